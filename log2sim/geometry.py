@@ -1,0 +1,243 @@
+"""Rigid transforms, quaternions, poses over time and oriented boxes.
+
+Transforms are named `dst_T_src` (4x4, float64) so that inner frames cancel: `map_T_cam = map_T_ego @ ego_T_cam`.
+Frames: map (local ENU), ego (ISO 8855: x forward, y left, z up), cam (x right, y down, z forward). Quaternions are
+scalar-first, yaw is counter-clockwise from +x in [-pi, pi).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+NS_PER_S = 1_000_000_000
+
+
+def wrap_angle(angle_rad: ArrayLike) -> Array:
+    """Wrap angles to [-pi, pi).
+
+    Notes
+    -----
+    Rounding can carry `mod` to its modulus, which would return +pi; that value is folded back.
+    """
+    wrapped = np.mod(np.asarray(angle_rad, dtype=np.float64) + np.pi, 2 * np.pi) - np.pi
+    return np.where(wrapped >= np.pi, -np.pi, wrapped)
+
+
+def rotation_from_quaternion(q_wxyz: ArrayLike) -> Array:
+    """Turn scalar-first unit quaternions (..., 4) into rotation matrices (..., 3, 3)."""
+    q = np.asarray(q_wxyz, dtype=np.float64)
+    w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quaternion_from_rotation(rotation: ArrayLike) -> Array:
+    """Turn rotation matrices (..., 3, 3) into scalar-first unit quaternions (..., 4) with w >= 0.
+
+    Notes
+    -----
+    Takes the largest of the four squared components as pivot (Shepperd, 1978), so no division is ill-conditioned.
+    """
+    r = np.asarray(rotation, dtype=np.float64)
+    d = np.diagonal(r, axis1=-2, axis2=-1)
+    trace = d.sum(-1)
+    squared = np.stack([1 + trace, 1 + 2 * d[..., 0] - trace, 1 + 2 * d[..., 1] - trace, 1 + 2 * d[..., 2] - trace], -1)
+    sums = {
+        (0, 1): r[..., 2, 1] - r[..., 1, 2], (0, 2): r[..., 0, 2] - r[..., 2, 0], (0, 3): r[..., 1, 0] - r[..., 0, 1],
+        (1, 2): r[..., 0, 1] + r[..., 1, 0], (1, 3): r[..., 0, 2] + r[..., 2, 0], (2, 3): r[..., 1, 2] + r[..., 2, 1],
+    }  # fmt: skip
+    pivot = np.argmax(squared, axis=-1)
+    candidates = np.empty((*r.shape[:-2], 4, 4))
+    for i in range(4):
+        for j in range(4):
+            candidates[..., i, j] = squared[..., i] if i == j else sums[min(i, j), max(i, j)]
+    q = np.take_along_axis(candidates, pivot[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., :1] < 0, -q, q)
+
+
+def rotation_from_rpy(roll_rad: ArrayLike, pitch_rad: ArrayLike, yaw_rad: ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) of intrinsic Z-Y-X angles: R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    roll, pitch, yaw = np.broadcast_arrays(*(np.asarray(a, dtype=np.float64) for a in (roll_rad, pitch_rad, yaw_rad)))
+    cr, sr, cp, sp, cy, sy = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def yaw_of(rotation: ArrayLike) -> Array:
+    """Yaw (...) in rad of rotation matrices or transforms (..., 3|4, 3|4)."""
+    r = np.asarray(rotation, dtype=np.float64)
+    return wrap_angle(np.arctan2(r[..., 1, 0], r[..., 0, 0]))
+
+
+def transform(rotation: ArrayLike, translation: ArrayLike) -> Array:
+    """Assemble 4x4 transforms from rotations (..., 3, 3) and translations (..., 3)."""
+    r, t = np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64)
+    out = np.zeros((*np.broadcast_shapes(r.shape[:-2], t.shape[:-1]), 4, 4))
+    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = r, t, 1.0
+    return out
+
+
+def inverse(dst_T_src: Array) -> Array:
+    """Invert rigid transforms (..., 4, 4)."""
+    rt = np.swapaxes(dst_T_src[..., :3, :3], -1, -2)
+    return transform(rt, -(rt @ dst_T_src[..., :3, 3:])[..., 0])
+
+
+def apply(dst_T_src: Array, points: ArrayLike) -> Array:
+    """Map points (N, 3) through one transform (4, 4), or each through its own (N, 4, 4)."""
+    p = np.asarray(points, dtype=np.float64)
+    if dst_T_src.ndim == 2:
+        return p @ dst_T_src[:3, :3].T + dst_T_src[:3, 3]
+    return np.einsum("nij,nj->ni", dst_T_src[:, :3, :3], p) + dst_T_src[:, :3, 3]
+
+
+def slerp(q0: Array, q1: Array, fraction: Array) -> Array:
+    """Interpolate unit quaternions (N, 4) along the shorter arc; `fraction` (N,) may leave [0, 1] to extrapolate."""
+    dot = np.sum(q0 * q1, axis=-1)
+    q1 = np.where(dot[:, None] < 0, -q1, q1)
+    angle = np.arccos(np.clip(np.abs(dot), 0.0, 1.0))
+    small = angle < 1e-6  # there sin(a f) / sin(a) = f up to 1e-13
+    sine = np.where(small, 1.0, np.sin(angle))
+    w0 = np.where(small, 1 - fraction, np.sin((1 - fraction) * angle) / sine)
+    w1 = np.where(small, fraction, np.sin(fraction * angle) / sine)
+    q = w0[:, None] * q0 + w1[:, None] * q1
+    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseTrack:
+    """Poses of the ego over time: `t_ns` (P,) int64 strictly increasing, `map_T_ego` (P, 4, 4)."""
+
+    t_ns: NDArray[np.int64]
+    map_T_ego: Array
+    max_gap_s: float = 1.0
+    extrapolate_s: float = 0.2
+
+    def __post_init__(self) -> None:
+        if len(self.t_ns) == 0 or len(self.t_ns) != len(self.map_T_ego):
+            raise ValueError("a pose track needs one pose per stamp and at least one of them")
+        if np.any(np.diff(self.t_ns) <= 0):
+            raise ValueError("stamps of a pose track must be strictly increasing")
+
+    def at(self, t_ns: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+        """Poses at stamps (N,) int64 ns, interpolated on SE(3).
+
+        Returns
+        -------
+        map_T_ego : (N, 4, 4) float64
+        valid : (N,) bool
+            False in gaps longer than `max_gap_s` and more than `extrapolate_s` outside the track.
+        """
+        t = np.atleast_1d(np.asarray(t_ns, dtype=np.int64))
+        if len(self.t_ns) == 1:
+            near = np.abs(t - self.t_ns[0]) <= round(self.extrapolate_s * NS_PER_S)
+            return np.repeat(self.map_T_ego, len(t), axis=0), near
+        i = np.clip(np.searchsorted(self.t_ns, t, side="right") - 1, 0, len(self.t_ns) - 2)
+        span = (self.t_ns[i + 1] - self.t_ns[i]).astype(np.float64)
+        fraction = (t - self.t_ns[i]).astype(np.float64) / span
+        q = quaternion_from_rotation(self.map_T_ego[:, :3, :3])
+        position = self.map_T_ego[:, :3, 3]
+        poses = transform(
+            rotation_from_quaternion(slerp(q[i], q[i + 1], fraction)),
+            position[i] + fraction[:, None] * (position[i + 1] - position[i]),
+        )
+        margin = round(self.extrapolate_s * NS_PER_S)
+        inside = (t >= self.t_ns[0] - margin) & (t <= self.t_ns[-1] + margin)
+        return poses, inside & ((span <= self.max_gap_s * NS_PER_S) | np.isin(t, self.t_ns))
+
+
+def box_corners_bev(xy_m: ArrayLike, length_m: ArrayLike, width_m: ArrayLike, yaw_rad: ArrayLike) -> Array:
+    """Corners (M, 4, 2) of oriented rectangles: front-left, rear-left, rear-right, front-right (counter-clockwise)."""
+    xy, length, width, yaw = (np.asarray(a, dtype=np.float64) for a in (xy_m, length_m, width_m, yaw_rad))
+    xy = np.atleast_2d(xy)
+    m = len(xy)
+    half_l, half_w = np.broadcast_to(length, m) / 2, np.broadcast_to(width, m) / 2
+    yaw = np.broadcast_to(yaw, m)
+    local = np.stack(
+        [
+            np.stack([half_l, half_w], -1),
+            np.stack([-half_l, half_w], -1),
+            np.stack([-half_l, -half_w], -1),
+            np.stack([half_l, -half_w], -1),
+        ],
+        axis=1,
+    )
+    c, s = np.cos(yaw), np.sin(yaw)
+    rotation = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], axis=1)
+    return np.einsum("mij,mkj->mki", rotation, local) + xy[:, None]
+
+
+def box_corners(center_m: ArrayLike, size_m: ArrayLike, yaw_rad: ArrayLike) -> Array:
+    """Corners (M, 8, 3) of upright boxes: the four of the bottom, then the four of the top, as `box_corners_bev`."""
+    center, size = np.atleast_2d(np.asarray(center_m, float)), np.atleast_2d(np.asarray(size_m, float))
+    bev = box_corners_bev(center[:, :2], size[:, 0], size[:, 1], yaw_rad)
+    half_height = size[:, 2, None, None] / 2
+    bottom = np.concatenate([bev, np.broadcast_to(center[:, None, 2:] - half_height, (len(center), 4, 1))], -1)
+    top = np.concatenate([bev, np.broadcast_to(center[:, None, 2:] + half_height, (len(center), 4, 1))], -1)
+    return np.concatenate([bottom, top], axis=1)
+
+
+def points_in_box(points: Array, center_m: Array, size_m: Array, yaw_rad: float, margin_m: float = 0.0) -> NDArray[np.bool_]:
+    """Mask (N,) of points (N, 3) inside one upright box (center (3,), size (3,) length, width, height)."""
+    d = points - center_m
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    half = np.asarray(size_m) / 2 + margin_m
+    along, across = d[:, 0] * c + d[:, 1] * s, -d[:, 0] * s + d[:, 1] * c
+    return (np.abs(along) <= half[0]) & (np.abs(across) <= half[1]) & (np.abs(d[:, 2]) <= half[2])
+
+
+def box_iou(a_px: ArrayLike, b_px: ArrayLike) -> Array:
+    """IoU (A, B) of axis-aligned image boxes (A, 4), (B, 4) as u0, v0, u1, v1 in px; 0 where both are empty."""
+    a, b = np.asarray(a_px, dtype=np.float64).reshape(-1, 1, 4), np.asarray(b_px, dtype=np.float64).reshape(1, -1, 4)
+    overlap = np.clip(np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2]), 0, None).prod(-1)
+    area_a, area_b = np.clip(a[..., 2:] - a[..., :2], 0, None).prod(-1), np.clip(b[..., 2:] - b[..., :2], 0, None).prod(-1)
+    union = area_a + area_b - overlap
+    return np.divide(overlap, union, out=np.zeros_like(union), where=union > 0)
+
+
+def bev_iou(a: ArrayLike, b: ArrayLike) -> float:
+    """IoU of two oriented rectangles given as corners (4, 2), counter-clockwise, in m.
+
+    Notes
+    -----
+    Sutherland-Hodgman clipping of one convex polygon by the other, then the shoelace formula.
+    """
+    poly = [np.asarray(p, float) for p in np.asarray(a, float)]
+    clip = np.asarray(b, float)
+    for k in range(len(clip)):
+        p, edge = clip[k], clip[(k + 1) % len(clip)] - clip[k]
+        if not poly:
+            return 0.0
+        side = [edge[0] * (q[1] - p[1]) - edge[1] * (q[0] - p[0]) for q in poly]
+        kept: list[Array] = []
+        for i in range(len(poly)):
+            j = (i + 1) % len(poly)
+            if side[i] >= 0:
+                kept.append(poly[i])
+            if (side[i] >= 0) != (side[j] >= 0):
+                kept.append(poly[i] + (poly[j] - poly[i]) * (side[i] / (side[i] - side[j])))
+        poly = kept
+    overlap = polygon_area(np.array(poly)) if len(poly) >= 3 else 0.0
+    union = polygon_area(np.asarray(a, float)) + polygon_area(clip) - overlap
+    return overlap / union if union > 0 else 0.0
+
+
+def polygon_area(corners: Array) -> float:
+    """Area of a simple polygon (K, 2), shoelace formula, about its first corner so that far origins cost no digits."""
+    d = corners - corners[0]
+    x, y = d[:, 0], d[:, 1]
+    return float(abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2)

@@ -1,0 +1,51 @@
+"""Plug-ins by name: tables that import nothing until a name is chosen, open to third parties through entry points."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+from importlib.metadata import entry_points
+from typing import Any
+
+from log2sim.errors import ConfigError
+
+BUILT_IN: dict[str, dict[str, str]] = {
+    "log": {
+        "log2sim": "log2sim.logs.native:READER",
+        "kitti": "log2sim.logs.kitti_raw:READER",
+        "kitti-tracking": "log2sim.logs.kitti_tracking:READER",
+        "pandaset": "log2sim.logs.pandaset:READER",
+    },
+    "detector": {
+        "ssd-mobilenet-v2": "log2sim.detect.ssd_mobilenet:create",
+        "labels": "log2sim.detect.labels:create",
+    },
+}
+
+
+def names(kind: str) -> list[str]:
+    """Names of all plug-ins of a kind ("log", "detector"), built-in ones first."""
+    return list(BUILT_IN[kind]) + sorted(e.name for e in entry_points(group=f"log2sim.{kind}"))
+
+
+def load(kind: str, name: str) -> Any:
+    """Import the plug-in `name` of a kind.
+
+    Raises
+    ------
+    ConfigError
+        When no plug-in has that name; the message lists the known ones and the nearest.
+    """
+    if name in BUILT_IN[kind]:
+        module, _, attribute = BUILT_IN[kind][name].partition(":")
+        return getattr(importlib.import_module(module), attribute)
+    for entry in entry_points(group=f"log2sim.{kind}"):
+        if entry.name == name:
+            return entry.load()
+    raise ConfigError(f"unknown {kind} '{name}'{nearest(name, names(kind))}; known: {', '.join(names(kind))}")
+
+
+def nearest(word: str, known: list[str]) -> str:
+    """A hint " (did you mean ...?)" or nothing."""
+    close = difflib.get_close_matches(word, known, n=1)
+    return f" (did you mean '{close[0]}'?)" if close else ""

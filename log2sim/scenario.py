@@ -1,0 +1,230 @@
+"""The result: who was there, how big, where and when, as `scenario.json` holds it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from log2sim.errors import ScenarioError
+from log2sim.files import read_json, write_json
+from log2sim.geometry import Array, wrap_angle
+from log2sim.schema import check
+from log2sim.types import CATEGORIES, MapFrame
+
+VERSION = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Waypoints:
+    """A trajectory of the box center as columns (T,), local ENU axes.
+
+    `t_s` strictly increasing seconds since the scenario's start, `speed_mps` along the heading (negative when reversing),
+    `observed` False where a gap was filled, `sigma_xy_m` one standard deviation of the position. `visible` only in truth.
+    """
+
+    t_s: Array
+    x_m: Array
+    y_m: Array
+    z_m: Array
+    yaw_rad: Array
+    speed_mps: Array
+    observed: NDArray[np.bool_]
+    sigma_xy_m: Array
+    visible: NDArray[np.bool_] | None = None
+
+    FLOATS = ("t_s", "x_m", "y_m", "z_m", "yaw_rad", "speed_mps", "sigma_xy_m")
+
+    def __len__(self) -> int:
+        return len(self.t_s)
+
+
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """States of one agent at asked times (T,): NaN and `valid` False outside its life."""
+
+    valid: NDArray[np.bool_]
+    x_m: Array
+    y_m: Array
+    z_m: Array
+    yaw_rad: Array
+    speed_mps: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Agent:
+    """One road user. `size_m` length, width, height; `color` is {"rgb": [r, g, b], "name": ...} or None."""
+
+    id: str
+    category: str
+    size_m: tuple[float, float, float]
+    waypoints: Waypoints
+    static: bool = False
+    rear_axle_offset_m: float = 0.0
+    color: Mapping[str, Any] | None = None
+    confidence: float = 1.0
+    quality: Mapping[str, Any] = field(default_factory=dict)
+
+    def at(self, t_s: ArrayLike, max_gap_s: float = math.inf, margin_s: float = 1e-6) -> Sampled:
+        """Sample the trajectory at times (T,), linearly, yaw along the shorter arc.
+
+        Times within `margin_s` outside the life take its end; times inside a gap longer than `max_gap_s` are not valid.
+        """
+        t, w = np.atleast_1d(np.asarray(t_s, dtype=np.float64)), self.waypoints
+        valid = (t >= w.t_s[0] - margin_s) & (t <= w.t_s[-1] + margin_s)
+        if len(w) > 1:
+            i = np.clip(np.searchsorted(w.t_s, t, side="right") - 1, 0, len(w) - 2)
+            on_waypoint = np.minimum(np.abs(t - w.t_s[i]), np.abs(w.t_s[i + 1] - t)) <= margin_s
+            valid &= on_waypoint | (w.t_s[i + 1] - w.t_s[i] <= max_gap_s)
+        columns = {k: np.interp(t, w.t_s, getattr(w, k)) for k in ("x_m", "y_m", "z_m", "speed_mps")}
+        columns["yaw_rad"] = wrap_angle(np.interp(t, w.t_s, np.unwrap(w.yaw_rad)))
+        return Sampled(valid=valid, **{k: np.where(valid, v, np.nan) for k, v in columns.items()})
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """A scenario. The ego is the agent with id "ego", if the log had one; `t0_ns` is the absolute time of t_s = 0."""
+
+    name: str
+    t0_ns: int
+    duration_s: float
+    agents: tuple[Agent, ...]
+    map: MapFrame = field(default_factory=MapFrame)
+    cameras: tuple[Mapping[str, Any], ...] = ()
+    plan: tuple[Mapping[str, Any], ...] = ()
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def ego(self) -> Agent | None:
+        return next((a for a in self.agents if a.id == "ego"), None)
+
+    @property
+    def others(self) -> tuple[Agent, ...]:
+        return tuple(a for a in self.agents if a.id != "ego")
+
+    @classmethod
+    def load(cls, path: Path | str) -> Scenario:
+        """Read and check a scenario file.
+
+        Raises
+        ------
+        ScenarioError
+            When the file is missing, is no JSON, breaks the schema or holds impossible values; names the agent and field.
+        """
+        document = read_json(path, ScenarioError)
+        try:
+            return cls.from_dict(document)
+        except ScenarioError as error:
+            raise ScenarioError(f"{path}: {error}") from None
+
+    def save(self, path: Path | str) -> None:
+        """Write the scenario, whole or not at all; what was written reads back to the same numbers."""
+        document = self.to_dict()
+        check(document, "scenario-1", ScenarioError)
+        write_json(path, document)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The document of `schemas/scenario-1.json`."""
+        m = self.map
+        return {
+            "scenario_version": VERSION,
+            "name": self.name,
+            "t0_ns": int(self.t0_ns),
+            "duration_s": float(self.duration_s),
+            "map": {
+                "latitude_deg": m.latitude_deg,
+                "longitude_deg": m.longitude_deg,
+                "altitude_m": m.altitude_m,
+                "projection": m.projection,
+                "offset_m": list(m.offset_m),
+            },
+            "agents": [_agent_to_dict(a) for a in self.agents],
+            "cameras": [dict(c) for c in self.cameras],
+            "plan": [dict(p) for p in self.plan],
+            "provenance": dict(self.provenance),
+        }
+
+    @classmethod
+    def from_dict(cls, document: Any) -> Scenario:
+        """Build a scenario from a document, after checking it against the schema and for sense."""
+        version = document.get("scenario_version") if isinstance(document, dict) else None
+        if version != VERSION:
+            raise ScenarioError(f"scenario_version is {version!r}, expected {VERSION}; is this a scenario file of log2sim?")
+        check(document, "scenario-1", ScenarioError)
+        m = document["map"]
+        scenario = cls(
+            name=document["name"],
+            t0_ns=document["t0_ns"],
+            duration_s=float(document["duration_s"]),
+            agents=tuple(_agent_from_dict(a) for a in document["agents"]),
+            map=MapFrame(m["latitude_deg"], m["longitude_deg"], m["altitude_m"], m["projection"], tuple(m["offset_m"])),
+            cameras=tuple(document["cameras"]),
+            plan=tuple(document["plan"]),
+            provenance=document["provenance"],
+        )
+        seen: set[str] = set()
+        for agent in scenario.agents:
+            if agent.id in seen:
+                raise ScenarioError(f"agent '{agent.id}': the id stands twice; ids must be unique")
+            seen.add(agent.id)
+        return scenario
+
+
+def _agent_to_dict(agent: Agent) -> dict[str, Any]:
+    w = agent.waypoints
+    columns: dict[str, list[Any]] = {k: np.asarray(getattr(w, k), dtype=np.float64).tolist() for k in Waypoints.FLOATS}
+    columns["observed"] = [bool(v) for v in w.observed]
+    if w.visible is not None:
+        columns["visible"] = [bool(v) for v in w.visible]
+    length, width, height = (float(v) for v in agent.size_m)
+    return {
+        "id": agent.id,
+        "category": agent.category,
+        "size_m": {"length": length, "width": width, "height": height},
+        "color": dict(agent.color) if agent.color is not None else None,
+        "static": bool(agent.static),
+        "rear_axle_offset_m": float(agent.rear_axle_offset_m),
+        "confidence": float(agent.confidence),
+        "quality": dict(agent.quality),
+        "waypoints": columns,
+    }
+
+
+def _agent_from_dict(entry: Mapping[str, Any]) -> Agent:
+    where = f"agent '{entry['id']}'"
+    if entry["category"] not in CATEGORIES:
+        raise ScenarioError(f"{where}: category '{entry['category']}' is not known; known: {', '.join(CATEGORIES)}")
+    columns = entry["waypoints"]
+    count = len(columns["t_s"])
+    for key, values in columns.items():
+        if len(values) != count:
+            raise ScenarioError(f"{where}: waypoints.{key} has {len(values)} values, t_s has {count}")
+    arrays = {k: np.array(columns[k], dtype=np.float64) for k in Waypoints.FLOATS}
+    for key, values in arrays.items():
+        if not np.all(np.isfinite(values)):
+            raise ScenarioError(f"{where}: waypoints.{key} is not finite at index {int(np.argmin(np.isfinite(values)))}")
+    if np.any(np.diff(arrays["t_s"]) <= 0):
+        k = int(np.argmax(np.diff(arrays["t_s"]) <= 0)) + 1
+        raise ScenarioError(f"{where}: waypoints.t_s does not increase at index {k} ({arrays['t_s'][k]:g} s)")
+    visible = columns.get("visible")
+    size = entry["size_m"]
+    return Agent(
+        id=entry["id"],
+        category=entry["category"],
+        size_m=(float(size["length"]), float(size["width"]), float(size["height"])),
+        waypoints=Waypoints(
+            **arrays,
+            observed=np.array(columns["observed"], dtype=bool),
+            visible=None if visible is None else np.array(visible, dtype=bool),
+        ),
+        static=entry["static"],
+        rear_axle_offset_m=float(entry["rear_axle_offset_m"]),
+        color=entry["color"],
+        confidence=float(entry["confidence"]),
+        quality=entry["quality"],
+    )

@@ -1,0 +1,32 @@
+"""Checks documents against the JSON Schemas that ship with the package."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from log2sim.errors import LogError
+
+
+@cache
+def load_schema(name: str) -> dict[str, Any]:
+    """The schema `name` ("log-1", "scenario-1", "replay-1", "report-1", "metrics-1") as a document."""
+    beside_source = Path(__file__).resolve().parent.parent / "schemas" / f"{name}.json"
+    if beside_source.is_file():
+        return json.loads(beside_source.read_text(encoding="utf-8"))
+    return json.loads(resources.files("log2sim_schemas").joinpath(f"{name}.json").read_text(encoding="utf-8"))
+
+
+def check(document: Any, name: str, error: type[LogError]) -> None:
+    """Raise `error` naming the first field that breaks the schema and what was expected there."""
+    from jsonschema import Draft202012Validator
+
+    problem = next(iter(sorted(Draft202012Validator(load_schema(name)).iter_errors(document), key=lambda e: list(map(str, e.path)))), None)
+    if problem is None:
+        return
+    place = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in problem.absolute_path).lstrip(".") or "the document"
+    message = problem.message if len(problem.message) < 200 else f"{problem.message[:80]} ... {problem.message[-100:]}"
+    raise error(f"{place}: {message}")
