@@ -1,0 +1,34 @@
+"""Fixtures that several test modules share."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+@pytest.fixture(scope="session")
+def real_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The recorded logs in their native layout; skips where they are not at hand."""
+    restore = SHARED / "data" / "restore.py"
+    if not restore.is_file():
+        pytest.skip("recorded logs are not beside this checkout (../shared/data)")
+    if importlib.util.find_spec("pandas") is None:
+        pytest.skip("laying out the recorded logs needs pandas")
+    out = tmp_path_factory.mktemp("real") / "data"
+    subprocess.run([sys.executable, str(restore), str(out)], check=True, capture_output=True)
+    return out
+
+
+@pytest.fixture(scope="session")
+def yolox_model() -> Path:
+    """A real detector; skips where it is not at hand."""
+    path = SHARED / "models" / "yolox_nano.onnx"
+    if not path.is_file():
+        pytest.skip("the YOLOX-nano model is not beside this checkout (../shared/models)")
+    return path
