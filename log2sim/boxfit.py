@@ -8,10 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array, wrap_angle
+from log2sim.types import TYPICAL_SIZE_M
 
 SEARCH_STEP_RAD = np.deg2rad(2.0)
 NEAREST_EDGE_M = 0.03
 MOST_POINTS = 256
+SENSOR_SIGMA_M = 0.08
+# A completed side may be anywhere between nothing hidden and all of the slack hidden: a uniform spread.
+SLACK_SIGMA = 12.0**-0.5
 
 
 def fit_yaw(xy_m: Array) -> tuple[float, float]:
@@ -45,7 +49,9 @@ def fit_yaw(xy_m: Array) -> tuple[float, float]:
 
 def _edge_distance(offsets: Array) -> Array:
     """Distance (N, K) of every point to the nearer of the two ends, robust to one stray point at either end."""
-    low, high = np.partition(offsets, [1, -2], axis=0)[[1, -2]] if len(offsets) >= 8 else (offsets.min(0), offsets.max(0))
+    low, high = (
+        np.partition(offsets, [1, -2], axis=0)[[1, -2]] if len(offsets) >= 8 else (offsets.min(0), offsets.max(0))
+    )
     return np.minimum(np.abs(offsets - low), np.abs(high - offsets))
 
 
@@ -103,6 +109,35 @@ def complete_box(low: Array, high: Array, size_m: Array, sensor: Array) -> tuple
     # +1: the sensor lies beyond the upper end, so the upper end is real and the box reaches down from it
     beyond = np.where(sensor > high, 1.0, np.where(sensor < low, -1.0, 0.0))
     return middle - beyond * slack / 2, slack
+
+
+def box_of_cluster(
+    cluster: Array, sensor: Array, category: str, ground_z: float, *, yaw_rad: float | None = None, size_m: Any = None
+) -> tuple[Array, Array, float, Array]:
+    """Center (3,), size (3,), yaw and covariance (2, 2) of the box around a cluster (n, 3) seen from `sensor` (3,).
+
+    Without `yaw_rad` the yaw is fitted, up to quarter turns; without `size_m` the typical size completes what was not seen.
+    """
+    typical = np.array(TYPICAL_SIZE_M[category])
+    if yaw_rad is None:
+        yaw_rad, _ = fit_yaw(cluster[:, :2])
+        low, high = extents(cluster[:, :2], yaw_rad)
+        # The longer side is the length, unless what is seen of it is as short as a width.
+        if (high - low)[1] > max((high - low)[0], typical[1] * 1.15):
+            yaw_rad += np.pi / 2
+    low, high = extents(cluster[:, :2], yaw_rad)
+    top = float(np.quantile(cluster[:, 2], 0.98)) - ground_z
+    size = (
+        np.asarray(size_m, dtype=np.float64)
+        if size_m is not None
+        else np.maximum([*(high - low), top], [*typical[:2], top])
+    )
+    sensor_local = rotate(sensor[:2], -yaw_rad)
+    center_local, slack = complete_box(low, high, size[:2], sensor_local)
+    center = np.append(rotate(center_local, yaw_rad), ground_z + size[2] / 2)
+    sigma = np.hypot(SENSOR_SIGMA_M, SLACK_SIGMA * slack)
+    axes = rotate(np.eye(2), yaw_rad)
+    return center, size, float(yaw_rad), axes.T @ np.diag(sigma**2) @ axes
 
 
 def align_to(yaw_rad: float, toward_rad: float, period_rad: float) -> float:

@@ -133,14 +133,18 @@ def _apply(record: Any, document: Mapping[str, Any], prefix: str, where: str) ->
     changes: dict[str, Any] = {}
     for key, value in document.items():
         if key not in known:
-            raise ConfigError(f"{where}: unknown setting '{prefix}{key}'{nearest(key, list(known))}; known: {', '.join(known)}")
+            raise ConfigError(
+                f"{where}: unknown setting '{prefix}{key}'{nearest(key, list(known))}; known: {', '.join(known)}"
+            )
         current = getattr(record, key)
         if dataclasses.is_dataclass(current):
             if dataclasses.is_dataclass(value):
                 changes[key] = value
                 continue
             if not isinstance(value, Mapping):
-                raise ConfigError(f"{where}: '{prefix}{key}' is a section; set one of its keys, e.g. {_first_key(current, prefix + key)}")
+                raise ConfigError(
+                    f"{where}: '{prefix}{key}' is a section; set one of its keys, e.g. {_first_key(current, prefix + key)}"
+                )
             changes[key] = _apply(current, value, f"{prefix}{key}.", where)
         else:
             changes[key] = _checked(value, hints[key], known[key], f"{where}: '{prefix}{key}'")

@@ -80,14 +80,16 @@ def synchronize(
         raise ConfigError(f"sync.reference: camera '{reference}' is not used; used: {', '.join(cameras)}")
     ticks = log.streams[reference].t_ns
     seconds = (ticks - ticks[0]) / NS_PER_S
-    keep = (seconds >= (start_s if start_s is not None else -np.inf)) & (seconds <= (stop_s if stop_s is not None else np.inf))
+    keep = (seconds >= (start_s if start_s is not None else -np.inf)) & (
+        seconds <= (stop_s if stop_s is not None else np.inf)
+    )
     if not keep.any():
         raise ConfigError(f"--start/--stop leave no frame of '{reference}', which lasts {seconds[-1]:.3f} s")
     ticks = ticks[keep]
     tolerance_ns = round(max_residual_s * NS_PER_S)
     frames, residuals = {}, {}
     for camera in cameras:
-        frames[camera], residuals[camera] = nearest_records(log.streams[camera].t_ns, ticks, tolerance_ns)
+        frames[camera], residuals[camera] = _taken_once(*nearest_records(log.streams[camera].t_ns, ticks, tolerance_ns))
     sweeps = {}
     for lidar in log.lidars:
         stream = log.streams[lidar]
@@ -118,6 +120,17 @@ def nearest_records(
     return np.where(near, index, -1), np.where(near, residual_ns / NS_PER_S, np.nan)
 
 
+def _taken_once(
+    index: NDArray[np.int64], residual_s: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Let only the nearest tick have a frame that several ticks would take: a frame is evidence for one moment."""
+    order = np.lexsort((np.abs(residual_s), index))
+    first = np.zeros(len(index), dtype=bool)
+    first[order] = np.r_[True, index[order][1:] != index[order][:-1]]
+    keep = first & (index >= 0)
+    return np.where(keep, index, -1), np.where(keep, residual_s, np.nan)
+
+
 def sweep_middle_ns(stream: Stream) -> int:
     """Median time of a sweep's points relative to its stamp, from the first sweep that can be read; 0 without point times.
 
@@ -138,5 +151,7 @@ def sweep_middle_ns(stream: Stream) -> int:
         if len(sweep.t_ns):
             return round((int(sweep.t_ns.min()) + int(sweep.t_ns.max())) / 2) - int(sweep.stamp_ns)
     if problem is not None and len(stream.t_ns) <= PROBED_RECORDS:
-        raise LogError(f"stream '{stream.name}': none of its {len(stream.t_ns)} sweeps can be read; the first problem: {problem}")
+        raise LogError(
+            f"stream '{stream.name}': none of its {len(stream.t_ns)} sweeps can be read; the first problem: {problem}"
+        )
     return 0

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import NS_PER_S, Array
+from log2sim.measure.ground import ON_GROUND_M, estimate_ground
 from log2sim.types import Log, Sweep
 
 # Rotation is held within one bin: at 1 rad/s and 50 m this is 2.5 cm; translation is interpolated for every point.
@@ -68,3 +70,41 @@ def to_map(log: Log, lidar: str, sweep: Sweep, *, compensate: bool) -> tuple[Arr
     position = map_T_lidar[:, :3, 3]
     fraction = (place - k)[:, None]
     return out + position[k] * (1 - fraction) + position[k + 1] * fraction, t_s
+
+
+def assemble_cloud(
+    log: Log,
+    sweeps: Mapping[str, Sweep],
+    *,
+    origin: Array,
+    ground_z: float,
+    max_range_m: float,
+    compensate: bool = True,
+) -> Cloud | None:
+    """One cloud in the map frame from the sweeps of all LiDARs that belong together, with its ground found.
+
+    Parameters
+    ----------
+    origin : (3,) map frame
+        Position of the ego (or the sensor); points beyond `max_range_m` of it are left out.
+    ground_z : float
+        Expected height of the ground at the origin, m, map frame.
+    """
+    parts, stamp = [], 0
+    for name, sweep in sweeps.items():
+        mapped = to_map(log, name, sweep, compensate=compensate)
+        if mapped is None or len(mapped[0]) == 0:
+            continue
+        stamp = stamp or sweep.stamp_ns
+        sensor, known = log.map_T_sensor(name, sweep.stamp_ns)
+        local = (mapped[0] - origin).astype(np.float32)
+        near = (np.abs(local[:, :2]) <= max_range_m).all(axis=1)
+        shift_s = np.float32((sweep.stamp_ns - stamp) / NS_PER_S)
+        parts.append((local[near], mapped[1][near] + shift_s, sensor[0, :3, 3] - origin if known[0] else np.zeros(3)))
+    if not parts:
+        return None
+    xyz, t_s = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+    surface = estimate_ground(xyz, np.zeros(2), ground_z - float(origin[2]))
+    height = xyz[:, 2] - surface.at(xyz[:, :2])
+    sensor = np.mean([p[2] for p in parts], axis=0).astype(np.float32)
+    return Cloud(stamp, np.asarray(origin, float), xyz, t_s, sensor, np.abs(height) <= ON_GROUND_M, height)

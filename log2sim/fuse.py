@@ -1,0 +1,96 @@
+"""Fusion: measurements of all sensors at one tick become one set of objects in the map frame."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.boxfit import box_of_cluster, rotate
+from log2sim.types import GROUP_OF, Measurements
+
+# Two clusters are one object when this share of the smaller lies in the other's extent.
+SHARED_POINTS = 0.4
+MARGIN_M = 0.15
+# Squared Mahalanobis distance of two independent positions, 2 degrees of freedom, 99 %.
+SAME_PLACE = 9.21
+
+
+def fuse(measurements: Measurements) -> Measurements:
+    """Join rows (M,) that are the same object, seen by two cameras or found twice by one.
+
+    Rows with LiDAR points are the same object when they share its points; rows without are gated by their covariances.
+    The joined row keeps the score, category and image box of the surest one. A person whose points are those of a vehicle
+    is its driver or a false alarm and is dropped.
+    """
+    order = np.argsort(-measurements.score * np.where(measurements.truncated, 0.7, 1.0), kind="stable")
+    rows = measurements.take(order)
+    owner = np.full(len(rows), -1)
+    for i in range(len(rows)):
+        for j in range(i):
+            if owner[j] == j and _same_object(rows, i, j):
+                owner[i] = j
+                break
+        else:
+            owner[i] = i
+    leaders = np.flatnonzero(owner == np.arange(len(rows)))
+    joined = [_join(rows, leader, np.flatnonzero(owner == leader)) for leader in leaders]
+    out = Measurements.join(joined)
+    return out.take(~_drivers(out))
+
+
+def _same_object(rows: Measurements, i: int, j: int) -> bool:
+    if GROUP_OF[str(rows.category[i])] != GROUP_OF[str(rows.category[j])]:
+        return False
+    if rows.source[i] == "lidar" and rows.source[j] == "lidar":
+        return shared_points(rows, i, j) >= SHARED_POINTS
+    if rows.camera[i] == rows.camera[j] or not rows.source[i] or not rows.source[j]:
+        return False
+    apart = (rows.center_m[i] - rows.center_m[j])[:2]
+    return bool(apart @ np.linalg.solve(rows.covariance[i] + rows.covariance[j], apart) <= SAME_PLACE)
+
+
+def shared_points(rows: Measurements, i: int, j: int) -> float:
+    """Largest share of one cluster's points that lie inside the extent of the other's points."""
+    distance = np.hypot(*(rows.center_m[i] - rows.center_m[j])[:2])
+    if distance > (rows.size_m[i, :2].sum() + rows.size_m[j, :2].sum()) / 2:
+        return 0.0
+    return max(_share_inside(rows, i, j), _share_inside(rows, j, i))
+
+
+def _share_inside(rows: Measurements, i: int, j: int) -> float:
+    yaw = float(rows.yaw_rad[j])
+    extent, points = rotate(rows.cluster[j][:, :2], -yaw), rotate(rows.cluster[i][:, :2], -yaw)
+    low, high = extent.min(axis=0) - MARGIN_M, extent.max(axis=0) + MARGIN_M
+    return float(((points >= low) & (points <= high)).all(axis=1).mean())
+
+
+def _join(rows: Measurements, leader: int, members: NDArray[np.intp]) -> Measurements:
+    row = rows.take([leader])
+    others = [m for m in members if m != leader and rows.camera[m] != rows.camera[leader] and rows.source[m] == "lidar"]
+    if not others or row.source[0] != "lidar":
+        return row
+    cluster = np.concatenate([rows.cluster[m] for m in [leader, *others]])
+    ground_z = float(row.center_m[0, 2] - row.size_m[0, 2] / 2)
+    origin = row.center_m[0]
+    center, size, yaw, covariance = box_of_cluster(
+        cluster - origin, row.sensor_m[0] - origin, str(row.category[0]), ground_z - float(origin[2])
+    )
+    whole = bool(row.truncated[0]) and all(rows.truncated[m] for m in others)
+    columns = {k: v for k, v in vars(row).items()}
+    columns |= {
+        "center_m": (center + origin)[None], "size_m": size[None], "yaw_rad": np.array([yaw]),
+        "covariance": covariance[None], "cluster": (cluster,), "truncated": np.array([whole]),
+        "points": np.array([int(rows.points[[leader, *others]].max())]),
+    }  # fmt: skip
+    return Measurements(**columns)
+
+
+def _drivers(rows: Measurements) -> NDArray[np.bool_]:
+    """Mask (M,) of people whose points lie inside a vehicle's extent."""
+    group = np.array([GROUP_OF[str(c)] for c in rows.category])
+    drop = np.zeros(len(rows), dtype=bool)
+    for i in np.flatnonzero((group == "pedestrian") & (rows.source == "lidar")):
+        for j in np.flatnonzero((group == "vehicle") & (rows.source == "lidar")):
+            near = np.hypot(*(rows.center_m[i] - rows.center_m[j])[:2]) < rows.size_m[j, 0]
+            drop[i] |= bool(near) and _share_inside(rows, int(i), int(j)) >= 0.8
+    return drop
