@@ -1,0 +1,88 @@
+"""Wide pictures in overlapping tiles, so that far objects are large enough for a detector with a small input."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.detect.suppression import suppress
+from log2sim.geometry import Array
+from log2sim.types import Detections
+
+OVERLAP = 0.25  # of a tile's width: a car at 15 m in a 60 degree picture fits into it
+BORDER_PX = 4.0  # boxes that end this close to an inner border are taken as cut there
+MAX_TILE_ASPECT = 1.25
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A part of a picture: columns u0..u1 and rows v0..v1 in px, ends excluded."""
+
+    u0: int
+    v0: int
+    u1: int
+    v1: int
+
+    def cut(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return np.ascontiguousarray(image[self.v0 : self.v1, self.u0 : self.u1])
+
+
+def plan_tiles(width_px: int, height_px: int, tiles: Literal["auto"] | int, input_px: int | None) -> list[Tile]:
+    """The whole picture, then the tiles of one row from left to right.
+
+    Parameters
+    ----------
+    tiles
+        1: only the whole picture; N: also N tiles; "auto": as many as make tiles nearly square, none where the model's
+        input already holds most of the picture's pixels.
+    input_px
+        Width of the model's input, None where it takes any size.
+    """
+    whole = Tile(0, 0, width_px, height_px)
+    count = auto_count(width_px, height_px, input_px) if tiles == "auto" else tiles
+    if count < 2:
+        return [whole]
+    tile_width = math.ceil(width_px / (count - (count - 1) * OVERLAP))
+    starts = np.rint(np.linspace(0, width_px - tile_width, count)).astype(int).tolist()
+    return [whole, *(Tile(u, 0, u + tile_width, height_px) for u in starts)]
+
+
+def auto_count(width_px: int, height_px: int, input_px: int | None) -> int:
+    """Number of tiles in a row whose shape is near to a square; 1 where tiling would gain nothing."""
+    if input_px is not None and width_px <= 1.25 * input_px:
+        return 1
+    wanted = width_px / height_px / MAX_TILE_ASPECT
+    return max(3, math.ceil((wanted - OVERLAP) / (1 - OVERLAP))) if wanted > 1 else 1
+
+
+def is_cut(box_px: Array, tile: Tile, width_px: int, height_px: int) -> NDArray[np.bool_]:
+    """Mask (M,) of the boxes (M, 4), px of the whole picture, that end at a border of the tile inside the picture."""
+    return (
+        ((tile.u0 > 0) & (box_px[:, 0] < tile.u0 + BORDER_PX))
+        | ((tile.v0 > 0) & (box_px[:, 1] < tile.v0 + BORDER_PX))
+        | ((tile.u1 < width_px) & (box_px[:, 2] > tile.u1 - BORDER_PX))
+        | ((tile.v1 < height_px) & (box_px[:, 3] > tile.v1 - BORDER_PX))
+    )
+
+
+def merge(found: list[tuple[Tile, Detections]], width_px: int, height_px: int, max_overlap: float) -> Detections:
+    """One set of boxes from those of all tiles, each already in px of the whole picture.
+
+    Notes
+    -----
+    A box cut by an inner border is dropped: tiles overlap, and what is too large for the overlap is found in the whole
+    picture. A half box would give a wrong object, a missing one only a missing frame of a track.
+    """
+    kept = [d.take(~is_cut(d.box_px, tile, width_px, height_px)) for tile, d in found]
+    if not kept:
+        return Detections.empty()
+    joined = Detections(
+        np.concatenate([d.box_px for d in kept]),
+        np.concatenate([d.score for d in kept]),
+        np.concatenate([d.category for d in kept]),
+    )
+    return suppress(joined, max_overlap)
