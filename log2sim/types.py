@@ -262,3 +262,15 @@ class Measurements:
             np.zeros(0, dtype=np.int64), text, none, text, np.zeros((0, 4)), np.zeros(0, dtype=bool), np.zeros((0, 3)),
             np.zeros((0, 3)), none, np.zeros((0, 2, 2)), np.zeros(0, dtype=np.int64), text, (), np.zeros((0, 3)), none,
         )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """One object over time: `tick` (n,) strictly increasing indices and the measurement (n rows) it got at each."""
+
+    category: str
+    tick: NDArray[np.int64]
+    measurements: Measurements
+
+    def __len__(self) -> int:
+        return len(self.tick)
