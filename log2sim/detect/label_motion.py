@@ -51,12 +51,9 @@ def boxes_at(moments: Mapping[int, Boxes], t_ns: int) -> Boxes | None:
     i = bisect_left(stamps, t_ns)
     before, after = stamps[max(i - 1, 0)], stamps[min(i, len(stamps) - 1)]
     near, far = (before, after) if t_ns - before <= after - t_ns or before == after else (after, before)
-    if abs(near - t_ns) > MAX_AGE_S * NS_PER_S and not (
-        before < t_ns < after and after - before <= MAX_GAP_S * NS_PER_S
-    ):
-        return None
-    if near in (far, t_ns) or abs(far - near) > MAX_GAP_S * NS_PER_S:
-        return moments[near]
+    between = before < t_ns < after and after - before <= MAX_GAP_S * NS_PER_S
+    if not between:
+        return moments[near] if abs(near - t_ns) <= MAX_AGE_S * NS_PER_S else None
     return moved(moments[near], moments[far], (t_ns - near) / (far - near), abs(far - near) / NS_PER_S)
 
 

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.detect.classes import Classes, choose_classes
-from log2sim.detect.layouts import LAYOUTS, Layout, Outputs, describe, named_layout
+from log2sim.detect.layout import Layout, Outputs, describe
+from log2sim.detect.layouts import LAYOUTS, named_layout
 from log2sim.detect.onnx_model import OnnxModel, load_model
 from log2sim.detect.riders import join_riders
 from log2sim.detect.suppression import suppress
