@@ -1,0 +1,88 @@
+"""Image files of a log: JPEG and PNG, with their size known before anything is decoded."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.errors import RecordError
+
+IMAGE_LIMIT_PX = 100_000_000
+IMAGE_LIMIT_BYTES = 256 * 1024 * 1024
+
+
+def read_image(path: Path, t_ns: int, width_px: int, height_px: int) -> NDArray[np.uint8]:
+    """Read an image as (H, W, 3) uint8 BGR.
+
+    Raises
+    ------
+    RecordError
+        When it is missing, truncated, no JPEG or PNG, or not of the size that the calibration is for; names file and stamp.
+    """
+    where = f"{path} (stamp {t_ns})"
+    data = read_bytes(path, t_ns, IMAGE_LIMIT_BYTES)
+    jpeg = data[:2] == b"\xff\xd8"
+    width, height = _jpeg_size(data, where) if jpeg else _png_size(data, where)
+    if width * height > IMAGE_LIMIT_PX:
+        raise RecordError(f"{where}: {width}x{height} px, more than the {IMAGE_LIMIT_PX} px that an image may have")
+    if (width, height) != (width_px, height_px):
+        raise RecordError(f"{where}: {width}x{height} px, the calibration is for {width_px}x{height_px}")
+    return _decode_jpeg(data, where) if jpeg else _decode_png(data, where)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height in px of an image file, from its header."""
+    with path.open("rb") as file:
+        data = file.read(IMAGE_LIMIT_BYTES)
+    return _jpeg_size(data, str(path)) if data[:2] == b"\xff\xd8" else _png_size(data, str(path))
+
+
+def read_bytes(path: Path, t_ns: int, limit_bytes: int) -> bytes:
+    """The bytes of one record's file, refused when it is missing or larger than `limit_bytes`."""
+    try:
+        size = path.stat().st_size
+        if size > limit_bytes:
+            raise RecordError(f"{path} (stamp {t_ns}): {size} bytes, more than the {limit_bytes} that it may have")
+        return path.read_bytes()
+    except OSError as error:
+        raise RecordError(f"{path} (stamp {t_ns}): cannot be read: {error.strerror}") from None
+
+
+def _jpeg_size(data: bytes, where: str) -> tuple[int, int]:
+    import simplejpeg
+
+    try:
+        height, width, _, _ = simplejpeg.decode_jpeg_header(data)
+    except ValueError as error:
+        raise RecordError(f"{where}: not a readable JPEG: {error}") from None
+    return width, height
+
+
+def _decode_jpeg(data: bytes, where: str) -> NDArray[np.uint8]:
+    import simplejpeg
+
+    try:
+        return simplejpeg.decode_jpeg(data, colorspace="BGR")
+    except ValueError as error:
+        raise RecordError(f"{where}: JPEG cannot be decoded: {error}") from None
+
+
+def _png_size(data: bytes, where: str) -> tuple[int, int]:
+    if data[:8] != b"\x89PNG\r\n\x1a\n" or len(data) < 24:
+        raise RecordError(f"{where}: neither a JPEG nor a PNG image")
+    return struct.unpack(">II", data[16:24])
+
+
+def _decode_png(data: bytes, where: str) -> NDArray[np.uint8]:
+    import cv2
+
+    # OpenCV returns the upper part of a truncated PNG as if it were whole.
+    if b"IEND" not in data[-64:]:
+        raise RecordError(f"{where}: PNG is truncated")
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise RecordError(f"{where}: PNG cannot be decoded")
+    return image.astype(np.uint8, copy=False)

@@ -1,0 +1,296 @@
+"""The native log folder: `log.json` (schemas/log-1.json) with CSV indexes, images and sweeps beside it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.errors import LogError
+from log2sim.files import inside, read_json
+from log2sim.geometry import Array, PoseTrack, rotation_from_quaternion, transform
+from log2sim.logs.images import read_image
+from log2sim.logs.sweeps import read_sweep
+from log2sim.logs.table import Table, in_order, read_table
+from log2sim.schema import check
+from log2sim.types import CATEGORIES, Camera, EgoVehicle, ImageLabels, Labels, Lidar, Log, MapFrame, Stream, Sweep
+
+MANIFEST = "log.json"
+
+INDEX_COLUMNS = {"t_ns": "int", "file": "str"}
+POSE_COLUMNS = {"t_ns": "int", **dict.fromkeys(("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"), "float")}
+GNSS_FIELDS = ("latitude_deg", "longitude_deg", "altitude_m", "roll_rad", "pitch_rad", "yaw_rad")
+GNSS_COLUMNS = {"t_ns": "int", **dict.fromkeys(GNSS_FIELDS, "float")}
+BOX_3D_FIELDS = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
+BOX_3D_COLUMNS = {"t_ns": "int", "track_id": "str", "category": "str", **dict.fromkeys(BOX_3D_FIELDS, "float")}
+BOX_2D_FIELDS = ("u0_px", "v0_px", "u1_px", "v1_px")
+BOX_2D_COLUMNS = {"t_ns": "int", "camera": "str", **dict.fromkeys(BOX_2D_FIELDS, "float"), "category": "str"}
+
+QUATERNION_TOLERANCE = 1e-3
+OFFSET_STEP_M = 1000.0
+DISTORTION_LENGTHS: Mapping[str, tuple[int, ...]] = {"none": (0,), "brown": (4, 5, 8), "fisheye": (4,)}
+
+
+class NativeReader:
+    """Reader of log2sim's own log folders."""
+
+    name = "log2sim"
+    looks_for = f"a folder with {MANIFEST}"
+
+    def matches(self, path: Path) -> bool:
+        return bool(self.sequences(path))
+
+    def sequences(self, path: Path) -> list[str]:
+        if (path / MANIFEST).is_file():
+            return [path.resolve().name]
+        return sorted(p.parent.name for p in path.glob(f"*/{MANIFEST}"))
+
+    def open(self, path: Path, sequence: str) -> Log:
+        root = path if (path / MANIFEST).is_file() else path / sequence
+        return _Folder(root).log()
+
+
+READER = NativeReader()
+
+
+class _Folder:
+    """One log folder while it is being opened; collects notes and the digest."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.file = root / MANIFEST
+        self.notes: list[str] = []
+        self.manifest: dict[str, Any] = read_json(self.file)
+        try:
+            check(self.manifest, "log-1", LogError)
+        except LogError as error:
+            raise LogError(f"{self.file}: {error}") from None
+        self.hash = hashlib.sha256(self.file.read_bytes())
+
+    def log(self) -> Log:
+        m = self.manifest
+        map_frame, track = self._ego()
+        sensors = [self._sensor(k, entry) for k, entry in enumerate(m["sensors"])]
+        self._check_sensors(sensors, track)
+        labels = self._labels()
+        offset = _offset(track, sensors, labels)
+        cameras = {s.name: _shifted_camera(s, offset) for s in sensors if isinstance(s, Camera)}
+        lidars = {s.name: _shifted_lidar(s, offset) for s in sensors if isinstance(s, Lidar)}
+        ego = m.get("ego", {})
+        default = EgoVehicle()
+        size = tuple(float(v) for v in ego.get("size_m", default.size_m))
+        return Log(
+            name=m["name"],
+            format=READER.name,
+            cameras=cameras,
+            lidars=lidars,
+            streams={e["name"]: self._stream(k, e, offset) for k, e in enumerate(m["sensors"])},
+            ego=None if track is None else PoseTrack(track.t_ns, _shifted(track.map_T_ego, offset)),
+            ego_vehicle=EgoVehicle(size, float(ego.get("rear_axle_offset_m", default.rear_axle_offset_m))),  # type: ignore[arg-type]
+            map=replace(map_frame, offset_m=tuple(offset.tolist())),
+            labels=None if labels is None else _shifted_labels(labels, offset),
+            image_labels=self._image_labels(set(cameras)),
+            ground_z_ego_m=float(ego.get("ground_z_m", 0.0)),
+            reference_camera=m.get("reference_camera"),
+            digest=self.hash.hexdigest(),
+            notes=tuple(self.notes),
+        )
+
+    def table(
+        self, relative: str, field: str, columns: Mapping[str, str], optional: Mapping[str, str] | None = None
+    ) -> Table:
+        """Read a table that the manifest names under `field`."""
+        table = read_table(inside(self.root, relative, f"{self.file}, field '{field}'"), columns, optional)
+        self.hash.update(table.sha256.encode())
+        return table
+
+    def _ego(self) -> tuple[MapFrame, PoseTrack | None]:
+        m = self.manifest.get("map", {})
+        map_frame = MapFrame(m.get("latitude_deg"), m.get("longitude_deg"), m.get("altitude_m"), m.get("projection"))
+        ego = self.manifest.get("ego")
+        if ego is None:
+            return map_frame, None
+        if "poses" in ego:
+            table = self.table(ego["poses"], "ego.poses", POSE_COLUMNS)
+            self._not_empty(table)
+            rotation = self._rotations(table)
+            poses = transform(rotation, table.stack("x_m", "y_m", "z_m"))
+        else:
+            table = self.table(ego["gnss"], "ego.gnss", GNSS_COLUMNS)
+            self._not_empty(table)
+            from log2sim.logs.geodesy import map_frame_of, poses_from_geodetic
+
+            _check_geodetic(table)
+            map_frame = map_frame_of(map_frame, *(float(table[f][0]) for f in GNSS_FIELDS[:3]))
+            poses = poses_from_geodetic(
+                map_frame, *(table[f] for f in GNSS_FIELDS), where=f"{self.file}, field 'map.projection'"
+            )
+        keep, notes = in_order(table["t_ns"], "ego")
+        self.notes += notes
+        return map_frame, PoseTrack(table["t_ns"][keep], poses[keep])
+
+    def _rotations(self, table: Table) -> Array:
+        q = table.stack("qw", "qx", "qy", "qz")
+        norm = np.linalg.norm(q, axis=1)
+        bad = np.flatnonzero(np.abs(norm - 1) > QUATERNION_TOLERANCE)
+        if len(bad):
+            raise LogError(f"{table.where(bad[0], 'qw,qx,qy,qz')}: norm {norm[bad[0]]:.6g}, expected a unit quaternion")
+        return rotation_from_quaternion(q)
+
+    def _not_empty(self, table: Table) -> None:
+        if not len(table):
+            raise LogError(f"{table.path}: no records below the header; a stream needs at least one")
+
+    def _sensor(self, k: int, entry: Mapping[str, Any]) -> Camera | Lidar:
+        where = f"{self.file}, sensors[{k}] '{entry['name']}'"
+        norm = float(np.linalg.norm(entry["rotation_wxyz"]))
+        if abs(norm - 1) > QUATERNION_TOLERANCE:
+            raise LogError(f"{where}: rotation_wxyz has norm {norm:.6g}, expected a unit quaternion (scalar first)")
+        mount_T_sensor = transform(rotation_from_quaternion(entry["rotation_wxyz"]), entry["translation_m"])
+        if entry["kind"] == "lidar":
+            return Lidar(entry["name"], entry["mount"], mount_T_sensor)
+        i = entry["intrinsics"]
+        model, distortion = i.get("distortion_model", "none"), tuple(float(v) for v in i.get("distortion", ()))
+        if len(distortion) not in DISTORTION_LENGTHS[model]:
+            expected = " or ".join(map(str, DISTORTION_LENGTHS[model]))
+            raise LogError(f"{where}: intrinsics.distortion has {len(distortion)} values, '{model}' takes {expected}")
+        K = np.array([[i["fx_px"], 0.0, i["cx_px"]], [0.0, i["fy_px"], i["cy_px"]], [0.0, 0.0, 1.0]])
+        return Camera(
+            entry["name"], i["width_px"], i["height_px"], K, entry["mount"], mount_T_sensor, model, distortion
+        )
+
+    def _check_sensors(self, sensors: list[Camera | Lidar], track: PoseTrack | None) -> None:
+        seen: set[str] = set()
+        for k, sensor in enumerate(sensors):
+            where = f"{self.file}, sensors[{k}] '{sensor.name}'"
+            if sensor.name in seen:
+                raise LogError(f"{where}: the name stands twice; names must be unique")
+            if sensor.mount == "ego" and track is None:
+                raise LogError(f"{where}: is mounted on the ego, but the log has no 'ego' with poses or gnss")
+            seen.add(sensor.name)
+        reference = self.manifest.get("reference_camera")
+        cameras = [s.name for s in sensors if isinstance(s, Camera)]
+        if reference is not None and reference not in cameras:
+            raise LogError(
+                f"{self.file}, field 'reference_camera': no camera '{reference}'; there are: {', '.join(cameras)}"
+            )
+
+    def _stream(self, k: int, entry: Mapping[str, Any], offset: Array) -> Stream:
+        table = self.table(entry["index"], f"sensors[{k}].index", INDEX_COLUMNS)
+        self._not_empty(table)
+        keep, notes = in_order(table["t_ns"], entry["name"])
+        self.notes += notes
+        files = [inside(self.root, str(table["file"][row]), table.where(row, "file")) for row in keep]
+        t_ns = table["t_ns"][keep]
+        if entry["kind"] == "camera":
+            size = entry["intrinsics"]["width_px"], entry["intrinsics"]["height_px"]
+            return Stream(entry["name"], t_ns, partial(_read_image, files, t_ns, size))
+        frame = entry.get("points_frame", "lidar")
+        return Stream(entry["name"], t_ns, partial(_read_sweep, files, t_ns, frame, offset))
+
+    def _labels(self) -> Labels | None:
+        relative = self.manifest.get("labels", {}).get("boxes_3d")
+        if relative is None:
+            return None
+        table = self.table(relative, "labels.boxes_3d", BOX_3D_COLUMNS, {"visible": "bool"})
+        _check_categories(table)
+        size = table.stack("length_m", "width_m", "height_m")
+        if np.any(size <= 0):
+            row, column = np.argwhere(size <= 0)[0]
+            field = ("length_m", "width_m", "height_m")[column]
+            raise LogError(f"{table.where(row, field)}: {size[row, column]:g}, expected a size above 0")
+        return Labels(
+            table["t_ns"],
+            table["track_id"],
+            table["category"],
+            table.stack("x_m", "y_m", "z_m"),
+            size,
+            table["yaw_rad"],
+            table.columns.get("visible"),
+        )
+
+    def _image_labels(self, cameras: set[str]) -> dict[str, ImageLabels]:
+        relative = self.manifest.get("labels", {}).get("boxes_2d")
+        if relative is None:
+            return {}
+        table = self.table(relative, "labels.boxes_2d", BOX_2D_COLUMNS)
+        _check_categories(table)
+        unknown = np.flatnonzero(~np.isin(table["camera"], sorted(cameras)))
+        if len(unknown):
+            name = table["camera"][unknown[0]]
+            raise LogError(
+                f"{table.where(unknown[0], 'camera')}: no camera '{name}'; there are: {', '.join(sorted(cameras))}"
+            )
+        box = table.stack(*BOX_2D_FIELDS)
+        empty = np.flatnonzero((box[:, 2] <= box[:, 0]) | (box[:, 3] <= box[:, 1]))
+        if len(empty):
+            raise LogError(f"{table.where(empty[0], 'u1_px,v1_px')}: the box is empty, expected u0 < u1 and v0 < v1")
+        rows = {name: table["camera"] == name for name in sorted(cameras)}
+        return {n: ImageLabels(table["t_ns"][r], box[r], table["category"][r]) for n, r in rows.items() if r.any()}
+
+
+def _check_categories(table: Table) -> None:
+    unknown = np.flatnonzero(~np.isin(table["category"], CATEGORIES))
+    if len(unknown):
+        found = table["category"][unknown[0]]
+        raise LogError(f"{table.where(unknown[0], 'category')}: '{found}', expected one of {', '.join(CATEGORIES)}")
+
+
+def _check_geodetic(table: Table) -> None:
+    for field, limit in (("latitude_deg", 90.0), ("longitude_deg", 360.0)):
+        bad = np.flatnonzero(np.abs(table[field]) > limit)
+        if len(bad):
+            raise LogError(
+                f"{table.where(bad[0], field)}: {table[field][bad[0]]:g}, expected at most {limit:g} degrees"
+            )
+
+
+def _read_image(files: list[Path], t_ns: NDArray[np.int64], size: tuple[int, int], i: int) -> NDArray[np.uint8]:
+    return read_image(files[i], int(t_ns[i]), *size)
+
+
+def _read_sweep(
+    files: list[Path], t_ns: NDArray[np.int64], frame: Literal["lidar", "map"], offset: Array, i: int
+) -> Sweep:
+    sweep = read_sweep(files[i], int(t_ns[i]), frame)
+    if frame == "map" and offset.any():
+        return Sweep(sweep.stamp_ns, sweep.xyz_m.astype(np.float64) - offset, frame, sweep.t_ns)
+    return sweep
+
+
+def _offset(track: PoseTrack | None, sensors: list[Camera | Lidar], labels: Labels | None) -> Array:
+    """Whole kilometers (3,) that bring the log near the map's origin."""
+    if track is not None:
+        first = track.map_T_ego[0, :3, 3]
+    else:
+        places = [_mount_T(s)[:3, 3] for s in sensors if s.mount == "map"]
+        first = places[0] if places else labels.center_m[0] if labels is not None and len(labels.t_ns) else np.zeros(3)
+    return OFFSET_STEP_M * np.round(first / OFFSET_STEP_M) + 0.0
+
+
+def _mount_T(sensor: Camera | Lidar) -> Array:
+    return sensor.mount_T_cam if isinstance(sensor, Camera) else sensor.mount_T_lidar
+
+
+def _shifted(map_T_x: Array, offset: Array) -> Array:
+    out = map_T_x.copy()
+    out[..., :3, 3] -= offset
+    return out
+
+
+def _shifted_camera(camera: Camera, offset: Array) -> Camera:
+    return camera if camera.mount == "ego" else replace(camera, mount_T_cam=_shifted(camera.mount_T_cam, offset))
+
+
+def _shifted_lidar(lidar: Lidar, offset: Array) -> Lidar:
+    return lidar if lidar.mount == "ego" else Lidar(lidar.name, lidar.mount, _shifted(lidar.mount_T_lidar, offset))
+
+
+def _shifted_labels(labels: Labels, offset: Array) -> Labels:
+    return replace(labels, center_m=labels.center_m - offset)

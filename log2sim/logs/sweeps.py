@@ -1,0 +1,106 @@
+"""Sweep files of a log: .npz, .npy, .bin and .pcd, with their size known before anything is allocated."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+import zlib
+from pathlib import Path
+from typing import IO, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.errors import RecordError
+from log2sim.logs.images import read_bytes
+from log2sim.logs.pcd import parse_pcd
+from log2sim.types import Sweep
+
+SWEEP_LIMIT_POINTS = 20_000_000
+SWEEP_LIMIT_BYTES = 1024 * 1024 * 1024
+
+Offset = NDArray[np.int64] | None
+
+
+def read_sweep(path: Path, t_ns: int, frame: Literal["lidar", "map"] = "lidar") -> Sweep:
+    """Read a sweep; rows that are not finite are left out.
+
+    Raises
+    ------
+    RecordError
+        When it is missing, truncated, too large or not of the layout that its suffix promises; names file and stamp.
+    """
+    data = read_bytes(path, t_ns, SWEEP_LIMIT_BYTES)
+    try:
+        xyz, offset_ns = _parse(path.suffix.lower(), data, t_ns)
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+        raise RecordError(f"{path} (stamp {t_ns}): not a readable sweep: {error}") from None
+    return sweep_of(xyz, t_ns, offset_ns, frame)
+
+
+def sweep_of(xyz_m: NDArray[Any], t_ns: int, offset_ns: Offset, frame: Literal["lidar", "map"]) -> Sweep:
+    """A `Sweep` of the finite rows of points (N, 3) with stamps `t_ns` + `offset_ns` (N,)."""
+    finite = np.isfinite(xyz_m).all(axis=1)
+    if not finite.all():
+        xyz_m = xyz_m[finite]
+        offset_ns = None if offset_ns is None else offset_ns[finite]
+    return Sweep(t_ns, xyz_m, frame, None if offset_ns is None else t_ns + offset_ns.astype(np.int64))
+
+
+def _parse(suffix: str, data: bytes, t_ns: int) -> tuple[NDArray[Any], Offset]:
+    if suffix == ".bin":
+        if len(data) % 16:
+            raise ValueError(f"{len(data)} bytes, expected four float32 (x, y, z, intensity) a point")
+        _limit(len(data) // 16)
+        return np.frombuffer(data, "<f4").reshape(-1, 4)[:, :3], None
+    if suffix == ".npy":
+        return _points(_read_npy(io.BytesIO(data), "the array")), None
+    if suffix == ".npz":
+        return _parse_npz(data)
+    if suffix == ".pcd":
+        return parse_pcd(data, t_ns, SWEEP_LIMIT_POINTS)
+    raise ValueError(f"unknown suffix '{suffix}', expected .npz, .npy, .bin or .pcd")
+
+
+def _parse_npz(data: bytes) -> tuple[NDArray[Any], Offset]:
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        names = archive.namelist()
+        if "xyz_m.npy" not in names:
+            raise ValueError(
+                f"no array 'xyz_m' in it, only {', '.join(n.removesuffix('.npy') for n in names[:9]) or 'none'}"
+            )
+        with archive.open("xyz_m.npy") as member:
+            xyz = _points(_read_npy(member, "xyz_m"))
+        if "t_offset_ns.npy" not in names:
+            return xyz, None
+        with archive.open("t_offset_ns.npy") as member:
+            offset = _read_npy(member, "t_offset_ns")
+    if offset.dtype.kind not in "iu" or offset.shape != (len(xyz),):
+        raise ValueError(f"t_offset_ns is {offset.dtype} {offset.shape}, expected whole numbers ({len(xyz)},)")
+    return xyz, offset.astype(np.int64)
+
+
+def _points(array: NDArray[Any]) -> NDArray[Any]:
+    if array.dtype.kind != "f" or array.ndim != 2 or array.shape[1] < 3:
+        raise ValueError(f"points are {array.dtype} {array.shape}, expected floating point (N, 3)")
+    return array[:, :3]
+
+
+def _read_npy(stream: IO[bytes], what: str) -> NDArray[Any]:
+    """Read one .npy array whose header was checked before its data are allocated; never unpickles."""
+    version = np.lib.format.read_magic(stream)
+    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, fortran, dtype = read_header(stream)
+    if dtype.hasobject or dtype.itemsize == 0 or len(shape) not in (1, 2) or (len(shape) == 2 and shape[1] > 64):
+        raise ValueError(f"{what} is {dtype} {shape}, expected numbers, (N, 3) or (N,)")
+    _limit(shape[0])
+    size = int(np.prod(shape)) * dtype.itemsize
+    data = stream.read(size)
+    if len(data) != size:
+        raise ValueError(f"{what} is truncated: {len(data)} of {size} bytes")
+    return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C")
+
+
+def _limit(points: int) -> None:
+    if not 0 <= points <= SWEEP_LIMIT_POINTS:
+        raise ValueError(f"{points} points, more than the {SWEEP_LIMIT_POINTS} that a sweep may have")

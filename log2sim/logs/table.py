@@ -1,0 +1,139 @@
+"""CSV tables of a log, read strictly: what is wrong is named by file, line and field."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.errors import LogError
+from log2sim.registry import nearest
+
+TABLE_LIMIT_BYTES = 256 * 1024 * 1024
+
+_DTYPE = {"int": np.int64, "float": np.float64}
+_EXPECTED = {"int": "a whole number", "float": "a finite number", "bool": "0, 1, true or false", "str": "text"}
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Columns of equal length by name, and the line (N,) of the file each row stands on."""
+
+    path: Path
+    columns: Mapping[str, NDArray[Any]]
+    line: NDArray[np.int64]
+    sha256: str
+
+    def __len__(self) -> int:
+        return len(self.line)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        return self.columns[name]
+
+    def stack(self, *names: str) -> NDArray[np.float64]:
+        """Columns side by side, (N, len(names)) float64."""
+        return np.stack([self.columns[n].astype(np.float64) for n in names], axis=1)
+
+    def where(self, row: int, field: str) -> str:
+        """The place of a value, for a message."""
+        return f"{self.path}, line {self.line[row]}, field '{field}'"
+
+
+def read_table(path: Path, columns: Mapping[str, str], optional: Mapping[str, str] | None = None) -> Table:
+    """Read a CSV file with a header.
+
+    Parameters
+    ----------
+    path : Path
+    columns, optional : mapping of name to "int", "float", "bool" or "str"
+        Columns that must and that may be there, in any order. An unknown one is an error.
+
+    Raises
+    ------
+    LogError
+        Naming file, line and field.
+    """
+    kinds = {**columns, **(optional or {})}
+    if not path.is_file():
+        raise LogError(f"{path}: no such file")
+    if path.stat().st_size > TABLE_LIMIT_BYTES:
+        raise LogError(f"{path}: {path.stat().st_size} bytes, more than the {TABLE_LIMIT_BYTES} that a table may have")
+    data = path.read_bytes()
+    try:
+        reader = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
+        rows = [(reader.line_num, row) for row in reader if row]
+    except (UnicodeDecodeError, csv.Error) as problem:
+        raise LogError(f"{path}: not a CSV table in UTF-8: {problem}") from None
+    if not rows:
+        raise LogError(f"{path}: is empty; expected the header {','.join(columns)}")
+    header = [name.strip() for name in rows[0][1]]
+    _check_header(path, header, columns, kinds)
+    line = np.array([n for n, _ in rows[1:]], dtype=np.int64)
+    for n, row in rows[1:]:
+        if len(row) != len(header):
+            raise LogError(f"{path}, line {n}: {len(row)} fields, the header has {len(header)}")
+    cells = {name: [row[k].strip() for _, row in rows[1:]] for k, name in enumerate(header)}
+    values = {name: _parse(path, line, name, text, kinds[name]) for name, text in cells.items()}
+    return Table(path, values, line, hashlib.sha256(data).hexdigest())
+
+
+def _check_header(path: Path, header: list[str], columns: Mapping[str, str], kinds: Mapping[str, str]) -> None:
+    missing = [name for name in columns if name not in header]
+    if missing:
+        raise LogError(f"{path}, line 1: column '{missing[0]}' is missing; expected the header {','.join(columns)}")
+    for name in header:
+        if name not in kinds:
+            hint = nearest(name, list(kinds))
+            raise LogError(f"{path}, line 1: unknown column '{name}'{hint}; known: {', '.join(kinds)}")
+        if header.count(name) > 1:
+            raise LogError(f"{path}, line 1: column '{name}' stands twice")
+
+
+def _parse(path: Path, line: NDArray[np.int64], name: str, text: list[str], kind: str) -> NDArray[Any]:
+    if kind == "str":
+        return np.array(text, dtype=np.str_)
+    if kind == "bool":
+        words = {"0": False, "1": True, "false": False, "true": True}
+        good = [t.lower() in words for t in text]
+        values: NDArray[Any] = np.array([words.get(t.lower(), False) for t in text], dtype=bool)
+    else:
+        try:
+            values = np.array(text, dtype=np.str_).astype(_DTYPE[kind])
+            good = list(np.isfinite(values))
+        except (ValueError, OverflowError):
+            values, good = np.zeros(0), [_is(t, kind) for t in text]
+    if not all(good):
+        k = good.index(False)
+        raise LogError(f"{path}, line {line[k]}, field '{name}': '{text[k][:40]}', expected {_EXPECTED[kind]}")
+    return values
+
+
+def _is(text: str, kind: str) -> bool:
+    try:
+        return bool(np.isfinite(np.array([text]).astype(_DTYPE[kind])[0]))
+    except (ValueError, OverflowError):
+        return False
+
+
+def in_order(t_ns: NDArray[np.int64], what: str) -> tuple[NDArray[np.intp], list[str]]:
+    """Rows to keep so that stamps strictly increase, and notes on what was wrong.
+
+    Late records are put in their place; of several with one stamp the first is kept.
+    """
+    order = np.argsort(t_ns, kind="stable")
+    notes = []
+    late = np.flatnonzero(t_ns[1:] < np.maximum.accumulate(t_ns)[:-1]) + 1
+    if len(late):
+        notes.append(f"{what}: {len(late)} of {len(t_ns)} records out of order, first at stamp {t_ns[late[0]]}; sorted")
+    again = np.flatnonzero(np.diff(t_ns[order]) == 0) + 1
+    if len(again):
+        first = t_ns[order[again[0]]]
+        notes.append(f"{what}: {len(again)} of {len(t_ns)} records repeat a stamp, first at stamp {first}; dropped")
+    return np.delete(order, again), notes
