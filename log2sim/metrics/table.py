@@ -1,0 +1,40 @@
+"""A result as a short table for a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+COLUMNS = (
+    ("recall", "recall", 3),
+    ("precision", "precis.", 3),
+    ("position_rmse_m", "pos rmse m", 2),
+    ("position_median_m", "pos med m", 2),
+    ("yaw_median_deg", "yaw med deg", 1),
+    ("speed_rmse_mps", "speed rmse m/s", 2),
+    ("size_median_m", "size med m", 2),
+    ("id_switches", "id sw", 0),
+    ("mota", "MOTA", 3),
+    ("hota", "HOTA", 3),
+)
+
+
+def format_table(result: Mapping[str, Any]) -> str:
+    """Lay out a result of `evaluate`: one line for all, one per range and category, one for the ego; '-' for none."""
+    lines = [("all", result)]
+    lines += [(f"{name} m", figures) for name, figures in (result["by_range"] or {}).items()]
+    lines += list(result["by_category"].items())
+    cells = [["", "agents", *(title for _, title, _ in COLUMNS)]]
+    for name, figures in lines:
+        agents = str(figures["counts"]["truth_agents"])
+        cells.append([name, agents, *(_cell(figures[key], digits) for key, _, digits in COLUMNS)])
+    ego = result["ego"]
+    if ego is not None:
+        cells.append(["ego", "", *(_cell(ego[key], digits) if key in ego else "" for key, _, digits in COLUMNS)])
+    widths = [max(len(row[k]) for row in cells) for k in range(len(cells[0]))]
+    rows = [[row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:]))] for row in cells]
+    return "\n".join("  ".join(row).rstrip() for row in rows)
+
+
+def _cell(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

@@ -1,0 +1,134 @@
+"""Which labeled boxes a camera and a LiDAR could see."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.camera import NEAREST_DEPTH_M, project, undistort
+from log2sim.geometry import Array, apply, box_corners, points_in_box, polygon_area
+from log2sim.types import Camera
+
+EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
+CELL_M = 2.0
+
+
+class PointGrid:
+    """Points (N, 3) sorted into columns of 2 x 2 m, so that those near a box are found without looking at all."""
+
+    def __init__(self, points: NDArray[np.floating]) -> None:
+        self._corner = points[:, :2].min(axis=0) if len(points) else np.zeros(2)
+        cell = ((points[:, :2] - self._corner) / CELL_M).astype(np.int64)
+        self._rows = int(cell[:, 1].max()) + 1 if len(points) else 1
+        key = cell[:, 0] * self._rows + cell[:, 1]
+        order = np.argsort(key, kind="stable")
+        self._key, self._points = key[order], points[order].astype(np.float64)
+
+    def count(self, center_m: Array, size_m: Array, yaw_rad: float) -> int:
+        """Number of points inside one upright box."""
+        reach = np.hypot(size_m[0], size_m[1]) / 2
+        low = np.floor((center_m[:2] - reach - self._corner) / CELL_M).astype(np.int64)
+        high = np.floor((center_m[:2] + reach - self._corner) / CELL_M).astype(np.int64)
+        # A key outside 0 .. rows - 1 would spill into the neighboring column of cells.
+        bottom, top = max(int(low[1]), 0), min(int(high[1]), self._rows - 1)
+        if top < bottom:
+            return 0
+        columns = np.arange(low[0], high[0] + 1) * self._rows
+        begin = np.searchsorted(self._key, columns + bottom)
+        end = np.searchsorted(self._key, columns + top, side="right")
+        inside = (points_in_box(self._points[b:e], center_m, size_m, yaw_rad) for b, e in zip(begin, end) if e > b)
+        return int(sum(np.count_nonzero(mask) for mask in inside))
+
+
+def image_shares(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Array, yaw_rad: Array) -> Array:
+    """Share (M,) of the outline of each box (M) in the map that falls inside the image.
+
+    Notes
+    -----
+    The outline is the convex hull of the part of the box in front of the camera, and areas are taken on the plane at depth
+    1, where edges stay straight whatever the lens does.
+    """
+    corners = box_corners(center_m, size_m, yaw_rad)
+    in_cam = apply(cam_T_map, corners.reshape(-1, 3))
+    _, in_image = project(camera, in_cam)
+    seen = in_image.reshape(-1, 8)
+    in_cam = in_cam.reshape(-1, 8, 3)
+    shares = np.where(seen.all(1), 1.0, 0.0)
+    border = image_border(camera)
+    for k in np.flatnonzero(~seen.all(1) & (in_cam[..., 2] > NEAREST_DEPTH_M).any(1)):
+        outline = convex_hull(_front_outline(in_cam[k]))
+        if np.any(outline.max(0) < border.min(0)) or np.any(outline.min(0) > border.max(0)):
+            continue
+        whole = polygon_area(outline)
+        # The border of a distorted image is not convex, the outline is: so the border is what gets clipped.
+        part = clip_to_convex(border, outline)
+        shares[k] = polygon_area(part) / whole if whole > 0 and len(part) >= 3 else 0.0
+    return shares
+
+
+def image_border(camera: Camera, per_side: int = 8) -> Array:
+    """The border of the image as a polygon (4 * per_side, 2) on the plane at depth 1."""
+    steps = np.arange(per_side) / per_side
+    w, h = float(camera.width_px), float(camera.height_px)
+    zero = np.zeros(per_side)
+    sides = [(steps * w, zero), (zero + w, steps * h), (w - steps * w, zero + h), (zero, h - steps * h)]
+    return undistort(camera, np.concatenate([np.stack(side, -1) for side in sides]))
+
+
+def _front_outline(corners_cam: Array) -> Array:
+    """Points (K, 2) at depth 1 of the corners (8, 3) in front, and of where edges pass the nearest depth."""
+    front = corners_cam[:, 2] > NEAREST_DEPTH_M
+    points = [corners_cam[front]]
+    for i, j in EDGES:
+        if front[i] != front[j]:
+            a, b = corners_cam[i], corners_cam[j]
+            points.append((a + (b - a) * (NEAREST_DEPTH_M - a[2]) / (b[2] - a[2]))[None])
+    stacked = np.concatenate(points)
+    return stacked[:, :2] / stacked[:, 2:]
+
+
+def convex_hull(points: Array) -> Array:
+    """Convex hull (K, 2), counter-clockwise, of points (N, 2).
+
+    Notes
+    -----
+    Andrew's monotone chain (1979). Points on one line give a polygon without area.
+    """
+    ordered = np.unique(points, axis=0).tolist()
+    if len(ordered) < 3:
+        return np.array(ordered)
+    chains = []
+    for run in (ordered, ordered[::-1]):
+        chain: list[list[float]] = []
+        for p in run:
+            while len(chain) >= 2 and _turn(chain[-2], chain[-1], p) <= 0:
+                chain.pop()
+            chain.append(p)
+        chains += chain[:-1]
+    return np.array(chains)
+
+
+def _turn(a: list[float], b: list[float], c: list[float]) -> float:
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+
+def clip_to_convex(polygon: Array, convex: Array) -> Array:
+    """The part (K, 2) of a polygon (N, 2) inside a convex one (M, 2), counter-clockwise; empty where they are apart.
+
+    Notes
+    -----
+    Sutherland-Hodgman (1974), one side of `convex` at a time.
+    """
+    kept = polygon
+    for start, end in zip(convex, np.roll(convex, -1, axis=0)):
+        if len(kept) == 0:
+            break
+        edge, to = end - start, kept - start
+        side = edge[0] * to[:, 1] - edge[1] * to[:, 0]
+        following, side_next = np.roll(kept, -1, axis=0), np.roll(side, -1)
+        crosses = (side >= 0) != (side_next >= 0)
+        fraction = np.divide(side, side - side_next, out=np.zeros_like(side), where=crosses)
+        crossing = kept + (following - kept) * fraction[:, None]
+        both = np.stack([kept, crossing], axis=1).reshape(-1, 2)
+        kept = both[np.stack([side >= 0, crosses], axis=1).ravel()]
+    return kept
