@@ -1,0 +1,193 @@
+"""One constant size for every track, and its positions measured anew against it.
+
+A single sweep sees two sides of an object at best. Over a track every side shows at some time, so lengths that were seen
+whole are kept, and each position is found again by laying the whole box against the sides that were seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim import boxfit
+from log2sim.geometry import NS_PER_S, Array, wrap_angle
+from log2sim.types import GROUP_OF, TYPICAL_SIZE_M, Track
+
+# A side seen at a flatter angle than this shows its near end only.
+LEAST_ASPECT = 0.35
+# Share of the whole sides that are longer: stray points lengthen some, sparse points shorten most.
+SIZE_QUANTILE = 0.75
+VOXEL_M = 0.15
+PERSISTENT_SHARE = 0.15
+POINTS_A_TICK = 150
+# Sizes that exist, as factors of the typical one.
+SHORTEST, LONGEST = 0.6, 1.6
+
+STANDING_MPS = {"vehicle": 0.35, "two_wheeler": 0.3, "pedestrian": 0.2, "other": 0.35}
+STANDING_DRIFT_M = {"vehicle": 1.2, "two_wheeler": 0.8, "pedestrian": 0.5, "other": 1.2}
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """What a track looks like: `size_m` (3,), and at each of its measurements `xy_m` (n, 2), `covariance` (n, 2, 2),
+    `z_m` (n,) of the center, and for a standing one `yaw_rad`, up to half turns.
+    """
+
+    size_m: Array
+    xy_m: Array
+    covariance: Array
+    z_m: Array
+    yaw_rad: float | None = None
+
+
+def is_standing(track: Track) -> bool:
+    """Whether a track never moves: its robust mean velocity and its drift stay within what changing views explain."""
+    m, group = track.measurements, GROUP_OF[track.category]
+    if len(m) < 3:
+        return group == "vehicle"
+    t = (m.t_ns - m.t_ns[0]) / NS_PER_S
+    xy = m.center_m[:, :2]
+    third = max(len(m) // 3, 1)
+    drift = np.median(xy[-third:], axis=0) - np.median(xy[:third], axis=0)
+    span = np.median(t[-third:]) - np.median(t[:third])
+    spread = np.quantile(np.hypot(*(xy - np.median(xy, axis=0)).T), 0.9)
+    moved = float(np.hypot(*drift))
+    slow = moved < STANDING_MPS[group] * max(float(span), 1e-9) or moved < 0.35
+    return bool(slow and moved < STANDING_DRIFT_M[group] and spread < 1.5 * STANDING_DRIFT_M[group])
+
+
+def shape_standing(track: Track) -> Shape:
+    """One pose and size of a track that stands still, from all its points together."""
+    m = track.measurements
+    origin = np.append(np.median(m.center_m[:, :2], axis=0), 0.0)
+    cloud = _persistent_points([c - origin for c in m.cluster])
+    sensor = m.sensor_m[:, :2] - origin[:2]
+    typical = np.array(TYPICAL_SIZE_M[track.category])
+    if len(cloud) < 5:
+        return _from_measured_centers(track, typical)
+    yaw, _ = boxfit.fit_yaw(cloud[:, :2])
+    yaw = _along_length(cloud[:, :2], yaw, boxfit.rotate(sensor, -yaw), typical)
+    low, high = boxfit.extents(cloud[:, :2], yaw)
+    local = boxfit.rotate(sensor, -yaw)
+    whole = _whole_sides(low, high, local)
+    size = _completed_size((high - low)[None], whole[None], typical[:2])
+    centers = np.array([boxfit.complete_box(low, high, size, s)[0] for s in local])
+    center = boxfit.rotate(np.median(centers, axis=0), yaw) + origin[:2]
+    height, z = _height(track)
+    slack = np.maximum(size - (high - low), 0.0)
+    sigma = np.hypot(boxfit.SENSOR_SIGMA_M, boxfit.SLACK_SIGMA * slack)
+    axes = boxfit.rotate(np.eye(2), yaw)
+    n = len(m)
+    covariance = np.tile(axes.T @ np.diag(sigma**2) @ axes, (n, 1, 1))
+    return Shape(np.append(size, height), np.tile(center, (n, 1)), covariance, np.full(n, np.median(z)), float(yaw))
+
+
+def shape_moving(track: Track, yaw_rad: Array) -> Shape:
+    """Size of a moving track and its center at every measurement, given its heading (n,) there."""
+    m = track.measurements
+    typical = np.array(TYPICAL_SIZE_M[track.category])
+    with_points = np.flatnonzero([len(c) >= 4 for c in m.cluster])
+    if len(with_points) == 0:
+        return _from_measured_centers(track, typical)
+    lows, highs, sensors = np.zeros((len(m), 2)), np.zeros((len(m), 2)), np.zeros((len(m), 2))
+    whole = np.zeros((len(m), 2), dtype=bool)
+    for k in with_points:
+        yaw, origin = float(yaw_rad[k]), m.center_m[k, :2]
+        lows[k], highs[k] = boxfit.extents(m.cluster[k][:, :2] - origin, yaw)
+        sensors[k] = boxfit.rotate(m.sensor_m[k, :2] - origin, -yaw)
+        whole[k] = _whole_sides(lows[k], highs[k], sensors[k]) & ~m.truncated[k]
+    size = _completed_size((highs - lows)[with_points], whole[with_points], typical[:2])
+    xy, covariance = m.center_m[:, :2].copy(), m.covariance.copy()
+    for k in with_points:
+        yaw = float(yaw_rad[k])
+        center, slack = boxfit.complete_box(lows[k], highs[k], size, sensors[k])
+        xy[k] = boxfit.rotate(center, yaw) + m.center_m[k, :2]
+        sigma = np.hypot(boxfit.SENSOR_SIGMA_M, boxfit.SLACK_SIGMA * slack)
+        axes = boxfit.rotate(np.eye(2), yaw)
+        covariance[k] = axes.T @ np.diag(sigma**2) @ axes
+    height, z = _height(track)
+    return Shape(np.append(size, height), xy, covariance, z)
+
+
+def _persistent_points(clusters: list[NDArray[np.float64]]) -> Array:
+    """Points (n, 3) of cells that several ticks saw, so that what a neighbor lent to one tick falls out."""
+    clusters = [boxfit.subsample(c, POINTS_A_TICK) for c in clusters if len(c)]
+    if not clusters:
+        return np.zeros((0, 3))
+    points = np.concatenate(clusters)
+    tick = np.repeat(np.arange(len(clusters)), [len(c) for c in clusters])
+    cell = np.floor(points[:, :2] / VOXEL_M).astype(np.int64)
+    _, key = np.unique(cell, axis=0, return_inverse=True)
+    seen = np.unique(np.stack([key.ravel(), tick], axis=1), axis=0)
+    count = np.bincount(seen[:, 0])
+    return points[count[key.ravel()] >= max(PERSISTENT_SHARE * len(clusters), min(2, len(clusters)))]
+
+
+def _along_length(xy: Array, yaw: float, sensor_local: Array, typical: Array) -> float:
+    """Turn a yaw known up to quarter turns so that it runs along the length."""
+    low, high = boxfit.extents(xy, yaw)
+    along, across = high - low
+    # Too long for a width: that side is the length. Both short: what faces the sensor flat-on is front or rear.
+    if max(along, across) > 1.2 * typical[1]:
+        return yaw if along >= across else yaw + np.pi / 2
+    ahead = np.median(np.abs(sensor_local), axis=0)
+    return yaw if ahead[0] >= ahead[1] else yaw + np.pi / 2
+
+
+def _whole_sides(low: Array, high: Array, sensor: Array) -> NDArray[np.bool_]:
+    """Whether length and width (2,) were seen from end to end: only a side that is not seen edge-on shows both ends."""
+    toward = np.atleast_2d(sensor) - (low + high) / 2
+    sine = np.abs(toward) / np.maximum(np.hypot(*toward.T)[:, None], 1e-9)
+    return np.array([(sine[:, 1] > LEAST_ASPECT).any(), (sine[:, 0] > LEAST_ASPECT).any()])
+
+
+def _completed_size(seen: Array, whole: NDArray[np.bool_], typical: Array) -> Array:
+    """Length and width (2,) from extents (n, 2), of which some were whole."""
+    size = np.empty(2)
+    for axis in range(2):
+        if whole[:, axis].any():
+            size[axis] = np.quantile(seen[whole[:, axis], axis], SIZE_QUANTILE)
+        else:
+            size[axis] = max(typical[axis], float(np.quantile(seen[:, axis], SIZE_QUANTILE)))
+    return np.clip(size, SHORTEST * typical, LONGEST * typical)
+
+
+def _height(track: Track) -> tuple[float, Array]:
+    """Height of the object and z (n,) of its center: points reach its top where the LiDAR looks that high."""
+    m = track.measurements
+    bottom = m.center_m[:, 2] - m.size_m[:, 2] / 2
+    tops = np.array(
+        [float(np.quantile(c[:, 2], 0.98)) - b if len(c) >= 4 else np.nan for c, b in zip(m.cluster, bottom)]
+    )
+    images = np.where(m.truncated, np.nan, m.height_px_m)
+    typical = TYPICAL_SIZE_M[track.category][2]
+    by_lidar = float(np.nanquantile(tops, SIZE_QUANTILE)) if np.isfinite(tops).any() else typical
+    by_image = float(np.nanmedian(images)) if np.isfinite(images).any() else typical
+    height = max(by_lidar, min(by_image, 1.15 * by_lidar))
+    height = float(np.clip(height, SHORTEST * typical, LONGEST * typical))
+    return height, bottom + height / 2
+
+
+def _from_measured_centers(track: Track, typical: Array) -> Shape:
+    m = track.measurements
+    height, z = _height(track)
+    yaw = float(np.nanmedian(m.yaw_rad)) if np.isfinite(m.yaw_rad).any() else None
+    return Shape(np.append(typical[:2], height), m.center_m[:, :2], m.covariance, z, yaw)
+
+
+def heading_of_standing(yaw_rad: float, xy: Array, flow: Array, *, reach_m: float = 15.0) -> float:
+    """Choose between the two directions of a standing vehicle: parked cars point the way traffic beside them goes.
+
+    `flow` (K, 3) holds x, y and heading of vehicles that moved; without any near enough the yaw stays as it is.
+    """
+    if len(flow) == 0:
+        return float(wrap_angle(yaw_rad))
+    distance = np.hypot(flow[:, 0] - xy[0], flow[:, 1] - xy[1])
+    parallel = np.abs(np.cos(flow[:, 2] - yaw_rad)) > 0.7
+    near = parallel & (distance < reach_m)
+    if not near.any():
+        return float(wrap_angle(yaw_rad))
+    vote = np.sum(np.sign(np.cos(flow[near, 2] - yaw_rad)) / (1.0 + distance[near]) ** 2)
+    return float(wrap_angle(yaw_rad if vote >= 0 else yaw_rad + np.pi))
