@@ -1,0 +1,50 @@
+"""Colors, line widths and letters of the pictures, and text that the font can set."""
+
+from __future__ import annotations
+
+from functools import cache
+
+from matplotlib import font_manager
+from matplotlib.ft2font import FT2Font
+from matplotlib.patheffects import AbstractPathEffect, withStroke
+
+INK = "#1B2330"
+"""Ego, titles and truth."""
+
+MUTED = "#667080"
+CROWD_COLOR = "#7C8794"
+"""Movers beyond those that have a color of their own."""
+
+GRID = "#E4E8ED"
+FRAME = "#B9C1CB"
+PARKED_FACE, PARKED_EDGE = "#D5DAE1", "#A9B2BE"
+PAPER = "#FFFFFF"
+
+PALETTE = (
+    "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#882255", "#999933", "#332288", "#44AA99",
+    "#AA4499", "#117733", "#CC6677", "#6699CC", "#A6761D", "#661100", "#5E9B2F", "#8C6BB1", "#2F6F7E", "#B8860B",
+)  # fmt: skip
+"""Colors told apart with color vision deficiency: Okabe and Ito (2008) without black and yellow, then Tol's muted set
+(2021) and four more of other lightness."""
+
+MARKERS = {"vehicle": "s", "two_wheeler": "D", "pedestrian": "o", "other": "^"}
+"""Marker of a group of categories, on the map for what is smaller than a car, and in the legend."""
+
+FONT = "DejaVu Sans"
+
+
+def halo(width_pt: float = 2.2) -> list[AbstractPathEffect]:
+    """A white rim that keeps letters readable on lines and pictures."""
+    return [withStroke(linewidth=width_pt, foreground=PAPER, alpha=0.9)]
+
+
+def printable(text: str, longest: int = 80) -> str:
+    """`text` in one line, shortened, with "?" for what the font lacks, so that nothing is drawn as an empty box."""
+    known = _characters()
+    line = "".join(c if ord(c) in known else "?" for c in " ".join(text.split()))
+    return line if len(line) <= longest else line[: longest - 1] + "…"
+
+
+@cache
+def _characters() -> frozenset[int]:
+    return frozenset(FT2Font(font_manager.findfont(FONT)).get_charmap())

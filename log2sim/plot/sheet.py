@@ -1,0 +1,173 @@
+"""The sheet of paper: title, map axes, and beside the map the legend, the scale and north."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Polygon
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
+
+from log2sim.plot.cast import Cast, Role
+from log2sim.plot.look import (
+    CROWD_COLOR,
+    FONT,
+    FRAME,
+    GRID,
+    INK,
+    MARKERS,
+    MUTED,
+    PAPER,
+    PARKED_EDGE,
+    PARKED_FACE,
+    printable,
+)
+from log2sim.plot.view import View, nice_step
+from log2sim.scenario import Scenario
+
+WIDTH_IN = 10.0
+LEFT_IN, SIDE_IN, TOP_IN, BOTTOM_IN, GAP_IN = 0.72, 2.3, 0.74, 0.52, 0.2
+LEAST_MAP_IN, MOST_MAP_IN = 3.4, 8.4
+ROW_IN = 0.178
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """A figure with its canvas, its map axes and the view they show."""
+
+    figure: Figure
+    canvas: FigureCanvasAgg
+    ax: Axes
+    view: View
+
+
+def make_sheet(view: View, legend_rows: int, *, projected: bool) -> Sheet:
+    """Lay out a sheet whose map has the view's proportions as far as paper allows."""
+    map_width = WIDTH_IN - LEFT_IN - SIDE_IN - GAP_IN
+    wanted = map_width * view.height_m / view.width_m
+    needed = legend_rows * ROW_IN + 1.0
+    map_height = float(np.clip(max(wanted, needed), LEAST_MAP_IN, MOST_MAP_IN))
+    height = map_height + TOP_IN + BOTTOM_IN
+    figure = Figure(figsize=(WIDTH_IN, height), facecolor=PAPER)
+    canvas = FigureCanvasAgg(figure)
+    ax = figure.add_axes((LEFT_IN / WIDTH_IN, BOTTOM_IN / height, map_width / WIDTH_IN, map_height / height))
+    fitted = view.fitted(map_width * 72, map_height * 72)
+    ax.set(xlim=(fitted.x0, fitted.x1), ylim=(fitted.y0, fitted.y1), facecolor="#FBFCFD")
+    ax.set_aspect("equal", adjustable="box")
+    _axes_style(ax, projected)
+    return Sheet(figure, canvas, ax, fitted)
+
+
+def write_title(sheet: Sheet, title: str, subtitle: str) -> None:
+    """Title and a quieter line under it, flush with the map's left edge."""
+    height = sheet.figure.get_figheight()
+    style: dict[str, Any] = {"family": FONT, "ha": "left", "va": "baseline", "parse_math": False}
+    x = LEFT_IN / WIDTH_IN
+    sheet.figure.text(x, 1 - 0.36 / height, printable(title, 70), fontsize=13, fontweight="bold", color=INK, **style)
+    sheet.figure.text(x, 1 - 0.59 / height, printable(subtitle, 130), fontsize=8, color=MUTED, **style)
+
+
+def draw_legend(sheet: Sheet, rows: list[tuple[Any, str]]) -> None:
+    """Legend in the column beside the map, so that it covers nothing."""
+    height = sheet.figure.get_figheight()
+    x = (WIDTH_IN - SIDE_IN) / WIDTH_IN
+    legend = sheet.figure.legend(
+        [handle for handle, _ in rows], [text for _, text in rows], loc="upper left", bbox_to_anchor=(x, 1 - TOP_IN / height),
+        borderaxespad=0, frameon=False, prop={"family": FONT, "size": 7.0}, handlelength=2.0, labelspacing=0.56,
+        handletextpad=0.7, labelcolor=INK,
+    )  # fmt: skip
+    for text in legend.get_texts():
+        text.set_parse_math(False)
+
+
+def legend_rows(
+    scenario: Scenario, cast: Cast, step_s: float, *, truth: bool, replay: bool, outside: int
+) -> list[tuple[Any, str]]:
+    """Handles and texts: leading movers, then what the marks mean, then what is summed up."""
+    rows: list[tuple[Any, str]] = []
+    for role in sorted(cast.movers, key=_reading_order):
+        if role.leading:
+            marker = "s" if role.is_ego else MARKERS[role.group]
+            rows.append((_line(role.color, lw=2.4 if role.is_ego else 1.7, marker=marker, ms=4.6), _name(role)))
+    rest = sum(not r.leading for r in cast.movers)
+    if rest:
+        rows.append((_line(CROWD_COLOR, lw=1.0), f"{rest} more moving, farther off"))
+    if cast.standing:
+        rows.append((Patch(fc=PARKED_FACE, ec=PARKED_EDGE, lw=0.6), f"{len(cast.standing)} standing"))
+    if cast.movers:
+        rows.append((Patch(fc=PAPER, ec=MUTED, lw=0.9), "start (hollow), end (filled)"))
+        rows.append((_line("none", marker="o", ms=3.2, mfc=PAPER, mec=MUTED, mew=0.9), f"every {step_s:g} s"))
+    if any(not r.agent.waypoints.observed.all() for r in cast.movers):
+        rows.append((_line(MUTED, lw=1.3, ls=(0, (2.2, 1.8))), "not observed, filled"))
+    if truth:
+        rows.append((_line(INK, lw=0.8, ls=(0, (3, 2))), "truth"))
+    if replay:
+        rows.append((_line(MUTED, lw=1.9, ls=(0, (0.1, 1.6)), dash_capstyle="round"), "replay"))
+    if outside:
+        rows.append((_line("none"), f"{outside} outside this view"))
+    return rows
+
+
+def draw_scale_and_north(sheet: Sheet, *, projected: bool) -> None:
+    """A scale bar of a round length, and where north is, when the map knows, at the foot of the column."""
+    height = sheet.figure.get_figheight()
+    m_per_in = sheet.view.m_per_pt * 72
+    length_m = nice_step(1.35 * m_per_in)
+    x, y, w = WIDTH_IN - SIDE_IN + 0.06, BOTTOM_IN + 0.08, length_m / m_per_in
+    column = sheet.figure.add_axes((0, 0, 1, 1), frameon=False)
+    column.set(xlim=(0, WIDTH_IN), ylim=(0, height), xticks=[], yticks=[])
+    column.set_zorder(-1)
+    for k, face in enumerate((INK, PAPER)):
+        column.add_patch(Polygon(_rectangle(x + k * w / 2, y, w / 2, 0.06), fc=face, ec=INK, lw=0.8, closed=True))
+    style: dict[str, Any] = {"family": FONT, "fontsize": 7, "color": INK, "va": "bottom"}
+    column.text(x, y + 0.1, "0", ha="center", **style)
+    column.text(x + w, y + 0.1, f"{length_m:g} m", ha="center", **style)
+    if projected:
+        nx, ny = WIDTH_IN - 0.42, y
+        column.add_patch(Polygon([(nx, ny + 0.4), (nx - 0.1, ny), (nx, ny + 0.09)], fc=INK, ec=INK, lw=0.8))
+        column.add_patch(Polygon([(nx, ny + 0.4), (nx + 0.1, ny), (nx, ny + 0.09)], fc=PAPER, ec=INK, lw=0.8))
+        column.text(nx, ny + 0.44, "N", ha="center", **{**style, "fontsize": 8.5, "fontweight": "bold"})
+
+
+def _axes_style(ax: Axes, projected: bool) -> None:
+    names = ("east", "north") if projected else ("map x", "map y")
+    ax.set_axisbelow(True)
+    ax.grid(True, color=GRID, lw=0.7)
+    for axis, name in zip((ax.xaxis, ax.yaxis), names):
+        axis.set_major_locator(MaxNLocator(nbins=9, steps=[1, 2, 5, 10]))
+        formatter = ScalarFormatter(useOffset=False)
+        formatter.set_scientific(False)
+        axis.set_major_formatter(formatter)
+        axis.set_label_text(f"{name} (m)", fontsize=7.5, color=MUTED, family=FONT)
+    ax.tick_params(labelsize=7, colors=MUTED, length=2.5, width=0.6, labelfontfamily=FONT)
+    for spine in ax.spines.values():
+        spine.set(color=FRAME, linewidth=0.8)
+
+
+def _reading_order(role: Role) -> tuple[bool, int, str]:
+    """The ego first, then labels as people count: 2 before 10."""
+    digits = "".join(c for c in role.label if c in "0123456789")
+    return (not role.is_ego, int(digits) if digits else 0, role.label)
+
+
+def _name(role: Role) -> str:
+    speed = float(np.max(np.abs(role.agent.waypoints.speed_mps)))
+    moving = f"{speed * 3.6:.0f} km/h" if speed >= 0.15 else "stands"
+    if role.is_ego:
+        return f"ego · {moving}"
+    short = "" if role.label == role.agent.id else f" · {printable(role.agent.id, 7)}"
+    return f"{printable(role.label, 9)} · {role.agent.category} · {moving}{short}"
+
+
+def _line(color: str, **style: Any) -> Line2D:
+    edge = {"mec": PAPER, "mew": 0.5} if "mec" not in style else {}
+    return Line2D([0, 1], [0, 1], color=color, **{"lw": 0, "mfc": color, **edge, **style})
+
+
+def _rectangle(x: float, y: float, w: float, h: float) -> list[tuple[float, float]]:
+    return [(x, y), (x + w, y), (x + w, y + h), (x, y + h)]
