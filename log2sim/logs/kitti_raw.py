@@ -1,25 +1,162 @@
-"""Placeholder until the reader stands."""
+"""KITTI raw drives (synchronized and rectified): DATE/DATE_drive_NNNN_sync with the calibration in DATE."""
 
 from __future__ import annotations
 
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from log2sim.errors import LogError
-from log2sim.types import Log
+from log2sim.geometry import Array, PoseTrack, transform
+from log2sim.logs import kitti
+from log2sim.logs.table import in_order
+from log2sim.types import Camera, Log, Stream
+
+CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt")
+REFERENCE_CAMERAS = ("image_02", "image_00", "image_03", "image_01")
+MARK = "*_drive_*_sync"
 
 
-class _Reader:
-    name = "kitti_raw"
-    looks_for = "not readable yet"
+class KittiRawReader:
+    """Reader of KITTI raw drives; the root is a drive, its date folder or the parent of date folders."""
+
+    name = "kitti"
+    looks_for = (
+        "a folder DATE_drive_NNNN_sync with oxts/data, its date folder with calib_cam_to_cam.txt, or their parent"
+    )
 
     def matches(self, path: Path) -> bool:
-        return False
+        return bool(self._drives(path))
 
     def sequences(self, path: Path) -> list[str]:
-        return []
+        return sorted(self._drives(path))
 
     def open(self, path: Path, sequence: str) -> Log:
-        raise LogError(f"{path}: this format is not readable yet")
+        return _Drive(self._drives(path)[sequence]).log()
+
+    def _drives(self, path: Path) -> dict[str, Path]:
+        # A drive given as "." has its name only once it is resolved.
+        path = path.resolve()
+        places = [path, *path.glob(MARK), *path.glob(f"*/{MARK}")]
+        return {p.name: p for p in places if (p / "oxts" / "data").is_dir() and p.match(MARK)}
 
 
-READER = _Reader()
+READER = KittiRawReader()
+
+
+@dataclass(frozen=True)
+class _Drive:
+    path: Path
+
+    def log(self) -> Log:
+        rig = self._rig()
+        notes: list[str] = []
+        streams: dict[str, Stream] = {}
+        cameras: dict[str, Camera] = {}
+        for number in rig.projections:
+            self._add_camera(rig, number, cameras, streams, notes)
+        if (self.path / "velodyne_points").is_dir():
+            streams["velodyne"] = self._sweeps(notes)
+        ego_t_ns, poses, map_frame = self._poses(notes)
+        if not streams:
+            raise LogError(f"{self.path}: neither images (image_00 to image_03) nor velodyne_points in it")
+        texts = [kitti.read_text(self.path.parent / name) for name in CALIBRATION]
+        return Log(
+            name=self.path.name,
+            format=READER.name,
+            cameras=cameras,
+            lidars={"velodyne": rig.lidar()} if "velodyne" in streams else {},
+            streams=streams,
+            ego=PoseTrack(ego_t_ns, poses),
+            ego_vehicle=kitti.PASSAT,
+            map=map_frame,
+            reference_camera=next((c for c in REFERENCE_CAMERAS if c in cameras), None),
+            digest=kitti.digest_of(texts, sorted(self.path.glob("*/data/*"))),
+            notes=tuple(notes),
+        )
+
+    def _rig(self) -> kitti.Rig:
+        cam, velo, imu = (self.path.parent / name for name in CALIBRATION)
+        c = kitti.read_calibration(cam)
+        rect = kitti.checked_rotation(kitti.entry(c, cam, (3, 3), "R_rect_00"), f"{cam}, entry 'R_rect_00'")
+        projections = {}
+        for k in range(4):
+            if (self.path / f"image_{k:02d}").is_dir():
+                key = f"P_rect_{k:02d}"
+                projections[k] = kitti.checked_projection(kitti.entry(c, cam, (3, 4), key), f"{cam}, entry '{key}'")
+        return kitti.rig_of(_rigid(imu), _rigid(velo), rect, projections)
+
+    def _add_camera(
+        self, rig: kitti.Rig, number: int, cameras: dict[str, Camera], streams: dict[str, Stream], notes: list[str]
+    ) -> None:
+        file = self.path.parent / CALIBRATION[0]
+        width, height = kitti.entry(kitti.read_calibration(file), file, (2,), f"S_rect_{number:02d}")
+        camera = rig.camera(number, round(width), round(height))
+        t_ns, files, _ = self._records(camera.name, (".png", ".jpg", ".jpeg"), notes)
+        cameras[camera.name] = camera
+        streams[camera.name] = kitti.image_stream(camera.name, t_ns, files, camera)
+
+    def _sweeps(self, notes: list[str]) -> Stream:
+        folder = self.path / "velodyne_points"
+        t_ns, files, numbers = self._records(folder.name, (".bin",), notes)
+        begin, end = (_stamps(folder / f"timestamps_{k}.txt") for k in ("start", "end"))
+        for name, stamps in (("start", begin), ("end", end)):
+            if len(stamps) <= numbers.max():
+                raise LogError(f"{folder}/timestamps_{name}.txt: {len(stamps)} lines, record {numbers.max()} has none")
+        return kitti.sweep_stream(t_ns, begin[numbers], end[numbers], files)
+
+    def _poses(self, notes: list[str]) -> tuple[NDArray[np.int64], Array, kitti.MapFrame]:
+        t_ns, files, _ = self._records("oxts", (".txt",), notes)
+        rows = []
+        for file in files:
+            record = kitti.parse_oxts(kitti.read_text(file), str(file))
+            if len(record) != 1:
+                raise LogError(f"{file}: {len(record)} lines, expected one oxts record")
+            rows.append(record[0])
+        poses, map_frame = kitti.poses_from_oxts(np.array(rows))
+        return t_ns, poses, map_frame
+
+    def _records(
+        self, name: str, suffixes: tuple[str, ...], notes: list[str]
+    ) -> tuple[NDArray[np.int64], list[Path], NDArray[np.intp]]:
+        """Stamps, files and numbers of the records of a stream, in order; a record that is not there is a gap."""
+        folder = self.path / name
+        files = kitti.numbered_files(folder / "data", suffixes)
+        if not files:
+            raise LogError(f"{folder}/data: no records ({', '.join(suffixes)}); a stream needs at least one")
+        stamps = _stamps(folder / "timestamps.txt")
+        numbers = np.array(list(files))
+        if len(stamps) <= numbers.max():
+            raise LogError(f"{folder}/timestamps.txt: {len(stamps)} lines, record {numbers.max()} has none")
+        missing = len(stamps) - len(numbers)
+        if missing:
+            first = np.setdiff1d(np.arange(len(stamps)), numbers)[0]
+            notes.append(f"{name}: {missing} of {len(stamps)} records are missing, first at stamp {stamps[first]}")
+        keep, problems = in_order(stamps[numbers], name)
+        notes += problems
+        numbers = numbers[keep]
+        return stamps[numbers], [files[n] for n in numbers.tolist()], numbers
+
+
+def _rigid(path: Path) -> Array:
+    calibration = kitti.read_calibration(path)
+    rotation = kitti.checked_rotation(kitti.entry(calibration, path, (3, 3), "R"), f"{path}, entry 'R'")
+    return transform(rotation, kitti.entry(calibration, path, (3,), "T"))
+
+
+def _stamps(path: Path) -> NDArray[np.int64]:
+    lines = kitti.read_text(path).split("\n")
+    while lines and not lines[-1].strip():
+        lines.pop()
+    stamps = np.zeros(len(lines), dtype=np.int64)
+    for k, line in enumerate(lines):
+        stamp = np.datetime64("NaT", "ns")
+        with suppress(ValueError):
+            stamp = np.datetime64(line.strip().replace(" ", "T"), "ns")
+        if np.isnat(stamp):
+            raise LogError(f"{path}, line {k + 1}: '{line.strip()[:40]}', expected YYYY-MM-DD HH:MM:SS.nnnnnnnnn")
+        stamps[k] = stamp.astype(np.int64)
+    return stamps

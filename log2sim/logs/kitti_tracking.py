@@ -1,25 +1,198 @@
-"""Placeholder until the reader stands."""
+"""The layout of the KITTI tracking benchmark: training/{image_02, velodyne, oxts, calib, label_02}/NNNN."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
-from log2sim.errors import LogError
-from log2sim.types import Log
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.errors import LogError, RecordError
+from log2sim.geometry import Array, PoseTrack, apply, transform, wrap_angle
+from log2sim.logs import kitti
+from log2sim.logs.images import image_size
+from log2sim.types import ImageLabels, Labels, Log, Stream
+
+PERIOD_NS = 100_000_000
+CAMERA_NUMBERS = (2, 3)
+CATEGORY_OF = {
+    "Car": "car",
+    "Van": "car",
+    "Truck": "truck",
+    "Pedestrian": "pedestrian",
+    "Person": "pedestrian",
+    "Person_sitting": "pedestrian",
+    "Cyclist": "cyclist",
+    "Tram": "other",
+    "Misc": "other",
+}
+LABEL_FIELDS = 17
+NO_STAMPS = "this layout has no stamps: 10 Hz is assumed for all streams, frame 0 at stamp 0"
 
 
-class _Reader:
-    name = "kitti_tracking"
-    looks_for = "not readable yet"
+class KittiTrackingReader:
+    """Reader of the tracking layout; the root is the folder "training" or its parent."""
+
+    name = "kitti-tracking"
+    looks_for = "a folder training/ (or that folder) with calib/NNNN.txt and image_02/NNNN/"
 
     def matches(self, path: Path) -> bool:
-        return False
+        return bool(self.sequences(path))
 
     def sequences(self, path: Path) -> list[str]:
-        return []
+        base = _base(path)
+        return sorted(p.stem for p in (base / "calib").glob("*.txt") if (base / "image_02" / p.stem).is_dir())
 
     def open(self, path: Path, sequence: str) -> Log:
-        raise LogError(f"{path}: this format is not readable yet")
+        return _Sequence(_base(path), sequence).log()
 
 
-READER = _Reader()
+READER = KittiTrackingReader()
+
+
+def _base(path: Path) -> Path:
+    return path / "training" if (path / "training" / "calib").is_dir() else path
+
+
+@dataclass(frozen=True)
+class _Sequence:
+    base: Path
+    name: str
+
+    def log(self) -> Log:
+        rig = self._rig()
+        streams: dict[str, Stream] = {}
+        cameras = {}
+        for number in rig.projections:
+            files = self._files(f"image_{number:02d}", (".png", ".jpg", ".jpeg"))
+            camera = rig.camera(number, *_first_size(list(files.values())))
+            cameras[camera.name] = camera
+            streams[camera.name] = kitti.image_stream(camera.name, _nominal(files), list(files.values()), camera)
+        if (self.base / "velodyne" / self.name).is_dir():
+            sweeps = self._files("velodyne", (".bin",))
+            t_ns = _nominal(sweeps)
+            streams["velodyne"] = kitti.sweep_stream(
+                t_ns, t_ns - PERIOD_NS // 2, t_ns + PERIOD_NS // 2, list(sweeps.values())
+            )
+        oxts_file = self.base / "oxts" / f"{self.name}.txt"
+        oxts = kitti.read_text(oxts_file)
+        rows = kitti.parse_oxts(oxts, str(oxts_file))
+        if not len(rows):
+            raise LogError(f"{oxts_file}: no records; a stream needs at least one")
+        poses, map_frame = kitti.poses_from_oxts(rows)
+        track = PoseTrack(np.arange(len(rows), dtype=np.int64) * PERIOD_NS, poses)
+        labels, image_labels, text = self._labels(rig, track)
+        records = sorted(p for folder in streams for p in (self.base / folder / self.name).iterdir())
+        calibration = kitti.read_text(self.base / "calib" / f"{self.name}.txt")
+        return Log(
+            name=f"kitti-tracking-{self.name}",
+            format=READER.name,
+            cameras=cameras,
+            lidars={"velodyne": rig.lidar()} if "velodyne" in streams else {},
+            streams=streams,
+            ego=track,
+            ego_vehicle=kitti.PASSAT,
+            map=map_frame,
+            labels=labels,
+            image_labels=image_labels,
+            reference_camera="image_02",
+            digest=kitti.digest_of([calibration, oxts, text], records),
+            notes=(NO_STAMPS,),
+        )
+
+    def _rig(self) -> kitti.Rig:
+        path = self.base / "calib" / f"{self.name}.txt"
+        c = kitti.read_calibration(path)
+        projections = {}
+        for k in CAMERA_NUMBERS:
+            if (self.base / f"image_{k:02d}" / self.name).is_dir():
+                projections[k] = kitti.checked_projection(
+                    kitti.entry(c, path, (3, 4), f"P{k}"), f"{path}, entry 'P{k}'"
+                )
+        rect = kitti.checked_rotation(kitti.entry(c, path, (3, 3), "R0_rect", "R_rect"), f"{path}, entry 'R0_rect'")
+        links = []
+        for keys in (("Tr_imu_to_velo", "Tr_imu_velo"), ("Tr_velo_to_cam", "Tr_velo_cam")):
+            m = kitti.entry(c, path, (3, 4), *keys)
+            links.append(transform(kitti.checked_rotation(m[:, :3], f"{path}, entry '{keys[0]}'"), m[:, 3]))
+        return kitti.rig_of(links[0], links[1], rect, projections)
+
+    def _files(self, folder: str, suffixes: tuple[str, ...]) -> dict[int, Path]:
+        files = kitti.numbered_files(self.base / folder / self.name, suffixes)
+        if not files:
+            raise LogError(
+                f"{self.base / folder / self.name}: no records ({', '.join(suffixes)}); a stream needs at least one"
+            )
+        return files
+
+    def _labels(self, rig: kitti.Rig, track: PoseTrack) -> tuple[Labels | None, dict[str, ImageLabels], str]:
+        path = self.base / "label_02" / f"{self.name}.txt"
+        if not path.is_file():
+            return None, {}, ""
+        text = kitti.read_text(path)
+        frame, track_id, category, values = parse_labels(text, path)
+        t_ns = frame * PERIOD_NS
+        image_labels = ImageLabels(t_ns, values[:, 3:7], category)
+        map_T_ego, known = track.at(t_ns)
+        center, size, yaw = boxes_in_map(map_T_ego @ rig.ego_T_rect, values[:, 7:14])
+        k = known
+        labels = Labels(t_ns[k], track_id[k], category[k], center[k], size[k], yaw[k])
+        return labels, {"image_02": image_labels}, text
+
+
+def parse_labels(text: str, path: Path) -> tuple[NDArray[np.int64], NDArray[np.str_], NDArray[np.str_], Array]:
+    """Frames (L,), track ids (L,), categories (L,) and the 14 numbers (L, 14) from truncation on; without DontCare."""
+    frames, ids, categories, values = [], [], [], []
+    for k, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if not words:
+            continue
+        if len(words) < LABEL_FIELDS or (words[2] not in CATEGORY_OF and words[2] != "DontCare"):
+            known = ", ".join([*CATEGORY_OF, "DontCare"])
+            raise LogError(f"{path}, line {k}: expected frame, track id, type ({known}) and {LABEL_FIELDS - 3} numbers")
+        if words[2] == "DontCare":
+            continue
+        try:
+            row = [float(word) for word in words[3:LABEL_FIELDS]]
+            frames.append(int(words[0]))
+        except ValueError:
+            raise LogError(f"{path}, line {k}: expected numbers after the type, found '{line[:60]}'") from None
+        if not np.isfinite(row).all():
+            raise LogError(f"{path}, line {k}: a number is not finite")
+        ids.append(words[1])
+        categories.append(CATEGORY_OF[words[2]])
+        values.append(row)
+    table = np.array(values).reshape(-1, LABEL_FIELDS - 3)
+    return np.array(frames, dtype=np.int64), np.array(ids, dtype=np.str_), np.array(categories, dtype=np.str_), table
+
+
+def boxes_in_map(map_T_rect: Array, values: Array) -> tuple[Array, Array, Array]:
+    """Box centers (L, 3), sizes (L, 3) and yaws (L,) in the map.
+
+    Parameters
+    ----------
+    map_T_rect : (L, 4, 4)
+        Pose of the rectified camera 0, whose frame the labels are in, at the stamp of each label.
+    values : (L, 7)
+        Height, width, length, then x, y, z of the bottom's center, then the rotation about the camera's y axis.
+    """
+    height, width, length = values[:, 0], values[:, 1], values[:, 2]
+    center = values[:, 3:6] - np.stack([np.zeros_like(height), height / 2, np.zeros_like(height)], axis=1)
+    turn = values[:, 6]
+    ahead = np.stack([np.cos(turn), np.zeros_like(turn), -np.sin(turn)], axis=1)
+    heading = np.einsum("lij,lj->li", map_T_rect[:, :3, :3], ahead)
+    yaw = wrap_angle(np.arctan2(heading[:, 1], heading[:, 0]))
+    return apply(map_T_rect, center), np.stack([length, width, height], axis=1), yaw
+
+
+def _nominal(files: dict[int, Path]) -> NDArray[np.int64]:
+    return np.array(list(files), dtype=np.int64) * PERIOD_NS
+
+
+def _first_size(files: list[Path]) -> tuple[int, int]:
+    for file in files:
+        try:
+            return image_size(file)
+        except RecordError:
+            continue
+    raise LogError(f"{files[0].parent}: none of {len(files)} images is readable")
