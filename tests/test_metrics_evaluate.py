@@ -1,0 +1,325 @@
+"""Figures of whole scenarios: closed forms, what counts, invariances."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from log2sim.errors import ConfigError, ScenarioError
+from log2sim.metrics.evaluate import evaluate
+from log2sim.metrics.table import format_table
+from log2sim.scenario import Agent, Scenario, Waypoints
+from log2sim.schema import check
+from log2sim.types import MapFrame
+
+T_S = np.arange(31) / 10
+CAR = (4.4, 1.8, 1.5)
+FIGURES = ("recall", "precision", "position_rmse_m", "yaw_median_deg", "speed_rmse_mps", "mota", "hota", "counts")
+
+
+def agent(id, x, y=0.0, yaw=0.0, speed=0.0, t_s=T_S, category="car", size_m=CAR, visible=None, **kwargs):
+    n = len(t_s)
+    fill = [np.broadcast_to(np.asarray(v, dtype=float), n).copy() for v in (x, y, 0.0, yaw, speed)]
+    seen = None if visible is None else np.broadcast_to(visible, n).copy()
+    points = Waypoints(t_s, *fill, np.ones(n, dtype=bool), np.zeros(n), seen)
+    return Agent(id, category, size_m, points, **kwargs)
+
+
+def scenario(*agents, **kwargs):
+    return Scenario(**{"name": "s", "t0_ns": 0, "duration_s": 3.0, "agents": agents, **kwargs})
+
+
+def moved(a, dx=0.0, dy=0.0, **columns):
+    w = a.waypoints
+    return replace(a, waypoints=replace(w, x_m=w.x_m + dx, y_m=w.y_m + dy, **columns))
+
+
+def world():
+    """An ego, a moving and a parked car, a walking and a standing pedestrian, a cyclist."""
+    return scenario(
+        agent("ego", 5 * T_S, speed=5.0),
+        agent("a", 10 + 5 * T_S, 3.0, speed=5.0),
+        agent("b", 15.0, -4.0, yaw=1.0, static=True),
+        agent("c", 8.0, 10 - T_S, yaw=-np.pi / 2, speed=1.0, category="pedestrian", size_m=(0.6, 0.6, 1.7)),
+        agent("d", 3.0, 8.0, yaw=2.0, category="pedestrian", size_m=(0.6, 0.6, 1.7)),
+        agent("e", 30 - 4 * T_S, -8.0, yaw=np.pi - 1e-9, speed=4.0, category="cyclist", size_m=(1.8, 0.6, 1.7)),
+    )
+
+
+def shifted(s, dx, dy=0.0):
+    return replace(s, agents=tuple(moved(a, dx, dy) for a in s.agents))
+
+
+def test_a_perfect_reconstruction_has_no_error():
+    result = evaluate(world(), world())
+    for key in ("recall", "precision", "recall_agents", "precision_agents", "mota", "hota", "det_a", "ass_a"):
+        assert result[key] == 1.0, key
+    for key in ("position_rmse_m", "position_median_m", "ade_m", "yaw_median_deg", "yaw_flipped", "speed_rmse_mps"):
+        assert result[key] == 0.0, key
+    assert result["size_median_m"] == 0.0
+    assert result["id_switches"] == 0
+    assert result["counts"]["truth_ticks"] == 5 * 31
+    assert result["ego"] == {"ticks": 31, "position_rmse_m": 0.0, "yaw_median_deg": 0.0, "speed_rmse_mps": 0.0}
+
+
+def test_a_result_keeps_its_schema_and_prints():
+    for ours, truth in ((world(), world()), (scenario(), world()), (world(), scenario()), (scenario(), scenario())):
+        result = evaluate(ours, truth)
+        check(result, "metrics-1", ScenarioError)
+        json.dumps(result, allow_nan=False)
+        assert "recall" in format_table(result).splitlines()[0]
+    lines = format_table(evaluate(world(), world())).splitlines()
+    assert [line.split()[0] for line in lines[1:]] == [
+        "all",
+        "0-20",
+        "20-40",
+        "40-60",
+        "car",
+        "cyclist",
+        "pedestrian",
+        "ego",
+    ]
+    assert len(set(map(len, lines[:-1]))) == 1
+
+
+def test_a_known_shift_is_the_position_error_and_the_ego_stands_apart():
+    ours = shifted(world(), 0.3, 0.4)
+    ours = replace(ours, agents=(moved(world().ego, 1.0), *ours.others))
+    result = evaluate(ours, world())
+    for key in ("position_rmse_m", "position_median_m", "ade_m"):
+        assert result[key] == pytest.approx(0.5, abs=1e-6)
+    assert result["ego"]["position_rmse_m"] == pytest.approx(1.0, abs=1e-6)
+    assert result["recall"] == 1.0
+
+
+def test_known_errors_of_size_and_speed():
+    truth = scenario(agent("ego", 0.0), agent("a", 10.0, speed=3.0), agent("b", 20.0, speed=1.0))
+    ours = scenario(
+        agent("ego", 0.0, speed=2.0),
+        agent("x", 10.0, speed=3.5, size_m=(4.4 + 0.6, 1.8 - 0.3, 1.5)),
+        agent("y", 20.0, speed=1.5, size_m=(4.4, 1.8, 1.5 + 0.9)),
+    )
+    result = evaluate(ours, truth)
+    assert result["speed_rmse_mps"] == pytest.approx(0.5)
+    assert result["size_median_m"] == pytest.approx(0.3)
+    assert [result[f"{k}_median_m"] for k in ("length", "width", "height")] == pytest.approx([0.3, 0.15, 0.45])
+    row = result["agents"][0]
+    assert (row["id"], row["matched_ids"], row["length_error_m"], row["width_error_m"]) == ("a", {"x": 31}, 0.6, -0.3)
+    assert result["ego"]["speed_rmse_mps"] == pytest.approx(2.0)
+
+
+def test_a_flipped_box_is_an_error_of_yaw_only():
+    truth = scenario(agent("a", 5 * T_S, speed=5.0))
+    result = evaluate(scenario(agent("x", 5 * T_S, yaw=-np.pi, speed=-5.0)), truth)
+    assert (result["yaw_median_deg"], result["yaw_flipped"], result["speed_rmse_mps"]) == (180.0, 1.0, 0.0)
+
+
+def test_yaw_is_compared_the_short_way_round():
+    truth = scenario(agent("a", 0.0, yaw=np.pi - 0.01))
+    assert evaluate(scenario(agent("x", 0.0, yaw=-np.pi + 0.01)), truth)["yaw_median_deg"] == pytest.approx(
+        np.degrees(0.02), abs=1e-5
+    )
+
+
+def test_a_standing_pedestrian_has_no_heading_and_a_walking_one_has():
+    def figure(speed):
+        truth = scenario(agent("a", 0.0, speed=speed, category="pedestrian"))
+        return evaluate(scenario(agent("x", 0.0, yaw=1.0, category="pedestrian")), truth)["yaw_median_deg"]
+
+    assert figure(0.4) is None
+    assert figure(0.6) == pytest.approx(np.degrees(1.0), abs=1e-5)
+
+
+def test_swapped_identities_are_two_switches():
+    half = T_S < 1.5
+    truth = scenario(agent("a", 0.0), agent("b", 20.0))
+    ours = scenario(agent("x", np.where(half, 0.0, 20.0)), agent("y", np.where(half, 20.0, 0.0)))
+    result = evaluate(ours, truth)
+    assert (result["id_switches"], result["recall"], result["precision"]) == (2, 1.0, 1.0)
+    assert result["mota"] == pytest.approx(1 - 2 / 62, abs=1e-6)
+    assert result["det_a"] == 1.0
+    assert result["ass_a"] < 0.55
+
+
+def test_missed_and_false_agents():
+    truth = scenario(agent("a", 0.0), agent("b", 20.0))
+    ours = scenario(agent("x", 0.0), agent("ghost", 50.0), agent("ghost2", 60.0, t_s=T_S[:5]))
+    result = evaluate(ours, truth)
+    assert result["recall"] == 0.5
+    assert result["precision"] == pytest.approx(31 / 67, abs=1e-6)
+    assert result["mota"] == pytest.approx(1 - (31 + 36) / 62, abs=1e-6)
+    assert (result["recall_agents"], result["precision_agents"]) == (0.5, pytest.approx(1 / 3, abs=1e-6))
+    assert [r["id"] for r in result["false_agents"]] == ["ghost", "ghost2"]
+
+
+def test_a_second_box_on_one_truth_is_false():
+    result = evaluate(scenario(agent("x", 0.0), agent("y", 0.5)), scenario(agent("a", 0.0)))
+    assert (result["recall"], result["precision"]) == (1.0, 0.5)
+
+
+def test_what_is_not_visible_is_neither_missed_nor_false():
+    seen = T_S < 1.45  # 15 ticks
+    truth = scenario(agent("a", 0.0, visible=seen), agent("hidden", 20.0, visible=False))
+    result = evaluate(scenario(agent("x", 0.0), agent("y", 20.0)), truth)
+    assert (result["counts"]["truth_ticks"], result["recall"], result["precision"]) == (15, 1.0, 1.0)
+    assert result["counts"]["reconstructed_agents"] == 1
+    nothing = evaluate(scenario(agent("far", 90.0, visible=None)), truth)
+    assert (nothing["counts"]["missed_ticks"], nothing["recall"], nothing["precision"]) == (15, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(("ticks", "counts"), [(9, 0), (10, 1)])
+def test_a_truth_agent_counts_from_one_second_in_total(ticks, counts):
+    seen = np.zeros(31, dtype=bool)
+    seen[: 2 * ticks : 2] = True  # in pieces
+    result = evaluate(
+        scenario(agent("x", 0.0)), scenario(agent("a", 0.0, visible=seen), agent("b", 9.0, visible=False))
+    )
+    assert result["counts"]["truth_agents"] == counts
+    assert result["precision"] == (1.0 if counts else None)
+
+
+def test_range_limits_both_sides_alike():
+    ego = agent("ego", 0.0)
+    truth = scenario(ego, agent("near", 10.0), agent("edge", 29.9), agent("far", 50.0))
+    ours = scenario(ego, agent("x", 10.0), agent("y", 30.1), agent("ghost", 45.0), agent("z", 50.0))
+    limited = evaluate(ours, truth, max_range_m=30.0)
+    assert (limited["recall"], limited["precision"], limited["counts"]["truth_agents"]) == (1.0, 1.0, 2)
+    assert evaluate(ours, truth)["precision"] == pytest.approx(0.75)
+    bands = evaluate(ours, truth)["by_range"]
+    assert {k: v["counts"]["truth_agents"] for k, v in bands.items()} == {"0-20": 1, "20-40": 1, "40-60": 1}
+    assert {k: v["precision"] for k, v in bands.items()} == {"0-20": 1.0, "20-40": 1.0, "40-60": 0.5}
+
+
+def test_a_reconstruction_in_range_of_a_truth_out_of_range_is_not_false():
+    ego = agent("ego", 0.0)
+    result = evaluate(scenario(ego, agent("x", 29.5)), scenario(ego, agent("a", 30.5)), max_range_m=30.0)
+    assert (result["recall"], result["precision"], result["counts"]["false_ticks"]) == (None, None, 0)
+
+
+def test_categories_narrow_both_sides_alike():
+    truth = scenario(
+        agent("car", 0.0), agent("ped", 10.0, category="pedestrian"), agent("ped2", 40.0, category="pedestrian")
+    )
+    ours = scenario(agent("x", 0.0), agent("p", 10.0, category="pedestrian"), agent("q", 60.0, category="pedestrian"))
+    everything = evaluate(ours, truth)
+    assert (everything["recall"], everything["precision"]) == (pytest.approx(2 / 3, abs=1e-6),) * 2
+    vehicles = evaluate(ours, truth, categories=["vehicle"])
+    assert (vehicles["recall"], vehicles["precision"], vehicles["categories"]) == (1.0, 1.0, ["bus", "car", "truck"])
+    people = evaluate(ours, truth, categories=["pedestrian"])
+    assert (people["recall"], people["precision"]) == (0.5, 0.5)
+    by = everything["by_category"]
+    assert (by["car"]["precision"], by["pedestrian"]["precision"]) == (1.0, 0.5)
+
+
+def test_categories_of_one_group_match_and_others_only_save_from_being_false():
+    truth = scenario(agent("a", 0.0), agent("b", 20.0, category="pedestrian"))
+    ours = scenario(agent("x", 0.0, category="truck"), agent("y", 20.0, category="cyclist"))
+    result = evaluate(ours, truth)
+    assert (result["recall"], result["precision"], result["counts"]["false_ticks"]) == (0.5, 1.0, 0)
+    twice = scenario(agent("x", 0.0), agent("y", 0.0, category="cyclist"), agent("z", 20.0, category="pedestrian"))
+    assert evaluate(twice, truth)["counts"]["false_ticks"] == 31
+
+
+def test_a_long_truth_is_matched_within_a_quarter_of_its_length():
+    bus = scenario(agent("a", 0.0, category="bus", size_m=(12.0, 2.5, 3.0)))
+    assert evaluate(scenario(agent("x", 2.9, category="bus")), bus)["recall"] == 1.0
+    assert evaluate(scenario(agent("x", 3.1, category="bus")), bus)["recall"] == 0.0
+
+
+def test_parked_agents_may_have_two_waypoints_on_either_side():
+    ends = T_S[[0, -1]]
+    ego = agent("ego", 5 * T_S, speed=5.0)
+    result = evaluate(
+        scenario(ego, agent("x", 9.0, t_s=ends, static=True)), scenario(ego, agent("a", 9.0, t_s=ends, static=True))
+    )
+    assert result["counts"]["truth_ticks"] == result["counts"]["matched_ticks"] == 31
+
+
+def test_gaps_of_the_truth_are_not_bridged_and_not_held_against_anybody():
+    kept = (T_S < 1.05) | (T_S > 1.95)
+    truth = scenario(agent("ego", 0.0), agent("a", 10 + T_S[kept], speed=1.0, t_s=T_S[kept]))
+    ours = scenario(agent("ego", 0.0), agent("x", 10 + T_S, speed=1.0))
+    result = evaluate(ours, truth)
+    assert (result["counts"]["truth_ticks"], result["recall"], result["precision"]) == (int(kept.sum()), 1.0, 1.0)
+
+
+def test_truth_at_other_instants_is_interpolated():
+    late = T_S + 0.04
+    truth = scenario(agent("a", 7 * late, speed=7.0, t_s=late), agent("b", 7 * late, 30.0, speed=7.0, t_s=late))
+    ours = scenario(agent("x", 7 * T_S, speed=7.0), agent("y", 7 * T_S, 30.0, speed=7.0))
+    result = evaluate(ours, truth)
+    assert result["position_rmse_m"] == pytest.approx(0.0, abs=1e-6)
+    # The first tick lies before the first label: not counted, not false.
+    assert (result["counts"]["truth_ticks"], result["precision"]) == (60, 1.0)
+
+
+def test_ticks_where_the_ego_was_thinned_out_come_from_the_others():
+    ego = agent("ego", [0.0, 15.0], t_s=T_S[[0, -1]], speed=5.0)
+    assert evaluate(scenario(ego, agent("x", T_S)), scenario(ego, agent("a", T_S)))["ticks"] == 31
+
+
+def test_start_time_and_map_offset_make_no_difference():
+    plain = evaluate(shifted(world(), 0.3), world())
+    s = shifted(world(), 0.3)
+    later = tuple(replace(a, waypoints=replace(a.waypoints, t_s=a.waypoints.t_s - 2.5)) for a in s.agents)
+    utm = replace(
+        s, t0_ns=1_700_000_002_500_000_000, agents=later, map=MapFrame(offset_m=(700_000.0, 5_200_000.0, 0.0))
+    )
+    truth = replace(
+        shifted(world(), 500.0, -1000.0),
+        t0_ns=1_700_000_000_000_000_000,
+        map=MapFrame(offset_m=(699_500.0, 5_201_000.0, 0.0)),
+    )
+    other = evaluate(utm, truth)
+    for key in FIGURES:
+        assert other[key] == pytest.approx(plain[key], abs=2e-6), key
+    assert plain["position_rmse_m"] == pytest.approx(0.3, abs=1e-6)
+
+
+def test_rotation_and_order_make_no_difference():
+    def rotated(s, angle):
+        c, n = np.cos(angle), np.sin(angle)
+        turn = [
+            replace(
+                a, waypoints=replace(w, x_m=c * w.x_m - n * w.y_m, y_m=n * w.x_m + c * w.y_m, yaw_rad=w.yaw_rad + angle)
+            )
+            for a in s.agents
+            for w in [a.waypoints]
+        ]
+        return replace(s, agents=tuple(turn[::-1]))
+
+    rng = np.random.default_rng(2)
+    ours = replace(
+        world(), agents=tuple(moved(a, rng.normal(0, 0.3, 31), rng.normal(0, 0.3, 31)) for a in world().agents)
+    )
+    plain, turned = evaluate(ours, world()), evaluate(rotated(ours, 1.1), rotated(world(), 1.1))
+    for key in FIGURES:
+        assert turned[key] == pytest.approx(plain[key], abs=2e-6), key
+
+
+def test_an_unknown_category_names_the_nearest():
+    with pytest.raises(ConfigError, match="did you mean 'vehicle'"):
+        evaluate(world(), world(), categories=["vehicles"])
+
+
+def test_a_range_needs_an_ego_and_a_positive_number():
+    with pytest.raises(ConfigError, match="ego"):
+        evaluate(scenario(agent("x", 0.0)), scenario(agent("a", 0.0)), max_range_m=30.0)
+    with pytest.raises(ConfigError, match="greater than 0"):
+        evaluate(world(), world(), max_range_m=0.0)
+    assert evaluate(scenario(agent("x", 0.0)), scenario(agent("a", 0.0)))["by_range"] is None
+
+
+def test_two_projections_are_refused():
+    a = replace(world(), map=MapFrame(projection="+proj=utm +zone=32"))
+    b = replace(world(), map=MapFrame(projection="+proj=utm +zone=33"))
+    with pytest.raises(ScenarioError, match="zone=33"):
+        evaluate(a, b)
+
+
+def test_times_apart_give_nothing():
+    result = evaluate(world(), replace(world(), t0_ns=10**12))
+    assert (result["ticks"], result["recall"], result["precision"], result["hota"]) == (0, None, None, None)

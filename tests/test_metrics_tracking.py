@@ -1,0 +1,165 @@
+"""CLEAR MOT and HOTA against second implementations, closed forms and invariances."""
+
+from __future__ import annotations
+
+import time
+import warnings
+
+import numpy as np
+import pytest
+
+from log2sim.metrics.clear import associate, mota, switches
+from log2sim.metrics.hota import hota
+from log2sim.metrics.pairs import assign, gate_m, near_pairs
+
+
+def random_tracks(seed, truths=8, others=9, ticks=40, arena_m=14.0):
+    """Crossing tracks with losses, noise, swaps of identity and clutter; NaN where an agent is not there."""
+    rng = np.random.default_rng(seed)
+    start, velocity = rng.uniform(0, arena_m, (truths, 1, 2)), rng.normal(0, 0.25, (truths, 1, 2))
+    truth = start + velocity * np.arange(ticks)[None, :, None]
+    other = np.full((others, ticks, 2), np.nan)
+    who = np.arange(truths)
+    for t in range(ticks):
+        if rng.random() < 0.15:
+            i, j = rng.choice(truths, 2, replace=False)
+            who[[i, j]] = who[[j, i]]
+        other[who, t] = truth[:, t] + rng.normal(0, 0.5, (truths, 2))
+    other[truths:] = rng.uniform(0, arena_m, (others - truths, ticks, 2))
+    truth[rng.random((truths, ticks)) < 0.15] = np.nan
+    other[rng.random((others, ticks)) < 0.2] = np.nan
+    return truth, other
+
+
+def pairs_of(truth, other):
+    same = np.ones((len(truth), len(other)), dtype=bool)
+    return near_pairs(truth, other, np.full(len(truth), 2.0), same)
+
+
+def there(xy):
+    return np.isfinite(xy[..., 0])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_counts_equal_those_of_motmetrics(seed):
+    motmetrics = pytest.importorskip("motmetrics")
+    # Sparse enough that no two truth agents claim the same past match: motmetrics then goes by row, we by distance.
+    truth, other = random_tracks(seed, arena_m=25.0)
+    accumulator = motmetrics.MOTAccumulator(auto_id=True)
+    for t in range(truth.shape[1]):
+        a, b = np.flatnonzero(there(truth)[:, t]), np.flatnonzero(there(other)[:, t])
+        distance = np.linalg.norm(truth[a, None, t] - other[None, b, t], axis=-1)
+        accumulator.update(a, b, np.where(distance <= 2.0, distance, np.nan))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        names = ["num_misses", "num_false_positives", "num_switches", "mota"]
+        expected = motmetrics.metrics.create().compute(accumulator, metrics=names).iloc[0]
+    found = associate(pairs_of(truth, other), len(truth), len(other), truth.shape[1])
+    missed = int((there(truth) & (found.match < 0)).sum())
+    false = int((there(other) & ~found.used).sum())
+    switched = int(switches(found.match, there(truth)).sum())
+    assert (missed, false, switched) == tuple(int(expected[k]) for k in names[:3])
+    assert switched > 3
+    assert mota(int(there(truth).sum()), missed, false, switched) == pytest.approx(expected["mota"], abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_hota_equals_that_of_trackeval(seed):
+    reference = pytest.importorskip("trackeval.metrics.hota", exc_type=ImportError)
+    truth, other = random_tracks(seed)
+    gt_ids, ids, similarity = [], [], []
+    for t in range(truth.shape[1]):
+        a, b = np.flatnonzero(there(truth)[:, t]), np.flatnonzero(there(other)[:, t])
+        gt_ids.append(a)
+        ids.append(b)
+        similarity.append(np.maximum(0, 1 - np.linalg.norm(truth[a, None, t] - other[None, b, t], axis=-1) / 2.0))
+    data = {
+        "gt_ids": gt_ids,
+        "tracker_ids": ids,
+        "similarity_scores": similarity,
+        "num_gt_ids": len(truth),
+        "num_tracker_ids": len(other),
+        "num_gt_dets": sum(map(len, gt_ids)),
+        "num_tracker_dets": sum(map(len, ids)),
+    }
+    expected = reference.HOTA().eval_sequence(data)
+    found = hota(pairs_of(truth, other), there(truth), there(other))
+    assert found.hota == pytest.approx(expected["HOTA"].mean(), abs=1e-12)
+    assert found.det_a == pytest.approx(expected["DetA"].mean(), abs=1e-12)
+    assert found.ass_a == pytest.approx(expected["AssA"].mean(), abs=1e-12)
+
+
+def test_hota_of_a_track_cut_in_two_halves_the_association():
+    # Every box is found; each half shares 10 of the 20 ticks with the truth: Jaccard 10 / (20 + 10 - 10) = 1/2.
+    truth = np.zeros((1, 20, 2))
+    other = np.full((2, 20, 2), np.nan)
+    other[0, :10] = other[1, 10:] = 0.0
+    found = hota(pairs_of(truth, other), there(truth), there(other))
+    assert (found.det_a, found.ass_a) == (1.0, 0.5)
+    assert found.hota == pytest.approx(np.sqrt(0.5), abs=1e-12)
+
+
+def test_hota_of_a_constant_offset_counts_the_thresholds_that_it_passes():
+    # 0.5 m of 2 m is a similarity of 0.75: 15 of the 19 thresholds from 0.05 to 0.95 are passed.
+    truth = np.zeros((1, 12, 2))
+    found = hota(pairs_of(truth, truth + np.array([0.5, 0.0])), there(truth), there(truth))
+    assert found.hota == pytest.approx(15 / 19, abs=1e-12)
+
+
+def test_a_match_is_kept_while_it_is_within_the_gate_although_another_is_nearer():
+    truth = np.zeros((1, 3, 2))
+    other = np.array([[[0.0, 0], [1.5, 0], [2.5, 0]], [[1.0, 0], [0.1, 0], [0.1, 0]]])
+    found = associate(pairs_of(truth, other), 1, 2, 3)
+    assert found.match.tolist() == [[0, 0, 1]]
+    assert switches(found.match, np.ones((1, 3), dtype=bool)).tolist() == [[False, False, True]]
+
+
+def test_most_pairs_come_before_least_distance():
+    # Greedy by distance would pair truth 1 with other 0 and leave truth 0 alone.
+    truth = np.array([[[0.0, 0]], [[1.6, 0]]])
+    other = np.array([[[1.5, 0]], [[3.4, 0]]])
+    assert associate(pairs_of(truth, other), 2, 2, 1).match.tolist() == [[0], [1]]
+
+
+def test_switches_are_counted_across_ticks_that_do_not_count():
+    match = np.array([[0, 1, 1, -1, 0]])
+    counted = np.array([[True, False, True, True, True]])
+    assert switches(match, counted).tolist() == [[False, False, True, False, True]]
+
+
+def test_order_of_agents_does_not_matter():
+    truth, other = random_tracks(3)
+    plain = hota(pairs_of(truth, other), there(truth), there(other))
+    turned = hota(pairs_of(truth[::-1], other[::-1]), there(truth)[::-1], there(other)[::-1])
+    assert turned.hota == pytest.approx(plain.hota, abs=1e-12)
+    plain_match = associate(pairs_of(truth, other), len(truth), len(other), truth.shape[1]).match
+    turned_match = associate(pairs_of(truth[::-1], other[::-1]), len(truth), len(other), truth.shape[1]).match[::-1]
+    assert np.array_equal(np.where(turned_match < 0, -1, len(other) - 1 - turned_match), plain_match)
+
+
+def test_assignment_equals_the_dense_solver():
+    from scipy.optimize import linear_sum_assignment
+
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        dense = np.where(rng.random((12, 9)) < 0.25, rng.random((12, 9)), 0.0)
+        rows, cols = np.nonzero(dense)
+        chosen = assign(rows, cols, dense[rows, cols])
+        assert len(np.unique(rows[chosen])) == len(np.unique(cols[chosen])) == len(chosen)
+        assert dense[rows[chosen], cols[chosen]].sum() == pytest.approx(dense[linear_sum_assignment(-dense)].sum())
+
+
+def test_the_gate_grows_with_long_vehicles_only():
+    assert gate_m(np.array([0.7, 4.5, 8.0, 12.0])).tolist() == [2.0, 2.0, 2.0, 3.0]
+
+
+@pytest.mark.slow
+def test_500_agents_over_600_ticks_take_seconds():
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(0, 150, (500, 1, 2)) + rng.normal(0, 0.3, (500, 1, 2)) * np.arange(600)[None, :, None]
+    other = truth + rng.normal(0, 0.3, truth.shape)
+    begin = time.perf_counter()
+    pairs = pairs_of(truth, other)
+    associate(pairs, 500, 500, 600)
+    hota(pairs, there(truth), there(other))
+    assert time.perf_counter() - begin < 60  # measured: a few seconds; the margin is for busy machines
