@@ -13,9 +13,10 @@ from log2sim.detect.suppression import suppress
 from log2sim.geometry import Array
 from log2sim.types import Detections
 
-OVERLAP = 0.25  # of a tile's width: a car at 15 m in a 60 degree picture fits into it
-BORDER_PX = 4.0  # boxes that end this close to an inner border are taken as cut there
-MAX_TILE_ASPECT = 1.25
+OVERLAP = 0.35  # of a tile's width: what is wider is found in the whole picture
+BORDER = 0.025  # of a tile's width: models place a cut edge only about so well
+MAX_SHRINKING = 1.6  # a tile's pixels an input pixel; beyond, far cars are lost, below, time is
+MAX_AUTO_TILES = 5
 
 
 @dataclass(frozen=True)
@@ -32,40 +33,46 @@ class Tile:
 
 
 def plan_tiles(width_px: int, height_px: int, tiles: Literal["auto"] | int, input_px: int | None) -> list[Tile]:
-    """The whole picture, then the tiles of one row from left to right.
+    """The whole picture, then the tiles of one row from left to right, in the middle and no higher than wide.
 
     Parameters
     ----------
     tiles
-        1: only the whole picture; N: also N tiles; "auto": as many as make tiles nearly square, none where the model's
-        input already holds most of the picture's pixels.
+        1: only the whole picture; N: also N tiles; "auto": see `auto_count`.
     input_px
         Width of the model's input, None where it takes any size.
+
+    Notes
+    -----
+    The sky and the road right before the car are left to the whole picture: nothing far away is there.
     """
     whole = Tile(0, 0, width_px, height_px)
-    count = auto_count(width_px, height_px, input_px) if tiles == "auto" else tiles
+    count = auto_count(width_px, input_px) if tiles == "auto" else tiles
     if count < 2:
         return [whole]
     tile_width = math.ceil(width_px / (count - (count - 1) * OVERLAP))
+    tile_height = min(height_px, tile_width)
+    v0 = (height_px - tile_height) // 2
     starts = np.rint(np.linspace(0, width_px - tile_width, count)).astype(int).tolist()
-    return [whole, *(Tile(u, 0, u + tile_width, height_px) for u in starts)]
+    return [whole, *(Tile(u, v0, u + tile_width, v0 + tile_height) for u in starts)]
 
 
-def auto_count(width_px: int, height_px: int, input_px: int | None) -> int:
-    """Number of tiles in a row whose shape is near to a square; 1 where tiling would gain nothing."""
-    if input_px is not None and width_px <= 1.25 * input_px:
+def auto_count(width_px: int, input_px: int | None) -> int:
+    """Number of tiles in a row, so that none is shrunk by more than `MAX_SHRINKING`; 1 where the whole picture is not."""
+    if input_px is None or width_px <= MAX_SHRINKING * input_px:
         return 1
-    wanted = width_px / height_px / MAX_TILE_ASPECT
-    return max(3, math.ceil((wanted - OVERLAP) / (1 - OVERLAP))) if wanted > 1 else 1
+    needed = (width_px / (MAX_SHRINKING * input_px) - OVERLAP) / (1 - OVERLAP)
+    return min(math.ceil(needed), MAX_AUTO_TILES)
 
 
 def is_cut(box_px: Array, tile: Tile, width_px: int, height_px: int) -> NDArray[np.bool_]:
     """Mask (M,) of the boxes (M, 4), px of the whole picture, that end at a border of the tile inside the picture."""
+    margin = BORDER * (tile.u1 - tile.u0)
     return (
-        ((tile.u0 > 0) & (box_px[:, 0] < tile.u0 + BORDER_PX))
-        | ((tile.v0 > 0) & (box_px[:, 1] < tile.v0 + BORDER_PX))
-        | ((tile.u1 < width_px) & (box_px[:, 2] > tile.u1 - BORDER_PX))
-        | ((tile.v1 < height_px) & (box_px[:, 3] > tile.v1 - BORDER_PX))
+        ((tile.u0 > 0) & (box_px[:, 0] < tile.u0 + margin))
+        | ((tile.v0 > 0) & (box_px[:, 1] < tile.v0 + margin))
+        | ((tile.u1 < width_px) & (box_px[:, 2] > tile.u1 - margin))
+        | ((tile.v1 < height_px) & (box_px[:, 3] > tile.v1 - margin))
     )
 
 

@@ -29,7 +29,7 @@ class Yolox:
 
     name: str = "yolox"
     preparation: Preparation = Preparation("corner", rgb=False, unit=False, default_px=416)  # noqa: RUF009
-    default_min_score: float = 0.3
+    default_min_score: float = 0.4
     default_classes: Classes = COCO_80
 
     def matches(self, outputs: Outputs, size: tuple[int, int]) -> bool:
@@ -71,7 +71,7 @@ class YoloRows:
     name: str
     preparation: Preparation
     anchors: int = 0  # boxes a cell by which it is recognized; 0: never, `layout=` has to name it
-    default_min_score: float = 0.3
+    default_min_score: float = 0.4
     default_classes: Classes = COCO_80
 
     def matches(self, outputs: Outputs, size: tuple[int, int]) -> bool:
@@ -93,7 +93,7 @@ class Yolov8:
 
     name: str = "yolov8"
     preparation: Preparation = Preparation("center", rgb=True, unit=True)  # noqa: RUF009
-    default_min_score: float = 0.3
+    default_min_score: float = 0.4
     default_classes: Classes = COCO_80
 
     def matches(self, outputs: Outputs, size: tuple[int, int]) -> bool:
@@ -115,7 +115,7 @@ class Yolov10:
 
     name: str = "yolov10"
     preparation: Preparation = Preparation("center", rgb=True, unit=True)  # noqa: RUF009
-    default_min_score: float = 0.3
+    default_min_score: float = 0.4
     default_classes: Classes = COCO_80
 
     def matches(self, outputs: Outputs, size: tuple[int, int]) -> bool:
