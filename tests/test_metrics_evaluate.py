@@ -227,6 +227,8 @@ def test_a_long_truth_is_matched_within_a_quarter_of_its_length():
     bus = scenario(agent("a", 0.0, category="bus", size_m=(12.0, 2.5, 3.0)))
     assert evaluate(scenario(agent("x", 2.9, category="bus")), bus)["recall"] == 1.0
     assert evaluate(scenario(agent("x", 3.1, category="bus")), bus)["recall"] == 0.0
+    # 1.5 m of 3 m is a similarity of 1/2, which passes 10 of 19 thresholds.
+    assert evaluate(scenario(agent("x", 1.5, category="bus")), bus)["hota"] == pytest.approx(10 / 19, abs=1e-6)
 
 
 def test_parked_agents_may_have_two_waypoints_on_either_side():
@@ -254,6 +256,16 @@ def test_truth_at_other_instants_is_interpolated():
     assert result["position_rmse_m"] == pytest.approx(0.0, abs=1e-6)
     # The first tick lies before the first label: not counted, not false.
     assert (result["counts"]["truth_ticks"], result["precision"]) == (60, 1.0)
+
+
+def test_shortly_before_its_first_label_a_truth_agent_is_carried_on():
+    # At 1.0 s it is 2.7 m before its first label, farther than the gate.
+    late = np.arange(109, 300) / 100
+    truth = scenario(agent("ego", 0.0), agent("a", 30 * late, speed=30.0, t_s=late))
+    result = evaluate(scenario(agent("ego", 0.0), agent("x", 30 * T_S[10:], speed=30.0, t_s=T_S[10:])), truth)
+    assert (result["recall"], result["precision"]) == (1.0, 1.0)
+    early = evaluate(scenario(agent("ego", 0.0), agent("x", 30 * T_S[5:], speed=30.0, t_s=T_S[5:])), truth)
+    assert early["counts"]["false_ticks"] == 5
 
 
 def test_ticks_where_the_ego_was_thinned_out_come_from_the_others():

@@ -96,6 +96,13 @@ def test_only_cameras_that_were_used_see():
         truth_from_log(log, cameras=["raer"])
 
 
+def test_points_of_all_lidars_are_added():
+    log = make_log([[60, 0, 0.75]], [10])
+    second = replace(log.streams["top"], name="second")
+    log = replace(log, lidars={"top": LIDAR, "second": LIDAR}, streams={**log.streams, "second": second})
+    assert share_visible(truth_from_log(log)) == {"car0": 1.0}
+
+
 def test_visibility_that_the_log_states_is_taken_and_no_sweep_read():
     stated = np.arange(FRAMES) < 5
     log = make_log([[60, 0, 0.75]], [0], visible=stated, broken=range(FRAMES))
