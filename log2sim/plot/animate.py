@@ -21,7 +21,6 @@ from log2sim.plot.look import FONT, INK, PAPER, halo
 from log2sim.plot.sheet import SIDE_IN, TOP_IN, WIDTH_IN, Sheet
 from log2sim.plot.tracks import base
 from log2sim.scenario import Agent, Scenario
-from log2sim.topdown.picture import TopdownPicture
 
 FPS = 10
 MOST_FRAMES = 300
@@ -58,12 +57,12 @@ def write_animation(
     *,
     replay: Any,
     truth: Scenario | None,
-    background: TopdownPicture | None,
+    background: draw.Background | None,
     title: str | None,
 ) -> None:
     """Write a .gif or .mp4; see `tracks.plot_tracks`."""
     suffix = out_path.suffix.lower()
-    sheet, step_s = base(scenario, cast, replay=replay, truth=truth, background=background, title=title)
+    sheet, step_s = base(scenario, cast, replay=replay, truth=truth, background=background, title=title, moving=True)
     draw.draw_tracks(sheet.ax, cast, sheet.view, step_s, alpha=0.22, faint=True)
     sheet.figure.set_dpi(DPI[suffix])
     pace = choose_pace(scenario.duration_s)
@@ -134,8 +133,8 @@ class Stage:
             self.sheet.ax.draw_artist(collection)
         for label, (role, pose) in zip(self.labels, roles):
             if role.leading and pose is not None:
-                reach = 0.5 * float(np.hypot(*role.agent.size_m[:2])) + 6 * self.sheet.view.m_per_pt
-                label.set_position((pose[0], pose[1] + reach))
+                top = shapes.boxes(role.agent, pose[:2], pose[2])[0, :, 1].max()
+                label.set_position((pose[0], top + 5.5 * self.sheet.view.m_per_pt))
                 self.sheet.ax.draw_artist(label)
         fast = "" if self.pace.speed_up < 1.05 else f"  (×{self.pace.speed_up:.1f})"
         self.stamp.set_text(f"t = {t_s:.1f} s{fast}")

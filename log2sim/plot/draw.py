@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgba
+from numpy.typing import NDArray
 
 from log2sim.geometry import Array
 from log2sim.plot import shapes
@@ -16,13 +17,28 @@ from log2sim.plot.cast import Cast, Role, moves, path
 from log2sim.plot.look import FONT, INK, MARKERS, MUTED, PAPER, PARKED_EDGE, PARKED_FACE, halo
 from log2sim.plot.view import CROWD, View
 from log2sim.scenario import Agent, Scenario
-from log2sim.topdown.picture import TopdownPicture
 
 BACKGROUND, STANDING, TRUTH, TRACK, MARK, REPLAY, BOX, LABEL = range(1, 9)
 """Layers, from the bottom up."""
 
 
-def draw_background(ax: Axes, picture: TopdownPicture) -> None:
+class Background(Protocol):
+    """A picture of the ground, as `topdown.picture.TopdownPicture` is one."""
+
+    @property
+    def image_bgr(self) -> NDArray[np.uint8]:
+        """(R, C, 3), row 0 in the north."""
+
+    @property
+    def alpha(self) -> NDArray[np.uint8]:
+        """(R, C), 0 where nothing is known."""
+
+    @property
+    def extent_m(self) -> tuple[float, float, float, float]:
+        """x0, x1, y0, y1 of the outer edges, map frame."""
+
+
+def draw_background(ax: Axes, picture: Background) -> None:
     """Lay a top-down picture under everything, paled so that tracks stand out."""
     pale = 0.62 * picture.image_bgr[..., ::-1].astype(np.float32) + 0.38 * 255
     rgba = np.dstack([np.rint(pale).astype(np.uint8), (picture.alpha * 0.95).astype(np.uint8)])
@@ -84,9 +100,9 @@ def draw_ends(ax: Axes, cast: Cast, view: View, *, ghosts_step_s: float | None) 
         z = BOX + rank / (len(cast.movers) + 1) * 0.5
         if ghosts_step_s is not None and role.leading:
             t, at = shapes.marks(agent, ghosts_step_s)
-            inner = (t > w.t_s[0]) & (t < w.t_s[-1])
-            if inner.any():
-                ghost = shapes.boxes(agent, at[inner], agent.at(t[inner]).yaw_rad)
+            apart = shapes.spaced(at, xy[[0, -1]], 1.15 * agent.size_m[0])
+            if apart.any():
+                ghost = shapes.boxes(agent, at[apart], agent.at(t[apart]).yaw_rad)
                 _polygons(
                     ax, ghost, facecolors=to_rgba(role.color, 0.10), edgecolors=to_rgba(role.color, 0.4), z=TRACK - 0.5
                 )
@@ -142,8 +158,8 @@ def draw_labels(ax: Axes, cast: Cast, view: View, size_pt: float = 7.0) -> None:
             continue
         text = "ego" if role.is_ego else role.label
         half = np.array([0.34 * size_pt * len(text) + 1.0, 0.55 * size_pt]) * view.m_per_pt
-        reach = 0.5 * float(np.hypot(*role.agent.size_m[:2])) + 2.5 * view.m_per_pt
-        place = _free_place(anchor, half, reach, taken, view)
+        box_half = np.ptp(shapes.boxes(role.agent, anchor, role.agent.waypoints.yaw_rad[-1])[0], axis=0) / 2
+        place = _free_place(anchor, half, box_half, taken, view)
         if place is None:
             continue
         taken.append((*(place - half), *(place + half)))
@@ -155,12 +171,13 @@ def draw_labels(ax: Axes, cast: Cast, view: View, size_pt: float = 7.0) -> None:
 
 
 def _free_place(
-    anchor: Array, half: Array, reach: float, taken: list[tuple[float, float, float, float]], view: View
+    anchor: Array, half: Array, box_half: Array, taken: list[tuple[float, float, float, float]], view: View
 ) -> Array | None:
-    angles = np.radians([45, 135, -45, -135, 90, -90, 0, 180])
-    for ring in (1.0, 1.5, 2.2):
-        for c, s in zip(np.cos(angles), np.sin(angles)):
-            place = anchor + np.array([c, s]) * (ring * reach) + np.array([np.sign(c) * half[0] * abs(c), s * half[1]])
+    """Center of a label of half size (2,) beside a box of half extents (2,), clear of what is taken; None if there is none."""
+    pad = 1.5 * view.m_per_pt
+    for ring in (0.0, 6.0, 14.0):
+        for side in ((1, 1), (-1, 1), (1, -1), (-1, -1), (0, 1), (0, -1), (1, 0), (-1, 0)):
+            place = anchor + np.array(side) * (box_half + half + pad + ring * view.m_per_pt)
             low, high = place - half, place + half
             inside = view.holds(np.stack([low, high])).all()
             if inside and not any(low[0] < t[2] and high[0] > t[0] and low[1] < t[3] and high[1] > t[1] for t in taken):
@@ -216,13 +233,17 @@ def _time_marks(ax: Axes, cast: Cast, view: View, step_s: float) -> None:
             xy[apart, 0], xy[apart, 1], "o", ms=2.7, mfc=PAPER, mec=role.color, mew=0.8, zorder=MARK + 0.1, ls="none"
         )
         if role.is_ego:
-            last = xy[:1] - 1e9
+            ends, written = path(role.agent)[[0, -1]], np.full(2, np.inf)
             for when, at in zip(t[apart], xy[apart]):
-                if when > 0 and view.holds(at[None])[0] and np.hypot(*(at - last)[0]) > 24 * view.m_per_pt:
-                    last = at[None]
+                clear = (
+                    np.hypot(*(ends - at).T).min() > role.agent.size_m[0] / 2
+                    and not np.hypot(*(at - written)) < 24 * view.m_per_pt
+                )
+                if clear and view.holds(at[None])[0]:
+                    written = at
                     ax.annotate(
-                        f"{when:g} s", at, (4, -8), textcoords="offset points", color=MUTED, fontsize=6, family=FONT,
-                        path_effects=halo(1.8), zorder=MARK + 0.2, annotation_clip=True,
+                        f"{when:g} s", at, (0, -12), textcoords="offset points", ha="center", color=MUTED, fontsize=6,
+                        family=FONT, path_effects=halo(1.8), zorder=MARK + 0.2, annotation_clip=True,
                     )  # fmt: skip
 
 

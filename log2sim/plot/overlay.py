@@ -13,6 +13,9 @@ from log2sim.camera import NEAREST_DEPTH_M, project
 from log2sim.geometry import Array, apply, box_corners
 from log2sim.types import Camera
 
+FAR_M = 25.0
+"""Boxes farther than this get thin lines, so that rows of parked cars stay readable."""
+
 _EDGES = (
     (0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7),
     (0, 7), (3, 4),
@@ -61,13 +64,13 @@ def draw_overlay(
     if center_m is None or size_m is None or yaw_rad is None:
         return out
     corners = box_corners(center_m, size_m, yaw_rad)
-    order = np.argsort([-float(apply(cam_T_map, c)[:, 2].mean()) for c in corners])
-    for k in order:
+    depth = np.array([apply(cam_T_map, c)[:, 2].mean() for c in corners])
+    for k in np.argsort(-depth):
         color = colors_bgr[k] if colors_bgr is not None else (80, 220, 60)
         seen = box_lines(camera, apply(cam_T_map, corners[k]))
         for a, b in seen:
-            cv2.line(out, _pixel(a), _pixel(b), color, thickness + 1, cv2.LINE_AA)
-        if labels is not None and len(seen):
+            cv2.line(out, _pixel(a), _pixel(b), color, thickness if depth[k] < FAR_M else 1, cv2.LINE_AA)
+        if labels is not None and len(seen) and np.ptp(seen[..., 1]) > camera.height_px / 40:
             _write(out, labels[k], seen.reshape(-1, 2).min(axis=0), color, camera.width_px / 1800)
     return out
 
@@ -114,7 +117,7 @@ def _write(out: NDArray[np.uint8], text: str, corner: Array, color: tuple[int, i
     at = _pixel((corner[0], max(corner[1] - 6, 14)))
     plain = "".join(c if 32 <= ord(c) < 127 else "?" for c in text)
     scale = max(0.4, 0.6 * scale)
-    for ink, width in (((20, 20, 20), 4), (color, 1)):
+    for ink, width in (((20, 20, 20), 3), (color, 1)):
         cv2.putText(out, plain, at, cv2.FONT_HERSHEY_SIMPLEX, scale, ink, width, cv2.LINE_AA)
 
 

@@ -18,11 +18,11 @@ def boxes(agent: Agent, xy_m: ArrayLike, yaw_rad: ArrayLike) -> Array:
     return box_corners_bev(xy_m, agent.size_m[0], agent.size_m[1], yaw_rad)
 
 
-def noses(corners: Array, depth: float = 0.3) -> Array:
+def noses(corners: Array, depth: float = 0.42) -> Array:
     """Triangles (M, 3, 2) in the front of footprints (M, 4, 2), pointing forward; `depth` is a fraction of the length."""
     front_left, rear_left, rear_right, front_right = np.moveaxis(corners, 1, 0)
     left, right = front_left + depth * (rear_left - front_left), front_right + depth * (rear_right - front_right)
-    inset = 0.12
+    inset = 0.2  # narrower than deep, so that it cannot be read as pointing sideways
     return np.stack(
         [left + inset * (right - left), right + inset * (left - right), (front_left + front_right) / 2], axis=1
     )
@@ -83,3 +83,14 @@ def marks(agent: Agent, step_s: float) -> tuple[Array, Array]:
     state = agent.at(t) if len(t) else None
     xy = np.zeros((0, 2)) if state is None else np.column_stack([state.x_m, state.y_m])
     return t, xy
+
+
+def spaced(xy_m: Array, ends_m: Array, apart_m: float) -> NDArray[np.bool_]:
+    """Mask (K,) of places along a path that keep a distance from its ends and from the place chosen before."""
+    chosen = np.zeros(len(xy_m), dtype=bool)
+    others = ends_m
+    for k, place in enumerate(xy_m):
+        if np.hypot(*(others - place).T).min() >= apart_m:
+            chosen[k] = True
+            others = np.concatenate([ends_m, place[None]])
+    return chosen

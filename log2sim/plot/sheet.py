@@ -28,7 +28,6 @@ from log2sim.plot.look import (
     printable,
 )
 from log2sim.plot.view import View, nice_step
-from log2sim.scenario import Scenario
 
 WIDTH_IN = 10.0
 LEFT_IN, SIDE_IN, TOP_IN, BOTTOM_IN, GAP_IN = 0.72, 2.3, 0.74, 0.52, 0.2
@@ -86,9 +85,9 @@ def draw_legend(sheet: Sheet, rows: list[tuple[Any, str]]) -> None:
 
 
 def legend_rows(
-    scenario: Scenario, cast: Cast, step_s: float, *, truth: bool, replay: bool, outside: int
+    cast: Cast, mark_step_s: float | None, *, truth: bool, replay: bool, outside: int
 ) -> list[tuple[Any, str]]:
-    """Handles and texts: leading movers, then what the marks mean, then what is summed up."""
+    """Handles and texts: leading movers, what is summed up, then what the marks mean where there are marks."""
     rows: list[tuple[Any, str]] = []
     for role in sorted(cast.movers, key=_reading_order):
         if role.leading:
@@ -99,10 +98,10 @@ def legend_rows(
         rows.append((_line(CROWD_COLOR, lw=1.0), f"{rest} more moving, farther off"))
     if cast.standing:
         rows.append((Patch(fc=PARKED_FACE, ec=PARKED_EDGE, lw=0.6), f"{len(cast.standing)} standing"))
-    if cast.movers:
+    if cast.movers and mark_step_s is not None:
         rows.append((Patch(fc=PAPER, ec=MUTED, lw=0.9), "start (hollow), end (filled)"))
-        rows.append((_line("none", marker="o", ms=3.2, mfc=PAPER, mec=MUTED, mew=0.9), f"every {step_s:g} s"))
-    if any(not r.agent.waypoints.observed.all() for r in cast.movers):
+        rows.append((_line("none", marker="o", ms=3.2, mfc=PAPER, mec=MUTED, mew=0.9), f"every {mark_step_s:g} s"))
+    if mark_step_s is not None and any(not r.agent.waypoints.observed.all() for r in cast.movers):
         rows.append((_line(MUTED, lw=1.3, ls=(0, (2.2, 1.8))), "not observed, filled"))
     if truth:
         rows.append((_line(INK, lw=0.8, ls=(0, (3, 2))), "truth"))

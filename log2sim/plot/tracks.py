@@ -15,7 +15,6 @@ from log2sim.plot.cast import Cast, assign, moves, path
 from log2sim.plot.sheet import Sheet, draw_legend, draw_scale_and_north, legend_rows, make_sheet, write_title
 from log2sim.plot.view import View, choose_view, time_step_s
 from log2sim.scenario import Scenario
-from log2sim.topdown.picture import TopdownPicture
 
 STILL, ANIMATED = (".png", ".svg", ".pdf"), (".gif", ".mp4")
 
@@ -26,7 +25,7 @@ def plot_tracks(
     *,
     replay: Any = None,
     truth: Scenario | None = None,
-    background: TopdownPicture | None = None,
+    background: draw.Background | None = None,
     title: str | None = None,
     overwrite: bool = False,
     dpi: int = 200,
@@ -39,7 +38,7 @@ def plot_tracks(
     truth : Scenario or None
         In the same map frame and from the same start.
     background : TopdownPicture or None
-        In the map frame.
+        A picture of the ground in the map frame, laid under everything.
     dpi : dots per inch of a .png; the sheet is 10 inches wide.
 
     Raises
@@ -78,7 +77,7 @@ def still(
     *,
     replay: Any = None,
     truth: Scenario | None = None,
-    background: TopdownPicture | None = None,
+    background: draw.Background | None = None,
     title: str | None = None,
 ) -> Sheet:
     """The sheet of a still picture."""
@@ -101,15 +100,17 @@ def base(
     *,
     replay: Any = None,
     truth: Scenario | None = None,
-    background: TopdownPicture | None = None,
+    background: draw.Background | None = None,
     title: str | None = None,
+    moving: bool = False,
 ) -> tuple[Sheet, float]:
     """What still and moving pictures share: sheet, background, standing agents, legend; and the time step of marks."""
     chosen = choose_view(cast)
     projected = scenario.map.projection is not None
     step_s = time_step_s(scenario.duration_s, len(cast.movers), _typical_speed(cast), chosen.width_m / 500)
     outside = _outside(cast, chosen)
-    rows = legend_rows(scenario, cast, step_s, truth=truth is not None, replay=replay is not None, outside=outside)
+    overlays = {"truth": truth is not None, "replay": replay is not None}
+    rows = legend_rows(cast, None if moving else step_s, outside=outside, **overlays)
     sheet = make_sheet(chosen, len(rows), projected=projected)
     if background is not None:
         draw.draw_background(sheet.ax, background)
