@@ -1,0 +1,163 @@
+"""Trajectories: smooth paths through waypoints and speeds that reach the waypoints' exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from log2sim.errors import ConfigError
+from log2sim.geometry import Array, wrap_angle
+
+STEP_M = 0.05  # between the points that a path is smoothed at
+MAX_CURVATURE_1PM = 0.25
+MAX_ACCELERATION_MPS2 = 3.0
+LONG_BEFORE_S = -1e4
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """States at asked times (T,): position of the guided point, heading, speed, way from the first waypoint."""
+
+    xy_m: Array
+    yaw_rad: Array
+    speed_mps: Array
+    way_m: Array
+
+
+class Path:
+    """A smooth curve along waypoints (W, 2), parametrized by its length and straight beyond its ends.
+
+    Notes
+    -----
+    The polyline is averaged twice over a window of `rounding_m`: corners become curves whose curvature grows and falls
+    linearly, like a clothoid pair, straight stretches stay straight, and nothing overshoots. A turn by 90 degrees peaks at
+    a curvature of about 5.7 / rounding_m.
+    """
+
+    def __init__(self, waypoints: Array, rounding_m: float) -> None:
+        from scipy.interpolate import CubicSpline
+
+        chord = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
+        at = np.concatenate([[0.0], np.cumsum(chord)])
+        margin = rounding_m
+        s = np.arange(-margin - 1.0, at[-1] + margin + 1.0, STEP_M)
+        line = np.stack([_extended(s, at, waypoints[:, k]) for k in (0, 1)], 1)
+        window = max(1, round(rounding_m / 2 / STEP_M) | 1)
+        kernel = np.convolve(np.ones(window), np.ones(window))
+        if window > 1:
+            line = np.stack([np.convolve(line[:, k], kernel / kernel.sum(), "valid") for k in (0, 1)], 1)
+            s = s[window - 1 : -(window - 1)]
+        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+        length -= np.interp(0.0, s, length)
+        self.at_waypoint_m = np.interp(at, s, length)
+        self._spline = CubicSpline(length[::4], line[::4])
+        self._ends = (length[0], length[::4][-1])
+        self.length_m = float(self.at_waypoint_m[-1])
+
+    def at(self, way_m: ArrayLike) -> tuple[Array, Array]:
+        """Points (T, 2) and headings (T,) after `way_m` (T,) meters from the first waypoint."""
+        way = np.asarray(way_m, dtype=np.float64)
+        inside = np.clip(way, *self._ends)
+        tangent = self._spline(inside, 1)
+        tangent /= np.linalg.norm(tangent, axis=-1, keepdims=True)
+        return self._spline(inside) + tangent * (way - inside)[:, None], np.arctan2(tangent[:, 1], tangent[:, 0])
+
+    def curvature_1pm(self) -> Array:
+        """Curvature at every 0.1 m."""
+        s = np.arange(self._ends[0], self._ends[1], 0.1)
+        d, dd = self._spline(s, 1), self._spline(s, 2)
+        return (d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / np.linalg.norm(d, axis=1) ** 3
+
+
+def _extended(s: Array, at: Array, values: Array) -> Array:
+    inner = np.interp(s, at, values)
+    before = (values[1] - values[0]) / (at[1] - at[0]) * np.minimum(s - at[0], 0)
+    after = (values[-1] - values[-2]) / (at[-1] - at[-2]) * np.maximum(s - at[-1], 0)
+    return inner + before + after
+
+
+class Trajectory:
+    """A path with a timetable. Speed goes from waypoint to waypoint by a smooth step, so acceleration has no jumps.
+
+    Parameters
+    ----------
+    waypoints : (W, 3)
+        x, y in m and the speed there in m/s.
+    wait_s
+        How long to stand at a waypoint, by its index; its speed must be 0.
+    start_s
+        When the first waypoint is left; before that the agent stands (speed 0) or comes along straight.
+    where
+        Names the agent in messages.
+    """
+
+    def __init__(
+        self, waypoints: ArrayLike, *, rounding_m: float, wait_s: Sequence[tuple[int, float]] = (), start_s: float = 0.0, where: str,
+        vehicle: bool = True,
+    ) -> None:  # fmt: skip
+        w = np.asarray(waypoints, dtype=np.float64)
+        _check_waypoints(w, dict(wait_s), where)
+        self.path = Path(w[:, :2], rounding_m)
+        if vehicle:
+            peak = float(np.abs(self.path.curvature_1pm()).max())
+            if peak > MAX_CURVATURE_1PM:
+                raise ConfigError(
+                    f"{where}: the path bends with {peak:.2f} 1/m, a vehicle manages {MAX_CURVATURE_1PM}; "
+                    "raise rounding_m or spread the waypoints of the turn"
+                )
+        self._legs = _timetable(self.path.at_waypoint_m, w[:, 2], dict(wait_s), start_s, where)
+
+    def at(self, t_s: ArrayLike) -> Motion:
+        """States at times (T,) in s since the start of the log."""
+        t = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
+        begin, span, way, v0, v1 = (self._legs[:, k] for k in range(5))
+        i = np.clip(np.searchsorted(begin, t, side="right") - 1, 0, len(begin) - 1)
+        finite = np.isfinite(span[i])
+        u = np.where(finite, (t - begin[i]) / np.where(finite, span[i], 1.0), 0.0)
+        dv = v1[i] - v0[i]
+        speed = np.where(finite, v0[i] + dv * (3 * u**2 - 2 * u**3), v0[i])
+        moved = np.where(finite, np.where(finite, span[i], 0.0) * (v0[i] * u + dv * (u**3 - u**4 / 2)), v0[i] * (t - begin[i]))
+        way_now = way[i] + moved
+        xy, yaw = self.path.at(way_now)
+        return Motion(xy, wrap_angle(yaw), speed, way_now)
+
+
+def _check_waypoints(w: Array, wait_s: dict[int, float], where: str) -> None:
+    if w.ndim != 2 or w.shape[1] != 3 or len(w) < 2:
+        raise ConfigError(f"{where}: waypoints must be two or more rows [x, y, speed]; for a parked agent give 'pose'")
+    step = np.linalg.norm(np.diff(w[:, :2], axis=0), axis=1)
+    if np.any(step < 1e-3):
+        raise ConfigError(f"{where}: waypoints {int(step.argmin())} and {int(step.argmin()) + 1} are the same point; use 'wait_s' to stand")
+    if np.any(w[:, 2] < 0):
+        raise ConfigError(f"{where}: waypoint {int(w[:, 2].argmin())} has a negative speed")
+    for index in wait_s:
+        if not 0 <= index < len(w) or w[index, 2] != 0:
+            raise ConfigError(f"{where}: wait_s names waypoint {index}, which must exist and have speed 0")
+
+
+def _timetable(at_m: Array, speed: Array, wait_s: dict[int, float], start_s: float, where: str) -> Array:
+    """Legs (L, 5): begin s, span s (inf: constant from here on), way m, speed at begin and end."""
+    legs: list[tuple[float, float, float, float, float]] = []
+    now = start_s
+    legs.append((LONG_BEFORE_S, np.inf, at_m[0] - speed[0] * (start_s - LONG_BEFORE_S), speed[0], speed[0]))
+    for k in range(len(at_m) - 1):
+        if k in wait_s:
+            legs.append((now, wait_s[k], at_m[k], 0.0, 0.0))
+            now += wait_s[k]
+        v0, v1, way = speed[k], speed[k + 1], at_m[k + 1] - at_m[k]
+        if v0 + v1 <= 0:
+            raise ConfigError(f"{where}: waypoints {k} and {k + 1} both have speed 0, so the way between them takes forever")
+        span = 2 * way / (v0 + v1)
+        peak = 1.5 * abs(v1 - v0) / span
+        if peak > MAX_ACCELERATION_MPS2 * (1 + 1e-9):
+            raise ConfigError(
+                f"{where}: from waypoint {k} to {k + 1} the speed changes with {peak:.1f} m/s2, at most "
+                f"{MAX_ACCELERATION_MPS2:g} is allowed; give the change more way"
+            )
+        legs.append((now, span, at_m[k], v0, v1))
+        now += span
+    legs.append((now, np.inf, at_m[-1], speed[-1], speed[-1]))
+    return np.array(legs)

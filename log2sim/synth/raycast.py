@@ -1,0 +1,152 @@
+"""LiDAR sweeps: rays from a moving sensor against moving road users, buildings and the ground."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import NS_PER_S, Array, inverse, rotation_from_rpy, transform
+from log2sim.synth.actors import Actor, EgoMotion
+from log2sim.synth.scene import Building, LidarSpec, Scene
+from log2sim.types import Sweep
+
+GROUND, BUILDING = -1, -2
+PAIRS_AT_ONCE = 400_000
+GRAZING_RETURN = 0.02  # sine of the angle on the ground below which nothing comes back
+
+
+@dataclass(frozen=True, eq=False)
+class Cast:
+    """A sweep and what each of its points lies on: `hit` (N,) index of the actor, or GROUND, or BUILDING."""
+
+    sweep: Sweep
+    hit: NDArray[np.int64]
+
+
+def ego_T_lidar(spec: LidarSpec) -> Array:
+    """Pose of the LiDAR on the ego."""
+    return transform(rotation_from_rpy(0.0, 0.0, np.deg2rad(spec.yaw_deg)), np.array(spec.position_m))
+
+
+def sweep_stamps(spec: LidarSpec, scene: Scene) -> NDArray[np.int64]:
+    """Ends of the sweeps (F,), absolute ns; every sweep lies wholly within the log."""
+    period = 1.0 / spec.rate_hz
+    first = int(np.ceil((period * _share(spec) - spec.offset_s) * spec.rate_hz - 1e-9))
+    last = int(np.floor((scene.duration_s - spec.offset_s) * spec.rate_hz + 1e-9))
+    t = np.arange(first, last + 1) * period + spec.offset_s
+    return scene.start_ns + np.rint(t * NS_PER_S).astype(np.int64)
+
+
+def _share(spec: LidarSpec) -> float:
+    return min(1.0, (spec.azimuth_deg[1] - spec.azimuth_deg[0]) / 360.0)
+
+
+def ray_pattern(spec: LidarSpec) -> tuple[Array, Array]:
+    """Directions (N, 3) in the lidar frame and times (N,) in s before the end of the sweep, column after column."""
+    low, high = spec.azimuth_deg
+    columns = max(1, round((high - low) / spec.azimuth_step_deg))
+    azimuth = np.deg2rad(high - (np.arange(columns) + 0.5) * (high - low) / columns)
+    elevation = np.deg2rad(np.linspace(spec.elevation_deg[0], spec.elevation_deg[1], spec.channels))
+    ago = _share(spec) / spec.rate_hz * (1 - (np.arange(columns) + 1) / columns)
+    a, e = np.repeat(azimuth, spec.channels), np.tile(elevation, columns)
+    directions = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], 1)
+    return directions, np.repeat(ago, spec.channels)
+
+
+def cast(spec: LidarSpec, scene: Scene, ego: EgoMotion, actors: tuple[Actor, ...], stamp_ns: int, rng: np.random.Generator) -> Cast:
+    """Cast one sweep; its stamp is its end, and every point is in the lidar frame at its own time."""
+    directions, ago_s = ray_pattern(spec)
+    t_ns = stamp_ns - np.rint(ago_s * NS_PER_S).astype(np.int64)
+    moments, column = np.unique(t_ns, return_inverse=True)
+    map_T_lidar = ego.map_T_ego_ns(moments) @ ego_T_lidar(spec)
+    origin = map_T_lidar[column, :3, 3]
+    ray = np.einsum("nij,nj->ni", map_T_lidar[column, :3, :3], directions)
+    distance = np.full(len(ray), np.inf)
+    hit = np.full(len(ray), GROUND)
+    down = -ray[:, 2] > GRAZING_RETURN
+    distance[down] = origin[down, 2] / -ray[down, 2]
+    for building in scene.building:
+        nearer = _box_distance(building, origin, ray)
+        closer = nearer < distance
+        distance[closer], hit[closer] = nearer[closer], BUILDING
+    t_s = (moments - scene.start_ns) / NS_PER_S
+    for index, actor in enumerate(actors):
+        rows, nearer = _actor_distance(actor, t_s, column, origin, ray)
+        closer = nearer < distance[rows]
+        distance[rows[closer]], hit[rows[closer]] = nearer[closer], index
+    # Drawn for every ray, so that a change of the scene moves no other ray's noise.
+    noise, lost = rng.normal(0.0, 1.0, len(ray)) * spec.noise_m, rng.random(len(ray)) < spec.dropout
+    keep = (distance <= spec.range_m) & (distance > 0.5) & ~lost
+    xyz = directions[keep] * (distance + noise)[keep, None]
+    if spec.resolution_m > 0:
+        xyz = np.rint(xyz / spec.resolution_m) * spec.resolution_m
+    return Cast(Sweep(stamp_ns, xyz.astype(np.float32), "lidar", t_ns[keep]), hit[keep])
+
+
+def _box_distance(building: Building, origin: Array, ray: Array) -> Array:
+    """Distance (N,) at which rays enter a building, inf where they miss it (slab method)."""
+    c, s = np.cos(np.deg2rad(building.yaw_deg)), np.sin(np.deg2rad(building.yaw_deg))
+    rotation = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
+    size = np.array(building.size_m)
+    o = (origin - [*building.center, size[2] / 2]) @ rotation.T
+    d = ray @ rotation.T
+    parallel = d == 0
+    d = np.where(parallel, 1.0, d)
+    a, b = (-size / 2 - o) / d, (size / 2 - o) / d
+    outside = parallel & (np.abs(o) > size / 2)
+    enter = np.where(parallel, -np.inf, np.minimum(a, b)).max(1)
+    leave = np.where(parallel, np.inf, np.maximum(a, b)).min(1)
+    return np.where((enter <= leave) & (enter > 0) & ~outside.any(1), enter, np.inf)
+
+
+def _actor_distance(actor: Actor, t_s: Array, column: NDArray[np.int64], origin: Array, ray: Array) -> tuple[NDArray[np.int64], Array]:
+    """Rays that meet the actor's box, each with the actor where it is at the ray's time, and distances to its shape."""
+    states = actor.at(t_s)
+    center = states.center_m[column]
+    radius = np.linalg.norm(actor.spec.box_m) / 2
+    to = center - origin
+    along = np.einsum("ni,ni->n", to, ray)
+    off = np.einsum("ni,ni->n", to, to) - along**2
+    rows = np.flatnonzero((off < radius**2) & (along > -radius))
+    if len(rows) == 0:
+        return rows, np.zeros(0)
+    agent_T_map = inverse(states.map_T_agent())[column[rows]]
+    o = np.einsum("nij,nj->ni", agent_T_map[:, :3, :3], origin[rows]) + agent_T_map[:, :3, 3]
+    d = np.einsum("nij,nj->ni", agent_T_map[:, :3, :3], ray[rows])
+    mesh = actor.mesh(float(t_s[column[rows]].mean()))
+    return rows, first_hit(o, d, mesh.vertices_m[mesh.faces])
+
+
+def first_hit(origin: Array, ray: Array, triangles: Array) -> Array:
+    """Distance (N,) along rays (N, 3) to the nearest of triangles (F, 3 vertices, 3), inf where there is none.
+
+    Notes
+    -----
+    Moeller and Trumbore (1997), both sides of a triangle count; O(N F) in blocks of bounded size.
+    """
+    out = np.full(len(ray), np.inf)
+    a = triangles[:, 0]
+    e1, e2 = triangles[:, 1] - a, triangles[:, 2] - a
+    normal = np.cross(e1, e2)
+    step = max(1, PAIRS_AT_ONCE // max(1, len(triangles)))
+    for k in range(0, len(ray), step):
+        o, d = origin[k : k + step], ray[k : k + step]
+        # Every product with a pair of indices is a matrix product: d . n, d . (e x a) and so on.
+        moment = np.cross(o, d)
+        determinant = -(d @ normal.T)
+        u = _triple(d, moment, a, e2)
+        v = -_triple(d, moment, a, e1)
+        t = o @ normal.T - np.einsum("fi,fi->f", a, normal)
+        solid = np.abs(determinant) > 1e-12
+        scale = np.divide(1.0, determinant, out=np.zeros_like(determinant), where=solid)
+        u, v, t = u * scale, v * scale, t * scale
+        inside = solid & (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (t > 0)
+        out[k : k + step] = np.where(inside, t, np.inf).min(1, initial=np.inf)
+    return out
+
+
+def _triple(d: Array, moment: Array, a: Array, e: Array) -> Array:
+    """(o - a) . (d x e) for all pairs (N, F) of rays and edges, from the rays' moments o x d."""
+    return moment @ e.T + d @ np.cross(a, e).T

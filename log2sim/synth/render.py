@@ -1,0 +1,284 @@
+"""Camera images: ground and facades by their planes, road users by a z-buffer, light from the sun and the sky."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import Array, apply, inverse
+from log2sim.synth.actors import Actor
+from log2sim.synth.backdrop import FACADE_M_PER_PX, GAMMA, GROUND_M_PER_PX, Backdrop, linear_table
+from log2sim.synth.paint import paint
+from log2sim.synth.raster import Fragments, rasterize
+from log2sim.types import Camera
+
+SUN = np.array([-0.45, -0.5, 0.74]) / np.linalg.norm([-0.45, -0.5, 0.74])
+SUN_LIGHT = np.array([0.80, 0.88, 0.95], np.float32)  # BGR
+SKY_LIGHT = np.array([0.56, 0.50, 0.45], np.float32)
+HORIZON = np.array([0.78, 0.74, 0.70], np.float32)
+ZENITH = np.array([0.72, 0.48, 0.30], np.float32)
+HAZE_M = 500.0
+NEAR_M = 0.2
+FAR_M = 2000.0
+OVERSAMPLING = 2
+NOBODY, WALL = -1, -2
+_LINEAR = linear_table()
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera at one moment: enlarged K, image size and pose."""
+
+    K: Array
+    width_px: int
+    height_px: int
+    map_T_cam: Array
+
+    @classmethod
+    def of(cls, camera: Camera, map_T_cam: Array, scale: int) -> View:
+        """Whole numbers are pixel centers, before and after enlarging."""
+        K = camera.K * scale
+        K[:2, 2] += (scale - 1) / 2
+        K[2, 2] = 1.0
+        return cls(K, camera.width_px * scale, camera.height_px * scale, map_T_cam)
+
+    def rays(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The map components of all rays with depth 1, as sums of a part by column (W, 3) and a part by row (H, 3)."""
+        u = (np.arange(self.width_px) - self.K[0, 2]) / self.K[0, 0]
+        v = (np.arange(self.height_px) - self.K[1, 2]) / self.K[1, 1]
+        R = self.map_T_cam[:3, :3]
+        return np.outer(u, R[:, 0]).astype(np.float32), (np.outer(v, R[:, 1]) + R[:, 2]).astype(np.float32)
+
+    def polygon(self, points_map: Array) -> NDArray[np.int32]:
+        """Image of a convex polygon (P, 3), clipped where it comes too near, in sixteenths of a pixel; may be empty."""
+        p = apply(inverse(self.map_T_cam), points_map)
+        out = []
+        for a, b in zip(p, np.roll(p, -1, axis=0)):
+            if a[2] >= NEAR_M:
+                out.append(a)
+            if (a[2] >= NEAR_M) != (b[2] >= NEAR_M):
+                out.append(a + (b - a) * (NEAR_M - a[2]) / (b[2] - a[2]))
+        if len(out) < 3:
+            return np.zeros((0, 2), np.int32)
+        q = np.array(out)
+        uv = q[:, :2] / q[:, 2:] * [self.K[0, 0], self.K[1, 1]] + self.K[:2, 2]
+        return np.rint(np.clip(uv, -1e5, 1e5) * 16).astype(np.int32)
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What a camera sees of an actor: pixels that show it, pixels of its whole silhouette in the image, box (4,) px.
+
+    The box is that of the visible part, edges of pixels counted from the image's corner.
+    """
+
+    visible_px: int
+    silhouette_px: int
+    box_px: Array
+
+
+def render(camera: Camera, map_T_cam: Array, backdrop: Backdrop, actors: tuple[Actor, ...], t_s: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """An image (H, W, 3) uint8 BGR."""
+    view = View.of(camera, map_T_cam, OVERSAMPLING)
+    color, depth, on_ground = _sky_and_ground(view, backdrop)
+    _draw_walls(view, backdrop, color, depth)
+    _draw_shadows(view, actors, t_s, color, on_ground & (depth < FAR_M))
+    flat_color, flat_depth = color.reshape(-1, 3), depth.ravel()
+    for actor in actors:
+        fragments = _fragments(view, actor, t_s)
+        near = np.flatnonzero(fragments.depth_m < flat_depth[fragments.pixel])
+        if len(near) == 0:
+            continue
+        pixel = fragments.pixel[near]
+        flat_color[pixel] = _shade(view, actor, t_s, fragments, near)
+        flat_depth[pixel] = fragments.depth_m[near]
+    haze = (1 - np.exp(-depth / HAZE_M))[..., None]
+    color += (HORIZON - color) * haze
+    return _developed(color, rng)
+
+
+def segment(camera: Camera, map_T_cam: Array, backdrop: Backdrop, actors: tuple[Actor, ...], t_s: float) -> list[Seen | None]:
+    """What the camera sees of each actor, None for nothing."""
+    view = View.of(camera, map_T_cam, 1)
+    depth = np.full((view.height_px, view.width_px), np.inf, np.float32)
+    _draw_walls(view, backdrop, None, depth)
+    owner = np.full(depth.size, NOBODY)
+    whole = []
+    for index, actor in enumerate(actors):
+        fragments = _fragments(view, actor, t_s)
+        near = fragments.depth_m < depth.ravel()[fragments.pixel]
+        pixel = fragments.pixel[near]
+        depth.ravel()[pixel] = fragments.depth_m[near]
+        owner[pixel] = index
+        whole.append(len(fragments.pixel))
+    out: list[Seen | None] = []
+    for index, silhouette in enumerate(whole):
+        pixel = np.flatnonzero(owner == index) if silhouette else np.zeros(0, int)
+        if len(pixel) == 0:
+            out.append(None)
+            continue
+        v, u = np.divmod(pixel, view.width_px)
+        out.append(Seen(len(pixel), silhouette, np.array([u.min(), v.min(), u.max() + 1, v.max() + 1], float)))
+    return out
+
+
+def _fragments(view: View, actor: Actor, t_s: float) -> Fragments:
+    states = actor.at(t_s)
+    cam_T_map = inverse(view.map_T_cam)
+    center = apply(cam_T_map, states.center_m)[0]
+    radius = float(np.linalg.norm(actor.spec.box_m)) / 2
+    reach = (view.width_px + view.height_px) / view.K[0, 0]
+    if center[2] < -radius or np.hypot(center[0], center[1]) - radius > reach * (center[2] + radius):
+        nothing = np.zeros(0, np.int64)
+        return Fragments(nothing, nothing.astype(np.float32), nothing, np.zeros((0, 3), np.float32))
+    mesh = actor.mesh(t_s)
+    vertices = apply(cam_T_map @ states.map_T_agent()[0], mesh.vertices_m)
+    return rasterize(vertices, mesh.faces, view.K, view.width_px, view.height_px)
+
+
+def _shade(view: View, actor: Actor, t_s: float, fragments: Fragments, near: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Light (P, 3) that comes from an actor's surface."""
+    mesh, map_T_agent = actor.mesh(t_s), actor.at(t_s).map_T_agent()[0]
+    corner = mesh.faces[fragments.face[near]]
+    weight = fragments.weight[near][:, :, None]
+    points = (mesh.vertices_m.astype(np.float32)[corner] * weight).sum(1)
+    normals = (mesh.normals.astype(np.float32)[corner] * weight).sum(1)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
+    surface = paint(actor.look, mesh.part[fragments.face[near]], points, normals)
+    R = map_T_agent[:3, :3].astype(np.float32)
+    n = normals @ R.T
+    to_camera = (view.map_T_cam[:3, 3] - map_T_agent[:3, 3]).astype(np.float32) - points @ R.T
+    to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
+    height = points[:, 2] + np.float32(actor.spec.box_m[2] / 2)
+    openness = (0.62 + 0.38 * n[:, 2]) * np.clip(0.55 + 0.6 * height, 0.0, 1.0)
+    sun = np.clip(n @ SUN.astype(np.float32), 0, 1)
+    light = surface.albedo * (openness[:, None] * SKY_LIGHT + sun[:, None] * SUN_LIGHT) + surface.glow
+    facing = np.clip((n * to_camera).sum(1), 0, 1)
+    mirrored = 2 * facing[:, None] * n - to_camera
+    gloss = surface.gloss * (0.35 + 0.65 * (1 - facing) ** 3)
+    light += gloss[:, None] * _surroundings(mirrored)
+    glint = np.clip(mirrored @ SUN.astype(np.float32), 0, 1) ** 60
+    return (light + (surface.gloss * 2.0 * glint)[:, None]).astype(np.float32)
+
+
+def _surroundings(direction: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What a mirror would show: sky above, houses around, road below."""
+    up = direction[:, 2:]
+    sky = HORIZON + (ZENITH - HORIZON) * np.clip(up * 1.6, 0, 1)
+    houses = np.float32(0.22)
+    blend = np.clip((up - 0.12) / 0.1, 0, 1)
+    below = np.clip((-up - 0.02) / 0.08, 0, 1)
+    return ((houses * (1 - blend) + sky * blend) * (1 - below) + 0.09 * below).astype(np.float32)
+
+
+def _sky_and_ground(view: View, backdrop: Backdrop) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    by_column, by_row = view.rays()
+    up = by_row[:, None, 2] + by_column[None, :, 2]
+    rise = np.clip(up / np.sqrt(1 + up * up) * 1.8, 0, 1)[..., None]
+    color = (HORIZON + (ZENITH - HORIZON) * rise).astype(np.float32)
+    ground = up < -1e-3
+    depth = np.full(up.shape, FAR_M, np.float32)
+    np.divide(-np.float32(view.map_T_cam[2, 3]), up, out=depth, where=ground)
+    np.minimum(depth, FAR_M, out=depth)
+    image = _ground_image(view, backdrop, depth)
+    lit = SKY_LIGHT + SUN_LIGHT * np.float32(SUN[2])
+    color[ground] = _LINEAR[image[ground]] * lit
+    return color, depth, ground
+
+
+def _ground_image(view: View, backdrop: Backdrop, depth: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """The ground texture as the camera sees it, from a level of the pyramid that is as coarse as the rows' pixels."""
+    h, w = view.height_px, view.width_px
+    cam_T_map = inverse(view.map_T_cam)
+    image_H_ground = view.K @ np.column_stack([cam_T_map[:3, 0], cam_T_map[:3, 1], cam_T_map[:3, 3]])
+    middle = depth[:, w // 2]
+    footprint = middle / view.K[0, 0] * np.sqrt(np.maximum(middle / max(view.map_T_cam[2, 3], 0.1), 1.0))
+    level = np.clip(np.rint(np.log2(np.maximum(footprint / GROUND_M_PER_PX, 1.0))), 0, len(backdrop.ground) - 1).astype(int)
+    out = np.empty((h, w, 3), np.uint8)
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(level)) + 1, [h]])
+    for top, bottom in zip(edges[:-1], edges[1:]):
+        k = int(level[top])
+        step = GROUND_M_PER_PX * 2**k
+        ground_H_texture = np.array([[step, 0, backdrop.corner_m[0] + step / 2], [0, step, backdrop.corner_m[1] + step / 2], [0, 0, 1]])
+        shift = np.array([[1, 0, 0], [0, 1, -top], [0, 0, 1.0]])
+        homography = shift @ image_H_ground @ ground_H_texture
+        plain = backdrop.ground[-1][0, 0].tolist()
+        out[top:bottom] = cv2.warpPerspective(
+            backdrop.ground[k], homography, (w, int(bottom - top)), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=plain
+        )
+    return out
+
+
+def _draw_walls(view: View, backdrop: Backdrop, color: NDArray[np.float32] | None, depth: NDArray[np.float32]) -> None:
+    """Draw facades where they are nearer than what is there; with `color` None only their depth."""
+    eye = view.map_T_cam[:3, 3]
+    by_column, by_row = view.rays()
+    for wall in backdrop.walls:
+        gap = float(np.dot(eye[:2] - wall.foot_m, wall.outward))
+        if gap <= 0:
+            continue
+        end = wall.foot_m + wall.along * wall.length_m
+        corners = np.array([[*wall.foot_m, 0], [*end, 0], [*end, wall.height_m], [*wall.foot_m, wall.height_m]])
+        polygon = view.polygon(corners)
+        if len(polygon) == 0:
+            continue
+        low = np.clip(polygon.min(0) // 16, 0, [view.width_px, view.height_px])
+        high = np.clip(polygon.max(0) // 16 + 2, 0, [view.width_px, view.height_px])
+        if np.any(high <= low):
+            continue
+        mask = np.zeros((high[1] - low[1], high[0] - low[0]), np.uint8)
+        cv2.fillConvexPoly(mask, polygon - low.astype(np.int32) * 16, 1, cv2.LINE_8, 4)
+        columns, rows = by_column[low[0] : high[0]], by_row[low[1] : high[1]]
+        toward = (rows[:, None, :2] + columns[None, :, :2]) @ wall.outward.astype(np.float32)
+        z = np.divide(np.float32(-gap), toward, out=np.full(mask.shape, np.inf, np.float32), where=toward < -1e-9)
+        region = (slice(low[1], high[1]), slice(low[0], high[0]))
+        drawn = (mask > 0) & (z < depth[region])
+        depth[region][drawn] = z[drawn]
+        if color is None:
+            continue
+        finite = np.where(np.isfinite(z), z, 0)
+        s = ((rows[:, None, :2] + columns[None, :, :2]) @ wall.along.astype(np.float32)) * finite + np.float32(np.dot(eye[:2] - wall.foot_m, wall.along))
+        height = (rows[:, None, 2] + columns[None, :, 2]) * finite + np.float32(eye[2])
+        texture = cv2.remap(wall.texture, s / FACADE_M_PER_PX - 0.5, height / FACADE_M_PER_PX - 0.5, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        light = SKY_LIGHT * 0.75 + SUN_LIGHT * np.float32(max(0.0, float(wall.outward @ SUN[:2])))
+        color[region][drawn] = _LINEAR[texture[drawn]] * light
+
+
+def _draw_shadows(view: View, actors: tuple[Actor, ...], t_s: float, color: NDArray[np.float32], ground: NDArray[np.bool_]) -> None:
+    """Darken the ground where actors keep the sun off it and, right under them, the sky too."""
+    sun = np.zeros(ground.shape, np.uint8)
+    sky = np.zeros(ground.shape, np.uint8)
+    slope = SUN[:2] / SUN[2]
+    for actor in actors:
+        map_T_agent = actor.at(t_s).map_T_agent()[0]
+        if np.linalg.norm(map_T_agent[:2, 3] - view.map_T_cam[:2, 3]) > 80.0:
+            continue
+        vertices = apply(map_T_agent, actor.mesh(t_s).vertices_m)
+        cast = (vertices[:, :2] - slope * vertices[:, 2:]).astype(np.float32)
+        below = vertices[vertices[:, 2] < 0.25 * actor.spec.box_m[2] + 0.05, :2].astype(np.float32)
+        for mask, points in ((sun, cast), (sky, below)):
+            hull = cv2.convexHull(points)[:, 0]
+            polygon = view.polygon(np.column_stack([hull, np.zeros(len(hull))]).astype(float))
+            if len(polygon):
+                cv2.fillConvexPoly(mask, polygon, 255, cv2.LINE_AA, 4)
+    sun = cv2.GaussianBlur(sun, (0, 0), 1.6 * OVERSAMPLING)
+    sky = cv2.GaussianBlur(sky, (0, 0), 1.8 * OVERSAMPLING)
+    rows = np.flatnonzero(((sun > 0) | (sky > 0)).any(1))
+    if len(rows) == 0:
+        return
+    band = slice(int(rows[0]), int(rows[-1]) + 1)
+    factor = (1 - 0.55 * (sun[band] / np.float32(255))) * (1 - 0.5 * (sky[band] / np.float32(255)))
+    color[band] *= np.where(ground[band], factor, 1.0)[..., None].astype(np.float32)
+
+
+def _developed(color: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Lens blur, sensor noise and gamma."""
+    h, w = color.shape[0] // OVERSAMPLING, color.shape[1] // OVERSAMPLING
+    image = cv2.resize(color, (w, h), interpolation=cv2.INTER_AREA)
+    image = cv2.GaussianBlur(image, (0, 0), 0.45)
+    image = 255 * np.clip(image, 0, 1) ** np.float32(1 / GAMMA)
+    grain = rng.standard_normal((h, w), dtype=np.float32)[..., None] * np.float32(1.2)
+    return np.clip(np.rint(image + grain), 0, 255).astype(np.uint8)

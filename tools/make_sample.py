@@ -1,0 +1,29 @@
+"""Make samples/crossing from samples/crossing.toml again; the same bytes for the same seed and library versions."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+from log2sim.synth import load_scene, write_synthetic
+
+SAMPLES = Path(__file__).resolve().parent.parent / "samples"
+SEED = 1
+JPEG_QUALITY = 70
+LIMIT_BYTES = 8_000_000
+
+
+def main() -> int:
+    """Write the sample and check that it is small enough to ship."""
+    begin = time.perf_counter()
+    out = Path(sys.argv[1]) if len(sys.argv) > 1 else SAMPLES / "crossing"
+    scene = load_scene(SAMPLES / "crossing.toml")
+    write_synthetic(scene, out, seed=SEED, overwrite=True, jpeg_quality=JPEG_QUALITY)
+    size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
+    print(f"{out}: {size / 1e6:.2f} MB in {time.perf_counter() - begin:.0f} s")
+    return 0 if size < LIMIT_BYTES else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
