@@ -332,6 +332,18 @@ def test_two_projections_are_refused():
         evaluate(a, b)
 
 
-def test_times_apart_give_nothing():
-    result = evaluate(world(), replace(world(), t0_ns=10**12))
-    assert (result["ticks"], result["recall"], result["precision"], result["hota"]) == (0, None, None, None)
+def test_a_truth_of_another_time_is_refused():
+    with pytest.raises(ScenarioError, match=r"covers 0.000 to 3.000 s, the truth 1000.000 to 1003.000 s"):
+        evaluate(world(), replace(world(), t0_ns=10**12))
+
+
+def test_a_scenario_without_agents_misses_everybody_and_a_truth_without_any_says_nothing():
+    empty = evaluate(scenario(), world())
+    assert (empty["recall"], empty["precision"], empty["hota"], empty["counts"]["missed_ticks"]) == (
+        0.0,
+        None,
+        0.0,
+        155,
+    )
+    blind = evaluate(world(), scenario())
+    assert (blind["ticks"], blind["recall"], blind["precision"], blind["hota"]) == (0, None, None, None)

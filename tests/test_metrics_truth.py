@@ -246,3 +246,24 @@ def test_static_is_what_neither_reaches_nor_drifts():
     assert not is_static(t, noise + np.stack([t, 0 * t], -1))
     assert not is_static(t[:5], np.stack([t[:5], 0 * t[:5]], -1))
     assert not is_static(t[:1], noise[:1])
+
+
+@pytest.mark.real
+def test_recorded_labels_have_the_points_that_a_full_search_finds(real_data):
+    from log2sim.logs import open_log
+    from log2sim.metrics.truth import points_in_labels
+
+    log = open_log(real_data / "kitti_tracking")
+    counts, unreadable = points_in_labels(log, log.labels)
+    assert unreadable == 0
+    (name,) = log.lidars
+    for i in (0, 40):
+        sweep = log.streams[name].read(i)
+        stamps = np.full(len(sweep.xyz_m), sweep.stamp_ns) if sweep.t_ns is None else sweep.t_ns
+        points = apply(log.map_T_sensor(name, stamps)[0], sweep.xyz_m)
+        rows = np.flatnonzero(log.labels.t_ns == log.streams["image_02"].t_ns[i])
+        assert len(rows) >= 3
+        for k in rows:
+            box = log.labels.center_m[k], log.labels.size_m[k], log.labels.yaw_rad[k]
+            # Points that share a pose within a millisecond may cross a face of the box.
+            assert counts[k] == pytest.approx(points_in_box(points, *box).sum(), rel=0.02, abs=2)

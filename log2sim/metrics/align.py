@@ -54,10 +54,12 @@ def evaluation_ticks_s(scenario: Scenario, truth: Scenario) -> Array:
     ego = scenario.ego
     ours = [a.waypoints.t_s for a in scenario.agents]
     theirs = [a.waypoints.t_s + shift_s for a in truth.agents]
-    if not ours or not theirs:
+    if not theirs:
         return np.zeros(0)
     first, last = min(t[0] for t in theirs), max(t[-1] for t in theirs)
-    begin, end = min(t[0] for t in ours), max(t[-1] for t in ours)
+    # A scenario in which nobody was found still misses what was there while it ran.
+    begin = min((t[0] for t in ours), default=0.0)
+    end = max((t[-1] for t in ours), default=scenario.duration_s)
     for times in ([] if ego is None else [ego.waypoints.t_s], ours, ours + theirs):
         if not times:
             continue

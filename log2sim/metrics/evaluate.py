@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.errors import ConfigError
+from log2sim.errors import ConfigError, ScenarioError
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.metrics.agents import agent_rows, false_rows, rounded_tree
 from log2sim.metrics.align import (
@@ -73,10 +73,12 @@ def evaluate(
     ConfigError
         For an unknown category, a range that is not positive, or a range without an ego to measure it from.
     ScenarioError
-        When the two use different map projections.
+        When the two use different map projections or share no time.
     """
     selected = _selected(categories)
     ticks_s = evaluation_ticks_s(scenario, truth)
+    if len(ticks_s) == 0 and scenario.agents and truth.agents:
+        raise ScenarioError(_apart(scenario, truth))
     truth_ticks_s = ticks_s + (scenario.t0_ns - truth.t0_ns) / NS_PER_S
     shift_m = map_shift_m(scenario, truth)
     ego_xy = _ego_xy(scenario, truth, ticks_s, truth_ticks_s, shift_m)
@@ -198,6 +200,15 @@ def _selected(categories: Sequence[str] | None) -> frozenset[str]:
         if name not in known:
             raise ConfigError(f"unknown category '{name}'{nearest(name, known)}; known: {', '.join(known)}")
     return frozenset(c for name in categories for c in GROUPS.get(name, (name,)))
+
+
+def _apart(scenario: Scenario, truth: Scenario) -> str:
+    spans = [
+        f"{min(s.t0_ns / NS_PER_S + float(a.waypoints.t_s[0]) for a in s.agents):.3f} to "
+        f"{max(s.t0_ns / NS_PER_S + float(a.waypoints.t_s[-1]) for a in s.agents):.3f} s"
+        for s in (scenario, truth)
+    ]
+    return f"the scenario covers {spans[0]}, the truth {spans[1]}: they share no time; are both of the same log?"
 
 
 def _check_range(max_range_m: float | None, ego_xy: Array | None) -> None:
