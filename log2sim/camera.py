@@ -30,9 +30,11 @@ def project(camera: Camera, points_cam: NDArray[np.floating[Any]]) -> tuple[Arra
     front = points[:, 2] > NEAREST_DEPTH_M
     uv = np.full((len(points), 2), np.nan)
     xy = points[front, :2] / points[front, 2:]
-    # Far outside the view the distortion polynomial folds back into the image, so what a pinhole of thrice the view would not see is left out.
-    half_view = 1.5 * np.array([camera.width_px / camera.K[0, 0], camera.height_px / camera.K[1, 1]])
-    seen = np.ones(len(xy), dtype=bool) if camera.distortion_model == "none" else np.all(np.abs(xy) <= half_view, axis=1)
+    seen = np.ones(len(xy), dtype=bool)
+    if camera.distortion_model != "none":
+        # Far outside the view a distortion polynomial folds back into the image; thrice the view is seen by no lens.
+        half_view = 1.5 * np.array([camera.width_px / camera.K[0, 0], camera.height_px / camera.K[1, 1]])
+        seen = np.all(np.abs(xy) <= half_view, axis=1)
     pixels = distort(camera, xy) @ camera.K[:2, :2].T + camera.K[:2, 2]
     uv[front] = np.where(seen[:, None], pixels, np.nan)
     with np.errstate(invalid="ignore"):

@@ -33,7 +33,7 @@ def fuse(measurements: Measurements) -> Measurements:
         else:
             owner[i] = i
     leaders = np.flatnonzero(owner == np.arange(len(rows)))
-    joined = [_join(rows, leader, np.flatnonzero(owner == leader)) for leader in leaders]
+    joined = [_join(rows, int(leader), np.flatnonzero(owner == leader)) for leader in leaders]
     out = Measurements.join(joined)
     return out.take(~_drivers(out))
 
@@ -76,7 +76,7 @@ def _join(rows: Measurements, leader: int, members: NDArray[np.intp]) -> Measure
         cluster - origin, row.sensor_m[0] - origin, str(row.category[0]), ground_z - float(origin[2])
     )
     whole = bool(row.truncated[0]) and all(rows.truncated[m] for m in others)
-    columns = {k: v for k, v in vars(row).items()}
+    columns = dict(vars(row))
     columns |= {
         "center_m": (center + origin)[None], "size_m": size[None], "yaw_rad": np.array([yaw]),
         "covariance": covariance[None], "cluster": (cluster,), "truncated": np.array([whole]),

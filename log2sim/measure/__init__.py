@@ -20,7 +20,7 @@ from log2sim.measure.cloud import Cloud, assemble_cloud, to_map
 from log2sim.measure.select import LEAST_POINTS, grow, select_cluster
 from log2sim.types import TYPICAL_SIZE_M, Camera, Detections, Measurements
 
-__all__ = ["Cloud", "View", "assemble_cloud", "measure_view", "to_map"]
+__all__ = ["Cloud", "View", "assemble_cloud", "measure_view", "project_cloud", "to_map"]
 
 # Obstacles between the road and what hangs over it.
 LOWEST_M, HIGHEST_M = 0.2, 4.2
@@ -48,7 +48,7 @@ def measure_view(view: View, detections: Detections, cloud: Cloud | None, *, mod
     else:
         keep = ~cloud.ground & (cloud.height > LOWEST_M) & (cloud.height < HIGHEST_M)
     obstacles = np.flatnonzero(keep)
-    seen, uv, depth = _project_cloud(view, cloud, obstacles)
+    seen, uv, depth = project_cloud(view, cloud, obstacles)
     index = obstacles[seen]
     xyz = cloud.xyz[index]
     range_m = np.linalg.norm(xyz - cloud.sensor, axis=1)
@@ -125,7 +125,7 @@ def _measure_as_paper(
     columns["t_ns"][k] = cloud.stamp_ns
 
 
-def _project_cloud(view: View, cloud: Cloud, index: NDArray[np.intp]) -> tuple[NDArray[np.intp], Array, Array]:
+def project_cloud(view: View, cloud: Cloud, index: NDArray[np.intp]) -> tuple[NDArray[np.intp], Array, Array]:
     """Which of the cloud's points at `index` the camera sees, their pixels (n, 2) and depths (n,).
 
     Notes

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.geometry import NS_PER_S
 from log2sim.track.forward import track_forward
 from log2sim.track.stitch import category_of, stitch
 from log2sim.types import Measurements, Track
@@ -20,7 +21,7 @@ def track(
     *,
     birth_score: float,
     max_gap_s: float,
-    min_hits: int,
+    min_life_s: float,
 ) -> list[Track]:
     """Turn the measurements of T ticks into tracks, longest lives first by their start.
 
@@ -31,8 +32,8 @@ def track(
         Lowest score that can start a track.
     max_gap_s : float
         Longest occlusion that is bridged, s.
-    min_hits : int
-        Tracks with fewer measurements, after stitching, are taken for false alarms.
+    min_life_s : float
+        Tracks seen for a shorter time, after stitching, are taken for false alarms, unless the log itself is as short.
     """
     tracklets = track_forward(measurements, t_ns, birth_score=birth_score)
     tracks = []
@@ -40,5 +41,13 @@ def track(
         rows = Measurements.join([measurements[k].take([r]) for k, r in zip(t.ticks, t.rows)])
         tracks.append(Track(category_of(rows), np.array(t.ticks, dtype=np.int64), rows))
     joined = stitch(tracks, t_ns, max_gap_s=max_gap_s)
-    kept = [t for t in joined if len(t) >= min_hits]
+    kept = [t for t in joined if len(t) >= least_hits(t_ns, min_life_s)]
     return sorted(kept, key=lambda t: (int(t.tick[0]), float(t.measurements.center_m[0, 0])))
+
+
+def least_hits(t_ns: NDArray[np.int64], min_life_s: float) -> int:
+    """How many measurements a track needs: so many ticks as the least life lasts, and one in a log of one tick."""
+    if len(t_ns) < 3:
+        return 1
+    period_s = float(np.median(np.diff(t_ns))) / NS_PER_S
+    return max(2, min(round(min_life_s / period_s), len(t_ns) // 2))

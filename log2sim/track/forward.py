@@ -31,7 +31,7 @@ TENTATIVE_AGE_S = 0.45
 CONFIRMED_AGE_S = 1.2
 
 
-@dataclass
+@dataclass(eq=False)
 class Tracklet:
     """A growing track: what it was given, its state at the last of it, and when that was."""
 

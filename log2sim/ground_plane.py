@@ -1,0 +1,128 @@
+"""The second pass: every camera's homography, and a place for the obstacles that no LiDAR point fell on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from log2sim.fuse import fuse
+from log2sim.geometry import Array, inverse
+from log2sim.observe import Observed, base_pose
+from log2sim.plan import Plan
+from log2sim.sync import Schedule
+from log2sim.topdown import Correspondences, HomographyFit, fit_camera, locate, refused
+from log2sim.types import TYPICAL_SIZE_M, Camera, Log, Measurements
+
+
+@dataclass(frozen=True, eq=False)
+class CameraGround:
+    """A camera's homography to the ground frame of the ego, and what it was learned from."""
+
+    camera: Camera
+    fit: HomographyFit
+    source: str
+    refusal: str = ""
+
+
+def fit_cameras(
+    log: Log, schedule: Schedule, seen: Observed, plan: Plan, method: str, rng: np.random.Generator
+) -> tuple[Plan, dict[str, CameraGround]]:
+    """Fit the cameras that need it; a refused fit falls back on the calibration, with its reason kept.
+
+    A camera needs it when a detection of it has no LiDAR points; when a top-down picture is asked for, every one does.
+    """
+    if not plan.keeps("homography"):
+        return plan, {}
+    reason = next(s.reason for s in plan.steps if s.stage == "homography")
+    wanted = _cameras_in_need(seen) if "picture" not in reason else set(plan.cameras)
+    if not wanted:
+        return plan.decided(
+            "homography", False, "every detection has LiDAR points, and no top-down picture is asked for"
+        ), {}
+    plan = plan.decided("homography", True, f"{reason}: {', '.join(c for c in plan.cameras if c in wanted)}")
+    return plan, {c: _fit_one(log, schedule, seen, c, method, rng) for c in plan.cameras if c in wanted}
+
+
+def _cameras_in_need(seen: Observed) -> set[str]:
+    return {str(c) for m in seen.measurements for c in m.camera[m.source == ""]}
+
+
+def _fit_one(
+    log: Log, schedule: Schedule, seen: Observed, name: str, method: str, rng: np.random.Generator
+) -> CameraGround:
+    camera = log.cameras[name]
+    feet, ground = Correspondences.join(seen.feet.get(name, [])), Correspondences.join(seen.ground.get(name, []))
+    fit, source = fit_camera(feet, ground, method=method, rng=rng)
+    if fit.ok:
+        return CameraGround(camera, fit, source)
+    calibrated = calibrated_ground(log, camera)
+    if calibrated is None:
+        return CameraGround(camera, fit, "none", fit.reason)
+    return CameraGround(camera, calibrated, "calibration and flat ground", fit.reason)
+
+
+def calibrated_ground(log: Log, camera: Camera) -> HomographyFit | None:
+    """The homography that the calibration gives for flat ground under the ego; None when the camera lies on it."""
+    base_T_cam = camera.mount_T_cam
+    cam_T_base = inverse(base_T_cam)
+    height = base_T_cam[2, 3] - log.ground_z_ego_m
+    if height < 0.2:
+        return None
+    image_H_ground = camera.K @ np.column_stack(
+        [cam_T_base[:3, 0], cam_T_base[:3, 1], cam_T_base[:3, 2] * log.ground_z_ego_m + cam_T_base[:3, 3]]
+    )
+    if np.linalg.cond(image_H_ground) > 1e12:
+        return None
+    h = np.linalg.inv(image_H_ground)
+    h /= np.linalg.norm(h[2])
+    # Depth of the ground point seen at a pixel is 1 / w of the inverse mapping, so w is positive where the ground is ahead.
+    s = np.linalg.svd(h, compute_uv=False)
+    return HomographyFit(True, "", h, refused("", 0).inliers, float("nan"), float(s[0] / s[-1]))
+
+
+def locate_the_rest(
+    log: Log, schedule: Schedule, seen: Observed, homographies: Mapping[str, CameraGround]
+) -> list[Measurements]:
+    """Measurements of all ticks, those without LiDAR points placed by their camera's homography where it is able to."""
+    return [_locate_tick(log, m, homographies) for m in seen.measurements]
+
+
+def _locate_tick(log: Log, m: Measurements, homographies: Mapping[str, CameraGround]) -> Measurements:
+    missing = np.flatnonzero(m.source == "")
+    if len(missing) == 0:
+        return m
+    columns = {k: v.copy() if isinstance(v, np.ndarray) else v for k, v in vars(m).items()}
+    for k in missing:
+        ground = homographies.get(str(m.camera[k]))
+        # A box that the image's lower border cuts has no foot in the image.
+        if ground is None or not ground.fit.ok or m.box_px[k, 3] > ground.camera.height_px - 3:
+            continue
+        base = base_pose(log, int(m.t_ns[k]))
+        placed = locate(
+            ground.fit, ground.camera, m.box_px[k], str(m.category[k]), _stand(log, ground.camera, base, int(m.t_ns[k]))
+        )
+        if placed is None:
+            continue
+        _write(columns, int(k), placed, base, log.ground_z_ego_m, str(m.category[k]))
+    placed_rows = Measurements(**columns)
+    return fuse(placed_rows)
+
+
+def _stand(log: Log, camera: Camera, base: Array, t_ns: int) -> Array:
+    """Where a camera stands (2,) in the ground frame."""
+    map_T_cam, _ = log.map_T_sensor(camera.name, t_ns)
+    return np.asarray((inverse(base) @ map_T_cam[0])[:2, 3], dtype=np.float64)
+
+
+def _write(
+    columns: dict[str, Array], k: int, placed: tuple[Array, Array], base: Array, ground_z: float, category: str
+) -> None:
+    xy, covariance = placed
+    length, width, height = TYPICAL_SIZE_M[category]
+    foot = base[:3, :3] @ np.array([xy[0], xy[1], ground_z]) + base[:3, 3]
+    columns["center_m"][k] = foot + np.array([0, 0, height / 2])
+    columns["size_m"][k] = length, width, height
+    columns["covariance"][k] = base[:2, :2] @ covariance @ base[:2, :2].T
+    columns["source"][k] = "topdown"

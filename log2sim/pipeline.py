@@ -1,0 +1,111 @@
+"""The method on one page: a log in, a scenario and a report out (Bhardwaj & Kalra, and past it)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from log2sim.assemble import Timeline, build_agents
+from log2sim.clock import StageClock
+from log2sim.config import Config
+from log2sim.detect import create_detector
+from log2sim.errors import NothingToReconstruct
+from log2sim.finish import ego_agent, ego_flow, make_scenario, without_doubles
+from log2sim.ground_plane import fit_cameras, locate_the_rest
+from log2sim.observe import observe
+from log2sim.plan import make_plan
+from log2sim.report import make_report
+from log2sim.scenario import Scenario
+from log2sim.sync import synchronize
+from log2sim.track import track
+from log2sim.types import Log
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A reconstructed scenario and the report of the run (`schemas/report-1.json`)."""
+
+    scenario: Scenario
+    report: dict[str, Any]
+
+
+def reconstruct(
+    log: Log, config: Config | None = None, *, picture: bool = False, progress: Progress | None = None
+) -> Result:
+    """Reconstruct the scenario of a log.
+
+    Parameters
+    ----------
+    log : Log
+        From `open_log`.
+    config : Config, optional
+        Settings; the defaults without.
+    picture : bool
+        Whether a top-down picture will be asked for, which needs every camera's homography.
+    progress : callable, optional
+        Called as `progress(stage, done, total)`.
+
+    Raises
+    ------
+    LogError, ConfigError, MissingExtra
+        For logs and settings that cannot work.
+    NothingToReconstruct
+        When neither an ego nor any agent was found.
+    """
+    config, clock = config or Config(), StageClock()
+    tell = progress or (lambda stage, done, total: None)
+    plan = make_plan(log, config, picture=picture)
+    detector = create_detector(
+        config.detect.name,
+        log,
+        min_score=config.detect.min_score or None,
+        tiles=config.detect.tiles or "auto",
+        layout=config.detect.layout or None,
+    )
+    with clock.stage("sync"):
+        schedule = synchronize(
+            log,
+            plan.cameras,
+            reference=config.sync.reference,
+            max_residual_s=config.sync.max_residual_s,
+            start_s=config.start_s,
+            stop_s=config.stop_s,
+        )
+    timeline = Timeline(schedule.t_ns, int(schedule.t_ns[0]))
+    seen = observe(
+        log,
+        schedule,
+        detector,
+        plan,
+        mode=config.measure.mode,
+        max_range_m=config.measure.max_range_m,
+        clock=clock,
+        progress=lambda done, total: tell("detect and measure", done, total),
+    )
+    with clock.stage("topdown"):
+        plan, homographies = fit_cameras(
+            log, schedule, seen, plan, config.topdown.method, np.random.default_rng(config.seed)
+        )
+        measurements = locate_the_rest(log, schedule, seen, homographies)
+    with clock.stage("track"):
+        tracks = track(
+            measurements,
+            schedule.t_ns,
+            birth_score=config.track.birth_score,
+            max_gap_s=config.track.max_gap_s,
+            min_life_s=config.track.min_life_s,
+        )
+    with clock.stage("smooth"):
+        built = build_agents(tracks, seen.obstacles, timeline, ego_flow(log, schedule), smooth=config.smooth.enabled)
+        agents = without_doubles(built)
+        ego = ego_agent(log, timeline)
+    if ego is None and not agents:
+        raise NothingToReconstruct(f"{log.name}: no ego poses, and no object was detected in {len(schedule)} ticks")
+    scenario = make_scenario(log, schedule, config, plan, detector, homographies, ego, agents)
+    report = make_report(log, schedule, config, plan, seen, homographies, scenario, clock)
+    return Result(scenario, report)

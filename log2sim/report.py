@@ -1,0 +1,92 @@
+"""What a run took and what can be known of its quality without truth, as `report.json` holds it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+import log2sim
+from log2sim.clock import StageClock
+from log2sim.config import Config
+from log2sim.files import rounded
+from log2sim.geometry import NS_PER_S
+from log2sim.ground_plane import CameraGround
+from log2sim.observe import Observed
+from log2sim.plan import Plan
+from log2sim.scenario import Scenario
+from log2sim.sync import Schedule
+from log2sim.topdown import jitter_m
+from log2sim.types import Log
+
+DETECTOR_STAGES = ("detect",)
+
+
+def make_report(
+    log: Log,
+    schedule: Schedule,
+    config: Config,
+    plan: Plan,
+    seen: Observed,
+    homographies: Mapping[str, CameraGround],
+    scenario: Scenario,
+    clock: StageClock,
+) -> dict[str, Any]:
+    """Assemble the report of a finished run."""
+    ticks, total = len(schedule), clock.total()
+    detecting = sum(clock.seconds.get(s, 0.0) for s in DETECTOR_STAGES)
+    return {
+        "report_version": 1,
+        "log": {"name": log.name, "format": log.format, "digest": log.digest, "notes": list(log.notes)},
+        "log2sim_version": log2sim.__version__,
+        "ticks": ticks,
+        "duration_s": (int(schedule.t_ns[-1]) - int(schedule.t_ns[0])) / NS_PER_S,
+        "seconds": round(total, 4),
+        "ticks_per_second": round(ticks / total, 3),
+        "ticks_per_second_without_detector": round(ticks / max(total - detecting, 1e-9), 3),
+        "stages": clock.table(ticks),
+        "plan": plan.to_list(),
+        "sync": {"reference": schedule.reference, "streams": schedule.summary()},
+        "unreadable": seen.records.summary() if seen.records is not None else {},
+        "detections": seen.detections,
+        "homography": {name: _homography_entry(g, config.topdown.method) for name, g in homographies.items()},
+        "measurements": _measurement_counts(seen),
+        "agents": _agent_counts(scenario),
+    }
+
+
+def _homography_entry(ground: CameraGround, method: str) -> dict[str, Any]:
+    fit = ground.fit
+    return {
+        "method": method,
+        "ok": fit.ok,
+        "source": ground.source,
+        "refused": ground.refusal or None,
+        "correspondences": len(fit.inliers),
+        "inliers": int(fit.inliers.sum()),
+        "error_m": rounded(fit.error_m, 4),
+        "jitter_m": rounded(jitter_m(fit), 4),
+        "condition": rounded(fit.condition, 3),
+    }
+
+
+def _measurement_counts(seen: Observed) -> dict[str, Any]:
+    sources = np.concatenate([m.source for m in seen.measurements]) if seen.measurements else np.zeros(0, dtype="<U16")
+    return {"total": len(sources), "with_lidar": int((sources == "lidar").sum())}
+
+
+def _agent_counts(scenario: Scenario) -> dict[str, Any]:
+    agents = scenario.others
+    categories = sorted({a.category for a in agents})
+    flagged = {a.id: list(a.quality["flags"]) for a in scenario.agents if a.quality.get("flags")}
+    residuals = [
+        a.quality["smoothing_residual_rms_m"] for a in agents if a.quality.get("smoothing_residual_rms_m") is not None
+    ]
+    return {
+        "total": len(agents),
+        "static": sum(a.static for a in agents),
+        "by_category": {c: sum(a.category == c for a in agents) for c in categories},
+        "smoothing_residual_median_m": rounded(float(np.median(residuals)), 4) if residuals else None,
+        "infeasible": flagged,
+    }
