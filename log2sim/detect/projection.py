@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.camera import NEAREST_DEPTH_M, project
-from log2sim.geometry import Array, apply, box_corners
+from log2sim.geometry import Array, apply, box_corners, inverse, points_in_box
 from log2sim.types import Camera
 
 # Corners as `box_corners` orders them: bottom 0-3, top 4-7, each counter-clockwise from the front left.
@@ -36,7 +36,8 @@ def project_boxes(center_m: Array, size_m: Array, yaw_rad: Array, camera: Camera
 
     Notes
     -----
-    A box is clipped to the view before it is projected, so one that reaches behind the camera keeps its visible part.
+    A box is clipped to the view before it is projected, so one that reaches behind the camera keeps its visible part. A
+    box around the camera is the vehicle that carries it and is not valid.
     """
     count = len(center_m)
     box, outlines = np.full((count, 4), np.nan), [np.zeros((0, 2))] * count
@@ -44,7 +45,10 @@ def project_boxes(center_m: Array, size_m: Array, yaw_rad: Array, camera: Camera
     corners = box_corners(center_m, size_m, yaw_rad) if count else np.zeros((0, 8, 3))
     planes = view_planes(camera)
     limit = np.array([camera.width_px, camera.height_px], dtype=np.float64)
+    camera_map = inverse(cam_T_map)[None, :3, 3]
     for i in range(count):
+        if points_in_box(camera_map, center_m[i], size_m[i], float(yaw_rad[i]))[0]:
+            continue
         corners_cam = apply(cam_T_map, corners[i])
         vertices = clip_box(corners_cam, planes)
         uv = project(camera, vertices)[0] if len(vertices) else np.zeros((0, 2))
@@ -72,7 +76,7 @@ def clip_box(corners_cam: Array, planes: Array) -> Array:
 
     Notes
     -----
-    Sutherland-Hodgman on each face. A view that lies wholly inside a box leaves nothing.
+    Sutherland-Hodgman on each face.
     """
     inside = corners_cam @ planes[:, :3].T + planes[:, 3] >= 0
     if inside.all():

