@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
-from matplotlib.ticker import MaxNLocator, ScalarFormatter
+from matplotlib.ticker import FuncFormatter, MultipleLocator
 
 from log2sim.plot.cast import Cast, Role
 from log2sim.plot.look import (
@@ -58,7 +58,7 @@ def make_sheet(view: View, legend_rows: int, *, projected: bool) -> Sheet:
     fitted = view.fitted(map_width * 72, map_height * 72)
     ax.set(xlim=(fitted.x0, fitted.x1), ylim=(fitted.y0, fitted.y1), facecolor="#FBFCFD")
     ax.set_aspect("equal", adjustable="box")
-    _axes_style(ax, projected)
+    _axes_style(ax, fitted, projected)
     return Sheet(figure, canvas, ax, fitted)
 
 
@@ -133,16 +133,18 @@ def draw_scale_and_north(sheet: Sheet, *, projected: bool) -> None:
         column.text(nx, ny + 0.44, "N", ha="center", **{**style, "fontsize": 8.5, "fontweight": "bold"})
 
 
-def _axes_style(ax: Axes, projected: bool) -> None:
+def _axes_style(ax: Axes, view: View, projected: bool) -> None:
     names = ("east", "north") if projected else ("map x", "map y")
     ax.set_axisbelow(True)
     ax.grid(True, color=GRID, lw=0.7)
-    for axis, name in zip((ax.xaxis, ax.yaxis), names):
-        axis.set_major_locator(MaxNLocator(nbins=9, steps=[1, 2, 5, 10]))
-        formatter = ScalarFormatter(useOffset=False)
-        formatter.set_scientific(False)
-        axis.set_major_formatter(formatter)
-        axis.set_label_text(f"{name} (m)", fontsize=7.5, color=MUTED, family=FONT)
+    step_m = nice_step(max(view.width_m, view.height_m) / 5)
+    for axis, name, low in zip((ax.xaxis, ax.yaxis), names, (view.x0, view.y0)):
+        # Numbers of seven digits say nothing; what is common to them goes into the axis' name.
+        base_m = float(np.floor(low / 1000) * 1000) if abs(low) >= 1e5 else 0.0
+        axis.set_major_locator(MultipleLocator(step_m))
+        axis.set_major_formatter(FuncFormatter(lambda v, _, base_m=base_m: f"{v - base_m:.6g}".replace("-", "−")))
+        since = f" − {base_m:.0f}" if base_m > 0 else f" + {-base_m:.0f}" if base_m < 0 else ""
+        axis.set_label_text(f"{name}{since} (m)", fontsize=7.5, color=MUTED, family=FONT)
     ax.tick_params(labelsize=7, colors=MUTED, length=2.5, width=0.6, labelfontfamily=FONT)
     for spine in ax.spines.values():
         spine.set(color=FRAME, linewidth=0.8)

@@ -111,15 +111,27 @@ def look_up(
 
 
 def _distorted(camera: Camera, u: Array, v: Array, front: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Distort pixels; those that a pinhole of three times the view would not see stay outside the image."""
+    """Distort pixels; those beyond the radius where the lens model folds back stay outside the image."""
     uv = np.stack([u[front], v[front]], axis=1).astype(np.float64)
     xy = (uv - camera.K[:2, 2]) @ np.linalg.inv(camera.K[:2, :2]).T
-    half_view = 1.5 * np.array([camera.width_px / camera.K[0, 0], camera.height_px / camera.K[1, 1]])
-    seen = np.all(np.abs(xy) <= half_view, axis=1)
+    seen = np.hypot(xy[:, 0], xy[:, 1]) < fold_radius(camera)
     bent = distort(camera, np.where(seen[:, None], xy, 0.0)) @ camera.K[:2, :2].T + camera.K[:2, 2]
     out = np.full((2, *u.shape), -1e6)
     out[:, front] = np.where(seen[:, None], bent, -1e6).T
     return out[0], out[1]
+
+
+def fold_radius(camera: Camera, largest: float = 8.0) -> float:
+    """Radius in normalized coordinates up to which the lens model moves outwards, at most `largest`.
+
+    Notes
+    -----
+    Beyond it the polynomial turns back and would show the far side of the road inside the image a second time.
+    """
+    r = np.linspace(0.0, largest, 1601)
+    bent = np.hypot(*distort(camera, np.column_stack([r, np.zeros_like(r)])).T)
+    falling = np.flatnonzero(np.diff(bent) <= 0)
+    return float(r[falling[0]]) if len(falling) else largest
 
 
 def seen_window(

@@ -1,0 +1,304 @@
+"""Pictures of scenarios: formats, what they show, and that a failure leaves nothing behind."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from log2sim.errors import ConfigError
+from log2sim.plot import plot_tracks, shapes
+from log2sim.plot.cast import assign
+from log2sim.plot.look import PALETTE, printable
+from log2sim.plot.sheet import Sheet
+from log2sim.plot.tracks import still
+from log2sim.plot.view import View, choose_view, nice_step, time_step_s
+from log2sim.scenario import Agent, Scenario, Waypoints
+from log2sim.types import TYPICAL_SIZE_M, MapFrame
+
+
+def make_agent(
+    name: str, start: tuple[float, float], velocity: tuple[float, float], *, category: str = "car", count: int = 21
+) -> Agent:
+    t = np.arange(count) * 0.1
+    vx, vy = velocity
+    n, speed = np.ones(count), float(np.hypot(vx, vy))
+    waypoints = Waypoints(
+        t,
+        start[0] + vx * t,
+        start[1] + vy * t,
+        0.8 * n,
+        np.arctan2(vy, vx) * n,
+        speed * n,
+        np.ones(count, dtype=bool),
+        0.1 * n,
+    )
+    return Agent(name, category, TYPICAL_SIZE_M[category], waypoints, static=speed == 0)
+
+
+def make_scenario(*agents: Agent, name: str = "scene") -> Scenario:
+    return Scenario(name, 0, 2.0, agents)
+
+
+def crossing() -> Scenario:
+    return make_scenario(
+        make_agent("ego", (-10, 0), (10, 0)),
+        make_agent("1", (15, 4), (-8, 0)),
+        make_agent("2", (3, -12), (0, 1.4), category="pedestrian"),
+        make_agent("p", (0, 8), (0, 0)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("suffix", "magic"),
+    [(".png", b"\x89PNG"), (".svg", b"<?xml"), (".pdf", b"%PDF"), (".gif", b"GIF89a"), (".MP4", b"")],
+)
+def test_the_suffix_chooses_the_format(tmp_path: Path, suffix: str, magic: bytes) -> None:
+    out = tmp_path / f"tracks{suffix}"
+    plot_tracks(crossing(), out)
+    assert out.read_bytes().startswith(magic)
+    assert out.stat().st_size > 5000
+    assert [p.name for p in tmp_path.iterdir()] == [out.name]
+
+
+def test_a_png_is_2000_px_wide(tmp_path: Path) -> None:
+    from PIL import Image
+
+    plot_tracks(crossing(), tmp_path / "a.png")
+    with Image.open(tmp_path / "a.png") as image:
+        assert image.width == 2000
+
+
+def test_a_gif_runs_in_real_time(tmp_path: Path) -> None:
+    from PIL import Image
+
+    plot_tracks(crossing(), tmp_path / "a.gif")
+    with Image.open(tmp_path / "a.gif") as image:
+        assert image.n_frames == 21  # 0.0, 0.1 ... 2.0 s
+        assert image.info["duration"] == 100
+        assert max(image.size) <= 1000
+
+
+def test_an_mp4_reads_back_with_all_frames(tmp_path: Path) -> None:
+    import cv2
+
+    plot_tracks(crossing(), tmp_path / "a.mp4")
+    video = cv2.VideoCapture(str(tmp_path / "a.mp4"))
+    count = 0
+    while video.read()[0]:
+        count += 1
+    video.release()
+    assert count == 21
+
+
+@pytest.mark.parametrize("suffix", [".svg", ".png"])
+def test_the_same_scenario_gives_the_same_bytes(tmp_path: Path, suffix: str) -> None:
+    for name in ("a", "b"):
+        plot_tracks(crossing(), tmp_path / f"{name}{suffix}")
+    assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
+
+
+def test_an_unknown_suffix_lists_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"\.png, \.svg, \.pdf.*\.gif, \.mp4.*'\.bmp'"):
+        plot_tracks(crossing(), tmp_path / "a.bmp")
+
+
+def test_an_existing_file_stays_unless_overwrite_is_asked_for(tmp_path: Path) -> None:
+    out = tmp_path / "a.png"
+    out.write_bytes(b"mine")
+    with pytest.raises(ConfigError, match="--overwrite"):
+        plot_tracks(crossing(), out)
+    assert out.read_bytes() == b"mine"
+    plot_tracks(crossing(), out, overwrite=True)
+    assert out.read_bytes() != b"mine"
+
+
+@pytest.mark.parametrize("suffix", [".png", ".gif"])
+def test_a_failure_leaves_the_old_file_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
+) -> None:
+    out = tmp_path / f"a{suffix}"
+    out.write_bytes(b"good")
+
+    def fail(*args: object, **kwargs: object) -> None:
+        raise RuntimeError("disk")
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", fail)
+    monkeypatch.setattr("log2sim.plot.animate.Stage.show", fail)
+    with pytest.raises(RuntimeError, match="disk"):
+        plot_tracks(crossing(), out, overwrite=True)
+    assert out.read_bytes() == b"good"
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def draw(scenario: Scenario, **overlays: object) -> Sheet:
+    return still(scenario, assign(scenario), **overlays)  # type: ignore[arg-type]
+
+
+def texts(sheet: Sheet) -> list[str]:
+    return [t.get_text() for legend in sheet.figure.legends for t in legend.get_texts()]
+
+
+def test_the_view_holds_every_mover_and_equal_meters_on_both_axes() -> None:
+    sheet = draw(crossing())
+    x0, x1 = sheet.ax.get_xlim()
+    y0, y1 = sheet.ax.get_ylim()
+    for agent in crossing().agents:
+        w = agent.waypoints
+        assert x0 < w.x_m.min() - 2 < w.x_m.max() + 2 < x1
+        assert y0 < w.y_m.min() - 1 < w.y_m.max() + 1 < y1
+    box = sheet.ax.get_window_extent()
+    assert box.width / (x1 - x0) == pytest.approx(box.height / (y1 - y0), rel=1e-6)
+
+
+def test_an_outlier_does_not_blow_up_the_view_and_is_reported() -> None:
+    scenario = make_scenario(*crossing().agents, make_agent("99", (5000, 0), (5, 0)))
+    assert choose_view(assign(scenario)) == choose_view(assign(crossing()))
+    assert "1 outside this view" in texts(draw(scenario))
+
+
+def test_far_map_coordinates_shift_the_view_and_nothing_else() -> None:
+    def shifted(agent: Agent) -> Agent:
+        w = agent.waypoints
+        return dataclasses.replace(agent, waypoints=dataclasses.replace(w, x_m=w.x_m + 5e5, y_m=w.y_m - 4e6))
+
+    near = choose_view(assign(crossing()))
+    far = choose_view(assign(make_scenario(*(shifted(a) for a in crossing().agents))))
+    assert (far.x0, far.x1, far.y0, far.y1) == pytest.approx(
+        (near.x0 + 5e5, near.x1 + 5e5, near.y0 - 4e6, near.y1 - 4e6), abs=1e-6
+    )
+
+
+def many(count: int) -> Scenario:
+    rng = np.random.default_rng(7)
+    return make_scenario(
+        make_agent("ego", (0, 0), (10, 0)),
+        *(
+            make_agent(f"id-{k:05d}", tuple(rng.uniform(-80, 80, 2)), tuple(rng.uniform(2, 9, 2)), count=5)
+            for k in range(count)
+        ),
+    )
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        make_scenario(),
+        make_scenario(make_agent("ego", (0, 0), (0, 0), count=1)),
+        make_scenario(make_agent("ego", (0, 0), (0, 0)), make_agent("1", (3, 3), (4, 1))),
+        make_scenario(*crossing().others),
+        make_scenario(
+            make_agent("ego", (0, -3), (12, 0)), *(make_agent(f"p{k}", (5 * k, 0), (0, 0)) for k in range(100))
+        ),
+        make_scenario(*crossing().agents, name="price $5$ of 日本\nand more"),
+    ],
+    ids=["nobody", "one waypoint", "ego stands", "no ego", "100 parked", "odd name"],
+)
+@pytest.mark.parametrize("suffix", [".png", ".gif"])
+def test_every_kind_of_scene_can_be_drawn(tmp_path: Path, scenario: Scenario, suffix: str) -> None:
+    plot_tracks(scenario, tmp_path / f"a{suffix}", dpi=60)
+
+
+def test_a_crowd_of_500_is_summed_up_in_the_legend() -> None:
+    rows = texts(draw(many(500)))
+    assert f"{500 - len(PALETTE)} more moving, farther off" in rows
+    assert len(rows) <= len(PALETTE) + 8
+
+
+def test_labels_do_not_overlap() -> None:
+    sheet = draw(many(40))
+    sheet.canvas.draw()
+    labels = [t for t in sheet.ax.texts if t.get_fontweight() == "bold"]
+    assert len(labels) > 10
+    boxes = [t.get_window_extent() for t in labels]
+    for i, a in enumerate(boxes):
+        # Letters of the box's edge may touch; a shared area of more than a pixel or two is an overlap.
+        assert not any(
+            min(a.x1, b.x1) - max(a.x0, b.x0) > 2 and min(a.y1, b.y1) - max(a.y0, b.y0) > 2 for b in boxes[:i]
+        )
+
+
+def test_the_legend_stands_beside_the_map() -> None:
+    sheet = draw(many(500))
+    sheet.canvas.draw()
+    legend = sheet.figure.legends[0].get_window_extent()
+    assert legend.x0 >= sheet.ax.get_window_extent().x1
+    assert legend.x1 <= sheet.figure.bbox.x1
+    assert legend.y0 >= 0
+
+
+def test_overlays_get_a_line_in_the_legend() -> None:
+    scenario = crossing()
+    replay = types.SimpleNamespace(
+        agents=[
+            types.SimpleNamespace(id=a.id, **{k: getattr(a.waypoints, k) for k in ("t_s", "x_m", "y_m", "yaw_rad")})
+            for a in scenario.agents
+        ]
+    )
+    assert not {"truth", "replay"} & set(texts(draw(scenario)))
+    assert {"truth", "replay"} <= set(texts(draw(scenario, truth=scenario, replay=replay)))
+
+
+def test_overlays_can_be_animated(tmp_path: Path) -> None:
+    scenario = crossing()
+    columns = {k: getattr(scenario.agents[0].waypoints, k) for k in ("t_s", "x_m", "y_m", "yaw_rad")}
+    replay = types.SimpleNamespace(agents=[types.SimpleNamespace(id="ego", **columns)])
+    plot_tracks(scenario, tmp_path / "a.gif", truth=scenario, replay=replay)
+
+
+def test_north_is_named_only_when_the_map_knows_it() -> None:
+    local = draw(crossing())
+    known = draw(dataclasses.replace(crossing(), map=MapFrame(49.0, 8.4, 0.0, "+proj=tmerc")))
+    assert (local.ax.get_xlabel(), known.ax.get_ylabel()) == ("map x (m)", "north (m)")
+    assert "N" in [t.get_text() for ax in known.figure.axes for t in ax.texts]
+    assert "N" not in [t.get_text() for ax in local.figure.axes for t in ax.texts]
+
+
+def test_boxes_have_the_real_size_and_heading() -> None:
+    agent = make_agent("1", (3.0, 4.0), (0.0, 2.0))  # drives north: length 4.4 along y, width 1.85 along x
+    corners = shapes.boxes(agent, (3.0, 4.0), np.pi / 2)[0]
+    expected = [(3 - 0.925, 4 + 2.2), (3 - 0.925, 4 - 2.2), (3 + 0.925, 4 - 2.2), (3 + 0.925, 4 + 2.2)]
+    np.testing.assert_allclose(corners, expected, atol=1e-12)
+    assert shapes.noses(corners[None])[0, 2] == pytest.approx((3.0, 6.2))
+
+
+def test_arrows_point_the_way_of_travel() -> None:
+    xy = np.column_stack([np.linspace(50, 0, 51), np.zeros(51)])
+    heads = shapes.arrows(xy, View(0, 50, -10, 10, m_per_pt=0.1))
+    assert len(heads) == 5  # 500 pt of way, one each 110 pt
+    assert all(head[0, 0] < head[[1, 3], 0].min() for head in heads)
+
+
+def test_filled_gaps_are_split_from_what_was_seen() -> None:
+    agent = make_agent("1", (0.0, 0.0), (1.0, 0.0), count=6)
+    observed = np.array([True, True, False, False, True, True])
+    agent = dataclasses.replace(agent, waypoints=dataclasses.replace(agent.waypoints, observed=observed))
+    seen, filled = shapes.seen_and_filled(agent)
+    assert [part[:, 0].round(6).tolist() for part in seen] == [[0.0, 0.1], [0.4, 0.5]]
+    assert [part[:, 0].round(6).tolist() for part in filled] == [[0.1, 0.2, 0.3, 0.4]]
+
+
+def test_colors_of_movers_are_distinct_and_keep_to_rank() -> None:
+    cast = assign(many(20))
+    assert len({role.color for role in cast.movers}) == 21
+    nearest = assign(
+        make_scenario(
+            make_agent("ego", (0, 0), (10, 0)), make_agent("a", (0, 50), (5, 0)), make_agent("b", (0, 5), (5, 0))
+        )
+    )
+    assert [role.agent.id for role in nearest.movers] == ["ego", "b", "a"]
+
+
+def test_steps_are_round_numbers() -> None:
+    assert [nice_step(v) for v in (0.9, 1.0, 3.2, 7.0, 49.9, 100.0)] == [0.5, 1.0, 2.0, 5.0, 20.0, 100.0]
+    assert time_step_s(6.0, 3, 10.0, 0.05) == 1.0
+    assert time_step_s(6.0, 3, 10.0, 5.0) == 5.0  # 45 m between marks of a car at 10 m/s
+    assert time_step_s(120.0, 50, 10.0, 0.05) == 20.0
+
+
+def test_letters_that_the_font_lacks_become_question_marks() -> None:
+    assert printable("Straße 日 \n x") == "Straße ? x"
+    assert len(printable("x" * 500)) == 80
