@@ -85,15 +85,15 @@ def _paint_ground(scene: Scene, low: Array, shape: tuple[int, int], rng: np.rand
     image[curb & (sidewalk > 0)] = (172, 176, 178)
     image[asphalt > 0] = ASPHALT
     image[white > 0] = MARKING
-    return _weathered(image, rng)
+    return _weathered(image, rng, 0.022)
 
 
-def _weathered(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+def _weathered(image: NDArray[np.uint8], rng: np.random.Generator, grain: float) -> NDArray[np.uint8]:
     """Grain, stains and patches of many sizes."""
     h, w = image.shape[:2]
-    shade = rng.normal(0, 0.035, (h, w)).astype(np.float32)
-    for size, sigma in ((6, 0.03), (40, 0.03), (200, 0.035)):
-        coarse = rng.normal(0, sigma, (h // size + 2, w // size + 2)).astype(np.float32)
+    shade = rng.standard_normal((h, w), dtype=np.float32) * np.float32(grain)
+    for size, share in ((6, 0.8), (40, 1.3), (200, 1.7)):
+        coarse = rng.normal(0, share * grain, (h // size + 2, w // size + 2)).astype(np.float32)
         shade += cv2.resize(coarse, (w, h), interpolation=cv2.INTER_CUBIC)
     return np.clip(image * (1 + shade[..., None]), 0, 255).astype(np.uint8)
 
@@ -157,7 +157,7 @@ def _facade(length_m: float, height_m: float, color: Sequence[int], rng: np.rand
             image[pane[0] : pane[1], pane[2] : pane[3]] = np.clip(ramp * np.array((112, 100, 88)), 0, 255)
             middle = (pane[2] + pane[3]) // 2
             image[pane[0] : pane[1], middle - 1 : middle + 1] = np.minimum(np.array(color[::-1]) * 1.05, 255)
-    return _weathered(image, rng)
+    return _weathered(image, rng, 0.012)
 
 
 def linear_table() -> NDArray[np.float32]:

@@ -280,5 +280,5 @@ def _developed(color: NDArray[np.float32], rng: np.random.Generator) -> NDArray[
     image = cv2.resize(color, (w, h), interpolation=cv2.INTER_AREA)
     image = cv2.GaussianBlur(image, (0, 0), 0.45)
     image = 255 * np.clip(image, 0, 1) ** np.float32(1 / GAMMA)
-    grain = rng.standard_normal((h, w), dtype=np.float32)[..., None] * np.float32(1.2)
+    grain = rng.standard_normal((h, w), dtype=np.float32)[..., None] * np.float32(0.8)
     return np.clip(np.rint(image + grain), 0, 255).astype(np.uint8)

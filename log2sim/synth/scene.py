@@ -145,7 +145,7 @@ class LidarSpec:
     range_m: float = _of("number", 80.0, low=1, high=500)
     noise_m: float = _of("number", 0.02, low=0, high=1)
     dropout: float = _of("number", 0.03, low=0, high=0.99)
-    resolution_m: float = _of("number", 0.004, low=0, high=0.1)
+    resolution_m: float = _of("number", 0.01, low=0, high=0.1)
 
 
 @dataclass(frozen=True)
