@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from log2sim.types import Camera, Log, Stream
 CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt")
 REFERENCE_CAMERAS = ("image_02", "image_00", "image_03", "image_01")
 MARK = "*_drive_*_sync"
+_NOT_A_TIME = np.iinfo(np.int64).min
 
 
 class KittiRawReader:
@@ -153,10 +153,10 @@ def _stamps(path: Path) -> NDArray[np.int64]:
         lines.pop()
     stamps = np.zeros(len(lines), dtype=np.int64)
     for k, line in enumerate(lines):
-        stamp = np.datetime64("NaT", "ns")
-        with suppress(ValueError):
-            stamp = np.datetime64(line.strip().replace(" ", "T"), "ns")
-        if np.isnat(stamp):
+        try:
+            stamps[k] = np.array([line.strip().replace(" ", "T")], dtype="datetime64[ns]").astype(np.int64)[0]
+        except ValueError:
+            stamps[k] = _NOT_A_TIME
+        if stamps[k] == _NOT_A_TIME:
             raise LogError(f"{path}, line {k + 1}: '{line.strip()[:40]}', expected YYYY-MM-DD HH:MM:SS.nnnnnnnnn")
-        stamps[k] = stamp.astype(np.int64)
     return stamps

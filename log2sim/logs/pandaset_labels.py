@@ -1,0 +1,140 @@
+"""PandaSet's cuboids as labels: sizes and yaws turned to our axes, each at the time at which the LiDAR saw it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.errors import LogError
+from log2sim.geometry import Array, apply, inverse, wrap_angle
+from log2sim.logs.unpickle import Columns, read_pickled_table
+from log2sim.types import Labels
+
+PERIOD_NS = 100_000_000
+SHORTEST_STEP_NS = 20_000_000
+
+CATEGORY_OF = {
+    "Car": "car",
+    "Pickup Truck": "truck",
+    "Medium-sized Truck": "truck",
+    "Semi-truck": "truck",
+    "Bus": "bus",
+    "Motorcycle": "motorcycle",
+    "Motorized Scooter": "motorcycle",
+    "Pedestrian": "pedestrian",
+    "Pedestrian with Object": "pedestrian",
+    "Emergency Vehicle": "other",
+    "Other Vehicle - Construction Vehicle": "other",
+    "Other Vehicle - Pedicab": "other",
+    "Other Vehicle - Uncommon": "other",
+    "Personal Mobility Device": "other",
+    "Towed Object": "other",
+    "Train": "other",
+    "Tram / Subway": "other",
+}
+# Things that are no road users.
+LEFT_OUT = {
+    "Animals - Bird", "Animals - Other", "Cones", "Construction Signs", "Pylons", "Road Barriers", "Rolling Containers",
+    "Signs", "Temporary Construction Barriers",
+}  # fmt: skip
+COLUMNS = (
+    "uuid", "label", "yaw", "position.x", "position.y", "position.z", "dimensions.x", "dimensions.y", "dimensions.z",
+    "attributes.rider_status", "cuboids.sibling_id", "cuboids.sensor_id",
+)  # fmt: skip
+GT_SENSOR = 1
+
+
+def read_labels(
+    files: dict[int, Path], t_ns: NDArray[np.int64], gt_t_ns: NDArray[np.int64], map_T_lidar: Array, notes: list[str]
+) -> Labels:
+    """Labels of the cuboid files by number of sweep.
+
+    Parameters
+    ----------
+    files : mapping of the sweep's number to its cuboids
+    t_ns, gt_t_ns : (N,) int64
+        Stamps of the sweeps of the Pandar64 and of the PandarGT.
+    map_T_lidar : (N, 4, 4)
+        Poses of the Pandar64 at `t_ns`.
+    notes : list of str
+        Takes what was left out.
+
+    Notes
+    -----
+    A cuboid fits the points where they were measured, and the Pandar64 sees different directions at different times; on
+    moving cars of sequence 002 `azimuth_offset_ns` is off the time of the points inside the box by 0.5 +- 0.4 ms. Of an object
+    with a cuboid for each LiDAR the Pandar64's is kept.
+    """
+    parts = []
+    unknown: set[str] = set()
+    for number, path in files.items():
+        if number < len(t_ns):
+            table = _checked(read_pickled_table(path, LogError), path)
+            parts.append(_frame(table, int(t_ns[number]), int(gt_t_ns[number]), map_T_lidar[number], unknown))
+    if unknown:
+        notes.append(f"labels left out because their kind is not known: {', '.join(sorted(unknown))}")
+    columns = [np.concatenate([p[k] for p in parts]) for k in range(6)] if parts else None
+    if columns is None:
+        raise LogError(f"{next(iter(files.values())).parent}: no cuboids of the sweeps of this log")
+    keep = _increasing(columns[0], columns[1])
+    return Labels(*(c[keep] for c in columns))
+
+
+def azimuth_offset_ns(xyz_lidar: Array) -> NDArray[np.int64]:
+    """When (N,) the Pandar64 saw directions (N, 3), relative to the stamp of its sweep.
+
+    It turns clockwise once in 0.1 s and passes the rear at the stamp.
+    """
+    turned = (np.arctan2(xyz_lidar[:, 1], xyz_lidar[:, 0]) + np.pi) / (2 * np.pi)
+    return np.round(-turned * PERIOD_NS).astype(np.int64)
+
+
+def _checked(table: Columns, path: Path) -> Columns:
+    for name in COLUMNS:
+        if name not in table:
+            raise LogError(f"{path}: no column '{name}'; expected cuboids with {', '.join(COLUMNS)}")
+    numbers = [n for n in COLUMNS if n.startswith(("yaw", "position", "dimensions"))]
+    for name in numbers:
+        if table[name].dtype.kind not in "fiu" or not np.isfinite(table[name]).all():
+            raise LogError(f"{path}, column '{name}': expected finite numbers")
+    return table
+
+
+def _frame(c: Columns, t_ns: int, gt_t_ns: int, map_T_lidar: Array, unknown: set[str]) -> tuple[NDArray[Any], ...]:
+    """Stamps, track ids, categories, centers, sizes and yaws of one sweep's cuboids."""
+    category = np.array(
+        [_category(str(k), str(r)) for k, r in zip(c["label"], c["attributes.rider_status"])], dtype="<U16"
+    )
+    unknown.update(str(k) for k, word in zip(c["label"], category) if not word and str(k) not in LEFT_OUT)
+    uuid, sibling = c["uuid"].astype(np.str_), c["cuboids.sibling_id"].astype(np.str_)
+    of_gt = c["cuboids.sensor_id"] == GT_SENSOR
+    twin = of_gt & np.isin(sibling, uuid[~of_gt])
+    # A cuboid of the PandarGT alone still belongs to the track of its twin.
+    track_id = np.where(of_gt & (np.char.str_len(sibling) > 1), sibling, uuid)
+    center = np.stack([c[f"position.{k}"] for k in "xyz"], axis=1).astype(np.float64)
+    stamp = np.where(of_gt, gt_t_ns, t_ns + azimuth_offset_ns(apply(inverse(map_T_lidar), center)))
+    # The data set's x is the width and its y the length; a yaw of 0 faces +y.
+    size = np.stack([c["dimensions.y"], c["dimensions.x"], c["dimensions.z"]], axis=1).astype(np.float64)
+    yaw = wrap_angle(c["yaw"] + np.pi / 2)
+    keep = (category != "") & ~twin & (size > 0).all(axis=1)
+    return tuple(column[keep] for column in (stamp, track_id, category, center, size, yaw))
+
+
+def _category(label: str, rider: str) -> str:
+    if label == "Bicycle":
+        return "cyclist" if rider == "With Rider" else "bicycle"
+    return CATEGORY_OF.get(label, "")
+
+
+def _increasing(t_ns: NDArray[np.int64], track_id: NDArray[np.str_]) -> NDArray[np.intp]:
+    """Rows to keep so that the stamps of each track increase: one that passes the rear is seen twice within a few ms."""
+    last: dict[str, int] = {}
+    keep = []
+    for row, (t, track) in enumerate(zip(t_ns.tolist(), track_id.tolist())):
+        if track not in last or t - last[track] >= SHORTEST_STEP_NS:
+            last[track] = t
+            keep.append(row)
+    return np.array(keep, dtype=np.intp)

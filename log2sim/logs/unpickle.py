@@ -1,0 +1,247 @@
+"""Tables out of pickled pandas DataFrames, without pandas and without running anything that a pickle names.
+
+Every class that a pickled table refers to is replaced by a small part of our own that only stores its state, so the version
+of pandas or NumPy that wrote the file does not matter, and any other class is refused by name.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+import re
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.errors import LogError, RecordError
+
+LIMIT_BYTES = 512 * 1024 * 1024
+
+Columns = dict[str, NDArray[Any]]
+
+
+def read_pickled_table(path: Path, error: type[LogError] = RecordError, limit_bytes: int = LIMIT_BYTES) -> Columns:
+    """Columns (N,) by name of a DataFrame in a .pkl or .pkl.gz file.
+
+    Raises
+    ------
+    RecordError or `error`
+        When the file is missing, larger than `limit_bytes` once unpacked, no table, or names a class that tables do not need.
+    """
+    try:
+        if path.stat().st_size > limit_bytes:
+            raise error(f"{path}: {path.stat().st_size} bytes, more than the {limit_bytes} that a table may have")
+        packed = path.read_bytes()
+    except OSError as problem:
+        raise error(f"{path}: cannot be read: {problem.strerror}") from None
+    try:
+        data = _gunzip(packed, limit_bytes) if packed[:2] == b"\x1f\x8b" else packed
+        table = _TableUnpickler(io.BytesIO(data)).load()
+        return _columns(table)
+    except (
+        pickle.UnpicklingError, zlib.error, struct.error, EOFError, ValueError, TypeError, KeyError, IndexError,
+        AttributeError, AssertionError, OverflowError, MemoryError, RecursionError,
+    ) as problem:  # fmt: skip
+        raise error(f"{path}: not a pickled table: {problem or type(problem).__name__}") from None
+
+
+def _gunzip(packed: bytes, limit_bytes: int) -> bytes:
+    unpacker = zlib.decompressobj(wbits=31)
+    data = unpacker.decompress(packed, limit_bytes)
+    if unpacker.unconsumed_tail:
+        raise ValueError(f"unpacks to more than the {limit_bytes} bytes that a table may have")
+    if not unpacker.eof:
+        raise ValueError("the file is truncated")
+    return data
+
+
+class _Part:
+    """Stands for an object of pandas or NumPy: what it was made of and what state it was given."""
+
+    __slots__ = ("args", "state")
+
+    def __init__(self, *args: Any) -> None:
+        self.args = args
+        self.state: Any = None
+
+
+class _Frame(_Part): ...
+
+
+class _Blocks(_Part): ...
+
+
+class _Index(_Part): ...
+
+
+class _Strings(_Part): ...
+
+
+class _Dtype(_Part): ...
+
+
+class _Array(_Part): ...
+
+
+class _Buffer(_Part): ...
+
+
+class _Known:
+    """A name that a pickle may refer to; calling it makes a part and nothing else."""
+
+    __slots__ = ("make",)
+
+    def __init__(self, make: Callable[..., Any]) -> None:
+        self.make = make
+
+
+_NAMES: dict[str, _Known] = {
+    name: _Known(make)
+    for make, names in (
+        (_Frame, ("pandas.DataFrame", "pandas.core.frame.DataFrame")),
+        (_Blocks, ("pandas.core.internals.managers.BlockManager", "pandas.core.internals.BlockManager")),
+        (_Part, ("pandas._libs.internals._unpickle_block",)),
+        (_Part, ("pandas.core.internals.blocks.new_block",)),
+        (_Index, ("pandas.core.indexes.base._new_Index", "pandas.indexes.base._new_Index")),
+        (_Index, ("pandas.Index", "pandas.core.indexes.base.Index", "pandas.indexes.base.Index")),
+        (_Index, ("pandas.RangeIndex", "pandas.core.indexes.range.RangeIndex", "pandas.indexes.range.RangeIndex")),
+        (_Index, ("pandas.core.indexes.numeric.Int64Index", "pandas.indexes.numeric.Int64Index")),
+        (_Strings, ("pandas._libs.arrays.__pyx_unpickle_NDArrayBacked",)),
+        (_Part, ("pandas.arrays.StringArray", "pandas.core.arrays.string_.StringArray")),
+        (_Part, ("pandas.StringDtype", "pandas.core.arrays.string_.StringDtype")),
+        (_Array, ("numpy._core.multiarray._reconstruct", "numpy.core.multiarray._reconstruct")),
+        (_Buffer, ("numpy._core.numeric._frombuffer", "numpy.core.numeric._frombuffer")),
+        (_Part, ("numpy.ndarray",)),
+        (_Dtype, ("numpy.dtype",)),
+        (slice, ("builtins.slice", "__builtin__.slice")),
+    )
+    for name in names
+}
+
+
+# The C unpickler reserves memory for any index that a memo names; the one in Python does not, and its opcodes can be replaced.
+class _TableUnpickler(pickle._Unpickler):
+    stack: list[Any]
+    append: Callable[[Any], None]
+    read: Callable[[int], bytes]
+    dispatch: ClassVar[dict[int, Any]] = dict(pickle._Unpickler.dispatch)
+
+    def find_class(self, module: str, name: str) -> _Known:
+        known = _NAMES.get(f"{module}.{name}")
+        if known is None:
+            raise pickle.UnpicklingError(f"it names {module}.{name}, which a table does not need")
+        return known
+
+    def load_call(self) -> None:
+        args = self.stack.pop()
+        known = self.stack.pop()
+        if not isinstance(known, _Known) or not isinstance(args, tuple):
+            raise pickle.UnpicklingError("it calls something that is not a class of tables")
+        self.stack.append(known.make(*args))
+
+    def load_state(self) -> None:
+        state = self.stack.pop()
+        if not isinstance(self.stack[-1], _Part):
+            raise pickle.UnpicklingError("it sets the state of something that is not part of a table")
+        self.stack[-1].state = state
+
+    def load_bounded_bytearray(self) -> None:
+        (size,) = struct.unpack("<Q", self.read(8))
+        data = self.read(size)
+        if len(data) != size:
+            raise EOFError("the file is truncated")
+        self.append(data)
+
+    def load_refused(self) -> None:
+        raise pickle.UnpicklingError("it holds an instruction that a table does not need")
+
+    dispatch[pickle.REDUCE[0]] = load_call
+    dispatch[pickle.NEWOBJ[0]] = load_call
+    dispatch[pickle.BUILD[0]] = load_state
+    dispatch[pickle.BYTEARRAY8[0]] = load_bounded_bytearray
+    for _code in (
+        "INST",
+        "OBJ",
+        "NEWOBJ_EX",
+        "EXT1",
+        "EXT2",
+        "EXT4",
+        "PERSID",
+        "BINPERSID",
+        "NEXT_BUFFER",
+        "READONLY_BUFFER",
+    ):
+        dispatch[getattr(pickle, _code)[0]] = load_refused
+
+
+def _columns(table: Any) -> Columns:
+    if not isinstance(table, _Frame) or not isinstance(table.state, dict):
+        raise ValueError(f"holds a {type(table).__name__.strip('_')}, expected a DataFrame")
+    manager = table.state.get("_mgr", table.state.get("_data"))
+    if not isinstance(manager, _Blocks):
+        raise ValueError("its DataFrame has no blocks")
+    axes, blocks = _layout(manager)
+    names = [str(n) for n in _values(axes[0]).tolist()]
+    columns: Columns = {}
+    for values, place in blocks:
+        rows = _values(values)
+        for k, column in enumerate(_places(place, len(names))):
+            columns[names[column]] = rows if rows.ndim == 1 else rows[k]
+    if len(set(map(len, columns.values()))) > 1 or len(columns) != len(names):
+        raise ValueError("its columns are incomplete")
+    return columns
+
+
+def _layout(manager: _Blocks) -> tuple[list[Any], list[tuple[Any, Any]]]:
+    """Axes, and values with their place of each block, of managers as written before and since pandas 1.3."""
+    if manager.args:
+        blocks, axes = manager.args
+        return axes, [(b.args[0], b.args[1]) for b in blocks]
+    inner = manager.state[3]["0.14.1"]
+    return inner["axes"], [(b["values"], b["mgr_locs"]) for b in inner["blocks"]]
+
+
+def _places(place: Any, count: int) -> list[int]:
+    if isinstance(place, slice):
+        if not all(isinstance(v, int) for v in (place.start, place.stop, place.step)):
+            raise ValueError("a block has no place")
+        return list(range(count))[place]
+    return [int(p) for p in _values(place)]
+
+
+def _values(part: Any) -> NDArray[Any]:
+    """The array behind a part."""
+    if isinstance(part, _Index):
+        return _values(part.args[1]["data"])
+    if isinstance(part, _Strings):
+        return _values(next(p for p in part.state if isinstance(p, (_Array, _Buffer))))
+    if isinstance(part, _Buffer):
+        data, dtype, shape, order = part.args
+        return _from_bytes(data, _dtype(dtype), shape, order)
+    if not isinstance(part, _Array):
+        raise ValueError(f"a {type(part).__name__.strip('_')} stands where an array was expected")
+    _, shape, dtype, fortran, data = part.state
+    if isinstance(data, list):
+        cells = np.empty(len(data), dtype=object)
+        cells[:] = data
+        return cells.reshape(shape, order="F" if fortran else "C")
+    return _from_bytes(data, _dtype(dtype), shape, "F" if fortran else "C")
+
+
+def _from_bytes(data: Any, dtype: np.dtype[Any], shape: Any, order: Any) -> NDArray[Any]:
+    if not isinstance(data, (bytes, bytearray)) or order not in ("C", "F"):
+        raise ValueError("an array has no data")
+    return np.frombuffer(data, dtype).reshape(shape, order=order)
+
+
+def _dtype(part: Any) -> np.dtype[Any]:
+    code = part.args[0] if isinstance(part, _Dtype) else None
+    if not isinstance(code, str) or not re.fullmatch(r"b1|[iu][1248]|f[48]", code):
+        raise ValueError(f"an array of type {code!r}, expected plain numbers")
+    order = part.state[1] if part.state else "="
+    return np.dtype(code).newbyteorder(">" if order == ">" else "<")
