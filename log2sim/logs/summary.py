@@ -1,0 +1,101 @@
+"""What is in a log, in numbers, without decoding its records."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.files import rounded
+from log2sim.geometry import NS_PER_S
+from log2sim.types import Log
+
+GAP_FACTOR = 1.7
+
+
+def summarize(log: Log) -> dict[str, Any]:
+    """A document for people and for JSON: sensors, rates, stamps, gaps, ego, labels and notes of a log."""
+    stamps = [s.t_ns for s in log.streams.values()]
+    begin, end = min(int(t[0]) for t in stamps), max(int(t[-1]) for t in stamps)
+    cameras = {
+        name: {
+            **summarize_stamps(log.streams[name].t_ns),
+            "size_px": [int(c.width_px), int(c.height_px)],
+            "field_of_view_deg": rounded(np.degrees(2 * np.arctan(c.width_px / 2 / c.K[0, 0])), 1),
+            "distortion_model": c.distortion_model,
+            **_place(c.mount, c.mount_T_cam),
+        }
+        for name, c in log.cameras.items()
+    }
+    lidars = {
+        name: {**summarize_stamps(log.streams[name].t_ns), **_place(s.mount, s.mount_T_lidar)}
+        for name, s in log.lidars.items()
+    }
+    return {
+        "name": log.name,
+        "format": log.format,
+        "begin_ns": begin,
+        "end_ns": end,
+        "duration_s": rounded((end - begin) / NS_PER_S, 3),
+        "reference_camera": log.reference_camera,
+        "cameras": cameras,
+        "lidars": lidars,
+        "ego": _ego(log),
+        "map": {
+            "latitude_deg": log.map.latitude_deg,
+            "longitude_deg": log.map.longitude_deg,
+            "altitude_m": log.map.altitude_m,
+            "projection": log.map.projection,
+            "offset_m": list(log.map.offset_m),
+        },
+        "labels": _labels(log),
+        "image_labels": {name: _counts(boxes.category) for name, boxes in log.image_labels.items()},
+        "notes": list(log.notes),
+        "digest": log.digest,
+    }
+
+
+def summarize_stamps(t_ns: NDArray[np.int64]) -> dict[str, Any]:
+    """Count, rate, range and gaps of increasing stamps (F,); a gap is a step of more than 1.7 times the median one."""
+    step = np.diff(t_ns)
+    median = float(np.median(step)) if len(step) else 0.0
+    gap = np.flatnonzero(step > GAP_FACTOR * median)
+    return {
+        "records": len(t_ns),
+        "rate_hz": rounded(NS_PER_S / median, 3) if median > 0 else None,
+        "begin_ns": int(t_ns[0]),
+        "end_ns": int(t_ns[-1]),
+        "gaps": [{"after_ns": int(t_ns[k]), "length_s": rounded(int(step[k]) / NS_PER_S, 6)} for k in gap],
+    }
+
+
+def _place(mount: str, mount_T_sensor: NDArray[np.float64]) -> dict[str, Any]:
+    return {"mount": mount, "translation_m": [rounded(v, 4) for v in mount_T_sensor[:3, 3]]}
+
+
+def _ego(log: Log) -> dict[str, Any] | None:
+    if log.ego is None:
+        return None
+    position = log.ego.map_T_ego[:, :3, 3]
+    steps = np.linalg.norm(np.diff(position[:, :2], axis=0), axis=1)
+    seconds = np.diff(log.ego.t_ns) / NS_PER_S
+    return {
+        **summarize_stamps(log.ego.t_ns),
+        "distance_m": rounded(steps.sum(), 2),
+        "top_speed_mps": rounded((steps / seconds).max(), 2) if len(steps) else None,
+        "size_m": list(log.ego_vehicle.size_m),
+    }
+
+
+def _labels(log: Log) -> dict[str, Any] | None:
+    if log.labels is None:
+        return None
+    first = {track: kind for track, kind in zip(log.labels.track_id.tolist()[::-1], log.labels.category.tolist()[::-1])}
+    return {"boxes": len(log.labels.t_ns), "tracks": len(first), "tracks_by_category": _counts(first.values())}
+
+
+def _counts(words: Iterable[Any]) -> dict[str, int]:
+    names, counts = np.unique([str(w) for w in words], return_counts=True)
+    return {str(n): int(c) for n, c in zip(names, counts)}
