@@ -24,6 +24,10 @@ CENTER_SIGMA_M = {"vehicle": 0.12, "two_wheeler": 0.1, "pedestrian": 0.08, "othe
 # Rear axle to box center, as a share of the length: BMW 320i of CommonRoad's vehicle models, b - overhang, rounded.
 REAR_AXLE_SHARE = {"vehicle": 0.28, "two_wheeler": 0.3}
 STANDING_SPEED_MPS = 0.15
+# What is there is detected most of the time: share of ticks with a detection times the score of the best ones.
+LEAST_CREDIT = 0.3
+LEAST_CREDIT_OF_ODD_SHAPES = 0.6
+HIDDEN_S = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +43,11 @@ class Timeline:
 
 @dataclass(frozen=True, eq=False)
 class Built:
-    """An agent and what the overlap check needs: how much evidence it has, ticks (n,) of its life."""
+    """An agent, how much evidence it has, and whether that is enough to believe in it."""
 
     agent: Agent
     evidence: float
+    credible: bool
 
 
 def build_agents(
@@ -54,10 +59,11 @@ def build_agents(
     """
     standing = [is_standing(t) for t in tracks]
     built = [_moving(t, obstacles, timeline, smooth=smooth) for t, s in zip(tracks, standing) if not s]
+    built = [b for b in built if b.credible]
     flows = [flow] + [_flow_of(b.agent) for b in built if GROUP_OF[b.agent.category] == "vehicle"]
     everything = np.concatenate(flows)
     built += [_standing(t, obstacles, timeline, everything) for t, s in zip(tracks, standing) if s]
-    return built
+    return [b for b in built if b.credible]
 
 
 def _flow_of(agent: Agent) -> Array:
@@ -250,4 +256,22 @@ def _agent(track: Track, shape: Shape, waypoints: Waypoints, quality: dict[str, 
         confidence=float(np.clip(strongest.mean(), 0.0, 1.0)),
         quality=quality,
     )
-    return Built(agent, float(m.score.sum()))
+    return Built(
+        agent,
+        float(m.score.sum()),
+        credit(track, strongest) >= (LEAST_CREDIT if shape.typical else LEAST_CREDIT_OF_ODD_SHAPES),
+    )
+
+
+def credit(track: Track, strongest: Array) -> float:
+    """How much a track deserves belief, in [0, 1]: detected how often while it could be, times how surely.
+
+    A gap longer than `HIDDEN_S` counts as being hidden, at the price of half of that time.
+    """
+    t = track.measurements.t_ns / NS_PER_S
+    steps = np.diff(t)
+    if len(steps) == 0:
+        return float(strongest.mean())
+    period = float(np.median(steps[steps <= np.median(steps)]))
+    expected = 1 + float(np.where(steps > HIDDEN_S, HIDDEN_S / 2, steps).sum()) / max(period, 1e-3)
+    return min(len(t) / expected, 1.0) * float(strongest.mean())

@@ -22,8 +22,10 @@ SIZE_QUANTILE = 0.75
 VOXEL_M = 0.15
 PERSISTENT_SHARE = 0.15
 POINTS_A_TICK = 150
-# Sizes that exist, as factors of the typical one.
+# Sizes that exist, as factors of the typical one; what looks smaller than the likely ones (length, width, height) was
+# hardly seen whole, or is something else.
 SHORTEST, LONGEST = 0.6, 1.6
+LEAST_LIKELY = np.array([0.65, 0.72, 0.75])
 
 STANDING_MPS = {"vehicle": 0.35, "two_wheeler": 0.3, "pedestrian": 0.2, "other": 0.35}
 STANDING_DRIFT_M = {"vehicle": 1.2, "two_wheeler": 0.8, "pedestrian": 0.5, "other": 1.2}
@@ -32,7 +34,8 @@ STANDING_DRIFT_M = {"vehicle": 1.2, "two_wheeler": 0.8, "pedestrian": 0.5, "othe
 @dataclass(frozen=True, eq=False)
 class Shape:
     """What a track looks like: `size_m` (3,), and at each of its measurements `xy_m` (n, 2), `covariance` (n, 2, 2),
-    `z_m` (n,) of the center, and for a standing one `yaw_rad`, up to half turns.
+    `z_m` (n,) of the center, and for a standing one `yaw_rad`, up to half turns. `typical` False: what was seen of it is
+    smaller or larger than its category can be, so that it hardly is one.
     """
 
     size_m: Array
@@ -40,6 +43,7 @@ class Shape:
     covariance: Array
     z_m: Array
     yaw_rad: float | None = None
+    typical: bool = True
 
 
 def is_standing(track: Track) -> bool:
@@ -72,7 +76,7 @@ def shape_standing(track: Track) -> Shape:
     low, high = boxfit.extents(cloud[:, :2], yaw)
     local = boxfit.rotate(sensor, -yaw)
     whole = _whole_sides(low, high, local)
-    size = _completed_size((high - low)[None], whole[None], typical[:2])
+    size, fits = _completed_size((high - low)[None], whole[None], typical[:2])
     centers = np.array([boxfit.complete_box(low, high, size, s)[0] for s in local])
     center = boxfit.rotate(np.median(centers, axis=0), yaw) + origin[:2]
     height, z = _height(track)
@@ -81,7 +85,9 @@ def shape_standing(track: Track) -> Shape:
     axes = boxfit.rotate(np.eye(2), yaw)
     n = len(m)
     covariance = np.tile(axes.T @ np.diag(sigma**2) @ axes, (n, 1, 1))
-    return Shape(np.append(size, height), np.tile(center, (n, 1)), covariance, np.full(n, np.median(z)), float(yaw))
+    return Shape(
+        np.append(size, height), np.tile(center, (n, 1)), covariance, np.full(n, np.median(z)), float(yaw), fits
+    )
 
 
 def shape_moving(track: Track, yaw_rad: Array) -> Shape:
@@ -98,7 +104,7 @@ def shape_moving(track: Track, yaw_rad: Array) -> Shape:
         lows[k], highs[k] = boxfit.extents(m.cluster[k][:, :2] - origin, yaw)
         sensors[k] = boxfit.rotate(m.sensor_m[k, :2] - origin, -yaw)
         whole[k] = _whole_sides(lows[k], highs[k], sensors[k]) & ~m.truncated[k]
-    size = _completed_size((highs - lows)[with_points], whole[with_points], typical[:2])
+    size, fits = _completed_size((highs - lows)[with_points], whole[with_points], typical[:2])
     xy, covariance = m.center_m[:, :2].copy(), m.covariance.copy()
     for k in with_points:
         yaw = float(yaw_rad[k])
@@ -108,7 +114,7 @@ def shape_moving(track: Track, yaw_rad: Array) -> Shape:
         axes = boxfit.rotate(np.eye(2), yaw)
         covariance[k] = axes.T @ np.diag(sigma**2) @ axes
     height, z = _height(track)
-    return Shape(np.append(size, height), xy, covariance, z)
+    return Shape(np.append(size, height), xy, covariance, z, None, fits and _tall_enough(height, typical))
 
 
 def _persistent_points(clusters: list[NDArray[np.float64]]) -> Array:
@@ -143,15 +149,16 @@ def _whole_sides(low: Array, high: Array, sensor: Array) -> NDArray[np.bool_]:
     return np.array([(sine[:, 1] > LEAST_ASPECT).any(), (sine[:, 0] > LEAST_ASPECT).any()])
 
 
-def _completed_size(seen: Array, whole: NDArray[np.bool_], typical: Array) -> Array:
-    """Length and width (2,) from extents (n, 2), of which some were whole."""
+def _completed_size(seen: Array, whole: NDArray[np.bool_], typical: Array) -> tuple[Array, bool]:
+    """Length and width (2,) from extents (n, 2), of which some were whole, and whether such an object exists."""
     size = np.empty(2)
     for axis in range(2):
         if whole[:, axis].any():
             size[axis] = np.quantile(seen[whole[:, axis], axis], SIZE_QUANTILE)
         else:
             size[axis] = max(typical[axis], float(np.quantile(seen[:, axis], SIZE_QUANTILE)))
-    return np.clip(size, SHORTEST * typical, LONGEST * typical)
+    likely = bool(((size >= LEAST_LIKELY[:2] * typical) & (size <= LONGEST * typical)).all())
+    return np.clip(size, SHORTEST * typical, LONGEST * typical), likely
 
 
 def _height(track: Track) -> tuple[float, Array]:
@@ -168,6 +175,10 @@ def _height(track: Track) -> tuple[float, Array]:
     height = max(by_lidar, min(by_image, 1.15 * by_lidar))
     height = float(np.clip(height, SHORTEST * typical, LONGEST * typical))
     return height, bottom + height / 2
+
+
+def _tall_enough(height: float, typical: Array) -> bool:
+    return bool(height >= LEAST_LIKELY[2] * typical[2])
 
 
 def _from_measured_centers(track: Track, typical: Array) -> Shape:

@@ -13,6 +13,8 @@ from log2sim.track.motion import ACCELERATION_MPS2, FIRST_SPEED_MPS, measurement
 from log2sim.types import GROUP_OF, Measurements, Track
 
 GATE = 13.8
+# Where both ends could meet anywhere within this (one sigma), meeting proves nothing.
+VAGUE_M = 2.0
 # An object that stands still is the same object however long it was hidden, if it stands where it stood.
 STANDING_MPS = 0.5
 STANDING_APART_M = 1.0
@@ -71,6 +73,8 @@ def _meeting_cost(a: _Ends, b: _Ends, max_gap_s: float) -> float:
     forward = predict(a.last[0][None], a.last[1][None], gap_s / 2, noise)
     backward = predict(b.first[0][None], b.first[1][None], -gap_s / 2, noise)
     difference, covariance = (forward[0] - backward[0])[0], (forward[1] + backward[1])[0]
+    if np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]) > VAGUE_M:
+        return 1e6
     squared = float(difference @ np.linalg.solve(covariance, difference))
     # 4 degrees of freedom; an uncertain meeting must not win over a sure one, hence the determinant.
     return squared + float(np.log(np.linalg.det(covariance[:2, :2]))) + 10.0 if squared <= GATE * 1.35 else 1e6
