@@ -124,8 +124,8 @@ def test_rider_on_a_motorcycle_stays_a_motorcycle() -> None:
 
 @pytest.mark.parametrize(
     "person",
-    [(200, 0, 230, 90), (55, 0, 85, 90), (20, 70, 50, 200), (20, -80, 50, 20)],
-    ids=["elsewhere", "beside", "nearer", "farther"],
+    [(200, 0, 230, 90), (55, 0, 85, 90), (20, 0, 50, 130), (20, -60, 50, 60), (20, 55, 50, 100)],
+    ids=["elsewhere", "beside", "nearer", "farther", "lower"],
 )
 def test_bicycle_without_a_rider_stays_one(person: tuple[float, float, float, float]) -> None:
     d = detections(("bicycle", 0.8, (10, 50, 62, 100)), ("pedestrian", 0.6, person))
@@ -134,7 +134,7 @@ def test_bicycle_without_a_rider_stays_one(person: tuple[float, float, float, fl
 
 def test_one_person_rides_one_of_two_bicycles() -> None:
     d = detections(
-        ("bicycle", 0.8, (10, 50, 62, 100)), ("bicycle", 0.7, (40, 52, 95, 101)), ("pedestrian", 0.6, (18, 0, 48, 90))
+        ("bicycle", 0.8, (10, 50, 62, 100)), ("bicycle", 0.7, (30, 52, 85, 101)), ("pedestrian", 0.6, (18, 0, 48, 90))
     )
     joined = join_riders(d)
     assert joined.category.tolist() == ["cyclist", "bicycle"]

@@ -55,7 +55,7 @@ class OnnxDetector:
         box = placement.to_picture(found.box_input)
         finite = np.isfinite(box).all(axis=1) & np.isfinite(found.score)
         low, high = np.zeros(2), np.array([tile.u1 - tile.u0, tile.v1 - tile.v0], dtype=np.float64)
-        box = np.clip(np.where(finite[:, None], box, 0.0), np.tile(low, 2), np.tile(high, 2))
+        box = np.clip(box, np.tile(low, 2), np.tile(high, 2))
         kept = finite & np.all(box[:, 2:] - box[:, :2] >= SMALLEST_BOX_PX, axis=1)
         origin = np.array([tile.u0, tile.v0, tile.u0, tile.v0], dtype=np.float64)
         score = np.clip(found.score[kept], 0.0, 1.0)

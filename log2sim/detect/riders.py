@@ -9,9 +9,9 @@ from log2sim.detect.suppression import strongest_first
 from log2sim.geometry import Array
 from log2sim.types import Detections
 
-# Measured in heights of the person's box; from how a rider sits: feet at the pedals, between axle and ground.
-FEET_SHARE = 0.35
 MIN_HORIZONTAL_SHARE = 0.5
+MAX_FEET_OFF = 0.5  # of the two-wheeler's height: feet are between its axles and the ground
+MIN_RISE = 0.1  # of the two-wheeler's height
 RIDDEN = {"bicycle": "cyclist", "motorcycle": "motorcycle", "cyclist": "cyclist"}
 
 
@@ -20,8 +20,8 @@ def join_riders(detections: Detections) -> Detections:
 
     Notes
     -----
-    A person rides where the lower third of its box overlaps the two-wheeler, most of the narrower width of both is
-    shared, and it rises above it. Somebody who pushes a bicycle walks beside it and is often joined too: in one picture
+    A person rides where its box ends near the two-wheeler's lower end, rises above it, and shares most of the narrower
+    width of both. Somebody who pushes a bicycle walks beside it and is often joined too: in one picture
     that cannot be told apart, and together they move as one. Best pairs first, each box in one pair.
     """
     person = np.flatnonzero(detections.category == "pedestrian")
@@ -50,10 +50,8 @@ def rider_fit(person_px: Array, wheeler_px: Array) -> Array:
 
 
 def _stands_on(p: Array, w: Array) -> NDArray[np.bool_]:
-    height = p[..., 3] - p[..., 1]
-    feet_from = p[..., 3] - FEET_SHARE * height
-    feet_in_wheeler = (feet_from < w[..., 3]) & (p[..., 3] > w[..., 1])
-    rises_above = p[..., 1] < w[..., 1] + 0.1 * (w[..., 3] - w[..., 1])
-    # Far behind or before each other, feet and tires end at different rows.
-    same_depth = np.abs(p[..., 3] - w[..., 3]) < 0.5 * np.maximum(height, w[..., 3] - w[..., 1])
-    return np.asarray(feet_in_wheeler & rises_above & same_depth)
+    height = w[..., 3] - w[..., 1]
+    rises_above = p[..., 1] < w[..., 1] - MIN_RISE * height
+    # Before or behind it, feet and tires end at different rows.
+    same_depth = np.abs(p[..., 3] - w[..., 3]) < MAX_FEET_OFF * height
+    return np.asarray(rises_above & same_depth)
