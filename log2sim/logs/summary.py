@@ -92,7 +92,7 @@ def _ego(log: Log) -> dict[str, Any] | None:
 def _labels(log: Log) -> dict[str, Any] | None:
     if log.labels is None:
         return None
-    first = {track: kind for track, kind in zip(log.labels.track_id.tolist()[::-1], log.labels.category.tolist()[::-1])}
+    first = dict(zip(log.labels.track_id.tolist()[::-1], log.labels.category.tolist()[::-1]))
     return {"boxes": len(log.labels.t_ns), "tracks": len(first), "tracks_by_category": _counts(first.values())}
 
 
