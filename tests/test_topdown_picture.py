@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -36,8 +37,14 @@ def checker(xy: Array, side_m: float = 1.0) -> Array:
     return np.where(odd > 0, 200.0, 60.0)
 
 
-def shoot(camera: Camera, map_T_cam: Array, ground_z_m: float = 0.0, gain: float = 1.0) -> np.ndarray:
-    """Render the checkerboard by casting 3 x 3 rays a pixel; a second way that knows no homography."""
+def shoot(
+    camera: Camera,
+    map_T_cam: Array,
+    ground_z_m: float = 0.0,
+    gain: float = 1.0,
+    ground_of: Callable[[Array], Array] = checker,
+) -> np.ndarray:
+    """Render the ground by casting 3 x 3 rays a pixel; a second way that knows no homography."""
     fine = (np.arange(3) - 1) / 3
     total = np.zeros((camera.height_px, camera.width_px))
     v, u = np.mgrid[: camera.height_px, : camera.width_px].astype(float)
@@ -50,7 +57,7 @@ def shoot(camera: Camera, map_T_cam: Array, ground_z_m: float = 0.0, gain: float
             down = rays[:, 2] < -1e-9
             distance = np.where(down, (ground_z_m - map_T_cam[2, 3]) / np.where(down, rays[:, 2], 1.0), 0.0)
             ground = map_T_cam[:2, 3] + distance[:, None] * rays[:, :2]
-            total += np.where(down, checker(ground) * gain, 255.0).reshape(u.shape) / 9
+            total += np.where(down, ground_of(ground) * gain, 255.0).reshape(u.shape) / 9
     return np.repeat(np.rint(total).astype(np.uint8)[..., None], 3, axis=2)
 
 
@@ -86,6 +93,19 @@ def test_a_shift_of_15_cm_would_be_noticed(two_cameras: list[GroundView]) -> Non
     shift = np.array([[1, 0, 0.15], [0, 1, 0], [0, 0, 1.0]])
     moved = [GroundView(v.image_bgr, shift @ v.ground_H_image, v.camera, signed=True) for v in two_cameras]
     assert wrong_cells(render_topdown(moved, extent_m=(0, 10, -8, 8)), edge_m=0.05) > 0.02
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_cells_show_their_own_center(axis: int) -> None:
+    """On ground that brightens by 30 a meter, a shift of half a cell would show as 0.75."""
+    camera = make_camera()
+    view = GroundView.from_pose(
+        shoot(camera, pose(0), ground_of=lambda xy: 20 + 30 * (xy[:, axis] % 7.5)), camera, pose(0)
+    )
+    picture = render_topdown([view], extent_m=(4.5, 7.2, 0.3, 2.0) if axis == 0 else (4.5, 7.2, 0.3, 1.6))
+    expected = 20 + 30 * cell_centers(picture)[axis]
+    assert picture.coverage.all()
+    assert abs(float(np.mean(picture.image_bgr[..., 0] - expected))) < 0.2
 
 
 def test_far_map_coordinates_and_another_ground_height_change_nothing(two_cameras: list[GroundView]) -> None:
