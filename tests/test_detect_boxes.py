@@ -141,6 +141,18 @@ def test_one_person_rides_one_of_two_bicycles() -> None:
     assert joined.box_px[0].tolist() == [10, 0, 62, 100]
 
 
+def test_parts_of_a_pair_are_dropped_and_neighbors_stay() -> None:
+    d = detections(
+        ("pedestrian", 0.6, (20, 0, 50, 90)),
+        ("bicycle", 0.8, (10, 50, 62, 100)),
+        ("bicycle", 0.7, (12, 70, 40, 99)),
+        ("pedestrian", 0.5, (22, 2, 48, 40)),
+        ("car", 0.5, (12, 60, 60, 98)),
+        ("bicycle", 0.4, (45, 50, 99, 100)),
+    )
+    assert join_riders(d).category.tolist() == ["cyclist", "car", "bicycle"]
+
+
 def test_tf1_resize_samples_at_the_corner() -> None:
     ramp = np.repeat(np.arange(0, 200, 2, dtype=np.uint8)[None, :, None], 100, axis=0).repeat(3, axis=2)
     small = stretch_as_tf1(ramp, (40, 40))
