@@ -193,7 +193,7 @@ def many(count: int) -> Scenario:
         make_scenario(
             make_agent("ego", (0, -3), (12, 0)), *(make_agent(f"p{k}", (5 * k, 0), (0, 0)) for k in range(100))
         ),
-        make_scenario(*crossing().agents, name="price $5$ of 日本\nand more"),
+        make_scenario(*crossing().agents, make_agent("$^$", (0, 5), (3, 0)), name="price $5$ of 日本\nand more"),
     ],
     ids=["nobody", "one waypoint", "ego stands", "no ego", "100 parked", "odd name"],
 )

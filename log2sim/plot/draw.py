@@ -149,25 +149,42 @@ def draw_replay(ax: Axes, replay: Any, cast: Cast) -> None:
     )
 
 
-def draw_labels(ax: Axes, cast: Cast, view: View, size_pt: float = 7.0) -> None:
-    """Labels beside the last box, each at the first free place around it; one without a free place stays out."""
+def draw_labels(ax: Axes, cast: Cast, view: View, times_step_s: float) -> None:
+    """Names beside the last boxes, and times along the ego's way, each at a free place or not at all."""
     taken = _occupied(cast, view)
     for role in cast.movers:
         anchor = path(role.agent)[-1]
-        if not role.leading or not view.holds(anchor[None])[0]:
-            continue
-        text = "ego" if role.is_ego else role.label
-        half = np.array([0.34 * size_pt * len(text) + 1.0, 0.55 * size_pt]) * view.m_per_pt
-        box_half = np.ptp(shapes.boxes(role.agent, anchor, role.agent.waypoints.yaw_rad[-1])[0], axis=0) / 2
-        place = _free_place(anchor, half, box_half, taken, view)
-        if place is None:
-            continue
-        taken.append((*(place - half), *(place + half)))
-        ax.text(
-            place[0],
-            place[1], text, color=role.color, fontsize=size_pt, fontweight="bold", family=FONT, ha="center", va="center_baseline",
-            zorder=LABEL, path_effects=halo(), parse_math=False, clip_on=True,
-        )  # fmt: skip
+        if role.leading and view.holds(anchor[None])[0]:
+            text = "ego" if role.is_ego else role.label
+            box_half = np.ptp(shapes.boxes(role.agent, anchor, role.agent.waypoints.yaw_rad[-1])[0], axis=0) / 2
+            _write(ax, text, anchor, box_half, taken, view, color=role.color, fontsize=7.0, fontweight="bold")
+    if cast.movers and cast.movers[0].is_ego:
+        ego = cast.movers[0].agent
+        t, xy = shapes.marks(ego, times_step_s)
+        apart = shapes.spaced(xy, path(ego)[[0, -1]], max(ego.size_m[0] / 2, 24 * view.m_per_pt))
+        for when, at in zip(t[apart], xy[apart]):
+            around = np.full(2, ego.size_m[1] / 2)
+            _write(ax, f"{when:g} s", at, around, taken, view, color=MUTED, fontsize=6.0, fontweight="normal")
+
+
+def _write(
+    ax: Axes,
+    text: str,
+    anchor: Array,
+    box_half: Array,
+    taken: list[tuple[float, float, float, float]],
+    view: View,
+    **style: Any,
+) -> None:
+    """Write beside a box at the first free place and take that place."""
+    size_pt = style["fontsize"]
+    half = np.array([0.34 * size_pt * len(text) + 1.0, 0.55 * size_pt]) * view.m_per_pt
+    place = _free_place(anchor, half, box_half, taken, view)
+    if place is None:
+        return
+    taken.append((*(place - half), *(place + half)))
+    style |= {"family": FONT, "ha": "center", "va": "center_baseline", "path_effects": halo(), "zorder": LABEL}
+    ax.text(place[0], place[1], text, parse_math=False, clip_on=True, **style)
 
 
 def _free_place(
@@ -232,19 +249,6 @@ def _time_marks(ax: Axes, cast: Cast, view: View, step_s: float) -> None:
         ax.plot(
             xy[apart, 0], xy[apart, 1], "o", ms=2.7, mfc=PAPER, mec=role.color, mew=0.8, zorder=MARK + 0.1, ls="none"
         )
-        if role.is_ego:
-            ends, written = path(role.agent)[[0, -1]], np.full(2, np.inf)
-            for when, at in zip(t[apart], xy[apart]):
-                clear = (
-                    np.hypot(*(ends - at).T).min() > role.agent.size_m[0] / 2
-                    and not np.hypot(*(at - written)) < 24 * view.m_per_pt
-                )
-                if clear and view.holds(at[None])[0]:
-                    written = at
-                    ax.annotate(
-                        f"{when:g} s", at, (0, -12), textcoords="offset points", ha="center", color=MUTED, fontsize=6,
-                        family=FONT, path_effects=halo(1.8), zorder=MARK + 0.2, annotation_clip=True,
-                    )  # fmt: skip
 
 
 def view_is_crowded(cast: Cast) -> bool:

@@ -161,8 +161,11 @@ def _name(role: Role) -> str:
     moving = f"{speed * 3.6:.0f} km/h" if speed >= 0.15 else "stands"
     if role.is_ego:
         return f"ego · {moving}"
-    short = "" if role.label == role.agent.id else f" · {printable(role.agent.id, 7)}"
-    return f"{printable(role.label, 9)} · {role.agent.category} · {moving}{short}"
+    if role.agent.id.startswith(role.agent.category):
+        return f"{printable(role.label, 9)} · {printable(role.agent.id, 20)} · {moving}"
+    text = f"{printable(role.label, 9)} · {role.agent.category} · {moving}"
+    room = 34 - len(text) - 3  # letters that the column holds
+    return text if role.label == role.agent.id else f"{text} · {printable(role.agent.id, max(room, 4))}"
 
 
 def _line(color: str, **style: Any) -> Line2D:

@@ -90,7 +90,7 @@ def still(
         draw.draw_truth(sheet.ax, truth)
     if replay is not None:
         draw.draw_replay(sheet.ax, replay, cast)
-    draw.draw_labels(sheet.ax, cast, sheet.view)
+    draw.draw_labels(sheet.ax, cast, sheet.view, step_s)
     return sheet
 
 
