@@ -11,6 +11,7 @@ import pytest
 
 from log2sim.errors import ConfigError
 from log2sim.plot import plot_tracks, shapes
+from log2sim.plot.animate import Stage
 from log2sim.plot.cast import assign
 from log2sim.plot.look import PALETTE, printable
 from log2sim.plot.sheet import Sheet
@@ -123,11 +124,19 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(
     out = tmp_path / f"a{suffix}"
     out.write_bytes(b"good")
 
-    def fail(*args: object, **kwargs: object) -> None:
+    def fail_half_way(figure: object, path: Path, **options: object) -> None:
+        path.write_bytes(b"half")
         raise RuntimeError("disk")
 
-    monkeypatch.setattr("matplotlib.figure.Figure.savefig", fail)
-    monkeypatch.setattr("log2sim.plot.animate.Stage.show", fail)
+    show = Stage.show
+
+    def fail_later(stage: Stage, t_s: float) -> None:
+        if t_s > 0.55:
+            raise RuntimeError("disk")
+        show(stage, t_s)
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", fail_half_way)
+    monkeypatch.setattr("log2sim.plot.animate.Stage.show", fail_later)
     with pytest.raises(RuntimeError, match="disk"):
         plot_tracks(crossing(), out, overwrite=True)
     assert out.read_bytes() == b"good"
