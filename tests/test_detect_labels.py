@@ -112,12 +112,26 @@ def test_labels_too_far_in_time_are_not_used() -> None:
 
 
 def test_yaw_is_interpolated_across_pi() -> None:
-    def at(yaw: float) -> Boxes:
-        return Boxes(np.array(["car"]), np.zeros((1, 3)), np.ones((1, 3)), np.array([yaw]))
-
-    moved = boxes_at({0: at(np.pi - 0.1), 100_000_000: at(-np.pi + 0.3)}, 50_000_000)
-    assert moved is not None
+    stamps = np.array([0, SECOND // 10])
+    yaw = np.array([np.pi - 0.1, -np.pi + 0.3])
+    boxes = Boxes(stamps, np.array(["car", "car"]), np.zeros((2, 3)), np.ones((2, 3)), yaw)
+    moved = boxes_at(boxes, SECOND // 20, SECOND // 10)
     assert moved.yaw_rad == pytest.approx([-np.pi + 0.1])
+
+
+@pytest.mark.parametrize("speed_mps", [0.0, 30.0])
+def test_boxes_with_a_stamp_each_come_once_and_at_the_time_of_the_frame(speed_mps: float) -> None:
+    rng = np.random.default_rng(3)
+    rows = []
+    for lane, y in enumerate((-6.0, -2.0, 2.0, 6.0)):
+        for sweep in range(12):
+            t_s = 0.1 * sweep + 0.02 * lane + rng.uniform(0, 0.015)
+            rows.append((round(t_s * SECOND), "car", (22.0 + speed_mps * t_s, y, 0.0), CAR))
+    found = detect(log_with(*rows), SECOND // 2)
+    assert len(found) == 4
+    rear_m = 20.0 + speed_mps * 0.5
+    lowest = np.sort(found.box_px[:, 3])
+    assert lowest == pytest.approx(np.full(4, 300 + 1000 * 0.75 / rear_m), abs=1e-3)
 
 
 def test_boxes_of_the_frame_come_before_projected_ones() -> None:

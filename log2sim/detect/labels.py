@@ -5,7 +5,6 @@ Track ids are never read: boxes are as anonymous as a model's, so that tracking 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim import registry
-from log2sim.detect.label_motion import Boxes, boxes_at
+from log2sim.detect.label_motion import Boxes, boxes_at, window_ns
 from log2sim.detect.projection import project_boxes, shown_share
 from log2sim.errors import ConfigError
 from log2sim.geometry import inverse
@@ -39,28 +38,24 @@ class LabelDetector:
         labels = self.log.image_labels.get(frame.camera.name)
         if labels is not None:
             return boxes_of_frame(labels, frame.t_ns)
-        boxes = boxes_at(self._moments, frame.t_ns)
+        boxes, window = self._boxes
         map_T_cam, known = self.log.map_T_sensor(frame.camera.name, frame.t_ns)
-        if boxes is None or not known[0]:
+        if not len(boxes.t_ns) or not known[0]:
             return Detections.empty()
-        return project_labels(boxes, frame.camera, inverse(map_T_cam[0]))
+        return project_labels(boxes_at(boxes, frame.t_ns, window), frame.camera, inverse(map_T_cam[0]))
 
     @cached_property
-    def _moments(self) -> Mapping[int, Boxes]:
-        """Labels by stamp, in order; those that the log calls invisible are left out."""
+    def _boxes(self) -> tuple[Boxes, int]:
+        """Labels in the order of their stamps, without those that the log calls invisible, and the time to look around."""
         labels = self.log.labels
         if labels is None:
-            return {}
+            return Boxes(np.zeros(0, np.int64), np.zeros(0, "<U16"), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)), 0
         shown = np.isin(labels.category, CATEGORIES)
         if labels.visible is not None:
             shown &= labels.visible
-        moments = {}
-        for t_ns in np.unique(labels.t_ns).tolist():
-            rows = shown & (labels.t_ns == t_ns)
-            moments[t_ns] = Boxes(
-                labels.category[rows], labels.center_m[rows], labels.size_m[rows], labels.yaw_rad[rows]
-            )
-        return moments
+        everything = Boxes(labels.t_ns, labels.category, labels.center_m, labels.size_m, labels.yaw_rad)
+        rows = np.flatnonzero(shown)
+        return everything.take(rows[np.argsort(labels.t_ns[rows], kind="stable")]), window_ns(labels.t_ns)
 
 
 def create(
