@@ -1,8 +1,8 @@
 """Synthetic logs: a scene file becomes a log, as sensors would have recorded it, and its exact truth.
 
-    scene = load_scene("samples/crossing.toml")
-    log, truth = synthesize(scene, seed=1)          # records are rendered and cast when they are read
-    write_synthetic(scene, "samples/crossing", seed=1)
+scene = load_scene("samples/crossing.toml")
+log, truth = synthesize(scene, seed=1)          # records are rendered and cast when they are read
+write_synthetic(scene, "samples/crossing", seed=1)
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import secrets
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from log2sim.errors import ConfigError
 from log2sim.synth.scene import Scene, load_scene
@@ -64,7 +64,7 @@ def write_synthetic(
     _refuse(target, overwrite)
     log, truth = synthesize(scene, seed=seed)
     staging = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
-    poses = "gnss" if scene.ego.poses == "gnss" else "poses"
+    poses: Literal["gnss", "poses"] = "gnss" if scene.ego.poses == "gnss" else "poses"
     try:
         write_log(log, staging, jpeg_quality=jpeg_quality, ego=poses, progress=progress)
         truth.save(staging / TRUTH_FILE)

@@ -79,9 +79,7 @@ def actors_of(scene: Scene) -> tuple[Actor, ...]:
 
 
 def _actor(spec: AgentSpec, index: int) -> Actor:
-    look = Look(
-        spec.category, spec.box_m, spec.color, spec.shape, spec.second_color, spec.skin, spec.hair, seed=index
-    )
+    look = Look(spec.category, spec.box_m, spec.color, spec.shape, spec.second_color, spec.skin, spec.hair, seed=index)
     if spec.pose is not None:
         x, y, yaw_deg = spec.pose
         return Actor(spec, look, None, (x, y, float(wrap_angle(np.deg2rad(yaw_deg)))))
@@ -104,7 +102,11 @@ class EgoMotion:
         ego = scene.ego
         self._start_ns = scene.start_ns
         self.trajectory = Trajectory(
-            ego.waypoints, rounding_m=ego.rounding_m, wait_s=[(int(k), s) for k, s in ego.wait_s], start_s=ego.start_s, where="ego"
+            ego.waypoints,
+            rounding_m=ego.rounding_m,
+            wait_s=[(int(k), s) for k, s in ego.wait_s],
+            start_s=ego.start_s,
+            where="ego",
         )
 
     def map_T_ego(self, t_s: ArrayLike) -> Array:

@@ -83,13 +83,17 @@ def _image_streams(
 
         map_T_cam = ego.map_T_ego_ns(t_ns[i : i + 1])[0] @ camera.mount_T_cam
         rng = np.random.default_rng([seed, 2, place, i])
-        return render(camera, map_T_cam, _backdrop(scene, seed), actors, (int(t_ns[i]) - scene.start_ns) / NS_PER_S, rng)
+        return render(
+            camera, map_T_cam, _backdrop(scene, seed), actors, (int(t_ns[i]) - scene.start_ns) / NS_PER_S, rng
+        )
 
     out = {}
     for place, spec in enumerate(scene.camera):
         stamps = frame_stamps(spec, scene)
         if len(stamps) == 0:
-            raise ConfigError(f"camera '{spec.name}': no frame falls within {scene.duration_s:g} s; change its offset_s")
+            raise ConfigError(
+                f"camera '{spec.name}': no frame falls within {scene.duration_s:g} s; change its offset_s"
+            )
         out[spec.name] = Stream(spec.name, stamps, _bound(read, cameras[spec.name], place, stamps))
     return out
 
@@ -100,9 +104,9 @@ def _bound(read: Callable[..., Any], *arguments: Any) -> Callable[[int], Any]:
 
 @lru_cache(maxsize=2)
 def _backdrop(scene: Scene, seed: int) -> Any:
-    from log2sim.synth.backdrop import backdrop_of
+    from log2sim.synth.backdrop import Backdrop
 
-    return backdrop_of(scene, np.random.default_rng([seed, 3]))
+    return Backdrop(scene, seed)
 
 
 def _casts(scene: Scene, ego: EgoMotion, actors: tuple[Actor, ...], seed: int) -> Callable[[str, int], raycast.Cast]:
@@ -194,7 +198,16 @@ def _waypoints(t_s: Array, states: States, visible: NDArray[np.bool_] | None) ->
 
 
 # The names that people give to colors, by their place in hue, saturation and value.
-_HUES = ((20, "red"), (45, "orange"), (70, "yellow"), (165, "green"), (200, "cyan"), (260, "blue"), (330, "purple"), (360, "red"))
+_HUES = (
+    (20, "red"),
+    (45, "orange"),
+    (70, "yellow"),
+    (165, "green"),
+    (200, "cyan"),
+    (260, "blue"),
+    (330, "purple"),
+    (360, "red"),
+)
 
 
 def color_name(rgb: tuple[int, int, int]) -> str:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -14,6 +16,7 @@ from log2sim.synth.scene import Building, Scene
 
 GROUND_M_PER_PX = 0.04
 GROUND_LIMIT_PX = 6000
+MARGIN_M = 12.0
 FACADE_M_PER_PX = 0.04
 GAMMA = 2.2
 MARKING, ASPHALT, PAVING, MEADOW = (214, 216, 216), (92, 91, 90), (150, 155, 158), (128, 142, 138)
@@ -32,25 +35,32 @@ class Wall:
     texture: NDArray[np.uint8]
 
 
-@dataclass(frozen=True, eq=False)
 class Backdrop:
-    """Ground texture as a pyramid (each level half as large), where its first pixel lies, and the walls."""
+    """The ground and the facades of a scene, painted when first asked for."""
 
-    ground: tuple[NDArray[np.uint8], ...]
-    corner_m: Array
-    walls: tuple[Wall, ...]
+    def __init__(self, scene: Scene, seed: int) -> None:
+        self._scene, self._seed = scene, seed
+        points = [p for road in scene.road for p in road.line] + [w[:2] for w in scene.ego.waypoints]
+        self.corner_m = np.array(points).min(0) - MARGIN_M
+        self._extent_m = np.array(points).max(0) + MARGIN_M - self.corner_m
 
+    @cached_property
+    def walls(self) -> tuple[Wall, ...]:
+        """The sides of all buildings."""
+        rng = np.random.default_rng([self._seed, 5])
+        return tuple(wall for building in self._scene.building for wall in _walls(building, rng))
 
-def backdrop_of(scene: Scene, rng: np.random.Generator) -> Backdrop:
-    """Paint the ground and the facades of a scene once."""
-    points = np.array([p for road in scene.road for p in road.line] + [w[:2] for w in scene.ego.waypoints])
-    low, high = points.min(0) - 12.0, points.max(0) + 12.0
-    shape = np.minimum(np.ceil((high - low) / GROUND_M_PER_PX).astype(int), GROUND_LIMIT_PX)
-    ground = [_paint_ground(scene, low, (int(shape[1]), int(shape[0])), rng)]
-    while min(ground[-1].shape[:2]) > 64 and len(ground) < 6:
-        ground.append(cv2.resize(ground[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
-    walls = [wall for building in scene.building for wall in _walls(building, rng)]
-    return Backdrop(tuple(ground), low, tuple(walls))
+    @cached_property
+    def ground(self) -> tuple[NDArray[np.uint8], ...]:
+        """The ground from above as a pyramid, each level half as large; the first pixel lies at `corner_m`."""
+        shape = np.minimum(np.ceil(self._extent_m / GROUND_M_PER_PX).astype(int), GROUND_LIMIT_PX)
+        rng = np.random.default_rng([self._seed, 3])
+        levels = [_paint_ground(self._scene, self.corner_m, (int(shape[1]), int(shape[0])), rng)]
+        while min(levels[-1].shape[:2]) > 64 and len(levels) < 6:
+            levels.append(
+                np.asarray(cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
+            )
+        return tuple(levels)
 
 
 def _paint_ground(scene: Scene, low: Array, shape: tuple[int, int], rng: np.random.Generator) -> NDArray[np.uint8]:
@@ -69,7 +79,7 @@ def _paint_ground(scene: Scene, low: Array, shape: tuple[int, int], rng: np.rand
                 _stroke(crossing, other, low, r.width_m + 4.0)
         marks = np.zeros(shape, np.uint8)
         if road.marking != "none":
-            for a, b in _dashes(line, 3.0, 3.0) if road.marking == "dashed" else zip(line[:-1], line[1:]):
+            for a, b in _dashes(line, 3.0, 3.0) if road.marking == "dashed" else pairwise(line):
                 _stroke(marks, np.array([a, b]), low, 0.14)
         for side in (-1, 1):
             _stroke(marks, _beside(line, side * (road.width_m / 2 - 0.2)), low, 0.1)
@@ -85,7 +95,7 @@ def _paint_ground(scene: Scene, low: Array, shape: tuple[int, int], rng: np.rand
     image[curb & (sidewalk > 0)] = (172, 176, 178)
     image[asphalt > 0] = ASPHALT
     image[white > 0] = MARKING
-    return _weathered(image, rng, 0.022)
+    return _weathered(image, rng, 0.015)
 
 
 def _weathered(image: NDArray[np.uint8], rng: np.random.Generator, grain: float) -> NDArray[np.uint8]:
@@ -100,7 +110,7 @@ def _weathered(image: NDArray[np.uint8], rng: np.random.Generator, grain: float)
 
 def _stroke(mask: NDArray[np.uint8], line: Array, low: Array, width_m: float) -> None:
     """Draw a line with square ends and a true width."""
-    for a, b in zip(line[:-1], line[1:]):
+    for a, b in pairwise(line):
         d = b - a
         across = np.array([-d[1], d[0]]) / np.linalg.norm(d) * width_m / 2
         corners = (np.array([a + across, b + across, b - across, a - across]) - low) / GROUND_M_PER_PX
@@ -112,10 +122,10 @@ def _stroke(mask: NDArray[np.uint8], line: Array, low: Array, width_m: float) ->
 
 def _dashes(line: Array, on_m: float, off_m: float) -> list[tuple[Array, Array]]:
     out = []
-    for a, b in zip(line[:-1], line[1:]):
+    for a, b in pairwise(line):
         length = float(np.linalg.norm(b - a))
-        for s in np.arange(off_m / 2, length, on_m + off_m):
-            out.append((a + (b - a) * s / length, a + (b - a) * min(s + on_m, length) / length))
+        begins = np.arange(off_m / 2, length, on_m + off_m) / length
+        out += [(a + (b - a) * f, a + (b - a) * min(f + on_m / length, 1.0)) for f in begins]
     return out
 
 
@@ -132,7 +142,9 @@ def _walls(building: Building, rng: np.random.Generator) -> list[Wall]:
         a, b = corners[k], corners[(k + 1) % 4]
         span = float(np.linalg.norm(b - a))
         along = (b - a) / span
-        out.append(Wall(a, along, np.array([along[1], -along[0]]), span, height, _facade(span, height, building.color, rng)))
+        out.append(
+            Wall(a, along, np.array([along[1], -along[0]]), span, height, _facade(span, height, building.color, rng))
+        )
     return out
 
 
@@ -157,7 +169,7 @@ def _facade(length_m: float, height_m: float, color: Sequence[int], rng: np.rand
             image[pane[0] : pane[1], pane[2] : pane[3]] = np.clip(ramp * np.array((112, 100, 88)), 0, 255)
             middle = (pane[2] + pane[3]) // 2
             image[pane[0] : pane[1], middle - 1 : middle + 1] = np.minimum(np.array(color[::-1]) * 1.05, 255)
-    return _weathered(image, rng, 0.012)
+    return _weathered(image, rng, 0.007)
 
 
 def linear_table() -> NDArray[np.float32]:

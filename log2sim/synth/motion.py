@@ -119,7 +119,9 @@ class Trajectory:
         u = np.where(finite, (t - begin[i]) / np.where(finite, span[i], 1.0), 0.0)
         dv = v1[i] - v0[i]
         speed = np.where(finite, v0[i] + dv * (3 * u**2 - 2 * u**3), v0[i])
-        moved = np.where(finite, np.where(finite, span[i], 0.0) * (v0[i] * u + dv * (u**3 - u**4 / 2)), v0[i] * (t - begin[i]))
+        moved = np.where(
+            finite, np.where(finite, span[i], 0.0) * (v0[i] * u + dv * (u**3 - u**4 / 2)), v0[i] * (t - begin[i])
+        )
         way_now = way[i] + moved
         xy, yaw = self.path.at(way_now)
         return Motion(xy, wrap_angle(yaw), speed, way_now)
@@ -130,7 +132,9 @@ def _check_waypoints(w: Array, wait_s: dict[int, float], where: str) -> None:
         raise ConfigError(f"{where}: waypoints must be two or more rows [x, y, speed]; for a parked agent give 'pose'")
     step = np.linalg.norm(np.diff(w[:, :2], axis=0), axis=1)
     if np.any(step < 1e-3):
-        raise ConfigError(f"{where}: waypoints {int(step.argmin())} and {int(step.argmin()) + 1} are the same point; use 'wait_s' to stand")
+        raise ConfigError(
+            f"{where}: waypoints {int(step.argmin())} and {int(step.argmin()) + 1} are the same point; use 'wait_s' to stand"
+        )
     if np.any(w[:, 2] < 0):
         raise ConfigError(f"{where}: waypoint {int(w[:, 2].argmin())} has a negative speed")
     for index in wait_s:
@@ -149,7 +153,9 @@ def _timetable(at_m: Array, speed: Array, wait_s: dict[int, float], start_s: flo
             now += wait_s[k]
         v0, v1, way = speed[k], speed[k + 1], at_m[k + 1] - at_m[k]
         if v0 + v1 <= 0:
-            raise ConfigError(f"{where}: waypoints {k} and {k + 1} both have speed 0, so the way between them takes forever")
+            raise ConfigError(
+                f"{where}: waypoints {k} and {k + 1} both have speed 0, so the way between them takes forever"
+            )
         span = 2 * way / (v0 + v1)
         peak = 1.5 * abs(v1 - v0) / span
         if peak > MAX_ACCELERATION_MPS2 * (1 + 1e-9):

@@ -66,15 +66,21 @@ def _box_inside(camera: Camera, cam_T_map: Array, actor: Actor, t_s: float) -> f
 
 
 def visible_at(
-    t_s: Array, scene: Scene, seen: Mapping[str, list[Sighting]], streams: Mapping[str, Stream],
-    casts: Callable[[str, int], Any], count: int,
+    t_s: Array,
+    scene: Scene,
+    seen: Mapping[str, list[Sighting]],
+    streams: Mapping[str, Stream],
+    casts: Callable[[str, int], Any],
+    count: int,
 ) -> NDArray[np.bool_]:
     """Mask (T, A): the frame of one camera and the sweep of one LiDAR nearest in time both show the agent well."""
     t_ns = scene.start_ns + np.rint(t_s * NS_PER_S).astype(np.int64)
     by_camera = np.zeros((len(t_s), count), dtype=bool)
     for frames in seen.values():
         nearest = _nearest(np.array([f.t_ns for f in frames]), t_ns)
-        good = np.array([(f.unoccluded >= MIN_UNOCCLUDED) & (f.inside >= MIN_BOX_INSIDE) for f in frames]).reshape(-1, count)
+        good = np.array([(f.unoccluded >= MIN_UNOCCLUDED) & (f.inside >= MIN_BOX_INSIDE) for f in frames]).reshape(
+            -1, count
+        )
         by_camera |= good[nearest]
     by_lidar = np.zeros_like(by_camera)
     for spec in scene.lidar:
@@ -103,12 +109,16 @@ def labels_2d(seen: Mapping[str, list[Sighting]], actors: tuple[Actor, ...]) -> 
             boxes.append(frame.box_px[rows])
             categories.append(category[rows])
         out[name] = ImageLabels(
-            np.array(t_ns, dtype=np.int64), np.concatenate(boxes).reshape(-1, 4), np.concatenate(categories).astype("<U16")
+            np.array(t_ns, dtype=np.int64),
+            np.concatenate(boxes).reshape(-1, 4),
+            np.concatenate(categories).astype("<U16"),
         )
     return out
 
 
-def labels_3d(scene: Scene, seen: Mapping[str, list[Sighting]], actors: tuple[Actor, ...], cameras: Mapping[str, Camera]) -> Labels | None:
+def labels_3d(
+    scene: Scene, seen: Mapping[str, list[Sighting]], actors: tuple[Actor, ...], cameras: Mapping[str, Camera]
+) -> Labels | None:
     """Boxes of all agents at the frames of the first camera."""
     if not scene.camera or not actors:
         return None

@@ -6,6 +6,7 @@ Colors are linear BGR in [0, 1]; `gloss` is the share of the surroundings that a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ from log2sim.synth.vehicles import BELT, WHEEL_AT, WHEEL_RADIUS_M, Part, roof_li
 
 GLASS = (0.055, 0.05, 0.045)
 RUBBER = (0.028, 0.027, 0.026)
+
+Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,9 @@ def linear_bgr(rgb: tuple[int, int, int]) -> NDArray[np.float32]:
 
 def paint(look: Look, part: NDArray[np.int64], points: Array, normals: Array) -> Paint:
     """Colors at points (P, 3), m, agent frame (box center), with normals (P, 3) and parts (P,)."""
-    out = Paint(np.zeros((len(part), 3), np.float32), np.zeros(len(part), np.float32), np.zeros((len(part), 3), np.float32))
+    out = Paint(
+        np.zeros((len(part), 3), np.float32), np.zeros(len(part), np.float32), np.zeros((len(part), 3), np.float32)
+    )
     z = points[:, 2] + look.size_m[2] / 2
     for value in np.unique(part):
         rows = np.flatnonzero(part == value)
@@ -55,14 +60,14 @@ def paint(look: Look, part: NDArray[np.int64], points: Array, normals: Array) ->
     return out
 
 
-def _set(out: Paint, rows, mask, albedo, gloss: float = 0.0, glow: float = 0.0) -> None:  # type: ignore[no-untyped-def]
+def _set(out: Paint, rows: Index, mask: NDArray[np.bool_], albedo: Any, gloss: float = 0.0, glow: float = 0.0) -> None:
     index = rows[mask]
     out.albedo[index] = albedo
     out.gloss[index] = gloss
     out.glow[index] = glow * np.asarray(albedo, np.float32)
 
 
-def _car(look, out, rows, p, z, n, part):  # type: ignore[no-untyped-def]
+def _car(look: Look, out: Paint, rows: Index, p: Array, z: Array, n: Array, part: Part) -> None:
     length, width, height = look.size_m
     x, y = p[:, 0], p[:, 1]
     u, h = x / length, z / height
@@ -72,50 +77,71 @@ def _car(look, out, rows, p, z, n, part):  # type: ignore[no-untyped-def]
     _set(out, rows, everywhere, linear_bgr(look.color), 0.16)
     side = np.abs(n[:, 1]) > 0.55
     # Seams of the doors, a dark sill and the handles.
-    seams = side & (h > 0.24) & (h < BELT) & (np.min(np.abs(x[:, None] - length * np.array([0.165, -0.03, -0.235])), 1) < 0.008)
+    seams = (
+        side
+        & (h > 0.24)
+        & (h < BELT)
+        & (np.min(np.abs(x[:, None] - length * np.array([0.165, -0.03, -0.235])), 1) < 0.008)
+    )
     _set(out, rows, seams, linear_bgr(look.color) * 0.25)
-    handle = side & (np.abs(h - 0.565) < 0.012) & (np.min(np.abs(x[:, None] - length * np.array([0.0, -0.2])), 1) < 0.07)
+    handle = (
+        side & (np.abs(h - 0.565) < 0.012) & (np.min(np.abs(x[:, None] - length * np.array([0.0, -0.2])), 1) < 0.07)
+    )
     _set(out, rows, handle, linear_bgr(look.color) * 0.5, 0.1)
     _set(out, rows, h < 0.225, (0.05, 0.05, 0.05))
     fender = np.min(np.hypot(x[:, None] - length * np.array([WHEEL_AT, -WHEEL_AT]), z[:, None] - WHEEL_RADIUS_M), 1)
     _set(out, rows, (fender < WHEEL_RADIUS_M + 0.055) & (np.abs(y) > 0.3 * width), (0.008, 0.008, 0.008))
     # Windows: the sides with three pillars, the windshield and the rear window with a frame.
     glass_side = side & (h > BELT + 0.035) & (h < top - 0.075) & (h < 0.93) & (u > -0.40)
-    pillar = np.min(np.abs(x[:, None] + 0.12 * (z[:, None] - height * 0.8) - length * np.array([-0.03, -0.245])), 1) < 0.035
+    pillar = (
+        np.min(np.abs(x[:, None] + 0.12 * (z[:, None] - height * 0.8) - length * np.array([-0.03, -0.245])), 1) < 0.035
+    )
     _set(out, rows, glass_side & ~pillar, GLASS, 0.34)
     frame = 0.43 * width - 0.10 * np.clip((h - BELT) / 0.36, 0, 1) * width
     ahead = (n[:, 0] > 0.25) & (h > 0.685) & (h < 0.955) & (np.abs(y) < frame)
     behind = (n[:, 0] < -0.2) & (h > 0.72) & (h < 0.94) & (np.abs(y) < frame * 0.97)
     _set(out, rows, ahead | behind, GLASS, 0.36)
-    _front(look, out, rows, y, h, n, u, width)
+    _front(out, rows, y, h, n, u, width)
     _rear(out, rows, y, h, n, u, width)
 
 
-def _front(look, out, rows, y, h, n, u, width):  # type: ignore[no-untyped-def]
+def _front(out: Paint, rows: Index, y: Array, h: Array, n: Array, u: Array, width: float) -> None:
     front = (u > 0.44) & (n[:, 0] > 0.2)
     lamp = front & (np.abs(y) > 0.27 * width) & (h > 0.415 + 0.06 * (np.abs(y) / width - 0.27)) & (h < 0.515)
     _set(out, rows, lamp, (0.75, 0.78, 0.78), 0.3, 0.25)
-    _set(out, rows, lamp & (np.abs(np.abs(y) - 0.36 * width) < 0.035) & (np.abs(h - 0.465) < 0.025), (0.2, 0.2, 0.2), 0.3)
+    _set(
+        out, rows, lamp & (np.abs(np.abs(y) - 0.36 * width) < 0.035) & (np.abs(h - 0.465) < 0.025), (0.2, 0.2, 0.2), 0.3
+    )
     grille = front & (np.abs(y) < 0.23 * width) & (h > 0.37) & (h < 0.47)
     _set(out, rows, grille, np.where((np.floor(h[grille] * 70) % 2)[:, None] > 0, 0.02, 0.09).astype(np.float32), 0.05)
     _set(out, rows, front & (np.abs(y) < 0.05) & (np.abs(h - 0.42) < 0.03), (0.6, 0.6, 0.6), 0.3)
     _set(out, rows, front & (np.abs(y) < 0.36 * width) & (h > 0.235) & (h < 0.305), (0.02, 0.02, 0.02))
     _set(out, rows, front & (np.abs(y) < 0.26) & (h > 0.30) & (h < 0.37), (0.75, 0.75, 0.75))
-    _set(out, rows, front & (np.abs(y) < 0.21) & (np.abs(h - 0.335) < 0.018) & (np.floor(y * 22) % 2 > 0), (0.05, 0.05, 0.05))
+    _set(
+        out,
+        rows,
+        front & (np.abs(y) < 0.21) & (np.abs(h - 0.335) < 0.018) & (np.floor(y * 22) % 2 > 0),
+        (0.05, 0.05, 0.05),
+    )
 
 
-def _rear(out, rows, y, h, n, u, width):  # type: ignore[no-untyped-def]
+def _rear(out: Paint, rows: Index, y: Array, h: Array, n: Array, u: Array, width: float) -> None:
     rear = (u < -0.45) & (n[:, 0] < -0.2)
     lamp = (u < -0.445) & (np.abs(y) > 0.30 * width) & (h > 0.5) & (h < 0.61)
     _set(out, rows, lamp, (0.02, 0.02, 0.45), 0.15, 0.25)
     _set(out, rows, lamp & (np.abs(h - 0.535) < 0.012), (0.6, 0.6, 0.7), 0.2)
     _set(out, rows, rear & (h > 0.635) & (h < 0.645), (0.02, 0.02, 0.02))
     _set(out, rows, rear & (np.abs(y) < 0.26) & (h > 0.44) & (h < 0.515), (0.75, 0.75, 0.75))
-    _set(out, rows, rear & (np.abs(y) < 0.21) & (np.abs(h - 0.477) < 0.018) & (np.floor(y * 22) % 2 > 0), (0.05, 0.05, 0.05))
+    _set(
+        out,
+        rows,
+        rear & (np.abs(y) < 0.21) & (np.abs(h - 0.477) < 0.018) & (np.floor(y * 22) % 2 > 0),
+        (0.05, 0.05, 0.05),
+    )
     _set(out, rows, rear & (h > 0.225) & (h < 0.3), (0.03, 0.03, 0.03))
 
 
-def _wheel(look, out, rows, p, z, n, part):  # type: ignore[no-untyped-def]
+def _wheel(look: Look, out: Paint, rows: Index, p: Array, z: Array, n: Array, part: Part) -> None:
     length = look.size_m[0]
     big = look.category in ("truck", "bus")
     radius = 0.48 if big else WHEEL_RADIUS_M
@@ -145,7 +171,7 @@ def truck_axles(look: Look) -> Array:
     return np.array([front - 0.95, rear + 1.1] if length < 8 else [front - 0.95, rear + 2.4, rear + 1.2])
 
 
-def _cab(look, out, rows, p, z, n, part):  # type: ignore[no-untyped-def]
+def _cab(look: Look, out: Paint, rows: Index, p: Array, z: Array, n: Array, part: Part) -> None:
     length, width, height = look.size_m
     top, front = 0.8 * height, length / 2
     y, x = p[:, 1], p[:, 0]
@@ -154,7 +180,12 @@ def _cab(look, out, rows, p, z, n, part):  # type: ignore[no-untyped-def]
     window = (np.abs(n[:, 1]) > 0.6) & (z > 0.55 * top) & (z < 0.9 * top) & (x > front - 1.35) & (x < front - 0.28)
     _set(out, rows, window, GLASS, 0.34)
     nose = n[:, 0] > 0.5
-    _set(out, rows, nose & (np.abs(y) < 0.34 * width) & (z > 0.27 * top) & (z < 0.47 * top) & (np.floor(z * 14) % 2 > 0), (0.03, 0.03, 0.03))
+    _set(
+        out,
+        rows,
+        nose & (np.abs(y) < 0.34 * width) & (z > 0.27 * top) & (z < 0.47 * top) & (np.floor(z * 14) % 2 > 0),
+        (0.03, 0.03, 0.03),
+    )
     _set(out, rows, nose & (z < 0.25 * top), (0.06, 0.06, 0.06))
     _set(out, rows, nose & (np.abs(y) > 0.32 * width) & (z > 0.25 * top) & (z < 0.33 * top), (0.8, 0.8, 0.8), 0.2, 0.3)
     _set(out, rows, nose & (np.abs(y) < 0.26) & (z > 0.16 * top) & (z < 0.21 * top), (0.75, 0.75, 0.75))
@@ -162,7 +193,7 @@ def _cab(look, out, rows, p, z, n, part):  # type: ignore[no-untyped-def]
     _set(out, rows, (fender < 0.56) & (np.abs(n[:, 1]) > 0.5), (0.01, 0.01, 0.01))
 
 
-def _cargo(look, out, rows, p, z, n, part):  # type: ignore[no-untyped-def]
+def _cargo(look: Look, out: Paint, rows: Index, p: Array, z: Array, n: Array, part: Part) -> None:
     length, width, height = look.size_m
     _set(out, rows, np.ones(len(rows), bool), linear_bgr(look.color), 0.03)
     side, rear = np.abs(n[:, 1]) > 0.7, n[:, 0] < -0.7
@@ -175,20 +206,33 @@ def _cargo(look, out, rows, p, z, n, part):  # type: ignore[no-untyped-def]
          linear_bgr(look.second_color), 0.03)  # fmt: skip
 
 
-def _bus(look, out, rows, p, z, n, part):  # type: ignore[no-untyped-def]
+def _bus(look: Look, out: Paint, rows: Index, p: Array, z: Array, n: Array, part: Part) -> None:
     length, width, height = look.size_m
     x, y = p[:, 0], p[:, 1]
     _set(out, rows, np.ones(len(rows), bool), linear_bgr(look.color), 0.12)
     side, front, rear = np.abs(n[:, 1]) > 0.55, n[:, 0] > 0.5, n[:, 0] < -0.5
-    _set(out, rows, side & (z < 0.5), (0.06, 0.06, 0.06))
+    _set(out, rows, z < 0.5, (0.06, 0.06, 0.06))
     row = side & (z > 0.43 * height) & (z < 0.80 * height) & (np.abs(x) < 0.475 * length)
     _set(out, rows, row & (np.mod(x + 0.5 * length, 1.45) > 0.09), GLASS, 0.34)
     _set(out, rows, side & (np.abs(z - 0.37 * height) < 0.05), linear_bgr(look.second_color), 0.1)
-    doors = side & (n[:, 1] < 0) & (z > 0.42) & (z < 0.8 * height) & (np.min(np.abs(x[:, None] - length * np.array([0.42, 0.02])), 1) < 0.6)
+    doors = (
+        side
+        & (n[:, 1] < 0)
+        & (z > 0.42)
+        & (z < 0.8 * height)
+        & (np.min(np.abs(x[:, None] - length * np.array([0.42, 0.02])), 1) < 0.6)
+    )
     _set(out, rows, doors, GLASS, 0.3)
     _set(out, rows, doors & (np.mod(x - 0.42 * length + 0.6, 0.6) < 0.05), linear_bgr(look.color) * 0.6)
     _set(out, rows, front & (z > 0.36 * height) & (z < 0.80 * height) & (np.abs(y) < 0.45 * width), GLASS, 0.36)
-    _set(out, rows, front & (z > 0.84 * height) & (z < 0.93 * height) & (np.abs(y) < 0.3 * width), (0.02, 0.12, 0.2), 0.0, 0.8)
+    _set(
+        out,
+        rows,
+        front & (z > 0.84 * height) & (z < 0.93 * height) & (np.abs(y) < 0.3 * width),
+        (0.02, 0.12, 0.2),
+        0.0,
+        0.8,
+    )
     _set(out, rows, rear & (z > 0.52 * height) & (z < 0.82 * height) & (np.abs(y) < 0.4 * width), GLASS, 0.34)
     _set(out, rows, front & (np.abs(y) > 0.32 * width) & (z > 0.7) & (z < 0.95), (0.8, 0.8, 0.8), 0.2, 0.3)
     _set(out, rows, rear & (np.abs(y) > 0.38 * width) & (z > 0.7) & (z < 1.2), (0.02, 0.02, 0.5), 0.1, 0.25)
@@ -197,7 +241,7 @@ def _bus(look, out, rows, p, z, n, part):  # type: ignore[no-untyped-def]
     _set(out, rows, side & (fender < 0.57), (0.01, 0.01, 0.01))
 
 
-def _cloth(look, out, rows, p, z, n, part):  # type: ignore[no-untyped-def]
+def _cloth(look: Look, out: Paint, rows: Index, p: Array, z: Array, n: Array, part: Part) -> None:
     color = linear_bgr(look.color if part == Part.SHIRT else look.second_color)
     # Folds: waves that follow the body, fixed to it, so that they move along.
     fold = np.sin(23 * z + 9 * p[:, 1] + look.seed) * np.sin(17 * p[:, 1] - 11 * z + 5 * p[:, 0])
@@ -208,7 +252,7 @@ def _cloth(look, out, rows, p, z, n, part):  # type: ignore[no-untyped-def]
         _set(out, rows, front, color * 0.4)
 
 
-def _plain(look, out, rows, p, z, n, part):  # type: ignore[no-untyped-def]
+def _plain(look: Look, out: Paint, rows: Index, p: Array, z: Array, n: Array, part: Part) -> None:
     albedo, gloss = {
         Part.SKIN: (linear_bgr(look.skin), 0.02),
         Part.HAIR: (linear_bgr(look.hair), 0.03),

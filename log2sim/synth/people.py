@@ -1,5 +1,7 @@
 """Shapes of pedestrians and cyclists, which move their limbs as they go."""
 
+# ruff: noqa: RUF005  (`+` adds to points here, it does not join lists)
+
 from __future__ import annotations
 
 from functools import lru_cache
@@ -45,7 +47,13 @@ def _walker(phase: float, standing: bool) -> Mesh:
         knee = hip + 0.44 * np.array([np.sin(thigh), 0, -np.cos(thigh)])
         ankle = knee + 0.42 * np.array([np.sin(shin), 0, -np.cos(shin)])
         toe = ankle + 0.19 * np.array([np.cos(shin + 0.05), 0.0, np.sin(shin + 0.05) - 0.12])
-        parts.append(limb([hip, (hip + knee) / 2, knee, (knee * 0.6 + ankle * 0.4), ankle], [0.095, 0.085, 0.062, 0.058, 0.045], Part.TROUSERS))
+        parts.append(
+            limb(
+                [hip, (hip + knee) / 2, knee, (knee * 0.6 + ankle * 0.4), ankle],
+                [0.095, 0.085, 0.062, 0.058, 0.045],
+                Part.TROUSERS,
+            )
+        )
         parts.append(limb([ankle + [-0.04, 0, -0.03], toe], [0.05, 0.04], Part.SHOE))
         arm = -0.45 * s
         shoulder = np.array([0.0, side * 0.195, shoulder_z])
@@ -89,26 +97,34 @@ def _rider(phase: float) -> Mesh:
     radius = 0.34
     rear, front = np.array([-0.53, 0.0, radius]), np.array([0.53, 0.0, radius])
     crank, seat, head = np.array([-0.08, 0.0, 0.28]), np.array([-0.26, 0.0, 0.92]), np.array([0.38, 0.0, 0.88])
-    parts = [hoop(c, radius, 0.022, Part.TIRE) for c in (rear, front)]
+    parts = [hoop(c, radius, 0.026, Part.TIRE) for c in (rear, front)]
     for hub in (rear, front):
         for k in range(8):
             a = k * np.pi / 8 + phase
             rim = 0.31 * np.array([np.cos(a), 0, np.sin(a)])
-            parts.append(limb([hub - rim, hub + rim], [0.004, 0.004], Part.MIRROR, count=4))
+            parts.append(limb([hub - rim, hub + rim], [0.005, 0.005], Part.MIRROR, count=4))
         parts.append(limb([hub + [0, -0.04, 0], hub + [0, 0.04, 0]], [0.025, 0.025], Part.TIRE, count=6))
     tubes = ((seat, crank), (crank, head), (seat + [0.02, 0, -0.08], head), (crank, rear), (seat + [0.03, 0, -0.12], rear),
              (head + [0.0, 0, 0.1], front))  # fmt: skip
-    parts += [limb([a, b], [0.02, 0.02], Part.FRAME, count=8) for a, b in tubes]
+    parts += [limb([a, b], [0.024, 0.024], Part.FRAME, count=8) for a, b in tubes]
     bar = head + [0.02, 0, 0.13]
     parts.append(limb([bar + [0, -0.27, 0], bar + [0, 0.27, 0]], [0.016, 0.016], Part.TIRE, count=6))
     parts.append(limb([seat + [-0.13, 0, 0.03], seat + [0.12, 0, 0.03]], [0.06, 0.03], Part.TIRE, count=8))
     hip_z = 1.0
     for side, shift in ((1, 0.0), (-1, np.pi)):
         pedal = crank + [0.17 * np.cos(phase + shift), side * 0.11, -0.17 * np.sin(phase + shift)]
-        parts.append(limb([crank + [0, side * 0.07, 0], pedal + [0, -side * 0.02, 0]], [0.014, 0.014], Part.MIRROR, count=6))
+        parts.append(
+            limb([crank + [0, side * 0.07, 0], pedal + [0, -side * 0.02, 0]], [0.014, 0.014], Part.MIRROR, count=6)
+        )
         hip, ankle = np.array([-0.22, side * 0.09, hip_z]), pedal + [-0.06, 0, 0.1]
         knee = _knee(hip, ankle, 0.44, 0.43)
-        parts.append(limb([hip, (hip + knee) / 2, knee, (knee * 0.6 + ankle * 0.4), ankle], [0.10, 0.09, 0.065, 0.06, 0.045], Part.TROUSERS))
+        parts.append(
+            limb(
+                [hip, (hip + knee) / 2, knee, (knee * 0.6 + ankle * 0.4), ankle],
+                [0.10, 0.09, 0.065, 0.06, 0.045],
+                Part.TROUSERS,
+            )
+        )
         parts.append(limb([ankle + [-0.03, 0, -0.04], pedal + [0.1, 0, 0.03]], [0.048, 0.038], Part.SHOE))
         shoulder = np.array([0.13, side * 0.19, 1.45])
         hand = bar + [0.01, side * 0.23, 0.03]

@@ -55,7 +55,9 @@ def ray_pattern(spec: LidarSpec) -> tuple[Array, Array]:
     return directions, np.repeat(ago, spec.channels)
 
 
-def cast(spec: LidarSpec, scene: Scene, ego: EgoMotion, actors: tuple[Actor, ...], stamp_ns: int, rng: np.random.Generator) -> Cast:
+def cast(
+    spec: LidarSpec, scene: Scene, ego: EgoMotion, actors: tuple[Actor, ...], stamp_ns: int, rng: np.random.Generator
+) -> Cast:
     """Cast one sweep; its stamp is its end, and every point is in the lidar frame at its own time."""
     directions, ago_s = ray_pattern(spec)
     t_ns = stamp_ns - np.rint(ago_s * NS_PER_S).astype(np.int64)
@@ -102,7 +104,9 @@ def _box_distance(building: Building, origin: Array, ray: Array) -> Array:
     return np.where((enter <= leave) & (enter > 0) & ~outside.any(1), enter, np.inf)
 
 
-def _actor_distance(actor: Actor, t_s: Array, column: NDArray[np.int64], origin: Array, ray: Array) -> tuple[NDArray[np.int64], Array]:
+def _actor_distance(
+    actor: Actor, t_s: Array, column: NDArray[np.int64], origin: Array, ray: Array
+) -> tuple[NDArray[np.int64], Array]:
     """Rays that meet the actor's box, each with the actor where it is at the ray's time, and distances to its shape."""
     states = actor.at(t_s)
     center = states.center_m[column]

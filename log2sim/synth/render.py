@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -80,7 +81,14 @@ class Seen:
     box_px: Array
 
 
-def render(camera: Camera, map_T_cam: Array, backdrop: Backdrop, actors: tuple[Actor, ...], t_s: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+def render(
+    camera: Camera,
+    map_T_cam: Array,
+    backdrop: Backdrop,
+    actors: tuple[Actor, ...],
+    t_s: float,
+    rng: np.random.Generator,
+) -> NDArray[np.uint8]:
     """An image (H, W, 3) uint8 BGR."""
     view = View.of(camera, map_T_cam, OVERSAMPLING)
     color, depth, on_ground = _sky_and_ground(view, backdrop)
@@ -100,7 +108,9 @@ def render(camera: Camera, map_T_cam: Array, backdrop: Backdrop, actors: tuple[A
     return _developed(color, rng)
 
 
-def segment(camera: Camera, map_T_cam: Array, backdrop: Backdrop, actors: tuple[Actor, ...], t_s: float) -> list[Seen | None]:
+def segment(
+    camera: Camera, map_T_cam: Array, backdrop: Backdrop, actors: tuple[Actor, ...], t_s: float
+) -> list[Seen | None]:
     """What the camera sees of each actor, None for nothing."""
     view = View.of(camera, map_T_cam, 1)
     depth = np.full((view.height_px, view.width_px), np.inf, np.float32)
@@ -174,7 +184,9 @@ def _surroundings(direction: NDArray[np.float32]) -> NDArray[np.float32]:
     return ((houses * (1 - blend) + sky * blend) * (1 - below) + 0.09 * below).astype(np.float32)
 
 
-def _sky_and_ground(view: View, backdrop: Backdrop) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+def _sky_and_ground(
+    view: View, backdrop: Backdrop
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
     by_column, by_row = view.rays()
     up = by_row[:, None, 2] + by_column[None, :, 2]
     rise = np.clip(up / np.sqrt(1 + up * up) * 1.8, 0, 1)[..., None]
@@ -196,18 +208,27 @@ def _ground_image(view: View, backdrop: Backdrop, depth: NDArray[np.float32]) ->
     image_H_ground = view.K @ np.column_stack([cam_T_map[:3, 0], cam_T_map[:3, 1], cam_T_map[:3, 3]])
     middle = depth[:, w // 2]
     footprint = middle / view.K[0, 0] * np.sqrt(np.maximum(middle / max(view.map_T_cam[2, 3], 0.1), 1.0))
-    level = np.clip(np.rint(np.log2(np.maximum(footprint / GROUND_M_PER_PX, 1.0))), 0, len(backdrop.ground) - 1).astype(int)
+    level = np.clip(np.rint(np.log2(np.maximum(footprint / GROUND_M_PER_PX, 1.0))), 0, len(backdrop.ground) - 1).astype(
+        int
+    )
     out = np.empty((h, w, 3), np.uint8)
     edges = np.concatenate([[0], np.flatnonzero(np.diff(level)) + 1, [h]])
-    for top, bottom in zip(edges[:-1], edges[1:]):
+    for top, bottom in pairwise(edges):
         k = int(level[top])
         step = GROUND_M_PER_PX * 2**k
-        ground_H_texture = np.array([[step, 0, backdrop.corner_m[0] + step / 2], [0, step, backdrop.corner_m[1] + step / 2], [0, 0, 1]])
+        ground_H_texture = np.array(
+            [[step, 0, backdrop.corner_m[0] + step / 2], [0, step, backdrop.corner_m[1] + step / 2], [0, 0, 1]]
+        )
         shift = np.array([[1, 0, 0], [0, 1, -top], [0, 0, 1.0]])
         homography = shift @ image_H_ground @ ground_H_texture
         plain = backdrop.ground[-1][0, 0].tolist()
         out[top:bottom] = cv2.warpPerspective(
-            backdrop.ground[k], homography, (w, int(bottom - top)), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=plain
+            backdrop.ground[k],
+            homography,
+            (w, int(bottom - top)),
+            flags=cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=plain,
         )
     return out
 
@@ -240,14 +261,24 @@ def _draw_walls(view: View, backdrop: Backdrop, color: NDArray[np.float32] | Non
         if color is None:
             continue
         finite = np.where(np.isfinite(z), z, 0)
-        s = ((rows[:, None, :2] + columns[None, :, :2]) @ wall.along.astype(np.float32)) * finite + np.float32(np.dot(eye[:2] - wall.foot_m, wall.along))
+        s = ((rows[:, None, :2] + columns[None, :, :2]) @ wall.along.astype(np.float32)) * finite + np.float32(
+            np.dot(eye[:2] - wall.foot_m, wall.along)
+        )
         height = (rows[:, None, 2] + columns[None, :, 2]) * finite + np.float32(eye[2])
-        texture = cv2.remap(wall.texture, s / FACADE_M_PER_PX - 0.5, height / FACADE_M_PER_PX - 0.5, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        texture = cv2.remap(
+            wall.texture,
+            s / FACADE_M_PER_PX - 0.5,
+            height / FACADE_M_PER_PX - 0.5,
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
         light = SKY_LIGHT * 0.75 + SUN_LIGHT * np.float32(max(0.0, float(wall.outward @ SUN[:2])))
         color[region][drawn] = _LINEAR[texture[drawn]] * light
 
 
-def _draw_shadows(view: View, actors: tuple[Actor, ...], t_s: float, color: NDArray[np.float32], ground: NDArray[np.bool_]) -> None:
+def _draw_shadows(
+    view: View, actors: tuple[Actor, ...], t_s: float, color: NDArray[np.float32], ground: NDArray[np.bool_]
+) -> None:
     """Darken the ground where actors keep the sun off it and, right under them, the sky too."""
     sun = np.zeros(ground.shape, np.uint8)
     sky = np.zeros(ground.shape, np.uint8)
@@ -264,13 +295,13 @@ def _draw_shadows(view: View, actors: tuple[Actor, ...], t_s: float, color: NDAr
             polygon = view.polygon(np.column_stack([hull, np.zeros(len(hull))]).astype(float))
             if len(polygon):
                 cv2.fillConvexPoly(mask, polygon, 255, cv2.LINE_AA, 4)
-    sun = cv2.GaussianBlur(sun, (0, 0), 1.6 * OVERSAMPLING)
-    sky = cv2.GaussianBlur(sky, (0, 0), 1.8 * OVERSAMPLING)
-    rows = np.flatnonzero(((sun > 0) | (sky > 0)).any(1))
+    soft_sun = np.asarray(cv2.GaussianBlur(sun, (0, 0), 1.6 * OVERSAMPLING), np.uint8)
+    soft_sky = np.asarray(cv2.GaussianBlur(sky, (0, 0), 1.8 * OVERSAMPLING), np.uint8)
+    rows = np.flatnonzero(((soft_sun > 0) | (soft_sky > 0)).any(1))
     if len(rows) == 0:
         return
     band = slice(int(rows[0]), int(rows[-1]) + 1)
-    factor = (1 - 0.55 * (sun[band] / np.float32(255))) * (1 - 0.5 * (sky[band] / np.float32(255)))
+    factor = (1 - 0.55 * (soft_sun[band] / np.float32(255))) * (1 - 0.5 * (soft_sky[band] / np.float32(255)))
     color[band] *= np.where(ground[band], factor, 1.0)[..., None].astype(np.float32)
 
 

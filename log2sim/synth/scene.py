@@ -4,6 +4,8 @@ Map frame: x east, y north, z up, in m; the ground is z = 0. Sensors are given o
 middle of the rear axle on the ground; yaw counter-clockwise, pitch positive upwards.
 """
 
+# ruff: noqa: RUF009  (`_of` is dataclasses.field with a check attached)
+
 from __future__ import annotations
 
 import difflib
@@ -201,7 +203,8 @@ def load_scene(path: Path | str) -> Scene:
 def scene_from_table(table: dict[str, Any]) -> Scene:
     """A scene from a TOML document."""
     scene: Scene = _build(Scene, table, "")
-    for kind, names in (("agent", [a.id for a in scene.agent]), ("sensor", [s.name for s in (*scene.camera, *scene.lidar)])):
+    sensors = [c.name for c in scene.camera] + [d.name for d in scene.lidar]
+    for kind, names in (("agent", [a.id for a in scene.agent]), ("sensor", sensors)):
         for name in names:
             if names.count(name) > 1:
                 raise ConfigError(f"{kind} '{name}' stands twice; names must be unique")
@@ -267,7 +270,9 @@ def _list(value: Any, where: str) -> list[Any]:
     return value
 
 
-def _vector(value: Any, width: int, where: str, low: float = -1e7, high: float = 1e7, *, whole: bool = False) -> tuple[Any, ...]:
+def _vector(
+    value: Any, width: int, where: str, low: float = -1e7, high: float = 1e7, *, whole: bool = False
+) -> tuple[Any, ...]:
     values = _list(value, where)
     if len(values) != width:
         raise ConfigError(f"'{where}' has {len(values)} values, expected {width}")
@@ -277,5 +282,7 @@ def _vector(value: Any, width: int, where: str, low: float = -1e7, high: float =
 def _number(value: Any, where: str, low: float, high: float, *, whole: bool = False) -> Any:
     good = isinstance(value, int if whole else (int, float)) and not isinstance(value, bool)
     if not good or not math.isfinite(value) or not low <= value <= high:
-        raise ConfigError(f"'{where}' is {value!r}, expected a {'whole ' if whole else ''}number from {low:g} to {high:g}")
+        raise ConfigError(
+            f"'{where}' is {value!r}, expected a {'whole ' if whole else ''}number from {low:g} to {high:g}"
+        )
     return value if whole else float(value)

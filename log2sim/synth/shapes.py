@@ -76,13 +76,11 @@ def _fan(ring: Array, part: int) -> Mesh:
     return surface(vertices, np.stack([k, (k + 1) % len(ring), np.full(len(ring), len(ring))], 1), part)
 
 
-def _frame(axis: Array) -> tuple[Array, Array]:
-    """Two unit vectors that make a right-handed frame with `axis`."""
+def _across(axis: Array) -> Array:
+    """A unit vector square to `axis`."""
     side = np.array([0.0, 1.0, 0.0]) if abs(axis[1]) < 0.9 * np.linalg.norm(axis) else np.array([1.0, 0.0, 0.0])
-    u = np.cross(side, axis)
-    u /= np.linalg.norm(u)
-    v = np.cross(axis, u)
-    return u, v / np.linalg.norm(v)
+    across = np.cross(side, axis)
+    return across / np.linalg.norm(across)
 
 
 def limb(points: ArrayLike, radii: Sequence[float], part: int, *, count: int = 10, flat: float = 1.0) -> Mesh:
@@ -92,10 +90,12 @@ def limb(points: ArrayLike, radii: Sequence[float], part: int, *, count: int = 1
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     angle = np.arange(count) * 2 * np.pi / count
     rings = []
-    u, v = _frame(p[-1] - p[0])
+    u = _across(p[-1] - p[0])
     stations = [(p[0] - tangent[0] * radii[0] * h, radii[0] * c, tangent[0]) for h, c in ((1.0, 0.05), (0.8, 0.6))]
     stations += [(p[i], radii[i], tangent[i]) for i in range(len(p))]
-    stations += [(p[-1] + tangent[-1] * radii[-1] * h, radii[-1] * c, tangent[-1]) for h, c in ((0.8, 0.6), (1.0, 0.05))]
+    stations += [
+        (p[-1] + tangent[-1] * radii[-1] * h, radii[-1] * c, tangent[-1]) for h, c in ((0.8, 0.6), (1.0, 0.05))
+    ]
     for center, radius, axis in stations:
         across = u - axis * np.dot(u, axis)
         across /= np.linalg.norm(across)
@@ -124,7 +124,16 @@ def block(low: ArrayLike, high: ArrayLike, part: int, *, bevel_m: float = 0.0) -
         top = np.column_stack([ring, np.full(4, z1)])
         return merged([*sides, _fan(bottom[::-1], part), _fan(top, part)])
     b = bevel_m
-    outline = [(x0 + b, y0), (x1 - b, y0), (x1, y0 + b), (x1, y1 - b), (x1 - b, y1), (x0 + b, y1), (x0, y1 - b), (x0, y0 + b)]
+    outline = [
+        (x0 + b, y0),
+        (x1 - b, y0),
+        (x1, y0 + b),
+        (x1, y1 - b),
+        (x1 - b, y1),
+        (x0 + b, y1),
+        (x0, y1 - b),
+        (x0, y0 + b),
+    ]
     ring = np.array(outline)
     center = np.array([(x0 + x1) / 2, (y0 + y1) / 2])
     inner = center + (ring - center) * (1 - b / np.array([(x1 - x0) / 2, (y1 - y0) / 2]))

@@ -60,13 +60,13 @@ def car(size_m: tuple[float, float, float], kind: str) -> Mesh:
         [-0.42 * length, -0.36 * width, 0.14 * height], [0.42 * length, 0.36 * width, 0.3 * height], Part.CHASSIS
     )
     wheels = [
-        disc_wheel([s * WHEEL_AT * length, side * (width / 2 - 0.115), WHEEL_RADIUS_M], WHEEL_RADIUS_M, 0.22, Part.WHEEL)
+        disc_wheel(
+            [s * WHEEL_AT * length, side * (width / 2 - 0.115), WHEEL_RADIUS_M], WHEEL_RADIUS_M, 0.22, Part.WHEEL
+        )
         for s in (-1, 1)
         for side in (-1, 1)
     ]
-    mirrors = [
-        block(*_mirror(length, width, height, side), Part.MIRROR, bevel_m=0.03) for side in (-1, 1)
-    ]
+    mirrors = [block(*_mirror(length, width, height, side), Part.MIRROR, bevel_m=0.03) for side in (-1, 1)]
     return merged([skin, floor, *wheels, *mirrors]).fitted(size_m)
 
 
@@ -131,7 +131,15 @@ def _cab(rear: float, front: float, half: float, low: float, high: float) -> Mes
     rings = []
     for xi, ti, wi in zip(x, top, squeeze):
         h = half * wi
-        left = [(0.0, low), (0.96 * h, low), (h, low + 0.08), (h, ti - 0.12), (0.97 * h, ti - 0.04), (0.88 * h, ti), (0.0, ti)]
+        left = [
+            (0.0, low),
+            (0.96 * h, low),
+            (h, low + 0.08),
+            (h, ti - 0.12),
+            (0.97 * h, ti - 0.04),
+            (0.88 * h, ti),
+            (0.0, ti),
+        ]
         right = [(-y, z) for y, z in left[-2:0:-1]]
         rings.append([(xi, y, z) for y, z in left + right])
     return loft(np.array(rings), Part.CAB)
