@@ -1,0 +1,283 @@
+"""KITTI readers: the calibration chain, the Mercator poses, the labels, on made-up and on recorded drives."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from log2sim.camera import project
+from log2sim.errors import LogError, RecordError
+from log2sim.geometry import apply, inverse, points_in_box, rotation_from_rpy, yaw_of
+from log2sim.logs import open_log
+from log2sim.logs.kitti import EGO_T_IMU, poses_from_oxts, spin_offset_ns
+from log2sim.logs.kitti_tracking import boxes_in_map
+from log2sim.types import Log
+
+FRAMES = 4
+R_VELO = rotation_from_rpy(0.01, -0.02, 0.03)
+R_CAM = rotation_from_rpy(-np.pi / 2, 0.005, -np.pi / 2 + 0.01).T
+R_RECT = rotation_from_rpy(0.004, -0.003, 0.002)
+T_VELO, T_CAM = np.array([-0.8, 0.3, -0.8]), np.array([0.01, -0.08, -0.27])
+P2 = np.array([[700.0, 0, 30, 45.0], [0, 700, 20, 0.2], [0, 0, 1, 0.003]])
+
+
+def numbers(values: np.ndarray) -> str:
+    return " ".join(f"{v:.12e}" for v in np.asarray(values).ravel())
+
+
+def oxts_line(k: int) -> str:
+    return numbers(np.array([49.0 + 1e-5 * k, 8.4 + 2e-5 * k, 110.0 + 0.1 * k, 0.01, -0.02, 0.7 + 0.1 * k, *range(24)]))
+
+
+def stamp(k: float) -> str:
+    return f"2011-09-26 13:04:32.{round(k * 100_000_000) + 123_456_789:09d}"
+
+
+def write_image(path: Path) -> None:
+    import simplejpeg
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(simplejpeg.encode_jpeg(np.full((40, 60, 3), 90, np.uint8), colorspace="BGR"))
+
+
+def write_points(path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.array([[10, 0, 0, 1], [0, 10, 0, 1], [0, -10, 0, 1]], dtype=np.float32).tofile(path)
+
+
+@pytest.fixture
+def raw(tmp_path: Path) -> Path:
+    date = tmp_path / "2011_09_26"
+    drive = date / "2011_09_26_drive_0001_sync"
+    for k in range(FRAMES):
+        write_image(drive / "image_02" / "data" / f"{k:010d}.jpg")
+        write_points(drive / "velodyne_points" / "data" / f"{k:010d}.bin")
+        (drive / "oxts" / "data").mkdir(parents=True, exist_ok=True)
+        (drive / "oxts" / "data" / f"{k:010d}.txt").write_text(oxts_line(k) + "\n")
+    for name in (
+        "image_02/timestamps",
+        "oxts/timestamps",
+        *(f"velodyne_points/timestamps{e}" for e in ("", "_start", "_end")),
+    ):
+        shift = {"_start": -0.5, "_end": 0.5}.get(name.removeprefix("velodyne_points/timestamps"), 0)
+        lines = (stamp(k + 1 + shift) for k in range(FRAMES))
+        (drive / f"{name}.txt").write_text("\n".join(lines) + "\n")
+    (date / "calib_imu_to_velo.txt").write_text(f"calib_time: x\nR: {numbers(R_VELO)}\nT: {numbers(T_VELO)}\n")
+    (date / "calib_velo_to_cam.txt").write_text(f"calib_time: x\nR: {numbers(R_CAM)}\nT: {numbers(T_CAM)}\n")
+    (date / "calib_cam_to_cam.txt").write_text(
+        f"calib_time: x\nS_rect_02: 60 40\nR_rect_00: {numbers(R_RECT)}\nP_rect_02: {numbers(P2)}\n"
+    )
+    return tmp_path
+
+
+@pytest.fixture
+def tracking(tmp_path: Path) -> Path:
+    base = tmp_path / "training"
+    for k in range(FRAMES):
+        write_image(base / "image_02" / "0007" / f"{k:06d}.png")
+        write_points(base / "velodyne" / "0007" / f"{k:06d}.bin")
+    for name in ("oxts", "calib", "label_02"):
+        (base / name).mkdir()
+    (base / "oxts" / "0007.txt").write_text("\n".join(oxts_line(k) for k in range(FRAMES)) + "\n")
+    (base / "calib" / "0007.txt").write_text(
+        f"P2: {numbers(P2)}\nR_rect {numbers(R_RECT)}\nTr_velo_cam {numbers(np.c_[R_CAM, T_CAM])}\n"
+        f"Tr_imu_velo {numbers(np.c_[R_VELO, T_VELO])}\n"
+    )
+    (base / "label_02" / "0007.txt").write_text(
+        "0 -1 DontCare -1 -1 -10 1 1 9 9 -1000 -1000 -1000 -10 -1 -1 -1\n"
+        "1 5 Van 0 0 -1.8 1 2 30 20 2.0 1.8 4.4 -4.5 1.8 13.4 -1.6\n"
+        "2 6 Person_sitting 0 0 -1.8 1 2 30 20 1.2 0.6 0.8 2 1.8 9 0\n"
+    )
+    return tmp_path
+
+
+def test_a_point_lands_where_the_chain_of_matrices_puts_it(raw: Path) -> None:
+    """P_rect R_rect T_cam_velo T_velo_imu, multiplied out with plain 4x4 matrices, against our mounts and our camera."""
+    log = open_log(raw)
+    point_ego = np.array([[12.0, 1.5, 0.8], [20.0, -4.0, 1.0]])
+    homogeneous = np.c_[point_ego - EGO_T_IMU[:3, 3], np.ones(2)].T
+    velo_T_imu, cam_T_velo, rect = np.eye(4), np.eye(4), np.eye(4)
+    velo_T_imu[:3] = np.c_[R_VELO, T_VELO]
+    cam_T_velo[:3] = np.c_[R_CAM, T_CAM]
+    rect[:3, :3] = R_RECT
+    pixels = P2 @ rect @ cam_T_velo @ velo_T_imu @ homogeneous
+    camera = log.cameras["image_02"]
+    uv, _ = project(camera, apply(inverse(camera.mount_T_cam), point_ego))
+    np.testing.assert_allclose(uv, (pixels[:2] / pixels[2]).T, atol=1e-6)
+    point_velo = (velo_T_imu @ homogeneous)[:3].T
+    np.testing.assert_allclose(apply(log.lidars["velodyne"].mount_T_lidar, point_velo), point_ego, atol=1e-9)
+
+
+def test_both_layouts_have_the_same_rig_and_poses(raw: Path, tracking: Path) -> None:
+    a, b = open_log(raw, format="kitti"), open_log(tracking, format="kitti-tracking")
+    np.testing.assert_allclose(a.cameras["image_02"].mount_T_cam, b.cameras["image_02"].mount_T_cam, atol=1e-9)
+    np.testing.assert_allclose(a.lidars["velodyne"].mount_T_lidar, b.lidars["velodyne"].mount_T_lidar, atol=1e-9)
+    np.testing.assert_allclose(a.ego.map_T_ego, b.ego.map_T_ego, atol=1e-9)
+    assert b.streams["image_02"].t_ns.tolist() == [0, 100_000_000, 200_000_000, 300_000_000]
+    assert any("no stamps" in note for note in b.notes)
+
+
+def test_mercator_poses_agree_with_the_projection_they_state() -> None:
+    from pyproj import Proj
+
+    rows = np.zeros((50, 30))
+    rows[:, 0], rows[:, 1] = 49.0 + np.linspace(0, 0.02, 50), 8.4 + np.linspace(0, -0.03, 50)
+    rows[:, 2], rows[:, 5] = 100.0, np.linspace(-3, 3, 50)
+    poses, frame = poses_from_oxts(rows)
+    imu = poses @ EGO_T_IMU
+    x, y = Proj(frame.projection)(rows[:, 1], rows[:, 0])
+    np.testing.assert_allclose(imu[:, 0, 3], x, atol=1e-6)
+    np.testing.assert_allclose(imu[:, 1, 3], y, atol=1e-6)
+    np.testing.assert_allclose(imu[:, 2, 3] + frame.altitude_m, 100.0)
+    np.testing.assert_allclose(yaw_of(poses), rows[:, 5], atol=1e-12)
+    # True lengths near the origin: a degree of latitude on the sphere is R pi / 180.
+    assert y[1] / 0.02 * 49 == pytest.approx(6378137 * np.pi / 180, rel=1e-4)
+
+
+def test_the_scanner_sees_left_before_front_before_right() -> None:
+    xyz = np.array([[-1.0, 1e-9, 0], [0, 1, 0], [1, 0, 0], [0, -1, 0], [-1, -1e-9, 0]])
+    np.testing.assert_array_equal(spin_offset_ns(xyz, -50, 60), [-50, -25, 0, 30, 60])
+
+
+def test_stamps_keep_their_nanoseconds(raw: Path) -> None:
+    log = open_log(raw)
+    assert log.streams["image_02"].t_ns[0] == 1_317_042_272_223_456_789
+    sweep = log.streams["velodyne"].read(1)
+    np.testing.assert_array_equal(sweep.t_ns - log.streams["velodyne"].t_ns[1], [0, -25_000_000, 25_000_000])
+
+
+def test_a_missing_sweep_is_a_gap_not_a_shift(raw: Path) -> None:
+    folder = next(raw.glob("*/*/velodyne_points"))
+    (folder / "data" / f"{1:010d}.bin").unlink()
+    log = open_log(raw)
+    steps = np.diff(log.streams["velodyne"].t_ns)
+    assert steps.tolist() == [200_000_000, 100_000_000]
+    assert any("velodyne_points: 1 of 4 records are missing" in note for note in log.notes)
+
+
+def test_a_root_a_date_and_a_drive_open_alike(raw: Path) -> None:
+    drive = next(raw.glob("*/*_sync"))
+    assert {open_log(p).digest for p in (raw, drive.parent, drive)} == {open_log(raw).digest}
+
+
+def test_labels_become_boxes_in_the_map(tracking: Path) -> None:
+    log = open_log(tracking)
+    labels = log.labels
+    assert labels.category.tolist() == ["car", "pedestrian"]
+    assert labels.t_ns.tolist() == [100_000_000, 200_000_000]
+    np.testing.assert_allclose(labels.size_m[0], [4.4, 1.8, 2.0])
+    map_T_cam, _ = log.map_T_sensor("image_02", labels.t_ns[:1])
+    baseline = np.linalg.solve(P2[:, :3], P2[:, 3])
+    expected = apply(map_T_cam[0], np.array([[-4.5, 1.8 - 1.0, 13.4]]) + baseline)
+    np.testing.assert_allclose(labels.center_m[:1], expected, atol=1e-9)
+    # rotation_y = -1.6 points along the camera's axis, so the van drives in the ego's direction but for 0.03 rad and the mount.
+    ego_yaw = yaw_of(log.ego.at(labels.t_ns[:1])[0])
+    assert abs(labels.yaw_rad[0] - ego_yaw[0]) < 0.08
+    assert log.image_labels["image_02"].box_px.tolist() == [[1, 2, 30, 20], [1, 2, 30, 20]]
+
+
+def test_rotation_about_the_camera_axis_turns_clockwise_in_the_map() -> None:
+    """With the camera looking along the map's x, rotation_y 0 points to the camera's right, the map's -y."""
+    map_T_rect = np.eye(4)[None].repeat(3, 0)
+    map_T_rect[:, :3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    values = np.array([[2, 1, 4, 0, 1, 10, turn] for turn in (0.0, -np.pi / 2, np.pi / 4)])
+    center, size, yaw = boxes_in_map(map_T_rect, values)
+    np.testing.assert_allclose(yaw, [-np.pi / 2, 0, -3 * np.pi / 4], atol=1e-12)
+    np.testing.assert_allclose(center[0], [10, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(size[0], [4, 1, 2])
+
+
+def edit(file: Path, old: str, new: str) -> None:
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new, 1))
+
+
+def test_a_rotation_that_is_not_orthonormal_is_refused_with_its_error(raw: Path) -> None:
+    bent = R_CAM.copy()
+    bent[0, 0] += 0.01
+    bent[1] *= 1.002
+    edit(raw / "2011_09_26" / "calib_velo_to_cam.txt", numbers(R_CAM), numbers(bent))
+    with pytest.raises(LogError, match=r"calib_velo_to_cam.txt, entry 'R'.*off the identity by 0\.01"):
+        open_log(raw)
+    edit(raw / "2011_09_26" / "calib_velo_to_cam.txt", numbers(bent), numbers(-R_CAM))
+    with pytest.raises(LogError, match=r"determinant -1"):
+        open_log(raw)
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "words"),
+    [
+        ("calib_cam_to_cam.txt", "P_rect_02: 7", "P_rect_02: 0", "positive focal"),
+        ("calib_cam_to_cam.txt", "P_rect_02", "P_rect_09", "no entry 'P_rect_02'"),
+        ("calib_imu_to_velo.txt", "T: -8", "T: nan -8", "expected 3 finite"),
+        ("2011_09_26_drive_0001_sync/oxts/data/0000000002.txt", "4.9", "x", "0000000002.txt, line 1"),
+        ("2011_09_26_drive_0001_sync/image_02/timestamps.txt", "2011-09-26", "yesterday", "timestamps.txt, line 1"),
+        ("2011_09_26_drive_0001_sync/oxts/timestamps.txt", stamp(4), "", "record 3 has none"),
+    ],
+)
+def test_a_fault_of_a_drive_names_its_file(raw: Path, file: str, old: str, new: str, words: str) -> None:
+    if "focal" in words:
+        old, new = numbers(P2[0]), numbers(np.array([-700.0, 0, 30, 45]))
+    edit(raw / "2011_09_26" / file, old, new)
+    with pytest.raises(LogError, match=Path(file).name) as caught:
+        open_log(raw)
+    assert words in str(caught.value)
+
+
+def test_a_missing_calibration_and_a_cut_sweep(raw: Path) -> None:
+    cloud = next(raw.glob("*/*/velodyne_points/data/*2.bin"))
+    cloud.write_bytes(cloud.read_bytes()[:-3])
+    with pytest.raises(RecordError, match=r"0000000002\.bin"):
+        open_log(raw).streams["velodyne"].read(2)
+    (raw / "2011_09_26" / "calib_imu_to_velo.txt").unlink()
+    with pytest.raises(LogError, match=r"calib_imu_to_velo.txt: no such file"):
+        open_log(raw)
+
+
+def test_a_bad_label_line_is_named(tracking: Path) -> None:
+    with (tracking / "training" / "label_02" / "0007.txt").open("a") as file:
+        file.write("3 7 Spaceship 0 0\n")
+    with pytest.raises(LogError, match=r"0007.txt, line 4"):
+        open_log(tracking)
+
+
+def count_points(log: Log, category: str, within_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points inside the label boxes, and inside boxes half a meter larger to each side."""
+    inside, around = [], []
+    labels, stream = log.labels, log.streams["velodyne"]
+    for i in range(0, len(stream.t_ns), 8):
+        sweep = stream.read(i)
+        points = apply(log.map_T_sensor("velodyne", sweep.t_ns)[0], sweep.xyz_m)
+        ego = log.ego.at(stream.t_ns[i])[0][0, :3, 3]
+        for k in np.flatnonzero((labels.t_ns == stream.t_ns[i]) & (labels.category == category)):
+            if np.linalg.norm(labels.center_m[k] - ego) < within_m:
+                args = labels.center_m[k], labels.size_m[k], labels.yaw_rad[k]
+                inside.append(points_in_box(points, *args, margin_m=0.1).sum())
+                around.append(points_in_box(points, args[0], args[1] + np.array([1.0, 1.0, 0.0]), args[2]).sum())
+    return np.array(inside), np.array(around)
+
+
+@pytest.mark.real
+def test_label_boxes_of_the_recorded_drive_hold_the_points_of_their_cars(real_data: Path) -> None:
+    log = open_log(real_data / "kitti_tracking")
+    inside, around = count_points(log, "car", 30.0)
+    assert len(inside) > 10
+    assert np.mean(inside > 20) > 0.9
+    assert inside.sum() / around.sum() > 0.8
+    assert log.labels.center_m[log.labels.category == "car", 2].mean() == pytest.approx(0.9, abs=0.5)
+
+
+@pytest.mark.real
+def test_the_recorded_drive_opens_with_its_real_stamps(real_data: Path) -> None:
+    log = open_log(real_data / "kitti_raw")
+    assert json.dumps(log.streams["image_02"].t_ns[:1].tolist()) == "[1317042272345808896]"
+    assert log.streams["image_02"].read(0).shape == (375, 1242, 3)
+    sweep = log.streams["velodyne"].read(0)
+    assert np.ptp(sweep.t_ns) == pytest.approx(0.1033e9, rel=0.01)
+    near = np.linalg.norm(sweep.xyz_m[:, :2], axis=1) < 12
+    heights = apply(log.lidars["velodyne"].mount_T_lidar, sweep.xyz_m[near])[:, 2]
+    assert abs(np.median(heights[heights < 0.4])) < 0.1

@@ -1,0 +1,429 @@
+"""The native log folder: what is written reads back, and what is wrong is named by file and field."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from log2sim.errors import ConfigError, LogError, RecordError
+from log2sim.geometry import PoseTrack, rotation_from_rpy, transform, wrap_angle, yaw_of
+from log2sim.logs import open_log
+from log2sim.logs.geodesy import transverse_mercator
+from log2sim.logs.summary import summarize
+from log2sim.logs.validate import validate_log
+from log2sim.logs.writer import write_log
+from log2sim.types import Camera, EgoVehicle, ImageLabels, Labels, Lidar, Log, MapFrame, Stream, Sweep
+
+T0_NS = 1_700_000_000_123_456_789
+FRAMES = 5
+
+
+def make_log(shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0), map_frame: MapFrame | None = None) -> Log:
+    """A small log in memory with a sensor of each kind on each mount, placed anywhere."""
+    rng = np.random.default_rng(5)
+    shift = np.array(shift_m)
+    t = T0_NS + np.arange(FRAMES) * 100_000_000
+    rotation = rotation_from_rpy(0.02, -0.01, np.linspace(3.0, 3.4, FRAMES))
+    position = shift + np.stack([np.arange(FRAMES) * 1.5, np.full(FRAMES, 2.0), np.full(FRAMES, 0.25)], axis=1)
+    poses = transform(rotation, position)
+    smooth = np.linspace(0, 200, 60 * 40).reshape(40, 60)[..., None] * np.array([1.0, 0.5, 0.2])
+    images = [np.clip(smooth + 5 * k, 0, 255).astype(np.uint8) for k in range(FRAMES)]
+    clouds = [rng.uniform(-40, 40, (50, 3)) for _ in range(FRAMES)]
+    offsets = np.arange(50) * 1_000_000 - 25_000_000
+    K = np.array([[55.0, 0, 30.5], [0, 56.0, 20.5], [0, 0, 1]])
+    on_ego = transform(rotation_from_rpy(-1.5, 0.1, -1.6), [1.5, 0.2, 1.4])
+    in_map = transform(rotation_from_rpy(0.1, 0.2, 0.3), shift + np.array([10.0, 5.0, 6.0]))
+    return Log(
+        name="small",
+        format="memory",
+        cameras={
+            "front": Camera("front", 60, 40, K, "ego", on_ego, "brown", (0.1, -0.05, 0.001, 0.002)),
+            "pole": Camera("pole", 60, 40, K, "map", in_map),
+        },
+        lidars={"top": Lidar("top", "ego", on_ego), "world": Lidar("world", "map", in_map)},
+        streams={
+            "front": Stream("front", t, lambda i: images[i]),
+            "pole": Stream("pole", t + 7, lambda i: images[i]),
+            "top": Stream("top", t, lambda i: Sweep(int(t[i]), clouds[i], "lidar", t[i] + offsets)),
+            "world": Stream("world", t, lambda i: Sweep(int(t[i]), clouds[i] + shift, "map")),
+        },
+        ego=PoseTrack(t, poses),
+        ego_vehicle=EgoVehicle((4.0, 1.7, 1.5), 1.2),
+        map=map_frame or MapFrame(),
+        labels=Labels(
+            t,
+            np.array(["a"] * FRAMES),
+            np.array(["car"] * FRAMES),
+            position + np.array([10.0, 0.0, 0.5]),
+            np.tile([4.4, 1.8, 1.5], (FRAMES, 1)),
+            np.linspace(-1, 1, FRAMES),
+            np.arange(FRAMES) % 2 == 0,
+        ),
+        image_labels={
+            "front": ImageLabels(t[:2], np.array([[1.0, 2, 30, 20], [2, 3, 31, 22]]), np.array(["car", "bus"]))
+        },
+        ground_z_ego_m=-0.3,
+        reference_camera="front",
+    )
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_log(make_log(), tmp_path / "log")
+    return tmp_path / "log"
+
+
+def edit(folder: Path, change: Callable[[dict], object]) -> None:
+    manifest = json.loads((folder / "log.json").read_text())
+    change(manifest)
+    (folder / "log.json").write_text(json.dumps(manifest))
+
+
+def edit_line(file: Path, line: int, text: str) -> None:
+    lines = file.read_text().splitlines()
+    lines[line - 1] = text
+    file.write_text("\n".join(lines) + "\n")
+
+
+def test_what_is_written_reads_back(folder: Path) -> None:
+    log, back = make_log(), open_log(folder)
+    assert (back.name, back.format, back.reference_camera, back.ground_z_ego_m) == ("small", "log2sim", "front", -0.3)
+    assert back.ego_vehicle == log.ego_vehicle
+    assert back.notes == ()
+    np.testing.assert_array_equal(back.ego.t_ns, log.ego.t_ns)
+    np.testing.assert_allclose(back.ego.map_T_ego, log.ego.map_T_ego, atol=1e-12)
+    for name, camera in log.cameras.items():
+        assert (back.cameras[name].mount, back.cameras[name].distortion) == (camera.mount, camera.distortion)
+        np.testing.assert_allclose(back.cameras[name].mount_T_cam, camera.mount_T_cam, atol=1e-12)
+        np.testing.assert_array_equal(back.cameras[name].K, camera.K)
+        np.testing.assert_array_equal(back.streams[name].t_ns, log.streams[name].t_ns)
+        difference = back.streams[name].read(3).astype(int) - log.streams[name].read(3)
+        assert np.abs(difference).mean() < 3  # JPEG
+    for name in log.lidars:
+        ours, theirs = log.streams[name].read(2), back.streams[name].read(2)
+        assert (theirs.frame, theirs.stamp_ns) == (ours.frame, ours.stamp_ns)
+        np.testing.assert_allclose(theirs.xyz_m, ours.xyz_m, atol=6e-4)
+    np.testing.assert_array_equal(back.streams["top"].read(2).t_ns, log.streams["top"].read(2).t_ns)
+    assert back.streams["world"].read(2).t_ns is None
+    for field in ("t_ns", "track_id", "category", "center_m", "size_m", "yaw_rad", "visible"):
+        np.testing.assert_array_equal(getattr(back.labels, field), getattr(log.labels, field))
+    np.testing.assert_array_equal(back.image_labels["front"].box_px, log.image_labels["front"].box_px)
+    assert validate_log(folder) == []
+
+
+@pytest.mark.parametrize("sweep", ["npy", "bin"])
+def test_other_sweep_files_hold_the_same_points(tmp_path: Path, sweep: str) -> None:
+    write_log(make_log(), tmp_path / "log", sweep=sweep)
+    read = open_log(tmp_path / "log").streams["top"].read(1)
+    np.testing.assert_allclose(read.xyz_m, make_log().streams["top"].read(1).xyz_m, atol=6e-4)
+
+
+def test_gnss_gives_the_poses_back(tmp_path: Path) -> None:
+    log = make_log((300.0, -200.0, 0.0), MapFrame(48.1, 11.5, 500.0, transverse_mercator(48.1, 11.5)))
+    write_log(log, tmp_path / "log", ego="gnss")
+    back = open_log(tmp_path / "log")
+    np.testing.assert_allclose(back.ego.map_T_ego[:, :3, 3], log.ego.map_T_ego[:, :3, 3], atol=1e-5)
+    np.testing.assert_allclose(back.ego.map_T_ego[:, :3, :3], log.ego.map_T_ego[:, :3, :3], atol=1e-8)
+
+
+def test_gnss_yaw_is_turned_to_the_grid_of_the_projection(tmp_path: Path) -> None:
+    """Three degrees off the central meridian of UTM, grid north is about sin(latitude) * 3 degrees off true north."""
+    write_log(
+        make_log(map_frame=MapFrame(48.1, 11.5, 500.0, transverse_mercator(48.1, 11.5))), tmp_path / "log", ego="gnss"
+    )
+    edit(tmp_path / "log", lambda m: m.update(map={"projection": "+proj=utm +zone=32 +datum=WGS84"}))
+    for k in range(FRAMES):
+        edit_line(tmp_path / "log" / "ego" / "gnss.csv", k + 2, f"{T0_NS + k},48.0,12.0,500,0,0,0.5")
+    log = open_log(tmp_path / "log")
+    expected = np.radians(3.0) * np.sin(np.radians(48.0))
+    assert wrap_angle(yaw_of(log.ego.map_T_ego[0]) - 0.5) == pytest.approx(expected, abs=2e-5)
+    assert log.map.offset_m[1] == pytest.approx(5.32e6, abs=5e3)
+    assert np.abs(log.ego.map_T_ego[0, :2, 3]).max() <= 500.0
+
+
+def test_a_far_map_origin_changes_nothing_but_the_offset(tmp_path: Path) -> None:
+    near, far = make_log(), make_log((7_000_000.0, -10_000_000.0, 0.0))
+    write_log(near, tmp_path / "near")
+    write_log(far, tmp_path / "far")
+    a, b = open_log(tmp_path / "near"), open_log(tmp_path / "far")
+    assert a.map.offset_m == (0.0, 0.0, 0.0)
+    assert b.map.offset_m == (7_000_000.0, -10_000_000.0, 0.0)
+    np.testing.assert_allclose(b.ego.map_T_ego, a.ego.map_T_ego, atol=1e-6)
+    np.testing.assert_allclose(b.labels.center_m, a.labels.center_m, atol=1e-6)
+    np.testing.assert_allclose(b.cameras["pole"].mount_T_cam, a.cameras["pole"].mount_T_cam, atol=1e-6)
+    np.testing.assert_allclose(b.lidars["world"].mount_T_lidar, a.lidars["world"].mount_T_lidar, atol=1e-6)
+    np.testing.assert_allclose(b.cameras["front"].mount_T_cam, a.cameras["front"].mount_T_cam, atol=1e-9)
+    np.testing.assert_allclose(b.streams["world"].read(0).xyz_m, a.streams["world"].read(0).xyz_m, atol=1e-3)
+    np.testing.assert_allclose(b.streams["top"].read(0).xyz_m, a.streams["top"].read(0).xyz_m, atol=1e-6)
+    write_log(b, tmp_path / "again")
+    assert open_log(tmp_path / "again").map.offset_m == b.map.offset_m
+
+
+def test_a_roadside_log_needs_no_ego(tmp_path: Path) -> None:
+    log = make_log()
+    fixed = replace(
+        log, ego=None, cameras={"pole": log.cameras["pole"]}, lidars={"world": log.lidars["world"]},
+        streams={k: log.streams[k] for k in ("pole", "world")}, image_labels={}, reference_camera=None,
+    )  # fmt: skip
+    write_log(fixed, tmp_path / "log")
+    back = open_log(tmp_path / "log")
+    assert back.ego is None
+    assert back.map_T_sensor("pole", back.streams["pole"].t_ns)[1].all()
+
+
+def test_late_and_repeated_records_are_put_right_and_noted(folder: Path) -> None:
+    index = folder / "front" / "index.csv"
+    rows = index.read_text().splitlines()
+    index.write_text("\n".join([rows[0], rows[2], rows[1], rows[3], rows[3], rows[4], rows[5]]) + "\n")
+    poses = folder / "ego" / "poses.csv"
+    rows = poses.read_text().splitlines()
+    poses.write_text("\n".join([rows[0], *rows[:0:-1]]) + "\n")
+    log = open_log(folder)
+    expected = make_log()
+    np.testing.assert_array_equal(log.streams["front"].t_ns, expected.streams["front"].t_ns)
+    np.testing.assert_allclose(log.ego.map_T_ego, expected.ego.map_T_ego, atol=1e-12)
+    assert abs(log.streams["front"].read(0).astype(int) - expected.streams["front"].read(0)).mean() < 3
+    text = "\n".join(log.notes)
+    assert f"front: 1 of 6 records out of order, first at stamp {T0_NS}" in text
+    assert f"front: 1 of 6 records repeat a stamp, first at stamp {T0_NS + 200_000_000}" in text
+    assert "ego: 4 of 5 records out of order" in text
+    assert len(validate_log(folder)) == 3
+
+
+def test_negative_and_zero_stamps_are_stamps(folder: Path) -> None:
+    for k in range(FRAMES):
+        edit_line(folder / "front" / "index.csv", k + 2, f"{(k - 2) * 10},front/{k:06d}.jpg")
+    assert open_log(folder).streams["front"].t_ns.tolist() == [-20, -10, 0, 10, 20]
+
+
+def test_rows_that_are_not_finite_are_left_out_with_their_times(folder: Path) -> None:
+    xyz = np.array([[1, 2, 3], [np.nan, 0, 0], [4, 5, 6], [0, np.inf, 0]], dtype=np.float32)
+    np.savez(folder / "top" / "000001.npz", xyz_m=xyz, t_offset_ns=np.array([10, 20, 30, 40]))
+    sweep = open_log(folder).streams["top"].read(1)
+    np.testing.assert_array_equal(sweep.xyz_m, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(sweep.t_ns - sweep.stamp_ns, [10, 30])
+
+
+def test_an_empty_cloud_is_a_sweep_without_points(folder: Path) -> None:
+    np.savez(folder / "top" / "000001.npz", xyz_m=np.zeros((0, 3), np.float32))
+    assert open_log(folder).streams["top"].read(1).xyz_m.shape == (0, 3)
+    assert any("no points" in p for p in validate_log(folder))
+
+
+PCD = "FIELDS x y z intensity {t}\nSIZE 4 4 4 4 {size}\nTYPE F F F F {kind}\nPOINTS {n}\nDATA {data}\n"
+
+
+@pytest.mark.parametrize("data", ["ascii", "binary"])
+def test_pcd_points_and_their_times(folder: Path, data: str) -> None:
+    xyz = np.array([[1.5, -2, 3], [4, 5, 6.25]])
+    header = PCD.format(t="t", size=4, kind="U", n=2, data=data).encode()
+    if data == "ascii":
+        body = b"1.5 -2 3 0.5 100\n4 5 6.25 0.1 200\n"
+    else:
+        layout = np.dtype([("xyzi", "<f4", 4), ("t", "<u4")])
+        rows = np.array([((1.5, -2, 3, 0.5), 100), ((4, 5, 6.25, 0.1), 200)], dtype=layout)
+        body = rows.tobytes()
+    (folder / "top" / "cloud.pcd").write_bytes(header + body)
+    edit_line(folder / "top" / "index.csv", 2, f"{T0_NS},top/cloud.pcd")
+    sweep = open_log(folder).streams["top"].read(0)
+    np.testing.assert_array_equal(sweep.xyz_m, xyz)
+    np.testing.assert_array_equal(sweep.t_ns - T0_NS, [100, 200])
+
+
+def test_a_root_of_several_logs_needs_a_sequence(tmp_path: Path) -> None:
+    write_log(make_log(), tmp_path / "a")
+    assert open_log(tmp_path).name == "small"
+    write_log(make_log(), tmp_path / "b")
+    with pytest.raises(ConfigError, match=r"2 sequences.*--sequence NAME: a, b"):
+        open_log(tmp_path)
+    with pytest.raises(ConfigError, match=r"no sequence 'bb'.*did you mean 'b'"):
+        open_log(tmp_path, sequence="bb")
+    assert open_log(tmp_path, sequence="b").digest == open_log(tmp_path / "a").digest
+
+
+def test_the_digest_follows_every_index(folder: Path) -> None:
+    before = open_log(folder).digest
+    edit_line(folder / "labels" / "boxes_3d.csv", 2, f"{T0_NS},a,car,1,2,3,4,2,1.5,0.1,1")
+    assert open_log(folder).digest != before
+
+
+def test_a_folder_is_never_half_written_nor_lost(tmp_path: Path) -> None:
+    log = make_log()
+
+    def broken(i: int) -> None:
+        raise RecordError("no such record")
+
+    bad = replace(log, streams={**log.streams, "world": Stream("world", log.streams["world"].t_ns, broken)})
+    write_log(log, tmp_path / "log")
+    with pytest.raises(RecordError):
+        write_log(bad, tmp_path / "log", overwrite=True)
+    assert open_log(tmp_path / "log").name == "small"
+    assert [p.name for p in tmp_path.iterdir()] == ["log"]
+    with pytest.raises(ConfigError, match="exists already"):
+        write_log(log, tmp_path / "log")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("x")
+    with pytest.raises(ConfigError, match="is no log folder"):
+        write_log(log, tmp_path / "mine", overwrite=True)
+    assert (tmp_path / "mine" / "thesis.txt").exists()
+
+
+def test_the_summary_counts_and_finds_gaps(folder: Path) -> None:
+    edit_line(folder / "front" / "index.csv", 6, f"{T0_NS + 900_000_000},front/000004.jpg")
+    summary = summarize(open_log(folder))
+    assert summary["cameras"]["front"]["rate_hz"] == 10.0
+    assert summary["cameras"]["front"]["gaps"] == [{"after_ns": T0_NS + 300_000_000, "length_s": 0.6}]
+    assert summary["labels"] == {"boxes": 5, "tracks": 1, "tracks_by_category": {"car": 1}}
+    assert summary["ego"]["distance_m"] == 6.0
+    assert any("no ego pose for 1 of 5" in p for p in validate_log(folder))
+    json.dumps(summary, allow_nan=False)
+
+
+# --- bad input: (what breaks it, words that the message must hold)
+
+
+def first_sensor(m: dict) -> dict:
+    return m["sensors"][0]
+
+
+MANIFEST_FAULTS = {
+    "version": (lambda m: m.update(log_version=2), ["log.json", "log_version"]),
+    "unknown key": (lambda m: m.update(sensor=[]), ["log.json", "sensor"]),
+    "rotation": (lambda m: first_sensor(m).update(rotation_wxyz=[1, 0.2, 0, 0]), ["sensors[0] 'front'", "rotation_wxyz", "norm"]),
+    "focal length": (lambda m: first_sensor(m)["intrinsics"].update(fx_px=0), ["sensors[0].intrinsics.fx_px"]),
+    "distortion": (lambda m: first_sensor(m)["intrinsics"].update(distortion=[1.0]), ["sensors[0]", "distortion has 1 values"]),
+    "path": (lambda m: first_sensor(m).update(index="../elsewhere.csv"), ["sensors[0].index", "leaves the log folder"]),
+    "absolute path": (lambda m: m["ego"].update(poses="/etc/passwd"), ["ego.poses", "leaves the log folder"]),
+    "name twice": (lambda m: m["sensors"][1].update(name="front"), ["sensors[1] 'front'", "stands twice"]),
+    "no ego": (lambda m: m.pop("ego"), ["sensors[0] 'front'", "mounted on the ego"]),
+    "two egos": (lambda m: m["ego"].update(gnss="ego/gnss.csv"), ["log.json", "ego"]),
+    "reference": (lambda m: m.update(reference_camera="rear"), ["reference_camera", "no camera 'rear'", "front, pole"]),
+    "camera without K": (lambda m: first_sensor(m).pop("intrinsics"), ["sensors[0]", "intrinsics"]),
+    "missing index": (lambda m: first_sensor(m).update(index="front/none.csv"), ["front/none.csv", "no such file"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", MANIFEST_FAULTS)
+def test_a_fault_of_the_manifest_names_its_field(folder: Path, fault: str) -> None:
+    change, words = MANIFEST_FAULTS[fault]
+    edit(folder, change)
+    with pytest.raises(LogError) as caught:
+        open_log(folder)
+    assert all(word in str(caught.value) for word in words), str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+TABLE_FAULTS = {
+    "not a number": ("ego/poses.csv", 3, f"{T0_NS},x,0,0,1,0,0,0", ["poses.csv, line 3", "'x_m'", "finite number"]),
+    "NaN": ("ego/poses.csv", 3, f"{T0_NS},1,nan,0,1,0,0,0", ["poses.csv, line 3", "'y_m'", "nan"]),
+    "quaternion": ("ego/poses.csv", 3, f"{T0_NS + 5},1,1,0,0.5,0,0,0", ["poses.csv, line 3", "qw,qx,qy,qz", "0.5"]),
+    "stamp": ("front/index.csv", 2, "1.5e9,front/000000.jpg", ["index.csv, line 2", "'t_ns'", "whole number"]),
+    "stamp too large": ("front/index.csv", 2, "99999999999999999999,front/000000.jpg", ["line 2", "'t_ns'"]),
+    "escape": ("front/index.csv", 2, f"{T0_NS},../../etc/passwd", ["index.csv, line 2", "'file'", "leaves the log folder"]),
+    "few fields": ("front/index.csv", 2, f"{T0_NS}", ["index.csv, line 2", "1 fields"]),
+    "header": ("front/index.csv", 1, "t_ns,files", ["index.csv, line 1", "'file'", "missing"]),
+    "column": ("ego/poses.csv", 1, "t_ns,x_m,y_m,z_m,qw,qx,qy,qq", ["poses.csv, line 1", "'qz'"]),
+    "category": ("labels/boxes_3d.csv", 2, f"{T0_NS},a,spaceship,1,2,3,4,2,1,0,1", ["line 2", "spaceship", "pedestrian"]),
+    "size": ("labels/boxes_3d.csv", 2, f"{T0_NS},a,car,1,2,3,4,-2,1,0,1", ["line 2", "'width_m'", "-2"]),
+    "visible": ("labels/boxes_3d.csv", 2, f"{T0_NS},a,car,1,2,3,4,2,1,0,maybe", ["line 2", "'visible'", "maybe"]),
+    "camera": ("labels/boxes_2d.csv", 2, f"{T0_NS},rear,1,2,3,4,car", ["line 2", "'camera'", "rear"]),
+    "empty box": ("labels/boxes_2d.csv", 2, f"{T0_NS},front,5,2,3,4,car", ["line 2", "the box is empty"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", TABLE_FAULTS)
+def test_a_fault_of_a_table_names_its_line_and_field(folder: Path, fault: str) -> None:
+    file, line, text, words = TABLE_FAULTS[fault]
+    edit_line(folder / file, line, text)
+    with pytest.raises(LogError) as caught:
+        open_log(folder)
+    assert all(word in str(caught.value) for word in words), str(caught.value)
+
+
+def test_a_stream_without_records_is_an_error(folder: Path) -> None:
+    (folder / "front" / "index.csv").write_text("t_ns,file\n")
+    with pytest.raises(LogError, match=r"front/index.csv: no records"):
+        open_log(folder)
+
+
+def test_a_symbolic_link_cannot_lead_out(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "secret.jpg").write_bytes(b"x")
+    (folder / "front" / "link.jpg").symlink_to(tmp_path / "secret.jpg")
+    edit_line(folder / "front" / "index.csv", 2, f"{T0_NS},front/link.jpg")
+    with pytest.raises(LogError, match=r"line 2, field 'file'.*leaves the log folder"):
+        open_log(folder)
+
+
+def png(width: int, height: int) -> bytes:
+    import cv2
+
+    return cv2.imencode(".png", np.random.default_rng(0).integers(0, 255, (height, width, 3), dtype=np.uint8))[
+        1
+    ].tobytes()
+
+
+RECORD_FAULTS = {
+    "truncated JPEG": ("front", lambda f: f.write_bytes(f.read_bytes()[:-200]), "JPEG"),
+    "no image": ("front", lambda f: f.write_bytes(b"hello"), "neither a JPEG nor a PNG"),
+    "empty file": ("front", lambda f: f.write_bytes(b""), "neither a JPEG nor a PNG"),
+    "wrong size": ("front", lambda f: f.write_bytes(png(61, 40)), "61x40 px, the calibration is for 60x40"),
+    "truncated PNG": ("front", lambda f: f.write_bytes(png(60, 40)[:-1000]), "truncated"),
+    "huge PNG": ("front", lambda f: f.write_bytes(b"\x89PNG\r\n\x1a\n" + b"\0" * 8 + b"\0\1\0\0" * 2), "65536x65536 px, more"),
+    "missing": ("front", lambda f: f.unlink(), "cannot be read"),
+    "truncated npz": ("top", lambda f: f.write_bytes(f.read_bytes()[:100]), "not a readable sweep"),
+    "no points": ("top", lambda f: np.savez(f, other=np.zeros(3)), "no array 'xyz_m'"),
+    "pickled array": ("top", lambda f: np.savez(f, xyz_m=np.array([[None] * 3], dtype=object)), "object"),
+    "flat array": ("top", lambda f: np.savez(f, xyz_m=np.zeros(7)), "(N, 3)"),
+    "times": ("top", lambda f: np.savez(f, xyz_m=np.zeros((4, 3)), t_offset_ns=np.zeros(3, int)), "t_offset_ns"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", RECORD_FAULTS)
+def test_a_record_that_cannot_be_read_is_one_record(folder: Path, fault: str) -> None:
+    name, change, words = RECORD_FAULTS[fault]
+    file = next(p for p in (folder / name).iterdir() if p.stem == "000002")
+    change(file)
+    stream = open_log(folder).streams[name]
+    with pytest.raises(RecordError) as caught:
+        stream.read(2)
+    assert words in str(caught.value)
+    assert file.name in str(caught.value)
+    assert str(T0_NS + 200_000_000) in str(caught.value)
+    stream.read(1)
+    assert len([p for p in validate_log(folder) if file.name in p]) == 1
+
+
+def test_a_header_that_promises_too_much_allocates_nothing(folder: Path) -> None:
+    header = np.lib.format.header_data_from_array_1_0(np.zeros((1, 3))) | {"shape": (10**12, 3)}
+    with (folder / "top" / "000002.npy").open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, header)
+    edit_line(folder / "top" / "index.csv", 4, f"{T0_NS + 200_000_000},top/000002.npy")
+    with pytest.raises(RecordError, match="1000000000000 points, more than"):
+        open_log(folder).streams["top"].read(2)
+    text = PCD.format(t="t", size=4, kind="U", n=10**12, data="binary")
+    (folder / "top" / "x.pcd").write_text(text)
+    edit_line(folder / "top" / "index.csv", 4, f"{T0_NS + 200_000_000},top/x.pcd")
+    with pytest.raises(RecordError, match="more than"):
+        open_log(folder).streams["top"].read(2)
+    (folder / "top" / "x.pcd").write_text(text.replace(str(10**12), "2").replace("binary", "binary_compressed"))
+    with pytest.raises(RecordError, match="binary_compressed is not supported"):
+        open_log(folder).streams["top"].read(2)
+
+
+def test_a_missing_or_unknown_folder_says_what_is_expected(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match="no such folder"):
+        open_log(tmp_path / "none")
+    with pytest.raises(LogError, match=r"no known log format.*log2sim \(a folder with log.json\).*kitti.*pandaset"):
+        open_log(tmp_path)
+    with pytest.raises(LogError, match="holds no sequence of format 'kitti'"):
+        open_log(tmp_path, format="kitti")
+    with pytest.raises(ConfigError, match=r"unknown log 'kiti'.*did you mean 'kitti'"):
+        open_log(tmp_path, format="kiti")
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(LogError, match="is a file"):
+        open_log(tmp_path / "file")
