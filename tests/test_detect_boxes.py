@@ -141,6 +141,15 @@ def test_one_person_rides_one_of_two_bicycles() -> None:
     assert joined.box_px[0].tolist() == [10, 0, 62, 100]
 
 
+def test_second_person_beside_a_bicycle_walks() -> None:
+    d = detections(
+        ("bicycle", 0.8, (10, 50, 62, 100)), ("pedestrian", 0.7, (20, 0, 50, 90)), ("pedestrian", 0.6, (40, 0, 75, 90))
+    )
+    joined = join_riders(d)
+    assert joined.category.tolist() == ["cyclist", "pedestrian"]
+    assert joined.box_px[0].tolist() == [10, 0, 62, 100]
+
+
 def test_parts_of_a_pair_are_dropped_and_neighbors_stay() -> None:
     d = detections(
         ("pedestrian", 0.6, (20, 0, 50, 90)),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from log2sim.detect import create_detector
-from log2sim.detect.label_motion import Boxes, boxes_at
+from log2sim.detect.label_motion import Boxes, boxes_at, mutual_partners, one_of_each
 from log2sim.errors import ConfigError
 from log2sim.geometry import transform
 from log2sim.types import Camera, Detections, Frame, ImageLabels, Labels, Log
@@ -132,6 +132,25 @@ def test_boxes_with_a_stamp_each_come_once_and_at_the_time_of_the_frame(speed_mp
     rear_m = 20.0 + speed_mps * 0.5
     lowest = np.sort(found.box_px[:, 3])
     assert lowest == pytest.approx(np.full(4, 300 + 1000 * 0.75 / rear_m), abs=1e-3)
+
+
+def cars(t_ns: list[int], x_m: list[float]) -> Boxes:
+    count = len(x_m)
+    center = np.stack([x_m, np.zeros(count), np.zeros(count)], axis=1)
+    return Boxes(np.array(t_ns), np.full(count, "car"), center, np.tile(CAR, (count, 1)), np.zeros(count))
+
+
+def test_one_object_at_two_stamps_counts_once_and_two_at_one_stamp_twice() -> None:
+    boxes = cars([0, 0, 50_000_000], [0.0, 3.0, 1.0])
+    assert one_of_each(boxes, np.array([2, 1, 0])).tolist() == [2]
+    assert one_of_each(boxes, np.array([1, 0, 2])).tolist() == [1, 0]
+    assert one_of_each(cars([0, 50_000_000], [0.0, 4.5]), np.array([0, 1])).tolist() == [0, 1]
+
+
+def test_partner_is_the_nearest_of_both_sides_within_reach() -> None:
+    before, after = cars([0, 0, 0], [0.0, 3.0, 90.0]), cars([SECOND // 10] * 2, [3.5, 100.0])
+    own, partner = mutual_partners(before, after)
+    assert (own.tolist(), partner.tolist()) == ([1], [0])  # the last pair would need 100 m/s
 
 
 def test_boxes_of_the_frame_come_before_projected_ones() -> None:
