@@ -34,6 +34,7 @@ ROAD_BELOW_POSE_M = 0.325
 POSE_T_EGO = transform(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), [0.0, 0.0, -ROAD_BELOW_POSE_M])
 # Fit of azimuth over time (x, y) and of the vertical field of view, -25 to +15 degrees (z), of the Pandar64's points.
 EGO_T_PANDAR64 = transform(np.eye(3), [0.75, 0.0, 1.8 + ROAD_BELOW_POSE_M])
+# Where the PandarGT stands is not known; its points are in the map already, so its mount only says from which side it looks.
 LIDARS: Mapping[str, int] = {"pandar64": 0, "pandargt": 1}
 # A Chrysler Pacifica, by its data sheet.
 PACIFICA = EgoVehicle(size_m=(5.18, 2.02, 1.78), rear_axle_offset_m=1.45)
