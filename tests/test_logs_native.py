@@ -235,6 +235,13 @@ def test_pcd_points_and_their_times(folder: Path, data: str) -> None:
     np.testing.assert_array_equal(sweep.t_ns - T0_NS, [100, 200])
 
 
+def test_an_absolute_time_in_a_pcd_file_is_taken_from_the_stamp(folder: Path) -> None:
+    header = PCD.format(t="timestamp", size=8, kind="U", n=2, data="ascii")
+    (folder / "top" / "cloud.pcd").write_text(f"{header}1 2 3 0 {T0_NS + 5}\n4 5 6 0 {T0_NS - 7}\n")
+    edit_line(folder / "top" / "index.csv", 2, f"{T0_NS},top/cloud.pcd")
+    np.testing.assert_array_equal(open_log(folder).streams["top"].read(0).t_ns, [T0_NS + 5, T0_NS - 7])
+
+
 def test_a_root_of_several_logs_needs_a_sequence(tmp_path: Path) -> None:
     write_log(make_log(), tmp_path / "a")
     assert open_log(tmp_path).name == "small"

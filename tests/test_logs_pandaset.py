@@ -17,7 +17,7 @@ from log2sim.errors import LogError, RecordError
 from log2sim.geometry import apply, inverse, points_in_box, rotation_from_rpy, wrap_angle
 from log2sim.logs import open_log
 from log2sim.logs.pandaset import tie_to_earth
-from log2sim.logs.pandaset_labels import azimuth_offset_ns
+from log2sim.logs.pandaset_labels import azimuth_offset_ns, read_labels
 from log2sim.logs.unpickle import read_pickled_table
 
 
@@ -105,6 +105,37 @@ def test_a_label_is_timed_by_its_direction() -> None:
     """Clockwise, the rear at the stamp: right 25 ms, front 50 ms, left 75 ms before."""
     xyz = np.array([[-1.0, -1e-12, 0], [0, -1, 0], [1, 0, 0], [0, 1, 0], [-1, 1e-12, 0]])
     np.testing.assert_array_equal(azimuth_offset_ns(xyz), [0, -25_000_000, -50_000_000, -75_000_000, -100_000_000])
+
+
+def cuboids(path: Path, rows: list[dict[str, object]]) -> None:
+    pandas = pytest.importorskip("pandas")
+    whole = {
+        "uuid": "u", "label": "Car", "yaw": 0.0, "position.x": 0.0, "position.y": 0.0, "position.z": 0.0, "dimensions.x": 1.8,
+        "dimensions.y": 4.4, "dimensions.z": 1.5, "attributes.rider_status": np.nan, "cuboids.sibling_id": "-",
+        "cuboids.sensor_id": -1,
+    }  # fmt: skip
+    pandas.DataFrame([whole | row for row in rows]).to_pickle(path)
+
+
+def test_cuboids_become_one_row_an_object_with_rising_stamps(tmp_path: Path) -> None:
+    """Two sweeps: a car crosses the line behind the ego; a bicycle is seen by both LiDARs, then by the PandarGT only."""
+    twin = {"uuid": "gt", "label": "Bicycle", "cuboids.sibling_id": "spin", "cuboids.sensor_id": 1, "position.x": 9.0}
+    spin = {"uuid": "spin", "label": "Bicycle", "cuboids.sibling_id": "gt", "cuboids.sensor_id": 0, "position.x": 9.1}
+    rider = {"attributes.rider_status": "With Rider"}
+    files = {k: tmp_path / f"{k:02d}.pkl.gz" for k in range(2)}
+    behind = {"uuid": "car", "position.x": -8.0}
+    cuboids(files[0], [behind | {"position.y": -0.01}, twin | rider, spin | rider, {"uuid": "cone", "label": "Cones"}])
+    cuboids(files[1], [behind | {"position.y": 0.01}, twin | rider, {"uuid": "ufo", "label": "Saucer"}])
+    notes: list[str] = []
+    t_ns = np.array([10**9, 10**9 + 100_000_000])
+    labels = read_labels(files, t_ns, t_ns + 30_000_000, np.eye(4)[None].repeat(2, 0), notes)
+    assert labels.track_id.tolist() == ["car", "spin", "spin"]
+    assert labels.category.tolist() == ["car", "cyclist", "cyclist"]
+    np.testing.assert_allclose(labels.t_ns, [10**9, 10**9 - 50_000_000, 10**9 + 130_000_000], atol=50_000)
+    np.testing.assert_allclose(labels.center_m[1:, 0], [9.1, 9.0])
+    np.testing.assert_allclose(labels.size_m[0], [4.4, 1.8, 1.5])
+    np.testing.assert_allclose(labels.yaw_rad, np.pi / 2)
+    assert notes == ["labels left out because their kind is not known: Saucer"]
 
 
 def track(turn_rad: float, length_m: float) -> tuple[np.ndarray, np.ndarray]:
@@ -209,6 +240,8 @@ def test_frame_by_frame_camera_poses_agree_with_the_one_mount(sequence: Path) ->
     from scipy.spatial.transform import Rotation
 
     ours, _ = log.map_T_sensor("front_camera", t_ns)
+    places = np.array([[r["position"][k] for k in "xyz"] for r in records])
+    assert np.median(np.linalg.norm(ours[:, :3, 3] - places, axis=1)) < 0.004
     for k in range(1, len(t_ns), 6):
         q, p = records[k]["heading"], records[k]["position"]
         point = apply(ours[k], np.array([[2.0, 1.0, 20.0]]))
