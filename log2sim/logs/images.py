@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.errors import RecordError
+from log2sim.errors import LogError, RecordError
 
 IMAGE_LIMIT_PX = 100_000_000
 IMAGE_LIMIT_BYTES = 256 * 1024 * 1024
@@ -33,11 +33,15 @@ def read_image(path: Path, t_ns: int, width_px: int, height_px: int) -> NDArray[
     return _decode_jpeg(data, where) if jpeg else _decode_png(data, where)
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Width and height in px of an image file, from its header."""
-    with path.open("rb") as file:
-        data = file.read(IMAGE_LIMIT_BYTES)
-    return _jpeg_size(data, str(path)) if data[:2] == b"\xff\xd8" else _png_size(data, str(path))
+def first_image_size(files: list[Path]) -> tuple[int, int]:
+    """Width and height in px of the first of the image files that can be read, from its header."""
+    for file in files:
+        try:
+            data = read_bytes(file, 0, IMAGE_LIMIT_BYTES)
+            return _jpeg_size(data, str(file)) if data[:2] == b"\xff\xd8" else _png_size(data, str(file))
+        except RecordError:
+            continue
+    raise LogError(f"{files[0].parent}: none of its {len(files)} images can be read")
 
 
 def read_bytes(path: Path, t_ns: int, limit_bytes: int) -> bytes:

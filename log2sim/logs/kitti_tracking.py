@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.errors import LogError, RecordError
+from log2sim.errors import LogError
 from log2sim.geometry import Array, PoseTrack, apply, transform, wrap_angle
 from log2sim.logs import kitti
-from log2sim.logs.images import image_size
+from log2sim.logs.images import first_image_size
 from log2sim.types import ImageLabels, Labels, Log, Stream
 
 PERIOD_NS = 100_000_000
@@ -66,7 +66,7 @@ class _Sequence:
         cameras = {}
         for number in rig.projections:
             files = self._files(f"image_{number:02d}", (".png", ".jpg", ".jpeg"))
-            camera = rig.camera(number, *_first_size(list(files.values())))
+            camera = rig.camera(number, *first_image_size(list(files.values())))
             cameras[camera.name] = camera
             streams[camera.name] = kitti.image_stream(camera.name, _nominal(files), list(files.values()), camera)
         if (self.base / "velodyne" / self.name).is_dir():
@@ -187,12 +187,3 @@ def boxes_in_map(map_T_rect: Array, values: Array) -> tuple[Array, Array, Array]
 
 def _nominal(files: dict[int, Path]) -> NDArray[np.int64]:
     return np.array(list(files), dtype=np.int64) * PERIOD_NS
-
-
-def _first_size(files: list[Path]) -> tuple[int, int]:
-    for file in files:
-        try:
-            return image_size(file)
-        except RecordError:
-            continue
-    raise LogError(f"{files[0].parent}: none of {len(files)} images is readable")

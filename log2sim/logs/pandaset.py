@@ -22,7 +22,7 @@ from log2sim.errors import LogError, RecordError
 from log2sim.files import read_json
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse, rotation_from_quaternion, transform
 from log2sim.logs import kitti
-from log2sim.logs.images import image_size, read_image
+from log2sim.logs.images import first_image_size, read_image
 from log2sim.logs.pandaset_labels import read_labels
 from log2sim.logs.sweeps import sweep_of
 from log2sim.logs.table import in_order
@@ -113,7 +113,7 @@ class _Sequence:
         for folder in sorted(p for p in (self.path / "camera").iterdir() if (p / "intrinsics.json").is_file()):
             t_ns, map_T_cam = _poses(folder)
             files = self._files(f"camera/{folder.name}", ".jpg", len(t_ns))
-            width, height = _first_size(list(files.values()))
+            width, height = first_image_size(list(files.values()))
             camera = Camera(
                 folder.name, width, height, _intrinsics(folder), "ego", _mount(track, t_ns, map_T_cam, folder, notes)
             )
@@ -236,15 +236,6 @@ def _mount(track: PoseTrack, t_ns: NDArray[np.int64], map_T_cam: Array, folder: 
     if spread_m > 0.05:
         notes.append(f"{folder.name}: its poses and the ego's do not fit together, typically by {spread_m:.2f} m")
     return transform(u @ vt, translation)
-
-
-def _first_size(files: list[Path]) -> tuple[int, int]:
-    for file in files:
-        try:
-            return image_size(file)
-        except RecordError:
-            continue
-    raise LogError(f"{files[0].parent}: none of {len(files)} images is readable")
 
 
 def _read_image(files: list[Path], t_ns: NDArray[np.int64], size: tuple[int, int], i: int) -> NDArray[np.uint8]:
