@@ -10,7 +10,7 @@ from log2sim.synth import load_scene, write_synthetic
 
 SAMPLES = Path(__file__).resolve().parent.parent / "samples"
 SEED = 1
-JPEG_QUALITY = 60
+JPEG_QUALITY = 58
 LIMIT_BYTES = 8_000_000
 
 

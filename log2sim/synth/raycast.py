@@ -48,11 +48,12 @@ def ray_pattern(spec: LidarSpec) -> tuple[Array, Array]:
     low, high = spec.azimuth_deg
     columns = max(1, round((high - low) / spec.azimuth_step_deg))
     azimuth = np.deg2rad(high - (np.arange(columns) + 0.5) * (high - low) / columns)
-    elevation = np.deg2rad(np.linspace(spec.elevation_deg[0], spec.elevation_deg[1], spec.channels))
+    even = np.linspace(spec.elevation_deg[0], spec.elevation_deg[1], spec.channels)
+    elevation = np.deg2rad(np.array(spec.channels_deg) if spec.channels_deg else even)
     ago = _share(spec) / spec.rate_hz * (1 - (np.arange(columns) + 1) / columns)
-    a, e = np.repeat(azimuth, spec.channels), np.tile(elevation, columns)
+    a, e = np.repeat(azimuth, len(elevation)), np.tile(elevation, columns)
     directions = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], 1)
-    return directions, np.repeat(ago, spec.channels)
+    return directions, np.repeat(ago, len(elevation))
 
 
 def cast(

@@ -133,13 +133,17 @@ class CameraSpec:
 
 @dataclass(frozen=True)
 class LidarSpec:
-    """A turning LiDAR on the ego. It turns clockwise over `azimuth_deg`, from the left (high) to the right (low)."""
+    """A turning LiDAR on the ego. It turns clockwise over `azimuth_deg`, from the left (high) to the right (low).
+
+    Its channels are spread evenly over `elevation_deg`, or stand where `channels_deg` says, which then counts instead.
+    """
 
     name: str = _of("text")
     position_m: Vec3 = _of("vec3")
     yaw_deg: float = _of("number", 0.0)
     channels: int = _of("count", 32, low=1, high=256)
     elevation_deg: Vec2 = _of("vec2", (-24.0, 6.0))
+    channels_deg: tuple[float, ...] = _of("angles", ())
     azimuth_deg: Vec2 = _of("vec2", (-180.0, 180.0))
     azimuth_step_deg: float = _of("number", 0.4, low=0.02, high=10)
     rate_hz: float = _of("number", 10.0, low=0.1, high=100)
@@ -255,6 +259,11 @@ def _checked(meta: Any, value: Any, where: str) -> Any:
         if kind == "points2" and len(rows) < 2:
             raise ConfigError(f"'{where}' has {len(rows)} points, expected two or more")
         return tuple(rows)
+    if kind == "angles":
+        angles = _list(value, where)
+        if not 1 <= len(angles) <= 256:
+            raise ConfigError(f"'{where}' has {len(angles)} values, expected 1 to 256")
+        return _vector(value, len(angles), where, low=-90, high=90)
     if kind == "size":
         return _vector(value, 3, where, low=0.1, high=500)
     if kind == "color":
