@@ -95,9 +95,15 @@ class Trajectory:
     """
 
     def __init__(
-        self, waypoints: ArrayLike, *, rounding_m: float, wait_s: Sequence[tuple[int, float]] = (), start_s: float = 0.0, where: str,
+        self,
+        waypoints: ArrayLike,
+        *,
+        rounding_m: float,
+        wait_s: Sequence[tuple[int, float]] = (),
+        start_s: float = 0.0,
+        where: str,
         vehicle: bool = True,
-    ) -> None:  # fmt: skip
+    ) -> None:
         w = np.asarray(waypoints, dtype=np.float64)
         _check_waypoints(w, dict(wait_s), where)
         self.path = Path(w[:, :2], rounding_m)

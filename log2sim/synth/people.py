@@ -15,6 +15,17 @@ from log2sim.synth.vehicles import Part
 STRIDE_M = 1.5  # two steps of a walking adult
 PEDAL_M = 5.2  # way of a bicycle per turn of the pedals
 PHASES = 24
+# Height as a fraction from hips to neck, half the width and half the depth in m.
+TORSO = (
+    (0.0, 0.13, 0.10),
+    (0.08, 0.165, 0.115),
+    (0.3, 0.15, 0.10),
+    (0.55, 0.175, 0.115),
+    (0.78, 0.195, 0.115),
+    (0.9, 0.185, 0.10),
+    (0.965, 0.13, 0.08),
+    (1.0, 0.06, 0.06),
+)
 
 
 @lru_cache(maxsize=512)
@@ -68,11 +79,9 @@ def _walker(phase: float, standing: bool) -> Mesh:
 
 def _torso(lean: float, low: float, high: float) -> Mesh:
     """Hips to neck as one skin of oval rings; `lean` is the forward shift a meter of height."""
-    stations = ((0.0, 0.13, 0.10), (0.08, 0.165, 0.115), (0.3, 0.15, 0.10), (0.55, 0.175, 0.115), (0.78, 0.195, 0.115), (0.9, 0.185, 0.10),
-                (0.965, 0.13, 0.08), (1.0, 0.06, 0.06))  # fmt: skip
     angle = np.arange(16) * 2 * np.pi / 16
     rings = []
-    for f, half_width, half_depth in stations:
+    for f, half_width, half_depth in TORSO:
         z = low + f * (high - low)
         ring = [half_depth * np.cos(angle) + lean * (z - low), half_width * np.sin(angle), np.full(16, z)]
         rings.append(np.stack(ring, 1))
