@@ -77,6 +77,8 @@ def _paint_ground(scene: Scene, low: Array, shape: tuple[int, int], rng: np.rand
         for j, (other, r) in enumerate(roads):
             if i != j:
                 _stroke(crossing, other, low, r.width_m + 4.0)
+        for zebra in scene.zebra:
+            _stroke(crossing, np.array(zebra.line), low, zebra.width_m + 1.6)
         marks = np.zeros(shape, np.uint8)
         if road.marking != "none":
             for a, b in _dashes(line, 3.0, 3.0) if road.marking == "dashed" else pairwise(line):
