@@ -13,7 +13,9 @@ from log2sim.geometry import NS_PER_S, apply, box_corners, inverse
 from log2sim.scenario import Scenario
 from log2sim.synth import write_synthetic
 from log2sim.synth.actors import EgoMotion, actors_of
-from log2sim.synth.raycast import GROUND, cast
+from log2sim.synth.observe import Sighting, visible_at
+from log2sim.synth.raycast import GROUND, Cast, cast
+from log2sim.types import Stream
 
 WALL = {"center": [25.0, 0.0], "size_m": [2.0, 120.0, 8.0]}
 
@@ -37,6 +39,31 @@ def test_points_of_a_turning_lidar_on_a_moving_ego_lie_on_the_agents_at_their_ow
         # Noise, 2 cm, only moves points along their rays.
         assert np.all(np.abs(local) <= np.array(actor.spec.box_m) / 2 + 0.1)
     assert truth.t0_ns == scene.start_ns
+
+
+def test_from_a_fast_turning_ego_a_wall_is_flat_when_every_point_has_its_own_pose() -> None:
+    curve = {"waypoints": [[0, 0, 12.0], [12, 0, 12.0], [16, 12, 12.0]], "rounding_m": 25.0}
+    log, _ = tiny_log([], ego=curve, building=[WALL], noise_m=0.0, observe=False)
+    sweep = log.streams["top"].read(6)
+    scene = tiny_scene([], ego=curve)
+    poses = EgoMotion(scene).map_T_ego_ns(sweep.t_ns) @ log.lidars["top"].mount_T_lidar
+    points = np.einsum("nij,nj->ni", poses[:, :3, :3], sweep.xyz_m.astype(float)) + poses[:, :3, 3]
+    wall = points[points[:, 2] > 0.3]
+    assert len(wall) > 200
+    assert np.abs(wall[:, 0] - 24.0).max() < 1e-3
+    at_end = apply(poses[-1], sweep.xyz_m)[points[:, 2] > 0.3]
+    assert np.abs(at_end[:, 0] - 24.0).max() > 0.2  # so the test would notice
+
+
+def test_visible_takes_an_unoccluded_third_half_a_box_in_the_image_and_twenty_points() -> None:
+    scene = tiny_scene()
+    unoccluded = np.array([0.9, 0.3, 0.9, 0.9])
+    inside = np.array([0.6, 1.0, 0.4, 1.0])
+    seen = {"front": [Sighting(scene.start_ns, unoccluded, inside, np.zeros((4, 4)))]}
+    hits = np.repeat([0, 1, 2, 3, -1], [20, 50, 50, 19, 100])
+    stream = Stream("top", np.array([scene.start_ns]), lambda i: None)
+    visible = visible_at(np.array([0.0]), scene, seen, {"top": stream}, lambda name, i: Cast(None, hits), 4)  # type: ignore[arg-type]
+    assert visible.tolist() == [[True, False, False, False]]
 
 
 def test_a_sweep_ends_at_its_stamp_and_takes_its_share_of_a_turn() -> None:
