@@ -12,15 +12,11 @@ from numpy.typing import NDArray
 from log2sim.geometry import Array, apply, inverse
 from log2sim.synth.actors import Actor
 from log2sim.synth.backdrop import FACADE_M_PER_PX, GAMMA, GROUND_M_PER_PX, Backdrop, linear_table
+from log2sim.synth.light import HORIZON, SKY_LIGHT, SUN, SUN_LIGHT, ZENITH, reflected
 from log2sim.synth.paint import paint
 from log2sim.synth.raster import Fragments, rasterize
 from log2sim.types import Camera
 
-SUN = np.array([-0.45, -0.5, 0.74]) / np.linalg.norm([-0.45, -0.5, 0.74])
-SUN_LIGHT = np.array([0.80, 0.88, 0.95], np.float32)  # BGR
-SKY_LIGHT = np.array([0.56, 0.50, 0.45], np.float32)
-HORIZON = np.array([0.78, 0.74, 0.70], np.float32)
-ZENITH = np.array([0.72, 0.48, 0.30], np.float32)
 HAZE_M = 500.0
 NEAR_M = 0.2
 FAR_M = 2000.0
@@ -163,25 +159,7 @@ def _shade(view: View, actor: Actor, t_s: float, fragments: Fragments, near: NDA
     to_camera = (view.map_T_cam[:3, 3] - map_T_agent[:3, 3]).astype(np.float32) - points @ R.T
     to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
     height = points[:, 2] + np.float32(actor.spec.box_m[2] / 2)
-    openness = (0.62 + 0.38 * n[:, 2]) * np.clip(0.55 + 0.6 * height, 0.0, 1.0)
-    sun = np.clip(n @ SUN.astype(np.float32), 0, 1)
-    light = surface.albedo * (openness[:, None] * SKY_LIGHT + sun[:, None] * SUN_LIGHT) + surface.glow
-    facing = np.clip((n * to_camera).sum(1), 0, 1)
-    mirrored = 2 * facing[:, None] * n - to_camera
-    gloss = surface.gloss * (0.35 + 0.65 * (1 - facing) ** 3)
-    light += gloss[:, None] * _surroundings(mirrored)
-    glint = np.clip(mirrored @ SUN.astype(np.float32), 0, 1) ** 60
-    return (light + (surface.gloss * 2.0 * glint)[:, None]).astype(np.float32)
-
-
-def _surroundings(direction: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What a mirror would show: sky above, houses around, road below."""
-    up = direction[:, 2:]
-    sky = HORIZON + (ZENITH - HORIZON) * np.clip(up * 1.6, 0, 1)
-    houses = np.float32(0.22)
-    blend = np.clip((up - 0.12) / 0.1, 0, 1)
-    below = np.clip((-up - 0.02) / 0.08, 0, 1)
-    return ((houses * (1 - blend) + sky * blend) * (1 - below) + 0.09 * below).astype(np.float32)
+    return reflected(surface, n, to_camera, height)
 
 
 def _sky_and_ground(
