@@ -1,0 +1,38 @@
+"""The simulator shim: scenarios as vehicles that follow their waypoints, and a place for the user's own ego."""
+
+from __future__ import annotations
+
+import sys
+from types import ModuleType
+from typing import Any
+
+from log2sim.replay.metrics import check_strict, require_strict
+from log2sim.replay.policy import Controls, EgoState, Observation, Others, Policy, Route, load_policy
+from log2sim.replay.result import AgentReplay, Replay, to_scenario
+from log2sim.replay.run import replay
+
+__all__ = [
+    "AgentReplay",
+    "Controls",
+    "EgoState",
+    "Observation",
+    "Others",
+    "Policy",
+    "Replay",
+    "Route",
+    "check_strict",
+    "load_policy",
+    "replay",
+    "require_strict",
+    "to_scenario",
+]
+
+
+class _CallablePackage(ModuleType):
+    """Once this package is imported, Python binds it as `log2sim.replay`, hiding the function of that name: so it is called."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Replay:
+        return replay(*args, **kwargs)
+
+
+sys.modules[__name__].__class__ = _CallablePackage

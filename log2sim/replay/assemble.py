@@ -1,0 +1,128 @@
+"""Puts what was recorded into a `Replay` and measures it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import Array
+from log2sim.replay.collisions import Boxes, collisions
+from log2sim.replay.metrics import agent_metrics, overall
+from log2sim.replay.reference import Path
+from log2sim.replay.result import AgentReplay, Replay
+from log2sim.replay.rollout import Clock, Tracks
+from log2sim.replay.vehicle import WHEELED
+from log2sim.replay.world import Group
+from log2sim.scenario import Agent, Scenario
+
+DIGITS = 6
+"""Decimals of stored states: a micrometer."""
+
+
+def assemble(
+    scenario: Scenario, groups: Sequence[Group], tracks: Tracks, clock: Clock, mode: str, model: str
+) -> Replay:
+    """The replay of a scenario from the recorded tracks."""
+    home = {a.id: (g.driver, r.path, r.flags) for g in groups for a, r in zip(g.agents, g.references)}
+    agents: list[AgentReplay] = []
+    stored: list[NDArray[np.intp]] = []
+    for agent in scenario.agents:
+        if agent.id in tracks:
+            driver, path, flags = home[agent.id]
+            steps, states = tracks[agent.id]
+            agents.append(_moved(agent, driver, model, path, flags, clock.begin_s + steps * clock.dt_s, states))
+            stored.append(steps)
+        else:
+            replayed, steps = _posed(agent, clock)
+            agents.append(replayed)
+            stored.append(steps)
+    paths = {k: path for k, (_, path, _) in home.items() if k in tracks}
+    document = json.dumps(scenario.to_dict(), sort_keys=True, ensure_ascii=False).encode()
+    return Replay(
+        scenario=scenario.name,
+        scenario_digest=hashlib.sha256(document).hexdigest(),
+        mode=mode,
+        model=model,
+        dt_s=clock.dt_s,
+        store_dt_s=round(clock.dt_s * clock.store_every, 9),
+        agents=tuple(agents),
+        metrics=_measure(agents, stored, paths, clock),
+    )
+
+
+def _moved(
+    agent: Agent, driver: str, model: str, path: Path, flags: tuple[str, ...], t_s: Array, states: Array
+) -> AgentReplay:
+    x, y, yaw, speed, steer, accel = states
+    if driver == "exact":
+        x, y, yaw, speed = path.centers(t_s)  # the tables in between are good to half a millimeter, the path is exact
+        model = "none"
+    elif agent.category not in WHEELED:
+        model = "point"
+    if np.isnan(accel).any():
+        accel = np.gradient(speed, t_s) if len(t_s) > 1 else np.zeros(len(t_s))
+    z = np.interp(t_s, path.t_s, path.z_m)
+    columns = (np.round(c, DIGITS) for c in (x, y, z, yaw, speed, steer, accel))
+    return AgentReplay(agent.id, agent.category, agent.size_m, driver, model, np.round(t_s, 9), *columns, flags=flags)
+
+
+def _posed(agent: Agent, clock: Clock) -> tuple[AgentReplay, NDArray[np.intp]]:
+    """An agent with one pose, and the stored steps at which it is there.
+
+    A static one with a single waypoint is there all the time; one that lived between two stored steps has that moment.
+    """
+    w = agent.waypoints
+    end_s = clock.time(clock.steps - 1)
+    always = agent.static and len(w) == 1
+    begin_s, until_s = (clock.begin_s, end_s) if always else (float(w.t_s[0]), float(w.t_s[-1]))
+    t_s = np.array([begin_s, until_s] if agent.static and until_s > begin_s else [begin_s])
+    first, last = clock.first_step(np.array([begin_s]))[0], clock.last_step(np.array([until_s]))[0]
+    every = clock.store_every
+    steps = np.arange(-(-first // every) * every, last + 1, every) if agent.static else np.zeros(0, dtype=np.intp)
+    pose = (np.full(len(t_s), round(float(c[0]), DIGITS)) for c in (w.x_m, w.y_m, w.z_m, w.yaw_rad))
+    speed = np.full(len(t_s), 0.0 if agent.static else float(w.speed_mps[0]))
+    zero = np.zeros(len(t_s))
+    driver = "static" if agent.static else "exact"
+    return AgentReplay(agent.id, agent.category, agent.size_m, driver, "none", t_s, *pose, speed, zero, zero), steps
+
+
+def _measure(
+    agents: Sequence[AgentReplay], stored: Sequence[NDArray[np.intp]], paths: dict[str, Path], clock: Clock
+) -> dict:
+    """All metrics: tracking by agent and overall, collisions."""
+    by_agent: dict[str, dict] = {}
+    for a in agents:
+        if a.id in paths:
+            by_agent[a.id] = agent_metrics(paths[a.id], a.t_s, a.x_m, a.y_m, a.yaw_rad, a.speed_mps)
+    replayed, logged = (_boxes(agents, stored, source, clock) for source in ({}, paths))
+    moves = np.array([a.driver != "static" for a in agents], dtype=bool)
+    t_s = clock.begin_s + np.arange(len(replayed.x_m)) * clock.store_every * clock.dt_s
+    events = collisions(replayed, logged, moves, t_s, [a.id for a in agents])
+    for k, values in by_agent.items():
+        values["collisions"] = [e for e in events if k in e["agents"]]
+    samples = {a.id: len(a) if a.driver == "pid" else 0 for a in agents}
+    return overall(by_agent, samples, events)
+
+
+def _boxes(
+    agents: Sequence[AgentReplay], stored: Sequence[NDArray[np.intp]], paths: dict[str, Path], clock: Clock
+) -> Boxes:
+    """Boxes at all stored steps, of the replay or, for agents with a path given, of the log."""
+    shape = ((clock.steps - 1) // clock.store_every + 1, len(agents))
+    columns = np.full((5, *shape), np.nan)
+    for k, (agent, steps) in enumerate(zip(agents, stored)):
+        rows = steps // clock.store_every
+        if agent.id in paths:
+            x, y, yaw, speed = paths[agent.id].centers(agent.t_s)
+            columns[:, rows, k] = x, y, agent.z_m, yaw, speed
+        elif len(rows) == len(agent):
+            columns[:, rows, k] = agent.x_m, agent.y_m, agent.z_m, agent.yaw_rad, agent.speed_mps
+        elif len(rows):  # one pose for all rows
+            pose = [agent.x_m[0], agent.y_m[0], agent.z_m[0], agent.yaw_rad[0], agent.speed_mps[0]]
+            columns[:, rows, k] = np.array(pose)[:, None]
+    size = np.array([a.size_m for a in agents], dtype=np.float64).reshape(-1, 3)
+    return Boxes(*columns, size_m=size)

@@ -1,0 +1,76 @@
+"""Who drives each agent of a scenario, and the groups that this makes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.replay.reference import (
+    MAX_CURVATURE_1PM,
+    Reference,
+    path_of,
+    point_reference,
+    tape_reference,
+    vehicle_reference,
+)
+from log2sim.replay.rollout import Clock
+from log2sim.replay.simulator import Simulator
+from log2sim.replay.vehicle import PEDAL_LAG_S, STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
+from log2sim.replay.world import Crowd, Driven, Fleet, Group, Tape
+from log2sim.scenario import Agent
+
+EGO = "ego"
+MAX_TWO_WHEELER_CURVATURE_1PM = 1.0
+
+
+def cast_agents(agents: Sequence[Agent], mode: str, *, drives_ego: bool) -> dict[str, list[Agent]]:
+    """Who is driven by what: "policy", "pid", "exact" or, with one pose for good, "static"."""
+    cast: dict[str, list[Agent]] = {"policy": [], "pid": [], "exact": [], "static": []}
+    for agent in agents:
+        if drives_ego and agent.id == EGO:
+            cast["policy"].append(agent)
+        elif agent.static:
+            cast["static"].append(agent)
+        else:
+            cast[mode if len(agent.waypoints) > 1 else "exact"].append(agent)
+    return cast
+
+
+def groups_of(cast: Mapping[str, Sequence[Agent]], clock: Clock, simulator: Simulator) -> list[Group]:
+    """The groups that have agents; static agents are in none."""
+    groups: list[Group] = []
+    for driver, kind in (("policy", Driven), ("pid", Fleet)):
+        agents = [a for a in cast[driver] if a.category in WHEELED]
+        if agents:
+            references = [_vehicle_reference(a, clock.dt_s) for a in agents]
+            groups.append(kind(agents, references, *_lives(agents, clock), parameters_for(agents), simulator))
+    agents = [a for a in cast["pid"] if a.category not in WHEELED]
+    if agents:
+        references = [point_reference(path_of(a, 0.0)) for a in agents]
+        groups.append(Crowd(agents, references, *_lives(agents, clock), simulator))
+    agents = list(cast["exact"])
+    if agents:
+        references = [tape_reference(path_of(a, rear_axle_offset(a))) for a in agents]
+        groups.append(Tape(agents, references, *_lives(agents, clock)))
+    return groups
+
+
+def _vehicle_reference(agent: Agent, dt_s: float) -> Reference:
+    """A vehicle's table: feed-forward is ahead by the actuator's lag and by half the step for which it is held."""
+    return vehicle_reference(
+        path_of(agent, rear_axle_offset(agent)),
+        accel_ahead_s=PEDAL_LAG_S + dt_s / 2,
+        curvature_ahead_s=STEER_LAG_S + dt_s / 2,
+        max_curvature_1pm=MAX_CURVATURE_1PM
+        if agent.category in ("car", "truck", "bus")
+        else MAX_TWO_WHEELER_CURVATURE_1PM,
+    )
+
+
+def _lives(agents: Sequence[Agent], clock: Clock) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First and last step (A,), (A,) of each agent; the last before the first where a life lies between two steps."""
+    begin = np.array([a.waypoints.t_s[0] for a in agents])
+    end = np.array([a.waypoints.t_s[-1] for a in agents])
+    return clock.first_step(begin), clock.last_step(end)

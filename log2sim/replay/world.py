@@ -1,0 +1,207 @@
+"""Groups of agents that are driven alike: followers on wheels, followers on foot, the log itself, the user's policy.
+
+A group owns the state of its agents; what it steps with is stateless. All columns are (A,) over the group's agents that
+live in the current window of time; `live` holds their indices in the group.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import Array, wrap_angle
+from log2sim.replay.follower import Memory, follow_points, follow_vehicles, start_points, start_vehicles
+from log2sim.replay.policy import Controls
+from log2sim.replay.reference import GRID_S, Reference
+from log2sim.replay.simulator import Simulator
+from log2sim.replay.vehicle import Columns, PointState, VehicleControls, VehicleParameters, VehicleState
+from log2sim.scenario import Agent
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot(Columns):
+    """Box centers in the map and what drives them, (A,); `accel_mps2` is NaN where the model has no such state."""
+
+    x_m: Array
+    y_m: Array
+    yaw_rad: Array
+    speed_mps: Array
+    steer_rad: Array
+    accel_mps2: Array
+
+
+class Group(ABC):
+    """Agents driven alike. `first`, `last` (A,) are the steps between which each agent lives."""
+
+    driver = "exact"
+
+    def __init__(self, agents: Sequence[Agent], references: Sequence[Reference], first: NDArray, last: NDArray) -> None:
+        self.agents, self.references, self.first, self.last = tuple(agents), tuple(references), first, last
+        self.origin_x_m = np.array([r.path.origin_m[0] for r in references])
+        self.origin_y_m = np.array([r.path.origin_m[1] for r in references])
+        self.offset_m = np.array([r.path.offset_m for r in references])
+        self.live = np.zeros(0, dtype=np.intp)
+        self.row = np.zeros((0, 0))
+
+    def open_window(self, begin: int, end: int, begin_s: float, end_s: float) -> None:
+        """Make the tables of the agents that live within the steps [begin, end) at hand."""
+        self.live = np.flatnonzero((self.first < end) & (self.last >= begin) & (self.last >= self.first))
+        self._row0 = int(np.floor(begin_s / GRID_S))
+        rows = np.arange(self._row0, int(np.floor(end_s / GRID_S)) + 3)
+        self._table = (
+            np.stack([_window(self.references[i], rows) for i in self.live], axis=2) if len(self.live) else None
+        )
+
+    def look_up(self, t_s: float) -> None:
+        """Set `row` (C, A) to the references at a time."""
+        if self._table is None:
+            return
+        place = t_s / GRID_S - self._row0
+        k = int(place)
+        lower = self._table[k]
+        self.row = lower + (place - k) * (self._table[k + 1] - lower)
+
+    @abstractmethod
+    def place(self, index: NDArray) -> None:
+        """Put the agents at `index` (of all agents) on their references."""
+
+    @abstractmethod
+    def snapshot(self) -> Snapshot:
+        """Where the living agents are now."""
+
+    @abstractmethod
+    def advance(self, dt_s: float) -> None:
+        """Move the living agents by one step."""
+
+    def _slots(self, index: NDArray) -> NDArray:
+        return np.searchsorted(self.live, index)
+
+
+class Tape(Group):
+    """Agents that are exactly where the log has them."""
+
+    def place(self, index: NDArray) -> None:
+        pass
+
+    def advance(self, dt_s: float) -> None:
+        pass
+
+    def snapshot(self) -> Snapshot:
+        x, y, yaw, speed = self.row[:4]
+        unknown = np.full(len(self.live), np.nan)
+        o = self.offset_m[self.live]
+        x = x + o * np.cos(yaw) + self.origin_x_m[self.live]
+        y = y + o * np.sin(yaw) + self.origin_y_m[self.live]
+        return Snapshot(x, y, wrap_angle(yaw), speed, np.zeros(len(self.live)), unknown)
+
+
+class Fleet(Group):
+    """Vehicles that follow their waypoints."""
+
+    driver = "pid"
+
+    def __init__(
+        self,
+        agents: Sequence[Agent],
+        references: Sequence[Reference],
+        first: NDArray,
+        last: NDArray,
+        parameters: VehicleParameters,
+        simulator: Simulator,
+    ) -> None:
+        super().__init__(agents, references, first, last)
+        self.parameters, self.simulator = parameters, simulator
+        self._all = VehicleState(*(np.zeros(len(agents)) for _ in range(6)))
+        self._all_memory = Memory.fresh(len(agents))
+        self._open(self.live)
+
+    def _open(self, live: NDArray) -> None:
+        self.state, self.memory, self.living = (
+            self._all.take(live),
+            self._all_memory.take(live),
+            self.parameters.take(live),
+        )
+
+    def open_window(self, begin: int, end: int, begin_s: float, end_s: float) -> None:
+        self._all.put(self.live, self.state)
+        self._all_memory.put(self.live, self.memory)
+        super().open_window(begin, end, begin_s, end_s)
+        self._open(self.live)
+
+    def place(self, index: NDArray) -> None:
+        slots = self._slots(index)
+        self.state.put(slots, start_vehicles(self.row[:, slots], self.living.take(slots)))
+        self.memory.put(slots, Memory.fresh(len(slots)))
+
+    def snapshot(self) -> Snapshot:
+        s, o = self.state, self.offset_m[self.live]
+        x = s.x_m + o * np.cos(s.yaw_rad) + self.origin_x_m[self.live]
+        y = s.y_m + o * np.sin(s.yaw_rad) + self.origin_y_m[self.live]
+        accel = np.where(
+            (s.speed_mps == 0) & (s.pedal_mps2 < 0), 0.0, s.pedal_mps2 * np.where(s.speed_mps < 0, -1.0, 1.0)
+        )
+        return Snapshot(x, y, wrap_angle(s.yaw_rad), s.speed_mps, s.steer_rad, accel)
+
+    def advance(self, dt_s: float) -> None:
+        controls, self.memory = follow_vehicles(self.row, self.state, self.memory, self.living, dt_s)
+        self.state = self.simulator.step_vehicles(self.state, controls, self.living, dt_s)
+
+
+class Driven(Fleet):
+    """The one vehicle that the user's policy drives, by the controls set before each step."""
+
+    driver = "policy"
+    controls = Controls(0.0, 0.0)
+
+    def advance(self, dt_s: float) -> None:
+        c = self.controls
+        commands = VehicleControls(
+            np.array([c.accel_mps2], float), np.array([c.steer_rad], float), np.array([c.reverse], bool)
+        )
+        self.state = self.simulator.step_vehicles(self.state, commands, self.living, dt_s)
+
+
+class Crowd(Group):
+    """Points that follow their waypoints."""
+
+    driver = "pid"
+
+    def __init__(
+        self,
+        agents: Sequence[Agent],
+        references: Sequence[Reference],
+        first: NDArray,
+        last: NDArray,
+        simulator: Simulator,
+    ) -> None:
+        super().__init__(agents, references, first, last)
+        self.simulator = simulator
+        self._all = PointState(*(np.zeros(len(agents)) for _ in range(4)))
+        self.state = self._all.take(self.live)
+
+    def open_window(self, begin: int, end: int, begin_s: float, end_s: float) -> None:
+        self._all.put(self.live, self.state)
+        super().open_window(begin, end, begin_s, end_s)
+        self.state = self._all.take(self.live)
+
+    def place(self, index: NDArray) -> None:
+        slots = self._slots(index)
+        self.state.put(slots, start_points(self.row[:, slots]))
+
+    def snapshot(self) -> Snapshot:
+        s, yaw = self.state, self.row[2]
+        speed = s.velocity_x_mps * np.cos(yaw) + s.velocity_y_mps * np.sin(yaw)
+        x, y = s.x_m + self.origin_x_m[self.live], s.y_m + self.origin_y_m[self.live]
+        return Snapshot(x, y, wrap_angle(yaw), speed, np.zeros(len(x)), np.full(len(x), np.nan))
+
+    def advance(self, dt_s: float) -> None:
+        self.state = self.simulator.step_points(self.state, follow_points(self.row, self.state), dt_s)
+
+
+def _window(reference: Reference, rows: NDArray) -> Array:
+    """Rows (W, C) of a table, its first and last row standing for the time before and after."""
+    return reference.columns[np.clip(rows - reference.first_row, 0, len(reference.columns) - 1)]
