@@ -1,0 +1,7 @@
+#!/usr/bin/env bash
+# Makes .venv, installs log2sim, reconstructs samples/crossing, replays it and compares it with its truth. Safe to run again.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+[ -x .venv/bin/python ] || python3 -m venv .venv
+.venv/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[coco]'
+exec .venv/bin/python tools/demo.py

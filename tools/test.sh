@@ -1,0 +1,8 @@
+#!/usr/bin/env bash
+# Makes .venv with the test extra and runs the whole test suite. Safe to run again; arguments go to pytest.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+[ -x .venv/bin/python ] || python3 -m venv .venv
+.venv/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[coco,test]'
+export OPENBLAS_NUM_THREADS=1
+exec .venv/bin/python -m pytest -m '' "$@"
