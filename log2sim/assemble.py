@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -24,6 +24,7 @@ CENTER_SIGMA_M = {"vehicle": 0.12, "two_wheeler": 0.1, "pedestrian": 0.08, "othe
 # Rear axle to box center, as a share of the length: BMW 320i of CommonRoad's vehicle models, b - overhang, rounded.
 REAR_AXLE_SHARE = {"vehicle": 0.28, "two_wheeler": 0.3}
 STANDING_SPEED_MPS = 0.15
+RIDER_MPS, RIDER_S = 3.0, 0.6
 # What is there is detected most of the time: share of ticks with a detection times the score of the best ones.
 LEAST_CREDIT = 0.3
 LEAST_CREDIT_OF_ODD_SHAPES = 0.6
@@ -58,12 +59,25 @@ def build_agents(
     `flow` (K, 3) is x, y and heading of the ego's path.
     """
     standing = [is_standing(t) for t in tracks]
-    built = [_moving(t, obstacles, timeline, smooth=smooth) for t, s in zip(tracks, standing) if not s]
+    moving = [as_rider_if_fast(t) for t, s in zip(tracks, standing) if not s]
+    built = [_moving(t, obstacles, timeline, smooth=smooth) for t in moving]
     built = [b for b in built if b.credible]
     flows = [flow] + [_flow_of(b.agent) for b in built if GROUP_OF[b.agent.category] == "vehicle"]
     everything = np.concatenate(flows)
     built += [_standing(t, obstacles, timeline, everything) for t, s in zip(tracks, standing) if s]
     return [b for b in built if b.credible]
+
+
+def as_rider_if_fast(track: Track) -> Track:
+    """A person who goes faster than people run is a cyclist whose bicycle the detector missed."""
+    m = track.measurements
+    t = (m.t_ns - m.t_ns[0]) / NS_PER_S
+    if track.category != "pedestrian" or t[-1] < RIDER_S:
+        return track
+    third = max(len(t) // 3, 1)
+    way = np.median(m.center_m[-third:, :2], axis=0) - np.median(m.center_m[:third, :2], axis=0)
+    speed = float(np.hypot(*way)) / max(float(np.median(t[-third:]) - np.median(t[:third])), 1e-3)
+    return replace(track, category="cyclist") if speed > RIDER_MPS else track
 
 
 def _flow_of(agent: Agent) -> Array:

@@ -16,9 +16,11 @@ from log2sim.geometry import NS_PER_S, Array, wrap_angle
 from log2sim.types import GROUP_OF, TYPICAL_SIZE_M, Track
 
 # A side seen at a flatter angle than this shows its near end only.
-LEAST_ASPECT = 0.35
+LEAST_ASPECT = 0.5
 # Share of the whole sides that are longer: stray points lengthen some, sparse points shorten most.
-SIZE_QUANTILE = 0.75
+SIZE_QUANTILE = 0.85
+# Farther to the left of a path than this is the oncoming side of the road.
+ONCOMING_M = 1.8
 VOXEL_M = 0.15
 PERSISTENT_SHARE = 0.15
 POINTS_A_TICK = 150
@@ -188,17 +190,25 @@ def _from_measured_centers(track: Track, typical: Array) -> Shape:
     return Shape(np.append(typical[:2], height), m.center_m[:, :2], m.covariance, z, yaw)
 
 
-def heading_of_standing(yaw_rad: float, xy: Array, flow: Array, *, reach_m: float = 15.0) -> float:
-    """Choose between the two directions of a standing vehicle: parked cars point the way traffic beside them goes.
+def heading_of_standing(yaw_rad: float, xy: Array, flow: Array, *, reach_m: float = 40.0) -> float:
+    """Choose between the two directions of a standing vehicle: it points the way the traffic of its side goes.
 
     `flow` (K, 3) holds x, y and heading of vehicles that moved; without any near enough the yaw stays as it is.
+
+    Notes
+    -----
+    Traffic keeps right: what stands to the right of a moving vehicle's path points along it, what stands clearly to its
+    left points against it. Each moment of each path votes, the nearer to the side the more.
     """
     if len(flow) == 0:
         return float(wrap_angle(yaw_rad))
-    distance = np.hypot(flow[:, 0] - xy[0], flow[:, 1] - xy[1])
-    parallel = np.abs(np.cos(flow[:, 2] - yaw_rad)) > 0.7
-    near = parallel & (distance < reach_m)
+    to = xy - flow[:, :2]
+    c, s = np.cos(flow[:, 2]), np.sin(flow[:, 2])
+    along, left = to[:, 0] * c + to[:, 1] * s, -to[:, 0] * s + to[:, 1] * c
+    near = (np.abs(np.cos(flow[:, 2] - yaw_rad)) > 0.7) & (np.abs(along) < reach_m) & (np.abs(left) < reach_m / 3)
     if not near.any():
         return float(wrap_angle(yaw_rad))
-    vote = np.sum(np.sign(np.cos(flow[near, 2] - yaw_rad)) / (1.0 + distance[near]) ** 2)
+    side = np.where(left[near] > ONCOMING_M, -1.0, 1.0)
+    weight = 1.0 / (1.0 + np.abs(left[near]) / 2 + np.abs(along[near]) / 10) ** 2
+    vote = np.sum(weight * side * np.sign(np.cos(flow[near, 2] - yaw_rad)))
     return float(wrap_angle(yaw_rad if vote >= 0 else yaw_rad + np.pi))
