@@ -27,6 +27,7 @@ POINTS_A_TICK = 150
 # Sizes that exist, as factors of the typical one; what looks smaller than the likely ones (length, width, height) was
 # hardly seen whole, or is something else.
 SHORTEST, LONGEST = 0.6, 1.6
+SHORTEST_WHOLE = 0.75
 LEAST_LIKELY = np.array([0.65, 0.72, 0.75])
 
 STANDING_MPS = {"vehicle": 0.35, "two_wheeler": 0.3, "pedestrian": 0.2, "other": 0.35}
@@ -153,13 +154,17 @@ def _whole_sides(low: Array, high: Array, sensor: Array) -> NDArray[np.bool_]:
 
 def _completed_size(seen: Array, whole: NDArray[np.bool_], typical: Array) -> tuple[Array, bool]:
     """Length and width (2,) from extents (n, 2), of which some were whole, and whether such an object exists."""
-    size = np.empty(2)
+    size, raw = np.empty(2), np.empty(2)
     for axis in range(2):
-        if whole[:, axis].any():
-            size[axis] = np.quantile(seen[whole[:, axis], axis], SIZE_QUANTILE)
-        else:
-            size[axis] = max(typical[axis], float(np.quantile(seen[:, axis], SIZE_QUANTILE)))
-    likely = bool(((size >= LEAST_LIKELY[:2] * typical) & (size <= LONGEST * typical)).all())
+        every = seen[:, axis]
+        ends = every[whole[:, axis]]
+        raw[axis] = np.quantile(ends if len(ends) else np.maximum(every, typical[axis]), SIZE_QUANTILE)
+        # A side shorter than any such object's was not seen from end to end after all.
+        ends = ends[ends >= SHORTEST_WHOLE * typical[axis]]
+        size[axis] = (
+            np.quantile(ends, SIZE_QUANTILE) if len(ends) else max(typical[axis], np.quantile(every, SIZE_QUANTILE))
+        )
+    likely = bool(((raw >= LEAST_LIKELY[:2] * typical) & (raw <= LONGEST * typical)).all())
     return np.clip(size, SHORTEST * typical, LONGEST * typical), likely
 
 
