@@ -74,9 +74,11 @@ def as_rider_if_fast(track: Track) -> Track:
     t = (m.t_ns - m.t_ns[0]) / NS_PER_S
     if track.category != "pedestrian" or t[-1] < RIDER_S:
         return track
-    third = max(len(t) // 3, 1)
-    way = np.median(m.center_m[-third:, :2], axis=0) - np.median(m.center_m[:third, :2], axis=0)
-    speed = float(np.hypot(*way)) / max(float(np.median(t[-third:]) - np.median(t[:third])), 1e-3)
+    later = np.searchsorted(t, t + RIDER_S)
+    start = np.flatnonzero(later < len(t))
+    later = later[start]
+    pace = np.hypot(*(m.center_m[later, :2] - m.center_m[start, :2]).T) / (t[later] - t[start])
+    speed = float(np.quantile(pace, 0.75)) if len(pace) else 0.0
     return replace(track, category="cyclist") if speed > RIDER_MPS else track
 
 

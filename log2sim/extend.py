@@ -18,6 +18,8 @@ SHELL_M = 0.5
 CROWDED = 0.6
 MOST_SHIFT_M = 0.8
 MOST_MISSES = 2
+# A box of which less than the rest of this share shows could be anywhere along it.
+MOST_HIDDEN = 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +107,7 @@ def look(cloud: Obstacles, tick: int, xy_m: Array, yaw_rad: float, size_m: Array
         return None
     sensor = boxfit.rotate(cloud.sensor[:2].astype(np.float64) + cloud.origin[:2] - xy_m, -yaw_rad)
     center, slack = boxfit.complete_box(low, high, size_m[:2], sensor)
-    if np.hypot(*center) > MOST_SHIFT_M:
+    if np.hypot(*center) > MOST_SHIFT_M or np.any(slack > MOST_HIDDEN * np.maximum(size_m[:2], 1.0)):
         return None
     sigma = np.hypot(2 * boxfit.SENSOR_SIGMA_M, boxfit.SLACK_SIGMA * slack)
     axes = boxfit.rotate(np.eye(2), yaw_rad)

@@ -113,7 +113,9 @@ def shape_moving(track: Track, yaw_rad: Array) -> Shape:
         yaw = float(yaw_rad[k])
         center, slack = boxfit.complete_box(lows[k], highs[k], size, sensors[k])
         xy[k] = boxfit.rotate(center, yaw) + m.center_m[k, :2]
-        sigma = np.hypot(boxfit.SENSOR_SIGMA_M, boxfit.SLACK_SIGMA * slack)
+        # What the image border cuts may show its middle only: then no end of it is real.
+        loose = slack if m.truncated[k] else boxfit.SLACK_SIGMA * slack
+        sigma = np.hypot(boxfit.SENSOR_SIGMA_M, loose)
         axes = boxfit.rotate(np.eye(2), yaw)
         covariance[k] = axes.T @ np.diag(sigma**2) @ axes
     height, z = _height(track)
