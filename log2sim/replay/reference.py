@@ -148,7 +148,7 @@ def vehicle_reference(
     if len(t) > 2:
         ahead, aside = _body_velocity(x, y, yaw)
         speed = speed + _smooth(ahead - logged_speed, TREND_S, odd=False)
-        course = yaw + _drift(ahead, aside)
+        course = yaw + _drift(speed, aside)
     else:
         course = yaw
     accel = np.gradient(speed, GRID_S) if len(t) > 1 else np.zeros(1)
@@ -223,13 +223,13 @@ def _body_velocity(x: Array, y: Array, yaw: Array) -> tuple[Array, Array]:
     return vx * np.cos(yaw) + vy * np.sin(yaw), vy * np.cos(yaw) - vx * np.sin(yaw)
 
 
-def _drift(ahead: Array, aside: Array) -> Array:
+def _drift(speed: Array, aside: Array) -> Array:
     """Angle (K,) from the heading to the course. A wheel has none: it is the log's yaw or its rear axle that is a bit off.
 
     A follower that held such a heading would run beside the path, by twice its distance constant times the angle. The
     least-squares angle has a prior of zero, so that jitter of a slow vehicle does not pass for drift.
     """
-    slope = _smooth(aside * ahead, TREND_S, odd=False) / (_smooth(ahead**2, TREND_S, odd=False) + DRIFT_PRIOR_MPS**2)
+    slope = _smooth(aside * speed, TREND_S, odd=False) / (_smooth(speed**2, TREND_S, odd=False) + DRIFT_PRIOR_MPS**2)
     return np.arctan(np.clip(slope, -MAX_DRIFT, MAX_DRIFT))
 
 
