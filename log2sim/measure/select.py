@@ -50,23 +50,43 @@ def select_cluster(xyz: NDArray[np.float32], uv: Array, range_m: Array, box_px: 
     what stands in front covers a part of it, and the background shows only around the object. Of clusters that fill the
     box alike the nearer one is the object.
     """
+    none = np.zeros(0, dtype=np.intp)
     if len(xyz) < LEAST_POINTS:
-        return np.zeros(0, dtype=np.intp)
+        return none
     labels = clusters_of(xyz[:, :2], CELL_M[GROUP_OF[category]])
-    order = np.argsort(labels, kind="stable")
-    groups = np.split(order, np.searchsorted(labels[order], np.arange(1, labels.max() + 1)))
-    groups = [g for g in groups if len(g) >= LEAST_POINTS]
-    best, best_score = np.zeros(0, dtype=np.intp), 0.0
-    nearest_m = min((float(np.median(range_m[g])) for g in groups), default=0.0)
-    for group in groups:
-        cropped = within_length(xyz, group, range_m, LONGEST_M[category])
-        sample = subsample(cropped, MOST_SCORED_POINTS)
-        span = np.r_[uv[sample].min(axis=0), uv[sample].max(axis=0)]
-        fill = float(box_iou(span, box_px)[0, 0])
-        score = fill * (nearest_m / max(float(np.median(range_m[cropped])), 1e-3)) ** 0.5
-        if fill >= LEAST_FILL and score > best_score:
-            best, best_score = cropped, score
-    return best
+    order, count = np.argsort(labels, kind="stable"), np.bincount(labels)
+    first = np.cumsum(count) - count
+    enough = count >= LEAST_POINTS
+    if not enough.any():
+        return none
+    span = np.concatenate(_ends(uv[order], first), axis=1)
+    middle_m = _medians(range_m, labels, first, count)
+    nearest_m = middle_m[enough].min()
+    low, high = _ends(xyz[order, :2], first)
+    unusual = enough & ((np.hypot(*(high - low).T) > LONGEST_M[category]) | (count > MOST_SCORED_POINTS))
+    members = {int(g): order[first[g] : first[g] + count[g]] for g in np.flatnonzero(unusual)}
+    for g, group in members.items():
+        members[g] = cropped = within_length(xyz, group, range_m, LONGEST_M[category])
+        sample = uv[subsample(cropped, MOST_SCORED_POINTS)]
+        span[g] = np.concatenate([sample.min(axis=0), sample.max(axis=0)])
+        middle_m[g] = np.median(range_m[cropped])
+    fill = box_iou(span, box_px)[:, 0]
+    score = np.where(enough & (fill >= LEAST_FILL), fill * np.sqrt(nearest_m / np.maximum(middle_m, 1e-3)), 0.0)
+    best = int(np.argmax(score))
+    if score[best] <= 0:
+        return none
+    return members[best] if best in members else order[first[best] : first[best] + count[best]]
+
+
+def _ends(values: NDArray[Any], first: Index) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Smallest and largest values (G, 2), (G, 2) of consecutive groups of rows (N, 2) that begin at `first` (G,)."""
+    return np.minimum.reduceat(values, first), np.maximum.reduceat(values, first)
+
+
+def _medians(values: NDArray[Any], labels: Index, first: Index, count: Index) -> Array:
+    """Median (G,) of the values (N,) of every label; each label's rows begin at `first` once sorted."""
+    ordered = values[np.lexsort((values, labels))]
+    return np.asarray((ordered[first + (count - 1) // 2] + ordered[first + count // 2]) / 2, dtype=np.float64)
 
 
 def within_length(xyz: NDArray[np.float32], group: Index, range_m: Array, longest_m: float) -> Index:
@@ -87,7 +107,8 @@ def grow(xy_all: NDArray[np.float32], seed: NDArray[np.float32], category: str) 
     """
     reach = LONGEST_M[category]
     center = np.median(seed, axis=0)
-    near = np.flatnonzero((np.abs(xy_all - center) <= reach).all(axis=1))
+    near = np.flatnonzero(np.abs(xy_all[:, 0] - center[0]) <= reach)
+    near = near[np.abs(xy_all[near, 1] - center[1]) <= reach]
     if len(near) == 0:
         return near
     labels = clusters_of(np.vstack([xy_all[near], seed]), CELL_M[GROUP_OF[category]])
