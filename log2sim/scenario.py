@@ -16,6 +16,7 @@ from log2sim.files import read_json, write_json
 from log2sim.geometry import Array, wrap_angle
 from log2sim.schema import check
 from log2sim.types import CATEGORIES, MapFrame
+from log2sim.unlabeled import Unlabeled
 
 VERSION = 1
 
@@ -88,7 +89,10 @@ class Agent:
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """A scenario. The ego is the agent with id "ego", if the log had one; `t0_ns` is the absolute time of t_s = 0."""
+    """A scenario. The ego is the agent with id "ego", if the log had one; `t0_ns` is the absolute time of t_s = 0.
+
+    `unlabeled` only in truth: where its labels say nothing, None where they are complete.
+    """
 
     name: str
     t0_ns: int
@@ -98,6 +102,7 @@ class Scenario:
     cameras: tuple[Mapping[str, Any], ...] = ()
     plan: tuple[Mapping[str, Any], ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    unlabeled: Unlabeled | None = None
 
     @property
     def ego(self) -> Agent | None:
@@ -131,7 +136,7 @@ class Scenario:
     def to_dict(self) -> dict[str, Any]:
         """The document of `schemas/scenario-1.json`."""
         m = self.map
-        return {
+        document = {
             "scenario_version": VERSION,
             "name": self.name,
             "t0_ns": int(self.t0_ns),
@@ -148,13 +153,16 @@ class Scenario:
             "plan": [dict(p) for p in self.plan],
             "provenance": dict(self.provenance),
         }
+        return document if self.unlabeled is None else {**document, "unlabeled": self.unlabeled.to_dict()}
 
     @classmethod
     def from_dict(cls, document: Any) -> Scenario:
         """Build a scenario from a document, after checking it against the schema and for sense."""
         version = document.get("scenario_version") if isinstance(document, dict) else None
         if version != VERSION:
-            raise ScenarioError(f"scenario_version is {version!r}, expected {VERSION}; is this a scenario file of log2sim?")
+            raise ScenarioError(
+                f"scenario_version is {version!r}, expected {VERSION}; is this a scenario file of log2sim?"
+            )
         check(document, "scenario-1", ScenarioError)
         m = document["map"]
         scenario = cls(
@@ -166,6 +174,7 @@ class Scenario:
             cameras=tuple(document["cameras"]),
             plan=tuple(document["plan"]),
             provenance=document["provenance"],
+            unlabeled=Unlabeled.from_dict(document["unlabeled"]) if "unlabeled" in document else None,
         )
         seen: set[str] = set()
         for agent in scenario.agents:
@@ -207,7 +216,9 @@ def _agent_from_dict(entry: Mapping[str, Any]) -> Agent:
     arrays = {k: np.array(columns[k], dtype=np.float64) for k in Waypoints.FLOATS}
     for key, values in arrays.items():
         if not np.all(np.isfinite(values)):
-            raise ScenarioError(f"{where}: waypoints.{key} is not finite at index {int(np.argmin(np.isfinite(values)))}")
+            raise ScenarioError(
+                f"{where}: waypoints.{key} is not finite at index {int(np.argmin(np.isfinite(values)))}"
+            )
     if np.any(np.diff(arrays["t_s"]) <= 0):
         k = int(np.argmax(np.diff(arrays["t_s"]) <= 0)) + 1
         raise ScenarioError(f"{where}: waypoints.t_s does not increase at index {k} ({arrays['t_s'][k]:g} s)")

@@ -16,10 +16,18 @@ from log2sim.errors import LogError
 from log2sim.files import inside, read_json
 from log2sim.geometry import Array, PoseTrack, rotation_from_quaternion, transform
 from log2sim.logs.images import read_image
+from log2sim.logs.native_labels import (
+    BOX_2D_COLUMNS,
+    BOX_3D_COLUMNS,
+    REGION_COLUMNS,
+    boxes_2d,
+    boxes_3d,
+    regions_2d,
+)
 from log2sim.logs.sweeps import read_sweep
 from log2sim.logs.table import Table, in_order, read_table
 from log2sim.schema import check
-from log2sim.types import CATEGORIES, Camera, EgoVehicle, ImageLabels, Labels, Lidar, Log, MapFrame, Stream, Sweep
+from log2sim.types import Camera, EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, Sweep
 
 MANIFEST = "log.json"
 
@@ -27,10 +35,6 @@ INDEX_COLUMNS = {"t_ns": "int", "file": "str"}
 POSE_COLUMNS = {"t_ns": "int", **dict.fromkeys(("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"), "float")}
 GNSS_FIELDS = ("latitude_deg", "longitude_deg", "altitude_m", "roll_rad", "pitch_rad", "yaw_rad")
 GNSS_COLUMNS = {"t_ns": "int", **dict.fromkeys(GNSS_FIELDS, "float")}
-BOX_3D_FIELDS = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
-BOX_3D_COLUMNS = {"t_ns": "int", "track_id": "str", "category": "str", **dict.fromkeys(BOX_3D_FIELDS, "float")}
-BOX_2D_FIELDS = ("u0_px", "v0_px", "u1_px", "v1_px")
-BOX_2D_COLUMNS = {"t_ns": "int", "camera": "str", **dict.fromkeys(BOX_2D_FIELDS, "float"), "category": "str"}
 
 QUATERNION_TOLERANCE = 1e-3
 OFFSET_STEP_M = 1000.0
@@ -79,6 +83,7 @@ class _Folder:
         sensors = [self._sensor(k, entry) for k, entry in enumerate(m["sensors"])]
         self._check_sensors(sensors, track)
         labels = self._labels()
+        boxes, regions = self._label_table("boxes_2d", BOX_2D_COLUMNS), self._label_table("ignored_2d", REGION_COLUMNS)
         offset = _offset(track, sensors, labels)
         cameras = {s.name: _shifted_camera(s, offset) for s in sensors if isinstance(s, Camera)}
         lidars = {s.name: _shifted_lidar(s, offset) for s in sensors if isinstance(s, Lidar)}
@@ -95,7 +100,8 @@ class _Folder:
             ego_vehicle=EgoVehicle(size, float(ego.get("rear_axle_offset_m", default.rear_axle_offset_m))),  # type: ignore[arg-type]
             map=replace(map_frame, offset_m=tuple(offset.tolist())),
             labels=None if labels is None else _shifted_labels(labels, offset),
-            image_labels=self._image_labels(set(cameras)),
+            image_labels={} if boxes is None else boxes_2d(boxes, set(cameras)),
+            ignored_regions={} if regions is None else regions_2d(regions, set(cameras)),
             ground_z_ego_m=float(ego.get("ground_z_m", 0.0)),
             reference_camera=m.get("reference_camera"),
             digest=self.hash.hexdigest(),
@@ -195,51 +201,21 @@ class _Folder:
         return Stream(entry["name"], t_ns, partial(_read_sweep, files, t_ns, frame, offset))
 
     def _labels(self) -> Labels | None:
-        relative = self.manifest.get("labels", {}).get("boxes_3d")
-        if relative is None:
+        entry = self.manifest.get("labels", {})
+        if "boxes_3d" not in entry:
             return None
-        table = self.table(relative, "labels.boxes_3d", BOX_3D_COLUMNS, {"visible": "bool"})
-        _check_categories(table)
-        size = table.stack("length_m", "width_m", "height_m")
-        if np.any(size <= 0):
-            row, column = np.argwhere(size <= 0)[0]
-            field = ("length_m", "width_m", "height_m")[column]
-            raise LogError(f"{table.where(row, field)}: {size[row, column]:g}, expected a size above 0")
-        return Labels(
-            table["t_ns"],
-            table["track_id"],
-            table["category"],
-            table.stack("x_m", "y_m", "z_m"),
-            size,
-            table["yaw_rad"],
-            table.columns.get("visible"),
-        )
+        names = [s["name"] for s in self.manifest["sensors"] if s["kind"] == "camera"]
+        for name in entry.get("cameras", ()):
+            if name not in names:
+                raise LogError(
+                    f"{self.file}, field 'labels.cameras': no camera '{name}'; there are: {', '.join(sorted(names))}"
+                )
+        labels = boxes_3d(self.table(entry["boxes_3d"], "labels.boxes_3d", BOX_3D_COLUMNS, {"visible": "bool"}))
+        return replace(labels, cameras=tuple(entry["cameras"]) if "cameras" in entry else None)
 
-    def _image_labels(self, cameras: set[str]) -> dict[str, ImageLabels]:
-        relative = self.manifest.get("labels", {}).get("boxes_2d")
-        if relative is None:
-            return {}
-        table = self.table(relative, "labels.boxes_2d", BOX_2D_COLUMNS)
-        _check_categories(table)
-        unknown = np.flatnonzero(~np.isin(table["camera"], sorted(cameras)))
-        if len(unknown):
-            name = table["camera"][unknown[0]]
-            raise LogError(
-                f"{table.where(unknown[0], 'camera')}: no camera '{name}'; there are: {', '.join(sorted(cameras))}"
-            )
-        box = table.stack(*BOX_2D_FIELDS)
-        empty = np.flatnonzero((box[:, 2] <= box[:, 0]) | (box[:, 3] <= box[:, 1]))
-        if len(empty):
-            raise LogError(f"{table.where(empty[0], 'u1_px,v1_px')}: the box is empty, expected u0 < u1 and v0 < v1")
-        rows = {name: table["camera"] == name for name in sorted(cameras)}
-        return {n: ImageLabels(table["t_ns"][r], box[r], table["category"][r]) for n, r in rows.items() if r.any()}
-
-
-def _check_categories(table: Table) -> None:
-    unknown = np.flatnonzero(~np.isin(table["category"], CATEGORIES))
-    if len(unknown):
-        found = table["category"][unknown[0]]
-        raise LogError(f"{table.where(unknown[0], 'category')}: '{found}', expected one of {', '.join(CATEGORIES)}")
+    def _label_table(self, key: str, columns: Mapping[str, str]) -> Table | None:
+        relative = self.manifest.get("labels", {}).get(key)
+        return None if relative is None else self.table(relative, f"labels.{key}", columns)
 
 
 def _check_geodetic(table: Table) -> None:

@@ -52,6 +52,7 @@ def summarize(log: Log) -> dict[str, Any]:
         },
         "labels": _labels(log),
         "image_labels": {name: _counts(boxes.category) for name, boxes in log.image_labels.items()},
+        "ignored_regions": {name: len(regions.t_ns) for name, regions in log.ignored_regions.items()},
         "notes": list(log.notes),
         "digest": log.digest,
     }

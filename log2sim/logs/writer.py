@@ -16,14 +16,8 @@ from numpy.typing import NDArray
 
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array, quaternion_from_rotation, yaw_of
-from log2sim.logs.native import (
-    BOX_2D_COLUMNS,
-    BOX_3D_COLUMNS,
-    GNSS_COLUMNS,
-    INDEX_COLUMNS,
-    MANIFEST,
-    POSE_COLUMNS,
-)
+from log2sim.logs.native import GNSS_COLUMNS, INDEX_COLUMNS, MANIFEST, POSE_COLUMNS
+from log2sim.logs.native_labels import BOX_2D_COLUMNS, BOX_3D_COLUMNS, REGION_COLUMNS
 from log2sim.schema import check
 from log2sim.types import Camera, Lidar, Log, Stream, Sweep
 
@@ -234,7 +228,7 @@ def _write_ego(log: Log, root: Path, manifest: dict[str, Any], kind: str) -> Non
 
 
 def _write_labels(log: Log, root: Path, manifest: dict[str, Any], offset: Array) -> None:
-    entry = {}
+    entry: dict[str, Any] = {}
     if log.labels is not None:
         b = log.labels
         entry["boxes_3d"] = "labels/boxes_3d.csv"
@@ -244,6 +238,8 @@ def _write_labels(log: Log, root: Path, manifest: dict[str, Any], offset: Array)
             columns["visible"] = "bool"
             rows = [(*row, int(v)) for row, v in zip(rows, b.visible)]
         _write_table(root / entry["boxes_3d"], columns, rows)
+        if b.cameras is not None:
+            entry["cameras"] = list(b.cameras)
     if log.image_labels:
         entry["boxes_2d"] = "labels/boxes_2d.csv"
         rows = []
@@ -251,6 +247,12 @@ def _write_labels(log: Log, root: Path, manifest: dict[str, Any], offset: Array)
             camera = np.full(len(boxes.t_ns), name)
             rows += [(*row, str(c)) for row, c in zip(_rows(boxes.t_ns, boxes.box_px, camera), boxes.category)]
         _write_table(root / entry["boxes_2d"], BOX_2D_COLUMNS, rows)
+    if log.ignored_regions:
+        entry["ignored_2d"] = "labels/ignored_2d.csv"
+        rows = []
+        for name, regions in log.ignored_regions.items():
+            rows += _rows(regions.t_ns, regions.box_px, np.full(len(regions.t_ns), name))
+        _write_table(root / entry["ignored_2d"], REGION_COLUMNS, rows)
     if entry:
         manifest["labels"] = entry
 
