@@ -12,7 +12,7 @@ import log2sim
 from log2sim.assemble import STANDING_SPEED_MPS, Built, Timeline
 from log2sim.config import Config
 from log2sim.detect import Detector
-from log2sim.geometry import NS_PER_S, Array, bev_iou, box_corners_bev, yaw_of
+from log2sim.geometry import NS_PER_S, Array, bev_iou, box_corners_bev, polygon_area, yaw_of
 from log2sim.ground_plane import CameraGround
 from log2sim.plan import Plan
 from log2sim.scenario import Agent, Scenario, Waypoints
@@ -63,8 +63,6 @@ def _same_place(a: Agent, b: Agent) -> bool:
 
 def _share_of_smaller(a: Array, b: Array) -> float:
     """Area that two rectangles (4, 2) share, as a part of the smaller one's."""
-    from log2sim.geometry import polygon_area
-
     iou, area_a, area_b = bev_iou(a, b), polygon_area(a), polygon_area(b)
     return iou / (1 + iou) * (area_a + area_b) / min(area_a, area_b)
 

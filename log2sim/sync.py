@@ -72,12 +72,16 @@ def synchronize(
 
     Raises
     ------
-    LogError, ConfigError
+    LogError
+        For a stream without records or with stamps that do not increase.
+    ConfigError
         When the reference is unknown or no tick is left.
     """
     reference = reference or (log.reference_camera if log.reference_camera in cameras else "") or cameras[0]
     if reference not in cameras:
         raise ConfigError(f"sync.reference: camera '{reference}' is not used; used: {', '.join(cameras)}")
+    for name in (*cameras, *log.lidars):
+        _check_stamps(log.streams[name])
     ticks = log.streams[reference].t_ns
     seconds = (ticks - ticks[0]) / NS_PER_S
     keep = (seconds >= (start_s if start_s is not None else -np.inf)) & (
@@ -99,6 +103,18 @@ def synchronize(
         sweeps[lidar] = index.reshape(asked.shape)
         _, residuals[lidar] = nearest_records(middle, asked[cameras.index(reference)], tolerance_ns)
     return Schedule(reference, ticks, frames, sweeps, residuals)
+
+
+def _check_stamps(stream: Stream) -> None:
+    """Raise `LogError` where a search among the stamps would go wrong; a reader puts its records in order."""
+    if len(stream.t_ns) == 0:
+        raise LogError(f"stream '{stream.name}': has no record; expected at least one, or a log without this sensor")
+    late = np.flatnonzero(np.diff(stream.t_ns) <= 0) + 1
+    if len(late):
+        raise LogError(
+            f"stream '{stream.name}': stamp {stream.t_ns[late[0]]} does not follow {stream.t_ns[late[0] - 1]}; expected "
+            "strictly increasing stamps, so sort the records and drop those that repeat one"
+        )
 
 
 def nearest_records(
@@ -132,7 +148,7 @@ def _taken_once(
 
 
 def sweep_middle_ns(stream: Stream) -> int:
-    """Median time of a sweep's points relative to its stamp, from the first sweep that can be read; 0 without point times.
+    """Middle of a sweep's point times relative to its stamp, ns, from the first sweep that can be read; 0 without point times.
 
     Raises
     ------
@@ -149,7 +165,7 @@ def sweep_middle_ns(stream: Stream) -> int:
         if sweep.t_ns is None:
             return 0
         if len(sweep.t_ns):
-            return round((int(sweep.t_ns.min()) + int(sweep.t_ns.max())) / 2) - int(sweep.stamp_ns)
+            return (int(sweep.t_ns.min()) + int(sweep.t_ns.max())) // 2 - int(sweep.stamp_ns)
     if problem is not None and len(stream.t_ns) <= PROBED_RECORDS:
         raise LogError(
             f"stream '{stream.name}': none of its {len(stream.t_ns)} sweeps can be read; the first problem: {problem}"

@@ -101,7 +101,8 @@ class Labels:
     """Labeled 3D boxes of a log, one row a box and stamp, in the map frame.
 
     `t_ns` (L,) int64, `track_id` (L,) str, `category` (L,) str, `center_m` (L, 3) box centers, `size_m` (L, 3) length,
-    width, height, `yaw_rad` (L,). `visible` (L,) bool where the log states it, else None: then it is computed.
+    width, height, `yaw_rad` (L,). `visible` (L,) bool where the log states it, else None: then it is computed. `cameras`
+    names those in whose view alone objects were labeled; None where they were labeled all around.
     """
 
     t_ns: NDArray[np.int64]
@@ -111,6 +112,7 @@ class Labels:
     size_m: Array
     yaw_rad: Array
     visible: NDArray[np.bool_] | None = None
+    cameras: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +122,14 @@ class ImageLabels:
     t_ns: NDArray[np.int64]
     box_px: Array
     category: NDArray[np.str_]
+
+
+@dataclass(frozen=True, eq=False)
+class ImageRegions:
+    """Parts of the images of one camera in which objects were left without labels: `t_ns` (L,), `box_px` (L, 4)."""
+
+    t_ns: NDArray[np.int64]
+    box_px: Array
 
 
 @dataclass(frozen=True)
@@ -150,7 +160,8 @@ class Log:
     """An opened log. Nothing is read from the streams until asked for.
 
     `ego` is None for a log of roadside sensors only. `ground_z_ego_m` is the height of the road in the ego frame: 0 where
-    the ego's origin lies on the ground. `digest` is a SHA-256 over the log's index.
+    the ego's origin lies on the ground. `ignored_regions` says by camera where `labels` are incomplete. `digest` is a
+    SHA-256 over the log's index.
     """
 
     name: str
@@ -163,6 +174,7 @@ class Log:
     map: MapFrame = field(default_factory=MapFrame)
     labels: Labels | None = None
     image_labels: Mapping[str, ImageLabels] = field(default_factory=dict)
+    ignored_regions: Mapping[str, ImageRegions] = field(default_factory=dict)
     ground_z_ego_m: float = 0.0
     reference_camera: str | None = None
     digest: str = ""

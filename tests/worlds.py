@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import Array, apply, box_corners, inverse, rotation_from_rpy, transform
 from log2sim.scenario import Scenario
 from log2sim.synth.assemble import synthesize
 from log2sim.synth.scene import Scene, scene_from_table
-from log2sim.types import Log
+from log2sim.types import Camera, Log, Mount
 
 CAR = {"id": "car", "category": "car", "size_m": [4.4, 1.8, 1.5], "waypoints": [[16.0, 2.0, 4.0], [40.0, 2.0, 4.0]]}
 PARKED = {"id": "parked", "category": "car", "size_m": [4.2, 1.8, 1.5], "pose": [14.0, -4.0, 10.0]}
@@ -62,3 +67,78 @@ def tiny_log(
     calm = {"dropout": 0.0, "resolution_m": 0.0} if noise_m == 0 else {}
     lidars = tuple(replace(spec, noise_m=noise_m, **calm) for spec in scene.lidar)
     return synthesize(replace(scene, lidar=lidars), seed=seed, observe=observe)
+
+
+@dataclass(frozen=True)
+class Solid:
+    """An upright box that a LiDAR can hit: center (3,), size (3,) length, width, height in m, yaw in rad."""
+
+    center_m: tuple[float, float, float]
+    size_m: tuple[float, float, float] = (4.4, 1.85, 1.6)
+    yaw_rad: float = 0.0
+
+
+def standing(
+    x_m: float, y_m: float, yaw_deg: float = 0.0, size_m: tuple[float, float, float] = (4.4, 1.85, 1.6)
+) -> Solid:
+    """A solid on the ground z = 0, of a typical car's size unless told otherwise."""
+    return Solid((x_m, y_m, size_m[2] / 2), size_m, float(np.deg2rad(yaw_deg)))
+
+
+def scan(
+    solids: Sequence[Solid],
+    *,
+    sensor: tuple[float, float, float] = (0.0, 0.0, 1.9),
+    azimuth_deg: tuple[float, float] = (-45.0, 45.0),
+    elevation_deg: tuple[float, float] = (-18.0, 4.0),
+    steps: tuple[int, int] = (360, 48),
+    slope: tuple[float, float] = (0.0, 0.0),
+    noise_m: float = 0.0,
+    seed: int = 0,
+) -> tuple[Array, NDArray[np.intp]]:
+    """First hits (N, 3) in the map frame of a fan of rays, and what each hit (N,): the solid's index, -1 the ground.
+
+    The ground is the plane z = slope . (x, y). Rays that hit nothing within 90 m give no point.
+    """
+    azimuth, elevation = (np.deg2rad(np.linspace(*r, n)) for r, n in zip((azimuth_deg, elevation_deg), steps))
+    a, e = (g.ravel() for g in np.meshgrid(azimuth, elevation, indexing="ij"))
+    ray = np.stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)], axis=1)
+    start = np.asarray(sensor, dtype=np.float64)
+    rise = ray[:, 2] - ray[:, :2] @ slope
+    above = start[2] - start[:2] @ slope
+    reach = [np.where(rise < 0, above / np.where(rise < 0, -rise, 1.0), np.inf)]
+    reach += [_hit(start, ray, solid) for solid in solids]
+    owner = np.argmin(reach, axis=0) - 1
+    nearest_m = np.min(reach, axis=0)
+    seen = nearest_m < 90.0
+    nearest_m = nearest_m[seen] + np.random.default_rng(seed).normal(0.0, noise_m, int(seen.sum()))
+    return start + ray[seen] * nearest_m[:, None], owner[seen]
+
+
+def _hit(start: Array, ray: Array, solid: Solid) -> Array:
+    """Distance (N,) along rays to a solid by the slab method, inf where it is missed."""
+    turn = rotation_from_rpy(0.0, 0.0, -solid.yaw_rad)
+    origin, along = turn @ (start - solid.center_m), ray @ turn.T
+    half = np.asarray(solid.size_m) / 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        one, other = (-half - origin) / along, (half - origin) / along
+    enter, leave = np.minimum(one, other).max(axis=1), np.maximum(one, other).min(axis=1)
+    return np.where((enter < leave) & (enter > 0), enter, np.inf)
+
+
+def camera_ahead(
+    name: str = "front", *, mount: Mount = "map", at: tuple[float, float, float] = (0.0, 0.0, 1.6), yaw_rad: float = 0.0
+) -> Camera:
+    """A camera without distortion, 1200 x 600 px and 81 degrees wide, that looks level along a yaw."""
+    axes = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    mount_T_cam = transform(rotation_from_rpy(0.0, 0.0, yaw_rad) @ axes, np.asarray(at))
+    k = np.array([[700.0, 0.0, 600.0], [0.0, 700.0, 300.0], [0.0, 0.0, 1.0]])
+    return Camera(name, 1200, 600, k, mount, mount_T_cam)
+
+
+def outline_px(camera: Camera, map_T_cam: Array, solid: Solid) -> Array:
+    """The exact 2D box (4,) of a solid that lies wholly in front of the camera, cut at the image's border."""
+    corners = apply(inverse(map_T_cam), box_corners(solid.center_m, solid.size_m, solid.yaw_rad)[0])
+    uv = corners[:, :2] / corners[:, 2:] * [camera.K[0, 0], camera.K[1, 1]] + camera.K[:2, 2]
+    wide = np.array([camera.width_px, camera.height_px])
+    return np.concatenate([np.clip(uv.min(axis=0), 0, wide), np.clip(uv.max(axis=0), 0, wide)])

@@ -98,7 +98,7 @@ def assemble_cloud(
         stamp = stamp or sweep.stamp_ns
         sensor, known = log.map_T_sensor(name, sweep.stamp_ns)
         local = (mapped[0] - origin).astype(np.float32)
-        near = (np.abs(local[:, :2]) <= max_range_m).all(axis=1)
+        near = (np.abs(local[:, 0]) <= max_range_m) & (np.abs(local[:, 1]) <= max_range_m)
         shift_s = np.float32((sweep.stamp_ns - stamp) / NS_PER_S)
         parts.append((local[near], mapped[1][near] + shift_s, sensor[0, :3, 3] - origin if known[0] else np.zeros(3)))
     if not parts:

@@ -30,13 +30,18 @@ class Ground:
     def at(self, xy: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
         """Height (N,) under positions (N, 2), bilinear, held constant beyond the grid's edge."""
         k = self.z.shape[0]
-        place = np.clip((np.asarray(xy) - self.center) / CELL_M + (k - 1) / 2, 0, k - 1.001)
-        i = place.astype(np.int64)
-        f = (place - i).astype(np.float32)
-        z = self.z.astype(np.float32)
-        low = z[i[:, 0], i[:, 1]] * (1 - f[:, 1]) + z[i[:, 0], i[:, 1] + 1] * f[:, 1]
-        high = z[i[:, 0] + 1, i[:, 1]] * (1 - f[:, 1]) + z[i[:, 0] + 1, i[:, 1] + 1] * f[:, 1]
-        return low * (1 - f[:, 0]) + high * f[:, 0]
+        (i, fi), (j, fj) = (self._cell(xy[:, axis], axis) for axis in range(2))
+        z, corner = self.z.astype(np.float32).ravel(), i * k + j
+        low = z[corner] * (1 - fj) + z[corner + 1] * fj
+        high = z[corner + k] * (1 - fj) + z[corner + k + 1] * fj
+        return low * (1 - fi) + high * fi
+
+    def _cell(self, values: NDArray[np.floating[Any]], axis: int) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+        """Index (N,) of the cell center below each coordinate (N,), and the share (N,) of the way to the next one."""
+        k = self.z.shape[0]
+        place = np.clip((values - self.center[axis]) / CELL_M + (k - 1) / 2, 0, k - 1.001)
+        i = place.astype(np.intp)
+        return i, (place - i).astype(np.float32)
 
 
 def estimate_ground(xyz: NDArray[np.floating[Any]], center: Array, z_hint: float) -> Ground:
@@ -47,8 +52,6 @@ def estimate_ground(xyz: NDArray[np.floating[Any]], center: Array, z_hint: float
     A quadratic surface is fitted to the lowest point of every cell by iteratively reweighted least squares, anchored to
     the road under the ego; what the cells near it still differ by is smoothed and added. Without any point it is flat.
     """
-    from scipy.ndimage import gaussian_filter
-
     k = int(2 * REACH_M / CELL_M) + 1
     lowest = _lowest_points(xyz, center, k)
     axis = (np.arange(k) - (k - 1) / 2) * CELL_M
@@ -63,19 +66,26 @@ def estimate_ground(xyz: NDArray[np.floating[Any]], center: Array, z_hint: float
     for widened in (2.0, 1.0):
         on_ground = (residual < widened * ACCEPT_ABOVE_M) & (residual > -widened * ACCEPT_BELOW_M)
         weight = (filled & on_ground).astype(np.float64)
-        total = gaussian_filter(weight, 2.0, mode="constant") + 1e-3 * gaussian_filter(weight, 8.0, mode="constant")
-        blurred = gaussian_filter(weight * residual, 2.0, mode="constant")
-        blurred += 1e-3 * gaussian_filter(weight * residual, 8.0, mode="constant")
+        total, blurred = _blur(weight), _blur(weight * residual)
         surface = surface + np.divide(blurred, total, out=np.zeros_like(total), where=total > 1e-6)
         residual = np.where(filled, lowest - surface, 0.0)
     return Ground(np.asarray(center, dtype=np.float64), surface)
 
 
+def _blur(grid: Array) -> Array:
+    """Gaussian mean (K, K) over two cells, and over eight with hardly any weight, for where the near ones are empty."""
+    import cv2
+
+    single = grid.astype(np.float32)
+    near, far = (cv2.GaussianBlur(single, (8 * s + 1, 8 * s + 1), s, borderType=cv2.BORDER_CONSTANT) for s in (2, 8))
+    return np.asarray(near + np.float32(1e-3) * far, dtype=np.float64)
+
+
 def _lowest_points(xyz: NDArray[np.floating[Any]], center: Array, k: int) -> Array:
     """The second lowest height in every cell (K, K), so that one false return below the road does not count; inf if empty."""
-    cell = np.floor((xyz[:, :2] - center) / CELL_M + k / 2).astype(np.int64)
-    inside = ((cell >= 0) & (cell < k)).all(axis=1)
-    flat, z = cell[inside, 0] * k + cell[inside, 1], np.asarray(xyz[inside, 2], dtype=np.float64)
+    i, j = (np.floor((xyz[:, axis] - center[axis]) / CELL_M + k / 2).astype(np.int64) for axis in range(2))
+    inside = (i >= 0) & (i < k) & (j >= 0) & (j < k)
+    flat, z = (i * k + j)[inside], xyz[inside, 2].astype(np.float64)
     lowest = np.full(k * k, np.inf)
     np.minimum.at(lowest, flat, z)
     second = np.full(k * k, np.inf)

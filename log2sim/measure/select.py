@@ -67,21 +67,40 @@ def candidates(
     inside = np.flatnonzero(((uv >= box_px[:2]) & (uv <= box_px[2:])).all(axis=1))
     if len(inside) < LEAST_POINTS:
         return []
-    labels, corner, grid = _cluster(xyz[inside, :2], CELL_M[GROUP_OF[category]])
-    order = np.argsort(labels, kind="stable")
-    groups = np.split(inside[order], np.searchsorted(labels[order], np.arange(1, labels.max() + 1)))
-    structure = _goes_on(xyz, uv, box_px, labels, corner, grid, CELL_M[GROUP_OF[category]])
-    groups = [g for g, wall in zip(groups, structure) if len(g) >= LEAST_POINTS and not wall]
-    found = []
-    nearest_m = min((float(np.median(range_m[g])) for g in groups), default=0.0)
-    for group in groups:
-        cropped = within_length(xyz, group, range_m, LONGEST_M[category])
-        sample = subsample(cropped, MOST_SCORED_POINTS)
-        span = np.r_[uv[sample].min(axis=0), uv[sample].max(axis=0)]
-        fill = float(box_iou(span, box_px)[0, 0])
-        if fill >= LEAST_FILL:
-            found.append((cropped, fill * (nearest_m / max(float(np.median(range_m[cropped])), 1e-3)) ** 0.5))
-    return found
+    cell_m = CELL_M[GROUP_OF[category]]
+    labels, corner, grid = _cluster(xyz[inside, :2], cell_m)
+    structure = _goes_on(xyz, uv, box_px, labels, corner, grid, cell_m)
+    order, count = np.argsort(labels, kind="stable"), np.bincount(labels)
+    first = np.cumsum(count) - count
+    enough = (count >= LEAST_POINTS) & ~structure
+    if not enough.any():
+        return []
+    span = np.concatenate(_ends(uv[inside[order]], first), axis=1)
+    middle_m = _medians(range_m[inside], labels, first, count)
+    nearest_m = middle_m[enough].min()
+    low, high = _ends(xyz[inside[order], :2], first)
+    members = {int(g): inside[order[first[g] : first[g] + count[g]]] for g in np.flatnonzero(enough)}
+    for g in np.flatnonzero(
+        enough & ((np.hypot(*(high - low).T) > LONGEST_M[category]) | (count > MOST_SCORED_POINTS))
+    ):
+        members[g] = cropped = within_length(xyz, members[g], range_m, LONGEST_M[category])
+        sample = uv[subsample(cropped, MOST_SCORED_POINTS)]
+        span[g] = np.concatenate([sample.min(axis=0), sample.max(axis=0)])
+        middle_m[g] = np.median(range_m[cropped])
+    fill = box_iou(span, box_px)[:, 0]
+    score = fill * np.sqrt(nearest_m / np.maximum(middle_m, 1e-3))
+    return [(points, float(score[g])) for g, points in members.items() if fill[g] >= LEAST_FILL]
+
+
+def _ends(values: NDArray[Any], first: Index) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Smallest and largest values (G, 2), (G, 2) of consecutive groups of rows (N, 2) that begin at `first` (G,)."""
+    return np.minimum.reduceat(values, first), np.maximum.reduceat(values, first)
+
+
+def _medians(values: NDArray[Any], labels: Index, first: Index, count: Index) -> Array:
+    """Median (G,) of the values (N,) of every label; each label's rows begin at `first` once sorted."""
+    ordered = values[np.lexsort((values, labels))]
+    return np.asarray((ordered[first + (count - 1) // 2] + ordered[first + count // 2]) / 2, dtype=np.float64)
 
 
 def _goes_on(
@@ -155,7 +174,8 @@ def grow(xy_all: NDArray[np.float32], seed: NDArray[np.float32], category: str) 
     """
     reach = LONGEST_M[category]
     center = np.median(seed, axis=0)
-    near = np.flatnonzero((np.abs(xy_all - center) <= reach).all(axis=1))
+    near = np.flatnonzero(np.abs(xy_all[:, 0] - center[0]) <= reach)
+    near = near[np.abs(xy_all[near, 1] - center[1]) <= reach]
     if len(near) == 0:
         return near
     labels = clusters_of(np.vstack([xy_all[near], seed]), CELL_M[GROUP_OF[category]])

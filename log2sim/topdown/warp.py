@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.camera import distort
+from log2sim.camera import distort, fold_radius
 from log2sim.geometry import Array, inverse
 from log2sim.types import Camera
 
@@ -119,19 +119,6 @@ def _distorted(camera: Camera, u: Array, v: Array, front: NDArray[np.bool_]) -> 
     out = np.full((2, *u.shape), -1e6)
     out[:, front] = np.where(seen[:, None], bent, -1e6).T
     return out[0], out[1]
-
-
-def fold_radius(camera: Camera, largest: float = 8.0) -> float:
-    """Radius in normalized coordinates up to which the lens model moves outwards, at most `largest`.
-
-    Notes
-    -----
-    Beyond it the polynomial turns back and would show the far side of the road inside the image a second time.
-    """
-    r = np.linspace(0.0, largest, 1601)
-    bent = np.hypot(*distort(camera, np.column_stack([r, np.zeros_like(r)])).T)
-    falling = np.flatnonzero(np.diff(bent) <= 0)
-    return float(r[falling[0]]) if len(falling) else largest
 
 
 def seen_window(
