@@ -20,7 +20,7 @@ from log2sim.geometry import inverse
 from log2sim.types import CATEGORIES, Camera, Detections, Frame, ImageLabels, Log
 
 MIN_SIDE_PX = 6.0
-MIN_SHOWN_SHARE = 0.2  # outlines of 3D boxes are larger than the objects and hide more than these
+MIN_SHOWN_SHARE = 0.0  # outlines of 3D boxes are larger than the objects and hide more than these
 STAMP_TOLERANCE_NS = 1_000_000  # labels and frames of one moment differ by rounding in some logs
 
 

@@ -17,7 +17,7 @@ from log2sim import boxfit
 from log2sim.camera import project
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.measure.cloud import Cloud, assemble_cloud, to_map
-from log2sim.measure.select import LEAST_POINTS, grow, select_cluster
+from log2sim.measure.select import LEAST_POINTS, MARGIN, candidates, choose, grow
 from log2sim.types import TYPICAL_SIZE_M, Camera, Detections, Measurements
 
 __all__ = ["Cloud", "View", "assemble_cloud", "measure_view", "project_cloud", "to_map"]
@@ -53,15 +53,22 @@ def measure_view(view: View, detections: Detections, cloud: Cloud | None, *, mod
     xyz = cloud.xyz[index]
     range_m = np.linalg.norm(xyz - cloud.sensor, axis=1)
     clusters = list(columns["cluster"])
-    for k, box in enumerate(detections.box_px):
-        inside = np.flatnonzero(
-            (uv[:, 0] >= box[0]) & (uv[:, 0] <= box[2]) & (uv[:, 1] >= box[1]) & (uv[:, 1] <= box[3])
-        )
-        if mode == "paper":
-            _measure_as_paper(columns, k, box, uv[inside], xyz[inside], cloud)
-            continue
-        category = str(detections.category[k])
-        chosen = inside[select_cluster(xyz[inside], uv[inside], range_m[inside], box, category)]
+    wide = detections.box_px + (MARGIN if mode == "robust" else 0.0) * np.tile(
+        detections.box_px[:, 2:] - detections.box_px[:, :2], 2
+    ) * [-1, -1, 1, 0]
+    inside = [
+        np.flatnonzero((uv[:, 0] >= b[0]) & (uv[:, 0] <= b[2]) & (uv[:, 1] >= b[1]) & (uv[:, 1] <= b[3])) for b in wide
+    ]
+    if mode == "paper":
+        for k, box in enumerate(detections.box_px):
+            _measure_as_paper(columns, k, box, uv[inside[k]], xyz[inside[k]], cloud)
+        return Measurements(**columns)
+    options = []
+    for k, i in enumerate(inside):
+        found = candidates(xyz[i], uv[i], range_m[i], detections.box_px[k], str(detections.category[k]))
+        options.append([(i[points], score) for points, score in found])
+    for k, chosen in enumerate(choose(options, detections.box_px, len(index))):
+        box, category = detections.box_px[k], str(detections.category[k])
         if len(chosen) < LEAST_POINTS:
             continue
         members = index[chosen]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,60 +23,73 @@ LEAST_POINTS = 4
 MOST_SCORED_POINTS = 400
 # A cluster that fills less of the box than this is something in front of the object or behind it.
 LEAST_FILL = 0.12
+# Around a box, a margin of this share of its sides is searched for what goes on there, as dense as this at least.
+MARGIN, SAME_DENSITY = 0.15, 0.3
+# Boxes that overlap by more are two of one object; a cluster of which more is another box's is that one's.
+SAME_BOX, MOST_FOREIGN = 0.7, 0.5
 
 
 def clusters_of(xy: NDArray[np.floating[Any]], cell_m: float) -> NDArray[np.intp]:
     """Label (N,) the connected clusters of points (N, 2): neighbors are in touching cells, corners included."""
+    return _cluster(xy, cell_m)[0]
+
+
+def _cluster(xy: NDArray[np.floating[Any]], cell_m: float) -> tuple[NDArray[np.intp], Array, NDArray[np.intp]]:
+    """Labels (N,) of the clusters, and the grid of labels (one cell wider on each side, -1 where empty) with its corner."""
     from scipy.ndimage import label
 
-    cell = np.floor((xy - xy.min(axis=0)) / cell_m).astype(np.intp)
-    grid = np.zeros(cell.max(axis=0) + 1, dtype=bool)
+    corner = xy.min(axis=0) - cell_m
+    cell = np.floor((xy - corner) / cell_m).astype(np.intp)
+    grid = np.zeros(cell.max(axis=0) + 2, dtype=bool)
     grid[cell[:, 0], cell[:, 1]] = True
     labels, _ = label(grid, structure=np.ones((3, 3), dtype=int))
-    return np.asarray(labels[cell[:, 0], cell[:, 1]], dtype=np.intp) - 1
+    labels = np.asarray(labels, dtype=np.intp) - 1
+    return labels[cell[:, 0], cell[:, 1]], corner, labels
 
 
-def select_cluster(xyz: NDArray[np.float32], uv: Array, range_m: Array, box_px: Array, category: str) -> Index:
-    """Indices of the points that are the object, among the points (N, 3) inside its box; empty when none fits.
+def candidates(
+    xyz: NDArray[np.float32], uv: Array, range_m: Array, box_px: Array, category: str
+) -> list[tuple[Index, float]]:
+    """Clusters of the points (N, 3) inside a box that could be its object, as indices, each with a score in (0, 1].
 
     Parameters
     ----------
-    uv : (N, 2) pixels of the points
-    range_m : (N,) distance from the sensor
+    xyz, uv, range_m : (N, 3), (N, 2), (N,)
+        Points in and right around the box, their pixels, and their distances from the sensor.
     box_px : (4,) the detector's box
 
     Notes
     -----
     Every cluster of the points in the box spans a rectangle in the image. The object's own one fills the detector's box;
     what stands in front covers a part of it, and the background shows only around the object. Of clusters that fill the
-    box alike the nearer one is the object.
+    box alike the nearer one is the object. What goes on outside the box is a wall or a hedge.
     """
-    none = np.zeros(0, dtype=np.intp)
-    if len(xyz) < LEAST_POINTS:
-        return none
-    labels = clusters_of(xyz[:, :2], CELL_M[GROUP_OF[category]])
+    inside = np.flatnonzero(((uv >= box_px[:2]) & (uv <= box_px[2:])).all(axis=1))
+    if len(inside) < LEAST_POINTS:
+        return []
+    cell_m = CELL_M[GROUP_OF[category]]
+    labels, corner, grid = _cluster(xyz[inside, :2], cell_m)
+    structure = _goes_on(xyz, uv, box_px, labels, corner, grid, cell_m)
     order, count = np.argsort(labels, kind="stable"), np.bincount(labels)
     first = np.cumsum(count) - count
-    enough = count >= LEAST_POINTS
+    enough = (count >= LEAST_POINTS) & ~structure
     if not enough.any():
-        return none
-    span = np.concatenate(_ends(uv[order], first), axis=1)
-    middle_m = _medians(range_m, labels, first, count)
+        return []
+    span = np.concatenate(_ends(uv[inside[order]], first), axis=1)
+    middle_m = _medians(range_m[inside], labels, first, count)
     nearest_m = middle_m[enough].min()
-    low, high = _ends(xyz[order, :2], first)
-    unusual = enough & ((np.hypot(*(high - low).T) > LONGEST_M[category]) | (count > MOST_SCORED_POINTS))
-    members = {int(g): order[first[g] : first[g] + count[g]] for g in np.flatnonzero(unusual)}
-    for g, group in members.items():
-        members[g] = cropped = within_length(xyz, group, range_m, LONGEST_M[category])
+    low, high = _ends(xyz[inside[order], :2], first)
+    members = {int(g): inside[order[first[g] : first[g] + count[g]]] for g in np.flatnonzero(enough)}
+    for g in np.flatnonzero(
+        enough & ((np.hypot(*(high - low).T) > LONGEST_M[category]) | (count > MOST_SCORED_POINTS))
+    ):
+        members[g] = cropped = within_length(xyz, members[g], range_m, LONGEST_M[category])
         sample = uv[subsample(cropped, MOST_SCORED_POINTS)]
         span[g] = np.concatenate([sample.min(axis=0), sample.max(axis=0)])
         middle_m[g] = np.median(range_m[cropped])
     fill = box_iou(span, box_px)[:, 0]
-    score = np.where(enough & (fill >= LEAST_FILL), fill * np.sqrt(nearest_m / np.maximum(middle_m, 1e-3)), 0.0)
-    best = int(np.argmax(score))
-    if score[best] <= 0:
-        return none
-    return members[best] if best in members else order[first[best] : first[best] + count[best]]
+    score = fill * np.sqrt(nearest_m / np.maximum(middle_m, 1e-3))
+    return [(points, float(score[g])) for g, points in members.items() if fill[g] >= LEAST_FILL]
 
 
 def _ends(values: NDArray[Any], first: Index) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -87,6 +101,59 @@ def _medians(values: NDArray[Any], labels: Index, first: Index, count: Index) ->
     """Median (G,) of the values (N,) of every label; each label's rows begin at `first` once sorted."""
     ordered = values[np.lexsort((values, labels))]
     return np.asarray((ordered[first + (count - 1) // 2] + ordered[first + count // 2]) / 2, dtype=np.float64)
+
+
+def _goes_on(
+    xyz: NDArray[np.float32],
+    uv: Array,
+    box_px: Array,
+    labels: NDArray[np.intp],
+    corner: Array,
+    grid: NDArray[np.intp],
+    cell_m: float,
+) -> NDArray[np.bool_]:
+    """Which clusters (L,) go on beyond two of the left, the right and the upper side of the box, in its margin."""
+    from scipy.ndimage import grey_dilation
+
+    count = np.bincount(labels)
+    outside = np.flatnonzero(((uv < box_px[:2]) | (uv > box_px[2:])).any(axis=1) & (uv[:, 1] <= box_px[3]))
+    cell = np.floor((xyz[outside, :2] - corner) / cell_m).astype(np.intp)
+    on_grid = ((cell >= 0) & (cell < grid.shape)).all(axis=1)
+    outside, cell = outside[on_grid], cell[on_grid]
+    owner = grey_dilation(grid, size=(3, 3))[cell[:, 0], cell[:, 1]]
+    sides = np.zeros(len(count), dtype=np.int64)
+    u, v = uv[outside].T
+    within = (u >= box_px[0]) & (u <= box_px[2])
+    for rows in (u < box_px[0], u > box_px[2], within & (v < box_px[1])):
+        beyond = np.bincount(owner[rows & (owner >= 0)], minlength=len(count))
+        sides += beyond >= np.maximum(SAME_DENSITY * MARGIN * count, 3)
+    return sides >= 2
+
+
+def choose(options: Sequence[Sequence[tuple[Index, float]]], boxes_px: Array, count: int) -> list[Index]:
+    """One cluster for each of K boxes, from its candidates over `count` points; empty where none is left.
+
+    Notes
+    -----
+    Boxes choose their best candidates, the largest clusters first. Points that are another box's are no longer to be
+    had: what shows of a hidden object is the little around the one that hides it. Boxes that overlap almost wholly are
+    two of one object and share its points.
+    """
+    chosen: list[Index] = [np.zeros(0, dtype=np.intp)] * len(options)
+    overlap = box_iou(boxes_px, boxes_px) if len(options) else np.zeros((0, 0))
+    owner = np.full(count, -1)
+    open_rows = {k: sorted(c, key=lambda o: -o[1]) for k, c in enumerate(options) if c}
+    while open_rows:
+        k = max(open_rows, key=lambda r: (len(open_rows[r][0][0]), -r))
+        points, _ = open_rows[k].pop(0)
+        taken = owner[points]
+        foreign = (taken >= 0) & (overlap[k, np.maximum(taken, 0)] < SAME_BOX)
+        if foreign.mean() <= MOST_FOREIGN:
+            chosen[k] = points[~foreign]
+            owner[points[taken < 0]] = k
+        if len(chosen[k]) or not open_rows[k]:
+            del open_rows[k]
+    return chosen
 
 
 def within_length(xyz: NDArray[np.float32], group: Index, range_m: Array, longest_m: float) -> Index:
