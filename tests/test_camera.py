@@ -114,6 +114,8 @@ def test_the_fold_is_where_the_lens_first_turns_back(model: str, distortion: tup
         ((0.0, 0.0, 0.01, 0.02), np.inf),
         ((0.1, 0.1, 0.0, 0.0), np.inf),
         ((0.0, 0.0, 0.0, 0.0, 0.0, -0.25, 0.0, 0.0), 2.0),  # 1 - r^2 / 4 = 0, a pole
+        # r (1 - s / 5) / (1 + s / 10) with s = r^2 has the slope 1 - 0.7 s - 0.02 s^2 over a square.
+        ((-0.2, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0), np.sqrt((np.sqrt(0.57) - 0.7) / 0.04)),
     ],
 )
 def test_fold_radius_in_closed_form(distortion: tuple[float, ...], expected: float) -> None:
@@ -195,12 +197,10 @@ def test_depth_is_tested_before_it_divides() -> None:
 
 
 def test_the_borders_of_an_image_belong_to_it_on_one_side() -> None:
-    camera = make_camera("none", ())
-    corners = np.array([[0.0, 0.0], [1279.9, 719.9], [1280.0, 300.0], [300.0, 720.0], [-0.1, 300.0]])
-    rays = np.column_stack([undistort(camera, corners), np.ones(5)])
-    # Half a millionth of a pixel inwards, for rounding.
-    _, valid = project(camera, rays + np.array([1e-12, 1e-12, 0]))
-    assert valid.tolist() == [True, True, False, False, False]
+    camera = Camera("unit", 1280, 720, np.eye(3), "ego", np.eye(4))  # x, y are pixels, exactly
+    corners = [[0.0, 0.0], [1279.9, 719.9], [1280.0, 300.0], [300.0, 720.0], [-1e-9, 300.0], [300.0, -1e-9]]
+    _, valid = project(camera, np.column_stack([corners, np.ones(6)]))
+    assert valid.tolist() == [True, True, False, False, False, False]
 
 
 def test_single_precision_points_keep_a_hundredth_of_a_pixel() -> None:
