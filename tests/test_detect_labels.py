@@ -69,17 +69,9 @@ def test_boxes_out_of_sight_are_dropped(center: tuple[float, float, float], size
     assert len(detect(log_with((0, "car", center, size)))) == 0
 
 
-def test_hidden_box_is_dropped_and_half_hidden_one_stays() -> None:
-    truck = (0, "truck", (10.0, 0, 0), (4.0, 3.0, 3.0))
-    assert detect(log_with(truck, (0, "car", (40.0, 0, 0), CAR))).category.tolist() == ["truck"]
-    # The truck's rear at 8 m covers 1.5 m to each side there: 187.5 px. A car at 40 m, its middle at that line, is half free.
-    half = (0, "car", (42.0, 7.5, 0), CAR)
-    assert detect(log_with(truck, half)).category.tolist() == ["truck", "car"]
-
-
-def test_nearer_box_does_not_hide_because_it_comes_later_in_the_log() -> None:
+def test_hidden_box_stays_and_nearest_comes_first() -> None:
     rows = [(0, "car", (40.0, 0, 0), CAR), (0, "truck", (10.0, 0, 0), (4.0, 3.0, 3.0))]
-    assert detect(log_with(*rows)).category.tolist() == ["truck"]
+    assert detect(log_with(*rows)).category.tolist() == ["truck", "car"]
 
 
 def test_boxes_that_the_log_calls_invisible_are_left_out() -> None:

@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 
 from log2sim import registry
 from log2sim.detect.label_motion import Boxes, boxes_at, window_ns
-from log2sim.detect.projection import project_boxes, shown_share
+from log2sim.detect.projection import project_boxes
 from log2sim.errors import ConfigError
 from log2sim.geometry import inverse
 from log2sim.types import CATEGORIES, Camera, Detections, Frame, ImageLabels, Log
 
 MIN_SIDE_PX = 6.0
-MIN_SHOWN_SHARE = 0.0  # outlines of 3D boxes are larger than the objects and hide more than these
 STAMP_TOLERANCE_NS = 1_000_000  # labels and frames of one moment differ by rounding in some logs
 
 
@@ -86,13 +85,14 @@ def boxes_of_frame(labels: ImageLabels, t_ns: int) -> Detections:
 
 
 def project_labels(boxes: Boxes, camera: Camera, cam_T_map: NDArray[np.float64]) -> Detections:
-    """Boxes that a camera sees: in the picture, large enough, not hidden by nearer ones; nearest first."""
+    """Boxes in a camera's picture that are large enough, nearest first.
+
+    Hidden ones are among them: the roof LiDAR often sees what the camera does not, and points decide what is measured.
+    """
     seen = project_boxes(boxes.center_m, boxes.size_m, boxes.yaw_rad, camera, cam_T_map)
     box_px = seen.box_px
     large = seen.valid.copy()
     large[seen.valid] = np.all(box_px[seen.valid, 2:] - box_px[seen.valid, :2] >= MIN_SIDE_PX, axis=1)
-    # Small boxes hide others too, so the share is computed before they are dropped.
-    shown = shown_share(seen, camera)
-    kept = np.flatnonzero(large & (shown >= MIN_SHOWN_SHARE))
+    kept = np.flatnonzero(large)
     kept = kept[np.argsort(seen.range_m[kept], kind="stable")]
     return Detections(box_px[kept], np.ones(len(kept)), boxes.category[kept].astype("<U16"))

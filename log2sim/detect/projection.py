@@ -1,4 +1,4 @@
-"""Upright 3D boxes as a camera sees them: image boxes, outlines, and what of them nearer ones leave free."""
+"""Upright 3D boxes as a camera sees them: their boxes in the image and how far they are."""
 
 from __future__ import annotations
 
@@ -15,19 +15,17 @@ from log2sim.types import Camera
 FACES = ((0, 1, 2, 3), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
 NEAR_M = 2 * NEAREST_DEPTH_M
 VIEW_MARGIN = 1.3  # lenses that bend inwards see a little more than a pinhole of the same size
-MASK_SIDE_PX = 480
 
 
 @dataclass(frozen=True, eq=False)
 class Projected:
-    """Boxes in one image: `valid` (L,), `box_px` (L, 4) clipped to the image, `outline_px` convex, `range_m` (L,).
+    """Boxes in one image: `valid` (L,), `box_px` (L, 4) clipped to the image, `range_m` (L,).
 
-    `range_m` is the distance of the nearest corner; rows that are not valid hold NaN and an empty outline.
+    `range_m` is the distance of the nearest corner; rows that are not valid hold NaN.
     """
 
     valid: NDArray[np.bool_]
     box_px: Array
-    outline_px: list[Array]
     range_m: Array
 
 
@@ -40,7 +38,7 @@ def project_boxes(center_m: Array, size_m: Array, yaw_rad: Array, camera: Camera
     box around the camera is the vehicle that carries it and is not valid.
     """
     count = len(center_m)
-    box, outlines = np.full((count, 4), np.nan), [np.zeros((0, 2))] * count
+    box = np.full((count, 4), np.nan)
     valid, range_m = np.zeros(count, dtype=bool), np.full(count, np.nan)
     corners = box_corners(center_m, size_m, yaw_rad) if count else np.zeros((0, 8, 3))
     planes = view_planes(camera)
@@ -54,10 +52,10 @@ def project_boxes(center_m: Array, size_m: Array, yaw_rad: Array, camera: Camera
         uv = project(camera, vertices)[0] if len(vertices) else np.zeros((0, 2))
         uv = np.clip(uv[np.isfinite(uv).all(axis=1)], 0, limit)
         if len(uv) >= 3 and np.all(np.ptp(uv, axis=0) > 0):
-            valid[i], outlines[i] = True, uv
+            valid[i] = True
             box[i] = np.concatenate([uv.min(axis=0), uv.max(axis=0)])
             range_m[i] = np.linalg.norm(corners_cam, axis=1).min()
-    return Projected(valid, box, outlines, range_m)
+    return Projected(valid, box, range_m)
 
 
 def view_planes(camera: Camera) -> Array:
@@ -101,29 +99,3 @@ def clip_polygon(polygon: Array, planes: Array) -> Array:
                 kept.append(p + (q - p) * (s / (s - t)))
         polygon = np.array(kept).reshape(-1, 3)
     return polygon
-
-
-def shown_share(seen: Projected, camera: Camera) -> Array:
-    """Share (L,) in [0, 1] of each outline that nearer boxes leave free; 0 where a box is not valid.
-
-    Notes
-    -----
-    Outlines are painted from near to far on a coarse mask. A box full of windows hides as much as a wall: what
-    detectors still see through a car's windows does not count.
-    """
-    import cv2
-
-    scale = MASK_SIDE_PX / max(camera.width_px, camera.height_px)
-    shape = (round(camera.height_px * scale) + 1, round(camera.width_px * scale) + 1)
-    covered = np.zeros(shape, dtype=np.uint8)
-    share = np.zeros(len(seen.valid))
-    order = np.flatnonzero(seen.valid)
-    for i in order[np.argsort(seen.range_m[order], kind="stable")]:
-        outline = cv2.convexHull(np.rint(seen.outline_px[i] * scale).astype(np.int32))
-        u, v, w, h = cv2.boundingRect(outline)
-        own = np.zeros((h, w), dtype=np.uint8)
-        cv2.fillConvexPoly(own, outline - np.array([u, v], dtype=np.int32), 1)
-        window = covered[v : v + h, u : u + w]
-        share[i] = 1.0 - window[own > 0].mean()
-        window |= own
-    return share
