@@ -13,7 +13,7 @@ from log2sim.errors import LogError, RecordError
 from log2sim.geometry import apply, inverse, points_in_box, rotation_from_rpy, yaw_of
 from log2sim.logs import open_log
 from log2sim.logs.kitti import EGO_T_IMU, poses_from_oxts, spin_offset_ns
-from log2sim.logs.kitti_tracking import boxes_in_map
+from log2sim.logs.kitti_labels import boxes_in_map
 from log2sim.types import Log
 
 FRAMES = 4

@@ -9,25 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.errors import LogError
-from log2sim.geometry import Array, PoseTrack, apply, transform, wrap_angle
+from log2sim.geometry import PoseTrack, transform
 from log2sim.logs import kitti
 from log2sim.logs.images import first_image_size
-from log2sim.types import ImageLabels, Labels, Log, Stream
+from log2sim.logs.kitti_labels import DriveLabels, read_labels
+from log2sim.types import Log, Stream
 
 PERIOD_NS = 100_000_000
 CAMERA_NUMBERS = (2, 3)
-CATEGORY_OF = {
-    "Car": "car",
-    "Van": "car",
-    "Truck": "truck",
-    "Pedestrian": "pedestrian",
-    "Person": "pedestrian",
-    "Person_sitting": "pedestrian",
-    "Cyclist": "cyclist",
-    "Tram": "other",
-    "Misc": "other",
-}
-LABEL_FIELDS = 17
 NO_STAMPS = "this layout has no stamps: 10 Hz is assumed for all streams, frame 0 at stamp 0"
 
 
@@ -82,7 +71,7 @@ class _Sequence:
             raise LogError(f"{oxts_file}: no records; a stream needs at least one")
         poses, map_frame = kitti.poses_from_oxts(rows)
         track = PoseTrack(np.arange(len(rows), dtype=np.int64) * PERIOD_NS, poses)
-        labels, image_labels, text = self._labels(rig, track)
+        labels = self._labels(rig, track)
         records = sorted(p for folder in streams for p in (self.base / folder / self.name).iterdir())
         calibration = kitti.read_text(self.base / "calib" / f"{self.name}.txt")
         return Log(
@@ -94,10 +83,11 @@ class _Sequence:
             ego=track,
             ego_vehicle=kitti.PASSAT,
             map=map_frame,
-            labels=labels,
-            image_labels=image_labels,
+            labels=labels.boxes_3d,
+            image_labels=labels.boxes_2d,
+            ignored_regions=labels.ignored,
             reference_camera="image_02",
-            digest=kitti.digest_of([calibration, oxts, text], records),
+            digest=kitti.digest_of([calibration, oxts, labels.text], records),
             notes=(NO_STAMPS,),
         )
 
@@ -125,64 +115,9 @@ class _Sequence:
             )
         return files
 
-    def _labels(self, rig: kitti.Rig, track: PoseTrack) -> tuple[Labels | None, dict[str, ImageLabels], str]:
+    def _labels(self, rig: kitti.Rig, track: PoseTrack) -> DriveLabels:
         path = self.base / "label_02" / f"{self.name}.txt"
-        if not path.is_file():
-            return None, {}, ""
-        text = kitti.read_text(path)
-        frame, track_id, category, values = parse_labels(text, path)
-        t_ns = frame * PERIOD_NS
-        image_labels = ImageLabels(t_ns, values[:, 3:7], category)
-        map_T_ego, known = track.at(t_ns)
-        center, size, yaw = boxes_in_map(map_T_ego @ rig.ego_T_rect, values[:, 7:14])
-        k = known
-        labels = Labels(t_ns[k], track_id[k], category[k], center[k], size[k], yaw[k])
-        return labels, {"image_02": image_labels}, text
-
-
-def parse_labels(text: str, path: Path) -> tuple[NDArray[np.int64], NDArray[np.str_], NDArray[np.str_], Array]:
-    """Frames (L,), track ids (L,), categories (L,) and the 14 numbers (L, 14) from truncation on; without DontCare."""
-    frames, ids, categories, values = [], [], [], []
-    for k, line in enumerate(text.splitlines(), start=1):
-        words = line.split()
-        if not words:
-            continue
-        if len(words) < LABEL_FIELDS or (words[2] not in CATEGORY_OF and words[2] != "DontCare"):
-            known = ", ".join([*CATEGORY_OF, "DontCare"])
-            raise LogError(f"{path}, line {k}: expected frame, track id, type ({known}) and {LABEL_FIELDS - 3} numbers")
-        if words[2] == "DontCare":
-            continue
-        try:
-            row = [float(word) for word in words[3:LABEL_FIELDS]]
-            frames.append(int(words[0]))
-        except ValueError:
-            raise LogError(f"{path}, line {k}: expected numbers after the type, found '{line[:60]}'") from None
-        if not np.isfinite(row).all():
-            raise LogError(f"{path}, line {k}: a number is not finite")
-        ids.append(words[1])
-        categories.append(CATEGORY_OF[words[2]])
-        values.append(row)
-    table = np.array(values).reshape(-1, LABEL_FIELDS - 3)
-    return np.array(frames, dtype=np.int64), np.array(ids, dtype=np.str_), np.array(categories, dtype=np.str_), table
-
-
-def boxes_in_map(map_T_rect: Array, values: Array) -> tuple[Array, Array, Array]:
-    """Box centers (L, 3), sizes (L, 3) and yaws (L,) in the map.
-
-    Parameters
-    ----------
-    map_T_rect : (L, 4, 4)
-        Pose of the rectified camera 0, whose frame the labels are in, at the stamp of each label.
-    values : (L, 7)
-        Height, width, length, then x, y, z of the bottom's center, then the rotation about the camera's y axis.
-    """
-    height, width, length = values[:, 0], values[:, 1], values[:, 2]
-    center = values[:, 3:6] - np.stack([np.zeros_like(height), height / 2, np.zeros_like(height)], axis=1)
-    turn = values[:, 6]
-    ahead = np.stack([np.cos(turn), np.zeros_like(turn), -np.sin(turn)], axis=1)
-    heading = np.einsum("lij,lj->li", map_T_rect[:, :3, :3], ahead)
-    yaw = wrap_angle(np.arctan2(heading[:, 1], heading[:, 0]))
-    return apply(map_T_rect, center), np.stack([length, width, height], axis=1), yaw
+        return read_labels(path, rig, track, lambda frame: frame * PERIOD_NS) if path.is_file() else DriveLabels()
 
 
 def _nominal(files: dict[int, Path]) -> NDArray[np.int64]:

@@ -58,6 +58,20 @@ def false_rows(other: Side, false: Mask, hit: Mask) -> list[dict[str, Any]]:
     ]
 
 
+def ignored_rows(other: Side, ignored: Mask) -> list[dict[str, Any]]:
+    """One row per reconstructed agent that is ignored at some tick."""
+    return [
+        {
+            "id": other.ids[j],
+            "category": str(other.category[j]),
+            "ignored_ticks": int(ignored[j].sum()),
+            "ticks": int(other.there[j].sum()),
+            "mean_range_m": float(other.range_m[j, ignored[j]].mean()),
+        }
+        for j in np.flatnonzero(ignored.any(1))
+    ]
+
+
 def rounded_tree(value: Any) -> Any:
     """A document with its floats rounded to micrometers and the like; what is not finite becomes None."""
     if isinstance(value, dict):

@@ -22,7 +22,7 @@ TRUTH_MARGIN_S = 0.15
 class Side:
     """States of agents as columns: A agents, T ticks; NaN where an agent is not there.
 
-    `xy_m` (A, T, 2) box centers in the scenario's map frame, `yaw_rad` and `speed_mps` (A, T), `size_m` (A, 3),
+    `xy_m` (A, T, 2) and `z_m` (A, T) box centers in the scenario's map frame, `yaw_rad` and `speed_mps` (A, T), `size_m` (A, 3),
     `range_m` (A, T) from the ego's center (infinite without an ego), `visible` (A, T) False where truth must not count.
     """
 
@@ -31,6 +31,7 @@ class Side:
     group: NDArray[np.str_]
     size_m: Array
     xy_m: Array
+    z_m: Array
     yaw_rad: Array
     speed_mps: Array
     range_m: Array
@@ -89,7 +90,8 @@ def reconstructed_side(agents: tuple[Agent, ...], ticks_s: Array, ego_xy: Array 
     xy = _stack([np.stack([s.x_m, s.y_m], -1) for s in sampled], (len(ticks_s), 2))
     yaw = _stack([s.yaw_rad for s in sampled], (len(ticks_s),))
     speed = _stack([s.speed_mps for s in sampled], (len(ticks_s),))
-    return _side(agents, xy, yaw, speed, np.isfinite(yaw), ego_xy)
+    z = _stack([s.z_m for s in sampled], (len(ticks_s),))
+    return _side(agents, xy, z, yaw, speed, np.isfinite(yaw), ego_xy)
 
 
 def truth_side(agents: tuple[Agent, ...], ticks_s: Array, shift_m: Array, ego_xy: Array | None) -> Side:
@@ -102,13 +104,14 @@ def truth_side(agents: tuple[Agent, ...], ticks_s: Array, shift_m: Array, ego_xy
     """
     columns = [_sample_truth(a, ticks_s) for a in agents]
     xy = _stack([c[0] for c in columns], (len(ticks_s), 2)) + shift_m[:2]
-    yaw = _stack([c[1] for c in columns], (len(ticks_s),))
-    speed = _stack([c[2] for c in columns], (len(ticks_s),))
-    visible = _stack([c[3].astype(np.float64) for c in columns], (len(ticks_s),)) > 0
-    return _side(agents, xy, yaw, speed, visible, ego_xy)
+    z = _stack([c[1] for c in columns], (len(ticks_s),)) + shift_m[2]
+    yaw = _stack([c[2] for c in columns], (len(ticks_s),))
+    speed = _stack([c[3] for c in columns], (len(ticks_s),))
+    visible = _stack([c[4].astype(np.float64) for c in columns], (len(ticks_s),)) > 0
+    return _side(agents, xy, z, yaw, speed, visible, ego_xy)
 
 
-def _sample_truth(agent: Agent, t: Array) -> tuple[Array, Array, Array, Mask]:
+def _sample_truth(agent: Agent, t: Array) -> tuple[Array, Array, Array, Array, Mask]:
     w = agent.waypoints
     s = agent.at(np.clip(t, w.t_s[0], w.t_s[-1]))
     outside = t - np.clip(t, w.t_s[0], w.t_s[-1])
@@ -121,10 +124,12 @@ def _sample_truth(agent: Agent, t: Array) -> tuple[Array, Array, Array, Mask]:
     max_gap_s = np.inf if agent.static and len(w) == 2 else MAX_TRUTH_GAP_S
     labeled = agent.at(t, max_gap_s=float(max_gap_s)).valid
     nan = np.where(there, 0.0, np.nan)
-    return xy + nan[:, None], s.yaw_rad + nan, s.speed_mps + nan, seen & labeled
+    return xy + nan[:, None], s.z_m + nan, s.yaw_rad + nan, s.speed_mps + nan, seen & labeled
 
 
-def _side(agents: tuple[Agent, ...], xy: Array, yaw: Array, speed: Array, visible: Mask, ego_xy: Array | None) -> Side:
+def _side(
+    agents: tuple[Agent, ...], xy: Array, z: Array, yaw: Array, speed: Array, visible: Mask, ego_xy: Array | None
+) -> Side:
     category = np.array([a.category for a in agents], dtype="<U16")
     if ego_xy is None:
         range_m = np.where(np.isfinite(yaw), np.inf, np.nan)
@@ -136,6 +141,7 @@ def _side(agents: tuple[Agent, ...], xy: Array, yaw: Array, speed: Array, visibl
         group=np.array([GROUP_OF.get(c, "other") for c in category], dtype="<U16"),
         size_m=np.array([a.size_m for a in agents], dtype=np.float64).reshape(-1, 3),
         xy_m=xy,
+        z_m=z,
         yaw_rad=yaw,
         speed_mps=speed,
         range_m=range_m,

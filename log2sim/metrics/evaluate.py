@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.metrics.agents import agent_rows, false_rows, rounded_tree
+from log2sim.metrics.agents import agent_rows, false_rows, ignored_rows, rounded_tree
 from log2sim.metrics.align import (
-    MAX_TRUTH_GAP_S,
     Side,
     evaluation_ticks_s,
     map_shift_m,
@@ -20,12 +19,15 @@ from log2sim.metrics.align import (
     truth_side,
 )
 from log2sim.metrics.clear import associate, mota, switches
+from log2sim.metrics.coverage import unlabeled_ticks
 from log2sim.metrics.hota import hota
-from log2sim.metrics.pairs import GATE_M, GATE_PER_LENGTH, Index, Mask, Pairs, gate_m, near_pairs
-from log2sim.metrics.states import WALKING_MPS, median, root_mean_square, state_errors, summarize
+from log2sim.metrics.pairs import Index, Mask, Pairs, gate_m, near_pairs
+from log2sim.metrics.rules import counting_rules, matching_rules
+from log2sim.metrics.states import median, root_mean_square, state_errors, summarize
 from log2sim.registry import nearest
 from log2sim.scenario import Scenario
 from log2sim.types import CATEGORIES, GROUPS
+from log2sim.unlabeled import Unlabeled
 
 VERSION = 1
 MIN_COUNTED_S = 1.0
@@ -34,7 +36,7 @@ RANGES_M = ((0.0, 20.0), (20.0, 40.0), (40.0, 60.0))
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """Both sides and who is whom: `match` (A, T), `counted`, `switched` (A, T), `false` (B, T) bool."""
+    """Both sides and who is whom: `match` (A, T), `counted`, `switched` (A, T), `false`, `ignored` (B, T) bool."""
 
     truth: Side
     other: Side
@@ -43,6 +45,7 @@ class Compared:
     counted: Mask
     switched: Mask
     false: Mask
+    ignored: Mask
 
 
 def evaluate(
@@ -87,6 +90,7 @@ def evaluate(
     ours = reconstructed_side(scenario.others, ticks_s, ego_xy)
     tick_s = float(np.median(np.diff(ticks_s))) if len(ticks_s) > 1 else 0.0
     compared = _compare(true, ours, tick_s, max_range_m, selected)
+    compared = _without_unlabeled(compared, truth.unlabeled, truth_ticks_s, shift_m)
     everywhere = np.ones_like(compared.counted), np.ones_like(compared.false)
     result = {
         "metrics_version": VERSION,
@@ -100,10 +104,11 @@ def evaluate(
         "by_range": None if ego_xy is None else _by_range(compared),
         "by_category": _by_category(compared),
         "ego": _ego_figures(scenario, truth, ticks_s, truth_ticks_s, shift_m),
-        "matching": _matching_rules(),
-        "counting": _counting_rules(truth),
+        "matching": matching_rules(),
+        "counting": counting_rules(truth, MIN_COUNTED_S),
         "agents": agent_rows(true, ours, compared.match, compared.counted, compared.switched),
         "false_agents": false_rows(ours, compared.false, _hit(compared, compared.counted)),
+        "ignored_agents": ignored_rows(ours, compared.ignored),
     }
     return rounded_tree(result)
 
@@ -119,7 +124,17 @@ def _compare(truth: Side, other: Side, tick_s: float, max_range_m: float | None,
     counted &= enough[:, None]
     false = other.there & ~found.used & ~found.absorbed & _within(other, max_range_m)
     false &= np.isin(other.category, list(selected))[:, None]
-    return Compared(truth, other, pairs, found.match, counted, switches(found.match, counted), false)
+    switched = switches(found.match, counted)
+    return Compared(truth, other, pairs, found.match, counted, switched, false, np.zeros_like(false))
+
+
+def _without_unlabeled(c: Compared, unlabeled: Unlabeled | None, truth_ticks_s: Array, shift_m: Array) -> Compared:
+    """Move false ticks to the ignored ones where the labels could not have told."""
+    if unlabeled is None:
+        return c
+    center = np.concatenate([c.other.xy_m, c.other.z_m[..., None]], axis=-1) - shift_m
+    ignored = unlabeled_ticks(unlabeled, truth_ticks_s, center, c.other.size_m, c.other.yaw_rad, c.false)
+    return replace(c, false=c.false & ~ignored, ignored=ignored)
 
 
 def _within(side: Side, max_range_m: float | None) -> Mask:
@@ -161,6 +176,7 @@ def _figures(c: Compared, truth_selected: Mask, other_selected: Mask) -> dict[st
             "matched_ticks": matched,
             "missed_ticks": truth_ticks - matched,
             "false_ticks": wrong,
+            "ignored_ticks": int((c.ignored & other_selected).sum()),
             "reconstructed_agents": int(ours.sum()),
             "false_agents": int((ours & ~real).sum()),
         },
@@ -245,32 +261,4 @@ def _ego_figures(
         "position_rmse_m": root_mean_square(errors.position_m),
         "yaw_median_deg": median(np.degrees(errors.yaw_rad)),
         "speed_rmse_mps": root_mean_square(errors.speed_mps),
-    }
-
-
-def _matching_rules() -> dict[str, Any]:
-    """How agents were matched, for the reader of the file."""
-    return {
-        "gate_m": GATE_M,
-        "gate_per_length": GATE_PER_LENGTH,
-        "groups": {name: list(members) for name, members in GROUPS.items()},
-        "rule": "one to one per tick by 2D distance of box centers within max(gate_m, gate_per_length x true length); "
-        "last match kept while within the gate, then most pairs with least total distance; "
-        "categories of one group match freely, across groups a match is neither found nor false",
-        "similarity": "HOTA: 1 - distance / gate, mean over thresholds 0.05 to 0.95",
-        "yaw": f"vehicles, two-wheelers and pedestrians of at least {WALKING_MPS:g} m/s; flipped: more than 90 degrees",
-        "speed": "signed along the heading; along the true heading where the box is flipped",
-        "size": "median over truth agents of the mean absolute error of length, width and height",
-    }
-
-
-def _counting_rules(truth: Scenario) -> dict[str, Any]:
-    """What was counted, for the reader of the file."""
-    return {
-        "min_s": MIN_COUNTED_S,
-        "max_truth_gap_s": MAX_TRUTH_GAP_S,
-        "rule": "a truth agent counts at the ticks at which it is visible, within range and selected, "
-        "when these make up at least min_s; a reconstructed agent is false at the ticks at which no labeled object, "
-        "visible or not, counted or not, matches it",
-        "visible": truth.provenance.get("visible", "as the truth file states; all where it states nothing"),
     }

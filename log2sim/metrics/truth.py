@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.geometry import NS_PER_S, Array, apply, inverse, wrap_angle, yaw_of
+from log2sim.metrics.label_views import unlabeled_of
 from log2sim.metrics.visible import PointGrid, image_shares
 from log2sim.registry import nearest
 from log2sim.scenario import Agent, Scenario, Waypoints
@@ -81,6 +82,7 @@ def truth_from_log(log: Log, *, cameras: Sequence[str] | None = None, progress: 
         agents=tuple(agents),
         map=log.map,
         provenance=_provenance(log, used, labels, unreadable),
+        unlabeled=unlabeled_of(log, t0_ns),
     )
 
 

@@ -64,11 +64,40 @@ def image_shares(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Arra
     return shares
 
 
-def _samples(outline: Array) -> Array:
-    """Points (S, 2) of a regular grid inside a convex outline (K, 2), counter-clockwise."""
+def image_samples(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Array, yaw_rad: Array) -> list[Array]:
+    """Pixels (S, 2) spread evenly over what the image shows of the outline of each box (M); none where it shows nothing.
+
+    Notes
+    -----
+    As in `image_shares`, but only samples near the view are drawn: a box beside the camera has an outline on the plane at
+    depth 1 so wide that a grid over all of it would step over the image.
+    """
+    corners = apply(cam_T_map, box_corners(center_m, size_m, yaw_rad).reshape(-1, 3)).reshape(-1, 8, 3)
+    low, high = _view(camera)
+    found = []
+    for box in corners:
+        outline = _front_outline(box) if np.any(box[:, 2] > NEAREST_DEPTH_M) else np.zeros((0, 2))
+        rays = _samples(convex_hull(outline), low, high)
+        uv, inside = project(camera, np.column_stack([rays, np.ones(len(rays))]))
+        found.append(uv[inside])
+    return found
+
+
+def _view(camera: Camera) -> tuple[Array, Array]:
+    """Corners (2,), (2,) of a part of the plane at depth 1 that holds the view: the view itself without a lens."""
+    size, focal = np.array([camera.width_px, camera.height_px]), np.diag(camera.K)[:2]
+    low, high = -camera.K[:2, 2] / focal, (size - camera.K[:2, 2]) / focal
+    # No lens that this plane can hold shows more than three times what its focal length says.
+    return (low, high) if camera.distortion_model == "none" else (3 * low, 3 * high)
+
+
+def _samples(outline: Array, lowest: Array | float = -np.inf, highest: Array | float = np.inf) -> Array:
+    """Points (S, 2) of a regular grid inside a convex outline (K, 2), counter-clockwise, and between two corners (2,)."""
     if len(outline) < 3:
         return np.zeros((0, 2))
-    low, high = outline.min(axis=0), outline.max(axis=0)
+    low, high = np.maximum(outline.min(axis=0), lowest), np.minimum(outline.max(axis=0), highest)
+    if np.any(low >= high):
+        return np.zeros((0, 2))
     steps = (np.arange(SAMPLES_PER_SIDE) + 0.5) / SAMPLES_PER_SIDE
     x, y = np.meshgrid(*(low + steps[:, None] * (high - low)).T)
     points = np.stack([x.ravel(), y.ravel()], -1)

@@ -1,0 +1,125 @@
+"""The labels of the KITTI tracking benchmark: boxes of what camera 2 sees, and the parts of its images without labels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.errors import LogError
+from log2sim.geometry import Array, PoseTrack, apply, wrap_angle
+from log2sim.logs import kitti
+from log2sim.types import ImageLabels, ImageRegions, Labels
+
+CATEGORY_OF = {
+    "Car": "car",
+    "Van": "car",
+    "Truck": "truck",
+    "Pedestrian": "pedestrian",
+    "Person": "pedestrian",
+    "Person_sitting": "pedestrian",
+    "Cyclist": "cyclist",
+    "Tram": "other",
+    "Misc": "other",
+}
+NOT_LABELED = "DontCare"
+LABEL_FIELDS = 17
+CAMERA = "image_02"
+
+
+@dataclass(frozen=True, eq=False)
+class DriveLabels:
+    """What a label file says; nothing without one. `text` is the file."""
+
+    boxes_3d: Labels | None = None
+    boxes_2d: Mapping[str, ImageLabels] = field(default_factory=dict)
+    ignored: Mapping[str, ImageRegions] = field(default_factory=dict)
+    text: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Lines (L,) of a label file: `frame`, `track_id`, `type` and the 14 numbers `values` (L, 14) from truncation on."""
+
+    frame: NDArray[np.int64]
+    track_id: NDArray[np.str_]
+    type: NDArray[np.str_]
+    values: Array
+
+    def take(self, index: NDArray[np.bool_]) -> Rows:
+        """The rows of a mask."""
+        return Rows(self.frame[index], self.track_id[index], self.type[index], self.values[index])
+
+
+def read_labels(
+    path: Path, rig: kitti.Rig, track: PoseTrack, stamp_of: Callable[[NDArray[np.int64]], NDArray[np.int64]]
+) -> DriveLabels:
+    """Read a label file; `stamp_of` gives the stamps (L,) of frame numbers (L,).
+
+    Notes
+    -----
+    Only what camera 2 sees has labels. There, parts of the image with objects too far, too hidden or too crowded to be
+    labeled are marked by boxes of the type DontCare.
+    """
+    text = kitti.read_text(path)
+    rows = parse_labels(text, path)
+    apart = rows.type == NOT_LABELED
+    empty = rows.take(apart)
+    rows = rows.take(~apart)
+    t_ns = stamp_of(rows.frame)
+    category = np.array([CATEGORY_OF[name] for name in rows.type.tolist()], dtype="<U16")
+    map_T_ego, known = track.at(t_ns)
+    center, size, yaw = boxes_in_map(map_T_ego @ rig.ego_T_rect, rows.values[:, 7:14])
+    k = known
+    return DriveLabels(
+        Labels(t_ns[k], rows.track_id[k], category[k], center[k], size[k], yaw[k], cameras=(CAMERA,)),
+        {CAMERA: ImageLabels(t_ns, rows.values[:, 3:7], category)},
+        {CAMERA: ImageRegions(stamp_of(empty.frame), empty.values[:, 3:7])},
+        text,
+    )
+
+
+def parse_labels(text: str, path: Path) -> Rows:
+    """The lines of a label file, or a `LogError` that names the one that is wrong."""
+    frames, ids, types, values = [], [], [], []
+    for k, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if not words:
+            continue
+        if len(words) < LABEL_FIELDS or (words[2] not in CATEGORY_OF and words[2] != NOT_LABELED):
+            known = ", ".join([*CATEGORY_OF, NOT_LABELED])
+            raise LogError(f"{path}, line {k}: expected frame, track id, type ({known}) and {LABEL_FIELDS - 3} numbers")
+        try:
+            row = [float(word) for word in words[3:LABEL_FIELDS]]
+            frames.append(int(words[0]))
+        except ValueError:
+            raise LogError(f"{path}, line {k}: expected numbers after the type, found '{line[:60]}'") from None
+        if not np.isfinite(row).all():
+            raise LogError(f"{path}, line {k}: a number is not finite")
+        ids.append(words[1])
+        types.append(words[2])
+        values.append(row)
+    table = np.array(values, dtype=np.float64).reshape(-1, LABEL_FIELDS - 3)
+    return Rows(np.array(frames, dtype=np.int64), np.array(ids, dtype="<U16"), np.array(types, dtype="<U16"), table)
+
+
+def boxes_in_map(map_T_rect: Array, values: Array) -> tuple[Array, Array, Array]:
+    """Box centers (L, 3), sizes (L, 3) and yaws (L,) in the map.
+
+    Parameters
+    ----------
+    map_T_rect : (L, 4, 4)
+        Pose of the rectified camera 0, whose frame the labels are in, at the stamp of each label.
+    values : (L, 7)
+        Height, width, length, then x, y, z of the bottom's center, then the rotation about the camera's y axis.
+    """
+    height, width, length = values[:, 0], values[:, 1], values[:, 2]
+    center = values[:, 3:6] - np.stack([np.zeros_like(height), height / 2, np.zeros_like(height)], axis=1)
+    turn = values[:, 6]
+    ahead = np.stack([np.cos(turn), np.zeros_like(turn), -np.sin(turn)], axis=1)
+    heading = np.einsum("lij,lj->li", map_T_rect[:, :3, :3], ahead)
+    yaw = wrap_angle(np.arctan2(heading[:, 1], heading[:, 0]))
+    return apply(map_T_rect, center), np.stack([length, width, height], axis=1), yaw
