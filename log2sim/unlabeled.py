@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.errors import ScenarioError
-from log2sim.geometry import Array, quaternion_from_rotation, rotation_from_quaternion, transform
+from log2sim.geometry import Array, rotation_from_quaternion, transform
 from log2sim.types import Camera
 
 QUATERNION_TOLERANCE = 1e-3
@@ -20,15 +20,22 @@ QUATERNION_TOLERANCE = 1e-3
 class LabelView:
     """The images of one camera in which objects were labeled.
 
-    `t_s` (F,) strictly increasing stamps, seconds of the truth, `map_T_cam` (F, 4, 4) at them; the mount of `camera`
-    means nothing here. `region_frame` (R,) int64 and `region_px` (R, 4) u0, v0, u1, v1: parts without labels.
+    `t_s` (F,) strictly increasing stamps, seconds of the truth; `translation_m` (F, 3) and `rotation_wxyz` (F, 4) of the
+    camera in the map at them; the mount of `camera` means nothing here. `region_frame` (R,) int64 and `region_px` (R, 4)
+    u0, v0, u1, v1: parts without labels.
     """
 
     camera: Camera
     t_s: Array
-    map_T_cam: Array
+    translation_m: Array
+    rotation_wxyz: Array
     region_frame: NDArray[np.int64]
     region_px: Array
+
+    @property
+    def map_T_cam(self) -> Array:
+        """Poses (F, 4, 4) of the camera."""
+        return transform(rotation_from_quaternion(self.rotation_wxyz), self.translation_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +71,8 @@ def _view_to_dict(view: LabelView) -> dict[str, Any]:
             "distortion": [float(d) for d in c.distortion],
         },
         "t_s": view.t_s.tolist(),
-        "translation_m": view.map_T_cam[:, :3, 3].tolist(),
-        "rotation_wxyz": quaternion_from_rotation(view.map_T_cam[:, :3, :3]).tolist(),
+        "translation_m": view.translation_m.tolist(),
+        "rotation_wxyz": view.rotation_wxyz.tolist(),
         "region_frame": view.region_frame.tolist(),
         "region_px": view.region_px.tolist(),
     }
@@ -91,4 +98,4 @@ def _view_from_dict(entry: Mapping[str, Any], where: str) -> LabelView:
         raise ScenarioError(f"{where}: t_s does not increase at index {int(np.argmax(np.diff(t_s) <= 0)) + 1}")
     if np.any(np.abs(np.linalg.norm(q, axis=1) - 1) > QUATERNION_TOLERANCE):
         raise ScenarioError(f"{where}: rotation_wxyz must hold unit quaternions, scalar first")
-    return LabelView(camera, t_s, transform(rotation_from_quaternion(q), position), frame, box)
+    return LabelView(camera, t_s, position, q, frame, box)

@@ -1,4 +1,8 @@
-"""KITTI raw drives (synchronized and rectified): DATE/DATE_drive_NNNN_sync with the calibration in DATE."""
+"""KITTI raw drives (synchronized and rectified): DATE/DATE_drive_NNNN_sync with the calibration in DATE.
+
+A file label_02.txt in the drive holds its labels in the format of the tracking benchmark, whose sequences are such drives
+frame by frame (sequence 0000 is drive 2011_09_26_0005).
+"""
 
 from __future__ import annotations
 
@@ -11,12 +15,15 @@ from numpy.typing import NDArray
 from log2sim.errors import LogError
 from log2sim.geometry import Array, PoseTrack, transform
 from log2sim.logs import kitti
+from log2sim.logs.kitti_labels import CAMERA as LABELED_CAMERA
+from log2sim.logs.kitti_labels import DriveLabels, read_labels
 from log2sim.logs.table import in_order
 from log2sim.types import Camera, Log, Stream
 
 CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt")
 REFERENCE_CAMERAS = ("image_02", "image_00", "image_03", "image_01")
 MARK = "*_drive_*_sync"
+LABELS = "label_02.txt"
 _NOT_A_TIME = np.iinfo(np.int64).min
 
 
@@ -63,6 +70,8 @@ class _Drive:
         ego_t_ns, poses, map_frame = self._poses(notes)
         if not streams:
             raise LogError(f"{self.path}: neither images (image_00 to image_03) nor velodyne_points in it")
+        track = PoseTrack(ego_t_ns, poses)
+        labels = self._labels(rig, track)
         texts = [kitti.read_text(self.path.parent / name) for name in CALIBRATION]
         return Log(
             name=self.path.name,
@@ -70,11 +79,14 @@ class _Drive:
             cameras=cameras,
             lidars={"velodyne": rig.lidar()} if "velodyne" in streams else {},
             streams=streams,
-            ego=PoseTrack(ego_t_ns, poses),
+            ego=track,
             ego_vehicle=kitti.PASSAT,
             map=map_frame,
+            labels=labels.boxes_3d,
+            image_labels=labels.boxes_2d,
+            ignored_regions=labels.ignored,
             reference_camera=next((c for c in REFERENCE_CAMERAS if c in cameras), None),
-            digest=kitti.digest_of(texts, sorted(self.path.glob("*/data/*"))),
+            digest=kitti.digest_of([*texts, labels.text], sorted(self.path.glob("*/data/*"))),
             notes=tuple(notes),
         )
 
@@ -118,6 +130,22 @@ class _Drive:
             rows.append(record[0])
         poses, map_frame = kitti.poses_from_oxts(np.array(rows))
         return t_ns, poses, map_frame
+
+    def _labels(self, rig: kitti.Rig, track: PoseTrack) -> DriveLabels:
+        path, times = self.path / LABELS, self.path / LABELED_CAMERA / "timestamps.txt"
+        if not path.is_file():
+            return DriveLabels()
+        stamps = _stamps(times)
+
+        def stamp_of(frame: NDArray[np.int64]) -> NDArray[np.int64]:
+            strange = frame[(frame < 0) | (frame >= len(stamps))]
+            if len(strange):
+                raise LogError(
+                    f"{path}: frame {strange[0]}, but {times} has {len(stamps)} lines; is it of another drive?"
+                )
+            return stamps[frame]
+
+        return read_labels(path, rig, track, stamp_of)
 
     def _records(
         self, name: str, suffixes: tuple[str, ...], notes: list[str]

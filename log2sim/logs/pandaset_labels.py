@@ -80,7 +80,8 @@ def read_labels(
     if columns is None:
         raise LogError(f"{next(iter(files.values())).parent}: no cuboids of the sweeps of this log")
     keep = _increasing(columns[0], columns[1])
-    return Labels(*(c[keep] for c in columns))
+    t_ns, track_id, category, center, size, yaw = (c[keep] for c in columns)
+    return Labels(t_ns, track_id, category, center, size, yaw)
 
 
 def azimuth_offset_ns(xyz_lidar: Array) -> NDArray[np.int64]:

@@ -17,9 +17,16 @@ from log2sim.errors import LogError
 from log2sim.registry import nearest
 
 TABLE_LIMIT_BYTES = 256 * 1024 * 1024
+# No coordinate on Earth, in any projection, is near this, and no square of it overflows.
+LARGEST_NUMBER = 1e8
 
 _DTYPE = {"int": np.int64, "float": np.float64}
-_EXPECTED = {"int": "a whole number", "float": "a finite number", "bool": "0, 1, true or false", "str": "text"}
+_EXPECTED = {
+    "int": "a whole number",
+    "float": f"a finite number of at most {LARGEST_NUMBER:g} in size",
+    "bool": "0, 1, true or false",
+    "str": "text",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +113,7 @@ def _parse(path: Path, line: NDArray[np.int64], name: str, text: list[str], kind
     else:
         try:
             values = np.array(text, dtype=np.str_).astype(_DTYPE[kind])
-            good = list(np.isfinite(values))
+            good = list(_in_reach(values))
         except (ValueError, OverflowError):
             values, good = np.zeros(0), [_is(t, kind) for t in text]
     if not all(good):
@@ -117,9 +124,14 @@ def _parse(path: Path, line: NDArray[np.int64], name: str, text: list[str], kind
 
 def _is(text: str, kind: str) -> bool:
     try:
-        return bool(np.isfinite(np.array([text]).astype(_DTYPE[kind])[0]))
+        return bool(_in_reach(np.array([text]).astype(_DTYPE[kind]))[0])
     except (ValueError, OverflowError):
         return False
+
+
+def _in_reach(values: NDArray[Any]) -> NDArray[np.bool_]:
+    """Which numbers are finite and, unless whole (stamps), not beyond all sense."""
+    return np.isfinite(values) & ((np.abs(values) <= LARGEST_NUMBER) | (values.dtype.kind == "i"))
 
 
 def in_order(t_ns: NDArray[np.int64], what: str) -> tuple[NDArray[np.intp], list[str]]:

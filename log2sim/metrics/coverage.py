@@ -60,9 +60,10 @@ def _frames_at(view: LabelView, t_s: Array) -> tuple[Index, Mask, Array]:
         return np.zeros(len(t_s), dtype=np.int64), np.zeros(len(t_s), dtype=bool), np.zeros((len(t_s), 4, 4))
     frame = np.abs(view.t_s - t_s[:, None]).argmin(1)
     near = np.abs(view.t_s[frame] - t_s) <= MAX_FRAME_LAG_S
-    track = PoseTrack(_to_ns(view.t_s), view.map_T_cam)
+    at_frames = view.map_T_cam
+    track = PoseTrack(_to_ns(view.t_s), at_frames)
     poses, known = track.at(_to_ns(np.clip(t_s, view.t_s[0], view.t_s[-1])))
-    return frame, near, np.where(known[:, None, None], poses, view.map_T_cam[frame])
+    return frame, near, np.where(known[:, None, None], poses, at_frames[frame])
 
 
 def _to_ns(t_s: Array) -> Index:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from log2sim.errors import LogError
-from log2sim.geometry import NS_PER_S
+from log2sim.geometry import NS_PER_S, quaternion_from_rotation
 from log2sim.registry import nearest
 from log2sim.types import Log
 from log2sim.unlabeled import LabelView, Unlabeled
@@ -54,4 +54,5 @@ def _view(log: Log, name: str, t0_ns: int) -> LabelView:
         frame = np.where(np.abs(t_ns[left] - regions.t_ns) <= np.abs(t_ns[right] - regions.t_ns), left, right)
         near = np.abs(t_ns[frame] - regions.t_ns) <= MAX_STAMP_LAG_NS
         frame, box = frame[near], regions.box_px[near]
-    return LabelView(log.cameras[name], (t_ns - t0_ns) / NS_PER_S, poses, frame, box)
+    rotation = quaternion_from_rotation(poses[:, :3, :3])
+    return LabelView(log.cameras[name], (t_ns - t0_ns) / NS_PER_S, poses[:, :3, 3], rotation, frame, box)
