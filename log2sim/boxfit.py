@@ -14,6 +14,8 @@ SEARCH_STEP_RAD = np.deg2rad(2.0)
 NEAREST_EDGE_M = 0.03
 MOST_POINTS = 256
 SENSOR_SIGMA_M = 0.08
+# A side longer than this share of the typical width is no front or rear.
+LONGER_THAN_WIDE = 1.2
 # A completed side may be anywhere between nothing hidden and all of the slack hidden: a uniform spread.
 SLACK_SIGMA = 12.0**-0.5
 
@@ -136,8 +138,7 @@ def box_of_cluster(
     else:
         yaw_rad, _ = fit_yaw(cluster[:, :2])
         low, high = extents(cluster[:, :2], yaw_rad)
-        # The longer side is the length, unless what is seen of it is as short as a width.
-        if (high - low)[1] > max((high - low)[0], typical[1] * 1.15):
+        if is_across(high - low, rotate(sensor[:2], -yaw_rad), typical):
             yaw_rad += np.pi / 2
             low, high = np.array([low[1], -high[0]]), np.array([high[1], -low[0]])
     top = float(quantile_of_sorted(np.sort(cluster[:, 2]), 0.98)) - ground_z
@@ -152,6 +153,19 @@ def box_of_cluster(
     sigma = np.hypot(SENSOR_SIGMA_M, SLACK_SIGMA * slack)
     axes = rotate(np.eye(2), yaw_rad)
     return center, size, float(yaw_rad), axes.T @ np.diag(sigma**2) @ axes
+
+
+def is_across(seen_m: Array, sensor: Array, typical: Array) -> bool:
+    """Whether a fitted yaw runs across the object, from the extents (2,) along and across it.
+
+    `sensor` is one place (2,) or several (K, 2) that it was seen from, in axes along and across; `typical` the
+    category's size.
+    """
+    # Too long for a width: that side is the length. Both short: what faces the sensor flat-on is front or rear.
+    if seen_m.max() > LONGER_THAN_WIDE * typical[1]:
+        return bool(seen_m[1] > seen_m[0])
+    ahead, aside = np.median(np.abs(np.atleast_2d(sensor)), axis=0)
+    return bool(aside > ahead)
 
 
 def align_to(yaw_rad: float, toward_rad: float, period_rad: float) -> float:

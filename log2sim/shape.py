@@ -75,8 +75,10 @@ def shape_standing(track: Track) -> Shape:
     if len(cloud) < 5:
         return _from_measured_centers(track, typical)
     yaw, _ = boxfit.fit_yaw(cloud[:, :2])
-    yaw = _along_length(cloud[:, :2], yaw, boxfit.rotate(sensor, -yaw), typical)
     low, high = boxfit.extents(cloud[:, :2], yaw)
+    if boxfit.is_across(high - low, boxfit.rotate(sensor, -yaw), typical):
+        yaw += np.pi / 2
+        low, high = boxfit.extents(cloud[:, :2], yaw)
     local = boxfit.rotate(sensor, -yaw)
     whole = _whole_sides(low, high, local)
     size, fits = _completed_size((high - low)[None], whole[None], typical[:2])
@@ -134,17 +136,6 @@ def _persistent_points(clusters: list[NDArray[np.float64]]) -> Array:
     seen = np.unique(np.stack([key.ravel(), tick], axis=1), axis=0)
     count = np.bincount(seen[:, 0])
     return points[count[key.ravel()] >= max(PERSISTENT_SHARE * len(clusters), min(2, len(clusters)))]
-
-
-def _along_length(xy: Array, yaw: float, sensor_local: Array, typical: Array) -> float:
-    """Turn a yaw known up to quarter turns so that it runs along the length."""
-    low, high = boxfit.extents(xy, yaw)
-    along, across = high - low
-    # Too long for a width: that side is the length. Both short: what faces the sensor flat-on is front or rear.
-    if max(along, across) > 1.2 * typical[1]:
-        return yaw if along >= across else yaw + np.pi / 2
-    ahead = np.median(np.abs(sensor_local), axis=0)
-    return yaw if ahead[0] >= ahead[1] else yaw + np.pi / 2
 
 
 def _whole_sides(low: Array, high: Array, sensor: Array) -> NDArray[np.bool_]:
