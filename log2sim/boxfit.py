@@ -14,6 +14,8 @@ SEARCH_STEP_RAD = np.deg2rad(2.0)
 NEAREST_EDGE_M = 0.03
 MOST_POINTS = 256
 SENSOR_SIGMA_M = 0.08
+# A side longer than this many typical widths is no width.
+LONGEST_WIDTH = 1.15
 # A completed side may be anywhere between nothing hidden and all of the slack hidden: a uniform spread.
 SLACK_SIGMA = 12.0**-0.5
 
@@ -136,8 +138,7 @@ def box_of_cluster(
     else:
         yaw_rad, _ = fit_yaw(cluster[:, :2])
         low, high = extents(cluster[:, :2], yaw_rad)
-        # The longer side is the length, unless what is seen of it is as short as a width.
-        if (high - low)[1] > max((high - low)[0], typical[1] * 1.15):
+        if _runs_across(low, high, rotate(sensor[:2], -yaw_rad), typical):
             yaw_rad += np.pi / 2
             low, high = np.array([low[1], -high[0]]), np.array([high[1], -low[0]])
     top = float(quantile_of_sorted(np.sort(cluster[:, 2]), 0.98)) - ground_z
@@ -152,6 +153,19 @@ def box_of_cluster(
     sigma = np.hypot(SENSOR_SIGMA_M, SLACK_SIGMA * slack)
     axes = rotate(np.eye(2), yaw_rad)
     return center, size, float(yaw_rad), axes.T @ np.diag(sigma**2) @ axes
+
+
+def _runs_across(low: Array, high: Array, sensor: Array, typical: Array) -> bool:
+    """Whether the length lies across the yaw that was fitted; everything in axes along and across that yaw.
+
+    A side too long for a width is the length. Where both are short, what faces the sensor flat-on is front or rear: an
+    object seen from straight behind must not turn with the last digit of its yaw.
+    """
+    along, across = high - low
+    if max(along, across) > LONGEST_WIDTH * typical[1]:
+        return bool(across > along)
+    away = np.abs(sensor - (low + high) / 2)
+    return bool(away[1] > away[0])
 
 
 def align_to(yaw_rad: float, toward_rad: float, period_rad: float) -> float:
