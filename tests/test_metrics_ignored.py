@@ -156,6 +156,16 @@ def test_an_agent_that_a_camera_shows_in_part_is_in_its_view():
     assert counts(one(-1.2, 2.0), truth_with(view(), outside=True))[1:] == (0, 21)
 
 
+@pytest.mark.parametrize(
+    ("k1", "slope", "seen"), [(0.0, 0.95, True), (0.2, 0.95, False), (0.0, 1.05, False), (-0.2, 1.05, True)]
+)
+def test_a_lens_bends_what_is_in_view(k1, slope, seen):
+    """The right rear corner's ray is at slope (1 + k1 slope^2) times the focal length; the image ends at once."""
+    lens = replace(CAMERA, distortion_model="brown", distortion=(k1, 0.0, 0.0, 0.0))
+    aside = one(20.0, 22.0 * slope + 1.0)
+    assert counts(aside, truth_with(view(camera=lens), outside=True))[1:] == ((21, 0) if seen else (0, 21))
+
+
 def test_one_camera_that_could_tell_outweighs_one_that_could_not():
     hidden, clear = view([EVERYWHERE]), view(camera=replace(CAMERA, name="second"))
     assert counts(one(), truth_with(hidden))[1:] == (0, 21)
