@@ -62,7 +62,7 @@ def nearest_course(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps
     -----
     Least squares over all knots at once, by Gauss-Newton steps with Levenberg-Marquardt damping. Rolling without slip is a
     residual as well (direct multiple shooting, Bock & Plitt, 1984), which makes every step a banded system: cost O(K).
-    Headings and speeds enter by Cauchy's loss, so a box turned back to front or a wrong sign is outvoted.
+    Headings and speeds enter by the pseudo-Huber loss, so a few that are far off are outvoted.
     """
     axis = _axis(yaw_rad)
     away = wrap_angle(yaw_rad - axis)
@@ -118,17 +118,17 @@ class _Problem:
     limits: Limits
 
     def cost(self, state: Array) -> float:
-        """Half the sum of squares, Cauchy's loss for headings and speeds."""
+        """Half the sum of squares, the pseudo-Huber loss for headings and speeds."""
         knot, _ = self._knots(state)
         roll, _ = self._rolls(state)
         plain = np.sum(roll**2) + np.sum(knot[:, [0, 1, 4, 5]] ** 2)
-        return float(plain + np.sum(np.log1p(knot[:, 2:4] ** 2))) / 2
+        return float(plain / 2 + np.sum(np.sqrt(1 + knot[:, 2:4] ** 2) - 1))
 
     def normal_equations(self, state: Array) -> tuple[Array, Array, Array]:
         """Blocks on the diagonal (K, 6, 6), below it (K - 1, 6, 6) and the gradient (K, 6) of the cost."""
         r, j = self._knots(state)
         weight = np.ones_like(r)
-        weight[:, 2:4] = 1 / (1 + r[:, 2:4] ** 2)
+        weight[:, 2:4] = 1 / np.sqrt(1 + r[:, 2:4] ** 2)
         diagonal = np.einsum("kri,kr,krj->kij", j, weight, j)
         gradient = np.einsum("kri,kr->ki", j, weight * r)
         r, j = self._rolls(state)

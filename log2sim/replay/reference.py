@@ -79,11 +79,10 @@ def drivable_course(path: Path, limits: Limits) -> tuple[Course, Array]:
         # The course up to a leap goes on as it was; it ends a hair before the moment of the next waypoint.
         until_s = path.t_s[end - 1] if end == len(path.t_s) else np.nextafter(path.t_s[end], path.t_s[begin])
         begin_s = path.t_s[begin]
-        count = max(int(np.ceil((until_s - begin_s) / KNOT_S - 1e-6)), 1) + 1
+        count = max(int(np.ceil((until_s - begin_s) / KNOT_S - 1e-6)), 1) + 1 if until_s > begin_s else 1
         t = np.linspace(begin_s, until_s, count)
         x, y, yaw, speed = path.at(t)
-        fits = until_s > begin_s and count <= MAX_KNOTS
-        course = (nearest_course if fits else as_logged)(t, x, y, yaw, speed, limits)
+        course = (nearest_course if 1 < count <= MAX_KNOTS else as_logged)(t, x, y, yaw, speed, limits)
         pieces.append(course)
         o = limits.offset_m
         center_x, center_y = course.x_m + o * np.cos(course.yaw_rad), course.y_m + o * np.sin(course.yaw_rad)
