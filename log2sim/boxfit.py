@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from log2sim.geometry import Array, wrap_angle
 from log2sim.types import TYPICAL_SIZE_M
@@ -14,9 +14,11 @@ SEARCH_STEP_RAD = np.deg2rad(2.0)
 NEAREST_EDGE_M = 0.03
 MOST_POINTS = 256
 SENSOR_SIGMA_M = 0.08
+# A side seen at a flatter angle than this (sine) shows its near end only.
+LEAST_ASPECT = 0.5
 # A side longer than this share of the typical width is no front or rear.
 LONGER_THAN_WIDE = 1.2
-# A completed side may be anywhere between nothing hidden and all of the slack hidden: a uniform spread.
+# A size that was completed may be wrong by all of what was added: a uniform spread. Without any real end it is worse.
 SLACK_SIGMA = 12.0**-0.5
 
 
@@ -97,62 +99,99 @@ def rotate(xy: Array, angle_rad: float) -> Array:
     return np.stack([xy[..., 0] * c - xy[..., 1] * s, xy[..., 0] * s + xy[..., 1] * c], axis=-1)
 
 
-def complete_box(low: Array, high: Array, size_m: Array, sensor: Array) -> tuple[Array, Array]:
+def ends_shown(low: Array, high: Array, sensor: Array, ends_seen: ArrayLike) -> NDArray[np.bool_]:
+    """Which ends of what was seen of a box are ends of the box; everything in axes along and across it.
+
+    Parameters
+    ----------
+    low, high : (2,) ends of the seen points along each axis
+    sensor : (2,) where the points were seen from
+    ends_seen : (2,) bool
+        Whether the right and the left end of the points, as the sensor sees them, are ends of the object.
+
+    Returns
+    -------
+    shown : (2, 2) bool
+        For each axis, whether the lower and the upper end are real.
+
+    Notes
+    -----
+    A side that faces the sensor is real. A side seen at a flat angle shows its near end only; one seen better shows the
+    ends that the sensor sees as right and left.
+    """
+    above, below = sensor > high, sensor < low
+    shown = np.stack([below, above], axis=1)
+    toward = np.abs(sensor - (low + high) / 2)
+    for axis in range(2):
+        other = 1 - axis
+        if not (above[other] or below[other]) or toward[other] < LEAST_ASPECT * np.hypot(*toward):
+            continue
+        face = high[other] if above[other] else low[other]
+        # Seen from below the length, or from beyond the upper end of it for the width, the lower end is on the left.
+        low_is_left = (face > sensor[other]) if axis == 0 else (face < sensor[other])
+        right, left = ends_seen
+        shown[axis] |= np.array([left, right] if low_is_left else [right, left], dtype=bool)
+    return shown
+
+
+def complete_box(
+    low: Array, high: Array, size_m: Array, sensor: Array, ends_seen: ArrayLike = (True, True)
+) -> tuple[Array, Array]:
     """Place a box of known size over what was seen of it; everything in axes along and across the box.
 
     Parameters
     ----------
-    low, high : (2,) ends of the seen points
+    low, high, sensor, ends_seen
+        See `ends_shown`.
     size_m : (2,) length and width of the whole box
-    sensor : (2,) where the points were seen from
 
     Returns
     -------
     center : (2,)
-    slack_m : (2,) >= 0
-        How far the center could still move along each axis with the points inside the box.
+    sigma_m : (2,)
+        Its standard deviation along each axis.
 
     Notes
     -----
-    The side that faces the sensor is the one that was seen, so the box starts there and reaches away from it. A sensor
-    beside the box sees that side from end to end, so the box is centered on it.
+    The box reaches from its real end to where it was not seen. With both ends real or none of them it is centered on
+    the points.
     """
-    seen = high - low
-    slack = np.maximum(size_m - seen, 0.0)
-    middle = (low + high) / 2
-    # +1: the sensor lies beyond the upper end, so the upper end is real and the box reaches down from it
-    beyond = np.where(sensor > high, 1.0, np.where(sensor < low, -1.0, 0.0))
-    return middle - beyond * slack / 2, slack
+    return place_box(low, high, size_m, ends_shown(low, high, sensor, ends_seen))
+
+
+def place_box(low: Array, high: Array, size_m: Array, shown: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """As `complete_box`, with the real ends (2, 2) that `ends_shown` tells."""
+    slack = np.maximum(size_m - (high - low), 0.0)
+    reach = shown[:, 1].astype(np.float64) - shown[:, 0]
+    doubt = np.where(shown.any(axis=1), SLACK_SIGMA, 1.0)
+    return (low + high) / 2 - reach * slack / 2, np.hypot(SENSOR_SIGMA_M, doubt * slack)
 
 
 def box_of_cluster(
-    cluster: Array, sensor: Array, category: str, ground_z: float, *, yaw_rad: float | None = None, size_m: Any = None
+    cluster: Array, sensor: Array, category: str, ground_z: float, ends_seen: ArrayLike = (True, True)
 ) -> tuple[Array, Array, float, Array]:
     """Center (3,), size (3,), yaw and covariance (2, 2) of the box around a cluster (n, 3) seen from `sensor` (3,).
 
-    Without `yaw_rad` the yaw is fitted, up to quarter turns; without `size_m` the typical size completes what was not seen.
+    The yaw is known up to half turns at best. The typical size completes what was not seen; `ends_seen` as in
+    `ends_shown`.
     """
     typical = np.array(TYPICAL_SIZE_M[category])
-    if yaw_rad is not None:
-        low, high = extents(cluster[:, :2], yaw_rad)
-    else:
-        yaw_rad, _ = fit_yaw(cluster[:, :2])
-        low, high = extents(cluster[:, :2], yaw_rad)
-        if is_across(high - low, rotate(sensor[:2], -yaw_rad), typical):
-            yaw_rad += np.pi / 2
-            low, high = np.array([low[1], -high[0]]), np.array([high[1], -low[0]])
+    yaw_rad, _ = fit_yaw(cluster[:, :2])
+    low, high = extents(cluster[:, :2], yaw_rad)
+    if is_across(high - low, rotate(sensor[:2], -yaw_rad), typical):
+        yaw_rad += np.pi / 2
+        low, high = np.array([low[1], -high[0]]), np.array([high[1], -low[0]])
     top = float(quantile_of_sorted(np.sort(cluster[:, 2]), 0.98)) - ground_z
-    size = (
-        np.asarray(size_m, dtype=np.float64)
-        if size_m is not None
-        else np.maximum([*(high - low), top], [*typical[:2], top])
-    )
-    sensor_local = rotate(sensor[:2], -yaw_rad)
-    center_local, slack = complete_box(low, high, size[:2], sensor_local)
+    size = np.maximum([*(high - low), top], [*typical[:2], top])
+    center_local, sigma = complete_box(low, high, size[:2], rotate(sensor[:2], -yaw_rad), ends_seen)
     center = np.append(rotate(center_local, yaw_rad), ground_z + size[2] / 2)
-    sigma = np.hypot(SENSOR_SIGMA_M, SLACK_SIGMA * slack)
+    return center, size, float(yaw_rad), oriented_covariance(sigma, yaw_rad)
+
+
+def oriented_covariance(sigma_m: Array, yaw_rad: float) -> Array:
+    """Covariance (2, 2) of a place with standard deviations (2,) along and across a yaw."""
     axes = rotate(np.eye(2), yaw_rad)
-    return center, size, float(yaw_rad), axes.T @ np.diag(sigma**2) @ axes
+    return axes.T @ np.diag(sigma_m**2) @ axes
 
 
 def is_across(seen_m: Array, sensor: Array, typical: Array) -> bool:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
@@ -49,17 +51,27 @@ def main() -> None:
         fail(str(error), error.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         fail("interrupted; nothing half-written was left", INTERRUPTED)
+    except BrokenPipeError:  # whoever read our output has had enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except OSError as error:
+        if debug:
+            raise
+        fail(f"{error.filename or 'a file'}: {error.strerror or error}; check the name and the permissions", 3)
     except Exception as error:
-        format_message = getattr(error, "format_message", None)  # click's own usage errors
+        format_message: Callable[[], str] | None = getattr(error, "format_message", None)  # click's own usage errors
         if format_message is None:
             if debug:
                 raise
             fail(f"internal error: {type(error).__name__}: {error}; run again with --debug for the place", 1)
-        fail(format_message(), getattr(error, "exit_code", 2))
+        if not arguments:
+            sys.stderr.write(format_message() + "\n")
+            sys.exit(2)
+        fail(f"{format_message()} (see log2sim --help)", getattr(error, "exit_code", 2))
     sys.exit(code if isinstance(code, int) else 0)
 
 
-def fail(message: str, code: int) -> None:
+def fail(message: str, code: int) -> NoReturn:
     """Print an error and leave."""
     sys.stderr.write(f"log2sim: {message}\n")
     sys.exit(code)
@@ -102,14 +114,15 @@ def reconstruct(
 ) -> None:
     """Reconstruct the scenario of a log."""
     from log2sim.config import Config
-    from log2sim.files import refuse_existing, write_json
+    from log2sim.errors import ConfigError
+    from log2sim.files import check_targets, write_json
     from log2sim.logs import open_log
     from log2sim.pipeline import reconstruct as run
     from log2sim.progress import progress
 
-    for target in (out, report, topdown):
-        if target is not None:
-            refuse_existing(target, overwrite=overwrite)
+    check_targets(out, report, topdown, overwrite=overwrite)
+    if cameras is not None and not cameras.replace(",", "").strip():
+        raise ConfigError("--cameras: is empty; name cameras separated by commas, or leave it out to use all")
     changes: dict[str, Any] = {"cameras": cameras, "start_s": start, "stop_s": stop, "seed": seed}
     if detector is not None:
         changes["detect"] = {"name": detector}
@@ -119,20 +132,32 @@ def reconstruct(
         say(f"note: {note}", quiet=quiet)
     with progress(quiet=quiet) as tell:
         result = run(opened, chosen, picture=topdown is not None, progress=tell)
-    result.scenario.save(out)
-    if report is not None:
-        write_json(report, result.report)
     if topdown is not None:
         from log2sim.mosaic import mosaic_of
         from log2sim.topdown.picture import write_picture
 
         write_picture(mosaic_of(opened, result.scenario), topdown, overwrite=overwrite)
+    if report is not None:
+        write_json(report, result.report)
+    result.scenario.save(out)
+    for note in left_out(result.report):
+        say(f"note: {note}", quiet=quiet)
     counts = result.report["agents"]
     say(
         f"{out}: {counts['total']} agents ({counts['static']} standing) over {result.scenario.duration_s:.1f} s, "
         f"{result.report['ticks_per_second']:.1f} ticks/s",
         quiet=quiet,
     )
+
+
+def left_out(report: dict[str, Any]) -> list[str]:
+    """What of a log a run could not use, a line each."""
+    unread = report["unreadable"].items()
+    lost = report["without_pose"].items()
+    return [
+        *(f"{name}: {u['count']} records could not be read, first: {u['first']}" for name, u in unread),
+        *(f"{name}: {count} frames left out, since no ego pose is known at their stamps" for name, count in lost),
+    ]
 
 
 @app.command()
@@ -148,13 +173,12 @@ def replay(
     quiet: Quiet = False,
 ) -> None:
     """Let vehicles drive a scenario."""
-    from log2sim.files import refuse_existing
+    from log2sim.files import check_targets
     from log2sim.replay import load_policy, require_strict
     from log2sim.replay import replay as run
     from log2sim.scenario import Scenario
 
-    if out is not None:
-        refuse_existing(out, overwrite=overwrite)
+    check_targets(out, overwrite=overwrite)
     loaded = Scenario.load(scenario)
     policy = load_policy(ego) if ego is not None else None
     result = run(loaded, mode=mode, model=model, dt_s=dt, ego=policy)
@@ -187,9 +211,11 @@ def plot(
     overwrite: Overwrite = False,
 ) -> None:
     """Draw a scenario from above."""
+    from log2sim.files import check_targets
     from log2sim.plot import plot_tracks
     from log2sim.scenario import Scenario
 
+    check_targets(out, overwrite=overwrite)
     loaded = Scenario.load(scenario)
     replayed = None
     if replay is not None:
@@ -218,13 +244,12 @@ def evaluate(
     quiet: Quiet = False,
 ) -> None:
     """Compare a scenario with the truth."""
-    from log2sim.files import refuse_existing, write_json
+    from log2sim.files import check_targets, write_json
     from log2sim.metrics.evaluate import evaluate as run
     from log2sim.metrics.table import format_table
     from log2sim.scenario import Scenario
 
-    if out is not None:
-        refuse_existing(out, overwrite=overwrite)
+    check_targets(out, overwrite=overwrite)
     loaded = Scenario.load(scenario)
     wanted = [c.strip() for c in categories.split(",")] if categories else None
     result = run(loaded, load_truth(truth, loaded, sequence), max_range_m=range, categories=wanted)
@@ -294,7 +319,7 @@ def validate(
 
         problems = validate_log(path, format=format, sequence=sequence)
         if problems:
-            raise LogError(f"{path}: {len(problems)} problems\n  " + "\n  ".join(problems))
+            raise LogError(f"{path}: {len(problems)} problem{'s' * (len(problems) > 1)}\n  " + "\n  ".join(problems))
     else:
         _validate_file(path)
     say(f"{path}: valid")

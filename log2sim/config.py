@@ -7,6 +7,7 @@ code that uses it.
 from __future__ import annotations
 
 import dataclasses
+import math
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -173,6 +174,8 @@ def _checked(value: Any, hint: Any, declared: dataclasses.Field[Any], where: str
         return value
     if isinstance(value, bool) or not isinstance(value, (int, float)) or (hint is int and not isinstance(value, int)):
         raise ConfigError(f"{where} is {value!r}, expected {'a whole number' if hint is int else 'a number'}")
+    if not math.isfinite(value):
+        raise ConfigError(f"{where} is {value!r}, expected a finite number")
     low, high = declared.metadata.get("low", float("-inf")), declared.metadata.get("high", float("inf"))
     if not low <= value <= high:
         raise ConfigError(f"{where} is {value!r}, expected a number from {low:g} to {high:g}")
@@ -193,9 +196,10 @@ def _read_toml(path: Path) -> dict[str, Any]:
 def _parse_value(text: str) -> Any:
     """A value as TOML would read it; anything else is a text, so that quotes are not needed on the command line."""
     try:
-        return tomllib.loads(f"value = {text}")["value"]
+        document = tomllib.loads(f"value = {text}")
     except tomllib.TOMLDecodeError:
         return text
+    return document["value"] if len(document) == 1 else text
 
 
 def _toml_value(value: Any) -> str:

@@ -106,17 +106,16 @@ def look(cloud: Obstacles, tick: int, xy_m: Array, yaw_rad: float, size_m: Array
     if np.any(high - low > size_m[:2] + 0.6):
         return None
     sensor = boxfit.rotate(cloud.sensor[:2].astype(np.float64) + cloud.origin[:2] - xy_m, -yaw_rad)
-    center, slack = boxfit.complete_box(low, high, size_m[:2], sensor)
+    center, sigma = boxfit.complete_box(low, high, size_m[:2], sensor)
+    slack = size_m[:2] - (high - low)
     if np.hypot(*center) > MOST_SHIFT_M or np.any(slack > MOST_HIDDEN * np.maximum(size_m[:2], 1.0)):
         return None
-    sigma = np.hypot(2 * boxfit.SENSOR_SIGMA_M, boxfit.SLACK_SIGMA * slack)
-    axes = boxfit.rotate(np.eye(2), yaw_rad)
     seen_s = float(cloud.t_s[near[inside]].mean())
     return Sighting(
         tick,
         cloud.stamp_ns + round(seen_s * NS_PER_S),
         boxfit.rotate(center, yaw_rad) + xy_m,
-        axes.T @ np.diag(sigma**2) @ axes,
+        boxfit.oriented_covariance(np.hypot(sigma, 2 * boxfit.SENSOR_SIGMA_M), yaw_rad),
         int(inside.sum()),
     )
 

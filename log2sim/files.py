@@ -42,6 +42,30 @@ def refuse_existing(path: Path | str, *, overwrite: bool) -> None:
         raise ConfigError(f"{path}: exists already; choose another name or pass --overwrite")
 
 
+def check_targets(*paths: Path | str | None, overwrite: bool) -> None:
+    """Refuse output files that could not be written, before any work is done for them; None is skipped.
+
+    Raises
+    ------
+    ConfigError
+        For a file that exists and may not be replaced, a folder, a parent that is a file, or one name for two files.
+    """
+    targets = [Path(p) for p in paths if p is not None]
+    for k, target in enumerate(targets):
+        refuse_existing(target, overwrite=overwrite)
+        if target.is_dir():
+            raise ConfigError(f"{target}: is a folder; give the name of a file")
+        above = next((p for p in target.parents if p.exists()), None)
+        if above is not None and not above.is_dir():
+            raise ConfigError(
+                f"{target}: cannot be written, since {above} is a file and not a folder; choose another place"
+            )
+        if target.resolve() in [t.resolve() for t in targets[:k]]:
+            raise ConfigError(
+                f"{target}: two files would be written under this one name; choose another for one of them"
+            )
+
+
 def write_json(path: Path | str, value: Any) -> None:
     """Write JSON (no NaN, no infinity), whole or not at all."""
     with replaced(path) as temporary:
@@ -56,21 +80,54 @@ def read_json(path: Path | str, error: type[LogError] = LogError) -> Any:
     if path.stat().st_size > JSON_LIMIT_BYTES:
         raise error(f"{path}: {path.stat().st_size} bytes, more than the {JSON_LIMIT_BYTES} that a JSON file may have")
     try:
-        return json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
+        text = path.read_text(encoding="utf-8")
+        return json.loads(text, parse_constant=_refuse, parse_float=_finite)
+    except _NotFinite as problem:
+        place = _place_not_finite(json.loads(text)) or "the document"
+        raise error(
+            f"{path}: {place} is {problem}, expected a finite number; write one, or null where it may be absent"
+        ) from None
     except json.JSONDecodeError as problem:
         raise error(f"{path}: not valid JSON at line {problem.lineno}, column {problem.colno}: {problem.msg}") from None
     except (UnicodeDecodeError, RecursionError, ValueError) as problem:
         raise error(f"{path}: not valid JSON: {problem}") from None
 
 
-def _refuse_constant(word: str) -> float:
-    raise ValueError(f"{word} is not a number that JSON allows; write null or leave the value out")
+class _NotFinite(ValueError):
+    """A number of a JSON file that is NaN, infinite or too large for a float64."""
+
+
+def _refuse(word: str) -> float:
+    raise _NotFinite(word[:40])
+
+
+def _finite(word: str) -> float:
+    value = float(word)
+    return value if math.isfinite(value) else _refuse(word)
+
+
+def _place_not_finite(value: Any) -> str | None:
+    """Where the first number that is not finite stands, as "a.b[3]"; None when there is none."""
+    if isinstance(value, float):
+        return None if math.isfinite(value) else ""
+    if not isinstance(value, (dict, list)):
+        return None
+    for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+        place = _place_not_finite(item)
+        if place is not None:
+            step = f"[{key}]" if isinstance(key, int) else f"{key}"
+            return step + ("." if place and not place.startswith("[") else "") + place
+    return None
 
 
 def inside(root: Path, relative: str, what: str) -> Path:
     """Resolve a path that a log names, and refuse one that leaves the log's folder (also through a symbolic link)."""
-    candidate = root / relative
-    resolved = candidate.resolve()
+    try:
+        resolved = (root / relative).resolve()
+    except (OSError, RuntimeError, ValueError) as problem:  # a loop of symbolic links, a zero byte
+        raise LogError(
+            f"{what}: path {relative[:100]!r} cannot be followed: {problem}; give the path of a file"
+        ) from None
     if Path(relative).is_absolute() or not resolved.is_relative_to(root.resolve()):
         raise LogError(f"{what}: path '{relative}' leaves the log folder; use a path relative to it, without '..'")
     return resolved

@@ -25,8 +25,9 @@ def fuse(measurements: Measurements) -> Measurements:
     order = np.argsort(-measurements.score * np.where(measurements.truncated, 0.7, 1.0), kind="stable")
     rows = measurements.take(order)
     owner = np.full(len(rows), -1)
+    possible = _possibly_same(rows)
     for i in range(len(rows)):
-        for j in range(i):
+        for j in np.flatnonzero(possible[i, :i]).tolist():
             if owner[j] == j and _same_object(rows, i, j):
                 owner[i] = j
                 break
@@ -38,26 +39,26 @@ def fuse(measurements: Measurements) -> Measurements:
     return out.take(~_drivers(out))
 
 
+def _possibly_same(rows: Measurements) -> NDArray[np.bool_]:
+    """Which pairs (M, M) can be one object: of the same group, and near each other or else of two cameras."""
+    group = np.array([GROUP_OF[str(c)] for c in rows.category])
+    lidar, placed = rows.source == "lidar", rows.source != ""
+    reach = rows.size_m[:, :2].sum(axis=1) / 2
+    apart = rows.center_m[:, None, :2] - rows.center_m[None, :, :2]
+    near = np.hypot(apart[..., 0], apart[..., 1]) <= reach[:, None] + reach
+    other_camera = (rows.camera[:, None] != rows.camera) & placed[:, None] & placed
+    return (group[:, None] == group) & np.where(lidar[:, None] & lidar, near, other_camera)
+
+
 def _same_object(rows: Measurements, i: int, j: int) -> bool:
-    if GROUP_OF[str(rows.category[i])] != GROUP_OF[str(rows.category[j])]:
-        return False
     if rows.source[i] == "lidar" and rows.source[j] == "lidar":
-        return shared_points(rows, i, j) >= SHARED_POINTS
-    if rows.camera[i] == rows.camera[j] or not rows.source[i] or not rows.source[j]:
-        return False
+        return max(_share_inside(rows, i, j), _share_inside(rows, j, i)) >= SHARED_POINTS
     apart = (rows.center_m[i] - rows.center_m[j])[:2]
     return bool(apart @ np.linalg.solve(rows.covariance[i] + rows.covariance[j], apart) <= SAME_PLACE)
 
 
-def shared_points(rows: Measurements, i: int, j: int) -> float:
-    """Largest share of one cluster's points that lie inside the extent of the other's points."""
-    distance = np.hypot(*(rows.center_m[i] - rows.center_m[j])[:2])
-    if distance > (rows.size_m[i, :2].sum() + rows.size_m[j, :2].sum()) / 2:
-        return 0.0
-    return max(_share_inside(rows, i, j), _share_inside(rows, j, i))
-
-
 def _share_inside(rows: Measurements, i: int, j: int) -> float:
+    """Share of the points of row `i` that lie inside the extent of the points of row `j`."""
     yaw = float(rows.yaw_rad[j])
     extent, points = rotate(rows.cluster[j][:, :2], -yaw), rotate(rows.cluster[i][:, :2], -yaw)
     low, high = extent.min(axis=0) - MARGIN_M, extent.max(axis=0) + MARGIN_M
@@ -72,14 +73,16 @@ def _join(rows: Measurements, leader: int, members: NDArray[np.intp]) -> Measure
     cluster = np.concatenate([rows.cluster[m] for m in [leader, *others]])
     ground_z = float(row.center_m[0, 2] - row.size_m[0, 2] / 2)
     origin = row.center_m[0]
+    # Where one camera's box cut the object, another's may show its end.
+    ends_seen = rows.ends_seen[[leader, *others]].any(axis=0)
     center, size, yaw, covariance = box_of_cluster(
-        cluster - origin, row.sensor_m[0] - origin, str(row.category[0]), ground_z - float(origin[2])
+        cluster - origin, row.sensor_m[0] - origin, str(row.category[0]), ground_z - float(origin[2]), ends_seen
     )
-    whole = bool(row.truncated[0]) and all(rows.truncated[m] for m in others)
+    cut = bool(row.truncated[0]) and all(rows.truncated[m] for m in others)
     columns = dict(vars(row))
     columns |= {
         "center_m": (center + origin)[None], "size_m": size[None], "yaw_rad": np.array([yaw]),
-        "covariance": covariance[None], "cluster": (cluster,), "truncated": np.array([whole]),
+        "covariance": covariance[None], "cluster": (cluster,), "truncated": np.array([cut]), "ends_seen": ends_seen[None],
         "points": np.array([int(rows.points[[leader, *others]].max())]),
     }  # fmt: skip
     return Measurements(**columns)

@@ -8,6 +8,7 @@ scalar-first, yaw is counter-clockwise from +x in [-pi, pi).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -133,6 +134,10 @@ class PoseTrack:
         if np.any(np.diff(self.t_ns) <= 0):
             raise ValueError("stamps of a pose track must be strictly increasing")
 
+    @cached_property
+    def _quaternions(self) -> Array:
+        return quaternion_from_rotation(self.map_T_ego[:, :3, :3])
+
     def at(self, t_ns: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
         """Poses at stamps (N,) int64 ns, interpolated on SE(3).
 
@@ -149,7 +154,7 @@ class PoseTrack:
         i = np.clip(np.searchsorted(self.t_ns, t, side="right") - 1, 0, len(self.t_ns) - 2)
         span = (self.t_ns[i + 1] - self.t_ns[i]).astype(np.float64)
         fraction = (t - self.t_ns[i]).astype(np.float64) / span
-        q = quaternion_from_rotation(self.map_T_ego[:, :3, :3])
+        q = self._quaternions
         position = self.map_T_ego[:, :3, 3]
         poses = transform(
             rotation_from_quaternion(slerp(q[i], q[i + 1], fraction)),

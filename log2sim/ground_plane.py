@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -75,7 +76,7 @@ def calibrated_ground(log: Log, camera: Camera) -> HomographyFit | None:
     )
     if np.linalg.cond(image_H_ground) > 1e12:
         return None
-    h = np.linalg.inv(image_H_ground)
+    h = np.asarray(np.linalg.inv(image_H_ground), dtype=np.float64)
     h /= np.linalg.norm(h[2])
     # Depth of the ground point seen at a pixel is 1 / w of the inverse mapping, so w is positive where the ground is ahead.
     s = np.linalg.svd(h, compute_uv=False)
@@ -93,7 +94,7 @@ def _locate_tick(log: Log, m: Measurements, homographies: Mapping[str, CameraGro
     missing = np.flatnonzero(m.source == "")
     if len(missing) == 0:
         return m
-    columns = {k: v.copy() if isinstance(v, np.ndarray) else v for k, v in vars(m).items()}
+    columns: dict[str, Any] = {k: v.copy() if isinstance(v, np.ndarray) else v for k, v in vars(m).items()}
     for k in missing:
         ground = homographies.get(str(m.camera[k]))
         # A box that the image's lower border cuts has no foot in the image.
@@ -117,7 +118,7 @@ def _stand(log: Log, camera: Camera, base: Array, t_ns: int) -> Array:
 
 
 def _write(
-    columns: dict[str, Array], k: int, placed: tuple[Array, Array], base: Array, ground_z: float, category: str
+    columns: dict[str, Any], k: int, placed: tuple[Array, Array], base: Array, ground_z: float, category: str
 ) -> None:
     xy, covariance = placed
     length, width, height = TYPICAL_SIZE_M[category]

@@ -55,6 +55,8 @@ class Records:
         """The record, or None when it cannot be read."""
         try:
             record = self.log.streams[stream].read(index)
+            if isinstance(record, Sweep) and not len(record.xyz_m):
+                raise RecordError(f"sweep at stamp {record.stamp_ns} has no finite point")
         except RecordError as error:
             with self._lock:
                 self.failed.setdefault(stream, []).append(str(error))
@@ -68,7 +70,8 @@ class Records:
         for stream, problems in self.failed.items():
             if not self.read.get(stream):
                 raise LogError(
-                    f"stream '{stream}': none of the {len(problems)} records asked for can be read; {problems[0]}"
+                    f"stream '{stream}': none of the {len(problems)} records asked for can be read, "
+                    f"the first because {problems[0]}. Mend or remove the stream; `log2sim validate` lists all problems"
                 )
 
     def summary(self) -> dict[str, Any]:

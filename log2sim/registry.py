@@ -23,6 +23,9 @@ BUILT_IN: dict[str, dict[str, str]] = {
 }
 
 
+SPOKEN = {"log": "log format"}
+
+
 def names(kind: str) -> list[str]:
     """Names of all plug-ins of a kind ("log", "detector"), built-in ones first."""
     return list(BUILT_IN[kind]) + sorted(e.name for e in entry_points(group=f"log2sim.{kind}"))
@@ -42,7 +45,9 @@ def load(kind: str, name: str) -> Any:
     for entry in entry_points(group=f"log2sim.{kind}"):
         if entry.name == name:
             return entry.load()
-    raise ConfigError(f"unknown {kind} '{name}'{nearest(name, names(kind))}; known: {', '.join(names(kind))}")
+    raise ConfigError(
+        f"unknown {SPOKEN.get(kind, kind)} '{name}'{nearest(name, names(kind))}; known: {', '.join(names(kind))}"
+    )
 
 
 def nearest(word: str, known: list[str]) -> str:

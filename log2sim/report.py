@@ -48,12 +48,23 @@ def make_report(
         "stages": clock.table(ticks),
         "plan": plan.to_list(),
         "sync": {"reference": schedule.reference, "streams": schedule.summary()},
+        "without_pose": _without_pose(log, schedule),
         "unreadable": seen.records.summary() if seen.records is not None else {},
         "detections": seen.detections,
         "homography": {name: _homography_entry(g, config.topdown.method) for name, g in homographies.items()},
         "measurements": _measurement_counts(seen),
         "agents": _agent_counts(scenario),
     }
+
+
+def _without_pose(log: Log, schedule: Schedule) -> dict[str, int]:
+    """Frames by camera that were left out because the ego's pose is not known at their stamp."""
+    counts = {}
+    for name, index in schedule.frames.items():
+        known = log.map_T_sensor(name, log.streams[name].t_ns[index[index >= 0]])[1]
+        if not known.all():
+            counts[name] = int(np.sum(~known))
+    return counts
 
 
 def _homography_entry(ground: CameraGround, method: str) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from log2sim.errors import LogError
+from log2sim.errors import Log2SimError
 
 
 @cache
@@ -20,7 +20,7 @@ def load_schema(name: str) -> dict[str, Any]:
     return json.loads(resources.files("log2sim_schemas").joinpath(f"{name}.json").read_text(encoding="utf-8"))
 
 
-def check(document: Any, name: str, error: type[LogError]) -> None:
+def check(document: Any, name: str, error: type[Log2SimError]) -> None:
     """Raise `error` naming the first field that breaks the schema and what was expected there."""
     from jsonschema import Draft202012Validator
 

@@ -15,8 +15,6 @@ from log2sim import boxfit
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
 from log2sim.types import GROUP_OF, TYPICAL_SIZE_M, Track
 
-# A side seen at a flatter angle than this shows its near end only.
-LEAST_ASPECT = 0.5
 # Share of the whole sides that are longer: stray points lengthen some, sparse points shorten most.
 SIZE_QUANTILE = 0.85
 # Farther to the left of a path than this is the oncoming side of the road.
@@ -80,16 +78,15 @@ def shape_standing(track: Track) -> Shape:
         yaw += np.pi / 2
         low, high = boxfit.extents(cloud[:, :2], yaw)
     local = boxfit.rotate(sensor, -yaw)
-    whole = _whole_sides(low, high, local)
-    size, fits = _completed_size((high - low)[None], whole[None], typical[:2])
-    centers = np.array([boxfit.complete_box(low, high, size, s)[0] for s in local])
-    center = boxfit.rotate(np.median(centers, axis=0), yaw) + origin[:2]
+    with_points = [k for k, c in enumerate(m.cluster) if len(c)]
+    shown = np.array([boxfit.ends_shown(low, high, local[k], m.ends_seen[k]) for k in with_points]).any(axis=0)
+    size, fits = _completed_size((high - low)[None], shown.all(axis=1)[None], typical[:2])
+    centers, sigmas = boxfit.place_box(low, high, size, shown)
+    center = boxfit.rotate(centers, yaw) + origin[:2]
     height, z = _height(track)
-    slack = np.maximum(size - (high - low), 0.0)
-    sigma = np.hypot(boxfit.SENSOR_SIGMA_M, boxfit.SLACK_SIGMA * slack)
-    axes = boxfit.rotate(np.eye(2), yaw)
+    covariance = boxfit.oriented_covariance(sigmas, yaw)
     n = len(m)
-    covariance = np.tile(axes.T @ np.diag(sigma**2) @ axes, (n, 1, 1))
+    covariance = np.tile(covariance, (n, 1, 1))
     return Shape(
         np.append(size, height), np.tile(center, (n, 1)), covariance, np.full(n, np.median(z)), float(yaw), fits
     )
@@ -103,23 +100,19 @@ def shape_moving(track: Track, yaw_rad: Array) -> Shape:
     if len(with_points) == 0:
         return _from_measured_centers(track, typical)
     lows, highs, sensors = np.zeros((len(m), 2)), np.zeros((len(m), 2)), np.zeros((len(m), 2))
-    whole = np.zeros((len(m), 2), dtype=bool)
+    shown = np.zeros((len(m), 2, 2), dtype=bool)
     for k in with_points:
         yaw, origin = float(yaw_rad[k]), m.center_m[k, :2]
         lows[k], highs[k] = boxfit.extents(m.cluster[k][:, :2] - origin, yaw)
         sensors[k] = boxfit.rotate(m.sensor_m[k, :2] - origin, -yaw)
-        whole[k] = _whole_sides(lows[k], highs[k], sensors[k]) & ~m.truncated[k]
-    size, fits = _completed_size((highs - lows)[with_points], whole[with_points], typical[:2])
+        shown[k] = boxfit.ends_shown(lows[k], highs[k], sensors[k], m.ends_seen[k])
+    size, fits = _completed_size((highs - lows)[with_points], shown[with_points].all(axis=2), typical[:2])
     xy, covariance = m.center_m[:, :2].copy(), m.covariance.copy()
     for k in with_points:
         yaw = float(yaw_rad[k])
-        center, slack = boxfit.complete_box(lows[k], highs[k], size, sensors[k])
+        center, sigma = boxfit.place_box(lows[k], highs[k], size, shown[k])
         xy[k] = boxfit.rotate(center, yaw) + m.center_m[k, :2]
-        # What the image border cuts may show its middle only: then no end of it is real.
-        loose = slack if m.truncated[k] else boxfit.SLACK_SIGMA * slack
-        sigma = np.hypot(boxfit.SENSOR_SIGMA_M, loose)
-        axes = boxfit.rotate(np.eye(2), yaw)
-        covariance[k] = axes.T @ np.diag(sigma**2) @ axes
+        covariance[k] = boxfit.oriented_covariance(sigma, yaw)
     height, z = _height(track)
     return Shape(np.append(size, height), xy, covariance, z, None, fits and _tall_enough(height, typical))
 
@@ -136,13 +129,6 @@ def _persistent_points(clusters: list[NDArray[np.float64]]) -> Array:
     seen = np.unique(np.stack([key.ravel(), tick], axis=1), axis=0)
     count = np.bincount(seen[:, 0])
     return points[count[key.ravel()] >= max(PERSISTENT_SHARE * len(clusters), min(2, len(clusters)))]
-
-
-def _whole_sides(low: Array, high: Array, sensor: Array) -> NDArray[np.bool_]:
-    """Whether length and width (2,) were seen from end to end: only a side that is not seen edge-on shows both ends."""
-    toward = np.atleast_2d(sensor) - (low + high) / 2
-    sine = np.abs(toward) / np.maximum(np.hypot(*toward.T)[:, None], 1e-9)
-    return np.array([(sine[:, 1] > LEAST_ASPECT).any(), (sine[:, 0] > LEAST_ASPECT).any()])
 
 
 def _completed_size(seen: Array, whole: NDArray[np.bool_], typical: Array) -> tuple[Array, bool]:

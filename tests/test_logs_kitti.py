@@ -179,6 +179,36 @@ def test_labels_become_boxes_in_the_map(tracking: Path) -> None:
     assert log.image_labels["image_02"].box_px.tolist() == [[1, 2, 30, 20], [1, 2, 30, 20]]
 
 
+def test_dont_care_boxes_are_regions_without_labels_of_camera_2(tracking: Path) -> None:
+    log = open_log(tracking)
+    regions = log.ignored_regions["image_02"]
+    assert (regions.t_ns.tolist(), regions.box_px.tolist()) == ([0], [[1, 1, 9, 9]])
+    assert log.labels.cameras == ("image_02",)
+    assert len(log.labels.t_ns) == len(log.image_labels["image_02"].t_ns) == 2
+
+
+def test_a_raw_drive_takes_the_labels_of_its_tracking_sequence_at_its_own_stamps(raw: Path, tracking: Path) -> None:
+    """Both fixtures are one drive, so both have the same boxes, each at the stamps that it knows."""
+    drive = next(raw.glob("*/*_sync"))
+    plain = open_log(raw, format="kitti")
+    assert (plain.labels, plain.ignored_regions) == (None, {})
+    (drive / "label_02.txt").write_text((tracking / "training" / "label_02" / "0007.txt").read_text())
+    a, b = open_log(raw, format="kitti"), open_log(tracking, format="kitti-tracking")
+    np.testing.assert_allclose(a.labels.center_m, b.labels.center_m, atol=1e-9)
+    np.testing.assert_allclose(a.labels.yaw_rad, b.labels.yaw_rad, atol=1e-12)
+    assert a.labels.track_id.tolist() == ["5", "6"]
+    stamps = a.streams["image_02"].t_ns
+    assert a.labels.t_ns.tolist() == stamps[[1, 2]].tolist()
+    assert a.ignored_regions["image_02"].t_ns.tolist() == stamps[[0]].tolist()
+    assert a.labels.cameras == ("image_02",)
+    assert a.digest != plain.digest
+    (drive / "image_02" / "data" / f"{0:010d}.jpg").unlink()
+    assert open_log(raw, format="kitti").labels.t_ns.tolist() == stamps[[1, 2]].tolist()
+    edit(drive / "label_02.txt", "2 6 Person", "9 6 Person")
+    with pytest.raises(LogError, match=r"label_02.txt: frame 9, but .*timestamps.txt has 4 lines"):
+        open_log(raw, format="kitti")
+
+
 def test_rotation_about_the_camera_axis_turns_clockwise_in_the_map() -> None:
     """With the camera looking along the map's x, rotation_y 0 points to the camera's right, the map's -y."""
     map_T_rect = np.eye(4)[None].repeat(3, 0)
@@ -269,6 +299,19 @@ def test_label_boxes_of_the_recorded_drive_hold_the_points_of_their_cars(real_da
     assert np.mean(inside > 20) > 0.9
     assert inside.sum() / around.sum() > 0.8
     assert log.labels.center_m[log.labels.category == "car", 2].mean() == pytest.approx(0.9, abs=0.5)
+
+
+@pytest.mark.real
+def test_dont_care_boxes_of_the_recorded_drive_are_where_no_label_is(real_data: Path) -> None:
+    """80 frames of sequence 0000 have 130 such boxes by count of the file's lines, none at the place of a label."""
+    log = open_log(real_data / "kitti_tracking")
+    regions, boxes = log.ignored_regions["image_02"], log.image_labels["image_02"]
+    text = (real_data / "kitti_tracking" / "training" / "label_02" / "0000.txt").read_text()
+    assert len(regions.t_ns) == text.count("DontCare") == 130
+    for t in np.unique(regions.t_ns):
+        a, b = regions.box_px[regions.t_ns == t][:, None], boxes.box_px[boxes.t_ns == t][None]
+        overlap = np.clip(np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2]), 0, None).prod(-1)
+        assert np.all(overlap < 0.5 * (b[..., 2:] - b[..., :2]).prod(-1))
 
 
 @pytest.mark.real

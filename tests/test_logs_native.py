@@ -429,7 +429,7 @@ def test_a_missing_or_unknown_folder_says_what_is_expected(tmp_path: Path) -> No
         open_log(tmp_path)
     with pytest.raises(LogError, match="holds no sequence of format 'kitti'"):
         open_log(tmp_path, format="kitti")
-    with pytest.raises(ConfigError, match=r"unknown log 'kiti'.*did you mean 'kitti'"):
+    with pytest.raises(ConfigError, match=r"unknown log format 'kiti'.*did you mean 'kitti'"):
         open_log(tmp_path, format="kiti")
     (tmp_path / "file").write_text("x")
     with pytest.raises(LogError, match="is a file"):

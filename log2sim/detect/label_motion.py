@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import NS_PER_S, Array, bev_iou, box_corners_bev, wrap_angle
+from log2sim.geometry import NS_PER_S, Array, box_corners_bev, wrap_angle
 
 MAX_AGE_S = 0.055  # a box without a partner on the other side of the frame is used up to this age
 MAX_WINDOW_S = 1.1  # labels at 1 Hz and denser are interpolated
@@ -93,19 +93,33 @@ def one_of_each(boxes: Boxes, index: NDArray[np.intp]) -> NDArray[np.intp]:
     -----
     Two objects never share ground, so boxes of different stamps that overlap are one object seen twice.
     """
-    kept: list[int] = []
-    corners = box_corners_bev(
-        boxes.center_m[index, :2], boxes.size_m[index, 0], boxes.size_m[index, 1], boxes.yaw_rad[index]
-    ) if len(index) else np.zeros((0, 4, 2))  # fmt: skip
-    reach = np.linalg.norm(boxes.size_m[index, :2], axis=1) / 2
-    for k, row in enumerate(index.tolist()):
-        near = (
-            np.linalg.norm(boxes.center_m[index[kept], :2] - boxes.center_m[row, :2], axis=1) < reach[k] + reach[kept]
-        )
-        other = boxes.t_ns[index[kept]] != boxes.t_ns[row]
-        if not any(bev_iou(corners[k], corners[kept[m]]) > 0 for m in np.flatnonzero(near & other)):
-            kept.append(k)
+    if not len(index):
+        return index
+    center, size, stamp = boxes.center_m[index, :2], boxes.size_m[index], boxes.t_ns[index]
+    reach = np.linalg.norm(size[:, :2], axis=1) / 2
+    near = np.linalg.norm(center[:, None] - center, axis=-1) < reach[:, None] + reach
+    k, m = np.nonzero(np.tril(near & (stamp[:, None] != stamp), -1))
+    corners = box_corners_bev(center, size[:, 0], size[:, 1], boxes.yaw_rad[index])
+    shared = share_ground(corners[k], corners[m])
+    earlier = np.zeros(near.shape, dtype=bool)
+    earlier[k[shared], m[shared]] = True
+    kept = np.ones(len(index), dtype=bool)
+    for row in np.flatnonzero(earlier.any(axis=1)):
+        kept[row] = not kept[earlier[row]].any()
     return index[kept]
+
+
+def share_ground(a: Array, b: Array) -> NDArray[np.bool_]:
+    """Whether rectangles overlap in pairs (P,), given as corners (P, 4, 2) in order; those that only touch do not.
+
+    Notes
+    -----
+    Separating axes: of two convex shapes that are apart, one has a side that all of the other lies beyond.
+    """
+    sides = np.concatenate([np.diff(corners[:, :3], axis=1) for corners in (a, b)], axis=1)
+    along_a, along_b = (np.einsum("pcd,psd->psc", corners, sides) for corners in (a, b))
+    apart = (along_a.max(-1) <= along_b.min(-1)) | (along_b.max(-1) <= along_a.min(-1))
+    return np.asarray(~apart.any(axis=1))
 
 
 def between(before: Boxes, after: Boxes, t_ns: int) -> Boxes:

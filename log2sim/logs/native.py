@@ -89,7 +89,7 @@ class _Folder:
         lidars = {s.name: _shifted_lidar(s, offset) for s in sensors if isinstance(s, Lidar)}
         ego = m.get("ego", {})
         default = EgoVehicle()
-        size = tuple(float(v) for v in ego.get("size_m", default.size_m))
+        length, width, height = (float(v) for v in ego.get("size_m", default.size_m))
         return Log(
             name=m["name"],
             format=READER.name,
@@ -97,7 +97,9 @@ class _Folder:
             lidars=lidars,
             streams={e["name"]: self._stream(k, e, offset) for k, e in enumerate(m["sensors"])},
             ego=None if track is None else PoseTrack(track.t_ns, _shifted(track.map_T_ego, offset)),
-            ego_vehicle=EgoVehicle(size, float(ego.get("rear_axle_offset_m", default.rear_axle_offset_m))),  # type: ignore[arg-type]
+            ego_vehicle=EgoVehicle(
+                (length, width, height), float(ego.get("rear_axle_offset_m", default.rear_axle_offset_m))
+            ),
             map=replace(map_frame, offset_m=tuple(offset.tolist())),
             labels=None if labels is None else _shifted_labels(labels, offset),
             image_labels={} if boxes is None else boxes_2d(boxes, set(cameras)),

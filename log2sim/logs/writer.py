@@ -114,7 +114,7 @@ def _write(log: Log, root: Path, jpeg_quality: int, ego: str, sweep: str, progre
         _write_index(stream, files, root / entry["index"])
     _write_ego(log, root, manifest, ego)
     _write_labels(log, root, manifest, offset)
-    check(manifest, "log-1", ConfigError)  # type: ignore[arg-type]
+    check(manifest, "log-1", ConfigError)
     (root / MANIFEST).write_text(json.dumps(manifest, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 

@@ -22,8 +22,6 @@ from log2sim.types import TYPICAL_SIZE_M, Camera, Detections, Measurements
 
 __all__ = ["Cloud", "View", "assemble_cloud", "measure_view", "project_cloud", "to_map"]
 
-# Obstacles between the road and what hangs over it.
-LOWEST_M, HIGHEST_M = 0.2, 4.2
 BORDER_PX = 3.0
 KEPT_POINTS = 400
 
@@ -44,21 +42,14 @@ def measure_view(view: View, detections: Detections, cloud: Cloud | None, *, mod
     if cloud is None or m == 0:
         return Measurements(**columns)
     if mode == "paper":
-        keep = np.ones(len(cloud.xyz), dtype=bool)
+        points, points_xyz, margin = np.arange(len(cloud.xyz)), cloud.xyz, 0.0
     else:
-        keep = ~cloud.ground & (cloud.height > LOWEST_M) & (cloud.height < HIGHEST_M)
-    obstacles = np.flatnonzero(keep)
-    seen, uv, depth = project_cloud(view, cloud, obstacles)
-    index = obstacles[seen]
-    xyz = cloud.xyz[index]
+        points, points_xyz, margin = cloud.obstacles, cloud.obstacles_xyz, MARGIN
+    seen, uv, depth = _project(view, cloud.origin, points_xyz)
+    index, xyz = points[seen], points_xyz[seen]
     range_m = np.linalg.norm(xyz - cloud.sensor, axis=1)
     clusters = list(columns["cluster"])
-    wide = detections.box_px + (MARGIN if mode == "robust" else 0.0) * np.tile(
-        detections.box_px[:, 2:] - detections.box_px[:, :2], 2
-    ) * [-1, -1, 1, 0]
-    inside = [
-        np.flatnonzero((uv[:, 0] >= b[0]) & (uv[:, 0] <= b[2]) & (uv[:, 1] >= b[1]) & (uv[:, 1] <= b[3])) for b in wide
-    ]
+    inside = _inside(uv, detections.box_px, margin)
     if mode == "paper":
         for k, box in enumerate(detections.box_px):
             _measure_as_paper(columns, k, box, uv[inside[k]], xyz[inside[k]], cloud)
@@ -73,11 +64,22 @@ def measure_view(view: View, detections: Detections, cloud: Cloud | None, *, mod
             continue
         members = index[chosen]
         if columns["truncated"][k]:
-            members = np.union1d(members, obstacles[grow(cloud.xyz[obstacles, :2], cloud.xyz[members, :2], category)])
+            members = np.union1d(members, points[grow(points_xyz[:, :2], cloud.xyz[members, :2], category)])
         columns["height_px_m"][k] = (box[3] - box[1]) * float(np.median(depth[chosen])) / view.camera.K[1, 1]
         clusters[k] = _fill_row(columns, k, members, category, cloud)
     columns["cluster"] = tuple(clusters)
     return Measurements(**columns)
+
+
+def _inside(uv: Array, box_px: Array, margin: float) -> list[NDArray[np.intp]]:
+    """Indices of the pixels (N, 2) in each box (M, 4), widened by a share of its sides but not downward."""
+    u, v = np.ascontiguousarray(uv.T)
+    found = []
+    for u0, v0, u1, v1 in box_px.tolist():
+        wide, high = margin * (u1 - u0), margin * (v1 - v0)
+        column = np.flatnonzero((u >= u0 - wide) & (u <= u1 + wide))
+        found.append(column[(v[column] >= v0 - high) & (v[column] <= v1)])
+    return found
 
 
 def _blank(view: View, detections: Detections) -> dict[str, Any]:
@@ -93,6 +95,7 @@ def _blank(view: View, detections: Detections) -> dict[str, Any]:
         "camera": np.full(m, view.camera.name),
         "box_px": box,
         "truncated": cut,
+        "ends_seen": np.zeros((m, 2), dtype=bool),
         "center_m": np.full((m, 3), np.nan),
         "size_m": size,
         "yaw_rad": np.full(m, np.nan),
@@ -109,7 +112,11 @@ def _fill_row(columns: dict[str, Any], k: int, members: NDArray[np.intp], catego
     """Write what one cluster says into row `k` and return its points in the map frame."""
     xyz = cloud.xyz[members].astype(np.float64)
     ground_z = float(np.median(xyz[:, 2] - cloud.height[members]))
-    center, size, yaw, covariance = boxfit.box_of_cluster(xyz, cloud.sensor.astype(np.float64), category, ground_z)
+    ends_seen = cloud.panorama.ends_seen(members)
+    center, size, yaw, covariance = boxfit.box_of_cluster(
+        xyz, cloud.sensor.astype(np.float64), category, ground_z, ends_seen
+    )
+    columns["ends_seen"][k] = ends_seen
     columns["center_m"][k] = center + cloud.origin
     columns["size_m"][k], columns["yaw_rad"][k], columns["covariance"][k] = size, yaw, covariance
     columns["points"][k], columns["source"][k] = len(members), "lidar"
@@ -133,7 +140,12 @@ def _measure_as_paper(
 
 
 def project_cloud(view: View, cloud: Cloud, index: NDArray[np.intp]) -> tuple[NDArray[np.intp], Array, Array]:
-    """Which of the cloud's points at `index` the camera sees, their pixels (n, 2) and depths (n,).
+    """Which of the cloud's points at `index` the camera sees, their pixels (n, 2) and depths (n,)."""
+    return _project(view, cloud.origin, cloud.xyz[index])
+
+
+def _project(view: View, origin: Array, xyz: NDArray[np.float32]) -> tuple[NDArray[np.intp], Array, Array]:
+    """Which of the points (N, 3) relative to `origin` the camera sees, their pixels (n, 2) and depths (n,).
 
     Notes
     -----
@@ -141,13 +153,12 @@ def project_cloud(view: View, cloud: Cloud, index: NDArray[np.intp]) -> tuple[ND
     goes through the lens.
     """
     cam_R_map = view.map_T_cam[:3, :3].T
-    offset = cam_R_map @ (cloud.origin - view.map_T_cam[:3, 3])
-    points = cloud.xyz[index] @ cam_R_map.T.astype(np.float32) + offset.astype(np.float32)
-    camera, z = view.camera, points[:, 2]
+    offset = cam_R_map @ (origin - view.map_T_cam[:3, 3])
+    points = cam_R_map.astype(np.float32) @ xyz.T + offset.astype(np.float32)[:, None]
+    camera, (x, y, z) = view.camera, points
     margin = 1.0 if camera.distortion_model == "none" else 1.3
     left, right = margin * camera.K[0, 2] / camera.K[0, 0], margin * (camera.width_px - camera.K[0, 2]) / camera.K[0, 0]
     up, down = margin * camera.K[1, 2] / camera.K[1, 1], margin * (camera.height_px - camera.K[1, 2]) / camera.K[1, 1]
-    x, y = points[:, 0], points[:, 1]
     rough = np.flatnonzero((z > 0.1) & (x > -left * z) & (x < right * z) & (y > -up * z) & (y < down * z))
-    uv, inside = project(camera, points[rough])
-    return rough[inside], uv[inside], np.asarray(z[rough[inside]], dtype=np.float64)
+    uv, inside = project(camera, points[:, rough].T)
+    return rough[inside], uv[inside], z[rough[inside]].astype(np.float64)

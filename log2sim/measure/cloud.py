@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import NS_PER_S, Array
+from log2sim.measure.ends import Panorama
 from log2sim.measure.ground import ON_GROUND_M, estimate_ground
 from log2sim.types import Log, Sweep
 
 # Rotation is held within one bin: at 1 rad/s and 50 m this is 2.5 cm; translation is interpolated for every point.
 POSE_BIN_NS = 500_000
 MOST_POSE_BINS = 4096
+# Obstacles stand between the road and what hangs over it.
+LOWEST_M, HIGHEST_M = 0.2, 4.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +37,21 @@ class Cloud:
     sensor: NDArray[np.float32]
     ground: NDArray[np.bool_]
     height: NDArray[np.float32]
+
+    @cached_property
+    def obstacles(self) -> NDArray[np.intp]:
+        """Indices (n,) of the points that stand on the road."""
+        return np.flatnonzero(~self.ground & (self.height > LOWEST_M) & (self.height < HIGHEST_M))
+
+    @cached_property
+    def obstacles_xyz(self) -> NDArray[np.float32]:
+        """The points (n, 3) at `obstacles`, for the cameras that share the cloud."""
+        return self.xyz[self.obstacles]
+
+    @cached_property
+    def panorama(self) -> Panorama:
+        """The points by azimuth around the sensor."""
+        return Panorama.of(self.xyz, self.sensor, self.ground)
 
 
 def to_map(log: Log, lidar: str, sweep: Sweep, *, compensate: bool) -> tuple[Array, NDArray[np.float32]] | None:

@@ -64,7 +64,8 @@ def candidates(
     what stands in front covers a part of it, and the background shows only around the object. Of clusters that fill the
     box alike the nearer one is the object. What goes on outside the box is a wall or a hedge.
     """
-    inside = np.flatnonzero(((uv >= box_px[:2]) & (uv <= box_px[2:])).all(axis=1))
+    u, v = uv.T
+    inside = np.flatnonzero((u >= box_px[0]) & (u <= box_px[2]) & (v >= box_px[1]) & (v <= box_px[3]))
     if len(inside) < LEAST_POINTS:
         return []
     cell_m = CELL_M[GROUP_OF[category]]
@@ -80,9 +81,8 @@ def candidates(
     nearest_m = middle_m[enough].min()
     low, high = _ends(xyz[inside[order], :2], first)
     members = {int(g): inside[order[first[g] : first[g] + count[g]]] for g in np.flatnonzero(enough)}
-    for g in np.flatnonzero(
-        enough & ((np.hypot(*(high - low).T) > LONGEST_M[category]) | (count > MOST_SCORED_POINTS))
-    ):
+    too_long = np.hypot(*(high - low).T) > LONGEST_M[category]
+    for g in np.flatnonzero(enough & (too_long | (count > MOST_SCORED_POINTS))).tolist():
         members[g] = cropped = within_length(xyz, members[g], range_m, LONGEST_M[category])
         sample = uv[subsample(cropped, MOST_SCORED_POINTS)]
         span[g] = np.concatenate([sample.min(axis=0), sample.max(axis=0)])
@@ -113,16 +113,18 @@ def _goes_on(
     cell_m: float,
 ) -> NDArray[np.bool_]:
     """Which clusters (L,) go on beyond two of the left, the right and the upper side of the box, in its margin."""
-    from scipy.ndimage import grey_dilation
+    import cv2
 
     count = np.bincount(labels)
-    outside = np.flatnonzero(((uv < box_px[:2]) | (uv > box_px[2:])).any(axis=1) & (uv[:, 1] <= box_px[3]))
-    cell = np.floor((xyz[outside, :2] - corner) / cell_m).astype(np.intp)
-    on_grid = ((cell >= 0) & (cell < grid.shape)).all(axis=1)
-    outside, cell = outside[on_grid], cell[on_grid]
-    owner = grey_dilation(grid, size=(3, 3))[cell[:, 0], cell[:, 1]]
+    u, v = uv.T
+    outside = np.flatnonzero(((u < box_px[0]) | (u > box_px[2]) | (v < box_px[1])) & (v <= box_px[3]))
+    i, j = np.floor((xyz[outside, :2] - corner) / cell_m).astype(np.intp).T
+    on_grid = (i >= 0) & (i < grid.shape[0]) & (j >= 0) & (j < grid.shape[1])
+    outside, i, j = outside[on_grid], i[on_grid], j[on_grid]
+    # OpenCV knows no wider integers; single precision holds every label exactly.
+    owner = cv2.dilate(grid.astype(np.float32), np.ones((3, 3)))[i, j].astype(np.intp)
     sides = np.zeros(len(count), dtype=np.int64)
-    u, v = uv[outside].T
+    u, v = u[outside], v[outside]
     within = (u >= box_px[0]) & (u <= box_px[2])
     for rows in (u < box_px[0], u > box_px[2], within & (v < box_px[1])):
         beyond = np.bincount(owner[rows & (owner >= 0)], minlength=len(count))

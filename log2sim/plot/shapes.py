@@ -12,6 +12,9 @@ from log2sim.plot.cast import path
 from log2sim.plot.view import View
 from log2sim.scenario import Agent
 
+# A track that leaves the sheet by far is no reason to draw for hours.
+MOST_ARROWS = 100
+
 
 def boxes(agent: Agent, xy_m: ArrayLike, yaw_rad: ArrayLike) -> Array:
     """Footprints (M, 4, 2) of an agent at M poses."""
@@ -49,7 +52,7 @@ def arrows(xy_m: Array, view: View, spacing_pt: float = 110.0, size_pt: float = 
     length = way[-1] / view.m_per_pt
     if length < 26:
         return []
-    count = max(1, round(length / spacing_pt))
+    count = min(max(1, round(length / spacing_pt)), MOST_ARROWS)
     size = size_pt * view.m_per_pt
     out = []
     for fraction in (np.arange(count) + 0.5) / count:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from log2sim.geometry import Array
 from log2sim.replay.collisions import Boxes, collisions
 from log2sim.replay.metrics import agent_metrics, overall
-from log2sim.replay.reference import Path
+from log2sim.replay.path import Path
 from log2sim.replay.result import AgentReplay, Replay
 from log2sim.replay.rollout import Clock, Tracks
 from log2sim.replay.vehicle import WHEELED
@@ -34,7 +35,8 @@ def assemble(
         if agent.id in tracks:
             driver, path, flags = home[agent.id]
             steps, states = tracks[agent.id]
-            agents.append(_moved(agent, driver, model, path, flags, clock.begin_s + steps * clock.dt_s, states))
+            t_s: Array = clock.begin_s + steps.astype(np.float64) * clock.dt_s
+            agents.append(_moved(agent, driver, model, path, flags, t_s, states))
             stored.append(steps)
         else:
             replayed, steps = _posed(agent, clock)
@@ -66,8 +68,11 @@ def _moved(
     if np.isnan(accel).any():
         accel = np.gradient(speed, t_s) if len(t_s) > 1 else np.zeros(len(t_s))
     z = np.interp(t_s, path.t_s, path.z_m)
-    columns = (np.round(c, DIGITS) for c in (x, y, z, yaw, speed, steer, accel))
-    return AgentReplay(agent.id, agent.category, agent.size_m, driver, model, np.round(t_s, 9), *columns, flags=flags)
+    x, y, z, yaw, speed, steer, accel = (np.round(c, DIGITS) for c in (x, y, z, yaw, speed, steer, accel))
+    t_s = np.round(t_s, 9)
+    return AgentReplay(
+        agent.id, agent.category, agent.size_m, driver, model, t_s, x, y, z, yaw, speed, steer, accel, flags
+    )
 
 
 def _posed(agent: Agent, clock: Clock) -> tuple[AgentReplay, NDArray[np.intp]]:
@@ -83,24 +88,26 @@ def _posed(agent: Agent, clock: Clock) -> tuple[AgentReplay, NDArray[np.intp]]:
     first, last = clock.first_step(np.array([begin_s]))[0], clock.last_step(np.array([until_s]))[0]
     every = clock.store_every
     steps = np.arange(-(-first // every) * every, last + 1, every) if agent.static else np.zeros(0, dtype=np.intp)
-    pose = (np.full(len(t_s), round(float(c[0]), DIGITS)) for c in (w.x_m, w.y_m, w.z_m, w.yaw_rad))
+    x, y, z, yaw = (np.full(len(t_s), round(float(c[0]), DIGITS)) for c in (w.x_m, w.y_m, w.z_m, w.yaw_rad))
     speed = np.full(len(t_s), 0.0 if agent.static else float(w.speed_mps[0]))
     zero = np.zeros(len(t_s))
     driver = "static" if agent.static else "exact"
-    return AgentReplay(agent.id, agent.category, agent.size_m, driver, "none", t_s, *pose, speed, zero, zero), steps
+    replayed = AgentReplay(agent.id, agent.category, agent.size_m, driver, "none", t_s, x, y, z, yaw, speed, zero, zero)
+    return replayed, steps
 
 
 def _measure(
     agents: Sequence[AgentReplay], stored: Sequence[NDArray[np.intp]], paths: dict[str, Path], clock: Clock
-) -> dict:
+) -> dict[str, Any]:
     """All metrics: tracking by agent and overall, collisions."""
-    by_agent: dict[str, dict] = {}
+    by_agent: dict[str, dict[str, Any]] = {}
     for a in agents:
         if a.id in paths:
             by_agent[a.id] = agent_metrics(paths[a.id], a.t_s, a.x_m, a.y_m, a.yaw_rad, a.speed_mps)
     replayed, logged = (_boxes(agents, stored, source, clock) for source in ({}, paths))
     moves = np.array([a.driver != "static" for a in agents], dtype=bool)
-    t_s = clock.begin_s + np.arange(len(replayed.x_m)) * clock.store_every * clock.dt_s
+    rows = np.arange(len(replayed.x_m), dtype=np.float64)
+    t_s = clock.begin_s + rows * (clock.store_every * clock.dt_s)
     events = collisions(replayed, logged, moves, t_s, [a.id for a in agents])
     for k, values in by_agent.items():
         values["collisions"] = [e for e in events if k in e["agents"]]
@@ -118,11 +125,12 @@ def _boxes(
         rows = steps // clock.store_every
         if agent.id in paths:
             x, y, yaw, speed = paths[agent.id].centers(agent.t_s)
-            columns[:, rows, k] = x, y, agent.z_m, yaw, speed
+            columns[:, rows, k] = np.stack([x, y, agent.z_m, yaw, speed])
         elif len(rows) == len(agent):
             columns[:, rows, k] = agent.x_m, agent.y_m, agent.z_m, agent.yaw_rad, agent.speed_mps
         elif len(rows):  # one pose for all rows
             pose = [agent.x_m[0], agent.y_m[0], agent.z_m[0], agent.yaw_rad[0], agent.speed_mps[0]]
             columns[:, rows, k] = np.array(pose)[:, None]
     size = np.array([a.size_m for a in agents], dtype=np.float64).reshape(-1, 3)
-    return Boxes(*columns, size_m=size)
+    x, y, z, yaw, speed = columns
+    return Boxes(x, y, z, yaw, speed, size)

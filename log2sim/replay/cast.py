@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.replay.reference import (
-    MAX_CURVATURE_1PM,
-    Reference,
-    path_of,
-    point_reference,
-    tape_reference,
-    vehicle_reference,
-)
+from log2sim.replay.drivable import LOCK_SHARE, Limits
+from log2sim.replay.path import path_of
+from log2sim.replay.reference import MAX_CURVATURE_1PM, Reference, point_reference, tape_reference, vehicle_reference
 from log2sim.replay.rollout import Clock
 from log2sim.replay.simulator import Simulator
 from log2sim.replay.vehicle import PEDAL_LAG_S, STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
@@ -59,8 +55,17 @@ def groups_of(cast: Mapping[str, Sequence[Agent]], clock: Clock, simulator: Simu
 
 def _vehicle_reference(agent: Agent, dt_s: float) -> Reference:
     """A vehicle's table: feed-forward is ahead by the actuator's lag and by half the step for which it is held."""
+    p = parameters_for([agent])
+    wheelbase_m = float(p.wheelbase_m[0])
+    limits = Limits(
+        offset_m=float(p.rear_axle_offset_m[0]),
+        max_curvature_1pm=LOCK_SHARE * math.tan(p.max_steer_rad[0]) / wheelbase_m,
+        max_curvature_rate_1pmps=float(p.max_steer_rate_radps[0]) / wheelbase_m,
+        max_accel_mps2=float(p.max_brake_mps2[0]),
+    )
     return vehicle_reference(
-        path_of(agent, rear_axle_offset(agent)),
+        path_of(agent, limits.offset_m),
+        limits,
         accel_ahead_s=PEDAL_LAG_S + dt_s / 2,
         curvature_ahead_s=STEER_LAG_S + dt_s / 2,
         max_curvature_1pm=MAX_CURVATURE_1PM

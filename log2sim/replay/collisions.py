@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,8 @@ CHUNK = 20
 """Samples that share one broad phase."""
 
 SAME_CONTACT_S = 0.5  # contacts of a pair that are nearer in time are one collision
-LOG_WINDOW_S = 1.0  # a replayed collision counts as the log's when the log's boxes overlap this near in time
+LOG_WINDOW_S = 0.5  # a replayed collision is the log's when the log's boxes overlap this near in time,
+LOG_MARGIN_M = 0.1  # or pass with less room than this, which is less than boxes err by
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,14 +97,15 @@ def rectangles_overlap(
 
 def collisions(
     replayed: Boxes, logged: Boxes, moves: NDArray[np.bool_], t_s: Array, ids: Sequence[str]
-) -> list[dict[str, object]]:
+) -> list[dict[str, Any]]:
     """Collisions of a replay in order of time: the pair, first and last contact, relative speed, and if the log has it."""
-    log_sample, log_a, log_b = overlaps(logged, moves)
+    grown = replace(logged, size_m=logged.size_m + np.array([LOG_MARGIN_M, LOG_MARGIN_M, 0.0]))
+    log_sample, log_a, log_b = overlaps(grown, moves)
     known: dict[tuple[int, int], Array] = {}
     for pair in set(zip(log_a.tolist(), log_b.tolist())):
         known[pair] = t_s[log_sample[(log_a == pair[0]) & (log_b == pair[1])]]
     sample, first, second = overlaps(replayed, moves)
-    events: list[dict[str, object]] = []
+    events: list[dict[str, Any]] = []
     for a, b in sorted(set(zip(first.tolist(), second.tolist()))):
         contact = np.sort(sample[(first == a) & (second == b)])
         for run in np.split(contact, np.flatnonzero(np.diff(t_s[contact]) > SAME_CONTACT_S) + 1):
@@ -118,7 +121,7 @@ def collisions(
                     "in_log": shared,
                 }
             )
-    return sorted(events, key=lambda e: (e["t_s"], e["agents"]))  # type: ignore[arg-type, return-value]
+    return sorted(events, key=lambda e: (e["t_s"], e["agents"]))
 
 
 def _relative_speed(boxes: Boxes, s: int, a: int, b: int) -> float:

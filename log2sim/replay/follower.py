@@ -27,6 +27,7 @@ class Gains:
     point_s: float = 0.3
     hold_below_mps: float = 0.05
     hold_brake_mps2: float = 2.0
+    hold_within_m: float = 0.1  # a vehicle that stopped shorter than this drives up
     max_lateral_accel_mps2: float = 9.0  # grip of a dry road
 
 
@@ -76,7 +77,11 @@ def follow_vehicles(
     along_rate = memory.along_rate_mps + blend * (speed - state.speed_mps - memory.along_rate_mps)
     across_slope = memory.across_slope + blend * (slope - memory.across_slope)
     gear = np.where(state.speed_mps == 0, reference_gear, np.sign(state.speed_mps))
-    held = (stands > 0.5) & (np.abs(state.speed_mps) < gains.hold_below_mps)
+    held = (
+        (stands > 0.5)
+        & (np.abs(state.speed_mps) < gains.hold_below_mps)
+        & (along * reference_gear < gains.hold_within_m)
+    )
 
     pedal, along_integral = _pedal(
         along, along_rate, accel, gear, held, memory.along_integral_mps2, parameters, dt_s, gains

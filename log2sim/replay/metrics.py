@@ -9,10 +9,11 @@ import numpy as np
 
 from log2sim.errors import CheckFailed
 from log2sim.geometry import Array, wrap_angle
-from log2sim.replay.reference import Path
+from log2sim.replay.path import Path
 
 SEARCH_S = 1.0
 SEARCH_STEP_S = 0.05
+STANDING_MPS = 0.1
 
 CROSS_TRACK_LIMIT_M = 0.5
 """Limit of a strict replay: a car of 1.9 m in a lane of 3.5 m has 0.8 m on either side."""
@@ -21,18 +22,27 @@ CROSS_TRACK_LIMIT_M = 0.5
 def tracking_errors(path: Path, t_s: Array, x_m: Array, y_m: Array) -> tuple[Array, Array]:
     """Errors across and along the logged path, (S,) each in m, left and ahead positive.
 
-    Along: from the logged box center at the same time, in the direction of its heading. Across: from the logged path at
-    the time within `SEARCH_S` at which it is nearest, so being late in a curve is no error across.
+    Along: from the logged box center at the same time, in the direction of its heading. Across: distance from the nearest
+    point of the course of logged box centers within `SEARCH_S`, so being late in a curve is no error across. Where the
+    nearest point is an end of that course, or the log stands, what lies along its direction counts as along.
     """
     log_x, log_y, log_yaw, _ = path.centers(t_s)
     along = (x_m - log_x) * np.cos(log_yaw) + (y_m - log_y) * np.sin(log_yaw)
-    shift = np.arange(-SEARCH_S, SEARCH_S + SEARCH_STEP_S / 2, SEARCH_STEP_S)
-    times = t_s[:, None] + shift
-    px, py, _, _ = (v.reshape(times.shape) for v in path.centers(times.ravel()))
-    nearest = times[np.arange(len(t_s)), np.argmin(np.hypot(px - x_m[:, None], py - y_m[:, None]), axis=1)]
-    near_x, near_y, near_yaw, _ = path.centers(nearest)
-    across = (y_m - near_y) * np.cos(near_yaw) - (x_m - near_x) * np.sin(near_yaw)
-    return across, along
+    times = t_s[:, None] + np.arange(-SEARCH_S, SEARCH_S + SEARCH_STEP_S / 2, SEARCH_STEP_S)
+    px, py, yaw, _ = (v.reshape(times.shape) for v in path.centers(times.ravel()))
+    ux, uy = np.diff(px, axis=1), np.diff(py, axis=1)
+    dx, dy = x_m[:, None] - px[:, :-1], y_m[:, None] - py[:, :-1]
+    square = ux**2 + uy**2
+    moves = square > (STANDING_MPS * SEARCH_STEP_S) ** 2
+    share = np.clip(np.divide(dx * ux + dy * uy, square, out=np.zeros_like(square), where=moves), 0.0, 1.0)
+    nearest = np.argmin(np.hypot(dx - share * ux, dy - share * uy), axis=1)
+    row = np.arange(len(t_s))
+    length = np.sqrt(np.where(moves, square, 1.0))
+    cos, sin = np.where(moves, ux / length, np.cos(yaw[:, :-1])), np.where(moves, uy / length, np.sin(yaw[:, :-1]))
+    across = dy * cos - dx * sin
+    # A vehicle that reverses has its left on the other side of its course.
+    behind = cos * np.cos(yaw[:, :-1]) + sin * np.sin(yaw[:, :-1]) < 0
+    return np.where(behind, -across, across)[row, nearest], along
 
 
 def agent_metrics(path: Path, t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps: Array) -> dict[str, float]:

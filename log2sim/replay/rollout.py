@@ -137,7 +137,12 @@ def _observe(ego: Driven, groups: Sequence[Group], statics: Sequence[Agent], clo
     t_s, s, p = clock.time(step), ego.snapshot(), ego.living
     agent = ego.agents[0]
     state = EgoState(
-        *(float(v[0]) for v in (s.x_m, s.y_m, s.yaw_rad, s.speed_mps, s.accel_mps2, s.steer_rad)),
+        x_m=float(s.x_m[0]),
+        y_m=float(s.y_m[0]),
+        yaw_rad=float(s.yaw_rad[0]),
+        speed_mps=float(s.speed_mps[0]),
+        accel_mps2=float(s.accel_mps2[0]),
+        steer_rad=float(s.steer_rad[0]),
         length_m=agent.size_m[0],
         width_m=agent.size_m[1],
         wheelbase_m=float(p.wheelbase_m[0]),

@@ -43,7 +43,7 @@ class Group(ABC):
         self.agents, self.references, self.first, self.last = tuple(agents), tuple(references), first, last
         self.origin_x_m = np.array([r.path.origin_m[0] for r in references])
         self.origin_y_m = np.array([r.path.origin_m[1] for r in references])
-        self.offset_m = np.array([r.path.offset_m for r in references])
+        self.offset_m = np.array([r.offset_m for r in references])
         self.live = np.zeros(0, dtype=np.intp)
         self.row = np.zeros((0, 0))
 
@@ -93,9 +93,7 @@ class Tape(Group):
     def snapshot(self) -> Snapshot:
         x, y, yaw, speed = self.row[:4]
         unknown = np.full(len(self.live), np.nan)
-        o = self.offset_m[self.live]
-        x = x + o * np.cos(yaw) + self.origin_x_m[self.live]
-        y = y + o * np.sin(yaw) + self.origin_y_m[self.live]
+        x, y = x + self.origin_x_m[self.live], y + self.origin_y_m[self.live]
         return Snapshot(x, y, wrap_angle(yaw), speed, np.zeros(len(self.live)), unknown)
 
 

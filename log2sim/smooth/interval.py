@@ -157,4 +157,4 @@ def _state_covariance(diagonal: Array, off: Array) -> Array:
         left[k] = off[k - 1].T @ np.linalg.solve(diagonal[k - 1] - left[k - 1], off[k - 1])
     for k in range(count - 2, -1, -1):
         right[k] = off[k] @ np.linalg.solve(diagonal[k + 1] - right[k + 1], off[k].T)
-    return np.linalg.inv(diagonal - left - right)
+    return np.asarray(np.linalg.inv(diagonal - left - right), dtype=np.float64)

@@ -262,7 +262,7 @@ class _Problem:
         normal = a.T @ a
         normal += np.trace(normal) * np.outer(direction, direction)
         try:
-            return -np.linalg.solve(normal, a.T @ b).reshape(3, 3)
+            return np.asarray(-np.linalg.solve(normal, a.T @ b).reshape(3, 3), dtype=np.float64)
         except np.linalg.LinAlgError:
             return None
 
