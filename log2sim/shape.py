@@ -57,7 +57,9 @@ def is_standing(track: Track) -> bool:
     third = max(len(m) // 3, 1)
     drift = np.median(xy[-third:], axis=0) - np.median(xy[:third], axis=0)
     span = np.median(t[-third:]) - np.median(t[:third])
-    spread = np.quantile(np.hypot(*(xy - np.median(xy, axis=0)).T), 0.9)
+    # Where little of it shows its center is a guess, so what the covariance explains is no motion.
+    guess = 2 * np.sqrt(np.linalg.eigvalsh(m.covariance)[:, -1])
+    spread = np.quantile(np.hypot(*(xy - np.median(xy, axis=0)).T) - guess, 0.9)
     moved = float(np.hypot(*drift))
     slow = moved < STANDING_MPS[group] * max(float(span), 1e-9) or moved < 0.35
     return bool(slow and moved < STANDING_DRIFT_M[group] and spread < 1.5 * STANDING_DRIFT_M[group])

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.camera import NEAREST_DEPTH_M, project
-from log2sim.geometry import Array, apply, box_corners, inverse, points_in_box
+from log2sim.geometry import Array, box_corners, inverse, points_in_box
 from log2sim.types import Camera
 
 # Corners as `box_corners` orders them: bottom 0-3, top 4-7, each counter-clockwise from the front left.
@@ -40,21 +40,23 @@ def project_boxes(center_m: Array, size_m: Array, yaw_rad: Array, camera: Camera
     count = len(center_m)
     box = np.full((count, 4), np.nan)
     valid, range_m = np.zeros(count, dtype=bool), np.full(count, np.nan)
-    corners = box_corners(center_m, size_m, yaw_rad) if count else np.zeros((0, 8, 3))
+    if not count:
+        return Projected(valid, box, range_m)
     planes = view_planes(camera)
     limit = np.array([camera.width_px, camera.height_px], dtype=np.float64)
     camera_map = inverse(cam_T_map)[None, :3, 3]
-    for i in range(count):
+    corners_cam = box_corners(center_m, size_m, yaw_rad) @ cam_T_map[:3, :3].T + cam_T_map[:3, 3]
+    inside = corners_cam @ planes[:, :3].T + planes[:, 3] >= 0  # (L, 8, 5)
+    for i in np.flatnonzero(np.all(inside.any(axis=1), axis=1)):
         if points_in_box(camera_map, center_m[i], size_m[i], float(yaw_rad[i]))[0]:
             continue
-        corners_cam = apply(cam_T_map, corners[i])
-        vertices = clip_box(corners_cam, planes)
+        vertices = corners_cam[i] if inside[i].all() else clip_box(corners_cam[i], planes)
         uv = project(camera, vertices)[0] if len(vertices) else np.zeros((0, 2))
         uv = np.clip(uv[np.isfinite(uv).all(axis=1)], 0, limit)
         if len(uv) >= 3 and np.all(np.ptp(uv, axis=0) > 0):
             valid[i] = True
             box[i] = np.concatenate([uv.min(axis=0), uv.max(axis=0)])
-            range_m[i] = np.linalg.norm(corners_cam, axis=1).min()
+            range_m[i] = np.linalg.norm(corners_cam[i], axis=1).min()
     return Projected(valid, box, range_m)
 
 

@@ -19,6 +19,8 @@ POSE_BIN_NS = 500_000
 MOST_POSE_BINS = 4096
 # Obstacles stand between the road and what hangs over it.
 LOWEST_M, HIGHEST_M = 0.2, 4.2
+GROUND_REACH_M = 45.0
+GROUND_SAMPLE = 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +54,12 @@ class Cloud:
     def panorama(self) -> Panorama:
         """The points by azimuth around the sensor."""
         return Panorama.of(self.xyz, self.sensor, self.ground)
+
+    @cached_property
+    def ground_sample(self) -> NDArray[np.intp]:
+        """Indices (n,) of every so-many-th of the ground points near the origin."""
+        index = np.flatnonzero(self.ground & (np.hypot(self.xyz[:, 0], self.xyz[:, 1]) < GROUND_REACH_M))
+        return index[:: max(len(index) // GROUND_SAMPLE, 1)]
 
 
 def to_map(log: Log, lidar: str, sweep: Sweep, *, compensate: bool) -> tuple[Array, NDArray[np.float32]] | None:

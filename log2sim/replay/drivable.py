@@ -24,7 +24,7 @@ JERK_MPS3 = 20.0  # and of what a driver does
 LATERAL_JERK_MPS3 = 20.0
 ROLL_M, ROLL_RAD, ROLL_MPS = 1e-3, 1e-3, 1e-2  # how exactly the wheels roll from knot to knot
 LOCK_SHARE = 0.95  # the rest of the lock is left to the controller
-BOUND = 0.02  # softness of limits, as a share of them
+BOUND = 0.002  # softness of limits, as a share of them
 
 ITERATIONS = 40
 DONE = 1e-4  # relative gain at which the iteration ends

@@ -1,0 +1,132 @@
+"""The nearest drivable course: drivable courses stay as they are, impossible ones become drivable."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from replay_maneuvers import MANEUVERS, agent_from, driven
+
+from log2sim.replay.drivable import Limits, _Problem, nearest_course
+from log2sim.replay.path import path_of
+from log2sim.replay.reference import drivable_course, vehicle_reference
+
+LIMITS = Limits(offset_m=1.3, max_curvature_1pm=0.27, max_curvature_rate_1pmps=0.37, max_accel_mps2=10.0)
+
+
+def rolling_error(course):
+    """How far each knot is from where a rear axle that rolls from the knot before would be, by small steps."""
+    h = np.diff(course.t_s)
+    parts = 200
+    f = (np.arange(parts) + 0.5) / parts
+    speed = course.speed_mps[:-1, None] + np.diff(course.speed_mps)[:, None] * f
+    curvature = course.curvature_1pm[:-1, None] + np.diff(course.curvature_1pm)[:, None] * f
+    step = h[:, None] / parts
+    yaw = course.yaw_rad[:-1, None] + np.cumsum(speed * curvature * step, axis=1) - speed * curvature * step / 2
+    x = course.x_m[:-1] + np.sum(speed * np.cos(yaw) * step, axis=1)
+    y = course.y_m[:-1] + np.sum(speed * np.sin(yaw) * step, axis=1)
+    return np.hypot(x - course.x_m[1:], y - course.y_m[1:])
+
+
+@pytest.mark.parametrize("name", MANEUVERS)
+def test_what_a_vehicle_drove_stays_as_it_is(name):
+    path = path_of(MANEUVERS[name](), 1.3)
+    course, departure_m = drivable_course(path, LIMITS)
+    assert departure_m.max() < 0.06
+    assert rolling_error(course).max() < 0.005
+
+
+def test_a_constant_turn_is_found_with_its_curvature_and_speed():
+    agent = driven(lambda t: np.full_like(t, 6.0), lambda s: np.full_like(s, -0.1), 4.0)
+    course, _ = drivable_course(path_of(agent, 1.3), LIMITS)
+    inner = slice(3, -3)
+    np.testing.assert_allclose(course.curvature_1pm[inner], -0.1, atol=1e-3)
+    np.testing.assert_allclose(course.speed_mps[inner], 6.0, atol=1e-2)
+
+
+def test_noise_in_position_and_heading_gives_a_course_that_rolls():
+    rng = np.random.default_rng(3)
+    agent = MANEUVERS["turn of radius 8 m"]()
+    w = agent.waypoints
+    noisy = agent_from(
+        w.t_s,
+        w.x_m + rng.normal(0, 0.1, len(w)),
+        w.y_m + rng.normal(0, 0.1, len(w)),
+        w.yaw_rad + rng.normal(0, 0.15, len(w)),
+        w.speed_mps,
+    )
+    course, _ = drivable_course(path_of(noisy, 1.3), LIMITS)
+    x = course.x_m + 1.3 * np.cos(course.yaw_rad) - (w.x_m - noisy.waypoints.x_m[0])[: len(course.t_s)]
+    y = course.y_m + 1.3 * np.sin(course.yaw_rad) - (w.y_m - noisy.waypoints.y_m[0])[: len(course.t_s)]
+    rms = np.sqrt(np.mean(x**2 + y**2))
+    assert rolling_error(course).max() < 0.01
+    assert rms < 0.1  # the noise is 0.14
+
+
+def test_a_turn_tighter_than_full_lock_is_widened_and_flagged():
+    agent = driven(lambda t: np.full_like(t, 3.0), lambda s: np.where(s > 4, 0.8, 0.0), 4.0)
+    path = path_of(agent, 1.3)
+    course, departure_m = drivable_course(path, LIMITS)
+    assert np.abs(course.curvature_1pm).max() < 0.30
+    assert departure_m.max() > 0.3
+    reference = vehicle_reference(path, LIMITS, accel_ahead_s=0.1, curvature_ahead_s=0.1)
+    assert any("distance from what can be driven" in flag for flag in reference.flags)
+    fine = path_of(MANEUVERS["turn of radius 8 m"](), 1.3)
+    assert vehicle_reference(fine, LIMITS, accel_ahead_s=0.1, curvature_ahead_s=0.1).flags == ()
+
+
+@pytest.mark.parametrize("turned", [[5], [20, 21, 22]])
+def test_boxes_turned_back_to_front_are_outvoted(turned):
+    agent = MANEUVERS["lane change"]()
+    w = agent.waypoints
+    yaw, speed = w.yaw_rad.copy(), w.speed_mps.copy()
+    yaw[turned] += np.pi
+    speed[turned] *= -1
+    right, _ = drivable_course(path_of(agent, 1.3), LIMITS)
+    course, _ = drivable_course(path_of(agent_from(w.t_s, w.x_m, w.y_m, yaw, speed), 1.3), LIMITS)
+    np.testing.assert_allclose(course.yaw_rad, right.yaw_rad, atol=0.02)
+    np.testing.assert_allclose(course.speed_mps, right.speed_mps, atol=0.1)
+
+
+def test_a_box_that_jitters_on_the_spot_does_not_turn():
+    rng = np.random.default_rng(1)
+    t = np.arange(50) * 0.1
+    agent = agent_from(t, rng.normal(0, 0.03, 50), rng.normal(0, 0.03, 50), np.full(50, 0.4), np.zeros(50))
+    course, _ = drivable_course(path_of(agent, 1.3), LIMITS)
+    assert np.abs(course.yaw_rad - 0.4).max() < 0.05
+    assert np.abs(course.speed_mps).max() < 0.1
+
+
+def test_shifting_and_turning_the_log_shifts_and_turns_the_course():
+    agent = MANEUVERS["reversing"]()
+    w = agent.waypoints
+    turn, (east, north) = 2.5, (3e6, -2e6)
+    x = east + np.cos(turn) * w.x_m - np.sin(turn) * w.y_m
+    y = north + np.sin(turn) * w.x_m + np.cos(turn) * w.y_m
+    one, _ = drivable_course(path_of(agent, 1.3), LIMITS)
+    other, _ = drivable_course(path_of(agent_from(w.t_s, x, y, w.yaw_rad + turn, w.speed_mps), 1.3), LIMITS)
+    np.testing.assert_allclose(other.x_m, np.cos(turn) * one.x_m - np.sin(turn) * one.y_m, atol=1e-4)
+    np.testing.assert_allclose(other.curvature_1pm, one.curvature_1pm, atol=1e-3)
+
+
+def test_the_gradient_is_that_of_the_cost():
+    rng = np.random.default_rng(0)
+    state = rng.normal(0, 0.5, (6, 6)) + np.array([0, 0, 0, 3.0, 0, 0])
+    state[:, 5] *= 2  # beyond the limit in places
+    logged = rng.normal(0, 1, (6, 4)) + np.array([0, 0, 0, 3.0])
+    problem = _Problem(0.1, logged, LIMITS)
+    _, _, gradient = problem.normal_equations(state)
+    numeric = np.zeros_like(state)
+    for index in np.ndindex(state.shape):
+        step = np.zeros_like(state)
+        step[index] = 1e-6
+        numeric[index] = (problem.cost(state + step) - problem.cost(state - step)) / 2e-6
+    # The chord's shortening is held constant in the derivative: second order in the angle of a knot.
+    np.testing.assert_allclose(gradient, numeric, rtol=0.02, atol=np.abs(numeric).max() * 0.02)
+
+
+def test_two_moments_suffice():
+    course = nearest_course(
+        np.array([0.0, 0.1]), np.array([0.0, 0.5]), np.zeros(2), np.zeros(2), np.full(2, 5.0), LIMITS
+    )
+    np.testing.assert_allclose(course.x_m + 1.3, [0.0, 0.5], atol=1e-3)
+    np.testing.assert_allclose(course.speed_mps, 5.0, atol=1e-2)

@@ -1,0 +1,120 @@
+"""Vehicle models against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from replay_maneuvers import agent_from
+
+from log2sim.replay.vehicle import (
+    PEDAL_LAG_S,
+    POINT_MAX_ACCEL_MPS2,
+    STEER_LAG_S,
+    PointControls,
+    PointState,
+    VehicleControls,
+    VehicleState,
+    parameters_for,
+    rear_axle_offset,
+    step_bicycle,
+    step_point,
+)
+
+CAR = parameters_for([agent_from([0.0], [0.0], [0.0], [0.0], [0.0])])
+
+
+def column(value):
+    return np.array([value], dtype=np.float64)
+
+
+def at_rest(*, speed=0.0, steer=0.0, pedal=0.0):
+    return VehicleState(column(0), column(0), column(0), column(speed), column(steer), column(pedal))
+
+
+def command(*, pedal=0.0, steer=0.0, reverse=False):
+    return VehicleControls(column(pedal), column(steer), np.array([reverse]))
+
+
+def run(state, controls, duration_s, dt_s):
+    for _ in range(round(duration_s / dt_s)):
+        state = step_bicycle(state, controls, CAR, dt_s)
+    return state
+
+
+@pytest.mark.parametrize("dt_s", [0.001, 0.01, 0.1, 1.0])
+@pytest.mark.parametrize("speed", [0.3, 5.0, 60.0])
+def test_constant_steering_drives_a_circle_of_wheelbase_over_tangent(dt_s, speed):
+    steer = 0.2
+    radius = CAR.wheelbase_m[0] / np.tan(steer)
+    turned = speed * 4.0 / radius
+    state = run(at_rest(speed=speed, steer=steer), command(steer=steer), 4.0, dt_s)
+    assert state.yaw_rad[0] == pytest.approx(turned, abs=1e-9)
+    assert state.x_m[0] == pytest.approx(radius * np.sin(turned), abs=1e-6)
+    assert state.y_m[0] == pytest.approx(radius * (1 - np.cos(turned)), abs=1e-6)
+
+
+def test_reversing_with_left_lock_turns_the_heading_right():
+    state = run(at_rest(speed=-2.0, steer=0.3), command(steer=0.3), 1.0, 0.01)
+    assert state.yaw_rad[0] == pytest.approx(-2.0 * np.tan(0.3) / CAR.wheelbase_m[0], abs=1e-9)
+    assert state.x_m[0] < -1.5
+
+
+@pytest.mark.parametrize("dt_s", [0.003, 0.01, 0.09])
+def test_braking_stops_after_the_stopping_distance_and_stays(dt_s):
+    speed, brake = 10.0, 5.0
+    state = run(at_rest(speed=speed, pedal=-brake), command(pedal=-brake), 3.0, dt_s)
+    assert state.speed_mps[0] == 0.0
+    assert state.x_m[0] == pytest.approx(speed**2 / (2 * brake), abs=1e-6)
+
+
+def test_the_pedal_follows_its_command_as_a_first_order_lag():
+    state = run(at_rest(speed=10.0), command(pedal=1.0), 0.25, 0.01)
+    assert state.pedal_mps2[0] == pytest.approx(1 - np.exp(-0.25 / PEDAL_LAG_S), abs=1e-9)
+    gained = 0.25 - PEDAL_LAG_S * (1 - np.exp(-0.25 / PEDAL_LAG_S))
+    assert state.speed_mps[0] == pytest.approx(10 + gained, abs=1e-9)
+
+
+def test_the_wheels_turn_no_faster_than_their_rate_and_no_further_than_the_lock():
+    early = run(at_rest(), command(steer=5.0), 0.2, 0.01)
+    late = run(at_rest(), command(steer=5.0), 5.0, 0.01)
+    assert early.steer_rad[0] == pytest.approx(0.2 * CAR.max_steer_rate_radps[0], abs=1e-9)
+    assert late.steer_rad[0] == pytest.approx(CAR.max_steer_rad[0], abs=1e-6)
+    assert np.all(CAR.steer_lag_s == STEER_LAG_S)
+
+
+def test_throttle_in_reverse_gear_drives_backward_from_rest_only():
+    assert run(at_rest(), command(pedal=1.0, reverse=True), 1.0, 0.01).speed_mps[0] < -0.5
+    assert run(at_rest(speed=3.0), command(pedal=1.0, reverse=True), 1.0, 0.01).speed_mps[0] > 3.5
+
+
+def test_a_step_in_one_or_in_two_halves_is_the_same_while_the_steering_is_constant():
+    state = at_rest(speed=20.0, steer=0.05, pedal=2.0)
+    controls = command(pedal=2.0, steer=0.05)
+    one = step_bicycle(state, controls, CAR, 0.02)
+    half = step_bicycle(state, controls, CAR, 0.01)
+    two = step_bicycle(half, controls, CAR, 0.01)
+    for key in ("x_m", "y_m", "yaw_rad", "speed_mps"):
+        assert getattr(one, key)[0] == pytest.approx(getattr(two, key)[0], abs=1e-5)
+    assert half.x_m[0] == pytest.approx(20.0 * 0.01, rel=1e-2)
+
+
+def test_a_point_follows_the_parabola_and_its_acceleration_is_limited():
+    state = PointState(column(1), column(2), column(3), column(-1))
+    for _ in range(100):
+        state = step_point(state, PointControls(column(0.5), column(-1.0)), 0.02)
+    assert state.x_m[0] == pytest.approx(1 + 3 * 2 + 0.5 * 4 / 2)
+    assert state.y_m[0] == pytest.approx(2 - 1 * 2 - 1.0 * 4 / 2)
+    pushed = step_point(state, PointControls(column(300.0), column(400.0)), 0.1)
+    gained = np.hypot(
+        pushed.velocity_x_mps - state.velocity_x_mps, pushed.velocity_y_mps - state.velocity_y_mps
+    )
+    assert gained[0] == pytest.approx(POINT_MAX_ACCEL_MPS2 * 0.1)
+
+
+def test_an_unknown_rear_axle_lies_behind_the_center_of_what_has_wheels():
+    def agent(category, offset_m):
+        return agent_from([0.0], [0.0], [0.0], [0.0], [0.0], category=category, offset_m=offset_m)
+
+    assert rear_axle_offset(agent("car", 1.1)) == 1.1
+    assert 1.0 < rear_axle_offset(agent("car", 0.0)) < 2.2
+    assert rear_axle_offset(agent("pedestrian", 1.1)) == 0.0

@@ -1,0 +1,553 @@
+"""Image-to-ground homographies: how near they come to what the data allow, and what they refuse."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from log2sim.camera import project
+from log2sim.geometry import apply, inverse, rotation_from_rpy, transform
+from log2sim.topdown import (
+    FOOT_SIGMA_PX,
+    Correspondences,
+    estimate_homography,
+    fit_camera,
+    foot_points,
+    jitter_m,
+    locate,
+)
+from log2sim.topdown.homography import METHODS, HomographyFit, apply_homography, jacobian
+from log2sim.topdown.warp import ground_homography
+from log2sim.types import TYPICAL_SIZE_M, Camera, Measurements
+
+K = np.array([[1000.0, 0.0, 640.0], [0.0, 1000.0, 360.0], [0.0, 0.0, 1.0]])
+PROBES_M = np.array([[x, y] for x in (8.0, 15.0, 25.0, 40.0) for y in (-0.3 * x, 0.0, 0.3 * x)])
+CAMERA_M = np.array([1.5, 0.2])
+
+
+def make_camera(pitch_deg: float = 4.0, height_m: float = 1.6) -> tuple[Camera, np.ndarray]:
+    """A camera that looks ahead and a little down, and its true `ground_H_image`."""
+    p = np.radians(pitch_deg)
+    rotation = np.array([[0, -np.sin(p), np.cos(p)], [-1, 0, 0], [0, -np.cos(p), -np.sin(p)]])
+    ego_T_cam = np.eye(4)
+    ego_T_cam[:3, :3], ego_T_cam[:3, 3] = rotation, [*CAMERA_M, height_m]
+    camera = Camera("front", 1280, 720, K, "ego", ego_T_cam)
+    return camera, ground_homography(camera, ego_T_cam)
+
+
+def to_image(ground_H_image: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    q = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(ground_H_image).T
+    return q[:, :2] / q[:, 2:]
+
+
+@dataclass
+class World:
+    """Correspondences of a stream with known truth."""
+
+    truth: np.ndarray
+    uv: np.ndarray
+    xy: np.ndarray
+    tick: np.ndarray
+    clean: np.ndarray
+
+    def fit(self, method: str = "time-aware", seed: int = 0, **sigmas: float) -> HomographyFit:
+        sigmas = {"sigma_px": 1.0, "sigma_m": 0.02, **sigmas}
+        rng = np.random.default_rng(seed)
+        return estimate_homography(self.uv, self.xy, self.tick, method=method, rng=rng, **sigmas)
+
+
+def make_world(
+    seed: int, ticks: int = 30, each: int = 6, noise_px: float = 1.0, noise_m: float = 0.02, outliers: float = 0.0
+) -> World:
+    rng = np.random.default_rng(seed)
+    truth = make_camera()[1]
+    count = ticks * each
+    xy = np.column_stack([rng.uniform(7.0, 45.0, count), rng.uniform(-0.5, 0.5, count)])
+    xy[:, 1] *= xy[:, 0]
+    uv = to_image(truth, xy) + rng.normal(0.0, noise_px, (count, 2))
+    xy = xy + rng.normal(0.0, noise_m, (count, 2))
+    wrong = rng.permutation(count) < round(outliers * count)
+    uv[wrong] = rng.uniform([0, 380], [1280, 720], (int(wrong.sum()), 2))
+    return World(truth, uv, xy, np.repeat(np.arange(ticks), each), ~wrong)
+
+
+def error_m(truth: np.ndarray, found: np.ndarray) -> float:
+    """Root mean square error on the ground relative to the range, over the view."""
+    uv = to_image(truth, PROBES_M)
+    d = np.hypot(*(apply_homography(found, uv)[0] - PROBES_M).T) / np.hypot(*PROBES_M.T)
+    return float(np.sqrt(np.mean(d**2)))
+
+
+def pooled_limit(world: World) -> np.ndarray:
+    """The most likely homography from all clean correspondences, told which they are: nothing does better on average."""
+
+    def residuals(h: np.ndarray) -> np.ndarray:
+        image_H_ground = np.append(h, 1.0).reshape(3, 3)
+        q = np.column_stack([world.xy[world.clean], np.ones(world.clean.sum())]) @ image_H_ground.T
+        return (q[:, :2] / q[:, 2:] - world.uv[world.clean]).ravel()
+
+    start = np.linalg.inv(world.truth)
+    start /= start[2, 2]
+    solution = least_squares(residuals, start.ravel()[:8], x_scale=np.abs(start.ravel()[:8]) + 1e-9, method="lm")
+    found = np.linalg.inv(np.append(solution.x, 1.0).reshape(3, 3))
+    return found * np.sign(found[2] @ np.append(world.uv[world.clean][0], 1.0))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_exact_data_give_the_exact_homography_as_opencv_finds_it(method: str) -> None:
+    world = make_world(0, noise_px=0.0, noise_m=0.0, ticks=8, each=10)
+    fit = world.fit(method)
+    reference, _ = cv2.findHomography(world.uv, world.xy)
+    uv = to_image(world.truth, PROBES_M)
+    mapped, below = apply_homography(fit.ground_H_image, uv)
+    assert fit.ok
+    assert fit.reason == ""
+    assert below.all()
+    np.testing.assert_allclose(mapped, PROBES_M, atol=1e-6)
+    expected = cv2.perspectiveTransform(uv[:, None], reference)[:, 0]
+    np.testing.assert_allclose(mapped, expected, atol=1e-5)
+    assert fit.inliers.all()
+    assert fit.error_m < 1e-8
+
+
+@pytest.mark.parametrize(
+    ("outliers", "each", "above_limit"), [(0.0, 6, 1.4), (0.3, 6, 1.4), (0.3, 12, 1.2), (0.6, 12, 1.4)]
+)
+def test_time_aware_comes_near_to_what_all_frames_together_allow(
+    outliers: float, each: int, above_limit: float
+) -> None:
+    limit, found, of_frame = [], [], []
+    for seed in range(8):
+        world = make_world(seed, each=each, outliers=outliers)
+        fit = world.fit()
+        assert fit.ok, fit.reason
+        limit.append(error_m(world.truth, pooled_limit(world)))
+        found.append(error_m(world.truth, fit.ground_H_image))
+        if seed < 3:
+            of_frame.append(error_m(world.truth, world.fit("min-frame").ground_H_image))
+        assert (fit.inliers & ~world.clean).sum() <= 1
+        assert (fit.inliers & world.clean).sum() >= 0.93 * world.clean.sum()
+    rms = [np.sqrt(np.mean(np.square(e))) for e in (limit, found, of_frame)]
+    assert rms[1] < above_limit * rms[0]
+    assert rms[1] < 0.5 * rms[2]  # one frame has a thirtieth of the data
+
+
+def test_error_is_the_median_distance_on_the_ground() -> None:
+    world = make_world(4, outliers=0.2)
+    fit = world.fit()
+    mapped, _ = apply_homography(fit.ground_H_image, world.uv)
+    assert fit.error_m == pytest.approx(np.median(np.hypot(*(mapped - world.xy)[fit.inliers].T)), rel=1e-6)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_too_few_correspondences_are_refused(method: str) -> None:
+    for count in range(4):
+        world = make_world(0, ticks=1, each=max(count, 1))
+        fit = estimate_homography(
+            world.uv[:count], world.xy[:count], world.tick[:count], method=method, rng=np.random.default_rng(0)
+        )
+        assert not fit.ok
+        assert f"{count} correspondences" in fit.reason
+        assert np.isnan(fit.ground_H_image).all()
+        assert fit.inliers.shape == (count,)
+        assert np.isnan(jitter_m(fit))
+        assert fit.condition == np.inf
+
+
+def degenerate_worlds() -> dict[str, World]:
+    base, rng = make_world(1, ticks=10, each=8, noise_px=0.0, noise_m=0.0), np.random.default_rng(1)
+    count = len(base.xy)
+
+    def on(xy: np.ndarray, noise_px: float = 0.0) -> World:
+        uv = to_image(base.truth, xy) + rng.normal(0, noise_px, (count, 2))
+        return World(base.truth, uv, xy, base.tick, base.clean)
+
+    x = base.xy[:, 0]
+    lane = np.column_stack([x, 0.1 * x + 1.0])
+    place = np.tile([[20.0, 1.0]], (count, 1))
+    three = np.array([[10.0, 0.0], [20.0, 3.0], [30.0, -4.0]])[np.arange(count) % 3]
+    one_off = lane.copy()
+    one_off[::8] += [0.0, 4.0]
+    one_off[:, 0] = np.where(np.arange(count) % 8 == 0, 15.0, one_off[:, 0])
+    one_off[::8, 1] = 6.5
+    return {
+        "collinear": on(lane),
+        "collinear with noise": on(lane, 1.0),
+        "a lane of 5 cm": on(lane + np.column_stack([0 * x, rng.uniform(-0.025, 0.025, count)]), 1.0),
+        "coincident": on(place),
+        "coincident with noise": on(place, 1.0),
+        "three places": on(three),
+        "a lane and one place": on(one_off),
+        "nonsense": World(
+            base.truth,
+            rng.uniform([0, 400], [1280, 720], (count, 2)),
+            rng.uniform([5, -20], [50, 20], (count, 2)),
+            base.tick,
+            base.clean,
+        ),
+        "not a number": World(base.truth, base.uv * np.nan, base.xy, base.tick, base.clean),
+    }
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("case", degenerate_worlds())
+def test_what_does_not_determine_a_homography_is_refused_with_a_reason(case: str, method: str) -> None:
+    world = degenerate_worlds()[case]
+    fit = world.fit(method)
+    assert not fit.ok
+    assert len(fit.reason) > 20
+    assert np.isnan(fit.ground_H_image).all()
+    assert not fit.inliers.any()
+    np.testing.assert_array_equal(fit.ticks, np.unique(world.tick))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_rows_that_are_not_finite_change_nothing(method: str) -> None:
+    world = make_world(2, noise_px=0.0, noise_m=0.0, outliers=0.2, ticks=10, each=10)
+    uv, xy = world.uv.copy(), world.xy.copy()
+    uv[3], uv[17, 1], xy[40, 0], xy[77] = np.nan, np.inf, -np.inf, np.nan
+    fit = World(world.truth, uv, xy, world.tick, world.clean).fit(method)
+    bad = np.isin(np.arange(100), [3, 17, 40, 77])
+    assert error_m(world.truth, fit.ground_H_image) < 1e-8
+    np.testing.assert_array_equal(fit.inliers, world.clean & ~bad)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_moving_ground_or_pixels_moves_the_homography_alike(method: str) -> None:
+    world = make_world(3, noise_px=0.0, noise_m=0.0, outliers=0.2, ticks=10, each=10)
+    for shift_m, shift_px in (((1e6, -5e6), (0.0, 0.0)), ((0.0, 0.0), (3000.0, -900.0))):
+        moved = World(world.truth, world.uv + shift_px, world.xy + shift_m, world.tick, world.clean)
+        fit = moved.fit(method)
+        mapped, _ = apply_homography(fit.ground_H_image, to_image(world.truth, PROBES_M) + shift_px)
+        np.testing.assert_allclose(mapped - shift_m, PROBES_M, atol=2e-5)
+        np.testing.assert_array_equal(fit.inliers, world.clean)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_order_of_rows_and_names_of_ticks_do_not_matter(method: str) -> None:
+    world = make_world(5, noise_px=0.0, noise_m=0.0, outliers=0.2, ticks=10, each=10)
+    order = np.random.default_rng(0).permutation(100)
+    shuffled = World(world.truth, world.uv[order], world.xy[order], 1000 - 7 * world.tick[order], world.clean[order])
+    fit = shuffled.fit(method)
+    assert error_m(world.truth, fit.ground_H_image) < 1e-8
+    np.testing.assert_array_equal(fit.inliers, world.clean[order])
+    np.testing.assert_array_equal(fit.ticks, 1000 - 7 * np.arange(10)[::-1])
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_same_seed_same_bytes(method: str) -> None:
+    world = make_world(6, outliers=0.3, each=12)
+    a, b, c = world.fit(method, seed=1), world.fit(method, seed=1), world.fit(method, seed=2)
+    assert a.ground_H_image.tobytes() == b.ground_H_image.tobytes()
+    assert a.inliers.tobytes() == b.inliers.tobytes()
+    # Another seed draws other samples; refinement over all inliers leads time-aware to the same place.
+    if method == "time-aware":
+        assert error_m(a.ground_H_image, c.ground_H_image) < 1e-3
+
+
+def test_noise_in_the_image_counts_for_more_far_away() -> None:
+    # A gate of fixed size in meters would throw the far half away or let near outliers in.
+    world = make_world(7, each=20, outliers=0.2)
+    far = np.hypot(*world.xy.T) > 35.0
+    fit = world.fit()
+    mapped, _ = apply_homography(fit.ground_H_image, world.uv)
+    distance = np.hypot(*(mapped - world.xy).T)
+    assert fit.inliers[far & world.clean].mean() > 0.9
+    assert np.median(distance[far & world.clean]) > 8 * np.median(
+        distance[(np.hypot(*world.xy.T) < 12.0) & world.clean]
+    )
+
+
+def test_condition_is_that_of_the_normalized_design_matrix() -> None:
+    world = make_world(8, outliers=0.2)
+    fit = world.fit()
+
+    def normalized(p: np.ndarray) -> np.ndarray:
+        d = p - p.mean(axis=0)
+        return d / np.sqrt((d**2).sum(axis=1).mean() / 2)
+
+    (u, v), (x, y) = normalized(world.uv[fit.inliers]).T, normalized(world.xy[fit.inliers]).T
+    one, zero = np.ones_like(u), np.zeros_like(u)
+    rows = [
+        np.stack([u, v, one, zero, zero, zero, -x * u, -x * v, -x], axis=1),
+        np.stack([zero, zero, zero, u, v, one, -y * u, -y * v, -y], axis=1),
+    ]
+    s = np.linalg.svd(np.concatenate(rows), compute_uv=False)
+    assert fit.condition == pytest.approx(s[0] / s[7], rel=1e-6)
+
+
+def test_a_narrow_lane_has_a_worse_condition_than_a_road() -> None:
+    world = make_world(9, noise_px=0.0, noise_m=0.0)
+
+    def condition(share: float) -> float:
+        xy = world.xy * [1.0, share]
+        return World(world.truth, to_image(world.truth, xy), xy, world.tick, world.clean).fit().condition
+
+    # Ten times narrower, ten times worse, and far from the bound that calls it a line.
+    assert condition(0.01) == pytest.approx(10 * condition(0.1), rel=0.05)
+    assert condition(0.01) < 100
+
+
+def test_frames_of_less_than_four_help_only_the_time_aware() -> None:
+    world = make_world(10, ticks=60, each=3, noise_px=0.5)
+    fit = world.fit(sigma_px=0.5)
+    assert fit.ok
+    assert error_m(world.truth, fit.ground_H_image) < 0.01
+    for method in ("per-frame", "min-frame"):
+        refused_fit = world.fit(method)
+        assert not refused_fit.ok
+        assert "no frame" in refused_fit.reason
+
+
+def test_per_frame_keeps_one_homography_a_tick_and_nan_where_there_is_none() -> None:
+    world = make_world(11, ticks=6, each=10, noise_px=0.0, noise_m=0.0)
+    keep = ~((world.tick == 2) & (np.arange(60) % 10 >= 3))  # tick 2 keeps three
+    fit = World(world.truth, world.uv[keep], world.xy[keep], world.tick[keep], world.clean[keep]).fit("per-frame")
+    assert fit.per_tick is not None
+    assert fit.ticks.tolist() == [0, 1, 2, 3, 4, 5]
+    assert np.isnan(fit.per_tick).all(axis=(1, 2)).tolist() == [False, False, True, False, False, False]
+    assert max(error_m(world.truth, fit.per_tick[k]) for k in (0, 1, 3, 4, 5)) < 1e-8
+    for method in ("time-aware", "min-frame"):
+        assert world.fit(method).per_tick is None
+
+
+def test_a_fixed_camera_does_not_jitter() -> None:
+    world = make_world(12, each=10)
+    assert jitter_m(world.fit("time-aware")) == 0.0
+    assert jitter_m(world.fit("min-frame")) == 0.0
+    assert jitter_m(world.fit("per-frame")) > 0.05  # one pixel of noise a frame shows
+    exact = make_world(12, each=10, noise_px=0.0, noise_m=0.0)
+    assert jitter_m(exact.fit("per-frame")) < 1e-7
+
+
+def test_jitter_of_a_nodding_camera_is_how_far_the_ground_moves() -> None:
+    xy = make_world(13, ticks=1, each=12).xy
+    nod = [make_camera(pitch_deg=4.0 + 0.1 * (-1) ** k)[1] for k in range(10)]
+    world = World(
+        nod[0],
+        np.concatenate([to_image(h, xy) for h in nod]),
+        np.tile(xy, (10, 1)),
+        np.repeat(np.arange(10), 12),
+        np.ones(1),
+    )
+    fit = world.fit("per-frame")
+    # Pixels of the probes, seen through the two poses in turn; x at height 1.6 m under angles 0.2 degrees apart.
+    middle = [
+        np.hypot(*(apply_homography(nod[0], uv)[0] - apply_homography(nod[1], uv)[0]).T)
+        for uv in [to_image(fit.ground_H_image, np.array([[10.0, 0.0], [20.0, 0.0], [40.0, 0.0]]))]
+    ]
+    assert jitter_m(fit) == pytest.approx(np.median(middle), rel=1e-4)
+    assert 0.4 < jitter_m(fit) < 1.2  # 20 m ahead: (18.5^2 / 1.6 + 1.6) * 0.2 degrees = 0.75 m
+
+
+def test_the_horizon_and_above_have_no_ground_position() -> None:
+    _, h = make_camera(pitch_deg=4.0)
+    horizon = 360 - 1000 * np.tan(np.radians(4.0))
+    uv = np.array([[640.0, horizon + 0.01], [640.0, horizon - 0.01], [100.0, 0.0], [640.0, 700.0], [np.nan, 500.0]])
+    xy, below = apply_homography(h, uv)
+    assert below.tolist() == [True, False, False, True, False]
+    assert np.isfinite(xy).all(axis=1).tolist() == below.tolist()
+    assert np.hypot(*xy[0]) > 1e5
+
+
+def test_jacobian_is_that_of_differences() -> None:
+    h, uv = (
+        make_world(14, each=5, noise_px=0.0).fit().ground_H_image,
+        np.array([[300.0, 500.0], [640.0, 400.0], [900.0, 700.0]]),
+    )
+    step = 1e-3
+    for axis in range(2):
+        aside = np.eye(2)[axis] * step
+        slope = (apply_homography(h, uv + aside)[0] - apply_homography(h, uv - aside)[0]) / (2 * step)
+        np.testing.assert_allclose(jacobian(h, uv)[:, :, axis], slope, rtol=1e-4, atol=1e-7)
+
+
+def test_shapes_and_methods_that_do_not_fit_are_the_callers_mistake() -> None:
+    rng = np.random.default_rng(0)
+    with pytest.raises(ValueError, match=r"\(N, 2\)"):
+        estimate_homography(np.zeros((5, 2)), np.zeros((4, 2)), np.zeros(5), rng=rng)
+    with pytest.raises(ValueError, match=r"\(N, 2\)"):
+        estimate_homography(np.zeros((5, 2)), np.zeros((5, 2)), np.zeros(4), rng=rng)
+    with pytest.raises(ValueError, match="time-aware"):
+        estimate_homography(np.zeros((5, 2)), np.zeros((5, 2)), np.zeros(5), rng=rng, method="frame")
+
+
+def a_camera_with_lens() -> Camera:
+    plain = make_camera()[0]
+    return Camera("front", 1280, 720, K, "ego", plain.mount_T_cam, "brown", (-0.2, 0.05, 0.001, -0.0005))
+
+
+def foot_pixel(camera: Camera, x: float, y: float) -> np.ndarray:
+    uv, _ = project(camera, apply(inverse(camera.mount_T_cam), [[x, y, 0.0]]))
+    return uv[0]
+
+
+def fitted(ground_H_image: np.ndarray) -> HomographyFit:
+    return HomographyFit(True, "", ground_H_image / np.linalg.norm(ground_H_image[2]), np.ones(4, bool), 0.0, 1.0)
+
+
+@pytest.mark.parametrize("camera", [make_camera()[0], a_camera_with_lens()], ids=["pinhole", "lens"])
+@pytest.mark.parametrize("foot", [(10.0, 0.2), (25.0, -6.0), (40.0, 11.0)])
+def test_an_obstacle_stands_behind_its_foot_by_half_its_depth(camera: Camera, foot: tuple[float, float]) -> None:
+    u, v = foot_pixel(camera, *foot)
+    placed = locate(fitted(make_camera()[1]), camera, np.array([u - 40, v - 60, u + 40, v]), "car", CAMERA_M)
+    assert placed is not None
+    ray = np.array(foot) - CAMERA_M
+    length, width, _ = TYPICAL_SIZE_M["car"]
+    expected = foot + ray / np.hypot(*ray) * (length + width) / 4
+    np.testing.assert_allclose(placed[0], expected, atol=1e-4)
+
+
+def test_the_covariance_of_a_located_obstacle_lies_along_the_ray_and_grows() -> None:
+    camera, h = make_camera()
+    sigma = []
+    for x in (10.0, 20.0, 40.0):
+        foot = np.add(CAMERA_M, [x, 0.0])
+        u, v = foot_pixel(camera, *foot)
+        placed = locate(fitted(h), camera, np.array([u - 20, v - 30, u + 20, v]), "pedestrian", CAMERA_M)
+        assert placed is not None
+        variance, axes = np.linalg.eigh(placed[1])
+        assert abs(axes[0, 1]) > 0.999
+        sigma.append(np.sqrt(variance))
+        # Flat ground seen from height h: a pixel is about (x^2 + h^2) / h / f deep and x / f wide.
+        deep = FOOT_SIGMA_PX * (x**2 + 1.6**2) / 1.6 / 1000
+        assert sigma[-1][1] == pytest.approx(np.hypot(deep, 0.2), rel=0.03)
+        assert sigma[-1][0] == pytest.approx(np.hypot(FOOT_SIGMA_PX * x / 1000, 0.2), rel=0.03)
+    assert sigma[0][1] < sigma[1][1] < sigma[2][1]
+
+
+def test_obstacles_at_the_horizon_and_far_away_are_not_located() -> None:
+    camera, h = make_camera()
+
+    def at(u: float, v: float) -> object:
+        return locate(fitted(h), camera, np.array([u - 5, v - 10, u + 5, v]), "car", CAMERA_M)
+
+    assert at(640.0, 200.0) is None
+    assert at(640.0, 291.0) is None  # a hand's breadth below the horizon, kilometers away
+    assert at(*foot_pixel(camera, *np.add(CAMERA_M, [59.5, 0.0]))) is not None
+    assert at(*foot_pixel(camera, *np.add(CAMERA_M, [60.5, 0.0]))) is None
+    assert at(np.nan, 600.0) is None
+
+
+def test_a_pixel_that_no_ray_reaches_is_not_located() -> None:
+    plain = make_camera()[0]
+    camera = Camera("front", 1280, 720, K, "ego", plain.mount_T_cam, "brown", (-1.0, 0.0, 0.0, 0.0))
+    # r (1 - r^2) is at most 0.385: 385 px from the center.
+    assert locate(fitted(make_camera()[1]), camera, np.array([630.0, 500.0, 650.0, 700.0]), "car", CAMERA_M) is not None
+    assert locate(fitted(make_camera()[1]), camera, np.array([1190.0, 500.0, 1210.0, 700.0]), "car", CAMERA_M) is None
+
+
+def as_correspondences(world: World) -> Correspondences:
+    return Correspondences(world.uv, world.xy, world.tick)
+
+
+NOTHING = Correspondences.join([])
+
+
+def test_a_camera_learns_from_obstacles_first() -> None:
+    feet, ground = make_world(20, each=8, noise_px=2.0), make_world(21, each=40, noise_px=0.3)
+    fit, source = fit_camera(
+        as_correspondences(feet), as_correspondences(ground), method="time-aware", rng=np.random.default_rng(0)
+    )
+    assert source == "obstacles"
+    assert len(fit.inliers) == len(feet.uv)
+    assert error_m(feet.truth, fit.ground_H_image) < 0.01
+
+
+@pytest.mark.parametrize("case", ["few", "collinear", "none"])
+def test_ground_points_join_where_obstacles_do_not_suffice(case: str) -> None:
+    lane = degenerate_worlds()["collinear with noise"]
+    few = make_world(22, ticks=3, each=4)
+    feet = {"few": as_correspondences(few), "collinear": as_correspondences(lane), "none": NOTHING}[case]
+    ground = make_world(23, each=20, noise_px=0.5)
+    fit, source = fit_camera(feet, as_correspondences(ground), method="time-aware", rng=np.random.default_rng(0))
+    assert fit.ok
+    assert source == "obstacles and ground points"
+    assert len(fit.inliers) == len(feet.uv) + len(ground.uv)
+    assert error_m(ground.truth, fit.ground_H_image) < 0.005
+
+
+def test_a_camera_that_saw_nothing_is_refused() -> None:
+    for feet in (NOTHING, Correspondences(np.ones((3, 2)), np.ones((3, 2)), np.zeros(3, dtype=np.int64))):
+        fit, source = fit_camera(feet, NOTHING, method="time-aware", rng=np.random.default_rng(0))
+        assert not fit.ok
+        assert source == "none"
+        assert f"{len(feet.uv)} correspondences" in fit.reason
+
+
+def measured(view: Camera, **changes: object) -> Measurements:
+    """Cars whose near side stands across the ray, seen by `view` in a map that is the ego frame moved by (100, 50)."""
+    feet = np.array([[12.0, 0.2], [20.0, 0.2], [30.0, 0.2], [40.0, 0.2]])
+    uv = np.array([foot_pixel(view, *f) for f in feet])
+    across = np.linspace(-0.9, 0.9, 60)
+    cluster = tuple(np.column_stack([np.full(60, f[0] + 100), f[1] + across + 50, np.full(60, 0.7)]) for f in feet)
+    columns: dict[str, object] = {
+        "t_ns": np.zeros(4, dtype=np.int64),
+        "category": np.full(4, "car"),
+        "score": np.ones(4),
+        "camera": np.full(4, view.name),
+        "box_px": np.column_stack([uv[:, 0] - 30, uv[:, 1] - 40, uv[:, 0] + 30, uv[:, 1]]),
+        "truncated": np.zeros(4, dtype=bool),
+        "center_m": np.column_stack([feet[:, 0] + 102.2, feet[:, 1] + 50, np.full(4, 0.75)]),
+        "size_m": np.tile([4.4, 1.8, 1.5], (4, 1)),
+        "yaw_rad": np.zeros(4),
+        "covariance": np.tile(np.eye(2) * 0.01, (4, 1, 1)),
+        "points": np.full(4, 60),
+        "source": np.full(4, "lidar"),
+        "cluster": cluster,
+        "sensor_m": np.tile([101.5, 50.2, 1.6], (4, 1)),
+        "height_px_m": np.full(4, 1.5),
+    }
+    return Measurements(**{**columns, **changes})  # type: ignore[arg-type]
+
+
+EGO_T_MAP = transform(np.eye(3), [-100.0, -50.0, 0.0])
+
+
+@pytest.mark.parametrize("camera", [make_camera()[0], a_camera_with_lens()], ids=["pinhole", "lens"])
+def test_feet_of_measured_obstacles_obey_the_true_homography(camera: Camera) -> None:
+    feet = foot_points(camera, measured(camera), EGO_T_MAP, tick=7)
+    assert feet.tick.tolist() == [7] * 4
+    np.testing.assert_allclose(feet.xy_ego, [[12.0, 0.2], [20.0, 0.2], [30.0, 0.2], [40.0, 0.2]], atol=1e-9)
+    np.testing.assert_allclose(apply_homography(make_camera()[1], feet.uv)[0], feet.xy_ego, atol=1e-4)
+
+
+def test_only_whole_obstacles_with_enough_lidar_points_of_that_camera_give_feet() -> None:
+    camera = make_camera()[0]
+    good = measured(
+        camera,
+        truncated=np.array([True, False, False, False]),
+        source=np.array(["lidar", "topdown", "lidar", "lidar"]),
+        points=np.array([60, 60, 19, 20]),
+    )
+    assert foot_points(camera, good, EGO_T_MAP, 0).xy_ego[:, 0].tolist() == [pytest.approx(40.0)]
+    elsewhere = measured(camera, camera=np.array(["rear", "rear", "front", "rear"]))
+    assert foot_points(camera, elsewhere, EGO_T_MAP, 0).xy_ego[:, 0].tolist() == [pytest.approx(30.0)]
+    assert foot_points(camera, Measurements.empty(), EGO_T_MAP, 0).uv.shape == (0, 2)
+
+
+def test_feet_lie_on_the_ground_below_the_obstacle_when_the_ego_tilts() -> None:
+    camera, tilted = make_camera()[0], transform(rotation_from_rpy(0.1, -0.05, 0.3), [-100.0, -40.0, 1.0])
+    feet = foot_points(camera, measured(camera), tilted, 0)
+    expected = apply(tilted, [[x + 100.0, 50.2, 0.0] for x in (12.0, 20.0, 30.0, 40.0)])[:, :2]
+    np.testing.assert_allclose(feet.xy_ego, expected, atol=1e-9)
+
+
+def test_four_points_almost_on_a_line_are_refused() -> None:
+    truth = make_camera()[1]
+    xy = np.array([[10.0, 1.0], [20.0, 1.001], [30.0, 0.999], [40.0, 1.001]])
+    fit = World(truth, to_image(truth, xy), xy, np.zeros(4, dtype=int), np.ones(4, dtype=bool)).fit()
+    assert "line" in fit.reason
+
+
+@pytest.mark.parametrize(("count", "agree", "needed"), [(8, 5, 6), (100, 15, 20)])
+def test_a_handful_that_agrees_among_many_that_do_not_is_refused(count: int, agree: int, needed: int) -> None:
+    world, rng = make_world(30, ticks=1, each=count, noise_px=0.0, noise_m=0.0), np.random.default_rng(0)
+    uv = np.concatenate([world.uv[:agree], rng.uniform([0, 400], [1280, 720], (count - agree, 2))])
+    fit = World(world.truth, uv, world.xy, world.tick, world.clean).fit()
+    assert not fit.ok
+    assert fit.reason.endswith(f"at least {needed} are needed")
