@@ -14,6 +14,10 @@ SEARCH_STEP_RAD = np.deg2rad(2.0)
 NEAREST_EDGE_M = 0.03
 MOST_POINTS = 256
 SENSOR_SIGMA_M = 0.08
+# What an end of a box is, see `ends_shown`.
+SEEN, FACING = 1, 2
+# Corners are rounded: the outermost point seen from the side lies inside by about this share of the width.
+ROUNDED = 0.08
 # A side seen at a flatter angle than this (sine) shows its near end only.
 LEAST_ASPECT = 0.5
 # A side longer than this share of the typical width is no front or rear.
@@ -111,8 +115,9 @@ def ends_shown(low: Array, high: Array, sensor: Array, ends_seen: ArrayLike) -> 
 
     Returns
     -------
-    shown : (2, 2) bool
-        For each axis, whether the lower and the upper end are real.
+    shown : (2, 2) int
+        For each axis, what its lower and its upper end are: `FACING` the sensor, `SEEN` from the side, or 0 where the box
+        may go on.
 
     Notes
     -----
@@ -120,7 +125,7 @@ def ends_shown(low: Array, high: Array, sensor: Array, ends_seen: ArrayLike) -> 
     ends that the sensor sees as right and left.
     """
     above, below = sensor > high, sensor < low
-    shown = np.stack([below, above], axis=1)
+    shown = np.where(np.stack([below, above], axis=1), FACING, 0)
     toward = np.abs(sensor - (low + high) / 2)
     for axis in range(2):
         other = 1 - axis
@@ -130,12 +135,13 @@ def ends_shown(low: Array, high: Array, sensor: Array, ends_seen: ArrayLike) -> 
         # Seen from below the length, or from beyond the upper end of it for the width, the lower end is on the left.
         low_is_left = (face > sensor[other]) if axis == 0 else (face < sensor[other])
         right, left = ends_seen
-        shown[axis] |= np.array([left, right] if low_is_left else [right, left], dtype=bool)
+        seen = np.array([left, right] if low_is_left else [right, left], dtype=bool)
+        shown[axis] = np.maximum(shown[axis], np.where(seen, SEEN, 0))
     return shown
 
 
 def complete_box(
-    low: Array, high: Array, size_m: Array, sensor: Array, ends_seen: ArrayLike = (True, True)
+    low: Array, high: Array, size_m: Array, sensor: Array, ends_seen: ArrayLike = (False, False)
 ) -> tuple[Array, Array]:
     """Place a box of known size over what was seen of it; everything in axes along and across the box.
 
@@ -153,22 +159,29 @@ def complete_box(
 
     Notes
     -----
-    The box reaches from its real end to where it was not seen. With both ends real or none of them it is centered on
-    the points.
+    The box reaches from its best end to where it was not seen; between two equally good ones, or without any, it is
+    centered on the points.
     """
     return place_box(low, high, size_m, ends_shown(low, high, sensor, ends_seen))
 
 
-def place_box(low: Array, high: Array, size_m: Array, shown: NDArray[np.bool_]) -> tuple[Array, Array]:
+def place_box(low: Array, high: Array, size_m: Array, shown: NDArray[np.int64]) -> tuple[Array, Array]:
     """As `complete_box`, with the real ends (2, 2) that `ends_shown` tells."""
-    slack = np.maximum(size_m - (high - low), 0.0)
-    reach = shown[:, 1].astype(np.float64) - shown[:, 0]
+    low, high = to_corners(low, high, shown, size_m[1])
+    slack = size_m - (high - low)
+    reach = np.sign(shown[:, 1] - shown[:, 0])
     doubt = np.where(shown.any(axis=1), SLACK_SIGMA, 1.0)
-    return (low + high) / 2 - reach * slack / 2, np.hypot(SENSOR_SIGMA_M, doubt * slack)
+    return (low + high) / 2 - reach * slack / 2, np.hypot(SENSOR_SIGMA_M, doubt * np.maximum(slack, 0.0))
+
+
+def to_corners(low: Array, high: Array, shown: NDArray[np.int64], width_m: float) -> tuple[Array, Array]:
+    """The ends (..., 2), moved out to the corners that are too round for a ray to touch where an end is seen from the side."""
+    outward = np.where(shown == SEEN, ROUNDED * width_m, 0.0)
+    return low - outward[..., 0], high + outward[..., 1]
 
 
 def box_of_cluster(
-    cluster: Array, sensor: Array, category: str, ground_z: float, ends_seen: ArrayLike = (True, True)
+    cluster: Array, sensor: Array, category: str, ground_z: float, ends_seen: ArrayLike = (False, False)
 ) -> tuple[Array, Array, float, Array]:
     """Center (3,), size (3,), yaw and covariance (2, 2) of the box around a cluster (n, 3) seen from `sensor` (3,).
 

@@ -81,8 +81,8 @@ def shape_standing(track: Track) -> Shape:
         low, high = boxfit.extents(cloud[:, :2], yaw)
     local = boxfit.rotate(sensor, -yaw)
     with_points = [k for k, c in enumerate(m.cluster) if len(c)]
-    shown = np.array([boxfit.ends_shown(low, high, local[k], m.ends_seen[k]) for k in with_points]).any(axis=0)
-    size, fits = _completed_size((high - low)[None], shown.all(axis=1)[None], typical[:2])
+    shown = np.array([boxfit.ends_shown(low, high, local[k], m.ends_seen[k]) for k in with_points]).max(axis=0)
+    size, fits = _completed_size(low[None], high[None], shown[None], typical[:2])
     centers, sigmas = boxfit.place_box(low, high, size, shown)
     center = boxfit.rotate(centers, yaw) + origin[:2]
     height, z = _height(track)
@@ -102,13 +102,13 @@ def shape_moving(track: Track, yaw_rad: Array) -> Shape:
     if len(with_points) == 0:
         return _from_measured_centers(track, typical)
     lows, highs, sensors = np.zeros((len(m), 2)), np.zeros((len(m), 2)), np.zeros((len(m), 2))
-    shown = np.zeros((len(m), 2, 2), dtype=bool)
+    shown = np.zeros((len(m), 2, 2), dtype=np.int64)
     for k in with_points:
         yaw, origin = float(yaw_rad[k]), m.center_m[k, :2]
         lows[k], highs[k] = boxfit.extents(m.cluster[k][:, :2] - origin, yaw)
         sensors[k] = boxfit.rotate(m.sensor_m[k, :2] - origin, -yaw)
         shown[k] = boxfit.ends_shown(lows[k], highs[k], sensors[k], m.ends_seen[k])
-    size, fits = _completed_size((highs - lows)[with_points], shown[with_points].all(axis=2), typical[:2])
+    size, fits = _completed_size(lows[with_points], highs[with_points], shown[with_points], typical[:2])
     xy, covariance = m.center_m[:, :2].copy(), m.covariance.copy()
     for k in with_points:
         yaw = float(yaw_rad[k])
@@ -133,8 +133,10 @@ def _persistent_points(clusters: list[NDArray[np.float64]]) -> Array:
     return points[count[key.ravel()] >= max(PERSISTENT_SHARE * len(clusters), min(2, len(clusters)))]
 
 
-def _completed_size(seen: Array, whole: NDArray[np.bool_], typical: Array) -> tuple[Array, bool]:
-    """Length and width (2,) from extents (n, 2), of which some were whole, and whether such an object exists."""
+def _completed_size(low: Array, high: Array, shown: NDArray[np.int64], typical: Array) -> tuple[Array, bool]:
+    """Length and width (2,) from ends (n, 2), (n, 2) of which some are real (n, 2, 2), and whether such an object exists."""
+    low, high = boxfit.to_corners(low, high, shown, typical[1])
+    seen, whole = high - low, shown.all(axis=2)
     size, raw = np.empty(2), np.empty(2)
     for axis in range(2):
         every = seen[:, axis]
