@@ -8,13 +8,19 @@ from typing import Any
 
 import numpy as np
 
+from log2sim.extend import Obstacles
 from log2sim.fuse import fuse
-from log2sim.geometry import Array, inverse
+from log2sim.geometry import Array, inverse, wrap_angle
 from log2sim.observe import Observed, base_pose
 from log2sim.plan import Plan
 from log2sim.sync import Schedule
 from log2sim.topdown import Correspondences, HomographyFit, fit_camera, locate, refused
 from log2sim.types import TYPICAL_SIZE_M, Camera, Log, Measurements
+
+# So many rays that go on behind a place say that nothing stands there, unless a part of these as large as this stops.
+LEAST_RAYS, MOST_STOPPED = 5, 0.25
+# What the LiDAR should have seen and did not is half as sure: it may continue a track and hardly start one.
+UNCONFIRMED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,10 +93,12 @@ def locate_the_rest(
     log: Log, schedule: Schedule, seen: Observed, homographies: Mapping[str, CameraGround]
 ) -> list[Measurements]:
     """Measurements of all ticks, those without LiDAR points placed by their camera's homography where it is able to."""
-    return [_locate_tick(log, m, homographies) for m in seen.measurements]
+    return [_locate_tick(log, m, o, homographies) for m, o in zip(seen.measurements, seen.obstacles, strict=True)]
 
 
-def _locate_tick(log: Log, m: Measurements, homographies: Mapping[str, CameraGround]) -> Measurements:
+def _locate_tick(
+    log: Log, m: Measurements, obstacles: Obstacles | None, homographies: Mapping[str, CameraGround]
+) -> Measurements:
     missing = np.flatnonzero(m.source == "")
     if len(missing) == 0:
         return m
@@ -106,9 +114,33 @@ def _locate_tick(log: Log, m: Measurements, homographies: Mapping[str, CameraGro
         )
         if placed is None:
             continue
+        if obstacles is not None:
+            beyond, stopped = rays_at(obstacles, base, placed, log.ground_z_ego_m, str(m.category[k]))
+            if beyond >= LEAST_RAYS and stopped < MOST_STOPPED * beyond:
+                continue
+            if beyond + stopped >= LEAST_RAYS:
+                columns["score"][k] *= UNCONFIRMED
         _write(columns, int(k), placed, base, log.ground_z_ego_m, str(m.category[k]))
     placed_rows = Measurements(**columns)
     return fuse(placed_rows)
+
+
+def rays_at(
+    obstacles: Obstacles, base: Array, placed: tuple[Array, Array], ground_z: float, category: str
+) -> tuple[int, int]:
+    """How many rays toward an object of a category, placed at (2,), (2, 2) in the frame `base` (4, 4), went on, and stopped."""
+    xy, covariance = placed
+    _, width, height = TYPICAL_SIZE_M[category]
+    foot = base[:3, :3] @ np.array([xy[0], xy[1], ground_z]) + base[:3, 3] - obstacles.origin - obstacles.sensor
+    range_m = float(np.hypot(*foot[:2]))
+    sigma_m = float(np.sqrt(xy @ covariance @ xy) / max(np.hypot(*xy), 1e-6))
+    rays = obstacles.xyz - obstacles.sensor
+    reach = np.hypot(rays[:, 0], rays[:, 1])
+    turned = wrap_angle(np.arctan2(rays[:, 1], rays[:, 0]) - np.arctan2(foot[1], foot[0]))
+    z_there = rays[:, 2] * range_m / np.maximum(reach, 1e-3) - foot[2]
+    toward = (np.abs(turned) * range_m < width / 2) & (z_there > 0.2 * height) & (z_there < 0.8 * height)
+    beyond = int((toward & (reach > range_m + width + 2 * sigma_m)).sum())
+    return beyond, int(toward.sum()) - beyond
 
 
 def _stand(log: Log, camera: Camera, base: Array, t_ns: int) -> Array:
