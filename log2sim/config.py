@@ -189,7 +189,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: larger than {CONFIG_LIMIT_BYTES} bytes, which no config file needs")
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as problem:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as problem:
         raise ConfigError(f"{path}: not valid TOML: {problem}") from None
 
 
@@ -197,7 +197,7 @@ def _parse_value(text: str) -> Any:
     """A value as TOML would read it; anything else is a text, so that quotes are not needed on the command line."""
     try:
         document = tomllib.loads(f"value = {text}")
-    except tomllib.TOMLDecodeError:
+    except (tomllib.TOMLDecodeError, RecursionError):
         return text
     return document["value"] if len(document) == 1 else text
 
