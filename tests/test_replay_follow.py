@@ -9,6 +9,10 @@ import pytest
 from replay_maneuvers import MANEUVERS, OFFSET_M, agent_from, driven, ramp, scenario_of
 
 from log2sim.replay import replay
+from log2sim.replay.follower import Memory, follow_points, follow_vehicles
+from log2sim.replay.vehicle import PointState, VehicleState, parameters_for, step_bicycle, step_point
+
+CAR = parameters_for([agent_from([0.0], [0.0], [0.0], [0.0], [0.0])])
 
 # Largest errors across and along in m and RMS error of speed in m/s: a hand's breadth, a pedal's lag.
 LIMITS = {
@@ -150,3 +154,48 @@ def test_map_offsets_of_a_thousand_kilometers_change_nothing():
     near, away = followed(agent)[0], followed(far)[0]
     np.testing.assert_allclose(away.x_m - 5e6, near.x_m, atol=1e-5)
     np.testing.assert_allclose(away.y_m + 3e6, near.y_m, atol=1e-5)
+
+
+def closed_loop(x, y, yaw, speed, reference_speed, duration_s, dt_s=0.01):
+    """States (N, 4) of a car that starts off a reference which goes straight along x from 0."""
+    state = VehicleState(*(np.array([v], float) for v in (x, y, yaw, speed, 0.0, 0.0)))
+    memory, out = Memory.fresh(1), []
+    for k in range(round(duration_s / dt_s)):
+        stands = float(reference_speed == 0)
+        row = np.array([[reference_speed * k * dt_s], [0], [0], [reference_speed], [0], [0], [1], [stands]], float)
+        controls, memory = follow_vehicles(row, state, memory, CAR, dt_s)
+        state = step_bicycle(state, controls, CAR, dt_s)
+        out.append(
+            [state.x_m[0] - reference_speed * (k + 1) * dt_s, state.y_m[0], state.yaw_rad[0], state.speed_mps[0]]
+        )
+    return np.array(out)
+
+
+@pytest.mark.parametrize("speed", [1.0, 5.0, 15.0, 40.0, 60.0])
+@pytest.mark.parametrize("dt_s", [0.01, 0.1])
+def test_being_off_the_path_dies_out_at_any_speed(speed, dt_s):
+    states = closed_loop(0.0, 1.0, 0.0, speed, speed, 20.0, dt_s)
+    assert np.abs(states[-1, 1]) < 0.02
+    assert states[:, 1].min() > -0.25  # hardly an overshoot
+    assert np.abs(states[:, 1]).max() <= 1.001
+
+
+def test_being_late_or_slow_is_made_up_for():
+    late, slow = closed_loop(-3.0, 0.0, 0.0, 10.0, 10.0, 20.0), closed_loop(0.0, 0.0, 0.0, 7.0, 10.0, 20.0)
+    for states in (late, slow):
+        assert np.abs(states[-1, 0]) < 0.05
+        assert states[-1, 3] == pytest.approx(10.0, abs=0.05)
+        assert states[:, 0].max() < 0.6
+
+
+def test_a_vehicle_that_stands_where_it_should_stays_and_one_that_stopped_short_drives_up():
+    assert np.all(closed_loop(-0.05, 0.0, 0.0, 0.0, 0.0, 5.0)[:, 0] == -0.05)
+    assert -0.11 < closed_loop(-0.5, 0.0, 0.0, 0.0, 0.0, 10.0)[-1, 0] < 0.11
+
+
+def test_a_pedestrian_off_the_path_comes_back():
+    state = PointState(*(np.array([v]) for v in (1.0, -0.5, 0.0, 0.0)))
+    row = np.zeros((8, 1))
+    for _ in range(300):
+        state = step_point(state, follow_points(row, state), 0.01)
+    assert np.hypot(state.x_m[0], state.y_m[0]) < 0.01

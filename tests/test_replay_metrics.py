@@ -24,13 +24,14 @@ def circle(radius_m, speed):
 
 @pytest.mark.parametrize("outward_m", [-0.4, 0.0, 0.7])
 @pytest.mark.parametrize("late_s", [0.0, 0.35])
-def test_on_a_circle_the_error_across_is_the_difference_of_radii_however_late(outward_m, late_s):
-    path = path_of(circle(20.0, 6.0), 0.0)
+@pytest.mark.parametrize(("radius", "speed", "limit"), [(20.0, 6.0, 2e-3), (8.0, 12.0, 7e-3)])
+def test_on_a_circle_the_error_across_is_the_difference_of_radii_however_late(outward_m, late_s, radius, speed, limit):
+    path = path_of(circle(radius, speed), 0.0)
     t = np.linspace(1.2, 2.8, 33)
-    angle = 6.0 * (t - late_s) / 20.0
-    r = 20.0 + outward_m
-    across, _ = tracking_errors(path, t, r * np.sin(angle), 20.0 - r * np.cos(angle))
-    np.testing.assert_allclose(across, -outward_m, atol=2e-3)  # a left turn: outward is right
+    angle = speed * (t - late_s) / radius
+    r = radius + outward_m
+    across, _ = tracking_errors(path, t, r * np.sin(angle), radius - r * np.cos(angle))
+    np.testing.assert_allclose(across, -outward_m, atol=limit)  # a left turn: outward is right; chords of 50 ms
 
 
 def test_on_a_straight_line_errors_are_the_components():

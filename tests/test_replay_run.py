@@ -23,6 +23,7 @@ def straight(id="a", y=0.0, speed=5.0, duration_s=3.0, **options):
 
 def test_exact_mode_goes_through_the_waypoints():
     agent = MANEUVERS["turn of radius 8 m"]()
+    agent = changed(agent, waypoints=changed(agent.waypoints, t_s=agent.waypoints.t_s + 0.013))
     result = replay(scenario_of(agent), mode="exact")
     w, r = agent.waypoints, result.agents[0]
     assert (r.driver, r.model) == ("exact", "none")
@@ -170,7 +171,7 @@ def test_an_observation_shows_ego_others_and_the_route():
     driver = Recorder(Controls(0.0, 0.0))
     far = agent_from([0.0], [150.0], [0.0], [0.0], [0.0], id="far", static=True)
     near = agent_from(
-        [0.0], [20.0], [4.0], [0.5], [0.0], id="near", category="truck", size_m=(7.0, 2.4, 3.0), static=True
+        [0.0], [12.0], [4.0], [0.5], [0.0], id="near", category="truck", size_m=(7.0, 2.4, 3.0), static=True
     )
     late = straight("late", y=-3)
     late = changed(late, waypoints=changed(late.waypoints, t_s=late.waypoints.t_s + 1.0))
@@ -178,9 +179,10 @@ def test_an_observation_shows_ego_others_and_the_route():
     first, later = driver.seen[0], driver.seen[150]
     assert (first.ego.x_m, first.ego.speed_mps, first.dt_s) == pytest.approx((0.0, 5.0, 0.01))
     assert list(first.others.id) == ["near"]
-    assert (first.others.x_m[0], first.others.yaw_rad[0], first.others.length_m[0]) == (20.0, 0.5, 7.0)
+    assert (first.others.x_m[0], first.others.yaw_rad[0], first.others.length_m[0]) == (12.0, 0.5, 7.0)
     assert later.t_s == pytest.approx(1.5)
     assert list(later.others.id) == ["late", "near"]
+    assert list(driver.seen[200].others.id) == ["near", "late"]
     assert later.others.speed_mps[0] == pytest.approx(5.0, abs=0.01)
     np.testing.assert_allclose(later.route.x_m, 5 * later.route.t_s, atol=1e-6)
     assert later.route.t_s[-1] == pytest.approx(3.0)
