@@ -29,7 +29,7 @@ def fuse(measurements: Measurements) -> Measurements:
     possible = _possibly_same(rows)
     for i in range(len(rows)):
         for j in np.flatnonzero(possible[i, :i]).tolist():
-            if owner[j] == j and _same_object(rows, i, j):
+            if owner[j] == j and _same_points(rows, i, j):
                 owner[i] = j
                 break
         else:
@@ -41,14 +41,18 @@ def fuse(measurements: Measurements) -> Measurements:
 
 
 def _possibly_same(rows: Measurements) -> NDArray[np.bool_]:
-    """Which pairs (M, M) can be one object: of the same group, and near each other or else of two cameras."""
+    """Which pairs (M, M) of one group can be one object: near each other if both have points, else at one place in two cameras."""
     group = np.array([GROUP_OF[str(c)] for c in rows.category])
     with_points, placed = _with_points(rows), rows.source != ""
     reach = rows.size_m[:, :2].sum(axis=1) / 2
-    apart = rows.center_m[:, None, :2] - rows.center_m[None, :, :2]
-    near = np.hypot(apart[..., 0], apart[..., 1]) <= reach[:, None] + reach
+    dx, dy = (rows.center_m[:, None, axis] - rows.center_m[:, axis] for axis in range(2))
+    near = np.hypot(dx, dy) <= reach[:, None] + reach
+    c = rows.covariance[:, None] + rows.covariance
+    determinant = c[..., 0, 0] * c[..., 1, 1] - c[..., 0, 1] ** 2
+    squared = c[..., 1, 1] * dx**2 - 2 * c[..., 0, 1] * dx * dy + c[..., 0, 0] * dy**2
     other_camera = (rows.camera[:, None] != rows.camera) & placed[:, None] & placed
-    return (group[:, None] == group) & np.where(with_points[:, None] & with_points, near, other_camera)
+    same_place = other_camera & (squared <= SAME_PLACE * determinant)
+    return (group[:, None] == group) & np.where(with_points[:, None] & with_points, near, same_place)
 
 
 def _with_points(rows: Measurements) -> NDArray[np.bool_]:
@@ -56,11 +60,11 @@ def _with_points(rows: Measurements) -> NDArray[np.bool_]:
     return np.array([s == "lidar" and len(c) > 0 for s, c in zip(rows.source, rows.cluster)], dtype=bool)
 
 
-def _same_object(rows: Measurements, i: int, j: int) -> bool:
-    if len(rows.cluster[i]) and len(rows.cluster[j]):
-        return max(_share_inside(rows, i, j), _share_inside(rows, j, i)) >= SHARED_POINTS
-    apart = (rows.center_m[i] - rows.center_m[j])[:2]
-    return bool(apart @ np.linalg.solve(rows.covariance[i] + rows.covariance[j], apart) <= SAME_PLACE)
+def _same_points(rows: Measurements, i: int, j: int) -> bool:
+    """Whether two rows share points; where one has none, their places have to be enough."""
+    if not len(rows.cluster[i]) or not len(rows.cluster[j]):
+        return True
+    return max(_share_inside(rows, i, j), _share_inside(rows, j, i)) >= SHARED_POINTS
 
 
 def _share_inside(rows: Measurements, i: int, j: int) -> float:
