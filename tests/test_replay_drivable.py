@@ -156,3 +156,13 @@ def test_feed_forward_is_that_of_a_later_time():
     np.testing.assert_allclose(later[:-10, 4], now[10:, 4], atol=1e-9)
     np.testing.assert_allclose(later[:-20, 5], now[20:, 5], atol=1e-9)
     assert now[150, 4] == pytest.approx(3.0, abs=0.1)
+
+
+def test_a_life_too_long_to_be_fitted_is_followed_as_logged(monkeypatch):
+    monkeypatch.setattr("log2sim.replay.reference.MAX_KNOTS", 20)
+    agent = MANEUVERS["brake to stop and go"]()
+    w = agent.waypoints
+    course, departure_m = drivable_course(path_of(agent, 1.3), LIMITS)
+    np.testing.assert_allclose(departure_m, 0.0, atol=1e-9)
+    np.testing.assert_allclose(course.accel_mps2[22:48], -10 / 3, atol=0.01)
+    np.testing.assert_allclose(course.x_m, w.x_m - w.x_m[0] - 1.3, atol=1e-9)
