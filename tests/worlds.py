@@ -50,7 +50,7 @@ def tiny_toml(**changes: Any) -> str:
     """The scene file of `tiny_table`."""
     top, tables = [], []
     for key, value in tiny_table(**changes).items():
-        rows = value if isinstance(value, list) and isinstance(value[0], dict) else [value]
+        rows = value if isinstance(value, list) and value and isinstance(value[0], dict) else [value]
         if not isinstance(rows[0], dict):
             top.append(f"{key} = {json.dumps(value)}")
         for row in rows if isinstance(rows[0], dict) else []:
