@@ -115,7 +115,7 @@ class Config:
 
     def to_dict(self) -> dict[str, Any]:
         """All settings as a nested document, as it stands in a scenario's provenance."""
-        return dataclasses.asdict(self)
+        return {**dataclasses.asdict(self), "cameras": list(self.cameras)}
 
     def to_toml(self) -> str:
         """All settings as TOML that `load` reads back."""
