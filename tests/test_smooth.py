@@ -104,6 +104,14 @@ def test_states_between_observations_are_those_of_a_knot_there() -> None:
     np.testing.assert_allclose(covariance, expected_covariance[rows, :2, :2], rtol=1e-3)
 
 
+def test_states_within_a_step_of_a_knot_are_carried_from_it() -> None:
+    t = DT * np.arange(20)
+    asked = t + 0.75 * KNOT_STEP_S
+    path = smooth_track(t, np.column_stack([2.0 * t**2, 0 * t]), sigma_m=0.01, at_s=asked)
+    np.testing.assert_allclose(path.xy_m[5:-5, 0], 2.0 * asked[5:-5] ** 2, atol=0.01)
+    np.testing.assert_allclose(path.velocity_mps[5:-5, 0], 4.0 * asked[5:-5], atol=0.01)
+
+
 @pytest.mark.parametrize("step_s", [1e-3, 0.01, 0.1, 1.0, 10.0])
 def test_steps_from_milliseconds_to_seconds(step_s: float) -> None:
     t = step_s * np.arange(60)
@@ -235,14 +243,15 @@ def test_yaw_runs_on_across_the_half_turn() -> None:
 
 
 def test_heading_between_two_parts_of_motion_turns_with_the_way() -> None:
-    # East at 2 m/s, creeping through a corner at 0.5 m/s, north at 2 m/s; it stands for a while at the corner's end.
-    velocity = np.array([[2.0, 0.0]] * 10 + [[0.4, 0.3]] * 10 + [[0.0, 0.0]] * 10 + [[0.0, 2.0]] * 10)
+    # East at 2 m/s, creeping through a corner at 0.5 m/s, north at 2 m/s; it stands, with
+    # 0.1 m/s of noise, for a while at the corner's end.
+    velocity = np.array([[2.0, 0.0]] * 10 + [[0.4, 0.3]] * 10 + [[0.1, 0.0]] * 10 + [[0.0, 2.0]] * 10)
     xy = np.concatenate([[[0.0, 0.0]], np.cumsum(velocity * DT, axis=0)[:-1]])
     yaw = yaw_of_motion(xy, velocity)
     assert (np.diff(yaw) >= -1e-12).all()
     assert yaw[9] == 0.0
     assert yaw[30] == pytest.approx(np.pi / 2)
-    assert np.ptp(yaw[21:30]) == pytest.approx(0.0, abs=1e-12)  # what stands does not turn
+    assert np.ptp(yaw[21:30]) == pytest.approx(0.0, abs=1e-12)
     assert 0.2 < yaw[15] < 1.2
 
 
