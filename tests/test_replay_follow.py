@@ -174,7 +174,7 @@ def closed_loop(x, y, yaw, speed, reference_speed, duration_s, dt_s=0.01):
 @pytest.mark.parametrize("speed", [1.0, 5.0, 15.0, 40.0, 60.0])
 @pytest.mark.parametrize("dt_s", [0.01, 0.1])
 def test_being_off_the_path_dies_out_at_any_speed(speed, dt_s):
-    states = closed_loop(0.0, 1.0, 0.0, speed, speed, 12.0, dt_s)
+    states = closed_loop(0.0, 1.0, 0.0, speed, speed, 20.0, dt_s)
     assert np.abs(states[-1, 1]) < 0.02
     assert states[:, 1].min() > -0.25  # hardly an overshoot
     assert np.abs(states[:, 1]).max() <= 1.001

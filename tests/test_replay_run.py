@@ -289,8 +289,7 @@ def test_hours_between_agents_are_refused_before_they_are_simulated():
 
 def test_many_agents_are_all_replayed():
     agents = [
-        driven(lambda t: np.full_like(t, 8.0), np.zeros_like, 1.0, start=(0, 5.0 * k, 0), id=f"a{k}")
-        for k in range(50)
+        driven(lambda t: np.full_like(t, 8.0), np.zeros_like, 1.0, start=(0, 5.0 * k, 0), id=f"a{k}") for k in range(50)
     ]
     result = replay(scenario_of(*agents), dt_s=0.02)
     assert result.metrics["followers"] == 50
