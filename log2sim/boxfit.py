@@ -57,11 +57,17 @@ def fit_yaw(xy_m: Array) -> tuple[float, float]:
 
 def _edge_distance(offsets: Array) -> Array:
     """Distance (K, N) of every point to the nearer of the two ends of its row, robust to one stray point at either end."""
-    n = offsets.shape[1]
-    k_low, k_high = (1, n - 2) if n >= 8 else (0, n - 1)
-    ordered = np.partition(offsets, (k_low, k_high), axis=1)
-    low, high = ordered[:, k_low, None], ordered[:, k_high, None]
+    low, high = _lower_end(offsets)[:, None], -_lower_end(-offsets)[:, None]
     return np.minimum(np.abs(offsets - low), np.abs(high - offsets))
+
+
+def _lower_end(offsets: Array) -> Array:
+    """The second lowest value of every row (K, N), of few points the lowest."""
+    if offsets.shape[1] < 8:
+        return offsets.min(axis=1)
+    others = offsets.copy()
+    others[np.arange(len(others)), others.argmin(axis=1)] = np.inf
+    return others.min(axis=1)
 
 
 def _parabolic_peak(score: Array, best: int) -> float:

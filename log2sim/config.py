@@ -115,7 +115,7 @@ class Config:
 
     def to_dict(self) -> dict[str, Any]:
         """All settings as a nested document, as it stands in a scenario's provenance."""
-        return dataclasses.asdict(self)
+        return {**dataclasses.asdict(self), "cameras": list(self.cameras)}
 
     def to_toml(self) -> str:
         """All settings as TOML that `load` reads back."""
@@ -189,7 +189,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: larger than {CONFIG_LIMIT_BYTES} bytes, which no config file needs")
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as problem:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as problem:
         raise ConfigError(f"{path}: not valid TOML: {problem}") from None
 
 
@@ -197,7 +197,7 @@ def _parse_value(text: str) -> Any:
     """A value as TOML would read it; anything else is a text, so that quotes are not needed on the command line."""
     try:
         document = tomllib.loads(f"value = {text}")
-    except tomllib.TOMLDecodeError:
+    except (tomllib.TOMLDecodeError, RecursionError):
         return text
     return document["value"] if len(document) == 1 else text
 

@@ -91,12 +91,14 @@ def follow(
 def look(cloud: Obstacles, tick: int, xy_m: Array, yaw_rad: float, size_m: Array, bottom_m: float) -> Sighting | None:
     """Find a box of known size and yaw near a predicted center (2,); None where the points do not show it."""
     reach = float(np.hypot(*size_m[:2])) / 2 + MARGIN_M + SHELL_M
-    local = cloud.xyz[:, :2] - (xy_m - cloud.origin[:2]).astype(np.float32)
-    z = cloud.xyz[:, 2] + np.float32(cloud.origin[2] - bottom_m)
-    near = np.flatnonzero((np.abs(local) <= reach).all(axis=1) & (z > 0.15) & (z < size_m[2] + 0.4))
+    x, y = (xy_m - cloud.origin[:2]).astype(np.float32)
+    near = np.flatnonzero(np.abs(cloud.xyz[:, 0] - x) <= reach)
+    near = near[np.abs(cloud.xyz[near, 1] - y) <= reach]
+    z = cloud.xyz[near, 2] + np.float32(cloud.origin[2] - bottom_m)
+    near = near[(z > 0.15) & (z < size_m[2] + 0.4)]
     if len(near) < LEAST_POINTS:
         return None
-    turned = boxfit.rotate(local[near].astype(np.float64), -yaw_rad)
+    turned = boxfit.rotate((cloud.xyz[near, :2] - np.array([x, y])).astype(np.float64), -yaw_rad)
     half = size_m[:2] / 2
     excess = (np.abs(turned) - half).max(axis=1)
     inside = excess <= MARGIN_M

@@ -83,9 +83,8 @@ def read_json(path: Path | str, error: type[LogError] = LogError) -> Any:
         text = path.read_text(encoding="utf-8")
         return json.loads(text, parse_constant=_refuse, parse_float=_finite)
     except _NotFinite as problem:
-        place = _place_not_finite(json.loads(text)) or "the document"
         raise error(
-            f"{path}: {place} is {problem}, expected a finite number; write one, or null where it may be absent"
+            f"{path}: {_place_in(text)} is {problem}, expected a finite number; write one, or null where it may be absent"
         ) from None
     except json.JSONDecodeError as problem:
         raise error(f"{path}: not valid JSON at line {problem.lineno}, column {problem.colno}: {problem.msg}") from None
@@ -104,6 +103,14 @@ def _refuse(word: str) -> float:
 def _finite(word: str) -> float:
     value = float(word)
     return value if math.isfinite(value) else _refuse(word)
+
+
+def _place_in(text: str) -> str:
+    """Where the first number of a JSON text that is not finite stands."""
+    try:
+        return _place_not_finite(json.loads(text)) or "the document"
+    except (ValueError, RecursionError):  # what follows it is no JSON either, or nested without end
+        return "a number"
 
 
 def _place_not_finite(value: Any) -> str | None:

@@ -18,7 +18,8 @@ SAME_PLACE = 9.21
 def fuse(measurements: Measurements) -> Measurements:
     """Join rows (M,) that are the same object, seen by two cameras or found twice by one.
 
-    Rows with LiDAR points are the same object when they share its points; rows without are gated by their covariances.
+    Rows with LiDAR points are the same object when they share its points; rows without, or whose points were not kept, are
+    gated by their covariances.
     The joined row keeps the score, category and image box of the surest one. A person whose points are those of a vehicle
     is its driver or a false alarm and is dropped.
     """
@@ -28,7 +29,7 @@ def fuse(measurements: Measurements) -> Measurements:
     possible = _possibly_same(rows)
     for i in range(len(rows)):
         for j in np.flatnonzero(possible[i, :i]).tolist():
-            if owner[j] == j and _same_object(rows, i, j):
+            if owner[j] == j and _same_points(rows, i, j):
                 owner[i] = j
                 break
         else:
@@ -40,21 +41,30 @@ def fuse(measurements: Measurements) -> Measurements:
 
 
 def _possibly_same(rows: Measurements) -> NDArray[np.bool_]:
-    """Which pairs (M, M) can be one object: of the same group, and near each other or else of two cameras."""
+    """Which pairs (M, M) of one group can be one object: near each other if both have points, else at one place in two cameras."""
     group = np.array([GROUP_OF[str(c)] for c in rows.category])
-    lidar, placed = rows.source == "lidar", rows.source != ""
+    with_points, placed = _with_points(rows), rows.source != ""
     reach = rows.size_m[:, :2].sum(axis=1) / 2
-    apart = rows.center_m[:, None, :2] - rows.center_m[None, :, :2]
-    near = np.hypot(apart[..., 0], apart[..., 1]) <= reach[:, None] + reach
+    dx, dy = (rows.center_m[:, None, axis] - rows.center_m[:, axis] for axis in range(2))
+    near = np.hypot(dx, dy) <= reach[:, None] + reach
+    c = rows.covariance[:, None] + rows.covariance
+    determinant = c[..., 0, 0] * c[..., 1, 1] - c[..., 0, 1] ** 2
+    squared = c[..., 1, 1] * dx**2 - 2 * c[..., 0, 1] * dx * dy + c[..., 0, 0] * dy**2
     other_camera = (rows.camera[:, None] != rows.camera) & placed[:, None] & placed
-    return (group[:, None] == group) & np.where(lidar[:, None] & lidar, near, other_camera)
+    same_place = other_camera & (squared <= SAME_PLACE * determinant)
+    return (group[:, None] == group) & np.where(with_points[:, None] & with_points, near, same_place)
 
 
-def _same_object(rows: Measurements, i: int, j: int) -> bool:
-    if rows.source[i] == "lidar" and rows.source[j] == "lidar":
-        return max(_share_inside(rows, i, j), _share_inside(rows, j, i)) >= SHARED_POINTS
-    apart = (rows.center_m[i] - rows.center_m[j])[:2]
-    return bool(apart @ np.linalg.solve(rows.covariance[i] + rows.covariance[j], apart) <= SAME_PLACE)
+def _with_points(rows: Measurements) -> NDArray[np.bool_]:
+    """Mask (M,) of rows whose LiDAR points are at hand."""
+    return np.array([s == "lidar" and len(c) > 0 for s, c in zip(rows.source, rows.cluster)], dtype=bool)
+
+
+def _same_points(rows: Measurements, i: int, j: int) -> bool:
+    """Whether two rows share points; where one has none, their places have to be enough."""
+    if not len(rows.cluster[i]) or not len(rows.cluster[j]):
+        return True
+    return max(_share_inside(rows, i, j), _share_inside(rows, j, i)) >= SHARED_POINTS
 
 
 def _share_inside(rows: Measurements, i: int, j: int) -> float:
@@ -67,8 +77,9 @@ def _share_inside(rows: Measurements, i: int, j: int) -> float:
 
 def _join(rows: Measurements, leader: int, members: NDArray[np.intp]) -> Measurements:
     row = rows.take([leader])
-    others = [m for m in members if m != leader and rows.camera[m] != rows.camera[leader] and rows.source[m] == "lidar"]
-    if not others or row.source[0] != "lidar":
+    with_points = _with_points(rows)
+    others = [m for m in members if m != leader and rows.camera[m] != rows.camera[leader] and with_points[m]]
+    if not others or not with_points[leader]:
         return row
     cluster = np.concatenate([rows.cluster[m] for m in [leader, *others]])
     ground_z = float(row.center_m[0, 2] - row.size_m[0, 2] / 2)
@@ -91,9 +102,9 @@ def _join(rows: Measurements, leader: int, members: NDArray[np.intp]) -> Measure
 def _drivers(rows: Measurements) -> NDArray[np.bool_]:
     """Mask (M,) of people whose points lie inside a vehicle's extent."""
     group = np.array([GROUP_OF[str(c)] for c in rows.category])
-    drop = np.zeros(len(rows), dtype=bool)
-    for i in np.flatnonzero((group == "pedestrian") & (rows.source == "lidar")):
-        for j in np.flatnonzero((group == "vehicle") & (rows.source == "lidar")):
+    drop, with_points = np.zeros(len(rows), dtype=bool), _with_points(rows)
+    for i in np.flatnonzero((group == "pedestrian") & with_points):
+        for j in np.flatnonzero((group == "vehicle") & with_points):
             near = np.hypot(*(rows.center_m[i] - rows.center_m[j])[:2]) < rows.size_m[j, 0]
             drop[i] |= bool(near) and _share_inside(rows, int(i), int(j)) >= 0.8
     return drop

@@ -103,15 +103,18 @@ def _locate_tick(
     if len(missing) == 0:
         return m
     columns: dict[str, Any] = {k: v.copy() if isinstance(v, np.ndarray) else v for k, v in vars(m).items()}
+    stands: dict[tuple[str, int], tuple[Array, Array]] = {}
     for k in missing:
         ground = homographies.get(str(m.camera[k]))
         # A box that the image's lower border cuts has no foot in the image.
         if ground is None or not ground.fit.ok or m.box_px[k, 3] > ground.camera.height_px - 3:
             continue
-        base = base_pose(log, int(m.t_ns[k]))
-        placed = locate(
-            ground.fit, ground.camera, m.box_px[k], str(m.category[k]), _stand(log, ground.camera, base, int(m.t_ns[k]))
-        )
+        frame = (ground.camera.name, int(m.t_ns[k]))
+        if frame not in stands:
+            base = base_pose(log, frame[1])
+            stands[frame] = base, _stand(log, ground.camera, base, frame[1])
+        base, stand = stands[frame]
+        placed = locate(ground.fit, ground.camera, m.box_px[k], str(m.category[k]), stand)
         if placed is None:
             continue
         if obstacles is not None:

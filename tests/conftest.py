@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -31,4 +32,34 @@ def yolox_model() -> Path:
     path = SHARED / "models" / "yolox_nano.onnx"
     if not path.is_file():
         pytest.skip("the YOLOX-nano model is not beside this checkout (../shared/models)")
+    return path
+
+
+@pytest.fixture(scope="session")
+def tiny_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The log of `worlds.tiny_log` as a folder with its truth; tests that change it take `log_folder`."""
+    from worlds import tiny_log
+
+    from log2sim.logs.writer import write_log
+
+    folder = tmp_path_factory.mktemp("tiny") / "tiny"
+    log, truth = tiny_log()
+    write_log(log, folder)
+    truth.save(folder / "truth.json")
+    return folder
+
+
+@pytest.fixture
+def log_folder(tiny_folder: Path, tmp_path: Path) -> Path:
+    """A copy of `tiny_folder` to be spoiled."""
+    return Path(shutil.copytree(tiny_folder, tmp_path / "log"))
+
+
+@pytest.fixture(scope="session")
+def tiny_scenario(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scenario file reconstructed from `tiny_folder`."""
+    from log2sim import Config, open_log, reconstruct
+
+    path = tmp_path_factory.mktemp("scenario") / "scenario.json"
+    reconstruct(open_log(tiny_folder), Config.load(detect={"name": "labels"})).scenario.save(path)
     return path

@@ -102,6 +102,13 @@ def test_interpolated_quaternions_are_scipys() -> None:
     assert (found * expected.inv()).magnitude().max() < 1e-7
 
 
+def test_between_equal_rotations_there_is_none() -> None:
+    # Rounding carries the product of a unit quaternion with itself above 1 now and then.
+    q = random_rotations(1000, 7).as_quat(scalar_first=True)
+    assert (np.sum(q * q, axis=1) > 1).any()
+    np.testing.assert_allclose(slerp(q, q, np.full(1000, 0.3)), q, atol=1e-14)
+
+
 def test_small_turns_and_extrapolation() -> None:
     for angle in (0.0, 1e-12, 1e-7, 1e-5, 1.0):
         q0, q1 = (Rotation.from_euler("z", a).as_quat(scalar_first=True)[None] for a in (0.0, angle))

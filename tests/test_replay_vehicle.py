@@ -105,9 +105,7 @@ def test_a_point_follows_the_parabola_and_its_acceleration_is_limited():
     assert state.x_m[0] == pytest.approx(1 + 3 * 2 + 0.5 * 4 / 2)
     assert state.y_m[0] == pytest.approx(2 - 1 * 2 - 1.0 * 4 / 2)
     pushed = step_point(state, PointControls(column(300.0), column(400.0)), 0.1)
-    gained = np.hypot(
-        pushed.velocity_x_mps - state.velocity_x_mps, pushed.velocity_y_mps - state.velocity_y_mps
-    )
+    gained = np.hypot(pushed.velocity_x_mps - state.velocity_x_mps, pushed.velocity_y_mps - state.velocity_y_mps)
     assert gained[0] == pytest.approx(POINT_MAX_ACCEL_MPS2 * 0.1)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -43,6 +44,21 @@ def tiny_table(agents: list[dict[str, Any]] | None = None, **changes: Any) -> di
         "gnss": {"position_sigma_m": 0.0, "angle_sigma_deg": 0.0},
     }
     return {**table, **changes}
+
+
+def tiny_toml(**changes: Any) -> str:
+    """The scene file of `tiny_table`."""
+    top, tables = [], []
+    for key, value in tiny_table(**changes).items():
+        rows = value if isinstance(value, list) and value and isinstance(value[0], dict) else [value]
+        if not isinstance(rows[0], dict):
+            top.append(f"{key} = {json.dumps(value)}")
+        for row in rows if isinstance(rows[0], dict) else []:
+            tables += [
+                f"[[{key}]]" if rows is value else f"[{key}]",
+                *(f"{k} = {json.dumps(v)}" for k, v in row.items()),
+            ]
+    return "\n".join(top + tables) + "\n"
 
 
 def tiny_scene(agents: list[dict[str, Any]] | None = None, **changes: Any) -> Scene:

@@ -38,13 +38,15 @@ def _cluster(xy: NDArray[np.floating[Any]], cell_m: float) -> tuple[NDArray[np.i
     """Labels (N,) of the clusters, and the grid of labels (one cell wider on each side, -1 where empty) with its corner."""
     from scipy.ndimage import label
 
-    corner = xy.min(axis=0) - cell_m
-    cell = np.floor((xy - corner) / cell_m).astype(np.intp)
-    grid = np.zeros(cell.max(axis=0) + 2, dtype=bool)
-    grid[cell[:, 0], cell[:, 1]] = True
+    x, y = xy.T
+    corner = np.array([x.min(), y.min()], dtype=xy.dtype) - cell_m
+    i, j = ((values - low) / cell_m for values, low in zip((x, y), corner))
+    i, j = i.astype(np.intp), j.astype(np.intp)
+    grid = np.zeros((i.max() + 2, j.max() + 2), dtype=bool)
+    grid[i, j] = True
     labels, _ = label(grid, structure=np.ones((3, 3), dtype=int))
     labels = np.asarray(labels, dtype=np.intp) - 1
-    return labels[cell[:, 0], cell[:, 1]], corner, labels
+    return labels[i, j], corner, labels
 
 
 def candidates(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from itertools import pairwise
 
@@ -29,12 +30,14 @@ MAX_DEPARTURE_M = 0.3  # more than boxes err by
 class Reference:
     """An agent's table: row k of `columns` (K, C) holds for the time (first_row + k) * GRID_S; see the functions below.
 
-    Rows are of the point that is `offset_m` behind the box center.
+    Rows are of the point that is `offset_m` behind the box center. `exact` gives rows (N, C) at any times (N,): rows of the
+    table are blended in between, across a leap of the log too.
     """
 
     path: Path
     first_row: int
     columns: Array
+    exact: Callable[[Array], Array]
     offset_m: float = 0.0
     flags: tuple[str, ...] = ()
 
@@ -52,20 +55,23 @@ def vehicle_reference(
     max_curvature_1pm: float = MAX_CURVATURE_1PM,
 ) -> Reference:
     """The table of a vehicle. Columns "..._ahead" are those of a later time, which makes up for the actuators' lag."""
-    first, t = _grid(path)
     course, departure_m = drivable_course(path, limits)
-    at = _sample(course, np.clip(t, path.t_s[0], path.t_s[-1]))
-    gear, stands = _gear(at.speed_mps), np.abs(at.speed_mps) < STANDSTILL_MPS
-    columns = np.stack(
-        [
+    first, t = _grid(path)
+    gear = _gear(_sample(course, t).speed_mps)
+
+    def exact(at_s: Array) -> Array:
+        at = _sample(course, at_s)
+        rows = [
             at.x_m, at.y_m, at.yaw_rad, at.speed_mps,
-            np.interp(t + accel_ahead_s, course.t_s, course.accel_mps2),
-            np.interp(t + curvature_ahead_s, course.t_s, course.curvature_1pm),
-            gear, stands.astype(np.float64),
-        ],
-        axis=1,
-    )  # fmt: skip
-    return Reference(path, first, columns, limits.offset_m, _flags(path, course, departure_m, max_curvature_1pm))
+            np.interp(at_s + accel_ahead_s, course.t_s, course.accel_mps2),
+            np.interp(at_s + curvature_ahead_s, course.t_s, course.curvature_1pm),
+            gear[np.clip(np.searchsorted(t, at_s), 0, len(t) - 1)],
+            np.abs(at.speed_mps) < STANDSTILL_MPS,
+        ]  # fmt: skip
+        return np.stack(rows, axis=1)
+
+    flags = _flags(path, course, departure_m, max_curvature_1pm)
+    return Reference(path, first, exact(t), exact, limits.offset_m, flags)
 
 
 def drivable_course(path: Path, limits: Limits) -> tuple[Course, Array]:
@@ -92,41 +98,60 @@ def drivable_course(path: Path, limits: Limits) -> tuple[Course, Array]:
 
 
 def _sample(course: Course, t_s: Array) -> Course:
-    """The course at times (N,), by cubics with its own velocities."""
+    """The course at times (N,), by cubics with its own velocities; straight on before its begin and after its end."""
+    inside = np.clip(t_s, course.t_s[0], course.t_s[-1])
+    outside = t_s - inside
     if len(course.t_s) == 1:
-        return Course(t_s, *(np.full(len(t_s), getattr(course, f.name)[0]) for f in fields(Course)[1:]))
-    i = np.clip(np.searchsorted(course.t_s, t_s, side="right") - 1, 0, len(course.t_s) - 2)
-    span, t = course.t_s[i + 1] - course.t_s[i], t_s - course.t_s[i]
-    speed, yaw = course.speed_mps, course.yaw_rad
-    no_jump = np.zeros(len(course.t_s) - 1, dtype=bool)
-    slopes = (
-        (course.x_m, speed * np.cos(yaw)),
-        (course.y_m, speed * np.sin(yaw)),
-        (yaw, speed * course.curvature_1pm),
-        (speed, course.accel_mps2),
-    )
-    x, y, yaw_at, speed_at = (hermite(v, slope, i, t, span, no_jump) for v, slope in slopes)
-    rest = (np.interp(t_s, course.t_s, c) for c in (course.accel_mps2, course.curvature_1pm))
-    return Course(t_s, x, y, yaw_at, speed_at, *rest)
+        x, y, yaw, speed, accel, curvature = (np.full(len(t_s), getattr(course, f.name)[0]) for f in fields(Course)[1:])
+    else:
+        i = np.clip(np.searchsorted(course.t_s, inside, side="right") - 1, 0, len(course.t_s) - 2)
+        span, t = course.t_s[i + 1] - course.t_s[i], inside - course.t_s[i]
+        no_jump = np.zeros(len(course.t_s) - 1, dtype=bool)
+        cos, sin = np.cos(course.yaw_rad), np.sin(course.yaw_rad)
+        x = hermite(course.x_m, course.speed_mps * cos, i, t, span, no_jump)
+        y = hermite(course.y_m, course.speed_mps * sin, i, t, span, no_jump)
+        yaw = hermite(course.yaw_rad, course.speed_mps * course.curvature_1pm, i, t, span, no_jump)
+        speed = hermite(course.speed_mps, course.accel_mps2, i, t, span, no_jump)
+        accel, curvature = (np.interp(inside, course.t_s, c) for c in (course.accel_mps2, course.curvature_1pm))
+    x, y = x + outside * speed * np.cos(yaw), y + outside * speed * np.sin(yaw)
+    return Course(t_s, x, y, yaw, speed, accel, curvature)
 
 
 def point_reference(path: Path) -> Reference:
     """The table of a point: velocity and acceleration of the smoothed course, on map axes."""
     first, t = _grid(path)
-    x, y, yaw, logged_speed = path.at(t)
+    x, y, yaw, logged_speed = _extended(path, t)
     if len(t) > 1:
         vx, vy = _smooth(np.gradient(x, GRID_S)), _smooth(np.gradient(y, GRID_S))
         ax, ay = np.gradient(vx, GRID_S), np.gradient(vy, GRID_S)
     else:
         vx, vy, ax, ay = logged_speed * np.cos(yaw), logged_speed * np.sin(yaw), np.zeros(1), np.zeros(1)
     stands = (np.hypot(vx, vy) < STANDSTILL_MPS).astype(np.float64)
-    return Reference(path, first, np.stack([x, y, yaw, vx, vy, ax, ay, stands], axis=1), flags=_leaps(path))
+
+    def exact(at_s: Array) -> Array:
+        smoothed = (np.interp(at_s, t, c) for c in (vx, vy, ax, ay, stands))
+        return np.stack([*_extended(path, at_s)[:3], *smoothed], axis=1)
+
+    return Reference(path, first, exact(t), exact, flags=_leaps(path))
 
 
 def tape_reference(path: Path) -> Reference:
     """The table of an agent that is where the log has it: x, y, yaw, logged speed."""
     first, t = _grid(path)
-    return Reference(path, first, np.stack(path.at(t), axis=1))
+
+    def exact(at_s: Array) -> Array:
+        return np.stack(_extended(path, at_s), axis=1)
+
+    return Reference(path, first, exact(t), exact)
+
+
+def _extended(path: Path, t_s: Array) -> tuple[Array, Array, Array, Array]:
+    """The path at times (N,), straight on before its begin and after its end: for the rows just outside."""
+    x, y, yaw, speed = path.at(t_s)
+    before, after = np.minimum(t_s - path.t_s[0], 0.0), np.maximum(t_s - path.t_s[-1], 0.0)
+    x = x + before * path.velocity_x_mps[0] + after * path.velocity_x_mps[-1]
+    y = y + before * path.velocity_y_mps[0] + after * path.velocity_y_mps[-1]
+    return x, y, yaw, speed
 
 
 def _grid(path: Path) -> tuple[int, Array]:

@@ -83,7 +83,7 @@ def roll(
             for group, placed in busy:
                 group.look_up(clock.time(step))
                 if step in placed:
-                    group.place(placed[step])
+                    group.place(placed[step], clock.time(step))
             if step % clock.store_every == 0:
                 for (group, _), (steps, rows) in zip(busy, records):
                     steps.append(step)
@@ -110,8 +110,9 @@ def _arrivals(group: Group, clock: Clock) -> dict[int, NDArray[np.intp]]:
             continue
         placed[int(group.first[i])].append(i)
         if not isinstance(group, Driven):
-            # The table blends the sides of a leap over one row, so the agent is placed once that is past.
-            for step in clock.first_step(reference.path.jump_times() + GRID_S):
+            # The table blends the sides of a leap over one row, so the agent is placed again once that is past.
+            leaps = reference.path.jump_times()
+            for step in clock.first_step(np.concatenate([leaps, leaps + GRID_S])):
                 if group.first[i] < step <= group.last[i]:
                     placed[int(step)].append(i)
     return {step: np.unique(index) for step, index in placed.items()}

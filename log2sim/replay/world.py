@@ -66,8 +66,8 @@ class Group(ABC):
         self.row = lower + (place - k) * (self._table[k + 1] - lower)
 
     @abstractmethod
-    def place(self, index: NDArray) -> None:
-        """Put the agents at `index` (of all agents) on their references."""
+    def place(self, index: NDArray, t_s: float) -> None:
+        """Put the agents at `index` (of all agents) on their references at a time."""
 
     @abstractmethod
     def snapshot(self) -> Snapshot:
@@ -77,6 +77,9 @@ class Group(ABC):
     def advance(self, dt_s: float) -> None:
         """Move the living agents by one step."""
 
+    def _exact(self, index: NDArray, t_s: float) -> Array:
+        return np.stack([self.references[i].exact(np.array([t_s]))[0] for i in index], axis=1)
+
     def _slots(self, index: NDArray) -> NDArray:
         return np.searchsorted(self.live, index)
 
@@ -84,7 +87,7 @@ class Group(ABC):
 class Tape(Group):
     """Agents that are exactly where the log has them."""
 
-    def place(self, index: NDArray) -> None:
+    def place(self, index: NDArray, t_s: float) -> None:
         pass
 
     def advance(self, dt_s: float) -> None:
@@ -130,9 +133,9 @@ class Fleet(Group):
         super().open_window(begin, end, begin_s, end_s)
         self._open(self.live)
 
-    def place(self, index: NDArray) -> None:
+    def place(self, index: NDArray, t_s: float) -> None:
         slots = self._slots(index)
-        self.state.put(slots, start_vehicles(self.row[:, slots], self.living.take(slots)))
+        self.state.put(slots, start_vehicles(self._exact(index, t_s), self.living.take(slots)))
         self.memory.put(slots, Memory.fresh(len(slots)))
 
     def snapshot(self) -> Snapshot:
@@ -186,9 +189,9 @@ class Crowd(Group):
         super().open_window(begin, end, begin_s, end_s)
         self.state = self._all.take(self.live)
 
-    def place(self, index: NDArray) -> None:
+    def place(self, index: NDArray, t_s: float) -> None:
         slots = self._slots(index)
-        self.state.put(slots, start_points(self.row[:, slots]))
+        self.state.put(slots, start_points(self._exact(index, t_s)))
 
     def snapshot(self) -> Snapshot:
         s, yaw = self.state, self.row[2]

@@ -27,7 +27,8 @@ def yaw_of_motion(xy_m: Array, velocity_mps: Array, *, hint_rad: float | None = 
     creeping = speed > 0.2
     step = np.diff(covered) * (creeping[1:] | creeping[:-1])
     progress = np.concatenate([[0.0], np.cumsum(step)])
-    angles = np.unwrap(_without_reversals(course[moving], hint_rad if not sideways else None))
+    # Who walks turns round; only what steers goes backward.
+    angles = np.unwrap(course[moving] if sideways else _without_reversals(course[moving], hint_rad))
     return wrap_angle(np.interp(progress, progress[moving], angles))
 
 

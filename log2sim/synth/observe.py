@@ -77,11 +77,12 @@ def visible_at(
     t_ns = scene.start_ns + np.rint(t_s * NS_PER_S).astype(np.int64)
     by_camera = np.zeros((len(t_s), count), dtype=bool)
     for frames in seen.values():
+        if not frames:
+            continue
         nearest = _nearest(np.array([f.t_ns for f in frames]), t_ns)
-        good = np.array([(f.unoccluded >= MIN_UNOCCLUDED) & (f.inside >= MIN_BOX_INSIDE) for f in frames]).reshape(
-            -1, count
-        )
-        by_camera |= good[nearest]
+        by_camera |= np.array([(f.unoccluded >= MIN_UNOCCLUDED) & (f.inside >= MIN_BOX_INSIDE) for f in frames])[
+            nearest
+        ]
     by_lidar = np.zeros_like(by_camera)
     for spec in scene.lidar:
         stamps = streams[spec.name].t_ns

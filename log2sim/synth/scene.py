@@ -196,7 +196,7 @@ def load_scene(path: Path | str) -> Scene:
         raise ConfigError(f"{path}: {path.stat().st_size} bytes, more than the {SCENE_LIMIT_BYTES} of a scene file")
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as problem:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as problem:
         raise ConfigError(f"{path}: not valid TOML: {problem}") from None
     try:
         return scene_from_table(table)

@@ -46,7 +46,8 @@ def pinhole(camera: Camera, uv: Array) -> Array:
 
 def foot_points(camera: Camera, measured: Measurements, ego_T_map: Array, tick: int) -> Correspondences:
     """Where obstacles touch the ground: middle of the box's lower side, and the ground below the nearest of their points."""
-    good = (measured.source == "lidar") & ~measured.truncated & (measured.points >= 20)
+    kept = np.array([len(c) > 0 for c in measured.cluster], dtype=bool)
+    good = (measured.source == "lidar") & ~measured.truncated & (measured.points >= 20) & kept
     rows = np.flatnonzero(good & (measured.camera == camera.name))
     uv, xy = [], []
     for k in rows:

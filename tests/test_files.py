@@ -1,0 +1,191 @@
+"""Files written whole or not at all, paths that stay inside a log, limits."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from log2sim import files
+from log2sim.errors import ConfigError, LogError, ScenarioError
+from log2sim.files import inside, read_json, refuse_existing, replaced, rounded, write_json
+
+
+@pytest.fixture
+def log_folder(tmp_path: Path) -> Path:
+    """A log folder with a sibling whose name begins alike."""
+    root = tmp_path / "log"
+    (root / "images").mkdir(parents=True)
+    (root / "images" / "0.png").write_bytes(b"x")
+    (tmp_path / "log-secret").mkdir()
+    (tmp_path / "log-secret" / "key").write_bytes(b"y")
+    return root
+
+
+@pytest.mark.parametrize(
+    "relative", ["images/0.png", "./images/0.png", "images/../images/0.png", "images/none.png", "a b/ü"]
+)
+def test_paths_inside_a_log_resolve(log_folder: Path, relative: str) -> None:
+    assert inside(log_folder, relative, "log.json") == (log_folder / relative).resolve()
+
+
+@pytest.mark.parametrize(
+    "relative",
+    [
+        "..",
+        "../log-secret/key",
+        "images/../../log-secret/key",
+        "../log/../log-secret/key",
+        "/etc/passwd",
+        "images/" + "../" * 40,
+    ],
+)
+def test_paths_that_leave_a_log_are_refused(log_folder: Path, relative: str) -> None:
+    with pytest.raises(LogError, match=r"^front\.csv row 3: path .* leaves the log folder; use a path relative"):
+        inside(log_folder, relative, "front.csv row 3")
+
+
+def test_an_absolute_path_is_refused_even_into_the_log(log_folder: Path) -> None:
+    with pytest.raises(LogError, match="leaves the log folder"):
+        inside(log_folder, str(log_folder / "images" / "0.png"), "log.json")
+
+
+def test_symbolic_links_may_stay_inside_but_not_leave(log_folder: Path) -> None:
+    (log_folder / "same").symlink_to(log_folder / "images")
+    assert inside(log_folder, "same/0.png", "log.json") == log_folder / "images" / "0.png"
+    (log_folder / "out").symlink_to(log_folder.parent / "log-secret")
+    (log_folder / "key").symlink_to("../log-secret/key")
+    for relative in ("out/key", "out", "key", "images/../out/key"):
+        with pytest.raises(LogError, match="leaves the log folder"):
+            inside(log_folder, relative, "log.json")
+
+
+def test_a_log_that_is_itself_a_link_is_a_log(log_folder: Path) -> None:
+    alias = log_folder.parent / "alias"
+    alias.symlink_to(log_folder)
+    assert inside(alias, "images/0.png", "log.json") == log_folder / "images" / "0.png"
+
+
+@pytest.mark.parametrize("relative", ["loop", "loop/x", "zero\0byte"])
+def test_paths_that_cannot_be_followed_are_refused(log_folder: Path, relative: str) -> None:
+    (log_folder / "loop").symlink_to("loop")
+    with pytest.raises(LogError, match=r"^log\.json: path"):
+        inside(log_folder, relative, "log.json")
+
+
+def test_a_file_appears_whole(tmp_path: Path) -> None:
+    target = tmp_path / "new" / "folder" / "result.json"
+    with replaced(target) as temporary:
+        assert temporary.parent == target.parent
+        assert temporary.suffix == ".json"
+        temporary.write_text("half")
+        assert not target.exists()
+        temporary.write_text("whole")
+    assert target.read_text() == "whole"
+    assert os.listdir(target.parent) == ["result.json"]
+
+
+def write_half(target: Path, problem: BaseException) -> None:
+    with replaced(target) as temporary:
+        temporary.write_text("half")
+        raise problem
+
+
+@pytest.mark.parametrize("problem", [RuntimeError(), KeyboardInterrupt()])
+def test_what_was_there_stays_when_writing_breaks_off(tmp_path: Path, problem: BaseException) -> None:
+    target = tmp_path / "result.json"
+    target.write_text("before")
+    with pytest.raises(type(problem)):
+        write_half(target, problem)
+    assert target.read_text() == "before"
+    assert os.listdir(tmp_path) == ["result.json"]
+
+
+def test_a_full_disk_is_one_clear_line(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"result\.json: cannot be written: No space left"):
+        write_half(tmp_path / "result.json", OSError(28, "No space left on device"))
+    assert os.listdir(tmp_path) == []
+
+
+def test_nothing_is_written_where_a_folder_or_a_file_stands(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(ConfigError, match="is a folder"), replaced(tmp_path):
+        pytest.fail("the block must not run")
+    with pytest.raises(ConfigError, match="cannot be made a folder"), replaced(tmp_path / "file" / "result.json"):
+        pytest.fail("the block must not run")
+    assert os.listdir(tmp_path) == ["file"]
+
+
+def test_two_writers_do_not_meet(tmp_path: Path) -> None:
+    target = tmp_path / "result.json"
+    with replaced(target) as first, replaced(target) as second:
+        assert first != second
+        first.write_text("first")
+        second.write_text("second")
+    assert target.read_text() == "first"  # the outer block ends last
+    assert os.listdir(tmp_path) == ["result.json"]
+
+
+def test_an_existing_file_is_kept_unless_told_otherwise(tmp_path: Path) -> None:
+    (tmp_path / "result.json").write_text("x")
+    with pytest.raises(ConfigError, match=r"result\.json: exists already.*--overwrite"):
+        refuse_existing(tmp_path / "result.json", overwrite=False)
+    refuse_existing(tmp_path / "result.json", overwrite=True)
+    refuse_existing(tmp_path / "new.json", overwrite=False)
+
+
+def test_json_comes_back_as_it_was(tmp_path: Path) -> None:
+    value = {"ü": [1, 0.1, 1e-300, None, True, "a\nb"], "t_ns": 1_700_000_000_123_456_789}
+    write_json(tmp_path / "a.json", value)
+    assert read_json(tmp_path / "a.json") == value
+    assert (tmp_path / "a.json").read_text(encoding="utf-8").endswith("\n")
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), object()])
+def test_json_that_cannot_be_written_leaves_nothing(tmp_path: Path, value: object) -> None:
+    with pytest.raises((ValueError, TypeError)):
+        write_json(tmp_path / "a.json", {"a": [1, value]})
+    assert os.listdir(tmp_path) == []
+
+
+def test_too_large_a_file_is_not_even_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps([0] * 100))
+    monkeypatch.setattr(files, "JSON_LIMIT_BYTES", path.stat().st_size)
+    assert len(read_json(path)) == 100
+    monkeypatch.setattr(files, "JSON_LIMIT_BYTES", path.stat().st_size - 1)
+    monkeypatch.setattr(Path, "read_text", lambda *_, **__: pytest.fail("read before its size was looked at"))
+    with pytest.raises(ScenarioError, match=r"a\.json: 300 bytes, more than the 299"):
+        read_json(path, ScenarioError)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b'{"a": 1,\n "b" 2}', r"not valid JSON at line 2, column 6"),
+        (b"\xff\xfe{}", r"not valid JSON: .*utf-8"),
+        (b'{"a": {"b": [1, 2, {"c": 1e400}]}}', r"a\.b\[2\]\.c is 1e400, expected a finite number"),
+        (b"[[0, -Infinity]]", r"\[0\]\[1\] is -Infinity"),
+        (b"NaN", r"the document is NaN"),
+        (b"[NaN", r"a number is NaN"),
+        (b"[NaN, " + b"[" * 100_000, r"a number is NaN"),
+        (b"[" * 100_000, r"not valid JSON"),
+        (b"1" * 5000, r"not valid JSON"),
+    ],
+    ids=["syntax", "encoding", "overflow", "infinity", "nan", "nan and cut", "nan and deep", "deep", "many digits"],
+)
+def test_what_is_wrong_with_a_json_file_is_named(tmp_path: Path, content: bytes, message: str) -> None:
+    path = tmp_path / "a.json"
+    path.write_bytes(content)
+    with pytest.raises(LogError, match=message) as caught:
+        read_json(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert len(str(caught.value)) < 400 + len(str(path))
+
+
+def test_rounded_numbers_for_json() -> None:
+    assert rounded(1.23456, 2) == 1.23
+    assert rounded(float("nan"), 2) is None
+    assert rounded(float("-inf"), 2) is None

@@ -1,0 +1,236 @@
+"""The second pass: homographies from calibration and from data, and obstacles placed by them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from worlds import Solid, camera_ahead, outline_px, standing
+
+from log2sim.camera import project
+from log2sim.geometry import PoseTrack, apply, inverse, rotation_from_rpy, transform
+from log2sim.ground_plane import CameraGround, calibrated_ground, fit_cameras, locate_the_rest
+from log2sim.observe import Observed
+from log2sim.plan import Plan, Step
+from log2sim.sync import synchronize
+from log2sim.topdown import Correspondences, refused
+from log2sim.topdown.homography import apply_homography
+from log2sim.types import TYPICAL_SIZE_M, Log, Measurements, Stream
+
+T0_NS = 1_700_000_000_000_000_000
+RNG_SEED = 5
+
+
+def log_with(camera, *, far=(0.0, 0.0, 0.0), yaw=0.0, ground_z=0.0):
+    """A log of five ticks whose ego stands still at a place in the map."""
+    t = T0_NS + np.arange(5) * 100_000_000
+    pose = transform(rotation_from_rpy(0, 0, yaw), np.array(far))
+    ego = PoseTrack(t, np.repeat(pose[None], 5, axis=0))
+    streams = {camera.name: Stream(camera.name, t, lambda i: None)}
+    return Log("log", "test", {camera.name: camera}, {}, streams, ego, ground_z_ego_m=ground_z)
+
+
+def tilted(pitch_rad=0.05, roll_rad=0.0, at=(1.5, 0.2, 1.6), **changes):
+    camera = camera_ahead(mount="ego", at=at)
+    turn = rotation_from_rpy(roll_rad, pitch_rad, 0.0)
+    mount = transform(turn @ camera.mount_T_cam[:3, :3], camera.mount_T_cam[:3, 3])
+    return replace(camera, mount_T_cam=mount, **changes)
+
+
+def plan_with(kept=True, reason="detections without LiDAR points may need it"):
+    return Plan(("front",), (Step("homography", kept, reason),))
+
+
+def unplaced(boxes_px, t_ns=T0_NS, category="car", camera="front"):
+    """Rows of one frame without a position."""
+    m = len(boxes_px)
+    size = np.tile(TYPICAL_SIZE_M[category], (m, 1))
+    nan = np.full(m, np.nan)
+    return Measurements(
+        np.full(m, t_ns), np.full(m, category, dtype="<U16"), np.full(m, 0.9), np.full(m, camera),
+        np.asarray(boxes_px, float), np.zeros(m, dtype=bool), np.full((m, 3), np.nan), size, nan,
+        np.full((m, 2, 2), np.nan), np.zeros(m, dtype=np.int64), np.full(m, "", dtype="<U16"),
+        tuple(np.zeros((0, 3)) for _ in range(m)), np.zeros((m, 3)), nan,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("ground_z", [0.0, -0.35])
+@pytest.mark.parametrize(("pitch", "roll"), [(0.0, 0.0), (0.08, 0.03), (-0.04, -0.1)])
+def test_the_calibrations_homography_undoes_the_projection_of_flat_ground(pitch, roll, ground_z):
+    camera = tilted(pitch, roll)
+    fit = calibrated_ground(log_with(camera, ground_z=ground_z), camera)
+    rng = np.random.default_rng(0)
+    ground = np.column_stack([rng.uniform(5, 60, 300), rng.uniform(-20, 20, 300), np.full(300, ground_z)])
+    uv, seen = project(camera, apply(inverse(camera.mount_T_cam), ground))
+    assert seen.sum() > 50
+    xy, below = apply_homography(fit.ground_H_image, uv[seen])
+    assert below.all()
+    np.testing.assert_allclose(xy, ground[seen, :2], atol=1e-6)
+    assert fit.ok
+    assert np.isfinite(fit.condition)
+
+
+def test_pixels_above_the_horizon_have_no_ground():
+    camera = tilted(0.0)
+    fit = calibrated_ground(log_with(camera), camera)
+    _, below = apply_homography(fit.ground_H_image, np.array([[600.0, 299.0], [600.0, 301.0], [0.0, 0.0]]))
+    assert below.tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize("at", [(1.5, 0.0, 0.0), (1.5, 0.0, 0.1), (1.5, 0.0, -1.0)])
+def test_a_camera_on_the_ground_or_below_has_no_homography(at):
+    camera = tilted(at=at)
+    assert calibrated_ground(log_with(camera), camera) is None
+
+
+def fit(log, seen, plan=None, method="time-aware"):
+    schedule = synchronize(log, ("front",))
+    return fit_cameras(log, schedule, seen, plan or plan_with(), method, np.random.default_rng(RNG_SEED))
+
+
+def test_nothing_is_fitted_when_the_plan_leaves_it_out():
+    plan, fits = fit(log_with(tilted()), Observed(measurements=[unplaced([[1, 2, 3, 4]])]), plan_with(False, "off"))
+    assert fits == {}
+    assert not plan.keeps("homography")
+
+
+def test_nothing_is_fitted_when_every_detection_has_points_and_the_plan_says_so():
+    plan, fits = fit(log_with(tilted()), Observed(measurements=[Measurements.empty()] * 5))
+    assert fits == {}
+    assert not plan.keeps("homography")
+    assert "every detection has LiDAR points" in plan.steps[0].reason
+
+
+def test_a_picture_needs_every_camera():
+    plan, fits = fit(
+        log_with(tilted()),
+        Observed(measurements=[Measurements.empty()]),
+        plan_with(True, "a top-down picture is asked for"),
+    )
+    assert list(fits) == ["front"]
+    assert plan.keeps("homography")
+
+
+def test_a_log_without_correspondences_falls_back_on_the_calibration_and_keeps_the_reason():
+    camera = tilted()
+    _, fits = fit(log_with(camera), Observed(measurements=[unplaced([[500, 280, 700, 400]])]))
+    found = fits["front"]
+    assert found.fit.ok
+    assert found.source == "calibration and flat ground"
+    assert "at least 4" in found.refusal
+    low = tilted(at=(1.0, 0.0, 0.05))
+    _, fits = fit(log_with(low), Observed(measurements=[unplaced([[500, 280, 700, 400]])]))
+    assert not fits["front"].fit.ok
+    assert fits["front"].source == "none"
+
+
+def correspondences(camera, count, rng, noise_px=0.0, collinear=False):
+    xy = np.column_stack([rng.uniform(6, 40, count), np.zeros(count) if collinear else rng.uniform(-8, 8, count)])
+    ground = np.column_stack([xy, np.zeros(count)])
+    uv, _ = project(camera, apply(inverse(camera.mount_T_cam), ground))
+    return Correspondences(uv + rng.normal(0, noise_px, uv.shape), xy, np.arange(count) // 20)
+
+
+@pytest.mark.parametrize("method", ["time-aware", "min-frame", "per-frame"])
+def test_obstacles_give_the_homography_of_the_true_camera(method):
+    camera, rng = tilted(0.06, 0.01), np.random.default_rng(1)
+    seen = Observed(measurements=[unplaced([[500, 280, 700, 400]])])
+    seen.feet["front"] = [correspondences(camera, 300, rng, 0.5)]
+    _, fits = fit(log_with(camera), seen, method=method)
+    found, truth = fits["front"], calibrated_ground(log_with(camera), camera)
+    assert found.source == "obstacles"
+    uv = np.array([[600.0, 550], [400, 450], [900, 480]])
+    xy, _ = apply_homography(found.fit.ground_H_image, uv)
+    np.testing.assert_allclose(xy, apply_homography(truth.ground_H_image, uv)[0], atol=0.3)
+
+
+def test_cars_of_one_lane_are_joined_by_points_of_the_ground():
+    camera, rng = tilted(0.06), np.random.default_rng(2)
+    seen = Observed(measurements=[unplaced([[500, 280, 700, 400]])])
+    seen.feet["front"] = [correspondences(camera, 200, rng, 0.3, collinear=True)]
+    seen.ground["front"] = [correspondences(camera, 200, rng, 0.3)]
+    _, fits = fit(log_with(camera), seen)
+    assert fits["front"].fit.ok
+    assert fits["front"].source == "obstacles and ground points"
+
+
+@pytest.mark.parametrize(("far", "yaw"), [((0, 0, 0), 0.0), ((5e5, 5e6, 80.0), 2.1), ((-40.0, 7, -3), -1.2)])
+@pytest.mark.parametrize("category", ["car", "pedestrian"])
+def test_an_obstacle_without_points_is_placed_where_its_foot_is(far, yaw, category):
+    camera = tilted()
+    log = log_with(camera, far=far, yaw=yaw)
+    size = TYPICAL_SIZE_M[category]
+    solid = standing(18.0, 3.0, 0.0, size)
+    m = unplaced([outline_px(camera, camera.mount_T_cam, solid)], category=category)
+    seen = Observed(measurements=[m])
+    homographies = {"front": CameraGround(camera, calibrated_ground(log, camera), "calibration")}
+    row = locate_the_rest(log, synchronize(log, ("front",)), seen, homographies)[0]
+    truth = apply(log.ego.map_T_ego[0], np.array([solid.center_m]))[0]
+    error = (row.center_m[0] - truth)[:2]
+    assert row.source.tolist() == ["topdown"]
+    assert error @ np.linalg.solve(row.covariance[0], error) < 9.21
+    assert np.hypot(*error) < 0.15 + 0.35 * (size[0] - size[1])
+    assert row.center_m[0, 2] == pytest.approx(truth[2], abs=1e-6)
+    assert row.size_m[0].tolist() == list(size)
+    # The rows of the first pass are left as they were.
+    assert m.source.tolist() == [""]
+    assert np.isnan(m.center_m).all()
+
+
+def test_the_covariance_turns_with_the_ego():
+    camera = tilted()
+    box = outline_px(camera, camera.mount_T_cam, standing(30.0, 0.0))
+
+    def covariance(yaw):
+        log = log_with(camera, yaw=yaw)
+        ground = {"front": CameraGround(camera, calibrated_ground(log, camera), "calibration")}
+        seen = Observed(measurements=[unplaced([box])])
+        return locate_the_rest(log, synchronize(log, ("front",)), seen, ground)[0].covariance[0]
+
+    along = covariance(0.0)
+    assert along[0, 0] > 4 * along[1, 1]
+    turn = rotation_from_rpy(0, 0, 1.1)[:2, :2]
+    np.testing.assert_allclose(covariance(1.1), turn @ along @ turn.T, atol=1e-9)
+
+
+LEFT_ALONE = {
+    "cut below": [500, 300, 700, 600],
+    "above the horizon": [500, 100, 560, 200],
+    "beyond 60 m": [590, 300, 600, 318],
+}
+
+
+@pytest.mark.parametrize("name", LEFT_ALONE)
+def test_boxes_whose_foot_says_nothing_stay_without_a_place(name):
+    camera = tilted(0.0)
+    log = log_with(camera)
+    ground = {"front": CameraGround(camera, calibrated_ground(log, camera), "calibration")}
+    seen = Observed(measurements=[unplaced([LEFT_ALONE[name]])])
+    row = locate_the_rest(log, synchronize(log, ("front",)), seen, ground)[0]
+    assert row.source.tolist() == [""]
+    assert np.isnan(row.center_m).all()
+
+
+@pytest.mark.parametrize(
+    "homographies", [{}, {"front": CameraGround(tilted(), refused("no", 0), "none")}], ids=["none", "refused"]
+)
+def test_without_a_homography_nothing_is_placed(homographies):
+    log = log_with(tilted())
+    seen = Observed(measurements=[unplaced([[500, 280, 700, 400]]), Measurements.empty()])
+    rows = locate_the_rest(log, synchronize(log, ("front",)), seen, homographies)
+    assert [r.source.tolist() for r in rows] == [[""], []]
+
+
+def test_two_cameras_that_place_one_obstacle_make_one_row_of_it():
+    left, right = tilted(at=(1.5, 0.4, 1.6)), replace(tilted(at=(1.5, -0.4, 1.6)), name="right")
+    log = log_with(left)
+    log = replace(log, cameras={"front": left, "right": right})
+    solid = Solid((15.0, 1.0, 0.875), TYPICAL_SIZE_M["pedestrian"])
+    rows = [
+        unplaced([outline_px(c, c.mount_T_cam, solid)], category="pedestrian", camera=c.name) for c in (left, right)
+    ]
+    ground = {c.name: CameraGround(c, calibrated_ground(log, c), "calibration") for c in (left, right)}
+    out = locate_the_rest(log, synchronize(log, ("front",)), Observed(measurements=[Measurements.join(rows)]), ground)
+    assert len(out[0]) == 1
+    assert np.hypot(*(out[0].center_m[0] - solid.center_m)[:2]) < 0.3

@@ -1,0 +1,430 @@
+"""Measurement in image boxes: ray-cast clouds whose every point has a known owner."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+from worlds import Solid, camera_ahead, outline_px, scan, standing
+
+from log2sim.boxfit import rotate
+from log2sim.geometry import apply, inverse, rotation_from_rpy, transform
+from log2sim.measure import Cloud, View, measure_view, project_cloud
+from log2sim.measure.ground import ON_GROUND_M
+from log2sim.types import TYPICAL_SIZE_M, Camera, Detections
+
+T0_NS = 1_700_000_000_000_000_000
+SENSOR = (0.0, 0.0, 1.9)
+PERSON = (0.7, 0.7, 1.75)
+
+
+def view_ahead(far=(0.0, 0.0, 0.0), yaw=0.0):
+    camera = camera_ahead(yaw_rad=yaw, at=(0.0, 0.0, 0.0))
+    at = np.array(far) + np.array([0.0, 0.0, 1.6])
+    return View(camera, T0_NS, transform(camera.mount_T_cam[:3, :3], at))
+
+
+def cloud_of(world, *, far=(0.0, 0.0, 0.0), height=None, t_s=None):
+    """The cloud of points (N, 3) on flat ground, with exact heights, as seen from `SENSOR`, all moved by `far`."""
+    height = world[:, 2] if height is None else height
+    t_s = np.zeros(len(world)) if t_s is None else t_s
+    return Cloud(
+        T0_NS,
+        np.array(far),
+        world.astype(np.float32),
+        np.asarray(t_s, dtype=np.float32),
+        np.array(SENSOR, dtype=np.float32),
+        np.abs(height) <= ON_GROUND_M,
+        height.astype(np.float32),
+    )
+
+
+def boxes(view, solids, categories=None, score=None):
+    outline = np.array([outline_px(view.camera, view.map_T_cam, s) for s in solids]).reshape(-1, 4)
+    category = np.array(categories or ["car"] * len(solids), dtype="<U16")
+    return Detections(outline, np.full(len(solids), 0.9) if score is None else score, category)
+
+
+def owners(cluster, world, owner):
+    """Which solid each point of a cluster comes from, by the nearest point of the world."""
+    assert len(cluster)
+    gap, which = KDTree(world).query(cluster)
+    assert gap.max() < 1e-4
+    return owner[which]
+
+
+def apart(yaw, truth, period=np.pi / 2):
+    return abs((yaw - truth + period / 2) % period - period / 2)
+
+
+PLACES = [(10, 2, 20), (14, -4, -30), (18, 6, 75), (22, -3, 140), (28, 5, 5), (35, -8, 170), (12, 5, 100)]
+
+
+@pytest.mark.parametrize(("x", "y", "yaw_deg"), PLACES)
+def test_a_free_car_is_measured_within_its_own_sigma(x, y, yaw_deg):
+    car, view = standing(x, y, yaw_deg), view_ahead()
+    world, owner = scan([car], noise_m=0.01)
+    row = measure_view(view, boxes(view, [car]), cloud_of(world))
+    error = (row.center_m[0] - car.center_m)[:2]
+    assert row.source[0] == "lidar"
+    assert apart(row.yaw_rad[0], car.yaw_rad) < np.deg2rad(4)
+    assert np.hypot(*error) < 0.6
+    assert error @ np.linalg.solve(row.covariance[0], error) < 13.8  # 99.9 %, two degrees of freedom
+    assert row.center_m[0, 2] - row.size_m[0, 2] / 2 == pytest.approx(0.0, abs=0.02)
+    on_car = int(((owner == 0) & (world[:, 2] > ON_GROUND_M)).sum())
+    assert 0.8 * on_car <= row.points[0] <= on_car
+    assert (owners(row.cluster[0], world, owner) == 0).all()
+
+
+@pytest.mark.parametrize("category", ["pedestrian", "cyclist", "truck", "bus"])
+def test_other_categories_are_found_too(category):
+    size = TYPICAL_SIZE_M[category]
+    solid, view = standing(20, 4, 30, size), view_ahead()
+    world, owner = scan([solid], noise_m=0.01, elevation_deg=(-10, 6))
+    row = measure_view(view, boxes(view, [solid], [category]), cloud_of(world))
+    assert row.source[0] == "lidar"
+    assert np.hypot(*(row.center_m[0] - solid.center_m)[:2]) < 0.1 + 0.1 * size[0]
+    assert row.size_m[0, 2] == pytest.approx(size[2], abs=0.25)
+    assert (owners(row.cluster[0], world, owner) == 0).mean() > 0.98
+
+
+@pytest.mark.parametrize("far", [(5e5, 5e6, 300.0), (-3e6, 7e6, -20.0)])
+def test_map_coordinates_of_any_size_change_nothing_else(far):
+    car = standing(15, 3, 25)
+    world, _ = scan([car], noise_m=0.01)
+    here_view, there_view = view_ahead(), view_ahead(far)
+    here = measure_view(here_view, boxes(here_view, [car]), cloud_of(world))
+    there = measure_view(there_view, boxes(here_view, [car]), cloud_of(world, far=far))
+    np.testing.assert_allclose(there.center_m - far, here.center_m, atol=1e-3)
+    np.testing.assert_allclose(there.cluster[0] - far, here.cluster[0], atol=1e-6)
+    np.testing.assert_allclose(there.sensor_m[0] - far, SENSOR, atol=1e-6)
+    for column in ("size_m", "yaw_rad", "covariance", "points", "height_px_m"):
+        np.testing.assert_allclose(getattr(there, column), getattr(here, column), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("angle", [0.6, 1.9, -2.6])
+def test_turning_the_world_turns_the_measurement(angle):
+    car = standing(15, 3, 25)
+    world, _ = scan([car], noise_m=0.01)
+    view, turned_view = view_ahead(), view_ahead(yaw=angle)
+    turned = np.column_stack([rotate(world[:, :2], angle), world[:, 2]])
+    here = measure_view(view, boxes(view, [car]), cloud_of(world))
+    there = measure_view(turned_view, boxes(view, [car]), cloud_of(turned))
+    # Cells of clustering and steps of the yaw search stay where they are, so a point or two may differ.
+    np.testing.assert_allclose(rotate(there.center_m[:, :2], -angle), here.center_m[:, :2], atol=0.08)
+    np.testing.assert_allclose(there.size_m, here.size_m, atol=0.08)
+    assert apart(there.yaw_rad[0], here.yaw_rad[0] + angle) < np.deg2rad(1.5)
+
+
+def test_the_order_of_points_and_of_boxes_does_not_matter():
+    cars, view = [standing(12, 3, 20), standing(20, -5, 80)], view_ahead()
+    world, _ = scan(cars, noise_m=0.01)
+    found, shuffled = boxes(view, cars), np.random.default_rng(0).permutation(len(world))
+    here = measure_view(view, found, cloud_of(world))
+    there = measure_view(view, found.take([1, 0]), cloud_of(world[shuffled]))
+    # Many points are thinned in their order before the yaw is searched, so the order may move it a little.
+    np.testing.assert_allclose(there.center_m[::-1], here.center_m, atol=0.05)
+    np.testing.assert_array_equal(there.points[::-1], here.points)
+
+
+@pytest.mark.parametrize(
+    ("name", "occluder"),
+    [
+        ("post", Solid((8.0, 1.6, 1.5), (0.2, 0.2, 3.0))),
+        ("person", standing(10, 2.5, 0, PERSON)),
+        ("hedge", Solid((9.0, 3.0, 0.4), (0.5, 6.0, 0.8))),
+    ],
+)
+def test_what_stands_in_front_is_not_the_object(name, occluder):
+    car, view = standing(16, 3, 40), view_ahead()
+    world, owner = scan([car, occluder], noise_m=0.01)
+    assert (owner == 1).sum() > 50
+    row = measure_view(view, boxes(view, [car]), cloud_of(world))
+    assert (owners(row.cluster[0], world, owner) == 0).all(), name
+    error = (row.center_m[0] - car.center_m)[:2]
+    assert np.hypot(*error) < 1.0
+
+
+def test_the_background_is_not_the_object():
+    car, wall, view = standing(14, 2, 30), Solid((22.0, 0.0, 2.0), (0.5, 30.0, 4.0)), view_ahead()
+    world, owner = scan([car, wall], noise_m=0.01)
+    loose = boxes(view, [car])
+    loose.box_px[0] += [-25, -25, 25, 10]
+    row = measure_view(view, loose, cloud_of(world))
+    assert (owners(row.cluster[0], world, owner) == 0).all()
+    assert np.hypot(*(row.center_m[0] - car.center_m)[:2]) < 0.4
+
+
+def test_a_person_before_a_car_and_the_car_behind_are_told_apart():
+    person, car, view = standing(9, 1.2, 0, PERSON), standing(15, 2, 90), view_ahead()
+    world, owner = scan([person, car], noise_m=0.01)
+    rows = measure_view(view, boxes(view, [person, car], ["pedestrian", "car"]), cloud_of(world))
+    assert (owners(rows.cluster[0], world, owner) == 0).all()
+    assert (owners(rows.cluster[1], world, owner) == 1).all()
+    assert np.hypot(*(rows.center_m[0] - person.center_m)[:2]) < 0.3
+
+
+@pytest.mark.parametrize("gap_m", [0.8, 1.5])
+def test_cars_parked_bumper_to_bumper_stay_two(gap_m):
+    view, y = view_ahead(), 5.0
+    cars = [standing(10, y, 0), standing(10 + 4.4 + gap_m, y, 0)]
+    world, owner = scan(cars, noise_m=0.01, azimuth_deg=(0, 60))
+    rows = measure_view(view, boxes(view, cars), cloud_of(world))
+    for k, car in enumerate(cars):
+        assert (owners(rows.cluster[k], world, owner) == k).mean() > 0.9
+        assert np.hypot(*(rows.center_m[k] - car.center_m)[:2]) < 0.7
+    assert rows.center_m[1, 0] - rows.center_m[0, 0] == pytest.approx(4.4 + gap_m, abs=0.7)
+
+
+@pytest.mark.parametrize("gap_m", [0.6, 0.8, 1.2])
+@pytest.mark.parametrize("loose_px", [0, 4])
+def test_cars_side_by_side_on_a_parking_lot_are_all_found(gap_m, loose_px):
+    view = view_ahead()
+    cars = [standing(15, -4 + k * (1.85 + gap_m), 0) for k in range(3)]
+    world, owner = scan(cars, noise_m=0.01, azimuth_deg=(-40, 40))
+    found = boxes(view, cars)
+    found.box_px[:] += np.array([-1, -1, 1, 1]) * loose_px
+    rows = measure_view(view, found, cloud_of(world))
+    for k, car in enumerate(cars):
+        assert (owners(rows.cluster[k], world, owner) == k).mean() > 0.8
+        assert np.hypot(*(rows.center_m[k] - car.center_m)[:2]) < 0.5
+
+
+def test_ground_in_the_box_and_branches_above_it_are_left_out():
+    car, view = standing(14, 2, 30), view_ahead()
+    branch = Solid((13.0, 2.0, 4.6), (3.0, 3.0, 0.4))
+    world, owner = scan([car, branch], noise_m=0.01, elevation_deg=(-20, 25), steps=(360, 90))
+    tall = boxes(view, [car])
+    tall.box_px[0] += [-20, -200, 20, 60]
+    row = measure_view(view, tall, cloud_of(world))
+    assert (owners(row.cluster[0], world, owner) == 0).all()
+    assert row.size_m[0, 2] < 2.0
+
+
+def test_boxes_cut_by_the_images_border_are_marked_and_use_points_beyond_it():
+    car, view = standing(9, 6.6, 10), view_ahead()
+    world, owner = scan([car], noise_m=0.01, azimuth_deg=(10, 80))
+    found = boxes(view, [car])
+    assert found.box_px[0, 0] == 0.0
+    uv, _ = project(view, world[owner == 0])
+    outside = (uv[:, 0] < 0).sum()
+    row = measure_view(view, found, cloud_of(world))
+    assert row.truncated.tolist() == [True]
+    assert outside > 20
+    seen = ((owner == 0) & (world[:, 2] > ON_GROUND_M)).sum()
+    assert row.points[0] > 0.9 * seen
+    assert np.hypot(*(row.center_m[0] - car.center_m)[:2]) < 0.4
+
+
+@pytest.mark.parametrize(
+    ("box", "cut"),
+    [
+        ((100, 100, 200, 200), False),
+        ((0, 100, 200, 200), True),
+        ((100, 0, 200, 200), True),
+        ((900, 100, 1200, 200), True),
+        ((100, 300, 200, 600), True),
+        ((4, 4, 1196, 596), False),
+    ],
+)
+def test_truncation_is_told_from_the_box_alone(box, cut):
+    found = Detections(np.array([box], dtype=float), np.ones(1), np.array(["car"]))
+    assert measure_view(view_ahead(), found, None).truncated.tolist() == [cut]
+
+
+def test_a_cut_object_beside_a_wall_does_not_swallow_the_wall():
+    car, wall, view = standing(9, 6.6, 0), Solid((25.0, 8.2, 1.5), (50.0, 0.3, 3.0)), view_ahead()
+    world, _ = scan([car, wall], noise_m=0.01, azimuth_deg=(5, 80))
+    row = measure_view(view, boxes(view, [car]), cloud_of(world))
+    length = np.ptp(row.cluster[0][:, :2], axis=0).max()
+    assert row.source[0] == "lidar"
+    assert length <= 12.0  # twice the farthest that anything of a car may be from its middle
+
+
+NOTHING = {
+    "sky": (500, 5, 560, 40),
+    "without area": (300, 320, 300, 320),
+    "upside down": (400, 400, 300, 300),
+    "outside": (-900, -900, -800, -800),
+    "NaN": (np.nan, np.nan, np.nan, np.nan),
+}
+
+
+@pytest.mark.parametrize("mode", ["robust", "paper"])
+@pytest.mark.parametrize("name", NOTHING)
+def test_boxes_without_points_come_back_without_a_place(name, mode):
+    world, _ = scan([standing(14, 2, 30)])
+    found = Detections(np.array([NOTHING[name]], dtype=float), np.array([0.7]), np.array(["truck"]))
+    rows = measure_view(view_ahead(), found, cloud_of(world), mode=mode)
+    assert rows.source.tolist() == [""]
+    assert rows.points.tolist() == [0]
+    assert np.isnan(rows.center_m).all()
+    assert np.isnan(rows.covariance).all()
+    assert np.isnan(rows.yaw_rad).all()
+    assert rows.cluster[0].shape == (0, 3)
+    assert rows.size_m[0].tolist() == list(TYPICAL_SIZE_M["truck"])
+    assert (rows.t_ns[0], rows.score[0], rows.camera[0]) == (T0_NS, 0.7, "front")
+
+
+@pytest.mark.parametrize("mode", ["robust", "paper"])
+@pytest.mark.parametrize("world", [None, np.zeros((0, 3)), np.array([[-10.0, 0, 1]])], ids=["no", "empty", "behind"])
+def test_without_a_cloud_all_rows_are_without_a_place(world, mode):
+    view = view_ahead()
+    cloud = None if world is None else cloud_of(world)
+    rows = measure_view(view, boxes(view, [standing(14, 2), standing(20, -3)]), cloud, mode=mode)
+    assert rows.source.tolist() == ["", ""]
+    none = measure_view(view, Detections.empty(), cloud, mode=mode)
+    assert len(none) == 0
+    assert none.center_m.shape == (0, 3)
+    assert none.covariance.shape == (0, 2, 2)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_fewer_points_than_make_a_cluster_are_no_measurement(count):
+    view, car = view_ahead(), standing(14, 0)
+    rng = np.random.default_rng(count)
+    world = np.array([11.8, 0, 0.8]) + rng.normal(0, 0.05, (count, 3))
+    assert measure_view(view, boxes(view, [car]), cloud_of(world)).source.tolist() == [""]
+
+
+@pytest.mark.parametrize("shape", ["post", "line across", "four places"])
+def test_degenerate_clusters_give_finite_boxes(shape):
+    view = view_ahead()
+    y, z = np.linspace(-0.2, 0.2, 40), np.linspace(0.3, 1.5, 40)
+    if shape == "post":
+        y = 0.15 * np.sign(y)
+    if shape == "four places":
+        y, z = 0.15 * np.sign(y), np.where(np.arange(40) % 2, 0.3, 1.5)
+    world = np.column_stack([np.full(40, 11.8), y, z])
+    row = measure_view(view, boxes(view, [standing(14, 0, 0, (4.4, 0.5, 1.6))]), cloud_of(world))
+    assert row.source.tolist() == ["lidar"]
+    assert np.isfinite([*row.center_m[0], *row.size_m[0], row.yaw_rad[0], *row.covariance[0].ravel()]).all()
+    assert np.linalg.eigvalsh(row.covariance[0]).min() > 0
+    assert row.size_m[0].min() > 0
+
+
+def test_the_stamp_is_the_mean_time_of_the_objects_own_points():
+    car, view = standing(14, 2, 30), view_ahead()
+    world, owner = scan([car])
+    t_s = np.where(owner == 0, np.linspace(-0.05, -0.03, len(world)), 5.0)
+    row = measure_view(view, boxes(view, [car]), cloud_of(world, t_s=t_s))
+    taken = (owner == 0) & (world[:, 2] > ON_GROUND_M)
+    assert (row.t_ns[0] - T0_NS) / 1e9 == pytest.approx(t_s[taken].mean(), abs=1e-3)
+    untouched = measure_view(view, Detections(np.array([NOTHING["sky"]], float), np.ones(1), np.array(["car"])), None)
+    assert untouched.t_ns[0] == T0_NS
+
+
+def test_the_height_in_the_image_is_the_objects_height():
+    for x in (8.0, 16.0, 30.0):
+        person, view = standing(x, 1.5, 0, PERSON), view_ahead()
+        world, _ = scan([person])
+        row = measure_view(view, boxes(view, [person], ["pedestrian"]), cloud_of(world))
+        # The outline is that of a box whose near side is half a width closer than its points' middle at most.
+        assert row.height_px_m[0] == pytest.approx(1.75, rel=0.12)
+
+
+def test_heights_count_from_the_ground_not_from_the_map():
+    slope = np.array([0.06, 0.0])
+    car = Solid((20.0, 2.0, 20 * 0.06 + 0.8), yaw_rad=0.5)
+    view = view_ahead()
+    world, owner = scan([car], slope=tuple(slope), noise_m=0.01)
+    row = measure_view(view, boxes(view, [car]), cloud_of(world, height=world[:, 2] - world[:, :2] @ slope))
+    assert row.center_m[0, 2] == pytest.approx(car.center_m[2], abs=0.15)
+    assert row.size_m[0, 2] == pytest.approx(1.6, abs=0.2)
+    assert (owners(row.cluster[0], world, owner) == 0).all()
+
+
+# Mode "paper"
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_paper_mode_is_the_point_nearest_to_the_box_center_and_the_extent_of_all(seed):
+    rng = np.random.default_rng(seed)
+    view = view_ahead()
+    world = rng.uniform([5, -6, 0], [25, 6, 2], (800, 3))
+    found = Detections(np.array([[450.0, 220, 700, 380]]) + rng.uniform(-40, 40, 4), np.ones(1), np.array(["car"]))
+    row = measure_view(view, found, cloud_of(world), mode="paper")
+    uv, front = project(view, world)
+    box = found.box_px[0]
+    inside = np.array([front[k] and box[0] <= uv[k, 0] <= box[2] and box[1] <= uv[k, 1] <= box[3] for k in range(800)])
+    middle = (box[:2] + box[2:]) / 2
+    best = min(np.flatnonzero(inside), key=lambda k: np.hypot(*(uv[k] - middle)))
+    np.testing.assert_allclose(row.center_m[0], world[best], atol=1e-5)
+    np.testing.assert_allclose(row.size_m[0], world[inside].max(0) - world[inside].min(0), atol=1e-5)
+    assert row.points[0] == inside.sum()
+
+
+def test_paper_mode_falls_for_the_occluder_that_robust_mode_sees_through():
+    car, post, view = standing(16, 0, 0), Solid((8.0, 0.0, 1.5), (0.3, 0.3, 3.0)), view_ahead()
+    world, _ = scan([car, post], noise_m=0.01)
+    found = boxes(view, [car])
+    paper = measure_view(view, found, cloud_of(world), mode="paper")
+    robust = measure_view(view, found, cloud_of(world), mode="robust")
+    assert abs(paper.center_m[0, 0] - 8.0) < 0.5
+    assert abs(robust.center_m[0, 0] - 16.0) < 0.5
+    assert paper.size_m[0, 0] > 5
+
+
+def test_paper_mode_gives_a_single_point_a_size():
+    view = view_ahead()
+    row = measure_view(view, boxes(view, [standing(14, 0)]), cloud_of(np.array([[12.0, 0, 0.8]])), mode="paper")
+    np.testing.assert_allclose(row.center_m[0], [12, 0, 0.8], atol=1e-6)
+    np.testing.assert_allclose(row.size_m[0], 0.1)
+
+
+# Projection of clouds
+
+
+def project(view, world):
+    """Pixels (N, 2) by the pinhole formula alone, and what is in front (N,)."""
+    p = apply(inverse(view.map_T_cam), world)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        uv = p[:, :2] / p[:, 2:] * 700.0 + [600.0, 300.0]
+    return uv, p[:, 2] > 0.1
+
+
+@pytest.mark.parametrize("far", [(0.0, 0.0, 0.0), (5e5, 5e6, 100.0)])
+def test_the_cameras_view_of_a_cloud_equals_the_pinhole_formula_for_every_point(far):
+    rng = np.random.default_rng(0)
+    world = rng.uniform([-30, -30, -2], [30, 30, 6], (4000, 3))
+    view = view_ahead(far, yaw=0.7)
+    index = np.arange(0, 4000, 3)
+    seen, uv, depth = project_cloud(view, cloud_of(world, far=far), index)
+    expected, front = project(view_ahead(yaw=0.7), world[index])
+    inside = front & (expected > 0.01).all(axis=1) & (expected < [1199.99, 599.99]).all(axis=1)
+    assert inside.sum() > 100
+    assert set(np.flatnonzero(inside)) <= set(seen.tolist())
+    np.testing.assert_allclose(uv, expected[seen], atol=0.05)
+    np.testing.assert_allclose(
+        depth, apply(inverse(view_ahead(yaw=0.7).map_T_cam), world[index[seen]])[:, 2], atol=1e-4
+    )
+
+
+def test_a_bent_lens_loses_no_point_that_it_shows():
+    plain = view_ahead()
+    c = plain.camera
+    bent = Camera(c.name, c.width_px, c.height_px, c.K, c.mount, c.mount_T_cam, "brown", (-0.2, 0.03, 0.0, 0.0))
+    view = View(bent, T0_NS, plain.map_T_cam)
+    a, b = np.meshgrid(np.linspace(-1.1, 1.1, 80), np.linspace(-0.6, 0.6, 50))
+    a, b = a.ravel(), b.ravel()
+    r2 = a * a + b * b
+    scale = 1 - 0.2 * r2 + 0.03 * r2 * r2
+    uv = np.stack([a * scale * 700 + 600, b * scale * 700 + 300], axis=1)
+    shown = (uv > 0.1).all(axis=1) & (uv < [1199.9, 599.9]).all(axis=1)
+    world = apply(view.map_T_cam, 12.0 * np.stack([a, b, np.ones_like(a)], axis=1))
+    seen, pixels, _ = project_cloud(view, cloud_of(world), np.arange(len(world)))
+    assert set(np.flatnonzero(shown)) <= set(seen.tolist())
+    assert (shown & ((np.abs(a) > 600 / 700) | (np.abs(b) > 300 / 700))).sum() > 50
+    np.testing.assert_allclose(pixels, uv[seen], atol=0.05)
+
+
+def test_tilted_cameras_see_what_is_before_them():
+    view = view_ahead()
+    down = transform(view.map_T_cam[:3, :3] @ rotation_from_rpy(-0.5, 0, 0), view.map_T_cam[:3, 3])
+    axis = down[:3, 2]
+    assert axis[2] < -0.4
+    world = down[:3, 3] + np.outer(np.arange(-5, 6), axis)
+    seen, uv, depth = project_cloud(View(view.camera, T0_NS, down), cloud_of(world), np.arange(11))
+    assert seen.tolist() == [6, 7, 8, 9, 10]
+    np.testing.assert_allclose(uv, np.tile([600.0, 300.0], (5, 1)), atol=1e-2)
+    np.testing.assert_allclose(depth, [1, 2, 3, 4, 5], atol=1e-5)

@@ -1,0 +1,276 @@
+"""The first pass: a driving ego, a ray-cast world and a detector that knows the truth."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from worlds import camera_ahead, outline_px, scan, standing
+
+from log2sim.clock import StageClock
+from log2sim.config import Config
+from log2sim.errors import LogError, RecordError
+from log2sim.geometry import PoseTrack, apply, inverse, rotation_from_rpy, transform
+from log2sim.observe import Records, base_pose, observe, place_of_ego
+from log2sim.pipeline import reconstruct
+from log2sim.plan import make_plan
+from log2sim.sync import synchronize
+from log2sim.types import Detections, Frame, ImageLabels, Lidar, Log, Stream, Sweep
+
+T0_NS = 1_700_000_000_000_000_000
+STEP_NS = 100_000_000
+TICKS = 4
+SPEED_MPS = 5.0
+SOLIDS = (standing(16.0, 3.0, 30.0), standing(12.0, -4.0, 0.0, (0.7, 0.7, 1.75)))
+CATEGORIES = ("car", "pedestrian")
+EGO_T_LIDAR = transform(np.eye(3), np.array([0.0, 0.0, 1.9]))
+STAMPS = T0_NS + np.arange(TICKS) * STEP_NS
+
+
+class Truth:
+    """A detector that projects the solids; it counts its frames and looks at the images only if told to."""
+
+    name, default_min_score = "truth", 0.1
+
+    def __init__(self, log, far=(0.0, 0.0, 0.0), *, looks=False):
+        self.log, self.far, self.looks, self.frames = log, np.array(far), looks, []
+
+    def detect(self, frame):
+        self.frames.append((frame.camera.name, frame.t_ns))
+        if self.looks:
+            frame.image()
+        map_T_cam = self.log.map_T_sensor(frame.camera.name, frame.t_ns)[0][0].copy()
+        map_T_cam[:3, 3] -= self.far
+        outline = np.array([outline_px(frame.camera, map_T_cam, s) for s in SOLIDS])
+        return Detections(outline, np.full(len(SOLIDS), 0.9), np.array(CATEGORIES, dtype="<U16"))
+
+
+def driving_log(*, far=(0.0, 0.0, 0.0), broken=(), cameras=("front",), empty=(), yaw=0.0):
+    """A log of four ticks at 5 m/s; `broken` and `empty` name (stream, index) that cannot be read or hold no point."""
+    reads = Counter()
+    far = np.array(far)
+    t = T0_NS + np.arange(-2, TICKS + 2) * STEP_NS
+    x = (t - T0_NS) / 1e9 * SPEED_MPS
+    poses = transform(np.eye(3), np.stack([x, 0 * x, 0 * x], axis=1) + far)
+
+    def check(name, i):
+        reads[name, i] += 1
+        if (name, i) in broken:
+            raise RecordError(f"{name} {i}: torn")
+
+    def image(name):
+        def read(i):
+            check(name, i)
+            return np.zeros((600, 1200, 3), dtype=np.uint8)
+
+        return read
+
+    def sweep(i):
+        check("top", i)
+        if ("top", i) in empty:
+            return Sweep(int(STAMPS[i]), np.zeros((0, 3)))
+        at = SPEED_MPS * i * STEP_NS / 1e9
+        world, _ = scan(SOLIDS, sensor=(at, 0.0, 1.9), noise_m=0.01, seed=i)
+        return Sweep(int(STAMPS[i]), world - [at, 0.0, 1.9], "lidar", np.full(len(world), STAMPS[i]))
+
+    log = Log(
+        "log",
+        "test",
+        {name: camera_ahead(name, mount="ego") for name in cameras},
+        {"top": Lidar("top", "ego", EGO_T_LIDAR)},
+        {**{name: Stream(name, STAMPS, image(name)) for name in cameras}, "top": Stream("top", STAMPS, sweep)},
+        PoseTrack(t, poses),
+    )
+    return log, reads
+
+
+def run(log, detector=None, *, config=None, max_range_m=80.0, mode="robust", picture=False, labels=False, reads=None):
+    reads = {} if reads is None else reads
+    config = config or Config.load(settings=["detect.name=labels"] if labels else [])
+    plan = make_plan(log, config, picture=picture)
+    ticks, schedule = [], synchronize(log, plan.cameras)
+    reads.clear()  # synchronization looks into a sweep
+    out = observe(
+        log, schedule, detector or Truth(log), plan,
+        mode=mode, max_range_m=max_range_m, clock=StageClock(), progress=lambda done, total: ticks.append((done, total)),
+    )  # fmt: skip
+    return out, ticks
+
+
+@pytest.mark.parametrize("far", [(0.0, 0.0, 0.0), (5e5, 5e6, 70.0)], ids=["origin", "UTM"])
+def test_every_tick_has_every_object_at_its_place_in_the_map(far):
+    log, _ = driving_log(far=far)
+    out, ticks = run(log, Truth(log, far))
+    assert ticks == [(k + 1, TICKS) for k in range(TICKS)]
+    assert len(out.measurements) == len(out.obstacles) == TICKS
+    for k, m in enumerate(out.measurements):
+        assert sorted(m.category.tolist()) == ["car", "pedestrian"]
+        for solid, category in zip(SOLIDS, CATEGORIES):
+            row = m.take(m.category == category)
+            assert np.hypot(*(row.center_m[0] - solid.center_m - far)[:2]) < 0.3
+            assert row.center_m[0, 2] - row.size_m[0, 2] / 2 == pytest.approx(far[2], abs=0.1)
+            assert row.t_ns[0] == STAMPS[k]
+    assert out.detections == {"front": TICKS * 2}
+
+
+def test_obstacles_are_the_points_above_the_ground_at_their_places():
+    log, _ = driving_log()
+    out, _ = run(log)
+    for k, cloud in enumerate(out.obstacles):
+        world = cloud.xyz + cloud.origin
+        assert cloud.stamp_ns == STAMPS[k]
+        assert len(world) > 50
+        np.testing.assert_allclose(cloud.sensor + cloud.origin, [SPEED_MPS * k * 0.1, 0, 1.9], atol=1e-4)
+        near = [(np.hypot(*(world[:, :2] - s.center_m[:2]).T) < 2.6) for s in SOLIDS]
+        assert np.logical_or(*near).mean() > 0.98
+        assert world[:, 2].min() > 0.1
+
+
+def test_obstacles_are_thinned_evenly_and_nothing_is_lost_of_an_object():
+    log, _ = driving_log()
+    out, _ = run(log)
+    world = out.obstacles[0].xyz + out.obstacles[0].origin
+    gap = np.linalg.norm(world[:, None] - world[None], axis=2) + np.eye(len(world))
+    full, owner = scan(SOLIDS, noise_m=0.01, seed=0)
+    full = full[(owner >= 0) & (full[:, 2] > 0.25)]
+    assert len(world) < 0.8 * len(full)
+    assert np.linalg.norm(full[:, None] - world[None], axis=2).min(axis=1).max() < 0.12 * np.sqrt(3) + 1e-3
+    assert np.median(gap.min(axis=1)) > 0.03
+
+
+def test_what_is_out_of_range_is_left_out():
+    log, _ = driving_log()
+    out, _ = run(log, max_range_m=14.0)
+    # The car is 16.3 m away at first and comes within 14 m after half a second; the person is 12.6 m away.
+    assert [m.category[m.source == "lidar"].tolist() for m in out.measurements] == [["pedestrian"]] * TICKS
+
+
+def test_each_record_is_read_once_and_images_only_if_they_are_needed():
+    log, reads = driving_log(cameras=("front", "left"))
+    detector = Truth(log)
+    out, _ = run(log, detector, labels=True, reads=reads)
+    assert set(reads) == {("top", i) for i in range(TICKS)}
+    assert set(reads.values()) == {1}
+    assert len(detector.frames) == 2 * TICKS
+    assert [len(m) for m in out.measurements] == [2] * TICKS  # seen by two cameras, joined
+    log, reads = driving_log(cameras=("front", "left"))
+    run(log, Truth(log, looks=True), reads=reads)
+    assert reads == {(s, i): 1 for s in ("front", "left", "top") for i in range(TICKS)}
+
+
+def test_one_torn_image_and_one_torn_sweep_are_counted_and_cost_only_their_tick():
+    log, _ = driving_log(broken={("front", 1), ("top", 2)})
+    out, ticks = run(log, Truth(log, looks=True))
+    assert len(ticks) == TICKS
+    found = [m.source.tolist() for m in out.measurements]
+    assert found[0] == found[3] == ["lidar", "lidar"]
+    assert found[1] == []
+    assert found[2] == ["", ""]
+    assert [o is None for o in out.obstacles] == [False, False, True, False]
+    assert out.records.summary() == {
+        "front": {"count": 1, "first": "front 1: torn"},
+        "top": {"count": 1, "first": "top 2: torn"},
+    }
+
+
+def test_an_empty_sweep_counts_as_one_that_cannot_be_read():
+    log, _ = driving_log(empty={("top", 1)})
+    out, _ = run(log)
+    assert out.records.summary()["top"]["count"] == 1
+    assert str(STAMPS[1]) in out.records.summary()["top"]["first"]
+    assert out.obstacles[1] is None
+
+
+@pytest.mark.parametrize("stream", ["front", "left"])
+def test_a_stream_of_which_nothing_can_be_read_is_an_error_that_names_it(stream):
+    log, _ = driving_log(broken={(stream, i) for i in range(TICKS)}, cameras=("front", "left"))
+    with pytest.raises(LogError, match=f"stream '{stream}': none of the {TICKS} records asked for can be read.*torn"):
+        run(log, Truth(log, looks=True))
+
+
+def test_records_count_what_was_read_and_what_was_not():
+    log, _ = driving_log(broken={("top", 0)})
+    records = Records(log)
+    assert records.get("top", 0) is None
+    with pytest.raises(LogError, match="stream 'top'"):
+        records.require_some()
+    assert isinstance(records.get("top", 1), Sweep)
+    records.require_some()
+    assert (records.read, records.failed) == ({"top": 1}, {"top": ["top 0: torn"]})
+
+
+def test_a_log_without_lidar_gives_rows_without_a_place():
+    log, _ = driving_log()
+    out, _ = run(replace(log, lidars={}))
+    assert [m.source.tolist() for m in out.measurements] == [["", ""]] * TICKS
+    assert out.obstacles == [None] * TICKS
+
+
+def roadside(log):
+    """The same log from posts: sensors fixed in the map where the ego was at the start, and no ego."""
+    cameras = {n: replace(c, mount="map") for n, c in log.cameras.items()}
+    streams = {**log.streams, "top": replace(log.streams["top"], read=lambda i: first(log, i))}
+    return replace(log, ego=None, cameras=cameras, lidars={"top": Lidar("top", "map", EGO_T_LIDAR)}, streams=streams)
+
+
+def first(log, i):
+    sweep = log.streams["top"].read(0)
+    return replace(sweep, stamp_ns=int(STAMPS[i]), t_ns=np.full(len(sweep.t_ns), STAMPS[i]))
+
+
+def test_sensors_on_a_post_need_no_ego():
+    log = roadside(driving_log()[0])
+    out, _ = run(log)
+    for m in out.measurements:
+        assert m.source.tolist() == ["lidar", "lidar"]
+        for solid, category in zip(SOLIDS, CATEGORIES):
+            row = m.take(m.category == category)
+            assert np.hypot(*(row.center_m[0] - solid.center_m)[:2]) < 0.3
+    np.testing.assert_array_equal(base_pose(log, T0_NS), np.eye(4))
+    origin, ground = place_of_ego(log, T0_NS)
+    np.testing.assert_allclose(origin, [0.0, 0.0, (1.9 + 1.6) / 2])
+    assert ground == 0.0
+
+
+def test_ticks_at_which_the_ego_is_not_known_have_no_measurements():
+    log, _ = driving_log()
+    known = PoseTrack(log.ego.t_ns[:3], log.ego.map_T_ego[:3], extrapolate_s=0.0)
+    out, _ = run(replace(log, ego=known))
+    assert [len(m) for m in out.measurements] == [2, 0, 0, 0]
+
+
+def test_the_ground_under_the_ego_turns_with_its_pitch():
+    log, _ = driving_log()
+    pose = transform(rotation_from_rpy(0.0, 0.1, 0.0), np.array([5.0, 6.0, 7.0]))
+    tilted = replace(log, ego=PoseTrack(STAMPS[:1], pose[None]), ground_z_ego_m=-0.5)
+    origin, ground = place_of_ego(tilted, int(STAMPS[0]))
+    np.testing.assert_allclose(origin, [5, 6, 7])
+    assert ground == pytest.approx(7.0 - 0.5 * np.cos(0.1))
+
+
+def test_feet_and_ground_points_lie_where_the_camera_sees_them():
+    log, _ = driving_log()
+    out, _ = run(log)
+    camera = log.cameras["front"]
+    ego_T_cam = camera.mount_T_cam
+    for parts, allowed_px in ((out.ground["front"], 3.0), (out.feet["front"], 25.0)):
+        assert sorted({int(t) for p in parts for t in p.tick}) == list(range(TICKS))
+        for p in parts:
+            ground = np.column_stack([p.xy_ego, np.zeros(len(p.xy_ego))])
+            seen = apply(inverse(ego_T_cam), ground)
+            uv = seen[:, :2] / seen[:, 2:] * 700.0 + [600.0, 300.0]
+            # Rough for feet: the lower side of an outline belongs to a corner, the ground to the nearest points.
+            assert np.median(np.hypot(*(uv - p.uv).T)) < allowed_px
+
+
+def test_mode_paper_runs_from_the_log_to_the_scenario():
+    log, _ = driving_log()
+    boxes = [Truth(log).detect(Frame(log.cameras["front"], int(t), lambda: None)).box_px for t in STAMPS]
+    labels = ImageLabels(np.repeat(STAMPS, 2), np.concatenate(boxes), np.array(CATEGORIES * TICKS))
+    log = replace(log, image_labels={"front": labels})
+    config = Config.load(settings=["detect.name=labels", "measure.mode=paper"])
+    scenario = reconstruct(log, config).scenario
+    assert scenario.ego is not None
+    assert scenario.others

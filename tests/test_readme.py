@@ -1,0 +1,107 @@
+"""What README.md tells people to type works: commands and options exist, links lead somewhere, code imports."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import importlib.util
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import typer
+
+from log2sim import cli
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+GROUP = typer.main.get_command(cli.app)
+
+
+def blocks() -> Iterator[str]:
+    """Code blocks, fenced or indented by four columns."""
+    yield from re.findall(r"^```[^\n]*\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)
+    rest = re.sub(r"^```[^\n]*\n.*?^```", "", README, flags=re.MULTILINE | re.DOTALL)
+    for block in re.findall(r"(?:^(?: {4}.*)?\n)+", rest, flags=re.MULTILINE):
+        lines = [line[4:] for line in block.split("\n") if line.startswith("    ")]
+        if lines:
+            yield "\n".join(lines)
+
+
+def commands() -> list[str]:
+    """Command lines of log2sim in code blocks, comments off and continued lines joined, and those within sentences."""
+    joined = "\n".join(blocks()).replace("\\\n", " ")
+    lines = [re.sub(r"\s+#.*", "", line).strip().removeprefix("$ ") for line in joined.split("\n")]
+    inline = re.findall(r"`(log2sim [^`\n]+)`", README)
+    return [line for line in (*lines, *inline) if re.match(r"log2sim \w", line)]
+
+
+def parse(line: str) -> None:
+    """Parse as the program would, without running it."""
+    name, *arguments = shlex.split(line)[1:]
+    assert name in GROUP.commands, f"no command '{name}' in: {line}"
+    GROUP.commands[name].make_context(name, arguments)
+
+
+@pytest.mark.parametrize("line", commands())
+def test_commands_of_the_readme_parse(line: str) -> None:
+    parse(line)
+
+
+def test_the_readme_shows_the_main_commands() -> None:
+    shown = {line.split()[1] for line in commands()}
+    assert {"reconstruct", "replay", "evaluate", "plot", "inspect", "validate"} <= shown
+
+
+def test_a_wrong_command_would_be_noticed() -> None:
+    with pytest.raises(AssertionError, match="no command"):
+        parse("log2sim reconstrct LOG")
+    with pytest.raises(Exception, match=r"No such option.*--outt"):
+        parse("log2sim replay scenario.json --outt x")
+    with pytest.raises(Exception, match="Missing parameter: out"):
+        parse("log2sim reconstruct LOG")
+
+
+def test_commands_of_the_demo_parse() -> None:
+    spec = importlib.util.spec_from_file_location("demo", ROOT / "tools/demo.py")
+    assert spec is not None
+    assert spec.loader is not None
+    demo = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(demo)
+    for command in demo.COMMANDS:
+        parse(shlex.join(["log2sim", *command, "--overwrite"]))
+
+
+def test_every_command_is_documented() -> None:
+    for name, command in GROUP.commands.items():
+        assert command.help, name
+        for parameter in command.params:
+            assert getattr(parameter, "help", None), f"{name} {parameter.name}"
+
+
+def test_scripts_and_links_exist() -> None:
+    scripts = set(re.findall(r"(?<![\w/])tools/\w+\.sh", README))
+    assert {"tools/demo.sh", "tools/test.sh"} <= scripts
+    links = re.findall(r"\]\(([^)\s#]+)", README) + re.findall(r"""src=["']([^"']+)""", README)
+    for target in (*scripts, *(link for link in links if "://" not in link)):
+        assert (ROOT / target).exists(), target
+
+
+def test_names_that_python_code_imports_exist() -> None:
+    seen = []
+    for block in blocks():
+        for node in _imports(block):
+            assert node.module is not None
+            module = importlib.import_module(node.module)
+            seen += [getattr(module, alias.name) for alias in node.names]
+    assert seen, "the README shows no use as a library"
+
+
+def _imports(block: str) -> list[ast.ImportFrom]:
+    try:
+        tree = ast.parse(block)
+    except SyntaxError:
+        return []
+    return [n for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and (n.module or "").startswith("log2sim")]

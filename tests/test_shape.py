@@ -1,0 +1,276 @@
+"""One size for every track and places measured against it: ray-cast tracks with exact truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from worlds import scan, standing
+
+from log2sim.boxfit import box_of_cluster, rotate
+from log2sim.geometry import rotation_from_rpy
+from log2sim.shape import heading_of_standing, is_standing, shape_moving, shape_standing
+from log2sim.types import TYPICAL_SIZE_M, Measurements, Track
+
+T0_NS = 1_700_000_000_000_000_000
+STEP_NS = 100_000_000
+CAR = (4.4, 1.85, 1.6)
+PERSON = (0.7, 0.7, 1.75)
+
+
+def measured(states, size=CAR, category="car", *, sensors=None, noise_m=0.01, truncated=False):
+    """A track over a box at the states (x, y, yaw), each measured from its sensor (3,) by the box fit."""
+    rows = []
+    for k, (x, y, yaw) in enumerate(states):
+        sensor = np.array((0.0, 0.0, 1.9) if sensors is None else sensors[k])
+        xyz, owner = scan(
+            [standing(x - sensor[0], y - sensor[1], np.rad2deg(yaw), size)],
+            azimuth_deg=(-180, 180), steps=(900, 32), noise_m=noise_m, seed=k,
+        )  # fmt: skip
+        cluster = xyz[(owner == 0) & (xyz[:, 2] > 0.2)] + [*sensor[:2], 0.0]
+        center, found, angle, covariance = box_of_cluster(cluster, sensor, category, 0.0)
+        rows.append(
+            Measurements(
+                np.array([T0_NS + k * STEP_NS]),
+                np.array([category], dtype="<U16"),
+                np.array([0.9]),
+                np.array(["a"]),
+                np.array([[10.0, 10, 20, 20]]),
+                np.array([truncated]),
+                center[None],
+                found[None],
+                np.array([angle]),
+                covariance[None],
+                np.array([len(cluster)]),
+                np.array(["lidar"], dtype="<U16"),
+                (cluster,),
+                sensor[None],
+                np.array([size[2]]),
+            )
+        )
+    return Track(category, np.arange(len(rows)), Measurements.join(rows))
+
+
+def bare(xy, category="car", step_s=0.1):
+    """A track of measured centers without points."""
+    xy = np.asarray(xy, dtype=np.float64)
+    n, size = len(xy), np.array(TYPICAL_SIZE_M[category])
+    m = Measurements(
+        T0_NS + np.round(np.arange(n) * step_s * 1e9).astype(np.int64), np.full(n, category, dtype="<U16"),
+        np.full(n, 0.9), np.full(n, "a"), np.zeros((n, 4)), np.zeros(n, dtype=bool),
+        np.column_stack([xy, np.full(n, size[2] / 2)]), np.tile(size, (n, 1)), np.full(n, np.nan),
+        np.tile(np.eye(2) * 0.25, (n, 1, 1)), np.zeros(n, dtype=np.int64), np.full(n, "topdown", dtype="<U16"),
+        tuple(np.zeros((0, 3)) for _ in range(n)), np.zeros((n, 3)), np.full(n, np.nan),
+    )  # fmt: skip
+    return Track(category, np.arange(n), m)
+
+
+def moved(track, shift, angle=0.0):
+    """The same track in a map that is turned and shifted."""
+
+    def go(p):
+        return np.concatenate([rotate(p[..., :2], angle), p[..., 2:]], axis=-1) + shift
+
+    m, r = track.measurements, rotation_from_rpy(0, 0, angle)[:2, :2]
+    return replace(
+        track,
+        measurements=replace(
+            m, center_m=go(m.center_m), sensor_m=go(m.sensor_m), cluster=tuple(go(c) for c in m.cluster),
+            yaw_rad=m.yaw_rad + angle, covariance=r @ m.covariance @ r.T,
+        ),
+    )  # fmt: skip
+
+
+def apart(yaw, truth, period=np.pi):
+    return abs((yaw - truth + period / 2) % period - period / 2)
+
+
+PASSING = [(0.8 * k, 0.0, 1.9) for k in range(25)]  # the sensor drives past at 8 m/s
+
+
+# Standing
+
+
+@pytest.mark.parametrize("category", ["car", "pedestrian", "cyclist"])
+@pytest.mark.parametrize("jitter_m", [0.0, 0.1])
+def test_what_stays_stands_and_what_goes_moves(category, jitter_m):
+    rng = np.random.default_rng(3)
+    xy = np.array([20.0, 3.0]) + rng.normal(0, jitter_m, (30, 2))
+    assert is_standing(bare(xy, category))
+    assert is_standing(bare(xy + np.array([5e5, 5e6]), category))
+    for speed in (1.2, 8.0):
+        along = np.outer(np.arange(30) * 0.1 * speed, [0.6, 0.8])
+        assert not is_standing(bare(xy + along, category))
+
+
+def test_a_few_wild_positions_do_not_make_a_parked_car_move():
+    xy = np.tile([20.0, 3.0], (40, 1))
+    xy[[7, 23]] += 6.0
+    assert is_standing(bare(xy))
+
+
+def test_of_two_sightings_a_vehicle_stands_and_a_person_walks():
+    xy = [[20.0, 3.0], [20.0, 3.1]]
+    assert is_standing(bare(xy, "car"))
+    assert not is_standing(bare(xy, "pedestrian"))
+
+
+@pytest.mark.parametrize(("x", "y", "yaw_deg"), [(12, 5, 0), (14, -5, 20), (10, 6, 95), (12, -4, 175)])
+def test_a_parked_car_passed_by_is_found_with_its_size_and_yaw(x, y, yaw_deg):
+    yaw = np.deg2rad(yaw_deg)
+    shape = shape_standing(measured([(x, y, yaw)] * 25, sensors=PASSING))
+    assert shape.typical
+    # A hundredth of the points is cut at each end, and rays miss the very corners.
+    np.testing.assert_allclose(shape.size_m, CAR, atol=0.2)
+    assert apart(shape.yaw_rad, yaw) < np.deg2rad(2)
+    assert np.hypot(*(shape.xy_m - [x, y]).T).max() < 0.1
+    np.testing.assert_array_equal(shape.xy_m, np.tile(shape.xy_m[0], (25, 1)))
+    np.testing.assert_allclose(shape.z_m, 0.8, atol=0.1)
+    error = shape.xy_m[0] - [x, y]
+    assert error @ np.linalg.solve(shape.covariance[0], error) < 9.21
+
+
+@pytest.mark.parametrize("size", [(3.7, 1.7, 1.5), (5.2, 2.0, 1.9)])
+def test_sizes_that_are_seen_whole_are_kept_and_not_typical_ones(size):
+    shape = shape_standing(measured([(10, 5, 0.1)] * 25, size, sensors=PASSING))
+    np.testing.assert_allclose(shape.size_m, size, atol=0.2)
+
+
+def test_a_size_that_is_not_seen_is_the_typical_one():
+    behind = [(0.0, 0.0, 0.9)] * 12
+    shape = shape_standing(measured([(12, 0, 0.0)] * 12, sensors=behind))
+    assert shape.size_m[0] == pytest.approx(TYPICAL_SIZE_M["car"][0], abs=0.1)
+    assert apart(shape.yaw_rad, 0.0) < np.deg2rad(3)
+    assert np.sqrt(shape.covariance[0, 0, 0]) > 3 * np.sqrt(shape.covariance[0, 1, 1])
+
+
+@pytest.mark.parametrize(("shift", "angle"), [((5e5, 5e6, 0.0), 0.0), ((-30.0, 8.0, 0.0), 1.3), ((0, 0, 0), -2.4)])
+def test_a_standing_shape_moves_and_turns_with_the_map(shift, angle):
+    track = measured([(12, 5, 0.3)] * 15, sensors=PASSING[:15])
+    here, there = shape_standing(track), shape_standing(moved(track, np.array(shift), angle))
+    # Cells that tell persistent points from stray ones lie fixed in the map.
+    np.testing.assert_allclose(there.size_m, here.size_m, atol=0.08)
+    np.testing.assert_allclose(there.xy_m, rotate(here.xy_m, angle) + shift[:2], atol=0.08)
+    assert apart(there.yaw_rad, here.yaw_rad + angle) < np.deg2rad(1.5)
+
+
+def test_points_that_one_tick_lent_from_a_neighbor_are_left_out():
+    track = measured([(12, 5, 0.0)] * 15, sensors=PASSING[:15])
+    m = track.measurements
+    stray = np.array([16.0, 5.0, 0.5]) + np.random.default_rng(0).normal(0, 0.3, (60, 3))
+    mixed = replace(track, measurements=replace(m, cluster=(np.vstack([m.cluster[0], stray]), *m.cluster[1:])))
+    np.testing.assert_allclose(shape_standing(mixed).size_m, shape_standing(track).size_m, atol=0.1)
+    np.testing.assert_allclose(shape_standing(mixed).xy_m, shape_standing(track).xy_m, atol=0.1)
+
+
+def test_standing_without_points_keeps_the_measured_places_and_the_typical_size():
+    track = bare([[20.0, 3.0], [20.1, 3.0], [20.0, 3.1]])
+    shape = shape_standing(track)
+    np.testing.assert_array_equal(shape.xy_m, track.measurements.center_m[:, :2])
+    np.testing.assert_allclose(shape.size_m, TYPICAL_SIZE_M["car"])
+    assert shape.yaw_rad is None
+
+
+@pytest.mark.parametrize("size", [(0.6, 0.5, 1.0), (9.5, 3.5, 1.6)])
+def test_what_no_car_can_be_is_not_typical(size):
+    assert not shape_standing(measured([(12, 6, 0.2)] * 15, size, sensors=PASSING[:15])).typical
+
+
+# Moving
+
+
+def oncoming(count=25, speed=8.0, y=4.0, heading=np.pi, start_m=30.0):
+    direction = np.array([np.cos(heading), np.sin(heading)])
+    start = np.array([start_m, y]) if heading else np.array([8.0, y])
+    xy = start + np.outer(np.arange(count) * 0.1 * speed, direction)
+    return [(x, y_, heading) for x, y_ in xy]
+
+
+@pytest.mark.parametrize("heading", [0.0, np.pi])
+def test_a_moving_car_keeps_one_size_and_is_found_within_its_sigma(heading):
+    states = oncoming(heading=heading)
+    track = measured(states)
+    shape = shape_moving(track, np.full(len(states), heading))
+    truth = np.array(states)[:, :2]
+    np.testing.assert_allclose(shape.size_m, CAR, atol=0.2)
+    error = shape.xy_m - truth
+    assert np.hypot(*error.T).max() < 0.3
+    assert np.median(np.einsum("ni,nij,nj->n", error, np.linalg.inv(shape.covariance), error)) < 1.4
+    assert shape.xy_m.shape == (25, 2)
+    assert shape.yaw_rad is None
+
+
+def test_a_long_car_seen_whole_once_is_long_all_along():
+    size = (5.4, 1.9, 1.6)
+    states = oncoming(start_m=15.0)
+    shape = shape_moving(measured(states, size), np.full(len(states), np.pi))
+    assert shape.size_m[0] == pytest.approx(5.4, abs=0.25)
+    assert np.hypot(*(shape.xy_m - np.array(states)[:, :2]).T).max() < 0.35
+
+
+@pytest.mark.parametrize(("shift", "angle"), [((5e5, 5e6, 0.0), 0.0), ((10.0, -8.0, 0.0), 2.0)])
+def test_a_moving_shape_moves_and_turns_with_the_map(shift, angle):
+    states = oncoming()
+    track, yaw = measured(states), np.full(len(states), np.pi)
+    here, there = shape_moving(track, yaw), shape_moving(moved(track, np.array(shift), angle), yaw + angle)
+    np.testing.assert_allclose(there.size_m, here.size_m, atol=1e-4)
+    np.testing.assert_allclose(there.xy_m, rotate(here.xy_m, angle) + shift[:2], atol=1e-4)
+    r = rotation_from_rpy(0, 0, angle)[:2, :2]
+    np.testing.assert_allclose(there.covariance, r @ here.covariance @ r.T, atol=1e-4)
+
+
+def test_what_the_images_border_cuts_is_less_sure_and_tells_no_size():
+    states = oncoming(start_m=15.0)
+    yaw = np.full(len(states), np.pi)
+    whole = shape_moving(measured(states, (3.6, 1.7, 1.5)), yaw)
+    cut = shape_moving(measured(states, (3.6, 1.7, 1.5), truncated=True), yaw)
+    assert whole.size_m[0] == pytest.approx(3.6, abs=0.2)
+    assert cut.size_m[0] == pytest.approx(TYPICAL_SIZE_M["car"][0], abs=0.05)
+    assert (np.trace(cut.covariance, axis1=1, axis2=2) > np.trace(whole.covariance, axis1=1, axis2=2)).all()
+
+
+def test_a_walker_is_as_tall_as_its_points():
+    states = [(10.0, -3 + 0.14 * k, np.pi / 2) for k in range(20)]
+    shape = shape_moving(measured(states, PERSON, "pedestrian"), np.full(20, np.pi / 2))
+    assert shape.size_m[2] == pytest.approx(1.75, abs=0.15)
+    assert np.hypot(*(shape.xy_m - np.array(states)[:, :2]).T).max() < 0.2
+
+
+def test_moving_without_points_keeps_the_measured_places():
+    track = bare([[10.0 + k, 2.0] for k in range(5)])
+    shape = shape_moving(track, np.zeros(5))
+    np.testing.assert_array_equal(shape.xy_m, track.measurements.center_m[:, :2])
+    np.testing.assert_array_equal(shape.covariance, track.measurements.covariance)
+    np.testing.assert_allclose(shape.size_m, TYPICAL_SIZE_M["car"])
+
+
+# Headings of what stands
+
+
+def path(x0, y0, heading, count=20, step_m=1.0):
+    k = np.arange(count)[:, None] * step_m
+    return np.hstack([[x0, y0] + k * [np.cos(heading), np.sin(heading)], np.full((count, 1), heading)])
+
+
+@pytest.mark.parametrize("yaw", [0.05, np.pi - 0.05])
+@pytest.mark.parametrize(("left_m", "with_it"), [(-3.0, True), (-0.5, True), (4.0, False)])
+@pytest.mark.parametrize("turn", [0.0, 1.0, -2.5])
+def test_traffic_keeps_right_whatever_way_the_box_was_fitted(yaw, left_m, with_it, turn):
+    """Right of a path eastward points east, clearly left of it points west."""
+    flow = path(0.0, 0.0, 0.0)
+    flow = np.column_stack([rotate(flow[:, :2], turn), flow[:, 2] + turn])
+    xy = rotate(np.array([10.0, left_m]), turn)
+    found = heading_of_standing(yaw + turn, xy, flow)
+    assert np.cos(found - turn) * (1 if with_it else -1) > 0.9
+    assert apart(found, yaw + turn) < 1e-9
+
+
+def test_without_traffic_nearby_a_heading_stays_as_it_is():
+    for flow in (np.zeros((0, 3)), path(500.0, 0.0, 0.0), path(0.0, 0.0, np.pi / 2)):
+        assert heading_of_standing(3.0, np.array([10.0, -2.0]), flow) == pytest.approx(3.0)
+
+
+def test_the_nearer_path_has_more_say():
+    flow = np.vstack([path(0.0, 3.0, 0.0), path(20.0, -12.0, np.pi)])
+    assert np.cos(heading_of_standing(0.0, np.array([10.0, 0.5]), flow)) > 0.9

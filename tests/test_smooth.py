@@ -1,0 +1,362 @@
+"""Smoothed trajectories: against dense least squares, closed forms, and truth with noise, outliers and gaps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import quad_vec
+from scipy.linalg import expm
+
+from log2sim.geometry import wrap_angle
+from log2sim.smooth import SmoothedTrack, estimate_sigma, signed_speed, smooth_track
+from log2sim.smooth.interval import (
+    ACCELERATION_PRIOR_MPS2,
+    KNOT_STEP_S,
+    VELOCITY_PRIOR_MPS,
+    Observations,
+    place_knots,
+    smooth_interval,
+)
+from log2sim.smooth.yaw import yaw_of_motion
+
+DT = 0.1
+
+
+def straight(t: np.ndarray) -> np.ndarray:
+    return np.column_stack([12.0 * t, 3.0 + 4.0 * t])
+
+
+def turn(t: np.ndarray) -> np.ndarray:
+    """8 m/s on a circle of 20 m."""
+    return 20.0 * np.column_stack([np.sin(0.4 * t), 1 - np.cos(0.4 * t)])
+
+
+def stop(t: np.ndarray) -> np.ndarray:
+    """10 m/s, braking with 2.5 m/s2 from 2 s on until it stands at 6 s."""
+    braking = np.clip(t - 2.0, 0.0, 4.0)
+    return np.column_stack([10.0 * np.minimum(t, 6.0) - 1.25 * braking**2, 0 * t])
+
+
+def reverse(t: np.ndarray) -> np.ndarray:
+    """Forward at first, standing still for an instant at 4 s, then backward."""
+    return np.column_stack([20.0 - 1.25 * (t - 4.0) ** 2, 0 * t])
+
+
+MANEUVERS = {"straight": straight, "turn": turn, "stop": stop, "reverse": reverse}
+
+
+def dense_solution(observed: Observations, knots: np.ndarray, density: float) -> tuple[np.ndarray, np.ndarray]:
+    """States (K, 6) and covariances (K, 6, 6): all knots' process noise integrated numerically, one dense system."""
+    f = np.zeros((3, 3))
+    f[0, 1] = f[1, 2] = 1.0
+    count = len(knots)
+    information, rhs = np.zeros((count * 6, count * 6)), np.zeros(count * 6)
+
+    def add(rows: np.ndarray, weight: np.ndarray, target: np.ndarray) -> None:
+        nonlocal information, rhs
+        information += rows.T @ weight @ rows
+        rhs += rows.T @ weight @ target
+
+    for k in range(count - 1):
+        dt = knots[k + 1] - knots[k]
+        noise, _ = quad_vec(lambda s: density * np.outer(expm(f * s)[:, 2], expm(f * s)[:, 2]), 0.0, dt, epsabs=1e-15)
+        for axis in range(2):
+            rows = np.zeros((3, count * 6))
+            rows[:, 6 * k + axis : 6 * k + 6 : 2] = -expm(f * dt)
+            rows[:, 6 * k + 6 + axis : 6 * k + 12 : 2] = np.eye(3)
+            add(rows, np.linalg.inv(noise), np.zeros(3))
+    prior = np.diag([0, 0, *[VELOCITY_PRIOR_MPS**-2] * 2, *[ACCELERATION_PRIOR_MPS2**-2] * 2])
+    information[:6, :6] += prior
+    for t, xy, r in zip(observed.t_s, observed.xy, observed.r):
+        k = int(np.argmin(np.abs(knots - t)))
+        rows = np.zeros((2, count * 6))
+        rows[[0, 1], [6 * k, 6 * k + 1]] = 1.0
+        add(rows, np.linalg.inv(r), xy)
+    covariance = np.linalg.inv(information)
+    states = (covariance @ rhs).reshape(count, 6)
+    return states, np.array([covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(count)])
+
+
+def test_the_banded_solver_agrees_with_dense_least_squares() -> None:
+    rng = np.random.default_rng(0)
+    t = np.cumsum(rng.uniform(0.05, 0.6, 12))
+    root = rng.normal(0, 0.2, (12, 2, 2))
+    # Observations on a smooth way far within their noise keep the robust weights at 1.
+    xy = np.column_stack([2.0 * t, 0.2 * t**2]) + rng.normal(0, 1e-4, (12, 2))
+    observed = Observations(t, xy, root @ np.swapaxes(root, 1, 2) + 0.04 * np.eye(2))
+    state, covariance, distance, weight = smooth_interval(observed, t, 2.0)
+    expected, expected_covariance = dense_solution(observed, t, 2.0)
+    assert weight.min() > 0.999
+    np.testing.assert_allclose(state, expected, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(covariance, expected_covariance[:, :2, :2], rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(distance, np.hypot(*(xy - state[:, :2]).T), atol=1e-9)
+
+
+def test_states_between_observations_are_those_of_a_knot_there() -> None:
+    t = np.array([0.0, 0.4, 0.8, 1.2, 1.6])
+    observed = Observations(t, np.column_stack([t**2, 0 * t]), np.tile(0.01 * np.eye(2), (5, 1, 1)))
+    asked = np.array([0.2, 0.5, 1.6, 2.0])
+    knots = np.unique(np.concatenate([t, asked]))
+    expected, expected_covariance = dense_solution(observed, knots, 4.0)
+    rows = np.searchsorted(knots, asked)
+    state, covariance, _, _ = smooth_interval(observed, asked, 4.0)
+    np.testing.assert_allclose(state, expected[rows], atol=2e-3)
+    np.testing.assert_allclose(covariance, expected_covariance[rows, :2, :2], rtol=1e-3)
+
+
+def test_states_within_a_step_of_a_knot_are_carried_from_it() -> None:
+    t = DT * np.arange(20)
+    asked = t + 0.75 * KNOT_STEP_S
+    path = smooth_track(t, np.column_stack([2.0 * t**2, 0 * t]), sigma_m=0.01, at_s=asked)
+    np.testing.assert_allclose(path.xy_m[5:-5, 0], 2.0 * asked[5:-5] ** 2, atol=0.01)
+    np.testing.assert_allclose(path.velocity_mps[5:-5, 0], 4.0 * asked[5:-5], atol=0.01)
+
+
+@pytest.mark.parametrize("step_s", [1e-3, 0.01, 0.1, 1.0, 10.0])
+def test_steps_from_milliseconds_to_seconds(step_s: float) -> None:
+    t = step_s * np.arange(60)
+    truth = np.column_stack([5.0 * t, -2.0 * t])
+    path = smooth_track(t, truth, sigma_m=0.1)
+    np.testing.assert_allclose(path.xy_m, truth, atol=1e-3 * max(1.0, 5 * step_s))
+    assert np.isfinite(path.covariance).all()
+    # Faster than noise allows and slower than the motion model remembers, speeds are not known so well.
+    if 0.01 <= step_s <= 1.0:
+        np.testing.assert_allclose(path.velocity_mps, np.tile([5.0, -2.0], (60, 1)), atol=0.05)
+
+
+@pytest.mark.parametrize("maneuver", MANEUVERS)
+@pytest.mark.parametrize("sigma", [0.1, 0.3, 0.6])
+def test_noise_outliers_and_gaps_leave_the_way_near_to_the_truth(maneuver: str, sigma: float) -> None:
+    t = DT * np.arange(80)
+    truth, velocity = MANEUVERS[maneuver](t), np.gradient(MANEUVERS[maneuver](t), t, axis=0)
+    squared, slow, rejected, kept, inside = [], [], [], [], []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        xy = truth + rng.normal(0, sigma, truth.shape)
+        wrong = np.isin(np.arange(80), rng.choice(np.arange(5, 75), 6, replace=False))
+        angle = rng.uniform(0, 2 * np.pi, 80)
+        xy[wrong] += 12 * sigma * np.column_stack([np.cos(angle), np.sin(angle)])[wrong]
+        valid = (np.arange(80) < 30) | (np.arange(80) >= 38)
+        path = smooth_track(t, xy, valid, sigma_m=sigma)
+        error = np.hypot(*(path.xy_m - truth).T)
+        squared.append(error**2)
+        slow.append(np.hypot(*(path.velocity_mps - velocity).T))
+        rejected.append(~path.inlier[wrong & valid])
+        kept.append(path.inlier[~wrong & valid])
+        inside.append(
+            np.einsum("ti,tij,tj->t", path.xy_m - truth, np.linalg.inv(path.covariance), path.xy_m - truth) < 9.21
+        )
+    assert np.concatenate(rejected).mean() > 0.97
+    assert np.concatenate(kept).mean() > 0.97
+    seen = valid & (t > 0.5) & (t < 7.4)
+    assert np.sqrt(np.mean(np.array(squared)[:, seen])) < 0.8 * sigma  # raw positions are off by 1.41 sigma
+    assert np.sqrt(np.mean(np.square(np.array(slow)[:, seen]))) < 0.35 + 1.6 * sigma
+    # What it says of its own error is true: within the 99 % ellipse far more often than not.
+    assert np.mean(inside) > 0.9
+
+
+def test_more_noise_in_the_data_less_weight() -> None:
+    t, rng = DT * np.arange(60), np.random.default_rng(1)
+    noise = rng.normal(0, 1, (60, 2))
+    sigma = np.where(np.arange(60) % 2 == 0, 0.05, 0.8)
+    xy = straight(t) + noise * sigma[:, None]
+    told = np.hypot(*(smooth_track(t, xy, sigma_m=sigma).xy_m - straight(t)).T)
+    untold = np.hypot(*(smooth_track(t, xy, sigma_m=0.4).xy_m - straight(t)).T)
+    assert told.mean() < 0.5 * untold.mean()
+    as_matrix = smooth_track(t, xy, covariance=sigma[:, None, None] ** 2 * np.eye(2))
+    np.testing.assert_allclose(as_matrix.xy_m, smooth_track(t, xy, sigma_m=sigma).xy_m, atol=1e-9)
+
+
+def test_the_noise_is_estimated_when_not_told() -> None:
+    for sigma in (0.05, 0.3):
+        for maneuver in (straight, turn):
+            t = DT * np.arange(200)
+            xy = maneuver(t) + np.random.default_rng(2).normal(0, sigma, (200, 2))
+            xy[::25] += 30.0  # a few outliers change little
+            assert estimate_sigma(t, xy) == pytest.approx(sigma, rel=0.35)
+    uneven = np.cumsum(np.random.default_rng(3).uniform(0.02, 0.2, 400))
+    xy = straight(uneven) + np.random.default_rng(4).normal(0, 0.3, (400, 2))
+    assert estimate_sigma(uneven, xy) == pytest.approx(0.3, rel=0.2)
+
+
+def noisy_stop(seed: int, sigma: float = 0.15) -> SmoothedTrack:
+    t = DT * np.arange(150)
+    return smooth_track(t, stop(t) + np.random.default_rng(seed).normal(0, sigma, (150, 2)), sigma_m=sigma)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_heading_is_held_at_a_standstill(seed: int) -> None:
+    path = noisy_stop(seed)
+    standing = path.t_s > 7.5
+    assert np.abs(path.yaw_rad[standing]).max() < np.radians(8)
+    assert np.ptp(path.yaw_rad[standing]) < np.radians(1)
+    assert np.hypot(*path.velocity_mps[standing].T)[:-5].max() < 0.35  # the end is known from one side only
+
+
+@pytest.mark.parametrize("hint", [None, 1.2])
+def test_what_never_moves_keeps_its_hint_and_place(hint: float | None) -> None:
+    t = DT * np.arange(100)
+    xy = np.random.default_rng(5).normal([40.0, -7.0], 0.2, (100, 2))
+    path = smooth_track(t, xy, sigma_m=0.2, yaw_hint_rad=hint)
+    assert (path.yaw_rad == (hint or 0.0)).all()
+    assert np.hypot(*(path.xy_m - [40.0, -7.0]).T).mean() < 0.12
+    assert (path.curvature_1pm == 0).all()
+
+
+def test_a_vehicle_does_not_slide_sideways() -> None:
+    for maneuver in MANEUVERS.values():
+        t = DT * np.arange(80)
+        xy = maneuver(t) + np.random.default_rng(6).normal(0, 0.1, (80, 2))
+        path = smooth_track(t, xy, sigma_m=0.1, yaw_hint_rad=0.0)
+        speed = np.hypot(*path.velocity_mps.T)
+        across = path.velocity_mps[:, 1] * np.cos(path.yaw_rad) - path.velocity_mps[:, 0] * np.sin(path.yaw_rad)
+        assert np.abs(across[speed > 1.0]).max() < 1e-6
+        assert np.abs(across).max() < 0.6
+
+
+def test_reversing_keeps_the_heading_and_turns_the_speed() -> None:
+    t = DT * np.arange(80)
+    for hint, heading in ((None, 0.0), (0.2, 0.0), (np.pi, np.pi)):
+        path = smooth_track(t, reverse(t), sigma_m=0.1, yaw_hint_rad=hint)
+        assert np.abs(wrap_angle(path.yaw_rad - heading)).max() < 0.02
+        speed = signed_speed(path.velocity_mps, path.yaw_rad)
+        expected = np.cos(heading) * -2.5 * (t - 4.0)
+        assert np.abs(speed - expected)[5:-5].max() < 0.15
+
+
+def test_pedestrians_may_turn_on_the_spot() -> None:
+    t = DT * np.arange(80)
+    there_and_back = np.column_stack([np.where(t < 4, 1.4 * t, 11.2 - 1.4 * t), 0 * t])
+    path = smooth_track(t, there_and_back, sigma_m=0.05, sideways=True)
+    assert np.abs(path.yaw_rad[:30]).max() < 0.1
+    assert np.abs(wrap_angle(path.yaw_rad[-30:] - np.pi)).max() < 0.1
+
+
+def test_yaw_runs_on_across_the_half_turn() -> None:
+    t = DT * np.arange(200)
+    path = smooth_track(t, turn(t), sigma_m=0.05)
+    expected = wrap_angle(0.4 * t)
+    assert np.abs(wrap_angle(path.yaw_rad - expected)).max() < 0.05
+    assert (path.yaw_rad >= -np.pi).all()
+    assert (path.yaw_rad < np.pi).all()
+    np.testing.assert_allclose(path.curvature_1pm[20:-20], 1 / 20, rtol=0.05)
+
+
+def test_heading_between_two_parts_of_motion_turns_with_the_way() -> None:
+    # East at 2 m/s, creeping through a corner at 0.5 m/s, north at 2 m/s; it stands, with
+    # 0.1 m/s of noise, for a while at the corner's end.
+    velocity = np.array([[2.0, 0.0]] * 10 + [[0.4, 0.3]] * 10 + [[0.1, 0.0]] * 10 + [[0.0, 2.0]] * 10)
+    xy = np.concatenate([[[0.0, 0.0]], np.cumsum(velocity * DT, axis=0)[:-1]])
+    yaw = yaw_of_motion(xy, velocity)
+    assert (np.diff(yaw) >= -1e-12).all()
+    assert yaw[9] == 0.0
+    assert yaw[30] == pytest.approx(np.pi / 2)
+    assert np.ptp(yaw[21:30]) == pytest.approx(0.0, abs=1e-12)
+    assert 0.2 < yaw[15] < 1.2
+
+
+@pytest.mark.parametrize("shift_s", [1e3, 1.7e9 - 1.7e9 % 1])
+def test_time_offset_changes_nothing(shift_s: float) -> None:
+    t = 0.125 * np.arange(64)  # exact in binary, so that the shift is
+    xy = turn(t) + np.random.default_rng(7).normal(0, 0.2, (64, 2))
+    a, b = smooth_track(t, xy, sigma_m=0.2), smooth_track(t + shift_s, xy, sigma_m=0.2)
+    np.testing.assert_allclose(b.xy_m, a.xy_m, atol=1e-9)
+    np.testing.assert_allclose(b.yaw_rad, a.yaw_rad, atol=1e-9)
+    np.testing.assert_allclose(b.t_s - shift_s, a.t_s)
+
+
+def test_utm_offset_changes_less_than_a_micrometer() -> None:
+    t, offset = DT * np.arange(80), np.array([457_000.0, 5_428_000.0])
+    xy = np.round(turn(t) + np.random.default_rng(8).normal(0, 0.3, (80, 2)), 6)
+    a, b = smooth_track(t, xy, sigma_m=0.3), smooth_track(t, xy + offset, sigma_m=0.3)
+    assert np.abs(b.xy_m - offset - a.xy_m).max() < 1e-6
+    assert np.abs(b.velocity_mps - a.velocity_mps).max() < 1e-6
+    assert np.abs(b.covariance - a.covariance).max() < 1e-9
+
+
+def test_a_turned_scene_gives_a_turned_track() -> None:
+    t, c, s = DT * np.arange(60), np.cos(2.0), np.sin(2.0)
+    rotation = np.array([[c, -s], [s, c]])
+    xy = turn(t) + np.random.default_rng(9).normal(0, 0.3, (60, 2))
+    a, b = smooth_track(t, xy, sigma_m=0.3), smooth_track(t, xy @ rotation.T, sigma_m=0.3)
+    np.testing.assert_allclose(b.xy_m, a.xy_m @ rotation.T, atol=1e-8)
+    np.testing.assert_allclose(wrap_angle(b.yaw_rad - a.yaw_rad - 2.0), 0.0, atol=1e-7)
+
+
+def test_one_position_is_a_place_and_two_are_a_way() -> None:
+    one = smooth_track([3.0], [[5.0, 6.0]], sigma_m=0.2, yaw_hint_rad=0.7)
+    np.testing.assert_allclose(one.xy_m, [[5.0, 6.0]], atol=1e-9)
+    np.testing.assert_allclose(one.velocity_mps, 0.0, atol=1e-9)
+    np.testing.assert_allclose(one.covariance, [0.04 * np.eye(2)], rtol=1e-6)
+    assert one.yaw_rad.tolist() == [0.7]
+    two = smooth_track([0.0, 1.0], [[0.0, 0.0], [3.0, 4.0]], sigma_m=0.01)
+    np.testing.assert_allclose(two.xy_m, [[0, 0], [3, 4]], atol=0.01)
+    np.testing.assert_allclose(two.velocity_mps.mean(axis=0), [3.0, 4.0], atol=0.1)
+    np.testing.assert_allclose(two.yaw_rad, np.arctan2(4, 3), atol=0.01)
+
+
+def test_gaps_are_filled_and_their_covariance_says_so() -> None:
+    t = np.concatenate([DT * np.arange(20), 5.0 + DT * np.arange(20)])
+    path = smooth_track(t, straight(t), sigma_m=0.1, at_s=DT * np.arange(70))
+    np.testing.assert_allclose(path.xy_m, straight(path.t_s), atol=0.02)
+    sigma = np.sqrt(path.covariance[:, 0, 0])
+    assert sigma[34] > 5 * sigma[10]
+    assert sigma[34] == sigma[20:50].max() or abs(int(np.argmax(sigma[20:50])) + 20 - 34) <= 1
+
+
+def test_rows_that_are_not_finite_or_not_valid_are_not_used() -> None:
+    t = DT * np.arange(40)
+    xy, valid = straight(t), np.ones(40, dtype=bool)
+    broken = xy.copy()
+    broken[5], broken[9, 1], broken[12] = np.nan, np.inf, [1e5, -1e5]
+    valid[12] = False
+    used = np.isin(np.arange(40), [5, 9, 12], invert=True)
+    path = smooth_track(t, broken, valid, sigma_m=0.1)
+    expected = smooth_track(t[used], xy[used], sigma_m=0.1, at_s=t)
+    np.testing.assert_array_equal(path.xy_m, expected.xy_m)
+    np.testing.assert_array_equal(path.inlier, used)
+    np.testing.assert_array_equal(np.isnan(path.residual_m), ~used)
+
+
+@pytest.mark.parametrize(
+    ("t", "xy", "valid", "sigma", "message"),
+    [
+        ([0.0, 0.1, 0.1], np.zeros((3, 2)), None, 0.1, "does not at index 2"),
+        ([0.0, 0.2, 0.1], np.zeros((3, 2)), None, 0.1, "does not at index 2"),
+        ([0.0, 0.1], np.zeros((3, 2)), None, 0.1, r"\(n, 2\)"),
+        ([0.0, 0.1], np.full((2, 2), np.nan), None, 0.1, "no valid position"),
+        ([0.0, 0.1], np.zeros((2, 2)), [False, False], 0.1, "no valid position"),
+        ([], np.zeros((0, 2)), None, 0.1, "no valid position"),
+        ([0.0, 0.1], np.zeros((2, 2)), None, 0.0, "sigma_m must be positive"),
+        ([0.0, 0.1], np.zeros((2, 2)), None, [0.1, np.nan], "sigma_m must be positive"),
+    ],
+)
+def test_what_cannot_be_smoothed_is_refused(
+    t: object, xy: np.ndarray, valid: object, sigma: object, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        smooth_track(t, xy, valid, sigma_m=sigma)  # type: ignore[arg-type]
+
+
+def test_impossible_motion_is_flagged() -> None:
+    t = DT * np.arange(60)
+    assert smooth_track(t, turn(t), sigma_m=0.1).flags == ()
+    spin = 2.0 * np.column_stack([np.sin(2.0 * t), 1 - np.cos(2.0 * t)])  # 4 m/s on a circle of 2 m
+    assert smooth_track(t, spin, sigma_m=0.01, jerk_density=1e4).flags == ("curvature",)
+    assert smooth_track(t, spin, sigma_m=0.01, jerk_density=1e4, sideways=True).flags == ()
+    rocket = np.column_stack([10.0 * t**2, 0 * t])
+    assert smooth_track(t, rocket, sigma_m=0.01, jerk_density=1e4).flags == ("acceleration",)
+
+
+def test_knots_stand_no_nearer_than_their_step() -> None:
+    t = np.array([0.3, 0.0, 0.001, 0.3, KNOT_STEP_S, 0.31, 0.5])
+    knots = place_knots(t)
+    assert knots.tolist() == [0.0, KNOT_STEP_S, 0.3, 0.5]
+
+
+def test_observations_a_millisecond_apart_agree_with_one_knot_each_in_the_mean() -> None:
+    # Two cameras see the same object 1 ms apart, ten times a second.
+    t = np.sort(np.concatenate([DT * np.arange(30), DT * np.arange(30) + 1e-3]))
+    path = smooth_track(t, turn(t), sigma_m=0.1)
+    assert np.abs(path.xy_m - turn(t)).max() < 0.03
+    assert np.abs(path.velocity_mps - 8.0 * np.column_stack([np.cos(0.4 * t), np.sin(0.4 * t)]))[10:-10].max() < 0.1

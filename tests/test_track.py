@@ -1,0 +1,344 @@
+"""Tracking: the motion model in closed form, and identities through crossings, gaps and occlusions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.integrate import quad_vec
+from scipy.linalg import expm
+
+from log2sim.geometry import NS_PER_S
+from log2sim.track import category_of, least_hits, track
+from log2sim.track.forward import track_forward
+from log2sim.track.motion import CENTER_SIGMA_M, innovation, measurement_noise, predict, update
+from log2sim.track.stitch import stitch
+from log2sim.types import Measurements, Track
+
+PERIOD_S = 0.1
+START_NS = 1_700_000_000_000_000_000
+OPTIONS = {"birth_score": 0.4, "max_gap_s": 3.0, "min_life_s": 0.3}
+
+Way = Callable[[float], tuple[float, float]]
+
+
+def stamps(ticks: int, period_s: float = PERIOD_S) -> np.ndarray:
+    return START_NS + np.rint(np.arange(ticks) * period_s * NS_PER_S).astype(np.int64)
+
+
+def seen(
+    xy: np.ndarray,
+    t_ns: np.ndarray | int,
+    name: list[str] | str = "",
+    category: list[str] | str = "car",
+    score: float = 0.9,
+    source: list[str] | str = "lidar",
+    sigma_m: float = 0.1,
+) -> Measurements:
+    """Measurements at places (M, 2); `name` is the truth, hidden in the camera's name, which tracking does not read."""
+    count = len(xy)
+    return Measurements(
+        t_ns=np.full(count, t_ns, dtype=np.int64),
+        category=np.broadcast_to(np.array(category, dtype="<U16"), count).copy(),
+        score=np.full(count, score),
+        camera=np.broadcast_to(np.array(name, dtype="<U16"), count).copy(),
+        box_px=np.zeros((count, 4)),
+        truncated=np.zeros(count, dtype=bool),
+        center_m=np.column_stack([xy, np.zeros(count)]),
+        size_m=np.tile([4.4, 1.8, 1.5], (count, 1)),
+        yaw_rad=np.zeros(count),
+        covariance=np.tile(np.eye(2) * sigma_m**2, (count, 1, 1)),
+        points=np.full(count, 50),
+        source=np.broadcast_to(np.array(source, dtype="<U16"), count).copy(),
+        cluster=(np.zeros((0, 3)),) * count,
+        sensor_m=np.zeros((count, 3)),
+        height_px_m=np.full(count, 1.5),
+    )
+
+
+def record(
+    ways: dict[str, Way],
+    ticks: int,
+    hidden: dict[str, tuple[int, int]] | None = None,
+    seed: int = 0,
+    noise_m: float = 0.1,
+    **columns: str,
+) -> tuple[list[Measurements], np.ndarray]:
+    """What is seen of named ways at every tick, in a new order each time; `hidden` names from and to ticks."""
+    rng, t_ns, found = np.random.default_rng(seed), stamps(ticks), []
+    for k in range(ticks):
+        names = [n for n in ways if not (hidden and n in hidden and hidden[n][0] <= k < hidden[n][1])]
+        rng.shuffle(names)
+        xy = np.array([ways[n](k * PERIOD_S) for n in names]).reshape(-1, 2)
+        found.append(seen(xy + rng.normal(0, noise_m, xy.shape), t_ns[k], names, **columns))
+    return found, t_ns
+
+
+def names_of(tracks: list[Track]) -> list[list[str]]:
+    """Whose measurements every track holds."""
+    return [sorted(set(t.measurements.camera.tolist())) for t in tracks]
+
+
+def line(x: float, y: float, vx: float, vy: float) -> Way:
+    return lambda t: (x + vx * t, y + vy * t)
+
+
+def test_prediction_is_that_of_white_acceleration() -> None:
+    f = np.zeros((4, 4))
+    f[0, 2] = f[1, 3] = 1.0
+    g = np.vstack([np.zeros((2, 2)), np.eye(2)])
+    rng = np.random.default_rng(0)
+    mean, root = rng.normal(0, 5, (3, 4)), rng.normal(0, 1, (3, 4, 4))
+    covariance, acceleration, dt = root @ np.swapaxes(root, 1, 2), np.array([1.0, 2.5, 0.3]), np.array([0.1, 1.3, 0.7])
+    found_mean, found_covariance = predict(mean, covariance, dt, acceleration)
+    for k in range(3):
+        q, _ = quad_vec(lambda s: expm(f * s) @ g @ g.T @ expm(f * s).T, 0.0, dt[k])
+        step = expm(f * dt[k])
+        np.testing.assert_allclose(found_mean[k], step @ mean[k], atol=1e-12)
+        expected = step @ covariance[k] @ step.T + acceleration[k] ** 2 * q
+        np.testing.assert_allclose(found_covariance[k], expected, rtol=1e-9, atol=1e-9)
+
+
+def test_two_short_predictions_are_one_long_and_backward_adds_noise_too() -> None:
+    mean, covariance, a = np.array([[1.0, 2.0, 3.0, -4.0]]), np.eye(4)[None], np.array([2.0])
+    once = predict(mean, covariance, 0.8, a)
+    twice = predict(*predict(mean, covariance, 0.3, a), 0.5, a)
+    for one, two in zip(once, twice):
+        np.testing.assert_allclose(one, two, rtol=1e-12)
+    # A mirrored past: the same places and spreads as the future, with speeds and their correlation turned round.
+    mirror = np.diag([1.0, 1.0, -1.0, -1.0])
+    back = predict(mean @ mirror, covariance, -0.8, a)
+    np.testing.assert_allclose(back[0] @ mirror, once[0], rtol=1e-12)
+    np.testing.assert_allclose(mirror @ back[1] @ mirror, once[1], rtol=1e-12)
+
+
+def test_update_and_innovation_are_those_of_the_textbook() -> None:
+    rng = np.random.default_rng(1)
+    mean, root = rng.normal(0, 3, (4, 4)), rng.normal(0, 1, (4, 4, 4))
+    covariance = root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(4)
+    xy, r, age = (
+        rng.normal(0, 3, (4, 2)),
+        np.array([np.eye(2) * s + 0.01 for s in (0.1, 0.5, 1.0, 2.0)]),
+        np.array([0.0, 0.05, -0.04, 1.0]),
+    )
+    found_mean, found_covariance = update(mean, covariance, xy, r, age)
+    squared, log_determinant = innovation(mean, covariance, xy, r, age)
+    for k in range(4):
+        h = np.hstack([np.eye(2), age[k] * np.eye(2)])
+        # Information form, a second way.
+        information = np.linalg.inv(covariance[k]) + h.T @ np.linalg.inv(r[k]) @ h
+        expected = np.linalg.solve(
+            information, np.linalg.solve(covariance[k], mean[k]) + h.T @ np.linalg.solve(r[k], xy[k])
+        )
+        np.testing.assert_allclose(found_mean[k], expected, atol=1e-9)
+        np.testing.assert_allclose(found_covariance[k], np.linalg.inv(information), atol=1e-9)
+        for j in range(4):
+            h = np.hstack([np.eye(2), age[j] * np.eye(2)])
+            s, d = h @ covariance[k] @ h.T + r[j], xy[j] - h @ mean[k]
+            assert squared[k, j] == pytest.approx(d @ np.linalg.solve(s, d))
+            assert log_determinant[k, j] == pytest.approx(np.log(np.linalg.det(s)))
+
+
+def test_noise_of_a_center_is_the_sensors_and_that_of_the_view() -> None:
+    r = measurement_noise(np.array([np.eye(2), [[2.0, 0.5], [0.5, 1.0]]]), np.array(["vehicle", "pedestrian"]))
+    np.testing.assert_allclose(r[0], np.eye(2) * (1 + CENTER_SIGMA_M["vehicle"] ** 2))
+    np.testing.assert_allclose(r[1], np.array([[2.0, 0.5], [0.5, 1.0]]) + np.eye(2) * CENTER_SIGMA_M["pedestrian"] ** 2)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_every_way_becomes_one_track_with_all_its_measurements(seed: int) -> None:
+    ways = {"a": line(0, 0, 12, 0), "b": line(60, 3.5, -14, 0), "c": line(20, -8, 0, 0), "d": line(5, 30, 3, -6)}
+    found, t_ns = record(ways, 40, seed=seed)
+    tracks = track(found, t_ns, **OPTIONS)
+    assert sorted(names_of(tracks)) == [["a"], ["b"], ["c"], ["d"]]
+    for t in tracks:
+        assert t.tick.tolist() == list(range(40))
+        np.testing.assert_array_equal(t.measurements.t_ns, t_ns)
+        assert t.category == "car"
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("apart_m", [1.5, 3.0])
+def test_tracks_that_cross_keep_their_identities(apart_m: float, seed: int) -> None:
+    # Both are at x = 30 at the same time, `apart_m` apart, one coming along x and one along y.
+    ways = {"along": line(0, 0, 10, 0), "across": line(30 + apart_m, -30, 0, 10)}
+    tracks = track(*record(ways, 60, seed=seed), **OPTIONS)
+    assert sorted(names_of(tracks)) == [["across"], ["along"]]
+    assert [len(t) for t in tracks] == [60, 60]
+
+
+def test_pedestrians_that_meet_walk_on() -> None:
+    ways = {"east": line(-4, 0.3, 1.4, 0), "west": line(4, -0.3, -1.4, 0)}
+    tracks = track(*record(ways, 60, noise_m=0.05, category="pedestrian"), **OPTIONS)
+    assert sorted(names_of(tracks)) == [["east"], ["west"]]
+
+
+@pytest.mark.parametrize("gap_ticks", [1, 3, 8, 11])
+def test_short_gaps_are_bridged_on_the_way(gap_ticks: int) -> None:
+    ways = {"a": line(0, 0, 10, 0), "b": line(0, 6, 10, 0)}
+    tracks = track(*record(ways, 50, hidden={"a": (20, 20 + gap_ticks)}), **OPTIONS)
+    assert sorted(names_of(tracks)) == [["a"], ["b"]]
+    (a,) = [t for t in tracks if t.measurements.camera[0] == "a"]
+    assert a.tick.tolist() == [k for k in range(50) if not 20 <= k < 20 + gap_ticks]
+
+
+def test_an_occlusion_is_stitched_and_not_beyond_what_is_allowed() -> None:
+    ways, hidden = {"a": line(0, 0, 1.4, 0), "b": line(0, 9, 1.4, 0)}, {"a": (30, 50)}
+    found, t_ns = record(ways, 80, hidden=hidden, category="pedestrian")
+    tracks = track(found, t_ns, **OPTIONS)
+    assert sorted(names_of(tracks)) == [["a"], ["b"]]
+    # The gap is 2.1 s from the last tick before to the first one after it.
+    assert len(track(found, t_ns, **{**OPTIONS, "max_gap_s": 2.05})) == 3
+    assert len(track(found, t_ns, **{**OPTIONS, "max_gap_s": 2.15})) == 2
+
+
+def test_a_chain_of_occlusions_is_one_track() -> None:
+    found, t_ns = record({"a": line(0, 0, 8, 0)}, 100, noise_m=0.05)
+    found = [Measurements.empty() if 20 <= k < 32 or 50 <= k < 62 or 75 <= k < 87 else m for k, m in enumerate(found)]
+    assert len(track_forward(found, t_ns, birth_score=0.4)) == 4
+    assert [len(t) for t in track(found, t_ns, **OPTIONS)] == [64]
+
+
+def test_what_comes_out_of_an_occlusion_elsewhere_is_somebody_else() -> None:
+    def jumping(t: float) -> tuple[float, float]:
+        return (8 * t, 0.0) if t < 3.5 else (8 * t, 12.0)
+
+    def turned(t: float) -> tuple[float, float]:
+        return (
+            (8 * t, 0.0) if t < 3.5 else (32 - 8 * (t - 4), 0.0)
+        )  # comes back at once with the speed of the other way
+
+    for way in (jumping, turned):
+        tracks = track(*record({"a": way}, 80, hidden={"a": (30, 45)}), **OPTIONS)
+        assert [len(t) for t in tracks] == [30, 35]
+
+
+def test_two_that_pass_behind_the_same_truck_come_out_as_themselves() -> None:
+    ways = {"fast": line(0, 0, 12, 0), "slow": line(10, 4, 6, 0)}
+    tracks = track(*record(ways, 70, hidden={"fast": (25, 37), "slow": (25, 37)}), **OPTIONS)
+    assert sorted(names_of(tracks)) == [["fast"], ["slow"]]
+    assert [len(t) for t in tracks] == [58, 58]
+
+
+def test_what_stands_is_the_same_however_long_it_was_hidden() -> None:
+    ways = {"parked": line(20, 5, 0, 0), "passing": line(0, 0, 10, 0)}
+    tracks = track(*record(ways, 120, hidden={"parked": (30, 90)}), **OPTIONS)
+    assert sorted(names_of(tracks)) == [["parked"], ["passing"]]
+
+
+def test_what_was_measured_before_and_after_its_tick_is_placed_where_it_was_then() -> None:
+    # Two cameras at odds: every other measurement is 50 ms old and so 1 m behind, at 20 m/s.
+    t_ns = stamps(40)
+    age = np.where(np.arange(40) % 2 == 0, 0, -50_000_000)
+    found = [
+        seen(np.array([[20.0 * (k * PERIOD_S + age[k] / NS_PER_S), 0.0]]), t_ns[k] + age[k], "a") for k in range(40)
+    ]
+    (tracklet,) = track_forward(found, t_ns, birth_score=0.4)
+    # State at the last tick: exact data of constant speed give the exact place for that tick, not for the old stamp.
+    assert tracklet.mean[0] == pytest.approx(20.0 * 3.9, abs=0.15)
+    assert tracklet.mean[2] == pytest.approx(20.0, abs=0.3)
+
+
+def test_stamps_out_of_order_between_ticks_do_not_break_a_track() -> None:
+    t_ns = stamps(40)
+    age_ns = np.where(np.arange(40) % 2 == 0, 60_000_000, -60_000_000)  # every second one was taken before its neighbor
+    assert (np.diff(t_ns + age_ns) < 0).any()
+    found = [
+        seen(np.array([[10.0 * (k * PERIOD_S + age_ns[k] / NS_PER_S), 0.0]]), t_ns[k] + age_ns[k], "a")
+        for k in range(40)
+    ]
+    for hidden in ((0, 0), (15, 27)):
+        shown = [Measurements.empty() if hidden[0] <= k < hidden[1] else m for k, m in enumerate(found)]
+        assert [len(t) for t in track(shown, t_ns, **OPTIONS)] == [40 - hidden[1] + hidden[0]]
+
+
+def test_order_of_rows_does_not_matter() -> None:
+    ways = {"a": line(0, 0, 12, 0), "b": line(60, 3.5, -14, 0), "c": line(20, -8, 0, 0)}
+    found, t_ns = record(ways, 30)
+    turned = [m.take(np.arange(len(m))[::-1]) for m in found]
+    for one, other in zip(track(found, t_ns, **OPTIONS), track(turned, t_ns, **OPTIONS), strict=True):
+        np.testing.assert_array_equal(one.measurements.center_m, other.measurements.center_m)
+
+
+def test_time_and_map_offsets_change_nothing() -> None:
+    ways = {"a": line(0, 0, 12, 0), "b": line(60, 3.5, -14, 0)}
+    found, t_ns = record(ways, 40, hidden={"a": (15, 30)})
+    far = []
+    for m in found:
+        columns = {**vars(m), "center_m": np.add(m.center_m, [457_000.0, 5_428_000.0, 0.0]), "t_ns": m.t_ns - START_NS}
+        far.append(Measurements(**columns))
+    here, there = track(found, t_ns, **OPTIONS), track(far, t_ns - START_NS, **OPTIONS)
+    assert names_of(here) == names_of(there)
+    assert [t.tick.tolist() for t in here] == [t.tick.tolist() for t in there]
+
+
+def test_without_measurements_there_are_no_tracks() -> None:
+    t_ns = stamps(5)
+    assert track([Measurements.empty()] * 5, t_ns, **OPTIONS) == []
+    assert track([], stamps(0), **OPTIONS) == []
+    assert stitch([], t_ns, max_gap_s=3.0) == []
+
+
+def test_measurements_without_a_place_are_passed_over() -> None:
+    t_ns = stamps(10)
+    found = [seen(np.array([[np.nan, np.nan], [5.0, 5.0]]), t, ["lost", "a"], source=["", "lidar"]) for t in t_ns]
+    assert names_of(track(found, t_ns, **OPTIONS)) == [["a"]]
+
+
+def test_weak_scores_continue_a_track_but_start_none() -> None:
+    t_ns = stamps(20)
+    place = np.array([[5.0, 5.0]])
+    assert track([seen(place, t, score=0.39) for t in t_ns], t_ns, **OPTIONS) == []
+    (one,) = track([seen(place, t, score=0.4 if k < 3 else 0.2) for k, t in enumerate(t_ns)], t_ns, **OPTIONS)
+    assert len(one) == 20
+
+
+def test_strong_scores_choose_first() -> None:
+    # A weak false alarm lies nearer to the track than the strong detection.
+    t_ns = stamps(12)
+    found = [seen(np.array([[5.0, 5.0]]), t, "a") for t in t_ns[:10]]
+    for t in t_ns[10:]:
+        strong, weak = seen(np.array([[5.5, 5.0]]), t, "a"), seen(np.array([[5.1, 5.0]]), t, "ghost", score=0.2)
+        found.append(Measurements.join([weak, strong]))
+    assert names_of(track(found, t_ns, **OPTIONS)) == [["a"]]
+
+
+def test_short_lives_are_false_alarms_except_in_a_log_as_short() -> None:
+    found, t_ns = record({"a": line(0, 0, 0, 0)}, 20, hidden={"a": (2, 20)})
+    assert track(found, t_ns, **OPTIONS) == []
+    assert len(track(found, t_ns, **{**OPTIONS, "min_life_s": 0.2})) == 1
+    assert len(track(found[:1], t_ns[:1], **OPTIONS)) == 1
+    assert [least_hits(stamps(n), 0.3) for n in (1, 2, 3, 4, 10, 100)] == [1, 1, 2, 2, 3, 3]
+    assert least_hits(stamps(100, 0.02), 0.3) == 15
+
+
+def test_cars_and_pedestrians_are_never_one_and_riders_may_be() -> None:
+    t_ns = stamps(20)
+    place = np.array([[5.0, 5.0]])
+
+    def changing(first: str, later: str) -> list[Track]:
+        found = [seen(place, t, category=first if k < 10 else later) for k, t in enumerate(t_ns)]
+        return track(found, t_ns, **OPTIONS)
+
+    assert [t.category for t in changing("car", "pedestrian")] == ["car", "pedestrian"]
+    assert [len(t) for t in changing("car", "truck")] == [20]  # one group
+    assert [len(t) for t in changing("pedestrian", "cyclist")] == [20]
+
+
+def test_the_category_is_that_of_most_of_the_score() -> None:
+    rows = [
+        seen(np.zeros((1, 2)), START_NS, category=c, score=s)
+        for c, s in (("car", 0.3), ("car", 0.3), ("car", 0.3), ("truck", 0.95))
+    ]
+    assert category_of(Measurements.join(rows)) == "truck"
+    assert category_of(Measurements.join(rows[:3])) == "car"
+    assert (
+        category_of(Measurements.join([rows[3], seen(np.zeros((1, 2)), START_NS, category="bus", score=0.95)])) == "bus"
+    )
+
+
+def test_tracks_come_in_the_order_of_their_start() -> None:
+    ways = {"late": line(0, 0, 5, 0), "right": line(50, 9, 5, 0), "left": line(-50, -9, 5, 0)}
+    tracks = track(*record(ways, 30, hidden={"late": (0, 10)}), **OPTIONS)
+    assert names_of(tracks) == [["left"], ["right"], ["late"]]
