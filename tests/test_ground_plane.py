@@ -82,6 +82,8 @@ def test_pixels_above_the_horizon_have_no_ground():
 def test_a_camera_on_the_ground_or_below_has_no_homography(at):
     camera = tilted(at=at)
     assert calibrated_ground(log_with(camera), camera) is None
+    raised = tilted(at=(at[0], at[1], at[2] + 0.7))
+    assert calibrated_ground(log_with(raised, ground_z=0.7), raised) is None
 
 
 def fit(log, seen, plan=None, method="time-aware"):

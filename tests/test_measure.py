@@ -287,6 +287,13 @@ def test_fewer_points_than_make_a_cluster_are_no_measurement(count):
     assert measure_view(view, boxes(view, [car]), cloud_of(world)).source.tolist() == [""]
 
 
+def test_a_thin_thing_in_a_cars_box_is_no_car():
+    view = view_ahead()
+    world, _ = scan([Solid((12.0, 0.0, 0.6), (0.1, 0.1, 1.2))], noise_m=0.005)
+    assert (world[:, 2] > 0.3).sum() > 10
+    assert measure_view(view, boxes(view, [standing(14, 0, 90)]), cloud_of(world)).source.tolist() == [""]
+
+
 @pytest.mark.parametrize("shape", ["post", "line across", "four places"])
 def test_degenerate_clusters_give_finite_boxes(shape):
     view = view_ahead()

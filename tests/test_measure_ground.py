@@ -61,7 +61,7 @@ def test_objects_and_walls_on_it_do_not_lift_the_ground(name):
 
 def test_reflections_below_the_road_do_not_pull_it_down():
     points = surface_points(SURFACES["flat"])
-    below = np.stack([*np.meshgrid(np.arange(-20.0, 20, 2), np.arange(-20.0, 20, 2))], -1).reshape(-1, 2)
+    below = np.stack([*np.meshgrid(np.arange(-20.0, 20), np.arange(-20.0, 20))], -1).reshape(-1, 2)
     points = np.vstack([points, np.column_stack([below, np.full(len(below), -1.5)])])
     ground = estimate_ground(points, np.zeros(2), 0.0)
     assert np.abs(ground.at(below)).max() < 0.15

@@ -160,6 +160,15 @@ def test_each_record_is_read_once_and_images_only_if_they_are_needed():
     assert reads == {(s, i): 1 for s in ("front", "left", "top") for i in range(TICKS)}
 
 
+def test_what_only_one_of_two_cameras_sees_is_kept():
+    log, _ = driving_log(cameras=("front", "left"))
+    detector, every = Truth(log), Truth(log)
+    detector.detect = lambda frame: every.detect(frame).take([0] if frame.camera.name == "front" else [1])
+    out, _ = run(log, detector)
+    for m in out.measurements:
+        assert sorted(zip(m.camera.tolist(), m.category.tolist())) == [("front", "car"), ("left", "pedestrian")]
+
+
 def test_one_torn_image_and_one_torn_sweep_are_counted_and_cost_only_their_tick():
     log, _ = driving_log(broken={("front", 1), ("top", 2)})
     out, ticks = run(log, Truth(log, looks=True))

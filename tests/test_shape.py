@@ -164,6 +164,13 @@ def test_points_that_one_tick_lent_from_a_neighbor_are_left_out():
     np.testing.assert_allclose(shape_standing(mixed).xy_m, shape_standing(track).xy_m, atol=0.1)
 
 
+def test_a_standing_box_lies_where_its_points_are_though_every_tick_was_off():
+    track = measured([(12, 5, 0.0)] * 15, sensors=PASSING[:15])
+    off = track.measurements.center_m + np.array([0.5, -0.4, 0.0])
+    shape = shape_standing(replace(track, measurements=replace(track.measurements, center_m=off)))
+    assert np.hypot(*(shape.xy_m - [12, 5]).T).max() < 0.1
+
+
 def test_standing_without_points_keeps_the_measured_places_and_the_typical_size():
     track = bare([[20.0, 3.0], [20.1, 3.0], [20.0, 3.1]])
     shape = shape_standing(track)
@@ -228,6 +235,15 @@ def test_what_the_images_border_cuts_is_less_sure_and_tells_no_size():
     assert whole.size_m[0] == pytest.approx(3.6, abs=0.2)
     assert cut.size_m[0] == pytest.approx(TYPICAL_SIZE_M["car"][0], abs=0.05)
     assert (np.trace(cut.covariance, axis1=1, axis2=2) > np.trace(whole.covariance, axis1=1, axis2=2)).all()
+
+
+def test_a_cut_car_ahead_may_be_anywhere_along_what_is_hidden_of_it():
+    states = [(12 + 0.8 * k, 0.0, 0.0) for k in range(8)]
+    whole, cut = (shape_moving(measured(states, truncated=t), np.zeros(8)) for t in (False, True))
+    np.testing.assert_allclose(cut.size_m, whole.size_m, atol=0.05)
+    ratio = np.sqrt(cut.covariance[:, 0, 0] / whole.covariance[:, 0, 0])
+    # All of the slack instead of the spread of a uniform one over it.
+    assert np.median(ratio) == pytest.approx(np.sqrt(12), rel=0.02)
 
 
 def test_a_walker_is_as_tall_as_its_points():

@@ -240,6 +240,9 @@ def test_compensated_points_lie_where_the_world_has_them_whatever_their_own_time
     found, seconds = to_map(log, "top", swept(log, world, t_s), compensate=True)
     # 1 rad/s and 50 m may cost 2.5 cm by the module's own word; here it is 0.4 rad/s and 71 m.
     assert np.abs(found - world).max() < 0.02
+    near = np.linalg.norm(world - ORIGIN, axis=1) < 8
+    assert near.sum() > 10
+    assert np.abs(found - world)[near].max() < 0.003
     np.testing.assert_allclose(seconds, t_s, atol=1e-6)
 
 

@@ -205,13 +205,12 @@ def test_what_comes_out_of_an_occlusion_elsewhere_is_somebody_else() -> None:
         return (8 * t, 0.0) if t < 3.5 else (8 * t, 12.0)
 
     def turned(t: float) -> tuple[float, float]:
-        return (
-            (8 * t, 0.0) if t < 3.5 else (32 - 8 * (t - 4), 0.0)
-        )  # comes back at once with the speed of the other way
+        # Both ends meet in the middle of the gap, at 3.55 s, with speeds that are opposite.
+        return (28.4 - 8 * abs(t - 3.55), 0.0)
 
     for way in (jumping, turned):
-        tracks = track(*record({"a": way}, 80, hidden={"a": (30, 45)}), **OPTIONS)
-        assert [len(t) for t in tracks] == [30, 35]
+        tracks = track(*record({"a": way}, 80, hidden={"a": (30, 42)}), **OPTIONS)
+        assert [len(t) for t in tracks] == [30, 38]
 
 
 def test_two_that_pass_behind_the_same_truck_come_out_as_themselves() -> None:
@@ -282,8 +281,24 @@ def test_without_measurements_there_are_no_tracks() -> None:
 
 def test_measurements_without_a_place_are_passed_over() -> None:
     t_ns = stamps(10)
-    found = [seen(np.array([[np.nan, np.nan], [5.0, 5.0]]), t, ["lost", "a"], source=["", "lidar"]) for t in t_ns]
+    found = [seen(np.array([[0.0, 0.0], [5.0, 5.0]]), t, ["lost", "a"], source=["", "lidar"]) for t in t_ns]
     assert names_of(track(found, t_ns, **OPTIONS)) == [["a"]]
+
+
+def test_a_track_takes_what_is_likely_and_nothing_else() -> None:
+    # What stood for 2 s is known to 0.4 m or so: 1.2 m aside for a moment is an outlier of it, 5 m aside is another one.
+    t_ns = stamps(40)
+    for aside_m, lives in ((1.2, [40]), (5.0, [20, 20])):
+        later = 5.0 + aside_m * (np.arange(40) >= 20) if aside_m > 2 else 5.0 + aside_m * (np.arange(40) == 20)
+        found = [seen(np.array([[5.0, y]]), t) for y, t in zip(later, t_ns)]
+        assert [len(t.ticks) for t in track_forward(found, t_ns, birth_score=0.4)] == lives
+
+
+@pytest.mark.parametrize(("seen_ticks", "gap_s", "pieces"), [(10, 1.1, 1), (10, 1.3, 2), (2, 0.4, 1), (2, 0.5, 2)])
+def test_a_track_waits_longer_when_it_is_confirmed(seen_ticks: int, gap_s: float, pieces: int) -> None:
+    hidden = (seen_ticks, seen_ticks + round(gap_s / PERIOD_S) - 1)
+    found, t_ns = record({"a": line(0, 0, 1, 0)}, 40, hidden={"a": hidden})
+    assert len(track_forward(found, t_ns, birth_score=0.4)) == pieces
 
 
 def test_weak_scores_continue_a_track_but_start_none() -> None:
