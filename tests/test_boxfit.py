@@ -6,7 +6,18 @@ import numpy as np
 import pytest
 from worlds import scan, standing
 
-from log2sim.boxfit import align_to, box_of_cluster, complete_box, extents, fit_yaw, rotate, subsample
+from log2sim.boxfit import (
+    FACING,
+    SEEN,
+    align_to,
+    box_of_cluster,
+    complete_box,
+    ends_shown,
+    extents,
+    fit_yaw,
+    rotate,
+    subsample,
+)
 from log2sim.types import CATEGORIES, TYPICAL_SIZE_M
 
 QUARTER = np.pi / 2
@@ -113,33 +124,58 @@ def test_rotation_is_counter_clockwise_and_undone_by_its_opposite():
     np.testing.assert_allclose(rotate(rotate(xy, 1.1), -1.1), xy, atol=1e-14)
 
 
+UNSEEN, RIGHT, LEFT, BOTH = (False, False), (True, False), (False, True), (True, True)
+
+
 @pytest.mark.parametrize(
-    ("sensor", "center", "why"),
+    ("sensor", "ends_seen", "center", "why"),
     [
-        ([-10.0, -10.0], [2.2, 0.9], "behind and to the right: both near sides are real"),
-        ([10.0, 10.0], [-1.2, 0.1], "ahead and to the left: the box reaches back from the far ends"),
-        ([0.5, -10.0], [0.5, 0.9], "beside the middle of the length: that side is seen whole and centered"),
-        ([0.5, 0.5], [0.5, 0.5], "inside what was seen: nothing says where the rest is"),
+        ([-10.0, -10.0], UNSEEN, [2.2, 0.9], "behind and to the right: both near sides are real"),
+        ([-10.0, -10.0], BOTH, [2.2, 0.9], "what faces the sensor is surer than what is seen from the side"),
+        ([10.0, 10.0], UNSEEN, [-1.2, 0.1], "ahead and to the left: the box reaches back from the far ends"),
+        ([0.5, -10.0], UNSEEN, [0.5, 0.9], "beside the middle of the length, no end seen: centered"),
+        ([0.5, -10.0], BOTH, [0.5, 0.9], "beside the middle of the length, both ends seen: centered"),
+        ([0.5, -10.0], RIGHT, [1 + 0.08 * 1.8 - 2.2, 0.9], "from the right side of a car, its front is on the right"),
+        ([0.5, -10.0], LEFT, [-0.08 * 1.8 + 2.2, 0.9], "and its rear on the left"),
+        ([0.5, 10.0], LEFT, [1 + 0.08 * 1.8 - 2.2, 0.1], "from its left side, its front is on the left"),
+        ([10.0, 0.5], LEFT, [-1.2, -0.08 * 1.8 + 0.9], "from ahead, its right side is on the left"),
+        ([0.5, 0.5], BOTH, [0.5, 0.5], "inside what was seen: nothing says where the rest is"),
     ],
 )
-def test_the_side_that_faces_the_sensor_stays_and_the_box_reaches_away_from_it(sensor, center, why):
-    found, slack = complete_box(np.zeros(2), np.ones(2), np.array([4.4, 1.8]), np.array(sensor))
+def test_a_box_reaches_from_its_best_end_to_where_it_was_not_seen(sensor, ends_seen, center, why):
+    found, _ = complete_box(np.zeros(2), np.ones(2), np.array([4.4, 1.8]), np.array(sensor), ends_seen)
     np.testing.assert_allclose(found, center, atol=1e-12, err_msg=why)
-    np.testing.assert_allclose(slack, [3.4, 0.8])
 
 
-def test_what_was_seen_of_more_than_the_whole_leaves_no_slack():
-    found, slack = complete_box(np.zeros(2), np.array([5.0, 2.0]), np.array([4.4, 1.8]), np.array([-9.0, -9.0]))
-    np.testing.assert_allclose(found, [2.5, 1.0])
-    assert slack.tolist() == [0.0, 0.0]
+def test_ends_seen_at_a_flat_angle_are_not_believed():
+    # 10 m ahead and 0.8 m beside the middle of its width: the side is seen at 5 degrees.
+    shown = ends_shown(np.array([-2.0, -0.9]), np.array([2.0, 0.9]), np.array([12.0, 1.7]), BOTH)
+    assert shown.tolist() == [[0, FACING], [SEEN, FACING]]
+
+
+def test_doubt_grows_with_what_was_not_seen_and_without_a_real_end():
+    size = np.array([4.4, 1.8])
+    sensor = np.array([-10.0, -10.0])
+    near = complete_box(np.zeros(2), np.array([3.4, 1.0]), size, sensor)[1]
+    far = complete_box(np.zeros(2), np.ones(2), size, sensor)[1]
+    np.testing.assert_allclose(far[0], np.hypot(0.08, 3.4 / np.sqrt(12)))
+    assert near[0] < far[0]
+    lost = complete_box(np.zeros(2), np.ones(2), size, np.array([0.5, -10.0]))[1]
+    assert lost[0] > 2 * far[0]
+
+
+def test_what_was_seen_of_more_than_the_whole_leaves_the_noise_of_the_sensor():
+    found, sigma = complete_box(np.zeros(2), np.array([5.0, 2.0]), np.array([4.4, 1.8]), np.array([-9.0, -9.0]))
+    np.testing.assert_allclose(found, [2.2, 0.9])
+    np.testing.assert_allclose(sigma, 0.08)
 
 
 def test_completion_is_the_same_seen_in_a_mirror():
     low, high, size, sensor = np.array([1.0, 2]), np.array([2.0, 2.5]), np.array([4.0, 2]), np.array([-3.0, 9])
-    center, slack = complete_box(low, high, size, sensor)
-    mirrored, same = complete_box(-high, -low, size, -sensor)
+    center, sigma = complete_box(low, high, size, sensor, RIGHT)
+    mirrored, same = complete_box(-high, -low, size, -sensor, RIGHT)
     np.testing.assert_allclose(mirrored, -center)
-    np.testing.assert_allclose(same, slack)
+    np.testing.assert_allclose(same, sigma)
 
 
 PLACES = [(12, 0, 0), (12, 5, 20), (20, -6, -35), (15, 4, 90), (25, 8, 140), (9, -5, 180), (18, 0, 60), (30, 3, 10)]

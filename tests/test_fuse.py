@@ -26,6 +26,7 @@ def row(cluster, category="car", camera="a", score=0.9, *, truncated=False, far=
         np.array([camera]),
         np.array([[10.0, 20, 30, 40]]) + score,
         np.array([truncated]),
+        np.zeros((1, 2), dtype=bool),
         (center + far)[None],
         size[None],
         np.array([yaw]),

@@ -49,7 +49,7 @@ def unplaced(boxes_px, t_ns=T0_NS, category="car", camera="front"):
     nan = np.full(m, np.nan)
     return Measurements(
         np.full(m, t_ns), np.full(m, category, dtype="<U16"), np.full(m, 0.9), np.full(m, camera),
-        np.asarray(boxes_px, float), np.zeros(m, dtype=bool), np.full((m, 3), np.nan), size, nan,
+        np.asarray(boxes_px, float), np.zeros(m, dtype=bool), np.zeros((m, 2), dtype=bool), np.full((m, 3), np.nan), size, nan,
         np.full((m, 2, 2), np.nan), np.zeros(m, dtype=np.int64), np.full(m, "", dtype="<U16"),
         tuple(np.zeros((0, 3)) for _ in range(m)), np.zeros((m, 3)), nan,
     )  # fmt: skip
