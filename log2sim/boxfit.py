@@ -197,7 +197,7 @@ def box_of_cluster(
     typical = np.array(TYPICAL_SIZE_M[category])
     yaw_rad, _ = fit_yaw(cluster[:, :2])
     low, high = extents(cluster[:, :2], yaw_rad)
-    if is_across(high - low, rotate(sensor[:2], -yaw_rad), typical):
+    if is_across(high - low, rotate(sensor[:2], -yaw_rad) - (low + high) / 2, typical):
         yaw_rad += np.pi / 2
         low, high = np.array([low[1], -high[0]]), np.array([high[1], -low[0]])
     top = float(quantile_of_sorted(np.sort(cluster[:, 2]), 0.98)) - ground_z
@@ -216,7 +216,7 @@ def oriented_covariance(sigma_m: Array, yaw_rad: float) -> Array:
 def is_across(seen_m: Array, sensor: Array, typical: Array) -> bool:
     """Whether a fitted yaw runs across the object, from the extents (2,) along and across it.
 
-    `sensor` is one place (2,) or several (K, 2) that it was seen from, in axes along and across; `typical` the
+    `sensor` is one place (2,) or several (K, 2) that it was seen from, along and across from its middle; `typical` the
     category's size.
     """
     # Too long for a width: that side is the length. Both short: what faces the sensor flat-on is front or rear.

@@ -235,14 +235,6 @@ def test_the_covariance_is_widest_along_what_was_not_seen():
     np.testing.assert_allclose(covariance, covariance.T)
 
 
-def test_a_known_yaw_and_size_are_kept():
-    xyz, owner = scan([standing(15, 5, 25)])
-    given = np.array([5.0, 2.0, 1.7])
-    center, size, yaw, _ = box_of_cluster(xyz[owner == 0], np.array([0, 0, 1.9]), "car", 0.0, yaw_rad=0.4, size_m=given)
-    assert (size.tolist(), yaw) == (given.tolist(), 0.4)
-    assert center[2] == pytest.approx(0.85)
-
-
 @pytest.mark.parametrize("category", CATEGORIES)
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_a_handful_of_points_gives_a_finite_box_of_at_least_the_typical_size(category, count):

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds import Solid, camera_ahead, outline_px, standing
+from worlds import Solid, camera_ahead, outline_px, scan, standing
 
 from log2sim.camera import project
+from log2sim.extend import Obstacles
 from log2sim.geometry import PoseTrack, apply, inverse, rotation_from_rpy, transform
 from log2sim.ground_plane import CameraGround, calibrated_ground, fit_cameras, locate_the_rest
 from log2sim.observe import Observed
@@ -165,7 +166,7 @@ def test_an_obstacle_without_points_is_placed_where_its_foot_is(far, yaw, catego
     size = TYPICAL_SIZE_M[category]
     solid = standing(18.0, 3.0, 0.0, size)
     m = unplaced([outline_px(camera, camera.mount_T_cam, solid)], category=category)
-    seen = Observed(measurements=[m])
+    seen = Observed(measurements=[m], obstacles=[None])
     homographies = {"front": CameraGround(camera, calibrated_ground(log, camera), "calibration")}
     row = locate_the_rest(log, synchronize(log, ("front",)), seen, homographies)[0]
     truth = apply(log.ego.map_T_ego[0], np.array([solid.center_m]))[0]
@@ -187,7 +188,7 @@ def test_the_covariance_turns_with_the_ego():
     def covariance(yaw):
         log = log_with(camera, yaw=yaw)
         ground = {"front": CameraGround(camera, calibrated_ground(log, camera), "calibration")}
-        seen = Observed(measurements=[unplaced([box])])
+        seen = Observed(measurements=[unplaced([box])], obstacles=[None])
         return locate_the_rest(log, synchronize(log, ("front",)), seen, ground)[0].covariance[0]
 
     along = covariance(0.0)
@@ -208,7 +209,7 @@ def test_boxes_whose_foot_says_nothing_stay_without_a_place(name):
     camera = tilted(0.0)
     log = log_with(camera)
     ground = {"front": CameraGround(camera, calibrated_ground(log, camera), "calibration")}
-    seen = Observed(measurements=[unplaced([LEFT_ALONE[name]])])
+    seen = Observed(measurements=[unplaced([LEFT_ALONE[name]])], obstacles=[None])
     row = locate_the_rest(log, synchronize(log, ("front",)), seen, ground)[0]
     assert row.source.tolist() == [""]
     assert np.isnan(row.center_m).all()
@@ -219,7 +220,7 @@ def test_boxes_whose_foot_says_nothing_stay_without_a_place(name):
 )
 def test_without_a_homography_nothing_is_placed(homographies):
     log = log_with(tilted())
-    seen = Observed(measurements=[unplaced([[500, 280, 700, 400]]), Measurements.empty()])
+    seen = Observed(measurements=[unplaced([[500, 280, 700, 400]]), Measurements.empty()], obstacles=[None, None])
     rows = locate_the_rest(log, synchronize(log, ("front",)), seen, homographies)
     assert [r.source.tolist() for r in rows] == [[""], []]
 
@@ -233,6 +234,38 @@ def test_two_cameras_that_place_one_obstacle_make_one_row_of_it():
         unplaced([outline_px(c, c.mount_T_cam, solid)], category="pedestrian", camera=c.name) for c in (left, right)
     ]
     ground = {c.name: CameraGround(c, calibrated_ground(log, c), "calibration") for c in (left, right)}
-    out = locate_the_rest(log, synchronize(log, ("front",)), Observed(measurements=[Measurements.join(rows)]), ground)
+    seen = Observed(measurements=[Measurements.join(rows)], obstacles=[None])
+    out = locate_the_rest(log, synchronize(log, ("front",)), seen, ground)
     assert len(out[0]) == 1
     assert np.hypot(*(out[0].center_m[0] - solid.center_m)[:2]) < 0.3
+
+
+def placed_where_rays_go(solids, at=(15.0, 1.0)):
+    """A car's box at a place, and what `locate_the_rest` makes of it where a LiDAR saw these solids."""
+    camera = tilted(0.0)
+    log = log_with(camera)
+    car = standing(*at)
+    box = outline_px(camera, log.map_T_sensor("front", T0_NS)[0][0], car)
+    xyz, owner = scan(solids)
+    above = xyz[(owner >= 0) & (xyz[:, 2] > 0.2)].astype(np.float32)
+    cloud = Obstacles(T0_NS, np.zeros(3), above, np.zeros(len(above), np.float32), np.array([0, 0, 1.9], np.float32))
+    ground = {"front": CameraGround(camera, calibrated_ground(log, camera), "calibration")}
+    seen = Observed(measurements=[unplaced([box])], obstacles=[cloud])
+    return locate_the_rest(log, synchronize(log, ("front",)), seen, ground)[0]
+
+
+FAR_WALL = standing(45.0, 0.0, 0.0, (0.5, 80.0, 4.0))
+
+
+def test_what_the_lidar_looks_through_is_not_placed():
+    assert placed_where_rays_go([FAR_WALL]).source.tolist() == [""]
+
+
+def test_what_the_lidar_should_have_seen_is_half_as_sure():
+    row = placed_where_rays_go([standing(15, 1), FAR_WALL])
+    assert (row.source.tolist(), row.score.tolist()) == (["topdown"], [0.45])
+
+
+def test_where_the_lidar_saw_nothing_a_placed_object_is_as_sure_as_its_detection():
+    row = placed_where_rays_go([])
+    assert (row.source.tolist(), row.score.tolist()) == (["topdown"], [0.9])

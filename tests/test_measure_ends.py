@@ -1,0 +1,84 @@
+"""Ends of clusters: what the rays beside an end reached tells whether it is the object's."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from worlds import scan, standing
+
+from log2sim.measure.ends import Panorama
+
+SENSOR = np.array([0.0, 0.0, 1.9], dtype=np.float32)
+
+
+def ends_of(solids, of=0, only=None, **options):
+    """Right and left end of one solid's points (or of those that `only` picks), as the panorama tells."""
+    xyz, owner = scan(solids, **options)
+    members = np.flatnonzero((owner == of) & (xyz[:, 2] > 0.2))
+    if only is not None:
+        members = members[only(xyz[members])]
+    assert len(members) > 20
+    panorama = Panorama.of(xyz.astype(np.float32), SENSOR, owner == -1)
+    return panorama.ends_seen(members).tolist()
+
+
+WALL = standing(30.0, 0.0, 0.0, (0.5, 60.0, 4.0))
+
+
+@pytest.mark.parametrize("behind", [[], [WALL]], ids=["ground behind", "wall behind"])
+@pytest.mark.parametrize(("x", "y", "yaw"), [(12, 0, 0), (12, 4, 30), (20, -5, 90), (8, 3, -60)])
+def test_both_ends_of_a_free_car_are_seen(x, y, yaw, behind):
+    assert ends_of([standing(x, y, yaw), *behind]) == [True, True]
+
+
+def test_a_car_straight_behind_is_as_one_ahead():
+    assert ends_of([standing(-12, 0, 10)], azimuth_deg=(135, 225)) == [True, True]
+    pole = standing(-7, -0.9, 0, (0.6, 0.6, 3.0))
+    # Seen from the sensor that looks back, -y is on the left.
+    assert ends_of([standing(-12, 0, 10), pole], azimuth_deg=(135, 225)) == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("azimuth_deg", "seen"), [((-45, 4), [True, False]), ((-4, 45), [False, True]), ((-4, 4), [False, False])]
+)
+def test_where_the_sensor_does_not_look_the_car_may_go_on(azimuth_deg, seen):
+    assert ends_of([standing(12, 0, 90)], azimuth_deg=azimuth_deg) == seen
+
+
+@pytest.mark.parametrize(("y", "seen"), [(0.9, [True, False]), (-0.9, [False, True]), (8.0, [True, True])])
+def test_where_something_nearer_stands_the_car_may_go_on(y, seen):
+    assert ends_of([standing(14, 0, 90), standing(7, y, 0, (1.0, 0.8, 3.0)), WALL]) == seen
+
+
+def test_a_part_of_a_wall_has_no_ends():
+    assert ends_of([WALL], only=lambda p: np.abs(p[:, 1]) < 2.2) == [False, False]
+
+
+def test_a_neighbor_beyond_a_gap_is_no_continuation():
+    row = [standing(10, 0, 90), standing(10, 5.4, 90), standing(10, -5.4, 90)]
+    assert ends_of(row) == [True, True]
+
+
+def test_a_roof_above_what_hides_the_body_ends_where_it_is_seen_to_end():
+    # Seen over a low wall right before it: rays beside its roof go on, those that the wall stops are lower.
+    low_wall = standing(10.5, 0.0, 0.0, (0.3, 40.0, 1.0))
+    assert ends_of([standing(13, 0, 90, (4.4, 1.85, 1.8)), low_wall, WALL]) == [True, True]
+
+
+def test_a_cloud_of_nothing_else_shows_no_ends():
+    xyz, owner = scan([standing(12, 0, 0)])
+    alone = xyz[owner == 0].astype(np.float32)
+    panorama = Panorama.of(alone, SENSOR, np.zeros(len(alone), dtype=bool))
+    assert panorama.ends_seen(np.arange(len(alone))).tolist() == [False, False]
+
+
+def test_the_turned_world_shows_the_same_ends():
+    xyz, owner = scan([standing(12, 3, 40), standing(7, 2.4, 0, (0.5, 0.5, 3.0))])
+    members = np.flatnonzero((owner == 0) & (xyz[:, 2] > 0.2))
+    found = []
+    for angle in np.linspace(-np.pi, np.pi, 13):
+        c, s = np.cos(angle), np.sin(angle)
+        turned = xyz @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        found.append(tuple(Panorama.of(turned.astype(np.float32), SENSOR, owner == -1).ends_seen(members)))
+    assert len(set(found)) == 1
+    assert found[0] == (True, False)
