@@ -254,7 +254,7 @@ def placed_where_rays_go(solids, at=(15.0, 1.0)):
     return locate_the_rest(log, synchronize(log, ("front",)), seen, ground)[0]
 
 
-FAR_WALL = standing(45.0, 0.0, 0.0, (0.5, 80.0, 4.0))
+FAR_WALL = standing(22.0, 0.0, 0.0, (0.5, 80.0, 4.0))
 
 
 def test_what_the_lidar_looks_through_is_not_placed():
