@@ -112,6 +112,8 @@ LOG_FAULTS: dict[str, tuple[Change, tuple[str, ...], int, list[str]]] = {
     "focal length": (manifest(lambda m: m["sensors"][0]["intrinsics"].update(fx_px=-3)), (), 3, ["sensors[0].intrinsics.fx_px", "-3"]),
     "parent path": (manifest(lambda m: m["sensors"][0].update(index="../x.csv")), (), 3, ["sensors[0].index", "'../x.csv' leaves"]),
     "absolute path": (manifest(lambda m: m["sensors"][0].update(index="/etc/passwd")), (), 3, ["sensors[0].index", "leaves the log"]),
+    "absolute path within": (lambda f: manifest(lambda m: m["ego"].update(poses=str(f / "ego/poses.csv")))(f), (), 3,
+                             ["ego.poses", "leaves the log folder"]),
     "zero byte in a path": (manifest(lambda m: m["sensors"][0].update(index="a\0b")), (), 3, ["sensors[0].index", "null byte"]),
     "symbolic link": (link_out, (), 3, ["front/index.csv, line 3", "'file'", "leaves the log folder"]),
     "loop of links": (link_loop, (), 3, ["front/index.csv, line 3", "'file'", "loop"]),

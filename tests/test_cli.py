@@ -181,13 +181,15 @@ def test_evaluate_narrows_and_takes_files_and_logs(tiny_scenario: Path, tiny_fol
     assert by_log.out == ""
     assert read(tmp_path / "a.json") == read(tmp_path / "b.json")
     narrowed = run(
-        "evaluate", tiny_scenario, "--truth", tiny_folder, "--range", "40", "--categories", "car",
+        "evaluate", tiny_scenario, "--truth", tiny_folder, "--range", "40", "--categories", "pedestrian",
         "--out", tmp_path / "c.json",
     )  # fmt: skip
     assert narrowed.code == 0
     document = read(tmp_path / "c.json")
     assert document["max_range_m"] == 40.0
-    assert list(document["by_category"]) == ["car"]
+    assert document["categories"] == ["pedestrian"]
+    assert list(read(tmp_path / "a.json")["by_category"]) == ["car"]  # the pedestrian is in sight for less than 1 s
+    assert document["by_category"] == {}
     # A scenario is its own truth without error.
     assert run("evaluate", tiny_scenario, "--truth", tiny_scenario, "--out", tmp_path / "d.json").code == 0
     assert read(tmp_path / "d.json")["position_rmse_m"] == 0.0

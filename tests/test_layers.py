@@ -31,9 +31,10 @@ def unit(module: str) -> str:
     return parts[1] if len(parts) > 1 else "__init__"
 
 
-def imports(file: Path) -> Iterator[str]:
-    """Modules of the package that a file imports anywhere in it, also within functions."""
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+def imports(file: Path, *, lazy: bool) -> Iterator[str]:
+    """Modules of the package that a file imports; with `lazy` also those imported within functions."""
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    for node in ast.walk(tree) if lazy else tree.body:
         if isinstance(node, ast.Import):
             yield from (a.name for a in node.names if a.name.split(".")[0] == "log2sim")
         elif isinstance(node, ast.ImportFrom):
@@ -51,19 +52,8 @@ def graph(*, lazy: bool) -> dict[str, set[str]]:
     edges: dict[str, set[str]] = {}
     for file in sorted(PACKAGE.rglob("*.py")):
         name = ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__")
-        edges[name] = set(imports(file)) if lazy else set(_at_start(file))
+        edges[name] = set(imports(file, lazy=lazy))
     return edges
-
-
-def _at_start(file: Path) -> Iterator[str]:
-    tree = ast.parse(file.read_text(encoding="utf-8"))
-    kept = [n for n in tree.body if isinstance(n, (ast.Import, ast.ImportFrom))]
-    for node in kept:
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("log2sim"):
-            for alias in node.names:
-                inner = f"{node.module}.{alias.name}"
-                path = PACKAGE.parent / inner.replace(".", "/")
-                yield inner if path.with_suffix(".py").exists() or path.is_dir() else node.module
 
 
 def units() -> dict[str, set[str]]:

@@ -3,5 +3,6 @@
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 [ -x .venv/bin/python ] || python3 -m venv .venv
-.venv/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[coco]'
+echo "installing into .venv (about a minute the first time)"
+.venv/bin/python -m pip install -qq --disable-pip-version-check --editable '.[coco]'
 exec .venv/bin/python tools/demo.py

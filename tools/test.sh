@@ -3,6 +3,7 @@
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 [ -x .venv/bin/python ] || python3 -m venv .venv
-.venv/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[coco,test]'
+echo "installing into .venv (about a minute the first time)"
+.venv/bin/python -m pip install -qq --disable-pip-version-check --editable '.[coco,test]'
 export OPENBLAS_NUM_THREADS=1
 exec .venv/bin/python -m pytest -m '' "$@"
