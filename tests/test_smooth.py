@@ -9,14 +9,14 @@ from scipy.linalg import expm
 
 from log2sim.geometry import wrap_angle
 from log2sim.smooth import SmoothedTrack, estimate_sigma, signed_speed, smooth_track
-from log2sim.smooth.interval import (
+from log2sim.smooth.chain import (
     ACCELERATION_PRIOR_MPS2,
     KNOT_STEP_S,
     VELOCITY_PRIOR_MPS,
     Observations,
     place_knots,
-    smooth_interval,
 )
+from log2sim.smooth.interval import Manner, smooth_interval
 from log2sim.smooth.yaw import yaw_of_motion
 
 DT = 0.1
@@ -84,12 +84,13 @@ def test_the_banded_solver_agrees_with_dense_least_squares() -> None:
     # Observations on a smooth way far within their noise keep the robust weights at 1.
     xy = np.column_stack([2.0 * t, 0.2 * t**2]) + rng.normal(0, 1e-4, (12, 2))
     observed = Observations(t, xy, root @ np.swapaxes(root, 1, 2) + 0.04 * np.eye(2))
-    state, covariance, distance, weight = smooth_interval(observed, t, 2.0)
+    path = smooth_interval(observed, t, Manner(2.0, sideways=True))
+    state, covariance = path.state.reshape(-1, 6), path.covariance
     expected, expected_covariance = dense_solution(observed, t, 2.0)
-    assert weight.min() > 0.999
+    assert path.weight.min() > 0.999
     np.testing.assert_allclose(state, expected, rtol=1e-3, atol=1e-3)
-    np.testing.assert_allclose(covariance, expected_covariance[:, :2, :2], rtol=1e-3, atol=1e-6)
-    np.testing.assert_allclose(distance, np.hypot(*(xy - state[:, :2]).T), atol=1e-9)
+    np.testing.assert_allclose(covariance, expected_covariance, rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(path.distance, np.hypot(*(xy - state[:, :2]).T), atol=1e-9)
 
 
 def test_states_between_observations_are_those_of_a_knot_there() -> None:
@@ -99,9 +100,9 @@ def test_states_between_observations_are_those_of_a_knot_there() -> None:
     knots = np.unique(np.concatenate([t, asked]))
     expected, expected_covariance = dense_solution(observed, knots, 4.0)
     rows = np.searchsorted(knots, asked)
-    state, covariance, _, _ = smooth_interval(observed, asked, 4.0)
-    np.testing.assert_allclose(state, expected[rows], atol=2e-3)
-    np.testing.assert_allclose(covariance, expected_covariance[rows, :2, :2], rtol=1e-3)
+    path = smooth_interval(observed, asked, Manner(4.0, sideways=True))
+    np.testing.assert_allclose(path.state.reshape(-1, 6), expected[rows], atol=2e-3)
+    np.testing.assert_allclose(path.covariance, expected_covariance[rows], rtol=1e-3, atol=1e-6)
 
 
 def test_states_within_a_step_of_a_knot_are_carried_from_it() -> None:
