@@ -18,6 +18,7 @@ __all__ = ["SmoothedTrack", "smooth_track", "yaw_of_motion"]
 MAX_ACCELERATION_MPS2 = 10.4
 MAX_CURVATURE_1PM = 0.3
 CURVATURE_SPEED_MPS = 1.5
+LEAST_INLIER_WEIGHT = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +91,14 @@ def smooth_track(
     asked = t if at_s is None else np.asarray(at_s, dtype=np.float64)
     # Far from the origin the normal equations would lose digits, so everything is relative to the first position.
     origin = xy[use][0]
-    manner = Manner(jerk_density, sideways, yaw_hint_rad, scaled=sigma_m is None and covariance is None)
+    # Covariances come from measurements, whose errors have heavier tails than they say.
+    manner = Manner(
+        jerk_density,
+        sideways,
+        yaw_hint_rad,
+        scaled=sigma_m is None and covariance is None,
+        wary=covariance is not None,
+    )
     path = smooth_interval(Observations(t[use], xy[use] - origin, r), asked, manner)
     velocity, acceleration = path.state[:, 1], path.state[:, 2]
     speed = np.hypot(*velocity.T)
@@ -99,7 +107,7 @@ def smooth_track(
     residual = np.full(len(t), np.nan)
     residual[use] = path.distance
     inlier = np.zeros(len(t), dtype=bool)
-    inlier[use] = path.weight > 0.5
+    inlier[use] = path.weight > LEAST_INLIER_WEIGHT
     return SmoothedTrack(
         t_s=asked,
         xy_m=path.state[:, 0] + origin,

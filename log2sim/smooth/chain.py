@@ -125,8 +125,6 @@ def nearest_index(knots: Array, t: Array) -> NDArray[np.intp]:
 
 
 def add_at(target: Array, place: NDArray[np.intp], values: Array) -> None:
-    """`target[place] += values` where places may repeat."""
-    if np.all(np.diff(place) > 0):
-        target[place] += values
-    else:
-        np.add.at(target, place, values)
+    """`target[place] += values` where places may repeat, in order."""
+    first = np.flatnonzero(np.diff(place, prepend=-1))
+    target[place[first]] += values if len(first) == len(place) else np.add.reduceat(values, first, axis=0)

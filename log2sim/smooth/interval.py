@@ -35,13 +35,15 @@ SLIP_MPS, SLIP_SHARE = 0.03, 0.15
 @dataclass(frozen=True)
 class Manner:
     """How an object moves: `jerk_density` in m2/s5 or None to estimate it, `sideways` True where it may go any way,
-    `heading_rad` where its motion does not tell, `scaled` True where the noise is known up to a factor only.
+    `heading_rad` where its motion does not tell, `scaled` True where the noise is known up to a factor only, `wary` True
+    where observations err by some sigmas more often than Gaussian ones.
     """
 
     jerk_density: float | None = None
     sideways: bool = False
     heading_rad: float | None = None
     scaled: bool = False
+    wary: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +93,7 @@ def smooth_interval(observed: Observations, asked_s: Array, manner: Manner) -> S
     constant-acceleration model, found in one go; the densities maximize the marginal likelihood. Cost O(n).
     """
     chain = Chain.over(np.concatenate([observed.t_s, asked_s]))
-    problem, least, state = _settle(_pose(chain, Readings.of(observed, chain), manner), DECIDING_ROUNDS)
+    problem, least, state = _settle(_pose(chain, Readings.of(observed, chain), manner), DECIDING_ROUNDS, manner)
     covariance = least.covariance()
     held = _held(problem, state, covariance, manner)
     if held is not None:
@@ -111,48 +113,52 @@ def _pose(chain: Chain, readings: Readings, manner: Manner) -> _Problem:
     read = Readings.of(observed, few)
     variance = np.trace(observed.r, axis1=1, axis2=2) / 2
     density = max(PERMISSIVE_JERK_DENSITY if manner.jerk_density is None else manner.jerk_density, floor(few))
-    state, weight = _without_outliers(few, read, variance, density)
+    state, weight = _without_outliers(few, read, variance, density, wary=manner.wary)
     factor = 1.0
     if manner.jerk_density is None or manner.scaled:
         fixed = total([(1.0, read.apart(state, weight / variance)), (1.0, beliefs(state, 2))])
         density, factor = shared_density(few, state, fixed, float(weight.sum()), scaled=manner.scaled)
         state = state + minimize(total([(1.0, fixed), (factor / density, few.jerk(state))])).step
-    search = _about(few, read, state, weight, np.linalg.inv(observed.r * factor), density, manner)
+    yaw = np.unwrap(yaw_of_motion(state[:, 0], state[:, 1], hint_rad=manner.heading_rad))
+    search = _about(few, read, state, weight, np.linalg.inv(observed.r * factor), yaw)
     if manner.jerk_density is None and not manner.sideways and len(few) >= 4:
         search = replace(search, density=separate_densities(few, search.jerk, search.evidence, density))
-        search, _, state = _settle(search, 1)
-    least_density = floor(chain)
+        search, _, state = _settle(search, 1, manner)
+    else:
+        search = replace(search, density=(density, density))
+    lowest = floor(chain)
+    yaw = np.interp(chain.knots_s, few.knots_s, yaw)
     return replace(
-        _about(chain, readings, carry(few, state, chain.knots_s), search.weight, search.information, density, manner),
-        density=(max(search.density[0], least_density), max(search.density[1], least_density)),
+        _about(chain, readings, carry(few, state, chain.knots_s), search.weight, search.information, yaw),
+        density=(max(search.density[0], lowest), max(search.density[1], lowest)),
     )
 
 
 def _about(
-    chain: Chain, readings: Readings, state: Array, weight: Array, information: Array, density: float, manner: Manner
+    chain: Chain, readings: Readings, state: Array, weight: Array, information: Array, yaw: Array
 ) -> _Problem:
-    """The problem as forms about a state (K, 3, 2), in whose direction along and across are told apart."""
-    yaw = np.unwrap(yaw_of_motion(state[:, 0], state[:, 1], hint_rad=manner.heading_rad))
+    """The problem as forms about a state (K, 3, 2) with headings (K,), by which along and across are told apart."""
     course = (yaw[1:] + yaw[:-1]) / 2
     along = np.stack([np.cos(course), np.sin(course)], axis=-1)
-    return _Problem(
-        chain, readings, state, weight, information, chain.jerk_by_direction(state, along), (density, density)
-    )
+    return _Problem(chain, readings, state, weight, information, chain.jerk_by_direction(state, along), (1.0, 1.0))
 
 
-def _settle(problem: _Problem, rounds: int) -> tuple[_Problem, Minimum, Array]:
+def _settle(problem: _Problem, rounds: int, manner: Manner) -> tuple[_Problem, Minimum, Array]:
     """Settle which observations are wrong: the problem with their weights, its minimum and the state (K, 3, 2) there."""
     for _ in range(rounds):
         least, state = problem.solve()
         residual = problem.readings.residual(state)
-        weight = decided(np.einsum("na,nab,nb->n", residual, problem.information, residual))
+        squared = np.einsum("na,nab,nb->n", residual, problem.information, residual)
+        weight = tolerant(squared) if manner.wary else decided(squared)
         if np.abs(weight - problem.weight).max() < SETTLED:
             return problem, least, state
         problem = replace(problem, weight=weight)
     return problem, *problem.solve()
 
 
-def _without_outliers(chain: Chain, readings: Readings, variance: Array, density: float) -> tuple[Array, Array]:
+def _without_outliers(
+    chain: Chain, readings: Readings, variance: Array, density: float, *, wary: bool
+) -> tuple[Array, Array]:
     """State (K, 3, 2) and weights (n,) with both axes alike and a given density."""
     start = np.zeros((len(chain), 3, 2))
     jerk, prior = chain.jerk(start), beliefs(start, 2)
@@ -161,9 +167,9 @@ def _without_outliers(chain: Chain, readings: Readings, variance: Array, density
         evidence = readings.apart(start, weight / variance)
         state = minimize(total([(1.0, evidence), (1.0, prior), (1.0 / density, jerk)])).step
         squared = (readings.residual(state) ** 2).sum(axis=1) / variance
-        if squared.max() < CLEAN_SIGMAS**2:
+        if not wary and squared.max() < CLEAN_SIGMAS**2:
             return state, np.ones(len(variance))
-        weight = tolerant(squared) if k < TOLERANT_ROUNDS else decided(squared)
+        weight = tolerant(squared) if wary or k < TOLERANT_ROUNDS else decided(squared)
     return state, weight
 
 

@@ -9,6 +9,9 @@ import numpy as np
 
 from log2sim.geometry import Array
 
+# A chain of no more states than this is inverted as a whole.
+DENSE_BLOCKS = 8
+
 
 @dataclass(frozen=True, eq=False)
 class Quadratic:
@@ -109,8 +112,8 @@ def selected_inverse(diagonal: Array, off: Array) -> tuple[Array, Array]:
     Cyclic reduction: every other state is eliminated at once, which leaves a chain of half the length. Its O(log K) rounds
     are each a few stacked products, where elimination along the chain would take K.
     """
-    if len(diagonal) == 1:
-        return np.linalg.inv(diagonal), off[:0]
+    if len(diagonal) <= DENSE_BLOCKS:
+        return _dense_inverse(diagonal, off)
     kept, gone = diagonal[::2], np.linalg.inv(diagonal[1::2])
     left, right = off[::2], off[1::2]  # kept to gone, gone to kept
     n, m = len(left), len(right)
@@ -128,3 +131,14 @@ def selected_inverse(diagonal: Array, off: Array) -> tuple[Array, Array]:
     on[::2], on[1::2] = inverse, gone
     above[::2], above[1::2] = np.swapaxes(to_left, 1, 2), to_right
     return on, above
+
+
+def _dense_inverse(diagonal: Array, off: Array) -> tuple[Array, Array]:
+    count, size, _ = diagonal.shape
+    dense = np.zeros((count, size, count, size))
+    k = np.arange(count)
+    dense[k, :, k] = diagonal
+    dense[k[:-1], :, k[1:]] = off
+    dense[k[1:], :, k[:-1]] = np.swapaxes(off, 1, 2)
+    inverse = np.linalg.inv(dense.reshape(count * size, -1)).reshape(dense.shape)
+    return inverse[k, :, k], inverse[k[:-1], :, k[1:]]
