@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from log2sim.geometry import Array, wrap_angle
+from log2sim.smooth.feasible import broken_limits
 from log2sim.smooth.interval import Manner, Observations, smooth_interval
 from log2sim.smooth.yaw import yaw_of_motion
 
 __all__ = ["SmoothedTrack", "smooth_track", "yaw_of_motion"]
 
-# Waymax (Gulino et al., 2023) calls a vehicle's motion infeasible beyond these.
-MAX_ACCELERATION_MPS2 = 10.4
-MAX_CURVATURE_1PM = 0.3
+# Slower than this, the curvature of a smoothed way is noise.
 CURVATURE_SPEED_MPS = 1.5
 LEAST_INLIER_WEIGHT = 0.25
 
@@ -67,8 +66,9 @@ def smooth_track(
         Covariance of the positions, m2.
     at_s : (T,), optional
         Times of the result, by default `t_s`.
-    jerk_density : float
-        Spectral density of the jerk, m2/s5: how fast the acceleration may change.
+    jerk_density : float, optional
+        Spectral density of the jerk, m2/s5: how fast the acceleration may change. By default the most likely one, along
+        and across the way separately unless `sideways`.
     sideways : bool
         True for pedestrians, who may turn on the spot.
     yaw_hint_rad : float, optional
@@ -118,7 +118,7 @@ def smooth_track(
         covariance=path.covariance[:, :2, :2],
         residual_m=residual,
         inlier=inlier,
-        flags=_flags(acceleration, curvature, sideways=sideways),
+        flags=broken_limits(asked, acceleration, path.yaw_rad, curvature) if not sideways else (),
     )
 
 
@@ -149,15 +149,6 @@ def estimate_sigma(t: Array, xy: Array) -> float:
     weights = 1.0 / apart.prod(axis=2)
     differences = np.einsum("nj,njk->nk", weights, xy[rows]) / np.linalg.norm(weights, axis=1, keepdims=True)
     return max(float(np.median(np.abs(differences))) / 0.6745, 1e-3)
-
-
-def _flags(acceleration: Array, curvature: Array, *, sideways: bool) -> tuple[str, ...]:
-    flags = []
-    if np.hypot(*acceleration.T).max() > MAX_ACCELERATION_MPS2:
-        flags.append("acceleration")
-    if not sideways and np.abs(curvature).max() > MAX_CURVATURE_1PM:
-        flags.append("curvature")
-    return tuple(flags)
 
 
 def signed_speed(velocity_mps: Array, yaw_rad: Array) -> Array:

@@ -14,7 +14,7 @@ from log2sim.smooth.quadratic import Quadratic
 # jerk costs 0.02 mm. The information that ties two knots grows like the fifth power of the inverse step: 1 ms apart they
 # would leave no digits for the data.
 KNOT_STEP_S = 0.02
-# Vague beliefs that make a single observation, or a pair of them, have an answer.
+# Vague beliefs about the first state.
 VELOCITY_PRIOR_MPS = 40.0
 ACCELERATION_PRIOR_MPS2 = 4.0
 
@@ -69,39 +69,46 @@ class Chain:
 
     def jerk(self, state: Array) -> Quadratic:
         """Squared jerk of every column of a reference state (K, 3, 2), over a density of 1."""
-        left = state[1:] - self.step @ state[:-1]
-        return Quadratic.of(self.diagonal, self.cross, self._pull(left), float(np.vdot(left, self.inverse @ left)))
+        return Quadratic.of(self.diagonal, self.cross, *self._pull(state[1:] - self.step @ state[:-1]))
 
     def jerk_by_direction(self, state: Array, direction: Array) -> tuple[Quadratic, Quadratic]:
         """The squared jerk along and across a direction (K-1, 2) at every step, over all six unknowns of a knot."""
         outer = direction[:, :, None] * direction[:, None, :]
         left = state[1:] - self.step @ state[:-1]
-        diagonal = np.zeros((len(self), 6, 6))
+        along = left @ outer
         # Each step has a direction of its own, so a knot's block takes two of them.
-        diagonal[:-1] = _spread(self.inverse_before, outer)
-        diagonal[1:] += _spread(self.inverse, outer)
-        cross = _spread(self.cross, outer)
-        both = np.broadcast_to(np.eye(2), (len(self), 2, 2))
-        forms = []
-        for part, d, c in (
-            (left @ outer, diagonal, cross),
-            (left - left @ outer, _spread(self.diagonal, both) - diagonal, _spread(self.cross, both[1:]) - cross),
-        ):
-            value = float(np.vdot(part, self.inverse @ part))
-            forms.append(Quadratic.of(d, c, self._pull(part).reshape(-1, 6, 1), value))
-        return forms[0], forms[1]
+        diagonal = np.zeros((len(self), 6, 6))
+        diagonal[:-1] = spread(self.inverse_before, outer)
+        diagonal[1:] += spread(self.inverse, outer)
+        cross = spread(self.cross, outer)
+        lengthwise = self._part(along, diagonal, cross)
+        np.negative(diagonal, out=diagonal)
+        np.negative(cross, out=cross)
+        for axis in range(2):  # across is all that is not along
+            diagonal[:, axis::2, axis::2] += self.diagonal
+            cross[:, axis::2, axis::2] += self.cross
+        return lengthwise, self._part(left - along, diagonal, cross)
 
-    def _pull(self, left: Array) -> Array:
-        """How what is left (K-1, 3, 2) of every step pulls at the knots."""
-        pull = np.zeros((len(self), *left.shape[1:]))
-        pull[:-1] = -self.cross @ left
-        pull[1:] -= self.inverse @ left
-        return pull
+    def _part(self, left: Array, diagonal: Array, cross: Array) -> Quadratic:
+        pull, value = self._pull(left)
+        return Quadratic.of(diagonal, cross, pull.reshape(-1, 6, 1), value)
+
+    def _pull(self, left: Array) -> tuple[Array, float]:
+        """How what is left (K-1, 3, 2) of every step pulls at the knots (K, 3, 2), and its square."""
+        weighted = self.inverse @ left
+        pull = np.zeros((len(self), 3, 2))
+        pull[:-1] = np.swapaxes(self.step, 1, 2) @ weighted
+        pull[1:] -= weighted
+        return pull, float(np.vdot(left, weighted))
 
 
-def _spread(blocks: Array, outer: Array) -> Array:
-    """Blocks (n, 3, 3) of one axis, over both along a direction whose outer square is (n, 2, 2): (n, 6, 6)."""
-    return np.asarray(blocks[:, :, None, :, None] * outer[:, None, :, None, :]).reshape(-1, 6, 6)
+def spread(blocks: Array, over: Array) -> Array:
+    """Blocks (n, 3, 3) of one axis times weights (n, 2, 2) of each pair of axes: (n, 6, 6)."""
+    product = np.empty((len(blocks), 6, 6))
+    for first in range(2):
+        for second in range(2):
+            np.multiply(blocks, over[:, first, second, None, None], out=product[:, first::2, second::2])
+    return product
 
 
 def place_knots(t_s: Array, step_s: float = KNOT_STEP_S) -> Array:
@@ -122,9 +129,3 @@ def nearest_index(knots: Array, t: Array) -> NDArray[np.intp]:
         return np.zeros(len(t), dtype=np.intp)
     i = np.clip(np.searchsorted(knots, t), 1, len(knots) - 1)
     return np.where(np.abs(knots[i - 1] - t) <= np.abs(knots[i] - t), i - 1, i)
-
-
-def add_at(target: Array, place: NDArray[np.intp], values: Array) -> None:
-    """`target[place] += values` where places may repeat, in order."""
-    first = np.flatnonzero(np.diff(place, prepend=-1))
-    target[place[first]] += values if len(first) == len(place) else np.add.reduceat(values, first, axis=0)

@@ -12,14 +12,17 @@ from log2sim.smooth.quadratic import Quadratic, minimize, total
 
 # What road users do, m2/s5: a belief held about the logarithm, so weakly that some seconds of data outweigh it.
 TYPICAL_JERK_DENSITY = 1.5
-LOG_SPREAD = 3.0
+LOG_SPREAD = 2.5
 # Information that ties two knots beyond this leaves no digits for the data.
 MAX_INFORMATION = 1e13
 LIMITS = (1e-4, 1e4)
-FIRST_STEP, SECOND_STEP = 2.0, 0.8
+# Reach of the search in the logarithm, round by round.
+WIDTHS = (2.0, 0.8)
 
 
-def shared_density(chain: Chain, state: Array, fixed: Quadratic, weight: float, *, scaled: bool) -> tuple[float, float]:
+def shared_density(
+    chain: Chain, state: Array, fixed: Quadratic, weight: float, *, scaled: bool, rounds: int = 2
+) -> tuple[float, float]:
     """Jerk density in m2/s5 of both axes and the factor on the noise's variance, by marginal likelihood.
 
     Parameters
@@ -30,6 +33,8 @@ def shared_density(chain: Chain, state: Array, fixed: Quadratic, weight: float, 
         Sum of the observations' weights.
     scaled : bool
         True where the variance of the noise is known up to a factor only.
+    rounds : int
+        How often to search, each time closer; 1 where a finer search follows.
     """
     jerk = chain.jerk(state)
     steps = len(chain) - 1
@@ -44,7 +49,7 @@ def shared_density(chain: Chain, state: Array, fixed: Quadratic, weight: float, 
 
     lowest = floor(chain)
     start = np.array([np.log(max(TYPICAL_JERK_DENSITY, lowest))])
-    u = _descend(misfit, start, (FIRST_STEP, SECOND_STEP), lowest)
+    u = _descend(misfit, start, WIDTHS[:rounds], lowest)
     ratio = float(np.exp(u[0]))
     if not scaled:
         return ratio, 1.0
@@ -68,7 +73,7 @@ def separate_densities(
             least.value + least.log_determinant + 3.0 * steps * logs.sum() + _belief(logs[0]) + _belief(logs[1])
         )
 
-    logs = _descend(misfit, np.full(2, np.log(start)), (FIRST_STEP, SECOND_STEP), floor(chain))
+    logs = _descend(misfit, np.full(2, np.log(start)), WIDTHS, floor(chain))
     return float(np.exp(logs[0])), float(np.exp(logs[1]))
 
 

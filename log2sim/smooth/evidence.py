@@ -8,9 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.smooth.chain import ACCELERATION_PRIOR_MPS2, VELOCITY_PRIOR_MPS, Chain, Observations, add_at, nearest_index
+from log2sim.smooth.chain import (
+    ACCELERATION_PRIOR_MPS2,
+    VELOCITY_PRIOR_MPS,
+    Chain,
+    Observations,
+    nearest_index,
+    spread,
+)
 from log2sim.smooth.quadratic import Quadratic
 
+# Information about position, velocity and acceleration of the first knot.
+BELIEFS = np.array([0.0, VELOCITY_PRIOR_MPS**-2, ACCELERATION_PRIOR_MPS2**-2])
 # Share of positions that are wrong and how much wider they scatter than the others.
 WRONG_SHARE, WRONG_WIDTH = 0.02, 10.0
 # While the trajectory is not yet known, an observation at this many sigmas counts a quarter.
@@ -19,16 +28,22 @@ TOLERANCE_SIGMAS = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """Observations and how each is read off a chain: knot `place` (n,), and `reading` (n, 3) of its three unknowns."""
+    """Observations and how each is read off a chain: knot `place` (n,), and `reading` (n, 3) of its three unknowns.
+
+    `first` are the rows with which another knot begins. All forms contain vague beliefs about the first knot, which make a
+    single observation, or a pair of them, have an answer.
+    """
 
     observed: Observations
     place: NDArray[np.intp]
     reading: Array
+    first: NDArray[np.intp]
 
     @classmethod
     def of(cls, observed: Observations, chain: Chain) -> Readings:
         place = nearest_index(chain.knots_s, observed.t_s)
-        return cls(observed, place, taylor(observed.t_s - chain.knots_s[place]))
+        first = np.concatenate([[0], np.flatnonzero(place[1:] > place[:-1]) + 1])
+        return cls(observed, place, taylor(observed.t_s - chain.knots_s[place]), first)
 
     def residual(self, state: Array) -> Array:
         """Observed less read (n, 2)."""
@@ -38,21 +53,32 @@ class Readings:
         """Squared residuals under scalar information (n,), over the three unknowns that both axes share."""
         residual = self.residual(state)
         rows = self.reading * information[:, None]
-        diagonal, pull = np.zeros((len(state), 3, 3)), np.zeros_like(state)
-        add_at(diagonal, self.place, rows[:, :, None] * self.reading[:, None, :])
-        add_at(pull, self.place, rows[:, :, None] * residual[:, None, :])
-        return Quadratic.of(diagonal, None, pull, float(information @ (residual**2).sum(axis=1)))
+        diagonal = self._gather(rows[:, :, None] * self.reading[:, None, :], len(state))
+        pull = self._gather(rows[:, :, None] * residual[:, None, :], len(state))
+        diagonal[0] += np.diag(BELIEFS)
+        pull[0] -= BELIEFS[:, None] * state[0]
+        value = float(information @ (residual**2).sum(axis=1) + BELIEFS @ (state[0] ** 2).sum(axis=1))
+        return Quadratic.of(diagonal, None, pull, value)
 
     def together(self, state: Array, information: Array) -> Quadratic:
         """Squared residuals under information (n, 2, 2), over all six unknowns of a knot."""
         residual = self.residual(state)
         weighted = np.einsum("nab,nb->na", information, residual)
         h = self.reading
-        blocks = h[:, :, None, None, None] * information[:, None, :, None, :] * h[:, None, None, :, None]
-        diagonal, pull = np.zeros((len(state), 6, 6)), np.zeros((len(state), 6, 1))
-        add_at(diagonal, self.place, blocks.reshape(-1, 6, 6))
-        add_at(pull, self.place, (h[:, :, None] * weighted[:, None, :]).reshape(-1, 6, 1))
-        return Quadratic.of(diagonal, None, pull, float(np.vdot(weighted, residual)))
+        diagonal = self._gather(spread(h[:, :, None] * h[:, None, :], information), len(state))
+        pull = self._gather((h[:, :, None] * weighted[:, None, :]).reshape(-1, 6, 1), len(state))
+        believed = np.repeat(BELIEFS, 2)
+        diagonal[0] += np.diag(believed)
+        pull[0, :, 0] -= believed * state[0].ravel()
+        value = float(np.vdot(weighted, residual) + believed @ state[0].ravel() ** 2)
+        return Quadratic.of(diagonal, None, pull, value)
+
+    def _gather(self, values: Array, count: int) -> Array:
+        """Sums (K, ...) of the values (n, ...) read off each knot."""
+        gathered = np.zeros((count, *values.shape[1:]))
+        unique = len(self.first) == len(self.place)
+        gathered[self.place[self.first]] = values if unique else np.add.reduceat(values, self.first, axis=0)
+        return gathered
 
 
 def taylor(offset_s: Array) -> Array:
@@ -73,18 +99,6 @@ def carry(chain: Chain, state: Array, asked_s: Array) -> Array:
     """States (T, 3, 2) at asked times, each from the nearest knot's (K, 3, 2)."""
     place = nearest_index(chain.knots_s, asked_s)
     return carrying(asked_s - chain.knots_s[place]) @ state[place]
-
-
-def beliefs(state: Array, columns: int) -> Quadratic:
-    """Vague beliefs about the first knot, over 3 unknowns with 2 columns or 6 with 1."""
-    count = len(state)
-    information = np.array([0.0, VELOCITY_PRIOR_MPS**-2, ACCELERATION_PRIOR_MPS2**-2])
-    size = 6 // columns
-    diagonal, pull = np.zeros((count, size, size)), np.zeros((count, size, columns))
-    np.fill_diagonal(diagonal[0], information if columns == 2 else np.repeat(information, 2))
-    weighted = information[:, None] * state[0]
-    pull[0] = -weighted.reshape(size, columns)
-    return Quadratic.of(diagonal, None, pull, float(np.vdot(weighted, state[0])))
 
 
 def hold(state: Array, velocity_information: Array, acceleration_information: Array) -> Quadratic:

@@ -10,10 +10,10 @@ import numpy as np
 from log2sim.geometry import Array
 from log2sim.smooth.chain import Chain, Observations, nearest_index
 from log2sim.smooth.density import floor, separate_densities, shared_density
-from log2sim.smooth.evidence import Readings, beliefs, carry, carrying, decided, hold, tolerant
+from log2sim.smooth.evidence import Readings, carry, carrying, decided, hold, tolerant
 from log2sim.smooth.quadratic import Minimum, Quadratic, minimize, total
 from log2sim.smooth.standing import standing_tolerance
-from log2sim.smooth.yaw import course_is_known, yaw_of_motion
+from log2sim.smooth.yaw import course_is_known, unwrapped, yaw_of_motion
 
 __all__ = ["Manner", "Observations", "Smoothed", "smooth_interval"]
 
@@ -23,7 +23,8 @@ TOLERANT_ROUNDS, DECIDING_ROUNDS = 4, 4
 SETTLED = 0.05
 # Noise and maneuvers are looked for on knots this far apart: in between the acceleration is taken as constant, which at the
 # jerk of an emergency brake costs a millimeter.
-SEARCH_STEP_S = 0.19
+SEARCH_STEP_S = 0.29
+LEAST_KNOTS = 4
 # No outlier hides where every residual is within this of the first, least-squares solution.
 CLEAN_SIGMAS = 3.5
 # What stands neither moves nor gathers speed beyond these; what rolls slips sideways by less than this share of its speed,
@@ -44,6 +45,19 @@ class Manner:
     heading_rad: float | None = None
     scaled: bool = False
     wary: bool = False
+
+    @property
+    def steers(self) -> bool:
+        """Whether how it maneuvers along and across its way is to be estimated separately."""
+        return self.jerk_density is None and not self.sideways
+
+
+@dataclass(frozen=True, eq=False)
+class _Rough:
+    state: Array
+    weight: Array
+    density: float
+    variance_factor: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +94,7 @@ class _Problem:
 
     @cached_property
     def evidence(self) -> Quadratic:
-        observed = self.readings.together(self.state, self.information * self.weight[:, None, None])
-        return total([(1.0, observed), (1.0, beliefs(self.state, 1))])
+        return self.readings.together(self.state, self.information * self.weight[:, None, None])
 
 
 def smooth_interval(observed: Observations, asked_s: Array, manner: Manner) -> Smoothed:
@@ -93,7 +106,7 @@ def smooth_interval(observed: Observations, asked_s: Array, manner: Manner) -> S
     constant-acceleration model, found in one go; the densities maximize the marginal likelihood. Cost O(n).
     """
     chain = Chain.over(np.concatenate([observed.t_s, asked_s]))
-    problem, least, state = _settle(_pose(chain, Readings.of(observed, chain), manner), DECIDING_ROUNDS, manner)
+    problem, least, state = _settle(_pose(chain, Readings.of(observed, chain), manner), manner)
     covariance = least.covariance()
     held = _held(problem, state, covariance, manner)
     if held is not None:
@@ -111,41 +124,45 @@ def _pose(chain: Chain, readings: Readings, manner: Manner) -> _Problem:
     observed = readings.observed
     few = Chain.over(observed.t_s, SEARCH_STEP_S)
     read = Readings.of(observed, few)
-    variance = np.trace(observed.r, axis1=1, axis2=2) / 2
-    density = max(PERMISSIVE_JERK_DENSITY if manner.jerk_density is None else manner.jerk_density, floor(few))
-    state, weight = _without_outliers(few, read, variance, density, wary=manner.wary)
-    factor = 1.0
-    if manner.jerk_density is None or manner.scaled:
-        fixed = total([(1.0, read.apart(state, weight / variance)), (1.0, beliefs(state, 2))])
-        density, factor = shared_density(few, state, fixed, float(weight.sum()), scaled=manner.scaled)
-        state = state + minimize(total([(1.0, fixed), (factor / density, few.jerk(state))])).step
-    yaw = np.unwrap(yaw_of_motion(state[:, 0], state[:, 1], hint_rad=manner.heading_rad))
-    search = _about(few, read, state, weight, np.linalg.inv(observed.r * factor), yaw)
-    if manner.jerk_density is None and not manner.sideways and len(few) >= 4:
-        search = replace(search, density=separate_densities(few, search.jerk, search.evidence, density))
-        search, _, state = _settle(search, 1, manner)
-    else:
-        search = replace(search, density=(density, density))
+    rough = _rough(few, read, manner)
+    information: Array = np.linalg.inv(observed.r * rough.variance_factor)
+    yaw = unwrapped(yaw_of_motion(rough.state[:, 0], rough.state[:, 1], hint_rad=manner.heading_rad))
+    density = (rough.density, rough.density)
+    if manner.steers and len(few) >= LEAST_KNOTS:
+        search = _about(few, read, rough.state, rough.weight, information, yaw)
+        density = separate_densities(few, search.jerk, search.evidence, rough.density)
+    course: Array = np.interp(chain.knots_s, few.knots_s, yaw)
+    problem = _about(chain, readings, carry(few, rough.state, chain.knots_s), rough.weight, information, course)
     lowest = floor(chain)
-    yaw = np.interp(chain.knots_s, few.knots_s, yaw)
-    return replace(
-        _about(chain, readings, carry(few, state, chain.knots_s), search.weight, search.information, yaw),
-        density=(max(search.density[0], lowest), max(search.density[1], lowest)),
+    return replace(problem, density=(max(density[0], lowest), max(density[1], lowest)))
+
+
+def _rough(chain: Chain, readings: Readings, manner: Manner) -> _Rough:
+    """Outliers, noise and one density for both axes, taken apart, which makes the search cheap."""
+    variance = np.trace(readings.observed.r, axis1=1, axis2=2) / 2
+    density = max(PERMISSIVE_JERK_DENSITY if manner.jerk_density is None else manner.jerk_density, floor(chain))
+    state, weight = _without_outliers(chain, readings, variance, density, wary=manner.wary)
+    if manner.jerk_density is not None and not manner.scaled:
+        return _Rough(state, weight, density, 1.0)
+    fixed = readings.apart(state, weight / variance)
+    density, factor = shared_density(
+        chain, state, fixed, float(weight.sum()), scaled=manner.scaled, rounds=1 if manner.steers else 2
     )
+    density = density if manner.jerk_density is None else manner.jerk_density
+    step = minimize(total([(1.0, fixed), (factor / density, chain.jerk(state))])).step
+    return _Rough(state + step, weight, density, factor)
 
 
-def _about(
-    chain: Chain, readings: Readings, state: Array, weight: Array, information: Array, yaw: Array
-) -> _Problem:
-    """The problem as forms about a state (K, 3, 2) with headings (K,), by which along and across are told apart."""
+def _about(chain: Chain, readings: Readings, state: Array, weight: Array, information: Array, yaw: Array) -> _Problem:
+    """The problem as forms about a state (K, 3, 2) with unwrapped headings (K,) that tell along from across."""
     course = (yaw[1:] + yaw[:-1]) / 2
     along = np.stack([np.cos(course), np.sin(course)], axis=-1)
     return _Problem(chain, readings, state, weight, information, chain.jerk_by_direction(state, along), (1.0, 1.0))
 
 
-def _settle(problem: _Problem, rounds: int, manner: Manner) -> tuple[_Problem, Minimum, Array]:
+def _settle(problem: _Problem, manner: Manner) -> tuple[_Problem, Minimum, Array]:
     """Settle which observations are wrong: the problem with their weights, its minimum and the state (K, 3, 2) there."""
-    for _ in range(rounds):
+    for _ in range(DECIDING_ROUNDS):
         least, state = problem.solve()
         residual = problem.readings.residual(state)
         squared = np.einsum("na,nab,nb->n", residual, problem.information, residual)
@@ -161,11 +178,11 @@ def _without_outliers(
 ) -> tuple[Array, Array]:
     """State (K, 3, 2) and weights (n,) with both axes alike and a given density."""
     start = np.zeros((len(chain), 3, 2))
-    jerk, prior = chain.jerk(start), beliefs(start, 2)
+    jerk = chain.jerk(start)
     weight = np.ones(len(variance))
     for k in range(TOLERANT_ROUNDS + 1):
         evidence = readings.apart(start, weight / variance)
-        state = minimize(total([(1.0, evidence), (1.0, prior), (1.0 / density, jerk)])).step
+        state = minimize(total([(1.0, evidence), (1.0 / density, jerk)])).step
         squared = (readings.residual(state) ** 2).sum(axis=1) / variance
         if not wary and squared.max() < CLEAN_SIGMAS**2:
             return state, np.ones(len(variance))

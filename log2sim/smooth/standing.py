@@ -17,10 +17,10 @@ SCATTER_SIGMAS = 3.0
 LEAST_WEIGHT = 0.25
 # What stands moves by less than the first; what comes to a halt does so within the time that follows.
 STANDING_MPS = 0.005
-EDGE_MPS, EDGE_S = 0.5, 0.25
+EDGE_MPS, EDGE_S = 1.0, 0.4
 END_SIGMAS, LEAST_STEP_M = 2.0, 0.03
 # Ends that explain this share of their scatter by going straight for so long are moving.
-STEADY_SHARE, LEAST_WAY_M = 0.85, 0.1
+STEADY_SHARE, LEAST_WAY_M, LEAST_STEADY = 0.85, 0.1, 4
 
 
 def standing_tolerance(knots_s: Array, readings: Readings, weight: Array, state: Array, covariance: Array) -> Array:
@@ -86,7 +86,7 @@ def _strangeness(t: Array, xy: Array, information: Array) -> tuple[float, float]
     )
     if whole >= 1.0:
         return whole, whole
-    quarter = max(len(t) // 4, LEAST_READINGS // 2)
+    quarter = max(len(t) // 4, LEAST_READINGS // 3)
     parts = slice(quarter), slice(quarter, -quarter), slice(-quarter, None)
     sums = [float(information[part].sum()) for part in parts]
     means = [information[part] @ xy[part] / s for part, s in zip(parts, sums)]
@@ -106,6 +106,8 @@ def _steady_way(t: Array, xy: Array) -> float:
 
     What drives off is seen by this even where the positions are far better than said.
     """
+    if len(t) < LEAST_STEADY:
+        return 0.0
     time, from_mean = t - t.mean(), xy - xy.mean(axis=0)
     slope = time @ from_mean / (time @ time)
     explained = float((slope @ slope) * (time @ time))

@@ -41,16 +41,21 @@ def yaw_of_motion(
     moving = speed > (WALKING_MPS if sideways else MOVING_MPS) if known is None else known
     if not moving.any():
         way = xy_m[-1] - xy_m[0]
-        course = float(np.arctan2(way[1], way[0])) if np.hypot(*way) > LEAST_WAY_M else 0.0
-        return np.full(len(xy_m), course if hint_rad is None else hint_rad)
+        overall = float(np.arctan2(way[1], way[0])) if np.hypot(*way) > LEAST_WAY_M else 0.0
+        return np.full(len(xy_m), overall if hint_rad is None else hint_rad)
     course = np.arctan2(velocity_mps[:, 1], velocity_mps[:, 0])
     # Noise of a standing object adds up as distance; only what is covered at some speed counts.
     creeping = speed > 0.2
     step = np.hypot(*np.diff(xy_m, axis=0).T) * (creeping[1:] | creeping[:-1])
     progress = np.concatenate([[0.0], np.cumsum(step)])
     # Who walks turns round; only what steers goes backward.
-    angles = np.unwrap(course[moving] if sideways else _without_reversals(course[moving], hint_rad))
+    angles = unwrapped(course[moving] if sideways else _without_reversals(course[moving], hint_rad))
     return wrap_angle(np.interp(progress, progress[moving], angles))
+
+
+def unwrapped(angles: Array) -> Array:
+    """Angles (n,) without leaps between neighbors."""
+    return np.concatenate([angles[:1], angles[0] + np.cumsum(wrap_angle(np.diff(angles)))])
 
 
 def _without_reversals(course: Array, hint_rad: float | None) -> Array:
