@@ -23,7 +23,7 @@ TOLERANT_ROUNDS, DECIDING_ROUNDS = 4, 4
 SETTLED = 0.05
 # Noise and maneuvers are looked for on knots this far apart: in between the acceleration is taken as constant, which at the
 # jerk of an emergency brake costs a millimeter.
-SEARCH_STEP_S = 0.29
+SEARCH_STEP_S = 0.39
 LEAST_KNOTS = 4
 # No outlier hides where every residual is within this of the first, least-squares solution.
 CLEAN_SIGMAS = 3.5
@@ -50,6 +50,10 @@ class Manner:
     def steers(self) -> bool:
         """Whether how it maneuvers along and across its way is to be estimated separately."""
         return self.jerk_density is None and not self.sideways
+
+    def weights(self, squared: Array) -> Array:
+        """How much observations (n,) count, from their squared distances in sigmas."""
+        return tolerant(squared) if self.wary else decided(squared)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +129,7 @@ def _pose(chain: Chain, readings: Readings, manner: Manner) -> _Problem:
     few = Chain.over(observed.t_s, SEARCH_STEP_S)
     read = Readings.of(observed, few)
     rough = _rough(few, read, manner)
-    information: Array = np.linalg.inv(observed.r * rough.variance_factor)
+    information = np.asarray(np.linalg.inv(observed.r * rough.variance_factor), dtype=np.float64)
     yaw = unwrapped(yaw_of_motion(rough.state[:, 0], rough.state[:, 1], hint_rad=manner.heading_rad))
     density = (rough.density, rough.density)
     if manner.steers and len(few) >= LEAST_KNOTS:
@@ -141,7 +145,7 @@ def _rough(chain: Chain, readings: Readings, manner: Manner) -> _Rough:
     """Outliers, noise and one density for both axes, taken apart, which makes the search cheap."""
     variance = np.trace(readings.observed.r, axis1=1, axis2=2) / 2
     density = max(PERMISSIVE_JERK_DENSITY if manner.jerk_density is None else manner.jerk_density, floor(chain))
-    state, weight = _without_outliers(chain, readings, variance, density, wary=manner.wary)
+    state, weight = _without_outliers(chain, readings, variance, density, manner)
     if manner.jerk_density is not None and not manner.scaled:
         return _Rough(state, weight, density, 1.0)
     fixed = readings.apart(state, weight / variance)
@@ -149,8 +153,9 @@ def _rough(chain: Chain, readings: Readings, manner: Manner) -> _Rough:
         chain, state, fixed, float(weight.sum()), scaled=manner.scaled, rounds=1 if manner.steers else 2
     )
     density = density if manner.jerk_density is None else manner.jerk_density
-    step = minimize(total([(1.0, fixed), (factor / density, chain.jerk(state))])).step
-    return _Rough(state + step, weight, density, factor)
+    state = state + minimize(total([(1.0, fixed), (factor / density, chain.jerk(state))])).step
+    squared = (readings.residual(state) ** 2).sum(axis=1) / (variance * factor)
+    return _Rough(state, manner.weights(squared), density, factor)
 
 
 def _about(chain: Chain, readings: Readings, state: Array, weight: Array, information: Array, yaw: Array) -> _Problem:
@@ -166,7 +171,7 @@ def _settle(problem: _Problem, manner: Manner) -> tuple[_Problem, Minimum, Array
         least, state = problem.solve()
         residual = problem.readings.residual(state)
         squared = np.einsum("na,nab,nb->n", residual, problem.information, residual)
-        weight = tolerant(squared) if manner.wary else decided(squared)
+        weight = manner.weights(squared)
         if np.abs(weight - problem.weight).max() < SETTLED:
             return problem, least, state
         problem = replace(problem, weight=weight)
@@ -174,7 +179,7 @@ def _settle(problem: _Problem, manner: Manner) -> tuple[_Problem, Minimum, Array
 
 
 def _without_outliers(
-    chain: Chain, readings: Readings, variance: Array, density: float, *, wary: bool
+    chain: Chain, readings: Readings, variance: Array, density: float, manner: Manner
 ) -> tuple[Array, Array]:
     """State (K, 3, 2) and weights (n,) with both axes alike and a given density."""
     start = np.zeros((len(chain), 3, 2))
@@ -184,10 +189,10 @@ def _without_outliers(
         evidence = readings.apart(start, weight / variance)
         state = minimize(total([(1.0, evidence), (1.0 / density, jerk)])).step
         squared = (readings.residual(state) ** 2).sum(axis=1) / variance
-        if not wary and squared.max() < CLEAN_SIGMAS**2:
-            return state, np.ones(len(variance))
-        weight = tolerant(squared) if wary or k < TOLERANT_ROUNDS else decided(squared)
-    return state, weight
+        if squared.max() < CLEAN_SIGMAS**2:
+            break
+        weight = tolerant(squared) if k < TOLERANT_ROUNDS else manner.weights(squared)
+    return state, manner.weights(squared)
 
 
 def _held(problem: _Problem, state: Array, covariance: Array, manner: Manner) -> Quadratic | None:

@@ -10,8 +10,9 @@ from log2sim.geometry import Array, wrap_angle
 # Below this the direction of a smoothed velocity is noise.
 MOVING_MPS = 1.0
 WALKING_MPS = 0.4
-# A course counts where its speed is this many of its own standard deviations: it is known to some ten degrees then.
-COURSE_SIGMAS = 5.0
+# A course counts where its speed is this many of its own standard deviations: it is known to some ten degrees then. Who
+# may turn on the spot has no heading to hold on to, so less will do.
+COURSE_SIGMAS = {False: 5.0, True: 2.5}
 SLOWEST_COURSE_MPS = {False: 0.5, True: 0.3}
 # Without a course anywhere, the way from end to end tells one if it is longer than this.
 LEAST_WAY_M = 1.0
@@ -21,7 +22,7 @@ def course_is_known(velocity_mps: Array, covariance: Array, *, sideways: bool = 
     """Where (T,) the direction of velocities (T, 2) with covariances (T, 2, 2) tells a heading."""
     speed = np.hypot(*velocity_mps.T)
     sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
-    return np.asarray(speed > np.maximum(COURSE_SIGMAS * sigma, SLOWEST_COURSE_MPS[sideways]))
+    return np.asarray(speed > np.maximum(COURSE_SIGMAS[sideways] * sigma, SLOWEST_COURSE_MPS[sideways]))
 
 
 def yaw_of_motion(
