@@ -36,15 +36,15 @@ def clusters_of(xy: NDArray[np.floating[Any]], cell_m: float) -> NDArray[np.intp
 
 def _cluster(xy: NDArray[np.floating[Any]], cell_m: float) -> tuple[NDArray[np.intp], Array, NDArray[np.intp]]:
     """Labels (N,) of the clusters, and the grid of labels (one cell wider on each side, -1 where empty) with its corner."""
-    from scipy.ndimage import label
+    import cv2
 
     x, y = xy.T
     corner = np.array([x.min(), y.min()], dtype=xy.dtype) - cell_m
     i, j = ((values - low) / cell_m for values, low in zip((x, y), corner))
     i, j = i.astype(np.intp), j.astype(np.intp)
-    grid = np.zeros((i.max() + 2, j.max() + 2), dtype=bool)
-    grid[i, j] = True
-    labels, _ = label(grid, structure=np.ones((3, 3), dtype=int))
+    grid = np.zeros((i.max() + 2, j.max() + 2), dtype=np.uint8)
+    grid[i, j] = 1
+    _, labels = cv2.connectedComponents(grid, connectivity=8)
     labels = np.asarray(labels, dtype=np.intp) - 1
     return labels[i, j], corner, labels
 
