@@ -23,6 +23,7 @@ ROUNDED = 0.08
 LEAST_ASPECT = 0.5
 # A side longer than this share of the typical width is no front or rear.
 LONGER_THAN_WIDE = 1.2
+EITHER_WAY = 0.25
 # A size that was completed may be wrong by all of what was added: a uniform spread. Without any real end it is worse.
 SLACK_SIGMA = 12.0**-0.5
 
@@ -221,6 +222,9 @@ def box_of_cluster(
     size = np.maximum([*(high - low), top], [*typical[:2], top])
     center_local, sigma = complete_box(low, high, size[:2], rotate(sensor[:2], -yaw_rad), ends_seen)
     center = np.append(rotate(center_local, yaw_rad), ground_z + size[2] / 2)
+    if (high - low).max() <= LONGER_THAN_WIDE * typical[1] and not all(ends_seen):
+        # So short a side may be a front or what shows of a flank; the two put the center in different places.
+        sigma = np.hypot(sigma, EITHER_WAY * (size[0] - size[1]))
     return center, size, float(yaw_rad), oriented_covariance(sigma, yaw_rad)
 
 
