@@ -15,6 +15,7 @@ SEARCH_STEP_RAD = np.deg2rad(2.0)
 NEAREST_EDGE_M = 0.03
 MOST_POINTS = 256
 SENSOR_SIGMA_M = 0.08
+SIZE_SPREAD = 0.05
 # What an end of a box is, see `ends_shown`.
 SEEN, FACING = 1, 2
 # Corners are rounded: the outermost point seen from the side lies inside by about this share of the width.
@@ -190,8 +191,10 @@ def place_box(low: Array, high: Array, size_m: Array, shown: NDArray[np.int64]) 
     low, high = to_corners(low, high, shown, size_m[1])
     slack = size_m - (high - low)
     reach = np.sign(shown[:, 1] - shown[:, 0])
-    doubt = np.where(shown.any(axis=1), SLACK_SIGMA, 1.0)
-    return (low + high) / 2 - reach * slack / 2, np.hypot(SENSOR_SIGMA_M, doubt * np.maximum(slack, 0.0))
+    doubt = np.where(shown.any(axis=1), SLACK_SIGMA, 1.0) * np.maximum(slack, 0.0)
+    # Objects of one category differ in size, so what is believed of an end that was not seen is never exact.
+    spread = np.where(shown.all(axis=1), 0.0, SIZE_SPREAD * size_m)
+    return (low + high) / 2 - reach * slack / 2, np.sqrt(SENSOR_SIGMA_M**2 + doubt**2 + spread**2)
 
 
 def to_corners(low: Array, high: Array, shown: NDArray[np.int64], width_m: float) -> tuple[Array, Array]:
