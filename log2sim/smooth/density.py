@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,9 +11,21 @@ from log2sim.geometry import Array
 from log2sim.smooth.chain import Chain
 from log2sim.smooth.quadratic import Quadratic, minimize, total
 
-# What road users do, m2/s5: a belief held about the logarithm, so weakly that some seconds of data outweigh it.
-TYPICAL_JERK_DENSITY = 1.5
-LOG_SPREAD = 2.5
+
+@dataclass(frozen=True)
+class Belief:
+    """What is believed about a jerk density before the data are seen: median in m2/s5 and spread of its logarithm."""
+
+    median: float
+    log_spread: float
+
+    def __call__(self, log_density: float) -> float:
+        return ((log_density - float(np.log(self.median))) / self.log_spread) ** 2
+
+
+# So weak that some seconds of data outweigh it; and a firm one for errors that repeat from tick to tick, which look like
+# maneuvers.
+OPEN, FIRM = Belief(1.5, 2.5), Belief(3.0, 0.7)
 # Information that ties two knots beyond this leaves no digits for the data.
 MAX_INFORMATION = 1e13
 LIMITS = (1e-4, 1e4)
@@ -21,7 +34,7 @@ WIDTHS = (2.0, 0.8)
 
 
 def shared_density(
-    chain: Chain, state: Array, fixed: Quadratic, weight: float, *, scaled: bool, rounds: int = 2
+    chain: Chain, state: Array, fixed: Quadratic, weight: float, *, scaled: bool, belief: Belief = OPEN, rounds: int = 2
 ) -> tuple[float, float]:
     """Jerk density in m2/s5 of both axes and the factor on the noise's variance, by marginal likelihood.
 
@@ -45,10 +58,10 @@ def shared_density(
         u = float(log_density[0])
         least = minimize(total([(1.0, fixed), (np.exp(-u), jerk)]))
         noise = freedom * np.log(least.value) if scaled else least.value
-        return float(noise + 2.0 * least.log_determinant + 6.0 * steps * u + _belief(u))
+        return float(noise + 2.0 * least.log_determinant + 6.0 * steps * u + belief(u))
 
     lowest = floor(chain)
-    start = np.array([np.log(max(TYPICAL_JERK_DENSITY, lowest))])
+    start = np.array([np.log(max(belief.median, lowest))])
     u = _descend(misfit, start, WIDTHS[:rounds], lowest)
     ratio = float(np.exp(u[0]))
     if not scaled:
@@ -58,7 +71,7 @@ def shared_density(
 
 
 def separate_densities(
-    chain: Chain, parts: tuple[Quadratic, Quadratic], fixed: Quadratic, start: float
+    chain: Chain, parts: tuple[Quadratic, Quadratic], fixed: Quadratic, start: float, belief: Belief = OPEN
 ) -> tuple[float, float]:
     """Jerk densities along and across the way, by marginal likelihood.
 
@@ -69,9 +82,7 @@ def separate_densities(
 
     def misfit(logs: Array) -> float:
         least = minimize(total([(1.0, fixed), (np.exp(-logs[0]), parts[0]), (np.exp(-logs[1]), parts[1])]))
-        return float(
-            least.value + least.log_determinant + 3.0 * steps * logs.sum() + _belief(logs[0]) + _belief(logs[1])
-        )
+        return float(least.value + least.log_determinant + 3.0 * steps * logs.sum() + belief(logs[0]) + belief(logs[1]))
 
     logs = _descend(misfit, np.full(2, np.log(start)), WIDTHS, floor(chain))
     return float(np.exp(logs[0])), float(np.exp(logs[1]))
@@ -81,10 +92,6 @@ def floor(chain: Chain) -> float:
     """Least density in m2/s5 with which the knots' equations can be solved."""
     stiffest = float(chain.inverse[:, 0, 0].max()) if len(chain) > 1 else 0.0
     return max(stiffest / MAX_INFORMATION, LIMITS[0])
-
-
-def _belief(log_density: float) -> float:
-    return ((log_density - np.log(TYPICAL_JERK_DENSITY)) / LOG_SPREAD) ** 2
 
 
 def _descend(misfit: Callable[[Array], float], start: Array, widths: tuple[float, ...], lowest: float) -> Array:

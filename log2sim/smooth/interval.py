@@ -9,7 +9,7 @@ import numpy as np
 
 from log2sim.geometry import Array
 from log2sim.smooth.chain import Chain, Observations, nearest_index
-from log2sim.smooth.density import floor, separate_densities, shared_density
+from log2sim.smooth.density import FIRM, OPEN, Belief, floor, separate_densities, shared_density
 from log2sim.smooth.evidence import Readings, carry, carrying, decided, hold, tolerant
 from log2sim.smooth.quadratic import Minimum, Quadratic, minimize, total
 from log2sim.smooth.standing import standing_tolerance
@@ -37,7 +37,7 @@ SLIP_MPS, SLIP_SHARE = 0.03, 0.15
 class Manner:
     """How an object moves: `jerk_density` in m2/s5 or None to estimate it, `sideways` True where it may go any way,
     `heading_rad` where its motion does not tell, `scaled` True where the noise is known up to a factor only, `wary` True
-    where observations err by some sigmas more often than Gaussian ones.
+    where observations err by some sigmas more often than Gaussian ones, and by the same amount again and again.
     """
 
     jerk_density: float | None = None
@@ -50,6 +50,11 @@ class Manner:
     def steers(self) -> bool:
         """Whether how it maneuvers along and across its way is to be estimated separately."""
         return self.jerk_density is None and not self.sideways
+
+    @property
+    def belief(self) -> Belief:
+        """What is believed about its jerk."""
+        return FIRM if self.wary else OPEN
 
     def weights(self, squared: Array) -> Array:
         """How much observations (n,) count, from their squared distances in sigmas."""
@@ -134,7 +139,7 @@ def _pose(chain: Chain, readings: Readings, manner: Manner) -> _Problem:
     density = (rough.density, rough.density)
     if manner.steers and len(few) >= LEAST_KNOTS:
         search = _about(few, read, rough.state, rough.weight, information, yaw)
-        density = separate_densities(few, search.jerk, search.evidence, rough.density)
+        density = separate_densities(few, search.jerk, search.evidence, rough.density, manner.belief)
     course: Array = np.interp(chain.knots_s, few.knots_s, yaw)
     problem = _about(chain, readings, carry(few, rough.state, chain.knots_s), rough.weight, information, course)
     lowest = floor(chain)
@@ -150,7 +155,13 @@ def _rough(chain: Chain, readings: Readings, manner: Manner) -> _Rough:
         return _Rough(state, weight, density, 1.0)
     fixed = readings.apart(state, weight / variance)
     density, factor = shared_density(
-        chain, state, fixed, float(weight.sum()), scaled=manner.scaled, rounds=1 if manner.steers else 2
+        chain,
+        state,
+        fixed,
+        float(weight.sum()),
+        scaled=manner.scaled,
+        belief=manner.belief,
+        rounds=1 if manner.steers else 2,
     )
     density = density if manner.jerk_density is None else manner.jerk_density
     state = state + minimize(total([(1.0, fixed), (factor / density, chain.jerk(state))])).step

@@ -18,7 +18,7 @@ LEAST_WEIGHT = 0.25
 # What stands moves by less than the first; what comes to a halt does so within the time that follows.
 STANDING_MPS = 0.005
 EDGE_MPS, EDGE_S = 1.0, 0.4
-END_SIGMAS, LEAST_STEP_M = 2.0, 0.03
+END_SIGMAS, LEAST_STEP_M = 2.5, 0.03
 # Ends that explain this share of their scatter by going straight for so long are moving.
 STEADY_SHARE, LEAST_WAY_M, LEAST_STEADY = 0.85, 0.1, 4
 
