@@ -123,7 +123,7 @@ def smooth_interval(observed: Observations, asked_s: Array, manner: Manner) -> S
         covariance = least.covariance()
     distance = np.hypot(*problem.readings.residual(state).T)
     state, covariance = _read_off(chain, asked_s, state, covariance)
-    known = course_is_known(state[:, 1], covariance[:, 2:4, 2:4], sideways=manner.sideways)
+    known = course_is_known(state[:, 1], covariance[:, 2:4, 2:4], sideways=manner.sideways, wary=manner.wary)
     yaw = yaw_of_motion(state[:, 0], state[:, 1], hint_rad=manner.heading_rad, sideways=manner.sideways, known=known)
     return Smoothed(state, covariance, yaw, distance, problem.weight, problem.density)
 
@@ -211,7 +211,7 @@ def _held(problem: _Problem, state: Array, covariance: Array, manner: Manner) ->
     velocity = state[:, 1]
     tolerance = standing_tolerance(problem.chain.knots_s, problem.readings, problem.weight, state, covariance)
     still = np.isfinite(tolerance)
-    known = course_is_known(velocity, covariance[:, 2:4, 2:4], sideways=manner.sideways) & ~still
+    known = course_is_known(velocity, covariance[:, 2:4, 2:4], sideways=manner.sideways, wary=manner.wary) & ~still
     slow = ~known & ~still
     if manner.sideways or not (known.any() or manner.heading_rad is not None):
         slow[:] = False

@@ -18,9 +18,16 @@ SLOWEST_COURSE_MPS = {False: 0.5, True: 0.3}
 LEAST_WAY_M = 1.0
 
 
-def course_is_known(velocity_mps: Array, covariance: Array, *, sideways: bool = False) -> NDArray[np.bool_]:
-    """Where (T,) the direction of velocities (T, 2) with covariances (T, 2, 2) tells a heading."""
+def course_is_known(
+    velocity_mps: Array, covariance: Array, *, sideways: bool = False, wary: bool = False
+) -> NDArray[np.bool_]:
+    """Where (T,) the direction of velocities (T, 2) with covariances (T, 2, 2) tells a heading.
+
+    `wary` where the covariances say too little of what repeats from tick to tick: then by speed alone.
+    """
     speed = np.hypot(*velocity_mps.T)
+    if wary:
+        return np.asarray(speed > (WALKING_MPS if sideways else MOVING_MPS))
     sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
     return np.asarray(speed > np.maximum(COURSE_SIGMAS[sideways] * sigma, SLOWEST_COURSE_MPS[sideways]))
 
