@@ -18,7 +18,7 @@ from log2sim.shape import Shape, heading_of_standing, is_standing, shape_moving,
 from log2sim.smooth import SmoothedTrack, signed_speed, smooth_track
 from log2sim.types import GROUP_OF, TYPICAL_SIZE_M, Track
 
-# How fast the acceleration of a group changes: spectral density of the jerk, m2/s5.
+# How fast the acceleration changes of those whose own track is not asked: spectral density of the jerk, m2/s5.
 JERK_DENSITY = {"pedestrian": 2.0}
 CENTER_SIGMA_M = {"vehicle": 0.12, "two_wheeler": 0.1, "pedestrian": 0.08, "other": 0.15}
 # Rear axle to box center, as a share of the length: BMW 320i of CommonRoad's vehicle models, b - overhang, rounded.
