@@ -18,8 +18,8 @@ from log2sim.shape import Shape, heading_of_standing, is_standing, shape_moving,
 from log2sim.smooth import SmoothedTrack, signed_speed, smooth_track
 from log2sim.types import GROUP_OF, TYPICAL_SIZE_M, Track
 
-# How fast the acceleration of a group changes: spectral density of the jerk, m2/s5.
-JERK_DENSITY = {"vehicle": 4.0, "two_wheeler": 4.0, "pedestrian": 2.0, "other": 4.0}
+# How fast the acceleration changes of those whose own track is not asked: spectral density of the jerk, m2/s5.
+JERK_DENSITY = {"pedestrian": 2.0}
 CENTER_SIGMA_M = {"vehicle": 0.12, "two_wheeler": 0.1, "pedestrian": 0.08, "other": 0.15}
 # Rear axle to box center, as a share of the length: BMW 320i of CommonRoad's vehicle models, b - overhang, rounded.
 REAR_AXLE_SHARE = {"vehicle": 0.28, "two_wheeler": 0.3}
@@ -152,7 +152,7 @@ def _moving(track: Track, obstacles: Sequence[Obstacles | None], timeline: Timel
     track, t = Track(track.category, track.tick[order], m.take(order)), t[order]
     extra = CENTER_SIGMA_M[group] ** 2 * np.eye(2)
     hint = _first_heading(track, t)
-    options: dict[str, Any] = {"jerk_density": JERK_DENSITY[group], "sideways": sideways, "yaw_hint_rad": hint}
+    options: dict[str, Any] = {"jerk_density": JERK_DENSITY.get(group), "sideways": sideways, "yaw_hint_rad": hint}
     xy, covariance = track.measurements.center_m[:, :2], track.measurements.covariance + extra
     rough = smooth_track(t, xy, covariance=covariance, at_s=t, **options)
     shape = shape_moving(track, _headings(rough, group))

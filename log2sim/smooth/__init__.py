@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from log2sim.geometry import Array, wrap_angle
-from log2sim.smooth.interval import Observations, smooth_interval
+from log2sim.smooth.feasible import broken_limits
+from log2sim.smooth.interval import Manner, Observations, smooth_interval
 from log2sim.smooth.yaw import yaw_of_motion
 
 __all__ = ["SmoothedTrack", "smooth_track", "yaw_of_motion"]
 
-# Waymax (Gulino et al., 2023) calls a vehicle's motion infeasible beyond these.
-MAX_ACCELERATION_MPS2 = 10.4
-MAX_CURVATURE_1PM = 0.3
+# Slower than this, the curvature of a smoothed way is noise.
 CURVATURE_SPEED_MPS = 1.5
+LEAST_INLIER_WEIGHT = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ def smooth_track(
     sigma_m: ArrayLike | None = None,
     covariance: Array | None = None,
     at_s: ArrayLike | None = None,
-    jerk_density: float = 4.0,
+    jerk_density: float | None = None,
     sideways: bool = False,
     yaw_hint_rad: float | None = None,
 ) -> SmoothedTrack:
@@ -66,8 +66,9 @@ def smooth_track(
         Covariance of the positions, m2.
     at_s : (T,), optional
         Times of the result, by default `t_s`.
-    jerk_density : float
-        Spectral density of the jerk, m2/s5: how fast the acceleration may change.
+    jerk_density : float, optional
+        Spectral density of the jerk, m2/s5: how fast the acceleration may change. By default the most likely one, along
+        and across the way separately unless `sideways`.
     sideways : bool
         True for pedestrians, who may turn on the spot.
     yaw_hint_rad : float, optional
@@ -90,29 +91,34 @@ def smooth_track(
     asked = t if at_s is None else np.asarray(at_s, dtype=np.float64)
     # Far from the origin the normal equations would lose digits, so everything is relative to the first position.
     origin = xy[use][0]
-    state, position_covariance, distance, weight = smooth_interval(
-        Observations(t[use], xy[use] - origin, r), asked, jerk_density
+    # Covariances come from measurements, whose errors have heavier tails than they say.
+    manner = Manner(
+        jerk_density,
+        sideways,
+        yaw_hint_rad,
+        scaled=sigma_m is None and covariance is None,
+        wary=covariance is not None,
     )
-    velocity, acceleration = state[:, 2:4], state[:, 4:6]
+    path = smooth_interval(Observations(t[use], xy[use] - origin, r), asked, manner)
+    velocity, acceleration = path.state[:, 1], path.state[:, 2]
     speed = np.hypot(*velocity.T)
     turning = velocity[:, 0] * acceleration[:, 1] - velocity[:, 1] * acceleration[:, 0]
-    moving = speed > CURVATURE_SPEED_MPS
-    curvature = np.divide(turning, speed**3, out=np.zeros_like(speed), where=moving)
+    curvature = np.divide(turning, speed**3, out=np.zeros_like(speed), where=speed > CURVATURE_SPEED_MPS)
     residual = np.full(len(t), np.nan)
-    residual[use] = distance
+    residual[use] = path.distance
     inlier = np.zeros(len(t), dtype=bool)
-    inlier[use] = weight > 0.25
+    inlier[use] = path.weight > LEAST_INLIER_WEIGHT
     return SmoothedTrack(
         t_s=asked,
-        xy_m=state[:, :2] + origin,
+        xy_m=path.state[:, 0] + origin,
         velocity_mps=velocity,
         acceleration_mps2=acceleration,
-        yaw_rad=yaw_of_motion(state[:, :2], velocity, hint_rad=yaw_hint_rad, sideways=sideways),
+        yaw_rad=path.yaw_rad,
         curvature_1pm=curvature,
-        covariance=position_covariance,
+        covariance=path.covariance[:, :2, :2],
         residual_m=residual,
         inlier=inlier,
-        flags=_flags(acceleration, curvature, sideways=sideways),
+        flags=broken_limits(asked, acceleration, path.yaw_rad, curvature) if not sideways else (),
     )
 
 
@@ -137,23 +143,12 @@ def estimate_sigma(t: Array, xy: Array) -> float:
     """
     if len(t) < 8:
         return 0.2
-    weights = np.ones((len(t) - 3, 4))
-    for j in range(4):
-        for m in range(4):
-            if m != j:
-                weights[:, j] /= (t[j : len(t) - 3 + j] - t[m : len(t) - 3 + m]) / np.median(np.diff(t))
     rows = np.arange(len(t) - 3)[:, None] + np.arange(4)
+    # Weights of the divided difference: the inverse products of each time's distances to the other three.
+    apart = (t[rows][:, :, None] - t[rows][:, None, :]) / np.median(np.diff(t)) + np.eye(4)
+    weights = 1.0 / apart.prod(axis=2)
     differences = np.einsum("nj,njk->nk", weights, xy[rows]) / np.linalg.norm(weights, axis=1, keepdims=True)
     return max(float(np.median(np.abs(differences))) / 0.6745, 1e-3)
-
-
-def _flags(acceleration: Array, curvature: Array, *, sideways: bool) -> tuple[str, ...]:
-    flags = []
-    if np.hypot(*acceleration.T).max() > MAX_ACCELERATION_MPS2:
-        flags.append("acceleration")
-    if not sideways and np.abs(curvature).max() > MAX_CURVATURE_1PM:
-        flags.append("curvature")
-    return tuple(flags)
 
 
 def signed_speed(velocity_mps: Array, yaw_rad: Array) -> Array:

@@ -1,160 +1,235 @@
-"""Fixed-interval smoothing of planar positions as one banded least-squares problem."""
+"""Fixed-interval smoothing of planar positions: outliers, noise and maneuvers estimated, then one banded solve."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from log2sim.geometry import Array
+from log2sim.smooth.chain import Chain, Observations, nearest_index
+from log2sim.smooth.density import FIRM, OPEN, Belief, floor, separate_densities, shared_density
+from log2sim.smooth.evidence import Readings, carry, carrying, decided, hold, tolerant
+from log2sim.smooth.quadratic import Minimum, Quadratic, minimize, total
+from log2sim.smooth.standing import standing_tolerance
+from log2sim.smooth.yaw import course_is_known, unwrapped, yaw_of_motion
 
-# Knots stand no nearer to each other than this; in between the acceleration is taken as constant, which at 100 m/s3 of
-# jerk costs 0.02 mm. The information that ties two knots grows like the fifth power of the inverse step: 1 ms apart they
-# would leave no digits for the data.
-KNOT_STEP_S = 0.02
-ROUNDS = 8
-# Tukey-like weight of the generalized t-distribution: at this many sigmas an observation counts half.
-TOLERANCE_SIGMAS = 3.0
-VELOCITY_PRIOR_MPS = 40.0
-ACCELERATION_PRIOR_MPS2 = 4.0
+__all__ = ["Manner", "Observations", "Smoothed", "smooth_interval"]
 
-# Covariance of position, velocity, acceleration after unit time of white jerk of unit density, and its inverse.
-_UNIT_Q = np.array([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1.0]])
-_UNIT_INFORMATION = np.linalg.inv(_UNIT_Q)
+# Jerk density in m2/s5 that lets every maneuver through while outliers are looked for.
+PERMISSIVE_JERK_DENSITY = 4.0
+TOLERANT_ROUNDS, DECIDING_ROUNDS = 4, 4
+SETTLED = 0.05
+# Noise and maneuvers are looked for on knots this far apart: in between the acceleration is taken as constant, which at the
+# jerk of an emergency brake costs a millimeter.
+SEARCH_STEP_S = 0.39
+LEAST_KNOTS = 4
+# No outlier hides where every residual is within this of the first, least-squares solution.
+CLEAN_SIGMAS = 3.5
+# What stands neither moves nor gathers speed beyond these; what rolls slips sideways by less than this share of its speed,
+# since the heading that it holds is known to some degrees only.
+STANDING_HZ = 10.0
+SLIP_MPS, SLIP_SHARE = 0.03, 0.15
+
+
+@dataclass(frozen=True)
+class Manner:
+    """How an object moves: `jerk_density` in m2/s5 or None to estimate it, `sideways` True where it may go any way,
+    `heading_rad` where its motion does not tell, `scaled` True where the noise is known up to a factor only, `wary` True
+    where observations err by some sigmas more often than Gaussian ones, and by the same amount again and again.
+    """
+
+    jerk_density: float | None = None
+    sideways: bool = False
+    heading_rad: float | None = None
+    scaled: bool = False
+    wary: bool = False
+
+    @property
+    def steers(self) -> bool:
+        """Whether how it maneuvers along and across its way is to be estimated separately."""
+        return self.jerk_density is None and not self.sideways
+
+    @property
+    def belief(self) -> Belief:
+        """What is believed about its jerk."""
+        return FIRM if self.wary else OPEN
+
+    def weights(self, squared: Array) -> Array:
+        """How much observations (n,) count, from their squared distances in sigmas."""
+        return tolerant(squared) if self.wary else decided(squared)
 
 
 @dataclass(frozen=True, eq=False)
-class Observations:
-    """Positions `xy` (n, 2) with covariances `r` (n, 2, 2) at times `t_s` (n,)."""
+class _Rough:
+    state: Array
+    weight: Array
+    density: float
+    variance_factor: float
 
-    t_s: Array
-    xy: Array
-    r: Array
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """`state` (T, 3, 2): position, velocity, acceleration at the asked times, `covariance` (T, 6, 6) of it, `yaw_rad` (T,);
+    `distance` (n,) in m and `weight` (n,) in [0, 1] of the observations; `density` in m2/s5 along and across the way.
+    """
+
+    state: Array
+    covariance: Array
+    yaw_rad: Array
+    distance: Array
+    weight: Array
+    density: tuple[float, float]
 
 
-def smooth_interval(observed: Observations, asked_s: Array, jerk_density: float) -> tuple[Array, Array, Array, Array]:
-    """Most probable trajectory given the positions, under white jerk.
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Everything as quadratic forms about `state` (K, 3, 2), the first rough solution."""
 
-    Returns
-    -------
-    state : (T, 6) x, y, vx, vy, ax, ay at the asked times
-    covariance : (T, 2, 2) of the position
-    distance : (n,) m from each observation to the trajectory
-    weight : (n,) in (0, 1], what the outlier rejection left of each observation
+    chain: Chain
+    readings: Readings
+    state: Array
+    weight: Array
+    information: Array
+    jerk: tuple[Quadratic, Quadratic]
+    density: tuple[float, float]
+
+    def solve(self, held: Quadratic | None = None) -> tuple[Minimum, Array]:
+        """The minimum and the state (K, 3, 2) there."""
+        terms = [(1.0, self.evidence), *((1.0 / d, j) for d, j in zip(self.density, self.jerk))]
+        least = minimize(total(terms if held is None else [*terms, (1.0, held)]))
+        return least, self.state + least.step.reshape(self.state.shape)
+
+    @cached_property
+    def evidence(self) -> Quadratic:
+        return self.readings.together(self.state, self.information * self.weight[:, None, None])
+
+
+def smooth_interval(observed: Observations, asked_s: Array, manner: Manner) -> Smoothed:
+    """Most probable trajectory given the positions, under white jerk along and across the way.
 
     Notes
     -----
-    The estimate is that of a Kalman filter with a Rauch-Tung-Striebel smoother for the constant-acceleration model, found
-    in one go: its normal equations are block-tridiagonal, with 6 states a knot, and are solved as a band. Robustness by
-    iteratively reweighted least squares. The process noise is inverted in units of the step, so steps from milliseconds
-    to seconds are equally well conditioned. Cost O(n).
+    For given densities the estimate is that of a Kalman filter with a Rauch-Tung-Striebel smoother for the
+    constant-acceleration model, found in one go; the densities maximize the marginal likelihood. Cost O(n).
     """
-    knots = place_knots(np.concatenate([observed.t_s, asked_s]))
-    place = nearest_index(knots, observed.t_s)
-    reading = _reading(observed.t_s - knots[place])
-    chain = _chain_information(np.diff(knots), jerk_density)
-    information = np.linalg.inv(observed.r)
-    weight = np.ones(len(observed.t_s))
-    state = np.zeros((len(knots), 6))
-    for k in range(ROUNDS):
-        diagonal, off, rhs = _normal_equations(chain, information * weight[:, None, None], place, reading, observed.xy)
-        state = _solve_banded(diagonal, off, rhs)
-        difference = observed.xy - np.einsum("nij,nj->ni", reading, state[place])
-        squared = np.einsum("ni,nij,nj->n", difference, information, difference)
-        updated = 1.0 / (1.0 + (squared / TOLERANCE_SIGMAS**2)) ** 2
-        if k and np.abs(updated - weight).max() < 1e-3:
+    chain = Chain.over(np.concatenate([observed.t_s, asked_s]))
+    problem, least, state = _settle(_pose(chain, Readings.of(observed, chain), manner), manner)
+    covariance = least.covariance()
+    held = _held(problem, state, covariance, manner)
+    if held is not None:
+        least, state = problem.solve(held)
+        covariance = least.covariance()
+    distance = np.hypot(*problem.readings.residual(state).T)
+    state, covariance = _read_off(chain, asked_s, state, covariance)
+    known = course_is_known(state[:, 1], covariance[:, 2:4, 2:4], sideways=manner.sideways, wary=manner.wary)
+    yaw = yaw_of_motion(state[:, 0], state[:, 1], hint_rad=manner.heading_rad, sideways=manner.sideways, known=known)
+    return Smoothed(state, covariance, yaw, distance, problem.weight, problem.density)
+
+
+def _pose(chain: Chain, readings: Readings, manner: Manner) -> _Problem:
+    """Find outliers, noise and densities on a chain of fewer knots, then pose the problem on all of them."""
+    observed = readings.observed
+    few = Chain.over(observed.t_s, SEARCH_STEP_S)
+    read = Readings.of(observed, few)
+    rough = _rough(few, read, manner)
+    information = np.asarray(np.linalg.inv(observed.r * rough.variance_factor), dtype=np.float64)
+    yaw = unwrapped(yaw_of_motion(rough.state[:, 0], rough.state[:, 1], hint_rad=manner.heading_rad))
+    density = (rough.density, rough.density)
+    if manner.steers and len(few) >= LEAST_KNOTS:
+        search = _about(few, read, rough.state, rough.weight, information, yaw)
+        density = separate_densities(few, search.jerk, search.evidence, rough.density, manner.belief)
+    course: Array = np.interp(chain.knots_s, few.knots_s, yaw)
+    problem = _about(chain, readings, carry(few, rough.state, chain.knots_s), rough.weight, information, course)
+    lowest = floor(chain)
+    return replace(problem, density=(max(density[0], lowest), max(density[1], lowest)))
+
+
+def _rough(chain: Chain, readings: Readings, manner: Manner) -> _Rough:
+    """Outliers, noise and one density for both axes, taken apart, which makes the search cheap."""
+    variance = np.trace(readings.observed.r, axis1=1, axis2=2) / 2
+    density = max(PERMISSIVE_JERK_DENSITY if manner.jerk_density is None else manner.jerk_density, floor(chain))
+    state, weight = _without_outliers(chain, readings, variance, density, manner)
+    if manner.jerk_density is not None and not manner.scaled:
+        return _Rough(state, weight, density, 1.0)
+    fixed = readings.apart(state, weight / variance)
+    density, factor = shared_density(
+        chain,
+        state,
+        fixed,
+        float(weight.sum()),
+        scaled=manner.scaled,
+        belief=manner.belief,
+        rounds=1 if manner.steers else 2,
+    )
+    density = density if manner.jerk_density is None else manner.jerk_density
+    state = state + minimize(total([(1.0, fixed), (factor / density, chain.jerk(state))])).step
+    squared = (readings.residual(state) ** 2).sum(axis=1) / (variance * factor)
+    return _Rough(state, manner.weights(squared), density, factor)
+
+
+def _about(chain: Chain, readings: Readings, state: Array, weight: Array, information: Array, yaw: Array) -> _Problem:
+    """The problem as forms about a state (K, 3, 2) with unwrapped headings (K,) that tell along from across."""
+    course = (yaw[1:] + yaw[:-1]) / 2
+    along = np.stack([np.cos(course), np.sin(course)], axis=-1)
+    return _Problem(chain, readings, state, weight, information, chain.jerk_by_direction(state, along), (1.0, 1.0))
+
+
+def _settle(problem: _Problem, manner: Manner) -> tuple[_Problem, Minimum, Array]:
+    """Settle which observations are wrong: the problem with their weights, its minimum and the state (K, 3, 2) there."""
+    for _ in range(DECIDING_ROUNDS):
+        least, state = problem.solve()
+        residual = problem.readings.residual(state)
+        squared = np.einsum("na,nab,nb->n", residual, problem.information, residual)
+        weight = manner.weights(squared)
+        if np.abs(weight - problem.weight).max() < SETTLED:
+            return problem, least, state
+        problem = replace(problem, weight=weight)
+    return problem, *problem.solve()
+
+
+def _without_outliers(
+    chain: Chain, readings: Readings, variance: Array, density: float, manner: Manner
+) -> tuple[Array, Array]:
+    """State (K, 3, 2) and weights (n,) with both axes alike and a given density."""
+    start = np.zeros((len(chain), 3, 2))
+    jerk = chain.jerk(start)
+    weight = np.ones(len(variance))
+    for k in range(TOLERANT_ROUNDS + 1):
+        evidence = readings.apart(start, weight / variance)
+        state = minimize(total([(1.0, evidence), (1.0 / density, jerk)])).step
+        squared = (readings.residual(state) ** 2).sum(axis=1) / variance
+        if squared.max() < CLEAN_SIGMAS**2:
             break
-        weight = updated
-    rows = nearest_index(knots, asked_s)
-    offset = asked_s - knots[rows]
-    there = _reading(offset)
-    covariance = there @ _state_covariance(diagonal, off)[rows] @ np.swapaxes(there, 1, 2)
-    moved = state[rows].copy()
-    moved[:, :2] = np.einsum("nij,nj->ni", there, state[rows])
-    moved[:, 2:4] += offset[:, None] * state[rows, 4:]
-    return moved, covariance, np.hypot(*difference.T), weight
+        weight = tolerant(squared) if k < TOLERANT_ROUNDS else manner.weights(squared)
+    return state, manner.weights(squared)
 
 
-def place_knots(t_s: Array) -> Array:
-    """Times (K,) out of those given (n,), from the first on, none nearer to the one before than `KNOT_STEP_S`."""
-    knots: list[float] = []
-    for t in np.unique(t_s):
-        if not knots or t - knots[-1] >= KNOT_STEP_S:
-            knots.append(float(t))
-    return np.array(knots)
+def _held(problem: _Problem, state: Array, covariance: Array, manner: Manner) -> Quadratic | None:
+    """What stands does not move, and what rolls slowly goes where it points: None where neither is the case."""
+    velocity = state[:, 1]
+    tolerance = standing_tolerance(problem.chain.knots_s, problem.readings, problem.weight, state, covariance)
+    still = np.isfinite(tolerance)
+    known = course_is_known(velocity, covariance[:, 2:4, 2:4], sideways=manner.sideways, wary=manner.wary) & ~still
+    slow = ~known & ~still
+    if manner.sideways or not (known.any() or manner.heading_rad is not None):
+        slow[:] = False
+    if not (still.any() or slow.any()):
+        return None
+    yaw = yaw_of_motion(state[:, 0], velocity, hint_rad=manner.heading_rad, sideways=manner.sideways, known=known)
+    across = np.stack([-np.sin(yaw), np.cos(yaw)], axis=-1)
+    slip = SLIP_MPS + SLIP_SHARE * np.hypot(*velocity.T)
+    about_velocity = (slow / slip**2)[:, None, None] * across[:, :, None] * across[:, None, :]
+    about_velocity = about_velocity + (tolerance**-2)[:, None, None] * np.eye(2)
+    about_acceleration = ((tolerance * STANDING_HZ) ** -2)[:, None, None] * np.eye(2)
+    return hold(problem.state, about_velocity, about_acceleration)
 
 
-def _reading(offset_s: Array) -> Array:
-    """How a position at an offset (n,) from its knot is read from the knot's state: (n, 2, 6)."""
-    h = np.zeros((len(offset_s), 2, 6))
-    for axis in range(2):
-        h[:, axis, axis] = 1.0
-        h[:, axis, 2 + axis] = offset_s
-        h[:, axis, 4 + axis] = offset_s**2 / 2
-    return h
-
-
-def nearest_index(knots: Array, t: Array) -> NDArray[np.intp]:
-    """Index of the knot nearest to every time."""
-    if len(knots) == 1:
-        return np.zeros(len(t), dtype=np.intp)
-    i = np.clip(np.searchsorted(knots, t), 1, len(knots) - 1)
-    return np.where(np.abs(knots[i - 1] - t) <= np.abs(knots[i] - t), i - 1, i)
-
-
-def _chain_information(dt: Array, density: float) -> tuple[Array, Array, Array]:
-    """Information blocks (3, 3) a step and axis: of the earlier state, between both, and of the later state."""
-    scale = np.stack([dt**-2.5, dt**-1.5, dt**-0.5], axis=-1)
-    inverse = _UNIT_INFORMATION * scale[:, :, None] * scale[:, None, :] / density
-    step = np.zeros((len(dt), 3, 3))
-    step[:, [0, 1, 2], [0, 1, 2]] = 1.0
-    step[:, 0, 1], step[:, 1, 2], step[:, 0, 2] = dt, dt, dt**2 / 2
-    cross = -np.swapaxes(step, 1, 2) @ inverse
-    return -cross @ step, cross, inverse
-
-
-def _normal_equations(
-    chain: tuple[Array, Array, Array], information: Array, place: NDArray[np.intp], reading: Array, xy: Array
-) -> tuple[Array, Array, Array]:
-    """Diagonal blocks (K, 6, 6), upper off-diagonal blocks (K-1, 6, 6) and right-hand side (K, 6)."""
-    earlier, cross, later = chain
-    count = len(earlier) + 1
-    diagonal, off, rhs = np.zeros((count, 6, 6)), np.zeros((count - 1, 6, 6)), np.zeros((count, 6))
-    for axis in range(2):
-        rows = np.arange(3) * 2 + axis
-        block = np.ix_(np.arange(count - 1), rows, rows)
-        off[block] = cross
-        diagonal[block] += earlier
-        diagonal[np.ix_(np.arange(1, count), rows, rows)] += later
-        # Vague beliefs that make a single observation, or a pair of them, have an answer.
-        diagonal[0, rows[1], rows[1]] += VELOCITY_PRIOR_MPS**-2
-        diagonal[0, rows[2], rows[2]] += ACCELERATION_PRIOR_MPS2**-2
-    weighted = np.swapaxes(reading, 1, 2) @ information
-    np.add.at(diagonal, place, weighted @ reading)
-    np.add.at(rhs, place, np.einsum("nij,nj->ni", weighted, xy))
-    return diagonal, off, rhs
-
-
-def _solve_banded(diagonal: Array, off: Array, rhs: Array) -> Array:
-    from scipy.linalg import solveh_banded
-
-    count = len(diagonal)
-    band = np.zeros((12, count, 6))  # upper form: band[11 + row - column, column]
-    for column in range(6):
-        for row in range(column + 1):
-            band[11 + row - column, :, column] = diagonal[:, row, column]
-        for row in range(6):
-            band[5 + row - column, 1:, column] = off[:, row, column]
-    return np.asarray(solveh_banded(band.reshape(12, -1), rhs.ravel())).reshape(count, 6)
-
-
-def _state_covariance(diagonal: Array, off: Array) -> Array:
-    """Diagonal blocks (K, 6, 6) of the inverse of a block-tridiagonal matrix, by elimination from both ends."""
-    count = len(diagonal)
-    left, right = np.zeros_like(diagonal), np.zeros_like(diagonal)
-    for k in range(1, count):
-        left[k] = off[k - 1].T @ np.linalg.solve(diagonal[k - 1] - left[k - 1], off[k - 1])
-    for k in range(count - 2, -1, -1):
-        right[k] = off[k] @ np.linalg.solve(diagonal[k + 1] - right[k + 1], off[k].T)
-    return np.asarray(np.linalg.inv(diagonal - left - right), dtype=np.float64)
+def _read_off(chain: Chain, asked_s: Array, state: Array, covariance: Array) -> tuple[Array, Array]:
+    """States (T, 3, 2) and covariances (T, 6, 6) at asked times, each carried over from the nearest knot."""
+    place = nearest_index(chain.knots_s, asked_s)
+    if np.array_equal(chain.knots_s[place], asked_s):
+        return state[place], covariance[place]
+    both = np.einsum("tij,ab->tiajb", carrying(asked_s - chain.knots_s[place]), np.eye(2)).reshape(-1, 6, 6)
+    return carry(chain, state, asked_s), both @ covariance[place] @ np.swapaxes(both, 1, 2)
