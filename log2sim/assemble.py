@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim import boxfit
+from log2sim.clock import Costs
 from log2sim.extend import Obstacles, Sighting, follow
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
 from log2sim.scenario import Agent, Waypoints
@@ -52,19 +53,31 @@ class Built:
 
 
 def build_agents(
-    tracks: Sequence[Track], obstacles: Sequence[Obstacles | None], timeline: Timeline, flow: Array, *, smooth: bool
+    tracks: Sequence[Track],
+    obstacles: Sequence[Obstacles | None],
+    timeline: Timeline,
+    flow: Array,
+    *,
+    smooth: bool,
+    costs: Costs | None = None,
 ) -> list[Built]:
     """Agents of all tracks, moving ones first, since the way they go tells which way parked cars point.
 
-    `flow` (K, 3) is x, y and heading of the ego's path.
+    `flow` (K, 3) is x, y and heading of the ego's path; `costs` gets the pieces "moving" and "standing".
     """
+    costs = costs or Costs()
     standing = [is_standing(t) for t in tracks]
     moving = [as_rider_if_fast(t) for t, s in zip(tracks, standing) if not s]
-    built = [_moving(t, obstacles, timeline, smooth=smooth) for t in moving]
+    built = []
+    for track in moving:
+        with costs.piece("moving"):
+            built.append(_moving(track, obstacles, timeline, smooth=smooth))
     built = [b for b in built if b.credible]
     flows = [flow] + [_flow_of(b.agent) for b in built if GROUP_OF[b.agent.category] == "vehicle"]
     everything = np.concatenate(flows)
-    built += [_standing(t, obstacles, timeline, everything) for t, s in zip(tracks, standing) if s]
+    for track in (t for t, s in zip(tracks, standing) if s):
+        with costs.piece("standing"):
+            built.append(_standing(track, obstacles, timeline, everything))
     return [b for b in built if b.credible]
 
 
