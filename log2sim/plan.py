@@ -20,6 +20,8 @@ LABELS = "labels"
 # An ego that moves less than this while the log lasts blurs no sweep by more; it turns less than this at 30 m.
 STATIC_EGO_M = 0.05
 STATIC_EGO_RAD = STATIC_EGO_M / 30.0
+# Largest departure of R R^T from 1: calibration files round to five digits or more.
+LARGEST_SKEW = 1e-3
 # No LiDAR for vehicles or roadsides measures farther.
 LIDAR_REACH_M = 300.0
 
@@ -84,7 +86,7 @@ def make_plan(log: Log, config: Config, *, picture: bool = False) -> Plan:
     ConfigError
         For a camera that the log does not have.
     LogError
-        For a log without any camera.
+        For a log without any camera, or with a calibration that no sensor can have.
     """
     if not log.cameras:
         raise LogError(f"{log.name}: the log has no camera; log2sim runs at camera rate and needs at least one")
@@ -93,6 +95,7 @@ def make_plan(log: Log, config: Config, *, picture: bool = False) -> Plan:
             known = list(log.cameras)
             raise ConfigError(f"--cameras: no camera '{name}'{nearest(name, known)}; the log has {', '.join(known)}")
     cameras = config.cameras or tuple(log.cameras)
+    _check_calibration(log, cameras)
     far = _far_lidars(log, config.measure.max_range_m)
     lidars = tuple(n for n in log.lidars if n not in far)
     steps = (
@@ -109,6 +112,26 @@ def make_plan(log: Log, config: Config, *, picture: bool = False) -> Plan:
         Step("smooth parked agents", True, "no agent stands still"),
     )  # fmt: skip
     return Plan(cameras, steps, lidars)
+
+
+def _check_calibration(log: Log, cameras: tuple[str, ...]) -> None:
+    """Raise `LogError` for a mounting that is no rigid motion and for intrinsics that project nothing."""
+    mounts = {n: log.cameras[n].mount_T_cam for n in cameras} | {n: s.mount_T_lidar for n, s in log.lidars.items()}
+    for name, mount_T_sensor in mounts.items():
+        rotation = mount_T_sensor[:3, :3]
+        skew = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        if not np.isfinite(mount_T_sensor).all() or not skew < LARGEST_SKEW or np.linalg.det(rotation) < 0:
+            raise LogError(
+                f"sensor '{name}': its mounting is not a rotation and a translation (R R^T departs from 1 by {skew:.2g}, "
+                f"det R is {np.linalg.det(rotation):.2g}); expected a right-handed rotation, so check the calibration"
+            )
+    for name in cameras:
+        k = log.cameras[name].K
+        if not np.isfinite(k).all() or k[0, 0] <= 0 or k[1, 1] <= 0 or k[2].tolist() != [0, 0, 1]:
+            raise LogError(
+                f"camera '{name}': its intrinsics K are {k.tolist()}; expected finite numbers, positive focal lengths and "
+                "0, 0, 1 in the last row"
+            )
 
 
 def plan_ticks(plan: Plan, log: Log, t_ns: NDArray[np.int64], *, min_life_s: float) -> Plan:
