@@ -83,6 +83,16 @@ def microsecond_frame() -> Outcome:
     return Outcome(ok and increasing and result.report["ticks"] == sound().report["ticks"] + 1, found)
 
 
+@case("stamps: two frames a sweep", "nobody lost")
+def slow_lidar() -> Outcome:
+    def thin(folder: Path) -> None:
+        file = folder / "top/index.csv"
+        head, *rows = file.read_text().splitlines()
+        file.write_text("\n".join([head, *rows[::2]]) + "\n")
+
+    return Outcome(*known_and_finite(result_of(thin), 3))
+
+
 # --- records
 
 
