@@ -363,7 +363,7 @@ def test_a_cloud_does_not_sample_the_ground_for_nobody(tiny: Log) -> None:
         assert cloud is not None
         cloud.prepare(ground=ground)
         assert ("ground_sample" in vars(cloud)) == ground
-        assert {"obstacles", "panorama"} <= set(vars(cloud))
+        assert {"obstacle_columns", "panorama"} <= set(vars(cloud))
 
 
 # --- fusion
