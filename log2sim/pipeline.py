@@ -13,7 +13,7 @@ from log2sim.clock import Costs, StageClock
 from log2sim.config import Config
 from log2sim.detect import Detector, create_detector
 from log2sim.errors import NothingToReconstruct
-from log2sim.finish import ego_agent, ego_flow, make_scenario, without_doubles
+from log2sim.finish import ego_agent, ego_flow, make_scenario, thinned, without_doubles
 from log2sim.ground_plane import fit_cameras, locate_the_rest
 from log2sim.observe import Observed, observe
 from log2sim.plan import Plan, make_plan, plan_ticks
@@ -125,10 +125,12 @@ def conclude(
         built = build_agents(tracks, seen.obstacles, timeline, flow, smooth=config.smooth.enabled, costs=costs)
         agents = without_doubles(built)
         ego = ego_agent(log, timeline)
+        # Without an ego the agents' waypoints are all that tells the ticks.
+        agents = thinned(agents) if ego is not None else agents
     if ego is None and not agents:
         raise NothingToReconstruct(f"{log.name}: no ego poses, and no object was detected in {len(schedule)} ticks")
     with clock.stage("probe savings"):
-        plan = settle(plan, log, schedule, seen, homographies, clock, costs)
+        plan = settle(plan, log, schedule, seen, homographies, agents, clock, costs)
     scenario = make_scenario(log, schedule, config, plan, detector, homographies, ego, agents)
     report = make_report(log, schedule, config, plan, seen, homographies, scenario, clock)
     return Result(scenario, report)

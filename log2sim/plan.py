@@ -110,6 +110,7 @@ def make_plan(log: Log, config: Config, *, picture: bool = False) -> Plan:
             "smooth", config.smooth.enabled, "measured positions jitter" if config.smooth.enabled else "smooth.enabled=false"
         ),
         Step("smooth parked agents", True, "no agent stands still"),
+        Step("every waypoint", True, "no agent moves straight at constant speed"),
     )  # fmt: skip
     return Plan(cameras, steps, lidars)
 

@@ -23,12 +23,15 @@ from log2sim.fuse import fuse
 from log2sim.geometry import PoseTrack, transform
 from log2sim.ground_plane import fit_cameras
 from log2sim.measure import assemble_cloud, at_rest, to_map
+from log2sim.metrics.evaluate import evaluate
 from log2sim.observe import Observed
 from log2sim.pipeline import Result
 from log2sim.plan import Plan, make_plan, plan_ticks
 from log2sim.savings import settle
+from log2sim.scenario import Waypoints
 from log2sim.schema import check
 from log2sim.sync import synchronize
+from log2sim.thin import thin
 from log2sim.types import Detections, Frame, Lidar, Log, Measurements, Stream, Sweep
 
 LABELS = Config.load(detect={"name": "labels"})
@@ -444,6 +447,88 @@ def test_a_parked_car_needs_no_controller(tiny: Log) -> None:
         np.testing.assert_allclose(getattr(with_pid, k), getattr(with_pose, k)[0], atol=0.01)
 
 
+# --- waypoints
+
+
+def way(
+    t: np.ndarray, x: np.ndarray, y: np.ndarray, speed: np.ndarray, observed: np.ndarray | None = None
+) -> Waypoints:
+    seen = np.ones(len(t), bool) if observed is None else observed
+    yaw = np.arctan2(np.gradient(y), np.gradient(x))
+    return Waypoints(t, x, y, np.full(len(t), 0.7), yaw, speed, seen, np.full(len(t), 0.1))
+
+
+T = np.arange(51) * 0.1
+DRIVE = way(T, 10.0 * T, np.zeros(51), np.full(51, 10.0))
+
+
+def test_constant_motion_keeps_a_waypoint_a_second() -> None:
+    few = thin(DRIVE)
+    np.testing.assert_allclose(np.diff(few.t_s).max(), 1.0, atol=0.11)
+    assert len(few) <= 8
+    assert (few.t_s[0], few.t_s[-1]) == (T[0], T[-1])
+
+
+def test_accelerating_and_turning_keep_what_interpolation_does_not_give_back() -> None:
+    braking = way(T, 10.0 * T - 1.5 * T**2, np.zeros(51), 10.0 - 3.0 * T)
+    assert len(thin(braking)) > 15
+    circle = way(T, 20 * np.sin(T / 2), 20 - 20 * np.cos(T / 2), np.full(51, 10.0))
+    assert len(thin(circle)) > 15
+
+
+def test_ends_of_what_was_observed_stay() -> None:
+    observed = (T < 1.95) | (T > 3.45)
+    few = thin(way(T, 10.0 * T, np.zeros(51), np.full(51, 10.0), observed))
+    assert {19, 20, 34, 35} <= set(np.rint(few.t_s * 10).astype(int))
+    assert not few.observed[(few.t_s > 1.95) & (few.t_s < 3.45)].any()
+
+
+@pytest.mark.parametrize("column", ["x_m", "y_m", "z_m", "yaw_rad", "speed_mps", "sigma_xy_m"])
+def test_a_waypoint_that_departs_in_any_column_stays(column: str) -> None:
+    values = getattr(DRIVE, column).copy()
+    values[23] += 0.05
+    assert 23 in np.rint(thin(replace(DRIVE, **{column: values})).t_s * 10).astype(int)
+    values[23] += 0.0015 - 0.05
+    assert len(thin(replace(DRIVE, **{column: values}))) == len(thin(DRIVE))
+
+
+def test_the_yaw_may_cross_the_half_turn() -> None:
+    yaw = np.where(np.arange(51) % 2, np.pi - 1e-4, -np.pi + 1e-4)
+    assert len(thin(replace(DRIVE, yaw_rad=yaw))) == len(thin(DRIVE))
+
+
+@pytest.fixture(scope="module")
+def straight() -> tuple[Log, Scenario]:
+    return tiny_log([CAR | {"waypoints": [[16.0, 2.0, 4.0], [60.0, 2.0, 4.0]]}, PARKED], duration_s=3.0, noise_m=0.0)
+
+
+def test_few_waypoints_are_as_good_as_all(straight: tuple[Log, Scenario], monkeypatch: pytest.MonkeyPatch) -> None:
+    log, truth = straight
+    few = run(log)
+    step = entry(few, "every waypoint")
+    assert not step["kept"]
+    assert step["saved_s"] > 0
+    monkeypatch.setattr(log2sim.pipeline, "thinned", lambda agents: agents)
+    every = run(log).scenario
+    assert every.ego is not None
+    ticks = every.ego.waypoints.t_s
+    assert [len(a.waypoints) for a in few.scenario.agents if a.id == "ego"] == [len(ticks)]
+    assert sum(len(a.waypoints) for a in few.scenario.agents) < sum(len(a.waypoints) for a in every.agents)
+    for a, b in zip(few.scenario.agents, every.agents):
+        p, q = a.at(ticks), b.at(ticks)
+        np.testing.assert_array_equal(p.valid, q.valid)
+        for k, tolerance in (("x_m", 0.01), ("y_m", 0.01), ("z_m", 0.01), ("yaw_rad", 0.002), ("speed_mps", 0.02)):
+            np.testing.assert_allclose(getattr(p, k), getattr(q, k), rtol=0, atol=tolerance + 1e-12)
+    measured = [evaluate(s, truth) for s in (few.scenario, every)]
+    assert measured[0]["recall"] == measured[1]["recall"]
+    assert measured[0]["position_rmse_m"] == pytest.approx(measured[1]["position_rmse_m"], abs=0.01)
+    assert evaluate(every, few.scenario)["recall"] == evaluate(every, every)["recall"] == 1.0
+    driven = [{a.id: a for a in replay(s).agents} for s in (few.scenario, every)]
+    for name, agent in driven[0].items():
+        np.testing.assert_allclose(agent.x_m, driven[1][name].x_m, rtol=0, atol=0.03)
+        np.testing.assert_allclose(agent.y_m, driven[1][name].y_m, rtol=0, atol=0.03)
+
+
 # --- the report
 
 
@@ -455,7 +540,7 @@ def test_savings_are_the_cost_of_a_piece_times_the_pieces_left_out(both: Log) ->
     clock.seconds.update({"decode": 1.0, "detect": 3.0})
     costs.seconds.update({"moving": 0.8, "standing": 0.1})
     costs.count.update({"moving": 4, "standing": 2})
-    settled = settle(plan, both, schedule, seen, {}, clock, costs)
+    settled = settle(plan, both, schedule, seen, {}, [], clock, costs)
     saved = {s.stage: s.saved_s for s in settled.steps}
     assert saved["every frame"] == pytest.approx(20 * 4.0 / 40)
     assert saved["smooth parked agents"] == pytest.approx(2 * (0.2 - 0.05))

@@ -47,7 +47,7 @@ def test_every_stage_is_decided_once_with_a_reason() -> None:
     assert len(set(stages)) == len(stages)
     assert set(stages) == {
         "every LiDAR", "compensate", "decode images", "every frame", "homography", "fuse", "track", "smooth",
-        "smooth parked agents",
+        "smooth parked agents", "every waypoint",
     }  # fmt: skip
     assert all(s.kept and len(s.reason) > 5 for s in plan.steps)
     assert plan.to_list() == [{"stage": s.stage, "kept": s.kept, "reason": s.reason} for s in plan.steps]
