@@ -160,8 +160,6 @@ def assemble_cloud(
         sensor, known = log.map_T_sensor(name, sweep.stamp_ns)
         local = (mapped[0] - origin).astype(np.float32)
         near = (np.abs(local[:, 0]) <= max_range_m) & (np.abs(local[:, 1]) <= max_range_m)
-        if not near.any():  # a LiDAR far away must not move the place that the points were seen from
-            continue
         shift_s = np.float32((sweep.stamp_ns - stamp) / NS_PER_S)
         parts.append((local[near], mapped[1][near] + shift_s, sensor[0, :3, 3] - origin if known[0] else np.zeros(3)))
     if not parts:
@@ -169,5 +167,6 @@ def assemble_cloud(
     xyz, t_s = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
     surface = estimate_ground(xyz, np.zeros(2), ground_z - float(origin[2]))
     height = xyz[:, 2] - surface.at(xyz[:, :2])
-    sensor = np.mean([p[2] for p in parts], axis=0).astype(np.float32)
+    # A LiDAR far away, of which no point is near, must not move the place that the points were seen from.
+    sensor = np.mean([p[2] for p in parts if len(p[0])] or [p[2] for p in parts], axis=0).astype(np.float32)
     return Cloud(stamp, np.asarray(origin, float), xyz, t_s, sensor, np.abs(height) <= ON_GROUND_M, height)
