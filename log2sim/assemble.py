@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim import boxfit
+from log2sim.clock import Costs
 from log2sim.extend import Obstacles, Sighting, follow
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
 from log2sim.scenario import Agent, Waypoints
@@ -29,6 +30,7 @@ RIDER_MPS, RIDER_S = 3.0, 0.6
 LEAST_CREDIT = 0.3
 LEAST_CREDIT_OF_ODD_SHAPES = 0.6
 HIDDEN_S = 1.0
+SAME_MOMENT_S = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,19 +54,31 @@ class Built:
 
 
 def build_agents(
-    tracks: Sequence[Track], obstacles: Sequence[Obstacles | None], timeline: Timeline, flow: Array, *, smooth: bool
+    tracks: Sequence[Track],
+    obstacles: Sequence[Obstacles | None],
+    timeline: Timeline,
+    flow: Array,
+    *,
+    smooth: bool,
+    costs: Costs | None = None,
 ) -> list[Built]:
     """Agents of all tracks, moving ones first, since the way they go tells which way parked cars point.
 
-    `flow` (K, 3) is x, y and heading of the ego's path.
+    `flow` (K, 3) is x, y and heading of the ego's path; `costs` gets the pieces "moving" and "standing".
     """
+    costs = costs or Costs()
     standing = [is_standing(t) for t in tracks]
     moving = [as_rider_if_fast(t) for t, s in zip(tracks, standing) if not s]
-    built = [_moving(t, obstacles, timeline, smooth=smooth) for t in moving]
+    built = []
+    for track in moving:
+        with costs.piece("moving"):
+            built.append(_moving(track, obstacles, timeline, smooth=smooth))
     built = [b for b in built if b.credible]
     flows = [flow] + [_flow_of(b.agent) for b in built if GROUP_OF[b.agent.category] == "vehicle"]
     everything = np.concatenate(flows)
-    built += [_standing(t, obstacles, timeline, everything) for t, s in zip(tracks, standing) if s]
+    for track in (t for t, s in zip(tracks, standing) if s):
+        with costs.piece("standing"):
+            built.append(_standing(track, obstacles, timeline, everything))
     return [b for b in built if b.credible]
 
 
@@ -148,7 +162,7 @@ def _moving(track: Track, obstacles: Sequence[Obstacles | None], timeline: Timel
     m, group = track.measurements, GROUP_OF[track.category]
     sideways = group in ("pedestrian",)
     t = timeline.seconds(m.t_ns)
-    order = np.flatnonzero(np.r_[True, np.diff(t) > 1e-3])
+    order = np.flatnonzero(np.r_[True, np.diff(t) > SAME_MOMENT_S])
     track, t = Track(track.category, track.tick[order], m.take(order)), t[order]
     extra = CENTER_SIGMA_M[group] ** 2 * np.eye(2)
     hint = _first_heading(track, t)
@@ -167,7 +181,7 @@ def _moving(track: Track, obstacles: Sequence[Obstacles | None], timeline: Timel
     )
     ticks_all = np.concatenate([track.tick, np.array([s.tick for s in sightings], dtype=np.int64)])
     first = np.argsort(t_all, kind="stable")
-    first = first[np.r_[True, np.diff(t_all[first]) > 1e-3]]
+    first = first[np.r_[True, np.diff(t_all[first]) > SAME_MOMENT_S]]
     life = np.arange(ticks_all.min(), ticks_all.max() + 1)
     at = timeline.seconds(timeline.t_ns[life])
     if not smooth:
@@ -284,7 +298,9 @@ def credit(track: Track, strongest: Array) -> float:
 
     A gap longer than `HIDDEN_S` counts as being hidden, at the price of half of that time.
     """
-    t = track.measurements.t_ns / NS_PER_S
+    t = np.sort((track.measurements.t_ns - track.measurements.t_ns[0]) / NS_PER_S)
+    # Frames that share a sweep measure at one moment, and that counts once.
+    t = t[np.r_[True, np.diff(t) > SAME_MOMENT_S]]
     steps = np.diff(t)
     if len(steps) == 0:
         return float(strongest.mean())

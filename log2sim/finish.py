@@ -18,6 +18,7 @@ from log2sim.plan import Plan
 from log2sim.scenario import Agent, Scenario, Waypoints
 from log2sim.smooth import signed_speed, smooth_track
 from log2sim.sync import Schedule
+from log2sim.thin import thin
 from log2sim.types import GROUP_OF, Log
 
 # Two agents that share this much of their boxes for most of the time are one.
@@ -40,6 +41,17 @@ def without_doubles(built: Sequence[Built], ego: Agent | None = None) -> list[Ag
         count[agent.category] = count.get(agent.category, 0) + 1
         named.append(replace(agent, id=f"{agent.category}-{count[agent.category]}"))
     return named
+
+
+def thinned(agents: Sequence[Agent]) -> list[Agent]:
+    """Agents with few waypoints where they move straight at constant speed; `quality` says how many were left out."""
+    out = []
+    for agent in agents:
+        few = thin(agent.waypoints)
+        left_out = len(agent.waypoints) - len(few)
+        quality = {**agent.quality, "waypoints_left_out": left_out} if left_out else agent.quality
+        out.append(replace(agent, waypoints=few, quality=quality) if left_out else agent)
+    return out
 
 
 def _same_place(a: Agent, b: Agent) -> bool:

@@ -15,13 +15,14 @@ MARGIN_M = 0.15
 SAME_PLACE = 9.21
 
 
-def fuse(measurements: Measurements) -> Measurements:
+def fuse(measurements: Measurements, *, across: bool = True) -> Measurements:
     """Join rows (M,) that are the same object, seen by two cameras or found twice by one.
 
     Rows with LiDAR points are the same object when they share its points; rows without, or whose points were not kept, are
     gated by their covariances.
     The joined row keeps the score, category and image box of the surest one. A person whose points are those of a vehicle
-    is its driver or a false alarm and is dropped.
+    is its driver or a false alarm and is dropped. With `across` off, for rows of one camera, nothing is joined: its doubles
+    are dropped, which gives the same.
     """
     order = np.argsort(-measurements.score * np.where(measurements.truncated, 0.7, 1.0), kind="stable")
     rows = measurements.take(order)
@@ -35,8 +36,10 @@ def fuse(measurements: Measurements) -> Measurements:
         else:
             owner[i] = i
     leaders = np.flatnonzero(owner == np.arange(len(rows)))
-    joined = [_join(rows, int(leader), np.flatnonzero(owner == leader)) for leader in leaders]
-    out = Measurements.join(joined)
+    if across:
+        out = Measurements.join([_join(rows, int(leader), np.flatnonzero(owner == leader)) for leader in leaders])
+    else:
+        out = rows.take(leaders)
     return out.take(~_drivers(out))
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from log2sim.clock import Costs
 from log2sim.extend import Obstacles
 from log2sim.fuse import fuse
 from log2sim.geometry import Array, inverse, wrap_angle
@@ -34,26 +35,45 @@ class CameraGround:
 
 
 def fit_cameras(
-    log: Log, schedule: Schedule, seen: Observed, plan: Plan, method: str, rng: np.random.Generator
+    log: Log,
+    schedule: Schedule,
+    seen: Observed,
+    plan: Plan,
+    method: str,
+    rng: np.random.Generator,
+    costs: Costs | None = None,
 ) -> tuple[Plan, dict[str, CameraGround]]:
     """Fit the cameras that need it; a refused fit falls back on the calibration, with its reason kept.
 
-    A camera needs it when a detection of it has no LiDAR points; when a top-down picture is asked for, every one does.
+    A camera needs it when a detection of it has no LiDAR points, but a foot in the image; when a top-down picture is asked
+    for, every one does.
     """
     if not plan.keeps("homography"):
         return plan, {}
     reason = next(s.reason for s in plan.steps if s.stage == "homography")
-    wanted = _cameras_in_need(seen) if "picture" not in reason else set(plan.cameras)
+    wanted = _cameras_in_need(log, seen) if "picture" not in reason else set(plan.cameras)
     if not wanted:
         return plan.decided(
-            "homography", False, "every detection has LiDAR points, and no top-down picture is asked for"
+            "homography",
+            False,
+            "every detection has LiDAR points or no foot in the image, and no top-down picture is asked for",
         ), {}
     plan = plan.decided("homography", True, f"{reason}: {', '.join(c for c in plan.cameras if c in wanted)}")
-    return plan, {c: _fit_one(log, schedule, seen, c, method, rng) for c in plan.cameras if c in wanted}
+    grounds, costs = {}, costs or Costs()
+    for camera in (c for c in plan.cameras if c in wanted):
+        with costs.piece("homography"):
+            grounds[camera] = _fit_one(log, schedule, seen, camera, method, rng)
+    return plan, grounds
 
 
-def _cameras_in_need(seen: Observed) -> set[str]:
-    return {str(c) for m in seen.measurements for c in m.camera[m.source == ""]}
+def _cameras_in_need(log: Log, seen: Observed) -> set[str]:
+    rows = [(str(m.camera[k]), m.box_px[k]) for m in seen.measurements for k in np.flatnonzero(m.source == "")]
+    return {name for name, box_px in rows if _has_foot(log.cameras[name], box_px)}
+
+
+def _has_foot(camera: Camera, box_px: Array) -> bool:
+    """Whether an obstacle touches the ground in the image: a box that its lower border cuts has no foot there."""
+    return bool(box_px[3] <= camera.height_px - 3)
 
 
 def _fit_one(
@@ -90,14 +110,18 @@ def calibrated_ground(log: Log, camera: Camera) -> HomographyFit | None:
 
 
 def locate_the_rest(
-    log: Log, schedule: Schedule, seen: Observed, homographies: Mapping[str, CameraGround]
+    log: Log, schedule: Schedule, seen: Observed, homographies: Mapping[str, CameraGround], *, across: bool = True
 ) -> list[Measurements]:
-    """Measurements of all ticks, those without LiDAR points placed by their camera's homography where it is able to."""
-    return [_locate_tick(log, m, o, homographies) for m, o in zip(seen.measurements, seen.obstacles, strict=True)]
+    """Measurements of all ticks, those without LiDAR points placed by their camera's homography where it is able to.
+
+    `across` says whether several cameras may have seen the same, see `fuse`.
+    """
+    ticks = zip(seen.measurements, seen.obstacles, strict=True)
+    return [_locate_tick(log, m, o, homographies, across) for m, o in ticks]
 
 
 def _locate_tick(
-    log: Log, m: Measurements, obstacles: Obstacles | None, homographies: Mapping[str, CameraGround]
+    log: Log, m: Measurements, obstacles: Obstacles | None, homographies: Mapping[str, CameraGround], across: bool
 ) -> Measurements:
     missing = np.flatnonzero(m.source == "")
     if len(missing) == 0:
@@ -106,8 +130,7 @@ def _locate_tick(
     stands: dict[tuple[str, int], tuple[Array, Array]] = {}
     for k in missing:
         ground = homographies.get(str(m.camera[k]))
-        # A box that the image's lower border cuts has no foot in the image.
-        if ground is None or not ground.fit.ok or m.box_px[k, 3] > ground.camera.height_px - 3:
+        if ground is None or not ground.fit.ok or not _has_foot(ground.camera, m.box_px[k]):
             continue
         frame = (ground.camera.name, int(m.t_ns[k]))
         if frame not in stands:
@@ -125,7 +148,7 @@ def _locate_tick(
                 columns["score"][k] *= UNCONFIRMED
         _write(columns, int(k), placed, base, log.ground_z_ego_m, str(m.category[k]))
     placed_rows = Measurements(**columns)
-    return fuse(placed_rows)
+    return fuse(placed_rows, across=across)
 
 
 def rays_at(

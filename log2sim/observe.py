@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.clock import StageClock
 from log2sim.detect import Detector
-from log2sim.errors import LogError, RecordError
 from log2sim.extend import Obstacles
 from log2sim.fuse import fuse
 from log2sim.geometry import Array, inverse
-from log2sim.measure import Cloud, View, assemble_cloud, measure_view, project_cloud
+from log2sim.look import Looker, Records
+from log2sim.measure import Cloud, View, assemble_cloud, at_rest, measure_view, project_cloud
 from log2sim.plan import Plan
 from log2sim.sync import Schedule
 from log2sim.topdown import Correspondences, foot_points, pinhole
-from log2sim.types import Detections, Frame, Log, Measurements, Sweep
+from log2sim.types import Detections, Log, Measurements, Sweep
 
 GROUND_POINTS_A_FRAME = 40
 OBSTACLE_REACH_M = 70.0
@@ -32,7 +32,11 @@ BACKGROUND_THREADS = 2
 
 @dataclass(eq=False)
 class Observed:
-    """What the first pass found: per tick the measurements of all cameras and the obstacles that the LiDARs saw."""
+    """What the first pass found: per tick the measurements of all cameras and the obstacles that the LiDARs saw.
+
+    `sweeps` counts them by how they were compensated, `looked` and `not_looked` the frames; `last_sweep`, and `busiest`,
+    the most measurements of a tick before fusion, tell what stages cost that were left out.
+    """
 
     measurements: list[Measurements] = field(default_factory=list)
     obstacles: list[Obstacles | None] = field(default_factory=list)
@@ -40,42 +44,11 @@ class Observed:
     ground: dict[str, list[Correspondences]] = field(default_factory=dict)
     detections: dict[str, int] = field(default_factory=dict)
     records: Records | None = None
-
-
-class Records:
-    """Reads records of a log and counts what cannot be read; a stream with nothing readable is an error."""
-
-    def __init__(self, log: Log) -> None:
-        self.log = log
-        self.read: dict[str, int] = {}
-        self.failed: dict[str, list[str]] = {}
-        self._lock = threading.Lock()
-
-    def get(self, stream: str, index: int) -> Any | None:
-        """The record, or None when it cannot be read."""
-        try:
-            record = self.log.streams[stream].read(index)
-            if isinstance(record, Sweep) and not len(record.xyz_m):
-                raise RecordError(f"sweep at stamp {record.stamp_ns} has no finite point")
-        except RecordError as error:
-            with self._lock:
-                self.failed.setdefault(stream, []).append(str(error))
-            return None
-        with self._lock:
-            self.read[stream] = self.read.get(stream, 0) + 1
-        return record
-
-    def require_some(self) -> None:
-        """Raise `LogError` for a stream of which nothing that was asked for could be read."""
-        for stream, problems in self.failed.items():
-            if not self.read.get(stream):
-                raise LogError(
-                    f"stream '{stream}': none of the {len(problems)} records asked for can be read, "
-                    f"the first because {problems[0]}. Mend or remove the stream; `log2sim validate` lists all problems"
-                )
-
-    def summary(self) -> dict[str, Any]:
-        return {s: {"count": len(p), "first": p[0]} for s, p in sorted(self.failed.items())}
+    sweeps: Counter[str] = field(default_factory=Counter)
+    last_sweep: tuple[str, Sweep] | None = None
+    busiest: Measurements | None = None
+    looked: int = 0
+    not_looked: Mapping[str, int] = field(default_factory=dict)
 
 
 def observe(
@@ -93,73 +66,30 @@ def observe(
     out = Observed(feet={c: [] for c in plan.cameras}, ground={c: [] for c in plan.cameras})
     records = out.records = Records(log)
     with ThreadPoolExecutor(BACKGROUND_THREADS) as pool:
-        clouds = _Clouds(log, schedule, plan, records, pool, max_range_m)
+        clouds = _Clouds(log, schedule, plan, records, out, pool, max_range_m)
+        looker = Looker(log, schedule, detector, plan, records, pool, clock)
         clouds.prefetch(0)
         for tick in range(len(schedule)):
-            frames = _frames(log, schedule, plan, tick, records)
-            found = _detect_all(frames, detector, pool, clock, decode=plan.keeps("decode images"))
+            found = looker.at(tick)
             with clock.stage("cloud"):
                 ready = [clouds.get(tick, row) for row in range(len(schedule.frames))]
             clouds.prefetch(tick + 1)
-            _measure_tick(log, schedule, tick, found, ready, out, mode=mode, max_range_m=max_range_m, clock=clock)
+            _measure_tick(log, schedule, plan, tick, found, ready, out, mode=mode, max_range_m=max_range_m, clock=clock)
             progress(tick + 1, len(schedule))
     records.require_some()
+    out.looked, out.not_looked = looker.looked, looker.left_out
     return out
-
-
-def _frames(log: Log, schedule: Schedule, plan: Plan, tick: int, records: Records) -> dict[str, Frame]:
-    """The camera frames of a tick; each decodes its image once, when somebody asks."""
-    frames = {}
-    for name in plan.cameras:
-        index = int(schedule.frames[name][tick])
-        if index >= 0:
-            frames[name] = Frame(log.cameras[name], int(log.streams[name].t_ns[index]), _Once(records, name, index))
-    return frames
-
-
-class _Once:
-    """An image that is decoded when first asked for."""
-
-    def __init__(self, records: Records, stream: str, index: int) -> None:
-        self._records, self._stream, self._index = records, stream, index
-        self._image: NDArray[np.uint8] | None = None
-
-    def __call__(self) -> NDArray[np.uint8]:
-        if self._image is None:
-            image = self._records.get(self._stream, self._index)
-            if image is None:
-                raise RecordError(f"{self._stream}: frame {self._index} cannot be read")
-            self._image = image
-        return self._image
-
-
-def _detect_all(
-    frames: dict[str, Frame], detector: Detector, pool: ThreadPoolExecutor, clock: StageClock, *, decode: bool
-) -> dict[str, Detections]:
-    """Detections of every frame of a tick; a frame that cannot be read has none. All frames decode at once, ahead."""
-    if decode:
-        with clock.stage("decode"):
-            readable = dict(zip(frames, pool.map(_decodes, frames.values())))
-        frames = {name: frame for name, frame in frames.items() if readable[name]}
-    with clock.stage("detect"):
-        return {name: detector.detect(frame) for name, frame in frames.items()}
-
-
-def _decodes(frame: Frame) -> bool:
-    try:
-        frame.image()
-    except RecordError:
-        return False
-    return True
 
 
 class _Clouds:
     """Clouds of coming ticks, made in the background; sweeps are read once, and ticks share the clouds of the same sweeps."""
 
     def __init__(
-        self, log: Log, schedule: Schedule, plan: Plan, records: Records, pool: ThreadPoolExecutor, max_range_m: float
-    ) -> None:
-        self._log, self._schedule, self._plan, self._records = log, schedule, plan, records
+        self, log: Log, schedule: Schedule, plan: Plan, records: Records, out: Observed,
+        pool: ThreadPoolExecutor, max_range_m: float,
+    ) -> None:  # fmt: skip
+        self._log, self._schedule, self._plan, self._records, self._out = log, schedule, plan, records, out
+        self._counting = threading.Lock()
         self._pool, self._max_range_m = pool, max_range_m
         self._sweeps: dict[tuple[str, int], Future[Sweep | None]] = {}
         self._clouds: dict[tuple[int, ...], Future[Cloud | None]] = {}
@@ -178,11 +108,21 @@ class _Clouds:
         # Sweeps go first: a cloud that waits for its sweeps must never keep them from being read.
         for sweep in sweeps:
             if sweep not in self._sweeps:
-                self._sweeps[sweep] = self._pool.submit(self._records.get, *sweep)
+                self._sweeps[sweep] = self._pool.submit(self._read, *sweep)
         for key in keys:
             if key not in self._clouds:
                 read = {n: self._sweeps[n, i] for n, i in zip(self._schedule.sweeps, key) if i >= 0}
                 self._clouds[key] = self._pool.submit(self._make, read)
+
+    def _read(self, name: str, index: int) -> Sweep | None:
+        assert self._out.records is not None
+        sweep: Sweep | None = self._records.get(name, index)
+        if sweep is not None:
+            kind = compensation_of(self._log, name, sweep) if self._plan.keeps("compensate") else "left out"
+            with self._counting:
+                self._out.sweeps[kind] += 1
+                self._out.last_sweep = name, sweep
+        return sweep
 
     def _make(self, reading: dict[str, Future[Sweep | None]]) -> Cloud | None:
         sweeps = {name: sweep for name, future in reading.items() if (sweep := future.result()) is not None}
@@ -194,7 +134,7 @@ class _Clouds:
             compensate=self._plan.keeps("compensate"),
         )  # fmt: skip
         if cloud is not None:
-            cloud.prepare()
+            cloud.prepare(ground=self._plan.keeps("homography"))
         return cloud
 
     def get(self, tick: int, row: int) -> Cloud | None:
@@ -205,6 +145,7 @@ class _Clouds:
 def _measure_tick(
     log: Log,
     schedule: Schedule,
+    plan: Plan,
     tick: int,
     found: dict[str, Detections],
     clouds: Sequence[Cloud | None],
@@ -219,13 +160,24 @@ def _measure_tick(
     with clock.stage("measure"):
         for camera, cloud in zip(schedule.frames, clouds, strict=True):
             if camera in found:
-                parts.append(_measure_camera(log, schedule, camera, tick, found[camera], cloud, out, mode))
+                parts.append(_measure_camera(log, schedule, plan, camera, tick, found[camera], cloud, out, mode))
     with clock.stage("fuse"):
         joined = Measurements.join(parts)
         joined = joined.take(_in_range(log, schedule, tick, joined, max_range_m))
-        out.measurements.append(fuse(joined) if len(joined) else joined)
+        if out.busiest is None or len(joined) > len(out.busiest):
+            out.busiest = joined
+        out.measurements.append(fuse(joined, across=plan.keeps("fuse")) if len(joined) else joined)
     with clock.stage("cloud"):
         out.obstacles.append(None if clouds[0] is None else _obstacles(clouds[0]))
+
+
+def compensation_of(log: Log, lidar: str, sweep: Sweep) -> str:
+    """How a sweep is compensated: "in the map" before, "no times" to do it with, "at rest" or "moving"."""
+    if sweep.frame == "map":
+        return "in the map"
+    if sweep.t_ns is None:
+        return "no times"
+    return "at rest" if at_rest(log, lidar, sweep) else "moving"
 
 
 def place_of_ego(log: Log, t_ns: int) -> tuple[Array, float]:
@@ -244,6 +196,7 @@ def place_of_ego(log: Log, t_ns: int) -> tuple[Array, float]:
 def _measure_camera(
     log: Log,
     schedule: Schedule,
+    plan: Plan,
     camera: str,
     tick: int,
     detections: Detections,
@@ -258,6 +211,8 @@ def _measure_camera(
         return Measurements.empty()
     view = View(log.cameras[camera], t_ns, map_T_cam[0])
     measured = measure_view(view, detections, cloud, mode=mode)
+    if not plan.keeps("homography"):
+        return measured
     ego_T_map = inverse(base_pose(log, t_ns))
     out.feet[camera].append(foot_points(view.camera, measured, ego_T_map, tick))
     if cloud is not None:

@@ -46,7 +46,7 @@ def make_report(
         "ticks_per_second": round(ticks / total, 3),
         "ticks_per_second_without_detector": round(ticks / max(total - detecting, 1e-9), 3),
         "stages": clock.table(ticks),
-        "plan": plan.to_list(),
+        "plan": plan.to_report(),
         "sync": {"reference": schedule.reference, "streams": schedule.summary()},
         "without_pose": _without_pose(log, schedule),
         "unreadable": seen.records.summary() if seen.records is not None else {},

@@ -17,9 +17,9 @@ GROUND = {
     "boxfit", "camera", "clock", "config", "errors", "files", "geometry", "registry", "scenario", "schema", "types", "unlabeled",
 }  # fmt: skip
 STAGES = {
-    "detect", "extend", "fuse", "logs", "measure", "metrics", "plot", "replay", "shape", "smooth", "sync", "synth", "topdown", "track",
+    "detect", "extend", "fuse", "logs", "measure", "metrics", "plot", "replay", "shape", "smooth", "sync", "synth", "thin", "topdown", "track",
 }  # fmt: skip
-PIPELINE = {"assemble", "finish", "ground_plane", "mosaic", "observe", "pipeline", "plan", "report"}
+PIPELINE = {"assemble", "finish", "ground_plane", "look", "mosaic", "observe", "pipeline", "plan", "report", "savings"}
 TOP = {"__init__", "__main__", "cli", "progress"}
 # Synthetic logs are written by the writer of logs.
 ALLOWED = {("synth", "logs")}

@@ -45,7 +45,10 @@ def test_every_stage_is_decided_once_with_a_reason() -> None:
     plan = make_plan(make_log(), Config())
     stages = [s.stage for s in plan.steps]
     assert len(set(stages)) == len(stages)
-    assert {"compensate", "decode images", "homography", "fuse", "track", "smooth"} == set(stages)
+    assert set(stages) == {
+        "every LiDAR", "compensate", "decode images", "every frame", "homography", "fuse", "track", "smooth",
+        "smooth parked agents", "every waypoint",
+    }  # fmt: skip
     assert all(s.kept and len(s.reason) > 5 for s in plan.steps)
     assert plan.to_list() == [{"stage": s.stage, "kept": s.kept, "reason": s.reason} for s in plan.steps]
 
@@ -104,7 +107,10 @@ def test_a_homography_is_kept_for_a_picture_without_lidar_and_for_what_lidar_mis
 
 
 def test_one_camera_needs_no_fusion() -> None:
-    assert decided("fuse", make_log(cameras=("front",))) == (False, "one camera sees no object twice")
+    assert decided("fuse", make_log(cameras=("front",))) == (
+        False,
+        "one camera sees no object twice; only doubles of its detector are dropped",
+    )
     assert not decided("fuse", None, "cameras=left")[0]
     assert decided("fuse") == (True, "2 cameras")
 

@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 from log2sim import boxfit
 from log2sim.boxfit import middle
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.measure.cloud import Cloud, assemble_cloud, to_map
+from log2sim.measure.cloud import Cloud, assemble_cloud, at_rest, to_map, with_many_poses, with_one_pose
 from log2sim.measure.seen import View, in_boxes, see
 from log2sim.measure.select import LEAST_POINTS, MARGIN, candidates, choose, grow
 from log2sim.types import TYPICAL_SIZE_M, Detections, Measurements
 
-__all__ = ["Cloud", "View", "assemble_cloud", "measure_view", "project_cloud", "to_map"]
+__all__ = [
+    "Cloud", "View", "assemble_cloud", "at_rest", "measure_view", "project_cloud", "to_map", "with_many_poses", "with_one_pose",
+]  # fmt: skip
 
 BORDER_PX = 3.0
 KEPT_POINTS = 400

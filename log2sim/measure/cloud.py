@@ -17,6 +17,10 @@ from log2sim.types import Log, Sweep
 # Rotation is held within one bin: at 1 rad/s and 50 m this is 2.5 cm; translation is interpolated for every point.
 POSE_BIN_NS = 500_000
 MOST_POSE_BINS = 4096
+# A sensor that moves less than this during a sweep, its turning taken at 30 m, needs one pose for it.
+AT_REST_M = 0.01
+AT_REST_RAD = AT_REST_M / 30.0
+AT_REST_PROBES = 5
 # Obstacles stand between the road and what hangs over it.
 LOWEST_M, HIGHEST_M = 0.2, 4.2
 GROUND_REACH_M = 45.0
@@ -66,26 +70,47 @@ class Cloud:
         index = np.flatnonzero(self.ground & (np.hypot(self.xyz[:, 0], self.xyz[:, 1]) < GROUND_REACH_M))
         return index[:: max(len(index) // GROUND_SAMPLE, 1)]
 
-    def prepare(self) -> None:
-        """Compute now, in the thread that makes the cloud, what measuring in it will ask for."""
-        _ = self.obstacle_columns, self.panorama, self.ground_sample
+    def prepare(self, *, ground: bool = True) -> None:
+        """Compute now, in the thread that makes the cloud, what measuring in it will ask for, its `ground` too or not."""
+        _ = self.obstacle_columns, self.panorama, self.ground_sample if ground else None
 
 
 def to_map(log: Log, lidar: str, sweep: Sweep, *, compensate: bool) -> tuple[Array, NDArray[np.float32]] | None:
     """Points (N, 3) float64 of a sweep in the map frame and their times (N,) s relative to its stamp.
 
-    Returns None where the pose of the sensor is not known at that time. Without point times, or with `compensate` off,
-    the whole sweep takes the pose of its stamp.
+    Returns None where the pose of the sensor is not known at that time. Without point times, at rest, or with `compensate`
+    off, the whole sweep takes the pose of its stamp.
     """
     t_ns = sweep.t_ns if sweep.t_ns is not None else np.full(len(sweep.xyz_m), sweep.stamp_ns, dtype=np.int64)
     t_s = ((t_ns - sweep.stamp_ns) / NS_PER_S).astype(np.float32)
     if sweep.frame == "map":
         return np.asarray(sweep.xyz_m, dtype=np.float64), t_s
-    if not compensate or sweep.t_ns is None or len(t_ns) == 0:
-        map_T_lidar, valid = log.map_T_sensor(lidar, sweep.stamp_ns)
-        if not valid[0]:
-            return None
-        return sweep.xyz_m @ map_T_lidar[0, :3, :3].T + map_T_lidar[0, :3, 3], t_s
+    one_pose = not compensate or sweep.t_ns is None or len(t_ns) == 0 or at_rest(log, lidar, sweep)
+    xyz = with_one_pose(log, lidar, sweep) if one_pose else with_many_poses(log, lidar, sweep, t_ns)
+    return None if xyz is None else (xyz, t_s)
+
+
+def at_rest(log: Log, lidar: str, sweep: Sweep) -> bool:
+    """Whether a LiDAR stands still while it takes a sweep with point times, to `AT_REST_M` at 30 m."""
+    if sweep.t_ns is None or len(sweep.t_ns) == 0:
+        return False
+    probes = np.linspace(0, int(sweep.t_ns.max() - sweep.t_ns.min()), AT_REST_PROBES).astype(np.int64)
+    map_T_lidar, valid = log.map_T_sensor(lidar, np.append(sweep.t_ns.min() + probes, sweep.stamp_ns))
+    moved = np.linalg.norm(map_T_lidar[:, :3, 3] - map_T_lidar[-1, :3, 3], axis=1)
+    turned = np.linalg.norm(map_T_lidar[:, :3, :3] - map_T_lidar[-1, :3, :3], axis=(1, 2)) / np.sqrt(2)
+    return bool(valid.all() and moved.max() < AT_REST_M and turned.max() < AT_REST_RAD)
+
+
+def with_one_pose(log: Log, lidar: str, sweep: Sweep) -> Array | None:
+    """Points (N, 3) in the map, all moved by the pose of the sweep's stamp; None where that is not known."""
+    map_T_lidar, valid = log.map_T_sensor(lidar, sweep.stamp_ns)
+    if not valid[0]:
+        return None
+    return np.asarray(sweep.xyz_m @ map_T_lidar[0, :3, :3].T + map_T_lidar[0, :3, 3], dtype=np.float64)
+
+
+def with_many_poses(log: Log, lidar: str, sweep: Sweep, t_ns: NDArray[np.int64]) -> Array | None:
+    """Points (N, 3) in the map, each moved by the pose of its own time (N,); None where one is not known."""
     first, span = int(t_ns.min()), int(t_ns.max() - t_ns.min())
     bins = min(max(span // POSE_BIN_NS, 1), MOST_POSE_BINS)
     knots = first + (np.arange(bins + 1) * span) // bins
@@ -105,7 +130,7 @@ def to_map(log: Log, lidar: str, sweep: Sweep, *, compensate: bool) -> tuple[Arr
     out[order] = rotated
     position = map_T_lidar[:, :3, 3]
     fraction = (place - k)[:, None]
-    return out + position[k] * (1 - fraction) + position[k + 1] * fraction, t_s
+    return np.asarray(out + position[k] * (1 - fraction) + position[k + 1] * fraction)
 
 
 def assemble_cloud(
@@ -142,5 +167,6 @@ def assemble_cloud(
     xyz, t_s = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
     surface = estimate_ground(xyz, np.zeros(2), ground_z - float(origin[2]))
     height = xyz[:, 2] - surface.at(xyz[:, :2])
-    sensor = np.mean([p[2] for p in parts], axis=0).astype(np.float32)
+    # A LiDAR far away, of which no point is near, must not move the place that the points were seen from.
+    sensor = np.mean([p[2] for p in parts if len(p[0])] or [p[2] for p in parts], axis=0).astype(np.float32)
     return Cloud(stamp, np.asarray(origin, float), xyz, t_s, sensor, np.abs(height) <= ON_GROUND_M, height)

@@ -14,6 +14,7 @@ from log2sim.scenario import Agent, Scenario
 from log2sim.types import GROUP_OF
 
 MAX_TRUTH_GAP_S = 0.25
+THINNED_GAP_S = 1.05  # waypoints of straight constant motion are left out for up to a second
 TRUTH_MARGIN_S = 0.15
 """How long beyond its first and last label a truth agent is carried on with its speed, never to be counted."""
 
@@ -120,8 +121,9 @@ def _sample_truth(agent: Agent, t: Array) -> tuple[Array, Array, Array, Array, M
     there = np.abs(outside) <= TRUTH_MARGIN_S
     nearest = np.abs(t[:, None] - w.t_s[None]).argmin(1)
     seen = np.ones(len(t), dtype=bool) if w.visible is None else w.visible[nearest]
-    # A parked truth agent may be written as its first and last waypoint only.
-    max_gap_s = np.inf if agent.static and len(w) == 2 else MAX_TRUTH_GAP_S
+    # A parked truth agent may be written as its first and last waypoint only, and one that moves straight as a few.
+    thinned = bool(agent.quality.get("waypoints_left_out"))
+    max_gap_s = np.inf if agent.static and len(w) == 2 else THINNED_GAP_S if thinned else MAX_TRUTH_GAP_S
     labeled = agent.at(t, max_gap_s=float(max_gap_s)).valid
     nan = np.where(there, 0.0, np.nan)
     return xy + nan[:, None], s.z_m + nan, s.yaw_rad + nan, s.speed_mps + nan, seen & labeled

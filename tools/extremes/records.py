@@ -1,0 +1,157 @@
+"""Extremes of what a log records: places, stamps, clouds and images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from extremes.small_log import LABELS, Row, folder_of, known_and_finite, result_of, rows_changed, same, small_log, sound
+from extremes.table import FAR_M, Outcome, case
+from log2sim import open_log, reconstruct
+from log2sim.errors import LogError
+from log2sim.pipeline import Result
+
+
+@case("map: UTM coordinates of 5e6 m", "as at the origin to 1e-6 m")
+def far_away() -> Outcome:
+    def move(row: Row) -> None:
+        for column, shift in zip(("x_m", "y_m"), FAR_M):
+            if column in row:
+                row[column] = repr(float(row[column]) + float(shift))
+
+    return same(result_of(lambda f: rows_changed(f, move)), 1e-6, tuple(FAR_M))
+
+
+def later(shift_ns: int) -> Result:
+    def shift(row: Row) -> None:
+        row["t_ns"] = str(int(row["t_ns"]) + shift_ns)
+
+    return result_of(lambda f: rows_changed(f, shift))
+
+
+@case("stamps: of 6.7e18 ns", "as at 1.7e18 ns to 1e-9 m")
+def large_stamps() -> Outcome:
+    return same(later(5_000_000_000_000_000_000), 1e-9)
+
+
+@case("stamps: negative, and zero among them", "as at 1.7e18 ns to 1e-9 m")
+def negative_stamps() -> Outcome:
+    return same(later(-int(sound().scenario.t0_ns) - 100_000_000), 1e-9)
+
+
+@case("stamps: every record twice", "repetitions left out and noted, the same scenario")
+def repeated_stamps() -> Outcome:
+    def repeat(folder: Path) -> None:
+        for file in (folder / "front/index.csv", folder / "top/index.csv", folder / "ego/poses.csv"):
+            head, *rows = file.read_text().splitlines()
+            file.write_text("\n".join([head, *(r for row in rows for r in (row, row))]) + "\n")
+
+    with folder_of(repeat) as folder:
+        log = open_log(folder)
+        outcome = same(reconstruct(log, LABELS), 1e-9)
+    noted = sum("repeat" in n or "same stamp" in n or "twice" in n or "duplicate" in n for n in log.notes)
+    return replace(outcome, ok=outcome.ok and noted > 0, found=f"{outcome.found}, {noted} notes")
+
+
+@case("stamps: in reverse order", "put in order and noted, the same scenario")
+def reversed_stamps() -> Outcome:
+    def reverse(folder: Path) -> None:
+        for file in (folder / "front/index.csv", folder / "top/index.csv", folder / "ego/poses.csv"):
+            head, *rows = file.read_text().splitlines()
+            file.write_text("\n".join([head, *reversed(rows)]) + "\n")
+
+    with folder_of(reverse) as folder:
+        log = open_log(folder)
+        outcome = same(reconstruct(log, LABELS), 1e-9)
+    return replace(outcome, ok=outcome.ok and len(log.notes) > 0, found=f"{outcome.found}, {len(log.notes)} notes")
+
+
+@case("stamps: a frame 1 us after another", "one tick each, nobody lost")
+def microsecond_frame() -> Outcome:
+    def double(folder: Path) -> None:
+        file = folder / "front/index.csv"
+        lines = file.read_text().splitlines()
+        t_ns, image = lines[3].split(",", 1)
+        lines.insert(4, f"{int(t_ns) + 1000},{image}")
+        file.write_text("\n".join(lines) + "\n")
+
+    result = result_of(double)
+    ok, found = known_and_finite(result, 3)
+    increasing = all((np.diff(a.waypoints.t_s) > 0).all() for a in result.scenario.agents)
+    return Outcome(ok and increasing and result.report["ticks"] == sound().report["ticks"] + 1, found)
+
+
+@case("stamps: two frames a sweep", "nobody lost")
+def slow_lidar() -> Outcome:
+    def thin(folder: Path) -> None:
+        file = folder / "top/index.csv"
+        head, *rows = file.read_text().splitlines()
+        file.write_text("\n".join([head, *rows[::2]]) + "\n")
+
+    return Outcome(*known_and_finite(result_of(thin), 3))
+
+
+# --- records
+
+
+@case("cloud: NaN and inf points", "left out, the same scenario")
+def bad_points() -> Outcome:
+    def spoil(folder: Path) -> None:
+        for file in (folder / "top").glob("*.npz"):
+            with np.load(file) as data:
+                columns = dict(data)
+            for bad in (np.nan, np.inf, -np.inf):
+                columns["xyz_m"] = np.concatenate([columns["xyz_m"], np.full((50, 3), bad, columns["xyz_m"].dtype)])
+                columns["t_offset_ns"] = np.concatenate([columns["t_offset_ns"], columns["t_offset_ns"][:50]])
+            np.savez(file, **columns)
+
+    return same(result_of(spoil), 1e-9)
+
+
+@case("cloud: one sweep without points", "counted, the others do")
+def empty_sweep() -> Outcome:
+    def empty(folder: Path) -> None:
+        file = sorted((folder / "top").glob("*.npz"))[2]
+        np.savez(file, xyz_m=np.zeros((0, 3), np.float32), t_offset_ns=np.zeros(0, np.int64))
+
+    result = result_of(empty)
+    ok, found = known_and_finite(result, 2)
+    count = result.report["unreadable"].get("top", {}).get("count", 0)
+    return Outcome(ok and count == 1, f"{found}, {count} unreadable")
+
+
+@case("image: one cut in half", "counted, the others do")
+def cut_image() -> Outcome:
+    def cut(folder: Path) -> None:
+        file = sorted((folder / "front").glob("*.jpg"))[1]
+        file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+    result = result_of(cut, picture=True)
+    ok, found = known_and_finite(result, 2)
+    count = result.report["unreadable"].get("front", {}).get("count", 0)
+    return Outcome(ok and count == 1, f"{found}, {count} unreadable")
+
+
+@case("image: all cut in half", "refused, naming the stream")
+def cut_images() -> Outcome:
+    def cut(folder: Path) -> None:
+        for file in (folder / "front").glob("*.jpg"):
+            file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+    try:
+        result_of(cut, picture=True)
+    except LogError as error:
+        return Outcome("stream 'front'" in str(error), "refused: stream 'front'")
+    return Outcome(False, "accepted")
+
+
+@case("frames: nobody in any", "the ego alone")
+def nobody() -> Outcome:
+    log = small_log()
+    late = {n: replace(b, t_ns=b.t_ns + 10**15) for n, b in log.image_labels.items()}
+    result = reconstruct(replace(log, image_labels=late), LABELS)
+    return Outcome(
+        [a.id for a in result.scenario.agents] == ["ego"], f"{len(result.scenario.others)} agents beside the ego"
+    )

@@ -1,0 +1,54 @@
+"""The table of extremes: named cases with the outcome that each must have. Tests and `stability.py` run the same ones.
+
+A case says what it found and whether that is what is required; it never raises for a wrong outcome.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+FAR_M = np.array([691_000.0, 5_334_000.0])
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a case found: whether it is as required, in words, and the condition number and error where there are any."""
+
+    ok: bool
+    found: str
+    condition: float | None = None
+    error: float | None = None
+    unit: str = "m"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A named extreme, what is required of it, and how to run it."""
+
+    name: str
+    required: str
+    run: Callable[[], Outcome]
+
+
+CASES: list[Case] = []
+
+
+def outcome_of(case: Case) -> Outcome:
+    """Run a case; an exception that it does not expect is an outcome too, and never the required one."""
+    try:
+        return case.run()
+    except Exception as error:
+        return Outcome(False, f"raised {type(error).__name__}: {error}")
+
+
+def case(name: str, required: str) -> Callable[[Callable[[], Outcome]], Callable[[], Outcome]]:
+    """Put a function into the table."""
+
+    def add(run: Callable[[], Outcome]) -> Callable[[], Outcome]:
+        CASES.append(Case(name, required, run))
+        return run
+
+    return add
