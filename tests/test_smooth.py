@@ -457,6 +457,22 @@ def test_what_drives_off_at_the_end_of_its_track_is_not_held() -> None:
             assert np.hypot(*path.velocity_mps[t < 7.5].T).max() < 0.1
 
 
+def test_what_has_just_driven_off_is_not_held_however_badly_it_is_said_to_be_seen() -> None:
+    t = DT * np.arange(100)
+    truth = np.column_stack([np.clip(t - 9.2, 0.0, None) ** 2, 0 * t])
+    for seed in range(4):
+        xy = truth + np.random.default_rng(seed).normal(0, 0.02, (100, 2))
+        assert smooth_track(t, xy, sigma_m=0.2, yaw_hint_rad=0.0).velocity_mps[-1, 0] > 0.1
+
+
+def test_what_rolls_slowly_goes_along_its_hint() -> None:
+    t = DT * np.arange(60)
+    for seed in range(6):
+        xy = np.column_stack([0.45 * t, 0 * t]) + np.random.default_rng(seed).normal(0, 0.3, (60, 2))
+        path = smooth_track(t, xy, sigma_m=0.3, jerk_density=4.0, yaw_hint_rad=0.0)
+        assert np.sqrt(np.mean(path.velocity_mps[:, 1] ** 2)) < 0.06
+
+
 def test_what_creeps_visibly_is_not_held() -> None:
     t = DT * np.arange(80)
     xy = np.column_stack([0.3 * t, 0 * t]) + np.random.default_rng(3).normal(0, 0.1, (80, 2))
