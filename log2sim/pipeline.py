@@ -123,8 +123,8 @@ def conclude(
     with clock.stage("smooth"):
         flow = ego_flow(log, schedule)
         built = build_agents(tracks, seen.obstacles, timeline, flow, smooth=config.smooth.enabled, costs=costs)
-        agents = without_doubles(built)
         ego = ego_agent(log, timeline)
+        agents = without_doubles(built, ego)
         # Without an ego the agents' waypoints are all that tells the ticks.
         agents = thinned(agents) if ego is not None else agents
     if ego is None and not agents:
