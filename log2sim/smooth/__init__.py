@@ -18,6 +18,8 @@ __all__ = ["SmoothedTrack", "smooth_track", "yaw_of_motion"]
 # Slower than this, the curvature of a smoothed way is noise.
 CURVATURE_SPEED_MPS = 1.5
 LEAST_INLIER_WEIGHT = 0.25
+# A gap longer than this is filled by a guess; jerk that traffic has, m2/s5.
+GAP_S, GAP_JERK_DENSITY = 2.0, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +117,9 @@ def smooth_track(
         acceleration_mps2=acceleration,
         yaw_rad=path.yaw_rad,
         curvature_1pm=curvature,
-        covariance=path.covariance[:, :2, :2],
+        covariance=_doubtful_in_gaps(
+            path.covariance[:, :2, :2], asked, t[use][path.weight > LEAST_INLIER_WEIGHT], path.density
+        ),
         residual_m=residual,
         inlier=inlier,
         flags=broken_limits(asked, acceleration, path.yaw_rad, curvature) if not sideways else (),
@@ -132,6 +136,27 @@ def _covariances(t: Array, xy: Array, sigma_m: ArrayLike | None, covariance: Arr
     if np.any(~np.isfinite(sigma) | (sigma <= 0)):
         raise ValueError("sigma_m must be positive and finite")
     return sigma[:, None, None] ** 2 * np.eye(2)
+
+
+def _doubtful_in_gaps(covariance: Array, at_s: Array, seen_s: Array, density: tuple[float, float]) -> Array:
+    """The covariances (T, 2, 2), wider where nothing was seen for long: how calmly something moved while it was seen tells
+    little about what it did unseen, so there it may have moved as vehicles do.
+    """
+    factor = GAP_JERK_DENSITY / max(np.sqrt(density[0] * density[1]), 1e-12)
+    if factor <= 1 or len(seen_s) == 0:
+        return covariance
+    out = covariance.copy()
+    for first, last in zip(seen_s[:-1], seen_s[1:]):
+        rows = np.flatnonzero((at_s > first) & (at_s < last))
+        if last - first <= GAP_S or len(rows) == 0:
+            continue
+        before, after = covariance[max(rows[0] - 1, 0)], covariance[min(rows[-1] + 1, len(covariance) - 1)]
+        share = ((at_s[rows] - first) / (last - first))[:, None, None]
+        excess = covariance[rows] - (1 - share) * before - share * after
+        # Only what the gap itself adds grows with the jerk.
+        grows = np.trace(excess, axis1=1, axis2=2) > 0
+        out[rows[grows]] += (factor - 1) * excess[grows]
+    return out
 
 
 def estimate_sigma(t: Array, xy: Array) -> float:
