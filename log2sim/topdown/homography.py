@@ -98,7 +98,7 @@ def estimate_homography(
         measured, xy = xy, np.asarray(xy_by_size_m, float)
         sigma_m = max(sigma_m, SIZE_SHARE * _reach_m(xy))
     ticks, number = np.unique(frame, return_inverse=True)
-    rows = np.flatnonzero(np.isfinite(uv).all(axis=1) & np.isfinite(xy).all(axis=1))
+    rows = np.flatnonzero(np.isfinite(uv[:, 0]) & np.isfinite(uv[:, 1]) & np.isfinite(xy[:, 0]) & np.isfinite(xy[:, 1]))
     if len(rows) < 4:
         return refused(f"{len(rows)} correspondences, at least 4 are needed", len(uv), ticks)
     rows = rows[np.argsort(number[rows], kind="stable")]

@@ -12,7 +12,7 @@ import numpy as np
 
 from log2sim.geometry import Array
 from log2sim.topdown.pose import tangent, unit_pose
-from log2sim.topdown.refine import Linearized, linearize, noise
+from log2sim.topdown.refine import Linearized, free_directions, linearize, noise
 from log2sim.topdown.stream import BOUND, Stream
 
 # How much a camera is believed to move before it is known: pixels along v, and angle of roll.
@@ -123,7 +123,7 @@ def _step(
     wide = at.slope[0] * use
     error = at.error[0] * use
     turn = _turn_slopes(at, generators) * use * real[:, None, None]
-    basis = _free_directions(h) if image_K is None else tangent(image_K, h)
+    basis = free_directions(h) if image_K is None else tangent(image_K, h)
     wide = (basis.T @ wide.reshape(9, -1)).reshape(-1, *wide.shape[1:])
 
     def by_tick(values: Array) -> Array:
@@ -159,9 +159,3 @@ def _turn_slopes(at: Linearized, generators: Array) -> Array:
         out[k, 0] = du * wu
         out[k, 1] = (dv - shear * du) * wv
     return out
-
-
-def _free_directions(h: Array) -> Array:
-    """Directions (9, 8) across the scale of a homography."""
-    _, _, vt = np.linalg.svd(h.reshape(1, 9))
-    return np.asarray(vt[1:].T)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from log2sim.geometry import Array
-from log2sim.topdown.refine import Linearized, linearize
-from log2sim.topdown.stream import BOUND, Stream
 
 
 def nearest_poses(image_K: Array, h: Array) -> Array:
@@ -45,29 +43,3 @@ def tangent(image_K: Array, h: Array) -> Array:
 def unit_pose(image_K: Array, h: Array) -> Array:
     """The nearest pose's homography (3, 3), scaled so that its axes have length 1."""
     return np.asarray(nearest_poses(image_K, h[None])[0])
-
-
-def refine_pose(stream: Stream, image_K: Array, h: Array, bounds: tuple[float, ...]) -> tuple[Array, Linearized]:
-    """The camera's homography (3, 3) of least bounded loss near `h`, and its errors; one step for each of `bounds`."""
-    current = best = unit_pose(image_K, h)
-    at = there = linearize(stream, best[None])
-    loss = np.inf
-    for bound in bounds:
-        value = float(np.minimum(at.squared, BOUND).sum())
-        if bound <= BOUND:
-            if value >= loss:
-                return best, there
-            if loss - value < 1e-4:
-                return current, at
-            best, there, loss = current, at, value
-        use = at.squared[0] < bound
-        basis = tangent(image_K, current)
-        slope = basis.T @ (at.slope[0] * use).reshape(9, -1)
-        normal = slope @ slope.T
-        if np.count_nonzero(use) < 4 or np.linalg.cond(normal) > 1e14:
-            break
-        step = -np.linalg.solve(normal, slope @ at.error[0].ravel())
-        current = unit_pose(image_K, current + (basis @ step).reshape(3, 3))
-        at = linearize(stream, current[None])
-    value = float(np.minimum(at.squared, BOUND).sum())
-    return (current, at) if value < loss else (best, there)

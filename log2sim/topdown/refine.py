@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
+from log2sim.topdown.pose import tangent, unit_pose
 from log2sim.topdown.stream import BOUND, Stream
 
 # An estimate of the noise starts from what is believed of it, worth so many correspondences, and stays within a factor.
@@ -15,6 +16,7 @@ BELIEVED_ROWS = 20.0
 NOISE_FACTOR = 4.0
 # Of a normal error's square that is cut at BOUND so much remains.
 CUT_SHARE = 0.953
+LEAST_GAIN = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,27 +49,39 @@ def linearize(stream: Stream, h: Array, warps: Array | None = None) -> Linearize
     depth = 1.0 / np.where(front, q[:, 2], 1.0)
     projected = q[:, :2] * depth[:, None]
     u, v = projected[:, 0], projected[:, 1]
-    # Motion in the image (K, 2, 2, N) by motion on the ground.
-    j = (h[:, :2, :2, None] - projected[:, :, None] * h[:, 2, None, :2, None]) * depth[:, None, None]
-    ground = np.stack([(a * b).sum(axis=1) for a, b in ((j[:, 0], j[:, 0]), (j[:, 0], j[:, 1]), (j[:, 1], j[:, 1]))])
-    cuu, cuv, cvv = stream.sigma_ground**2 * ground
+    a, b, c = h[:, 0, :2, None] * depth[:, None], h[:, 1, :2, None] * depth[:, None], h[:, 2, :2, None] * depth[:, None]
+    # Motion in the image (K, N) by motion on the ground, and the covariance that noise on the ground has there.
+    ux, uy = a[:, 0] - u * c[:, 0], a[:, 1] - u * c[:, 1]
+    vx, vy = b[:, 0] - v * c[:, 0], b[:, 1] - v * c[:, 1]
+    ground = np.empty((3, count, len(stream.tick)))
+    ground[0], ground[1], ground[2] = ux * ux + uy * uy, ux * vx + uy * vy, vx * vx + vy * vy
+    cuu, cuv = stream.sigma_ground**2 * ground[:2]
     cuu += stream.sigma_image**2
     shear = cuv / cuu
-    wu, wv = 1.0 / np.sqrt(cuu), 1.0 / np.sqrt(cvv + stream.sigma_image**2 - cuv * shear)
+    # The determinant is a sum of squares and so has no cancellation, even where a hypothesis folds the ground to a line.
+    area = stream.sigma_image**2 * (cuu + stream.sigma_ground**2 * ground[2])
+    area += stream.sigma_ground**4 * (ux * vy - uy * vx) ** 2
+    whiten = np.empty_like(ground)
+    np.sqrt(area, out=area)
+    np.sqrt(cuu, out=cuu)
+    wu = np.divide(1.0, cuu, out=whiten[0])
+    wv = np.divide(cuu, area, out=whiten[1])
+    whiten[2] = shear
     error = projected - stream.image
     error[:, 1] -= shear * error[:, 0]
     error[:, 0] *= wu
     error[:, 1] *= wv
-    squared = np.where(front, (error * error).sum(axis=1), np.inf)
+    squared = error[:, 0] * error[:, 0] + error[:, 1] * error[:, 1]
+    squared[~front] = np.inf
     scaled = stream.ground * depth[:, None]
     slope = np.empty((count, 9, 2, stream.image.shape[1]))
-    slope[:, 0:3, 0] = scaled * wu[:, None]
+    np.multiply(scaled, wu[:, None], out=slope[:, 0:3, 0])
     slope[:, 3:6, 0] = 0.0
-    slope[:, 6:9, 0] = slope[:, 0:3, 0] * -u[:, None]
-    slope[:, 3:6, 1] = scaled * wv[:, None]
-    slope[:, 0:3, 1] = slope[:, 3:6, 1] * -shear[:, None]
-    slope[:, 6:9, 1] = slope[:, 3:6, 1] * (shear * u - v)[:, None]
-    return Linearized(error, squared, slope, projected, ground, np.stack([wu, wv, shear]))
+    np.multiply(slope[:, 0:3, 0], -u[:, None], out=slope[:, 6:9, 0])
+    np.multiply(scaled, wv[:, None], out=slope[:, 3:6, 1])
+    np.multiply(slope[:, 3:6, 1], -shear[:, None], out=slope[:, 0:3, 1])
+    np.multiply(slope[:, 3:6, 1], (shear * u - v)[:, None], out=slope[:, 6:9, 1])
+    return Linearized(error, squared, slope, projected, ground, whiten)
 
 
 def refine_many(stream: Stream, h: Array, bounds: tuple[float, ...]) -> Array:
@@ -80,22 +94,49 @@ def refine_many(stream: Stream, h: Array, bounds: tuple[float, ...]) -> Array:
     return h
 
 
-def refine(stream: Stream, h: Array, rounds: int) -> tuple[Array, Linearized]:
-    """The homography (3, 3) of least bounded loss near `h`, and its errors."""
-    best = h / np.linalg.norm(h)
-    at = linearize(stream, best[None])
+def refine(stream: Stream, h: Array, rounds: int, image_K: Array | None = None) -> Array:
+    """The homography (3, 3) of least bounded loss near `h`; with intrinsics `image_K` (3, 3) that of a camera."""
+    at = linearize(stream, h[None])
     loss = float(np.minimum(at.squared, BOUND).sum())
     for _ in range(rounds):
-        proposed = best + newton_steps(at, at.squared < BOUND, best[None])[0]
-        proposed /= np.linalg.norm(proposed)
+        proposed = step(at, h, image_K)
         there = linearize(stream, proposed[None])
         value = float(np.minimum(there.squared, BOUND).sum())
         if value >= loss:
             break
-        gain, best, at, loss = loss - value, proposed, there, value
-        if gain < 1e-4:
+        gain, h, at, loss = loss - value, proposed, there, value
+        if gain < LEAST_GAIN:
             break
-    return best, at
+    return h
+
+
+def step(at: Linearized, h: Array, image_K: Array | None = None, bound: float = BOUND, k: int = 0) -> Array:
+    """A homography (3, 3) after a Gauss-Newton step from `h`, the `k`-th of those linearized; `h` where there is none."""
+    use = at.squared[k] < bound
+    basis = free_directions(h) if image_K is None else tangent(image_K, h)
+    slope = (at.slope[k] * use).reshape(9, -1)
+    normal, right = basis.T @ (slope @ slope.T) @ basis, basis.T @ (slope @ at.error[k].ravel())
+    size = np.sqrt(np.maximum(np.diagonal(normal), 1e-300))
+    try:
+        along = np.linalg.solve(normal / size[:, None] / size + 1e-14 * np.eye(len(size)), right / size) / size
+    except np.linalg.LinAlgError:
+        return h
+    moved = h - (basis @ along).reshape(3, 3)
+    if np.count_nonzero(use) < 4 or not np.isfinite(moved).all():
+        return h
+    return moved / np.linalg.norm(moved) if image_K is None else unit_pose(image_K, moved)
+
+
+def free_directions(h: Array) -> Array:
+    """Directions (9, 8) across the scale of a homography (3, 3)."""
+    # The reflection that takes the homography to an axis takes the other axes to what is across it (Householder).
+    v = h.ravel() / np.linalg.norm(h)
+    largest = int(np.argmax(np.abs(v)))
+    v[largest] += np.sign(v[largest])
+    across = [k for k in range(9) if k != largest]
+    out = v[:, None] * (-v[across] / abs(v[largest]))
+    out[across, range(8)] += 1.0
+    return out
 
 
 def newton_steps(at: Linearized, use: NDArray[np.bool_], h: Array) -> Array:

@@ -39,11 +39,9 @@ class Stream:
     @classmethod
     def of(cls, uv_px: Array, xy_m: Array, tick: NDArray[np.int64], sigma_px: float, sigma_m: float) -> Stream:
         """Normalize correspondences (N, 2), (N, 2), (N,) whose ticks ascend."""
-        image_N_px, ground_N_m = normalization(uv_px), normalization(xy_m)
-        image = uv_px.T * image_N_px[0, 0] + image_N_px[:2, 2:]
-        ground = np.empty((3, len(uv_px)))
-        ground[:2] = xy_m.T * ground_N_m[0, 0] + ground_N_m[:2, 2:]
-        ground[2] = 1.0
+        image_N_px, image = normalized(np.ascontiguousarray(uv_px.T))
+        ground_N_m, places = normalized(np.ascontiguousarray(xy_m.T))
+        ground = np.concatenate([places, np.ones((1, len(uv_px)))])
         start = np.flatnonzero(np.diff(tick, prepend=tick[0] - 1))
         sigmas = sigma_px * image_N_px[0, 0], sigma_m * ground_N_m[0, 0]
         return cls(image, ground, tick, start, *sigmas, image_N_px, ground_N_m)
@@ -84,12 +82,15 @@ class Stream:
         return np.asarray(h / np.linalg.norm(h[..., 2, :], axis=-1)[..., None, None], dtype=np.float64)
 
 
-def normalization(points: Array) -> Array:
-    """The similarity (3, 3) that gives points (N, 2) mean 0 and spread 1 along each axis."""
-    center = points.mean(axis=0)
-    spread = np.sqrt(((points - center) ** 2).sum(axis=1).mean() / 2)
+def normalized(points: Array) -> tuple[Array, Array]:
+    """The similarity (3, 3) that gives points (2, N) mean 0 and spread 1 along each axis, and the points so moved."""
+    center = points.mean(axis=1, keepdims=True)
+    away = points - center
+    spread = float(np.sqrt((away * away).mean()))
     scale = 1.0 / spread if spread > 0 else 1.0
-    return np.array([[scale, 0, -scale * center[0]], [0, scale, -scale * center[1]], [0, 0, 1.0]])
+    away *= scale
+    to_unit = np.array([[scale, 0, -scale * center[0, 0]], [0, scale, -scale * center[1, 0]], [0, 0, 1.0]])
+    return to_unit, away
 
 
 def squared_errors(stream: Stream, image_H_ground: Array, nod: float = 0.0) -> Array:
