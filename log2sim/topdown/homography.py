@@ -21,6 +21,8 @@ from log2sim.topdown.stream import BOUND, Stream, losses
 METHODS = ("time-aware", "calibrated", "min-frame", "per-frame", "straw-man")
 # Sizes of cars differ by about so much, and so does a range that is told from a size.
 SIZE_SHARE = 0.1
+# Intrinsics of a lens of 1e5 px have a condition of 1e5.
+MOST_CONDITION = 1e12
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,9 +82,9 @@ def estimate_homography(
     -----
     "per-frame" is a RANSAC for each frame, and "straw-man" (Bhardwaj & Kalra) the same with ground positions that average
     sizes tell instead of a LiDAR. "min-frame" is their answer: of all frames' homographies the one with the least error
-    over all frames. "time-aware" draws one half of its hypotheses from single frames, where
-    correspondences share the camera's momentary pose, the other half from all, scores each over all frames and obstacles
-    with a bounded loss of the error in units of its expected size, and refines the best over all of its inliers.
+    over all frames. "time-aware" draws one half of its hypotheses from single frames, where correspondences share the
+    camera's momentary pose, the other half from all, scores each over all frames and obstacles with a bounded loss of the
+    error in units of its expected size, and refines the best over all of its inliers.
     "calibrated" does the same over the six parameters of the pose of a camera whose intrinsics are known.
     """
     uv, xy, frame = np.asarray(uv_px, float), np.asarray(xy_m, float), np.asarray(tick)
@@ -90,12 +92,12 @@ def estimate_homography(
         raise ValueError(f"uv_px and xy_m must be (N, 2) and tick (N,), got {uv.shape}, {xy.shape}, {frame.shape}")
     if method not in METHODS:
         raise ValueError(f"unknown method '{method}'; known: {', '.join(METHODS)}")
-    if method == "calibrated" and K is None:
-        raise ValueError("method 'calibrated' needs the intrinsics K")
+    intrinsics = np.zeros(0) if K is None else np.asarray(K, float)
+    if method == "calibrated" and intrinsics.shape != (3, 3):
+        raise ValueError(f"method 'calibrated' needs the intrinsics K (3, 3), got shape {intrinsics.shape}")
+    measured = xy
     if method == "straw-man":
-        if xy_by_size_m is None:
-            raise ValueError("method 'straw-man' needs the ground positions by average sizes, xy_by_size_m")
-        measured, xy = xy, np.asarray(xy_by_size_m, float)
+        xy = _sized(xy_by_size_m, uv.shape)
         sigma_m = max(sigma_m, SIZE_SHARE * _reach_m(xy))
     ticks, number = np.unique(frame, return_inverse=True)
     rows = np.flatnonzero(np.isfinite(uv[:, 0]) & np.isfinite(uv[:, 1]) & np.isfinite(xy[:, 0]) & np.isfinite(xy[:, 1]))
@@ -104,12 +106,15 @@ def estimate_homography(
     rows = rows[np.argsort(number[rows], kind="stable")]
     present, dense = np.unique(number[rows], return_inverse=True)
     stream = Stream.of(uv[rows], xy[rows], dense, sigma_px, sigma_m)
-    if method in ("time-aware", "calibrated"):
-        image_K = stream.image_N_px @ np.asarray(K, float) if K is not None else None
-        fit = _of_stream(stream, rng, image_K, calibrated=method == "calibrated", per_tick=per_tick)
+    of_stream = method in ("time-aware", "calibrated")
+    if of_stream:
+        image_K = stream.image_N_px @ intrinsics if method == "calibrated" else None
+        if image_K is not None and not (np.isfinite(intrinsics).all() and np.linalg.cond(intrinsics) < MOST_CONDITION):
+            return refused("the intrinsics K are singular", len(uv), ticks)
+        fit = _of_stream(stream, rng, image_K, per_tick=per_tick)
     else:
         fit = _of_frames(stream, rng, keep_all=method != "min-frame")
-    fit = _restored(fit, ticks, present, rows, len(uv))
+    fit = _restored(fit, ticks, present, rows, len(uv), of_stream)
     if method == "straw-man" and fit.ok:
         away = np.hypot(*(apply_homography(fit.ground_H_image, uv)[0] - measured)[fit.inliers].T)
         fit = replace(fit, error_m=float(np.nanmedian(away)) if np.isfinite(away).any() else float("nan"))
@@ -117,16 +122,29 @@ def estimate_homography(
 
 
 def _restored(
-    fit: HomographyFit, ticks: NDArray[Any], present: NDArray[np.int64], rows: NDArray[np.int64], count: int
+    fit: HomographyFit,
+    ticks: NDArray[Any],
+    present: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    count: int,
+    of_stream: bool,
 ) -> HomographyFit:
     """A fit of some rows and ticks as one of all that were given."""
     inliers = np.zeros(count, dtype=bool)
     inliers[rows] = fit.inliers
     each = fit.per_tick
     if each is not None:
-        each = np.full((len(ticks), 3, 3), np.nan)
+        # Where nothing was seen in a tick, what adds to the stream is as unknown as it is small.
+        each = np.repeat((fit.ground_H_image if of_stream else np.full((3, 3), np.nan))[None], len(ticks), axis=0)
         each[present] = fit.per_tick
     return replace(fit, inliers=inliers, ticks=ticks, per_tick=each)
+
+
+def _sized(xy_by_size_m: ArrayLike | None, shape: tuple[int, ...]) -> Array:
+    """The straw man's ground positions (N, 2), checked."""
+    if xy_by_size_m is None or np.shape(xy_by_size_m) != shape:
+        raise ValueError("method 'straw-man' needs the ground positions by average sizes, xy_by_size_m (N, 2)")
+    return np.asarray(xy_by_size_m, float)
 
 
 def _reach_m(xy: Array) -> float:
@@ -135,22 +153,14 @@ def _reach_m(xy: Array) -> float:
     return 2.0 * float(np.sqrt(known.var(axis=0).sum())) if len(known) else 0.0
 
 
-def ground_from_sizes(
-    uv_px: Array,
-    height_px: Array,
-    height_m: Array,
-    K: Array,
-    stand_m: tuple[float, float] = (0.0, 0.0),
-    yaw_rad: float = 0.0,
-) -> Array:
+def ground_from_sizes(uv_px: Array, height_px: Array, height_m: Array, K: Array, ego_T_cam: Array) -> Array:
     """Ground positions (N, 2) of feet (N, 2) from how high (N,) objects of average heights (N,) look: the straw man's ruler.
 
-    The camera stands at `stand_m` and looks ahead along `yaw_rad`, level.
+    `ego_T_cam` (4, 4) is where the camera stands and which way it looks.
     """
     depth = K[1, 1] * height_m / height_px
-    left = -(uv_px[:, 0] - K[0, 2]) / K[0, 0] * depth
-    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
-    return np.column_stack([stand_m[0] + c * depth - s * left, stand_m[1] + s * depth + c * left])
+    rays = np.column_stack([(uv_px - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(len(uv_px))])
+    return np.asarray((rays * depth[:, None]) @ ego_T_cam[:2, :3].T + ego_T_cam[:2, 3])
 
 
 def apply_homography(ground_H_image: Array, uv_px: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
@@ -176,19 +186,16 @@ def refused(reason: str, count: int, ticks: NDArray[Any] | None = None) -> Homog
     return HomographyFit(False, reason, none, np.zeros(count, dtype=bool), float("nan"), float("inf"), ticks)
 
 
-def _of_stream(
-    stream: Stream, rng: np.random.Generator, image_K: Array | None, *, calibrated: bool, per_tick: bool
-) -> HomographyFit:
+def _of_stream(stream: Stream, rng: np.random.Generator, image_K: Array | None, *, per_tick: bool) -> HomographyFit:
     """One homography over all ticks, and where asked what each tick adds to it."""
-    known = image_K if calibrated else None
     nod = NOD_PX * stream.image_N_px[0, 0] if per_tick else 0.0
-    found = search(stream, rng, nod=nod, image_K=known)
+    found = search(stream, rng, nod=nod, image_K=image_K)
     if found.h is None:
         return refused("every sample of four is collinear or coincident", stream.image.shape[1])
     if not per_tick:
-        return _fit(found, known)
-    moving = fit_moving(stream, found.h, known)
-    fit = _fit(Found(moving.image_H_ground, moving.stream, moving.at), known)
+        return _fit(found, image_K)
+    moving = fit_moving(stream, found.h, image_K)
+    fit = _fit(Found(moving.image_H_ground, moving.stream, moving.at), image_K)
     if not fit.ok:
         return fit
     return replace(fit, per_tick=stream.to_ground_H_image(moving.warps @ moving.image_H_ground))

@@ -10,7 +10,7 @@ from log2sim.topdown.stream import Stream, losses
 
 # Of four points no three may lie on a line: twice the area of their smallest triangle, where the data have spread 1.
 LEAST_AREA = 1e-7
-COARSE_ROWS = 96
+COARSE_ROWS = 80
 # Four noisy points miss the others by more than the noise, so hypotheses are scored with a wider bound.
 WIDER = 2.0
 
@@ -71,8 +71,8 @@ def _dual(points: Array) -> Array:
 def best_hypotheses(stream: Stream, found: Array, rng: np.random.Generator, nod: float, keep: int) -> Array:
     """The `keep` best of homographies (K, 3, 3): all on some of the correspondences, the better ones on all."""
     rows = stream.image.shape[1]
-    if rows > 2 * COARSE_ROWS and len(found) > 3 * keep:
+    if rows > 2 * COARSE_ROWS and len(found) > 2 * keep:
         some = stream.coarse(np.sort(rng.permutation(rows)[:COARSE_ROWS]), WIDER)
-        found = found[np.argsort(losses(some, found, nod), kind="stable")[: 3 * keep]]
+        found = found[np.argsort(losses(some, found, nod), kind="stable")[: 2 * keep]]
     loss = losses(stream.coarse(slice(None), WIDER), found, nod)
     return np.asarray(found[np.argsort(loss, kind="stable")[:keep]])

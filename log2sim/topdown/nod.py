@@ -54,10 +54,9 @@ def fit_moving(stream: Stream, h: Array, image_K: Array | None) -> Moving:
     for k in range(ROUNDS):
         warps = _warps(generators, angles)
         at = linearize(best, h[None], warps[best.tick])
-        if k >= 2:
-            best = best.with_noise(*noise(best, at, 8 + 2 * len(angles)))
-            at = linearize(best, h[None], warps[best.tick])
         h, angles, information = _step(best, h, angles, at, generators, spread, real, image_K)
+        if k >= 1:
+            best = best.with_noise(*noise(best, at, 8 + 2 * len(angles)))
         variance = 1.0 / (information + 1.0 / spread**2)
         if k == ROUNDS - 2:
             raw = angles * (1.0 + 1.0 / (spread**2 * np.maximum(information, 1e-12)))

@@ -14,9 +14,9 @@ from log2sim.topdown.refine import Linearized, free_directions, linearize, noise
 from log2sim.topdown.stream import BOUND, Stream, losses, normalized, squared_errors
 
 # Sets of four that are drawn, how many of them are scored, and the share of inliers below which the next line is tried.
-EFFORTS = ((500, 64, 0.36), (3000, 256, 0.0))
+EFFORTS = ((500, 64, 0.35), (3000, 256, 0.0))
 EFFORT_OF_A_FRAME = ((120, 48, 0.5), (500, 96, 0.0))
-POLISHED = 4
+POLISHED, POSES_POLISHED = 3, 2
 POLISH_ROWS = 160
 POLISH_BOUNDS = (4 * BOUND, 1.5 * BOUND)
 # The pose nearest to a homography misses what that fits, most of all where correspondences are few.
@@ -29,7 +29,7 @@ LEAST_SHARE = 0.2
 MOST_UNSURE = 0.25
 PROBES = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]])
 NEAR_BOUND = 8 * BOUND
-NOISE_ROUNDS, FINAL_ROUNDS = 2, 2
+NOISE_ROUNDS, FINAL_ROUNDS = 1, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +64,10 @@ def search(
             found = best_hypotheses(stream, found, rng, nod, POLISHED)
             tried = np.concatenate([tried, _polish(stream, found, rng, nod, image_K)])
         if len(tried):
-            loss = losses(stream, tried, nod)
-            tried = tried[[int(np.argmin(loss))]]
-            if loss.min() < (1 - share) * BOUND:
+            squared = squared_errors(stream, tried, nod)
+            best = int(np.argmin(np.minimum(squared, BOUND).sum(axis=1)))
+            tried = tried[[best]]
+            if np.count_nonzero(squared[best] < BOUND) > share * squared.shape[1]:
                 break
     if len(tried) == 0:
         return Found(None, stream)
@@ -81,7 +82,7 @@ def _polish(stream: Stream, found: Array, rng: np.random.Generator, nod: float, 
     found = refine_many(part, found, POLISH_BOUNDS)
     if image_K is None:
         return found
-    poses = nearest_poses(image_K, found)
+    poses = nearest_poses(image_K, found[np.argsort(losses(part, found), kind="stable")[:POSES_POLISHED]])
     poses = poses[np.isfinite(poses).all(axis=(1, 2))]
     for bound in POSE_BOUNDS if len(poses) else ():
         at = linearize(part, poses)
