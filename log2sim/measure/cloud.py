@@ -61,6 +61,10 @@ class Cloud:
         index = np.flatnonzero(self.ground & (np.hypot(self.xyz[:, 0], self.xyz[:, 1]) < GROUND_REACH_M))
         return index[:: max(len(index) // GROUND_SAMPLE, 1)]
 
+    def prepare(self) -> None:
+        """Compute now, in the thread that makes the cloud, what measuring in it will ask for."""
+        _ = self.obstacles_xyz, self.panorama, self.ground_sample
+
 
 def to_map(log: Log, lidar: str, sweep: Sweep, *, compensate: bool) -> tuple[Array, NDArray[np.float32]] | None:
     """Points (N, 3) float64 of a sweep in the map frame and their times (N,) s relative to its stamp.
