@@ -18,7 +18,7 @@ from log2sim.topdown.stream import BOUND, Stream
 # How much a camera is believed to move before it is known: pixels along v, and angle of roll.
 NOD_PX = 4.0
 ROLL_RAD = 2e-3
-ROUNDS = 6
+ROUNDS = 5
 MOST_CANDIDATES = 24
 # A movement is real where it is larger than noise makes it by more than so many standard deviations.
 REAL = 3.0
@@ -125,12 +125,14 @@ def _step(
     basis = free_directions(h) if image_K is None else tangent(image_K, h)
     wide = (basis.T @ wide.reshape(9, -1)).reshape(-1, *wide.shape[1:])
 
-    def by_tick(values: Array) -> Array:
-        return np.asarray(np.add.reduceat(values.sum(axis=-2), stream.start, axis=-1))
+    def by_tick(a: Array, b: Array) -> Array:
+        """Products (T, n, m) of two sets of rows (n, 2, N), (m, 2, N), summed over each tick."""
+        products = a[:, None, 0] * b[:, 0] + a[:, None, 1] * b[:, 1]
+        return np.asarray(np.add.reduceat(products, stream.start, axis=-1).transpose(2, 0, 1))
 
-    own = by_tick(turn[:, None] * turn[None]).transpose(2, 0, 1) + np.diag(1.0 / spread**2)
-    shared = by_tick(wide[:, None] * turn[None]).transpose(2, 0, 1)
-    pull = by_tick(turn * error).T + angles / spread**2
+    own = by_tick(turn, turn) + np.diag(1.0 / spread**2)
+    shared = by_tick(wide, turn)
+    pull = by_tick(turn, error[None])[:, :, 0] + angles / spread**2
     gain = shared @ np.linalg.inv(own)
     flat = wide.reshape(len(wide), -1)
     normal = flat @ flat.T - (gain @ shared.swapaxes(1, 2)).sum(axis=0)
