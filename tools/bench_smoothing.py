@@ -1,6 +1,6 @@
 """Noisy vehicle tracks with known truth: log2sim's smoother beside SciPy's splines and filters and filterpy.
 
-Four maneuvers of 20 s at 10 Hz: a lane change at 15 m/s, a right-angle turn with slowing down, a stop of 4 s, a slalom.
+Four maneuvers of 20 s at 10 Hz: a lane change at 15 m/s, a right-angle turn with slowing down, a stop, a slalom.
 A tenth of the samples is missing; where asked 3 % are outliers of 5 to 20 sigma.
 """
 
@@ -54,7 +54,7 @@ def maneuver(name: str) -> Motion:
         turn = np.pi / 2 / (1.2 * np.sqrt(np.pi)) * pulse(9.0, 1.2)
     elif name == "stop and go":
         speed = 13.0 * (1.0 - rises(5.0, 1.3)) + 11.0 * rises(14.0, 1.6)
-        speed = np.where(speed < 0.02, 0.0, speed)
+        speed = np.where(speed < 0.1, 0.0, speed)
         turn = 0.004 * speed * np.sin(0.5 * t)
     else:
         speed, turn = np.full_like(t, 10.0), 0.4 * np.sin(2 * np.pi * t / 5.0)
