@@ -111,6 +111,17 @@ def test_a_camera_that_pitches_by_a_tenth_of_a_degree_is_followed(method: str) -
     assert min(still) > 0.4  # one homography cannot follow
 
 
+def test_a_camera_that_pitches_by_far_more_than_expected_is_followed_too() -> None:
+    for seed in range(4):
+        world = nodding(seed, 0.4)
+        fit = world.fit(per_tick=True)
+        assert fit.ok, fit.reason
+        assert fit.per_tick is not None
+        assert world.error_m(fit.per_tick, NEAR_M) < 0.03
+        assert world.error_m(fit.per_tick, FAR_M) < 0.13
+        assert (fit.inliers & world.clean).sum() > 0.96 * world.clean.sum()
+
+
 @pytest.mark.parametrize("method", ["time-aware", "calibrated"])
 def test_a_camera_that_stands_still_gets_one_homography_though_more_are_asked_for(method: str) -> None:
     world = nodding(5)
@@ -400,6 +411,16 @@ def test_the_straw_man_is_as_good_as_its_sizes_and_says_how_far_off_it_is() -> N
     assert world.fit("time-aware").error_m < 0.02 * wrong.error_m * 5
     with pytest.raises(ValueError, match="average sizes"):
         world.fit("straw-man")
+
+
+def test_the_straw_man_allows_for_sizes_that_differ() -> None:
+    world = nodding(8, outliers=0.0)
+    sizes = np.random.default_rng(0).normal(1.0, 0.08, (40, 10))
+    by_size = world.xy * np.tile(sizes, (1, 2)).reshape(-1, 1)
+    fit = world.fit("straw-man", xy_by_size_m=by_size)
+    assert fit.ok, fit.reason
+    assert fit.inliers.mean() > 0.6
+    assert 0.3 < world.error_m(fit.ground_H_image, FAR_M) < 10.0
 
 
 # Extremes.

@@ -117,10 +117,12 @@ def errors_m(found: Array, stream: Stream, ranges_m: tuple[float, ...]) -> Array
 
 
 def limit(stream: Stream, noise_px: float, rows: Array | None = None) -> Array:
-    """The most likely `ground_H_image` of the clean correspondences, noise known and started at the truth."""
+    """The most likely `ground_H_image` of the clean correspondences, noise known and started at the truth; NaN below four."""
     from scipy.optimize import least_squares
 
     use = stream.clean if rows is None else stream.clean & rows
+    if use.sum() < 4:
+        return np.full((3, 3), np.nan)
     g, p, start = stream.xy[use], stream.uv[use], camera()
     w = g @ start[2, :2] + start[2, 2]
     slope = (start[:2, :2] - mapped(start, g)[:, :, None] * start[2:, :2]) / w[:, None, None]
@@ -320,7 +322,7 @@ def run(*, quick: bool) -> tuple[str, str]:
 
     cv2.setNumThreads(1)
     warnings.simplefilter("ignore")
-    seeds, repeats = (1, 3) if quick else (7, 7)
+    seeds, repeats = (1, 3) if quick else (5, 7)
     thresholds = best_thresholds()
     fixed = {f"{n:g} px, {o:.0%}": Case(n, o) for o in (0.3, 0.6) for n in (0.5, 1.0, 2.0)}
     few = {f"{n:g} px, {o:.0%}": Case(n, o, cars=3) for o in (0.3, 0.6) for n in (0.5, 1.0, 2.0)}

@@ -48,10 +48,11 @@ def fit_moving(stream: Stream, h: Array, image_K: Array | None) -> Moving:
     generators = _generators(stream, image_K)
     spread = np.array([NOD_PX * stream.image_N_px[0, 0], ROLL_RAD])
     angles = np.zeros((len(stream.start), 2))
-    angles[:, 0] = _agreed_shift(stream, h, spread[0])
     real = np.ones(2, dtype=bool)
     best = stream
     for k in range(ROUNDS):
+        if k < 2:  # the second time with a homography and a spread that fit this camera
+            angles[:, 0] = _agreed_shift(stream, h, spread[0])
         warps = _warps(generators, angles)
         at = linearize(best, h[None], warps[best.tick])
         h, angles, information = _step(best, h, angles, at, generators, spread, real, image_K)
