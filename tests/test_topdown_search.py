@@ -155,6 +155,14 @@ def test_ticks_with_few_points_stay_near_the_stream() -> None:
     assert moved_m(11) == 0.0
 
 
+def test_thousands_of_points_in_a_tick_are_no_burden() -> None:
+    world = nodding(6, 0.2, cars=1500, ticks=4)
+    fit = world.fit(per_tick=True)
+    assert fit.ok, fit.reason
+    assert fit.per_tick is not None
+    assert world.error_m(fit.per_tick, FAR_M) < 0.03
+
+
 def test_one_wrong_point_alone_in_its_tick_moves_nothing() -> None:
     world = nodding(7, 0.05, outliers=0.0)
     keep = (world.tick != 5) | (np.arange(len(world.tick)) % 20 == 0)

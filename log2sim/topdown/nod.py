@@ -19,7 +19,7 @@ from log2sim.topdown.stream import BOUND, Stream
 NOD_PX = 4.0
 ROLL_RAD = 2e-3
 ROUNDS = 5
-MOST_CANDIDATES = 24
+MOST_CANDIDATES, MOST_VOTERS = 24, 96
 # A movement is real where it is larger than noise makes it by more than so many standard deviations.
 REAL = 3.0
 
@@ -94,12 +94,16 @@ def _agreed_shift(stream: Stream, h: Array, spread: float) -> Array:
     at = linearize(stream, h[None])
     wu, wv, shear = at.whiten[:, 0]
     eu, ev = at.projected[0] - stream.image
-    width = int(stream.count.max())
-    column = np.arange(stream.image.shape[1]) - stream.start[stream.tick]
-    table = np.full((4, len(stream.start), width), np.nan)
-    table[:, stream.tick, column] = np.stack([-(ev - shear * eu), wv, (eu * wu) ** 2, np.ones_like(eu)])
-    asked, weight, aside, _ = table
-    candidates = np.concatenate([np.zeros((len(asked), 1)), asked[:, :MOST_CANDIDATES]], axis=1)
+    # Of ticks with very many correspondences an even part votes.
+    count = stream.count[stream.tick]
+    slots = np.minimum(count, MOST_VOTERS)
+    column = (np.arange(len(count)) - stream.start[stream.tick]) * slots // count
+    width = int(slots.max())
+    table = np.full((3, len(stream.start), width), np.nan)
+    table[:, stream.tick, column] = np.stack([-(ev - shear * eu), wv, (eu * wu) ** 2])
+    asked, weight, aside = table
+    some = asked[:, :: max(width // MOST_CANDIDATES, 1)]
+    candidates = np.concatenate([np.zeros((len(asked), 1)), some], axis=1)
     apart = (asked[:, None, :] - candidates[:, :, None]) * weight[:, None, :]
     bounded = np.fmin(apart * apart + aside[:, None, :], BOUND)
     bounded[np.broadcast_to(np.isnan(asked)[:, None, :], bounded.shape)] = 0.0
