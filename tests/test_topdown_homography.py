@@ -557,3 +557,37 @@ def test_a_handful_that_agrees_among_many_that_do_not_is_refused(count: int, agr
     fit = World(world.truth, uv, world.xy, world.tick, world.clean).fit()
     assert not fit.ok
     assert fit.reason.endswith(f"at least {needed} are needed")
+
+
+def test_feet_know_where_average_sizes_would_put_them() -> None:
+    camera = make_camera()[0]
+    good = measured(camera)
+    ego_T_cam = camera.mount_T_cam
+    feet_m = np.array([[12.0, 0.2], [20.0, 0.2], [30.0, 0.2], [40.0, 0.2]])
+    depth = apply(inverse(ego_T_cam), np.column_stack([feet_m, np.zeros(4)]))[:, 2]
+    box = good.box_px.copy()
+    box[:, 1] = box[:, 3] - K[1, 1] * TYPICAL_SIZE_M["car"][2] / depth
+    feet = foot_points(camera, measured(camera, box_px=box), EGO_T_MAP, 0)
+    assert feet.xy_by_size is not None
+    np.testing.assert_allclose(feet.xy_by_size, feet_m, atol=1e-6)
+    box[:, 1] = box[:, 3] - 2 * K[1, 1] * TYPICAL_SIZE_M["car"][2] / depth  # twice as high is half as far
+    near = foot_points(camera, measured(camera, box_px=box), EGO_T_MAP, 0).xy_by_size
+    assert near is not None
+    np.testing.assert_allclose(near - CAMERA_M, (feet_m - CAMERA_M) / 2, rtol=0.02, atol=0.05)
+
+
+def test_the_straw_man_has_no_lidar_and_calibrated_has_intrinsics() -> None:
+    feet = as_correspondences(make_world(24, each=12))
+    rng = np.random.default_rng(0)
+    fit, source = fit_camera(feet, feet, method="straw-man", rng=rng)
+    assert not fit.ok
+    assert source == "none"
+    sized = Correspondences.join([Correspondences(feet.uv, feet.xy_ego, feet.tick, feet.xy_ego), NOTHING])
+    fit, source = fit_camera(sized, NOTHING, method="straw-man", rng=rng)
+    assert fit.ok
+    assert source == "obstacles of average size"
+    fit, source = fit_camera(feet, NOTHING, method="calibrated", rng=rng, K=K)
+    assert fit.ok
+    assert source == "obstacles"
+    axes = np.linalg.inv(K) @ np.linalg.inv(fit.ground_H_image)
+    assert np.linalg.norm(axes[:, 0]) == pytest.approx(np.linalg.norm(axes[:, 1]), rel=1e-6)
