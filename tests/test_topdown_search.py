@@ -104,6 +104,9 @@ def test_a_camera_that_pitches_by_a_tenth_of_a_degree_is_followed(method: str) -
         assert fit.ok, fit.reason
         assert fit.per_tick is not None
         near.append(world.error_m(fit.per_tick, NEAR_M))
+        own = np.concatenate([apply_homography(h, world.uv[world.tick == t])[0] for t, h in enumerate(fit.per_tick)])
+        away = np.hypot(*(own - world.xy)[fit.inliers].T)
+        assert fit.error_m == pytest.approx(np.median(away), rel=1e-3)
         far.append(world.error_m(fit.per_tick, FAR_M))
         still.append(world.error_m(fit.ground_H_image, FAR_M))
     assert np.median(near) < 0.02

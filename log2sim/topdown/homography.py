@@ -158,7 +158,7 @@ def ground_from_sizes(uv_px: Array, height_px: Array, height_m: Array, K: Array,
 
     `ego_T_cam` (4, 4) is where the camera stands and which way it looks.
     """
-    depth = K[1, 1] * height_m / height_px
+    depth = K[1, 1] * height_m / np.where(height_px > 0, height_px, np.nan)
     rays = np.column_stack([(uv_px - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(len(uv_px))])
     return np.asarray((rays * depth[:, None]) @ ego_T_cam[:2, :3].T + ego_T_cam[:2, 3])
 
@@ -195,7 +195,8 @@ def _of_stream(stream: Stream, rng: np.random.Generator, image_K: Array | None, 
     if not per_tick:
         return _fit(found, image_K)
     moving = fit_moving(stream, found.h, image_K)
-    fit = _fit(Found(moving.image_H_ground, moving.stream, moving.at), image_K)
+    warps = moving.warps[stream.tick]
+    fit = _fit(Found(moving.image_H_ground, moving.stream, moving.at, warps), image_K)
     if not fit.ok:
         return fit
     return replace(fit, per_tick=stream.to_ground_H_image(moving.warps @ moving.image_H_ground))
@@ -230,7 +231,10 @@ def _fit(found: Found, image_K: Array | None) -> HomographyFit:
         return refused(health.reason, count)
     inliers = found.at.squared[0] < BOUND
     ground_H_image = stream.to_ground_H_image(found.h)
-    back = np.linalg.inv(found.h) @ np.vstack([stream.image, np.ones((1, count))])
+    seen = np.vstack([stream.image, np.ones((1, count))])
+    if found.warps is not None:
+        seen = np.linalg.solve(found.warps, seen.T[:, :, None])[:, :, 0].T
+    back = np.linalg.inv(found.h) @ seen
     error = np.hypot(*(back[:2] / back[2] - stream.ground[:2])[:, inliers]) / stream.ground_N_m[0, 0]
     return HomographyFit(
         True, "", ground_H_image, inliers, float(np.median(error)), health.condition, sigma_m=health.sigma_m

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from log2sim.geometry import Array
 from log2sim.topdown.pose import tangent, unit_pose
@@ -60,14 +61,21 @@ def fit_moving(stream: Stream, h: Array, image_K: Array | None) -> Moving:
             best = best.with_noise(*noise(best, at, 8 + 2 * len(angles)))
         variance = 1.0 / (information + 1.0 / spread**2)
         if k == ROUNDS - 2:
-            raw = angles * (1.0 + 1.0 / (spread**2 * np.maximum(information, 1e-12)))
-            told = information > 1.0 / spread**2 / 100
-            excess = np.array([(raw[told[:, i], i] ** 2 * information[told[:, i], i] - 1).sum() for i in range(2)])
-            real = excess > REAL * np.sqrt(2.0 * np.maximum(told.sum(axis=0), 1))
+            real = _is_real(angles, information, spread)
             angles = angles * real
         spread = np.sqrt(np.maximum((angles**2 + variance).mean(axis=0), spread**2 / 25))
     warps = _warps(generators, angles)
     return Moving(h, warps, best, linearize(best, h[None], warps[best.tick]))
+
+
+def _is_real(angles: Array, information: Array, spread: Array) -> NDArray[np.bool_]:
+    """Whether pitch and roll (2,) differ from zero over the ticks by more than noise makes them."""
+    told = information > 0.01 / spread**2
+    information = np.where(told, information, 1.0)
+    # What was drawn to zero by the spread as it would be without that.
+    free = angles * (1.0 + 1.0 / (spread**2 * information))
+    excess = np.where(told, free**2 * information - 1.0, 0.0).sum(axis=0)
+    return np.asarray(excess > REAL * np.sqrt(2.0 * np.maximum(told.sum(axis=0), 1)))
 
 
 def _generators(stream: Stream, image_K: Array | None) -> Array:

@@ -36,12 +36,13 @@ NOISE_ROUNDS, FINAL_ROUNDS = 1, 2
 class Found:
     """A homography (3, 3), ground to image in normalized units; the stream with its noise as found; the errors.
 
-    `h` is None where no four correspondences determine one.
+    `h` is None where no four correspondences determine one; `warps` (N, 3, 3) is what each one's tick adds.
     """
 
     h: Array | None
     stream: Stream
     at: Linearized | None = None
+    warps: Array | None = None
 
 
 def search(
