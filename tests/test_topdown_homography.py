@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import cv2
@@ -27,6 +28,8 @@ from log2sim.types import TYPICAL_SIZE_M, Camera, Measurements
 K = np.array([[1000.0, 0.0, 640.0], [0.0, 1000.0, 360.0], [0.0, 0.0, 1.0]])
 PROBES_M = np.array([[x, y] for x in (8.0, 15.0, 25.0, 40.0) for y in (-0.3 * x, 0.0, 0.3 * x)])
 CAMERA_M = np.array([1.5, 0.2])
+# The straw man believes sizes to a tenth only, so that its gate tells fewer outliers.
+FROM_LIDAR = tuple(m for m in METHODS if m != "straw-man")
 
 
 def make_camera(pitch_deg: float = 4.0, height_m: float = 1.6) -> tuple[Camera, np.ndarray]:
@@ -53,11 +56,13 @@ class World:
     xy: np.ndarray
     tick: np.ndarray
     clean: np.ndarray
+    K: np.ndarray = dataclasses.field(default_factory=lambda: K)
 
     def fit(self, method: str = "time-aware", seed: int = 0, **sigmas: float) -> HomographyFit:
         sigmas = {"sigma_px": 1.0, "sigma_m": 0.02, **sigmas}
         rng = np.random.default_rng(seed)
-        return estimate_homography(self.uv, self.xy, self.tick, method=method, rng=rng, **sigmas)
+        extra = {"calibrated": {"K": self.K}, "straw-man": {"xy_by_size_m": self.xy}}.get(method, {})
+        return estimate_homography(self.uv, self.xy, self.tick, method=method, rng=rng, **sigmas, **extra)
 
 
 def make_world(
@@ -147,9 +152,8 @@ def test_error_is_the_median_distance_on_the_ground() -> None:
 def test_too_few_correspondences_are_refused(method: str) -> None:
     for count in range(4):
         world = make_world(0, ticks=1, each=max(count, 1))
-        fit = estimate_homography(
-            world.uv[:count], world.xy[:count], world.tick[:count], method=method, rng=np.random.default_rng(0)
-        )
+        first = World(world.truth, *(a[:count] for a in (world.uv, world.xy, world.tick, world.clean)))
+        fit = first.fit(method)
         assert not fit.ok
         assert f"{count} correspondences" in fit.reason
         assert np.isnan(fit.ground_H_image).all()
@@ -205,7 +209,7 @@ def test_what_does_not_determine_a_homography_is_refused_with_a_reason(case: str
     np.testing.assert_array_equal(fit.ticks, np.unique(world.tick))
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", FROM_LIDAR)
 def test_rows_that_are_not_finite_change_nothing(method: str) -> None:
     world = make_world(2, noise_px=0.0, noise_m=0.0, outliers=0.2, ticks=10, each=10)
     uv, xy = world.uv.copy(), world.xy.copy()
@@ -216,18 +220,19 @@ def test_rows_that_are_not_finite_change_nothing(method: str) -> None:
     np.testing.assert_array_equal(fit.inliers, world.clean & ~bad)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", FROM_LIDAR)
 def test_moving_ground_or_pixels_moves_the_homography_alike(method: str) -> None:
     world = make_world(3, noise_px=0.0, noise_m=0.0, outliers=0.2, ticks=10, each=10)
     for shift_m, shift_px in (((1e6, -5e6), (0.0, 0.0)), ((0.0, 0.0), (3000.0, -900.0))):
-        moved = World(world.truth, world.uv + shift_px, world.xy + shift_m, world.tick, world.clean)
+        shifted_K = K + np.column_stack([np.zeros((3, 2)), [*shift_px, 0.0]])
+        moved = World(world.truth, world.uv + shift_px, world.xy + shift_m, world.tick, world.clean, shifted_K)
         fit = moved.fit(method)
         mapped, _ = apply_homography(fit.ground_H_image, to_image(world.truth, PROBES_M) + shift_px)
         np.testing.assert_allclose(mapped - shift_m, PROBES_M, atol=2e-5)
         np.testing.assert_array_equal(fit.inliers, world.clean)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", FROM_LIDAR)
 def test_order_of_rows_and_names_of_ticks_do_not_matter(method: str) -> None:
     world = make_world(5, noise_px=0.0, noise_m=0.0, outliers=0.2, ticks=10, each=10)
     order = np.random.default_rng(0).permutation(100)
@@ -552,3 +557,37 @@ def test_a_handful_that_agrees_among_many_that_do_not_is_refused(count: int, agr
     fit = World(world.truth, uv, world.xy, world.tick, world.clean).fit()
     assert not fit.ok
     assert fit.reason.endswith(f"at least {needed} are needed")
+
+
+def test_feet_know_where_average_sizes_would_put_them() -> None:
+    camera = make_camera()[0]
+    good = measured(camera)
+    ego_T_cam = camera.mount_T_cam
+    feet_m = np.array([[12.0, 0.2], [20.0, 0.2], [30.0, 0.2], [40.0, 0.2]])
+    depth = apply(inverse(ego_T_cam), np.column_stack([feet_m, np.zeros(4)]))[:, 2]
+    box = good.box_px.copy()
+    box[:, 1] = box[:, 3] - K[1, 1] * TYPICAL_SIZE_M["car"][2] / depth
+    feet = foot_points(camera, measured(camera, box_px=box), EGO_T_MAP, 0)
+    assert feet.xy_by_size is not None
+    np.testing.assert_allclose(feet.xy_by_size, feet_m, atol=1e-6)
+    box[:, 1] = box[:, 3] - 2 * K[1, 1] * TYPICAL_SIZE_M["car"][2] / depth  # twice as high is half as far
+    near = foot_points(camera, measured(camera, box_px=box), EGO_T_MAP, 0).xy_by_size
+    assert near is not None
+    np.testing.assert_allclose(near - CAMERA_M, (feet_m - CAMERA_M) / 2, rtol=0.02, atol=0.05)
+
+
+def test_the_straw_man_has_no_lidar_and_calibrated_has_intrinsics() -> None:
+    feet = as_correspondences(make_world(24, each=12))
+    rng = np.random.default_rng(0)
+    fit, source = fit_camera(feet, feet, method="straw-man", rng=rng)
+    assert not fit.ok
+    assert source == "none"
+    sized = Correspondences.join([Correspondences(feet.uv, feet.xy_ego, feet.tick, feet.xy_ego), NOTHING])
+    fit, source = fit_camera(sized, NOTHING, method="straw-man", rng=rng)
+    assert fit.ok
+    assert source == "obstacles of average size"
+    fit, source = fit_camera(feet, NOTHING, method="calibrated", rng=rng, K=K)
+    assert fit.ok
+    assert source == "obstacles"
+    axes = np.linalg.inv(K) @ np.linalg.inv(fit.ground_H_image)
+    assert np.linalg.norm(axes[:, 0]) == pytest.approx(np.linalg.norm(axes[:, 1]), rel=1e-6)

@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 
 from log2sim.camera import undistort
 from log2sim.geometry import Array
-from log2sim.topdown.homography import HomographyFit, apply_homography, estimate_homography, jacobian, refused
+from log2sim.topdown.homography import (
+    HomographyFit,
+    apply_homography,
+    estimate_homography,
+    ground_from_sizes,
+    jacobian,
+    refused,
+)
 from log2sim.types import TYPICAL_SIZE_M, Camera, Measurements
 
 __all__ = ["Correspondences", "HomographyFit", "estimate_homography", "fit_camera", "jitter_m", "locate"]
@@ -26,17 +33,23 @@ PROBED_M = np.array([[10.0, 0.0], [20.0, 0.0], [40.0, 0.0]])
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """Pixels `uv` (N, 2), free of distortion, their ground positions `xy_ego` (N, 2) and `tick` (N,), of one camera."""
+    """Pixels `uv` (N, 2), free of distortion, their ground positions `xy_ego` (N, 2) and `tick` (N,), of one camera.
+
+    `xy_by_size` (N, 2) is where average sizes put them without a LiDAR, NaN where there is no object to tell it.
+    """
 
     uv: Array
     xy_ego: Array
     tick: NDArray[np.int64]
+    xy_by_size: Array | None = None
 
     @classmethod
     def join(cls, parts: Sequence[Correspondences]) -> Correspondences:
         if not parts:
             return cls(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
-        return cls(*(np.concatenate([getattr(p, k) for p in parts]) for k in ("uv", "xy_ego", "tick")))
+        sized = [np.full((len(p.uv), 2), np.nan) if p.xy_by_size is None else p.xy_by_size for p in parts]
+        uv, xy, tick = (np.concatenate([getattr(p, k) for p in parts]) for k in ("uv", "xy_ego", "tick"))
+        return cls(uv, xy, tick, np.concatenate(sized))
 
 
 def pinhole(camera: Camera, uv: Array) -> Array:
@@ -61,20 +74,37 @@ def foot_points(camera: Camera, measured: Measurements, ego_T_map: Array, tick: 
         uv.append([(box[0] + box[2]) / 2, box[3]])
     if not rows.size:
         return Correspondences.join([])
-    return Correspondences(pinhole(camera, np.array(uv)), np.array(xy), np.full(len(rows), tick, dtype=np.int64))
+    feet, boxes = pinhole(camera, np.array(uv)), measured.box_px[rows]
+    height_m = np.array([TYPICAL_SIZE_M[str(c)][2] for c in measured.category[rows]])
+    ego_T_cam = camera.mount_T_cam if camera.mount == "ego" else ego_T_map @ camera.mount_T_cam
+    by_size = ground_from_sizes(feet, boxes[:, 3] - boxes[:, 1], height_m, camera.K, ego_T_cam)
+    return Correspondences(feet, np.array(xy), np.full(len(rows), tick, dtype=np.int64), by_size)
 
 
 def fit_camera(
-    feet: Correspondences, ground: Correspondences, *, method: str, rng: np.random.Generator
+    feet: Correspondences, ground: Correspondences, *, method: str, rng: np.random.Generator, K: Array | None = None
 ) -> tuple[HomographyFit, str]:
     """The homography of one camera, and what it was learned from.
 
     Obstacles come first; where there are too few of them or they do not determine it (cars of one lane are collinear),
-    LiDAR ground points join them.
+    LiDAR ground points join them. "straw-man" has no LiDAR and so the obstacles alone; "calibrated" needs `K` (3, 3).
     """
+    if method == "straw-man":
+        by_size = np.full((len(feet.uv), 2), np.nan) if feet.xy_by_size is None else feet.xy_by_size
+        fit = estimate_homography(
+            feet.uv, feet.xy_ego, feet.tick, method=method, rng=rng, sigma_px=FOOT_SIGMA_PX, xy_by_size_m=by_size
+        )
+        return fit, "obstacles of average size" if fit.ok else "none"
     if len(feet.uv) >= ENOUGH_FEET:
         fit = estimate_homography(
-            feet.uv, feet.xy_ego, feet.tick, method=method, rng=rng, sigma_px=FOOT_SIGMA_PX, sigma_m=2 * GROUND_SIGMA_M
+            feet.uv,
+            feet.xy_ego,
+            feet.tick,
+            method=method,
+            rng=rng,
+            K=K,
+            sigma_px=FOOT_SIGMA_PX,
+            sigma_m=2 * GROUND_SIGMA_M,
         )
         if fit.ok and fit.condition < 30:
             return fit, "obstacles"
@@ -82,7 +112,7 @@ def fit_camera(
     if len(both.uv) < 4:
         return refused(f"{len(both.uv)} correspondences in the whole log, at least 4 are needed", len(both.uv)), "none"
     fit = estimate_homography(
-        both.uv, both.xy_ego, both.tick, method=method, rng=rng, sigma_px=GROUND_SIGMA_PX, sigma_m=GROUND_SIGMA_M
+        both.uv, both.xy_ego, both.tick, method=method, rng=rng, K=K, sigma_px=GROUND_SIGMA_PX, sigma_m=GROUND_SIGMA_M
     )
     return fit, "obstacles and ground points"
 

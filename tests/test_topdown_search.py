@@ -1,0 +1,467 @@
+"""Parts of the homography estimators against closed forms and second methods, and what they reach on nodding cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pytest
+
+from log2sim.geometry import rotation_from_rpy
+from log2sim.topdown import HomographyFit, estimate_homography, jitter_m
+from log2sim.topdown.homography import apply_homography, ground_from_sizes
+from log2sim.topdown.hypotheses import draw, solve
+from log2sim.topdown.pose import nearest_poses, tangent
+from log2sim.topdown.refine import free_directions, linearize, noise
+from log2sim.topdown.stream import BOUND, Stream, losses, squared_errors
+
+K = np.array([[2050.0, 0.0, 960.0], [0.0, 2050.0, 640.0], [0.0, 0.0, 1.0]])
+HEIGHT_M = 2.1
+AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+NEAR_M, FAR_M = (6.0, 10.0, 15.0, 25.0), (30.0, 40.0, 50.0, 60.0)
+
+
+def image_H_ground(pitch_deg: float = 2.0, roll_deg: float = 0.0) -> np.ndarray:
+    """Flat ground to the image of a camera 2.1 m above it."""
+    cam_R_ground = AXES @ rotation_from_rpy(np.radians(roll_deg), np.radians(pitch_deg), 0.0).T
+    return K @ np.column_stack([cam_R_ground[:, :2], cam_R_ground @ [0.0, 0.0, -HEIGHT_M]])
+
+
+def through(h: np.ndarray, points: np.ndarray) -> np.ndarray:
+    q = points @ h[:, :2].T + h[:, 2]
+    return q[:, :2] / q[:, 2:]
+
+
+@dataclass
+class Nodding:
+    """A stream of box feet seen by a camera that may pitch and roll in each tick."""
+
+    uv: np.ndarray
+    xy: np.ndarray
+    tick: np.ndarray
+    clean: np.ndarray
+    poses: np.ndarray
+
+    def fit(self, method: str = "time-aware", seed: int = 0, **more: object) -> HomographyFit:
+        given = {"K": K, **more}
+        return estimate_homography(
+            self.uv,
+            self.xy,
+            self.tick,
+            method=method,
+            rng=np.random.default_rng(seed),
+            **given,  # type: ignore[arg-type]
+        )
+
+    def error_m(self, each: np.ndarray, ranges_m: tuple[float, ...]) -> float:
+        """Median distance on the ground between what homographies of all ticks and the truth say of the same pixels."""
+        ground = np.array([[x, y] for x in ranges_m for y in (-0.35 * x, 0.0, 0.35 * x) if abs(y) < 12])
+        uv = through(image_H_ground(), ground)
+        truth = [through(np.linalg.inv(h), uv) for h in self.poses]
+        found = [through(h, uv) for h in np.broadcast_to(each, (len(self.poses), 3, 3))]
+        return float(np.median(np.hypot(*np.moveaxis(np.array(found) - truth, -1, 0))))
+
+
+def nodding(
+    seed: int, nod_deg: float = 0.0, *, cars: int = 10, ticks: int = 40, noise_px: float = 1.0, outliers: float = 0.3
+) -> Nodding:
+    """Cars 6-60 m ahead, two feet each; in each tick the same number of outliers, half of them swapped, half too high."""
+    rng = np.random.default_rng([seed, 77])
+    x, y = rng.uniform(6.0, 60.0, (ticks, cars)), rng.uniform(-9.0, 9.0, (ticks, cars))
+    y = np.clip(y, -0.42 * x, 0.42 * x)
+    uv, xy, clean, poses = [], [], [], []
+    for k in range(ticks):
+        feet = np.concatenate([np.column_stack([x[k], y[k] + s]) for s in (0.9, -0.9)])
+        poses.append(image_H_ground(2.0 + nod_deg * rng.normal(), nod_deg * rng.normal()))
+        pixel = through(poses[-1], feet) + rng.normal(0.0, noise_px, feet.shape)
+        ground = feet + rng.normal(0.0, 0.05, feet.shape)
+        wrong = rng.permutation(2 * cars)[: round(2 * cars * outliers)]
+        swapped, high = wrong[::2], wrong[1::2]
+        ground[swapped] = np.roll(feet, 3, axis=0)[swapped] + rng.normal(0.0, 0.3, (len(swapped), 2))
+        pixel[high, 1] -= rng.uniform(20.0, 150.0, len(high))
+        uv.append(pixel)
+        xy.append(ground)
+        clean.append(~np.isin(np.arange(2 * cars), wrong))
+    tick = np.repeat(np.arange(ticks), 2 * cars)
+    return Nodding(np.concatenate(uv), np.concatenate(xy), tick, np.concatenate(clean), np.array(poses))
+
+
+def make_stream(seed: int = 0, **changes: float) -> Stream:
+    world = nodding(seed, **changes)  # type: ignore[arg-type]
+    return Stream.of(world.uv, world.xy, world.tick, 1.0, 0.05)
+
+
+# The camera that pitches.
+
+
+@pytest.mark.parametrize("method", ["time-aware", "calibrated"])
+def test_a_camera_that_pitches_by_a_tenth_of_a_degree_is_followed(method: str) -> None:
+    near, far, still = [], [], []
+    for seed in range(4):
+        world = nodding(seed, 0.1)
+        fit = world.fit(method, per_tick=True)
+        assert fit.ok, fit.reason
+        assert fit.per_tick is not None
+        near.append(world.error_m(fit.per_tick, NEAR_M))
+        own = np.concatenate([apply_homography(h, world.uv[world.tick == t])[0] for t, h in enumerate(fit.per_tick)])
+        away = np.hypot(*(own - world.xy)[fit.inliers].T)
+        assert fit.error_m == pytest.approx(np.median(away), rel=1e-3)
+        far.append(world.error_m(fit.per_tick, FAR_M))
+        still.append(world.error_m(fit.ground_H_image, FAR_M))
+    assert np.median(near) < 0.02
+    assert np.median(far) < 0.115
+    assert min(still) > 0.4  # one homography cannot follow
+
+
+def test_a_camera_that_pitches_by_far_more_than_expected_is_followed_too() -> None:
+    for seed in range(4):
+        world = nodding(seed, 0.4)
+        fit = world.fit(per_tick=True)
+        assert fit.ok, fit.reason
+        assert fit.per_tick is not None
+        assert world.error_m(fit.per_tick, NEAR_M) < 0.03
+        assert world.error_m(fit.per_tick, FAR_M) < 0.13
+        assert (fit.inliers & world.clean).sum() > 0.96 * world.clean.sum()
+
+
+@pytest.mark.parametrize("method", ["time-aware", "calibrated"])
+def test_a_camera_that_stands_still_gets_one_homography_though_more_are_asked_for(method: str) -> None:
+    world = nodding(5)
+    fit = world.fit(method, per_tick=True)
+    assert fit.per_tick is not None
+    assert jitter_m(fit) < 1e-9
+    assert world.error_m(fit.per_tick, FAR_M) < 0.06
+    assert world.fit(method).per_tick is None
+
+
+def test_ticks_with_few_points_stay_near_the_stream() -> None:
+    world = nodding(6, 0.1, outliers=0.0)
+    column = np.arange(len(world.tick)) % 20
+    keep = np.where(world.tick == 3, column < 1, np.where(world.tick == 7, column < 2, True))
+    world.uv[world.tick == 11] = np.nan
+    few = Nodding(world.uv[keep], world.xy[keep], world.tick[keep], world.clean[keep], world.poses)
+    fit = few.fit(per_tick=True)
+    assert fit.per_tick is not None
+    assert len(fit.per_tick) == 40
+    np.testing.assert_array_equal(fit.per_tick[11], fit.ground_H_image)
+    horizon = image_H_ground() @ [1.0, 0.0, 0.0]
+    ahead = np.array([horizon[:2] / horizon[2] + [0.0, 40.0]])
+
+    def moved_m(k: int) -> float:
+        """How far ground some 100 m ahead moves, in units of its distance."""
+        a, b = (apply_homography(h, ahead)[0][0] for h in (fit.per_tick[k], fit.ground_H_image))  # type: ignore[index]
+        return float(np.hypot(*(a - b)) / np.hypot(*b))
+
+    of_all = [moved_m(k) for k in range(40) if k not in (3, 7, 11)]
+    assert max(moved_m(3), moved_m(7)) < 1.2 * max(of_all)
+    assert moved_m(11) == 0.0
+
+
+def test_thousands_of_points_in_a_tick_are_no_burden() -> None:
+    world = nodding(6, 0.2, cars=1500, ticks=4)
+    fit = world.fit(per_tick=True)
+    assert fit.ok, fit.reason
+    assert fit.per_tick is not None
+    assert world.error_m(fit.per_tick, FAR_M) < 0.03
+
+
+def test_one_wrong_point_alone_in_its_tick_moves_nothing() -> None:
+    world = nodding(7, 0.05, outliers=0.0)
+    keep = (world.tick != 5) | (np.arange(len(world.tick)) % 20 == 0)
+    world.uv[np.flatnonzero(world.tick == 5)[0], 1] -= 80.0
+    lone = Nodding(world.uv[keep], world.xy[keep], world.tick[keep], world.clean[keep], world.poses)
+    fit = lone.fit(per_tick=True)
+    assert fit.per_tick is not None
+    still = [np.abs(through(np.linalg.inv(fit.per_tick[5]), np.array([[40.0, 0.0]])) -
+             through(np.linalg.inv(fit.ground_H_image), np.array([[40.0, 0.0]]))).max()]  # fmt: skip
+    assert max(still) < 4.0  # of 80 px
+
+
+# Few correspondences, many outliers.
+
+
+@pytest.mark.parametrize("method", ["time-aware", "calibrated"])
+@pytest.mark.parametrize(("cars", "outliers"), [(3, 0.6), (2, 0.5), (10, 0.7)])
+def test_many_outliers_are_overcome_even_where_no_frame_has_four_good_correspondences(
+    cars: int, outliers: float, method: str
+) -> None:
+    for seed in range(4):
+        world = nodding(seed, cars=cars, outliers=outliers)
+        fit = world.fit(method)
+        assert fit.ok, fit.reason
+        away = through(fit.ground_H_image, through(image_H_ground(), world.xy)) - world.xy
+        assert np.median(np.hypot(*away[world.clean].T)) < 0.1
+        assert (fit.inliers & ~world.clean).sum() <= 0.02 * len(world.tick)
+
+
+@pytest.mark.parametrize("method", ["time-aware", "calibrated", "min-frame"])
+def test_95_percent_outliers_are_refused(method: str) -> None:
+    fit = nodding(1, outliers=0.95).fit(method)
+    assert not fit.ok
+    assert "agree" in fit.reason or "determine" in fit.reason
+
+
+def test_noise_that_was_believed_wrongly_costs_little() -> None:
+    def error(**sigmas: float) -> float:
+        worlds = [nodding(seed, noise_px=0.7) for seed in range(6)]
+        return float(np.mean([w.error_m(w.fit(**sigmas).ground_H_image, FAR_M) for w in worlds]))
+
+    known = error(sigma_px=0.7, sigma_m=0.05)
+    assert error(sigma_px=2.1, sigma_m=0.05) < 1.25 * known
+    assert error(sigma_px=0.7, sigma_m=0.15) < 1.25 * known
+
+
+def test_a_homography_knows_how_sure_it_is() -> None:
+    ratios = []
+    for seed in range(30):
+        world = nodding(seed, cars=4, ticks=10, outliers=0.2)
+        fit = world.fit()
+        middle, spread = world.xy[fit.inliers].mean(axis=0), world.xy[fit.inliers].std(axis=0)
+        reach = float(np.sqrt((spread**2).sum() / 2))
+        probes = middle + reach * np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]])
+        away = through(fit.ground_H_image, through(image_H_ground(), probes)) - probes
+        ratios.append(np.hypot(*away.T).max() / fit.sigma_m)
+    assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.6
+
+
+# Calibrated.
+
+
+def test_calibrated_beats_what_eight_parameters_allow() -> None:
+    def limit(world: Nodding) -> np.ndarray:
+        uv, xy = world.uv[world.clean], world.xy[world.clean]
+        s = Stream.of(uv, xy, np.zeros(len(uv), dtype=np.int64), 1.0, 0.05)
+        h = s.image_N_px @ image_H_ground() @ np.linalg.inv(s.ground_N_m)
+        for _ in range(6):  # Gauss-Newton over the clean correspondences alone, from the truth
+            at = linearize(s, h[None])
+            slope = free_directions(h).T @ at.slope[0].reshape(9, -1)
+            step = np.linalg.lstsq(slope.T, -at.error[0].ravel(), rcond=None)[0]
+            h = h + (free_directions(h) @ step).reshape(3, 3)
+        return s.to_ground_H_image(h)
+
+    ours, eight = [], []
+    for seed in range(10):
+        world = nodding(seed, cars=3, ticks=20)
+        fit = world.fit("calibrated")
+        assert fit.ok
+        ours.append(world.error_m(fit.ground_H_image, NEAR_M))
+        eight.append(world.error_m(limit(world), NEAR_M))
+    assert np.mean(ours) < 0.85 * np.mean(eight)
+
+
+def test_calibrated_gives_a_homography_that_a_camera_can_have() -> None:
+    fit = nodding(3, cars=3).fit("calibrated")
+    axes = np.linalg.inv(K) @ np.linalg.inv(fit.ground_H_image)
+    gram = axes[:, :2].T @ axes[:, :2]
+    assert gram[0, 1] == pytest.approx(0.0, abs=1e-8 * gram[0, 0])
+    assert gram[0, 0] == pytest.approx(gram[1, 1], rel=1e-8)
+
+
+def test_calibrated_needs_intrinsics_that_are_some() -> None:
+    world = nodding(0, ticks=4)
+    with pytest.raises(ValueError, match="intrinsics"):
+        world.fit("calibrated", K=None)
+    for singular in (np.zeros((3, 3)), np.diag([2050.0, 0.0, 1.0]), np.full((3, 3), np.nan)):
+        fit = world.fit("calibrated", K=singular)
+        assert not fit.ok
+        assert "singular" in fit.reason
+
+
+def test_nearest_pose_is_the_polar_part() -> None:
+    rng = np.random.default_rng(0)
+    h = rng.normal(size=(20, 3, 3))
+    for found, given in zip(nearest_poses(K, h), h):
+        m = np.linalg.inv(K) @ given
+        u, s, vt = np.linalg.svd(m[:, :2], full_matrices=False)
+        expected = K @ np.column_stack([u @ vt, m[:, 2] / s.mean()])
+        np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-6)
+    assert np.isnan(nearest_poses(K, np.ones((1, 3, 3)))).any()
+
+
+def test_the_tangent_of_a_pose_is_that_of_small_turns_and_shifts() -> None:
+    step = 1e-6
+    pose = np.linalg.inv(K) @ image_H_ground(3.0, 1.0)
+    full = np.column_stack([pose[:, 0], pose[:, 1], pose[:, 2]])
+    derivatives = tangent(K, K @ full)
+    for k, axis in enumerate(np.eye(3)):
+        turned = full.copy()
+        turned[:, :2] = cv2.Rodrigues(axis * step)[0] @ full[:, :2]
+        np.testing.assert_allclose((K @ (turned - full)).ravel() / step, derivatives[:, k], rtol=1e-5, atol=1e-2)
+        shifted = full.copy()
+        shifted[:, 2] += axis * step
+        np.testing.assert_allclose((K @ (shifted - full)).ravel() / step, derivatives[:, 3 + k], rtol=1e-5, atol=1e-2)
+
+
+# Parts.
+
+
+def test_four_correspondences_give_the_homography_that_opencv_finds() -> None:
+    stream = make_stream(outliers=0.0)
+    rng = np.random.default_rng(1)
+    rows = draw(stream, rng, 200, across=True)
+    found = solve(stream, rows, keep=10_000)
+    assert 100 < len(found) < 200  # some are drawn twice, some near a line
+    reference = []
+    for quad in rows.T:
+        if len(set(quad.tolist())) == 4:
+            g, p = (a[:2, quad].T.astype(np.float32) for a in (stream.ground, stream.image))
+            reference.append(cv2.getPerspectiveTransform(g, p))
+    flat = np.array([h.ravel() / np.linalg.norm(h) for h in reference])
+    for h in found:
+        near = np.abs(flat @ (h.ravel() / np.linalg.norm(h))).max()
+        assert near == pytest.approx(1.0, abs=1e-4)
+
+
+def test_hypotheses_see_their_own_points_in_front_and_exactly() -> None:
+    stream = make_stream(outliers=0.3)
+    rows = draw(stream, np.random.default_rng(2), 300, across=False)
+    for quad in rows.T:
+        for h in solve(stream, quad[:, None], keep=5):
+            q = h @ stream.ground[:, quad]
+            assert (q[2] > 0).all()
+            np.testing.assert_allclose(q[:2] / q[2], stream.image[:, quad], atol=1e-6)
+
+
+def test_draws_keep_to_one_tick_unless_told_otherwise() -> None:
+    stream, rng = make_stream(), np.random.default_rng(0)
+    own = stream.tick[draw(stream, rng, 500, across=False)]
+    assert (own == own[0]).all()
+    assert len(np.unique(own)) == 40
+    mixed = stream.tick[draw(stream, rng, 500, across=True)]
+    assert (mixed == mixed[0]).all(axis=0).mean() < 0.01
+
+
+def test_squared_errors_are_those_of_the_definition() -> None:
+    stream = make_stream(3)
+    h = stream.image_N_px @ image_H_ground(2.05, 0.1) @ np.linalg.inv(stream.ground_N_m)
+    ours = squared_errors(stream, np.stack([h, -h]), nod=0.01)
+    for k in range(0, 800, 37):
+        (u, v), p = stream.image[:, k], stream.ground[:, k]
+        q = h @ p
+        equations = np.array([u * q[2] - q[0], v * q[2] - q[1]])
+        by_ground = np.outer([u, v], h[2, :2]) - h[:2, :2]
+        spread = q[2] ** 2 * np.diag([stream.sigma_image**2, stream.sigma_image**2 + 0.01**2])
+        spread += stream.sigma_ground**2 * by_ground @ by_ground.T
+        assert ours[0, k] == pytest.approx(equations @ np.linalg.solve(spread, equations), rel=1e-6)
+    assert np.isinf(ours[1]).all()  # everything behind the camera
+
+
+def test_derivatives_of_errors_are_those_of_differences() -> None:
+    stream = make_stream(4)
+    h = stream.image_N_px @ image_H_ground() @ np.linalg.inv(stream.ground_N_m)
+    at = linearize(stream, h[None])
+    wu, wv, shear = at.whiten[:, 0]
+    step = 1e-7
+    for k in range(9):
+        aside = np.eye(9)[k].reshape(3, 3) * step
+        a, b = (linearize(stream, g[None]).projected[0] for g in (h + aside, h - aside))
+        du, dv = (a - b) / (2 * step)
+        np.testing.assert_allclose(at.slope[0, k, 0], du * wu, rtol=1e-4, atol=1e-2)
+        np.testing.assert_allclose(at.slope[0, k, 1], (dv - shear * du) * wv, rtol=1e-4, atol=1e-2)
+
+
+def test_whitened_errors_of_clean_data_have_unit_variance() -> None:
+    stream = make_stream(5, outliers=0.0)
+    h = stream.image_N_px @ image_H_ground() @ np.linalg.inv(stream.ground_N_m)
+    at = linearize(stream, h[None])
+    assert np.mean(at.error[0] ** 2, axis=1) == pytest.approx([1.0, 1.0], abs=0.15)
+    assert np.mean(at.error[0, 0] * at.error[0, 1]) == pytest.approx(0.0, abs=0.12)
+    assert (at.squared[0] < BOUND).mean() == pytest.approx(0.99, abs=0.012)
+
+
+@pytest.mark.parametrize(("pixel", "place"), [(1.0, 1.0), (2.0, 0.5), (0.5, 2.0), (0.7, 0.7)])
+def test_noise_is_found_from_the_errors(pixel: float, place: float) -> None:
+    world = nodding(6, outliers=0.0)
+    stream = Stream.of(world.uv, world.xy, world.tick, 1.0 / pixel, 0.05 / place)
+    h = stream.image_N_px @ image_H_ground() @ np.linalg.inv(stream.ground_N_m)
+    for _ in range(6):
+        stream = stream.with_noise(*noise(stream, linearize(stream, h[None]), 0))
+    believed = stream.sigma_image / stream.image_N_px[0, 0], stream.sigma_ground / stream.ground_N_m[0, 0]
+    assert believed == pytest.approx((1.0, 0.05), rel=0.12)
+
+
+def test_bounded_losses_ignore_how_far_an_outlier_is() -> None:
+    world = nodding(7, outliers=0.0)
+    h = None
+    values = []
+    for far_px in (500.0, 5000.0):
+        uv = world.uv.copy()
+        uv[0] += [0.0, far_px]
+        stream = Stream.of(uv, world.xy, world.tick, 1.0, 0.05)
+        h = stream.image_N_px @ image_H_ground() @ np.linalg.inv(stream.ground_N_m)
+        values.append(losses(stream, h[None])[0] * len(uv))
+    assert values[0] == pytest.approx(values[1], rel=1e-6)
+
+
+# The straw man.
+
+
+def test_average_sizes_place_what_has_them() -> None:
+    height_m = np.array([1.5, 1.7, 1.5])
+    ground = np.array([[12.0, 2.0], [25.0, -6.0], [40.0, 0.0]])
+    ego_T_cam = np.eye(4)
+    ego_T_cam[:3, :3], ego_T_cam[:3, 3] = AXES.T, [1.5, 0.3, HEIGHT_M]
+    away = ground - [1.5, 0.3]
+    feet = np.column_stack([960 - 2050 * away[:, 1] / away[:, 0], 640 + 2050 * HEIGHT_M / away[:, 0]])
+    looks_px = 2050 * height_m / away[:, 0]
+    np.testing.assert_allclose(ground_from_sizes(feet, looks_px, height_m, K, ego_T_cam), ground, atol=1e-9)
+    taller = ground_from_sizes(feet, looks_px, height_m * 1.1, K, ego_T_cam)
+    np.testing.assert_allclose(taller - [1.5, 0.3], 1.1 * away, atol=1e-9)
+
+
+def test_the_straw_man_is_as_good_as_its_sizes_and_says_how_far_off_it_is() -> None:
+    world = nodding(8, outliers=0.0)
+    right = world.fit("straw-man", xy_by_size_m=world.xy)
+    assert world.error_m(right.ground_H_image, NEAR_M) < 0.5
+    wrong = world.fit("straw-man", xy_by_size_m=1.15 * world.xy)
+    assert wrong.ok
+    assert wrong.per_tick is not None
+    away = np.median(np.hypot(*(0.15 * world.xy).T))
+    assert wrong.error_m == pytest.approx(away, rel=0.2)
+    assert world.fit("time-aware").error_m < 0.02 * wrong.error_m * 5
+    with pytest.raises(ValueError, match="average sizes"):
+        world.fit("straw-man")
+
+
+def test_the_straw_man_allows_for_sizes_that_differ() -> None:
+    world = nodding(8, outliers=0.0)
+    sizes = np.random.default_rng(0).normal(1.0, 0.08, (40, 10))
+    by_size = world.xy * np.tile(sizes, (1, 2)).reshape(-1, 1)
+    fit = world.fit("straw-man", xy_by_size_m=by_size)
+    assert fit.ok, fit.reason
+    assert fit.inliers.mean() > 0.6
+    assert 0.3 < world.error_m(fit.ground_H_image, FAR_M) < 10.0
+
+
+# Extremes.
+
+
+@pytest.mark.parametrize("method", ["time-aware", "calibrated"])
+def test_large_offsets_and_stamps_change_nothing(method: str) -> None:
+    world = nodding(9)
+    plain = world.fit(method)
+    far = Nodding(world.uv, np.add(world.xy, [5e5, 5e6]), world.tick * 100_000_000 + 10**18, world.clean, world.poses)
+    moved = far.fit(method)
+    uv = through(image_H_ground(), np.array([[10.0, 1.0], [30.0, -4.0], [60.0, 3.0]]))
+    a, b = (apply_homography(f.ground_H_image, uv)[0] for f in (plain, moved))
+    np.testing.assert_allclose(b - [5e5, 5e6], a, atol=1e-4)
+    np.testing.assert_array_equal(plain.inliers, moved.inliers)
+
+
+@pytest.mark.parametrize("per_tick", [False, True])
+@pytest.mark.parametrize("method", ["time-aware", "calibrated"])
+def test_a_line_a_place_and_a_tick_alone_are_refused_or_right(method: str, per_tick: bool) -> None:
+    x = np.linspace(8.0, 50.0, 60)
+    tick = np.arange(60) // 6
+    rng = np.random.default_rng(0)
+    for xy in (np.column_stack([x, 0.2 * x + 1]), np.column_stack([x, 0 * x]), np.tile([[20.0, 1.0]], (60, 1))):
+        for noise_px in (0.0, 1.0):
+            uv = through(image_H_ground(), xy) + rng.normal(0.0, noise_px, (60, 2))
+            fit = Nodding(uv, xy, tick, np.ones(60, bool), np.empty(0)).fit(method, per_tick=per_tick)
+            assert not fit.ok
+            assert len(fit.reason) > 20
+    alone = nodding(2, ticks=1, outliers=0.2)
+    fit = alone.fit(method, per_tick=per_tick)
+    assert fit.ok, fit.reason
+    assert alone.error_m(fit.ground_H_image, NEAR_M) < 0.5
