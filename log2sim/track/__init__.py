@@ -36,10 +36,12 @@ def track(
         Tracks seen for a shorter time, after stitching, are taken for false alarms, unless the log itself is as short.
     """
     tracklets = track_forward(measurements, t_ns, birth_score=birth_score)
+    everything = Measurements.join(measurements)
+    first_row = np.cumsum([0, *(len(m) for m in measurements)])
     tracks = []
     for t in tracklets:
-        rows = Measurements.join([measurements[k].take([r]) for k, r in zip(t.ticks, t.rows)])
-        tracks.append(Track(category_of(rows), np.array(t.ticks, dtype=np.int64), rows))
+        rows = everything.take(first_row[t.ticks] + t.rows)
+        tracks.append(Track(category_of(rows), t.ticks, rows))
     joined = stitch(tracks, t_ns, max_gap_s=max_gap_s)
     kept = [t for t in joined if len(t) >= least_hits(t_ns, min_life_s)]
     return sorted(kept, key=lambda t: (int(t.tick[0]), float(t.measurements.center_m[0, 0])))

@@ -27,7 +27,7 @@ def predict(mean: Array, covariance: Array, dt_s: Array | float, acceleration: A
         noise[:, k, k] = density * span**3 / 3
         noise[:, k, k + 2] = noise[:, k + 2, k] = density * span * dt / 2
         noise[:, k + 2, k + 2] = density * span
-    return np.einsum("aij,aj->ai", step, mean), step @ covariance @ np.swapaxes(step, 1, 2) + noise
+    return (step @ mean[:, :, None])[..., 0], step @ covariance @ np.swapaxes(step, 1, 2) + noise
 
 
 def innovation(mean: Array, covariance: Array, xy: Array, r: Array, age_s: Array) -> tuple[Array, Array]:
@@ -35,13 +35,16 @@ def innovation(mean: Array, covariance: Array, xy: Array, r: Array, age_s: Array
 
     `age_s` (M,) is when each was measured relative to the states: a sweep sees an object before or after the tick.
     """
-    place = mean[:, None, :2] + age_s[None, :, None] * mean[:, None, 2:]
-    h_p = covariance[:, None, :2, :] + age_s[None, :, None, None] * covariance[:, None, 2:, :]
-    s = h_p[..., :2] + age_s[None, :, None, None] * h_p[..., 2:] + r[None]
-    d = xy[None] - place
-    determinant = s[..., 0, 0] * s[..., 1, 1] - s[..., 0, 1] ** 2
-    squared = s[..., 1, 1] * d[..., 0] ** 2 - 2 * s[..., 0, 1] * d[..., 0] * d[..., 1] + s[..., 0, 0] * d[..., 1] ** 2
-    return squared / determinant, np.log(determinant)
+    p = covariance[:, None]
+    dx, dy = xy[:, 0] - mean[:, :1], xy[:, 1] - mean[:, 1:2]
+    s_xx, s_xy, s_yy = p[..., 0, 0] + r[:, 0, 0], p[..., 0, 1] + r[:, 0, 1], p[..., 1, 1] + r[:, 1, 1]
+    if np.any(age_s):
+        dx, dy = dx - age_s * mean[:, 2:3], dy - age_s * mean[:, 3:4]
+        s_xx = s_xx + age_s * (2 * p[..., 0, 2] + age_s * p[..., 2, 2])
+        s_xy = s_xy + age_s * (p[..., 0, 3] + p[..., 1, 2] + age_s * p[..., 2, 3])
+        s_yy = s_yy + age_s * (2 * p[..., 1, 3] + age_s * p[..., 3, 3])
+    determinant = s_xx * s_yy - s_xy * s_xy
+    return (s_yy * dx * dx - 2 * s_xy * dx * dy + s_xx * dy * dy) / determinant, np.log(determinant)
 
 
 def update(mean: Array, covariance: Array, xy: Array, r: Array, age_s: Array) -> tuple[Array, Array]:
@@ -49,14 +52,14 @@ def update(mean: Array, covariance: Array, xy: Array, r: Array, age_s: Array) ->
     h = np.zeros((len(mean), 2, 4))
     h[:, 0, 0] = h[:, 1, 1] = 1.0
     h[:, 0, 2] = h[:, 1, 3] = age_s
-    s = h @ covariance @ np.swapaxes(h, 1, 2) + r
-    gain = np.swapaxes(np.linalg.solve(s, h @ covariance), 1, 2)
+    reach = h @ covariance
+    gain = np.swapaxes(np.linalg.solve(reach @ np.swapaxes(h, 1, 2) + r, reach), 1, 2)
     rest = np.eye(4) - gain @ h
-    mean = mean + np.einsum("aij,aj->ai", gain, xy - np.einsum("aij,aj->ai", h, mean))
+    mean = mean + (gain @ (xy[:, :, None] - h @ mean[:, :, None]))[..., 0]
     return mean, rest @ covariance @ np.swapaxes(rest, 1, 2) + gain @ r @ np.swapaxes(gain, 1, 2)
 
 
 def measurement_noise(covariance: Array, groups: NDArray[Any]) -> Array:
     """Noise (M, 2, 2) of box centers: the sensor's and what changing views add."""
-    extra = np.array([CENTER_SIGMA_M[str(g)] for g in groups])
-    return covariance + extra[:, None, None] ** 2 * np.eye(2)
+    extra = np.array([CENTER_SIGMA_M[g] for g in groups.tolist()])
+    return covariance + (extra**2)[:, None, None] * np.eye(2)
