@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.track.motion import (
     ACCELERATION_MPS2,
-    CENTER_SIGMA_M,
-    FIRST_SPEED_MPS,
+    first_velocity,
     innovation,
+    measurement_noise,
     predict,
     update,
 )
@@ -30,10 +30,9 @@ TENTATIVE_AGE_S = 0.45
 CONFIRMED_AGE_S = 1.2
 
 _NAMES = tuple(GROUPS)
+_NAME_ARRAY = np.array(_NAMES)
 _INDEX = {category: _NAMES.index(group) for category, group in GROUP_OF.items()}
 _ACCELERATION = np.array([ACCELERATION_MPS2[g] for g in _NAMES])
-_FIRST_SPEED = np.array([FIRST_SPEED_MPS[g] for g in _NAMES])
-_CENTER_NOISE = np.array([CENTER_SIGMA_M[g] ** 2 * np.eye(2) for g in _NAMES])
 _GROUP_COST = np.array([
     [0.0 if a == b else OTHER_GROUP_COST if (a, b) in RELATED else NOT_ALLOWED for b in _NAMES] for a in _NAMES
 ])  # fmt: skip
@@ -51,10 +50,10 @@ class Tracklet:
 
 
 def track_forward(
-    measurements: Sequence[Measurements], t_ns: NDArray[np.int64], *, birth_score: float
+    measurements: Sequence[Measurements], t_ns: NDArray[np.int64], *, birth_score: float, whole_boxes: bool = False
 ) -> list[Tracklet]:
     """Assign the measurements of T ticks (stamps (T,)) to tracklets, which come in the order of their births."""
-    tracker = ForwardTracker(birth_score=birth_score)
+    tracker = ForwardTracker(birth_score=birth_score, whole_boxes=whole_boxes)
     log: list[tuple[Index, NDArray[np.int64], Index]] = []
     for tick, found in enumerate(measurements):
         rows, number = tracker.step(found, int(t_ns[tick]))
@@ -72,11 +71,13 @@ class ForwardTracker:
     """Tracks that live now, as columns; `step` is causal.
 
     `number` (A,) names the tracks in the order of their births, `mean` (A, 4) and `covariance` (A, 4, 4) are their states at
-    the last tick, `seen_ns` (A,) when each got a measurement last, `hits` (A,) how many it has.
+    the last tick, `seen_ns` (A,) when each got a measurement last, `hits` (A,) how many it has. `whole_boxes` says that the
+    measurements come from a 3D detector: their centers do not move with the view and their yaw is the axis of motion.
     """
 
-    def __init__(self, *, birth_score: float) -> None:
+    def __init__(self, *, birth_score: float, whole_boxes: bool = False) -> None:
         self.birth_score = birth_score
+        self.whole_boxes = whole_boxes
         self.number = np.zeros(0, dtype=np.intp)
         self.mean, self.covariance = np.zeros((0, 4)), np.zeros((0, 4, 4))
         self.seen_ns, self.hits = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
@@ -95,7 +96,7 @@ class ForwardTracker:
         rows = np.flatnonzero(found.source != "")
         if len(rows) == 0:
             return rows, np.zeros(0, dtype=np.intp)
-        columns = _Columns(found, rows, now_ns)
+        columns = _Columns(found, rows, now_ns, whole_boxes=self.whole_boxes)
         strong = found.score[rows] >= self.birth_score
         tracks, taken = self._choose(columns, strong)
         self._update(tracks, columns, taken, now_ns)
@@ -167,7 +168,7 @@ class ForwardTracker:
         count, group = len(born), columns.group[born]
         mean, covariance = np.zeros((count, 4)), np.zeros((count, 4, 4))
         mean[:, :2], covariance[:, :2, :2] = columns.xy[born], columns.r[born]
-        covariance[:, 2, 2] = covariance[:, 3, 3] = _FIRST_SPEED[group] ** 2
+        covariance[:, 2:, 2:] = first_velocity(columns.yaw_rad[born], columns.name[born], whole_boxes=self.whole_boxes)
         self.number = np.concatenate([self.number, np.arange(self._born, self._born + count)])
         self.mean, self.covariance = np.concatenate([self.mean, mean]), np.concatenate([self.covariance, covariance])
         self.seen_ns = np.concatenate([self.seen_ns, np.full(count, now_ns, dtype=np.int64)])
@@ -179,8 +180,10 @@ class ForwardTracker:
 class _Columns:
     """The placed measurements of one tick as arrays for the filter."""
 
-    def __init__(self, found: Measurements, rows: Index, now_ns: int) -> None:
+    def __init__(self, found: Measurements, rows: Index, now_ns: int, *, whole_boxes: bool) -> None:
         self.xy = found.center_m[rows, :2]
+        self.yaw_rad = found.yaw_rad[rows]
         self.group = np.array([_INDEX[c] for c in found.category[rows].tolist()])
-        self.r = found.covariance[rows] + _CENTER_NOISE[self.group]
+        self.name = _NAME_ARRAY[self.group]
+        self.r = measurement_noise(found.covariance[rows], self.name, whole_boxes=whole_boxes)
         self.age_s = (found.t_ns[rows] - now_ns) / NS_PER_S

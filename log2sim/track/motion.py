@@ -12,6 +12,8 @@ from log2sim.geometry import Array
 # How fast an object of a group can be when it is first seen, and how fast its velocity may change (standard deviations).
 FIRST_SPEED_MPS = {"vehicle": 8.0, "two_wheeler": 4.0, "pedestrian": 1.5, "other": 3.0}
 ACCELERATION_MPS2 = {"vehicle": 2.5, "two_wheeler": 1.5, "pedestrian": 1.0, "other": 1.5}
+# What steers starts along its own axis; this share of its first speed may point across.
+ACROSS_SHARE = {"vehicle": 0.25, "two_wheeler": 0.4, "pedestrian": 1.0, "other": 1.0}
 # What a box center moves by when other sides of the object come into view.
 CENTER_SIGMA_M = {"vehicle": 0.35, "two_wheeler": 0.2, "pedestrian": 0.15, "other": 0.35}
 
@@ -59,7 +61,19 @@ def update(mean: Array, covariance: Array, xy: Array, r: Array, age_s: Array) ->
     return mean, rest @ covariance @ np.swapaxes(rest, 1, 2) + gain @ r @ np.swapaxes(gain, 1, 2)
 
 
-def measurement_noise(covariance: Array, groups: NDArray[Any]) -> Array:
-    """Noise (M, 2, 2) of box centers: the sensor's and what changing views add."""
+def measurement_noise(covariance: Array, groups: NDArray[Any], *, whole_boxes: bool = False) -> Array:
+    """Noise (M, 2, 2) of box centers: the sensor's and what changing views add, which is nothing to whole boxes."""
+    if whole_boxes:
+        return covariance
     extra = np.array([CENTER_SIGMA_M[g] for g in groups.tolist()])
     return covariance + (extra**2)[:, None, None] * np.eye(2)
+
+
+def first_velocity(yaw_rad: Array, groups: NDArray[Any], *, whole_boxes: bool = False) -> Array:
+    """Covariance (M, 2, 2) of the velocity of what was seen once: along the axis of a whole box more than across."""
+    along = np.array([FIRST_SPEED_MPS[g] for g in groups.tolist()])
+    if not whole_boxes:
+        return (along**2)[:, None, None] * np.eye(2)
+    across = along * np.array([ACROSS_SHARE[g] for g in groups.tolist()])
+    axis = np.stack([np.cos(yaw_rad), np.sin(yaw_rad)], axis=-1)
+    return (across**2)[:, None, None] * np.eye(2) + (along**2 - across**2)[:, None, None] * axis[:, :, None] * axis[:, None, :]

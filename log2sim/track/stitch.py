@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.track.motion import ACCELERATION_MPS2, FIRST_SPEED_MPS, measurement_noise, predict, update
+from log2sim.track.motion import ACCELERATION_MPS2, first_velocity, measurement_noise, predict, update
 from log2sim.types import GROUP_OF, Measurements, Track
 
 # 99.9 % of the squared Mahalanobis distance with 4 degrees of freedom.
@@ -35,7 +35,7 @@ class _Ends:
     group: NDArray[np.str_]
 
 
-def stitch(tracks: Sequence[Track], t_ns: NDArray[np.int64], *, max_gap_s: float) -> list[Track]:
+def stitch(tracks: Sequence[Track], t_ns: NDArray[np.int64], *, max_gap_s: float, whole_boxes: bool = False) -> list[Track]:
     """Join tracks whose ends meet, cheapest pairs first, until nothing meets any more.
 
     Both ends are carried to the middle of the gap with the uncertainty that the gap adds, and must agree there in place
@@ -45,7 +45,7 @@ def stitch(tracks: Sequence[Track], t_ns: NDArray[np.int64], *, max_gap_s: float
 
     current = list(tracks)
     while len(current) > 1:
-        cost = _meeting_costs(_ends(current), max_gap_s)
+        cost = _meeting_costs(_ends(current, whole_boxes=whole_boxes), max_gap_s)
         i, j = linear_sum_assignment(cost)
         met = cost[i, j] < FORBIDDEN
         if not met.any():
@@ -88,30 +88,32 @@ def _meeting_costs(ends: _Ends, max_gap_s: float) -> Array:
     return cost
 
 
-def _ends(tracks: Sequence[Track]) -> _Ends:
+def _ends(tracks: Sequence[Track], *, whole_boxes: bool) -> _Ends:
     group = np.array([GROUP_OF[t.category] for t in tracks])
     parts = [t.measurements for t in tracks]
     return _Ends(
         np.array([m.t_ns[0] for m in parts]),
         np.array([m.t_ns[-1] for m in parts]),
-        _filtered([np.arange(len(m))[:MEMORY][::-1] for m in parts], parts, group),
-        _filtered([np.arange(len(m))[-MEMORY:] for m in parts], parts, group),
+        _filtered([np.arange(len(m))[:MEMORY][::-1] for m in parts], parts, group, whole_boxes=whole_boxes),
+        _filtered([np.arange(len(m))[-MEMORY:] for m in parts], parts, group, whole_boxes=whole_boxes),
         group,
     )
 
 
 def _filtered(
-    orders: Sequence[NDArray[np.intp]], parts: Sequence[Measurements], group: NDArray[np.str_]
+    orders: Sequence[NDArray[np.intp]], parts: Sequence[Measurements], group: NDArray[np.str_], *, whole_boxes: bool
 ) -> tuple[Array, Array]:
     """Filter states (A, 4) and covariances (A, 4, 4) of all tracks after the last of the rows that each is given in order."""
     count = np.array([len(o) for o in orders])
     start = np.cumsum(count) - count
     xy = np.concatenate([m.center_m[o, :2] for m, o in zip(parts, orders)])
     t_ns = np.concatenate([m.t_ns[o] for m, o in zip(parts, orders)])
-    r = measurement_noise(np.concatenate([m.covariance[o] for m, o in zip(parts, orders)]), np.repeat(group, count))
+    r = np.concatenate([m.covariance[o] for m, o in zip(parts, orders)])
+    r = measurement_noise(r, np.repeat(group, count), whole_boxes=whole_boxes)
+    yaw = np.array([m.yaw_rad[o[0]] for m, o in zip(parts, orders)])
     mean, covariance = np.zeros((len(parts), 4)), np.zeros((len(parts), 4, 4))
     mean[:, :2], covariance[:, :2, :2] = xy[start], r[start]
-    covariance[:, 2, 2] = covariance[:, 3, 3] = np.array([FIRST_SPEED_MPS[g] for g in group.tolist()]) ** 2
+    covariance[:, 2:, 2:] = first_velocity(yaw, group, whole_boxes=whole_boxes)
     noise = np.array([ACCELERATION_MPS2[g] for g in group.tolist()])
     for k in range(1, int(count.max())):
         on = np.flatnonzero(count > k)
