@@ -152,8 +152,7 @@ def rows_offline(boxes: Boxes, measurements: Sequence[Measurements]) -> Rows:
     score = np.array([_confidence(t, boxes) for t in tracks])[paths.track]
     category = np.array([boxes.category[t.measurements.points][t.measurements.category == t.category][0] for t in tracks])
     keep = seen | ((score >= FILL_SCORE) & (_gap_frames(seen) <= FILL_FRAMES))
-    xy = np.where(seen[:, None], Measurements.join(measurements).center_m[model, :2], paths.mean[:, :2])
-    return Rows(paths.tick, paths.track, source, model, xy, score, category[paths.track]).take(keep)
+    return Rows(paths.tick, paths.track, source, model, paths.mean[:, :2], score, category[paths.track]).take(keep)
 
 
 def _confidence(t: Track, boxes: Boxes) -> float:
@@ -171,14 +170,11 @@ def as_seen(rows: Rows, boxes: Boxes, measurements: Measurements, view: View, fi
     rows = rows.take(np.lexsort([rows.track, rows.frame]))
     columns = {**vars(boxes.take(rows.model)), "frame": rows.frame, "track_id": rows.track, "score": rows.score}
     columns |= {"category": rows.category}
-    made = np.flatnonzero(rows.source < 0)
-    if len(made):
-        model = rows.model[made]
-        center = np.column_stack([rows.xy_m[made], measurements.center_m[model, 2]])
-        fresh = from_map(center, measurements.size_m[model], measurements.yaw_rad[model], rows.frame[made], view)
-        for name, value in fresh.items():
-            columns[name] = columns[name].copy()
-            columns[name][made] = value
+    center = np.column_stack([rows.xy_m, measurements.center_m[rows.model, 2]])
+    in_camera = from_map(center, measurements.size_m[rows.model], measurements.yaw_rad[rows.model], rows.frame, view)
+    # In the image the detector knows better than a box around a box.
+    in_camera["box_px"] = np.where((rows.source < 0)[:, None], in_camera["box_px"], boxes.box_px[rows.model])
+    columns |= in_camera
     inside = np.isfinite(columns["box_px"]).all(axis=1)
     out, source = Boxes(**columns).take(inside), rows.source[inside]
     hidden = hidden_share(out, len(view.map_T_cam))

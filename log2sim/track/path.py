@@ -26,8 +26,10 @@ class Paths:
     covariance: Array
 
 
-def smooth_paths(tracks: Sequence[Track], t_ns: NDArray[np.int64], *, whole_boxes: bool = False) -> Paths:
+def smooth_paths(tracks: Sequence[Track], t_ns: NDArray[np.int64], *, whole_boxes: bool = False, before: int = 0, after: int = 0) -> Paths:
     """Most probable states of all tracks at all ticks from their first to their last measurement.
+
+    They go on for `before` ticks into the past and `after` ticks into the future, as far as there are ticks.
 
     Notes
     -----
@@ -46,8 +48,28 @@ def smooth_paths(tracks: Sequence[Track], t_ns: NDArray[np.int64], *, whole_boxe
     for k, t in enumerate(tracks):
         row[start[k] + t.tick - first[k]] = np.arange(len(t))
     grid = _Grid(tracks, start, length, np.asarray(t_ns, dtype=np.int64)[tick], row, whole_boxes=whole_boxes)
-    mean, covariance = grid.smoothed()
-    return Paths(track, tick, row, mean, covariance)
+    paths = Paths(track, tick, row, *grid.smoothed())
+    ends = [start + length - 1 + 0 * k for k in range(after)], [start + 0 * k for k in range(before)]
+    steps = [np.full(len(tracks), k + 1) for k in range(after)], [np.full(len(tracks), -k - 1) for k in range(before)]
+    origin, step = np.concatenate([*ends[0], *ends[1], start[:0]]), np.concatenate([*steps[0], *steps[1], start[:0]])
+    return _prolonged(paths, origin, step, grid.noise, t_ns) if len(origin) else paths
+
+
+def _prolonged(
+    paths: Paths, origin: NDArray[np.int64], step: NDArray[np.int64], noise: Array, t_ns: NDArray[np.int64]
+) -> Paths:
+    """The paths with rows predicted `step` (K,) ticks from the rows `origin` (K,), in the order of tracks and ticks."""
+    tick = paths.tick[origin] + step
+    there = (tick >= 0) & (tick < len(t_ns))
+    origin, tick = origin[there], tick[there]
+    dt_s = (t_ns[tick] - t_ns[paths.tick[origin]]) / NS_PER_S
+    mean, covariance = predict(paths.mean[origin], paths.covariance[origin], dt_s, noise[paths.track[origin]])
+    track = np.concatenate([paths.track, paths.track[origin]])
+    ticks = np.concatenate([paths.tick, tick])
+    order = np.lexsort([ticks, track])
+    row = np.concatenate([paths.row, np.full(len(tick), -1)])
+    means, covariances = np.concatenate([paths.mean, mean]), np.concatenate([paths.covariance, covariance])
+    return Paths(track[order], ticks[order], row[order], means[order], covariances[order])
 
 
 class _Grid:
