@@ -42,6 +42,8 @@ COAST_S, COAST_HITS, COAST_SCORE = 0.15, 5, 4.0
 # Offline, gaps up to this are bridged; in tracks of at least this confidence those up to so many frames are filled.
 MAX_GAP_S = 2.0
 FILL_SCORE, FILL_FRAMES, FILL_HIDDEN = 4.0, 7, 0.7
+# Who comes into the detector's range this far away, or leaves it there, was there a little before and is a little longer.
+FAR_M, FAR_FRAMES = 55.0, 4
 
 Index = NDArray[np.int64]
 
@@ -143,15 +145,20 @@ def rows_offline(boxes: Boxes, measurements: Sequence[Measurements]) -> Rows:
     # The tracker does not read how many points there were, so the row of a detection travels in their place.
     marked = [replace(m, points=first[k] + np.arange(len(m))) for k, m in enumerate(measurements)]
     tracks = track(marked, t_ns, birth_score=0.0, max_gap_s=MAX_GAP_S, min_life_s=0.0, whole_boxes=True)
-    paths = smooth_paths(tracks, t_ns, whole_boxes=True)
+    paths = smooth_paths(tracks, t_ns, whole_boxes=True, before=FAR_FRAMES, after=FAR_FRAMES)
     rows_of = np.concatenate([t.measurements.points for t in tracks])
     seen = paths.row >= 0
     source = np.full(len(seen), -1, dtype=np.int64)
     source[seen] = rows_of
-    model = rows_of[np.cumsum(seen) - 1]
+    # What is not seen looks like the detection before; ahead of the first one, like that one.
+    before = paths.tick < np.array([t.tick[0] for t in tracks])[paths.track]
+    model = rows_of[np.cumsum(seen) - 1 + before]
     score = np.array([_confidence(t, boxes) for t in tracks])[paths.track]
     category = np.array([boxes.category[t.measurements.points][t.measurements.category == t.category][0] for t in tracks])
-    keep = seen | ((score >= FILL_SCORE) & (_gap_frames(seen) <= FILL_FRAMES))
+    beyond = before | (paths.tick > np.array([t.tick[-1] for t in tracks])[paths.track])
+    far = np.hypot(*boxes.bottom_m[model][:, [0, 2]].T) >= FAR_M
+    short = _gap_frames(seen, paths.track) <= FILL_FRAMES
+    keep = seen | ((score >= FILL_SCORE) & np.where(beyond, far, short))
     return Rows(paths.tick, paths.track, source, model, paths.mean[:, :2], score, category[paths.track]).take(keep)
 
 
@@ -159,9 +166,9 @@ def _confidence(t: Track, boxes: Boxes) -> float:
     return float(boxes.score[t.measurements.points].mean() + np.log(min(len(t), FULL_HITS)))
 
 
-def _gap_frames(seen: NDArray[np.bool_]) -> Index:
-    """Length (N,) of the run of rows alike that each row is in; tracks begin and end with seen rows, so gaps never join."""
-    run = np.cumsum(np.r_[False, seen[1:] != seen[:-1]])
+def _gap_frames(seen: NDArray[np.bool_], number: Index) -> Index:
+    """Length (N,) of the run of rows alike of one track that each row is in."""
+    run = np.cumsum(np.r_[False, (seen[1:] != seen[:-1]) | (number[1:] != number[:-1])])
     return np.bincount(run)[run]
 
 
