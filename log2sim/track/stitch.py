@@ -73,7 +73,10 @@ def _meeting_costs(ends: _Ends, max_gap_s: float) -> Array:
     speed = np.maximum(np.hypot(*last[:, 2:].T), np.hypot(*first[:, 2:].T))
     stood = (speed < STANDING_MPS) & (apart < STANDING_APART_M)
     cost[a[stood], b[stood]] = apart[stood]
-    near = np.flatnonzero(~stood & (gap_s <= max_gap_s))
+    half = gap_s[:, None] / 2
+    beside = np.hypot(*(last[:, :2] + half * last[:, 2:] - first[:, :2] + half * first[:, 2:]).T)
+    # Farther apart than this no allowed uncertainty brings them together.
+    near = np.flatnonzero(~stood & (gap_s <= max_gap_s) & (beside <= np.sqrt(GATE) * VAGUE_M))
     a, b, half = a[near], b[near], gap_s[near] / 2
     noise = np.array([ACCELERATION_MPS2[g] for g in ends.group[a].tolist()])
     forward = predict(ends.last[0][a], ends.last[1][a], half, noise)
