@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -69,7 +70,8 @@ def _poses(path: Path) -> Array:
 
 def _rect_T_imu(c: Mapping[str, Array], path: Path) -> Array:
     rect = transform(
-        kitti.checked_rotation(kitti.entry(c, path, (3, 3), "R0_rect", "R_rect"), f"{path}, entry 'R0_rect'"), np.zeros(3)
+        kitti.checked_rotation(kitti.entry(c, path, (3, 3), "R0_rect", "R_rect"), f"{path}, entry 'R0_rect'"),
+        np.zeros(3),
     )
     links = []
     for keys in (("Tr_velo_to_cam", "Tr_velo_cam"), ("Tr_imu_to_velo", "Tr_imu_velo")):
@@ -106,14 +108,16 @@ def to_measurements(boxes: Boxes, view: View) -> list[Measurements]:
         height_px_m=boxes.size_hwl_m[:, 0],
     )
     cuts = np.searchsorted(boxes.frame, np.arange(len(view.map_T_cam) + 1))
-    return [everything.take(slice(a, b)) for a, b in zip(cuts[:-1], cuts[1:])]
+    return [everything.take(slice(a, b)) for a, b in pairwise(cuts)]
 
 
 def from_map(center_m: Array, size_m: Array, yaw_rad: Array, frame: NDArray[np.int64], view: View) -> dict[str, Array]:
     """Columns of `Boxes` for boxes (N,) given in the map: length, width, height and yaw about z."""
     cam_T_map = inverse(view.map_T_cam[frame])
     center = apply(cam_T_map, center_m)
-    ahead = np.einsum("nij,nj->ni", cam_T_map[:, :3, :3], np.column_stack([np.cos(yaw_rad), np.sin(yaw_rad), 0 * yaw_rad]))
+    ahead = np.einsum(
+        "nij,nj->ni", cam_T_map[:, :3, :3], np.column_stack([np.cos(yaw_rad), np.sin(yaw_rad), 0 * yaw_rad])
+    )
     bottom = center.copy()
     bottom[:, 1] += size_m[:, 2] / 2
     yaw = np.arctan2(-ahead[:, 2], ahead[:, 0])
@@ -149,7 +153,7 @@ def hidden_share(boxes: Boxes, frames: int) -> Array:
     grid = low[:, None] + (high - low)[:, None] * steps[:, None]
     out = np.zeros(len(boxes))
     cuts = np.searchsorted(boxes.frame, np.arange(frames + 1))
-    for a, b in zip(cuts[:-1], cuts[1:]):
+    for a, b in pairwise(cuts):
         if b - a < 2:
             continue
         nearer = depth[None, a:b] < depth[a:b, None] - NEARER_M

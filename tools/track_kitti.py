@@ -154,7 +154,9 @@ def rows_offline(boxes: Boxes, measurements: Sequence[Measurements]) -> Rows:
     before = paths.tick < np.array([t.tick[0] for t in tracks])[paths.track]
     model = rows_of[np.cumsum(seen) - 1 + before]
     score = np.array([_confidence(t, boxes) for t in tracks])[paths.track]
-    category = np.array([boxes.category[t.measurements.points][t.measurements.category == t.category][0] for t in tracks])
+    category = np.array(
+        [boxes.category[t.measurements.points][t.measurements.category == t.category][0] for t in tracks]
+    )
     beyond = before | (paths.tick > np.array([t.tick[-1] for t in tracks])[paths.track])
     far = np.hypot(*boxes.bottom_m[model][:, [0, 2]].T) >= FAR_M
     short = _gap_frames(seen, paths.track) <= FILL_FRAMES
@@ -192,7 +194,9 @@ def as_seen(rows: Rows, boxes: Boxes, measurements: Measurements, view: View, fi
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--detections", type=Path, action="append", required=True, help="folder of one category; repeatable")
+    parser.add_argument(
+        "--detections", type=Path, action="append", required=True, help="folder of one category; repeatable"
+    )
     parser.add_argument("--calib", type=Path, required=True)
     parser.add_argument("--ego-motion", type=Path, help="folder of poses t x y z qx qy qz qw, one row a frame")
     parser.add_argument("--online", action="store_true", help="causal: no frame knows of a later one")
@@ -208,9 +212,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(detections: Sequence[Path], calib: Path, ego_motion: Path | None, out: Path, *, online: bool) -> None:
     """Track all sequences and write their results; tells what was done with which."""
+    detections = [f for folder in detections for f in (folder, *sorted(folder.glob("*/"))) if any(f.glob("*.txt"))]
     names = sorted({p.stem for folder in detections for p in folder.glob("*.txt")})
     if not names:
-        raise LogError(f"{', '.join(map(str, detections))}: no files NNNN.txt with detections")
+        raise LogError("--detections: no files NNNN.txt in the given folders; expected one a sequence")
     out.mkdir(parents=True, exist_ok=True)
     frames, seconds = 0, 0.0
     for name in names:
@@ -226,7 +231,9 @@ def run(detections: Sequence[Path], calib: Path, ego_motion: Path | None, out: P
         seconds += time.perf_counter() - began
         frames += count
         write_tracks(out / f"{name}.txt", tracks)
-        frame = "map frame" if poses is not None else "frame of the car: its motion is not known and nothing stands for it"
+        frame = (
+            "map frame" if poses is not None else "frame of the car: its motion is not known and nothing stands for it"
+        )
         print(f"{name}: {count} frames, {len(np.unique(tracks.track_id))} tracks, {frame}")
     print(f"{frames} frames in {seconds:.2f} s: {frames / max(seconds, 1e-9):.0f} frames/s without reading and writing")
 

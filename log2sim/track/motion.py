@@ -76,4 +76,6 @@ def first_velocity(yaw_rad: Array, groups: NDArray[Any], *, whole_boxes: bool = 
         return (along**2)[:, None, None] * np.eye(2)
     across = along * np.array([ACROSS_SHARE[g] for g in groups.tolist()])
     axis = np.stack([np.cos(yaw_rad), np.sin(yaw_rad)], axis=-1)
-    return (across**2)[:, None, None] * np.eye(2) + (along**2 - across**2)[:, None, None] * axis[:, :, None] * axis[:, None, :]
+    return (across**2)[:, None, None] * np.eye(2) + (along**2 - across**2)[:, None, None] * axis[:, :, None] * axis[
+        :, None, :
+    ]

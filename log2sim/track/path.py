@@ -26,7 +26,9 @@ class Paths:
     covariance: Array
 
 
-def smooth_paths(tracks: Sequence[Track], t_ns: NDArray[np.int64], *, whole_boxes: bool = False, before: int = 0, after: int = 0) -> Paths:
+def smooth_paths(
+    tracks: Sequence[Track], t_ns: NDArray[np.int64], *, whole_boxes: bool = False, before: int = 0, after: int = 0
+) -> Paths:
     """Most probable states of all tracks at all ticks from their first to their last measurement.
 
     They go on for `before` ticks into the past and `after` ticks into the future, as far as there are ticks.
@@ -89,7 +91,9 @@ class _Grid:
         self.seen = row >= 0
         self.xy, self.r, self.age_s = np.zeros((len(row), 2)), np.zeros((len(row), 2, 2)), np.zeros(len(row))
         self.xy[at] = m.center_m[:, :2]
-        self.r[at] = measurement_noise(m.covariance, np.repeat(group, [len(t) for t in tracks]), whole_boxes=whole_boxes)
+        self.r[at] = measurement_noise(
+            m.covariance, np.repeat(group, [len(t) for t in tracks]), whole_boxes=whole_boxes
+        )
         self.age_s[at] = (m.t_ns - t_ns[at]) / NS_PER_S
 
     def smoothed(self) -> tuple[Array, Array]:

@@ -35,7 +35,9 @@ class _Ends:
     group: NDArray[np.str_]
 
 
-def stitch(tracks: Sequence[Track], t_ns: NDArray[np.int64], *, max_gap_s: float, whole_boxes: bool = False) -> list[Track]:
+def stitch(
+    tracks: Sequence[Track], t_ns: NDArray[np.int64], *, max_gap_s: float, whole_boxes: bool = False
+) -> list[Track]:
     """Join tracks whose ends meet, cheapest pairs first, until nothing meets any more.
 
     Both ends are carried to the middle of the gap with the uncertainty that the gap adds, and must agree there in place
