@@ -51,7 +51,9 @@ def standing_view(frames: int) -> View:
 
 def random_boxes(count: int, seed: int) -> Boxes:
     rng = np.random.default_rng(seed)
-    b = boxes(np.zeros(count), rng.uniform(-2, 2, (count, 2)) + np.array([0, 20]), yaw=rng.uniform(-np.pi, np.pi, count))
+    b = boxes(
+        np.zeros(count), rng.uniform(-2, 2, (count, 2)) + np.array([0, 20]), yaw=rng.uniform(-np.pi, np.pi, count)
+    )
     return replace(
         b, size_hwl_m=rng.uniform(0.5, 4, (count, 3)), bottom_m=b.bottom_m + rng.uniform(-0.5, 0.5, (count, 3))
     )
