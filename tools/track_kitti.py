@@ -36,7 +36,7 @@ MAY_BE_ONE = ("Pedestrian", "Cyclist")
 FULL_HITS = 10
 # The benchmark labels what its camera sees: what nearer boxes hide by more than this share counts only where the detector is
 # this sure of it (a logit).
-HIDDEN_SHARE, SURE_SCORE = 0.8, 1.0
+HIDDEN_SHARE, SURE_SCORE = 0.8, 2.0
 # Online, a track that was seen this often and well goes on while it is not seen, for so long.
 COAST_S, COAST_HITS, COAST_SCORE = 0.15, 5, 4.0
 # Offline, gaps up to this are bridged; in tracks of at least this confidence those up to so many frames are filled.

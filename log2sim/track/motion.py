@@ -13,7 +13,7 @@ from log2sim.geometry import Array
 FIRST_SPEED_MPS = {"vehicle": 8.0, "two_wheeler": 4.0, "pedestrian": 1.5, "other": 3.0}
 ACCELERATION_MPS2 = {"vehicle": 2.5, "two_wheeler": 1.5, "pedestrian": 1.0, "other": 1.5}
 # What steers starts along its own axis; this share of its first speed may point across.
-ACROSS_SHARE = {"vehicle": 0.25, "two_wheeler": 0.4, "pedestrian": 1.0, "other": 1.0}
+ACROSS_SHARE = {"vehicle": 0.4, "two_wheeler": 0.4, "pedestrian": 1.0, "other": 1.0}
 # What a box center moves by when other sides of the object come into view.
 CENTER_SIGMA_M = {"vehicle": 0.35, "two_wheeler": 0.2, "pedestrian": 0.15, "other": 0.35}
 
