@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from log2sim.geometry import Array, wrap_angle
 from log2sim.types import TYPICAL_SIZE_M
@@ -14,6 +15,7 @@ SEARCH_STEP_RAD = np.deg2rad(2.0)
 NEAREST_EDGE_M = 0.03
 MOST_POINTS = 256
 SENSOR_SIGMA_M = 0.08
+SIZE_SPREAD = 0.05
 # What an end of a box is, see `ends_shown`.
 SEEN, FACING = 1, 2
 # Corners are rounded: the outermost point seen from the side lies inside by about this share of the width.
@@ -22,6 +24,7 @@ ROUNDED = 0.08
 LEAST_ASPECT = 0.5
 # A side longer than this share of the typical width is no front or rear.
 LONGER_THAN_WIDE = 1.2
+EITHER_WAY = 0.25
 # A size that was completed may be wrong by all of what was added: a uniform spread. Without any real end it is worse.
 SLACK_SIGMA = 12.0**-0.5
 
@@ -103,13 +106,21 @@ def quantile_of_sorted(ordered: Array, share: float) -> Array:
     return np.asarray(ordered[below] + (place - below) * (ordered[above] - ordered[below]), dtype=np.float64)
 
 
+def middle(values: NDArray[Any]) -> float:
+    """The upper median of values (N,), N > 0; ten times as quick as NumPy's median for a few hundred of them."""
+    k = len(values) // 2
+    return float(np.partition(values, k)[k])
+
+
 def rotate(xy: Array, angle_rad: float) -> Array:
     """Rotate points (..., 2) counter-clockwise."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return np.stack([xy[..., 0] * c - xy[..., 1] * s, xy[..., 0] * s + xy[..., 1] * c], axis=-1)
 
 
-def ends_shown(low: Array, high: Array, sensor: Array, ends_seen: ArrayLike) -> NDArray[np.bool_]:
+def ends_shown(
+    low: Array, high: Array, sensor: Array, ends_seen: Sequence[bool] | NDArray[np.bool_]
+) -> NDArray[np.int64]:
     """Which ends of what was seen of a box are ends of the box; everything in axes along and across it.
 
     Parameters
@@ -147,7 +158,11 @@ def ends_shown(low: Array, high: Array, sensor: Array, ends_seen: ArrayLike) -> 
 
 
 def complete_box(
-    low: Array, high: Array, size_m: Array, sensor: Array, ends_seen: ArrayLike = (False, False)
+    low: Array,
+    high: Array,
+    size_m: Array,
+    sensor: Array,
+    ends_seen: Sequence[bool] | NDArray[np.bool_] = (False, False),
 ) -> tuple[Array, Array]:
     """Place a box of known size over what was seen of it; everything in axes along and across the box.
 
@@ -176,8 +191,10 @@ def place_box(low: Array, high: Array, size_m: Array, shown: NDArray[np.int64]) 
     low, high = to_corners(low, high, shown, size_m[1])
     slack = size_m - (high - low)
     reach = np.sign(shown[:, 1] - shown[:, 0])
-    doubt = np.where(shown.any(axis=1), SLACK_SIGMA, 1.0)
-    return (low + high) / 2 - reach * slack / 2, np.hypot(SENSOR_SIGMA_M, doubt * np.maximum(slack, 0.0))
+    doubt = np.where(shown.any(axis=1), SLACK_SIGMA, 1.0) * np.maximum(slack, 0.0)
+    # Objects of one category differ in size, so what is believed of an end that was not seen is never exact.
+    spread = np.where(shown.all(axis=1), 0.0, SIZE_SPREAD * size_m)
+    return (low + high) / 2 - reach * slack / 2, np.sqrt(SENSOR_SIGMA_M**2 + doubt**2 + spread**2)
 
 
 def to_corners(low: Array, high: Array, shown: NDArray[np.int64], width_m: float) -> tuple[Array, Array]:
@@ -187,7 +204,11 @@ def to_corners(low: Array, high: Array, shown: NDArray[np.int64], width_m: float
 
 
 def box_of_cluster(
-    cluster: Array, sensor: Array, category: str, ground_z: float, ends_seen: ArrayLike = (False, False)
+    cluster: Array,
+    sensor: Array,
+    category: str,
+    ground_z: float,
+    ends_seen: Sequence[bool] | NDArray[np.bool_] = (False, False),
 ) -> tuple[Array, Array, float, Array]:
     """Center (3,), size (3,), yaw and covariance (2, 2) of the box around a cluster (n, 3) seen from `sensor` (3,).
 
@@ -204,6 +225,9 @@ def box_of_cluster(
     size = np.maximum([*(high - low), top], [*typical[:2], top])
     center_local, sigma = complete_box(low, high, size[:2], rotate(sensor[:2], -yaw_rad), ends_seen)
     center = np.append(rotate(center_local, yaw_rad), ground_z + size[2] / 2)
+    if (high - low).max() <= LONGER_THAN_WIDE * typical[1] and not all(ends_seen):
+        # So short a side may be a front or what shows of a flank; the two put the center in different places.
+        sigma = np.hypot(sigma, EITHER_WAY * (size[0] - size[1]))
     return center, size, float(yaw_rad), oriented_covariance(sigma, yaw_rad)
 
 

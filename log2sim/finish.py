@@ -26,13 +26,14 @@ SAMPLES = 12
 EGO_SIGMA_M = 0.02
 
 
-def without_doubles(built: Sequence[Built]) -> list[Agent]:
-    """Agents that are not in another's place, the ones with more evidence first, named by category and number."""
-    kept: list[Built] = []
+def without_doubles(built: Sequence[Built], ego: Agent | None = None) -> list[Agent]:
+    """Agents that are in nobody else's place, the ego's included, those with more evidence first; named by category."""
+    taken = [ego] if ego is not None else []
+    kept: list[Agent] = []
     for candidate in sorted(built, key=lambda b: -b.evidence):
-        if not any(_same_place(candidate.agent, other.agent) for other in kept):
-            kept.append(candidate)
-    agents = sorted((b.agent for b in kept), key=lambda a: (float(a.waypoints.t_s[0]), float(a.waypoints.x_m[0])))
+        if not any(_same_place(candidate.agent, other) for other in (*taken, *kept)):
+            kept.append(candidate.agent)
+    agents = sorted(kept, key=lambda a: (float(a.waypoints.t_s[0]), float(a.waypoints.x_m[0])))
     count: dict[str, int] = {}
     named = []
     for agent in agents:
@@ -44,7 +45,7 @@ def without_doubles(built: Sequence[Built]) -> list[Agent]:
 def _same_place(a: Agent, b: Agent) -> bool:
     """Whether two agents overlap for most of the time that both are there."""
     first, last = max(a.waypoints.t_s[0], b.waypoints.t_s[0]), min(a.waypoints.t_s[-1], b.waypoints.t_s[-1])
-    if last < first:
+    if last < first or not _ways_meet(a, b):
         return False
     t = np.linspace(first, last, SAMPLES)
     pa, pb = a.at(t), b.at(t)
@@ -59,6 +60,15 @@ def _same_place(a: Agent, b: Agent) -> bool:
     )
     shared = [_share_of_smaller(p, q) for p, q in zip(boxes_a, boxes_b)]
     return bool(np.median(shared) > SHARED_AREA)
+
+
+def _ways_meet(a: Agent, b: Agent) -> bool:
+    """Whether the rectangles around two agents' ways come as near as their boxes could ever touch; quick to tell."""
+    reach = (np.hypot(*a.size_m[:2]) + np.hypot(*b.size_m[:2])) / 2
+    return all(
+        p.min() - q.max() <= reach and q.min() - p.max() <= reach
+        for p, q in ((a.waypoints.x_m, b.waypoints.x_m), (a.waypoints.y_m, b.waypoints.y_m))
+    )
 
 
 def _share_of_smaller(a: Array, b: Array) -> float:

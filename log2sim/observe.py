@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
@@ -27,7 +27,7 @@ GROUND_POINTS_A_FRAME = 40
 OBSTACLE_REACH_M = 70.0
 OBSTACLE_VOXEL_M = 0.12
 RANK_BITS = 25  # more than the points of any sweep
-DETECTING_THREADS = 2
+BACKGROUND_THREADS = 2
 
 
 @dataclass(eq=False)
@@ -92,16 +92,16 @@ def observe(
     """Run detection and measurement over all ticks."""
     out = Observed(feet={c: [] for c in plan.cameras}, ground={c: [] for c in plan.cameras})
     records = out.records = Records(log)
-    sweeps = _SweepReader(log, schedule, records)
-    with ThreadPoolExecutor(DETECTING_THREADS) as pool:
+    with ThreadPoolExecutor(BACKGROUND_THREADS) as pool:
+        clouds = _Clouds(log, schedule, plan, records, pool, max_range_m)
+        clouds.prefetch(0)
         for tick in range(len(schedule)):
-            sweeps.prefetch(pool, tick)
             frames = _frames(log, schedule, plan, tick, records)
             found = _detect_all(frames, detector, pool, clock, decode=plan.keeps("decode images"))
-            sweeps.prefetch(pool, tick + 1)
-            _measure_tick(
-                log, schedule, plan, tick, found, sweeps, out, mode=mode, max_range_m=max_range_m, clock=clock
-            )
+            with clock.stage("cloud"):
+                ready = [clouds.get(tick, row) for row in range(len(schedule.frames))]
+            clouds.prefetch(tick + 1)
+            _measure_tick(log, schedule, tick, found, ready, out, mode=mode, max_range_m=max_range_m, clock=clock)
             progress(tick + 1, len(schedule))
     records.require_some()
     return out
@@ -153,83 +153,79 @@ def _decodes(frame: Frame) -> bool:
     return True
 
 
-class _SweepReader:
-    """Reads the sweeps of coming ticks in the background and keeps the few that ticks share."""
+class _Clouds:
+    """Clouds of coming ticks, made in the background; sweeps are read once, and ticks share the clouds of the same sweeps."""
 
-    def __init__(self, log: Log, schedule: Schedule, records: Records) -> None:
-        self._log, self._schedule, self._records = log, schedule, records
-        self._pending: dict[tuple[str, int], Future[Sweep | None]] = {}
+    def __init__(
+        self, log: Log, schedule: Schedule, plan: Plan, records: Records, pool: ThreadPoolExecutor, max_range_m: float
+    ) -> None:
+        self._log, self._schedule, self._plan, self._records = log, schedule, plan, records
+        self._pool, self._max_range_m = pool, max_range_m
+        self._sweeps: dict[tuple[str, int], Future[Sweep | None]] = {}
+        self._clouds: dict[tuple[int, ...], Future[Cloud | None]] = {}
 
-    def needed(self, tick: int) -> list[tuple[str, int]]:
-        """Lidar and index of every sweep that any camera of a tick uses."""
-        if tick >= len(self._schedule):
-            return []
-        return [
-            (lidar, int(i))
-            for lidar, index in self._schedule.sweeps.items()
-            for i in np.unique(index[:, tick])
-            if i >= 0
-        ]
+    def _key(self, tick: int, row: int) -> tuple[int, ...]:
+        """The sweep of every LiDAR, -1 for none, that a camera of a tick uses."""
+        return tuple(int(index[row, tick]) for index in self._schedule.sweeps.values())
 
-    def prefetch(self, pool: ThreadPoolExecutor, tick: int) -> None:
-        """Start reading what a tick needs, and forget what only earlier ticks needed."""
-        wanted = self.needed(tick)
-        keep = set(wanted) | set(self.needed(tick - 1) if tick else [])
-        self._pending = {k: v for k, v in self._pending.items() if k in keep}
-        for key in wanted:
-            if key not in self._pending:
-                self._pending[key] = pool.submit(self._records.get, *key)
+    def prefetch(self, tick: int) -> None:
+        """Start making what a tick needs, and forget what only earlier ticks needed."""
+        ticks = [k for k in (tick - 1, tick) if 0 <= k < len(self._schedule)]
+        keys = {key: None for k in ticks for row in range(len(self._schedule.frames)) for key in [self._key(k, row)]}
+        sweeps = {(name, i): None for key in keys for name, i in zip(self._schedule.sweeps, key) if i >= 0}
+        self._clouds = {k: v for k, v in self._clouds.items() if k in keys}
+        self._sweeps = {k: v for k, v in self._sweeps.items() if k in sweeps}
+        # Sweeps go first: a cloud that waits for its sweeps must never keep them from being read.
+        for sweep in sweeps:
+            if sweep not in self._sweeps:
+                self._sweeps[sweep] = self._pool.submit(self._records.get, *sweep)
+        for key in keys:
+            if key not in self._clouds:
+                read = {n: self._sweeps[n, i] for n, i in zip(self._schedule.sweeps, key) if i >= 0}
+                self._clouds[key] = self._pool.submit(self._make, read)
 
-    def get(self, lidar: str, index: int) -> Sweep | None:
-        return self._pending[lidar, index].result()
+    def _make(self, reading: dict[str, Future[Sweep | None]]) -> Cloud | None:
+        sweeps = {name: sweep for name, future in reading.items() if (sweep := future.result()) is not None}
+        if not sweeps:
+            return None
+        origin, ground_z = place_of_ego(self._log, next(iter(sweeps.values())).stamp_ns)
+        cloud = assemble_cloud(
+            self._log, sweeps, origin=origin, ground_z=ground_z, max_range_m=self._max_range_m,
+            compensate=self._plan.keeps("compensate"),
+        )  # fmt: skip
+        if cloud is not None:
+            cloud.prepare()
+        return cloud
+
+    def get(self, tick: int, row: int) -> Cloud | None:
+        """The cloud for the camera in a row of the schedule; waits until it is made."""
+        return self._clouds[self._key(tick, row)].result()
 
 
 def _measure_tick(
     log: Log,
     schedule: Schedule,
-    plan: Plan,
     tick: int,
     found: dict[str, Detections],
-    sweeps: _SweepReader,
+    clouds: Sequence[Cloud | None],
     out: Observed,
     *,
     mode: str,
     max_range_m: float,
     clock: StageClock,
 ) -> None:
-    """Measure the detections of a tick and keep what later stages ask for."""
-    clouds: dict[tuple[int, ...], Cloud | None] = {}
+    """Measure the detections of a tick, each camera in its cloud, and keep what later stages ask for."""
     parts: list[Measurements] = []
-    for row, camera in enumerate(schedule.frames):
-        index = {lidar: int(schedule.sweeps[lidar][row, tick]) for lidar in schedule.sweeps}
-        key = tuple(index.values())
-        if key not in clouds:
-            with clock.stage("read sweeps"):
-                read = {name: sweeps.get(name, i) for name, i in index.items() if i >= 0}
-            with clock.stage("cloud"):
-                clouds[key] = _cloud(log, schedule, tick, read, plan, max_range_m)
-        if camera not in found:
-            continue
-        with clock.stage("measure"):
-            measured = _measure_camera(log, schedule, camera, tick, found[camera], clouds[key], out, mode)
-        parts.append(measured)
+    with clock.stage("measure"):
+        for camera, cloud in zip(schedule.frames, clouds, strict=True):
+            if camera in found:
+                parts.append(_measure_camera(log, schedule, camera, tick, found[camera], cloud, out, mode))
     with clock.stage("fuse"):
         joined = Measurements.join(parts)
         joined = joined.take(_in_range(log, schedule, tick, joined, max_range_m))
         out.measurements.append(fuse(joined) if len(joined) else joined)
-    reference = clouds[tuple(int(schedule.sweeps[lidar][0, tick]) for lidar in schedule.sweeps)]
     with clock.stage("cloud"):
-        out.obstacles.append(None if reference is None else _obstacles(reference))
-
-
-def _cloud(
-    log: Log, schedule: Schedule, tick: int, read: dict[str, Sweep | None], plan: Plan, max_range_m: float
-) -> Cloud | None:
-    available = {name: sweep for name, sweep in read.items() if sweep is not None}
-    origin, ground_z = place_of_ego(log, int(schedule.t_ns[tick]))
-    return assemble_cloud(
-        log, available, origin=origin, ground_z=ground_z, max_range_m=max_range_m, compensate=plan.keeps("compensate")
-    )
+        out.obstacles.append(None if clouds[0] is None else _obstacles(clouds[0]))
 
 
 def place_of_ego(log: Log, t_ns: int) -> tuple[Array, float]:
@@ -294,7 +290,7 @@ def _in_range(log: Log, schedule: Schedule, tick: int, rows: Measurements, max_r
 
 def _obstacles(cloud: Cloud) -> Obstacles:
     """The points above the ground, thinned to one a voxel so that a long log fits in memory."""
-    index, xyz = cloud.obstacles, cloud.obstacles_xyz
+    index, xyz = cloud.obstacles, cloud.obstacle_columns.T
     near = np.flatnonzero(np.hypot(xyz[:, 0], xyz[:, 1]) < OBSTACLE_REACH_M)
     index = index[near[_one_a_voxel(xyz[near], OBSTACLE_VOXEL_M)]]
     return Obstacles(cloud.stamp_ns, cloud.origin, cloud.xyz[index], cloud.t_s[index], cloud.sensor)
