@@ -17,19 +17,24 @@ ACROSS_SHARE = {"vehicle": 0.4, "two_wheeler": 0.4, "pedestrian": 1.0, "other": 
 # What a box center moves by when other sides of the object come into view.
 CENTER_SIGMA_M = {"vehicle": 0.35, "two_wheeler": 0.2, "pedestrian": 0.15, "other": 0.35}
 
+_DIAGONAL, _PLACE, _SPEED = np.arange(4), np.arange(2), np.arange(2, 4)
+
 
 def predict(mean: Array, covariance: Array, dt_s: Array | float, acceleration: Array) -> tuple[Array, Array]:
     """Carry states (A, 4) x, y, vx, vy with covariances (A, 4, 4) forward; `acceleration` (A,) is the process noise."""
-    dt = np.broadcast_to(np.asarray(dt_s, dtype=np.float64), len(mean))
-    step = np.tile(np.eye(4), (len(mean), 1, 1))
-    step[:, 0, 2] = step[:, 1, 3] = dt
-    span, density = np.abs(dt), acceleration**2
-    noise = np.zeros((len(mean), 4, 4))
-    for k in range(2):
-        noise[:, k, k] = density * span**3 / 3
-        noise[:, k, k + 2] = noise[:, k + 2, k] = density * span * dt / 2
-        noise[:, k + 2, k + 2] = density * span
-    return (step @ mean[:, :, None])[..., 0], step @ covariance @ np.swapaxes(step, 1, 2) + noise
+    dt = np.asarray(dt_s, dtype=np.float64)
+    if dt.ndim and len(dt) and (dt == dt[0]).all():
+        dt = dt[0]
+    # One step for all where they go equally far, which they do but for gaps.
+    step, noise = np.zeros((*dt.shape, 4, 4)), np.zeros((*dt.shape, 4, 4))
+    span = np.abs(dt)
+    step[..., _DIAGONAL, _DIAGONAL] = 1.0
+    step[..., _PLACE, _SPEED] = dt[..., None]
+    noise[..., _PLACE, _PLACE] = (span**3 / 3)[..., None]
+    noise[..., _PLACE, _SPEED] = noise[..., _SPEED, _PLACE] = (span * dt / 2)[..., None]
+    noise[..., _SPEED, _SPEED] = span[..., None]
+    noise = noise * (acceleration**2)[:, None, None]
+    return (step @ mean[:, :, None])[..., 0], step @ covariance @ np.swapaxes(step, -1, -2) + noise
 
 
 def innovation(mean: Array, covariance: Array, xy: Array, r: Array, age_s: Array) -> tuple[Array, Array]:
