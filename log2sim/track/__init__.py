@@ -46,7 +46,8 @@ def track(
         rows = everything.take(first_row[t.ticks] + t.rows)
         tracks.append(Track(category_of(rows), t.ticks, rows))
     joined = stitch(tracks, t_ns, max_gap_s=max_gap_s, whole_boxes=whole_boxes)
-    kept = [t for t in joined if len(t) >= least_hits(t_ns, min_life_s)]
+    least = least_hits(t_ns, min_life_s)
+    kept = [t for t in joined if len(t) >= least]
     return sorted(kept, key=lambda t: (int(t.tick[0]), float(t.measurements.center_m[0, 0])))
 
 

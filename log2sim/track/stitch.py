@@ -68,12 +68,13 @@ def _meeting_costs(ends: _Ends, max_gap_s: float) -> Array:
     """Cost (A, A) of the second track being the first one's continuation, `FORBIDDEN` where it cannot be."""
     cost = np.full((len(ends.group), len(ends.group)), FORBIDDEN)
     gap_s = (ends.first_ns[None, :] - ends.last_ns[:, None]) / NS_PER_S
-    a, b = np.nonzero((gap_s > 0) & (ends.group[:, None] == ends.group[None, :]))
-    gap_s = gap_s[a, b]
+    stands, stood = (np.hypot(*state[:, 2:].T) < STANDING_MPS for state in (ends.last[0], ends.first[0]))
+    still = stands[:, None] & stood[None, :]
+    a, b = np.nonzero((gap_s > 0) & (still | (gap_s <= max_gap_s)) & (ends.group[:, None] == ends.group[None, :]))
+    gap_s, still = gap_s[a, b], still[a, b]
     last, first = ends.last[0][a], ends.first[0][b]
     apart = np.hypot(*(last - first)[:, :2].T)
-    speed = np.maximum(np.hypot(*last[:, 2:].T), np.hypot(*first[:, 2:].T))
-    stood = (speed < STANDING_MPS) & (apart < STANDING_APART_M)
+    stood = still & (apart < STANDING_APART_M)
     cost[a[stood], b[stood]] = apart[stood]
     half = gap_s[:, None] / 2
     beside = np.hypot(*(last[:, :2] + half * last[:, 2:] - first[:, :2] + half * first[:, 2:]).T)
