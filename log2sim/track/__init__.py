@@ -22,6 +22,7 @@ def track(
     birth_score: float,
     max_gap_s: float,
     min_life_s: float,
+    whole_boxes: bool = False,
 ) -> list[Track]:
     """Turn the measurements of T ticks into tracks, longest lives first by their start.
 
@@ -32,16 +33,21 @@ def track(
         Lowest score that can start a track.
     max_gap_s : float
         Longest occlusion that is bridged, s.
+    whole_boxes : bool
+        Whether the measurements come from a 3D detector: centers that do not move with the view, yaw along the motion.
     min_life_s : float
         Tracks seen for a shorter time, after stitching, are taken for false alarms, unless the log itself is as short.
     """
-    tracklets = track_forward(measurements, t_ns, birth_score=birth_score)
+    tracklets = track_forward(measurements, t_ns, birth_score=birth_score, whole_boxes=whole_boxes)
+    everything = Measurements.join(measurements)
+    first_row = np.cumsum([0, *(len(m) for m in measurements)])
     tracks = []
     for t in tracklets:
-        rows = Measurements.join([measurements[k].take([r]) for k, r in zip(t.ticks, t.rows)])
-        tracks.append(Track(category_of(rows), np.array(t.ticks, dtype=np.int64), rows))
-    joined = stitch(tracks, t_ns, max_gap_s=max_gap_s)
-    kept = [t for t in joined if len(t) >= least_hits(t_ns, min_life_s)]
+        rows = everything.take(first_row[t.ticks] + t.rows)
+        tracks.append(Track(category_of(rows), t.ticks, rows))
+    joined = stitch(tracks, t_ns, max_gap_s=max_gap_s, whole_boxes=whole_boxes)
+    least = least_hits(t_ns, min_life_s)
+    kept = [t for t in joined if len(t) >= least]
     return sorted(kept, key=lambda t: (int(t.tick[0]), float(t.measurements.center_m[0, 0])))
 
 

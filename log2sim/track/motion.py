@@ -12,22 +12,29 @@ from log2sim.geometry import Array
 # How fast an object of a group can be when it is first seen, and how fast its velocity may change (standard deviations).
 FIRST_SPEED_MPS = {"vehicle": 8.0, "two_wheeler": 4.0, "pedestrian": 1.5, "other": 3.0}
 ACCELERATION_MPS2 = {"vehicle": 2.5, "two_wheeler": 1.5, "pedestrian": 1.0, "other": 1.5}
+# What steers starts along its own axis; this share of its first speed may point across.
+ACROSS_SHARE = {"vehicle": 0.4, "two_wheeler": 0.4, "pedestrian": 1.0, "other": 1.0}
 # What a box center moves by when other sides of the object come into view.
 CENTER_SIGMA_M = {"vehicle": 0.35, "two_wheeler": 0.2, "pedestrian": 0.15, "other": 0.35}
+
+_DIAGONAL, _PLACE, _SPEED = np.arange(4), np.arange(2), np.arange(2, 4)
 
 
 def predict(mean: Array, covariance: Array, dt_s: Array | float, acceleration: Array) -> tuple[Array, Array]:
     """Carry states (A, 4) x, y, vx, vy with covariances (A, 4, 4) forward; `acceleration` (A,) is the process noise."""
-    dt = np.broadcast_to(np.asarray(dt_s, dtype=np.float64), len(mean))
-    step = np.tile(np.eye(4), (len(mean), 1, 1))
-    step[:, 0, 2] = step[:, 1, 3] = dt
-    span, density = np.abs(dt), acceleration**2
-    noise = np.zeros((len(mean), 4, 4))
-    for k in range(2):
-        noise[:, k, k] = density * span**3 / 3
-        noise[:, k, k + 2] = noise[:, k + 2, k] = density * span * dt / 2
-        noise[:, k + 2, k + 2] = density * span
-    return np.einsum("aij,aj->ai", step, mean), step @ covariance @ np.swapaxes(step, 1, 2) + noise
+    dt = np.asarray(dt_s, dtype=np.float64)
+    if dt.ndim and len(dt) and (dt == dt[0]).all():
+        dt = dt[0]
+    # One step for all where they go equally far, which they do but for gaps.
+    step, noise = np.zeros((*dt.shape, 4, 4)), np.zeros((*dt.shape, 4, 4))
+    span = np.abs(dt)
+    step[..., _DIAGONAL, _DIAGONAL] = 1.0
+    step[..., _PLACE, _SPEED] = dt[..., None]
+    noise[..., _PLACE, _PLACE] = (span**3 / 3)[..., None]
+    noise[..., _PLACE, _SPEED] = noise[..., _SPEED, _PLACE] = (span * dt / 2)[..., None]
+    noise[..., _SPEED, _SPEED] = span[..., None]
+    noise = noise * (acceleration**2)[:, None, None]
+    return (step @ mean[:, :, None])[..., 0], step @ covariance @ np.swapaxes(step, -1, -2) + noise
 
 
 def innovation(mean: Array, covariance: Array, xy: Array, r: Array, age_s: Array) -> tuple[Array, Array]:
@@ -35,13 +42,16 @@ def innovation(mean: Array, covariance: Array, xy: Array, r: Array, age_s: Array
 
     `age_s` (M,) is when each was measured relative to the states: a sweep sees an object before or after the tick.
     """
-    place = mean[:, None, :2] + age_s[None, :, None] * mean[:, None, 2:]
-    h_p = covariance[:, None, :2, :] + age_s[None, :, None, None] * covariance[:, None, 2:, :]
-    s = h_p[..., :2] + age_s[None, :, None, None] * h_p[..., 2:] + r[None]
-    d = xy[None] - place
-    determinant = s[..., 0, 0] * s[..., 1, 1] - s[..., 0, 1] ** 2
-    squared = s[..., 1, 1] * d[..., 0] ** 2 - 2 * s[..., 0, 1] * d[..., 0] * d[..., 1] + s[..., 0, 0] * d[..., 1] ** 2
-    return squared / determinant, np.log(determinant)
+    p = covariance[:, None]
+    dx, dy = xy[:, 0] - mean[:, :1], xy[:, 1] - mean[:, 1:2]
+    s_xx, s_xy, s_yy = p[..., 0, 0] + r[:, 0, 0], p[..., 0, 1] + r[:, 0, 1], p[..., 1, 1] + r[:, 1, 1]
+    if np.any(age_s):
+        dx, dy = dx - age_s * mean[:, 2:3], dy - age_s * mean[:, 3:4]
+        s_xx = s_xx + age_s * (2 * p[..., 0, 2] + age_s * p[..., 2, 2])
+        s_xy = s_xy + age_s * (p[..., 0, 3] + p[..., 1, 2] + age_s * p[..., 2, 3])
+        s_yy = s_yy + age_s * (2 * p[..., 1, 3] + age_s * p[..., 3, 3])
+    determinant = s_xx * s_yy - s_xy * s_xy
+    return (s_yy * dx * dx - 2 * s_xy * dx * dy + s_xx * dy * dy) / determinant, np.log(determinant)
 
 
 def update(mean: Array, covariance: Array, xy: Array, r: Array, age_s: Array) -> tuple[Array, Array]:
@@ -49,14 +59,28 @@ def update(mean: Array, covariance: Array, xy: Array, r: Array, age_s: Array) ->
     h = np.zeros((len(mean), 2, 4))
     h[:, 0, 0] = h[:, 1, 1] = 1.0
     h[:, 0, 2] = h[:, 1, 3] = age_s
-    s = h @ covariance @ np.swapaxes(h, 1, 2) + r
-    gain = np.swapaxes(np.linalg.solve(s, h @ covariance), 1, 2)
+    reach = h @ covariance
+    gain = np.swapaxes(np.linalg.solve(reach @ np.swapaxes(h, 1, 2) + r, reach), 1, 2)
     rest = np.eye(4) - gain @ h
-    mean = mean + np.einsum("aij,aj->ai", gain, xy - np.einsum("aij,aj->ai", h, mean))
+    mean = mean + (gain @ (xy[:, :, None] - h @ mean[:, :, None]))[..., 0]
     return mean, rest @ covariance @ np.swapaxes(rest, 1, 2) + gain @ r @ np.swapaxes(gain, 1, 2)
 
 
-def measurement_noise(covariance: Array, groups: NDArray[Any]) -> Array:
-    """Noise (M, 2, 2) of box centers: the sensor's and what changing views add."""
-    extra = np.array([CENTER_SIGMA_M[str(g)] for g in groups])
-    return covariance + extra[:, None, None] ** 2 * np.eye(2)
+def measurement_noise(covariance: Array, groups: NDArray[Any], *, whole_boxes: bool = False) -> Array:
+    """Noise (M, 2, 2) of box centers: the sensor's and what changing views add, which is nothing to whole boxes."""
+    if whole_boxes:
+        return covariance
+    extra = np.array([CENTER_SIGMA_M[g] for g in groups.tolist()])
+    return covariance + (extra**2)[:, None, None] * np.eye(2)
+
+
+def first_velocity(yaw_rad: Array, groups: NDArray[Any], *, whole_boxes: bool = False) -> Array:
+    """Covariance (M, 2, 2) of the velocity of what was seen once: along the axis of a whole box more than across."""
+    along = np.array([FIRST_SPEED_MPS[g] for g in groups.tolist()])
+    if not whole_boxes:
+        return (along**2)[:, None, None] * np.eye(2)
+    across = along * np.array([ACROSS_SHARE[g] for g in groups.tolist()])
+    axis = np.stack([np.cos(yaw_rad), np.sin(yaw_rad)], axis=-1)
+    return (across**2)[:, None, None] * np.eye(2) + (along**2 - across**2)[:, None, None] * axis[:, :, None] * axis[
+        :, None, :
+    ]

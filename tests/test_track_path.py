@@ -1,0 +1,107 @@
+"""Paths of tracks: the smoother against the full least-squares problem, gaps and ends; what whole boxes tell of motion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_track import OPTIONS, line, names_of, record, seen, stamps
+
+from log2sim.geometry import NS_PER_S
+from log2sim.track import track
+from log2sim.track.motion import ACCELERATION_MPS2, FIRST_SPEED_MPS, first_velocity, measurement_noise, predict
+from log2sim.track.path import smooth_paths
+from log2sim.types import Measurements, Track
+
+
+def a_track(ticks: list[int], t_ns: np.ndarray, seed: int = 0, category: str = "car", sigma_m: float = 0.3) -> Track:
+    rng = np.random.default_rng(seed)
+    xy = np.column_stack([0.9 * np.array(ticks), -0.2 * np.array(ticks)]) + rng.normal(0, sigma_m, (len(ticks), 2))
+    rows = [seen(p[None], t_ns[k], category=category, sigma_m=sigma_m) for k, p in zip(ticks, xy)]
+    return Track(category, np.array(ticks), Measurements.join(rows))
+
+
+def least_squares(t: Track, t_ns: np.ndarray, *, whole_boxes: bool) -> tuple[np.ndarray, np.ndarray]:
+    """States (n, 4) and covariances (n, 4, 4) from one dense normal matrix over all ticks of the track's life."""
+    group = np.array(["vehicle"])
+    ticks = np.arange(t.tick[0], t.tick[-1] + 1)
+    n = len(ticks)
+    information, rhs = np.zeros((4 * n, 4 * n)), np.zeros(4 * n)
+    r = measurement_noise(t.measurements.covariance, np.repeat(group, len(t)), whole_boxes=whole_boxes)
+    for k, tick in enumerate(t.tick):
+        at = 4 * (tick - ticks[0])
+        information[at : at + 2, at : at + 2] += np.linalg.inv(r[k])
+        rhs[at : at + 2] += np.linalg.solve(r[k], t.measurements.center_m[k, :2])
+    speed = first_velocity(t.measurements.yaw_rad[:1], group, whole_boxes=whole_boxes)[0]
+    information[2:4, 2:4] += np.linalg.inv(speed)
+    for k in range(n - 1):
+        dt = (t_ns[ticks[k + 1]] - t_ns[ticks[k]]) / NS_PER_S
+        noise = predict(np.zeros((1, 4)), np.zeros((1, 4, 4)), dt, np.array([ACCELERATION_MPS2["vehicle"]]))[1][0]
+        step = np.eye(4)
+        step[0, 2] = step[1, 3] = dt
+        link = np.hstack([-step, np.eye(4)])
+        information[4 * k : 4 * k + 8, 4 * k : 4 * k + 8] += link.T @ np.linalg.inv(noise) @ link
+    covariance = np.linalg.inv(information)
+    blocks = np.stack([covariance[4 * k : 4 * k + 4, 4 * k : 4 * k + 4] for k in range(n)])
+    return np.linalg.solve(information, rhs).reshape(n, 4), blocks
+
+
+@pytest.mark.parametrize("whole_boxes", [False, True])
+def test_smoothed_paths_solve_the_whole_least_squares_problem(whole_boxes: bool) -> None:
+    t_ns = stamps(30)
+    t_ns[12:] += 40_000_000  # ticks need not be even
+    tracks = [
+        a_track([0, 1, 2, 6, 7, 11, 12, 13], t_ns, 1),
+        a_track([5, 6], t_ns, 2),
+        a_track(list(range(20, 30)), t_ns, 3),
+        a_track([8], t_ns),
+    ]
+    paths = smooth_paths(tracks, t_ns, whole_boxes=whole_boxes)
+    assert paths.tick.tolist() == [*range(14), 5, 6, *range(20, 30), 8]
+    for k, t in enumerate(tracks):
+        of = paths.track == k
+        mean, covariance = least_squares(t, t_ns, whole_boxes=whole_boxes)
+        np.testing.assert_allclose(paths.mean[of], mean, atol=1e-7)
+        np.testing.assert_allclose(paths.covariance[of], covariance, atol=1e-7)
+        assert paths.tick[of][paths.row[of] >= 0].tolist() == t.tick.tolist()
+        assert paths.row[of][paths.row[of] >= 0].tolist() == list(range(len(t)))
+
+
+def test_paths_go_on_beyond_both_ends_as_far_as_there_are_ticks() -> None:
+    t_ns = stamps(12)
+    inner, outer = a_track([4, 5, 6], t_ns, 1), a_track([1, 2, 11], t_ns, 2)
+    short, long = smooth_paths([inner, outer], t_ns), smooth_paths([inner, outer], t_ns, before=3, after=2)
+    assert long.tick[long.track == 0].tolist() == list(range(1, 9))
+    assert long.tick[long.track == 1].tolist() == list(range(12))
+    first = short.mean[0]
+    expected = [*(first[:2] - first[2:] * 0.3), *first[2:]]
+    np.testing.assert_allclose(long.mean[long.track == 0][0], expected, atol=1e-9)
+    kept = (long.tick >= np.array([4, 1])[long.track]) & (long.tick <= np.array([6, 11])[long.track])
+    np.testing.assert_array_equal(long.mean[kept], short.mean)
+    assert len(smooth_paths([], t_ns).tick) == 0
+
+
+def test_whole_boxes_start_along_their_axis() -> None:
+    yaw = np.array([0.0, 0.7, np.pi / 2])
+    axis, side = np.stack([np.cos(yaw), np.sin(yaw)], 1), np.stack([-np.sin(yaw), np.cos(yaw)], 1)
+    whole = first_velocity(yaw, np.array(["vehicle"] * 3), whole_boxes=True)
+    along, across = (np.einsum("ni,nij,nj->n", d, whole, d) for d in (axis, side))
+    np.testing.assert_allclose(along, FIRST_SPEED_MPS["vehicle"] ** 2)
+    assert (across < 0.3 * along).all()
+    np.testing.assert_allclose(np.einsum("ni,nij,nj->n", axis, whole, side), 0, atol=1e-9)
+    np.testing.assert_allclose(first_velocity(yaw, np.array(["vehicle"] * 3)), np.tile(64 * np.eye(2), (3, 1, 1)))
+
+
+def test_parked_side_by_side_whole_boxes_do_not_change_places() -> None:
+    # Two cars stand 2.5 m beside each other; they are seen in turn before both are.
+    t_ns = stamps(12)
+    places = {"left": (30.0, 2.5), "right": (30.0, 0.0)}
+    shown = [["left"], ["right"], ["left"], ["right"], *[["left", "right"]] * 8]
+    found = [seen(np.array([places[n] for n in names]), t, names, sigma_m=0.2) for names, t in zip(shown, t_ns)]
+    whole = track(found, t_ns, **OPTIONS, whole_boxes=True)
+    assert sorted(names_of(whole)) == [["left"], ["right"]]
+
+
+def test_whole_boxes_are_tracked_like_others() -> None:
+    ways = {"a": line(0, 0, 12, 0), "b": line(60, 3.5, -14, 0), "c": line(20, -8, 0, 0)}
+    found, t_ns = record(ways, 60, hidden={"a": (20, 34)})
+    assert sorted(names_of(track(found, t_ns, **OPTIONS, whole_boxes=True))) == [["a"], ["b"], ["c"]]
