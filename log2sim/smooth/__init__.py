@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -146,7 +147,7 @@ def _doubtful_in_gaps(covariance: Array, at_s: Array, seen_s: Array, density: tu
     if factor <= 1 or len(seen_s) == 0:
         return covariance
     out = covariance.copy()
-    for first, last in zip(seen_s[:-1], seen_s[1:]):
+    for first, last in pairwise(seen_s.tolist()):
         rows = np.flatnonzero((at_s > first) & (at_s < last))
         if last - first <= GAP_S or len(rows) == 0:
             continue
