@@ -13,8 +13,8 @@ from typing import Any
 HEAD = """# Benchmarks
 
 log2sim's single estimators beside what a user would otherwise take. Each table comes from one process on one machine, so
-its ratios mean more than its times; times are those of the processor, one thread. `tools/bench.py` writes the parts between the markers; what was measured, on which
-worlds, is told above each table.
+its ratios mean more than its times; times are those of the processor, one thread. `tools/bench.py` writes the parts
+between the markers; what was measured, on which worlds, is told above each table.
 """
 
 
