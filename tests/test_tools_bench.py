@@ -70,7 +70,8 @@ def test_log2sim_and_plain_numpy_find_the_same_points_in_boxes() -> None:
 
     rng, views = np.random.default_rng(0), make_views()
     xyz, boxes = make_sweep(6400, rng), [make_boxes(rng) for _ in views]
-    ours, plain, cv = (f(xyz, views, boxes) for f in (with_log2sim, lambda *a: with_numpy(np.float64, *a), with_opencv))
+    ours = with_log2sim(np.ascontiguousarray(xyz.T), views, boxes)
+    plain, cv = with_numpy(np.float64, xyz, views, boxes), with_opencv(xyz, views, boxes)
     np.testing.assert_allclose(cv, plain, atol=1e-6)
     np.testing.assert_array_equal(np.isnan(ours), np.isnan(plain))
     assert np.nanmedian(np.abs(np.subtract(ours, plain))) < 1e-3

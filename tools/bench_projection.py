@@ -13,7 +13,7 @@ import numpy as np
 from bench_table import markdown, optional, timed
 
 from log2sim.boxfit import middle
-from log2sim.measure import View, _inside, _project
+from log2sim.measure.seen import View, in_boxes, see
 from log2sim.types import Camera
 
 Array = np.ndarray[Any, Any]
@@ -68,12 +68,12 @@ def make_boxes(rng: np.random.Generator) -> Array:
     return np.concatenate([np.clip(center - half, 0, limits), np.clip(center + half, 0, limits)], axis=1)
 
 
-def with_log2sim(xyz: Array, views: list[View], boxes: list[Array]) -> list[float]:
-    """As the measurement does it."""
+def with_log2sim(columns: Array, views: list[View], boxes: list[Array]) -> list[float]:
+    """As the measurement does it, which keeps the points of a sweep as columns (3, N) for all of its cameras."""
     out = []
     for view, box in zip(views, boxes, strict=True):
-        _, uv, depth = _project(view, np.zeros(3), xyz)
-        out += [float(middle(depth[i])) if len(i) else float("nan") for i in _inside(uv, box, 0.0)]
+        seen = see(view, np.zeros(3), columns)
+        out += [float(middle(seen.depth[i])) if len(i) else float("nan") for i in in_boxes(seen, box)]
     return out
 
 
@@ -154,7 +154,7 @@ def run(*, quick: bool) -> tuple[str, str]:
     sweeps["180k, random order"] = rng.permutation(sweeps["180k"])
     for xyz in sweeps.values():
         methods: dict[str, Callable[[], Any]] = {
-            "log2sim": partial(with_log2sim, xyz, views, boxes),
+            "log2sim": partial(with_log2sim, np.ascontiguousarray(xyz.T), views, boxes),
             "numpy float64, mask for each box": partial(with_numpy, np.float64, xyz, views, boxes),
             "numpy float32, mask for each box": partial(with_numpy, np.float32, xyz, views, boxes),
             "cv2.projectPoints, mask for each box": partial(with_opencv, xyz, views, boxes),

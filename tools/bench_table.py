@@ -13,8 +13,8 @@ from typing import Any
 HEAD = """# Benchmarks
 
 log2sim's single estimators beside what a user would otherwise take. Each table comes from one process on one machine, so
-its ratios mean more than its times. `tools/bench.py` writes the parts between the markers; what was measured, on which
-worlds, is told above each table.
+its ratios mean more than its times; times are those of the processor, one thread. `tools/bench.py` writes the parts
+between the markers; what was measured, on which worlds, is told above each table.
 """
 
 
@@ -27,12 +27,12 @@ def optional(name: str) -> ModuleType | None:
 
 
 def timed(call: Callable[[], Any], repeats: int) -> tuple[Any, float]:
-    """What a call returns and the median of its seconds."""
+    """What a call returns and the median of its seconds of processor time, which other programs hardly disturb."""
     seconds, out = [], None
     for _ in range(repeats):
-        begin = time.perf_counter()
+        begin = time.process_time()
         out = call()
-        seconds.append(time.perf_counter() - begin)
+        seconds.append(time.process_time() - begin)
     return out, statistics.median(seconds)
 
 

@@ -196,7 +196,7 @@ def _of_stream(stream: Stream, rng: np.random.Generator, image_K: Array | None, 
         return _fit(found, image_K)
     moving = fit_moving(stream, found.h, image_K)
     warps = moving.warps[stream.tick]
-    fit = _fit(Found(moving.image_H_ground, moving.stream, moving.at, warps), image_K)
+    fit = _fit(Found(moving.image_H_ground, moving.stream, moving.at, warps, moving.spent), image_K)
     if not fit.ok:
         return fit
     return replace(fit, per_tick=stream.to_ground_H_image(moving.warps @ moving.image_H_ground))
@@ -226,7 +226,7 @@ def _fit(found: Found, image_K: Array | None) -> HomographyFit:
     stream, count = found.stream, found.stream.image.shape[1]
     if found.h is None or found.at is None:
         return refused("every sample of four is collinear or coincident", count)
-    health = judge(stream, found.h, found.at, image_K)
+    health = judge(stream, found.h, found.at, image_K, found.spent)
     if not health.ok:
         return refused(health.reason, count)
     inliers = found.at.squared[0] < BOUND

@@ -28,13 +28,15 @@ REAL = 3.0
 @dataclass(frozen=True, eq=False)
 class Moving:
     """A stream's homography (3, 3), ground to image in normalized units, the `warps` (T, 3, 3) of the image that come
-    on top of it in each tick, the stream with its noise as found, and the errors.
+    on top of it in each tick, the stream with its noise as found, the errors, and how many parameters were `spent` on
+    angles, counted by how far these were left free.
     """
 
     image_H_ground: Array
     warps: Array
     stream: Stream
     at: Linearized
+    spent: float
 
 
 def fit_moving(stream: Stream, h: Array, image_K: Array | None) -> Moving:
@@ -65,7 +67,8 @@ def fit_moving(stream: Stream, h: Array, image_K: Array | None) -> Moving:
             angles = angles * real
         spread = np.sqrt(np.maximum((angles**2 + variance).mean(axis=0), spread**2 / 25))
     warps = _warps(generators, angles)
-    return Moving(h, warps, best, linearize(best, h[None], warps[best.tick]))
+    spent = float((real * information * variance).sum())
+    return Moving(h, warps, best, linearize(best, h[None], warps[best.tick]), spent)
 
 
 def _is_real(angles: Array, information: Array, spread: Array) -> NDArray[np.bool_]:

@@ -36,13 +36,15 @@ NOISE_ROUNDS, FINAL_ROUNDS = 1, 2
 class Found:
     """A homography (3, 3), ground to image in normalized units; the stream with its noise as found; the errors.
 
-    `h` is None where no four correspondences determine one; `warps` (N, 3, 3) is what each one's tick adds.
+    `h` is None where no four correspondences determine one; `warps` (N, 3, 3) is what each one's tick adds,
+    with so many parameters `spent` on it.
     """
 
     h: Array | None
     stream: Stream
     at: Linearized | None = None
     warps: Array | None = None
+    spent: float = 0.0
 
 
 def search(
@@ -117,12 +119,15 @@ class Health:
     sigma_m: float
 
 
-def judge(stream: Stream, h: Array, at: Linearized, image_K: Array | None) -> Health:
-    """Judge a homography by how many correspondences agree with it and what these determine."""
+def judge(stream: Stream, h: Array, at: Linearized, image_K: Array | None, spent: float = 0.0) -> Health:
+    """Judge a homography by how many correspondences agree with it and what these determine.
+
+    Two parameters `spent` on ticks make one correspondence agree that then proves nothing.
+    """
     inliers, rows = at.squared[0] < BOUND, stream.image.shape[1]
     count = int(inliers.sum())
     least = 4 if rows < LEAST_INLIERS else LEAST_INLIERS
-    needed = max(least, int(np.ceil(LEAST_SHARE * rows)))
+    needed = max(least, int(np.ceil(spent / 2 + LEAST_SHARE * (rows - spent / 2))))
     if count < needed:
         reason = f"{count} of {rows} correspondences agree, at least {needed} are needed"
         return Health(False, reason, float("inf"), float("inf"))
