@@ -11,15 +11,15 @@ import numpy as np
 from log2sim.assemble import Timeline, build_agents
 from log2sim.clock import StageClock
 from log2sim.config import Config
-from log2sim.detect import create_detector
+from log2sim.detect import Detector, create_detector
 from log2sim.errors import NothingToReconstruct
 from log2sim.finish import ego_agent, ego_flow, make_scenario, without_doubles
 from log2sim.ground_plane import fit_cameras, locate_the_rest
-from log2sim.observe import observe
-from log2sim.plan import make_plan
+from log2sim.observe import Observed, observe
+from log2sim.plan import Plan, make_plan
 from log2sim.report import make_report
 from log2sim.scenario import Scenario
-from log2sim.sync import synchronize
+from log2sim.sync import Schedule, synchronize
 from log2sim.track import track
 from log2sim.types import Log
 
@@ -60,23 +60,9 @@ def reconstruct(
     config, clock = config or Config(), StageClock()
     tell = progress or (lambda stage, done, total: None)
     plan = make_plan(log, config, picture=picture)
-    detector = create_detector(
-        config.detect.name,
-        log,
-        min_score=config.detect.min_score or None,
-        tiles=config.detect.tiles or "auto",
-        layout=config.detect.layout or None,
-    )
+    detector = detector_of(log, config)
     with clock.stage("sync"):
-        schedule = synchronize(
-            log,
-            plan.cameras,
-            reference=config.sync.reference,
-            max_residual_s=config.sync.max_residual_s,
-            start_s=config.start_s,
-            stop_s=config.stop_s,
-        )
-    timeline = Timeline(schedule.t_ns, int(schedule.t_ns[0]))
+        schedule = schedule_of(log, config, plan)
     seen = observe(
         log,
         schedule,
@@ -87,6 +73,37 @@ def reconstruct(
         clock=clock,
         progress=lambda done, total: tell("detect and measure", done, total),
     )
+    return conclude(log, config, plan, detector, schedule, seen, clock)
+
+
+def detector_of(log: Log, config: Config) -> Detector:
+    """The detector that the settings name."""
+    return create_detector(
+        config.detect.name,
+        log,
+        min_score=config.detect.min_score or None,
+        tiles=config.detect.tiles or "auto",
+        layout=config.detect.layout or None,
+    )
+
+
+def schedule_of(log: Log, config: Config, plan: Plan) -> Schedule:
+    """The ticks of a run and what belongs to each."""
+    return synchronize(
+        log,
+        plan.cameras,
+        reference=config.sync.reference,
+        max_residual_s=config.sync.max_residual_s,
+        start_s=config.start_s,
+        stop_s=config.stop_s,
+    )
+
+
+def conclude(
+    log: Log, config: Config, plan: Plan, detector: Detector, schedule: Schedule, seen: Observed, clock: StageClock
+) -> Result:
+    """The second pass: from what was seen, which stays as it is, to the scenario and the report."""
+    timeline = Timeline(schedule.t_ns, int(schedule.t_ns[0]))
     with clock.stage("topdown"):
         plan, homographies = fit_cameras(
             log, schedule, seen, plan, config.topdown.method, np.random.default_rng(config.seed)
