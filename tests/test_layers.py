@@ -19,7 +19,7 @@ GROUND = {
 STAGES = {
     "detect", "extend", "fuse", "logs", "measure", "metrics", "plot", "replay", "shape", "smooth", "sync", "synth", "topdown", "track",
 }  # fmt: skip
-PIPELINE = {"assemble", "finish", "ground_plane", "mosaic", "observe", "pipeline", "plan", "report"}
+PIPELINE = {"assemble", "bench", "finish", "ground_plane", "mosaic", "observe", "pipeline", "plan", "report"}
 TOP = {"__init__", "cli", "progress"}
 # Synthetic logs are written by the writer of logs.
 ALLOWED = {("synth", "logs")}

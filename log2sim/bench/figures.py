@@ -1,0 +1,98 @@
+"""What a reconstructed scenario is worth: figures against the truth, and those that need none."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from log2sim.metrics.evaluate import evaluate
+from log2sim.scenario import Agent, Scenario
+
+CUT_M = 2.0
+"""Distance from which an object is no longer the one that was meant, m; the metrics match up to it."""
+
+AHEAD_S = 1.0
+COPIED = (
+    "recall",
+    "precision",
+    "position_rmse_m",
+    "position_median_m",
+    "speed_rmse_mps",
+    "yaw_median_deg",
+    "hota",
+    "id_switches",
+)
+"""Figures of `evaluate` that are kept."""
+
+
+def scenario_figures(scenario: Scenario, truth: Scenario | None, tick_s: float) -> dict[str, Any]:
+    """Figures of a scenario; without truth only those that its own waypoints tell.
+
+    `error_m`: root mean square of the distances, where a missed and a false object together count as one that is 2 m off.
+    `state_error_m`: how far off an object will be one second later, by its errors of position and speed.
+    `jitter_m`: see `jitter`. `gap_share`: part of the agents' ticks at which the detector did not see them.
+    `smoothing_residual_m`: median over agents of the distances of the measurements from the smoothed path.
+    """
+    out: dict[str, Any] = {
+        "agents": len(scenario.others),
+        "jitter_m": jitter(scenario),
+        "gap_share": _gap_share(scenario, tick_s),
+        "smoothing_residual_m": _smoothing_residual(scenario),
+    }
+    if truth is None:
+        return out
+    found = evaluate(scenario, truth)
+    out |= {key: found[key] for key in COPIED}
+    counts = found["counts"]
+    out["error_m"] = combined_error(
+        counts["matched_ticks"], found["position_rmse_m"], counts["missed_ticks"], counts["false_ticks"]
+    )
+    if found["position_rmse_m"] is not None:
+        out["state_error_m"] = float(np.hypot(found["position_rmse_m"], AHEAD_S * found["speed_rmse_mps"]))
+    return out
+
+
+def combined_error(matched: int, rmse_m: float | None, missed: int, false: int) -> float | None:
+    """Root mean square distance, m, with missed and false objects counted; None where there is nothing to count.
+
+    Notes
+    -----
+    GOSPA (Rahmathullah et al., 2017) with p = 2 and alpha = 2, divided by the number of objects so that it is a distance:
+    between 0 for a perfect result and the cut-off for one that has nothing right.
+    """
+    lost = (missed + false) / 2
+    if matched + lost == 0:
+        return None
+    squares = matched * (rmse_m or 0.0) ** 2 + CUT_M**2 * lost
+    return float(np.sqrt(squares / (matched + lost)))
+
+
+def jitter(scenario: Scenario) -> float | None:
+    """Median over moving agents of the noise in their waypoints, m; None when none moves for long enough.
+
+    Notes
+    -----
+    Third differences lack motion of constant acceleration; of white noise of deviation s they have 20 s2.
+    """
+    values = [_third_differences(a) for a in scenario.others if not a.static and len(a.waypoints) >= 5]
+    return float(np.median(values)) if values else None
+
+
+def _third_differences(agent: Agent) -> float:
+    xy = np.column_stack([agent.waypoints.x_m, agent.waypoints.y_m])
+    return float(np.sqrt(np.mean(np.diff(xy, n=3, axis=0) ** 2) / 20))
+
+
+def _gap_share(scenario: Scenario, tick_s: float) -> float | None:
+    lives = [(a.quality["detections"], a.waypoints.t_s[-1] - a.waypoints.t_s[0]) for a in scenario.others]
+    if not lives or tick_s <= 0:
+        return None
+    seen, ticks = (sum(v) for v in zip(*((n, life / tick_s + 1) for n, life in lives)))
+    return float(np.clip(1 - seen / ticks, 0.0, 1.0))
+
+
+def _smoothing_residual(scenario: Scenario) -> float | None:
+    known = [a.quality.get("smoothing_residual_rms_m") for a in scenario.others]
+    values = [v for v in known if v is not None]
+    return float(np.median(values)) if values else None
