@@ -16,11 +16,16 @@ from log2sim.geometry import NS_PER_S
 from log2sim.schema import check
 
 VERSION = 1
-# Figures of a whole run that the table shows beside its error.
+# Figures that the table shows beside the error, in the panels that have them.
 COLUMNS = (
     ("recall", "recall", 3),
     ("precision", "precis.", 3),
     ("position_rmse_m", "pos rmse m", 2),
+    ("placed_share", "placed", 3),
+    ("median_m", "median m", 2),
+    ("near_error_m", "<25 m", 2),
+    ("far_error_m", ">25 m", 2),
+    ("foot_median_m", "foot med m", 2),
     ("jitter_m", "jitter m", 4),
 )
 

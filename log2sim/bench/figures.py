@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from log2sim.bench.parts import Parts, error_of
 from log2sim.metrics.evaluate import evaluate
 from log2sim.scenario import Agent, Scenario
 
@@ -26,7 +29,15 @@ COPIED = (
 """Figures of `evaluate` that are kept."""
 
 
-def scenario_figures(scenario: Scenario, truth: Scenario | None, tick_s: float) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Judged:
+    """Figures of a run, and of those that are errors the parts that single objects have in them."""
+
+    figures: dict[str, Any]
+    parts: Mapping[str, Parts] = field(default_factory=dict)
+
+
+def judge_scenario(scenario: Scenario, truth: Scenario | None, tick_s: float) -> Judged:
     """Figures of a scenario; without truth only those that its own waypoints tell.
 
     `error_m`: root mean square of the distances, where a missed and a false object together count as one that is 2 m off.
@@ -41,31 +52,42 @@ def scenario_figures(scenario: Scenario, truth: Scenario | None, tick_s: float) 
         "smoothing_residual_m": _smoothing_residual(scenario),
     }
     if truth is None:
-        return out
+        return Judged(out)
     found = evaluate(scenario, truth)
-    out |= {key: found[key] for key in COPIED}
-    counts = found["counts"]
-    out["error_m"] = combined_error(
-        counts["matched_ticks"], found["position_rmse_m"], counts["missed_ticks"], counts["false_ticks"]
-    )
-    if found["position_rmse_m"] is not None:
-        out["state_error_m"] = float(np.hypot(found["position_rmse_m"], AHEAD_S * found["speed_rmse_mps"]))
-    return out
+    parts = {"error_m": _error_parts(found), "state_error_m": _state_parts(found)}
+    out |= {key: found[key] for key in COPIED} | {key: error_of(p) for key, p in parts.items()}
+    return Judged(out, parts)
 
 
-def combined_error(matched: int, rmse_m: float | None, missed: int, false: int) -> float | None:
-    """Root mean square distance, m, with missed and false objects counted; None where there is nothing to count.
+def _error_parts(found: Mapping[str, Any]) -> Parts:
+    """What each object adds to `error_m`.
 
     Notes
     -----
     GOSPA (Rahmathullah et al., 2017) with p = 2 and alpha = 2, divided by the number of objects so that it is a distance:
     between 0 for a perfect result and the cut-off for one that has nothing right.
     """
-    lost = (missed + false) / 2
-    if matched + lost == 0:
-        return None
-    squares = matched * (rmse_m or 0.0) ** 2 + CUT_M**2 * lost
-    return float(np.sqrt(squares / (matched + lost)))
+    parts = {}
+    for row in found["agents"]:
+        lost = (row["ticks"] - row["matched"]) / 2
+        parts[row["id"]] = (
+            row["matched"] * (row["position_rmse_m"] or 0.0) ** 2 + CUT_M**2 * lost,
+            row["matched"] + lost,
+        )
+    for row in found["false_agents"]:
+        parts[f"false {row['id']}"] = CUT_M**2 * row["false_ticks"] / 2, row["false_ticks"] / 2
+    return parts
+
+
+def _state_parts(found: Mapping[str, Any]) -> Parts:
+    rows = [row for row in found["agents"] if row["matched"]]
+    return {
+        row["id"]: (
+            row["matched"] * (row["position_rmse_m"] ** 2 + (AHEAD_S * row["speed_rmse_mps"]) ** 2),
+            row["matched"],
+        )
+        for row in rows
+    }
 
 
 def jitter(scenario: Scenario) -> float | None:

@@ -9,21 +9,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from log2sim.bench.parts import Parts, share_not_worse
+
 # Errors that differ by less are the same: logs are short, and a few objects more or less move them by as much.
 SAME_ERROR = 0.05
+# Part of the resamples in which a setting must do as well as the present one to take its place.
+SURE = 0.9
 # Nobody notices less than this share of the whole run's time.
 SAME_TIME = 0.05
 
 
 @dataclass(frozen=True)
 class Point:
-    """One setting of a stage: its time, its error (None where nothing tells it) and everything else that was measured."""
+    """One setting of a stage: its time, its error (None where nothing tells it) and everything else that was measured.
+
+    `parts` is what single objects have in the error, where it is known.
+    """
 
     setting: str
     present: bool
     ms_per_tick: float
     error: float | None
     figures: dict[str, Any] = field(default_factory=dict)
+    parts: Parts = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -58,6 +66,8 @@ def front_of(points: Sequence[Point]) -> NDArray[np.bool_]:
 def judge(points: Sequence[Point], unit: str, whole_ms: float) -> Verdict:
     """Choose among the settings of a stage: least error, and the cheapest of those whose error is about as small.
 
+    Another setting takes the present one's place only where that is no matter of chance.
+
     Parameters
     ----------
     points : sequence of Point
@@ -68,32 +78,49 @@ def judge(points: Sequence[Point], unit: str, whole_ms: float) -> Verdict:
         What a tick of a whole run takes, ms; a stage's time is weighed against it.
     """
     present = next(p for p in points if p.present)
-    known = [p for p in points if p.error is not None]
-    if not known or present.error is None:
-        return Verdict(None, present.setting, "no error is known")
-    if len(known) == 1:
-        return Verdict(present.setting, present.setting, f"{present.setting} is the only setting")
-    least = min(p.error for p in known if p.error is not None)
-    as_good = [p for p in known if p.error is not None and p.error <= least * (1 + SAME_ERROR)]
-    chosen = min(as_good, key=lambda p: p.ms_per_tick)
-    if present in as_good and present.ms_per_tick - chosen.ms_per_tick <= SAME_TIME * whole_ms:
-        chosen = present
-    if chosen is present:
-        return Verdict(present.setting, present.setting, _stays(present, known, unit))
-    return Verdict(chosen.setting, present.setting, _instead(chosen, present, unit))
+    others = [p for p in points if p.error is not None and p is not present]
+    if present.error is None:
+        return Verdict(None, present.setting, "no error of the present setting is known")
+    if not others:
+        return Verdict(present.setting, present.setting, f"there is nothing but {present.setting} to choose")
+    better = [p for p in others if _gains(p, present, whole_ms)]
+    sure = [p for p in better if _sureness(p, present) >= SURE]
+    if sure:
+        chosen = _choose(sure)
+        return Verdict(chosen.setting, present.setting, _instead(chosen, present, unit))
+    best = _choose(better or others)
+    reason = f"{present.setting} stays: {_figures(present, unit)}; "
+    if better:
+        reason += f"{best.setting} may be better or not: {_figures(best, unit)}, {_sureness(best, present):.0%} sure"
+    else:
+        reason += f"next is {best.setting}: {_figures(best, unit)}"
+    return Verdict(present.setting, present.setting, reason)
 
 
-def _stays(present: Point, known: Sequence[Point], unit: str) -> str:
-    others = [p for p in known if p is not present]
-    best = min(others, key=lambda p: p.error or 0.0)
-    return (
-        f"{present.setting} stays: {_figures(present, unit)}; the best other is {best.setting}: {_figures(best, unit)}"
-    )
+def _gains(point: Point, present: Point, whole_ms: float) -> bool:
+    """Whether a setting looks better than the present one: less error, or about the same in clearly less time."""
+    error, known = point.error or 0.0, present.error or 0.0
+    cheaper = present.ms_per_tick - point.ms_per_tick > SAME_TIME * whole_ms
+    return error < known * (1 - SAME_ERROR) or (cheaper and error <= known * (1 + SAME_ERROR))
+
+
+def _sureness(point: Point, present: Point) -> float:
+    """Share of resamples in which a setting is no worse than the present one, where the objects' parts are known."""
+    if not point.parts or not present.parts:
+        return 1.0
+    return share_not_worse(point.parts, present.parts, SAME_ERROR if point.ms_per_tick < present.ms_per_tick else 0.0)
+
+
+def _choose(points: Sequence[Point]) -> Point:
+    """The cheapest of those whose error is about the least."""
+    least = min(p.error or 0.0 for p in points)
+    return min((p for p in points if (p.error or 0.0) <= least * (1 + SAME_ERROR)), key=lambda p: p.ms_per_tick)
 
 
 def _instead(chosen: Point, present: Point, unit: str) -> str:
-    return f"{chosen.setting} rather than {present.setting}: {_figures(chosen, unit)} against {_figures(present, unit)}"
+    sureness = f", {_sureness(chosen, present):.0%} sure" if chosen.parts else ""
+    return f"{chosen.setting} rather than {present.setting}: {_figures(chosen, unit)} against {_figures(present, unit)}{sureness}"
 
 
 def _figures(point: Point, unit: str) -> str:
-    return f"{point.error:.3g} {unit}, {point.ms_per_tick:.3g} ms"
+    return f"{point.error:.3g}{f' {unit}' * bool(unit)}, {point.ms_per_tick:.3g} ms"

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
+from log2sim.bench.figures import Judged
 from log2sim.bench.front import Point, Verdict, front_of, judge
 from log2sim.bench.runs import Bed, Progress, Run, homography_points, run_all
 
@@ -38,8 +38,8 @@ ERRORS = {
         ("smoothing_residual_m", "measurements' distance from the smoothed path", "m"),
     ),
     "homography": (
-        ("median_m", "obstacles placed without LiDAR, median distance from the truth", "m"),
-        ("median_m", "obstacles placed without LiDAR, median distance from where LiDAR has them", "m"),
+        ("error_m", "obstacles placed by it alone, error cut at 2 m", "m"),
+        ("error_m", "obstacles placed by it alone, distance from LiDAR's place cut at 2 m", "m"),
     ),
     "smooth": (
         ("state_error_m", "error of the position one second ahead", "m"),
@@ -54,13 +54,13 @@ ERRORS = {
 
 def make_panels(bed: Bed, tell: Progress) -> list[Panel]:
     """Run everything and lay it out, one panel a stage and one for whole runs."""
-    runs, measured, seen = run_all(bed, tell)
+    runs, seen = run_all(bed, tell)
     whole_ms = bed.ms_per_tick(runs[0].seconds)
     known = bed.truth is not None
     by_stage = {stage: [runs[0], *(r for r in runs[1:] if r.setting.stage == stage)] for stage in OWN_STAGES}
     points = {
         "detect": [_point(bed, "detect", r) for r in by_stage["detect"]],
-        "measure": [_measure_point(bed, r, measured) for r in by_stage["measure"]],
+        "measure": [_measure_point(bed, r) for r in by_stage["measure"]],
         "homography": homography_points(bed, seen, tell),
         "smooth": [_point(bed, "smooth", r) for r in by_stage["smooth"]],
         "whole run": [_whole_point(bed, r) for r in runs],
@@ -83,24 +83,25 @@ def _name(bed: Bed, stage: str, run: Run) -> str:
 
 def _point(bed: Bed, stage: str, run: Run) -> Point:
     ms = bed.ms_per_tick(sum(run.stages_s.get(s, 0.0) for s in OWN_STAGES[stage]))
-    return Point(_name(bed, stage, run), run.setting.present, ms, run.figures.get(_error(bed, stage)), run.figures)
+    return _judged(_name(bed, stage, run), run.setting.present, ms, run.judged, _error(bed, stage))
 
 
-def _measure_point(bed: Bed, run: Run, measured: dict[str, dict[str, Any]]) -> Point:
+def _judged(name: str, present: bool, ms: float, judged: Judged, error: str) -> Point:
+    return Point(name, present, ms, judged.figures.get(error), judged.figures, judged.parts.get(error, {}))
+
+
+def _measure_point(bed: Bed, run: Run) -> Point:
     point = _point(bed, "measure", run)
     if bed.truth is None:
         return point
-    own = measured[point.setting]
-    return Point(point.setting, point.present, point.ms_per_tick, own["error_m"], own)
+    return _judged(point.setting, point.present, point.ms_per_tick, run.measured, "error_m")
 
 
 def _whole_point(bed: Bed, run: Run) -> Point:
     name = "present settings" if run.setting.present else run.setting.key
-    stages = {f"{stage}_ms": bed.ms_per_tick(s) for stage, s in run.stages_s.items()}
-    figures = {**run.figures, "stages": stages}
-    return Point(
-        name, run.setting.present, bed.ms_per_tick(run.seconds), run.figures.get(_error(bed, "whole run")), figures
-    )
+    stages = {stage: bed.ms_per_tick(s) for stage, s in run.stages_s.items()}
+    point = _judged(name, run.setting.present, bed.ms_per_tick(run.seconds), run.judged, _error(bed, "whole run"))
+    return replace(point, figures={**point.figures, "stages_ms_per_tick": stages})
 
 
 def _error(bed: Bed, stage: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
@@ -16,13 +16,16 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from log2sim.bench import Benchmark
 from log2sim.bench.front import Point
+from log2sim.bench.names import write_names
 from log2sim.bench.panels import Panel
 from log2sim.files import replaced
-from log2sim.plot.look import CROWD_COLOR, FONT, FRAME, GRID, INK, MUTED, PALETTE, PAPER, halo, printable
+from log2sim.geometry import Array
+from log2sim.plot.look import CROWD_COLOR, FONT, FRAME, GRID, INK, MUTED, PALETTE, PAPER, printable
 
 COLUMNS = 3
-CELL_IN = (4.3, 3.75)
-MARGIN_IN = {"left": 0.62, "right": 0.2, "top": 0.8, "bottom": 0.56}
+CELL_IN = (4.3, 3.6)
+MARGIN_IN = {"left": 0.62, "right": 0.2, "top": 0.62, "bottom": 0.56}
+HEAD_IN = 0.62
 FRONT, CHOSEN = PALETTE[0], PALETTE[4]
 
 
@@ -36,7 +39,7 @@ def write_picture(result: Benchmark, path: Path, *, dpi: int = 150) -> None:
 def draw(result: Benchmark) -> Figure:
     """The figure; its last cell says what the marks mean and what the figures support."""
     rows = -(-(len(result.panels) + 1) // COLUMNS)
-    width, height = COLUMNS * CELL_IN[0], rows * CELL_IN[1] + 0.55
+    width, height = COLUMNS * CELL_IN[0], rows * CELL_IN[1] + HEAD_IN
     figure = Figure(figsize=(width, height), facecolor=PAPER)
     FigureCanvasAgg(figure)
     _title(figure, result)
@@ -69,25 +72,28 @@ def _title(figure: Figure, result: Benchmark) -> None:
 
 
 def _draw_panel(ax: Axes, panel: Panel) -> None:
-    known = [(p, f) for p, f in zip(panel.points, panel.on_front, strict=True) if p.error is not None]
+    shown = [(p, f) for p, f in zip(panel.points, panel.on_front, strict=True) if p.error is not None]
     _style(ax)
     style: dict[str, Any] = {"transform": ax.transAxes, "family": FONT, "va": "baseline", "parse_math": False}
     ax.text(0, 1.1, panel.stage, fontsize=10, fontweight="bold", color=INK, **style)
-    ax.text(
-        0, 1.035, printable(f"{panel.label}{f' ({panel.unit})' * bool(panel.unit)}"), fontsize=6.8, color=MUTED, **style
-    )
-    if not known:
-        ax.text(0.5, 0.5, "no error is known", ha="center", fontsize=8, color=MUTED, **style)
+    label = f"{panel.label}{f' ({panel.unit})' * bool(panel.unit)}"
+    ax.text(0, 1.035, printable(label, 90), fontsize=6.8, color=MUTED, **style)
+    hidden = [p.setting for p in panel.points if p.error is None]
+    if hidden:
+        ax.text(0.02, 0.025, printable(f"no error known: {', '.join(hidden)}"), fontsize=6.8, color=MUTED, **style)
+    if not shown:
         ax.set(xticks=[], yticks=[])
         return
-    x = np.array([p.ms_per_tick for p, _ in known])
-    y = np.array([p.error for p, _ in known], dtype=np.float64)
+    points = [p for p, _ in shown]
+    x = np.array([p.ms_per_tick for p in points])
+    y = np.array([p.error for p in points], dtype=np.float64)
     _limits(ax, x, y)
-    front = sorted((p.ms_per_tick, float(p.error or 0.0)) for p, f in known if f)
+    front = sorted((p.ms_per_tick, float(p.error or 0.0)) for p, f in shown if f)
     ax.step(*zip(*front), where="post", color=FRONT, lw=1.3, alpha=0.55, zorder=2)
-    for point, on_front in known:
+    for point, on_front in shown:
         _mark(ax, point, on_front=on_front, chosen=point.setting == panel.verdict.supported)
-    _label(ax, [p for p, _ in known], x, y)
+    corners = [k for (a, b), (c, d) in pairwise(front) for k in ((a, b), (c, b), (c, d))]
+    write_names(ax, points, np.column_stack([x, y]), np.array(corners).reshape(-1, 2))
 
 
 def _mark(ax: Axes, point: Point, *, on_front: bool, chosen: bool) -> None:
@@ -110,67 +116,20 @@ def _style(ax: Axes) -> None:
         spine.set(color=FRAME, linewidth=0.8)
 
 
-def _limits(ax: Axes, x: np.ndarray[Any, Any], y: np.ndarray[Any, Any]) -> None:
+def _limits(ax: Axes, x: Array, y: Array) -> None:
     """A logarithmic axis of time, at least a factor of three wide; errors with room for names."""
     low, high = np.log10(max(x.min(), 1e-3)), np.log10(max(x.max(), 1e-3))
     wide = max((high - low) * 1.5, np.log10(3.0))
-    middle = (low + high) / 2
+    start, end = 10 ** ((low + high - wide) / 2), 10 ** ((low + high + wide) / 2)
     ax.set_xscale("log")
-    ax.set_xlim(10 ** (middle - wide / 2), 10 ** (middle + wide / 2))
-    steps = [m * 10.0**k for k in range(-4, 7) for m in (1, 2, 5)]
-    ax.xaxis.set_major_locator(FixedLocator([s for s in steps if ax.get_xlim()[0] <= s <= ax.get_xlim()[1]]))
+    ax.set_xlim(start, end)
+    digits = (1, 2, 5) if end > 6 * start else (1, 1.5, 2, 3, 4, 5, 6, 8)
+    steps = [m * 10.0**k for k in range(-4, 7) for m in digits]
+    ax.xaxis.set_major_locator(FixedLocator([s for s in steps if start <= s <= end]))
     ax.xaxis.set_minor_locator(NullLocator())
     ax.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
-    room = max(float(np.ptp(y)) * 0.22, float(y.max()) * 0.06, 1e-6)
-    ax.set_ylim(max(float(y.min()) - room, 0.0 if y.min() > room else -0.4 * room), float(y.max()) + room)
-
-
-def _label(ax: Axes, points: Sequence[Point], x: np.ndarray[Any, Any], y: np.ndarray[Any, Any]) -> None:
-    """Names beside the points, each where it covers least of the other names and points."""
-    at = ax.transData.transform(np.column_stack([x, y]))
-    pt = ax.figure.dpi / 72
-    frame = ax.get_window_extent()
-    taken = [(u - 5 * pt, v - 5 * pt, u + 5 * pt, v + 5 * pt) for u, v in at]
-    for point, (u, v) in sorted(zip(points, at), key=lambda pair: -float(pair[1][1])):
-        name = printable(point.setting, 28)
-        w, h = (len(name) * 3.75 + 2) * pt, 8 * pt
-        spots = [
-            (u + side * gap * pt - (w if side < 0 else w / 2 if side == 0 else 0), v + rise * pt)
-            for side, gap, rise in SPOTS
-        ]
-        boxes = [(a, b - h / 2, a + w, b + h / 2) for a, b in spots]
-        cost = [
-            sum(_shared(box, other) for other in taken)
-            + 3 * _outside(box, (frame.x0, frame.y0, frame.x1, frame.y1))
-            + k
-            for k, box in enumerate(boxes)
-        ]
-        best = boxes[int(np.argmin(cost))]
-        taken.append(best)
-        a, b = ax.transData.inverted().transform((best[0], (best[1] + best[3]) / 2))
-        weight = "bold" if point.present else "normal"
-        ax.text(
-            a, b, name, fontsize=6.8, family=FONT, color=INK, weight=weight, va="center_baseline", ha="left",
-            parse_math=False, path_effects=halo(1.8), zorder=5,
-        )  # fmt: skip
-
-
-# Side, distance and height in points of a name from its point: right and left first, then above and below.
-SPOTS = tuple(
-    (side, gap, rise)
-    for rise in (0, 8, -8, 16, -16, 24, -24, 32, -32)
-    for side, gap in ((1, 8), (-1, 8), (0, 0))
-    if side or rise
-)
-
-
-def _shared(a: tuple[float, ...], b: tuple[float, ...]) -> float:
-    """Area that two boxes share, square pixels."""
-    return max(min(a[2], b[2]) - max(a[0], b[0]), 0.0) * max(min(a[3], b[3]) - max(a[1], b[1]), 0.0)
-
-
-def _outside(box: tuple[float, ...], frame: tuple[float, ...]) -> float:
-    return (box[2] - box[0]) * (box[3] - box[1]) - _shared(box, frame)
+    room = max(float(np.ptp(y)) * 0.22, float(y.max()) * 0.1, 1e-6)
+    ax.set_ylim(max(float(y.min()) - room, -0.4 * room), float(y.max()) + room)
 
 
 def _draw_words(ax: Axes, result: Benchmark) -> None:
@@ -185,18 +144,18 @@ def _draw_words(ax: Axes, result: Benchmark) -> None:
         (Line2D([], [], marker="o", ms=12, mfc="none", mec=CHOSEN, ls="none", mew=1.6), "what the figures support"),
     ]
     ax.legend(
-        [h for h, _ in handles], [t for _, t in handles], loc="upper left", bbox_to_anchor=(-0.03, 1.12), frameon=False,
+        [h for h, _ in handles], [t for _, t in handles], loc="upper left", bbox_to_anchor=(-0.03, 1.14), frameon=False,
         ncols=2, prop={"family": FONT, "size": 7.0}, labelcolor=INK, handletextpad=0.5, columnspacing=1.2, labelspacing=0.7,
     )  # fmt: skip
-    y = 0.86
+    y = 0.92
     for panel in result.panels:
-        for k, line in enumerate(wrap(printable(panel.verdict.reason, 200), 62)):
+        for k, line in enumerate(wrap(printable(panel.verdict.reason, 240), 50)):
             head = panel.stage if k == 0 else ""
             ax.text(0, y, head, fontsize=7.2, family=FONT, color=INK, weight="bold", va="top", parse_math=False)
-            ax.text(0.2, y, line, fontsize=7.2, family=FONT, color=INK, va="top", parse_math=False)
+            ax.text(0.23, y, line, fontsize=7.2, family=FONT, color=INK, va="top", parse_math=False)
             y -= 0.058
         y -= 0.03
     for note in result.notes:
-        for line in wrap(printable(f"Note: {note}", 200), 78):
+        for line in wrap(printable(f"Note: {note}", 240), 70):
             ax.text(0, y, line, fontsize=6.6, family=FONT, color=MUTED, va="top", parse_math=False)
             y -= 0.05

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.bench.figures import CUT_M
+from log2sim.bench.figures import CUT_M, Judged
+from log2sim.bench.parts import error_of
 from log2sim.detect.projection import project_boxes
 from log2sim.geometry import NS_PER_S, Array, box_iou, inverse
 from log2sim.ground_plane import CameraGround, locate_the_rest
 from log2sim.metrics.align import Side, truth_side
-from log2sim.observe import Observed
+from log2sim.observe import Observed, base_pose
 from log2sim.scenario import Scenario
 from log2sim.sync import Schedule
-from log2sim.topdown import FARTHEST_M, Correspondences, pinhole
-from log2sim.types import GROUP_OF, Log, Measurements
+from log2sim.topdown import FARTHEST_M, Correspondences, apply_homography, foot_points, pinhole
+from log2sim.types import GROUP_OF, Camera, Log, Measurements
 
 LEAST_IOU = 0.5
 NEAR_M = 25.0
@@ -27,18 +28,27 @@ HELD_OUT = 0.25
 
 LEAST_POINTS = 20
 SAME_FOOT_PX = 0.01
+BLOCK_S = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Where the objects of a tick's measurements are: `xy` (M, 2) in the map, NaN where not known, and `who` (M,) each is."""
+
+    xy: Array
+    who: NDArray[np.int64]
 
 
 def true_places(
     log: Log, schedule: Schedule, seen: Observed, truth: Scenario, *, when: Literal["measured", "imaged"] = "measured"
-) -> list[Array]:
-    """For every tick the true centers (M, 2) of the objects in the boxes of its measurements; NaN where none is known.
+) -> list[Known]:
+    """For every tick the true centers of the objects in the boxes of its measurements.
 
     They are those at the measurements' own times, or at the stamps of the images. Objects are recognized in the image, by
     the overlap of boxes, so that a wrong place cannot hide itself.
     """
     shift_m = np.array(truth.map.offset_m) - np.array(log.map.offset_m)
-    out = [np.full((len(m), 2), np.nan) for m in seen.measurements]
+    out = [Known(np.full((len(m), 2), np.nan), np.full(len(m), -1)) for m in seen.measurements]
     for camera, index in schedule.frames.items():
         ticks = np.flatnonzero(index >= 0)
         stamps = log.streams[camera].t_ns[index[ticks]]
@@ -51,8 +61,17 @@ def true_places(
                 boxes = _boxes_in_image(log, camera, side, int(k), inverse(map_T_cam[k]))
                 pairs = _recognized(m.take(rows), side, boxes)
                 later_s = (m.t_ns[rows] - stamps[k]) / NS_PER_S if when == "measured" else np.zeros(len(rows))
-                out[ticks[k]][rows] = _true_xy(side, int(k), pairs, later_s)
+                out[ticks[k]].xy[rows] = _true_xy(side, int(k), pairs, later_s)
+                out[ticks[k]].who[rows] = pairs
     return out
+
+
+def lidar_places(seen: Observed, tick_s: float) -> list[Known]:
+    """Where LiDAR has the objects of every tick's measurements; those of half a second are taken for one."""
+    return [
+        Known(m.center_m[:, :2], np.full(len(m), int(tick * tick_s / BLOCK_S)))
+        for tick, m in enumerate(seen.measurements)
+    ]
 
 
 def _boxes_in_image(log: Log, camera: str, side: Side, k: int, cam_T_map: Array) -> Array:
@@ -82,23 +101,28 @@ def _true_xy(side: Side, k: int, pairs: NDArray[np.intp], later_s: Array) -> Arr
     return np.where((pairs >= 0)[:, None], xy, np.nan)
 
 
-def measured_figures(seen: Observed, true_xy: Sequence[Array]) -> dict[str, Any]:
-    """How far measured centers lie from the true ones; `error_m` as in `scenario_figures`, without false objects."""
+def judge_measured(seen: Observed, known: Sequence[Known]) -> Judged:
+    """How far measured centers lie from the true ones; `error_m` cuts at 2 m, which objects without a place count as."""
     measured = np.concatenate([m.center_m[:, :2] for m in seen.measurements])
-    distance = np.hypot(*(measured - np.concatenate(list(true_xy))).T)
-    has_truth = np.isfinite(np.concatenate([t[:, 0] for t in true_xy]))
-    placed = np.isfinite(measured[:, 0])
-    known, asked = distance[has_truth & placed], int(has_truth.sum())
-    if not asked:
-        return {"objects": 0, "error_m": None}
-    cut = np.concatenate([np.minimum(known, CUT_M), np.full(asked - len(known), CUT_M)])
-    return {
-        "objects": asked,
-        "placed_share": len(known) / asked,
-        "error_m": float(np.sqrt(np.mean(cut**2))),
-        "median_m": float(np.median(known)) if len(known) else None,
-        "farther_than_2_m_share": float(np.mean(cut >= CUT_M)),
+    true, who = np.concatenate([k.xy for k in known]), np.concatenate([k.who for k in known])
+    asked = np.isfinite(true[:, 0])
+    return _judge_distances(np.hypot(*(measured - true)[asked].T), who[asked])
+
+
+def _judge_distances(distance: Array, who: NDArray[np.int64]) -> Judged:
+    """Figures of distances (K,), NaN for objects without a place; `who` (K,) says which are one object's."""
+    cut = np.where(distance < CUT_M, distance, CUT_M)
+    squares, count = np.bincount(who, cut**2), np.bincount(who)
+    parts = {str(k): (float(squares[k]), float(count[k])) for k in np.flatnonzero(count)}
+    placed = np.isfinite(distance)
+    figures = {
+        "objects": len(distance),
+        "placed_share": float(placed.mean()) if len(distance) else None,
+        "error_m": error_of(parts),
+        "median_m": float(np.median(distance[placed])) if placed.any() else None,
+        "farther_than_2_m_share": float(np.mean(cut >= CUT_M)) if len(distance) else None,
     }
+    return Judged(figures, {"error_m": parts})
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,35 +130,38 @@ class Held:
     """Measured obstacles kept from the homographies.
 
     `seen` is what is left to fit to. `asked` holds by camera the obstacles of every tick, their LiDAR place taken away,
-    and `known_xy` where they are, (M, 2) in the map.
+    and `known` where they are; `feet` where LiDAR has their feet.
     """
 
     seen: Observed
     asked: dict[str, list[Measurements]]
-    known_xy: dict[str, list[Array]]
+    known: dict[str, list[Known]]
+    feet: dict[str, Correspondences]
 
     def __len__(self) -> int:
         return sum(len(m) for rows in self.asked.values() for m in rows)
 
 
-def hold_out(
-    log: Log, schedule: Schedule, seen: Observed, true_xy: Sequence[Array] | None, rng: np.random.Generator
-) -> Held:
-    """Set a part of the measured obstacles within 60 m aside, with their true places, or those of the LiDAR without truth."""
+def hold_out(log: Log, schedule: Schedule, seen: Observed, known: Sequence[Known], rng: np.random.Generator) -> Held:
+    """Set a part of the measured obstacles within 60 m aside, with what is known of their places at the images' stamps."""
     asked: dict[str, list[Measurements]] = {camera: [] for camera in seen.feet}
-    known: dict[str, list[Array]] = {camera: [] for camera in seen.feet}
+    places: dict[str, list[Known]] = {camera: [] for camera in seen.feet}
+    held: dict[str, list[Correspondences]] = {camera: [] for camera in seen.feet}
     for tick, m in enumerate(seen.measurements):
-        xy = m.center_m[:, :2] if true_xy is None else true_xy[tick]
+        xy, who = known[tick].xy, known[tick].who
         near = np.hypot(*(m.center_m - m.sensor_m)[:, :2].T) <= FARTHEST_M
         good = (m.source == "lidar") & ~m.truncated & (m.points >= LEAST_POINTS) & near & np.isfinite(xy[:, 0])
         good &= rng.random(len(m)) < HELD_OUT
         for camera in asked:
             rows = np.flatnonzero(good & (m.camera == camera))
-            stamp = log.streams[camera].t_ns[schedule.frames[camera][tick]]
-            asked[camera].append(_without_place(m.take(rows), int(stamp)))
-            known[camera].append(xy[rows])
-    feet = {camera: [_without_feet(log, camera, parts, asked[camera])] for camera, parts in seen.feet.items()}
-    return Held(replace(seen, feet=feet), asked, known)
+            stamp = int(log.streams[camera].t_ns[schedule.frames[camera][tick]])
+            ego_T_map = inverse(base_pose(log, stamp))
+            held[camera].append(foot_points(log.cameras[camera], m.take(rows), ego_T_map, tick))
+            asked[camera].append(_without_place(m.take(rows), stamp))
+            places[camera].append(Known(xy[rows], who[rows]))
+    feet = {camera: [_without_feet(log.cameras[camera], parts, asked[camera])] for camera, parts in seen.feet.items()}
+    aside = {camera: Correspondences.join(parts) for camera, parts in held.items()}
+    return Held(replace(seen, feet=feet), asked, places, aside)
 
 
 def _without_place(m: Measurements, stamp: int) -> Measurements:
@@ -149,57 +176,59 @@ def _without_place(m: Measurements, stamp: int) -> Measurements:
     )
 
 
-def _without_feet(
-    log: Log, camera: str, parts: Sequence[Correspondences], asked: Sequence[Measurements]
-) -> Correspondences:
+def _without_feet(camera: Camera, parts: Sequence[Correspondences], asked: Sequence[Measurements]) -> Correspondences:
     """The correspondences of a camera but those of the obstacles that were set aside."""
     feet = Correspondences.join(parts)
     tick = np.concatenate([np.full(len(m), k) for k, m in enumerate(asked)])
     box = np.concatenate([m.box_px for m in asked])
     if not len(box) or not len(feet.uv):
         return feet
-    uv = pinhole(log.cameras[camera], np.column_stack([(box[:, 0] + box[:, 2]) / 2, box[:, 3]]))
+    uv = pinhole(camera, np.column_stack([(box[:, 0] + box[:, 2]) / 2, box[:, 3]]))
     same = (feet.tick[:, None] == tick) & (np.abs(feet.uv[:, None] - uv).max(axis=2) < SAME_FOOT_PX)
     kept = ~same.any(axis=1)
     return Correspondences(feet.uv[kept], feet.xy_ego[kept], feet.tick[kept])
 
 
-def placed_figures(log: Log, schedule: Schedule, held: Held, grounds: Mapping[str, CameraGround]) -> dict[str, Any]:
-    """How far the homographies alone put the obstacles that were set aside; one that gets no place is infinitely far."""
-    distance, range_m = [np.zeros(0)], [np.zeros(0)]
-    for camera, rows in held.asked.items():
-        if camera not in grounds:
-            continue
-        for m, placed, xy in zip(
-            rows, _places(log, schedule, rows, grounds[camera]), held.known_xy[camera], strict=True
-        ):
-            distance.append(np.nan_to_num(np.hypot(*(placed - xy).T), nan=np.inf))
-            range_m.append(np.hypot(*(xy - m.sensor_m[:, :2]).T))
-    d, r = np.concatenate(distance), np.concatenate(range_m)
-    near = r < NEAR_M
-    return {
-        "objects": len(d),
-        "placed_share": float(np.isfinite(d).mean()) if len(d) else None,
-        "median_m": _median(d),
-        "near_median_m": _median(d[near]),
-        "far_median_m": _median(d[~near]),
+def judge_placed(log: Log, schedule: Schedule, held: Held, grounds: Mapping[str, CameraGround]) -> Judged:
+    """How far the homographies alone put the obstacles that were set aside; see `judge_measured`.
+
+    `near_error_m` and `far_error_m` are of those within and beyond 25 m; `foot_median_m` is the distance between the
+    ground points at their feet, which says more of a homography and less of what is behind the foot.
+    """
+    distance, range_m, who = [np.zeros(0)], [np.zeros(0)], [np.zeros(0, dtype=np.int64)]
+    for camera in (c for c in held.asked if c in grounds):
+        for tick, (m, known) in enumerate(zip(held.asked[camera], held.known[camera], strict=True)):
+            distance.append(np.hypot(*(_places(log, schedule, tick, m, grounds[camera]) - known.xy).T))
+            range_m.append(np.hypot(*(known.xy - m.sensor_m[:, :2]).T))
+            who.append(known.who)
+    d, near, w = np.concatenate(distance), np.concatenate(range_m) < NEAR_M, np.concatenate(who)
+    judged = _judge_distances(d, w)
+    extra = {
+        f"{name}_error_m": _judge_distances(d[rows], w[rows]).figures["error_m"]
+        for name, rows in (("near", near), ("far", ~near))
     }
+    return Judged(judged.figures | extra | {"foot_median_m": _foot_median(held, grounds)}, judged.parts)
 
 
-def _median(distance: Array) -> float | None:
-    """Median, None of nothing and where half of it is infinite."""
-    value = float(np.median(distance)) if len(distance) else np.inf
+def _foot_median(held: Held, grounds: Mapping[str, CameraGround]) -> float | None:
+    """Median distance of the feet, in m; None where fewer than half of them are placed."""
+    errors = [np.zeros(0)]
+    for camera, feet in held.feet.items():
+        for tick in np.unique(feet.tick) if camera in grounds else ():
+            fit, rows = at_tick(grounds[camera], int(tick)).fit, feet.tick == tick
+            xy = apply_homography(fit.ground_H_image, feet.uv[rows])[0]
+            errors.append(np.nan_to_num(np.hypot(*(xy - feet.xy_ego[rows]).T), nan=np.inf))
+    value = float(np.median(np.concatenate(errors))) if len(errors) > 1 else np.inf
     return value if np.isfinite(value) else None
 
 
-def _places(log: Log, schedule: Schedule, rows: Sequence[Measurements], ground: CameraGround) -> list[Array]:
-    """Places (M, 2) in the map of the rows of every tick by the homography, that of the tick where it has one of its own."""
-    out = []
-    for tick, m in enumerate(rows):
-        grounds = {ground.camera.name: at_tick(ground, tick)}
-        found = locate_the_rest(log, schedule, Observed(measurements=[m], obstacles=[None]), grounds)[0]
-        out.append(_in_order(m, found))
-    return out
+def _places(log: Log, schedule: Schedule, tick: int, m: Measurements, ground: CameraGround) -> Array:
+    """Places (M, 2) in the map of the rows of a tick by the homography, that of the tick where it has one of its own."""
+    if not len(m):
+        return np.zeros((0, 2))
+    seen = Observed(measurements=[m], obstacles=[None])
+    found = locate_the_rest(log, schedule, seen, {ground.camera.name: at_tick(ground, tick)})[0]
+    return _in_order(m, found)
 
 
 def at_tick(ground: CameraGround, tick: int) -> CameraGround:

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.bench.figures import scenario_figures
+from log2sim.bench.figures import Judged, judge_scenario
 from log2sim.bench.front import Point
-from log2sim.bench.places import Held, hold_out, measured_figures, placed_figures, true_places
+from log2sim.bench.places import Held, hold_out, judge_measured, judge_placed, lidar_places, true_places
 from log2sim.bench.settings import Grid, Setting
 from log2sim.bench.shared import Remembered, detect_once
 from log2sim.clock import StageClock
@@ -57,10 +57,14 @@ class Bed:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A whole run: its figures and the seconds of its stages, also of those that it shared with other runs."""
+    """A whole run: what it is worth and the seconds of its stages, also of those that it shared with other runs.
+
+    `measured` is what its measurements are worth, which only truth can tell.
+    """
 
     setting: Setting
-    figures: Figures
+    judged: Judged
+    measured: Judged
     stages_s: dict[str, float]
 
     @property
@@ -100,53 +104,57 @@ def look(bed: Bed, detect: Setting, measure: Setting, tell: Progress) -> tuple[O
     return seen, {**clock.seconds, **shared, "detect": bed.found[detect.name].seconds}
 
 
-def run(bed: Bed, settings: Sequence[Setting], seen: Observed, before_s: dict[str, float], tell: Progress) -> list[Run]:
+def run(
+    bed: Bed, settings: Sequence[Setting], first_pass: tuple[Observed, dict[str, float]], tell: Progress
+) -> list[Run]:
     """Go on from a first pass to the scenario with every setting, and measure what it is worth.
 
     Settings take turns several times and the median of each stage's time counts.
     """
-    figures: dict[str, Figures] = {}
+    (seen, before_s), measured = first_pass, measured_by(bed, first_pass[0])
+    judged: dict[str, Judged] = {}
     spent: dict[str, list[dict[str, float]]] = {s.key: [] for s in settings}
     for repeat in range(REPEATS):
         for k, setting in enumerate(settings):
             clock = StageClock()
-            figures[setting.key] = _concluded(bed, setting, seen, clock)
+            judged[setting.key] = _concluded(bed, setting, seen, clock)
             spent[setting.key].append(clock.seconds)
             tell("track and smooth", repeat * len(settings) + k + 1, REPEATS * len(settings))
     return [
-        Run(s, figures[s.key], {**before_s, **{k: _median([t[k] for t in spent[s.key]]) for k in spent[s.key][0]}})
+        Run(
+            s,
+            judged[s.key],
+            measured,
+            {**before_s, **{k: _median([t[k] for t in spent[s.key]]) for k in spent[s.key][0]}},
+        )
         for s in settings
     ]
 
 
-def _concluded(bed: Bed, setting: Setting, seen: Observed, clock: StageClock) -> Figures:
+def _concluded(bed: Bed, setting: Setting, seen: Observed, clock: StageClock) -> Judged:
     detector = bed.found[bed.grid.present.name]
     try:
         result = conclude(bed.log, setting.config, bed.plan, detector, bed.schedule, seen, clock)
     except NothingToReconstruct:
-        return {"agents": 0}
-    return scenario_figures(result.scenario, bed.truth, bed.tick_s)
+        return Judged({"agents": 0})
+    return judge_scenario(result.scenario, bed.truth, bed.tick_s)
 
 
 def _median(values: Sequence[float]) -> float:
     return float(np.median(values))
 
 
-def run_all(bed: Bed, tell: Progress) -> tuple[list[Run], dict[str, Figures], Observed]:
-    """Run every setting, the present one first; also the figures of the measurements by setting, and what was seen."""
-    grid, measured = bed.grid, {}
+def run_all(bed: Bed, tell: Progress) -> tuple[list[Run], Observed]:
+    """Run every setting, the present one first; also what was seen with it."""
+    grid = bed.grid
     warm_up(bed)
-    present, present_s = look(bed, grid.present, grid.measure[0], tell)
-    measured[grid.measure[0].name] = measured_by(bed, present)
-    runs = run(bed, (grid.present, *grid.homography[1:], *grid.smooth[1:]), present, present_s, tell)
+    present = look(bed, grid.present, grid.measure[0], tell)
+    runs = run(bed, (grid.present, *grid.homography[1:], *grid.smooth[1:]), present, tell)
     for setting in grid.measure[1:]:
-        seen, before_s = look(bed, grid.present, setting, tell)
-        measured[setting.name] = measured_by(bed, seen)
-        runs += run(bed, [setting], seen, before_s, tell)
+        runs += run(bed, [setting], look(bed, grid.present, setting, tell), tell)
     for setting in grid.detect[1:]:
-        seen, before_s = look(bed, setting, grid.measure[0], tell)
-        runs += run(bed, [setting], seen, before_s, tell)
-    return runs, measured, present
+        runs += run(bed, [setting], look(bed, setting, grid.measure[0], tell), tell)
+    return runs, present[0]
 
 
 def warm_up(bed: Bed) -> None:
@@ -164,18 +172,21 @@ def warm_up(bed: Bed) -> None:
     _concluded(short, bed.grid.present, seen, StageClock())
 
 
-def measured_by(bed: Bed, seen: Observed) -> Figures:
-    """Figures of the measured centers; none without truth."""
+def measured_by(bed: Bed, seen: Observed) -> Judged:
+    """What measured centers are worth; nothing is known without truth."""
     if bed.truth is None:
-        return {}
-    return measured_figures(seen, true_places(bed.log, bed.schedule, seen, bed.truth))
+        return Judged({})
+    return judge_measured(seen, true_places(bed.log, bed.schedule, seen, bed.truth))
 
 
 def homography_points(bed: Bed, seen: Observed, tell: Progress) -> list[Point]:
     """Every method of the homography, judged by obstacles that it was not fitted to; none where no obstacle was measured."""
     truth, seed = bed.truth, bed.grid.present.config.seed
-    true_xy = true_places(bed.log, bed.schedule, seen, truth, when="imaged") if truth is not None else None
-    held = hold_out(bed.log, bed.schedule, seen, true_xy, np.random.default_rng(seed))
+    if truth is not None:
+        known = true_places(bed.log, bed.schedule, seen, truth, when="imaged")
+    else:
+        known = lidar_places(seen, bed.tick_s)
+    held = hold_out(bed.log, bed.schedule, seen, known, np.random.default_rng(seed))
     if not len(held):
         return []
     spent: dict[str, list[float]] = {s.name: [] for s in bed.grid.homography}
@@ -188,9 +199,10 @@ def homography_points(bed: Bed, seen: Observed, tell: Progress) -> list[Point]:
             tell("homographies", repeat * len(spent) + k + 1, REPEATS * len(spent))
     out = []
     for setting in bed.grid.homography:
-        figures = placed_figures(bed.log, bed.schedule, held, fits[setting.name]) | fit_figures(fits[setting.name])
+        judged = judge_placed(bed.log, bed.schedule, held, fits[setting.name])
+        figures = judged.figures | fit_figures(fits[setting.name])
         ms = bed.ms_per_tick(_median(spent[setting.name]))
-        out.append(Point(setting.name, setting.present, ms, figures["median_m"], figures))
+        out.append(Point(setting.name, setting.present, ms, figures["error_m"], figures, judged.parts["error_m"]))
     return out
 
 
