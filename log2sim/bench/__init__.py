@@ -69,5 +69,5 @@ def _notes(bed: Bed, panels: list[Panel]) -> list[str]:
             f"detector '{bed.grid.detect[0].config.detect.name}' has no setting of tiles or input size to compare"
         )
     if all(p.stage != "homography" for p in panels):
-        notes.append("no obstacle with LiDAR points within 60 m: no homography can be judged")
+        notes.append("too few obstacles with LiDAR points within 60 m to judge homographies by")
     return notes

@@ -103,7 +103,7 @@ def _rows(panel: Panel) -> list[str]:
             f"  {'*' if p.present else ' '}{'+' if on_front else ' '}",
             p.setting,
             f"{p.ms_per_tick:.3g}",
-            _cell(p.error, 3),
+            "-" if p.error is None else f"{p.error:.3g}",
             *(_cell(p.figures.get(key), digits) for key, _, digits in columns),
         ]
         for p, on_front in _by_time(panel)

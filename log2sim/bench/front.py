@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from log2sim.bench.parts import Parts, share_not_worse
 
+NO_ERROR = "no error of the present setting is known; objects have to be in sight for a second"
 # Errors that differ by less are the same: logs are short, and a few objects more or less move them by as much.
 SAME_ERROR = 0.05
 # Part of the resamples in which a setting must do as well as the present one to take its place.
@@ -80,7 +81,7 @@ def judge(points: Sequence[Point], unit: str, whole_ms: float) -> Verdict:
     present = next(p for p in points if p.present)
     others = [p for p in points if p.error is not None and p is not present]
     if present.error is None:
-        return Verdict(None, present.setting, "no error of the present setting is known")
+        return Verdict(None, present.setting, NO_ERROR)
     if not others:
         return Verdict(present.setting, present.setting, f"there is nothing but {present.setting} to choose")
     better = [p for p in others if _gains(p, present, whole_ms)]

@@ -9,12 +9,13 @@ from matplotlib.axes import Axes
 
 from log2sim.bench.front import Point
 from log2sim.geometry import Array
-from log2sim.plot.look import FONT, INK, halo, printable
+from log2sim.plot.look import CROWD_COLOR, FONT, INK, halo, printable
 
 SIZE_PT, LETTER_PT, LINE_PT, POINT_PT = 6.8, 3.9, 9.0, 6.0
+# Points nearer to each other than this look like one and get one block of names.
 TOGETHER_PT = 7.0
-"""Points nearer to each other than this look like one and get one block of names."""
-
+# Names farther from their point than this get a line to it.
+APART_PT = 13.0
 # Side, distance and height in points of a block of names from its point: beside it first, then above and below.
 SPOTS = tuple(
     (side, gap, rise)
@@ -39,6 +40,7 @@ def write_names(ax: Axes, points: Sequence[Point], xy: Array, line: Array) -> No
         names = [printable(points[k].setting, 30) for k in members]
         box = _best_box(at[members].mean(axis=0), names, taken, inside, pt)
         taken.append(box)
+        _lead(ax, at[members].mean(axis=0), box, pt)
         for k, (member, name) in enumerate(zip(members, names)):
             x, y = ax.transData.inverted().transform((box[0], box[3] - (k + 0.5) * LINE_PT * pt))
             ax.text(
@@ -69,6 +71,14 @@ def _best_box(at: Array, names: Sequence[str], taken: Sequence[Box], inside: Box
         boxes.append(box)
         costs.append(sum(_shared(box, other) for other in taken) + 3 * (width * height - _shared(box, inside)) + k)
     return boxes[int(np.argmin(costs))]
+
+
+def _lead(ax: Axes, at: Array, box: Box, pt: float) -> None:
+    """A thin line from names to their point, where they stand apart."""
+    end = np.clip(at, box[:2], box[2:])
+    if np.hypot(*(end - at)) > APART_PT * pt:
+        line = ax.transData.inverted().transform(np.stack([at, end]))
+        ax.plot(*line.T, color=CROWD_COLOR, lw=0.6, zorder=1.5)
 
 
 def _around(u: float, v: float, reach: float) -> Box:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from log2sim.config import Config
-from log2sim.detect import Detector
 from log2sim.detect.onnx_detector import OnnxDetector
 from log2sim.detect.tiling import plan_tiles
 from log2sim.pipeline import detector_of
@@ -16,6 +15,9 @@ from log2sim.types import Log
 
 TILES = (0, 1, 2, 3, 5)
 """Tiles to try beside the present setting; 0 is "auto"."""
+
+SIDES_PX = (320, 416, 640, 960)
+"""Sides of the input to try with models that take any."""
 
 HYPOTHESES = (10, 30, 100, 300, 1000, 3000)
 """Hypotheses to try beside the present number, for methods that draw them."""
@@ -87,7 +89,7 @@ def choices(section: Any, key: str) -> list[str]:
     """What a setting may be, the present value first, without the one that leaves the stage out."""
     present = getattr(section, key)
     allowed = next(f.metadata["allowed"] for f in dataclasses.fields(section) if f.name == key)
-    return [present, *(a for a in allowed if a not in (present, NO_METHOD))]
+    return [value for value in dict.fromkeys([present, *allowed]) if value != NO_METHOD]
 
 
 def _choices(stage: str, config: Config, section: str, key: str) -> tuple[Setting, ...]:
@@ -119,32 +121,43 @@ def _smooth_name(config: Config, switches: Sequence[str], named: Sequence[str]) 
 
 
 def _detector_settings(log: Log, config: Config, detectors: Sequence[str]) -> list[Setting]:
-    """Every detector with the tiles that change what it looks at."""
+    """Every detector with the tiles that change what it looks at, and with other sizes of its input where it takes them."""
     names = list(dict.fromkeys([config.detect.name, *detectors]))
     out: list[Setting] = []
     for name in names:
-        own = config if name == config.detect.name else changed(config, "detect", name=name, layout="")
-        detector, seen = detector_of(log, own), set()
-        for tiles in dict.fromkeys([own.detect.tiles, *(TILES if isinstance(detector, OnnxDetector) else ())]):
-            plan = _tile_plan(log, config, detector, tiles)
-            if plan not in seen:
-                seen.add(plan)
-                label = f"{name.rsplit('/', 1)[-1]} " if len(names) > 1 else ""
-                text = f"{label}{_tiles_name(detector, tiles)}".strip()
-                out.append(Setting("detect", text or name, changed(own, "detect", tiles=tiles), not out))
+        own = config if name == config.detect.name else changed(config, "detect", name=name, layout="", input_px=0)
+        label = f"{name.rsplit('/', 1)[-1].removesuffix('.onnx')} " if len(names) > 1 else ""
+        detector = detector_of(log, own)
+        if not isinstance(detector, OnnxDetector):
+            out.append(Setting("detect", name, own, not out))
+            continue
+        for key, value in _looks(log, own, detector):
+            other = changed(own, "detect", **{key: value})
+            out.append(Setting("detect", f"{label}{_look_name(key, value)}", other, not out))
     return out
 
 
-def _tile_plan(log: Log, config: Config, detector: Detector, tiles: int) -> tuple[int, ...]:
+def _looks(log: Log, config: Config, detector: OnnxDetector) -> list[tuple[str, int]]:
+    """Settings of a detector that differ in what it looks at, the present one first."""
+    looks, seen = [], set()
+    for tiles in dict.fromkeys([config.detect.tiles, *TILES]):
+        plan = _tile_plan(log, config, detector, tiles)
+        if plan not in seen:
+            seen.add(plan)
+            looks.append(("tiles", tiles))
+    if detector.model.spec.width_px is None and detector.model.spec.height_px is None:
+        looks += [("input_px", side) for side in SIDES_PX if side != detector.layout.preparation.default_px]
+    return looks
+
+
+def _tile_plan(log: Log, config: Config, detector: OnnxDetector, tiles: int) -> tuple[int, ...]:
     """How many pictures a detector looks at for a frame of each camera."""
-    if not isinstance(detector, OnnxDetector):
-        return ()
     side = detector.model.spec.width_px or detector.layout.preparation.default_px
     cameras = [log.cameras[name] for name in config.cameras or log.cameras]
     return tuple(len(plan_tiles(c.width_px, c.height_px, tiles or "auto", side)) for c in cameras)
 
 
-def _tiles_name(detector: Detector, tiles: int) -> str:
-    if not isinstance(detector, OnnxDetector):
-        return ""
-    return "auto tiles" if tiles == 0 else "no tiles" if tiles == 1 else f"{tiles} tiles"
+def _look_name(key: str, value: int) -> str:
+    if key == "input_px":
+        return f"input {value} px"
+    return "auto tiles" if value == 0 else "no tiles" if value == 1 else f"{value} tiles"
