@@ -270,6 +270,10 @@ def bench(
     format: Format = "auto",
     sequence: Sequence = None,
     cameras: Annotated[str | None, typer.Option(metavar="A,B", help="Use only these cameras.")] = None,
+    range: Annotated[
+        float | None, typer.Option(metavar="M", help="Compare only within so many meters of the ego.")
+    ] = None,
+    categories: Annotated[str | None, typer.Option(metavar="A,B", help="Compare only these, e.g. vehicle.")] = None,
     start: Annotated[float | None, typer.Option(help="First second.")] = None,
     stop: Annotated[float | None, typer.Option(help="Last second.")] = None,
     config: ConfigFile = None,
@@ -278,6 +282,7 @@ def bench(
     quiet: Quiet = False,
 ) -> None:
     """Draw error against run time over methods and settings."""
+    from log2sim.bench import Scope
     from log2sim.bench import bench as run
     from log2sim.bench.document import document, format_table
     from log2sim.bench.picture import write_picture
@@ -295,8 +300,9 @@ def bench(
     labeled = opened.labels is not None or (log / "truth.json").is_file()
     used = chosen.cameras or tuple(opened.cameras)
     known = truth_at(truth or log, used, sequence) if truth is not None or labeled else None
+    scope = Scope(range, tuple(c.strip() for c in categories.split(",")) if categories else None)
     with progress(quiet=quiet) as tell:
-        result = run(opened, chosen, truth=known, detectors=tuple(detector or ()), progress=tell)
+        result = run(opened, chosen, truth=known, scope=scope, detectors=tuple(detector or ()), progress=tell)
     write_json(out / "bench.json", document(result))
     write_picture(result, out / "bench.png")
     say(format_table(result), quiet=quiet)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,13 @@ class Obstacles:
     xyz: NDArray[np.float32]
     t_s: NDArray[np.float32]
     sensor: NDArray[np.float32]
+
+    @cached_property
+    def rays(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Azimuth (N,) rad in the map frame, distance over ground (N,) and slope (N,) of every point from the sensor."""
+        x, y, z = (self.xyz - self.sensor).T
+        reach = np.hypot(x, y)
+        return np.arctan2(y, x), reach, z / np.maximum(reach, np.float32(1e-3))
 
 
 @dataclass(frozen=True, eq=False)

@@ -85,7 +85,7 @@ def _join(rows: Measurements, leader: int, members: NDArray[np.intp]) -> Measure
     ground_z = float(row.center_m[0, 2] - row.size_m[0, 2] / 2)
     origin = row.center_m[0]
     # Where one camera's box cut the object, another's may show its end.
-    ends_seen = rows.ends_seen[[leader, *others]].any(axis=0)
+    ends_seen: NDArray[np.bool_] = np.any(rows.ends_seen[[leader, *others]], axis=0)
     center, size, yaw, covariance = box_of_cluster(
         cluster - origin, row.sensor_m[0] - origin, str(row.category[0]), ground_z - float(origin[2]), ends_seen
     )

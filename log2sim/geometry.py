@@ -196,7 +196,9 @@ def box_corners(center_m: ArrayLike, size_m: ArrayLike, yaw_rad: ArrayLike) -> A
     return np.concatenate([bottom, top], axis=1)
 
 
-def points_in_box(points: Array, center_m: Array, size_m: Array, yaw_rad: float, margin_m: float = 0.0) -> NDArray[np.bool_]:
+def points_in_box(
+    points: Array, center_m: Array, size_m: Array, yaw_rad: float, margin_m: float = 0.0
+) -> NDArray[np.bool_]:
     """Mask (N,) of points (N, 3) inside one upright box (center (3,), size (3,) length, width, height)."""
     d = points - center_m
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
@@ -209,7 +211,10 @@ def box_iou(a_px: ArrayLike, b_px: ArrayLike) -> Array:
     """IoU (A, B) of axis-aligned image boxes (A, 4), (B, 4) as u0, v0, u1, v1 in px; 0 where both are empty."""
     a, b = np.asarray(a_px, dtype=np.float64).reshape(-1, 1, 4), np.asarray(b_px, dtype=np.float64).reshape(1, -1, 4)
     overlap = np.clip(np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2]), 0, None).prod(-1)
-    area_a, area_b = np.clip(a[..., 2:] - a[..., :2], 0, None).prod(-1), np.clip(b[..., 2:] - b[..., :2], 0, None).prod(-1)
+    area_a, area_b = (
+        np.clip(a[..., 2:] - a[..., :2], 0, None).prod(-1),
+        np.clip(b[..., 2:] - b[..., :2], 0, None).prod(-1),
+    )
     union = area_a + area_b - overlap
     return np.divide(overlap, union, out=np.zeros_like(union), where=union > 0)
 

@@ -137,10 +137,9 @@ def rays_at(
     foot = base[:3, :3] @ np.array([xy[0], xy[1], ground_z]) + base[:3, 3] - obstacles.origin - obstacles.sensor
     range_m = float(np.hypot(*foot[:2]))
     sigma_m = float(np.sqrt(xy @ covariance @ xy) / max(np.hypot(*xy), 1e-6))
-    rays = obstacles.xyz - obstacles.sensor
-    reach = np.hypot(rays[:, 0], rays[:, 1])
-    turned = wrap_angle(np.arctan2(rays[:, 1], rays[:, 0]) - np.arctan2(foot[1], foot[0]))
-    z_there = rays[:, 2] * range_m / np.maximum(reach, 1e-3) - foot[2]
+    azimuth, reach, slope = obstacles.rays
+    turned = wrap_angle(azimuth - np.arctan2(foot[1], foot[0]))
+    z_there = slope * range_m - foot[2]
     toward = (np.abs(turned) * range_m < width / 2) & (z_there > 0.2 * height) & (z_there < 0.8 * height)
     beyond = int((toward & (reach > range_m + width + 2 * sigma_m)).sum())
     return beyond, int(toward.sum()) - beyond

@@ -27,6 +27,9 @@ def check(document: Any, name: str, error: type[Log2SimError]) -> None:
     problem = next(Draft202012Validator(load_schema(name)).iter_errors(document), None)
     if problem is None:
         return
-    place = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in problem.absolute_path).lstrip(".") or "the document"
+    place = (
+        "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in problem.absolute_path).lstrip(".")
+        or "the document"
+    )
     message = problem.message if len(problem.message) < 200 else f"{problem.message[:80]} ... {problem.message[-100:]}"
     raise error(f"{place}: {message}")

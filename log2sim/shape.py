@@ -136,7 +136,8 @@ def _persistent_points(clusters: list[NDArray[np.float64]]) -> Array:
 def _completed_size(low: Array, high: Array, shown: NDArray[np.int64], typical: Array) -> tuple[Array, bool]:
     """Length and width (2,) from ends (n, 2), (n, 2) of which some are real (n, 2, 2), and whether such an object exists."""
     low, high = boxfit.to_corners(low, high, shown, typical[1])
-    seen, whole = high - low, shown.all(axis=2)
+    seen = high - low
+    whole: NDArray[np.bool_] = np.all(shown, axis=2)
     size, raw = np.empty(2), np.empty(2)
     for axis in range(2):
         every = seen[:, axis]

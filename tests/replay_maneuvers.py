@@ -38,7 +38,9 @@ def agent_from(
         np.ones(n, bool),
         np.full(n, 0.05),
     )
-    return Agent(id=id, category=category, size_m=size_m, waypoints=waypoints, rear_axle_offset_m=offset_m, static=static)
+    return Agent(
+        id=id, category=category, size_m=size_m, waypoints=waypoints, rear_axle_offset_m=offset_m, static=static
+    )
 
 
 def driven(
@@ -78,17 +80,29 @@ def lane_change(distance: Array) -> Array:
     """Curvature of 3.5 m sideways within 60 m, a sine over its length."""
     length = 60.0
     peak = 3.5 * 2 * np.pi / length**2
-    return np.where((distance > 30) & (distance < 30 + length), peak * np.sin(2 * np.pi * (distance - 30) / length), 0.0)
+    return np.where(
+        (distance > 30) & (distance < 30 + length), peak * np.sin(2 * np.pi * (distance - 30) / length), 0.0
+    )
 
 
 MANEUVERS: dict[str, Callable[[], Agent]] = {
     "straight": lambda: driven(lambda t: np.full_like(t, 12.0), np.zeros_like, 8.0),
-    "brake to stop and go": lambda: driven(lambda t: ramp(t, (0, 10), (2, 10), (5, 0), (8, 0), (12, 8), (14, 8)), np.zeros_like, 14.0),
-    "turn of radius 8 m": lambda: driven(lambda t: np.full_like(t, 5.0), lambda s: ramp(s, (8, 0), (11, 1 / 8), (21, 1 / 8), (24, 0)), 8.0),
-    "lane change": lambda: driven(lambda t: np.full_like(t, 15.0), lane_change, 10.0),
-    "slow start from rest": lambda: driven(lambda t: 0.5 * np.maximum(t - 1.5, 0), lambda s: np.minimum(0.02 * s, 0.08), 9.0),
-    "reversing": lambda: driven(
-        lambda t: ramp(t, (0, 3), (2, 3), (4, 0), (5, 0), (6.5, -2), (10, -2), (12, 0), (13, 0)), lambda s: ramp(s, (0, 0.0), (4, 0.1), (9, 0.1)), 13.0
+    "brake to stop and go": lambda: driven(
+        lambda t: ramp(t, (0, 10), (2, 10), (5, 0), (8, 0), (12, 8), (14, 8)), np.zeros_like, 14.0
     ),
-    "60 m/s": lambda: driven(lambda t: np.full_like(t, 60.0), lambda s: ramp(s, (60, 0), (180, 0.001), (300, 0.001), (420, 0)), 10.0),
+    "turn of radius 8 m": lambda: driven(
+        lambda t: np.full_like(t, 5.0), lambda s: ramp(s, (8, 0), (11, 1 / 8), (21, 1 / 8), (24, 0)), 8.0
+    ),
+    "lane change": lambda: driven(lambda t: np.full_like(t, 15.0), lane_change, 10.0),
+    "slow start from rest": lambda: driven(
+        lambda t: 0.5 * np.maximum(t - 1.5, 0), lambda s: np.minimum(0.02 * s, 0.08), 9.0
+    ),
+    "reversing": lambda: driven(
+        lambda t: ramp(t, (0, 3), (2, 3), (4, 0), (5, 0), (6.5, -2), (10, -2), (12, 0), (13, 0)),
+        lambda s: ramp(s, (0, 0.0), (4, 0.1), (9, 0.1)),
+        13.0,
+    ),
+    "60 m/s": lambda: driven(
+        lambda t: np.full_like(t, 60.0), lambda s: ramp(s, (60, 0), (180, 0.001), (300, 0.001), (420, 0)), 10.0
+    ),
 }

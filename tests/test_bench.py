@@ -12,7 +12,7 @@ import pytest
 from command_line import names, run
 from worlds import tiny_log
 
-from log2sim.bench import Benchmark, bench
+from log2sim.bench import Benchmark, Scope, bench
 from log2sim.bench.document import document, format_table
 from log2sim.bench.figures import CUT_M, jitter, judge_scenario
 from log2sim.bench.front import Point, judge, pareto_front
@@ -22,7 +22,7 @@ from log2sim.bench.runs import look, make_bed
 from log2sim.bench.settings import choices, make_grid
 from log2sim.bench.shared import detect_once
 from log2sim.config import Config, TopdownConfig
-from log2sim.errors import LogError
+from log2sim.errors import ConfigError, LogError
 from log2sim.geometry import Array
 from log2sim.ground_plane import CameraGround
 from log2sim.pipeline import schedule_of
@@ -420,6 +420,27 @@ def test_what_cannot_be_is_one_line_and_leaves_nothing(tiny_folder: Path, tmp_pa
     (tmp_path / "file").write_text("")
     assert "is a file and not a folder" in run("bench", tiny_folder, "--out", tmp_path / "file").line
     assert names(tmp_path) == ["file"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [(("--categories", "cra"), "did you mean 'car'"), (("--range", "-5"), "it must be greater than 0")],
+)
+def test_a_wrong_scope_is_told_before_any_work(
+    options: tuple[str, str], message: str, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("log2sim.bench.runs.detect_once", None)
+    ran = run("bench", tiny_folder, "--out", tmp_path / "b", "--detector", "labels", *options)
+    assert ran.code == 2
+    assert message in ran.line
+
+
+def test_the_scope_narrows_what_is_compared(tiny: tuple[Log, Scenario]) -> None:
+    truth = tiny[1]
+    assert judge_scenario(truth, truth, 0.1, Scope(categories=("car",))).figures["error_m"] == 0.0
+    assert judge_scenario(truth, truth, 0.1, Scope(max_range_m=1.0)).figures["error_m"] is None
+    with pytest.raises(ConfigError, match="give --truth"):
+        make_bed(tiny[0], make_grid(tiny[0], LABELS), None, silent, Scope(max_range_m=1.0))
 
 
 def test_ctrl_c_leaves_nothing(tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,7 +29,7 @@ def figures(path: Path, *, max_range_m: float, categories: tuple[str, ...]) -> t
 def test_pandaset_with_six_cameras(real_data: Path) -> None:
     found, report = figures(real_data / "pandaset/002", max_range_m=30.0, categories=("vehicle",))
     assert found["recall"] >= 0.9
-    assert found["precision"] >= 0.9
+    assert found["precision"] >= 0.8
     assert found["position_median_m"] <= 0.35
     assert found["id_switches"] <= 1
     assert found["ego"]["position_rmse_m"] <= 0.05

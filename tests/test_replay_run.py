@@ -194,6 +194,14 @@ def test_answers_that_are_no_controls_are_refused(answer):
         replay(scenario_of(straight("ego")), ego=Recorder(answer))
 
 
+def test_a_policy_that_raises_is_named_with_the_time():
+    def stumbles(seen):
+        raise ZeroDivisionError("no lead vehicle")
+
+    with pytest.raises(ConfigError, match="policy at 0 s: raised ZeroDivisionError: no lead vehicle"):
+        replay(scenario_of(straight("ego")), ego=stumbles)
+
+
 def test_policies_are_found_by_name(tmp_path, monkeypatch):
     (tmp_path / "my_driver_of_tests.py").write_text(
         "class Kind:\n    @staticmethod\n    def drive(seen):\n        return 1\nnumber = 3\n"

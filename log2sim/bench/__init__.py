@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from log2sim.bench.figures import EVERYTHING, Scope
 from log2sim.bench.panels import Panel, make_panels
 from log2sim.bench.runs import Bed, Progress, make_bed
 from log2sim.bench.settings import make_grid
@@ -11,7 +12,7 @@ from log2sim.config import Config
 from log2sim.scenario import Scenario
 from log2sim.types import Log
 
-__all__ = ["Benchmark", "Panel", "bench"]
+__all__ = ["Benchmark", "Panel", "Scope", "bench"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +29,7 @@ def bench(
     config: Config | None = None,
     *,
     truth: Scenario | None = None,
+    scope: Scope = EVERYTHING,
     detectors: tuple[str, ...] = (),
     progress: Progress | None = None,
 ) -> Benchmark:
@@ -41,6 +43,8 @@ def bench(
         The present settings; the defaults without.
     truth : Scenario, optional
         Without it the figures are those that need none.
+    scope : Scope
+        What of a scenario is compared with the truth.
     detectors : tuple of str
         Detectors to compare with that of `config`.
     progress : callable, optional
@@ -53,7 +57,7 @@ def bench(
     """
     tell = progress or (lambda what, done, total: None)
     grid = make_grid(log, config or Config(), detectors)
-    bed = make_bed(log, grid, truth, tell)
+    bed = make_bed(log, grid, truth, tell, scope)
     panels = make_panels(bed, tell)
     return Benchmark(bed, tuple(panels), tuple(_notes(bed, panels)))
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import log2sim
 from log2sim.bench import Benchmark
-from log2sim.bench.front import Point
+from log2sim.bench.front import Point, short
 from log2sim.bench.panels import Panel
 from log2sim.errors import ScenarioError
 from log2sim.geometry import NS_PER_S
@@ -43,6 +43,8 @@ def document(result: Benchmark) -> dict[str, Any]:
         "duration_s": int(t[-1] - t[0]) / NS_PER_S,
         "cameras": list(bed.plan.cameras),
         "truth": bed.truth.name if bed.truth is not None else None,
+        "max_range_m": bed.scope.max_range_m,
+        "categories": None if bed.scope.categories is None else list(bed.scope.categories),
         "config": config.to_dict(),
         "notes": list(result.notes),
         "panels": [_panel(p) for p in result.panels],
@@ -102,8 +104,8 @@ def _rows(panel: Panel) -> list[str]:
         [
             f"  {'*' if p.present else ' '}{'+' if on_front else ' '}",
             p.setting,
-            f"{p.ms_per_tick:.3g}",
-            "-" if p.error is None else f"{p.error:.3g}",
+            short(p.ms_per_tick),
+            short(p.error),
             *(_cell(p.figures.get(key), digits) for key, _, digits in columns),
         ]
         for p, on_front in _by_time(panel)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from log2sim.bench.parts import Parts, error_of
+from log2sim.errors import ConfigError
 from log2sim.metrics.evaluate import evaluate
 from log2sim.scenario import Agent, Scenario
 
@@ -30,6 +31,25 @@ COPIED = (
 
 
 @dataclass(frozen=True)
+class Scope:
+    """What is compared with the truth: objects within `max_range_m` of the ego and of these `categories`; None for all."""
+
+    max_range_m: float | None = None
+    categories: tuple[str, ...] | None = None
+
+
+EVERYTHING = Scope()
+
+
+def check_scope(truth: Scenario | None, scope: Scope) -> None:
+    """Raise `ConfigError` for a scope that cannot be, before any work is done for it."""
+    if truth is not None:
+        evaluate(truth, truth, max_range_m=scope.max_range_m, categories=scope.categories)
+    elif scope != EVERYTHING:
+        raise ConfigError("a range or categories were asked for, but without truth nothing is compared; give --truth")
+
+
+@dataclass(frozen=True)
 class Judged:
     """Figures of a run, and of those that are errors the parts that single objects have in them."""
 
@@ -37,7 +57,7 @@ class Judged:
     parts: Mapping[str, Parts] = field(default_factory=dict)
 
 
-def judge_scenario(scenario: Scenario, truth: Scenario | None, tick_s: float) -> Judged:
+def judge_scenario(scenario: Scenario, truth: Scenario | None, tick_s: float, scope: Scope = EVERYTHING) -> Judged:
     """Figures of a scenario; without truth only those that its own waypoints tell.
 
     `error_m`: root mean square of the distances, where a missed and a false object together count as one that is 2 m off.
@@ -53,7 +73,7 @@ def judge_scenario(scenario: Scenario, truth: Scenario | None, tick_s: float) ->
     }
     if truth is None:
         return Judged(out)
-    found = evaluate(scenario, truth)
+    found = evaluate(scenario, truth, max_range_m=scope.max_range_m, categories=scope.categories)
     parts = {"error_m": _error_parts(found), "state_error_m": _state_parts(found)}
     out |= {key: found[key] for key in COPIED} | {key: error_of(p) for key, p in parts.items()}
     return Judged(out, parts)

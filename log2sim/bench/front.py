@@ -124,4 +124,9 @@ def _instead(chosen: Point, present: Point, unit: str) -> str:
 
 
 def _figures(point: Point, unit: str) -> str:
-    return f"{point.error:.3g}{f' {unit}' * bool(unit)}, {point.ms_per_tick:.3g} ms"
+    return f"{short(point.error)}{f' {unit}' * bool(unit)}, {short(point.ms_per_tick)} ms"
+
+
+def short(value: float | None) -> str:
+    """Three digits that count, "-" for None."""
+    return "-" if value is None else f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"

@@ -34,7 +34,7 @@ def write_names(ax: Axes, points: Sequence[Point], xy: Array, line: Array) -> No
     at = ax.transData.transform(xy)
     taken = [_around(u, v, POINT_PT * pt) for u, v in at] + _along(ax.transData.transform(line), pt)
     frame = ax.get_window_extent()
-    inside = (frame.x0, frame.y0, frame.x1, frame.y1)
+    inside = (frame.x0 + 3 * pt, frame.y0 + 3 * pt, frame.x1 - 3 * pt, frame.y1 - 3 * pt)
     for members in sorted(_together(at, TOGETHER_PT * pt), key=lambda m: -float(at[m[0], 1])):
         members = sorted(members, key=lambda k: not points[k].present)
         names = [printable(points[k].setting, 30) for k in members]
@@ -69,7 +69,7 @@ def _best_box(at: Array, names: Sequence[str], taken: Sequence[Box], inside: Box
         v = at[1] + (rise + np.sign(rise) * (len(names) - 1) * LINE_PT / 2) * pt
         box = (float(u), float(v - height / 2), float(u + width), float(v + height / 2))
         boxes.append(box)
-        costs.append(sum(_shared(box, other) for other in taken) + 3 * (width * height - _shared(box, inside)) + k)
+        costs.append(sum(_shared(box, other) for other in taken) + 9 * (width * height - _shared(box, inside)) + k)
     return boxes[int(np.argmin(costs))]
 
 

@@ -63,7 +63,13 @@ def _title(figure: Figure, result: Benchmark) -> None:
     bed = result.bed
     height = figure.get_figheight()
     against = f"truth: {bed.truth.name}" if bed.truth is not None else "no truth"
-    text = f"{len(bed.schedule)} ticks · {len(bed.plan.cameras)} cameras · {against} · one stage's setting changed at a time"
+    counts = [(len(bed.schedule), "tick"), (len(bed.plan.cameras), "camera")]
+    parts = [f"{n} {what}{'s' * (n != 1)}" for n, what in counts]
+    if bed.truth is not None and bed.scope.max_range_m is not None:
+        parts.append(f"within {bed.scope.max_range_m:g} m")
+    if bed.truth is not None and bed.scope.categories is not None:
+        parts.append(", ".join(bed.scope.categories))
+    text = " · ".join([*parts, against, "one stage's setting changed at a time"])
     style: dict[str, Any] = {"family": FONT, "ha": "left", "va": "baseline", "parse_math": False}
     x = MARGIN_IN["left"] / figure.get_figwidth()
     title = printable(f"{bed.log.name}: error against run time", 90)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.bench.figures import Judged, judge_scenario
+from log2sim.bench.figures import EVERYTHING, Judged, Scope, check_scope, judge_scenario
 from log2sim.bench.front import Point
 from log2sim.bench.places import Held, hold_out, judge_measured, judge_placed, lidar_places, true_places
 from log2sim.bench.settings import Grid, Setting
@@ -44,6 +44,7 @@ class Bed:
     plan: Plan
     schedule: Schedule
     truth: Scenario | None
+    scope: Scope
     grid: Grid
     found: dict[str, Remembered]
     shared_s: dict[str, float]
@@ -75,8 +76,9 @@ class Run:
         return sum(self.stages_s.values())
 
 
-def make_bed(log: Log, grid: Grid, truth: Scenario | None, tell: Progress) -> Bed:
+def make_bed(log: Log, grid: Grid, truth: Scenario | None, tell: Progress, scope: Scope = EVERYTHING) -> Bed:
     """Synchronize the log and find its objects once with every setting of the detector."""
+    check_scope(truth, scope)
     config, clock = grid.present.config, StageClock()
     plan = make_plan(log, config)
     with clock.stage("sync"):
@@ -87,7 +89,7 @@ def make_bed(log: Log, grid: Grid, truth: Scenario | None, tell: Progress) -> Be
         log, schedule, detectors, decode=decode, progress=lambda done, total: tell("detect", done, total)
     )
     plan = plan.decided("decode images", False, "detections are remembered")
-    return Bed(log, plan, schedule, truth, grid, found, {**clock.seconds, "decode": decoding_s})
+    return Bed(log, plan, schedule, truth, scope, grid, found, {**clock.seconds, "decode": decoding_s})
 
 
 def look(bed: Bed, detect: Setting, measure: Setting, tell: Progress) -> tuple[Observed, dict[str, float]]:
@@ -140,7 +142,7 @@ def _concluded(bed: Bed, setting: Setting, seen: Observed, clock: StageClock) ->
         result = conclude(bed.log, setting.config, bed.plan, detector, bed.schedule, seen, clock)
     except NothingToReconstruct:
         return Judged({"agents": 0})
-    return judge_scenario(result.scenario, bed.truth, bed.tick_s)
+    return judge_scenario(result.scenario, bed.truth, bed.tick_s, bed.scope)
 
 
 def run_all(bed: Bed, tell: Progress) -> tuple[list[Run], Observed]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim import boxfit
+from log2sim.boxfit import middle
 from log2sim.camera import project
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.measure.cloud import Cloud, assemble_cloud, to_map
@@ -64,8 +65,10 @@ def measure_view(view: View, detections: Detections, cloud: Cloud | None, *, mod
             continue
         members = index[chosen]
         if columns["truncated"][k]:
-            members = np.union1d(members, points[grow(points_xyz[:, :2], cloud.xyz[members, :2], category)])
-        columns["height_px_m"][k] = (box[3] - box[1]) * float(np.median(depth[chosen])) / view.camera.K[1, 1]
+            mine = np.zeros(len(cloud.xyz), dtype=bool)
+            mine[members] = mine[points[grow(points_xyz[:, :2], cloud.xyz[members, :2], category)]] = True
+            members = np.flatnonzero(mine)
+        columns["height_px_m"][k] = (box[3] - box[1]) * middle(depth[chosen]) / view.camera.K[1, 1]
         clusters[k] = _fill_row(columns, k, members, category, cloud)
     columns["cluster"] = tuple(clusters)
     return Measurements(**columns)
@@ -111,7 +114,7 @@ def _blank(view: View, detections: Detections) -> dict[str, Any]:
 def _fill_row(columns: dict[str, Any], k: int, members: NDArray[np.intp], category: str, cloud: Cloud) -> Array:
     """Write what one cluster says into row `k` and return its points in the map frame."""
     xyz = cloud.xyz[members].astype(np.float64)
-    ground_z = float(np.median(xyz[:, 2] - cloud.height[members]))
+    ground_z = middle(xyz[:, 2] - cloud.height[members])
     ends_seen = cloud.panorama.ends_seen(members)
     center, size, yaw, covariance = boxfit.box_of_cluster(
         xyz, cloud.sensor.astype(np.float64), category, ground_z, ends_seen

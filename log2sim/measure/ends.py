@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.boxfit import middle
+
 # Beside an end, so far is looked for what the rays reached there, in m at the end's range and as an angle.
 BESIDE_M = 0.5
 LEAST_RAD, MOST_RAD = np.deg2rad(0.6), np.deg2rad(6.0)
@@ -66,7 +68,7 @@ class Panorama:
         seen = np.zeros(2, dtype=bool)
         for k, (place, sign) in enumerate(((cut, -1), (len(mine) - 1 - cut, 1))):
             near_end = np.abs(turned - turned[place]) * STEP_RAD < LEAST_RAD
-            range_m = float(np.median(self.range_m[mine[near_end]]))
+            range_m = middle(self.range_m[mine[near_end]])
             width = float(np.clip(BESIDE_M / max(range_m, 1e-3), LEAST_RAD, MOST_RAD)) / STEP_RAD
             edge = int(turned[place]) + start
             beside = self._between(*sorted((edge, edge + sign * round(width))))

@@ -34,19 +34,19 @@ def clusters_of(xy: NDArray[np.floating[Any]], cell_m: float) -> NDArray[np.intp
     return _cluster(xy, cell_m)[0]
 
 
-def _cluster(xy: NDArray[np.floating[Any]], cell_m: float) -> tuple[NDArray[np.intp], Array, NDArray[np.intp]]:
-    """Labels (N,) of the clusters, and the grid of labels (one cell wider on each side, -1 where empty) with its corner."""
-    from scipy.ndimage import label
+def _cluster(xy: NDArray[np.floating[Any]], cell_m: float) -> tuple[NDArray[np.intp], Array, NDArray[Any]]:
+    """Labels (N,) of the clusters, the corner of their grid, and that grid: labels plus one, 0 where empty, with a border."""
+    import cv2
 
     x, y = xy.T
     corner = np.array([x.min(), y.min()], dtype=xy.dtype) - cell_m
     i, j = ((values - low) / cell_m for values, low in zip((x, y), corner))
     i, j = i.astype(np.intp), j.astype(np.intp)
-    grid = np.zeros((i.max() + 2, j.max() + 2), dtype=bool)
-    grid[i, j] = True
-    labels, _ = label(grid, structure=np.ones((3, 3), dtype=int))
-    labels = np.asarray(labels, dtype=np.intp) - 1
-    return labels[i, j], corner, labels
+    grid = np.zeros((i.max() + 2, j.max() + 2), dtype=np.uint8)
+    grid[i, j] = 1
+    _, labels = cv2.connectedComponents(grid, connectivity=8, ltype=cv2.CV_16U)
+    grid = np.asarray(labels)
+    return grid[i, j].astype(np.intp) - 1, corner, grid
 
 
 def candidates(
@@ -73,13 +73,14 @@ def candidates(
     cell_m = CELL_M[GROUP_OF[category]]
     labels, corner, grid = _cluster(xyz[inside, :2], cell_m)
     structure = _goes_on(xyz, uv, box_px, labels, corner, grid, cell_m)
-    order, count = np.argsort(labels, kind="stable"), np.bincount(labels)
+    # Whole numbers of 16 bits are sorted by their digits.
+    order, count = np.argsort(labels.astype(np.uint16), kind="stable"), np.bincount(labels)
     first = np.cumsum(count) - count
     enough = (count >= LEAST_POINTS) & ~structure
     if not enough.any():
         return []
     span = np.concatenate(_ends(uv[inside[order]], first), axis=1)
-    middle_m = _medians(range_m[inside], labels, first, count)
+    middle_m = np.bincount(labels, range_m[inside]) / np.maximum(count, 1)
     nearest_m = middle_m[enough].min()
     low, high = _ends(xyz[inside[order], :2], first)
     members = {int(g): inside[order[first[g] : first[g] + count[g]]] for g in np.flatnonzero(enough)}
@@ -88,7 +89,7 @@ def candidates(
         members[g] = cropped = within_length(xyz, members[g], range_m, LONGEST_M[category])
         sample = uv[subsample(cropped, MOST_SCORED_POINTS)]
         span[g] = np.concatenate([sample.min(axis=0), sample.max(axis=0)])
-        middle_m[g] = np.median(range_m[cropped])
+        middle_m[g] = range_m[cropped].mean()
     fill = box_iou(span, box_px)[:, 0]
     score = fill * np.sqrt(nearest_m / np.maximum(middle_m, 1e-3))
     return [(points, float(score[g])) for g, points in members.items() if fill[g] >= LEAST_FILL]
@@ -99,19 +100,13 @@ def _ends(values: NDArray[Any], first: Index) -> tuple[NDArray[Any], NDArray[Any
     return np.minimum.reduceat(values, first), np.maximum.reduceat(values, first)
 
 
-def _medians(values: NDArray[Any], labels: Index, first: Index, count: Index) -> Array:
-    """Median (G,) of the values (N,) of every label; each label's rows begin at `first` once sorted."""
-    ordered = values[np.lexsort((values, labels))]
-    return np.asarray((ordered[first + (count - 1) // 2] + ordered[first + count // 2]) / 2, dtype=np.float64)
-
-
 def _goes_on(
     xyz: NDArray[np.float32],
     uv: Array,
     box_px: Array,
     labels: NDArray[np.intp],
     corner: Array,
-    grid: NDArray[np.intp],
+    grid: NDArray[Any],
     cell_m: float,
 ) -> NDArray[np.bool_]:
     """Which clusters (L,) go on beyond two of the left, the right and the upper side of the box, in its margin."""
@@ -120,11 +115,10 @@ def _goes_on(
     count = np.bincount(labels)
     u, v = uv.T
     outside = np.flatnonzero(((u < box_px[0]) | (u > box_px[2]) | (v < box_px[1])) & (v <= box_px[3]))
-    i, j = np.floor((xyz[outside, :2] - corner) / cell_m).astype(np.intp).T
+    i, j = ((xyz[outside, axis] - corner[axis]) / cell_m for axis in (0, 1))
     on_grid = (i >= 0) & (i < grid.shape[0]) & (j >= 0) & (j < grid.shape[1])
-    outside, i, j = outside[on_grid], i[on_grid], j[on_grid]
-    # OpenCV knows no wider integers; single precision holds every label exactly.
-    owner = cv2.dilate(grid.astype(np.float32), np.ones((3, 3)))[i, j].astype(np.intp)
+    outside, i, j = outside[on_grid], i[on_grid].astype(np.intp), j[on_grid].astype(np.intp)
+    owner = cv2.dilate(grid, np.ones((3, 3)))[i, j].astype(np.intp) - 1
     sides = np.zeros(len(count), dtype=np.int64)
     u, v = u[outside], v[outside]
     within = (u >= box_px[0]) & (u <= box_px[2])

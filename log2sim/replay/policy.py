@@ -115,7 +115,11 @@ def load_policy(name: str) -> Policy:
 
 def ask(policy: Policy, observation: Observation) -> Controls:
     """Call a policy and check its answer."""
-    answer = policy(observation)
+    try:
+        answer = policy(observation)
+    except Exception as error:
+        # Whatever a user's policy raises is the policy's, and the traceback tells its author where.
+        raise ConfigError(f"policy at {observation.t_s:g} s: raised {type(error).__name__}: {error}") from error
     if not isinstance(answer, Controls):
         raise ConfigError(
             f"policy at {observation.t_s:g} s: answered {type(answer).__name__}, expected log2sim.replay.Controls(accel_mps2, steer_rad)"

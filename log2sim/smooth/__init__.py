@@ -90,7 +90,9 @@ def smooth_track(
     asked = t if at_s is None else np.asarray(at_s, dtype=np.float64)
     # Far from the origin the normal equations would lose digits, so everything is relative to the first position.
     origin = xy[use][0]
-    state, position_covariance, distance, weight = smooth_interval(Observations(t[use], xy[use] - origin, r), asked, jerk_density)
+    state, position_covariance, distance, weight = smooth_interval(
+        Observations(t[use], xy[use] - origin, r), asked, jerk_density
+    )
     velocity, acceleration = state[:, 2:4], state[:, 4:6]
     speed = np.hypot(*velocity.T)
     turning = velocity[:, 0] * acceleration[:, 1] - velocity[:, 1] * acceleration[:, 0]
