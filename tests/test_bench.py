@@ -22,6 +22,11 @@ from log2sim.bench.runs import look, make_bed
 from log2sim.bench.settings import choices, make_grid
 from log2sim.bench.shared import detect_once
 from log2sim.config import Config, TopdownConfig
+from log2sim.detect.classes import COCO_80
+from log2sim.detect.layouts import LAYOUTS
+from log2sim.detect.onnx_detector import OnnxDetector
+from log2sim.detect.onnx_model import OnnxModel
+from log2sim.detect.preparation import InputSpec
 from log2sim.errors import ConfigError, LogError
 from log2sim.geometry import Array
 from log2sim.ground_plane import CameraGround
@@ -243,6 +248,35 @@ def test_new_choices_appear_by_themselves() -> None:
         kind: str = field(default="b", metadata={"allowed": ("a", "b", "c", "off")})
 
     assert choices(Section(), "kind") == ["b", "a", "c"]
+
+
+def test_tiles_and_input_sizes_are_those_that_change_something(
+    tiny: tuple[Log, Scenario], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def open_size(log: Log, config: Config) -> OnnxDetector:
+        side = None if config.detect.name == "any.onnx" else 300
+        model = OnnxModel(Path("m.onnx"), InputSpec("images", side, side, False, np.dtype(np.float32)), {}, None)
+        return OnnxDetector("m", model, LAYOUTS["yolox"], COCO_80, 0.4, 0.5, "auto", 0.4)
+
+    monkeypatch.setattr("log2sim.bench.settings.detector_of", open_size)
+    grid = make_grid(tiny[0], Config.load(detect={"name": "any.onnx"}), ["models/fixed.onnx"])
+    found = {s.name: (s.config.detect.tiles, s.config.detect.input_px) for s in grid.detect}
+    # The picture is 480 px wide, so "auto" is no tiles for both; 416 px is what the family takes anyway.
+    assert found == {
+        "any auto tiles": (0, 0),
+        "any 2 tiles": (2, 0),
+        "any 3 tiles": (3, 0),
+        "any 5 tiles": (5, 0),
+        "any input 320 px": (0, 320),
+        "any input 640 px": (0, 640),
+        "any input 960 px": (0, 960),
+        "fixed auto tiles": (0, 0),
+        "fixed 2 tiles": (2, 0),
+        "fixed 3 tiles": (3, 0),
+        "fixed 5 tiles": (5, 0),
+    }
+    assert [s.present for s in grid.detect] == [True] + [False] * 10
+    assert grid.detect[-1].config.detect.name == "models/fixed.onnx"
 
 
 @dataclass

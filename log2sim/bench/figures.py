@@ -127,7 +127,11 @@ def _third_differences(agent: Agent) -> float:
 
 
 def _gap_share(scenario: Scenario, tick_s: float) -> float | None:
-    lives = [(a.quality["detections"], a.waypoints.t_s[-1] - a.waypoints.t_s[0]) for a in scenario.others]
+    lives = [
+        (a.quality["detections"], a.waypoints.t_s[-1] - a.waypoints.t_s[0])
+        for a in scenario.others
+        if "detections" in a.quality
+    ]
     if not lives or tick_s <= 0:
         return None
     seen, ticks = (sum(v) for v in zip(*((n, life / tick_s + 1) for n, life in lives)))

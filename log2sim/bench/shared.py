@@ -34,6 +34,13 @@ class Remembered:
         """Time that the detector took for all frames, s."""
         return sum(self.spent_s)
 
+    def remember(self, detector: Detector, frame: Frame) -> None:
+        """Ask a detector for the boxes of one frame."""
+        begin = time.perf_counter()
+        boxes = detector.detect(frame)
+        self.spent_s.append(time.perf_counter() - begin)
+        self.found[frame.camera.name, frame.t_ns] = boxes
+
     def detect(self, frame: Frame) -> Detections:
         """Boxes of one frame, from memory."""
         return self.found.get((frame.camera.name, frame.t_ns), Detections.empty())
@@ -74,10 +81,7 @@ def detect_once(
                 continue
             frame = Frame(log.cameras[camera], int(log.streams[camera].t_ns[index[tick]]), partial(_decoded, image))
             for key, detector in detectors.items():
-                begin = time.perf_counter()
-                boxes = detector.detect(frame)
-                memory[key].spent_s.append(time.perf_counter() - begin)
-                memory[key].found[camera, frame.t_ns] = boxes
+                memory[key].remember(detector, frame)
         progress(tick + 1, len(schedule))
     records.require_some()
     return memory, decoding_s
