@@ -15,7 +15,7 @@ SIZE_PT, LETTER_PT, LINE_PT, POINT_PT = 6.8, 3.9, 9.0, 6.0
 # Points nearer to each other than this look like one and get one block of names.
 TOGETHER_PT = 7.0
 # Names farther from their point than this get a line to it.
-APART_PT = 13.0
+APART_PT = 9.0
 # Side, distance and height in points of a block of names from its point: beside it first, then above and below.
 SPOTS = tuple(
     (side, gap, rise)
@@ -37,7 +37,7 @@ def write_names(ax: Axes, points: Sequence[Point], xy: Array, line: Array) -> No
     inside = (frame.x0 + 3 * pt, frame.y0 + 3 * pt, frame.x1 - 3 * pt, frame.y1 - 3 * pt)
     for members in sorted(_together(at, TOGETHER_PT * pt), key=lambda m: -float(at[m[0], 1])):
         members = sorted(members, key=lambda k: not points[k].present)
-        names = [printable(points[k].setting, 30) for k in members]
+        names = [printable(_short(points[k].setting), 30) for k in members]
         box = _best_box(at[members].mean(axis=0), names, taken, inside, pt)
         taken.append(box)
         _lead(ax, at[members].mean(axis=0), box, pt)
@@ -47,6 +47,12 @@ def write_names(ax: Axes, points: Sequence[Point], xy: Array, line: Array) -> No
                 x, y, name, fontsize=SIZE_PT, family=FONT, color=INK, va="center_baseline", ha="left", parse_math=False,
                 weight="bold" if points[member].present else "normal", path_effects=halo(1.8), zorder=5,
             )  # fmt: skip
+
+
+def _short(setting: str) -> str:
+    """A setting without its stage, where its name says which stage it is of."""
+    stage, _, name = setting.partition(": ")
+    return setting if name in ("", "on", "off") or stage == "smooth" else name
 
 
 def _together(at: Array, reach: float) -> list[list[int]]:
