@@ -16,6 +16,7 @@ from log2sim.bench import Benchmark, Scope, bench
 from log2sim.bench.document import document, format_table
 from log2sim.bench.figures import CUT_M, jitter, judge_scenario
 from log2sim.bench.front import Point, judge, pareto_front
+from log2sim.bench.names import short_name
 from log2sim.bench.parts import error_of, share_not_worse
 from log2sim.bench.places import at_tick, hold_out, judge_measured, true_places
 from log2sim.bench.runs import look, make_bed
@@ -35,7 +36,7 @@ from log2sim.plan import make_plan
 from log2sim.scenario import Agent, Scenario, Waypoints
 from log2sim.schema import check
 from log2sim.topdown import HomographyFit
-from log2sim.types import Camera, Detections, Frame, Log
+from log2sim.types import Camera, Detections, Frame, Log, Measurements
 
 LABELS = Config.load(detect={"name": "labels"})
 
@@ -177,6 +178,8 @@ def test_jitter_is_the_deviation_of_white_noise_and_not_acceleration() -> None:
     assert jitter(replace(world(), agents=(moving("a", smooth),))) == pytest.approx(0.0, abs=1e-9)
     assert jitter(replace(world(), agents=(moving("a", smooth + noise),))) == pytest.approx(0.2, rel=0.1)
     assert jitter(world()) is None
+    standing = replace(moving("b", smooth + 10 * noise), static=True)
+    assert jitter(replace(world(), agents=(moving("a", smooth), standing))) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_measured_centers_of_a_log_are_near_the_truth_and_outliers_are_cut(tiny: tuple[Log, Scenario]) -> None:
@@ -195,6 +198,53 @@ def test_measured_centers_of_a_log_are_near_the_truth_and_outliers_are_cut(tiny:
     figures = judge_measured(lost, known).figures
     assert figures["error_m"] == pytest.approx(CUT_M)
     assert figures["placed_share"] == 0.0
+
+
+def test_places_are_known_at_the_times_of_the_measurements_and_of_the_images(tiny: tuple[Log, Scenario]) -> None:
+    log, truth = tiny
+    bed = make_bed(log, make_grid(log, LABELS), truth, silent)
+    seen, _ = look(bed, bed.grid.present, bed.grid.measure[0], silent)
+    later = replace(seen, measurements=[replace(m, t_ns=m.t_ns + 100_000_000) for m in seen.measurements])
+    for when, expected_m in (("measured", 0.4), ("imaged", 0.0)):
+        before, after = (true_places(log, bed.schedule, s, truth, when=when) for s in (seen, later))  # type: ignore[arg-type]
+        moved = np.concatenate([np.hypot(*(a.xy - b.xy).T) for a, b in zip(after, before, strict=True)])
+        assert np.nanmax(moved) == pytest.approx(expected_m, abs=0.01)  # the car drives at 4 m/s
+        assert np.nanmin(moved) == pytest.approx(0.0, abs=1e-9)  # the other one is parked
+
+
+def test_an_object_is_recognized_once_and_only_in_its_group(tiny: tuple[Log, Scenario]) -> None:
+    log, truth = tiny
+    bed = make_bed(log, make_grid(log, LABELS), truth, silent)
+    seen, _ = look(bed, bed.grid.present, bed.grid.measure[0], silent)
+    m = seen.measurements[5]
+    shifted = replace(m, box_px=m.box_px + [3.0, 0.0, 3.0, 0.0])
+    both = replace(seen, measurements=[*seen.measurements[:5], Measurements.join([m, shifted]), *seen.measurements[6:]])
+    known = true_places(log, bed.schedule, both, truth)[5]
+    alone = true_places(log, bed.schedule, seen, truth)[5]
+    np.testing.assert_array_equal(known.who, np.r_[alone.who, np.full(len(m), -1)])
+    assert (alone.who >= 0).sum() >= 2
+    people = replace(m, category=np.full(len(m), "pedestrian", dtype="<U16"))
+    other = replace(seen, measurements=[*seen.measurements[:5], people, *seen.measurements[6:]])
+    who = true_places(log, bed.schedule, other, truth)[5].who
+    assert (who[m.category == "car"] == -1).all()
+
+
+def test_only_whole_boxes_with_enough_points_are_set_aside(tiny: tuple[Log, Scenario]) -> None:
+    log, truth = tiny
+    bed = make_bed(log, make_grid(log, LABELS), truth, silent)
+    seen, _ = look(bed, bed.grid.present, bed.grid.measure[0], silent)
+    known = true_places(log, bed.schedule, seen, truth, when="imaged")
+    spoils: list[dict[str, Any]] = [{"truncated": True}, {"points": 5}, {"source": "topdown"}]
+    for spoil in spoils:
+        spoiled = [replace(m, **{k: np.full(len(m), v) for k, v in spoil.items()}) for m in seen.measurements]
+        held = hold_out(log, bed.schedule, replace(seen, measurements=spoiled), known, np.random.default_rng(0))
+        assert len(held) == 0, spoil
+
+
+def test_names_in_the_picture_say_their_stage_only_where_they_must() -> None:
+    named = ["detect: no tiles", "homography: min-frame", "smooth: off", "smooth: spline", "present settings", "paper"]
+    shown = ["no tiles", "min-frame", "smooth: off", "smooth: spline", "present settings", "paper"]
+    assert [short_name(name) for name in named] == shown
 
 
 def test_obstacles_set_aside_are_not_fitted_to(tiny: tuple[Log, Scenario]) -> None:

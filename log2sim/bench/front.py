@@ -55,7 +55,7 @@ def pareto_front(cost: ArrayLike, error: ArrayLike) -> NDArray[np.bool_]:
     known = np.isfinite(c) & np.isfinite(e)
     no_worse = (c[None] <= c[:, None]) & (e[None] <= e[:, None])
     better = (c[None] < c[:, None]) | (e[None] < e[:, None])
-    beaten = (no_worse & better & known[None]).any(axis=1)
+    beaten = (no_worse & better).any(axis=1)
     return known & ~beaten
 
 

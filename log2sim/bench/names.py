@@ -37,7 +37,7 @@ def write_names(ax: Axes, points: Sequence[Point], xy: Array, line: Array) -> No
     inside = (frame.x0 + 3 * pt, frame.y0 + 3 * pt, frame.x1 - 3 * pt, frame.y1 - 3 * pt)
     for members in sorted(_together(at, TOGETHER_PT * pt), key=lambda m: -float(at[m[0], 1])):
         members = sorted(members, key=lambda k: not points[k].present)
-        names = [printable(_short(points[k].setting), 30) for k in members]
+        names = [printable(short_name(points[k].setting), 30) for k in members]
         box = _best_box(at[members].mean(axis=0), names, taken, inside, pt)
         taken.append(box)
         _lead(ax, at[members].mean(axis=0), box, pt)
@@ -49,7 +49,7 @@ def write_names(ax: Axes, points: Sequence[Point], xy: Array, line: Array) -> No
             )  # fmt: skip
 
 
-def _short(setting: str) -> str:
+def short_name(setting: str) -> str:
     """A setting without its stage, where its name says which stage it is of."""
     stage, _, name = setting.partition(": ")
     return setting if name in ("", "on", "off") or stage == "smooth" else name

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from log2sim.bench.figures import Judged
 from log2sim.bench.front import Point, Verdict, front_of, judge
-from log2sim.bench.runs import Bed, Progress, Run, homography_points, run_all
+from log2sim.bench.runs import FOR_THE_REPORT, Bed, Progress, Run, homography_points, run_all
 
 OWN_STAGES = {"detect": ("detect",), "measure": ("measure", "fuse"), "smooth": ("smooth",)}
 
@@ -99,7 +99,7 @@ def _measure_point(bed: Bed, run: Run) -> Point:
 
 def _whole_point(bed: Bed, run: Run) -> Point:
     name = "present settings" if run.setting.present else run.setting.key
-    stages = {stage: bed.ms_per_tick(s) for stage, s in run.stages_s.items()}
+    stages = {stage: bed.ms_per_tick(s) for stage, s in run.stages_s.items() if stage not in FOR_THE_REPORT}
     point = _judged(name, run.setting.present, bed.ms_per_tick(run.seconds), run.judged, _error(bed, "whole run"))
     return replace(point, figures={**point.figures, "stages_ms_per_tick": stages})
 
