@@ -19,7 +19,7 @@ from log2sim.bench.front import Point, judge, pareto_front
 from log2sim.bench.names import short_name
 from log2sim.bench.parts import error_of, share_not_worse
 from log2sim.bench.places import at_tick, hold_out, judge_measured, true_places
-from log2sim.bench.runs import look, make_bed
+from log2sim.bench.runs import Bed, look, make_bed
 from log2sim.bench.settings import choices, make_grid
 from log2sim.bench.shared import detect_once
 from log2sim.config import Config, TopdownConfig
@@ -31,6 +31,7 @@ from log2sim.detect.preparation import InputSpec
 from log2sim.errors import ConfigError, LogError
 from log2sim.geometry import Array
 from log2sim.ground_plane import CameraGround
+from log2sim.observe import Observed
 from log2sim.pipeline import schedule_of
 from log2sim.plan import make_plan
 from log2sim.scenario import Agent, Scenario, Waypoints
@@ -38,6 +39,7 @@ from log2sim.schema import check
 from log2sim.topdown import HomographyFit
 from log2sim.types import Camera, Detections, Frame, Log, Measurements
 
+FirstPass = tuple[Bed, Observed, dict[str, float]]
 LABELS = Config.load(detect={"name": "labels"})
 
 
@@ -48,6 +50,12 @@ def silent(what: str, done: int, total: int) -> None:
 @pytest.fixture(scope="module")
 def tiny() -> tuple[Log, Scenario]:
     return tiny_log()
+
+
+@pytest.fixture(scope="module")
+def first_pass(tiny: tuple[Log, Scenario]) -> FirstPass:
+    bed = make_bed(tiny[0], make_grid(tiny[0], LABELS), tiny[1], silent)
+    return bed, *look(bed, bed.grid.present, bed.grid.measure[0], silent)
 
 
 @pytest.fixture(scope="module")
@@ -182,10 +190,10 @@ def test_jitter_is_the_deviation_of_white_noise_and_not_acceleration() -> None:
     assert jitter(replace(world(), agents=(moving("a", smooth), standing))) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_measured_centers_of_a_log_are_near_the_truth_and_outliers_are_cut(tiny: tuple[Log, Scenario]) -> None:
-    log, truth = tiny
-    bed = make_bed(log, make_grid(log, LABELS), truth, silent)
-    seen, stages_s = look(bed, bed.grid.present, bed.grid.measure[0], silent)
+def test_measured_centers_of_a_log_are_near_the_truth_and_outliers_are_cut(
+    tiny: tuple[Log, Scenario], first_pass: FirstPass
+) -> None:
+    (log, truth), (bed, seen, stages_s) = tiny, first_pass
     known = true_places(log, bed.schedule, seen, truth)
     good = judge_measured(seen, known).figures
     assert good["objects"] >= 20
@@ -200,10 +208,10 @@ def test_measured_centers_of_a_log_are_near_the_truth_and_outliers_are_cut(tiny:
     assert figures["placed_share"] == 0.0
 
 
-def test_places_are_known_at_the_times_of_the_measurements_and_of_the_images(tiny: tuple[Log, Scenario]) -> None:
-    log, truth = tiny
-    bed = make_bed(log, make_grid(log, LABELS), truth, silent)
-    seen, _ = look(bed, bed.grid.present, bed.grid.measure[0], silent)
+def test_places_are_known_at_the_times_of_the_measurements_and_of_the_images(
+    tiny: tuple[Log, Scenario], first_pass: FirstPass
+) -> None:
+    (log, truth), (bed, seen, _) = tiny, first_pass
     later = replace(seen, measurements=[replace(m, t_ns=m.t_ns + 100_000_000) for m in seen.measurements])
     for when, expected_m in (("measured", 0.4), ("imaged", 0.0)):
         before, after = (true_places(log, bed.schedule, s, truth, when=when) for s in (seen, later))  # type: ignore[arg-type]
@@ -212,12 +220,10 @@ def test_places_are_known_at_the_times_of_the_measurements_and_of_the_images(tin
         assert np.nanmin(moved) == pytest.approx(0.0, abs=1e-9)  # the other one is parked
 
 
-def test_an_object_is_recognized_once_and_only_in_its_group(tiny: tuple[Log, Scenario]) -> None:
-    log, truth = tiny
-    bed = make_bed(log, make_grid(log, LABELS), truth, silent)
-    seen, _ = look(bed, bed.grid.present, bed.grid.measure[0], silent)
+def test_an_object_is_recognized_once_and_only_in_its_group(tiny: tuple[Log, Scenario], first_pass: FirstPass) -> None:
+    (log, truth), (bed, seen, _) = tiny, first_pass
     m = seen.measurements[5]
-    shifted = replace(m, box_px=m.box_px + [3.0, 0.0, 3.0, 0.0])
+    shifted = replace(m, box_px=m.box_px + np.array([3.0, 0.0, 3.0, 0.0]))
     both = replace(seen, measurements=[*seen.measurements[:5], Measurements.join([m, shifted]), *seen.measurements[6:]])
     known = true_places(log, bed.schedule, both, truth)[5]
     alone = true_places(log, bed.schedule, seen, truth)[5]
@@ -229,10 +235,8 @@ def test_an_object_is_recognized_once_and_only_in_its_group(tiny: tuple[Log, Sce
     assert (who[m.category == "car"] == -1).all()
 
 
-def test_only_whole_boxes_with_enough_points_are_set_aside(tiny: tuple[Log, Scenario]) -> None:
-    log, truth = tiny
-    bed = make_bed(log, make_grid(log, LABELS), truth, silent)
-    seen, _ = look(bed, bed.grid.present, bed.grid.measure[0], silent)
+def test_only_whole_boxes_with_enough_points_are_set_aside(tiny: tuple[Log, Scenario], first_pass: FirstPass) -> None:
+    (log, truth), (bed, seen, _) = tiny, first_pass
     known = true_places(log, bed.schedule, seen, truth, when="imaged")
     spoils: list[dict[str, Any]] = [{"truncated": True}, {"points": 5}, {"source": "topdown"}]
     for spoil in spoils:
@@ -247,10 +251,8 @@ def test_names_in_the_picture_say_their_stage_only_where_they_must() -> None:
     assert [short_name(name) for name in named] == shown
 
 
-def test_obstacles_set_aside_are_not_fitted_to(tiny: tuple[Log, Scenario]) -> None:
-    log, truth = tiny
-    bed = make_bed(log, make_grid(log, LABELS), truth, silent)
-    seen, _ = look(bed, bed.grid.present, bed.grid.measure[0], silent)
+def test_obstacles_set_aside_are_not_fitted_to(tiny: tuple[Log, Scenario], first_pass: FirstPass) -> None:
+    (log, truth), (bed, seen, _) = tiny, first_pass
     known = true_places(log, bed.schedule, seen, truth, when="imaged")
     held = hold_out(log, bed.schedule, seen, known, np.random.default_rng(0))
     before = sum(len(f.uv) for parts in seen.feet.values() for f in parts)
