@@ -15,6 +15,7 @@ SEARCH_STEP_RAD = np.deg2rad(2.0)
 NEAREST_EDGE_M = 0.03
 MOST_POINTS = 256
 SENSOR_SIGMA_M = 0.08
+SIZE_SPREAD = 0.05
 # What an end of a box is, see `ends_shown`.
 SEEN, FACING = 1, 2
 # Corners are rounded: the outermost point seen from the side lies inside by about this share of the width.
@@ -23,6 +24,7 @@ ROUNDED = 0.08
 LEAST_ASPECT = 0.5
 # A side longer than this share of the typical width is no front or rear.
 LONGER_THAN_WIDE = 1.2
+EITHER_WAY = 0.25
 # A size that was completed may be wrong by all of what was added: a uniform spread. Without any real end it is worse.
 SLACK_SIGMA = 12.0**-0.5
 
@@ -189,8 +191,10 @@ def place_box(low: Array, high: Array, size_m: Array, shown: NDArray[np.int64]) 
     low, high = to_corners(low, high, shown, size_m[1])
     slack = size_m - (high - low)
     reach = np.sign(shown[:, 1] - shown[:, 0])
-    doubt = np.where(shown.any(axis=1), SLACK_SIGMA, 1.0)
-    return (low + high) / 2 - reach * slack / 2, np.hypot(SENSOR_SIGMA_M, doubt * np.maximum(slack, 0.0))
+    doubt = np.where(shown.any(axis=1), SLACK_SIGMA, 1.0) * np.maximum(slack, 0.0)
+    # Objects of one category differ in size, so what is believed of an end that was not seen is never exact.
+    spread = np.where(shown.all(axis=1), 0.0, SIZE_SPREAD * size_m)
+    return (low + high) / 2 - reach * slack / 2, np.sqrt(SENSOR_SIGMA_M**2 + doubt**2 + spread**2)
 
 
 def to_corners(low: Array, high: Array, shown: NDArray[np.int64], width_m: float) -> tuple[Array, Array]:
@@ -221,6 +225,9 @@ def box_of_cluster(
     size = np.maximum([*(high - low), top], [*typical[:2], top])
     center_local, sigma = complete_box(low, high, size[:2], rotate(sensor[:2], -yaw_rad), ends_seen)
     center = np.append(rotate(center_local, yaw_rad), ground_z + size[2] / 2)
+    if (high - low).max() <= LONGER_THAN_WIDE * typical[1] and not all(ends_seen):
+        # So short a side may be a front or what shows of a flank; the two put the center in different places.
+        sigma = np.hypot(sigma, EITHER_WAY * (size[0] - size[1]))
     return center, size, float(yaw_rad), oriented_covariance(sigma, yaw_rad)
 
 

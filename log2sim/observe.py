@@ -290,7 +290,7 @@ def _in_range(log: Log, schedule: Schedule, tick: int, rows: Measurements, max_r
 
 def _obstacles(cloud: Cloud) -> Obstacles:
     """The points above the ground, thinned to one a voxel so that a long log fits in memory."""
-    index, xyz = cloud.obstacles, cloud.obstacles_xyz
+    index, xyz = cloud.obstacles, cloud.obstacle_columns.T
     near = np.flatnonzero(np.hypot(xyz[:, 0], xyz[:, 1]) < OBSTACLE_REACH_M)
     index = index[near[_one_a_voxel(xyz[near], OBSTACLE_VOXEL_M)]]
     return Obstacles(cloud.stamp_ns, cloud.origin, cloud.xyz[index], cloud.t_s[index], cloud.sensor)

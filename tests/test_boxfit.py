@@ -158,14 +158,15 @@ def test_doubt_grows_with_what_was_not_seen_and_without_a_real_end():
     sensor = np.array([-10.0, -10.0])
     near = complete_box(np.zeros(2), np.array([3.4, 1.0]), size, sensor)[1]
     far = complete_box(np.zeros(2), np.ones(2), size, sensor)[1]
-    np.testing.assert_allclose(far[0], np.hypot(0.08, 3.4 / np.sqrt(12)))
+    # The sensor's 0.08 m, the uniform spread of what was added, and how much cars differ: 5 % of the length.
+    np.testing.assert_allclose(far[0] ** 2, 0.08**2 + 3.4**2 / 12 + (0.05 * 4.4) ** 2)
     assert near[0] < far[0]
     lost = complete_box(np.zeros(2), np.ones(2), size, np.array([0.5, -10.0]))[1]
     assert lost[0] > 2 * far[0]
 
 
 def test_what_was_seen_of_more_than_the_whole_leaves_the_noise_of_the_sensor():
-    found, sigma = complete_box(np.zeros(2), np.array([5.0, 2.0]), np.array([4.4, 1.8]), np.array([-9.0, -9.0]))
+    found, sigma = complete_box(np.zeros(2), np.array([5.0, 2.0]), np.array([4.4, 1.8]), np.array([-9.0, -9.0]), BOTH)
     np.testing.assert_allclose(found, [2.2, 0.9])
     np.testing.assert_allclose(sigma, 0.08)
 
@@ -226,13 +227,25 @@ def test_the_box_moves_and_turns_with_the_world(angle):
 
 def test_the_covariance_is_widest_along_what_was_not_seen():
     xyz, owner = scan([standing(15, 0, 0)])
-    _, _, yaw, covariance = box_of_cluster(xyz[owner == 0], np.array([0, 0, 1.9]), "car", 0.0)
+    _, _, yaw, covariance = box_of_cluster(xyz[owner == 0], np.array([0, 0, 1.9]), "car", 0.0, BOTH)
     assert apart(yaw, 0.0, np.pi) < 0.05
     # Straight from behind the roof and the rear are seen: what remains of the length is spread evenly.
     low, high = extents(xyz[owner == 0, :2], 0.0)
-    assert np.sqrt(covariance[0, 0]) == pytest.approx((4.4 - (high - low)[0]) / np.sqrt(12), rel=0.1)
+    hidden_m = 4.4 - (high - low)[0]
+    assert np.sqrt(covariance[0, 0]) == pytest.approx(np.hypot(hidden_m / np.sqrt(12), 0.05 * 4.4), rel=0.1)
     assert np.sqrt(covariance[1, 1]) < 0.15
     np.testing.assert_allclose(covariance, covariance.T)
+
+
+def test_a_short_side_without_its_ends_may_be_a_front_or_part_of_a_flank():
+    side = np.column_stack([np.full(60, 12.0), np.linspace(-0.8, 0.8, 60), np.linspace(0.3, 1.2, 60)])
+    sigma = [
+        np.sqrt(np.linalg.eigvalsh(box_of_cluster(side, np.array([0, 0, 1.9]), "car", 0.0, ends)[3]))
+        for ends in (BOTH, UNSEEN)
+    ]
+    # Front or flank: the center lies half of the difference between length and width away.
+    assert sigma[0][0] < 0.3
+    assert sigma[1][0] > 0.5
 
 
 @pytest.mark.parametrize("category", CATEGORIES)

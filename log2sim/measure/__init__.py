@@ -7,7 +7,6 @@ that were not seen with the typical size of the category.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,25 +14,16 @@ from numpy.typing import NDArray
 
 from log2sim import boxfit
 from log2sim.boxfit import middle
-from log2sim.camera import project
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.measure.cloud import Cloud, assemble_cloud, to_map
+from log2sim.measure.seen import View, in_boxes, see
 from log2sim.measure.select import LEAST_POINTS, MARGIN, candidates, choose, grow
-from log2sim.types import TYPICAL_SIZE_M, Camera, Detections, Measurements
+from log2sim.types import TYPICAL_SIZE_M, Detections, Measurements
 
 __all__ = ["Cloud", "View", "assemble_cloud", "measure_view", "project_cloud", "to_map"]
 
 BORDER_PX = 3.0
 KEPT_POINTS = 400
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """One camera frame with what is needed to measure in it: `map_T_cam` (4, 4) at its stamp."""
-
-    camera: Camera
-    t_ns: int
-    map_T_cam: Array
 
 
 def measure_view(view: View, detections: Detections, cloud: Cloud | None, *, mode: str = "robust") -> Measurements:
@@ -43,14 +33,15 @@ def measure_view(view: View, detections: Detections, cloud: Cloud | None, *, mod
     if cloud is None or m == 0:
         return Measurements(**columns)
     if mode == "paper":
-        points, points_xyz, margin = np.arange(len(cloud.xyz)), cloud.xyz, 0.0
+        points, columns_m, margin = np.arange(len(cloud.xyz)), cloud.columns, 0.0
     else:
-        points, points_xyz, margin = cloud.obstacles, cloud.obstacles_xyz, MARGIN
-    seen, uv, depth = _project(view, cloud.origin, points_xyz)
-    index, xyz = points[seen], points_xyz[seen]
+        points, columns_m, margin = cloud.obstacles, cloud.obstacle_columns, MARGIN
+    seen = see(view, cloud.origin, columns_m)
+    index, uv = points[seen.index], np.stack([seen.u, seen.v], axis=1)
+    xyz = columns_m[:, seen.index].T
     range_m = np.linalg.norm(xyz - cloud.sensor, axis=1)
     clusters = list(columns["cluster"])
-    inside = _inside(uv, detections.box_px, margin)
+    inside = in_boxes(seen, detections.box_px, margin)
     if mode == "paper":
         for k, box in enumerate(detections.box_px):
             _measure_as_paper(columns, k, box, uv[inside[k]], xyz[inside[k]], cloud)
@@ -66,23 +57,12 @@ def measure_view(view: View, detections: Detections, cloud: Cloud | None, *, mod
         members = index[chosen]
         if columns["truncated"][k]:
             mine = np.zeros(len(cloud.xyz), dtype=bool)
-            mine[members] = mine[points[grow(points_xyz[:, :2], cloud.xyz[members, :2], category)]] = True
+            mine[members] = mine[points[grow(columns_m[:2].T, cloud.xyz[members, :2], category)]] = True
             members = np.flatnonzero(mine)
-        columns["height_px_m"][k] = (box[3] - box[1]) * middle(depth[chosen]) / view.camera.K[1, 1]
+        columns["height_px_m"][k] = (box[3] - box[1]) * middle(seen.depth[chosen]) / view.camera.K[1, 1]
         clusters[k] = _fill_row(columns, k, members, category, cloud)
     columns["cluster"] = tuple(clusters)
     return Measurements(**columns)
-
-
-def _inside(uv: Array, box_px: Array, margin: float) -> list[NDArray[np.intp]]:
-    """Indices of the pixels (N, 2) in each box (M, 4), widened by a share of its sides but not downward."""
-    u, v = np.ascontiguousarray(uv.T)
-    found = []
-    for u0, v0, u1, v1 in box_px.tolist():
-        wide, high = margin * (u1 - u0), margin * (v1 - v0)
-        column = np.flatnonzero((u >= u0 - wide) & (u <= u1 + wide))
-        found.append(column[(v[column] >= v0 - high) & (v[column] <= v1)])
-    return found
 
 
 def _blank(view: View, detections: Detections) -> dict[str, Any]:
@@ -129,7 +109,7 @@ def _fill_row(columns: dict[str, Any], k: int, members: NDArray[np.intp], catego
 
 
 def _measure_as_paper(
-    columns: dict[str, Any], k: int, box: Array, uv: Array, xyz: NDArray[np.float32], cloud: Cloud
+    columns: dict[str, Any], k: int, box: Array, uv: NDArray[np.floating[Any]], xyz: NDArray[np.float32], cloud: Cloud
 ) -> None:
     """Depth of the point nearest to the box center, extents of all points in the box."""
     if len(xyz) == 0:
@@ -144,24 +124,6 @@ def _measure_as_paper(
 
 def project_cloud(view: View, cloud: Cloud, index: NDArray[np.intp]) -> tuple[NDArray[np.intp], Array, Array]:
     """Which of the cloud's points at `index` the camera sees, their pixels (n, 2) and depths (n,)."""
-    return _project(view, cloud.origin, cloud.xyz[index])
-
-
-def _project(view: View, origin: Array, xyz: NDArray[np.float32]) -> tuple[NDArray[np.intp], Array, Array]:
-    """Which of the points (N, 3) relative to `origin` the camera sees, their pixels (n, 2) and depths (n,).
-
-    Notes
-    -----
-    Points are turned in single precision and tested against the frustum before anything is divided; only what is left
-    goes through the lens.
-    """
-    cam_R_map = view.map_T_cam[:3, :3].T
-    offset = cam_R_map @ (origin - view.map_T_cam[:3, 3])
-    points = cam_R_map.astype(np.float32) @ xyz.T + offset.astype(np.float32)[:, None]
-    camera, (x, y, z) = view.camera, points
-    margin = 1.0 if camera.distortion_model == "none" else 1.3
-    left, right = margin * camera.K[0, 2] / camera.K[0, 0], margin * (camera.width_px - camera.K[0, 2]) / camera.K[0, 0]
-    up, down = margin * camera.K[1, 2] / camera.K[1, 1], margin * (camera.height_px - camera.K[1, 2]) / camera.K[1, 1]
-    rough = np.flatnonzero((z > 0.1) & (x > -left * z) & (x < right * z) & (y > -up * z) & (y < down * z))
-    uv, inside = project(camera, points[:, rough].T)
-    return rough[inside], uv[inside], z[rough[inside]].astype(np.float64)
+    seen = see(view, cloud.origin, np.ascontiguousarray(cloud.xyz[index].T))
+    uv = np.stack([seen.u, seen.v], axis=1).astype(np.float64)
+    return seen.index, uv, seen.depth.astype(np.float64)

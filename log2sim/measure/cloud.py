@@ -46,9 +46,14 @@ class Cloud:
         return np.flatnonzero(~self.ground & (self.height > LOWEST_M) & (self.height < HIGHEST_M))
 
     @cached_property
-    def obstacles_xyz(self) -> NDArray[np.float32]:
-        """The points (n, 3) at `obstacles`, for the cameras that share the cloud."""
-        return self.xyz[self.obstacles]
+    def columns(self) -> NDArray[np.float32]:
+        """The points as columns x, y, z (3, N)."""
+        return np.ascontiguousarray(self.xyz.T)
+
+    @cached_property
+    def obstacle_columns(self) -> NDArray[np.float32]:
+        """The points at `obstacles` as columns (3, n), for the cameras that share the cloud."""
+        return np.ascontiguousarray(self.xyz[self.obstacles].T)
 
     @cached_property
     def panorama(self) -> Panorama:
@@ -63,7 +68,7 @@ class Cloud:
 
     def prepare(self) -> None:
         """Compute now, in the thread that makes the cloud, what measuring in it will ask for."""
-        _ = self.obstacles_xyz, self.panorama, self.ground_sample
+        _ = self.obstacle_columns, self.panorama, self.ground_sample
 
 
 def to_map(log: Log, lidar: str, sweep: Sweep, *, compensate: bool) -> tuple[Array, NDArray[np.float32]] | None:

@@ -50,7 +50,7 @@ def _cluster(xy: NDArray[np.floating[Any]], cell_m: float) -> tuple[NDArray[np.i
 
 
 def candidates(
-    xyz: NDArray[np.float32], uv: Array, range_m: Array, box_px: Array, category: str
+    xyz: NDArray[np.float32], uv: NDArray[np.floating[Any]], range_m: Array, box_px: Array, category: str
 ) -> list[tuple[Index, float]]:
     """Clusters of the points (N, 3) inside a box that could be its object, as indices, each with a score in (0, 1].
 
@@ -102,7 +102,7 @@ def _ends(values: NDArray[Any], first: Index) -> tuple[NDArray[Any], NDArray[Any
 
 def _goes_on(
     xyz: NDArray[np.float32],
-    uv: Array,
+    uv: NDArray[np.floating[Any]],
     box_px: Array,
     labels: NDArray[np.intp],
     corner: Array,
