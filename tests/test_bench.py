@@ -329,6 +329,8 @@ def test_tiles_and_input_sizes_are_those_that_change_something(
     }
     assert [s.present for s in grid.detect] == [True] + [False] * 10
     assert grid.detect[-1].config.detect.name == "models/fixed.onnx"
+    alike = make_grid(tiny[0], Config.load(detect={"name": "a/m.onnx"}), ["b/m.onnx"]).detect
+    assert len({s.name for s in alike}) == len(alike) == 8
 
 
 @dataclass

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from log2sim.config import Config
@@ -18,9 +19,6 @@ TILES = (0, 1, 2, 3, 5)
 
 SIDES_PX = (320, 416, 640, 960)
 """Sides of the input to try with models that take any."""
-
-HYPOTHESES = (10, 30, 100, 300, 1000, 3000)
-"""Hypotheses to try beside the present number, for methods that draw them."""
 
 NO_METHOD = "off"
 
@@ -126,7 +124,7 @@ def _detector_settings(log: Log, config: Config, detectors: Sequence[str]) -> li
     out: list[Setting] = []
     for name in names:
         own = config if name == config.detect.name else changed(config, "detect", name=name, layout="", input_px=0)
-        label = f"{name.rsplit('/', 1)[-1].removesuffix('.onnx')} " if len(names) > 1 else ""
+        label = f"{_short(name, names)} " if len(names) > 1 else ""
         detector = detector_of(log, own)
         if not isinstance(detector, OnnxDetector):
             out.append(Setting("detect", name, own, not out))
@@ -135,6 +133,13 @@ def _detector_settings(log: Log, config: Config, detectors: Sequence[str]) -> li
             other = changed(own, "detect", **{key: value})
             out.append(Setting("detect", f"{label}{_look_name(key, value)}", other, not out))
     return out
+
+
+def _short(name: str, names: Sequence[str]) -> str:
+    """A detector's name without folder and suffix, where that still tells it from the others."""
+    stems = [Path(n).stem if n.endswith(".onnx") else n for n in names]
+    stem = stems[list(names).index(name)]
+    return stem if stems.count(stem) == 1 else name
 
 
 def _looks(log: Log, config: Config, detector: OnnxDetector) -> list[tuple[str, int]]:
