@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from log2sim.bench.parts import Parts, share_not_worse
+from log2sim.bench.parts import LEAST_OBJECTS, Parts, share_not_worse
 
 NO_ERROR = "no error of the present setting is known; objects have to be in sight for a second"
 # Errors that differ by less are the same: logs are short, and a few objects more or less move them by as much.
@@ -92,7 +92,7 @@ def judge(points: Sequence[Point], unit: str, whole_ms: float) -> Verdict:
     best = _choose(better or others)
     reason = f"{present.setting} stays: {_figures(present, unit)}; "
     if better:
-        reason += f"{best.setting} may be better or not: {_figures(best, unit)}, {_sureness(best, present):.0%} sure"
+        reason += f"{best.setting} may be better or not: {_figures(best, unit)}{_sure_words(best, present)}"
     else:
         reason += f"next is {best.setting}: {_figures(best, unit)}"
     return Verdict(present.setting, present.setting, reason)
@@ -119,8 +119,15 @@ def _choose(points: Sequence[Point]) -> Point:
 
 
 def _instead(chosen: Point, present: Point, unit: str) -> str:
-    sureness = f", {_sureness(chosen, present):.0%} sure" if chosen.parts else ""
-    return f"{chosen.setting} rather than {present.setting}: {_figures(chosen, unit)} against {_figures(present, unit)}{sureness}"
+    figures = f"{_figures(chosen, unit)} against {_figures(present, unit)}"
+    return f"{chosen.setting} rather than {present.setting}: {figures}{_sure_words(chosen, present)}"
+
+
+def _sure_words(point: Point, present: Point) -> str:
+    if not point.parts:
+        return ""
+    few = len({*point.parts, *present.parts}) < LEAST_OBJECTS
+    return ", too few objects to tell" if few else f", {_sureness(point, present):.0%} sure"
 
 
 def _figures(point: Point, unit: str) -> str:
