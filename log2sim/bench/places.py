@@ -186,7 +186,7 @@ def _without_feet(camera: Camera, parts: Sequence[Correspondences], asked: Seque
     uv = pinhole(camera, np.column_stack([(box[:, 0] + box[:, 2]) / 2, box[:, 3]]))
     same = (feet.tick[:, None] == tick) & (np.abs(feet.uv[:, None] - uv).max(axis=2) < SAME_FOOT_PX)
     kept = ~same.any(axis=1)
-    return Correspondences(feet.uv[kept], feet.xy_ego[kept], feet.tick[kept])
+    return replace(feet, **{name: column[kept] for name, column in vars(feet).items() if column is not None})
 
 
 def judge_placed(log: Log, schedule: Schedule, held: Held, grounds: Mapping[str, CameraGround]) -> Judged:
