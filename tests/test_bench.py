@@ -18,7 +18,7 @@ from log2sim.bench.figures import CUT_M, jitter, judge_scenario
 from log2sim.bench.front import Point, judge, pareto_front
 from log2sim.bench.names import short_name
 from log2sim.bench.parts import error_of, share_not_worse
-from log2sim.bench.places import at_tick, hold_out, judge_measured, true_places
+from log2sim.bench.places import at_tick, hold_out, judge_measured, judge_placed, true_places
 from log2sim.bench.runs import Bed, look, make_bed
 from log2sim.bench.settings import choices, make_grid
 from log2sim.bench.shared import detect_once
@@ -30,13 +30,13 @@ from log2sim.detect.onnx_model import OnnxModel
 from log2sim.detect.preparation import InputSpec
 from log2sim.errors import ConfigError, LogError
 from log2sim.geometry import Array
-from log2sim.ground_plane import CameraGround
+from log2sim.ground_plane import CameraGround, calibrated_ground
 from log2sim.observe import Observed
 from log2sim.pipeline import schedule_of
 from log2sim.plan import make_plan
 from log2sim.scenario import Agent, Scenario, Waypoints
 from log2sim.schema import check
-from log2sim.topdown import HomographyFit
+from log2sim.topdown import HomographyFit, apply_homography
 from log2sim.types import Camera, Detections, Frame, Log, Measurements
 
 FirstPass = tuple[Bed, Observed, dict[str, float]]
@@ -257,10 +257,33 @@ def test_obstacles_set_aside_are_not_fitted_to(tiny: tuple[Log, Scenario], first
     held = hold_out(log, bed.schedule, seen, known, np.random.default_rng(0))
     before = sum(len(f.uv) for parts in seen.feet.values() for f in parts)
     after = sum(len(f.uv) for parts in held.seen.feet.values() for f in parts)
-    aside = sum(len(f.uv) for f in held.feet.values())
+    aside = sum(len(f.uv) for parts in held.feet.values() for f in parts)
     assert aside == len(held) > 0
     assert after == before - aside
     assert all((m.source == "").all() and np.isnan(m.center_m).all() for rows in held.asked.values() for m in rows)
+
+
+def test_a_right_homography_has_no_error_and_a_shifted_one_its_shift(
+    tiny: tuple[Log, Scenario], first_pass: FirstPass
+) -> None:
+    (log, truth), (bed, seen, _) = tiny, first_pass
+    known = true_places(log, bed.schedule, seen, truth, when="imaged")
+    held = hold_out(log, bed.schedule, seen, known, np.random.default_rng(0))
+    base = calibrated_ground(log, log.cameras["front"])
+    assert base is not None
+    uv = [apply_homography(np.linalg.inv(base.ground_H_image), f.xy_ego)[0] for f in held.feet["front"]]
+    exact = replace(held, feet={"front": [replace(f, uv=p) for f, p in zip(held.feet["front"], uv, strict=True)]})
+
+    def judged(shift_m: float) -> dict[str, Any]:
+        shift = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, shift_m], [0.0, 0.0, 1.0]])
+        fit = replace(base, ground_H_image=shift @ base.ground_H_image)
+        return judge_placed(log, bed.schedule, exact, {"front": CameraGround(log.cameras["front"], fit, "")}).figures
+
+    assert judged(0.0)["error_m"] == pytest.approx(0.0, abs=1e-6)
+    assert judged(0.0)["placed_share"] == 1.0
+    assert judged(0.7)["error_m"] == judged(0.7)["near_error_m"] == pytest.approx(0.7)
+    assert judged(30.0)["error_m"] == pytest.approx(CUT_M)
+    assert judged(0.0)["center_error_m"] < judged(1.5)["center_error_m"] <= CUT_M
 
 
 def test_a_tick_has_its_own_homography_or_none() -> None:

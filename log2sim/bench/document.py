@@ -25,7 +25,7 @@ COLUMNS = (
     ("median_m", "median m", 2),
     ("near_error_m", "<25 m", 2),
     ("far_error_m", ">25 m", 2),
-    ("foot_median_m", "foot med m", 2),
+    ("center_error_m", "center m", 2),
     ("jitter_m", "jitter m", 4),
 )
 

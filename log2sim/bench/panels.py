@@ -38,8 +38,8 @@ ERRORS = {
         ("smoothing_residual_m", "measurements' distance from the smoothed path", "m"),
     ),
     "homography": (
-        ("error_m", "obstacles placed by it alone, error cut at 2 m", "m"),
-        ("error_m", "obstacles placed by it alone, distance from LiDAR's place cut at 2 m", "m"),
+        ("error_m", "feet of obstacles placed by it alone, distance from LiDAR's, cut at 2 m", "m"),
+        ("error_m", "feet of obstacles placed by it alone, distance from LiDAR's, cut at 2 m", "m"),
     ),
     "smooth": (
         ("state_error_m", "error of the position one second ahead", "m"),

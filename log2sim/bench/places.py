@@ -130,13 +130,13 @@ class Held:
     """Measured obstacles kept from the homographies.
 
     `seen` is what is left to fit to. `asked` holds by camera the obstacles of every tick, their LiDAR place taken away,
-    and `known` where they are; `feet` where LiDAR has their feet.
+    `known` where their centers are and `feet`, in the same order, where LiDAR has their feet.
     """
 
     seen: Observed
     asked: dict[str, list[Measurements]]
     known: dict[str, list[Known]]
-    feet: dict[str, Correspondences]
+    feet: dict[str, list[Correspondences]]
 
     def __len__(self) -> int:
         return sum(len(m) for rows in self.asked.values() for m in rows)
@@ -151,6 +151,7 @@ def hold_out(log: Log, schedule: Schedule, seen: Observed, known: Sequence[Known
         xy, who = known[tick].xy, known[tick].who
         near = np.hypot(*(m.center_m - m.sensor_m)[:, :2].T) <= FARTHEST_M
         good = (m.source == "lidar") & ~m.truncated & (m.points >= LEAST_POINTS) & near & np.isfinite(xy[:, 0])
+        good &= np.array([len(c) > 0 for c in m.cluster], dtype=bool)
         good &= rng.random(len(m)) < HELD_OUT
         for camera in asked:
             rows = np.flatnonzero(good & (m.camera == camera))
@@ -160,8 +161,7 @@ def hold_out(log: Log, schedule: Schedule, seen: Observed, known: Sequence[Known
             asked[camera].append(_without_place(m.take(rows), stamp))
             places[camera].append(Known(xy[rows], who[rows]))
     feet = {camera: [_without_feet(log.cameras[camera], parts, asked[camera])] for camera, parts in seen.feet.items()}
-    aside = {camera: Correspondences.join(parts) for camera, parts in held.items()}
-    return Held(replace(seen, feet=feet), asked, places, aside)
+    return Held(replace(seen, feet=feet), asked, places, held)
 
 
 def _without_place(m: Measurements, stamp: int) -> Measurements:
@@ -190,36 +190,34 @@ def _without_feet(camera: Camera, parts: Sequence[Correspondences], asked: Seque
 
 
 def judge_placed(log: Log, schedule: Schedule, held: Held, grounds: Mapping[str, CameraGround]) -> Judged:
-    """How far the homographies alone put the obstacles that were set aside; see `judge_measured`.
+    """How far the homographies alone put the feet of the obstacles that were set aside from where LiDAR has them.
 
-    `near_error_m` and `far_error_m` are of those within and beyond 25 m; `foot_median_m` is the distance between the
-    ground points at their feet, which says more of a homography and less of what is behind the foot.
+    `near_error_m` and `far_error_m` are of those within and beyond 25 m. `center_error_m` and `center_median_m` are of the
+    centers against what is known of these; half of that is a guess of how deep an object is, which can cancel the error
+    of a bad homography. Everything is cut at 2 m, which feet without a place count as.
     """
-    distance, range_m, who = [np.zeros(0)], [np.zeros(0)], [np.zeros(0, dtype=np.int64)]
+    feet, centers, range_m, who = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)], [np.zeros(0, dtype=np.int64)]
     for camera in (c for c in held.asked if c in grounds):
         for tick, (m, known) in enumerate(zip(held.asked[camera], held.known[camera], strict=True)):
-            distance.append(np.hypot(*(_places(log, schedule, tick, m, grounds[camera]) - known.xy).T))
+            feet.append(_foot_distances(held.feet[camera][tick], at_tick(grounds[camera], tick)))
+            centers.append(np.hypot(*(_places(log, schedule, tick, m, grounds[camera]) - known.xy).T))
             range_m.append(np.hypot(*(known.xy - m.sensor_m[:, :2]).T))
             who.append(known.who)
-    d, near, w = np.concatenate(distance), np.concatenate(range_m) < NEAR_M, np.concatenate(who)
-    judged = _judge_distances(d, w)
+    d, near, w = np.concatenate(feet), np.concatenate(range_m) < NEAR_M, np.concatenate(who)
+    judged, center = _judge_distances(d, w), _judge_distances(np.concatenate(centers), w).figures
     extra = {
         f"{name}_error_m": _judge_distances(d[rows], w[rows]).figures["error_m"]
         for name, rows in (("near", near), ("far", ~near))
     }
-    return Judged(judged.figures | extra | {"foot_median_m": _foot_median(held, grounds)}, judged.parts)
+    extra |= {f"center_{key}": center[key] for key in ("error_m", "median_m")}
+    return Judged(judged.figures | extra, judged.parts)
 
 
-def _foot_median(held: Held, grounds: Mapping[str, CameraGround]) -> float | None:
-    """Median distance of the feet, in m; None where fewer than half of them are placed."""
-    errors = [np.zeros(0)]
-    for camera, feet in held.feet.items():
-        for tick in np.unique(feet.tick) if camera in grounds else ():
-            fit, rows = at_tick(grounds[camera], int(tick)).fit, feet.tick == tick
-            xy = apply_homography(fit.ground_H_image, feet.uv[rows])[0]
-            errors.append(np.nan_to_num(np.hypot(*(xy - feet.xy_ego[rows]).T), nan=np.inf))
-    value = float(np.median(np.concatenate(errors))) if len(errors) > 1 else np.inf
-    return value if np.isfinite(value) else None
+def _foot_distances(feet: Correspondences, ground: CameraGround) -> Array:
+    """How far (N,) a homography puts feet from where they are, m; NaN for those above its horizon."""
+    if not len(feet.uv):
+        return np.zeros(0)
+    return np.asarray(np.hypot(*(apply_homography(ground.fit.ground_H_image, feet.uv)[0] - feet.xy_ego).T))
 
 
 def _places(log: Log, schedule: Schedule, tick: int, m: Measurements, ground: CameraGround) -> Array:
