@@ -183,11 +183,22 @@ def test_jitter_is_the_deviation_of_white_noise_and_not_acceleration() -> None:
     t = np.arange(400) * 0.1
     smooth = np.column_stack([3 * t + 1.5 * t**2, 0 * t])
     noise = np.random.default_rng(1).normal(0, 0.2, (400, 2))
-    assert jitter(replace(world(), agents=(moving("a", smooth),))) == pytest.approx(0.0, abs=1e-9)
-    assert jitter(replace(world(), agents=(moving("a", smooth + noise),))) == pytest.approx(0.2, rel=0.1)
-    assert jitter(world()) is None
+
+    def of(*agents: Agent) -> float | None:
+        return jitter(replace(world(), agents=agents), 0.1)
+
+    assert of(moving("a", smooth)) == pytest.approx(0.0, abs=1e-9)
+    assert of(moving("a", smooth + noise)) == pytest.approx(0.2, rel=0.1)
+    assert of() is None
+    assert of(moving("a", smooth[:4])) is None
     standing = replace(moving("b", smooth + 10 * noise), static=True)
-    assert jitter(replace(world(), agents=(moving("a", smooth), standing))) == pytest.approx(0.0, abs=1e-9)
+    assert of(moving("a", smooth), standing) == pytest.approx(0.0, abs=1e-9)
+    # Fewer waypoints of the same motion: nothing was lost, so nothing jitters.
+    whole = moving("a", smooth).waypoints
+    kept = np.unique(np.r_[0, np.random.default_rng(2).integers(0, 400, 90), 399])
+    columns = {name: getattr(whole, name)[kept] for name in Waypoints.FLOATS} | {"observed": whole.observed[kept]}
+    thinned = replace(moving("a", smooth), waypoints=Waypoints(**{**columns, "speed_mps": 3 + 3 * t[kept]}))
+    assert of(thinned) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_measured_centers_of_a_log_are_near_the_truth_and_outliers_are_cut(

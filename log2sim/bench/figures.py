@@ -67,7 +67,7 @@ def judge_scenario(scenario: Scenario, truth: Scenario | None, tick_s: float, sc
     """
     out: dict[str, Any] = {
         "agents": len(scenario.others),
-        "jitter_m": jitter(scenario),
+        "jitter_m": jitter(scenario, tick_s),
         "gap_share": _gap_share(scenario, tick_s),
         "smoothing_residual_m": _smoothing_residual(scenario),
     }
@@ -110,20 +110,32 @@ def _state_parts(found: Mapping[str, Any]) -> Parts:
     }
 
 
-def jitter(scenario: Scenario) -> float | None:
+def jitter(scenario: Scenario, tick_s: float) -> float | None:
     """Median over moving agents of the noise in their waypoints, m; None when none moves for long enough.
 
     Notes
     -----
-    Third differences lack motion of constant acceleration; of white noise of deviation s they have 20 s2.
+    Third differences lack motion of constant acceleration; of white noise of deviation s they have 20 s2. Where waypoints
+    are farther apart than a tick, the motion between them is the cubic that has their speeds.
     """
-    values = [_third_differences(a) for a in scenario.others if not a.static and len(a.waypoints) >= 5]
-    return float(np.median(values)) if values else None
+    if tick_s <= 0:
+        return None
+    values = [_third_differences(a, tick_s) for a in scenario.others if not a.static and len(a.waypoints) > 1]
+    known = [v for v in values if v is not None]
+    return float(np.median(known)) if known else None
 
 
-def _third_differences(agent: Agent) -> float:
-    xy = np.column_stack([agent.waypoints.x_m, agent.waypoints.y_m])
-    return float(np.sqrt(np.mean(np.diff(xy, n=3, axis=0) ** 2) / 20))
+def _third_differences(agent: Agent, tick_s: float) -> float | None:
+    from scipy.interpolate import CubicHermiteSpline
+
+    w = agent.waypoints
+    ticks = int(round((w.t_s[-1] - w.t_s[0]) / tick_s)) + 1
+    if ticks < 5:
+        return None
+    xy = np.column_stack([w.x_m, w.y_m])
+    velocity = w.speed_mps[:, None] * np.column_stack([np.cos(w.yaw_rad), np.sin(w.yaw_rad)])
+    at = CubicHermiteSpline(w.t_s, xy, velocity)(np.linspace(w.t_s[0], w.t_s[-1], ticks))
+    return float(np.sqrt(np.mean(np.diff(at, n=3, axis=0) ** 2) / 20))
 
 
 def _gap_share(scenario: Scenario, tick_s: float) -> float | None:
