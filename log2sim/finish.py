@@ -26,13 +26,14 @@ SAMPLES = 12
 EGO_SIGMA_M = 0.02
 
 
-def without_doubles(built: Sequence[Built]) -> list[Agent]:
-    """Agents that are not in another's place, the ones with more evidence first, named by category and number."""
-    kept: list[Built] = []
+def without_doubles(built: Sequence[Built], ego: Agent | None = None) -> list[Agent]:
+    """Agents that are in nobody else's place, the ego's included, those with more evidence first; named by category."""
+    taken = [ego] if ego is not None else []
+    kept: list[Agent] = []
     for candidate in sorted(built, key=lambda b: -b.evidence):
-        if not any(_same_place(candidate.agent, other.agent) for other in kept):
-            kept.append(candidate)
-    agents = sorted((b.agent for b in kept), key=lambda a: (float(a.waypoints.t_s[0]), float(a.waypoints.x_m[0])))
+        if not any(_same_place(candidate.agent, other) for other in (*taken, *kept)):
+            kept.append(candidate.agent)
+    agents = sorted(kept, key=lambda a: (float(a.waypoints.t_s[0]), float(a.waypoints.x_m[0])))
     count: dict[str, int] = {}
     named = []
     for agent in agents:

@@ -120,8 +120,8 @@ def conclude(
         )
     with clock.stage("smooth"):
         built = build_agents(tracks, seen.obstacles, timeline, ego_flow(log, schedule), smooth=config.smooth.enabled)
-        agents = without_doubles(built)
         ego = ego_agent(log, timeline)
+        agents = without_doubles(built, ego)
     if ego is None and not agents:
         raise NothingToReconstruct(f"{log.name}: no ego poses, and no object was detected in {len(schedule)} ticks")
     scenario = make_scenario(log, schedule, config, plan, detector, homographies, ego, agents)

@@ -1,0 +1,67 @@
+"""The last steps: no two agents in one place, none in the ego's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from log2sim.assemble import Built
+from log2sim.finish import without_doubles
+from log2sim.scenario import Agent, Waypoints
+
+
+def agent(x_m, y_m=0.0, yaw=0.0, category="car", size=(4.4, 1.8, 1.5), t=(0.0, 4.0), speed=0.0):
+    t_s = np.linspace(*t, 5)
+    n = len(t_s)
+    waypoints = Waypoints(
+        t_s=t_s, x_m=x_m + speed * t_s, y_m=np.full(n, y_m), z_m=np.full(n, 0.7), yaw_rad=np.full(n, yaw),
+        speed_mps=np.full(n, speed), observed=np.ones(n, dtype=bool), sigma_xy_m=np.full(n, 0.1),
+    )  # fmt: skip
+    return Agent("", category, size, waypoints)
+
+
+def names(*built, ego=None):
+    return [a.id for a in without_doubles([Built(a, e, True) for a, e in built], ego)]
+
+
+def test_of_two_in_one_place_the_one_with_more_evidence_stays():
+    left = without_doubles([Built(agent(10.0), 3.0, True), Built(agent(10.8, size=(5.0, 1.9, 1.6)), 9.0, True)])
+    assert [a.size_m[0] for a in left] == [5.0]
+    assert left[0].id == "car-1"
+
+
+def test_neighbors_bumper_to_bumper_both_stay_and_are_numbered_by_their_start():
+    assert names((agent(15.0), 9.0), (agent(10.3), 3.0)) == ["car-1", "car-2"]
+    later = replace(agent(30.0).waypoints, t_s=np.linspace(1.0, 4.0, 5))
+    ordered = without_doubles([Built(replace(agent(30.0), waypoints=later), 9.0, True), Built(agent(50.0), 1.0, True)])
+    assert [a.waypoints.x_m[0] for a in ordered] == [50.0, 30.0]
+
+
+@pytest.mark.parametrize(("y_m", "kept"), [(0.3, 0), (3.5, 1)])
+def test_what_shares_the_place_of_the_ego_is_dropped(y_m, kept):
+    ego = agent(0.0, speed=8.0)
+    assert len(names((agent(1.0, y_m, yaw=0.8, speed=8.0), 9.0), ego=ego)) == kept
+
+
+def test_those_who_were_there_at_different_times_share_a_place():
+    assert len(names((agent(10.0, t=(0.0, 1.9)), 5.0), (agent(10.0, t=(2.0, 4.0)), 4.0))) == 2
+
+
+def test_ways_that_cross_are_no_doubles():
+    crossing = agent(-10.0, speed=5.0)
+    across = agent(0.0, y_m=-9.0, yaw=np.pi / 2)
+    assert len(names((crossing, 5.0), (across, 4.0))) == 2
+
+
+@pytest.mark.parametrize(("apart_m", "kept"), [(0.2, 1), (0.5, 2)])
+def test_people_are_doubles_only_where_they_stand_in_each_other(apart_m, kept):
+    body = (0.7, 0.6, 1.75)
+    pair = [(agent(x, category="pedestrian", size=body), 1.0) for x in (5.0, 5.0 + apart_m)]
+    assert len(names(*pair)) == kept
+
+
+def test_a_person_on_the_back_seat_is_not_another_agent_beside_the_car():
+    person = agent(10.5, category="pedestrian", size=(0.7, 0.6, 1.5))
+    assert names((agent(10.0), 9.0), (person, 2.0)) == ["car-1"]
