@@ -129,7 +129,7 @@ def _third_differences(agent: Agent, tick_s: float) -> float | None:
     from scipy.interpolate import CubicHermiteSpline
 
     w = agent.waypoints
-    ticks = int(round((w.t_s[-1] - w.t_s[0]) / tick_s)) + 1
+    ticks = round((w.t_s[-1] - w.t_s[0]) / tick_s) + 1
     if ticks < 5:
         return None
     xy = np.column_stack([w.x_m, w.y_m])
