@@ -15,7 +15,7 @@ SIZE_PT, LETTER_PT, LINE_PT, POINT_PT = 6.8, 3.9, 9.0, 6.0
 # Points nearer to each other than this look like one and get one block of names.
 TOGETHER_PT = 7.0
 # Names farther from their point than this get a line to it.
-APART_PT = 9.0
+APART_PT = 11.5
 # Side, distance and height in points of a block of names from its point: beside it first, then above and below.
 SPOTS = tuple(
     (side, gap, rise)
