@@ -19,7 +19,7 @@ APART_PT = 11.5
 # Side, distance and height in points of a block of names from its point: beside it first, then above and below.
 SPOTS = tuple(
     (side, gap, rise)
-    for rise in (0, 9, -9, 16, -16, 24, -24, 34, -34, 46, -46)
+    for rise in (0, 9, -9, 16, -16, 24, -24, 34, -34, 46, -46, 60, -60, 76, -76)
     for side, gap in ((1, 10), (-1, 10), (0, 0))
     if side or abs(rise) > 9
 )
@@ -32,7 +32,8 @@ def write_names(ax: Axes, points: Sequence[Point], xy: Array, line: Array) -> No
     """Write the settings of points (K, 2) beside them; `line` (n, 2) are the corners of a line to keep clear of."""
     pt = float(ax.figure.dpi) / 72
     at = ax.transData.transform(xy)
-    taken = [_around(u, v, POINT_PT * pt) for u, v in at] + _along(ax.transData.transform(line), pt)
+    # A name over a point is worse than one over another name.
+    taken = 3 * [_around(u, v, POINT_PT * pt) for u, v in at] + _along(ax.transData.transform(line), pt)
     frame = ax.get_window_extent()
     inside = (frame.x0 + 3 * pt, frame.y0 + 3 * pt, frame.x1 - 3 * pt, frame.y1 - 3 * pt)
     for members in sorted(_together(at, TOGETHER_PT * pt), key=lambda m: -float(at[m[0], 1])):
