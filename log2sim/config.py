@@ -38,12 +38,16 @@ class SyncConfig:
 
 @dataclass(frozen=True)
 class DetectConfig:
-    """`name`: detector or path of an ONNX file; `min_score`: lowest score that can continue a track, 0 for the detector's own."""
+    """`name`: detector or path of an ONNX file; `min_score`: lowest score that can continue a track, 0 for the detector's own.
+
+    `input_px`: side of the input of a model that takes any size, 0 for what its family takes.
+    """
 
     name: str = "ssd-mobilenet-v2"
     min_score: float = _number(0.0, 0.0, 1.0)
     tiles: int = field(default=0, metadata={"low": 0, "high": 64})
     layout: str = ""
+    input_px: int = field(default=0, metadata={"low": 0, "high": 8192})
 
 
 @dataclass(frozen=True)

@@ -87,6 +87,7 @@ def detector_of(log: Log, config: Config) -> Detector:
         min_score=config.detect.min_score or None,
         tiles=config.detect.tiles or "auto",
         layout=config.detect.layout or None,
+        input_px=config.detect.input_px or None,
     )
 
 

@@ -13,7 +13,7 @@ from log2sim.errors import Log2SimError
 
 @cache
 def load_schema(name: str) -> dict[str, Any]:
-    """The schema `name` ("log-1", "scenario-1", "replay-1", "report-1", "metrics-1") as a document."""
+    """The schema `name` ("log-1", "scenario-1", "replay-1", "report-1", "metrics-1", "bench-1") as a document."""
     beside_source = Path(__file__).resolve().parent.parent / "schemas" / f"{name}.json"
     if beside_source.is_file():
         return json.loads(beside_source.read_text(encoding="utf-8"))

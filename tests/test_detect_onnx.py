@@ -139,6 +139,51 @@ def test_layout_is_recognized_and_decodes_to_the_known_box(case: str, tmp_path: 
     assert found[0][2] == pytest.approx(BOX, abs=1e-3)
 
 
+def picky_model(path: Path, output: NDArray[np.float32], side: int) -> Path:
+    """A model that says it takes any size and fails for all but one."""
+    helper, array = onnx.helper, onnx.numpy_helper.from_array
+    constants = {"c": output, "same": np.zeros((1, 3, side, side), np.float32), "zero": np.zeros(1, np.float32)}
+    nodes = [helper.make_node("Constant", [], [name], value=array(value)) for name, value in constants.items()]
+    nodes += [
+        helper.make_node("Add", ["images", "same"], ["sum"]),
+        helper.make_node("ReduceMean", ["sum"], ["mean"], keepdims=0),
+        helper.make_node("Mul", ["mean", "zero"], ["nothing"]),
+        helper.make_node("Add", ["c", "nothing"], ["output"]),
+    ]
+    infos = [
+        helper.make_tensor_value_info(n, 1, v) for n, v in (("images", (1, 3, None, None)), ("output", output.shape))
+    ]
+    graph = helper.make_graph(nodes, "picky", infos[:1], infos[1:])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8), path)
+    return path
+
+
+def test_a_model_that_refuses_the_sizes_of_other_families_is_recognized(tmp_path: Path) -> None:
+    path = picky_model(tmp_path / "m.onnx", zeros(3549, 85), 416)
+    assert create_detector(str(path), LOG).layout.name == "yolox"  # type: ignore[attr-defined]
+    with pytest.raises(ConfigError, match=r"m\.onnx: the model fails on a picture \(1, 3, 320, 320\)"):
+        create_detector(str(path), LOG, input_px=320)
+    with pytest.raises(ConfigError, match=r"n\.onnx: the model fails on a picture"):
+        create_detector(str(picky_model(tmp_path / "n.onnx", zeros(5, 7), 77)), LOG)
+
+
+@pytest.mark.parametrize(("side", "expected"), [(96, (64.0, 48.0, 128.0, 80.0)), (192, (32.0, 8.0, 64.0, 24.0))])
+def test_a_model_of_any_size_takes_the_one_asked_for(side: int, expected: tuple[float, ...], tmp_path: Path) -> None:
+    output = zeros(84, 10)
+    output[0, :4, 7], output[0, 4 + CAR, 7] = (48.0, 48.0, 32.0, 16.0), SCORE  # px of the input, bars above and below
+    path = save_model(tmp_path / "m.onnx", {"output0": output}, shape=(1, 3, None, None))
+    [(_, _, box)] = detect(path, layout="yolov8", input_px=side)
+    assert box == pytest.approx(expected, abs=1e-3)
+
+
+def test_a_model_of_one_size_takes_no_other(tmp_path: Path) -> None:
+    path = save_model(tmp_path / "m.onnx", {"output0": yolov8()})
+    with pytest.raises(ConfigError, match=r"input_px 320: the model takes 96 x 64 px and nothing else"):
+        create_detector(str(path), LOG, input_px=320)
+    with pytest.raises(ConfigError, match="only a detector given as the path of an ONNX file"):
+        create_detector("labels", LOG, input_px=320)
+
+
 def test_detr_logits_and_boxes_apart_decode_the_same(tmp_path: Path) -> None:
     merged = rt_detr()
     logits = np.full((1, 300, 80), -20, np.float32)

@@ -19,7 +19,9 @@ GROUND = {
 STAGES = {
     "detect", "extend", "fuse", "logs", "measure", "metrics", "plot", "replay", "shape", "smooth", "sync", "synth", "thin", "topdown", "track",
 }  # fmt: skip
-PIPELINE = {"assemble", "finish", "ground_plane", "look", "mosaic", "observe", "pipeline", "plan", "report", "savings"}
+PIPELINE = {
+    "assemble", "bench", "finish", "ground_plane", "look", "mosaic", "observe", "pipeline", "plan", "report", "savings",
+}  # fmt: skip
 TOP = {"__init__", "__main__", "cli", "progress"}
 # Synthetic logs are written by the writer of logs.
 ALLOWED = {("synth", "logs")}

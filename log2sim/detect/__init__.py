@@ -41,6 +41,7 @@ def create_detector(
     max_overlap: float = MAX_OVERLAP,
     tiles: Literal["auto"] | int = "auto",
     layout: str | None = None,
+    input_px: int | None = None,
 ) -> Detector:
     """Make a detector for a log.
 
@@ -58,6 +59,8 @@ def create_detector(
         1: the whole picture only; N > 1: also N overlapping tiles; "auto": what the picture's size asks for.
     layout
         Output layout of an ONNX file, where it cannot be recognized.
+    input_px
+        Side of the input of an ONNX file that takes any size, None for what its family takes.
 
     Raises
     ------
@@ -71,10 +74,17 @@ def create_detector(
         from log2sim.detect.onnx_detector import open_onnx
 
         return open_onnx(
-            Path(name_or_path), min_score=min_score, max_overlap=max_overlap, tiles=tiles, layout_name=layout
+            Path(name_or_path),
+            min_score=min_score,
+            max_overlap=max_overlap,
+            tiles=tiles,
+            layout_name=layout,
+            input_px=input_px,
         )
     if layout is not None:
         raise ConfigError(f"layout '{layout}': only a detector given as the path of an ONNX file takes a layout")
+    if input_px is not None:
+        raise ConfigError(f"input_px {input_px}: only a detector given as the path of an ONNX file takes another size")
     try:
         create = registry.load("detector", name_or_path)
     except ConfigError as error:

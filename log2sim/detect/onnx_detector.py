@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,6 +69,7 @@ def open_onnx(
     max_overlap: float,
     tiles: Literal["auto"] | int,
     layout_name: str | None = None,
+    input_px: int | None = None,
     name: str | None = None,
 ) -> OnnxDetector:
     """Load a model, find out its layout and its classes by a gray probe picture, and make a detector of it."""
@@ -83,6 +84,8 @@ def open_onnx(
         raise ConfigError(
             f"{path}: outputs {describe(outputs)} do not fit the layout '{layout.name}' ({error})"
         ) from None
+    if input_px is not None:
+        layout = resized(layout, model, input_px)
     score = layout.default_min_score if min_score is None else min_score
     return OnnxDetector(name or path.name, model, layout, classes, score, max_overlap, tiles, layout.default_min_score)
 
@@ -96,17 +99,40 @@ def recognize(model: OnnxModel, chosen: Layout | None) -> tuple[Layout, Outputs]
     """
     tried: dict[tuple[int, ...], Outputs] = {}
     outputs: Outputs = {}
+    failure: ConfigError | None = None
     for layout in [chosen] if chosen is not None else LAYOUTS.values():
         probe, placement = layout.preparation(np.full((PROBE_PX, PROBE_PX, 3), 114, np.uint8), model.spec)
         if probe.shape not in tried:
-            tried[probe.shape] = model.run(probe)
+            try:
+                tried[probe.shape] = model.run(probe)
+            except (
+                ConfigError
+            ) as error:  # many models that take any size want multiples of 32, and not every family has one
+                failure = failure or error
+                tried[probe.shape] = {}
+        if not tried[probe.shape]:
+            continue
         outputs = tried[probe.shape]
         if chosen is not None or layout.matches(outputs, placement.input_px):
             return layout, outputs
+    if failure is not None and not outputs:
+        raise failure
     raise ConfigError(
         f"{model.path}: outputs {describe(outputs)} are of no layout that is recognized by itself; "
         f"name one with layout=: {', '.join(LAYOUTS)}"
     )
+
+
+def resized(layout: Layout, model: OnnxModel, input_px: int) -> Layout:
+    """The layout with another side of the input, after a run on a gray picture of that size."""
+    if model.spec.width_px is not None or model.spec.height_px is not None:
+        raise ConfigError(
+            f"{model.path}: input_px {input_px}: the model takes {model.spec.width_px} x {model.spec.height_px} px and "
+            "nothing else; leave input_px out"
+        )
+    changed: Any = replace(cast(Any, layout), preparation=replace(layout.preparation, default_px=input_px))
+    model.run(changed.preparation(np.full((PROBE_PX, PROBE_PX, 3), 114, np.uint8), model.spec)[0])
+    return cast(Layout, changed)
 
 
 def probe_size(model: OnnxModel, layout: Layout) -> tuple[int, int]:

@@ -1,0 +1,576 @@
+"""Error against run time: the front, the verdict, what runs share, the figures, and the command with its files."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_line import names, run
+from worlds import tiny_log
+
+from log2sim.bench import Benchmark, Scope, bench
+from log2sim.bench.document import document, format_table
+from log2sim.bench.figures import CUT_M, jitter, judge_scenario
+from log2sim.bench.front import Point, judge, pareto_front
+from log2sim.bench.names import short_name
+from log2sim.bench.parts import error_of, share_not_worse
+from log2sim.bench.places import at_tick, hold_out, judge_measured, judge_placed, true_places
+from log2sim.bench.runs import Bed, look, make_bed
+from log2sim.bench.settings import choices, make_grid
+from log2sim.bench.shared import detect_once
+from log2sim.config import Config, TopdownConfig
+from log2sim.detect.classes import COCO_80
+from log2sim.detect.layouts import LAYOUTS
+from log2sim.detect.onnx_detector import OnnxDetector
+from log2sim.detect.onnx_model import OnnxModel
+from log2sim.detect.preparation import InputSpec
+from log2sim.errors import ConfigError, LogError
+from log2sim.geometry import Array
+from log2sim.ground_plane import CameraGround, calibrated_ground
+from log2sim.observe import Observed
+from log2sim.pipeline import schedule_of
+from log2sim.plan import make_plan
+from log2sim.scenario import Agent, Scenario, Waypoints
+from log2sim.schema import check
+from log2sim.topdown import HomographyFit, apply_homography
+from log2sim.types import Camera, Detections, Frame, Log, Measurements
+
+FirstPass = tuple[Bed, Observed, dict[str, float]]
+LABELS = Config.load(detect={"name": "labels"})
+
+
+def silent(what: str, done: int, total: int) -> None:
+    pass
+
+
+@pytest.fixture(scope="module")
+def tiny() -> tuple[Log, Scenario]:
+    return tiny_log()
+
+
+@pytest.fixture(scope="module")
+def first_pass(tiny: tuple[Log, Scenario]) -> FirstPass:
+    bed = make_bed(tiny[0], make_grid(tiny[0], LABELS), tiny[1], silent)
+    return bed, *look(bed, bed.grid.present, bed.grid.measure[0], silent)
+
+
+@pytest.fixture(scope="module")
+def result(tiny: tuple[Log, Scenario]) -> Benchmark:
+    return bench(tiny[0], LABELS, truth=tiny[1])
+
+
+# The front and the verdict
+
+
+def test_the_front_is_what_nothing_beats() -> None:
+    cost = [1.0, 2.0, 2.0, 3.0, 4.0, 5.0, 0.5]
+    error = [9.0, 5.0, 6.0, 5.0, 1.0, 1.0, np.nan]
+    assert pareto_front(cost, error).tolist() == [True, True, False, False, True, False, False]
+
+
+def test_equal_points_are_both_on_the_front_and_nothing_has_no_front() -> None:
+    assert pareto_front([1.0, 1.0], [2.0, 2.0]).tolist() == [True, True]
+    assert pareto_front([], []).tolist() == []
+    assert pareto_front([1.0], [np.nan]).tolist() == [False]
+
+
+def test_the_front_agrees_with_a_sweep_over_sorted_points() -> None:
+    rng = np.random.default_rng(3)
+    cost, error = rng.random(200), rng.random(200)
+    lowest, expected = np.inf, set()
+    for k in np.argsort(cost):
+        if error[k] < lowest:
+            lowest = error[k]
+            expected.add(int(k))
+    assert set(np.flatnonzero(pareto_front(cost, error)).tolist()) == expected
+
+
+def point(name: str, ms: float, error: float | None, *, present: bool = False, spread: float = 0.0) -> Point:
+    """A point of ten objects that have the same error, or ones that scatter about it by a factor."""
+    factors = 1 + spread * np.linspace(-1, 1, 10)
+    parts = {} if error is None else {str(k): (float((error * f) ** 2), 1.0) for k, f in enumerate(factors)}
+    return Point(name, present, ms, error, {}, parts)
+
+
+def test_less_error_wins_and_of_equal_errors_the_cheaper() -> None:
+    now = point("now", 10.0, 1.0, present=True)
+    assert judge([now, point("better", 30.0, 0.5)], "m", 100.0).supported == "better"
+    assert judge([now, point("cheaper", 1.0, 1.02)], "m", 100.0).supported == "cheaper"
+    assert judge([now, point("a", 30.0, 0.5), point("b", 20.0, 0.51)], "m", 100.0).supported == "b"
+    assert judge([now, point("worse", 1.0, 2.0)], "m", 100.0).agrees
+
+
+def test_a_gain_that_nobody_notices_changes_nothing() -> None:
+    now = point("now", 10.0, 1.0, present=True)
+    assert judge([now, point("cheaper", 6.0, 1.0)], "m", 100.0).agrees
+    assert judge([now, point("better", 10.0, 0.98)], "m", 100.0).agrees
+
+
+def test_chance_replaces_nothing() -> None:
+    now = point("now", 10.0, 1.0, present=True)
+    other = replace(now, setting="other", present=False, error=0.8)
+    lucky = replace(other, parts={str(k): ((4.0 if k % 2 else 0.04), 1.0) for k in range(10)})
+    verdict = judge([now, lucky], "m", 100.0)
+    assert verdict.agrees
+    assert "may be better or not" in verdict.reason
+    assert judge([now, replace(other, parts={str(k): (0.64, 1.0) for k in range(10)})], "m", 100.0).supported == "other"
+
+
+def test_without_an_error_there_is_no_verdict() -> None:
+    verdict = judge([point("now", 1.0, None, present=True), point("other", 1.0, 1.0)], "m", 1.0)
+    assert verdict.supported is None
+    assert not verdict.agrees
+
+
+def test_resampling_knows_sure_and_unsure() -> None:
+    ones, twos = {str(k): (1.0, 1.0) for k in range(10)}, {str(k): (4.0, 1.0) for k in range(10)}
+    assert share_not_worse(ones, twos, 0.0) == 1.0
+    assert share_not_worse(twos, ones, 0.0) == 0.0
+    assert share_not_worse(twos, ones, 1.01) == 1.0  # twice the error is within an allowance of 101 %
+    mixed = {str(k): ((0.0 if k % 2 else 2.0), 1.0) for k in range(10)}
+    assert 0.3 < share_not_worse(mixed, ones, 0.0) < 0.8
+    assert share_not_worse(dict(list(ones.items())[:4]), dict(list(twos.items())[:4]), 0.0) == 0.0
+
+
+# Figures
+
+
+def moving(name: str, xy: Array, tick_s: float = 0.1) -> Agent:
+    n = len(xy)
+    speed = np.full(n, 3.0)
+    columns = {"z_m": np.zeros(n), "yaw_rad": np.zeros(n), "speed_mps": speed, "sigma_xy_m": np.full(n, 0.1)}
+    w = Waypoints(t_s=np.arange(n) * tick_s, x_m=xy[:, 0], y_m=xy[:, 1], observed=np.ones(n, dtype=bool), **columns)
+    return Agent(name, "car", (4.0, 1.8, 1.5), w, quality={"detections": n, "flags": []})
+
+
+def world(*offsets: tuple[float, float]) -> Scenario:
+    """Cars 20 m apart that all drive along x, off from there by so much."""
+    x = 0.3 * np.arange(20)
+    agents = tuple(
+        moving(f"car-{k}", np.column_stack([x + dx, 20.0 * k + dy + 0 * x])) for k, (dx, dy) in enumerate(offsets)
+    )
+    return Scenario("world", 0, 1.9, agents)
+
+
+def test_the_error_counts_distance_misses_and_false_objects() -> None:
+    truth = world((0, 0), (0, 0))
+    perfect = judge_scenario(truth, truth, 0.1).figures
+    assert perfect["error_m"] == 0.0
+    assert perfect["recall"] == perfect["precision"] == 1.0
+    shifted = judge_scenario(world((0, 1.0), (0, -1.0)), truth, 0.1).figures
+    assert shifted["error_m"] == pytest.approx(1.0)
+    assert shifted["state_error_m"] == pytest.approx(1.0)
+    # One of two is missed: 20 ticks right, 20 missed, each of these half an object that is 2 m off.
+    missed = judge_scenario(world((0, 0)), truth, 0.1).figures
+    assert missed["error_m"] == pytest.approx(np.sqrt(CUT_M**2 * 10 / (20 + 10)))
+    # One is 10 m off, so one is missed and one false: together an object that is 2 m off.
+    lost = judge_scenario(world((0, 0), (0, 10.0)), truth, 0.1).figures
+    assert lost["error_m"] == pytest.approx(np.sqrt(CUT_M**2 * 20 / (20 + 20)))
+
+
+def test_the_parts_of_objects_make_up_the_error() -> None:
+    judged = judge_scenario(world((0, 0.5), (0, 10.0), (0.3, 0.0)), world((0, 0), (0, 0), (0, 0)), 0.1)
+    assert error_of(judged.parts["error_m"]) == pytest.approx(judged.figures["error_m"])
+    assert len(judged.parts["error_m"]) == 4
+    assert error_of({}) is None
+
+
+def test_jitter_is_the_deviation_of_white_noise_and_not_acceleration() -> None:
+    t = np.arange(400) * 0.1
+    smooth = np.column_stack([3 * t + 1.5 * t**2, 0 * t])
+    noise = np.random.default_rng(1).normal(0, 0.2, (400, 2))
+
+    def of(*agents: Agent) -> float | None:
+        return jitter(replace(world(), agents=agents), 0.1)
+
+    assert of(moving("a", smooth)) == pytest.approx(0.0, abs=1e-9)
+    assert of(moving("a", smooth + noise)) == pytest.approx(0.2, rel=0.1)
+    assert of() is None
+    assert of(moving("a", smooth[:4])) is None
+    standing = replace(moving("b", smooth + 10 * noise), static=True)
+    assert of(moving("a", smooth), standing) == pytest.approx(0.0, abs=1e-9)
+    # Fewer waypoints of the same motion: nothing was lost, so nothing jitters.
+    whole = moving("a", smooth).waypoints
+    kept = np.unique(np.r_[0, np.random.default_rng(2).integers(0, 400, 90), 399])
+    columns = {name: getattr(whole, name)[kept] for name in Waypoints.FLOATS} | {"observed": whole.observed[kept]}
+    thinned = replace(moving("a", smooth), waypoints=Waypoints(**{**columns, "speed_mps": 3 + 3 * t[kept]}))
+    assert of(thinned) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_measured_centers_of_a_log_are_near_the_truth_and_outliers_are_cut(
+    tiny: tuple[Log, Scenario], first_pass: FirstPass
+) -> None:
+    (log, truth), (bed, seen, stages_s) = tiny, first_pass
+    known = true_places(log, bed.schedule, seen, truth)
+    good = judge_measured(seen, known).figures
+    assert good["objects"] >= 20
+    assert good["error_m"] < 0.4
+    assert {"sync", "detect", "cloud", "measure", "fuse"} <= set(stages_s)
+    assert "decode" not in stages_s  # boxes come from the log
+    far = replace(seen, measurements=[replace(m, center_m=m.center_m + 50.0) for m in seen.measurements])
+    assert judge_measured(far, known).figures["error_m"] == pytest.approx(CUT_M)
+    lost = replace(seen, measurements=[replace(m, center_m=m.center_m * np.nan) for m in seen.measurements])
+    figures = judge_measured(lost, known).figures
+    assert figures["error_m"] == pytest.approx(CUT_M)
+    assert figures["placed_share"] == 0.0
+
+
+def test_places_are_known_at_the_times_of_the_measurements_and_of_the_images(
+    tiny: tuple[Log, Scenario], first_pass: FirstPass
+) -> None:
+    (log, truth), (bed, seen, _) = tiny, first_pass
+    later = replace(seen, measurements=[replace(m, t_ns=m.t_ns + 100_000_000) for m in seen.measurements])
+    for when, expected_m in (("measured", 0.4), ("imaged", 0.0)):
+        before, after = (true_places(log, bed.schedule, s, truth, when=when) for s in (seen, later))  # type: ignore[arg-type]
+        moved = np.concatenate([np.hypot(*(a.xy - b.xy).T) for a, b in zip(after, before, strict=True)])
+        assert np.nanmax(moved) == pytest.approx(expected_m, abs=0.01)  # the car drives at 4 m/s
+        assert np.nanmin(moved) == pytest.approx(0.0, abs=1e-9)  # the other one is parked
+
+
+def test_an_object_is_recognized_once_and_only_in_its_group(tiny: tuple[Log, Scenario], first_pass: FirstPass) -> None:
+    (log, truth), (bed, seen, _) = tiny, first_pass
+    m = seen.measurements[5]
+    shifted = replace(m, box_px=m.box_px + np.array([3.0, 0.0, 3.0, 0.0]))
+    both = replace(seen, measurements=[*seen.measurements[:5], Measurements.join([m, shifted]), *seen.measurements[6:]])
+    known = true_places(log, bed.schedule, both, truth)[5]
+    alone = true_places(log, bed.schedule, seen, truth)[5]
+    np.testing.assert_array_equal(known.who, np.r_[alone.who, np.full(len(m), -1)])
+    assert (alone.who >= 0).sum() >= 2
+    people = replace(m, category=np.full(len(m), "pedestrian", dtype="<U16"))
+    other = replace(seen, measurements=[*seen.measurements[:5], people, *seen.measurements[6:]])
+    who = true_places(log, bed.schedule, other, truth)[5].who
+    assert (who[m.category == "car"] == -1).all()
+
+
+def test_only_whole_boxes_with_enough_points_are_set_aside(tiny: tuple[Log, Scenario], first_pass: FirstPass) -> None:
+    (log, truth), (bed, seen, _) = tiny, first_pass
+    known = true_places(log, bed.schedule, seen, truth, when="imaged")
+    spoils: list[dict[str, Any]] = [{"truncated": True}, {"points": 5}, {"source": "topdown"}]
+    for spoil in spoils:
+        spoiled = [replace(m, **{k: np.full(len(m), v) for k, v in spoil.items()}) for m in seen.measurements]
+        held = hold_out(log, bed.schedule, replace(seen, measurements=spoiled), known, np.random.default_rng(0))
+        assert len(held) == 0, spoil
+
+
+def test_names_in_the_picture_say_their_stage_only_where_they_must() -> None:
+    named = ["detect: no tiles", "homography: min-frame", "smooth: off", "smooth: spline", "present settings", "paper"]
+    shown = ["no tiles", "min-frame", "smooth: off", "smooth: spline", "present settings", "paper"]
+    assert [short_name(name) for name in named] == shown
+
+
+def test_obstacles_set_aside_are_not_fitted_to(tiny: tuple[Log, Scenario], first_pass: FirstPass) -> None:
+    (log, truth), (bed, seen, _) = tiny, first_pass
+    known = true_places(log, bed.schedule, seen, truth, when="imaged")
+    held = hold_out(log, bed.schedule, seen, known, np.random.default_rng(0))
+    before = sum(len(f.uv) for parts in seen.feet.values() for f in parts)
+    after = sum(len(f.uv) for parts in held.seen.feet.values() for f in parts)
+    aside = sum(len(f.uv) for parts in held.feet.values() for f in parts)
+    assert aside == len(held) > 0
+    assert after == before - aside
+    assert all((m.source == "").all() and np.isnan(m.center_m).all() for rows in held.asked.values() for m in rows)
+
+
+def test_a_right_homography_has_no_error_and_a_shifted_one_its_shift(
+    tiny: tuple[Log, Scenario], first_pass: FirstPass
+) -> None:
+    (log, truth), (bed, seen, _) = tiny, first_pass
+    known = true_places(log, bed.schedule, seen, truth, when="imaged")
+    held = hold_out(log, bed.schedule, seen, known, np.random.default_rng(0))
+    base = calibrated_ground(log, log.cameras["front"])
+    assert base is not None
+    uv = [apply_homography(np.linalg.inv(base.ground_H_image), f.xy_ego)[0] for f in held.feet["front"]]
+    exact = replace(held, feet={"front": [replace(f, uv=p) for f, p in zip(held.feet["front"], uv, strict=True)]})
+
+    def judged(shift_m: float) -> dict[str, Any]:
+        shift = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, shift_m], [0.0, 0.0, 1.0]])
+        fit = replace(base, ground_H_image=shift @ base.ground_H_image)
+        return judge_placed(log, bed.schedule, exact, {"front": CameraGround(log.cameras["front"], fit, "")}).figures
+
+    assert judged(0.0)["error_m"] == pytest.approx(0.0, abs=1e-6)
+    assert judged(0.0)["placed_share"] == 1.0
+    assert judged(0.7)["error_m"] == judged(0.7)["near_error_m"] == pytest.approx(0.7)
+    assert judged(30.0)["error_m"] == pytest.approx(CUT_M)
+    assert judged(0.0)["center_error_m"] < judged(1.5)["center_error_m"] <= CUT_M
+
+
+def test_a_tick_has_its_own_homography_or_none() -> None:
+    each = np.stack([np.eye(3), np.full((3, 3), np.nan)])
+    fit = HomographyFit(True, "", 5 * np.eye(3), np.ones(4, bool), 0.1, 1.0, np.array([3, 4]), each)
+    ground = CameraGround(Camera("c", 10, 10, np.eye(3), "ego", np.eye(4)), fit, "obstacles")
+    assert at_tick(ground, 3).fit.ground_H_image[0, 0] == 1.0
+    assert not at_tick(ground, 4).fit.ok
+    assert not at_tick(ground, 9).fit.ok
+    assert at_tick(replace(ground, fit=replace(fit, per_tick=None)), 9).fit.ground_H_image[0, 0] == 5.0
+
+
+# Settings and shared work
+
+
+def test_the_settings_are_those_that_exist(tiny: tuple[Log, Scenario]) -> None:
+    allowed = next(f.metadata["allowed"] for f in fields(TopdownConfig) if f.name == "method")
+    grid = make_grid(tiny[0], Config.load(detect={"name": "labels"}, measure={"mode": "paper"}))
+    assert {s.name for s in grid.homography} == set(allowed) - {"off"}
+    assert [s.name for s in grid.measure] == ["paper", "robust"]
+    assert [s.config.measure.mode for s in grid.measure] == ["paper", "robust"]
+    assert [s.present for s in grid.measure] == [True, False]
+    assert "off" in [s.name for s in grid.smooth]
+    assert not all(s.config.smooth.enabled for s in grid.smooth)
+    assert [s.name for s in grid.detect] == ["labels"]
+
+
+def test_a_method_that_is_off_is_compared_all_the_same(tiny: tuple[Log, Scenario]) -> None:
+    grid = make_grid(tiny[0], Config.load(detect={"name": "labels"}, topdown={"method": "off"}))
+    assert grid.homography[0].config.topdown.method == TopdownConfig().method
+    assert "off" not in [s.name for s in grid.homography]
+
+
+def test_new_choices_appear_by_themselves() -> None:
+    @dataclass(frozen=True)
+    class Section:
+        kind: str = field(default="b", metadata={"allowed": ("a", "b", "c", "off")})
+
+    assert choices(Section(), "kind") == ["b", "a", "c"]
+
+
+def test_tiles_and_input_sizes_are_those_that_change_something(
+    tiny: tuple[Log, Scenario], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def open_size(log: Log, config: Config) -> OnnxDetector:
+        side = None if config.detect.name == "any.onnx" else 300
+        model = OnnxModel(Path("m.onnx"), InputSpec("images", side, side, False, np.dtype(np.float32)), {}, None)
+        return OnnxDetector("m", model, LAYOUTS["yolox"], COCO_80, 0.4, 0.5, "auto", 0.4)
+
+    monkeypatch.setattr("log2sim.bench.settings.detector_of", open_size)
+    grid = make_grid(tiny[0], Config.load(detect={"name": "any.onnx"}), ["models/fixed.onnx"])
+    found = {s.name: (s.config.detect.tiles, s.config.detect.input_px) for s in grid.detect}
+    # The picture is 480 px wide, so "auto" is no tiles for both; 416 px is what the family takes anyway.
+    assert found == {
+        "any auto tiles": (0, 0),
+        "any 2 tiles": (2, 0),
+        "any 3 tiles": (3, 0),
+        "any 5 tiles": (5, 0),
+        "any input 320 px": (0, 320),
+        "any input 640 px": (0, 640),
+        "any input 960 px": (0, 960),
+        "fixed auto tiles": (0, 0),
+        "fixed 2 tiles": (2, 0),
+        "fixed 3 tiles": (3, 0),
+        "fixed 5 tiles": (5, 0),
+    }
+    assert [s.present for s in grid.detect] == [True] + [False] * 10
+    assert grid.detect[-1].config.detect.name == "models/fixed.onnx"
+    alike = make_grid(tiny[0], Config.load(detect={"name": "a/m.onnx"}), ["b/m.onnx"]).detect
+    assert len({s.name for s in alike}) == len(alike) == 8
+
+
+@dataclass
+class Counting:
+    """A detector that counts what it is asked for."""
+
+    name: str = "counting"
+    default_min_score: float = 0.3
+    asked: list[tuple[str, int]] = field(default_factory=list)
+
+    def detect(self, frame: Frame) -> Detections:
+        self.asked.append((frame.camera.name, frame.t_ns))
+        assert frame.image().shape[2] == 3
+        return Detections(np.array([[1.0, 2.0, 3.0, 4.0]]), np.array([0.5]), np.array(["car"]))
+
+
+def test_every_frame_is_decoded_and_detected_once(tiny: tuple[Log, Scenario]) -> None:
+    log, decoded = tiny[0], []
+    stream = log.streams["front"]
+    log = replace(
+        log, streams={**log.streams, "front": replace(stream, read=lambda k: (decoded.append(k), stream.read(k))[1])}
+    )
+    schedule = schedule_of(log, LABELS, make_plan(log, LABELS))
+    detectors = {"a": Counting(), "b": Counting()}
+    told: list[tuple[int, int]] = []
+    found, decoding_s = detect_once(
+        log, schedule, detectors, decode=True, progress=lambda done, total: told.append((done, total))
+    )
+    frames = [("front", int(t)) for t in stream.t_ns]
+    assert detectors["a"].asked == detectors["b"].asked == frames
+    assert decoded == list(range(len(frames)))
+    assert told == [(k + 1, len(frames)) for k in range(len(frames))]
+    assert decoding_s > 0
+    assert found["a"].seconds > 0
+
+    def fail() -> Any:
+        raise AssertionError("an image was asked for again")
+
+    for name, t_ns in frames * 2:
+        assert len(found["a"].detect(Frame(log.cameras[name], t_ns, fail))) == 1
+    assert len(detectors["a"].asked) == len(frames)
+    assert len(found["a"].detect(Frame(log.cameras["front"], 1, fail))) == 0
+
+
+def test_unreadable_frames_have_no_detections_and_none_at_all_is_an_error(tiny: tuple[Log, Scenario]) -> None:
+    from log2sim.errors import RecordError
+
+    log = tiny[0]
+    stream = log.streams["front"]
+
+    def broken(limit: int) -> Log:
+        def read(k: int) -> Any:
+            if k < limit:
+                raise RecordError(f"front: frame {k} is broken")
+            return stream.read(k)
+
+        return replace(log, streams={**log.streams, "front": replace(stream, read=read)})
+
+    schedule = schedule_of(log, LABELS, make_plan(log, LABELS))
+    found, _ = detect_once(broken(3), schedule, {"a": Counting()}, decode=True, progress=lambda done, total: None)
+    assert len(found["a"].found) == len(schedule) - 3
+    with pytest.raises(LogError, match="none of the 10 records asked for can be read"):
+        detect_once(broken(99), schedule, {"a": Counting()}, decode=True, progress=lambda done, total: None)
+
+
+# The whole
+
+
+def test_every_stage_has_a_panel_and_the_figures_fit_each_other(result: Benchmark) -> None:
+    panels = {p.stage: p for p in result.panels}
+    assert list(panels) == ["detect", "measure", "homography", "smooth", "whole run"]
+    for panel in panels.values():
+        assert sum(p.present for p in panel.points) == 1
+        assert len({p.setting for p in panel.points}) == len(panel.points)
+        assert all(p.ms_per_tick > 0 for p in panel.points)
+        assert any(panel.on_front)
+    grid = result.bed.grid
+    settings = sum(map(len, (grid.detect, grid.measure, grid.homography, grid.smooth)))
+    assert len(panels["whole run"].points) == settings - 3
+    present = next(p for p in panels["whole run"].points if p.present)
+    assert present.ms_per_tick == pytest.approx(sum(present.figures["stages_ms_per_tick"].values()))
+    assert present.figures["recall"] == 1.0
+    measured = {p.setting: p.error for p in panels["measure"].points}
+    assert measured["robust"] < 0.5 * measured["paper"]
+    assert panels["measure"].verdict.supported == "robust"
+
+
+def test_the_document_keeps_its_schema_and_says_the_same(result: Benchmark) -> None:
+    out = json.loads(json.dumps(document(result), allow_nan=False))
+    check(out, "bench-1", LogError)
+    assert out["truth"] == "tiny"
+    assert out["ticks"] == 10
+    for panel, entry in zip(result.panels, out["panels"], strict=True):
+        front = {p.setting for p, f in zip(panel.points, panel.on_front, strict=True) if f}
+        assert {p["setting"] for p in entry["points"] if p["on_front"]} == front
+        assert entry["supports"]["setting"] == panel.verdict.supported
+        assert all(p["error"] == p["figures"][entry["error"]["figure"]] for p in entry["points"])
+
+
+def test_the_table_has_every_setting_and_marks_the_present(result: Benchmark) -> None:
+    lines = format_table(result).split("\n")
+    for panel in result.panels:
+        rows = lines[lines.index(f"{panel.stage}: {panel.label}") + 2 :][: len(panel.points)]
+        for p in panel.points:
+            [row] = [r for r in rows if f" {p.setting}  " in r]
+            assert ("*" in row) == p.present
+        order = [next(p.ms_per_tick for p in panel.points if f" {p.setting}  " in r) for r in rows]
+        assert order == sorted(order)
+    assert "What the figures support:" in lines
+
+
+@pytest.fixture
+def no_labels(log_folder: Path) -> Path:
+    (log_folder / "truth.json").unlink()
+    manifest = json.loads((log_folder / "log.json").read_text())
+    manifest["labels"] = {"boxes_2d": manifest["labels"]["boxes_2d"]}
+    (log_folder / "log.json").write_text(json.dumps(manifest))
+    return log_folder
+
+
+def test_without_truth_only_steadiness_is_told_and_said_so(no_labels: Path, tmp_path: Path) -> None:
+    ran = run("bench", no_labels, "--out", tmp_path / "b", "--detector", "labels", "--stop", "0.5")
+    assert ran.code == 0, ran.err
+    assert "note: no truth" in ran.out
+    out = json.loads((tmp_path / "b/bench.json").read_text())
+    panels = {p["stage"]: p for p in out["panels"]}
+    assert out["truth"] is None
+    assert panels["whole run"]["error"]["figure"] == "jitter_m"
+    assert {s: p["supports"]["setting"] for s, p in panels.items() if s != "homography"} == dict.fromkeys(
+        ("detect", "measure", "smooth", "whole run")
+    )
+    assert panels["homography"]["supports"]["setting"] is not None  # LiDAR tells where the obstacles are
+    assert "recall" not in panels["whole run"]["points"][0]["figures"]
+
+
+def test_the_command_writes_two_files_and_replaces_only_when_asked(tiny_folder: Path, tmp_path: Path) -> None:
+    import cv2
+
+    options = (tiny_folder, "--out", tmp_path / "b", "--detector", "labels", "--stop", "0.5")
+    ran = run("bench", *options)
+    assert ran.code == 0, ran.err
+    assert names(tmp_path / "b") == ["bench.json", "bench.png"]
+    assert "detect: 6 of 6" in ran.err
+    assert run("validate", tmp_path / "b/bench.json").code == 0
+    picture = cv2.imread(str(tmp_path / "b/bench.png"))
+    assert picture.shape[1] > 1500
+    assert 0.01 < (picture.min(axis=2) < 200).mean() < 0.3
+    again = run("bench", *options)
+    assert again.code == 2
+    assert "--overwrite" in again.line
+    quiet = run("bench", *options, "--overwrite", "--quiet", "--stop", "0.2")
+    assert (quiet.code, quiet.out, quiet.err) == (0, "", "")
+    assert json.loads((tmp_path / "b/bench.json").read_text())["ticks"] == 3
+
+
+def test_one_tick_is_enough_to_run(tiny_folder: Path, tmp_path: Path) -> None:
+    ran = run("bench", tiny_folder, "--out", tmp_path / "b", "--detector", "labels", "--stop", "0")
+    assert ran.code == 0, ran.err
+    out = json.loads((tmp_path / "b/bench.json").read_text())
+    assert out["ticks"] == 1
+    whole = out["panels"][-1]
+    assert whole["stage"] == "whole run"
+    assert whole["supports"]["setting"] is None
+
+
+def test_what_cannot_be_is_one_line_and_leaves_nothing(tiny_folder: Path, tmp_path: Path) -> None:
+    wrong = {
+        3: (tmp_path / "none", "--out", tmp_path / "b"),
+        2: (tiny_folder, "--out", tmp_path / "b", "--detector", "labels", "--detector", "lables"),
+    }
+    for code, arguments in wrong.items():
+        ran = run("bench", *arguments)
+        assert ran.code == code
+        assert ran.line
+    (tmp_path / "file").write_text("")
+    assert "is a file and not a folder" in run("bench", tiny_folder, "--out", tmp_path / "file").line
+    assert names(tmp_path) == ["file"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [(("--categories", "cra"), "did you mean 'car'"), (("--range", "-5"), "it must be greater than 0")],
+)
+def test_a_wrong_scope_is_told_before_any_work(
+    options: tuple[str, str], message: str, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("log2sim.bench.runs.detect_once", None)
+    ran = run("bench", tiny_folder, "--out", tmp_path / "b", "--detector", "labels", *options)
+    assert ran.code == 2
+    assert message in ran.line
+
+
+def test_the_scope_narrows_what_is_compared(tiny: tuple[Log, Scenario]) -> None:
+    truth = tiny[1]
+    assert judge_scenario(truth, truth, 0.1, Scope(categories=("car",))).figures["error_m"] == 0.0
+    assert judge_scenario(truth, truth, 0.1, Scope(max_range_m=1.0)).figures["error_m"] is None
+    with pytest.raises(ConfigError, match="give --truth"):
+        make_bed(tiny[0], make_grid(tiny[0], LABELS), None, silent, Scope(max_range_m=1.0))
+
+
+def test_ctrl_c_leaves_nothing(tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*arguments: Any, **options: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("log2sim.bench.runs.conclude", interrupted)
+    ran = run("bench", tiny_folder, "--out", tmp_path / "b", "--detector", "labels", "--quiet")
+    assert ran.code == 130
+    assert "interrupted" in ran.err
+    assert names(tmp_path) == []
