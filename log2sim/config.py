@@ -60,9 +60,13 @@ class MeasureConfig:
 
 @dataclass(frozen=True)
 class TopdownConfig:
-    """`method`: how the image-to-ground homography is estimated; "off" leaves it out."""
+    """`method`: how the image-to-ground homography is estimated; "off" leaves it out.
 
-    method: str = _choice("time-aware", "min-frame", "per-frame", "off")
+    `hypotheses`: sets of four that RANSAC draws, for the stream or for each frame, 0 for as many as the data need.
+    """
+
+    method: str = _choice("time-aware", "calibrated", "min-frame", "per-frame", "straw-man", "off")
+    hypotheses: int = field(default=0, metadata={"low": 0, "high": 100_000})
 
 
 @dataclass(frozen=True)

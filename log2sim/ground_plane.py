@@ -42,6 +42,8 @@ def fit_cameras(
     method: str,
     rng: np.random.Generator,
     costs: Costs | None = None,
+    *,
+    hypotheses: int | None = None,
 ) -> tuple[Plan, dict[str, CameraGround]]:
     """Fit the cameras that need it; a refused fit falls back on the calibration, with its reason kept.
 
@@ -62,7 +64,7 @@ def fit_cameras(
     grounds, costs = {}, costs or Costs()
     for camera in (c for c in plan.cameras if c in wanted):
         with costs.piece("homography"):
-            grounds[camera] = _fit_one(log, schedule, seen, camera, method, rng)
+            grounds[camera] = _fit_one(log, schedule, seen, camera, method, rng, hypotheses)
     return plan, grounds
 
 
@@ -77,11 +79,17 @@ def _has_foot(camera: Camera, box_px: Array) -> bool:
 
 
 def _fit_one(
-    log: Log, schedule: Schedule, seen: Observed, name: str, method: str, rng: np.random.Generator
+    log: Log,
+    schedule: Schedule,
+    seen: Observed,
+    name: str,
+    method: str,
+    rng: np.random.Generator,
+    hypotheses: int | None,
 ) -> CameraGround:
     camera = log.cameras[name]
     feet, ground = Correspondences.join(seen.feet.get(name, [])), Correspondences.join(seen.ground.get(name, []))
-    fit, source = fit_camera(feet, ground, method=method, rng=rng)
+    fit, source = fit_camera(feet, ground, method=method, rng=rng, K=camera.K, hypotheses=hypotheses)
     if fit.ok:
         return CameraGround(camera, fit, source)
     calibrated = calibrated_ground(log, camera)

@@ -110,7 +110,14 @@ def conclude(
     timeline, costs = Timeline(schedule.t_ns, int(schedule.t_ns[0])), Costs()
     with clock.stage("topdown"):
         plan, homographies = fit_cameras(
-            log, schedule, seen, plan, config.topdown.method, np.random.default_rng(config.seed), costs
+            log,
+            schedule,
+            seen,
+            plan,
+            config.topdown.method,
+            np.random.default_rng(config.seed),
+            costs,
+            hypotheses=config.topdown.hypotheses or None,
         )
         measurements = locate_the_rest(log, schedule, seen, homographies, across=plan.keeps("fuse"))
     with clock.stage("track"):

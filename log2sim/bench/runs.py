@@ -84,6 +84,7 @@ def make_bed(log: Log, grid: Grid, truth: Scenario | None, tell: Progress, scope
     check_scope(truth, scope)
     config, clock = grid.present.config, StageClock()
     plan = make_plan(log, config)
+    log = plan.narrowed(log)
     with clock.stage("sync"):
         schedule = schedule_of(log, config, plan)
     detectors = {s.name: detector_of(log, s.config) for s in grid.detect}
@@ -201,16 +202,17 @@ def homography_points(bed: Bed, seen: Observed, tell: Progress) -> list[Point]:
     held = hold_out(bed.log, bed.schedule, seen, known, np.random.default_rng(seed))
     if not len(held):
         return []
-    spent: dict[str, list[float]] = {s.name: [] for s in bed.grid.homography}
+    settings = (*bed.grid.homography, *bed.grid.hypotheses)
+    spent: dict[str, list[float]] = {s.name: [] for s in settings}
     fits: dict[str, dict[str, CameraGround]] = {}
     for repeat in range(REPEATS):
-        for k, setting in enumerate(bed.grid.homography):
+        for k, setting in enumerate(settings):
             begin = time.perf_counter()
             fits[setting.name] = fit(bed, setting, held)
             spent[setting.name].append(time.perf_counter() - begin)
             tell("homographies", repeat * len(spent) + k + 1, REPEATS * len(spent))
     out = []
-    for setting in bed.grid.homography:
+    for setting in settings:
         judged = judge_placed(bed.log, bed.schedule, held, fits[setting.name])
         figures = judged.figures | fit_figures(fits[setting.name])
         ms = bed.ms_per_tick(min(spent[setting.name]))
@@ -222,9 +224,16 @@ def fit(bed: Bed, setting: Setting, held: Held) -> dict[str, CameraGround]:
     """The homographies of all cameras by one method."""
     plan = bed.plan.decided("homography", True, "a top-down picture is asked for")
     config = setting.config
-    return fit_cameras(
-        bed.log, bed.schedule, held.seen, plan, config.topdown.method, np.random.default_rng(config.seed)
-    )[1]
+    _, grounds = fit_cameras(
+        bed.log,
+        bed.schedule,
+        held.seen,
+        plan,
+        config.topdown.method,
+        np.random.default_rng(config.seed),
+        hypotheses=config.topdown.hypotheses or None,
+    )
+    return grounds
 
 
 def fit_figures(grounds: Mapping[str, CameraGround]) -> Figures:

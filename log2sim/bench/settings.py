@@ -20,6 +20,9 @@ TILES = (0, 1, 2, 3, 5)
 SIDES_PX = (320, 416, 640, 960)
 """Sides of the input to try with models that take any."""
 
+HYPOTHESES = (8, 30, 100, 300, 1000, 3000)
+"""Numbers of hypotheses to try beside the present one."""
+
 NO_METHOD = "off"
 
 
@@ -45,6 +48,7 @@ class Grid:
     detect: tuple[Setting, ...]
     measure: tuple[Setting, ...]
     homography: tuple[Setting, ...]
+    hypotheses: tuple[Setting, ...]
     smooth: tuple[Setting, ...]
 
     @property
@@ -74,8 +78,18 @@ def make_grid(log: Log, config: Config, detectors: Sequence[str] = ()) -> Grid:
         detect=tuple(_detector_settings(log, config, detectors)),
         measure=_choices("measure", config, "measure", "mode"),
         homography=_choices("homography", config, "topdown", "method"),
+        hypotheses=tuple(_hypotheses(config)),
         smooth=tuple(_smooth_settings(config)),
     )
+
+
+def _hypotheses(config: Config) -> list[Setting]:
+    """Other numbers of hypotheses for the present method; only the homographies of these are judged, no whole runs."""
+    return [
+        Setting("homography", f"{n} hypotheses", changed(config, "topdown", hypotheses=n), False)
+        for n in HYPOTHESES
+        if n != config.topdown.hypotheses
+    ]
 
 
 def changed(config: Config, section: str, **changes: Any) -> Config:

@@ -82,7 +82,13 @@ def foot_points(camera: Camera, measured: Measurements, ego_T_map: Array, tick: 
 
 
 def fit_camera(
-    feet: Correspondences, ground: Correspondences, *, method: str, rng: np.random.Generator, K: Array | None = None
+    feet: Correspondences,
+    ground: Correspondences,
+    *,
+    method: str,
+    rng: np.random.Generator,
+    K: Array | None = None,
+    hypotheses: int | None = None,
 ) -> tuple[HomographyFit, str]:
     """The homography of one camera, and what it was learned from.
 
@@ -92,7 +98,14 @@ def fit_camera(
     if method == "straw-man":
         by_size = np.full((len(feet.uv), 2), np.nan) if feet.xy_by_size is None else feet.xy_by_size
         fit = estimate_homography(
-            feet.uv, feet.xy_ego, feet.tick, method=method, rng=rng, sigma_px=FOOT_SIGMA_PX, xy_by_size_m=by_size
+            feet.uv,
+            feet.xy_ego,
+            feet.tick,
+            method=method,
+            rng=rng,
+            sigma_px=FOOT_SIGMA_PX,
+            xy_by_size_m=by_size,
+            hypotheses=hypotheses,
         )
         return fit, "obstacles of average size" if fit.ok else "none"
     if len(feet.uv) >= ENOUGH_FEET:
@@ -103,6 +116,7 @@ def fit_camera(
             method=method,
             rng=rng,
             K=K,
+            hypotheses=hypotheses,
             sigma_px=FOOT_SIGMA_PX,
             sigma_m=2 * GROUND_SIGMA_M,
         )
@@ -112,7 +126,15 @@ def fit_camera(
     if len(both.uv) < 4:
         return refused(f"{len(both.uv)} correspondences in the whole log, at least 4 are needed", len(both.uv)), "none"
     fit = estimate_homography(
-        both.uv, both.xy_ego, both.tick, method=method, rng=rng, K=K, sigma_px=GROUND_SIGMA_PX, sigma_m=GROUND_SIGMA_M
+        both.uv,
+        both.xy_ego,
+        both.tick,
+        method=method,
+        rng=rng,
+        K=K,
+        hypotheses=hypotheses,
+        sigma_px=GROUND_SIGMA_PX,
+        sigma_m=GROUND_SIGMA_M,
     )
     return fit, "obstacles and ground points"
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from log2sim.geometry import Array
 from log2sim.topdown.nod import NOD_PX, fit_moving
 from log2sim.topdown.refine import linearize
-from log2sim.topdown.search import EFFORT_OF_A_FRAME, Found, judge, search
+from log2sim.topdown.search import EFFORT_OF_A_FRAME, EFFORTS, Efforts, Found, judge, search
 from log2sim.topdown.stream import BOUND, Stream, losses
 
 METHODS = ("time-aware", "calibrated", "min-frame", "per-frame", "straw-man")
@@ -56,6 +56,7 @@ def estimate_homography(
     K: ArrayLike | None = None,
     per_tick: bool = False,
     xy_by_size_m: ArrayLike | None = None,
+    hypotheses: int | None = None,
     sigma_px: float = 1.5,
     sigma_m: float = 0.1,
 ) -> HomographyFit:
@@ -74,6 +75,8 @@ def estimate_homography(
         homography. "per-frame" and "straw-man" have one homography a tick in any case, "min-frame" never.
     xy_by_size_m : (N, 2) ground positions that average sizes tell (`ground_from_sizes`), which "straw-man" needs; its
         `error_m` is the distance to `xy_m` all the same
+    hypotheses : int, optional
+        Sets of four to draw, for the stream or for each frame; without it as many as the data need.
     sigma_px, sigma_m : float
         Standard deviations of the pixels and of the ground positions, as far as known: they are estimated anew from the
         inliers, within a factor of 4.
@@ -111,14 +114,19 @@ def estimate_homography(
         image_K = stream.image_N_px @ intrinsics if method == "calibrated" else None
         if image_K is not None and not (np.isfinite(intrinsics).all() and np.linalg.cond(intrinsics) < MOST_CONDITION):
             return refused("the intrinsics K are singular", len(uv), ticks)
-        fit = _of_stream(stream, rng, image_K, per_tick=per_tick)
+        fit = _of_stream(stream, rng, image_K, _efforts(hypotheses, EFFORTS), per_tick=per_tick)
     else:
-        fit = _of_frames(stream, rng, keep_all=method != "min-frame")
+        fit = _of_frames(stream, rng, _efforts(hypotheses, EFFORT_OF_A_FRAME), keep_all=method != "min-frame")
     fit = _restored(fit, ticks, present, rows, len(uv), of_stream)
     if method == "straw-man" and fit.ok:
         away = np.hypot(*(apply_homography(fit.ground_H_image, uv)[0] - measured)[fit.inliers].T)
         fit = replace(fit, error_m=float(np.nanmedian(away)) if np.isfinite(away).any() else float("nan"))
     return fit
+
+
+def _efforts(hypotheses: int | None, usual: Efforts) -> Efforts:
+    """So many sets of four, of which an eighth is scored as usual, or the usual ones."""
+    return usual if hypotheses is None else ((hypotheses, max(hypotheses // 8, 8), 0.0),)
 
 
 def _restored(
@@ -186,10 +194,12 @@ def refused(reason: str, count: int, ticks: NDArray[Any] | None = None) -> Homog
     return HomographyFit(False, reason, none, np.zeros(count, dtype=bool), float("nan"), float("inf"), ticks)
 
 
-def _of_stream(stream: Stream, rng: np.random.Generator, image_K: Array | None, *, per_tick: bool) -> HomographyFit:
+def _of_stream(
+    stream: Stream, rng: np.random.Generator, image_K: Array | None, efforts: Efforts, *, per_tick: bool
+) -> HomographyFit:
     """One homography over all ticks, and where asked what each tick adds to it."""
     nod = NOD_PX * stream.image_N_px[0, 0] if per_tick else 0.0
-    found = search(stream, rng, nod=nod, image_K=image_K)
+    found = search(stream, rng, nod=nod, image_K=image_K, efforts=efforts)
     if found.h is None:
         return refused("every sample of four is collinear or coincident", stream.image.shape[1])
     if not per_tick:
@@ -202,14 +212,14 @@ def _of_stream(stream: Stream, rng: np.random.Generator, image_K: Array | None, 
     return replace(fit, per_tick=stream.to_ground_H_image(moving.warps @ moving.image_H_ground))
 
 
-def _of_frames(stream: Stream, rng: np.random.Generator, *, keep_all: bool) -> HomographyFit:
+def _of_frames(stream: Stream, rng: np.random.Generator, efforts: Efforts, *, keep_all: bool) -> HomographyFit:
     """One RANSAC for each frame; then the one with the least error over all frames."""
     each = np.full((len(stream.start), 3, 3), np.nan)
     found: list[Array] = []
     for k, (start, count) in enumerate(zip(stream.start, stream.count)):
         if count < 4:
             continue
-        own = search(stream.take(slice(start, start + count)), rng, efforts=EFFORT_OF_A_FRAME)
+        own = search(stream.take(slice(start, start + count)), rng, efforts=efforts)
         fit = _fit(own, None)
         if fit.ok and own.h is not None:
             each[k] = fit.ground_H_image

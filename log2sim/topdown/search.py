@@ -13,6 +13,7 @@ from log2sim.topdown.pose import nearest_poses, tangent
 from log2sim.topdown.refine import Linearized, free_directions, linearize, noise, refine, refine_many, step
 from log2sim.topdown.stream import BOUND, Stream, losses, normalized, squared_errors
 
+Efforts = tuple[tuple[int, int, float], ...]
 # Sets of four that are drawn, how many of them are scored, and the share of inliers below which the next line is tried.
 EFFORTS = ((500, 64, 0.35), (3000, 256, 0.0))
 EFFORT_OF_A_FRAME = ((120, 48, 0.5), (500, 96, 0.0))
@@ -53,7 +54,7 @@ def search(
     *,
     nod: float = 0.0,
     image_K: Array | None = None,
-    efforts: tuple[tuple[int, int, float], ...] = EFFORTS,
+    efforts: Efforts = EFFORTS,
 ) -> Found:
     """The homography that most correspondences agree with, refined over all of them.
 
