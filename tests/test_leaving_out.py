@@ -348,7 +348,7 @@ def test_a_box_without_a_foot_in_the_image_needs_no_homography(both: Log) -> Non
 def test_correspondences_that_nobody_reads_are_not_gathered(tiny: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[Observed] = []
     monkeypatch.setattr(
-        log2sim.pipeline, "fit_cameras", lambda log, schedule, s, plan, *_: (seen.append(s), (plan, {}))[1]
+        log2sim.pipeline, "fit_cameras", lambda log, schedule, s, plan, *_, **__: (seen.append(s), (plan, {}))[1]
     )
     run(tiny, Config.load(detect={"name": "labels"}, topdown={"method": "off"}))
     run(tiny)
