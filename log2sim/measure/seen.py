@@ -75,8 +75,9 @@ def see(view: View, origin: Array, columns: NDArray[np.float32]) -> Seen:
     z = turned[2]
     np.greater(z, np.float32(NEAREST_DEPTH_M), out=mark)
     for axis in (0, 1):
-        np.multiply(z, np.float32(low[axis]), out=bound)
-        mark &= np.greater_equal(turned[axis], bound, out=other)
+        # A pinhole's image begins at zero, which needs no product.
+        edge = np.multiply(z, np.float32(low[axis]), out=bound) if lens else np.float32(0.0)
+        mark &= np.greater_equal(turned[axis], edge, out=other)
         np.multiply(z, np.float32(high[axis]), out=bound)
         mark &= np.less(turned[axis], bound, out=other)
     index = np.flatnonzero(mark)
@@ -120,8 +121,9 @@ def in_boxes(seen: Seen, box_px: Array, margin: float = 0.0) -> list[NDArray[np.
     # Boxes may reach out of the image; those of NaN have no points.
     first, last = (np.clip(np.nan_to_num(edge), 0, 65535).astype(np.uint16) for edge in (left, right))
     first, last = np.searchsorted(column, first, "left"), np.searchsorted(column, last, "right")
+    edges = np.stack([left, top, right, bottom], axis=1).tolist()
     found = []
-    for a, b, u0, v0, u1, v1 in zip(first, last, left, top, right, bottom, strict=True):
+    for a, b, (u0, v0, u1, v1) in zip(first.tolist(), last.tolist(), edges, strict=True):
         us, vs = u[a:b], v[a:b]
         found.append(np.sort(order[a:b][(us >= u0) & (us <= u1) & (vs >= v0) & (vs <= v1)]))
     return found
