@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -144,12 +143,13 @@ def _doubtful_in_gaps(covariance: Array, at_s: Array, seen_s: Array, density: tu
     little about what it did unseen, so there it may have moved as vehicles do.
     """
     factor = GAP_JERK_DENSITY / max(np.sqrt(density[0] * density[1]), 1e-12)
-    if factor <= 1 or len(seen_s) == 0:
+    gaps = np.flatnonzero(np.diff(seen_s) > GAP_S)
+    if factor <= 1 or len(gaps) == 0:
         return covariance
     out = covariance.copy()
-    for first, last in pairwise(seen_s.tolist()):
+    for first, last in zip(seen_s[gaps].tolist(), seen_s[gaps + 1].tolist(), strict=True):
         rows = np.flatnonzero((at_s > first) & (at_s < last))
-        if last - first <= GAP_S or len(rows) == 0:
+        if len(rows) == 0:
             continue
         before, after = covariance[max(rows[0] - 1, 0)], covariance[min(rows[-1] + 1, len(covariance) - 1)]
         share = ((at_s[rows] - first) / (last - first))[:, None, None]
