@@ -24,6 +24,8 @@ from log2sim.types import GROUP_OF, Log
 # Two agents that share this much of their boxes for most of the time are one.
 SHARED_AREA = 0.25
 SAMPLES = 12
+# Boxes that share less than this of the smaller one only touch.
+TOUCHING = 0.05
 EGO_SIGMA_M = 0.02
 
 
@@ -41,6 +43,32 @@ def without_doubles(built: Sequence[Built], ego: Agent | None = None) -> list[Ag
         count[agent.category] = count.get(agent.category, 0) + 1
         named.append(replace(agent, id=f"{agent.category}-{count[agent.category]}"))
     return named
+
+
+def outside(agents: Sequence[Agent], ego: Agent | None) -> list[Agent]:
+    """Moving agents without the beginnings and ends of their ways that lie in the ego's box, where nobody can have been.
+
+    There an agent was followed by what little of it the sensors showed beside the ego.
+    """
+    return list(agents) if ego is None else [_outside(a, ego) for a in agents]
+
+
+def _outside(agent: Agent, ego: Agent) -> Agent:
+    if agent.static or not _ways_meet(agent, ego):
+        return agent
+    w = agent.waypoints
+    there = ego.at(w.t_s)
+    mine = box_corners_bev(np.stack([w.x_m, w.y_m], axis=1), agent.size_m[0], agent.size_m[1], w.yaw_rad)
+    its = box_corners_bev(np.stack([there.x_m, there.y_m], axis=1), ego.size_m[0], ego.size_m[1], there.yaw_rad)
+    near = there.valid & (
+        np.hypot(w.x_m - there.x_m, w.y_m - there.y_m) < sum(np.hypot(*a.size_m[:2]) for a in (agent, ego)) / 2
+    )
+    apart = np.array([not n or _share_of_smaller(p, q) <= TOUCHING for n, p, q in zip(near, mine, its)])
+    if apart.all() or not apart.any():
+        return agent
+    first, last = int(np.argmax(apart)), len(apart) - int(np.argmax(apart[::-1]))
+    columns = {k: v[first:last] for k, v in vars(w).items() if v is not None}
+    return replace(agent, waypoints=Waypoints(**columns))
 
 
 def thinned(agents: Sequence[Agent]) -> list[Agent]:

@@ -13,7 +13,7 @@ from log2sim.clock import Costs, StageClock
 from log2sim.config import Config
 from log2sim.detect import Detector, create_detector
 from log2sim.errors import NothingToReconstruct
-from log2sim.finish import ego_agent, ego_flow, make_scenario, thinned, without_doubles
+from log2sim.finish import ego_agent, ego_flow, make_scenario, outside, thinned, without_doubles
 from log2sim.ground_plane import fit_cameras, locate_the_rest
 from log2sim.observe import Observed, observe
 from log2sim.plan import Plan, make_plan, plan_ticks
@@ -132,7 +132,7 @@ def conclude(
         flow = ego_flow(log, schedule)
         built = build_agents(tracks, seen.obstacles, timeline, flow, smooth=config.smooth.enabled, costs=costs)
         ego = ego_agent(log, timeline)
-        agents = without_doubles(built, ego)
+        agents = outside(without_doubles(built, ego), ego)
         # Without an ego the agents' waypoints are all that tells the ticks.
         agents = thinned(agents) if ego is not None else agents
     if ego is None and not agents:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from log2sim.assemble import Built
-from log2sim.finish import without_doubles
+from log2sim.finish import outside, without_doubles
 from log2sim.scenario import Agent, Waypoints
 
 
@@ -65,3 +65,30 @@ def test_people_are_doubles_only_where_they_stand_in_each_other(apart_m, kept):
 def test_a_person_on_the_back_seat_is_not_another_agent_beside_the_car():
     person = agent(10.5, category="pedestrian", size=(0.7, 0.6, 1.5))
     assert names((agent(10.0), 9.0), (person, 2.0)) == ["car-1"]
+
+
+def passing(y_m):
+    """A car that comes from behind the standing ego, 10 m in 4 s."""
+    return agent(-10.0, y_m, speed=2.5)
+
+
+def test_a_way_that_ends_in_the_ego_is_cut_where_it_enters():
+    ego = agent(0.0)
+    (cut,) = outside([passing(0.3)], ego)
+    # Both are 4.4 m long: they meet when the centers are that far apart, at 2.24 s; waypoints stand every second.
+    assert cut.waypoints.t_s.tolist() == [0.0, 1.0, 2.0]
+    assert cut.waypoints.x_m.tolist() == [-10.0, -7.5, -5.0]
+    backward = replace(passing(0.3), waypoints=replace(passing(0.3).waypoints, x_m=passing(0.3).waypoints.x_m[::-1]))
+    assert outside([backward], ego)[0].waypoints.t_s.tolist() == [2.0, 3.0, 4.0]
+
+
+@pytest.mark.parametrize("y_m", [1.85, -2.5])
+def test_who_passes_beside_the_ego_keeps_the_whole_way(y_m):
+    (kept,) = outside([passing(y_m)], agent(0.0))
+    assert kept.waypoints.t_s.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+
+
+def test_without_an_ego_and_for_what_stands_nothing_is_cut():
+    assert outside([passing(0.0)], None)[0].waypoints.t_s[-1] == 4.0
+    parked = replace(agent(3.0), static=True)
+    assert outside([parked], agent(0.0))[0] is parked
