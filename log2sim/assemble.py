@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from log2sim import boxfit
 from log2sim.clock import Costs
+from log2sim.credit import SAME_MOMENT_S, is_credible
 from log2sim.extend import Obstacles, Sighting, follow
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
 from log2sim.scenario import Agent, Waypoints
@@ -26,11 +27,6 @@ CENTER_SIGMA_M = {"vehicle": 0.12, "two_wheeler": 0.1, "pedestrian": 0.08, "othe
 REAR_AXLE_SHARE = {"vehicle": 0.28, "two_wheeler": 0.3}
 STANDING_SPEED_MPS = 0.15
 RIDER_MPS, RIDER_S = 3.0, 0.6
-# What is there is detected most of the time: share of ticks with a detection times the score of the best ones.
-LEAST_CREDIT = 0.3
-LEAST_CREDIT_OF_ODD_SHAPES = 0.6
-HIDDEN_S = 1.0
-SAME_MOMENT_S = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,21 +285,5 @@ def _agent(track: Track, shape: Shape, waypoints: Waypoints, quality: dict[str, 
     return Built(
         agent,
         float(m.score.sum()),
-        credit(track, strongest) >= (LEAST_CREDIT if shape.typical else LEAST_CREDIT_OF_ODD_SHAPES),
+        is_credible(track, strongest, typical=shape.typical),
     )
-
-
-def credit(track: Track, strongest: Array) -> float:
-    """How much a track deserves belief, in [0, 1]: detected how often while it could be, times how surely.
-
-    A gap longer than `HIDDEN_S` counts as being hidden, at the price of half of that time.
-    """
-    t = np.sort((track.measurements.t_ns - track.measurements.t_ns[0]) / NS_PER_S)
-    # Frames that share a sweep measure at one moment, and that counts once.
-    t = t[np.r_[True, np.diff(t) > SAME_MOMENT_S]]
-    steps = np.diff(t)
-    if len(steps) == 0:
-        return float(strongest.mean())
-    period = float(np.median(steps[steps <= np.median(steps)]))
-    expected = 1 + float(np.where(steps > HIDDEN_S, HIDDEN_S / 2, steps).sum()) / max(period, 1e-3)
-    return min(len(t) / expected, 1.0) * float(strongest.mean())

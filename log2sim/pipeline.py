@@ -13,9 +13,10 @@ from log2sim.clock import Costs, StageClock
 from log2sim.config import Config
 from log2sim.detect import Detector, create_detector
 from log2sim.errors import NothingToReconstruct
-from log2sim.finish import ego_agent, ego_flow, make_scenario, outside, thinned, without_doubles
+from log2sim.finish import ego_agent, ego_flow, make_scenario, thinned
 from log2sim.ground_plane import fit_cameras, locate_the_rest
 from log2sim.observe import Observed, observe
+from log2sim.overlap import outside, without_doubles
 from log2sim.plan import Plan, make_plan, plan_ticks
 from log2sim.report import make_report
 from log2sim.savings import settle

@@ -391,7 +391,7 @@ def test_interrupting_leaves_nothing(tmp_path: Path) -> None:
     scene.write_text(tiny_toml(agents=[PARKED], duration_s=2.0))
     (tmp_path / "work").mkdir()
     process = subprocess.Popen(
-        [sys.executable, "-m", "log2sim.cli", "synth", str(scene), "--out", str(tmp_path / "work/log"), "--quiet"],
+        [sys.executable, "-m", "log2sim", "synth", str(scene), "--out", str(tmp_path / "work/log"), "--quiet"],
         stderr=subprocess.PIPE,
         text=True,
     )

@@ -261,7 +261,7 @@ def test_help_answers_at_once() -> None:
 
 def _seconds(*arguments: str) -> float:
     begin = time.perf_counter()
-    subprocess.run([sys.executable, "-m", "log2sim.cli", *arguments], check=True, capture_output=True)
+    subprocess.run([sys.executable, "-m", "log2sim", *arguments], check=True, capture_output=True)
     return time.perf_counter() - begin
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import shutil
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +20,10 @@ from log2sim.metrics.evaluate import evaluate
 from log2sim.pipeline import Result
 from log2sim.schema import check
 from log2sim.types import Labels, Log, Stream
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
+
+from extremes.small_log import rows_changed
 
 UTM_M = (691_000.0, 5_334_000.0, 0.0)
 LABELS = Config.load(detect={"name": "labels"})
@@ -123,15 +127,7 @@ def test_a_log_is_not_changed_by_a_run(tiny: tuple[Log, Scenario]) -> None:
 def rewrite(source: Path, target: Path, change: Callable[[dict[str, str]], None]) -> Path:
     """A copy of a log folder with every row of every table changed."""
     shutil.copytree(source, target)
-    for file in target.rglob("*.csv"):
-        with file.open(newline="") as stream:
-            rows = list(csv.DictReader(stream))
-        for row in rows:
-            change(row)
-        with file.open("w", newline="") as stream:
-            writer = csv.DictWriter(stream, list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
+    rows_changed(target, change)
     return target
 
 

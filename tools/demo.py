@@ -22,7 +22,7 @@ def main() -> None:
     """Run the four commands, then print the stages."""
     for command in COMMANDS:
         print(f"$ log2sim {' '.join(command)}", flush=True)
-        subprocess.run([sys.executable, "-m", "log2sim.cli", *command, "--overwrite"], cwd=ROOT, check=True)
+        subprocess.run([sys.executable, "-m", "log2sim", *command, "--overwrite"], cwd=ROOT, check=True)
     report = json.loads((ROOT / OUT / "report.json").read_text(encoding="utf-8"))
     print(f"\n{'stage':<16}{'seconds':>10}{'ticks/s':>12}")
     for row in report["stages"]:

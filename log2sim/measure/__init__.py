@@ -1,8 +1,8 @@
 """Measurement: LiDAR points inside a detector's box give its object's place, size and heading.
 
 Mode "paper" follows Bhardwaj & Kalra: depth of the point nearest to the box center, extents of all points in the box.
-Mode "robust" takes the ground away, finds the object's own cluster, fits an oriented box to it and completes the sides
-that were not seen with the typical size of the category.
+Mode "robust" takes the ground away, gives every box the cluster that is its object's own, fits an oriented box to it, and
+completes the sides that were not seen with the typical size of the category, from the ends that are real.
 """
 
 from __future__ import annotations
@@ -30,28 +30,24 @@ KEPT_POINTS = 400
 
 def measure_view(view: View, detections: Detections, cloud: Cloud | None, *, mode: str = "robust") -> Measurements:
     """Measure every detection (M,) of one camera frame; rows without LiDAR points come with source "" and NaN places."""
-    m = len(detections)
     columns = _blank(view, detections)
-    if cloud is None or m == 0:
-        return Measurements(**columns)
-    if mode == "paper":
-        points, columns_m, margin = np.arange(len(cloud.xyz)), cloud.columns, 0.0
-    else:
-        points, columns_m, margin = cloud.obstacles, cloud.obstacle_columns, MARGIN
+    if cloud is not None and len(detections):
+        (_measure_as_paper if mode == "paper" else _measure_robustly)(columns, view, detections, cloud)
+    return Measurements(**columns)
+
+
+def _measure_robustly(columns: dict[str, Any], view: View, detections: Detections, cloud: Cloud) -> None:
+    """Give every box the cluster that is its object, and write what it says into its row."""
+    points, columns_m = cloud.obstacles, cloud.obstacle_columns
     seen = see(view, cloud.origin, columns_m)
     index, uv = points[seen.index], np.stack([seen.u, seen.v], axis=1)
     xyz = columns_m[:, seen.index].T
     range_m = np.linalg.norm(xyz - cloud.sensor, axis=1)
-    clusters = list(columns["cluster"])
-    inside = in_boxes(seen, detections.box_px, margin)
-    if mode == "paper":
-        for k, box in enumerate(detections.box_px):
-            _measure_as_paper(columns, k, box, uv[inside[k]], xyz[inside[k]], cloud)
-        return Measurements(**columns)
     options = []
-    for k, i in enumerate(inside):
+    for k, i in enumerate(in_boxes(seen, detections.box_px, MARGIN)):
         found = candidates(xyz[i], uv[i], range_m[i], detections.box_px[k], str(detections.category[k]))
         options.append([(i[points], score) for points, score in found])
+    clusters = list(columns["cluster"])
     for k, chosen in enumerate(choose(options, detections.box_px, len(index))):
         box, category = detections.box_px[k], str(detections.category[k])
         if len(chosen) < LEAST_POINTS:
@@ -64,7 +60,6 @@ def measure_view(view: View, detections: Detections, cloud: Cloud | None, *, mod
         columns["height_px_m"][k] = (box[3] - box[1]) * middle(seen.depth[chosen]) / view.camera.K[1, 1]
         clusters[k] = _fill_row(columns, k, members, category, cloud)
     columns["cluster"] = tuple(clusters)
-    return Measurements(**columns)
 
 
 def _blank(view: View, detections: Detections) -> dict[str, Any]:
@@ -110,18 +105,20 @@ def _fill_row(columns: dict[str, Any], k: int, members: NDArray[np.intp], catego
     return boxfit.subsample(xyz, KEPT_POINTS) + cloud.origin
 
 
-def _measure_as_paper(
-    columns: dict[str, Any], k: int, box: Array, uv: NDArray[np.floating[Any]], xyz: NDArray[np.float32], cloud: Cloud
-) -> None:
+def _measure_as_paper(columns: dict[str, Any], view: View, detections: Detections, cloud: Cloud) -> None:
     """Depth of the point nearest to the box center, extents of all points in the box."""
-    if len(xyz) == 0:
-        return
-    nearest = int(np.argmin(np.hypot(*(uv - (box[:2] + box[2:]) / 2).T)))
-    columns["center_m"][k] = xyz[nearest] + cloud.origin
-    columns["size_m"][k] = np.maximum(np.ptp(xyz, axis=0), 0.1)
-    columns["yaw_rad"][k], columns["covariance"][k] = 0.0, np.eye(2)
-    columns["points"][k], columns["source"][k] = len(xyz), "lidar"
-    columns["t_ns"][k] = cloud.stamp_ns
+    seen = see(view, cloud.origin, cloud.columns)
+    uv, xyz = np.stack([seen.u, seen.v], axis=1), cloud.xyz[seen.index]
+    for k, inside in enumerate(in_boxes(seen, detections.box_px)):
+        if len(inside) == 0:
+            continue
+        box = detections.box_px[k]
+        nearest = inside[np.argmin(np.hypot(*(uv[inside] - (box[:2] + box[2:]) / 2).T))]
+        columns["center_m"][k] = xyz[nearest] + cloud.origin
+        columns["size_m"][k] = np.maximum(np.ptp(xyz[inside], axis=0), 0.1)
+        columns["yaw_rad"][k], columns["covariance"][k] = 0.0, np.eye(2)
+        columns["points"][k], columns["source"][k] = len(inside), "lidar"
+        columns["t_ns"][k] = cloud.stamp_ns
 
 
 def project_cloud(view: View, cloud: Cloud, index: NDArray[np.intp]) -> tuple[NDArray[np.intp], Array, Array]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,47 +96,19 @@ def fit_camera(
     Obstacles come first; where there are too few of them or they do not determine it (cars of one lane are collinear),
     LiDAR ground points join them. "straw-man" has no LiDAR and so the obstacles alone; "calibrated" needs `K` (3, 3).
     """
+    fit_to = partial(estimate_homography, method=method, rng=rng, hypotheses=hypotheses)
     if method == "straw-man":
         by_size = np.full((len(feet.uv), 2), np.nan) if feet.xy_by_size is None else feet.xy_by_size
-        fit = estimate_homography(
-            feet.uv,
-            feet.xy_ego,
-            feet.tick,
-            method=method,
-            rng=rng,
-            sigma_px=FOOT_SIGMA_PX,
-            xy_by_size_m=by_size,
-            hypotheses=hypotheses,
-        )
+        fit = fit_to(feet.uv, feet.xy_ego, feet.tick, sigma_px=FOOT_SIGMA_PX, xy_by_size_m=by_size)
         return fit, "obstacles of average size" if fit.ok else "none"
     if len(feet.uv) >= ENOUGH_FEET:
-        fit = estimate_homography(
-            feet.uv,
-            feet.xy_ego,
-            feet.tick,
-            method=method,
-            rng=rng,
-            K=K,
-            hypotheses=hypotheses,
-            sigma_px=FOOT_SIGMA_PX,
-            sigma_m=2 * GROUND_SIGMA_M,
-        )
+        fit = fit_to(feet.uv, feet.xy_ego, feet.tick, K=K, sigma_px=FOOT_SIGMA_PX, sigma_m=2 * GROUND_SIGMA_M)
         if fit.ok and fit.condition < 30:
             return fit, "obstacles"
     both = Correspondences.join([feet, ground])
     if len(both.uv) < 4:
         return refused(f"{len(both.uv)} correspondences in the whole log, at least 4 are needed", len(both.uv)), "none"
-    fit = estimate_homography(
-        both.uv,
-        both.xy_ego,
-        both.tick,
-        method=method,
-        rng=rng,
-        K=K,
-        hypotheses=hypotheses,
-        sigma_px=GROUND_SIGMA_PX,
-        sigma_m=GROUND_SIGMA_M,
-    )
+    fit = fit_to(both.uv, both.xy_ego, both.tick, K=K, sigma_px=GROUND_SIGMA_PX, sigma_m=GROUND_SIGMA_M)
     return fit, "obstacles and ground points"
 
 

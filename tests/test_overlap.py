@@ -1,4 +1,4 @@
-"""The last steps: no two agents in one place, none in the ego's."""
+"""No two agents in one place, none in the ego's."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from log2sim.assemble import Built
-from log2sim.finish import outside, without_doubles
+from log2sim.overlap import outside, without_doubles
 from log2sim.scenario import Agent, Waypoints
 
 

@@ -1,0 +1,51 @@
+"""The command line's application, the options that commands share, and how they speak."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+
+from log2sim import __version__
+
+app = typer.Typer(
+    name="log2sim",
+    help="Reconstruct driving logs as scenarios that a simulator can run.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+LogPath = Annotated[Path, typer.Argument(metavar="LOG", help="Folder of a log.")]
+ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A scenario.json.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
+Format = Annotated[str, typer.Option(help="Log format: auto, log2sim, kitti, kitti-tracking, pandaset.")]
+Sequence = Annotated[str | None, typer.Option(help="Which sequence, when the folder holds several.")]
+Settings = Annotated[list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change a setting.")]
+ConfigFile = Annotated[Path | None, typer.Option("--config", metavar="FILE.toml", help="Settings file.")]
+
+
+def fail(message: str, code: int) -> NoReturn:
+    """Print an error and leave."""
+    sys.stderr.write(f"log2sim: {message}\n")
+    sys.exit(code)
+
+
+def say(text: str, *, quiet: bool = False) -> None:
+    """Print a line for the user."""
+    if not quiet:
+        sys.stdout.write(text + "\n")
+        sys.stdout.flush()
+
+
+@app.callback(invoke_without_command=True)
+def root(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+    """Reconstruct driving logs as scenarios that a simulator can run. Add --debug for tracebacks."""
+    if version:
+        say(__version__)
+        raise typer.Exit
