@@ -75,6 +75,8 @@ def write_json(path: Path | str, value: Any) -> None:
 def read_json(path: Path | str, error: type[LogError] = LogError) -> Any:
     """Read a JSON file; anything wrong with it becomes `error` naming the file and the place."""
     path = Path(path)
+    if path.is_dir():
+        raise error(f"{path}: is a folder; expected a JSON file, such as the scenario.json that `reconstruct` writes")
     if not path.is_file():
         raise error(f"{path}: no such file")
     if path.stat().st_size > JSON_LIMIT_BYTES:

@@ -350,6 +350,7 @@ def test_a_failing_last_step_leaves_what_was_there(
         (("replay", "{s}", "--ego", "nothing"), 2, ["'nothing'", "module:attribute"]),
         (("replay", "{s}", "--ego", "no_such_module:x"), 2, ["no_such_module", "cannot be imported"]),
         (("replay", "none.json"), 3, ["none.json", "no such file"]),
+        (("replay", "."), 3, [".", "is a folder; expected a JSON file"]),
         (("plot", "{s}", "--out", "x.jpeg"), 2, [".png", ".mp4", "'.jpeg'"]),
         (("plot", "{s}", "--out", "x.png", "--replay", "{s}"), 3, ["replay_version"]),
         (("plot", "{s}", "--out", "x.png", "--truth", "none"), 3, ["none", "no such file"]),
