@@ -85,21 +85,29 @@ def replay(
     mode: Annotated[str, typer.Option(help="pid or exact.")] = "pid",
     model: Annotated[str, typer.Option(help="Vehicle model: kinematic.")] = "kinematic",
     dt: Annotated[float, typer.Option(help="Step in s.")] = 0.01,
-    ego: Annotated[str | None, typer.Option(metavar="MODULE:ATTRIBUTE", help="Policy that drives the ego.")] = None,
+    ego: Annotated[
+        str | None, typer.Option(metavar="MODULE|FILE.py:ATTRIBUTE", help="Policy that drives the ego.")
+    ] = None,
+    agents: Annotated[str, typer.Option(help="What the others do: log, or reactive (brake for what is new).")] = "log",
+    react: Annotated[str | None, typer.Option(metavar="ID,ID", help="Only these react.")] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit 6 when a limit is broken.")] = False,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
     """Let vehicles drive a scenario."""
+    from log2sim.errors import ConfigError
     from log2sim.files import check_targets
     from log2sim.replay import load_policy, require_strict
     from log2sim.replay import replay as run
     from log2sim.scenario import Scenario
 
     check_targets(out, overwrite=overwrite)
+    if react is not None and agents != "log":
+        raise ConfigError("--react names the agents that react, --agents reactive means all: give one of them")
+    chosen = agents if react is None else [name.strip() for name in react.split(",")]
     loaded = Scenario.load(scenario)
     policy = load_policy(ego) if ego is not None else None
-    result = run(loaded, mode=mode, model=model, dt_s=dt, ego=policy)
+    result = run(loaded, mode=mode, model=model, dt_s=dt, ego=policy, agents=chosen)
     if out is not None:
         result.save(out)
     m = result.metrics

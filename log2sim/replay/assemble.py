@@ -17,6 +17,7 @@ from log2sim.replay.path import Path
 from log2sim.replay.result import AgentReplay, Replay
 from log2sim.replay.rollout import Clock, Tracks
 from log2sim.replay.vehicle import WHEELED
+from log2sim.replay.ways import times_at
 from log2sim.replay.world import Group
 from log2sim.scenario import Agent, Scenario
 
@@ -65,9 +66,10 @@ def _moved(
         model = "none"
     elif agent.category not in WHEELED:
         model = "point"
+    log_t_s = times_at(path, t_s, x, y) if driver == "reactive" else t_s
     if np.isnan(accel).any():
         accel = np.gradient(speed, t_s) if len(t_s) > 1 else np.zeros(len(t_s))
-    z = np.interp(t_s, path.t_s, path.z_m)
+    z = np.interp(log_t_s, path.t_s, path.z_m)
     x, y, z, yaw, speed, steer, accel = (np.round(c, DIGITS) for c in (x, y, z, yaw, speed, steer, accel))
     t_s = np.round(t_s, 9)
     return AgentReplay(

@@ -84,7 +84,7 @@ def check_strict(replay: Any) -> list[str]:
         if not e["in_log"]
     ]
     for agent in replay.agents:
-        if agent.driver == "policy":
+        if agent.driver in ("policy", "reactive"):
             continue
         worst = replay.metrics["by_agent"].get(agent.id, {}).get("cross_track_max_m", 0.0)
         if worst > CROSS_TRACK_LIMIT_M:
