@@ -78,7 +78,9 @@ def leaders(ways: Ways, corridor: Corridor, boxes: Boxes, room: Room) -> Leaders
     within = c.width_m[:, None] / 2 + room.side_m
     center = foot.distance_m + foot.ahead_m - c.distance_m[:, None]
     inside = np.abs(foot.left_m) < within + half_length * np.abs(turn_sin) + half_width * np.abs(turn_cos)
-    inside &= center > c.progress_m - room.behind_m
+    ahead = center > c.progress_m - room.behind_m
+    # Who is once behind within the corridor comes from behind and has to see to it itself.
+    inside &= ahead & ~np.logical_or.accumulate(inside & ~ahead, axis=1)
     gap = center + _nearest_edge(foot.left_m, turn_cos, turn_sin, half_length, half_width, within)
     gap -= c.length_m[:, None] / 2
 
