@@ -20,7 +20,8 @@ LOGGED = Room(side_m=0.5, crossing_m=2.5, crossing_s=0.8, behind_m=1.0)
 GAP_M, SPEED_MPS = 0.5, 0.5
 """A situation may be worse than the log's by these, and by the difference of the rooms, and still is the log's."""
 
-NOTICED = 1e-4  # of the free acceleration
+NOTICED = 1e-3  # of the free acceleration
+BEND_M = 1.0  # by which ways may leave the hull of a few of their points
 
 Index = NDArray[np.intp]
 
@@ -29,7 +30,8 @@ Index = NDArray[np.intp]
 class Moment:
     """All agents (A,) at one time: `t_s` on each one's own log, `rate` at which it goes through that, where it is, its size.
 
-    `driven` is the agent that a policy drives, -1 if none is; `reacts` marks those that decide.
+    `driven` is the agent that a policy drives, -1 if none is; `reacts` marks those that decide. `course` (A, H) is where all
+    are expected to go.
     """
 
     ways: Ways
@@ -40,6 +42,7 @@ class Moment:
     t_s: Array
     rate: Array
     pose: Pose
+    course: Course
 
     def reach_m(self, i: Index) -> Array:
         """How far agents (P,) look ahead: to where they could stop in comfort, and a bit."""
@@ -47,12 +50,35 @@ class Moment:
         stop_m = pace * (d.time_gap_s + HORIZON_S[-1]) + pace**2 / (2 * d.comfort_mps2)
         return np.minimum(LOOK_M + stop_m + self.size_m[i, 0], EXTENSION_M)
 
-    def near(self, i: Index, j: Index) -> NDArray[np.bool_]:
-        """Whether j (P,) may come into the reach of i (P,) within the horizon."""
+    def meeting(self, i: Index, j: Index) -> tuple[Index, Index]:
+        """Those of the pairs (P,), (P,) that may come near each other within the horizon."""
         p, radius = self.pose, np.hypot(self.size_m[:, 0], self.size_m[:, 1]) / 2
         reach = self.reach_m(i) + np.abs(p.speed_mps[j]) * HORIZON_S[-1] + radius[i] + radius[j]
-        level = np.abs(p.z_m[i] - p.z_m[j]) < (self.size_m[i, 2] + self.size_m[j, 2]) / 2
-        return level & (np.hypot(p.x_m[i] - p.x_m[j], p.y_m[i] - p.y_m[j]) < reach)
+        near = np.abs(p.z_m[i] - p.z_m[j]) < (self.size_m[i, 2] + self.size_m[j, 2]) / 2
+        near &= (p.x_m[i] - p.x_m[j]) ** 2 + (p.y_m[i] - p.y_m[j]) ** 2 < reach**2
+        i, j = i[near], j[near]
+        x, y = (np.ascontiguousarray(c[:, ::4].T) for c in self.course[:2])
+        swept = self._hull(i, x[:, j], y[:, j])
+        room = radius[j] + self.size_m[i, 1] / 2 + LOGGED.side_m + BEND_M
+        own = np.flatnonzero(self.reacts)
+        ahead = np.linspace(0.0, 1.0, 13)[:, None] * self.reach_m(own)
+        x, y, *_ = self.ways.along(own[None], self.pose.distance_m[own] + ahead)
+        meets, slot = np.zeros(len(i), dtype=bool), np.searchsorted(own, i)
+        for part in (slice(0, 4), slice(3, 7), slice(6, 10), slice(9, 13)):
+            section = self._hull(own, x[part], y[part])
+            apart = [
+                (low > end[slot] + room) | (high < begin[slot] - room)
+                for (low, high), (begin, end) in zip(swept, section)
+            ]
+            meets |= ~(apart[0] | apart[1])
+        return i[meets], j[meets]
+
+    def _hull(self, i: Index, x_m: Array, y_m: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        """Least and greatest of points (N, P), ahead and to the left of agents i (P,)."""
+        cos, sin = np.cos(self.pose.yaw_rad[i]), np.sin(self.pose.yaw_rad[i])
+        dx, dy = x_m - self.pose.x_m[i], y_m - self.pose.y_m[i]
+        ahead, left = dx * cos + dy * sin, dy * cos - dx * sin
+        return (ahead.min(axis=0), ahead.max(axis=0)), (left.min(axis=0), left.max(axis=0))
 
 
 def excess(m: Moment, i: Index, j: Index, trusted: NDArray[np.bool_]) -> Array:
@@ -62,7 +88,8 @@ def excess(m: Moment, i: Index, j: Index, trusted: NDArray[np.bool_]) -> Array:
     logged = m.ways.at(i[:, None], m.t_s[i][:, None] + HORIZON_S).distance_m - m.pose.distance_m[i][:, None]
     starting = pace[:, None] * HORIZON_S + driver.accel_mps2[:, None] * HORIZON_S**2 / 2
     means = np.where(m.rate[i][:, None] < 1, np.minimum(logged, starting), logged)
-    found = leaders(m.ways, _corridor(m, i, pace, means), _boxes(m, j, _expected(m, j)), NOW)
+    course = tuple(c[j] for c in m.course)
+    found = leaders(m.ways, _corridor(m, i, pace, means), _boxes(m, j, course), NOW)
     # Who was first in the log where two reactive ones meet goes first; what is in the way already is waited for.
     first = m.reacts[i] & m.reacts[j] & (found.ahead_s > 0)
     first &= found.own_t_s < m.t_s[j] + m.rate[j] * found.ahead_s
@@ -98,15 +125,13 @@ def _boxes(m: Moment, j: Index, course: Course) -> Boxes:
     return Boxes(*course, m.size_m[j, 0], m.size_m[j, 1])
 
 
-def _expected(m: Moment, j: Index) -> Course:
-    """Where agents (P,) go from where they are."""
-    course = on_schedule(m.ways, j, m.t_s[j], m.rate[j])
-    if not np.any(j == m.driven):
+def expected(ways: Ways, pose: Pose, t_s: Array, rate: Array, driven: int) -> Course:
+    """Where all agents (A,) go from where they are; the driven one as if it kept to its way."""
+    course = on_schedule(ways, np.arange(len(t_s)), t_s, rate)
+    if driven < 0:
         return course
-    k = m.driven
-    x, y, yaw, speed = (float(c[k]) for c in (m.pose.x_m, m.pose.y_m, m.pose.yaw_rad, m.pose.speed_mps))
-    free = of_driven(m.ways, k, x, y, yaw, speed)
-    return _choose(j == k, free, course)
+    x, y, yaw, speed = (float(c[driven]) for c in (pose.x_m, pose.y_m, pose.yaw_rad, pose.speed_mps))
+    return _choose(np.arange(len(t_s)) == driven, of_driven(ways, driven, x, y, yaw, speed), course)
 
 
 def _logged(m: Moment, j: Index, t_s: Array) -> Course:

@@ -15,7 +15,7 @@ from log2sim.geometry import Array
 from log2sim.replay.clock import Clock
 from log2sim.replay.driver import drivers_for, respond
 from log2sim.replay.path import Path
-from log2sim.replay.situation import Moment, excess
+from log2sim.replay.situation import Moment, excess, expected
 from log2sim.replay.trust import deep_overlaps
 from log2sim.replay.ways import Pose, Ways
 from log2sim.replay.world import Snapshot
@@ -23,6 +23,7 @@ from log2sim.scenario import Agent
 
 DECIDE_S = 0.1
 STANDING_MPS = 0.05  # where the log is slower, its time goes on: waiting for somebody counts as the log's own stop
+CHUNK = 4096  # pairs looked at together
 SAME_S = 1e-9  # delays that differ by rounding are the same
 
 
@@ -87,14 +88,15 @@ class Traffic:
         pose = self.ways.at(np.arange(len(tau)), tau)
         pace = np.abs(pose.speed_mps[own])
         log_accel = (np.abs(self.ways.at(own, tau[own] + DECIDE_S).speed_mps) - pace) / DECIDE_S
+        pose = self._with_ego(pose, ego)
+        course = expected(self.ways, pose, tau, self.rate, self._driven)
         moment = Moment(
-            self.ways, self.driver, self._size, self.reacts, self._driven, tau, self.rate, self._with_ego(pose, ego)
+            self.ways, self.driver, self._size, self.reacts, self._driven, tau, self.rate, pose, course
         )
         taken = np.zeros(len(tau))
-        i, j = self._pairs(t_s, tau, own)
-        near = moment.near(i, j)
-        if near.any():
-            i, j = i[near], j[near]
+        pairs = moment.meeting(*self._pairs(t_s, tau, own))
+        for begin in range(0, len(pairs[0]), CHUNK):
+            i, j = (p[begin : begin + CHUNK] for p in pairs)
             np.maximum.at(taken, i, excess(moment, i, j, ~self._distrusted[i, j]))
         rate, slope = respond(self.driver.take(own), self.rate[own], taken[own], pace, log_accel)
         stands = pace < STANDING_MPS

@@ -86,8 +86,9 @@ class Ways:
         first = np.clip((from_m / SPACING_M).astype(np.intp), 0, self.marks[agent] - 1)
         ahead = np.arange(0, int(reach_m / SPACING_M) + COARSE, COARSE)
         k = np.minimum(first[:, None] + ahead, self.marks[agent][:, None] - 1)
-        near = self._marks[self._mark0[agent][:, None] + k]
-        square = (x_m[:, :, None] - near[:, None, :, 0]) ** 2 + (y_m[:, :, None] - near[:, None, :, 1]) ** 2
+        near = self._marks[self._mark0[agent][:, None] + k, :2]
+        # |a - b|^2 less |a|^2, which is the same for all b.
+        square = (near**2).sum(axis=2)[:, None] - 2 * np.stack([x_m, y_m], axis=2) @ near.swapaxes(1, 2)
         k = np.take_along_axis(k, np.argmin(square, axis=2), axis=1)
         begin = self._mark0[agent][:, None]
         for _ in range(2):
