@@ -53,9 +53,7 @@ def reactive_ids(agents: Sequence[Agent], wanted: str | Collection[str], *, driv
     ConfigError
         When a name is not known, or is that of an agent that cannot react: parked, seen once, or driven by a policy.
     """
-    able = [
-        a.id for a in agents if not a.static and len(a.waypoints) > 1 and not (drives_ego and a.id == EGO)
-    ]
+    able = [a.id for a in agents if not a.static and len(a.waypoints) > 1 and not (drives_ego and a.id == EGO)]
     if isinstance(wanted, str):
         if wanted not in ("log", "reactive"):
             raise ConfigError(f"agents '{wanted}': expected log or reactive")

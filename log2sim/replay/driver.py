@@ -13,7 +13,9 @@ from log2sim.scenario import Agent
 
 EXPONENT = 4.0
 MIN_GAP_M = 0.1  # shorter gaps, and overlaps, are as bad as this one
-MIN_PACE_MPS = 0.5  # where the log is slower, the rate answers as if it went this fast, or it had no bounds at standstill
+MIN_PACE_MPS = (
+    0.5  # where the log is slower, the rate answers as if it went this fast, or it had no bounds at standstill
+)
 HOLD_MPS = 0.2  # who is slower and has somebody in front stands,
 HOLD_DEMAND = 0.5  # until that takes less than this share of the free acceleration: at 1.4 times the gap of standstill
 

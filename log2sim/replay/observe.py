@@ -81,7 +81,7 @@ class Observer:
         x, y, cos, sin, at_s = way.along(ONE, self.progress_m + ahead)
         pace = np.abs(way.at(ONE, np.where(np.isnan(at_s), self._path.t_s[-1], at_s)).speed_mps)
         columns = (ahead, x + way.origin_m[0], y + way.origin_m[1], wrap_angle(np.arctan2(sin, cos)), pace, at_s)
-        return PathAhead(*(_locked(c) for c in columns))
+        return PathAhead(self.progress_m, *(_locked(c) for c in columns))
 
     def _others(self, ego: EgoState, step: int, t_s: float) -> Others:
         here = (self._stays[:, 0] <= t_s) & (t_s <= self._stays[:, 1])

@@ -94,9 +94,10 @@ class PathAhead:
 
     `distance_m` is counted from the first row, the nearest to the ego. `yaw_rad` is the direction of travel, `speed_mps`
     the pace of the log at that place, `t_s` when the log was there. Beyond the end of the log the way goes straight on with
-    the last pace, and `t_s` is NaN.
+    the last pace, and `t_s` is NaN. `progress_m` is the way up to the first row.
     """
 
+    progress_m: float
     distance_m: Array
     x_m: Array
     y_m: Array

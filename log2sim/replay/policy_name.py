@@ -34,9 +34,7 @@ def load_policy(name: str) -> Policy:
     try:
         target: Any = _import_file(Path(source)) if source.endswith(".py") else _import_module(source)
     except Exception as error:  # a user's module may raise anything while it is imported
-        raise ConfigError(
-            f"policy '{name}': '{source}' cannot be imported: {type(error).__name__}: {error}"
-        ) from error
+        raise ConfigError(f"policy '{name}': '{source}' cannot be imported: {type(error).__name__}: {error}") from error
     for part in attribute.split("."):
         if not hasattr(target, part):
             raise ConfigError(f"policy '{name}': '{part}' is not in {target!r}")

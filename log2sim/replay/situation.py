@@ -88,8 +88,8 @@ def excess(m: Moment, i: Index, j: Index, trusted: NDArray[np.bool_]) -> Array:
     logged = m.ways.at(i[:, None], m.t_s[i][:, None] + HORIZON_S).distance_m - m.pose.distance_m[i][:, None]
     starting = pace[:, None] * HORIZON_S + driver.accel_mps2[:, None] * HORIZON_S**2 / 2
     means = np.where(m.rate[i][:, None] < 1, np.minimum(logged, starting), logged)
-    course = tuple(c[j] for c in m.course)
-    found = leaders(m.ways, _corridor(m, i, pace, means), _boxes(m, j, course), NOW)
+    x, y, yaw, speed = (c[j] for c in m.course)
+    found = leaders(m.ways, _corridor(m, i, pace, means), _boxes(m, j, (x, y, yaw, speed)), NOW)
     # Who was first in the log where two reactive ones meet goes first; what is in the way already is waited for.
     first = m.reacts[i] & m.reacts[j] & (found.ahead_s > 0)
     first &= found.own_t_s < m.t_s[j] + m.rate[j] * found.ahead_s

@@ -50,7 +50,12 @@ class Traffic:
     """
 
     def __init__(
-        self, agents: Sequence[Agent], paths: Sequence[Path], reactive: Collection[str], clock: Clock, driven: str | None
+        self,
+        agents: Sequence[Agent],
+        paths: Sequence[Path],
+        reactive: Collection[str],
+        clock: Clock,
+        driven: str | None,
     ) -> None:
         self.index = {a.id: k for k, a in enumerate(agents)}
         self.ways, self.clock = Ways(paths), clock
@@ -90,9 +95,7 @@ class Traffic:
         log_accel = (np.abs(self.ways.at(own, tau[own] + DECIDE_S).speed_mps) - pace) / DECIDE_S
         pose = self._with_ego(pose, ego)
         course = expected(self.ways, pose, tau, self.rate, self._driven)
-        moment = Moment(
-            self.ways, self.driver, self._size, self.reacts, self._driven, tau, self.rate, pose, course
-        )
+        moment = Moment(self.ways, self.driver, self._size, self.reacts, self._driven, tau, self.rate, pose, course)
         taken = np.zeros(len(tau))
         pairs = moment.meeting(*self._pairs(t_s, tau, own))
         for begin in range(0, len(pairs[0]), CHUNK):
@@ -112,9 +115,7 @@ class Traffic:
         yaw[k], speed[k] = ego.yaw_rad[0], ego.speed_mps[0]
         return pose._replace(x_m=x, y_m=y, yaw_rad=yaw, speed_mps=speed)
 
-    def _pairs(
-        self, t_s: float, tau: Array, own: NDArray[np.intp]
-    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def _pairs(self, t_s: float, tau: Array, own: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Reactive agents (P,) and those (P,) present that are not to them as the log has it."""
         differs = (np.abs(self.delay_s[own][:, None] - self.delay_s) > SAME_S) & ~self._static
         if self._driven >= 0:

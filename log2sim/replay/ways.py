@@ -139,13 +139,22 @@ def _by_distance(table: Array) -> Array:
     if len(whole) > 1:
         dx, dy = np.gradient(x), np.gradient(y)
         length = np.hypot(dx, dy)
-        cos, sin = np.divide(dx, length, out=np.ones_like(dx), where=length > 0), np.divide(dy, length, out=np.zeros_like(dy), where=length > 0)
+        cos, sin = (
+            np.divide(dx, length, out=np.ones_like(dx), where=length > 0),
+            np.divide(dy, length, out=np.zeros_like(dy), where=length > 0),
+        )
     else:
         heading = yaw[0] if speed.sum() >= 0 else yaw[0] + np.pi
         cos, sin = np.array([np.cos(heading)]), np.array([np.sin(heading)])
     on = np.arange(1, int(EXTENSION_M / SPACING_M) + 1) * SPACING_M
     beyond = np.stack(
-        [x[-1] + on * cos[-1], y[-1] + on * sin[-1], np.full(len(on), cos[-1]), np.full(len(on), sin[-1]), np.full(len(on), np.nan)],
+        [
+            x[-1] + on * cos[-1],
+            y[-1] + on * sin[-1],
+            np.full(len(on), cos[-1]),
+            np.full(len(on), sin[-1]),
+            np.full(len(on), np.nan),
+        ],
         axis=1,
     )
     return np.concatenate([np.stack([x, y, cos, sin, t], axis=1), beyond])
