@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -26,16 +27,16 @@ WHEELED = ("car", "truck", "bus", "motorcycle", "cyclist", "bicycle")
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Base of records whose fields are arrays (A,)."""
+    """Base of records whose fields are arrays (A,) or (..., A)."""
 
     def take(self, index: Any) -> Self:
         """The agents at `index` (integers, a slice or a mask)."""
-        return type(self)(*(getattr(self, f.name)[index] for f in fields(self)))
+        return type(self)(*(getattr(self, f.name)[..., index] for f in fields(self)))
 
     def put(self, index: Any, other: Self) -> None:
         """Overwrite the agents at `index`; only the owner of the columns may do so."""
         for f in fields(self):
-            getattr(self, f.name)[index] = getattr(other, f.name)
+            getattr(self, f.name)[..., index] = getattr(other, f.name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +76,11 @@ class VehicleParameters(Columns):
     max_brake_mps2: Array
     max_jerk_mps3: Array
     pedal_lag_s: Array
+
+    @cached_property
+    def max_curvature_1pm(self) -> Array:
+        """At full lock."""
+        return np.tan(self.max_steer_rad) / self.wheelbase_m
 
 
 @dataclass(frozen=True, eq=False)
