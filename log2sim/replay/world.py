@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array, wrap_angle
+from log2sim.geometry import Array, cos_sin, wrap_angle
 from log2sim.replay.follower import Memory, follow_points, follow_vehicles, start_points, start_vehicles
 from log2sim.replay.policy import Controls
 from log2sim.replay.reference import GRID_S, Reference
@@ -51,10 +51,12 @@ class Group(ABC):
         """Make the tables of the agents that live within the steps [begin, end) at hand."""
         self.live = np.flatnonzero((self.first < end) & (self.last >= begin) & (self.last >= self.first))
         self._row0 = int(np.floor(begin_s / GRID_S))
-        rows = np.arange(self._row0, int(np.floor(end_s / GRID_S)) + 3)
-        self._table = (
-            np.stack([_window(self.references[i], rows) for i in self.live], axis=2) if len(self.live) else None
-        )
+        rows = int(np.floor(end_s / GRID_S)) + 3 - self._row0
+        self._table = None
+        if len(self.live):
+            self._table = np.empty((rows, self.references[0].columns.shape[1], len(self.live)))
+            for slot, i in enumerate(self.live):
+                _fill(self._table[:, :, slot], self.references[i], self._row0)
 
     def look_up(self, t_s: float) -> None:
         """Set `row` (C, A) to the references at a time."""
@@ -140,8 +142,9 @@ class Fleet(Group):
 
     def snapshot(self) -> Snapshot:
         s, o = self.state, self.offset_m[self.live]
-        x = s.x_m + o * np.cos(s.yaw_rad) + self.origin_x_m[self.live]
-        y = s.y_m + o * np.sin(s.yaw_rad) + self.origin_y_m[self.live]
+        cos, sin = cos_sin(s.yaw_rad)
+        x = s.x_m + o * cos + self.origin_x_m[self.live]
+        y = s.y_m + o * sin + self.origin_y_m[self.live]
         accel = np.where(
             (s.speed_mps == 0) & (s.pedal_mps2 < 0), 0.0, s.pedal_mps2 * np.where(s.speed_mps < 0, -1.0, 1.0)
         )
@@ -203,6 +206,11 @@ class Crowd(Group):
         self.state = self.simulator.step_points(self.state, follow_points(self.row, self.state), dt_s)
 
 
-def _window(reference: Reference, rows: NDArray) -> Array:
-    """Rows (W, C) of a table, its first and last row standing for the time before and after."""
-    return reference.columns[np.clip(rows - reference.first_row, 0, len(reference.columns) - 1)]
+def _fill(window: Array, reference: Reference, row0: int) -> None:
+    """Copy the rows from `row0` on of a table to a window (W, C); its first and last row stand for before and after."""
+    columns, begin = reference.columns, reference.first_row - row0
+    low = min(max(begin, 0), len(window))
+    high = min(max(begin + len(columns), low), len(window))
+    window[:low] = columns[0]
+    window[low:high] = columns[low - begin : high - begin]
+    window[high:] = columns[-1]
