@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.replay.drivable import LOCK_SHARE, Limits
+from log2sim.replay.follower import control_step
 from log2sim.replay.path import path_of
 from log2sim.replay.reference import MAX_CURVATURE_1PM, Reference, point_reference, tape_reference, vehicle_reference
 from log2sim.replay.rollout import Clock
@@ -66,8 +67,8 @@ def _vehicle_reference(agent: Agent, dt_s: float) -> Reference:
     return vehicle_reference(
         path_of(agent, limits.offset_m),
         limits,
-        accel_ahead_s=PEDAL_LAG_S + dt_s / 2,
-        curvature_ahead_s=STEER_LAG_S + dt_s / 2,
+        accel_ahead_s=PEDAL_LAG_S + control_step(dt_s) / 2,
+        curvature_ahead_s=STEER_LAG_S + control_step(dt_s) / 2,
         max_curvature_1pm=MAX_CURVATURE_1PM
         if agent.category in ("car", "truck", "bus")
         else MAX_TWO_WHEELER_CURVATURE_1PM,

@@ -35,7 +35,15 @@ class Gains:
 GAINS = Gains()
 INTEGRAL_LIMIT_MPS2 = 1.0
 INTEGRAL_SHARE = 0.2  # of the curvature that lock and grip allow
+MAX_CONTROL_STEP_S = 0.1
+"""Longest time for which controls are held: a third of the shortest time in which an error decays."""
+
 CORRECTED_ALONG_M = 2.0  # how far the arc at the reference is trusted beside it
+
+
+def control_step(dt_s: float) -> float:
+    """The part of a simulation step for which controls are held."""
+    return dt_s / max(1, math.ceil(dt_s / MAX_CONTROL_STEP_S - 1e-9))
 
 
 @dataclass(frozen=True, eq=False)

@@ -99,4 +99,6 @@ def hermite(value: Array, slope: Array, i: NDArray[np.intp], t: Array, span: Arr
     f = t / span
     begin, end = value[..., i], value[..., i + 1]
     begin_rise, end_rise, rise = span * slope[..., i], span * slope[..., i + 1], end - begin
-    return begin + f * (begin_rise + f * (3 * rise - 2 * begin_rise - end_rise + f * (begin_rise + end_rise - 2 * rise)))
+    return begin + f * (
+        begin_rise + f * (3 * rise - 2 * begin_rise - end_rise + f * (begin_rise + end_rise - 2 * rise))
+    )
