@@ -20,7 +20,7 @@ SMOOTHING_S = 0.12
 """Standard deviation of the Gaussian over the velocity of points: one waypoint of a 10 Hz log."""
 
 STANDSTILL_MPS = 0.08
-MIN_RUN_M = 0.3  # shorter forward or backward runs are noise of a standing agent
+MIN_RUN_M, MIN_RUN_MPS = 0.3, 0.5  # shorter and slower runs forward or backward are noise of a standing agent
 MAX_ACCEL_MPS2 = 10.4  # feasibility limits of Waymax (Gulino et al., 2023)
 MAX_CURVATURE_1PM = 0.3
 MAX_DEPARTURE_M = 0.3  # more than boxes err by
@@ -57,15 +57,15 @@ def vehicle_reference(
     """The table of a vehicle. Columns "..._ahead" are those of a later time, which makes up for the actuators' lag."""
     course, departure_m = drivable_course(path, limits)
     first, t = _grid(path)
-    gear = _gear(_motion(course, t)[3])
+    gear, stands = _gears(_motion(course, t)[3])
 
     def exact(at_s: Array) -> Array:
         rows = np.empty((len(VEHICLE_COLUMNS), len(at_s)))
         rows[:4] = _motion(course, at_s)
         rows[4] = np.interp(at_s + accel_ahead_s, course.t_s, course.accel_mps2)
         rows[5] = np.interp(at_s + curvature_ahead_s, course.t_s, course.curvature_1pm)
-        rows[6] = gear[np.minimum(np.searchsorted(t, at_s), len(t) - 1)]
-        rows[7] = np.abs(rows[3]) < STANDSTILL_MPS
+        k = np.minimum(np.searchsorted(t, at_s), len(t) - 1)
+        rows[6], rows[7] = gear[k], stands[k]
         return rows.T
 
     flags = _flags(path, course, departure_m, max_curvature_1pm)
@@ -164,21 +164,19 @@ def _smooth(values: Array) -> Array:
     return np.convolve(padded, kernel / kernel.sum(), mode="valid")
 
 
-def _gear(speed: Array) -> Array:
-    """+1 or -1 for every row: the direction of the current motion, or of the next one while standing."""
+def _gears(speed: Array) -> tuple[Array, Array]:
+    """For every row the gear, +1 or -1, of the current motion, or of the next one while standing; and whether it stands."""
     direction = np.where(np.abs(speed) < STANDSTILL_MPS, 0, np.sign(speed)).astype(int)
-    edges = np.flatnonzero(np.diff(direction)) + 1
-    runs: list[NDArray[np.intp]] = np.split(np.arange(len(speed)), edges)
-    moving = [r for r in runs if direction[r[0]] != 0 and abs(speed[r].sum()) * GRID_S >= MIN_RUN_M]
-    gear = np.ones(len(speed))
-    if not moving:
-        return gear
+    runs: list[NDArray[np.intp]] = np.split(np.arange(len(speed)), np.flatnonzero(np.diff(direction)) + 1)
+    gear, stands = np.ones(len(speed)), np.ones(len(speed))
     begin = 0
-    for run in moving:
-        gear[begin : run[-1] + 1] = direction[run[0]]
-        begin = run[-1] + 1
-    gear[begin:] = direction[moving[-1][0]]
-    return gear
+    for run in runs:
+        way_m, peak_mps = np.abs(speed[run]).sum() * GRID_S, np.abs(speed[run]).max()
+        if direction[run[0]] != 0 and (way_m >= MIN_RUN_M or peak_mps >= MIN_RUN_MPS):
+            gear[begin:] = direction[run[0]]
+            stands[run] = 0.0
+            begin = run[-1] + 1
+    return gear, stands
 
 
 def _leaps(path: Path) -> tuple[str, ...]:
