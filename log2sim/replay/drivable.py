@@ -35,12 +35,13 @@ DAMPED = np.array([1 / POSITION_M, 1 / POSITION_M, 1 / YAW_RAD, 1 / SPEED_MPS, 1
 
 @dataclass(frozen=True)
 class Limits:
-    """What a vehicle can do: curvature and its rate in time, acceleration; and where its box center is."""
+    """What a vehicle can do: curvature and its rate in time, acceleration ahead and sideways; and where its box center is."""
 
     offset_m: float
     max_curvature_1pm: float
     max_curvature_rate_1pmps: float
     max_accel_mps2: float
+    max_lateral_mps2: float = 8.0  # of a dry road's grip of 9 m/s2; the rest is left to the controller
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +132,7 @@ class _Problem:
         """Half the sum of squares, the pseudo-Huber loss for headings and speeds."""
         knot, _ = self._knots(state)
         roll, _ = self._rolls(state)
-        plain = np.sum(roll**2) + np.sum(knot[:, [0, 1, 4, 5]] ** 2)
+        plain = np.sum(roll**2) + np.sum(knot[:, [0, 1, 4, 5, 6]] ** 2)
         return float(plain / 2 + np.sum(np.sqrt(1 + knot[:, 2:4] ** 2) - 1))
 
     def normal_equations(self, state: Array) -> tuple[Array, Array, Array]:
@@ -151,12 +152,12 @@ class _Problem:
         return diagonal, both[:, STATES:, :STATES], gradient
 
     def _knots(self, state: Array) -> tuple[Array, Array]:
-        """Residuals (K, 6) against the log and the limits, and their derivatives (K, 6, 6)."""
+        """Residuals (K, 7) against the log and the limits, and their derivatives (K, 7, 6)."""
         x, y, yaw, speed, accel, curvature = state.T
         o, scale = self.limits.offset_m, np.sqrt(self.h_s / KNOT_S)
         cos, sin = np.cos(yaw), np.sin(yaw)
-        residual = np.zeros((len(state), 6))
-        jacobian = np.zeros((len(state), 6, STATES))
+        residual = np.zeros((len(state), 7))
+        jacobian = np.zeros((len(state), 7, STATES))
         residual[:, 0] = (x + o * cos - self.logged[:, 0]) / POSITION_M
         residual[:, 1] = (y + o * sin - self.logged[:, 1]) / POSITION_M
         residual[:, 2] = (yaw - self.logged[:, 2]) / YAW_RAD
@@ -164,11 +165,11 @@ class _Problem:
         jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1 / POSITION_M
         jacobian[:, 0, 2], jacobian[:, 1, 2] = -o * sin / POSITION_M, o * cos / POSITION_M
         jacobian[:, 2, 2], jacobian[:, 3, 3] = 1 / YAW_RAD, 1 / SPEED_MPS
-        limits = ((4, accel, self.limits.max_accel_mps2), (5, curvature, self.limits.max_curvature_1pm))
-        for c, value, limit in limits:
-            beyond = np.abs(value) - limit
-            residual[:, c] = np.sign(value) * np.maximum(beyond, 0.0) / (BOUND * limit)
-            jacobian[:, c, c] = (beyond > 0) / (BOUND * limit)
+        limits = self.limits
+        residual[:, 4], jacobian[:, 4, 4] = _beyond(accel, limits.max_accel_mps2)
+        residual[:, 5], jacobian[:, 5, 5] = _beyond(curvature, limits.max_curvature_1pm)
+        residual[:, 6], slope = _beyond(speed**2 * curvature, limits.max_lateral_mps2)
+        jacobian[:, 6, 3], jacobian[:, 6, 5] = slope * 2 * speed * curvature, slope * speed**2
         return residual * scale, jacobian * scale
 
     def _rolls(self, state: Array) -> tuple[Array, Array]:
@@ -185,7 +186,7 @@ class _Problem:
                 (rise[:, 2] - h * mean[:, 3] * mean[:, 5]) / ROLL_RAD,
                 (rise[:, 3] - h * mean[:, 4]) / ROLL_MPS,
                 rise[:, 4] / np.sqrt(h * KNOT_S) / JERK_MPS3,
-                rise[:, 5] / np.sqrt(h * KNOT_S) / self._curvature_rate(),
+                rise[:, 5] / np.sqrt(h * KNOT_S) / self._curvature_rate,
             ],
             axis=1,
         )
@@ -201,14 +202,21 @@ class _Problem:
             )
             jacobian[:, 3, end + 4] = -h / 2 / ROLL_MPS
             jacobian[:, 4, end + 4] = sign / np.sqrt(h * KNOT_S) / JERK_MPS3
-            jacobian[:, 5, end + 5] = sign / np.sqrt(h * KNOT_S) / self._curvature_rate()
+            jacobian[:, 5, end + 5] = sign / np.sqrt(h * KNOT_S) / self._curvature_rate
         return residual, jacobian
 
+    @cached_property
     def _curvature_rate(self) -> Array:
         """Standard deviation (K - 1,) of the rate of curvature: by the steering, and by the passengers when fast."""
         pace = np.maximum(np.abs(self.logged[1:, 3]), np.abs(self.logged[:-1, 3]))
         steering = self.limits.max_curvature_rate_1pmps / 2
         return LATERAL_JERK_MPS3 / np.maximum(pace**2, LATERAL_JERK_MPS3 / steering)
+
+
+def _beyond(value: Array, limit: float) -> tuple[Array, Array]:
+    """How far values (K,) are beyond a limit of their size, in units of its softness, and the derivative of that."""
+    beyond = value - np.minimum(np.maximum(value, -limit), limit)
+    return beyond / (BOUND * limit), (beyond != 0) / (BOUND * limit)
 
 
 def _solve(diagonal: Array, beside: Array, gradient: Array, damping: float) -> NDArray[np.float64]:
