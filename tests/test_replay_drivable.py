@@ -76,6 +76,15 @@ def test_a_turn_tighter_than_full_lock_is_widened_and_flagged():
     assert vehicle_reference(fine, LIMITS, accel_ahead_s=0.1, curvature_ahead_s=0.1).flags == ()
 
 
+def test_a_bend_taken_faster_than_tires_hold_is_widened_and_flagged():
+    agent = driven(lambda t: np.full_like(t, 20.0), lambda s: ramp(s, (20, 0), (40, 0.04), (60, 0.04), (80, 0)), 6.0)
+    path = path_of(agent, 1.3)
+    course, _ = drivable_course(path, LIMITS)
+    assert np.abs(course.speed_mps**2 * course.curvature_1pm).max() < 1.05 * LIMITS.max_lateral_mps2  # 16 in the log
+    reference = vehicle_reference(path, LIMITS, accel_ahead_s=0.1, curvature_ahead_s=0.1)
+    assert any("distance from what can be driven" in flag for flag in reference.flags)
+
+
 @pytest.mark.parametrize("turned", [[0], [5], [20, 21, 22]])
 def test_boxes_turned_back_to_front_are_outvoted(turned):
     agent = MANEUVERS["lane change"]()

@@ -27,8 +27,9 @@ ROLL_M, ROLL_RAD, ROLL_MPS = 1e-3, 1e-3, 1e-2  # how exactly the wheels roll fro
 LOCK_SHARE = 0.95  # the rest of the lock is left to the controller
 BOUND = 0.002  # softness of limits, as a share of them
 
-ITERATIONS = 40
+ITERATIONS, TRIALS = 40, 16
 DONE = 1e-4  # relative gain at which the iteration ends
+SLOWEST_RADPS = 0.01
 STATES = 6  # x, y, yaw, speed, acceleration, curvature
 DAMPED = np.array([1 / POSITION_M, 1 / POSITION_M, 1 / YAW_RAD, 1 / SPEED_MPS, 1.0, 10.0]) ** 2
 
@@ -79,12 +80,12 @@ def nearest_course(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps
     away = wrap_angle(yaw_rad - axis)
     logged = np.stack([x_m, y_m, axis + away, np.where(np.abs(away) > np.pi / 2, -speed_mps, speed_mps)], axis=1)
     along = np.gradient(x_m, t_s) * np.cos(axis) + np.gradient(y_m, t_s) * np.sin(axis)
-    state = _first_guess(t_s, x_m, y_m, axis, along, limits.offset_m)
+    state = _first_guess(t_s, x_m, y_m, axis, along, limits)
     problem = _Problem(float(t_s[1] - t_s[0]), logged, limits)
     cost, damping = problem.cost(state), 1e-2
     for _ in range(ITERATIONS):
         diagonal, beside, gradient = problem.normal_equations(state)
-        for _ in range(8):
+        for _ in range(TRIALS):
             trial = state - _solve(diagonal, beside, gradient, damping)
             trial_cost = problem.cost(trial)
             if trial_cost < cost:
@@ -100,10 +101,7 @@ def nearest_course(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps
 
 def as_logged(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps: Array, limits: Limits) -> Course:
     """The course as the log has it, at times (K,), K >= 1: of a moment, or of a life too long to be fitted."""
-    guess = _first_guess(t_s, x_m, y_m, yaw_rad, speed_mps, limits.offset_m)
-    if len(t_s) > 1:
-        guess[:, 4] = np.gradient(speed_mps, t_s)
-    return Course(t_s, *guess.T)
+    return Course(t_s, *_first_guess(t_s, x_m, y_m, yaw_rad, speed_mps, limits).T)
 
 
 def _axis(yaw: Array) -> Array:
@@ -112,11 +110,18 @@ def _axis(yaw: Array) -> Array:
     return axis + np.pi if np.sum(np.cos(axis - yaw)) < 0 else axis
 
 
-def _first_guess(t_s: Array, x: Array, y: Array, yaw: Array, speed: Array, offset_m: float) -> Array:
-    """Rear axles as the log has them, without acceleration and curvature; (K, 6)."""
+def _first_guess(t_s: Array, x: Array, y: Array, yaw: Array, speed: Array, limits: Limits) -> Array:
+    """Rear axles as the log has them, acceleration and curvature within their limits; (K, 6)."""
     guess = np.zeros((len(t_s), STATES))
-    guess[:, 0], guess[:, 1] = x - offset_m * np.cos(yaw), y - offset_m * np.sin(yaw)
+    guess[:, 0], guess[:, 1] = x - limits.offset_m * np.cos(yaw), y - limits.offset_m * np.sin(yaw)
     guess[:, 2], guess[:, 3] = yaw, speed
+    if len(t_s) > 1:
+        accel, turn = np.gradient(speed, t_s), np.gradient(yaw, t_s)
+        guess[:, 4] = np.clip(accel, -limits.max_accel_mps2, limits.max_accel_mps2)
+        # As a share of the curvature that lock and grip allow, which leaves slow vehicles that turn on the spot at the lock.
+        pace = np.abs(speed)
+        most = limits.max_lateral_mps2 / np.maximum(pace**2, limits.max_lateral_mps2 / limits.max_curvature_1pm)
+        guess[:, 5] = most * np.clip(turn / np.maximum(most * pace, SLOWEST_RADPS), -1, 1) * np.sign(speed)
     return guess
 
 
