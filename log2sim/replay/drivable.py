@@ -82,18 +82,20 @@ def nearest_course(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps
     along = np.gradient(x_m, t_s) * np.cos(axis) + np.gradient(y_m, t_s) * np.sin(axis)
     state = _first_guess(t_s, x_m, y_m, axis, along, limits)
     problem = _Problem(float(t_s[1] - t_s[0]), logged, limits)
-    cost, damping = problem.cost(state), 1e-2
+    residuals = problem.residuals(state)
+    cost, damping = _cost(residuals), 1e-2
     for _ in range(ITERATIONS):
-        diagonal, beside, gradient = problem.normal_equations(state)
+        diagonal, beside, gradient = _normal_equations(residuals)
         for _ in range(TRIALS):
             trial = state - _solve(diagonal, beside, gradient, damping)
-            trial_cost = problem.cost(trial)
-            if trial_cost < cost:
+            residuals = problem.residuals(trial)
+            gain = cost - _cost(residuals)
+            if gain > 0:
                 break
             damping *= 8
         else:
             break
-        gain, state, cost, damping = cost - trial_cost, trial, trial_cost, max(damping / 4, 1e-9)
+        state, cost, damping = trial, cost - gain, max(damping / 4, 1e-9)
         if gain < DONE * cost:
             break
     return Course(t_s, *state.T)
@@ -133,28 +135,9 @@ class _Problem:
     logged: Array
     limits: Limits
 
-    def cost(self, state: Array) -> float:
-        """Half the sum of squares, the pseudo-Huber loss for headings and speeds."""
-        knot, _ = self._knots(state)
-        roll, _ = self._rolls(state)
-        plain = np.sum(roll**2) + np.sum(knot[:, [0, 1, 4, 5, 6]] ** 2)
-        return float(plain / 2 + np.sum(np.sqrt(1 + knot[:, 2:4] ** 2) - 1))
-
-    def normal_equations(self, state: Array) -> tuple[Array, Array, Array]:
-        """Blocks on the diagonal (K, 6, 6), below it (K - 1, 6, 6) and the gradient (K, 6) of the cost."""
-        r, j = self._knots(state)
-        weight = np.ones_like(r)
-        weight[:, 2:4] = 1 / np.sqrt(1 + r[:, 2:4] ** 2)
-        diagonal = np.einsum("kri,kr,krj->kij", j, weight, j)
-        gradient = np.einsum("kri,kr->ki", j, weight * r)
-        r, j = self._rolls(state)
-        both = np.einsum("kri,krj->kij", j, j)
-        push = np.einsum("kri,kr->ki", j, r)
-        diagonal[:-1] += both[:, :STATES, :STATES]
-        diagonal[1:] += both[:, STATES:, STATES:]
-        gradient[:-1] += push[:, :STATES]
-        gradient[1:] += push[:, STATES:]
-        return diagonal, both[:, STATES:, :STATES], gradient
+    def residuals(self, state: Array) -> Residuals:
+        """Residuals and their derivatives, of the knots and of the ways between them."""
+        return *self._knots(state), *self._rolls(state)
 
     def _knots(self, state: Array) -> tuple[Array, Array]:
         """Residuals (K, 7) against the log and the limits, and their derivatives (K, 7, 6)."""
@@ -165,16 +148,15 @@ class _Problem:
         jacobian = np.zeros((len(state), 7, STATES))
         residual[:, 0] = (x + o * cos - self.logged[:, 0]) / POSITION_M
         residual[:, 1] = (y + o * sin - self.logged[:, 1]) / POSITION_M
-        residual[:, 2] = (yaw - self.logged[:, 2]) / YAW_RAD
-        residual[:, 3] = (speed - self.logged[:, 3]) / SPEED_MPS
         jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1 / POSITION_M
         jacobian[:, 0, 2], jacobian[:, 1, 2] = -o * sin / POSITION_M, o * cos / POSITION_M
-        jacobian[:, 2, 2], jacobian[:, 3, 3] = 1 / YAW_RAD, 1 / SPEED_MPS
         limits = self.limits
-        residual[:, 4], jacobian[:, 4, 4] = _beyond(accel, limits.max_accel_mps2)
-        residual[:, 5], jacobian[:, 5, 5] = _beyond(curvature, limits.max_curvature_1pm)
-        residual[:, 6], slope = _beyond(speed**2 * curvature, limits.max_lateral_mps2)
-        jacobian[:, 6, 3], jacobian[:, 6, 5] = slope * 2 * speed * curvature, slope * speed**2
+        residual[:, 2], jacobian[:, 2, 4] = _beyond(accel, limits.max_accel_mps2)
+        residual[:, 3], jacobian[:, 3, 5] = _beyond(curvature, limits.max_curvature_1pm)
+        residual[:, 4], slope = _beyond(speed**2 * curvature, limits.max_lateral_mps2)
+        jacobian[:, 4, 3], jacobian[:, 4, 5] = slope * 2 * speed * curvature, slope * speed**2
+        residual[:, 5], jacobian[:, 5, 2] = (yaw - self.logged[:, 2]) / YAW_RAD, 1 / YAW_RAD
+        residual[:, 6], jacobian[:, 6, 3] = (speed - self.logged[:, 3]) / SPEED_MPS, 1 / SPEED_MPS
         return residual * scale, jacobian * scale
 
     def _rolls(self, state: Array) -> tuple[Array, Array]:
@@ -216,6 +198,33 @@ class _Problem:
         pace = np.maximum(np.abs(self.logged[1:, 3]), np.abs(self.logged[:-1, 3]))
         steering = self.limits.max_curvature_rate_1pmps / 2
         return LATERAL_JERK_MPS3 / np.maximum(pace**2, LATERAL_JERK_MPS3 / steering)
+
+
+Residuals = tuple[Array, Array, Array, Array]
+PLAIN, ROBUST = slice(5), slice(5, 7)  # of a knot's residuals; heading and speed count by the pseudo-Huber loss
+
+
+def _cost(residuals: Residuals) -> float:
+    """Half the sum of squares, the pseudo-Huber loss for headings and speeds."""
+    knot, _, roll, _ = residuals
+    plain = np.sum(roll**2) + np.sum(knot[:, PLAIN] ** 2)
+    return float(plain / 2 + np.sum(np.sqrt(1 + knot[:, ROBUST] ** 2) - 1))
+
+
+def _normal_equations(residuals: Residuals) -> tuple[Array, Array, Array]:
+    """Blocks on the diagonal (K, 6, 6), below it (K - 1, 6, 6) and the gradient (K, 6) of the cost."""
+    knot, knot_slopes, roll, roll_slopes = residuals
+    weight = np.ones_like(knot)
+    weight[:, ROBUST] = 1 / np.sqrt(1 + knot[:, ROBUST] ** 2)
+    weighted = (weight[:, :, None] * knot_slopes).transpose(0, 2, 1)
+    diagonal, gradient = weighted @ knot_slopes, (weighted @ knot[:, :, None])[:, :, 0]
+    turned = roll_slopes.transpose(0, 2, 1)
+    both, push = turned @ roll_slopes, (turned @ roll[:, :, None])[:, :, 0]
+    diagonal[:-1] += both[:, :STATES, :STATES]
+    diagonal[1:] += both[:, STATES:, STATES:]
+    gradient[:-1] += push[:, :STATES]
+    gradient[1:] += push[:, STATES:]
+    return diagonal, both[:, STATES:, :STATES], gradient
 
 
 def _beyond(value: Array, limit: float) -> tuple[Array, Array]:
