@@ -158,7 +158,7 @@ def test_map_offsets_of_a_thousand_kilometers_change_nothing():
 
 def closed_loop(x, y, yaw, speed, reference_speed, duration_s, dt_s=0.01):
     """States (N, 4) of a car that starts off a reference which goes straight along x from 0."""
-    state = VehicleState(*(np.array([v], float) for v in (x, y, yaw, speed, 0.0, 0.0)))
+    state = VehicleState(*(np.array([v], float) for v in (x, y, yaw, speed, 0, 0, 0, 0)))
     memory, out = Memory.fresh(1), []
     for k in range(round(duration_s / dt_s)):
         stands = float(reference_speed == 0)

@@ -28,7 +28,9 @@ def column(value):
 
 
 def at_rest(*, speed=0.0, steer=0.0, pedal=0.0):
-    return VehicleState(column(0), column(0), column(0), column(speed), column(steer), column(pedal))
+    return VehicleState(
+        column(0), column(0), column(0), column(speed), column(steer), column(pedal), column(0), column(0)
+    )
 
 
 def command(*, pedal=0.0, steer=0.0, reverse=False):

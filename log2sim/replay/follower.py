@@ -155,7 +155,8 @@ def start_vehicles(row: Array, parameters: VehicleParameters) -> VehicleState:
     angle = np.arctan(parameters.wheelbase_m * curvature)
     steer = np.minimum(np.maximum(angle, -parameters.max_steer_rad), parameters.max_steer_rad)
     pedal = np.minimum(np.maximum(accel * gear, -parameters.max_brake_mps2), parameters.max_throttle_mps2)
-    return VehicleState(x.copy(), y.copy(), yaw.copy(), np.where(stands > 0.5, 0.0, speed), steer, pedal)
+    still = np.zeros(len(x))
+    return VehicleState(x.copy(), y.copy(), yaw.copy(), np.where(stands > 0.5, 0.0, speed), steer, pedal, still, still)
 
 
 def start_points(row: Array) -> PointState:

@@ -28,6 +28,11 @@ WHEELED = ("car", "truck", "bus", "motorcycle", "cyclist", "bicycle")
 class Columns:
     """Base of records whose fields are arrays (A,)."""
 
+    @classmethod
+    def zeros(cls, count: int) -> Self:
+        """Agents whose columns are all zero."""
+        return cls(*(np.zeros(count) for _ in fields(cls)))
+
     def take(self, index: Any) -> Self:
         """The agents at `index` (integers, a slice or a mask)."""
         return type(self)(*(getattr(self, f.name)[index] for f in fields(self)))
@@ -42,7 +47,8 @@ class Columns:
 class VehicleState(Columns):
     """Rear axle `x_m`, `y_m`, `yaw_rad` (not wrapped), `speed_mps` (negative in reverse), and what the actuators do.
 
-    `pedal_mps2` is throttle (positive) or brake (negative), whatever the gear.
+    `pedal_mps2` is throttle (positive) or brake (negative), whatever the gear. `lateral_mps`, the rear axle's velocity to
+    the left, and `yaw_rate_radps` are states of the models that slip; the kinematic bicycle leaves them as they are.
     """
 
     x_m: Array
@@ -51,6 +57,8 @@ class VehicleState(Columns):
     speed_mps: Array
     steer_rad: Array
     pedal_mps2: Array
+    lateral_mps: Array
+    yaw_rate_radps: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +177,7 @@ def step_bicycle(
         chord = gear * distance * _sinc(turn / 2)
         x, y = x + chord * np.cos(yaw + turn / 2), y + chord * np.sin(yaw + turn / 2)
         yaw, speed = yaw + turn, gear * pace
-    return VehicleState(x, y, yaw, speed, steer, pedal)
+    return VehicleState(x, y, yaw, speed, steer, pedal, state.lateral_mps, state.yaw_rate_radps)
 
 
 def step_point(state: PointState, controls: PointControls, dt_s: float) -> PointState:

@@ -116,7 +116,7 @@ class Fleet(Group):
     ) -> None:
         super().__init__(agents, references, first, last)
         self.parameters, self.simulator = parameters, simulator
-        self._all = VehicleState(*(np.zeros(len(agents)) for _ in range(6)))
+        self._all = VehicleState.zeros(len(agents))
         self._all_memory = Memory.fresh(len(agents))
         self._open(self.live)
 
@@ -181,7 +181,7 @@ class Crowd(Group):
     ) -> None:
         super().__init__(agents, references, first, last)
         self.simulator = simulator
-        self._all = PointState(*(np.zeros(len(agents)) for _ in range(4)))
+        self._all = PointState.zeros(len(agents))
         self.state = self._all.take(self.live)
 
     def open_window(self, begin: int, end: int, begin_s: float, end_s: float) -> None:
