@@ -11,7 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from log2sim.geometry import Array
-from log2sim.replay.vehicle import Columns, PointControls, PointState, VehicleControls, VehicleParameters, VehicleState
+from log2sim.replay.vehicle import (
+    GRAVITY_MPS2,
+    Columns,
+    PointControls,
+    PointState,
+    VehicleControls,
+    VehicleParameters,
+    VehicleState,
+)
 
 
 @dataclass(frozen=True)
@@ -136,7 +144,8 @@ def _steer(
     windup = (wanted != limited) & (across * wanted > 0)
     grown = integral + np.where(windup | (pace == 0), 0.0, across) * (dt_s / (length**2 * gains.integral_s))
     bound = 0.2 * grip
-    return np.arctan(p.wheelbase_m * limited), np.minimum(np.maximum(grown, -bound), bound)
+    steer = np.arctan(p.wheelbase_m * limited * (1 + p.understeer_s2pm2 * pace**2))
+    return steer, np.minimum(np.maximum(grown, -bound), bound)
 
 
 def follow_points(row: Array, state: PointState, gains: Gains = GAINS) -> PointControls:
@@ -152,11 +161,13 @@ def follow_points(row: Array, state: PointState, gains: Gains = GAINS) -> PointC
 def start_vehicles(row: Array, parameters: VehicleParameters) -> VehicleState:
     """States of vehicles that are on their references `row` (C, A)."""
     x, y, yaw, speed, accel, curvature, gear, stands = row
-    angle = np.arctan(parameters.wheelbase_m * curvature)
+    angle = np.arctan(parameters.wheelbase_m * curvature * (1 + parameters.understeer_s2pm2 * speed**2))
     steer = np.minimum(np.maximum(angle, -parameters.max_steer_rad), parameters.max_steer_rad)
     pedal = np.minimum(np.maximum(accel * gear, -parameters.max_brake_mps2), parameters.max_throttle_mps2)
-    still = np.zeros(len(x))
-    return VehicleState(x.copy(), y.copy(), yaw.copy(), np.where(stands > 0.5, 0.0, speed), steer, pedal, still, still)
+    speed = np.where(stands > 0.5, 0.0, speed)
+    rate = speed * curvature
+    lateral = -rate * speed * np.abs(speed) / (GRAVITY_MPS2 * parameters.friction * parameters.rear_stiffness_1prad)
+    return VehicleState(x.copy(), y.copy(), yaw.copy(), speed, steer, pedal, lateral, rate)
 
 
 def start_points(row: Array) -> PointState:
