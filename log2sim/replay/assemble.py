@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.replay.collisions import Boxes, collisions
+from log2sim.replay.boxes import Boxes
+from log2sim.replay.collisions import collisions
 from log2sim.replay.metrics import agent_metrics, overall
 from log2sim.replay.path import Path
 from log2sim.replay.result import AgentReplay, Replay
