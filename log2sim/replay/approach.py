@@ -101,7 +101,12 @@ def _on_course(
         lines.append((start, mean))
     (x, ux), (y, uy) = lines
     for first in range(0, len(here), BLOCK):
-        i, j = (grid.ravel() for grid in np.meshgrid(np.arange(first, min(first + BLOCK, len(here))), np.arange(first, len(here)), indexing="ij"))
+        i, j = (
+            grid.ravel()
+            for grid in np.meshgrid(
+                np.arange(first, min(first + BLOCK, len(here))), np.arange(first, len(here)), indexing="ij"
+            )
+        )
         pair = (j > i) & (moves[here[i]] | moves[here[j]])
         i, j = i[pair], j[pair]
         meet = _circles_meet(

@@ -78,7 +78,7 @@ class Boxes:
             out.append(np.where(np.isnan(mean) & self.present, alone, mean))
         return out[0], out[1]
 
-    def poses(self, row: Array, agent: Rows) -> tuple[Array, Array, Array, Array]:
+    def poses(self, row: Array | Rows, agent: Rows) -> tuple[Array, Array, Array, Array]:
         """x, y, z and yaw (N,) of agents (N,) at rows (N,) with a fraction, which are within their lives."""
         k = np.floor(row).astype(np.intp)
         fraction = np.where(self.moves_on[k, agent], row - k, 0.0)
@@ -90,7 +90,7 @@ class Boxes:
         turn = wrap_angle(self.yaw_rad[after, agent] - self.yaw_rad[k, agent])
         return x, y, z, self.yaw_rad[k, agent] + np.where(fraction > 0, fraction * turn, 0.0)
 
-    def overlap(self, row_a: Array, a: Rows, row_b: Array, b: Rows) -> NDArray[np.bool_]:
+    def overlap(self, row_a: Array | Rows, a: Rows, row_b: Array | Rows, b: Rows) -> NDArray[np.bool_]:
         """Whether box a at its row overlaps box b at its own (N,)."""
         xa, ya, za, yaw_a = self.poses(row_a, a)
         xb, yb, zb, yaw_b = self.poses(row_b, b)

@@ -60,12 +60,13 @@ def contacts(boxes: Boxes, moves: NDArray[np.bool_], only: NDArray[np.bool_] | N
 
 def _motion(boxes: Boxes, k: Rows, after: Rows, a: Rows, b: Rows) -> Motion:
     """The motion of pairs (N,) from rows to later ones, which are the same where one of them does not move on."""
-    now, then = ([c[r, b] - c[r, a] for c in (boxes.x_m, boxes.y_m, boxes.z_m)] for r in (k, after))
-    turns = (wrap_angle(boxes.yaw_rad[after, agent] - boxes.yaw_rad[k, agent]) for agent in (a, b))
+    x, y, z = (c[k, b] - c[k, a] for c in (boxes.x_m, boxes.y_m, boxes.z_m))
+    then_x, then_y, then_z = (c[after, b] - c[after, a] for c in (boxes.x_m, boxes.y_m, boxes.z_m))
+    yaw_a, yaw_b = boxes.yaw_rad[k, a], boxes.yaw_rad[k, b]
+    turn_a, turn_b = wrap_angle(boxes.yaw_rad[after, a] - yaw_a), wrap_angle(boxes.yaw_rad[after, b] - yaw_b)
     return Motion(
-        *now, *(t - n for n, t in zip(now, then)), boxes.yaw_rad[k, a], boxes.yaw_rad[k, b], *turns,
-        boxes.size_m[a], boxes.size_m[b],
-    )  # fmt: skip
+        x, y, z, then_x - x, then_y - y, then_z - z, yaw_a, yaw_b, turn_a, turn_b, boxes.size_m[a], boxes.size_m[b]
+    )
 
 
 def _in_reach(
@@ -107,7 +108,7 @@ def collisions(
     for a, b in sorted(set(zip(touching.a.tolist(), touching.b.tolist()))):
         in_log = np.interp(_of_pair(known, a, b), rows, t_s)
         together = max(replayed.first_row[a], replayed.first_row[b])
-        for begin_row, end_row in _runs(*_of_pair(touching, a, b), SAME_CONTACT_S / _spacing(t_s)):
+        for begin_row, end_row in _runs(_of_pair(touching, a, b), SAME_CONTACT_S / _spacing(t_s)):
             begin, end = np.interp([begin_row, end_row], rows, t_s)
             shared = (in_log[0] <= end + LOG_WINDOW_S) & (in_log[1] >= begin - LOG_WINDOW_S)
             events.append(
@@ -129,8 +130,9 @@ def _of_pair(found: Contacts, a: int, b: int) -> Array:
     return np.stack([chosen.first_row, chosen.last_row])[:, np.argsort(chosen.first_row)]
 
 
-def _runs(first: Array, last: Array, gap: float) -> list[tuple[float, float]]:
-    """Begin and end of contacts (K,), those joined that are at most `gap` apart."""
+def _runs(contact: Array, gap: float) -> list[tuple[float, float]]:
+    """Begin and end of contacts (2, K), those joined that are at most `gap` apart."""
+    first, last = contact
     new = np.flatnonzero(first[1:] - last[:-1] > gap) + 1
     return [(float(f[0]), float(t[-1])) for f, t in zip(np.split(first, new), np.split(last, new))]
 

@@ -178,8 +178,7 @@ def _refined(boxes: Boxes, pairs: _Pairs) -> Encroachments:
             np.broadcast_to(c, shape).ravel()
             for c in (i[:, :, None], j[:, None, :], a[:, None, None], b[:, None, None])
         )
-        apart = np.where(boxes.overlap(all_i, all_a, all_j, all_b), all_j - all_i, np.inf).reshape(len(a), -1)
-        best = np.argmin(apart, axis=1)
-        row = np.arange(len(a))
-        left, came = all_i.reshape(len(a), -1)[row, best], all_j.reshape(len(a), -1)[row, best]
+        apart = np.where(boxes.overlap(all_i, all_a, all_j, all_b), all_j - all_i, np.inf)
+        best = np.argmin(apart.reshape(len(a), len(offset) ** 2), axis=1) + np.arange(len(a)) * len(offset) ** 2
+        left, came = all_i[best], all_j[best]
     return Encroachments(a, b, left, came)
