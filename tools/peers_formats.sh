@@ -22,7 +22,8 @@ metadrive() {
 }
 
 commonroad() {
-    environment commonroad commonroad-io==2026.1 commonroad-drivability-checker==2025.4.0 scipy jsonschema typer rich
+    # This checker needs modules that later releases of commonroad-io have moved.
+    environment commonroad commonroad-io==2024.3 commonroad-drivability-checker==2025.4.0
 }
 
 for name in "${@:-metadrive commonroad}"; do

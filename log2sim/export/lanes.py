@@ -47,8 +47,7 @@ def lanes(scenario: Scenario) -> tuple[Lane, ...]:
     movers = [a for a in scenario.others if GROUP_OF[a.category] == "vehicle" and not a.static]
     found: list[Lane] = []
     for agent in (*ego, *movers):
-        path = _path(agent)
-        if len(path) >= 2:
+        for path in _paths(agent):
             found += [Lane(agent.id, path[part], _width(agent)) for part in _new_parts(path, found)]
     return tuple(found) or (_lane_under((*ego, *scenario.agents)[0]),)
 
@@ -65,20 +64,38 @@ def _lane_under(agent: Agent) -> Lane:
     return Lane(agent.id, np.stack([center - ahead, center, center + ahead]), _width(agent))
 
 
-def _path(agent: Agent) -> Array:
-    """The path of an agent on the ground (N, 3), as long as its boxes reach; empty for one that hardly moves."""
+def _paths(agent: Agent) -> Iterator[Array]:
+    """Paths of an agent on the ground (N, 3), as long as its boxes reach; a new one where it changes gear.
+
+    They lead the way that the agent looks, so that one that backs into a gap does not make a lane of its own.
+    """
     w = agent.waypoints
     points = np.stack([w.x_m, w.y_m, w.z_m - agent.size_m[2] / 2], axis=-1)
-    kept = [points[0]]
-    for point in points[1:]:
-        if np.linalg.norm(point[:2] - kept[-1][:2]) >= SPACING_M:
-            kept.append(point)
-    if len(kept) < 2:
-        return np.zeros((0, 3))
+    kept = [0]
+    for k in range(1, len(points)):
+        if np.linalg.norm(points[k, :2] - points[kept[-1], :2]) >= SPACING_M:
+            kept.append(k)
+    points, yaw = points[kept], w.yaw_rad[kept]
+    step = np.diff(points[:, :2], axis=0)
+    forward = step[:, 0] * np.cos(yaw[:-1]) + step[:, 1] * np.sin(yaw[:-1]) >= 0
+    for start, stop in _runs(forward):
+        yield _lengthened(points[start : stop + 1], agent)
+    for start, stop in _runs(~forward):
+        yield _lengthened(points[start : stop + 1][::-1], agent)
+
+
+def _runs(mask: NDArray[np.bool_]) -> list[list[int]]:
+    """Start and stop of every run of True."""
+    edges: list[list[int]] = np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]]))).reshape(-1, 2).tolist()
+    return edges
+
+
+def _lengthened(points: Array, agent: Agent) -> Array:
+    """A path (N, 3), N >= 2, with half the agent's length and points in between added."""
     reach = agent.size_m[0] / 2 + MARGIN_M
-    first, last = kept[0] - kept[1], kept[-1] - kept[-2]
-    ends = kept[0] + first * reach / np.linalg.norm(first), kept[-1] + last * reach / np.linalg.norm(last)
-    return _dense(np.array([ends[0], *kept, ends[1]]))
+    first, last = points[0] - points[1], points[-1] - points[-2]
+    ends = points[0] + first * reach / np.linalg.norm(first), points[-1] + last * reach / np.linalg.norm(last)
+    return _dense(np.vstack([ends[0], points, ends[1]]))
 
 
 def _dense(points: Array) -> Array:
@@ -91,9 +108,7 @@ def _dense(points: Array) -> Array:
 
 def _new_parts(path: Array, found: list[Lane]) -> Iterator[slice]:
     """Parts of a path that no lane covers, each with the point where it leaves a lane or comes back to one."""
-    new = ~_covered(path, found)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], new, [False]]).astype(int)))
-    for start, stop in edges.reshape(-1, 2).tolist():
+    for start, stop in _runs(~_covered(path, found)):
         part = slice(max(start - 1, 0), min(stop + 1, len(path)))
         if np.linalg.norm(np.diff(path[part, :2], axis=0), axis=1).sum() >= SHORTEST_M:
             yield part

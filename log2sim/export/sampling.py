@@ -88,8 +88,7 @@ def clock(start_s: float, stop_s: float, step_s: float) -> Array:
             f"waypoints span {stop_s - start_s:g} s, at most {MOST_STEPS * step_s:g} s can be exported in steps of "
             f"{step_s:g} s; cut the scenario into parts"
         )
-    times: Array = start_s + step_s * np.arange(int(steps) + 1)
-    return times
+    return start_s + step_s * np.arange(int(steps) + 1, dtype=np.float64)
 
 
 def near_origin(scenario: Scenario) -> Array:
