@@ -22,6 +22,8 @@ BUILT_IN: dict[str, dict[str, str]] = {
     },
     "export": {
         "csv": "log2sim.export.csv_table:EXPORTER",
+        "scenarionet": "log2sim.export.scenarionet:EXPORTER",
+        "commonroad": "log2sim.export.commonroad:EXPORTER",
     },
 }
 
