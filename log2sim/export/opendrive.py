@@ -9,37 +9,57 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from log2sim.errors import ConfigError
-from log2sim.export.placement import origin_m
+from log2sim.export.placement import Placement, near_origin, on_map
+from log2sim.export.road_checks import require_roads
 from log2sim.export.roads import Road, roads_of
-from log2sim.export.xml_text import element, escaped, number, read, write
+from log2sim.export.xml_text import element, escaped, number, read, require_number, write
 from log2sim.scenario import Scenario
+from log2sim.types import MapFrame
 
 FILE_NAME = "road.xodr"
 # Positions to 10 nm and angles to 1e-12 rad: pieces that follow each other leave no gap that a checker sees.
 LENGTH_DIGITS, ANGLE_DIGITS, CUBIC_DIGITS = 8, 12, 12
 
 
-def add_road_file(scenario: Scenario, folder: Path, map_path: Path | None) -> str:
-    """Write the road of a scenario into a folder, or a copy of the user's; returns the file's name.
+def add_road_file(scenario: Scenario, folder: Path, map_path: Path | None) -> tuple[str, Placement]:
+    """Write the road of a scenario into a folder, or a copy of the user's; returns its name and where agents are on it.
 
     Raises
     ------
+    ScenarioError
+        When the user's file is no OpenDRIVE file that players can use.
     ConfigError
-        When the user's file is no OpenDRIVE file.
+        When its coordinates cannot be brought together with the scenario's.
     """
     if map_path is None:
-        write(document(scenario), folder / FILE_NAME)
-        return FILE_NAME
+        placement = near_origin(scenario)
+        root = document(scenario, placement)
+        require_roads(root, FILE_NAME)
+        write(root, folder / FILE_NAME)
+        return FILE_NAME, placement
     root = read(map_path)
-    if root.tag != "OpenDRIVE" or root.find("header") is None:
-        raise ConfigError(f"--map {map_path}: its root is <{root.tag[:40]}>, expected <OpenDRIVE> with a <header>")
+    require_roads(root, str(map_path))
     shutil.copyfile(map_path, folder / FILE_NAME)
-    return FILE_NAME
+    return FILE_NAME, _placement_on(root, scenario, map_path)
 
 
-def document(scenario: Scenario) -> Element:
-    """The OpenDRIVE document of a scenario's roads, about the same origin as its other files."""
-    x0, y0 = origin_m(scenario)
+def _placement_on(root: Element, scenario: Scenario, map_path: Path) -> Placement:
+    offset, turned = root.find("header/offset"), "0"
+    values = [0.0, 0.0, 0.0]
+    if offset is not None:
+        turned = offset.get("hdg", "0")
+        values = [require_number(offset.get(key, "0"), f"{map_path}: offset {key}") for key in "xyz"]
+    if require_number(turned, f"{map_path}: offset hdg") != 0:
+        raise ConfigError(
+            f"--map {map_path}: its offset turns the map (hdg={turned[:20]}), which is not supported; use one with hdg=0"
+        )
+    x, y, z = values
+    return on_map(scenario.map, (root.findtext("header/geoReference") or "").strip() or None, (x, y, z))
+
+
+def document(scenario: Scenario, placement: Placement) -> Element:
+    """The OpenDRIVE document of a scenario's roads, about the same origin as the agents."""
+    x0, y0, _ = placement.origin_m
     roads = roads_of(scenario)
     ends = np.concatenate([r.line.at(np.linspace(0.0, r.line.length_m, 50))[:, :2] for r in roads]) - [x0, y0]
     (west, south), (east, north) = ends.min(axis=0), ends.max(axis=0)
@@ -48,23 +68,23 @@ def document(scenario: Scenario) -> Element:
         "header", root, revMajor="1", revMinor="7", name=escaped(scenario.name), version="1", vendor="log2sim",
         north=number(north), south=number(south), east=number(east), west=number(west),
     )  # fmt: skip
-    _add_place(header, scenario, x0, y0)
+    _add_place(header, scenario.map, placement)
     for k, road in enumerate(roads):
-        _add_road(root, road, k + 1, x0, y0)
+        _add_road(root, road, k + 1, placement)
     return root
 
 
-def _add_place(header: Element, scenario: Scenario, x0: float, y0: float) -> None:
+def _add_place(header: Element, frame: MapFrame, placement: Placement) -> None:
     """Where on Earth: projected coordinates are those of the file plus its offset."""
-    place = scenario.map
-    if place.projection is not None:
-        element("geoReference", header).text = place.projection
-    x, y, z = place.offset_m
-    if (x + x0, y + y0, z) != (0.0, 0.0, 0.0):
-        element("offset", header, x=number(x + x0), y=number(y + y0), z=number(z), hdg="0")
+    if frame.projection is not None:
+        element("geoReference", header).text = frame.projection
+    x, y, z = (float(a + b) for a, b in zip(frame.offset_m, placement.origin_m))
+    if (x, y, z) != (0.0, 0.0, 0.0):
+        element("offset", header, x=number(x), y=number(y), z=number(z), hdg="0")
 
 
-def _add_road(root: Element, road: Road, road_id: int, x0: float, y0: float) -> None:
+def _add_road(root: Element, road: Road, road_id: int, placement: Placement) -> None:
+    x0, y0, z0 = placement.origin_m
     parent = element(
         "road", root, name=escaped(road.name), length=number(road.line.length_m, LENGTH_DIGITS), id=str(road_id), junction="-1", rule="RHT"
     )  # fmt: skip
@@ -79,8 +99,8 @@ def _add_road(root: Element, road: Road, road_id: int, x0: float, y0: float) -> 
         else:
             element("arc", geometry, curvature=number(piece.curvature_1pm, ANGLE_DIGITS))
     profile = element("elevationProfile", parent)
-    for s, *cubic in road.elevation:
-        _add_cubic(profile, "elevation", "s", s, cubic)
+    for s, a, *rest in road.elevation:
+        _add_cubic(profile, "elevation", "s", s, [a - z0, *rest])
     element("lateralProfile", parent)
     _add_lanes(parent, road)
 

@@ -12,7 +12,7 @@ from log2sim.export import Options
 from log2sim.export.opendrive import add_road_file
 from log2sim.export.openscenario_entities import add_entity
 from log2sim.export.openscenario_story import Revision, add_storyboard, part_of
-from log2sim.export.placement import origin_m
+from log2sim.export.placement import Placement
 from log2sim.export.xml_text import element, escaped, number, unique_names, write
 from log2sim.scenario import Scenario
 
@@ -34,25 +34,24 @@ class OpenScenario:
         if revision is None:
             known = ", ".join(REVISIONS)
             raise ConfigError(f"--revision {options.revision}: OpenSCENARIO XML is written as one of {known}")
-        road = add_road_file(scenario, folder, options.map)
-        write(document(scenario, road, revision), folder / "scenario.xosc")
+        road, placement = add_road_file(scenario, folder, options.map)
+        write(document(scenario, road, placement, revision), folder / "scenario.xosc")
 
 
 EXPORTER = OpenScenario()
 
 
-def document(scenario: Scenario, road: str, revision: Revision) -> Element:
+def document(scenario: Scenario, road: str, placement: Placement, revision: Revision) -> Element:
     """The document of a scenario whose road lies in the file `road` beside it."""
-    origin = origin_m(scenario)
     names = unique_names(a.id for a in scenario.agents)
     duration_s = max(scenario.duration_s, *(float(a.waypoints.t_s[-1]) for a in scenario.agents))
-    parts = [part_of(a, name, duration_s, origin) for a, name in zip(scenario.agents, names)]
+    parts = [part_of(a, name, duration_s, placement) for a, name in zip(scenario.agents, names)]
     root = element("OpenSCENARIO")
     element(
         "FileHeader", root,
         revMajor="1", revMinor=str(revision.minor), date=_date(scenario.t0_ns), author="log2sim", description=_title(scenario.name),
     )  # fmt: skip
-    _add_parameters(root, scenario, origin)
+    _add_parameters(root, scenario, placement)
     element("CatalogLocations", root)
     element("LogicFile", element("RoadNetwork", root), filepath=road)
     entities = element("Entities", root)
@@ -62,15 +61,17 @@ def document(scenario: Scenario, road: str, revision: Revision) -> Element:
     return root
 
 
-def _add_parameters(root: Element, scenario: Scenario, origin: tuple[float, float]) -> None:
+def _add_parameters(root: Element, scenario: Scenario, placement: Placement) -> None:
     """What an import needs of the scenario as a whole; 1.0 and 1.1 have no properties that belong to no agent."""
     values = {
         "log2sim_name": escaped(scenario.name),
         "log2sim_t0_ns": str(scenario.t0_ns),
         "log2sim_duration_s": number(scenario.duration_s, 9),
         "log2sim_map": escaped(json.dumps(vars(scenario.map))),
-        "log2sim_origin_m": f"{number(origin[0])} {number(origin[1])}",
+        "log2sim_origin_m": " ".join(number(v) for v in placement.origin_m),
     }
+    if placement.target is not None:
+        values["log2sim_projection"] = escaped(placement.target)
     parameters = element("ParameterDeclarations", root)
     for name, value in values.items():
         element("ParameterDeclaration", parameters, name=name, parameterType="string", value=value)

@@ -12,6 +12,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from log2sim.export.placement import Placement
 from log2sim.export.xml_text import element, number
 from log2sim.geometry import Array
 from log2sim.scenario import Agent
@@ -64,13 +65,13 @@ class Part:
         return float(self.vertices[-1, 0])
 
 
-def part_of(agent: Agent, name: str, duration_s: float, origin_m: tuple[float, float]) -> Part:
+def part_of(agent: Agent, name: str, duration_s: float, placement: Placement) -> Part:
     """The part of an agent: the middle of its rear axle on the ground, headings that never jump by a turn."""
     w = agent.waypoints
-    heading = np.unwrap(w.yaw_rad)
-    x = w.x_m - origin_m[0] - agent.rear_axle_offset_m * np.cos(heading)
-    y = w.y_m - origin_m[1] - agent.rear_axle_offset_m * np.sin(heading)
-    vertices = np.column_stack([w.t_s, x, y, w.z_m - agent.size_m[2] / 2, heading])
+    states = placement.forward(np.column_stack([w.x_m, w.y_m, w.z_m, np.unwrap(w.yaw_rad)]))
+    heading, axle_m = states[:, 3], agent.rear_axle_offset_m
+    back = np.column_stack([axle_m * np.cos(heading), axle_m * np.sin(heading), np.full(len(w), agent.size_m[2] / 2)])
+    vertices = np.column_stack([w.t_s, states[:, :3] - back, heading])
     if len(vertices) == 1:
         vertices = np.repeat(vertices, 2, axis=0) + np.outer([0, MOMENT_S], [1, 0, 0, 0, 0])
     enters, leaves = w.t_s[0] > SAME_TIME_S, vertices[-1, 0] < duration_s - SAME_TIME_S

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -114,7 +115,7 @@ def fit(xy_m: Array) -> tuple[ReferenceLine, Array]:
     ends = _longest_biarcs(samples)
     steps, stations = [], np.zeros(len(samples))
     s = 0.0
-    for i, j in zip(ends[:-1], ends[1:]):
+    for i, j in pairwise(ends):
         pair = _biarc(samples[i], samples[j])
         steps += pair
         length = sum(step[3] for step in pair)
@@ -185,7 +186,9 @@ def _biarc(start: Array, end: Array) -> list[tuple[float, float, float, float, f
 def _arc(start: Array, heading: float, end: Array) -> tuple[float, float, float, float, float]:
     chord = end - start
     distance = float(np.hypot(*chord))
-    off = float(np.arctan2(np.cos(heading) * chord[1] - np.sin(heading) * chord[0], chord @ [np.cos(heading), np.sin(heading)]))
+    off = float(
+        np.arctan2(np.cos(heading) * chord[1] - np.sin(heading) * chord[0], chord @ [np.cos(heading), np.sin(heading)])
+    )
     if distance * abs(off) / 4 < FLAT_M:
         return float(start[0]), float(start[1]), heading, distance, 0.0
     return float(start[0]), float(start[1]), heading, distance * off / np.sin(off), 2 * np.sin(off) / distance

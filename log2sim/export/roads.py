@@ -27,6 +27,8 @@ JOIN_M = 10.0
 # Along a road, not across it.
 ALONG_RAD = np.deg2rad(30.0)
 PROBE_M = 0.25
+# Heights are averaged over this length: the ego's are surveyed, those of others measured from afar.
+EGO_LEVEL_M, LEVEL_M = 1.0, 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,16 +57,22 @@ class Road:
         dx, dy = points[:, 0] - x, points[:, 1] - y
         along, across = dx * np.cos(heading) + dy * np.sin(heading), dy * np.cos(heading) - dx * np.sin(heading)
         turned = np.abs(wrap_angle(points[:, 2] - heading))
-        left, right = (self.lane_m / 2 + self.left_m, self.lane_m / 2 + self.right_m) if aside_m is None else (aside_m,) * 2
+        left, right = (
+            (self.lane_m / 2 + self.left_m, self.lane_m / 2 + self.right_m) if aside_m is None else (aside_m,) * 2
+        )
         parallel = np.minimum(turned, np.pi - turned) <= ALONG_RAD
         return parallel & (np.abs(along) <= PROBE_M) & (across <= left) & (across >= -right)
 
 
 @dataclass(frozen=True, eq=False)
 class Way:
-    """A stretch of an agent's path without a reversal, in the direction in which it points: points (N, 4) x, y, z, heading."""
+    """A stretch of an agent's path without a reversal, in the direction in which it points.
+
+    `points` (N, 4) are x, y, z, heading; `beyond_m` is how far a road goes on straight before and after them.
+    """
 
     points: Array
+    beyond_m: tuple[float, float] = (BEYOND_M, BEYOND_M)
 
 
 def roads_of(scenario: Scenario) -> list[Road]:
@@ -75,17 +83,15 @@ def roads_of(scenario: Scenario) -> list[Road]:
     vehicles = [a for a in scenario.agents if a.category != "pedestrian"] or list(scenario.agents)
     first = scenario.ego or max(vehicles, key=lambda a: float(np.ptp(_progress(a))))
     roads: list[Road] = []
-    for way in ways(first) or [None]:
-        if way is None:
-            roads.append(_standing_road(first))
-        elif not roads or not all(_covered(roads, way, TOLERANCE_M)):
-            roads.append(_road(first, way.points, beside_m=LANE_M))
-    for agent in vehicles:
-        if agent is first or agent.static:
-            continue
+    for way in ways(first):
+        if not roads or not _covered(roads, way, TOLERANCE_M).all():
+            roads.append(_road(first, way, beside_m=LANE_M, level_m=EGO_LEVEL_M))
+    if not roads:
+        roads.append(_standing_road(first))
+    others = [a for a in vehicles if a is not first and not a.static]
+    for agent in sorted(others, key=lambda a: -float(np.ptp(_progress(a)))):
         for way in ways(agent):
-            for points in _off_roads(way, roads):
-                roads.append(_road(agent, points))
+            roads.extend([_road(agent, part) for part in _off_roads(way, roads)])
     return roads
 
 
@@ -137,8 +143,8 @@ def _covered(roads: list[Road], way: Way, aside_m: float | None) -> NDArray[np.b
     return np.any([road.holds(states, aside_m) for road in roads], axis=0)
 
 
-def _off_roads(way: Way, roads: list[Road]) -> Iterator[Array]:
-    """Points (N, 4) of the stretches of a way that leave the roads, with `JOIN_M` of the way on either side."""
+def _off_roads(way: Way, roads: list[Road]) -> Iterator[Way]:
+    """The stretches of a way that leave the roads, with `JOIN_M` of the way on either side."""
     travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way.points[:, :2], axis=0).T))])
     if travelled[-1] < SHORTEST_WAY_M:
         return
@@ -150,15 +156,16 @@ def _off_roads(way: Way, roads: list[Road]) -> Iterator[Array]:
         begin, end = travelled[run[0]] - JOIN_M, travelled[run[-1]] + JOIN_M
         rows = np.flatnonzero((travelled >= begin) & (travelled <= end))
         if len(rows) >= 2 and travelled[rows[-1]] - travelled[rows[0]] >= SHORTEST_WAY_M:
-            yield way.points[rows]
+            ends = (rows[0] == 0, rows[-1] == len(way.points) - 1)
+            yield Way(way.points[rows], (BEYOND_M * ends[0], BEYOND_M * ends[1]))
 
 
-def _road(agent: Agent, points: Array, beside_m: float = 0.0) -> Road:
-    line, stations = fit(points[:, :2])
-    return Road(
-        agent.id, line.extended(BEYOND_M, BEYOND_M), _elevation(stations + BEYOND_M, points[:, 2], line.length_m + 2 * BEYOND_M),
-        _lane_m(agent), beside_m, beside_m,
-    )  # fmt: skip
+def _road(agent: Agent, way: Way, beside_m: float = 0.0, level_m: float = LEVEL_M) -> Road:
+    line, stations = fit(way.points[:, :2])
+    before, after = way.beyond_m
+    line = line.extended(before, after)
+    elevation = _elevation(stations + before, way.points[:, 2], line.length_m, level_m)
+    return Road(agent.id, line, elevation, _lane_m(agent), beside_m, beside_m)
 
 
 def _standing_road(agent: Agent) -> Road:
@@ -173,18 +180,17 @@ def _lane_m(agent: Agent) -> float:
     return max(LANE_M, agent.size_m[1] + SPARE_M)
 
 
-def _elevation(stations: Array, ground_m: Array, length_m: float) -> Array:
-    """Cubics (K, 5) s, a, b, c, d through heights (N,) at stations (N,), flat before and after them, without overshoot."""
+def _elevation(stations: Array, ground_m: Array, length_m: float, level_m: float) -> Array:
+    """Cubics (K, 5) s, a, b, c, d through the mean of heights (N,) every `level_m`, flat at the ends, without overshoot."""
     from scipy.interpolate import PchipInterpolator
 
-    kept = [0]
-    for k in range(1, len(stations)):
-        if stations[k] - stations[kept[-1]] >= 1.0:
-            kept.append(k)
-    s = np.concatenate([[0.0], stations[kept], [length_m]])
-    z = np.concatenate([ground_m[:1], ground_m[kept], ground_m[kept[-1:]]])
-    d, c, b, a = PchipInterpolator(s, z).c
-    rows = np.column_stack([s[:-1], a, b, c, d])
+    block = np.floor((stations - stations[0]) / level_m).astype(int)
+    _, first, counts = np.unique(block, return_index=True, return_counts=True)
+    s, z = (np.add.reduceat(v, first) / counts for v in (stations, ground_m))
+    s, z = np.concatenate([[0.0], s, [length_m]]), np.concatenate([z[:1], z, z[-1:]])
+    apart = np.concatenate([np.diff(s) > 1e-6, [True]])
+    d, c, b, a = PchipInterpolator(s[apart], z[apart]).c
+    rows = np.column_stack([s[apart][:-1], a, b, c, d])
     # Flat ground is one row; checkers rightly call the others redundant.
-    repeated = np.concatenate([[False], (np.abs(rows[1:, 2:]).max(axis=1) < 1e-12) & (np.abs(rows[:-1, 2:]).max(axis=1) < 1e-12)])
-    return rows[~repeated]
+    flat = np.abs(rows[:, 2:]).max(axis=1) < 1e-12
+    return rows[~np.concatenate([[False], flat[1:] & flat[:-1]])]

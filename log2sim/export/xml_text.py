@@ -74,7 +74,9 @@ class _Reader:
     def start(self, tag: str, attributes: dict[str, str]) -> None:
         self.depth += 1
         if self.depth > DEPTH_LIMIT:
-            raise ScenarioError(f"{self.where}: elements nest deeper than {DEPTH_LIMIT}; is this a scenario or road file?")
+            raise ScenarioError(
+                f"{self.where}: elements nest deeper than {DEPTH_LIMIT}; is this a scenario or road file?"
+            )
         self.builder.start(tag, attributes)
 
     def end(self, tag: str) -> None:
@@ -82,7 +84,9 @@ class _Reader:
         self.builder.end(tag)
 
     def refuse(self, *_: object) -> None:
-        raise ScenarioError(f"{self.where}: has a document type declaration, which is not read; remove its <!DOCTYPE ...>")
+        raise ScenarioError(
+            f"{self.where}: has a document type declaration, which is not read; remove its <!DOCTYPE ...>"
+        )
 
 
 def read(path: Path) -> ElementTree.Element:
