@@ -12,7 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from log2sim.geometry import Array, cos_sin
-from log2sim.replay.vehicle import Columns, PointControls, PointState, VehicleControls, VehicleParameters, VehicleState
+from log2sim.replay.vehicle import (
+    GRAVITY_MPS2,
+    Columns,
+    PointControls,
+    PointState,
+    VehicleControls,
+    VehicleParameters,
+    VehicleState,
+)
 
 
 @dataclass(frozen=True)
@@ -104,7 +112,8 @@ def follow_vehicles(
 
     held = (stands > 0.5) & (pace < gains.hold_below_mps) & (error[0] * reference_gear < gains.hold_within_m)
     given[0, held], integral[0, held] = -gains.hold_brake_mps2, 0.0
-    controls = VehicleControls(given[0], np.arctan(p.wheelbase_m * given[1]), reference_gear < 0)
+    steer = np.arctan(p.wheelbase_m * given[1] * (1 + p.understeer_s2pm2 * pace**2))
+    controls = VehicleControls(given[0], steer, reference_gear < 0)
     return controls, Memory(integral, rate)
 
 
@@ -145,11 +154,13 @@ def follow_points(row: Array, state: PointState, gains: Gains = GAINS) -> PointC
 def start_vehicles(row: Array, parameters: VehicleParameters) -> VehicleState:
     """States of vehicles that are on their references `row` (C, A)."""
     x, y, yaw, speed, accel, curvature, gear, stands = row
-    angle = np.arctan(parameters.wheelbase_m * curvature)
+    angle = np.arctan(parameters.wheelbase_m * curvature * (1 + parameters.understeer_s2pm2 * speed**2))
     steer = np.minimum(np.maximum(angle, -parameters.max_steer_rad), parameters.max_steer_rad)
     pedal = np.minimum(np.maximum(accel * gear, -parameters.max_brake_mps2), parameters.max_throttle_mps2)
     speed, pedal = np.where(stands > 0.5, 0.0, [speed, pedal])
-    return VehicleState(x.copy(), y.copy(), yaw.copy(), speed, steer, pedal)
+    rate = speed * curvature
+    lateral = -rate * speed * np.abs(speed) / (GRAVITY_MPS2 * parameters.friction * parameters.rear_stiffness_1prad)
+    return VehicleState(x.copy(), y.copy(), yaw.copy(), speed, steer, pedal, lateral, rate)
 
 
 def start_points(row: Array) -> PointState:
