@@ -33,14 +33,14 @@ def comfort(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array) -> dict[str, flo
     Returns
     -------
     dict or None
-        None for fewer than four rows, which have no third derivative.
+        None for fewer than five rows, which no window fits.
 
     Notes
     -----
     Derivatives of cubics fitted to the positions in a sliding window (Savitzky and Golay, 1964): longitudinal along the
     heading, lateral across it, both of the box center whatever drives it. What changes faster than the window is damped.
     """
-    if len(t_s) < 4:
+    if len(t_s) < 5:
         return None
     spacing_s = (t_s[-1] - t_s[0]) / (len(t_s) - 1)
     ax, ay = (_derivative(c, 2, ACCEL_WINDOW_S, spacing_s) for c in (x_m, y_m))
