@@ -167,7 +167,8 @@ def test_only_who_is_seen_to_leave_and_who_is_seen_to_come_counts():
 def test_the_shortest_post_encroachment_times_are_those_of_all_rows():
     boxes = town(30, seed=11)
     found = encroachments(boxes, SPACING_S)
-    got = {(min(p), max(p)): (c - l) for p, c, l in zip(zip(found.first.tolist(), found.second.tolist()), found.came_row, found.left_row)}  # fmt: skip
+    pairs = [(min(p), max(p)) for p in zip(found.first.tolist(), found.second.tolist())]
+    got = dict(zip(pairs, (found.came_row - found.left_row).tolist()))
     i, j = (g.ravel() for g in np.meshgrid(np.arange(len(T_S)), np.arange(len(T_S)), indexing="ij"))
     i, j = i[i < j], j[i < j]
     expected = {}

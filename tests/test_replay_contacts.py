@@ -22,8 +22,8 @@ def boxes_of(*tracks, size=(4.0, 2.0, 1.5)):
     shape = (len(T_S), len(tracks))
     x, y, yaw = (np.full(shape, np.nan) for _ in range(3))
     for k, (fx, fy, fyaw, *life) in enumerate(tracks):
-        begin, end = life or (-np.inf, np.inf)
-        there = (T_S > begin - 1e-9) & (T_S < end + 1e-9)
+        begin, end = life or (T_S[0], T_S[-1])
+        there = np.abs(T_S - (begin + end) / 2) < (end - begin) / 2 + 1e-9
         for column, f in ((x, fx), (y, fy), (yaw, fyaw)):
             column[there, k] = (f(T_S) if callable(f) else np.full(len(T_S), f))[there]
     sizes = np.array(size if np.ndim(size) == 2 else [size] * len(tracks), float)
