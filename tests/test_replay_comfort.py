@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from command_line import run
 from replay_maneuvers import MANEUVERS, agent_from, driven, ramp, scenario_of
+from scipy.signal import savgol_filter
 
 from log2sim.errors import CheckFailed, ConfigError
 from log2sim.files import write_json
@@ -20,7 +21,7 @@ from log2sim.replay import (
     replay,
     require_strict,
 )
-from log2sim.replay.comfort import LIMITS, comfort
+from log2sim.replay.comfort import LIMITS, _derivative, comfort
 
 T_S = np.arange(0, 121) * 0.05
 
@@ -68,6 +69,15 @@ def test_each_limit_of_comfort_counts(key, x, y, yaw):
     broken = [k for k, limit in LIMITS.items() if comfort(T_S, x, y, yaw)[k] > limit]
     assert broken == [key]
     assert not comfort(T_S, x, y, yaw)["comfortable"]
+
+
+@pytest.mark.parametrize("count", [5, 8, 16, 90])
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_derivatives_are_those_of_scipy(count, order):
+    values = np.cumsum(np.random.default_rng(count).normal(size=count))
+    window = min(2 * round(0.75 / 0.05 / 2) + 1, count - (count + 1) % 2)
+    expected = savgol_filter(values, window, 3, deriv=order, delta=0.05)
+    np.testing.assert_allclose(_derivative(values, order, 0.75, 0.05), expected, rtol=1e-8, atol=1e-6)
 
 
 def test_short_lives_have_no_comfort_and_standing_is_comfortable():
