@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,9 @@ MOST_FRAMES = 300
 
 TAIL_S = 1.5
 DPI = {".gif": 96, ".mp4": 128}
+
+CLEAR = 255
+"""The index of a .gif that paints nothing; the ones below are colors."""
 
 SWATCH_PX = 100
 """Width of what speaks for the colors of agents when a palette is chosen."""
@@ -193,20 +197,33 @@ def _tail(agent: Agent, t_s: float) -> Array:
 def _write_gif(frames: Iterator[Image], path: Path, colors: Sequence[str]) -> None:
     from PIL import Image as Pillow
 
-    # One palette for all frames keeps colors still and lets the encoder store only what changes. It is chosen by area, so
-    # colors that mean something get some.
     first = next(frames)
-    rgb = np.array([to_rgb(color) for color in colors])
-    swatches = np.rint(255 * rgb).astype(np.uint8)[:, None].repeat(first.shape[0] // len(rgb) + 1, axis=0)
-    wide = np.concatenate([first, swatches[: first.shape[0]].repeat(SWATCH_PX, axis=1)], axis=1)
-    palette = Pillow.fromarray(wide).quantize(255, dither=Pillow.Dither.NONE)
+    palette = Pillow.fromarray(_with_swatches(first, colors)).quantize(CLEAR, dither=Pillow.Dither.NONE)
 
-    def quantized() -> Iterator[Any]:
-        for frame in frames:
-            yield Pillow.fromarray(frame).quantize(palette=palette, dither=Pillow.Dither.NONE)
+    def changes() -> Iterator[Any]:
+        """Frames in which all that stays as it was is clear, which makes the file several times smaller."""
+        before = None
+        for frame in itertools.chain([first], frames):
+            now = np.asarray(Pillow.fromarray(frame).quantize(palette=palette, dither=Pillow.Dither.NONE))
+            picture = Pillow.fromarray(now if before is None else np.where(now == before, np.uint8(CLEAR), now))
+            picture.putpalette(palette.getpalette() or ())
+            if before is not None:
+                picture.info["transparency"] = CLEAR
+            before = now
+            yield picture
 
-    start = Pillow.fromarray(first).quantize(palette=palette, dither=Pillow.Dither.NONE)
-    start.save(path, save_all=True, append_images=quantized(), duration=round(1000 / FPS), loop=0, optimize=False)
+    pictures = changes()
+    next(pictures).save(
+        path, save_all=True, append_images=pictures, duration=round(1000 / FPS), loop=0, optimize=False, disposal=1,
+        transparency=CLEAR,
+    )  # fmt: skip
+
+
+def _with_swatches(frame: Image, colors: Sequence[str]) -> Image:
+    """A frame to choose one palette for all of them by: since colors count by area, those that mean something get some."""
+    rgb = np.rint(255 * np.array([to_rgb(color) for color in colors])).astype(np.uint8)
+    row = np.arange(len(frame)) * len(rgb) // len(frame)
+    return np.concatenate([frame, np.repeat(rgb[row][:, None], SWATCH_PX, axis=1)], axis=1)
 
 
 def _write_mp4(frames: Iterator[Image], path: Path, asked_for: Path) -> None:

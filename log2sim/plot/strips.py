@@ -14,7 +14,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from log2sim.geometry import Array
 from log2sim.plot.cast import Cast, Role
-from log2sim.plot.look import ALARM, FONT, FRAME, GRID, INK, MUTED, PAPER, halo
+from log2sim.plot.look import ALARM, FONT, FRAME, GRID, INK, MUTED, PAPER, halo, printable
 from log2sim.plot.sheet import HEAD_IN, LEFT_IN, SIDE_IN, STRIP_GAP_IN, STRIP_IN, TIME_IN, WIDTH_IN, Sheet
 from log2sim.scenario import Scenario
 
@@ -136,10 +136,11 @@ def draw_strips(sheet: Sheet, story: Story, span_s: tuple[float, float], *, movi
         ax = sheet.figure.add_axes((LEFT_IN / WIDTH_IN, bottom / height, width / WIDTH_IN, STRIP_IN / height))
         _draw_strip(ax, strip, story, span_s, last=k == count - 1, moving=moving)
         axes.append(ax)
-    name = "ego" if story.role.is_ego else f"{story.role.label} · {story.role.agent.id}"
+    role = story.role
+    name = role.label if role.is_ego or role.label == role.agent.id else f"{role.label} · {role.agent.id}"
     sheet.figure.text(
-        LEFT_IN / WIDTH_IN, (top + HEAD_IN - 0.16) / height, f"{name} in the replay, driven by {_spoken(story.driver)}",
-        family=FONT, fontsize=8.5, fontweight="bold", color=story.role.color, parse_math=False, va="baseline",
+        LEFT_IN / WIDTH_IN, (top + HEAD_IN - 0.16) / height, f"{printable(name, 40)} in the replay, driven by {_spoken(story.driver)}",
+        family=FONT, fontsize=8.5, fontweight="bold", color=role.color, parse_math=False, va="baseline",
     )  # fmt: skip
     return DrawnStrips(story, tuple(axes))
 
