@@ -14,10 +14,10 @@ from log2sim.replay.collisions import collisions
 from log2sim.replay.comfort import comfort
 from log2sim.replay.conflicts import conflicts, least
 from log2sim.replay.metrics import Errors, agent_metrics, overall
+from log2sim.replay.parameters import WHEELED
 from log2sim.replay.path import Path
 from log2sim.replay.result import AgentReplay
 from log2sim.replay.rollout import Clock
-from log2sim.replay.vehicle import WHEELED
 
 FOLLOWING = ("pid", "exact")
 """Drivers that are held against the log."""

@@ -86,7 +86,7 @@ def _motion(boxes: Boxes, k: Rows, a: Rows, b: Rows) -> Motion:
     yaw_a, yaw_b = boxes.yaw_rad[k, a], boxes.yaw_rad[k, b]
     turn_a, turn_b = wrap_angle(boxes.yaw_rad[after, a] - yaw_a), wrap_angle(boxes.yaw_rad[after, b] - yaw_b)
     return Motion(
-        x, y, z, then_x - x, then_y - y, then_z - z, yaw_a, yaw_b, turn_a, turn_b, boxes.size_m[a], boxes.size_m[b]
+        x, y, z, then_x - x, then_y - y, then_z - z, yaw_a, yaw_b, turn_a, turn_b, boxes.size_m[a].T, boxes.size_m[b].T
     )
 
 

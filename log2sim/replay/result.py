@@ -37,10 +37,11 @@ class Commands:
 class AgentReplay:
     """What one agent did: box centers in the map as columns (S,), while it lives.
 
-    `driver` is "static" (one pose, two rows), "exact" (the log), "pid", "reactive" or "policy"; `model` "none", "kinematic"
-    or "point". `accel_mps2` is along the heading; `steer_rad` is 0 where nothing steers. `flags` say what in the log cannot
-    be driven. `commands` are None where there is no vehicle model; `cross_track_m`, `along_track_m` (S,) are the distances
-    from the log, left and ahead positive, None for what stands for good.
+    `driver` is "static" (one pose, two rows), "exact" (the log), "pid", "reactive" or "policy"; `model` "none", "point",
+    "kinematic", "dynamic" or "single-track", with the reason in `model_reason`. `accel_mps2` is along the heading;
+    `steer_rad` is 0 where nothing steers. `flags` say what in the log cannot be driven. `commands` are None where there is
+    no vehicle model; `cross_track_m`, `along_track_m` (S,) are the distances from the log, left and ahead positive, None
+    for what stands for good.
     """
 
     id: str
@@ -57,6 +58,7 @@ class AgentReplay:
     steer_rad: Array
     accel_mps2: Array
     flags: tuple[str, ...] = ()
+    model_reason: str = ""
     commands: Commands | None = None
     cross_track_m: Array | None = None
     along_track_m: Array | None = None
@@ -156,6 +158,7 @@ def _agent_to_dict(agent: AgentReplay) -> dict[str, Any]:
         "size_m": {"length": length, "width": width, "height": height},
         "driver": agent.driver,
         "model": agent.model,
+        "model_reason": agent.model_reason,
         "flags": list(agent.flags),
         "states": {k: getattr(agent, k).tolist() for k in AgentReplay.COLUMNS},
         "commands": {k: getattr(commands, k).tolist() for k in Commands.COLUMNS} if commands is not None else None,
@@ -177,6 +180,7 @@ def _agent_from_dict(entry: Mapping[str, Any]) -> AgentReplay:
         driver=entry["driver"],
         model=entry["model"],
         flags=tuple(entry["flags"]),
+        model_reason=entry.get("model_reason", ""),
         commands=Commands(**commands) if commands else None,
         **states,
         **_columns(entry, "errors", AgentReplay.ERRORS),

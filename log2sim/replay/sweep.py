@@ -20,7 +20,7 @@ HALVINGS = 8  # of the last step: 3 us of 50 ms
 class Motion(Columns):
     """N pairs over an interval of time: the way from a to b at its begin and how it changes until its end, yaws and turns.
 
-    `dx_m`, `dy_m`, `dz_m`, their changes `vx_m`, `vy_m`, `vz_m`, yaws and `turn_*_rad` (N,), sizes (N, 3).
+    `dx_m`, `dy_m`, `dz_m`, their changes `vx_m`, `vy_m`, `vz_m`, yaws and `turn_*_rad` (N,), sizes (3, N).
     """
 
     dx_m: Array
@@ -50,7 +50,7 @@ class Motion(Columns):
         way = self.vx_m**2 + self.vy_m**2
         closing = -(self.dx_m * self.vx_m + self.dy_m * self.vy_m)
         u = np.clip(np.divide(closing, way, out=np.zeros_like(way), where=way > 0), 0.0, 1.0)
-        reach = (np.hypot(*self.size_a_m[:, :2].T) + np.hypot(*self.size_b_m[:, :2].T)) / 2
+        reach = (np.hypot(*self.size_a_m[:2]) + np.hypot(*self.size_b_m[:2])) / 2
         return np.hypot(self.dx_m + u * self.vx_m, self.dy_m + u * self.vy_m) < reach
 
     def free_for(self, u: Array) -> Array:
@@ -66,11 +66,9 @@ class Motion(Columns):
         yaw_a, yaw_b = self.yaw_a_rad + u * self.turn_a_rad, self.yaw_b_rad + u * self.turn_b_rad
         spin_a, spin_b = np.abs(self.turn_a_rad), np.abs(self.turn_b_rad)
         relative = np.abs(self.turn_b_rad - self.turn_a_rad) / 2
-        radius_a, radius_b = (np.hypot(size[:, 0], size[:, 1]) for size in (self.size_a_m, self.size_b_m))
-        free = _time(
-            np.abs(self.dz_m + u * self.vz_m) - (self.size_a_m[:, 2] + self.size_b_m[:, 2]) / 2, np.abs(self.vz_m)
-        )
-        for nx, ny, reach, of_a in axes_between(yaw_a, yaw_b, self.size_a_m, self.size_b_m):
+        radius_a, radius_b = (np.hypot(*size[:2]) for size in (self.size_a_m, self.size_b_m))
+        free = _time(np.abs(self.dz_m + u * self.vz_m) - (self.size_a_m[2] + self.size_b_m[2]) / 2, np.abs(self.vz_m))
+        for nx, ny, reach, of_a in axes_between(yaw_a, yaw_b, self.size_a_m.T, self.size_b_m.T):
             spin, radius = (spin_a, radius_b) if of_a else (spin_b, radius_a)
             rate = np.abs(self.vx_m * nx + self.vy_m * ny) + spin * distance + relative * radius
             free = np.maximum(free, _time(np.abs(dx * nx + dy * ny) - reach, rate))
