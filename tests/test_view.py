@@ -309,7 +309,7 @@ def test_scrubbing_changes_the_time(browser: Browser, sample: Path) -> None:
     browser.mouse((box["x"] + 9, y), (box["x"] + box["width"] / 2, y))
     assert time_of(browser) == pytest.approx(2.6, abs=0.1)
     browser.wait(f"document.getElementById('time').textContent === '{time_of(browser):.2f}'")
-    assert browser.run("return location.hash") == f"#t={time_of(browser):.2f}"
+    browser.wait(f"location.hash === '#t={time_of(browser):.2f}'")
 
 
 def test_a_link_names_the_moment_and_the_agent(browser: Browser, sample: Path) -> None:
@@ -374,7 +374,7 @@ def test_playing_keeps_to_the_clock_at_any_speed(browser: Browser, sample: Path)
     assert browser.run("return pass(100)") == pytest.approx(0.81)
     browser.press(" ")
     assert browser.run("return pass(100)") == pytest.approx(0.81)
-    assert browser.run("return location.hash") == "#t=0.81"
+    browser.wait("location.hash === '#t=0.81'")
     browser.run("log2sim.time = 5.15; log2sim.play()")
     assert [browser.run("return pass(200)") for _ in range(3)] == pytest.approx([5.17, 5.19, 5.2])
     assert browser.run("return document.getElementById('play').getAttribute('aria-label')") == "Play"
@@ -413,6 +413,7 @@ def test_fingers_choose_drag_and_pinch(browser: Browser, sample: Path) -> None:
     assert browser.run("return log2sim.chosen") == "bus_1"
     assert browser.run("return document.getElementById('details').clientHeight") > 100
     browser.run("log2sim.choose(null)")
+    pixel(browser, np.zeros(2))  # the map is as high again as without the panel
     before, scale = place_of(browser, "ego"), browser.run("return log2sim.pixelsPerMeter")
     browser.touch([(100, 500), (110, 480), (130, 440)])
     np.testing.assert_allclose(place_of(browser, "ego") - before, [30, -60], atol=1)
@@ -452,6 +453,18 @@ def test_the_list_is_searched(browser: Browser, sample: Path) -> None:
     browser.run("const s = document.getElementById('search'); s.value = 'xyz'; s.dispatchEvent(new Event('input'))")
     assert browser.run(shown) == []
     assert text_of(browser, "more") == "No agent is called so."
+
+
+def test_an_agent_chosen_from_the_list_comes_into_sight(browser: Browser, tmp_path: Path) -> None:
+    opened(browser, page_with(tmp_path, agent("ego", np.arange(5.0), 0.0), agent("far", np.arange(5.0), 50.0)), "#t=3")
+    browser.press(*"++++++++")
+    size = browser.run("const m = document.getElementById('map'); return [m.clientWidth, m.clientHeight]")
+    assert (place_of(browser, "far") < 0).any()
+    browser.run("[...document.querySelectorAll('#agents button')].at(-1).click()")
+    np.testing.assert_allclose(place_of(browser, "far"), np.array(size) / 2, atol=1e-6)
+    before = place_of(browser, "far")
+    browser.run("[...document.querySelectorAll('#agents button')].at(-1).click()")
+    np.testing.assert_array_equal(place_of(browser, "far"), before)
 
 
 def test_dark_systems_get_a_dark_page(browser: Browser, sample: Path) -> None:

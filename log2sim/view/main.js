@@ -1,90 +1,7 @@
-// State, time and what keeps the parts together. Frames are drawn while something moves and else not at all.
+// What people can do, and the start.
 
-const RATES = [0.1, 0.2, 0.5, 1, 2, 5, 10];
-const PLAY = "M6 3.5v13l11-6.5z", PAUSE = "M5.5 3.5h3.2v13H5.5zM11.3 3.5h3.2v13h-3.2z";
 const LAYER_NAMES = { log: "Log", truth: "Truth", replay: "Replay", trails: "Trails", names: "Names" };
-
-const data = load(byId("data").textContent);
-const tracks = data.layers.log, ego = tracks.find((track) => track.ego) ?? null;
-for (const track of tracks) track.label = track.id.length > 24 ? `${track.id.slice(0, 23)}…` : track.id;
-const state = {
-  t: data.begin, rate: 1, playing: false, follow: false, chosen: null, hovered: null,
-  shown: { log: true, truth: true, replay: true, trails: true, names: true },
-};
-dress(data.layers);
-const view = new View(), painter = new Painter(byId("map"), view);
-let queued = false, before = 0, dimmed = 0, fitted = false, labelled = "";
-
-const wake = () => {
-  if (!queued) {
-    queued = true;
-    requestAnimationFrame(frame);
-  }
-};
-
-const frame = (now) => {
-  queued = false;
-  if (state.playing) {
-    state.t += Math.min((now - before) / 1000, 0.25) * state.rate;
-    if (state.t >= data.end) {
-      state.t = data.end;
-      pause();
-    }
-  }
-  before = now;
-  draw(now);
-  if (state.playing) wake();
-};
-
-const draw = (now) => {
-  const leader = state.follow ? (state.chosen ?? ego) : null;
-  if (leader) {
-    leader.moveTo(state.t);
-    if (leader.there) [view.x, view.y] = [leader.px, leader.py];
-  }
-  painter.paint(data.layers, state.t, state.shown, state.chosen, state.hovered);
-  const text = state.t.toFixed(2);
-  if (text !== labelled) {
-    byId("time").textContent = labelled = text;
-    byId("scrub").value = state.t;
-  }
-  side.tick(state.t);
-  if (now - dimmed > 250 || !state.playing) {
-    side.dim();
-    dimmed = now;
-  }
-};
-
-const seek = (t) => {
-  if (!Number.isFinite(t)) return;
-  state.t = Math.min(Math.max(t, data.begin), data.end);
-  wake();
-  if (!state.playing) remember();
-};
-
-const play = () => {
-  if (state.t >= data.end) state.t = data.begin;
-  state.playing = true;
-  before = performance.now();
-  showPlay();
-  wake();
-};
-
-const pause = () => {
-  state.playing = false;
-  showPlay();
-  remember();
-};
-
-const showPlay = () => {
-  byId("play-shape").setAttribute("d", state.playing ? PAUSE : PLAY);
-  byId("play").setAttribute("aria-label", state.playing ? "Pause" : "Play");
-};
-
-const setRate = (step) => {
-  state.rate = RATES[Math.min(Math.max(RATES.indexOf(state.rate) + step, 0), RATES.length - 1)];
-  byId("rate").textContent = `${state.rate}×`;
-};
+let fitted = false;
 
 const choose = (track) => {
   state.chosen = track;
@@ -92,6 +9,15 @@ const choose = (track) => {
   drawLife();
   remember();
   wake();
+};
+
+// Choose an agent and bring it into sight, if it is there now.
+const visit = (track) => {
+  choose(track);
+  if (track === null) return;
+  track.moveTo(state.t);
+  const sx = view.sx(track.px), sy = view.sy(track.py);
+  if (track.there && !(sx > 20 && sy > 20 && sx < view.width - 20 && sy < view.height - 20)) [view.x, view.y] = [track.px, track.py];
 };
 
 const hover = (track) => {
@@ -142,42 +68,6 @@ const toggle = (layer) => {
   state.shown[layer] = !state.shown[layer];
   byId(`layer-${layer}`).setAttribute("aria-pressed", state.shown[layer]);
   wake();
-};
-
-// The life of the chosen agent above the slider, pale where nobody saw it.
-const drawLife = () => {
-  const canvas = byId("life"), pen = sharpPen(canvas), track = state.chosen;
-  if (!track || !canvas.clientWidth) return;
-  const sx = (t) => ((t - data.begin) / Math.max(data.end - data.begin, 1e-3)) * canvas.clientWidth;
-  const bar = (from, to, color) => {
-    pen.fillStyle = color;
-    pen.fillRect(sx(from), 0, Math.max(sx(to) - sx(from), 2), canvas.clientHeight);
-  };
-  if (track.always) bar(data.begin, data.end, theme.parked_edge);
-  else if (track.t.length === 1) bar(track.first, track.first, track.line);
-  for (let k = 0, from = 0; k + 1 < track.t.length; k++) {
-    if (k + 2 < track.t.length && track.filled[k + 1] === track.filled[k]) continue;
-    bar(track.t[from], track.t[k + 1], track.filled[k] ? track.pale : track.standing ? theme.parked_edge : track.line);
-    from = k + 1;
-  }
-};
-
-// The address names the moment and the agent, so that it can be passed on.
-const remember = () => {
-  const parts = new URLSearchParams({ t: state.t.toFixed(2) });
-  if (state.chosen) parts.set("agent", state.chosen.id);
-  try {
-    history.replaceState(null, "", `#${parts}`);
-  } catch {
-    // Some browsers do not let a page that was opened as a file do so.
-  }
-};
-
-const recall = () => {
-  const parts = new URLSearchParams(location.hash.slice(1));
-  const t = parts.get("t"), id = parts.get("agent");
-  if (id !== null) choose(tracks.find((track) => track.id === id) ?? null);
-  if (t !== null && t.trim() !== "") seek(Number(t));
 };
 
 const resize = () => {
@@ -233,14 +123,24 @@ const listen = () => {
     wake();
   });
   new ResizeObserver(resize).observe(byId("map"));
+  watchSharpness();
+};
+
+// Paint anew when the window comes onto a screen of another sharpness.
+const watchSharpness = () => {
+  const now = matchMedia(`(resolution: ${window.devicePixelRatio}dppx)`);
+  now.addEventListener("change", () => {
+    resize();
+    watchSharpness();
+  }, { once: true });
 };
 
 const neighbor = (step) => {
   const here = tracks.indexOf(state.chosen), count = tracks.length;
-  if (count) choose(tracks[here < 0 ? (step > 0 ? 0 : count - 1) : (here + step + count) % count]);
+  if (count) visit(tracks[here < 0 ? (step > 0 ? 0 : count - 1) : (here + step + count) % count]);
 };
 
-const side = new Side(data, { choose, seek, hover });
+const side = new Side(data, { choose: visit, seek, hover });
 
 const start = () => {
   const moving = tracks.filter((track) => !track.standing && !track.ego).length, agents = tracks.length - (ego ? 1 : 0);

@@ -17,7 +17,18 @@ from log2sim.scenario import Scenario
 from log2sim.view.pack import SCALES, pack
 
 SUFFIXES = (".html", ".htm")
-SCRIPTS = ("track.js", "theme.js", "map.js", "paint.js", "chart.js", "side.js", "controls.js", "main.js")
+SCRIPTS = (
+    "track.js",
+    "theme.js",
+    "map.js",
+    "paint.js",
+    "chart.js",
+    "side.js",
+    "controls.js",
+    "stage.js",
+    "timeline.js",
+    "main.js",
+)
 """Parts of the script in the order in which they build on each other."""
 
 
