@@ -19,7 +19,7 @@ from browser import CHROMIUM, DRIVER, Browser, browsing
 from command_line import names, run
 
 from log2sim.errors import ConfigError
-from log2sim.geometry import Array, box_corners_bev
+from log2sim.geometry import Array, box_corners_bev, wrap_angle
 from log2sim.plot import look
 from log2sim.plot.cast import assign
 from log2sim.replay import replay
@@ -31,7 +31,7 @@ from log2sim.view.page import page_of
 ROOT = Path(__file__).resolve().parents[1]
 TRUTH = ROOT / "samples" / "crossing" / "truth.json"
 ESCAPE, HOME, END, LEFT, RIGHT, ENTER = "\ue00c", "\ue011", "\ue010", "\ue012", "\ue014", "\ue007"
-EVIL = '</script><script>window.hacked = 1</script><img src=x onerror="window.hacked = 1">{{data}}<!--'
+EVIL = '</script x></script><script>window.hacked = 1</script><img src=x onerror="window.hacked = 1">{{data}}<!--'
 
 
 def agent(id: str, x_m: Array, y_m: float, yaw_rad: float = 0.0, **changes: Any) -> Agent:
@@ -242,6 +242,32 @@ def test_agents_are_where_the_scenario_has_them(browser: Browser, sample: Path) 
             mine, ego = a.at(t), scenario.agents[0].at(t)
             offset = (np.array(shown[a.id]) - shown["ego"]) / scale
             np.testing.assert_allclose(offset, [mine.x_m[0] - ego.x_m[0], ego.y_m[0] - mine.y_m[0]], atol=2e-3)
+
+
+def test_agents_are_where_they_are_between_waypoints_too(browser: Browser, tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    source = agent("a", rng.uniform(-50, 50, 60), 0.0)
+    w = source.waypoints
+    t = np.round(np.cumsum(rng.uniform(0.001, 0.12, 60)), 4)
+    source = replace(
+        source, waypoints=replace(w, t_s=t, y_m=rng.uniform(-50, 50, 60), yaw_rad=rng.uniform(-3.1, 3.1, 60))
+    )
+    opened(browser, page_with(tmp_path, source, agent("origin", np.zeros(5), 0.0)), "#agent=a")
+    script = """const out = [];
+        for (const t of arguments[0]) {
+            log2sim.time = t;
+            out.push([...log2sim.placeOf("a") ?? [0, 0], log2sim.headingOf("a") ?? 1e9]);
+        }
+        return [out, log2sim.placeOf("origin"), log2sim.pixelsPerMeter];"""
+    asked = np.concatenate([rng.uniform(0, t[-1] + 0.3, 300), np.linspace(0, t[-1], 300), t])
+    shown, origin, scale = browser.run(script, asked.tolist())
+    known = source.at(asked, margin_s=1e-4)
+    x, y, heading = np.array(shown).T
+    np.testing.assert_array_equal(heading < 1e9, known.valid)
+    there = known.valid
+    np.testing.assert_allclose((x - origin[0])[there] / scale, known.x_m[there], atol=2e-3)
+    np.testing.assert_allclose((origin[1] - y)[there] / scale, known.y_m[there], atol=2e-3)
+    np.testing.assert_allclose(wrap_angle(heading - known.yaw_rad)[there], 0.0, atol=2e-4)
 
 
 def test_boxes_have_their_size_color_and_heading(browser: Browser, tmp_path: Path) -> None:

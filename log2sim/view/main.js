@@ -179,6 +179,12 @@ window.log2sim = {
     track?.moveTo(state.t);
     return track?.there ? [view.sx(track.px), view.sy(track.py)] : null;
   },
+  // Its heading in rad, counter-clockwise from east; null when it is not there.
+  headingOf: (id) => {
+    const track = tracks.find((other) => other.id === id);
+    track?.moveTo(state.t);
+    return track?.there ? track.pyaw : null;
+  },
   get pixelsPerMeter() { return view.scale; },
 };
 start();
