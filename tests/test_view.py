@@ -493,6 +493,23 @@ def test_an_agent_chosen_from_the_list_comes_into_sight(browser: Browser, tmp_pa
     np.testing.assert_array_equal(place_of(browser, "far"), before)
 
 
+@pytest.mark.parametrize(("size", "first"), [((1200, 800), True), ((390, 780), False)], ids=["wide", "narrow"])
+def test_the_list_is_put_away_and_an_agent_shown_all_the_same(
+    browser: Browser, sample: Path, size: tuple[int, int], first: bool
+) -> None:
+    opened(browser, sample, size=size)
+    script = "return ['cast', 'details'].map((id) => document.getElementById(id).getClientRects().length > 0)"
+    assert browser.run(script) == [first, False]
+    browser.press("a")
+    assert browser.run(script) == [not first, False]
+    browser.run("log2sim.choose('bus_1')")
+    assert browser.run(script) == [False, True]
+    browser.press(ESCAPE)
+    assert browser.run(script) == [not first, False]
+    inside = "const r = document.getElementById('scrub').getBoundingClientRect(); return [r.right, r.bottom]"
+    assert (np.array(browser.run(inside)) <= size).all()
+
+
 def test_dark_systems_get_a_dark_page(browser: Browser, sample: Path) -> None:
     light = pixel(opened(browser, sample), np.array([3.0, 300.0]))
     dark = pixel(opened(browser, sample, dark=True), np.array([3.0, 300.0]))

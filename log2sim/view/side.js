@@ -54,6 +54,7 @@ class Side {
     byId("agents").replaceChildren(...found.slice(0, MOST_ROWS).map((track) => this.row(track)));
     const rest = found.length - MOST_ROWS;
     byId("more").hidden = rest <= 0 && found.length > 0;
+    this.dim();
     byId("more").textContent = found.length ? `${rest} more; search for them` : "No agent is called so.";
   }
 

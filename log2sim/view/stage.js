@@ -43,6 +43,7 @@ const draw = (now) => {
   if (text !== labelled) {
     byId("time").textContent = labelled = text;
     byId("scrub").value = state.t;
+    byId("scrub").setAttribute("aria-valuetext", `${text} s`);
   }
   side.tick(state.t);
   if (now - dimmed > 250 || !state.playing) {
