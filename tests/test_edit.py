@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -222,7 +221,7 @@ def test_a_new_collision_is_told_with_its_pair_and_time() -> None:
     assert edit(source, [Shift("other", 0.1)]).warnings == ()
     (warning,) = edit(source, [Shift("other", 1.4)]).warnings
     # Bumpers at 3 m from the crossing (half a length and half a width) touch 0.3 s before both are there.
-    assert re.fullmatch(r"agents 'ego' and 'other' collide at 1\.7[0-5] s at 14\.1 m/s, .*", warning)
+    assert "agents 'ego' and 'other' collide at 1.70 s at 14.1 m/s" in warning
     result = edit(source, [Shift("other", 1.4)])
     with pytest.raises(CheckFailed, match="'ego' and 'other' collide"):
         result.require_clean()
