@@ -38,7 +38,9 @@ def scenario(*agents: Agent, **changes: Any) -> Scenario:
     return Scenario(**{"name": "test", "t0_ns": 1_700_000_000_000_000_000, "duration_s": last_s, "agents": agents, "map": UTM, **changes})  # fmt: skip
 
 
-def line(length_m: float = 30.0, count: int = 31, heading_rad: float = 0.0, start: tuple[float, float] = (0.0, 0.0)) -> Array:
+def line(
+    length_m: float = 30.0, count: int = 31, heading_rad: float = 0.0, start: tuple[float, float] = (0.0, 0.0)
+) -> Array:
     """Points (count, 2) on a straight line."""
     along = np.linspace(0.0, length_m, count)
     return np.column_stack([start[0] + along * np.cos(heading_rad), start[1] + along * np.sin(heading_rad)])

@@ -48,7 +48,9 @@ def play(path: Path) -> dict[str, Entity]:
     found = {}
     for node in root.iterfind("Entities/ScenarioObject"):
         name = node.attrib["name"]
-        groups = [g for g in root.iter("ManeuverGroup") if [e.attrib["entityRef"] for e in g.iter("EntityRef")] == [name]]
+        groups = [
+            g for g in root.iter("ManeuverGroup") if [e.attrib["entityRef"] for e in g.iter("EntityRef")] == [name]
+        ]
         rows = [
             [float(v.attrib["time"]), *(float(v.find("Position/WorldPosition").attrib[k]) for k in "xyzh")]
             for g in groups
@@ -131,7 +133,7 @@ def distance(points: Array, line: Array) -> Array:
 
     near = cKDTree(line).query(points)[1]
     best = np.full(len(points), np.inf)
-    for shift in (-1, 0):
+    for shift in (-2, -1, 0, 1):  # where two geometries meet there are two samples
         a = line[np.clip(near + shift, 0, len(line) - 2)]
         b = line[np.clip(near + shift, 0, len(line) - 2) + 1]
         span = b - a

@@ -189,7 +189,11 @@ def test_scenario_runner_806_nothing_is_relative(revision: str, tmp_path: Path) 
 
 
 def test_scenario_runner_reads_1_0_and_wants_the_trajectory_right_under_the_action(tmp_path: Path) -> None:
-    for revision, path in (("1.0", "Trajectory"), ("1.1", "TrajectoryRef/Trajectory"), ("1.2", "TrajectoryRef/Trajectory")):
+    for revision, path in (
+        ("1.0", "Trajectory"),
+        ("1.1", "TrajectoryRef/Trajectory"),
+        ("1.2", "TrajectoryRef/Trajectory"),
+    ):
         written(tmp_path, guest(), revision)
         actions = list(ElementTree.parse(tmp_path / "scenario.xosc").iter("FollowTrajectoryAction"))
         assert actions
@@ -203,7 +207,7 @@ def test_esmini_590_the_vehicle_is_placed_by_its_rear_axle_on_the_ground(tmp_pat
 
 @pytest.mark.parametrize("east_m", [1e4, 4.56e5, 5e7])
 def test_esmini_174_far_from_the_origin_float32_keeps_half_a_millimeter(east_m: float, tmp_path: Path) -> None:
-    near, far = (scenario(agent(bend() + [x, -x / 3])) for x in (0.0, east_m))
+    near, far = (scenario(agent(bend() + np.array([x, -x / 3]))) for x in (0.0, east_m))
     vertices = written(tmp_path, far)["ego"].vertices[:, 1:4]
     assert np.abs(vertices.astype(np.float32) - vertices).max() <= 0.0005
     shape = written(tmp_path, near)["ego"].vertices[:, 1:3]
@@ -225,7 +229,9 @@ def test_esmini_461_triggers_have_no_edge_to_wait_for(revision: str, tmp_path: P
     conditions = list(ElementTree.parse(tmp_path / "scenario.xosc").iter("Condition"))
     assert {c.attrib["conditionEdge"] for c in conditions} == {"none"}
     act = ElementTree.parse(tmp_path / "scenario.xosc").find(".//Act/StartTrigger//SimulationTimeCondition").attrib
-    expected = {"rule": "greaterThan", "value": "-0.000001"} if revision == "1.0" else {"rule": "greaterOrEqual", "value": "0"}
+    expected = (
+        {"rule": "greaterThan", "value": "-0.000001"} if revision == "1.0" else {"rule": "greaterOrEqual", "value": "0"}
+    )
     assert act == expected
 
 
