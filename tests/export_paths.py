@@ -34,7 +34,7 @@ def agent(
 
 def scenario(*agents: Agent, **changes: Any) -> Scenario:
     """A scenario of agents that lasts as long as they do."""
-    last_s = max((float(a.waypoints.t_s[-1]) for a in agents), default=0.0)
+    last_s = max((float(a.waypoints.t_s[-1]) for a in agents if len(a.waypoints)), default=0.0)
     return Scenario(**{"name": "test", "t0_ns": 1_700_000_000_000_000_000, "duration_s": last_s, "agents": agents, "map": UTM, **changes})  # fmt: skip
 
 
