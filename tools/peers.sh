@@ -11,6 +11,7 @@ environments=(
     "qc asam-qc-openscenarioxml==1.0.0 asam-qc-opendrive==1.0.0 numpy<2"
     "carla carla>=0.9.16 numpy"
     "sumo eclipse-sumo>=1.20"
+    "scenariogeneration scenariogeneration>=0.16"
 )
 for line in "${environments[@]}"; do
     read -r name packages <<<"$line"
