@@ -20,14 +20,20 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "ssd-mobilenet-v2": "log2sim.detect.ssd_mobilenet:create",
         "labels": "log2sim.detect.labels:create",
     },
+    "export": {
+        "openscenario": "log2sim.export.openscenario:EXPORTER",
+        "csv": "log2sim.export.csv_table:EXPORTER",
+        "scenarionet": "log2sim.export.scenarionet:EXPORTER",
+        "commonroad": "log2sim.export.commonroad:EXPORTER",
+    },
 }
 
 
-SPOKEN = {"log": "log format"}
+SPOKEN = {"log": "log format", "export": "export format"}
 
 
 def names(kind: str) -> list[str]:
-    """Names of all plug-ins of a kind ("log", "detector"), built-in ones first."""
+    """Names of all plug-ins of a kind ("log", "detector", "export"), built-in ones first."""
     return list(BUILT_IN[kind]) + sorted(e.name for e in entry_points(group=f"log2sim.{kind}"))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from dataclasses import replace as changed
 
 import numpy as np
@@ -9,8 +10,9 @@ import pytest
 from replay_maneuvers import MANEUVERS, OFFSET_M, agent_from, driven, ramp, scenario_of
 
 from log2sim.replay import replay
-from log2sim.replay.follower import Memory, follow_points, follow_vehicles
-from log2sim.replay.vehicle import PointState, VehicleState, parameters_for, step_bicycle, step_point
+from log2sim.replay.follower import GAINS, Memory, follow_points, follow_vehicles
+from log2sim.replay.parameters import parameters_for
+from log2sim.replay.vehicle import PointState, VehicleState, step_bicycle, step_point
 
 CAR = parameters_for([agent_from([0.0], [0.0], [0.0], [0.0], [0.0])])
 
@@ -34,7 +36,7 @@ def followed(agent, **options):
 @pytest.mark.parametrize("name", MANEUVERS)
 def test_maneuvers_are_followed_within_limits(name):
     across, along, speed = LIMITS[name]
-    agent, metrics, _ = followed(MANEUVERS[name]())
+    agent, metrics, _ = followed(MANEUVERS[name](), model="kinematic")
     assert metrics["cross_track_max_m"] < across
     assert metrics["along_track_rms_m"] < along
     assert metrics["speed_rms_mps"] < speed
@@ -61,7 +63,7 @@ def test_a_push_off_the_path_dies_out_without_overshoot_to_the_other_side():
     w = agent.waypoints
     y = np.where(w.t_s < 2.0, 0.0, 1.4)  # the log steps sideways, too little for a leap
     stepped = changed(agent, waypoints=changed(w, y_m=y))
-    result, _, _ = followed(stepped)
+    result, _, _ = followed(stepped, model="kinematic")
     late = result.t_s > 5.0
     assert np.abs(result.y_m[late] - 1.4).max() < 0.05
     assert result.y_m.max() < 1.4 + 0.15
@@ -93,9 +95,9 @@ def test_a_box_that_drifts_sideways_is_followed_as_far_as_wheels_allow():
     assert np.degrees(np.median(result.yaw_rad)) == pytest.approx(np.degrees(np.arctan(0.05)), abs=1.0)
 
 
-def test_wheels_never_slip_sideways():
+def test_wheels_of_the_kinematic_model_never_slip_sideways():
     for name in ("turn of radius 8 m", "reversing"):
-        agent, _, _ = followed(MANEUVERS[name](), dt_s=0.05)
+        agent, _, _ = followed(MANEUVERS[name](), dt_s=0.05, model="kinematic")
         rear_x, rear_y = agent.x_m - 1.3 * np.cos(agent.yaw_rad), agent.y_m - 1.3 * np.sin(agent.yaw_rad)
         mean = (np.unwrap(agent.yaw_rad)[1:] + np.unwrap(agent.yaw_rad)[:-1]) / 2
         sideways = np.diff(rear_y) * np.cos(mean) - np.diff(rear_x) * np.sin(mean)
@@ -158,7 +160,7 @@ def test_map_offsets_of_a_thousand_kilometers_change_nothing():
 
 def closed_loop(x, y, yaw, speed, reference_speed, duration_s, dt_s=0.01):
     """States (N, 4) of a car that starts off a reference which goes straight along x from 0."""
-    state = VehicleState(*(np.array([v], float) for v in (x, y, yaw, speed, 0.0, 0.0)))
+    state = VehicleState(*(np.array([v], float) for v in (x, y, yaw, speed, 0, 0, 0, 0)))
     memory, out = Memory.fresh(1), []
     for k in range(round(duration_s / dt_s)):
         stands = float(reference_speed == 0)
@@ -186,6 +188,36 @@ def test_being_late_or_slow_is_made_up_for():
         assert np.abs(states[-1, 0]) < 0.05
         assert states[-1, 3] == pytest.approx(10.0, abs=0.05)
         assert states[:, 0].max() < 0.6
+
+
+def controls_at(*, x=0.0, y=0.0, yaw=0.0, speed=10.0, row=(0, 0, 0, 10, 0, 0, 1, 0), dt_s=0.01):
+    """Controls and memory of a car that has just begun to follow one row of a table."""
+    state = replace_columns(VehicleState, x_m=x, y_m=y, yaw_rad=yaw, speed_mps=speed)
+    return follow_vehicles(np.array(row, float)[:, None], state, Memory.fresh(1), CAR, dt_s)
+
+
+def replace_columns(kind, **values):
+    return kind(*(np.array([values.get(f.name, 0.0)]) for f in fields(kind)))
+
+
+def test_late_in_a_curve_the_wheels_stay_turned_as_the_curve_is():
+    radius, late = 20.0, 1.5
+    angle = -late / radius
+    controls, _ = controls_at(
+        x=radius * np.sin(angle), y=radius * (1 - np.cos(angle)), yaw=angle, row=(0, 0, 0, 10, 0, 1 / radius, 1, 0)
+    )
+    # What is left is the third order of the angle, not the 5.6 cm by which the tangent misses the arc.
+    assert np.tan(controls.steer_rad[0]) / CAR.wheelbase_m[0] == pytest.approx(1 / radius, rel=0.01)
+
+
+def test_the_integral_grows_with_the_error_but_not_at_the_limit_of_an_actuator():
+    near, far = (controls_at(x=-d, y=-d / 100)[1].integral[:, 0] for d in (0.5, 2.9))
+    assert near[0] == pytest.approx(0.5 * 0.01 / (GAINS.along_s**2 * GAINS.integral_s), rel=1e-6)
+    assert near[1] == pytest.approx(0.005 * 0.01 / ((10 * GAINS.across_s) ** 2 * GAINS.integral_s), rel=1e-6)
+    assert far[0] == 0.0  # 2.9 m / (0.6 s)^2 is more than full throttle
+    assert far[1] > 0.0
+    aside = controls_at(y=-6.0)[1].integral[:, 0]
+    assert aside[1] == 0.0  # the wheels are at the limit of grip
 
 
 def test_a_vehicle_that_stands_where_it_should_stays_and_one_that_stopped_short_drives_up():

@@ -13,12 +13,14 @@ from log2sim.errors import ConfigError
 from log2sim.registry import nearest
 from log2sim.replay.clock import Clock
 from log2sim.replay.drivable import LOCK_SHARE, Limits
+from log2sim.replay.follower import control_step
+from log2sim.replay.models import Choice, choose, slipping_reference, understeer
+from log2sim.replay.parameters import PEDAL_LAG_S, STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
 from log2sim.replay.path import Path, path_of
 from log2sim.replay.reactive import Reactive, ReactiveCrowd, ReactiveFleet, ReactiveTape
 from log2sim.replay.reference import MAX_CURVATURE_1PM, Reference, point_reference, tape_reference, vehicle_reference
-from log2sim.replay.simulator import Simulator
+from log2sim.replay.simulator import STEPS, simulator_named
 from log2sim.replay.traffic import Traffic
-from log2sim.replay.vehicle import PEDAL_LAG_S, STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
 from log2sim.replay.world import Crowd, Driven, Fleet, Group, Tape
 from log2sim.scenario import Agent
 
@@ -67,25 +69,49 @@ def reactive_ids(agents: Sequence[Agent], wanted: str | Collection[str], *, driv
     return frozenset(wanted)
 
 
-def groups_of(cast: Mapping[str, Sequence[Agent]], mode: str, clock: Clock, simulator: Simulator) -> list[Group]:
-    """The groups that have agents; static agents are in none."""
+def groups_of(
+    cast: Mapping[str, Sequence[Agent]], clock: Clock, mode: str = "pid", model: str = "auto"
+) -> tuple[list[Group], dict[str, Choice]]:
+    """The groups that have agents, and by id the model that moves each vehicle; static agents are in none."""
     groups: list[Group] = []
-    wheeled = (("policy", Driven), ("reactive", ReactiveFleet), ("pid", Fleet))
-    for driver, kind in wheeled:
-        agents = [a for a in cast[driver] if a.category in WHEELED]
-        if agents and not (driver == "reactive" and mode == "exact"):
-            references = [_vehicle_reference(a, clock.dt_s) for a in agents]
-            groups.append(kind(agents, references, *_lives(agents, clock), parameters_for(agents), simulator))
-    for driver, on_foot in (("reactive", ReactiveCrowd), ("pid", Crowd)):
-        agents = [a for a in cast[driver] if a.category not in WHEELED]
-        if agents and not (driver == "reactive" and mode == "exact"):
-            references = [point_reference(path_of(a, 0.0)) for a in agents]
-            groups.append(on_foot(agents, references, *_lives(agents, clock), simulator))
-    for driver, tape in (("reactive", ReactiveTape), ("exact", Tape)):
+    choices: dict[str, Choice] = {}
+    controlled: list[tuple[str, type[Fleet], type[Crowd]]] = [("policy", Driven, Crowd)]
+    if mode == "pid":
+        controlled += [("reactive", ReactiveFleet, ReactiveCrowd), ("pid", Fleet, Crowd)]
+    for driver, kind, on_foot in controlled:
+        wheeled = [a for a in cast[driver] if a.category in WHEELED]
+        groups += _fleets(wheeled, kind, clock, model, choices)
+        walking = [a for a in cast[driver] if a.category not in WHEELED]
+        if walking:
+            references = [point_reference(path_of(a, 0.0)) for a in walking]
+            groups.append(on_foot(walking, references, *_lives(walking, clock), simulator_named("kinematic")))
+    for driver, tape in (("exact", Tape), *([("reactive", ReactiveTape)] if mode == "exact" else [])):
         agents = list(cast[driver])
-        if agents and not (driver == "reactive" and mode == "pid"):
+        if agents:
             references = [tape_reference(path_of(a, rear_axle_offset(a))) for a in agents]
             groups.append(tape(agents, references, *_lives(agents, clock)))
+    return groups, choices
+
+
+def _fleets(
+    agents: Sequence[Agent], kind: type[Fleet], clock: Clock, model: str, choices: dict[str, Choice]
+) -> list[Group]:
+    """Groups of vehicles, one for each model that moves some of them; what moves each is added to `choices`."""
+    groups: list[Group] = []
+    references = {a.id: _vehicle_reference(a, clock.dt_s) for a in agents}
+    for a in agents:
+        choices[a.id] = choose(a, references[a.id], parameters_for([a]), model, free=kind is Driven)
+    for name in STEPS:
+        moved = [a for a in agents if choices[a.id].model == name]
+        if moved:
+            p = parameters_for(moved, published=name == "single-track")
+            followed = [references[a.id] for a in moved]
+            if name != "kinematic":
+                p = replace(p, understeer_s2pm2=understeer(p))
+                ahead_s = STEER_LAG_S + control_step(clock.dt_s) / 2
+                ones = [p.take(slice(i, i + 1)) for i in range(len(moved))]
+                followed = [slipping_reference(r, one, name, ahead_s) for r, one in zip(followed, ones)]
+            groups.append(kind(moved, followed, *_lives(moved, clock), p, simulator_named(name)))
     return groups
 
 
@@ -97,7 +123,7 @@ def traffic_of(agents: Sequence[Agent], groups: Sequence[Group], clock: Clock) -
     paths = {a.id: r.path for g in groups for a, r in zip(g.agents, g.references)}
     driven = next((g.agents[0].id for g in groups if isinstance(g, Driven)), None)
     reactive = {a.id for g in reacting for a in g.agents}
-    traffic = Traffic(agents, [paths.get(a.id) or _pose(a) for a in agents], reactive, clock, driven)
+    traffic = Traffic(agents, [paths.get(a.id) or _pose(a) for a in agents], reactive, driven)
     for group in reacting:
         group.join(traffic, clock)
     return traffic
@@ -123,8 +149,8 @@ def _vehicle_reference(agent: Agent, dt_s: float) -> Reference:
     return vehicle_reference(
         path_of(agent, limits.offset_m),
         limits,
-        accel_ahead_s=PEDAL_LAG_S + dt_s / 2,
-        curvature_ahead_s=STEER_LAG_S + dt_s / 2,
+        accel_ahead_s=PEDAL_LAG_S + control_step(dt_s) / 2,
+        curvature_ahead_s=STEER_LAG_S + control_step(dt_s) / 2,
         max_curvature_1pm=MAX_CURVATURE_1PM
         if agent.category in ("car", "truck", "bus")
         else MAX_TWO_WHEELER_CURVATURE_1PM,

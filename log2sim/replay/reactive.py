@@ -43,6 +43,7 @@ class Reactive(Group):
 
     def look_up(self, t_s: float) -> None:
         """Set `row` (C, A) to the references at the places where the agents are."""
+        self.now_s = t_s
         live, delay = self.live, self.traffic.delay_s[self.index]
         # Who fell behind lives on until it has come to the end of its log.
         self.last = np.minimum(self.clock.last_step(self._end_s + delay), self.clock.steps - 1)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
 from log2sim.replay.clock import Clock
+from log2sim.replay.follower import control_step
+from log2sim.replay.models import Choice
 from log2sim.replay.observe import Observer
 from log2sim.replay.policy import SIGHT_M, Controls, Observation, Policy, ask
 from log2sim.replay.reference import GRID_S
@@ -22,7 +25,7 @@ WINDOW_S = 10.0
 Progress = Callable[[int, int], None]
 
 Tracks = dict[str, tuple[NDArray[np.intp], Array]]
-"""By agent id: the stored steps (S,) and the columns (6, S) of a `Snapshot` at them."""
+"""By agent id: the stored steps (S,) and the columns (C, S) of a `Snapshot` at them."""
 
 
 class World:
@@ -38,6 +41,8 @@ class World:
         Agents with one pose, in no group.
     traffic : Traffic, optional
         What reactive agents decide by.
+    choices : mapping, optional
+        By id, the model that moves each vehicle and why.
     sight_m : float
         How far the ego's policy sees.
     """
@@ -48,9 +53,11 @@ class World:
         clock: Clock,
         statics: Sequence[Agent] = (),
         traffic: Traffic | None = None,
+        choices: Mapping[str, Choice] | None = None,
         sight_m: float = SIGHT_M,
     ) -> None:
         self.groups, self.clock, self.statics, self.traffic = tuple(groups), clock, tuple(statics), traffic
+        self.choices = dict(choices or {})
         self.ego = next((g for g in groups if isinstance(g, Driven)), None)
         self._observer = Observer(self.ego, self.groups, self.statics, sight_m) if self.ego is not None else None
         self._arrivals = [_arrivals(group, clock) for group in groups]
@@ -100,10 +107,11 @@ class World:
         """Move everybody by one step."""
         if self.done:
             raise ValueError(f"the world is at its end, {self.t_s:g} s")
-        if self.traffic is not None:
-            self.traffic.decide(self.step, self.t_s, self.ego.snapshot() if self.ego is not None else None)
-        for group, _ in self._busy:
-            group.advance(self.clock.dt_s)
+        if self.traffic is None:
+            for group, _ in self._busy:
+                group.advance(self.clock.dt_s)
+        else:
+            self._react(self.traffic)
         self.step += 1
         self._arrive()
 
@@ -114,6 +122,17 @@ class World:
             k: (np.concatenate([p[0] for p in v]), np.concatenate([p[1] for p in v], axis=1))
             for k, v in self._tracks.items()
         }
+
+    def _react(self, traffic: Traffic) -> None:
+        """Move everybody by one step, within a long one by parts in which the reactive ones see where the others are."""
+        held_s = control_step(self.clock.dt_s)
+        for part in range(round(self.clock.dt_s / held_s)):
+            t_s = self.t_s + part * held_s
+            for group, _ in self._busy if part else ():
+                group.look_up(t_s)
+            traffic.decide(t_s, held_s, self.ego.snapshot() if self.ego is not None else None)
+            for group, _ in self._busy:
+                group.advance(held_s)
 
     def _arrive(self) -> None:
         """Look up what holds at this step, place whose life begins, and store."""
@@ -141,9 +160,11 @@ class World:
         """Move what was stored to the tracks, cut to the life of each agent."""
         for (group, _), (steps, rows) in zip(self._busy, self._records):
             at, columns = np.array(steps, dtype=np.intp), np.array(rows)
+            begin = np.searchsorted(at, group.first[group.live])
+            end = np.searchsorted(at, group.last[group.live], side="right")
             for slot, i in enumerate(group.live):
-                alive = (at >= group.first[i]) & (at <= group.last[i])
-                if alive.any():
+                alive = slice(begin[slot], end[slot])
+                if begin[slot] < end[slot]:
                     self._tracks[group.agents[i].id].append((at[alive], columns[alive, :, slot].T))
         self._records = [([], []) for _ in self._busy]
 
@@ -179,5 +200,4 @@ def _arrivals(group: Group, clock: Clock) -> dict[int, NDArray[np.intp]]:
 
 
 def _stack(snapshot: Snapshot) -> Array:
-    s = snapshot
-    return np.stack([s.x_m, s.y_m, s.yaw_rad, s.speed_mps, s.steer_rad, s.accel_mps2])
+    return np.stack([getattr(snapshot, f.name) for f in fields(snapshot)])

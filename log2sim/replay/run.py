@@ -7,18 +7,19 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from log2sim.errors import ConfigError, ScenarioError
+from log2sim.registry import nearest
 from log2sim.replay.assemble import assemble
 from log2sim.replay.cast import EGO, cast_agents, groups_of, reactive_ids, traffic_of
 from log2sim.replay.clock import Clock
+from log2sim.replay.models import MODELS
+from log2sim.replay.parameters import WHEELED
 from log2sim.replay.policy import SIGHT_M, Policy, begin
 from log2sim.replay.result import Replay
 from log2sim.replay.rollout import Progress, World, roll
-from log2sim.replay.simulator import simulator_named
-from log2sim.replay.vehicle import WHEELED
 from log2sim.scenario import Agent, Scenario
 
 MODES = ("pid", "exact")
-DT_RANGE_S = (0.0005, 0.1)
+DT_RANGE_S = (0.0005, 1.0)
 MAX_STEPS = 20_000_000
 
 
@@ -26,7 +27,7 @@ def replay(
     scenario: Scenario,
     *,
     mode: str = "pid",
-    model: str = "kinematic",
+    model: str = "auto",
     dt_s: float = 0.01,
     ego: Policy | None = None,
     agents: str | Collection[str] = "log",
@@ -40,9 +41,12 @@ def replay(
     scenario : Scenario
     mode : {"pid", "exact"}
         Agents follow their waypoints by control through a vehicle model, or are where the log has them.
-    model : {"kinematic"}
+    model : {"auto", "kinematic", "dynamic", "single-track"}
+        How vehicles move: rolling without slip, on tires that slip and saturate, or by the published single-track model
+        with linear tires; "auto" takes for each the simplest that is good enough, `AgentReplay.model_reason` says why.
     dt_s : float
-        Simulation and control step in s, from 0.0005 to 0.1. States are stored about every 0.05 s.
+        Simulation step in s, from 0.0005 to 1; controls are renewed at least every 0.1 s. States are stored about every
+        0.05 s, or every step.
     ego : callable, optional
         `policy(observation) -> Controls` that drives the ego instead, from its first logged state to the end of its life.
         If it has `reset(scenario)`, that is called first.
@@ -72,14 +76,14 @@ def replay(
     if ego is not None:
         begin(ego, scenario)
     tracks = roll(world, ego, progress)
-    return assemble(scenario, world.groups, tracks, world.clock, mode, model)
+    return assemble(scenario, world.groups, tracks, world.clock, world.choices, mode, model)
 
 
 def open_world(
     scenario: Scenario,
     *,
     mode: str = "pid",
-    model: str = "kinematic",
+    model: str = "auto",
     dt_s: float = 0.01,
     drives_ego: bool = True,
     agents: str | Collection[str] = "log",
@@ -92,7 +96,8 @@ def open_world(
         raise ConfigError(f"dt: {dt_s} s, expected {DT_RANGE_S[0]} to {DT_RANGE_S[1]} s")
     if not sight_m >= 0:
         raise ConfigError(f"sight: {sight_m} m, expected 0 or more")
-    simulator = simulator_named(model)
+    if model not in MODELS:
+        raise ConfigError(f"unknown vehicle model '{model}'{nearest(model, list(MODELS))}; known: {', '.join(MODELS)}")
     if drives_ego and (scenario.ego is None or scenario.ego.category not in WHEELED):
         raise ConfigError(f"ego policy: scenario '{scenario.name}' has no agent '{EGO}' on wheels that it could drive")
     for agent in scenario.agents:
@@ -100,8 +105,8 @@ def open_world(
     clock = _clock(scenario.agents, dt_s)
     reactive = reactive_ids(scenario.agents, agents, drives_ego=drives_ego)
     cast = cast_agents(scenario.agents, mode, drives_ego=drives_ego, reactive=reactive)
-    groups = groups_of(cast, mode, clock, simulator)
-    return World(groups, clock, cast["static"], traffic_of(scenario.agents, groups, clock), sight_m)
+    groups, choices = groups_of(cast, clock, mode, model)
+    return World(groups, clock, cast["static"], traffic_of(scenario.agents, groups, clock), choices, sight_m)
 
 
 def _check_waypoints(agent: Agent) -> None:

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.replay.clock import Clock
 from log2sim.replay.driver import drivers_for, respond
 from log2sim.replay.path import Path
 from log2sim.replay.situation import Moment, excess, expected
@@ -36,7 +35,6 @@ class Traffic:
         All agents, and the courses of their box centers: of static ones, one pose.
     reactive : collection of str
         Ids of those that react.
-    clock : Clock
     driven : str, optional
         Id of the agent whose states are given with each decision, since it need not be where its log is.
 
@@ -54,36 +52,34 @@ class Traffic:
         agents: Sequence[Agent],
         paths: Sequence[Path],
         reactive: Collection[str],
-        clock: Clock,
         driven: str | None,
     ) -> None:
         self.index = {a.id: k for k, a in enumerate(agents)}
-        self.ways, self.clock = Ways(paths), clock
+        self.ways = Ways(paths)
         self.reacts = np.array([a.id in reactive for a in agents], dtype=bool)
         self.driver = drivers_for(agents)
         self._static = np.array([a.static for a in agents], dtype=bool)
         self._stays = self._static & (self.ways.begin_s == self.ways.end_s)
         self._driven = self.index[driven] if driven is not None else -1
-        self._every = max(1, round(DECIDE_S / clock.dt_s))
         self._size = np.array([a.size_m for a in agents], dtype=np.float64).reshape(-1, 3)
         self._distrusted = deep_overlaps(self.ways, self._size, self._static)
         self.restart()
 
     def restart(self) -> None:
         """Put everybody on the log's time."""
-        count = len(self.reacts)
+        count, self._decided_s = len(self.reacts), -np.inf
         self.delay_s, self.rate, self.rate_slope = np.zeros(count), np.ones(count), np.zeros(count)
 
-    def decide(self, step: int, t_s: float, ego: Snapshot | None) -> None:
-        """Choose how fast the reactive ones go on, and move their time by one step.
+    def decide(self, t_s: float, dt_s: float, ego: Snapshot | None) -> None:
+        """Choose how fast the reactive ones go on, and move their time by `dt_s`.
 
         `ego` is the state of the driven agent, None if there is none.
         """
         tau = t_s - self.delay_s
         going = self.reacts & (self.ways.begin_s <= tau) & (tau < self.ways.end_s)
-        if step % self._every == 0:
+        if t_s > self._decided_s + DECIDE_S - SAME_S:
+            self._decided_s = t_s
             self._decide(t_s, tau, np.flatnonzero(going), ego)
-        dt_s = self.clock.dt_s
         rate = np.where(going, np.clip(self.rate + self.rate_slope * dt_s, 0.0, 1.0), 1.0)
         self.delay_s = self.delay_s + np.where(going, (1 - (self.rate + rate) / 2) * dt_s, 0.0)
         self.rate = rate

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.replay.collisions import Boxes, overlaps
+from log2sim.replay.boxes import Boxes
+from log2sim.replay.collisions import contacts
 from log2sim.replay.ways import TIME_STEP_S, Ways
 
 DEEP_M = 0.5  # more than boxes err by
@@ -33,9 +34,10 @@ def deep_overlaps(ways: Ways, size_m: Array, static: NDArray[np.bool_]) -> NDArr
         pose = ways.at(everybody, part[:, None])
         there = (begin_s <= part[:, None]) & (part[:, None] <= end_s)
         x, y, z, yaw, speed = (np.where(there, c, np.nan) for c in pose[:5])
-        sample, a, b = overlaps(Boxes(x, y, z, yaw, speed, size), moving)
+        found = contacts(Boxes(x, y, z, yaw, speed, size), moving)
+        a, b = found.a, found.b
         deep[a, b] = True
-        at_once = part[sample] <= np.maximum(begin_s[a], begin_s[b]) + TIME_STEP_S
+        at_once = part[found.first_row.astype(np.intp)] <= np.maximum(begin_s[a], begin_s[b]) + TIME_STEP_S
         together[a[at_once], b[at_once]] = True
-    found = deep & ~together
-    return found | found.T
+    into = deep & ~together
+    return into | into.T

@@ -1,0 +1,52 @@
+"""Commands that hand a scenario to others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from log2sim.cli.app import Overwrite, Quiet, ScenarioPath, app, say
+
+
+@app.command()
+def export(
+    scenario: ScenarioPath,
+    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help="Format; an unknown one lists the known.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write into.")],
+    revision: Annotated[str | None, typer.Option(help="Revision of the format's standard.")] = None,
+    map: Annotated[Path | None, typer.Option(metavar="FILE", help="Road network to use instead of an own one.")] = None,
+    mode: Annotated[str | None, typer.Option(help="For scripts that move agents: exact or pid.")] = None,
+    log: Annotated[Path | None, typer.Option(metavar="LOG", help="Log whose pictures and points go along.")] = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write a scenario in the format of a simulator or viewer."""
+    from log2sim.export import Options
+    from log2sim.export import export as run
+    from log2sim.export.checks import remarks
+    from log2sim.scenario import Scenario
+
+    loaded = Scenario.load(scenario)
+    files = run(loaded, to, out, Options(revision, map, mode, log), overwrite=overwrite)
+    for file in files:
+        say(f"{file}: written", quiet=quiet)
+    for remark in remarks(loaded):
+        say(f"note: {remark}", quiet=quiet)
+
+
+@app.command(name="import")
+def import_(
+    file: Annotated[Path, typer.Argument(metavar="FILE.xosc", help="An OpenSCENARIO file with trajectories.")],
+    out: Annotated[Path, typer.Option("--out", metavar="SCENARIO", help="Scenario file to write.")],
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Turn an OpenSCENARIO file back into a scenario."""
+    from log2sim.export.openscenario_read import load
+    from log2sim.files import check_targets
+
+    check_targets(out, overwrite=overwrite)
+    load(file).save(out)
+    say(f"{out}: written", quiet=quiet)

@@ -1,0 +1,122 @@
+"""What every export format has to keep: a contract over all built-in formats, and the command."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import names, run
+
+from log2sim import registry
+from log2sim.errors import ConfigError, MissingExtra, ScenarioError
+from log2sim.export import Options, export, formats
+from log2sim.scenario import Scenario
+
+SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    return Scenario.load(SAMPLE)
+
+
+@pytest.fixture(params=formats())
+def name(request: pytest.FixtureRequest, scenario: Scenario, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Every format whose packages are installed."""
+    try:
+        export(scenario, request.param, tmp_path_factory.mktemp("probe"))
+    except MissingExtra as missing:
+        pytest.skip(str(missing))
+    return str(request.param)
+
+
+def test_a_format_writes_files_into_the_folder_and_nothing_beside_it(
+    name: str, scenario: Scenario, tmp_path: Path
+) -> None:
+    files = export(scenario, name, tmp_path / "out")
+    assert files
+    assert all(f.is_file() and f.stat().st_size > 0 for f in files)
+    assert list(files) == sorted(p for p in (tmp_path / "out").rglob("*") if p.is_file())
+    assert names(tmp_path) == ["out"]
+
+
+def test_a_format_writes_the_same_bytes_again(name: str, scenario: Scenario, tmp_path: Path) -> None:
+    first, second = (export(scenario, name, tmp_path / k) for k in ("a", "b"))
+    assert [f.read_bytes() for f in first] == [f.read_bytes() for f in second]
+
+
+def test_a_format_does_not_replace_files_unasked(name: str, scenario: Scenario, tmp_path: Path) -> None:
+    export(scenario, name, tmp_path / "out")
+    with pytest.raises(ConfigError, match="exists already"):
+        export(scenario, name, tmp_path / "out")
+    export(scenario, name, tmp_path / "out", overwrite=True)
+    assert names(tmp_path) == ["out"]
+
+
+def test_a_format_says_what_it_loses_and_which_options_it_has(name: str) -> None:
+    exporter = registry.load("export", name)
+    assert exporter.loses
+    assert set(exporter.options) <= {f.name for f in fields(Options)}
+
+
+def test_a_format_refuses_a_scenario_without_agents(name: str, scenario: Scenario, tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match="no agents"):
+        export(replace(scenario, agents=()), name, tmp_path / "out")
+    assert names(tmp_path) == []
+
+
+def test_a_format_names_the_agent_whose_time_does_not_increase(name: str, scenario: Scenario, tmp_path: Path) -> None:
+    agent = scenario.agents[0]
+    t_s = agent.waypoints.t_s.copy()
+    t_s[3] = t_s[2]
+    broken = replace(agent, waypoints=replace(agent.waypoints, t_s=t_s))
+    with pytest.raises(ScenarioError, match=r"agent 'ego': waypoints\.t_s does not increase at index 3"):
+        export(replace(scenario, agents=(broken, *scenario.agents[1:])), name, tmp_path / "out")
+    assert names(tmp_path) == []
+
+
+def test_a_format_takes_ids_that_are_no_file_names(name: str, scenario: Scenario, tmp_path: Path) -> None:
+    odd = replace(scenario.agents[1], id="../ä <&>\"' 1")
+    files = export(replace(scenario, agents=(scenario.agents[0], odd)), name, tmp_path / "out")
+    assert all(f.resolve().is_relative_to(tmp_path / "out") for f in files)
+    assert names(tmp_path) == ["out"]
+
+
+def test_an_option_that_a_format_lacks_is_refused(scenario: Scenario, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"--mode: format 'csv' has no such option"):
+        export(scenario, "csv", tmp_path / "out", Options(mode="pid"))
+
+
+def test_the_table_holds_every_waypoint(scenario: Scenario, tmp_path: Path) -> None:
+    (file,) = export(scenario, "csv", tmp_path)
+    with file.open(newline="", encoding="utf-8") as opened:
+        rows = list(csv.DictReader(opened))
+    for agent in scenario.agents:
+        own = [r for r in rows if r["id"] == agent.id]
+        np.testing.assert_array_equal([float(r["x_m"]) for r in own], agent.waypoints.x_m)
+        np.testing.assert_array_equal([r["observed"] == "1" for r in own], agent.waypoints.observed)
+        assert {float(r["width_m"]) for r in own} == {agent.size_m[1]}
+
+
+def test_the_command_names_what_it_wrote(tmp_path: Path) -> None:
+    ran = run("export", SAMPLE, "--to", "csv", "--out", tmp_path / "out")
+    assert ran.code == 0
+    assert ran.out == f"{tmp_path / 'out' / 'agents.csv'}: written\n"
+
+
+def test_an_unknown_format_lists_the_known(tmp_path: Path) -> None:
+    ran = run("export", SAMPLE, "--to", "cvs", "--out", tmp_path / "out")
+    assert ran.code == 2
+    assert ran.line == f"log2sim: unknown export format 'cvs' (did you mean 'csv'?); known: {', '.join(formats())}"
+    assert names(tmp_path) == []
+
+
+def test_a_file_where_the_folder_should_be_is_named(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("mine")
+    ran = run("export", SAMPLE, "--to", "csv", "--out", tmp_path / "out")
+    assert ran.code == 2
+    assert "is a file; give the name of a folder" in ran.line
+    assert (tmp_path / "out").read_text() == "mine"
