@@ -239,7 +239,7 @@ def test_only_those_named_react():
     scene = scenario_of(*(line(k, -30.0 * n, duration_s=12) for n, k in enumerate(("ego", "f", "g"))))
     result = replay(scene, ego=stops_at(1.0), agents=["f"], dt_s=0.05)
     assert [a.driver for a in result.agents] == ["policy", "reactive", "pid"]
-    assert [e["agents"] for e in new_collisions(result)][0] == ["f", "g"]
+    assert next(e["agents"] for e in new_collisions(result)) == ["f", "g"]
     assert replay(scene, agents="reactive", dt_s=0.05).agent("ego").driver == "pid"
     assert replay(scene, agents=["ego"], dt_s=0.05).agent("ego").driver == "reactive"
 

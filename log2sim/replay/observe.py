@@ -66,6 +66,7 @@ class Observer:
             width_m=agent.size_m[1],
             wheelbase_m=float(p.wheelbase_m[0]),
             rear_axle_offset_m=float(p.rear_axle_offset_m[0]),
+            understeer_s2pm2=float(p.understeer_s2pm2[0]),
         )
 
     def _route(self, t_s: float) -> Route:

@@ -40,7 +40,7 @@ class EgoState:
     """The ego: where it is, what its actuators do now (`accel_mps2` along the heading, `steer_rad` at the wheels), its size.
 
     The rear axle, about which a vehicle turns, is `rear_axle_offset_m` behind the box center, the front one
-    `wheelbase_m` ahead of that.
+    `wheelbase_m` ahead of that. A curvature c takes a steering angle of atan(wheelbase c (1 + understeer speed^2)).
     """
 
     x_m: float
@@ -53,6 +53,7 @@ class EgoState:
     width_m: float
     wheelbase_m: float
     rear_axle_offset_m: float
+    understeer_s2pm2: float
 
 
 @dataclass(frozen=True, eq=False)
