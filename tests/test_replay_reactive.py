@@ -141,6 +141,8 @@ def test_of_two_whose_ways_cross_the_first_in_the_log_goes_first_and_both_get_th
     a, b = result.agent("a"), result.agent("b")
     assert new_collisions(result) == []
     assert b.t_s[b.x_m > 0][0] < a.t_s[a.y_m > 0][0]
+    assert b.accel_mps2[(b.x_m > -20) & (b.x_m < 0)].min() > -0.3  # it does not wait for who waits for it
+    assert a.accel_mps2.min() < -1
     assert min(a.y_m[-1], b.x_m[-1]) > 50
 
 
@@ -212,7 +214,7 @@ def test_an_ego_that_does_about_as_the_log_moves_nobody():
 
 @pytest.mark.parametrize(
     "other",
-    [line("o", 300, 3.5, 25, 12, np.pi), parked("o", 150, -2.3), line("o", -40, 0, 27, 12), line("o", -8, 3.2, 25, 12)],
+    [line("o", 300, 3.5, 25, 12, np.pi), parked("o", 150, -2.3), line("o", -29, 0, 27, 12), line("o", -8, 3.2, 25, 12)],
     ids=["oncoming", "parked beside", "from behind", "next lane"],
 )
 def test_who_is_not_in_the_way_makes_nobody_brake(other):
