@@ -27,7 +27,7 @@ class Painter {
     pen.setLineDash(SOLID);
     pen.lineJoin = "round";
     pen.fillStyle = theme.ground;
-    pen.fillRect(0, 0, this.view.width, this.view.height);
+    pen.fillRect(0, 0, this.view.width + 1, this.view.height + 1);  // the last pixel may be half one
     this.grid();
     for (const track of layers.log) track.moveTo(t);
     if (shown.log) this.log(layers.log, t, shown, chosen);
@@ -168,7 +168,7 @@ class Painter {
     pen.stroke();
   }
 
-  // Boxes of another layer, hollow, with the way of the last seconds.
+  // Boxes of another layer, hollow.
   outlines(tracks, t, dashes, width) {
     const pen = this.pen;
     for (let i = 0; i < tracks.length; i++) {
