@@ -16,7 +16,19 @@ from log2sim import Scenario, cli
 from log2sim.errors import LogError
 from log2sim.schema import check
 
-COMMANDS = ("reconstruct", "replay", "edit", "plot", "view", "evaluate", "bench", "synth", "inspect", "validate", "config")
+COMMANDS = (
+    "reconstruct",
+    "replay",
+    "edit",
+    "plot",
+    "view",
+    "evaluate",
+    "bench",
+    "synth",
+    "inspect",
+    "validate",
+    "config",
+)
 PNG, GIF = b"\x89PNG", b"GIF8"
 
 
