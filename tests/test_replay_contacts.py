@@ -97,7 +97,7 @@ def test_a_bar_that_turns_touches_when_its_corner_gets_there(rate):
 def random_motions(count, seed):
     rng = np.random.default_rng(seed)
     size_a, size_b = (
-        np.stack([rng.uniform(0.5, 12, count), rng.uniform(0.4, 3, count), np.ones(count)], axis=1) for _ in range(2)
+        np.stack([rng.uniform(0.5, 12, count), rng.uniform(0.4, 3, count), np.ones(count)]) for _ in range(2)
     )
     place, way = rng.uniform(-9, 9, (2, count)), rng.normal(0, 6, (2, count))
     turn = rng.uniform(-0.6, 0.6, (2, count)) * (rng.uniform(size=count) < 0.7)
@@ -108,7 +108,7 @@ def random_motions(count, seed):
 def overlapping(m, u):
     return rectangles_overlap(
         m.dx_m + u * m.vx_m, m.dy_m + u * m.vy_m, m.yaw_a_rad + u * m.turn_a_rad, m.yaw_b_rad + u * m.turn_b_rad,
-        m.size_a_m, m.size_b_m,
+        m.size_a_m.T, m.size_b_m.T,
     )  # fmt: skip
 
 
