@@ -207,8 +207,6 @@ def _write_gif(frames: Iterator[Image], path: Path, colors: Sequence[str]) -> No
             now = np.asarray(Pillow.fromarray(frame).quantize(palette=palette, dither=Pillow.Dither.NONE))
             picture = Pillow.fromarray(now if before is None else np.where(now == before, np.uint8(CLEAR), now))
             picture.putpalette(palette.getpalette() or ())
-            if before is not None:
-                picture.info["transparency"] = CLEAR
             before = now
             yield picture
 
