@@ -190,6 +190,15 @@ def test_a_limit_nearly_named_is_guessed():
         parse_limits(["min_ttc=1"])
 
 
+def test_the_summary_of_a_driven_ego_is_about_the_ego():
+    from log2sim.replay.summary import summarize
+
+    driven = replay(hard_braking(), ego=lambda seen: Controls(-3.0, 0.0))
+    assert "least time to collision of the ego" in summarize(driven)
+    assert "(ego and wall at" in summarize(driven)
+    assert "collision of the ego" not in summarize(replay(hard_braking()))
+
+
 def test_the_command_lists_collisions_and_broken_limits_and_leaves_with_6_when_strict(tmp_path):
     hard_braking().save(tmp_path / "s.json")
     said = run("replay", tmp_path / "s.json", "--limit", "min_ttc_s=3")
@@ -222,6 +231,6 @@ def test_times_between_agents_do_not_depend_on_the_step(dt_s):
     # Each is out of the other's lane (4.4 + 1.8) / 2 m past the crossing.
     assert m["min_pet"]["s"] == pytest.approx((5 - 3.1 / 6) - (3 + 3.1 / 10), abs=2e-3)
     assert m["min_pet"]["agents"] == ["first", "second"]
-    # 28 m + 3 s * 3 m/s apart at first, 8 s later 24 m nearer; bumper to bumper a length less.
-    assert m["min_ttc"]["s"] == pytest.approx((28 + 9 - 24 - 4.4) / 3, abs=0.02)
+    # Centers are 41 m apart at first and come nearer by 3 m/s for 8 s; bumper to bumper is a length less.
+    assert m["min_ttc"]["s"] == pytest.approx((41 - 3 * 8 - 4.4) / 3, abs=0.02)
     assert m["min_ttc"]["agents"] == ["behind", "ahead"]

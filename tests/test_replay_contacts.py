@@ -79,11 +79,13 @@ def test_one_that_leaves_the_crossing_before_the_other_comes_is_not_hit():
         assert len(events_of(boxes_of(a, b))) == count
 
 
+@pytest.mark.parametrize("view", [0.0, 0.5, -2.0])
 @pytest.mark.parametrize("rate", [1.5, -6.0])
-def test_a_bar_that_turns_touches_when_its_corner_gets_there(rate):
+def test_a_bar_that_turns_touches_when_its_corner_gets_there(rate, view):
     bar, wall = (10.0, 0.5, 2.0), (2.0, 40.0, 2.0)
     gap = 4.6
-    a, b = (0.0, 0.0, lambda t: np.pi / 2 + rate * t), (gap + 1.0, 0.0, 0.0)
+    a = (0.0, 0.0, lambda t: view + np.pi / 2 + rate * t)  # seen from some sides its yaw passes pi
+    b = ((gap + 1.0) * np.cos(view), (gap + 1.0) * np.sin(view), view)
 
     def reach(t):
         yaw = np.pi / 2 + rate * t
