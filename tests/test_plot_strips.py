@@ -12,7 +12,7 @@ from matplotlib.text import Text
 from replay_maneuvers import MANEUVERS, agent_from, scenario_of
 
 from log2sim.plot import plot_tracks
-from log2sim.plot.animate import Pace, Stage
+from log2sim.plot.animate import WAY_ALPHA, Pace, Stage
 from log2sim.plot.cast import assign
 from log2sim.plot.hits import hits_of
 from log2sim.plot.look import ALARM
@@ -196,6 +196,7 @@ def test_a_gif_keeps_every_frame_and_the_colors_that_mean_something(tmp_path: Pa
             moving.seek(frame)
             pixels = np.asarray(moving.convert("RGB")).reshape(-1, 3).astype(int)
             for color in [role.color for role in assign(scenario).movers] + [ALARM]:
-                rgb = np.rint(255 * np.array(to_rgb(color)))
-                near = (np.abs(pixels - rgb).max(axis=1) <= 3).sum()
-                assert near > 10, (frame, color)
+                full = 255 * np.array(to_rgb(color))
+                for alpha in (1.0, WAY_ALPHA) if color != ALARM else (1.0,):
+                    near = np.abs(pixels - (alpha * full + (1 - alpha) * 255)).max(axis=1) <= 6
+                    assert near.sum() > 10, (frame, color, alpha)
