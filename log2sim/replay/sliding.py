@@ -40,7 +40,8 @@ def step_dynamic(
     with shape factor 1 and no curvature, D sin(arctan(C s)) = D C s / sqrt(1 + (C s)^2) with s the tangent of the slip
     angle: stiffness C at first, D at most. D is friction times load, less what drive and brakes take of it (friction
     ellipse). The pedal accelerates the rear axle: the drive makes up for what rolling along a curve costs, so that without
-    slip this is the kinematic bicycle, while without friction the momentum stays what it is.
+    slip this is the kinematic bicycle, while without friction the momentum stays what it is. That make-up is beyond the
+    friction limit: at full lock, while the yaw rate changes, the sum of forces can exceed it by a seventh.
     """
     p, chassis = parameters, Chassis.of(parameters)
     count, h = inner_steps(dt_s)
