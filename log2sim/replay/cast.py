@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.replay.drivable import LOCK_SHARE, Limits
+from log2sim.replay.follower import control_step
 from log2sim.replay.models import Choice, choose, slipping_reference, understeer
 from log2sim.replay.parameters import PEDAL_LAG_S, STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
 from log2sim.replay.path import path_of
@@ -54,7 +55,7 @@ def groups_of(
                 followed = [references[a.id] for a in moved]
                 if name != "kinematic":
                     p = replace(p, understeer_s2pm2=understeer(p))
-                    ahead_s = STEER_LAG_S + clock.dt_s / 2
+                    ahead_s = STEER_LAG_S + control_step(clock.dt_s) / 2
                     ones = [p.take(slice(i, i + 1)) for i in range(len(moved))]
                     followed = [slipping_reference(r, one, name, ahead_s) for r, one in zip(followed, ones)]
                 groups.append(kind(moved, followed, *_lives(moved, clock), p, simulator_named(name)))
@@ -82,8 +83,8 @@ def _vehicle_reference(agent: Agent, dt_s: float) -> Reference:
     return vehicle_reference(
         path_of(agent, limits.offset_m),
         limits,
-        accel_ahead_s=PEDAL_LAG_S + dt_s / 2,
-        curvature_ahead_s=STEER_LAG_S + dt_s / 2,
+        accel_ahead_s=PEDAL_LAG_S + control_step(dt_s) / 2,
+        curvature_ahead_s=STEER_LAG_S + control_step(dt_s) / 2,
         max_curvature_1pm=MAX_CURVATURE_1PM
         if agent.category in ("car", "truck", "bus")
         else MAX_TWO_WHEELER_CURVATURE_1PM,

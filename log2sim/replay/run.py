@@ -18,7 +18,7 @@ from log2sim.replay.rollout import Clock, Progress, roll
 from log2sim.scenario import Agent, Scenario
 
 MODES = ("pid", "exact")
-DT_RANGE_S = (0.0005, 0.1)
+DT_RANGE_S = (0.0005, 1.0)
 MAX_STEPS = 20_000_000
 
 
@@ -42,7 +42,8 @@ def replay(
         How vehicles move: rolling without slip, on tires that slip and saturate, or by the published single-track model
         with linear tires; "auto" takes for each the simplest that is good enough, `AgentReplay.model_reason` says why.
     dt_s : float
-        Simulation and control step in s, from 0.0005 to 0.1. States are stored about every 0.05 s.
+        Simulation step in s, from 0.0005 to 1; controls are renewed at least every 0.1 s. States are stored about every
+        0.05 s, or every step.
     ego : callable, optional
         `policy(observation) -> Controls` that drives the ego instead, from its first logged state to the end of its life.
     progress : callable, optional

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -23,7 +24,7 @@ GRAVITY_MPS2 = 9.81
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Base of records whose fields are arrays (A,)."""
+    """Base of records whose fields are arrays (A,) or (..., A)."""
 
     @classmethod
     def zeros(cls, count: int) -> Self:
@@ -32,12 +33,12 @@ class Columns:
 
     def take(self, index: Any) -> Self:
         """The agents at `index` (integers, a slice or a mask)."""
-        return type(self)(*(getattr(self, f.name)[index] for f in fields(self)))
+        return type(self)(*(getattr(self, f.name)[..., index] for f in fields(self)))
 
     def put(self, index: Any, other: Self) -> None:
         """Overwrite the agents at `index`; only the owner of the columns may do so."""
         for f in fields(self):
-            getattr(self, f.name)[index] = getattr(other, f.name)
+            getattr(self, f.name)[..., index] = getattr(other, f.name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +93,11 @@ class VehicleParameters(Columns):
     rear_stiffness_1prad: Array
     friction: Array
     understeer_s2pm2: Array
+
+    @cached_property
+    def max_curvature_1pm(self) -> Array:
+        """At full lock."""
+        return np.tan(self.max_steer_rad) / self.wheelbase_m
 
 
 @dataclass(frozen=True, eq=False)
