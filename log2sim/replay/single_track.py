@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,20 +118,31 @@ class Slips(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two linear equations for the slips of an agent, a and b above c and d, in units of their own."""
+    """Two linear equations for the slips of an agent, a and b above c and d; solved by Cramer's rule.
+
+    What is solved for are the slips in units of their own, which may be zero; the factors are units over determinant.
+    """
 
     a: Array
     b: Array
     c: Array
     d: Array
-    unit: Slips
+    rear_factor: Array
+    front_factor: Array
+
+    @classmethod
+    def of(cls, a: Array, b: Array, c: Array, d: Array, unit: Slips | None = None) -> Self:
+        factor = 1 / (a * d - b * c)
+        return (
+            cls(a, b, c, d, factor, factor)
+            if unit is None
+            else cls(a, b, c, d, unit.rear * factor, unit.front * factor)
+        )
 
     def solve(self, rear: Array, front: Array) -> Slips:
-        """The slips for right-hand sides (A,), (A,), by Cramer's rule."""
-        determinant = self.a * self.d - self.b * self.c
+        """The slips for right-hand sides (A,), (A,)."""
         return Slips(
-            self.unit.rear * (self.d * rear - self.b * front) / determinant,
-            self.unit.front * (self.a * front - self.c * rear) / determinant,
+            self.rear_factor * (self.d * rear - self.b * front), self.front_factor * (self.a * front - self.c * rear)
         )
 
 
@@ -139,19 +150,18 @@ def linear_slips(slips: Slips, motion: Motion, p: VehicleParameters, c: Chassis,
     """Slip angles (rad, positive to the left) after a step of the published model."""
     m, wheelbase = motion, p.wheelbase_m
     speed, accel = (m.speed0_mps + m.speed1_mps) / 2, (m.speed1_mps - m.speed0_mps) / h
-    pace, gear = np.abs(speed), np.where(speed < 0, -1.0, 1.0)
+    pace, gear = np.abs(speed), np.copysign(1.0, speed)
     rear_grip, front_grip = grips(accel, p, c)
     by_rear, by_front = rear_grip * p.rear_stiffness_1prad, front_grip * p.front_stiffness_1prad
     # The yaw rate is speed * (front - rear + steer) / wheelbase; it and its growth with the speed move both axles.
     rear_turn = (p.cg_to_rear_m * gear * accel - pace * speed) / wheelbase
     front_turn = -(c.cg_to_front_m * gear * accel + pace * speed) / wheelbase
     tau, turned = GAMMA * h, m.steer1_rad - m.steer0_rad
-    system = Pair(
+    system = Pair.of(
         pace + tau * (c.rear * by_rear + rear_turn),
         tau * (c.cross * by_front - rear_turn),
         tau * (c.cross * by_rear + front_turn),
         pace + tau * (c.front * by_front - front_turn),
-        Slips(np.ones_like(pace), np.ones_like(pace)),
     )
 
     def stage(rear: Array, front: Array, steer: Array) -> Slips:

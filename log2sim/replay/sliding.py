@@ -171,7 +171,7 @@ def _relaxation(
     by_rear = p.rear_stiffness_1prad * rear_grip * ellipse
     by_front = p.front_stiffness_1prad * front_grip * ellipse * cos2 * np.sqrt(cos2)
     rear_turn, front_turn = (speed / p.wheelbase_m * scale for scale in (rear_scale, front_scale))
-    return Pair(
+    return Pair.of(
         rear_scale + tau * (c.rear * by_rear - rear_turn),
         tau * (c.cross * by_front + front_turn),
         tau * (c.cross * by_rear - rear_turn),

@@ -144,11 +144,8 @@ def step_bicycle(
         steer, mean_steer = actuate(steer, steer_target, p.steer_lag_s, p.max_steer_rate_radps, h)
         gear = engaged(speed, controls.reverse)
         pace, distance = advance(np.abs(speed), mean_pedal, h)
-        way = gear * distance
-        turn = way * (np.tan(mean_steer) / p.wheelbase_m)
-        chord = way * sinc(turn / 2)
-        cos, sin = cos_and_sin(yaw + turn / 2)
-        x, y, yaw, speed = x + chord * cos, y + chord * sin, yaw + turn, gear * pace
+        x, y, yaw = roll(x, y, yaw, gear * distance, np.tan(mean_steer) / p.wheelbase_m)
+        speed = gear * pace
     return VehicleState(x, y, yaw, speed, steer, pedal, state.lateral_mps, state.yaw_rate_radps)
 
 
@@ -169,6 +166,14 @@ def step_point(state: PointState, controls: PointControls, dt_s: float) -> Point
 def clamp(value: Array, low: Array | float, high: Array | float) -> Array:
     """Values within limits; `np.clip` takes twice as long on short arrays."""
     return np.minimum(np.maximum(value, low), high)
+
+
+def roll(x: Array, y: Array, yaw: Array, way: Array, curvature: Array) -> tuple[Array, Array, Array]:
+    """Position and yaw at the end of an arc of signed length `way`."""
+    turn = way * curvature
+    chord = way * sinc(turn / 2)
+    cos, sin = cos_and_sin(yaw + turn / 2)
+    return x + chord * cos, y + chord * sin, yaw + turn
 
 
 def engaged(speed: Array, reverse: NDArray[np.bool_]) -> Array:
