@@ -34,9 +34,9 @@ from vehicle_maneuvers import (
 )
 
 from log2sim.files import write_json
-from log2sim.geometry import Array
+from log2sim.geometry import Array, cos_sin
 from log2sim.replay.single_track import Chassis, Motion, Slips, linear_course, linear_slips
-from log2sim.replay.vehicle import cos_and_sin, roll
+from log2sim.replay.vehicle import roll
 
 STORE_S = 0.1
 STEPS_S = (0.001, 0.005, 0.01, 0.02, 0.05)
@@ -141,7 +141,7 @@ def stepped(case: Case, model: str, h: float, agents: int) -> Array:
         else:
             before, slips = slips, linear_slips(slips, motion, p, chassis, h)
             chord, angle, turn = linear_course(before, slips, motion, p)
-            cos, sin = cos_and_sin(yaw + angle)
+            cos, sin = cos_sin(yaw + angle)
             x, y, yaw = x + chord * cos, y + chord * sin, yaw + turn
         steer, speed = motion.steer1_rad, motion.speed1_mps
         if (k + 1) % every == 0:
@@ -164,7 +164,7 @@ def known_ahead(case: Case, model: str, h: float) -> Array:
     else:
         slips = np.array(slip_course(motion, h)).T
         chord, angle, turn = linear_course(Slips(*slips[:, :-1]), Slips(*slips[:, 1:]), motion, VEHICLE)
-        cos, sin = cos_and_sin(np.cumsum(turn) - turn + angle)
+        cos, sin = cos_sin(np.cumsum(turn) - turn + angle)
         dx, dy = chord * cos, chord * sin
     every = round(STORE_S / h)
     xy = np.concatenate([[[0.0, 0.0]], np.cumsum(np.stack([dx, dy], axis=1), axis=0)])

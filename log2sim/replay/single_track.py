@@ -14,7 +14,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array
+from log2sim.geometry import Array, cos_sin
 from log2sim.replay.vehicle import (
     GRAVITY_MPS2,
     VehicleControls,
@@ -23,7 +23,6 @@ from log2sim.replay.vehicle import (
     actuate,
     advance,
     clamp,
-    cos_and_sin,
     engaged,
     sinc,
 )
@@ -57,7 +56,7 @@ def step_single_track(
     pedal_target = clamp(controls.pedal_mps2, -p.max_brake_mps2, p.max_throttle_mps2)
     steer_target = clamp(controls.steer_rad, -p.max_steer_rad, p.max_steer_rad)
     yaw, speed, pedal, steer = state.yaw_rad, state.speed_mps, state.pedal_mps2, state.steer_rad
-    cos, sin = cos_and_sin(yaw)
+    cos, sin = cos_sin(yaw)
     x, y = state.x_m + p.cg_to_rear_m * cos, state.y_m + p.cg_to_rear_m * sin
     still = speed == 0
     per_speed = np.where(still, 0.0, 1 / np.where(still, 1.0, speed))
@@ -73,9 +72,9 @@ def step_single_track(
         motion = Motion(speed0, speed, gear * distance, steer0, mean_steer, steer)
         before, slips = slips, linear_slips(slips, motion, p, chassis, h)
         chord, angle, turn = linear_course(before, slips, motion, p)
-        cos, sin = cos_and_sin(yaw + angle)
+        cos, sin = cos_sin(yaw + angle)
         x, y, yaw = x + chord * cos, y + chord * sin, yaw + turn
-    cos, sin = cos_and_sin(yaw)
+    cos, sin = cos_sin(yaw)
     x, y = x - p.cg_to_rear_m * cos, y - p.cg_to_rear_m * sin
     yaw_rate = speed * (slips.front - slips.rear + steer) / p.wheelbase_m
     return VehicleState(x, y, yaw, speed, steer, pedal, speed * slips.rear, yaw_rate)

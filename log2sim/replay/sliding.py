@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array
+from log2sim.geometry import Array, cos_sin
 from log2sim.replay.single_track import AGAIN, GAMMA, Chassis, Pair, Slips, grips, inner_steps
 from log2sim.replay.vehicle import (
     GRAVITY_MPS2,
@@ -20,7 +20,6 @@ from log2sim.replay.vehicle import (
     actuate,
     advance,
     clamp,
-    cos_and_sin,
     engaged,
     sinc,
 )
@@ -120,7 +119,7 @@ def slide(body: Body, drive: Drive, p: VehicleParameters, c: Chassis, h: float) 
     turn = (way * d.mean_bend + h * (front + last.front - rear - last.rear) / 2) / p.wheelbase_m
     shrink = sinc(turn / 2)
     ahead, aside = way * shrink, h * (rear + last.rear) / 2 * shrink
-    cos, sin = cos_and_sin(body.yaw_rad + turn / 2)
+    cos, sin = cos_sin(body.yaw_rad + turn / 2)
     x, y = body.x_m + ahead * cos - aside * sin, body.y_m + ahead * sin + aside * cos
     return Body(x, y, body.yaw_rad + turn, speed1, last.rear, rate1)
 

@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array
+from log2sim.geometry import Array, cos_sin
 
 MAX_INNER_STEP_S = 0.02
 """Longest step over which the mean steering angle stands for its course; the error falls with its square."""
@@ -172,7 +172,7 @@ def roll(x: Array, y: Array, yaw: Array, way: Array, curvature: Array) -> tuple[
     """Position and yaw at the end of an arc of signed length `way`."""
     turn = way * curvature
     chord = way * sinc(turn / 2)
-    cos, sin = cos_and_sin(yaw + turn / 2)
+    cos, sin = cos_sin(yaw + turn / 2)
     return x + chord * cos, y + chord * sin, yaw + turn
 
 
@@ -204,14 +204,6 @@ def advance(pace: Array, pedal: Array, h: float) -> tuple[Array, Array]:
         return after, distance
     braking = np.where(stops, pedal, -1.0)  # negative wherever the step ends at rest
     return np.where(stops, 0.0, after), np.where(stops, -(pace**2) / (2 * braking), distance)
-
-
-def cos_and_sin(angle: Array) -> tuple[Array, Array]:
-    """Cosine and sine, both from the tangent of the half angle: one function to evaluate, and one that NumPy vectorizes."""
-    t = np.tan(angle / 2)
-    t2 = t * t
-    scale = 1 / (1 + t2)
-    return (1 - t2) * scale, 2 * t * scale
 
 
 def sinc(angle: Array) -> Array:
