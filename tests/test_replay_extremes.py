@@ -279,6 +279,11 @@ def test_three_rounds_through_plus_and_minus_pi(dt_s, model):
     assert np.all((states.yaw_rad >= -np.pi) & (states.yaw_rad < np.pi))
 
 
+def test_between_waypoints_the_logged_heading_goes_the_short_way_through_pi():
+    states = followed(on_circle(10.0, 15.0, 30.0, rate_hz=4.0), mode="exact")
+    np.testing.assert_allclose(wrap_angle(states.yaw_rad - 10.0 * states.t_s / 15.0), 0.0, atol=1e-5)
+
+
 def test_headings_that_flicker_about_pi_are_one_heading():
     rng, t = np.random.default_rng(4), np.arange(101) * 0.1
     noise = rng.normal(0, 0.03, 101)
