@@ -22,6 +22,7 @@ from log2sim.replay.policy import (
     Route,
     ask,
 )
+from log2sim.replay.record import Record, Tracks, tracks_of
 from log2sim.replay.reference import GRID_S
 from log2sim.replay.world import Driven, Group, Snapshot
 from log2sim.scenario import Agent
@@ -61,15 +62,11 @@ class Clock:
         return np.floor((t_s - self.begin_s) / self.dt_s + MARGIN).astype(np.intp)
 
 
-Tracks = dict[str, tuple[NDArray[np.intp], Array]]
-"""By agent id: the stored steps (S,) and the columns (C, S) of a `Snapshot` at them."""
-
-
 def roll(
     groups: Sequence[Group], clock: Clock, statics: Sequence[Agent], policy: Policy | None, progress: Progress | None
 ) -> Tracks:
     """Drive all groups from the first step to the last and return what was stored."""
-    tracks: dict[str, list[tuple[NDArray[np.intp], Array]]] = defaultdict(list)
+    records: list[Record] = []
     arrivals = [_arrivals(group, clock) for group in groups]
     driven = next((g for g in groups if isinstance(g, Driven)), None)
     width = max(1, round(WINDOW_S / clock.dt_s))
@@ -78,28 +75,23 @@ def roll(
         for group in groups:
             group.open_window(begin, end, clock.time(begin), clock.time(end))
         busy = [(g, a) for g, a in zip(groups, arrivals) if len(g.live)]
-        records: list[tuple[list[int], list[Array]]] = [([], []) for _ in busy]
+        window = [Record(group, begin, end, clock.store_every) for group, _ in busy]
+        records += window
         for step in range(begin, end):
             for group, placed in busy:
                 group.look_up(clock.time(step))
                 if step in placed:
                     group.place(placed[step], clock.time(step))
             if step % clock.store_every == 0:
-                for (group, _), (steps, rows) in zip(busy, records):
-                    steps.append(step)
-                    rows.append(_stack(group.snapshot()))
+                for record in window:
+                    record.add()
             if policy is not None and driven is not None and driven.first[0] <= step <= driven.last[0]:
                 driven.controls = ask(policy, _observe(driven, groups, statics, clock, step))
             for group, _ in busy:
                 group.advance(clock.dt_s)
-        for (group, _), (steps, rows) in zip(busy, records):
-            if steps:
-                _keep(tracks, group, np.array(steps), np.stack(rows))
         if progress is not None:
             progress(end, clock.steps)
-    return {
-        k: (np.concatenate([p[0] for p in v]), np.concatenate([p[1] for p in v], axis=1)) for k, v in tracks.items()
-    }
+    return tracks_of(records)
 
 
 def _arrivals(group: Group, clock: Clock) -> dict[int, NDArray[np.intp]]:
@@ -120,18 +112,6 @@ def _arrivals(group: Group, clock: Clock) -> dict[int, NDArray[np.intp]]:
 
 def _stack(snapshot: Snapshot) -> Array:
     return np.stack([getattr(snapshot, f.name) for f in fields(snapshot)])
-
-
-def _keep(
-    tracks: dict[str, list[tuple[NDArray[np.intp], Array]]], group: Group, steps: NDArray[np.intp], rows: Array
-) -> None:
-    """Add to the tracks what was recorded in one window, `rows` (S, C, A), cut to the life of each agent."""
-    begin = np.searchsorted(steps, group.first[group.live])
-    end = np.searchsorted(steps, group.last[group.live], side="right")
-    for slot, i in enumerate(group.live):
-        alive = slice(begin[slot], end[slot])
-        if begin[slot] < end[slot]:
-            tracks[group.agents[i].id].append((steps[alive], rows[alive, :, slot].T))
 
 
 def _observe(ego: Driven, groups: Sequence[Group], statics: Sequence[Agent], clock: Clock, step: int) -> Observation:
