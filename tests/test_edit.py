@@ -221,7 +221,7 @@ def test_a_new_collision_is_told_with_its_pair_and_time() -> None:
     assert edit(source, [Shift("other", 0.1)]).warnings == ()
     (warning,) = edit(source, [Shift("other", 1.4)]).warnings
     # Bumpers at 3 m from the crossing (half a length and half a width) touch 0.3 s before both are there.
-    assert "agents 'ego' and 'other' collide at 1.75 s at 14.1 m/s" in warning
+    assert "agents 'ego' and 'other' collide at 1.70 s at 14.1 m/s" in warning
     result = edit(source, [Shift("other", 1.4)])
     with pytest.raises(CheckFailed, match="'ego' and 'other' collide"):
         result.require_clean()
