@@ -115,6 +115,7 @@ def test_overlaps_at_entry_agree_with_looking_at_every_pair() -> None:
     expected = {frozenset(pair) for pair in pairs}
     found = overlaps_at_entry(agents)
     assert {frozenset(pair[:2]) for pair in found} == expected
+    assert len(found) == len(expected)
     assert len(expected) > 5
     assert all(agents[a].waypoints.t_s[0] <= agents[b].waypoints.t_s[0] for a, b, _ in found)
 

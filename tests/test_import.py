@@ -53,6 +53,7 @@ def test_a_scenario_comes_back_within_a_micrometer(world: str, revision: str, tm
         for key in ("x_m", "y_m", "z_m"):
             np.testing.assert_allclose(getattr(w, key), getattr(v, key), atol=2e-6)
         assert np.abs(wrap_angle(w.yaw_rad - v.yaw_rad)).max() < 1e-8
+        assert np.all((w.yaw_rad >= -np.pi) & (w.yaw_rad < np.pi))
         for key in ("speed_mps", "sigma_xy_m"):
             np.testing.assert_allclose(getattr(w, key), getattr(v, key), atol=1e-4)
 
