@@ -29,8 +29,8 @@ class OpenScenario:
 
     options: tuple[str, ...] = ("revision", "map")
     loses = (
-        "cameras, quality, plan and provenance; a cyclist and a bicycle are both bicycles and what is 'other' a van,"
-        " except to `log2sim import`; to ScenarioRunner sizes and axles too"
+        "cameras, quality, plan and provenance; players take a cyclist for a bicycle and what is 'other' for a van (an import"
+        " does not), and ScenarioRunner takes over no sizes"
     )
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
