@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -14,7 +15,7 @@ from log2sim.geometry import Array
 TOLERANCE_M, SPLINE_M, ARCS_M = 0.01, 0.006, 0.002
 # Points of a path nearer than this are one; between those further apart than this the line from one to the next counts.
 LEAST_STEP_M, LARGEST_STEP_M = 0.01, 0.5
-SAMPLE_M = 0.1
+SAMPLE_M = 0.2
 # An arc whose middle is nearer its chord than this is written as a line.
 FLAT_M = 1e-6
 
@@ -30,19 +31,11 @@ class Piece:
     length_m: float
     curvature_1pm: float
 
-    def at(self, along_m: Array) -> Array:
-        """Points (N, 3) x, y, heading at distances (N,) from the piece's start."""
-        turned = self.curvature_1pm * along_m
-        chord = along_m * np.sinc(turned / (2 * np.pi))
-        direction = self.heading_rad + turned / 2
-        return np.column_stack(
-            [self.x_m + chord * np.cos(direction), self.y_m + chord * np.sin(direction), self.heading_rad + turned]
-        )
-
     @property
     def end(self) -> Array:
         """x, y, heading (3,) where the piece ends."""
-        return self.at(np.array([self.length_m]))[0]
+        start = np.array([self.x_m, self.y_m, self.heading_rad])
+        return _along(start, np.array([self.curvature_1pm]), np.array([self.length_m]))[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,14 +48,15 @@ class ReferenceLine:
     def length_m(self) -> float:
         return self.pieces[-1].s_m + self.pieces[-1].length_m
 
+    @cached_property
+    def _columns(self) -> Array:
+        return np.array([[p.s_m, p.x_m, p.y_m, p.heading_rad, p.curvature_1pm] for p in self.pieces]).T
+
     def at(self, s_m: Array) -> Array:
         """Points (N, 3) x, y, heading at stations (N,)."""
-        starts = np.array([p.s_m for p in self.pieces])
-        index = np.clip(np.searchsorted(starts, s_m, side="right") - 1, 0, len(starts) - 1)
-        out = np.empty((len(s_m), 3))
-        for k in np.unique(index):
-            out[index == k] = self.pieces[k].at(s_m[index == k] - starts[k])
-        return out
+        starts = self._columns[0]
+        k = np.clip(np.searchsorted(starts, s_m, side="right") - 1, 0, None)
+        return _along(self._columns[1:4, k].T, self._columns[4, k], s_m - starts[k])
 
     def extended(self, before_m: float, after_m: float) -> ReferenceLine:
         """The same with straight lines before and after it, stations counted from the new start."""
@@ -73,6 +67,16 @@ class ReferenceLine:
         steps += [(p.x_m, p.y_m, p.heading_rad, p.length_m, p.curvature_1pm) for p in self.pieces]
         steps += [(x, y, heading, after_m, 0.0)]
         return chained(steps)
+
+
+def _along(start: Array, curvature_1pm: Array, along_m: Array) -> Array:
+    """Points (N, 3) x, y, heading at distances (N,) along arcs that begin at (N, 3) or all at (3,)."""
+    x, y, heading = start.T
+    turned = curvature_1pm * along_m
+    chord = along_m * np.sinc(turned / (2 * np.pi))
+    return np.column_stack(
+        [x + chord * np.cos(heading + turned / 2), y + chord * np.sin(heading + turned / 2), heading + turned]
+    )
 
 
 def chained(steps: Sequence[tuple[float, float, float, float, float]]) -> ReferenceLine:

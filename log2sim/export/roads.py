@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,22 +48,29 @@ class Road:
     left_m: float = 0.0
     right_m: float = 0.0
 
-    def holds(self, points: Array, aside_m: float | None = None) -> NDArray[np.bool_]:
-        """Whether points (N, 3) x, y, heading lie along the road, on its lanes or within `aside_m` of its line."""
+    @cached_property
+    def _probes(self) -> tuple[Array, Any]:
+        """Points (P, 3) x, y, heading every `PROBE_M`, and a tree of their positions."""
         from scipy.spatial import cKDTree
 
-        stations = np.linspace(0.0, self.line.length_m, max(int(self.line.length_m / PROBE_M), 1) + 1)
-        probes = self.line.at(stations)
-        near = np.minimum(cKDTree(probes[:, :2]).query(points[:, :2], k=1)[1], len(probes) - 1)
-        x, y, heading = probes[near].T
-        dx, dy = points[:, 0] - x, points[:, 1] - y
+        probes = self.line.at(np.linspace(0.0, self.line.length_m, max(int(self.line.length_m / PROBE_M), 1) + 1))
+        return probes, cKDTree(probes[:, :2])
+
+    def holds(self, points: Array, aside_m: float | None = None) -> NDArray[np.bool_]:
+        """Whether points (N, 3) x, y, heading lie along the road, on its lanes or within `aside_m` of its line."""
+        left, right = self.lane_m / 2 + self.left_m, self.lane_m / 2 + self.right_m
+        if aside_m is not None:
+            left = right = aside_m
+        probes, tree = self._probes
+        near = tree.query(points[:, :2], distance_upper_bound=max(left, right) + PROBE_M)[1]
+        held = near < len(probes)
+        x, y, heading = probes[near[held]].T
+        dx, dy = points[held, 0] - x, points[held, 1] - y
         along, across = dx * np.cos(heading) + dy * np.sin(heading), dy * np.cos(heading) - dx * np.sin(heading)
-        turned = np.abs(wrap_angle(points[:, 2] - heading))
-        left, right = (
-            (self.lane_m / 2 + self.left_m, self.lane_m / 2 + self.right_m) if aside_m is None else (aside_m,) * 2
-        )
+        turned = np.abs(wrap_angle(points[held, 2] - heading))
         parallel = np.minimum(turned, np.pi - turned) <= ALONG_RAD
-        return parallel & (np.abs(along) <= PROBE_M) & (across <= left) & (across >= -right)
+        held[held] = parallel & (np.abs(along) <= PROBE_M) & (across <= left) & (across >= -right)
+        return held
 
 
 @dataclass(frozen=True, eq=False)
