@@ -14,8 +14,11 @@ from log2sim.geometry import Array
 # The smoothing spline stays this near the path, and the arcs as near the spline: together below TOLERANCE_M.
 TOLERANCE_M, SPLINE_M, ARCS_M = 0.01, 0.006, 0.002
 # Points of a path nearer than this are one; between those further apart than this the line from one to the next counts.
-LEAST_STEP_M, LARGEST_STEP_M = 0.01, 0.5
+LEAST_STEP_M, LARGEST_STEP_M = 0.01, 0.25
 SAMPLE_M = 0.2
+# How far the points may lie from the spline on average, from the calmest curve to the one through all of them.
+SIGMAS_M = (*(SPLINE_M / 2 * 0.7**k for k in range(8)), 0.0)
+SWING = 1.2
 # An arc whose middle is nearer its chord than this is written as a line.
 FLAT_M = 1e-6
 
@@ -139,11 +142,13 @@ def _spline(xy_m: Array) -> tuple[Array, Array]:
     u = np.concatenate([a + np.arange(n) / n * d for a, n, d in zip(travelled, parts, steps)] + [travelled[-1:]])
     dense = np.column_stack([np.interp(u, travelled, xy_m[:, k]) for k in (0, 1)])
     at = np.linspace(0.0, travelled[-1], max(int(np.ceil(travelled[-1] / SAMPLE_M)), 2) + 1)
-    for sigma_m in (SPLINE_M / 2, SPLINE_M / 4, SPLINE_M / 8, 0.0):
-        tck, _ = splprep(dense.T, u=u, k=min(3, len(u) - 1), s=len(u) * sigma_m**2)
-        if np.hypot(*(np.array(splev(u, tck)) - dense.T)).max() <= SPLINE_M:
+    for sigma_m in SIGMAS_M:
+        tck, _ = splprep(dense.T, u=u, k=min(3, len(u) - 1), s=len(u) * sigma_m**2, quiet=1)
+        (x, y), (dx, dy) = splev(at, tck), splev(at, tck, der=1)
+        # Its parameter is the way along the path; where it runs much faster it swings out between two points.
+        calm = np.hypot(dx, dy).max() <= SWING
+        if calm and np.hypot(*(np.array(splev(u, tck)) - dense.T)).max() <= SPLINE_M:
             break
-    (x, y), (dx, dy) = splev(at, tck), splev(at, tck, der=1)
     heading = np.unwrap(np.arctan2(dy, dx))
     return np.column_stack([x, y, heading]), travelled / travelled[-1] * (len(at) - 1)
 

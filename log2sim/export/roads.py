@@ -178,11 +178,12 @@ def _road(agent: Agent, way: Way, beside_m: float = 0.0, level_m: float = LEVEL_
 
 
 def _standing_road(agent: Agent) -> Road:
-    """A straight road under an agent that never moves."""
+    """A straight road through the middle of where an agent stands."""
     w = agent.waypoints
-    line = straight(float(w.x_m[0]), float(w.y_m[0]), float(w.yaw_rad[0]), 2 * BEYOND_M)
-    ground = float(w.z_m[0]) - agent.size_m[2] / 2
-    return Road(agent.id, line, np.array([[0.0, ground, 0.0, 0.0, 0.0]]), _lane_m(agent), LANE_M, LANE_M)
+    x, y, yaw = (float(np.mean(v)) for v in (w.x_m, w.y_m, np.unwrap(w.yaw_rad)))
+    ground = float(np.mean(w.z_m)) - agent.size_m[2] / 2
+    elevation = np.array([[0.0, ground, 0.0, 0.0, 0.0]])
+    return Road(agent.id, straight(x, y, yaw, 2 * BEYOND_M), elevation, _lane_m(agent), LANE_M, LANE_M)
 
 
 def _lane_m(agent: Agent) -> float:
