@@ -12,7 +12,7 @@ import numpy as np
 from log2sim.geometry import Array
 
 # The smoothing spline stays this near the path, and the arcs as near the spline: together below TOLERANCE_M.
-TOLERANCE_M, SPLINE_M, ARCS_M = 0.01, 0.006, 0.002
+TOLERANCE_M, SPLINE_M, ARCS_M = 0.01, 0.007, 0.002
 # Points of a path nearer than this are one; between those further apart than this the line from one to the next counts.
 LEAST_STEP_M, LARGEST_STEP_M = 0.01, 0.25
 SAMPLE_M = 0.2
@@ -136,6 +136,9 @@ def _spline(xy_m: Array) -> tuple[Array, Array]:
     """Samples (M, 3) x, y, heading of a smooth curve within `SPLINE_M` of points (N, 2), and where those lie among them."""
     from scipy.interpolate import splev, splprep
 
+    straight_on = _straight_samples(xy_m)
+    if straight_on is not None:
+        return straight_on
     steps = np.hypot(*np.diff(xy_m, axis=0).T)
     travelled = np.concatenate([[0.0], np.cumsum(steps)])
     parts = np.maximum(np.ceil(steps / LARGEST_STEP_M).astype(int), 1)
@@ -143,7 +146,8 @@ def _spline(xy_m: Array) -> tuple[Array, Array]:
     dense = np.column_stack([np.interp(u, travelled, xy_m[:, k]) for k in (0, 1)])
     at = np.linspace(0.0, travelled[-1], max(int(np.ceil(travelled[-1] / SAMPLE_M)), 2) + 1)
     for sigma_m in SIGMAS_M:
-        tck, _ = splprep(dense.T, u=u, k=min(3, len(u) - 1), s=len(u) * sigma_m**2, quiet=1)
+        # Asked for all its output it warns of nothing; what it has not solved the two tests below refuse.
+        (tck, _), *_ = splprep(dense.T, u=u, k=min(3, len(u) - 1), s=len(u) * sigma_m**2, full_output=1, quiet=1)
         (x, y), (dx, dy) = splev(at, tck), splev(at, tck, der=1)
         # Its parameter is the way along the path; where it runs much faster it swings out between two points.
         calm = np.hypot(dx, dy).max() <= SWING
@@ -151,6 +155,19 @@ def _spline(xy_m: Array) -> tuple[Array, Array]:
             break
     heading = np.unwrap(np.arctan2(dy, dx))
     return np.column_stack([x, y, heading]), travelled / travelled[-1] * (len(at) - 1)
+
+
+def _straight_samples(xy_m: Array) -> tuple[Array, Array] | None:
+    """The two ends of the line nearest to all points (N, 2) if it is within `SPLINE_M` of them, as `_spline` returns them."""
+    middle = xy_m.mean(axis=0)
+    across, along = np.linalg.eigh(np.cov((xy_m - middle).T))[1].T
+    along = along if (xy_m[-1] - xy_m[0]) @ along > 0 else -along
+    s = (xy_m - middle) @ along
+    if np.abs((xy_m - middle) @ across).max() > SPLINE_M or np.any(np.diff(s) <= 0):
+        return None
+    heading = np.arctan2(along[1], along[0])
+    ends = np.array([[*(middle + v * along), heading] for v in (s[0], s[-1])])
+    return ends, (s - s[0]) / (s[-1] - s[0])
 
 
 def _longest_biarcs(samples: Array) -> list[int]:

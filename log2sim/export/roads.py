@@ -20,7 +20,7 @@ SPARE_M = 0.8
 # Roads go on for this long before and after the path, so that the whole vehicle stands on them.
 BEYOND_M = 10.0
 # Moving back less than this is a vehicle that settles; more begins a new way.
-REVERSAL_M = 0.25
+REVERSAL_M = 0.1
 # A vehicle that moves less has no way of its own; ways that leave the roads for less are on them.
 SHORTEST_WAY_M = 2.0
 SHORTEST_LINE_M = 0.1
