@@ -136,8 +136,10 @@ def test_ids_become_unique_names_and_stay_known(tmp_path: Path) -> None:
 
 
 def test_names_and_text_survive_their_escape() -> None:
-    texts = ["", "plain", "100 % $x ${1+1}", "\x00\x1f\ufffe", "\ud800 alone", "%24"]
+    texts = ["", "plain", "100 % $x ${1+1}", "\x00\x1f\ufffe", "%24"]
     assert [unescaped(escaped(t)) for t in texts] == texts
+    assert unescaped(escaped("\ud800 alone")) == "? alone"
+    assert unescaped("%ff") == "\ufffd"
     assert all("$" not in escaped(t) and escaped(t).isascii() for t in texts)
     assert unique_names(["x" * 200, "x" * 200]) == ["x" * 60, "x" * 60 + "_2"]
 
