@@ -17,7 +17,7 @@ import numpy as np
 from log2sim.errors import ScenarioError
 from log2sim.export import Options
 from log2sim.export.lanes import Lane, lanes
-from log2sim.export.sampling import Motion, clock, motion
+from log2sim.export.sampling import Motion, clock, motion, on_clock
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.scenario import Agent, Scenario
 from log2sim.types import MapFrame
@@ -146,9 +146,7 @@ def _obstacle(agent: Agent, number: int, t_s: Array) -> Element | None:
         _shape(obstacle, agent)
         obstacle.append(_state("initialState", motion(agent, agent.waypoints.t_s[:1]), 0, 0))
         return obstacle
-    move = motion(agent, t_s)
-    if move.valid.sum() < 2:  # an initial state and a trajectory are two steps or more
-        move = motion(agent, t_s, margin_s=STEP_S)
+    move = on_clock(agent, t_s, at_least=2)  # an initial state and a trajectory
     steps = np.flatnonzero(move.valid).tolist()
     if len(steps) < 2:
         return None

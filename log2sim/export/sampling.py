@@ -74,6 +74,14 @@ def _over(change: Array, span_s: Array) -> Array:
     return rates
 
 
+def on_clock(agent: Agent, t_s: Array, at_least: int = 1) -> Motion:
+    """Sample an agent at equal steps (T,); one that lives between them takes the `at_least` nearest, so nobody is lost."""
+    sampled = motion(agent, t_s)
+    if sampled.valid.sum() >= at_least or len(t_s) < 2:
+        return sampled
+    return motion(agent, t_s, margin_s=at_least * (t_s[1] - t_s[0]) / 2)
+
+
 def clock(start_s: float, stop_s: float, step_s: float) -> Array:
     """Times (T,) from `start_s` in equal steps up to `stop_s`, at least one.
 
