@@ -83,39 +83,35 @@ def replay(
     scenario: ScenarioPath,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Replay file to write.")] = None,
     mode: Annotated[str, typer.Option(help="pid or exact.")] = "pid",
-    model: Annotated[str, typer.Option(help="Vehicle model: kinematic.")] = "kinematic",
+    model: Annotated[str, typer.Option(help="Vehicle model: auto, kinematic, dynamic or single-track.")] = "auto",
     dt: Annotated[float, typer.Option(help="Step in s.")] = 0.01,
     ego: Annotated[str | None, typer.Option(metavar="MODULE:ATTRIBUTE", help="Policy that drives the ego.")] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit 6 when a limit is broken.")] = False,
+    limit: Annotated[
+        list[str] | None, typer.Option(metavar="METRIC=VALUE", help="A limit, e.g. min_ttc_s=1; with --strict.")
+    ] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
     """Let vehicles drive a scenario."""
     from log2sim.files import check_targets
-    from log2sim.replay import load_policy, require_strict
+    from log2sim.replay import check_limits, load_policy, parse_limits, require_strict
     from log2sim.replay import replay as run
+    from log2sim.replay.summary import summarize
     from log2sim.scenario import Scenario
 
     check_targets(out, overwrite=overwrite)
+    limits = parse_limits(limit or ())
     loaded = Scenario.load(scenario)
     policy = load_policy(ego) if ego is not None else None
     result = run(loaded, mode=mode, model=model, dt_s=dt, ego=policy)
     if out is not None:
         result.save(out)
-    m = result.metrics
-    new = sum(not c["in_log"] for c in m["collisions"])
-    say(
-        f"cross-track {_figure(m['cross_track_rms_m'])} m rms, {_figure(m['cross_track_max_m'])} m max · "
-        f"along-track {_figure(m['along_track_rms_m'])} m rms · speed {_figure(m['speed_rms_mps'])} m/s rms · "
-        f"{len(m['collisions'])} collisions, {new} that the log does not have",
-        quiet=quiet,
-    )
+    say(summarize(result), quiet=quiet)
     if strict:
-        require_strict(result)
-
-
-def _figure(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
+        require_strict(result, limits)
+    for broken in check_limits(result, limits):
+        say(f"limit broken: {broken}", quiet=quiet)
 
 
 @app.command()
