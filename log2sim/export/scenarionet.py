@@ -17,7 +17,8 @@ import numpy as np
 from log2sim.errors import ScenarioError
 from log2sim.export import Options
 from log2sim.export.lanes import lanes
-from log2sim.export.sampling import Motion, clock, file_name, near_origin, on_clock
+from log2sim.export.placement import near_origin
+from log2sim.export.sampling import Motion, clock, file_name, on_clock
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.scenario import VERSION, Agent, Scenario
 from log2sim.types import GROUP_OF
@@ -64,7 +65,7 @@ def describe(scenario: Scenario) -> Value:
             f"scenario '{scenario.name}' has no agent 'ego', which MetaDrive follows; name one of its agents so"
         )
     t_s = clock(ego.waypoints.t_s[0], ego.waypoints.t_s[-1], STEP_S)
-    origin = near_origin(scenario)
+    origin = np.array(near_origin(scenario).origin_m)
     moves = {agent.id: on_clock(agent, t_s) for agent in scenario.agents}
     tracks = {a.id: _track(a, moves[a.id], origin) for a in scenario.agents if moves[a.id].valid.any()}
     left_out = {a.id: "not alive at any step of the ego" for a in scenario.agents if a.id not in tracks}
