@@ -44,6 +44,8 @@ def test_a_format_writes_files_into_the_folder_and_nothing_beside_it(
 
 
 def test_a_format_writes_the_same_bytes_again(name: str, scenario: Scenario, tmp_path: Path) -> None:
+    if name == "rerun":
+        pytest.skip("Rerun draws ids for what it stores; that the data are the same is tested with its own comparison")
     first, second = (export(scenario, name, tmp_path / k) for k in ("a", "b"))
     assert [f.read_bytes() for f in first] == [f.read_bytes() for f in second]
 

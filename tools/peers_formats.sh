@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Makes the environments in which software of others reads our exports, in .peers or in $LOG2SIM_PEERS. Arguments choose
-# some of: metadrive commonroad omega_prime. The tests marked `peers` use those that are there and skip the others.
+# some of: metadrive commonroad omega_prime rerun. The tests marked `peers` use those that are there and skip the others.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 where="${LOG2SIM_PEERS:-.peers}"
@@ -30,6 +30,10 @@ omega_prime() {
     environment omega_prime omega-prime==0.3.7
 }
 
-for name in "${@:-metadrive commonroad omega_prime}"; do
+rerun() {
+    environment rerun --editable '.[rerun]'
+}
+
+for name in "${@:-metadrive commonroad omega_prime rerun}"; do
     for one in $name; do "$one"; done
 done
