@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from export_worlds import REAR_M, ROOT, circling, moved, peer, straight, world
+from export_peers import omega_prime_has_everybody
+from export_worlds import REAR_M, ROOT, circling, moved, straight, world
 
 from log2sim.export import export
 from log2sim.geometry import NS_PER_S, wrap_angle
@@ -142,11 +142,4 @@ def test_omega_prime_accepts_the_trace(make: str, tmp_path: Path) -> None:
     """Its validation passes, and its table has every agent where the scenario has it."""
     late: Agent = straight("late", "bus", start=(0.0, 9.0), t_s=np.array([1.0, 1.5, 2.0]))
     scenario = Scenario.load(SAMPLE) if make == "sample" else world(circling(), late)
-    (file,) = export(scenario, "osi", tmp_path)
-    rows = json.loads(peer("omega_prime")(ROOT / "tests" / "peers" / "omega_prime_read.py", file))
-    assert {row[0] for row in rows} == set(range(1, len(scenario.agents) + 1))
-    for number, agent in enumerate(scenario.agents, start=1):
-        own = np.array([row[1:] for row in rows if row[0] == number], dtype=float)
-        at = agent.at((own[:, 0] - scenario.t0_ns) / NS_PER_S, margin_s=1e-4)
-        np.testing.assert_allclose(own[:, 1:3], np.stack([at.x_m, at.y_m], -1), atol=1e-6)
-        np.testing.assert_allclose(wrap_angle(own[:, 3] - at.yaw_rad), 0.0, atol=1e-6)
+    omega_prime_has_everybody(scenario, tmp_path)

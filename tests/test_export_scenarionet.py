@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -11,11 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from export_worlds import RADIUS_M, REAR_M, ROOT, SPEED_MPS, circling, moved, peer, straight, world
+from export_peers import metadrive_replays
+from export_worlds import RADIUS_M, REAR_M, ROOT, SPEED_MPS, circling, moved, straight, world
 
 from log2sim.errors import ScenarioError
 from log2sim.export import export
-from log2sim.geometry import NS_PER_S, wrap_angle
+from log2sim.geometry import NS_PER_S
 from log2sim.scenario import Scenario
 from log2sim.types import CATEGORIES
 
@@ -191,7 +191,6 @@ def test_endless_scenarios_are_refused_before_memory_is_taken(tmp_path: Path) ->
 @pytest.mark.parametrize("make", ["sample", "closed form", "far", "late and short"])
 def test_metadrive_replays_every_waypoint(make: str, tmp_path: Path) -> None:
     """MetaDrive's `ScenarioEnv` shows every agent where the scenario has it, at every step and at no other."""
-    run = peer("metadrive")
     late = straight("late", start=(0.0, 9.0), t_s=np.array([1.0, 1.5, 2.0]))
     scenario = {
         "sample": Scenario.load(SAMPLE),
@@ -203,16 +202,7 @@ def test_metadrive_replays_every_waypoint(make: str, tmp_path: Path) -> None:
             straight("ego"), late, straight("walker", "pedestrian", start=(0.0, -9.0), t_s=np.array([0.2, 0.9]))
         ),
     }[make]
-    offset = described(scenario, tmp_path)["metadata"]["position_offset_m"]
-    steps = json.loads(run(ROOT / "tests" / "peers" / "metadrive_replay.py", tmp_path))
-    t_s = 0.1 * np.arange(len(steps))
-    for agent in scenario.agents:
-        at = agent.at(t_s)
-        shown = np.array([step.get(agent.id, [np.nan] * 5) for step in steps])
-        np.testing.assert_array_equal(np.isfinite(shown[:, 0]), at.valid)
-        apart = np.hypot(shown[:, 0] + offset[0] - at.x_m, shown[:, 1] + offset[1] - at.y_m)
-        assert np.nanmax(apart) < 1e-4
-        assert np.nanmax(np.abs(wrap_angle(shown[:, 2] - at.yaw_rad))) < 1e-5
+    assert metadrive_replays(scenario, tmp_path) < 1e-4
 
 
 def test_agents_keep_color_and_confidence(tmp_path: Path) -> None:
