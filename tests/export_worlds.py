@@ -1,11 +1,15 @@
-"""Scenarios in closed form for the tests of the export formats."""
+"""Scenarios in closed form for the tests of the export formats, and what reads their files."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from log2sim.geometry import Array, wrap_angle
 from log2sim.scenario import Agent, Scenario, Waypoints
@@ -63,3 +67,18 @@ def moved(scenario: Scenario, x_m: float, y_m: float) -> Scenario:
         return replace(agent, waypoints=replace(w, x_m=w.x_m + x_m, y_m=w.y_m + y_m))
 
     return replace(scenario, agents=tuple(shift(a) for a in scenario.agents))
+
+
+def peer(name: str) -> Callable[..., str]:
+    """Runs Python in the environment `name` of `tools/peers.sh` and returns what it printed; skips without it."""
+    python = Path(os.environ.get("LOG2SIM_PEERS", ROOT / ".peers")) / name / "bin" / "python"
+    if not python.exists():
+        pytest.skip(f"the environment '{name}' is not there: tools/peers.sh makes it")
+
+    def run(*arguments: object) -> str:
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+        ran = subprocess.run([str(python), *map(str, arguments)], capture_output=True, text=True, env=environment)
+        assert ran.returncode == 0, ran.stderr[-4000:]
+        return ran.stdout
+
+    return run

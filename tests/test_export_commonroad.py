@@ -11,8 +11,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from export_peers import commonroad_finds, overlaps
 from export_worlds import ROOT, circling, straight, world
+from peer_checks import commonroad_finds, overlaps
 
 from log2sim.errors import ScenarioError
 from log2sim.export import export

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from export_peers import omega_prime_has_everybody
 from export_worlds import REAR_M, ROOT, circling, moved, straight, world
+from peer_checks import omega_prime_has_everybody
 
 from log2sim.export import export
 from log2sim.geometry import NS_PER_S, wrap_angle

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from export_peers import commonroad_finds, metadrive_replays, omega_prime_has_everybody, overlaps, peer
+from export_worlds import peer
+from peer_checks import commonroad_finds, metadrive_replays, omega_prime_has_everybody, overlaps
 
 from log2sim import Config, open_log, reconstruct
 from log2sim.export import Options, export

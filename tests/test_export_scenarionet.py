@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from export_peers import metadrive_replays
 from export_worlds import RADIUS_M, REAR_M, ROOT, SPEED_MPS, circling, moved, straight, world
+from peer_checks import metadrive_replays
 
 from log2sim.errors import ScenarioError
 from log2sim.export import export

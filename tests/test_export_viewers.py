@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from command_line import names, run
-from export_peers import peer
-from export_worlds import REAR_M, ROOT, circling, moved, straight, world
+from export_worlds import REAR_M, ROOT, circling, moved, peer, straight, world
 
 from log2sim import open_log
 from log2sim.errors import ConfigError, RecordError, ScenarioError

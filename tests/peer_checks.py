@@ -1,39 +1,20 @@
-"""Checks of exported files by software of others, which runs in environments of its own (tools/peers_formats.sh)."""
+"""Checks of exported files by software of others, which runs in environments of its own (tools/peers.sh)."""
 
 from __future__ import annotations
 
 import csv
 import json
-import os
-import subprocess
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
+from export_worlds import ROOT, peer
 
 from log2sim.export import export
 from log2sim.geometry import NS_PER_S, bev_iou, box_corners_bev, wrap_angle
 from log2sim.scenario import Scenario
 
-ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = ROOT / "tests" / "peers"
-
-
-def peer(name: str) -> Callable[..., str]:
-    """Runs Python in one of the environments and returns what it printed; skips where that is absent."""
-    python = Path(os.environ.get("LOG2SIM_PEERS", ROOT / ".peers")) / name / "bin" / "python"
-    if not python.exists():
-        pytest.skip(f"the environment '{name}' is not there: tools/peers_formats.sh makes it")
-
-    def run(*arguments: object) -> str:
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
-        ran = subprocess.run([str(python), *map(str, arguments)], capture_output=True, text=True, env=environment)
-        assert ran.returncode == 0, ran.stderr[-4000:]
-        return ran.stdout
-
-    return run
 
 
 def metadrive_replays(scenario: Scenario, folder: Path) -> float:
