@@ -21,6 +21,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "labels": "log2sim.detect.labels:create",
     },
     "export": {
+        "carla": "log2sim.export.carla:EXPORTER",
         "csv": "log2sim.export.csv_table:EXPORTER",
     },
 }
