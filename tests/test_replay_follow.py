@@ -10,7 +10,8 @@ from replay_maneuvers import MANEUVERS, OFFSET_M, agent_from, driven, ramp, scen
 
 from log2sim.replay import replay
 from log2sim.replay.follower import Memory, follow_points, follow_vehicles
-from log2sim.replay.vehicle import PointState, VehicleState, parameters_for, step_bicycle, step_point
+from log2sim.replay.parameters import parameters_for
+from log2sim.replay.vehicle import PointState, VehicleState, step_bicycle, step_point
 
 CAR = parameters_for([agent_from([0.0], [0.0], [0.0], [0.0], [0.0])])
 
@@ -34,7 +35,7 @@ def followed(agent, **options):
 @pytest.mark.parametrize("name", MANEUVERS)
 def test_maneuvers_are_followed_within_limits(name):
     across, along, speed = LIMITS[name]
-    agent, metrics, _ = followed(MANEUVERS[name]())
+    agent, metrics, _ = followed(MANEUVERS[name](), model="kinematic")
     assert metrics["cross_track_max_m"] < across
     assert metrics["along_track_rms_m"] < along
     assert metrics["speed_rms_mps"] < speed
@@ -61,7 +62,7 @@ def test_a_push_off_the_path_dies_out_without_overshoot_to_the_other_side():
     w = agent.waypoints
     y = np.where(w.t_s < 2.0, 0.0, 1.4)  # the log steps sideways, too little for a leap
     stepped = changed(agent, waypoints=changed(w, y_m=y))
-    result, _, _ = followed(stepped)
+    result, _, _ = followed(stepped, model="kinematic")
     late = result.t_s > 5.0
     assert np.abs(result.y_m[late] - 1.4).max() < 0.05
     assert result.y_m.max() < 1.4 + 0.15
@@ -93,9 +94,9 @@ def test_a_box_that_drifts_sideways_is_followed_as_far_as_wheels_allow():
     assert np.degrees(np.median(result.yaw_rad)) == pytest.approx(np.degrees(np.arctan(0.05)), abs=1.0)
 
 
-def test_wheels_never_slip_sideways():
+def test_wheels_of_the_kinematic_model_never_slip_sideways():
     for name in ("turn of radius 8 m", "reversing"):
-        agent, _, _ = followed(MANEUVERS[name](), dt_s=0.05)
+        agent, _, _ = followed(MANEUVERS[name](), dt_s=0.05, model="kinematic")
         rear_x, rear_y = agent.x_m - 1.3 * np.cos(agent.yaw_rad), agent.y_m - 1.3 * np.sin(agent.yaw_rad)
         mean = (np.unwrap(agent.yaw_rad)[1:] + np.unwrap(agent.yaw_rad)[:-1]) / 2
         sideways = np.diff(rear_y) * np.cos(mean) - np.diff(rear_x) * np.sin(mean)
@@ -158,7 +159,7 @@ def test_map_offsets_of_a_thousand_kilometers_change_nothing():
 
 def closed_loop(x, y, yaw, speed, reference_speed, duration_s, dt_s=0.01):
     """States (N, 4) of a car that starts off a reference which goes straight along x from 0."""
-    state = VehicleState(*(np.array([v], float) for v in (x, y, yaw, speed, 0.0, 0.0)))
+    state = VehicleState(*(np.array([v], float) for v in (x, y, yaw, speed, 0, 0, 0, 0)))
     memory, out = Memory.fresh(1), []
     for k in range(round(duration_s / dt_s)):
         stands = float(reference_speed == 0)

@@ -6,16 +6,13 @@ import numpy as np
 import pytest
 from replay_maneuvers import agent_from
 
+from log2sim.replay.parameters import PEDAL_LAG_S, STEER_LAG_S, parameters_for, rear_axle_offset
 from log2sim.replay.vehicle import (
-    PEDAL_LAG_S,
     POINT_MAX_ACCEL_MPS2,
-    STEER_LAG_S,
     PointControls,
     PointState,
     VehicleControls,
     VehicleState,
-    parameters_for,
-    rear_axle_offset,
     step_bicycle,
     step_point,
 )
@@ -28,7 +25,9 @@ def column(value):
 
 
 def at_rest(*, speed=0.0, steer=0.0, pedal=0.0):
-    return VehicleState(column(0), column(0), column(0), column(speed), column(steer), column(pedal))
+    return VehicleState(
+        column(0), column(0), column(0), column(speed), column(steer), column(pedal), column(0), column(0)
+    )
 
 
 def command(*, pedal=0.0, steer=0.0, reverse=False):

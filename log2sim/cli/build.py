@@ -83,7 +83,7 @@ def replay(
     scenario: ScenarioPath,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Replay file to write.")] = None,
     mode: Annotated[str, typer.Option(help="pid or exact.")] = "pid",
-    model: Annotated[str, typer.Option(help="Vehicle model: kinematic.")] = "kinematic",
+    model: Annotated[str, typer.Option(help="Vehicle model: auto, kinematic, dynamic or single-track.")] = "auto",
     dt: Annotated[float, typer.Option(help="Step in s.")] = 0.01,
     ego: Annotated[str | None, typer.Option(metavar="MODULE:ATTRIBUTE", help="Policy that drives the ego.")] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit 6 when a limit is broken.")] = False,

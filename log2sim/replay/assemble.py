@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from log2sim.geometry import Array
 from log2sim.replay.collisions import Boxes, collisions
 from log2sim.replay.metrics import agent_metrics, overall
+from log2sim.replay.models import Choice
 from log2sim.replay.path import Path
 from log2sim.replay.result import AgentReplay, Replay
 from log2sim.replay.rollout import Clock, Tracks
-from log2sim.replay.vehicle import WHEELED
 from log2sim.replay.world import Group
 from log2sim.scenario import Agent, Scenario
 
@@ -25,7 +25,13 @@ DIGITS = 6
 
 
 def assemble(
-    scenario: Scenario, groups: Sequence[Group], tracks: Tracks, clock: Clock, mode: str, model: str
+    scenario: Scenario,
+    groups: Sequence[Group],
+    tracks: Tracks,
+    clock: Clock,
+    choices: Mapping[str, Choice],
+    mode: str,
+    model: str,
 ) -> Replay:
     """The replay of a scenario from the recorded tracks."""
     home = {a.id: (g.driver, r.path, r.flags) for g in groups for a, r in zip(g.agents, g.references)}
@@ -36,7 +42,8 @@ def assemble(
             driver, path, flags = home[agent.id]
             steps, states = tracks[agent.id]
             t_s: Array = clock.begin_s + steps.astype(np.float64) * clock.dt_s
-            agents.append(_moved(agent, driver, model, path, flags, t_s, states))
+            choice = choices.get(agent.id, Choice("point", "") if driver == "pid" else Choice("none", ""))
+            agents.append(_moved(agent, driver, choice, path, flags, t_s, states))
             stored.append(steps)
         else:
             replayed, steps = _posed(agent, clock)
@@ -57,22 +64,20 @@ def assemble(
 
 
 def _moved(
-    agent: Agent, driver: str, model: str, path: Path, flags: tuple[str, ...], t_s: Array, states: Array
+    agent: Agent, driver: str, choice: Choice, path: Path, flags: tuple[str, ...], t_s: Array, states: Array
 ) -> AgentReplay:
     x, y, yaw, speed, steer, accel = states
     if driver == "exact":
         x, y, yaw, speed = path.centers(t_s)  # the tables in between are good to half a millimeter, the path is exact
-        model = "none"
-    elif agent.category not in WHEELED:
-        model = "point"
     if np.isnan(accel).any():
         accel = np.gradient(speed, t_s) if len(t_s) > 1 else np.zeros(len(t_s))
     z = np.interp(t_s, path.t_s, path.z_m)
     x, y, z, yaw, speed, steer, accel = (np.round(c, DIGITS) for c in (x, y, z, yaw, speed, steer, accel))
     t_s = np.round(t_s, 9)
     return AgentReplay(
-        agent.id, agent.category, agent.size_m, driver, model, t_s, x, y, z, yaw, speed, steer, accel, flags
-    )
+        agent.id, agent.category, agent.size_m, driver, choice.model, t_s, x, y, z, yaw, speed, steer, accel, flags,
+        model_reason=choice.reason,
+    )  # fmt: skip
 
 
 def _posed(agent: Agent, clock: Clock) -> tuple[AgentReplay, NDArray[np.intp]]:

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.replay.drivable import LOCK_SHARE, Limits
+from log2sim.replay.follower import control_step
+from log2sim.replay.models import Choice, choose, slipping_reference, understeer
+from log2sim.replay.parameters import PEDAL_LAG_S, STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
 from log2sim.replay.path import path_of
 from log2sim.replay.reference import MAX_CURVATURE_1PM, Reference, point_reference, tape_reference, vehicle_reference
 from log2sim.replay.rollout import Clock
-from log2sim.replay.simulator import Simulator
-from log2sim.replay.vehicle import PEDAL_LAG_S, STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
+from log2sim.replay.simulator import STEPS, simulator_named
 from log2sim.replay.world import Crowd, Driven, Fleet, Group, Tape
 from log2sim.scenario import Agent
 
@@ -34,23 +37,37 @@ def cast_agents(agents: Sequence[Agent], mode: str, *, drives_ego: bool) -> dict
     return cast
 
 
-def groups_of(cast: Mapping[str, Sequence[Agent]], clock: Clock, simulator: Simulator) -> list[Group]:
-    """The groups that have agents; static agents are in none."""
+def groups_of(
+    cast: Mapping[str, Sequence[Agent]], clock: Clock, model: str = "auto"
+) -> tuple[list[Group], dict[str, Choice]]:
+    """The groups that have agents, and by id the model that moves each vehicle; static agents are in none."""
     groups: list[Group] = []
+    choices: dict[str, Choice] = {}
     for driver, kind in (("policy", Driven), ("pid", Fleet)):
         agents = [a for a in cast[driver] if a.category in WHEELED]
-        if agents:
-            references = [_vehicle_reference(a, clock.dt_s) for a in agents]
-            groups.append(kind(agents, references, *_lives(agents, clock), parameters_for(agents), simulator))
+        references = {a.id: _vehicle_reference(a, clock.dt_s) for a in agents}
+        for a in agents:
+            choices[a.id] = choose(a, references[a.id], parameters_for([a]), model, free=driver == "policy")
+        for name in STEPS:
+            moved = [a for a in agents if choices[a.id].model == name]
+            if moved:
+                p = parameters_for(moved, published=name == "single-track")
+                followed = [references[a.id] for a in moved]
+                if name != "kinematic":
+                    p = replace(p, understeer_s2pm2=understeer(p))
+                    ahead_s = STEER_LAG_S + control_step(clock.dt_s) / 2
+                    ones = [p.take(slice(i, i + 1)) for i in range(len(moved))]
+                    followed = [slipping_reference(r, one, name, ahead_s) for r, one in zip(followed, ones)]
+                groups.append(kind(moved, followed, *_lives(moved, clock), p, simulator_named(name)))
     agents = [a for a in cast["pid"] if a.category not in WHEELED]
     if agents:
-        references = [point_reference(path_of(a, 0.0)) for a in agents]
-        groups.append(Crowd(agents, references, *_lives(agents, clock), simulator))
+        followed = [point_reference(path_of(a, 0.0)) for a in agents]
+        groups.append(Crowd(agents, followed, *_lives(agents, clock), simulator_named("kinematic")))
     agents = list(cast["exact"])
     if agents:
-        references = [tape_reference(path_of(a, rear_axle_offset(a))) for a in agents]
-        groups.append(Tape(agents, references, *_lives(agents, clock)))
-    return groups
+        followed = [tape_reference(path_of(a, rear_axle_offset(a))) for a in agents]
+        groups.append(Tape(agents, followed, *_lives(agents, clock)))
+    return groups, choices
 
 
 def vehicle_limits(agent: Agent) -> Limits:
@@ -71,8 +88,8 @@ def _vehicle_reference(agent: Agent, dt_s: float) -> Reference:
     return vehicle_reference(
         path_of(agent, limits.offset_m),
         limits,
-        accel_ahead_s=PEDAL_LAG_S + dt_s / 2,
-        curvature_ahead_s=STEER_LAG_S + dt_s / 2,
+        accel_ahead_s=PEDAL_LAG_S + control_step(dt_s) / 2,
+        curvature_ahead_s=STEER_LAG_S + control_step(dt_s) / 2,
         max_curvature_1pm=MAX_CURVATURE_1PM
         if agent.category in ("car", "truck", "bus")
         else MAX_TWO_WHEELER_CURVATURE_1PM,

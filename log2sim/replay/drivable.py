@@ -8,6 +8,7 @@ beforehand, over the whole life at once: the box centers bind, the headings advi
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +54,15 @@ class Course:
     speed_mps: Array
     accel_mps2: Array
     curvature_1pm: Array
+
+    @cached_property
+    def motion(self) -> tuple[Array, Array]:
+        """x, y, yaw and speed as rows (4, K), and their derivatives in time (4, K)."""
+        cos, sin, v = np.cos(self.yaw_rad), np.sin(self.yaw_rad), self.speed_mps
+        return (
+            np.stack([self.x_m, self.y_m, self.yaw_rad, v]),
+            np.stack([v * cos, v * sin, v * self.curvature_1pm, self.accel_mps2]),
+        )
 
 
 def nearest_course(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps: Array, limits: Limits) -> Course:

@@ -6,12 +6,21 @@ across it each behave like a damped oscillator with the time constant below, wha
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from log2sim.geometry import Array
-from log2sim.replay.vehicle import Columns, PointControls, PointState, VehicleControls, VehicleParameters, VehicleState
+from log2sim.geometry import Array, cos_sin
+from log2sim.replay.vehicle import (
+    GRAVITY_MPS2,
+    Columns,
+    PointControls,
+    PointState,
+    VehicleControls,
+    VehicleParameters,
+    VehicleState,
+)
 
 
 @dataclass(frozen=True)
@@ -33,21 +42,31 @@ class Gains:
 
 GAINS = Gains()
 INTEGRAL_LIMIT_MPS2 = 1.0
+INTEGRAL_SHARE = 0.2  # of the curvature that lock and grip allow
+MAX_CONTROL_STEP_S = 0.1
+"""Longest time for which controls are held: a third of the shortest time in which an error decays."""
+
 CORRECTED_ALONG_M = 2.0  # how far the arc at the reference is trusted beside it
+
+
+def control_step(dt_s: float) -> float:
+    """The part of a simulation step for which controls are held."""
+    return dt_s / max(1, math.ceil(dt_s / MAX_CONTROL_STEP_S - 1e-9))
 
 
 @dataclass(frozen=True, eq=False)
 class Memory(Columns):
-    """What the controllers of vehicles remember: integrals and the filtered derivatives of the errors, all (A,)."""
+    """What the controllers of vehicles remember of the errors along the path and across it, (2, A) each.
 
-    along_integral_mps2: Array
-    across_integral_1pm: Array
-    along_rate_mps: Array
-    across_slope: Array
+    `integral` in m/s2 and 1/m; `rate` the filtered derivatives, which are a speed in m/s and the slope toward the path.
+    """
+
+    integral: Array
+    rate: Array
 
     @classmethod
     def fresh(cls, count: int) -> Memory:
-        return cls(*(np.zeros(count) for _ in range(4)))
+        return cls(np.zeros((2, count)), np.zeros((2, count)))
 
 
 def follow_vehicles(
@@ -62,81 +81,62 @@ def follow_vehicles(
 
     Notes
     -----
-    Works on errors at the foot point: where the reference is `along` ahead, its arc is bent back by that much, so a vehicle
-    that is late in a curve is not pulled inside. The correction across the path is a curvature that depends on the way
-    driven and not on time, hence nothing is divided by the speed.
+    Two PID controllers with feed-forward, along the path and across it, are the rows of (2, A) arrays: for a thousand
+    agents a call of numpy costs as much as what it computes. The correction across the path is a curvature that depends on
+    the way driven and not on time, hence nothing is divided by the speed.
     """
-    x, y, yaw, speed, accel, curvature, reference_gear, stands = row
-    cos, sin = np.cos(yaw), np.sin(yaw)
+    p, reference_gear, stands = parameters, row[6], row[7]
+    pace = np.abs(state.speed_mps)
+    gear = np.where(pace == 0, reference_gear, np.sign(state.speed_mps))
+    error, raw_rate = _errors(row, state)
+    rate = memory.rate - math.expm1(-dt_s / gains.derivative_filter_s) * (raw_rate - memory.rate)
+    damping = 2 * gains.damping * rate
+    damping[1] *= gear  # in reverse, turning to the left leads to the right
+
+    stiffness = _rows(1 / gains.along_s, 1 / np.maximum(pace * gains.across_s, gains.across_min_m))
+    pull = error * stiffness**2
+    wanted = row[4:6] + pull + damping * stiffness + memory.integral
+    # The smallest radius with grip grows with the square of the speed; at standstill only the lock limits.
+    grip = np.minimum(gains.max_lateral_accel_mps2 / np.maximum(pace**2, 1.0), p.max_curvature_1pm)
+    asked = _rows(wanted[0] * gear, wanted[1])
+    given = np.minimum(np.maximum(asked, _rows(-p.max_brake_mps2, -grip)), _rows(p.max_throttle_mps2, grip))
+
+    # Anti-windup: an actuator at its limit learns nothing from more error of the same sign, nor do wheels that stand.
+    learns = (given == asked) | (error * wanted <= 0)
+    learns[1] &= pace > 0
+    bound = _rows(INTEGRAL_LIMIT_MPS2, INTEGRAL_SHARE * grip)
+    integral = memory.integral + (dt_s / gains.integral_s) * pull * learns
+    integral = np.minimum(np.maximum(integral, -bound), bound)
+
+    held = (stands > 0.5) & (pace < gains.hold_below_mps) & (error[0] * reference_gear < gains.hold_within_m)
+    given[0, held], integral[0, held] = -gains.hold_brake_mps2, 0.0
+    steer = np.arctan(p.wheelbase_m * given[1] * (1 + p.understeer_s2pm2 * pace**2))
+    controls = VehicleControls(given[0], steer, reference_gear < 0)
+    return controls, Memory(integral, rate)
+
+
+def _errors(row: Array, state: VehicleState) -> tuple[Array, Array]:
+    """Errors along and across the path in m (2, A), and their derivatives: difference in speed, slope toward the path.
+
+    They are those at the foot point: where the reference is `along` ahead, its arc is bent back by that much, so a vehicle
+    that is late in a curve is not pulled inside.
+    """
+    x, y, yaw, speed, _, curvature, _, _ = row
+    cos, sin = cos_sin(yaw)
     dx, dy = x - state.x_m, y - state.y_m
     along = cos * dx + sin * dy
     back = np.minimum(np.maximum(along, -CORRECTED_ALONG_M), CORRECTED_ALONG_M)
-    across = cos * dy - sin * dx + curvature * back**2 / 2
-    slope = np.sin(yaw - curvature * back - state.yaw_rad)
-    blend = -np.expm1(-dt_s / gains.derivative_filter_s)
-    along_rate = memory.along_rate_mps + blend * (speed - state.speed_mps - memory.along_rate_mps)
-    across_slope = memory.across_slope + blend * (slope - memory.across_slope)
-    gear = np.where(state.speed_mps == 0, reference_gear, np.sign(state.speed_mps))
-    held = (
-        (stands > 0.5)
-        & (np.abs(state.speed_mps) < gains.hold_below_mps)
-        & (along * reference_gear < gains.hold_within_m)
-    )
-
-    pedal, along_integral = _pedal(
-        along, along_rate, accel, gear, held, memory.along_integral_mps2, parameters, dt_s, gains
-    )
-    steer, across_integral = _steer(
-        across, gear * across_slope, curvature, state, memory.across_integral_1pm, parameters, dt_s, gains
-    )
-    controls = VehicleControls(pedal, steer, reference_gear < 0)
-    return controls, Memory(along_integral, across_integral, along_rate, across_slope)
+    turn = curvature * back
+    across = cos * dy - sin * dx + turn * back / 2
+    _, slope = cos_sin(yaw - turn - state.yaw_rad)
+    return _rows(along, across), _rows(speed - state.speed_mps, slope)
 
 
-def _pedal(
-    along: Array,
-    rate: Array,
-    accel: Array,
-    gear: Array,
-    held: Array,
-    integral: Array,
-    p: VehicleParameters,
-    dt_s: float,
-    gains: Gains,
-) -> tuple[Array, Array]:
-    """Pedal (A,) and the integral: PID on the error along the path; the brake is held while the reference stands."""
-    wanted = accel + along / gains.along_s**2 + 2 * gains.damping * rate / gains.along_s + integral
-    pedal = wanted * gear
-    limited = np.minimum(np.maximum(pedal, -p.max_brake_mps2), p.max_throttle_mps2)
-    # Anti-windup: an actuator at its limit learns nothing from more error of the same sign.
-    windup = (pedal != limited) & (along * wanted > 0)
-    grown = integral + np.where(windup, 0.0, along) * (dt_s / (gains.along_s**2 * gains.integral_s))
-    grown = np.minimum(np.maximum(grown, -INTEGRAL_LIMIT_MPS2), INTEGRAL_LIMIT_MPS2)
-    return np.where(held, -gains.hold_brake_mps2, limited), np.where(held, 0.0, grown)
-
-
-def _steer(
-    across: Array,
-    slope: Array,
-    curvature: Array,
-    state: VehicleState,
-    integral: Array,
-    p: VehicleParameters,
-    dt_s: float,
-    gains: Gains,
-) -> tuple[Array, Array]:
-    """Steering angle (A,) and the integral: PID on the error across the path, as a curvature, within lock and grip."""
-    pace = np.abs(state.speed_mps)
-    length = np.maximum(pace * gains.across_s, gains.across_min_m)
-    wanted = curvature + across / length**2 + 2 * gains.damping * slope / length + integral
-    limit = np.tan(p.max_steer_rad) / p.wheelbase_m
-    # The smallest radius with grip grows with the square of the speed; at standstill only the lock limits.
-    grip = gains.max_lateral_accel_mps2 / np.maximum(pace**2, gains.max_lateral_accel_mps2 / limit)
-    limited = np.minimum(np.maximum(wanted, -grip), grip)
-    windup = (wanted != limited) & (across * wanted > 0)
-    grown = integral + np.where(windup | (pace == 0), 0.0, across) * (dt_s / (length**2 * gains.integral_s))
-    bound = 0.2 * grip
-    return np.arctan(p.wheelbase_m * limited), np.minimum(np.maximum(grown, -bound), bound)
+def _rows(along: Array | float, across: Array) -> Array:
+    """An array (2, A) of what holds along the path and across it."""
+    both = np.empty((2, len(across)))
+    both[0], both[1] = along, across
+    return both
 
 
 def follow_points(row: Array, state: PointState, gains: Gains = GAINS) -> PointControls:
@@ -152,10 +152,13 @@ def follow_points(row: Array, state: PointState, gains: Gains = GAINS) -> PointC
 def start_vehicles(row: Array, parameters: VehicleParameters) -> VehicleState:
     """States of vehicles that are on their references `row` (C, A)."""
     x, y, yaw, speed, accel, curvature, gear, stands = row
-    angle = np.arctan(parameters.wheelbase_m * curvature)
+    angle = np.arctan(parameters.wheelbase_m * curvature * (1 + parameters.understeer_s2pm2 * speed**2))
     steer = np.minimum(np.maximum(angle, -parameters.max_steer_rad), parameters.max_steer_rad)
     pedal = np.minimum(np.maximum(accel * gear, -parameters.max_brake_mps2), parameters.max_throttle_mps2)
-    return VehicleState(x.copy(), y.copy(), yaw.copy(), np.where(stands > 0.5, 0.0, speed), steer, pedal)
+    speed = np.where(stands > 0.5, 0.0, speed)
+    rate = speed * curvature
+    lateral = -rate * speed * np.abs(speed) / (GRAVITY_MPS2 * parameters.friction * parameters.rear_stiffness_1prad)
+    return VehicleState(x.copy(), y.copy(), yaw.copy(), speed, steer, pedal, lateral, rate)
 
 
 def start_points(row: Array) -> PointState:

@@ -44,9 +44,15 @@ class Path:
             return np.full(len(t), self.x_m[0]), np.full(len(t), self.y_m[0]), yaw, speed
         i = np.clip(np.searchsorted(self.t_s, t, side="right") - 1, 0, len(self.t_s) - 2)
         span = self.t_s[i + 1] - self.t_s[i]
-        x = hermite(self.x_m, self.velocity_x_mps, i, t - self.t_s[i], span, self.jump)
-        y = hermite(self.y_m, self.velocity_y_mps, i, t - self.t_s[i], span, self.jump)
-        return x, y, np.where(self.jump[i] & (t < self.t_s[i + 1]), self.yaw_rad[i], yaw), speed
+        since = t - self.t_s[i]
+        x = hermite(self.x_m, self.velocity_x_mps, i, since, span)
+        y = hermite(self.y_m, self.velocity_y_mps, i, since, span)
+        leaps = self.jump[i] & (t < self.t_s[i + 1])
+        if leaps.any():
+            x = np.where(leaps, self.x_m[i] + since * self.velocity_x_mps[i], x)
+            y = np.where(leaps, self.y_m[i] + since * self.velocity_y_mps[i], y)
+            yaw = np.where(leaps, self.yaw_rad[i], yaw)
+        return x, y, yaw, speed
 
     def centers(self, t_s: Array) -> tuple[Array, Array, Array, Array]:
         """Box center x, y in the map, yaw in [-pi, pi) and logged speed at times (N,)."""
@@ -88,12 +94,11 @@ def _tangents(
     return np.where(replace, dx, vx), np.where(replace, dy, vy)
 
 
-def hermite(value: Array, slope: Array, i: NDArray[np.intp], t: Array, span: Array, jump: NDArray[np.bool_]) -> Array:
-    """Cubic through value[i], value[i + 1] with their slopes, `t` after the first; a straight line before a leap."""
+def hermite(value: Array, slope: Array, i: NDArray[np.intp], t: Array, span: Array) -> Array:
+    """Cubics (..., N) through value[..., i] and value[..., i + 1] with their slopes, at `t` (N,) after the first."""
     f = t / span
-    rise = value[i + 1] - value[i]
-    cubic = value[i] + f * (
-        span * slope[i]
-        + f * (3 * rise - span * (2 * slope[i] + slope[i + 1]) + f * (span * (slope[i] + slope[i + 1]) - 2 * rise))
+    begin, end = value[..., i], value[..., i + 1]
+    begin_rise, end_rise, rise = span * slope[..., i], span * slope[..., i + 1], end - begin
+    return begin + f * (
+        begin_rise + f * (3 * rise - 2 * begin_rise - end_rise + f * (begin_rise + end_rise - 2 * rise))
     )
-    return np.where(jump[i] & (f < 1), value[i] + t * slope[i], cubic)

@@ -20,7 +20,7 @@ SMOOTHING_S = 0.12
 """Standard deviation of the Gaussian over the velocity of points: one waypoint of a 10 Hz log."""
 
 STANDSTILL_MPS = 0.08
-MIN_RUN_M = 0.3  # shorter forward or backward runs are noise of a standing agent
+MIN_RUN_M, MIN_RUN_MPS = 0.3, 0.5  # shorter and slower runs forward or backward are noise of a standing agent
 MAX_ACCEL_MPS2 = 10.4  # feasibility limits of Waymax (Gulino et al., 2023)
 MAX_CURVATURE_1PM = 0.3
 MAX_DEPARTURE_M = 0.3  # more than boxes err by
@@ -57,18 +57,16 @@ def vehicle_reference(
     """The table of a vehicle. Columns "..._ahead" are those of a later time, which makes up for the actuators' lag."""
     course, departure_m = drivable_course(path, limits)
     first, t = _grid(path)
-    gear = _gear(_sample(course, t).speed_mps)
+    gear, stands = _gears(_motion(course, t)[3])
 
     def exact(at_s: Array) -> Array:
-        at = _sample(course, at_s)
-        rows = [
-            at.x_m, at.y_m, at.yaw_rad, at.speed_mps,
-            np.interp(at_s + accel_ahead_s, course.t_s, course.accel_mps2),
-            np.interp(at_s + curvature_ahead_s, course.t_s, course.curvature_1pm),
-            gear[np.clip(np.searchsorted(t, at_s), 0, len(t) - 1)],
-            np.abs(at.speed_mps) < STANDSTILL_MPS,
-        ]  # fmt: skip
-        return np.stack(rows, axis=1)
+        rows = np.empty((len(VEHICLE_COLUMNS), len(at_s)))
+        rows[:4] = _motion(course, at_s)
+        rows[4] = np.interp(at_s + accel_ahead_s, course.t_s, course.accel_mps2)
+        rows[5] = np.interp(at_s + curvature_ahead_s, course.t_s, course.curvature_1pm)
+        k = np.minimum(np.searchsorted(t, at_s), len(t) - 1)
+        rows[6], rows[7] = gear[k], stands[k]
+        return rows.T
 
     flags = _flags(path, course, departure_m, max_curvature_1pm)
     return Reference(path, first, exact(t), exact, limits.offset_m, flags)
@@ -97,24 +95,19 @@ def drivable_course(path: Path, limits: Limits) -> tuple[Course, Array]:
     return whole, np.concatenate(departures)
 
 
-def _sample(course: Course, t_s: Array) -> Course:
-    """The course at times (N,), by cubics with its own velocities; straight on before its begin and after its end."""
-    inside = np.clip(t_s, course.t_s[0], course.t_s[-1])
-    outside = t_s - inside
+def _motion(course: Course, t_s: Array) -> Array:
+    """Rows x, y, yaw, speed (4, N) at times (N,), by cubics; straight on before the begin of the course and after its end."""
+    inside = np.minimum(np.maximum(t_s, course.t_s[0]), course.t_s[-1])
+    values, rates = course.motion
     if len(course.t_s) == 1:
-        x, y, yaw, speed, accel, curvature = (np.full(len(t_s), getattr(course, f.name)[0]) for f in fields(Course)[1:])
+        motion = np.repeat(values, len(t_s), axis=1)
     else:
-        i = np.clip(np.searchsorted(course.t_s, inside, side="right") - 1, 0, len(course.t_s) - 2)
-        span, t = course.t_s[i + 1] - course.t_s[i], inside - course.t_s[i]
-        no_jump = np.zeros(len(course.t_s) - 1, dtype=bool)
-        cos, sin = np.cos(course.yaw_rad), np.sin(course.yaw_rad)
-        x = hermite(course.x_m, course.speed_mps * cos, i, t, span, no_jump)
-        y = hermite(course.y_m, course.speed_mps * sin, i, t, span, no_jump)
-        yaw = hermite(course.yaw_rad, course.speed_mps * course.curvature_1pm, i, t, span, no_jump)
-        speed = hermite(course.speed_mps, course.accel_mps2, i, t, span, no_jump)
-        accel, curvature = (np.interp(inside, course.t_s, c) for c in (course.accel_mps2, course.curvature_1pm))
-    x, y = x + outside * speed * np.cos(yaw), y + outside * speed * np.sin(yaw)
-    return Course(t_s, x, y, yaw, speed, accel, curvature)
+        i = np.minimum(np.searchsorted(course.t_s, inside, side="right") - 1, len(course.t_s) - 2)
+        motion = hermite(values, rates, i, inside - course.t_s[i], course.t_s[i + 1] - course.t_s[i])
+    way = (t_s - inside) * motion[3]
+    motion[0] += way * np.cos(motion[2])
+    motion[1] += way * np.sin(motion[2])
+    return motion
 
 
 def point_reference(path: Path) -> Reference:
@@ -171,21 +164,19 @@ def _smooth(values: Array) -> Array:
     return np.convolve(padded, kernel / kernel.sum(), mode="valid")
 
 
-def _gear(speed: Array) -> Array:
-    """+1 or -1 for every row: the direction of the current motion, or of the next one while standing."""
+def _gears(speed: Array) -> tuple[Array, Array]:
+    """For every row the gear, +1 or -1, of the current motion, or of the next one while standing; and whether it stands."""
     direction = np.where(np.abs(speed) < STANDSTILL_MPS, 0, np.sign(speed)).astype(int)
-    edges = np.flatnonzero(np.diff(direction)) + 1
-    runs: list[NDArray[np.intp]] = np.split(np.arange(len(speed)), edges)
-    moving = [r for r in runs if direction[r[0]] != 0 and abs(speed[r].sum()) * GRID_S >= MIN_RUN_M]
-    gear = np.ones(len(speed))
-    if not moving:
-        return gear
+    runs: list[NDArray[np.intp]] = np.split(np.arange(len(speed)), np.flatnonzero(np.diff(direction)) + 1)
+    gear, stands = np.ones(len(speed)), np.ones(len(speed))
     begin = 0
-    for run in moving:
-        gear[begin : run[-1] + 1] = direction[run[0]]
-        begin = run[-1] + 1
-    gear[begin:] = direction[moving[-1][0]]
-    return gear
+    for run in runs:
+        way_m, peak_mps = np.abs(speed[run]).sum() * GRID_S, np.abs(speed[run]).max()
+        if direction[run[0]] != 0 and (way_m >= MIN_RUN_M or peak_mps >= MIN_RUN_MPS):
+            gear[begin:] = direction[run[0]]
+            stands[run] = 0.0
+            begin = run[-1] + 1
+    return gear, stands
 
 
 def _leaps(path: Path) -> tuple[str, ...]:

@@ -22,7 +22,8 @@ VERSION = 1
 class AgentReplay:
     """What one agent did: box centers in the map as columns (S,), while it lives.
 
-    `driver` is "static" (one pose, two rows), "exact" (the log), "pid" or "policy"; `model` "none", "kinematic" or "point".
+    `driver` is "static" (one pose, two rows), "exact" (the log), "pid" or "policy"; `model` "none", "point", "kinematic",
+    "dynamic" or "single-track", with the reason in `model_reason`.
     `accel_mps2` is along the heading; `steer_rad` is 0 where nothing steers. `flags` say what in the log cannot be driven.
     """
 
@@ -40,6 +41,7 @@ class AgentReplay:
     steer_rad: Array
     accel_mps2: Array
     flags: tuple[str, ...] = ()
+    model_reason: str = ""
 
     COLUMNS = ("t_s", "x_m", "y_m", "z_m", "yaw_rad", "speed_mps", "steer_rad", "accel_mps2")
 
@@ -134,6 +136,7 @@ def _agent_to_dict(agent: AgentReplay) -> dict[str, Any]:
         "size_m": {"length": length, "width": width, "height": height},
         "driver": agent.driver,
         "model": agent.model,
+        "model_reason": agent.model_reason,
         "flags": list(agent.flags),
         "states": {k: getattr(agent, k).tolist() for k in AgentReplay.COLUMNS},
     }
@@ -154,5 +157,6 @@ def _agent_from_dict(entry: Mapping[str, Any]) -> AgentReplay:
         driver=entry["driver"],
         model=entry["model"],
         flags=tuple(entry["flags"]),
+        model_reason=entry.get("model_reason", ""),
         **columns,
     )

@@ -127,9 +127,11 @@ def _keep(
     tracks: dict[str, list[tuple[NDArray[np.intp], Array]]], group: Group, steps: NDArray[np.intp], rows: Array
 ) -> None:
     """Add to the tracks what was recorded in one window, `rows` (S, 6, A), cut to the life of each agent."""
+    begin = np.searchsorted(steps, group.first[group.live])
+    end = np.searchsorted(steps, group.last[group.live], side="right")
     for slot, i in enumerate(group.live):
-        alive = (steps >= group.first[i]) & (steps <= group.last[i])
-        if alive.any():
+        alive = slice(begin[slot], end[slot])
+        if begin[slot] < end[slot]:
             tracks[group.agents[i].id].append((steps[alive], rows[alive, :, slot].T))
 
 

@@ -7,17 +7,18 @@ from collections.abc import Sequence
 import numpy as np
 
 from log2sim.errors import ConfigError, ScenarioError
+from log2sim.registry import nearest
 from log2sim.replay.assemble import assemble
 from log2sim.replay.cast import EGO, cast_agents, groups_of
+from log2sim.replay.models import MODELS
+from log2sim.replay.parameters import WHEELED
 from log2sim.replay.policy import Policy
 from log2sim.replay.result import Replay
 from log2sim.replay.rollout import Clock, Progress, roll
-from log2sim.replay.simulator import simulator_named
-from log2sim.replay.vehicle import WHEELED
 from log2sim.scenario import Agent, Scenario
 
 MODES = ("pid", "exact")
-DT_RANGE_S = (0.0005, 0.1)
+DT_RANGE_S = (0.0005, 1.0)
 MAX_STEPS = 20_000_000
 
 
@@ -25,7 +26,7 @@ def replay(
     scenario: Scenario,
     *,
     mode: str = "pid",
-    model: str = "kinematic",
+    model: str = "auto",
     dt_s: float = 0.01,
     ego: Policy | None = None,
     progress: Progress | None = None,
@@ -37,9 +38,12 @@ def replay(
     scenario : Scenario
     mode : {"pid", "exact"}
         Agents follow their waypoints by control through a vehicle model, or are where the log has them.
-    model : {"kinematic"}
+    model : {"auto", "kinematic", "dynamic", "single-track"}
+        How vehicles move: rolling without slip, on tires that slip and saturate, or by the published single-track model
+        with linear tires; "auto" takes for each the simplest that is good enough, `AgentReplay.model_reason` says why.
     dt_s : float
-        Simulation and control step in s, from 0.0005 to 0.1. States are stored about every 0.05 s.
+        Simulation step in s, from 0.0005 to 1; controls are renewed at least every 0.1 s. States are stored about every
+        0.05 s, or every step.
     ego : callable, optional
         `policy(observation) -> Controls` that drives the ego instead, from its first logged state to the end of its life.
     progress : callable, optional
@@ -61,16 +65,17 @@ def replay(
         raise ConfigError(f"mode '{mode}': expected one of {', '.join(MODES)}")
     if not DT_RANGE_S[0] <= dt_s <= DT_RANGE_S[1]:
         raise ConfigError(f"dt: {dt_s} s, expected {DT_RANGE_S[0]} to {DT_RANGE_S[1]} s")
-    simulator = simulator_named(model)
+    if model not in MODELS:
+        raise ConfigError(f"unknown vehicle model '{model}'{nearest(model, list(MODELS))}; known: {', '.join(MODELS)}")
     if ego is not None and (scenario.ego is None or scenario.ego.category not in WHEELED):
         raise ConfigError(f"ego policy: scenario '{scenario.name}' has no agent '{EGO}' on wheels that it could drive")
     for agent in scenario.agents:
         _check_waypoints(agent)
     clock = _clock(scenario.agents, dt_s)
     cast = cast_agents(scenario.agents, mode, drives_ego=ego is not None)
-    groups = groups_of(cast, clock, simulator)
+    groups, choices = groups_of(cast, clock, model)
     tracks = roll(groups, clock, cast["static"], ego, progress)
-    return assemble(scenario, groups, tracks, clock, mode, model)
+    return assemble(scenario, groups, tracks, clock, choices, mode, model)
 
 
 def _check_waypoints(agent: Agent) -> None:

@@ -1,15 +1,17 @@
 """What the replay asks of a simulator, and the embedded one.
 
-A simulator moves all agents at once by stateless steps. Another one (a game engine, a tire model) is made usable by giving
-it these two functions and a line in `SIMULATORS`.
+A simulator moves all agents at once by stateless steps. Another vehicle model is made usable by a line in `STEPS`, another
+simulator (a game engine) by giving it the two functions of `Simulator`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 from log2sim.errors import ConfigError
 from log2sim.registry import nearest
+from log2sim.replay.single_track import step_dynamic, step_single_track
 from log2sim.replay.vehicle import (
     PointControls,
     PointState,
@@ -35,24 +37,29 @@ class Simulator(Protocol):
         ...
 
 
-class KinematicSimulator:
-    """The embedded default: kinematic bicycles with actuators, and point masses."""
+Step = Callable[[VehicleState, VehicleControls, VehicleParameters, float], VehicleState]
+
+
+class EmbeddedSimulator:
+    """Vehicles by one of the models of this package, and point masses."""
+
+    def __init__(self, step: Step) -> None:
+        self._step = step
 
     def step_vehicles(
         self, state: VehicleState, controls: VehicleControls, parameters: VehicleParameters, dt_s: float
     ) -> VehicleState:
-        return step_bicycle(state, controls, parameters, dt_s)
+        return self._step(state, controls, parameters, dt_s)
 
     def step_points(self, state: PointState, controls: PointControls, dt_s: float) -> PointState:
         return step_point(state, controls, dt_s)
 
 
-SIMULATORS: dict[str, type[Simulator]] = {"kinematic": KinematicSimulator}
+STEPS: dict[str, Step] = {"kinematic": step_bicycle, "dynamic": step_dynamic, "single-track": step_single_track}
 
 
 def simulator_named(model: str) -> Simulator:
     """The simulator for `model`; `ConfigError` when there is none of that name."""
-    if model not in SIMULATORS:
-        known = ", ".join(SIMULATORS)
-        raise ConfigError(f"unknown vehicle model '{model}'{nearest(model, list(SIMULATORS))}; known: {known}")
-    return SIMULATORS[model]()
+    if model not in STEPS:
+        raise ConfigError(f"unknown vehicle model '{model}'{nearest(model, list(STEPS))}; known: {', '.join(STEPS)}")
+    return EmbeddedSimulator(STEPS[model])

@@ -13,8 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array, wrap_angle
-from log2sim.replay.follower import Memory, follow_points, follow_vehicles, start_points, start_vehicles
+from log2sim.geometry import Array, cos_sin, wrap_angle
+from log2sim.replay.follower import (
+    Memory,
+    control_step,
+    follow_points,
+    follow_vehicles,
+    start_points,
+    start_vehicles,
+)
 from log2sim.replay.policy import Controls
 from log2sim.replay.reference import GRID_S, Reference
 from log2sim.replay.simulator import Simulator
@@ -46,18 +53,22 @@ class Group(ABC):
         self.offset_m = np.array([r.offset_m for r in references])
         self.live = np.zeros(0, dtype=np.intp)
         self.row = np.zeros((0, 0))
+        self.now_s = 0.0
 
     def open_window(self, begin: int, end: int, begin_s: float, end_s: float) -> None:
         """Make the tables of the agents that live within the steps [begin, end) at hand."""
         self.live = np.flatnonzero((self.first < end) & (self.last >= begin) & (self.last >= self.first))
         self._row0 = int(np.floor(begin_s / GRID_S))
-        rows = np.arange(self._row0, int(np.floor(end_s / GRID_S)) + 3)
-        self._table = (
-            np.stack([_window(self.references[i], rows) for i in self.live], axis=2) if len(self.live) else None
-        )
+        rows = int(np.floor(end_s / GRID_S)) + 3 - self._row0
+        self._table = None
+        if len(self.live):
+            self._table = np.empty((rows, self.references[0].columns.shape[1], len(self.live)))
+            for slot, i in enumerate(self.live):
+                _fill(self._table[:, :, slot], self.references[i], self._row0)
 
     def look_up(self, t_s: float) -> None:
         """Set `row` (C, A) to the references at a time."""
+        self.now_s = t_s
         if self._table is None:
             return
         place = t_s / GRID_S - self._row0
@@ -73,9 +84,17 @@ class Group(ABC):
     def snapshot(self) -> Snapshot:
         """Where the living agents are now."""
 
-    @abstractmethod
     def advance(self, dt_s: float) -> None:
-        """Move the living agents by one step."""
+        """Move the living agents by one step from the time that was looked up; controls are renewed within a long one."""
+        held_s = control_step(dt_s)
+        for part in range(round(dt_s / held_s)):
+            if part:
+                self.look_up(self.now_s + held_s)
+            self._step(held_s)
+
+    @abstractmethod
+    def _step(self, dt_s: float) -> None:
+        """Move the living agents with the controls of this moment."""
 
     def _exact(self, index: NDArray, t_s: float) -> Array:
         return np.stack([self.references[i].exact(np.array([t_s]))[0] for i in index], axis=1)
@@ -90,7 +109,7 @@ class Tape(Group):
     def place(self, index: NDArray, t_s: float) -> None:
         pass
 
-    def advance(self, dt_s: float) -> None:
+    def _step(self, dt_s: float) -> None:
         pass
 
     def snapshot(self) -> Snapshot:
@@ -116,7 +135,7 @@ class Fleet(Group):
     ) -> None:
         super().__init__(agents, references, first, last)
         self.parameters, self.simulator = parameters, simulator
-        self._all = VehicleState(*(np.zeros(len(agents)) for _ in range(6)))
+        self._all = VehicleState.zeros(len(agents))
         self._all_memory = Memory.fresh(len(agents))
         self._open(self.live)
 
@@ -140,14 +159,15 @@ class Fleet(Group):
 
     def snapshot(self) -> Snapshot:
         s, o = self.state, self.offset_m[self.live]
-        x = s.x_m + o * np.cos(s.yaw_rad) + self.origin_x_m[self.live]
-        y = s.y_m + o * np.sin(s.yaw_rad) + self.origin_y_m[self.live]
+        cos, sin = cos_sin(s.yaw_rad)
+        x = s.x_m + o * cos + self.origin_x_m[self.live]
+        y = s.y_m + o * sin + self.origin_y_m[self.live]
         accel = np.where(
             (s.speed_mps == 0) & (s.pedal_mps2 < 0), 0.0, s.pedal_mps2 * np.where(s.speed_mps < 0, -1.0, 1.0)
         )
         return Snapshot(x, y, wrap_angle(s.yaw_rad), s.speed_mps, s.steer_rad, accel)
 
-    def advance(self, dt_s: float) -> None:
+    def _step(self, dt_s: float) -> None:
         controls, self.memory = follow_vehicles(self.row, self.state, self.memory, self.living, dt_s)
         self.state = self.simulator.step_vehicles(self.state, controls, self.living, dt_s)
 
@@ -158,7 +178,7 @@ class Driven(Fleet):
     driver = "policy"
     controls = Controls(0.0, 0.0)
 
-    def advance(self, dt_s: float) -> None:
+    def _step(self, dt_s: float) -> None:
         c = self.controls
         commands = VehicleControls(
             np.array([c.accel_mps2], float), np.array([c.steer_rad], float), np.array([c.reverse], bool)
@@ -181,7 +201,7 @@ class Crowd(Group):
     ) -> None:
         super().__init__(agents, references, first, last)
         self.simulator = simulator
-        self._all = PointState(*(np.zeros(len(agents)) for _ in range(4)))
+        self._all = PointState.zeros(len(agents))
         self.state = self._all.take(self.live)
 
     def open_window(self, begin: int, end: int, begin_s: float, end_s: float) -> None:
@@ -199,10 +219,15 @@ class Crowd(Group):
         x, y = s.x_m + self.origin_x_m[self.live], s.y_m + self.origin_y_m[self.live]
         return Snapshot(x, y, wrap_angle(yaw), speed, np.zeros(len(x)), np.full(len(x), np.nan))
 
-    def advance(self, dt_s: float) -> None:
+    def _step(self, dt_s: float) -> None:
         self.state = self.simulator.step_points(self.state, follow_points(self.row, self.state), dt_s)
 
 
-def _window(reference: Reference, rows: NDArray) -> Array:
-    """Rows (W, C) of a table, its first and last row standing for the time before and after."""
-    return reference.columns[np.clip(rows - reference.first_row, 0, len(reference.columns) - 1)]
+def _fill(window: Array, reference: Reference, row0: int) -> None:
+    """Copy the rows from `row0` on of a table to a window (W, C); its first and last row stand for before and after."""
+    columns, begin = reference.columns, reference.first_row - row0
+    low = min(max(begin, 0), len(window))
+    high = min(max(begin + len(columns), low), len(window))
+    window[:low] = columns[0]
+    window[low:high] = columns[low - begin : high - begin]
+    window[high:] = columns[-1]
