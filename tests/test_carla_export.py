@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from carla_courses import SIZES, agent, left_turn, of
 from command_line import run
 
 from log2sim.errors import ConfigError
@@ -25,42 +26,17 @@ from log2sim.geometry import wrap_angle
 from log2sim.replay import follower
 from log2sim.replay.carla_assets import BY_CATEGORY, nearest_assets
 from log2sim.replay.carla_player import Course, Follower, main, size_table
-from log2sim.replay.vehicle import VehicleParameters, VehicleState
-from log2sim.scenario import Agent, Scenario, Waypoints
+from log2sim.replay.parameters import parameters_for
+from log2sim.replay.vehicle import VehicleState
+from log2sim.scenario import Agent, Scenario
 from log2sim.types import CATEGORIES
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
-SIZES = {blueprint: size_m for offers in BY_CATEGORY.values() for blueprint, size_m in offers.items()}
 
 
 @pytest.fixture(scope="module")
 def scenario() -> Scenario:
     return Scenario.load(SAMPLE)
-
-
-def agent(name: str, t: Any, x: Any, y: Any, yaw: Any, speed: Any, **changes: Any) -> Agent:
-    t, x, y, yaw, speed = np.broadcast_arrays(*(np.asarray(v, dtype=np.float64) for v in (t, x, y, yaw, speed)))
-    z = np.full(len(t), 0.8)
-    w = Waypoints(t, x, y, z, yaw, speed, np.ones(len(t), dtype=bool), np.full(len(t), 0.1))
-    made = Agent(name, "car", (4.6, 1.9, 1.6), w, rear_axle_offset_m=1.4)
-    return replace(made, **changes)
-
-
-def left_turn(
-    name: str = "ego", radius_m: float = 12.0, speed: float = 6.0, at: tuple[float, float] = (0.0, 0.0)
-) -> Agent:
-    """A car that drives 12 m straight on to the east, then a quarter circle to the left, as its rear axle rolls."""
-    t = np.arange(0.0, 6.01, 0.1)
-    way = speed * t - 12.0
-    yaw = np.clip(way, 0.0, radius_m * np.pi / 2) / radius_m
-    on = np.maximum(way - radius_m * np.pi / 2, 0.0)
-    x = at[0] + np.minimum(way, 0.0) + radius_m * np.sin(yaw) + 1.4 * np.cos(yaw)
-    y = at[1] + radius_m * (1 - np.cos(yaw)) + on + 1.4 * np.sin(yaw)
-    return agent(name, t, x, y, yaw, speed)
-
-
-def of(*agents: Agent) -> Scenario:
-    return Scenario("made", 0, float(max(a.waypoints.t_s[-1] for a in agents)), agents)
 
 
 def written(scenario: Scenario, folder: Path, mode: str | None = None) -> tuple[Path, dict[str, Any]]:
@@ -168,10 +144,11 @@ def test_data_of_something_else_are_refused(text: str, tmp_path: Path, capsys: p
 def test_the_script_follows_as_the_shim_does() -> None:
     """The scalar controller against log2sim.replay.follower, over 300 steps of random states."""
     rng = np.random.default_rng(3)
-    wheelbase, lock, dt = 2.7, 0.65, 0.02
-    one = np.ones(1)
-    parameters = VehicleParameters(*(v * one for v in (wheelbase, 1.4, lock, 1.0, 0.1, 6.0, 10.0, 60.0, 0.1)))
-    memory, own = follower.Memory.fresh(1), Follower(6.0, 10.0, math.tan(lock) / wheelbase)
+    dt = 0.02
+    one, parameters = np.ones(1), parameters_for([left_turn()])
+    wheelbase, lock = float(parameters.wheelbase_m[0]), float(parameters.max_steer_rad[0])
+    limits = (float(parameters.max_throttle_mps2[0]), float(parameters.max_brake_mps2[0]), math.tan(lock) / wheelbase)
+    memory, own = follower.Memory.fresh(1), Follower(*limits)
     empty = {f: np.zeros(1) for f in VehicleState.__dataclass_fields__}
     for k in range(300):
         speed = 0.0 if k % 10 == 0 else rng.normal(4, 5)

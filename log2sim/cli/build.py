@@ -86,20 +86,24 @@ def replay(
     model: Annotated[str, typer.Option(help="Vehicle model: auto, kinematic, dynamic or single-track.")] = "auto",
     dt: Annotated[float, typer.Option(help="Step in s.")] = 0.01,
     ego: Annotated[str | None, typer.Option(metavar="MODULE:ATTRIBUTE", help="Policy that drives the ego.")] = None,
+    simulator: Annotated[str, typer.Option(help="own, or carla: a CARLA server moves the agents.")] = "own",
+    host: Annotated[str, typer.Option(help="With carla: where its server runs.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="With carla: its port.")] = 2000,
+    map: Annotated[str | None, typer.Option(metavar="TOWN|FILE.xodr", help="With carla: world to load first.")] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit 6 when a limit is broken.")] = False,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
     """Let vehicles drive a scenario."""
     from log2sim.files import check_targets
-    from log2sim.replay import load_policy, require_strict
+    from log2sim.replay import host_named, load_policy, require_strict
     from log2sim.replay import replay as run
     from log2sim.scenario import Scenario
 
     check_targets(out, overwrite=overwrite)
     loaded = Scenario.load(scenario)
     policy = load_policy(ego) if ego is not None else None
-    result = run(loaded, mode=mode, model=model, dt_s=dt, ego=policy)
+    result = run(loaded, mode=mode, model=model, dt_s=dt, ego=policy, host=host_named(simulator, host, port, map))
     if out is not None:
         result.save(out)
     m = result.metrics

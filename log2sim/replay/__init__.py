@@ -10,6 +10,7 @@ from log2sim.replay.metrics import check_strict, require_strict
 from log2sim.replay.policy import Controls, EgoState, Observation, Others, Policy, Route, load_policy
 from log2sim.replay.result import AgentReplay, Replay, to_scenario
 from log2sim.replay.run import replay
+from log2sim.replay.simulator import host_named
 
 __all__ = [
     "AgentReplay",
@@ -21,6 +22,7 @@ __all__ = [
     "Replay",
     "Route",
     "check_strict",
+    "host_named",
     "load_policy",
     "replay",
     "require_strict",

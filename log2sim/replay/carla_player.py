@@ -23,6 +23,7 @@ from types import ModuleType
 from typing import Any
 
 VERSION = 1
+NO_CLIENT = 5  # exit code
 Place = tuple[float, float, float, float]  # box center x, y, its lowest face z, yaw in rad
 MARGIN_S = 1e-6
 STANDSTILL_MPS = 0.05  # physics never rests entirely
@@ -293,8 +294,8 @@ class Player:
         self.drift_m: dict[str, list[float]] = {}
         self._map = stage.world.get_map() if ground == "map" else None
 
-    def step(self, t_s: float) -> None:
-        """One tick, at whose end the world shows a time of the log; agents come and go."""
+    def commands(self, t_s: float) -> list[Any]:
+        """What makes the next tick end with the world at a time of the log; agents come and go."""
         commands: list[Any] = []
         for agent in self.agents:
             if agent["begin_s"] - MARGIN_S <= t_s <= agent["end_s"] + MARGIN_S:
@@ -302,8 +303,7 @@ class Player:
                 commands += self._drive(agent, t_s) if drives else self._place(agent, t_s)
             elif agent["id"] in self.stage.bodies:
                 self.stage.remove(agent["id"])
-        self.stage.send(commands)
-        self.stage.world.tick()
+        return commands
 
     def _place(self, agent: dict[str, Any], t_s: float) -> Iterator[Any]:
         """Commands that put an agent where the log has it, with its velocity.
@@ -313,14 +313,14 @@ class Player:
         body, rolls = self.stage.bodies.get(agent["id"]), self.physics and agent["drive"] == "vehicle"
         if body is not None and agent["static"]:
             return
-        x, y, z, yaw = self._grounded(agent, self.logged[agent["id"]].place(t_s))
+        x, y, z, yaw = self.grounded(agent, self.logged[agent["id"]].place(t_s))
         vx, vy = self._velocity(agent, t_s)
         if rolls or agent["drive"] == "walker":
             x, y = x - vx * self.stage.dt_s, y - vy * self.stage.dt_s
         body = body or self.stage.spawn(agent, (x, y, z, yaw), rolls)
         yield self.carla.command.ApplyTransform(body.actor.id, body.transform(x, y, z, yaw))
         if body.is_walker:
-            yield self._walk(body, vx, vy, yaw)
+            yield self.walk(body, vx, vy, yaw)
         elif body.is_vehicle:
             yield self.carla.command.ApplyTargetVelocity(body.actor.id, self.carla.Vector3D(vx, vy, 0.0))
             (curvature,) = self.logged[agent["id"]].at(t_s, "curvature_1pm")
@@ -336,7 +336,7 @@ class Player:
         body, course = self.stage.bodies.get(name), self.courses.get(name, self.logged[name])
         vx, vy = self._velocity(agent, t_s)
         if body is None or self._leaps(agent, now_s):
-            x, y, z, yaw = self._grounded(agent, course.place(t_s))
+            x, y, z, yaw = self.grounded(agent, course.place(t_s))
             start = (x - vx * self.stage.dt_s, y - vy * self.stage.dt_s, z, yaw)
             body = body or self.stage.spawn(agent, start, True)
             if body.is_vehicle:
@@ -349,7 +349,7 @@ class Player:
             x, y, yaw, speed = self._found(agent, body, now_s)
         if body.is_walker:
             logged_x, logged_y, *_ = self.logged[name].place(now_s)
-            yield self._walk(body, vx + (logged_x - x) / WALKER_S, vy + (logged_y - y) / WALKER_S, yaw)
+            yield self.walk(body, vx + (logged_x - x) / WALKER_S, vy + (logged_y - y) / WALKER_S, yaw)
         else:
             wanted, axle = self._wanted(course, body.axle_m, now_s), behind(x, y, yaw, body.axle_m)
             pedal, curvature, reverse = self.followers[name].step(wanted, (*axle, yaw), speed, self.stage.dt_s)
@@ -359,7 +359,7 @@ class Player:
     def _found(self, agent: dict[str, Any], body: Body, t_s: float) -> Place:
         """Where physics has brought an agent: box center x, y, yaw and speed."""
         x, y, z, yaw, speed = body.pose()
-        logged_x, logged_y, logged_z, _ = self._grounded(agent, self.logged[agent["id"]].place(t_s))
+        logged_x, logged_y, logged_z, _ = self.grounded(agent, self.logged[agent["id"]].place(t_s))
         if z < logged_z - FALLEN_M:
             raise ReplayError(
                 f"agent '{agent['id']}' fell {logged_z - z:.0f} m: there is no road below it; give the map that the log was "
@@ -376,7 +376,7 @@ class Player:
         accel, curvature = course.at(t_s + AHEAD_S + self.stage.dt_s / 2, "accel_mps2", "curvature_1pm")
         return (*behind(x, y, yaw, axle_m), yaw, speed, accel, curvature, gear, stands)
 
-    def _walk(self, body: Body, vx: float, vy: float, yaw: float) -> Any:
+    def walk(self, body: Body, vx: float, vy: float, yaw: float) -> Any:
         """The command that lets a walker go with a velocity, or stand looking ahead."""
         speed = math.hypot(vx, vy)
         way = (vx / speed, vy / speed) if speed > STANDSTILL_MPS else (math.cos(yaw), math.sin(yaw))
@@ -400,7 +400,7 @@ class Player:
         """Whether the log leaps within the tick that begins at a time."""
         return any(t_s + MARGIN_S < leap_s <= t_s + self.stage.dt_s + MARGIN_S for leap_s in agent["leaps_s"])
 
-    def _grounded(self, agent: dict[str, Any], place: Place) -> Place:
+    def grounded(self, agent: dict[str, Any], place: Place) -> Place:
         """The place at the height of the nearest road, or as logged."""
         if self._map is None:
             return place
@@ -434,7 +434,7 @@ def load_client() -> ModuleType:
     try:
         import carla
     except ImportError as error:
-        raise ReplayError(f"CARLA's Python client is needed: pip install carla ({error})", 5) from None
+        raise ReplayError(f"CARLA's Python client is needed: pip install carla ({error})", NO_CLIENT) from None
     return carla
 
 
@@ -510,7 +510,8 @@ def play(player: Player, data: dict[str, Any], *, follow: str, pace: float) -> N
     for k in range(math.floor((end_s - begin_s) / dt_s + MARGIN_S) + 1):
         started = time.monotonic()
         t_s = begin_s + k * dt_s
-        player.step(t_s)
+        player.stage.send(player.commands(t_s))
+        player.stage.world.tick()
         if watched is not None and watched["begin_s"] <= t_s <= watched["end_s"]:
             player.stage.watch(player.logged[follow].place(t_s))
         if pace > 0:

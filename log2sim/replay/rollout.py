@@ -23,6 +23,7 @@ from log2sim.replay.policy import (
     ask,
 )
 from log2sim.replay.reference import GRID_S
+from log2sim.replay.simulator import Host
 from log2sim.replay.world import Driven, Group, Snapshot
 from log2sim.scenario import Agent
 
@@ -66,9 +67,14 @@ Tracks = dict[str, tuple[NDArray[np.intp], Array]]
 
 
 def roll(
-    groups: Sequence[Group], clock: Clock, statics: Sequence[Agent], policy: Policy | None, progress: Progress | None
+    groups: Sequence[Group],
+    clock: Clock,
+    statics: Sequence[Agent],
+    policy: Policy | None,
+    progress: Progress | None,
+    host: Host | None = None,
 ) -> Tracks:
-    """Drive all groups from the first step to the last and return what was stored."""
+    """Drive all groups from the first step to the last and return what was stored; a `host` moves them, if any."""
     tracks: dict[str, list[tuple[NDArray[np.intp], Array]]] = defaultdict(list)
     arrivals = [_arrivals(group, clock) for group in groups]
     driven = next((g for g in groups if isinstance(g, Driven)), None)
@@ -92,6 +98,8 @@ def roll(
                 driven.controls = ask(policy, _observe(driven, groups, statics, clock, step))
             for group, _ in busy:
                 group.advance(clock.dt_s)
+            if host is not None:
+                host.tick(step)
         for (group, _), (steps, rows) in zip(busy, records):
             if steps:
                 _keep(tracks, group, np.array(steps), np.stack(rows))

@@ -10,11 +10,12 @@ from log2sim.errors import ConfigError, ScenarioError
 from log2sim.registry import nearest
 from log2sim.replay.assemble import assemble
 from log2sim.replay.cast import EGO, cast_agents, groups_of
-from log2sim.replay.models import MODELS
+from log2sim.replay.models import MODELS, Choice
 from log2sim.replay.parameters import WHEELED
 from log2sim.replay.policy import Policy
 from log2sim.replay.result import Replay
 from log2sim.replay.rollout import Clock, Progress, roll
+from log2sim.replay.simulator import Host
 from log2sim.scenario import Agent, Scenario
 
 MODES = ("pid", "exact")
@@ -29,6 +30,7 @@ def replay(
     model: str = "auto",
     dt_s: float = 0.01,
     ego: Policy | None = None,
+    host: Host | None = None,
     progress: Progress | None = None,
 ) -> Replay:
     """Replay a scenario and compare it with the log.
@@ -46,6 +48,9 @@ def replay(
         0.05 s, or every step.
     ego : callable, optional
         `policy(observation) -> Controls` that drives the ego instead, from its first logged state to the end of its life.
+    host : Host, optional
+        Simulator outside this process that moves the agents instead, such as `log2sim.replay.carla.CarlaSimulator`; it has
+        its own vehicle models, so `model` is not used.
     progress : callable, optional
         Called with the steps done and their number, some times a run.
 
@@ -73,9 +78,20 @@ def replay(
         _check_waypoints(agent)
     clock = _clock(scenario.agents, dt_s)
     cast = cast_agents(scenario.agents, mode, drives_ego=ego is not None)
-    groups, choices = groups_of(cast, clock, model)
-    tracks = roll(groups, clock, cast["static"], ego, progress)
-    return assemble(scenario, groups, tracks, clock, choices, mode, model)
+    if host is None:
+        groups, choices = groups_of(cast, clock, model)
+        tracks = roll(groups, clock, cast["static"], ego, progress)
+        return assemble(scenario, groups, tracks, clock, choices, mode, model)
+    if dt_s > host.max_dt_s:
+        raise ConfigError(f"dt: {dt_s} s, {host.name} takes at most {host.max_dt_s:g} s")
+    groups, choices = groups_of(cast, clock, "kinematic")  # whose references suit any model
+    host.open(groups, clock, cast["static"])
+    try:
+        tracks = roll(groups, clock, cast["static"], ego, progress, host)
+    finally:
+        host.close()
+    choices = {k: Choice(host.name, "the simulator's own") for k in choices}
+    return assemble(scenario, groups, tracks, clock, choices, mode, host.name)
 
 
 def _check_waypoints(agent: Agent) -> None:
