@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -111,6 +113,12 @@ class Scenario:
     @property
     def others(self) -> tuple[Agent, ...]:
         return tuple(a for a in self.agents if a.id != "ego")
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the scenario's document, by which replays and edits name their source."""
+        document = json.dumps(self.to_dict(), sort_keys=True, ensure_ascii=False)
+        return hashlib.sha256(document.encode()).hexdigest()
 
     @classmethod
     def load(cls, path: Path | str) -> Scenario:

@@ -205,6 +205,7 @@ def play(carla: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         if prepare is not None:
             prepare(client)
         monkeypatch.setattr(carla, "Client", client)
+        words = tuple(str(path.with_name("road.xodr")) if w == "ROAD" else w for w in words)
         return main(["--data", str(path), "--pace", "0", "--ground", ground, *words]), client
 
     return playing
@@ -476,3 +477,38 @@ def test_positions_of_the_data_are_those_of_carlas_own_map(carla: ModuleType, tm
         assert math.hypot(lane.location.x - x, lane.location.y - y) < 0.01
         assert lane.location.z == pytest.approx(z, abs=0.01)
         assert (lane.rotation.yaw - yaw + 180) % 360 - 180 == pytest.approx(0, abs=0.1)
+
+
+@pytest.mark.parametrize("name", ["truth", "turn", "hill"])
+def test_carla_reads_the_exported_road_with_the_ego_in_the_middle_of_a_lane(
+    name: str, carla: ModuleType, scenario: Scenario, tmp_path: Path
+) -> None:
+    """Lane centers within 1 cm of the ego's path, in place and in height, heading the ego's way."""
+    made = {"truth": scenario, "turn": of(left_turn(at=(3e5, 5e6))), "hill": of(along_the_road())}[name]
+    _, data = written(made, tmp_path)
+    assert_on_a_lane(carla, data, tmp_path / data["road"])
+
+
+def assert_on_a_lane(carla: ModuleType, data: dict[str, Any], road_path: Path) -> None:
+    """The rear axle of the ego at all logged moments against the lane that `carla.Map` has there."""
+    road, ego = carla.Map("road", road_path.read_text(encoding="utf-8")), data["agents"][0]
+    course = Course(ego["exact"])
+    for t_s in ego["exact"]["t_s"]:
+        x, y, z, yaw = course.place(t_s)
+        lane = road.get_waypoint(carla.Location(x, y, z)).transform
+        assert math.hypot(lane.location.x - x, lane.location.y - y) < 0.01
+        assert lane.location.z == pytest.approx(z, abs=0.05)
+        turned = math.remainder(math.radians(lane.rotation.yaw) - yaw, 2 * math.pi)
+        assert abs(turned) < 0.3  # the box's center does not move along its heading in a turn
+
+
+@pytest.mark.parametrize("mode", ["exact", "pid"])
+def test_the_exported_road_carries_the_exported_agents(
+    play: Any, scenario: Scenario, mode: str, tmp_path: Path
+) -> None:
+    """carla#5190: one export, one command, and a log is replayed on a road that was not there before."""
+    code, client = play(scenario, "--opendrive", "ROAD", "--mode", mode, ground="map")
+    assert client.loaded == [(tmp_path / "out" / "road.xodr").read_text(encoding="utf-8")]
+    assert code == 0
+    for logged in scenario.agents:
+        assert drift_m(client, logged, "hero" if logged.id == "ego" else logged.id, 0.05).max() < 0.3

@@ -8,7 +8,8 @@ from replay_maneuvers import agent_from, scenario_of
 
 from log2sim.errors import CheckFailed
 from log2sim.replay import check_strict, replay, require_strict
-from log2sim.replay.collisions import LOG_MARGIN_M, LOG_WINDOW_S, Boxes, collisions, overlaps, rectangles_overlap
+from log2sim.replay.boxes import Boxes, rectangles_overlap
+from log2sim.replay.collisions import LOG_MARGIN_M, LOG_WINDOW_S, collisions, contacts
 from log2sim.replay.metrics import tracking_errors
 from log2sim.replay.path import path_of
 
@@ -97,11 +98,11 @@ def boxes(*tracks, z=None, size=(4.0, 2.0, 1.5)):
 def test_bridges_and_absent_agents_are_not_hit():
     moves = np.array([True, True])
     x = np.linspace(0, 1, 30)
-    assert len(overlaps(boxes((0, x), (0, x)), moves)[0]) == 30
-    assert len(overlaps(boxes((0, x), (0, x), z=(0.0, 1.5)), moves)[0]) == 0
+    assert len(contacts(boxes((0, x), (0, x)), moves).a) == 30
+    assert len(contacts(boxes((0, x), (0, x), z=(0.0, 1.5)), moves).a) == 0
     gone = np.where(np.arange(30) < 25, np.nan, x)
-    assert len(overlaps(boxes((0, x), (0, gone)), moves)[0]) == 5
-    assert len(overlaps(boxes((0, x), (0, x)), np.array([False, False]))[0]) == 0
+    assert len(contacts(boxes((0, x), (0, gone)), moves).a) == 5
+    assert len(contacts(boxes((0, x), (0, x)), np.array([False, False])).a) == 0
 
 
 def test_all_pairs_are_found_as_by_trying_each():
@@ -113,7 +114,7 @@ def test_all_pairs_are_found_as_by_trying_each():
         np.stack([rng.uniform(1, 12, n), rng.uniform(0.5, 3, n), np.ones(n)], axis=1),
     )
     moves = rng.uniform(size=n) < 0.5
-    _, first, second = overlaps(Boxes(x, y, 0 * x, yaw, 0 * x, size), moves)
+    found = contacts(Boxes(x, y, 0 * x, yaw, 0 * x, size), moves)
 
     def corners(k):
         rim = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * size[k, :2] / 2
@@ -137,7 +138,7 @@ def test_all_pairs_are_found_as_by_trying_each():
         if (moves[a] or moves[b]) and (inside(grid(a), b) or inside(grid(b), a))
     }
     assert len(expected) > 5
-    assert set(zip(first.tolist(), second.tolist())) == expected
+    assert set(zip(found.a.tolist(), found.b.tolist())) == expected
 
 
 def one_contact(log_x, log_y=0.0):

@@ -91,35 +91,31 @@ def replay(
     port: Annotated[int, typer.Option(help="With carla: its port.")] = 2000,
     map: Annotated[str | None, typer.Option(metavar="TOWN|FILE.xodr", help="With carla: world to load first.")] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit 6 when a limit is broken.")] = False,
+    limit: Annotated[
+        list[str] | None, typer.Option(metavar="METRIC=VALUE", help="A limit, e.g. min_ttc_s=1; with --strict.")
+    ] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
     """Let vehicles drive a scenario."""
     from log2sim.files import check_targets
-    from log2sim.replay import host_named, load_policy, require_strict
+    from log2sim.replay import check_limits, host_named, load_policy, parse_limits, require_strict
     from log2sim.replay import replay as run
+    from log2sim.replay.summary import summarize
     from log2sim.scenario import Scenario
 
     check_targets(out, overwrite=overwrite)
+    limits = parse_limits(limit or ())
     loaded = Scenario.load(scenario)
     policy = load_policy(ego) if ego is not None else None
     result = run(loaded, mode=mode, model=model, dt_s=dt, ego=policy, host=host_named(simulator, host, port, map))
     if out is not None:
         result.save(out)
-    m = result.metrics
-    new = sum(not c["in_log"] for c in m["collisions"])
-    say(
-        f"cross-track {_figure(m['cross_track_rms_m'])} m rms, {_figure(m['cross_track_max_m'])} m max · "
-        f"along-track {_figure(m['along_track_rms_m'])} m rms · speed {_figure(m['speed_rms_mps'])} m/s rms · "
-        f"{len(m['collisions'])} collisions, {new} that the log does not have",
-        quiet=quiet,
-    )
+    say(summarize(result), quiet=quiet)
     if strict:
-        require_strict(result)
-
-
-def _figure(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
+        require_strict(result, limits)
+    for broken in check_limits(result, limits):
+        say(f"limit broken: {broken}", quiet=quiet)
 
 
 @app.command()

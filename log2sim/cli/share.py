@@ -25,8 +25,28 @@ def export(
     """Write a scenario in the format of a simulator or viewer."""
     from log2sim.export import Options
     from log2sim.export import export as run
+    from log2sim.export.checks import remarks
     from log2sim.scenario import Scenario
 
-    files = run(Scenario.load(scenario), to, out, Options(revision, map, mode, log), overwrite=overwrite)
+    loaded = Scenario.load(scenario)
+    files = run(loaded, to, out, Options(revision, map, mode, log), overwrite=overwrite)
     for file in files:
         say(f"{file}: written", quiet=quiet)
+    for remark in remarks(loaded):
+        say(f"note: {remark}", quiet=quiet)
+
+
+@app.command(name="import")
+def import_(
+    file: Annotated[Path, typer.Argument(metavar="FILE.xosc", help="An OpenSCENARIO file with trajectories.")],
+    out: Annotated[Path, typer.Option("--out", metavar="SCENARIO", help="Scenario file to write.")],
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Turn an OpenSCENARIO file back into a scenario."""
+    from log2sim.export.openscenario_read import load
+    from log2sim.files import check_targets
+
+    check_targets(out, overwrite=overwrite)
+    load(file).save(out)
+    say(f"{out}: written", quiet=quiet)

@@ -6,14 +6,15 @@ import sys
 from types import ModuleType
 from typing import Any
 
-from log2sim.replay.metrics import check_strict, require_strict
+from log2sim.replay.limits import check_limits, check_strict, parse_limits, require_strict
 from log2sim.replay.policy import Controls, EgoState, Observation, Others, Policy, Route, load_policy
-from log2sim.replay.result import AgentReplay, Replay, to_scenario
+from log2sim.replay.result import AgentReplay, Commands, Replay, to_scenario
 from log2sim.replay.run import replay
 from log2sim.replay.simulator import host_named
 
 __all__ = [
     "AgentReplay",
+    "Commands",
     "Controls",
     "EgoState",
     "Observation",
@@ -21,9 +22,11 @@ __all__ = [
     "Policy",
     "Replay",
     "Route",
+    "check_limits",
     "check_strict",
     "host_named",
     "load_policy",
+    "parse_limits",
     "replay",
     "require_strict",
     "to_scenario",

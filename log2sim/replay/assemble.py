@@ -5,23 +5,26 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.replay.collisions import Boxes, collisions
-from log2sim.replay.metrics import agent_metrics, overall
+from log2sim.replay.assess import FOLLOWING, assess
+from log2sim.replay.metrics import Errors, errors_of
 from log2sim.replay.models import Choice
 from log2sim.replay.path import Path
-from log2sim.replay.result import AgentReplay, Replay
+from log2sim.replay.result import AgentReplay, Commands, Replay
 from log2sim.replay.rollout import Clock, Tracks
 from log2sim.replay.world import Group
 from log2sim.scenario import Agent, Scenario
 
 DIGITS = 6
 """Decimals of stored states: a micrometer."""
+
+FINE = 4
+"""Decimals of commands and errors: a tenth of a millimeter."""
 
 
 def assemble(
@@ -37,13 +40,16 @@ def assemble(
     home = {a.id: (g.driver, r.path, r.flags) for g in groups for a, r in zip(g.agents, g.references)}
     agents: list[AgentReplay] = []
     stored: list[NDArray[np.intp]] = []
+    errors: dict[str, Errors] = {}
     for agent in scenario.agents:
         if agent.id in tracks:
             driver, path, flags = home[agent.id]
             steps, states = tracks[agent.id]
             t_s: Array = clock.begin_s + steps.astype(np.float64) * clock.dt_s
             choice = choices.get(agent.id, Choice("point", "") if driver == "pid" else Choice("none", ""))
-            agents.append(_moved(agent, driver, choice, path, flags, t_s, states))
+            replayed = _moved(agent, driver, choice, path, flags, t_s, states)
+            errors[agent.id] = errors_of(path, replayed, follows=driver in FOLLOWING)
+            agents.append(_with_errors(replayed, errors[agent.id]))
             stored.append(steps)
         else:
             replayed, steps = _posed(agent, clock)
@@ -59,14 +65,14 @@ def assemble(
         dt_s=clock.dt_s,
         store_dt_s=round(clock.dt_s * clock.store_every, 9),
         agents=tuple(agents),
-        metrics=_measure(agents, stored, paths, clock),
+        metrics=assess(agents, stored, paths, errors, clock),
     )
 
 
 def _moved(
     agent: Agent, driver: str, choice: Choice, path: Path, flags: tuple[str, ...], t_s: Array, states: Array
 ) -> AgentReplay:
-    x, y, yaw, speed, steer, accel = states
+    x, y, yaw, speed, steer, accel, *told = states
     if driver == "exact":
         x, y, yaw, speed = path.centers(t_s)  # the tables in between are good to half a millimeter, the path is exact
     if np.isnan(accel).any():
@@ -74,10 +80,20 @@ def _moved(
     z = np.interp(t_s, path.t_s, path.z_m)
     x, y, z, yaw, speed, steer, accel = (np.round(c, DIGITS) for c in (x, y, z, yaw, speed, steer, accel))
     t_s = np.round(t_s, 9)
+    pedal, wheel, gear = told
+    commands = Commands(np.round(pedal, FINE), np.round(wheel, FINE), np.where(gear < 0, -1, 1).astype(np.int8))
     return AgentReplay(
         agent.id, agent.category, agent.size_m, driver, choice.model, t_s, x, y, z, yaw, speed, steer, accel, flags,
-        model_reason=choice.reason,
+        choice.reason, None if np.isnan(pedal).any() else commands,
     )  # fmt: skip
+
+
+def _with_errors(agent: AgentReplay, errors: Errors) -> AgentReplay:
+    """The agent with its errors, unless it is the log itself."""
+    if agent.driver == "exact":
+        return agent
+    across, along = (np.round(c, FINE) for c in (errors.across_m, errors.along_m))
+    return replace(agent, cross_track_m=across, along_track_m=along)
 
 
 def _posed(agent: Agent, clock: Clock) -> tuple[AgentReplay, NDArray[np.intp]]:
@@ -99,43 +115,3 @@ def _posed(agent: Agent, clock: Clock) -> tuple[AgentReplay, NDArray[np.intp]]:
     driver = "static" if agent.static else "exact"
     replayed = AgentReplay(agent.id, agent.category, agent.size_m, driver, "none", t_s, x, y, z, yaw, speed, zero, zero)
     return replayed, steps
-
-
-def _measure(
-    agents: Sequence[AgentReplay], stored: Sequence[NDArray[np.intp]], paths: dict[str, Path], clock: Clock
-) -> dict[str, Any]:
-    """All metrics: tracking by agent and overall, collisions."""
-    by_agent: dict[str, dict[str, Any]] = {}
-    for a in agents:
-        if a.id in paths:
-            by_agent[a.id] = agent_metrics(paths[a.id], a.t_s, a.x_m, a.y_m, a.yaw_rad, a.speed_mps)
-    replayed, logged = (_boxes(agents, stored, source, clock) for source in ({}, paths))
-    moves = np.array([a.driver != "static" for a in agents], dtype=bool)
-    rows = np.arange(len(replayed.x_m), dtype=np.float64)
-    t_s = clock.begin_s + rows * (clock.store_every * clock.dt_s)
-    events = collisions(replayed, logged, moves, t_s, [a.id for a in agents])
-    for k, values in by_agent.items():
-        values["collisions"] = [e for e in events if k in e["agents"]]
-    samples = {a.id: len(a) if a.driver == "pid" else 0 for a in agents}
-    return overall(by_agent, samples, events)
-
-
-def _boxes(
-    agents: Sequence[AgentReplay], stored: Sequence[NDArray[np.intp]], paths: dict[str, Path], clock: Clock
-) -> Boxes:
-    """Boxes at all stored steps, of the replay or, for agents with a path given, of the log."""
-    shape = ((clock.steps - 1) // clock.store_every + 1, len(agents))
-    columns = np.full((5, *shape), np.nan)
-    for k, (agent, steps) in enumerate(zip(agents, stored)):
-        rows = steps // clock.store_every
-        if agent.id in paths:
-            x, y, yaw, speed = paths[agent.id].centers(agent.t_s)
-            columns[:, rows, k] = np.stack([x, y, agent.z_m, yaw, speed])
-        elif len(rows) == len(agent):
-            columns[:, rows, k] = agent.x_m, agent.y_m, agent.z_m, agent.yaw_rad, agent.speed_mps
-        elif len(rows):  # one pose for all rows
-            pose = [agent.x_m[0], agent.y_m[0], agent.z_m[0], agent.yaw_rad[0], agent.speed_mps[0]]
-            columns[:, rows, k] = np.array(pose)[:, None]
-    size = np.array([a.size_m for a in agents], dtype=np.float64).reshape(-1, 3)
-    x, y, z, yaw, speed = columns
-    return Boxes(x, y, z, yaw, speed, size)

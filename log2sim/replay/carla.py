@@ -86,7 +86,7 @@ class CarlaSimulator:
         driven = [a for g in groups if isinstance(g, (Fleet, Crowd)) for a in g.agents]
         placed = [a for g in groups if not isinstance(g, (Fleet, Crowd)) for a in g.agents] + list(statics)
         self.offset_m = _offset_m(driven + placed)
-        data = {d["id"]: d for d in carla_agents(driven + placed, self.offset_m)}
+        data = {d["id"]: d for d in carla_agents([_shifted(a, self.offset_m) for a in driven + placed])}
         self._data, self._courses = data, {k: player.Course(d["exact"]) for k, d in data.items()}
         self._read: dict[str, tuple[float, float]] = {}
         with _own_errors():
@@ -226,6 +226,12 @@ def _offset_m(agents: Sequence[Agent]) -> tuple[float, float]:
         return 0.0, 0.0
     x, y = np.round((first.min(axis=0) + first.max(axis=0)) / 2 / STEP_M) * STEP_M
     return float(x), float(y)
+
+
+def _shifted(agent: Agent, offset_m: tuple[float, float]) -> Agent:
+    """An agent whose coordinates have an offset taken off."""
+    w = agent.waypoints
+    return replace(agent, waypoints=replace(w, x_m=w.x_m - offset_m[0], y_m=w.y_m - offset_m[1]))
 
 
 @contextmanager

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Replay a driving log in CARLA: `python replay_carla.py [--mode exact|pid] [--map TOWN | --opendrive FILE.xodr]`.
+"""Replay a driving log in CARLA: `python replay_carla.py [--mode exact|pid] [--opendrive | --map TOWN]`.
 
 Needs a running CARLA 0.9.x server and its Python client (`pip install carla`), nothing else. Who drives where stands in the
 data file, in CARLA's frame: x forward, y to the RIGHT, z up, meters, yaw in degrees clockwise seen from above.
@@ -529,7 +529,15 @@ def arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--map", metavar="TOWN", help="load this town first")
-    where.add_argument("--opendrive", type=Path, metavar="FILE.xodr", help="make a world from this road network first")
+    road = Path(__file__).with_name("road.xodr")
+    where.add_argument(
+        "--opendrive",
+        type=Path,
+        nargs="?",
+        const=road,
+        metavar="FILE.xodr",
+        help="make a world of this road network first (default: the one exported)",
+    )
     parser.add_argument(
         "--mode", choices=("exact", "pid"), help="as logged, or driven along the log (default: as exported)"
     )

@@ -2,33 +2,55 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from log2sim.errors import CheckFailed
 from log2sim.geometry import Array, wrap_angle
 from log2sim.replay.path import Path
+from log2sim.replay.result import AgentReplay
 
 SEARCH_S = 1.0
 SEARCH_STEP_S = 0.05
 STANDING_MPS = 0.1
 
-CROSS_TRACK_LIMIT_M = 0.5
-"""Limit of a strict replay: a car of 1.9 m in a lane of 3.5 m has 0.8 m on either side."""
+OFF_PATH_M = 0.5
+"""Farther than this across from its course an agent is off its path: a car of 1.9 m in a lane of 3.5 m has 0.8 m."""
 
 
-def tracking_errors(path: Path, t_s: Array, x_m: Array, y_m: Array) -> tuple[Array, Array]:
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """How far an agent is from the log at its rows (S,): left, ahead, faster and counter-clockwise positive."""
+
+    across_m: Array
+    along_m: Array
+    speed_mps: Array
+    yaw_rad: Array
+
+
+def errors_of(path: Path, agent: AgentReplay, *, follows: bool) -> Errors:
+    """Errors of an agent; one that does not follow the log may be far behind or ahead, and keep to its course yet."""
+    near_s = agent.t_s if follows else _nearest_times(path, agent.x_m, agent.y_m)
+    across, along = tracking_errors(path, agent.t_s, agent.x_m, agent.y_m, near_s)
+    _, _, log_yaw, log_speed = path.centers(agent.t_s)
+    return Errors(across, along, agent.speed_mps - log_speed, wrap_angle(agent.yaw_rad - log_yaw))
+
+
+def tracking_errors(path: Path, t_s: Array, x_m: Array, y_m: Array, near_s: Array | None = None) -> tuple[Array, Array]:
     """Errors across and along the logged path, (S,) each in m, left and ahead positive.
 
     Along: from the logged box center at the same time, in the direction of its heading. Across: distance from the nearest
-    point of the course of logged box centers within `SEARCH_S`, so being late in a curve is no error across. Where the
-    nearest point is an end of that course, or the log stands, what lies along its direction counts as along.
+    point of the course of logged box centers within `SEARCH_S` of the same time, or of the times `near_s` (S,), so being
+    late in a curve is no error across. Where the nearest point is an end of that course, or the log stands, what lies
+    along its direction counts as along.
     """
     log_x, log_y, log_yaw, _ = path.centers(t_s)
     along = (x_m - log_x) * np.cos(log_yaw) + (y_m - log_y) * np.sin(log_yaw)
-    times = t_s[:, None] + np.arange(-SEARCH_S, SEARCH_S + SEARCH_STEP_S / 2, SEARCH_STEP_S)
+    times = (t_s if near_s is None else near_s)[:, None] + np.arange(
+        -SEARCH_S, SEARCH_S + SEARCH_STEP_S / 2, SEARCH_STEP_S
+    )
     px, py, yaw, _ = (v.reshape(times.shape) for v in path.centers(times.ravel()))
     ux, uy = np.diff(px, axis=1), np.diff(py, axis=1)
     dx, dy = x_m[:, None] - px[:, :-1], y_m[:, None] - py[:, :-1]
@@ -45,22 +67,20 @@ def tracking_errors(path: Path, t_s: Array, x_m: Array, y_m: Array) -> tuple[Arr
     return np.where(behind, -across, across)[row, nearest], along
 
 
-def agent_metrics(path: Path, t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps: Array) -> dict[str, float]:
-    """Tracking errors of one agent."""
-    across, along = tracking_errors(path, t_s, x_m, y_m)
-    _, _, log_yaw, log_speed = path.centers(t_s)
+def agent_metrics(errors: Errors) -> dict[str, Any]:
+    """Tracking errors of one agent, and the share of its rows that are farther than `OFF_PATH_M` from its course."""
+    across = np.abs(errors.across_m)
     return {
-        "cross_track_rms_m": _rms(across),
-        "cross_track_max_m": round(float(np.max(np.abs(across))), 6),
-        "along_track_rms_m": _rms(along),
-        "speed_rms_mps": _rms(speed_mps - log_speed),
-        "yaw_rms_rad": _rms(wrap_angle(yaw_rad - log_yaw)),
+        "cross_track_rms_m": _rms(errors.across_m),
+        "cross_track_max_m": round(float(np.max(across)), 6),
+        "along_track_rms_m": _rms(errors.along_m),
+        "speed_rms_mps": _rms(errors.speed_mps),
+        "yaw_rms_rad": _rms(errors.yaw_rad),
+        "off_path_share": round(float(np.mean(across > OFF_PATH_M)), 6),
     }
 
 
-def overall(
-    by_agent: Mapping[str, Mapping[str, Any]], samples: Mapping[str, int], events: Sequence[Mapping[str, Any]]
-) -> dict[str, Any]:
+def overall(by_agent: Mapping[str, Mapping[str, Any]], samples: Mapping[str, int]) -> dict[str, Any]:
     """Errors over all followers, every stored sample counting alike; 0 where nobody follows."""
     ids = [k for k in by_agent if samples[k] > 0]
     total = sum(samples[k] for k in ids)
@@ -69,35 +89,22 @@ def overall(
         square = sum(samples[k] * by_agent[k][key] ** 2 for k in ids)
         out[key] = round(float(np.sqrt(square / total)), 6) if total else 0.0
     out["cross_track_max_m"] = max((by_agent[k]["cross_track_max_m"] for k in ids), default=0.0)
+    off = sum(samples[k] * by_agent[k]["off_path_share"] for k in ids)
+    out["off_path_share"] = round(off / total, 6) if total else 0.0
     out["followers"] = len(ids)
-    out["collisions"] = [dict(e) for e in events]
-    out["new_collisions"] = sum(not e["in_log"] for e in events)
-    out["by_agent"] = {k: dict(v) for k, v in by_agent.items()}
     return out
 
 
-def check_strict(replay: Any) -> list[str]:
-    """What breaks a limit of `--strict`: collisions that the log does not have, vehicles off their path, impossible logs."""
-    broken = [
-        f"{' and '.join(e['agents'])} collide at {e['t_s']:.2f} s ({e['relative_speed_mps']:.1f} m/s); the log has no such collision"
-        for e in replay.metrics["collisions"]
-        if not e["in_log"]
-    ]
-    for agent in replay.agents:
-        if agent.driver == "policy":
-            continue
-        worst = replay.metrics["by_agent"].get(agent.id, {}).get("cross_track_max_m", 0.0)
-        if worst > CROSS_TRACK_LIMIT_M:
-            broken.append(f"agent '{agent.id}': {worst:.2f} m off its path, limit {CROSS_TRACK_LIMIT_M:g} m")
-        broken += [f"agent '{agent.id}': {flag}" for flag in agent.flags]
-    return broken
+def _nearest_times(path: Path, x_m: Array, y_m: Array) -> Array:
+    """The times (S,) at which the log is nearest to places."""
+    from scipy.spatial import cKDTree
 
-
-def require_strict(replay: Any) -> None:
-    """Raise `CheckFailed` with all broken limits."""
-    broken = check_strict(replay)
-    if broken:
-        raise CheckFailed("the replay breaks limits:\n  " + "\n  ".join(broken))
+    t = np.arange(path.t_s[0], path.t_s[-1] + SEARCH_STEP_S / 2, SEARCH_STEP_S)
+    x, y = path.at(t)[:2]
+    _, nearest = cKDTree(np.stack([x, y], axis=1)).query(
+        np.stack([x_m - path.origin_m[0], y_m - path.origin_m[1]], axis=1)
+    )
+    return t[nearest]
 
 
 def _rms(values: Array) -> float:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from log2sim.errors import ScenarioError
 from log2sim.files import read_json, write_json
@@ -19,12 +20,28 @@ VERSION = 1
 
 
 @dataclass(frozen=True, eq=False)
+class Commands:
+    """What a vehicle was told at its rows (S,), held over the step before: throttle (positive) or brake, steering, gear.
+
+    `gear` is 1 forward and -1 backward. What its actuators did is `steer_rad` and `accel_mps2` of the `AgentReplay`.
+    """
+
+    pedal_mps2: Array
+    steer_rad: Array
+    gear: NDArray[np.int8]
+
+    COLUMNS = ("pedal_mps2", "steer_rad", "gear")
+
+
+@dataclass(frozen=True, eq=False)
 class AgentReplay:
     """What one agent did: box centers in the map as columns (S,), while it lives.
 
-    `driver` is "static" (one pose, two rows), "exact" (the log), "pid" or "policy"; `model` "none", "point", "kinematic",
-    "dynamic" or "single-track", with the reason in `model_reason`.
-    `accel_mps2` is along the heading; `steer_rad` is 0 where nothing steers. `flags` say what in the log cannot be driven.
+    `driver` is "static" (one pose, two rows), "exact" (the log), "pid", "reactive" or "policy"; `model` "none", "point",
+    "kinematic", "dynamic" or "single-track", with the reason in `model_reason`. `accel_mps2` is along the heading;
+    `steer_rad` is 0 where nothing steers. `flags` say what in the log cannot be driven. `commands` are None where there is
+    no vehicle model; `cross_track_m`, `along_track_m` (S,) are the distances from the log, left and ahead positive, None
+    for what stands for good.
     """
 
     id: str
@@ -42,8 +59,12 @@ class AgentReplay:
     accel_mps2: Array
     flags: tuple[str, ...] = ()
     model_reason: str = ""
+    commands: Commands | None = None
+    cross_track_m: Array | None = None
+    along_track_m: Array | None = None
 
     COLUMNS = ("t_s", "x_m", "y_m", "z_m", "yaw_rad", "speed_mps", "steer_rad", "accel_mps2")
+    ERRORS = ("cross_track_m", "along_track_m")
 
     def __len__(self) -> int:
         return len(self.t_s)
@@ -130,6 +151,7 @@ def to_scenario(replay: Replay, scenario: Scenario) -> Scenario:
 
 def _agent_to_dict(agent: AgentReplay) -> dict[str, Any]:
     length, width, height = (float(v) for v in agent.size_m)
+    commands, known = agent.commands, agent.cross_track_m is not None
     return {
         "id": agent.id,
         "category": agent.category,
@@ -139,16 +161,17 @@ def _agent_to_dict(agent: AgentReplay) -> dict[str, Any]:
         "model_reason": agent.model_reason,
         "flags": list(agent.flags),
         "states": {k: getattr(agent, k).tolist() for k in AgentReplay.COLUMNS},
+        "commands": {k: getattr(commands, k).tolist() for k in Commands.COLUMNS} if commands is not None else None,
+        "errors": {k: getattr(agent, k).tolist() for k in AgentReplay.ERRORS} if known else None,
     }
 
 
 def _agent_from_dict(entry: Mapping[str, Any]) -> AgentReplay:
-    columns = {k: np.array(entry["states"][k], dtype=np.float64) for k in AgentReplay.COLUMNS}
-    for key, values in columns.items():
-        if len(values) != len(columns["t_s"]):
-            raise ScenarioError(
-                f"agent '{entry['id']}': states.{key} has {len(values)} values, t_s has {len(columns['t_s'])}"
-            )
+    states = _columns(entry, "states", AgentReplay.COLUMNS)
+    # Files of 0.1.0 have neither commands nor errors.
+    commands = _columns(entry, "commands", Commands.COLUMNS)
+    if commands:
+        commands["gear"] = commands["gear"].astype(np.int8)
     size = entry["size_m"]
     return AgentReplay(
         id=entry["id"],
@@ -158,5 +181,17 @@ def _agent_from_dict(entry: Mapping[str, Any]) -> AgentReplay:
         model=entry["model"],
         flags=tuple(entry["flags"]),
         model_reason=entry.get("model_reason", ""),
-        **columns,
+        commands=Commands(**commands) if commands else None,
+        **states,
+        **_columns(entry, "errors", AgentReplay.ERRORS),
     )
+
+
+def _columns(entry: Mapping[str, Any], group: str, keys: Sequence[str]) -> dict[str, Any]:
+    """The columns of a group, which are as long as the times; none where the group is absent."""
+    count = len(entry["states"]["t_s"])
+    columns = {k: np.array(v, dtype=np.float64) for k, v in (entry.get(group) or {}).items() if k in keys}
+    for key, values in columns.items():
+        if len(values) != count:
+            raise ScenarioError(f"agent '{entry['id']}': {group}.{key} has {len(values)} values, t_s has {count}")
+    return columns

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,7 +63,7 @@ class Clock:
 
 
 Tracks = dict[str, tuple[NDArray[np.intp], Array]]
-"""By agent id: the stored steps (S,) and the columns (6, S) of a `Snapshot` at them."""
+"""By agent id: the stored steps (S,) and the columns (C, S) of a `Snapshot` at them."""
 
 
 def roll(
@@ -127,14 +127,13 @@ def _arrivals(group: Group, clock: Clock) -> dict[int, NDArray[np.intp]]:
 
 
 def _stack(snapshot: Snapshot) -> Array:
-    s = snapshot
-    return np.stack([s.x_m, s.y_m, s.yaw_rad, s.speed_mps, s.steer_rad, s.accel_mps2])
+    return np.stack([getattr(snapshot, f.name) for f in fields(snapshot)])
 
 
 def _keep(
     tracks: dict[str, list[tuple[NDArray[np.intp], Array]]], group: Group, steps: NDArray[np.intp], rows: Array
 ) -> None:
-    """Add to the tracks what was recorded in one window, `rows` (S, 6, A), cut to the life of each agent."""
+    """Add to the tracks what was recorded in one window, `rows` (S, C, A), cut to the life of each agent."""
     begin = np.searchsorted(steps, group.first[group.live])
     end = np.searchsorted(steps, group.last[group.live], side="right")
     for slot, i in enumerate(group.live):

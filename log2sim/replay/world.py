@@ -31,7 +31,10 @@ from log2sim.scenario import Agent
 
 @dataclass(frozen=True, eq=False)
 class Snapshot(Columns):
-    """Box centers in the map and what drives them, (A,); `accel_mps2` is NaN where the model has no such state."""
+    """Box centers in the map and what drives them, (A,); `accel_mps2` is NaN where the model has no such state.
+
+    Commands are those that led here, held over the last step; NaN for agents without.
+    """
 
     x_m: Array
     y_m: Array
@@ -39,6 +42,9 @@ class Snapshot(Columns):
     speed_mps: Array
     steer_rad: Array
     accel_mps2: Array
+    pedal_command_mps2: Array
+    steer_command_rad: Array
+    gear: Array
 
 
 class Group(ABC):
@@ -116,7 +122,7 @@ class Tape(Group):
         x, y, yaw, speed = self.row[:4]
         unknown = np.full(len(self.live), np.nan)
         x, y = x + self.origin_x_m[self.live], y + self.origin_y_m[self.live]
-        return Snapshot(x, y, wrap_angle(yaw), speed, np.zeros(len(self.live)), unknown)
+        return Snapshot(x, y, wrap_angle(yaw), speed, np.zeros(len(self.live)), unknown, unknown, unknown, unknown)
 
 
 class Fleet(Group):
@@ -137,6 +143,7 @@ class Fleet(Group):
         self.parameters, self.simulator = parameters, simulator
         self._all = VehicleState.zeros(len(agents))
         self._all_memory = Memory.fresh(len(agents))
+        self._all_commands = VehicleControls(np.zeros(len(agents)), np.zeros(len(agents)), np.zeros(len(agents), bool))
         self._open(self.live)
 
     def _open(self, live: NDArray) -> None:
@@ -145,10 +152,12 @@ class Fleet(Group):
             self._all_memory.take(live),
             self.parameters.take(live),
         )
+        self.commands = self._all_commands.take(live)
 
     def open_window(self, begin: int, end: int, begin_s: float, end_s: float) -> None:
         self._all.put(self.live, self.state)
         self._all_memory.put(self.live, self.memory)
+        self._all_commands.put(self.live, self.commands)
         super().open_window(begin, end, begin_s, end_s)
         self._open(self.live)
 
@@ -156,6 +165,8 @@ class Fleet(Group):
         slots = self._slots(index)
         self.state.put(slots, start_vehicles(self._exact(index, t_s), self.living.take(slots)))
         self.memory.put(slots, Memory.fresh(len(slots)))
+        placed = self.state.take(slots)
+        self.commands.put(slots, VehicleControls(placed.pedal_mps2, placed.steer_rad, placed.speed_mps < 0))
 
     def snapshot(self) -> Snapshot:
         s, o = self.state, self.offset_m[self.live]
@@ -165,11 +176,13 @@ class Fleet(Group):
         accel = np.where(
             (s.speed_mps == 0) & (s.pedal_mps2 < 0), 0.0, s.pedal_mps2 * np.where(s.speed_mps < 0, -1.0, 1.0)
         )
-        return Snapshot(x, y, wrap_angle(s.yaw_rad), s.speed_mps, s.steer_rad, accel)
+        c = self.commands
+        gear = np.where(c.reverse, -1.0, 1.0)
+        return Snapshot(x, y, wrap_angle(s.yaw_rad), s.speed_mps, s.steer_rad, accel, c.pedal_mps2, c.steer_rad, gear)
 
     def _step(self, dt_s: float) -> None:
-        controls, self.memory = follow_vehicles(self.row, self.state, self.memory, self.living, dt_s)
-        self.state = self.simulator.step_vehicles(self.state, controls, self.living, dt_s)
+        self.commands, self.memory = follow_vehicles(self.row, self.state, self.memory, self.living, dt_s)
+        self.state = self.simulator.step_vehicles(self.state, self.commands, self.living, dt_s)
 
 
 class Driven(Fleet):
@@ -180,10 +193,10 @@ class Driven(Fleet):
 
     def _step(self, dt_s: float) -> None:
         c = self.controls
-        commands = VehicleControls(
+        self.commands = VehicleControls(
             np.array([c.accel_mps2], float), np.array([c.steer_rad], float), np.array([c.reverse], bool)
         )
-        self.state = self.simulator.step_vehicles(self.state, commands, self.living, dt_s)
+        self.state = self.simulator.step_vehicles(self.state, self.commands, self.living, dt_s)
 
 
 class Crowd(Group):
@@ -217,7 +230,8 @@ class Crowd(Group):
         s, yaw = self.state, self.row[2]
         speed = s.velocity_x_mps * np.cos(yaw) + s.velocity_y_mps * np.sin(yaw)
         x, y = s.x_m + self.origin_x_m[self.live], s.y_m + self.origin_y_m[self.live]
-        return Snapshot(x, y, wrap_angle(yaw), speed, np.zeros(len(x)), np.full(len(x), np.nan))
+        unknown = np.full(len(x), np.nan)
+        return Snapshot(x, y, wrap_angle(yaw), speed, np.zeros(len(x)), unknown, unknown, unknown, unknown)
 
     def _step(self, dt_s: float) -> None:
         self.state = self.simulator.step_points(self.state, follow_points(self.row, self.state), dt_s)

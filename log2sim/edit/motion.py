@@ -1,0 +1,74 @@
+"""What an edit makes of the waypoints of one agent. Waypoints in, waypoints out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import Array
+from log2sim.scenario import Agent, Waypoints
+
+STANDING_MPS = 0.5  # slower than this a heading says little about a path
+
+
+def later(agent: Agent, seconds: float) -> Waypoints:
+    """Waypoints that are `seconds` later, without what would come before the scenario's start at t = 0.
+
+    Where that cuts between two waypoints, one at t = 0 is put on the line between them. None may be left: (0,) columns.
+    """
+    moved = replace(agent.waypoints, t_s=agent.waypoints.t_s + seconds)
+    first = int(np.searchsorted(moved.t_s, 0.0))
+    kept = _rows(moved, np.arange(first, len(moved)))
+    if first == 0 or first == len(moved) or moved.t_s[first] == 0.0:
+        return kept
+    at_start = agent.at(-seconds)
+    start = {k: getattr(at_start, k) for k in ("x_m", "y_m", "z_m", "yaw_rad", "speed_mps")}
+    start["t_s"] = np.zeros(1)
+    start["sigma_xy_m"] = np.interp([0.0], moved.t_s, moved.sigma_xy_m)
+    columns = {k: np.concatenate([start[k], getattr(kept, k)]) for k in Waypoints.FLOATS}
+    seen = moved.observed[first - 1 : first] & moved.observed[first : first + 1]
+    return Waypoints(**columns, observed=np.concatenate([seen, kept.observed]))
+
+
+def faster(w: Waypoints, factor: float) -> Waypoints:
+    """Waypoints that are passed `factor` times as fast from the first one on: the same places, at other times."""
+    return replace(w, t_s=w.t_s[0] + (w.t_s - w.t_s[0]) / factor, speed_mps=w.speed_mps * factor)
+
+
+def to_the_left(w: Waypoints, meters: float) -> Waypoints:
+    """Waypoints `meters` to the left of their headings, which stay; to the right where negative.
+
+    Notes
+    -----
+    A point fixed to the left of a rigid body moves along the body's heading, `meters` times the yaw rate slower than the
+    body, which is 1 - curvature times `meters` of its speed. So all points of the body, the rear axle among them, drive a
+    parallel curve, and what stands stays turned as it is. `folds` says where no parallel curve exists. The height stays.
+    """
+    yaw = np.unwrap(w.yaw_rad)
+    rate = np.gradient(yaw, w.t_s, edge_order=2 if len(w) > 2 else 1) if len(w) > 1 else np.zeros(len(w))
+    return replace(
+        w,
+        x_m=w.x_m - meters * np.sin(w.yaw_rad),
+        y_m=w.y_m + meters * np.cos(w.yaw_rad),
+        speed_mps=w.speed_mps - meters * rate,
+    )
+
+
+def folds(w: Waypoints, meters: float) -> NDArray[np.bool_]:
+    """Mask (T - 1,) of the steps between waypoints that turn about a point no farther off than the parallel path."""
+    chord, turn = chords(w)
+    moves = np.abs(chord) > STANDING_MPS * np.diff(w.t_s)
+    return moves & (chord * (chord - meters * turn) <= 0)
+
+
+def chords(w: Waypoints) -> tuple[Array, Array]:
+    """Signed way along the mean heading, m, and change of heading, rad, of the steps between waypoints, (T - 1,) each."""
+    yaw = np.unwrap(w.yaw_rad)
+    turn, mean = np.diff(yaw), (yaw[1:] + yaw[:-1]) / 2
+    return np.diff(w.x_m) * np.cos(mean) + np.diff(w.y_m) * np.sin(mean), turn
+
+
+def _rows(w: Waypoints, rows: NDArray[np.intp]) -> Waypoints:
+    return Waypoints(**{k: getattr(w, k)[rows] for k in (*Waypoints.FLOATS, "observed")})

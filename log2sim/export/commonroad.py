@@ -1,0 +1,214 @@
+"""Scenarios of CommonRoad: lanelets under the paths, the agents as obstacles, and the ego's way as planning problem.
+
+Written without CommonRoad's own library: every year's release of it has other modules, all of them pin a protobuf that
+nothing else can be installed with, and its writer cuts decimals off and dates files by the day of writing.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from datetime import UTC, datetime
+from pathlib import Path
+from xml.etree.ElementTree import Element, ElementTree, SubElement, indent
+
+import numpy as np
+
+from log2sim.errors import ScenarioError
+from log2sim.export import Options
+from log2sim.export.lanes import Lane, lanes
+from log2sim.export.sampling import Motion, clock, motion
+from log2sim.geometry import NS_PER_S, Array
+from log2sim.scenario import Agent, Scenario
+from log2sim.types import MapFrame
+
+VERSION = "2020a"
+STEP_S = 0.1
+DECIMALS = 9
+GOAL_S = 1.0  # how far from the recorded time the goal may be reached
+GOAL_LENGTH_M = 6.0
+GOAL_SIDE_M = 1.0
+GOAL_YAW_RAD = 0.35
+GOAL_SPEED_MPS = 3.0
+UNKNOWN_PLACE = ("-999", "999", "999")  # CommonRoad's values for no GeoNames id, latitude and longitude
+
+TYPE_OF_CATEGORY = {
+    "car": "car", "truck": "truck", "bus": "bus", "motorcycle": "motorcycle", "cyclist": "bicycle",
+    "bicycle": "bicycle", "pedestrian": "pedestrian", "other": "unknown",
+}  # fmt: skip
+# Static obstacles have types of their own, without people: who stands is a dynamic obstacle that does not move.
+STATIC_TYPE = dict.fromkeys(("car", "truck", "bus", "motorcycle", "bicycle"), "parkedVehicle") | {"other": "unknown"}
+
+
+class CommonRoad:
+    """`ZAM_<name>-1_1_T-1.xml` of version 2020a, and `agents.csv` with what each of its numbers is in the scenario."""
+
+    options: tuple[str, ...] = ()
+    loses = (
+        "colors, uncertainty and observed flags, times between steps of 0.1 s and before the ego's first, the ego's way "
+        "between start and goal, when parked vehicles were first and last seen, cameras, plan; text ids (in agents.csv)"
+    )
+
+    def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
+        ego, t_s = _ego_and_clock(scenario)
+        name = f"ZAM_{_camel_case(scenario.name)}-1_1_T-1"
+        root = _root(scenario, name)
+        roads = lanes(scenario)
+        for number, lane in enumerate(roads, start=1):
+            root.append(_lanelet(lane, number))
+        first = len(roads) + 1
+        table = [("commonroad_id", "agent", "category", "role"), (first, ego.id, ego.category, "planning problem")]
+        obstacles = []
+        for number, agent in enumerate(scenario.others, start=first + 1):
+            obstacle = _obstacle(agent, number, t_s)
+            obstacles += [obstacle] if obstacle is not None else []
+            role = obstacle.tag if obstacle is not None else "left out: not alive at any step"
+            table.append((number, agent.id, agent.category, role))
+        root.extend(sorted(obstacles, key=lambda o: o.tag != "staticObstacle"))  # the schema wants these first
+        root.append(_planning_problem(ego, first, clock(t_s[0], ego.waypoints.t_s[-1], STEP_S)))
+        indent(root)
+        ElementTree(root).write(folder / f"{name}.xml", encoding="utf-8", xml_declaration=True)
+        with (folder / "agents.csv").open("w", newline="", encoding="utf-8") as opened:
+            csv.writer(opened, lineterminator="\n").writerows(table)
+
+
+def _ego_and_clock(scenario: Scenario) -> tuple[Agent, Array]:
+    """The ego, and all steps from its first waypoint to the last of anybody."""
+    ego = scenario.ego
+    if ego is None:
+        raise ScenarioError(
+            f"scenario '{scenario.name}' has no agent 'ego', whose way is CommonRoad's planning problem; name one so"
+        )
+    start, stop = ego.waypoints.t_s[0], ego.waypoints.t_s[-1]
+    if stop - start < STEP_S:
+        raise ScenarioError(f"agent 'ego': lives {stop - start:g} s, a planning problem needs {STEP_S} s or more")
+    return ego, clock(start, max(a.waypoints.t_s[-1] for a in scenario.agents), STEP_S)
+
+
+def _camel_case(text: str) -> str:
+    """A name of letters and digits only, as benchmark ids need it."""
+    return "".join(word[:1].upper() + word[1:] for word in re.findall("[A-Za-z0-9]+", text))[:50] or "Scenario"
+
+
+def _number(value: float) -> str:
+    """A decimal without exponent, as the schema wants it."""
+    text = f"{value:.{DECIMALS}f}".rstrip("0").rstrip(".")
+    return "0" if text == "-0" else text
+
+
+def _texts(parent: Element, **children: str) -> Element:
+    for tag, text in children.items():
+        SubElement(parent, tag).text = text
+    return parent
+
+
+def _point(parent: Element, xyz: Array) -> None:
+    _texts(SubElement(parent, "point"), **dict(zip("xyz", map(_number, xyz))))
+
+
+def _root(scenario: Scenario, name: str) -> Element:
+    """The document with its head. It is dated by the recording, so that the same scenario gives the same bytes."""
+    root = Element("commonRoad", commonRoadVersion=VERSION, benchmarkID=name, timeStepSize=_number(STEP_S))
+    root.set("date", datetime.fromtimestamp(scenario.t0_ns // NS_PER_S, UTC).date().isoformat())
+    root.attrib |= {"author": "log2sim", "affiliation": "", "source": re.sub(r"[^\x20-\x7e]", "_", scenario.name)}
+    root.append(_location(scenario.map))
+    SubElement(root, "scenarioTags")
+    return root
+
+
+def _location(frame: MapFrame) -> Element:
+    place = dict(zip(("geoNameId", "gpsLatitude", "gpsLongitude"), UNKNOWN_PLACE))
+    if frame.latitude_deg is not None and frame.longitude_deg is not None:
+        place |= {"gpsLatitude": _number(frame.latitude_deg), "gpsLongitude": _number(frame.longitude_deg)}
+    location = _texts(Element("location"), **place)
+    if frame.projection is not None:
+        shift = SubElement(
+            _texts(SubElement(location, "geoTransformation"), geoReference=frame.projection), "additionalTransformation"
+        )
+        x, y, _ = frame.offset_m  # what leads from projected coordinates to those of the file
+        _texts(shift, xTranslation=_number(-x), yTranslation=_number(-y), zRotation="0", scaling="1")
+    return location
+
+
+def _lanelet(lane: Lane, number: int) -> Element:
+    lanelet = Element("lanelet", id=str(number))
+    for tag, bound in zip(("leftBound", "rightBound"), lane.bounds_m):
+        parent = SubElement(lanelet, tag)
+        for point in bound:
+            _point(parent, point)
+    return _texts(lanelet, laneletType="unknown")
+
+
+def _obstacle(agent: Agent, number: int, t_s: Array) -> Element | None:
+    """An agent as obstacle; None for one that is gone before the first step."""
+    if agent.static and agent.category in STATIC_TYPE:
+        obstacle = _texts(Element("staticObstacle", id=str(number)), type=STATIC_TYPE[agent.category])
+        _shape(obstacle, agent)
+        obstacle.append(_state("initialState", motion(agent, agent.waypoints.t_s[:1]), 0, 0))
+        return obstacle
+    move = motion(agent, t_s)
+    if move.valid.sum() < 2:  # an initial state and a trajectory are two steps or more
+        move = motion(agent, t_s, margin_s=STEP_S)
+    steps = np.flatnonzero(move.valid).tolist()
+    if len(steps) < 2:
+        return None
+    obstacle = _texts(Element("dynamicObstacle", id=str(number)), type=TYPE_OF_CATEGORY[agent.category])
+    _shape(obstacle, agent)
+    obstacle.append(_state("initialState", move, steps[0], steps[0]))
+    SubElement(obstacle, "trajectory").extend(_state("state", move, k, k) for k in steps[1:])
+    return obstacle
+
+
+def _shape(obstacle: Element, agent: Agent) -> None:
+    length, width, _ = map(_number, agent.size_m)
+    _texts(SubElement(SubElement(obstacle, "shape"), "rectangle"), length=length, width=width)
+
+
+def _along(vector: Array, yaw_rad: float) -> float:
+    return float(vector[0] * np.cos(yaw_rad) + vector[1] * np.sin(yaw_rad))
+
+
+def _state(tag: str, move: Motion, k: int, step: int) -> Element:
+    """The state at index k of a motion; speed and acceleration are along the heading."""
+    yaw = float(move.yaw_rad[k])
+    state = Element(tag)
+    _point(SubElement(state, "position"), move.position_m[k, :2])
+    exact = {
+        "orientation": _number(yaw),
+        "time": str(step),
+        "velocity": _number(_along(move.velocity_mps[k], yaw)),
+        "acceleration": _number(_along(move.acceleration_mps2[k], yaw)),
+    }
+    for key, value in exact.items():
+        _texts(SubElement(state, key), exact=value)
+    return state
+
+
+def _planning_problem(ego: Agent, number: int, t_s: Array) -> Element:
+    """Drive from where the ego was first to where it was last, about when it was there."""
+    move, last, spare = motion(ego, t_s), len(t_s) - 1, round(GOAL_S / STEP_S)
+    problem = Element("planningProblem", id=str(number))
+    initial = _state("initialState", move, 0, 0)
+    for key in ("yawRate", "slipAngle"):
+        _texts(SubElement(initial, key), exact="0")
+    problem.append(initial)
+    yaw = float(move.yaw_rad[last])
+    speed = _along(move.velocity_mps[last], yaw)
+    goal = SubElement(problem, "goalState")
+    area = SubElement(SubElement(goal, "position"), "rectangle")
+    _texts(
+        area, length=_number(GOAL_LENGTH_M), width=_number(ego.size_m[1] + 2 * GOAL_SIDE_M), orientation=_number(yaw)
+    )
+    x, y, _ = map(_number, move.position_m[last])
+    _texts(SubElement(area, "center"), x=x, y=y)
+    _interval(goal, "orientation", yaw, GOAL_YAW_RAD)
+    _interval(goal, "velocity", speed, GOAL_SPEED_MPS)
+    _texts(SubElement(goal, "time"), intervalStart=str(max(0, last - spare)), intervalEnd=str(last + spare))
+    return problem
+
+
+def _interval(parent: Element, tag: str, middle: float, reach: float) -> None:
+    _texts(SubElement(parent, tag), intervalStart=_number(middle - reach), intervalEnd=_number(middle + reach))
+
+
+EXPORTER = CommonRoad()

@@ -1,0 +1,135 @@
+"""OpenDRIVE 1.7: the roads of a scenario as a file, or the user's own file in their place."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from log2sim.errors import ConfigError
+from log2sim.export.placement import Placement, near_origin, on_map
+from log2sim.export.road_checks import require_roads
+from log2sim.export.roads import Road, roads_of
+from log2sim.export.xml_text import element, escaped, number, read, require_number, write
+from log2sim.scenario import Scenario
+from log2sim.types import MapFrame
+
+FILE_NAME = "road.xodr"
+# Positions to 10 nm and angles to 1e-12 rad: pieces that follow each other leave no gap that a checker sees.
+LENGTH_DIGITS, ANGLE_DIGITS, CUBIC_DIGITS = 8, 12, 12
+
+
+def add_road_file(scenario: Scenario, folder: Path, map_path: Path | None) -> tuple[str, Placement]:
+    """Write the road of a scenario into a folder, or a copy of the user's; returns its name and where agents are on it.
+
+    Raises
+    ------
+    ScenarioError
+        When the user's file is no OpenDRIVE file that players can use.
+    ConfigError
+        When its coordinates cannot be brought together with the scenario's.
+    """
+    if map_path is None:
+        placement = near_origin(scenario)
+        root = document(scenario, placement)
+        require_roads(root, FILE_NAME)
+        write(root, folder / FILE_NAME)
+        return FILE_NAME, placement
+    root = read(map_path)
+    require_roads(root, str(map_path))
+    shutil.copyfile(map_path, folder / FILE_NAME)
+    return FILE_NAME, _placement_on(root, scenario, map_path)
+
+
+def _placement_on(root: Element, scenario: Scenario, map_path: Path) -> Placement:
+    offset, turned = root.find("header/offset"), "0"
+    values = [0.0, 0.0, 0.0]
+    if offset is not None:
+        turned = offset.get("hdg", "0")
+        values = [require_number(offset.get(key, "0"), f"{map_path}: offset {key}") for key in "xyz"]
+    if require_number(turned, f"{map_path}: offset hdg") != 0:
+        raise ConfigError(
+            f"--map {map_path}: its offset turns the map (hdg={turned[:20]}), which is not supported; use one with hdg=0"
+        )
+    x, y, z = values
+    return on_map(scenario.map, (root.findtext("header/geoReference") or "").strip() or None, (x, y, z))
+
+
+def document(scenario: Scenario, placement: Placement) -> Element:
+    """The OpenDRIVE document of a scenario's roads, about the same origin as the agents."""
+    x0, y0, _ = placement.origin_m
+    roads = roads_of(scenario)
+    ends = np.concatenate([r.line.at(np.linspace(0.0, r.line.length_m, 50))[:, :2] for r in roads]) - [x0, y0]
+    (west, south), (east, north) = ends.min(axis=0), ends.max(axis=0)
+    root = element("OpenDRIVE")
+    header = element(
+        "header", root, revMajor="1", revMinor="7", name=escaped(scenario.name), version="1", vendor="log2sim",
+        north=number(north), south=number(south), east=number(east), west=number(west),
+    )  # fmt: skip
+    _add_place(header, scenario.map, placement)
+    for k, road in enumerate(roads):
+        _add_road(root, road, k + 1, placement)
+    return root
+
+
+def _add_place(header: Element, frame: MapFrame, placement: Placement) -> None:
+    """Where on Earth: projected coordinates are those of the file plus its offset."""
+    if frame.projection is not None:
+        element("geoReference", header).text = frame.projection
+    x, y, z = (float(a + b) for a, b in zip(frame.offset_m, placement.origin_m))
+    if (x, y, z) != (0.0, 0.0, 0.0):
+        element("offset", header, x=number(x), y=number(y), z=number(z), hdg="0")
+
+
+def _add_road(root: Element, road: Road, road_id: int, placement: Placement) -> None:
+    x0, y0, z0 = placement.origin_m
+    parent = element(
+        "road", root, name=escaped(road.name), length=number(road.line.length_m, LENGTH_DIGITS), id=str(road_id), junction="-1", rule="RHT"
+    )  # fmt: skip
+    plan = element("planView", parent)
+    for piece in road.line.pieces:
+        geometry = element(
+            "geometry", plan, s=number(piece.s_m, LENGTH_DIGITS), x=number(piece.x_m - x0, LENGTH_DIGITS),
+            y=number(piece.y_m - y0, LENGTH_DIGITS), hdg=number(piece.heading_rad, ANGLE_DIGITS), length=number(piece.length_m, LENGTH_DIGITS),
+        )  # fmt: skip
+        if piece.curvature_1pm == 0:
+            element("line", geometry)
+        else:
+            element("arc", geometry, curvature=number(piece.curvature_1pm, ANGLE_DIGITS))
+    profile = element("elevationProfile", parent)
+    for s, a, *rest in road.elevation:
+        _add_cubic(profile, "elevation", "s", s, [a - z0, *rest])
+    element("lateralProfile", parent)
+    _add_lanes(parent, road)
+
+
+def _add_lanes(parent: Element, road: Road) -> None:
+    """Lane -1 in the middle of the reference line, one lane on either side of it where the road has them."""
+    lanes = element("lanes", parent)
+    _add_cubic(lanes, "laneOffset", "s", 0.0, [road.lane_m / 2, 0.0, 0.0, 0.0])
+    section = element("laneSection", lanes, s="0")
+    if road.left_m > 0:
+        _add_lane(element("left", section), 1, road.left_m, "solid")
+    middle = element("lane", element("center", section), id="0", type="none", level="false")
+    _add_mark(middle, "broken" if road.left_m > 0 else "solid")
+    right = element("right", section)
+    _add_lane(right, -1, road.lane_m, "broken" if road.right_m > 0 else "solid")
+    if road.right_m > 0:
+        _add_lane(right, -2, road.right_m, "solid")
+
+
+def _add_lane(parent: Element, lane_id: int, width_m: float, mark: str) -> None:
+    lane = element("lane", parent, id=str(lane_id), type="driving", level="false")
+    _add_cubic(lane, "width", "sOffset", 0.0, [width_m, 0.0, 0.0, 0.0])
+    _add_mark(lane, mark)
+
+
+def _add_mark(lane: Element, kind: str) -> None:
+    element("roadMark", lane, sOffset="0", type=kind, weight="standard", color="white", width="0.12")
+
+
+def _add_cubic(parent: Element, tag: str, station: str, s: float, coefficients: list[float]) -> None:
+    values = {name: number(float(v), CUBIC_DIGITS) for name, v in zip("abcd", coefficients)}
+    element(tag, parent, **{station: number(float(s), LENGTH_DIGITS)}, **values)

@@ -1,0 +1,91 @@
+"""OpenSCENARIO XML 1.0, 1.1 and 1.2 with the OpenDRIVE road under it."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+from log2sim.errors import ConfigError
+from log2sim.export import Options
+from log2sim.export.opendrive import add_road_file
+from log2sim.export.openscenario_entities import add_entity
+from log2sim.export.openscenario_story import Revision, add_storyboard, part_of
+from log2sim.export.placement import Placement
+from log2sim.export.xml_text import element, escaped, number, unique_names, write
+from log2sim.scenario import Scenario
+
+REVISIONS = {"1.0": Revision(0), "1.1": Revision(1), "1.2": Revision(2)}
+NEWEST = "1.2"
+
+
+class OpenScenario:
+    """`scenario.xosc` and the road that it names."""
+
+    options: tuple[str, ...] = ("revision", "map")
+    loses = (
+        "cameras, quality, plan and provenance; a cyclist and a bicycle are both bicycles and what is 'other' a van,"
+        " except to `log2sim import`; to ScenarioRunner sizes and axles too"
+    )
+
+    def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
+        revision = REVISIONS.get(options.revision or NEWEST)
+        if revision is None:
+            known = ", ".join(REVISIONS)
+            raise ConfigError(f"--revision {options.revision}: OpenSCENARIO XML is written as one of {known}")
+        road, placement = add_road_file(scenario, folder, options.map)
+        write(document(scenario, road, placement, revision), folder / "scenario.xosc")
+
+
+EXPORTER = OpenScenario()
+
+
+def document(scenario: Scenario, road: str, placement: Placement, revision: Revision) -> Element:
+    """The document of a scenario whose road lies in the file `road` beside it."""
+    names = unique_names(a.id for a in scenario.agents)
+    duration_s = max(scenario.duration_s, *(float(a.waypoints.t_s[-1]) for a in scenario.agents))
+    parts = [part_of(a, name, duration_s, placement) for a, name in zip(scenario.agents, names)]
+    root = element("OpenSCENARIO")
+    element(
+        "FileHeader", root,
+        revMajor="1", revMinor=str(revision.minor), date=_date(scenario.t0_ns), author="log2sim", description=_title(scenario.name),
+    )  # fmt: skip
+    _add_parameters(root, scenario, placement)
+    element("CatalogLocations", root)
+    element("LogicFile", element("RoadNetwork", root), filepath=road)
+    entities = element("Entities", root)
+    for agent, name in zip(scenario.agents, names):
+        add_entity(entities, agent, name, revision.minor)
+    add_storyboard(root, parts, duration_s, revision)
+    return root
+
+
+def _add_parameters(root: Element, scenario: Scenario, placement: Placement) -> None:
+    """What an import needs of the scenario as a whole; 1.0 and 1.1 have no properties that belong to no agent."""
+    values = {
+        "log2sim_name": escaped(scenario.name),
+        "log2sim_t0_ns": str(scenario.t0_ns),
+        "log2sim_duration_s": number(scenario.duration_s, 9),
+        "log2sim_map": escaped(json.dumps(vars(scenario.map))),
+        "log2sim_origin_m": " ".join(number(v) for v in placement.origin_m),
+    }
+    if placement.target is not None:
+        values["log2sim_projection"] = escaped(placement.target)
+    parameters = element("ParameterDeclarations", root)
+    for name, value in values.items():
+        element("ParameterDeclaration", parameters, name=name, parameterType="string", value=value)
+
+
+def _date(t0_ns: int) -> str:
+    """When the log began: the file's date too, so that the same scenario gives the same file."""
+    try:
+        moment = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=t0_ns // 1_000_000_000)
+    except OverflowError:
+        moment = datetime(1970, 1, 1, tzinfo=UTC)
+    return moment.replace(tzinfo=None).isoformat(timespec="seconds")
+
+
+def _title(name: str) -> str:
+    """The scenario's name, made harmless: at its start "CARLA:" would switch ScenarioRunner to left-handed axes."""
+    return f"log2sim: {escaped(name)}"

@@ -1,0 +1,279 @@
+"""A scenario out of an OpenSCENARIO file: all that an export wrote, or the trajectories of anyone else's file."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from log2sim.errors import ConfigError, LogError, ScenarioError
+from log2sim.export.openscenario_entities import KINDS, PREFIX
+from log2sim.export.placement import Placement
+from log2sim.export.xml_text import read, require_number, unescaped
+from log2sim.geometry import Array, wrap_angle
+from log2sim.scenario import VERSION, Scenario
+from log2sim.types import MapFrame
+
+CATEGORY_OF = {kind.category: category for category, kind in reversed(list(KINDS.items()))} | {
+    "van": "car", "semitrailer": "truck", "trailer": "other", "tram": "other", "train": "other",
+}  # fmt: skip
+EGO_NAMES = ("ego", "hero")
+VERTEX_LIMIT = 10_000_000
+
+
+def load(path: Path | str) -> Scenario:
+    """Read an OpenSCENARIO XML file of revision 1.0 to 1.3.
+
+    Raises
+    ------
+    ScenarioError
+        When the file is no such file, or moves its entities in another way than by trajectories with times; names the
+        entity and what was found.
+    """
+    path = Path(path)
+    root = read(path)
+    try:
+        return _scenario(root, path)
+    except (LogError, ConfigError) as error:
+        raise ScenarioError(f"{path}: {error}") from None
+
+
+def _scenario(root: Element, path: Path) -> Scenario:
+    if root.tag != "OpenSCENARIO" or root.find("Entities") is None or root.find("Storyboard") is None:
+        raise ScenarioError(
+            f"its root is <{root.tag[:40]}>, expected <OpenSCENARIO> with <Entities> and a <Storyboard>"
+        )
+    parameters = {
+        p.get("name", ""): p.get("value", "") for p in root.iterfind("ParameterDeclarations/ParameterDeclaration")
+    }
+    _resolve(root, parameters)
+    frame = _map(parameters.get("log2sim_map"))
+    placement = _placement(parameters, frame)
+    vertices = _vertices(root)
+    last_s = max((rows[-1, 0] for rows in vertices.values()), default=0.0)
+    agents = [
+        _agent(o, vertices.get(o.get("name", "")), root, last_s, placement)
+        for o in root.iterfind("Entities/ScenarioObject")
+    ]
+    header = root.find("FileHeader")
+    title = header.get("description", "") if header is not None else ""
+    return Scenario.from_dict(
+        {
+            "scenario_version": VERSION,
+            "name": unescaped(parameters["log2sim_name"]) if "log2sim_name" in parameters else title or path.stem,
+            "t0_ns": _whole(parameters.get("log2sim_t0_ns", "0")),
+            "duration_s": require_number(
+                parameters.get("log2sim_duration_s", str(last_s)), "parameter log2sim_duration_s"
+            ),
+            "map": {**vars(frame), "offset_m": list(frame.offset_m)},
+            "agents": agents,
+            "cameras": [],
+            "plan": [],
+            "provenance": {"imported_from": path.name},
+        }
+    )
+
+
+def _resolve(root: Element, parameters: Mapping[str, str]) -> None:
+    """Put the values of parameters where attributes name them."""
+    for node in root.iter():
+        for key, value in node.attrib.items():
+            if value.startswith("$"):
+                if value[1:] not in parameters:
+                    raise ScenarioError(
+                        f"<{node.tag}> {key}: {value[:40]!r} is no parameter of the file, expected one or a value"
+                    )
+                node.set(key, parameters[value[1:]])
+
+
+def _whole(text: str) -> int:
+    if not re.fullmatch(r"-?[0-9]{1,19}", text):
+        raise ScenarioError(f"parameter log2sim_t0_ns is {text[:40]!r}, expected nanoseconds")
+    return int(text)
+
+
+def _map(text: str | None) -> MapFrame:
+    if text is None:
+        return MapFrame()
+    try:
+        entries = json.loads(unescaped(text))
+        frame = MapFrame(**{**entries, "offset_m": tuple(float(v) for v in entries["offset_m"])})
+    except (ValueError, TypeError, KeyError, RecursionError):
+        raise ScenarioError(f"parameter log2sim_map is {text[:60]!r}, expected the map that an export writes") from None
+    if len(frame.offset_m) != 3:
+        raise ScenarioError("parameter log2sim_map: offset_m, expected three numbers")
+    return frame
+
+
+def _placement(parameters: Mapping[str, str], frame: MapFrame) -> Placement:
+    origin = [
+        require_number(v, "parameter log2sim_origin_m") for v in parameters.get("log2sim_origin_m", "0 0 0").split()
+    ]
+    if len(origin) != 3:
+        raise ScenarioError("parameter log2sim_origin_m: expected three numbers")
+    target = parameters.get("log2sim_projection")
+    return Placement(
+        (origin[0], origin[1], origin[2]),
+        frame.offset_m,
+        frame.projection,
+        None if target is None else unescaped(target),
+    )
+
+
+def _vertices(root: Element) -> dict[str, Array]:
+    """By entity the vertices (V, 5) t, x, y, z, heading of all its trajectories."""
+    found: dict[str, list[Array]] = {}
+    for group in root.iter("ManeuverGroup"):
+        names = [ref.get("entityRef", "") for ref in group.iterfind("Actors/EntityRef")]
+        for follow in group.iter("FollowTrajectoryAction"):
+            for name in names:
+                found.setdefault(name, []).append(_polyline(follow, f"entity '{name[:100]}'"))
+    return {name: np.concatenate(parts) for name, parts in found.items()}
+
+
+def _polyline(follow: Element, where: str) -> Array:
+    timing = follow.find("TimeReference/Timing")
+    if timing is None or timing.get("domainAbsoluteRelative") != "absolute":
+        raise ScenarioError(
+            f"{where}: its trajectory has no <Timing> with an absolute domain; without it nothing has a time"
+        )
+    nodes = list(follow.iter("Vertex"))
+    if not nodes or len(nodes) > VERTEX_LIMIT:
+        raise ScenarioError(
+            f"{where}: its trajectory has {len(nodes)} vertices of a polyline, expected 1 to {VERTEX_LIMIT}"
+        )
+    scale, offset = (require_number(timing.get(key), f"{where}: Timing {key}") for key in ("scale", "offset"))
+    rows = np.array([[require_number(n.get("time"), f"{where}: Vertex time"), *_pose(n, where)] for n in nodes])
+    rows[:, 0] = offset + scale * rows[:, 0]
+    return _headed(rows)
+
+
+def _headed(rows: Array) -> Array:
+    """Vertices (V, 5) with the direction of travel where no heading is written: nobody means 0 by leaving it out."""
+    absent = np.isnan(rows[:, 4])
+    steps = np.diff(rows[:, 1:3], axis=0)
+    moving = np.flatnonzero(np.hypot(*steps.T) > 0)
+    if absent.any():
+        travel = np.zeros(len(rows))
+        if len(moving):
+            last = moving[np.clip(np.searchsorted(moving, np.arange(len(rows)), side="right") - 1, 0, None)]
+            travel = np.arctan2(steps[last, 1], steps[last, 0])
+        rows[absent, 4] = travel[absent]
+    return rows
+
+
+def _pose(node: Element, where: str) -> list[float]:
+    """x, y, z, heading of the `WorldPosition` within an element; NaN for a heading that is not written."""
+    world = node.find("Position/WorldPosition")
+    if world is None:
+        raise ScenarioError(f"{where}: a position that is no <WorldPosition>; only those can be read without the road")
+    x, y, z = (
+        require_number(world.get(key, "0" if key == "z" else None), f"{where}: WorldPosition {key}") for key in "xyz"
+    )
+    heading = world.get("h")
+    return [x, y, z, float("nan") if heading is None else require_number(heading, f"{where}: WorldPosition h")]
+
+
+def _agent(node: Element, vertices: Array | None, root: Element, last_s: float, placement: Placement) -> dict[str, Any]:
+    """The document of one agent."""
+    name = node.get("name", "")
+    where = f"entity '{name[:100]}'"
+    body = next((b for b in (node.find(tag) for tag in ("Vehicle", "Pedestrian", "MiscObject")) if b is not None), None)
+    box = body.find("BoundingBox") if body is not None else None
+    center, size = (box.find("Center"), box.find("Dimensions")) if box is not None else (None, None)
+    if body is None or center is None or size is None:
+        raise ScenarioError(f"{where}: no <BoundingBox> in the file; entities out of catalogs are not read")
+    properties = {p.get("name", ""): p.get("value", "") for p in body.iterfind("Properties/Property")}
+    size_m = {key: require_number(size.get(key), f"{where}: Dimensions {key}") for key in ("length", "width", "height")}
+    offset_m = require_number(center.get("x"), f"{where}: Center x")
+    height_m = require_number(center.get("z"), f"{where}: Center z")
+    if vertices is None:
+        vertices = _standing(root, name, where, last_s)
+    return {
+        "id": unescaped(properties[PREFIX + "id"]) if PREFIX + "id" in properties else _identity(name, properties),
+        "category": properties.get(PREFIX + "category") or _category(body),
+        "size_m": size_m,
+        "color": _color(properties, where),
+        "static": properties.get(PREFIX + "static", str(not np.ptp(vertices[:, 1:], axis=0).any()).lower()) == "true",
+        "rear_axle_offset_m": offset_m,
+        "confidence": require_number(properties.get(PREFIX + "confidence", "1"), f"{where}: property confidence"),
+        "quality": {},
+        "waypoints": _waypoints(vertices, properties, placement, (offset_m, height_m), where),
+    }  # fmt: skip
+
+
+def _standing(root: Element, name: str, where: str, last_s: float) -> Array:
+    """Vertices (2, 5) of an entity that stands where the file puts it at first."""
+    for private in root.iterfind("Storyboard/Init/Actions/Private"):
+        teleport = private.find("PrivateAction/TeleportAction") if private.get("entityRef") == name else None
+        if teleport is not None:
+            pose = _pose(teleport, where)
+            return np.nan_to_num(np.array([[0.0, *pose], [max(last_s, 1e-3), *pose]]))
+    raise ScenarioError(f"{where}: has neither a trajectory nor a position at the start; nothing says where it is")
+
+
+def _identity(name: str, properties: Mapping[str, str]) -> str:
+    return "ego" if properties.get("type") == "ego_vehicle" or name.lower() in EGO_NAMES else name
+
+
+def _category(body: Element) -> str:
+    if body.tag == "Vehicle":
+        return CATEGORY_OF.get(body.get("vehicleCategory", ""), "other")
+    return "pedestrian" if body.tag == "Pedestrian" and body.get("pedestrianCategory") != "animal" else "other"
+
+
+def _color(properties: Mapping[str, str], where: str) -> Mapping[str, Any] | None:
+    text = properties.get("color")
+    if text is None:
+        return None
+    if not re.fullmatch(r"\s*[0-9]{1,3}\s*,\s*[0-9]{1,3}\s*,\s*[0-9]{1,3}\s*", text):
+        raise ScenarioError(f"{where}: property color is {text[:40]!r}, expected three whole numbers such as 200,30,30")
+    return {"rgb": [int(v) for v in text.split(",")], "name": unescaped(properties.get(PREFIX + "color_name", ""))}
+
+
+def _waypoints(
+    vertices: Array, properties: Mapping[str, str], placement: Placement, center_m: tuple[float, float], where: str
+) -> Mapping[str, Any]:
+    """Columns of waypoints of the box center, which is so far ahead of and above the vertices.
+
+    Speeds are those exported, or those along the vertices if somebody added or took some.
+    """
+    speeds = _column(properties, "speed_mps", where)
+    if speeds is not None and len(speeds) == 1:
+        vertices = vertices[:1]
+    exported = speeds is not None and len(speeds) == len(vertices)
+    sigma = _column(properties, "sigma_xy_m", where) if exported else None
+    observed = properties.get(PREFIX + "observed", "") if exported else ""
+    t, x, y, z, heading = vertices.T
+    ahead_m, above_m = center_m
+    centers = np.column_stack([x + ahead_m * np.cos(heading), y + ahead_m * np.sin(heading), z + above_m, heading])
+    columns = dict(zip(("x_m", "y_m", "z_m", "yaw_rad"), placement.back(centers).T))
+    columns |= {"t_s": t, "speed_mps": speeds if exported else _speed(vertices)}
+    columns["sigma_xy_m"] = sigma if sigma is not None and len(sigma) == len(t) else np.zeros(len(t))
+    columns["yaw_rad"] = wrap_angle(columns["yaw_rad"])
+    return {
+        **{key: values.tolist() for key, values in columns.items()},
+        "observed": [mark == "1" for mark in observed] if len(observed) == len(t) else [True] * len(t),
+    }
+
+
+def _column(properties: Mapping[str, str], name: str, where: str) -> Array | None:
+    text = properties.get(PREFIX + name)
+    return (
+        None
+        if text is None
+        else np.array([require_number(v, f"{where}: property {PREFIX}{name}") for v in text.split()])
+    )
+
+
+def _speed(vertices: Array) -> Array:
+    """Speed (V,) along the heading from the way between vertices (V, 5)."""
+    t, x, y, _, heading = vertices.T
+    if len(t) < 2 or np.any(np.diff(t) <= 0):
+        return np.zeros(len(t))
+    return np.gradient(x, t) * np.cos(heading) + np.gradient(y, t) * np.sin(heading)

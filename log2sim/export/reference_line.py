@@ -1,0 +1,194 @@
+"""A path as the reference line of a road: lines and arcs that join without a kink and stay within 1 cm of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from log2sim.geometry import Array
+
+# The smoothing spline stays this near the path, and the arcs as near the spline: together below TOLERANCE_M.
+TOLERANCE_M, SPLINE_M, ARCS_M = 0.01, 0.006, 0.002
+# Points of a path nearer than this are one; between those further apart than this the line from one to the next counts.
+LEAST_STEP_M, LARGEST_STEP_M = 0.01, 0.5
+SAMPLE_M = 0.1
+# An arc whose middle is nearer its chord than this is written as a line.
+FLAT_M = 1e-6
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A line (curvature 0) or an arc from `s_m` on: start, heading, length, curvature (positive to the left)."""
+
+    s_m: float
+    x_m: float
+    y_m: float
+    heading_rad: float
+    length_m: float
+    curvature_1pm: float
+
+    def at(self, along_m: Array) -> Array:
+        """Points (N, 3) x, y, heading at distances (N,) from the piece's start."""
+        turned = self.curvature_1pm * along_m
+        chord = along_m * np.sinc(turned / (2 * np.pi))
+        direction = self.heading_rad + turned / 2
+        return np.column_stack(
+            [self.x_m + chord * np.cos(direction), self.y_m + chord * np.sin(direction), self.heading_rad + turned]
+        )
+
+    @property
+    def end(self) -> Array:
+        """x, y, heading (3,) where the piece ends."""
+        return self.at(np.array([self.length_m]))[0]
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceLine:
+    """Pieces in order of `s_m`, the first at 0, each beginning where the one before ends."""
+
+    pieces: tuple[Piece, ...]
+
+    @property
+    def length_m(self) -> float:
+        return self.pieces[-1].s_m + self.pieces[-1].length_m
+
+    def at(self, s_m: Array) -> Array:
+        """Points (N, 3) x, y, heading at stations (N,)."""
+        starts = np.array([p.s_m for p in self.pieces])
+        index = np.clip(np.searchsorted(starts, s_m, side="right") - 1, 0, len(starts) - 1)
+        out = np.empty((len(s_m), 3))
+        for k in np.unique(index):
+            out[index == k] = self.pieces[k].at(s_m[index == k] - starts[k])
+        return out
+
+    def extended(self, before_m: float, after_m: float) -> ReferenceLine:
+        """The same with straight lines before and after it, stations counted from the new start."""
+        first, (x, y, heading) = self.pieces[0], self.pieces[-1].end
+        back = first.heading_rad
+        start = (first.x_m - before_m * np.cos(back), first.y_m - before_m * np.sin(back))
+        steps = [(*start, back, before_m, 0.0)]
+        steps += [(p.x_m, p.y_m, p.heading_rad, p.length_m, p.curvature_1pm) for p in self.pieces]
+        steps += [(x, y, heading, after_m, 0.0)]
+        return chained(steps)
+
+
+def chained(steps: Sequence[tuple[float, float, float, float, float]]) -> ReferenceLine:
+    """Pieces (x, y, heading, length, curvature) one after the other; lines that go straight on become one."""
+    pieces: list[Piece] = []
+    for x, y, heading, length, curvature in steps:
+        if length <= 0:
+            continue
+        if pieces and curvature == 0 == pieces[-1].curvature_1pm and abs(heading - pieces[-1].heading_rad) < 1e-9:
+            last = pieces.pop()
+            x, y, heading, length = last.x_m, last.y_m, last.heading_rad, last.length_m + length
+        s = pieces[-1].s_m + pieces[-1].length_m if pieces else 0.0
+        pieces.append(Piece(s, float(x), float(y), float(heading), float(length), float(curvature)))
+    return ReferenceLine(tuple(pieces))
+
+
+def straight(x_m: float, y_m: float, heading_rad: float, length_m: float) -> ReferenceLine:
+    """A straight line of a length whose middle is at x, y."""
+    half = length_m / 2
+    start = (x_m - half * np.cos(heading_rad), y_m - half * np.sin(heading_rad))
+    return chained([(*start, heading_rad, length_m, 0.0)])
+
+
+def fit(xy_m: Array) -> tuple[ReferenceLine, Array]:
+    """Lines and arcs along points (N, 2), at least two and each further on than the one before.
+
+    Returns
+    -------
+    line : ReferenceLine
+    s_m : (N,) float64
+        Stations of the points.
+
+    Notes
+    -----
+    A smoothing spline takes the millimeters out of which curvature would be made; then the longest pair of arcs that
+    departs less than `ARCS_M` from it replaces each stretch of it, tangents equal where they join (biarcs: Bolton 1975).
+    Cost: a banded least-squares problem per spline, and O(N log N) for the arcs.
+    """
+    samples, sample_of_point = _spline(xy_m)
+    ends = _longest_biarcs(samples)
+    steps, stations = [], np.zeros(len(samples))
+    s = 0.0
+    for i, j in pairwise(ends):
+        pair = _biarc(samples[i], samples[j])
+        steps += pair
+        length = sum(step[3] for step in pair)
+        travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(samples[i : j + 1, :2], axis=0).T))])
+        stations[i : j + 1] = s + travelled / travelled[-1] * length
+        s += length
+    return chained(steps), np.interp(sample_of_point, np.arange(len(samples)), stations)
+
+
+def _spline(xy_m: Array) -> tuple[Array, Array]:
+    """Samples (M, 3) x, y, heading of a smooth curve within `SPLINE_M` of points (N, 2), and where those lie among them."""
+    from scipy.interpolate import splev, splprep
+
+    steps = np.hypot(*np.diff(xy_m, axis=0).T)
+    travelled = np.concatenate([[0.0], np.cumsum(steps)])
+    parts = np.maximum(np.ceil(steps / LARGEST_STEP_M).astype(int), 1)
+    u = np.concatenate([a + np.arange(n) / n * d for a, n, d in zip(travelled, parts, steps)] + [travelled[-1:]])
+    dense = np.column_stack([np.interp(u, travelled, xy_m[:, k]) for k in (0, 1)])
+    at = np.linspace(0.0, travelled[-1], max(int(np.ceil(travelled[-1] / SAMPLE_M)), 2) + 1)
+    for sigma_m in (SPLINE_M / 2, SPLINE_M / 4, SPLINE_M / 8, 0.0):
+        tck, _ = splprep(dense.T, u=u, k=min(3, len(u) - 1), s=len(u) * sigma_m**2)
+        if np.hypot(*(np.array(splev(u, tck)) - dense.T)).max() <= SPLINE_M:
+            break
+    (x, y), (dx, dy) = splev(at, tck), splev(at, tck, der=1)
+    heading = np.unwrap(np.arctan2(dy, dx))
+    return np.column_stack([x, y, heading]), travelled / travelled[-1] * (len(at) - 1)
+
+
+def _longest_biarcs(samples: Array) -> list[int]:
+    """Indices of the samples (M, 3) between which biarcs stay within `ARCS_M`; each step doubles, then halves."""
+    ends, last = [0], len(samples) - 1
+    while ends[-1] < last:
+        start, reach, step = ends[-1], 1, 1
+        while step and start + reach < last:
+            end = min(start + reach + step, last)
+            if _departure(samples[start : end + 1]) <= ARCS_M:
+                reach, step = end - start, 2 * step
+            else:
+                step //= 2
+        ends.append(start + reach)
+    return ends
+
+
+def _departure(samples: Array) -> float:
+    """How far the biarc from the first to the last of samples (M, 3) passes from those between."""
+    line = chained(_biarc(samples[0], samples[-1]))
+    if abs(samples[-1, 2] - samples[0, 2]) > np.pi / 2 or line.length_m == 0:
+        return np.inf
+    travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(samples[:, :2], axis=0).T))])
+    x, y, heading = line.at(travelled / travelled[-1] * line.length_m).T
+    across = -np.sin(heading) * (samples[:, 0] - x) + np.cos(heading) * (samples[:, 1] - y)
+    return float(np.abs(across).max())
+
+
+def _biarc(start: Array, end: Array) -> list[tuple[float, float, float, float, float]]:
+    """Two arcs (x, y, heading, length, curvature) from one x, y, heading (3,) to another, with equal tangent lengths."""
+    p, q = start[:2], end[:2]
+    t, v = (np.array([np.cos(h), np.sin(h)]) for h in (start[2], end[2]))
+    chord, spread = q - p, 2 * (1 - float(t @ v))
+    along = float(chord @ (t + v))
+    # d**2 * spread + 2 * d * along = |chord|**2, in the form that does not cancel when the headings are nearly equal.
+    d = float(chord @ chord) / (along + np.sqrt(along**2 + spread * float(chord @ chord)))
+    middle = (p + q + d * (t - v)) / 2
+    first = _arc(p, start[2], middle)
+    return [first, _arc(middle, first[2] + first[3] * first[4], q)]
+
+
+def _arc(start: Array, heading: float, end: Array) -> tuple[float, float, float, float, float]:
+    chord = end - start
+    distance = float(np.hypot(*chord))
+    off = float(
+        np.arctan2(np.cos(heading) * chord[1] - np.sin(heading) * chord[0], chord @ [np.cos(heading), np.sin(heading)])
+    )
+    if distance * abs(off) / 4 < FLAT_M:
+        return float(start[0]), float(start[1]), heading, distance, 0.0
+    return float(start[0]), float(start[1]), heading, distance * off / np.sin(off), 2 * np.sin(off) / distance

@@ -1,0 +1,196 @@
+"""Which roads a scenario needs: one along the ego's path, and one wherever another vehicle leaves those that there are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.export.reference_line import LEAST_STEP_M, TOLERANCE_M, ReferenceLine, fit, straight
+from log2sim.geometry import Array, wrap_angle
+from log2sim.scenario import Agent, Scenario
+
+LANE_M = 3.5
+# Free space beside the vehicle that a lane is made for, both sides together.
+SPARE_M = 0.8
+# Roads go on for this long before and after the path, so that the whole vehicle stands on them.
+BEYOND_M = 10.0
+# Moving back less than this is a vehicle that settles; more begins a new way.
+REVERSAL_M = 0.25
+# A vehicle that moves less has no way of its own; ways that leave the roads for less are on them.
+SHORTEST_WAY_M = 2.0
+SHORTEST_LINE_M = 0.1
+# Gaps between two stretches off the roads that become one, and how far a road reaches back onto those it leaves.
+JOIN_M = 10.0
+# Along a road, not across it.
+ALONG_RAD = np.deg2rad(30.0)
+PROBE_M = 0.25
+# Heights are averaged over this length: the ego's are surveyed, those of others measured from afar.
+EGO_LEVEL_M, LEVEL_M = 1.0, 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class Road:
+    """A road whose lane -1 lies in the middle of the reference line.
+
+    `lane_m` is the width of lane -1, `left_m` and `right_m` the width of a lane beside it, 0 for none; `elevation` (K, 5)
+    stations and coefficients a, b, c, d of cubics.
+    """
+
+    name: str
+    line: ReferenceLine
+    elevation: Array
+    lane_m: float
+    left_m: float = 0.0
+    right_m: float = 0.0
+
+    def holds(self, points: Array, aside_m: float | None = None) -> NDArray[np.bool_]:
+        """Whether points (N, 3) x, y, heading lie along the road, on its lanes or within `aside_m` of its line."""
+        from scipy.spatial import cKDTree
+
+        stations = np.linspace(0.0, self.line.length_m, max(int(self.line.length_m / PROBE_M), 1) + 1)
+        probes = self.line.at(stations)
+        near = np.minimum(cKDTree(probes[:, :2]).query(points[:, :2], k=1)[1], len(probes) - 1)
+        x, y, heading = probes[near].T
+        dx, dy = points[:, 0] - x, points[:, 1] - y
+        along, across = dx * np.cos(heading) + dy * np.sin(heading), dy * np.cos(heading) - dx * np.sin(heading)
+        turned = np.abs(wrap_angle(points[:, 2] - heading))
+        left, right = (
+            (self.lane_m / 2 + self.left_m, self.lane_m / 2 + self.right_m) if aside_m is None else (aside_m,) * 2
+        )
+        parallel = np.minimum(turned, np.pi - turned) <= ALONG_RAD
+        return parallel & (np.abs(along) <= PROBE_M) & (across <= left) & (across >= -right)
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """A stretch of an agent's path without a reversal, in the direction in which it points.
+
+    `points` (N, 4) are x, y, z, heading; `beyond_m` is how far a road goes on straight before and after them.
+    """
+
+    points: Array
+    beyond_m: tuple[float, float] = (BEYOND_M, BEYOND_M)
+
+
+def roads_of(scenario: Scenario) -> list[Road]:
+    """All roads of a scenario, the ego's first; without an ego the vehicle that goes farthest stands in for it.
+
+    Positions are those of the scenario, z that of the ground.
+    """
+    vehicles = [a for a in scenario.agents if a.category != "pedestrian"] or list(scenario.agents)
+    first = scenario.ego or max(vehicles, key=lambda a: float(np.ptp(_progress(a))))
+    roads: list[Road] = []
+    for way in ways(first):
+        if not roads or not _covered(roads, way, TOLERANCE_M).all():
+            roads.append(_road(first, way, beside_m=LANE_M, level_m=EGO_LEVEL_M))
+    if not roads:
+        roads.append(_standing_road(first))
+    others = [a for a in vehicles if a is not first and not a.static]
+    for agent in sorted(others, key=lambda a: -float(np.ptp(_progress(a)))):
+        for way in ways(agent):
+            roads.extend([_road(agent, part) for part in _off_roads(way, roads)])
+    return roads
+
+
+def ways(agent: Agent) -> list[Way]:
+    """The stretches of an agent's path between its reversals; none for one that stands."""
+    w = agent.waypoints
+    points = np.column_stack([w.x_m, w.y_m, w.z_m - agent.size_m[2] / 2, np.unwrap(w.yaw_rad)])
+    progress = _progress(agent)
+    found = []
+    for first, last, sign in _monotone(progress):
+        rows = np.arange(first, last + 1)
+        ahead = sign * progress[rows]
+        new = np.maximum.accumulate(ahead)
+        kept = [0]
+        for k in range(1, len(rows)):
+            if new[k] == ahead[k] and ahead[k] >= ahead[kept[-1]] + LEAST_STEP_M:
+                kept.append(k)
+        if ahead[kept[-1]] - ahead[0] >= SHORTEST_LINE_M:
+            found.append(Way(points[rows[kept]][::sign]))
+    return found
+
+
+def _progress(agent: Agent) -> Array:
+    """Distance (T,) that an agent went along its own heading, less when it went back."""
+    w = agent.waypoints
+    heading = np.unwrap(w.yaw_rad)
+    mean = (heading[1:] + heading[:-1]) / 2
+    return np.concatenate([[0.0], np.cumsum(np.diff(w.x_m) * np.cos(mean) + np.diff(w.y_m) * np.sin(mean))])
+
+
+def _monotone(progress: Array) -> Iterator[tuple[int, int, int]]:
+    """First and last row and direction of each stretch that goes one way, up to settling back by `REVERSAL_M`."""
+    start, extreme, sign = 0, 0, 0
+    for k in range(1, len(progress)):
+        if sign == 0:
+            if abs(progress[k] - progress[start]) > REVERSAL_M or k == len(progress) - 1:
+                sign, extreme = (1 if progress[k] >= progress[start] else -1), k
+        elif sign * (progress[k] - progress[extreme]) > 0:
+            extreme = k
+        elif sign * (progress[extreme] - progress[k]) > REVERSAL_M:
+            yield start, extreme, sign
+            start, extreme, sign = extreme, k, -sign
+    if sign:
+        yield start, extreme, sign
+
+
+def _covered(roads: list[Road], way: Way, aside_m: float | None) -> NDArray[np.bool_]:
+    states = way.points[:, [0, 1, 3]]
+    return np.any([road.holds(states, aside_m) for road in roads], axis=0)
+
+
+def _off_roads(way: Way, roads: list[Road]) -> Iterator[Way]:
+    """The stretches of a way that leave the roads, with `JOIN_M` of the way on either side."""
+    travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way.points[:, :2], axis=0).T))])
+    if travelled[-1] < SHORTEST_WAY_M:
+        return
+    off = np.flatnonzero(~_covered(roads, way, None))
+    if not len(off):
+        return
+    runs = np.split(off, np.flatnonzero(np.diff(travelled[off]) > 2 * JOIN_M) + 1)
+    for run in runs:
+        begin, end = travelled[run[0]] - JOIN_M, travelled[run[-1]] + JOIN_M
+        rows = np.flatnonzero((travelled >= begin) & (travelled <= end))
+        if len(rows) >= 2 and travelled[rows[-1]] - travelled[rows[0]] >= SHORTEST_WAY_M:
+            ends = (rows[0] == 0, rows[-1] == len(way.points) - 1)
+            yield Way(way.points[rows], (BEYOND_M * ends[0], BEYOND_M * ends[1]))
+
+
+def _road(agent: Agent, way: Way, beside_m: float = 0.0, level_m: float = LEVEL_M) -> Road:
+    line, stations = fit(way.points[:, :2])
+    before, after = way.beyond_m
+    line = line.extended(before, after)
+    elevation = _elevation(stations + before, way.points[:, 2], line.length_m, level_m)
+    return Road(agent.id, line, elevation, _lane_m(agent), beside_m, beside_m)
+
+
+def _standing_road(agent: Agent) -> Road:
+    """A straight road under an agent that never moves."""
+    w = agent.waypoints
+    line = straight(float(w.x_m[0]), float(w.y_m[0]), float(w.yaw_rad[0]), 2 * BEYOND_M)
+    ground = float(w.z_m[0]) - agent.size_m[2] / 2
+    return Road(agent.id, line, np.array([[0.0, ground, 0.0, 0.0, 0.0]]), _lane_m(agent), LANE_M, LANE_M)
+
+
+def _lane_m(agent: Agent) -> float:
+    return max(LANE_M, agent.size_m[1] + SPARE_M)
+
+
+def _elevation(stations: Array, ground_m: Array, length_m: float, level_m: float) -> Array:
+    """Cubics (K, 5) s, a, b, c, d through the mean of heights (N,) every `level_m`, flat at the ends, without overshoot."""
+    from scipy.interpolate import PchipInterpolator
+
+    block = np.floor((stations - stations[0]) / level_m).astype(int)
+    _, first, counts = np.unique(block, return_index=True, return_counts=True)
+    s, z = (np.add.reduceat(v, first) / counts for v in (stations, ground_m))
+    s, z = np.concatenate([[0.0], s, [length_m]]), np.concatenate([z[:1], z, z[-1:]])
+    apart = np.concatenate([np.diff(s) > 1e-6, [True]])
+    d, c, b, a = PchipInterpolator(s[apart], z[apart]).c
+    rows = np.column_stack([s[apart][:-1], a, b, c, d])
+    # Flat ground is one row; checkers rightly call the others redundant.
+    flat = np.abs(rows[:, 2:]).max(axis=1) < 1e-12
+    return rows[~np.concatenate([[False], flat[1:] & flat[:-1]])]

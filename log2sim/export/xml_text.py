@@ -1,0 +1,131 @@
+"""XML as formats of simulators need it: numbers in a fixed form, untrusted text made harmless, nothing external read."""
+
+from __future__ import annotations
+
+import re
+import string
+from collections.abc import Iterable
+from pathlib import Path
+from urllib.parse import quote, unquote
+from xml.etree import ElementTree
+from xml.parsers import expat
+
+from log2sim.errors import LogError, ScenarioError
+
+SIZE_LIMIT_BYTES = 256 * 1024 * 1024
+DEPTH_LIMIT = 100
+
+# "$" begins a parameter in OpenSCENARIO, "%" our own escape; everything else of ASCII that prints stays as it is.
+_PLAIN = "".join(c for c in string.printable if c not in "%$" and (c == " " or not c.isspace()))
+
+
+def element(tag: str, parent: ElementTree.Element | None = None, **attributes: str) -> ElementTree.Element:
+    """A new element, within `parent` unless that is None."""
+    if parent is None:
+        return ElementTree.Element(tag, attributes)
+    return ElementTree.SubElement(parent, tag, attributes)
+
+
+def number(value: float, digits: int = 6) -> str:
+    """A finite number with at most so many decimals and no exponent, and never "-0"."""
+    text = f"{value:.{digits}f}".rstrip("0").rstrip(".")
+    return "0" if text in ("-0", "") else text
+
+
+def escaped(text: str) -> str:
+    """Any text as printable ASCII that no player takes for a parameter; `unescaped` gives it back."""
+    return quote(text, safe=_PLAIN, errors="surrogatepass")
+
+
+def unescaped(text: str) -> str:
+    """What was given to `escaped`."""
+    return unquote(text, errors="surrogatepass")
+
+
+def unique_names(texts: Iterable[str]) -> list[str]:
+    """A name of letters, digits, "_", "-" and "." for each text, no two alike even where case is ignored."""
+    names: list[str] = []
+    taken: set[str] = set()
+    for text in texts:
+        stem = re.sub(r"[^A-Za-z0-9_.-]", "_", text)[:60] or "_"
+        name, k = stem, 1
+        while name.lower() in taken:
+            k += 1
+            name = f"{stem}_{k}"
+        taken.add(name.lower())
+        names.append(name)
+    return names
+
+
+def write(root: ElementTree.Element, path: Path) -> None:
+    """Write a document, indented, in UTF-8."""
+    ElementTree.indent(root, space=" ")
+    text = ElementTree.tostring(root, encoding="unicode")
+    path.write_text(f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n', encoding="utf-8", newline="\n")
+
+
+class _Reader:
+    """Builds a tree from expat's events, refusing what a file from a stranger could harm with."""
+
+    def __init__(self, where: Path) -> None:
+        self.where, self.depth = where, 0
+        self.builder = ElementTree.TreeBuilder()
+
+    def start(self, tag: str, attributes: dict[str, str]) -> None:
+        self.depth += 1
+        if self.depth > DEPTH_LIMIT:
+            raise ScenarioError(
+                f"{self.where}: elements nest deeper than {DEPTH_LIMIT}; is this a scenario or road file?"
+            )
+        self.builder.start(tag, attributes)
+
+    def end(self, tag: str) -> None:
+        self.depth -= 1
+        self.builder.end(tag)
+
+    def refuse(self, *_: object) -> None:
+        raise ScenarioError(
+            f"{self.where}: has a document type declaration, which is not read; remove its <!DOCTYPE ...>"
+        )
+
+
+def read(path: Path) -> ElementTree.Element:
+    """Parse a file of at most `SIZE_LIMIT_BYTES` without entities, DTDs or anything outside it.
+
+    Raises
+    ------
+    ScenarioError
+        When the file is missing, too large, no XML, or declares a document type.
+    """
+    if not path.is_file():
+        raise ScenarioError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}; expected an XML file")
+    if path.stat().st_size > SIZE_LIMIT_BYTES:
+        raise ScenarioError(f"{path}: {path.stat().st_size} bytes, more than the {SIZE_LIMIT_BYTES} that are read")
+    reader, parser = _Reader(path), expat.ParserCreate()
+    parser.buffer_text = True
+    parser.StartElementHandler, parser.EndElementHandler = reader.start, reader.end
+    parser.CharacterDataHandler = reader.builder.data
+    parser.StartDoctypeDeclHandler = reader.refuse
+    try:
+        with path.open("rb") as file:
+            parser.ParseFile(file)
+        return reader.builder.close()
+    except (expat.ExpatError, UnicodeError, ValueError) as problem:
+        raise ScenarioError(f"{path}: not valid XML: {problem}") from None
+
+
+def require_number(value: str | None, where: str) -> float:
+    """A finite number out of an attribute.
+
+    Raises
+    ------
+    LogError
+        When the attribute is absent or no finite number.
+    """
+    try:
+        found = float(value) if value is not None else float("nan")
+    except ValueError:
+        found = float("nan")
+    if not -1e300 < found < 1e300:
+        raise LogError(f"{where} is {str(value)[:40]!r}, expected a finite number")
+    return found

@@ -1,0 +1,81 @@
+"""How a ride feels: accelerations and jerk of a box center, smoothed as a body feels them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from log2sim.geometry import Array
+
+ACCEL_WINDOW_S = 0.75
+JERK_WINDOW_S = 1.5
+"""Lengths of the fits. Shorter ones show the steps of a controller and the noise of a log instead of the ride."""
+
+LIMITS = {
+    "lon_accel_max_mps2": 2.40,
+    "lon_decel_max_mps2": 4.05,
+    "lat_accel_max_mps2": 4.89,
+    "lon_jerk_max_mps3": 4.13,
+    "jerk_max_mps3": 8.37,
+    "yaw_rate_max_radps": 0.95,
+    "yaw_accel_max_radps2": 1.93,
+}
+"""Comfort of nuPlan's planning benchmark (Karnchanachari et al., 2024), taken from human drivers of its log."""
+
+
+def comfort(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array) -> dict[str, float | bool] | None:
+    """Greatest and RMS acceleration, jerk and rates of turn, and whether all keep to `LIMITS`.
+
+    Parameters
+    ----------
+    t_s, x_m, y_m, yaw_rad : (S,) float64, s, m and rad
+        Evenly spaced box centers without leaps.
+
+    Returns
+    -------
+    dict or None
+        None for fewer than four rows, which have no third derivative.
+
+    Notes
+    -----
+    Derivatives of cubics fitted to the positions in a sliding window (Savitzky and Golay, 1964): longitudinal along the
+    heading, lateral across it, both of the box center whatever drives it. What changes faster than the window is damped.
+    """
+    if len(t_s) < 4:
+        return None
+    spacing_s = (t_s[-1] - t_s[0]) / (len(t_s) - 1)
+    ax, ay = (_derivative(c, 2, ACCEL_WINDOW_S, spacing_s) for c in (x_m, y_m))
+    jx, jy = (_derivative(c, 3, JERK_WINDOW_S, spacing_s) for c in (x_m, y_m))
+    yaw = np.unwrap(yaw_rad)
+    yaw_rate, yaw_accel = (_derivative(yaw, order, ACCEL_WINDOW_S, spacing_s) for order in (1, 2))
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    lon_accel, lat_accel, lon_jerk = ax * cos + ay * sin, ay * cos - ax * sin, jx * cos + jy * sin
+    out = {
+        "lon_accel_max_mps2": max(float(lon_accel.max()), 0.0),
+        "lon_decel_max_mps2": max(float(-lon_accel.min()), 0.0),
+        "lon_accel_rms_mps2": _rms(lon_accel),
+        "lat_accel_max_mps2": float(np.abs(lat_accel).max()),
+        "lat_accel_rms_mps2": _rms(lat_accel),
+        "lon_jerk_max_mps3": float(np.abs(lon_jerk).max()),
+        "lon_jerk_rms_mps3": _rms(lon_jerk),
+        "jerk_max_mps3": float(np.hypot(jx, jy).max()),
+        "yaw_rate_max_radps": float(np.abs(yaw_rate).max()),
+        "yaw_accel_max_radps2": float(np.abs(yaw_accel).max()),
+    }
+    rounded: dict[str, float | bool] = {k: round(v, 4) for k, v in out.items()}
+    rounded["comfortable"] = all(out[k] <= limit for k, limit in LIMITS.items())
+    return rounded
+
+
+def _derivative(values: Array, order: int, window_s: float, spacing_s: float) -> Array:
+    """Derivative (S,) of cubics fitted to a window about each row, at the ends to the window there."""
+    from scipy.signal import savgol_filter
+
+    longest = len(values) if len(values) % 2 else len(values) - 1
+    wanted = 2 * round(window_s / spacing_s / 2) + 1
+    window = max(min(wanted, longest), 3)
+    # Relative to the first row, since filters lose digits at far map offsets.
+    return savgol_filter(values - values[0], window, min(3, window - 1), deriv=order, delta=spacing_s)
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))

@@ -1,0 +1,41 @@
+"""What a replay came to, in a few lines for people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from log2sim.replay.result import Replay
+
+MOST_LISTED = 5
+
+
+def summarize(replay: Replay) -> str:
+    """Errors in one line, what agents did to each other in a second one, then the first collisions, new ones first."""
+    m = replay.metrics
+    lines = [
+        f"cross-track {m['cross_track_rms_m']:.3f} m rms, {m['cross_track_max_m']:.3f} m max · "
+        f"along-track {m['along_track_rms_m']:.3f} m rms · speed {m['speed_rms_mps']:.3f} m/s rms",
+        f"{_counted(len(m['collisions']), 'collision')}, {m['new_collisions']} that the log does not have · "
+        f"least time to collision {_least(m['min_ttc'])} · post-encroachment time {_least(m['min_pet'])}",
+    ]
+    events = sorted(m["collisions"], key=lambda e: (e["in_log"], e["t_s"]))
+    lines += [f"  {_collision(e)}" for e in events[:MOST_LISTED]]
+    if len(events) > MOST_LISTED:
+        lines.append(f"  and {len(events) - MOST_LISTED} more")
+    return "\n".join(lines)
+
+
+def _collision(event: Mapping[str, Any]) -> str:
+    known = ", as in the log" if event["in_log"] else ""
+    return f"{' and '.join(event['agents'])} collide at {event['t_s']:.2f} s ({event['relative_speed_mps']:.1f} m/s){known}"
+
+
+def _least(found: Mapping[str, Any] | None) -> str:
+    if found is None:
+        return "-"
+    return f"{found['s']:.2f} s ({' and '.join(found['agents'])} at {found['t_s']:.2f} s)"
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"

@@ -1,0 +1,160 @@
+"""CommonRoad files: what they hold, and what CommonRoad's own reader, schema and collision checker say of them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from export_worlds import ROOT, circling, peer, straight, world
+
+from log2sim.errors import ScenarioError
+from log2sim.export import export
+from log2sim.geometry import bev_iou, box_corners_bev, wrap_angle
+from log2sim.scenario import Scenario
+from log2sim.types import CATEGORIES, MapFrame
+
+SAMPLE = ROOT / "samples" / "crossing" / "truth.json"
+
+
+def written(scenario: Scenario, folder: Path) -> tuple[ElementTree.Element, dict[str, dict[str, str]]]:
+    """The document, and the rows of agents.csv by agent."""
+    table, file = sorted(export(scenario, "commonroad", folder), key=lambda f: f.suffix)
+    with table.open(newline="", encoding="utf-8") as opened:
+        rows = {row["agent"]: row for row in csv.DictReader(opened)}
+    return ElementTree.parse(file).getroot(), rows
+
+
+def test_ids_lead_back_to_the_agents(tmp_path: Path) -> None:
+    root, rows = written(Scenario.load(SAMPLE), tmp_path)
+    for row in rows.values():
+        (element,) = (e for e in root if e.get("id") == row["commonroad_id"])
+        assert element.tag == row["role"].replace("planning problem", "planningProblem")
+    assert {e.get("id") for e in root.iter() if "bstacle" in e.tag} <= {row["commonroad_id"] for row in rows.values()}
+
+
+def test_no_category_is_dropped(tmp_path: Path) -> None:
+    moving = [straight(f"{c} moving", c, start=(0.0, 5.0 * k + 5)) for k, c in enumerate(CATEGORIES)]
+    still = [
+        replace(straight(f"{c} still", c, start=(0.0, -5.0 * k - 5), speed=0.0), static=True)
+        for k, c in enumerate(CATEGORIES)
+    ]
+    root, rows = written(world(straight("ego"), *moving, *still), tmp_path)
+    types = {name: root.findtext(f"*[@id='{row['commonroad_id']}']/type") for name, row in rows.items()}
+    assert types["cyclist moving"] == types["bicycle moving"] == types["cyclist still"] == "bicycle"
+    assert types["truck moving"] == "truck"
+    assert types["truck still"] == "parkedVehicle"
+    assert types["pedestrian still"] == "pedestrian"
+    assert types["other moving"] == types["other still"] == "unknown"
+
+
+def test_who_enters_late_is_not_there_before(tmp_path: Path) -> None:
+    late = straight("late", start=(0.0, 9.0), t_s=np.array([1.0, 1.5, 2.0]))
+    short = straight("short", start=(0.0, 9.0), t_s=np.array([0.53, 0.56]))
+    early = straight("early", start=(0.0, 9.0), t_s=np.array([0.0, 0.1]))
+    root, rows = written(world(straight("ego", t_s=np.array([0.4, 1.0, 2.0])), late, short, early), tmp_path)
+    steps = {
+        name: [int(t.text or "") for t in root.findall(f"*[@id='{row['commonroad_id']}']//time/exact")]
+        for name, row in rows.items()
+    }
+    assert steps["late"] == list(range(6, 17))
+    assert steps["short"] == [1, 2]
+    assert rows["early"]["role"] == "left out: not alive at any step"
+
+
+def test_the_date_is_that_of_the_recording(tmp_path: Path) -> None:
+    root, _ = written(world(straight("ego")), tmp_path)
+    assert root.get("date") == "2023-11-14"
+
+
+def test_the_way_to_projected_coordinates_is_stored(tmp_path: Path) -> None:
+    frame = MapFrame(49.0, 8.4, 110.0, "+proj=utm +zone=32", (456_000.0, 5_428_000.0, 0.0))
+    root, _ = written(replace(world(straight("ego")), map=frame), tmp_path)
+    assert root.findtext("location/geoTransformation/geoReference") == "+proj=utm +zone=32"
+    assert root.findtext("location/geoTransformation/additionalTransformation/xTranslation") == "-456000"
+    assert root.findtext("location/gpsLatitude") == "49"
+
+
+def test_numbers_have_no_exponent(tmp_path: Path) -> None:
+    root, _ = written(world(straight("ego", speed=1e-7, start=(1e-8, 1e9))), tmp_path)
+    values = [e.text or "" for e in root.iter() if e.tag in ("x", "y", "z", "exact")]
+    assert all(re.fullmatch(r"-?\d+(\.\d+)?", value) for value in values)
+    assert {"1000000000", "0.00000001"} <= set(values)
+
+
+@pytest.mark.parametrize(
+    ("agent", "complaint"),
+    [(straight("car-1"), "no agent 'ego'"), (straight("ego", t_s=np.array([0.0, 0.05])), "agent 'ego': lives 0.05 s")],
+)
+def test_what_makes_no_planning_problem_is_refused(agent: Any, complaint: str, tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match=complaint):
+        export(world(agent), "commonroad", tmp_path / "out")
+
+
+def read_by_commonroad(
+    scenario: Scenario, folder: Path
+) -> tuple[dict[str, Any], np.ndarray, dict[str, dict[str, str]]]:
+    """What CommonRoad's software finds, the ego's [x, y, yaw, length, width] at every step, and agents.csv."""
+    run = peer("commonroad")
+    _, rows = written(scenario, folder)
+    ego = scenario.ego
+    assert ego is not None
+    at = ego.at(0.1 * np.arange(round(ego.waypoints.t_s[-1] / 0.1 - 0.5) + 1))
+    boxes = np.stack([at.x_m, at.y_m, at.yaw_rad, *np.broadcast_arrays(*ego.size_m[:2], at.x_m)[:2]], axis=-1)
+    (folder / "ego.json").write_text(json.dumps(boxes.tolist()))
+    (file,) = folder.glob("*.xml")
+    return json.loads(run(ROOT / "tests" / "peers" / "commonroad_read.py", file, folder / "ego.json")), boxes, rows
+
+
+def overlaps(scenario: Scenario, boxes: np.ndarray) -> list[int]:
+    """Steps at which the ego's box shares ground with another's, by clipping polygons."""
+    steps = []
+    for k, (x, y, yaw, length, width) in enumerate(boxes):
+        own = box_corners_bev([x, y], length, width, yaw)[0]
+        states = [(a, a.at(a.waypoints.t_s[:1] if a.static else 0.1 * k)) for a in scenario.others]
+        corners = [
+            box_corners_bev([s.x_m[0], s.y_m[0]], *a.size_m[:2], s.yaw_rad[0])[0] for a, s in states if s.valid[0]
+        ]
+        steps += [k] if any(bev_iou(own, other) > 0 for other in corners) else []
+    return steps
+
+
+@pytest.mark.peers
+def test_commonroad_reads_the_sample_as_it_is(tmp_path: Path) -> None:
+    """Its schema has no complaint, its reader finds every pose, the ego's end is a goal reached, all lanes are valid."""
+    scenario = Scenario.load(SAMPLE)
+    found, boxes, rows = read_by_commonroad(scenario, tmp_path)
+    assert found["complaints"] == []
+    assert found["arrived"]
+    assert all(found["lanelets_valid"])
+    assert all(found["ego_on_lanelet"])
+    for agent in scenario.others:
+        obstacle = found["obstacles"][rows[agent.id]["commonroad_id"]]
+        at = agent.at(0.1 * np.arange(len(boxes)))
+        poses = np.array(obstacle["poses"])
+        np.testing.assert_allclose(poses[:, :2], np.stack([at.x_m, at.y_m], -1), atol=1e-8)
+        np.testing.assert_allclose(wrap_angle(poses[:, 2] - at.yaw_rad), 0.0, atol=1e-8)
+        np.testing.assert_allclose(poses[:, 3], at.speed_mps, atol=1e-8)
+        assert obstacle["size"] == pytest.approx(agent.size_m[:2])
+
+
+@pytest.mark.peers
+def test_commonroads_collision_checker_agrees(tmp_path: Path) -> None:
+    """The ego turns through a crossing car, past a parked one that it scratches, and behind one that comes late."""
+    crossing = straight("crossing", start=(2.0, 11.0), speed=3.0)
+    parked = replace(straight("parked", start=(13.6, 3.5), speed=0.0, yaw=0.4), static=True)
+    late = straight("late", start=(4.0, 12.0), speed=0.5, t_s=np.array([2.05, 3.0]))
+    scenario = world(circling(), crossing, parked, late)
+    found, boxes, _ = read_by_commonroad(scenario, tmp_path)
+    expected = overlaps(scenario, boxes)
+    assert 3 < len(expected) < len(boxes) - 3
+    assert found["collisions"] == expected
+    assert set(found["complaints"]) == {
+        "Element 'exact': [facet 'maxInclusive'] The value '21' is greater than the maximum value allowed ('0')."
+    }  # the schema knows nobody who enters late; its reader and checker do
