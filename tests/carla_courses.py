@@ -22,10 +22,14 @@ def agent(name: str, t: Any, x: Any, y: Any, yaw: Any, speed: Any, **changes: An
 
 
 def left_turn(
-    name: str = "ego", radius_m: float = 12.0, speed: float = 6.0, at: tuple[float, float] = (0.0, 0.0)
+    name: str = "ego",
+    radius_m: float = 12.0,
+    speed: float = 6.0,
+    at: tuple[float, float] = (0.0, 0.0),
+    spacing_s: float = 0.1,
 ) -> Agent:
     """A car that drives 12 m straight on to the east, then a quarter circle to the left, as its rear axle rolls."""
-    t = np.arange(0.0, 6.01, 0.1)
+    t = np.arange(0.0, 6.001, spacing_s)
     way = speed * t - 12.0
     yaw = np.clip(way, 0.0, radius_m * np.pi / 2) / radius_m
     on = np.maximum(way - radius_m * np.pi / 2, 0.0)

@@ -82,6 +82,7 @@ class Actor:
         assert self.is_vehicle
         x, y, _, yaw = self.pose
         wheels = []
+        known = 100.0 if self.ticked else 0.0  # centimeters; not before the first tick
         for along, lock in ((self.rear_x + self.wheelbase, 70.0), (self.rear_x, 0.0)):
             for side in (-0.8, 0.8):
                 at = (
@@ -90,7 +91,7 @@ class Actor:
                 )
                 wheels.append(
                     carla.WheelPhysicsControl(
-                        max_steer_angle=lock, position=carla.Vector3D(100 * at[0], 100 * at[1], 30.0)
+                        max_steer_angle=lock, position=carla.Vector3D(known * at[0], known * at[1], 30.0)
                     )
                 )
         return carla.VehiclePhysicsControl(wheels=wheels, steering_curve=[carla.Vector2D(*p) for p in STEERING_CURVE])

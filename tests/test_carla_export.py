@@ -25,7 +25,7 @@ from log2sim.export import Options, export
 from log2sim.geometry import wrap_angle
 from log2sim.replay import follower
 from log2sim.replay.carla_assets import BY_CATEGORY, nearest_assets
-from log2sim.replay.carla_player import Course, Follower, main, size_table
+from log2sim.replay.carla_player import Body, Course, Follower, main, size_table
 from log2sim.replay.parameters import parameters_for
 from log2sim.replay.vehicle import VehicleState
 from log2sim.scenario import Agent, Scenario
@@ -133,6 +133,9 @@ def test_the_script_runs_without_log2sim_and_without_the_client(scenario: Scenar
 
 @pytest.mark.parametrize("text", ["", "[]", '{"format": "log2sim-carla", "version": 99}'])
 def test_data_of_something_else_are_refused(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """carla#7767: silent on a bad path."""
+    assert main(["--data", str(tmp_path / "none.json")]) == 3
+    assert "none.json: cannot be read" in capsys.readouterr().err
     (tmp_path / "x.json").write_text(text)
     assert main(["--data", str(tmp_path / "x.json")]) == 3
     assert capsys.readouterr().err.startswith(f"replay_carla: {tmp_path / 'x.json'}: ")
@@ -268,7 +271,8 @@ def test_exact_wheels_turn_and_velocities_are_told(play: Any, carla: ModuleType)
         tick = client.world.tick
 
         def ticking() -> int:
-            shown.extend(a.shown_steer_deg[carla.VehicleWheelLocation.FL_Wheel] for a in client.world.actors.values())
+            wheel = carla.VehicleWheelLocation.FL_Wheel
+            shown.extend(a.shown_steer_deg.get(wheel, 0.0) for a in client.world.actors.values())
             return int(tick())
 
         client.world.tick = ticking
@@ -329,6 +333,44 @@ def test_reversing_and_stopping(play: Any) -> None:
     assert np.ptp(at[at.size * 3 // 4 :]) < 0.01
     back = [c.control.reverse for _, _, c in client.orders if type(c).__name__ == "ApplyVehicleControl"]
     assert any(back)
+
+
+@pytest.mark.parametrize("spacing_s", [0.02, 0.1, 0.5])
+def test_denser_waypoints_do_not_make_it_worse(play: Any, spacing_s: float) -> None:
+    """scenario_runner#966, #1011, #938: goes straight or cuts the corner of a left turn, and more so with more waypoints."""
+    turning = left_turn(spacing_s=spacing_s)
+    _, client = play(of(turning), "--mode", "pid")
+    assert drift_m(client, left_turn(spacing_s=0.01), "hero", 0.05).max() < 0.3
+
+
+@pytest.mark.parametrize("mode", ["exact", "pid"])
+def test_a_standing_car_does_not_spin(play: Any, mode: str) -> None:
+    """esmini#199: headings are those of the log and not of positions that jitter."""
+    rng = np.random.default_rng(5)
+    t = np.arange(0.0, 4.01, 0.1)
+    standing = agent("ego", t, rng.normal(0, 0.03, len(t)), rng.normal(0, 0.03, len(t)), 0.7, 0.0)
+    _, client = play(of(standing), "--mode", mode)
+    yaw = np.array([seen["hero"][3] for seen in client.world.seen])
+    assert np.abs(np.degrees(yaw) + math.degrees(0.7)).max() < 1.0
+
+
+def test_axles_are_measured_even_if_the_server_knows_them_only_after_a_tick(carla: ModuleType) -> None:
+    from carla_server import Actor, Blueprint
+
+    size_m, spawned = (4.0, 1.8, 1.5), carla.Transform(carla.Location(30.0, -7.0, 0.3), carla.Rotation(yaw=75.0))
+    actor = Actor(1, Blueprint("vehicle.audi.a2"), size_m, spawned)
+    body = Body(carla, {}, actor, spawned)
+    assert (body.wheelbase_m, body.axle_m) == pytest.approx((0.6 * 4.0, 0.3 * 4.0))
+    actor.advance(0.05)
+    body.pose()
+    assert (body.wheelbase_m, body.axle_m) == pytest.approx((actor.wheelbase, 0.05 - actor.rear_x), abs=1e-4)
+    assert body.max_steer_rad == pytest.approx(math.radians(70.0))
+
+
+def test_an_asset_of_another_size_than_expected_is_noted(play: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    grown = {**SIZES, "vehicle.toyota.prius": (5.0, 2.0, 1.5)}
+    play(of(left_turn()), prepare=lambda client: setattr(client.world.library, "sizes", grown))
+    assert "note: agent 'ego': vehicle.toyota.prius is 5.00 x 2.00 x 1.50 m on this server" in capsys.readouterr().out
 
 
 def test_colors_are_painted_where_the_asset_takes_them(play: Any) -> None:

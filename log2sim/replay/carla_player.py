@@ -31,6 +31,9 @@ SPAWN_HEIGHTS_M = (0.3, 2.0, 5.0, 10.0, 20.0, 40.0)  # something may stand where
 ROAD_WITHIN_M = 30.0
 FALLEN_M = 5.0
 KMH_PER_MPS = 3.6
+SHOWN_DEG = 0.2
+SUBSTEP_S, SUBSTEPS = 0.01, 10  # of CARLA's physics within a tick
+SIZE_DIFFERS_M = 0.1
 
 # The controller of log2sim's own simulator: time constants in s, lengths in m.
 ALONG_S, ACROSS_S, ACROSS_MIN_M, INTEGRAL_S, FILTER_S, DAMPING = 0.6, 0.6, 1.5, 4.0, 0.05, 1.0
@@ -77,27 +80,29 @@ class Body:
         self._box_x, self._box_y, self._bottom = box.location.x, box.location.y, box.location.z - box.extent.z
         self.is_walker = actor.type_id.startswith("walker.")
         self.is_vehicle = actor.type_id.startswith("vehicle.")
+        self._measured = not self.is_vehicle
         if self.is_vehicle:
-            self._measure(actor.get_physics_control(), spawned)
+            physics, wheels = actor.get_physics_control(), carla.VehicleWheelLocation
+            self.max_steer_rad = math.radians(max([w.max_steer_angle for w in physics.wheels], default=0.0) or 70.0)
+            curve = sorted((p.x, p.y) for p in physics.steering_curve) or [(0.0, 1.0)]
+            self._steering = Course({"t_s": [p[0] for p in curve], "share": [p[1] for p in curve]})
+            self._front = (wheels.FL_Wheel, wheels.FR_Wheel) if len(physics.wheels) > 2 else (wheels.Front_Wheel,)
+            self._shown_deg = 0.0
+            self.wheelbase_m, self.axle_m = 0.6 * self.size_m[0], 0.3 * self.size_m[0]
+            self._measure(physics, spawned)
 
-    def _measure(self, physics: Any, spawned: Any) -> None:
-        """Wheelbase, the way from rear axle to box center, full lock, and the share of it that is left at speed."""
-        forward = spawned.get_forward_vector()
+    def _measure(self, physics: Any, at: Any) -> None:
+        """Wheelbase and the way from rear axle to box center, once the server knows where the wheels are."""
+        forward = at.get_forward_vector()
         places: dict[bool, list[float]] = {True: [], False: []}
         for wheel in physics.wheels:  # their positions are world coordinates in centimeters
-            x, y = wheel.position.x / 100 - spawned.location.x, wheel.position.y / 100 - spawned.location.y
+            x, y = wheel.position.x / 100 - at.location.x, wheel.position.y / 100 - at.location.y
             places[wheel.max_steer_angle > 0].append(x * forward.x + y * forward.y)
-        length = self.size_m[0]
-        self.wheelbase_m, self.axle_m = 0.6 * length, 0.3 * length
         if places[True] and places[False]:
             front, rear = (sum(p) / len(p) for p in (places[True], places[False]))
-            if 0.4 * length < front - rear < 0.9 * length:  # some servers report no positions
+            self._measured = 0.4 * self.size_m[0] < front - rear < 0.9 * self.size_m[0]
+            if self._measured:
                 self.wheelbase_m, self.axle_m = front - rear, self._box_x - rear
-        self.max_steer_rad = math.radians(max([w.max_steer_angle for w in physics.wheels], default=0.0) or 70.0)
-        wheels = self.carla.VehicleWheelLocation
-        self._front = (wheels.FL_Wheel, wheels.FR_Wheel) if len(physics.wheels) > 2 else (wheels.Front_Wheel,)
-        curve = sorted((p.x, p.y) for p in physics.steering_curve) or [(0.0, 1.0)]
-        self._steering = Course({"t_s": [p[0] for p in curve], "share": [p[1] for p in curve]})
 
     def transform(self, x: float, y: float, z: float, yaw: float) -> Any:
         """Where the actor has to be for its box to be centered at x, y, and to stand at z."""
@@ -114,6 +119,9 @@ class Body:
     def pose(self) -> tuple[float, float, float, float, float]:
         """Box center x, y, lowest face z, yaw in rad and speed along it, after the last tick."""
         transform, velocity = self.actor.get_transform(), self.actor.get_velocity()
+        if not self._measured:
+            self._measure(self.actor.get_physics_control(), transform)
+            self._measured = True
         at, yaw = transform.location, math.radians(transform.rotation.yaw)
         cos, sin = math.cos(yaw), math.sin(yaw)
         x, y = at.x + self._box_x * cos - self._box_y * sin, at.y + self._box_x * sin + self._box_y * cos
@@ -126,8 +134,11 @@ class Body:
 
     def show_steering(self, curvature: float) -> None:
         """Turn the looks of the front wheels, which CARLA allows while physics is off."""
-        for wheel in self._front:
-            self.actor.set_wheel_steer_direction(wheel, math.degrees(self.steer_angle(curvature)))
+        angle_deg = math.degrees(self.steer_angle(curvature))
+        if abs(angle_deg - self._shown_deg) > SHOWN_DEG:  # every call is one to the server
+            self._shown_deg = angle_deg
+            for wheel in self._front:
+                self.actor.set_wheel_steer_direction(wheel, angle_deg)
 
     def control(self, pedal_mps2: float, curvature: float, speed: float, reverse: bool) -> Any:
         """Pedal and curvature as CARLA's inputs.
@@ -209,11 +220,13 @@ class Stage:
         self.carla, self.client, self.world, self.dt_s = carla, client, world, dt_s
         self.library = world.get_blueprint_library()
         self.bodies: dict[str, Body] = {}
+        self.notes: list[str] = []
 
     def __enter__(self) -> Stage:
         self._before = self.world.get_settings()
         settings = self.world.get_settings()
         settings.synchronous_mode, settings.fixed_delta_seconds = True, self.dt_s
+        settings.substepping, settings.max_substep_delta_time, settings.max_substeps = True, SUBSTEP_S, SUBSTEPS
         self.world.apply_settings(settings)
         return self
 
@@ -227,7 +240,7 @@ class Stage:
 
     def spawn(self, agent: dict[str, Any], place: Place, physics: bool) -> Body:
         """Make the actor of an agent, above its place; it is put there by a command before the next tick."""
-        blueprint = self._blueprint(agent)
+        blueprint, size_m = self._blueprint(agent)
         x, y, z, yaw = place
         for height in SPAWN_HEIGHTS_M:
             above = self.carla.Transform(
@@ -239,16 +252,21 @@ class Stage:
         else:
             raise ReplayError(f"agent '{agent['id']}': CARLA could not spawn {blueprint.id} at {x:.1f}, {y:.1f}", 4)
         body = self.bodies[agent["id"]] = Body(self.carla, agent, actor, above)
+        if max(abs(a - b) for a, b in zip(body.size_m, size_m)) > SIZE_DIFFERS_M:
+            length, width, height = body.size_m
+            self.notes.append(
+                f"note: agent '{agent['id']}': {blueprint.id} is {length:.2f} x {width:.2f} x {height:.2f} m on this server"
+            )
         if not physics:
             self.send([self.carla.command.SetSimulatePhysics(actor.id, False)])
         return body
 
-    def _blueprint(self, agent: dict[str, Any]) -> Any:
-        """The nearest asset that this server has, in the agent's color where it can be painted."""
+    def _blueprint(self, agent: dict[str, Any]) -> tuple[Any, Sequence[float]]:
+        """The nearest asset that this server has, in the agent's color where it can be painted, and its size as exported."""
         for asset in agent["assets"]:
             found = self.library.filter(asset["blueprint"])
             if len(found):
-                blueprint = found[0]
+                blueprint, size_m = found[0], asset["size_m"]
                 break
         else:
             names = ", ".join(a["blueprint"] for a in agent["assets"])
@@ -261,7 +279,7 @@ class Stage:
         for name, value in settings.items():
             if blueprint.has_attribute(name):
                 blueprint.set_attribute(name, value)
-        return blueprint
+        return blueprint, size_m
 
     def remove(self, name: str) -> None:
         """Take an agent's actor out of the world."""
@@ -337,6 +355,11 @@ class Player:
         vx, vy = self._velocity(agent, t_s)
         if body is None or self._leaps(agent, now_s):
             x, y, z, yaw = self.grounded(agent, course.place(t_s))
+            speed = math.hypot(vx, vy)
+            if name in self.courses:  # differences of positions would let a standing vehicle start with a jerk
+                speed, stands = course.at(t_s, "speed_mps", "stands")
+                speed = 0.0 if stands > 0.5 else speed
+                vx, vy = speed * math.cos(yaw), speed * math.sin(yaw)
             start = (x - vx * self.stage.dt_s, y - vy * self.stage.dt_s, z, yaw)
             body = body or self.stage.spawn(agent, start, True)
             if body.is_vehicle:
@@ -344,7 +367,6 @@ class Player:
             yield self.carla.command.ApplyTransform(body.actor.id, body.transform(*start))
             yield self.carla.command.ApplyTargetVelocity(body.actor.id, self.carla.Vector3D(vx, vy, 0.0))
             now_s = t_s  # the error is none at the end of this tick, so neither is it now
-            speed = vx * math.cos(yaw) + vy * math.sin(yaw)
         else:
             x, y, yaw, speed = self._found(agent, body, now_s)
         if body.is_walker:
@@ -578,6 +600,8 @@ def run(words: Sequence[str] | None = None) -> None:
         ground = args.ground or ("map" if mode == "pid" else "log")
         player = Player(stage, data, mode, physics=args.physics, ground=ground)
         play(player, data, follow=args.follow, pace=args.pace)
+    for note in stage.notes:
+        say(note)
     if player.drift_m:
         say(drift_table(player.drift_m))
 
