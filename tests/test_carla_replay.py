@@ -128,6 +128,7 @@ def test_agents_come_go_and_leap(server: Client) -> None:
     early = agent("early", [0.0, 1.0], [0.0, 1.3], 60.0, 0.0, 1.3, category="pedestrian", size_m=(0.6, 0.6, 1.8))
     replayed = in_carla(of(leaping, late, early))
     assert replayed.metrics["cross_track_max_m"] < 0.3
+    assert replayed.metrics["along_track_rms_m"] < 0.3
     for one in (leaping, late, early):
         at = [(k + 1) * 0.05 for k, seen in enumerate(server.world.seen) if one.id in seen]
         assert (at[0], at[-1]) == pytest.approx((one.waypoints.t_s[0] + 0.05, one.waypoints.t_s[-1]))
@@ -135,7 +136,8 @@ def test_agents_come_go_and_leap(server: Client) -> None:
 
 
 def test_far_from_the_origin_is_the_same(server: Client) -> None:
-    near, far = in_carla(of(left_turn())), in_carla(of(left_turn(at=(4.6e5, 5.41e6))))
+    parked = agent("parked", [0.0, 6.0], 4.6e5 + 20.0, 5.41e6, 0.5, 0.0, static=True)
+    near, far = in_carla(of(left_turn())), in_carla(of(left_turn(at=(4.6e5, 5.41e6)), parked))
     np.testing.assert_allclose(far.agents[0].x_m - 4.6e5, near.agents[0].x_m, atol=1e-3)
     np.testing.assert_allclose(far.agents[0].y_m - 5.41e6, near.agents[0].y_m, atol=1e-3)
     assert max(abs(v) for seen in server.world.seen for at in seen.values() for v in at[:2]) < 1000

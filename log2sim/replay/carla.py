@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from log2sim.errors import ConfigError, MissingExtra
-from log2sim.geometry import Array, wrap_angle
+from log2sim.geometry import Array
 from log2sim.replay import carla_player as player
 from log2sim.replay.carla_data import carla_agents
 from log2sim.replay.rollout import Clock
@@ -189,7 +189,7 @@ class CarlaSimulator:
             at_x, at_y, _, at_yaw, now = self.stage.bodies[name].pose()
             at = self._from_carla(group, slot, at_x - o * math.cos(at_yaw), at_y - o * math.sin(at_yaw))
             x[slot], y[slot] = self._read[name] = at
-            yaw[slot] += wrap_angle(-at_yaw - yaw[slot])
+            yaw[slot] = -at_yaw
             pedal[slot] = (now - speed[slot]) / self.clock.dt_s * (-1.0 if now < 0 else 1.0)
             speed[slot] = now
         seen = {"x_m": x, "y_m": y, "yaw_rad": yaw, "speed_mps": speed, "pedal_mps2": pedal}
