@@ -20,6 +20,7 @@ from log2sim.scenario import Scenario
 pytest.importorskip("carla", reason="CARLA's client is not installed (extra 'carla')")
 
 import carla
+import carla_server
 from carla_server import Client
 
 from log2sim.replay.carla import CarlaSimulator
@@ -99,6 +100,17 @@ def test_a_push_in_carla_is_noticed_and_driven_back(server: Client) -> None:
     (ego,) = in_carla(of(agent("ego", t, 8.0 * t, 0.0, 0.0, 8.0))).agents
     assert ego.y_m[40] == pytest.approx(-1.0, abs=0.05)
     assert np.abs(ego.y_m[-20:]).max() < 0.2
+
+
+@pytest.mark.parametrize("change", [{"ACCEL_MPS2": 2.5}, {"BRAKE_MPS2": 18.0}, {"LAG_S": 0.3}, {"DRAG_1PM": 0.02}])
+def test_pedals_and_lags_need_not_be_as_assumed(
+    server: Client, change: dict[str, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in change.items():
+        monkeypatch.setattr(carla_server, name, value)
+    metrics = in_carla(Scenario.load(SAMPLE)).metrics
+    assert metrics["cross_track_max_m"] < 0.3
+    assert metrics["along_track_rms_m"] < 0.3
 
 
 def test_left_is_left(server: Client) -> None:
