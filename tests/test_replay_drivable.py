@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from replay_maneuvers import MANEUVERS, agent_from, driven, ramp
 
-from log2sim.replay.drivable import Limits, _Problem, nearest_course
+from log2sim.replay.drivable import Limits, _cost, _normal_equations, _Problem, nearest_course
 from log2sim.replay.path import path_of
 from log2sim.replay.reference import GRID_S, drivable_course, point_reference, tape_reference, vehicle_reference
 
@@ -76,6 +76,15 @@ def test_a_turn_tighter_than_full_lock_is_widened_and_flagged():
     assert vehicle_reference(fine, LIMITS, accel_ahead_s=0.1, curvature_ahead_s=0.1).flags == ()
 
 
+def test_a_bend_taken_faster_than_tires_hold_is_widened_and_flagged():
+    agent = driven(lambda t: np.full_like(t, 20.0), lambda s: ramp(s, (20, 0), (40, 0.04), (60, 0.04), (80, 0)), 6.0)
+    path = path_of(agent, 1.3)
+    course, _ = drivable_course(path, LIMITS)
+    assert np.abs(course.speed_mps**2 * course.curvature_1pm).max() < 1.05 * LIMITS.max_lateral_mps2  # 16 in the log
+    reference = vehicle_reference(path, LIMITS, accel_ahead_s=0.1, curvature_ahead_s=0.1)
+    assert any("distance from what can be driven" in flag for flag in reference.flags)
+
+
 @pytest.mark.parametrize("turned", [[0], [5], [20, 21, 22]])
 def test_boxes_turned_back_to_front_are_outvoted(turned):
     agent = MANEUVERS["lane change"]()
@@ -116,12 +125,12 @@ def test_the_gradient_is_that_of_the_cost():
     state[:, 5] *= 2  # beyond the limit in places
     logged = rng.normal(0, 1, (6, 4)) + np.array([0, 0, 0, 3.0])
     problem = _Problem(0.1, logged, LIMITS)
-    _, _, gradient = problem.normal_equations(state)
+    _, _, gradient = _normal_equations(problem.residuals(state))
     numeric = np.zeros_like(state)
     for index in np.ndindex(state.shape):
         step = np.zeros_like(state)
         step[index] = 1e-6
-        numeric[index] = (problem.cost(state + step) - problem.cost(state - step)) / 2e-6
+        numeric[index] = (_cost(problem.residuals(state + step)) - _cost(problem.residuals(state - step))) / 2e-6
     # The chord's shortening is held constant in the derivative: second order in the angle of a knot.
     np.testing.assert_allclose(gradient, numeric, rtol=0.02, atol=np.abs(numeric).max() * 0.02)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from dataclasses import replace as changed
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from replay_maneuvers import MANEUVERS, OFFSET_M, agent_from, driven, ramp, scenario_of
 
 from log2sim.replay import replay
-from log2sim.replay.follower import Memory, follow_points, follow_vehicles
+from log2sim.replay.follower import GAINS, Memory, follow_points, follow_vehicles
 from log2sim.replay.parameters import parameters_for
 from log2sim.replay.vehicle import PointState, VehicleState, step_bicycle, step_point
 
@@ -187,6 +188,36 @@ def test_being_late_or_slow_is_made_up_for():
         assert np.abs(states[-1, 0]) < 0.05
         assert states[-1, 3] == pytest.approx(10.0, abs=0.05)
         assert states[:, 0].max() < 0.6
+
+
+def controls_at(*, x=0.0, y=0.0, yaw=0.0, speed=10.0, row=(0, 0, 0, 10, 0, 0, 1, 0), dt_s=0.01):
+    """Controls and memory of a car that has just begun to follow one row of a table."""
+    state = replace_columns(VehicleState, x_m=x, y_m=y, yaw_rad=yaw, speed_mps=speed)
+    return follow_vehicles(np.array(row, float)[:, None], state, Memory.fresh(1), CAR, dt_s)
+
+
+def replace_columns(kind, **values):
+    return kind(*(np.array([values.get(f.name, 0.0)]) for f in fields(kind)))
+
+
+def test_late_in_a_curve_the_wheels_stay_turned_as_the_curve_is():
+    radius, late = 20.0, 1.5
+    angle = -late / radius
+    controls, _ = controls_at(
+        x=radius * np.sin(angle), y=radius * (1 - np.cos(angle)), yaw=angle, row=(0, 0, 0, 10, 0, 1 / radius, 1, 0)
+    )
+    # What is left is the third order of the angle, not the 5.6 cm by which the tangent misses the arc.
+    assert np.tan(controls.steer_rad[0]) / CAR.wheelbase_m[0] == pytest.approx(1 / radius, rel=0.01)
+
+
+def test_the_integral_grows_with_the_error_but_not_at_the_limit_of_an_actuator():
+    near, far = (controls_at(x=-d, y=-d / 100)[1].integral[:, 0] for d in (0.5, 2.9))
+    assert near[0] == pytest.approx(0.5 * 0.01 / (GAINS.along_s**2 * GAINS.integral_s), rel=1e-6)
+    assert near[1] == pytest.approx(0.005 * 0.01 / ((10 * GAINS.across_s) ** 2 * GAINS.integral_s), rel=1e-6)
+    assert far[0] == 0.0  # 2.9 m / (0.6 s)^2 is more than full throttle
+    assert far[1] > 0.0
+    aside = controls_at(y=-6.0)[1].integral[:, 0]
+    assert aside[1] == 0.0  # the wheels are at the limit of grip
 
 
 def test_a_vehicle_that_stands_where_it_should_stays_and_one_that_stopped_short_drives_up():

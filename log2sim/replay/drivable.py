@@ -27,20 +27,22 @@ ROLL_M, ROLL_RAD, ROLL_MPS = 1e-3, 1e-3, 1e-2  # how exactly the wheels roll fro
 LOCK_SHARE = 0.95  # the rest of the lock is left to the controller
 BOUND = 0.002  # softness of limits, as a share of them
 
-ITERATIONS = 40
+ITERATIONS, TRIALS = 40, 16
 DONE = 1e-4  # relative gain at which the iteration ends
+SLOWEST_RADPS = 0.01
 STATES = 6  # x, y, yaw, speed, acceleration, curvature
 DAMPED = np.array([1 / POSITION_M, 1 / POSITION_M, 1 / YAW_RAD, 1 / SPEED_MPS, 1.0, 10.0]) ** 2
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a vehicle can do: curvature and its rate in time, acceleration; and where its box center is."""
+    """What a vehicle can do: curvature and its rate in time, acceleration ahead and sideways; and where its box center is."""
 
     offset_m: float
     max_curvature_1pm: float
     max_curvature_rate_1pmps: float
     max_accel_mps2: float
+    max_lateral_mps2: float = 8.0  # of a dry road's grip of 9 m/s2; the rest is left to the controller
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,20 +80,22 @@ def nearest_course(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps
     away = wrap_angle(yaw_rad - axis)
     logged = np.stack([x_m, y_m, axis + away, np.where(np.abs(away) > np.pi / 2, -speed_mps, speed_mps)], axis=1)
     along = np.gradient(x_m, t_s) * np.cos(axis) + np.gradient(y_m, t_s) * np.sin(axis)
-    state = _first_guess(t_s, x_m, y_m, axis, along, limits.offset_m)
+    state = _first_guess(t_s, x_m, y_m, axis, along, limits)
     problem = _Problem(float(t_s[1] - t_s[0]), logged, limits)
-    cost, damping = problem.cost(state), 1e-2
+    residuals = problem.residuals(state)
+    cost, damping = _cost(residuals), 1e-2
     for _ in range(ITERATIONS):
-        diagonal, beside, gradient = problem.normal_equations(state)
-        for _ in range(8):
+        diagonal, beside, gradient = _normal_equations(residuals)
+        for _ in range(TRIALS):
             trial = state - _solve(diagonal, beside, gradient, damping)
-            trial_cost = problem.cost(trial)
-            if trial_cost < cost:
+            residuals = problem.residuals(trial)
+            gain = cost - _cost(residuals)
+            if gain > 0:
                 break
             damping *= 8
         else:
             break
-        gain, state, cost, damping = cost - trial_cost, trial, trial_cost, max(damping / 4, 1e-9)
+        state, cost, damping = trial, cost - gain, max(damping / 4, 1e-9)
         if gain < DONE * cost:
             break
     return Course(t_s, *state.T)
@@ -99,10 +103,7 @@ def nearest_course(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps
 
 def as_logged(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps: Array, limits: Limits) -> Course:
     """The course as the log has it, at times (K,), K >= 1: of a moment, or of a life too long to be fitted."""
-    guess = _first_guess(t_s, x_m, y_m, yaw_rad, speed_mps, limits.offset_m)
-    if len(t_s) > 1:
-        guess[:, 4] = np.gradient(speed_mps, t_s)
-    return Course(t_s, *guess.T)
+    return Course(t_s, *_first_guess(t_s, x_m, y_m, yaw_rad, speed_mps, limits).T)
 
 
 def _axis(yaw: Array) -> Array:
@@ -111,11 +112,18 @@ def _axis(yaw: Array) -> Array:
     return axis + np.pi if np.sum(np.cos(axis - yaw)) < 0 else axis
 
 
-def _first_guess(t_s: Array, x: Array, y: Array, yaw: Array, speed: Array, offset_m: float) -> Array:
-    """Rear axles as the log has them, without acceleration and curvature; (K, 6)."""
+def _first_guess(t_s: Array, x: Array, y: Array, yaw: Array, speed: Array, limits: Limits) -> Array:
+    """Rear axles as the log has them, acceleration and curvature within their limits; (K, 6)."""
     guess = np.zeros((len(t_s), STATES))
-    guess[:, 0], guess[:, 1] = x - offset_m * np.cos(yaw), y - offset_m * np.sin(yaw)
+    guess[:, 0], guess[:, 1] = x - limits.offset_m * np.cos(yaw), y - limits.offset_m * np.sin(yaw)
     guess[:, 2], guess[:, 3] = yaw, speed
+    if len(t_s) > 1:
+        accel, turn = np.gradient(speed, t_s), np.gradient(yaw, t_s)
+        guess[:, 4] = np.clip(accel, -limits.max_accel_mps2, limits.max_accel_mps2)
+        # As a share of the curvature that lock and grip allow, which leaves slow vehicles that turn on the spot at the lock.
+        pace = np.abs(speed)
+        most = limits.max_lateral_mps2 / np.maximum(pace**2, limits.max_lateral_mps2 / limits.max_curvature_1pm)
+        guess[:, 5] = most * np.clip(turn / np.maximum(most * pace, SLOWEST_RADPS), -1, 1) * np.sign(speed)
     return guess
 
 
@@ -127,48 +135,28 @@ class _Problem:
     logged: Array
     limits: Limits
 
-    def cost(self, state: Array) -> float:
-        """Half the sum of squares, the pseudo-Huber loss for headings and speeds."""
-        knot, _ = self._knots(state)
-        roll, _ = self._rolls(state)
-        plain = np.sum(roll**2) + np.sum(knot[:, [0, 1, 4, 5]] ** 2)
-        return float(plain / 2 + np.sum(np.sqrt(1 + knot[:, 2:4] ** 2) - 1))
-
-    def normal_equations(self, state: Array) -> tuple[Array, Array, Array]:
-        """Blocks on the diagonal (K, 6, 6), below it (K - 1, 6, 6) and the gradient (K, 6) of the cost."""
-        r, j = self._knots(state)
-        weight = np.ones_like(r)
-        weight[:, 2:4] = 1 / np.sqrt(1 + r[:, 2:4] ** 2)
-        diagonal = np.einsum("kri,kr,krj->kij", j, weight, j)
-        gradient = np.einsum("kri,kr->ki", j, weight * r)
-        r, j = self._rolls(state)
-        both = np.einsum("kri,krj->kij", j, j)
-        push = np.einsum("kri,kr->ki", j, r)
-        diagonal[:-1] += both[:, :STATES, :STATES]
-        diagonal[1:] += both[:, STATES:, STATES:]
-        gradient[:-1] += push[:, :STATES]
-        gradient[1:] += push[:, STATES:]
-        return diagonal, both[:, STATES:, :STATES], gradient
+    def residuals(self, state: Array) -> Residuals:
+        """Residuals and their derivatives, of the knots and of the ways between them."""
+        return *self._knots(state), *self._rolls(state)
 
     def _knots(self, state: Array) -> tuple[Array, Array]:
-        """Residuals (K, 6) against the log and the limits, and their derivatives (K, 6, 6)."""
+        """Residuals (K, 7) against the log and the limits, and their derivatives (K, 7, 6)."""
         x, y, yaw, speed, accel, curvature = state.T
         o, scale = self.limits.offset_m, np.sqrt(self.h_s / KNOT_S)
         cos, sin = np.cos(yaw), np.sin(yaw)
-        residual = np.zeros((len(state), 6))
-        jacobian = np.zeros((len(state), 6, STATES))
+        residual = np.zeros((len(state), 7))
+        jacobian = np.zeros((len(state), 7, STATES))
         residual[:, 0] = (x + o * cos - self.logged[:, 0]) / POSITION_M
         residual[:, 1] = (y + o * sin - self.logged[:, 1]) / POSITION_M
-        residual[:, 2] = (yaw - self.logged[:, 2]) / YAW_RAD
-        residual[:, 3] = (speed - self.logged[:, 3]) / SPEED_MPS
         jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1 / POSITION_M
         jacobian[:, 0, 2], jacobian[:, 1, 2] = -o * sin / POSITION_M, o * cos / POSITION_M
-        jacobian[:, 2, 2], jacobian[:, 3, 3] = 1 / YAW_RAD, 1 / SPEED_MPS
-        limits = ((4, accel, self.limits.max_accel_mps2), (5, curvature, self.limits.max_curvature_1pm))
-        for c, value, limit in limits:
-            beyond = np.abs(value) - limit
-            residual[:, c] = np.sign(value) * np.maximum(beyond, 0.0) / (BOUND * limit)
-            jacobian[:, c, c] = (beyond > 0) / (BOUND * limit)
+        limits = self.limits
+        residual[:, 2], jacobian[:, 2, 4] = _beyond(accel, limits.max_accel_mps2)
+        residual[:, 3], jacobian[:, 3, 5] = _beyond(curvature, limits.max_curvature_1pm)
+        residual[:, 4], slope = _beyond(speed**2 * curvature, limits.max_lateral_mps2)
+        jacobian[:, 4, 3], jacobian[:, 4, 5] = slope * 2 * speed * curvature, slope * speed**2
+        residual[:, 5], jacobian[:, 5, 2] = (yaw - self.logged[:, 2]) / YAW_RAD, 1 / YAW_RAD
+        residual[:, 6], jacobian[:, 6, 3] = (speed - self.logged[:, 3]) / SPEED_MPS, 1 / SPEED_MPS
         return residual * scale, jacobian * scale
 
     def _rolls(self, state: Array) -> tuple[Array, Array]:
@@ -185,7 +173,7 @@ class _Problem:
                 (rise[:, 2] - h * mean[:, 3] * mean[:, 5]) / ROLL_RAD,
                 (rise[:, 3] - h * mean[:, 4]) / ROLL_MPS,
                 rise[:, 4] / np.sqrt(h * KNOT_S) / JERK_MPS3,
-                rise[:, 5] / np.sqrt(h * KNOT_S) / self._curvature_rate(),
+                rise[:, 5] / np.sqrt(h * KNOT_S) / self._curvature_rate,
             ],
             axis=1,
         )
@@ -201,14 +189,48 @@ class _Problem:
             )
             jacobian[:, 3, end + 4] = -h / 2 / ROLL_MPS
             jacobian[:, 4, end + 4] = sign / np.sqrt(h * KNOT_S) / JERK_MPS3
-            jacobian[:, 5, end + 5] = sign / np.sqrt(h * KNOT_S) / self._curvature_rate()
+            jacobian[:, 5, end + 5] = sign / np.sqrt(h * KNOT_S) / self._curvature_rate
         return residual, jacobian
 
+    @cached_property
     def _curvature_rate(self) -> Array:
         """Standard deviation (K - 1,) of the rate of curvature: by the steering, and by the passengers when fast."""
         pace = np.maximum(np.abs(self.logged[1:, 3]), np.abs(self.logged[:-1, 3]))
         steering = self.limits.max_curvature_rate_1pmps / 2
         return LATERAL_JERK_MPS3 / np.maximum(pace**2, LATERAL_JERK_MPS3 / steering)
+
+
+Residuals = tuple[Array, Array, Array, Array]
+PLAIN, ROBUST = slice(5), slice(5, 7)  # of a knot's residuals; heading and speed count by the pseudo-Huber loss
+
+
+def _cost(residuals: Residuals) -> float:
+    """Half the sum of squares, the pseudo-Huber loss for headings and speeds."""
+    knot, _, roll, _ = residuals
+    plain = np.sum(roll**2) + np.sum(knot[:, PLAIN] ** 2)
+    return float(plain / 2 + np.sum(np.sqrt(1 + knot[:, ROBUST] ** 2) - 1))
+
+
+def _normal_equations(residuals: Residuals) -> tuple[Array, Array, Array]:
+    """Blocks on the diagonal (K, 6, 6), below it (K - 1, 6, 6) and the gradient (K, 6) of the cost."""
+    knot, knot_slopes, roll, roll_slopes = residuals
+    weight = np.ones_like(knot)
+    weight[:, ROBUST] = 1 / np.sqrt(1 + knot[:, ROBUST] ** 2)
+    weighted = (weight[:, :, None] * knot_slopes).transpose(0, 2, 1)
+    diagonal, gradient = weighted @ knot_slopes, (weighted @ knot[:, :, None])[:, :, 0]
+    turned = roll_slopes.transpose(0, 2, 1)
+    both, push = turned @ roll_slopes, (turned @ roll[:, :, None])[:, :, 0]
+    diagonal[:-1] += both[:, :STATES, :STATES]
+    diagonal[1:] += both[:, STATES:, STATES:]
+    gradient[:-1] += push[:, :STATES]
+    gradient[1:] += push[:, STATES:]
+    return diagonal, both[:, STATES:, :STATES], gradient
+
+
+def _beyond(value: Array, limit: float) -> tuple[Array, Array]:
+    """How far values (K,) are beyond a limit of their size, in units of its softness, and the derivative of that."""
+    beyond = value - np.minimum(np.maximum(value, -limit), limit)
+    return beyond / (BOUND * limit), (beyond != 0) / (BOUND * limit)
 
 
 def _solve(diagonal: Array, beside: Array, gradient: Array, damping: float) -> NDArray[np.float64]:

@@ -46,7 +46,7 @@ INTEGRAL_SHARE = 0.2  # of the curvature that lock and grip allow
 MAX_CONTROL_STEP_S = 0.1
 """Longest time for which controls are held: a third of the shortest time in which an error decays."""
 
-CORRECTED_ALONG_M = 2.0  # how far the arc at the reference is trusted beside it
+MAX_ALONG_M = 3.0  # how far the arc at the reference is trusted, and what is made up for at once: at 2.5 m/s
 
 
 def control_step(dt_s: float) -> float:
@@ -101,8 +101,10 @@ def follow_vehicles(
     asked = _rows(wanted[0] * gear, wanted[1])
     given = np.minimum(np.maximum(asked, _rows(-p.max_brake_mps2, -grip)), _rows(p.max_throttle_mps2, grip))
 
-    # Anti-windup: an actuator at its limit learns nothing from more error of the same sign, nor do wheels that stand.
+    # Anti-windup: nothing is learned from more error of the same sign while an actuator is at its limit, from a vehicle
+    # that is far behind and makes up for it, or from wheels that stand.
     learns = (given == asked) | (error * wanted <= 0)
+    learns[0] &= np.abs(error[0]) < MAX_ALONG_M
     learns[1] &= pace > 0
     bound = _rows(INTEGRAL_LIMIT_MPS2, INTEGRAL_SHARE * grip)
     integral = memory.integral + (dt_s / gains.integral_s) * pull * learns
@@ -125,9 +127,9 @@ def _errors(row: Array, state: VehicleState) -> tuple[Array, Array]:
     cos, sin = cos_sin(yaw)
     dx, dy = x - state.x_m, y - state.y_m
     along = cos * dx + sin * dy
-    back = np.minimum(np.maximum(along, -CORRECTED_ALONG_M), CORRECTED_ALONG_M)
-    turn = curvature * back
-    across = cos * dy - sin * dx + turn * back / 2
+    along = np.minimum(np.maximum(along, -MAX_ALONG_M), MAX_ALONG_M)
+    turn = curvature * along
+    across = cos * dy - sin * dx + turn * along / 2
     _, slope = cos_sin(yaw - turn - state.yaw_rad)
     return _rows(along, across), _rows(speed - state.speed_mps, slope)
 
@@ -155,7 +157,7 @@ def start_vehicles(row: Array, parameters: VehicleParameters) -> VehicleState:
     angle = np.arctan(parameters.wheelbase_m * curvature * (1 + parameters.understeer_s2pm2 * speed**2))
     steer = np.minimum(np.maximum(angle, -parameters.max_steer_rad), parameters.max_steer_rad)
     pedal = np.minimum(np.maximum(accel * gear, -parameters.max_brake_mps2), parameters.max_throttle_mps2)
-    speed = np.where(stands > 0.5, 0.0, speed)
+    speed, pedal = np.where(stands > 0.5, 0.0, [speed, pedal])
     rate = speed * curvature
     lateral = -rate * speed * np.abs(speed) / (GRAVITY_MPS2 * parameters.friction * parameters.rear_stiffness_1prad)
     return VehicleState(x.copy(), y.copy(), yaw.copy(), speed, steer, pedal, lateral, rate)

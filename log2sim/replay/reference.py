@@ -42,7 +42,7 @@ class Reference:
     flags: tuple[str, ...] = ()
 
 
-VEHICLE_COLUMNS = ("x", "y", "yaw", "speed", "accel_ahead", "curvature_ahead", "gear", "stands")
+VEHICLE_COLUMNS = ("x", "y", "yaw", "speed", "accel_ahead", "curvature_ahead", "gear_ahead", "stands_ahead")
 POINT_COLUMNS = ("x", "y", "yaw", "velocity_x", "velocity_y", "accel_x", "accel_y", "stands")
 
 
@@ -64,7 +64,7 @@ def vehicle_reference(
         rows[:4] = _motion(course, at_s)
         rows[4] = np.interp(at_s + accel_ahead_s, course.t_s, course.accel_mps2)
         rows[5] = np.interp(at_s + curvature_ahead_s, course.t_s, course.curvature_1pm)
-        k = np.minimum(np.searchsorted(t, at_s), len(t) - 1)
+        k = np.minimum(np.searchsorted(t, at_s + accel_ahead_s), len(t) - 1)
         rows[6], rows[7] = gear[k], stands[k]
         return rows.T
 
@@ -114,11 +114,11 @@ def point_reference(path: Path) -> Reference:
     """The table of a point: velocity and acceleration of the smoothed course, on map axes."""
     first, t = _grid(path)
     x, y, yaw, logged_speed = _extended(path, t)
-    if len(t) > 1:
-        vx, vy = _smooth(np.gradient(x, GRID_S)), _smooth(np.gradient(y, GRID_S))
-        ax, ay = np.gradient(vx, GRID_S), np.gradient(vy, GRID_S)
-    else:
-        vx, vy, ax, ay = logged_speed * np.cos(yaw), logged_speed * np.sin(yaw), np.zeros(1), np.zeros(1)
+    vx, vy, ax, ay = logged_speed * np.cos(yaw), logged_speed * np.sin(yaw), np.zeros(len(t)), np.zeros(len(t))
+    for piece in np.split(np.arange(len(t)), np.searchsorted(t, path.jump_times())):
+        if len(piece) > 1:
+            vx[piece], vy[piece] = (_smooth(np.gradient(c[piece], GRID_S)) for c in (x, y))
+            ax[piece], ay[piece] = np.gradient(vx[piece], GRID_S), np.gradient(vy[piece], GRID_S)
     stands = (np.hypot(vx, vy) < STANDSTILL_MPS).astype(np.float64)
 
     def exact(at_s: Array) -> Array:
