@@ -37,7 +37,7 @@ SIZE_DIFFERS_M = 0.1
 
 # The controller of log2sim's own simulator: time constants in s, lengths in m.
 ALONG_S, ACROSS_S, ACROSS_MIN_M, INTEGRAL_S, FILTER_S, DAMPING = 0.6, 0.6, 1.5, 4.0, 0.05, 1.0
-HOLD_WITHIN_M, HOLD_BRAKE_MPS2, GRIP_MPS2, INTEGRAL_MPS2, CORRECTED_ALONG_M = 0.1, 2.0, 9.0, 1.0, 2.0
+HOLD_WITHIN_M, HOLD_BRAKE_MPS2, GRIP_MPS2, INTEGRAL_MPS2, MAX_ALONG_M = 0.1, 2.0, 9.0, 1.0, 3.0
 AHEAD_S = 0.1  # how far feed-forward runs ahead: the lag of pedals and steering
 WALKER_S = 0.3
 
@@ -179,10 +179,9 @@ class Follower:
         """
         x, y, yaw, course_speed, accel, curvature, course_gear, stands = wanted
         dx, dy = x - at[0], y - at[1]
-        along = math.cos(yaw) * dx + math.sin(yaw) * dy
-        back = clamp(along, -CORRECTED_ALONG_M, CORRECTED_ALONG_M)
-        across = math.cos(yaw) * dy - math.sin(yaw) * dx + curvature * back**2 / 2
-        slope = math.sin(yaw - curvature * back - at[2])
+        along = clamp(math.cos(yaw) * dx + math.sin(yaw) * dy, -MAX_ALONG_M, MAX_ALONG_M)
+        across = math.cos(yaw) * dy - math.sin(yaw) * dx + curvature * along**2 / 2
+        slope = math.sin(yaw - curvature * along - at[2])
         blend = -math.expm1(-dt_s / FILTER_S)
         self.along_rate += blend * (course_speed - speed - self.along_rate)
         self.across_slope += blend * (slope - self.across_slope)
@@ -197,7 +196,8 @@ class Follower:
         if held:
             self.along_integral = 0.0
             return -HOLD_BRAKE_MPS2
-        if limited == wanted * gear or along * wanted <= 0:  # at its limit an actuator learns nothing from more error
+        # At its limit an actuator learns nothing from more error, nor does a vehicle that is far behind.
+        if abs(along) < MAX_ALONG_M and (limited == wanted * gear or along * wanted <= 0):
             grown = self.along_integral + along * dt_s / (ALONG_S**2 * INTEGRAL_S)
             self.along_integral = clamp(grown, -INTEGRAL_MPS2, INTEGRAL_MPS2)
         return limited
