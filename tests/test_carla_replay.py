@@ -13,6 +13,7 @@ import pytest
 from carla_courses import SIZES, agent, left_turn, of
 from command_line import run
 
+from log2sim import Config, open_log, reconstruct
 from log2sim.errors import ConfigError, MissingExtra
 from log2sim.replay import Controls, Replay, replay
 from log2sim.scenario import Scenario
@@ -54,6 +55,17 @@ def test_vehicles_follow_in_carla_as_in_the_shim(server: Client) -> None:
         assert one.model == ("carla" if other.model == "kinematic" else other.model)
         np.testing.assert_array_equal(one.t_s, other.t_s)
         np.testing.assert_array_equal(one.z_m, other.z_m)
+
+
+@pytest.mark.slow
+@pytest.mark.real
+@pytest.mark.parametrize("log", ["sample", "pandaset", "kitti_tracking"])
+def test_reconstructed_logs_are_followed_in_carla(log: str, server: Client, request: pytest.FixtureRequest) -> None:
+    folder = SAMPLE.parent if log == "sample" else request.getfixturevalue("real_data") / log
+    made = reconstruct(open_log(folder), Config.load(detect={"name": "labels"})).scenario
+    metrics = in_carla(made).metrics
+    assert metrics["cross_track_max_m"] < 0.3
+    assert metrics["cross_track_rms_m"] < 0.05
 
 
 def test_what_is_stored_is_what_carla_shows(server: Client) -> None:

@@ -37,7 +37,8 @@ SIZE_DIFFERS_M = 0.1
 
 # The controller of log2sim's own simulator: time constants in s, lengths in m.
 ALONG_S, ACROSS_S, ACROSS_MIN_M, INTEGRAL_S, FILTER_S, DAMPING = 0.6, 0.6, 1.5, 4.0, 0.05, 1.0
-HOLD_WITHIN_M, HOLD_BRAKE_MPS2, GRIP_MPS2, INTEGRAL_MPS2, MAX_ALONG_M = 0.1, 2.0, 9.0, 1.0, 3.0
+HOLD_WITHIN_M, HOLD_BRAKE_MPS2, GRIP_MPS2, MAX_ALONG_M = 0.1, 2.0, 9.0, 3.0
+INTEGRAL_MPS2, INTEGRAL_SHARE = 1.0, 0.2  # limits of the integrals, the latter as a share of the curvature with grip
 AHEAD_S = 0.1  # how far feed-forward runs ahead: the lag of pedals and steering
 WALKER_S = 0.3
 
@@ -191,6 +192,7 @@ class Follower:
         return pedal, self._curvature(across, gear * self.across_slope, curvature, speed, dt_s), course_gear < 0
 
     def _pedal(self, along: float, accel: float, gear: float, held: bool, dt_s: float) -> float:
+        """Pedal in m/s2: PID on the error along the path; the brake is held while the course stands."""
         wanted = accel + along / ALONG_S**2 + 2 * DAMPING * self.along_rate / ALONG_S + self.along_integral
         limited = clamp(wanted * gear, -self.max_brake, self.max_throttle)
         if held:
@@ -203,13 +205,14 @@ class Follower:
         return limited
 
     def _curvature(self, across: float, slope: float, curvature: float, speed: float, dt_s: float) -> float:
+        """Curvature in 1/m: PID on the error across the path, within lock and grip."""
         length = max(abs(speed) * ACROSS_S, ACROSS_MIN_M)
         wanted = curvature + across / length**2 + 2 * DAMPING * slope / length + self.across_integral
         grip = GRIP_MPS2 / max(speed**2, GRIP_MPS2 / self.max_curvature)
         limited = clamp(wanted, -grip, grip)
         if speed != 0 and (limited == wanted or across * wanted <= 0):
             self.across_integral += across * dt_s / (length**2 * INTEGRAL_S)
-        self.across_integral = clamp(self.across_integral, -0.2 * grip, 0.2 * grip)
+        self.across_integral = clamp(self.across_integral, -INTEGRAL_SHARE * grip, INTEGRAL_SHARE * grip)
         return limited
 
 
