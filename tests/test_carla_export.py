@@ -223,7 +223,7 @@ def drift_m(client: Any, agent: Agent, role: str, dt_s: float, begin_s: float = 
 
 
 def test_exact_agents_are_where_the_log_has_them_at_every_tick(play: Any, scenario: Scenario) -> None:
-    """carla#5190, #968: the box itself, whatever the origin of the asset, at every tick and without drift."""
+    """carla#5190, #5615, #968, #8636: the box itself, whatever the origin of the asset, at every tick and without drift."""
     code, client = play(scenario, "--mode", "exact")
     assert code == 0
     for logged in scenario.agents:
@@ -511,7 +511,7 @@ def along_the_road(sideways_m: float = 0.0) -> Agent:
 
 
 def test_a_world_is_made_from_opendrive_and_heights_are_its_roads(play: Any, tmp_path: Path) -> None:
-    """metadrive#716, autoware_universe#13232: a car of a log whose heights are off stands on the map's road."""
+    """carla#9235, metadrive#716, autoware_universe#13232: a car of a log whose heights are off stands on the map's road."""
     (tmp_path / "road.xodr").write_text(ROAD)
     driving = along_the_road()
     sunk = replace(driving, waypoints=replace(driving.waypoints, z_m=driving.waypoints.z_m - 3.0))
@@ -531,6 +531,34 @@ def test_a_map_elsewhere_is_said(play: Any, carla: ModuleType, capsys: pytest.Ca
     assert client.loaded == ["Town03"]
     assert code == 2
     assert "agent 'ego': no road within 30 m of its place" in capsys.readouterr().err
+    assert client.world.applied[-1] == (False, None)
+
+
+def test_what_stands_off_the_map_stays_at_its_height(play: Any, carla: ModuleType) -> None:
+    parked = replace(along_the_road(80.0), id="parked", static=True)
+    code, client = play(of(along_the_road(), parked), "--mode", "pid", ground="map", road=carla.Map("line", ROAD))
+    assert code == 0
+    assert client.world.seen[0]["parked"][2] == pytest.approx(parked.waypoints.z_m[0] - 0.8, abs=1e-3)
+
+
+def test_a_car_without_a_road_below_is_named(play: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    """metadrive#716: instead of cars that sink without a word."""
+
+    def drop(client: Any) -> None:
+        tick = client.world.tick
+
+        def ticking() -> int:
+            count = int(tick())
+            for actor in client.world.actors.values():
+                x, y, z, yaw = actor.pose
+                actor.pose = (x, y, z - 0.3 * count, yaw)
+            return count
+
+        client.world.tick = ticking
+
+    code, client = play(of(left_turn()), "--mode", "pid", prepare=drop)
+    assert code == 4
+    assert "agent 'ego' fell" in capsys.readouterr().err
     assert client.world.applied[-1] == (False, None)
 
 

@@ -150,7 +150,7 @@ class CarlaSimulator:
         if body is None or self._read.get(name) != (state.x_m[slot], state.y_m[slot]):
             x, y = self._to_carla(group, slot, float(state.x_m[slot]), float(state.y_m[slot]))
             center = (x + offset_m * math.cos(yaw), y + offset_m * math.sin(yaw))
-            place = self._player.grounded(self._data[name], (*center, self._height(name, step), yaw))
+            place = self._player.grounded(self._data[name], (*center, self._height(name, step), yaw), falls=True)
             body = body or self.stage.spawn(self._data[name], place, True)
             velocity = self.carla.Vector3D(speed * math.cos(yaw), speed * math.sin(yaw), 0.0)
             yield command.ApplyTransform(body.actor.id, body.transform(*place))
@@ -186,7 +186,8 @@ class CarlaSimulator:
         for slot in self._present(group, step):
             i = group.live[slot]
             name, o = group.agents[i].id, float(group.offset_m[i])
-            at_x, at_y, _, at_yaw, now = self.stage.bodies[name].pose()
+            at_x, at_y, at_z, at_yaw, now = self.stage.bodies[name].pose()
+            self._player.require_ground(self._data[name], at_z, self._courses[name].place(self.clock.time(step)))
             at = self._from_carla(group, slot, at_x - o * math.cos(at_yaw), at_y - o * math.sin(at_yaw))
             x[slot], y[slot] = self._read[name] = at
             yaw[slot] = -at_yaw

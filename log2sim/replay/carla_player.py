@@ -357,7 +357,7 @@ class Player:
         body, course = self.stage.bodies.get(name), self.courses.get(name, self.logged[name])
         vx, vy = self._velocity(agent, t_s)
         if body is None or self._leaps(agent, now_s):
-            x, y, z, yaw = self.grounded(agent, course.place(t_s))
+            x, y, z, yaw = self.grounded(agent, course.place(t_s), falls=True)
             speed = math.hypot(vx, vy)
             if name in self.courses:  # differences of positions would let a standing vehicle start with a jerk
                 speed, stands = course.at(t_s, "speed_mps", "stands")
@@ -384,14 +384,9 @@ class Player:
     def _found(self, agent: dict[str, Any], body: Body, t_s: float) -> Place:
         """Where physics has brought an agent: box center x, y, yaw and speed."""
         x, y, z, yaw, speed = body.pose()
-        logged_x, logged_y, logged_z, _ = self.grounded(agent, self.logged[agent["id"]].place(t_s))
-        if z < logged_z - FALLEN_M:
-            raise ReplayError(
-                f"agent '{agent['id']}' fell {logged_z - z:.0f} m: there is no road below it; give the map that the log was "
-                "driven on (--map, --opendrive), or --mode exact",
-                4,
-            )
-        self.drift_m.setdefault(agent["id"], []).append(math.hypot(x - logged_x, y - logged_y))
+        logged = self.logged[agent["id"]].place(t_s)
+        self.require_ground(agent, z, logged)
+        self.drift_m.setdefault(agent["id"], []).append(math.hypot(x - logged[0], y - logged[1]))
         return x, y, yaw, speed
 
     def _wanted(self, course: Course, axle_m: float, t_s: float) -> tuple[float, ...]:
@@ -425,18 +420,32 @@ class Player:
         """Whether the log leaps within the tick that begins at a time."""
         return any(t_s + MARGIN_S < leap_s <= t_s + self.stage.dt_s + MARGIN_S for leap_s in agent["leaps_s"])
 
-    def grounded(self, agent: dict[str, Any], place: Place) -> Place:
-        """The place at the height of the nearest road, or as logged."""
+    def grounded(self, agent: dict[str, Any], place: Place, *, falls: bool = False) -> Place:
+        """The place at the height of the nearest road; as logged where there is none near, unless the agent `falls` then."""
         if self._map is None:
             return place
         x, y, z, yaw = place
         road = self._map.get_waypoint(self.carla.Location(x, y, z), True, self.carla.LaneType.Any)
-        if road is None or math.hypot(road.transform.location.x - x, road.transform.location.y - y) > ROAD_WITHIN_M:
+        if road is not None:
+            at = road.transform.location
+            if math.hypot(at.x - x, at.y - y) <= ROAD_WITHIN_M:
+                return x, y, at.z, yaw
+        if falls:
             raise ReplayError(
                 f"agent '{agent['id']}': no road within {ROAD_WITHIN_M:g} m of its place at {x:.1f}, {y:.1f}; give the map that "
                 "the log was driven on (--map, --opendrive), or --ground log"
             )
-        return x, y, road.transform.location.z, yaw
+        return place
+
+    def require_ground(self, agent: dict[str, Any], z: float, place: Place) -> None:
+        """Raise `ReplayError` for an agent whose lowest face is far below its place."""
+        below_m = self.grounded(agent, place)[2] - z
+        if below_m > FALLEN_M:
+            raise ReplayError(
+                f"agent '{agent['id']}' fell {below_m:.0f} m: there is no road below it; give the map that the log was driven "
+                "on (--map, --opendrive), or --mode exact",
+                4,
+            )
 
 
 def behind(x: float, y: float, yaw: float, way_m: float) -> tuple[float, float]:
