@@ -467,6 +467,12 @@ def test_a_server_without_the_asset_gets_the_next_one_or_a_clear_error(
     assert "agent 'ego': this server has none of vehicle.toyota.prius" in capsys.readouterr().err
 
 
+def test_versions_that_differ_are_noted(play: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    code, _ = play(of(left_turn()), prepare=lambda client: setattr(client, "get_server_version", lambda: "0.9.15"))
+    assert code == 0
+    assert "note: the server is CARLA 0.9.15, this client 0.9.16" in capsys.readouterr().out
+
+
 def test_the_spectator_is_behind_the_ego(play: Any) -> None:
     _, client = play(of(left_turn()))
     at = client.world.spectator.at

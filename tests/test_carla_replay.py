@@ -15,6 +15,7 @@ from command_line import run
 
 from log2sim import Config, open_log, reconstruct
 from log2sim.errors import ConfigError, MissingExtra
+from log2sim.export import export
 from log2sim.replay import Controls, Replay, replay
 from log2sim.scenario import Scenario
 
@@ -25,8 +26,24 @@ import carla_server
 from carla_server import Client
 
 from log2sim.replay.carla import CarlaSimulator
+from log2sim.replay.carla import Server as CarlaServer
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "own"),
+    [
+        (carla_server.Client, carla.Client, set()),
+        (carla_server.World, carla.World, set()),
+        (carla_server.Actor, carla.Vehicle, {"put", "center", "advance"}),
+        (carla_server.Blueprint, carla.ActorBlueprint, set()),
+        (carla_server.Library, carla.BlueprintLibrary, set()),
+    ],
+)
+def test_the_stand_in_answers_to_nothing_that_the_client_lacks(ours: type, theirs: type, own: set[str]) -> None:
+    invented = {n for n, v in vars(ours).items() if callable(v) and not n.startswith("_")} - set(dir(theirs)) - own
+    assert invented == set()
 
 
 @pytest.fixture
@@ -167,6 +184,17 @@ def test_far_from_the_origin_is_the_same(server: Client) -> None:
     assert max(abs(v) for seen in server.world.seen for at in seen.values() for v in at[:2]) < 1000
 
 
+@pytest.mark.parametrize("at", [(0.0, 0.0), (4.6e5, 300.0), (4.6e5, 5.41e6)])
+def test_the_road_of_an_export_is_under_the_agents(at: tuple[float, float], server: Client, tmp_path: Path) -> None:
+    made = of(left_turn(at=at))
+    export(made, "carla", tmp_path)
+    in_carla(made, host=CarlaSimulator(CarlaServer(opendrive=tmp_path / "road.xodr")))
+    for seen in server.world.seen[:-1]:
+        x, y, z, _ = seen["hero"]
+        road = server.world.road.get_waypoint(carla.Location(x, y, z)).transform.location
+        assert math.hypot(road.x - x, road.y - y) < 0.3
+
+
 def test_a_policy_drives_the_ego_in_carla(server: Client) -> None:
     """carla#8637: something that interacts, put into a recorded scene."""
     sample = Scenario.load(SAMPLE)
@@ -200,10 +228,8 @@ def test_a_long_step_is_refused(server: Client) -> None:
 
 
 def test_no_server_is_said_with_what_to_do() -> None:
-    from log2sim.replay.carla import Server
-
     with pytest.raises(ConfigError, match=r"CARLA: no CARLA server answers at 127\.0\.0\.1:1 within 0\.5 s"):
-        in_carla(of(left_turn()), host=CarlaSimulator(Server(port=1, timeout_s=0.5)))
+        in_carla(of(left_turn()), host=CarlaSimulator(CarlaServer(port=1, timeout_s=0.5)))
 
 
 def test_without_the_client_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

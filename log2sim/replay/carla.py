@@ -221,11 +221,10 @@ class CarlaSimulator:
 
 
 def _offset_m(agents: Sequence[Agent]) -> tuple[float, float]:
-    """Whole kilometers x, y that bring all agents near CARLA's origin; zero while they are."""
-    first: Array = np.array([[a.waypoints.x_m[0], a.waypoints.y_m[0]] for a in agents])
-    if np.abs(first).max() <= NEAR_M:
-        return 0.0, 0.0
-    x, y = np.round((first.min(axis=0) + first.max(axis=0)) / 2 / STEP_M) * STEP_M
+    """Whole kilometers x, y that bring all agents near CARLA's origin, zero while they are: as for the roads of an export."""
+    xy: Array = np.concatenate([np.column_stack([a.waypoints.x_m, a.waypoints.y_m]) for a in agents])
+    middle = (xy.min(axis=0) + xy.max(axis=0)) / 2
+    x, y = np.where(np.abs(xy).max(axis=0) > NEAR_M, np.round(middle / STEP_M) * STEP_M, 0.0)
     return float(x), float(y)
 
 

@@ -477,16 +477,22 @@ def connect(carla: ModuleType, host: str, port: int, timeout_s: float) -> Any:
     client = carla.Client(host, port)
     client.set_timeout(timeout_s)
     try:
-        server, own = client.get_server_version(), client.get_client_version()
+        client.get_server_version()
     except RuntimeError as error:
         raise ReplayError(
             f"no CARLA server answers at {host}:{port} within {timeout_s:g} s ({error}); start one (CarlaUE4.sh), or give its "
             "--host and --port",
             3,
         ) from None
-    if server != own:
-        say(f"note: the server is CARLA {server}, this client {own}; install carla=={server} if something fails")
     return client
+
+
+def version_note(client: Any) -> list[str]:
+    """What to know when server and client are of different versions."""
+    server, own = client.get_server_version(), client.get_client_version()
+    if server == own:
+        return []
+    return [f"note: the server is CARLA {server}, this client {own}; install carla=={server} if something fails"]
 
 
 def open_world(carla: ModuleType, client: Any, town: str | None, opendrive: Path | None) -> Any:
@@ -612,7 +618,7 @@ def run(words: Sequence[str] | None = None) -> None:
         ground = args.ground or ("map" if mode == "pid" else "log")
         player = Player(stage, data, mode, physics=args.physics, ground=ground)
         play(player, data, follow=args.follow, pace=args.pace)
-    for note in stage.notes:
+    for note in version_note(client) + stage.notes:
         say(note)
     if player.drift_m:
         say(drift_table(player.drift_m))
