@@ -205,6 +205,20 @@ def test_a_policy_drives_the_ego_in_carla(server: Client) -> None:
     assert np.hypot(driven.x_m[-1] - driven.x_m[0], driven.y_m[-1] - driven.y_m[0]) < 1.0
 
 
+@pytest.mark.parametrize("mode", ["pid", "exact"])
+def test_reactive_agents_react_in_carla(server: Client, mode: str) -> None:
+    """carla#8637: who follows an ego that stops does not drive into it, and is shown where it is stored."""
+    t = np.arange(0.0, 8.01, 0.1)
+    ego, behind = (agent(name, t, x + 6.0 * t, 0.0, 0.0, 6.0) for name, x in (("ego", 15.0), ("behind", 0.0)))
+    replayed = in_carla(of(ego, behind), ego=lambda seen: Controls(-4.0, 0.0), agents="reactive", mode=mode)
+    assert replayed.metrics["collisions"] == []
+    last = replayed.agent("behind")
+    assert last.driver == "reactive"
+    assert last.x_m[-1] < replayed.agent("ego").x_m[-1]
+    for row in range(1, len(last)):
+        assert server.world.seen[row - 1]["behind"][0] == pytest.approx(last.x_m[row], abs=0.02)
+
+
 @pytest.mark.parametrize("problem", [KeyboardInterrupt, RuntimeError("time-out of 60000ms")])
 def test_the_world_is_left_as_it_was(server: Client, problem: Any) -> None:
     tick = server.world.tick

@@ -104,7 +104,7 @@ def test_60_mps_straight_on(dt_s):
 def test_60_mps_in_a_wide_curve(dt_s):
     outside, late = off_circle(followed(on_circle(60.0, 600.0, 20.0), dt_s=dt_s), 60.0, 600.0)
     assert np.abs(outside).max() < 0.1  # 6 m/s2 sideways, two thirds of the grip
-    assert np.abs(late).max() < 0.05
+    assert np.abs(late).max() < 0.1
 
 
 # Directions and limits.

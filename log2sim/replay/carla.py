@@ -19,7 +19,7 @@ from log2sim.errors import ConfigError, MissingExtra
 from log2sim.geometry import Array
 from log2sim.replay import carla_player as player
 from log2sim.replay.carla_data import carla_agents
-from log2sim.replay.rollout import Clock
+from log2sim.replay.clock import Clock
 from log2sim.replay.vehicle import (
     PointControls,
     PointState,
@@ -28,7 +28,7 @@ from log2sim.replay.vehicle import (
     VehicleState,
     step_point,
 )
-from log2sim.replay.world import Crowd, Fleet, Group
+from log2sim.replay.world import Crowd, Fleet, Group, Tape
 from log2sim.scenario import Agent
 
 NEAR_M, STEP_M = 8192.0, 1000.0  # float32 steps by 1 mm beyond; whole kilometers are taken off
@@ -83,10 +83,10 @@ class CarlaSimulator:
             When no server answers, or it cannot load the world.
         """
         self.clock = clock
-        driven = [a for g in groups if isinstance(g, (Fleet, Crowd)) for a in g.agents]
-        placed = [a for g in groups if not isinstance(g, (Fleet, Crowd)) for a in g.agents] + list(statics)
-        self.offset_m = _offset_m(driven + placed)
-        data = {d["id"]: d for d in carla_agents([_shifted(a, self.offset_m) for a in driven + placed])}
+        everybody = [a for g in groups for a in g.agents] + list(statics)
+        taped = [a for g in groups if isinstance(g, Tape) and g.keeps_time for a in g.agents] + list(statics)
+        self.offset_m = _offset_m(everybody)
+        data = {d["id"]: d for d in carla_agents([_shifted(a, self.offset_m) for a in everybody])}
         self._data, self._courses = data, {k: player.Course(d["exact"]) for k, d in data.items()}
         self._read: dict[str, tuple[float, float]] = {}
         with _own_errors():
@@ -95,10 +95,11 @@ class CarlaSimulator:
             world = player.open_world(carla, client, self.server.town, self.server.opendrive)
             self.carla, self.stage = carla, player.Stage(carla, client, world, clock.dt_s)
             ground = "log" if self.server.town is None and self.server.opendrive is None else "map"
-            shown = {"agents": [data[a.id] for a in placed]}
+            shown = {"agents": [data[a.id] for a in taped]}
             self._player = player.Player(self.stage, shown, "exact", physics=False, ground=ground)
         self._fleets = [(g, _Seat()) for g in groups if isinstance(g, Fleet)]
         self._crowds = [(g, _Seat()) for g in groups if isinstance(g, Crowd)]
+        self._delayed = [g for g in groups if isinstance(g, Tape) and not g.keeps_time]
         for fleet, seat in self._fleets:
             fleet.simulator = seat
         for crowd, seat in self._crowds:
@@ -117,6 +118,8 @@ class CarlaSimulator:
                     commands += self._drive(fleet, seat, slot, step)
             for crowd, seat in crowds:
                 commands += self._walk(crowd, seat, step)
+            for tape in self._delayed:
+                commands += self._show(tape, step)
             self.stage.send(commands)
             self.stage.world.tick()
             for fleet, seat in fleets:
@@ -176,6 +179,21 @@ class CarlaSimulator:
                 yield self.carla.command.ApplyTransform(body.actor.id, body.transform(*place))
             if walks:
                 yield self._player.walk(body, (goal_x - x) / dt_s, (goal_y - y) / dt_s, yaw)
+
+    def _show(self, group: Tape, step: int) -> Iterator[Any]:
+        """Commands that put agents on their logged way, where they are later than the log."""
+        now, dt_s = group.snapshot(), self.clock.dt_s
+        for slot in self._present(group, step):
+            name, yaw, speed = group.agents[group.live[slot]].id, -float(now.yaw_rad[slot]), float(now.speed_mps[slot])
+            x, y = float(now.x_m[slot]) - self.offset_m[0], -float(now.y_m[slot]) + self.offset_m[1]
+            vx, vy = speed * math.cos(yaw), speed * math.sin(yaw)
+            walks = self._data[name]["drive"] == "walker"
+            at = (x, y) if walks else (x + vx * dt_s, y + vy * dt_s)
+            place = self._player.grounded(self._data[name], (*at, self._height(name, step), yaw))
+            body = self.stage.bodies.get(name) or self.stage.spawn(self._data[name], place, False)
+            yield self.carla.command.ApplyTransform(body.actor.id, body.transform(*place))
+            if walks:
+                yield self._player.walk(body, vx, vy, yaw)
 
     def _read_fleet(self, group: Fleet, seat: _Seat, step: int) -> None:
         """Take over from CARLA where the vehicles are; what it does not tell, actuators, are the commands."""
