@@ -467,6 +467,48 @@ def test_a_layer_that_is_not_there_has_no_button(browser: Browser, tmp_path: Pat
     assert not pressed(browser, "follow")  # there is nobody to follow
 
 
+def test_collisions_of_the_replay_are_marked_and_visited(browser: Browser, tmp_path: Path) -> None:
+    scenario = made(agent("ego", np.linspace(0, 20, 5), 0.0), agent("car", np.linspace(20, 0, 5), 0.5, yaw_rad=np.pi))
+    replayed = replay(scenario, mode="exact", dt_s=0.1)
+    (event,) = replayed.metrics["collisions"]  # both at 10 m after 2 s, bumpers 0.4 s before
+    assert (event["t_s"], event["until_s"]) == pytest.approx((1.6, 2.4), abs=0.06)
+    later = {**event, "t_s": 3.0, "until_s": 3.1, "agents": ["car"], "in_log": False}
+    metrics = {**replayed.metrics, "collisions": [event, later]}
+    write_page(scenario, tmp_path / "page.html", replay=replace(replayed, metrics=metrics))
+    opened(browser, tmp_path / "page.html")
+    marks = browser.run("return [...document.querySelectorAll('#events button')].map((b) => [b.className, b.title])")
+    assert marks == [
+        ["known", f"ego and car collide at {event['t_s']:.2f} s, in the log too"], ["new", "car collide at 3.00 s"],
+    ]  # fmt: skip
+    browser.press("e")
+    assert time_of(browser) == pytest.approx(event["t_s"], abs=1e-4)
+    assert browser.run("return log2sim.chosen") == "ego"
+    browser.press("e")
+    assert (time_of(browser), browser.run("return log2sim.chosen")) == (3.0, "car")
+    browser.press("e")
+    assert time_of(browser) == pytest.approx(event["t_s"], abs=1e-4)
+    box = browser.run("return document.querySelector('#events .new').getBoundingClientRect().toJSON()")
+    browser.mouse((box["x"] + box["width"] / 2, box["y"] + box["height"] - 3))
+    assert time_of(browser) == 3.0
+    browser.run("log2sim.choose(null)")
+    scale = browser.run("return log2sim.pixelsPerMeter")
+    below = place_of(browser, "car") + np.array([1.2 * scale, scale + 3.5])
+    colors = [pixel(browser, below + np.array([0, k])) for k in (-1, 0, 1)]
+    assert any(np.abs(np.subtract(c, rgb("#C62828"))).max() < 60 for c in colors)
+
+
+def test_plots_show_how_far_truth_and_replay_are(browser: Browser, tmp_path: Path) -> None:
+    ways = {
+        name: agent("ego", np.linspace(0, 20, 5), y) for name, y in (("log", 0.0), ("truth", 0.25), ("replay", -1.5))
+    }
+    layers = {"truth": made(ways["truth"]), "replay": replay(made(ways["replay"]), mode="exact", dt_s=0.1)}
+    write_page(made(ways["log"]), tmp_path / "page.html", **layers)
+    opened(browser, tmp_path / "page.html", "#t=1.7&agent=ego")
+    pixel(browser, np.zeros(2))
+    shown = "return [...document.querySelectorAll('figure')].map((f) => f.hidden ? null : f.querySelector('output').textContent)"
+    assert browser.run(shown) == ["5.00 m/s · 18 km/h", None, "0.25 m · 1.50 m"]
+
+
 def test_the_list_is_searched(browser: Browser, sample: Path) -> None:
     opened(browser, sample)
     shown = "return [...document.querySelectorAll('#agents .id')].map((e) => e.textContent)"

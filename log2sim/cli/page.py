@@ -20,7 +20,7 @@ def view(
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Make a page that plays a scenario in a browser, with nothing from outside."""
+    """Make a page that plays a scenario in a browser."""
     from log2sim.cli.judge import load_truth
     from log2sim.files import check_targets
     from log2sim.replay import Replay

@@ -20,8 +20,9 @@ const sharpPen = (canvas) => {
 };
 
 class Chart {
-  // seek: called with a time when the plot is clicked or dragged on.
-  constructor(parent, title, begin, end, seek) {
+  // least: height of the axis at least; seek: called with a time when the plot is clicked or dragged on.
+  constructor(parent, title, least, { begin, end }, seek) {
+    this.least = least;
     this.begin = begin;
     this.end = Math.max(end, begin + 1e-3);
     this.figure = element("figure");
@@ -56,7 +57,7 @@ class Chart {
     this.figure.hidden = series.length === 0;
     if (this.figure.hidden || !this.canvas.clientWidth) return;
     const pen = sharpPen(this.canvas), height = this.canvas.clientHeight;
-    let low = 0, high = 1;
+    let low = 0, high = this.least;
     for (const { v } of series) {
       for (let k = 0; k < v.length; k++) {
         low = Math.min(low, v[k]);

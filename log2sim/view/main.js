@@ -5,7 +5,8 @@ let fitted = false;
 
 const choose = (track) => {
   state.chosen = track;
-  side.choose(track);
+  list.choose(track);
+  details.choose(track);
   drawLife();
   remember();
   wake();
@@ -76,7 +77,7 @@ const resize = () => {
     fit();
     fitted = true;
   }
-  if (state.chosen) side.describe(state.chosen);
+  details.show();
   drawLife();
   draw(performance.now());
 };
@@ -85,7 +86,7 @@ const listen = () => {
   const buttons = {
     play: () => (state.playing ? pause() : play()), slower: () => setRate(-1), faster: () => setRate(1), fit,
     "zoom-in": () => zoom(1.5), "zoom-out": () => zoom(1 / 1.5), follow: () => follow(!state.follow),
-    "help-toggle": () => byId("help").showModal(), "list-toggle": showList,
+    "help-toggle": () => byId("help").showModal(), deselect: () => choose(null), "list-toggle": showList,
   };
   for (const [id, run] of Object.entries(buttons)) byId(id).addEventListener("click", run);
   byId("scrub").addEventListener("input", (event) => seek(event.target.valueAsNumber));
@@ -101,6 +102,7 @@ const listen = () => {
     ["n p", "next or previous agent", ["n"], () => neighbor(1)],
     ["d t r", "log, truth or replay on or off", ["d"], () => toggle("log")],
     ["w l", "trails or names on or off", ["w"], () => toggle("trails")],
+    ["e", "next collision of the replay", ["e"], nextEvent],
     ["a /", "list of agents, search in it", ["a"], buttons["list-toggle"]],
     ["Esc", "choose nobody", ["Escape"], () => choose(null)],
     ["?", "this list", ["?"], buttons["help-toggle"]],
@@ -118,7 +120,8 @@ const listen = () => {
   window.addEventListener("hashchange", recall);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
     dress(data.layers);
-    side.redraw();
+    list.show();
+    details.show();
     drawLife();
     wake();
   });
@@ -140,7 +143,7 @@ const neighbor = (step) => {
   if (count) visit(tracks[here < 0 ? (step > 0 ? 0 : count - 1) : (here + step + count) % count]);
 };
 
-const side = new Side(data, { choose: visit, seek, hover });
+const list = new List(tracks, { choose: visit, hover }), details = new Details(data, seek);
 
 const start = () => {
   const moving = tracks.filter((track) => !track.standing && !track.ego).length, agents = tracks.length - (ego ? 1 : 0);
@@ -158,6 +161,7 @@ const start = () => {
     button.addEventListener("click", () => toggle(layer));
     byId("layers").append(button);
   }
+  markEvents();
   setRate(0);
   showPlay();
   listen();

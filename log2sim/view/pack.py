@@ -47,7 +47,14 @@ def pack(scenario: Scenario, truth: Scenario | None = None, replay: Any = None) 
         "end_s": max([scenario.duration_s, *(last for _, last in spans)]),
         "origin": _origin(scenario),
         "layers": layers,
+        "events": [] if replay is None else _events(replay),
     }
+
+
+def _events(replay: Any) -> list[dict[str, Any]]:
+    """Collisions of a replay in order of time."""
+    keys = ("t_s", "until_s", "agents", "in_log")
+    return [{k: event[k] for k in keys} for event in replay.metrics.get("collisions", ())]
 
 
 def _log(scenario: Scenario) -> Iterator[dict[str, Any]]:

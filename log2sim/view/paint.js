@@ -22,18 +22,19 @@ class Painter {
   }
 
   // shown: which layers and extras; chosen, hovered: tracks of the log or null.
-  paint(layers, t, shown, chosen, hovered) {
+  paint({ layers, events }, t, shown, chosen, hovered) {
     const pen = this.pen;
     pen.setLineDash(SOLID);
     pen.lineJoin = "round";
     pen.fillStyle = theme.ground;
-    pen.fillRect(0, 0, this.view.width, this.view.height);
+    pen.fillRect(0, 0, this.view.width + 1, this.view.height + 1);  // the last pixel may be half one
     this.grid();
     for (const track of layers.log) track.moveTo(t);
     if (shown.log) this.log(layers.log, t, shown, chosen);
     if (shown.truth && layers.truth) this.outlines(layers.truth, t, TRUTH_DASHES, 1.1);
     if (shown.replay && layers.replay) this.outlines(layers.replay, t, DOTTED, 1.6);
     pen.setLineDash(SOLID);
+    if (shown.replay) this.contacts(events, t);
     if (shown.log && chosen && chosen.there) this.ring(chosen, theme.accent, 2);
     if (shown.log && hovered && hovered !== chosen && hovered.there) this.ring(hovered, theme.muted, 1.2);
     if (shown.log) this.names(layers.log, shown, chosen, hovered);
@@ -167,7 +168,7 @@ class Painter {
     pen.stroke();
   }
 
-  // Boxes of another layer, hollow, with the way of the last seconds.
+  // Boxes of another layer, hollow.
   outlines(tracks, t, dashes, width) {
     const pen = this.pen;
     for (let i = 0; i < tracks.length; i++) {
@@ -179,6 +180,17 @@ class Painter {
       pen.strokeStyle = track.line;
       pen.lineWidth = width;
       pen.stroke();
+    }
+  }
+
+  // Rings around agents that collide in the replay, shown a moment longer than that takes.
+  contacts(events, t) {
+    for (let k = 0; k < events.length; k++) {
+      const event = events[k];
+      if (t < event.t_s - 0.05 || t > event.until_s + 0.3) continue;
+      for (let i = 0; i < event.tracks.length; i++) {
+        if (event.tracks[i].there) this.ring(event.tracks[i], event.in_log ? theme.muted : theme.alert, 2);
+      }
     }
   }
 

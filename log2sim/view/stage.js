@@ -38,16 +38,16 @@ const draw = (now) => {
     leader.moveTo(state.t);
     if (leader.there) [view.x, view.y] = [leader.px, leader.py];
   }
-  painter.paint(data.layers, state.t, state.shown, state.chosen, state.hovered);
+  painter.paint(data, state.t, state.shown, state.chosen, state.hovered);
   const text = state.t.toFixed(2);
   if (text !== labelled) {
     byId("time").textContent = labelled = text;
     byId("scrub").value = state.t;
     byId("scrub").setAttribute("aria-valuetext", `${text} s`);
   }
-  side.tick(state.t);
+  details.tick(state.t);
   if (now - dimmed > 250 || !state.playing) {
-    side.dim();
+    list.dim();
     dimmed = now;
   }
 };

@@ -2,6 +2,7 @@
 
 const RATES = [0.1, 0.2, 0.5, 1, 2, 5, 10];
 const PLAY = "M6 3.5v13l11-6.5z", PAUSE = "M5.5 3.5h3.2v13H5.5zM11.3 3.5h3.2v13h-3.2z";
+const MOST_MARKS = 300;
 let writing = 0;
 
 const seek = (t) => {
@@ -51,6 +52,29 @@ const drawLife = () => {
     bar(track.t[from], track.t[k + 1], track.filled[k] ? track.pale : track.standing ? theme.parked_edge : track.line);
     from = k + 1;
   }
+};
+
+// A mark under the slider for each collision of the replay, red where the log has none.
+const markEvents = () => {
+  const whole = Math.max(data.end - data.begin, 1e-3), inset = 8;  // half the slider's knob, where its ends are
+  byId("events").append(...data.events.slice(0, MOST_MARKS).map((event) => {
+    const what = `${event.agents.join(" and ")} collide at ${event.t_s.toFixed(2)} s${event.in_log ? ", in the log too" : ""}`;
+    const button = element("button", { type: "button", title: what, "aria-label": what, class: event.in_log ? "known" : "new" });
+    button.style.left = `calc(${inset}px + (100% - ${2 * inset}px) * ${(event.t_s - data.begin) / whole})`;
+    button.addEventListener("click", () => visitEvent(event));
+    return button;
+  }));
+};
+
+const visitEvent = (event) => {
+  pause();
+  seek(event.t_s);
+  visit(tracks.find((track) => event.agents.includes(track.id)) ?? null);
+};
+
+const nextEvent = () => {
+  const next = data.events.find((event) => event.t_s > state.t + 1e-6) ?? data.events[0];
+  if (next) visitEvent(next);
 };
 
 // The address names the moment and the agent, so that it can be passed on; browsers let it change a few times a second.

@@ -107,5 +107,8 @@ const load = (text) => {
   for (const [name, entries] of Object.entries(document_.layers)) {
     layers[name] = entries.map((entry) => new Track(entry, document_.scales));
   }
-  return { name: document_.name, origin: document_.origin, begin: document_.begin_s, end: document_.end_s, layers };
+  const events = document_.events.map((event) => ({
+    ...event, tracks: (layers.replay ?? []).filter((track) => event.agents.includes(track.id)),
+  }));
+  return { name: document_.name, origin: document_.origin, begin: document_.begin_s, end: document_.end_s, layers, events };
 };
