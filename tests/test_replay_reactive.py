@@ -11,7 +11,7 @@ from replay_maneuvers import MANEUVERS, agent_from, driven, ramp, scenario_of
 from replay_scenes import LENGTH_M, Speed, departure, gap, line, parked, walker
 
 from log2sim.errors import ConfigError
-from log2sim.replay import Controls, open_world
+from log2sim.replay import Controls, load_policy, open_world
 from log2sim.replay import replay as run
 from log2sim.replay.corridor import _nearest_edge
 from log2sim.replay.driver import demand, drivers_for, respond
@@ -143,6 +143,19 @@ def test_of_two_whose_ways_cross_the_first_in_the_log_goes_first_and_both_get_th
     assert b.t_s[b.x_m > 0][0] < a.t_s[a.y_m > 0][0]
     assert a.accel_mps2.min() < -1
     assert min(a.y_m[-1], b.x_m[-1]) > 50
+
+
+def test_at_the_edge_of_a_conflict_an_agent_does_not_hunt():
+    scene = scenario_of(
+        line("ego", 0, speed=12, duration_s=9), line("f", -25, speed=12, duration_s=9), parked("p", 80, 0),
+        line("c", 40, -70, 10, 9, np.pi / 2), line("on", 150, 3.5, 12, 9, np.pi),
+    )  # fmt: skip
+    brakes_late = load_policy(f"{SAMPLE.parents[1]}/egos.py:BrakeLate")
+    result = run(scene, ego=brakes_late, agents="reactive", dt_s=0.02)
+    c = result.agent("c")
+    assert new_collisions(result) == []
+    assert c.accel_mps2.min() < -0.8
+    assert np.count_nonzero(np.diff((c.accel_mps2 < -0.5).astype(int)) > 0) <= 2  # brakes once, perhaps once more
 
 
 def test_two_that_wait_for_each_other_do_not_wait_for_ever():

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from log2sim.geometry import Array
 from log2sim.replay.driver import drivers_for, respond
 from log2sim.replay.path import Path
-from log2sim.replay.situation import Moment, excess, expected
+from log2sim.replay.situation import NOTICED, Moment, excess, expected
 from log2sim.replay.trust import deep_overlaps
 from log2sim.replay.ways import Pose, Ways
 from log2sim.replay.world import Snapshot
@@ -23,6 +23,9 @@ from log2sim.scenario import Agent
 DECIDE_S = 0.1
 STANDING_MPS = 0.05  # where the log is slower, its time goes on: waiting for somebody counts as the log's own stop
 CHUNK = 4096  # pairs looked at together
+RELEASE_S, MOST_KEPT = 0.5, 4.0
+"""A demand that is gone fades over this time, so that one at the edge of a conflict does not make an agent hunt."""
+
 SAME_S = 1e-9  # delays that differ by rounding are the same
 
 
@@ -69,6 +72,7 @@ class Traffic:
         """Put everybody on the log's time."""
         count, self._decided_s = len(self.reacts), -np.inf
         self.delay_s, self.rate, self.rate_slope = np.zeros(count), np.ones(count), np.zeros(count)
+        self._taken = np.zeros(count)
 
     def decide(self, t_s: float, dt_s: float, ego: Snapshot | None) -> None:
         """Choose how fast the reactive ones go on, and move their time by `dt_s`.
@@ -97,6 +101,9 @@ class Traffic:
         for begin in range(0, len(pairs[0]), CHUNK):
             i, j = (p[begin : begin + CHUNK] for p in pairs)
             np.maximum.at(taken, i, excess(moment, i, j, ~self._distrusted[i, j]))
+        kept = np.minimum(self._taken, MOST_KEPT) * np.exp(-DECIDE_S / RELEASE_S)
+        taken = np.maximum(taken, np.where(kept > NOTICED, kept, 0.0))
+        self._taken = taken
         rate, slope = respond(self.driver.take(own), self.rate[own], taken[own], pace, log_accel)
         stands = pace < STANDING_MPS
         self.rate[own], self.rate_slope[own] = np.where(stands, 1.0, rate), np.where(stands, 0.0, slope)
