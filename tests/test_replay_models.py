@@ -12,6 +12,7 @@ from log2sim.errors import ConfigError
 from log2sim.replay import Controls, Replay, replay
 from log2sim.replay.models import SLIP_TOLERANCE_RAD
 from log2sim.replay.parameters import PUBLISHED, parameters_for
+from log2sim.replay.summary import summarize
 from log2sim.replay.vehicle import GRAVITY_MPS2
 
 SLIPPING = pytest.mark.parametrize("model", ["dynamic", "single-track"])
@@ -40,6 +41,13 @@ def test_the_reason_for_the_model_is_in_the_file(tmp_path):
     result = replay(scenario_of(cruise(10.0)))
     result.save(tmp_path / "replay.json")
     assert Replay.load(tmp_path / "replay.json").agents[0].model_reason == result.agents[0].model_reason != ""
+
+
+def test_the_summary_counts_the_models_and_says_why_a_vehicle_slips():
+    calm, hasty = cruise(10.0), replace(cruise(20.0, bend(60.0)), id="hasty")
+    lines = summarize(replay(scenario_of(calm, hasty))).splitlines()
+    assert "models: 1 kinematic, 1 dynamic" in lines
+    assert any(line.startswith("  hasty dynamic: rear tires slip up to 0.0") for line in lines)
 
 
 def test_what_leans_is_kinematic_and_what_a_policy_drives_is_dynamic():

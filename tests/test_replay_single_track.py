@@ -140,6 +140,46 @@ def test_a_swerve_at_25_mps_is_that_of_a_high_order_integrator_on_the_published_
     assert np.hypot(*(cg - theirs_xy).T).max() < 0.01
 
 
+@pytest.mark.parametrize("accel", [-3.0, 3.0])
+def test_backward_the_forces_of_the_published_model_oppose_the_slip_as_well(accel):
+    """The published equations with the tires' forces, and only these, by the size of the speed, solved by SciPy."""
+    p, steer, to_rear = BMW, 0.15, float(BMW.cg_to_rear_m[0])
+    wheelbase, inertia, height = float(p.wheelbase_m[0]), float(p.gyration_m2[0]), float(p.cg_height_m[0])
+    to_front, stiffness = wheelbase - to_rear, float(p.friction[0] * p.rear_stiffness_1prad[0]) / wheelbase
+
+    def rates(_, state):
+        _, _, speed, yaw, yaw_rate, slip = state
+        front_slip, rear_slip = slip + to_front * yaw_rate / speed - steer, slip - to_rear * yaw_rate / speed
+        side = math.copysign(1.0, speed)
+        front = -side * stiffness * (GRAVITY_MPS2 * to_rear - accel * height) * front_slip
+        rear = -side * stiffness * (GRAVITY_MPS2 * to_front + accel * height) * rear_slip
+        twist = (to_front * front - to_rear * rear) / inertia
+        course = yaw + slip
+        return [
+            speed * math.cos(course),
+            speed * math.sin(course),
+            accel,
+            yaw_rate,
+            twist,
+            (front + rear) / speed - yaw_rate,
+        ]
+
+    end = run(
+        step_single_track,
+        p,
+        vehicle(speed_mps=-6.0, steer_rad=steer, pedal_mps2=-accel),
+        command(-accel, steer, True),
+        1.0,
+        0.005,
+    )[-1]
+    start = [to_rear, 0.0, -6.0, 0.0, 0.0, 0.0]  # the yaw rate and the lateral velocity are zero
+    solved = solve_ivp(rates, (0, 1.0), start, method="Radau", rtol=1e-9, atol=1e-11).y[:, -1]
+    cg = end[0] + to_rear * math.cos(end[2]), end[1] + to_rear * math.sin(end[2])
+    np.testing.assert_allclose(cg, solved[:2], atol=1e-3)
+    np.testing.assert_allclose([end[3], end[2], end[7]], solved[2:5], atol=5e-4)
+    assert end[6] == pytest.approx(end[3] * solved[5] - to_rear * solved[4], abs=5e-4)
+
+
 # The saturating model
 
 

@@ -17,6 +17,7 @@ from log2sim.replay.path import path_of
 from log2sim.replay.reference import MAX_CURVATURE_1PM, Reference, point_reference, tape_reference, vehicle_reference
 from log2sim.replay.rollout import Clock
 from log2sim.replay.simulator import STEPS, simulator_named
+from log2sim.replay.vehicle import VehicleParameters
 from log2sim.replay.world import Crowd, Driven, Fleet, Group, Tape
 from log2sim.scenario import Agent
 
@@ -51,13 +52,7 @@ def groups_of(
         for name in STEPS:
             moved = [a for a in agents if choices[a.id].model == name]
             if moved:
-                p = parameters_for(moved, published=name == "single-track")
-                followed = [references[a.id] for a in moved]
-                if name != "kinematic":
-                    p = replace(p, understeer_s2pm2=understeer(p))
-                    ahead_s = STEER_LAG_S + control_step(clock.dt_s) / 2
-                    ones = [p.take(slice(i, i + 1)) for i in range(len(moved))]
-                    followed = [slipping_reference(r, one, name, ahead_s) for r, one in zip(followed, ones)]
+                p, followed = _prepared(moved, [references[a.id] for a in moved], name, clock)
                 groups.append(kind(moved, followed, *_lives(moved, clock), p, simulator_named(name)))
     agents = [a for a in cast["pid"] if a.category not in WHEELED]
     if agents:
@@ -68,6 +63,19 @@ def groups_of(
         followed = [tape_reference(path_of(a, rear_axle_offset(a))) for a in agents]
         groups.append(Tape(agents, followed, *_lives(agents, clock)))
     return groups, choices
+
+
+def _prepared(
+    agents: Sequence[Agent], references: Sequence[Reference], model: str, clock: Clock
+) -> tuple[VehicleParameters, Sequence[Reference]]:
+    """Parameters of vehicles that a model moves, and their references with what its slip asks for."""
+    p = parameters_for(agents, published=model == "single-track")
+    if model == "kinematic":
+        return p, references
+    p = replace(p, understeer_s2pm2=understeer(p))
+    ahead_s = STEER_LAG_S + control_step(clock.dt_s) / 2
+    each = [p.take(slice(i, i + 1)) for i in range(len(agents))]
+    return p, [slipping_reference(r, one, model, ahead_s) for r, one in zip(references, each)]
 
 
 def _vehicle_reference(agent: Agent, dt_s: float) -> Reference:
