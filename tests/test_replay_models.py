@@ -108,6 +108,12 @@ def test_parameters_grow_with_the_size_and_loads_stay_on_the_wheels():
     assert np.all(p.cg_height_m < 0.6 * np.array([s[2] for s in sizes.values()]))
 
 
+def test_the_rule_for_the_yaw_inertia_holds_for_the_published_vehicles():
+    for vehicle in PUBLISHED.values():
+        rule = vehicle.cg_to_front_m * vehicle.cg_to_rear_m
+        assert rule == pytest.approx(vehicle.inertia_kgm2 / vehicle.mass_kg, rel=0.1)
+
+
 def test_the_published_model_takes_the_published_car_nearest_in_size():
     def wheelbase(length, width):
         one = [agent_from([0.0], [0.0], [0.0], [0.0], [0.0], size_m=(length, width, 1.5))]

@@ -18,7 +18,9 @@ from log2sim.replay.vehicle import GRAVITY_MPS2, VehicleControls, VehicleState, 
 BMW = published_parameters(2, rear_axle_offset_m=1.4)
 CAR = parameters_for([agent_from([0.0], [0.0], [0.0], [0.0], [0.0])])
 STEPS = {"single-track": (step_single_track, BMW), "dynamic": (step_dynamic, CAR)}
+ALL_STEPS = {**STEPS, "kinematic": (step_bicycle, CAR)}
 BOTH = pytest.mark.parametrize("name", STEPS)
+ALL = pytest.mark.parametrize("name", ALL_STEPS)
 
 
 def vehicle(**columns):
@@ -321,9 +323,9 @@ EXTREMES = {
 }
 
 
-@BOTH
+@ALL
 def test_the_path_is_the_converged_one_at_every_step_in_every_extreme(name):
-    step, one = STEPS[name]
+    step, one = ALL_STEPS[name]
     cases = EXTREMES.values()
     p = replace(one.take(np.zeros(len(cases), int)), friction=np.array([c[2] for c in cases]))
 
@@ -342,7 +344,7 @@ def test_the_path_is_the_converged_one_at_every_step_in_every_extreme(name):
             out.append(np.stack([state.x_m, state.y_m], axis=1))
         return np.array(out)
 
-    converged, limits = paths(0.001), np.array([c[3] for c in cases])
+    converged, limits = paths(0.002), np.array([c[3] for c in cases])
     for dt_s in (0.01, 0.02, 0.05, 0.2, 1.0):
         error = np.linalg.norm(paths(dt_s) - converged, axis=2).max(axis=0)
         assert {k: e for k, e, limit in zip(EXTREMES, error, limits) if e > limit} == {}
@@ -362,10 +364,10 @@ def test_halving_the_step_quarters_the_error(name):
     assert 3.0 < errors[1] / errors[2] < 5.5
 
 
-@BOTH
+@ALL
 @pytest.mark.parametrize("friction", [1.05, 0.1])
 def test_who_braked_to_standstill_stays_and_then_starts_the_right_way(name, friction):
-    step, p = STEPS[name]
+    step, p = ALL_STEPS[name]
     p = replace(p, friction=np.array([friction]))
     stopped = vehicle(speed_mps=4.0, steer_rad=0.5)
     for _ in range(150):
@@ -404,9 +406,9 @@ def some_controls(rng, count):
     return VehicleControls(rng.normal(0, 5, count), rng.normal(0, 0.5, count), rng.random(count) < 0.3)
 
 
-@BOTH
+@ALL
 def test_agents_at_once_move_as_one_by_one(name):
-    step, one = STEPS[name]
+    step, one = ALL_STEPS[name]
     rng = np.random.default_rng(2)
     state, controls = some_states(rng, 40), some_controls(rng, 40)
     together = stack(step(state, controls, one.take(np.zeros(40, int)), 0.03))
@@ -415,9 +417,9 @@ def test_agents_at_once_move_as_one_by_one(name):
         np.testing.assert_allclose(together[:, k], alone[:, 0], rtol=1e-12, atol=1e-12)
 
 
-@BOTH
+@ALL
 def test_turned_and_shifted_and_mirrored_vehicles_move_turned_and_shifted_and_mirrored(name):
-    step, one = STEPS[name]
+    step, one = ALL_STEPS[name]
     rng = np.random.default_rng(3)
     state, controls, p = some_states(rng, 40), some_controls(rng, 40), one.take(np.zeros(40, int))
     x, y, yaw, speed, steer, pedal, lateral, rate = stack(step(state, controls, p, 0.05))
