@@ -52,6 +52,7 @@ class Group(ABC):
     """Agents driven alike. `first`, `last` (A,) are the steps between which each agent lives."""
 
     driver = "exact"
+    keeps_time = True  # its agents are where the log has them at the same time, after a leap too
 
     def __init__(self, agents: Sequence[Agent], references: Sequence[Reference], first: NDArray, last: NDArray) -> None:
         self.agents, self.references, self.first, self.last = tuple(agents), tuple(references), first, last
@@ -193,6 +194,7 @@ class Driven(Fleet):
     """The one vehicle that the user's policy drives, by the controls set before each step."""
 
     driver = "policy"
+    keeps_time = False
     controls = Controls(0.0, 0.0)
 
     def _step(self, dt_s: float) -> None:
