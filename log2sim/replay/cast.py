@@ -20,11 +20,7 @@ from log2sim.replay.path import Path, path_of
 from log2sim.replay.reactive import Reactive, ReactiveCrowd, ReactiveFleet, ReactiveTape
 from log2sim.replay.reference import MAX_CURVATURE_1PM, Reference, point_reference, tape_reference, vehicle_reference
 from log2sim.replay.simulator import STEPS, simulator_named
-<<<<<<< HEAD
-from log2sim.replay.vehicle import VehicleParameters
-=======
 from log2sim.replay.traffic import Traffic
->>>>>>> main
 from log2sim.replay.world import Crowd, Driven, Fleet, Group, Tape
 from log2sim.scenario import Agent
 
@@ -79,40 +75,6 @@ def groups_of(
     """The groups that have agents, and by id the model that moves each vehicle; static agents are in none."""
     groups: list[Group] = []
     choices: dict[str, Choice] = {}
-<<<<<<< HEAD
-    for driver, kind in (("policy", Driven), ("pid", Fleet)):
-        agents = [a for a in cast[driver] if a.category in WHEELED]
-        references = {a.id: _vehicle_reference(a, clock.dt_s) for a in agents}
-        for a in agents:
-            choices[a.id] = choose(a, references[a.id], parameters_for([a]), model, free=driver == "policy")
-        for name in STEPS:
-            moved = [a for a in agents if choices[a.id].model == name]
-            if moved:
-                p, followed = _prepared(moved, [references[a.id] for a in moved], name, clock)
-                groups.append(kind(moved, followed, *_lives(moved, clock), p, simulator_named(name)))
-    agents = [a for a in cast["pid"] if a.category not in WHEELED]
-    if agents:
-        followed = [point_reference(path_of(a, 0.0)) for a in agents]
-        groups.append(Crowd(agents, followed, *_lives(agents, clock), simulator_named("kinematic")))
-    agents = list(cast["exact"])
-    if agents:
-        followed = [tape_reference(path_of(a, rear_axle_offset(a))) for a in agents]
-        groups.append(Tape(agents, followed, *_lives(agents, clock)))
-    return groups, choices
-
-
-def _prepared(
-    agents: Sequence[Agent], references: Sequence[Reference], model: str, clock: Clock
-) -> tuple[VehicleParameters, Sequence[Reference]]:
-    """Parameters of vehicles that a model moves, and their references with what its slip asks for."""
-    p = parameters_for(agents, published=model == "single-track")
-    if model == "kinematic":
-        return p, references
-    p = replace(p, understeer_s2pm2=understeer(p))
-    ahead_s = STEER_LAG_S + control_step(clock.dt_s) / 2
-    each = [p.take(slice(i, i + 1)) for i in range(len(agents))]
-    return p, [slipping_reference(r, one, model, ahead_s) for r, one in zip(references, each)]
-=======
     controlled: list[tuple[str, type[Fleet], type[Crowd]]] = [("policy", Driven, Crowd)]
     if mode == "pid":
         controlled += [("reactive", ReactiveFleet, ReactiveCrowd), ("pid", Fleet, Crowd)]
@@ -172,7 +134,6 @@ def _pose(agent: Agent) -> Path:
     w = agent.waypoints
     first = {k: np.full(len(w), getattr(w, k)[0]) for k in ("x_m", "y_m", "z_m", "yaw_rad")}
     return path_of(replace(agent, waypoints=replace(w, **first, speed_mps=np.zeros(len(w)))), 0.0)
->>>>>>> main
 
 
 def _vehicle_reference(agent: Agent, dt_s: float) -> Reference:
