@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -22,9 +23,7 @@ def load_schema(name: str) -> dict[str, Any]:
 
 def check(document: Any, name: str, error: type[Log2SimError]) -> None:
     """Raise `error` naming the first field that breaks the schema and what was expected there."""
-    from jsonschema import Draft202012Validator
-
-    problem = next(Draft202012Validator(load_schema(name)).iter_errors(document), None)
+    problem = next(_validator()(load_schema(name)).iter_errors(document), None)
     if problem is None:
         return
     place = (
@@ -33,3 +32,30 @@ def check(document: Any, name: str, error: type[Log2SimError]) -> None:
     )
     message = problem.message if len(problem.message) < 200 else f"{problem.message[:80]} ... {problem.message[-100:]}"
     raise error(f"{place}: {message}")
+
+
+@cache
+def _validator() -> Any:
+    """A validator that looks at columns of plain numbers as a whole: one by one, a long scenario takes seconds."""
+    from jsonschema import Draft202012Validator
+    from jsonschema.validators import extend
+
+    item_by_item = Draft202012Validator.VALIDATORS["items"]
+
+    def items(validator: Any, expected: Any, values: Any, schema: Any) -> Any:
+        if not _all_right(expected, values):
+            yield from item_by_item(validator, expected, values, schema)
+
+    return extend(Draft202012Validator, {"items": items})
+
+
+PLAIN: dict[str, set[type]] = {"number": {int, float}, "integer": {int}, "boolean": {bool}}
+
+
+def _all_right(expected: Any, values: Any) -> bool:
+    """Whether values are a list of plain ones that keep to `expected`; False also where that takes a closer look."""
+    if not isinstance(values, list) or not values or set(expected) - {"type", "minimum", "maximum"}:
+        return False
+    if not set(map(type, values)) <= PLAIN.get(expected.get("type", ""), set()):
+        return False
+    return min(values) >= expected.get("minimum", -math.inf) and max(values) <= expected.get("maximum", math.inf)

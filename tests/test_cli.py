@@ -16,7 +16,19 @@ from log2sim import Scenario, cli
 from log2sim.errors import LogError
 from log2sim.schema import check
 
-COMMANDS = ("reconstruct", "replay", "edit", "plot", "evaluate", "bench", "synth", "inspect", "validate", "config")
+COMMANDS = (
+    "reconstruct",
+    "replay",
+    "edit",
+    "plot",
+    "view",
+    "evaluate",
+    "bench",
+    "synth",
+    "inspect",
+    "validate",
+    "config",
+)
 PNG, GIF = b"\x89PNG", b"GIF8"
 
 
@@ -243,7 +255,7 @@ def test_help_and_version() -> None:
         result = CliRunner().invoke(cli.app, [name, "-h"])
         assert result.exit_code == 0
         assert f"log2sim {name}" in result.output or f" {name} " in result.output
-        if name in ("reconstruct", "replay", "edit", "plot", "evaluate", "bench", "synth"):
+        if name in ("reconstruct", "replay", "edit", "plot", "view", "evaluate", "bench", "synth"):
             assert "--out" in result.output
     assert run("--version").out == f"{log2sim.__version__}\n"
     nothing = run()

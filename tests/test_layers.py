@@ -20,7 +20,7 @@ STAGES = {
     "detect", "export", "extend", "fuse", "logs", "measure", "metrics", "plot", "replay", "shape", "smooth", "sync", "synth", "thin", "topdown", "track",
 }  # fmt: skip
 PIPELINE = {
-    "assemble", "bench", "credit", "edit", "finish", "ground_plane", "look", "mosaic", "observe", "overlap", "pipeline", "plan", "report", "savings",
+    "assemble", "bench", "credit", "edit", "finish", "ground_plane", "look", "mosaic", "observe", "overlap", "pipeline", "plan", "report", "savings", "view",
 }  # fmt: skip
 TOP = {"__init__", "__main__", "cli", "progress"}
 # Synthetic logs are written by the writer of logs.

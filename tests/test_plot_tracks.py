@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import types
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from log2sim.plot.look import PALETTE, printable
 from log2sim.plot.sheet import Sheet
 from log2sim.plot.tracks import still
 from log2sim.plot.view import View, choose_view, nice_step, time_step_s
+from log2sim.replay import replay
 from log2sim.scenario import Agent, Scenario, Waypoints
 from log2sim.types import TYPICAL_SIZE_M, MapFrame
 
@@ -248,21 +248,13 @@ def test_the_legend_stands_beside_the_map() -> None:
 
 def test_overlays_get_a_line_in_the_legend() -> None:
     scenario = crossing()
-    replay = types.SimpleNamespace(
-        agents=[
-            types.SimpleNamespace(id=a.id, **{k: getattr(a.waypoints, k) for k in ("t_s", "x_m", "y_m", "yaw_rad")})
-            for a in scenario.agents
-        ]
-    )
     assert not {"truth", "replay"} & set(texts(draw(scenario)))
-    assert {"truth", "replay"} <= set(texts(draw(scenario, truth=scenario, replay=replay)))
+    assert {"truth", "replay"} <= set(texts(draw(scenario, truth=scenario, replay=replay(scenario))))
 
 
 def test_overlays_can_be_animated(tmp_path: Path) -> None:
     scenario = crossing()
-    columns = {k: getattr(scenario.agents[0].waypoints, k) for k in ("t_s", "x_m", "y_m", "yaw_rad")}
-    replay = types.SimpleNamespace(agents=[types.SimpleNamespace(id="ego", **columns)])
-    plot_tracks(scenario, tmp_path / "a.gif", truth=scenario, replay=replay)
+    plot_tracks(scenario, tmp_path / "a.gif", truth=scenario, replay=replay(scenario))
 
 
 def test_north_is_named_only_when_the_map_knows_it() -> None:

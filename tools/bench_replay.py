@@ -111,7 +111,9 @@ def speed_row(count: int, model: str = "auto", duration_s: float = DRIVE_S) -> d
     )
     end = time.process_time()
     # The first stretch holds the references and the agents' arrivals; the others hold look-ups, control, model and storing.
-    step_s = statistics.median((t1 - t0) / (n1 - n0) for (n0, t0), (n1, t1) in pairwise(told))
+    stretches = [(n1 - n0, t1 - t0) for (n0, t0), (n1, t1) in pairwise(told)]
+    longest = max(count for count, _ in stretches)
+    step_s = statistics.median(seconds / count for count, seconds in stretches if count == longest)
     return {
         "agents": count,
         "model": model,

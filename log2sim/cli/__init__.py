@@ -7,11 +7,11 @@ from collections.abc import Callable
 
 import typer
 
-from log2sim.cli import build, change, judge, look, share
+from log2sim.cli import build, change, judge, look, page, share
 from log2sim.cli.app import app, fail
 from log2sim.errors import Log2SimError
 
-__all__ = ["app", "build", "change", "judge", "look", "main", "share"]
+__all__ = ["app", "build", "change", "judge", "look", "main", "page", "share"]
 
 INTERRUPTED = 130
 

@@ -91,7 +91,8 @@ def _back_to_front(agent: Agent) -> Iterator[str]:
     forward = np.where(w.speed_mps[1:] + w.speed_mps[:-1] < 0, -1.0, 1.0)
     against = (step >= STEP_M) & (forward * (dx * np.cos(middle) + dy * np.sin(middle)) < 0)
     moved, wrong = step[step >= STEP_M].sum(), step[against].sum()
-    if moved >= MOVED_M and wrong > moved / 2:
+    reach = np.hypot(np.ptp(w.x_m), np.ptp(w.y_m))  # a box that trembles in its place goes far and gets nowhere
+    if reach >= MOVED_M and wrong > moved / 2:
         yield (
             f"agent '{agent.id}': goes backward on {wrong:.1f} of {moved:.1f} m while its speed says forward; if its box is"
             " labeled back to front, turn yaw_rad by half a turn, and if it reverses, make speed_mps negative"

@@ -181,13 +181,15 @@ def _lane_m(agent: Agent) -> float:
 
 
 def _elevation(stations: Array, ground_m: Array, length_m: float, level_m: float) -> Array:
-    """Cubics (K, 5) s, a, b, c, d through the mean of heights (N,) every `level_m`, flat at the ends, without overshoot."""
+    """Cubics (K, 5) s, a, b, c, d through heights (N,) at the ends and their means every `level_m`, without overshoot."""
     from scipy.interpolate import PchipInterpolator
 
     block = np.floor((stations - stations[0]) / level_m).astype(int)
     _, first, counts = np.unique(block, return_index=True, return_counts=True)
     s, z = (np.add.reduceat(v, first) / counts for v in (stations, ground_m))
-    s, z = np.concatenate([[0.0], s, [length_m]]), np.concatenate([z[:1], z, z[-1:]])
+    inner = (s > stations[0] + level_m / 4) & (s < stations[-1] - level_m / 4)
+    s = np.concatenate([[0.0], stations[:1], s[inner], stations[-1:], [length_m]])
+    z = np.concatenate([ground_m[:1], ground_m[:1], z[inner], ground_m[-1:], ground_m[-1:]])
     apart = np.concatenate([np.diff(s) > 1e-6, [True]])
     d, c, b, a = PchipInterpolator(s[apart], z[apart]).c
     rows = np.column_stack([s[apart][:-1], a, b, c, d])

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import to_rgba
+from matplotlib.colors import to_rgb, to_rgba
 from numpy.typing import NDArray
 
 from log2sim.errors import ConfigError
@@ -17,8 +18,10 @@ from log2sim.files import replaced
 from log2sim.geometry import Array
 from log2sim.plot import draw, shapes
 from log2sim.plot.cast import Cast, path
-from log2sim.plot.look import FONT, INK, PAPER, halo
+from log2sim.plot.hits import hits_of
+from log2sim.plot.look import ALARM, FONT, INK, PAPER, halo
 from log2sim.plot.sheet import SIDE_IN, TOP_IN, WIDTH_IN, Sheet
+from log2sim.plot.strips import DrawnStrips
 from log2sim.plot.tracks import base
 from log2sim.scenario import Agent, Scenario
 
@@ -27,7 +30,16 @@ MOST_FRAMES = 300
 """A longer scenario is shown faster, and says so."""
 
 TAIL_S = 1.5
+TAIL_ALPHA, WAY_ALPHA = 0.65, 0.22
+"""How much color tails have, and the ways as a whole."""
+
 DPI = {".gif": 96, ".mp4": 128}
+
+CLEAR = 255
+"""The index of a .gif that paints nothing; the ones below are colors."""
+
+SWATCH_PX = 100
+"""Width of what speaks for the colors of agents when a palette is chosen."""
 
 Image = NDArray[np.uint8]
 
@@ -62,22 +74,24 @@ def write_animation(
 ) -> None:
     """Write a .gif or .mp4; see `tracks.plot_tracks`."""
     suffix = out_path.suffix.lower()
-    sheet, step_s = base(scenario, cast, replay=replay, truth=truth, background=background, title=title, moving=True)
-    draw.draw_tracks(sheet.ax, cast, sheet.view, step_s, alpha=0.22, faint=True)
+    sheet, step_s, strips = base(
+        scenario, cast, replay=replay, truth=truth, background=background, title=title, moving=True
+    )
+    draw.draw_tracks(sheet.ax, cast, sheet.view, step_s, alpha=WAY_ALPHA, faint=True)
     sheet.figure.set_dpi(DPI[suffix])
     pace = choose_pace(scenario.duration_s)
-    frames = _frames(sheet, cast, pace, replay, truth)
+    stage = Stage(sheet, cast, replay, truth, pace, strips)
+    frames = _frames(sheet, stage, pace)
     with replaced(out_path) as temporary:
         if suffix == ".gif":
-            _write_gif(frames, temporary)
+            _write_gif(frames, temporary, [role.color for role in cast.movers] + [ALARM])
         else:
             _write_mp4(frames, temporary, out_path)
 
 
-def _frames(sheet: Sheet, cast: Cast, pace: Pace, replay: Any, truth: Scenario | None) -> Iterator[Image]:
+def _frames(sheet: Sheet, stage: Stage, pace: Pace) -> Iterator[Image]:
     """RGB frames (H, W, 3); what does not move is drawn once."""
     canvas = sheet.canvas
-    stage = Stage(sheet, cast, replay, truth, pace)
     canvas.draw()
     ground = canvas.copy_from_bbox(sheet.figure.bbox)
     for k in range(pace.frames):
@@ -89,8 +103,14 @@ def _frames(sheet: Sheet, cast: Cast, pace: Pace, replay: Any, truth: Scenario |
 class Stage:
     """The artists that change from frame to frame; `show` moves them and paints them onto the canvas."""
 
-    def __init__(self, sheet: Sheet, cast: Cast, replay: Any, truth: Scenario | None, pace: Pace) -> None:
-        self.sheet, self.cast, self.truth, self.pace = sheet, cast, truth, pace
+    def __init__(
+        self, sheet: Sheet, cast: Cast, replay: Any, truth: Scenario | None, pace: Pace, strips: DrawnStrips | None
+    ) -> None:
+        self.sheet, self.cast, self.truth, self.pace, self.strips = sheet, cast, truth, pace, strips
+        if strips is not None:
+            strips.start()
+        self.hit_s, self.hit_xy_m = hits_of(replay)
+        self.hits = draw.draw_hits(sheet.ax, self.hit_xy_m, animated=True)
         driven = {a.id: a for a in replay.agents} if replay is not None else {}
         self.replayed = [(driven[r.agent.id], r) for r in cast.movers if r.agent.id in driven]
         hidden: dict[str, Any] = {"animated": True, "zorder": draw.BOX}
@@ -127,7 +147,7 @@ class Stage:
         self.boxes.set_facecolor(colors)
         self.noses.set_verts(list(shapes.noses(np.array(corners))) if corners else [])
         self.tails.set_segments([_tail(r.agent, t_s) for r, _ in present])
-        self.tails.set_color([to_rgba(r.color, 0.65) for r, _ in present])
+        self.tails.set_color([to_rgba(r.color, TAIL_ALPHA) for r, _ in present])
         self._show_overlays(t_s)
         for collection in self.collections:
             self.sheet.ax.draw_artist(collection)
@@ -136,9 +156,13 @@ class Stage:
                 top = shapes.boxes(role.agent, pose[:2], pose[2])[0, :, 1].max()
                 label.set_position((pose[0], top + 5.5 * self.sheet.view.m_per_pt))
                 self.sheet.ax.draw_artist(label)
+        self.hits.set_data(*self.hit_xy_m[self.hit_s <= t_s + 1e-6].T)
+        self.sheet.ax.draw_artist(self.hits)
         fast = "" if self.pace.speed_up < 1.05 else f"  (×{self.pace.speed_up:.1f})"
         self.stamp.set_text(f"t = {t_s:.1f} s{fast}")
         self.sheet.figure.draw_artist(self.stamp)
+        if self.strips is not None:
+            self.strips.show(t_s)
 
     def _show_overlays(self, t_s: float) -> None:
         if self.truth is not None:
@@ -173,18 +197,36 @@ def _tail(agent: Agent, t_s: float) -> Array:
     return np.concatenate([chosen, [[now.x_m[0], now.y_m[0]]]])
 
 
-def _write_gif(frames: Iterator[Image], path: Path) -> None:
+def _write_gif(frames: Iterator[Image], path: Path, colors: Sequence[str]) -> None:
     from PIL import Image as Pillow
 
-    # One palette for all frames keeps colors still and lets the encoder store only what changes.
     first = next(frames)
-    palette = Pillow.fromarray(first).quantize(255, dither=Pillow.Dither.NONE)
+    palette = Pillow.fromarray(_with_swatches(first, colors)).quantize(CLEAR, dither=Pillow.Dither.NONE)
 
-    def quantized() -> Iterator[Any]:
-        for frame in frames:
-            yield Pillow.fromarray(frame).quantize(palette=palette, dither=Pillow.Dither.NONE)
+    def changes() -> Iterator[Any]:
+        """Frames in which all that stays as it was is clear, which makes the file several times smaller."""
+        before = None
+        for frame in itertools.chain([first], frames):
+            now = np.asarray(Pillow.fromarray(frame).quantize(palette=palette, dither=Pillow.Dither.NONE))
+            picture = Pillow.fromarray(now if before is None else np.where(now == before, np.uint8(CLEAR), now))
+            picture.putpalette(palette.getpalette() or ())
+            before = now
+            yield picture
 
-    palette.save(path, save_all=True, append_images=quantized(), duration=round(1000 / FPS), loop=0, optimize=False)
+    pictures = changes()
+    next(pictures).save(
+        path, save_all=True, append_images=pictures, duration=round(1000 / FPS), loop=0, optimize=False, disposal=1,
+        transparency=CLEAR,
+    )  # fmt: skip
+
+
+def _with_swatches(frame: Image, colors: Sequence[str]) -> Image:
+    """A frame to choose one palette for all of them by: since colors count by area, those that mean something get some."""
+    full = np.array([to_rgb(color) for color in colors])
+    mixes = [alpha * full + (1 - alpha) * np.array(to_rgb(PAPER)) for alpha in (1.0, TAIL_ALPHA, WAY_ALPHA)]
+    rgb = np.rint(255 * np.concatenate(mixes)).astype(np.uint8)
+    row = np.arange(len(frame)) * len(rgb) // len(frame)
+    return np.concatenate([frame, np.repeat(rgb[row][:, None], SWATCH_PX, axis=1)], axis=1)
 
 
 def _write_mp4(frames: Iterator[Image], path: Path, asked_for: Path) -> None:

@@ -9,12 +9,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgba
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
 from log2sim.plot import shapes
 from log2sim.plot.cast import Cast, Role, moves, path
-from log2sim.plot.look import FONT, INK, MARKERS, MUTED, PAPER, PARKED_EDGE, PARKED_FACE, halo
+from log2sim.plot.look import FONT, HIT, INK, MARKERS, MUTED, PAPER, PARKED_EDGE, PARKED_FACE, halo
 from log2sim.plot.view import CROWD, View
 from log2sim.scenario import Agent, Scenario
 
@@ -147,6 +148,11 @@ def draw_replay(ax: Axes, replay: Any, cast: Cast) -> None:
     ax.add_collection(
         PolyCollection(ends, facecolors="none", edgecolors=end_colors, zorder=BOX + 0.7, **dotted), autolim=False
     )
+
+
+def draw_hits(ax: Axes, xy_m: Array, **style: Any) -> Line2D:
+    """Crosses where agents collide that do not in the log."""
+    return ax.plot(*xy_m.T, ls="none", zorder=LABEL - 0.1, **HIT, **style)[0]
 
 
 def draw_labels(ax: Axes, cast: Cast, view: View, times_step_s: float) -> None:

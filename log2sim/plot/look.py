@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 from matplotlib import font_manager
 from matplotlib.ft2font import FT2Font
@@ -19,6 +20,9 @@ GRID = "#E4E8ED"
 FRAME = "#B9C1CB"
 PARKED_FACE, PARKED_EDGE = "#D5DAE1", "#A9B2BE"
 PAPER = "#FFFFFF"
+ALARM = "#C8102E"
+HIT: dict[str, Any] = {"marker": "X", "ms": 8.5, "mfc": ALARM, "mec": PAPER, "mew": 0.9}
+"""Collisions that the log does not have."""
 
 PALETTE = (
     "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#882255", "#999933", "#332288", "#44AA99",

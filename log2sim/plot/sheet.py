@@ -19,6 +19,7 @@ from log2sim.plot.look import (
     FONT,
     FRAME,
     GRID,
+    HIT,
     INK,
     MARKERS,
     MUTED,
@@ -33,33 +34,37 @@ WIDTH_IN = 10.0
 LEFT_IN, SIDE_IN, TOP_IN, BOTTOM_IN, GAP_IN = 0.72, 2.3, 0.74, 0.52, 0.2
 LEAST_MAP_IN, MOST_MAP_IN = 3.4, 8.4
 ROW_IN = 0.178
+STRIP_IN, STRIP_GAP_IN, TIME_IN, HEAD_IN = 0.56, 0.12, 0.36, 0.26
+"""Below the map: a strip and the gap below it, the axis of time and the strips' heading."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """A figure with its canvas, its map axes and the view they show."""
+    """A figure with its canvas, its map axes, the view they show, and the height in inches below all that is the map's."""
 
     figure: Figure
     canvas: FigureCanvasAgg
     ax: Axes
     view: View
+    foot_in: float = 0.0
 
 
-def make_sheet(view: View, legend_rows: int, *, projected: bool) -> Sheet:
-    """Lay out a sheet whose map has the view's proportions as far as paper allows."""
+def make_sheet(view: View, legend_rows: int, *, projected: bool, foot_in: float = 0.0) -> Sheet:
+    """Lay out a sheet whose map has the view's proportions as far as paper allows, above a foot for something else."""
     map_width = WIDTH_IN - LEFT_IN - SIDE_IN - GAP_IN
     wanted = map_width * view.height_m / view.width_m
     needed = legend_rows * ROW_IN + 1.0
     map_height = float(np.clip(max(wanted, needed), LEAST_MAP_IN, MOST_MAP_IN))
-    height = map_height + TOP_IN + BOTTOM_IN
+    height = map_height + TOP_IN + BOTTOM_IN + foot_in
     figure = Figure(figsize=(WIDTH_IN, height), facecolor=PAPER)
     canvas = FigureCanvasAgg(figure)
-    ax = figure.add_axes((LEFT_IN / WIDTH_IN, BOTTOM_IN / height, map_width / WIDTH_IN, map_height / height))
+    bottom = foot_in + BOTTOM_IN
+    ax = figure.add_axes((LEFT_IN / WIDTH_IN, bottom / height, map_width / WIDTH_IN, map_height / height))
     fitted = view.fitted(map_width * 72, map_height * 72)
     ax.set(xlim=(fitted.x0, fitted.x1), ylim=(fitted.y0, fitted.y1), facecolor="#FBFCFD")
     ax.set_aspect("equal", adjustable="box")
     _axes_style(ax, fitted, projected)
-    return Sheet(figure, canvas, ax, fitted)
+    return Sheet(figure, canvas, ax, fitted, foot_in)
 
 
 def write_title(sheet: Sheet, title: str, subtitle: str) -> None:
@@ -85,7 +90,7 @@ def draw_legend(sheet: Sheet, rows: list[tuple[Any, str]]) -> None:
 
 
 def legend_rows(
-    cast: Cast, mark_step_s: float | None, *, truth: bool, replay: bool, outside: int
+    cast: Cast, mark_step_s: float | None, *, truth: bool, replay: bool, hits: int, outside: int
 ) -> list[tuple[Any, str]]:
     """Handles and texts: leading movers, what is summed up, then what the marks mean where there are marks."""
     rows: list[tuple[Any, str]] = []
@@ -107,6 +112,8 @@ def legend_rows(
         rows.append((_line(INK, lw=0.8, ls=(0, (3, 2))), "truth"))
     if replay:
         rows.append((_line(MUTED, lw=1.9, ls=(0, (0.1, 1.6)), dash_capstyle="round"), "replay"))
+    if hits:
+        rows.append((Line2D([], [], ls="none", **{**HIT, "ms": 6.0}), "collides, not in the log"))
     if outside:
         rows.append((_line("none"), f"{outside} outside this view"))
     return rows
@@ -117,7 +124,7 @@ def draw_scale_and_north(sheet: Sheet, *, projected: bool) -> None:
     height = sheet.figure.get_figheight()
     m_per_in = sheet.view.m_per_pt * 72
     length_m = nice_step(1.35 * m_per_in)
-    x, y, w = WIDTH_IN - SIDE_IN + 0.06, BOTTOM_IN + 0.08, length_m / m_per_in
+    x, y, w = WIDTH_IN - SIDE_IN + 0.06, sheet.foot_in + BOTTOM_IN + 0.08, length_m / m_per_in
     column = sheet.figure.add_axes((0, 0, 1, 1), frameon=False)
     column.set(xlim=(0, WIDTH_IN), ylim=(0, height), xticks=[], yticks=[])
     column.set_zorder(-1)

@@ -12,7 +12,9 @@ from log2sim.errors import ConfigError
 from log2sim.files import refuse_existing, replaced
 from log2sim.plot import draw
 from log2sim.plot.cast import Cast, assign, moves, path
+from log2sim.plot.hits import hits_of
 from log2sim.plot.sheet import Sheet, draw_legend, draw_scale_and_north, legend_rows, make_sheet, write_title
+from log2sim.plot.strips import DrawnStrips, draw_strips, foot_in, story_of
 from log2sim.plot.view import View, choose_view, time_step_s
 from log2sim.scenario import Scenario
 
@@ -34,7 +36,8 @@ def plot_tracks(
 
     Parameters
     ----------
-    replay : object with `agents`, each with `id` and columns `t_s, x_m, y_m, yaw_rad`, or None
+    replay : log2sim.replay.Replay or None
+        Laid over; what the ego did and was told, or the one farthest from its path, goes into strips below the map.
     truth : Scenario or None
         In the same map frame and from the same start.
     background : TopdownPicture or None
@@ -81,7 +84,7 @@ def still(
     title: str | None = None,
 ) -> Sheet:
     """The sheet of a still picture."""
-    sheet, step_s = base(scenario, cast, replay=replay, truth=truth, background=background, title=title)
+    sheet, step_s, _ = base(scenario, cast, replay=replay, truth=truth, background=background, title=title)
     overlaid = truth is not None or replay is not None
     draw.draw_tracks(sheet.ax, cast, sheet.view, step_s, alpha=0.45 if overlaid else 1.0)
     ghosts = None if overlaid or draw.view_is_crowded(cast) else step_s
@@ -90,6 +93,7 @@ def still(
         draw.draw_truth(sheet.ax, truth)
     if replay is not None:
         draw.draw_replay(sheet.ax, replay, cast)
+        draw.draw_hits(sheet.ax, hits_of(replay)[1])
     draw.draw_labels(sheet.ax, cast, sheet.view, step_s)
     return sheet
 
@@ -103,15 +107,17 @@ def base(
     background: draw.Background | None = None,
     title: str | None = None,
     moving: bool = False,
-) -> tuple[Sheet, float]:
-    """What still and moving pictures share: sheet, background, standing agents, legend; and the time step of marks."""
+) -> tuple[Sheet, float, DrawnStrips | None]:
+    """What still and moving pictures share: sheet, background, standing agents, legend; the time step of marks; strips."""
     chosen = choose_view(cast)
     projected = scenario.map.projection is not None
     step_s = time_step_s(scenario.duration_s, len(cast.movers), _typical_speed(cast), chosen.width_m / 500)
     outside = _outside(cast, chosen)
     overlays = {"truth": truth is not None, "replay": replay is not None}
-    rows = legend_rows(cast, None if moving else step_s, outside=outside, **overlays)
-    sheet = make_sheet(chosen, len(rows), projected=projected)
+    hits = len(hits_of(replay)[0])
+    rows = legend_rows(cast, None if moving else step_s, hits=hits, outside=outside, **overlays)
+    story = story_of(replay, scenario, cast)
+    sheet = make_sheet(chosen, len(rows), projected=projected, foot_in=foot_in(story))
     if background is not None:
         draw.draw_background(sheet.ax, background)
     sheet.ax.set(xlim=(sheet.view.x0, sheet.view.x1), ylim=(sheet.view.y0, sheet.view.y1))
@@ -119,7 +125,10 @@ def base(
     draw_legend(sheet, rows)
     draw_scale_and_north(sheet, projected=projected)
     write_title(sheet, title or scenario.name or "scenario", _subtitle(scenario, cast))
-    return sheet, step_s
+    strips = None
+    if story is not None:
+        strips = draw_strips(sheet, story, (0.0, scenario.duration_s), moving=moving)
+    return sheet, step_s, strips
 
 
 def _subtitle(scenario: Scenario, cast: Cast) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,6 +16,9 @@ from log2sim.replay.vehicle import Columns
 
 CHUNK = 20
 """Rows that share one broad phase."""
+
+BATCH = 100_000
+"""Pairs that are looked at together, so that memory stays small."""
 
 SAME_CONTACT_S = 0.5  # contacts of a pair that are nearer in time are one collision
 LOG_WINDOW_S = 0.5  # a replayed collision is the log's when the log's boxes overlap this near in time,
@@ -41,25 +44,43 @@ def contacts(boxes: Boxes, moves: NDArray[np.bool_], only: NDArray[np.bool_] | N
     forward for the first overlap and backward for the last. Where an agent leaps or vanishes the boxes are compared at the
     row alone. Cost: A log A and the pairs in reach, a chunk.
     """
-    found = [np.zeros((4, 0))]
+    k, a, b = np.concatenate([np.zeros((3, 0), dtype=np.intp), *_candidates(boxes, moves, only)], axis=1)
+    first_row, last_row = np.zeros(len(k)), np.zeros(len(k))
+    for begin in range(0, len(k), BATCH):
+        part = slice(begin, begin + BATCH)
+        first_row[part], last_row[part] = _steps_of_contact(boxes, k[part], a[part], b[part])
+    hit = ~np.isnan(first_row)
+    return Contacts(a[hit], b[hit], first_row[hit], last_row[hit])
+
+
+def _candidates(
+    boxes: Boxes, moves: NDArray[np.bool_], only: NDArray[np.bool_] | None
+) -> Iterator[tuple[Rows, Rows, Rows]]:
+    """Rows and pairs (3, N) that may touch before the next row."""
     for begin in range(0, len(boxes.x_m), CHUNK):
         rows = slice(begin, begin + CHUNK + 1)
         i, j = _in_reach(boxes.x_m[rows], boxes.y_m[rows], boxes.radius_m, moves, only)
         present = boxes.present[begin : begin + CHUNK]
-        k, pair = np.nonzero(present[:, i] & present[:, j])
-        k, a, b = k + begin, i[pair], j[pair]
-        on = boxes.moves_on[k, a] & boxes.moves_on[k, b]
-        motion = _motion(boxes, k, np.where(on, k + 1, k), a, b)
-        touch = first_touch(motion)
-        hit = np.flatnonzero(~np.isnan(touch))
-        left = np.where(on[hit], 1.0 - first_touch(motion.take(hit).reversed()), 0.0)
-        found.append(np.stack([a[hit], b[hit], k[hit] + touch[hit], k[hit] + np.fmax(left, touch[hit])]))
-    a, b, first_row, last_row = np.concatenate(found, axis=1)
-    return Contacts(a.astype(np.intp), b.astype(np.intp), first_row, last_row)
+        row, pair = np.nonzero(present[:, i] & present[:, j])
+        k, a, b = row + begin, i[pair], j[pair]
+        near = _motion(boxes, k, a, b).may_touch()
+        yield k[near], a[near], b[near]
 
 
-def _motion(boxes: Boxes, k: Rows, after: Rows, a: Rows, b: Rows) -> Motion:
-    """The motion of pairs (N,) from rows to later ones, which are the same where one of them does not move on."""
+def _steps_of_contact(boxes: Boxes, k: Rows, a: Rows, b: Rows) -> tuple[Array, Array]:
+    """Rows (N,), with a fraction, of the first and the last overlap from rows `k` to the next; NaN where there is none."""
+    motion = _motion(boxes, k, a, b)
+    first, last = first_touch(motion), np.zeros(len(k))
+    hit = np.flatnonzero(~np.isnan(first))
+    on = boxes.moves_on[k[hit], a[hit]] & boxes.moves_on[k[hit], b[hit]]
+    last[hit] = np.where(on, 1.0 - first_touch(motion.take(hit).reversed()), 0.0)
+    rows = k.astype(np.float64)
+    return rows + first, rows + np.fmax(first, last)
+
+
+def _motion(boxes: Boxes, k: Rows, a: Rows, b: Rows) -> Motion:
+    """The motion of pairs (N,) from rows to the next, none where one of them does not get there by moving."""
+    after = np.where(boxes.moves_on[k, a] & boxes.moves_on[k, b], k + 1, k)
     x, y, z = (c[k, b] - c[k, a] for c in (boxes.x_m, boxes.y_m, boxes.z_m))
     then_x, then_y, then_z = (c[after, b] - c[after, a] for c in (boxes.x_m, boxes.y_m, boxes.z_m))
     yaw_a, yaw_b = boxes.yaw_rad[k, a], boxes.yaw_rad[k, b]
@@ -104,11 +125,12 @@ def collisions(
     known = contacts(grown, moves, involved)
     velocity = np.stack(replayed.velocities(_spacing(t_s)))
     rows = np.arange(len(t_s), dtype=np.float64)
+    logged_contacts = _by_pair(known)
     events: list[dict[str, Any]] = []
-    for a, b in sorted(set(zip(touching.a.tolist(), touching.b.tolist()))):
-        in_log = np.interp(_of_pair(known, a, b), rows, t_s)
+    for (a, b), contact in _by_pair(touching).items():
+        in_log = np.interp(logged_contacts.get((a, b), np.zeros((2, 0))), rows, t_s)
         together = max(replayed.first_row[a], replayed.first_row[b])
-        for begin_row, end_row in _runs(_of_pair(touching, a, b), SAME_CONTACT_S / _spacing(t_s)):
+        for begin_row, end_row in _runs(contact, SAME_CONTACT_S / _spacing(t_s)):
             begin, end = np.interp([begin_row, end_row], rows, t_s)
             shared = (in_log[0] <= end + LOG_WINDOW_S) & (in_log[1] >= begin - LOG_WINDOW_S)
             events.append(
@@ -124,10 +146,13 @@ def collisions(
     return sorted(events, key=lambda e: (e["t_s"], e["agents"]))
 
 
-def _of_pair(found: Contacts, a: int, b: int) -> Array:
-    """First and last rows (2, K) of a pair's contacts in order of time."""
-    chosen = found.take((found.a == a) & (found.b == b))
-    return np.stack([chosen.first_row, chosen.last_row])[:, np.argsort(chosen.first_row)]
+def _by_pair(found: Contacts) -> dict[tuple[int, int], Array]:
+    """First and last rows (2, K) of each pair's contacts in order of time."""
+    found = found.take(np.lexsort((found.first_row, found.b, found.a)))
+    new = np.flatnonzero((np.diff(found.a) != 0) | (np.diff(found.b) != 0)) + 1
+    rows = np.split(np.stack([found.first_row, found.last_row]), new, axis=1)
+    begins = np.concatenate([[0], new])[: len(found.a)]
+    return dict(zip(zip(found.a[begins].tolist(), found.b[begins].tolist()), rows))
 
 
 def _runs(contact: Array, gap: float) -> list[tuple[float, float]]:
@@ -143,8 +168,7 @@ def _spacing(t_s: Array) -> float:
 
 def _relative_speed(velocity: Array, row: float, a: int, b: int) -> float:
     """Relative speed at a row with a fraction, from velocities (2, S, A)."""
-    relative = velocity[:, :, b] - velocity[:, :, a]
     k = int(row)
-    now = relative[:, k]
-    then = relative[:, min(k + 1, relative.shape[1] - 1)]
+    after = min(k + 1, velocity.shape[1] - 1)
+    now, then = (velocity[:, r, b] - velocity[:, r, a] for r in (k, after))
     return float(np.hypot(*(now if np.isnan(then).any() else now + (row - k) * (then - now))))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from log2sim.geometry import Array
@@ -33,14 +35,14 @@ def comfort(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array) -> dict[str, flo
     Returns
     -------
     dict or None
-        None for fewer than four rows, which have no third derivative.
+        None for fewer than five rows, which no window fits.
 
     Notes
     -----
     Derivatives of cubics fitted to the positions in a sliding window (Savitzky and Golay, 1964): longitudinal along the
     heading, lateral across it, both of the box center whatever drives it. What changes faster than the window is damped.
     """
-    if len(t_s) < 4:
+    if len(t_s) < 5:
         return None
     spacing_s = (t_s[-1] - t_s[0]) / (len(t_s) - 1)
     ax, ay = (_derivative(c, 2, ACCEL_WINDOW_S, spacing_s) for c in (x_m, y_m))
@@ -67,14 +69,20 @@ def comfort(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array) -> dict[str, flo
 
 
 def _derivative(values: Array, order: int, window_s: float, spacing_s: float) -> Array:
-    """Derivative (S,) of cubics fitted to a window about each row, at the ends to the window there."""
-    from scipy.signal import savgol_filter
-
-    longest = len(values) if len(values) % 2 else len(values) - 1
-    wanted = 2 * round(window_s / spacing_s / 2) + 1
-    window = max(min(wanted, longest), 3)
-    # Relative to the first row, since filters lose digits at far map offsets.
-    return savgol_filter(values - values[0], window, min(3, window - 1), deriv=order, delta=spacing_s)
+    """Derivative (S,) of the cubics fitted to a window about each row; near an end of that of the window at the end."""
+    longest = len(values) - (len(values) + 1) % 2
+    half = min(round(window_s / spacing_s / 2), longest // 2)
+    at_s = np.arange(-half, half + 1) * spacing_s
+    fit = np.linalg.pinv(np.vander(at_s, 4, increasing=True))
+    # Relative to the first row, since far map offsets would cost digits.
+    cubics = np.lib.stride_tricks.sliding_window_view(values - values[0], len(at_s)) @ fit.T
+    row = np.arange(len(values))
+    center = np.clip(row, half, len(values) - 1 - half)
+    since_s = (row - center) * spacing_s
+    return sum(
+        (math.perm(k, order) * cubics[center - half, k] * since_s ** (k - order) for k in range(order, 4)),
+        start=np.zeros(len(values)),
+    )
 
 
 def _rms(values: Array) -> float:

@@ -13,7 +13,6 @@ import numpy as np
 
 from log2sim.geometry import Array, cos_sin
 from log2sim.replay.vehicle import (
-    GRAVITY_MPS2,
     Columns,
     PointControls,
     PointState,
@@ -159,9 +158,8 @@ def start_vehicles(row: Array, parameters: VehicleParameters) -> VehicleState:
     steer = np.minimum(np.maximum(angle, -parameters.max_steer_rad), parameters.max_steer_rad)
     pedal = np.minimum(np.maximum(accel * gear, -parameters.max_brake_mps2), parameters.max_throttle_mps2)
     speed, pedal = np.where(stands > 0.5, 0.0, [speed, pedal])
-    rate = speed * curvature
-    lateral = -rate * speed * np.abs(speed) / (GRAVITY_MPS2 * parameters.friction * parameters.rear_stiffness_1prad)
-    return VehicleState(x.copy(), y.copy(), yaw.copy(), speed, steer, pedal, lateral, rate)
+    still = np.zeros(len(x))
+    return VehicleState(x.copy(), y.copy(), yaw.copy(), speed, steer, pedal, still, still)
 
 
 def start_points(row: Array) -> PointState:

@@ -48,23 +48,26 @@ def tracking_errors(path: Path, t_s: Array, x_m: Array, y_m: Array, near_s: Arra
     """
     log_x, log_y, log_yaw, _ = path.centers(t_s)
     along = (x_m - log_x) * np.cos(log_yaw) + (y_m - log_y) * np.sin(log_yaw)
-    times = (t_s if near_s is None else near_s)[:, None] + np.arange(
-        -SEARCH_S, SEARCH_S + SEARCH_STEP_S / 2, SEARCH_STEP_S
-    )
-    px, py, yaw, _ = (v.reshape(times.shape) for v in path.centers(times.ravel()))
-    ux, uy = np.diff(px, axis=1), np.diff(py, axis=1)
-    dx, dy = x_m[:, None] - px[:, :-1], y_m[:, None] - py[:, :-1]
+    begin_s, end_s = path.t_s[0] - SEARCH_S, path.t_s[-1] + SEARCH_S
+    px, py, yaw, _ = path.centers(np.arange(begin_s, end_s + SEARCH_STEP_S, SEARCH_STEP_S))
+    ux, uy = np.diff(px), np.diff(py)
     square = ux**2 + uy**2
     moves = square > (STANDING_MPS * SEARCH_STEP_S) ** 2
-    share = np.clip(np.divide(dx * ux + dy * uy, square, out=np.zeros_like(square), where=moves), 0.0, 1.0)
-    nearest = np.argmin(np.hypot(dx - share * ux, dy - share * uy), axis=1)
+    # Segments near each row (S, K): on each the share of it at which it is nearest.
+    reach = round(SEARCH_S / SEARCH_STEP_S)
+    middle = np.rint(((t_s if near_s is None else near_s) - begin_s) / SEARCH_STEP_S).astype(np.intp)
+    near = np.clip(middle[:, None] + np.arange(-reach, reach), 0, len(square) - 1)
+    dx, dy, sx, sy = x_m[:, None] - px[near], y_m[:, None] - py[near], ux[near], uy[near]
+    slope = np.divide(1.0, square, out=np.zeros_like(square), where=moves)
+    share = np.clip((dx * sx + dy * sy) * slope[near], 0.0, 1.0)
+    best = np.argmin((dx - share * sx) ** 2 + (dy - share * sy) ** 2, axis=1)
     row = np.arange(len(t_s))
+    k, dx, dy = near[row, best], dx[row, best], dy[row, best]
     length = np.sqrt(np.where(moves, square, 1.0))
-    cos, sin = np.where(moves, ux / length, np.cos(yaw[:, :-1])), np.where(moves, uy / length, np.sin(yaw[:, :-1]))
-    across = dy * cos - dx * sin
+    cos, sin = np.where(moves, ux / length, np.cos(yaw[:-1])), np.where(moves, uy / length, np.sin(yaw[:-1]))
     # A vehicle that reverses has its left on the other side of its course.
-    behind = cos * np.cos(yaw[:, :-1]) + sin * np.sin(yaw[:, :-1]) < 0
-    return np.where(behind, -across, across)[row, nearest], along
+    left = np.where(cos * np.cos(yaw[:-1]) + sin * np.sin(yaw[:-1]) < 0, -1.0, 1.0)
+    return left[k] * (dy * cos[k] - dx * sin[k]), along
 
 
 def agent_metrics(errors: Errors) -> dict[str, Any]:

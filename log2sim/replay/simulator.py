@@ -11,7 +11,8 @@ from typing import Protocol
 
 from log2sim.errors import ConfigError
 from log2sim.registry import nearest
-from log2sim.replay.single_track import step_dynamic, step_single_track
+from log2sim.replay.single_track import step_single_track
+from log2sim.replay.sliding import step_dynamic
 from log2sim.replay.vehicle import (
     PointControls,
     PointState,

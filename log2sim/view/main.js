@@ -1,0 +1,194 @@
+// What people can do, and the start.
+
+const LAYER_NAMES = { log: "Log", truth: "Truth", replay: "Replay", trails: "Trails", names: "Names" };
+let fitted = false;
+
+const choose = (track) => {
+  state.chosen = track;
+  list.choose(track);
+  details.choose(track);
+  drawLife();
+  remember();
+  wake();
+};
+
+// Choose an agent and bring it into sight, if it is there now.
+const visit = (track) => {
+  choose(track);
+  if (track === null) return;
+  track.moveTo(state.t);
+  const sx = view.sx(track.px), sy = view.sy(track.py);
+  if (track.there && !(sx > 20 && sy > 20 && sx < view.width - 20 && sy < view.height - 20)) [view.x, view.y] = [track.px, track.py];
+};
+
+const hover = (track) => {
+  if (track === state.hovered) return;
+  state.hovered = track;
+  byId("map").classList.toggle("over", track !== null);
+  wake();
+};
+
+// The agent under a point of the screen, the nearest center first.
+const under = (sx, sy, margin) => {
+  const x = view.mx(sx), y = view.my(sy), reach = margin / view.scale;
+  let best = null, least = Infinity;
+  for (const track of tracks) {
+    if (!state.shown.log || !track.there || !track.holds(x, y, reach)) continue;
+    const distance = Math.hypot(track.px - x, track.py - y);
+    if (distance < least) [best, least] = [track, distance];
+  }
+  return best;
+};
+
+const follow = (on) => {
+  state.follow = on && (ego !== null || state.chosen !== null);
+  byId("follow").setAttribute("aria-pressed", state.follow);
+  wake();
+};
+
+const zoom = (factor, sx = view.width / 2, sy = view.height / 2) => {
+  view.zoom(factor, sx, sy);
+  wake();
+};
+
+const fit = () => {
+  follow(false);
+  view.fit(tracks, { left: 24, right: 56, top: 76, bottom: 44 });
+  wake();
+};
+
+// Beside the map the list is there until it is put away; on a narrow screen it is away until asked for.
+const showList = () => {
+  const narrow = matchMedia("(max-width: 720px)").matches && state.chosen !== null;
+  if (narrow) choose(null);
+  document.body.classList.toggle("flipped", narrow || undefined);
+};
+
+const toggle = (layer) => {
+  if (!(layer in LAYER_NAMES) || (data.layers[layer] === undefined && layer in { truth: 0, replay: 0 })) return;
+  state.shown[layer] = !state.shown[layer];
+  byId(`layer-${layer}`).setAttribute("aria-pressed", state.shown[layer]);
+  wake();
+};
+
+const resize = () => {
+  painter.resize();
+  if (!fitted && view.width > 1) {
+    fit();
+    fitted = true;
+  }
+  details.show();
+  drawLife();
+  draw(performance.now());
+};
+
+const listen = () => {
+  const buttons = {
+    play: () => (state.playing ? pause() : play()), slower: () => setRate(-1), faster: () => setRate(1), fit,
+    "zoom-in": () => zoom(1.5), "zoom-out": () => zoom(1 / 1.5), follow: () => follow(!state.follow),
+    "help-toggle": () => byId("help").showModal(), deselect: () => choose(null), "list-toggle": showList,
+  };
+  for (const [id, run] of Object.entries(buttons)) byId(id).addEventListener("click", run);
+  byId("scrub").addEventListener("input", (event) => seek(event.target.valueAsNumber));
+  const jump = (seconds) => (event) => seek(state.t + seconds * (event.shiftKey ? 10 : 1));
+  listenToKeys([
+    ["Space", "play or pause", [" "], buttons.play],
+    ["← →", "0.1 s back or on, 1 s with Shift", ["ArrowLeft"], jump(-0.1)],
+    ["Home End", "first or last moment", ["Home"], () => seek(data.begin)],
+    ["< >", "slower or faster", ["<", ","], () => setRate(-1)],
+    ["+ −", "zoom in or out", ["+", "="], () => zoom(1.25)],
+    ["0", "show all", ["0"], fit],
+    ["f", "follow the chosen agent, else the ego", ["f"], buttons.follow],
+    ["n p", "next or previous agent", ["n"], () => neighbor(1)],
+    ["d t r", "log, truth or replay on or off", ["d"], () => toggle("log")],
+    ["w l", "trails or names on or off", ["w"], () => toggle("trails")],
+    ["e", "next collision of the replay", ["e"], nextEvent],
+    ["a /", "list of agents, search in it", ["a"], buttons["list-toggle"]],
+    ["Esc", "choose nobody", ["Escape"], () => choose(null)],
+    ["?", "this list", ["?"], buttons["help-toggle"]],
+  ], [
+    [["ArrowRight"], jump(0.1)], [["End"], () => seek(data.end)], [[">", "."], () => setRate(1)],
+    [["-", "_"], () => zoom(1 / 1.25)], [["p"], () => neighbor(-1)], [["t"], () => toggle("truth")],
+    [["r"], () => toggle("replay")], [["l"], () => toggle("names")], [["/"], () => byId("search").focus()],
+  ]);
+  listenToPointers(byId("map"), {
+    drag: (dx, dy) => { follow(false); view.drag(dx, dy); wake(); },
+    zoom,
+    click: (sx, sy, margin) => choose(under(sx, sy, margin)),
+    hover: (sx, sy) => hover(sx === null ? null : under(sx, sy, 3)),
+  });
+  window.addEventListener("hashchange", recall);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+    dress(data.layers);
+    list.show();
+    details.show();
+    drawLife();
+    wake();
+  });
+  new ResizeObserver(resize).observe(byId("map"));
+  watchSharpness();
+};
+
+// Paint anew when the window comes onto a screen of another sharpness.
+const watchSharpness = () => {
+  const now = matchMedia(`(resolution: ${window.devicePixelRatio}dppx)`);
+  now.addEventListener("change", () => {
+    resize();
+    watchSharpness();
+  }, { once: true });
+};
+
+const neighbor = (step) => {
+  const here = tracks.indexOf(state.chosen), count = tracks.length;
+  if (count) visit(tracks[here < 0 ? (step > 0 ? 0 : count - 1) : (here + step + count) % count]);
+};
+
+const list = new List(tracks, { choose: visit, hover }), details = new Details(data, seek);
+
+const start = () => {
+  const moving = tracks.filter((track) => !track.standing && !track.ego).length, agents = tracks.length - (ego ? 1 : 0);
+  const parts = [`${(data.end - data.begin).toFixed(1)} s`, `${agents} agent${agents === 1 ? "" : "s"}, ${moving} moving`];
+  if (!ego) parts.push("no ego");
+  if (data.origin) parts.push(`origin ${data.origin}`);
+  byId("whole").textContent = `/ ${data.end.toFixed(1)} s`;
+  byId("name").textContent = data.name || "scenario";
+  byId("summary").textContent = parts.join(" · ");
+  Object.assign(byId("scrub"), { min: data.begin, max: data.end, value: data.begin });
+  byId("follow").disabled = tracks.length === 0;
+  for (const [layer, name] of Object.entries(LAYER_NAMES)) {
+    if (layer in { truth: 0, replay: 0 } && !data.layers[layer]) continue;
+    const button = element("button", { id: `layer-${layer}`, type: "button", "aria-pressed": true, class: layer }, name);
+    button.addEventListener("click", () => toggle(layer));
+    byId("layers").append(button);
+  }
+  markEvents();
+  setRate(0);
+  showPlay();
+  listen();
+  resize();
+  recall();
+};
+
+// For scripts and tests in the browser's console.
+window.log2sim = {
+  get time() { return state.t; },
+  set time(t) { seek(t); },
+  get agents() { return tracks.map((track) => track.id); },
+  get chosen() { return state.chosen?.id ?? null; },
+  choose: (id) => choose(tracks.find((track) => track.id === id) ?? null),
+  play, pause,
+  // Where on the canvas the middle of an agent is, in CSS pixels; null when it is not there.
+  placeOf: (id) => {
+    const track = tracks.find((other) => other.id === id);
+    track?.moveTo(state.t);
+    return track?.there ? [view.sx(track.px), view.sy(track.py)] : null;
+  },
+  // Its heading in rad, counter-clockwise from east; null when it is not there.
+  headingOf: (id) => {
+    const track = tracks.find((other) => other.id === id);
+    track?.moveTo(state.t);
+    return track?.there ? track.pyaw : null;
+  },
+  get pixelsPerMeter() { return view.scale; },
+};
+start();

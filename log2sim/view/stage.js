@@ -1,0 +1,53 @@
+// What there is, what is shown of it, and the frames: drawn while something moves and else not at all.
+
+const data = load(byId("data").textContent);
+const tracks = data.layers.log, ego = tracks.find((track) => track.ego) ?? null;
+for (const track of tracks) track.label = track.id.length > 24 ? `${track.id.slice(0, 23)}…` : track.id;
+const state = {
+  t: data.begin, rate: 1, playing: false, follow: false, chosen: null, hovered: null,
+  shown: { log: true, truth: true, replay: true, trails: true, names: true },
+};
+dress(data.layers);
+const view = new View(), painter = new Painter(byId("map"), view);
+let queued = false, before = 0, dimmed = 0, labelled = "";
+
+const wake = () => {
+  if (!queued) {
+    queued = true;
+    requestAnimationFrame(frame);
+  }
+};
+
+const frame = (now) => {
+  queued = false;
+  if (state.playing) {
+    state.t += Math.min((now - before) / 1000, 0.25) * state.rate;
+    if (state.t >= data.end) {
+      state.t = data.end;
+      pause();
+    }
+  }
+  before = now;
+  draw(now);
+  if (state.playing) wake();
+};
+
+const draw = (now) => {
+  const leader = state.follow ? (state.chosen ?? ego) : null;
+  if (leader) {
+    leader.moveTo(state.t);
+    if (leader.there) [view.x, view.y] = [leader.px, leader.py];
+  }
+  painter.paint(data, state.t, state.shown, state.chosen, state.hovered);
+  const text = state.t.toFixed(2);
+  if (text !== labelled) {
+    byId("time").textContent = labelled = text;
+    byId("scrub").value = state.t;
+    byId("scrub").setAttribute("aria-valuetext", `${text} s`);
+  }
+  details.tick(state.t);
+  if (now - dimmed > 250 || !state.playing) {
+    list.dim();
+    dimmed = now;
+  }
+};

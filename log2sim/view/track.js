@@ -1,0 +1,114 @@
+// Agents over time. Columns are decoded once; where an agent is now stands in its own fields, so that nothing is made per frame.
+
+const sums = (differences, scale) => {
+  const out = new Float64Array(differences.length);
+  let step = 0, value = 0;
+  for (let k = 0; k < out.length; k++) {
+    step += differences[k];
+    value += step;
+    out[k] = value / scale;
+  }
+  return out;
+};
+
+class Track {
+  constructor(entry, scales) {
+    Object.assign(this, {
+      id: entry.id, category: entry.category, group: entry.group, standing: entry.standing, always: entry.always,
+      ego: entry.ego === true, leading: entry.leading === true || entry.ego === true, base: entry.color ?? null,
+      length: entry.size_m[0], width: entry.size_m[1],
+      t: sums(entry.t_s, scales.t_s), x: sums(entry.x_m, scales.x_m), y: sums(entry.y_m, scales.y_m),
+      yaw: sums(entry.yaw_rad, scales.yaw_rad), v: sums(entry.speed_mps, scales.speed_mps),
+    });
+    this.filled = new Uint8Array(Math.max(this.t.length - 1, 0));
+    const edges = entry.filled ?? [];
+    for (let k = 0; k < edges.length; k += 2) this.filled.fill(1, edges[k], edges[k + 1]);
+    this.first = this.t[0];
+    this.last = this.t[this.t.length - 1];
+    this.there = this.guessed = false;
+    this.k = 0;
+    this.px = this.py = this.pyaw = this.pv = 0;
+    this.fill = this.edge = this.pale = this.line = "";  // set by the theme
+  }
+
+  // Index of the last waypoint not after t, from where the search left off.
+  find(t) {
+    const times = this.t, n = times.length;
+    let k = this.k;
+    if (times[k] <= t && (k + 1 === n || t < times[k + 1])) return k;
+    if (k + 2 < n && times[k + 1] <= t && t < times[k + 2]) return (this.k = k + 1);
+    let low = 0, high = n;
+    while (high - low > 1) {
+      const middle = (low + high) >> 1;
+      if (times[middle] <= t) low = middle; else high = middle;
+    }
+    return (this.k = low);
+  }
+
+  // Take the place at time t: linear between waypoints, as everywhere in log2sim.
+  moveTo(t) {
+    const slack = 1e-4;
+    this.there = this.always || (t >= this.first - slack && t <= this.last + slack);
+    if (!this.there) return;
+    const k = this.find(t), n = this.t.length;
+    if (k + 1 === n || t <= this.t[k]) {
+      this.set(this.x[k], this.y[k], this.yaw[k], this.v[k], n > 1 && this.filled[Math.min(k, n - 2)] === 1);
+      return;
+    }
+    const share = (t - this.t[k]) / (this.t[k + 1] - this.t[k]);
+    this.set(
+      this.x[k] + share * (this.x[k + 1] - this.x[k]),
+      this.y[k] + share * (this.y[k + 1] - this.y[k]),
+      this.yaw[k] + share * (this.yaw[k + 1] - this.yaw[k]),
+      this.v[k] + share * (this.v[k + 1] - this.v[k]),
+      this.filled[k] === 1,
+    );
+  }
+
+  set(x, y, yaw, v, guessed) {
+    this.px = x;
+    this.py = y;
+    this.pyaw = yaw;
+    this.pv = v;
+    this.guessed = guessed;
+  }
+
+  // Whether a place in the map is within the box, or nearer to it than a margin.
+  holds(x, y, margin) {
+    const dx = x - this.px, dy = y - this.py, c = Math.cos(this.pyaw), s = Math.sin(this.pyaw);
+    return Math.abs(dx * c + dy * s) <= this.length / 2 + margin && Math.abs(dy * c - dx * s) <= this.width / 2 + margin;
+  }
+}
+
+// The agent of another layer that is this one: by id, else the one that stays nearest while both are there.
+const counterpart = (track, layer) => {
+  const named = layer.find((other) => other.id === track.id);
+  if (named) return named;
+  let best = null, least = 2.0;
+  for (const other of layer) {
+    const first = Math.max(track.first, other.first), last = Math.min(track.last, other.last);
+    if (other.group !== track.group || last - first < 0.3 * (track.last - track.first)) continue;
+    let sum = 0;
+    const samples = 16;
+    for (let k = 0; k < samples; k++) {
+      const t = first + ((last - first) * k) / (samples - 1);
+      track.moveTo(t);
+      other.moveTo(t);
+      sum += Math.hypot(track.px - other.px, track.py - other.py);
+    }
+    if (sum / samples < least) [best, least] = [other, sum / samples];
+  }
+  return best;
+};
+
+const load = (text) => {
+  const document_ = JSON.parse(text);
+  const layers = {};
+  for (const [name, entries] of Object.entries(document_.layers)) {
+    layers[name] = entries.map((entry) => new Track(entry, document_.scales));
+  }
+  const events = document_.events.map((event) => ({
+    ...event, tracks: (layers.replay ?? []).filter((track) => event.agents.includes(track.id)),
+  }));
+  return { name: document_.name, origin: document_.origin, begin: document_.begin_s, end: document_.end_s, layers, events };
+};

@@ -1,0 +1,347 @@
+"""The road under a scenario: along every path within 1 cm, walked by an integrator of its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from command_line import names
+from export_paths import UTM, agent, bend, line, scenario
+from export_readers import Sampled, distance, play, roads
+
+from log2sim.errors import ConfigError, ScenarioError
+from log2sim.export import Options, export
+from log2sim.export.reference_line import ReferenceLine, fit, straight
+from log2sim.export.road_checks import require_roads
+from log2sim.geometry import Array
+from log2sim.scenario import Agent, Scenario
+from log2sim.types import MapFrame
+
+SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
+
+
+def eight(count: int = 300) -> Array:
+    angle = np.linspace(0.0, 2 * np.pi, count)
+    return np.column_stack([30 * np.sin(angle), 15 * np.sin(2 * angle)])
+
+
+def there_and_back() -> Agent:
+    """Forward 20 m, then back 8 m along an arc, facing forward all the while."""
+    back = bend(12.0, 0.7, 30) * [-1, 1] + np.array([20.0, 0.0])
+    xy = np.concatenate([line(20.0, 41), back[1:]])
+    yaw = np.concatenate([np.zeros(41), -np.linspace(0.0, 0.7, 30)[1:]])
+    return agent(xy, yaw_rad=yaw)
+
+
+def creeping() -> Agent:
+    """1 m at 2 cm/s, with half a millimeter of noise."""
+    xy = line(1.0, 500) + np.random.default_rng(0).normal(0.0, 5e-4, (500, 2))
+    return agent(xy, yaw_rad=0.0)
+
+
+PATHS = {
+    "straight": agent(line()),
+    "diagonal": agent(line(heading_rad=2.2)),
+    "turn": agent(bend()),
+    "tight turn": agent(bend(5.0, np.pi, 100)),
+    "s": agent(np.column_stack([np.linspace(0, 60, 200), 3 * np.sin(np.linspace(0, 60, 200) / 8)])),
+    "crossing itself": agent(eight()),
+    "loops": agent(bend(9.0, 13.0, 500)),
+    "reversing": agent(line(), yaw_rad=np.pi),
+    "there and back": there_and_back(),
+    "creeping": creeping(),
+    "standing": agent(np.zeros((20, 2)) + np.array([3.0, 4.0]), yaw_rad=0.3),
+    "standing and trembling": agent(np.random.default_rng(1).normal(0.0, 0.003, (50, 2)), yaw_rad=0.3),
+    "one waypoint": agent([[3.0, 4.0]], yaw_rad=-3.0),
+    "two waypoints": agent([[0.0, 0.0], [25.0, 9.0]]),
+    "12 cm": agent(line(0.12, 5)),
+    "stopping between": agent(np.concatenate([line(10.0, 21), np.full((30, 2), [10.0, 0.0]), bend()[1:] + np.array([10.0, 0.0])]), yaw_rad=None),
+    "far away": agent(bend() + np.array([4.0e6, -5.0e6])),
+}  # fmt: skip
+PATHS["stopping between"] = agent(
+    np.column_stack([PATHS["stopping between"].waypoints.x_m, PATHS["stopping between"].waypoints.y_m]),
+    yaw_rad=np.concatenate([np.zeros(51), np.linspace(0.0, np.pi / 2, 60)[1:]]),
+)
+
+
+def network(folder: Path, world: Scenario) -> list[Sampled]:
+    export(world, "openscenario", folder, overwrite=True)
+    return roads(folder / "road.xodr", 0.05)
+
+
+@pytest.fixture(scope="module", params=PATHS)
+def driven(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    """The name of a path and the folder of its export."""
+    folder = tmp_path_factory.mktemp("driven")
+    export(scenario(PATHS[request.param]), "openscenario", folder)
+    return request.param, folder
+
+
+def path_of(a: Agent, folder: Path) -> Array:
+    """The agent's path (N, 2) on the axes of the files: every waypoint, and the straight way from one to the next."""
+    w = a.waypoints
+    t = np.unique(np.concatenate([w.t_s, np.linspace(w.t_s[0], w.t_s[-1], 1000)]))
+    offset = ElementTree.parse(folder / "road.xodr").find("header/offset")
+    shift = np.array([float(offset.attrib[k]) for k in "xy"]) - UTM.offset_m[:2]
+    return np.column_stack([np.interp(t, w.t_s, w.x_m), np.interp(t, w.t_s, w.y_m)]) - shift
+
+
+def test_the_ego_drives_within_1_cm_of_the_reference_line_and_of_the_middle_of_its_lane(
+    driven: tuple[str, Path],
+) -> None:
+    name, folder = driven
+    found = roads(folder / "road.xodr", 0.05)
+    path = path_of(PATHS[name], folder)
+    for lines in ([r.line[:, :2] for r in found], [r.centers[-1][:, :2] for r in found]):
+        apart = np.min([distance(path, each) for each in lines], axis=0)
+        assert apart.max() <= 0.01
+        assert apart.max() > 0 or name in ("standing", "one waypoint")  # the walker and the fit are not the same code
+
+
+def test_no_geometry_is_degenerate(driven: tuple[str, Path]) -> None:
+    for road in ElementTree.parse(driven[1] / "road.xodr").getroot().iterfind("road"):
+        pieces = road.findall("planView/geometry")
+        s, length = (np.array([float(p.attrib[k]) for p in pieces]) for k in ("s", "length"))
+        assert s[0] == 0
+        assert length.min() > 0.01
+        np.testing.assert_allclose(np.diff(s), length[:-1], atol=2e-8)
+        assert float(road.attrib["length"]) == pytest.approx(length.sum(), abs=1e-6)
+        assert float(road.attrib["length"]) >= 20.0
+        curvature = [abs(float(p.find("arc").attrib["curvature"])) for p in pieces if p.find("arc") is not None]
+        assert all(1e-9 < c < 0.5 for c in curvature)
+
+
+def test_pieces_join_without_gap_or_kink(driven: tuple[str, Path]) -> None:
+    for road in ElementTree.parse(driven[1] / "road.xodr").getroot().iterfind("road"):
+        end = None
+        for piece in road.iterfind("planView/geometry"):
+            x, y, h, length = (float(piece.attrib[k]) for k in ("x", "y", "hdg", "length"))
+            if end is not None:
+                np.testing.assert_allclose([x, y], end[:2], atol=1e-6)
+                assert abs(h - end[2]) < 1e-4
+            c = float(piece.find("arc").attrib["curvature"]) if piece.find("arc") is not None else 0.0
+            # The closed form by complex numbers, where the writer uses chords.
+            ahead = length if c == 0 else (np.exp(1j * c * length) - 1) / (1j * c)
+            z = ahead * np.exp(1j * h)
+            end = (x + z.real, y + z.imag, h + c * length)
+
+
+def test_a_circle_becomes_arcs_of_its_curvature() -> None:
+    """But for the ends, where a smoothing spline has data on one side only."""
+    found, stations = fit(bend(15.0, np.pi / 2, 200))
+    np.testing.assert_allclose([p.curvature_1pm for p in found.pieces], 1 / 15, rtol=0.08)
+    assert found.length_m == pytest.approx(15 * np.pi / 2, abs=0.01)
+    np.testing.assert_allclose(stations, np.linspace(0, found.length_m, 200), atol=0.01)
+
+
+def test_a_straight_path_is_one_line_with_what_is_before_and_after_it(tmp_path: Path) -> None:
+    (road,) = network(tmp_path, scenario(agent(line())))
+    (piece,) = road.road.findall("planView/geometry")
+    assert piece.find("line") is not None
+    assert [float(piece.attrib[k]) for k in ("x", "y", "hdg", "length")] == pytest.approx([-10.0, 0.0, 0.0, 50.0])
+
+
+def test_a_reference_line_gives_points_at_stations_in_any_order() -> None:
+    found = straight(1.0, 2.0, np.pi / 2, 4.0)
+    np.testing.assert_allclose(
+        found.at(np.array([3.0, 0.0])), [[1.0, 3.0, np.pi / 2], [1.0, 0.0, np.pi / 2]], atol=1e-12
+    )
+    assert isinstance(found, ReferenceLine)
+
+
+def test_the_road_rises_with_the_ground_under_the_ego(tmp_path: Path) -> None:
+    z = 100.0 + 2.0 * np.sin(np.linspace(0.0, 60.0, 121) / 20.0)
+    (road,) = network(tmp_path, scenario(agent(line(60.0, 121), ground_m=z)))
+    on = (road.line[:, 0] >= 0) & (road.line[:, 0] <= 60)
+    np.testing.assert_allclose(road.line[on, 2], 100.0 + 2.0 * np.sin(road.line[on, 0] / 20.0), atol=0.03)
+
+
+def test_flat_ground_is_one_elevation(tmp_path: Path) -> None:
+    (road,) = network(tmp_path, scenario(agent(line(), ground_m=7.0)))
+    assert [e.attrib["a"] for e in road.road.iterfind("elevationProfile/elevation")] == ["7"]
+
+
+def test_a_lane_is_wide_enough_for_who_drives_it(tmp_path: Path) -> None:
+    for width_m, lane_m in ((1.9, 3.5), (3.2, 4.0)):
+        (road,) = network(tmp_path, scenario(agent(line(), size_m=(8.0, width_m, 3.0))))
+        lane = road.road.find("lanes/laneSection/right/lane[@id='-1']/width")
+        assert float(lane.attrib["a"]) == pytest.approx(lane_m)
+
+
+def test_others_get_a_road_where_they_leave_the_ego_s_and_none_where_they_do_not(tmp_path: Path) -> None:
+    ego, beside = agent(line(60.0, 61)), agent(line(40.0, 41, start=(5.0, 3.4)), "beside")
+    assert len(network(tmp_path, scenario(ego, beside))) == 1
+    leaving = agent(np.concatenate([line(30.0, 31), bend()[1:] + np.array([30.0, 0.0])]), "leaving", yaw_rad=np.concatenate([np.zeros(31), np.linspace(0, np.pi / 2, 60)[1:]]))  # fmt: skip
+    found = network(tmp_path, scenario(ego, leaving))
+    assert [r.road.attrib["name"] for r in found] == ["ego", "leaving"]
+    off = path_of(leaving, tmp_path)
+    off = off[off[:, 1] > 2.0]
+    assert distance(off, found[1].line[:, :2]).max() <= 0.01
+    crossing = agent(line(40.0, 41, np.pi / 2, (30.0, -20.0)), "crossing")
+    assert len(network(tmp_path, scenario(ego, crossing))) == 2
+
+
+def test_neither_pedestrians_nor_parked_cars_make_roads(tmp_path: Path) -> None:
+    walker = agent(line(20.0, 21, 1.0, (0.0, 30.0)), "walker", category="pedestrian")
+    parked = agent(np.full((5, 2), [5.0, 20.0]), "parked", yaw_rad=1.0, static=True)
+    assert len(network(tmp_path, scenario(agent(line()), walker, parked))) == 1
+
+
+def test_a_scenario_without_an_ego_has_the_road_of_who_goes_farthest(tmp_path: Path) -> None:
+    found = network(tmp_path, scenario(agent(line(5.0, 6), "near"), agent(line(50.0, 51, 1.0), "far")))
+    assert found[0].road.attrib["name"] == "far"
+    assert len(network(tmp_path, scenario(agent(line(5.0, 6), "walker", category="pedestrian")))) == 1
+
+
+# What users of OpenDRIVE players complain about, by the issue that tells it.
+
+
+def test_sumo_8445_local_plus_offset_are_coordinates_of_the_projection(tmp_path: Path) -> None:
+    """eclipse-sumo/sumo#8445, #12802; esmini#189; carla#2383: where the local origin lies has to be in the file."""
+    export(scenario(agent(bend() + np.array([25_300.0, 0.0]))), "openscenario", tmp_path)
+    header = ElementTree.parse(tmp_path / "road.xodr").find("header")
+    assert header.findtext("geoReference") == UTM.projection
+    offset = [float(header.find("offset").attrib[k]) for k in "xyz"]
+    assert offset == [456000.0 + 25000.0, 5428000.0, 100.0]
+    (road,) = roads(tmp_path / "road.xodr")
+    assert road.line[0, 0] == pytest.approx(290.0, abs=0.1)
+
+
+def test_scenarionet_103_the_shift_is_in_the_files_and_undone_by_an_import(tmp_path: Path) -> None:
+    from log2sim.export.openscenario_read import load
+
+    world = scenario(agent(bend() + np.array([25_300.0, 7e6])))
+    export(world, "openscenario", tmp_path)
+    back = load(tmp_path / "scenario.xosc").agents[0].waypoints
+    np.testing.assert_allclose(back.y_m, world.agents[0].waypoints.y_m, atol=1e-6)
+
+
+def test_a_local_map_claims_no_place_on_earth(tmp_path: Path) -> None:
+    export(scenario(agent(line()), map=MapFrame(37.8, -122.4, 3.0)), "openscenario", tmp_path)
+    header = ElementTree.parse(tmp_path / "road.xodr").find("header")
+    assert header.find("geoReference") is None
+    assert header.find("offset") is None
+
+
+def users_map(folder: Path, world: Scenario, projection: str | None, offset: tuple[float, float, float] | None) -> Path:
+    """A road that another tool could have made."""
+    export(world, "openscenario", folder)
+    tree = ElementTree.parse(folder / "road.xodr")
+    header = tree.find("header")
+    for child in list(header):
+        header.remove(child)
+    if projection is not None:
+        ElementTree.SubElement(header, "geoReference").text = projection
+    if offset is not None:
+        ElementTree.SubElement(header, "offset", {**dict(zip("xyz", map(str, offset))), "hdg": "0"})
+    tree.write(folder / "mine.xodr", encoding="utf-8")
+    return folder / "mine.xodr"
+
+
+def test_the_user_s_map_is_copied_as_it_is(tmp_path: Path) -> None:
+    mine = users_map(tmp_path / "a", scenario(agent(line())), None, None)
+    files = export(scenario(agent(bend())), "openscenario", tmp_path / "b", Options(map=mine))
+    assert (tmp_path / "b" / "road.xodr").read_bytes() == mine.read_bytes()
+    assert [f.name for f in files] == ["road.xodr", "scenario.xosc"]
+    logic = ElementTree.parse(tmp_path / "b" / "scenario.xosc").find("RoadNetwork/LogicFile")
+    assert logic.attrib == {"filepath": "road.xodr"}
+
+
+def test_on_the_user_s_map_agents_have_its_coordinates(tmp_path: Path) -> None:
+    world = scenario(agent(bend(), rear_axle_offset_m=0.0))
+    mine = users_map(tmp_path / "a", world, UTM.projection, (455_000.0, 5_428_000.0, 90.0))
+    export(world, "openscenario", tmp_path / "b", Options(map=mine))
+    vertices = play(tmp_path / "b" / "scenario.xosc")["ego"].vertices
+    np.testing.assert_allclose(
+        vertices[:, 1:4], np.column_stack([bend() + np.array([1000.0, 0.0]), np.full(60, 10.0)]), atol=1e-5
+    )
+
+
+def test_a_map_in_another_projection_has_the_agents_where_they_are_on_earth(tmp_path: Path) -> None:
+    """Against PROJ, point by point, and headings by a step of one meter on the ellipsoid's plane."""
+    from pyproj import Transformer
+
+    from log2sim.export.openscenario_read import load
+
+    other = "+proj=tmerc +lat_0=49 +lon_0=8.4 +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m +geoidgrids=egm96_15.gtx +vunits=m +no_defs"
+    world = scenario(agent(bend(), rear_axle_offset_m=0.0))
+    mine = users_map(tmp_path / "a", world, other, (0.0, 0.0, 100.0))
+    export(world, "openscenario", tmp_path / "b", Options(map=mine))
+    to_other = Transformer.from_crs(
+        "EPSG:32632", "+proj=tmerc +lat_0=49 +lon_0=8.4 +k=1 +ellps=WGS84 +units=m", always_xy=True
+    )
+    expected = np.column_stack(to_other.transform(*(bend() + UTM.offset_m[:2]).T))
+    played = play(tmp_path / "b" / "scenario.xosc")["ego"]
+    np.testing.assert_allclose(played.vertices[:, 1:3], expected, atol=1e-3)
+    direction = np.gradient(expected, axis=0)
+    np.testing.assert_allclose(played.vertices[2:-2, 4], np.unwrap(np.arctan2(*direction.T[::-1]))[2:-2], atol=2e-3)
+    back = load(tmp_path / "b" / "scenario.xosc").agents[0].waypoints
+    np.testing.assert_allclose(np.column_stack([back.x_m, back.y_m]), bend(), atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        ("<OpenDRIVE/>", "expected <OpenDRIVE> with a <header>"),
+        ("<OpenDRIVE><header/></OpenDRIVE>", "has no roads"),
+        ("no xml", "not valid XML"),
+        ("<!DOCTYPE x [<!ENTITY a 'b'>]><OpenDRIVE/>", "document type declaration"),
+    ],
+)
+def test_a_map_that_is_none_is_refused_and_nothing_stays(spoil: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.xodr").write_text(spoil)
+    with pytest.raises(ScenarioError, match=message):
+        export(scenario(agent(line())), "openscenario", tmp_path / "out", Options(map=tmp_path / "mine.xodr"))
+    assert names(tmp_path) == ["mine.xodr"]
+
+
+def test_a_map_whose_projection_is_not_one_is_refused(tmp_path: Path) -> None:
+    for text, message in (("+proj=nonsense", "is no projection"), ("EPSG:32632", "is no PROJ string")):
+        mine = users_map(tmp_path / text[:6], scenario(agent(line())), text, None)
+        with pytest.raises(ConfigError, match=message):
+            export(scenario(agent(line())), "openscenario", tmp_path / "out", Options(map=mine))
+
+
+def test_a_turned_map_is_refused(tmp_path: Path) -> None:
+    mine = users_map(tmp_path / "a", scenario(agent(line())), UTM.projection, (0.0, 0.0, 0.0))
+    mine.write_text(
+        mine.read_text()
+        .replace('hdg="0" />\n  </header>', 'hdg="0.1" /></header>')
+        .replace('z="0.0" hdg="0"', 'z="0.0" hdg="0.1"')
+    )
+    with pytest.raises(ConfigError, match="offset turns the map"):
+        export(scenario(agent(line())), "openscenario", tmp_path / "out", Options(map=mine))
+
+
+@pytest.mark.parametrize(
+    ("find", "attribute", "value", "message"),
+    [
+        ("planView/geometry[2]", "s", "1", "geometry at s=1"),
+        ("planView/geometry[1]", "length", "0", "with length 0"),
+        ("planView/geometry[1]", "length", "nan", "expected a finite number"),
+        (".", "length", "7", "but its geometry ends at"),
+        ("elevationProfile/elevation[2]", "s", "0", "expected stations in order"),
+        ("lanes/laneSection/right/lane/width", "sOffset", "2", "lane -1 has no width"),
+    ],
+)
+def test_a_road_out_of_order_is_named(find: str, attribute: str, value: str, message: str, tmp_path: Path) -> None:
+    export(scenario(agent(bend(), ground_m=np.linspace(0, 2, 60))), "openscenario", tmp_path)
+    root = ElementTree.parse(tmp_path / "road.xodr").getroot()
+    require_roads(root, "road.xodr")
+    root.find("road").find(find).set(attribute, value)
+    with pytest.raises(Exception, match=message) as raised:
+        require_roads(root, "road.xodr")
+    assert "road.xodr: road '1'" in str(raised.value)
+
+
+def test_the_sample_s_roads_hold_every_vehicle_that_moves(tmp_path: Path) -> None:
+    world = replace(Scenario.load(SAMPLE))
+    found = network(tmp_path, world)
+    centers = [c[:, :2] for r in found for c in r.centers.values()]
+    for a in world.agents:
+        if not a.static and a.category != "pedestrian":
+            xy = np.column_stack([a.waypoints.x_m, a.waypoints.y_m])
+            assert np.min([distance(xy, c) for c in centers], axis=0).max() <= 3.5 / 2

@@ -1,0 +1,223 @@
+"""Time to collision and post-encroachment time: closed forms, and all pairs of rows tried one by one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_replay_contacts import SPACING_S, T_S, boxes_of
+
+from log2sim.replay.approach import HORIZON_S, approaches, time_to_touch
+from log2sim.replay.boxes import Boxes, rectangles_overlap
+from log2sim.replay.conflicts import conflicts, least
+from log2sim.replay.encroachment import CROSSING_RAD, encroachments
+
+SIZE = np.array([[4.0, 2.0, 1.5]])
+
+
+def touch(dx, dy, vx, vy, yaw_a=0.0, yaw_b=0.0):
+    one = [np.array([v], float) for v in (dx, dy, vx, vy, yaw_a, yaw_b)]
+    return float(time_to_touch(*one, SIZE, SIZE)[0])
+
+
+def test_time_to_touch_is_the_gap_over_the_closing_speed():
+    assert touch(20, 0, -8, 0) == pytest.approx((20 - 4) / 8)
+    assert touch(20, 1.9, -8, 0) == pytest.approx((20 - 4) / 8)
+    assert touch(0, -9, 0, 2, 0.0, 0.0) == pytest.approx((9 - 2) / 2)
+    assert touch(20, 0, -8, 0, 0.0, np.pi / 2) == pytest.approx((20 - 3) / 8)
+    assert touch(12, 9, -6, -3, 0.0, np.pi / 2) == pytest.approx(max((12 - 3) / 6, (9 - 3) / 3))
+    # A corner ahead of a side: it reaches (4 + 2) / 2 / sqrt(2) from its center.
+    assert touch(20, 0, -8, 0, 0.0, np.pi / 4) == pytest.approx((20 - 2 - 3 / np.sqrt(2)) / 8)
+
+
+def test_boxes_that_pass_part_or_overlap_never_touch():
+    assert touch(20, 2.0, -8, 0) == np.inf
+    assert touch(20, 0, 8, 0) == np.inf
+    assert touch(20, 0, 0, 0) == np.inf
+    assert touch(3, 0, -1, 0) == np.inf
+    assert touch(12, 9, -6, -0.5, 0.0, np.pi / 2) == np.inf
+
+
+def test_time_to_touch_is_when_moments_see_the_first_overlap():
+    rng = np.random.default_rng(1)
+    n = 1000
+    d, v = rng.uniform(-12, 12, (2, n)), rng.normal(0, 5, (2, n))
+    yaw, size = rng.uniform(-np.pi, np.pi, (2, n)), rng.uniform(0.5, 5, (2, n, 3))
+    found = time_to_touch(*d, *v, *yaw, *size)
+    moments = np.arange(0, 6, 0.002)
+    seen = np.stack([rectangles_overlap(*(d + t * v), *yaw, *size) for t in moments])
+    expected = np.where(seen.any(axis=0) & ~seen[0], moments[np.argmax(seen, axis=0)], np.inf)
+    brief = (seen.sum(axis=0) <= 2) | seen[0]
+    np.testing.assert_array_equal((found < 5.9)[~brief], (expected < 5.9)[~brief])
+    soon = (expected < 5.9) & ~brief
+    assert soon.sum() > 50
+    assert np.all(np.abs(found[soon] - expected[soon]) < 0.0021)
+    assert np.all(np.isinf(found[seen[0]]))
+
+
+def town(count, seed):
+    """Agents that drive straight, turn or stand, some only for a while."""
+    rng = np.random.default_rng(seed)
+    tracks = []
+    for _ in range(count):
+        x, y, yaw, speed, rate = (*rng.uniform(-25, 25, 2), *rng.uniform(-np.pi, np.pi, 1), rng.uniform(0, 15), rng.choice([0, 0.4, 1.8]))  # fmt: skip
+        speed = speed * (rng.uniform() < 0.8)
+        begin, end = sorted(rng.choice(T_S, 2))
+        life = (0.0, 4.0) if rng.uniform() < 0.6 else (begin, end)
+
+        def heading(t, yaw=yaw, rate=rate):
+            return yaw + rate * t
+
+        def along(trig, start, speed=speed, rate=rate, heading=heading):
+            def at(t):
+                fine = np.linspace(0, 1, 101)[:, None] * t
+                return start + speed * trig(heading(fine)).mean(axis=0) * t
+
+            return at
+
+        tracks.append((along(np.cos, x), along(np.sin, y), heading, *life))
+    sizes = np.stack([rng.uniform(0.6, 8, count), rng.uniform(0.5, 2.5, count), np.full(count, 1.6)], axis=1)
+    return boxes_of(*tracks, size=sizes)
+
+
+def test_the_least_times_to_collision_are_those_of_all_pairs_at_all_rows():
+    boxes = town(40, seed=7)
+    moves = np.arange(40) % 5 > 0
+    vx, vy = boxes.velocities(SPACING_S)
+    a, b = np.triu_indices(40, 1)
+    a, b = (c[moves[a] | moves[b]] for c in (a, b))
+    times = np.stack([
+        time_to_touch(x[b] - x[a], y[b] - y[a], ux[b] - ux[a], uy[b] - uy[a], yaw[a], yaw[b], boxes.size_m[a], boxes.size_m[b])
+        for x, y, ux, uy, yaw in zip(boxes.x_m, boxes.y_m, vx, vy, boxes.yaw_rad)
+    ])  # fmt: skip
+    together = boxes.present[:, a] & boxes.present[:, b]
+    times = np.where(together & (times <= HORIZON_S), times, np.inf)
+    expected = {(i, j): t for i, j, t in zip(a.tolist(), b.tolist(), times.min(axis=0)) if np.isfinite(t)}
+    found = approaches(boxes, moves, SPACING_S)
+    pairs = list(zip(found.a.tolist(), found.b.tolist()))
+    assert len(expected) > 40
+    assert set(pairs) == set(expected)
+    np.testing.assert_allclose(found.time_s, [expected[p] for p in pairs], atol=1e-12)
+    rows = [times[:, np.flatnonzero((a == i) & (b == j))[0]].argmin() for i, j in pairs]
+    np.testing.assert_array_equal(found.row, rows)
+
+
+def test_a_follower_that_brakes_has_its_least_time_where_gap_over_speed_is_least():
+    gap, closing, brake = 20.0, 9.0, 2.5
+    leader = (lambda t: 30 + gap + 10 * t, 0.0, 0.0)
+    follower = (lambda t: 26 + (10 + closing) * t - brake / 2 * np.minimum(t, closing / brake) ** 2 - np.maximum(t - closing / brake, 0) * closing, 0.0, 0.0)  # fmt: skip
+    t = np.arange(0, 4, 1e-4)
+    speed = closing - brake * t
+    expected = ((gap - closing * t + brake / 2 * t**2) / np.where(speed > 0, speed, np.nan))[speed > 0].min()
+    (found,) = approaches(boxes_of(leader, follower), np.ones(2, bool), SPACING_S).time_s
+    assert found == pytest.approx(expected, abs=2e-3)
+
+
+def test_velocities_are_of_the_motion_and_not_of_the_heading():
+    boxes = boxes_of((lambda t: 3 * t, lambda t: -4 * t + t**2, 1.0, 1.0, 3.0), (0.0, 0.0, 0.5, 2.0, 2.0))
+    vx, vy = boxes.velocities(SPACING_S)
+    inner = slice(21, 60)
+    np.testing.assert_allclose(vx[inner, 0], 3.0, atol=1e-9)
+    np.testing.assert_allclose(vy[inner, 0], -4 + 2 * T_S[inner], atol=1e-9)
+    assert np.isnan(vx[:20, 0]).all()
+    assert (vx[40, 1], vy[40, 1]) == (0.0, 0.0)
+    alone = Boxes(boxes.x_m, boxes.y_m, boxes.z_m, boxes.yaw_rad, boxes.speed_mps + 2.0, boxes.size_m)
+    assert alone.velocities(SPACING_S)[1][40, 1] == pytest.approx(2 * np.sin(0.5))
+
+
+def test_at_right_angles_it_is_from_the_rear_out_to_the_front_in():
+    first = (lambda t: 10 * (t - 1.0), 0.0, 0.0)  # out of the other's lane when its center is 3 m past
+    for late_s in (1.03, 1.77):
+        second = (0.0, lambda t, late_s=late_s: -5 * (t - 1.0 - late_s), -np.pi / 2)
+        expected = (1.0 + late_s - 3 / 5) - (1.0 + 3 / 10)
+        for tracks, order in (((first, second), (0, 1)), ((second, first), (1, 0))):
+            found = encroachments(boxes_of(*tracks), SPACING_S)
+            assert (found.first.tolist(), found.second.tolist()) == ([order[0]], [order[1]])
+            assert (found.came_row - found.left_row) * SPACING_S == pytest.approx(expected, abs=5e-4)
+            assert found.left_row * SPACING_S == pytest.approx(1.3, abs=5e-4)
+
+
+def test_who_stops_on_the_crossing_leaves_when_it_drives_on():
+    first = (lambda t: np.minimum(10 * (t - 0.5), 0.0) + 10 * np.maximum(t - 2.0, 0), 0.0, 0.0)
+    second = (0.0, lambda t: 8 * (t - 3.5), np.pi / 2)
+    found = encroachments(boxes_of(first, second), SPACING_S)
+    assert (found.came_row - found.left_row) * SPACING_S == pytest.approx((3.5 - 3 / 8) - 2.3, abs=5e-4)
+
+
+def pairs_of(*tracks):
+    return len(encroachments(boxes_of(*tracks), SPACING_S).first)
+
+
+def test_only_who_is_seen_to_leave_and_who_is_seen_to_come_counts():
+    def straight(t):
+        return 10 * (t - 1.0)
+
+    def across(t):
+        return 10 * (t - 2.0)
+
+    second = (0.0, across, np.pi / 2)
+    assert pairs_of((straight, 0.0, 0.0), second) == 1
+    assert pairs_of((straight, 0.0, 0.0, 0.0, 1.0), second) == 0  # its log ends on the crossing
+    assert pairs_of((straight, 0.0, 0.0), (0.0, across, np.pi / 2, 2.0, 4.0)) == 0  # it appears there
+    assert pairs_of((0.0, 0.0, 0.0, 0.0, 1.0), second) == 0  # parked, and then no more seen
+    assert pairs_of((lambda t: straight(t + 0.8), 0.0, 0.1), (straight, 0.0, 0.0)) == 0  # one follows the other
+    assert pairs_of((straight, 5.0, 0.0), (lambda t: 20 - straight(t), 0.0, np.pi)) == 0  # in other lanes
+    assert pairs_of((straight, 0.0, 0.0)) == 0
+
+
+def test_the_shortest_post_encroachment_times_are_those_of_all_rows():
+    boxes = town(30, seed=11)
+    found = encroachments(boxes, SPACING_S)
+    pairs = [(min(p), max(p)) for p in zip(found.first.tolist(), found.second.tolist())]
+    got = dict(zip(pairs, (found.came_row - found.left_row).tolist()))
+    i, j = (g.ravel() for g in np.meshgrid(np.arange(len(T_S)), np.arange(len(T_S)), indexing="ij"))
+    i, j = i[i < j], j[i < j]
+    expected = {}
+    for a in range(30):
+        for b in range(30):
+            if a == b or not boxes.present[:, [a, b]].any(axis=0).all():
+                continue
+            k, m = (np.full(len(i), c) for c in (a, b))
+            turn = np.angle(np.exp(1j * (boxes.yaw_rad[j, b] - boxes.yaw_rad[i, a])))
+            valid = boxes.present[i, a] & boxes.present[j, b] & (np.abs(turn) >= CROSSING_RAD)
+            at = np.flatnonzero(valid)
+            at = at[boxes.overlap(i[at], k[at], j[at], m[at])]
+            last, first = np.flatnonzero(boxes.present[:, a])[-1], np.flatnonzero(boxes.present[:, b])[0]
+            at = at[~boxes.overlap(np.full(len(at), last), k[at], j[at], m[at])]
+            at = at[~boxes.overlap(i[at], k[at], np.full(len(at), first), m[at])]
+            if len(at):
+                pair = (min(a, b), max(a, b))
+                expected[pair] = min(expected.get(pair, np.inf), float((j - i)[at].min()))
+    assert len(expected) > 15
+    assert set(got) == set(expected)
+    rows = np.array([expected[p] - got[p] for p in got])
+    # Between the rows it may be shorter: each moment moves by at most 1 + 1/4 + 1/16 + 1/64 rows.
+    assert np.all((rows > -0.01) & (rows <= 2 * 85 / 64))
+
+
+@pytest.mark.parametrize(("late_s", "count"), [(3.9, 1), (8.2, 1), (10.3, 1), (10.6, 0)])
+def test_it_is_found_up_to_ten_seconds_later_and_not_after(late_s, count):
+    t = np.arange(0, 400) * SPACING_S
+    x = np.stack([10 * (t - 2.0), 0 * t], axis=1)
+    y = np.stack([0 * t, 10 * (t - 2.0 - late_s)], axis=1)
+    yaw = np.tile([0.0, np.pi / 2], (400, 1))
+    boxes = Boxes(x, y, 0 * x, yaw, 0 * x + 10, np.tile([4.0, 2.0, 1.5], (2, 1)))
+    found = encroachments(boxes, SPACING_S)
+    assert len(found.first) == count
+    # Out at 3 m past the crossing, in at 3 m before: 0.6 s less than they are apart.
+    assert np.all(np.abs((found.came_row - found.left_row) * SPACING_S - (late_s - 0.6)) < 5e-4)
+
+
+def test_a_new_collision_is_zero_and_one_of_the_log_is_left_out_of_the_least():
+    a, b = (lambda t: 10 * t, 0.0, 0.0), (lambda t: 60 - 10 * t, 0.0, np.pi)
+    c = (lambda t: 100 + 0 * t, lambda t: 20 - 5 * t, -np.pi / 2)
+    boxes, ids = boxes_of(a, b, c), ["ego", "b", "c"]
+    event = {"agents": ["ego", "b"], "t_s": 2.8, "until_s": 3.2, "relative_speed_mps": 20.0, "from_start": False}
+    for in_log, contact, value in ((False, "new", 0.0), (True, "log", None)):
+        near = conflicts(boxes, np.ones(3, bool), T_S, ids, [{**event, "in_log": in_log}])
+        entry = next(e for e in near if e["agents"] == ["ego", "b"])
+        assert (entry["contact"], entry["ego"]) == (contact, True)
+        smallest = least([entry], "min_ttc")
+        assert smallest is None if value is None else (smallest["s"], smallest["t_s"]) == (0.0, 2.8)
+    assert conflicts(boxes_of(c), np.ones(1, bool), T_S, ["c"], []) == []
+    none = np.zeros((len(T_S), 0))
+    assert conflicts(Boxes(none, none, none, none, none, np.zeros((0, 3))), np.zeros(0, bool), T_S, [], []) == []

@@ -1,0 +1,184 @@
+"""Contacts between stored states: closed forms, and overlaps at a thousand times as many moments."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from replay_maneuvers import agent_from, scenario_of
+from scipy.optimize import brentq
+
+from log2sim.geometry import wrap_angle
+from log2sim.replay import replay
+from log2sim.replay.boxes import Boxes, rectangles_overlap
+from log2sim.replay.collisions import collisions, contacts
+from log2sim.replay.sweep import STEPS, Motion, first_touch
+
+SPACING_S = 0.05
+T_S = np.arange(0, 81) * SPACING_S
+
+
+def boxes_of(*tracks, size=(4.0, 2.0, 1.5)):
+    """Boxes from tracks of functions x, y, yaw of time, and times from which to which each is there."""
+    shape = (len(T_S), len(tracks))
+    x, y, yaw = (np.full(shape, np.nan) for _ in range(3))
+    for k, (fx, fy, fyaw, *life) in enumerate(tracks):
+        begin, end = life or (T_S[0], T_S[-1])
+        there = np.abs(T_S - (begin + end) / 2) < (end - begin) / 2 + 1e-9
+        for column, f in ((x, fx), (y, fy), (yaw, fyaw)):
+            column[there, k] = (f(T_S) if callable(f) else np.full(len(T_S), f))[there]
+    sizes = np.array(size if np.ndim(size) == 2 else [size] * len(tracks), float)
+    return Boxes(x, y, np.where(np.isnan(x), np.nan, 0.8), wrap_angle(yaw), np.zeros(shape), sizes)
+
+
+def events_of(boxes):
+    count = len(boxes.size_m)
+    far = Boxes(*(c + 1e4 * np.arange(count) for c in (boxes.x_m, boxes.y_m)), boxes.z_m, boxes.yaw_rad, boxes.speed_mps, boxes.size_m)  # fmt: skip
+    return collisions(boxes, far, np.ones(count, bool), T_S, [str(k) for k in range(count)])
+
+
+@pytest.mark.parametrize("start", [100.0, 101.3, 102.9])
+@pytest.mark.parametrize("offset", [0.0, 1e7])
+def test_two_that_meet_head_on_touch_when_the_gap_is_closed(start, offset):
+    a = (lambda t: offset + 30 * t, offset, 0.0)
+    b = (lambda t: offset + start - 30 * t, offset + 0.5, np.pi)
+    (event,) = events_of(boxes_of(a, b))
+    assert event["t_s"] == pytest.approx((start - 4.0) / 60, abs=1e-4)
+    assert event["until_s"] == pytest.approx((start + 4.0) / 60, abs=1e-4)
+    assert event["relative_speed_mps"] == pytest.approx(60.0, abs=1e-3)
+    assert not event["from_start"]
+
+
+@pytest.mark.parametrize("start", np.linspace(60.0, 66.0, 13))
+def test_nothing_tunnels_at_60_mps(start):
+    bicycle = (1.8, 0.6, 1.7)
+    a, b = (lambda t: 60 * t, 0.0, 0.0), (lambda t: start - 60 * t, 0.2, np.pi)
+    (event,) = events_of(boxes_of(a, b, size=bicycle))
+    assert event["t_s"] == pytest.approx((start - 1.8) / 120, abs=1e-4)
+    assert event["until_s"] == pytest.approx((start + 1.8) / 120, abs=1e-4)
+    beside = (lambda t: start - 60 * t, 0.61, np.pi)
+    assert events_of(boxes_of(a, beside, size=bicycle)) == []
+
+
+@pytest.mark.parametrize("late_s", [-0.08, -0.06, 0.0, 0.06, 0.08])
+def test_two_that_cross_at_right_angles_touch_while_both_cover_the_crossing(late_s):
+    a = (lambda t: 50 * (t - 1.013), 0.0, 0.0)
+    b = (0.0, lambda t: 30 * (t - 1.013 - late_s), np.pi / 2)
+    # Each covers the other's lane while its center is within (4 + 2) / 2 of it.
+    begin = max(1.013 - 3 / 50, 1.013 + late_s - 3 / 30)
+    end = min(1.013 + 3 / 50, 1.013 + late_s + 3 / 30)
+    (event,) = events_of(boxes_of(a, b))
+    assert (event["t_s"], event["until_s"]) == pytest.approx((begin, end), abs=1e-4)
+    assert event["relative_speed_mps"] == pytest.approx(np.hypot(50, 30), abs=1e-3)
+
+
+def test_one_that_leaves_the_crossing_before_the_other_comes_is_not_hit():
+    a = (lambda t: 50 * (t - 1.013), 0.0, 0.0)
+    missed = 3 / 50 + 3 / 30
+    for late_s, count in ((missed + 0.001, 0), (missed - 0.002, 1), (-missed - 0.001, 0)):
+        b = (0.0, lambda t, late_s=late_s: 30 * (t - 1.013 - late_s), np.pi / 2)
+        assert len(events_of(boxes_of(a, b))) == count
+
+
+@pytest.mark.parametrize("view", [0.0, 0.5, -2.0])
+@pytest.mark.parametrize("rate", [1.5, -6.0])
+def test_a_bar_that_turns_touches_when_its_corner_gets_there(rate, view):
+    bar, wall = (10.0, 0.5, 2.0), (2.0, 40.0, 2.0)
+    gap = 4.6
+    a = (0.0, 0.0, lambda t: view + np.pi / 2 + rate * t)  # seen from some sides its yaw passes pi
+    b = ((gap + 1.0) * np.cos(view), (gap + 1.0) * np.sin(view), view)
+
+    def reach(t):
+        yaw = np.pi / 2 + rate * t
+        return 5.0 * abs(np.cos(yaw)) + 0.25 * abs(np.sin(yaw)) - gap
+
+    expected = brentq(reach, 0.0, np.pi / 2 / abs(rate))
+    event = events_of(boxes_of(a, b, size=(bar, wall)))[0]
+    assert event["t_s"] == pytest.approx(expected, abs=1e-4)
+
+
+def random_motions(count, seed):
+    rng = np.random.default_rng(seed)
+    size_a, size_b = (
+        np.stack([rng.uniform(0.5, 12, count), rng.uniform(0.4, 3, count), np.ones(count)]) for _ in range(2)
+    )
+    place, way = rng.uniform(-9, 9, (2, count)), rng.normal(0, 6, (2, count))
+    turn = rng.uniform(-0.6, 0.6, (2, count)) * (rng.uniform(size=count) < 0.7)
+    zero = np.zeros(count)
+    return Motion(*place, zero, *way, zero, *rng.uniform(-np.pi, np.pi, (2, count)), *turn, size_a, size_b)
+
+
+def overlapping(m, u):
+    return rectangles_overlap(
+        m.dx_m + u * m.vx_m, m.dy_m + u * m.vy_m, m.yaw_a_rad + u * m.turn_a_rad, m.yaw_b_rad + u * m.turn_b_rad,
+        m.size_a_m.T, m.size_b_m.T,
+    )  # fmt: skip
+
+
+def test_first_touches_are_those_of_a_thousand_moments():
+    motion = random_motions(3000, seed=4)
+    moments = np.linspace(0, 1, 1025)
+    seen = np.stack([overlapping(motion, u) for u in moments])
+    ever, first = seen.any(axis=0), moments[np.argmax(seen, axis=0)]
+    found = first_touch(motion)
+    touched = ~np.isnan(found)
+    assert 0.2 < ever.mean() < 0.8
+    brief = seen.sum(axis=0) <= 1024 / STEPS
+    assert not np.any(~touched & ever & ~brief)
+    assert np.mean(~touched & ever) < 0.003
+    assert overlapping(motion.take(touched), found[touched]).all()
+    both = touched & ever & ~brief
+    late = found[both] - first[both]
+    assert np.all(late < 1 / STEPS)
+    assert np.mean(np.abs(late) < 2 / 1024) > 0.99  # the others graze for less than a step before
+
+
+def test_backward_the_first_touch_is_the_last():
+    motion = random_motions(300, seed=5)
+    touched = ~np.isnan(first_touch(motion))
+    last = 1 - first_touch(motion.reversed())
+    assert np.mean(touched == ~np.isnan(last)) > 0.99
+    both = touched & ~np.isnan(last)
+    assert np.all(last[both] >= first_touch(motion)[both] - 1e-3)
+
+
+def test_one_that_leaps_over_another_does_not_hit_it():
+    b = (20.0, 0.0, 0.0)
+    assert events_of(boxes_of((lambda t: 5 * t + np.where(t > 1.02, 40.0, 0.0), 0.0, 0.0), b)) == []
+    (event,) = events_of(boxes_of((lambda t: 5 * t + np.where(t > 1.02, 16.0, 0.0), 0.0, 0.0), b))
+    assert event["t_s"] == pytest.approx(1.05)  # it lands in it
+
+
+def test_boxes_that_appear_inside_each_other_say_so_and_those_of_other_times_do_not_meet():
+    stands, passes = (0.0, 0.0, 0.0), (lambda t: -8 + 4 * t, 0.0, 0.0)
+    (event,) = events_of(boxes_of(stands, (*passes, 1.5, 4.0)))
+    assert event["from_start"]
+    assert event["t_s"] == pytest.approx(1.5)
+    (event,) = events_of(boxes_of((*stands, 0.0, 1.5), passes))
+    assert not event["from_start"]
+    assert (event["t_s"], event["until_s"]) == pytest.approx((1.0, 1.5), abs=1e-4)
+    assert events_of(boxes_of((*stands, 0.0, 0.9), passes)) == []
+    assert events_of(boxes_of((*stands, 0.0, 2.0), (0.0, 0.0, 0.0, 2.05, 4.0))) == []
+
+
+def test_one_alone_and_nobody_hit_nothing():
+    assert events_of(boxes_of((lambda t: 5 * t, 0.0, 0.0))) == []
+    none = np.zeros((len(T_S), 0))
+    assert events_of(Boxes(none, none, none, none, none, np.zeros((0, 3)))) == []
+
+
+def test_the_order_of_agents_does_not_matter():
+    a, b = (lambda t: 17 * t, 0.3, 0.1), (30.0, lambda t: 20 - 13 * t, -1.2)
+    one, other = contacts(boxes_of(a, b), np.ones(2, bool)), contacts(boxes_of(b, a), np.ones(2, bool))
+    np.testing.assert_allclose(one.first_row, other.first_row, atol=1e-3)
+    assert len(one.a) > 1
+
+
+@pytest.mark.parametrize("mode", ["exact", "pid"])
+def test_a_collision_does_not_depend_on_the_step(mode):
+    t = np.arange(0, 41) * 0.1
+    a = agent_from(t, 30 * t, 0 * t, 0 * t, np.full(41, 30.0), id="a")
+    b = agent_from(t, 131.0 - 30 * t, 0 * t + 0.4, np.full(41, np.pi), np.full(41, 30.0), id="b")
+    for dt_s in (0.005, 0.01, 0.02, 0.05, 0.1):
+        (event,) = replay(scenario_of(a, b), mode=mode, dt_s=dt_s).metrics["collisions"]
+        assert event["t_s"] == pytest.approx((131.0 - 4.4) / 60, abs=2e-4)
+        assert event["relative_speed_mps"] == pytest.approx(60.0, abs=0.01)

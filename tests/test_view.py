@@ -1,0 +1,597 @@
+"""The page: what is written into it, and what it does in a headless Chromium."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from html.parser import HTMLParser
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import CHROMIUM, DRIVER, Browser, browsing
+from command_line import names, run
+
+from log2sim.errors import ConfigError
+from log2sim.geometry import Array, box_corners_bev, wrap_angle
+from log2sim.plot import look
+from log2sim.plot.cast import assign
+from log2sim.replay import replay
+from log2sim.scenario import Agent, Scenario, Waypoints
+from log2sim.view import write_page
+from log2sim.view.pack import SCALES, pack, shortened
+from log2sim.view.page import page_of
+
+ROOT = Path(__file__).resolve().parents[1]
+TRUTH = ROOT / "samples" / "crossing" / "truth.json"
+ESCAPE, HOME, END, LEFT, RIGHT, ENTER = "\ue00c", "\ue011", "\ue010", "\ue012", "\ue014", "\ue007"
+EVIL = '</script x></script><script>window.hacked = 1</script><img src=x onerror="window.hacked = 1">{{data}}<!--'
+
+
+def agent(id: str, x_m: Array, y_m: float, yaw_rad: float = 0.0, **changes: Any) -> Agent:
+    """An agent with a waypoint a second along x."""
+    n, x = len(x_m), np.asarray(x_m, float)
+    speed = np.gradient(x) if n > 1 else np.zeros(1)
+    columns = {"x_m": x, "y_m": np.full(n, y_m), "z_m": np.zeros(n), "yaw_rad": np.full(n, yaw_rad), "speed_mps": speed}
+    w = Waypoints(t_s=np.arange(float(n)), observed=np.ones(n, bool), sigma_xy_m=np.zeros(n), **columns)
+    return Agent(**{"id": id, "category": "car", "size_m": (4.0, 2.0, 1.6), "waypoints": w, **changes})
+
+
+def filled(source: Agent, first: int, last: int) -> Agent:
+    """The agent with waypoints that nobody observed."""
+    observed = np.ones(len(source.waypoints), bool)
+    observed[first : last + 1] = False
+    return replace(source, waypoints=replace(source.waypoints, observed=observed))
+
+
+def made(*agents: Agent, name: str = "made") -> Scenario:
+    return Scenario(name=name, t0_ns=0, duration_s=4.0, agents=agents)
+
+
+class Parts(HTMLParser):
+    """Tags of a page with their attributes, and the text in each of its scripts and styles."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: list[tuple[str, str]] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data: str) -> None:
+        if self.tags and self.tags[-1][0] in ("script", "style") and data.strip():
+            self.texts.append((self.tags[-1][0], data))
+
+
+# What is written
+
+
+def test_columns_come_back_from_their_second_differences() -> None:
+    values = np.random.default_rng(0).normal(0, 1e7, 300)
+    summed = np.cumsum(np.cumsum(shortened(values, 1e3))) / 1e3
+    np.testing.assert_allclose(summed, values, atol=0.5e-3 + 1e-8)
+    assert shortened([2.5], 10) == [25]
+    assert shortened(np.arange(9.0), 1e4)[2:] == [0] * 7
+
+
+def test_the_document_holds_every_layer() -> None:
+    scenario = Scenario.load(TRUTH)
+    replayed = replay(scenario, dt_s=0.1)
+    document = pack(scenario, truth=scenario, replay=replayed)
+    assert {k: len(v) for k, v in document["layers"].items()} == {"log": 12, "truth": 12, "replay": 12}
+    assert document["end_s"] == scenario.duration_s
+    entry = next(e for e in document["layers"]["replay"] if e["id"] == "car_turning")
+    summed = np.cumsum(np.cumsum(entry["x_m"])) / SCALES["x_m"]
+    np.testing.assert_allclose(summed, replayed.agent("car_turning").x_m, atol=0.51e-3)
+
+
+def test_agents_have_the_colors_of_the_pictures() -> None:
+    scenario = Scenario.load(TRUTH)
+    entries = {e["id"]: e for e in pack(scenario)["layers"]["log"]}
+    cast = assign(scenario)
+    assert list(entries) == [r.agent.id for r in cast.movers] + [a.id for a in cast.standing]
+    for role in cast.movers[1:]:
+        assert entries[role.agent.id]["color"] == role.color
+    assert entries["ego"]["ego"]
+    assert [e["id"] for e in entries.values() if e["standing"]] == [a.id for a in cast.standing]
+
+
+def test_the_style_has_the_colors_of_the_pictures() -> None:
+    style = resources.files("log2sim.view").joinpath("style.css").read_text(encoding="utf-8")
+    light = dict(re.findall(r"--([\w-]+): (#\w{6})", style[: style.index("@media")]))
+    wanted = {
+        "paper": look.PAPER, "ink": look.INK, "muted": look.MUTED, "grid": look.GRID, "frame": look.FRAME,
+        "parked-face": look.PARKED_FACE, "parked-edge": look.PARKED_EDGE,
+    }  # fmt: skip
+    assert {k: light[k] for k in wanted} == wanted
+
+
+def test_the_page_asks_for_nothing_from_outside() -> None:
+    page = page_of({**pack(Scenario.load(TRUTH)), "scales": SCALES})
+    parts = Parts(page)
+    assert set(re.findall(r"https?://[^\s\"'<>]+", page)) == {"http://www.w3.org/2000/svg"}  # a name, not a place
+    assert not [a for _, a in parts.tags if {"src", "action"} & set(a)]
+    assert [a["href"] for tag, a in parts.tags if tag == "link"] == ["data:,"]
+    policy = next(a["content"] for _, a in parts.tags if a.get("http-equiv") == "Content-Security-Policy")
+    assert policy is not None
+    assert policy.startswith("default-src 'none';")
+    (style,) = (text for tag, text in parts.texts if tag == "style")
+    script = [text for tag, text in parts.texts if tag == "script"][-1]
+    for text, kind in ((script, "script"), (style, "style")):
+        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        assert f"{kind}-src 'sha256-{digest}'" in policy
+
+
+def test_names_in_a_scenario_cannot_become_part_of_the_page() -> None:
+    document = {**pack(made(agent(EVIL, np.arange(5.0), 0.0), name=EVIL)), "scales": SCALES}
+    parts, usual = (Parts(page_of(d)) for d in (document, {**document, "name": "x", "layers": {"log": []}}))
+    assert [tag for tag, _ in parts.tags] == [tag for tag, _ in usual.tags]
+    data = next(text for tag, text in parts.texts if tag == "script")
+    assert json.loads(data) == document
+
+
+def test_view_writes_a_page(tmp_path: Path) -> None:
+    assert run("replay", TRUTH, "--dt", "0.1", "--out", tmp_path / "r.json", "--quiet").code == 0
+    arguments = ("view", TRUTH, "--truth", TRUTH, "--replay", tmp_path / "r.json", "--out", tmp_path / "v.html")
+    ran = run(*arguments)
+    assert ran.code == 0, ran.err
+    assert "v.html: 0.1 MB, 12 agents" in ran.out
+    assert names(tmp_path) == ["r.json", "v.html"]
+    assert "--overwrite" in run(*arguments).line
+    assert run(*arguments, "--overwrite", "--quiet").out == ""
+
+
+def test_a_page_that_cannot_be_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ran = run("view", TRUTH, "--out", tmp_path / "v.png")
+    assert ran.code == 2
+    assert "must end in .html" in ran.line
+    monkeypatch.setattr("log2sim.view.pack.MOST_ROWS", 100)
+    with pytest.raises(ConfigError, match="1260 waypoints are more than the 100"):
+        write_page(Scenario.load(TRUTH), tmp_path / "v.html")
+    assert names(tmp_path) == []
+
+
+# What it does
+
+
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """One browser for all tests of this module; skips where there is none."""
+    if CHROMIUM is None or DRIVER is None:
+        pytest.skip("needs Chromium and its driver (Debian: chromium, chromium-driver)")
+    with browsing(tmp_path_factory.mktemp("profile")) as browser:
+        yield browser
+
+
+@pytest.fixture
+def browser(chromium: Browser) -> Iterator[Browser]:
+    """The browser, whose pages must neither log an error nor ask for anything but themselves."""
+    yield chromium
+    assert chromium.log("browser") == []
+    assert {address.split("#")[0].rpartition("/")[2] for address in chromium.requests()} <= {"page.html"}
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page of the sample with all layers."""
+    path = tmp_path_factory.mktemp("view") / "page.html"
+    scenario = Scenario.load(TRUTH)
+    write_page(scenario, path, truth=scenario, replay=replay(scenario, dt_s=0.1))
+    return path
+
+
+def opened(browser: Browser, page: Path, hash: str = "", **window: Any) -> Browser:
+    browser.open(page.as_uri() + hash, **window)
+    return browser
+
+
+def page_with(tmp_path: Path, *agents: Agent, name: str = "made") -> Path:
+    write_page(made(*agents, name=name), tmp_path / "page.html")
+    return tmp_path / "page.html"
+
+
+def time_of(browser: Browser) -> float:
+    return float(browser.run("return log2sim.time"))
+
+
+def place_of(browser: Browser, id: str) -> Array:
+    return np.array(browser.run("return log2sim.placeOf(arguments[0])", id), dtype=np.float64)
+
+
+def pixel(browser: Browser, place: Array) -> tuple[int, ...]:
+    """Color of the canvas at a place after the next frame."""
+    script = """const [x, y, done] = arguments;
+        requestAnimationFrame(() => requestAnimationFrame(() => {
+            const pen = new OffscreenCanvas(1, 1).getContext("2d", {willReadFrequently: true});
+            pen.drawImage(document.getElementById("map"), -Math.round(x), -Math.round(y));
+            done([...pen.getImageData(0, 0, 1, 1).data]);
+        }));"""
+    return tuple(browser.run_async(script, float(place[0]), float(place[1])))[:3]
+
+
+def rgb(hex: str) -> tuple[int, ...]:
+    return tuple(int(hex[k : k + 2], 16) for k in (1, 3, 5))
+
+
+def pressed(browser: Browser, id: str) -> bool:
+    return bool(browser.run("return document.getElementById(arguments[0]).getAttribute('aria-pressed') === 'true'", id))
+
+
+def text_of(browser: Browser, id: str) -> str:
+    return str(browser.run("return document.getElementById(arguments[0]).textContent", id))
+
+
+def test_agents_are_where_the_scenario_has_them(browser: Browser, sample: Path) -> None:
+    scenario, moments = Scenario.load(TRUTH), [0.0, 0.013, 1.77, 5.2, 3.3, 3.31]
+    opened(browser, sample)
+    scale = browser.run("return log2sim.pixelsPerMeter")
+    script = (
+        "log2sim.time = arguments[0]; return Object.fromEntries(log2sim.agents.map((id) => [id, log2sim.placeOf(id)]))"
+    )
+    for t in moments:
+        shown = browser.run(script, t)
+        for a in scenario.agents[1:]:
+            mine, ego = a.at(t), scenario.agents[0].at(t)
+            offset = (np.array(shown[a.id]) - shown["ego"]) / scale
+            np.testing.assert_allclose(offset, [mine.x_m[0] - ego.x_m[0], ego.y_m[0] - mine.y_m[0]], atol=2e-3)
+
+
+def test_agents_are_where_they_are_between_waypoints_too(browser: Browser, tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    source = agent("a", rng.uniform(-50, 50, 60), 0.0)
+    w = source.waypoints
+    t = np.round(np.cumsum(rng.uniform(0.001, 0.12, 60)), 4)
+    source = replace(
+        source, waypoints=replace(w, t_s=t, y_m=rng.uniform(-50, 50, 60), yaw_rad=rng.uniform(-3.1, 3.1, 60))
+    )
+    opened(browser, page_with(tmp_path, source, agent("origin", np.zeros(5), 0.0)), "#agent=a")
+    script = """const out = [];
+        for (const t of arguments[0]) {
+            log2sim.time = t;
+            out.push([...log2sim.placeOf("a") ?? [0, 0], log2sim.headingOf("a") ?? 1e9]);
+        }
+        return [out, log2sim.placeOf("origin"), log2sim.pixelsPerMeter];"""
+    asked = np.concatenate([rng.uniform(0, t[-1] + 0.3, 300), np.linspace(0, t[-1], 300), t])
+    shown, origin, scale = browser.run(script, asked.tolist())
+    known = source.at(asked, margin_s=1e-4)
+    x, y, heading = np.array(shown).T
+    np.testing.assert_array_equal(heading < 1e9, known.valid)
+    there = known.valid
+    np.testing.assert_allclose((x - origin[0])[there] / scale, known.x_m[there], atol=2e-3)
+    np.testing.assert_allclose((origin[1] - y)[there] / scale, known.y_m[there], atol=2e-3)
+    np.testing.assert_allclose(wrap_angle(heading - known.yaw_rad)[there], 0.0, atol=2e-4)
+
+
+def test_boxes_have_their_size_color_and_heading(browser: Browser, tmp_path: Path) -> None:
+    turned = agent("ego", np.full(5, 3.0), -2.0, yaw_rad=0.6)
+    opened(browser, page_with(tmp_path, turned, agent("car", np.linspace(0, 20, 5), 8.0)))
+    scale, center = browser.run("return log2sim.pixelsPerMeter"), place_of(browser, "ego")
+
+    def at(ahead: float, left: float) -> tuple[int, ...]:
+        c, s = np.cos(0.6), np.sin(0.6)
+        return pixel(browser, center + scale * np.array([ahead * c - left * s, -ahead * s - left * c]))
+
+    inside = [at(a, b) for a in (-1.85, 1.85) for b in (-0.85, 0.85)]
+    assert inside == [rgb(look.INK)] * 4
+    outside = [at(2.2, 0.0), at(-2.2, 0.0), at(0.0, 1.2), at(0.0, -1.2), at(2.0, 1.4)]
+    assert rgb(look.INK) not in outside
+    assert min(at(1.2, 0.0)) > 200 > max(at(-1.2, 0.0))  # the nose is at the front
+    corners = box_corners_bev([[3.0, -2.0]], 4.0, 2.0, 0.6)[0] - [3.0, -2.0]
+    just_in = center + 0.93 * scale * corners[0] * [1, -1]
+    assert pixel(browser, just_in) == rgb(look.INK)
+
+
+def test_what_nobody_observed_is_pale(browser: Browser, tmp_path: Path) -> None:
+    page = page_with(
+        tmp_path, filled(agent("ego", np.linspace(0, 12, 5), 0.0), 2, 2), agent("car", np.arange(5.0), 9.0)
+    )
+    opened(browser, page, "#t=0.5&agent=ego")
+    behind = np.array([-1.2, 0.6]) * browser.run("return log2sim.pixelsPerMeter")
+    assert pixel(browser, place_of(browser, "ego") + behind) == rgb(look.INK)
+    assert text_of(browser, "agent-now").endswith("yes")
+    browser.run("log2sim.time = 1.5")
+    assert min(pixel(browser, place_of(browser, "ego") + behind)) > 150
+    assert text_of(browser, "agent-now").endswith("no, filled in between")
+
+
+def test_a_click_on_an_agent_shows_its_panel(browser: Browser, sample: Path) -> None:
+    opened(browser, sample, "#t=2")
+    browser.mouse(tuple(place_of(browser, "car_turning")))
+    assert browser.run("return log2sim.chosen") == "car_turning"
+    assert text_of(browser, "agent-id") == "car_turning"
+    assert "car · 4.3 × 1.8 m · 0.0 to 5.2 s" in text_of(browser, "agent-kind")
+    speed = Scenario.load(TRUTH).agents[2].at(2.0).speed_mps[0]
+    browser.wait("document.querySelector('figcaption output').textContent")
+    shown = browser.run("return document.querySelector('figcaption output').textContent")
+    assert shown == f"{speed:.2f} m/s · {speed * 3.6:.0f} km/h"
+    assert browser.run("return [...document.querySelectorAll('.plot canvas')].every((c) => c.clientWidth > 100)")
+    browser.mouse((20.0, 300.0))
+    assert browser.run("return log2sim.chosen") is None
+    assert browser.run("return document.getElementById('details').hidden")
+
+
+def test_the_plots_seek_where_they_are_clicked(browser: Browser, sample: Path) -> None:
+    opened(browser, sample, "#t=0&agent=ego")
+    box = browser.run("return document.querySelector('.plot canvas').getBoundingClientRect().toJSON()")
+    x = box["x"] + 34 + (box["width"] - 42) / 2
+    browser.mouse((x, box["y"] + 40))
+    assert time_of(browser) == pytest.approx(2.6, abs=0.03)
+    browser.mouse((x, box["y"] + 40), (x + 30, box["y"] + 40))
+    assert time_of(browser) > 3.0
+
+
+def test_scrubbing_changes_the_time(browser: Browser, sample: Path) -> None:
+    opened(browser, sample)
+    box = browser.run("return document.getElementById('scrub').getBoundingClientRect().toJSON()")
+    y = box["y"] + box["height"] / 2
+    browser.mouse((box["x"] + 9, y), (box["x"] + box["width"] / 2, y))
+    assert time_of(browser) == pytest.approx(2.6, abs=0.1)
+    browser.wait(f"document.getElementById('time').textContent === '{time_of(browser):.2f}'")
+    browser.wait(f"location.hash === '#t={time_of(browser):.2f}'")
+
+
+def test_a_link_names_the_moment_and_the_agent(browser: Browser, sample: Path) -> None:
+    opened(browser, sample, "#t=3.2&agent=bus_1")
+    assert time_of(browser) == 3.2
+    assert browser.run("return log2sim.chosen") == "bus_1"
+    browser.run("location.hash = '#t=1.5&agent=ego'")
+    browser.wait("log2sim.time === 1.5 && log2sim.chosen === 'ego'")
+    for nonsense, t in (("#t=soon", 1.5), ("#t=-9", 0.0), ("#t=1e9", 5.2), ("#agent=nobody", 5.2), ("#%", 5.2)):
+        browser.run("location.hash = arguments[0]", nonsense)
+        browser.wait(f"log2sim.time === {t}")
+    assert browser.run("return log2sim.chosen") is None
+
+
+def test_the_keyboard_does_everything(browser: Browser, sample: Path) -> None:
+    opened(browser, sample, "#t=1")
+    browser.press(RIGHT, RIGHT, RIGHT, LEFT)
+    assert time_of(browser) == pytest.approx(1.2)
+    browser.press(END)
+    assert time_of(browser) == 5.2
+    browser.press(HOME)
+    assert time_of(browser) == 0.0
+    scale = browser.run("return log2sim.pixelsPerMeter")
+    browser.press("+")
+    assert browser.run("return log2sim.pixelsPerMeter") == pytest.approx(1.25 * scale)
+    browser.press("-", "-", "0")
+    assert browser.run("return log2sim.pixelsPerMeter") == pytest.approx(scale)
+    browser.press(">", ">", "<")
+    assert text_of(browser, "rate") == "2×"
+    browser.press("t", "r", "d", "w", "l")
+    assert [pressed(browser, f"layer-{k}") for k in ("truth", "replay", "log", "trails", "names")] == [False] * 5
+    browser.press("t")
+    assert pressed(browser, "layer-truth")
+    browser.press("n")
+    assert browser.run("return log2sim.chosen") == "ego"
+    browser.press("n", "p", ESCAPE)
+    assert browser.run("return log2sim.chosen") is None
+    browser.press("f")
+    assert pressed(browser, "follow")
+    assert browser.run("return document.getElementById('help').open") is False
+    browser.press("?")
+    assert browser.run("return document.getElementById('help').open") is True
+    browser.press(ESCAPE)
+    assert browser.run("return document.getElementById('help').open") is False
+
+
+# Time stands in the page but for the frames that a test lets pass.
+CLOCK = """let now = 1000, queue = [];
+    performance.now = () => now;
+    window.requestAnimationFrame = (f) => queue.push(f);
+    window.pass = (ms) => { now += ms; for (const f of queue.splice(0)) f(now); return log2sim.time; };"""
+
+
+def test_playing_keeps_to_the_clock_at_any_speed(browser: Browser, sample: Path) -> None:
+    opened(browser, sample)
+    browser.run(CLOCK)
+    browser.press(" ")
+    assert [browser.run("return pass(100)") for _ in range(3)] == pytest.approx([0.1, 0.2, 0.3])
+    browser.press(">", ">", ">")  # 2, 5, 10 times
+    assert browser.run("return pass(50)") == pytest.approx(0.8)
+    browser.press("<", "<", "<", "<", "<", "<")  # 0.1
+    assert browser.run("return pass(100)") == pytest.approx(0.81)
+    browser.press(" ")
+    assert browser.run("return pass(100)") == pytest.approx(0.81)
+    browser.wait("location.hash === '#t=0.81'")
+    browser.run("log2sim.time = 5.15; log2sim.play()")
+    assert [browser.run("return pass(200)") for _ in range(3)] == pytest.approx([5.17, 5.19, 5.2])
+    assert browser.run("return document.getElementById('play').getAttribute('aria-label')") == "Play"
+    assert browser.run("log2sim.play(); return pass(100)") == pytest.approx(0.01)  # from the start again
+
+
+def test_following_keeps_the_agent_in_the_middle(browser: Browser, sample: Path) -> None:
+    opened(browser, sample)
+    middle = browser.run("const m = document.getElementById('map'); return [m.clientWidth / 2, m.clientHeight / 2]")
+    browser.press("f")
+    for t in (1.0, 4.0):
+        browser.run("log2sim.time = arguments[0]", t)
+        pixel(browser, np.zeros(2))
+        np.testing.assert_allclose(place_of(browser, "ego"), middle, atol=1e-6)
+    browser.run("log2sim.choose('car_turning')")
+    pixel(browser, np.zeros(2))
+    np.testing.assert_allclose(place_of(browser, "car_turning"), middle, atol=1e-6)
+    browser.mouse((300, 300), (340, 320))
+    assert not pressed(browser, "follow")
+
+
+def test_mouse_and_wheel_move_the_map(browser: Browser, sample: Path) -> None:
+    opened(browser, sample)
+    before, scale = place_of(browser, "ego"), browser.run("return log2sim.pixelsPerMeter")
+    browser.mouse((500, 600), (520, 590), (600, 560))
+    np.testing.assert_allclose(place_of(browser, "ego") - before, [100, -40], atol=1)
+    held = place_of(browser, "bus_1")
+    browser.wheel(*held, -400)
+    assert browser.run("return log2sim.pixelsPerMeter") > 1.5 * scale
+    np.testing.assert_allclose(place_of(browser, "bus_1"), held, atol=1.5)
+
+
+def test_fingers_choose_drag_and_pinch(browser: Browser, sample: Path) -> None:
+    opened(browser, sample, "#t=2", size=(390, 780))
+    browser.touch([tuple(place_of(browser, "bus_1"))])
+    assert browser.run("return log2sim.chosen") == "bus_1"
+    assert browser.run("return document.getElementById('details').clientHeight") > 100
+    browser.run("log2sim.choose(null)")
+    pixel(browser, np.zeros(2))  # the map is as high again as without the panel
+    before, scale = place_of(browser, "ego"), browser.run("return log2sim.pixelsPerMeter")
+    browser.touch([(100, 500), (110, 480), (130, 440)])
+    np.testing.assert_allclose(place_of(browser, "ego") - before, [30, -60], atol=1)
+    browser.touch([(150, 400), (120, 400), (100, 400)], [(250, 400), (280, 400), (300, 400)])
+    assert browser.run("return log2sim.pixelsPerMeter") == pytest.approx(2 * scale, rel=0.01)
+
+
+def test_layers_come_and_go(browser: Browser, sample: Path) -> None:
+    opened(browser, sample, "#t=2")
+    behind = np.array([-1.5, 0.0]) * browser.run("return log2sim.pixelsPerMeter")
+    place = place_of(browser, "ego") + behind
+    assert pixel(browser, place) == rgb(look.INK)
+    browser.press("d", "t", "r")
+    assert pixel(browser, place) == (251, 252, 253)
+    browser.press("d")
+    assert pixel(browser, place) == rgb(look.INK)
+
+
+def test_a_layer_that_is_not_there_has_no_button(browser: Browser, tmp_path: Path) -> None:
+    opened(browser, page_with(tmp_path, agent("car", np.arange(5.0), 0.0)))
+    assert browser.run("return [...document.querySelectorAll('#layers button')].map((b) => b.textContent)") == [
+        "Log", "Trails", "Names",
+    ]  # fmt: skip
+    browser.press("t", "r", "f")
+    assert not pressed(browser, "follow")  # there is nobody to follow
+
+
+def test_collisions_of_the_replay_are_marked_and_visited(browser: Browser, tmp_path: Path) -> None:
+    scenario = made(agent("ego", np.linspace(0, 20, 5), 0.0), agent("car", np.linspace(20, 0, 5), 0.5, yaw_rad=np.pi))
+    replayed = replay(scenario, mode="exact", dt_s=0.1)
+    (event,) = replayed.metrics["collisions"]  # both at 10 m after 2 s, bumpers 0.4 s before
+    assert (event["t_s"], event["until_s"]) == pytest.approx((1.6, 2.4), abs=0.06)
+    later = {**event, "t_s": 3.0, "until_s": 3.1, "agents": ["car"], "in_log": False}
+    metrics = {**replayed.metrics, "collisions": [event, later]}
+    write_page(scenario, tmp_path / "page.html", replay=replace(replayed, metrics=metrics))
+    opened(browser, tmp_path / "page.html")
+    marks = browser.run("return [...document.querySelectorAll('#events button')].map((b) => [b.className, b.title])")
+    assert marks == [
+        ["known", f"ego and car collide at {event['t_s']:.2f} s, in the log too"], ["new", "car collide at 3.00 s"],
+    ]  # fmt: skip
+    browser.press("e")
+    assert time_of(browser) == pytest.approx(event["t_s"], abs=1e-4)
+    assert browser.run("return log2sim.chosen") == "ego"
+    browser.press("e")
+    assert (time_of(browser), browser.run("return log2sim.chosen")) == (3.0, "car")
+    browser.press("e")
+    assert time_of(browser) == pytest.approx(event["t_s"], abs=1e-4)
+    box = browser.run("return document.querySelector('#events .new').getBoundingClientRect().toJSON()")
+    browser.mouse((box["x"] + box["width"] / 2, box["y"] + box["height"] - 3))
+    assert time_of(browser) == 3.0
+    browser.run("log2sim.choose(null)")
+    scale = browser.run("return log2sim.pixelsPerMeter")
+    below = place_of(browser, "car") + np.array([1.2 * scale, scale + 3.5])
+    colors = [pixel(browser, below + np.array([0, k])) for k in (-1, 0, 1)]
+    assert any(np.abs(np.subtract(c, rgb("#C62828"))).max() < 60 for c in colors)
+
+
+def test_plots_show_how_far_truth_and_replay_are(browser: Browser, tmp_path: Path) -> None:
+    ways = {
+        name: agent("ego", np.linspace(0, 20, 5), y) for name, y in (("log", 0.0), ("truth", 0.25), ("replay", -1.5))
+    }
+    layers = {"truth": made(ways["truth"]), "replay": replay(made(ways["replay"]), mode="exact", dt_s=0.1)}
+    write_page(made(ways["log"]), tmp_path / "page.html", **layers)
+    opened(browser, tmp_path / "page.html", "#t=1.7&agent=ego")
+    pixel(browser, np.zeros(2))
+    shown = "return [...document.querySelectorAll('figure')].map((f) => f.hidden ? null : f.querySelector('output').textContent)"
+    assert browser.run(shown) == ["5.00 m/s · 18 km/h", None, "0.25 m · 1.50 m"]
+
+
+def test_the_list_is_searched(browser: Browser, sample: Path) -> None:
+    opened(browser, sample)
+    shown = "return [...document.querySelectorAll('#agents .id')].map((e) => e.textContent)"
+    assert len(browser.run(shown)) == 12
+    browser.press("/", *"standing car")
+    assert browser.run(shown) == ["car_parked", "car_parked_north"]
+    assert time_of(browser) == 0.0  # letters of a search are no commands
+    browser.press(ENTER)
+    assert browser.run("return log2sim.chosen") == "car_parked"
+    browser.run("const s = document.getElementById('search'); s.value = 'xyz'; s.dispatchEvent(new Event('input'))")
+    assert browser.run(shown) == []
+    assert text_of(browser, "more") == "No agent is called so."
+
+
+def test_an_agent_chosen_from_the_list_comes_into_sight(browser: Browser, tmp_path: Path) -> None:
+    opened(browser, page_with(tmp_path, agent("ego", np.arange(5.0), 0.0), agent("far", np.arange(5.0), 50.0)), "#t=3")
+    browser.press(*"++++++++")
+    size = browser.run("const m = document.getElementById('map'); return [m.clientWidth, m.clientHeight]")
+    assert (place_of(browser, "far") < 0).any()
+    browser.run("[...document.querySelectorAll('#agents button')].at(-1).click()")
+    np.testing.assert_allclose(place_of(browser, "far"), np.array(size) / 2, atol=1e-6)
+    before = place_of(browser, "far")
+    browser.run("[...document.querySelectorAll('#agents button')].at(-1).click()")
+    np.testing.assert_array_equal(place_of(browser, "far"), before)
+
+
+@pytest.mark.parametrize(("size", "first"), [((1200, 800), True), ((390, 780), False)], ids=["wide", "narrow"])
+def test_the_list_is_put_away_and_an_agent_shown_all_the_same(
+    browser: Browser, sample: Path, size: tuple[int, int], first: bool
+) -> None:
+    opened(browser, sample, size=size)
+    script = "return ['cast', 'details'].map((id) => document.getElementById(id).getClientRects().length > 0)"
+    assert browser.run(script) == [first, False]
+    browser.press("a")
+    assert browser.run(script) == [not first, False]
+    browser.run("log2sim.choose('bus_1')")
+    assert browser.run(script) == [False, True]
+    browser.press(ESCAPE)
+    assert browser.run(script) == [not first, False]
+    inside = "const r = document.getElementById('scrub').getBoundingClientRect(); return [r.right, r.bottom]"
+    assert (np.array(browser.run(inside)) <= size).all()
+
+
+def test_dark_systems_get_a_dark_page(browser: Browser, sample: Path) -> None:
+    light = pixel(opened(browser, sample), np.array([3.0, 300.0]))
+    dark = pixel(opened(browser, sample, dark=True), np.array([3.0, 300.0]))
+    assert light == (251, 252, 253)
+    assert max(dark) < 40
+    browser.cdp("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "light"}])
+    browser.wait("!matchMedia('(prefers-color-scheme: dark)').matches")
+    pixel(browser, np.zeros(2))
+    assert pixel(browser, np.array([3.0, 300.0])) == light  # at once, without loading it again
+
+
+def test_names_from_the_file_stay_text(browser: Browser, tmp_path: Path) -> None:
+    opened(browser, page_with(tmp_path, agent(EVIL, np.arange(5.0), 0.0), name=EVIL), "#agent=x")
+    browser.run("log2sim.choose(arguments[0])", EVIL)
+    assert browser.run("return window.hacked") is None
+    assert browser.run("return document.querySelectorAll('img, iframe').length") == 0
+    assert [text_of(browser, id) for id in ("name", "agent-id")] == [EVIL, EVIL]
+    assert browser.run("return document.title") == EVIL
+
+
+def test_the_policy_lets_nothing_out(chromium: Browser, sample: Path) -> None:
+    opened(chromium, sample)
+    script = "const done = arguments[0]; fetch('http://127.0.0.1:9/').then(() => done('sent'), (e) => done(e.name))"
+    assert chromium.run_async(script) == "TypeError"
+    chromium.run(
+        "const s = document.createElement('script'); s.textContent = 'window.ran = 1'; document.body.append(s)"
+    )
+    chromium.run("const i = new Image(); i.src = 'http://127.0.0.1:9/i.png'; document.body.append(i)")
+    assert chromium.run("return window.ran") is None
+    refused = [entry["message"] for entry in chromium.log("browser")]
+    assert len([m for m in refused if "Content Security Policy" in m]) >= 3
+    chromium.requests()
+
+
+@pytest.mark.parametrize(
+    "agents", [(), (agent("one", np.array([2.0]), 1.0, static=True),), (agent("two", np.array([2.0]), 1.0),)]
+)
+def test_pages_with_next_to_nothing_open(browser: Browser, tmp_path: Path, agents: tuple[Agent, ...]) -> None:
+    opened(browser, page_with(tmp_path, *agents))
+    browser.press("n", " ", "f", "+", END)
+    assert time_of(browser) == 4.0
+    there = [a.id for a in agents if browser.run("return log2sim.placeOf(arguments[0])", a.id)]
+    assert there == [a.id for a in agents if a.static]  # what stands has one pose for good
