@@ -15,6 +15,7 @@ from log2sim.replay.observe import Observer
 from log2sim.replay.policy import SIGHT_M, Controls, Observation, Policy, ask
 from log2sim.replay.record import Record, Tracks, tracks_of
 from log2sim.replay.reference import GRID_S
+from log2sim.replay.simulator import Host
 from log2sim.replay.traffic import Traffic
 from log2sim.replay.world import Driven, Group
 from log2sim.scenario import Agent
@@ -28,6 +29,7 @@ class World:
     """All agents on one clock, moved one step at a time.
 
     Between two calls the world is at `step`, and whose life begins there has been placed. `advance` moves on, until `done`.
+    With a `host`, a simulator elsewhere, groups only give their controls, and its tick moves them.
 
     Parameters
     ----------
@@ -54,6 +56,7 @@ class World:
     ) -> None:
         self.groups, self.clock, self.statics, self.traffic = tuple(groups), clock, tuple(statics), traffic
         self.choices = dict(choices or {})
+        self.host: Host | None = None
         self.ego = next((g for g in groups if isinstance(g, Driven)), None)
         self._observer = Observer(self.ego, self.groups, self.statics, sight_m) if self.ego is not None else None
         self._arrivals = [_arrivals(group, clock) for group in groups]
@@ -63,9 +66,9 @@ class World:
     def restart(self) -> None:
         """Go back to the first step; what was stored is forgotten."""
         self.step = 0
-        self._records: list[Record] = []
-        self._recording: list[Record] = []
         self._busy: list[tuple[Group, dict[int, NDArray[np.intp]]]] = []
+        self._records: list[Record] = []
+        self._window: list[Record] = []
         if self.traffic is not None:
             self.traffic.restart()
         if self.ego is not None:
@@ -108,6 +111,8 @@ class World:
                 group.advance(self.clock.dt_s)
         else:
             self._react(self.traffic)
+        if self.host is not None:
+            self.host.tick(self.step)
         self.step += 1
         self._arrive()
 
@@ -136,7 +141,7 @@ class World:
             if step in placed:
                 group.place(placed[step], t_s)
         if step % self.clock.store_every == 0:
-            for record in self._recording:
+            for record in self._window:
                 record.add()
 
     def _open_window(self) -> None:
@@ -144,8 +149,8 @@ class World:
         for group in self.groups:
             group.open_window(self.step, end, self.t_s, self.clock.time(end))
         self._busy = [(g, a) for g, a in zip(self.groups, self._arrivals) if len(g.live)]
-        self._recording = [Record(g, self.step, end, self.clock.store_every) for g, _ in self._busy]
-        self._records += self._recording
+        self._window = [Record(group, self.step, end, self.clock.store_every) for group, _ in self._busy]
+        self._records += self._window
 
 
 def roll(world: World, policy: Policy | None = None, progress: Progress | None = None) -> Tracks:
