@@ -316,6 +316,12 @@ def test_a_map_whose_projection_is_not_one_is_refused(tmp_path: Path) -> None:
             export(scenario(agent(line())), "openscenario", tmp_path / "out", Options(map=mine))
 
 
+def test_scenario_runner_1047_a_map_of_another_place_is_refused(tmp_path: Path) -> None:
+    mine = users_map(tmp_path / "a", scenario(agent(line())), UTM.projection, (0.0, 0.0, 0.0))
+    with pytest.raises(ConfigError, match="its roads are 5447 km away from all agents"):
+        export(scenario(agent(line())), "openscenario", tmp_path / "out", Options(map=mine))
+
+
 def test_a_turned_map_is_refused(tmp_path: Path) -> None:
     mine = users_map(tmp_path / "a", scenario(agent(line())), UTM.projection, (0.0, 0.0, 0.0))
     mine.write_text(
