@@ -13,7 +13,7 @@ from export_paths import agent, bend, line, scenario
 from export_readers import Entity, play, roads, trigger_s
 
 from log2sim.errors import ConfigError, ScenarioError
-from log2sim.export import Options, export
+from log2sim.export import Options, export, openscenario
 from log2sim.export.xml_text import escaped, unescaped, unique_names
 from log2sim.geometry import wrap_angle
 from log2sim.scenario import Scenario
@@ -101,6 +101,15 @@ def test_nobody_starts_in_another_who_does_not_in_the_log(revision: str, tmp_pat
     assert min(np.diff(sorted(heights)), default=10.0) > 1.6
     overlapping = agent(line(start=(1.0, 0.5)), "twin")
     written(tmp_path, scenario(agent(line()), overlapping), revision)
+
+
+def test_a_writer_that_would_put_agents_into_one_another_is_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(openscenario, "starts", lambda parts, revision: np.zeros((len(parts), 4)))
+    with pytest.raises(ScenarioError, match="agents 'ego' and 'guest' would start in one another"):
+        export(guest(), "openscenario", tmp_path / "out")
+    assert names(tmp_path) == []
 
 
 @pytest.mark.parametrize("category", CATEGORIES)
