@@ -157,12 +157,14 @@ def test_a_path_straight_but_for_millimeters_is_one_line(heading_deg: float) -> 
 
 
 def test_a_spline_that_swings_out_between_two_points_is_not_taken() -> None:
-    """FITPACK's smoothing of this path passes near every point and loops between the last two."""
-    angle = np.arange(14) * 0.27852241573038233 / 5
-    xy = np.column_stack([10 * np.sin(angle), 10 * np.sin(2 * angle)])
+    """FITPACK's smoothing of this path of corners passes near every point and bulges between two of them."""
+    rng = np.random.default_rng(73)
+    count = int(rng.integers(3, 12))
+    steps = rng.uniform(0.05, 8.0, (count, 1))
+    turns = np.cumsum(rng.uniform(-1.2, 1.2, count))
+    xy = np.cumsum(steps * np.column_stack([np.cos(turns), np.sin(turns)]), axis=0)
     found, stations = fit(xy)
-    chords = np.hypot(*np.diff(xy, axis=0).T).sum()
-    assert found.length_m == pytest.approx(chords, rel=0.01)
+    assert found.length_m == pytest.approx(np.hypot(*np.diff(xy, axis=0).T).sum(), rel=0.01)
     assert np.hypot(*(found.at(stations)[:, :2] - xy).T).max() <= 0.01
 
 
