@@ -16,6 +16,11 @@ from log2sim.geometry import Array
 from log2sim.types import Camera
 
 NEAREST_DEPTH_M = 0.1
+# Corners of a box joined by edges, as `geometry.box_corners` orders them; the last two cross out the front.
+_EDGES = (
+    (0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7),
+    (0, 7), (3, 4),
+)  # fmt: skip
 # Undistortion: rays of the start table, and rounds of Newton's method, which doubles the digits of that start.
 _TABLE = 1024
 _ROUNDS = 12
@@ -43,6 +48,32 @@ def project(camera: Camera, points_cam: NDArray[np.floating[Any]]) -> tuple[Arra
     with np.errstate(invalid="ignore"):
         inside = (uv[:, 0] >= 0) & (uv[:, 0] < camera.width_px) & (uv[:, 1] >= 0) & (uv[:, 1] < camera.height_px)
     return uv, inside
+
+
+def box_lines(camera: Camera, corners_cam: Array) -> Array:
+    """Edges (E, 2, 2) in px of a box with corners (8, 3) in the cam frame, clipped at the near plane.
+
+    Notes
+    -----
+    A straight edge is bent by a distorting lens; it is cut into eight pieces then.
+    """
+    ends = np.array([[corners_cam[a], corners_cam[b]] for a, b in _EDGES])
+    ends = ends[(ends[..., 2] > 1.01 * NEAREST_DEPTH_M).any(axis=1)]
+    if len(ends) == 0:
+        return np.zeros((0, 2, 2))
+    near = 1.01 * NEAREST_DEPTH_M
+    for a, b in ((0, 1), (1, 0)):
+        behind = ends[:, a, 2] < near
+        p, q = ends[behind, a], ends[behind, b]
+        ends[behind, a] = q + (p - q) * ((q[:, 2] - near) / (q[:, 2] - p[:, 2]))[:, None]
+    pieces = 1 if camera.distortion_model == "none" else 8
+    f = np.linspace(0, 1, pieces + 1)[None, :, None]
+    points = ends[:, None, 0] * (1 - f) + ends[:, None, 1] * f
+    uv = project(camera, points.reshape(-1, 3))[0].reshape(len(ends), pieces + 1, 2)
+    lines = np.stack([uv[:, :-1], uv[:, 1:]], axis=2).reshape(-1, 2, 2)
+    low, high = lines.min(axis=1), lines.max(axis=1)
+    touches = (high >= 0).all(axis=1) & (low[:, 0] < camera.width_px) & (low[:, 1] < camera.height_px)
+    return lines[touches & np.isfinite(lines).all(axis=(1, 2))]
 
 
 def _bends(camera: Camera) -> bool:

@@ -70,10 +70,10 @@ def moved(scenario: Scenario, x_m: float, y_m: float) -> Scenario:
 
 
 def peer(name: str) -> Callable[..., str]:
-    """Runs Python in the environment `name` of `tools/peers_formats.sh` and returns what it printed; skips without it."""
+    """Runs Python in the environment `name` of `tools/peers.sh` and returns what it printed; skips without it."""
     python = Path(os.environ.get("LOG2SIM_PEERS", ROOT / ".peers")) / name / "bin" / "python"
     if not python.exists():
-        pytest.skip(f"the environment '{name}' is not there: tools/peers_formats.sh makes it")
+        pytest.skip(f"the environment '{name}' is not there: tools/peers.sh makes it")
 
     def run(*arguments: object) -> str:
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -12,11 +11,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from export_worlds import ROOT, circling, peer, straight, world
+from export_worlds import ROOT, circling, straight, world
+from peer_checks import commonroad_finds, overlaps
 
 from log2sim.errors import ScenarioError
 from log2sim.export import export
-from log2sim.geometry import bev_iou, box_corners_bev, wrap_angle
+from log2sim.geometry import wrap_angle
 from log2sim.scenario import Scenario
 from log2sim.types import CATEGORIES, MapFrame
 
@@ -97,39 +97,11 @@ def test_what_makes_no_planning_problem_is_refused(agent: Any, complaint: str, t
         export(world(agent), "commonroad", tmp_path / "out")
 
 
-def read_by_commonroad(
-    scenario: Scenario, folder: Path
-) -> tuple[dict[str, Any], np.ndarray, dict[str, dict[str, str]]]:
-    """What CommonRoad's software finds, the ego's [x, y, yaw, length, width] at every step, and agents.csv."""
-    run = peer("commonroad")
-    _, rows = written(scenario, folder)
-    ego = scenario.ego
-    assert ego is not None
-    at = ego.at(0.1 * np.arange(round(ego.waypoints.t_s[-1] / 0.1 - 0.5) + 1))
-    boxes = np.stack([at.x_m, at.y_m, at.yaw_rad, *np.broadcast_arrays(*ego.size_m[:2], at.x_m)[:2]], axis=-1)
-    (folder / "ego.json").write_text(json.dumps(boxes.tolist()))
-    (file,) = folder.glob("*.xml")
-    return json.loads(run(ROOT / "tests" / "peers" / "commonroad_read.py", file, folder / "ego.json")), boxes, rows
-
-
-def overlaps(scenario: Scenario, boxes: np.ndarray) -> list[int]:
-    """Steps at which the ego's box shares ground with another's, by clipping polygons."""
-    steps = []
-    for k, (x, y, yaw, length, width) in enumerate(boxes):
-        own = box_corners_bev([x, y], length, width, yaw)[0]
-        states = [(a, a.at(a.waypoints.t_s[:1] if a.static else 0.1 * k)) for a in scenario.others]
-        corners = [
-            box_corners_bev([s.x_m[0], s.y_m[0]], *a.size_m[:2], s.yaw_rad[0])[0] for a, s in states if s.valid[0]
-        ]
-        steps += [k] if any(bev_iou(own, other) > 0 for other in corners) else []
-    return steps
-
-
 @pytest.mark.peers
 def test_commonroad_reads_the_sample_as_it_is(tmp_path: Path) -> None:
     """Its schema has no complaint, its reader finds every pose, the ego's end is a goal reached, all lanes are valid."""
     scenario = Scenario.load(SAMPLE)
-    found, boxes, rows = read_by_commonroad(scenario, tmp_path)
+    found, boxes, rows = commonroad_finds(scenario, tmp_path)
     assert found["complaints"] == []
     assert found["arrived"]
     assert all(found["lanelets_valid"])
@@ -151,7 +123,7 @@ def test_commonroads_collision_checker_agrees(tmp_path: Path) -> None:
     parked = replace(straight("parked", start=(13.6, 3.5), speed=0.0, yaw=0.4), static=True)
     late = straight("late", start=(4.0, 12.0), speed=0.5, t_s=np.array([2.05, 3.0]))
     scenario = world(circling(), crossing, parked, late)
-    found, boxes, _ = read_by_commonroad(scenario, tmp_path)
+    found, boxes, _ = commonroad_finds(scenario, tmp_path)
     expected = overlaps(scenario, boxes)
     assert 3 < len(expected) < len(boxes) - 3
     assert found["collisions"] == expected

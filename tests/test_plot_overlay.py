@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from log2sim.camera import box_lines
 from log2sim.plot import draw_overlay
-from log2sim.plot.overlay import box_lines
 from log2sim.types import Camera
 
 CAMERA = Camera("front", 640, 480, np.array([[500.0, 0, 320], [0, 500.0, 240], [0, 0, 1]]), "ego", np.eye(4))

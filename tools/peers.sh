@@ -12,7 +12,19 @@ environments=(
     "carla carla>=0.9.16 numpy"
     "sumo eclipse-sumo>=1.20"
     "scenariogeneration scenariogeneration>=0.16"
+    "metadrive metadrive-simulator==0.4.3"
+    "commonroad commonroad-io==2024.3 commonroad-drivability-checker==2025.4.0" # which needs modules that later releases moved
+    "omega_prime omega-prime==0.3.7"
+    "rerun --editable .[rerun]"
 )
+# MetaDrive needs its models and textures for rendering only; without these two files it would download all at the start.
+stub_assets() {
+    local assets
+    assets="$("$1/bin/python" -c 'from importlib.util import find_spec as f; print(f("metadrive").submodule_search_locations[0])')/assets"
+    mkdir -p "$assets/textures/grass1"
+    echo 0.4.3 >"$assets/version.txt"
+    : >"$assets/textures/grass1/GroundGrassGreen002_COL_1K.jpg"
+}
 for line in "${environments[@]}"; do
     read -r name packages <<<"$line"
     if [[ $# -gt 0 && " $* " != *" $name "* ]]; then continue; fi
@@ -23,6 +35,7 @@ for line in "${environments[@]}"; do
     python3 -m venv --clear "$folder/$name"
     read -ra list <<<"$packages"
     "$folder/$name/bin/pip" install --quiet --disable-pip-version-check "${list[@]}"
+    if [[ $name == metadrive ]]; then stub_assets "$folder/$name"; fi
     echo "$packages" >"$folder/$name/packages.txt"
     echo "$folder/$name: made"
 done

@@ -26,10 +26,12 @@ def export(
     from log2sim.export import Options
     from log2sim.export import export as run
     from log2sim.export.checks import remarks
+    from log2sim.logs import open_log
     from log2sim.scenario import Scenario
 
     loaded = Scenario.load(scenario)
-    files = run(loaded, to, out, Options(revision, map, mode, log), overwrite=overwrite)
+    opened = open_log(log) if log is not None else None
+    files = run(loaded, to, out, Options(revision, map, mode, opened), overwrite=overwrite)
     for file in files:
         say(f"{file}: written", quiet=quiet)
     for remark in remarks(loaded):

@@ -13,6 +13,7 @@ from log2sim.errors import ConfigError
 from log2sim.export.checks import require_exportable
 from log2sim.files import refuse_existing
 from log2sim.scenario import Scenario
+from log2sim.types import Log
 
 __all__ = ["Exporter", "Options", "export", "formats"]
 
@@ -22,13 +23,13 @@ class Options:
     """What a user may ask of an export; None leaves it to the format. A format names those that it understands.
 
     `revision` of the format's standard; `map` a road network that is used instead of an own one; `mode` "exact" or "pid",
-    for scripts that move agents; `log` the recorded log, for formats that also hold its pictures and points.
+    for scripts that move agents; `log` the recorded log, opened, for formats that also hold its pictures and points.
     """
 
     revision: str | None = None
     map: Path | None = None
     mode: str | None = None
-    log: Path | None = None
+    log: Log | None = None
 
 
 class Exporter(Protocol):

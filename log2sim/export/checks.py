@@ -24,6 +24,11 @@ def require_exportable(scenario: Scenario) -> None:
     wrong = [problem for agent in scenario.agents for problem in _problems(agent)]
     if not scenario.agents:
         wrong = ["it has no agents"]
+    wrong += [
+        f"name or id {text!a}: holds half a surrogate pair, which no file can; give it another"
+        for text in (scenario.name, *(a.id for a in scenario.agents))
+        if not _is_text(text)
+    ]
     wrong += _repeated(scenario) or ([] if wrong else _scattered(scenario))
     if wrong:
         raise ScenarioError(f"scenario '{scenario.name}' cannot be exported:\n  " + "\n  ".join(wrong))
@@ -85,6 +90,14 @@ def _states(agents: Sequence[Agent], t_s: float) -> Array:
     """x, y, z, yaw (4, A) of all agents at a time, NaN for those that are not there."""
     states = [a.at(t_s) for a in agents]
     return np.array([[getattr(s, key)[0] for s in states] for key in ("x_m", "y_m", "z_m", "yaw_rad")])
+
+
+def _is_text(text: str) -> bool:
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _problems(agent: Agent) -> list[str]:

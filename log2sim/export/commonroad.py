@@ -10,14 +10,15 @@ import csv
 import re
 from datetime import UTC, datetime
 from pathlib import Path
-from xml.etree.ElementTree import Element, ElementTree, SubElement, indent
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from log2sim.errors import ScenarioError
-from log2sim.export import Options
+from log2sim.export import Options, xml_text
 from log2sim.export.lanes import Lane, lanes
-from log2sim.export.sampling import Motion, clock, motion
+from log2sim.export.sampling import Motion, clock, motion, on_clock
+from log2sim.export.xml_text import element
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.scenario import Agent, Scenario
 from log2sim.types import MapFrame
@@ -66,8 +67,7 @@ class CommonRoad:
             table.append((number, agent.id, agent.category, role))
         root.extend(sorted(obstacles, key=lambda o: o.tag != "staticObstacle"))  # the schema wants these first
         root.append(_planning_problem(ego, first, clock(t_s[0], ego.waypoints.t_s[-1], STEP_S)))
-        indent(root)
-        ElementTree(root).write(folder / f"{name}.xml", encoding="utf-8", xml_declaration=True)
+        xml_text.write(root, folder / f"{name}.xml")
         with (folder / "agents.csv").open("w", newline="", encoding="utf-8") as opened:
             csv.writer(opened, lineterminator="\n").writerows(table)
 
@@ -90,50 +90,47 @@ def _camel_case(text: str) -> str:
     return "".join(word[:1].upper() + word[1:] for word in re.findall("[A-Za-z0-9]+", text))[:50] or "Scenario"
 
 
-def _number(value: float) -> str:
-    """A decimal without exponent, as the schema wants it."""
-    text = f"{value:.{DECIMALS}f}".rstrip("0").rstrip(".")
-    return "0" if text == "-0" else text
+def _decimal(value: float) -> str:
+    return xml_text.number(value, DECIMALS)
 
 
 def _texts(parent: Element, **children: str) -> Element:
     for tag, text in children.items():
-        SubElement(parent, tag).text = text
+        element(tag, parent).text = text
     return parent
 
 
 def _point(parent: Element, xyz: Array) -> None:
-    _texts(SubElement(parent, "point"), **dict(zip("xyz", map(_number, xyz))))
+    _texts(element("point", parent), **dict(zip("xyz", map(_decimal, xyz))))
 
 
 def _root(scenario: Scenario, name: str) -> Element:
     """The document with its head. It is dated by the recording, so that the same scenario gives the same bytes."""
-    root = Element("commonRoad", commonRoadVersion=VERSION, benchmarkID=name, timeStepSize=_number(STEP_S))
+    root = element("commonRoad", None, commonRoadVersion=VERSION, benchmarkID=name, timeStepSize=_decimal(STEP_S))
     root.set("date", datetime.fromtimestamp(scenario.t0_ns // NS_PER_S, UTC).date().isoformat())
-    root.attrib |= {"author": "log2sim", "affiliation": "", "source": re.sub(r"[^\x20-\x7e]", "_", scenario.name)}
+    root.attrib |= {"author": "log2sim", "affiliation": "", "source": xml_text.escaped(scenario.name)}
     root.append(_location(scenario.map))
-    SubElement(root, "scenarioTags")
+    element("scenarioTags", root)
     return root
 
 
 def _location(frame: MapFrame) -> Element:
     place = dict(zip(("geoNameId", "gpsLatitude", "gpsLongitude"), UNKNOWN_PLACE))
     if frame.latitude_deg is not None and frame.longitude_deg is not None:
-        place |= {"gpsLatitude": _number(frame.latitude_deg), "gpsLongitude": _number(frame.longitude_deg)}
-    location = _texts(Element("location"), **place)
+        place |= {"gpsLatitude": _decimal(frame.latitude_deg), "gpsLongitude": _decimal(frame.longitude_deg)}
+    location = _texts(element("location"), **place)
     if frame.projection is not None:
-        shift = SubElement(
-            _texts(SubElement(location, "geoTransformation"), geoReference=frame.projection), "additionalTransformation"
-        )
         x, y, _ = frame.offset_m  # what leads from projected coordinates to those of the file
-        _texts(shift, xTranslation=_number(-x), yTranslation=_number(-y), zRotation="0", scaling="1")
+        way = _texts(element("geoTransformation", location), geoReference=xml_text.escaped(frame.projection))
+        shift = {"xTranslation": _decimal(-x), "yTranslation": _decimal(-y), "zRotation": "0", "scaling": "1"}
+        _texts(element("additionalTransformation", way), **shift)
     return location
 
 
 def _lanelet(lane: Lane, number: int) -> Element:
-    lanelet = Element("lanelet", id=str(number))
+    lanelet = element("lanelet", id=str(number))
     for tag, bound in zip(("leftBound", "rightBound"), lane.bounds_m):
-        parent = SubElement(lanelet, tag)
+        parent = element(tag, lanelet)
         for point in bound:
             _point(parent, point)
     return _texts(lanelet, laneletType="unknown")
@@ -142,26 +139,24 @@ def _lanelet(lane: Lane, number: int) -> Element:
 def _obstacle(agent: Agent, number: int, t_s: Array) -> Element | None:
     """An agent as obstacle; None for one that is gone before the first step."""
     if agent.static and agent.category in STATIC_TYPE:
-        obstacle = _texts(Element("staticObstacle", id=str(number)), type=STATIC_TYPE[agent.category])
+        obstacle = _texts(element("staticObstacle", id=str(number)), type=STATIC_TYPE[agent.category])
         _shape(obstacle, agent)
         obstacle.append(_state("initialState", motion(agent, agent.waypoints.t_s[:1]), 0, 0))
         return obstacle
-    move = motion(agent, t_s)
-    if move.valid.sum() < 2:  # an initial state and a trajectory are two steps or more
-        move = motion(agent, t_s, margin_s=STEP_S)
+    move = on_clock(agent, t_s, at_least=2)  # an initial state and a trajectory
     steps = np.flatnonzero(move.valid).tolist()
     if len(steps) < 2:
         return None
-    obstacle = _texts(Element("dynamicObstacle", id=str(number)), type=TYPE_OF_CATEGORY[agent.category])
+    obstacle = _texts(element("dynamicObstacle", id=str(number)), type=TYPE_OF_CATEGORY[agent.category])
     _shape(obstacle, agent)
     obstacle.append(_state("initialState", move, steps[0], steps[0]))
-    SubElement(obstacle, "trajectory").extend(_state("state", move, k, k) for k in steps[1:])
+    element("trajectory", obstacle).extend(_state("state", move, k, k) for k in steps[1:])
     return obstacle
 
 
 def _shape(obstacle: Element, agent: Agent) -> None:
-    length, width, _ = map(_number, agent.size_m)
-    _texts(SubElement(SubElement(obstacle, "shape"), "rectangle"), length=length, width=width)
+    length, width, _ = map(_decimal, agent.size_m)
+    _texts(element("rectangle", element("shape", obstacle)), length=length, width=width)
 
 
 def _along(vector: Array, yaw_rad: float) -> float:
@@ -171,44 +166,43 @@ def _along(vector: Array, yaw_rad: float) -> float:
 def _state(tag: str, move: Motion, k: int, step: int) -> Element:
     """The state at index k of a motion; speed and acceleration are along the heading."""
     yaw = float(move.yaw_rad[k])
-    state = Element(tag)
-    _point(SubElement(state, "position"), move.position_m[k, :2])
+    state = element(tag)
+    _point(element("position", state), move.position_m[k, :2])
     exact = {
-        "orientation": _number(yaw),
+        "orientation": _decimal(yaw),
         "time": str(step),
-        "velocity": _number(_along(move.velocity_mps[k], yaw)),
-        "acceleration": _number(_along(move.acceleration_mps2[k], yaw)),
+        "velocity": _decimal(_along(move.velocity_mps[k], yaw)),
+        "acceleration": _decimal(_along(move.acceleration_mps2[k], yaw)),
     }
     for key, value in exact.items():
-        _texts(SubElement(state, key), exact=value)
+        _texts(element(key, state), exact=value)
     return state
 
 
 def _planning_problem(ego: Agent, number: int, t_s: Array) -> Element:
     """Drive from where the ego was first to where it was last, about when it was there."""
     move, last, spare = motion(ego, t_s), len(t_s) - 1, round(GOAL_S / STEP_S)
-    problem = Element("planningProblem", id=str(number))
+    problem = element("planningProblem", id=str(number))
     initial = _state("initialState", move, 0, 0)
     for key in ("yawRate", "slipAngle"):
-        _texts(SubElement(initial, key), exact="0")
+        _texts(element(key, initial), exact="0")
     problem.append(initial)
     yaw = float(move.yaw_rad[last])
     speed = _along(move.velocity_mps[last], yaw)
-    goal = SubElement(problem, "goalState")
-    area = SubElement(SubElement(goal, "position"), "rectangle")
-    _texts(
-        area, length=_number(GOAL_LENGTH_M), width=_number(ego.size_m[1] + 2 * GOAL_SIDE_M), orientation=_number(yaw)
-    )
-    x, y, _ = map(_number, move.position_m[last])
-    _texts(SubElement(area, "center"), x=x, y=y)
+    goal = element("goalState", problem)
+    area = element("rectangle", element("position", goal))
+    side = ego.size_m[1] + 2 * GOAL_SIDE_M
+    _texts(area, length=_decimal(GOAL_LENGTH_M), width=_decimal(side), orientation=_decimal(yaw))
+    x, y, _ = map(_decimal, move.position_m[last])
+    _texts(element("center", area), x=x, y=y)
     _interval(goal, "orientation", yaw, GOAL_YAW_RAD)
     _interval(goal, "velocity", speed, GOAL_SPEED_MPS)
-    _texts(SubElement(goal, "time"), intervalStart=str(max(0, last - spare)), intervalEnd=str(last + spare))
+    _texts(element("time", goal), intervalStart=str(max(0, last - spare)), intervalEnd=str(last + spare))
     return problem
 
 
 def _interval(parent: Element, tag: str, middle: float, reach: float) -> None:
-    _texts(SubElement(parent, tag), intervalStart=_number(middle - reach), intervalEnd=_number(middle + reach))
+    _texts(element(tag, parent), intervalStart=_decimal(middle - reach), intervalEnd=_decimal(middle + reach))
 
 
 EXPORTER = CommonRoad()

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from log2sim.errors import ScenarioError
 from log2sim.geometry import Array
-from log2sim.scenario import Agent, Scenario
+from log2sim.scenario import Agent
 
 DERIVATIVE_S = 0.05  # half the span over which rates are taken: half a step of most logs, so neighbors decide them
-WHOLE_M = 1000.0
 MOST_STEPS = 100_000  # 2.8 hours at 10 Hz; a table of all agents' states at more of them hardly fits into memory
 
 
@@ -74,6 +73,14 @@ def _over(change: Array, span_s: Array) -> Array:
     return rates
 
 
+def on_clock(agent: Agent, t_s: Array, at_least: int = 1) -> Motion:
+    """Sample an agent at equal steps (T,); one that lives between them takes the `at_least` nearest, so nobody is lost."""
+    sampled = motion(agent, t_s)
+    if sampled.valid.sum() >= at_least or len(t_s) < 2:
+        return sampled
+    return motion(agent, t_s, margin_s=at_least * (t_s[1] - t_s[0]) / 2)
+
+
 def clock(start_s: float, stop_s: float, step_s: float) -> Array:
     """Times (T,) from `start_s` in equal steps up to `stop_s`, at least one.
 
@@ -89,12 +96,6 @@ def clock(start_s: float, stop_s: float, step_s: float) -> Array:
             f"{step_s:g} s; cut the scenario into parts"
         )
     return start_s + step_s * np.arange(int(steps) + 1, dtype=np.float64)
-
-
-def near_origin(scenario: Scenario) -> Array:
-    """Whole kilometers (3,), to take off positions so that they stay exact where a reader keeps them in float32."""
-    w = (scenario.ego or scenario.agents[0]).waypoints
-    return np.trunc(np.array([w.x_m[0], w.y_m[0], 0.0]) / WHOLE_M) * WHOLE_M
 
 
 def file_name(text: str) -> str:

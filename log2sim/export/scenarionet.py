@@ -17,7 +17,8 @@ import numpy as np
 from log2sim.errors import ScenarioError
 from log2sim.export import Options
 from log2sim.export.lanes import lanes
-from log2sim.export.sampling import Motion, clock, file_name, motion, near_origin
+from log2sim.export.placement import near_origin
+from log2sim.export.sampling import Motion, clock, file_name, on_clock
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.scenario import VERSION, Agent, Scenario
 from log2sim.types import GROUP_OF
@@ -64,8 +65,8 @@ def describe(scenario: Scenario) -> Value:
             f"scenario '{scenario.name}' has no agent 'ego', which MetaDrive follows; name one of its agents so"
         )
     t_s = clock(ego.waypoints.t_s[0], ego.waypoints.t_s[-1], STEP_S)
-    origin = near_origin(scenario)
-    moves = {agent.id: _on_clock(agent, t_s) for agent in scenario.agents}
+    origin = np.array(near_origin(scenario).origin_m)
+    moves = {agent.id: on_clock(agent, t_s) for agent in scenario.agents}
     tracks = {a.id: _track(a, moves[a.id], origin) for a in scenario.agents if moves[a.id].valid.any()}
     left_out = {a.id: "not alive at any step of the ego" for a in scenario.agents if a.id not in tracks}
     features = {
@@ -99,12 +100,6 @@ def describe(scenario: Scenario) -> Value:
         "map_features": features,
         "metadata": metadata,
     }
-
-
-def _on_clock(agent: Agent, t_s: Array) -> Motion:
-    """An agent at all steps; one that lives between two steps takes the nearest, so that nobody is lost."""
-    sampled = motion(agent, t_s)
-    return sampled if sampled.valid.any() else motion(agent, t_s, margin_s=STEP_S / 2)
 
 
 def _track(agent: Agent, move: Motion, origin: Array) -> Value:

@@ -9,18 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from log2sim.camera import NEAREST_DEPTH_M, project
+from log2sim.camera import box_lines, project
 from log2sim.geometry import Array, apply, box_corners
 from log2sim.types import Camera
 
 FAR_M = 25.0
 """Boxes farther than this get thin lines, so that rows of parked cars stay readable."""
-
-_EDGES = (
-    (0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7),
-    (0, 7), (3, 4),
-)  # fmt: skip
-"""Corners joined by edges, as `geometry.box_corners` orders them; the last two cross out the front."""
 
 
 def draw_overlay(
@@ -73,32 +67,6 @@ def draw_overlay(
         if labels is not None and len(seen) and np.ptp(seen[..., 1]) > camera.height_px / 40:
             _write(out, labels[k], seen.reshape(-1, 2).min(axis=0), color, camera.width_px / 1800)
     return out
-
-
-def box_lines(camera: Camera, corners_cam: Array) -> Array:
-    """Edges (E, 2, 2) in px of a box with corners (8, 3) in the cam frame, clipped at the near plane.
-
-    Notes
-    -----
-    A straight edge is bent by a distorting lens; it is cut into eight pieces then.
-    """
-    ends = np.array([[corners_cam[a], corners_cam[b]] for a, b in _EDGES])
-    ends = ends[(ends[..., 2] > 1.01 * NEAREST_DEPTH_M).any(axis=1)]
-    if len(ends) == 0:
-        return np.zeros((0, 2, 2))
-    near = 1.01 * NEAREST_DEPTH_M
-    for a, b in ((0, 1), (1, 0)):
-        behind = ends[:, a, 2] < near
-        p, q = ends[behind, a], ends[behind, b]
-        ends[behind, a] = q + (p - q) * ((q[:, 2] - near) / (q[:, 2] - p[:, 2]))[:, None]
-    pieces = 1 if camera.distortion_model == "none" else 8
-    f = np.linspace(0, 1, pieces + 1)[None, :, None]
-    points = ends[:, None, 0] * (1 - f) + ends[:, None, 1] * f
-    uv = project(camera, points.reshape(-1, 3))[0].reshape(len(ends), pieces + 1, 2)
-    lines = np.stack([uv[:, :-1], uv[:, 1:]], axis=2).reshape(-1, 2, 2)
-    low, high = lines.min(axis=1), lines.max(axis=1)
-    touches = (high >= 0).all(axis=1) & (low[:, 0] < camera.width_px) & (low[:, 1] < camera.height_px)
-    return lines[touches & np.isfinite(lines).all(axis=(1, 2))]
 
 
 def _draw_points(out: NDArray[np.uint8], camera: Camera, points_cam: Array, depth_range_m: tuple[float, float]) -> None:

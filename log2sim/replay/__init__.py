@@ -12,6 +12,7 @@ from log2sim.replay.policy_name import load_policy
 from log2sim.replay.result import AgentReplay, Commands, Replay, to_scenario
 from log2sim.replay.rollout import World
 from log2sim.replay.run import open_world, replay
+from log2sim.replay.simulator import host_named
 
 __all__ = [
     "AgentReplay",
@@ -27,6 +28,7 @@ __all__ = [
     "World",
     "check_limits",
     "check_strict",
+    "host_named",
     "load_policy",
     "open_world",
     "parse_limits",

@@ -136,16 +136,21 @@ def _pose(agent: Agent) -> Path:
     return path_of(replace(agent, waypoints=replace(w, **first, speed_mps=np.zeros(len(w)))), 0.0)
 
 
-def _vehicle_reference(agent: Agent, dt_s: float) -> Reference:
-    """A vehicle's table: feed-forward is ahead by the actuator's lag and by half the step for which it is held."""
+def vehicle_limits(agent: Agent) -> Limits:
+    """What a wheeled agent can drive, from its category and length."""
     p = parameters_for([agent])
     wheelbase_m = float(p.wheelbase_m[0])
-    limits = Limits(
+    return Limits(
         offset_m=float(p.rear_axle_offset_m[0]),
         max_curvature_1pm=LOCK_SHARE * math.tan(p.max_steer_rad[0]) / wheelbase_m,
         max_curvature_rate_1pmps=float(p.max_steer_rate_radps[0]) / wheelbase_m,
         max_accel_mps2=float(p.max_brake_mps2[0]),
     )
+
+
+def _vehicle_reference(agent: Agent, dt_s: float) -> Reference:
+    """A vehicle's table: feed-forward is ahead by the actuator's lag and by half the step for which it is held."""
+    limits = vehicle_limits(agent)
     return vehicle_reference(
         path_of(agent, limits.offset_m),
         limits,

@@ -4,34 +4,32 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array
 from log2sim.replay.clock import Clock
 from log2sim.replay.follower import control_step
 from log2sim.replay.models import Choice
 from log2sim.replay.observe import Observer
 from log2sim.replay.policy import SIGHT_M, Controls, Observation, Policy, ask
+from log2sim.replay.record import Record, Tracks, tracks_of
 from log2sim.replay.reference import GRID_S
+from log2sim.replay.simulator import Host
 from log2sim.replay.traffic import Traffic
-from log2sim.replay.world import Driven, Group, Snapshot
+from log2sim.replay.world import Driven, Group
 from log2sim.scenario import Agent
 
 WINDOW_S = 10.0
 
 Progress = Callable[[int, int], None]
 
-Tracks = dict[str, tuple[NDArray[np.intp], Array]]
-"""By agent id: the stored steps (S,) and the columns (C, S) of a `Snapshot` at them."""
-
 
 class World:
     """All agents on one clock, moved one step at a time.
 
     Between two calls the world is at `step`, and whose life begins there has been placed. `advance` moves on, until `done`.
+    With a `host`, a simulator elsewhere, groups only give their controls, and its tick moves them.
 
     Parameters
     ----------
@@ -58,6 +56,7 @@ class World:
     ) -> None:
         self.groups, self.clock, self.statics, self.traffic = tuple(groups), clock, tuple(statics), traffic
         self.choices = dict(choices or {})
+        self.host: Host | None = None
         self.ego = next((g for g in groups if isinstance(g, Driven)), None)
         self._observer = Observer(self.ego, self.groups, self.statics, sight_m) if self.ego is not None else None
         self._arrivals = [_arrivals(group, clock) for group in groups]
@@ -67,9 +66,9 @@ class World:
     def restart(self) -> None:
         """Go back to the first step; what was stored is forgotten."""
         self.step = 0
-        self._tracks: dict[str, list[tuple[NDArray[np.intp], Array]]] = defaultdict(list)
         self._busy: list[tuple[Group, dict[int, NDArray[np.intp]]]] = []
-        self._records: list[tuple[list[int], list[Array]]] = []
+        self._records: list[Record] = []
+        self._window: list[Record] = []
         if self.traffic is not None:
             self.traffic.restart()
         if self.ego is not None:
@@ -112,16 +111,14 @@ class World:
                 group.advance(self.clock.dt_s)
         else:
             self._react(self.traffic)
+        if self.host is not None:
+            self.host.tick(self.step)
         self.step += 1
         self._arrive()
 
     def tracks(self) -> Tracks:
         """What was stored so far."""
-        self._keep()
-        return {
-            k: (np.concatenate([p[0] for p in v]), np.concatenate([p[1] for p in v], axis=1))
-            for k, v in self._tracks.items()
-        }
+        return tracks_of(self._records)
 
     def _react(self, traffic: Traffic) -> None:
         """Move everybody by one step, within a long one by parts in which the reactive ones see where the others are."""
@@ -144,29 +141,16 @@ class World:
             if step in placed:
                 group.place(placed[step], t_s)
         if step % self.clock.store_every == 0:
-            for (group, _), (steps, rows) in zip(self._busy, self._records):
-                steps.append(step)
-                rows.append(_stack(group.snapshot()))
+            for record in self._window:
+                record.add()
 
     def _open_window(self) -> None:
-        self._keep()
         end = min(self.step + self._width, self.clock.steps)
         for group in self.groups:
             group.open_window(self.step, end, self.t_s, self.clock.time(end))
         self._busy = [(g, a) for g, a in zip(self.groups, self._arrivals) if len(g.live)]
-        self._records = [([], []) for _ in self._busy]
-
-    def _keep(self) -> None:
-        """Move what was stored to the tracks, cut to the life of each agent."""
-        for (group, _), (steps, rows) in zip(self._busy, self._records):
-            at, columns = np.array(steps, dtype=np.intp), np.array(rows)
-            begin = np.searchsorted(at, group.first[group.live])
-            end = np.searchsorted(at, group.last[group.live], side="right")
-            for slot, i in enumerate(group.live):
-                alive = slice(begin[slot], end[slot])
-                if begin[slot] < end[slot]:
-                    self._tracks[group.agents[i].id].append((at[alive], columns[alive, :, slot].T))
-        self._records = [([], []) for _ in self._busy]
+        self._window = [Record(group, self.step, end, self.clock.store_every) for group, _ in self._busy]
+        self._records += self._window
 
 
 def roll(world: World, policy: Policy | None = None, progress: Progress | None = None) -> Tracks:
@@ -197,7 +181,3 @@ def _arrivals(group: Group, clock: Clock) -> dict[int, NDArray[np.intp]]:
                 if group.first[i] < step <= group.last[i]:
                     placed[int(step)].append(i)
     return {step: np.unique(index) for step, index in placed.items()}
-
-
-def _stack(snapshot: Snapshot) -> Array:
-    return np.stack([getattr(snapshot, f.name) for f in fields(snapshot)])

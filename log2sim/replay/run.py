@@ -11,11 +11,12 @@ from log2sim.registry import nearest
 from log2sim.replay.assemble import assemble
 from log2sim.replay.cast import EGO, cast_agents, groups_of, reactive_ids, traffic_of
 from log2sim.replay.clock import Clock
-from log2sim.replay.models import MODELS
+from log2sim.replay.models import MODELS, Choice
 from log2sim.replay.parameters import WHEELED
 from log2sim.replay.policy import SIGHT_M, Policy, begin
 from log2sim.replay.result import Replay
-from log2sim.replay.rollout import Progress, World, roll
+from log2sim.replay.rollout import Progress, Tracks, World, roll
+from log2sim.replay.simulator import Host
 from log2sim.scenario import Agent, Scenario
 
 MODES = ("pid", "exact")
@@ -32,6 +33,7 @@ def replay(
     ego: Policy | None = None,
     agents: str | Collection[str] = "log",
     sight_m: float = SIGHT_M,
+    host: Host | None = None,
     progress: Progress | None = None,
 ) -> Replay:
     """Replay a scenario and compare it with the log.
@@ -55,6 +57,9 @@ def replay(
         them, or those with these ids (the ego too, if it is among them).
     sight_m : float
         How far the ego's policy sees other agents, center to center.
+    host : Host, optional
+        Simulator elsewhere that moves the agents instead, such as `log2sim.replay.carla.CarlaSimulator`; it has its own
+        vehicle models, so `model` is not used.
     progress : callable, optional
         Called with the steps done and their number, some times a run.
 
@@ -70,13 +75,31 @@ def replay(
     Static agents and those seen only once have no controller. Tracking errors are taken over the agents that follow; the
     user's ego has its own by agent. Cost: one step moves all agents that live in the current 10 s at once.
     """
+    if host is not None:
+        model = "kinematic"  # the references of what only rolls suit any other model
     world = open_world(
         scenario, mode=mode, model=model, dt_s=dt_s, drives_ego=ego is not None, agents=agents, sight_m=sight_m
     )
     if ego is not None:
         begin(ego, scenario)
-    tracks = roll(world, ego, progress)
-    return assemble(scenario, world.groups, tracks, world.clock, world.choices, mode, model)
+    if host is None:
+        tracks = roll(world, ego, progress)
+        return assemble(scenario, world.groups, tracks, world.clock, world.choices, mode, model)
+    tracks = _roll_elsewhere(world, host, ego, progress)
+    choices = {k: Choice(host.name, "the simulator's own") for k in world.choices}
+    return assemble(scenario, world.groups, tracks, world.clock, choices, mode, host.name)
+
+
+def _roll_elsewhere(world: World, host: Host, ego: Policy | None, progress: Progress | None) -> Tracks:
+    """Let a simulator elsewhere move a world to its end; it is left as it was found, whatever happens."""
+    if world.clock.dt_s > host.max_dt_s:
+        raise ConfigError(f"dt: {world.clock.dt_s} s, {host.name} takes at most {host.max_dt_s:g} s")
+    host.open(world.groups, world.clock, world.statics)
+    world.host = host
+    try:
+        return roll(world, ego, progress)
+    finally:
+        host.close()
 
 
 def open_world(

@@ -24,9 +24,10 @@ def poses(env, scenario):
     """x, y, heading and velocity of everything that is in the world, by the id that it has in the file."""
     objects = env.engine.get_objects()
     shown = {name: objects[key] for name, key in env.engine.traffic_manager.scenario_id_to_obj_id.items()}
-    back = scenario["metadata"].get("old_origin_in_current_coordinate", (0.0, 0.0))
+    moved = scenario["metadata"].get("old_origin_in_current_coordinate", (0.0, 0.0))  # by MetaDrive itself
+    dx, dy = (offset - m for offset, m in zip(scenario["metadata"]["position_offset_m"], moved))
     return {
-        name: [o.position[0] - back[0], o.position[1] - back[1], o.heading_theta, *map(float, o.velocity)]
+        name: [o.position[0] + dx, o.position[1] + dy, o.heading_theta, *map(float, o.velocity)]
         for name, o in shown.items()
     }
 

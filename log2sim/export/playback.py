@@ -1,0 +1,167 @@
+"""What a viewer is shown of a scenario and its log, whichever viewer: boxes at equal steps, pictures with boxes, points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.camera import box_lines
+from log2sim.errors import ConfigError, RecordError
+from log2sim.export.sampling import Motion, clock, on_clock
+from log2sim.geometry import NS_PER_S, Array, apply, box_corners, inverse
+from log2sim.scenario import Agent, Scenario
+from log2sim.types import Camera, Log, Sweep
+
+STEP_S = 0.1
+PICTURE_PX = 960  # wider pictures are made smaller, so that a minute of several cameras stays a file to hand around
+JPEG_QUALITY = 80
+MOST_POINTS = 10_000
+
+# What everything is drawn in, red, green and blue of 255.
+EGO_RGB = (0, 158, 115)
+RGB_OF_CATEGORY = {
+    "car": (86, 180, 233), "truck": (0, 114, 178), "bus": (0, 70, 140), "motorcycle": (230, 159, 0), "cyclist": (230, 159, 0),
+    "bicycle": (240, 228, 66), "pedestrian": (213, 94, 0), "other": (160, 160, 160),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """All agents at equal steps: `t_ns` (T,) int64 absolute stamps, and each agent's motion (T,)."""
+
+    t_ns: NDArray[np.int64]
+    moves: tuple[tuple[Agent, Motion], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A camera frame: JPEG, the camera of its size, its pose in the map if known, and lines (E, 2, 2) px by agent."""
+
+    t_ns: int
+    camera: Camera
+    map_T_cam: Array | None
+    jpeg: bytes
+    outlines: tuple[tuple[Agent, Array], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """A LiDAR sweep, thinned: `points_map` (N, 3)."""
+
+    t_ns: int
+    lidar: str
+    points_map: Array
+
+
+@dataclass(frozen=True)
+class Unreadable:
+    """A record of the log that could not be read, and why."""
+
+    t_ns: int
+    stream: str
+    reason: str
+
+
+Shown = Picture | Cloud | Unreadable
+
+
+def rgb_of(agent: Agent) -> tuple[int, int, int]:
+    return EGO_RGB if agent.id == "ego" else RGB_OF_CATEGORY[agent.category]
+
+
+def steps_of(scenario: Scenario) -> Steps:
+    """Every agent every `STEP_S`, from the first waypoint of any to the last."""
+    ends = [(a.waypoints.t_s[0], a.waypoints.t_s[-1]) for a in scenario.agents]
+    t_s = clock(min(first for first, _ in ends), max(last for _, last in ends), STEP_S)
+    t_ns = scenario.t0_ns + np.round(t_s * NS_PER_S).astype(np.int64)
+    return Steps(t_ns, tuple((agent, on_clock(agent, t_s)) for agent in scenario.agents))
+
+
+def shown_of(scenario: Scenario, log: Log) -> Iterator[Shown]:
+    """Pictures and points of a log within the scenario's time, in order of time; each is read when it is asked for.
+
+    Raises
+    ------
+    ConfigError
+        When the log has no record in that time.
+    """
+    start, stop = scenario.t0_ns, scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
+    index = [
+        (t_ns, name, i)
+        for name, stream in log.streams.items()
+        if name in log.cameras or name in log.lidars
+        for i, t_ns in enumerate(stream.t_ns.tolist())
+        if start <= t_ns <= stop
+    ]
+    if not index:
+        raise ConfigError(
+            f"--log: log '{log.name}' has no picture and no sweep between {start} and {stop} ns, the time of scenario "
+            f"'{scenario.name}'; give the log that it was made from"
+        )
+    for t_ns, name, i in sorted(index):
+        yield _shown(scenario, log, name, i, t_ns)
+
+
+def _shown(scenario: Scenario, log: Log, name: str, i: int, t_ns: int) -> Shown:
+    try:
+        record = log.streams[name].read(i)
+    except RecordError as error:
+        return Unreadable(t_ns, name, str(error))
+    if name in log.cameras:
+        return _picture(scenario, log, log.cameras[name], record, t_ns)
+    return Cloud(t_ns, name, _points_map(log, name, record))
+
+
+def _picture(scenario: Scenario, log: Log, camera: Camera, image_bgr: NDArray[np.uint8], t_ns: int) -> Picture:
+    import cv2
+    import simplejpeg
+
+    small = _smaller(camera, min(1.0, PICTURE_PX / camera.width_px))
+    if small is not camera:
+        size = (small.width_px, small.height_px)
+        image_bgr = np.asarray(cv2.resize(image_bgr, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    jpeg = simplejpeg.encode_jpeg(np.ascontiguousarray(image_bgr), quality=JPEG_QUALITY, colorspace="BGR")
+    poses, known = log.map_T_sensor(camera.name, t_ns)
+    if not known[0]:
+        return Picture(t_ns, small, None, jpeg, ())
+    return Picture(t_ns, small, poses[0], jpeg, tuple(_outlines(scenario, small, inverse(poses[0]), t_ns)))
+
+
+def _smaller(camera: Camera, scale: float) -> Camera:
+    """The camera of the same picture in another size; the middle of the first pixel is (0, 0) in both."""
+    if scale == 1.0:
+        return camera
+    width, height = round(camera.width_px * scale), round(camera.height_px * scale)
+    K = camera.K.copy()
+    for axis, (new, old) in enumerate(((width, camera.width_px), (height, camera.height_px))):
+        K[axis] *= new / old
+        K[axis, 2] += (new / old - 1) / 2
+    return replace(camera, width_px=width, height_px=height, K=K)
+
+
+def _outlines(scenario: Scenario, camera: Camera, cam_T_map: Array, t_ns: int) -> Iterator[tuple[Agent, Array]]:
+    """Edges of the boxes that a camera sees; the ego is not drawn around its own cameras."""
+    t_s = (t_ns - scenario.t0_ns) / NS_PER_S
+    for agent in scenario.others if camera.mount == "ego" else scenario.agents:
+        at = agent.at(t_s)
+        if at.valid[0]:
+            corners = box_corners([at.x_m[0], at.y_m[0], at.z_m[0]], agent.size_m, at.yaw_rad)[0]
+            lines = box_lines(camera, apply(cam_T_map, corners))
+            if len(lines):
+                yield agent, lines
+
+
+def _points_map(log: Log, name: str, sweep: Sweep) -> Array:
+    """Every n-th point of a sweep in the map (N, 3), each seen from where the sensor was at its own time."""
+    kept = slice(None, None, max(1, -(-len(sweep.xyz_m) // MOST_POINTS)))
+    points = sweep.xyz_m[kept].astype(np.float64)
+    if sweep.frame == "map":
+        return points
+    t_ns = np.array([sweep.stamp_ns]) if sweep.t_ns is None else sweep.t_ns[kept]
+    poses, known = log.map_T_sensor(name, t_ns)
+    if sweep.t_ns is None:
+        return apply(poses[0], points) if known[0] else points[:0]
+    return apply(poses[known], points[known])
