@@ -22,6 +22,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
     },
     "export": {
         "openscenario": "log2sim.export.openscenario:EXPORTER",
+        "carla": "log2sim.export.carla:EXPORTER",
         "csv": "log2sim.export.csv_table:EXPORTER",
         "scenarionet": "log2sim.export.scenarionet:EXPORTER",
         "commonroad": "log2sim.export.commonroad:EXPORTER",

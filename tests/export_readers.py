@@ -131,13 +131,12 @@ def distance(points: Array, line: Array) -> Array:
     """Distance (N,) of points (N, 2) from a line given by samples (M, 2), to its chords."""
     from scipy.spatial import cKDTree
 
-    near = cKDTree(line).query(points)[1]
     best = np.full(len(points), np.inf)
-    for shift in (-2, -1, 0, 1):  # where two geometries meet there are two samples
-        a = line[np.clip(near + shift, 0, len(line) - 2)]
-        b = line[np.clip(near + shift, 0, len(line) - 2) + 1]
-        span = b - a
-        length2 = np.maximum((span**2).sum(axis=1), 1e-30)
-        f = np.clip(((points - a) * span).sum(axis=1) / length2, 0, 1)
-        best = np.minimum(best, np.hypot(*(points - a - f[:, None] * span).T))
+    for near in cKDTree(line).query(points, k=4)[1].T:  # where a road crosses itself the nearest is not the best
+        for shift in (-1, 0):
+            a, b = (line[np.clip(near + shift + k, 0, len(line) - 1)] for k in (0, 1))
+            span = b - a
+            length2 = np.maximum((span**2).sum(axis=1), 1e-30)
+            f = np.clip(((points - a) * span).sum(axis=1) / length2, 0, 1)
+            best = np.minimum(best, np.hypot(*(points - a - f[:, None] * span).T))
     return best

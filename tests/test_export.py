@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import importlib.util
 import sys
 from dataclasses import fields, replace
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +18,8 @@ from log2sim.errors import ConfigError, MissingExtra, ScenarioError
 from log2sim.export import Options, export, formats
 from log2sim.scenario import Scenario
 
-SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
+ROOT = Path(__file__).resolve().parents[1]
+SAMPLE = ROOT / "samples" / "crossing" / "truth.json"
 
 
 @pytest.fixture(scope="module")
@@ -152,3 +155,41 @@ def test_a_file_where_the_folder_should_be_is_named(tmp_path: Path) -> None:
     assert ran.code == 2
     assert "is a file; give the name of a folder" in ran.line
     assert (tmp_path / "out").read_text() == "mine"
+
+
+def test_what_each_format_loses_stands_in_the_readme() -> None:
+    """`python tools/formats_table.py` writes it."""
+    spec = importlib.util.spec_from_file_location("formats_table", ROOT / "tools" / "formats_table.py")
+    assert spec is not None
+    assert spec.loader is not None
+    tool = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tool)
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert tool.with_table(readme) == readme
+    assert tool.table().count("\n") == 2 + len(registry.BUILT_IN["export"])
+
+
+def test_a_writer_that_fails_leaves_nothing_behind(
+    scenario: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Failing:
+        options: tuple[str, ...] = ()
+        loses = "everything"
+
+        def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
+            (folder / "half").write_text("written")
+            raise ScenarioError("agent 'x': cannot be held")
+
+    monkeypatch.setattr(registry, "load", lambda kind, name: Failing())
+    with pytest.raises(ScenarioError, match="agent 'x'"):
+        export(scenario, "failing", tmp_path / "out")
+    assert names(tmp_path) == []
+
+
+def test_third_parties_add_formats_by_entry_points(
+    scenario: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    theirs = EntryPoint("theirs", "log2sim.export.csv_table:EXPORTER", "log2sim.export")
+    monkeypatch.setattr(registry, "entry_points", lambda group: [theirs] if group == theirs.group else [])
+    assert formats()[-1] == "theirs"
+    assert [f.name for f in export(scenario, "theirs", tmp_path / "out")] == ["agents.csv"]

@@ -10,7 +10,7 @@ import pytest
 from export_paths import agent, bend, line, scenario
 
 from log2sim.errors import ScenarioError
-from log2sim.export.checks import overlaps_at_entry, remarks, require_exportable
+from log2sim.export.checks import overlaps_at_entry, remarks, require_exportable, require_start_as_in_log
 from log2sim.scenario import Agent, Scenario
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
@@ -115,6 +115,7 @@ def test_overlaps_at_entry_agree_with_looking_at_every_pair() -> None:
     expected = {frozenset(pair) for pair in pairs}
     found = overlaps_at_entry(agents)
     assert {frozenset(pair[:2]) for pair in found} == expected
+    assert len(found) == len(expected)
     assert len(expected) > 5
     assert all(agents[a].waypoints.t_s[0] <= agents[b].waypoints.t_s[0] for a, b, _ in found)
 
@@ -123,3 +124,14 @@ def test_the_sample_has_nothing_to_remark() -> None:
     world = Scenario.load(SAMPLE)
     require_exportable(world)
     assert remarks(world) == []
+
+
+def test_a_start_that_puts_agents_into_one_another_is_refused_unless_the_log_did() -> None:
+    agents = [agent(line()), agent(line(start=(0.0, 5.0)), "beside")]
+    apart = np.array([[0.0, 0.0, 0.8, 0.0], [0.0, 5.0, 0.8, 0.0]])
+    require_start_as_in_log(agents, apart)
+    together = apart * [1, 0.1, 1, 1]
+    with pytest.raises(ScenarioError, match="agents 'ego' and 'beside' would start in one another"):
+        require_start_as_in_log(agents, together)
+    require_start_as_in_log(agents, together * [[1, 1, 1, 1], [np.nan, 1, 1, 1]])
+    require_start_as_in_log([agent(line()), agent(line(start=(0.0, 0.5)), "beside")], together)

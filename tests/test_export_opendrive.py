@@ -184,6 +184,17 @@ def test_others_get_a_road_where_they_leave_the_ego_s_and_none_where_they_do_not
     assert len(network(tmp_path, scenario(ego, crossing))) == 2
 
 
+def test_who_crosses_the_ego_s_road_is_not_on_it(tmp_path: Path) -> None:
+    across = agent(line(9.0, 10, np.pi / 2, (15.0, -4.5)), "across")
+    assert [r.road.attrib["name"] for r in network(tmp_path, scenario(agent(line()), across))] == ["ego", "across"]
+
+
+def test_a_road_leads_the_way_that_a_reversing_ego_faces(tmp_path: Path) -> None:
+    (road,) = network(tmp_path, scenario(agent(line(), yaw_rad=np.pi)))
+    assert abs(float(road.road.find("planView/geometry").attrib["hdg"])) == pytest.approx(np.pi)
+    assert road.line[0, 0] == pytest.approx(40.0)
+
+
 def test_neither_pedestrians_nor_parked_cars_make_roads(tmp_path: Path) -> None:
     walker = agent(line(20.0, 21, 1.0, (0.0, 30.0)), "walker", category="pedestrian")
     parked = agent(np.full((5, 2), [5.0, 20.0]), "parked", yaw_rad=1.0, static=True)

@@ -84,11 +84,22 @@ def test_in_1_0_who_comes_late_waits_out_of_sight_since_scenariorunner_knows_no_
     entities = written(tmp_path, guest(), "1.0")
     assert ElementTree.parse(tmp_path / "scenario.xosc").find(".//EntityAction") is None
     z = [float(p.attrib["z"]) for p in entities["guest"].init.iter("WorldPosition")]
-    assert z == [-500.0]
+    assert z == [-510.0]
     events = entities["guest"].events
     assert [trigger_s(events[k]) for k in ("enters", "follows", "leaves")] == pytest.approx([1.0, 1.0, 2.0])
     heights = [float(events[k].find(".//TeleportAction//WorldPosition").attrib["z"]) for k in ("enters", "leaves")]
-    assert heights == [0.0, -500.0]
+    assert heights == [0.0, -510.0]
+
+
+def test_nobody_starts_in_another_who_does_not_in_the_log(revision: str, tmp_path: Path) -> None:
+    """Three cars that appear one after the other at one spot would wait in one another."""
+    queue = [agent(line(8.0, 11, start=(0.0, 5.0)), f"car {k}", first_s=0.5 + 2.0 * k) for k in range(3)]
+    entities = written(tmp_path, scenario(agent(line()), *queue), revision)
+    heights = [float(e.init.find(".//WorldPosition").attrib["z"]) for e in entities.values() if e.init is not None]
+    assert len(heights) == (4 if revision == "1.0" else 1)
+    assert min(np.diff(sorted(heights)), default=10.0) > 1.6
+    overlapping = agent(line(start=(1.0, 0.5)), "twin")
+    written(tmp_path, scenario(agent(line()), overlapping), revision)
 
 
 @pytest.mark.parametrize("category", CATEGORIES)
@@ -125,8 +136,10 @@ def test_ids_become_unique_names_and_stay_known(tmp_path: Path) -> None:
 
 
 def test_names_and_text_survive_their_escape() -> None:
-    texts = ["", "plain", "100 % $x ${1+1}", "\x00\x1f\ufffe", "\ud800 alone", "%24"]
+    texts = ["", "plain", "100 % $x ${1+1}", "\x00\x1f\ufffe", "%24"]
     assert [unescaped(escaped(t)) for t in texts] == texts
+    assert unescaped(escaped("\ud800 alone")) == "? alone"
+    assert unescaped("%ff") == "\ufffd"
     assert all("$" not in escaped(t) and escaped(t).isascii() for t in texts)
     assert unique_names(["x" * 200, "x" * 200]) == ["x" * 60, "x" * 60 + "_2"]
 
@@ -137,6 +150,12 @@ def test_an_agent_seen_once_is_there_for_a_moment(revision: str, tmp_path: Path)
     vertices = written(tmp_path, scenario(agent(line()), once), revision)["once"].vertices
     np.testing.assert_allclose(vertices[:, 0], [0.7, 0.701], atol=1e-9)
     np.testing.assert_array_equal(vertices[0, 1:], vertices[1, 1:])
+
+
+def test_an_agent_whose_log_began_before_the_scenario_starts_where_it_is_at_0_s(revision: str, tmp_path: Path) -> None:
+    early = agent(line(), first_s=-1.05, rear_axle_offset_m=0.0)
+    start = written(tmp_path, scenario(early), revision)["ego"].init.find(".//WorldPosition").attrib
+    assert float(start["x"]) == pytest.approx(10.5)
 
 
 # What users of OpenSCENARIO players complain about, by the issue that tells it (shared list, "what users ask for").

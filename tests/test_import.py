@@ -53,6 +53,7 @@ def test_a_scenario_comes_back_within_a_micrometer(world: str, revision: str, tm
         for key in ("x_m", "y_m", "z_m"):
             np.testing.assert_allclose(getattr(w, key), getattr(v, key), atol=2e-6)
         assert np.abs(wrap_angle(w.yaw_rad - v.yaw_rad)).max() < 1e-8
+        assert np.all((w.yaw_rad >= -np.pi) & (w.yaw_rad < np.pi))
         for key in ("speed_mps", "sigma_xy_m"):
             np.testing.assert_allclose(getattr(w, key), getattr(v, key), atol=1e-4)
 
@@ -180,11 +181,14 @@ def test_no_file_a_folder_a_bomb_and_a_giant_are_refused(tmp_path: Path, monkeyp
     (tmp_path / "deep.xosc").write_text("<a>" * 10_000)
     with pytest.raises(ScenarioError, match="nest deeper than"):
         load(tmp_path / "deep.xosc")
+    (tmp_path / "strange.xosc").write_text('<?xml version="1.0" encoding="klingon"?><a/>')
+    with pytest.raises(ScenarioError, match="not valid XML: unknown encoding"):
+        load(tmp_path / "strange.xosc")
     monkeypatch.setattr(xml_text, "SIZE_LIMIT_BYTES", 1000)
     (tmp_path / "big.xosc").write_text(FOREIGN)
     with pytest.raises(ScenarioError, match="more than the 1000 that are read"):
         load(tmp_path / "big.xosc")
-    assert names(tmp_path) == ["big.xosc", "deep.xosc"]
+    assert names(tmp_path) == ["big.xosc", "deep.xosc", "strange.xosc"]
 
 
 def test_an_import_keeps_what_the_map_says_of_the_place(tmp_path: Path) -> None:

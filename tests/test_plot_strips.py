@@ -12,7 +12,7 @@ from matplotlib.text import Text
 from replay_maneuvers import MANEUVERS, agent_from, scenario_of
 
 from log2sim.plot import plot_tracks
-from log2sim.plot.animate import Pace, Stage
+from log2sim.plot.animate import WAY_ALPHA, Pace, Stage
 from log2sim.plot.cast import assign
 from log2sim.plot.hits import hits_of
 from log2sim.plot.look import ALARM
@@ -142,7 +142,8 @@ def test_the_map_keeps_its_size_above_the_strips() -> None:
     scenario, result = reckless()
     plain, with_strips = sheet_of(scenario, None), sheet_of(scenario, result)
     one, other = (s.ax.get_window_extent() for s in (plain, with_strips))
-    assert other.width == pytest.approx(one.width)
+    assert (other.width, other.height) == pytest.approx((one.width, one.height))
+    assert with_strips.figure.bbox.y1 - other.y1 == pytest.approx(plain.figure.bbox.y1 - one.y1)
     assert all(ax.get_window_extent().y1 < other.y0 for ax in strip_axes(with_strips))
 
 
@@ -158,6 +159,8 @@ def test_collisions_that_the_log_has_not_are_marked_between_the_boxes() -> None:
         t.get_text() for t in sheet_of(scenario, result).figure.legends[0].get_texts()
     ]
     assert len(hits_of(replay(scenario))[0]) == 0
+    in_log = dataclasses.replace(result, metrics={**result.metrics, "collisions": [{**event, "in_log": True}]})
+    assert len(hits_of(in_log)[0]) == 0
 
 
 def test_the_cursor_moves_and_marks_come_when_it_hits() -> None:
@@ -193,6 +196,7 @@ def test_a_gif_keeps_every_frame_and_the_colors_that_mean_something(tmp_path: Pa
             moving.seek(frame)
             pixels = np.asarray(moving.convert("RGB")).reshape(-1, 3).astype(int)
             for color in [role.color for role in assign(scenario).movers] + [ALARM]:
-                rgb = np.rint(255 * np.array(to_rgb(color)))
-                near = (np.abs(pixels - rgb).max(axis=1) <= 3).sum()
-                assert near > 10, (frame, color)
+                full = 255 * np.array(to_rgb(color))
+                for alpha in (1.0, WAY_ALPHA) if color != ALARM else (1.0,):
+                    near = np.abs(pixels - (alpha * full + (1 - alpha) * 255)).max(axis=1) <= 6
+                    assert near.sum() > 10, (frame, color, alpha)

@@ -190,6 +190,15 @@ def test_a_limit_nearly_named_is_guessed():
         parse_limits(["min_ttc=1"])
 
 
+def test_the_summary_of_a_driven_ego_is_about_the_ego():
+    from log2sim.replay.summary import summarize
+
+    driven = replay(hard_braking(), ego=lambda seen: Controls(-3.0, 0.0))
+    assert "least time to collision of the ego" in summarize(driven)
+    assert "(ego and wall at" in summarize(driven)
+    assert "collision of the ego" not in summarize(replay(hard_braking()))
+
+
 def test_the_command_lists_collisions_and_broken_limits_and_leaves_with_6_when_strict(tmp_path):
     hard_braking().save(tmp_path / "s.json")
     said = run("replay", tmp_path / "s.json", "--limit", "min_ttc_s=3")
@@ -209,3 +218,19 @@ def test_the_command_lists_collisions_and_broken_limits_and_leaves_with_6_when_s
     assert "1 collision, 0 that the log does not have" in said.out
     assert "ego and wall collide at" in said.out
     assert "as in the log" in said.out
+
+
+@pytest.mark.parametrize("dt_s", [0.005, 0.02, 0.1])
+def test_times_between_agents_do_not_depend_on_the_step(dt_s):
+    t = np.arange(0, 81) * 0.1
+    first = agent_from(t, 10 * (t - 3), 0 * t, 0 * t, np.full(81, 10.0), id="first")
+    second = agent_from(t, 0 * t, 6 * (t - 5), np.full(81, np.pi / 2), np.full(81, 6.0), id="second")
+    behind = agent_from(t, 8 * (t - 3) - 40, 30 + 0 * t, 0 * t, np.full(81, 8.0), id="behind")
+    ahead = agent_from(t, 5 * (t - 3) - 20 + 12, 30 + 0 * t, 0 * t, np.full(81, 5.0), id="ahead")
+    m = replay(scenario_of(first, second, behind, ahead), dt_s=dt_s).metrics
+    # Each is out of the other's lane (4.4 + 1.8) / 2 m past the crossing.
+    assert m["min_pet"]["s"] == pytest.approx((5 - 3.1 / 6) - (3 + 3.1 / 10), abs=2e-3)
+    assert m["min_pet"]["agents"] == ["first", "second"]
+    # Centers are 41 m apart at first and come nearer by 3 m/s for 8 s; bumper to bumper is a length less.
+    assert m["min_ttc"]["s"] == pytest.approx((41 - 3 * 8 - 4.4) / 3, abs=0.02)
+    assert m["min_ttc"]["agents"] == ["behind", "ahead"]

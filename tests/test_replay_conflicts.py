@@ -59,7 +59,7 @@ def town(count, seed):
     rng = np.random.default_rng(seed)
     tracks = []
     for _ in range(count):
-        x, y, yaw, speed, rate = (*rng.uniform(-25, 25, 2), *rng.uniform(-np.pi, np.pi, 1), rng.uniform(0, 15), rng.choice([0, 0.4]))  # fmt: skip
+        x, y, yaw, speed, rate = (*rng.uniform(-25, 25, 2), *rng.uniform(-np.pi, np.pi, 1), rng.uniform(0, 15), rng.choice([0, 0.4, 1.8]))  # fmt: skip
         speed = speed * (rng.uniform() < 0.8)
         begin, end = sorted(rng.choice(T_S, 2))
         life = (0.0, 4.0) if rng.uniform() < 0.6 else (begin, end)
@@ -187,11 +187,24 @@ def test_the_shortest_post_encroachment_times_are_those_of_all_rows():
             if len(at):
                 pair = (min(a, b), max(a, b))
                 expected[pair] = min(expected.get(pair, np.inf), float((j - i)[at].min()))
-    assert len(expected) > 25
+    assert len(expected) > 15
     assert set(got) == set(expected)
     rows = np.array([expected[p] - got[p] for p in got])
     # Between the rows it may be shorter: each moment moves by at most 1 + 1/4 + 1/16 + 1/64 rows.
     assert np.all((rows > -0.01) & (rows <= 2 * 85 / 64))
+
+
+@pytest.mark.parametrize(("late_s", "count"), [(3.9, 1), (8.2, 1), (10.3, 1), (10.6, 0)])
+def test_it_is_found_up_to_ten_seconds_later_and_not_after(late_s, count):
+    t = np.arange(0, 400) * SPACING_S
+    x = np.stack([10 * (t - 2.0), 0 * t], axis=1)
+    y = np.stack([0 * t, 10 * (t - 2.0 - late_s)], axis=1)
+    yaw = np.tile([0.0, np.pi / 2], (400, 1))
+    boxes = Boxes(x, y, 0 * x, yaw, 0 * x + 10, np.tile([4.0, 2.0, 1.5], (2, 1)))
+    found = encroachments(boxes, SPACING_S)
+    assert len(found.first) == count
+    # Out at 3 m past the crossing, in at 3 m before: 0.6 s less than they are apart.
+    assert np.all(np.abs((found.came_row - found.left_row) * SPACING_S - (late_s - 0.6)) < 5e-4)
 
 
 def test_a_new_collision_is_zero_and_one_of_the_log_is_left_out_of_the_least():

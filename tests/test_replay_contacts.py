@@ -79,11 +79,13 @@ def test_one_that_leaves_the_crossing_before_the_other_comes_is_not_hit():
         assert len(events_of(boxes_of(a, b))) == count
 
 
+@pytest.mark.parametrize("view", [0.0, 0.5, -2.0])
 @pytest.mark.parametrize("rate", [1.5, -6.0])
-def test_a_bar_that_turns_touches_when_its_corner_gets_there(rate):
+def test_a_bar_that_turns_touches_when_its_corner_gets_there(rate, view):
     bar, wall = (10.0, 0.5, 2.0), (2.0, 40.0, 2.0)
     gap = 4.6
-    a, b = (0.0, 0.0, lambda t: np.pi / 2 + rate * t), (gap + 1.0, 0.0, 0.0)
+    a = (0.0, 0.0, lambda t: view + np.pi / 2 + rate * t)  # seen from some sides its yaw passes pi
+    b = ((gap + 1.0) * np.cos(view), (gap + 1.0) * np.sin(view), view)
 
     def reach(t):
         yaw = np.pi / 2 + rate * t
@@ -97,7 +99,7 @@ def test_a_bar_that_turns_touches_when_its_corner_gets_there(rate):
 def random_motions(count, seed):
     rng = np.random.default_rng(seed)
     size_a, size_b = (
-        np.stack([rng.uniform(0.5, 12, count), rng.uniform(0.4, 3, count), np.ones(count)], axis=1) for _ in range(2)
+        np.stack([rng.uniform(0.5, 12, count), rng.uniform(0.4, 3, count), np.ones(count)]) for _ in range(2)
     )
     place, way = rng.uniform(-9, 9, (2, count)), rng.normal(0, 6, (2, count))
     turn = rng.uniform(-0.6, 0.6, (2, count)) * (rng.uniform(size=count) < 0.7)
@@ -108,7 +110,7 @@ def random_motions(count, seed):
 def overlapping(m, u):
     return rectangles_overlap(
         m.dx_m + u * m.vx_m, m.dy_m + u * m.vy_m, m.yaw_a_rad + u * m.turn_a_rad, m.yaw_b_rad + u * m.turn_b_rad,
-        m.size_a_m, m.size_b_m,
+        m.size_a_m.T, m.size_b_m.T,
     )  # fmt: skip
 
 

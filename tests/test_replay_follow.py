@@ -216,6 +216,9 @@ def test_the_integral_grows_with_the_error_but_not_at_the_limit_of_an_actuator()
     assert near[1] == pytest.approx(0.005 * 0.01 / ((10 * GAINS.across_s) ** 2 * GAINS.integral_s), rel=1e-6)
     assert far[0] == 0.0  # 2.9 m / (0.6 s)^2 is more than full throttle
     assert far[1] > 0.0
+    catching_up = controls_at(x=-5.0, speed=12.5, dt_s=0.1)
+    assert 0.0 < catching_up[0].pedal_mps2[0] < 3.0
+    assert catching_up[1].integral[0, 0] == 0.0
     aside = controls_at(y=-6.0)[1].integral[:, 0]
     assert aside[1] == 0.0  # the wheels are at the limit of grip
 

@@ -1,6 +1,6 @@
 """How well and how fast agents follow their waypoints: tracking errors by control step, and speed by number of agents.
 
-python tools/bench_replay.py [SCENARIO ...] [--dt SECONDS ...] [--agents N ...] [--out FILE.json]
+python tools/bench_replay.py [SCENARIO ...] [--dt SECONDS ...] [--agents N ...] [--models NAME ...] [--out FILE.json]
 
 Errors over all followers of a scenario, and the worst agent by each. Speed: cars on rings that change their speed, stepped
 at 10 ms on one core; building the references (once, before the first step) and measuring the result are told apart.
@@ -28,6 +28,7 @@ SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.j
 STEPS_S = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
 LIMITS = {"cross_track_rms_m": 0.10, "cross_track_max_m": 0.35, "along_track_rms_m": 0.3, "speed_rms_mps": 0.3}
 COUNTS = (1, 10, 100, 1000)
+MODELS = ("auto", "dynamic")
 SPEED_DT_S = 0.01
 DRIVE_S = 40.0
 LOG_S = 0.1
@@ -41,11 +42,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--agents", nargs="*", type=int, default=COUNTS, help="numbers of agents whose speed is measured"
     )
+    parser.add_argument("--models", nargs="*", default=MODELS, help="vehicle models whose speed is measured")
     parser.add_argument("--out", type=Path, help="also write the rows here")
     options = parser.parse_args(arguments)
     tracking = [row for path in options.scenarios or [SAMPLE] for row in tracking_rows(Scenario.load(path), options.dt)]
     print(tracking_table(tracking))
-    speed = [speed_row(count) for count in options.agents]
+    speed = [speed_row(count, model) for model in options.models for count in options.agents]
     print(f"\n{speed_table(speed)}")
     if options.out:
         options.out.write_text(json.dumps({"tracking": tracking, "speed": speed}, indent=1) + "\n", encoding="utf-8")
@@ -91,25 +93,29 @@ def ring_car(index: int, duration_s: float) -> Agent:
     if index % 5 == 0:
         speed = np.maximum(3.0 * (speed - 7.0), 0.0)
     way = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2 * LOG_S)])
-    radius, offset = 20.0 + index % 30, 1.3
+    radius, offset = 40.0 + index % 20, 1.3  # at most 2.5 m/s2 sideways
     yaw = way / radius
     x, y = radius * np.sin(yaw) + offset * np.cos(yaw), radius * (1 - np.cos(yaw)) + offset * np.sin(yaw)
-    columns = (t, x + 120.0 * (index % 32), y + 120.0 * (index // 32), 0 * t, wrap_angle(yaw), speed)
+    columns = (t, x + 150.0 * (index % 32), y + 150.0 * (index // 32), 0 * t, wrap_angle(yaw), speed)
     waypoints = Waypoints(*columns, observed=np.ones(len(t), dtype=bool), sigma_xy_m=np.full(len(t), 0.05))
     return Agent(f"car-{index}", "car", (4.4, 1.8, 1.5), waypoints, rear_axle_offset_m=offset)
 
 
-def speed_row(count: int, duration_s: float = DRIVE_S) -> dict[str, Any]:
+def speed_row(count: int, model: str = "auto", duration_s: float = DRIVE_S) -> dict[str, Any]:
     """Seconds of processor time that a replay of so many cars takes: by step in the long run, and around the steps."""
     scenario = Scenario("rings", 0, duration_s, tuple(ring_car(k, duration_s) for k in range(count)))
     told: list[tuple[int, float]] = []
     begin = time.process_time()
-    replay(scenario, dt_s=SPEED_DT_S, progress=lambda done, _: told.append((done, time.process_time())))
+    done = replay(
+        scenario, dt_s=SPEED_DT_S, model=model, progress=lambda steps, _: told.append((steps, time.process_time()))
+    )
     end = time.process_time()
     # The first stretch holds the references and the agents' arrivals; the others hold look-ups, control, model and storing.
     step_s = statistics.median((t1 - t0) / (n1 - n0) for (n0, t0), (n1, t1) in pairwise(told))
     return {
         "agents": count,
+        "model": model,
+        "moved_by": sorted({a.model for a in done.agents}),
         "dt_s": SPEED_DT_S,
         "step_us": step_s * 1e6,
         "agent_steps_per_s": count / step_s,
@@ -122,12 +128,21 @@ def speed_row(count: int, duration_s: float = DRIVE_S) -> dict[str, Any]:
 
 def speed_table(rows: list[dict[str, Any]]) -> str:
     """The rows as Markdown."""
-    head = ["agents", "us a step", "agents x steps a second", "times real time", "s before", "s after", "whole replay"]
+    head = [
+        "model",
+        "agents",
+        "us a step",
+        "agents x steps a second",
+        "times real time",
+        "s before",
+        "s after",
+        "whole replay",
+    ]
     return markdown(
         head,
         [
             [
-                str(row["agents"]), f"{row['step_us']:.0f}", f"{row['agent_steps_per_s']:,.0f}", f"{row['times_real_time']:.0f}",
+                f"{row['model']}: {', '.join(row['moved_by'])}", str(row["agents"]), f"{row['step_us']:.0f}", f"{row['agent_steps_per_s']:,.0f}", f"{row['times_real_time']:.0f}",
                 f"{row['before_s']:.2f}", f"{row['after_s']:.2f}", f"{row['whole_times_real_time']:.1f}",
             ]
             for row in rows

@@ -85,7 +85,15 @@ def replay(
     mode: Annotated[str, typer.Option(help="pid or exact.")] = "pid",
     model: Annotated[str, typer.Option(help="Vehicle model: auto, kinematic, dynamic or single-track.")] = "auto",
     dt: Annotated[float, typer.Option(help="Step in s.")] = 0.01,
-    ego: Annotated[str | None, typer.Option(metavar="MODULE:ATTRIBUTE", help="Policy that drives the ego.")] = None,
+    ego: Annotated[
+        str | None, typer.Option(metavar="MODULE|FILE.py:ATTRIBUTE", help="Policy that drives the ego.")
+    ] = None,
+    agents: Annotated[str, typer.Option(help="What the others do: log, or reactive (brake for what is new).")] = "log",
+    react: Annotated[str | None, typer.Option(metavar="ID,ID", help="Only these react.")] = None,
+    simulator: Annotated[str, typer.Option(help="own, or carla: a CARLA server moves the agents.")] = "own",
+    host: Annotated[str, typer.Option(help="With carla: where its server runs.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="With carla: its port.")] = 2000,
+    map: Annotated[str | None, typer.Option(metavar="TOWN|FILE.xodr", help="With carla: world to load first.")] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit 6 when a limit is broken.")] = False,
     limit: Annotated[
         list[str] | None, typer.Option(metavar="METRIC=VALUE", help="A limit, e.g. min_ttc_s=1; with --strict.")
@@ -94,17 +102,22 @@ def replay(
     quiet: Quiet = False,
 ) -> None:
     """Let vehicles drive a scenario."""
+    from log2sim.errors import ConfigError
     from log2sim.files import check_targets
-    from log2sim.replay import check_limits, load_policy, parse_limits, require_strict
+    from log2sim.replay import check_limits, host_named, load_policy, parse_limits, require_strict
     from log2sim.replay import replay as run
     from log2sim.replay.summary import summarize
     from log2sim.scenario import Scenario
 
     check_targets(out, overwrite=overwrite)
+    if react is not None and agents != "log":
+        raise ConfigError("--react names the agents that react, --agents reactive means all: give one of them")
+    chosen = agents if react is None else [name.strip() for name in react.split(",")]
     limits = parse_limits(limit or ())
     loaded = Scenario.load(scenario)
     policy = load_policy(ego) if ego is not None else None
-    result = run(loaded, mode=mode, model=model, dt_s=dt, ego=policy)
+    moved_by = host_named(simulator, host, port, map)
+    result = run(loaded, mode=mode, model=model, dt_s=dt, ego=policy, agents=chosen, host=moved_by)
     if out is not None:
         result.save(out)
     say(summarize(result), quiet=quiet)

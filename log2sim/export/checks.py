@@ -46,22 +46,43 @@ def remarks(scenario: Scenario) -> list[str]:
     return found
 
 
+def require_start_as_in_log(agents: Sequence[Agent], placed: Array) -> None:
+    """Raise unless agents that an export places in one another at its start (A, 4) are so in the scenario too.
+
+    `placed` holds x, y, z of the box center and yaw, NaN for agents that it does not place yet.
+    """
+    there = overlaps(agents, _states(agents, max(0.0, min(float(a.waypoints.t_s[0]) for a in agents))))
+    for a, b in overlaps(agents, placed.T).keys() - there.keys():
+        raise ScenarioError(
+            f"agents '{agents[a].id}' and '{agents[b].id}' would start in one another, which they do not in the scenario"
+        )
+
+
 def overlaps_at_entry(agents: Sequence[Agent]) -> list[tuple[int, int, float]]:
     """Pairs of agents (indices) whose boxes overlap at the moment when the later of both appears, with their IoU."""
     first_s = np.array([a.waypoints.t_s[0] for a in agents])
-    size = np.array([a.size_m for a in agents]).reshape(-1, 3)
-    reach = np.hypot(size[:, 0], size[:, 1]) / 2
     found = []
     for t_s in np.unique(first_s):
-        x, y, z, yaw = _states(agents, t_s)
-        corners = box_corners_bev(np.column_stack([x, y]), size[:, 0], size[:, 1], yaw)
-        for k in np.flatnonzero(first_s == t_s):
-            near = np.hypot(x - x[k], y - y[k]) <= reach + reach[k]  # False where an agent is not there: NaN
-            near &= np.abs(z - z[k]) <= (size[:, 2] + size[k, 2]) / 2
-            for other in np.flatnonzero(near & ((first_s < t_s) | (np.arange(len(agents)) < k))):
-                share = bev_iou(corners[k], corners[other])
-                if share > TOUCHING_IOU:
-                    found.append((int(other), int(k), share))
+        for (a, b), share in overlaps(agents, _states(agents, t_s)).items():
+            if max(first_s[a], first_s[b]) == t_s:
+                found.append((a, b, share) if first_s[a] <= first_s[b] else (b, a, share))
+    return found
+
+
+def overlaps(agents: Sequence[Agent], states: Array) -> dict[tuple[int, int], float]:
+    """IoU by pair of agents (indices, the lower first) whose boxes overlap in states (4, A) x, y, z, yaw; NaN is absent."""
+    size = np.array([a.size_m for a in agents]).reshape(-1, 3)
+    x, y, z, yaw = states
+    reach = np.hypot(size[:, 0], size[:, 1]) / 2
+    corners = box_corners_bev(np.column_stack([x, y]), size[:, 0], size[:, 1], yaw)
+    found = {}
+    for k in range(len(agents)):
+        near = np.hypot(x[:k] - x[k], y[:k] - y[k]) <= reach[:k] + reach[k]  # False for NaN
+        near &= np.abs(z[:k] - z[k]) <= (size[:k, 2] + size[k, 2]) / 2
+        for other in np.flatnonzero(near):
+            share = bev_iou(corners[k], corners[other])
+            if share > TOUCHING_IOU:
+                found[int(other), k] = share
     return found
 
 

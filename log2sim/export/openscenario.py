@@ -7,13 +7,17 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
+import numpy as np
+
 from log2sim.errors import ConfigError
 from log2sim.export import Options
+from log2sim.export.checks import require_start_as_in_log
 from log2sim.export.opendrive import add_road_file
 from log2sim.export.openscenario_entities import add_entity
-from log2sim.export.openscenario_story import Revision, add_storyboard, part_of
+from log2sim.export.openscenario_story import Revision, add_storyboard, parts_of, starts
 from log2sim.export.placement import Placement
 from log2sim.export.xml_text import element, escaped, number, unique_names, write
+from log2sim.geometry import Array
 from log2sim.scenario import Scenario
 
 REVISIONS = {"1.0": Revision(0), "1.1": Revision(1), "1.2": Revision(2)}
@@ -25,8 +29,8 @@ class OpenScenario:
 
     options: tuple[str, ...] = ("revision", "map")
     loses = (
-        "cameras, quality, plan and provenance; a cyclist and a bicycle are both bicycles and what is 'other' a van,"
-        " except to `log2sim import`; to ScenarioRunner sizes and axles too"
+        "cameras, quality, plan and provenance; players take a cyclist for a bicycle and what is 'other' for a van (an import"
+        " does not), and ScenarioRunner takes over no sizes"
     )
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
@@ -45,7 +49,8 @@ def document(scenario: Scenario, road: str, placement: Placement, revision: Revi
     """The document of a scenario whose road lies in the file `road` beside it."""
     names = unique_names(a.id for a in scenario.agents)
     duration_s = max(scenario.duration_s, *(float(a.waypoints.t_s[-1]) for a in scenario.agents))
-    parts = [part_of(a, name, duration_s, placement) for a, name in zip(scenario.agents, names)]
+    parts = parts_of(scenario.agents, names, duration_s, placement)
+    require_start_as_in_log(scenario.agents, _boxes(scenario, starts(parts, revision)))
     root = element("OpenSCENARIO")
     element(
         "FileHeader", root,
@@ -59,6 +64,14 @@ def document(scenario: Scenario, road: str, placement: Placement, revision: Revi
         add_entity(entities, agent, name, revision.minor)
     add_storyboard(root, parts, duration_s, revision)
     return root
+
+
+def _boxes(scenario: Scenario, references: Array) -> Array:
+    """Box centers and headings (A, 4) of agents whose reference points are at (A, 4)."""
+    ahead_m = np.array([a.rear_axle_offset_m for a in scenario.agents])
+    x, y, z, heading = references.T
+    height_m = np.array([a.size_m[2] for a in scenario.agents])
+    return np.column_stack([x + ahead_m * np.cos(heading), y + ahead_m * np.sin(heading), z + height_m / 2, heading])
 
 
 def _add_parameters(root: Element, scenario: Scenario, placement: Placement) -> None:

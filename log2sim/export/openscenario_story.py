@@ -1,13 +1,14 @@
 """The storyboard: where agents stand at first, the trajectories that they follow, when they come and go.
 
 Written by revision. 1.0 is what CARLA's ScenarioRunner reads: it knows no spawning and deleting and stops at such an
-action, so there agents wait `HIDDEN_M` below their first pose and go back below after the last one; it also knows neither
-`greaterOrEqual` nor `TrajectoryRef`. From 1.1 on agents are added and deleted.
+action, so there agents wait `HIDDEN_M` or more below their first pose and go back below after the last one; it also knows
+neither `greaterOrEqual` nor `TrajectoryRef`. From 1.1 on agents are added and deleted.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -17,7 +18,8 @@ from log2sim.export.xml_text import element, number
 from log2sim.geometry import Array
 from log2sim.scenario import Agent
 
-HIDDEN_M = 500.0
+# Each agent that waits has a level of its own, so that none waits in another.
+HIDDEN_M, LEVEL_M = 500.0, 10.0
 # A polyline needs two vertices; an agent that was seen once stays this long.
 MOMENT_S = 0.001
 # "At or after t" where only "after" can be said.
@@ -48,13 +50,18 @@ class Revision:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """What one agent plays: vertices (V, 5) t, x, y, z, heading of its reference point; absent before and after or not."""
+    """What one agent plays: vertices (V, 5) t, x, y, z, heading of its reference point.
+
+    `enters` and `leaves` tell whether it is absent before and after them, `hidden_m` how far below it waits where absent
+    agents cannot be taken away.
+    """
 
     name: str
     vertices: Array
     speed_mps: float
     enters: bool
     leaves: bool
+    hidden_m: float = HIDDEN_M
 
     @property
     def first_s(self) -> float:
@@ -64,8 +71,20 @@ class Part:
     def last_s(self) -> float:
         return float(self.vertices[-1, 0])
 
+    @property
+    def start(self) -> Array:
+        """The vertex (5,) where it begins, which is where it is at 0 s if its log began before."""
+        t_s = max(self.first_s, 0.0)
+        return np.array([np.interp(t_s, self.vertices[:, 0], column) for column in self.vertices.T])
 
-def part_of(agent: Agent, name: str, duration_s: float, placement: Placement) -> Part:
+
+def parts_of(agents: Sequence[Agent], names: Sequence[str], duration_s: float, placement: Placement) -> list[Part]:
+    """The parts of all agents, each on a level of its own where it is hidden."""
+    parts = [_part(agent, name, duration_s, placement) for agent, name in zip(agents, names)]
+    return [replace(part, hidden_m=HIDDEN_M + LEVEL_M * k) for k, part in enumerate(parts)]
+
+
+def _part(agent: Agent, name: str, duration_s: float, placement: Placement) -> Part:
     """The part of an agent: the middle of its rear axle on the ground, headings that never jump by a turn."""
     w = agent.waypoints
     states = placement.forward(np.column_stack([w.x_m, w.y_m, w.z_m, np.unwrap(w.yaw_rad)]))
@@ -77,6 +96,15 @@ def part_of(agent: Agent, name: str, duration_s: float, placement: Placement) ->
     enters, leaves = w.t_s[0] > SAME_TIME_S, vertices[-1, 0] < duration_s - SAME_TIME_S
     # Players refuse a negative speed at the start; a reversing agent gets its own from the trajectory at once.
     return Part(name, vertices, max(float(w.speed_mps[0]), 0.0), bool(enters), bool(leaves))
+
+
+def starts(parts: Sequence[Part], revision: Revision) -> Array:
+    """Where agents stand at the start (A, 4) x, y, z, heading of their reference points; NaN for those added later."""
+    rows = np.array([part.start[1:] for part in parts])
+    for row, part in zip(rows, parts):
+        if part.enters:
+            row[2] = np.nan if revision.spawns else row[2] - part.hidden_m
+    return rows
 
 
 def add_storyboard(parent: Element, parts: list[Part], duration_s: float, revision: Revision) -> None:
@@ -95,8 +123,8 @@ def add_storyboard(parent: Element, parts: list[Part], duration_s: float, revisi
 
 def _add_start(actions: Element, part: Part) -> None:
     private = element("Private", actions, entityRef=part.name)
-    below = HIDDEN_M if part.enters else 0.0
-    _add_position(element("TeleportAction", element("PrivateAction", private)), part.vertices[0], below)
+    below_m = part.hidden_m if part.enters else 0.0
+    _add_position(element("TeleportAction", element("PrivateAction", private)), part.start, below_m)
     _add_speed(private, "PrivateAction", 0.0 if part.enters else part.speed_mps)
 
 
@@ -130,7 +158,7 @@ def _add_end(maneuver: Element, part: Part, revision: Revision) -> None:
             element("DeleteEntityAction", entity)
         else:
             private = element("PrivateAction", action)
-            _add_position(element("TeleportAction", private), part.vertices[-1], HIDDEN_M)
+            _add_position(element("TeleportAction", private), part.vertices[-1], part.hidden_m)
     _add_trigger(event, "StartTrigger", f"{part.name} was seen", part.last_s, revision)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -11,10 +12,13 @@ import numpy as np
 from log2sim.geometry import Array
 
 # The smoothing spline stays this near the path, and the arcs as near the spline: together below TOLERANCE_M.
-TOLERANCE_M, SPLINE_M, ARCS_M = 0.01, 0.006, 0.002
+TOLERANCE_M, SPLINE_M, ARCS_M = 0.01, 0.007, 0.002
 # Points of a path nearer than this are one; between those further apart than this the line from one to the next counts.
-LEAST_STEP_M, LARGEST_STEP_M = 0.01, 0.5
-SAMPLE_M = 0.1
+LEAST_STEP_M, LARGEST_STEP_M = 0.01, 0.25
+SAMPLE_M = 0.2
+# How far the points may lie from the spline on average, from the calmest curve to the one through all of them.
+SIGMAS_M = (*(SPLINE_M / 2 * 0.7**k for k in range(8)), 0.0)
+SWING = 1.2
 # An arc whose middle is nearer its chord than this is written as a line.
 FLAT_M = 1e-6
 
@@ -30,19 +34,11 @@ class Piece:
     length_m: float
     curvature_1pm: float
 
-    def at(self, along_m: Array) -> Array:
-        """Points (N, 3) x, y, heading at distances (N,) from the piece's start."""
-        turned = self.curvature_1pm * along_m
-        chord = along_m * np.sinc(turned / (2 * np.pi))
-        direction = self.heading_rad + turned / 2
-        return np.column_stack(
-            [self.x_m + chord * np.cos(direction), self.y_m + chord * np.sin(direction), self.heading_rad + turned]
-        )
-
     @property
     def end(self) -> Array:
         """x, y, heading (3,) where the piece ends."""
-        return self.at(np.array([self.length_m]))[0]
+        start = np.array([self.x_m, self.y_m, self.heading_rad])
+        return _along(start, np.array([self.curvature_1pm]), np.array([self.length_m]))[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,14 +51,15 @@ class ReferenceLine:
     def length_m(self) -> float:
         return self.pieces[-1].s_m + self.pieces[-1].length_m
 
+    @cached_property
+    def _columns(self) -> Array:
+        return np.array([[p.s_m, p.x_m, p.y_m, p.heading_rad, p.curvature_1pm] for p in self.pieces]).T
+
     def at(self, s_m: Array) -> Array:
         """Points (N, 3) x, y, heading at stations (N,)."""
-        starts = np.array([p.s_m for p in self.pieces])
-        index = np.clip(np.searchsorted(starts, s_m, side="right") - 1, 0, len(starts) - 1)
-        out = np.empty((len(s_m), 3))
-        for k in np.unique(index):
-            out[index == k] = self.pieces[k].at(s_m[index == k] - starts[k])
-        return out
+        starts = self._columns[0]
+        k = np.clip(np.searchsorted(starts, s_m, side="right") - 1, 0, None)
+        return _along(self._columns[1:4, k].T, self._columns[4, k], s_m - starts[k])
 
     def extended(self, before_m: float, after_m: float) -> ReferenceLine:
         """The same with straight lines before and after it, stations counted from the new start."""
@@ -73,6 +70,16 @@ class ReferenceLine:
         steps += [(p.x_m, p.y_m, p.heading_rad, p.length_m, p.curvature_1pm) for p in self.pieces]
         steps += [(x, y, heading, after_m, 0.0)]
         return chained(steps)
+
+
+def _along(start: Array, curvature_1pm: Array, along_m: Array) -> Array:
+    """Points (N, 3) x, y, heading at distances (N,) along arcs that begin at (N, 3) or all at (3,)."""
+    x, y, heading = start.T
+    turned = curvature_1pm * along_m
+    chord = along_m * np.sinc(turned / (2 * np.pi))
+    return np.column_stack(
+        [x + chord * np.cos(heading + turned / 2), y + chord * np.sin(heading + turned / 2), heading + turned]
+    )
 
 
 def chained(steps: Sequence[tuple[float, float, float, float, float]]) -> ReferenceLine:
@@ -129,19 +136,38 @@ def _spline(xy_m: Array) -> tuple[Array, Array]:
     """Samples (M, 3) x, y, heading of a smooth curve within `SPLINE_M` of points (N, 2), and where those lie among them."""
     from scipy.interpolate import splev, splprep
 
+    straight_on = _straight_samples(xy_m)
+    if straight_on is not None:
+        return straight_on
     steps = np.hypot(*np.diff(xy_m, axis=0).T)
     travelled = np.concatenate([[0.0], np.cumsum(steps)])
     parts = np.maximum(np.ceil(steps / LARGEST_STEP_M).astype(int), 1)
     u = np.concatenate([a + np.arange(n) / n * d for a, n, d in zip(travelled, parts, steps)] + [travelled[-1:]])
     dense = np.column_stack([np.interp(u, travelled, xy_m[:, k]) for k in (0, 1)])
     at = np.linspace(0.0, travelled[-1], max(int(np.ceil(travelled[-1] / SAMPLE_M)), 2) + 1)
-    for sigma_m in (SPLINE_M / 2, SPLINE_M / 4, SPLINE_M / 8, 0.0):
-        tck, _ = splprep(dense.T, u=u, k=min(3, len(u) - 1), s=len(u) * sigma_m**2)
-        if np.hypot(*(np.array(splev(u, tck)) - dense.T)).max() <= SPLINE_M:
+    for sigma_m in SIGMAS_M:
+        # Asked for all its output it warns of nothing; what it has not solved the two tests below refuse.
+        (tck, _), *_ = splprep(dense.T, u=u, k=min(3, len(u) - 1), s=len(u) * sigma_m**2, full_output=1, quiet=1)
+        (x, y), (dx, dy) = splev(at, tck), splev(at, tck, der=1)
+        # Its parameter is the way along the path; where it runs much faster it swings out between two points.
+        calm = np.hypot(dx, dy).max() <= SWING
+        if calm and np.hypot(*(np.array(splev(u, tck)) - dense.T)).max() <= SPLINE_M:
             break
-    (x, y), (dx, dy) = splev(at, tck), splev(at, tck, der=1)
     heading = np.unwrap(np.arctan2(dy, dx))
     return np.column_stack([x, y, heading]), travelled / travelled[-1] * (len(at) - 1)
+
+
+def _straight_samples(xy_m: Array) -> tuple[Array, Array] | None:
+    """The two ends of the line nearest to all points (N, 2) if it is within `SPLINE_M` of them, as `_spline` returns them."""
+    middle = xy_m.mean(axis=0)
+    across, along = np.linalg.eigh(np.cov((xy_m - middle).T))[1].T
+    along = along if (xy_m[-1] - xy_m[0]) @ along > 0 else -along
+    s = (xy_m - middle) @ along
+    if np.abs((xy_m - middle) @ across).max() > SPLINE_M or np.any(np.diff(s) <= 0):
+        return None
+    heading = np.arctan2(along[1], along[0])
+    ends = np.array([[*(middle + v * along), heading] for v in (s[0], s[-1])])
+    return ends, (s - s[0]) / (s[-1] - s[0])
 
 
 def _longest_biarcs(samples: Array) -> list[int]:

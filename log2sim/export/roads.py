@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +20,7 @@ SPARE_M = 0.8
 # Roads go on for this long before and after the path, so that the whole vehicle stands on them.
 BEYOND_M = 10.0
 # Moving back less than this is a vehicle that settles; more begins a new way.
-REVERSAL_M = 0.25
+REVERSAL_M = 0.1
 # A vehicle that moves less has no way of its own; ways that leave the roads for less are on them.
 SHORTEST_WAY_M = 2.0
 SHORTEST_LINE_M = 0.1
@@ -46,22 +48,29 @@ class Road:
     left_m: float = 0.0
     right_m: float = 0.0
 
-    def holds(self, points: Array, aside_m: float | None = None) -> NDArray[np.bool_]:
-        """Whether points (N, 3) x, y, heading lie along the road, on its lanes or within `aside_m` of its line."""
+    @cached_property
+    def _probes(self) -> tuple[Array, Any]:
+        """Points (P, 3) x, y, heading every `PROBE_M`, and a tree of their positions."""
         from scipy.spatial import cKDTree
 
-        stations = np.linspace(0.0, self.line.length_m, max(int(self.line.length_m / PROBE_M), 1) + 1)
-        probes = self.line.at(stations)
-        near = np.minimum(cKDTree(probes[:, :2]).query(points[:, :2], k=1)[1], len(probes) - 1)
-        x, y, heading = probes[near].T
-        dx, dy = points[:, 0] - x, points[:, 1] - y
+        probes = self.line.at(np.linspace(0.0, self.line.length_m, max(int(self.line.length_m / PROBE_M), 1) + 1))
+        return probes, cKDTree(probes[:, :2])
+
+    def holds(self, points: Array, aside_m: float | None = None) -> NDArray[np.bool_]:
+        """Whether points (N, 3) x, y, heading lie along the road, on its lanes or within `aside_m` of its line."""
+        left, right = self.lane_m / 2 + self.left_m, self.lane_m / 2 + self.right_m
+        if aside_m is not None:
+            left = right = aside_m
+        probes, tree = self._probes
+        near = tree.query(points[:, :2], distance_upper_bound=max(left, right) + PROBE_M)[1]
+        held = near < len(probes)
+        x, y, heading = probes[near[held]].T
+        dx, dy = points[held, 0] - x, points[held, 1] - y
         along, across = dx * np.cos(heading) + dy * np.sin(heading), dy * np.cos(heading) - dx * np.sin(heading)
-        turned = np.abs(wrap_angle(points[:, 2] - heading))
-        left, right = (
-            (self.lane_m / 2 + self.left_m, self.lane_m / 2 + self.right_m) if aside_m is None else (aside_m,) * 2
-        )
+        turned = np.abs(wrap_angle(points[held, 2] - heading))
         parallel = np.minimum(turned, np.pi - turned) <= ALONG_RAD
-        return parallel & (np.abs(along) <= PROBE_M) & (across <= left) & (across >= -right)
+        held[held] = parallel & (np.abs(along) <= PROBE_M) & (across <= left) & (across >= -right)
+        return held
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,11 +178,12 @@ def _road(agent: Agent, way: Way, beside_m: float = 0.0, level_m: float = LEVEL_
 
 
 def _standing_road(agent: Agent) -> Road:
-    """A straight road under an agent that never moves."""
+    """A straight road through the middle of where an agent stands."""
     w = agent.waypoints
-    line = straight(float(w.x_m[0]), float(w.y_m[0]), float(w.yaw_rad[0]), 2 * BEYOND_M)
-    ground = float(w.z_m[0]) - agent.size_m[2] / 2
-    return Road(agent.id, line, np.array([[0.0, ground, 0.0, 0.0, 0.0]]), _lane_m(agent), LANE_M, LANE_M)
+    x, y, yaw = (float(np.mean(v)) for v in (w.x_m, w.y_m, np.unwrap(w.yaw_rad)))
+    ground = float(np.mean(w.z_m)) - agent.size_m[2] / 2
+    elevation = np.array([[0.0, ground, 0.0, 0.0, 0.0]])
+    return Road(agent.id, straight(x, y, yaw, 2 * BEYOND_M), elevation, _lane_m(agent), LANE_M, LANE_M)
 
 
 def _lane_m(agent: Agent) -> float:

@@ -34,12 +34,12 @@ def number(value: float, digits: int = 6) -> str:
 
 def escaped(text: str) -> str:
     """Any text as printable ASCII that no player takes for a parameter; `unescaped` gives it back."""
-    return quote(text, safe=_PLAIN, errors="surrogatepass")
+    return quote(text, safe=_PLAIN, errors="replace")
 
 
 def unescaped(text: str) -> str:
-    """What was given to `escaped`."""
-    return unquote(text, errors="surrogatepass")
+    """What was given to `escaped`, but for halves of surrogate pairs, which no file can hold."""
+    return unquote(text, errors="replace")
 
 
 def unique_names(texts: Iterable[str]) -> list[str]:
@@ -110,7 +110,7 @@ def read(path: Path) -> ElementTree.Element:
         with path.open("rb") as file:
             parser.ParseFile(file)
         return reader.builder.close()
-    except (expat.ExpatError, UnicodeError, ValueError) as problem:
+    except (expat.ExpatError, LookupError, ValueError) as problem:  # LookupError: an encoding that nobody knows
         raise ScenarioError(f"{path}: not valid XML: {problem}") from None
 
 

@@ -30,6 +30,9 @@ MOST_FRAMES = 300
 """A longer scenario is shown faster, and says so."""
 
 TAIL_S = 1.5
+TAIL_ALPHA, WAY_ALPHA = 0.65, 0.22
+"""How much color tails have, and the ways as a whole."""
+
 DPI = {".gif": 96, ".mp4": 128}
 
 CLEAR = 255
@@ -74,7 +77,7 @@ def write_animation(
     sheet, step_s, strips = base(
         scenario, cast, replay=replay, truth=truth, background=background, title=title, moving=True
     )
-    draw.draw_tracks(sheet.ax, cast, sheet.view, step_s, alpha=0.22, faint=True)
+    draw.draw_tracks(sheet.ax, cast, sheet.view, step_s, alpha=WAY_ALPHA, faint=True)
     sheet.figure.set_dpi(DPI[suffix])
     pace = choose_pace(scenario.duration_s)
     stage = Stage(sheet, cast, replay, truth, pace, strips)
@@ -144,7 +147,7 @@ class Stage:
         self.boxes.set_facecolor(colors)
         self.noses.set_verts(list(shapes.noses(np.array(corners))) if corners else [])
         self.tails.set_segments([_tail(r.agent, t_s) for r, _ in present])
-        self.tails.set_color([to_rgba(r.color, 0.65) for r, _ in present])
+        self.tails.set_color([to_rgba(r.color, TAIL_ALPHA) for r, _ in present])
         self._show_overlays(t_s)
         for collection in self.collections:
             self.sheet.ax.draw_artist(collection)
@@ -207,8 +210,6 @@ def _write_gif(frames: Iterator[Image], path: Path, colors: Sequence[str]) -> No
             now = np.asarray(Pillow.fromarray(frame).quantize(palette=palette, dither=Pillow.Dither.NONE))
             picture = Pillow.fromarray(now if before is None else np.where(now == before, np.uint8(CLEAR), now))
             picture.putpalette(palette.getpalette() or ())
-            if before is not None:
-                picture.info["transparency"] = CLEAR
             before = now
             yield picture
 
@@ -221,7 +222,9 @@ def _write_gif(frames: Iterator[Image], path: Path, colors: Sequence[str]) -> No
 
 def _with_swatches(frame: Image, colors: Sequence[str]) -> Image:
     """A frame to choose one palette for all of them by: since colors count by area, those that mean something get some."""
-    rgb = np.rint(255 * np.array([to_rgb(color) for color in colors])).astype(np.uint8)
+    full = np.array([to_rgb(color) for color in colors])
+    mixes = [alpha * full + (1 - alpha) * np.array(to_rgb(PAPER)) for alpha in (1.0, TAIL_ALPHA, WAY_ALPHA)]
+    rgb = np.rint(255 * np.concatenate(mixes)).astype(np.uint8)
     row = np.arange(len(frame)) * len(rgb) // len(frame)
     return np.concatenate([frame, np.repeat(rgb[row][:, None], SWATCH_PX, axis=1)], axis=1)
 

@@ -7,9 +7,12 @@ from types import ModuleType
 from typing import Any
 
 from log2sim.replay.limits import check_limits, check_strict, parse_limits, require_strict
-from log2sim.replay.policy import Controls, EgoState, Observation, Others, Policy, Route, load_policy
+from log2sim.replay.policy import Controls, EgoState, Observation, Others, PathAhead, Policy, Route
+from log2sim.replay.policy_name import load_policy
 from log2sim.replay.result import AgentReplay, Commands, Replay, to_scenario
-from log2sim.replay.run import replay
+from log2sim.replay.rollout import World
+from log2sim.replay.run import open_world, replay
+from log2sim.replay.simulator import host_named
 
 __all__ = [
     "AgentReplay",
@@ -18,12 +21,16 @@ __all__ = [
     "EgoState",
     "Observation",
     "Others",
+    "PathAhead",
     "Policy",
     "Replay",
     "Route",
+    "World",
     "check_limits",
     "check_strict",
+    "host_named",
     "load_policy",
+    "open_world",
     "parse_limits",
     "replay",
     "require_strict",

@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array
 from log2sim.replay.assess import FOLLOWING, assess
+from log2sim.replay.clock import Clock
 from log2sim.replay.metrics import Errors, errors_of
 from log2sim.replay.models import Choice
 from log2sim.replay.path import Path
 from log2sim.replay.result import AgentReplay, Commands, Replay
-from log2sim.replay.rollout import Clock, Tracks
+from log2sim.replay.rollout import Tracks
+from log2sim.replay.ways import times_at
 from log2sim.replay.world import Group
 from log2sim.scenario import Agent, Scenario
 
@@ -41,12 +43,13 @@ def assemble(
     agents: list[AgentReplay] = []
     stored: list[NDArray[np.intp]] = []
     errors: dict[str, Errors] = {}
+    walks = ("pid", "reactive") if mode == "pid" else ()
     for agent in scenario.agents:
         if agent.id in tracks:
             driver, path, flags = home[agent.id]
             steps, states = tracks[agent.id]
             t_s: Array = clock.begin_s + steps.astype(np.float64) * clock.dt_s
-            choice = choices.get(agent.id, Choice("point", "") if driver == "pid" else Choice("none", ""))
+            choice = choices.get(agent.id, Choice("point", "") if driver in walks else Choice("none", ""))
             replayed = _moved(agent, driver, choice, path, flags, t_s, states)
             errors[agent.id] = errors_of(path, replayed, follows=driver in FOLLOWING)
             agents.append(_with_errors(replayed, errors[agent.id]))
@@ -75,9 +78,10 @@ def _moved(
     x, y, yaw, speed, steer, accel, *told = states
     if driver == "exact":
         x, y, yaw, speed = path.centers(t_s)  # the tables in between are good to half a millimeter, the path is exact
+    log_t_s = times_at(path, t_s, x, y) if driver == "reactive" else t_s
     if np.isnan(accel).any():
         accel = np.gradient(speed, t_s) if len(t_s) > 1 else np.zeros(len(t_s))
-    z = np.interp(t_s, path.t_s, path.z_m)
+    z = np.interp(log_t_s, path.t_s, path.z_m)
     x, y, z, yaw, speed, steer, accel = (np.round(c, DIGITS) for c in (x, y, z, yaw, speed, steer, accel))
     t_s = np.round(t_s, 9)
     pedal, wheel, gear = told

@@ -125,11 +125,12 @@ def collisions(
     known = contacts(grown, moves, involved)
     velocity = np.stack(replayed.velocities(_spacing(t_s)))
     rows = np.arange(len(t_s), dtype=np.float64)
+    logged_contacts = _by_pair(known)
     events: list[dict[str, Any]] = []
-    for a, b in sorted(set(zip(touching.a.tolist(), touching.b.tolist()))):
-        in_log = np.interp(_of_pair(known, a, b), rows, t_s)
+    for (a, b), contact in _by_pair(touching).items():
+        in_log = np.interp(logged_contacts.get((a, b), np.zeros((2, 0))), rows, t_s)
         together = max(replayed.first_row[a], replayed.first_row[b])
-        for begin_row, end_row in _runs(_of_pair(touching, a, b), SAME_CONTACT_S / _spacing(t_s)):
+        for begin_row, end_row in _runs(contact, SAME_CONTACT_S / _spacing(t_s)):
             begin, end = np.interp([begin_row, end_row], rows, t_s)
             shared = (in_log[0] <= end + LOG_WINDOW_S) & (in_log[1] >= begin - LOG_WINDOW_S)
             events.append(
@@ -145,10 +146,13 @@ def collisions(
     return sorted(events, key=lambda e: (e["t_s"], e["agents"]))
 
 
-def _of_pair(found: Contacts, a: int, b: int) -> Array:
-    """First and last rows (2, K) of a pair's contacts in order of time."""
-    chosen = found.take((found.a == a) & (found.b == b))
-    return np.stack([chosen.first_row, chosen.last_row])[:, np.argsort(chosen.first_row)]
+def _by_pair(found: Contacts) -> dict[tuple[int, int], Array]:
+    """First and last rows (2, K) of each pair's contacts in order of time."""
+    found = found.take(np.lexsort((found.first_row, found.b, found.a)))
+    new = np.flatnonzero((np.diff(found.a) != 0) | (np.diff(found.b) != 0)) + 1
+    rows = np.split(np.stack([found.first_row, found.last_row]), new, axis=1)
+    begins = np.concatenate([[0], new])[: len(found.a)]
+    return dict(zip(zip(found.a[begins].tolist(), found.b[begins].tolist()), rows))
 
 
 def _runs(contact: Array, gap: float) -> list[tuple[float, float]]:
@@ -164,8 +168,7 @@ def _spacing(t_s: Array) -> float:
 
 def _relative_speed(velocity: Array, row: float, a: int, b: int) -> float:
     """Relative speed at a row with a fraction, from velocities (2, S, A)."""
-    relative = velocity[:, :, b] - velocity[:, :, a]
     k = int(row)
-    now = relative[:, k]
-    then = relative[:, min(k + 1, relative.shape[1] - 1)]
+    after = min(k + 1, velocity.shape[1] - 1)
+    now, then = (velocity[:, r, b] - velocity[:, r, a] for r in (k, after))
     return float(np.hypot(*(now if np.isnan(then).any() else now + (row - k) * (then - now))))

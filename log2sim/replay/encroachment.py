@@ -21,6 +21,9 @@ CROSSING_RAD = math.radians(30.0)
 COARSE, FINER, LEVELS = 64, 4, 3
 """Rows of the largest blocks, into how many parts these are divided, and the number of sizes."""
 
+BATCH = 2000
+"""Pairs whose times are refined together, so that memory stays small."""
+
 PARTS, ZOOMS = 4, 4
 """A row is divided into so many parts so many times: 50 ms to 0.2 ms."""
 
@@ -43,7 +46,7 @@ class _Pairs(NamedTuple):
     i: Rows
     j: Rows
 
-    def take(self, index: NDArray) -> _Pairs:
+    def take(self, index: NDArray | slice) -> _Pairs:
         return _Pairs(*(column[index] for column in self))
 
     def divided(self) -> _Pairs:
@@ -76,11 +79,16 @@ def encroachments(boxes: Boxes, spacing_s: float) -> Encroachments:
     for pairs in _coarse(hulls[0], lag):
         for hull in hulls[1:]:
             pairs = hull.met(pairs.divided())
-        found.append(_crossings(boxes, pairs.divided(), lag))
+        found.append(_shortest(_crossings(boxes, pairs.divided(), lag)))
     if not found:
         none = np.zeros(0, dtype=np.intp)
         return Encroachments(none, none, np.zeros(0), np.zeros(0))
-    return _refined(boxes, _shortest(_Pairs(*(np.concatenate(column) for column in zip(*found)))))
+    pairs = _shortest(_Pairs(*(np.concatenate(column) for column in zip(*found))))
+    left, came = np.zeros(len(pairs.a)), np.zeros(len(pairs.a))
+    for begin in range(0, len(left), BATCH):
+        part = slice(begin, begin + BATCH)
+        left[part], came[part] = _refined(boxes, pairs.take(part))
+    return Encroachments(pairs.a, pairs.b, left, came)
 
 
 class _Hulls:
@@ -165,8 +173,8 @@ def _shortest(pairs: _Pairs) -> _Pairs:
     return pairs.take(new)
 
 
-def _refined(boxes: Boxes, pairs: _Pairs) -> Encroachments:
-    """Times between the rows: of ever finer grids about the moments found the ones nearest in time."""
+def _refined(boxes: Boxes, pairs: _Pairs) -> tuple[Array, Array]:
+    """Rows (N,), (N,) with a fraction: of ever finer grids about the moments found the ones nearest in time."""
     a, b, left, came = pairs.a, pairs.b, pairs.i.astype(np.float64), pairs.j.astype(np.float64)
     offset = np.arange(-PARTS, PARTS + 1)
     shape = (len(a), len(offset), len(offset))
@@ -181,4 +189,4 @@ def _refined(boxes: Boxes, pairs: _Pairs) -> Encroachments:
         apart = np.where(boxes.overlap(all_i, all_a, all_j, all_b), all_j - all_i, np.inf)
         best = np.argmin(apart.reshape(len(a), len(offset) ** 2), axis=1) + np.arange(len(a)) * len(offset) ** 2
         left, came = all_i[best], all_j[best]
-    return Encroachments(a, b, left, came)
+    return left, came

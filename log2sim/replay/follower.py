@@ -13,7 +13,6 @@ import numpy as np
 
 from log2sim.geometry import Array, cos_sin
 from log2sim.replay.vehicle import (
-    GRAVITY_MPS2,
     Columns,
     PointControls,
     PointState,
@@ -87,7 +86,8 @@ def follow_vehicles(
     """
     p, reference_gear, stands = parameters, row[6], row[7]
     pace = np.abs(state.speed_mps)
-    gear = np.where(pace == 0, reference_gear, np.sign(state.speed_mps))
+    moves, square = pace > 0, pace * pace
+    gear = np.where(moves, np.sign(state.speed_mps), reference_gear)
     error, raw_rate = _errors(row, state)
     rate = memory.rate - math.expm1(-dt_s / gains.derivative_filter_s) * (raw_rate - memory.rate)
     damping = 2 * gains.damping * rate
@@ -97,7 +97,7 @@ def follow_vehicles(
     pull = error * stiffness**2
     wanted = row[4:6] + pull + damping * stiffness + memory.integral
     # The smallest radius with grip grows with the square of the speed; at standstill only the lock limits.
-    grip = np.minimum(gains.max_lateral_accel_mps2 / np.maximum(pace**2, 1.0), p.max_curvature_1pm)
+    grip = np.minimum(gains.max_lateral_accel_mps2 / np.maximum(square, 1.0), p.max_curvature_1pm)
     asked = _rows(wanted[0] * gear, wanted[1])
     given = np.minimum(np.maximum(asked, _rows(-p.max_brake_mps2, -grip)), _rows(p.max_throttle_mps2, grip))
 
@@ -105,14 +105,14 @@ def follow_vehicles(
     # that is far behind and makes up for it, or from wheels that stand.
     learns = (given == asked) | (error * wanted <= 0)
     learns[0] &= np.abs(error[0]) < MAX_ALONG_M
-    learns[1] &= pace > 0
+    learns[1] &= moves
     bound = _rows(INTEGRAL_LIMIT_MPS2, INTEGRAL_SHARE * grip)
     integral = memory.integral + (dt_s / gains.integral_s) * pull * learns
     integral = np.minimum(np.maximum(integral, -bound), bound)
 
     held = (stands > 0.5) & (pace < gains.hold_below_mps) & (error[0] * reference_gear < gains.hold_within_m)
     given[0, held], integral[0, held] = -gains.hold_brake_mps2, 0.0
-    steer = np.arctan(p.wheelbase_m * given[1] * (1 + p.understeer_s2pm2 * pace**2))
+    steer = np.arctan(p.wheelbase_m * given[1] * (1 + p.understeer_s2pm2 * square))
     controls = VehicleControls(given[0], steer, reference_gear < 0)
     return controls, Memory(integral, rate)
 
@@ -158,9 +158,8 @@ def start_vehicles(row: Array, parameters: VehicleParameters) -> VehicleState:
     steer = np.minimum(np.maximum(angle, -parameters.max_steer_rad), parameters.max_steer_rad)
     pedal = np.minimum(np.maximum(accel * gear, -parameters.max_brake_mps2), parameters.max_throttle_mps2)
     speed, pedal = np.where(stands > 0.5, 0.0, [speed, pedal])
-    rate = speed * curvature
-    lateral = -rate * speed * np.abs(speed) / (GRAVITY_MPS2 * parameters.friction * parameters.rear_stiffness_1prad)
-    return VehicleState(x.copy(), y.copy(), yaw.copy(), speed, steer, pedal, lateral, rate)
+    still = np.zeros(len(x))
+    return VehicleState(x.copy(), y.copy(), yaw.copy(), speed, steer, pedal, still, still)
 
 
 def start_points(row: Array) -> PointState:

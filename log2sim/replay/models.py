@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -9,10 +10,11 @@ import numpy as np
 
 from log2sim.geometry import Array
 from log2sim.replay.reference import GRID_S, STANDSTILL_MPS, VEHICLE_COLUMNS, Reference
-from log2sim.replay.vehicle import GRAVITY_MPS2, VehicleParameters
+from log2sim.replay.single_track import Chassis, grips
+from log2sim.replay.vehicle import GRAVITY_MPS2, VehicleParameters, VehicleState
 from log2sim.scenario import Agent
 
-YAW, SPEED, CURVATURE = (VEHICLE_COLUMNS.index(name) for name in ("yaw", "speed", "curvature_ahead"))
+YAW, SPEED, ACCEL, CURVATURE = map(VEHICLE_COLUMNS.index, ("yaw", "speed", "accel_ahead", "curvature_ahead"))
 
 MODELS = ("auto", "kinematic", "dynamic", "single-track")
 SLIPPING = ("dynamic", "single-track")
@@ -24,6 +26,9 @@ SLIP_TOLERANCE_RAD = 0.02
 A car has it at 3.3 m/s2 sideways, a third of what its tires bear. Polack et al. ("The kinematic bicycle model: a consistent
 model for planning feasible trajectories for autonomous vehicles?", 2017) take the kinematic model as valid up to half.
 """
+
+ROUNDS = 4
+"""Passes in which slips, the drag of slips and the load that this moves settle."""
 
 MAX_FRICTION_USE = 0.95
 """Share of the friction limit beyond which slips are not predicted: they grow without bound."""
@@ -77,38 +82,53 @@ def slipping_reference(reference: Reference, p: VehicleParameters, model: str, a
     """
     if len(reference.columns) < 3:
         return reference
-    later_nose, bend = _inverse(reference.columns, p, saturates=model != "single-track")
+    later_nose, bend, drag = _inverse(reference.columns, p, saturates=model != "single-track")
     t_s = np.arange(reference.first_row, reference.first_row + len(bend), dtype=np.float64) * GRID_S
     nose = np.interp(t_s, t_s + ahead_s, later_nose)
 
     def slipped(columns: Array, at_s: Array) -> Array:
         out = columns.copy()
-        out[:, YAW] += np.interp(at_s, t_s, nose)
-        out[:, CURVATURE] += np.interp(at_s, t_s, bend)
+        for column, more in ((YAW, nose), (CURVATURE, bend), (ACCEL, drag)):
+            out[:, column] += np.interp(at_s, t_s, more)
         return out
 
     def exact(at_s: Array) -> Array:
         return slipped(reference.exact(at_s), at_s)
 
-    return replace(reference, columns=slipped(reference.columns, t_s), exact=exact)
+    return replace(reference, columns=slipped(reference.columns, t_s), exact=exact, slips=True)
 
 
-def _inverse(columns: Array, p: VehicleParameters, *, saturates: bool) -> tuple[Array, Array]:
-    """What slip adds to the heading (K,) in rad and to the curvature (K,) in 1/m of rows of a table, at their own time."""
-    speed, curvature = columns[:, SPEED], columns[:, CURVATURE]
-    to_rear, whole = p.cg_to_rear_m, GRAVITY_MPS2 * p.friction
+def moving_as(state: VehicleState, reference: Callable[[float], Array], t_s: float) -> VehicleState:
+    """The state with the lateral velocity and the yaw rate that the reference's rows (C, A) have at a time."""
+    before, after = reference(t_s), reference(t_s + GRID_S)  # before its begin a reference goes straight on
+    (dx, dy), turn = (after - before)[:2] / GRID_S, (after - before)[YAW]
+    yaw = (before + after)[YAW] / 2
+    return replace(state, lateral_mps=np.cos(yaw) * dy - np.sin(yaw) * dx, yaw_rate_radps=turn / GRID_S)
+
+
+def _inverse(columns: Array, p: VehicleParameters, *, saturates: bool) -> tuple[Array, Array, Array]:
+    """What slip adds to heading, curvature and acceleration, (K,) each, of the rows of a table, as of the curvature's time."""
+    speed, curvature, to_rear, chassis = columns[:, SPEED], columns[:, CURVATURE], p.cg_to_rear_m, Chassis.of(p)
     twist = np.gradient(speed * curvature, GRID_S)
-    accel = speed**2 * curvature + to_rear * twist  # of the center of gravity
-    front_force = (p.gyration_m2 * twist + to_rear * accel) / p.wheelbase_m
-    front_use = front_force * p.wheelbase_m / (whole * to_rear)
-    rear_use = (accel - front_force) * p.wheelbase_m / (whole * (p.wheelbase_m - to_rear))
-    front = _slip(front_use, p.front_stiffness_1prad, saturates=saturates)
-    rear = _slip(rear_use, p.rear_stiffness_1prad, saturates=saturates)
+    aside = speed**2 * curvature + to_rear * twist  # acceleration of the center of gravity
+    front_force = (p.gyration_m2 * twist + to_rear * aside) / p.wheelbase_m
+    drag, bend = np.zeros_like(speed), p.wheelbase_m * curvature
+    for _ in range(ROUNDS if saturates else 1):
+        accel = columns[:, ACCEL] + drag
+        rear_grip, front_grip = grips(accel, p, chassis)
+        share = np.clip(accel / (GRAVITY_MPS2 * p.friction), -MAX_FRICTION_USE, MAX_FRICTION_USE)
+        ellipse, cos2 = (np.sqrt(1 - share**2), 1 / (1 + bend**2)) if saturates else (1.0, 1.0)
+        front_use, rear_use = front_force / (front_grip * ellipse), (aside - front_force) / (rear_grip * ellipse)
+        front = _slip(front_use / np.sqrt(cos2), p.front_stiffness_1prad, saturates=saturates) / cos2
+        rear = _slip(rear_use, p.rear_stiffness_1prad, saturates=saturates)
+        bend = p.wheelbase_m * curvature + front - rear
+        if saturates:
+            slip = rear + to_rear / p.wheelbase_m * (front - rear)  # of the center of gravity, beyond that of rolling
+            drag = speed * np.abs(speed) * curvature * slip
     nose = np.sign(speed) * rear
     moving = np.abs(speed) > STANDSTILL_MPS
     swing = np.where(moving, np.gradient(nose, GRID_S) / np.where(moving, speed, 1.0), 0.0)
-    gain = 1 + understeer(p) * speed**2
-    return nose, (curvature + swing + (front - rear) / p.wheelbase_m) / gain - curvature
+    return nose, (bend / p.wheelbase_m + swing) / (1 + understeer(p) * speed**2) - curvature, drag
 
 
 def _slip(use: Array, stiffness_1prad: Array, *, saturates: bool = True) -> Array:

@@ -1,8 +1,11 @@
-"""What a user's own driver of the ego sees and answers."""
+"""What a user's own driver of the ego sees and answers.
+
+All positions are box centers on the map's axes in m, yaw is counter-clockwise from +x in rad within [-pi, pi), speed is
+along the heading in m/s (negative in reverse gear), time is in s on the scenario's clock. All arrays are read-only.
+"""
 
 from __future__ import annotations
 
-import importlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,10 +15,12 @@ from numpy.typing import NDArray
 
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
+from log2sim.scenario import Scenario
 
 SIGHT_M = 100.0
 ROUTE_AHEAD_S = 10.0
 ROUTE_STEP_S = 0.1
+PATH_AHEAD_M = 100.0
 
 
 @dataclass(frozen=True)
@@ -32,7 +37,11 @@ class Controls:
 
 @dataclass(frozen=True)
 class EgoState:
-    """The ego: box center in the map in m, yaw in [-pi, pi), speed along the heading, what its actuators do, its size."""
+    """The ego: where it is, what its actuators do now (`accel_mps2` along the heading, `steer_rad` at the wheels), its size.
+
+    The rear axle, about which a vehicle turns, is `rear_axle_offset_m` behind the box center, the front one
+    `wheelbase_m` ahead of that. A curvature c takes a steering angle of atan(wheelbase c (1 + understeer speed^2)).
+    """
 
     x_m: float
     y_m: float
@@ -44,11 +53,15 @@ class EgoState:
     width_m: float
     wheelbase_m: float
     rear_axle_offset_m: float
+    understeer_s2pm2: float
 
 
 @dataclass(frozen=True, eq=False)
 class Others:
-    """Agents within `SIGHT_M` of the ego, nearest first, as columns (A,): box centers in the map, sizes in m."""
+    """Agents whose box center is within sight, nearest first, as columns (A,): parked ones too, the ego not.
+
+    `velocity_x_mps`, `velocity_y_mps` are on the map's axes; `id` and `category` are strings.
+    """
 
     id: NDArray[Any]
     category: NDArray[Any]
@@ -56,19 +69,42 @@ class Others:
     y_m: Array
     yaw_rad: Array
     speed_mps: Array
+    velocity_x_mps: Array
+    velocity_y_mps: Array
     length_m: Array
     width_m: Array
+
+    def __len__(self) -> int:
+        return len(self.x_m)
 
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """Where the recorded ego goes in the next 10 s, as columns (T,): box centers in the map, every 0.1 s from now."""
+    """Where the recorded ego is in the next 10 s, as columns (T,): every 0.1 s from now to the end of the log."""
 
     t_s: Array
     x_m: Array
     y_m: Array
     yaw_rad: Array
     speed_mps: Array
+
+
+@dataclass(frozen=True, eq=False)
+class PathAhead:
+    """The recorded ego's way from the place beside the ego, whenever it was there, as columns (P,): 100 m, one row a meter.
+
+    `distance_m` is counted from the first row, the nearest to the ego. `yaw_rad` is the direction of travel, `speed_mps`
+    the pace of the log at that place, `t_s` when the log was there. Beyond the end of the log the way goes straight on with
+    the last pace, and `t_s` is NaN. `progress_m` is the way up to the first row.
+    """
+
+    progress_m: float
+    distance_m: Array
+    x_m: Array
+    y_m: Array
+    yaw_rad: Array
+    speed_mps: Array
+    t_s: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,50 +116,40 @@ class Observation:
     ego: EgoState
     others: Others
     route: Route
+    path: PathAhead
 
 
 Policy = Callable[[Observation], Controls]
+"""A function, or an object with `__call__` and, if it keeps something between steps, `reset(scenario)`."""
 
 
-def load_policy(name: str) -> Policy:
-    """The callable that "module:attribute" names; dots in the attribute are followed.
-
-    Raises
-    ------
-    ConfigError
-        When the name has another form, or what it names cannot be imported or called.
-    """
-    module_name, colon, attribute = name.partition(":")
-    if not (module_name and colon and attribute):
-        raise ConfigError(f"policy '{name}': expected module:attribute, such as my_driver:brake_late")
+def begin(policy: Policy, scenario: Scenario) -> None:
+    """Call a policy's `reset(scenario)` if it has one, so that it can be used for one replay after the other."""
+    reset = getattr(policy, "reset", None)
+    if reset is None:
+        return
     try:
-        target: Any = importlib.import_module(module_name)
-    except Exception as error:  # a user's module may raise anything while it is imported
-        raise ConfigError(
-            f"policy '{name}': module '{module_name}' cannot be imported: {type(error).__name__}: {error}"
-        ) from error
-    for part in attribute.split("."):
-        if not hasattr(target, part):
-            raise ConfigError(f"policy '{name}': '{part}' is not in {target!r}")
-        target = getattr(target, part)
-    if not callable(target):
-        raise ConfigError(
-            f"policy '{name}': is a {type(target).__name__}, expected a callable policy(observation) -> Controls"
-        )
-    return target
+        reset(scenario)
+    except Exception as error:
+        raise ConfigError(f"policy: reset raised {type(error).__name__}: {error}") from error
 
 
 def ask(policy: Policy, observation: Observation) -> Controls:
     """Call a policy and check its answer."""
+    where = f"policy at {observation.t_s:g} s"
     try:
         answer = policy(observation)
     except Exception as error:
         # Whatever a user's policy raises is the policy's, and the traceback tells its author where.
-        raise ConfigError(f"policy at {observation.t_s:g} s: raised {type(error).__name__}: {error}") from error
+        raise ConfigError(f"{where}: raised {type(error).__name__}: {error}") from error
     if not isinstance(answer, Controls):
         raise ConfigError(
-            f"policy at {observation.t_s:g} s: answered {type(answer).__name__}, expected log2sim.replay.Controls(accel_mps2, steer_rad)"
+            f"{where}: answered {type(answer).__name__}, expected log2sim.replay.Controls(accel_mps2, steer_rad)"
         )
-    if not (math.isfinite(answer.accel_mps2) and math.isfinite(answer.steer_rad)):
-        raise ConfigError(f"policy at {observation.t_s:g} s: answered {answer}, expected finite numbers")
+    try:
+        finite = math.isfinite(answer.accel_mps2) and math.isfinite(answer.steer_rad)
+    except TypeError:
+        finite = False
+    if not finite:
+        raise ConfigError(f"{where}: answered {answer}, expected finite numbers")
     return answer

@@ -31,7 +31,7 @@ class Reference:
     """An agent's table: row k of `columns` (K, C) holds for the time (first_row + k) * GRID_S; see the functions below.
 
     Rows are of the point that is `offset_m` behind the box center. `exact` gives rows (N, C) at any times (N,): rows of the
-    table are blended in between, across a leap of the log too.
+    table are blended in between, across a leap of the log too. What `slips` does not move along its yaw.
     """
 
     path: Path
@@ -40,6 +40,7 @@ class Reference:
     exact: Callable[[Array], Array]
     offset_m: float = 0.0
     flags: tuple[str, ...] = ()
+    slips: bool = False
 
 
 VEHICLE_COLUMNS = ("x", "y", "yaw", "speed", "accel_ahead", "curvature_ahead", "gear_ahead", "stands_ahead")

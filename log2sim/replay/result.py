@@ -38,10 +38,10 @@ class AgentReplay:
     """What one agent did: box centers in the map as columns (S,), while it lives.
 
     `driver` is "static" (one pose, two rows), "exact" (the log), "pid", "reactive" or "policy"; `model` "none", "point",
-    "kinematic", "dynamic" or "single-track", with the reason in `model_reason`. `accel_mps2` is along the heading;
-    `steer_rad` is 0 where nothing steers. `flags` say what in the log cannot be driven. `commands` are None where there is
-    no vehicle model; `cross_track_m`, `along_track_m` (S,) are the distances from the log, left and ahead positive, None
-    for what stands for good.
+    "kinematic", "dynamic", "single-track" or a simulator elsewhere ("carla"), with the reason in `model_reason`.
+    `accel_mps2` is along the heading; `steer_rad` is 0 where nothing steers. `flags` say what in the log cannot be driven.
+    `commands` are None where there is no vehicle model; `cross_track_m`, `along_track_m` (S,) are the distances from the
+    log, left and ahead positive, None for what stands for good.
     """
 
     id: str

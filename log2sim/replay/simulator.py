@@ -1,17 +1,19 @@
 """What the replay asks of a simulator, and the embedded one.
 
 A simulator moves all agents at once by stateless steps. Another vehicle model is made usable by a line in `STEPS`, another
-simulator (a game engine) by giving it the two functions of `Simulator`.
+simulator by giving it the two functions of `Simulator`, and one that runs elsewhere (a game engine) as a `Host`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Protocol
 
 from log2sim.errors import ConfigError
 from log2sim.registry import nearest
-from log2sim.replay.single_track import step_dynamic, step_single_track
+from log2sim.replay.single_track import step_single_track
+from log2sim.replay.sliding import step_dynamic
 from log2sim.replay.vehicle import (
     PointControls,
     PointState,
@@ -21,6 +23,7 @@ from log2sim.replay.vehicle import (
     step_bicycle,
     step_point,
 )
+from log2sim.scenario import Agent
 
 
 class Simulator(Protocol):
@@ -34,6 +37,32 @@ class Simulator(Protocol):
 
     def step_points(self, state: PointState, controls: PointControls, dt_s: float) -> PointState:
         """The state of the points (pedestrians and whatever has no wheels) after the step."""
+        ...
+
+
+class Host(Protocol):
+    """A simulator outside this process, which has one clock for all agents: a step of the replay is one tick of it.
+
+    `open` seats the groups: their simulators from then on take controls down and leave states as they are. `tick`, called
+    when all groups have given their controls, moves everybody and sets the groups' states to what came of it.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def max_dt_s(self) -> float: ...
+
+    def open(self, groups: Sequence[Any], clock: Any, statics: Sequence[Agent]) -> None:
+        """Begin with groups (`log2sim.replay.world`), a clock, and agents that stand for good."""
+        ...
+
+    def tick(self, step: int) -> None:
+        """Move from a step to the next."""
+        ...
+
+    def close(self) -> None:
+        """Leave the simulator as it was found."""
         ...
 
 
@@ -63,3 +92,26 @@ def simulator_named(model: str) -> Simulator:
     if model not in STEPS:
         raise ConfigError(f"unknown vehicle model '{model}'{nearest(model, list(STEPS))}; known: {', '.join(STEPS)}")
     return EmbeddedSimulator(STEPS[model])
+
+
+HOSTS = ("own", "carla")
+
+
+def host_named(name: str, address: str, port: int, map: str | None) -> Host | None:
+    """The simulator of a name, at an address and port, with a town or an OpenDRIVE file to load; None for the own one.
+
+    Raises
+    ------
+    ConfigError
+        When there is none of that name, or the file does not exist.
+    """
+    if name not in HOSTS:
+        raise ConfigError(f"unknown simulator '{name}'{nearest(name, list(HOSTS))}; known: {', '.join(HOSTS)}")
+    if name == "own":
+        return None
+    from log2sim.replay.carla import CarlaSimulator, Server
+
+    opendrive = Path(map) if map is not None and map.endswith(".xodr") else None
+    if opendrive is not None and not opendrive.is_file():
+        raise ConfigError(f"--map: {opendrive}: no such file")
+    return CarlaSimulator(Server(address, port, town=None if opendrive else map, opendrive=opendrive))

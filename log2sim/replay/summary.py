@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+from log2sim.replay.conflicts import least
 from log2sim.replay.result import Replay
 
 MOST_LISTED = 5
 
 
 def summarize(replay: Replay) -> str:
-    """Errors in one line, what agents did to each other in a second one, then the first collisions, new ones first."""
+    """Errors in one line, what agents did to each other in a second one, then the first collisions, new ones first.
+
+    Where a policy drives the ego, the times are those of the ego.
+    """
     m = replay.metrics
+    driven = any(a.driver == "policy" for a in replay.agents)
+    near = [e for e in m["conflicts"] if e["ego"] or not driven]
+    whose = " of the ego" if driven else ""
     lines = [
         f"cross-track {m['cross_track_rms_m']:.3f} m rms, {m['cross_track_max_m']:.3f} m max · "
         f"along-track {m['along_track_rms_m']:.3f} m rms · speed {m['speed_rms_mps']:.3f} m/s rms",
         f"{_counted(len(m['collisions']), 'collision')}, {m['new_collisions']} that the log does not have · "
-        f"least time to collision {_least(m['min_ttc'])} · post-encroachment time {_least(m['min_pet'])}",
+        f"least time to collision{whose} {_least(near, 'min_ttc')} · post-encroachment time {_least(near, 'pet')}",
     ]
     events = sorted(m["collisions"], key=lambda e: (e["in_log"], e["t_s"]))
     lines += [f"  {_collision(e)}" for e in events[:MOST_LISTED]]
@@ -31,7 +38,8 @@ def _collision(event: Mapping[str, Any]) -> str:
     return f"{' and '.join(event['agents'])} collide at {event['t_s']:.2f} s ({event['relative_speed_mps']:.1f} m/s){known}"
 
 
-def _least(found: Mapping[str, Any] | None) -> str:
+def _least(near: Sequence[Mapping[str, Any]], key: str) -> str:
+    found = least(near, key)
     if found is None:
         return "-"
     return f"{found['s']:.2f} s ({' and '.join(found['agents'])} at {found['t_s']:.2f} s)"

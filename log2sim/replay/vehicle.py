@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array
+from log2sim.geometry import Array, cos_sin
 
 MAX_INNER_STEP_S = 0.02
 """Longest step over which the mean steering angle stands for its course; the error falls with its square."""
@@ -139,16 +139,13 @@ def step_bicycle(
     h = dt_s / count
     x, y, yaw, speed = state.x_m, state.y_m, state.yaw_rad, state.speed_mps
     pedal, steer = state.pedal_mps2, state.steer_rad
-    standing_gear = np.where(controls.reverse, -1.0, 1.0)
     for _ in range(count):
         pedal, mean_pedal = actuate(pedal, pedal_target, p.pedal_lag_s, p.max_jerk_mps3, h)
         steer, mean_steer = actuate(steer, steer_target, p.steer_lag_s, p.max_steer_rate_radps, h)
-        gear = np.where(speed == 0, standing_gear, np.sign(speed))
+        gear = engaged(speed, controls.reverse)
         pace, distance = advance(np.abs(speed), mean_pedal, h)
-        turn = gear * distance * np.tan(mean_steer) / p.wheelbase_m
-        chord = gear * distance * sinc(turn / 2)
-        x, y = x + chord * np.cos(yaw + turn / 2), y + chord * np.sin(yaw + turn / 2)
-        yaw, speed = yaw + turn, gear * pace
+        x, y, yaw = roll(x, y, yaw, gear * distance, np.tan(mean_steer) / p.wheelbase_m)
+        speed = gear * pace
     return VehicleState(x, y, yaw, speed, steer, pedal, state.lateral_mps, state.yaw_rate_radps)
 
 
@@ -166,31 +163,52 @@ def step_point(state: PointState, controls: PointControls, dt_s: float) -> Point
     )
 
 
-def clamp(value: Array, low: Array, high: Array) -> Array:
+def clamp(value: Array, low: Array | float, high: Array | float) -> Array:
     """Values within limits; `np.clip` takes twice as long on short arrays."""
     return np.minimum(np.maximum(value, low), high)
 
 
+def roll(x: Array, y: Array, yaw: Array, way: Array, curvature: Array) -> tuple[Array, Array, Array]:
+    """Position and yaw at the end of an arc of signed length `way`."""
+    turn = way * curvature
+    chord = way * sinc(turn / 2)
+    cos, sin = cos_sin(yaw + turn / 2)
+    return x + chord * cos, y + chord * sin, yaw + turn
+
+
+def engaged(speed: Array, reverse: NDArray[np.bool_]) -> Array:
+    """Gear: the sign of the motion, at rest that of the lever."""
+    gear = np.sign(speed)
+    return gear if gear.all() else np.where(gear == 0, np.where(reverse, -1.0, 1.0), gear)
+
+
 def actuate(value: Array, target: Array, lag_s: Array, max_rate: Array, h: float) -> tuple[Array, Array]:
     """Value after `h` and its mean over `h` of an actuator with lag, which moves at `max_rate` while far from the target."""
-    gap = np.abs(target - value)
-    sign = np.sign(target - value)
-    limited_s = np.minimum(np.maximum(gap / max_rate - lag_s, 0.0), h)
-    near = gap - max_rate * limited_s
+    gap = target - value
+    limited_s = clamp(np.abs(gap) / max_rate - lag_s, 0.0, h)
     decay = np.exp((limited_s - h) / lag_s)
-    mean_gap = (limited_s * (gap + near) / 2 + near * lag_s * (1 - decay)) / h
-    return target - sign * near * decay, target - sign * mean_gap
+    mean_share = lag_s * (1 - decay) / h
+    if not limited_s.any():  # the same numbers as below, in half the time
+        return target - gap * decay, target - gap * mean_share
+    near = gap - np.copysign(max_rate * limited_s, gap)
+    mean_gap = limited_s * (gap + near) / (2 * h) + near * mean_share
+    return target - near * decay, target - mean_gap
 
 
 def advance(pace: Array, pedal: Array, h: float) -> tuple[Array, Array]:
     """Pace (not negative) after `h` and the distance covered; braking ends at rest, within the step too."""
     after = pace + pedal * h
+    distance = (pace + after) * (h / 2)
     stops = after < 0
+    if not stops.any():
+        return after, distance
     braking = np.where(stops, pedal, -1.0)  # negative wherever the step ends at rest
-    return np.where(stops, 0.0, after), np.where(stops, -(pace**2) / (2 * braking), (pace + after) * h / 2)
+    return np.where(stops, 0.0, after), np.where(stops, -(pace**2) / (2 * braking), distance)
 
 
 def sinc(angle: Array) -> Array:
     """sin(angle) / angle, 1 at zero."""
-    zero = angle == 0
-    return np.where(zero, 1.0, np.sin(angle) / np.where(zero, 1.0, angle))
+    half = angle / 2
+    t = np.tan(half)
+    zero = half == 0
+    return np.where(zero, 1.0, t) / (np.where(zero, 1.0, half) * (1 + t * t))

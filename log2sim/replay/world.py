@@ -22,6 +22,7 @@ from log2sim.replay.follower import (
     start_points,
     start_vehicles,
 )
+from log2sim.replay.models import moving_as
 from log2sim.replay.policy import Controls
 from log2sim.replay.reference import GRID_S, Reference
 from log2sim.replay.simulator import Simulator
@@ -51,6 +52,7 @@ class Group(ABC):
     """Agents driven alike. `first`, `last` (A,) are the steps between which each agent lives."""
 
     driver = "exact"
+    keeps_time = True  # its agents are where the log has them at the same time, after a leap too
 
     def __init__(self, agents: Sequence[Agent], references: Sequence[Reference], first: NDArray, last: NDArray) -> None:
         self.agents, self.references, self.first, self.last = tuple(agents), tuple(references), first, last
@@ -163,7 +165,10 @@ class Fleet(Group):
 
     def place(self, index: NDArray, t_s: float) -> None:
         slots = self._slots(index)
-        self.state.put(slots, start_vehicles(self._exact(index, t_s), self.living.take(slots)))
+        state = start_vehicles(self._exact(index, t_s), self.living.take(slots))
+        if self.references[index[0]].slips:  # all of a fleet have the same model
+            state = moving_as(state, lambda at_s: self._exact(index, at_s), t_s)
+        self.state.put(slots, state)
         self.memory.put(slots, Memory.fresh(len(slots)))
         placed = self.state.take(slots)
         self.commands.put(slots, VehicleControls(placed.pedal_mps2, placed.steer_rad, placed.speed_mps < 0))
@@ -189,6 +194,7 @@ class Driven(Fleet):
     """The one vehicle that the user's policy drives, by the controls set before each step."""
 
     driver = "policy"
+    keeps_time = False
     controls = Controls(0.0, 0.0)
 
     def _step(self, dt_s: float) -> None:

@@ -1,0 +1,65 @@
+"""The benchmark of followers: its rows are the replay's own figures, and an error beyond its limit is told."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from replay_maneuvers import MANEUVERS, scenario_of
+
+from log2sim.replay import replay
+
+TOOLS = Path(__file__).resolve().parents[1] / "tools"
+
+
+@pytest.fixture(autouse=True)
+def _tools_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(TOOLS))
+
+
+def test_rows_are_those_of_the_replay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import bench_replay
+
+    scene = scenario_of(MANEUVERS["lane change"]())
+    scene.save(tmp_path / "scene.json")
+    out = tmp_path / "rows.json"
+    options = ["--dt", "0.05", "0.1", "--agents", "2", "--models", "kinematic", "--out", str(out)]
+    assert bench_replay.main([str(tmp_path / "scene.json"), *options]) == 0
+    rows = json.loads(out.read_text())
+    assert [row["dt_s"] for row in rows["tracking"]] == [0.05, 0.1]
+    metrics = replay(scene, dt_s=0.1).metrics
+    for key in bench_replay.LIMITS:
+        assert rows["tracking"][1][key] == metrics[key]
+        assert rows["tracking"][1]["worst"][key] == {"agent": "a", "value": metrics["by_agent"]["a"][key]}
+    (speed,) = rows["speed"]
+    assert (speed["agents"], speed["moved_by"]) == (2, ["kinematic"])
+    assert speed["agent_steps_per_s"] == pytest.approx(2 / (speed["step_us"] * 1e-6))
+    assert speed["times_real_time"] == pytest.approx(0.01 / (speed["step_us"] * 1e-6))
+    printed = capsys.readouterr().out
+    assert "| maneuver | 100 | 1 |" in printed
+    assert "none" in printed
+
+
+def test_an_error_beyond_its_limit_is_told_and_ends_with_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import bench_replay
+
+    monkeypatch.setitem(bench_replay.LIMITS, "cross_track_max_m", 1e-4)
+    path = tmp_path / "scene.json"
+    scenario_of(MANEUVERS["lane change"]()).save(path)
+    assert bench_replay.main([str(path), "--dt", "0.1", "--agents"]) == 1
+    assert "| a |" in capsys.readouterr().out
+
+
+def test_cars_on_rings_drive_what_their_speeds_say() -> None:
+    import numpy as np
+    from bench_replay import ring_car
+
+    for index in (0, 7):
+        w = ring_car(index, 20.0).waypoints
+        way = np.hypot(np.diff(w.x_m), np.diff(w.y_m))
+        # The box center is on a ring that is wider than the rear axle's by half of offset^2 / radius.
+        np.testing.assert_allclose(way, (w.speed_mps[1:] + w.speed_mps[:-1]) / 2 * 0.1, rtol=2e-3, atol=1e-6)
+    assert ring_car(0, 20.0).waypoints.speed_mps.min() == 0.0

@@ -1,0 +1,346 @@
+"""Reactive agents: they brake for what the log does not have, as the intelligent-driver model says, and for nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import replace as changed
+from pathlib import Path
+
+import numpy as np
+import pytest
+from replay_maneuvers import MANEUVERS, agent_from, driven, ramp, scenario_of
+from replay_scenes import LENGTH_M, Speed, departure, gap, line, parked, walker
+
+from log2sim.errors import ConfigError
+from log2sim.replay import Controls, replay
+from log2sim.replay.corridor import _nearest_edge
+from log2sim.replay.driver import demand, drivers_for, respond
+from log2sim.replay.path import path_of
+from log2sim.replay.ways import Ways, times_at
+from log2sim.scenario import Scenario
+
+SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
+
+
+def new_collisions(result):
+    return [e for e in result.metrics["collisions"] if not e["in_log"]]
+
+
+def stops_at(t_s, speed=25.0):
+    return Speed(lambda t: speed if t < t_s else 0.0)
+
+
+# The model.
+
+
+@pytest.mark.parametrize("leader_mps", [12.0, 20.0])
+def test_behind_a_constant_leader_the_gap_is_that_of_the_model_in_equilibrium(leader_mps):
+    # Acceleration 0 and equal speeds: 1 - (v / v0)^4 = ((s0 + v T) / s)^2, with the values of town traffic.
+    s0, time_gap, v0 = 2.0, 1.0, 25.0
+    expected = (s0 + leader_mps * time_gap) / np.sqrt(1 - (leader_mps / v0) ** 4)
+    scene = scenario_of(line("ego", 70, duration_s=80), line("f", 0, duration_s=80))
+    result = replay(scene, ego=Speed(lambda t: leader_mps), agents="reactive", dt_s=0.1)
+    assert result.agent("f").driver == "reactive"
+    assert gap(result, "f")[-1] == pytest.approx(expected, abs=0.15)
+    assert result.agent("f").speed_mps[-1] == pytest.approx(leader_mps, abs=0.02)
+    assert gap(result, "f").min() > expected - 0.5  # no overshoot
+
+
+def test_the_demand_of_a_leader_is_the_square_of_desired_to_real_gap():
+    driver = drivers_for([line("a", 0)])
+    one = np.ones(1)
+    # 10 m/s behind 4 m/s: s* = 2 + 10 * 1 + 10 * 6 / (2 sqrt(1.0 * 1.5))
+    desired = 12 + 60 / (2 * np.sqrt(1.5))
+    assert demand(driver, 20 * one, 10 * one, 4 * one)[0] == pytest.approx((desired / 20) ** 2)
+    assert demand(driver, 20 * one, 10 * one, 60 * one)[0] == pytest.approx((2 / 20) ** 2)  # it draws away
+    assert demand(driver, np.inf * one, 10 * one, 4 * one)[0] == 0.0
+
+
+def test_a_free_agent_goes_on_at_the_logs_rate_and_accelerates_to_it():
+    driver = drivers_for([line("a", 0)])
+    one, none = np.ones(1), np.zeros(1)
+    rate, slope = respond(driver, one, none, 10 * one, -3 * one)
+    assert (rate[0], slope[0]) == (1.0, 0.0)
+    rate, slope = respond(driver, 0.5 * one, none, 10 * one, none)
+    assert slope[0] == pytest.approx((1 - 0.5**4) * 1.0 / 10)
+    # The log brakes by 3 m/s2 anyway, so a demand of 2 m/s2 asks for nothing more.
+    assert respond(driver, one, 2 * one, 10 * one, -3 * one)[1][0] == 0.0
+    assert respond(driver, one, 5 * one, 10 * one, -3 * one)[1][0] == pytest.approx(-0.2)
+
+
+# Interference.
+
+
+@pytest.mark.parametrize("distance_m", [6.0, 10.0, 20.0, 40.0])
+def test_a_follower_at_25_mps_stops_behind_an_ego_that_brakes_hard(distance_m):
+    scene = scenario_of(line("ego", distance_m + LENGTH_M, duration_s=16), line("f", 0, duration_s=16))
+    result = replay(scene, ego=stops_at(3.0), agents="reactive", dt_s=0.05)
+    f = result.agent("f")
+    assert gap(result, "f").min() > 1.0
+    assert new_collisions(result) == []
+    assert f.speed_mps.min() > -0.05
+    late = f.t_s > 13
+    assert np.ptp(f.x_m[late]) < 1e-6  # it stands, and does not creep
+    assert 1.0 < gap(result, "f")[-1] < 4.0
+    log = replay(scene, ego=stops_at(3.0), dt_s=0.05)
+    assert gap(log, "f").min() < 0
+    assert new_collisions(log)
+
+
+def test_a_stopped_follower_drives_on_when_the_way_is_free_and_makes_up_nothing():
+    scene = scenario_of(line("ego", 30, duration_s=60), line("f", 0, duration_s=60))
+    go = Speed(lambda t: 25.0 if t < 3 or t > 15 else 0.0)
+    result = replay(scene, ego=go, agents="reactive", dt_s=0.05)
+    f = result.agent("f")
+    assert f.speed_mps.min() == 0.0
+    assert f.speed_mps[-1] == pytest.approx(25.0, abs=1.0)
+    assert f.speed_mps.max() < 25.1
+    start = f.t_s[(f.speed_mps > 0.1) & (f.t_s > 15)][0]
+    assert start < 18
+    jerks = np.diff(np.sign(np.diff(f.speed_mps[(f.t_s > 3) & (f.t_s < 12)])))
+    assert np.count_nonzero(jerks) <= 4  # brakes once, without hunting
+
+
+def test_an_ego_across_the_way_is_waited_for():
+    scene = scenario_of(line("ego", -20, speed=10, duration_s=12), line("c", 2, -50, 10, 12, np.pi / 2))
+    ego = Speed(lambda t: 4.0)
+    assert new_collisions(replay(scene, ego=ego, dt_s=0.05))
+    result = replay(scene, ego=ego, agents="reactive", dt_s=0.05)
+    c = result.agent("c")
+    assert result.metrics["collisions"] == []
+    assert c.speed_mps.min() < 8
+    assert c.y_m[-1] > 20  # and then it went on
+    assert np.abs(c.x_m - 2).max() < 0.01
+
+
+def test_a_pedestrian_does_not_walk_into_an_ego_that_comes_later_than_in_the_log():
+    scene = scenario_of(line("ego", -50, speed=20, duration_s=12), walker("p", 2, -6, 1.4, 12, np.pi / 2))
+    ego = Speed(lambda t: 13.0)
+    assert new_collisions(replay(scene, ego=ego, dt_s=0.05))
+    result = replay(scene, ego=ego, agents="reactive", dt_s=0.05)
+    assert result.metrics["collisions"] == []
+    assert result.agent("p").speed_mps.min() < 0.1
+    assert result.agent("p").y_m[-1] > 4
+
+
+def test_of_two_whose_ways_cross_the_first_in_the_log_goes_first_and_both_get_through():
+    # In the log b passes the crossing at 5 s, a at 7 s; the ego holds b up until both would be there together.
+    scene = scenario_of(
+        line("ego", -30, speed=10, duration_s=30),
+        line("b", -50, speed=10, duration_s=30),
+        line("a", 0, -70, 10, 30, np.pi / 2),
+    )
+    held_up = Speed(lambda t: 5.0 if t < 3 else 10.0)
+    assert new_collisions(replay(scene, ego=held_up, agents=["b"], dt_s=0.05))  # a does not wait
+    result = replay(scene, ego=held_up, agents="reactive", dt_s=0.05)
+    a, b = result.agent("a"), result.agent("b")
+    assert new_collisions(result) == []
+    assert b.t_s[b.x_m > 0][0] < a.t_s[a.y_m > 0][0]
+    assert min(a.y_m[-1], b.x_m[-1]) > 50
+
+
+def test_two_that_wait_for_each_other_do_not_wait_for_ever():
+    # Four ways into one crossing; everybody comes late by another delay.
+    legs = [line(f"a{k}", *(-60 * np.array([np.cos(yaw), np.sin(yaw)]) + 2 * np.array([np.sin(yaw), -np.cos(yaw)])), 10, 40, yaw)
+            for k, yaw in enumerate(np.arange(4) * np.pi / 2)]  # fmt: skip
+    legs = [changed(a, waypoints=changed(a.waypoints, t_s=a.waypoints.t_s + 3.0 * k)) for k, a in enumerate(legs)]
+    blocker = line("ego", -45, -2, 10, 40)
+    result = replay(
+        scenario_of(blocker, *legs), ego=Speed(lambda t: 0.0 if t < 9 else 10.0), agents="reactive", dt_s=0.05
+    )
+    assert new_collisions(result) == []
+    for k in range(4):
+        a = result.agent(f"a{k}")
+        assert np.hypot(a.x_m[-1] - a.x_m[0], a.y_m[-1] - a.y_m[0]) > 120
+
+
+def test_a_logged_stop_is_kept_as_long_as_it_was():
+    stop = driven(lambda t: ramp(t, (0, 10), (8, 10), (11, 0), (15, 0), (19, 8), (30, 8)), np.zeros_like, 30.0, id="s")
+    scene = scenario_of(line("ego", 25, speed=10, duration_s=40), stop)
+    ego = Speed(lambda t: 3.0 if t < 6 else 14.0)
+
+    def stands(r):
+        return np.ptp(r.t_s[np.abs(r.speed_mps) < 0.02]), r.x_m[np.abs(r.speed_mps) < 0.02][0]
+
+    logged = replay(scene, dt_s=0.05).agent("s")
+    result = replay(scene, ego=ego, agents="reactive", dt_s=0.05)
+    s = result.agent("s")
+    assert s.x_m[s.t_s <= 10][-1] < logged.x_m[logged.t_s <= 10][-1] - 5  # it was held up before
+    assert stands(s)[0] == pytest.approx(stands(logged)[0], abs=0.3)
+    assert stands(s)[1] == pytest.approx(stands(logged)[1], abs=0.1)
+    assert s.t_s[-1] > logged.t_s[-1] + 1  # it lives until its way ends
+    assert s.x_m[-1] == pytest.approx(logged.x_m[-1], abs=0.3)
+
+
+# No interference.
+
+
+def test_where_nobody_interferes_reactive_agents_do_exactly_as_the_log():
+    agents = [changed(f(), id=name) for name, f in MANEUVERS.items()]
+    scene = scenario_of(*agents)
+    log, result = replay(scene, dt_s=0.05), replay(scene, agents="reactive", dt_s=0.05)
+    assert {a.driver for a in result.agents} == {"reactive"}
+    assert max(departure(result, log, a.id) for a in agents) < 1e-9
+
+
+def test_the_sample_in_which_a_car_and_a_pedestrian_pass_within_a_hand_stays_as_it_is():
+    scene = Scenario.load(SAMPLE)
+    log, result = replay(scene, dt_s=0.05), replay(scene, agents="reactive", dt_s=0.05)
+    assert max(departure(result, log, a.id) for a in scene.agents) < 1e-9
+
+
+def test_an_ego_that_does_about_as_the_log_moves_nobody():
+    # A platoon that is closer than the model would drive, next to oncoming and parked cars.
+    ids = ["f0", "f1", "on", "beside"]
+    scene = scenario_of(
+        line("ego", 30, speed=20, duration_s=8),
+        line("f0", 20, speed=20, duration_s=8),
+        line("f1", 12, speed=20, duration_s=8),
+        line("on", 250, 2.3, 20, 8, np.pi),
+        line("beside", 28, -2.3, 20, 8),
+        parked("p", 90, -4.2),
+    )
+    ego = Speed(lambda t: 20.0 + 0.2 * np.sin(2 * t))
+    log, result = replay(scene, dt_s=0.05), replay(scene, ego=ego, agents="reactive", dt_s=0.05)
+    assert max(departure(result, log, k) for k in ids) < 0.05
+
+
+@pytest.mark.parametrize(
+    "other",
+    [line("o", 300, 3.5, 25, 12, np.pi), parked("o", 150, -2.3), line("o", -40, 0, 27, 12), line("o", -8, 3.2, 25, 12)],
+    ids=["oncoming", "parked beside", "from behind", "next lane"],
+)
+def test_who_is_not_in_the_way_makes_nobody_brake(other):
+    # The log has nobody but the agent there, since the other's place in it is far away: it is driven by a policy here.
+    far = changed(other, id="ego", static=False)
+    if len(far.waypoints) == 1:
+        t = np.array([0.0, 12.0])
+        far = agent_from(t, np.full(2, 150.0), np.full(2, -2.3), np.zeros(2), np.zeros(2), id="ego")
+    moving = Speed(lambda t: float(other.waypoints.speed_mps[0]))
+    scene = scenario_of(far, line("f", 0, duration_s=12))
+    log = replay(scenario_of(line("f", 0, duration_s=12)), dt_s=0.05)
+    result = replay(scene, ego=moving, agents="reactive", dt_s=0.05)
+    assert departure(result, log, "f") < 1e-6
+
+
+def test_what_the_log_drives_into_is_braked_for():
+    scene = scenario_of(line("f", 0, speed=12, duration_s=12), parked("p", 80, 0.5))
+    assert replay(scene, dt_s=0.05).metrics["collisions"]
+    result = replay(scene, agents="reactive", dt_s=0.05)
+    assert result.metrics["collisions"] == []
+    assert 1.0 < 80 - result.agent("f").x_m[-1] - LENGTH_M < 4.0
+    grazing = scenario_of(line("f", 0, speed=12, duration_s=12), parked("p", 80, 1.6))
+    assert departure(replay(grazing, agents="reactive"), replay(grazing), "f") < 1e-9
+
+
+# Choice, invariance, extremes.
+
+
+def test_only_those_named_react():
+    scene = scenario_of(*(line(k, -30.0 * n, duration_s=12) for n, k in enumerate(("ego", "f", "g"))))
+    result = replay(scene, ego=stops_at(1.0), agents=["f"], dt_s=0.05)
+    assert [a.driver for a in result.agents] == ["policy", "reactive", "pid"]
+    assert next(e["agents"] for e in new_collisions(result)) == ["f", "g"]
+    assert replay(scene, agents="reactive", dt_s=0.05).agent("ego").driver == "pid"
+    assert replay(scene, agents=["ego"], dt_s=0.05).agent("ego").driver == "reactive"
+
+
+@pytest.mark.parametrize(
+    ("agents", "said"),
+    [
+        ("react", "expected log or reactive"),
+        (["g"], "there is none of that id"),
+        (["p"], "cannot react"),
+        (["ego"], "cannot react"),
+    ],
+)
+def test_names_of_agents_that_cannot_react_are_refused(agents, said):
+    scene = scenario_of(line("ego", 0, duration_s=1), line("f", -20, duration_s=1), parked("p", 50, 5))
+    with pytest.raises(ConfigError, match=said):
+        replay(scene, ego=stops_at(0.5), agents=agents)
+
+
+def test_far_from_the_origin_and_turned_the_reaction_is_the_same():
+    def scene(x, y, yaw):
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        return scenario_of(line("ego", x + 30 * cos, y + 30 * sin, 15, 10, yaw), line("f", x, y, 15, 10, yaw))
+
+    one = replay(scene(0, 0, 0), ego=stops_at(2, 15), agents="reactive", dt_s=0.05).agent("f")
+    far = replay(scene(1e6, -1e6, 2.5), ego=stops_at(2, 15), agents="reactive", dt_s=0.05).agent("f")
+    np.testing.assert_allclose(np.hypot(far.x_m - far.x_m[0], far.y_m - far.y_m[0]), one.x_m, atol=1e-4)
+
+
+def test_the_step_hardly_matters():
+    scene = scenario_of(line("ego", 35, duration_s=14), line("f", 0, duration_s=14))
+    ends = [replay(scene, ego=stops_at(2), agents="reactive", dt_s=dt).agent("f").x_m[-1] for dt in (0.01, 0.1)]
+    assert np.ptp(ends) < 0.6
+
+
+def test_exact_agents_react_exactly_on_their_way():
+    turn = MANEUVERS["turn of radius 8 m"]()
+    scene = scenario_of(changed(turn, id="t"), line("ego", 15, 0.0, 5, 8))
+    result = replay(scene, mode="exact", ego=stops_at(0, 5), agents="reactive")
+    t, path = result.agent("t"), path_of(turn, 1.3)
+    assert t.driver == "reactive"
+    assert t.speed_mps[-1] == 0.0
+    x, y, *_ = path.centers(np.arange(0, 8, 0.001))
+    assert max(np.hypot(x - a, y - b).min() for a, b in zip(t.x_m, t.y_m)) < 0.01
+
+
+def test_a_leap_of_the_log_comes_when_the_late_agent_is_there():
+    f = line("f", 0, speed=10, duration_s=12)
+    leap = np.where(f.waypoints.t_s > 5.05, 40.0, 0.0)
+    f = changed(f, waypoints=changed(f.waypoints, x_m=f.waypoints.x_m + leap))
+    scene = scenario_of(line("ego", 25, speed=10, duration_s=14), f)
+    log = replay(scene, agents="reactive", dt_s=0.05)
+    assert departure(log, replay(scene, dt_s=0.05), "f") < 1e-9
+    r = replay(scene, ego=Speed(lambda t: 7.0), agents="reactive", dt_s=0.05).agent("f")
+    (at,) = np.flatnonzero(np.diff(r.x_m) > 20)
+    assert r.t_s[at] > 5.5
+    assert r.x_m[at] == pytest.approx(50, abs=1.5)
+
+
+# Geometry.
+
+
+def test_the_nearest_edge_within_a_corridor_is_that_of_the_clipped_box():
+    rng = np.random.default_rng(0)
+    length, width, within = 4.6, 1.9, 1.1
+    u, v = np.meshgrid(np.linspace(-length / 2, length / 2, 1201), np.linspace(-width / 2, width / 2, 501))
+    for yaw in [*rng.uniform(-np.pi, np.pi, 30), 0.0, np.pi / 2, -np.pi / 2]:
+        left = rng.uniform(-2, 2)
+        x, y = u * np.cos(yaw) - v * np.sin(yaw), left + u * np.sin(yaw) + v * np.cos(yaw)
+        inside = np.abs(y) < within
+        if inside.any():
+            got = _nearest_edge(
+                *(np.full((1, 1), c) for c in (left, np.cos(yaw), np.sin(yaw), length / 2, width / 2, within))
+            )
+            assert got[0, 0] == pytest.approx(x[inside].min(), abs=0.02)
+
+
+def test_feet_on_a_curved_way_are_those_of_a_search_over_all_its_points():
+    agent = MANEUVERS["turn of radius 8 m"]()
+    path = path_of(agent, 1.3)
+    ways = Ways([path])
+    rng = np.random.default_rng(1)
+    fine = np.arange(0, 8, 0.001)
+    x, y, *_ = path.at(fine)
+    points = np.stack([x, y], axis=1)[rng.integers(0, len(x), 40)] + rng.uniform(-2, 2, (40, 2))
+    foot = ways.foot(np.zeros(40, dtype=int), np.zeros(40), 60.0, points[:, :1], points[:, 1:])
+    nearest = np.argmin(np.hypot(points[:, :1] - x, points[:, 1:] - y), axis=1)
+    inner = (nearest > 0) & (nearest < len(x) - 1)
+    offset = np.hypot(points[:, 0] - x[nearest], points[:, 1] - y[nearest])
+    np.testing.assert_allclose(np.abs(foot.left_m[inner, 0]), offset[inner], atol=0.06)
+    along = foot.distance_m[:, 0] + foot.ahead_m[:, 0]
+    np.testing.assert_allclose(along[inner], 5.0 * fine[nearest][inner], atol=0.25)  # 5 m/s
+
+
+def test_the_time_of_the_log_at_a_place_is_found_from_the_way_gone():
+    path = path_of(line("a", 0, speed=10, duration_s=10), 0.0)
+    t = np.linspace(0, 10, 201)
+    np.testing.assert_allclose(times_at(path, t, 6 * t, 0 * t), 0.6 * t, atol=1e-6)
+
+
+def test_controls_of_a_policy_hold_only_for_the_ego():
+    scene = scenario_of(line("ego", 0, speed=5, duration_s=2), line("f", -50, speed=5, duration_s=2))
+    result = replay(scene, ego=lambda seen: Controls(0.0, 0.4), agents="reactive")
+    assert np.abs(result.agent("f").y_m).max() < 1e-6
