@@ -90,7 +90,7 @@ def test_numbers_have_no_exponent(tmp_path: Path) -> None:
 
 def test_lanes_keep_their_height(tmp_path: Path) -> None:
     """Flat maps out of sloping recordings: CommonRoad/commonroad-scenario-designer#34."""
-    ego = straight("ego", speed=10.0)
+    ego = straight("ego", speed=10.0, t_s=np.linspace(0.0, 3.0, 31))
     w = ego.waypoints
     uphill = replace(ego, waypoints=replace(w, z_m=5.0 + 0.1 * w.x_m + ego.size_m[2] / 2))
     root, _ = written(world(uphill), tmp_path)
