@@ -144,6 +144,30 @@ def test_a_straight_path_is_one_line_with_what_is_before_and_after_it(tmp_path: 
     assert [float(piece.attrib[k]) for k in ("x", "y", "hdg", "length")] == pytest.approx([-10.0, 0.0, 0.0, 50.0])
 
 
+@pytest.mark.parametrize("heading_deg", [0.0, 60.0, 135.0, 180.0, -90.0, -10.0])
+def test_a_path_straight_but_for_millimeters_is_one_line(heading_deg: float) -> None:
+    along = np.linspace(0.0, 40.0, 81)
+    aside = np.random.default_rng(3).uniform(-0.005, 0.005, 81)
+    turn = np.deg2rad(heading_deg)
+    xy = np.column_stack([along * np.cos(turn) - aside * np.sin(turn), along * np.sin(turn) + aside * np.cos(turn)])
+    found, stations = fit(xy)
+    (piece,) = found.pieces
+    assert np.abs(np.angle(np.exp(1j * (piece.heading_rad - turn)))) < 1e-3
+    np.testing.assert_allclose(stations, along, atol=1e-3)
+
+
+def test_a_spline_that_swings_out_between_two_points_is_not_taken() -> None:
+    """FITPACK's smoothing of this path of corners passes near every point and bulges between two of them."""
+    rng = np.random.default_rng(73)
+    count = int(rng.integers(3, 12))
+    steps = rng.uniform(0.05, 8.0, (count, 1))
+    turns = np.cumsum(rng.uniform(-1.2, 1.2, count))
+    xy = np.cumsum(steps * np.column_stack([np.cos(turns), np.sin(turns)]), axis=0)
+    found, stations = fit(xy)
+    assert found.length_m == pytest.approx(np.hypot(*np.diff(xy, axis=0).T).sum(), rel=0.01)
+    assert np.hypot(*(found.at(stations)[:, :2] - xy).T).max() <= 0.01
+
+
 def test_a_reference_line_gives_points_at_stations_in_any_order() -> None:
     found = straight(1.0, 2.0, np.pi / 2, 4.0)
     np.testing.assert_allclose(
@@ -309,11 +333,27 @@ def test_a_map_that_is_none_is_refused_and_nothing_stays(spoil: str, message: st
     assert names(tmp_path) == ["mine.xodr"]
 
 
+def test_where_both_name_the_same_projection_nobody_has_to_know_it(tmp_path: Path) -> None:
+    world = scenario(
+        agent(bend(), rear_axle_offset_m=0.0), map=MapFrame(projection="+proj=ours +k=1", offset_m=(500.0, 0.0, 0.0))
+    )
+    mine = users_map(tmp_path / "a", world, "+k=1 +proj=ours +no_defs", (100.0, 0.0, 0.0))
+    export(world, "openscenario", tmp_path / "b", Options(map=mine))
+    vertices = play(tmp_path / "b" / "scenario.xosc")["ego"].vertices
+    np.testing.assert_allclose(vertices[:, 1:3], bend() + np.array([400.0, 0.0]), atol=1e-6)
+
+
 def test_a_map_whose_projection_is_not_one_is_refused(tmp_path: Path) -> None:
     for text, message in (("+proj=nonsense", "is no projection"), ("EPSG:32632", "is no PROJ string")):
         mine = users_map(tmp_path / text[:6], scenario(agent(line())), text, None)
         with pytest.raises(ConfigError, match=message):
             export(scenario(agent(line())), "openscenario", tmp_path / "out", Options(map=mine))
+
+
+def test_scenario_runner_1047_a_map_of_another_place_is_refused(tmp_path: Path) -> None:
+    mine = users_map(tmp_path / "a", scenario(agent(line())), UTM.projection, (0.0, 0.0, 0.0))
+    with pytest.raises(ConfigError, match="its roads are 5447 km away from all agents"):
+        export(scenario(agent(line())), "openscenario", tmp_path / "out", Options(map=mine))
 
 
 def test_a_turned_map_is_refused(tmp_path: Path) -> None:

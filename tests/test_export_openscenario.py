@@ -13,7 +13,7 @@ from export_paths import agent, bend, line, scenario
 from export_readers import Entity, play, roads, trigger_s
 
 from log2sim.errors import ConfigError, ScenarioError
-from log2sim.export import Options, export
+from log2sim.export import Options, export, openscenario
 from log2sim.export.xml_text import escaped, unescaped, unique_names
 from log2sim.geometry import wrap_angle
 from log2sim.scenario import Scenario
@@ -67,6 +67,7 @@ def test_an_unknown_revision_lists_the_known(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("revision", ["1.1", "1.2"])
 def test_who_comes_late_is_added_and_who_leaves_early_is_deleted(revision: str, tmp_path: Path) -> None:
+    """esmini#695: vehicles stayed after their end; esmini#211: the action names its entity, not what it does."""
     entities = written(tmp_path, guest(), revision)
     events = entities["guest"].events
     assert entities["guest"].init is None
@@ -100,6 +101,15 @@ def test_nobody_starts_in_another_who_does_not_in_the_log(revision: str, tmp_pat
     assert min(np.diff(sorted(heights)), default=10.0) > 1.6
     overlapping = agent(line(start=(1.0, 0.5)), "twin")
     written(tmp_path, scenario(agent(line()), overlapping), revision)
+
+
+def test_a_writer_that_would_put_agents_into_one_another_is_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(openscenario, "starts", lambda parts, revision: np.zeros((len(parts), 4)))
+    with pytest.raises(ScenarioError, match="agents 'ego' and 'guest' would start in one another"):
+        export(guest(), "openscenario", tmp_path / "out")
+    assert names(tmp_path) == []
 
 
 @pytest.mark.parametrize("category", CATEGORIES)
@@ -234,6 +244,7 @@ def test_esmini_174_far_from_the_origin_float32_keeps_half_a_millimeter(east_m: 
 
 
 def test_esmini_642_times_are_absolute_and_on_every_vertex(revision: str, tmp_path: Path) -> None:
+    """esmini#121, #773: no offset, no scale; ScenarioRunner#803, scenariogeneration#104, #40: never without times."""
     entities = written(tmp_path, guest(), revision)
     root = ElementTree.parse(tmp_path / "scenario.xosc")
     assert root.find(".//TimeReference/None") is None
@@ -244,6 +255,7 @@ def test_esmini_642_times_are_absolute_and_on_every_vertex(revision: str, tmp_pa
 
 
 def test_esmini_461_triggers_have_no_edge_to_wait_for(revision: str, tmp_path: Path) -> None:
+    """What holds from the start never rises."""
     written(tmp_path, guest(), revision)
     conditions = list(ElementTree.parse(tmp_path / "scenario.xosc").iter("Condition"))
     assert {c.attrib["conditionEdge"] for c in conditions} == {"none"}
@@ -280,11 +292,13 @@ def test_scenario_runner_966_no_vertex_is_added_or_lost_and_positions_are_exact(
 
 
 def test_osc_generator_17_every_agent_follows_a_trajectory(tmp_path: Path) -> None:
+    """And #2, esmini#608: recordings as trajectories, not as maneuvers that resemble them."""
     entities = written(tmp_path, Scenario.load(SAMPLE))
     assert all(e.events["follows"].find(".//FollowTrajectoryAction") is not None for e in entities.values())
 
 
 def test_metadrive_716_agents_stand_on_the_road_that_goes_with_them(tmp_path: Path) -> None:
+    """autoware_universe PR#13232: heights other than the map's; nuscenes-devkit#1033: heights that were dropped."""
     slope = 100.0 + 0.05 * np.linspace(0.0, 30.0, 31)
     entities = written(tmp_path, scenario(agent(line(), ground_m=slope, rear_axle_offset_m=0.0)))
     (road,) = roads(tmp_path / "road.xodr")

@@ -22,6 +22,7 @@ from log2sim.scenario import Scenario
 pytestmark = [pytest.mark.peers, pytest.mark.slow]
 
 SAMPLE = ROOT / "samples" / "crossing"
+PEERS = Path(os.environ.get("LOG2SIM_PEERS", ROOT / ".peers"))
 REVISIONS = ("1.0", "1.1", "1.2")
 QC_CONFIG = """<Config><Param name="InputFile" value="{file}"/><CheckerBundle application="{bundle}">
 <Param name="resultFile" value="result.xqar"/></CheckerBundle></Config>
@@ -32,7 +33,9 @@ NOT_APPLICABLE = {"check_asam_xodr_junctions_connection_one_link_to_incoming"}
 
 @pytest.fixture(scope="module", params=["truth", "sample", "pandaset", "kitti"])
 def world(request: pytest.FixtureRequest) -> Scenario:
-    """The sample's truth, and what is reconstructed from the sample and from recorded logs."""
+    """The sample's truth, and what is reconstructed from the sample and from recorded logs; where anybody is to judge it."""
+    if not PEERS.is_dir() and "LOG2SIM_ESMINI" not in os.environ:
+        pytest.skip("no software of others is there: `bash tools/peers.sh` sets it up")
     if request.param == "truth":
         return Scenario.load(SAMPLE / "truth.json")
     if request.param == "sample":
@@ -54,7 +57,7 @@ def folders(world: Scenario, tmp_path_factory: pytest.TempPathFactory) -> dict[s
 
 
 def tool(environment: str, name: str) -> Path:
-    path = Path(os.environ.get("LOG2SIM_PEERS", ROOT / ".peers")) / environment / "bin" / name
+    path = PEERS / environment / "bin" / name
     if not path.exists():
         pytest.skip(f"{name} is not there: `bash tools/peers.sh {environment}` makes it")
     return path

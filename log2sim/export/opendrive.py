@@ -19,6 +19,8 @@ from log2sim.types import MapFrame
 FILE_NAME = "road.xodr"
 # Positions to 10 nm and angles to 1e-12 rad: pieces that follow each other leave no gap that a checker sees.
 LENGTH_DIGITS, ANGLE_DIGITS, CUBIC_DIGITS = 8, 12, 12
+# A map whose nearest road is farther away is not one of the scenario's place.
+FAR_M = 1000.0
 
 
 def add_road_file(scenario: Scenario, folder: Path, map_path: Path | None) -> tuple[str, Placement]:
@@ -54,7 +56,26 @@ def _placement_on(root: Element, scenario: Scenario, map_path: Path) -> Placemen
             f"--map {map_path}: its offset turns the map (hdg={turned[:20]}), which is not supported; use one with hdg=0"
         )
     x, y, z = values
-    return on_map(scenario.map, (root.findtext("header/geoReference") or "").strip() or None, (x, y, z))
+    placement = on_map(scenario.map, (root.findtext("header/geoReference") or "").strip() or None, (x, y, z))
+    _require_near(root, scenario, placement, map_path)
+    return placement
+
+
+def _require_near(root: Element, scenario: Scenario, placement: Placement, map_path: Path) -> None:
+    """Raise when no agent comes near any road: then the map is of another place, or in other coordinates."""
+    pieces = list(root.iter("geometry"))
+    roads = np.array(
+        [[require_number(p.get(key), f"{map_path}: geometry {key}") for key in ("x", "y", "length")] for p in pieces]
+    )
+    firsts = [(a.waypoints.x_m[0], a.waypoints.y_m[0], 0.0, 0.0) for a in scenario.agents]
+    gaps = [
+        (np.hypot(*(roads[:, :2] - state[:2]).T) - roads[:, 2]).min() for state in placement.forward(np.array(firsts))
+    ]
+    if min(gaps) > FAR_M:
+        raise ConfigError(
+            f"--map {map_path}: its roads are {min(gaps) / 1000:.0f} km away from all agents; is it the map of this place, and do"
+            " its geoReference and offset, and the scenario's map, say where they lie?"
+        )
 
 
 def document(scenario: Scenario, placement: Placement) -> Element:
