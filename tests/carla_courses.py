@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.replay.carla_assets import BY_CATEGORY
+from log2sim.replay.carla.assets import BY_CATEGORY
 from log2sim.scenario import Agent, Scenario, Waypoints
 
 SIZES = {blueprint: size_m for offers in BY_CATEGORY.values() for blueprint, size_m in offers.items()}

@@ -24,10 +24,10 @@ from log2sim.errors import ConfigError
 from log2sim.export import Options, export
 from log2sim.geometry import wrap_angle
 from log2sim.replay import follower
-from log2sim.replay.carla_assets import BY_CATEGORY, nearest_assets
-from log2sim.replay.carla_player import Body, Course, Follower, main, size_table
-from log2sim.replay.parameters import parameters_for
-from log2sim.replay.vehicle import VehicleState
+from log2sim.replay.carla.assets import BY_CATEGORY, nearest_assets
+from log2sim.replay.carla.player import Body, Course, Follower, main, size_table
+from log2sim.replay.vehicles.parameters import parameters_for
+from log2sim.replay.vehicles.vehicle import VehicleState
 from log2sim.scenario import Agent, Scenario
 from log2sim.types import CATEGORIES
 

@@ -25,8 +25,8 @@ import carla
 import carla_server
 from carla_server import Client
 
-from log2sim.replay.carla import CarlaSimulator
-from log2sim.replay.carla import Server as CarlaServer
+from log2sim.replay.carla.simulator import CarlaSimulator
+from log2sim.replay.carla.simulator import Server as CarlaServer
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
 

@@ -21,7 +21,7 @@ from log2sim.replay import (
     replay,
     require_strict,
 )
-from log2sim.replay.comfort import LIMITS, _derivative, comfort
+from log2sim.replay.assess.comfort import LIMITS, _derivative, comfort
 
 T_S = np.arange(0, 121) * 0.05
 
@@ -191,7 +191,7 @@ def test_a_limit_nearly_named_is_guessed():
 
 
 def test_the_summary_of_a_driven_ego_is_about_the_ego():
-    from log2sim.replay.summary import summarize
+    from log2sim.replay.assess.summary import summarize
 
     driven = replay(hard_braking(), ego=lambda seen: Controls(-3.0, 0.0))
     assert "least time to collision of the ego" in summarize(driven)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from test_replay_contacts import SPACING_S, T_S, boxes_of
 
-from log2sim.replay.approach import HORIZON_S, approaches, time_to_touch
-from log2sim.replay.boxes import Boxes, rectangles_overlap
-from log2sim.replay.conflicts import conflicts, least
-from log2sim.replay.encroachment import CROSSING_RAD, encroachments
+from log2sim.replay.assess.approach import HORIZON_S, approaches, time_to_touch
+from log2sim.replay.assess.boxes import Boxes, rectangles_overlap
+from log2sim.replay.assess.conflicts import conflicts, least
+from log2sim.replay.assess.encroachment import CROSSING_RAD, encroachments
 
 SIZE = np.array([[4.0, 2.0, 1.5]])
 

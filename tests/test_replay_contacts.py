@@ -9,9 +9,9 @@ from scipy.optimize import brentq
 
 from log2sim.geometry import wrap_angle
 from log2sim.replay import replay
-from log2sim.replay.boxes import Boxes, rectangles_overlap
-from log2sim.replay.collisions import collisions, contacts
-from log2sim.replay.sweep import STEPS, Motion, first_touch
+from log2sim.replay.assess.boxes import Boxes, rectangles_overlap
+from log2sim.replay.assess.collisions import collisions, contacts
+from log2sim.replay.assess.sweep import STEPS, Motion, first_touch
 
 SPACING_S = 0.05
 T_S = np.arange(0, 81) * SPACING_S

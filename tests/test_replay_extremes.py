@@ -13,8 +13,8 @@ from log2sim.geometry import wrap_angle
 from log2sim.replay import replay
 from log2sim.replay.drivable import LOCK_SHARE
 from log2sim.replay.follower import Memory, follow_vehicles
-from log2sim.replay.parameters import parameters_for
-from log2sim.replay.vehicle import VehicleState, step_bicycle
+from log2sim.replay.vehicles.parameters import parameters_for
+from log2sim.replay.vehicles.vehicle import VehicleState, step_bicycle
 from log2sim.scenario import Waypoints
 
 STEPS_S = [0.001, 0.01, 0.1, 1.0]

@@ -11,8 +11,8 @@ from replay_maneuvers import MANEUVERS, OFFSET_M, agent_from, driven, ramp, scen
 
 from log2sim.replay import replay
 from log2sim.replay.follower import GAINS, Memory, follow_points, follow_vehicles
-from log2sim.replay.parameters import parameters_for
-from log2sim.replay.vehicle import PointState, VehicleState, step_bicycle, step_point
+from log2sim.replay.vehicles.parameters import parameters_for
+from log2sim.replay.vehicles.vehicle import PointState, VehicleState, step_bicycle, step_point
 
 CAR = parameters_for([agent_from([0.0], [0.0], [0.0], [0.0], [0.0])])
 

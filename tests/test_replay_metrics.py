@@ -8,9 +8,9 @@ from replay_maneuvers import agent_from, scenario_of
 
 from log2sim.errors import CheckFailed
 from log2sim.replay import check_strict, replay, require_strict
-from log2sim.replay.boxes import Boxes, rectangles_overlap
-from log2sim.replay.collisions import LOG_MARGIN_M, LOG_WINDOW_S, collisions, contacts
-from log2sim.replay.metrics import tracking_errors
+from log2sim.replay.assess.boxes import Boxes, rectangles_overlap
+from log2sim.replay.assess.collisions import LOG_MARGIN_M, LOG_WINDOW_S, collisions, contacts
+from log2sim.replay.assess.metrics import tracking_errors
 from log2sim.replay.path import path_of
 
 T_S = np.arange(0, 41) * 0.1

@@ -10,10 +10,10 @@ from replay_maneuvers import agent_from, driven, lane_change, ramp, scenario_of
 
 from log2sim.errors import ConfigError
 from log2sim.replay import Controls, Replay, replay
-from log2sim.replay.models import SLIP_TOLERANCE_RAD
-from log2sim.replay.parameters import PUBLISHED, parameters_for
-from log2sim.replay.summary import summarize
-from log2sim.replay.vehicle import GRAVITY_MPS2
+from log2sim.replay.assess.summary import summarize
+from log2sim.replay.vehicles.models import SLIP_TOLERANCE_RAD
+from log2sim.replay.vehicles.parameters import PUBLISHED, parameters_for
+from log2sim.replay.vehicles.vehicle import GRAVITY_MPS2
 
 SLIPPING = pytest.mark.parametrize("model", ["dynamic", "single-track"])
 

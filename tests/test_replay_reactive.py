@@ -13,11 +13,11 @@ from replay_scenes import LENGTH_M, Speed, departure, gap, line, parked, walker
 from log2sim.errors import ConfigError
 from log2sim.replay import Controls, load_policy, open_world
 from log2sim.replay import replay as run
-from log2sim.replay.corridor import _nearest_edge
-from log2sim.replay.driver import demand, drivers_for, respond
 from log2sim.replay.path import path_of
+from log2sim.replay.reactive.corridor import _nearest_edge
+from log2sim.replay.reactive.driver import demand, drivers_for, respond
+from log2sim.replay.reactive.ways import Ways, times_at
 from log2sim.replay.rollout import roll
-from log2sim.replay.ways import Ways, times_at
 from log2sim.scenario import Scenario
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"

@@ -106,7 +106,7 @@ def replay(
     from log2sim.files import check_targets
     from log2sim.replay import check_limits, host_named, load_policy, parse_limits, require_strict
     from log2sim.replay import replay as run
-    from log2sim.replay.summary import summarize
+    from log2sim.replay.assess.summary import summarize
     from log2sim.scenario import Scenario
 
     check_targets(out, overwrite=overwrite)

@@ -1,6 +1,6 @@
 """A scenario for CARLA: a script that replays it through CARLA's Python client, and its data.
 
-The script is `log2sim.replay.carla_player` as it stands there, so what is tested is what is written.
+The script is `log2sim.replay.carla.player` as it stands there, so what is tested is what is written.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from log2sim.errors import ConfigError
 from log2sim.export import Options
 from log2sim.export.opendrive import add_road_file
 from log2sim.export.placement import Placement
-from log2sim.replay import carla_player
-from log2sim.replay.carla_data import carla_agents
+from log2sim.replay.carla import player
+from log2sim.replay.carla.data import carla_agents
 from log2sim.scenario import Agent, Scenario
 
 MODES = ("exact", "pid")
@@ -36,7 +36,7 @@ class Carla:
         x, y, z = placement.origin_m
         data = {
             "format": "log2sim-carla",
-            "version": carla_player.VERSION,
+            "version": player.VERSION,
             "scenario": scenario.name,
             "mode": mode,
             "road": road,
@@ -45,7 +45,7 @@ class Carla:
         }
         text = json.dumps(data, allow_nan=False, ensure_ascii=False)
         (folder / "scenario_carla.json").write_text(text + "\n", encoding="utf-8")
-        (folder / "replay_carla.py").write_bytes(Path(carla_player.__file__).read_bytes())
+        (folder / "replay_carla.py").write_bytes(Path(player.__file__).read_bytes())
 
 
 EXPORTER = Carla()

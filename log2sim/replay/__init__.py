@@ -6,7 +6,7 @@ import sys
 from types import ModuleType
 from typing import Any
 
-from log2sim.replay.limits import check_limits, check_strict, parse_limits, require_strict
+from log2sim.replay.assess.limits import check_limits, check_strict, parse_limits, require_strict
 from log2sim.replay.policy import Controls, EgoState, Observation, Others, PathAhead, Policy, Route
 from log2sim.replay.policy_name import load_policy
 from log2sim.replay.result import AgentReplay, Commands, Replay, to_scenario

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.replay.assess import FOLLOWING, assess
+from log2sim.replay.assess.metrics import Errors, errors_of
+from log2sim.replay.assess.run import FOLLOWING, assess
 from log2sim.replay.clock import Clock
-from log2sim.replay.metrics import Errors, errors_of
-from log2sim.replay.models import Choice
 from log2sim.replay.path import Path
+from log2sim.replay.reactive.ways import times_at
 from log2sim.replay.result import AgentReplay, Commands, Replay
 from log2sim.replay.rollout import Tracks
-from log2sim.replay.ways import times_at
+from log2sim.replay.vehicles.models import Choice
 from log2sim.replay.world import Group
 from log2sim.scenario import Agent, Scenario
 

@@ -14,13 +14,13 @@ from log2sim.registry import nearest
 from log2sim.replay.clock import Clock
 from log2sim.replay.drivable import LOCK_SHARE, Limits
 from log2sim.replay.follower import control_step
-from log2sim.replay.models import Choice, choose, slipping_reference, understeer
-from log2sim.replay.parameters import PEDAL_LAG_S, STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
 from log2sim.replay.path import Path, path_of
-from log2sim.replay.reactive import Reactive, ReactiveCrowd, ReactiveFleet, ReactiveTape
+from log2sim.replay.reactive.group import Reactive, ReactiveCrowd, ReactiveFleet, ReactiveTape
+from log2sim.replay.reactive.traffic import Traffic
 from log2sim.replay.reference import MAX_CURVATURE_1PM, Reference, point_reference, tape_reference, vehicle_reference
 from log2sim.replay.simulator import STEPS, simulator_named
-from log2sim.replay.traffic import Traffic
+from log2sim.replay.vehicles.models import Choice, choose, slipping_reference, understeer
+from log2sim.replay.vehicles.parameters import PEDAL_LAG_S, STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
 from log2sim.replay.world import Crowd, Driven, Fleet, Group, Tape
 from log2sim.scenario import Agent
 

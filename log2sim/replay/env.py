@@ -14,7 +14,7 @@ import numpy as np
 
 from log2sim.errors import MissingExtra
 from log2sim.geometry import Array, box_corners_bev, wrap_angle
-from log2sim.replay.boxes import rectangles_overlap
+from log2sim.replay.assess.boxes import rectangles_overlap
 from log2sim.replay.policy import Controls, EgoState, Observation
 from log2sim.replay.run import open_world
 from log2sim.scenario import Scenario

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from log2sim.geometry import Array, cos_sin
-from log2sim.replay.vehicle import (
+from log2sim.replay.vehicles.vehicle import (
     Columns,
     PointControls,
     PointState,

@@ -18,7 +18,7 @@ from log2sim.replay.policy import (
     PathAhead,
     Route,
 )
-from log2sim.replay.ways import SPACING_M, Ways
+from log2sim.replay.reactive.ways import SPACING_M, Ways
 from log2sim.replay.world import Driven, Group
 from log2sim.scenario import Agent
 

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from log2sim.replay.clock import Clock
 from log2sim.replay.follower import control_step
-from log2sim.replay.models import Choice
 from log2sim.replay.observe import Observer
 from log2sim.replay.policy import SIGHT_M, Controls, Observation, Policy, ask
+from log2sim.replay.reactive.traffic import Traffic
 from log2sim.replay.record import Record, Tracks, tracks_of
 from log2sim.replay.reference import GRID_S
 from log2sim.replay.simulator import Host
-from log2sim.replay.traffic import Traffic
+from log2sim.replay.vehicles.models import Choice
 from log2sim.replay.world import Driven, Group
 from log2sim.scenario import Agent
 

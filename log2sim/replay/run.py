@@ -11,12 +11,12 @@ from log2sim.registry import nearest
 from log2sim.replay.assemble import assemble
 from log2sim.replay.cast import EGO, cast_agents, groups_of, reactive_ids, traffic_of
 from log2sim.replay.clock import Clock
-from log2sim.replay.models import MODELS, Choice
-from log2sim.replay.parameters import WHEELED
 from log2sim.replay.policy import SIGHT_M, Policy, begin
 from log2sim.replay.result import Replay
 from log2sim.replay.rollout import Progress, Tracks, World, roll
 from log2sim.replay.simulator import Host
+from log2sim.replay.vehicles.models import MODELS, Choice
+from log2sim.replay.vehicles.parameters import WHEELED
 from log2sim.scenario import Agent, Scenario
 
 MODES = ("pid", "exact")
@@ -58,7 +58,7 @@ def replay(
     sight_m : float
         How far the ego's policy sees other agents, center to center.
     host : Host, optional
-        Simulator elsewhere that moves the agents instead, such as `log2sim.replay.carla.CarlaSimulator`; it has its own
+        Simulator elsewhere that moves the agents instead, such as `log2sim.replay.carla.simulator.CarlaSimulator`; it has its own
         vehicle models, so `model` is not used.
     progress : callable, optional
         Called with the steps done and their number, some times a run.

@@ -12,9 +12,9 @@ from typing import Any, Protocol
 
 from log2sim.errors import ConfigError
 from log2sim.registry import nearest
-from log2sim.replay.single_track import step_single_track
-from log2sim.replay.sliding import step_dynamic
-from log2sim.replay.vehicle import (
+from log2sim.replay.vehicles.single_track import step_single_track
+from log2sim.replay.vehicles.sliding import step_dynamic
+from log2sim.replay.vehicles.vehicle import (
     PointControls,
     PointState,
     VehicleControls,
@@ -109,7 +109,7 @@ def host_named(name: str, address: str, port: int, map: str | None) -> Host | No
         raise ConfigError(f"unknown simulator '{name}'{nearest(name, list(HOSTS))}; known: {', '.join(HOSTS)}")
     if name == "own":
         return None
-    from log2sim.replay.carla import CarlaSimulator, Server
+    from log2sim.replay.carla.simulator import CarlaSimulator, Server
 
     opendrive = Path(map) if map is not None and map.endswith(".xodr") else None
     if opendrive is not None and not opendrive.is_file():

@@ -22,11 +22,11 @@ from log2sim.replay.follower import (
     start_points,
     start_vehicles,
 )
-from log2sim.replay.models import moving_as
 from log2sim.replay.policy import Controls
 from log2sim.replay.reference import GRID_S, Reference
 from log2sim.replay.simulator import Simulator
-from log2sim.replay.vehicle import Columns, PointState, VehicleControls, VehicleParameters, VehicleState
+from log2sim.replay.vehicles.models import moving_as
+from log2sim.replay.vehicles.vehicle import Columns, PointState, VehicleControls, VehicleParameters, VehicleState
 from log2sim.scenario import Agent
 
 

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.replay.corridor import HORIZON_S
-from log2sim.replay.ways import Ways
+from log2sim.replay.reactive.corridor import HORIZON_S
+from log2sim.replay.reactive.ways import Ways
 
 ON_WAY_M, ON_WAY_COS = 1.5, 0.9
 """A driven agent this near to its logged way, and pointing along it, is expected to stay on it."""

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array, wrap_angle
-from log2sim.replay.boxes import Boxes, Rows, rectangles_overlap
-from log2sim.replay.vehicle import Columns
+from log2sim.replay.assess.boxes import Boxes, Rows, rectangles_overlap
+from log2sim.replay.vehicles.vehicle import Columns
 
 HORIZON_S = 10.0
 CROSSING_RAD = math.radians(30.0)

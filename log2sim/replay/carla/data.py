@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from log2sim.geometry import Array
-from log2sim.replay.carla_assets import nearest_assets
+from log2sim.replay.carla.assets import nearest_assets
 from log2sim.replay.cast import vehicle_limits
-from log2sim.replay.parameters import WHEELED, parameters_for, rear_axle_offset
 from log2sim.replay.path import Path, path_of
 from log2sim.replay.reference import vehicle_reference
+from log2sim.replay.vehicles.parameters import WHEELED, parameters_for, rear_axle_offset
 from log2sim.scenario import Agent
 
 SAMPLE_S = 0.05
@@ -24,7 +24,7 @@ LEAP_S = 1e-6  # a leap of the log becomes two samples so far apart
 
 
 def carla_agents(agents: Sequence[Agent]) -> list[dict[str, Any]]:
-    """Agents as `carla_player` reads them. Their positions should be near the origin: CARLA counts in float32."""
+    """Agents as `player` reads them. Their positions should be near the origin: CARLA counts in float32."""
     begin_s = min(float(a.waypoints.t_s[0]) for a in agents)
     end_s = max(float(a.waypoints.t_s[-1]) for a in agents)
     seen: Counter[str] = Counter()

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array, wrap_angle
-from log2sim.replay.boxes import Boxes, Rows
-from log2sim.replay.sweep import Motion, first_touch
-from log2sim.replay.vehicle import Columns
+from log2sim.replay.assess.boxes import Boxes, Rows
+from log2sim.replay.assess.sweep import Motion, first_touch
+from log2sim.replay.vehicles.vehicle import Columns
 
 CHUNK = 20
 """Rows that share one broad phase."""

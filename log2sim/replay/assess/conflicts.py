@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.replay.approach import approaches
-from log2sim.replay.boxes import Boxes
-from log2sim.replay.encroachment import encroachments
+from log2sim.replay.assess.approach import approaches
+from log2sim.replay.assess.boxes import Boxes
+from log2sim.replay.assess.encroachment import encroachments
 
 EGO = "ego"
 

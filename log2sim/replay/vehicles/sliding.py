@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array, cos_sin
-from log2sim.replay.single_track import AGAIN, GAMMA, Chassis, Pair, Slips, grips, inner_steps
-from log2sim.replay.vehicle import (
+from log2sim.replay.vehicles.single_track import AGAIN, GAMMA, Chassis, Pair, Slips, grips, inner_steps
+from log2sim.replay.vehicles.vehicle import (
     GRAVITY_MPS2,
     VehicleControls,
     VehicleParameters,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.replay.ways import Ways
+from log2sim.replay.reactive.ways import Ways
 
 HORIZON_S = np.arange(0.0, 3.01, 0.25)
 """Times (H,) ahead at which others are expected somewhere: a car that crosses at 20 m/s moves by its length in between."""

@@ -10,8 +10,8 @@ import numpy as np
 
 from log2sim.geometry import Array
 from log2sim.replay.reference import GRID_S, STANDSTILL_MPS, VEHICLE_COLUMNS, Reference
-from log2sim.replay.single_track import Chassis, grips
-from log2sim.replay.vehicle import GRAVITY_MPS2, VehicleParameters, VehicleState
+from log2sim.replay.vehicles.single_track import Chassis, grips
+from log2sim.replay.vehicles.vehicle import GRAVITY_MPS2, VehicleParameters, VehicleState
 from log2sim.scenario import Agent
 
 YAW, SPEED, ACCEL, CURVATURE = map(VEHICLE_COLUMNS.index, ("yaw", "speed", "accel_ahead", "curvature_ahead"))

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.replay.boxes import Boxes
+from log2sim.replay.assess.boxes import Boxes
+from log2sim.replay.assess.collisions import collisions
+from log2sim.replay.assess.comfort import comfort
+from log2sim.replay.assess.conflicts import conflicts, least
+from log2sim.replay.assess.metrics import Errors, agent_metrics, overall
 from log2sim.replay.clock import Clock
-from log2sim.replay.collisions import collisions
-from log2sim.replay.comfort import comfort
-from log2sim.replay.conflicts import conflicts, least
-from log2sim.replay.metrics import Errors, agent_metrics, overall
-from log2sim.replay.parameters import WHEELED
 from log2sim.replay.path import Path
 from log2sim.replay.result import AgentReplay
+from log2sim.replay.vehicles.parameters import WHEELED
 
 FOLLOWING = ("pid", "exact")
 """Drivers that are held against the log."""

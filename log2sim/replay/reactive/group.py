@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array
 from log2sim.replay.clock import Clock
+from log2sim.replay.reactive.traffic import Traffic
 from log2sim.replay.reference import GRID_S, POINT_COLUMNS, STANDSTILL_MPS, VEHICLE_COLUMNS
-from log2sim.replay.traffic import Traffic
 from log2sim.replay.world import Crowd, Fleet, Group, Tape
 
 SPEEDS = {"speed": "accel_ahead", "velocity_x": "accel_x", "velocity_y": "accel_y"}

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.replay.driver import drivers_for, respond
 from log2sim.replay.path import Path
-from log2sim.replay.situation import NOTICED, Moment, excess, expected
-from log2sim.replay.trust import deep_overlaps
-from log2sim.replay.ways import Pose, Ways
+from log2sim.replay.reactive.driver import drivers_for, respond
+from log2sim.replay.reactive.situation import NOTICED, Moment, excess, expected
+from log2sim.replay.reactive.trust import deep_overlaps
+from log2sim.replay.reactive.ways import Pose, Ways
 from log2sim.replay.world import Snapshot
 from log2sim.scenario import Agent
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from log2sim.replay.vehicle import VehicleParameters
+from log2sim.replay.vehicles.vehicle import VehicleParameters
 from log2sim.scenario import Agent
 
 WHEELED = ("car", "truck", "bus", "motorcycle", "cyclist", "bicycle")

@@ -8,7 +8,7 @@ from typing import Any
 
 from log2sim.errors import CheckFailed, ConfigError
 from log2sim.registry import nearest
-from log2sim.replay.comfort import LIMITS as COMFORT
+from log2sim.replay.assess.comfort import LIMITS as COMFORT
 
 CROSS_TRACK_LIMIT_M = 0.5
 """Limit of a strict replay: a car of 1.9 m in a lane of 3.5 m has 0.8 m on either side."""

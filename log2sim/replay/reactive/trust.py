@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.replay.boxes import Boxes
-from log2sim.replay.collisions import contacts
-from log2sim.replay.ways import TIME_STEP_S, Ways
+from log2sim.replay.assess.boxes import Boxes
+from log2sim.replay.assess.collisions import contacts
+from log2sim.replay.reactive.ways import TIME_STEP_S, Ways
 
 DEEP_M = 0.5  # more than boxes err by
 CHUNK = 200

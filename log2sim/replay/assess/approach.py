@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.replay.boxes import Boxes, Rows, axes_between
-from log2sim.replay.vehicle import Columns
+from log2sim.replay.assess.boxes import Boxes, Rows, axes_between
+from log2sim.replay.vehicles.vehicle import Columns
 
 HORIZON_S = 10.0
 """Nobody keeps course and speed for longer, so a later meeting says nothing."""

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from log2sim.replay.conflicts import least
+from log2sim.replay.assess.conflicts import least
 from log2sim.replay.result import Replay
 
 MOST_LISTED = 5

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.replay.corridor import HORIZON_S, Boxes, Corridor, Room, leaders
-from log2sim.replay.driver import Driver, demand
-from log2sim.replay.expect import Course, of_driven, on_schedule, on_way
-from log2sim.replay.ways import EXTENSION_M, Pose, Ways
+from log2sim.replay.reactive.corridor import HORIZON_S, Boxes, Corridor, Room, leaders
+from log2sim.replay.reactive.driver import Driver, demand
+from log2sim.replay.reactive.expect import Course, of_driven, on_schedule, on_way
+from log2sim.replay.reactive.ways import EXTENSION_M, Pose, Ways
 
 LOOK_M = 10.0  # at standstill
 

@@ -1,7 +1,7 @@
 """CARLA as the simulator of a replay: vehicles by its physics, steered by the same controllers as in the shim.
 
 States are read back from CARLA after every tick and controls sent as its vehicles and walkers take them. All conversions of
-frames, pedals and steering are those of `carla_player`, which also is the script that an export writes.
+frames, pedals and steering are those of `player`, which also is the script that an export writes.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ import numpy as np
 
 from log2sim.errors import ConfigError, MissingExtra
 from log2sim.geometry import Array
-from log2sim.replay import carla_player as player
-from log2sim.replay.carla_data import carla_agents
+from log2sim.replay.carla import player
+from log2sim.replay.carla.data import carla_agents
 from log2sim.replay.clock import Clock
-from log2sim.replay.vehicle import (
+from log2sim.replay.vehicles.vehicle import (
     PointControls,
     PointState,
     VehicleControls,

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from log2sim.geometry import Array
-from log2sim.replay.parameters import WHEELED
-from log2sim.replay.vehicle import Columns
+from log2sim.replay.vehicles.parameters import WHEELED
+from log2sim.replay.vehicles.vehicle import Columns
 from log2sim.scenario import Agent
 
 EXPONENT = 4.0

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array, cos_sin
-from log2sim.replay.vehicle import (
+from log2sim.replay.vehicles.vehicle import (
     GRAVITY_MPS2,
     VehicleControls,
     VehicleParameters,

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from log2sim.geometry import Array
-from log2sim.replay.boxes import axes_between
-from log2sim.replay.vehicle import Columns
+from log2sim.replay.assess.boxes import axes_between
+from log2sim.replay.vehicles.vehicle import Columns
 
 STEPS = 64
 """An interval is crossed in at most so many steps; a touch that lasts shorter than one may pass unseen, 0.8 ms of 50 ms."""

@@ -1,0 +1,1 @@
+"""What moves agents: vehicle models, their parameters, and which of them a maneuver needs."""
