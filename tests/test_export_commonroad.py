@@ -88,6 +88,20 @@ def test_numbers_have_no_exponent(tmp_path: Path) -> None:
     assert {"1000000000", "0.00000001"} <= set(values)
 
 
+def test_lanes_keep_their_height(tmp_path: Path) -> None:
+    """Flat maps out of sloping recordings: CommonRoad/commonroad-scenario-designer#34."""
+    ego = straight("ego", speed=10.0, t_s=np.linspace(0.0, 3.0, 31))
+    w = ego.waypoints
+    uphill = replace(ego, waypoints=replace(w, z_m=5.0 + 0.1 * w.x_m + ego.size_m[2] / 2))
+    root, _ = written(world(uphill), tmp_path)
+    points = [
+        (float(p.findtext("x") or "nan"), float(p.findtext("z") or "nan"))
+        for p in root.iterfind("lanelet/leftBound/point")
+    ]
+    x, z = np.array([(x, z) for x, z in points if 1.0 < x < 29.0]).T
+    np.testing.assert_allclose(z, 5.0 + 0.1 * x, atol=0.05)
+
+
 @pytest.mark.parametrize(
     ("agent", "complaint"),
     [(straight("car-1"), "no agent 'ego'"), (straight("ego", t_s=np.array([0.0, 0.05])), "agent 'ego': lives 0.05 s")],

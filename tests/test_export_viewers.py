@@ -306,6 +306,23 @@ def test_rerun_has_every_box_at_every_step(recorded: tuple[Callable[..., str], P
 
 
 @pytest.mark.peers
+def test_rerun_projects_as_the_camera_does(recorded: tuple[Callable[..., str], Path, Path]) -> None:
+    """Pose and intrinsics, which Rerun stores column by column, take a point of the map to its pixel."""
+    python, file, _ = recorded
+    rows: Rows = json.loads(python(ROOT / "tests" / "peers" / "rerun_read.py", file, "/cameras/front_left"))
+    log = open_log(SAMPLE)
+    t_ns, pose = next((t, v) for _, t, v in rows if t is not None and "Transform3D:mat3x3" in v)
+    (lens,) = (v for _, _, v in rows if "Pinhole:image_from_camera" in v)
+    rotation = np.reshape(pose["Transform3D:mat3x3"][0], (3, 3)).T
+    K = np.reshape(lens["Pinhole:image_from_camera"][0], (3, 3)).T
+    map_T_cam = log.map_T_sensor("front_left", t_ns)[0][0]
+    np.testing.assert_allclose(rotation, map_T_cam[:3, :3], atol=1e-6)
+    np.testing.assert_allclose(pose["Transform3D:translation"][0], map_T_cam[:3, 3], atol=1e-5)
+    np.testing.assert_allclose(K, log.cameras["front_left"].K, rtol=1e-6)
+    assert lens["Pinhole:resolution"][0] == [896.0, 520.0]
+
+
+@pytest.mark.peers
 def test_rerun_has_pictures_with_lines_and_points(recorded: tuple[Callable[..., str], Path, Path]) -> None:
     python, file, _ = recorded
     log = open_log(SAMPLE)

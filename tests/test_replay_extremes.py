@@ -20,8 +20,8 @@ from log2sim.scenario import Waypoints
 STEPS_S = [0.001, 0.01, 0.1, 1.0]
 LONG_STEPS_S = [0.01, 0.1, 0.25, 1.0]  # for lives too long for steps of 1 ms in a quick test
 CAR = parameters_for([agent_from([0.0], [0.0], [0.0], [0.0], [0.0])])
-# Largest errors across and along in m. Tires slip when a bend begins, and what is not foreseen of it is made up for.
-LIMITS_M = {"kinematic": (0.1, 0.05), "dynamic": (0.35, 0.3)}
+# Largest errors across and along in m.
+LIMITS_M = {"kinematic": (0.1, 0.05), "dynamic": (0.1, 0.1)}
 LOCK_1PM = float(np.tan(CAR.max_steer_rad[0]) / CAR.wheelbase_m[0])
 
 

@@ -37,7 +37,7 @@ def test_rows_are_those_of_the_replay(tmp_path: Path, capsys: pytest.CaptureFixt
     assert speed["agent_steps_per_s"] == pytest.approx(2 / (speed["step_us"] * 1e-6))
     assert speed["times_real_time"] == pytest.approx(0.01 / (speed["step_us"] * 1e-6))
     printed = capsys.readouterr().out
-    assert "| maneuver | 100 | 1 |" in printed
+    assert "| scene.json | 100 | 1 |" in printed
     assert "none" in printed
 
 

@@ -45,7 +45,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--models", nargs="*", default=MODELS, help="vehicle models whose speed is measured")
     parser.add_argument("--out", type=Path, help="also write the rows here")
     options = parser.parse_args(arguments)
-    tracking = [row for path in options.scenarios or [SAMPLE] for row in tracking_rows(Scenario.load(path), options.dt)]
+    tracking = [row for path in options.scenarios or [SAMPLE] for row in tracking_rows(path, options.dt)]
     print(tracking_table(tracking))
     speed = [speed_row(count, model) for model in options.models for count in options.agents]
     print(f"\n{speed_table(speed)}")
@@ -54,9 +54,9 @@ def main(arguments: list[str] | None = None) -> int:
     return int(any(row[key] > limit for row in tracking for key, limit in LIMITS.items()))
 
 
-def tracking_rows(scenario: Scenario, steps_s: list[float]) -> list[dict[str, Any]]:
+def tracking_rows(path: Path, steps_s: list[float]) -> list[dict[str, Any]]:
     """Errors of a scenario at control steps: of all followers, of the worst one, and which agents are beyond a limit."""
-    rows = []
+    scenario, rows = Scenario.load(path), []
     for dt_s in steps_s:
         done = replay(scenario, dt_s=dt_s)
         followers = [a.id for a in done.agents if a.driver == "pid"]
@@ -64,7 +64,7 @@ def tracking_rows(scenario: Scenario, steps_s: list[float]) -> list[dict[str, An
         worst = {key: max(by_agent, key=lambda k, key=key: by_agent[k][key], default=None) for key in LIMITS}
         rows.append(
             {
-                "scenario": scenario.name,
+                "scenario": path.name,
                 "dt_s": dt_s,
                 "followers": len(followers),
                 **{key: done.metrics[key] for key in LIMITS},
@@ -111,7 +111,9 @@ def speed_row(count: int, model: str = "auto", duration_s: float = DRIVE_S) -> d
     )
     end = time.process_time()
     # The first stretch holds the references and the agents' arrivals; the others hold look-ups, control, model and storing.
-    step_s = statistics.median((t1 - t0) / (n1 - n0) for (n0, t0), (n1, t1) in pairwise(told))
+    stretches = [(n1 - n0, t1 - t0) for (n0, t0), (n1, t1) in pairwise(told)]
+    longest = max(count for count, _ in stretches)
+    step_s = statistics.median(seconds / count for count, seconds in stretches if count == longest)
     return {
         "agents": count,
         "model": model,

@@ -10,12 +10,12 @@ import numpy as np
 
 from log2sim.errors import MissingExtra
 from log2sim.export import Options
-from log2sim.export.sampling import Motion, clock, file_name, on_clock
+from log2sim.export.playback import steps_of
+from log2sim.export.sampling import Motion, file_name
 from log2sim.geometry import NS_PER_S
 from log2sim.scenario import Agent, Scenario
 from log2sim.types import MapFrame
 
-STEP_S = 0.1  # the least rate that users of such traces take (omega-prime's specification)
 SOURCE = "io.log2sim.scenario"
 AXLE_OF_HEIGHT = 0.2  # height of the wheel hubs over the ground as a share of a vehicle's, since nobody measured it
 
@@ -40,13 +40,11 @@ class Osi:
             import betterosi
         except ImportError:
             raise MissingExtra("export to OSI", "osi") from None
-        ends = [(a.waypoints.t_s[0], a.waypoints.t_s[-1]) for a in scenario.agents]
-        t_s = clock(min(first for first, _ in ends), max(last for _, last in ends), STEP_S)
-        moves = [on_clock(agent, t_s) for agent in scenario.agents]
+        steps = steps_of(scenario)
         head = _head(betterosi, scenario)
-        with betterosi.Writer(folder / _trace_name(betterosi, scenario, len(t_s))) as writer:
-            for k, stamp_ns in enumerate((scenario.t0_ns + np.round(t_s * NS_PER_S).astype(np.int64)).tolist()):
-                alive = [(n, a, m) for n, (a, m) in enumerate(zip(scenario.agents, moves), start=1) if m.valid[k]]
+        with betterosi.Writer(folder / _trace_name(betterosi, scenario, len(steps.t_ns))) as writer:
+            for k, stamp_ns in enumerate(steps.t_ns.tolist()):
+                alive = [(n, a, m) for n, (a, m) in enumerate(steps.moves, start=1) if m.valid[k]]
                 truth = betterosi.GroundTruth(
                     **head,
                     timestamp=betterosi.Timestamp(seconds=stamp_ns // NS_PER_S, nanos=stamp_ns % NS_PER_S),

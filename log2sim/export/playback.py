@@ -15,7 +15,7 @@ from log2sim.geometry import NS_PER_S, Array, apply, box_corners, inverse
 from log2sim.scenario import Agent, Scenario
 from log2sim.types import Camera, Log, Sweep
 
-STEP_S = 0.1
+STEP_S = 0.1  # the least rate that readers of OSI traces take, and smooth enough to watch
 PICTURE_PX = 960  # wider pictures are made smaller, so that a minute of several cameras stays a file to hand around
 JPEG_QUALITY = 80
 MOST_POINTS = 10_000

@@ -131,11 +131,10 @@ def _pinhole(record: Picture) -> Part:
 
     camera = record.camera
     size = [[camera.width_px, camera.height_px]]
-    # Rerun stores matrices column by column.
     return (
         ("cameras", camera.name),
         None,
-        rerun.Pinhole.columns(image_from_camera=[camera.K.T.ravel()], resolution=size),
+        rerun.Pinhole.columns(image_from_camera=[camera.K], resolution=size),
     )
 
 
@@ -145,7 +144,7 @@ def _picture(record: Picture, t_ns: NDArray[np.int64], origin: Array) -> Iterato
     place = ("cameras", record.camera.name)
     if record.map_T_cam is not None:
         rotation, translation = record.map_T_cam[:3, :3], record.map_T_cam[:3, 3] - origin
-        yield place, t_ns, rerun.Transform3D.columns(translation=[translation], mat3x3=[rotation.T.ravel()])
+        yield place, t_ns, rerun.Transform3D.columns(translation=[translation], mat3x3=[rotation])
     yield place, t_ns, rerun.EncodedImage.columns(blob=[record.jpeg], media_type=["image/jpeg"])
     lines = [line for _, outline in record.outlines for line in outline]
     if not lines:

@@ -74,19 +74,9 @@ def describe(scenario: Scenario) -> Value:
         for k, lane in enumerate(lanes(scenario))
     }
     metadata = {
-        "id": scenario.name,
-        "scenario_id": scenario.name,
-        "dataset": DATASET,
-        "history_metadata": dict(scenario.provenance),
-        "metadrive_processed": False,
-        "coordinate": "metadrive",
+        **_metadata(scenario, t_s),
         "sdc_id": ego.id,
-        "ts": t_s - t_s[0],
-        "sample_rate": STEP_S,
-        "t0_ns": scenario.t0_ns + round(t_s[0] * NS_PER_S),
-        "timestamps_ns": scenario.t0_ns + np.round(t_s * NS_PER_S).astype(np.int64),
         "position_offset_m": origin.tolist(),
-        "map": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(scenario.map).items()},
         "left_out": left_out,
         "object_summary": {k: _object_summary(k, track) for k, track in tracks.items()},
     }
@@ -99,6 +89,23 @@ def describe(scenario: Scenario) -> Value:
         "dynamic_map_states": {},
         "map_features": features,
         "metadata": metadata,
+    }
+
+
+def _metadata(scenario: Scenario, t_s: Array) -> Value:
+    """Where and when a description of steps at times (T,) was recorded, and how it was made."""
+    return {
+        "id": scenario.name,
+        "scenario_id": scenario.name,
+        "dataset": DATASET,
+        "history_metadata": dict(scenario.provenance),
+        "metadrive_processed": False,
+        "coordinate": "metadrive",
+        "ts": t_s - t_s[0],
+        "sample_rate": STEP_S,
+        "t0_ns": scenario.t0_ns + round(t_s[0] * NS_PER_S),
+        "timestamps_ns": scenario.t0_ns + np.round(t_s * NS_PER_S).astype(np.int64),
+        "map": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(scenario.map).items()},
     }
 
 

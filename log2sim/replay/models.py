@@ -17,7 +17,6 @@ from log2sim.scenario import Agent
 YAW, SPEED, ACCEL, CURVATURE = map(VEHICLE_COLUMNS.index, ("yaw", "speed", "accel_ahead", "curvature_ahead"))
 
 MODELS = ("auto", "kinematic", "dynamic", "single-track")
-SLIPPING = ("dynamic", "single-track")
 TWO_WHEELERS = ("motorcycle", "cyclist", "bicycle")
 
 SLIP_TOLERANCE_RAD = 0.02
@@ -49,20 +48,13 @@ def choose(agent: Agent, reference: Reference, parameters: VehicleParameters, wa
         return Choice("kinematic", "leans into its curves, which slip does not describe")
     if free:
         return Choice("dynamic", "what a policy drives is not known beforehand")
-    slip = np.abs(predicted_slips(reference.columns, parameters)[1])
+    speed, curvature = reference.columns[:, SPEED], reference.columns[:, CURVATURE]
+    aside_mps2 = speed**2 * curvature
+    # In steady cornering both axles use the same share of their friction, whatever the place of the center of gravity.
+    slip = np.abs(_slip(aside_mps2 / (GRAVITY_MPS2 * parameters.friction), parameters.rear_stiffness_1prad))
     worst = int(np.argmax(slip))
-    found = f"rear tires slip up to {slip[worst]:.3f} rad, {SLIP_TOLERANCE_RAD:g} are tolerated"
-    return Choice("dynamic" if slip[worst] > SLIP_TOLERANCE_RAD else "kinematic", found)
-
-
-def predicted_slips(columns: Array, p: VehicleParameters) -> tuple[Array, Array]:
-    """Slip angles (K,), (K,) of the front and rear tires that a reference's rows (K, C) need in steady cornering.
-
-    Both axles use the same share of their friction then, whatever the place of the center of gravity.
-    """
-    speed, curvature = columns[:, SPEED], columns[:, CURVATURE]
-    use = speed**2 * curvature / (GRAVITY_MPS2 * p.friction)
-    return _slip(use, p.front_stiffness_1prad), _slip(use, p.rear_stiffness_1prad)
+    found = f"{slip[worst]:.3f} rad at {abs(aside_mps2[worst]):.1f} m/s2 sideways, {SLIP_TOLERANCE_RAD:g} are tolerated"
+    return Choice("dynamic" if slip[worst] > SLIP_TOLERANCE_RAD else "kinematic", f"rear tires slip up to {found}")
 
 
 def understeer(p: VehicleParameters) -> Array:
@@ -81,7 +73,7 @@ def slipping_reference(reference: Reference, p: VehicleParameters, model: str, a
     steering angle; as a curvature of which the follower makes this angle again.
     """
     if len(reference.columns) < 3:
-        return reference
+        return replace(reference, slips=True)
     later_nose, bend, drag = _inverse(reference.columns, p, saturates=model != "single-track")
     t_s = np.arange(reference.first_row, reference.first_row + len(bend), dtype=np.float64) * GRID_S
     nose = np.interp(t_s, t_s + ahead_s, later_nose)

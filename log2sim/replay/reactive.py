@@ -72,15 +72,13 @@ class Reactive(Group):
             return row
         row = row.copy()
         names = {name: k for k, name in enumerate(self.columns)}
-        for speed, accel in SPEEDS.items():
-            if speed in names and accel in names:
-                row[names[accel]] = row[names[accel]] * rate**2 + row[names[speed]] * slope
-        for speed in SPEEDS:
-            if speed in names:
-                row[names[speed]] *= rate
+        speeds = [names[speed] for speed in SPEEDS if speed in names]
+        for speed, change in SPEEDS.items():
+            if change in names:
+                row[names[change]] = row[names[change]] * rate**2 + row[names[speed]] * slope
+        row[speeds] *= rate
         if "stands" in names:
-            pace = np.max([np.abs(row[names[s]]) for s in SPEEDS if s in names], axis=0)
-            row[names["stands"]] = np.maximum(row[names["stands"]], pace < STANDSTILL_MPS)
+            row[names["stands"]] = np.maximum(row[names["stands"]], np.hypot.reduce(row[speeds]) < STANDSTILL_MPS)
         return row
 
 

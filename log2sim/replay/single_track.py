@@ -132,11 +132,8 @@ class Pair:
     @classmethod
     def of(cls, a: Array, b: Array, c: Array, d: Array, unit: Slips | None = None) -> Self:
         factor = 1 / (a * d - b * c)
-        return (
-            cls(a, b, c, d, factor, factor)
-            if unit is None
-            else cls(a, b, c, d, unit.rear * factor, unit.front * factor)
-        )
+        rear, front = (factor, factor) if unit is None else (unit.rear * factor, unit.front * factor)
+        return cls(a, b, c, d, rear, front)
 
     def solve(self, rear: Array, front: Array) -> Slips:
         """The slips for right-hand sides (A,), (A,)."""
@@ -146,7 +143,13 @@ class Pair:
 
 
 def linear_slips(slips: Slips, motion: Motion, p: VehicleParameters, c: Chassis, h: float) -> Slips:
-    """Slip angles (rad, positive to the left) after a step of the published model."""
+    """Slip angles (rad, positive to the left) after a step of the published model.
+
+    Notes
+    -----
+    Linear in the slips while speed and acceleration are the mean ones of the step, hence solved without iteration:
+    |v| slips' = -(chassis) (stiffness) slips + (turn) (yaw rate / v) - |v| (0, steer').
+    """
     m, wheelbase = motion, p.wheelbase_m
     speed, accel = (m.speed0_mps + m.speed1_mps) / 2, (m.speed1_mps - m.speed0_mps) / h
     pace, gear = np.abs(speed), np.copysign(1.0, speed)

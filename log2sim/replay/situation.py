@@ -57,6 +57,7 @@ class Moment:
         near = np.abs(p.z_m[i] - p.z_m[j]) < (self.size_m[i, 2] + self.size_m[j, 2]) / 2
         near &= (p.x_m[i] - p.x_m[j]) ** 2 + (p.y_m[i] - p.y_m[j]) ** 2 < reach**2
         i, j = i[near], j[near]
+        # In a circle there are many whom four boxes about the way ahead leave out: above all those in other lanes.
         x, y = (np.ascontiguousarray(c[:, ::4].T) for c in self.course[:2])
         swept = self._hull(i, x[:, j], y[:, j])
         room = radius[j] + self.size_m[i, 1] / 2 + LOGGED.side_m + BEND_M

@@ -97,12 +97,15 @@ def slide(body: Body, drive: Drive, p: VehicleParameters, c: Chassis, h: float) 
     d, speed, rear = drive, body.speed_mps, body.lateral_mps
     front = rear + p.wheelbase_m * body.yaw_rate_radps - speed * d.bend0
     start = Slips(rear, front)
+
+    # To the middle of the step.
     speed1, _, accel = _push(speed, _gain(start, body.yaw_rate_radps, 0.0, d, p, h), d, h)
     mean_speed = (speed + speed1) / 2
     begin, end, swing = _pulls(speed, speed1, d, p, h)
     system = _relaxation(mean_speed, accel, start, d, p, c, h / 2)
     middle = system.solve(rear + (begin + end) / 4, front + (begin + end) / 4 + swing / 2)
 
+    # All of it. The speed is needed for the slips and follows from them, so it is predicted and then corrected.
     rate = (mean_speed * d.mean_bend + middle.front - middle.rear) / p.wheelbase_m
     speed1, _, accel = _push(speed, _gain(middle, rate, 2 * (middle.rear - rear), d, p, h), d, h)
     begin, end, swing = _pulls(speed, speed1, d, p, h)
@@ -116,6 +119,7 @@ def slide(body: Body, drive: Drive, p: VehicleParameters, c: Chassis, h: float) 
     rate1 = (speed1 * d.bend1 + last.front - last.rear) / p.wheelbase_m
     speed1, way, _ = _push(speed, _gain(middle, rate, last.rear - rear, d, p, h), d, h)
 
+    # Along an arc.
     turn = (way * d.mean_bend + h * (front + last.front - rear - last.rear) / 2) / p.wheelbase_m
     shrink = sinc(turn / 2)
     ahead, aside = way * shrink, h * (rear + last.rear) / 2 * shrink

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,7 +13,7 @@ MOST_LISTED = 5
 
 
 def summarize(replay: Replay) -> str:
-    """Errors in one line, what agents did to each other in a second one, then the first collisions, new ones first.
+    """Errors in one line, what agents did to each other, what moved them, then the first collisions, new ones first.
 
     Where a policy drives the ego, the times are those of the ego.
     """
@@ -26,11 +27,24 @@ def summarize(replay: Replay) -> str:
         f"{_counted(len(m['collisions']), 'collision')}, {m['new_collisions']} that the log does not have · "
         f"least time to collision{whose} {_least(near, 'min_ttc')} · post-encroachment time {_least(near, 'pet')}",
     ]
+    lines += _models(replay)
     events = sorted(m["collisions"], key=lambda e: (e["in_log"], e["t_s"]))
     lines += [f"  {_collision(e)}" for e in events[:MOST_LISTED]]
     if len(events) > MOST_LISTED:
         lines.append(f"  and {len(events) - MOST_LISTED} more")
     return "\n".join(lines)
+
+
+def _models(replay: Replay) -> list[str]:
+    """How many agents each model moves in one line, and why for the first of those that slip without being asked to."""
+    counts = Counter(a.model for a in replay.agents if a.model != "none")
+    if not counts:
+        return []
+    chosen = [a for a in replay.agents if a.model == "dynamic" and replay.model == "auto"]
+    found = [f"  {a.id} dynamic: {a.model_reason}" for a in chosen[:MOST_LISTED]]
+    if len(chosen) > MOST_LISTED:
+        found.append(f"  and {len(chosen) - MOST_LISTED} more")
+    return ["models: " + ", ".join(f"{count} {model}" for model, count in counts.most_common()), *found]
 
 
 def _collision(event: Mapping[str, Any]) -> str:
