@@ -188,6 +188,18 @@ def test_flat_ground_is_one_elevation(tmp_path: Path) -> None:
     assert [e.attrib["a"] for e in road.road.iterfind("elevationProfile/elevation")] == ["7"]
 
 
+def test_a_slope_is_one_elevation_and_goes_on_beyond_the_path(tmp_path: Path) -> None:
+    (road,) = network(tmp_path, scenario(agent(line(), ground_m=7.0 + 0.05 * np.linspace(0.0, 30.0, 31))))
+    (cubic,) = road.road.findall("elevationProfile/elevation")
+    assert [float(cubic.attrib[k]) for k in "abcd"] == pytest.approx([6.5, 0.05, 0.0, 0.0], abs=1e-9)
+
+
+def test_noise_of_heights_makes_no_bumps(tmp_path: Path) -> None:
+    z = np.random.default_rng(0).normal(0.0, 0.01, 121)
+    (road,) = network(tmp_path, scenario(agent(line(60.0, 121), ground_m=z)))
+    assert np.abs(np.gradient(road.line[:, 2], 0.05)).max() < 0.02
+
+
 def test_a_lane_is_wide_enough_for_who_drives_it(tmp_path: Path) -> None:
     for width_m, lane_m in ((1.9, 3.5), (3.2, 4.0)):
         (road,) = network(tmp_path, scenario(agent(line(), size_m=(8.0, width_m, 3.0))))

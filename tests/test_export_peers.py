@@ -110,7 +110,7 @@ def test_carla_s_lanes_have_the_ego_within_1_cm_of_their_middle(
     (tmp_path / "points.json").write_text(json.dumps(points.tolist()))
     found = json.loads(peer("carla")(ROOT / "tests/peers/carla_lanes.py", folders["1.2"] / "road.xodr", tmp_path / "points.json"))  # fmt: skip
     assert found["aside_m"] <= 0.01
-    assert found["above_m"] <= 0.03
+    assert found["above_m"] <= 0.05
     assert found["lanes"] == [[1, -1]]
 
 

@@ -16,6 +16,8 @@ TOLERANCE_M, SPLINE_M, ARCS_M = 0.01, 0.007, 0.002
 # Points of a path nearer than this are one; between those further apart than this the line from one to the next counts.
 LEAST_STEP_M, LARGEST_STEP_M = 0.01, 0.25
 SAMPLE_M = 0.2
+# Paths of more than some kilometers are looked at in longer steps, so that no path takes minutes.
+MOST_POINTS = 20_000
 # How far the points may lie from the spline on average, from the calmest curve to the one through all of them.
 SIGMAS_M = (*(SPLINE_M / 2 * 0.7**k for k in range(8)), 0.0)
 SWING = 1.2
@@ -141,10 +143,10 @@ def _spline(xy_m: Array) -> tuple[Array, Array]:
         return straight_on
     steps = np.hypot(*np.diff(xy_m, axis=0).T)
     travelled = np.concatenate([[0.0], np.cumsum(steps)])
-    parts = np.maximum(np.ceil(steps / LARGEST_STEP_M).astype(int), 1)
+    parts = np.maximum(np.ceil(steps / max(LARGEST_STEP_M, travelled[-1] / MOST_POINTS)).astype(int), 1)
     u = np.concatenate([a + np.arange(n) / n * d for a, n, d in zip(travelled, parts, steps)] + [travelled[-1:]])
     dense = np.column_stack([np.interp(u, travelled, xy_m[:, k]) for k in (0, 1)])
-    at = np.linspace(0.0, travelled[-1], max(int(np.ceil(travelled[-1] / SAMPLE_M)), 2) + 1)
+    at = np.linspace(0.0, travelled[-1], int(np.clip(np.ceil(travelled[-1] / SAMPLE_M), 2, MOST_POINTS)) + 1)
     for sigma_m in SIGMAS_M:
         # Asked for all its output it warns of nothing; what it has not solved the two tests below refuse.
         (tck, _), *_ = splprep(dense.T, u=u, k=min(3, len(u) - 1), s=len(u) * sigma_m**2, full_output=1, quiet=1)
