@@ -21,14 +21,14 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "labels": "log2sim.detect.labels:create",
     },
     "export": {
-        "openscenario": "log2sim.export.openscenario:EXPORTER",
+        "openscenario": "log2sim.export.openscenario.write:EXPORTER",
         "carla": "log2sim.export.carla:EXPORTER",
         "csv": "log2sim.export.csv_table:EXPORTER",
         "scenarionet": "log2sim.export.scenarionet:EXPORTER",
         "commonroad": "log2sim.export.commonroad:EXPORTER",
         "osi": "log2sim.export.osi:EXPORTER",
-        "mcap": "log2sim.export.mcap:EXPORTER",
-        "rerun": "log2sim.export.rerun:EXPORTER",
+        "mcap": "log2sim.export.viewers.mcap:EXPORTER",
+        "rerun": "log2sim.export.viewers.rerun:EXPORTER",
     },
 }
 

@@ -110,9 +110,9 @@ def test_a_name_that_no_file_can_hold_is_refused(scenario: Scenario, tmp_path: P
 def test_a_missing_package_names_its_extra(
     to: str, module: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    for loaded in [name for name in sys.modules if name.startswith("log2sim.export.foxglove")]:
+    for loaded in [name for name in sys.modules if name.startswith("log2sim.export.viewers.foxglove")]:
         monkeypatch.delitem(sys.modules, loaded)
-    monkeypatch.delattr("log2sim.export.foxglove", raising=False)
+    monkeypatch.delattr("log2sim.export.viewers.foxglove", raising=False)
     monkeypatch.setitem(sys.modules, module, None)
     ran = run("export", SAMPLE, "--to", to, "--out", tmp_path / "out")
     assert ran.code == 5

@@ -14,8 +14,8 @@ from export_readers import Sampled, distance, play, roads
 
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.export import Options, export
-from log2sim.export.reference_line import ReferenceLine, fit, straight
-from log2sim.export.road_checks import require_roads
+from log2sim.export.roads.checks import require_roads
+from log2sim.export.roads.reference_line import ReferenceLine, fit, straight
 from log2sim.geometry import Array
 from log2sim.scenario import Agent, Scenario
 from log2sim.types import MapFrame
@@ -258,7 +258,7 @@ def test_sumo_8445_local_plus_offset_are_coordinates_of_the_projection(tmp_path:
 
 
 def test_scenarionet_103_the_shift_is_in_the_files_and_undone_by_an_import(tmp_path: Path) -> None:
-    from log2sim.export.openscenario_read import load
+    from log2sim.export.openscenario.read import load
 
     world = scenario(agent(bend() + np.array([25_300.0, 7e6])))
     export(world, "openscenario", tmp_path)
@@ -311,7 +311,7 @@ def test_a_map_in_another_projection_has_the_agents_where_they_are_on_earth(tmp_
     """Against PROJ, point by point, and headings by a step of one meter on the ellipsoid's plane."""
     from pyproj import Transformer
 
-    from log2sim.export.openscenario_read import load
+    from log2sim.export.openscenario.read import load
 
     other = "+proj=tmerc +lat_0=49 +lon_0=8.4 +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m +geoidgrids=egm96_15.gtx +vunits=m +no_defs"
     world = scenario(agent(bend(), rear_axle_offset_m=0.0))

@@ -13,7 +13,8 @@ from export_paths import agent, bend, line, scenario
 from export_readers import Entity, play, roads, trigger_s
 
 from log2sim.errors import ConfigError, ScenarioError
-from log2sim.export import Options, export, openscenario
+from log2sim.export import Options, export
+from log2sim.export.openscenario import write as openscenario
 from log2sim.export.xml_text import escaped, unescaped, unique_names
 from log2sim.geometry import wrap_angle
 from log2sim.scenario import Scenario

@@ -17,7 +17,7 @@ from export_worlds import REAR_M, ROOT, circling, moved, peer, straight, world
 from log2sim import open_log
 from log2sim.errors import ConfigError, RecordError, ScenarioError
 from log2sim.export import Options, export
-from log2sim.export.playback import MOST_POINTS, PICTURE_PX, Cloud, Picture, shown_of
+from log2sim.export.viewers.playback import MOST_POINTS, PICTURE_PX, Cloud, Picture, shown_of
 from log2sim.geometry import NS_PER_S, apply, box_corners, inverse, points_in_box
 from log2sim.scenario import Scenario
 from log2sim.types import Camera, Log, Stream
@@ -188,7 +188,7 @@ def test_wide_pictures_are_made_smaller_with_their_calibration(scenario: Scenari
     ],
 )
 def test_lenses_have_foxgloves_names(model: str, given: tuple[float, ...], named: str, count: int) -> None:
-    foxglove = pytest.importorskip("log2sim.export.foxglove", exc_type=ImportError)
+    foxglove = pytest.importorskip("log2sim.export.viewers.foxglove", exc_type=ImportError)
     camera = Camera("c", 64, 48, np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]), "ego", np.eye(4), model, given)
     found = {topic: m for _, topic, m in foxglove.shown(Picture(0, camera, None, b"", ()), np.zeros(3))}
     calibration = found["/camera/c/calibration"]

@@ -12,7 +12,7 @@ from export_paths import UTM, agent, bend, line, scenario
 
 from log2sim.errors import ScenarioError
 from log2sim.export import Options, export, xml_text
-from log2sim.export.openscenario_read import load
+from log2sim.export.openscenario.read import load
 from log2sim.geometry import wrap_angle
 from log2sim.scenario import Scenario
 

@@ -46,7 +46,7 @@ def import_(
     quiet: Quiet = False,
 ) -> None:
     """Turn an OpenSCENARIO file back into a scenario."""
-    from log2sim.export.openscenario_read import load
+    from log2sim.export.openscenario.read import load
     from log2sim.files import check_targets
 
     check_targets(out, overwrite=overwrite)

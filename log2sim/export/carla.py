@@ -13,8 +13,8 @@ import numpy as np
 
 from log2sim.errors import ConfigError
 from log2sim.export import Options
-from log2sim.export.opendrive import add_road_file
 from log2sim.export.placement import Placement
+from log2sim.export.roads.opendrive import add_road_file
 from log2sim.replay.carla import player
 from log2sim.replay.carla.data import carla_agents
 from log2sim.scenario import Agent, Scenario

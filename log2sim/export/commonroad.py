@@ -16,7 +16,7 @@ import numpy as np
 
 from log2sim.errors import ScenarioError
 from log2sim.export import Options, xml_text
-from log2sim.export.lanes import Lane, lanes
+from log2sim.export.roads.lanes import Lane, lanes
 from log2sim.export.sampling import Motion, clock, motion, on_clock
 from log2sim.export.xml_text import element
 from log2sim.geometry import NS_PER_S, Array

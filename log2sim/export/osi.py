@@ -10,8 +10,8 @@ import numpy as np
 
 from log2sim.errors import MissingExtra
 from log2sim.export import Options
-from log2sim.export.playback import steps_of
 from log2sim.export.sampling import Motion, file_name
+from log2sim.export.viewers.playback import steps_of
 from log2sim.geometry import NS_PER_S
 from log2sim.scenario import Agent, Scenario
 from log2sim.types import MapFrame

@@ -16,8 +16,8 @@ import numpy as np
 
 from log2sim.errors import ScenarioError
 from log2sim.export import Options
-from log2sim.export.lanes import lanes
 from log2sim.export.placement import near_origin
+from log2sim.export.roads.lanes import lanes
 from log2sim.export.sampling import Motion, clock, file_name, on_clock
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.scenario import VERSION, Agent, Scenario

@@ -12,7 +12,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from log2sim.errors import ConfigError, LogError, ScenarioError
-from log2sim.export.openscenario_entities import KINDS, PREFIX
+from log2sim.export.openscenario.entities import KINDS, PREFIX
 from log2sim.export.placement import Placement
 from log2sim.export.xml_text import read, require_number, unescaped
 from log2sim.geometry import Array, wrap_angle

@@ -12,10 +12,10 @@ import numpy as np
 from log2sim.errors import ConfigError
 from log2sim.export import Options
 from log2sim.export.checks import require_start_as_in_log
-from log2sim.export.opendrive import add_road_file
-from log2sim.export.openscenario_entities import add_entity
-from log2sim.export.openscenario_story import Revision, add_storyboard, parts_of, starts
+from log2sim.export.openscenario.entities import add_entity
+from log2sim.export.openscenario.story import Revision, add_storyboard, parts_of, starts
 from log2sim.export.placement import Placement
+from log2sim.export.roads.opendrive import add_road_file
 from log2sim.export.xml_text import element, escaped, number, unique_names, write
 from log2sim.geometry import Array
 from log2sim.scenario import Scenario

@@ -10,8 +10,8 @@ import numpy as np
 
 from log2sim.errors import ConfigError
 from log2sim.export.placement import Placement, near_origin, on_map
-from log2sim.export.road_checks import require_roads
-from log2sim.export.roads import Road, roads_of
+from log2sim.export.roads.checks import require_roads
+from log2sim.export.roads.infer import Road, roads_of
 from log2sim.export.xml_text import element, escaped, number, read, require_number, write
 from log2sim.scenario import Scenario
 from log2sim.types import MapFrame

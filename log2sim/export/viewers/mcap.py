@@ -14,12 +14,12 @@ import numpy as np
 from log2sim.errors import MissingExtra, ScenarioError
 from log2sim.export import Options
 from log2sim.export.placement import near_origin
-from log2sim.export.playback import shown_of, steps_of
 from log2sim.export.sampling import file_name
+from log2sim.export.viewers.playback import shown_of, steps_of
 from log2sim.scenario import Scenario
 
 if TYPE_CHECKING:
-    from log2sim.export.foxglove import Message
+    from log2sim.export.viewers.foxglove import Message
 
 
 class Mcap:
@@ -38,7 +38,7 @@ class Mcap:
         try:
             from mcap_protobuf.writer import Writer
 
-            from log2sim.export import foxglove
+            from log2sim.export.viewers import foxglove
         except ImportError:
             raise MissingExtra("export to MCAP", "mcap") from None
         steps = steps_of(scenario)

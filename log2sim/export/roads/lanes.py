@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from log2sim.export.roads import Road, roads_of
+from log2sim.export.roads.infer import Road, roads_of
 from log2sim.geometry import Array
 from log2sim.scenario import Scenario
 

@@ -1,0 +1,1 @@
+"""OpenSCENARIO XML: written in three revisions, and read back."""

@@ -1,0 +1,1 @@
+"""Logs and results for viewers: Foxglove's messages and Rerun's recordings."""
