@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -59,10 +57,9 @@ def assemble(
             agents.append(replayed)
             stored.append(steps)
     paths = {k: path for k, (_, path, _) in home.items() if k in tracks}
-    document = json.dumps(scenario.to_dict(), sort_keys=True, ensure_ascii=False).encode()
     return Replay(
         scenario=scenario.name,
-        scenario_digest=hashlib.sha256(document).hexdigest(),
+        scenario_digest=scenario.digest,
         mode=mode,
         model=model,
         dt_s=clock.dt_s,
