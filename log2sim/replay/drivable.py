@@ -219,8 +219,8 @@ def _cost(terms: list[Term]) -> float:
 
 
 def _normal_equations(terms: list[Term], count: int) -> tuple[Array, Array]:
-    """Second derivatives of the cost as a band (12, K, 6), the diagonal and what is below it, and the gradient (K, 6)."""
-    band, gradient = np.zeros((2 * STATES, count, STATES)), np.zeros((count, STATES))
+    """Second derivatives of the cost as a band (K, 6, 12), the diagonal and what is below it, and the gradient (K, 6)."""
+    band, gradient = np.zeros((count, STATES, 2 * STATES)), np.zeros((count, STATES))
     for residual, slopes, robust in terms:
         weight = 1 / np.sqrt(1 + residual**2) if robust else 1.0
         for i, slope in slopes.items():
@@ -228,7 +228,7 @@ def _normal_equations(terms: list[Term], count: int) -> tuple[Array, Array]:
             _at(gradient, i, residual)[:] += weighted * residual
             for j, other in slopes.items():
                 if j <= i:
-                    _at(band[i - j], j, residual)[:] += weighted * other
+                    _at(band[:, :, i - j], j, residual)[:] += weighted * other
     return band, gradient
 
 
@@ -249,6 +249,6 @@ def _solve(band: Array, gradient: Array, damping: float) -> NDArray[np.float64]:
     from scipy.linalg import solveh_banded
 
     damped = band.copy()
-    damped[0] += damping * DAMPED
-    flat = damped.reshape(len(band), -1)
+    damped[:, :, 0] += damping * DAMPED
+    flat = damped.reshape(gradient.size, -1).T
     return solveh_banded(flat, gradient.ravel(), lower=True, overwrite_ab=True).reshape(gradient.shape)
