@@ -143,7 +143,7 @@ def _obstacle(agent: Agent, number: int, t_s: Array) -> Element | None:
         _shape(obstacle, agent)
         obstacle.append(_state("initialState", motion(agent, agent.waypoints.t_s[:1]), 0, 0))
         return obstacle
-    move = on_clock(agent, t_s, at_least=2)  # an initial state and a trajectory
+    move = on_clock(agent, t_s, STEP_S, at_least=2)  # an initial state and a trajectory
     steps = np.flatnonzero(move.valid).tolist()
     if len(steps) < 2:
         return None
