@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -15,7 +13,7 @@ from log2sim.replay.assess.metrics import Errors, errors_of
 from log2sim.replay.assess.run import FOLLOWING, assess
 from log2sim.replay.clock import Clock
 from log2sim.replay.path import Path
-from log2sim.replay.reactive.ways import times_at
+from log2sim.replay.reactive.ways import times_at, times_beside
 from log2sim.replay.result import AgentReplay, Commands, Replay
 from log2sim.replay.rollout import Tracks
 from log2sim.replay.vehicles.models import Choice
@@ -59,10 +57,9 @@ def assemble(
             agents.append(replayed)
             stored.append(steps)
     paths = {k: path for k, (_, path, _) in home.items() if k in tracks}
-    document = json.dumps(scenario.to_dict(), sort_keys=True, ensure_ascii=False).encode()
     return Replay(
         scenario=scenario.name,
-        scenario_digest=hashlib.sha256(document).hexdigest(),
+        scenario_digest=scenario.digest,
         mode=mode,
         model=model,
         dt_s=clock.dt_s,
@@ -78,10 +75,14 @@ def _moved(
     x, y, yaw, speed, steer, accel, *told = states
     if driver == "exact":
         x, y, yaw, speed = path.centers(t_s)  # the tables in between are good to half a millimeter, the path is exact
-    log_t_s = times_at(path, t_s, x, y) if driver == "reactive" else t_s
+    log_t_s = t_s
+    if driver == "reactive":
+        log_t_s = times_at(path, t_s, x, y)
+    elif driver == "policy":
+        log_t_s = times_beside(path, x, y)
     if np.isnan(accel).any():
         accel = np.gradient(speed, t_s) if len(t_s) > 1 else np.zeros(len(t_s))
-    z = np.interp(log_t_s, path.t_s, path.z_m)
+    z = path.heights(log_t_s)  # of the road there, whenever the log was
     x, y, z, yaw, speed, steer, accel = (np.round(c, DIGITS) for c in (x, y, z, yaw, speed, steer, accel))
     t_s = np.round(t_s, 9)
     pedal, wheel, gear = told

@@ -22,9 +22,6 @@ from log2sim.replay.reactive.ways import SPACING_M, Ways
 from log2sim.replay.world import Driven, Group
 from log2sim.scenario import Agent
 
-ROUTE_BACK_M, ROUTE_ON_M = 5.0, 20.0
-"""How far from its last place the ego is looked for on the recorded way: so it stays on its branch where ways cross."""
-
 ONE = np.zeros(1, dtype=np.intp)
 
 
@@ -74,10 +71,8 @@ class Observer:
         return Route(*(_locked(c) for c in (ahead, *self._path.centers(ahead))))
 
     def _ahead(self, ego: EgoState) -> PathAhead:
-        way, begin_m = self._way, max(self.progress_m - ROUTE_BACK_M, 0.0)
-        x, y = (np.array([[c - o]]) for c, o in zip((ego.x_m, ego.y_m), way.origin_m))
-        foot = way.foot(ONE, np.array([begin_m]), self.progress_m - begin_m + ROUTE_ON_M, x, y)
-        self.progress_m = max(float(foot.distance_m[0, 0] + foot.ahead_m[0, 0]), 0.0)
+        way = self._way
+        self.progress_m = way.beside(0, self.progress_m, ego.x_m, ego.y_m)
         ahead = np.arange(0.0, PATH_AHEAD_M + SPACING_M / 2, SPACING_M)
         x, y, cos, sin, at_s = way.along(ONE, self.progress_m + ahead)
         pace = np.abs(way.at(ONE, np.where(np.isnan(at_s), self._path.t_s[-1], at_s)).speed_mps)

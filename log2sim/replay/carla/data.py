@@ -68,7 +68,7 @@ def _courses(agent: Agent, path: Path, *, drives: bool) -> tuple[dict[str, list[
     """Columns of the logged course and, for a vehicle that drives, of the one that it can drive; both of the box center."""
     t_s = _times(agent, path)
     x, y, yaw, _ = path.at(t_s)
-    z = np.interp(t_s, path.t_s, path.z_m) - agent.size_m[2] / 2
+    z = path.heights(t_s) - agent.size_m[2] / 2
     origin_x, origin_y = path.origin_m
     if not drives:
         return {**_mirrored(t_s, x + origin_x, y + origin_y, z, yaw), "curvature_1pm": [0.0] * len(t_s)}, None
