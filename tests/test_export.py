@@ -98,6 +98,15 @@ def test_a_name_that_no_file_can_hold_is_refused(scenario: Scenario, tmp_path: P
         export(replace(scenario, agents=(scenario.agents[0], odd)), "csv", tmp_path / "out")
 
 
+@pytest.mark.parametrize("projection", ["+proj=utm +zone=32 \ud83d", "+proj=utm\x0b+zone=32", "\uffff"])
+def test_a_projection_that_no_file_can_hold_is_refused(projection: str, scenario: Scenario, tmp_path: Path) -> None:
+    odd = replace(scenario, map=replace(scenario.map, projection=projection))
+    with pytest.raises(ScenarioError, match=r"map\.projection .* no XML file can; write a PROJ string"):
+        export(odd, "openscenario", tmp_path / "out")
+    lines = replace(scenario, map=replace(scenario.map, projection="PROJCRS[\n  1]"))
+    assert export(lines, "openscenario", tmp_path / "out")
+
+
 @pytest.mark.parametrize(
     ("to", "module"),
     [
