@@ -145,6 +145,17 @@ def test_the_table_holds_every_waypoint(scenario: Scenario, tmp_path: Path) -> N
         assert {float(r["width_m"]) for r in own} == {agent.size_m[1]}
 
 
+@pytest.mark.parametrize("to", ["csv", "commonroad"])
+def test_a_spreadsheet_runs_no_id(to: str, scenario: Scenario, tmp_path: Path) -> None:
+    ids = ['=HYPERLINK("http://a.b","c")', "@SUM(1)", "+1+cmd|'x'!A1", "-2+3", "\t=1+1", "-12", "+1.5", "a=1"]
+    agents = [replace(a, id=i) for a, i in zip(scenario.others * 2, ids)]
+    export(replace(scenario, agents=(scenario.ego, *agents)), to, tmp_path)
+    with (tmp_path / "agents.csv").open(newline="", encoding="utf-8") as opened:
+        cells = {cell for row in csv.reader(opened) for cell in row}
+    assert cells >= {f"'{i}" for i in ids[:5]} | set(ids[5:])
+    assert not cells & set(ids[:5])
+
+
 def test_the_command_names_what_it_wrote(tmp_path: Path) -> None:
     ran = run("export", SAMPLE, "--to", "csv", "--out", tmp_path / "out")
     assert ran.code == 0
