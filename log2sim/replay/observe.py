@@ -34,9 +34,8 @@ class Observer:
         self._way = Ways([self._path])
         self._groups = [g for g in groups if g is not ego]
         self._statics = _poses(statics)
-        # A static agent with one waypoint is there all the time.
-        self._stays = np.array([[a.waypoints.t_s[0], a.waypoints.t_s[-1]] for a in statics]).reshape(-1, 2)
-        self._stays[self._stays[:, 0] == self._stays[:, 1]] = -np.inf, np.inf
+        lives = [(-np.inf, np.inf) if a.stays else (a.waypoints.t_s[0], a.waypoints.t_s[-1]) for a in statics]
+        self._static_lives_s = np.array(lives, dtype=np.float64).reshape(-1, 2)
         self._agents = [_identities(g.agents) for g in self._groups]
         self._static_agents = _identities(statics)
         self.restart()
@@ -80,7 +79,8 @@ class Observer:
         return PathAhead(self.progress_m, *(_locked(c) for c in columns))
 
     def _others(self, ego: EgoState, step: int, t_s: float) -> Others:
-        here = (self._stays[:, 0] <= t_s) & (t_s <= self._stays[:, 1])
+        begin_s, end_s = self._static_lives_s.T
+        here = (begin_s <= t_s) & (t_s <= end_s)
         poses, who = [self._statics[:, here]], [self._static_agents[here]]
         for group, agents in zip(self._groups, self._agents):
             if len(group.live):
