@@ -165,11 +165,32 @@ def test_an_ego_that_falls_behind_its_log_has_the_height_of_its_place_and_is_hit
     ego = slope.agent("ego")
     assert ego.x_m[-1] < 20
     np.testing.assert_allclose(ego.z_m, 0.1 * ego.x_m, atol=1e-3)
-    assert (
-        slope.metrics["collisions"]
-        == replay(scenario_of(*flat), ego=Recorder(Controls(-4.0, 0.0))).metrics["collisions"]
-    )
+    level = replay(scenario_of(*flat), ego=Recorder(Controls(-4.0, 0.0)))
+    assert slope.metrics["collisions"] == level.metrics["collisions"]
     assert slope.metrics["new_collisions"] == 1
+
+
+def test_an_observation_tells_the_height_of_the_ego_and_of_others_also_of_late_ones():
+    agents = [line("ego", 60, speed=10, duration_s=8), line("late", 30, speed=10, duration_s=8)]
+    agents += [line("x", 50, 3.5, 10, 8), parked("p", 90, 5)]
+    driver = Recorder(Controls(-4.0, 0.0))
+    replay(scenario_of(*map(uphill, agents)), ego=driver, agents=["late"])
+    for seen in driver.seen[::50]:
+        assert seen.ego.z_m == pytest.approx(0.1 * seen.ego.x_m, abs=0.01)
+        np.testing.assert_allclose(seen.others.z_m, 0.1 * seen.others.x_m, atol=0.03)
+    late = seen.others.x_m[seen.others.id == "late"]
+    assert late < 30 + 10 * seen.t_s - 10
+    assert set(seen.others.height_m) == {seen.ego.height_m} == {1.5}
+
+
+def test_agents_brake_for_a_late_ego_on_a_slope_as_on_the_flat():
+    flat = [line("ego", 60, speed=10, duration_s=12), line("late", 30, speed=10, duration_s=12)]
+    on_flat, on_slope = (
+        replay(scenario_of(*agents), ego=Recorder(Controls(-4.0, 0.0)), agents="reactive")
+        for agents in (flat, map(uphill, flat))
+    )
+    assert on_slope.metrics["collisions"] == on_flat.metrics["collisions"] == []
+    np.testing.assert_allclose(on_slope.agent("late").x_m, on_flat.agent("late").x_m, atol=1e-3)
 
 
 def test_where_a_way_crosses_over_itself_the_height_is_that_of_the_own_level():
