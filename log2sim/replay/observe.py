@@ -54,7 +54,7 @@ class Observer:
     def _state(self) -> EgoState:
         """The ego, at the height of its recorded way at `progress_m`."""
         agent, s, p = self.ego.agents[0], self.ego.snapshot(), self.ego.living
-        log_t_s = self._way.times(0, np.array([self.progress_m]))
+        log_t_s = self._way.times(ONE, np.array([self.progress_m]))
         return EgoState(
             x_m=float(s.x_m[0]),
             y_m=float(s.y_m[0]),

@@ -119,7 +119,8 @@ class Traffic:
         # Its height is that of the road where it is, or on a slope nobody would brake for one that fell behind.
         self._driven_m = self.ways.beside(k, self._driven_m, float(ego.x_m[0]), float(ego.y_m[0]))
         z = pose.z_m.copy()
-        z[k] = self.ways.at(np.array([k]), self.ways.times(k, np.array([self._driven_m]))).z_m[0]
+        driven = np.array([k])
+        z[k] = self.ways.at(driven, self.ways.times(driven, np.array([self._driven_m]))).z_m[0]
         return pose._replace(x_m=x, y_m=y, z_m=z, yaw_rad=yaw, speed_mps=speed)
 
     def _pairs(self, t_s: float, tau: Array, own: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

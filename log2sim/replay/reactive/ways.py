@@ -114,9 +114,9 @@ class Ways:
         foot = self.foot(np.array([agent]), np.array([begin_m]), from_m - begin_m + ON_M, x, y)
         return max(float(foot.distance_m[0, 0] + foot.ahead_m[0, 0]), 0.0)
 
-    def times(self, agent: int, distance_m: Array) -> Array:
-        """When the log of an agent was at distances (N,) along its way; its end for what is beyond."""
-        t_s = self.along(np.array([agent]), distance_m)[4]
+    def times(self, agent: NDArray[np.intp], distance_m: Array) -> Array:
+        """When the log was at distances along ways, broadcast together; its end for what is beyond."""
+        t_s = self.along(agent, distance_m)[4]
         return np.where(np.isnan(t_s), self.end_s[agent], t_s)
 
 
@@ -125,7 +125,7 @@ def times_beside(path: Path, x_m: Array, y_m: Array) -> Array:
     way, gone_m = Ways([path]), np.zeros(len(x_m))
     for k, (x, y) in enumerate(zip(x_m.tolist(), y_m.tolist())):
         gone_m[k] = way.beside(0, gone_m[k - 1] if k else 0.0, x, y)
-    return way.times(0, gone_m)
+    return way.times(np.zeros(1, dtype=np.intp), gone_m)
 
 
 def times_at(path: Path, t_s: Array, x_m: Array, y_m: Array) -> Array:
