@@ -306,6 +306,8 @@ def test_edit_changes_a_scenario_that_then_replays_and_plots(tmp_path: Path) -> 
         assert run(*command).code == 0
     only = run("edit", source, "--only", "ego,bus_1", "--only", "car_turning", "--out", out, "--overwrite", "--quiet")
     assert (only.code, only.out, only.err) == (0, "", "")
+    assert "1 edit, 1 agent over 5.2 s" in run("edit", source, "--only", "ego", "--out", out, "--overwrite").out
+    run("edit", source, "--only", "ego,bus_1,car_turning", "--out", out, "--overwrite")
     assert [a["id"] for a in read(out)["agents"]] == ["ego", "bus_1", "car_turning"]
 
 
@@ -318,6 +320,19 @@ def test_edit_warns_and_strict_fails_with_6(tmp_path: Path) -> None:
     strict = run(*arguments, "--strict", "--quiet")
     assert strict.code == 6
     assert "'ego' and 'bus_1' collide" in strict.err
+    replayed = run("replay", tmp_path / "e.json", "--out", tmp_path / "r.json")
+    assert replayed.code == 0, replayed.err
+    assert run("validate", tmp_path / "r.json").code == 0
+
+
+def test_a_replay_of_another_scenario_is_shown_with_a_warning(tiny_scenario: Path, tmp_path: Path) -> None:
+    other = Path(__file__).resolve().parents[1] / "samples/crossing/truth.json"
+    run("replay", other, "--mode", "exact", "--out", tmp_path / "r.json")
+    for command, name in (("plot", "p.png"), ("view", "v.html")):
+        ran = run(command, tiny_scenario, "--replay", tmp_path / "r.json", "--out", tmp_path / name)
+        assert ran.code == 0
+        assert "r.json replays 'crossing', not 'tiny'" in ran.out
+        assert "warning" not in run(command, other, "--replay", tmp_path / "r.json", "--out", tmp_path / f"o{name}").out
 
 
 @pytest.mark.parametrize(

@@ -155,6 +155,9 @@ def test_a_file_where_the_folder_should_be_is_named(tmp_path: Path) -> None:
     assert ran.code == 2
     assert "is a file; give the name of a folder" in ran.line
     assert (tmp_path / "out").read_text() == "mine"
+    below = run("export", SAMPLE, "--to", "csv", "--out", tmp_path / "out" / "deeper")
+    assert below.code == 2
+    assert "out is a file and not a folder" in below.line
 
 
 def test_what_each_format_loses_stands_in_the_readme() -> None:

@@ -43,6 +43,11 @@ def say(text: str, *, quiet: bool = False) -> None:
         sys.stdout.flush()
 
 
+def counted(count: int, noun: str) -> str:
+    """A number of things, in words."""
+    return f"{count} {noun}{'s' * (count != 1)}"
+
+
 @app.callback(invoke_without_command=True)
 def root(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
     """Reconstruct driving logs as scenarios that a simulator can run. Add --debug for tracebacks."""

@@ -91,8 +91,8 @@ def replay(
     agents: Annotated[str, typer.Option(help="What the others do: log, or reactive (brake for what is new).")] = "log",
     react: Annotated[str | None, typer.Option(metavar="ID,ID", help="Only these react.")] = None,
     simulator: Annotated[str, typer.Option(help="own, or carla: a CARLA server moves the agents.")] = "own",
-    host: Annotated[str, typer.Option(help="With carla: where its server runs.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="With carla: its port.")] = 2000,
+    host: Annotated[str | None, typer.Option(help="With carla: where its server runs, else 127.0.0.1.")] = None,
+    port: Annotated[int | None, typer.Option(help="With carla: its port, else 2000.", min=1, max=65535)] = None,
     map: Annotated[str | None, typer.Option(metavar="TOWN|FILE.xodr", help="With carla: world to load first.")] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit 6 when a limit is broken.")] = False,
     limit: Annotated[
@@ -104,6 +104,7 @@ def replay(
     """Let vehicles drive a scenario."""
     from log2sim.errors import ConfigError
     from log2sim.files import check_targets
+    from log2sim.progress import progress
     from log2sim.replay import check_limits, host_named, load_policy, parse_limits, require_strict
     from log2sim.replay import replay as run
     from log2sim.replay.assess.summary import summarize
@@ -117,7 +118,11 @@ def replay(
     loaded = Scenario.load(scenario)
     policy = load_policy(ego) if ego is not None else None
     moved_by = host_named(simulator, host, port, map)
-    result = run(loaded, mode=mode, model=model, dt_s=dt, ego=policy, agents=chosen, host=moved_by)
+    with progress(quiet=quiet) as tell:
+        result = run(
+            loaded, mode=mode, model=model, dt_s=dt, ego=policy, agents=chosen, host=moved_by,
+            progress=lambda done, total: tell("replay", done, total),
+        )  # fmt: skip
     if out is not None:
         result.save(out)
     say(summarize(result), quiet=quiet)

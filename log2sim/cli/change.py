@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from log2sim.cli.app import Overwrite, Quiet, ScenarioPath, app, say
+from log2sim.cli.app import Overwrite, Quiet, ScenarioPath, app, counted, say
 
 if TYPE_CHECKING:
     from log2sim.edit import Edit
@@ -54,10 +54,10 @@ def edit(
     result.scenario.save(out)
     for warning in result.warnings:
         say(f"warning: {warning}", quiet=quiet)
-    changed, seconds = len(edits), result.scenario.duration_s
+    edited = result.scenario
     say(
-        f"{out}: {changed} edit{'s' * (changed != 1)}, {len(result.scenario.agents)} agents over {seconds:.1f} s, "
-        f"{len(result.warnings)} warning{'s' * (len(result.warnings) != 1)}",
+        f"{out}: {counted(len(edits), 'edit')}, {counted(len(edited.agents), 'agent')} over {edited.duration_s:.1f} s, "
+        f"{counted(len(result.warnings), 'warning')}",
         quiet=quiet,
     )
     if strict:

@@ -9,6 +9,8 @@ import typer
 
 from log2sim.cli.app import Overwrite, Quiet, ScenarioPath, app, say
 
+MOST_NOTES = 5
+
 
 @app.command()
 def export(
@@ -34,8 +36,11 @@ def export(
     files = run(loaded, to, out, Options(revision, map, mode, opened), overwrite=overwrite)
     for file in files:
         say(f"{file}: written", quiet=quiet)
-    for remark in remarks(loaded):
-        say(f"note: {remark}", quiet=quiet)
+    notes = remarks(loaded)
+    for note in notes[:MOST_NOTES]:
+        say(f"note: {note}", quiet=quiet)
+    if len(notes) > MOST_NOTES:
+        say(f"note: and {len(notes) - MOST_NOTES} more such pairs", quiet=quiet)
 
 
 @app.command(name="import")
