@@ -86,7 +86,9 @@ def export(
     refuse_below_file(folder)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        # Within a folder that exists, since it may be another file system than what is above it.
+        beside = folder if folder.is_dir() else folder.parent
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=beside))
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be written: {error.strerror or error}") from error
     try:
