@@ -325,6 +325,25 @@ def test_edit_warns_and_strict_fails_with_6(tmp_path: Path) -> None:
     assert run("validate", tmp_path / "r.json").code == 0
 
 
+def test_a_replay_never_replaces_its_scenario(tiny_scenario: Path) -> None:
+    before = tiny_scenario.read_bytes()
+    ran = run("replay", tiny_scenario, "--out", tiny_scenario, "--overwrite")
+    assert ran.code == 2
+    assert "is the scenario itself" in ran.err
+    assert tiny_scenario.read_bytes() == before
+
+
+def test_who_reacts_is_named_by_ids_even_if_they_hold_a_comma(tiny_scenario: Path, tmp_path: Path) -> None:
+    document = read(tiny_scenario)
+    movers = [a for a in document["agents"] if not a["static"]]
+    movers[-1]["id"] = "a, b"
+    (tmp_path / "s.json").write_text(json.dumps(document))
+    ran = run("replay", tmp_path / "s.json", "--react", "a, b", "--out", tmp_path / "r.json", "--quiet")
+    assert (ran.code, ran.err) == (0, "")
+    drivers = {a["id"]: a["driver"] for a in read(tmp_path / "r.json")["agents"]}
+    assert [k for k, v in drivers.items() if v == "reactive"] == ["a, b"]
+
+
 def test_a_replay_of_another_scenario_is_shown_with_a_warning(tiny_scenario: Path, tmp_path: Path) -> None:
     other = Path(__file__).resolve().parents[1] / "samples/crossing/truth.json"
     run("replay", other, "--mode", "exact", "--out", tmp_path / "r.json")

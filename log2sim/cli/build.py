@@ -102,6 +102,7 @@ def replay(
     quiet: Quiet = False,
 ) -> None:
     """Let vehicles drive a scenario."""
+    from log2sim.cli.change import ids_of
     from log2sim.errors import ConfigError
     from log2sim.files import check_targets
     from log2sim.progress import progress
@@ -111,11 +112,13 @@ def replay(
     from log2sim.scenario import Scenario
 
     check_targets(out, overwrite=overwrite)
+    if out is not None and out.resolve() == scenario.resolve():
+        raise ConfigError(f"{out}: is the scenario itself, which a replay must not replace; choose another name")
     if react is not None and agents != "log":
         raise ConfigError("--react names the agents that react, --agents reactive means all: give one of them")
-    chosen = agents if react is None else [name.strip() for name in react.split(",")]
     limits = parse_limits(limit or ())
     loaded = Scenario.load(scenario)
+    chosen = agents if react is None else list(ids_of(loaded, [react]))
     policy = load_policy(ego) if ego is not None else None
     moved_by = host_named(simulator, host, port, map)
     with progress(quiet=quiet) as tell:
