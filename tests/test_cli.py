@@ -14,6 +14,7 @@ from worlds import tiny_toml
 import log2sim
 from log2sim import Scenario, cli
 from log2sim.errors import LogError
+from log2sim.registry import BUILT_IN
 from log2sim.schema import check
 
 COMMANDS = (
@@ -257,6 +258,8 @@ def test_help_and_version() -> None:
         assert f"log2sim {name}" in result.output or f" {name} " in result.output
         if name in ("reconstruct", "replay", "edit", "plot", "view", "evaluate", "bench", "synth"):
             assert "--out" in result.output
+    shown = run("export", "--help")
+    assert all(name in shown.out.replace(",", " ").replace(".", " ").split() for name in BUILT_IN["export"])
     assert run("--version").out == f"{log2sim.__version__}\n"
     nothing = run()
     assert nothing.code == 2

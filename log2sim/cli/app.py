@@ -12,7 +12,7 @@ from log2sim import __version__
 
 app = typer.Typer(
     name="log2sim",
-    help="Reconstruct driving logs as scenarios that a simulator can run.",
+    help="Reconstruct driving logs as scenarios that a simulator can run. Add --debug for tracebacks.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

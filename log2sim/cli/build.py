@@ -84,7 +84,7 @@ def replay(
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Replay file to write.")] = None,
     mode: Annotated[str, typer.Option(help="pid or exact.")] = "pid",
     model: Annotated[str, typer.Option(help="Vehicle model: auto, kinematic, dynamic or single-track.")] = "auto",
-    dt: Annotated[float, typer.Option(help="Step in s.")] = 0.01,
+    dt: Annotated[float, typer.Option(help="Step in s, from 0.0005 to 1.")] = 0.01,
     ego: Annotated[
         str | None, typer.Option(metavar="MODULE|FILE.py:ATTRIBUTE", help="Policy that drives the ego.")
     ] = None,
@@ -94,9 +94,13 @@ def replay(
     host: Annotated[str | None, typer.Option(help="With carla: where its server runs, else 127.0.0.1.")] = None,
     port: Annotated[int | None, typer.Option(help="With carla: its port, else 2000.", min=1, max=65535)] = None,
     map: Annotated[str | None, typer.Option(metavar="TOWN|FILE.xodr", help="With carla: world to load first.")] = None,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit 6 when a limit is broken.")] = False,
+    strict: Annotated[
+        bool,
+        typer.Option("--strict", help="Exit 6 when a limit is broken: of --limit, new collisions, far off the path."),
+    ] = False,
     limit: Annotated[
-        list[str] | None, typer.Option(metavar="METRIC=VALUE", help="A limit, e.g. min_ttc_s=1; with --strict.")
+        list[str] | None,
+        typer.Option(metavar="METRIC=VALUE", help="Tell who breaks it, e.g. min_ttc_s=1; see --strict."),
     ] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,

@@ -10,17 +10,22 @@ import typer
 from log2sim.cli.app import Overwrite, Quiet, ScenarioPath, app, say
 
 MOST_NOTES = 5
+FORMATS = "openscenario, carla, csv, scenarionet, commonroad, osi, mcap, rerun"  # written out: --help imports nothing
 
 
 @app.command()
 def export(
     scenario: ScenarioPath,
-    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help="Format; an unknown one lists the known.")],
+    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help=f"One of {FORMATS}.")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write into.")],
-    revision: Annotated[str | None, typer.Option(help="Revision of the format's standard.")] = None,
-    map: Annotated[Path | None, typer.Option(metavar="FILE", help="Road network to use instead of an own one.")] = None,
-    mode: Annotated[str | None, typer.Option(help="For scripts that move agents: exact or pid.")] = None,
-    log: Annotated[Path | None, typer.Option(metavar="LOG", help="Log whose pictures and points go along.")] = None,
+    revision: Annotated[str | None, typer.Option(help="openscenario: 1.0, 1.1 or 1.2.")] = None,
+    map: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="openscenario, carla: OpenDRIVE to use, not an own.")
+    ] = None,
+    mode: Annotated[str | None, typer.Option(help="carla: exact or pid.")] = None,
+    log: Annotated[
+        Path | None, typer.Option(metavar="LOG", help="mcap, rerun: log whose pictures and points go along.")
+    ] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
