@@ -116,6 +116,7 @@ def test_in_reverse_the_pedal_is_that_of_the_gear() -> None:
     assert np.corrcoef(told.values[moving], done.values[moving])[0, 1] > 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("driver", ["pid", "policy"])
 def test_no_writing_of_the_sheet_covers_other_writing(driver: str) -> None:
     scenario, result = reckless()
@@ -138,6 +139,7 @@ def test_no_writing_of_the_sheet_covers_other_writing(driver: str) -> None:
             assert not (wide > 2 and high > 2), (a.get_text(), b.get_text())
 
 
+@pytest.mark.slow
 def test_the_map_keeps_its_size_above_the_strips() -> None:
     scenario, result = reckless()
     plain, with_strips = sheet_of(scenario, None), sheet_of(scenario, result)
@@ -184,6 +186,7 @@ def test_the_cursor_moves_and_marks_come_when_it_hits() -> None:
     assert len(strips.moving[0][3].get_xdata()) == 0
 
 
+@pytest.mark.slow
 def test_a_gif_keeps_every_frame_and_the_colors_that_mean_something(tmp_path: Path) -> None:
     from PIL import Image
 

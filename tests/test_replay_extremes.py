@@ -269,6 +269,7 @@ def test_a_single_waypoint_is_a_state_and_not_a_way(dt_s):
 # Invariances.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt_s", LONG_STEPS_S)
 @pytest.mark.parametrize("model", LIMITS_M)
 def test_three_rounds_through_plus_and_minus_pi(dt_s, model):
@@ -339,6 +340,7 @@ def test_after_half_an_hour_a_vehicle_is_as_near_as_in_the_first_minute():
         assert np.abs(error[end]).max() < np.abs(error[early]).max() + 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("window_s", [0.7, 7.0, 1e3])
 @pytest.mark.parametrize("category", ["car", "pedestrian"])
 def test_windows_of_any_length_give_the_same_states(window_s, category, monkeypatch):

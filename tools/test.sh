@@ -6,4 +6,4 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 echo "installing into .venv (about a minute the first time)"
 .venv/bin/python -m pip install -qq --disable-pip-version-check --editable '.[coco,test]'
 export OPENBLAS_NUM_THREADS=1
-exec .venv/bin/python -m pytest -m '' "$@"
+exec .venv/bin/python -m pytest -m 'not peers' --numprocesses auto --dist loadfile "$@"
