@@ -145,6 +145,10 @@ def test_plot_takes_the_cameras_as_background(tiny_scenario: Path, tiny_folder: 
     assert run("plot", tiny_scenario, "--out", tmp_path / "plain.png").code == 0
     assert run("plot", tiny_scenario, "--out", tmp_path / "t.png", "--background", tiny_folder).code == 0
     assert (tmp_path / "t.png").stat().st_size > 1.5 * (tmp_path / "plain.png").stat().st_size
+    document = read(tiny_scenario) | {"cameras": []}  # truth names no cameras: all of the log paint
+    (tmp_path / "truth.json").write_text(json.dumps(document))
+    assert run("plot", tmp_path / "truth.json", "--out", tmp_path / "b.png", "--background", tiny_folder).code == 0
+    assert (tmp_path / "b.png").stat().st_size > 1.5 * (tmp_path / "plain.png").stat().st_size
 
 
 def test_replay_prints_errors_and_exact_has_none(tiny_scenario: Path, tmp_path: Path) -> None:
@@ -355,6 +359,9 @@ def test_a_replay_of_another_scenario_is_shown_with_a_warning(tiny_scenario: Pat
         assert ran.code == 0
         assert "r.json replays 'crossing', not 'tiny'" in ran.out
         assert "warning" not in run(command, other, "--replay", tmp_path / "r.json", "--out", tmp_path / f"o{name}").out
+        run("edit", other, "--remove", "bus_1", "--out", tmp_path / "e.json", "--overwrite")
+        fewer = run(command, tmp_path / "e.json", "--replay", tmp_path / "r.json", "--out", tmp_path / f"e{name}")
+        assert "another version of 'crossing': 1 of its 12 agents are not in it" in fewer.out
 
 
 @pytest.mark.parametrize(

@@ -127,8 +127,13 @@ def load_replay(path: Path, scenario: Scenario, *, quiet: bool = False) -> Repla
     from log2sim.replay import Replay as Replayed
 
     loaded = Replayed.load(path)
+    known = {a.id for a in scenario.agents}
+    strangers = [a.id for a in loaded.agents if a.id not in known]
     if loaded.scenario != scenario.name:
         say(f"warning: {path} replays '{loaded.scenario}', not '{scenario.name}'; nothing need fit", quiet=quiet)
+    elif strangers:
+        count = f"{len(strangers)} of its {len(loaded.agents)} agents"
+        say(f"warning: {path} replays another version of '{scenario.name}': {count} are not in it", quiet=quiet)
     return loaded
 
 
