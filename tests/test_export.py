@@ -98,6 +98,15 @@ def test_a_name_that_no_file_can_hold_is_refused(scenario: Scenario, tmp_path: P
         export(replace(scenario, agents=(scenario.agents[0], odd)), "csv", tmp_path / "out")
 
 
+@pytest.mark.parametrize("projection", ["+proj=utm +zone=32 \ud83d", "+proj=utm\x0b+zone=32", "\uffff"])
+def test_a_projection_that_no_file_can_hold_is_refused(projection: str, scenario: Scenario, tmp_path: Path) -> None:
+    odd = replace(scenario, map=replace(scenario.map, projection=projection))
+    with pytest.raises(ScenarioError, match=r"map\.projection .* no XML file can; write a PROJ string"):
+        export(odd, "openscenario", tmp_path / "out")
+    lines = replace(scenario, map=replace(scenario.map, projection="PROJCRS[\n  1]"))
+    assert export(lines, "openscenario", tmp_path / "out")
+
+
 @pytest.mark.parametrize(
     ("to", "module"),
     [
@@ -136,6 +145,17 @@ def test_the_table_holds_every_waypoint(scenario: Scenario, tmp_path: Path) -> N
         assert {float(r["width_m"]) for r in own} == {agent.size_m[1]}
 
 
+@pytest.mark.parametrize("to", ["csv", "commonroad"])
+def test_a_spreadsheet_runs_no_id(to: str, scenario: Scenario, tmp_path: Path) -> None:
+    ids = ['=HYPERLINK("http://a.b","c")', "@SUM(1)", "+1+cmd|'x'!A1", "-2+3", "\t=1+1", "-12", "+1.5", "a=1"]
+    agents = [replace(a, id=i) for a, i in zip(scenario.others * 2, ids)]
+    export(replace(scenario, agents=(scenario.ego, *agents)), to, tmp_path)
+    with (tmp_path / "agents.csv").open(newline="", encoding="utf-8") as opened:
+        cells = {cell for row in csv.reader(opened) for cell in row}
+    assert cells >= {f"'{i}" for i in ids[:5]} | set(ids[5:])
+    assert not cells & set(ids[:5])
+
+
 def test_the_command_names_what_it_wrote(tmp_path: Path) -> None:
     ran = run("export", SAMPLE, "--to", "csv", "--out", tmp_path / "out")
     assert ran.code == 0
@@ -149,12 +169,29 @@ def test_an_unknown_format_lists_the_known(tmp_path: Path) -> None:
     assert names(tmp_path) == []
 
 
+def test_a_folder_that_exists_may_be_a_file_system_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    folder, move = tmp_path / "mounted", Path.replace
+
+    def within(source: Path, target: Path) -> Path:
+        if source.is_relative_to(folder) != target.is_relative_to(folder):
+            raise OSError(18, "Invalid cross-device link")
+        return move(source, target)
+
+    folder.mkdir()
+    monkeypatch.setattr(Path, "replace", within)
+    assert run("export", SAMPLE, "--to", "csv", "--out", folder).code == 0
+    assert (names(tmp_path), names(folder)) == (["mounted"], ["agents.csv"])
+
+
 def test_a_file_where_the_folder_should_be_is_named(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("mine")
     ran = run("export", SAMPLE, "--to", "csv", "--out", tmp_path / "out")
     assert ran.code == 2
     assert "is a file; give the name of a folder" in ran.line
     assert (tmp_path / "out").read_text() == "mine"
+    below = run("export", SAMPLE, "--to", "csv", "--out", tmp_path / "out" / "deeper")
+    assert below.code == 2
+    assert "out is a file and not a folder" in below.line
 
 
 def test_what_each_format_loses_stands_in_the_readme() -> None:

@@ -28,11 +28,14 @@ except ImportError as error:
 ID = "log2sim/Scenario-v0"
 
 PATH_EVERY_M, PATH_ROWS = 5, 10
-MAX_SPEED_MPS, MAX_ACCEL_MPS2 = 80.0, 15.0
+# Bounds of what is observed: no road user is faster, brakes harder or is larger.
+MAX_SPEED_MPS, MAX_ACCEL_MPS2, MAX_LENGTH_M, MAX_WIDTH_M = 80.0, 15.0, 60.0, 10.0
+PATH_BOUND_M = 60.0  # the last row of the path is 50 m ahead, seen by an ego that is at most `LOST_M` off it
 
+# What a step costs, in meters of way gone.
 OFF_PATH_PER_M_S = 0.2
 COLLISION = 100.0
-OFF_PATH_M = 15.0
+LOST_M = 15.0  # so far off the path an episode ends
 
 PICTURE_PX, PICTURE_M = 400, 80.0
 
@@ -93,6 +96,8 @@ class ScenarioEnv(gymnasium.Env[Seen, Any]):
         self.scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
         self.world = open_world(self.scenario, dt_s=dt_s, agents=agents, sight_m=sight_m)
         self.render_mode, self._steps = render_mode, max(1, round(hold_s / dt_s))
+        self._seen: Observation
+        self._begun = False
         ego = self.world.ego
         if ego is None:  # open_world refuses such a scenario
             raise ValueError("the world has no ego to drive")
@@ -102,9 +107,9 @@ class ScenarioEnv(gymnasium.Env[Seen, Any]):
         self.action_space = Box(-1.0, 1.0, (2,), np.float32)
         self._rows = max_others
         bounds = {
-            "ego": [MAX_SPEED_MPS, MAX_ACCEL_MPS2, np.pi / 2, OFF_PATH_M, np.pi],
-            "path": [[60.0, 60.0, MAX_SPEED_MPS]] * PATH_ROWS,
-            "others": [[sight_m, sight_m, MAX_SPEED_MPS, MAX_SPEED_MPS, np.pi, 60.0, 10.0]] * max_others,
+            "ego": [MAX_SPEED_MPS, MAX_ACCEL_MPS2, np.pi / 2, LOST_M, np.pi],
+            "path": [[PATH_BOUND_M, PATH_BOUND_M, MAX_SPEED_MPS]] * PATH_ROWS,
+            "others": [[sight_m, sight_m, MAX_SPEED_MPS, MAX_SPEED_MPS, np.pi, MAX_LENGTH_M, MAX_WIDTH_M]] * max_others,
         }
         self._bounds = {k: np.array(v, np.float32) for k, v in bounds.items()}
         spaces: dict[str, Any] = {k: Box(-v, v) for k, v in self._bounds.items()}
@@ -116,12 +121,14 @@ class ScenarioEnv(gymnasium.Env[Seen, Any]):
         self.world.restart()
         while not self.world.ego_lives:
             self.world.advance()
-        self._seen = self.world.observe()
+        self._seen, self._begun = self.world.observe(), True
         return self._shown(), {"t_s": self._seen.t_s}
 
     def step(self, action: Any) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
-        """Hold an action for `hold_s`."""
-        pedal, wheel = (float(v) for v in np.clip(action, -1.0, 1.0))
+        """Hold an action for `hold_s`; `ValueError` when it is not two finite numbers."""
+        if not self._begun:
+            raise gymnasium.error.ResetNeeded("the episode has not begun: call reset() before step()")
+        pedal, wheel = _shares(action)
         brake, throttle = self.accel_limits_mps2
         before_m, begin_s = self._seen.path.progress_m, self._seen.t_s
         self.world.steer(Controls(pedal * (throttle if pedal > 0 else brake), wheel * self.max_steer_rad))
@@ -143,13 +150,13 @@ class ScenarioEnv(gymnasium.Env[Seen, Any]):
             "collision": -COLLISION * collides,
         }
         arrived = bool(np.isnan(seen.path.t_s[1]))
-        truncated = not (collides or arrived) and (over or abs(offset_m) > OFF_PATH_M)
+        truncated = not (collides or arrived) and (over or abs(offset_m) > LOST_M)
         info = {"t_s": seen.t_s, "collision": collides, "reward": parts}
         return self._shown(), float(sum(parts.values())), collides or arrived, truncated, info
 
     def render(self) -> Any:
         """The surroundings of the ego from above, (400, 400, 3) uint8, its front to the right; None without a render mode."""
-        return _picture(self._seen) if self.render_mode == "rgb_array" else None
+        return _picture(self._seen) if self._begun and self.render_mode == "rgb_array" else None
 
     def _shown(self) -> Seen:
         """The observation as arrays within the bounds of its space."""
@@ -169,6 +176,15 @@ class ScenarioEnv(gymnasium.Env[Seen, Any]):
         }
         shown = {k: np.clip(v.astype(np.float32), -self._bounds[k], self._bounds[k]) for k, v in arrays.items()}
         return {**shown, "others_mask": (np.arange(count) < len(near)).astype(np.int8)}
+
+
+def _shares(action: Any) -> tuple[float, float]:
+    """The pedal and the steering of an action, as shares from -1 to 1."""
+    values = np.asarray(action, dtype=np.float64)
+    if values.shape != (2,) or not np.isfinite(values).all():
+        raise ValueError(f"action {action!r}: expected two finite numbers from -1 to 1, pedal and steering")
+    pedal, wheel = np.clip(values, -1.0, 1.0).tolist()
+    return pedal, wheel
 
 
 def _turned(ego: EgoState, x: Array, y: Array) -> tuple[Array, Array]:
@@ -194,7 +210,8 @@ def _collides(seen: Observation) -> bool:
     own = np.broadcast_to([ego.length_m, ego.width_m], (len(o), 2))
     size = np.stack([o.length_m, o.width_m], axis=1)
     yaw = np.full(len(o), ego.yaw_rad)
-    return bool(rectangles_overlap(o.x_m - ego.x_m, o.y_m - ego.y_m, yaw, o.yaw_rad, own, size).any())
+    level = np.abs(o.z_m - ego.z_m) < (o.height_m + ego.height_m) / 2
+    return bool((level & rectangles_overlap(o.x_m - ego.x_m, o.y_m - ego.y_m, yaw, o.yaw_rad, own, size)).any())
 
 
 def _picture(seen: Observation) -> Any:

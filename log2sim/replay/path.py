@@ -59,6 +59,10 @@ class Path:
         x, y, yaw, speed = self.at(t_s)
         return x + self.origin_m[0], y + self.origin_m[1], wrap_angle(yaw), speed
 
+    def heights(self, t_s: Array) -> Array:
+        """Height z of the box center in the map at times (N,), held outside the life."""
+        return np.interp(t_s, self.t_s, self.z_m)
+
     def jump_times(self) -> Array:
         """Times (J,) at which the log stands elsewhere than it could have driven to."""
         return self.t_s[1:][self.jump]

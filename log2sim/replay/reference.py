@@ -21,8 +21,9 @@ SMOOTHING_S = 0.12
 
 STANDSTILL_MPS = 0.08
 MIN_RUN_M, MIN_RUN_MPS = 0.3, 0.5  # shorter and slower runs forward or backward are noise of a standing agent
-MAX_ACCEL_MPS2 = 10.4  # feasibility limits of Waymax (Gulino et al., 2023)
+MAX_ACCEL_MPS2 = 10.4  # feasibility limits of Waymax (Gulino et al., 2023, section 3.3)
 MAX_CURVATURE_1PM = 0.3
+MAX_TWO_WHEELER_CURVATURE_1PM = 1.0  # which it does not tell; a bicycle turns within a meter
 MAX_DEPARTURE_M = 0.3  # more than boxes err by
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.registry import nearest
 from log2sim.replay.assemble import assemble
-from log2sim.replay.cast import EGO, cast_agents, groups_of, reactive_ids, traffic_of
+from log2sim.replay.cast import cast_agents, groups_of, reactive_ids, traffic_of
 from log2sim.replay.clock import Clock
 from log2sim.replay.policy import SIGHT_M, Policy, begin
 from log2sim.replay.result import Replay
@@ -17,7 +17,7 @@ from log2sim.replay.rollout import Progress, Tracks, World, roll
 from log2sim.replay.simulator import Host
 from log2sim.replay.vehicles.models import MODELS, Choice
 from log2sim.replay.vehicles.parameters import WHEELED
-from log2sim.scenario import Agent, Scenario
+from log2sim.scenario import EGO, Agent, Scenario
 
 MODES = ("pid", "exact")
 DT_RANGE_S = (0.0005, 1.0)
@@ -112,7 +112,17 @@ def open_world(
     agents: str | Collection[str] = "log",
     sight_m: float = SIGHT_M,
 ) -> World:
-    """A scenario as a world to be moved step by step: with `drives_ego` by controls of the caller's. See `replay`."""
+    """A scenario as a world to be moved step by step: with `drives_ego` by controls of the caller's. See `replay`.
+
+    Examples
+    --------
+    >>> world = open_world(scenario)
+    >>> while not world.done:
+    ...     if world.ego_lives:
+    ...         seen = world.observe()  # an Observation, as policies get it
+    ...         world.steer(Controls(accel_mps2=1.0, steer_rad=0.0))
+    ...     world.advance()
+    """
     if mode not in MODES:
         raise ConfigError(f"mode '{mode}': expected one of {', '.join(MODES)}")
     if not DT_RANGE_S[0] <= dt_s <= DT_RANGE_S[1]:

@@ -190,7 +190,8 @@ def _refined(boxes: Boxes, pairs: _Pairs) -> tuple[Array, Array]:
             np.broadcast_to(c, shape).ravel()
             for c in (i[:, :, None], j[:, None, :], a[:, None, None], b[:, None, None])
         )
-        apart = np.where(boxes.overlap(all_i, all_a, all_j, all_b), all_j - all_i, np.inf)
+        meets = boxes.overlap(all_i, all_a, all_j, all_b) & (all_i <= all_j)  # those who collide share a moment
+        apart = np.where(meets, all_j - all_i, np.inf)
         best = np.argmin(apart.reshape(len(a), len(offset) ** 2), axis=1) + np.arange(len(a)) * len(offset) ** 2
         left, came = all_i[best], all_j[best]
     return left, came

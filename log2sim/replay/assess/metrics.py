@@ -83,19 +83,33 @@ def agent_metrics(errors: Errors) -> dict[str, Any]:
     }
 
 
-def overall(by_agent: Mapping[str, Mapping[str, Any]], samples: Mapping[str, int]) -> dict[str, Any]:
-    """Errors over all followers, every stored sample counting alike; 0 where nobody follows."""
-    ids = [k for k in by_agent if samples[k] > 0]
-    total = sum(samples[k] for k in ids)
+def overall(
+    by_agent: Mapping[str, Mapping[str, Any]], on_time: Mapping[str, int], on_way: Mapping[str, int]
+) -> dict[str, Any]:
+    """Errors over all followers, every stored sample counting alike; 0 where nobody follows.
+
+    Parameters
+    ----------
+    by_agent : by id
+        The errors of each agent.
+    on_time, on_way : by id
+        The samples of those who are where the log is at each moment, and of all who keep to its way, however late.
+    """
     out: dict[str, Any] = {}
-    for key in ("cross_track_rms_m", "along_track_rms_m", "speed_rms_mps", "yaw_rms_rad"):
-        square = sum(samples[k] * by_agent[k][key] ** 2 for k in ids)
-        out[key] = round(float(np.sqrt(square / total)), 6) if total else 0.0
-    out["cross_track_max_m"] = max((by_agent[k]["cross_track_max_m"] for k in ids), default=0.0)
-    off = sum(samples[k] * by_agent[k]["off_path_share"] for k in ids)
-    out["off_path_share"] = round(off / total, 6) if total else 0.0
-    out["followers"] = len(ids)
+    for key, samples in (
+        ("cross_track_rms_m", on_way), ("along_track_rms_m", on_time), ("speed_rms_mps", on_time), ("yaw_rms_rad", on_time),
+    ):  # fmt: skip
+        out[key] = round(float(np.sqrt(_mean({k: e[key] ** 2 for k, e in by_agent.items()}, samples))), 6)
+    out["cross_track_max_m"] = max((e["cross_track_max_m"] for k, e in by_agent.items() if k in on_way), default=0.0)
+    out["off_path_share"] = round(_mean({k: e["off_path_share"] for k, e in by_agent.items()}, on_way), 6)
+    out["followers"] = len(on_time)
     return out
+
+
+def _mean(values: Mapping[str, float], samples: Mapping[str, int]) -> float:
+    """Mean of the values that have samples, weighted by their number; 0 without any."""
+    total = sum(samples.values())
+    return sum(count * values[k] for k, count in samples.items()) / total if total else 0.0
 
 
 def _nearest_times(path: Path, x_m: Array, y_m: Array) -> Array:

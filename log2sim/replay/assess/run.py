@@ -59,9 +59,10 @@ def assess(
         for a in agents
         if a.id in errors
     }
-    samples = {a.id: len(a) if a.driver == "pid" else 0 for a in agents}
+    on_time = {a.id: len(a) for a in agents if a.driver == "pid"}
+    on_way = on_time | {a.id: len(a) for a in agents if a.driver == "reactive"}
     return {
-        **overall(by_agent, samples),
+        **overall(by_agent, on_time, on_way),
         "collisions": events,
         "new_collisions": sum(not e["in_log"] for e in events),
         "min_ttc": least(near, "min_ttc"),
@@ -97,7 +98,7 @@ def _boxes(
         rows = steps // clock.store_every
         if agent.id in paths:
             x, y, yaw, speed = paths[agent.id].centers(agent.t_s)
-            columns[:, rows, k] = np.stack([x, y, agent.z_m, yaw, speed])
+            columns[:, rows, k] = np.stack([x, y, paths[agent.id].heights(agent.t_s), yaw, speed])
         elif len(rows) == len(agent):
             columns[:, rows, k] = agent.x_m, agent.y_m, agent.z_m, agent.yaw_rad, agent.speed_mps
         elif len(rows):  # one pose for all rows
