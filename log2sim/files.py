@@ -44,6 +44,13 @@ def refuse_existing(path: Path | str, *, overwrite: bool) -> None:
         raise ConfigError(f"{path}: exists already; choose another name or pass --overwrite")
 
 
+def refuse_below_file(path: Path | str) -> None:
+    """Raise `ConfigError` when what should be a folder above `path` is a file."""
+    above = next((p for p in Path(path).parents if p.exists()), None)
+    if above is not None and not above.is_dir():
+        raise ConfigError(f"{path}: cannot be written, since {above} is a file and not a folder; choose another place")
+
+
 def check_targets(*paths: Path | str | None, overwrite: bool) -> None:
     """Refuse output files that could not be written, before any work is done for them; None is skipped.
 
@@ -54,14 +61,10 @@ def check_targets(*paths: Path | str | None, overwrite: bool) -> None:
     """
     targets = [Path(p) for p in paths if p is not None]
     for k, target in enumerate(targets):
-        refuse_existing(target, overwrite=overwrite)
         if target.is_dir():
             raise ConfigError(f"{target}: is a folder; give the name of a file")
-        above = next((p for p in target.parents if p.exists()), None)
-        if above is not None and not above.is_dir():
-            raise ConfigError(
-                f"{target}: cannot be written, since {above} is a file and not a folder; choose another place"
-            )
+        refuse_existing(target, overwrite=overwrite)
+        refuse_below_file(target)
         if target.resolve() in [t.resolve() for t in targets[:k]]:
             raise ConfigError(
                 f"{target}: two files would be written under this one name; choose another for one of them"

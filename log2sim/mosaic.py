@@ -16,10 +16,14 @@ RESOLUTION_M = 0.06
 
 
 def mosaic_of(log: Log, scenario: Scenario) -> TopdownPicture:
-    """Paint the ground around the ego's path, or around the sensors of a roadside log."""
+    """Paint the ground around the ego's path, or around the sensors of a roadside log.
+
+    By the cameras that the scenario was made with, or by all of the log where it names none, as truth does.
+    """
     from log2sim.observe import place_of_ego
 
     used = [str(c["name"]) for c in scenario.cameras if c.get("used") and c["name"] in log.cameras]
+    used = used or list(log.cameras)
     stamps = scenario.t0_ns + np.round(np.linspace(0, scenario.duration_s, MOMENTS) * NS_PER_S).astype(np.int64)
     places = np.array([place_of_ego(log, int(t))[0][:2] for t in stamps])
     low, high = places.min(axis=0) - REACH_M, places.max(axis=0) + REACH_M

@@ -25,6 +25,7 @@ import carla
 import carla_server
 from carla_server import Client
 
+from log2sim.replay.carla import player
 from log2sim.replay.carla.simulator import CarlaSimulator
 from log2sim.replay.carla.simulator import Server as CarlaServer
 
@@ -260,6 +261,17 @@ def test_the_command_replays_in_carla(server: Client, tmp_path: Path) -> None:
     assert server.address == ("far", 2003)
     assert server.loaded == ["Town04"]
     assert Replay.load(tmp_path / "replay.json").model == "carla"
+
+
+@pytest.mark.parametrize("words", [("--host", "far"), ("--port", "2003"), ("--map", "Town04")])
+def test_options_of_carla_without_it_are_refused(words: tuple[str, str]) -> None:
+    ran = run("replay", SAMPLE, *words)
+    assert (ran.code, ran.out) == (2, "")
+    assert "are for --simulator carla" in ran.line
+
+
+def test_a_server_gets_a_moment_to_answer_and_then_its_time_to_work(server: Client) -> None:
+    assert player.connect(carla, "127.0.0.1", 2000, 60.0).timeout_s == 60.0
 
 
 def test_an_unknown_simulator_lists_the_known(tmp_path: Path) -> None:

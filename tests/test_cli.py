@@ -14,6 +14,7 @@ from worlds import tiny_toml
 import log2sim
 from log2sim import Scenario, cli
 from log2sim.errors import LogError
+from log2sim.registry import BUILT_IN
 from log2sim.schema import check
 
 COMMANDS = (
@@ -144,6 +145,10 @@ def test_plot_takes_the_cameras_as_background(tiny_scenario: Path, tiny_folder: 
     assert run("plot", tiny_scenario, "--out", tmp_path / "plain.png").code == 0
     assert run("plot", tiny_scenario, "--out", tmp_path / "t.png", "--background", tiny_folder).code == 0
     assert (tmp_path / "t.png").stat().st_size > 1.5 * (tmp_path / "plain.png").stat().st_size
+    document = read(tiny_scenario) | {"cameras": []}  # truth names no cameras: all of the log paint
+    (tmp_path / "truth.json").write_text(json.dumps(document))
+    assert run("plot", tmp_path / "truth.json", "--out", tmp_path / "b.png", "--background", tiny_folder).code == 0
+    assert (tmp_path / "b.png").stat().st_size > 1.5 * (tmp_path / "plain.png").stat().st_size
 
 
 def test_replay_prints_errors_and_exact_has_none(tiny_scenario: Path, tmp_path: Path) -> None:
@@ -257,6 +262,8 @@ def test_help_and_version() -> None:
         assert f"log2sim {name}" in result.output or f" {name} " in result.output
         if name in ("reconstruct", "replay", "edit", "plot", "view", "evaluate", "bench", "synth"):
             assert "--out" in result.output
+    shown = run("export", "--help")
+    assert all(name in shown.out.replace(",", " ").replace(".", " ").split() for name in BUILT_IN["export"])
     assert run("--version").out == f"{log2sim.__version__}\n"
     nothing = run()
     assert nothing.code == 2
@@ -306,6 +313,8 @@ def test_edit_changes_a_scenario_that_then_replays_and_plots(tmp_path: Path) -> 
         assert run(*command).code == 0
     only = run("edit", source, "--only", "ego,bus_1", "--only", "car_turning", "--out", out, "--overwrite", "--quiet")
     assert (only.code, only.out, only.err) == (0, "", "")
+    assert "1 edit, 1 agent over 5.2 s" in run("edit", source, "--only", "ego", "--out", out, "--overwrite").out
+    run("edit", source, "--only", "ego,bus_1,car_turning", "--out", out, "--overwrite")
     assert [a["id"] for a in read(out)["agents"]] == ["ego", "bus_1", "car_turning"]
 
 
@@ -318,6 +327,41 @@ def test_edit_warns_and_strict_fails_with_6(tmp_path: Path) -> None:
     strict = run(*arguments, "--strict", "--quiet")
     assert strict.code == 6
     assert "'ego' and 'bus_1' collide" in strict.err
+    replayed = run("replay", tmp_path / "e.json", "--out", tmp_path / "r.json")
+    assert replayed.code == 0, replayed.err
+    assert run("validate", tmp_path / "r.json").code == 0
+
+
+def test_a_replay_never_replaces_its_scenario(tiny_scenario: Path) -> None:
+    before = tiny_scenario.read_bytes()
+    ran = run("replay", tiny_scenario, "--out", tiny_scenario, "--overwrite")
+    assert ran.code == 2
+    assert "is the scenario itself" in ran.err
+    assert tiny_scenario.read_bytes() == before
+
+
+def test_who_reacts_is_named_by_ids_even_if_they_hold_a_comma(tiny_scenario: Path, tmp_path: Path) -> None:
+    document = read(tiny_scenario)
+    movers = [a for a in document["agents"] if not a["static"]]
+    movers[-1]["id"] = "a, b"
+    (tmp_path / "s.json").write_text(json.dumps(document))
+    ran = run("replay", tmp_path / "s.json", "--react", "a, b", "--out", tmp_path / "r.json", "--quiet")
+    assert (ran.code, ran.err) == (0, "")
+    drivers = {a["id"]: a["driver"] for a in read(tmp_path / "r.json")["agents"]}
+    assert [k for k, v in drivers.items() if v == "reactive"] == ["a, b"]
+
+
+def test_a_replay_of_another_scenario_is_shown_with_a_warning(tiny_scenario: Path, tmp_path: Path) -> None:
+    other = Path(__file__).resolve().parents[1] / "samples/crossing/truth.json"
+    run("replay", other, "--mode", "exact", "--out", tmp_path / "r.json")
+    for command, name in (("plot", "p.png"), ("view", "v.html")):
+        ran = run(command, tiny_scenario, "--replay", tmp_path / "r.json", "--out", tmp_path / name)
+        assert ran.code == 0
+        assert "r.json replays 'crossing', not 'tiny'" in ran.out
+        assert "warning" not in run(command, other, "--replay", tmp_path / "r.json", "--out", tmp_path / f"o{name}").out
+        run("edit", other, "--remove", "bus_1", "--out", tmp_path / "e.json", "--overwrite")
+        fewer = run(command, tmp_path / "e.json", "--replay", tmp_path / "r.json", "--out", tmp_path / f"e{name}")
+        assert "another version of 'crossing': 1 of its 12 agents are not in it" in fewer.out
 
 
 @pytest.mark.parametrize(

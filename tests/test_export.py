@@ -169,12 +169,29 @@ def test_an_unknown_format_lists_the_known(tmp_path: Path) -> None:
     assert names(tmp_path) == []
 
 
+def test_a_folder_that_exists_may_be_a_file_system_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    folder, move = tmp_path / "mounted", Path.replace
+
+    def within(source: Path, target: Path) -> Path:
+        if source.is_relative_to(folder) != target.is_relative_to(folder):
+            raise OSError(18, "Invalid cross-device link")
+        return move(source, target)
+
+    folder.mkdir()
+    monkeypatch.setattr(Path, "replace", within)
+    assert run("export", SAMPLE, "--to", "csv", "--out", folder).code == 0
+    assert (names(tmp_path), names(folder)) == (["mounted"], ["agents.csv"])
+
+
 def test_a_file_where_the_folder_should_be_is_named(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("mine")
     ran = run("export", SAMPLE, "--to", "csv", "--out", tmp_path / "out")
     assert ran.code == 2
     assert "is a file; give the name of a folder" in ran.line
     assert (tmp_path / "out").read_text() == "mine"
+    below = run("export", SAMPLE, "--to", "csv", "--out", tmp_path / "out" / "deeper")
+    assert below.code == 2
+    assert "out is a file and not a folder" in below.line
 
 
 def test_what_each_format_loses_stands_in_the_readme() -> None:

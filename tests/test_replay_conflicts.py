@@ -148,6 +148,16 @@ def test_who_stops_on_the_crossing_leaves_when_it_drives_on():
     assert (found.came_row - found.left_row) * SPACING_S == pytest.approx((3.5 - 3 / 8) - 2.3, abs=5e-4)
 
 
+def test_the_time_between_those_who_collide_is_zero_and_never_negative():
+    first = (lambda t: 10 * (t - 1.0), 0.0, 0.0)
+    for late_s in (0.0, 0.17, 0.4, 0.85):  # the last is 0.05 s less than it takes to get out of each other's way
+        found = encroachments(
+            boxes_of(first, (0.0, lambda t, late_s=late_s: 5 * (t - 1.0 - late_s), np.pi / 2)), SPACING_S
+        )
+        assert np.all(found.came_row == found.left_row)
+        assert len(found.first) == 1
+
+
 def pairs_of(*tracks):
     return len(encroachments(boxes_of(*tracks), SPACING_S).first)
 

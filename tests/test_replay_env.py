@@ -143,3 +143,14 @@ def test_without_gymnasium_the_extra_is_named(monkeypatch):
     monkeypatch.setattr(builtins, "__import__", missing)
     with pytest.raises(MissingExtra, match=r"pip install 'log2sim\[gym\]'"):
         import log2sim.replay.env  # noqa: F401
+
+
+def test_steps_before_the_reset_and_actions_that_are_no_two_numbers_are_refused():
+    env = made(scenario_of(line("ego", 0, speed=10, duration_s=2)))
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"call reset\(\)"):
+        env.step([0.0, 0.0])
+    env.reset()
+    for action in ([np.nan, 0.0], [np.inf, 0.0], [0.0], None, [[0.0, 0.0]]):
+        with pytest.raises(ValueError, match="expected two finite numbers from -1 to 1"):
+            env.step(action)
+    assert env.step([0.0, 0.0])[4]["t_s"] == pytest.approx(0.1)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from replay_maneuvers import agent_from, scenario_of
+from replay_maneuvers import agent_from, driven, lane_change, scenario_of
 
 from log2sim.errors import CheckFailed
 from log2sim.replay import check_strict, replay, require_strict
 from log2sim.replay.assess.boxes import Boxes, rectangles_overlap
 from log2sim.replay.assess.collisions import LOG_MARGIN_M, LOG_WINDOW_S, collisions, contacts
 from log2sim.replay.assess.metrics import tracking_errors
+from log2sim.replay.assess.summary import summarize
 from log2sim.replay.path import path_of
 
 T_S = np.arange(0, 41) * 0.1
@@ -242,3 +243,20 @@ def test_overall_errors_weigh_every_sample_alike():
         np.sqrt(samples @ np.array([long, short]) ** 2 / samples.sum()), abs=2e-6
     )
     assert metrics["followers"] == 2
+
+
+def test_errors_across_are_of_all_who_keep_to_the_way_and_a_dash_stands_where_nobody_has_one():
+    agents = [
+        driven(lambda t: np.full_like(t, 15.0), lane_change, 6.0, id="ego"),
+        driven(lambda t: np.full_like(t, 15.0), lane_change, 6.0, start=(0, 40, 0), id="other"),
+    ]
+    done = replay(scenario_of(*agents), agents=["ego", "other"])
+    assert {a.driver for a in done.agents} == {"reactive"}
+    worst = max(done.metrics["by_agent"][k]["cross_track_max_m"] for k in ("ego", "other"))
+    assert (done.metrics["cross_track_max_m"], done.metrics["followers"]) == (worst, 0)
+    assert worst > 0.001
+    assert summarize(done).startswith(
+        f"cross-track {done.metrics['cross_track_rms_m']:.3f} m rms, {worst:.3f} m max · along-track - · speed -"
+    )
+    assert summarize(replay(scenario_of())).startswith("cross-track - · along-track - · speed -")
+    assert summarize(replay(scenario_of(*agents), mode="exact")).startswith("cross-track 0.000 m rms")

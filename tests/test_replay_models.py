@@ -59,6 +59,17 @@ def test_what_leans_is_kinematic_and_what_a_policy_drives_is_dynamic():
     assert (policed.driver, policed.model) == ("policy", "dynamic")
 
 
+@pytest.mark.parametrize("speed", [-6.0, -12.0])
+def test_what_reverses_fast_rolls_and_keeps_to_its_way_where_slips_would_lead_it_off(speed):
+    swerve = cruise(speed, lambda s: 4.5 / speed**2 * np.sin(2 * np.pi * s / 30))
+    rolling, slipping = (replay(scenario_of(swerve), model=m) for m in ("auto", "dynamic"))
+    assert rolling.agents[0].model == "kinematic"
+    assert rolling.agents[0].model_reason.startswith(f"reverses at up to {-speed:.1f} m/s")
+    assert rolling.metrics["cross_track_max_m"] < 0.1 < slipping.metrics["cross_track_max_m"]
+    forward = replay(scenario_of(cruise(-speed, lambda s: 4.5 / speed**2 * np.sin(2 * np.pi * s / 30))))
+    assert forward.agents[0].model == "dynamic"
+
+
 @pytest.mark.parametrize("model", ["kinematic", "dynamic", "single-track"])
 def test_a_model_that_is_asked_for_moves_every_vehicle(model):
     result = replay(scenario_of(cruise(10.0)), model=model)

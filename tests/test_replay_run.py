@@ -211,7 +211,7 @@ def test_policies_are_found_by_name(tmp_path, monkeypatch):
     assert load_policy("my_driver_of_tests:Kind.drive")(None) == 1
     for name, said in (
         ("my_driver_of_tests", "expected module:attribute"),
-        ("my_driver_of_tests:absent", "'absent' is not in"),
+        ("my_driver_of_tests:absent", "there is no 'absent' in 'my_driver_of_tests'"),
         ("my_driver_of_tests:number", "expected a callable"),
         ("broken_driver_of_tests:drive", "no such wheel"),
         ("no_module_of_tests:drive", "cannot be imported"),

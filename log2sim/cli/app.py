@@ -12,7 +12,7 @@ from log2sim import __version__
 
 app = typer.Typer(
     name="log2sim",
-    help="Reconstruct driving logs as scenarios that a simulator can run.",
+    help="Reconstruct driving logs as scenarios that a simulator can run. Add --debug for tracebacks.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -41,6 +41,11 @@ def say(text: str, *, quiet: bool = False) -> None:
     if not quiet:
         sys.stdout.write(text + "\n")
         sys.stdout.flush()
+
+
+def counted(count: int, noun: str) -> str:
+    """A number of things, in words."""
+    return f"{count} {noun}{'s' * (count != 1)}"
 
 
 @app.callback(invoke_without_command=True)

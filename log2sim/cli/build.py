@@ -84,40 +84,52 @@ def replay(
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Replay file to write.")] = None,
     mode: Annotated[str, typer.Option(help="pid or exact.")] = "pid",
     model: Annotated[str, typer.Option(help="Vehicle model: auto, kinematic, dynamic or single-track.")] = "auto",
-    dt: Annotated[float, typer.Option(help="Step in s.")] = 0.01,
+    dt: Annotated[float, typer.Option(help="Step in s, from 0.0005 to 1.")] = 0.01,
     ego: Annotated[
         str | None, typer.Option(metavar="MODULE|FILE.py:ATTRIBUTE", help="Policy that drives the ego.")
     ] = None,
     agents: Annotated[str, typer.Option(help="What the others do: log, or reactive (brake for what is new).")] = "log",
     react: Annotated[str | None, typer.Option(metavar="ID,ID", help="Only these react.")] = None,
     simulator: Annotated[str, typer.Option(help="own, or carla: a CARLA server moves the agents.")] = "own",
-    host: Annotated[str, typer.Option(help="With carla: where its server runs.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="With carla: its port.")] = 2000,
+    host: Annotated[str | None, typer.Option(help="With carla: where its server runs, else 127.0.0.1.")] = None,
+    port: Annotated[int | None, typer.Option(help="With carla: its port, else 2000.", min=1, max=65535)] = None,
     map: Annotated[str | None, typer.Option(metavar="TOWN|FILE.xodr", help="With carla: world to load first.")] = None,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit 6 when a limit is broken.")] = False,
+    strict: Annotated[
+        bool,
+        typer.Option("--strict", help="Exit 6 when a limit is broken: of --limit, new collisions, far off the path."),
+    ] = False,
     limit: Annotated[
-        list[str] | None, typer.Option(metavar="METRIC=VALUE", help="A limit, e.g. min_ttc_s=1; with --strict.")
+        list[str] | None,
+        typer.Option(metavar="METRIC=VALUE", help="Tell who breaks it, e.g. min_ttc_s=1; see --strict."),
     ] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
     """Let vehicles drive a scenario."""
+    from log2sim.cli.change import ids_of
     from log2sim.errors import ConfigError
     from log2sim.files import check_targets
+    from log2sim.progress import progress
     from log2sim.replay import check_limits, host_named, load_policy, parse_limits, require_strict
     from log2sim.replay import replay as run
     from log2sim.replay.assess.summary import summarize
     from log2sim.scenario import Scenario
 
     check_targets(out, overwrite=overwrite)
+    if out is not None and out.resolve() == scenario.resolve():
+        raise ConfigError(f"{out}: is the scenario itself, which a replay must not replace; choose another name")
     if react is not None and agents != "log":
         raise ConfigError("--react names the agents that react, --agents reactive means all: give one of them")
-    chosen = agents if react is None else [name.strip() for name in react.split(",")]
     limits = parse_limits(limit or ())
     loaded = Scenario.load(scenario)
+    chosen = agents if react is None else list(ids_of(loaded, [react]))
     policy = load_policy(ego) if ego is not None else None
     moved_by = host_named(simulator, host, port, map)
-    result = run(loaded, mode=mode, model=model, dt_s=dt, ego=policy, agents=chosen, host=moved_by)
+    with progress(quiet=quiet) as tell:
+        result = run(
+            loaded, mode=mode, model=model, dt_s=dt, ego=policy, agents=chosen, host=moved_by,
+            progress=lambda done, total: tell("replay", done, total),
+        )  # fmt: skip
     if out is not None:
         result.save(out)
     say(summarize(result), quiet=quiet)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from log2sim.cli.app import Overwrite, Quiet, ScenarioPath, app, say
+from log2sim.cli.app import Overwrite, Quiet, ScenarioPath, app, counted, say
 
 if TYPE_CHECKING:
     from log2sim.edit import Edit
@@ -54,10 +54,10 @@ def edit(
     result.scenario.save(out)
     for warning in result.warnings:
         say(f"warning: {warning}", quiet=quiet)
-    changed, seconds = len(edits), result.scenario.duration_s
+    edited = result.scenario
     say(
-        f"{out}: {changed} edit{'s' * (changed != 1)}, {len(result.scenario.agents)} agents over {seconds:.1f} s, "
-        f"{len(result.warnings)} warning{'s' * (len(result.warnings) != 1)}",
+        f"{out}: {counted(len(edits), 'edit')}, {counted(len(edited.agents), 'agent')} over {edited.duration_s:.1f} s, "
+        f"{counted(len(result.warnings), 'warning')}",
         quiet=quiet,
     )
     if strict:
@@ -68,15 +68,16 @@ def _choices(scenario: Scenario, only: Changes, remove: Changes) -> Iterator[Edi
     """The edits that say who is there."""
     from log2sim.edit import Only, Remove
 
-    known = {a.id for a in scenario.agents}
-
-    def ids(entries: Changes) -> Iterator[str]:
-        for entry in entries or ():
-            yield from [entry] if entry in known else (name.strip() for name in entry.split(","))
-
     if only:
-        yield Only(tuple(ids(only)))
-    yield from map(Remove, ids(remove))
+        yield Only(tuple(ids_of(scenario, only)))
+    yield from map(Remove, ids_of(scenario, remove or ()))
+
+
+def ids_of(scenario: Scenario, entries: Iterable[str]) -> Iterator[str]:
+    """The ids that entries such as "A,B" name; an id of the scenario may itself hold a comma."""
+    known = {a.id for a in scenario.agents}
+    for entry in entries:
+        yield from [entry] if entry in known else (name.strip() for name in entry.split(","))
 
 
 def _motions(changes: dict[str, Changes]) -> Iterator[Edit]:

@@ -11,6 +11,7 @@ import typer
 from log2sim.cli.app import ConfigFile, Format, LogPath, Overwrite, Quiet, ScenarioPath, Sequence, Settings, app, say
 
 if TYPE_CHECKING:
+    from log2sim.replay import Replay
     from log2sim.scenario import Scenario
     from log2sim.types import Log
 
@@ -32,11 +33,7 @@ def plot(
 
     check_targets(out, overwrite=overwrite)
     loaded = Scenario.load(scenario)
-    replayed = None
-    if replay is not None:
-        from log2sim.replay import Replay
-
-        replayed = Replay.load(replay)
+    replayed = load_replay(replay, loaded) if replay is not None else None
     picture = None
     if background is not None:
         from log2sim.logs import open_log
@@ -123,6 +120,21 @@ def bench(
     write_json(out / "bench.json", document(result))
     write_picture(result, out / "bench.png")
     say(format_table(result), quiet=quiet)
+
+
+def load_replay(path: Path, scenario: Scenario, *, quiet: bool = False) -> Replay:
+    """A replay to show with a scenario; says so when it is one of another."""
+    from log2sim.replay import Replay as Replayed
+
+    loaded = Replayed.load(path)
+    known = {a.id for a in scenario.agents}
+    strangers = [a.id for a in loaded.agents if a.id not in known]
+    if loaded.scenario != scenario.name:
+        say(f"warning: {path} replays '{loaded.scenario}', not '{scenario.name}'; nothing need fit", quiet=quiet)
+    elif strangers:
+        count = f"{len(strangers)} of its {len(loaded.agents)} agents"
+        say(f"warning: {path} replays another version of '{scenario.name}': {count} are not in it", quiet=quiet)
+    return loaded
 
 
 def load_truth(path: Path, scenario: Scenario, sequence: str | None) -> Scenario:

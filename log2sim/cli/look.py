@@ -27,7 +27,10 @@ def validate(
     format: Format = "auto",
     sequence: Sequence = None,
 ) -> None:
-    """Check a file or every record of a log; exits 3 with the problems."""
+    """Check a file or every record of a log.
+
+    Exits with 3 and the problems, if there are any.
+    """
     from log2sim.errors import LogError
 
     if path.is_dir():
@@ -67,7 +70,10 @@ def config(
     file: ConfigFile = None,
     settings: Settings = None,
 ) -> None:
-    """Print all settings as TOML: the defaults, or what a file and --set make of them."""
+    """Print all settings as TOML.
+
+    The defaults, or what a file and --set make of them.
+    """
     from log2sim.config import Config
 
     say(Config.load(file, settings or ()).to_toml().rstrip())

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from log2sim.cli.app import Overwrite, Quiet, ScenarioPath, Sequence, app, say
+from log2sim.cli.app import Overwrite, Quiet, ScenarioPath, Sequence, app, counted, say
 
 
 @app.command()
@@ -21,15 +21,14 @@ def view(
     quiet: Quiet = False,
 ) -> None:
     """Make a page that plays a scenario in a browser."""
-    from log2sim.cli.judge import load_truth
+    from log2sim.cli.judge import load_replay, load_truth
     from log2sim.files import check_targets
-    from log2sim.replay import Replay
     from log2sim.scenario import Scenario
     from log2sim.view import write_page
 
     check_targets(out, overwrite=overwrite)
     loaded = Scenario.load(scenario)
-    replayed = Replay.load(replay) if replay is not None else None
+    replayed = load_replay(replay, loaded, quiet=quiet) if replay is not None else None
     known = load_truth(truth, loaded, sequence) if truth is not None else None
     write_page(loaded, out, truth=known, replay=replayed, overwrite=overwrite)
-    say(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {len(loaded.agents)} agents", quiet=quiet)
+    say(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {counted(len(loaded.agents), 'agent')}", quiet=quiet)

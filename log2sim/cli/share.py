@@ -9,16 +9,23 @@ import typer
 
 from log2sim.cli.app import Overwrite, Quiet, ScenarioPath, app, say
 
+MOST_NOTES = 5
+FORMATS = "openscenario, carla, csv, scenarionet, commonroad, osi, mcap, rerun"  # written out: --help imports nothing
+
 
 @app.command()
 def export(
     scenario: ScenarioPath,
-    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help="Format; an unknown one lists the known.")],
+    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help=f"One of {FORMATS}.")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write into.")],
-    revision: Annotated[str | None, typer.Option(help="Revision of the format's standard.")] = None,
-    map: Annotated[Path | None, typer.Option(metavar="FILE", help="Road network to use instead of an own one.")] = None,
-    mode: Annotated[str | None, typer.Option(help="For scripts that move agents: exact or pid.")] = None,
-    log: Annotated[Path | None, typer.Option(metavar="LOG", help="Log whose pictures and points go along.")] = None,
+    revision: Annotated[str | None, typer.Option(help="openscenario: 1.0, 1.1 or 1.2.")] = None,
+    map: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="openscenario, carla: OpenDRIVE to use, not an own.")
+    ] = None,
+    mode: Annotated[str | None, typer.Option(help="carla: exact or pid.")] = None,
+    log: Annotated[
+        Path | None, typer.Option(metavar="LOG", help="mcap, rerun: log whose pictures and points go along.")
+    ] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
@@ -34,8 +41,11 @@ def export(
     files = run(loaded, to, out, Options(revision, map, mode, opened), overwrite=overwrite)
     for file in files:
         say(f"{file}: written", quiet=quiet)
-    for remark in remarks(loaded):
-        say(f"note: {remark}", quiet=quiet)
+    notes = remarks(loaded)
+    for note in notes[:MOST_NOTES]:
+        say(f"note: {note}", quiet=quiet)
+    if len(notes) > MOST_NOTES:
+        say(f"note: and {len(notes) - MOST_NOTES} more such pairs", quiet=quiet)
 
 
 @app.command(name="import")

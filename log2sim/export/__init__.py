@@ -11,7 +11,7 @@ from typing import Protocol
 from log2sim import registry
 from log2sim.errors import ConfigError
 from log2sim.export.checks import require_exportable
-from log2sim.files import refuse_existing
+from log2sim.files import refuse_below_file, refuse_existing
 from log2sim.scenario import Scenario
 from log2sim.types import Log
 
@@ -83,9 +83,12 @@ def export(
     folder = Path(out)
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"{folder}: is a file; give the name of a folder")
+    refuse_below_file(folder)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        # Within a folder that exists, since it may be another file system than what is above it.
+        beside = folder if folder.is_dir() else folder.parent
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=beside))
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be written: {error.strerror or error}") from error
     try:

@@ -234,6 +234,7 @@ def _write_mp4(frames: Iterator[Image], path: Path, asked_for: Path) -> None:
 
     first = next(frames)
     height, width = (n // 2 * 2 for n in first.shape[:2])  # the codec wants even sides
+    path.touch()  # says so when nothing can be written here, of which OpenCV tells nothing
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), FPS, (width, height))
     try:
         if not writer.isOpened():

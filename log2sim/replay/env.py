@@ -96,6 +96,8 @@ class ScenarioEnv(gymnasium.Env[Seen, Any]):
         self.scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
         self.world = open_world(self.scenario, dt_s=dt_s, agents=agents, sight_m=sight_m)
         self.render_mode, self._steps = render_mode, max(1, round(hold_s / dt_s))
+        self._seen: Observation
+        self._begun = False
         ego = self.world.ego
         if ego is None:  # open_world refuses such a scenario
             raise ValueError("the world has no ego to drive")
@@ -119,12 +121,14 @@ class ScenarioEnv(gymnasium.Env[Seen, Any]):
         self.world.restart()
         while not self.world.ego_lives:
             self.world.advance()
-        self._seen = self.world.observe()
+        self._seen, self._begun = self.world.observe(), True
         return self._shown(), {"t_s": self._seen.t_s}
 
     def step(self, action: Any) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
-        """Hold an action for `hold_s`."""
-        pedal, wheel = (float(v) for v in np.clip(action, -1.0, 1.0))
+        """Hold an action for `hold_s`; `ValueError` when it is not two finite numbers."""
+        if not self._begun:
+            raise gymnasium.error.ResetNeeded("the episode has not begun: call reset() before step()")
+        pedal, wheel = _shares(action)
         brake, throttle = self.accel_limits_mps2
         before_m, begin_s = self._seen.path.progress_m, self._seen.t_s
         self.world.steer(Controls(pedal * (throttle if pedal > 0 else brake), wheel * self.max_steer_rad))
@@ -152,7 +156,7 @@ class ScenarioEnv(gymnasium.Env[Seen, Any]):
 
     def render(self) -> Any:
         """The surroundings of the ego from above, (400, 400, 3) uint8, its front to the right; None without a render mode."""
-        return _picture(self._seen) if self.render_mode == "rgb_array" else None
+        return _picture(self._seen) if self._begun and self.render_mode == "rgb_array" else None
 
     def _shown(self) -> Seen:
         """The observation as arrays within the bounds of its space."""
@@ -172,6 +176,15 @@ class ScenarioEnv(gymnasium.Env[Seen, Any]):
         }
         shown = {k: np.clip(v.astype(np.float32), -self._bounds[k], self._bounds[k]) for k, v in arrays.items()}
         return {**shown, "others_mask": (np.arange(count) < len(near)).astype(np.int8)}
+
+
+def _shares(action: Any) -> tuple[float, float]:
+    """The pedal and the steering of an action, as shares from -1 to 1."""
+    values = np.asarray(action, dtype=np.float64)
+    if values.shape != (2,) or not np.isfinite(values).all():
+        raise ValueError(f"action {action!r}: expected two finite numbers from -1 to 1, pedal and steering")
+    pedal, wheel = np.clip(values, -1.0, 1.0).tolist()
+    return pedal, wheel
 
 
 def _turned(ego: EgoState, x: Array, y: Array) -> tuple[Array, Array]:

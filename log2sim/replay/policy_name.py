@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import Any
 
 from log2sim.errors import ConfigError
+from log2sim.registry import nearest
 from log2sim.replay.policy import Policy
 
 
@@ -37,7 +38,8 @@ def load_policy(name: str) -> Policy:
         raise ConfigError(f"policy '{name}': '{source}' cannot be imported: {type(error).__name__}: {error}") from error
     for part in attribute.split("."):
         if not hasattr(target, part):
-            raise ConfigError(f"policy '{name}': '{part}' is not in {target!r}")
+            known = [key for key in vars(target) if not key.startswith("_")] if hasattr(target, "__dict__") else []
+            raise ConfigError(f"policy '{name}': there is no '{part}' in '{source}'{nearest(part, known)}")
         target = getattr(target, part)
     if isinstance(target, type):
         try:

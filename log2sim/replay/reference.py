@@ -59,19 +59,23 @@ def vehicle_reference(
     """The table of a vehicle. Columns "..._ahead" are those of a later time, which makes up for the actuators' lag."""
     course, departure_m = drivable_course(path, limits)
     first, t = _grid(path)
-    gear, stands = _gears(_motion(course, t)[3])
+    motion = _motion(course, t)
+    gear, stands = _gears(motion[3])
 
-    def exact(at_s: Array) -> Array:
+    def rows_at(at_s: Array, motion: Array) -> Array:
         rows = np.empty((len(VEHICLE_COLUMNS), len(at_s)))
-        rows[:4] = _motion(course, at_s)
+        rows[:4] = motion
         rows[4] = np.interp(at_s + accel_ahead_s, course.t_s, course.accel_mps2)
         rows[5] = np.interp(at_s + curvature_ahead_s, course.t_s, course.curvature_1pm)
         k = np.minimum(np.searchsorted(t, at_s + accel_ahead_s), len(t) - 1)
         rows[6], rows[7] = gear[k], stands[k]
         return rows.T
 
+    def exact(at_s: Array) -> Array:
+        return rows_at(at_s, _motion(course, at_s))
+
     flags = _flags(path, course, departure_m, max_curvature_1pm)
-    return Reference(path, first, exact(t), exact, limits.offset_m, flags)
+    return Reference(path, first, rows_at(t, motion), exact, limits.offset_m, flags)
 
 
 def drivable_course(path: Path, limits: Limits) -> tuple[Course, Array]:

@@ -112,7 +112,17 @@ def open_world(
     agents: str | Collection[str] = "log",
     sight_m: float = SIGHT_M,
 ) -> World:
-    """A scenario as a world to be moved step by step: with `drives_ego` by controls of the caller's. See `replay`."""
+    """A scenario as a world to be moved step by step: with `drives_ego` by controls of the caller's. See `replay`.
+
+    Examples
+    --------
+    >>> world = open_world(scenario)
+    >>> while not world.done:
+    ...     if world.ego_lives:
+    ...         seen = world.observe()  # an Observation, as policies get it
+    ...         world.steer(Controls(accel_mps2=1.0, steer_rad=0.0))
+    ...     world.advance()
+    """
     if mode not in MODES:
         raise ConfigError(f"mode '{mode}': expected one of {', '.join(MODES)}")
     if not DT_RANGE_S[0] <= dt_s <= DT_RANGE_S[1]:

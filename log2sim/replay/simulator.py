@@ -97,21 +97,26 @@ def simulator_named(model: str) -> Simulator:
 HOSTS = ("own", "carla")
 
 
-def host_named(name: str, address: str, port: int, map: str | None) -> Host | None:
+def host_named(name: str, address: str | None, port: int | None, map: str | None) -> Host | None:
     """The simulator of a name, at an address and port, with a town or an OpenDRIVE file to load; None for the own one.
 
     Raises
     ------
     ConfigError
-        When there is none of that name, or the file does not exist.
+        When there is none of that name, it has no use for what is given, or the file does not exist.
     """
     if name not in HOSTS:
         raise ConfigError(f"unknown simulator '{name}'{nearest(name, list(HOSTS))}; known: {', '.join(HOSTS)}")
     if name == "own":
+        if not address is port is map is None:
+            raise ConfigError("--host, --port and --map are for --simulator carla; add it, or leave them out")
         return None
     from log2sim.replay.carla.simulator import CarlaSimulator, Server
 
     opendrive = Path(map) if map is not None and map.endswith(".xodr") else None
     if opendrive is not None and not opendrive.is_file():
         raise ConfigError(f"--map: {opendrive}: no such file")
-    return CarlaSimulator(Server(address, port, town=None if opendrive else map, opendrive=opendrive))
+    own = Server()
+    return CarlaSimulator(
+        Server(address or own.host, port or own.port, town=None if opendrive else map, opendrive=opendrive)
+    )

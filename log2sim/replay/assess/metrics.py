@@ -57,9 +57,9 @@ def tracking_errors(path: Path, t_s: Array, x_m: Array, y_m: Array, near_s: Arra
     reach = round(SEARCH_S / SEARCH_STEP_S)
     middle = np.rint(((t_s if near_s is None else near_s) - begin_s) / SEARCH_STEP_S).astype(np.intp)
     near = np.clip(middle[:, None] + np.arange(-reach, reach), 0, len(square) - 1)
-    dx, dy, sx, sy = x_m[:, None] - px[near], y_m[:, None] - py[near], ux[near], uy[near]
+    dx, dy, sx, sy = x_m[:, None] - px.take(near), y_m[:, None] - py.take(near), ux.take(near), uy.take(near)
     slope = np.divide(1.0, square, out=np.zeros_like(square), where=moves)
-    share = np.clip((dx * sx + dy * sy) * slope[near], 0.0, 1.0)
+    share = np.clip((dx * sx + dy * sy) * slope.take(near), 0.0, 1.0)
     best = np.argmin((dx - share * sx) ** 2 + (dy - share * sy) ** 2, axis=1)
     row = np.arange(len(t_s))
     k, dx, dy = near[row, best], dx[row, best], dy[row, best]
@@ -83,19 +83,33 @@ def agent_metrics(errors: Errors) -> dict[str, Any]:
     }
 
 
-def overall(by_agent: Mapping[str, Mapping[str, Any]], samples: Mapping[str, int]) -> dict[str, Any]:
-    """Errors over all followers, every stored sample counting alike; 0 where nobody follows."""
-    ids = [k for k in by_agent if samples[k] > 0]
-    total = sum(samples[k] for k in ids)
+def overall(
+    by_agent: Mapping[str, Mapping[str, Any]], on_time: Mapping[str, int], on_way: Mapping[str, int]
+) -> dict[str, Any]:
+    """Errors over all followers, every stored sample counting alike; 0 where nobody follows.
+
+    Parameters
+    ----------
+    by_agent : by id
+        The errors of each agent.
+    on_time, on_way : by id
+        The samples of those who are where the log is at each moment, and of all who keep to its way, however late.
+    """
     out: dict[str, Any] = {}
-    for key in ("cross_track_rms_m", "along_track_rms_m", "speed_rms_mps", "yaw_rms_rad"):
-        square = sum(samples[k] * by_agent[k][key] ** 2 for k in ids)
-        out[key] = round(float(np.sqrt(square / total)), 6) if total else 0.0
-    out["cross_track_max_m"] = max((by_agent[k]["cross_track_max_m"] for k in ids), default=0.0)
-    off = sum(samples[k] * by_agent[k]["off_path_share"] for k in ids)
-    out["off_path_share"] = round(off / total, 6) if total else 0.0
-    out["followers"] = len(ids)
+    for key, samples in (
+        ("cross_track_rms_m", on_way), ("along_track_rms_m", on_time), ("speed_rms_mps", on_time), ("yaw_rms_rad", on_time),
+    ):  # fmt: skip
+        out[key] = round(float(np.sqrt(_mean({k: e[key] ** 2 for k, e in by_agent.items()}, samples))), 6)
+    out["cross_track_max_m"] = max((e["cross_track_max_m"] for k, e in by_agent.items() if k in on_way), default=0.0)
+    out["off_path_share"] = round(_mean({k: e["off_path_share"] for k, e in by_agent.items()}, on_way), 6)
+    out["followers"] = len(on_time)
     return out
+
+
+def _mean(values: Mapping[str, float], samples: Mapping[str, int]) -> float:
+    """Mean of the values that have samples, weighted by their number; 0 without any."""
+    total = sum(samples.values())
+    return sum(count * values[k] for k, count in samples.items()) / total if total else 0.0
 
 
 def _nearest_times(path: Path, x_m: Array, y_m: Array) -> Array:

@@ -59,9 +59,10 @@ def assess(
         for a in agents
         if a.id in errors
     }
-    samples = {a.id: len(a) if a.driver == "pid" else 0 for a in agents}
+    on_time = {a.id: len(a) for a in agents if a.driver == "pid"}
+    on_way = on_time | {a.id: len(a) for a in agents if a.driver == "reactive"}
     return {
-        **overall(by_agent, samples),
+        **overall(by_agent, on_time, on_way),
         "collisions": events,
         "new_collisions": sum(not e["in_log"] for e in events),
         "min_ttc": least(near, "min_ttc"),

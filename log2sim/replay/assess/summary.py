@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from log2sim.replay.assess.conflicts import least
+from log2sim.replay.assess.run import FOLLOWING
 from log2sim.replay.result import Replay
 
 MOST_LISTED = 5
@@ -15,15 +16,14 @@ MOST_LISTED = 5
 def summarize(replay: Replay) -> str:
     """Errors in one line, what agents did to each other, what moved them, then the first collisions, new ones first.
 
-    Where a policy drives the ego, the times are those of the ego.
+    Where a policy drives the ego, the times are those of the ego. An error that no agent can have is a dash.
     """
     m = replay.metrics
     driven = any(a.driver == "policy" for a in replay.agents)
     near = [e for e in m["conflicts"] if e["ego"] or not driven]
     whose = " of the ego" if driven else ""
     lines = [
-        f"cross-track {m['cross_track_rms_m']:.3f} m rms, {m['cross_track_max_m']:.3f} m max · "
-        f"along-track {m['along_track_rms_m']:.3f} m rms · speed {m['speed_rms_mps']:.3f} m/s rms",
+        _errors(replay),
         f"{_counted(len(m['collisions']), 'collision')}, {m['new_collisions']} that the log does not have · "
         f"least time to collision{whose} {_least(near, 'min_ttc')} · post-encroachment time {_least(near, 'pet')}",
     ]
@@ -33,6 +33,18 @@ def summarize(replay: Replay) -> str:
     if len(events) > MOST_LISTED:
         lines.append(f"  and {len(events) - MOST_LISTED} more")
     return "\n".join(lines)
+
+
+def _errors(replay: Replay) -> str:
+    """Errors across of all who keep to the way of the log, and those in time of all who also do as it did."""
+    m, drivers = replay.metrics, {a.driver for a in replay.agents}
+    on_time = bool(drivers & {*FOLLOWING})
+    across, along, speed = "-", "-", "-"
+    if on_time or "reactive" in drivers:
+        across = f"{m['cross_track_rms_m']:.3f} m rms, {m['cross_track_max_m']:.3f} m max"
+    if on_time:
+        along, speed = f"{m['along_track_rms_m']:.3f} m rms", f"{m['speed_rms_mps']:.3f} m/s rms"
+    return f"cross-track {across} · along-track {along} · speed {speed}"
 
 
 def _models(replay: Replay) -> list[str]:

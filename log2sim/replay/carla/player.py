@@ -26,6 +26,7 @@ VERSION = 1
 NO_CLIENT = 5  # exit code
 Place = tuple[float, float, float, float]  # box center x, y, its lowest face z, yaw in rad
 MARGIN_S = 1e-6
+ANSWER_S = 10.0  # a server that is there says its version at once, while a world takes long to load
 STANDSTILL_MPS = 0.05  # physics never rests entirely
 SPAWN_HEIGHTS_M = (0.3, 2.0, 5.0, 10.0, 20.0, 40.0)  # something may stand where an agent appears
 ROAD_WITHIN_M = 30.0
@@ -475,15 +476,17 @@ def load_client() -> ModuleType:
 def connect(carla: ModuleType, host: str, port: int, timeout_s: float) -> Any:
     """A client of a server that answers."""
     client = carla.Client(host, port)
-    client.set_timeout(timeout_s)
+    patience_s = min(timeout_s, ANSWER_S)
+    client.set_timeout(patience_s)
     try:
         client.get_server_version()
     except RuntimeError as error:
         raise ReplayError(
-            f"no CARLA server answers at {host}:{port} within {timeout_s:g} s ({error}); start one (CarlaUE4.sh), or give its "
+            f"no CARLA server answers at {host}:{port} within {patience_s:g} s ({error}); start one (CarlaUE4.sh), or give its "
             "--host and --port",
             3,
         ) from None
+    client.set_timeout(timeout_s)
     return client
 
 
@@ -583,7 +586,9 @@ def arguments(words: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--host", default="127.0.0.1")
     parser.add_argument("--port", type=int, default=2000)
-    parser.add_argument("--timeout", type=float, default=60.0, metavar="S", help="how long to wait for the server")
+    parser.add_argument(
+        "--timeout", type=float, default=60.0, metavar="S", help="how long the server may take, e.g. to load a world"
+    )
     parser.add_argument("--dt", type=float, default=0.05, metavar="S", help="length of a tick, at most 0.1")
     parser.add_argument(
         "--physics", action="store_true", help="with exact: leave physics on, so that velocities are seen"

@@ -26,6 +26,9 @@ A car has it at 3.3 m/s2 sideways, a third of what its tires bear. Polack et al.
 model for planning feasible trajectories for autonomous vehicles?", 2017) take the kinematic model as valid up to half.
 """
 
+FAST_REVERSE_MPS = 3.0
+"""Beyond it tires that slip are steered worse than what rolls: the rear axle leads, and what steers it swings out behind."""
+
 ROUNDS = 4
 """Passes in which slips, the drag of slips and the load that this moves settle."""
 
@@ -49,6 +52,10 @@ def choose(agent: Agent, reference: Reference, parameters: VehicleParameters, wa
     if free:
         return Choice("dynamic", "what a policy drives is not known beforehand")
     speed, curvature = reference.columns[:, SPEED], reference.columns[:, CURVATURE]
+    if speed.min() < -FAST_REVERSE_MPS:
+        return Choice(
+            "kinematic", f"reverses at up to {-speed.min():.1f} m/s, and slips are followed up to {FAST_REVERSE_MPS:g}"
+        )
     aside_mps2 = speed**2 * curvature
     # In steady cornering both axles use the same share of their friction, whatever the place of the center of gravity.
     slip = np.abs(_slip(aside_mps2 / (GRAVITY_MPS2 * parameters.friction), parameters.rear_stiffness_1prad))
