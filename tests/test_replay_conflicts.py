@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from replay_maneuvers import scenario_of
+from replay_scenes import line
 from test_replay_contacts import SPACING_S, T_S, boxes_of
 
+from log2sim.replay import replay
 from log2sim.replay.assess.approach import HORIZON_S, approaches, time_to_touch
 from log2sim.replay.assess.boxes import Boxes, rectangles_overlap
 from log2sim.replay.assess.conflicts import conflicts, least
@@ -231,3 +236,15 @@ def test_a_new_collision_is_zero_and_one_of_the_log_is_left_out_of_the_least():
     assert conflicts(boxes_of(c), np.ones(1, bool), T_S, ["c"], []) == []
     none = np.zeros((len(T_S), 0))
     assert conflicts(Boxes(none, none, none, none, none, np.zeros((0, 3))), np.zeros(0, bool), T_S, [], []) == []
+
+
+@pytest.mark.parametrize("grade", [-0.1, 0.05, 0.1])
+def test_on_a_slope_the_time_to_collision_is_that_on_the_flat_and_under_a_bridge_none(grade):
+    agents = [line("ego", 0, speed=20, duration_s=2), line("slow", 60, speed=5, duration_s=2)]
+
+    def least(height_of):
+        raised = (replace(a, waypoints=replace(a.waypoints, z_m=height_of(a))) for a in agents)
+        return replay(scenario_of(*raised), mode="exact").metrics["min_ttc"]
+
+    assert least(lambda a: grade * a.waypoints.x_m) == least(lambda a: 0 * a.waypoints.x_m) is not None
+    assert least(lambda a: 0 * a.waypoints.x_m + 6 * (a.id == "slow")) is None

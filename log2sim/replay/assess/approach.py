@@ -39,7 +39,7 @@ def approaches(boxes: Boxes, moves: NDArray[np.bool_], spacing_s: float) -> Appr
     Boxes that overlap already have none. It is taken at every row, and knows no road: two that pass each other in a bend
     would collide if they went straight on. Cost: the pairs within reach of each other for every `CHUNK` rows, then those on course.
     """
-    vx, vy = boxes.velocities(spacing_s)
+    (vx, vy), climb = boxes.velocities(spacing_s), boxes.climbs(spacing_s)
     found = [np.zeros((4, 0))]
     for begin in range(0, len(boxes.x_m), CHUNK):
         rows = slice(begin, begin + CHUNK)
@@ -49,14 +49,14 @@ def approaches(boxes: Boxes, moves: NDArray[np.bool_], spacing_s: float) -> Appr
             dx, dy = boxes.x_m[k, j] - boxes.x_m[k, i], boxes.y_m[k, j] - boxes.y_m[k, i]
             ux, uy = vx[k, j] - vx[k, i], vy[k, j] - vy[k, i]
             near = _circles_meet(dx, dy, ux, uy, boxes.radius_m[i] + boxes.radius_m[j], 0.0, HORIZON_S)
-            height = (boxes.size_m[i, 2] + boxes.size_m[j, 2]) / 2
-            keep = np.flatnonzero(near & (np.abs(boxes.z_m[k, j] - boxes.z_m[k, i]) < height))
-            k, i, j = k[keep], i[keep], j[keep]
+            k, i, j = k[near], i[near], j[near]
             time = time_to_touch(
-                dx[keep], dy[keep], ux[keep], uy[keep],
+                dx[near], dy[near], ux[near], uy[near],
                 boxes.yaw_rad[k, i], boxes.yaw_rad[k, j], boxes.size_m[i], boxes.size_m[j],
             )  # fmt: skip
-            found.append(_least(np.stack([i, j, time, k])[:, time <= HORIZON_S]))
+            soon = time <= HORIZON_S
+            k, i, j, time = k[soon], i[soon], j[soon], time[soon]
+            found.append(_least(np.stack([i, j, time, k])[:, _level(boxes, climb, i, j, k, time)]))
     a, b, time, row = _least(np.concatenate(found, axis=1))
     return Approaches(a.astype(np.intp), b.astype(np.intp), time, row.astype(np.intp))
 
@@ -79,6 +79,13 @@ def time_to_touch(
         enter = np.maximum(enter, np.minimum(one, other))
         leave = np.minimum(leave, np.where(moves, np.maximum(one, other), -never))
     return np.where((enter >= 0) & (enter < leave), enter, np.inf)
+
+
+def _level(boxes: Boxes, climb: Array, i: Rows, j: Rows, k: Rows, time_s: Array) -> NDArray[np.bool_]:
+    """Whether pairs (N,) are at one height at rows k, or will be after a time, on a slope that both go along."""
+    apart_m = boxes.z_m[k, j] - boxes.z_m[k, i]
+    then_m = apart_m + time_s * (climb[k, j] - climb[k, i])
+    return np.minimum(np.abs(apart_m), np.abs(then_m)) < (boxes.size_m[i, 2] + boxes.size_m[j, 2]) / 2
 
 
 def _on_course(

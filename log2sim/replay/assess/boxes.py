@@ -70,15 +70,22 @@ class Boxes:
 
         An agent with neither step moves along its heading at its speed.
         """
-        along = (self.speed_mps * np.cos(self.yaw_rad), self.speed_mps * np.sin(self.yaw_rad))
-        out = []
-        for values, alone in zip((self.x_m, self.y_m), along):
-            after = np.full(values.shape, np.nan)
-            after[:-1] = np.where(self.moves_on[:-1], np.diff(values, axis=0) / spacing_s, np.nan)
-            before = np.concatenate([after[-1:] * np.nan, after[:-1]])
-            mean = np.where(np.isnan(after), before, np.where(np.isnan(before), after, (after + before) / 2))
-            out.append(np.where(np.isnan(mean) & self.present, alone, mean))
-        return out[0], out[1]
+        cos, sin = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
+        return (
+            self._rates(self.x_m, self.speed_mps * cos, spacing_s),
+            self._rates(self.y_m, self.speed_mps * sin, spacing_s),
+        )
+
+    def climbs(self, spacing_s: float) -> Array:
+        """Vertical velocity (S, A), likewise; 0 for an agent with neither step."""
+        return self._rates(self.z_m, np.zeros(self.z_m.shape), spacing_s)
+
+    def _rates(self, values: Array, alone: Array, spacing_s: float) -> Array:
+        after = np.full(values.shape, np.nan)
+        after[:-1] = np.where(self.moves_on[:-1], np.diff(values, axis=0) / spacing_s, np.nan)
+        before = np.concatenate([after[-1:] * np.nan, after[:-1]])
+        mean = np.where(np.isnan(after), before, np.where(np.isnan(before), after, (after + before) / 2))
+        return np.where(np.isnan(mean) & self.present, alone, mean)
 
     def poses(self, row: Array | Rows, agent: Rows) -> tuple[Array, Array, Array, Array]:
         """x, y, z and yaw (N,) of agents (N,) at rows (N,) with a fraction, which are within their lives."""
