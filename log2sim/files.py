@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +15,7 @@ from typing import Any
 from log2sim.errors import ConfigError, LogError
 
 JSON_LIMIT_BYTES = 512 * 1024 * 1024
+_HALF_PAIR = re.compile(r"\\u[dD][89a-fA-F]")
 
 
 @contextmanager
@@ -86,13 +88,21 @@ def read_json(path: Path | str, error: type[LogError] = LogError) -> Any:
         raise error(f"{path}: {path.stat().st_size} bytes, more than the {JSON_LIMIT_BYTES} that a JSON file may have")
     try:
         text = path.read_text(encoding="utf-8")
-        return json.loads(text, parse_constant=_refuse, parse_float=_finite)
+        value = json.loads(text, parse_constant=_refuse, parse_float=_finite)
+        if _HALF_PAIR.search(text):  # an escape may stand for half a surrogate pair, which no file can hold
+            json.dumps(value, ensure_ascii=False).encode()
+        return value
     except _NotFinite as problem:
         raise error(
             f"{path}: {_place_in(text)} is {problem}, expected a finite number; write one, or null where it may be absent"
         ) from None
     except json.JSONDecodeError as problem:
         raise error(f"{path}: not valid JSON at line {problem.lineno}, column {problem.colno}: {problem.msg}") from None
+    except UnicodeEncodeError as problem:
+        half = problem.object[problem.start : problem.end][:1]
+        raise error(
+            f"{path}: a text holds {half!a}, half a surrogate pair, which no file can; write the whole"
+        ) from None
     except (UnicodeDecodeError, RecursionError, ValueError) as problem:
         raise error(f"{path}: not valid JSON: {problem}") from None
 

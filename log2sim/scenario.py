@@ -21,6 +21,7 @@ from log2sim.types import CATEGORIES, MapFrame
 from log2sim.unlabeled import Unlabeled
 
 VERSION = 1
+EGO = "ego"  # the id of the ego
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +74,11 @@ class Agent:
     confidence: float = 1.0
     quality: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def stays(self) -> bool:
+        """Whether it stands and was seen only once: then it is there all the time."""
+        return self.static and len(self.waypoints) == 1
+
     def at(self, t_s: ArrayLike, max_gap_s: float = math.inf, margin_s: float = 1e-6) -> Sampled:
         """Sample the trajectory at times (T,), linearly, yaw along the shorter arc.
 
@@ -91,7 +97,7 @@ class Agent:
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """A scenario. The ego is the agent with id "ego", if the log had one; `t0_ns` is the absolute time of t_s = 0.
+    """A scenario. The ego is the agent with id `EGO`, if the log had one; `t0_ns` is the absolute time of t_s = 0.
 
     `unlabeled` only in truth: where its labels say nothing, None where they are complete.
     """
@@ -108,11 +114,11 @@ class Scenario:
 
     @property
     def ego(self) -> Agent | None:
-        return next((a for a in self.agents if a.id == "ego"), None)
+        return next((a for a in self.agents if a.id == EGO), None)
 
     @property
     def others(self) -> tuple[Agent, ...]:
-        return tuple(a for a in self.agents if a.id != "ego")
+        return tuple(a for a in self.agents if a.id != EGO)
 
     @property
     def digest(self) -> str:

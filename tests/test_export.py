@@ -98,6 +98,15 @@ def test_a_name_that_no_file_can_hold_is_refused(scenario: Scenario, tmp_path: P
         export(replace(scenario, agents=(scenario.agents[0], odd)), "csv", tmp_path / "out")
 
 
+@pytest.mark.parametrize("projection", ["+proj=utm +zone=32 \ud83d", "+proj=utm\x0b+zone=32", "\uffff"])
+def test_a_projection_that_no_file_can_hold_is_refused(projection: str, scenario: Scenario, tmp_path: Path) -> None:
+    odd = replace(scenario, map=replace(scenario.map, projection=projection))
+    with pytest.raises(ScenarioError, match=r"map\.projection .* no XML file can; write a PROJ string"):
+        export(odd, "openscenario", tmp_path / "out")
+    lines = replace(scenario, map=replace(scenario.map, projection="PROJCRS[\n  1]"))
+    assert export(lines, "openscenario", tmp_path / "out")
+
+
 @pytest.mark.parametrize(
     ("to", "module"),
     [
@@ -134,6 +143,17 @@ def test_the_table_holds_every_waypoint(scenario: Scenario, tmp_path: Path) -> N
         np.testing.assert_array_equal([float(r["x_m"]) for r in own], agent.waypoints.x_m)
         np.testing.assert_array_equal([r["observed"] == "1" for r in own], agent.waypoints.observed)
         assert {float(r["width_m"]) for r in own} == {agent.size_m[1]}
+
+
+@pytest.mark.parametrize("to", ["csv", "commonroad"])
+def test_a_spreadsheet_runs_no_id(to: str, scenario: Scenario, tmp_path: Path) -> None:
+    ids = ['=HYPERLINK("http://a.b","c")', "@SUM(1)", "+1+cmd|'x'!A1", "-2+3", "\t=1+1", "-12", "+1.5", "a=1"]
+    agents = [replace(a, id=i) for a, i in zip(scenario.others * 2, ids)]
+    export(replace(scenario, agents=(scenario.ego, *agents)), to, tmp_path)
+    with (tmp_path / "agents.csv").open(newline="", encoding="utf-8") as opened:
+        cells = {cell for row in csv.reader(opened) for cell in row}
+    assert cells >= {f"'{i}" for i in ids[:5]} | set(ids[5:])
+    assert not cells & set(ids[:5])
 
 
 def test_the_command_names_what_it_wrote(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from export_worlds import REAR_M, ROOT, circling, moved, peer, straight, world
 from log2sim import open_log
 from log2sim.errors import ConfigError, RecordError, ScenarioError
 from log2sim.export import Options, export
-from log2sim.export.viewers.playback import MOST_POINTS, PICTURE_PX, Cloud, Picture, shown_of
+from log2sim.export.viewers.playback import MOST_POINTS, PICTURE_PX, Cloud, Picture, shown_of, steps_of
 from log2sim.geometry import NS_PER_S, apply, box_corners, inverse, points_in_box
 from log2sim.scenario import Scenario
 from log2sim.types import Camera, Log, Stream
@@ -366,3 +366,11 @@ def test_rerun_opens_the_mcap_file(scenario: Scenario, log: Log, tmp_path: Path)
     report = python("-m", "rerun", "mcap", "check", file)
     assert "/camera/front/boxes" in report
     assert all(" ok " in f" {line} " for line in report.splitlines() if "/camera/" in line or "/lidar/" in line)
+
+
+def test_who_comes_after_the_last_step_is_shown_at_it() -> None:
+    late, once = straight("late", t_s=[1.06, 1.09]), straight("once", t_s=[1.09])
+    steps = steps_of(world(straight("ego", t_s=[0.0, 1.0]), late, once))
+    assert [np.flatnonzero(m.valid).tolist() for _, m in steps.moves] == [list(range(11)), [10], [10]]
+    steps = steps_of(world(straight("ego", t_s=[0.0, 0.02]), straight("late", t_s=[0.05, 0.08])))
+    assert [m.valid.tolist() for _, m in steps.moves] == [[True], [True]]

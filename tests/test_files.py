@@ -185,6 +185,16 @@ def test_what_is_wrong_with_a_json_file_is_named(tmp_path: Path, content: bytes,
     assert len(str(caught.value)) < 400 + len(str(path))
 
 
+def test_half_a_surrogate_pair_is_refused_where_it_is_read(tmp_path: Path) -> None:
+    """It could not be written again, nor shown."""
+    path = tmp_path / "a.json"
+    path.write_text(r'{"whole": "\ud83d\ude97", "escaped": "\\ud83d"}')
+    assert read_json(path) == {"whole": "\U0001f697", "escaped": "\\ud83d"}
+    path.write_text(r'{"name": ["a\uD83Db"]}')
+    with pytest.raises(ScenarioError, match=r"holds '\\ud83d', half a surrogate pair"):
+        read_json(path, ScenarioError)
+
+
 def test_rounded_numbers_for_json() -> None:
     assert rounded(1.23456, 2) == 1.23
     assert rounded(float("nan"), 2) is None

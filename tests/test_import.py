@@ -12,6 +12,7 @@ from export_paths import UTM, agent, bend, line, scenario
 
 from log2sim.errors import ScenarioError
 from log2sim.export import Options, export, xml_text
+from log2sim.export.openscenario import read
 from log2sim.export.openscenario.read import load
 from log2sim.geometry import wrap_angle
 from log2sim.scenario import Scenario
@@ -190,6 +191,18 @@ def test_no_file_a_folder_a_bomb_and_a_giant_are_refused(tmp_path: Path, monkeyp
     with pytest.raises(ScenarioError, match="more than the 1000 that are read"):
         load(tmp_path / "big.xosc")
     assert names(tmp_path) == ["big.xosc", "deep.xosc", "strange.xosc"]
+
+
+def test_a_trajectory_that_entities_share_counts_for_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "many.xosc").write_text(
+        FOREIGN.replace(
+            '<EntityRef entityRef="Ego"/>', '<EntityRef entityRef="Ego"/>' + '<EntityRef entityRef="a"/>' * 99
+        )
+    )
+    assert len(load(tmp_path / "many.xosc").agents) == 2
+    monkeypatch.setattr(read, "VERTEX_LIMIT", 100)
+    with pytest.raises(ScenarioError, match="more than 100 vertices together"):
+        load(tmp_path / "many.xosc")
 
 
 def test_an_import_keeps_what_the_map_says_of_the_place(tmp_path: Path) -> None:

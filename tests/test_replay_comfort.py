@@ -54,6 +54,15 @@ def test_a_swing_along_the_heading_has_its_acceleration_and_jerk(spacing_s, head
     assert felt["lat_accel_max_mps2"] < 1e-6
 
 
+@pytest.mark.parametrize("spacing_s", [0.25, 0.3, 0.5, 1.0])
+def test_steps_longer_than_the_windows_keep_the_acceleration(spacing_s):
+    t = np.arange(0, 12, spacing_s)
+    felt = comfort(t, 2.5 * t**2, 0 * t, 0 * t)
+    assert felt["lon_accel_max_mps2"] == pytest.approx(5.0)
+    assert felt["jerk_max_mps3"] < 1e-6
+    assert not felt["comfortable"]
+
+
 @pytest.mark.parametrize(
     ("key", "x", "y", "yaw"),
     [

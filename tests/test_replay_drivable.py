@@ -125,14 +125,33 @@ def test_the_gradient_is_that_of_the_cost():
     state[:, 5] *= 2  # beyond the limit in places
     logged = rng.normal(0, 1, (6, 4)) + np.array([0, 0, 0, 3.0])
     problem = _Problem(0.1, logged, LIMITS)
-    _, _, gradient = _normal_equations(problem.residuals(state))
+    _, gradient = _normal_equations(problem.terms(state), len(state))
     numeric = np.zeros_like(state)
     for index in np.ndindex(state.shape):
         step = np.zeros_like(state)
         step[index] = 1e-6
-        numeric[index] = (_cost(problem.residuals(state + step)) - _cost(problem.residuals(state - step))) / 2e-6
+        numeric[index] = (_cost(problem.terms(state + step)) - _cost(problem.terms(state - step))) / 2e-6
     # The chord's shortening is held constant in the derivative: second order in the angle of a knot.
     np.testing.assert_allclose(gradient, numeric, rtol=0.02, atol=np.abs(numeric).max() * 0.02)
+
+
+def test_the_band_is_that_of_the_residuals_derivatives():
+    rng = np.random.default_rng(0)
+    state = rng.normal(0, 0.1, (4, 6)) + np.array([0, 0, 0, 3.0, 0, 0.1])
+    state[:, 2] /= 100  # the derivatives leave out how turning shortens the chord
+    problem = _Problem(0.1, rng.normal(0, 0.1, (4, 4)) + np.array([0, 0, 0, 3.0]), LIMITS)
+    terms = problem.terms(state)
+    slopes = np.zeros((sum(len(t.residual) for t in terms), 24))
+    for k in range(24):
+        step = 1e-6 * np.eye(24)[k].reshape(4, 6)
+        up, down = (np.concatenate([t.residual for t in problem.terms(state + s)]) for s in (step, -step))
+        slopes[:, k] = (up - down) / 2e-6
+    weight = np.concatenate([1 / np.sqrt(1 + t.residual**2) if t.robust else np.ones(len(t.residual)) for t in terms])
+    expected = slopes.T @ (weight[:, None] * slopes)
+    band, _ = _normal_equations(terms, 4)
+    for column, lower in enumerate(band.reshape(24, 12)):
+        below = expected[column : column + 12, column]
+        np.testing.assert_allclose(lower[: len(below)], below, rtol=0.02, atol=np.abs(expected).max() * 1e-4)
 
 
 def test_two_moments_suffice():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,18 @@ def test_it_passes_gymnasiums_own_checker_without_a_warning():
 
     env = gymnasium.make(log2sim.replay.env.ID, scenario=SAMPLE, render_mode="rgb_array")
     check_env(env.unwrapped)
+
+
+def test_who_crosses_on_a_bridge_is_not_hit():
+    over = line("over", 40, -40, 10, 8, np.pi / 2)
+    for z_m, hit in ((6.0, False), (0.0, True)):
+        bridge = replace(over, waypoints=replace(over.waypoints, z_m=over.waypoints.z_m + z_m))
+        env = made(scenario_of(line("ego", 0, speed=10, duration_s=8), bridge), agents="log")
+        env.reset()
+        ended = cut = False
+        while not (ended or cut):
+            *_, ended, cut, info = env.step(np.zeros(2, np.float32))
+        assert info["collision"] == hit
 
 
 def test_the_ego_drives_along_its_path_to_the_end_and_is_paid_by_the_meter():

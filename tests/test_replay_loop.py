@@ -16,6 +16,8 @@ from replay_scenes import LENGTH_M, Speed, gap, line, parked, walker
 
 from log2sim.errors import ConfigError
 from log2sim.replay import Controls, load_policy, open_world, replay
+from log2sim.replay.path import path_of
+from log2sim.replay.reactive.ways import times_beside
 from log2sim.replay.rollout import roll
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -150,6 +152,56 @@ def test_the_path_of_a_way_that_crosses_itself_does_not_jump_to_the_other_branch
         world.steer(Controls(5.0 - seen.ego.speed_mps, float(np.arctan(seen.ego.wheelbase_m * np.interp(seen.t_s, [4, 4.1, 15.9, 16], [0, 2.5 * np.pi / 60, 2.5 * np.pi / 60, 0])))))  # fmt: skip
         world.advance()
     assert last > 110
+
+
+def uphill(agent, grade=0.1):
+    """The agent on a road that rises along x."""
+    return changed(agent, waypoints=changed(agent.waypoints, z_m=grade * agent.waypoints.x_m))
+
+
+def test_an_ego_that_falls_behind_its_log_has_the_height_of_its_place_and_is_hit_there():
+    flat = [line("ego", 0, speed=10, duration_s=8), line("behind", -40, speed=10, duration_s=8)]
+    slope = replay(scenario_of(*map(uphill, flat)), ego=Recorder(Controls(-4.0, 0.0)))
+    ego = slope.agent("ego")
+    assert ego.x_m[-1] < 20
+    np.testing.assert_allclose(ego.z_m, 0.1 * ego.x_m, atol=1e-3)
+    level = replay(scenario_of(*flat), ego=Recorder(Controls(-4.0, 0.0)))
+    assert slope.metrics["collisions"] == level.metrics["collisions"]
+    assert slope.metrics["new_collisions"] == 1
+
+
+def test_an_observation_tells_the_height_of_the_ego_and_of_others_also_of_late_ones():
+    agents = [line("ego", 60, speed=10, duration_s=8), line("late", 30, speed=10, duration_s=8)]
+    agents += [line("x", 50, 3.5, 10, 8), parked("p", 90, 5)]
+    driver = Recorder(Controls(-4.0, 0.0))
+    replay(scenario_of(*map(uphill, agents)), ego=driver, agents=["late"])
+    for seen in driver.seen[::50]:
+        assert seen.ego.z_m == pytest.approx(0.1 * seen.ego.x_m, abs=0.01)
+        np.testing.assert_allclose(seen.others.z_m, 0.1 * seen.others.x_m, atol=0.03)
+    late = seen.others.x_m[seen.others.id == "late"]
+    assert late < 30 + 10 * seen.t_s - 10
+    assert set(seen.others.height_m) == {seen.ego.height_m} == {1.5}
+
+
+def test_agents_brake_for_a_late_ego_on_a_slope_as_on_the_flat():
+    flat = [line("ego", 60, speed=10, duration_s=12), line("late", 30, speed=10, duration_s=12)]
+    on_flat, on_slope = (
+        replay(scenario_of(*agents), ego=Recorder(Controls(-4.0, 0.0)), agents="reactive")
+        for agents in (flat, map(uphill, flat))
+    )
+    assert on_slope.metrics["collisions"] == on_flat.metrics["collisions"] == []
+    np.testing.assert_allclose(on_slope.agent("late").x_m, on_flat.agent("late").x_m, atol=1e-3)
+
+
+def test_where_a_way_crosses_over_itself_the_height_is_that_of_the_own_level():
+    t = np.arange(0, 24.01, 0.1)
+    yaw = np.clip((t - 4) / 12, 0, 1) * 2.5 * np.pi  # a ramp that turns over the road it left
+    x, y = (np.concatenate([[0.0], np.cumsum(0.5 * f(yaw[:-1]))]) for f in (np.cos, np.sin))
+    loop = agent_from(t, x, y, yaw, np.full(len(t), 5.0), id="ego", offset_m=0.01)
+    path = path_of(changed(loop, waypoints=changed(loop.waypoints, z_m=0.5 * t)), 0.01)
+    late = np.arange(0, 24, 0.05)
+    found = times_beside(path, *path.centers(late)[:2])
+    np.testing.assert_allclose(found, late, atol=0.25)  # a meter of way
 
 
 # Policies.

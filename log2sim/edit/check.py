@@ -11,12 +11,12 @@ import numpy as np
 from log2sim.edit.motion import STANDING_MPS, chords
 from log2sim.geometry import Array
 from log2sim.replay import replay
+from log2sim.replay.reference import MAX_ACCEL_MPS2, MAX_CURVATURE_1PM, MAX_TWO_WHEELER_CURVATURE_1PM
 from log2sim.scenario import Agent, Scenario
 from log2sim.types import GROUP_OF
 
-# Waymax's limits of feasible motion (Gulino et al., 2023, section 3.3); two-wheelers turn tighter and people on the spot.
-MAX_ACCEL_MPS2 = 10.4
-MAX_CURVATURE_1PM = {"vehicle": 0.3, "two_wheeler": 1.0}
+# As a replay flags them; people turn on the spot.
+CURVATURE_LIMITS_1PM = {"vehicle": MAX_CURVATURE_1PM, "two_wheeler": MAX_TWO_WHEELER_CURVATURE_1PM}
 STEP_S = 0.05
 SAME_CONTACT_S = 0.5
 WORSE = 1 + 1e-6
@@ -63,7 +63,7 @@ class Peak:
 
 def _infeasible(before: Agent, after: Agent) -> Iterator[str]:
     """Acceleration and curvature beyond their limits, and beyond what the source has itself."""
-    curvature_limit = MAX_CURVATURE_1PM.get(GROUP_OF[after.category], np.inf)
+    curvature_limit = CURVATURE_LIMITS_1PM.get(GROUP_OF[after.category], np.inf)
     for what, peak_of, limit, unit in (
         ("acceleration", peak_acceleration, MAX_ACCEL_MPS2, "m/s2"),
         ("curvature", peak_curvature, curvature_limit, "1/m"),

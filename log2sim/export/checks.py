@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -17,6 +18,8 @@ FARTHEST_M = 65_536.0
 STEP_M, MOVED_M = 0.05, 2.0
 # Boxes of a log touch; what overlaps by less is taken for that.
 TOUCHING_IOU = 0.02
+# Names are escaped where XML needs it; a projection has to stay as it is.
+_NO_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def require_exportable(scenario: Scenario) -> None:
@@ -29,6 +32,9 @@ def require_exportable(scenario: Scenario) -> None:
         for text in (scenario.name, *(a.id for a in scenario.agents))
         if not _is_text(text)
     ]
+    projection = scenario.map.projection
+    if projection is not None and _NO_XML.search(projection):
+        wrong.append(f"map.projection {projection[:60]!a}: holds characters that no XML file can; write a PROJ string")
     wrong += _repeated(scenario) or ([] if wrong else _scattered(scenario))
     if wrong:
         raise ScenarioError(f"scenario '{scenario.name}' cannot be exported:\n  " + "\n  ".join(wrong))

@@ -6,7 +6,6 @@ nothing else can be installed with, and its writer cuts decimals off and dates f
 
 from __future__ import annotations
 
-import csv
 import re
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 
 from log2sim.errors import ScenarioError
 from log2sim.export import Options, xml_text
+from log2sim.export.csv_table import write_table
 from log2sim.export.roads.lanes import Lane, lanes
 from log2sim.export.sampling import Motion, clock, motion, on_clock
 from log2sim.export.xml_text import element
@@ -68,8 +68,7 @@ class CommonRoad:
         root.extend(sorted(obstacles, key=lambda o: o.tag != "staticObstacle"))  # the schema wants these first
         root.append(_planning_problem(ego, first, clock(t_s[0], ego.waypoints.t_s[-1], STEP_S)))
         xml_text.write(root, folder / f"{name}.xml")
-        with (folder / "agents.csv").open("w", newline="", encoding="utf-8") as opened:
-            csv.writer(opened, lineterminator="\n").writerows(table)
+        write_table(folder / "agents.csv", table)
 
 
 def _ego_and_clock(scenario: Scenario) -> tuple[Agent, Array]:
@@ -143,7 +142,7 @@ def _obstacle(agent: Agent, number: int, t_s: Array) -> Element | None:
         _shape(obstacle, agent)
         obstacle.append(_state("initialState", motion(agent, agent.waypoints.t_s[:1]), 0, 0))
         return obstacle
-    move = on_clock(agent, t_s, at_least=2)  # an initial state and a trajectory
+    move = on_clock(agent, t_s, STEP_S, at_least=2)  # an initial state and a trajectory
     steps = np.flatnonzero(move.valid).tolist()
     if len(steps) < 2:
         return None

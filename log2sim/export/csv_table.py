@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import csv
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from log2sim.export import Options
 from log2sim.scenario import Scenario
@@ -11,22 +14,37 @@ from log2sim.scenario import Scenario
 COLUMNS = ("t_s", "x_m", "y_m", "z_m", "yaw_rad", "speed_mps", "observed", "sigma_xy_m")
 HEADER = ("id", "category", *COLUMNS, "length_m", "width_m", "height_m", "static", "rear_axle_offset_m", "confidence")
 
+# What spreadsheets take for a formula, and run: a text that begins so and is no number.
+FORMULA = re.compile(r"\s*[=+\-@](?!\d+(\.\d+)?$)")
+
+
+def write_table(file: Path, rows: Iterable[Sequence[Any]]) -> None:
+    """Write rows as CSV; texts that a spreadsheet would run as a formula begin with an apostrophe, so that it shows them."""
+    with file.open("w", newline="", encoding="utf-8") as opened:
+        table = csv.writer(opened, lineterminator="\n")
+        for row in rows:
+            table.writerow([f"'{v}" if isinstance(v, str) and FORMULA.match(v) else v for v in row])
+
 
 class Csv:
     """`agents.csv`, ordered by agent and time; numbers in full precision."""
 
     options: tuple[str, ...] = ()
-    loses = "map origin, colors, cameras, quality, plan and provenance"
+    loses = (
+        "map origin, colors, cameras, quality, plan and provenance; ids that a spreadsheet would run get an apostrophe"
+    )
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
-        with (folder / "agents.csv").open("w", newline="", encoding="utf-8") as file:
-            table = csv.writer(file, lineterminator="\n")
-            table.writerow(HEADER)
-            for agent in scenario.agents:
-                about = (*agent.size_m, int(agent.static), agent.rear_axle_offset_m, agent.confidence)
-                columns = [getattr(agent.waypoints, name).tolist() for name in COLUMNS]
-                columns[COLUMNS.index("observed")] = agent.waypoints.observed.astype(int).tolist()
-                table.writerows((agent.id, agent.category, *row, *about) for row in zip(*columns))
+        write_table(folder / "agents.csv", _rows(scenario))
+
+
+def _rows(scenario: Scenario) -> Iterator[Sequence[Any]]:
+    yield HEADER
+    for agent in scenario.agents:
+        about = (*agent.size_m, int(agent.static), agent.rear_axle_offset_m, agent.confidence)
+        columns = [getattr(agent.waypoints, name).tolist() for name in COLUMNS]
+        columns[COLUMNS.index("observed")] = agent.waypoints.observed.astype(int).tolist()
+        yield from ((agent.id, agent.category, *row, *about) for row in zip(*columns))
 
 
 EXPORTER = Csv()

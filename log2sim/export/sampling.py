@@ -13,6 +13,7 @@ from log2sim.geometry import Array
 from log2sim.scenario import Agent
 
 DERIVATIVE_S = 0.05  # half the span over which rates are taken: half a step of most logs, so neighbors decide them
+ROUNDING_S = 1e-6
 MOST_STEPS = 100_000  # 2.8 hours at 10 Hz; a table of all agents' states at more of them hardly fits into memory
 
 
@@ -31,7 +32,7 @@ class Motion:
     acceleration_mps2: Array
 
 
-def motion(agent: Agent, t_s: Array, margin_s: float = 1e-6) -> Motion:
+def motion(agent: Agent, t_s: Array, margin_s: float = ROUNDING_S) -> Motion:
     """Sample an agent at times (T,); times within `margin_s` outside its life take its end.
 
     Notes
@@ -73,12 +74,18 @@ def _over(change: Array, span_s: Array) -> Array:
     return rates
 
 
-def on_clock(agent: Agent, t_s: Array, at_least: int = 1) -> Motion:
-    """Sample an agent at equal steps (T,); one that lives between them takes the `at_least` nearest, so nobody is lost."""
+def on_clock(agent: Agent, t_s: Array, step_s: float, at_least: int = 1) -> Motion:
+    """Sample an agent at equal steps (T,) of `step_s`.
+
+    One that lives between them, or after the last before the next would come, takes the `at_least` nearest, so nobody is
+    lost.
+    """
     sampled = motion(agent, t_s)
-    if sampled.valid.sum() >= at_least or len(t_s) < 2:
+    if sampled.valid.sum() >= at_least:
         return sampled
-    return motion(agent, t_s, margin_s=at_least * (t_s[1] - t_s[0]) / 2)
+    past_s = agent.waypoints.t_s[0] - t_s[-1]
+    after = past_s + (at_least - 1) * step_s if 0 < past_s < step_s else 0.0
+    return motion(agent, t_s, margin_s=max(at_least * step_s / 2, after + ROUNDING_S))
 
 
 def clock(start_s: float, stop_s: float, step_s: float) -> Array:

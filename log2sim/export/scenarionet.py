@@ -66,7 +66,7 @@ def describe(scenario: Scenario) -> Value:
         )
     t_s = clock(ego.waypoints.t_s[0], ego.waypoints.t_s[-1], STEP_S)
     origin = np.array(near_origin(scenario).origin_m)
-    moves = {agent.id: on_clock(agent, t_s) for agent in scenario.agents}
+    moves = {agent.id: on_clock(agent, t_s, STEP_S) for agent in scenario.agents}
     tracks = {a.id: _track(a, moves[a.id], origin) for a in scenario.agents if moves[a.id].valid.any()}
     left_out = {a.id: "not alive at any step of the ego" for a in scenario.agents if a.id not in tracks}
     features = {

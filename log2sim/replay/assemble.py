@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -15,7 +13,7 @@ from log2sim.replay.assess.metrics import Errors, errors_of
 from log2sim.replay.assess.run import FOLLOWING, assess
 from log2sim.replay.clock import Clock
 from log2sim.replay.path import Path
-from log2sim.replay.reactive.ways import times_at
+from log2sim.replay.reactive.ways import times_at, times_beside
 from log2sim.replay.result import AgentReplay, Commands, Replay
 from log2sim.replay.rollout import Tracks
 from log2sim.replay.vehicles.models import Choice
@@ -45,24 +43,22 @@ def assemble(
     errors: dict[str, Errors] = {}
     walks = ("pid", "reactive") if mode == "pid" else ()
     for agent in scenario.agents:
-        if agent.id in tracks:
+        if agent.id not in tracks:
+            replayed, steps = _posed(agent, clock)
+        else:
             driver, path, flags = home[agent.id]
             steps, states = tracks[agent.id]
             t_s: Array = clock.begin_s + steps.astype(np.float64) * clock.dt_s
             choice = choices.get(agent.id, Choice("point", "") if driver in walks else Choice("none", ""))
-            replayed = _moved(agent, driver, choice, path, flags, t_s, states)
-            errors[agent.id] = errors_of(path, replayed, follows=driver in FOLLOWING)
-            agents.append(_with_errors(replayed, errors[agent.id]))
-            stored.append(steps)
-        else:
-            replayed, steps = _posed(agent, clock)
-            agents.append(replayed)
-            stored.append(steps)
+            moved = _moved(agent, driver, choice, path, flags, t_s, states)
+            errors[agent.id] = errors_of(path, moved, follows=driver in FOLLOWING)
+            replayed = _with_errors(moved, errors[agent.id])
+        agents.append(replayed)
+        stored.append(steps)
     paths = {k: path for k, (_, path, _) in home.items() if k in tracks}
-    document = json.dumps(scenario.to_dict(), sort_keys=True, ensure_ascii=False).encode()
     return Replay(
         scenario=scenario.name,
-        scenario_digest=hashlib.sha256(document).hexdigest(),
+        scenario_digest=scenario.digest,
         mode=mode,
         model=model,
         dt_s=clock.dt_s,
@@ -78,10 +74,14 @@ def _moved(
     x, y, yaw, speed, steer, accel, *told = states
     if driver == "exact":
         x, y, yaw, speed = path.centers(t_s)  # the tables in between are good to half a millimeter, the path is exact
-    log_t_s = times_at(path, t_s, x, y) if driver == "reactive" else t_s
+    log_t_s = t_s
+    if driver == "reactive":
+        log_t_s = times_at(path, t_s, x, y)
+    elif driver == "policy":
+        log_t_s = times_beside(path, x, y)
     if np.isnan(accel).any():
         accel = np.gradient(speed, t_s) if len(t_s) > 1 else np.zeros(len(t_s))
-    z = np.interp(log_t_s, path.t_s, path.z_m)
+    z = path.heights(log_t_s)  # of the road there, whenever the log was
     x, y, z, yaw, speed, steer, accel = (np.round(c, DIGITS) for c in (x, y, z, yaw, speed, steer, accel))
     t_s = np.round(t_s, 9)
     pedal, wheel, gear = told
@@ -107,8 +107,7 @@ def _posed(agent: Agent, clock: Clock) -> tuple[AgentReplay, NDArray[np.intp]]:
     """
     w = agent.waypoints
     end_s = clock.time(clock.steps - 1)
-    always = agent.static and len(w) == 1
-    begin_s, until_s = (clock.begin_s, end_s) if always else (float(w.t_s[0]), float(w.t_s[-1]))
+    begin_s, until_s = (clock.begin_s, end_s) if agent.stays else (float(w.t_s[0]), float(w.t_s[-1]))
     t_s = np.array([begin_s, until_s] if agent.static and until_s > begin_s else [begin_s])
     first, last = clock.first_step(np.array([begin_s]))[0], clock.last_step(np.array([until_s]))[0]
     every = clock.store_every

@@ -17,16 +17,19 @@ from log2sim.replay.follower import control_step
 from log2sim.replay.path import Path, path_of
 from log2sim.replay.reactive.group import Reactive, ReactiveCrowd, ReactiveFleet, ReactiveTape
 from log2sim.replay.reactive.traffic import Traffic
-from log2sim.replay.reference import MAX_CURVATURE_1PM, Reference, point_reference, tape_reference, vehicle_reference
+from log2sim.replay.reference import (
+    MAX_CURVATURE_1PM,
+    MAX_TWO_WHEELER_CURVATURE_1PM,
+    Reference,
+    point_reference,
+    tape_reference,
+    vehicle_reference,
+)
 from log2sim.replay.simulator import STEPS, simulator_named
 from log2sim.replay.vehicles.models import Choice, choose, slipping_reference, understeer
 from log2sim.replay.vehicles.parameters import PEDAL_LAG_S, STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
 from log2sim.replay.world import Crowd, Driven, Fleet, Group, Tape
-from log2sim.scenario import Agent
-
-EGO = "ego"
-MAX_TWO_WHEELER_CURVATURE_1PM = 1.0
-
+from log2sim.scenario import EGO, Agent
 
 Cast = dict[str, list[Agent]]
 """Agents by what drives them: "policy", "reactive", "pid", "exact" or, with one pose for good, "static"."""

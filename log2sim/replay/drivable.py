@@ -7,8 +7,10 @@ beforehand, over the whole life at once: the box centers bind, the headings advi
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +32,8 @@ BOUND = 0.002  # softness of limits, as a share of them
 ITERATIONS, TRIALS = 40, 16
 DONE = 1e-4  # relative gain at which the iteration ends
 SLOWEST_RADPS = 0.01
-STATES = 6  # x, y, yaw, speed, acceleration, curvature
+X, Y, YAW, SPEED, ACCEL, CURVATURE = range(6)
+STATES = NEXT = 6  # the next knot's states are counted on
 DAMPED = np.array([1 / POSITION_M, 1 / POSITION_M, 1 / YAW_RAD, 1 / SPEED_MPS, 1.0, 10.0]) ** 2
 
 
@@ -82,14 +85,14 @@ def nearest_course(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps
     along = np.gradient(x_m, t_s) * np.cos(axis) + np.gradient(y_m, t_s) * np.sin(axis)
     state = _first_guess(t_s, x_m, y_m, axis, along, limits)
     problem = _Problem(float(t_s[1] - t_s[0]), logged, limits)
-    residuals = problem.residuals(state)
-    cost, damping = _cost(residuals), 1e-2
+    terms = problem.terms(state)
+    cost, damping = _cost(terms), 1e-2
     for _ in range(ITERATIONS):
-        diagonal, beside, gradient = _normal_equations(residuals)
+        band, gradient = _normal_equations(terms, len(state))
         for _ in range(TRIALS):
-            trial = state - _solve(diagonal, beside, gradient, damping)
-            residuals = problem.residuals(trial)
-            gain = cost - _cost(residuals)
+            trial = state - _solve(band, gradient, damping)
+            terms = problem.terms(trial)
+            gain = cost - _cost(terms)
             if gain > 0:
                 break
             damping *= 8
@@ -127,6 +130,20 @@ def _first_guess(t_s: Array, x: Array, y: Array, yaw: Array, speed: Array, limit
     return guess
 
 
+Slopes = dict[int, Array | float]
+
+
+class Term(NamedTuple):
+    """Residuals of the knots (K,) or of the ways between them (K - 1,), and their derivatives, by state.
+
+    What is `robust` counts by the pseudo-Huber loss, all else by its square.
+    """
+
+    residual: Array
+    slopes: Slopes
+    robust: bool = False
+
+
 @dataclass(frozen=True, eq=False)
 class _Problem:
     """`logged` (K, 4): center x, y, yaw and speed at knots `h_s` apart."""
@@ -135,62 +152,48 @@ class _Problem:
     logged: Array
     limits: Limits
 
-    def residuals(self, state: Array) -> Residuals:
-        """Residuals and their derivatives, of the knots and of the ways between them."""
-        return *self._knots(state), *self._rolls(state)
+    def terms(self, state: Array) -> list[Term]:
+        """What the cost is made of: terms of the knots and of the ways between them."""
+        return [*self._knots(state), *self._ways(state)]
 
-    def _knots(self, state: Array) -> tuple[Array, Array]:
-        """Residuals (K, 7) against the log and the limits, and their derivatives (K, 7, 6)."""
+    def _knots(self, state: Array) -> list[Term]:
+        """What the log says of the knots, and the limits."""
         x, y, yaw, speed, accel, curvature = state.T
-        o, scale = self.limits.offset_m, np.sqrt(self.h_s / KNOT_S)
+        log_x, log_y, log_yaw, log_speed = self.logged.T
+        limits, o, scale = self.limits, self.limits.offset_m, math.sqrt(self.h_s / KNOT_S)
         cos, sin = np.cos(yaw), np.sin(yaw)
-        residual = np.zeros((len(state), 7))
-        jacobian = np.zeros((len(state), 7, STATES))
-        residual[:, 0] = (x + o * cos - self.logged[:, 0]) / POSITION_M
-        residual[:, 1] = (y + o * sin - self.logged[:, 1]) / POSITION_M
-        jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1 / POSITION_M
-        jacobian[:, 0, 2], jacobian[:, 1, 2] = -o * sin / POSITION_M, o * cos / POSITION_M
-        limits = self.limits
-        residual[:, 2], jacobian[:, 2, 4] = _beyond(accel, limits.max_accel_mps2)
-        residual[:, 3], jacobian[:, 3, 5] = _beyond(curvature, limits.max_curvature_1pm)
-        residual[:, 4], slope = _beyond(speed**2 * curvature, limits.max_lateral_mps2)
-        jacobian[:, 4, 3], jacobian[:, 4, 5] = slope * 2 * speed * curvature, slope * speed**2
-        residual[:, 5], jacobian[:, 5, 2] = (yaw - self.logged[:, 2]) / YAW_RAD, 1 / YAW_RAD
-        residual[:, 6], jacobian[:, 6, 3] = (speed - self.logged[:, 3]) / SPEED_MPS, 1 / SPEED_MPS
-        return residual * scale, jacobian * scale
+        place, turn, pace = scale / POSITION_M, scale / YAW_RAD, scale / SPEED_MPS
+        hard, gentle = _beyond(accel, limits.max_accel_mps2, scale)
+        tight, wide = _beyond(curvature, limits.max_curvature_1pm, scale)
+        aside, grip = _beyond(speed**2 * curvature, limits.max_lateral_mps2, scale)
+        return [
+            Term((x + o * cos - log_x) * place, {X: place, YAW: -o * place * sin}),
+            Term((y + o * sin - log_y) * place, {Y: place, YAW: o * place * cos}),
+            Term(hard, {ACCEL: gentle}),
+            Term(tight, {CURVATURE: wide}),
+            Term(aside, {SPEED: grip * 2 * speed * curvature, CURVATURE: grip * speed**2}),
+            Term((yaw - log_yaw) * turn, {YAW: turn}, robust=True),
+            Term((speed - log_speed) * pace, {SPEED: pace}, robust=True),
+        ]
 
-    def _rolls(self, state: Array) -> tuple[Array, Array]:
-        """Residuals (K - 1, 6) of rolling and of the driver's smoothness, and their derivatives (K - 1, 6, 12)."""
-        h, (a, b) = self.h_s, (state[:-1], state[1:])
-        mean, rise = (a + b) / 2, b - a
-        cos, sin = np.cos(mean[:, 2]), np.sin(mean[:, 2])
-        way = h * mean[:, 3] * np.sinc(rise[:, 2] / (2 * np.pi))
-        per_speed = h * np.sinc(rise[:, 2] / (2 * np.pi)) / 2
-        residual = np.stack(
-            [
-                (rise[:, 0] - way * cos) / ROLL_M,
-                (rise[:, 1] - way * sin) / ROLL_M,
-                (rise[:, 2] - h * mean[:, 3] * mean[:, 5]) / ROLL_RAD,
-                (rise[:, 3] - h * mean[:, 4]) / ROLL_MPS,
-                rise[:, 4] / np.sqrt(h * KNOT_S) / JERK_MPS3,
-                rise[:, 5] / np.sqrt(h * KNOT_S) / self._curvature_rate,
-            ],
-            axis=1,
-        )
-        jacobian = np.zeros((len(a), 6, 2 * STATES))
-        for end, sign in ((0, -1.0), (STATES, 1.0)):
-            for row, scale in ((0, ROLL_M), (1, ROLL_M), (2, ROLL_RAD), (3, ROLL_MPS)):
-                jacobian[:, row, end + row] = sign / scale
-            jacobian[:, 0, end + 2], jacobian[:, 0, end + 3] = way * sin / 2 / ROLL_M, -per_speed * cos / ROLL_M
-            jacobian[:, 1, end + 2], jacobian[:, 1, end + 3] = -way * cos / 2 / ROLL_M, -per_speed * sin / ROLL_M
-            jacobian[:, 2, end + 3], jacobian[:, 2, end + 5] = (
-                -h * mean[:, 5] / 2 / ROLL_RAD,
-                -h * mean[:, 3] / 2 / ROLL_RAD,
-            )
-            jacobian[:, 3, end + 4] = -h / 2 / ROLL_MPS
-            jacobian[:, 4, end + 4] = sign / np.sqrt(h * KNOT_S) / JERK_MPS3
-            jacobian[:, 5, end + 5] = sign / np.sqrt(h * KNOT_S) / self._curvature_rate
-        return residual, jacobian
+    def _ways(self, state: Array) -> list[Term]:
+        """Rolling from knot to knot, and the driver's smoothness."""
+        h, (a, b) = self.h_s, (state[:-1].T, state[1:].T)
+        (_, _, yaw, speed, accel, curvature), (dx, dy, turn, gain, jerk, bend) = (a + b) / 2, b - a
+        cos, sin, per_speed = np.cos(yaw), np.sin(yaw), h * np.sinc(turn / (2 * np.pi))
+        east, north = per_speed * cos, per_speed * sin
+        smooth, straight = 1 / (math.sqrt(h * KNOT_S) * JERK_MPS3), 1 / (math.sqrt(h * KNOT_S) * self._curvature_rate)
+        return [
+            _between((dx - speed * east) / ROLL_M, X, 1 / ROLL_M, {YAW: speed * north / ROLL_M, SPEED: -east / ROLL_M}),
+            _between((dy - speed * north) / ROLL_M, Y, 1 / ROLL_M, {YAW: -speed * east / ROLL_M, SPEED: -north / ROLL_M}),
+            _between(
+                (turn - h * speed * curvature) / ROLL_RAD, YAW, 1 / ROLL_RAD,
+                {SPEED: -h / ROLL_RAD * curvature, CURVATURE: -h / ROLL_RAD * speed},
+            ),
+            _between((gain - h * accel) / ROLL_MPS, SPEED, 1 / ROLL_MPS, {ACCEL: -h / ROLL_MPS}),
+            _between(jerk * smooth, ACCEL, smooth, {}),
+            _between(bend * straight, CURVATURE, straight, {}),
+        ]  # fmt: skip
 
     @cached_property
     def _curvature_rate(self) -> Array:
@@ -200,48 +203,52 @@ class _Problem:
         return LATERAL_JERK_MPS3 / np.maximum(pace**2, LATERAL_JERK_MPS3 / steering)
 
 
-Residuals = tuple[Array, Array, Array, Array]
-PLAIN, ROBUST = slice(5), slice(5, 7)  # of a knot's residuals; heading and speed count by the pseudo-Huber loss
+def _between(residual: Array, state: int, per_rise: Array | float, per_mean: Slopes) -> Term:
+    """A term of each knot and the next, by its derivatives: by the rise of one state and by the means of others."""
+    halves = {k: slope / 2 for k, slope in per_mean.items()}
+    return Term(
+        residual, {state: -per_rise, NEXT + state: per_rise, **halves, **{NEXT + k: s for k, s in halves.items()}}
+    )
 
 
-def _cost(residuals: Residuals) -> float:
+def _cost(terms: list[Term]) -> float:
     """Half the sum of squares, the pseudo-Huber loss for headings and speeds."""
-    knot, _, roll, _ = residuals
-    plain = np.sum(roll**2) + np.sum(knot[:, PLAIN] ** 2)
-    return float(plain / 2 + np.sum(np.sqrt(1 + knot[:, ROBUST] ** 2) - 1))
+    return float(
+        sum(np.sum(np.sqrt(1 + t.residual**2) - 1) if t.robust else t.residual @ t.residual / 2 for t in terms)
+    )
 
 
-def _normal_equations(residuals: Residuals) -> tuple[Array, Array, Array]:
-    """Blocks on the diagonal (K, 6, 6), below it (K - 1, 6, 6) and the gradient (K, 6) of the cost."""
-    knot, knot_slopes, roll, roll_slopes = residuals
-    weight = np.ones_like(knot)
-    weight[:, ROBUST] = 1 / np.sqrt(1 + knot[:, ROBUST] ** 2)
-    weighted = (weight[:, :, None] * knot_slopes).transpose(0, 2, 1)
-    diagonal, gradient = weighted @ knot_slopes, (weighted @ knot[:, :, None])[:, :, 0]
-    turned = roll_slopes.transpose(0, 2, 1)
-    both, push = turned @ roll_slopes, (turned @ roll[:, :, None])[:, :, 0]
-    diagonal[:-1] += both[:, :STATES, :STATES]
-    diagonal[1:] += both[:, STATES:, STATES:]
-    gradient[:-1] += push[:, :STATES]
-    gradient[1:] += push[:, STATES:]
-    return diagonal, both[:, STATES:, :STATES], gradient
+def _normal_equations(terms: list[Term], count: int) -> tuple[Array, Array]:
+    """Second derivatives of the cost as a band (K, 6, 12), the diagonal and what is below it, and the gradient (K, 6)."""
+    band, gradient = np.zeros((count, STATES, 2 * STATES)), np.zeros((count, STATES))
+    for residual, slopes, robust in terms:
+        weight = 1 / np.sqrt(1 + residual**2) if robust else 1.0
+        for i, slope in slopes.items():
+            weighted = weight * slope
+            _at(gradient, i, residual)[:] += weighted * residual
+            for j, other in slopes.items():
+                if j <= i:
+                    _at(band[:, :, i - j], j, residual)[:] += weighted * other
+    return band, gradient
 
 
-def _beyond(value: Array, limit: float) -> tuple[Array, Array]:
+def _at(rows: Array, state: int, residual: Array) -> Array:
+    """The column of a state in rows (K, 6), as long as a term's residual."""
+    knot, column = divmod(state, STATES)
+    return rows[knot : knot + len(residual), column]
+
+
+def _beyond(value: Array, limit: float, scale: float) -> tuple[Array, Array]:
     """How far values (K,) are beyond a limit of their size, in units of its softness, and the derivative of that."""
-    beyond = value - np.minimum(np.maximum(value, -limit), limit)
-    return beyond / (BOUND * limit), (beyond != 0) / (BOUND * limit)
+    beyond, unit = value - np.minimum(np.maximum(value, -limit), limit), scale / (BOUND * limit)
+    return beyond * unit, (beyond != 0) * unit
 
 
-def _solve(diagonal: Array, beside: Array, gradient: Array, damping: float) -> NDArray[np.float64]:
+def _solve(band: Array, gradient: Array, damping: float) -> NDArray[np.float64]:
     """Solve the damped block-tridiagonal system; (K, 6)."""
     from scipy.linalg import solveh_banded
 
-    count = len(diagonal)
-    band = np.zeros((2 * STATES, count, STATES))
-    i, j = np.tril_indices(STATES)
-    band[i - j, :, j] = diagonal[:, i, j].T
-    band[0] += damping * DAMPED
-    i, j = np.indices((STATES, STATES)).reshape(2, -1)
-    band[STATES + i - j, :-1, j] = beside[:, i, j].T
-    return solveh_banded(band.reshape(2 * STATES, -1), gradient.ravel(), lower=True).reshape(count, STATES)
+    damped = band.copy()
+    damped[:, :, 0] += damping * DAMPED
+    flat = damped.reshape(gradient.size, -1).T
+    return solveh_banded(flat, gradient.ravel(), lower=True, overwrite_ab=True).reshape(gradient.shape)

@@ -28,11 +28,14 @@ except ImportError as error:
 ID = "log2sim/Scenario-v0"
 
 PATH_EVERY_M, PATH_ROWS = 5, 10
-MAX_SPEED_MPS, MAX_ACCEL_MPS2 = 80.0, 15.0
+# Bounds of what is observed: no road user is faster, brakes harder or is larger.
+MAX_SPEED_MPS, MAX_ACCEL_MPS2, MAX_LENGTH_M, MAX_WIDTH_M = 80.0, 15.0, 60.0, 10.0
+PATH_BOUND_M = 60.0  # the last row of the path is 50 m ahead, seen by an ego that is at most `LOST_M` off it
 
+# What a step costs, in meters of way gone.
 OFF_PATH_PER_M_S = 0.2
 COLLISION = 100.0
-OFF_PATH_M = 15.0
+LOST_M = 15.0  # so far off the path an episode ends
 
 PICTURE_PX, PICTURE_M = 400, 80.0
 
@@ -104,9 +107,9 @@ class ScenarioEnv(gymnasium.Env[Seen, Any]):
         self.action_space = Box(-1.0, 1.0, (2,), np.float32)
         self._rows = max_others
         bounds = {
-            "ego": [MAX_SPEED_MPS, MAX_ACCEL_MPS2, np.pi / 2, OFF_PATH_M, np.pi],
-            "path": [[60.0, 60.0, MAX_SPEED_MPS]] * PATH_ROWS,
-            "others": [[sight_m, sight_m, MAX_SPEED_MPS, MAX_SPEED_MPS, np.pi, 60.0, 10.0]] * max_others,
+            "ego": [MAX_SPEED_MPS, MAX_ACCEL_MPS2, np.pi / 2, LOST_M, np.pi],
+            "path": [[PATH_BOUND_M, PATH_BOUND_M, MAX_SPEED_MPS]] * PATH_ROWS,
+            "others": [[sight_m, sight_m, MAX_SPEED_MPS, MAX_SPEED_MPS, np.pi, MAX_LENGTH_M, MAX_WIDTH_M]] * max_others,
         }
         self._bounds = {k: np.array(v, np.float32) for k, v in bounds.items()}
         spaces: dict[str, Any] = {k: Box(-v, v) for k, v in self._bounds.items()}
@@ -147,7 +150,7 @@ class ScenarioEnv(gymnasium.Env[Seen, Any]):
             "collision": -COLLISION * collides,
         }
         arrived = bool(np.isnan(seen.path.t_s[1]))
-        truncated = not (collides or arrived) and (over or abs(offset_m) > OFF_PATH_M)
+        truncated = not (collides or arrived) and (over or abs(offset_m) > LOST_M)
         info = {"t_s": seen.t_s, "collision": collides, "reward": parts}
         return self._shown(), float(sum(parts.values())), collides or arrived, truncated, info
 
@@ -207,7 +210,8 @@ def _collides(seen: Observation) -> bool:
     own = np.broadcast_to([ego.length_m, ego.width_m], (len(o), 2))
     size = np.stack([o.length_m, o.width_m], axis=1)
     yaw = np.full(len(o), ego.yaw_rad)
-    return bool(rectangles_overlap(o.x_m - ego.x_m, o.y_m - ego.y_m, yaw, o.yaw_rad, own, size).any())
+    level = np.abs(o.z_m - ego.z_m) < (o.height_m + ego.height_m) / 2
+    return bool((level & rectangles_overlap(o.x_m - ego.x_m, o.y_m - ego.y_m, yaw, o.yaw_rad, own, size)).any())
 
 
 def _picture(seen: Observation) -> Any:

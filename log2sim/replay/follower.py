@@ -13,12 +13,14 @@ import numpy as np
 
 from log2sim.geometry import Array, cos_sin
 from log2sim.replay.vehicles.vehicle import (
+    TINY,
     Columns,
     PointControls,
     PointState,
     VehicleControls,
     VehicleParameters,
     VehicleState,
+    rows,
 )
 
 
@@ -87,31 +89,32 @@ def follow_vehicles(
     p, reference_gear, stands = parameters, row[6], row[7]
     pace = np.abs(state.speed_mps)
     moves, square = pace > 0, pace * pace
-    gear = np.where(moves, np.sign(state.speed_mps), reference_gear)
+    gear = np.sign(state.speed_mps + TINY * reference_gear)
     error, raw_rate = _errors(row, state)
     rate = memory.rate - math.expm1(-dt_s / gains.derivative_filter_s) * (raw_rate - memory.rate)
     damping = 2 * gains.damping * rate
     damping[1] *= gear  # in reverse, turning to the left leads to the right
 
-    stiffness = _rows(1 / gains.along_s, 1 / np.maximum(pace * gains.across_s, gains.across_min_m))
+    stiffness = rows(1 / gains.along_s, 1 / np.maximum(pace * gains.across_s, gains.across_min_m))
     pull = error * stiffness**2
     wanted = row[4:6] + pull + damping * stiffness + memory.integral
     # The smallest radius with grip grows with the square of the speed; at standstill only the lock limits.
     grip = np.minimum(gains.max_lateral_accel_mps2 / np.maximum(square, 1.0), p.max_curvature_1pm)
-    asked = _rows(wanted[0] * gear, wanted[1])
-    given = np.minimum(np.maximum(asked, _rows(-p.max_brake_mps2, -grip)), _rows(p.max_throttle_mps2, grip))
+    asked = rows(wanted[0] * gear, wanted[1])
+    given = np.minimum(np.maximum(asked, rows(-p.max_brake_mps2, -grip)), rows(p.max_throttle_mps2, grip))
 
     # Anti-windup: nothing is learned from more error of the same sign while an actuator is at its limit, from a vehicle
     # that is far behind and makes up for it, or from wheels that stand.
     learns = (given == asked) | (error * wanted <= 0)
     learns[0] &= np.abs(error[0]) < MAX_ALONG_M
     learns[1] &= moves
-    bound = _rows(INTEGRAL_LIMIT_MPS2, INTEGRAL_SHARE * grip)
+    bound = rows(INTEGRAL_LIMIT_MPS2, INTEGRAL_SHARE * grip)
     integral = memory.integral + (dt_s / gains.integral_s) * pull * learns
     integral = np.minimum(np.maximum(integral, -bound), bound)
 
     held = (stands > 0.5) & (pace < gains.hold_below_mps) & (error[0] * reference_gear < gains.hold_within_m)
-    given[0, held], integral[0, held] = -gains.hold_brake_mps2, 0.0
+    np.copyto(given[0], -gains.hold_brake_mps2, where=held)
+    np.copyto(integral[0], 0.0, where=held)
     steer = np.arctan(p.wheelbase_m * given[1] * (1 + p.understeer_s2pm2 * square))
     controls = VehicleControls(given[0], steer, reference_gear < 0)
     return controls, Memory(integral, rate)
@@ -131,14 +134,7 @@ def _errors(row: Array, state: VehicleState) -> tuple[Array, Array]:
     turn = curvature * along
     across = cos * dy - sin * dx + turn * along / 2
     _, slope = cos_sin(yaw - turn - state.yaw_rad)
-    return _rows(along, across), _rows(speed - state.speed_mps, slope)
-
-
-def _rows(along: Array | float, across: Array) -> Array:
-    """An array (2, A) of what holds along the path and across it."""
-    both = np.empty((2, len(across)))
-    both[0], both[1] = along, across
-    return both
+    return rows(along, across), rows(speed - state.speed_mps, slope)
 
 
 def follow_points(row: Array, state: PointState, gains: Gains = GAINS) -> PointControls:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array, wrap_angle
+from log2sim.replay.path import Path, path_of
 from log2sim.replay.policy import (
     PATH_AHEAD_M,
     ROUTE_AHEAD_S,
@@ -22,9 +23,6 @@ from log2sim.replay.reactive.ways import SPACING_M, Ways
 from log2sim.replay.world import Driven, Group
 from log2sim.scenario import Agent
 
-ROUTE_BACK_M, ROUTE_ON_M = 5.0, 20.0
-"""How far from its last place the ego is looked for on the recorded way: so it stays on its branch where ways cross."""
-
 ONE = np.zeros(1, dtype=np.intp)
 
 
@@ -37,11 +35,10 @@ class Observer:
         self._way = Ways([self._path])
         self._groups = [g for g in groups if g is not ego]
         self._statics = _poses(statics)
-        # A static agent with one waypoint is there all the time.
-        self._stays = np.array([[a.waypoints.t_s[0], a.waypoints.t_s[-1]] for a in statics]).reshape(-1, 2)
-        self._stays[self._stays[:, 0] == self._stays[:, 1]] = -np.inf, np.inf
-        self._agents = [_identities(g.agents) for g in self._groups]
-        self._static_agents = _identities(statics)
+        lives = [(-np.inf, np.inf) if a.stays else (a.waypoints.t_s[0], a.waypoints.t_s[-1]) for a in statics]
+        self._static_lives_s = np.array(lives, dtype=np.float64).reshape(-1, 2)
+        self._agents = [_identities(g.agents, [r.path for r in g.references]) for g in self._groups]
+        self._static_agents = _identities(statics, [path_of(a, 0.0) for a in statics])
         self.restart()
 
     def restart(self) -> None:
@@ -50,20 +47,25 @@ class Observer:
 
     def __call__(self, step: int, t_s: float, dt_s: float) -> Observation:
         """What the policy sees at a step; call it in the order of steps."""
+        ahead = self._ahead()
         ego = self._state()
-        return Observation(t_s, dt_s, ego, self._others(ego, step, t_s), self._route(t_s), self._ahead(ego))
+        return Observation(t_s, dt_s, ego, self._others(ego, step, t_s), self._route(t_s), ahead)
 
     def _state(self) -> EgoState:
+        """The ego, at the height of its recorded way at `progress_m`."""
         agent, s, p = self.ego.agents[0], self.ego.snapshot(), self.ego.living
+        log_t_s = self._way.times(ONE, np.array([self.progress_m]))
         return EgoState(
             x_m=float(s.x_m[0]),
             y_m=float(s.y_m[0]),
+            z_m=float(self._path.heights(log_t_s)[0]),
             yaw_rad=float(s.yaw_rad[0]),
             speed_mps=float(s.speed_mps[0]),
             accel_mps2=float(s.accel_mps2[0]),
             steer_rad=float(s.steer_rad[0]),
             length_m=agent.size_m[0],
             width_m=agent.size_m[1],
+            height_m=agent.size_m[2],
             wheelbase_m=float(p.wheelbase_m[0]),
             rear_axle_offset_m=float(p.rear_axle_offset_m[0]),
             understeer_s2pm2=float(p.understeer_s2pm2[0]),
@@ -73,11 +75,9 @@ class Observer:
         ahead = np.arange(t_s, min(t_s + ROUTE_AHEAD_S, self._path.t_s[-1]) + ROUTE_STEP_S / 2, ROUTE_STEP_S)
         return Route(*(_locked(c) for c in (ahead, *self._path.centers(ahead))))
 
-    def _ahead(self, ego: EgoState) -> PathAhead:
-        way, begin_m = self._way, max(self.progress_m - ROUTE_BACK_M, 0.0)
-        x, y = (np.array([[c - o]]) for c, o in zip((ego.x_m, ego.y_m), way.origin_m))
-        foot = way.foot(ONE, np.array([begin_m]), self.progress_m - begin_m + ROUTE_ON_M, x, y)
-        self.progress_m = max(float(foot.distance_m[0, 0] + foot.ahead_m[0, 0]), 0.0)
+    def _ahead(self) -> PathAhead:
+        way, now = self._way, self.ego.snapshot()
+        self.progress_m = way.beside(0, self.progress_m, float(now.x_m[0]), float(now.y_m[0]))
         ahead = np.arange(0.0, PATH_AHEAD_M + SPACING_M / 2, SPACING_M)
         x, y, cos, sin, at_s = way.along(ONE, self.progress_m + ahead)
         pace = np.abs(way.at(ONE, np.where(np.isnan(at_s), self._path.t_s[-1], at_s)).speed_mps)
@@ -85,28 +85,32 @@ class Observer:
         return PathAhead(self.progress_m, *(_locked(c) for c in columns))
 
     def _others(self, ego: EgoState, step: int, t_s: float) -> Others:
-        here = (self._stays[:, 0] <= t_s) & (t_s <= self._stays[:, 1])
-        poses, who = [self._statics[:, here]], [self._static_agents[here]]
+        begin_s, end_s = self._static_lives_s.T
+        here = (begin_s <= t_s) & (t_s <= end_s)
+        poses, who, log_s = [self._statics[:, here]], [self._static_agents[here]], [np.full(here.sum(), t_s)]
         for group, agents in zip(self._groups, self._agents):
             if len(group.live):
                 present = (group.first[group.live] <= step) & (step <= group.last[group.live])
                 s = group.snapshot()
                 poses.append(np.stack([s.x_m, s.y_m, s.yaw_rad, s.speed_mps])[:, present])
                 who.append(agents[group.live[present]])
+                log_s.append(group.log_times(t_s)[present])
         x, y, yaw, speed = np.concatenate(poses, axis=1)
         distance = np.hypot(x - ego.x_m, y - ego.y_m)
         near = np.argsort(distance, kind="stable")
         near = near[distance[near] <= self.sight_m]
         x, y, yaw, speed, seen = x[near], y[near], yaw[near], speed[near], np.concatenate(who)[near]
-        columns = (x, y, yaw, speed, speed * np.cos(yaw), speed * np.sin(yaw), seen["length_m"], seen["width_m"])
+        z = np.array([path.heights(t) for path, t in zip(seen["path"], np.concatenate(log_s)[near])], dtype=np.float64)
+        size = (seen[k] for k in ("length_m", "width_m", "height_m"))
+        columns = (x, y, z, yaw, speed, speed * np.cos(yaw), speed * np.sin(yaw), *size)
         return Others(_locked(seen["id"]), _locked(seen["category"]), *(_locked(c) for c in columns))
 
 
-def _identities(agents: Sequence[Agent]) -> NDArray:
-    """Id, category and size of agents as records (A,)."""
-    rows = [(a.id, a.category, a.size_m[0], a.size_m[1]) for a in agents]
-    kinds = [("id", object), ("category", object), ("length_m", np.float64), ("width_m", np.float64)]
-    return np.array(rows, dtype=kinds)
+def _identities(agents: Sequence[Agent], paths: Sequence[Path]) -> NDArray:
+    """Id, category, size and logged path of agents as records (A,)."""
+    rows = [(a.id, a.category, *a.size_m, path) for a, path in zip(agents, paths)]
+    sizes = [(k, np.float64) for k in ("length_m", "width_m", "height_m")]
+    return np.array(rows, dtype=[("id", object), ("category", object), *sizes, ("path", object)])
 
 
 def _poses(agents: Sequence[Agent]) -> Array:

@@ -59,6 +59,10 @@ class Path:
         x, y, yaw, speed = self.at(t_s)
         return x + self.origin_m[0], y + self.origin_m[1], wrap_angle(yaw), speed
 
+    def heights(self, t_s: Array) -> Array:
+        """Height z of the box center in the map at times (N,), held outside the life."""
+        return np.interp(t_s, self.t_s, self.z_m)
+
     def jump_times(self) -> Array:
         """Times (J,) at which the log stands elsewhere than it could have driven to."""
         return self.t_s[1:][self.jump]
@@ -97,8 +101,8 @@ def _tangents(
 def hermite(value: Array, slope: Array, i: NDArray[np.intp], t: Array, span: Array) -> Array:
     """Cubics (..., N) through value[..., i] and value[..., i + 1] with their slopes, at `t` (N,) after the first."""
     f = t / span
-    begin, end = value[..., i], value[..., i + 1]
-    begin_rise, end_rise, rise = span * slope[..., i], span * slope[..., i + 1], end - begin
+    begin, end = value.take(i, axis=-1), value.take(i + 1, axis=-1)
+    begin_rise, end_rise, rise = span * slope.take(i, axis=-1), span * slope.take(i + 1, axis=-1), end - begin
     return begin + f * (
         begin_rise + f * (3 * rise - 2 * begin_rise - end_rise + f * (begin_rise + end_rise - 2 * rise))
     )

@@ -45,12 +45,14 @@ class EgoState:
 
     x_m: float
     y_m: float
+    z_m: float
     yaw_rad: float
     speed_mps: float
     accel_mps2: float
     steer_rad: float
     length_m: float
     width_m: float
+    height_m: float
     wheelbase_m: float
     rear_axle_offset_m: float
     understeer_s2pm2: float
@@ -60,19 +62,22 @@ class EgoState:
 class Others:
     """Agents whose box center is within sight, nearest first, as columns (A,): parked ones too, the ego not.
 
-    `velocity_x_mps`, `velocity_y_mps` are on the map's axes; `id` and `category` are strings.
+    `velocity_x_mps`, `velocity_y_mps` are on the map's axes; `id` and `category` are strings. Who is on another level, as
+    `z_m` and `height_m` tell, is in nobody's way.
     """
 
     id: NDArray[Any]
     category: NDArray[Any]
     x_m: Array
     y_m: Array
+    z_m: Array
     yaw_rad: Array
     speed_mps: Array
     velocity_x_mps: Array
     velocity_y_mps: Array
     length_m: Array
     width_m: Array
+    height_m: Array
 
     def __len__(self) -> int:
         return len(self.x_m)

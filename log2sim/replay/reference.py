@@ -21,8 +21,9 @@ SMOOTHING_S = 0.12
 
 STANDSTILL_MPS = 0.08
 MIN_RUN_M, MIN_RUN_MPS = 0.3, 0.5  # shorter and slower runs forward or backward are noise of a standing agent
-MAX_ACCEL_MPS2 = 10.4  # feasibility limits of Waymax (Gulino et al., 2023)
+MAX_ACCEL_MPS2 = 10.4  # feasibility limits of Waymax (Gulino et al., 2023, section 3.3)
 MAX_CURVATURE_1PM = 0.3
+MAX_TWO_WHEELER_CURVATURE_1PM = 1.0  # which it does not tell; a bicycle turns within a meter
 MAX_DEPARTURE_M = 0.3  # more than boxes err by
 
 
@@ -58,19 +59,23 @@ def vehicle_reference(
     """The table of a vehicle. Columns "..._ahead" are those of a later time, which makes up for the actuators' lag."""
     course, departure_m = drivable_course(path, limits)
     first, t = _grid(path)
-    gear, stands = _gears(_motion(course, t)[3])
+    motion = _motion(course, t)
+    gear, stands = _gears(motion[3])
 
-    def exact(at_s: Array) -> Array:
+    def rows_at(at_s: Array, motion: Array) -> Array:
         rows = np.empty((len(VEHICLE_COLUMNS), len(at_s)))
-        rows[:4] = _motion(course, at_s)
+        rows[:4] = motion
         rows[4] = np.interp(at_s + accel_ahead_s, course.t_s, course.accel_mps2)
         rows[5] = np.interp(at_s + curvature_ahead_s, course.t_s, course.curvature_1pm)
         k = np.minimum(np.searchsorted(t, at_s + accel_ahead_s), len(t) - 1)
         rows[6], rows[7] = gear[k], stands[k]
         return rows.T
 
+    def exact(at_s: Array) -> Array:
+        return rows_at(at_s, _motion(course, at_s))
+
     flags = _flags(path, course, departure_m, max_curvature_1pm)
-    return Reference(path, first, exact(t), exact, limits.offset_m, flags)
+    return Reference(path, first, rows_at(t, motion), exact, limits.offset_m, flags)
 
 
 def drivable_course(path: Path, limits: Limits) -> tuple[Course, Array]:

@@ -9,7 +9,7 @@ import numpy as np
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.registry import nearest
 from log2sim.replay.assemble import assemble
-from log2sim.replay.cast import EGO, cast_agents, groups_of, reactive_ids, traffic_of
+from log2sim.replay.cast import cast_agents, groups_of, reactive_ids, traffic_of
 from log2sim.replay.clock import Clock
 from log2sim.replay.policy import SIGHT_M, Policy, begin
 from log2sim.replay.result import Replay
@@ -17,7 +17,7 @@ from log2sim.replay.rollout import Progress, Tracks, World, roll
 from log2sim.replay.simulator import Host
 from log2sim.replay.vehicles.models import MODELS, Choice
 from log2sim.replay.vehicles.parameters import WHEELED
-from log2sim.scenario import Agent, Scenario
+from log2sim.scenario import EGO, Agent, Scenario
 
 MODES = ("pid", "exact")
 DT_RANGE_S = (0.0005, 1.0)

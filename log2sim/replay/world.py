@@ -74,6 +74,10 @@ class Group(ABC):
             for slot, i in enumerate(self.live):
                 _fill(self._table[:, :, slot], self.references[i], self._row0)
 
+    def log_times(self, t_s: float) -> Array:
+        """When the log was where the living agents are meant to be at a time (A,)."""
+        return np.full(len(self.live), t_s)
+
     def look_up(self, t_s: float) -> None:
         """Set `row` (C, A) to the references at a time."""
         self.now_s = t_s

@@ -56,8 +56,9 @@ def _scenario(root: Element, path: Path) -> Scenario:
     placement = _placement(parameters, frame)
     vertices = _vertices(root)
     last_s = max((rows[-1, 0] for rows in vertices.values()), default=0.0)
+    starts = _starts(root)
     agents = [
-        _agent(o, vertices.get(o.get("name", "")), root, last_s, placement)
+        _agent(o, vertices.get(o.get("name", "")), starts, last_s, placement)
         for o in root.iterfind("Entities/ScenarioObject")
     ]
     if not agents:
@@ -128,13 +129,23 @@ def _placement(parameters: Mapping[str, str], frame: MapFrame) -> Placement:
 
 
 def _vertices(root: Element) -> dict[str, Array]:
-    """By entity the vertices (V, 5) t, x, y, z, heading of all its trajectories."""
+    """By entity the vertices (V, 5) t, x, y, z, heading of all its trajectories.
+
+    Many entities may share one trajectory, so a small file may ask for very many vertices: they are counted for each.
+    """
     found: dict[str, list[Array]] = {}
+    count = 0
     for group in root.iter("ManeuverGroup"):
         names = [ref.get("entityRef", "") for ref in group.iterfind("Actors/EntityRef")]
-        for follow in group.iter("FollowTrajectoryAction"):
+        for follow in group.iter("FollowTrajectoryAction") if names else ():
+            rows = _polyline(follow, f"entity '{names[0][:100]}'")
+            count += len(names) * len(rows)
+            if count > VERTEX_LIMIT:
+                raise ScenarioError(
+                    f"its entities have more than {VERTEX_LIMIT} vertices together; cut the file into parts"
+                )
             for name in names:
-                found.setdefault(name, []).append(_polyline(follow, f"entity '{name[:100]}'"))
+                found.setdefault(name, []).append(rows)
     return {name: np.concatenate(parts) for name, parts in found.items()}
 
 
@@ -145,10 +156,8 @@ def _polyline(follow: Element, where: str) -> Array:
             f"{where}: its trajectory has no <Timing> with an absolute domain; without it nothing has a time"
         )
     nodes = list(follow.iter("Vertex"))
-    if not nodes or len(nodes) > VERTEX_LIMIT:
-        raise ScenarioError(
-            f"{where}: its trajectory has {len(nodes)} vertices of a polyline, expected 1 to {VERTEX_LIMIT}"
-        )
+    if not nodes:
+        raise ScenarioError(f"{where}: its trajectory has no vertices of a polyline, expected at least one")
     scale, offset = (require_number(timing.get(key), f"{where}: Timing {key}") for key in ("scale", "offset"))
     rows = np.array([[require_number(n.get("time"), f"{where}: Vertex time"), *_pose(n, where)] for n in nodes])
     rows[:, 0] = offset + scale * rows[:, 0]
@@ -181,7 +190,9 @@ def _pose(node: Element, where: str) -> list[float]:
     return [x, y, z, float("nan") if heading is None else require_number(heading, f"{where}: WorldPosition h")]
 
 
-def _agent(node: Element, vertices: Array | None, root: Element, last_s: float, placement: Placement) -> dict[str, Any]:
+def _agent(
+    node: Element, vertices: Array | None, starts: Mapping[str, Element], last_s: float, placement: Placement
+) -> dict[str, Any]:
     """The document of one agent."""
     name = node.get("name", "")
     where = f"entity '{name[:100]}'"
@@ -195,7 +206,7 @@ def _agent(node: Element, vertices: Array | None, root: Element, last_s: float, 
     offset_m = require_number(center.get("x"), f"{where}: Center x")
     height_m = require_number(center.get("z"), f"{where}: Center z")
     if vertices is None:
-        vertices = _standing(root, name, where, last_s)
+        vertices = _standing(starts.get(name), where, last_s)
     return {
         "id": unescaped(properties[PREFIX + "id"]) if PREFIX + "id" in properties else _identity(name, properties),
         "category": properties.get(PREFIX + "category") or _category(body),
@@ -209,14 +220,22 @@ def _agent(node: Element, vertices: Array | None, root: Element, last_s: float, 
     }  # fmt: skip
 
 
-def _standing(root: Element, name: str, where: str, last_s: float) -> Array:
-    """Vertices (2, 5) of an entity that stands where the file puts it at first."""
+def _starts(root: Element) -> dict[str, Element]:
+    """By entity where the file puts it at first."""
+    found: dict[str, Element] = {}
     for private in root.iterfind("Storyboard/Init/Actions/Private"):
-        teleport = private.find("PrivateAction/TeleportAction") if private.get("entityRef") == name else None
+        teleport = private.find("PrivateAction/TeleportAction")
         if teleport is not None:
-            pose = _pose(teleport, where)
-            return np.nan_to_num(np.array([[0.0, *pose], [max(last_s, 1e-3), *pose]]))
-    raise ScenarioError(f"{where}: has neither a trajectory nor a position at the start; nothing says where it is")
+            found.setdefault(private.get("entityRef", ""), teleport)
+    return found
+
+
+def _standing(start: Element | None, where: str, last_s: float) -> Array:
+    """Vertices (2, 5) of an entity that stands where the file puts it at first."""
+    if start is None:
+        raise ScenarioError(f"{where}: has neither a trajectory nor a position at the start; nothing says where it is")
+    pose = _pose(start, where)
+    return np.nan_to_num(np.array([[0.0, *pose], [max(last_s, 1e-3), *pose]]))
 
 
 def _identity(name: str, properties: Mapping[str, str]) -> str:

@@ -77,7 +77,7 @@ def steps_of(scenario: Scenario) -> Steps:
     ends = [(a.waypoints.t_s[0], a.waypoints.t_s[-1]) for a in scenario.agents]
     t_s = clock(min(first for first, _ in ends), max(last for _, last in ends), STEP_S)
     t_ns = scenario.t0_ns + np.round(t_s * NS_PER_S).astype(np.int64)
-    return Steps(t_ns, tuple((agent, on_clock(agent, t_s)) for agent in scenario.agents))
+    return Steps(t_ns, tuple((agent, on_clock(agent, t_s, STEP_S)) for agent in scenario.agents))
 
 
 def shown_of(scenario: Scenario, log: Log) -> Iterator[Shown]:

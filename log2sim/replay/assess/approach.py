@@ -37,7 +37,7 @@ def approaches(boxes: Boxes, moves: NDArray[np.bool_], spacing_s: float) -> Appr
     -----
     Time-to-collision of Hayward (1972) in the plane: both boxes keep their velocity and their heading; see `time_to_touch`.
     Boxes that overlap already have none. It is taken at every row, and knows no road: two that pass each other in a bend
-    would collide if they went straight on. Cost: A^2 comparisons for every `CHUNK` rows, then the pairs on course.
+    would collide if they went straight on. Cost: the pairs within reach of each other for every `CHUNK` rows, then those on course.
     """
     vx, vy = boxes.velocities(spacing_s)
     found = [np.zeros((4, 0))]
@@ -89,6 +89,8 @@ def _on_course(
     For some rows each agent is a circle on a straight line, so large that it holds all its places then and, at all its
     velocities then, all places within the horizon.
     """
+    from scipy.spatial import cKDTree
+
     here = np.flatnonzero(boxes.present[rows].any(axis=0))
     t = (np.arange(len(vx)) - (len(vx) - 1) / 2)[:, None] * spacing_s
     radius = boxes.radius_m[here]
@@ -100,13 +102,13 @@ def _on_course(
         radius = radius + np.nanmax(off, axis=0)
         lines.append((start, mean))
     (x, ux), (y, uy) = lines
+    places, reach = np.stack([x, y], axis=1), radius + np.hypot(ux, uy) * (HORIZON_S + t[-1, 0])
+    tree = cKDTree(places)
     for first in range(0, len(here), BLOCK):
-        i, j = (
-            grid.ravel()
-            for grid in np.meshgrid(
-                np.arange(first, min(first + BLOCK, len(here))), np.arange(first, len(here)), indexing="ij"
-            )
-        )
+        block = slice(first, first + BLOCK)
+        within_m = np.max(reach[block]) + np.max(reach)
+        found = cKDTree(places[block]).sparse_distance_matrix(tree, within_m, output_type="ndarray")
+        i, j = first + found["i"], found["j"]
         pair = (j > i) & (moves[here[i]] | moves[here[j]])
         i, j = i[pair], j[pair]
         meet = _circles_meet(

@@ -49,7 +49,9 @@ class Boxes:
     @cached_property
     def last_row(self) -> Rows:
         """The last row (A,) with the agent; the last of all where there is none."""
-        return len(self.x_m) - 1 - (np.argmax(self.present[::-1], axis=0) if len(self.x_m) else 0) + 0 * self.first_row
+        if not len(self.x_m):
+            return np.full(len(self.size_m), -1, dtype=np.intp)
+        return len(self.x_m) - 1 - np.argmax(self.present[::-1], axis=0)
 
     @cached_property
     def moves_on(self) -> NDArray[np.bool_]:
@@ -97,6 +99,11 @@ class Boxes:
         size_a, size_b = self.size_m[a], self.size_m[b]
         vertical = np.abs(zb - za) < (size_a[:, 2] + size_b[:, 2]) / 2
         return vertical & rectangles_overlap(xb - xa, yb - ya, yaw_a, yaw_b, size_a, size_b)
+
+
+def spacing_s(t_s: Array) -> float:
+    """The time from row to row of evenly spaced times (S,); 1 where there is only one, of which nothing moves."""
+    return float(t_s[1] - t_s[0]) if len(t_s) > 1 else 1.0
 
 
 def axes_between(

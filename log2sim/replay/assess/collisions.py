@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array, wrap_angle
-from log2sim.replay.assess.boxes import Boxes, Rows
+from log2sim.replay.assess.boxes import Boxes, Rows, spacing_s
 from log2sim.replay.assess.sweep import Motion, first_touch
 from log2sim.replay.vehicles.vehicle import Columns
 
@@ -123,14 +123,14 @@ def collisions(
     involved = np.isin(np.arange(len(ids)), np.concatenate([touching.a, touching.b]))
     grown = replace(logged, size_m=logged.size_m + np.array([LOG_MARGIN_M, LOG_MARGIN_M, 0.0]))
     known = contacts(grown, moves, involved)
-    velocity = np.stack(replayed.velocities(_spacing(t_s)))
+    velocity = np.stack(replayed.velocities(spacing_s(t_s)))
     rows = np.arange(len(t_s), dtype=np.float64)
     logged_contacts = _by_pair(known)
     events: list[dict[str, Any]] = []
     for (a, b), contact in _by_pair(touching).items():
         in_log = np.interp(logged_contacts.get((a, b), np.zeros((2, 0))), rows, t_s)
         together = max(replayed.first_row[a], replayed.first_row[b])
-        for begin_row, end_row in _runs(contact, SAME_CONTACT_S / _spacing(t_s)):
+        for begin_row, end_row in _runs(contact, SAME_CONTACT_S / spacing_s(t_s)):
             begin, end = np.interp([begin_row, end_row], rows, t_s)
             shared = (in_log[0] <= end + LOG_WINDOW_S) & (in_log[1] >= begin - LOG_WINDOW_S)
             events.append(
@@ -160,10 +160,6 @@ def _runs(contact: Array, gap: float) -> list[tuple[float, float]]:
     first, last = contact
     new = np.flatnonzero(first[1:] - last[:-1] > gap) + 1
     return [(float(f[0]), float(t[-1])) for f, t in zip(np.split(first, new), np.split(last, new))]
-
-
-def _spacing(t_s: Array) -> float:
-    return float(t_s[1] - t_s[0]) if len(t_s) > 1 else 1.0
 
 
 def _relative_speed(velocity: Array, row: float, a: int, b: int) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -11,6 +12,9 @@ from log2sim.geometry import Array
 ACCEL_WINDOW_S = 0.75
 JERK_WINDOW_S = 1.5
 """Lengths of the fits. Shorter ones show the steps of a controller and the noise of a log instead of the ride."""
+
+LEAST_ROWS = 5
+"""A window of fewer rows fits no cubic; where rows lie far apart the fits are longer for that."""
 
 LIMITS = {
     "lon_accel_max_mps2": 2.40,
@@ -42,9 +46,9 @@ def comfort(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array) -> dict[str, flo
     Derivatives of cubics fitted to the positions in a sliding window (Savitzky and Golay, 1964): longitudinal along the
     heading, lateral across it, both of the box center whatever drives it. What changes faster than the window is damped.
     """
-    if len(t_s) < 5:
+    if len(t_s) < LEAST_ROWS:
         return None
-    spacing_s = (t_s[-1] - t_s[0]) / (len(t_s) - 1)
+    spacing_s = round((t_s[-1] - t_s[0]) / (len(t_s) - 1), 9)  # as times are stored, and the same for all agents
     ax, ay = (_derivative(c, 2, ACCEL_WINDOW_S, spacing_s) for c in (x_m, y_m))
     jx, jy = (_derivative(c, 3, JERK_WINDOW_S, spacing_s) for c in (x_m, y_m))
     yaw = np.unwrap(yaw_rad)
@@ -71,17 +75,26 @@ def comfort(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array) -> dict[str, flo
 def _derivative(values: Array, order: int, window_s: float, spacing_s: float) -> Array:
     """Derivative (S,) of the cubics fitted to a window about each row; near an end of that of the window at the end."""
     longest = len(values) - (len(values) + 1) % 2
-    half = min(round(window_s / spacing_s / 2), longest // 2)
+    half = min(max(round(window_s / spacing_s / 2), LEAST_ROWS // 2), longest // 2)
+    weights = _weights(half, order, spacing_s)
+    values = values - values[0]  # far map offsets would cost digits
+    return np.concatenate(
+        [
+            weights[:half] @ values[: 2 * half + 1],
+            np.correlate(values, weights[half], mode="valid"),
+            weights[half + 1 :] @ values[-2 * half - 1 :],
+        ]
+    )
+
+
+@lru_cache(maxsize=64)
+def _weights(half: int, order: int, spacing_s: float) -> Array:
+    """Weights (W, W) of the values of a window of W = 2 half + 1 rows in the derivative at each of its rows."""
     at_s = np.arange(-half, half + 1) * spacing_s
     fit = np.linalg.pinv(np.vander(at_s, 4, increasing=True))
-    # Relative to the first row, since far map offsets would cost digits.
-    cubics = np.lib.stride_tricks.sliding_window_view(values - values[0], len(at_s)) @ fit.T
-    row = np.arange(len(values))
-    center = np.clip(row, half, len(values) - 1 - half)
-    since_s = (row - center) * spacing_s
     return sum(
-        (math.perm(k, order) * cubics[center - half, k] * since_s ** (k - order) for k in range(order, 4)),
-        start=np.zeros(len(values)),
+        (math.perm(k, order) * np.outer(at_s ** (k - order), fit[k]) for k in range(order, 4)),
+        start=np.zeros((len(at_s), len(at_s))),
     )
 
 

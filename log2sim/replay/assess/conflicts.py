@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array
 from log2sim.replay.assess.approach import approaches
-from log2sim.replay.assess.boxes import Boxes
+from log2sim.replay.assess.boxes import Boxes, spacing_s
 from log2sim.replay.assess.encroachment import encroachments
-
-EGO = "ego"
+from log2sim.scenario import EGO
 
 Event = Mapping[str, Any]
 
@@ -26,7 +25,7 @@ def conflicts(
     Both times of a pair with a collision that the log does not have are 0 when it begins; `contact` is "none", "new" or
     "log".
     """
-    spacing_s = float(t_s[1] - t_s[0]) if len(t_s) > 1 else 1.0
+    step_s = spacing_s(t_s)
     rows = np.arange(len(t_s), dtype=np.float64)
     by_pair: dict[tuple[int, int], dict[str, Any]] = {}
 
@@ -36,10 +35,10 @@ def conflicts(
             by_pair[pair] = _empty(ids[pair[0]], ids[pair[1]])
         return by_pair[pair]
 
-    close = approaches(boxes, moves, spacing_s)
+    close = approaches(boxes, moves, step_s)
     for a, b, time_s, row in zip(*(c.tolist() for c in (close.a, close.b, close.time_s, close.row))):
         record(a, b).update(min_ttc_s=round(time_s, 4), min_ttc_t_s=round(float(t_s[row]), 6))
-    crossed = encroachments(boxes, spacing_s)
+    crossed = encroachments(boxes, step_s)
     left, came = (np.interp(row, rows, t_s) for row in (crossed.left_row, crossed.came_row))
     for a, b, left_s, came_s in zip(crossed.first.tolist(), crossed.second.tolist(), left.tolist(), came.tolist()):
         record(a, b).update(pet_s=round(came_s - left_s, 4), pet_t_s=round(came_s, 6), pet_first=ids[a])

@@ -71,7 +71,7 @@ def encroachments(boxes: Boxes, spacing_s: float) -> Encroachments:
     second to arrive, and if their headings differ there by at least `CROSSING_RAD`.
 
     Method: oriented rectangles about what boxes cover during 64 rows are compared, then during 16 and 4 where these
-    overlap, then the boxes; the row found is divided. Cost: A^2 for every 64 rows, then what overlaps.
+    overlap, then the boxes; the row found is divided. Cost: A log A for every 64 rows, then what overlaps.
     """
     lag = HORIZON_S / spacing_s
     hulls = [_Hulls(boxes, COARSE // FINER**level) for level in range(LEVELS)]
@@ -139,14 +139,18 @@ def _range(values: Array, half: Array) -> tuple[Array, Array]:
 
 def _coarse(hulls: _Hulls, lag: float) -> Iterator[_Pairs]:
     """Pairs of blocks that overlap, those of two blocks of rows at a time."""
+    from scipy.spatial import cKDTree
+
     count = len(hulls.x_m)
+    there = [np.flatnonzero(~np.isnan(x)) for x in hulls.x_m]
+    trees = [cKDTree(np.stack([x[k], y[k]], axis=1)) for x, y, k in zip(hulls.x_m, hulls.y_m, there)]
+    reach = [np.max(radius[k], initial=0.0) for radius, k in zip(hulls.radius_m, there)]
     for i in range(count):
         for j in range(i, min(count, i + int(lag // hulls.size) + 2)):
-            far = np.hypot(
-                hulls.x_m[j] - hulls.x_m[i][:, None], hulls.y_m[j] - hulls.y_m[i][:, None]
-            )  # NaN compares as False
-            a, b = np.nonzero(far < hulls.radius_m[i][:, None] + hulls.radius_m[j])
-            a, b = a[a != b], b[a != b]
+            found = trees[i].sparse_distance_matrix(trees[j], reach[i] + reach[j], output_type="ndarray")
+            a, b = there[i][found["i"]], there[j][found["j"]]
+            near = (a != b) & (found["v"] < hulls.radius_m[i, a] + hulls.radius_m[j, b])
+            a, b = a[near], b[near]
             yield hulls.met(_Pairs(a, b, np.full(len(a), i), np.full(len(a), j)))
 
 

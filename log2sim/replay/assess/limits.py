@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 from log2sim.errors import CheckFailed, ConfigError
 from log2sim.registry import nearest
 from log2sim.replay.assess.comfort import LIMITS as COMFORT
+from log2sim.replay.result import Replay
 
 CROSS_TRACK_LIMIT_M = 0.5
 """Limit of a strict replay: a car of 1.9 m in a lane of 3.5 m has 0.8 m on either side."""
@@ -46,7 +46,7 @@ def parse_limits(texts: Iterable[str]) -> dict[str, float]:
     return limits
 
 
-def check_limits(replay: Any, limits: Mapping[str, float]) -> list[str]:
+def check_limits(replay: Replay, limits: Mapping[str, float]) -> list[str]:
     """What breaks the limits asked for: of the ego where a policy drives it, else of every agent that moves."""
     driven = [a.id for a in replay.agents if a.driver == "policy"]
     by_agent = replay.metrics["by_agent"]
@@ -61,7 +61,7 @@ def check_limits(replay: Any, limits: Mapping[str, float]) -> list[str]:
     return broken
 
 
-def check_strict(replay: Any, limits: Mapping[str, float] | None = None) -> list[str]:
+def check_strict(replay: Replay, limits: Mapping[str, float] | None = None) -> list[str]:
     """What breaks a limit of `--strict`: collisions that the log does not have, followers off their path, impossible logs.
 
     Comfort, time to collision and post-encroachment time count where `limits` names them: what a log's drivers did is no
@@ -82,7 +82,7 @@ def check_strict(replay: Any, limits: Mapping[str, float] | None = None) -> list
     return broken + check_limits(replay, limits or {})
 
 
-def require_strict(replay: Any, limits: Mapping[str, float] | None = None) -> None:
+def require_strict(replay: Replay, limits: Mapping[str, float] | None = None) -> None:
     """Raise `CheckFailed` with all broken limits."""
     broken = check_strict(replay, limits)
     if broken:

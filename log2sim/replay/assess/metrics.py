@@ -57,9 +57,9 @@ def tracking_errors(path: Path, t_s: Array, x_m: Array, y_m: Array, near_s: Arra
     reach = round(SEARCH_S / SEARCH_STEP_S)
     middle = np.rint(((t_s if near_s is None else near_s) - begin_s) / SEARCH_STEP_S).astype(np.intp)
     near = np.clip(middle[:, None] + np.arange(-reach, reach), 0, len(square) - 1)
-    dx, dy, sx, sy = x_m[:, None] - px[near], y_m[:, None] - py[near], ux[near], uy[near]
+    dx, dy, sx, sy = x_m[:, None] - px.take(near), y_m[:, None] - py.take(near), ux.take(near), uy.take(near)
     slope = np.divide(1.0, square, out=np.zeros_like(square), where=moves)
-    share = np.clip((dx * sx + dy * sy) * slope[near], 0.0, 1.0)
+    share = np.clip((dx * sx + dy * sy) * slope.take(near), 0.0, 1.0)
     best = np.argmin((dx - share * sx) ** 2 + (dy - share * sy) ** 2, axis=1)
     row = np.arange(len(t_s))
     k, dx, dy = near[row, best], dx[row, best], dy[row, best]

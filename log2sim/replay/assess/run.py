@@ -98,7 +98,7 @@ def _boxes(
         rows = steps // clock.store_every
         if agent.id in paths:
             x, y, yaw, speed = paths[agent.id].centers(agent.t_s)
-            columns[:, rows, k] = np.stack([x, y, agent.z_m, yaw, speed])
+            columns[:, rows, k] = np.stack([x, y, paths[agent.id].heights(agent.t_s), yaw, speed])
         elif len(rows) == len(agent):
             columns[:, rows, k] = agent.x_m, agent.y_m, agent.z_m, agent.yaw_rad, agent.speed_mps
         elif len(rows):  # one pose for all rows

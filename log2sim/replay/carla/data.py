@@ -36,10 +36,10 @@ def carla_agents(agents: Sequence[Agent]) -> list[dict[str, Any]]:
 
 
 def _agent(agent: Agent, turn: int, span_s: tuple[float, float]) -> dict[str, Any]:
-    """One agent: a static one that was seen once is there all the time, `span_s`, as in log2sim's own simulator."""
+    """One agent; one that stays is there for all of `span_s`, as in log2sim's own simulator."""
     w, wheeled = agent.waypoints, agent.category in WHEELED
     moves = not agent.static and len(w) > 1
-    life_s = span_s if agent.static and len(w) == 1 else (float(w.t_s[0]), float(w.t_s[-1]))
+    life_s = span_s if agent.stays else (float(w.t_s[0]), float(w.t_s[-1]))
     path = path_of(agent, rear_axle_offset(agent))
     exact, pid = _courses(agent, path, drives=moves and wheeled)
     limits = parameters_for([agent]) if wheeled else None
@@ -68,7 +68,7 @@ def _courses(agent: Agent, path: Path, *, drives: bool) -> tuple[dict[str, list[
     """Columns of the logged course and, for a vehicle that drives, of the one that it can drive; both of the box center."""
     t_s = _times(agent, path)
     x, y, yaw, _ = path.at(t_s)
-    z = np.interp(t_s, path.t_s, path.z_m) - agent.size_m[2] / 2
+    z = path.heights(t_s) - agent.size_m[2] / 2
     origin_x, origin_y = path.origin_m
     if not drives:
         return {**_mirrored(t_s, x + origin_x, y + origin_y, z, yaw), "curvature_1pm": [0.0] * len(t_s)}, None

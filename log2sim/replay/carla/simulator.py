@@ -153,7 +153,7 @@ class CarlaSimulator:
         if body is None or self._read.get(name) != (state.x_m[slot], state.y_m[slot]):
             x, y = self._to_carla(group, slot, float(state.x_m[slot]), float(state.y_m[slot]))
             center = (x + offset_m * math.cos(yaw), y + offset_m * math.sin(yaw))
-            place = self._player.grounded(self._data[name], (*center, self._height(name, step), yaw), falls=True)
+            place = self._player.grounded(self._data[name], (*center, self._height(group, slot, step), yaw), falls=True)
             body = body or self.stage.spawn(self._data[name], place, True)
             velocity = self.carla.Vector3D(speed * math.cos(yaw), speed * math.sin(yaw), 0.0)
             yield command.ApplyTransform(body.actor.id, body.transform(*place))
@@ -174,7 +174,7 @@ class CarlaSimulator:
             body, walks = self.stage.bodies.get(name), self._data[name]["drive"] == "walker"
             if body is None or not walks or self._read.get(name) != (state.x_m[slot], state.y_m[slot]):
                 at = (x, y) if walks else (goal_x, goal_y)
-                place = self._player.grounded(self._data[name], (*at, self._height(name, step), yaw))
+                place = self._player.grounded(self._data[name], (*at, self._height(group, slot, step), yaw))
                 body = body or self.stage.spawn(self._data[name], place, walks)
                 yield self.carla.command.ApplyTransform(body.actor.id, body.transform(*place))
             if walks:
@@ -189,7 +189,7 @@ class CarlaSimulator:
             vx, vy = speed * math.cos(yaw), speed * math.sin(yaw)
             walks = self._data[name]["drive"] == "walker"
             at = (x, y) if walks else (x + vx * dt_s, y + vy * dt_s)
-            place = self._player.grounded(self._data[name], (*at, self._height(name, step), yaw))
+            place = self._player.grounded(self._data[name], (*at, self._height(group, slot, step), yaw))
             body = self.stage.bodies.get(name) or self.stage.spawn(self._data[name], place, False)
             yield self.carla.command.ApplyTransform(body.actor.id, body.transform(*place))
             if walks:
@@ -223,9 +223,10 @@ class CarlaSimulator:
             x[slot], y[slot] = self._read[name] = self._from_carla(group, slot, *self.stage.bodies[name].pose()[:2])
         group.state = PointState(x, y, (x - state.x_m) / dt_s, (y - state.y_m) / dt_s)
 
-    def _height(self, name: str, step: int) -> float:
-        """The height of an agent's lowest face in the log."""
-        return self._courses[name].place(self.clock.time(step))[2]
+    def _height(self, group: Group, slot: int, step: int) -> float:
+        """The height of an agent's lowest face where the log was when it is there."""
+        course = self._courses[group.agents[group.live[slot]].id]
+        return course.place(float(group.log_times(self.clock.time(step))[slot]))[2]
 
     def _to_carla(self, group: Group, slot: int, x: float, y: float) -> tuple[float, float]:
         """A place of a group's state, which is relative to the agent's first waypoint, in CARLA's frame."""

@@ -41,6 +41,9 @@ class Reactive(Group):
             self.last, self._tau = self._logged_last, np.full(len(self.agents), -np.inf)
         super().open_window(begin, end, begin_s, end_s)
 
+    def log_times(self, t_s: float) -> Array:
+        return t_s - self.traffic.delay_s[self.index[self.live]]
+
     def look_up(self, t_s: float) -> None:
         """Set `row` (C, A) to the references at the places where the agents are."""
         self.now_s = t_s

@@ -54,9 +54,10 @@ class Moment:
         """Those of the pairs (P,), (P,) that may come near each other within the horizon."""
         p, radius = self.pose, np.hypot(self.size_m[:, 0], self.size_m[:, 1]) / 2
         reach = self.reach_m(i) + np.abs(p.speed_mps[j]) * HORIZON_S[-1] + radius[i] + radius[j]
-        near = np.abs(p.z_m[i] - p.z_m[j]) < (self.size_m[i, 2] + self.size_m[j, 2]) / 2
-        near &= (p.x_m[i] - p.x_m[j]) ** 2 + (p.y_m[i] - p.y_m[j]) ** 2 < reach**2
+        near = (p.x_m[i] - p.x_m[j]) ** 2 + (p.y_m[i] - p.y_m[j]) ** 2 < reach**2
         i, j = i[near], j[near]
+        level = self._level(i, j)
+        i, j = i[level], j[level]
         # In a circle there are many whom four boxes about the way ahead leave out: above all those in other lanes.
         x, y = (np.ascontiguousarray(c[:, ::4].T) for c in self.course[:2])
         swept = self._hull(i, x[:, j], y[:, j])
@@ -73,6 +74,14 @@ class Moment:
             ]
             meets |= ~(apart[0] | apart[1])
         return i[meets], j[meets]
+
+    def _level(self, i: Index, j: Index) -> NDArray[np.bool_]:
+        """Whether agents j (P,) are as high as agents i (P,), or as the ways of these are as far ahead as they are."""
+        p = self.pose
+        gap_m = np.hypot(p.x_m[i] - p.x_m[j], p.y_m[i] - p.y_m[j])
+        ahead_m = self.ways.at(i, self.ways.times(i, p.distance_m[i] + gap_m)).z_m
+        apart_m = np.minimum(np.abs(p.z_m[i] - p.z_m[j]), np.abs(ahead_m - p.z_m[j]))
+        return apart_m < (self.size_m[i, 2] + self.size_m[j, 2]) / 2
 
     def _hull(self, i: Index, x_m: Array, y_m: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         """Least and greatest of points (N, P), ahead and to the left of agents i (P,)."""

@@ -62,7 +62,7 @@ class Traffic:
         self.reacts = np.array([a.id in reactive for a in agents], dtype=bool)
         self.driver = drivers_for(agents)
         self._static = np.array([a.static for a in agents], dtype=bool)
-        self._stays = self._static & (self.ways.begin_s == self.ways.end_s)
+        self._stays = np.array([a.stays for a in agents], dtype=bool)
         self._driven = self.index[driven] if driven is not None else -1
         self._size = np.array([a.size_m for a in agents], dtype=np.float64).reshape(-1, 3)
         self._distrusted = deep_overlaps(self.ways, self._size, self._static)
@@ -72,7 +72,7 @@ class Traffic:
         """Put everybody on the log's time."""
         count, self._decided_s = len(self.reacts), -np.inf
         self.delay_s, self.rate, self.rate_slope = np.zeros(count), np.ones(count), np.zeros(count)
-        self._taken = np.zeros(count)
+        self._taken, self._driven_m = np.zeros(count), 0.0
 
     def decide(self, t_s: float, dt_s: float, ego: Snapshot | None) -> None:
         """Choose how fast the reactive ones go on, and move their time by `dt_s`.
@@ -116,7 +116,12 @@ class Traffic:
         x, y, yaw, speed = pose.x_m.copy(), pose.y_m.copy(), pose.yaw_rad.copy(), pose.speed_mps.copy()
         x[k], y[k] = ego.x_m[0] - self.ways.origin_m[0], ego.y_m[0] - self.ways.origin_m[1]
         yaw[k], speed[k] = ego.yaw_rad[0], ego.speed_mps[0]
-        return pose._replace(x_m=x, y_m=y, yaw_rad=yaw, speed_mps=speed)
+        # Its height is that of the road where it is, or on a slope nobody would brake for one that fell behind.
+        self._driven_m = self.ways.beside(k, self._driven_m, float(ego.x_m[0]), float(ego.y_m[0]))
+        z = pose.z_m.copy()
+        driven = np.array([k])
+        z[k] = self.ways.at(driven, self.ways.times(driven, np.array([self._driven_m]))).z_m[0]
+        return pose._replace(x_m=x, y_m=y, z_m=z, yaw_rad=yaw, speed_mps=speed)
 
     def _pairs(self, t_s: float, tau: Array, own: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Reactive agents (P,) and those (P,) present that are not to them as the log has it."""

@@ -17,6 +17,9 @@ SPACING_M = 1.0
 EXTENSION_M = 120.0
 """How far a way goes straight on beyond the end of the log: as far as a driver looks ahead."""
 
+BACK_M, ON_M = 5.0, 20.0
+"""How far from its last place an agent is looked for on its way: so it stays on its branch where ways cross."""
+
 STANDING_MPS = 0.15  # what moves slower stands, and its jitter is no way
 COARSE = 4  # rows between those that a search looks at first
 
@@ -104,6 +107,26 @@ class Ways:
         dx, dy = x_m - x, y_m - y
         return Foot(dx * cos + dy * sin, dy * cos - dx * sin, cos, sin, k * SPACING_M, t_s)
 
+    def beside(self, agent: int, from_m: float, x_m: float, y_m: float) -> float:
+        """How far along its way an agent is that is at a place of the map and was at `from_m` before; at least 0."""
+        begin_m = max(from_m - BACK_M, 0.0)
+        x, y = (np.array([[c - o]]) for c, o in zip((x_m, y_m), self.origin_m))
+        foot = self.foot(np.array([agent]), np.array([begin_m]), from_m - begin_m + ON_M, x, y)
+        return max(float(foot.distance_m[0, 0] + foot.ahead_m[0, 0]), 0.0)
+
+    def times(self, agent: NDArray[np.intp], distance_m: Array) -> Array:
+        """When the log was at distances along ways, broadcast together; its end for what is beyond."""
+        t_s = self.along(agent, distance_m)[4]
+        return np.where(np.isnan(t_s), self.end_s[agent], t_s)
+
+
+def times_beside(path: Path, x_m: Array, y_m: Array) -> Array:
+    """When the log was beside the places (S,) of an agent that drives as it likes, one after the other along its path."""
+    way, gone_m = Ways([path]), np.zeros(len(x_m))
+    for k, (x, y) in enumerate(zip(x_m.tolist(), y_m.tolist())):
+        gone_m[k] = way.beside(0, gone_m[k - 1] if k else 0.0, x, y)
+    return way.times(np.zeros(1, dtype=np.intp), gone_m)
+
 
 def times_at(path: Path, t_s: Array, x_m: Array, y_m: Array) -> Array:
     """When the log was where an agent that goes along its path is (S,): the time of the same distance gone.
@@ -127,7 +150,7 @@ def _by_time(path: Path, origin_m: tuple[float, float]) -> Array:
         step = np.where(step < STANDING_MPS * (t_s[1] - t_s[0]), 0.0, step)
     distance = np.concatenate([[0.0], np.cumsum(step)])
     dx, dy = path.origin_m[0] - origin_m[0], path.origin_m[1] - origin_m[1]
-    return np.stack([t_s, x + dx, y + dy, np.interp(t_s, path.t_s, path.z_m), yaw, speed, distance], axis=1)
+    return np.stack([t_s, x + dx, y + dy, path.heights(t_s), yaw, speed, distance], axis=1)
 
 
 def _by_distance(table: Array) -> Array:

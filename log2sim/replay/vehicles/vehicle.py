@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ MAX_INNER_STEP_S = 0.02
 """Longest step over which the mean steering angle stands for its course; the error falls with its square."""
 
 GRAVITY_MPS2 = 9.81
+
+TINY = 1e-300
+"""Added to what may be zero: it changes no other number, and takes a third of the time of asking where."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +71,15 @@ class VehicleControls(Columns):
     reverse: NDArray[np.bool_]
 
 
+class Actuators(NamedTuple):
+    """Limits, lags and greatest rates of actuators, arrays of one shape."""
+
+    low: Array
+    high: Array
+    lag_s: Array
+    max_rate: Array
+
+
 @dataclass(frozen=True, eq=False)
 class VehicleParameters(Columns):
     """Size and limits of vehicles, all positive; `rear_axle_offset_m` leads from the rear axle to the box center.
@@ -98,6 +110,16 @@ class VehicleParameters(Columns):
     def max_curvature_1pm(self) -> Array:
         """At full lock."""
         return np.tan(self.max_steer_rad) / self.wheelbase_m
+
+    @cached_property
+    def actuators(self) -> Actuators:
+        """Of pedal and steering, as rows (2, A)."""
+        return Actuators(
+            rows(-self.max_brake_mps2, -self.max_steer_rad),
+            rows(self.max_throttle_mps2, self.max_steer_rad),
+            rows(self.pedal_lag_s, self.steer_lag_s),
+            rows(self.max_jerk_mps3, self.max_steer_rate_radps),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,20 +154,19 @@ def step_bicycle(
     drives with the mean steering angle of the step: exact for constant steering at any acceleration, of second order in
     the step otherwise, never unstable. Braking ends at standstill; only the other gear's throttle leads on from there.
     """
-    p = parameters
-    pedal_target = clamp(controls.pedal_mps2, -p.max_brake_mps2, p.max_throttle_mps2)
-    steer_target = clamp(controls.steer_rad, -p.max_steer_rad, p.max_steer_rad)
+    low, high, lag_s, max_rate = parameters.actuators
+    target = clamp(rows(controls.pedal_mps2, controls.steer_rad), low, high)
+    actuators = rows(state.pedal_mps2, state.steer_rad)
     count = max(1, math.ceil(dt_s / MAX_INNER_STEP_S - 1e-9))
     h = dt_s / count
     x, y, yaw, speed = state.x_m, state.y_m, state.yaw_rad, state.speed_mps
-    pedal, steer = state.pedal_mps2, state.steer_rad
     for _ in range(count):
-        pedal, mean_pedal = actuate(pedal, pedal_target, p.pedal_lag_s, p.max_jerk_mps3, h)
-        steer, mean_steer = actuate(steer, steer_target, p.steer_lag_s, p.max_steer_rate_radps, h)
+        actuators, (mean_pedal, mean_steer) = actuate(actuators, target, lag_s, max_rate, h)
         gear = engaged(speed, controls.reverse)
         pace, distance = advance(np.abs(speed), mean_pedal, h)
-        x, y, yaw = roll(x, y, yaw, gear * distance, np.tan(mean_steer) / p.wheelbase_m)
+        x, y, yaw = roll(x, y, yaw, gear * distance, np.tan(mean_steer) / parameters.wheelbase_m)
         speed = gear * pace
+    pedal, steer = actuators
     return VehicleState(x, y, yaw, speed, steer, pedal, state.lateral_mps, state.yaw_rate_radps)
 
 
@@ -168,6 +189,13 @@ def clamp(value: Array, low: Array | float, high: Array | float) -> Array:
     return np.minimum(np.maximum(value, low), high)
 
 
+def rows(first: Array | float, second: Array) -> Array:
+    """Two columns (A,) as one array (2, A); `np.stack` takes three times as long."""
+    both = np.empty((2, len(second)))
+    both[0], both[1] = first, second
+    return both
+
+
 def roll(x: Array, y: Array, yaw: Array, way: Array, curvature: Array) -> tuple[Array, Array, Array]:
     """Position and yaw at the end of an arc of signed length `way`."""
     turn = way * curvature
@@ -178,20 +206,20 @@ def roll(x: Array, y: Array, yaw: Array, way: Array, curvature: Array) -> tuple[
 
 def engaged(speed: Array, reverse: NDArray[np.bool_]) -> Array:
     """Gear: the sign of the motion, at rest that of the lever."""
-    gear = np.sign(speed)
-    return gear if gear.all() else np.where(gear == 0, np.where(reverse, -1.0, 1.0), gear)
+    return np.sign(speed + TINY * (0.5 - reverse))
 
 
 def actuate(value: Array, target: Array, lag_s: Array, max_rate: Array, h: float) -> tuple[Array, Array]:
     """Value after `h` and its mean over `h` of an actuator with lag, which moves at `max_rate` while far from the target."""
     gap = target - value
-    limited_s = clamp(np.abs(gap) / max_rate - lag_s, 0.0, h)
+    far = np.abs(gap) - max_rate * lag_s
+    if not (far > 0).any():  # the same numbers as below, in half the time
+        decay = np.exp(-h / lag_s)
+        return target - gap * decay, target - gap * (lag_s * (1 - decay) / h)
+    limited_s = clamp(far / max_rate, 0.0, h)
     decay = np.exp((limited_s - h) / lag_s)
-    mean_share = lag_s * (1 - decay) / h
-    if not limited_s.any():  # the same numbers as below, in half the time
-        return target - gap * decay, target - gap * mean_share
     near = gap - np.copysign(max_rate * limited_s, gap)
-    mean_gap = limited_s * (gap + near) / (2 * h) + near * mean_share
+    mean_gap = limited_s * (gap + near) / (2 * h) + near * (lag_s * (1 - decay) / h)
     return target - near * decay, target - mean_gap
 
 
@@ -199,16 +227,14 @@ def advance(pace: Array, pedal: Array, h: float) -> tuple[Array, Array]:
     """Pace (not negative) after `h` and the distance covered; braking ends at rest, within the step too."""
     after = pace + pedal * h
     distance = (pace + after) * (h / 2)
-    stops = after < 0
-    if not stops.any():
-        return after, distance
-    braking = np.where(stops, pedal, -1.0)  # negative wherever the step ends at rest
-    return np.where(stops, 0.0, after), np.where(stops, -(pace**2) / (2 * braking), distance)
+    stops = np.flatnonzero(after < 0)
+    if len(stops):
+        after[stops], distance[stops] = 0.0, -(pace[stops] ** 2) / (2 * pedal[stops])
+    return after, distance
 
 
 def sinc(angle: Array) -> Array:
     """sin(angle) / angle, 1 at zero."""
-    half = angle / 2
+    half = angle / 2 + TINY
     t = np.tan(half)
-    zero = half == 0
-    return np.where(zero, 1.0, t) / (np.where(zero, 1.0, half) * (1 + t * t))
+    return t / (half * (1 + t * t))
