@@ -136,6 +136,7 @@ def test_vertices_that_somebody_added_get_speeds_of_their_own(tmp_path: Path) ->
         ('<Dimensions width="0.4" length="0.4" height="0.8"/>', "", "entity 'cone': no <BoundingBox>"),
         ('width="2" length="5"', 'width="-2" length="5"', "width"),
         ("<Entities>", "<Entities><!-- x --><Entitles/>", None),
+        (FOREIGN[FOREIGN.index("<Entities>") : FOREIGN.index("<Storyboard>")], "<Entities/>", "hold no <ScenarioObject>"),
         ('<?xml version="1.0"?>', '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b SYSTEM "file:///etc/passwd">]>', "type declaration"),
     ],
 )  # fmt: skip

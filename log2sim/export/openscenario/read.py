@@ -61,6 +61,8 @@ def _scenario(root: Element, path: Path) -> Scenario:
         _agent(o, vertices.get(o.get("name", "")), starts, last_s, placement)
         for o in root.iterfind("Entities/ScenarioObject")
     ]
+    if not agents:
+        raise ScenarioError("its <Entities> hold no <ScenarioObject>, expected at least one")
     header = root.find("FileHeader")
     title = header.get("description", "") if header is not None else ""
     return Scenario.from_dict(
