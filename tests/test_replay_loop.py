@@ -72,6 +72,13 @@ def test_a_world_that_is_restarted_repeats_itself():
         np.testing.assert_array_equal(first[id][1], second[id][1])
 
 
+@pytest.mark.parametrize("controls", [Controls(math.nan, 0.0), Controls(0.0, math.inf)], ids=["pedal", "steering"])
+def test_a_world_is_not_steered_by_what_is_no_number(controls):
+    world = open_world(scenario_of(line("ego", 0, duration_s=1)))
+    with pytest.raises(ValueError, match="expected finite numbers"):
+        world.steer(controls)
+
+
 def test_a_world_without_a_driven_ego_has_nothing_to_observe_or_steer():
     world = open_world(scenario_of(line("ego", 0, duration_s=1)), drives_ego=False)
     assert not world.ego_lives

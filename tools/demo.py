@@ -15,11 +15,13 @@ COMMANDS = (
     ("replay", "out/scenario.json", "--out", "out/replay.json"),
     ("evaluate", "out/scenario.json", "--truth", str(SAMPLE), "--range", "40", "--out", "out/metrics.json"),
     ("plot", "out/scenario.json", "--replay", "out/replay.json", "--truth", str(SAMPLE), "--out", "out/tracks.png"),
+    ("view", "out/scenario.json", "--replay", "out/replay.json", "--truth", str(SAMPLE), "--out", "out/view.html"),
+    ("export", "out/scenario.json", "--to", "openscenario", "--out", "out/openscenario"),
 )  # fmt: skip
 
 
 def main() -> None:
-    """Run the four commands, then print the stages."""
+    """Run the commands, then print the stages."""
     for command in COMMANDS:
         print(f"$ log2sim {' '.join(command)}", flush=True)
         subprocess.run([sys.executable, "-m", "log2sim", *command, "--overwrite"], cwd=ROOT, check=True)
@@ -28,7 +30,7 @@ def main() -> None:
     for row in report["stages"]:
         print(f"{row['stage']:<16}{row['seconds']:>10.2f}{row['ticks_per_second'] or 0:>12.1f}")
     print(f"{'all':<16}{report['seconds']:>10.2f}{report['ticks_per_second']:>12.1f}")
-    print(f"\nwritten to {OUT}/: scenario.json report.json replay.json metrics.json tracks.png")
+    print(f"\nwritten to {OUT}/: scenario.json report.json replay.json metrics.json tracks.png view.html openscenario/")
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 
@@ -100,6 +101,8 @@ class World:
         """Set the ego's controls, which hold until they are set again."""
         if self.ego is None:
             raise ValueError("no policy drives an agent of this world")
+        if not (math.isfinite(controls.accel_mps2) and math.isfinite(controls.steer_rad)):
+            raise ValueError(f"{controls}, expected finite numbers")
         self.ego.controls = controls
 
     def advance(self) -> None:
