@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from log2sim.errors import ScenarioError
 from log2sim.files import read_json, write_json
-from log2sim.geometry import Array, wrap_angle
+from log2sim.geometry import NS_PER_S, Array, wrap_angle
 from log2sim.schema import check
 from log2sim.types import CATEGORIES, MapFrame
 from log2sim.unlabeled import Unlabeled
@@ -140,6 +140,29 @@ class Scenario:
             return cls.from_dict(document)
         except ScenarioError as error:
             raise ScenarioError(f"{path}: {error}") from None
+
+    def beside(self, other: Scenario) -> Scenario:
+        """This scenario with the times and places of another one's start and map, to be shown or compared with it.
+
+        Raises
+        ------
+        ScenarioError
+            When their maps have different projections.
+        """
+        ours, theirs = other.map, self.map
+        if ours.projection and theirs.projection and ours.projection != theirs.projection:
+            raise ScenarioError(
+                f"map.projection: '{other.name}' has '{ours.projection}', '{self.name}' has '{theirs.projection}'; "
+                "bring both to one projection first"
+            )
+        later_s = (self.t0_ns - other.t0_ns) / NS_PER_S
+        dx, dy, dz = (b - a for a, b in zip(ours.offset_m, theirs.offset_m))
+        moved = []
+        for agent in self.agents:
+            w = agent.waypoints
+            w = replace(w, t_s=w.t_s + later_s, x_m=w.x_m + dx, y_m=w.y_m + dy, z_m=w.z_m + dz)
+            moved.append(replace(agent, waypoints=w))
+        return replace(self, t0_ns=other.t0_ns, map=ours, agents=tuple(moved))
 
     def save(self, path: Path | str) -> None:
         """Write the scenario, whole or not at all; what was written reads back to the same numbers."""

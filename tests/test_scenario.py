@@ -75,6 +75,23 @@ def test_what_is_saved_reads_back_to_the_same_numbers(tmp_path: Path) -> None:
     assert list(path.parent.iterdir()) == [path]
 
 
+def test_beside_another_a_scenario_has_its_start_and_its_map() -> None:
+    here = make_scenario()
+    start_s, (dx, dy, dz) = 0.25, (400_000.0, -3.5, 120.0)
+    other = replace(here, t0_ns=here.t0_ns - 250_000_000, map=replace(here.map, offset_m=tuple(
+        a - b for a, b in zip(here.map.offset_m, (dx, dy, dz))
+    )))  # fmt: skip
+    moved = here.beside(other)
+    assert (moved.t0_ns, moved.map) == (other.t0_ns, other.map)
+    for a, b in zip(here.agents, moved.agents, strict=True):
+        for name, step in (("t_s", start_s), ("x_m", dx), ("y_m", dy), ("z_m", dz), ("yaw_rad", 0.0)):
+            np.testing.assert_allclose(getattr(b.waypoints, name) - getattr(a.waypoints, name), step, atol=1e-9)
+    with pytest.raises(ScenarioError, match="bring both to one projection"):
+        replace(here, map=replace(here.map, projection="+proj=utm +zone=32")).beside(
+            replace(here, map=replace(here.map, projection="+proj=utm +zone=33"))
+        )
+
+
 def test_the_ego_is_told_from_the_others() -> None:
     scenario = make_scenario()
     assert scenario.ego is scenario.agents[0]

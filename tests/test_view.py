@@ -497,6 +497,16 @@ def test_collisions_of_the_replay_are_marked_and_visited(browser: Browser, tmp_p
     assert any(np.abs(np.subtract(c, rgb("#C62828"))).max() < 60 for c in colors)
 
 
+def test_a_truth_that_starts_earlier_stands_at_the_same_moments() -> None:
+    truth = Scenario.load(TRUTH)
+    later = replace(truth, t0_ns=truth.t0_ns + 50_000_000)
+    document = pack(later, truth=truth)
+    log, known = (next(e for e in document["layers"][k] if e["id"] == "ego") for k in ("log", "truth"))
+    first = [e["t_s"][0] / SCALES["t_s"] for e in (log, known)]
+    assert first[1] - first[0] == pytest.approx(-0.05)
+    assert document["begin_s"] == 0.0
+
+
 def test_plots_show_how_far_truth_and_replay_are(browser: Browser, tmp_path: Path) -> None:
     ways = {
         name: agent("ego", np.linspace(0, 20, 5), y) for name, y in (("log", 0.0), ("truth", 0.25), ("replay", -1.5))

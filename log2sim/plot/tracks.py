@@ -39,7 +39,7 @@ def plot_tracks(
     replay : log2sim.replay.Replay or None
         Laid over; what the ego did and was told, or the one farthest from its path, goes into strips below the map.
     truth : Scenario or None
-        In the same map frame and from the same start.
+        Brought to the scenario's start and map.
     background : TopdownPicture or None
         A picture of the ground in the map frame, laid under everything.
     dpi : dots per inch of a .png; the sheet is 10 inches wide.
@@ -48,6 +48,8 @@ def plot_tracks(
     ------
     ConfigError
         When the name ends in something else, the file exists and `overwrite` is False, or it cannot be written.
+    ScenarioError
+        When the truth's map has another projection.
     """
     out_path = Path(out_path)
     suffix = out_path.suffix.lower()
@@ -58,6 +60,7 @@ def plot_tracks(
         )
     refuse_existing(out_path, overwrite=overwrite)
     cast = assign(scenario)
+    truth = None if truth is None else truth.beside(scenario)
     if suffix in ANIMATED:
         from log2sim.plot.animate import write_animation
 

@@ -26,10 +26,14 @@ def pack(scenario: Scenario, truth: Scenario | None = None, replay: Any = None) 
     ------
     ConfigError
         When there are more waypoints than a browser can be expected to hold.
+    ScenarioError
+        When the truth's map has another projection.
     """
     layers = {"log": list(_log(scenario))}
     if truth is not None:
-        layers["truth"] = [_entry(a, a.waypoints, standing=not moves(a), static=a.static) for a in truth.agents]
+        layers["truth"] = [
+            _entry(a, a.waypoints, standing=not moves(a), static=a.static) for a in truth.beside(scenario).agents
+        ]
     if replay is not None:
         stand = {a.id: a.driver == "static" for a in replay.agents}
         layers["replay"] = [_entry(a, a, standing=stand[a.id], static=stand[a.id]) for a in replay.agents if len(a.t_s)]
@@ -40,7 +44,7 @@ def pack(scenario: Scenario, truth: Scenario | None = None, replay: Any = None) 
             f"{rows} waypoints are more than the {MOST_ROWS} that a page can hold; take fewer agents, "
             f"such as with `log2sim edit --only`"
         )
-    spans = [_span(e) for e in entries]
+    spans = [_span(e) for name in ("log", "replay") for e in layers.get(name, ())]
     return {
         "name": scenario.name,
         "begin_s": min([0.0, *(first for first, _ in spans)]),

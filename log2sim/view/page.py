@@ -46,7 +46,7 @@ def write_page(
     Parameters
     ----------
     truth : Scenario or None
-        In the same map frame and from the same start; shown as a layer.
+        Shown as a layer, brought to the scenario's start and map.
     replay : Replay or None
         Shown as a layer, and beside the log in the plots of an agent.
 
