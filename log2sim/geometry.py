@@ -18,6 +18,18 @@ Array = NDArray[np.float64]
 NS_PER_S = 1_000_000_000
 
 
+NEAR_M = 8192.0
+"""From here on float32 steps by 1 mm."""
+
+NEAR_STEP_M = 1000.0
+
+
+def whole_kilometers(points: Array) -> Array:
+    """Whole kilometers (D,) to take off points (N, D) so that float32 keeps a millimeter; 0 on axes where all are near."""
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    return np.where(np.abs(points).max(axis=0) > NEAR_M, np.round(middle / NEAR_STEP_M) * NEAR_STEP_M, 0.0)
+
+
 def wrap_angle(angle_rad: ArrayLike) -> Array:
     """Wrap angles to [-pi, pi).
 

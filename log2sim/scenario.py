@@ -47,6 +47,20 @@ class Waypoints:
     def __len__(self) -> int:
         return len(self.t_s)
 
+    def problem(self) -> str | None:
+        """What keeps them from being a trajectory: none at all, a number that is not finite, times that do not increase."""
+        if len(self) == 0:
+            return "has no waypoints, expected at least one"
+        for key in self.FLOATS:
+            finite = np.isfinite(getattr(self, key))
+            if not finite.all():
+                return f"waypoints.{key} is not finite at index {int(np.argmin(finite))}"
+        late = np.diff(self.t_s) <= 0
+        if late.any():
+            k = int(np.argmax(late)) + 1
+            return f"waypoints.t_s does not increase at index {k} ({self.t_s[k]:g} s)"
+        return None
+
 
 @dataclass(frozen=True, eq=False)
 class Sampled:
@@ -141,6 +155,22 @@ class Scenario:
         except ScenarioError as error:
             raise ScenarioError(f"{path}: {error}") from None
 
+    def shift_to(self, other: Scenario) -> Array:
+        """What to add to positions (3,) of this scenario to bring them into the map of another.
+
+        Raises
+        ------
+        ScenarioError
+            When their maps have different projections.
+        """
+        theirs, ours = other.map, self.map
+        if theirs.projection and ours.projection and theirs.projection != ours.projection:
+            raise ScenarioError(
+                f"map.projection: '{other.name}' has '{theirs.projection}', '{self.name}' has '{ours.projection}'; "
+                "bring both to one projection first"
+            )
+        return np.array(ours.offset_m, dtype=np.float64) - np.array(theirs.offset_m, dtype=np.float64)
+
     def beside(self, other: Scenario) -> Scenario:
         """This scenario with the times and places of another one's start and map, to be shown or compared with it.
 
@@ -149,20 +179,14 @@ class Scenario:
         ScenarioError
             When their maps have different projections.
         """
-        ours, theirs = other.map, self.map
-        if ours.projection and theirs.projection and ours.projection != theirs.projection:
-            raise ScenarioError(
-                f"map.projection: '{other.name}' has '{ours.projection}', '{self.name}' has '{theirs.projection}'; "
-                "bring both to one projection first"
-            )
         later_s = (self.t0_ns - other.t0_ns) / NS_PER_S
-        dx, dy, dz = (b - a for a, b in zip(ours.offset_m, theirs.offset_m))
+        dx, dy, dz = self.shift_to(other)
         moved = []
         for agent in self.agents:
             w = agent.waypoints
             w = replace(w, t_s=w.t_s + later_s, x_m=w.x_m + dx, y_m=w.y_m + dy, z_m=w.z_m + dz)
             moved.append(replace(agent, waypoints=w))
-        return replace(self, t0_ns=other.t0_ns, map=ours, agents=tuple(moved))
+        return replace(self, t0_ns=other.t0_ns, map=other.map, agents=tuple(moved))
 
     def save(self, path: Path | str) -> None:
         """Write the scenario, whole or not at all; what was written reads back to the same numbers."""
@@ -251,25 +275,21 @@ def _agent_from_dict(entry: Mapping[str, Any]) -> Agent:
         if len(values) != count:
             raise ScenarioError(f"{where}: waypoints.{key} has {len(values)} values, t_s has {count}")
     arrays = {k: np.array(columns[k], dtype=np.float64) for k in Waypoints.FLOATS}
-    for key, values in arrays.items():
-        if not np.all(np.isfinite(values)):
-            raise ScenarioError(
-                f"{where}: waypoints.{key} is not finite at index {int(np.argmin(np.isfinite(values)))}"
-            )
-    if np.any(np.diff(arrays["t_s"]) <= 0):
-        k = int(np.argmax(np.diff(arrays["t_s"]) <= 0)) + 1
-        raise ScenarioError(f"{where}: waypoints.t_s does not increase at index {k} ({arrays['t_s'][k]:g} s)")
     visible = columns.get("visible")
+    waypoints = Waypoints(
+        **arrays,
+        observed=np.array(columns["observed"], dtype=bool),
+        visible=None if visible is None else np.array(visible, dtype=bool),
+    )
+    problem = waypoints.problem()
+    if problem is not None:
+        raise ScenarioError(f"{where}: {problem}")
     size = entry["size_m"]
     return Agent(
         id=entry["id"],
         category=entry["category"],
         size_m=(float(size["length"]), float(size["width"]), float(size["height"])),
-        waypoints=Waypoints(
-            **arrays,
-            observed=np.array(columns["observed"], dtype=bool),
-            visible=None if visible is None else np.array(visible, dtype=bool),
-        ),
+        waypoints=waypoints,
         static=entry["static"],
         rear_axle_offset_m=float(entry["rear_axle_offset_m"]),
         color=entry["color"],

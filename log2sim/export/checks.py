@@ -107,15 +107,9 @@ def _is_text(text: str) -> bool:
 
 
 def _problems(agent: Agent) -> list[str]:
-    where, w = f"agent '{agent.id}'", agent.waypoints
-    if len(w) == 0:
-        return [f"{where}: has no waypoints, expected at least one"]
-    wrong = []
-    if np.any(np.diff(w.t_s) <= 0):
-        k = int(np.argmax(np.diff(w.t_s) <= 0)) + 1
-        wrong.append(f"{where}: waypoints.t_s does not increase at index {k} ({w.t_s[k]:g} s)")
-    if not all(np.isfinite(getattr(w, key)).all() for key in w.FLOATS):
-        wrong.append(f"{where}: a waypoint is not finite")
+    where = f"agent '{agent.id}'"
+    problem = agent.waypoints.problem()
+    wrong = [] if problem is None else [f"{where}: {problem}"]
     if not (np.isfinite(agent.size_m).all() and min(agent.size_m) > 0):
         wrong.append(f"{where}: size {agent.size_m} m, expected positive lengths")
     return wrong or list(_back_to_front(agent))

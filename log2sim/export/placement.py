@@ -8,13 +8,9 @@ from typing import Any
 import numpy as np
 
 from log2sim.errors import ConfigError
-from log2sim.geometry import Array, wrap_angle
+from log2sim.geometry import Array, whole_kilometers, wrap_angle
 from log2sim.scenario import Scenario
 from log2sim.types import MapFrame
-
-# float32 steps by 1 mm from 8192 m on.
-NEAR_M = 8192.0
-STEP_M = 1000.0
 
 
 @dataclass(frozen=True)
@@ -65,8 +61,7 @@ def near_origin(scenario: Scenario) -> Placement:
     xyz = np.concatenate(
         [np.column_stack([a.waypoints.x_m, a.waypoints.y_m, a.waypoints.z_m]) for a in scenario.agents]
     )
-    middle = (xyz.min(axis=0) + xyz.max(axis=0)) / 2
-    x, y, z = np.where(np.abs(xyz).max(axis=0) > NEAR_M, np.round(middle / STEP_M) * STEP_M, 0.0)
+    x, y, z = whole_kilometers(xyz)
     return Placement((float(x), float(y), float(z)))
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.errors import ScenarioError
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.metrics.pairs import Mask
 from log2sim.scenario import Agent, Scenario
@@ -72,17 +71,6 @@ def evaluation_ticks_s(scenario: Scenario, truth: Scenario) -> Array:
         if len(t) > 1 and (t[-1] - t[0]) / (len(t) - 1) <= MAX_TRUTH_GAP_S:
             break
     return t
-
-
-def map_shift_m(scenario: Scenario, truth: Scenario) -> Array:
-    """What to add to the truth's positions (3,) to bring them into the scenario's map frame."""
-    ours, theirs = scenario.map, truth.map
-    if ours.projection and theirs.projection and ours.projection != theirs.projection:
-        raise ScenarioError(
-            f"map.projection: the scenario has '{ours.projection}', the truth '{theirs.projection}'; "
-            "bring both to one projection first"
-        )
-    return np.array(theirs.offset_m, dtype=np.float64) - np.array(ours.offset_m, dtype=np.float64)
 
 
 def reconstructed_side(agents: tuple[Agent, ...], ticks_s: Array, ego_xy: Array | None) -> Side:

@@ -14,7 +14,6 @@ from log2sim.metrics.agents import agent_rows, false_rows, ignored_rows, rounded
 from log2sim.metrics.align import (
     Side,
     evaluation_ticks_s,
-    map_shift_m,
     reconstructed_side,
     truth_side,
 )
@@ -83,7 +82,7 @@ def evaluate(
     if len(ticks_s) == 0 and scenario.agents and truth.agents:
         raise ScenarioError(_apart(scenario, truth))
     truth_ticks_s = ticks_s + (scenario.t0_ns - truth.t0_ns) / NS_PER_S
-    shift_m = map_shift_m(scenario, truth)
+    shift_m = truth.shift_to(scenario)
     ego_xy = _ego_xy(scenario, truth, ticks_s, truth_ticks_s, shift_m)
     _check_range(max_range_m, ego_xy)
     true = truth_side(truth.others, truth_ticks_s, shift_m, ego_xy)

@@ -25,7 +25,7 @@ from log2sim.replay.reference import (
     tape_reference,
     vehicle_reference,
 )
-from log2sim.replay.simulator import STEPS, simulator_named
+from log2sim.replay.simulator import STEPS, EmbeddedSimulator
 from log2sim.replay.vehicles.models import Choice, choose, slipping_reference, understeer
 from log2sim.replay.vehicles.parameters import PEDAL_LAG_S, STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
 from log2sim.replay.world import Crowd, Driven, Fleet, Group, Tape
@@ -87,7 +87,7 @@ def groups_of(
         walking = [a for a in cast[driver] if a.category not in WHEELED]
         if walking:
             references = [point_reference(path_of(a, 0.0)) for a in walking]
-            groups.append(on_foot(walking, references, *_lives(walking, clock), simulator_named("kinematic")))
+            groups.append(on_foot(walking, references, *_lives(walking, clock), EmbeddedSimulator(STEPS["kinematic"])))
     for driver, tape in (("exact", Tape), *([("reactive", ReactiveTape)] if mode == "exact" else [])):
         agents = list(cast[driver])
         if agents:
@@ -114,7 +114,7 @@ def _fleets(
                 ahead_s = STEER_LAG_S + control_step(clock.dt_s) / 2
                 ones = [p.take(slice(i, i + 1)) for i in range(len(moved))]
                 followed = [slipping_reference(r, one, name, ahead_s) for r, one in zip(followed, ones)]
-            groups.append(kind(moved, followed, *_lives(moved, clock), p, simulator_named(name)))
+            groups.append(kind(moved, followed, *_lives(moved, clock), p, EmbeddedSimulator(STEPS[name])))
     return groups
 
 

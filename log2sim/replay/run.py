@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-import numpy as np
-
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.registry import nearest
 from log2sim.replay.assemble import assemble
@@ -134,27 +132,14 @@ def open_world(
     if drives_ego and (scenario.ego is None or scenario.ego.category not in WHEELED):
         raise ConfigError(f"ego policy: scenario '{scenario.name}' has no agent '{EGO}' on wheels that it could drive")
     for agent in scenario.agents:
-        _check_waypoints(agent)
+        problem = agent.waypoints.problem()
+        if problem is not None:
+            raise ScenarioError(f"agent '{agent.id}': {problem}")
     clock = _clock(scenario.agents, dt_s)
     reactive = reactive_ids(scenario.agents, agents, drives_ego=drives_ego)
     cast = cast_agents(scenario.agents, mode, drives_ego=drives_ego, reactive=reactive)
     groups, choices = groups_of(cast, clock, mode, model)
     return World(groups, clock, cast["static"], traffic_of(scenario.agents, groups, clock), choices, sight_m)
-
-
-def _check_waypoints(agent: Agent) -> None:
-    w = agent.waypoints
-    if len(w) == 0:
-        raise ScenarioError(f"agent '{agent.id}': has no waypoints, expected at least one")
-    for key in w.FLOATS:
-        values = getattr(w, key)
-        if not np.all(np.isfinite(values)):
-            raise ScenarioError(
-                f"agent '{agent.id}': waypoints.{key} is not finite at index {int(np.argmin(np.isfinite(values)))}"
-            )
-    if np.any(np.diff(w.t_s) <= 0):
-        k = int(np.argmax(np.diff(w.t_s) <= 0)) + 1
-        raise ScenarioError(f"agent '{agent.id}': waypoints.t_s does not increase at index {k} ({w.t_s[k]:g} s)")
 
 
 def _clock(agents: Sequence[Agent], dt_s: float) -> Clock:

@@ -87,13 +87,6 @@ class EmbeddedSimulator:
 STEPS: dict[str, Step] = {"kinematic": step_bicycle, "dynamic": step_dynamic, "single-track": step_single_track}
 
 
-def simulator_named(model: str) -> Simulator:
-    """The simulator for `model`; `ConfigError` when there is none of that name."""
-    if model not in STEPS:
-        raise ConfigError(f"unknown vehicle model '{model}'{nearest(model, list(STEPS))}; known: {', '.join(STEPS)}")
-    return EmbeddedSimulator(STEPS[model])
-
-
 HOSTS = ("own", "carla")
 
 

@@ -8,10 +8,8 @@ from collections.abc import Iterable, Mapping
 from log2sim.errors import CheckFailed, ConfigError
 from log2sim.registry import nearest
 from log2sim.replay.assess.comfort import LIMITS as COMFORT
+from log2sim.replay.assess.metrics import OFF_PATH_M
 from log2sim.replay.result import Replay
-
-CROSS_TRACK_LIMIT_M = 0.5
-"""Limit of a strict replay: a car of 1.9 m in a lane of 3.5 m has 0.8 m on either side."""
 
 AT_LEAST = ("min_ttc_s", "min_pet_s")
 AT_MOST = (
@@ -76,8 +74,8 @@ def check_strict(replay: Replay, limits: Mapping[str, float] | None = None) -> l
         if agent.driver in ("policy", "reactive"):
             continue
         worst = replay.metrics["by_agent"].get(agent.id, {}).get("cross_track_max_m", 0.0)
-        if worst > CROSS_TRACK_LIMIT_M:
-            broken.append(f"agent '{agent.id}': {worst:.2f} m off its path, limit {CROSS_TRACK_LIMIT_M:g} m")
+        if worst > OFF_PATH_M:
+            broken.append(f"agent '{agent.id}': {worst:.2f} m off its path, limit {OFF_PATH_M:g} m")
         broken += [f"agent '{agent.id}': {flag}" for flag in agent.flags]
     return broken + check_limits(replay, limits or {})
 

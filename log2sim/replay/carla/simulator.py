@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from log2sim.errors import ConfigError, MissingExtra
-from log2sim.geometry import Array
+from log2sim.geometry import Array, whole_kilometers
 from log2sim.replay.carla import player
 from log2sim.replay.carla.data import carla_agents
 from log2sim.replay.clock import Clock
@@ -30,8 +30,6 @@ from log2sim.replay.vehicles.vehicle import (
 )
 from log2sim.replay.world import Crowd, Fleet, Group, Tape
 from log2sim.scenario import Agent
-
-NEAR_M, STEP_M = 8192.0, 1000.0  # float32 steps by 1 mm beyond; whole kilometers are taken off
 
 
 @dataclass(frozen=True)
@@ -242,8 +240,7 @@ class CarlaSimulator:
 def _offset_m(agents: Sequence[Agent]) -> tuple[float, float]:
     """Whole kilometers x, y that bring all agents near CARLA's origin, zero while they are: as for the roads of an export."""
     xy: Array = np.concatenate([np.column_stack([a.waypoints.x_m, a.waypoints.y_m]) for a in agents])
-    middle = (xy.min(axis=0) + xy.max(axis=0)) / 2
-    x, y = np.where(np.abs(xy).max(axis=0) > NEAR_M, np.round(middle / STEP_M) * STEP_M, 0.0)
+    x, y = whole_kilometers(xy)
     return float(x), float(y)
 
 

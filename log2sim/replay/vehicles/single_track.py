@@ -21,6 +21,7 @@ from log2sim.replay.vehicles.vehicle import (
     VehicleParameters,
     VehicleState,
     actuate,
+    actuation,
     advance,
     clamp,
     engaged,
@@ -53,9 +54,8 @@ def step_single_track(
     """
     p, chassis = parameters, Chassis.of(parameters)
     count, h = inner_steps(dt_s)
-    pedal_target = clamp(controls.pedal_mps2, -p.max_brake_mps2, p.max_throttle_mps2)
-    steer_target = clamp(controls.steer_rad, -p.max_steer_rad, p.max_steer_rad)
-    yaw, speed, pedal, steer = state.yaw_rad, state.speed_mps, state.pedal_mps2, state.steer_rad
+    actuators, target, lag_s, max_rate = actuation(state, controls, p)
+    yaw, speed, steer = state.yaw_rad, state.speed_mps, state.steer_rad
     cos, sin = cos_sin(yaw)
     x, y = state.x_m + p.cg_to_rear_m * cos, state.y_m + p.cg_to_rear_m * sin
     still = speed == 0
@@ -64,8 +64,8 @@ def step_single_track(
     slips = Slips(rear, np.where(still, 0.0, rear + p.wheelbase_m * state.yaw_rate_radps * per_speed - steer))
     for _ in range(count):
         speed0, steer0 = speed, steer
-        pedal, mean_pedal = actuate(pedal, pedal_target, p.pedal_lag_s, p.max_jerk_mps3, h)
-        steer, mean_steer = actuate(steer, steer_target, p.steer_lag_s, p.max_steer_rate_radps, h)
+        actuators, (mean_pedal, mean_steer) = actuate(actuators, target, lag_s, max_rate, h)
+        steer = actuators[1]
         gear = engaged(speed, controls.reverse)
         pace, distance = advance(np.abs(speed), mean_pedal, h)
         speed = gear * pace
@@ -77,7 +77,7 @@ def step_single_track(
     cos, sin = cos_sin(yaw)
     x, y = x - p.cg_to_rear_m * cos, y - p.cg_to_rear_m * sin
     yaw_rate = speed * (slips.front - slips.rear + steer) / p.wheelbase_m
-    return VehicleState(x, y, yaw, speed, steer, pedal, speed * slips.rear, yaw_rate)
+    return VehicleState(x, y, yaw, speed, steer, actuators[0], speed * slips.rear, yaw_rate)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,6 +18,7 @@ from log2sim.replay.vehicles.vehicle import (
     VehicleParameters,
     VehicleState,
     actuate,
+    actuation,
     advance,
     clamp,
     engaged,
@@ -44,21 +45,18 @@ def step_dynamic(
     """
     p, chassis = parameters, Chassis.of(parameters)
     count, h = inner_steps(dt_s)
-    pedal_target = clamp(controls.pedal_mps2, -p.max_brake_mps2, p.max_throttle_mps2)
-    steer_target = clamp(controls.steer_rad, -p.max_steer_rad, p.max_steer_rad)
+    actuators, target, lag_s, max_rate = actuation(state, controls, p)
     grip = ANTILOCK_SHARE * GRAVITY_MPS2 * p.friction
     body = Body(state.x_m, state.y_m, state.yaw_rad, state.speed_mps, state.lateral_mps, state.yaw_rate_radps)
-    pedal, steer = state.pedal_mps2, state.steer_rad
-    bend = np.tan(steer)
+    bend = np.tan(state.steer_rad)
     for _ in range(count):
         bend0 = bend
-        pedal, mean_pedal = actuate(pedal, pedal_target, p.pedal_lag_s, p.max_jerk_mps3, h)
-        steer, mean_steer = actuate(steer, steer_target, p.steer_lag_s, p.max_steer_rate_radps, h)
-        bend = np.tan(steer)
+        actuators, (mean_pedal, mean_steer) = actuate(actuators, target, lag_s, max_rate, h)
+        bend = np.tan(actuators[1])
         gear = engaged(body.speed_mps, controls.reverse)
         drive = Drive(clamp(mean_pedal, -grip, grip), gear, bend0, np.tan(mean_steer), bend)
         body = slide(body, drive, p, chassis, h)
-    b = body
+    b, (pedal, steer) = body, actuators
     return VehicleState(b.x_m, b.y_m, b.yaw_rad, b.speed_mps, steer, pedal, b.lateral_mps, b.yaw_rate_radps)
 
 

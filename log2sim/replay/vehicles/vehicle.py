@@ -154,9 +154,7 @@ def step_bicycle(
     drives with the mean steering angle of the step: exact for constant steering at any acceleration, of second order in
     the step otherwise, never unstable. Braking ends at standstill; only the other gear's throttle leads on from there.
     """
-    low, high, lag_s, max_rate = parameters.actuators
-    target = clamp(rows(controls.pedal_mps2, controls.steer_rad), low, high)
-    actuators = rows(state.pedal_mps2, state.steer_rad)
+    actuators, target, lag_s, max_rate = actuation(state, controls, parameters)
     count = max(1, math.ceil(dt_s / MAX_INNER_STEP_S - 1e-9))
     h = dt_s / count
     x, y, yaw, speed = state.x_m, state.y_m, state.yaw_rad, state.speed_mps
@@ -207,6 +205,15 @@ def roll(x: Array, y: Array, yaw: Array, way: Array, curvature: Array) -> tuple[
 def engaged(speed: Array, reverse: NDArray[np.bool_]) -> Array:
     """Gear: the sign of the motion, at rest that of the lever."""
     return np.sign(speed + TINY * (0.5 - reverse))
+
+
+def actuation(
+    state: VehicleState, controls: VehicleControls, parameters: VehicleParameters
+) -> tuple[Array, Array, Array, Array]:
+    """Pedal and steering (2, A) as they are, then what moves them: where commands within limits lead, lags, greatest rates."""
+    low, high, lag_s, max_rate = parameters.actuators
+    target = clamp(rows(controls.pedal_mps2, controls.steer_rad), low, high)
+    return rows(state.pedal_mps2, state.steer_rad), target, lag_s, max_rate
 
 
 def actuate(value: Array, target: Array, lag_s: Array, max_rate: Array, h: float) -> tuple[Array, Array]:
