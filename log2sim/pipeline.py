@@ -8,22 +8,22 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.assemble import Timeline, build_agents
-from log2sim.clock import Costs, StageClock
+from log2sim.agents.build import Timeline, build_agents
+from log2sim.agents.duplicates import outside, without_doubles
+from log2sim.agents.ego import ego_agent, ego_flow
+from log2sim.agents.scenario_of import make_scenario, thinned
 from log2sim.config import Config
-from log2sim.detect import Detector, create_detector
+from log2sim.datatypes import Log, Scenario
 from log2sim.errors import NothingToReconstruct
-from log2sim.finish import ego_agent, ego_flow, make_scenario, thinned
-from log2sim.ground_plane import fit_cameras, locate_the_rest
-from log2sim.observe import Observed, observe
-from log2sim.overlap import outside, without_doubles
+from log2sim.perception.detect.detectors import Detector, create_detector
+from log2sim.perception.first_pass import Observed, observe
+from log2sim.perception.homography_stage import fit_cameras, locate_the_rest
+from log2sim.perception.sync import Schedule, synchronize
 from log2sim.plan import Plan, make_plan, plan_ticks
 from log2sim.report import make_report
 from log2sim.savings import settle
-from log2sim.scenario import Scenario
-from log2sim.sync import Schedule, synchronize
-from log2sim.track import track
-from log2sim.types import Log
+from log2sim.stage_clock import Costs, StageClock
+from log2sim.tracking.tracker import track
 
 Progress = Callable[[str, int, int], None]
 

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.config import Config
+from log2sim.datatypes import Log
 from log2sim.errors import ConfigError, LogError
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.registry import nearest
-from log2sim.track import least_hits
-from log2sim.types import Log
+from log2sim.tracking.tracker import least_hits
 
 LABELS = "labels"
 # An ego that moves less than this while the log lasts blurs no sweep by more; it turns less than this at 30 m.
@@ -41,7 +41,7 @@ class Step:
 class Plan:
     """The sensors to use and every decision about stages.
 
-    `lidars` are those within reach; detectors look at every frame at each `stride`-th tick, see `log2sim.look`.
+    `lidars` are those within reach; detectors look at every frame at each `stride`-th tick, see `log2sim.perception.frames`.
     """
 
     cameras: tuple[str, ...]

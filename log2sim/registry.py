@@ -17,8 +17,8 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "pandaset": "log2sim.logs.pandaset:READER",
     },
     "detector": {
-        "ssd-mobilenet-v2": "log2sim.detect.ssd_mobilenet:create",
-        "labels": "log2sim.detect.labels:create",
+        "ssd-mobilenet-v2": "log2sim.perception.detect.ssd_mobilenet:create",
+        "labels": "log2sim.perception.detect.labels:create",
     },
     "export": {
         "openscenario": "log2sim.export.openscenario.write:EXPORTER",

@@ -7,18 +7,17 @@ from typing import Any
 
 import numpy as np
 
-import log2sim
-from log2sim.clock import StageClock
 from log2sim.config import Config
-from log2sim.files import rounded
+from log2sim.datatypes import Log, Scenario
+from log2sim.documents import rounded
 from log2sim.geometry import NS_PER_S
-from log2sim.ground_plane import CameraGround
-from log2sim.observe import Observed
+from log2sim.perception.first_pass import Observed
+from log2sim.perception.homography.correspondences import jitter_m
+from log2sim.perception.homography_stage import CameraGround
+from log2sim.perception.sync import Schedule
 from log2sim.plan import Plan
-from log2sim.scenario import Scenario
-from log2sim.sync import Schedule
-from log2sim.topdown import jitter_m
-from log2sim.types import Log
+from log2sim.stage_clock import StageClock
+from log2sim.version import __version__
 
 DETECTOR_STAGES = ("detect",)
 
@@ -39,7 +38,7 @@ def make_report(
     return {
         "report_version": 1,
         "log": {"name": log.name, "format": log.format, "digest": log.digest, "notes": list(log.notes)},
-        "log2sim_version": log2sim.__version__,
+        "log2sim_version": __version__,
         "ticks": ticks,
         "duration_s": (int(schedule.t_ns[-1]) - int(schedule.t_ns[0])) / NS_PER_S,
         "seconds": round(total, 4),

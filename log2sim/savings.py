@@ -12,18 +12,17 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from log2sim.clock import Costs, StageClock
+from log2sim.agents.simplify import TOLERANCE_M
+from log2sim.datatypes import Agent, Log, Stream, Waypoints
 from log2sim.errors import RecordError
-from log2sim.fuse import fuse
-from log2sim.ground_plane import CameraGround
-from log2sim.measure import with_many_poses, with_one_pose
-from log2sim.observe import Observed
+from log2sim.perception.first_pass import Observed
+from log2sim.perception.fusion import fuse
+from log2sim.perception.homography.correspondences import Correspondences, fit_camera
+from log2sim.perception.homography_stage import CameraGround
+from log2sim.perception.lidar.cloud import with_many_poses, with_one_pose
+from log2sim.perception.sync import Schedule
 from log2sim.plan import Plan
-from log2sim.scenario import Agent, Waypoints
-from log2sim.sync import Schedule
-from log2sim.thin import TOLERANCE_M
-from log2sim.topdown import Correspondences, fit_camera
-from log2sim.types import Log, Stream
+from log2sim.stage_clock import Costs, StageClock
 
 PROBED_CORRESPONDENCES = 200
 

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from log2sim.replay import Controls, EgoState, Observation, Others, PathAhead
-from log2sim.scenario import Scenario
+from log2sim.datatypes import Scenario
+from log2sim.simulation.policy import Controls, EgoState, Observation, Others, PathAhead
 
 
 class BrakeLate:

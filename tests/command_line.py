@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from unittest import mock
 
-from log2sim import cli
+from log2sim.cli import entry
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def run(*arguments: object) -> Ran:
         contextlib.redirect_stderr(err),
     ):
         try:
-            cli.main()
+            entry.main()
         except SystemExit as stop:
             return Ran(int(stop.code or 0), out.getvalue(), err.getvalue())
     raise AssertionError("main returned instead of exiting")

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from log2sim.datatypes import Agent, MapFrame, Scenario, Waypoints
 from log2sim.geometry import Array, wrap_angle
-from log2sim.scenario import Agent, Scenario, Waypoints
-from log2sim.types import MapFrame
 
 UTM = MapFrame(49.0, 8.4, 115.0, "+proj=utm +zone=32 +datum=WGS84 +units=m", (456000.0, 5428000.0, 100.0))
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from log2sim.datatypes import Agent, Scenario, Waypoints
 from log2sim.geometry import Array, wrap_angle
-from log2sim.scenario import Agent, Scenario, Waypoints
 
 ROOT = Path(__file__).resolve().parents[1]
 RADIUS_M, SPEED_MPS, REAR_M = 12.0, 6.0, 1.4

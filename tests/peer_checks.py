@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from export_worlds import ROOT, peer
 
-from log2sim.export import export
+from log2sim.datatypes import Scenario
+from log2sim.export.exporters import export
 from log2sim.geometry import NS_PER_S, bev_iou, box_corners_bev, wrap_angle
-from log2sim.scenario import Scenario
 
 SCRIPTS = ROOT / "tests" / "peers"
 

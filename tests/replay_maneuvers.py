@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from log2sim.datatypes import Agent, Scenario, Waypoints
 from log2sim.geometry import Array, wrap_angle
-from log2sim.scenario import Agent, Scenario, Waypoints
 
 OFFSET_M = 1.3
 FINE_S = 0.001

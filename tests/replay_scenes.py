@@ -7,8 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from replay_maneuvers import agent_from
 
-from log2sim.replay import Controls, Observation, Replay
-from log2sim.scenario import Agent
+from log2sim.datatypes import Agent
+from log2sim.simulation.policy import Controls, Observation
+from log2sim.simulation.result import Replay
 
 LENGTH_M = 4.4
 

@@ -12,32 +12,31 @@ import pytest
 from command_line import names, run
 from worlds import tiny_log
 
-from log2sim.bench import Benchmark, Scope, bench
-from log2sim.bench.document import document, format_table
-from log2sim.bench.figures import CUT_M, jitter, judge_scenario
-from log2sim.bench.front import Point, judge, pareto_front
-from log2sim.bench.names import short_name
-from log2sim.bench.parts import error_of, share_not_worse
-from log2sim.bench.places import at_tick, hold_out, judge_measured, judge_placed, true_places
-from log2sim.bench.runs import Bed, look, make_bed
-from log2sim.bench.settings import choices, make_grid
-from log2sim.bench.shared import detect_once
 from log2sim.config import Config, TopdownConfig
-from log2sim.detect.classes import COCO_80
-from log2sim.detect.layouts import LAYOUTS
-from log2sim.detect.onnx_detector import OnnxDetector
-from log2sim.detect.onnx_model import OnnxModel
-from log2sim.detect.preparation import InputSpec
+from log2sim.datatypes import Agent, Detections, Frame, Log, Measurements, Scenario, Waypoints
+from log2sim.documents import check
 from log2sim.errors import ConfigError, LogError
-from log2sim.geometry import Array
-from log2sim.ground_plane import CameraGround, calibrated_ground
-from log2sim.observe import Observed
+from log2sim.evaluation.bench.benchmark import Benchmark, bench
+from log2sim.evaluation.bench.bootstrap import error_of, share_not_worse
+from log2sim.evaluation.bench.document import document, format_table
+from log2sim.evaluation.bench.label_placement import short_name
+from log2sim.evaluation.bench.localization import at_tick, hold_out, judge_measured, judge_placed, true_places
+from log2sim.evaluation.bench.pareto import Point, judge, pareto_front
+from log2sim.evaluation.bench.runs import Bed, look, make_bed
+from log2sim.evaluation.bench.scores import CUT_M, Scope, jitter, judge_scenario
+from log2sim.evaluation.bench.settings import choices, make_grid
+from log2sim.evaluation.bench.shared_detections import detect_once
+from log2sim.geometry import Array, Camera
+from log2sim.perception.detect.classes import COCO_80
+from log2sim.perception.detect.layouts import LAYOUTS
+from log2sim.perception.detect.onnx_detector import OnnxDetector
+from log2sim.perception.detect.onnx_model import OnnxModel
+from log2sim.perception.detect.preparation import InputSpec
+from log2sim.perception.first_pass import Observed
+from log2sim.perception.homography.estimate import HomographyFit, apply_homography
+from log2sim.perception.homography_stage import CameraGround, calibrated_ground
 from log2sim.pipeline import schedule_of
 from log2sim.plan import make_plan
-from log2sim.scenario import Agent, Scenario, Waypoints
-from log2sim.schema import check
-from log2sim.topdown import HomographyFit, apply_homography
-from log2sim.types import Camera, Detections, Frame, Log, Measurements
 
 FirstPass = tuple[Bed, Observed, dict[str, float]]
 LABELS = Config.load(detect={"name": "labels"})
@@ -344,7 +343,7 @@ def test_tiles_and_input_sizes_are_those_that_change_something(
         model = OnnxModel(Path("m.onnx"), InputSpec("images", side, side, False, np.dtype(np.float32)), {}, None)
         return OnnxDetector("m", model, LAYOUTS["yolox"], COCO_80, 0.4, 0.5, "auto", 0.4)
 
-    monkeypatch.setattr("log2sim.bench.settings.detector_of", open_size)
+    monkeypatch.setattr("log2sim.evaluation.bench.settings.detector_of", open_size)
     grid = make_grid(tiny[0], Config.load(detect={"name": "any.onnx"}), ["models/fixed.onnx"])
     found = {s.name: (s.config.detect.tiles, s.config.detect.input_px) for s in grid.detect}
     # The picture is 480 px wide, so "auto" is no tiles for both; 416 px is what the family takes anyway.
@@ -551,7 +550,7 @@ def test_what_cannot_be_is_one_line_and_leaves_nothing(tiny_folder: Path, tmp_pa
 def test_a_wrong_scope_is_told_before_any_work(
     options: tuple[str, str], message: str, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("log2sim.bench.runs.detect_once", None)
+    monkeypatch.setattr("log2sim.evaluation.bench.runs.detect_once", None)
     ran = run("bench", tiny_folder, "--out", tmp_path / "b", "--detector", "labels", *options)
     assert ran.code == 2
     assert message in ran.line
@@ -569,7 +568,7 @@ def test_ctrl_c_leaves_nothing(tiny_folder: Path, tmp_path: Path, monkeypatch: p
     def interrupted(*arguments: Any, **options: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("log2sim.bench.runs.conclude", interrupted)
+    monkeypatch.setattr("log2sim.evaluation.bench.runs.conclude", interrupted)
     ran = run("bench", tiny_folder, "--out", tmp_path / "b", "--detector", "labels", "--quiet")
     assert ran.code == 130
     assert "interrupted" in ran.err

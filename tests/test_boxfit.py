@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from worlds import scan, standing
 
-from log2sim.boxfit import (
+from log2sim.datatypes import CATEGORIES, TYPICAL_SIZE_M
+from log2sim.perception.box_fitting import (
     FACING,
     SEEN,
     align_to,
@@ -18,7 +19,6 @@ from log2sim.boxfit import (
     rotate,
     subsample,
 )
-from log2sim.types import CATEGORIES, TYPICAL_SIZE_M
 
 QUARTER = np.pi / 2
 FAR_M = np.array([5e5, 5e6])

@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from log2sim.camera import NEAREST_DEPTH_M, distort, fold_radius, project, undistort
-from log2sim.types import Camera
+from log2sim.geometry import NEAREST_DEPTH_M, Camera, distort, fold_radius, project, undistort
 
 K = np.array([[900.0, 0.0, 655.0], [0.0, 880.0, 350.0], [0.0, 0.0, 1.0]])
 

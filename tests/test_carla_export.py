@@ -20,16 +20,15 @@ import pytest
 from carla_courses import SIZES, agent, left_turn, of
 from command_line import run
 
+from log2sim.datatypes import CATEGORIES, Agent, Scenario
 from log2sim.errors import ConfigError
-from log2sim.export import Options, export
+from log2sim.export.exporters import Options, export
 from log2sim.geometry import wrap_angle
-from log2sim.replay import follower
-from log2sim.replay.carla.assets import BY_CATEGORY, nearest_assets
-from log2sim.replay.carla.player import Body, Course, Follower, main, size_table
-from log2sim.replay.vehicles.parameters import parameters_for
-from log2sim.replay.vehicles.vehicle import VehicleState
-from log2sim.scenario import Agent, Scenario
-from log2sim.types import CATEGORIES
+from log2sim.simulation import follower
+from log2sim.simulation.carla.assets import BY_CATEGORY, nearest_assets
+from log2sim.simulation.carla.player import Body, Course, Follower, main, size_table
+from log2sim.simulation.vehicles.parameters import parameters_for
+from log2sim.simulation.vehicles.vehicle import VehicleState
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
 
@@ -145,7 +144,7 @@ def test_data_of_something_else_are_refused(text: str, tmp_path: Path, capsys: p
 
 
 def test_the_script_follows_as_the_shim_does() -> None:
-    """The scalar controller against log2sim.replay.follower, over 300 steps of random states."""
+    """The scalar controller against log2sim.simulation.follower, over 300 steps of random states."""
     rng = np.random.default_rng(3)
     dt = 0.02
     one, parameters = np.ones(1), parameters_for([left_turn()])

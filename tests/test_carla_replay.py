@@ -14,10 +14,12 @@ from carla_courses import SIZES, agent, left_turn, of
 from command_line import run
 
 from log2sim import Config, open_log, reconstruct
+from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError, MissingExtra
-from log2sim.export import export
-from log2sim.replay import Controls, Replay, replay
-from log2sim.scenario import Scenario
+from log2sim.export.exporters import export
+from log2sim.simulation.policy import Controls
+from log2sim.simulation.result import Replay
+from log2sim.simulation.runner import replay
 
 pytest.importorskip("carla", reason="CARLA's client is not installed (extra 'carla')")
 
@@ -25,9 +27,9 @@ import carla
 import carla_server
 from carla_server import Client
 
-from log2sim.replay.carla import player
-from log2sim.replay.carla.simulator import CarlaSimulator
-from log2sim.replay.carla.simulator import Server as CarlaServer
+from log2sim.simulation.carla import player
+from log2sim.simulation.carla.simulator import CarlaSimulator
+from log2sim.simulation.carla.simulator import Server as CarlaServer
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
 

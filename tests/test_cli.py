@@ -12,10 +12,11 @@ from typer.testing import CliRunner
 from worlds import tiny_toml
 
 import log2sim
-from log2sim import Scenario, cli
+from log2sim import Scenario
+from log2sim.cli import entry
+from log2sim.documents import check
 from log2sim.errors import LogError
 from log2sim.registry import BUILT_IN
-from log2sim.schema import check
 
 COMMANDS = (
     "reconstruct",
@@ -173,7 +174,7 @@ def test_strict_fails_with_6(tiny_scenario: Path, tmp_path: Path) -> None:
 
 def test_a_policy_drives_the_ego(tiny_scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "brake_hard.py").write_text(
-        "from log2sim.replay import Controls\n\n\ndef drive(observation):\n    return Controls(-6.0, 0.0)\n"
+        "from log2sim.simulation import Controls\n\n\ndef drive(observation):\n    return Controls(-6.0, 0.0)\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     assert run("replay", tiny_scenario, "--out", tmp_path / "log.json").code == 0
@@ -257,7 +258,7 @@ def test_help_and_version() -> None:
     assert shown.code == 0
     assert all(f"  {name} " in shown.out for name in COMMANDS)
     for name in COMMANDS:
-        result = CliRunner().invoke(cli.app, [name, "-h"])
+        result = CliRunner().invoke(entry.app, [name, "-h"])
         assert result.exit_code == 0
         assert f"log2sim {name}" in result.output or f" {name} " in result.output
         if name in ("reconstruct", "replay", "edit", "plot", "view", "evaluate", "bench", "synth"):
@@ -274,7 +275,7 @@ def test_a_missing_extra_exits_with_5_and_names_it(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr("log2sim.detect.ssd_mobilenet.PACKAGE", "no_such_package_anywhere")
+    monkeypatch.setattr("log2sim.perception.detect.ssd_mobilenet.PACKAGE", "no_such_package_anywhere")
     ran = run("reconstruct", tiny_folder, "--out", tmp_path / "s.json", "--quiet")
     assert ran.code == 5
     assert "pip install 'log2sim[coco]'" in ran.line

@@ -7,12 +7,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from log2sim.detect.preparation import InputSpec, Preparation, stretch_as_tf1
-from log2sim.detect.riders import join_riders
-from log2sim.detect.suppression import suppress
-from log2sim.detect.tiling import MAX_AUTO_TILES, OVERLAP, Tile, auto_count, merge, plan_tiles
+from log2sim.datatypes import GROUP_OF, Detections
 from log2sim.geometry import box_iou
-from log2sim.types import GROUP_OF, Detections
+from log2sim.perception.detect.preparation import InputSpec, Preparation, stretch_as_tf1
+from log2sim.perception.detect.riders import join_riders
+from log2sim.perception.detect.suppression import suppress
+from log2sim.perception.detect.tiling import MAX_AUTO_TILES, OVERLAP, Tile, auto_count, merge, plan_tiles
 
 
 def detections(*rows: tuple[str, float, tuple[float, float, float, float]]) -> Detections:

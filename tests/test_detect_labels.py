@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from log2sim.detect import create_detector
-from log2sim.detect.label_motion import Boxes, boxes_at, mutual_partners, one_of_each
+from log2sim.datatypes import Detections, Frame, ImageLabels, Labels, Log
 from log2sim.errors import ConfigError
-from log2sim.geometry import transform
-from log2sim.types import Camera, Detections, Frame, ImageLabels, Labels, Log
+from log2sim.geometry import Camera, transform
+from log2sim.perception.detect.detectors import create_detector
+from log2sim.perception.detect.label_motion import Boxes, boxes_at, mutual_partners, one_of_each
 
 # Looks along map x from the origin, 1000 px focal length.
 CAM_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from log2sim.detect import create_detector
+from log2sim.datatypes import Frame, Log
 from log2sim.errors import ConfigError
-from log2sim.types import Camera, Frame, Log
+from log2sim.geometry import Camera
+from log2sim.perception.detect.detectors import create_detector
 
 onnx = pytest.importorskip("onnx", reason="building test models needs onnx")
 

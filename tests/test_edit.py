@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from log2sim.edit import Edit, Lateral, Only, Remove, Shift, Speed, edit
+from log2sim.datatypes import Agent, Scenario, Waypoints
+from log2sim.edit.apply import edit
+from log2sim.edit.edits import Edit, Lateral, Only, Remove, Shift, Speed
 from log2sim.errors import CheckFailed, ConfigError, ScenarioError
 from log2sim.geometry import Array, wrap_angle
-from log2sim.replay import replay
-from log2sim.scenario import Agent, Scenario, Waypoints
+from log2sim.simulation.runner import replay
 
 TRUTH = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
 

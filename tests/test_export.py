@@ -14,9 +14,9 @@ import pytest
 from command_line import names, run
 
 from log2sim import registry
+from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError, MissingExtra, ScenarioError
-from log2sim.export import Options, export, formats
-from log2sim.scenario import Scenario
+from log2sim.export.exporters import Options, export, formats
 
 ROOT = Path(__file__).resolve().parents[1]
 SAMPLE = ROOT / "samples" / "crossing" / "truth.json"

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from export_paths import agent, bend, line, scenario
 
+from log2sim.datatypes import Agent, Scenario
 from log2sim.errors import ScenarioError
 from log2sim.export.checks import overlaps_at_entry, remarks, require_exportable, require_start_as_in_log
-from log2sim.scenario import Agent, Scenario
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
 

@@ -14,11 +14,10 @@ import pytest
 from export_worlds import ROOT, circling, straight, world
 from peer_checks import commonroad_finds, overlaps
 
+from log2sim.datatypes import CATEGORIES, MapFrame, Scenario
 from log2sim.errors import ScenarioError
-from log2sim.export import export
+from log2sim.export.exporters import export
 from log2sim.geometry import wrap_angle
-from log2sim.scenario import Scenario
-from log2sim.types import CATEGORIES, MapFrame
 
 SAMPLE = ROOT / "samples" / "crossing" / "truth.json"
 

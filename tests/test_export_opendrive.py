@@ -12,13 +12,12 @@ from command_line import names
 from export_paths import UTM, agent, bend, line, scenario
 from export_readers import Sampled, distance, play, roads
 
+from log2sim.datatypes import Agent, MapFrame, Scenario
 from log2sim.errors import ConfigError, ScenarioError
-from log2sim.export import Options, export
+from log2sim.export.exporters import Options, export
 from log2sim.export.roads.checks import require_roads
 from log2sim.export.roads.reference_line import ReferenceLine, fit, straight
 from log2sim.geometry import Array
-from log2sim.scenario import Agent, Scenario
-from log2sim.types import MapFrame
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
 

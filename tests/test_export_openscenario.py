@@ -12,13 +12,12 @@ from command_line import names, run
 from export_paths import agent, bend, line, scenario
 from export_readers import Entity, play, roads, trigger_s
 
+from log2sim.datatypes import CATEGORIES, Scenario
 from log2sim.errors import ConfigError, ScenarioError
-from log2sim.export import Options, export
+from log2sim.export.exporters import Options, export
 from log2sim.export.openscenario import write as openscenario
 from log2sim.export.xml_text import escaped, unescaped, unique_names
 from log2sim.geometry import wrap_angle
-from log2sim.scenario import Scenario
-from log2sim.types import CATEGORIES
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
 REVISIONS = ("1.0", "1.1", "1.2")

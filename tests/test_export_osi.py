@@ -12,10 +12,9 @@ import pytest
 from export_worlds import REAR_M, ROOT, circling, moved, straight, world
 from peer_checks import omega_prime_has_everybody
 
-from log2sim.export import export
+from log2sim.datatypes import CATEGORIES, Agent, MapFrame, Scenario
+from log2sim.export.exporters import export
 from log2sim.geometry import NS_PER_S, wrap_angle
-from log2sim.scenario import Agent, Scenario
-from log2sim.types import CATEGORIES, MapFrame
 
 betterosi = pytest.importorskip("betterosi")
 

@@ -15,9 +15,9 @@ from export_readers import play
 from export_worlds import ROOT, peer
 
 from log2sim import Config, open_log, reconstruct
-from log2sim.export import Options, export
+from log2sim.datatypes import Scenario
+from log2sim.export.exporters import Options, export
 from log2sim.geometry import wrap_angle
-from log2sim.scenario import Scenario
 
 pytestmark = [pytest.mark.peers, pytest.mark.slow]
 

@@ -10,9 +10,8 @@ from export_worlds import peer
 from peer_checks import commonroad_finds, metadrive_replays, omega_prime_has_everybody, overlaps
 
 from log2sim import Config, open_log, reconstruct
-from log2sim.export import Options, export
-from log2sim.scenario import Scenario
-from log2sim.types import Log
+from log2sim.datatypes import Log, Scenario
+from log2sim.export.exporters import Options, export
 
 pytestmark = [pytest.mark.peers, pytest.mark.slow, pytest.mark.real]
 

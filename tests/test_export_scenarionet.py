@@ -13,11 +13,10 @@ import pytest
 from export_worlds import RADIUS_M, REAR_M, ROOT, SPEED_MPS, circling, moved, straight, world
 from peer_checks import metadrive_replays
 
+from log2sim.datatypes import CATEGORIES, Scenario
 from log2sim.errors import ScenarioError
-from log2sim.export import export
+from log2sim.export.exporters import export
 from log2sim.geometry import NS_PER_S
-from log2sim.scenario import Scenario
-from log2sim.types import CATEGORIES
 
 SAMPLE = ROOT / "samples" / "crossing" / "truth.json"
 

@@ -15,12 +15,11 @@ from command_line import names, run
 from export_worlds import REAR_M, ROOT, circling, moved, peer, straight, world
 
 from log2sim import open_log
+from log2sim.datatypes import Log, Scenario, Stream
 from log2sim.errors import ConfigError, RecordError, ScenarioError
-from log2sim.export import Options, export
+from log2sim.export.exporters import Options, export
 from log2sim.export.viewers.playback import MOST_POINTS, PICTURE_PX, Cloud, Picture, shown_of, steps_of
-from log2sim.geometry import NS_PER_S, apply, box_corners, inverse, points_in_box
-from log2sim.scenario import Scenario
-from log2sim.types import Camera, Log, Stream
+from log2sim.geometry import NS_PER_S, Camera, apply, box_corners, inverse, points_in_box
 
 SAMPLE = ROOT / "samples" / "crossing"
 

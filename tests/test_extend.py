@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from worlds import Solid, scan, standing
 
-from log2sim.boxfit import rotate
-from log2sim.extend import Obstacles, follow, look
+from log2sim.agents.lidar_tracking import follow, look
+from log2sim.datatypes import Obstacles
 from log2sim.geometry import rotation_from_rpy
+from log2sim.perception.box_fitting import rotate
 
 T0_NS = 1_700_000_000_000_000_000
 SIZE = np.array([4.4, 1.85, 1.6])

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from log2sim import files
+from log2sim import documents
+from log2sim.documents import inside, read_json, refuse_existing, replaced, rounded, write_json
 from log2sim.errors import ConfigError, LogError, ScenarioError
-from log2sim.files import inside, read_json, refuse_existing, replaced, rounded, write_json
 
 
 @pytest.fixture
@@ -153,9 +153,9 @@ def test_json_that_cannot_be_written_leaves_nothing(tmp_path: Path, value: objec
 def test_too_large_a_file_is_not_even_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.json"
     path.write_text(json.dumps([0] * 100))
-    monkeypatch.setattr(files, "JSON_LIMIT_BYTES", path.stat().st_size)
+    monkeypatch.setattr(documents, "JSON_LIMIT_BYTES", path.stat().st_size)
     assert len(read_json(path)) == 100
-    monkeypatch.setattr(files, "JSON_LIMIT_BYTES", path.stat().st_size - 1)
+    monkeypatch.setattr(documents, "JSON_LIMIT_BYTES", path.stat().st_size - 1)
     monkeypatch.setattr(Path, "read_text", lambda *_, **__: pytest.fail("read before its size was looked at"))
     with pytest.raises(ScenarioError, match=r"a\.json: 300 bytes, more than the 299"):
         read_json(path, ScenarioError)

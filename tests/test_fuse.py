@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from worlds import scan, standing
 
-from log2sim.boxfit import box_of_cluster, rotate
-from log2sim.fuse import fuse
-from log2sim.types import TYPICAL_SIZE_M, Measurements
+from log2sim.datatypes import TYPICAL_SIZE_M, Measurements
+from log2sim.perception.box_fitting import box_of_cluster, rotate
+from log2sim.perception.fusion import fuse
 
 T0_NS = 1_700_000_000_000_000_000
 SENSOR = np.array([0.0, 0.0, 1.9])

@@ -8,16 +8,14 @@ import numpy as np
 import pytest
 from worlds import Solid, camera_ahead, outline_px, scan, standing
 
-from log2sim.camera import project
-from log2sim.extend import Obstacles
-from log2sim.geometry import PoseTrack, apply, inverse, rotation_from_rpy, transform
-from log2sim.ground_plane import CameraGround, calibrated_ground, fit_cameras, locate_the_rest
-from log2sim.observe import Observed
+from log2sim.datatypes import TYPICAL_SIZE_M, Log, Measurements, Obstacles, Stream
+from log2sim.geometry import PoseTrack, apply, inverse, project, rotation_from_rpy, transform
+from log2sim.perception.first_pass import Observed
+from log2sim.perception.homography.correspondences import Correspondences
+from log2sim.perception.homography.estimate import apply_homography, refused
+from log2sim.perception.homography_stage import CameraGround, calibrated_ground, fit_cameras, locate_the_rest
+from log2sim.perception.sync import synchronize
 from log2sim.plan import Plan, Step
-from log2sim.sync import synchronize
-from log2sim.topdown import Correspondences, refused
-from log2sim.topdown.homography import apply_homography
-from log2sim.types import TYPICAL_SIZE_M, Log, Measurements, Stream
 
 T0_NS = 1_700_000_000_000_000_000
 RNG_SEED = 5

@@ -10,12 +10,13 @@ import pytest
 from command_line import names, run
 from export_paths import UTM, agent, bend, line, scenario
 
+from log2sim.datatypes import Scenario
 from log2sim.errors import ScenarioError
-from log2sim.export import Options, export, xml_text
+from log2sim.export import xml_text
+from log2sim.export.exporters import Options, export
 from log2sim.export.openscenario import read
 from log2sim.export.openscenario.read import load
 from log2sim.geometry import wrap_angle
-from log2sim.scenario import Scenario
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
 WORLDS = {

@@ -11,28 +11,27 @@ import pytest
 from test_pipeline import assert_same_agents
 from worlds import CAR, PARKED, scan, standing, tiny_log
 
-import log2sim.assemble
-import log2sim.measure.cloud
+import log2sim.agents.build
+import log2sim.perception.lidar.cloud
 import log2sim.pipeline
 import log2sim.plan
 from log2sim import Config, Scenario, reconstruct, replay
-from log2sim.clock import Costs, StageClock
-from log2sim.detect import create_detector
+from log2sim.agents.simplify import thin
+from log2sim.datatypes import Detections, Frame, Lidar, Log, Measurements, Stream, Sweep, Waypoints
+from log2sim.documents import check
 from log2sim.errors import LogError, RecordError
-from log2sim.fuse import fuse
+from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.geometry import PoseTrack, transform
-from log2sim.ground_plane import fit_cameras
-from log2sim.measure import assemble_cloud, at_rest, to_map
-from log2sim.metrics.evaluate import evaluate
-from log2sim.observe import Observed
+from log2sim.perception.detect.detectors import create_detector
+from log2sim.perception.first_pass import Observed
+from log2sim.perception.fusion import fuse
+from log2sim.perception.homography_stage import fit_cameras
+from log2sim.perception.lidar.cloud import assemble_cloud, at_rest, to_map
+from log2sim.perception.sync import synchronize
 from log2sim.pipeline import Result
 from log2sim.plan import Plan, make_plan, plan_ticks
 from log2sim.savings import settle
-from log2sim.scenario import Waypoints
-from log2sim.schema import check
-from log2sim.sync import synchronize
-from log2sim.thin import thin
-from log2sim.types import Detections, Frame, Lidar, Log, Measurements, Stream, Sweep
+from log2sim.stage_clock import Costs, StageClock
 
 LABELS = Config.load(detect={"name": "labels"})
 FRONT = {"name": "front", "position_m": [1.7, 0.0, 1.5], "size_px": [480, 300], "offset_s": 0.03}
@@ -96,7 +95,7 @@ def test_an_ego_that_stands_needs_no_compensation(still: Log, monkeypatch: pytes
     assert "stands still" in left_out["reason"]
     assert left_out["saved_how"].startswith("estimated")
     monkeypatch.setattr(log2sim.plan, "STATIC_EGO_M", 0.0)
-    monkeypatch.setattr(log2sim.measure.cloud, "AT_REST_M", 0.0)
+    monkeypatch.setattr(log2sim.perception.lidar.cloud, "AT_REST_M", 0.0)
     full = run(log)
     assert entry(full, "compensate")["kept"]
     assert 0.0 < farthest_m(without.scenario, full.scenario) < 0.05
@@ -142,7 +141,7 @@ def test_a_sweep_during_which_the_ego_rests_takes_one_pose(tiny: Log, monkeypatc
     assert "rests during" in step["reason"]
     assert step["saved_s"] is not None
     assert step["saved_how"].startswith("estimated")
-    monkeypatch.setattr(log2sim.measure.cloud, "AT_REST_M", 0.0)
+    monkeypatch.setattr(log2sim.perception.lidar.cloud, "AT_REST_M", 0.0)
     full = run(log)
     assert "rests" not in entry(full, "compensate")["reason"]
     assert farthest_m(without.scenario, full.scenario) < 0.01
@@ -385,7 +384,8 @@ def assert_same_rows(a: Measurements, b: Measurements) -> None:
 
 def doubled_rows(log: Log) -> Measurements:
     """What one camera measured in a tick, each object twice, a little apart and with another score."""
-    from log2sim.measure import View, measure_view
+    from log2sim.perception.lidar.measure import measure_view
+    from log2sim.perception.lidar.projection import View
 
     t_ns = int(log.streams["front"].t_ns[4])
     view = View(log.cameras["front"], t_ns, log.map_T_sensor("front", t_ns)[0][0])
@@ -426,7 +426,7 @@ def test_a_parked_car_needs_no_smoothing(tiny: Log, monkeypatch: pytest.MonkeyPa
     assert step["reason"].startswith("1 of 3 tracks")
     assert step["saved_how"].startswith("estimated")
     (parked,) = [a for a in without.scenario.others if a.static]
-    monkeypatch.setattr(log2sim.assemble, "is_standing", lambda track: False)
+    monkeypatch.setattr(log2sim.agents.build, "is_standing", lambda track: False)
     full = run(tiny)
     assert entry(full, "smooth parked agents")["kept"]
     smoothed = min(full.scenario.others, key=lambda a: np.hypot(a.waypoints.x_m[0] - 14.0, a.waypoints.y_m[0] + 4.0))

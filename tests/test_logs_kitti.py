@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from log2sim.camera import project
+from log2sim.datatypes import Log
 from log2sim.errors import LogError, RecordError
-from log2sim.geometry import apply, inverse, points_in_box, rotation_from_rpy, yaw_of
-from log2sim.logs import open_log
+from log2sim.geometry import apply, inverse, points_in_box, project, rotation_from_rpy, yaw_of
 from log2sim.logs.kitti import EGO_T_IMU, poses_from_oxts, spin_offset_ns
 from log2sim.logs.kitti_labels import boxes_in_map
-from log2sim.types import Log
+from log2sim.logs.opening import open_log
 
 FRAMES = 4
 R_VELO = rotation_from_rpy(0.01, -0.02, 0.03)

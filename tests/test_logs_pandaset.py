@@ -12,10 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from log2sim.camera import project
 from log2sim.errors import LogError, RecordError
-from log2sim.geometry import apply, inverse, points_in_box, rotation_from_rpy, wrap_angle
-from log2sim.logs import open_log
+from log2sim.geometry import apply, inverse, points_in_box, project, rotation_from_rpy, wrap_angle
+from log2sim.logs.opening import open_log
 from log2sim.logs.pandaset import tie_to_earth
 from log2sim.logs.pandaset_labels import azimuth_offset_ns, read_labels
 from log2sim.logs.unpickle import read_pickled_table

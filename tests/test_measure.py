@@ -7,11 +7,13 @@ import pytest
 from scipy.spatial import KDTree
 from worlds import Solid, camera_ahead, outline_px, scan, standing
 
-from log2sim.boxfit import rotate
-from log2sim.geometry import apply, inverse, rotation_from_rpy, transform
-from log2sim.measure import Cloud, View, measure_view, project_cloud
-from log2sim.measure.ground import ON_GROUND_M
-from log2sim.types import TYPICAL_SIZE_M, Camera, Detections
+from log2sim.datatypes import TYPICAL_SIZE_M, Detections
+from log2sim.geometry import Camera, apply, inverse, rotation_from_rpy, transform
+from log2sim.perception.box_fitting import rotate
+from log2sim.perception.lidar.cloud import Cloud
+from log2sim.perception.lidar.ground import ON_GROUND_M
+from log2sim.perception.lidar.measure import measure_view, project_cloud
+from log2sim.perception.lidar.projection import View
 
 T0_NS = 1_700_000_000_000_000_000
 SENSOR = (0.0, 0.0, 1.9)

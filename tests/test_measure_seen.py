@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from worlds import camera_ahead
 
-from log2sim.camera import project
-from log2sim.geometry import apply, inverse, rotation_from_rpy, transform
-from log2sim.measure.seen import View, in_boxes, see
+from log2sim.geometry import apply, inverse, project, rotation_from_rpy, transform
+from log2sim.perception.lidar.projection import View, in_boxes, see
 
 BROWN = {"distortion_model": "brown", "distortion": (-0.3, 0.1, 0.001, -0.002, -0.02)}
 FISHEYE = {"distortion_model": "fisheye", "distortion": (0.02, -0.01, 0.003, 0.0)}

@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from log2sim.datatypes import Agent, MapFrame, Scenario, Waypoints
+from log2sim.documents import check
 from log2sim.errors import ConfigError, ScenarioError
-from log2sim.metrics.evaluate import evaluate
-from log2sim.metrics.table import format_table
-from log2sim.scenario import Agent, Scenario, Waypoints
-from log2sim.schema import check
-from log2sim.types import MapFrame
+from log2sim.evaluation.metrics.evaluator import evaluate
+from log2sim.evaluation.metrics.table import format_table
 
 T_S = np.arange(31) / 10
 CAR = (4.4, 1.8, 1.5)

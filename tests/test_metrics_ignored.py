@@ -9,17 +9,15 @@ import numpy as np
 import pytest
 from worlds import tiny_log
 
+from log2sim.datatypes import Agent, ImageRegions, LabelView, MapFrame, Scenario, Unlabeled, Waypoints
+from log2sim.documents import check
 from log2sim.errors import LogError, ScenarioError
-from log2sim.geometry import box_corners, transform
-from log2sim.logs import open_log
+from log2sim.evaluation.metrics.evaluator import evaluate
+from log2sim.evaluation.metrics.label_views import unlabeled_of
+from log2sim.evaluation.metrics.truth import truth_from_log
+from log2sim.geometry import Camera, box_corners, transform
+from log2sim.logs.opening import open_log
 from log2sim.logs.writer import write_log
-from log2sim.metrics.evaluate import evaluate
-from log2sim.metrics.label_views import unlabeled_of
-from log2sim.metrics.truth import truth_from_log
-from log2sim.scenario import Agent, Scenario, Waypoints
-from log2sim.schema import check
-from log2sim.types import Camera, ImageRegions, MapFrame
-from log2sim.unlabeled import LabelView, Unlabeled
 
 T_S = np.arange(21) / 10
 CAR = (4.0, 2.0, 1.5)

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from log2sim.datatypes import Labels, Lidar, Log, Stream, Sweep
 from log2sim.errors import ConfigError, LogError, RecordError
-from log2sim.geometry import PoseTrack, apply, inverse, points_in_box, rotation_from_rpy, transform
-from log2sim.metrics.evaluate import evaluate
-from log2sim.metrics.truth import is_static, nearest_record, speed_along, truth_from_log
-from log2sim.metrics.visible import PointGrid, convex_hull, image_shares
-from log2sim.types import Camera, Labels, Lidar, Log, Stream, Sweep
+from log2sim.evaluation.metrics.evaluator import evaluate
+from log2sim.evaluation.metrics.truth import is_static, nearest_record, speed_along, truth_from_log
+from log2sim.evaluation.metrics.visibility import PointGrid, convex_hull, image_shares
+from log2sim.geometry import Camera, PoseTrack, apply, inverse, points_in_box, rotation_from_rpy, transform
 
 NS = 1_000_000_000
 STEP_NS = NS // 10
@@ -250,8 +250,8 @@ def test_static_is_what_neither_reaches_nor_drifts():
 
 @pytest.mark.real
 def test_recorded_labels_have_the_points_that_a_full_search_finds(real_data):
-    from log2sim.logs import open_log
-    from log2sim.metrics.truth import points_in_labels
+    from log2sim.evaluation.metrics.truth import points_in_labels
+    from log2sim.logs.opening import open_log
 
     log = open_log(real_data / "kitti_tracking")
     counts, unreadable = points_in_labels(log, log.labels)

@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 from worlds import camera_ahead, outline_px, scan, standing
 
-from log2sim.clock import StageClock
 from log2sim.config import Config
+from log2sim.datatypes import Detections, Frame, ImageLabels, Lidar, Log, Stream, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import PoseTrack, apply, inverse, rotation_from_rpy, transform
-from log2sim.observe import Records, base_pose, observe, place_of_ego
+from log2sim.perception.first_pass import base_pose, observe, place_of_ego
+from log2sim.perception.frames import Records
+from log2sim.perception.sync import synchronize
 from log2sim.pipeline import reconstruct
 from log2sim.plan import make_plan
-from log2sim.sync import synchronize
-from log2sim.types import Detections, Frame, ImageLabels, Lidar, Log, Stream, Sweep
+from log2sim.stage_clock import StageClock
 
 T0_NS = 1_700_000_000_000_000_000
 STEP_NS = 100_000_000

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from log2sim.assemble import Built
-from log2sim.overlap import outside, without_doubles
-from log2sim.scenario import Agent, Waypoints
+from log2sim.agents.build import Built
+from log2sim.agents.duplicates import outside, without_doubles
+from log2sim.datatypes import Agent, Waypoints
 
 
 def agent(x_m, y_m=0.0, yaw=0.0, category="car", size=(4.4, 1.8, 1.5), t=(0.0, 4.0), speed=0.0):

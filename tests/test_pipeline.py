@@ -14,12 +14,11 @@ import pytest
 from worlds import PARKED, tiny_log
 
 from log2sim import Config, Scenario, open_log, reconstruct, replay
+from log2sim.datatypes import Labels, Log, Stream
+from log2sim.documents import check, write_json
 from log2sim.errors import ConfigError, LogError, NothingToReconstruct, ScenarioError
-from log2sim.files import write_json
-from log2sim.metrics.evaluate import evaluate
+from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.pipeline import Result
-from log2sim.schema import check
-from log2sim.types import Labels, Log, Stream
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 
@@ -279,7 +278,7 @@ def test_a_wrong_camera_is_refused(tiny: tuple[Log, Scenario]) -> None:
 
 
 def test_the_scenario_replays_and_the_replay_reads_back(result: Result, tmp_path: Path) -> None:
-    from log2sim.replay import Replay
+    from log2sim.simulation.result import Replay
 
     done = replay(result.scenario)
     done.save(tmp_path / "r.json")

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from log2sim.config import Config
+from log2sim.datatypes import Lidar, Log
 from log2sim.errors import ConfigError, LogError
-from log2sim.geometry import PoseTrack, transform
+from log2sim.geometry import Camera, PoseTrack, transform
 from log2sim.plan import Plan, Step, make_plan
-from log2sim.types import Camera, Lidar, Log
 
 
 def make_log(

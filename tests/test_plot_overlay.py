@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from log2sim.camera import box_lines
-from log2sim.plot import draw_overlay
-from log2sim.types import Camera
+from log2sim.geometry import Camera, box_lines
+from log2sim.visualization.plot.overlay import draw_overlay
 
 CAMERA = Camera("front", 640, 480, np.array([[500.0, 0, 320], [0, 500.0, 240], [0, 0, 1]]), "ego", np.eye(4))
 CAM_T_EGO = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])

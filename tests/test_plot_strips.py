@@ -11,16 +11,18 @@ from matplotlib.colors import to_rgb
 from matplotlib.text import Text
 from replay_maneuvers import MANEUVERS, agent_from, scenario_of
 
-from log2sim.plot import plot_tracks
-from log2sim.plot.animate import WAY_ALPHA, Pace, Stage
-from log2sim.plot.cast import assign
-from log2sim.plot.hits import hits_of
-from log2sim.plot.look import ALARM
-from log2sim.plot.sheet import Sheet
-from log2sim.plot.strips import story_of
-from log2sim.plot.tracks import base, still
-from log2sim.replay import Controls, Replay, replay
-from log2sim.scenario import Scenario
+from log2sim.datatypes import Scenario
+from log2sim.simulation.policy import Controls
+from log2sim.simulation.result import Replay
+from log2sim.simulation.runner import replay
+from log2sim.visualization.plot.animation import WAY_ALPHA, Pace, Stage
+from log2sim.visualization.plot.collisions import hits_of
+from log2sim.visualization.plot.layout import Sheet
+from log2sim.visualization.plot.roles import assign
+from log2sim.visualization.plot.scene import base
+from log2sim.visualization.plot.style import ALARM
+from log2sim.visualization.plot.time_series import story_of
+from log2sim.visualization.plot.tracks import plot_tracks, still
 
 
 def named(key: str, id: str, **moved: float):

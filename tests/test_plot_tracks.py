@@ -8,17 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from log2sim.datatypes import TYPICAL_SIZE_M, Agent, MapFrame, Scenario, Waypoints
 from log2sim.errors import ConfigError
-from log2sim.plot import plot_tracks, shapes
-from log2sim.plot.animate import Stage
-from log2sim.plot.cast import assign
-from log2sim.plot.look import PALETTE, printable
-from log2sim.plot.sheet import Sheet
-from log2sim.plot.tracks import still
-from log2sim.plot.view import View, choose_view, nice_step, time_step_s
-from log2sim.replay import replay
-from log2sim.scenario import Agent, Scenario, Waypoints
-from log2sim.types import TYPICAL_SIZE_M, MapFrame
+from log2sim.simulation.runner import replay
+from log2sim.visualization.plot import shapes
+from log2sim.visualization.plot.animation import Stage
+from log2sim.visualization.plot.layout import Sheet
+from log2sim.visualization.plot.roles import assign
+from log2sim.visualization.plot.style import PALETTE, printable
+from log2sim.visualization.plot.tracks import plot_tracks, still
+from log2sim.visualization.plot.viewport import View, choose_view, nice_step, time_step_s
 
 
 def make_agent(
@@ -136,7 +135,7 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(
         show(stage, t_s)
 
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", fail_half_way)
-    monkeypatch.setattr("log2sim.plot.animate.Stage.show", fail_later)
+    monkeypatch.setattr("log2sim.visualization.plot.animation.Stage.show", fail_later)
     with pytest.raises(RuntimeError, match="disk"):
         plot_tracks(crossing(), out, overwrite=True)
     assert out.read_bytes() == b"good"

@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 import typer
 
-from log2sim import cli
+from log2sim.cli import entry
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-GROUP = typer.main.get_command(cli.app)
+GROUP = typer.main.get_command(entry.app)
 
 
 def blocks() -> Iterator[str]:

@@ -8,10 +8,10 @@ from replay_maneuvers import agent_from, scenario_of
 from scipy.optimize import brentq
 
 from log2sim.geometry import wrap_angle
-from log2sim.replay import replay
-from log2sim.replay.assess.boxes import Boxes, rectangles_overlap
-from log2sim.replay.assess.collisions import collisions, contacts
-from log2sim.replay.assess.sweep import STEPS, Motion, first_touch
+from log2sim.simulation.metrics.box_tracks import Boxes, rectangles_overlap
+from log2sim.simulation.metrics.collisions import collisions, contacts
+from log2sim.simulation.metrics.continuous_collision import STEPS, Motion, first_touch
+from log2sim.simulation.runner import replay
 
 SPACING_S = 0.05
 T_S = np.arange(0, 81) * SPACING_S

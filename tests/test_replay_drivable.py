@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from replay_maneuvers import MANEUVERS, agent_from, driven, ramp
 
-from log2sim.replay.drivable import Limits, _cost, _normal_equations, _Problem, nearest_course
-from log2sim.replay.path import path_of
-from log2sim.replay.reference import GRID_S, drivable_course, point_reference, tape_reference, vehicle_reference
+from log2sim.simulation.feasible_trajectory import Limits, _cost, _normal_equations, _Problem, nearest_course
+from log2sim.simulation.path import path_of
+from log2sim.simulation.reference import GRID_S, drivable_course, point_reference, tape_reference, vehicle_reference
 
 LIMITS = Limits(offset_m=1.3, max_curvature_1pm=0.27, max_curvature_rate_1pmps=0.37, max_accel_mps2=10.0)
 
@@ -187,7 +187,7 @@ def test_feed_forward_is_that_of_a_later_time():
 
 
 def test_a_life_too_long_to_be_fitted_is_followed_as_logged(monkeypatch):
-    monkeypatch.setattr("log2sim.replay.reference.MAX_KNOTS", 20)
+    monkeypatch.setattr("log2sim.simulation.reference.MAX_KNOTS", 20)
     agent = MANEUVERS["brake to stop and go"]()
     w = agent.waypoints
     course, departure_m = drivable_course(path_of(agent, 1.3), LIMITS)

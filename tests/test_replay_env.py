@@ -20,7 +20,7 @@ SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.j
 
 
 def made(scene, **options):
-    from log2sim.replay.env import ScenarioEnv
+    from log2sim.simulation.env import ScenarioEnv
 
     return ScenarioEnv(scene, **options)
 
@@ -28,9 +28,9 @@ def made(scene, **options):
 def test_it_passes_gymnasiums_own_checker_without_a_warning():
     from gymnasium.utils.env_checker import check_env
 
-    import log2sim.replay.env
+    import log2sim.simulation.env
 
-    env = gymnasium.make(log2sim.replay.env.ID, scenario=SAMPLE, render_mode="rgb_array")
+    env = gymnasium.make(log2sim.simulation.env.ID, scenario=SAMPLE, render_mode="rgb_array")
     check_env(env.unwrapped)
 
 
@@ -139,10 +139,10 @@ def test_without_gymnasium_the_extra_is_named(monkeypatch):
             raise ImportError(name)
         return real(name, *rest)
 
-    monkeypatch.delitem(sys.modules, "log2sim.replay.env", raising=False)
+    monkeypatch.delitem(sys.modules, "log2sim.simulation.env", raising=False)
     monkeypatch.setattr(builtins, "__import__", missing)
     with pytest.raises(MissingExtra, match=r"pip install 'log2sim\[gym\]'"):
-        import log2sim.replay.env  # noqa: F401
+        import log2sim.simulation.env  # noqa: F401
 
 
 def test_steps_before_the_reset_and_actions_that_are_no_two_numbers_are_refused():

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from replay_maneuvers import OFFSET_M, agent_from, driven, ramp, scenario_of
 
+from log2sim.datatypes import Waypoints
 from log2sim.errors import ScenarioError
 from log2sim.geometry import wrap_angle
-from log2sim.replay import replay
-from log2sim.replay.drivable import LOCK_SHARE
-from log2sim.replay.follower import Memory, follow_vehicles
-from log2sim.replay.vehicles.parameters import parameters_for
-from log2sim.replay.vehicles.vehicle import VehicleState, step_bicycle
-from log2sim.scenario import Waypoints
+from log2sim.simulation.feasible_trajectory import LOCK_SHARE
+from log2sim.simulation.follower import Memory, follow_vehicles
+from log2sim.simulation.runner import replay
+from log2sim.simulation.vehicles.parameters import parameters_for
+from log2sim.simulation.vehicles.vehicle import VehicleState, step_bicycle
 
 STEPS_S = [0.001, 0.01, 0.1, 1.0]
 LONG_STEPS_S = [0.01, 0.1, 0.25, 1.0]  # for lives too long for steps of 1 ms in a quick test
@@ -299,7 +299,7 @@ def test_headings_that_flicker_about_pi_are_one_heading():
 @pytest.fixture
 def _exact_numbers(monkeypatch):
     """States as they are, not rounded for the file."""
-    monkeypatch.setattr("log2sim.replay.assemble.DIGITS", 12)
+    monkeypatch.setattr("log2sim.simulation.replay_result.DIGITS", 12)
 
 
 @pytest.mark.usefixtures("_exact_numbers")
@@ -347,7 +347,7 @@ def test_windows_of_any_length_give_the_same_states(window_s, category, monkeypa
     agent = driven(lambda t: 8 + 4 * np.sin(0.7 * t), lambda s: 0.04 * np.sin(s / 20), 30.0)
     scene = scenario_of(changed(agent, category=category), shifted(changed(agent, id="late"), t=3.3))
     one = replay(scene, dt_s=0.02)
-    monkeypatch.setattr("log2sim.replay.rollout.WINDOW_S", window_s)
+    monkeypatch.setattr("log2sim.simulation.rollout.WINDOW_S", window_s)
     other = replay(scene, dt_s=0.02)
     for a, b in zip(one.agents, other.agents):
         assert a.id == b.id

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from replay_maneuvers import MANEUVERS, OFFSET_M, agent_from, driven, ramp, scenario_of
 
-from log2sim.replay import replay
-from log2sim.replay.follower import GAINS, Memory, follow_points, follow_vehicles
-from log2sim.replay.vehicles.parameters import parameters_for
-from log2sim.replay.vehicles.vehicle import PointState, VehicleState, step_bicycle, step_point
+from log2sim.simulation.follower import GAINS, Memory, follow_points, follow_vehicles
+from log2sim.simulation.runner import replay
+from log2sim.simulation.vehicles.parameters import parameters_for
+from log2sim.simulation.vehicles.vehicle import PointState, VehicleState, step_bicycle, step_point
 
 CAR = parameters_for([agent_from([0.0], [0.0], [0.0], [0.0], [0.0])])
 

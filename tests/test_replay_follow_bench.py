@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from replay_maneuvers import MANEUVERS, scenario_of
 
-from log2sim.replay import replay
+from log2sim.simulation.runner import replay
 
 TOOLS = Path(__file__).resolve().parents[1] / "tools"
 

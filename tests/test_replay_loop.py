@@ -16,10 +16,12 @@ from replay_maneuvers import MANEUVERS, agent_from, scenario_of
 from replay_scenes import LENGTH_M, Speed, gap, line, parked, walker
 
 from log2sim.errors import ConfigError
-from log2sim.replay import Controls, load_policy, open_world, replay
-from log2sim.replay.path import path_of
-from log2sim.replay.reactive.ways import times_beside
-from log2sim.replay.rollout import roll
+from log2sim.simulation.path import path_of
+from log2sim.simulation.policy import Controls
+from log2sim.simulation.policy_loading import load_policy
+from log2sim.simulation.reactive.path_table import times_beside
+from log2sim.simulation.rollout import roll
+from log2sim.simulation.runner import open_world, replay
 
 ROOT = Path(__file__).resolve().parents[1]
 SAMPLE = ROOT / "samples" / "crossing" / "truth.json"
@@ -266,10 +268,10 @@ def test_policies_are_found_in_files_and_classes_are_made(tmp_path):
 
 def test_a_module_in_the_current_folder_is_found_from_a_plain_shell(tmp_path):
     (tmp_path / "my_driver.py").write_text(
-        "from log2sim.replay import Controls\ndef brake_late(seen):\n    return Controls(-5.0 * (seen.t_s > 1), 0.0)\n"
+        "from log2sim.simulation import Controls\ndef brake_late(seen):\n    return Controls(-5.0 * (seen.t_s > 1), 0.0)\n"
     )
     # As an installed script runs, which does not search the current folder by itself.
-    code = "import sys; from log2sim.cli import main; sys.path.remove(''); sys.argv[0] = 'log2sim'; main()"
+    code = "import sys; from log2sim.cli.entry import main; sys.path.remove(''); sys.argv[0] = 'log2sim'; main()"
     ran = subprocess.run(
         [sys.executable, "-c", code, "replay", str(SAMPLE), "--ego", "my_driver:brake_late", "--out", "r.json"],
         cwd=tmp_path, capture_output=True, text=True,
@@ -288,7 +290,7 @@ def test_the_command_line_lets_agents_react(tmp_path):
     scene = scenario_of(*(line(k, -30.0 * n, duration_s=6) for n, k in enumerate(("ego", "f", "g"))))
     scene.save(tmp_path / "s.json")
     (tmp_path / "stop.py").write_text(
-        "from log2sim.replay import Controls\ndef drive(seen):\n    return Controls(-8.0, 0.0)\n"
+        "from log2sim.simulation import Controls\ndef drive(seen):\n    return Controls(-8.0, 0.0)\n"
     )
 
     def drivers(*options):

@@ -7,12 +7,13 @@ import pytest
 from replay_maneuvers import agent_from, driven, lane_change, scenario_of
 
 from log2sim.errors import CheckFailed
-from log2sim.replay import check_strict, replay, require_strict
-from log2sim.replay.assess.boxes import Boxes, rectangles_overlap
-from log2sim.replay.assess.collisions import LOG_MARGIN_M, LOG_WINDOW_S, collisions, contacts
-from log2sim.replay.assess.metrics import tracking_errors
-from log2sim.replay.assess.summary import summarize
-from log2sim.replay.path import path_of
+from log2sim.simulation.metrics.box_tracks import Boxes, rectangles_overlap
+from log2sim.simulation.metrics.collisions import LOG_MARGIN_M, LOG_WINDOW_S, collisions, contacts
+from log2sim.simulation.metrics.limits import check_strict, require_strict
+from log2sim.simulation.metrics.summary import summarize
+from log2sim.simulation.metrics.tracking_error import tracking_errors
+from log2sim.simulation.path import path_of
+from log2sim.simulation.runner import replay
 
 T_S = np.arange(0, 41) * 0.1
 
@@ -198,7 +199,7 @@ def test_boxes_that_cross_in_the_log_collide_in_the_replay_and_the_log_has_it():
 
 
 def test_an_ego_that_does_not_brake_has_a_collision_that_the_log_has_not_and_strict_says_so():
-    from log2sim.replay import Controls
+    from log2sim.simulation.policy import Controls
 
     t = T_S
     speed = np.maximum(6 - 3 * t, 0)

@@ -9,11 +9,13 @@ import pytest
 from replay_maneuvers import agent_from, driven, lane_change, ramp, scenario_of
 
 from log2sim.errors import ConfigError
-from log2sim.replay import Controls, Replay, replay
-from log2sim.replay.assess.summary import summarize
-from log2sim.replay.vehicles.models import SLIP_TOLERANCE_RAD
-from log2sim.replay.vehicles.parameters import PUBLISHED, parameters_for
-from log2sim.replay.vehicles.vehicle import GRAVITY_MPS2
+from log2sim.simulation.metrics.summary import summarize
+from log2sim.simulation.policy import Controls
+from log2sim.simulation.result import Replay
+from log2sim.simulation.runner import replay
+from log2sim.simulation.vehicles.model_choice import SLIP_TOLERANCE_RAD
+from log2sim.simulation.vehicles.parameters import PUBLISHED, parameters_for
+from log2sim.simulation.vehicles.vehicle import GRAVITY_MPS2
 
 SLIPPING = pytest.mark.parametrize("model", ["dynamic", "single-track"])
 

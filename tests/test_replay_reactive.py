@@ -10,15 +10,17 @@ import pytest
 from replay_maneuvers import MANEUVERS, agent_from, driven, ramp, scenario_of
 from replay_scenes import LENGTH_M, Speed, departure, gap, line, parked, walker
 
+from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError
-from log2sim.replay import Controls, load_policy, open_world
-from log2sim.replay import replay as run
-from log2sim.replay.path import path_of
-from log2sim.replay.reactive.corridor import _nearest_edge
-from log2sim.replay.reactive.driver import demand, drivers_for, respond
-from log2sim.replay.reactive.ways import Ways, times_at
-from log2sim.replay.rollout import roll
-from log2sim.scenario import Scenario
+from log2sim.simulation.path import path_of
+from log2sim.simulation.policy import Controls
+from log2sim.simulation.policy_loading import load_policy
+from log2sim.simulation.reactive.idm import demand, drivers_for, respond
+from log2sim.simulation.reactive.path_table import Ways, times_at
+from log2sim.simulation.reactive.swept_corridor import _nearest_edge
+from log2sim.simulation.rollout import roll
+from log2sim.simulation.runner import open_world
+from log2sim.simulation.runner import replay as run
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
 

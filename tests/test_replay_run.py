@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from replay_maneuvers import MANEUVERS, agent_from, driven, scenario_of
 
-import log2sim
+from log2sim.documents import check, write_json
 from log2sim.errors import ConfigError, ScenarioError
-from log2sim.files import write_json
-from log2sim.replay import Controls, Replay, load_policy, replay, to_scenario
-from log2sim.schema import check
+from log2sim.simulation.policy import Controls
+from log2sim.simulation.policy_loading import load_policy
+from log2sim.simulation.result import Replay, to_scenario
+from log2sim.simulation.runner import replay
 
 
 def straight(id="a", y=0.0, speed=5.0, duration_s=3.0, **options):
@@ -35,12 +36,6 @@ def test_exact_mode_goes_through_the_waypoints():
     angle = np.unwrap(w.yaw_rad)
     np.testing.assert_allclose(r.yaw_rad[between], np.interp(r.t_s[between], w.t_s, angle), atol=1e-5)
     assert result.metrics["followers"] == 0
-
-
-def test_the_package_is_the_function_too():
-    scene = scenario_of(straight())
-    assert log2sim.replay(scene).to_dict() == replay(scene).to_dict()
-    assert log2sim.replay.replay is replay
 
 
 def test_the_same_scenario_gives_the_same_bytes():

@@ -10,10 +10,17 @@ import pytest
 from replay_maneuvers import agent_from
 from scipy.integrate import solve_ivp
 
-from log2sim.replay.vehicles.parameters import PUBLISHED, parameters_for, published_parameters
-from log2sim.replay.vehicles.single_track import Chassis, Motion, Slips, linear_course, linear_slips, step_single_track
-from log2sim.replay.vehicles.sliding import step_dynamic
-from log2sim.replay.vehicles.vehicle import GRAVITY_MPS2, VehicleControls, VehicleState, step_bicycle
+from log2sim.simulation.vehicles.dynamic import step_dynamic
+from log2sim.simulation.vehicles.parameters import PUBLISHED, parameters_for, published_parameters
+from log2sim.simulation.vehicles.single_track import (
+    Chassis,
+    Motion,
+    Slips,
+    linear_course,
+    linear_slips,
+    step_single_track,
+)
+from log2sim.simulation.vehicles.vehicle import GRAVITY_MPS2, VehicleControls, VehicleState, step_bicycle
 
 BMW = published_parameters(2, rear_axle_offset_m=1.4)
 CAR = parameters_for([agent_from([0.0], [0.0], [0.0], [0.0], [0.0])])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from replay_maneuvers import agent_from
 
-from log2sim.replay.vehicles.parameters import PEDAL_LAG_S, STEER_LAG_S, parameters_for, rear_axle_offset
-from log2sim.replay.vehicles.vehicle import (
+from log2sim.simulation.vehicles.parameters import PEDAL_LAG_S, STEER_LAG_S, parameters_for, rear_axle_offset
+from log2sim.simulation.vehicles.vehicle import (
     POINT_MAX_ACCEL_MPS2,
     PointControls,
     PointState,

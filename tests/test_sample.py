@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from log2sim import Config, Scenario, open_log, reconstruct, replay
-from log2sim.metrics.evaluate import evaluate
+from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.pipeline import Result
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing"

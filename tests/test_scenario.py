@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from log2sim.datatypes import Agent, MapFrame, Scenario, Waypoints
 from log2sim.errors import ScenarioError
-from log2sim.scenario import Agent, Scenario, Waypoints
-from log2sim.types import MapFrame
 
 
 def make_agent(agent_id: str = "car-1", seed: int = 0, count: int = 7, *, visible: bool = False) -> Agent:

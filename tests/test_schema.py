@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from jsonschema import Draft202012Validator
 
-from log2sim import schema
+from log2sim import documents
 from log2sim.errors import ScenarioError
 
 COLUMN = {"type": "array", "minItems": 1, "maxItems": 5, "items": {"type": "number", "minimum": -10, "maximum": 10}}
@@ -31,12 +31,12 @@ NAMES = {"type": "array", "items": {"type": "string"}}
 def test_a_column_is_judged_as_by_the_plain_validator(
     expected: dict[str, Any], values: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(schema, "load_schema", lambda name: {"properties": {"values": expected}})
+    monkeypatch.setattr(documents, "load_schema", lambda name: {"properties": {"values": expected}})
     problem = next(Draft202012Validator({"properties": {"values": expected}}).iter_errors({"values": values}), None)
     if problem is None:
-        schema.check({"values": values}, "any", ScenarioError)
+        documents.check({"values": values}, "any", ScenarioError)
     else:
         with pytest.raises(ScenarioError) as caught:
-            schema.check({"values": values}, "any", ScenarioError)
+            documents.check({"values": values}, "any", ScenarioError)
         assert problem.message in str(caught.value)
         assert str(caught.value).startswith("values")

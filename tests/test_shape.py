@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from worlds import scan, standing
 
-from log2sim.boxfit import box_of_cluster, rotate
+from log2sim.agents.size import heading_of_standing, is_standing, shape_moving, shape_standing
+from log2sim.datatypes import TYPICAL_SIZE_M, Measurements, Track
 from log2sim.geometry import rotation_from_rpy
-from log2sim.shape import heading_of_standing, is_standing, shape_moving, shape_standing
-from log2sim.types import TYPICAL_SIZE_M, Measurements, Track
+from log2sim.perception.box_fitting import box_of_cluster, rotate
 
 T0_NS = 1_700_000_000_000_000_000
 STEP_NS = 100_000_000

@@ -13,19 +13,19 @@ import pytest
 from scipy.integrate import quad_vec
 from scipy.linalg import expm
 
-from log2sim.geometry import wrap_angle
-from log2sim.smooth import SmoothedTrack, estimate_sigma, signed_speed, smooth_track
-from log2sim.smooth.chain import (
+from log2sim.agents.smooth.feasibility import broken_limits
+from log2sim.agents.smooth.fixed_interval import Manner, smooth_interval
+from log2sim.agents.smooth.heading import yaw_of_motion
+from log2sim.agents.smooth.motion_prior import (
     ACCELERATION_PRIOR_MPS2,
     KNOT_STEP_S,
     VELOCITY_PRIOR_MPS,
     Observations,
     place_knots,
 )
-from log2sim.smooth.feasible import broken_limits
-from log2sim.smooth.interval import Manner, smooth_interval
-from log2sim.smooth.quadratic import band_of, blocks_of, selected_inverse
-from log2sim.smooth.yaw import yaw_of_motion
+from log2sim.agents.smooth.quadratic import band_of, blocks_of, selected_inverse
+from log2sim.agents.smooth.smoother import SmoothedTrack, estimate_sigma, signed_speed, smooth_track
+from log2sim.geometry import wrap_angle
 
 DT = 0.1
 

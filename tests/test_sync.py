@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from worlds import camera_ahead
 
+from log2sim.datatypes import Lidar, Log, Stream, Sweep
 from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.geometry import PoseTrack, apply, rotation_from_rpy, transform
-from log2sim.measure import to_map
-from log2sim.sync import nearest_records, sweep_middle_ns, synchronize
-from log2sim.types import Lidar, Log, Stream, Sweep
+from log2sim.perception.lidar.cloud import to_map
+from log2sim.perception.sync import nearest_records, sweep_middle_ns, synchronize
 
 T0_NS = 1_700_000_000_000_000_000
 MS = 1_000_000

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from worlds import CAR, PARKED, WALKER, tiny_log, tiny_scene
 
+from log2sim.datatypes import Scenario, Stream
 from log2sim.errors import ConfigError
 from log2sim.geometry import NS_PER_S, apply, box_corners, inverse
-from log2sim.scenario import Scenario
-from log2sim.synth import write_synthetic
 from log2sim.synth.actors import EgoMotion, actors_of
-from log2sim.synth.observe import Sighting, visible_at
+from log2sim.synth.labels import Sighting, visible_at
 from log2sim.synth.raycast import GROUND, Cast, cast
-from log2sim.types import Stream
+from log2sim.synth.write import write_synthetic
 
 WALL = {"center": [25.0, 0.0], "size_m": [2.0, 120.0, 8.0]}
 

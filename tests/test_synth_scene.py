@@ -9,8 +9,7 @@ import pytest
 from worlds import CAR, tiny_table
 
 from log2sim.errors import ConfigError
-from log2sim.synth import load_scene
-from log2sim.synth.scene import scene_from_table
+from log2sim.synth.scene import load_scene, scene_from_table
 
 SAMPLE = Path(__file__).resolve().parent.parent / "samples" / "crossing.toml"
 

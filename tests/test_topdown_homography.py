@@ -10,20 +10,24 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from log2sim.camera import project
-from log2sim.geometry import apply, inverse, rotation_from_rpy, transform
-from log2sim.topdown import (
+from log2sim.datatypes import TYPICAL_SIZE_M, Measurements
+from log2sim.geometry import Camera, apply, inverse, project, rotation_from_rpy, transform
+from log2sim.perception.homography.correspondences import (
     FOOT_SIGMA_PX,
     Correspondences,
-    estimate_homography,
     fit_camera,
     foot_points,
     jitter_m,
     locate,
 )
-from log2sim.topdown.homography import METHODS, HomographyFit, apply_homography, jacobian
-from log2sim.topdown.warp import ground_homography
-from log2sim.types import TYPICAL_SIZE_M, Camera, Measurements
+from log2sim.perception.homography.estimate import (
+    METHODS,
+    HomographyFit,
+    apply_homography,
+    estimate_homography,
+    jacobian,
+)
+from log2sim.visualization.birdseye.ground_view import ground_homography
 
 K = np.array([[1000.0, 0.0, 640.0], [0.0, 1000.0, 360.0], [0.0, 0.0, 1.0]])
 PROBES_M = np.array([[x, y] for x in (8.0, 15.0, 25.0, 40.0) for y in (-0.3 * x, 0.0, 0.3 * x)])

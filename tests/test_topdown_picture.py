@@ -9,11 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from log2sim.camera import fold_radius, undistort
 from log2sim.errors import ConfigError
-from log2sim.geometry import Array, inverse, rotation_from_rpy, transform
-from log2sim.topdown.picture import GroundView, Mosaic, ground_homography, render_topdown, write_picture
-from log2sim.types import Camera
+from log2sim.geometry import Array, Camera, fold_radius, inverse, rotation_from_rpy, transform, undistort
+from log2sim.visualization.birdseye.ground_view import GroundView, ground_homography
+from log2sim.visualization.birdseye.mosaic import Mosaic, render_topdown, write_picture
 
 EGO_R_CAM = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
 K = np.array([[800.0, 0, 640], [0, 800.0, 360], [0, 0, 1]])

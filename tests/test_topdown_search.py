@@ -9,12 +9,17 @@ import numpy as np
 import pytest
 
 from log2sim.geometry import rotation_from_rpy
-from log2sim.topdown import HomographyFit, estimate_homography, jitter_m
-from log2sim.topdown.homography import apply_homography, ground_from_sizes
-from log2sim.topdown.hypotheses import draw, solve
-from log2sim.topdown.pose import nearest_poses, tangent
-from log2sim.topdown.refine import free_directions, linearize, noise
-from log2sim.topdown.stream import BOUND, Stream, losses, squared_errors
+from log2sim.perception.homography.correspondences import jitter_m
+from log2sim.perception.homography.estimate import (
+    HomographyFit,
+    apply_homography,
+    estimate_homography,
+    ground_from_sizes,
+)
+from log2sim.perception.homography.hypotheses import draw, solve
+from log2sim.perception.homography.pose import nearest_poses, tangent
+from log2sim.perception.homography.refine import free_directions, linearize, noise
+from log2sim.perception.homography.stream import BOUND, Stream, losses, squared_errors
 
 K = np.array([[2050.0, 0.0, 960.0], [0.0, 2050.0, 640.0], [0.0, 0.0, 1.0]])
 HEIGHT_M = 2.1

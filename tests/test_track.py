@@ -9,12 +9,12 @@ import pytest
 from scipy.integrate import quad_vec
 from scipy.linalg import expm
 
+from log2sim.datatypes import Measurements, Track
 from log2sim.geometry import NS_PER_S
-from log2sim.track import category_of, least_hits, track
-from log2sim.track.forward import track_forward
-from log2sim.track.motion import CENTER_SIGMA_M, innovation, measurement_noise, predict, update
-from log2sim.track.stitch import stitch
-from log2sim.types import Measurements, Track
+from log2sim.tracking.forward import track_forward
+from log2sim.tracking.motion import CENTER_SIGMA_M, innovation, measurement_noise, predict, update
+from log2sim.tracking.stitch import category_of, stitch
+from log2sim.tracking.tracker import least_hits, track
 
 PERIOD_S = 0.1
 START_NS = 1_700_000_000_000_000_000

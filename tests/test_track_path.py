@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from test_track import OPTIONS, line, names_of, record, seen, stamps
 
+from log2sim.datatypes import Measurements, Track
 from log2sim.geometry import NS_PER_S
-from log2sim.track import track
-from log2sim.track.motion import ACCELERATION_MPS2, FIRST_SPEED_MPS, first_velocity, measurement_noise, predict
-from log2sim.track.path import smooth_paths
-from log2sim.types import Measurements, Track
+from log2sim.tracking.motion import ACCELERATION_MPS2, FIRST_SPEED_MPS, first_velocity, measurement_noise, predict
+from log2sim.tracking.path import smooth_paths
+from log2sim.tracking.tracker import track
 
 
 def a_track(ticks: list[int], t_ns: np.ndarray, seed: int = 0, category: str = "car", sigma_m: float = 0.3) -> Track:

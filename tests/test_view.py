@@ -18,15 +18,14 @@ import pytest
 from browser import CHROMIUM, DRIVER, Browser, browsing
 from command_line import names, run
 
+from log2sim.datatypes import Agent, Scenario, Waypoints
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array, box_corners_bev, wrap_angle
-from log2sim.plot import look
-from log2sim.plot.cast import assign
-from log2sim.replay import replay
-from log2sim.scenario import Agent, Scenario, Waypoints
-from log2sim.view import write_page
-from log2sim.view.pack import SCALES, pack, shortened
-from log2sim.view.page import page_of
+from log2sim.simulation.runner import replay
+from log2sim.visualization.page.pack import SCALES, pack, shortened
+from log2sim.visualization.page.writer import page_of, write_page
+from log2sim.visualization.plot import style
+from log2sim.visualization.plot.roles import assign
 
 ROOT = Path(__file__).resolve().parents[1]
 TRUTH = ROOT / "samples" / "crossing" / "truth.json"
@@ -105,11 +104,11 @@ def test_agents_have_the_colors_of_the_pictures() -> None:
 
 
 def test_the_style_has_the_colors_of_the_pictures() -> None:
-    style = resources.files("log2sim.view").joinpath("style.css").read_text(encoding="utf-8")
-    light = dict(re.findall(r"--([\w-]+): (#\w{6})", style[: style.index("@media")]))
+    css = resources.files("log2sim.visualization.page").joinpath("style.css").read_text(encoding="utf-8")
+    light = dict(re.findall(r"--([\w-]+): (#\w{6})", css[: css.index("@media")]))
     wanted = {
-        "paper": look.PAPER, "ink": look.INK, "muted": look.MUTED, "grid": look.GRID, "frame": look.FRAME,
-        "parked-face": look.PARKED_FACE, "parked-edge": look.PARKED_EDGE,
+        "paper": style.PAPER, "ink": style.INK, "muted": style.MUTED, "grid": style.GRID, "frame": style.FRAME,
+        "parked-face": style.PARKED_FACE, "parked-edge": style.PARKED_EDGE,
     }  # fmt: skip
     assert {k: light[k] for k in wanted} == wanted
 
@@ -153,7 +152,7 @@ def test_a_page_that_cannot_be_is_refused(tmp_path: Path, monkeypatch: pytest.Mo
     ran = run("view", TRUTH, "--out", tmp_path / "v.png")
     assert ran.code == 2
     assert "must end in .html" in ran.line
-    monkeypatch.setattr("log2sim.view.pack.MOST_ROWS", 100)
+    monkeypatch.setattr("log2sim.visualization.page.pack.MOST_ROWS", 100)
     with pytest.raises(ConfigError, match="1260 waypoints are more than the 100"):
         write_page(Scenario.load(TRUTH), tmp_path / "v.html")
     assert names(tmp_path) == []
@@ -280,13 +279,13 @@ def test_boxes_have_their_size_color_and_heading(browser: Browser, tmp_path: Pat
         return pixel(browser, center + scale * np.array([ahead * c - left * s, -ahead * s - left * c]))
 
     inside = [at(a, b) for a in (-1.85, 1.85) for b in (-0.85, 0.85)]
-    assert inside == [rgb(look.INK)] * 4
+    assert inside == [rgb(style.INK)] * 4
     outside = [at(2.2, 0.0), at(-2.2, 0.0), at(0.0, 1.2), at(0.0, -1.2), at(2.0, 1.4)]
-    assert rgb(look.INK) not in outside
+    assert rgb(style.INK) not in outside
     assert min(at(1.2, 0.0)) > 200 > max(at(-1.2, 0.0))  # the nose is at the front
     corners = box_corners_bev([[3.0, -2.0]], 4.0, 2.0, 0.6)[0] - [3.0, -2.0]
     just_in = center + 0.93 * scale * corners[0] * [1, -1]
-    assert pixel(browser, just_in) == rgb(look.INK)
+    assert pixel(browser, just_in) == rgb(style.INK)
 
 
 def test_what_nobody_observed_is_pale(browser: Browser, tmp_path: Path) -> None:
@@ -295,7 +294,7 @@ def test_what_nobody_observed_is_pale(browser: Browser, tmp_path: Path) -> None:
     )
     opened(browser, page, "#t=0.5&agent=ego")
     behind = np.array([-1.2, 0.6]) * browser.run("return log2sim.pixelsPerMeter")
-    assert pixel(browser, place_of(browser, "ego") + behind) == rgb(look.INK)
+    assert pixel(browser, place_of(browser, "ego") + behind) == rgb(style.INK)
     assert text_of(browser, "agent-now").endswith("yes")
     browser.run("log2sim.time = 1.5")
     assert min(pixel(browser, place_of(browser, "ego") + behind)) > 150
@@ -451,11 +450,11 @@ def test_layers_come_and_go(browser: Browser, sample: Path) -> None:
     opened(browser, sample, "#t=2")
     behind = np.array([-1.5, 0.0]) * browser.run("return log2sim.pixelsPerMeter")
     place = place_of(browser, "ego") + behind
-    assert pixel(browser, place) == rgb(look.INK)
+    assert pixel(browser, place) == rgb(style.INK)
     browser.press("d", "t", "r")
     assert pixel(browser, place) == (251, 252, 253)
     browser.press("d")
-    assert pixel(browser, place) == rgb(look.INK)
+    assert pixel(browser, place) == rgb(style.INK)
 
 
 def test_a_layer_that_is_not_there_has_no_button(browser: Browser, tmp_path: Path) -> None:

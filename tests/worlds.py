@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array, apply, box_corners, inverse, rotation_from_rpy, transform
-from log2sim.scenario import Scenario
-from log2sim.synth.assemble import synthesize
+from log2sim.datatypes import Log, Scenario
+from log2sim.geometry import Array, Camera, Mount, apply, box_corners, inverse, rotation_from_rpy, transform
 from log2sim.synth.scene import Scene, scene_from_table
-from log2sim.types import Camera, Log, Mount
+from log2sim.synth.synthesis import synthesize
 
 CAR = {"id": "car", "category": "car", "size_m": [4.4, 1.8, 1.5], "waypoints": [[16.0, 2.0, 4.0], [40.0, 2.0, 4.0]]}
 PARKED = {"id": "parked", "category": "car", "size_m": [4.2, 1.8, 1.5], "pose": [14.0, -4.0, 10.0]}

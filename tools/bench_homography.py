@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from bench_table import markdown, optional, timed
 
-from log2sim.topdown import estimate_homography
+from log2sim.perception.homography.estimate import estimate_homography
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from bench_table import markdown, optional, timed
 
-from log2sim.boxfit import middle
-from log2sim.measure.seen import View, in_boxes, see
-from log2sim.types import Camera
+from log2sim.geometry import Camera
+from log2sim.perception.box_fitting import middle
+from log2sim.perception.lidar.projection import View, in_boxes, see
 
 Array = np.ndarray[Any, Any]
 

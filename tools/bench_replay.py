@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from bench_table import markdown
 
+from log2sim.datatypes import Agent, Scenario, Waypoints
 from log2sim.geometry import wrap_angle
-from log2sim.replay import replay
-from log2sim.scenario import Agent, Scenario, Waypoints
+from log2sim.simulation.runner import replay
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
 STEPS_S = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from bench_table import markdown, optional
 
-from log2sim.smooth import smooth_track
+from log2sim.agents.smooth.smoother import smooth_track
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 

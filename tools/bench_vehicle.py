@@ -33,10 +33,10 @@ from vehicle_maneuvers import (
     start_of,
 )
 
-from log2sim.files import write_json
+from log2sim.documents import write_json
 from log2sim.geometry import Array, cos_sin
-from log2sim.replay.vehicles.single_track import Chassis, Motion, Slips, linear_course, linear_slips
-from log2sim.replay.vehicles.vehicle import roll
+from log2sim.simulation.vehicles.single_track import Chassis, Motion, Slips, linear_course, linear_slips
+from log2sim.simulation.vehicles.vehicle import roll
 
 STORE_S = 0.1
 STEPS_S = (0.001, 0.005, 0.01, 0.02, 0.05)

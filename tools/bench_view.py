@@ -19,10 +19,9 @@ from typing import Any
 import numpy as np
 from bench_table import markdown
 
-from log2sim.replay import replay
-from log2sim.scenario import Agent, Scenario, Waypoints
-from log2sim.types import TYPICAL_SIZE_M
-from log2sim.view import write_page
+from log2sim.datatypes import TYPICAL_SIZE_M, Agent, Scenario, Waypoints
+from log2sim.simulation.runner import replay
+from log2sim.visualization.page.writer import write_page
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from browser import CHROMIUM, DRIVER, Browser, browsing

@@ -11,10 +11,10 @@ import numpy as np
 from kitti_boxes import Boxes
 from numpy.typing import NDArray
 
+from log2sim.datatypes import Measurements
 from log2sim.errors import LogError
 from log2sim.geometry import Array, apply, box_corners, inverse, rotation_from_quaternion, transform
 from log2sim.logs import kitti
-from log2sim.types import Measurements
 
 PERIOD_NS = 100_000_000
 CATEGORY_OF = {"Car": "car", "Pedestrian": "pedestrian", "Cyclist": "cyclist"}

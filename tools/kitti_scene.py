@@ -9,8 +9,8 @@ import numpy as np
 from kitti_boxes import Boxes, overlap_3d
 from numpy.typing import NDArray
 
+from log2sim.evaluation.metrics.pairs import assign
 from log2sim.geometry import Array
-from log2sim.metrics.pairs import assign
 
 NEIGHBORS = {"Car": "Van", "Pedestrian": "Person_sitting"}
 MAX_OCCLUSION, MAX_TRUNCATION, MIN_HEIGHT_PX = 2, 0, 25.0

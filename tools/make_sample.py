@@ -6,7 +6,8 @@ import sys
 import time
 from pathlib import Path
 
-from log2sim.synth import load_scene, write_synthetic
+from log2sim.synth.scene import load_scene
+from log2sim.synth.write import write_synthetic
 
 SAMPLES = Path(__file__).resolve().parent.parent / "samples"
 SEED = 1

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from log2sim.replay.vehicles.parameters import published_parameters
-from log2sim.replay.vehicles.single_track import Chassis
-from log2sim.replay.vehicles.vehicle import GRAVITY_MPS2
+from log2sim.simulation.vehicles.parameters import published_parameters
+from log2sim.simulation.vehicles.single_track import Chassis
+from log2sim.simulation.vehicles.vehicle import GRAVITY_MPS2
 
 VEHICLE = published_parameters(2, rear_axle_offset_m=1.4)
 CHASSIS = Chassis.of(VEHICLE)

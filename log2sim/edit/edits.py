@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from log2sim.datatypes import Agent, Waypoints
 from log2sim.edit.motion import chords, faster, folds, later, to_the_left
 from log2sim.errors import ConfigError
-from log2sim.scenario import Agent, Waypoints
 
 Agents = Mapping[str, Agent]
 """Agents by id, in the order of the scenario."""

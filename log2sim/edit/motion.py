@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes import Agent, Waypoints
 from log2sim.geometry import Array
-from log2sim.scenario import Agent, Waypoints
 
 STANDING_MPS = 0.5  # slower than this a heading says little about a path
 

@@ -1,6 +1,6 @@
 """A scenario for CARLA: a script that replays it through CARLA's Python client, and its data.
 
-The script is `log2sim.replay.carla.player` as it stands there, so what is tested is what is written.
+The script is `log2sim.simulation.carla.player` as it stands there, so what is tested is what is written.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
+from log2sim.datatypes import Agent, Scenario
 from log2sim.errors import ConfigError
-from log2sim.export import Options
+from log2sim.export.exporters import Options
 from log2sim.export.placement import Placement
 from log2sim.export.roads.opendrive import add_road_file
-from log2sim.replay.carla import player
-from log2sim.replay.carla.data import carla_agents
-from log2sim.scenario import Agent, Scenario
+from log2sim.simulation.carla import player
+from log2sim.simulation.carla.data import carla_agents
 
 MODES = ("exact", "pid")
 

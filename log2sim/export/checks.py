@@ -8,9 +8,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes import Agent, Scenario
 from log2sim.errors import ScenarioError
 from log2sim.geometry import Array, bev_iou, box_corners_bev
-from log2sim.scenario import Agent, Scenario
 
 # Players that count in float32 place what is this far from the middle to 4 mm; beyond, it shakes.
 FARTHEST_M = 65_536.0

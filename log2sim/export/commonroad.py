@@ -13,15 +13,15 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from log2sim.datatypes import Agent, MapFrame, Scenario
 from log2sim.errors import ScenarioError
-from log2sim.export import Options, xml_text
+from log2sim.export import xml_text
 from log2sim.export.csv_table import write_table
+from log2sim.export.exporters import Options
 from log2sim.export.roads.lanes import Lane, lanes
 from log2sim.export.sampling import Motion, clock, motion, on_clock
 from log2sim.export.xml_text import element
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.scenario import Agent, Scenario
-from log2sim.types import MapFrame
 
 VERSION = "2020a"
 STEP_S = 0.1

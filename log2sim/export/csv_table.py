@@ -8,8 +8,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from log2sim.export import Options
-from log2sim.scenario import Scenario
+from log2sim.datatypes import Scenario
+from log2sim.export.exporters import Options
 
 COLUMNS = ("t_s", "x_m", "y_m", "z_m", "yaw_rad", "speed_mps", "observed", "sigma_xy_m")
 HEADER = ("id", "category", *COLUMNS, "length_m", "width_m", "height_m", "static", "rear_axle_offset_m", "confidence")

@@ -8,15 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from log2sim.datatypes import Agent, MapFrame, Scenario
 from log2sim.errors import MissingExtra
-from log2sim.export import Options
+from log2sim.export.exporters import Options
 from log2sim.export.sampling import Motion, file_name
 from log2sim.export.viewers.playback import steps_of
 from log2sim.geometry import NS_PER_S
-from log2sim.scenario import Agent, Scenario
-from log2sim.types import MapFrame
 
-SOURCE = "io.log2sim.scenario"
+SOURCE = "io.log2sim.datatypes.scenario"
 AXLE_OF_HEIGHT = 0.2  # height of the wheel hubs over the ground as a share of a vehicle's, since nobody measured it
 
 # Names in OSI's `MovingObject.VehicleClassification.Type`; it counts whoever rides with the vehicle.

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from log2sim.datatypes import MapFrame, Scenario
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array, whole_kilometers, wrap_angle
-from log2sim.scenario import Scenario
-from log2sim.types import MapFrame
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes import Agent
 from log2sim.errors import ScenarioError
 from log2sim.geometry import Array
-from log2sim.scenario import Agent
 
 DERIVATIVE_S = 0.05  # half the span over which rates are taken: half a step of most logs, so neighbors decide them
 ROUNDING_S = 1e-6

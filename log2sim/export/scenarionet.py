@@ -14,14 +14,13 @@ from typing import Any
 
 import numpy as np
 
+from log2sim.datatypes import GROUP_OF, VERSION, Agent, Scenario
 from log2sim.errors import ScenarioError
-from log2sim.export import Options
+from log2sim.export.exporters import Options
 from log2sim.export.placement import near_origin
 from log2sim.export.roads.lanes import lanes
 from log2sim.export.sampling import Motion, clock, file_name, on_clock
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.scenario import VERSION, Agent, Scenario
-from log2sim.types import GROUP_OF
 
 STEP_S = 0.1  # MetaDrive's step; it takes every file to have it
 DATASET = "log2sim"

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from log2sim.datatypes import MapFrame
 from log2sim.errors import LogError
 from log2sim.geometry import Array, rotation_from_rpy, transform
-from log2sim.types import MapFrame
 
 NORTH_STEP_DEG = 1e-5
 

@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes import EgoVehicle, Lidar, MapFrame, Stream, Sweep
 from log2sim.errors import LogError
-from log2sim.geometry import Array, inverse, rotation_from_rpy, transform
+from log2sim.geometry import Array, Camera, inverse, rotation_from_rpy, transform
 from log2sim.logs.images import read_image
 from log2sim.logs.sweeps import read_sweep, sweep_of
-from log2sim.types import Camera, EgoVehicle, Lidar, MapFrame, Stream, Sweep
 
 EARTH_RADIUS_M = 6378137.0
 ROTATION_TOLERANCE = 1e-3

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes import ImageLabels, ImageRegions, Labels
 from log2sim.errors import LogError
 from log2sim.geometry import Array, PoseTrack, apply, wrap_angle
 from log2sim.logs import kitti
-from log2sim.types import ImageLabels, ImageRegions, Labels
 
 CATEGORY_OF = {
     "Car": "car",

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes import Log, Stream
 from log2sim.errors import LogError
-from log2sim.geometry import Array, PoseTrack, transform
+from log2sim.geometry import Array, Camera, PoseTrack, transform
 from log2sim.logs import kitti
 from log2sim.logs.kitti_labels import CAMERA as LABELED_CAMERA
 from log2sim.logs.kitti_labels import DriveLabels, read_labels
 from log2sim.logs.table import in_order
-from log2sim.types import Camera, Log, Stream
 
 CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt")
 REFERENCE_CAMERAS = ("image_02", "image_00", "image_03", "image_01")

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes import Log, Stream
 from log2sim.errors import LogError
 from log2sim.geometry import PoseTrack, transform
 from log2sim.logs import kitti
 from log2sim.logs.images import first_image_size
 from log2sim.logs.kitti_labels import DriveLabels, read_labels
-from log2sim.types import Log, Stream
 
 PERIOD_NS = 100_000_000
 CAMERA_NUMBERS = (2, 3)

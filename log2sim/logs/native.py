@@ -12,22 +12,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, Sweep
+from log2sim.documents import check, inside, read_json
 from log2sim.errors import LogError
-from log2sim.files import inside, read_json
-from log2sim.geometry import Array, PoseTrack, rotation_from_quaternion, transform
+from log2sim.geometry import Array, Camera, PoseTrack, rotation_from_quaternion, transform
 from log2sim.logs.images import read_image
-from log2sim.logs.native_labels import (
-    BOX_2D_COLUMNS,
-    BOX_3D_COLUMNS,
-    REGION_COLUMNS,
-    boxes_2d,
-    boxes_3d,
-    regions_2d,
-)
+from log2sim.logs.native_labels import BOX_2D_COLUMNS, BOX_3D_COLUMNS, REGION_COLUMNS, boxes_2d, boxes_3d, regions_2d
 from log2sim.logs.sweeps import read_sweep
 from log2sim.logs.table import Table, in_order, read_table
-from log2sim.schema import check
-from log2sim.types import Camera, EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, Sweep
 
 MANIFEST = "log.json"
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes import CATEGORIES, ImageLabels, ImageRegions, Labels
 from log2sim.errors import LogError
 from log2sim.geometry import Array
 from log2sim.logs.table import Table
-from log2sim.types import CATEGORIES, ImageLabels, ImageRegions, Labels
 
 SIZE_FIELDS = ("length_m", "width_m", "height_m")
 BOX_3D_FIELDS = ("x_m", "y_m", "z_m", *SIZE_FIELDS, "yaw_rad")

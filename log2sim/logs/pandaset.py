@@ -18,16 +18,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes import EgoVehicle, Lidar, Log, MapFrame, Stream, Sweep
+from log2sim.documents import read_json
 from log2sim.errors import LogError, RecordError
-from log2sim.files import read_json
-from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse, rotation_from_quaternion, transform
+from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, inverse, rotation_from_quaternion, transform
 from log2sim.logs import kitti
 from log2sim.logs.images import first_image_size, read_image
 from log2sim.logs.pandaset_labels import read_labels
 from log2sim.logs.sweeps import sweep_of
 from log2sim.logs.table import in_order
 from log2sim.logs.unpickle import Columns, read_pickled_table
-from log2sim.types import Camera, EgoVehicle, Lidar, Log, MapFrame, Stream, Sweep
 
 ROAD_BELOW_POSE_M = 0.325
 # Takes points of the ego frame (x forward, y left, origin on the road) into the frame of the data set's poses.

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes import Labels
 from log2sim.errors import LogError
 from log2sim.geometry import Array, apply, inverse, wrap_angle
 from log2sim.logs.unpickle import Columns, read_pickled_table
-from log2sim.types import Labels
 
 PERIOD_NS = 100_000_000
 SHORTEST_STEP_NS = 20_000_000

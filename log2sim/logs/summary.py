@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.files import rounded
+from log2sim.datatypes import Log
+from log2sim.documents import rounded
 from log2sim.geometry import NS_PER_S
-from log2sim.types import Log
 
 GAP_FACTOR = 1.7
 

@@ -11,10 +11,10 @@ from typing import IO, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes import Sweep
 from log2sim.errors import RecordError
 from log2sim.logs.images import read_bytes
 from log2sim.logs.pcd import parse_pcd
-from log2sim.types import Sweep
 
 SWEEP_LIMIT_POINTS = 20_000_000
 SWEEP_LIMIT_BYTES = 1024 * 1024 * 1024

@@ -14,12 +14,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes import Lidar, Log, Stream, Sweep
+from log2sim.documents import check
 from log2sim.errors import ConfigError
-from log2sim.geometry import Array, quaternion_from_rotation, yaw_of
+from log2sim.geometry import Array, Camera, quaternion_from_rotation, yaw_of
 from log2sim.logs.native import GNSS_COLUMNS, INDEX_COLUMNS, MANIFEST, POSE_COLUMNS
 from log2sim.logs.native_labels import BOX_2D_COLUMNS, BOX_3D_COLUMNS, REGION_COLUMNS
-from log2sim.schema import check
-from log2sim.types import Camera, Lidar, Log, Stream, Sweep
 
 POINT_STEP_M = 1e-3
 # float32 resolves 1 mm up to about 8 km.

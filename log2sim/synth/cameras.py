@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import NS_PER_S, rotation_from_rpy, transform
+from log2sim.geometry import NS_PER_S, Camera, rotation_from_rpy, transform
 from log2sim.synth.scene import CameraSpec, Scene
-from log2sim.types import Camera
 
 
 def camera_of(spec: CameraSpec) -> Camera:

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes import Sweep
 from log2sim.geometry import NS_PER_S, Array, inverse, rotation_from_rpy, transform
 from log2sim.synth.actors import Actor, EgoMotion
 from log2sim.synth.scene import Building, LidarSpec, Scene
-from log2sim.types import Sweep
 
 GROUND, BUILDING = -1, -2
 PAIRS_AT_ONCE = 400_000

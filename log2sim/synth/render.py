@@ -9,13 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array, apply, inverse
+from log2sim.geometry import Array, Camera, apply, inverse
 from log2sim.synth.actors import Actor
 from log2sim.synth.backdrop import FACADE_M_PER_PX, GAMMA, GROUND_M_PER_PX, Backdrop, linear_table
 from log2sim.synth.light import HORIZON, SKY_LIGHT, SUN, SUN_LIGHT, ZENITH, reflected
 from log2sim.synth.paint import paint
 from log2sim.synth.raster import Fragments, rasterize
-from log2sim.types import Camera
 
 HAZE_M = 500.0
 NEAR_M = 0.2

@@ -15,8 +15,8 @@ from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from log2sim.datatypes import TYPICAL_SIZE_M
 from log2sim.errors import ConfigError
-from log2sim.types import TYPICAL_SIZE_M
 
 SCENE_LIMIT_BYTES = 4 * 1024 * 1024
 AGENT_CATEGORIES = ("car", "truck", "bus", "pedestrian", "cyclist")

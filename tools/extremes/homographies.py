@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from extremes.table import Outcome, case
-from log2sim.geometry import Array, inverse, transform
-from log2sim.topdown import Correspondences, HomographyFit, estimate_homography, fit_camera, locate
-from log2sim.topdown.homography import apply_homography
-from log2sim.types import Camera
+from log2sim.geometry import Array, Camera, inverse, transform
+from log2sim.perception.homography.correspondences import Correspondences, fit_camera, locate
+from log2sim.perception.homography.estimate import HomographyFit, apply_homography, estimate_homography
 
 METHODS = ("time-aware", "min-frame", "per-frame")
 PROBES_M = np.array([[x, y] for x in (8.0, 15.0, 30.0) for y in (-0.3 * x, 0.0, 0.3 * x)])

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from extremes.table import FAR_M, Outcome, case
+from log2sim.agents.smooth.smoother import SmoothedTrack, signed_speed, smooth_track
+from log2sim.datatypes import Measurements
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, rotation_from_rpy, transform, wrap_angle, yaw_of
-from log2sim.smooth import SmoothedTrack, signed_speed, smooth_track
-from log2sim.track import track
-from log2sim.types import Measurements
+from log2sim.tracking.tracker import track
 
 
 def smoothed_error_m(result: SmoothedTrack, truth: Array) -> float:

@@ -13,8 +13,8 @@ import numpy as np
 from extremes.small_log import LABELS, folder_of, known_and_finite, refused, refused_log, small_log, sound
 from extremes.table import Outcome, case
 from log2sim import open_log, reconstruct
+from log2sim.datatypes import Log
 from log2sim.errors import NothingToReconstruct
-from log2sim.types import Log
 
 
 @case("log: one camera", "all agents, no fusion")

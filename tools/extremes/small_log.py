@@ -13,12 +13,12 @@ import numpy as np
 
 from extremes.table import Outcome
 from log2sim import Config, Scenario, open_log, reconstruct
+from log2sim.datatypes import Log
 from log2sim.errors import Log2SimError, LogError
 from log2sim.logs.writer import write_log
 from log2sim.pipeline import Result
-from log2sim.synth.assemble import synthesize
 from log2sim.synth.scene import scene_from_table
-from log2sim.types import Log
+from log2sim.synth.synthesis import synthesize
 
 LABELS = Config.load(detect={"name": "labels"})
 Row = dict[str, str]

@@ -8,8 +8,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from log2sim.datatypes import Agent
 from log2sim.export.xml_text import element, escaped, number
-from log2sim.scenario import Agent
 
 PREFIX = "log2sim."
 """Begins the names of properties that only `log2sim import` reads."""

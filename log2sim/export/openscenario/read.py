@@ -11,13 +11,12 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from log2sim.datatypes import VERSION, MapFrame, Scenario
 from log2sim.errors import ConfigError, LogError, ScenarioError
 from log2sim.export.openscenario.entities import KINDS, PREFIX
 from log2sim.export.placement import Placement
 from log2sim.export.xml_text import read, require_number, unescaped
 from log2sim.geometry import Array, wrap_angle
-from log2sim.scenario import VERSION, Scenario
-from log2sim.types import MapFrame
 
 CATEGORY_OF = {kind.category: category for category, kind in reversed(list(KINDS.items()))} | {
     "van": "car", "semitrailer": "truck", "trailer": "other", "tram": "other", "train": "other",

@@ -13,10 +13,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from log2sim.datatypes import Agent
 from log2sim.export.placement import Placement
 from log2sim.export.xml_text import element, number
 from log2sim.geometry import Array
-from log2sim.scenario import Agent
 
 # Each agent that waits has a level of its own, so that none waits in another.
 HIDDEN_M, LEVEL_M = 500.0, 10.0

@@ -9,16 +9,16 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError
-from log2sim.export import Options
 from log2sim.export.checks import require_start_as_in_log
+from log2sim.export.exporters import Options
 from log2sim.export.openscenario.entities import add_entity
 from log2sim.export.openscenario.story import Revision, add_storyboard, parts_of, starts
 from log2sim.export.placement import Placement
 from log2sim.export.roads.opendrive import add_road_file
 from log2sim.export.xml_text import element, escaped, number, unique_names, write
 from log2sim.geometry import Array
-from log2sim.scenario import Scenario
 
 REVISIONS = {"1.0": Revision(0), "1.1": Revision(1), "1.2": Revision(2)}
 NEWEST = "1.2"

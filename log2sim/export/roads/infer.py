@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes import Agent, Scenario
 from log2sim.export.roads.reference_line import LEAST_STEP_M, TOLERANCE_M, ReferenceLine, fit, straight
 from log2sim.geometry import Array, wrap_angle
-from log2sim.scenario import Agent, Scenario
 
 LANE_M = 3.5
 # Free space beside the vehicle that a lane is made for, both sides together.

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from log2sim.datatypes import Scenario
 from log2sim.export.roads.infer import Road, roads_of
 from log2sim.geometry import Array
-from log2sim.scenario import Scenario
 
 SPACING_M = 1.0
 

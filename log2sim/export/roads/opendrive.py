@@ -8,13 +8,12 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from log2sim.datatypes import MapFrame, Scenario
 from log2sim.errors import ConfigError
 from log2sim.export.placement import Placement, near_origin, on_map
 from log2sim.export.roads.checks import require_roads
 from log2sim.export.roads.infer import Road, roads_of
 from log2sim.export.xml_text import element, escaped, number, read, require_number, write
-from log2sim.scenario import Scenario
-from log2sim.types import MapFrame
 
 FILE_NAME = "road.xodr"
 # Positions to 10 nm and angles to 1e-12 rad: pieces that follow each other leave no gap that a checker sees.

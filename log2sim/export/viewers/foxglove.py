@@ -30,9 +30,9 @@ from foxglove_schemas_protobuf.TextPrimitive_pb2 import TextPrimitive
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 
+from log2sim.datatypes import Agent
 from log2sim.export.viewers.playback import Cloud, Picture, Shown, Steps, Unreadable, rgb_of
 from log2sim.geometry import NS_PER_S, Array, quaternion_from_rotation, rotation_from_rpy, transform
-from log2sim.scenario import Agent
 
 MAP = "map"
 BOX_ALPHA, PATH_ALPHA = 0.6, 0.9

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from log2sim.datatypes import Scenario
 from log2sim.errors import MissingExtra, ScenarioError
-from log2sim.export import Options
+from log2sim.export.exporters import Options
 from log2sim.export.placement import near_origin
 from log2sim.export.sampling import file_name
 from log2sim.export.viewers.playback import shown_of, steps_of
-from log2sim.scenario import Scenario
 
 if TYPE_CHECKING:
     from log2sim.export.viewers.foxglove import Message

@@ -8,12 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.camera import box_lines
+from log2sim.datatypes import Agent, Log, Scenario, Sweep
 from log2sim.errors import ConfigError, RecordError
 from log2sim.export.sampling import Motion, clock, on_clock
-from log2sim.geometry import NS_PER_S, Array, apply, box_corners, inverse
-from log2sim.scenario import Agent, Scenario
-from log2sim.types import Camera, Log, Sweep
+from log2sim.geometry import NS_PER_S, Array, Camera, apply, box_corners, box_lines, inverse
 
 STEP_S = 0.1  # the least rate that readers of OSI traces take, and smooth enough to watch
 PICTURE_PX = 960  # wider pictures are made smaller, so that a minute of several cameras stays a file to hand around

@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes import Agent, Log, Scenario
 from log2sim.errors import MissingExtra
-from log2sim.export import Options
+from log2sim.export.exporters import Options
 from log2sim.export.placement import near_origin
 from log2sim.export.sampling import Motion, file_name
 from log2sim.export.viewers.playback import Cloud, Picture, Shown, Steps, Unreadable, rgb_of, shown_of, steps_of
 from log2sim.geometry import Array
-from log2sim.scenario import Agent, Scenario
-from log2sim.types import Log
 
 TIMELINE = "time"
 PATH_PX, OUTLINE_PX = 1.5, 1.0

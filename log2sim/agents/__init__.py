@@ -1,0 +1,1 @@
+"""Tracks become agents: size, trajectory, confirmation, and the ego."""

@@ -1,0 +1,288 @@
+"""Tracks become agents: standing ones get one pose, moving ones a smoothed trajectory, and both are followed by LiDAR."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.agents.confirmation import SAME_MOMENT_S, is_credible
+from log2sim.agents.lidar_tracking import Sighting, follow
+from log2sim.agents.size import Shape, heading_of_standing, is_standing, shape_moving, shape_standing
+from log2sim.agents.smooth.smoother import SmoothedTrack, signed_speed, smooth_track
+from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Agent, Obstacles, Track, Waypoints
+from log2sim.geometry import NS_PER_S, Array, wrap_angle
+from log2sim.perception import box_fitting
+from log2sim.stage_clock import Costs
+
+# How fast the acceleration changes of those whose own track is not asked: spectral density of the jerk, m2/s5.
+JERK_DENSITY = {"pedestrian": 2.0}
+CENTER_SIGMA_M = {"vehicle": 0.12, "two_wheeler": 0.1, "pedestrian": 0.08, "other": 0.15}
+# Rear axle to box center, as a share of the length: BMW 320i of CommonRoad's vehicle models, b - overhang, rounded.
+REAR_AXLE_SHARE = {"vehicle": 0.28, "two_wheeler": 0.3}
+STANDING_SPEED_MPS = 0.15
+RIDER_MPS, RIDER_S = 3.0, 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class Timeline:
+    """The ticks of a run: stamps `t_ns` (T,) and the scenario's start `t0_ns`."""
+
+    t_ns: NDArray[np.int64]
+    t0_ns: int
+
+    def seconds(self, t_ns: NDArray[np.int64]) -> Array:
+        return np.asarray((t_ns - self.t0_ns) / NS_PER_S, dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Built:
+    """An agent, how much evidence it has, and whether that is enough to believe in it."""
+
+    agent: Agent
+    evidence: float
+    credible: bool
+
+
+def build_agents(
+    tracks: Sequence[Track],
+    obstacles: Sequence[Obstacles | None],
+    timeline: Timeline,
+    flow: Array,
+    *,
+    smooth: bool,
+    costs: Costs | None = None,
+) -> list[Built]:
+    """Agents of all tracks, moving ones first, since the way they go tells which way parked cars point.
+
+    `flow` (K, 3) is x, y and heading of the ego's path; `costs` gets the pieces "moving" and "standing".
+    """
+    costs = costs or Costs()
+    standing = [is_standing(t) for t in tracks]
+    moving = [as_rider_if_fast(t) for t, s in zip(tracks, standing) if not s]
+    built = []
+    for track in moving:
+        with costs.piece("moving"):
+            built.append(_moving(track, obstacles, timeline, smooth=smooth))
+    built = [b for b in built if b.credible]
+    flows = [flow] + [_flow_of(b.agent) for b in built if GROUP_OF[b.agent.category] == "vehicle"]
+    everything = np.concatenate(flows)
+    for track in (t for t, s in zip(tracks, standing) if s):
+        with costs.piece("standing"):
+            built.append(_standing(track, obstacles, timeline, everything))
+    return [b for b in built if b.credible]
+
+
+def as_rider_if_fast(track: Track) -> Track:
+    """A person who goes faster than people run is a cyclist whose bicycle the detector missed."""
+    m = track.measurements
+    t = (m.t_ns - m.t_ns[0]) / NS_PER_S
+    if track.category != "pedestrian" or t[-1] < RIDER_S:
+        return track
+    later = np.searchsorted(t, t + RIDER_S)
+    start = np.flatnonzero(later < len(t))
+    later = later[start]
+    pace = np.hypot(*(m.center_m[later, :2] - m.center_m[start, :2]).T) / (t[later] - t[start])
+    speed = float(np.quantile(pace, 0.75)) if len(pace) else 0.0
+    return replace(track, category="cyclist") if speed > RIDER_MPS else track
+
+
+def _flow_of(agent: Agent) -> Array:
+    w = agent.waypoints
+    moving = np.abs(w.speed_mps) > 1.5
+    return np.stack([w.x_m[moving], w.y_m[moving], w.yaw_rad[moving]], axis=1)
+
+
+def _standing(track: Track, obstacles: Sequence[Obstacles | None], timeline: Timeline, flow: Array) -> Built:
+    shape = shape_standing(track)
+    group = GROUP_OF[track.category]
+    xy = shape.xy_m[0]
+    yaw = float(np.nan_to_num(shape.yaw_rad)) if shape.yaw_rad is not None else 0.0
+    yaw = heading_of_standing(yaw, xy, flow) if group in ("vehicle", "two_wheeler") else float(wrap_angle(yaw))
+    z = float(np.median(shape.z_m))
+    others = [k for k in range(len(timeline.t_ns)) if k not in set(track.tick.tolist())]
+    sightings = _look_for(
+        obstacles, others, timeline, xy, np.zeros(2), yaw, shape, z, int(timeline.t_ns[track.tick[0]])
+    )
+    seen = np.unique(np.r_[track.tick, np.array([s.tick for s in sightings], dtype=np.int64)])
+    life = np.array([seen[0], seen[-1]]) if seen[-1] > seen[0] else seen[:1]
+    n = len(life)
+    sigma = float(np.sqrt(np.trace(np.median(shape.covariance, axis=0)) / 2))
+    waypoints = Waypoints(
+        t_s=timeline.seconds(timeline.t_ns[life]),
+        x_m=np.full(n, xy[0]),
+        y_m=np.full(n, xy[1]),
+        z_m=np.full(n, z),
+        yaw_rad=np.full(n, yaw),
+        speed_mps=np.zeros(n),
+        observed=np.ones(n, dtype=bool),
+        sigma_xy_m=np.full(n, sigma),
+    )
+    share = len(seen) / (seen[-1] - seen[0] + 1)
+    quality = _quality(track, len(sightings)) | {"observed_share": round(float(share), 3), "flags": []}
+    return _agent(track, shape, waypoints, quality, static=True)
+
+
+def _look_for(
+    obstacles: Sequence[Obstacles | None],
+    ticks: Sequence[int],
+    timeline: Timeline,
+    xy: Array,
+    velocity: Array,
+    yaw: float,
+    shape: Shape,
+    z: float,
+    start_ns: int,
+) -> list[Sighting]:
+    if not ticks:
+        return []
+    return follow(
+        obstacles,
+        ticks,
+        timeline.t_ns,
+        start_ns=start_ns,
+        xy_m=xy,
+        velocity_mps=velocity,
+        yaw_rad=yaw,
+        size_m=shape.size_m,
+        bottom_m=z - shape.size_m[2] / 2,
+    )
+
+
+def _moving(track: Track, obstacles: Sequence[Obstacles | None], timeline: Timeline, *, smooth: bool) -> Built:
+    m, group = track.measurements, GROUP_OF[track.category]
+    sideways = group in ("pedestrian",)
+    t = timeline.seconds(m.t_ns)
+    order = np.flatnonzero(np.r_[True, np.diff(t) > SAME_MOMENT_S])
+    track, t = Track(track.category, track.tick[order], m.take(order)), t[order]
+    extra = CENTER_SIGMA_M[group] ** 2 * np.eye(2)
+    hint = _first_heading(track, t)
+    options: dict[str, Any] = {"jerk_density": JERK_DENSITY.get(group), "sideways": sideways, "yaw_hint_rad": hint}
+    xy, covariance = track.measurements.center_m[:, :2], track.measurements.covariance + extra
+    rough = smooth_track(t, xy, covariance=covariance, at_s=t, **options)
+    shape = shape_moving(track, _headings(rough, group))
+    for _ in range(2):
+        rough = smooth_track(t, shape.xy_m, covariance=shape.covariance + extra, at_s=t, **options)
+        shape = shape_moving(track, _headings(rough, group))
+    sightings = _follow_moving(track, rough, shape, obstacles, timeline)
+    t_all = np.concatenate([t, timeline.seconds(np.array([s.t_ns for s in sightings], dtype=np.int64))])
+    xy_all = np.concatenate([shape.xy_m, np.array([s.xy_m for s in sightings]).reshape(-1, 2)])
+    covariance_all = (
+        np.concatenate([shape.covariance, np.array([s.covariance for s in sightings]).reshape(-1, 2, 2)]) + extra
+    )
+    ticks_all = np.concatenate([track.tick, np.array([s.tick for s in sightings], dtype=np.int64)])
+    first = np.argsort(t_all, kind="stable")
+    first = first[np.r_[True, np.diff(t_all[first]) > SAME_MOMENT_S]]
+    life = np.arange(ticks_all.min(), ticks_all.max() + 1)
+    at = timeline.seconds(timeline.t_ns[life])
+    if not smooth:
+        options["jerk_density"] = 1e4
+    path = smooth_track(t_all[first], xy_all[first], covariance=covariance_all[first], at_s=at, **options)
+    waypoints = _waypoints(path, _headings(path, group), shape, t, at, np.isin(life, ticks_all))
+    quality = _quality(track, len(sightings)) | {
+        "observed_share": round(float(np.isin(life, ticks_all).mean()), 3),
+        "smoothing_residual_rms_m": round(float(np.sqrt(np.nanmean(path.residual_m[path.inlier] ** 2))), 4)
+        if path.inlier.any()
+        else None,
+        "flags": list(path.flags),
+    }
+    return _agent(track, shape, waypoints, quality, static=False)
+
+
+def _headings(path: SmoothedTrack, group: str) -> Array:
+    """Heading (T,) of the body: the course of its center, less the angle by which a turning center slips outward.
+
+    The center of a vehicle that turns about a point level with its rear axle moves at atan(offset x curvature) to it.
+    """
+    if group not in REAR_AXLE_SHARE:
+        return path.yaw_rad
+    offset = REAR_AXLE_SHARE[group] * TYPICAL_SIZE_M["car" if group == "vehicle" else "cyclist"][0]
+    return wrap_angle(path.yaw_rad - np.arcsin(np.clip(offset * path.curvature_1pm, -0.5, 0.5)))
+
+
+def _first_heading(track: Track, t: Array) -> float | None:
+    """Where a track points before it moves: along the boxes' own axes, on the side toward which it goes."""
+    xy = track.measurements.center_m[:, :2]
+    way = np.median(xy[-max(len(xy) // 4, 1) :], axis=0) - np.median(xy[: max(len(xy) // 4, 1)], axis=0)
+    yaws = track.measurements.yaw_rad[np.isfinite(track.measurements.yaw_rad)]
+    course = float(np.arctan2(way[1], way[0]))
+    if np.hypot(*way) < 0.3:
+        return box_fitting.align_to(float(yaws[0]), 0.0, np.pi) if len(yaws) else None
+    return course
+
+
+def _follow_moving(
+    track: Track, path: SmoothedTrack, shape: Shape, obstacles: Sequence[Obstacles | None], timeline: Timeline
+) -> list[Sighting]:
+    """Sightings before, after and in the gaps of a moving track."""
+    z = float(np.median(shape.z_m))
+    headings = _headings(path, GROUP_OF[track.category])
+    found: list[Sighting] = []
+    ticks, total = track.tick, len(timeline.t_ns)
+    spans = [(0, list(range(int(ticks[0]) - 1, -1, -1))), (len(ticks) - 1, list(range(int(ticks[-1]) + 1, total)))]
+    spans += [(k, list(range(a + 1, b))) for k, (a, b) in enumerate(pairwise(ticks.tolist())) if b > a + 1]
+    for k, wanted in spans:
+        found += _look_for(
+            obstacles, wanted, timeline, path.xy_m[k], path.velocity_mps[k], float(headings[k]), shape, z,
+            int(track.measurements.t_ns[k]),
+        )  # fmt: skip
+    return found
+
+
+def _waypoints(
+    path: SmoothedTrack, yaw: Array, shape: Shape, t: Array, at: Array, observed: NDArray[np.bool_]
+) -> Waypoints:
+    speed = signed_speed(path.velocity_mps, yaw)
+    return Waypoints(
+        t_s=at,
+        x_m=path.xy_m[:, 0],
+        y_m=path.xy_m[:, 1],
+        z_m=np.interp(at, t, _running_median(shape.z_m)),
+        yaw_rad=yaw,
+        speed_mps=np.where(np.abs(speed) < STANDING_SPEED_MPS, 0.0, speed),
+        observed=observed,
+        sigma_xy_m=np.sqrt(np.trace(path.covariance, axis1=1, axis2=2) / 2),
+    )
+
+
+def _running_median(values: Array, half: int = 4) -> Array:
+    padded = np.pad(values, half, mode="edge")
+    return np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1), axis=1)
+
+
+def _quality(track: Track, sightings: int) -> dict[str, Any]:
+    m = track.measurements
+    return {
+        "detections": len(m),
+        "lidar_only": sightings,
+        "without_lidar": int((m.source != "lidar").sum()),
+        "points_median": float(np.median(m.points)),
+        "score_max": round(float(m.score.max()), 4),
+    }
+
+
+def _agent(track: Track, shape: Shape, waypoints: Waypoints, quality: dict[str, Any], *, static: bool) -> Built:
+    m = track.measurements
+    size = tuple(float(v) for v in shape.size_m)
+    group = GROUP_OF[track.category]
+    # Independent looks would multiply; those of a video are not, so the confidence saturates with the strongest few.
+    strongest = np.sort(m.score)[-5:]
+    agent = Agent(
+        id="",
+        category=track.category,
+        size_m=(size[0], size[1], size[2]),
+        waypoints=waypoints,
+        static=static,
+        rear_axle_offset_m=round(REAR_AXLE_SHARE.get(group, 0.0) * size[0], 3),
+        confidence=float(np.clip(strongest.mean(), 0.0, 1.0)),
+        quality=quality,
+    )
+    return Built(
+        agent,
+        float(m.score.sum()),
+        is_credible(track, strongest, typical=shape.typical),
+    )

@@ -1,0 +1,94 @@
+"""Nobody is where somebody else is: doubles are dropped, and ways are cut where they enter the ego."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from log2sim.agents.build import Built
+from log2sim.datatypes import GROUP_OF, Agent, Waypoints
+from log2sim.geometry import Array, bev_iou, box_corners_bev, polygon_area
+
+# Two agents that share this much of their boxes for most of the time are one; people stand closer than boxes tell.
+SHARED_AREA = 0.25
+SAME_PERSON_M = 0.35
+SAMPLES = 12
+# Boxes that share less than this of the smaller one only touch.
+TOUCHING = 0.05
+
+
+def without_doubles(built: Sequence[Built], ego: Agent | None = None) -> list[Agent]:
+    """Agents that are in nobody else's place, the ego's included, those with more evidence first; named by category."""
+    taken = [ego] if ego is not None else []
+    kept: list[Agent] = []
+    for candidate in sorted(built, key=lambda b: -b.evidence):
+        if not any(_same_place(candidate.agent, other) for other in (*taken, *kept)):
+            kept.append(candidate.agent)
+    agents = sorted(kept, key=lambda a: (float(a.waypoints.t_s[0]), float(a.waypoints.x_m[0])))
+    count: dict[str, int] = {}
+    named = []
+    for agent in agents:
+        count[agent.category] = count.get(agent.category, 0) + 1
+        named.append(replace(agent, id=f"{agent.category}-{count[agent.category]}"))
+    return named
+
+
+def outside(agents: Sequence[Agent], ego: Agent | None) -> list[Agent]:
+    """Moving agents without the beginnings and ends of their ways that lie in the ego's box, where nobody can have been.
+
+    There an agent was followed by what little of it the sensors showed beside the ego.
+    """
+    return list(agents) if ego is None else [_outside(a, ego) for a in agents]
+
+
+def _outside(agent: Agent, ego: Agent) -> Agent:
+    if agent.static or not _ways_meet(agent, ego):
+        return agent
+    w = agent.waypoints
+    apart = shared_areas(agent, ego, w.t_s) <= TOUCHING
+    if apart.all() or not apart.any():
+        return agent
+    first, last = int(np.argmax(apart)), len(apart) - int(np.argmax(apart[::-1]))
+    columns = {k: v[first:last] for k, v in vars(w).items() if v is not None}
+    return replace(agent, waypoints=Waypoints(**columns))
+
+
+def _same_place(a: Agent, b: Agent) -> bool:
+    """Whether two agents overlap for most of the time that both are there."""
+    first, last = max(a.waypoints.t_s[0], b.waypoints.t_s[0]), min(a.waypoints.t_s[-1], b.waypoints.t_s[-1])
+    if last < first or not _ways_meet(a, b):
+        return False
+    t = np.linspace(first, last, SAMPLES)
+    if {GROUP_OF[a.category], GROUP_OF[b.category]} == {"pedestrian"}:
+        p, q = a.at(t), b.at(t)
+        return bool(np.median(np.hypot(p.x_m - q.x_m, p.y_m - q.y_m)) < SAME_PERSON_M)
+    return bool(np.median(shared_areas(a, b, t)) > SHARED_AREA)
+
+
+def _ways_meet(a: Agent, b: Agent) -> bool:
+    """Whether the rectangles around two agents' ways come as near as their boxes could ever touch; quick to tell."""
+    reach = (np.hypot(*a.size_m[:2]) + np.hypot(*b.size_m[:2])) / 2
+    return all(
+        p.min() - q.max() <= reach and q.min() - p.max() <= reach
+        for p, q in ((a.waypoints.x_m, b.waypoints.x_m), (a.waypoints.y_m, b.waypoints.y_m))
+    )
+
+
+def shared_areas(a: Agent, b: Agent, t_s: Array) -> Array:
+    """Area that two agents' boxes share at times (T,), as parts (T,) of the smaller one's; 0 where one is not there."""
+    p, q = a.at(t_s), b.at(t_s)
+    reach = (np.hypot(*a.size_m[:2]) + np.hypot(*b.size_m[:2])) / 2
+    near = p.valid & q.valid & (np.hypot(p.x_m - q.x_m, p.y_m - q.y_m) < reach)
+    boxes_a, boxes_b = (
+        box_corners_bev(np.stack([s.x_m, s.y_m], axis=1), x.size_m[0], x.size_m[1], s.yaw_rad)
+        for s, x in ((p, a), (q, b))
+    )
+    return np.array([_share_of_smaller(*boxes) if n else 0.0 for n, *boxes in zip(near, boxes_a, boxes_b)])
+
+
+def _share_of_smaller(a: Array, b: Array) -> float:
+    """Area that two rectangles (4, 2) share, as a part of the smaller one's."""
+    iou, area_a, area_b = bev_iou(a, b), polygon_area(a), polygon_area(b)
+    return iou / (1 + iou) * (area_a + area_b) / min(area_a, area_b)

@@ -1,0 +1,52 @@
+"""The last steps: the ego as an agent, few waypoints where few are enough, everything put into a scenario."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from log2sim.agents.build import STANDING_SPEED_MPS, Timeline
+from log2sim.agents.smooth.smoother import signed_speed, smooth_track
+from log2sim.datatypes import Agent, Log, Waypoints
+from log2sim.geometry import Array, yaw_of
+from log2sim.perception.sync import Schedule
+
+EGO_SIGMA_M = 0.02
+
+
+def ego_agent(log: Log, timeline: Timeline) -> Agent | None:
+    """The ego at every tick; None for a log without poses."""
+    if log.ego is None:
+        return None
+    map_T_ego, valid = log.ego.at(timeline.t_ns)
+    if not valid.any():
+        return None
+    vehicle = log.ego_vehicle
+    length, width, height = vehicle.size_m
+    center = map_T_ego[valid] @ np.array([vehicle.rear_axle_offset_m, 0.0, log.ground_z_ego_m + height / 2, 1.0])
+    t, yaw = timeline.seconds(timeline.t_ns[valid]), yaw_of(map_T_ego[valid])
+    path = smooth_track(t, center[:, :2], sigma_m=EGO_SIGMA_M)
+    speed = signed_speed(path.velocity_mps, yaw)
+    waypoints = Waypoints(
+        t_s=t,
+        x_m=path.xy_m[:, 0],
+        y_m=path.xy_m[:, 1],
+        z_m=center[:, 2],
+        yaw_rad=yaw,
+        speed_mps=np.where(np.abs(speed) < STANDING_SPEED_MPS, 0.0, speed),
+        observed=np.ones(len(t), dtype=bool),
+        sigma_xy_m=np.sqrt(np.trace(path.covariance, axis1=1, axis2=2) / 2),
+    )
+    moved = float(np.hypot(np.ptp(center[:, 0]), np.ptp(center[:, 1])))
+    return Agent(
+        "ego", "car", (length, width, height), waypoints, static=moved < 0.3, rear_axle_offset_m=vehicle.rear_axle_offset_m,
+        quality={"source": "ego poses of the log", "flags": list(path.flags)},
+    )  # fmt: skip
+
+
+def ego_flow(log: Log, schedule: Schedule) -> Array:
+    """Places and headings (K, 3) of the ego's path, which parked cars beside it are taken to follow."""
+    if log.ego is None:
+        return np.zeros((0, 3))
+    map_T_ego, valid = log.ego.at(schedule.t_ns)
+    poses = map_T_ego[valid]
+    return np.column_stack([poses[:, :2, 3], yaw_of(poses)])

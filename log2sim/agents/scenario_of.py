@@ -1,0 +1,79 @@
+"""The last steps: the ego as an agent, few waypoints where few are enough, everything put into a scenario."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from log2sim.agents.simplify import thin
+from log2sim.config import Config
+from log2sim.datatypes import Agent, Log, Scenario
+from log2sim.geometry import NS_PER_S
+from log2sim.perception.detect.detectors import Detector
+from log2sim.perception.homography_stage import CameraGround
+from log2sim.perception.sync import Schedule
+from log2sim.plan import Plan
+from log2sim.version import __version__
+
+
+def thinned(agents: Sequence[Agent]) -> list[Agent]:
+    """Agents with few waypoints where they move straight at constant speed; `quality` says how many were left out."""
+    out = []
+    for agent in agents:
+        few = thin(agent.waypoints)
+        left_out = len(agent.waypoints) - len(few)
+        quality = {**agent.quality, "waypoints_left_out": left_out} if left_out else agent.quality
+        out.append(replace(agent, waypoints=few, quality=quality) if left_out else agent)
+    return out
+
+
+def make_scenario(
+    log: Log,
+    schedule: Schedule,
+    config: Config,
+    plan: Plan,
+    detector: Detector,
+    homographies: Mapping[str, CameraGround],
+    ego: Agent | None,
+    agents: Sequence[Agent],
+) -> Scenario:
+    """Put everything into the record that `scenario.json` holds."""
+    return Scenario(
+        name=log.name,
+        t0_ns=int(schedule.t_ns[0]),
+        duration_s=float((schedule.t_ns[-1] - schedule.t_ns[0]) / NS_PER_S),
+        agents=(*((ego,) if ego is not None else ()), *agents),
+        map=log.map,
+        cameras=tuple(_camera_entry(name, homographies.get(name), name in plan.cameras) for name in log.cameras),
+        plan=tuple(plan.to_list()),
+        provenance={
+            "log": {"name": log.name, "format": log.format, "digest": log.digest},
+            "log2sim_version": __version__,
+            "detector": detector.name,
+            "config": config.to_dict(),
+            "seed": config.seed,
+            "history": ["reconstruct"],
+        },
+    )
+
+
+def _camera_entry(name: str, ground: CameraGround | None, used: bool) -> dict[str, Any]:
+    if ground is None or not ground.fit.ok:
+        return {"name": name, "used": used, "homography": None}
+    fit = ground.fit
+    finite_error = float(fit.error_m) if np.isfinite(fit.error_m) else None
+    return {
+        "name": name,
+        "used": used,
+        "homography": {
+            "ground_H_image": fit.ground_H_image.tolist(),
+            "source": ground.source,
+            "inliers": int(fit.inliers.sum()),
+            "correspondences": len(fit.inliers),
+            "error_m": finite_error,
+            "condition": float(fit.condition),
+        },
+    }

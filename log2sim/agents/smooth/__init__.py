@@ -1,0 +1,8 @@
+"""Fixed-interval smoothing of positions to trajectories that a vehicle could have driven."""
+
+from __future__ import annotations
+
+from log2sim.agents.smooth.heading import yaw_of_motion
+from log2sim.agents.smooth.smoother import SmoothedTrack, smooth_track
+
+__all__ = ["SmoothedTrack", "smooth_track", "yaw_of_motion"]

@@ -1,0 +1,97 @@
+"""Change a scenario."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, counted, say
+
+if TYPE_CHECKING:
+    from log2sim.datatypes import Scenario
+    from log2sim.edit.edits import Edit
+
+Changes = list[str] | None
+
+
+def edit(
+    scenario: ScenarioPath,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Scenario file to write.")],
+    shift: Annotated[
+        Changes, typer.Option(metavar="AGENT=SECONDS", help="Later by so much, earlier if negative.")
+    ] = None,
+    speed: Annotated[Changes, typer.Option(metavar="AGENT=FACTOR", help="So many times as fast.")] = None,
+    lateral: Annotated[
+        Changes, typer.Option(metavar="AGENT=METERS", help="To its left by so much, right if negative.")
+    ] = None,
+    remove: Annotated[Changes, typer.Option(metavar="AGENT", help="Without this agent.")] = None,
+    only: Annotated[Changes, typer.Option(metavar="A,B", help="Only these; the ego is 'ego'.")] = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit 6 when a check fails.")] = False,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Change who is in a scenario, when, how fast and where.
+
+    All options but --out may be given several times. They apply in this order, however they are written: only, remove,
+    speed, lateral, shift.
+    """
+    from log2sim.datatypes import Scenario
+    from log2sim.documents import check_targets
+    from log2sim.edit.apply import edit as run
+
+    check_targets(out, overwrite=overwrite)
+    loaded = Scenario.load(scenario)
+    # A shift comes last, so that no other edit misses what it cuts off before the start.
+    edits = [
+        *_choices(loaded, only, remove),
+        *_motions({"speed": speed, "lateral": lateral, "shift": shift}),
+    ]
+    result = run(loaded, edits)
+    result.scenario.save(out)
+    for warning in result.warnings:
+        say(f"warning: {warning}", quiet=quiet)
+    edited = result.scenario
+    say(
+        f"{out}: {counted(len(edits), 'edit')}, {counted(len(edited.agents), 'agent')} over {edited.duration_s:.1f} s, "
+        f"{counted(len(result.warnings), 'warning')}",
+        quiet=quiet,
+    )
+    if strict:
+        result.require_clean()
+
+
+def _choices(scenario: Scenario, only: Changes, remove: Changes) -> Iterator[Edit]:
+    """The edits that say who is there."""
+    from log2sim.edit.edits import Only, Remove
+
+    if only:
+        yield Only(tuple(ids_of(scenario, only)))
+    yield from map(Remove, ids_of(scenario, remove or ()))
+
+
+def ids_of(scenario: Scenario, entries: Iterable[str]) -> Iterator[str]:
+    """The ids that entries such as "A,B" name; an id of the scenario may itself hold a comma."""
+    known = {a.id for a in scenario.agents}
+    for entry in entries:
+        yield from [entry] if entry in known else (name.strip() for name in entry.split(","))
+
+
+def _motions(changes: dict[str, Changes]) -> Iterator[Edit]:
+    """The edits that say when, how fast and where."""
+    from log2sim.edit.edits import Lateral, Shift, Speed
+    from log2sim.errors import ConfigError
+
+    kinds = {"speed": Speed, "lateral": Lateral, "shift": Shift}
+    for option, entries in changes.items():
+        for entry in entries or ():
+            agent, _, value = entry.rpartition("=")  # an id may hold an equals sign, a number does not
+            try:
+                number = float(value)
+            except ValueError:
+                number = None
+            if not agent or number is None:
+                raise ConfigError(f"--{option} {entry}: expected an agent, '=' and a number, such as car-1=1.5")
+            yield kinds[option](agent, number)

@@ -1,0 +1,47 @@
+"""Write a scenario in the format of another simulator or viewer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, say
+
+MOST_NOTES = 5
+FORMATS = "openscenario, carla, csv, scenarionet, commonroad, osi, mcap, rerun"  # written out: --help imports nothing
+
+
+def export(
+    scenario: ScenarioPath,
+    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help=f"One of {FORMATS}.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write into.")],
+    revision: Annotated[str | None, typer.Option(help="openscenario: 1.0, 1.1 or 1.2.")] = None,
+    map: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="openscenario, carla: OpenDRIVE to use, not an own.")
+    ] = None,
+    mode: Annotated[str | None, typer.Option(help="carla: exact or pid.")] = None,
+    log: Annotated[
+        Path | None, typer.Option(metavar="LOG", help="mcap, rerun: log whose pictures and points go along.")
+    ] = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write a scenario in the format of a simulator or viewer."""
+    from log2sim.datatypes import Scenario
+    from log2sim.export.checks import remarks
+    from log2sim.export.exporters import Options
+    from log2sim.export.exporters import export as run
+    from log2sim.logs.opening import open_log
+
+    loaded = Scenario.load(scenario)
+    opened = open_log(log) if log is not None else None
+    files = run(loaded, to, out, Options(revision, map, mode, opened), overwrite=overwrite)
+    for file in files:
+        say(f"{file}: written", quiet=quiet)
+    notes = remarks(loaded)
+    for note in notes[:MOST_NOTES]:
+        say(f"note: {note}", quiet=quiet)
+    if len(notes) > MOST_NOTES:
+        say(f"note: and {len(notes) - MOST_NOTES} more such pairs", quiet=quiet)

@@ -1,0 +1,25 @@
+"""Turn a file of another simulator back into a scenario."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from log2sim.cli.options import Overwrite, Quiet, say
+
+
+def import_(
+    file: Annotated[Path, typer.Argument(metavar="FILE.xosc", help="An OpenSCENARIO file with trajectories.")],
+    out: Annotated[Path, typer.Option("--out", metavar="SCENARIO", help="Scenario file to write.")],
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Turn an OpenSCENARIO file back into a scenario."""
+    from log2sim.documents import check_targets
+    from log2sim.export.openscenario.read import load
+
+    check_targets(out, overwrite=overwrite)
+    load(file).save(out)
+    say(f"{out}: written", quiet=quiet)

@@ -1,0 +1,36 @@
+"""Options that several commands share, and output for the user."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+
+LogPath = Annotated[Path, typer.Argument(metavar="LOG", help="Folder of a log.")]
+ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A scenario.json.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
+Format = Annotated[str, typer.Option(help="Log format: auto, log2sim, kitti, kitti-tracking, pandaset.")]
+Sequence = Annotated[str | None, typer.Option(help="Which sequence, when the folder holds several.")]
+Settings = Annotated[list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change a setting.")]
+ConfigFile = Annotated[Path | None, typer.Option("--config", metavar="FILE.toml", help="Settings file.")]
+
+
+def fail(message: str, code: int) -> NoReturn:
+    """Print an error and leave."""
+    sys.stderr.write(f"log2sim: {message}\n")
+    sys.exit(code)
+
+
+def say(text: str, *, quiet: bool = False) -> None:
+    """Print a line for the user."""
+    if not quiet:
+        sys.stdout.write(text + "\n")
+        sys.stdout.flush()
+
+
+def counted(count: int, noun: str) -> str:
+    """A number of things, in words."""
+    return f"{count} {noun}{'s' * (count != 1)}"

@@ -1,0 +1,41 @@
+"""Draw a scenario from above."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from log2sim.cli.options import Overwrite, ScenarioPath, Sequence
+
+if TYPE_CHECKING:
+    pass
+from log2sim.cli.truth import load_replay, load_truth
+
+
+def plot(
+    scenario: ScenarioPath,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help=".png .svg .pdf, or .gif .mp4.")],
+    replay: Annotated[Path | None, typer.Option(metavar="REPLAY", help="Replay to lay over.")] = None,
+    truth: Annotated[Path | None, typer.Option(metavar="TRUTH", help="Scenario file, or a log with labels.")] = None,
+    background: Annotated[Path | None, typer.Option(metavar="LOG", help="Log whose cameras paint the ground.")] = None,
+    sequence: Sequence = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Draw a scenario from above."""
+    from log2sim.datatypes import Scenario
+    from log2sim.documents import check_targets
+    from log2sim.visualization.plot.tracks import plot_tracks
+
+    check_targets(out, overwrite=overwrite)
+    loaded = Scenario.load(scenario)
+    replayed = load_replay(replay, loaded) if replay is not None else None
+    picture = None
+    if background is not None:
+        from log2sim.logs.opening import open_log
+        from log2sim.visualization.birdseye.of_log import mosaic_of
+
+        picture = mosaic_of(open_log(background, sequence=sequence), loaded)
+    known = load_truth(truth, loaded, sequence) if truth is not None else None
+    plot_tracks(loaded, out, replay=replayed, truth=known, background=picture, overwrite=overwrite)

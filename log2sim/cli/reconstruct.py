@@ -1,0 +1,77 @@
+"""Reconstruct the scenario of a log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from log2sim.cli.options import ConfigFile, Format, LogPath, Overwrite, Quiet, Sequence, Settings, say
+
+
+def reconstruct(
+    log: LogPath,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Scenario file to write.")],
+    format: Format = "auto",
+    sequence: Sequence = None,
+    detector: Annotated[
+        str | None, typer.Option(metavar="NAME|MODEL.onnx|labels", help="What finds the objects.")
+    ] = None,
+    cameras: Annotated[str | None, typer.Option(metavar="A,B", help="Use only these cameras.")] = None,
+    start: Annotated[float | None, typer.Option(help="First second.")] = None,
+    stop: Annotated[float | None, typer.Option(help="Last second.")] = None,
+    config: ConfigFile = None,
+    settings: Settings = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of everything random.")] = None,
+    report: Annotated[Path | None, typer.Option(metavar="FILE.json", help="Write the report.")] = None,
+    topdown: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Write the fused top-down picture.")] = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Reconstruct the scenario of a log."""
+    from log2sim.cli.progress import progress
+    from log2sim.config import Config
+    from log2sim.documents import check_targets, write_json
+    from log2sim.errors import ConfigError
+    from log2sim.logs.opening import open_log
+    from log2sim.pipeline import reconstruct as run
+
+    check_targets(out, report, topdown, overwrite=overwrite)
+    if cameras is not None and not cameras.replace(",", "").strip():
+        raise ConfigError("--cameras: is empty; name cameras separated by commas, or leave it out to use all")
+    changes: dict[str, Any] = {"cameras": cameras, "start_s": start, "stop_s": stop, "seed": seed}
+    if detector is not None:
+        changes["detect"] = {"name": detector}
+    chosen = Config.load(config, settings or (), **changes)
+    opened = open_log(log, format=format, sequence=sequence)
+    for note in opened.notes:
+        say(f"note: {note}", quiet=quiet)
+    with progress(quiet=quiet) as tell:
+        result = run(opened, chosen, picture=topdown is not None, progress=tell)
+    if topdown is not None:
+        from log2sim.visualization.birdseye.mosaic import write_picture
+        from log2sim.visualization.birdseye.of_log import mosaic_of
+
+        write_picture(mosaic_of(opened, result.scenario), topdown, overwrite=overwrite)
+    if report is not None:
+        write_json(report, result.report)
+    result.scenario.save(out)
+    for note in left_out(result.report):
+        say(f"note: {note}", quiet=quiet)
+    counts = result.report["agents"]
+    say(
+        f"{out}: {counts['total']} agents ({counts['static']} standing) over {result.scenario.duration_s:.1f} s, "
+        f"{result.report['ticks_per_second']:.1f} ticks/s",
+        quiet=quiet,
+    )
+
+
+def left_out(report: dict[str, Any]) -> list[str]:
+    """What of a log a run could not use, a line each."""
+    unread = report["unreadable"].items()
+    lost = report["without_pose"].items()
+    return [
+        *(f"{name}: {u['count']} records could not be read, first: {u['first']}" for name, u in unread),
+        *(f"{name}: {count} frames left out, since no ego pose is known at their stamps" for name, count in lost),
+    ]

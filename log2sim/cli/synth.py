@@ -1,0 +1,30 @@
+"""Make a synthetic log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from log2sim.cli.options import Overwrite, Quiet, say
+
+
+def synth(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="Scene description.")],
+    out: Annotated[Path, typer.Option("--out", metavar="LOG", help="Log folder to write.")],
+    seed: Annotated[int, typer.Option(help="Seed of all noise.")] = 0,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Make a synthetic log with exact truth."""
+    from log2sim.cli.progress import progress
+    from log2sim.synth.scene import load_scene
+    from log2sim.synth.write import write_synthetic
+
+    loaded = load_scene(scene)
+    with progress(quiet=quiet) as tell:
+        write_synthetic(
+            loaded, out, seed=seed, overwrite=overwrite, progress=lambda done, total: tell("synthesize", done, total)
+        )
+    say(f"{out}: written", quiet=quiet)

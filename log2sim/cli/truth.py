@@ -1,0 +1,48 @@
+"""Truth and replays that several commands load."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from log2sim.cli.options import say
+
+if TYPE_CHECKING:
+    from log2sim.datatypes import Log, Scenario
+    from log2sim.simulation.result import Replay
+
+
+def load_replay(path: Path, scenario: Scenario, *, quiet: bool = False) -> Replay:
+    """A replay to show with a scenario; says so when it is one of another."""
+    from log2sim.simulation.result import Replay as Replayed
+
+    loaded = Replayed.load(path)
+    known = {a.id for a in scenario.agents}
+    strangers = [a.id for a in loaded.agents if a.id not in known]
+    if loaded.scenario != scenario.name:
+        say(f"warning: {path} replays '{loaded.scenario}', not '{scenario.name}'; nothing need fit", quiet=quiet)
+    elif strangers:
+        count = f"{len(strangers)} of its {len(loaded.agents)} agents"
+        say(f"warning: {path} replays another version of '{scenario.name}': {count} are not in it", quiet=quiet)
+    return loaded
+
+
+def load_truth(path: Path, scenario: Scenario, sequence: str | None) -> Scenario:
+    """Truth for a scenario, of what the cameras saw that were used for it; see `truth_at`."""
+    return truth_at(path, [str(c["name"]) for c in scenario.cameras if c.get("used")], sequence)
+
+
+def truth_at(path: Path, used: Iterable[str], sequence: str | None) -> Scenario:
+    """Truth from a scenario file, or from a log: its own `truth.json`, else its labels seen by the cameras that were used."""
+    from log2sim.datatypes import Scenario as Truth
+
+    if not path.is_dir():
+        return Truth.load(path)
+    if (path / "truth.json").is_file():
+        return Truth.load(path / "truth.json")
+    from log2sim.evaluation.metrics.truth import truth_from_log
+    from log2sim.logs.opening import open_log
+
+    log: Log = open_log(path, sequence=sequence)
+    return truth_from_log(log, cameras=[name for name in used if name in log.cameras] or None)

@@ -1,0 +1,52 @@
+"""Check files and logs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from log2sim.cli.options import Format, Sequence, say
+
+
+def validate(
+    path: Annotated[Path, typer.Argument(metavar="FILE_OR_LOG", help="A scenario, a replay, or a log folder.")],
+    format: Format = "auto",
+    sequence: Sequence = None,
+) -> None:
+    """Check a file or every record of a log.
+
+    Exits with 3 and the problems, if there are any.
+    """
+    from log2sim.errors import LogError
+
+    if path.is_dir():
+        from log2sim.logs.validation import validate_log
+
+        problems = validate_log(path, format=format, sequence=sequence)
+        if problems:
+            raise LogError(f"{path}: {len(problems)} problem{'s' * (len(problems) > 1)}\n  " + "\n  ".join(problems))
+    else:
+        _validate_file(path)
+    say(f"{path}: valid")
+
+
+def _validate_file(path: Path) -> None:
+    from log2sim.datatypes import Scenario
+    from log2sim.documents import check, read_json
+    from log2sim.errors import ScenarioError
+    from log2sim.simulation.result import Replay
+
+    document = read_json(path, ScenarioError)
+    keys = document if isinstance(document, dict) else {}
+    if "replay_version" in keys:
+        Replay.load(path)
+    elif "metrics_version" in keys:
+        check(document, "metrics-1", ScenarioError)
+    elif "report_version" in keys:
+        check(document, "report-1", ScenarioError)
+    elif "bench_version" in keys:
+        check(document, "bench-1", ScenarioError)
+    else:
+        Scenario.load(path)

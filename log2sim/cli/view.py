@@ -1,0 +1,33 @@
+"""Write a page that plays a scenario in a browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, Sequence, counted, say
+
+
+def view(
+    scenario: ScenarioPath,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE.html", help="Page to write.")],
+    truth: Annotated[Path | None, typer.Option(metavar="TRUTH", help="Scenario file, or a log with labels.")] = None,
+    replay: Annotated[Path | None, typer.Option(metavar="REPLAY", help="Replay to show as a layer.")] = None,
+    sequence: Sequence = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Make a page that plays a scenario in a browser."""
+    from log2sim.cli.truth import load_replay, load_truth
+    from log2sim.datatypes import Scenario
+    from log2sim.documents import check_targets
+    from log2sim.visualization.page.writer import write_page
+
+    check_targets(out, overwrite=overwrite)
+    loaded = Scenario.load(scenario)
+    replayed = load_replay(replay, loaded, quiet=quiet) if replay is not None else None
+    known = load_truth(truth, loaded, sequence) if truth is not None else None
+    write_page(loaded, out, truth=known, replay=replayed, overwrite=overwrite)
+    say(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {counted(len(loaded.agents), 'agent')}", quiet=quiet)

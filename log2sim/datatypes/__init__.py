@@ -1,0 +1,50 @@
+"""What flows between the stages: logs, measurements, tracks and scenarios, as frozen records of columns."""
+
+from __future__ import annotations
+
+from log2sim.datatypes.categories import CATEGORIES, GROUP_OF, GROUPS, TYPICAL_SIZE_M
+from log2sim.datatypes.ignore_regions import LabelView, Unlabeled
+from log2sim.datatypes.log import (
+    EgoVehicle,
+    Frame,
+    ImageLabels,
+    ImageRegions,
+    Labels,
+    Lidar,
+    Log,
+    MapFrame,
+    Stream,
+    Sweep,
+)
+from log2sim.datatypes.measurements import Detections, Measurements
+from log2sim.datatypes.obstacles import Obstacles
+from log2sim.datatypes.scenario import EGO, VERSION, Agent, Scenario, Waypoints
+from log2sim.datatypes.tracks import Track
+
+__all__ = [
+    "CATEGORIES",
+    "EGO",
+    "GROUPS",
+    "GROUP_OF",
+    "TYPICAL_SIZE_M",
+    "VERSION",
+    "Agent",
+    "Detections",
+    "EgoVehicle",
+    "Frame",
+    "ImageLabels",
+    "ImageRegions",
+    "LabelView",
+    "Labels",
+    "Lidar",
+    "Log",
+    "MapFrame",
+    "Measurements",
+    "Obstacles",
+    "Scenario",
+    "Stream",
+    "Sweep",
+    "Track",
+    "Unlabeled",
+    "Waypoints",
+]

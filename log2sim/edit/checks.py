@@ -1,0 +1,95 @@
+"""What an edit brings about that the scenario did not have: collisions, and motion that nobody could drive."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence, Set
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from log2sim.datatypes import GROUP_OF, Agent, Scenario
+from log2sim.edit.motion import STANDING_MPS, chords
+from log2sim.geometry import Array
+from log2sim.simulation.reference import MAX_ACCEL_MPS2, MAX_CURVATURE_1PM, MAX_TWO_WHEELER_CURVATURE_1PM
+from log2sim.simulation.runner import replay
+
+# As a replay flags them; people turn on the spot.
+CURVATURE_LIMITS_1PM = {"vehicle": MAX_CURVATURE_1PM, "two_wheeler": MAX_TWO_WHEELER_CURVATURE_1PM}
+STEP_S = 0.05
+SAME_CONTACT_S = 0.5
+WORSE = 1 + 1e-6
+
+
+def warnings_of(before: Scenario, after: Scenario) -> tuple[str, ...]:
+    """What is wrong with the edited scenario and was not with its source, a line each, with agent, time and value."""
+    source = {a.id: a for a in before.agents}
+    changed = [a for a in after.agents if a is not source[a.id]]
+    infeasible = [line for a in changed for line in _infeasible(source[a.id], a)]
+    return (*_collisions(before, after, {a.id for a in changed}), *infeasible)
+
+
+def _collisions(before: Scenario, after: Scenario, changed: Set[str]) -> Iterator[str]:
+    """Overlaps of boxes where the source has none of the same two agents within `SAME_CONTACT_S`."""
+    if not changed:
+        return
+    known: dict[frozenset[str], list[tuple[float, float]]] = {}
+    for event in _overlaps(before, changed):
+        known.setdefault(frozenset(event["agents"]), []).append((event["t_s"], event["until_s"]))
+    for event in _overlaps(after, changed):
+        begin_s, until_s = event["t_s"], event["until_s"]
+        spans = known.get(frozenset(event["agents"]), [])
+        if not any(b - SAME_CONTACT_S <= until_s and begin_s <= u + SAME_CONTACT_S for b, u in spans):
+            yield (
+                f"agents '{event['agents'][0]}' and '{event['agents'][1]}' collide at {begin_s:.2f} s "
+                f"at {event['relative_speed_mps']:.1f} m/s, which the source does not have"
+            )
+
+
+def _overlaps(scenario: Scenario, changed: Set[str]) -> Sequence[dict[str, Any]]:
+    """Collisions as a replay of the waypoints themselves tells them: pairs of boxes of which one moves or was moved."""
+    agents = (replace(a, static=a.static and not (a.id in changed and len(a.waypoints) > 1)) for a in scenario.agents)
+    return replay(replace(scenario, agents=tuple(agents)), mode="exact", dt_s=STEP_S).metrics["collisions"]
+
+
+@dataclass(frozen=True)
+class Peak:
+    """The largest value of something, and when."""
+
+    value: float
+    t_s: float
+
+
+def _infeasible(before: Agent, after: Agent) -> Iterator[str]:
+    """Acceleration and curvature beyond their limits, and beyond what the source has itself."""
+    curvature_limit = CURVATURE_LIMITS_1PM.get(GROUP_OF[after.category], np.inf)
+    for what, peak_of, limit, unit in (
+        ("acceleration", peak_acceleration, MAX_ACCEL_MPS2, "m/s2"),
+        ("curvature", peak_curvature, curvature_limit, "1/m"),
+    ):
+        peak = peak_of(after)
+        if peak.value > max(limit, peak_of(before).value) * WORSE:
+            yield f"agent '{after.id}': {what} {peak.value:.3g} {unit} at {peak.t_s:.2f} s, limit {limit:g} {unit}"
+
+
+def peak_acceleration(agent: Agent) -> Peak:
+    """Largest acceleration in m/s2, along and across the heading together, between two waypoints."""
+    w = agent.waypoints
+    span, speed = np.diff(w.t_s), (w.speed_mps[1:] + w.speed_mps[:-1]) / 2
+    _, turn = chords(w)
+    return _peak(w.t_s, np.hypot(np.diff(w.speed_mps), speed * turn) / span)
+
+
+def peak_curvature(agent: Agent) -> Peak:
+    """Largest curvature in 1/m between two waypoints, 0 where the agent stands."""
+    w = agent.waypoints
+    chord, turn = chords(w)
+    moves = np.abs(chord) > STANDING_MPS * np.diff(w.t_s)
+    return _peak(w.t_s, np.divide(np.abs(turn), np.abs(chord), out=np.zeros(len(turn)), where=moves))
+
+
+def _peak(t_s: Array, values: Array) -> Peak:
+    if len(values) == 0:
+        return Peak(0.0, float(t_s[0]))
+    k = int(np.argmax(values >= values.max() / WORSE))  # the first of those that rounding alone tells apart
+    return Peak(float(values[k]), float(t_s[k] + t_s[k + 1]) / 2)

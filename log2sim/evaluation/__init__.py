@@ -1,0 +1,1 @@
+"""Comparison with truth: metrics of one scenario, and benchmarks over methods and settings."""

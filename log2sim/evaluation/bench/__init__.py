@@ -1,0 +1,9 @@
+"""Error against run time of methods and settings on one log."""
+
+from __future__ import annotations
+
+from log2sim.evaluation.bench.benchmark import Benchmark, bench
+from log2sim.evaluation.bench.panels import Panel
+from log2sim.evaluation.bench.scores import Scope
+
+__all__ = ["Benchmark", "Panel", "Scope", "bench"]

@@ -1,0 +1,142 @@
+"""Brings a scenario and its truth to the same instants, the same frame and the same columns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import GROUP_OF, Agent, Scenario
+from log2sim.evaluation.metrics.pairs import Mask
+from log2sim.geometry import NS_PER_S, Array
+
+MAX_TRUTH_GAP_S = 0.25
+THINNED_GAP_S = 1.05  # waypoints of straight constant motion are left out for up to a second
+TRUTH_MARGIN_S = 0.15
+"""How long beyond its first and last label a truth agent is carried on with its speed, never to be counted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """States of agents as columns: A agents, T ticks; NaN where an agent is not there.
+
+    `xy_m` (A, T, 2) and `z_m` (A, T) box centers in the scenario's map frame, `yaw_rad` and `speed_mps` (A, T), `size_m` (A, 3),
+    `range_m` (A, T) from the ego's center (infinite without an ego), `visible` (A, T) False where truth must not count.
+    """
+
+    ids: tuple[str, ...]
+    category: NDArray[np.str_]
+    group: NDArray[np.str_]
+    size_m: Array
+    xy_m: Array
+    z_m: Array
+    yaw_rad: Array
+    speed_mps: Array
+    range_m: Array
+    visible: Mask
+
+    @property
+    def there(self) -> Mask:
+        """(A, T) whether each agent exists at each tick."""
+        return np.isfinite(self.xy_m[..., 0])
+
+
+def evaluation_ticks_s(scenario: Scenario, truth: Scenario) -> Array:
+    """Instants (T,) to compare at, seconds of the scenario, inside what the truth covers.
+
+    Notes
+    -----
+    The ego's waypoints stand at the ticks. Where they were thinned out (on average more than 0.25 s apart) the
+    waypoints of all agents join, and where those were too, the truth's.
+    """
+    shift_s = (truth.t0_ns - scenario.t0_ns) / NS_PER_S
+    ego = scenario.ego
+    ours = [a.waypoints.t_s for a in scenario.agents]
+    theirs = [a.waypoints.t_s + shift_s for a in truth.agents]
+    if not theirs:
+        return np.zeros(0)
+    first, last = min(t[0] for t in theirs), max(t[-1] for t in theirs)
+    # A scenario in which nobody was found still misses what was there while it ran.
+    begin = min((t[0] for t in ours), default=0.0)
+    end = max((t[-1] for t in ours), default=scenario.duration_s)
+    for times in ([] if ego is None else [ego.waypoints.t_s], ours, ours + theirs):
+        if not times:
+            continue
+        # Agents of one tick may differ in the last digits of their stamps.
+        _, index = np.unique(np.round(np.concatenate(times), 4), return_index=True)
+        t = np.sort(np.concatenate(times)[index])
+        t = t[(t >= max(first, begin) - TRUTH_MARGIN_S) & (t <= min(last, end) + TRUTH_MARGIN_S)]
+        if len(t) > 1 and (t[-1] - t[0]) / (len(t) - 1) <= MAX_TRUTH_GAP_S:
+            break
+    return t
+
+
+def reconstructed_side(agents: tuple[Agent, ...], ticks_s: Array, ego_xy: Array | None) -> Side:
+    """Sample reconstructed agents at the ticks; `ego_xy` (T, 2) or None."""
+    sampled = [a.at(ticks_s) for a in agents]
+    xy = _stack([np.stack([s.x_m, s.y_m], -1) for s in sampled], (len(ticks_s), 2))
+    yaw = _stack([s.yaw_rad for s in sampled], (len(ticks_s),))
+    speed = _stack([s.speed_mps for s in sampled], (len(ticks_s),))
+    z = _stack([s.z_m for s in sampled], (len(ticks_s),))
+    return _side(agents, xy, z, yaw, speed, np.isfinite(yaw), ego_xy)
+
+
+def truth_side(agents: tuple[Agent, ...], ticks_s: Array, shift_m: Array, ego_xy: Array | None) -> Side:
+    """Sample truth agents at the ticks (seconds of the truth), moved by `shift_m`.
+
+    Notes
+    -----
+    `visible` is that of the nearer waypoint, and False in gaps longer than 0.25 s and outside the agent's life, where
+    its interpolated or continued box only keeps a reconstructed agent from being called false.
+    """
+    columns = [_sample_truth(a, ticks_s) for a in agents]
+    xy = _stack([c[0] for c in columns], (len(ticks_s), 2)) + shift_m[:2]
+    z = _stack([c[1] for c in columns], (len(ticks_s),)) + shift_m[2]
+    yaw = _stack([c[2] for c in columns], (len(ticks_s),))
+    speed = _stack([c[3] for c in columns], (len(ticks_s),))
+    visible = _stack([c[4].astype(np.float64) for c in columns], (len(ticks_s),)) > 0
+    return _side(agents, xy, z, yaw, speed, visible, ego_xy)
+
+
+def _sample_truth(agent: Agent, t: Array) -> tuple[Array, Array, Array, Array, Mask]:
+    w = agent.waypoints
+    s = agent.at(np.clip(t, w.t_s[0], w.t_s[-1]))
+    outside = t - np.clip(t, w.t_s[0], w.t_s[-1])
+    carried = s.speed_mps * outside
+    xy = np.stack([s.x_m + carried * np.cos(s.yaw_rad), s.y_m + carried * np.sin(s.yaw_rad)], -1)
+    there = np.abs(outside) <= TRUTH_MARGIN_S
+    nearest = np.abs(t[:, None] - w.t_s[None]).argmin(1)
+    seen = np.ones(len(t), dtype=bool) if w.visible is None else w.visible[nearest]
+    # A parked truth agent may be written as its first and last waypoint only, and one that moves straight as a few.
+    thinned = bool(agent.quality.get("waypoints_left_out"))
+    max_gap_s = np.inf if agent.static and len(w) == 2 else THINNED_GAP_S if thinned else MAX_TRUTH_GAP_S
+    labeled = agent.at(t, max_gap_s=float(max_gap_s)).valid
+    nan = np.where(there, 0.0, np.nan)
+    return xy + nan[:, None], s.z_m + nan, s.yaw_rad + nan, s.speed_mps + nan, seen & labeled
+
+
+def _side(
+    agents: tuple[Agent, ...], xy: Array, z: Array, yaw: Array, speed: Array, visible: Mask, ego_xy: Array | None
+) -> Side:
+    category = np.array([a.category for a in agents], dtype="<U16")
+    if ego_xy is None:
+        range_m = np.where(np.isfinite(yaw), np.inf, np.nan)
+    else:
+        range_m = np.hypot(xy[..., 0] - ego_xy[:, 0], xy[..., 1] - ego_xy[:, 1])
+    return Side(
+        ids=tuple(a.id for a in agents),
+        category=category,
+        group=np.array([GROUP_OF.get(c, "other") for c in category], dtype="<U16"),
+        size_m=np.array([a.size_m for a in agents], dtype=np.float64).reshape(-1, 3),
+        xy_m=xy,
+        z_m=z,
+        yaw_rad=yaw,
+        speed_mps=speed,
+        range_m=range_m,
+        visible=visible,
+    )
+
+
+def _stack(rows: list[Array], shape: tuple[int, ...]) -> Array:
+    return np.stack(rows) if rows else np.zeros((0, *shape))

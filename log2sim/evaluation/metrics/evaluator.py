@@ -1,0 +1,256 @@
+"""Compares a reconstructed scenario with the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from log2sim.datatypes import CATEGORIES, GROUPS, Scenario, Unlabeled
+from log2sim.errors import ConfigError, ScenarioError
+from log2sim.evaluation.metrics.align import Side, evaluation_ticks_s, reconstructed_side, truth_side
+from log2sim.evaluation.metrics.clear_mot import associate, mota, switches
+from log2sim.evaluation.metrics.hota import hota
+from log2sim.evaluation.metrics.label_coverage import unlabeled_ticks
+from log2sim.evaluation.metrics.pairs import Index, Mask, Pairs, gate_m, near_pairs
+from log2sim.evaluation.metrics.per_agent import agent_rows, false_rows, ignored_rows, rounded_tree
+from log2sim.evaluation.metrics.rules import counting_rules, matching_rules
+from log2sim.evaluation.metrics.state_errors import median, root_mean_square, state_errors, summarize
+from log2sim.geometry import NS_PER_S, Array
+from log2sim.registry import nearest
+
+VERSION = 1
+MIN_COUNTED_S = 1.0
+RANGES_M = ((0.0, 20.0), (20.0, 40.0), (40.0, 60.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """Both sides and who is whom: `match` (A, T), `counted`, `switched` (A, T), `false`, `ignored` (B, T) bool."""
+
+    truth: Side
+    other: Side
+    pairs: Pairs
+    match: Index
+    counted: Mask
+    switched: Mask
+    false: Mask
+    ignored: Mask
+
+
+def evaluate(
+    scenario: Scenario,
+    truth: Scenario,
+    *,
+    max_range_m: float | None = None,
+    categories: Sequence[str] | None = None,
+) -> dict[str, Any]:
+    """Measure a scenario against its truth.
+
+    Parameters
+    ----------
+    scenario, truth : Scenario
+        May have different start times and map offsets. Agents with the id "ego" are compared apart.
+    max_range_m : float, optional
+        Leaves out what is farther from the ego, on both sides alike.
+    categories : sequence of str, optional
+        Categories or groups ("vehicle", "two_wheeler") to look at, on both sides alike.
+
+    Returns
+    -------
+    dict
+        The document of `schemas/metrics-1.json`; None where a figure cannot be computed.
+
+    Raises
+    ------
+    ConfigError
+        For an unknown category, a range that is not positive, or a range without an ego to measure it from.
+    ScenarioError
+        When the two use different map projections or share no time.
+    """
+    selected = _selected(categories)
+    ticks_s = evaluation_ticks_s(scenario, truth)
+    if len(ticks_s) == 0 and scenario.agents and truth.agents:
+        raise ScenarioError(_apart(scenario, truth))
+    truth_ticks_s = ticks_s + (scenario.t0_ns - truth.t0_ns) / NS_PER_S
+    shift_m = truth.shift_to(scenario)
+    ego_xy = _ego_xy(scenario, truth, ticks_s, truth_ticks_s, shift_m)
+    _check_range(max_range_m, ego_xy)
+    true = truth_side(truth.others, truth_ticks_s, shift_m, ego_xy)
+    ours = reconstructed_side(scenario.others, ticks_s, ego_xy)
+    tick_s = float(np.median(np.diff(ticks_s))) if len(ticks_s) > 1 else 0.0
+    compared = _compare(true, ours, tick_s, max_range_m, selected)
+    compared = _without_unlabeled(compared, truth.unlabeled, truth_ticks_s, shift_m)
+    everywhere = np.ones_like(compared.counted), np.ones_like(compared.false)
+    result = {
+        "metrics_version": VERSION,
+        "scenario": scenario.name,
+        "truth": truth.name,
+        "max_range_m": max_range_m,
+        "categories": None if categories is None else sorted(selected),
+        "ticks": len(ticks_s),
+        "tick_s": tick_s,
+        **_figures(compared, *everywhere),
+        "by_range": None if ego_xy is None else _by_range(compared),
+        "by_category": _by_category(compared),
+        "ego": _ego_figures(scenario, truth, ticks_s, truth_ticks_s, shift_m),
+        "matching": matching_rules(),
+        "counting": counting_rules(truth, MIN_COUNTED_S),
+        "agents": agent_rows(true, ours, compared.match, compared.counted, compared.switched),
+        "false_agents": false_rows(ours, compared.false, _hit(compared, compared.counted)),
+        "ignored_agents": ignored_rows(ours, compared.ignored),
+    }
+    return rounded_tree(result)
+
+
+def _compare(truth: Side, other: Side, tick_s: float, max_range_m: float | None, selected: frozenset[str]) -> Compared:
+    same_group = truth.group[:, None] == other.group[None]
+    pairs = near_pairs(truth.xy_m, other.xy_m, gate_m(truth.size_m[:, 0]), same_group)
+    found = associate(pairs, len(truth.ids), len(other.ids), truth.range_m.shape[1])
+    counted = truth.there & truth.visible & _within(truth, max_range_m)
+    counted &= np.isin(truth.category, list(selected))[:, None]
+    # Stamps jitter, so a second is as many ticks as come nearest to it.
+    enough = counted.sum(1) * tick_s >= MIN_COUNTED_S - tick_s / 2 if tick_s else np.zeros(len(counted), dtype=bool)
+    counted &= enough[:, None]
+    false = other.there & ~found.used & ~found.absorbed & _within(other, max_range_m)
+    false &= np.isin(other.category, list(selected))[:, None]
+    switched = switches(found.match, counted)
+    return Compared(truth, other, pairs, found.match, counted, switched, false, np.zeros_like(false))
+
+
+def _without_unlabeled(c: Compared, unlabeled: Unlabeled | None, truth_ticks_s: Array, shift_m: Array) -> Compared:
+    """Move false ticks to the ignored ones where the labels could not have told."""
+    if unlabeled is None:
+        return c
+    center = np.concatenate([c.other.xy_m, c.other.z_m[..., None]], axis=-1) - shift_m
+    ignored = unlabeled_ticks(unlabeled, truth_ticks_s, center, c.other.size_m, c.other.yaw_rad, c.false)
+    return replace(c, false=c.false & ~ignored, ignored=ignored)
+
+
+def _within(side: Side, max_range_m: float | None) -> Mask:
+    return np.ones_like(side.there) if max_range_m is None else side.range_m <= max_range_m
+
+
+def _hit(c: Compared, truth_selected: Mask) -> Mask:
+    """(B, T) whether a reconstructed agent is matched with one of the selected truth ticks."""
+    i, t = np.nonzero(truth_selected & (c.match >= 0))
+    hit = np.zeros(c.false.shape, dtype=bool)
+    hit[c.match[i, t], t] = True
+    return hit
+
+
+def _figures(c: Compared, truth_selected: Mask, other_selected: Mask) -> dict[str, Any]:
+    """All figures over the selected ticks of the truth (A, T) and the selected false ticks (B, T)."""
+    counted, false = c.counted & truth_selected, c.false & other_selected
+    hit = _hit(c, counted)
+    truth_ticks, matched, wrong = int(counted.sum()), int(hit.sum()), int(false.sum())
+    agents, found = counted.any(1), (counted & (c.match >= 0)).sum(1) >= 0.5 * counted.sum(1)
+    ours, real = (hit | false).any(1), hit.sum(1) >= false.sum(1)
+    id_switches = int((c.switched & counted).sum())
+    tracking = hota(c.pairs, counted, hit | false)
+    return {
+        "recall": matched / truth_ticks if truth_ticks else None,
+        "precision": matched / (matched + wrong) if matched + wrong else None,
+        "recall_agents": float(found[agents].mean()) if agents.any() else None,
+        "precision_agents": float(real[ours].mean()) if ours.any() else None,
+        **summarize(state_errors(c.truth, c.other, c.match, counted)),
+        "id_switches": id_switches,
+        "mota": mota(truth_ticks, truth_ticks - matched, wrong, id_switches),
+        "hota": None if tracking is None else tracking.hota,
+        "det_a": None if tracking is None else tracking.det_a,
+        "ass_a": None if tracking is None else tracking.ass_a,
+        "counts": {
+            "truth_agents": int(agents.sum()),
+            "truth_agents_found": int((agents & found).sum()),
+            "truth_ticks": truth_ticks,
+            "matched_ticks": matched,
+            "missed_ticks": truth_ticks - matched,
+            "false_ticks": wrong,
+            "ignored_ticks": int((c.ignored & other_selected).sum()),
+            "reconstructed_agents": int(ours.sum()),
+            "false_agents": int((ours & ~real).sum()),
+        },
+    }
+
+
+def _by_range(c: Compared) -> dict[str, Any]:
+    return {
+        f"{low:g}-{high:g}": _figures(
+            c,
+            (c.truth.range_m >= low) & (c.truth.range_m < high),
+            (c.other.range_m >= low) & (c.other.range_m < high),
+        )
+        for low, high in RANGES_M
+    }
+
+
+def _by_category(c: Compared) -> dict[str, Any]:
+    """Matched ticks stand under the truth's category, false ones under their own."""
+    names = set(c.truth.category[c.counted.any(1)]) | set(c.other.category[c.false.any(1)])
+    return {
+        name: _figures(c, _rows(c.truth.category == name, c.counted), _rows(c.other.category == name, c.false))
+        for name in CATEGORIES
+        if name in names
+    }
+
+
+def _rows(which: Mask, like: Mask) -> Mask:
+    return np.broadcast_to(which[:, None], like.shape)
+
+
+def _selected(categories: Sequence[str] | None) -> frozenset[str]:
+    if categories is None:
+        return frozenset(CATEGORIES)
+    known = [*CATEGORIES, *(g for g in GROUPS if g not in CATEGORIES)]
+    for name in categories:
+        if name not in known:
+            raise ConfigError(f"unknown category '{name}'{nearest(name, known)}; known: {', '.join(known)}")
+    return frozenset(c for name in categories for c in GROUPS.get(name, (name,)))
+
+
+def _apart(scenario: Scenario, truth: Scenario) -> str:
+    spans = [
+        f"{min(s.t0_ns / NS_PER_S + float(a.waypoints.t_s[0]) for a in s.agents):.3f} to "
+        f"{max(s.t0_ns / NS_PER_S + float(a.waypoints.t_s[-1]) for a in s.agents):.3f} s"
+        for s in (scenario, truth)
+    ]
+    return f"the scenario covers {spans[0]}, the truth {spans[1]}: they share no time; are both of the same log?"
+
+
+def _check_range(max_range_m: float | None, ego_xy: Array | None) -> None:
+    if max_range_m is None:
+        return
+    if not max_range_m > 0:
+        raise ConfigError(f"range is {max_range_m:g} m; it must be greater than 0")
+    if ego_xy is None:
+        raise ConfigError("a range was asked for, but neither the scenario nor the truth has an ego to measure it from")
+
+
+def _ego_xy(scenario: Scenario, truth: Scenario, ticks_s: Array, truth_ticks_s: Array, shift_m: Array) -> Array | None:
+    """The ego's path (T, 2), the true one where it is known; None without an ego."""
+    xy: Array | None = None
+    if scenario.ego is not None:
+        xy = reconstructed_side((scenario.ego,), ticks_s, None).xy_m[0]
+    if truth.ego is not None:
+        true_xy = truth_side((truth.ego,), truth_ticks_s, shift_m, None).xy_m[0]
+        xy = true_xy if xy is None else np.where(np.isfinite(true_xy), true_xy, xy)
+    return xy
+
+
+def _ego_figures(
+    scenario: Scenario, truth: Scenario, ticks_s: Array, truth_ticks_s: Array, shift_m: Array
+) -> dict[str, Any] | None:
+    if truth.ego is None or scenario.ego is None:
+        return None
+    true = truth_side((truth.ego,), truth_ticks_s, shift_m, None)
+    ours = reconstructed_side((scenario.ego,), ticks_s, None)
+    both = true.there & true.visible & ours.there
+    errors = state_errors(true, ours, np.where(ours.there, 0, -1), both)
+    return {
+        "ticks": int(both.sum()),
+        "position_rmse_m": root_mean_square(errors.position_m),
+        "yaw_median_deg": median(np.degrees(errors.yaw_rad)),
+        "speed_rmse_mps": root_mean_square(errors.speed_mps),
+    }

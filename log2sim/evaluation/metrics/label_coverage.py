@@ -1,0 +1,77 @@
+"""Where the labels could not have told whether a reconstructed agent is there."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from log2sim.datatypes import LabelView, Unlabeled
+from log2sim.evaluation.metrics.pairs import Index, Mask
+from log2sim.evaluation.metrics.visibility import image_samples
+from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse
+
+MIN_REGION_SHARE = 0.5
+MAX_FRAME_LAG_S = 0.15
+"""A tick is compared with the nearest labeled frame of a camera, and with none that is farther off than this."""
+
+
+def unlabeled_ticks(
+    unlabeled: Unlabeled, t_s: Array, center_m: Array, size_m: Array, yaw_rad: Array, asked: Mask
+) -> Mask:
+    """Mark (B, T) the boxes that no labeled camera shows in a part of its image in which objects were labeled.
+
+    Parameters
+    ----------
+    unlabeled : Unlabeled
+    t_s : (T,)
+        Ticks, seconds of the truth.
+    center_m, size_m, yaw_rad : (B, T, 3), (B, 3), (B, T)
+        Boxes in the truth's map frame.
+    asked : (B, T) bool
+        Only these are looked at; all others stay False.
+
+    Notes
+    -----
+    A camera shows a box in a part without labels when at least half of what its image shows of the outline lies in the
+    union of the regions of the nearest frame. One that shows it elsewhere outweighs those.
+    """
+    labeled, hidden = np.zeros_like(asked), np.zeros_like(asked)
+    for view in unlabeled.views:
+        frame, near, map_T_cam = _frames_at(view, t_s)
+        for k in np.flatnonzero(asked.any(0) & near):
+            rows = np.flatnonzero(asked[:, k])
+            regions = view.region_px[view.region_frame == frame[k]]
+            boxes = center_m[rows, k], size_m[rows], yaw_rad[rows, k]
+            for row, uv in zip(rows, image_samples(view.camera, inverse(map_T_cam[k]), *boxes)):
+                if len(uv):
+                    share = _inside_any(uv, regions).mean()
+                    (hidden if share >= MIN_REGION_SHARE else labeled)[row, k] = True
+    unseen = asked & ~hidden & ~labeled if unlabeled.outside_views else np.zeros_like(asked)
+    return (hidden & ~labeled) | unseen
+
+
+def _frames_at(view: LabelView, t_s: Array) -> tuple[Index, Mask, Array]:
+    """Index (T,) of the frame nearest to each instant, whether it is near enough, and the camera's poses (T, 4, 4) then.
+
+    Notes
+    -----
+    Poses are interpolated: at 30 m/s a car is 1.5 m farther half a frame later.
+    """
+    if len(view.t_s) == 0:
+        return np.zeros(len(t_s), dtype=np.int64), np.zeros(len(t_s), dtype=bool), np.zeros((len(t_s), 4, 4))
+    frame = np.abs(view.t_s - t_s[:, None]).argmin(1)
+    near = np.abs(view.t_s[frame] - t_s) <= MAX_FRAME_LAG_S
+    at_frames = view.map_T_cam
+    track = PoseTrack(_to_ns(view.t_s), at_frames)
+    poses, known = track.at(_to_ns(np.clip(t_s, view.t_s[0], view.t_s[-1])))
+    return frame, near, np.where(known[:, None, None], poses, at_frames[frame])
+
+
+def _to_ns(t_s: Array) -> Index:
+    return np.round(t_s * NS_PER_S).astype(np.int64)
+
+
+def _inside_any(uv: Array, regions: Array) -> Mask:
+    """Whether pixels (S, 2) lie in some of the regions (R, 4)."""
+    u, v = uv[:, None, 0], uv[:, None, 1]
+    within = (u >= regions[:, 0]) & (u <= regions[:, 2]) & (v >= regions[:, 1]) & (v <= regions[:, 3])
+    return np.asarray(within.any(axis=1))

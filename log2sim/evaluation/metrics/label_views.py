@@ -1,0 +1,57 @@
+"""What a log says about where its labels are incomplete, as truth files carry it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from log2sim.datatypes import LabelView, Log, Unlabeled
+from log2sim.errors import LogError
+from log2sim.geometry import NS_PER_S, quaternion_from_rotation
+from log2sim.registry import nearest
+
+MAX_STAMP_LAG_NS = 50_000_000
+"""A region belongs to the frame nearest to its stamp, and to none that is farther off than this."""
+
+
+def unlabeled_of(log: Log, t0_ns: int) -> Unlabeled | None:
+    """Where the labels of a log say nothing; None when they are complete.
+
+    Parameters
+    ----------
+    log : Log
+        Its labels may name the cameras in whose view alone they are complete, and it may have ignored regions.
+    t0_ns : int
+        Start of the truth.
+
+    Raises
+    ------
+    LogError
+        For labels of a camera that the log does not have.
+    """
+    only = None if log.labels is None else log.labels.cameras
+    if only is None and not log.ignored_regions:
+        return None
+    names = list(log.ignored_regions) if only is None else list(only)
+    for name in names:
+        if name not in log.cameras:
+            raise LogError(
+                f"{log.name}: its labels are of camera '{name}'{nearest(name, list(log.cameras))}, which it does not "
+                f"have; there are: {', '.join(log.cameras)}"
+            )
+    return Unlabeled(tuple(_view(log, name, t0_ns) for name in names), outside_views=only is not None)
+
+
+def _view(log: Log, name: str, t0_ns: int) -> LabelView:
+    t_ns = np.unique(log.streams[name].t_ns) if name in log.streams else np.zeros(0, dtype=np.int64)
+    poses, known = log.map_T_sensor(name, t_ns)
+    t_ns, poses = t_ns[known], poses[known]
+    frame, box = np.zeros(0, dtype=np.int64), np.zeros((0, 4))
+    regions = log.ignored_regions.get(name)
+    if regions is not None and len(t_ns):
+        right = np.clip(np.searchsorted(t_ns, regions.t_ns), 0, len(t_ns) - 1)
+        left = np.maximum(right - 1, 0)
+        frame = np.where(np.abs(t_ns[left] - regions.t_ns) <= np.abs(t_ns[right] - regions.t_ns), left, right)
+        near = np.abs(t_ns[frame] - regions.t_ns) <= MAX_STAMP_LAG_NS
+        frame, box = frame[near], regions.box_px[near]
+    rotation = quaternion_from_rotation(poses[:, :3, :3])
+    return LabelView(log.cameras[name], (t_ns - t0_ns) / NS_PER_S, poses[:, :3, 3], rotation, frame, box)

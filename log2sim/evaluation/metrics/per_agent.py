@@ -1,0 +1,83 @@
+"""Tables agent by agent, for finding out what went wrong."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from log2sim.evaluation.metrics.align import Side
+from log2sim.evaluation.metrics.pairs import Index, Mask
+from log2sim.evaluation.metrics.state_errors import median, root_mean_square, state_errors
+
+DIGITS = 6
+
+
+def agent_rows(truth: Side, other: Side, match: Index, counted: Mask, switched: Mask) -> list[dict[str, Any]]:
+    """One row per counted truth agent: whom it was matched with and how far off that was. Sizes are signed errors."""
+    errors = state_errors(truth, other, match, counted)
+    rows = []
+    for i in np.flatnonzero(counted.any(1)):
+        mine = errors.take(errors.truth == i)
+        ids, ticks = np.unique(mine.other, return_counts=True)
+        size = mine.size_m.mean(axis=0) if len(mine.other) else np.full(3, np.nan)
+        headed = mine.yaw_rad[np.isfinite(mine.yaw_rad)]
+        rows.append(
+            {
+                "id": truth.ids[i],
+                "category": str(truth.category[i]),
+                "ticks": int(counted[i].sum()),
+                "matched": len(mine.other),
+                "matched_ids": {other.ids[j]: int(n) for j, n in zip(ids, ticks)},
+                "id_switches": int(switched[i].sum()),
+                "mean_range_m": float(truth.range_m[i, counted[i]].mean()),
+                "position_rmse_m": root_mean_square(mine.position_m),
+                "yaw_median_deg": median(np.degrees(headed)),
+                "speed_rmse_mps": root_mean_square(mine.speed_mps),
+                "length_error_m": float(size[0]),
+                "width_error_m": float(size[1]),
+                "height_error_m": float(size[2]),
+            }
+        )
+    return rows
+
+
+def false_rows(other: Side, false: Mask, hit: Mask) -> list[dict[str, Any]]:
+    """One row per reconstructed agent that is false at some tick."""
+    return [
+        {
+            "id": other.ids[j],
+            "category": str(other.category[j]),
+            "false_ticks": int(false[j].sum()),
+            "matched_ticks": int(hit[j].sum()),
+            "ticks": int(other.there[j].sum()),
+            "mean_range_m": float(other.range_m[j, false[j]].mean()),
+        }
+        for j in np.flatnonzero(false.any(1))
+    ]
+
+
+def ignored_rows(other: Side, ignored: Mask) -> list[dict[str, Any]]:
+    """One row per reconstructed agent that is ignored at some tick."""
+    return [
+        {
+            "id": other.ids[j],
+            "category": str(other.category[j]),
+            "ignored_ticks": int(ignored[j].sum()),
+            "ticks": int(other.there[j].sum()),
+            "mean_range_m": float(other.range_m[j, ignored[j]].mean()),
+        }
+        for j in np.flatnonzero(ignored.any(1))
+    ]
+
+
+def rounded_tree(value: Any) -> Any:
+    """A document with its floats rounded to micrometers and the like; what is not finite becomes None."""
+    if isinstance(value, dict):
+        return {k: rounded_tree(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [rounded_tree(v) for v in value]
+    if isinstance(value, float):
+        return round(value, DIGITS) if math.isfinite(value) else None
+    return value

@@ -1,0 +1,47 @@
+"""What was matched and counted how, in words, for the reader of a metrics file."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from log2sim.datatypes import GROUPS, Scenario
+from log2sim.evaluation.metrics.align import MAX_TRUTH_GAP_S
+from log2sim.evaluation.metrics.label_coverage import MAX_FRAME_LAG_S, MIN_REGION_SHARE
+from log2sim.evaluation.metrics.pairs import GATE_M, GATE_PER_LENGTH
+from log2sim.evaluation.metrics.state_errors import WALKING_MPS
+
+IGNORED_RULE = (
+    "an unmatched reconstructed agent is neither right nor false at the ticks at which the labels could not have told: "
+    f"every labeled camera that shows it (a frame within {MAX_FRAME_LAG_S:g} s) has at least {MIN_REGION_SHARE:g} of its "
+    "outline inside the image in regions left without labels, or no labeled camera shows any of it and only what these "
+    "cameras see was labeled"
+)
+
+
+def matching_rules() -> dict[str, Any]:
+    """How agents were matched."""
+    return {
+        "gate_m": GATE_M,
+        "gate_per_length": GATE_PER_LENGTH,
+        "groups": {name: list(members) for name, members in GROUPS.items()},
+        "rule": "one to one per tick by 2D distance of box centers within max(gate_m, gate_per_length x true length); "
+        "last match kept while within the gate, then most pairs with least total distance; "
+        "categories of one group match freely, across groups a match is neither found nor false",
+        "similarity": "HOTA: 1 - distance / gate, mean over thresholds 0.05 to 0.95",
+        "yaw": f"vehicles, two-wheelers and pedestrians of at least {WALKING_MPS:g} m/s; flipped: more than 90 degrees",
+        "speed": "signed along the heading; along the true heading where the box is flipped",
+        "size": "median over truth agents of the mean absolute error of length, width and height",
+    }
+
+
+def counting_rules(truth: Scenario, min_s: float) -> dict[str, Any]:
+    """What was counted; `min_s` is the least time a truth agent has to count for."""
+    return {
+        "min_s": min_s,
+        "max_truth_gap_s": MAX_TRUTH_GAP_S,
+        "rule": "a truth agent counts at the ticks at which it is visible, within range and selected, "
+        "when these make up at least min_s; a reconstructed agent is false at the ticks at which no labeled object, "
+        "visible or not, counted or not, matches it, but for the ignored ones",
+        "ignored": IGNORED_RULE if truth.unlabeled is not None else "none; the truth claims to be complete",
+        "visible": truth.provenance.get("visible", "as the truth file states; all where it states nothing"),
+    }

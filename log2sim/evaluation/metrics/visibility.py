@@ -1,0 +1,141 @@
+"""Which labeled boxes a camera and a LiDAR could see."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import NEAREST_DEPTH_M, Array, Camera, apply, box_corners, points_in_box, project
+
+EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
+CELL_M = 2.0
+SAMPLES_PER_SIDE = 32
+
+
+class PointGrid:
+    """Points (N, 3) sorted into columns of 2 x 2 m, so that those near a box are found without looking at all."""
+
+    def __init__(self, points: NDArray[np.floating]) -> None:
+        self._corner = points[:, :2].min(axis=0) if len(points) else np.zeros(2)
+        cell = ((points[:, :2] - self._corner) / CELL_M).astype(np.int64)
+        self._rows = int(cell[:, 1].max()) + 1 if len(points) else 1
+        key = cell[:, 0] * self._rows + cell[:, 1]
+        order = np.argsort(key, kind="stable")
+        self._key, self._points = key[order], points[order].astype(np.float64)
+
+    def count(self, center_m: Array, size_m: Array, yaw_rad: float) -> int:
+        """Number of points inside one upright box."""
+        reach = np.hypot(size_m[0], size_m[1]) / 2
+        low = np.floor((center_m[:2] - reach - self._corner) / CELL_M).astype(np.int64)
+        high = np.floor((center_m[:2] + reach - self._corner) / CELL_M).astype(np.int64)
+        # A key outside 0 .. rows - 1 would spill into the neighboring column of cells.
+        bottom, top = max(int(low[1]), 0), min(int(high[1]), self._rows - 1)
+        if top < bottom:
+            return 0
+        columns = np.arange(low[0], high[0] + 1) * self._rows
+        begin = np.searchsorted(self._key, columns + bottom)
+        end = np.searchsorted(self._key, columns + top, side="right")
+        inside = (points_in_box(self._points[b:e], center_m, size_m, yaw_rad) for b, e in zip(begin, end) if e > b)
+        return int(sum(np.count_nonzero(mask) for mask in inside))
+
+
+def image_shares(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Array, yaw_rad: Array) -> Array:
+    """Share (M,) of the outline of each box (M) in the map that falls inside the image.
+
+    Notes
+    -----
+    The outline is the convex hull of the part of the box in front of the camera, on the plane at depth 1, where edges stay
+    straight whatever the lens does. Its share is that of a grid of samples, good to 1 or 2 %: a clipped area would need
+    the border of the image on that plane, which a strongly bent lens model does not always have.
+    """
+    corners = box_corners(center_m, size_m, yaw_rad)
+    in_cam = apply(cam_T_map, corners.reshape(-1, 3))
+    _, in_image = project(camera, in_cam)
+    seen = in_image.reshape(-1, 8)
+    in_cam = in_cam.reshape(-1, 8, 3)
+    shares = np.where(seen.all(1), 1.0, 0.0)
+    for k in np.flatnonzero(~seen.all(1) & (in_cam[..., 2] > NEAREST_DEPTH_M).any(1)):
+        samples = _samples(convex_hull(_front_outline(in_cam[k])))
+        if len(samples):
+            _, inside = project(camera, np.column_stack([samples, np.ones(len(samples))]))
+            shares[k] = inside.mean()
+    return shares
+
+
+def image_samples(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Array, yaw_rad: Array) -> list[Array]:
+    """Pixels (S, 2) spread evenly over what the image shows of the outline of each box (M); none where it shows nothing.
+
+    Notes
+    -----
+    As in `image_shares`, but only samples near the view are drawn: a box beside the camera has an outline on the plane at
+    depth 1 so wide that a grid over all of it would step over the image.
+    """
+    corners = apply(cam_T_map, box_corners(center_m, size_m, yaw_rad).reshape(-1, 3)).reshape(-1, 8, 3)
+    low, high = _view(camera)
+    found = []
+    for box in corners:
+        outline = _front_outline(box) if np.any(box[:, 2] > NEAREST_DEPTH_M) else np.zeros((0, 2))
+        rays = _samples(convex_hull(outline), low, high)
+        uv, inside = project(camera, np.column_stack([rays, np.ones(len(rays))]))
+        found.append(uv[inside])
+    return found
+
+
+def _view(camera: Camera) -> tuple[Array, Array]:
+    """Corners (2,), (2,) of a part of the plane at depth 1 that holds the view: the view itself without a lens."""
+    size, focal = np.array([camera.width_px, camera.height_px]), np.diag(camera.K)[:2]
+    low, high = -camera.K[:2, 2] / focal, (size - camera.K[:2, 2]) / focal
+    # No lens that this plane can hold shows more than three times what its focal length says.
+    return (low, high) if camera.distortion_model == "none" else (3 * low, 3 * high)
+
+
+def _samples(outline: Array, lowest: Array | float = -np.inf, highest: Array | float = np.inf) -> Array:
+    """Points (S, 2) of a regular grid inside a convex outline (K, 2), counter-clockwise, and between two corners (2,)."""
+    if len(outline) < 3:
+        return np.zeros((0, 2))
+    low, high = np.maximum(outline.min(axis=0), lowest), np.minimum(outline.max(axis=0), highest)
+    if np.any(low >= high):
+        return np.zeros((0, 2))
+    steps = (np.arange(SAMPLES_PER_SIDE) + 0.5) / SAMPLES_PER_SIDE
+    x, y = np.meshgrid(*(low + steps[:, None] * (high - low)).T)
+    points = np.stack([x.ravel(), y.ravel()], -1)
+    edge = np.roll(outline, -1, axis=0) - outline
+    to = points[:, None] - outline[None]
+    return points[np.all(edge[:, 0] * to[..., 1] - edge[:, 1] * to[..., 0] >= 0, axis=1)]
+
+
+def _front_outline(corners_cam: Array) -> Array:
+    """Points (K, 2) at depth 1 of the corners (8, 3) in front, and of where edges pass the nearest depth."""
+    front = corners_cam[:, 2] > NEAREST_DEPTH_M
+    points = [corners_cam[front]]
+    for i, j in EDGES:
+        if front[i] != front[j]:
+            a, b = corners_cam[i], corners_cam[j]
+            points.append((a + (b - a) * (NEAREST_DEPTH_M - a[2]) / (b[2] - a[2]))[None])
+    stacked = np.concatenate(points)
+    return stacked[:, :2] / stacked[:, 2:]
+
+
+def convex_hull(points: Array) -> Array:
+    """Convex hull (K, 2), counter-clockwise, of points (N, 2).
+
+    Notes
+    -----
+    Andrew's monotone chain (1979). Points on one line give a polygon without area.
+    """
+    ordered = np.unique(points, axis=0).tolist()
+    if len(ordered) < 3:
+        return np.array(ordered)
+    chains = []
+    for run in (ordered, ordered[::-1]):
+        chain: list[list[float]] = []
+        for p in run:
+            while len(chain) >= 2 and _turn(chain[-2], chain[-1], p) <= 0:
+                chain.pop()
+            chain.append(p)
+        chains += chain[:-1]
+    return np.array(chains)
+
+
+def _turn(a: list[float], b: list[float], c: list[float]) -> float:
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])

@@ -1,0 +1,113 @@
+"""Scenarios in the formats of others. Each format is a plug-in that writes into an empty folder; see `Exporter`."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Protocol
+
+from log2sim import registry
+from log2sim.datatypes import Log, Scenario
+from log2sim.documents import refuse_below_file, refuse_existing
+from log2sim.errors import ConfigError
+from log2sim.export.checks import require_exportable
+
+__all__ = ["Exporter", "Options", "export", "formats"]
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a user may ask of an export; None leaves it to the format. A format names those that it understands.
+
+    `revision` of the format's standard; `map` a road network that is used instead of an own one; `mode` "exact" or "pid",
+    for scripts that move agents; `log` the recorded log, opened, for formats that also hold its pictures and points.
+    """
+
+    revision: str | None = None
+    map: Path | None = None
+    mode: str | None = None
+    log: Log | None = None
+
+
+class Exporter(Protocol):
+    """A format. `options` names the fields of `Options` that it understands, `loses` says what of a scenario it cannot hold."""
+
+    @property
+    def options(self) -> tuple[str, ...]: ...
+
+    @property
+    def loses(self) -> str: ...
+
+    def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
+        """Write files into an empty folder that exists.
+
+        Raises
+        ------
+        ConfigError
+            When the value of an option cannot be used.
+        MissingExtra
+            When what the format needs is not installed.
+        ScenarioError
+            When the format cannot hold the scenario at all; names the agent and the reason.
+        """
+        ...
+
+
+def formats() -> list[str]:
+    """Names of all formats, built-in ones first."""
+    return registry.names("export")
+
+
+def export(
+    scenario: Scenario, to: str, out: Path | str, options: Options | None = None, *, overwrite: bool = False
+) -> tuple[Path, ...]:
+    """Write a scenario in the format `to` into the folder `out`, all files or none; returns them in order of name.
+
+    Raises
+    ------
+    ConfigError
+        For an unknown format, an option that it does not understand, or files that exist and may not be replaced.
+    ScenarioError
+        When the scenario breaks what players of the formats rely on; see `log2sim.export.checks`.
+    """
+    exporter: Exporter = registry.load("export", to)
+    chosen = options or Options()
+    for field in fields(Options):
+        if getattr(chosen, field.name) is not None and field.name not in exporter.options:
+            known = ", ".join(f"--{name}" for name in exporter.options) or "none"
+            raise ConfigError(f"--{field.name}: format '{to}' has no such option; it has {known}")
+    require_exportable(scenario)
+    folder = Path(out)
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError(f"{folder}: is a file; give the name of a folder")
+    refuse_below_file(folder)
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        # Within a folder that exists, since it may be another file system than what is above it.
+        beside = folder if folder.is_dir() else folder.parent
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=beside))
+    except OSError as error:
+        raise ConfigError(f"{folder}: cannot be written: {error.strerror or error}") from error
+    try:
+        exporter.write(scenario, temporary, chosen)
+        return _move_into(temporary, folder, overwrite=overwrite)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _move_into(temporary: Path, folder: Path, *, overwrite: bool) -> tuple[Path, ...]:
+    """Move all files of a folder into another, after making sure that all may be."""
+    names = sorted(p.relative_to(temporary) for p in temporary.rglob("*") if p.is_file())
+    for name in names:
+        refuse_existing(folder / name, overwrite=overwrite)
+        if (folder / name).is_dir():
+            raise ConfigError(f"{folder / name}: is a folder, where a file would be written; choose another folder")
+    for name in names:
+        try:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (temporary / name).replace(folder / name)
+        except OSError as error:
+            raise ConfigError(f"{folder / name}: cannot be written: {error.strerror or error}") from error
+    return tuple(folder / name for name in names)

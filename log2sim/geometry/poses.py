@@ -1,0 +1,69 @@
+"""Rigid transforms, quaternions, poses over time and oriented boxes.
+
+Transforms are named `dst_T_src` (4x4, float64) so that inner frames cancel: `map_T_cam = map_T_ego @ ego_T_cam`.
+Frames: map (local ENU), ego (ISO 8855: x forward, y left, z up), cam (x right, y down, z forward). Quaternions are
+scalar-first, yaw is counter-clockwise from +x in [-pi, pi).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from log2sim.geometry.transforms import (
+    NS_PER_S,
+    Array,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    slerp,
+    transform,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseTrack:
+    """Poses of the ego over time: `t_ns` (P,) int64 strictly increasing, `map_T_ego` (P, 4, 4)."""
+
+    t_ns: NDArray[np.int64]
+    map_T_ego: Array
+    max_gap_s: float = 1.0
+    extrapolate_s: float = 0.2
+
+    def __post_init__(self) -> None:
+        if len(self.t_ns) == 0 or len(self.t_ns) != len(self.map_T_ego):
+            raise ValueError("a pose track needs one pose per stamp and at least one of them")
+        if np.any(np.diff(self.t_ns) <= 0):
+            raise ValueError("stamps of a pose track must be strictly increasing")
+
+    @cached_property
+    def _quaternions(self) -> Array:
+        return quaternion_from_rotation(self.map_T_ego[:, :3, :3])
+
+    def at(self, t_ns: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+        """Poses at stamps (N,) int64 ns, interpolated on SE(3).
+
+        Returns
+        -------
+        map_T_ego : (N, 4, 4) float64
+        valid : (N,) bool
+            False in gaps longer than `max_gap_s` and more than `extrapolate_s` outside the track.
+        """
+        t = np.atleast_1d(np.asarray(t_ns, dtype=np.int64))
+        if len(self.t_ns) == 1:
+            near = np.abs(t - self.t_ns[0]) <= round(self.extrapolate_s * NS_PER_S)
+            return np.repeat(self.map_T_ego, len(t), axis=0), near
+        i = np.clip(np.searchsorted(self.t_ns, t, side="right") - 1, 0, len(self.t_ns) - 2)
+        span = (self.t_ns[i + 1] - self.t_ns[i]).astype(np.float64)
+        fraction = (t - self.t_ns[i]).astype(np.float64) / span
+        q = self._quaternions
+        position = self.map_T_ego[:, :3, 3]
+        poses = transform(
+            rotation_from_quaternion(slerp(q[i], q[i + 1], fraction)),
+            position[i] + fraction[:, None] * (position[i + 1] - position[i]),
+        )
+        margin = round(self.extrapolate_s * NS_PER_S)
+        inside = (t >= self.t_ns[0] - margin) & (t <= self.t_ns[-1] + margin)
+        return poses, inside & ((span <= self.max_gap_s * NS_PER_S) | np.isin(t, self.t_ns))

@@ -1,0 +1,87 @@
+"""Reads every record of a log and says what is wrong with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from log2sim.datatypes import Log, Stream, Sweep
+from log2sim.errors import RecordError
+from log2sim.logs.native import READER
+from log2sim.logs.opening import open_log
+
+FAR_POINT_M = 1000.0
+
+
+def validate_log(
+    path: Path | str,
+    *,
+    format: str = "auto",
+    sequence: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[str]:
+    """Problems of a log, one line each; none when it is fine.
+
+    Parameters
+    ----------
+    path, format, sequence
+        As for `open_log`.
+    progress : callable, optional
+        Called as `progress(done, total)` after each record.
+
+    Raises
+    ------
+    LogError
+        When the log cannot be opened at all.
+    """
+    log = open_log(path, format=format, sequence=sequence)
+    # Notes on foreign formats tell what the format lacks; in our own they tell what is wrong with the stamps.
+    problems = list(log.notes) if log.format == READER.name else []
+    total = sum(len(s.t_ns) for s in log.streams.values())
+    done = 0
+    for stream in log.streams.values():
+        bad = 0
+        for i in range(len(stream.t_ns)):
+            problem = _record(log, stream, i)
+            bad += problem is not None and problem[0]
+            if problem is not None:
+                problems.append(problem[1])
+            done += 1
+            if progress is not None:
+                progress(done, total)
+        if bad == len(stream.t_ns):
+            problems.append(f"stream '{stream.name}': none of its {bad} records can be read")
+    return problems + _coverage(log)
+
+
+def _record(log: Log, stream: Stream, i: int) -> tuple[bool, str] | None:
+    """Whether a record cannot be read, and what is wrong with it."""
+    try:
+        record = stream.read(i)
+    except RecordError as error:
+        return True, f"stream '{stream.name}': {error}"
+    if not isinstance(record, Sweep):
+        return None
+    where = f"stream '{stream.name}', stamp {stream.t_ns[i]}"
+    if not len(record.xyz_m):
+        return False, f"{where}: the sweep has no points"
+    if record.frame == "lidar" and float(np.abs(record.xyz_m).max()) > FAR_POINT_M:
+        return False, f"{where}: a point is {np.abs(record.xyz_m).max():.0f} m from the LiDAR; are the units meters?"
+    if record.t_ns is not None and np.abs(record.t_ns - stream.t_ns[i]).max() > 1_000_000_000:
+        return False, f"{where}: the time of a point is more than 1 s off the stamp of its sweep"
+    return None
+
+
+def _coverage(log: Log) -> list[str]:
+    """Records of sensors on the ego at stamps at which its pose is not known."""
+    problems = []
+    for name, stream in log.streams.items():
+        known = log.map_T_sensor(name, stream.t_ns)[1]
+        if not known.all():
+            first = stream.t_ns[np.argmin(known)]
+            problems.append(
+                f"stream '{name}': no ego pose for {np.sum(~known)} of {len(known)} records, first at stamp {first}"
+            )
+    return problems

@@ -1,1 +1,0 @@
-"""Error figures of a scenario against truth: `evaluate.evaluate`, `truth.truth_from_log`, `table.format_table`."""

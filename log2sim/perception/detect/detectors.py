@@ -1,0 +1,104 @@
+"""2D boxes of road users in camera frames: from an ONNX model through ONNX Runtime, or from boxes in the log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, Protocol
+
+from log2sim import registry
+from log2sim.datatypes import Detections, Frame, Log
+from log2sim.errors import ConfigError
+
+__all__ = ["Detector", "create_detector"]
+
+MAX_OVERLAP = 0.5
+MAX_TILES = 64
+
+
+class Detector(Protocol):
+    """Finds road users in one camera frame.
+
+    `name` goes into the provenance of a scenario, `default_min_score` is the score in [0, 1] below which the boxes of
+    this detector are more often wrong than useful.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def default_min_score(self) -> float: ...
+
+    def detect(self, frame: Frame) -> Detections:
+        """Boxes of one frame, best score first, always the same for the same frame; may be called from threads."""
+        ...
+
+
+def create_detector(
+    name_or_path: str,
+    log: Log,
+    *,
+    min_score: float | None = None,
+    max_overlap: float = MAX_OVERLAP,
+    tiles: Literal["auto"] | int = "auto",
+    layout: str | None = None,
+    input_px: int | None = None,
+) -> Detector:
+    """Make a detector for a log.
+
+    Parameters
+    ----------
+    name_or_path
+        A registered name ("ssd-mobilenet-v2", "labels", plug-ins of others) or the path of an `.onnx` file.
+    log
+        The log whose frames it will see; `labels` takes its boxes from there.
+    min_score
+        Least score in [0, 1] of a box, None for the detector's own default.
+    max_overlap
+        IoU in (0, 1] above which two boxes of one group of categories are the same object.
+    tiles
+        1: the whole picture only; N > 1: also N overlapping tiles; "auto": what the picture's size asks for.
+    layout
+        Output layout of an ONNX file, where it cannot be recognized.
+    input_px
+        Side of the input of an ONNX file that takes any size, None for what its family takes.
+
+    Raises
+    ------
+    ConfigError
+        An unknown name, a file that is no usable model, or a setting out of range.
+    MissingExtra
+        The detector's package is not installed.
+    """
+    check_settings(min_score, max_overlap, tiles)
+    if name_or_path.lower().endswith(".onnx"):
+        from log2sim.perception.detect.onnx_detector import open_onnx
+
+        return open_onnx(
+            Path(name_or_path),
+            min_score=min_score,
+            max_overlap=max_overlap,
+            tiles=tiles,
+            layout_name=layout,
+            input_px=input_px,
+        )
+    if layout is not None:
+        raise ConfigError(f"layout '{layout}': only a detector given as the path of an ONNX file takes a layout")
+    if input_px is not None:
+        raise ConfigError(f"input_px {input_px}: only a detector given as the path of an ONNX file takes another size")
+    try:
+        create = registry.load("detector", name_or_path)
+    except ConfigError as error:
+        raise ConfigError(f"{error}, or the path of an ONNX file (ending in .onnx)") from None
+    detector: Detector = create(log, min_score=min_score, max_overlap=max_overlap, tiles=tiles)
+    return detector
+
+
+def check_settings(min_score: float | None, max_overlap: float, tiles: str | int) -> None:
+    """Raise `ConfigError` for a setting that is out of its range."""
+    if min_score is not None and not 0 <= min_score <= 1:
+        raise ConfigError(f"min_score {min_score}: expected a number from 0 to 1")
+    if not 0 < max_overlap <= 1:
+        raise ConfigError(f"max_overlap {max_overlap}: expected a number above 0 and up to 1")
+    counted = isinstance(tiles, int) and not isinstance(tiles, bool)
+    if tiles != "auto" and not (counted and 1 <= int(tiles) <= MAX_TILES):
+        raise ConfigError(f"tiles {tiles!r}: expected 'auto' or a whole number from 1 to {MAX_TILES}")

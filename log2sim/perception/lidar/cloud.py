@@ -1,0 +1,172 @@
+"""Sweeps brought to the map frame: every point moved by the ego pose of its own moment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Log, Sweep
+from log2sim.geometry import NS_PER_S, Array
+from log2sim.perception.lidar.azimuth_index import Panorama
+from log2sim.perception.lidar.ground import ON_GROUND_M, estimate_ground
+
+# Rotation is held within one bin: at 1 rad/s and 50 m this is 2.5 cm; translation is interpolated for every point.
+POSE_BIN_NS = 500_000
+MOST_POSE_BINS = 4096
+# A sensor that moves less than this during a sweep, its turning taken at 30 m, needs one pose for it.
+AT_REST_M = 0.01
+AT_REST_RAD = AT_REST_M / 30.0
+AT_REST_PROBES = 5
+# Obstacles stand between the road and what hangs over it.
+LOWEST_M, HIGHEST_M = 0.2, 4.2
+GROUND_REACH_M = 45.0
+GROUND_SAMPLE = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Points of one moment in the map frame.
+
+    `xyz` (N, 3) float32, m, relative to `origin` (3,) float64 in the map frame, so that single precision holds 1e-5 m;
+    `t_s` (N,) float32 seconds relative to `stamp_ns`; `sensor` (3,) float32 where the points were seen from, relative to
+    `origin`; `ground` (N,) bool marks points on the ground; `height` (N,) float32 above the ground.
+    """
+
+    stamp_ns: int
+    origin: Array
+    xyz: NDArray[np.float32]
+    t_s: NDArray[np.float32]
+    sensor: NDArray[np.float32]
+    ground: NDArray[np.bool_]
+    height: NDArray[np.float32]
+
+    @cached_property
+    def obstacles(self) -> NDArray[np.intp]:
+        """Indices (n,) of the points that stand on the road."""
+        return np.flatnonzero(~self.ground & (self.height > LOWEST_M) & (self.height < HIGHEST_M))
+
+    @cached_property
+    def columns(self) -> NDArray[np.float32]:
+        """The points as columns x, y, z (3, N)."""
+        return np.ascontiguousarray(self.xyz.T)
+
+    @cached_property
+    def obstacle_columns(self) -> NDArray[np.float32]:
+        """The points at `obstacles` as columns (3, n), for the cameras that share the cloud."""
+        return np.ascontiguousarray(self.xyz[self.obstacles].T)
+
+    @cached_property
+    def panorama(self) -> Panorama:
+        """The points by azimuth around the sensor."""
+        return Panorama.of(self.xyz, self.sensor, self.ground)
+
+    @cached_property
+    def ground_sample(self) -> NDArray[np.intp]:
+        """Indices (n,) of every so-many-th of the ground points near the origin."""
+        index = np.flatnonzero(self.ground & (np.hypot(self.xyz[:, 0], self.xyz[:, 1]) < GROUND_REACH_M))
+        return index[:: max(len(index) // GROUND_SAMPLE, 1)]
+
+    def prepare(self, *, ground: bool = True) -> None:
+        """Compute now, in the thread that makes the cloud, what measuring in it will ask for, its `ground` too or not."""
+        _ = self.obstacle_columns, self.panorama, self.ground_sample if ground else None
+
+
+def to_map(log: Log, lidar: str, sweep: Sweep, *, compensate: bool) -> tuple[Array, NDArray[np.float32]] | None:
+    """Points (N, 3) float64 of a sweep in the map frame and their times (N,) s relative to its stamp.
+
+    Returns None where the pose of the sensor is not known at that time. Without point times, at rest, or with `compensate`
+    off, the whole sweep takes the pose of its stamp.
+    """
+    t_ns = sweep.t_ns if sweep.t_ns is not None else np.full(len(sweep.xyz_m), sweep.stamp_ns, dtype=np.int64)
+    t_s = ((t_ns - sweep.stamp_ns) / NS_PER_S).astype(np.float32)
+    if sweep.frame == "map":
+        return np.asarray(sweep.xyz_m, dtype=np.float64), t_s
+    one_pose = not compensate or sweep.t_ns is None or len(t_ns) == 0 or at_rest(log, lidar, sweep)
+    xyz = with_one_pose(log, lidar, sweep) if one_pose else with_many_poses(log, lidar, sweep, t_ns)
+    return None if xyz is None else (xyz, t_s)
+
+
+def at_rest(log: Log, lidar: str, sweep: Sweep) -> bool:
+    """Whether a LiDAR stands still while it takes a sweep with point times, to `AT_REST_M` at 30 m."""
+    if sweep.t_ns is None or len(sweep.t_ns) == 0:
+        return False
+    probes = np.linspace(0, int(sweep.t_ns.max() - sweep.t_ns.min()), AT_REST_PROBES).astype(np.int64)
+    map_T_lidar, valid = log.map_T_sensor(lidar, np.append(sweep.t_ns.min() + probes, sweep.stamp_ns))
+    moved = np.linalg.norm(map_T_lidar[:, :3, 3] - map_T_lidar[-1, :3, 3], axis=1)
+    turned = np.linalg.norm(map_T_lidar[:, :3, :3] - map_T_lidar[-1, :3, :3], axis=(1, 2)) / np.sqrt(2)
+    return bool(valid.all() and moved.max() < AT_REST_M and turned.max() < AT_REST_RAD)
+
+
+def with_one_pose(log: Log, lidar: str, sweep: Sweep) -> Array | None:
+    """Points (N, 3) in the map, all moved by the pose of the sweep's stamp; None where that is not known."""
+    map_T_lidar, valid = log.map_T_sensor(lidar, sweep.stamp_ns)
+    if not valid[0]:
+        return None
+    return np.asarray(sweep.xyz_m @ map_T_lidar[0, :3, :3].T + map_T_lidar[0, :3, 3], dtype=np.float64)
+
+
+def with_many_poses(log: Log, lidar: str, sweep: Sweep, t_ns: NDArray[np.int64]) -> Array | None:
+    """Points (N, 3) in the map, each moved by the pose of its own time (N,); None where one is not known."""
+    first, span = int(t_ns.min()), int(t_ns.max() - t_ns.min())
+    bins = min(max(span // POSE_BIN_NS, 1), MOST_POSE_BINS)
+    knots = first + (np.arange(bins + 1) * span) // bins
+    map_T_lidar, valid = log.map_T_sensor(lidar, knots)
+    if not valid.all():
+        return None
+    place = (t_ns - first) / max(span, 1) * bins
+    k = np.minimum(place.astype(np.int64), bins - 1)
+    order = np.argsort(k, kind="stable")
+    edges = np.searchsorted(k[order], np.arange(bins + 1))
+    out = np.empty((len(t_ns), 3))
+    sorted_points = np.asarray(sweep.xyz_m, dtype=np.float64)[order]
+    rotated = np.empty_like(sorted_points)
+    for b in np.flatnonzero(np.diff(edges)):
+        rows = slice(edges[b], edges[b + 1])
+        np.matmul(sorted_points[rows], map_T_lidar[b, :3, :3].T, out=rotated[rows])
+    out[order] = rotated
+    position = map_T_lidar[:, :3, 3]
+    fraction = (place - k)[:, None]
+    return np.asarray(out + position[k] * (1 - fraction) + position[k + 1] * fraction)
+
+
+def assemble_cloud(
+    log: Log,
+    sweeps: Mapping[str, Sweep],
+    *,
+    origin: Array,
+    ground_z: float,
+    max_range_m: float,
+    compensate: bool = True,
+) -> Cloud | None:
+    """One cloud in the map frame from the sweeps of all LiDARs that belong together, with its ground found.
+
+    Parameters
+    ----------
+    origin : (3,) map frame
+        Position of the ego (or the sensor); points beyond `max_range_m` of it are left out.
+    ground_z : float
+        Expected height of the ground at the origin, m, map frame.
+    """
+    parts, stamp = [], 0
+    for name, sweep in sweeps.items():
+        mapped = to_map(log, name, sweep, compensate=compensate)
+        if mapped is None or len(mapped[0]) == 0:
+            continue
+        stamp = stamp or sweep.stamp_ns
+        sensor, known = log.map_T_sensor(name, sweep.stamp_ns)
+        local = (mapped[0] - origin).astype(np.float32)
+        near = (np.abs(local[:, 0]) <= max_range_m) & (np.abs(local[:, 1]) <= max_range_m)
+        shift_s = np.float32((sweep.stamp_ns - stamp) / NS_PER_S)
+        parts.append((local[near], mapped[1][near] + shift_s, sensor[0, :3, 3] - origin if known[0] else np.zeros(3)))
+    if not parts:
+        return None
+    xyz, t_s = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+    surface = estimate_ground(xyz, np.zeros(2), ground_z - float(origin[2]))
+    height = xyz[:, 2] - surface.at(xyz[:, :2])
+    # A LiDAR far away, of which no point is near, must not move the place that the points were seen from.
+    sensor = np.mean([p[2] for p in parts if len(p[0])] or [p[2] for p in parts], axis=0).astype(np.float32)
+    return Cloud(stamp, np.asarray(origin, float), xyz, t_s, sensor, np.abs(height) <= ON_GROUND_M, height)

@@ -1,0 +1,127 @@
+"""Clouds into images: which points a camera sees, and which of them lie in its boxes."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import NEAREST_DEPTH_M, Array, Camera, fold_radius, project, undistort
+
+BORDER_SAMPLES = 33
+# Between samples a border bends by less than this, in tangents; no lens of these models sees past the widest.
+SLACK, WIDEST = 0.01, 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One camera frame with what is needed to measure in it: `map_T_cam` (4, 4) at its stamp."""
+
+    camera: Camera
+    t_ns: int
+    map_T_cam: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Points that a camera sees: `index` (n,) in the cloud, pixels `u` and `v` (n,), `depth` (n,) m along the optical axis."""
+
+    index: NDArray[np.intp]
+    u: NDArray[np.float32]
+    v: NDArray[np.float32]
+    depth: NDArray[np.float32]
+
+
+class _Workspace(threading.local):
+    """Working memory of a thread, kept from frame to frame: fresh pages cost more than the projection itself."""
+
+    def __init__(self) -> None:
+        self._numbers = np.empty(0, dtype=np.float32)
+        self._marks = np.empty(0, dtype=np.bool_)
+
+    def take(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Numbers (4, count) and marks (2, count), not initialized."""
+        if len(self._numbers) < 4 * count:
+            self._numbers, self._marks = np.empty(4 * count, dtype=np.float32), np.empty(2 * count, dtype=np.bool_)
+        return self._numbers[: 4 * count].reshape(4, count), self._marks[: 2 * count].reshape(2, count)
+
+
+_workspace = _Workspace()
+
+
+def see(view: View, origin: Array, columns: NDArray[np.float32]) -> Seen:
+    """Project points given as columns x, y, z (3, N) relative to `origin` (3,) in the map frame.
+
+    Notes
+    -----
+    One product in single precision turns the points and applies the intrinsics; what is outside the frustum falls out
+    before anything is divided, so that only the few points of the image are. Those go through the lens in double
+    precision where there is one.
+    """
+    camera, cam_R_map = view.camera, view.map_T_cam[:3, :3].T
+    offset = cam_R_map @ (origin - view.map_T_cam[:3, 3])
+    lens = camera.distortion_model != "none"
+    K = np.eye(3) if lens else camera.K
+    low, high = _frustum(camera) if lens else (np.zeros(2), np.array([camera.width_px, camera.height_px], dtype=float))
+    numbers, (mark, other) = _workspace.take(columns.shape[1])
+    turned, bound = numbers[:3], numbers[3]
+    np.matmul((K @ cam_R_map).astype(np.float32), columns, out=turned)
+    turned += (K @ offset).astype(np.float32)[:, None]
+    z = turned[2]
+    np.greater(z, np.float32(NEAREST_DEPTH_M), out=mark)
+    for axis in (0, 1):
+        # A pinhole's image begins at zero, which needs no product.
+        edge = np.multiply(z, np.float32(low[axis]), out=bound) if lens else np.float32(0.0)
+        mark &= np.greater_equal(turned[axis], edge, out=other)
+        np.multiply(z, np.float32(high[axis]), out=bound)
+        mark &= np.less(turned[axis], bound, out=other)
+    index = np.flatnonzero(mark)
+    depth = z[index]
+    if not lens:
+        return Seen(index, turned[0][index] / depth, turned[1][index] / depth, depth)
+    uv, inside = project(camera, turned[:, index].T)
+    u, v = uv[inside].T.astype(np.float32)
+    return Seen(index[inside], u, v, depth[inside])
+
+
+@lru_cache(maxsize=64)
+def _frustum(camera: Camera) -> tuple[Array, Array]:
+    """Bounds (2,), (2,) of x / z and y / z of the rays that reach the image, from those at its border."""
+    along = np.linspace(0.0, 1.0, BORDER_SAMPLES)
+    zero, one = np.zeros(BORDER_SAMPLES), np.ones(BORDER_SAMPLES)
+    border = np.stack([np.r_[along, along, zero, one], np.r_[zero, one, along, along]], axis=1)
+    rays = undistort(camera, border * [camera.width_px, camera.height_px])
+    if np.isnan(rays).any():
+        # Pixels that no ray reaches: the lens folds inside the image, and everything up to the fold may be seen.
+        reach = min(fold_radius(camera), WIDEST)
+        return np.full(2, -reach), np.full(2, reach)
+    return rays.min(axis=0) - SLACK, rays.max(axis=0) + SLACK
+
+
+def in_boxes(seen: Seen, box_px: Array, margin: float = 0.0) -> list[NDArray[np.intp]]:
+    """Rows of `seen` in each box (M, 4), in their order; boxes are widened by a share of their sides, but not downward.
+
+    Notes
+    -----
+    Points are sorted by whole columns once, by their digits; a box looks only at those between its own.
+    """
+    if len(box_px) == 0:
+        return []
+    column = seen.u.astype(np.uint16)
+    order = np.argsort(column, kind="stable")
+    column, u, v = column[order], seen.u[order], seen.v[order]
+    wide, tall = margin * (box_px[:, 2:] - box_px[:, :2]).T
+    left, top = box_px[:, 0] - wide, box_px[:, 1] - tall
+    right, bottom = box_px[:, 2] + wide, box_px[:, 3]
+    # Boxes may reach out of the image; those of NaN have no points.
+    first, last = (np.clip(np.nan_to_num(edge), 0, 65535).astype(np.uint16) for edge in (left, right))
+    first, last = np.searchsorted(column, first, "left"), np.searchsorted(column, last, "right")
+    edges = np.stack([left, top, right, bottom], axis=1).tolist()
+    found = []
+    for a, b, (u0, v0, u1, v1) in zip(first.tolist(), last.tolist(), edges, strict=True):
+        us, vs = u[a:b], v[a:b]
+        found.append(np.sort(order[a:b][(us >= u0) & (us <= u1) & (vs >= v0) & (vs <= v1)]))
+    return found

@@ -1,6 +1,0 @@
-"""Pictures of scenarios, and of boxes and points on camera images. Matplotlib's objects only, so no global state."""
-
-from log2sim.plot.overlay import draw_overlay
-from log2sim.plot.tracks import plot_tracks
-
-__all__ = ["draw_overlay", "plot_tracks"]

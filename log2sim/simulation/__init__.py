@@ -1,0 +1,34 @@
+"""The simulator shim: scenarios as vehicles that follow their waypoints, and a place for the user's own ego."""
+
+from __future__ import annotations
+
+from log2sim.simulation.backends import host_named
+from log2sim.simulation.metrics.limits import check_limits, check_strict, parse_limits, require_strict
+from log2sim.simulation.policy import Controls, EgoState, Observation, Others, PathAhead, Policy, Route
+from log2sim.simulation.policy_loading import load_policy
+from log2sim.simulation.result import AgentReplay, Commands, Replay, to_scenario
+from log2sim.simulation.rollout import World
+from log2sim.simulation.runner import open_world, replay
+
+__all__ = [
+    "AgentReplay",
+    "Commands",
+    "Controls",
+    "EgoState",
+    "Observation",
+    "Others",
+    "PathAhead",
+    "Policy",
+    "Replay",
+    "Route",
+    "World",
+    "check_limits",
+    "check_strict",
+    "host_named",
+    "load_policy",
+    "open_world",
+    "parse_limits",
+    "replay",
+    "require_strict",
+    "to_scenario",
+]

@@ -1,0 +1,114 @@
+"""A scenario as CARLA's script reads it: who looks how, and where each agent is when, in CARLA's frame."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from log2sim.datatypes import Agent
+from log2sim.geometry import Array
+from log2sim.simulation.carla.assets import nearest_assets
+from log2sim.simulation.path import Path, path_of
+from log2sim.simulation.reference import vehicle_limits, vehicle_reference
+from log2sim.simulation.vehicles.parameters import WHEELED, parameters_for, rear_axle_offset
+
+SAMPLE_S = 0.05
+"""Spacing of the samples: between them a straight line errs by at most a h^2 / 8 = 3 mm at 10 m/s2."""
+
+LEAP_S = 1e-6  # a leap of the log becomes two samples so far apart
+
+
+def carla_agents(agents: Sequence[Agent]) -> list[dict[str, Any]]:
+    """Agents as `player` reads them. Their positions should be near the origin: CARLA counts in float32."""
+    begin_s = min(float(a.waypoints.t_s[0]) for a in agents)
+    end_s = max(float(a.waypoints.t_s[-1]) for a in agents)
+    seen: Counter[str] = Counter()
+    described = []
+    for agent in agents:
+        described.append(_agent(agent, seen[agent.category], (begin_s, end_s)))
+        seen[agent.category] += 1
+    return described
+
+
+def _agent(agent: Agent, turn: int, span_s: tuple[float, float]) -> dict[str, Any]:
+    """One agent; one that stays is there for all of `span_s`, as in log2sim's own simulator."""
+    w, wheeled = agent.waypoints, agent.category in WHEELED
+    moves = not agent.static and len(w) > 1
+    life_s = span_s if agent.stays else (float(w.t_s[0]), float(w.t_s[-1]))
+    path = path_of(agent, rear_axle_offset(agent))
+    exact, pid = _courses(agent, path, drives=moves and wheeled)
+    limits = parameters_for([agent]) if wheeled else None
+    return {
+        "id": agent.id,
+        "category": agent.category,
+        "size_m": [round(v, 3) for v in agent.size_m],
+        "color": None if agent.color is None else list(agent.color["rgb"]),
+        "static": agent.static,
+        "assets": [
+            {"blueprint": a.blueprint, "size_m": a.size_m, "error_m": a.error_m}
+            for a in nearest_assets(agent, turn=turn)
+        ],
+        "begin_s": life_s[0],
+        "end_s": life_s[1],
+        "leaps_s": [float(t) for t in path.jump_times()],
+        "drive": None if not moves else "vehicle" if wheeled else "walker" if agent.category == "pedestrian" else None,
+        "max_throttle_mps2": None if limits is None else float(limits.max_throttle_mps2[0]),
+        "max_brake_mps2": None if limits is None else float(limits.max_brake_mps2[0]),
+        "exact": exact,
+        "pid": pid,
+    }
+
+
+def _courses(agent: Agent, path: Path, *, drives: bool) -> tuple[dict[str, list[float]], dict[str, list[float]] | None]:
+    """Columns of the logged course and, for a vehicle that drives, of the one that it can drive; both of the box center."""
+    t_s = _times(agent, path)
+    x, y, yaw, _ = path.at(t_s)
+    z = path.heights(t_s) - agent.size_m[2] / 2
+    origin_x, origin_y = path.origin_m
+    if not drives:
+        return {**_mirrored(t_s, x + origin_x, y + origin_y, z, yaw), "curvature_1pm": [0.0] * len(t_s)}, None
+    limits = vehicle_limits(agent)
+    reference = vehicle_reference(path, limits, accel_ahead_s=0.0, curvature_ahead_s=0.0)
+    rear_x, rear_y, rear_yaw, speed, accel, curvature, gear, stands = reference.exact(t_s).T
+    center_x, center_y = rear_x + limits.offset_m * np.cos(rear_yaw), rear_y + limits.offset_m * np.sin(rear_yaw)
+    bend = {"curvature_1pm": _rounded(-curvature)}
+    exact = {**_mirrored(t_s, x + origin_x, y + origin_y, z, yaw), **bend}
+    pid = {
+        **_mirrored(t_s, center_x + origin_x, center_y + origin_y, z, rear_yaw),
+        **bend,
+        "speed_mps": _rounded(speed),
+        "accel_mps2": _rounded(accel),
+        "gear": _rounded(gear),
+        "stands": _rounded(stands),
+    }
+    return exact, pid
+
+
+def _times(agent: Agent, path: Path) -> Array:
+    """When the course is sampled: regularly, at every waypoint, and just before a leap."""
+    if agent.static:
+        return path.t_s[:1]
+    regular = np.arange(path.t_s[0], path.t_s[-1], SAMPLE_S)
+    k = np.searchsorted(path.t_s, regular, side="right")
+    gap_s = np.minimum(regular - path.t_s[k - 1], path.t_s[np.minimum(k, len(path.t_s) - 1)] - regular)
+    return np.sort(np.concatenate([regular[gap_s > 10 * LEAP_S], path.t_s, path.jump_times() - LEAP_S]))
+
+
+def _mirrored(t_s: Array, x: Array, y: Array, z: Array, yaw: Array) -> dict[str, list[float]]:
+    """Columns in CARLA's left-handed frame."""
+    return {
+        "t_s": _rounded(t_s, 7),
+        "x_m": _rounded(x),
+        "y_m": _rounded(-y),
+        "z_m": _rounded(z),
+        "yaw_deg": _rounded(-np.degrees(yaw)),
+    }
+
+
+def _rounded(values: ArrayLike, digits: int = 4) -> list[float]:
+    """Numbers for the file: a tenth of a millimeter, or of a thousandth of a degree."""
+    return [float(v) for v in np.round(np.asarray(values, dtype=np.float64), digits) + 0.0]

@@ -1,0 +1,141 @@
+"""Who drives each agent of a scenario, and the groups that this makes."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import EGO, Agent
+from log2sim.errors import ConfigError
+from log2sim.registry import nearest
+from log2sim.simulation.follower import control_step
+from log2sim.simulation.groups import Crowd, Driven, Fleet, Group, Tape
+from log2sim.simulation.path import Path, path_of
+from log2sim.simulation.reactive.groups import Reactive, ReactiveCrowd, ReactiveFleet, ReactiveTape
+from log2sim.simulation.reactive.traffic import Traffic
+from log2sim.simulation.reference import (
+    _vehicle_reference,
+    point_reference,
+    tape_reference,
+)
+from log2sim.simulation.simulators import STEPS, EmbeddedSimulator
+from log2sim.simulation.step_clock import Clock
+from log2sim.simulation.vehicles.model_choice import Choice, choose, slipping_reference, understeer
+from log2sim.simulation.vehicles.parameters import STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
+
+Cast = dict[str, list[Agent]]
+"""Agents by what drives them: "policy", "reactive", "pid", "exact" or, with one pose for good, "static"."""
+
+
+def cast_agents(agents: Sequence[Agent], mode: str, *, drives_ego: bool, reactive: Collection[str] = ()) -> Cast:
+    """Who is driven by what; ids in `reactive` are of agents that can be."""
+    cast: Cast = {"policy": [], "reactive": [], "pid": [], "exact": [], "static": []}
+    for agent in agents:
+        if drives_ego and agent.id == EGO:
+            cast["policy"].append(agent)
+        elif agent.static:
+            cast["static"].append(agent)
+        elif agent.id in reactive:
+            cast["reactive"].append(agent)
+        else:
+            cast[mode if len(agent.waypoints) > 1 else "exact"].append(agent)
+    return cast
+
+
+def reactive_ids(agents: Sequence[Agent], wanted: str | Collection[str], *, drives_ego: bool) -> frozenset[str]:
+    """Ids of the agents that react: all that can for "reactive", none for "log", or those named.
+
+    Raises
+    ------
+    ConfigError
+        When a name is not known, or is that of an agent that cannot react: parked, seen once, or driven by a policy.
+    """
+    able = [a.id for a in agents if not a.static and len(a.waypoints) > 1 and not (drives_ego and a.id == EGO)]
+    if isinstance(wanted, str):
+        if wanted not in ("log", "reactive"):
+            raise ConfigError(f"agents '{wanted}': expected log or reactive")
+        return frozenset(i for i in able if i != EGO) if wanted == "reactive" else frozenset()
+    for name in wanted:
+        if name in able:
+            continue
+        if any(a.id == name for a in agents):
+            raise ConfigError(f"agent '{name}': cannot react, it is parked, seen only once, or driven by the policy")
+        raise ConfigError(f"agent '{name}': there is none of that id{nearest(name, able)}")
+    return frozenset(wanted)
+
+
+def groups_of(
+    cast: Mapping[str, Sequence[Agent]], clock: Clock, mode: str = "pid", model: str = "auto"
+) -> tuple[list[Group], dict[str, Choice]]:
+    """The groups that have agents, and by id the model that moves each vehicle; static agents are in none."""
+    groups: list[Group] = []
+    choices: dict[str, Choice] = {}
+    controlled: list[tuple[str, type[Fleet], type[Crowd]]] = [("policy", Driven, Crowd)]
+    if mode == "pid":
+        controlled += [("reactive", ReactiveFleet, ReactiveCrowd), ("pid", Fleet, Crowd)]
+    for driver, kind, on_foot in controlled:
+        wheeled = [a for a in cast[driver] if a.category in WHEELED]
+        groups += _fleets(wheeled, kind, clock, model, choices)
+        walking = [a for a in cast[driver] if a.category not in WHEELED]
+        if walking:
+            references = [point_reference(path_of(a, 0.0)) for a in walking]
+            groups.append(on_foot(walking, references, *_lives(walking, clock), EmbeddedSimulator(STEPS["kinematic"])))
+    for driver, tape in (("exact", Tape), *([("reactive", ReactiveTape)] if mode == "exact" else [])):
+        agents = list(cast[driver])
+        if agents:
+            references = [tape_reference(path_of(a, rear_axle_offset(a))) for a in agents]
+            groups.append(tape(agents, references, *_lives(agents, clock)))
+    return groups, choices
+
+
+def _fleets(
+    agents: Sequence[Agent], kind: type[Fleet], clock: Clock, model: str, choices: dict[str, Choice]
+) -> list[Group]:
+    """Groups of vehicles, one for each model that moves some of them; what moves each is added to `choices`."""
+    groups: list[Group] = []
+    references = {a.id: _vehicle_reference(a, clock.dt_s) for a in agents}
+    for a in agents:
+        choices[a.id] = choose(a, references[a.id], parameters_for([a]), model, free=kind is Driven)
+    for name in STEPS:
+        moved = [a for a in agents if choices[a.id].model == name]
+        if moved:
+            p = parameters_for(moved, published=name == "single-track")
+            followed = [references[a.id] for a in moved]
+            if name != "kinematic":
+                p = replace(p, understeer_s2pm2=understeer(p))
+                ahead_s = STEER_LAG_S + control_step(clock.dt_s) / 2
+                ones = [p.take(slice(i, i + 1)) for i in range(len(moved))]
+                followed = [slipping_reference(r, one, name, ahead_s) for r, one in zip(followed, ones)]
+            groups.append(kind(moved, followed, *_lives(moved, clock), p, EmbeddedSimulator(STEPS[name])))
+    return groups
+
+
+def traffic_of(agents: Sequence[Agent], groups: Sequence[Group], clock: Clock) -> Traffic | None:
+    """What the reactive groups decide by, with which they are connected; None where nobody reacts."""
+    reacting = [g for g in groups if isinstance(g, Reactive)]
+    if not reacting:
+        return None
+    paths = {a.id: r.path for g in groups for a, r in zip(g.agents, g.references)}
+    driven = next((g.agents[0].id for g in groups if isinstance(g, Driven)), None)
+    reactive = {a.id for g in reacting for a in g.agents}
+    traffic = Traffic(agents, [paths.get(a.id) or _pose(a) for a in agents], reactive, driven)
+    for group in reacting:
+        group.join(traffic, clock)
+    return traffic
+
+
+def _pose(agent: Agent) -> Path:
+    """The path of a static agent: it stands, as long as it lives."""
+    w = agent.waypoints
+    first = {k: np.full(len(w), getattr(w, k)[0]) for k in ("x_m", "y_m", "z_m", "yaw_rad")}
+    return path_of(replace(agent, waypoints=replace(w, **first, speed_mps=np.zeros(len(w)))), 0.0)
+
+
+def _lives(agents: Sequence[Agent], clock: Clock) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First and last step (A,), (A,) of each agent; the last before the first where a life lies between two steps."""
+    begin = np.array([a.waypoints.t_s[0] for a in agents])
+    end = np.array([a.waypoints.t_s[-1] for a in agents])
+    return clock.first_step(begin), clock.last_step(end)

@@ -1,0 +1,239 @@
+"""A gymnasium environment in which an agent drives the ego of a scenario (extra `gym`).
+
+import gymnasium, log2sim.replay.env
+env = gymnasium.make("log2sim/Scenario-v0", scenario="scenario.json")
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from log2sim.datatypes import Scenario
+from log2sim.errors import MissingExtra
+from log2sim.geometry import Array, box_corners_bev, wrap_angle
+from log2sim.simulation.metrics.box_tracks import rectangles_overlap
+from log2sim.simulation.policy import Controls, EgoState, Observation
+from log2sim.simulation.runner import open_world
+
+try:
+    import gymnasium
+    from gymnasium.spaces import Box, Dict
+except ImportError as error:
+    raise MissingExtra("log2sim.simulation.env", "gym") from error
+
+ID = "log2sim/Scenario-v0"
+
+PATH_EVERY_M, PATH_ROWS = 5, 10
+# Bounds of what is observed: no road user is faster, brakes harder or is larger.
+MAX_SPEED_MPS, MAX_ACCEL_MPS2, MAX_LENGTH_M, MAX_WIDTH_M = 80.0, 15.0, 60.0, 10.0
+PATH_BOUND_M = 60.0  # the last row of the path is 50 m ahead, seen by an ego that is at most `LOST_M` off it
+
+# What a step costs, in meters of way gone.
+OFF_PATH_PER_M_S = 0.2
+COLLISION = 100.0
+LOST_M = 15.0  # so far off the path an episode ends
+
+PICTURE_PX, PICTURE_M = 400, 80.0
+
+Seen = dict[str, Any]
+
+
+class ScenarioEnv(gymnasium.Env[Seen, Any]):
+    """Drive the ego of a scenario among its other agents.
+
+    Parameters
+    ----------
+    scenario : Scenario or path
+    dt_s : float
+        Simulation step.
+    hold_s : float
+        Each action holds for so long: a multiple of `dt_s`.
+    agents : {"reactive", "log"} or collection of str
+        What the other agents do; see `log2sim.simulation.runner.replay`.
+    sight_m : float
+        How far others are seen.
+    max_others : int
+        Rows for the nearest others.
+    render_mode : {"rgb_array"}, optional
+
+    Notes
+    -----
+    Action, `Box(-1, 1, (2,))` float32: the pedal (full brake to full throttle) and the steering (full lock to the right to
+    full lock to the left), as shares of what the vehicle can do: `accel_limits_mps2`, `max_steer_rad`.
+
+    Observation, a dictionary of float32 boxes; values beyond a bound are put on it:
+
+    - `ego` (5,): speed in m/s, acceleration in m/s2, steering angle in rad, offset from the recorded path in m (left
+      positive), heading against it in rad.
+    - `path` (10, 3): the recorded path 5, 10, ... 50 m ahead: forward, left in m of the ego's box center and the log's speed.
+    - `others` (max_others, 7): nearest first: forward, left in m, velocity forward, left in m/s (of the other, on the ego's
+      axes), heading against the ego's in rad, length, width in m. Rows without an agent are 0.
+    - `others_mask` (max_others,) int8: 1 where a row has an agent.
+
+    Reward of a step: the way gone along the recorded path in m, less 0.2 per second and meter of offset from it, less 100 for
+    a collision; `info["reward"]` has the parts. The episode terminates with a collision or at the end of the recorded path,
+    and is truncated when the recorded time is over, or the ego leaves the path by more than 15 m. Nothing is random: seeds
+    give the same episode.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+
+    def __init__(
+        self,
+        scenario: Scenario | Path | str,
+        *,
+        dt_s: float = 0.02,
+        hold_s: float = 0.1,
+        agents: str | Collection[str] = "reactive",
+        sight_m: float = 60.0,
+        max_others: int = 16,
+        render_mode: str | None = None,
+    ) -> None:
+        self.scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
+        self.world = open_world(self.scenario, dt_s=dt_s, agents=agents, sight_m=sight_m)
+        self.render_mode, self._steps = render_mode, max(1, round(hold_s / dt_s))
+        self._seen: Observation
+        self._begun = False
+        ego = self.world.ego
+        if ego is None:  # open_world refuses such a scenario
+            raise ValueError("the world has no ego to drive")
+        p = ego.parameters
+        self.accel_limits_mps2 = float(p.max_brake_mps2[0]), float(p.max_throttle_mps2[0])
+        self.max_steer_rad = float(p.max_steer_rad[0])
+        self.action_space = Box(-1.0, 1.0, (2,), np.float32)
+        self._rows = max_others
+        bounds = {
+            "ego": [MAX_SPEED_MPS, MAX_ACCEL_MPS2, np.pi / 2, LOST_M, np.pi],
+            "path": [[PATH_BOUND_M, PATH_BOUND_M, MAX_SPEED_MPS]] * PATH_ROWS,
+            "others": [[sight_m, sight_m, MAX_SPEED_MPS, MAX_SPEED_MPS, np.pi, MAX_LENGTH_M, MAX_WIDTH_M]] * max_others,
+        }
+        self._bounds = {k: np.array(v, np.float32) for k, v in bounds.items()}
+        spaces: dict[str, Any] = {k: Box(-v, v) for k, v in self._bounds.items()}
+        self.observation_space = Dict({**spaces, "others_mask": Box(0, 1, (max_others,), np.int8)})
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
+        """Start the scenario again, at the moment when the ego appears."""
+        super().reset(seed=seed)
+        self.world.restart()
+        while not self.world.ego_lives:
+            self.world.advance()
+        self._seen, self._begun = self.world.observe(), True
+        return self._shown(), {"t_s": self._seen.t_s}
+
+    def step(self, action: Any) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
+        """Hold an action for `hold_s`; `ValueError` when it is not two finite numbers."""
+        if not self._begun:
+            raise gymnasium.error.ResetNeeded("the episode has not begun: call reset() before step()")
+        pedal, wheel = _shares(action)
+        brake, throttle = self.accel_limits_mps2
+        before_m, begin_s = self._seen.path.progress_m, self._seen.t_s
+        self.world.steer(Controls(pedal * (throttle if pedal > 0 else brake), wheel * self.max_steer_rad))
+        collides = over = False
+        for _ in range(self._steps):
+            self.world.advance()
+            over = self.world.done or not self.world.ego_lives
+            if not self.world.ego_lives:
+                break
+            self._seen = self.world.observe()
+            collides = _collides(self._seen)
+            if collides or over:
+                break
+        seen = self._seen
+        offset_m = float(_in_frame_of_path(seen)[0])
+        parts = {
+            "progress": seen.path.progress_m - before_m,
+            "off_path": -OFF_PATH_PER_M_S * abs(offset_m) * (seen.t_s - begin_s),
+            "collision": -COLLISION * collides,
+        }
+        arrived = bool(np.isnan(seen.path.t_s[1]))
+        truncated = not (collides or arrived) and (over or abs(offset_m) > LOST_M)
+        info = {"t_s": seen.t_s, "collision": collides, "reward": parts}
+        return self._shown(), float(sum(parts.values())), collides or arrived, truncated, info
+
+    def render(self) -> Any:
+        """The surroundings of the ego from above, (400, 400, 3) uint8, its front to the right; None without a render mode."""
+        return _picture(self._seen) if self._begun and self.render_mode == "rgb_array" else None
+
+    def _shown(self) -> Seen:
+        """The observation as arrays within the bounds of its space."""
+        seen, ego = self._seen, self._seen.ego
+        ahead = np.arange(1, PATH_ROWS + 1) * PATH_EVERY_M
+        path = (*_in_frame(ego, seen.path.x_m[ahead], seen.path.y_m[ahead]), seen.path.speed_mps[ahead])
+        o, count = seen.others, self._rows
+        velocity = _turned(ego, o.velocity_x_mps, o.velocity_y_mps)
+        columns = (*_in_frame(ego, o.x_m, o.y_m), *velocity, wrap_angle(o.yaw_rad - ego.yaw_rad), o.length_m, o.width_m)
+        near = np.stack(columns, axis=1)[:count]
+        others = np.zeros((count, 7))
+        others[: len(near)] = near
+        arrays = {
+            "ego": np.array([ego.speed_mps, ego.accel_mps2, ego.steer_rad, *_in_frame_of_path(seen)]),
+            "path": np.stack(path, axis=1),
+            "others": others,
+        }
+        shown = {k: np.clip(v.astype(np.float32), -self._bounds[k], self._bounds[k]) for k, v in arrays.items()}
+        return {**shown, "others_mask": (np.arange(count) < len(near)).astype(np.int8)}
+
+
+def _shares(action: Any) -> tuple[float, float]:
+    """The pedal and the steering of an action, as shares from -1 to 1."""
+    values = np.asarray(action, dtype=np.float64)
+    if values.shape != (2,) or not np.isfinite(values).all():
+        raise ValueError(f"action {action!r}: expected two finite numbers from -1 to 1, pedal and steering")
+    pedal, wheel = np.clip(values, -1.0, 1.0).tolist()
+    return pedal, wheel
+
+
+def _turned(ego: EgoState, x: Array, y: Array) -> tuple[Array, Array]:
+    """Forward and left components (N,), (N,) of vectors on the map's axes."""
+    cos, sin = np.cos(ego.yaw_rad), np.sin(ego.yaw_rad)
+    return x * cos + y * sin, y * cos - x * sin
+
+
+def _in_frame(ego: EgoState, x_m: Array, y_m: Array) -> tuple[Array, Array]:
+    """Points (N,), (N,) of the map seen from the ego's box center: forward, left."""
+    return _turned(ego, x_m - ego.x_m, y_m - ego.y_m)
+
+
+def _in_frame_of_path(seen: Observation) -> tuple[Array, Array]:
+    """Offset of the ego to the left of its path in m, and its heading against it in rad."""
+    x, y, yaw = seen.path.x_m[0], seen.path.y_m[0], seen.path.yaw_rad[0]
+    dx, dy = seen.ego.x_m - x, seen.ego.y_m - y
+    return dy * np.cos(yaw) - dx * np.sin(yaw), wrap_angle(seen.ego.yaw_rad - yaw)
+
+
+def _collides(seen: Observation) -> bool:
+    o, ego = seen.others, seen.ego
+    own = np.broadcast_to([ego.length_m, ego.width_m], (len(o), 2))
+    size = np.stack([o.length_m, o.width_m], axis=1)
+    yaw = np.full(len(o), ego.yaw_rad)
+    level = np.abs(o.z_m - ego.z_m) < (o.height_m + ego.height_m) / 2
+    return bool((level & rectangles_overlap(o.x_m - ego.x_m, o.y_m - ego.y_m, yaw, o.yaw_rad, own, size)).any())
+
+
+def _picture(seen: Observation) -> Any:
+    """The ego, its path and the others, drawn."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.collections import PolyCollection
+    from matplotlib.figure import Figure
+
+    ego, o = seen.ego, seen.others
+    figure = Figure(figsize=(PICTURE_PX / 100, PICTURE_PX / 100), dpi=100)
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.set(xlim=(-PICTURE_M / 2, PICTURE_M / 2), ylim=(-PICTURE_M / 2, PICTURE_M / 2), aspect="equal")
+    axes.axis("off")
+    axes.plot(*_in_frame(ego, seen.path.x_m, seen.path.y_m), color="#9aa5b1", linewidth=1.5)
+    centers = np.stack(_in_frame(ego, o.x_m, o.y_m), axis=1)
+    others = box_corners_bev(centers.reshape(-1, 2), o.length_m, o.width_m, o.yaw_rad - ego.yaw_rad)
+    axes.add_collection(PolyCollection(list(others), facecolor="#7aa6c2", edgecolor="#33566b"))
+    own = box_corners_bev([[0.0, 0.0]], ego.length_m, ego.width_m, 0.0)
+    axes.add_collection(PolyCollection(list(own), facecolor="#1f2933"))
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+gymnasium.register(ID, entry_point="log2sim.simulation.env:ScenarioEnv")

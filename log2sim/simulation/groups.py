@@ -1,0 +1,257 @@
+"""Groups of agents that are driven alike: followers on wheels, followers on foot, the log itself, the user's policy.
+
+A group owns the state of its agents; what it steps with is stateless. All columns are (A,) over the group's agents that
+live in the current window of time; `live` holds their indices in the group.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Agent
+from log2sim.geometry import Array, cos_sin, wrap_angle
+from log2sim.simulation.follower import (
+    Memory,
+    control_step,
+    follow_points,
+    follow_vehicles,
+    start_points,
+    start_vehicles,
+)
+from log2sim.simulation.policy import Controls
+from log2sim.simulation.reference import GRID_S, Reference
+from log2sim.simulation.simulators import Simulator
+from log2sim.simulation.vehicles.model_choice import moving_as
+from log2sim.simulation.vehicles.vehicle import Columns, PointState, VehicleControls, VehicleParameters, VehicleState
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot(Columns):
+    """Box centers in the map and what drives them, (A,); `accel_mps2` is NaN where the model has no such state.
+
+    Commands are those that led here, held over the last step; NaN for agents without.
+    """
+
+    x_m: Array
+    y_m: Array
+    yaw_rad: Array
+    speed_mps: Array
+    steer_rad: Array
+    accel_mps2: Array
+    pedal_command_mps2: Array
+    steer_command_rad: Array
+    gear: Array
+
+
+class Group(ABC):
+    """Agents driven alike. `first`, `last` (A,) are the steps between which each agent lives."""
+
+    driver = "exact"
+    keeps_time = True  # its agents are where the log has them at the same time, after a leap too
+
+    def __init__(self, agents: Sequence[Agent], references: Sequence[Reference], first: NDArray, last: NDArray) -> None:
+        self.agents, self.references, self.first, self.last = tuple(agents), tuple(references), first, last
+        self.origin_x_m = np.array([r.path.origin_m[0] for r in references])
+        self.origin_y_m = np.array([r.path.origin_m[1] for r in references])
+        self.offset_m = np.array([r.offset_m for r in references])
+        self.live = np.zeros(0, dtype=np.intp)
+        self.row = np.zeros((0, 0))
+        self.now_s = 0.0
+
+    def open_window(self, begin: int, end: int, begin_s: float, end_s: float) -> None:
+        """Make the tables of the agents that live within the steps [begin, end) at hand."""
+        self.live = np.flatnonzero((self.first < end) & (self.last >= begin) & (self.last >= self.first))
+        self._row0 = int(np.floor(begin_s / GRID_S))
+        rows = int(np.floor(end_s / GRID_S)) + 3 - self._row0
+        self._table = None
+        if len(self.live):
+            self._table = np.empty((rows, self.references[0].columns.shape[1], len(self.live)))
+            for slot, i in enumerate(self.live):
+                _fill(self._table[:, :, slot], self.references[i], self._row0)
+
+    def log_times(self, t_s: float) -> Array:
+        """When the log was where the living agents are meant to be at a time (A,)."""
+        return np.full(len(self.live), t_s)
+
+    def look_up(self, t_s: float) -> None:
+        """Set `row` (C, A) to the references at a time."""
+        self.now_s = t_s
+        if self._table is None:
+            return
+        place = t_s / GRID_S - self._row0
+        k = int(place)
+        lower = self._table[k]
+        self.row = lower + (place - k) * (self._table[k + 1] - lower)
+
+    @abstractmethod
+    def place(self, index: NDArray, t_s: float) -> None:
+        """Put the agents at `index` (of all agents) on their references at a time."""
+
+    @abstractmethod
+    def snapshot(self) -> Snapshot:
+        """Where the living agents are now."""
+
+    def advance(self, dt_s: float) -> None:
+        """Move the living agents by one step from the time that was looked up; controls are renewed within a long one."""
+        held_s = control_step(dt_s)
+        for part in range(round(dt_s / held_s)):
+            if part:
+                self.look_up(self.now_s + held_s)
+            self._step(held_s)
+
+    @abstractmethod
+    def _step(self, dt_s: float) -> None:
+        """Move the living agents with the controls of this moment."""
+
+    def _exact(self, index: NDArray, t_s: float) -> Array:
+        return np.stack([self.references[i].exact(np.array([t_s]))[0] for i in index], axis=1)
+
+    def _slots(self, index: NDArray) -> NDArray:
+        return np.searchsorted(self.live, index)
+
+
+class Tape(Group):
+    """Agents that are exactly where the log has them."""
+
+    def place(self, index: NDArray, t_s: float) -> None:
+        pass
+
+    def _step(self, dt_s: float) -> None:
+        pass
+
+    def snapshot(self) -> Snapshot:
+        x, y, yaw, speed = self.row[:4]
+        unknown = np.full(len(self.live), np.nan)
+        x, y = x + self.origin_x_m[self.live], y + self.origin_y_m[self.live]
+        return Snapshot(x, y, wrap_angle(yaw), speed, np.zeros(len(self.live)), unknown, unknown, unknown, unknown)
+
+
+class Fleet(Group):
+    """Vehicles that follow their waypoints."""
+
+    driver = "pid"
+
+    def __init__(
+        self,
+        agents: Sequence[Agent],
+        references: Sequence[Reference],
+        first: NDArray,
+        last: NDArray,
+        parameters: VehicleParameters,
+        simulator: Simulator,
+    ) -> None:
+        super().__init__(agents, references, first, last)
+        self.parameters, self.simulator = parameters, simulator
+        self._all = VehicleState.zeros(len(agents))
+        self._all_memory = Memory.fresh(len(agents))
+        self._all_commands = VehicleControls(np.zeros(len(agents)), np.zeros(len(agents)), np.zeros(len(agents), bool))
+        self._open(self.live)
+
+    def _open(self, live: NDArray) -> None:
+        self.state, self.memory, self.living = (
+            self._all.take(live),
+            self._all_memory.take(live),
+            self.parameters.take(live),
+        )
+        self.commands = self._all_commands.take(live)
+
+    def open_window(self, begin: int, end: int, begin_s: float, end_s: float) -> None:
+        self._all.put(self.live, self.state)
+        self._all_memory.put(self.live, self.memory)
+        self._all_commands.put(self.live, self.commands)
+        super().open_window(begin, end, begin_s, end_s)
+        self._open(self.live)
+
+    def place(self, index: NDArray, t_s: float) -> None:
+        slots = self._slots(index)
+        state = start_vehicles(self._exact(index, t_s), self.living.take(slots))
+        if self.references[index[0]].slips:  # all of a fleet have the same model
+            state = moving_as(state, lambda at_s: self._exact(index, at_s), t_s)
+        self.state.put(slots, state)
+        self.memory.put(slots, Memory.fresh(len(slots)))
+        placed = self.state.take(slots)
+        self.commands.put(slots, VehicleControls(placed.pedal_mps2, placed.steer_rad, placed.speed_mps < 0))
+
+    def snapshot(self) -> Snapshot:
+        s, o = self.state, self.offset_m[self.live]
+        cos, sin = cos_sin(s.yaw_rad)
+        x = s.x_m + o * cos + self.origin_x_m[self.live]
+        y = s.y_m + o * sin + self.origin_y_m[self.live]
+        accel = np.where(
+            (s.speed_mps == 0) & (s.pedal_mps2 < 0), 0.0, s.pedal_mps2 * np.where(s.speed_mps < 0, -1.0, 1.0)
+        )
+        c = self.commands
+        gear = np.where(c.reverse, -1.0, 1.0)
+        return Snapshot(x, y, wrap_angle(s.yaw_rad), s.speed_mps, s.steer_rad, accel, c.pedal_mps2, c.steer_rad, gear)
+
+    def _step(self, dt_s: float) -> None:
+        self.commands, self.memory = follow_vehicles(self.row, self.state, self.memory, self.living, dt_s)
+        self.state = self.simulator.step_vehicles(self.state, self.commands, self.living, dt_s)
+
+
+class Driven(Fleet):
+    """The one vehicle that the user's policy drives, by the controls set before each step."""
+
+    driver = "policy"
+    keeps_time = False
+    controls = Controls(0.0, 0.0)
+
+    def _step(self, dt_s: float) -> None:
+        c = self.controls
+        self.commands = VehicleControls(
+            np.array([c.accel_mps2], float), np.array([c.steer_rad], float), np.array([c.reverse], bool)
+        )
+        self.state = self.simulator.step_vehicles(self.state, self.commands, self.living, dt_s)
+
+
+class Crowd(Group):
+    """Points that follow their waypoints."""
+
+    driver = "pid"
+
+    def __init__(
+        self,
+        agents: Sequence[Agent],
+        references: Sequence[Reference],
+        first: NDArray,
+        last: NDArray,
+        simulator: Simulator,
+    ) -> None:
+        super().__init__(agents, references, first, last)
+        self.simulator = simulator
+        self._all = PointState.zeros(len(agents))
+        self.state = self._all.take(self.live)
+
+    def open_window(self, begin: int, end: int, begin_s: float, end_s: float) -> None:
+        self._all.put(self.live, self.state)
+        super().open_window(begin, end, begin_s, end_s)
+        self.state = self._all.take(self.live)
+
+    def place(self, index: NDArray, t_s: float) -> None:
+        slots = self._slots(index)
+        self.state.put(slots, start_points(self._exact(index, t_s)))
+
+    def snapshot(self) -> Snapshot:
+        s, yaw = self.state, self.row[2]
+        speed = s.velocity_x_mps * np.cos(yaw) + s.velocity_y_mps * np.sin(yaw)
+        x, y = s.x_m + self.origin_x_m[self.live], s.y_m + self.origin_y_m[self.live]
+        unknown = np.full(len(x), np.nan)
+        return Snapshot(x, y, wrap_angle(yaw), speed, np.zeros(len(x)), unknown, unknown, unknown, unknown)
+
+    def _step(self, dt_s: float) -> None:
+        self.state = self.simulator.step_points(self.state, follow_points(self.row, self.state), dt_s)
+
+
+def _fill(window: Array, reference: Reference, row0: int) -> None:
+    """Copy the rows from `row0` on of a table to a window (W, C); its first and last row stand for before and after."""
+    columns, begin = reference.columns, reference.first_row - row0
+    low = min(max(begin, 0), len(window))
+    high = min(max(begin + len(columns), low), len(window))
+    window[:low] = columns[0]
+    window[low:high] = columns[low - begin : high - begin]
+    window[high:] = columns[-1]

@@ -1,0 +1,109 @@
+"""All metrics of a replay: tracking, collisions, pairs that come near each other in time, comfort."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.simulation.metrics.box_tracks import Boxes
+from log2sim.simulation.metrics.collisions import collisions
+from log2sim.simulation.metrics.comfort import comfort
+from log2sim.simulation.metrics.conflicts import conflicts, least
+from log2sim.simulation.metrics.tracking_error import Errors, agent_metrics, overall
+from log2sim.simulation.path import Path
+from log2sim.simulation.result import AgentReplay
+from log2sim.simulation.step_clock import Clock
+from log2sim.simulation.vehicles.parameters import WHEELED
+
+FOLLOWING = ("pid", "exact")
+"""Drivers that are held against the log."""
+
+
+def assess(
+    agents: Sequence[AgentReplay],
+    stored: Sequence[NDArray[np.intp]],
+    paths: Mapping[str, Path],
+    errors: Mapping[str, Errors],
+    clock: Clock,
+) -> dict[str, Any]:
+    """The metrics of `schemas/replay-1.json`, by agent and overall.
+
+    Parameters
+    ----------
+    agents : sequence of AgentReplay
+    stored : sequence of (S,) int
+        The steps of each agent's rows; of a static agent all stored steps at which it is there.
+    paths, errors : by id
+        Courses of the agents that move in the log, and how far they are from them.
+    """
+    ids = [a.id for a in agents]
+    replayed, logged = (_boxes(agents, stored, source, clock) for source in ({}, paths))
+    moves = np.array([a.driver != "static" for a in agents], dtype=bool)
+    rows = np.arange(len(replayed.x_m), dtype=np.float64)
+    t_s = clock.begin_s + rows * (clock.store_every * clock.dt_s)
+    events = collisions(replayed, logged, moves, t_s, ids)
+    near = conflicts(replayed, moves, t_s, ids, events)
+    events_of, near_of = _by_agent(events), _by_agent(near)
+    by_agent = {
+        a.id: {
+            **agent_metrics(errors[a.id]),
+            "min_ttc_s": (least(near_of[a.id], "min_ttc") or {}).get("s"),
+            "min_pet_s": (least(near_of[a.id], "pet") or {}).get("s"),
+            "comfort": _comfort(a, paths[a.id]),
+            "collisions": events_of[a.id],
+        }
+        for a in agents
+        if a.id in errors
+    }
+    on_time = {a.id: len(a) for a in agents if a.driver == "pid"}
+    on_way = on_time | {a.id: len(a) for a in agents if a.driver == "reactive"}
+    return {
+        **overall(by_agent, on_time, on_way),
+        "collisions": events,
+        "new_collisions": sum(not e["in_log"] for e in events),
+        "min_ttc": least(near, "min_ttc"),
+        "min_pet": least(near, "pet"),
+        "conflicts": near,
+        "by_agent": by_agent,
+    }
+
+
+def _by_agent(records: Iterable[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """The records by the id of each of their agents."""
+    found: dict[str, list[Any]] = defaultdict(list)
+    for record in records:
+        for id in record["agents"]:
+            found[id].append(record)
+    return found
+
+
+def _comfort(agent: AgentReplay, path: Path) -> dict[str, float | bool] | None:
+    """Comfort of a vehicle; None for who walks, and where the log leaps."""
+    if agent.category not in WHEELED or len(path.jump_times()):
+        return None
+    return comfort(agent.t_s, agent.x_m, agent.y_m, agent.yaw_rad)
+
+
+def _boxes(
+    agents: Sequence[AgentReplay], stored: Sequence[NDArray[np.intp]], paths: Mapping[str, Path], clock: Clock
+) -> Boxes:
+    """Boxes at all stored steps, of the replay or, for agents with a path given, of the log."""
+    shape = ((clock.steps - 1) // clock.store_every + 1, len(agents))
+    columns = np.full((5, *shape), np.nan)
+    for k, (agent, steps) in enumerate(zip(agents, stored)):
+        rows = steps // clock.store_every
+        if agent.id in paths:
+            x, y, yaw, speed = paths[agent.id].centers(agent.t_s)
+            columns[:, rows, k] = np.stack([x, y, paths[agent.id].heights(agent.t_s), yaw, speed])
+        elif len(rows) == len(agent):
+            columns[:, rows, k] = agent.x_m, agent.y_m, agent.z_m, agent.yaw_rad, agent.speed_mps
+        elif len(rows):  # one pose for all rows
+            pose = [agent.x_m[0], agent.y_m[0], agent.z_m[0], agent.yaw_rad[0], agent.speed_mps[0]]
+            columns[:, rows, k] = np.array(pose)[:, None]
+    size = np.array([a.size_m for a in agents], dtype=np.float64).reshape(-1, 3)
+    x, y, z, yaw, speed = columns
+    return Boxes(x, y, z, yaw, speed, size)

@@ -1,0 +1,75 @@
+"""What a replay came to, in a few lines for people."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from log2sim.simulation.metrics.all_metrics import FOLLOWING
+from log2sim.simulation.metrics.conflicts import least
+from log2sim.simulation.result import Replay
+
+MOST_LISTED = 5
+
+
+def summarize(replay: Replay) -> str:
+    """Errors in one line, what agents did to each other, what moved them, then the first collisions, new ones first.
+
+    Where a policy drives the ego, the times are those of the ego. An error that no agent can have is a dash.
+    """
+    m = replay.metrics
+    driven = any(a.driver == "policy" for a in replay.agents)
+    near = [e for e in m["conflicts"] if e["ego"] or not driven]
+    whose = " of the ego" if driven else ""
+    lines = [
+        _errors(replay),
+        f"{_counted(len(m['collisions']), 'collision')}, {m['new_collisions']} that the log does not have · "
+        f"least time to collision{whose} {_least(near, 'min_ttc')} · post-encroachment time {_least(near, 'pet')}",
+    ]
+    lines += _models(replay)
+    events = sorted(m["collisions"], key=lambda e: (e["in_log"], e["t_s"]))
+    lines += [f"  {_collision(e)}" for e in events[:MOST_LISTED]]
+    if len(events) > MOST_LISTED:
+        lines.append(f"  and {len(events) - MOST_LISTED} more")
+    return "\n".join(lines)
+
+
+def _errors(replay: Replay) -> str:
+    """Errors across of all who keep to the way of the log, and those in time of all who also do as it did."""
+    m, drivers = replay.metrics, {a.driver for a in replay.agents}
+    on_time = bool(drivers & {*FOLLOWING})
+    across, along, speed = "-", "-", "-"
+    if on_time or "reactive" in drivers:
+        across = f"{m['cross_track_rms_m']:.3f} m rms, {m['cross_track_max_m']:.3f} m max"
+    if on_time:
+        along, speed = f"{m['along_track_rms_m']:.3f} m rms", f"{m['speed_rms_mps']:.3f} m/s rms"
+    return f"cross-track {across} · along-track {along} · speed {speed}"
+
+
+def _models(replay: Replay) -> list[str]:
+    """How many agents each model moves in one line, and why for the first of those that slip without being asked to."""
+    counts = Counter(a.model for a in replay.agents if a.model != "none")
+    if not counts:
+        return []
+    chosen = [a for a in replay.agents if a.model == "dynamic" and replay.model == "auto"]
+    found = [f"  {a.id} dynamic: {a.model_reason}" for a in chosen[:MOST_LISTED]]
+    if len(chosen) > MOST_LISTED:
+        found.append(f"  and {len(chosen) - MOST_LISTED} more")
+    return ["models: " + ", ".join(f"{count} {model}" for model, count in counts.most_common()), *found]
+
+
+def _collision(event: Mapping[str, Any]) -> str:
+    known = ", as in the log" if event["in_log"] else ""
+    return f"{' and '.join(event['agents'])} collide at {event['t_s']:.2f} s ({event['relative_speed_mps']:.1f} m/s){known}"
+
+
+def _least(near: Sequence[Mapping[str, Any]], key: str) -> str:
+    found = least(near, key)
+    if found is None:
+        return "-"
+    return f"{found['s']:.2f} s ({' and '.join(found['agents'])} at {found['t_s']:.2f} s)"
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"

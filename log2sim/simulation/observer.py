@@ -1,0 +1,126 @@
+"""What the policy of the ego sees of a world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Agent
+from log2sim.geometry import Array, wrap_angle
+from log2sim.simulation.groups import Driven, Group
+from log2sim.simulation.path import Path, path_of
+from log2sim.simulation.policy import (
+    PATH_AHEAD_M,
+    ROUTE_AHEAD_S,
+    ROUTE_STEP_S,
+    EgoState,
+    Observation,
+    Others,
+    PathAhead,
+    Route,
+)
+from log2sim.simulation.reactive.path_table import SPACING_M, Ways
+
+ONE = np.zeros(1, dtype=np.intp)
+
+
+class Observer:
+    """Observations for the one vehicle that a policy drives, among all groups and static agents."""
+
+    def __init__(self, ego: Driven, groups: Sequence[Group], statics: Sequence[Agent], sight_m: float) -> None:
+        self.ego, self.sight_m = ego, sight_m
+        self._path = ego.references[0].path
+        self._way = Ways([self._path])
+        self._groups = [g for g in groups if g is not ego]
+        self._statics = _poses(statics)
+        lives = [(-np.inf, np.inf) if a.stays else (a.waypoints.t_s[0], a.waypoints.t_s[-1]) for a in statics]
+        self._static_lives_s = np.array(lives, dtype=np.float64).reshape(-1, 2)
+        self._agents = [_identities(g.agents, [r.path for r in g.references]) for g in self._groups]
+        self._static_agents = _identities(statics, [path_of(a, 0.0) for a in statics])
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew."""
+        self.progress_m = 0.0
+
+    def __call__(self, step: int, t_s: float, dt_s: float) -> Observation:
+        """What the policy sees at a step; call it in the order of steps."""
+        ahead = self._ahead()
+        ego = self._state()
+        return Observation(t_s, dt_s, ego, self._others(ego, step, t_s), self._route(t_s), ahead)
+
+    def _state(self) -> EgoState:
+        """The ego, at the height of its recorded way at `progress_m`."""
+        agent, s, p = self.ego.agents[0], self.ego.snapshot(), self.ego.living
+        log_t_s = self._way.times(ONE, np.array([self.progress_m]))
+        return EgoState(
+            x_m=float(s.x_m[0]),
+            y_m=float(s.y_m[0]),
+            z_m=float(self._path.heights(log_t_s)[0]),
+            yaw_rad=float(s.yaw_rad[0]),
+            speed_mps=float(s.speed_mps[0]),
+            accel_mps2=float(s.accel_mps2[0]),
+            steer_rad=float(s.steer_rad[0]),
+            length_m=agent.size_m[0],
+            width_m=agent.size_m[1],
+            height_m=agent.size_m[2],
+            wheelbase_m=float(p.wheelbase_m[0]),
+            rear_axle_offset_m=float(p.rear_axle_offset_m[0]),
+            understeer_s2pm2=float(p.understeer_s2pm2[0]),
+        )
+
+    def _route(self, t_s: float) -> Route:
+        ahead = np.arange(t_s, min(t_s + ROUTE_AHEAD_S, self._path.t_s[-1]) + ROUTE_STEP_S / 2, ROUTE_STEP_S)
+        return Route(*(_locked(c) for c in (ahead, *self._path.centers(ahead))))
+
+    def _ahead(self) -> PathAhead:
+        way, now = self._way, self.ego.snapshot()
+        self.progress_m = way.beside(0, self.progress_m, float(now.x_m[0]), float(now.y_m[0]))
+        ahead = np.arange(0.0, PATH_AHEAD_M + SPACING_M / 2, SPACING_M)
+        x, y, cos, sin, at_s = way.along(ONE, self.progress_m + ahead)
+        pace = np.abs(way.at(ONE, np.where(np.isnan(at_s), self._path.t_s[-1], at_s)).speed_mps)
+        columns = (ahead, x + way.origin_m[0], y + way.origin_m[1], wrap_angle(np.arctan2(sin, cos)), pace, at_s)
+        return PathAhead(self.progress_m, *(_locked(c) for c in columns))
+
+    def _others(self, ego: EgoState, step: int, t_s: float) -> Others:
+        begin_s, end_s = self._static_lives_s.T
+        here = (begin_s <= t_s) & (t_s <= end_s)
+        poses, who, log_s = [self._statics[:, here]], [self._static_agents[here]], [np.full(here.sum(), t_s)]
+        for group, agents in zip(self._groups, self._agents):
+            if len(group.live):
+                present = (group.first[group.live] <= step) & (step <= group.last[group.live])
+                s = group.snapshot()
+                poses.append(np.stack([s.x_m, s.y_m, s.yaw_rad, s.speed_mps])[:, present])
+                who.append(agents[group.live[present]])
+                log_s.append(group.log_times(t_s)[present])
+        x, y, yaw, speed = np.concatenate(poses, axis=1)
+        distance = np.hypot(x - ego.x_m, y - ego.y_m)
+        near = np.argsort(distance, kind="stable")
+        near = near[distance[near] <= self.sight_m]
+        x, y, yaw, speed, seen = x[near], y[near], yaw[near], speed[near], np.concatenate(who)[near]
+        z = np.array([path.heights(t) for path, t in zip(seen["path"], np.concatenate(log_s)[near])], dtype=np.float64)
+        size = (seen[k] for k in ("length_m", "width_m", "height_m"))
+        columns = (x, y, z, yaw, speed, speed * np.cos(yaw), speed * np.sin(yaw), *size)
+        return Others(_locked(seen["id"]), _locked(seen["category"]), *(_locked(c) for c in columns))
+
+
+def _identities(agents: Sequence[Agent], paths: Sequence[Path]) -> NDArray:
+    """Id, category, size and logged path of agents as records (A,)."""
+    rows = [(a.id, a.category, *a.size_m, path) for a, path in zip(agents, paths)]
+    sizes = [(k, np.float64) for k in ("length_m", "width_m", "height_m")]
+    return np.array(rows, dtype=[("id", object), ("category", object), *sizes, ("path", object)])
+
+
+def _poses(agents: Sequence[Agent]) -> Array:
+    """x, y, yaw and speed (4, A) of agents that stand."""
+    first = [(a.waypoints.x_m[0], a.waypoints.y_m[0], a.waypoints.yaw_rad[0], 0.0) for a in agents]
+    return np.array(first, dtype=np.float64).reshape(-1, 4).T
+
+
+def _locked(values: NDArray) -> NDArray:
+    """The array, which nobody can change from now on; strings as such and not as objects."""
+    out = values.astype(str) if values.dtype == object else np.ascontiguousarray(values)
+    out.setflags(write=False)
+    return out

@@ -1,0 +1,101 @@
+"""Groups of reactive agents: driven like their kind, on references that they go through at their own rate."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import Array
+from log2sim.simulation.groups import Crowd, Fleet, Group, Tape
+from log2sim.simulation.reactive.traffic import Traffic
+from log2sim.simulation.reference import GRID_S, POINT_COLUMNS, STANDSTILL_MPS, VEHICLE_COLUMNS
+from log2sim.simulation.step_clock import Clock
+
+SPEEDS = {"speed": "accel_ahead", "velocity_x": "accel_x", "velocity_y": "accel_y"}
+"""Columns that go with the rate, and those of their change."""
+
+
+class Reactive(Group):
+    """A group whose agents are at the place of their log that `traffic` says, and pass it at its rate."""
+
+    driver = "reactive"
+    keeps_time = False
+    columns: tuple[str, ...] = ("x", "y", "yaw", "speed")
+
+    def join(self, traffic: Traffic, clock: Clock) -> None:
+        """Take part in the traffic; to be called once, before anything else."""
+        self.traffic, self.clock, self._logged_last = traffic, clock, self.last
+        self.index = np.array([traffic.index[a.id] for a in self.agents], dtype=np.intp)
+        self._end_s = np.array([r.path.t_s[-1] for r in self.references])
+        self._first_row = np.array([r.first_row for r in self.references], dtype=np.intp)
+        self._rows = np.array([len(r.columns) for r in self.references], dtype=np.intp)
+        self._begin = np.cumsum(self._rows) - self._rows
+        self._flat = np.concatenate([r.columns for r in self.references])
+        leaps = [(k, t) for k, r in enumerate(self.references) for t in r.path.jump_times()]
+        # As in the log, who leaps is placed again once the row that blends both sides is past.
+        self._leaps = np.array([(k, t + wait) for k, t in leaps for wait in (0.0, GRID_S)]).reshape(-1, 2)
+        self._tau = np.full(len(self.agents), -np.inf)
+
+    def open_window(self, begin: int, end: int, begin_s: float, end_s: float) -> None:
+        if begin == 0:
+            self.last, self._tau = self._logged_last, np.full(len(self.agents), -np.inf)
+        super().open_window(begin, end, begin_s, end_s)
+
+    def log_times(self, t_s: float) -> Array:
+        return t_s - self.traffic.delay_s[self.index[self.live]]
+
+    def look_up(self, t_s: float) -> None:
+        """Set `row` (C, A) to the references at the places where the agents are."""
+        self.now_s = t_s
+        live, delay = self.live, self.traffic.delay_s[self.index]
+        # Who fell behind lives on until it has come to the end of its log.
+        self.last = np.minimum(self.clock.last_step(self._end_s + delay), self.clock.steps - 1)
+        tau = t_s - delay
+        last = self._rows[live] - 1
+        place = np.clip(tau[live] / GRID_S - self._first_row[live], 0.0, last)
+        k = np.minimum(place.astype(np.intp), np.maximum(last - 1, 0))
+        low = self._flat[self._begin[live] + k]
+        high = self._flat[self._begin[live] + np.minimum(k + 1, last)]
+        self.row = self._slowed((low + (place - k)[:, None] * (high - low)).T, live)
+        agent, at_s = self._leaps[:, 0].astype(np.intp), self._leaps[:, 1]
+        leapt = (self._tau[agent] < at_s) & (at_s <= tau[agent]) & np.isfinite(self._tau[agent])
+        self._tau = tau
+        if leapt.any():
+            self.place(np.intersect1d(agent[leapt], live), t_s)
+
+    def _exact(self, index: NDArray, t_s: float) -> Array:
+        at_s = t_s - self.traffic.delay_s[self.index[index]]
+        rows = [self.references[i].exact(np.array([t]))[0] for i, t in zip(index, at_s)]
+        return self._slowed(np.stack(rows, axis=1), index)
+
+    def _slowed(self, row: Array, index: NDArray) -> Array:
+        """The rows (C, N) of agents that pass their places at their rate."""
+        rate, slope = self.traffic.rate[self.index[index]], self.traffic.rate_slope[self.index[index]]
+        if np.all(rate == 1):
+            return row
+        row = row.copy()
+        names = {name: k for k, name in enumerate(self.columns)}
+        speeds = [names[speed] for speed in SPEEDS if speed in names]
+        for speed, change in SPEEDS.items():
+            if change in names:
+                row[names[change]] = row[names[change]] * rate**2 + row[names[speed]] * slope
+        row[speeds] *= rate
+        if "stands" in names:
+            row[names["stands"]] = np.maximum(row[names["stands"]], np.hypot.reduce(row[speeds]) < STANDSTILL_MPS)
+        return row
+
+
+class ReactiveFleet(Reactive, Fleet):
+    """Vehicles that react."""
+
+    columns = VEHICLE_COLUMNS
+
+
+class ReactiveCrowd(Reactive, Crowd):
+    """Points that react."""
+
+    columns = POINT_COLUMNS
+
+
+class ReactiveTape(Reactive, Tape):
+    """Agents that react and are exactly on their logged way."""

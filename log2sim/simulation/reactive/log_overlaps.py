@@ -1,0 +1,43 @@
+"""Which pairs of agents the log drives into each other, so that it cannot be a model of how to drive."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import Array
+from log2sim.simulation.metrics.box_tracks import Boxes
+from log2sim.simulation.metrics.collisions import contacts
+from log2sim.simulation.reactive.path_table import TIME_STEP_S, Ways
+
+DEEP_M = 0.5  # more than boxes err by
+CHUNK = 200
+
+
+def deep_overlaps(ways: Ways, size_m: Array, static: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pairs (A, A) whose logged boxes come to overlap by more than `DEEP_M` although they did not from the start.
+
+    Those that overlap from the start are one object seen twice, or a load and its carrier: nothing to brake for.
+    """
+    count = len(size_m)
+    deep, together = np.zeros((2, count, count), dtype=bool)
+    stays = static & (ways.begin_s == ways.end_s)
+    moving = ~static
+    if not moving.any():
+        return deep
+    begin_s = np.where(stays, -np.inf, ways.begin_s)
+    end_s = np.where(stays, np.inf, ways.end_s)
+    t_s = np.arange(ways.begin_s[moving].min(), ways.end_s[moving].max() + TIME_STEP_S, TIME_STEP_S)
+    size = np.maximum(size_m - [DEEP_M, DEEP_M, 0.0], 0.1)
+    everybody = np.arange(count)
+    for part in np.split(t_s, range(CHUNK, len(t_s), CHUNK)):
+        pose = ways.at(everybody, part[:, None])
+        there = (begin_s <= part[:, None]) & (part[:, None] <= end_s)
+        x, y, z, yaw, speed = (np.where(there, c, np.nan) for c in pose[:5])
+        found = contacts(Boxes(x, y, z, yaw, speed, size), moving)
+        a, b = found.a, found.b
+        deep[a, b] = True
+        at_once = part[found.first_row.astype(np.intp)] <= np.maximum(begin_s[a], begin_s[b]) + TIME_STEP_S
+        together[a[at_once], b[at_once]] = True
+    into = deep & ~together
+    return into | into.T

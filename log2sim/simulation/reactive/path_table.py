@@ -1,0 +1,189 @@
+"""The ways of many agents' box centers, by time and by distance, in flat tables that are read for all at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import Array
+from log2sim.simulation.path import Path
+
+TIME_STEP_S = 0.1  # linear in between: off by a h^2 / 8, a centimeter at 10 m/s2
+SPACING_M = 1.0
+EXTENSION_M = 120.0
+"""How far a way goes straight on beyond the end of the log: as far as a driver looks ahead."""
+
+BACK_M, ON_M = 5.0, 20.0
+"""How far from its last place an agent is looked for on its way: so it stays on its branch where ways cross."""
+
+STANDING_MPS = 0.15  # what moves slower stands, and its jitter is no way
+COARSE = 4  # rows between those that a search looks at first
+
+
+class Pose(NamedTuple):
+    """Box centers relative to the origin of the ways: yaw unwrapped, signed speed, distance gone since the life began."""
+
+    x_m: Array
+    y_m: Array
+    z_m: Array
+    yaw_rad: Array
+    speed_mps: Array
+    distance_m: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Foot:
+    """Points seen from the places of a way that are nearest to them: ahead of and left of that place, in m.
+
+    `cos`, `sin` is the direction of travel there, `distance_m` the way up to it, `t_s` the log's time there (NaN beyond).
+    """
+
+    ahead_m: Array
+    left_m: Array
+    cos: Array
+    sin: Array
+    distance_m: Array
+    t_s: Array
+
+
+class Ways:
+    """Ways of A agents. Positions are relative to `origin_m`, which keeps digits far from the map's origin."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self.origin_m = paths[0].origin_m if paths else (0.0, 0.0)
+        self.begin_s = np.array([p.t_s[0] for p in paths], dtype=np.float64)
+        self.end_s = np.array([p.t_s[-1] for p in paths], dtype=np.float64)
+        tables = [_by_time(p, self.origin_m) for p in paths]
+        marks = [_by_distance(t) for t in tables]
+        self._row0, self._rows = _offsets(tables)
+        self._mark0, self.marks = _offsets(marks)
+        self._poses = np.concatenate([t[:, 1:] for t in tables]) if tables else np.zeros((0, 6))
+        self._marks = np.concatenate(marks) if marks else np.zeros((0, 5))
+
+    def at(self, agent: NDArray[np.intp], t_s: Array) -> Pose:
+        """Where agents are at times of the log, broadcast together: held before their life, going straight on after it."""
+        begin, end, rows = self.begin_s[agent], self.end_s[agent], self._rows[agent]
+        step = np.where(rows > 1, (end - begin) / np.maximum(rows - 1, 1), 1.0)
+        place = np.clip((t_s - begin) / step, 0.0, rows - 1)
+        k = np.minimum(place.astype(np.intp), np.maximum(rows - 2, 0))
+        low = self._poses[self._row0[agent] + k]
+        high = self._poses[self._row0[agent] + np.minimum(k + 1, rows - 1)]
+        x, y, z, yaw, speed, distance = np.moveaxis(low + (place - k)[..., None] * (high - low), -1, 0)
+        beyond = np.maximum(t_s - end, 0.0) * speed
+        return Pose(x + beyond * np.cos(yaw), y + beyond * np.sin(yaw), z, yaw, speed, distance + np.abs(beyond))
+
+    def along(self, agent: NDArray[np.intp], distance_m: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """x, y, direction of travel as cos, sin, and the log's time at distances, broadcast together."""
+        place = np.clip(distance_m / SPACING_M, 0.0, self.marks[agent] - 1)
+        k = np.minimum(place.astype(np.intp), self.marks[agent] - 2)
+        low, high = self._marks[self._mark0[agent] + k], self._marks[self._mark0[agent] + k + 1]
+        x, y, cos, sin, t_s = np.moveaxis(low + (place - k)[..., None] * (high - low), -1, 0)
+        return x, y, cos, sin, t_s
+
+    def foot(self, agent: NDArray[np.intp], from_m: Array, reach_m: float, x_m: Array, y_m: Array) -> Foot:
+        """The places within `reach_m` from `from_m` (P,) on the ways of agents (P,) that are nearest to points (P, H)."""
+        first = np.clip((from_m / SPACING_M).astype(np.intp), 0, self.marks[agent] - 1)
+        ahead = np.arange(0, int(reach_m / SPACING_M) + COARSE, COARSE)
+        k = np.minimum(first[:, None] + ahead, self.marks[agent][:, None] - 1)
+        near = self._marks[self._mark0[agent][:, None] + k, :2]
+        # |a - b|^2 less |a|^2, which is the same for all b.
+        square = (near**2).sum(axis=2)[:, None] - 2 * np.stack([x_m, y_m], axis=2) @ near.swapaxes(1, 2)
+        k = np.take_along_axis(k, np.argmin(square, axis=2), axis=1)
+        begin = self._mark0[agent][:, None]
+        for _ in range(2):
+            x, y, cos, sin, t_s = np.moveaxis(self._marks[begin + k], -1, 0)
+            dx, dy = x_m - x, y_m - y
+            forward = dx * cos + dy * sin
+            moved = k + np.clip(np.rint(forward / SPACING_M), -COARSE, COARSE).astype(np.intp)
+            moved = np.clip(moved, first[:, None], self.marks[agent][:, None] - 1)
+            if np.array_equal(moved, k):
+                break
+            k = moved
+        x, y, cos, sin, t_s = np.moveaxis(self._marks[begin + k], -1, 0)
+        dx, dy = x_m - x, y_m - y
+        return Foot(dx * cos + dy * sin, dy * cos - dx * sin, cos, sin, k * SPACING_M, t_s)
+
+    def beside(self, agent: int, from_m: float, x_m: float, y_m: float) -> float:
+        """How far along its way an agent is that is at a place of the map and was at `from_m` before; at least 0."""
+        begin_m = max(from_m - BACK_M, 0.0)
+        x, y = (np.array([[c - o]]) for c, o in zip((x_m, y_m), self.origin_m))
+        foot = self.foot(np.array([agent]), np.array([begin_m]), from_m - begin_m + ON_M, x, y)
+        return max(float(foot.distance_m[0, 0] + foot.ahead_m[0, 0]), 0.0)
+
+    def times(self, agent: NDArray[np.intp], distance_m: Array) -> Array:
+        """When the log was at distances along ways, broadcast together; its end for what is beyond."""
+        t_s = self.along(agent, distance_m)[4]
+        return np.where(np.isnan(t_s), self.end_s[agent], t_s)
+
+
+def times_beside(path: Path, x_m: Array, y_m: Array) -> Array:
+    """When the log was beside the places (S,) of an agent that drives as it likes, one after the other along its path."""
+    way, gone_m = Ways([path]), np.zeros(len(x_m))
+    for k, (x, y) in enumerate(zip(x_m.tolist(), y_m.tolist())):
+        gone_m[k] = way.beside(0, gone_m[k - 1] if k else 0.0, x, y)
+    return way.times(np.zeros(1, dtype=np.intp), gone_m)
+
+
+def times_at(path: Path, t_s: Array, x_m: Array, y_m: Array) -> Array:
+    """When the log was where an agent that goes along its path is (S,): the time of the same distance gone.
+
+    An agent that keeps its way yet not its times has its height and its errors from there.
+    """
+    table = _by_time(path, path.origin_m)
+    gone = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x_m), np.diff(y_m)))])
+    start = float(np.interp(t_s[0], table[:, 0], table[:, 6]))
+    return np.maximum(np.minimum(np.interp(start + gone, table[:, 6], table[:, 0]), t_s), path.t_s[0])
+
+
+def _by_time(path: Path, origin_m: tuple[float, float]) -> Array:
+    """Rows (K, 7) evenly spaced over a life: time, then the columns of a `Pose`."""
+    begin, end = path.t_s[0], path.t_s[-1]
+    count = int(np.ceil((end - begin) / TIME_STEP_S)) + 1 if end > begin else 1
+    t_s = np.linspace(begin, end, count)
+    x, y, yaw, speed = path.at(t_s)
+    step = np.hypot(np.diff(x), np.diff(y))
+    if count > 1:
+        step = np.where(step < STANDING_MPS * (t_s[1] - t_s[0]), 0.0, step)
+    distance = np.concatenate([[0.0], np.cumsum(step)])
+    dx, dy = path.origin_m[0] - origin_m[0], path.origin_m[1] - origin_m[1]
+    return np.stack([t_s, x + dx, y + dy, path.heights(t_s), yaw, speed, distance], axis=1)
+
+
+def _by_distance(table: Array) -> Array:
+    """Rows (K, 5) every `SPACING_M` of a way: x, y, direction of travel as cos, sin, and time."""
+    t_s, x, y, _, yaw, speed, distance = table.T
+    whole = np.arange(int(distance[-1] / SPACING_M) + 1) * SPACING_M
+    moved = np.concatenate([[True], np.diff(distance) > 0])
+    x, y, t = (np.interp(whole, distance[moved], c[moved]) for c in (x, y, t_s))
+    if len(whole) > 1:
+        dx, dy = np.gradient(x), np.gradient(y)
+        length = np.hypot(dx, dy)
+        cos, sin = (
+            np.divide(dx, length, out=np.ones_like(dx), where=length > 0),
+            np.divide(dy, length, out=np.zeros_like(dy), where=length > 0),
+        )
+    else:
+        heading = yaw[0] if speed.sum() >= 0 else yaw[0] + np.pi
+        cos, sin = np.array([np.cos(heading)]), np.array([np.sin(heading)])
+    on = np.arange(1, int(EXTENSION_M / SPACING_M) + 1) * SPACING_M
+    beyond = np.stack(
+        [
+            x[-1] + on * cos[-1],
+            y[-1] + on * sin[-1],
+            np.full(len(on), cos[-1]),
+            np.full(len(on), sin[-1]),
+            np.full(len(on), np.nan),
+        ],
+        axis=1,
+    )
+    return np.concatenate([np.stack([x, y, cos, sin, t], axis=1), beyond])
+
+
+def _offsets(tables: Sequence[Array]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First row and number of rows of each table once they are joined."""
+    count = np.array([len(t) for t in tables], dtype=np.intp)
+    return np.cumsum(count) - count, count

@@ -1,0 +1,113 @@
+"""Where boxes reach into the corridor that an agent is about to sweep on its own way."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import Array
+from log2sim.simulation.reactive.path_table import Ways
+
+HORIZON_S = np.arange(0.0, 3.01, 0.25)
+"""Times (H,) ahead at which others are expected somewhere: a car that crosses at 20 m/s moves by its length in between."""
+
+
+class Boxes(NamedTuple):
+    """Boxes that pairs of agents look at, at the times of the horizon: centers, yaw, speed (P, H), length and width (P,)."""
+
+    x_m: Array
+    y_m: Array
+    yaw_rad: Array
+    speed_mps: Array
+    length_m: Array
+    width_m: Array
+
+
+class Corridor(NamedTuple):
+    """What agents (P,) are about to sweep: whose way, how far they are on it, their size, how fast they go.
+
+    `progress_m` (P, H) is how far they mean to go from here until the times of the horizon, `reach_m` how far they look.
+    """
+
+    agent: NDArray[np.intp]
+    distance_m: Array
+    length_m: Array
+    width_m: Array
+    pace_mps: Array
+    progress_m: Array
+    reach_m: float
+
+
+class Room(NamedTuple):
+    """What is kept clear: on both sides, before what crosses as a way and as a time; `behind_m` widens what is ahead."""
+
+    side_m: float
+    crossing_m: float
+    crossing_s: float
+    behind_m: float
+
+
+class Leaders(NamedTuple):
+    """What agents (P,) have to keep clear of: `gap_m` from the front bumper, inf where nothing; its speed along the way.
+
+    `ahead_s` is when it is in the way (0 where it is now), `own_t_s` the log's time of the agent at that place.
+    """
+
+    gap_m: Array
+    speed_mps: Array
+    ahead_s: Array
+    own_t_s: Array
+
+
+def leaders(ways: Ways, corridor: Corridor, boxes: Boxes, room: Room) -> Leaders:
+    """For each pair, what the agent has to keep clear of in the other's box, now or within the horizon.
+
+    Notes
+    -----
+    A box that is in the corridor and will stay there is followed. One that crosses counts if the agent, going as it means
+    to, comes near it while it is in the corridor. Boxes whose center is behind that of the agent never count. What moves
+    along the way while it comes in has its gap taken back to now, so a cut-in is a leader. Cost: P H reach / 4 distances.
+    """
+    c = corridor
+    foot = ways.foot(c.agent, c.distance_m, c.reach_m, boxes.x_m, boxes.y_m)
+    cos, sin = np.cos(boxes.yaw_rad), np.sin(boxes.yaw_rad)
+    turn_cos, turn_sin = cos * foot.cos + sin * foot.sin, sin * foot.cos - cos * foot.sin
+    half_length, half_width = boxes.length_m[:, None] / 2, boxes.width_m[:, None] / 2
+    within = c.width_m[:, None] / 2 + room.side_m
+    center = foot.distance_m + foot.ahead_m - c.distance_m[:, None]
+    inside = np.abs(foot.left_m) < within + half_length * np.abs(turn_sin) + half_width * np.abs(turn_cos)
+    ahead = center > c.progress_m - room.behind_m
+    # Who is once behind within the corridor comes from behind and has to see to it itself.
+    inside &= ahead & ~np.logical_or.accumulate(inside & ~ahead, axis=1)
+    gap = center + _nearest_edge(foot.left_m, turn_cos, turn_sin, half_length, half_width, within)
+    gap -= c.length_m[:, None] / 2
+
+    stays = inside[:, 0] & inside[:, -1]
+    met = inside & (gap <= c.progress_m + room.crossing_m + room.crossing_s * c.pace_mps[:, None])
+    first = np.where(stays, 0, np.argmax(met, axis=1))
+    row = np.arange(len(first))
+    ahead_s, speed = HORIZON_S[first], (boxes.speed_mps * turn_cos)[row, first]
+    now = gap[row, first] - np.maximum(speed, 0.0) * ahead_s
+    own_t_s = foot.t_s[row, first]
+    return Leaders(
+        np.where(stays | met.any(axis=1), now, np.inf), speed, ahead_s, np.where(np.isnan(own_t_s), np.inf, own_t_s)
+    )
+
+
+def _nearest_edge(left: Array, cos: Array, sin: Array, half_length: Array, half_width: Array, within: Array) -> Array:
+    """How far ahead of their center (so negative) rectangles begin within the corridor |y| < `within`, in m.
+
+    `left` is the center's place across it, `cos`, `sin` the heading against it. The rearmost corner counts if it is inside,
+    else the point where the edge that leads inward from there enters.
+    """
+    forward, upward = np.where(cos >= 0, 1.0, -1.0), np.where(sin >= 0, 1.0, -1.0)
+    corner_x = -(np.abs(cos) * half_length + np.abs(sin) * half_width)
+    corner_y = left - forward * sin * half_length + upward * cos * half_width
+    beside = np.maximum(np.abs(corner_y) - within, 0.0)
+    # Two edges meet in the corner: the long side leads to the left where forward and upward agree, the short one to the right.
+    long_side = (forward == upward) == (corner_y < 0)
+    across = np.where(long_side, np.abs(sin), np.abs(cos))
+    ahead = np.where(long_side, np.abs(cos), np.abs(sin))
+    return corner_x + beside * np.divide(ahead, across, out=np.zeros_like(across), where=(across > 0) & (beside > 0))

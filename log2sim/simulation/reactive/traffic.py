@@ -1,0 +1,135 @@
+"""How reactive agents decide: along their own logged way, as the log did, but braking for what the log did not have there.
+
+Each reactive agent lives on its own time: it goes through its log at `rate` (1 as logged, 0 stands), and so falls behind by
+`delay_s`. It never leaves its way, keeps the log's stops, takes up the log's speed of the place again, and makes up nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Agent
+from log2sim.geometry import Array
+from log2sim.simulation.groups import Snapshot
+from log2sim.simulation.path import Path
+from log2sim.simulation.reactive.idm import drivers_for, respond
+from log2sim.simulation.reactive.interaction import NOTICED, Moment, excess, expected
+from log2sim.simulation.reactive.log_overlaps import deep_overlaps
+from log2sim.simulation.reactive.path_table import Pose, Ways
+
+DECIDE_S = 0.1
+STANDING_MPS = 0.05  # where the log is slower, its time goes on: waiting for somebody counts as the log's own stop
+CHUNK = 4096  # pairs looked at together
+RELEASE_S, MOST_KEPT = 0.5, 4.0
+"""A demand that is gone fades over this time, so that one at the edge of a conflict does not make an agent hunt."""
+
+SAME_S = 1e-9  # delays that differ by rounding are the same
+
+
+class Traffic:
+    """Decisions of the reactive ones among the A agents of a scenario; all columns are (A,) over all of them.
+
+    Parameters
+    ----------
+    agents, paths : sequences
+        All agents, and the courses of their box centers: of static ones, one pose.
+    reactive : collection of str
+        Ids of those that react.
+    driven : str, optional
+        Id of the agent whose states are given with each decision, since it need not be where its log is.
+
+    Notes
+    -----
+    A pair of agents is looked at only while it is not as the log has it: one is driven by a policy, or their delays differ,
+    or the log itself drives them into each other. What a leader demands is compared with what it demanded in the log when
+    the agent was at this place, and only the excess counts; so a log that drives closer than the model would is kept. Of
+    two reactive ones whose ways cross, the one that was there first in the log goes first. Cost: R A comparisons a decision,
+    then some 500 distances for each pair in reach.
+    """
+
+    def __init__(
+        self,
+        agents: Sequence[Agent],
+        paths: Sequence[Path],
+        reactive: Collection[str],
+        driven: str | None,
+    ) -> None:
+        self.index = {a.id: k for k, a in enumerate(agents)}
+        self.ways = Ways(paths)
+        self.reacts = np.array([a.id in reactive for a in agents], dtype=bool)
+        self.driver = drivers_for(agents)
+        self._static = np.array([a.static for a in agents], dtype=bool)
+        self._stays = np.array([a.stays for a in agents], dtype=bool)
+        self._driven = self.index[driven] if driven is not None else -1
+        self._size = np.array([a.size_m for a in agents], dtype=np.float64).reshape(-1, 3)
+        self._distrusted = deep_overlaps(self.ways, self._size, self._static)
+        self.restart()
+
+    def restart(self) -> None:
+        """Put everybody on the log's time."""
+        count, self._decided_s = len(self.reacts), -np.inf
+        self.delay_s, self.rate, self.rate_slope = np.zeros(count), np.ones(count), np.zeros(count)
+        self._taken, self._driven_m = np.zeros(count), 0.0
+
+    def decide(self, t_s: float, dt_s: float, ego: Snapshot | None) -> None:
+        """Choose how fast the reactive ones go on, and move their time by `dt_s`.
+
+        `ego` is the state of the driven agent, None if there is none.
+        """
+        tau = t_s - self.delay_s
+        going = self.reacts & (self.ways.begin_s <= tau) & (tau < self.ways.end_s)
+        if t_s > self._decided_s + DECIDE_S - SAME_S:
+            self._decided_s = t_s
+            self._decide(t_s, tau, np.flatnonzero(going), ego)
+        rate = np.where(going, np.clip(self.rate + self.rate_slope * dt_s, 0.0, 1.0), 1.0)
+        self.delay_s = self.delay_s + np.where(going, (1 - (self.rate + rate) / 2) * dt_s, 0.0)
+        self.rate = rate
+
+    def _decide(self, t_s: float, tau: Array, own: NDArray[np.intp], ego: Snapshot | None) -> None:
+        """Set the rates of agents `own` (R,) and their slopes."""
+        pose = self.ways.at(np.arange(len(tau)), tau)
+        pace = np.abs(pose.speed_mps[own])
+        log_accel = (np.abs(self.ways.at(own, tau[own] + DECIDE_S).speed_mps) - pace) / DECIDE_S
+        pose = self._with_ego(pose, ego)
+        course = expected(self.ways, pose, tau, self.rate, self._driven)
+        moment = Moment(self.ways, self.driver, self._size, self.reacts, self._driven, tau, self.rate, pose, course)
+        taken = np.zeros(len(tau))
+        pairs = moment.meeting(*self._pairs(t_s, tau, own))
+        for begin in range(0, len(pairs[0]), CHUNK):
+            i, j = (p[begin : begin + CHUNK] for p in pairs)
+            np.maximum.at(taken, i, excess(moment, i, j, ~self._distrusted[i, j]))
+        kept = np.minimum(self._taken, MOST_KEPT) * np.exp(-DECIDE_S / RELEASE_S)
+        taken = np.maximum(taken, np.where(kept > NOTICED, kept, 0.0))
+        self._taken = taken
+        rate, slope = respond(self.driver.take(own), self.rate[own], taken[own], pace, log_accel)
+        stands = pace < STANDING_MPS
+        self.rate[own], self.rate_slope[own] = np.where(stands, 1.0, rate), np.where(stands, 0.0, slope)
+
+    def _with_ego(self, pose: Pose, ego: Snapshot | None) -> Pose:
+        """The poses with that of the driven agent, which is where its driver took it."""
+        k = self._driven
+        if ego is None or k < 0 or not len(ego.x_m):
+            return pose
+        x, y, yaw, speed = pose.x_m.copy(), pose.y_m.copy(), pose.yaw_rad.copy(), pose.speed_mps.copy()
+        x[k], y[k] = ego.x_m[0] - self.ways.origin_m[0], ego.y_m[0] - self.ways.origin_m[1]
+        yaw[k], speed[k] = ego.yaw_rad[0], ego.speed_mps[0]
+        # Its height is that of the road where it is, or on a slope nobody would brake for one that fell behind.
+        self._driven_m = self.ways.beside(k, self._driven_m, float(ego.x_m[0]), float(ego.y_m[0]))
+        z = pose.z_m.copy()
+        driven = np.array([k])
+        z[k] = self.ways.at(driven, self.ways.times(driven, np.array([self._driven_m]))).z_m[0]
+        return pose._replace(x_m=x, y_m=y, z_m=z, yaw_rad=yaw, speed_mps=speed)
+
+    def _pairs(self, t_s: float, tau: Array, own: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Reactive agents (P,) and those (P,) present that are not to them as the log has it."""
+        differs = (np.abs(self.delay_s[own][:, None] - self.delay_s) > SAME_S) & ~self._static
+        if self._driven >= 0:
+            differs[:, self._driven] = True
+        differs |= self._distrusted[own]
+        differs &= (self.ways.begin_s <= t_s) & (tau <= self.ways.end_s) | self._stays
+        differs[np.arange(len(own)), own] = False
+        row, j = np.nonzero(differs)
+        return own[row], j

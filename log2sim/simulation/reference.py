@@ -1,0 +1,241 @@
+"""Tables of what agents follow: for vehicles the rear axle of the course that they can drive, for points their course."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Agent
+from log2sim.geometry import Array
+from log2sim.simulation.feasible_trajectory import (
+    KNOT_S,
+    LOCK_SHARE,
+    MAX_KNOTS,
+    Course,
+    Limits,
+    as_logged,
+    nearest_course,
+)
+from log2sim.simulation.follower import control_step
+from log2sim.simulation.path import Path, hermite, path_of
+from log2sim.simulation.vehicles.parameters import PEDAL_LAG_S, STEER_LAG_S, parameters_for
+
+GRID_S = 0.02
+"""Spacing of the tables; between their rows a linear course errs by at most a h^2 / 8 = 0.5 mm at 10 m/s2."""
+
+SMOOTHING_S = 0.12
+"""Standard deviation of the Gaussian over the velocity of points: one waypoint of a 10 Hz log."""
+
+STANDSTILL_MPS = 0.08
+MIN_RUN_M, MIN_RUN_MPS = 0.3, 0.5  # shorter and slower runs forward or backward are noise of a standing agent
+MAX_ACCEL_MPS2 = 10.4  # feasibility limits of Waymax (Gulino et al., 2023, section 3.3)
+MAX_CURVATURE_1PM = 0.3
+MAX_TWO_WHEELER_CURVATURE_1PM = 1.0  # which it does not tell; a bicycle turns within a meter
+MAX_DEPARTURE_M = 0.3  # more than boxes err by
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """An agent's table: row k of `columns` (K, C) holds for the time (first_row + k) * GRID_S; see the functions below.
+
+    Rows are of the point that is `offset_m` behind the box center. `exact` gives rows (N, C) at any times (N,): rows of the
+    table are blended in between, across a leap of the log too. What `slips` does not move along its yaw.
+    """
+
+    path: Path
+    first_row: int
+    columns: Array
+    exact: Callable[[Array], Array]
+    offset_m: float = 0.0
+    flags: tuple[str, ...] = ()
+    slips: bool = False
+
+
+VEHICLE_COLUMNS = ("x", "y", "yaw", "speed", "accel_ahead", "curvature_ahead", "gear_ahead", "stands_ahead")
+POINT_COLUMNS = ("x", "y", "yaw", "velocity_x", "velocity_y", "accel_x", "accel_y", "stands")
+
+
+def vehicle_reference(
+    path: Path,
+    limits: Limits,
+    *,
+    accel_ahead_s: float,
+    curvature_ahead_s: float,
+    max_curvature_1pm: float = MAX_CURVATURE_1PM,
+) -> Reference:
+    """The table of a vehicle. Columns "..._ahead" are those of a later time, which makes up for the actuators' lag."""
+    course, departure_m = drivable_course(path, limits)
+    first, t = _grid(path)
+    motion = _motion(course, t)
+    gear, stands = _gears(motion[3])
+
+    def rows_at(at_s: Array, motion: Array) -> Array:
+        rows = np.empty((len(VEHICLE_COLUMNS), len(at_s)))
+        rows[:4] = motion
+        rows[4] = np.interp(at_s + accel_ahead_s, course.t_s, course.accel_mps2)
+        rows[5] = np.interp(at_s + curvature_ahead_s, course.t_s, course.curvature_1pm)
+        k = np.minimum(np.searchsorted(t, at_s + accel_ahead_s), len(t) - 1)
+        rows[6], rows[7] = gear[k], stands[k]
+        return rows.T
+
+    def exact(at_s: Array) -> Array:
+        return rows_at(at_s, _motion(course, at_s))
+
+    flags = _flags(path, course, departure_m, max_curvature_1pm)
+    return Reference(path, first, rows_at(t, motion), exact, limits.offset_m, flags)
+
+
+def drivable_course(path: Path, limits: Limits) -> tuple[Course, Array]:
+    """The course of the rear axle that a vehicle can drive, and how far in m (K,) it is from the logged box centers.
+
+    Between leaps of the log it is made piece by piece.
+    """
+    edges = np.concatenate([[0], np.flatnonzero(path.jump) + 1, [len(path.t_s)]])
+    pieces, departures = [], []
+    for begin, end in pairwise(edges.tolist()):
+        # The course up to a leap goes on as it was; it ends a hair before the moment of the next waypoint.
+        until_s = path.t_s[end - 1] if end == len(path.t_s) else np.nextafter(path.t_s[end], path.t_s[begin])
+        begin_s = path.t_s[begin]
+        count = max(int(np.ceil((until_s - begin_s) / KNOT_S - 1e-6)), 1) + 1 if until_s > begin_s else 1
+        t = np.linspace(begin_s, until_s, count)
+        x, y, yaw, speed = path.at(t)
+        course = (nearest_course if 1 < count <= MAX_KNOTS else as_logged)(t, x, y, yaw, speed, limits)
+        pieces.append(course)
+        o = limits.offset_m
+        center_x, center_y = course.x_m + o * np.cos(course.yaw_rad), course.y_m + o * np.sin(course.yaw_rad)
+        departures.append(np.hypot(center_x - x, center_y - y))
+    whole = Course(*(np.concatenate([getattr(p, f.name) for p in pieces]) for f in fields(Course)))
+    return whole, np.concatenate(departures)
+
+
+def _motion(course: Course, t_s: Array) -> Array:
+    """Rows x, y, yaw, speed (4, N) at times (N,), by cubics; straight on before the begin of the course and after its end."""
+    inside = np.minimum(np.maximum(t_s, course.t_s[0]), course.t_s[-1])
+    values, rates = course.motion
+    if len(course.t_s) == 1:
+        motion = np.repeat(values, len(t_s), axis=1)
+    else:
+        i = np.minimum(np.searchsorted(course.t_s, inside, side="right") - 1, len(course.t_s) - 2)
+        motion = hermite(values, rates, i, inside - course.t_s[i], course.t_s[i + 1] - course.t_s[i])
+    way = (t_s - inside) * motion[3]
+    motion[0] += way * np.cos(motion[2])
+    motion[1] += way * np.sin(motion[2])
+    return motion
+
+
+def point_reference(path: Path) -> Reference:
+    """The table of a point: velocity and acceleration of the smoothed course, on map axes."""
+    first, t = _grid(path)
+    x, y, yaw, logged_speed = _extended(path, t)
+    vx, vy, ax, ay = logged_speed * np.cos(yaw), logged_speed * np.sin(yaw), np.zeros(len(t)), np.zeros(len(t))
+    for piece in np.split(np.arange(len(t)), np.searchsorted(t, path.jump_times())):
+        if len(piece) > 1:
+            vx[piece], vy[piece] = (_smooth(np.gradient(c[piece], GRID_S)) for c in (x, y))
+            ax[piece], ay[piece] = np.gradient(vx[piece], GRID_S), np.gradient(vy[piece], GRID_S)
+    stands = (np.hypot(vx, vy) < STANDSTILL_MPS).astype(np.float64)
+
+    def exact(at_s: Array) -> Array:
+        smoothed = (np.interp(at_s, t, c) for c in (vx, vy, ax, ay, stands))
+        return np.stack([*_extended(path, at_s)[:3], *smoothed], axis=1)
+
+    return Reference(path, first, exact(t), exact, flags=_leaps(path))
+
+
+def tape_reference(path: Path) -> Reference:
+    """The table of an agent that is where the log has it: x, y, yaw, logged speed."""
+    first, t = _grid(path)
+
+    def exact(at_s: Array) -> Array:
+        return np.stack(_extended(path, at_s), axis=1)
+
+    return Reference(path, first, exact(t), exact)
+
+
+def _extended(path: Path, t_s: Array) -> tuple[Array, Array, Array, Array]:
+    """The path at times (N,), straight on before its begin and after its end: for the rows just outside."""
+    x, y, yaw, speed = path.at(t_s)
+    before, after = np.minimum(t_s - path.t_s[0], 0.0), np.maximum(t_s - path.t_s[-1], 0.0)
+    x = x + before * path.velocity_x_mps[0] + after * path.velocity_x_mps[-1]
+    y = y + before * path.velocity_y_mps[0] + after * path.velocity_y_mps[-1]
+    return x, y, yaw, speed
+
+
+def _grid(path: Path) -> tuple[int, Array]:
+    """First row and the times of all rows that cover the life of a path."""
+    first = int(np.floor(path.t_s[0] / GRID_S))
+    last = int(np.ceil(path.t_s[-1] / GRID_S))
+    return first, np.arange(first, last + 1, dtype=np.float64) * GRID_S
+
+
+def _smooth(values: Array) -> Array:
+    """Gaussian smoothing; the ends are mirrored in a point, so that a straight course stays as it is."""
+    if len(values) < 3:
+        return values
+    reach = min(int(np.ceil(3 * SMOOTHING_S / GRID_S)), len(values) - 1)
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * GRID_S / SMOOTHING_S) ** 2)
+    padded = np.pad(values, reach, mode="reflect", reflect_type="odd")
+    return np.convolve(padded, kernel / kernel.sum(), mode="valid")
+
+
+def _gears(speed: Array) -> tuple[Array, Array]:
+    """For every row the gear, +1 or -1, of the current motion, or of the next one while standing; and whether it stands."""
+    direction = np.where(np.abs(speed) < STANDSTILL_MPS, 0, np.sign(speed)).astype(int)
+    runs: list[NDArray[np.intp]] = np.split(np.arange(len(speed)), np.flatnonzero(np.diff(direction)) + 1)
+    gear, stands = np.ones(len(speed)), np.ones(len(speed))
+    begin = 0
+    for run in runs:
+        way_m, peak_mps = np.abs(speed[run]).sum() * GRID_S, np.abs(speed[run]).max()
+        if direction[run[0]] != 0 and (way_m >= MIN_RUN_M or peak_mps >= MIN_RUN_MPS):
+            gear[begin:] = direction[run[0]]
+            stands[run] = 0.0
+            begin = run[-1] + 1
+    return gear, stands
+
+
+def _leaps(path: Path) -> tuple[str, ...]:
+    return tuple(f"the log leaps at {at:.2f} s" for at in path.jump_times())
+
+
+def _flags(path: Path, course: Course, departure_m: Array, max_curvature_1pm: float) -> tuple[str, ...]:
+    """What no vehicle could drive: leaps, and a course that is far from the log or beyond what is feasible all the same."""
+    flags = list(_leaps(path))
+    for name, values, limit, unit in (
+        ("acceleration", course.accel_mps2, MAX_ACCEL_MPS2, "m/s2"),
+        ("curvature", course.curvature_1pm, max_curvature_1pm, "1/m"),
+        ("distance from what can be driven", departure_m, MAX_DEPARTURE_M, "m"),
+    ):
+        worst = int(np.argmax(np.abs(values)))
+        if abs(values[worst]) > limit:
+            flags.append(f"{name} of {values[worst]:.2f} {unit} at {course.t_s[worst]:.2f} s, limit {limit:g}")
+    return tuple(flags)
+
+
+def vehicle_limits(agent: Agent) -> Limits:
+    """What a wheeled agent can drive, from its category and length."""
+    p = parameters_for([agent])
+    wheelbase_m = float(p.wheelbase_m[0])
+    return Limits(
+        offset_m=float(p.rear_axle_offset_m[0]),
+        max_curvature_1pm=LOCK_SHARE * math.tan(p.max_steer_rad[0]) / wheelbase_m,
+        max_curvature_rate_1pmps=float(p.max_steer_rate_radps[0]) / wheelbase_m,
+        max_accel_mps2=float(p.max_brake_mps2[0]),
+    )
+
+
+def _vehicle_reference(agent: Agent, dt_s: float) -> Reference:
+    """A vehicle's table: feed-forward is ahead by the actuator's lag and by half the step for which it is held."""
+    limits = vehicle_limits(agent)
+    return vehicle_reference(
+        path_of(agent, limits.offset_m),
+        limits,
+        accel_ahead_s=PEDAL_LAG_S + control_step(dt_s) / 2,
+        curvature_ahead_s=STEER_LAG_S + control_step(dt_s) / 2,
+        max_curvature_1pm=MAX_CURVATURE_1PM
+        if agent.category in ("car", "truck", "bus")
+        else MAX_TWO_WHEELER_CURVATURE_1PM,
+    )

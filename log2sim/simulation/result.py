@@ -1,0 +1,196 @@
+"""The result of a replay, as `replay.json` holds it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Scenario, Waypoints
+from log2sim.documents import check, read_json, write_json
+from log2sim.errors import ScenarioError
+from log2sim.geometry import Array
+
+VERSION = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Commands:
+    """What a vehicle was told at its rows (S,), held over the step before: throttle (positive) or brake, steering, gear.
+
+    `gear` is 1 forward and -1 backward. What its actuators did is `steer_rad` and `accel_mps2` of the `AgentReplay`.
+    """
+
+    pedal_mps2: Array
+    steer_rad: Array
+    gear: NDArray[np.int8]
+
+    COLUMNS = ("pedal_mps2", "steer_rad", "gear")
+
+
+@dataclass(frozen=True, eq=False)
+class AgentReplay:
+    """What one agent did: box centers in the map as columns (S,), while it lives.
+
+    `driver` is "static" (one pose, two rows), "exact" (the log), "pid", "reactive" or "policy"; `model` "none", "point",
+    "kinematic", "dynamic", "single-track" or a simulator elsewhere ("carla"), with the reason in `model_reason`.
+    `accel_mps2` is along the heading; `steer_rad` is 0 where nothing steers. `flags` say what in the log cannot be driven.
+    `commands` are None where there is no vehicle model; `cross_track_m`, `along_track_m` (S,) are the distances from the
+    log, left and ahead positive, None for what stands for good.
+    """
+
+    id: str
+    category: str
+    size_m: tuple[float, float, float]
+    driver: str
+    model: str
+    t_s: Array
+    x_m: Array
+    y_m: Array
+    z_m: Array
+    yaw_rad: Array
+    speed_mps: Array
+    steer_rad: Array
+    accel_mps2: Array
+    flags: tuple[str, ...] = ()
+    model_reason: str = ""
+    commands: Commands | None = None
+    cross_track_m: Array | None = None
+    along_track_m: Array | None = None
+
+    COLUMNS = ("t_s", "x_m", "y_m", "z_m", "yaw_rad", "speed_mps", "steer_rad", "accel_mps2")
+    ERRORS = ("cross_track_m", "along_track_m")
+
+    def __len__(self) -> int:
+        return len(self.t_s)
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """A replayed scenario. `scenario_digest` is the SHA-256 of the scenario's document, `store_dt_s` the spacing of rows."""
+
+    scenario: str
+    scenario_digest: str
+    mode: str
+    model: str
+    dt_s: float
+    store_dt_s: float
+    agents: tuple[AgentReplay, ...]
+    metrics: Mapping[str, Any] = field(default_factory=dict)
+
+    def agent(self, id: str) -> AgentReplay:
+        """The agent with an id; `KeyError` when there is none."""
+        for agent in self.agents:
+            if agent.id == id:
+                return agent
+        raise KeyError(id)
+
+    def save(self, path: Path | str) -> None:
+        """Write the replay, whole or not at all."""
+        document = self.to_dict()
+        check(document, "replay-1", ScenarioError)
+        write_json(path, document)
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Read and check a replay file; `ScenarioError` names the field that is wrong."""
+        document = read_json(path, ScenarioError)
+        try:
+            return cls.from_dict(document)
+        except ScenarioError as error:
+            raise ScenarioError(f"{path}: {error}") from None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The document of `schemas/replay-1.json`."""
+        return {
+            "replay_version": VERSION,
+            "scenario": self.scenario,
+            "scenario_digest": self.scenario_digest,
+            "mode": self.mode,
+            "model": self.model,
+            "dt_s": self.dt_s,
+            "store_dt_s": self.store_dt_s,
+            "agents": [_agent_to_dict(a) for a in self.agents],
+            "metrics": dict(self.metrics),
+        }
+
+    @classmethod
+    def from_dict(cls, document: Any) -> Self:
+        """Build a replay from a document, after checking it against the schema."""
+        version = document.get("replay_version") if isinstance(document, dict) else None
+        if version != VERSION:
+            raise ScenarioError(f"replay_version is {version!r}, expected {VERSION}; is this a replay file of log2sim?")
+        check(document, "replay-1", ScenarioError)
+        plain = ("scenario", "scenario_digest", "mode", "model", "dt_s", "store_dt_s", "metrics")
+        return cls(agents=tuple(_agent_from_dict(a) for a in document["agents"]), **{k: document[k] for k in plain})
+
+
+def to_scenario(replay: Replay, scenario: Scenario) -> Scenario:
+    """The scenario with its agents where the replay has them: the replay as something to evaluate, plot or export."""
+    done = {a.id: a for a in replay.agents}
+    agents = []
+    for agent in scenario.agents:
+        if agent.id not in done:
+            continue
+        r = done[agent.id]
+        w = agent.waypoints
+        waypoints = Waypoints(
+            r.t_s, r.x_m, r.y_m, r.z_m, r.yaw_rad, r.speed_mps,
+            observed=np.zeros(len(r), dtype=bool),
+            sigma_xy_m=np.interp(r.t_s, w.t_s, w.sigma_xy_m),
+        )  # fmt: skip
+        agents.append(replace(agent, waypoints=waypoints))
+    provenance = {**scenario.provenance, "replay": {"mode": replay.mode, "model": replay.model, "dt_s": replay.dt_s}}
+    return replace(scenario, agents=tuple(agents), provenance=provenance)
+
+
+def _agent_to_dict(agent: AgentReplay) -> dict[str, Any]:
+    length, width, height = (float(v) for v in agent.size_m)
+    commands, known = agent.commands, agent.cross_track_m is not None
+    return {
+        "id": agent.id,
+        "category": agent.category,
+        "size_m": {"length": length, "width": width, "height": height},
+        "driver": agent.driver,
+        "model": agent.model,
+        "model_reason": agent.model_reason,
+        "flags": list(agent.flags),
+        "states": {k: getattr(agent, k).tolist() for k in AgentReplay.COLUMNS},
+        "commands": {k: getattr(commands, k).tolist() for k in Commands.COLUMNS} if commands is not None else None,
+        "errors": {k: getattr(agent, k).tolist() for k in AgentReplay.ERRORS} if known else None,
+    }
+
+
+def _agent_from_dict(entry: Mapping[str, Any]) -> AgentReplay:
+    states = _columns(entry, "states", AgentReplay.COLUMNS)
+    # Files of 0.1.0 have neither commands nor errors.
+    commands = _columns(entry, "commands", Commands.COLUMNS)
+    if commands:
+        commands["gear"] = commands["gear"].astype(np.int8)
+    size = entry["size_m"]
+    return AgentReplay(
+        id=entry["id"],
+        category=entry["category"],
+        size_m=(float(size["length"]), float(size["width"]), float(size["height"])),
+        driver=entry["driver"],
+        model=entry["model"],
+        flags=tuple(entry["flags"]),
+        model_reason=entry.get("model_reason", ""),
+        commands=Commands(**commands) if commands else None,
+        **states,
+        **_columns(entry, "errors", AgentReplay.ERRORS),
+    )
+
+
+def _columns(entry: Mapping[str, Any], group: str, keys: Sequence[str]) -> dict[str, Any]:
+    """The columns of a group, which are as long as the times; none where the group is absent."""
+    count = len(entry["states"]["t_s"])
+    columns = {k: np.array(v, dtype=np.float64) for k, v in (entry.get(group) or {}).items() if k in keys}
+    for key, values in columns.items():
+        if len(values) != count:
+            raise ScenarioError(f"agent '{entry['id']}': {group}.{key} has {len(values)} values, t_s has {count}")
+    return columns

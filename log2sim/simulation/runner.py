@@ -1,0 +1,154 @@
+"""Replays a scenario: decides who drives each agent, rolls the world out and measures what came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+from log2sim.datatypes import EGO, Agent, Scenario
+from log2sim.errors import ConfigError, ScenarioError
+from log2sim.registry import nearest
+from log2sim.simulation.drivers import cast_agents, groups_of, reactive_ids, traffic_of
+from log2sim.simulation.policy import SIGHT_M, Policy, begin
+from log2sim.simulation.recording import Tracks
+from log2sim.simulation.replay_result import assemble
+from log2sim.simulation.result import Replay
+from log2sim.simulation.rollout import Progress, World, roll
+from log2sim.simulation.simulators import Host
+from log2sim.simulation.step_clock import Clock
+from log2sim.simulation.vehicles.model_choice import MODELS, Choice
+from log2sim.simulation.vehicles.parameters import WHEELED
+
+MODES = ("pid", "exact")
+DT_RANGE_S = (0.0005, 1.0)
+MAX_STEPS = 20_000_000
+
+
+def replay(
+    scenario: Scenario,
+    *,
+    mode: str = "pid",
+    model: str = "auto",
+    dt_s: float = 0.01,
+    ego: Policy | None = None,
+    agents: str | Collection[str] = "log",
+    sight_m: float = SIGHT_M,
+    host: Host | None = None,
+    progress: Progress | None = None,
+) -> Replay:
+    """Replay a scenario and compare it with the log.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    mode : {"pid", "exact"}
+        Agents follow their waypoints by control through a vehicle model, or are where the log has them.
+    model : {"auto", "kinematic", "dynamic", "single-track"}
+        How vehicles move: rolling without slip, on tires that slip and saturate, or by the published single-track model
+        with linear tires; "auto" takes for each the simplest that is good enough, `AgentReplay.model_reason` says why.
+    dt_s : float
+        Simulation step in s, from 0.0005 to 1; controls are renewed at least every 0.1 s. States are stored about every
+        0.05 s, or every step.
+    ego : callable, optional
+        `policy(observation) -> Controls` that drives the ego instead, from its first logged state to the end of its life.
+        If it has `reset(scenario)`, that is called first.
+    agents : {"log", "reactive"} or collection of str
+        Whether the other agents do as the log, or brake along their own way for what the log does not have there: all of
+        them, or those with these ids (the ego too, if it is among them).
+    sight_m : float
+        How far the ego's policy sees other agents, center to center.
+    host : Host, optional
+        Simulator elsewhere that moves the agents instead, such as `log2sim.simulation.carla.simulator.CarlaSimulator`; it has its own
+        vehicle models, so `model` is not used.
+    progress : callable, optional
+        Called with the steps done and their number, some times a run.
+
+    Raises
+    ------
+    ConfigError
+        When an argument is out of its range, or a policy is given for a scenario without an ego on wheels.
+    ScenarioError
+        When an agent has no waypoints, or waypoints that are not finite or not in the order of time.
+
+    Notes
+    -----
+    Static agents and those seen only once have no controller. Tracking errors are taken over the agents that follow; the
+    user's ego has its own by agent. Cost: one step moves all agents that live in the current 10 s at once.
+    """
+    if host is not None:
+        model = "kinematic"  # the references of what only rolls suit any other model
+    world = open_world(
+        scenario, mode=mode, model=model, dt_s=dt_s, drives_ego=ego is not None, agents=agents, sight_m=sight_m
+    )
+    if ego is not None:
+        begin(ego, scenario)
+    if host is None:
+        tracks = roll(world, ego, progress)
+        return assemble(scenario, world.groups, tracks, world.clock, world.choices, mode, model)
+    tracks = _roll_elsewhere(world, host, ego, progress)
+    choices = {k: Choice(host.name, "the simulator's own") for k in world.choices}
+    return assemble(scenario, world.groups, tracks, world.clock, choices, mode, host.name)
+
+
+def _roll_elsewhere(world: World, host: Host, ego: Policy | None, progress: Progress | None) -> Tracks:
+    """Let a simulator elsewhere move a world to its end; it is left as it was found, whatever happens."""
+    if world.clock.dt_s > host.max_dt_s:
+        raise ConfigError(f"dt: {world.clock.dt_s} s, {host.name} takes at most {host.max_dt_s:g} s")
+    host.open(world.groups, world.clock, world.statics)
+    world.host = host
+    try:
+        return roll(world, ego, progress)
+    finally:
+        host.close()
+
+
+def open_world(
+    scenario: Scenario,
+    *,
+    mode: str = "pid",
+    model: str = "auto",
+    dt_s: float = 0.01,
+    drives_ego: bool = True,
+    agents: str | Collection[str] = "log",
+    sight_m: float = SIGHT_M,
+) -> World:
+    """A scenario as a world to be moved step by step: with `drives_ego` by controls of the caller's. See `replay`.
+
+    Examples
+    --------
+    >>> world = open_world(scenario)
+    >>> while not world.done:
+    ...     if world.ego_lives:
+    ...         seen = world.observe()  # an Observation, as policies get it
+    ...         world.steer(Controls(accel_mps2=1.0, steer_rad=0.0))
+    ...     world.advance()
+    """
+    if mode not in MODES:
+        raise ConfigError(f"mode '{mode}': expected one of {', '.join(MODES)}")
+    if not DT_RANGE_S[0] <= dt_s <= DT_RANGE_S[1]:
+        raise ConfigError(f"dt: {dt_s} s, expected {DT_RANGE_S[0]} to {DT_RANGE_S[1]} s")
+    if not sight_m >= 0:
+        raise ConfigError(f"sight: {sight_m} m, expected 0 or more")
+    if model not in MODELS:
+        raise ConfigError(f"unknown vehicle model '{model}'{nearest(model, list(MODELS))}; known: {', '.join(MODELS)}")
+    if drives_ego and (scenario.ego is None or scenario.ego.category not in WHEELED):
+        raise ConfigError(f"ego policy: scenario '{scenario.name}' has no agent '{EGO}' on wheels that it could drive")
+    for agent in scenario.agents:
+        problem = agent.waypoints.problem()
+        if problem is not None:
+            raise ScenarioError(f"agent '{agent.id}': {problem}")
+    clock = _clock(scenario.agents, dt_s)
+    reactive = reactive_ids(scenario.agents, agents, drives_ego=drives_ego)
+    cast = cast_agents(scenario.agents, mode, drives_ego=drives_ego, reactive=reactive)
+    groups, choices = groups_of(cast, clock, mode, model)
+    return World(groups, clock, cast["static"], traffic_of(scenario.agents, groups, clock), choices, sight_m)
+
+
+def _clock(agents: Sequence[Agent], dt_s: float) -> Clock:
+    begin_s = min((float(a.waypoints.t_s[0]) for a in agents), default=0.0)
+    end_s = max((float(a.waypoints.t_s[-1]) for a in agents), default=0.0)
+    clock = Clock.spanning(begin_s, end_s, dt_s)
+    if clock.steps > MAX_STEPS:
+        raise ScenarioError(
+            f"waypoints span {end_s - begin_s:g} s, {clock.steps} steps of {dt_s} s; at most {MAX_STEPS} can be run"
+        )
+    return clock

@@ -1,0 +1,181 @@
+"""The single-track model whose tires saturate: it understeers, slides and spins. Steps over all agents.
+
+As in `single_track`, each step solves for the slips at its end, in a form that stays regular at standstill.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import Array, cos_sin
+from log2sim.simulation.vehicles.single_track import AGAIN, GAMMA, Chassis, Pair, Slips, grips, inner_steps
+from log2sim.simulation.vehicles.vehicle import (
+    GRAVITY_MPS2,
+    VehicleControls,
+    VehicleParameters,
+    VehicleState,
+    actuate,
+    actuation,
+    advance,
+    clamp,
+    engaged,
+    sinc,
+)
+
+ANTILOCK_SHARE = 0.95
+"""Share of the friction limit that drive and brakes may use: wheels that do not lock keep a third of it for steering."""
+
+
+def step_dynamic(
+    state: VehicleState, controls: VehicleControls, parameters: VehicleParameters, dt_s: float
+) -> VehicleState:
+    """Move vehicles by `dt_s` with constant commands by a single-track model whose tires saturate.
+
+    Notes
+    -----
+    Angles are exact. Lateral force of an axle: the magic formula of Pacejka ("Tire and Vehicle Dynamics", 2012, chapter 4)
+    with shape factor 1 and no curvature, D sin(arctan(C s)) = D C s / sqrt(1 + (C s)^2) with s the tangent of the slip
+    angle: stiffness C at first, D at most. D is friction times load, less what drive and brakes take of it (friction
+    ellipse). The pedal accelerates the rear axle: the drive makes up for what rolling along a curve costs, so that without
+    slip this is the kinematic bicycle, while without friction the momentum stays what it is. That make-up is beyond the
+    friction limit: at full lock, while the yaw rate changes, the sum of forces can exceed it by a seventh.
+    """
+    p, chassis = parameters, Chassis.of(parameters)
+    count, h = inner_steps(dt_s)
+    actuators, target, lag_s, max_rate = actuation(state, controls, p)
+    grip = ANTILOCK_SHARE * GRAVITY_MPS2 * p.friction
+    body = Body(state.x_m, state.y_m, state.yaw_rad, state.speed_mps, state.lateral_mps, state.yaw_rate_radps)
+    bend = np.tan(state.steer_rad)
+    for _ in range(count):
+        bend0 = bend
+        actuators, (mean_pedal, mean_steer) = actuate(actuators, target, lag_s, max_rate, h)
+        bend = np.tan(actuators[1])
+        gear = engaged(body.speed_mps, controls.reverse)
+        drive = Drive(clamp(mean_pedal, -grip, grip), gear, bend0, np.tan(mean_steer), bend)
+        body = slide(body, drive, p, chassis, h)
+    b, (pedal, steer) = body, actuators
+    return VehicleState(b.x_m, b.y_m, b.yaw_rad, b.speed_mps, steer, pedal, b.lateral_mps, b.yaw_rate_radps)
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """What one step of the saturating model is given: the pedal, the gear, and tangents of the steering angle."""
+
+    pedal_mps2: Array
+    gear: Array
+    bend0: Array
+    mean_bend: Array
+    bend1: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """Rear axle, yaw, its speed along and its velocity to the left of the heading, yaw rate."""
+
+    x_m: Array
+    y_m: Array
+    yaw_rad: Array
+    speed_mps: Array
+    lateral_mps: Array
+    yaw_rate_radps: Array
+
+
+def slide(body: Body, drive: Drive, p: VehicleParameters, c: Chassis, h: float) -> Body:
+    """One step of the saturating model.
+
+    Notes
+    -----
+    Unknown are the lateral velocities at which the axles slip. Tires act by their secant stiffness, so every step is
+    dissipative whatever its length; it is that of the slips in the middle, where half an implicit Euler step leads: second
+    order.
+    """
+    d, speed, rear = drive, body.speed_mps, body.lateral_mps
+    front = rear + p.wheelbase_m * body.yaw_rate_radps - speed * d.bend0
+    start = Slips(rear, front)
+
+    # To the middle of the step.
+    speed1, _, accel = _push(speed, _gain(start, body.yaw_rate_radps, 0.0, d, p, h), d, h)
+    mean_speed = (speed + speed1) / 2
+    begin, end, swing = _pulls(speed, speed1, d, p, h)
+    system = _relaxation(mean_speed, accel, start, d, p, c, h / 2)
+    middle = system.solve(rear + (begin + end) / 4, front + (begin + end) / 4 + swing / 2)
+
+    # All of it. The speed is needed for the slips and follows from them, so it is predicted and then corrected.
+    rate = (mean_speed * d.mean_bend + middle.front - middle.rear) / p.wheelbase_m
+    speed1, _, accel = _push(speed, _gain(middle, rate, 2 * (middle.rear - rear), d, p, h), d, h)
+    begin, end, swing = _pulls(speed, speed1, d, p, h)
+    system = _relaxation((speed + speed1) / 2, accel, middle, d, p, c, GAMMA * h)
+    pull = GAMMA * (begin + GAMMA * (end - begin))
+    first = system.solve(rear + pull, front + pull + GAMMA * swing)
+    pull = GAMMA * end
+    last = system.solve(
+        rear + AGAIN * (first.rear - rear) + pull, front + AGAIN * (first.front - front) + pull + GAMMA * swing
+    )
+    rate1 = (speed1 * d.bend1 + last.front - last.rear) / p.wheelbase_m
+    speed1, way, _ = _push(speed, _gain(middle, rate, last.rear - rear, d, p, h), d, h)
+
+    # Along an arc.
+    turn = (way * d.mean_bend + h * (front + last.front - rear - last.rear) / 2) / p.wheelbase_m
+    shrink = sinc(turn / 2)
+    ahead, aside = way * shrink, h * (rear + last.rear) / 2 * shrink
+    cos, sin = cos_sin(body.yaw_rad + turn / 2)
+    x, y = body.x_m + ahead * cos - aside * sin, body.y_m + ahead * sin + aside * cos
+    return Body(x, y, body.yaw_rad + turn, speed1, last.rear, rate1)
+
+
+def _gain(
+    slips: Slips, rate: Array, grown: Array | float, d: Drive, p: VehicleParameters, h: float
+) -> NDArray[np.float64]:
+    """What slipping adds to the speed within a step, while the lateral velocity of the rear axle grows by `grown`."""
+    slip_rate = (slips.front - slips.rear) / p.wheelbase_m
+    return h * rate * (slips.rear + p.cg_to_rear_m * slip_rate) - p.cg_to_rear_m * d.mean_bend / p.wheelbase_m * grown
+
+
+def _pulls(speed: Array, speed1: Array, d: Drive, p: VehicleParameters, h: float) -> tuple[Array, Array, Array]:
+    """What rolling asks of the tires, as growth of slip in a step: by its yaw rate at begin and end, and by its change."""
+    rolling, rolling1 = speed * d.bend0, speed1 * d.bend1
+    each = -h / p.wheelbase_m
+    return each * speed * rolling, each * speed1 * rolling1, rolling - rolling1
+
+
+def _push(speed: Array, gain: Array, d: Drive, h: float) -> tuple[Array, Array, Array]:
+    """Speed after a step, the way and the acceleration of the tires; `gain` is what slipping adds to the speed.
+
+    Throttle pushes whither the gear says, brakes hold against the motion and end at rest.
+    """
+    push = h * np.maximum(d.pedal_mps2, 0.0) * d.gear
+    free = speed + gain + push
+    sign = np.sign(free)
+    pace, distance = advance(np.abs(free), np.minimum(d.pedal_mps2, 0.0), h)
+    return sign * pace, sign * distance - (gain + push) * (h / 2), (sign * pace - speed - gain) / h
+
+
+def _relaxation(
+    speed: Array, accel: Array, slips: Slips, d: Drive, p: VehicleParameters, c: Chassis, tau: float
+) -> Pair:
+    """Equations of an implicit step `tau` for slip velocities (m/s), linear about `slips`.
+
+    Secant stiffness is a force over a scale that vanishes at standstill; with the scales as units nothing is divided by
+    them.
+    """
+    rear, front = slips.rear, slips.front
+    use = accel / (GRAVITY_MPS2 * p.friction)
+    rear_grip, front_grip = grips(accel, p, c)
+    ellipse = np.sqrt(np.maximum(1 - use * use, 0.0))
+    cos2 = 1 / (1 + d.mean_bend**2)
+    rear_scale = np.sqrt(speed**2 + (p.rear_stiffness_1prad * rear) ** 2)
+    along, across = speed + front * d.mean_bend * cos2, p.front_stiffness_1prad * cos2 * front
+    front_scale = np.sqrt(along**2 + across**2)
+    by_rear = p.rear_stiffness_1prad * rear_grip * ellipse
+    by_front = p.front_stiffness_1prad * front_grip * ellipse * cos2 * np.sqrt(cos2)
+    rear_turn, front_turn = (speed / p.wheelbase_m * scale for scale in (rear_scale, front_scale))
+    return Pair.of(
+        rear_scale + tau * (c.rear * by_rear - rear_turn),
+        tau * (c.cross * by_front + front_turn),
+        tau * (c.cross * by_rear - rear_turn),
+        front_scale + tau * (c.front * by_front + front_turn),
+        Slips(rear_scale, front_scale),
+    )

@@ -1,0 +1,138 @@
+"""Which model moves each vehicle: the simplest that is good enough for its maneuver, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from log2sim.datatypes import Agent
+from log2sim.geometry import Array
+from log2sim.simulation.reference import GRID_S, STANDSTILL_MPS, VEHICLE_COLUMNS, Reference
+from log2sim.simulation.vehicles.single_track import Chassis, grips
+from log2sim.simulation.vehicles.vehicle import GRAVITY_MPS2, VehicleParameters, VehicleState
+
+YAW, SPEED, ACCEL, CURVATURE = map(VEHICLE_COLUMNS.index, ("yaw", "speed", "accel_ahead", "curvature_ahead"))
+
+MODELS = ("auto", "kinematic", "dynamic", "single-track")
+TWO_WHEELERS = ("motorcycle", "cyclist", "bicycle")
+
+SLIP_TOLERANCE_RAD = 0.02
+"""Slip angle of the rear tires up to which rolling without slip is good enough: 1.1 degrees, as much as headings in a log err.
+
+A car has it at 3.3 m/s2 sideways, a third of what its tires bear. Polack et al. ("The kinematic bicycle model: a consistent
+model for planning feasible trajectories for autonomous vehicles?", 2017) take the kinematic model as valid up to half.
+"""
+
+FAST_REVERSE_MPS = 3.0
+"""Beyond it tires that slip are steered worse than what rolls: the rear axle leads, and what steers it swings out behind."""
+
+ROUNDS = 4
+"""Passes in which slips, the drag of slips and the load that this moves settle."""
+
+MAX_FRICTION_USE = 0.95
+"""Share of the friction limit beyond which slips are not predicted: they grow without bound."""
+
+
+class Choice(NamedTuple):
+    """The model of a vehicle, and the reason for it."""
+
+    model: str
+    reason: str
+
+
+def choose(agent: Agent, reference: Reference, parameters: VehicleParameters, wanted: str, *, free: bool) -> Choice:
+    """The model for a vehicle (`parameters` of shape (1,)) when the user wants `wanted`; `free` vehicles leave their log."""
+    if wanted != "auto":
+        return Choice(wanted, "asked for")
+    if agent.category in TWO_WHEELERS:
+        return Choice("kinematic", "leans into its curves, which slip does not describe")
+    if free:
+        return Choice("dynamic", "what a policy drives is not known beforehand")
+    speed, curvature = reference.columns[:, SPEED], reference.columns[:, CURVATURE]
+    if speed.min() < -FAST_REVERSE_MPS:
+        return Choice(
+            "kinematic", f"reverses at up to {-speed.min():.1f} m/s, and slips are followed up to {FAST_REVERSE_MPS:g}"
+        )
+    aside_mps2 = speed**2 * curvature
+    # In steady cornering both axles use the same share of their friction, whatever the place of the center of gravity.
+    slip = np.abs(_slip(aside_mps2 / (GRAVITY_MPS2 * parameters.friction), parameters.rear_stiffness_1prad))
+    worst = int(np.argmax(slip))
+    found = f"{slip[worst]:.3f} rad at {abs(aside_mps2[worst]):.1f} m/s2 sideways, {SLIP_TOLERANCE_RAD:g} are tolerated"
+    return Choice("dynamic" if slip[worst] > SLIP_TOLERANCE_RAD else "kinematic", f"rear tires slip up to {found}")
+
+
+def understeer(p: VehicleParameters) -> Array:
+    """Steering angle (A,) beyond that of rolling, per lateral acceleration and wheelbase in s2/m2, while slips are small."""
+    compliance = 1 / p.front_stiffness_1prad - 1 / p.rear_stiffness_1prad
+    return compliance / (GRAVITY_MPS2 * p.friction * p.wheelbase_m)
+
+
+def slipping_reference(reference: Reference, p: VehicleParameters, model: str, ahead_s: float) -> Reference:
+    """The reference of a vehicle that slips (`p` of shape (1,)), its curvature being that of `ahead_s` later.
+
+    Notes
+    -----
+    The equations of the single-track model solved for what drives them (inverse dynamics): the forces that turn and move
+    the vehicle as the course does, the slips of these forces, the heading that these slips add to the course, and the
+    steering angle; as a curvature of which the follower makes this angle again.
+    """
+    if len(reference.columns) < 3:
+        return replace(reference, slips=True)
+    later_nose, bend, drag = _inverse(reference.columns, p, saturates=model != "single-track")
+    t_s = np.arange(reference.first_row, reference.first_row + len(bend), dtype=np.float64) * GRID_S
+    nose = np.interp(t_s, t_s + ahead_s, later_nose)
+
+    def slipped(columns: Array, at_s: Array) -> Array:
+        out = columns.copy()
+        for column, more in ((YAW, nose), (CURVATURE, bend), (ACCEL, drag)):
+            out[:, column] += np.interp(at_s, t_s, more)
+        return out
+
+    def exact(at_s: Array) -> Array:
+        return slipped(reference.exact(at_s), at_s)
+
+    return replace(reference, columns=slipped(reference.columns, t_s), exact=exact, slips=True)
+
+
+def moving_as(state: VehicleState, reference: Callable[[float], Array], t_s: float) -> VehicleState:
+    """The state with the lateral velocity and the yaw rate that the reference's rows (C, A) have at a time."""
+    before, after = reference(t_s), reference(t_s + GRID_S)  # before its begin a reference goes straight on
+    (dx, dy), turn = (after - before)[:2] / GRID_S, (after - before)[YAW]
+    yaw = (before + after)[YAW] / 2
+    return replace(state, lateral_mps=np.cos(yaw) * dy - np.sin(yaw) * dx, yaw_rate_radps=turn / GRID_S)
+
+
+def _inverse(columns: Array, p: VehicleParameters, *, saturates: bool) -> tuple[Array, Array, Array]:
+    """What slip adds to heading, curvature and acceleration, (K,) each, of the rows of a table, as of the curvature's time."""
+    speed, curvature, to_rear, chassis = columns[:, SPEED], columns[:, CURVATURE], p.cg_to_rear_m, Chassis.of(p)
+    twist = np.gradient(speed * curvature, GRID_S)
+    aside = speed**2 * curvature + to_rear * twist  # acceleration of the center of gravity
+    front_force = (p.gyration_m2 * twist + to_rear * aside) / p.wheelbase_m
+    drag, bend = np.zeros_like(speed), p.wheelbase_m * curvature
+    for _ in range(ROUNDS if saturates else 1):
+        accel = columns[:, ACCEL] + drag
+        rear_grip, front_grip = grips(accel, p, chassis)
+        share = np.clip(accel / (GRAVITY_MPS2 * p.friction), -MAX_FRICTION_USE, MAX_FRICTION_USE)
+        ellipse, cos2 = (np.sqrt(1 - share**2), 1 / (1 + bend**2)) if saturates else (1.0, 1.0)
+        front_use, rear_use = front_force / (front_grip * ellipse), (aside - front_force) / (rear_grip * ellipse)
+        front = _slip(front_use / np.sqrt(cos2), p.front_stiffness_1prad, saturates=saturates) / cos2
+        rear = _slip(rear_use, p.rear_stiffness_1prad, saturates=saturates)
+        bend = p.wheelbase_m * curvature + front - rear
+        if saturates:
+            slip = rear + to_rear / p.wheelbase_m * (front - rear)  # of the center of gravity, beyond that of rolling
+            drag = speed * np.abs(speed) * curvature * slip
+    nose = np.sign(speed) * rear
+    moving = np.abs(speed) > STANDSTILL_MPS
+    swing = np.where(moving, np.gradient(nose, GRID_S) / np.where(moving, speed, 1.0), 0.0)
+    return nose, (bend / p.wheelbase_m + swing) / (1 + understeer(p) * speed**2) - curvature, drag
+
+
+def _slip(use: Array, stiffness_1prad: Array, *, saturates: bool = True) -> Array:
+    """Slip angle at a share of the friction limit, of tires that saturate there or, published, do not."""
+    if not saturates:
+        return use / stiffness_1prad
+    use = np.clip(use, -MAX_FRICTION_USE, MAX_FRICTION_USE)
+    return use / np.sqrt(1 - use**2) / stiffness_1prad

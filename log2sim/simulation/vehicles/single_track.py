@@ -1,0 +1,199 @@
+"""The published single-track model with linear tires, and what models whose tires slip share. Steps over all agents.
+
+Slip angles relax at a rate of about 200 / v per second, so equations with 1 / v are stiff at walking pace and end at
+standstill. Here they are multiplied by the speed and each step solves for the slips at its end: at standstill the equation
+for the slips turns into "no slip" by itself, which is the kinematic bicycle, and no threshold speed is needed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import Array, cos_sin
+from log2sim.simulation.vehicles.vehicle import (
+    GRAVITY_MPS2,
+    VehicleControls,
+    VehicleParameters,
+    VehicleState,
+    actuate,
+    actuation,
+    advance,
+    clamp,
+    engaged,
+    sinc,
+)
+
+MAX_INNER_STEP_S = 0.01
+"""Longest step of the integrator; its error falls with the square."""
+
+GAMMA = 1 - math.sqrt(0.5)
+"""Of the singly diagonally implicit Runge-Kutta method of two stages that is L-stable and of second order (Alexander, 1977)."""
+
+AGAIN = (1 - GAMMA) / GAMMA
+
+LIFT_SHARE = 0.9
+"""Share of an axle's load that drive and brakes may take off it."""
+
+
+def step_single_track(
+    state: VehicleState, controls: VehicleControls, parameters: VehicleParameters, dt_s: float
+) -> VehicleState:
+    """Move vehicles by `dt_s` with constant commands by the published single-track model with linear tires.
+
+    Notes
+    -----
+    Equations: Althoff, Koschi & Manzinger, "CommonRoad: Vehicle Models", 2020, section "Single-Track Model", with the load
+    transfer of braking and driving, small angles and no limit of friction. They have the speed of the center of gravity as
+    `speed_mps`, and `lateral_mps` is speed times slip angle less what the yaw rate adds at the rear axle. They are published
+    for forward motion; backward, each tire's force opposes its slip as well. Actuators as in `step_bicycle`.
+    """
+    p, chassis = parameters, Chassis.of(parameters)
+    count, h = inner_steps(dt_s)
+    actuators, target, lag_s, max_rate = actuation(state, controls, p)
+    yaw, speed, steer = state.yaw_rad, state.speed_mps, state.steer_rad
+    cos, sin = cos_sin(yaw)
+    x, y = state.x_m + p.cg_to_rear_m * cos, state.y_m + p.cg_to_rear_m * sin
+    still = speed == 0
+    per_speed = np.where(still, 0.0, 1 / np.where(still, 1.0, speed))
+    rear = state.lateral_mps * per_speed
+    slips = Slips(rear, np.where(still, 0.0, rear + p.wheelbase_m * state.yaw_rate_radps * per_speed - steer))
+    for _ in range(count):
+        speed0, steer0 = speed, steer
+        actuators, (mean_pedal, mean_steer) = actuate(actuators, target, lag_s, max_rate, h)
+        steer = actuators[1]
+        gear = engaged(speed, controls.reverse)
+        pace, distance = advance(np.abs(speed), mean_pedal, h)
+        speed = gear * pace
+        motion = Motion(speed0, speed, gear * distance, steer0, mean_steer, steer)
+        before, slips = slips, linear_slips(slips, motion, p, chassis, h)
+        chord, angle, turn = linear_course(before, slips, motion, p)
+        cos, sin = cos_sin(yaw + angle)
+        x, y, yaw = x + chord * cos, y + chord * sin, yaw + turn
+    cos, sin = cos_sin(yaw)
+    x, y = x - p.cg_to_rear_m * cos, y - p.cg_to_rear_m * sin
+    yaw_rate = speed * (slips.front - slips.rear + steer) / p.wheelbase_m
+    return VehicleState(x, y, yaw, speed, steer, actuators[0], speed * slips.rear, yaw_rate)
+
+
+@dataclass(frozen=True, eq=False)
+class Chassis:
+    """How forces at the axles accelerate the axles sideways, per force and mass: rear by rear, either by the other, front."""
+
+    rear: Array
+    cross: Array
+    front: Array
+    cg_to_front_m: Array
+
+    @classmethod
+    def of(cls, p: VehicleParameters) -> Chassis:
+        to_rear, to_front = p.cg_to_rear_m, p.wheelbase_m - p.cg_to_rear_m
+        rear, front = 1 + to_rear**2 / p.gyration_m2, 1 + to_front**2 / p.gyration_m2
+        return cls(rear, 1 - to_front * to_rear / p.gyration_m2, front, to_front)
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What one step of the linear model is given: speed and steering angle at its ends, distance, mean steering angle."""
+
+    speed0_mps: Array
+    speed1_mps: Array
+    distance_m: Array
+    steer0_rad: Array
+    mean_steer_rad: Array
+    steer1_rad: Array
+
+
+class Slips(NamedTuple):
+    """Of the axles: slip angles in rad, or velocities in m/s to the left of the heading beyond those of rolling."""
+
+    rear: Array
+    front: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Two linear equations for the slips of an agent, a and b above c and d; solved by Cramer's rule.
+
+    What is solved for are the slips in units of their own, which may be zero; the factors are units over determinant.
+    """
+
+    a: Array
+    b: Array
+    c: Array
+    d: Array
+    rear_factor: Array
+    front_factor: Array
+
+    @classmethod
+    def of(cls, a: Array, b: Array, c: Array, d: Array, unit: Slips | None = None) -> Self:
+        factor = 1 / (a * d - b * c)
+        rear, front = (factor, factor) if unit is None else (unit.rear * factor, unit.front * factor)
+        return cls(a, b, c, d, rear, front)
+
+    def solve(self, rear: Array, front: Array) -> Slips:
+        """The slips for right-hand sides (A,), (A,)."""
+        return Slips(
+            self.rear_factor * (self.d * rear - self.b * front), self.front_factor * (self.a * front - self.c * rear)
+        )
+
+
+def linear_slips(slips: Slips, motion: Motion, p: VehicleParameters, c: Chassis, h: float) -> Slips:
+    """Slip angles (rad, positive to the left) after a step of the published model.
+
+    Notes
+    -----
+    Linear in the slips while speed and acceleration are the mean ones of the step, hence solved without iteration:
+    |v| slips' = -(chassis) (stiffness) slips + (turn) (yaw rate / v) - |v| (0, steer').
+    """
+    m, wheelbase = motion, p.wheelbase_m
+    speed, accel = (m.speed0_mps + m.speed1_mps) / 2, (m.speed1_mps - m.speed0_mps) / h
+    pace, gear = np.abs(speed), np.copysign(1.0, speed)
+    rear_grip, front_grip = grips(accel, p, c)
+    by_rear, by_front = rear_grip * p.rear_stiffness_1prad, front_grip * p.front_stiffness_1prad
+    # The yaw rate is speed * (front - rear + steer) / wheelbase; it and its growth with the speed move both axles.
+    rear_turn = (p.cg_to_rear_m * gear * accel - pace * speed) / wheelbase
+    front_turn = -(c.cg_to_front_m * gear * accel + pace * speed) / wheelbase
+    tau, turned = GAMMA * h, m.steer1_rad - m.steer0_rad
+    system = Pair.of(
+        pace + tau * (c.rear * by_rear + rear_turn),
+        tau * (c.cross * by_front - rear_turn),
+        tau * (c.cross * by_rear + front_turn),
+        pace + tau * (c.front * by_front - front_turn),
+    )
+
+    def stage(rear: Array, front: Array, steer: Array) -> Slips:
+        push = tau * steer
+        return system.solve(pace * rear + rear_turn * push, pace * (front - GAMMA * turned) + front_turn * push)
+
+    rear, front = slips
+    first = stage(rear, front, m.steer0_rad + GAMMA * turned)
+    return stage(rear + AGAIN * (first.rear - rear), front + AGAIN * (first.front - front), m.steer1_rad)
+
+
+def linear_course(slips0: Slips, slips1: Slips, motion: Motion, p: VehicleParameters) -> tuple[Array, Array, Array]:
+    """How the center of gravity moves in a step of the published model: chord, its angle to the heading before, turn."""
+    (rear, front), (rear1, front1), share = slips0, slips1, p.cg_to_rear_m / p.wheelbase_m
+    turn = motion.distance_m * ((front + front1 - rear - rear1) / 2 + motion.mean_steer_rad) / p.wheelbase_m
+    before = rear + share * (front - rear + motion.steer0_rad)
+    after = rear1 + share * (front1 - rear1 + motion.steer1_rad)
+    half = (turn + after - before) / 2
+    return motion.distance_m * sinc(half), before + half, turn
+
+
+def grips(accel: Array, p: VehicleParameters, c: Chassis) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Force per mass that rear and front axle can bear: friction times load, which moves to the rear with `accel`."""
+    lever = p.cg_height_m / GRAVITY_MPS2
+    shift = clamp(lever * accel, -LIFT_SHARE * c.cg_to_front_m, LIFT_SHARE * p.cg_to_rear_m)
+    whole = p.friction * GRAVITY_MPS2 / p.wheelbase_m
+    return whole * (c.cg_to_front_m + shift), whole * (p.cg_to_rear_m - shift)
+
+
+def inner_steps(dt_s: float) -> tuple[int, float]:
+    """Number and length of the steps that make up `dt_s`."""
+    count = max(1, math.ceil(dt_s / MAX_INNER_STEP_S - 1e-9))
+    return count, dt_s / count

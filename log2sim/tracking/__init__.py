@@ -1,0 +1,1 @@
+"""Tracking in the map frame: forward assignment and stitching over occlusions."""

@@ -1,0 +1,182 @@
+"""Forward tracking: measurements of every tick assigned to constant-velocity tracks in the map frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import GROUP_OF, GROUPS, Measurements
+from log2sim.geometry import NS_PER_S, Array
+from log2sim.tracking.motion import ACCELERATION_MPS2, first_velocity, innovation, measurement_noise, predict, update
+
+# 99.9 % of the squared Mahalanobis distance with 2 degrees of freedom.
+GATE = 13.8
+NOT_ALLOWED = 1e6
+# A rider is taken for a pedestrian now and then and the other way round; it costs as much as 2.4 sigma.
+OTHER_GROUP_COST = 6.0
+RELATED = (("pedestrian", "two_wheeler"), ("two_wheeler", "pedestrian"))
+TENTATIVE_HITS = 3
+TENTATIVE_AGE_S = 0.45
+CONFIRMED_AGE_S = 1.2
+
+_NAMES = tuple(GROUPS)
+_NAME_ARRAY = np.array(_NAMES)
+_INDEX = {category: _NAMES.index(group) for category, group in GROUP_OF.items()}
+_ACCELERATION = np.array([ACCELERATION_MPS2[g] for g in _NAMES])
+_GROUP_COST = np.array([
+    [0.0 if a == b else OTHER_GROUP_COST if (a, b) in RELATED else NOT_ALLOWED for b in _NAMES] for a in _NAMES
+])  # fmt: skip
+
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Tracklet:
+    """What a track was given, by `ticks` (n,) and `rows` (n,) of their measurements, and its last state `mean` (4,)."""
+
+    ticks: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    mean: Array
+
+
+def track_forward(
+    measurements: Sequence[Measurements], t_ns: NDArray[np.int64], *, birth_score: float, whole_boxes: bool = False
+) -> list[Tracklet]:
+    """Assign the measurements of T ticks (stamps (T,)) to tracklets, which come in the order of their births."""
+    tracker = ForwardTracker(birth_score=birth_score, whole_boxes=whole_boxes)
+    log: list[tuple[Index, NDArray[np.int64], Index]] = []
+    for tick, found in enumerate(measurements):
+        rows, number = tracker.step(found, int(t_ns[tick]))
+        log.append((number, np.full(len(rows), tick, dtype=np.int64), rows))
+    if not log:
+        return []
+    number, ticks, rows = (np.concatenate(column) for column in zip(*log))
+    order = np.argsort(number, kind="stable")
+    cuts = np.flatnonzero(np.diff(number[order])) + 1
+    means = tracker.last_states()
+    return [Tracklet(ticks[i], rows[i], means[k]) for k, i in enumerate(np.split(order, cuts))] if len(order) else []
+
+
+class ForwardTracker:
+    """Tracks that live now, as columns; `step` is causal.
+
+    `number` (A,) names the tracks in the order of their births, `mean` (A, 4) and `covariance` (A, 4, 4) are their states at
+    the last tick, `seen_ns` (A,) when each got a measurement last, `hits` (A,) how many it has. `whole_boxes` says that the
+    measurements come from a 3D detector: their centers do not move with the view and their yaw is the axis of motion.
+    """
+
+    def __init__(self, *, birth_score: float, whole_boxes: bool = False) -> None:
+        self.birth_score = birth_score
+        self.whole_boxes = whole_boxes
+        self.number = np.zeros(0, dtype=np.intp)
+        self.mean, self.covariance = np.zeros((0, 4)), np.zeros((0, 4, 4))
+        self.seen_ns, self.hits = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+        self._group = np.zeros(0, dtype=np.intp)
+        self._born = 0
+        self._now_ns: int | None = None
+        self._ended: list[tuple[Index, Array]] = []
+
+    def step(self, found: Measurements, now_ns: int) -> tuple[Index, Index]:
+        """Take the measurements of a tick; returns the rows that went to tracks and the numbers of these tracks.
+
+        Those with a score of at least the birth score may start a track; weaker ones only continue one (Zhang et al.,
+        "ByteTrack", ECCV 2022), after the strong ones had their choice.
+        """
+        self._advance(now_ns)
+        rows = np.flatnonzero(found.source != "")
+        if len(rows) == 0:
+            return rows, np.zeros(0, dtype=np.intp)
+        columns = _Columns(found, rows, now_ns, whole_boxes=self.whole_boxes)
+        strong = found.score[rows] >= self.birth_score
+        tracks, taken = self._choose(columns, strong)
+        self._update(tracks, columns, taken, now_ns)
+        numbers = self.number[tracks]
+        fresh = strong.copy()
+        fresh[taken] = False
+        born = np.flatnonzero(fresh)
+        if len(born):
+            self._start(columns, born, now_ns)
+            numbers = np.concatenate([numbers, self.number[len(self.number) - len(born) :]])
+            taken = np.concatenate([taken, born])
+        return rows[taken], numbers
+
+    def last_states(self) -> Array:
+        """States (N, 4) of all tracks that ever were, by number, when they ended or now."""
+        ended = [*self._ended, (self.number, self.mean)]
+        number = np.concatenate([n for n, _ in ended])
+        return np.concatenate([m for _, m in ended])[np.argsort(number)]
+
+    def _advance(self, now_ns: int) -> None:
+        """Drop the tracks that were not seen for too long and carry the others to now."""
+        age_s = (now_ns - self.seen_ns) / NS_PER_S
+        alive = age_s <= np.where(self.hits >= TENTATIVE_HITS, CONFIRMED_AGE_S, TENTATIVE_AGE_S)
+        if not alive.all():
+            self._ended.append((self.number[~alive], self.mean[~alive]))
+            self.number, self.mean, self.covariance = self.number[alive], self.mean[alive], self.covariance[alive]
+            self.seen_ns, self.hits, self._group = self.seen_ns[alive], self.hits[alive], self._group[alive]
+        if self._now_ns is not None and len(self.number):
+            dt_s = (now_ns - self._now_ns) / NS_PER_S
+            self.mean, self.covariance = predict(self.mean, self.covariance, dt_s, _ACCELERATION[self._group])
+        self._now_ns = now_ns
+
+    def _choose(self, columns: _Columns, strong: NDArray[np.bool_]) -> tuple[Index, Index]:
+        """Tracks and measurements that belong together: the cheapest assignment inside the gate, strong ones first.
+
+        The cost is the negative log-likelihood.
+        """
+        from scipy.optimize import linear_sum_assignment
+
+        none = np.zeros(0, dtype=np.intp)
+        if len(self.number) == 0:
+            return none, none
+        squared, log_determinant = innovation(self.mean, self.covariance, columns.xy, columns.r, columns.age_s)
+        cost = squared + log_determinant + _GROUP_COST[self._group[:, None], columns.group]
+        cost[(squared > GATE) | (cost >= NOT_ALLOWED / 2)] = NOT_ALLOWED
+        chosen = []
+        for stage in (strong, ~strong):
+            rows = np.flatnonzero(stage)
+            if len(rows) == 0:
+                continue
+            a, m = linear_sum_assignment(cost[:, rows])
+            m = rows[m]
+            good = cost[a, m] < NOT_ALLOWED / 2
+            chosen.append((a[good], m[good]))
+            cost[a[good]] = NOT_ALLOWED
+        tracks, taken = (np.concatenate(c) for c in zip(*chosen))
+        return tracks, taken
+
+    def _update(self, tracks: Index, columns: _Columns, taken: Index, now_ns: int) -> None:
+        if len(tracks) == 0:
+            return
+        self.mean[tracks], self.covariance[tracks] = update(
+            self.mean[tracks], self.covariance[tracks], columns.xy[taken], columns.r[taken], columns.age_s[taken]
+        )
+        self.seen_ns[tracks] = now_ns
+        self.hits[tracks] += 1
+
+    def _start(self, columns: _Columns, born: Index, now_ns: int) -> None:
+        count, group = len(born), columns.group[born]
+        mean, covariance = np.zeros((count, 4)), np.zeros((count, 4, 4))
+        mean[:, :2], covariance[:, :2, :2] = columns.xy[born], columns.r[born]
+        covariance[:, 2:, 2:] = first_velocity(columns.yaw_rad[born], columns.name[born], whole_boxes=self.whole_boxes)
+        self.number = np.concatenate([self.number, np.arange(self._born, self._born + count)])
+        self.mean, self.covariance = np.concatenate([self.mean, mean]), np.concatenate([self.covariance, covariance])
+        self.seen_ns = np.concatenate([self.seen_ns, np.full(count, now_ns, dtype=np.int64)])
+        self.hits = np.concatenate([self.hits, np.ones(count, dtype=np.int64)])
+        self._group = np.concatenate([self._group, group])
+        self._born += count
+
+
+class _Columns:
+    """The placed measurements of one tick as arrays for the filter."""
+
+    def __init__(self, found: Measurements, rows: Index, now_ns: int, *, whole_boxes: bool) -> None:
+        self.xy = found.center_m[rows, :2]
+        self.yaw_rad = found.yaw_rad[rows]
+        self.group = np.array([_INDEX[c] for c in found.category[rows].tolist()])
+        self.name = _NAME_ARRAY[self.group]
+        self.r = measurement_noise(found.covariance[rows], self.name, whole_boxes=whole_boxes)
+        self.age_s = (found.t_ns[rows] - now_ns) / NS_PER_S

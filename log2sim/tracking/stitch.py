@@ -1,0 +1,142 @@
+"""Stitching: tracklets that an occlusion cut in pieces become one track again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import GROUP_OF, Measurements, Track
+from log2sim.geometry import NS_PER_S, Array
+from log2sim.tracking.motion import ACCELERATION_MPS2, first_velocity, measurement_noise, predict, update
+
+# 99.9 % of the squared Mahalanobis distance with 4 degrees of freedom.
+GATE = 18.5
+FORBIDDEN = 1e6
+# Where both ends could meet anywhere within this (one sigma), meeting proves nothing.
+VAGUE_M = 2.0
+# An object that stands still is the same object however long it was hidden, if it stands where it stood.
+STANDING_MPS = 0.5
+STANDING_APART_M = 1.0
+# What lies farther back says nothing about the end; the filter has forgotten it.
+MEMORY = 20
+
+
+@dataclass(frozen=True, eq=False)
+class _Ends:
+    """Stamps (A,), states (A, 4) and covariances (A, 4, 4) of tracks at both ends, from one filter pass in each direction."""
+
+    first_ns: NDArray[np.int64]
+    last_ns: NDArray[np.int64]
+    first: tuple[Array, Array]
+    last: tuple[Array, Array]
+    group: NDArray[np.str_]
+
+
+def stitch(
+    tracks: Sequence[Track], t_ns: NDArray[np.int64], *, max_gap_s: float, whole_boxes: bool = False
+) -> list[Track]:
+    """Join tracks whose ends meet, cheapest pairs first, until nothing meets any more.
+
+    Both ends are carried to the middle of the gap with the uncertainty that the gap adds, and must agree there in place
+    and speed.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    current = list(tracks)
+    while len(current) > 1:
+        cost = _meeting_costs(_ends(current, whole_boxes=whole_boxes), max_gap_s)
+        i, j = linear_sum_assignment(cost)
+        met = cost[i, j] < FORBIDDEN
+        if not met.any():
+            break
+        following = dict(zip(i[met].tolist(), j[met].tolist()))
+        heads = sorted(set(range(len(current))) - set(following.values()))
+        joined = []
+        for head in heads:
+            chain = [head]
+            while chain[-1] in following:
+                chain.append(following[chain[-1]])
+            joined.append(_concatenate([current[k] for k in chain]))
+        current = joined
+    return current
+
+
+def _meeting_costs(ends: _Ends, max_gap_s: float) -> Array:
+    """Cost (A, A) of the second track being the first one's continuation, `FORBIDDEN` where it cannot be."""
+    cost = np.full((len(ends.group), len(ends.group)), FORBIDDEN)
+    gap_s = (ends.first_ns[None, :] - ends.last_ns[:, None]) / NS_PER_S
+    stands, stood = (np.hypot(*state[:, 2:].T) < STANDING_MPS for state in (ends.last[0], ends.first[0]))
+    still = stands[:, None] & stood[None, :]
+    a, b = np.nonzero((gap_s > 0) & (still | (gap_s <= max_gap_s)) & (ends.group[:, None] == ends.group[None, :]))
+    gap_s, still = gap_s[a, b], still[a, b]
+    last, first = ends.last[0][a], ends.first[0][b]
+    apart = np.hypot(*(last - first)[:, :2].T)
+    stood = still & (apart < STANDING_APART_M)
+    cost[a[stood], b[stood]] = apart[stood]
+    half = gap_s[:, None] / 2
+    beside = np.hypot(*(last[:, :2] + half * last[:, 2:] - first[:, :2] + half * first[:, 2:]).T)
+    # Farther apart than this no allowed uncertainty brings them together.
+    near = np.flatnonzero(~stood & (gap_s <= max_gap_s) & (beside <= np.sqrt(GATE) * VAGUE_M))
+    a, b, half = a[near], b[near], gap_s[near] / 2
+    noise = np.array([ACCELERATION_MPS2[g] for g in ends.group[a].tolist()])
+    forward = predict(ends.last[0][a], ends.last[1][a], half, noise)
+    backward = predict(ends.first[0][b], ends.first[1][b], -half, noise)
+    difference, covariance = forward[0] - backward[0], forward[1] + backward[1]
+    squared = np.einsum("ni,ni->n", difference, np.linalg.solve(covariance, difference[..., None])[..., 0])
+    place = covariance[:, :2, :2]
+    sure = np.sqrt(np.linalg.eigvalsh(place)[:, -1]) <= VAGUE_M
+    good = sure & (squared <= GATE)
+    # 4 degrees of freedom; an uncertain meeting must not win over a sure one, hence the determinant.
+    cost[a[good], b[good]] = squared[good] + np.log(np.linalg.det(place[good])) + 10.0
+    return cost
+
+
+def _ends(tracks: Sequence[Track], *, whole_boxes: bool) -> _Ends:
+    group = np.array([GROUP_OF[t.category] for t in tracks])
+    parts = [t.measurements for t in tracks]
+    return _Ends(
+        np.array([m.t_ns[0] for m in parts]),
+        np.array([m.t_ns[-1] for m in parts]),
+        _filtered([np.arange(len(m))[:MEMORY][::-1] for m in parts], parts, group, whole_boxes=whole_boxes),
+        _filtered([np.arange(len(m))[-MEMORY:] for m in parts], parts, group, whole_boxes=whole_boxes),
+        group,
+    )
+
+
+def _filtered(
+    orders: Sequence[NDArray[np.intp]], parts: Sequence[Measurements], group: NDArray[np.str_], *, whole_boxes: bool
+) -> tuple[Array, Array]:
+    """Filter states (A, 4) and covariances (A, 4, 4) of all tracks after the last of the rows that each is given in order."""
+    count = np.array([len(o) for o in orders])
+    start = np.cumsum(count) - count
+    xy = np.concatenate([m.center_m[o, :2] for m, o in zip(parts, orders)])
+    t_ns = np.concatenate([m.t_ns[o] for m, o in zip(parts, orders)])
+    r = np.concatenate([m.covariance[o] for m, o in zip(parts, orders)])
+    r = measurement_noise(r, np.repeat(group, count), whole_boxes=whole_boxes)
+    yaw = np.array([m.yaw_rad[o[0]] for m, o in zip(parts, orders)])
+    mean, covariance = np.zeros((len(parts), 4)), np.zeros((len(parts), 4, 4))
+    mean[:, :2], covariance[:, :2, :2] = xy[start], r[start]
+    covariance[:, 2:, 2:] = first_velocity(yaw, group, whole_boxes=whole_boxes)
+    noise = np.array([ACCELERATION_MPS2[g] for g in group.tolist()])
+    for k in range(1, int(count.max())):
+        on = np.flatnonzero(count > k)
+        row = start[on] + k
+        predicted = predict(mean[on], covariance[on], (t_ns[row] - t_ns[row - 1]) / NS_PER_S, noise[on])
+        mean[on], covariance[on] = update(*predicted, xy[row], r[row], np.zeros(len(on)))
+    return mean, covariance
+
+
+def _concatenate(parts: Sequence[Track]) -> Track:
+    if len(parts) == 1:
+        return parts[0]
+    m = Measurements.join([p.measurements for p in parts])
+    return Track(category_of(m), np.concatenate([p.tick for p in parts]), m)
+
+
+def category_of(m: Measurements) -> str:
+    """The category that got most of the score over a track's life; ties go to the first by name."""
+    names, index = np.unique(m.category, return_inverse=True)
+    return str(names[np.argmax(np.bincount(index, weights=m.score))])

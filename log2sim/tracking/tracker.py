@@ -1,0 +1,59 @@
+"""Tracking in the map frame: forward assignment, stitching over occlusions, one category a track."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Measurements, Track
+from log2sim.geometry import NS_PER_S
+from log2sim.tracking.forward import track_forward
+from log2sim.tracking.stitch import category_of, stitch
+
+__all__ = ["category_of", "track"]
+
+
+def track(
+    measurements: Sequence[Measurements],
+    t_ns: NDArray[np.int64],
+    *,
+    birth_score: float,
+    max_gap_s: float,
+    min_life_s: float,
+    whole_boxes: bool = False,
+) -> list[Track]:
+    """Turn the measurements of T ticks into tracks, longest lives first by their start.
+
+    Parameters
+    ----------
+    t_ns : (T,) int64
+    birth_score : float
+        Lowest score that can start a track.
+    max_gap_s : float
+        Longest occlusion that is bridged, s.
+    whole_boxes : bool
+        Whether the measurements come from a 3D detector: centers that do not move with the view, yaw along the motion.
+    min_life_s : float
+        Tracks seen for a shorter time, after stitching, are taken for false alarms, unless the log itself is as short.
+    """
+    tracklets = track_forward(measurements, t_ns, birth_score=birth_score, whole_boxes=whole_boxes)
+    everything = Measurements.join(measurements)
+    first_row = np.cumsum([0, *(len(m) for m in measurements)])
+    tracks = []
+    for t in tracklets:
+        rows = everything.take(first_row[t.ticks] + t.rows)
+        tracks.append(Track(category_of(rows), t.ticks, rows))
+    joined = stitch(tracks, t_ns, max_gap_s=max_gap_s, whole_boxes=whole_boxes)
+    least = least_hits(t_ns, min_life_s)
+    kept = [t for t in joined if len(t) >= least]
+    return sorted(kept, key=lambda t: (int(t.tick[0]), float(t.measurements.center_m[0, 0])))
+
+
+def least_hits(t_ns: NDArray[np.int64], min_life_s: float) -> int:
+    """How many measurements a track needs: so many ticks as the least life lasts, and one in a log of one tick."""
+    if len(t_ns) < 3:
+        return 1
+    period_s = float(np.median(np.diff(t_ns))) / NS_PER_S
+    return max(2, min(round(min_life_s / period_s), len(t_ns) // 2))

@@ -1,0 +1,1 @@
+"""Pictures, films, the bird's-eye view and the page for browsers."""

@@ -1,0 +1,98 @@
+"""Puts data, script and style into the one page."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+import re
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from log2sim.datatypes import Scenario
+from log2sim.documents import refuse_existing, replaced
+from log2sim.errors import ConfigError
+from log2sim.visualization.page.pack import SCALES, pack
+
+SUFFIXES = (".html", ".htm")
+SCRIPTS = (
+    "track.js",
+    "theme.js",
+    "map.js",
+    "paint.js",
+    "chart.js",
+    "list.js",
+    "details.js",
+    "controls.js",
+    "stage.js",
+    "timeline.js",
+    "main.js",
+)
+"""Parts of the script in the order in which they build on each other."""
+
+
+def write_page(
+    scenario: Scenario,
+    out_path: Path | str,
+    *,
+    truth: Scenario | None = None,
+    replay: Any = None,
+    overwrite: bool = False,
+) -> None:
+    """Write a page that plays a scenario in a browser, on its own: it asks nothing of any network.
+
+    Parameters
+    ----------
+    truth : Scenario or None
+        Shown as a layer, brought to the scenario's start and map.
+    replay : Replay or None
+        Shown as a layer, and beside the log in the plots of an agent.
+
+    Raises
+    ------
+    ConfigError
+        When the name ends in something else than .html, the file exists and `overwrite` is False, it cannot be written, or
+        there are more waypoints than a page can hold.
+    """
+    out_path = Path(out_path)
+    if out_path.suffix.lower() not in SUFFIXES:
+        raise ConfigError(f"{out_path}: a page's name must end in {' or '.join(SUFFIXES)}, not in '{out_path.suffix}'")
+    refuse_existing(out_path, overwrite=overwrite)
+    page = page_of({**pack(scenario, truth, replay), "scales": SCALES})
+    with replaced(out_path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+
+
+def page_of(document: dict[str, Any]) -> str:
+    """The page as text. Its policy lets the browser run this very script and load nothing at all."""
+    script = '"use strict";\n(() => {\n' + "".join(_file(name) for name in SCRIPTS) + "})();\n"
+    style = _file("style.css")
+    policy = (
+        f"default-src 'none'; script-src '{_hash(script)}'; style-src '{_hash(style)}'; img-src data:; "
+        "base-uri 'none'; form-action 'none'"
+    )
+    parts = {
+        "policy": policy,
+        "title": html.escape(document["name"] or "scenario"),
+        "style": style,
+        "data": _harmless(document),
+        "script": script,
+    }
+    # One pass: what is put in is never looked at again, so no name in a scenario can stand for a part of the page.
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _file("page.html"))
+
+
+def _harmless(document: dict[str, Any]) -> str:
+    """JSON that cannot end the element that it stands in, whatever the names in it."""
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False)
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def _hash(text: str) -> str:
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+
+
+def _file(name: str) -> str:
+    return resources.files("log2sim.visualization.page").joinpath(name).read_text(encoding="utf-8")

@@ -1,0 +1,118 @@
+"""Print how the package holds together: rooms, imports between them, import cycles, long signatures and lines.
+
+A room is a folder or a module directly below `log2sim`. Imports within functions count like all others.
+
+Usage: python tools/imports.py [CHECKOUT] [--edges]
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+MAX_PARAMETERS = 5
+Graph = Mapping[str, set[str]]
+
+
+def main() -> None:
+    """Run the command."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
+    parser.add_argument("checkout", nargs="?", type=Path, default=Path(__file__).resolve().parents[1])
+    parser.add_argument(
+        "--edges", action="store_true", help="print every import between rooms and every long signature"
+    )
+    options = parser.parse_args()
+    modules = module_graph(options.checkout / "log2sim")
+    rooms = room_graph(modules)
+    signatures = sorted(long_signatures(options.checkout / "log2sim"))
+    print(f"rooms                                     {len(rooms)}")
+    print(f"imports between rooms (room -> room)      {sum(map(len, rooms.values()))}")
+    print(
+        f"imports between modules of two rooms      {sum(room_of(m) != room_of(t) for m in modules for t in modules[m])}"
+    )
+    print(f"import cycles of modules                  {len(cycles(modules))}")
+    print(f"import cycles of rooms                    {len(cycles(rooms))}")
+    print(f"functions with more than {MAX_PARAMETERS} parameters     {len(signatures)}")
+    for folder in ("log2sim", "tests", "tools"):
+        files = sorted((options.checkout / folder).rglob("*.py"))
+        lines = sum(len(f.read_text(encoding="utf-8").splitlines()) for f in files)
+        print(f"{folder:<10}{len(files):>4} modules {lines:>7} lines")
+    if options.edges:
+        for room, targets in rooms.items():
+            print(f"{room}: {', '.join(sorted(targets))}")
+        for group in (*cycles(modules), *cycles(rooms)):
+            print(f"cycle: {', '.join(sorted(group))}")
+        for signature in signatures:
+            print(signature)
+
+
+def module_graph(package: Path) -> dict[str, set[str]]:
+    """Modules of the package and the modules that each imports, lazily or not; names without the package's own."""
+    files = {_name(f, package): f for f in sorted(package.rglob("*.py"))}
+    return {name: set(_imports(file, files)) - {name} for name, file in files.items()}
+
+
+def _name(file: Path, package: Path) -> str:
+    parts = file.relative_to(package).with_suffix("").parts
+    return ".".join(parts).removesuffix(".__init__")
+
+
+def _imports(file: Path, known: Mapping[str, Path]) -> Iterator[str]:
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (a.name.removeprefix("log2sim.") for a in node.names if a.name.startswith("log2sim."))
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "log2sim":
+            module = (node.module or "").removeprefix("log2sim").removeprefix(".")
+            for alias in node.names:
+                inner = f"{module}.{alias.name}".removeprefix(".")
+                yield inner if inner in known else module or "__init__"
+
+
+def room_of(module: str) -> str:
+    """The folder or module below the package that a module belongs to."""
+    return module.split(".")[0]
+
+
+def room_graph(modules: Graph) -> dict[str, set[str]]:
+    """Rooms and the rooms that each imports."""
+    rooms: dict[str, set[str]] = {}
+    for module, targets in modules.items():
+        rooms.setdefault(room_of(module), set()).update(room_of(t) for t in targets)
+    return {room: targets - {room} for room, targets in rooms.items()}
+
+
+def cycles(graph: Graph) -> list[set[str]]:
+    """Groups of two or more nodes that import each other, directly or through others."""
+    reach = {node: _reachable(graph, node) for node in graph}
+    groups: list[set[str]] = []
+    for node in graph:
+        group = {other for other in reach[node] if node in reach.get(other, set())}
+        if group - {node} and group not in groups:
+            groups.append(group)
+    return groups
+
+
+def _reachable(graph: Graph, start: str) -> set[str]:
+    found, todo = set[str](), [start]
+    while todo:
+        new = graph.get(todo.pop(), set()) - found
+        found |= new
+        todo += new
+    return found
+
+
+def long_signatures(package: Path) -> Iterator[str]:
+    """Functions with more parameters than `MAX_PARAMETERS`, `self` and `cls` apart, as "module:line name (count)"."""
+    for file in sorted(package.rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef):
+                names = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
+                count = len([n for n in names if n not in ("self", "cls")])
+                if count > MAX_PARAMETERS:
+                    yield f"{_name(file, package)}:{node.lineno} {node.name} ({count})"
+
+
+if __name__ == "__main__":
+    main()
