@@ -14,6 +14,7 @@ from log2sim.synth.scene import Building, LidarSpec, Scene
 
 GROUND, BUILDING = -1, -2
 PAIRS_AT_ONCE = 400_000
+MESH_MARGIN_M = 1e-6  # rounding of a mesh that fills its box
 GRAZING_RETURN = 0.02  # sine of the angle on the ground below which nothing comes back
 
 
@@ -94,15 +95,26 @@ def _box_distance(building: Building, origin: Array, ray: Array) -> Array:
     c, s = np.cos(np.deg2rad(building.yaw_deg)), np.sin(np.deg2rad(building.yaw_deg))
     rotation = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
     size = np.array(building.size_m)
-    o = (origin - [*building.center, size[2] / 2]) @ rotation.T
-    d = ray @ rotation.T
-    parallel = d == 0
-    d = np.where(parallel, 1.0, d)
-    a, b = (-size / 2 - o) / d, (size / 2 - o) / d
-    outside = parallel & (np.abs(o) > size / 2)
+    return slab_distance(size, (origin - [*building.center, size[2] / 2]) @ rotation.T, ray @ rotation.T)
+
+
+def slab_distance(size_m: Array, origin: Array, ray: Array, *, from_inside: bool = False) -> Array:
+    """Distance (N,) at which rays (N, 3) enter a box of size (3,) around the zero point, inf where they miss it.
+
+    Rays that start inside miss it too, unless `from_inside`: then the distance is negative.
+
+    Notes
+    -----
+    Slab method of Kay & Kajiya, "Ray Tracing Complex Scenes" (SIGGRAPH 1986).
+    """
+    parallel = ray == 0
+    d = np.where(parallel, 1.0, ray)
+    a, b = (-size_m / 2 - origin) / d, (size_m / 2 - origin) / d
+    outside = parallel & (np.abs(origin) > size_m / 2)
     enter = np.where(parallel, -np.inf, np.minimum(a, b)).max(1)
     leave = np.where(parallel, np.inf, np.maximum(a, b)).min(1)
-    return np.where((enter <= leave) & (enter > 0) & ~outside.any(1), enter, np.inf)
+    ahead = leave > 0 if from_inside else enter > 0
+    return np.where((enter <= leave) & ahead & ~outside.any(1), enter, np.inf)
 
 
 def _actor_distance(
@@ -110,19 +122,19 @@ def _actor_distance(
 ) -> tuple[NDArray[np.int64], Array]:
     """Rays that meet the actor's box, each with the actor where it is at the ray's time, and distances to its shape."""
     states = actor.at(t_s)
-    center = states.center_m[column]
-    radius = np.linalg.norm(actor.spec.box_m) / 2
-    to = center - origin
+    to = states.center_m[column] - origin
     along = np.einsum("ni,ni->n", to, ray)
     off = np.einsum("ni,ni->n", to, to) - along**2
+    radius = np.linalg.norm(actor.spec.box_m) / 2
     rows = np.flatnonzero((off < radius**2) & (along > -radius))
     if len(rows) == 0:
         return rows, np.zeros(0)
+    mesh = actor.mesh(float(t_s[column[rows]].mean()))
     agent_T_map = inverse(states.map_T_agent())[column[rows]]
     o = np.einsum("nij,nj->ni", agent_T_map[:, :3, :3], origin[rows]) + agent_T_map[:, :3, 3]
     d = np.einsum("nij,nj->ni", agent_T_map[:, :3, :3], ray[rows])
-    mesh = actor.mesh(float(t_s[column[rows]].mean()))
-    return rows, first_hit(o, d, mesh.vertices_m[mesh.faces])
+    meets = np.isfinite(slab_distance(np.array(actor.spec.box_m) + 2 * MESH_MARGIN_M, o, d, from_inside=True))
+    return rows[meets], first_hit(o[meets], d[meets], mesh.vertices_m[mesh.faces])
 
 
 def first_hit(origin: Array, ray: Array, triangles: Array) -> Array:
