@@ -34,7 +34,7 @@ def spoiled(key: str, index: int, value: float) -> Agent:
         (agent(line(), "bad", size_m=(4.0, np.nan, 1.5)), "agent 'bad': size"),
         (agent(line(), "bad", yaw_rad=np.pi, speed_mps=np.full(31, 10.0)), "agent 'bad': goes backward on 30"),
         (agent(line(), "bad", yaw_rad=0.0, speed_mps=np.full(31, -10.0)), "agent 'bad': goes backward on 30"),
-        (agent(line(), "ego"), "agent 'ego': the id stands twice"),
+        (agent(line(), "ego"), "agent 'ego': the id occurs twice"),
         (agent(line(start=(0.0, 4e5)), "bad"), "agent 'bad': is 200 km from the middle of the scenario, expected at most 66 km"),
     ],
 )  # fmt: skip

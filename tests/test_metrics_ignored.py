@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from worlds import tiny_log
 
-from log2sim.datatypes import Agent, ImageRegions, LabelView, MapFrame, Scenario, Unlabeled, Waypoints
+from log2sim.datatypes import Agent, IgnoreRegions, ImageRegions, LabelView, MapFrame, Scenario, Waypoints
 from log2sim.documents import check
 from log2sim.errors import LogError, ScenarioError
 from log2sim.evaluation.metrics.evaluator import evaluate
-from log2sim.evaluation.metrics.label_views import unlabeled_of
+from log2sim.evaluation.metrics.label_views import ignore_regions_of
 from log2sim.evaluation.metrics.truth import truth_from_log
 from log2sim.geometry import Camera, box_corners, transform
 from log2sim.logs.opening import open_log
@@ -86,7 +86,7 @@ TRUTH = scenario(agent("a", 30.0, 10.0))
 
 
 def truth_with(*views, outside=False):
-    return replace(TRUTH, unlabeled=Unlabeled(tuple(views), outside))
+    return replace(TRUTH, ignore_regions=IgnoreRegions(tuple(views), outside))
 
 
 def test_only_the_agent_in_a_region_is_ignored():
@@ -221,7 +221,7 @@ def test_start_and_offset_of_the_truth_do_not_matter():
         duration_s=7.0,
         agents=moved_agents,
         map=MapFrame(offset_m=tuple(shift.tolist())),
-        unlabeled=Unlabeled((seen,), False),
+        ignore_regions=IgnoreRegions((seen,), False),
     )
     assert counts(one(), truth)[1:] == (0, 21)
     assert counts(one(20.0, 5.0), truth)[1:] == (21, 0)
@@ -255,7 +255,7 @@ def test_random_worlds_against_painted_pixels():
         low = rng.uniform([0, 80], [600, 200], (6, 2))
         regions = np.hstack([low, low + rng.uniform([40, 30], [250, 150], (6, 2))])
         ghosts = [agent(str(k), *c, size_m=tuple(s)) for k, (c, s) in enumerate(zip(center, size))]
-        truth = scenario(agent("far", 900.0), unlabeled=Unlabeled((view(regions.round()),), True))
+        truth = scenario(agent("far", 900.0), ignore_regions=IgnoreRegions((view(regions.round()),), True))
         result, false, ignored = counts(scenario(*ghosts), truth)
         assert false + ignored == 25 * 21
         found = {row["id"] for row in result["ignored_agents"]}
@@ -276,8 +276,8 @@ def test_a_truth_file_keeps_its_views(tmp_path):
     truth.save(tmp_path / "truth.json")
     again = Scenario.load(tmp_path / "truth.json")
     assert again.to_dict() == truth.to_dict()
-    assert again.unlabeled.views[0].camera.distortion == lens.distortion
-    np.testing.assert_array_equal(again.unlabeled.views[0].map_T_cam, seen.map_T_cam)
+    assert again.ignore_regions.views[0].camera.distortion == lens.distortion
+    np.testing.assert_array_equal(again.ignore_regions.views[0].map_T_cam, seen.map_T_cam)
     TRUTH.save(tmp_path / "plain.json")
     assert "unlabeled" not in json.loads((tmp_path / "plain.json").read_text())
 
@@ -318,17 +318,17 @@ def test_a_log_hands_its_regions_to_the_truth():
         log, [t_ns[0], t_ns[4] + 2_000_000, t_ns[-1] + 10**9], [[0, 0, 9, 9], [1, 1, 8, 8], EVERYWHERE]
     )
     truth = truth_from_log(log)
-    (seen,) = truth.unlabeled.views
-    assert truth.unlabeled.outside_views
+    (seen,) = truth.ignore_regions.views
+    assert truth.ignore_regions.outside_views
     assert seen.region_frame.tolist() == [0, 4]
     assert seen.region_px.tolist() == [[0, 0, 9, 9], [1, 1, 8, 8]]
     np.testing.assert_array_equal(np.round(seen.t_s * 1e9).astype(np.int64) + truth.t0_ns, t_ns)
     np.testing.assert_allclose(seen.map_T_cam, log.map_T_sensor("front", t_ns)[0], atol=1e-9)
     all_around = replace(log, labels=replace(log.labels, cameras=None))
-    assert not unlabeled_of(all_around, 0).outside_views
-    assert unlabeled_of(replace(all_around, ignored_regions={}), 0) is None
+    assert not ignore_regions_of(all_around, 0).outside_views
+    assert ignore_regions_of(replace(all_around, ignored_regions={}), 0) is None
     with pytest.raises(LogError, match=r"labels are of camera 'fronr'.*there are: front"):
-        unlabeled_of(labeled_by_camera(log, t_ns[:1], [EVERYWHERE], ("fronr",)), 0)
+        ignore_regions_of(labeled_by_camera(log, t_ns[:1], [EVERYWHERE], ("fronr",)), 0)
 
 
 def test_a_native_log_keeps_its_regions_and_names_what_is_wrong(tmp_path):

@@ -80,13 +80,13 @@ def test_beside_another_a_scenario_has_its_start_and_its_map() -> None:
     other = replace(here, t0_ns=here.t0_ns - 250_000_000, map=replace(here.map, offset_m=tuple(
         a - b for a, b in zip(here.map.offset_m, (dx, dy, dz))
     )))  # fmt: skip
-    moved = here.beside(other)
+    moved = here.aligned_to(other)
     assert (moved.t0_ns, moved.map) == (other.t0_ns, other.map)
     for a, b in zip(here.agents, moved.agents, strict=True):
         for name, step in (("t_s", start_s), ("x_m", dx), ("y_m", dy), ("z_m", dz), ("yaw_rad", 0.0)):
             np.testing.assert_allclose(getattr(b.waypoints, name) - getattr(a.waypoints, name), step, atol=1e-9)
     with pytest.raises(ScenarioError, match="bring both to one projection"):
-        replace(here, map=replace(here.map, projection="+proj=utm +zone=32")).beside(
+        replace(here, map=replace(here.map, projection="+proj=utm +zone=32")).aligned_to(
             replace(here, map=replace(here.map, projection="+proj=utm +zone=33"))
         )
 
@@ -132,7 +132,7 @@ BROKEN: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
         r"waypoints\.t_s does not increase at index 3",
     ),
     "an unknown category": (lambda d: agent_of(d).update(category="tram"), r"'car-1': category 'tram' is not known"),
-    "an id twice": (lambda d: agent_of(d).update(id="ego"), r"agent 'ego': the id stands twice"),
+    "an id twice": (lambda d: agent_of(d).update(id="ego"), r"agent 'ego': the id occurs twice"),
     "a confidence above one": (lambda d: agent_of(d).update(confidence=1.2), r"agents\[1\]\.confidence"),
     "a start that is no integer": (lambda d: d.update(t0_ns=1.5), r"t0_ns"),
 }

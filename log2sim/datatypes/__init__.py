@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from log2sim.datatypes.agent import Agent, Waypoints
 from log2sim.datatypes.categories import CATEGORIES, GROUP_OF, GROUPS, TYPICAL_SIZE_M
-from log2sim.datatypes.ignore_regions import LabelView, Unlabeled
+from log2sim.datatypes.ignore_regions import IgnoreRegions, LabelView
 from log2sim.datatypes.log import (
     EgoVehicle,
     Frame,
@@ -18,7 +19,7 @@ from log2sim.datatypes.log import (
 )
 from log2sim.datatypes.measurements import Detections, Measurements
 from log2sim.datatypes.obstacles import Obstacles
-from log2sim.datatypes.scenario import EGO, VERSION, Agent, Scenario, Waypoints
+from log2sim.datatypes.scenario import EGO, VERSION, Scenario
 from log2sim.datatypes.tracks import Track
 
 __all__ = [
@@ -32,6 +33,7 @@ __all__ = [
     "Detections",
     "EgoVehicle",
     "Frame",
+    "IgnoreRegions",
     "ImageLabels",
     "ImageRegions",
     "LabelView",
@@ -45,6 +47,5 @@ __all__ = [
     "Stream",
     "Sweep",
     "Track",
-    "Unlabeled",
     "Waypoints",
 ]

@@ -1,4 +1,4 @@
-"""Where the labels of a truth say nothing: what its cameras show and the parts of their images without labels."""
+"""Ignore regions of a truth: parts of images, and of the scene, in which objects were left without labels."""
 
 from __future__ import annotations
 
@@ -19,9 +19,20 @@ QUATERNION_TOLERANCE = 1e-3
 class LabelView:
     """The images of one camera in which objects were labeled.
 
-    `t_s` (F,) strictly increasing stamps, seconds of the truth; `translation_m` (F, 3) and `rotation_wxyz` (F, 4) of the
-    camera in the map at them; the mount of `camera` means nothing here. `region_frame` (R,) int64 and `region_px` (R, 4)
-    u0, v0, u1, v1: parts without labels.
+    Attributes
+    ----------
+    camera : Camera
+        Its mount is not used.
+    t_s : (F,) float64, s
+        Strictly increasing stamps since the start of the truth.
+    translation_m : (F, 3) float64, m
+        Of the camera in the map.
+    rotation_wxyz : (F, 4) float64
+        Unit quaternions of the camera in the map, scalar first.
+    region_frame : (R,) int64
+        Index into `t_s` of each region.
+    region_px : (R, 4) float64, px
+        u0, v0, u1, v1 of each part of an image without labels.
     """
 
     camera: Camera
@@ -33,24 +44,38 @@ class LabelView:
 
     @property
     def map_T_cam(self) -> Array:
-        """Poses (F, 4, 4) of the camera."""
+        """Return the poses (F, 4, 4) of the camera."""
         return transform(rotation_from_quaternion(self.rotation_wxyz), self.translation_m)
 
 
 @dataclass(frozen=True, eq=False)
-class Unlabeled:
-    """`views` of cameras, and whether objects outside all of them were left without labels too."""
+class IgnoreRegions:
+    """Where reconstructed objects are neither right nor false, because nothing was labeled there.
+
+    Attributes
+    ----------
+    views : tuple of LabelView
+        One for each labeled camera.
+    outside_views : bool
+        Whether objects outside all views were left without labels too.
+    """
 
     views: tuple[LabelView, ...]
     outside_views: bool
 
     def to_dict(self) -> dict[str, Any]:
-        """The part `unlabeled` of `schemas/scenario-1.json`."""
+        """Return the part `unlabeled` of a document of `schemas/scenario-1.json`."""
         return {"outside_views": self.outside_views, "views": [_view_to_dict(v) for v in self.views]}
 
     @classmethod
-    def from_dict(cls, document: Mapping[str, Any]) -> Unlabeled:
-        """Build it from a document that keeps the schema; columns that do not fit each other are a `ScenarioError`."""
+    def from_dict(cls, document: Mapping[str, Any]) -> IgnoreRegions:
+        """Build them from the part `unlabeled` of a document that keeps the schema.
+
+        Raises
+        ------
+        ScenarioError
+            When columns do not fit each other.
+        """
         views = tuple(_view_from_dict(v, f"unlabeled.views[{k}]") for k, v in enumerate(document["views"]))
         return cls(views, bool(document["outside_views"]))
 

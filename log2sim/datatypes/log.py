@@ -1,7 +1,7 @@
-"""What flows between the stages: sensors, streams, logs, detections.
+"""A driving log: its sensors, the streams of their records, ego poses and labels.
 
-Everything is a frozen record of columns. Arrays are never changed once a record holds them. Letters in shapes: N points,
-M boxes, L labels, A agents, T ticks, F frames of a stream.
+All types are frozen dataclasses of columns; no code changes an array that one of them holds. Letters in shapes: N points,
+M boxes, L labels, T ticks, F records of a stream.
 """
 
 from __future__ import annotations
@@ -18,7 +18,15 @@ from log2sim.geometry import Array, Camera, Mount, PoseTrack
 
 @dataclass(frozen=True, eq=False)
 class Lidar:
-    """A LiDAR; `mount_T_lidar` (4, 4)."""
+    """A LiDAR and where it is mounted.
+
+    Attributes
+    ----------
+    name : str
+    mount : {"ego", "map"}
+        Frame that it is fixed in: on the vehicle or at the roadside.
+    mount_T_lidar : (4, 4) float64
+    """
 
     name: str
     mount: Mount
@@ -29,8 +37,16 @@ class Lidar:
 class Sweep:
     """One LiDAR sweep.
 
-    `xyz_m` (N, 3) float32 or float64 in `frame`: "lidar" (the sensor's own, each point at its own time) or "map" (already
-    compensated). `t_ns` (N,) int64 absolute stamps of the points, or None when the log has none. All rows are finite.
+    Attributes
+    ----------
+    stamp_ns : int
+        Absolute time of the sweep.
+    xyz_m : (N, 3) float32 or float64, m
+        Finite points in `frame`.
+    frame : {"lidar", "map"}
+        "lidar": the sensor's frame at each point's own time; "map": already motion-compensated.
+    t_ns : (N,) int64 or None
+        Absolute stamps of the points; None when the log has none.
     """
 
     stamp_ns: int
@@ -41,10 +57,17 @@ class Sweep:
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """The records of one sensor in the order of the log: `t_ns` (F,) int64 and `read(i)`.
+    """The records of one sensor in the order of the log.
 
-    `read` returns (H, W, 3) uint8 BGR for a camera and a `Sweep` for a LiDAR; it raises `RecordError` for one that cannot
-    be read. It is safe to call from several threads.
+    Attributes
+    ----------
+    name : str
+        Of the sensor.
+    t_ns : (F,) int64
+        Absolute stamps.
+    read : callable
+        Returns record `i`: (H, W, 3) uint8 BGR of a camera, a `Sweep` of a LiDAR. Raises `RecordError` for a record that
+        cannot be read. Several threads may call it at once.
     """
 
     name: str
@@ -54,11 +77,23 @@ class Stream:
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """Labeled 3D boxes of a log, one row a box and stamp, in the map frame.
+    """Labeled 3D boxes of a log in the map frame, one row a box and stamp.
 
-    `t_ns` (L,) int64, `track_id` (L,) str, `category` (L,) str, `center_m` (L, 3) box centers, `size_m` (L, 3) length,
-    width, height, `yaw_rad` (L,). `visible` (L,) bool where the log states it, else None: then it is computed. `cameras`
-    names those in whose view alone objects were labeled; None where they were labeled all around.
+    Attributes
+    ----------
+    t_ns : (L,) int64
+        Absolute stamps.
+    track_id : (L,) str
+    category : (L,) str
+    center_m : (L, 3) float64, m
+        Box centers.
+    size_m : (L, 3) float64, m
+        Length, width, height.
+    yaw_rad : (L,) float64
+    visible : (L,) bool or None
+        As the log states it; None where it states nothing and visibility is computed.
+    cameras : tuple of str or None
+        The cameras in whose images alone objects were labeled; None when they were labeled all around.
     """
 
     t_ns: NDArray[np.int64]
@@ -73,7 +108,16 @@ class Labels:
 
 @dataclass(frozen=True, eq=False)
 class ImageLabels:
-    """Labeled 2D boxes of one camera: `t_ns` (L,) the stamp of the frame, `box_px` (L, 4), `category` (L,) str."""
+    """Labeled 2D boxes of one camera.
+
+    Attributes
+    ----------
+    t_ns : (L,) int64
+        Absolute stamp of the frame.
+    box_px : (L, 4) float64, px
+        u0, v0, u1, v1.
+    category : (L,) str
+    """
 
     t_ns: NDArray[np.int64]
     box_px: Array
@@ -82,7 +126,15 @@ class ImageLabels:
 
 @dataclass(frozen=True, eq=False)
 class ImageRegions:
-    """Parts of the images of one camera in which objects were left without labels: `t_ns` (L,), `box_px` (L, 4)."""
+    """Parts of the images of one camera in which objects were left without labels.
+
+    Attributes
+    ----------
+    t_ns : (L,) int64
+        Absolute stamp of the frame.
+    box_px : (L, 4) float64, px
+        u0, v0, u1, v1.
+    """
 
     t_ns: NDArray[np.int64]
     box_px: Array
@@ -90,10 +142,16 @@ class ImageRegions:
 
 @dataclass(frozen=True)
 class MapFrame:
-    """Where the map frame lies on Earth: local x, y, z + `offset_m` are coordinates of `projection` (a PROJ string).
+    """Where the map frame lies on Earth: local x, y, z + `offset_m` are coordinates of `projection`.
 
-    Without a projection the map is only local. `offset_m` keeps the numbers small: large map coordinates are stored as
-    whole kilometers here and the rest in the poses, so nothing is lost and nothing is rounded away.
+    Attributes
+    ----------
+    latitude_deg, longitude_deg, altitude_m : float or None
+        Of the map's origin; None when unknown.
+    projection : str or None
+        A PROJ string; None for a map that is only local.
+    offset_m : (3,) tuple of float, m
+        Whole kilometers taken off large map coordinates, so that the rest keeps its digits.
     """
 
     latitude_deg: float | None = None
@@ -105,7 +163,15 @@ class MapFrame:
 
 @dataclass(frozen=True)
 class EgoVehicle:
-    """Size (length, width, height) in m; box center = ego origin + `rear_axle_offset_m` forward, half the height up."""
+    """The ego's box.
+
+    Attributes
+    ----------
+    size_m : (3,) tuple of float, m
+        Length, width, height.
+    rear_axle_offset_m : float, m
+        From the ego's origin forward to the center of the box.
+    """
 
     size_m: tuple[float, float, float] = (4.6, 1.9, 1.6)
     rear_axle_offset_m: float = 1.4
@@ -113,11 +179,33 @@ class EgoVehicle:
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """An opened log. Nothing is read from the streams until asked for.
+    """An opened log. The records of its streams are read on request.
 
-    `ego` is None for a log of roadside sensors only. `ground_z_ego_m` is the height of the road in the ego frame: 0 where
-    the ego's origin lies on the ground. `ignored_regions` says by camera where `labels` are incomplete. `digest` is a
-    SHA-256 over the log's index.
+    Attributes
+    ----------
+    name : str
+    format : str
+        Name of the reader.
+    cameras, lidars : mapping of str to Camera, Lidar
+    streams : mapping of str to Stream
+        By the name of the sensor.
+    ego : PoseTrack or None
+        None for a log of roadside sensors only.
+    ego_vehicle : EgoVehicle
+    map : MapFrame
+    labels : Labels or None
+    image_labels : mapping of str to ImageLabels
+        By camera.
+    ignored_regions : mapping of str to ImageRegions
+        By camera: where `labels` are incomplete.
+    ground_z_ego_m : float, m
+        Height of the road in the ego frame; 0 when the ego's origin lies on the ground.
+    reference_camera : str or None
+        The camera whose stamps make the ticks.
+    digest : str
+        SHA-256 over the log's index.
+    notes : tuple of str
+        Remarks of the reader for the report.
     """
 
     name: str
@@ -137,7 +225,21 @@ class Log:
     notes: tuple[str, ...] = ()
 
     def map_T_sensor(self, name: str, t_ns: Any) -> tuple[Array, NDArray[np.bool_]]:
-        """Poses (N, 4, 4) of a sensor in the map at stamps (N,) and whether each is known (N,)."""
+        """Interpolate the pose of a sensor.
+
+        Parameters
+        ----------
+        name : str
+            A camera or LiDAR of this log.
+        t_ns : int or (N,) int64
+            Absolute stamps.
+
+        Returns
+        -------
+        map_T_sensor : (N, 4, 4) float64
+        valid : (N,) bool
+            Whether the ego pose is known there; always True for a sensor fixed in the map.
+        """
         sensor = self.cameras.get(name) or self.lidars[name]
         mount_T_sensor = sensor.mount_T_cam if isinstance(sensor, Camera) else sensor.mount_T_lidar
         t = np.atleast_1d(np.asarray(t_ns, dtype=np.int64))
@@ -151,7 +253,16 @@ class Log:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One camera frame as a detector sees it: `image()` decodes it, and only when called."""
+    """One camera frame as a detector gets it.
+
+    Attributes
+    ----------
+    camera : Camera
+    t_ns : int
+        Absolute stamp.
+    image : callable
+        Decodes the frame when called: (H, W, 3) uint8 BGR.
+    """
 
     camera: Camera
     t_ns: int

@@ -136,7 +136,7 @@ def _back_to_front(agent: Agent) -> Iterator[str]:
 def _repeated(scenario: Scenario) -> list[str]:
     ids = [a.id for a in scenario.agents]
     return [
-        f"agent '{name}': the id stands twice; ids must be unique"
+        f"agent '{name}': the id occurs twice; ids must be unique"
         for name in sorted({n for n in ids if ids.count(n) > 1})
     ]
 

@@ -15,7 +15,7 @@ from log2sim.export.sampling import Motion, file_name
 from log2sim.export.viewers.playback import steps_of
 from log2sim.geometry import NS_PER_S
 
-SOURCE = "io.log2sim.datatypes.scenario"
+SOURCE = "io.log2sim.scenario"
 AXLE_OF_HEIGHT = 0.2  # height of the wheel hubs over the ground as a share of a vehicle's, since nobody measured it
 
 # Names in OSI's `MovingObject.VehicleClassification.Type`; it counts whoever rides with the vehicle.

@@ -35,7 +35,7 @@ class Observer:
         self._way = Ways([self._path])
         self._groups = [g for g in groups if g is not ego]
         self._statics = _poses(statics)
-        lives = [(-np.inf, np.inf) if a.stays else (a.waypoints.t_s[0], a.waypoints.t_s[-1]) for a in statics]
+        lives = [(-np.inf, np.inf) if a.is_permanent else (a.waypoints.t_s[0], a.waypoints.t_s[-1]) for a in statics]
         self._static_lives_s = np.array(lives, dtype=np.float64).reshape(-1, 2)
         self._agents = [_identities(g.agents, [r.path for r in g.references]) for g in self._groups]
         self._static_agents = _identities(statics, [path_of(a, 0.0) for a in statics])

@@ -107,7 +107,7 @@ def _posed(agent: Agent, clock: Clock) -> tuple[AgentReplay, NDArray[np.intp]]:
     """
     w = agent.waypoints
     end_s = clock.time(clock.steps - 1)
-    begin_s, until_s = (clock.begin_s, end_s) if agent.stays else (float(w.t_s[0]), float(w.t_s[-1]))
+    begin_s, until_s = (clock.begin_s, end_s) if agent.is_permanent else (float(w.t_s[0]), float(w.t_s[-1]))
     t_s = np.array([begin_s, until_s] if agent.static and until_s > begin_s else [begin_s])
     first, last = clock.first_step(np.array([begin_s]))[0], clock.last_step(np.array([until_s]))[0]
     every = clock.store_every

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.datatypes import CATEGORIES, GROUPS, Scenario, Unlabeled
+from log2sim.datatypes import CATEGORIES, GROUPS, IgnoreRegions, Scenario
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.evaluation.metrics.align import Side, evaluation_ticks_s, reconstructed_side, truth_side
 from log2sim.evaluation.metrics.clear_mot import associate, mota, switches
 from log2sim.evaluation.metrics.hota import hota
-from log2sim.evaluation.metrics.label_coverage import unlabeled_ticks
+from log2sim.evaluation.metrics.label_coverage import ignored_ticks
 from log2sim.evaluation.metrics.pairs import Index, Mask, Pairs, gate_m, near_pairs
 from log2sim.evaluation.metrics.per_agent import agent_rows, false_rows, ignored_rows, rounded_tree
 from log2sim.evaluation.metrics.rules import counting_rules, matching_rules
@@ -82,7 +82,7 @@ def evaluate(
     ours = reconstructed_side(scenario.others, ticks_s, ego_xy)
     tick_s = float(np.median(np.diff(ticks_s))) if len(ticks_s) > 1 else 0.0
     compared = _compare(true, ours, tick_s, max_range_m, selected)
-    compared = _without_unlabeled(compared, truth.unlabeled, truth_ticks_s, shift_m)
+    compared = _without_ignored(compared, truth.ignore_regions, truth_ticks_s, shift_m)
     everywhere = np.ones_like(compared.counted), np.ones_like(compared.false)
     result = {
         "metrics_version": VERSION,
@@ -120,12 +120,12 @@ def _compare(truth: Side, other: Side, tick_s: float, max_range_m: float | None,
     return Compared(truth, other, pairs, found.match, counted, switched, false, np.zeros_like(false))
 
 
-def _without_unlabeled(c: Compared, unlabeled: Unlabeled | None, truth_ticks_s: Array, shift_m: Array) -> Compared:
+def _without_ignored(c: Compared, regions: IgnoreRegions | None, truth_ticks_s: Array, shift_m: Array) -> Compared:
     """Move false ticks to the ignored ones where the labels could not have told."""
-    if unlabeled is None:
+    if regions is None:
         return c
     center = np.concatenate([c.other.xy_m, c.other.z_m[..., None]], axis=-1) - shift_m
-    ignored = unlabeled_ticks(unlabeled, truth_ticks_s, center, c.other.size_m, c.other.yaw_rad, c.false)
+    ignored = ignored_ticks(regions, truth_ticks_s, center, c.other.size_m, c.other.yaw_rad, c.false)
     return replace(c, false=c.false & ~ignored, ignored=ignored)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from log2sim.datatypes import LabelView, Unlabeled
+from log2sim.datatypes import IgnoreRegions, LabelView
 from log2sim.evaluation.metrics.pairs import Index, Mask
 from log2sim.evaluation.metrics.visibility import image_samples
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse
@@ -14,14 +14,14 @@ MAX_FRAME_LAG_S = 0.15
 """A tick is compared with the nearest labeled frame of a camera, and with none that is farther off than this."""
 
 
-def unlabeled_ticks(
-    unlabeled: Unlabeled, t_s: Array, center_m: Array, size_m: Array, yaw_rad: Array, asked: Mask
+def ignored_ticks(
+    ignore_regions: IgnoreRegions, t_s: Array, center_m: Array, size_m: Array, yaw_rad: Array, asked: Mask
 ) -> Mask:
     """Mark (B, T) the boxes that no labeled camera shows in a part of its image in which objects were labeled.
 
     Parameters
     ----------
-    unlabeled : Unlabeled
+    ignore_regions : IgnoreRegions
     t_s : (T,)
         Ticks, seconds of the truth.
     center_m, size_m, yaw_rad : (B, T, 3), (B, 3), (B, T)
@@ -35,7 +35,7 @@ def unlabeled_ticks(
     union of the regions of the nearest frame. One that shows it elsewhere outweighs those.
     """
     labeled, hidden = np.zeros_like(asked), np.zeros_like(asked)
-    for view in unlabeled.views:
+    for view in ignore_regions.views:
         frame, near, map_T_cam = _frames_at(view, t_s)
         for k in np.flatnonzero(asked.any(0) & near):
             rows = np.flatnonzero(asked[:, k])
@@ -45,7 +45,7 @@ def unlabeled_ticks(
                 if len(uv):
                     share = _inside_any(uv, regions).mean()
                     (hidden if share >= MIN_REGION_SHARE else labeled)[row, k] = True
-    unseen = asked & ~hidden & ~labeled if unlabeled.outside_views else np.zeros_like(asked)
+    unseen = asked & ~hidden & ~labeled if ignore_regions.outside_views else np.zeros_like(asked)
     return (hidden & ~labeled) | unseen
 
 

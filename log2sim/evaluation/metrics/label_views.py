@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from log2sim.datatypes import LabelView, Log, Unlabeled
+from log2sim.datatypes import IgnoreRegions, LabelView, Log
 from log2sim.errors import LogError
 from log2sim.geometry import NS_PER_S, quaternion_from_rotation
 from log2sim.registry import nearest
@@ -13,7 +13,7 @@ MAX_STAMP_LAG_NS = 50_000_000
 """A region belongs to the frame nearest to its stamp, and to none that is farther off than this."""
 
 
-def unlabeled_of(log: Log, t0_ns: int) -> Unlabeled | None:
+def ignore_regions_of(log: Log, t0_ns: int) -> IgnoreRegions | None:
     """Where the labels of a log say nothing; None when they are complete.
 
     Parameters
@@ -38,7 +38,7 @@ def unlabeled_of(log: Log, t0_ns: int) -> Unlabeled | None:
                 f"{log.name}: its labels are of camera '{name}'{nearest(name, list(log.cameras))}, which it does not "
                 f"have; there are: {', '.join(log.cameras)}"
             )
-    return Unlabeled(tuple(_view(log, name, t0_ns) for name in names), outside_views=only is not None)
+    return IgnoreRegions(tuple(_view(log, name, t0_ns) for name in names), outside_views=only is not None)
 
 
 def _view(log: Log, name: str, t0_ns: int) -> LabelView:

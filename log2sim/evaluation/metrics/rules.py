@@ -42,6 +42,6 @@ def counting_rules(truth: Scenario, min_s: float) -> dict[str, Any]:
         "rule": "a truth agent counts at the ticks at which it is visible, within range and selected, "
         "when these make up at least min_s; a reconstructed agent is false at the ticks at which no labeled object, "
         "visible or not, counted or not, matches it, but for the ignored ones",
-        "ignored": IGNORED_RULE if truth.unlabeled is not None else "none; the truth claims to be complete",
+        "ignored": IGNORED_RULE if truth.ignore_regions is not None else "none; the truth claims to be complete",
         "visible": truth.provenance.get("visible", "as the truth file states; all where it states nothing"),
     }

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, Labels, Log, Scenario, Sweep, Waypoints
 from log2sim.errors import ConfigError, LogError, RecordError
-from log2sim.evaluation.metrics.label_views import unlabeled_of
+from log2sim.evaluation.metrics.label_views import ignore_regions_of
 from log2sim.evaluation.metrics.visibility import PointGrid, image_shares
 from log2sim.geometry import NS_PER_S, Array, apply, inverse, wrap_angle, yaw_of
 from log2sim.registry import nearest
@@ -81,7 +81,7 @@ def truth_from_log(log: Log, *, cameras: Sequence[str] | None = None, progress: 
         agents=tuple(agents),
         map=log.map,
         provenance=_provenance(log, used, labels, unreadable),
-        unlabeled=unlabeled_of(log, t0_ns),
+        ignore_regions=ignore_regions_of(log, t0_ns),
     )
 
 

@@ -38,7 +38,7 @@ def _agent(agent: Agent, turn: int, span_s: tuple[float, float]) -> dict[str, An
     """One agent; one that stays is there for all of `span_s`, as in log2sim's own simulator."""
     w, wheeled = agent.waypoints, agent.category in WHEELED
     moves = not agent.static and len(w) > 1
-    life_s = span_s if agent.stays else (float(w.t_s[0]), float(w.t_s[-1]))
+    life_s = span_s if agent.is_permanent else (float(w.t_s[0]), float(w.t_s[-1]))
     path = path_of(agent, rear_axle_offset(agent))
     exact, pid = _courses(agent, path, drives=moves and wheeled)
     limits = parameters_for([agent]) if wheeled else None

@@ -62,7 +62,7 @@ class Traffic:
         self.reacts = np.array([a.id in reactive for a in agents], dtype=bool)
         self.driver = drivers_for(agents)
         self._static = np.array([a.static for a in agents], dtype=bool)
-        self._stays = np.array([a.stays for a in agents], dtype=bool)
+        self._stays = np.array([a.is_permanent for a in agents], dtype=bool)
         self._driven = self.index[driven] if driven is not None else -1
         self._size = np.array([a.size_m for a in agents], dtype=np.float64).reshape(-1, 3)
         self._distrusted = deep_overlaps(self.ways, self._size, self._static)

@@ -31,7 +31,7 @@ def pack(scenario: Scenario, truth: Scenario | None = None, replay: Any = None) 
     layers = {"log": list(_log(scenario))}
     if truth is not None:
         layers["truth"] = [
-            _entry(a, a.waypoints, standing=not moves(a), static=a.static) for a in truth.beside(scenario).agents
+            _entry(a, a.waypoints, standing=not moves(a), static=a.static) for a in truth.aligned_to(scenario).agents
         ]
     if replay is not None:
         stand = {a.id: a.driver == "static" for a in replay.agents}

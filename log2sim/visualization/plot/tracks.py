@@ -60,7 +60,7 @@ def plot_tracks(
         )
     refuse_existing(out_path, overwrite=overwrite)
     cast = assign(scenario)
-    truth = None if truth is None else truth.beside(scenario)
+    truth = None if truth is None else truth.aligned_to(scenario)
     if suffix in ANIMATED:
         from log2sim.visualization.plot.animation import write_animation
 

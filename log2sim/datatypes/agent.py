@@ -1,0 +1,212 @@
+"""Road users: a box of one size on a trajectory."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from log2sim.datatypes.categories import CATEGORIES
+from log2sim.errors import ScenarioError
+from log2sim.geometry import Array, wrap_angle
+
+
+@dataclass(frozen=True, eq=False)
+class Waypoints:
+    """A trajectory of the box center as columns, map frame.
+
+    Attributes
+    ----------
+    t_s : (T,) float64, s
+        Strictly increasing times since the scenario's start.
+    x_m, y_m, z_m : (T,) float64, m
+        Box center.
+    yaw_rad : (T,) float64
+    speed_mps : (T,) float64, m/s
+        Along the heading, negative when reversing.
+    observed : (T,) bool
+        False where a gap was filled.
+    sigma_xy_m : (T,) float64, m
+        One standard deviation of the position.
+    visible : (T,) bool or None
+        Whether the sensors could see the agent; only in truth.
+    """
+
+    t_s: Array
+    x_m: Array
+    y_m: Array
+    z_m: Array
+    yaw_rad: Array
+    speed_mps: Array
+    observed: NDArray[np.bool_]
+    sigma_xy_m: Array
+    visible: NDArray[np.bool_] | None = None
+
+    FLOATS = ("t_s", "x_m", "y_m", "z_m", "yaw_rad", "speed_mps", "sigma_xy_m")
+
+    def __len__(self) -> int:
+        """Return the number of waypoints."""
+        return len(self.t_s)
+
+    def problem(self) -> str | None:
+        """Describe the first defect: no waypoint, a value that is not finite, times that do not increase; None without."""
+        if len(self) == 0:
+            return "has no waypoints, expected at least one"
+        for key in self.FLOATS:
+            finite = np.isfinite(getattr(self, key))
+            if not finite.all():
+                return f"waypoints.{key} is not finite at index {int(np.argmin(finite))}"
+        late = np.diff(self.t_s) <= 0
+        if late.any():
+            k = int(np.argmax(late)) + 1
+            return f"waypoints.t_s does not increase at index {k} ({self.t_s[k]:g} s)"
+        return None
+
+
+@dataclass(frozen=True, eq=False)
+class AgentStates:
+    """States of one agent at requested times; NaN where not valid.
+
+    Attributes
+    ----------
+    valid : (T,) bool
+        Whether the trajectory covers the time.
+    x_m, y_m, z_m : (T,) float64, m
+        Box center, map frame.
+    yaw_rad : (T,) float64
+    speed_mps : (T,) float64, m/s
+    """
+
+    valid: NDArray[np.bool_]
+    x_m: Array
+    y_m: Array
+    z_m: Array
+    yaw_rad: Array
+    speed_mps: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Agent:
+    """One road user.
+
+    Attributes
+    ----------
+    id : str
+        Unique within the scenario; `EGO` for the ego.
+    category : str
+        One of `CATEGORIES`.
+    size_m : (3,) tuple of float, m
+        Length, width, height.
+    waypoints : Waypoints
+    static : bool
+        Whether it never moves.
+    rear_axle_offset_m : float, m
+        From the rear axle forward to the center of the box.
+    color : mapping or None
+        {"rgb": [r, g, b], "name": ...}.
+    confidence : float
+        In [0, 1].
+    quality : mapping
+        Figures of the reconstruction, such as the number of detections.
+    """
+
+    id: str
+    category: str
+    size_m: tuple[float, float, float]
+    waypoints: Waypoints
+    static: bool = False
+    rear_axle_offset_m: float = 0.0
+    color: Mapping[str, Any] | None = None
+    confidence: float = 1.0
+    quality: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def is_permanent(self) -> bool:
+        """Whether it is a static agent with a single waypoint, which is present during the whole scenario."""
+        return self.static and len(self.waypoints) == 1
+
+    def at(self, t_s: ArrayLike, max_gap_s: float = math.inf, margin_s: float = 1e-6) -> AgentStates:
+        """Interpolate the trajectory linearly, yaw along the shorter arc.
+
+        Parameters
+        ----------
+        t_s : float or (T,), s
+        max_gap_s : float, s
+            Times inside a longer gap between waypoints are not valid.
+        margin_s : float, s
+            Times up to this far outside the trajectory take its nearest end.
+        """
+        t, w = np.atleast_1d(np.asarray(t_s, dtype=np.float64)), self.waypoints
+        valid = (t >= w.t_s[0] - margin_s) & (t <= w.t_s[-1] + margin_s)
+        if len(w) > 1:
+            i = np.clip(np.searchsorted(w.t_s, t, side="right") - 1, 0, len(w) - 2)
+            on_waypoint = np.minimum(np.abs(t - w.t_s[i]), np.abs(w.t_s[i + 1] - t)) <= margin_s
+            valid &= on_waypoint | (w.t_s[i + 1] - w.t_s[i] <= max_gap_s)
+        columns = {k: np.interp(t, w.t_s, getattr(w, k)) for k in ("x_m", "y_m", "z_m", "speed_mps")}
+        columns["yaw_rad"] = wrap_angle(np.interp(t, w.t_s, np.unwrap(w.yaw_rad)))
+        return AgentStates(valid=valid, **{k: np.where(valid, v, np.nan) for k, v in columns.items()})
+
+
+def agent_to_dict(agent: Agent) -> dict[str, Any]:
+    """Return the entry of an agent in a document of `schemas/scenario-1.json`."""
+    w = agent.waypoints
+    columns: dict[str, list[Any]] = {k: np.asarray(getattr(w, k), dtype=np.float64).tolist() for k in Waypoints.FLOATS}
+    columns["observed"] = [bool(v) for v in w.observed]
+    if w.visible is not None:
+        columns["visible"] = [bool(v) for v in w.visible]
+    length, width, height = (float(v) for v in agent.size_m)
+    return {
+        "id": agent.id,
+        "category": agent.category,
+        "size_m": {"length": length, "width": width, "height": height},
+        "color": dict(agent.color) if agent.color is not None else None,
+        "static": bool(agent.static),
+        "rear_axle_offset_m": float(agent.rear_axle_offset_m),
+        "confidence": float(agent.confidence),
+        "quality": dict(agent.quality),
+        "waypoints": columns,
+    }
+
+
+def agent_from_dict(entry: Mapping[str, Any]) -> Agent:
+    """Build an agent from an entry that keeps the schema.
+
+    Raises
+    ------
+    ScenarioError
+        For an unknown category, columns of different lengths or an impossible trajectory.
+    """
+    where = f"agent '{entry['id']}'"
+    if entry["category"] not in CATEGORIES:
+        raise ScenarioError(f"{where}: category '{entry['category']}' is not known; known: {', '.join(CATEGORIES)}")
+    columns = entry["waypoints"]
+    count = len(columns["t_s"])
+    for key, values in columns.items():
+        if len(values) != count:
+            raise ScenarioError(f"{where}: waypoints.{key} has {len(values)} values, t_s has {count}")
+    arrays = {k: np.array(columns[k], dtype=np.float64) for k in Waypoints.FLOATS}
+    visible = columns.get("visible")
+    waypoints = Waypoints(
+        **arrays,
+        observed=np.array(columns["observed"], dtype=bool),
+        visible=None if visible is None else np.array(visible, dtype=bool),
+    )
+    problem = waypoints.problem()
+    if problem is not None:
+        raise ScenarioError(f"{where}: {problem}")
+    size = entry["size_m"]
+    return Agent(
+        id=entry["id"],
+        category=entry["category"],
+        size_m=(float(size["length"]), float(size["width"]), float(size["height"])),
+        waypoints=waypoints,
+        static=entry["static"],
+        rear_axle_offset_m=float(entry["rear_axle_offset_m"]),
+        color=entry["color"],
+        confidence=float(entry["confidence"]),
+        quality=entry["quality"],
+    )
