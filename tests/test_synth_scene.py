@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 from worlds import CAR, tiny_table
 
+from log2sim.documents import load_schema
 from log2sim.errors import ConfigError
-from log2sim.synth.scene import load_scene, scene_from_table
+from log2sim.synth.scene import load_scene, scene_from_table, scene_schema
 
 SAMPLE = Path(__file__).resolve().parent.parent / "samples" / "crossing.toml"
 
@@ -32,11 +33,15 @@ def test_the_sample_has_the_agents_that_a_junction_needs() -> None:
         ({"agent": [{**CAR, "size_m": [4.0, 2.0]}]}, r"size_m' has 2 values, expected 3"),
         ({"agent": [{**CAR, "color": [300, 0, 0]}]}, r"color\[0\]' is 300"),
         ({"agent": [{**CAR, "pose": [0.0, 0.0, 0.0]}]}, r"either 'waypoints' or 'pose'"),
-        ({"agent": [CAR, CAR]}, r"'car' stands twice"),
+        ({"agent": [CAR, CAR]}, r"'car' occurs twice"),
         ({"agent": [{**CAR, "id": "ego"}]}, r"belongs to the recording vehicle"),
         ({"agent": [{**CAR, "id": "../x"}]}, r"letters, digits"),
         ({"duration_s": float("nan")}, r"'duration_s' is nan"),
         ({"duration_s": "long"}, r"'duration_s' is 'long', expected a number"),
+        ({"start_ns": 1.5}, r"'start_ns' is 1\.5, expected a whole number from 0"),
+        ({"road": [{"line": [[0.0, 0.0]]}]}, r"line' has 1 values, expected 2 or more"),
+        ({"gnss": {"rate_hz": 0}}, r"'gnss\.rate_hz' is 0, expected a number from 0\.5 to 1000"),
+        ({"gnss": 3}, r"'gnss' is 3, expected a table"),
         ({"ego": {}}, r"'ego.waypoints' is missing"),
         ({"camera": {}}, r"'camera' is \{\}, expected a list"),
         ({"camera": [{"name": "c", "position_m": [0, 0, 1], "size_px": [1e5, 5]}]}, r"size_px\[0\]"),
@@ -54,3 +59,17 @@ def test_a_file_that_is_missing_or_no_toml_is_named(tmp_path: Path) -> None:
     broken.write_text("name = ", encoding="utf-8")
     with pytest.raises(ConfigError, match=r"broken\.toml: not valid TOML"):
         load_scene(broken)
+
+
+def test_the_stored_schema_is_the_one_of_the_models() -> None:
+    assert load_schema("scene-1") == scene_schema(), "write it again with tools/write_schemas.py"
+
+
+def test_every_key_has_a_description_and_every_quantity_a_unit() -> None:
+    tables = [scene_schema(), *scene_schema()["$defs"].values()]
+    for table in tables:
+        for name, key in table["properties"].items():
+            assert key.get("description"), name
+            suffix = name.rpartition("_")[2]
+            if suffix in {"m", "s", "ns", "hz", "deg", "px"} and name != "wait_s":
+                assert key["unit"].lower() == suffix, name

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -80,8 +80,8 @@ def tiny_log(
     """
     scene = tiny_scene(agents, **changes)
     calm = {"dropout": 0.0, "resolution_m": 0.0} if noise_m == 0 else {}
-    lidars = tuple(replace(spec, noise_m=noise_m, **calm) for spec in scene.lidar)
-    return synthesize(replace(scene, lidar=lidars), seed=seed, observe=observe)
+    lidars = tuple(spec.model_copy(update={"noise_m": noise_m, **calm}) for spec in scene.lidar)
+    return synthesize(scene.model_copy(update={"lidar": lidars}), seed=seed, observe=observe)
 
 
 @dataclass(frozen=True)

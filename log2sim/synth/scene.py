@@ -1,184 +1,215 @@
-"""The description of a synthetic log: what stands and moves where, and which sensors look at it.
+"""Scene files: the description of a synthetic log as pydantic models, from which the JSON Schema `scene-1` is generated.
 
-Map frame: x east, y north, z up, in m; the ground is z = 0. Sensors are given on the ego: x forward, y left, z up from the
-middle of the rear axle on the ground; yaw counter-clockwise, pitch positive upwards.
+Map frame: x east, y north, z up, in m; the ground is z = 0. Sensors are mounted on the ego: x forward, y left, z up, origin
+at the middle of the rear axle on the ground; yaw counter-clockwise, pitch positive upwards.
 """
-
-# ruff: noqa: RUF009  (`_of` is dataclasses.field with a check attached)
 
 from __future__ import annotations
 
-import difflib
-import math
 import tomllib
-from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, Strict, ValidationError, model_validator
 
 from log2sim.datatypes import TYPICAL_SIZE_M
 from log2sim.errors import ConfigError
+from log2sim.model_errors import first_problem
 
 SCENE_LIMIT_BYTES = 4 * 1024 * 1024
-AGENT_CATEGORIES = ("car", "truck", "bus", "pedestrian", "cyclist")
+MAX_COORDINATE_M = 1e7
 
-Vec2 = tuple[float, float]
-Vec3 = tuple[float, float, float]
+Number = Annotated[float, Strict()]
+Whole = Annotated[int, Strict()]
+Coordinate = Annotated[float, Strict(), Field(ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M)]
+Extent = Annotated[float, Strict(), Field(ge=0.1, le=500)]
+Angle = Annotated[float, Strict(), Field(ge=-90, le=90)]
+Channel = Annotated[int, Strict(), Field(ge=0, le=255)]
+Pixels = Annotated[int, Strict(), Field(ge=16, le=8192)]
+Name = Annotated[str, Field(pattern=r"^[\w-]+$")]
 
-
-def _of(kind: str, default: Any = MISSING, **limits: Any) -> Any:
-    """A field that `load_scene` checks: `kind` names the check, `low` and `high` bound numbers."""
-    meta = {"kind": kind, **limits}
-    return field(metadata=meta) if default is MISSING else field(default=default, metadata=meta)
-
-
-@dataclass(frozen=True)
-class Origin:
-    """Where x = y = 0 lies on Earth."""
-
-    latitude_deg: float = _of("number", 52.52, low=-80, high=84)
-    longitude_deg: float = _of("number", 13.405, low=-180, high=180)
-    altitude_m: float = _of("number", 34.0, low=-500, high=9000)
+Vec2 = tuple[Coordinate, Coordinate]
+Vec3 = tuple[Coordinate, Coordinate, Coordinate]
+Size = tuple[Extent, Extent, Extent]
+Color = tuple[Channel, Channel, Channel]
+Line = Annotated[tuple[Vec2, ...], Field(min_length=2)]
 
 
-@dataclass(frozen=True)
-class Road:
-    """A road along a line, with a center marking and sidewalks."""
-
-    line: tuple[Vec2, ...] = _of("points2")
-    width_m: float = _of("number", 7.0, low=1, high=60)
-    marking: str = _of("text", "dashed", choices=("dashed", "solid", "none"))
-    sidewalk_m: float = _of("number", 2.5, low=0, high=20)
+def key(description: str, default: Any = ..., unit: str | None = None, **limits: Any) -> Any:
+    """Declare a key of a scene file: what it means, its default, its unit and its limits (`ge`, `le`, `max_length` ...)."""
+    extra: dict[str, JsonValue] = {} if unit is None else {"unit": unit}
+    return Field(default, description=description, json_schema_extra=extra, **limits)
 
 
-@dataclass(frozen=True)
-class Zebra:
-    """A crosswalk: its middle line goes from side to side of the road."""
+class Table(BaseModel):
+    """Base of all tables of a scene file: immutable, unknown keys are errors."""
 
-    line: tuple[Vec2, ...] = _of("points2")
-    width_m: float = _of("number", 3.0, low=1, high=20)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-@dataclass(frozen=True)
-class Building:
+class Origin(Table):
+    """Geodetic position of x = y = 0."""
+
+    latitude_deg: Number = key("Latitude of the origin, WGS 84.", 52.52, "deg", ge=-80, le=84)
+    longitude_deg: Number = key("Longitude of the origin, WGS 84.", 13.405, "deg", ge=-180, le=180)
+    altitude_m: Number = key("Altitude of the ground.", 34.0, "m", ge=-500, le=9000)
+
+
+class Road(Table):
+    """A road along a polyline, with a center marking and sidewalks."""
+
+    line: Line = key("Center line, points [x, y].", unit="m")
+    width_m: Number = key("Width of the carriageway.", 7.0, "m", ge=1, le=60)
+    marking: Literal["dashed", "solid", "none"] = key("Center marking.", "dashed")
+    sidewalk_m: Number = key("Width of the sidewalk on each side.", 2.5, "m", ge=0, le=20)
+
+
+class Zebra(Table):
+    """A crosswalk."""
+
+    line: Line = key("Its center line from one side of the road to the other, points [x, y].", unit="m")
+    width_m: Number = key("Extent along the road.", 3.0, "m", ge=1, le=20)
+
+
+class Building(Table):
     """A box with a facade."""
 
-    center: Vec2 = _of("vec2")
-    size_m: Vec3 = _of("size")
-    yaw_deg: float = _of("number", 0.0)
-    color: tuple[int, int, int] = _of("color", (190, 180, 165))
+    center: Vec2 = key("Center [x, y].", unit="m")
+    size_m: Size = key("Length, width, height.", unit="m")
+    yaw_deg: Number = key("Direction of its length.", 0.0, "deg")
+    color: Color = key("Color of the facade, RGB 0 to 255.", (190, 180, 165))
 
 
-@dataclass(frozen=True)
-class Ego:
+class Ego(Table):
     """The recording vehicle; its waypoints guide the middle of its rear axle."""
 
-    waypoints: tuple[Vec3, ...] = _of("points3")
-    size_m: Vec3 = _of("size", (4.6, 1.9, 1.6))
-    rear_axle_offset_m: float = _of("number", 1.4, low=0, high=10)
-    rounding_m: float = _of("number", 25.0, low=0, high=200)
-    wait_s: tuple[Vec2, ...] = _of("pairs", ())
-    start_s: float = _of("number", 0.0)
-    poses: str = _of("text", "gnss", choices=("gnss", "poses"))
+    waypoints: tuple[Vec3, ...] = key("Rows [x, y, speed].", unit="m, m, m/s")
+    size_m: Size = key("Length, width, height.", (4.6, 1.9, 1.6), "m")
+    rear_axle_offset_m: Number = key("Distance from the rear axle forward to the box center.", 1.4, "m", ge=0, le=10)
+    rounding_m: Number = key("Window over which corners of the path are rounded.", 25.0, "m", ge=0, le=200)
+    wait_s: tuple[Vec2, ...] = key("Rows [index of a waypoint with speed 0, time to stand there].", (), "1, s")
+    start_s: Number = key("Time at the first waypoint.", 0.0, "s")
+    poses: Literal["gnss", "poses"] = key("Whether the log states GNSS fixes or poses in the map.", "gnss")
 
 
-@dataclass(frozen=True)
-class AgentSpec:
-    """A road user, on the way (`waypoints` of x, y, speed) or parked (`pose`: x and y of the box center, yaw in degrees).
+class AgentSpec(Table):
+    """A road user, moving along `waypoints` or parked at `pose`.
 
-    The waypoints of cars, trucks and buses guide the rear axle, those of the others the middle.
+    The waypoints of cars, trucks and buses guide the rear axle, those of the others the center.
     """
 
-    id: str = _of("text")
-    category: str = _of("text", choices=AGENT_CATEGORIES)
-    size_m: Vec3 | None = _of("size", None)
-    color: tuple[int, int, int] = _of("color", (150, 30, 30))
-    second_color: tuple[int, int, int] = _of("color", (45, 50, 66))
-    skin: tuple[int, int, int] = _of("color", (196, 150, 122))
-    hair: tuple[int, int, int] = _of("color", (52, 38, 28))
-    shape: str = _of("text", "sedan", choices=("sedan", "hatch"))
-    waypoints: tuple[Vec3, ...] = _of("points3", ())
-    pose: Vec3 | None = _of("vec3", None)
-    rounding_m: float | None = _of("number", None, low=0, high=200)
-    wait_s: tuple[Vec2, ...] = _of("pairs", ())
-    start_s: float = _of("number", 0.0)
+    id: Name = key("Unique name of letters, digits, '_' and '-'.")
+    category: Literal["car", "truck", "bus", "pedestrian", "cyclist"] = key("Kind of road user.")
+    size_m: Size | None = key("Length, width, height; by default typical for the category.", None, "m")
+    color: Color = key("Body or upper clothes, RGB 0 to 255.", (150, 30, 30))
+    second_color: Color = key("Cab, stripe or trousers, RGB 0 to 255.", (45, 50, 66))
+    skin: Color = key("Skin, RGB 0 to 255.", (196, 150, 122))
+    hair: Color = key("Hair, RGB 0 to 255.", (52, 38, 28))
+    shape: Literal["sedan", "hatch"] = key("Body of a car.", "sedan")
+    waypoints: tuple[Vec3, ...] = key("Rows [x, y, speed].", (), "m, m, m/s")
+    pose: Vec3 | None = key("Box center and heading [x, y, yaw] of a parked agent.", None, "m, m, deg")
+    rounding_m: Number | None = key(
+        "Window over which corners of the path are rounded; by default 25 for vehicles, else 3.",
+        None,
+        "m",
+        ge=0,
+        le=200,
+    )
+    wait_s: tuple[Vec2, ...] = key("Rows [index of a waypoint with speed 0, time to stand there].", (), "1, s")
+    start_s: Number = key("Time at the first waypoint; it stands or comes straight before.", 0.0, "s")
 
     @property
     def vehicle(self) -> bool:
+        """Whether it steers like a car."""
         return self.category in ("car", "truck", "bus")
 
     @property
-    def box_m(self) -> Vec3:
-        """Length, width, height: what was given or the category's typical size."""
+    def box_m(self) -> tuple[float, float, float]:
+        """Length, width, height: as given or the category's typical size."""
         return self.size_m or TYPICAL_SIZE_M[self.category]
 
     @property
     def rear_axle_offset_m(self) -> float:
-        """How far the box center lies ahead of the guided point."""
+        """Distance from the guided point forward to the box center."""
         return 0.3 * self.box_m[0] if self.vehicle else 0.0
 
-
-@dataclass(frozen=True)
-class CameraSpec:
-    """A camera on the ego."""
-
-    name: str = _of("text")
-    position_m: Vec3 = _of("vec3")
-    yaw_deg: float = _of("number", 0.0)
-    pitch_deg: float = _of("number", 0.0, low=-60, high=60)
-    fov_deg: float = _of("number", 70.0, low=5, high=150)
-    size_px: tuple[int, int] = _of("size_px", (960, 600))
-    rate_hz: float = _of("number", 10.0, low=0.1, high=200)
-    offset_s: float = _of("number", 0.0)
+    @model_validator(mode="after")
+    def _moving_or_parked(self) -> Self:
+        if self.id == "ego":
+            raise ValueError("agent 'ego': this id belongs to the recording vehicle; choose another")
+        if bool(self.waypoints) == (self.pose is not None):
+            raise ValueError(f"agent '{self.id}': give either 'waypoints' or 'pose' (x, y, yaw in degrees)")
+        return self
 
 
-@dataclass(frozen=True)
-class LidarSpec:
-    """A turning LiDAR on the ego. It turns clockwise over `azimuth_deg`, from the left (high) to the right (low).
+class CameraSpec(Table):
+    """A pinhole camera on the ego."""
 
-    Its channels are spread evenly over `elevation_deg`, or stand where `channels_deg` says, which then counts instead.
-    """
-
-    name: str = _of("text")
-    position_m: Vec3 = _of("vec3")
-    yaw_deg: float = _of("number", 0.0)
-    channels: int = _of("count", 32, low=1, high=256)
-    elevation_deg: Vec2 = _of("vec2", (-24.0, 6.0))
-    channels_deg: tuple[float, ...] = _of("angles", ())
-    azimuth_deg: Vec2 = _of("vec2", (-180.0, 180.0))
-    azimuth_step_deg: float = _of("number", 0.4, low=0.02, high=10)
-    rate_hz: float = _of("number", 10.0, low=0.1, high=100)
-    offset_s: float = _of("number", 0.0)
-    range_m: float = _of("number", 80.0, low=1, high=500)
-    noise_m: float = _of("number", 0.02, low=0, high=1)
-    dropout: float = _of("number", 0.03, low=0, high=0.99)
-    resolution_m: float = _of("number", 0.01, low=0, high=0.1)
+    name: Name = key("Unique name of letters, digits, '_' and '-'.")
+    position_m: Vec3 = key("Position [x, y, z] on the ego.", unit="m")
+    yaw_deg: Number = key("Viewing direction, 0 forward, counter-clockwise.", 0.0, "deg")
+    pitch_deg: Number = key("Viewing direction, positive upwards.", 0.0, "deg", ge=-60, le=60)
+    fov_deg: Number = key("Horizontal field of view.", 70.0, "deg", ge=5, le=150)
+    size_px: tuple[Pixels, Pixels] = key("Width and height of the image.", (960, 600), "px")
+    rate_hz: Number = key("Frame rate.", 10.0, "Hz", ge=0.1, le=200)
+    offset_s: Number = key("Time of one of its frames.", 0.0, "s")
 
 
-@dataclass(frozen=True)
-class Gnss:
-    """GNSS/IMU: rate and standard deviations of its slowly wandering errors."""
+class LidarSpec(Table):
+    """A spinning LiDAR on the ego. It turns clockwise over `azimuth_deg`, from the left (high) to the right (low)."""
 
-    rate_hz: float = _of("number", 100.0, low=0.5, high=1000)
-    position_sigma_m: float = _of("number", 0.02, low=0, high=10)
-    angle_sigma_deg: float = _of("number", 0.1, low=0, high=10)
+    name: Name = key("Unique name of letters, digits, '_' and '-'.")
+    position_m: Vec3 = key("Position [x, y, z] on the ego.", unit="m")
+    yaw_deg: Number = key("Direction of azimuth 0, 0 forward, counter-clockwise.", 0.0, "deg")
+    channels: Whole = key("Number of channels, spread evenly over `elevation_deg`.", 32, ge=1, le=256)
+    elevation_deg: Vec2 = key("Lowest and highest channel.", (-24.0, 6.0), "deg")
+    channels_deg: Annotated[tuple[Angle, ...], Field(min_length=1, max_length=256)] = key(
+        "Elevation of each channel; replaces `channels` and `elevation_deg`.", (), "deg"
+    )
+    azimuth_deg: Vec2 = key("Right and left end of the field of view.", (-180.0, 180.0), "deg")
+    azimuth_step_deg: Number = key("Angle between two firings.", 0.4, "deg", ge=0.02, le=10)
+    rate_hz: Number = key("Turns per second.", 10.0, "Hz", ge=0.1, le=100)
+    offset_s: Number = key("End of one of its sweeps.", 0.0, "s")
+    range_m: Number = key("Largest measured distance.", 80.0, "m", ge=1, le=500)
+    noise_m: Number = key("Standard deviation of a distance.", 0.02, "m", ge=0, le=1)
+    dropout: Number = key("Share of returns that are lost.", 0.03, "1", ge=0, le=0.99)
+    resolution_m: Number = key("Step to which coordinates are rounded; 0 keeps them.", 0.01, "m", ge=0, le=0.1)
 
 
-@dataclass(frozen=True)
-class Scene:
+class Gnss(Table):
+    """GNSS/IMU whose errors are first-order Gauss-Markov processes."""
+
+    rate_hz: Number = key("Rate of the poses.", 100.0, "Hz", ge=0.5, le=1000)
+    position_sigma_m: Number = key("Standard deviation of each coordinate.", 0.02, "m", ge=0, le=10)
+    angle_sigma_deg: Number = key("Standard deviation of each angle.", 0.1, "deg", ge=0, le=10)
+
+
+class Scene(Table):
     """A whole scene. TOML tables are named in the singular: [[road]], [[agent]], [[camera]] ..."""
 
-    name: str = _of("text")
-    duration_s: float = _of("number", low=0.1, high=600)
-    ego: Ego = _of("table", cls=Ego)
-    start_ns: int = _of("count", 1_700_000_000_000_000_000, low=0, high=9_000_000_000_000_000_000)
-    origin: Origin = _of("table", Origin(), cls=Origin)
-    road: tuple[Road, ...] = _of("tables", (), cls=Road)
-    zebra: tuple[Zebra, ...] = _of("tables", (), cls=Zebra)
-    building: tuple[Building, ...] = _of("tables", (), cls=Building)
-    agent: tuple[AgentSpec, ...] = _of("tables", (), cls=AgentSpec)
-    camera: tuple[CameraSpec, ...] = _of("tables", (), cls=CameraSpec)
-    lidar: tuple[LidarSpec, ...] = _of("tables", (), cls=LidarSpec)
-    gnss: Gnss = _of("table", Gnss(), cls=Gnss)
+    name: str = key("Name of the log and the scenario.")
+    duration_s: Number = key("Length of the log.", unit="s", ge=0.1, le=600)
+    ego: Ego = key("The recording vehicle.")
+    start_ns: Whole = key(
+        "Stamp of the log's begin, Unix time.", 1_700_000_000_000_000_000, "ns", ge=0, le=9_000_000_000_000_000_000
+    )
+    origin: Origin = key("Position on Earth.", Origin())
+    road: tuple[Road, ...] = key("Roads.", ())
+    zebra: tuple[Zebra, ...] = key("Crosswalks.", ())
+    building: tuple[Building, ...] = key("Buildings.", ())
+    agent: tuple[AgentSpec, ...] = key("Road users besides the ego.", ())
+    camera: tuple[CameraSpec, ...] = key("Cameras.", ())
+    lidar: tuple[LidarSpec, ...] = key("LiDARs.", ())
+    gnss: Gnss = key("Errors of the ego's poses.", Gnss())
+
+    @model_validator(mode="after")
+    def _unique_names(self) -> Self:
+        sensors = [c.name for c in self.camera] + [d.name for d in self.lidar]
+        for kind, names in (("agent", [a.id for a in self.agent]), ("sensor", sensors)):
+            for name in names:
+                if names.count(name) > 1:
+                    raise ValueError(f"{kind} '{name}' occurs twice; names must be unique")
+        return self
 
 
 def load_scene(path: Path | str) -> Scene:
@@ -205,93 +236,23 @@ def load_scene(path: Path | str) -> Scene:
 
 
 def scene_from_table(table: dict[str, Any]) -> Scene:
-    """A scene from a TOML document."""
-    scene: Scene = _build(Scene, table, "")
-    sensors = [c.name for c in scene.camera] + [d.name for d in scene.lidar]
-    for kind, names in (("agent", [a.id for a in scene.agent]), ("sensor", sensors)):
-        for name in names:
-            if names.count(name) > 1:
-                raise ConfigError(f"{kind} '{name}' stands twice; names must be unique")
-            if not name or not all(c.isalnum() or c in "_-" for c in name):
-                raise ConfigError(f"{kind} '{name}': a name may only have letters, digits, '_' and '-'")
-    for agent in scene.agent:
-        if agent.id == "ego":
-            raise ConfigError("agent 'ego': this id belongs to the recording vehicle; choose another")
-        if bool(agent.waypoints) == (agent.pose is not None):
-            raise ConfigError(f"agent '{agent.id}': give either 'waypoints' or 'pose' (x, y, yaw in degrees)")
-    return scene
+    """Check a TOML document and make it a scene.
+
+    Raises
+    ------
+    ConfigError
+        For the first unknown key or impossible value.
+    """
+    try:
+        return Scene.model_validate(table)
+    except ValidationError as error:
+        raise ConfigError(first_problem(error, Scene)) from None
 
 
-def _build(cls: Any, table: Any, where: str) -> Any:
-    if not isinstance(table, dict):
-        raise ConfigError(f"{where or 'the file'}: expected a table, found {type(table).__name__}")
-    known = {f.name: f for f in fields(cls)}
-    for key in table:
-        if key not in known:
-            near = difflib.get_close_matches(key, known, 1, 0.0)[0]
-            raise ConfigError(f"unknown key '{where}{key}'; did you mean '{where}{near}'?")
-    values = {}
-    for name, f in known.items():
-        if name in table:
-            values[name] = _checked(f.metadata, table[name], f"{where}{name}")
-        elif f.default is MISSING:
-            raise ConfigError(f"'{where}{name}' is missing")
-    return cls(**values)
-
-
-def _checked(meta: Any, value: Any, where: str) -> Any:
-    kind = meta["kind"]
-    if kind == "table":
-        return _build(meta["cls"], value, f"{where}.")
-    if kind == "tables":
-        rows = _list(value, where)
-        return tuple(_build(meta["cls"], row, f"{where}[{i}].") for i, row in enumerate(rows))
-    if kind == "text":
-        if not isinstance(value, str) or value not in meta.get("choices", (value,)):
-            expected = "one of " + ", ".join(meta["choices"]) if "choices" in meta else "text"
-            raise ConfigError(f"'{where}' is {value!r}, expected {expected}")
-        return value
-    if kind in ("number", "count"):
-        return _number(value, where, meta.get("low", -math.inf), meta.get("high", math.inf), whole=kind == "count")
-    if kind in ("points2", "points3", "pairs"):
-        width = 3 if kind == "points3" else 2
-        rows = [_vector(row, width, f"{where}[{i}]") for i, row in enumerate(_list(value, where))]
-        if kind == "points2" and len(rows) < 2:
-            raise ConfigError(f"'{where}' has {len(rows)} points, expected two or more")
-        return tuple(rows)
-    if kind == "angles":
-        angles = _list(value, where)
-        if not 1 <= len(angles) <= 256:
-            raise ConfigError(f"'{where}' has {len(angles)} values, expected 1 to 256")
-        return _vector(value, len(angles), where, low=-90, high=90)
-    if kind == "size":
-        return _vector(value, 3, where, low=0.1, high=500)
-    if kind == "color":
-        return _vector(value, 3, where, low=0, high=255, whole=True)
-    if kind == "size_px":
-        return _vector(value, 2, where, low=16, high=8192, whole=True)
-    return _vector(value, 2 if kind == "vec2" else 3, where)
-
-
-def _list(value: Any, where: str) -> list[Any]:
-    if not isinstance(value, list):
-        raise ConfigError(f"'{where}' is {value!r}, expected a list")
-    return value
-
-
-def _vector(
-    value: Any, width: int, where: str, low: float = -1e7, high: float = 1e7, *, whole: bool = False
-) -> tuple[Any, ...]:
-    values = _list(value, where)
-    if len(values) != width:
-        raise ConfigError(f"'{where}' has {len(values)} values, expected {width}")
-    return tuple(_number(v, f"{where}[{i}]", low, high, whole=whole) for i, v in enumerate(values))
-
-
-def _number(value: Any, where: str, low: float, high: float, *, whole: bool = False) -> Any:
-    good = isinstance(value, int if whole else (int, float)) and not isinstance(value, bool)
-    if not good or not math.isfinite(value) or not low <= value <= high:
-        raise ConfigError(
-            f"'{where}' is {value!r}, expected a {'whole ' if whole else ''}number from {low:g} to {high:g}"
-        )
-    return value if whole else float(value)
+def scene_schema() -> dict[str, Any]:
+    """JSON Schema of scene files, as stored in `schemas/scene-1.json`."""
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        **Scene.model_json_schema(),
+        "title": "log2sim scene file, version 1",
+    }
