@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.agents.build import Timeline, build_agents
+from log2sim.agents.build import Timeline, estimate_agents
 from log2sim.agents.duplicates import outside, without_doubles
 from log2sim.agents.ego import ego_agent, ego_flow
-from log2sim.agents.scenario_of import make_scenario, thinned
+from log2sim.agents.scenario_of import scenario_of, thinned
 from log2sim.config import Config
 from log2sim.datatypes import Log, Scenario
 from log2sim.errors import NothingToReconstruct
 from log2sim.perception.detect.detectors import Detector, create_detector
-from log2sim.perception.first_pass import Observed, observe
+from log2sim.perception.first_pass import Observations, observe
 from log2sim.perception.homography_stage import fit_cameras, locate_the_rest
 from log2sim.perception.sync import Schedule, synchronize
 from log2sim.plan import Plan, make_plan, plan_ticks
@@ -105,7 +105,7 @@ def schedule_of(log: Log, config: Config, plan: Plan) -> Schedule:
 
 
 def conclude(
-    log: Log, config: Config, plan: Plan, detector: Detector, schedule: Schedule, seen: Observed, clock: StageClock
+    log: Log, config: Config, plan: Plan, detector: Detector, schedule: Schedule, seen: Observations, clock: StageClock
 ) -> Result:
     """The second pass: from what was seen, which stays as it is, to the scenario and the report."""
     timeline, costs = Timeline(schedule.t_ns, int(schedule.t_ns[0])), Costs()
@@ -131,7 +131,7 @@ def conclude(
         )
     with clock.stage("smooth"):
         flow = ego_flow(log, schedule)
-        built = build_agents(tracks, seen.obstacles, timeline, flow, smooth=config.smooth.enabled, costs=costs)
+        built = estimate_agents(tracks, seen.obstacles, timeline, flow, smooth=config.smooth.enabled, costs=costs)
         ego = ego_agent(log, timeline)
         agents = outside(without_doubles(built, ego), ego)
         # Without an ego the agents' waypoints are all that tells the ticks.
@@ -140,6 +140,6 @@ def conclude(
         raise NothingToReconstruct(f"{log.name}: no ego poses, and no object was detected in {len(schedule)} ticks")
     with clock.stage("probe savings"):
         plan = settle(plan, log, schedule, seen, homographies, agents, clock, costs)
-    scenario = make_scenario(log, schedule, config, plan, detector, homographies, ego, agents)
+    scenario = scenario_of(log, schedule, config, plan, detector, homographies, ego, agents)
     report = make_report(log, schedule, config, plan, seen, homographies, scenario, clock)
     return Result(scenario, report)

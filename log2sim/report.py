@@ -11,7 +11,7 @@ from log2sim.config import Config
 from log2sim.datatypes import Log, Scenario
 from log2sim.documents import rounded
 from log2sim.geometry import NS_PER_S
-from log2sim.perception.first_pass import Observed
+from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography.correspondences import jitter_m
 from log2sim.perception.homography_stage import CameraGround
 from log2sim.perception.sync import Schedule
@@ -27,7 +27,7 @@ def make_report(
     schedule: Schedule,
     config: Config,
     plan: Plan,
-    seen: Observed,
+    seen: Observations,
     homographies: Mapping[str, CameraGround],
     scenario: Scenario,
     clock: StageClock,
@@ -81,7 +81,7 @@ def _homography_entry(ground: CameraGround, method: str) -> dict[str, Any]:
     }
 
 
-def _measurement_counts(seen: Observed) -> dict[str, Any]:
+def _measurement_counts(seen: Observations) -> dict[str, Any]:
     sources = np.concatenate([m.source for m in seen.measurements]) if seen.measurements else np.zeros(0, dtype="<U16")
     return {"total": len(sources), "with_lidar": int((sources == "lidar").sum())}
 

@@ -15,11 +15,11 @@ import numpy as np
 from log2sim.agents.simplify import TOLERANCE_M
 from log2sim.datatypes import Agent, Log, Stream, Waypoints
 from log2sim.errors import RecordError
-from log2sim.perception.first_pass import Observed
+from log2sim.perception.first_pass import Observations
 from log2sim.perception.fusion import fuse
 from log2sim.perception.homography.correspondences import Correspondences, fit_camera
 from log2sim.perception.homography_stage import CameraGround
-from log2sim.perception.lidar.cloud import with_many_poses, with_one_pose
+from log2sim.perception.lidar.cloud import deskew, transform_rigidly
 from log2sim.perception.sync import Schedule
 from log2sim.plan import Plan
 from log2sim.stage_clock import Costs, StageClock
@@ -31,7 +31,7 @@ def settle(
     plan: Plan,
     log: Log,
     schedule: Schedule,
-    seen: Observed,
+    seen: Observations,
     grounds: Mapping[str, CameraGround],
     agents: Sequence[Agent],
     clock: StageClock,
@@ -58,21 +58,21 @@ def seconds_of(work: Callable[[], object], repeats: int = 1) -> float:
     return min(spent)
 
 
-def _frames(plan: Plan, seen: Observed, clock: StageClock) -> Plan:
-    count = sum(seen.not_looked.values())
+def _frames(plan: Plan, seen: Observations, clock: StageClock) -> Plan:
+    count = sum(seen.frames_skipped.values())
     if not count:
         return plan
-    names = ", ".join(f"{name} {n}" for name, n in sorted(seen.not_looked.items()))
+    names = ", ".join(f"{name} {n}" for name, n in sorted(seen.frames_skipped.items()))
     plan = plan.decided(
         "every frame",
         False,
-        f"{count} of {count + seen.looked} frames are between two looks that found nothing: {names}",
+        f"{count} of {count + seen.frames_detected} frames are between two looks that found nothing: {names}",
     )
-    each = (clock.seconds.get("decode", 0.0) + clock.seconds.get("detect", 0.0)) / max(seen.looked, 1)
-    return plan.saved("every frame", count * each, _estimate(each, "a frame looked at", seen.looked, count))
+    each = (clock.seconds.get("decode", 0.0) + clock.seconds.get("detect", 0.0)) / max(seen.frames_detected, 1)
+    return plan.saved("every frame", count * each, _estimate(each, "a frame looked at", seen.frames_detected, count))
 
 
-def _lidars(plan: Plan, log: Log, schedule: Schedule, seen: Observed, clock: StageClock) -> Plan:
+def _lidars(plan: Plan, log: Log, schedule: Schedule, seen: Observations, clock: StageClock) -> Plan:
     """A sweep out of reach is neither read nor put into a cloud; reading it is probed."""
     far = [s for name, s in log.streams.items() if name not in log.lidars and name not in log.cameras]
     if not far:
@@ -96,7 +96,7 @@ def _images(plan: Plan, log: Log, schedule: Schedule) -> Plan:
     return plan.saved("decode images", frames * each, _estimate(each, f"a frame of {name}", 1, frames))
 
 
-def _compensation(plan: Plan, log: Log, seen: Observed) -> Plan:
+def _compensation(plan: Plan, log: Log, seen: Observations) -> Plan:
     kinds, total = seen.sweeps, sum(seen.sweeps.values())
     if plan.keeps("compensate") and total:
         if kinds["in the map"] == total:
@@ -114,13 +114,13 @@ def _compensation(plan: Plan, log: Log, seen: Observed) -> Plan:
     if sweep.frame == "map" or sweep.t_ns is None or not len(sweep.t_ns):
         return plan
     t_ns = sweep.t_ns
-    each = seconds_of(lambda: with_many_poses(log, name, sweep, t_ns), 2) - seconds_of(
-        lambda: with_one_pose(log, name, sweep), 2
+    each = seconds_of(lambda: deskew(log, name, sweep, t_ns), 2) - seconds_of(
+        lambda: transform_rigidly(log, name, sweep), 2
     )
     return plan.saved("compensate", left_out * each, _estimate(each, f"a sweep of {name}", 1, left_out))
 
 
-def _homographies(plan: Plan, seen: Observed, grounds: Mapping[str, CameraGround], costs: Costs) -> Plan:
+def _homographies(plan: Plan, seen: Observations, grounds: Mapping[str, CameraGround], costs: Costs) -> Plan:
     left_out = [c for c in plan.cameras if c not in grounds and (seen.feet.get(c) or seen.ground.get(c))]
     if not left_out:
         return plan
@@ -143,7 +143,7 @@ def _homographies(plan: Plan, seen: Observed, grounds: Mapping[str, CameraGround
     return plan.saved("homography", count * each, _estimate(each, "a correspondence in a short fit", len(rows), count))
 
 
-def _fusion(plan: Plan, seen: Observed, ticks: int) -> Plan:
+def _fusion(plan: Plan, seen: Observations, ticks: int) -> Plan:
     rows = seen.busiest
     if plan.keeps("fuse") or rows is None or not len(rows):
         return plan

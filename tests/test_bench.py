@@ -32,13 +32,13 @@ from log2sim.perception.detect.layouts import LAYOUTS
 from log2sim.perception.detect.onnx_detector import OnnxDetector
 from log2sim.perception.detect.onnx_model import OnnxModel
 from log2sim.perception.detect.preparation import InputSpec
-from log2sim.perception.first_pass import Observed
+from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography.estimate import HomographyFit, apply_homography
 from log2sim.perception.homography_stage import CameraGround, calibrated_ground
 from log2sim.pipeline import schedule_of
 from log2sim.plan import make_plan
 
-FirstPass = tuple[Bed, Observed, dict[str, float]]
+FirstPass = tuple[Bed, Observations, dict[str, float]]
 LABELS = Config.load(detect={"name": "labels"})
 
 

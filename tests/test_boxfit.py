@@ -8,14 +8,14 @@ from worlds import scan, standing
 
 from log2sim.datatypes import CATEGORIES, TYPICAL_SIZE_M
 from log2sim.perception.box_fitting import (
-    FACING,
-    SEEN,
+    FACING_END,
+    SIDE_END,
     align_to,
-    box_of_cluster,
     complete_box,
-    ends_shown,
     extents,
+    fit_box,
     fit_yaw,
+    real_ends,
     rotate,
     subsample,
 )
@@ -128,7 +128,7 @@ UNSEEN, RIGHT, LEFT, BOTH = (False, False), (True, False), (False, True), (True,
 
 
 @pytest.mark.parametrize(
-    ("sensor", "ends_seen", "center", "why"),
+    ("sensor", "ends_visible", "center", "why"),
     [
         ([-10.0, -10.0], UNSEEN, [2.2, 0.9], "behind and to the right: both near sides are real"),
         ([-10.0, -10.0], BOTH, [2.2, 0.9], "what faces the sensor is surer than what is seen from the side"),
@@ -142,15 +142,15 @@ UNSEEN, RIGHT, LEFT, BOTH = (False, False), (True, False), (False, True), (True,
         ([0.5, 0.5], BOTH, [0.5, 0.5], "inside what was seen: nothing says where the rest is"),
     ],
 )
-def test_a_box_reaches_from_its_best_end_to_where_it_was_not_seen(sensor, ends_seen, center, why):
-    found, _ = complete_box(np.zeros(2), np.ones(2), np.array([4.4, 1.8]), np.array(sensor), ends_seen)
+def test_a_box_reaches_from_its_best_end_to_where_it_was_not_seen(sensor, ends_visible, center, why):
+    found, _ = complete_box(np.zeros(2), np.ones(2), np.array([4.4, 1.8]), np.array(sensor), ends_visible)
     np.testing.assert_allclose(found, center, atol=1e-12, err_msg=why)
 
 
 def test_ends_seen_at_a_flat_angle_are_not_believed():
     # 10 m ahead and 0.8 m beside the middle of its width: the side is seen at 5 degrees.
-    shown = ends_shown(np.array([-2.0, -0.9]), np.array([2.0, 0.9]), np.array([12.0, 1.7]), BOTH)
-    assert shown.tolist() == [[0, FACING], [SEEN, FACING]]
+    shown = real_ends(np.array([-2.0, -0.9]), np.array([2.0, 0.9]), np.array([12.0, 1.7]), BOTH)
+    assert shown.tolist() == [[0, FACING_END], [SIDE_END, FACING_END]]
 
 
 def test_doubt_grows_with_what_was_not_seen_and_without_a_real_end():
@@ -186,7 +186,7 @@ PLACES = [(12, 0, 0), (12, 5, 20), (20, -6, -35), (15, 4, 90), (25, 8, 140), (9,
 def test_a_car_of_typical_size_is_found_where_it_stands(x, y, yaw_deg):
     car = standing(x, y, yaw_deg)
     xyz, owner = scan([car], noise_m=0.01)
-    center, size, yaw, covariance = box_of_cluster(xyz[owner == 0], np.array([0, 0, 1.9]), "car", 0.0)
+    center, size, yaw, covariance = fit_box(xyz[owner == 0], np.array([0, 0, 1.9]), "car", 0.0)
     assert apart(yaw, car.yaw_rad, np.pi) < np.deg2rad(4)
     assert np.hypot(*(center - car.center_m)[:2]) < 0.2
     error = (center - car.center_m)[:2]
@@ -202,7 +202,7 @@ def test_a_car_ahead_seen_from_straight_behind_does_not_turn_with_a_fraction_of_
     xyz, owner = scan([standing(12, 0, turn_deg)], sensor=(0, 0, 0.8), noise_m=0.01)
     cluster = rotate(xyz[owner == 0, :2], np.deg2rad(yaw_deg))
     cluster = np.column_stack([cluster, xyz[owner == 0, 2]])
-    center, _, yaw, _ = box_of_cluster(cluster, np.array([0, 0, 0.8]), "car", 0.0)
+    center, _, yaw, _ = fit_box(cluster, np.array([0, 0, 0.8]), "car", 0.0)
     assert apart(yaw, np.deg2rad(yaw_deg + turn_deg), np.pi) < np.deg2rad(3)
     assert np.hypot(*(center[:2] - rotate(np.array([12.0, 0.0]), np.deg2rad(yaw_deg)))) < 0.2
 
@@ -215,8 +215,8 @@ def test_the_box_moves_and_turns_with_the_world(angle):
     def moved(p):
         return np.concatenate([rotate(p[..., :2], angle), p[..., 2:]], axis=-1) + shift
 
-    center, size, yaw, covariance = box_of_cluster(cluster, sensor, "car", 0.0)
-    center_2, size_2, yaw_2, covariance_2 = box_of_cluster(moved(cluster), moved(sensor), "car", 300.0)
+    center, size, yaw, covariance = fit_box(cluster, sensor, "car", 0.0)
+    center_2, size_2, yaw_2, covariance_2 = fit_box(moved(cluster), moved(sensor), "car", 300.0)
     # The search steps by two degrees and interpolates: a turn may cost a fraction of a step.
     np.testing.assert_allclose(center_2, moved(center), atol=0.05)
     np.testing.assert_allclose(size_2, size, atol=0.05)
@@ -227,7 +227,7 @@ def test_the_box_moves_and_turns_with_the_world(angle):
 
 def test_the_covariance_is_widest_along_what_was_not_seen():
     xyz, owner = scan([standing(15, 0, 0)])
-    _, _, yaw, covariance = box_of_cluster(xyz[owner == 0], np.array([0, 0, 1.9]), "car", 0.0, BOTH)
+    _, _, yaw, covariance = fit_box(xyz[owner == 0], np.array([0, 0, 1.9]), "car", 0.0, BOTH)
     assert apart(yaw, 0.0, np.pi) < 0.05
     # Straight from behind the roof and the rear are seen: what remains of the length is spread evenly.
     low, high = extents(xyz[owner == 0, :2], 0.0)
@@ -240,7 +240,7 @@ def test_the_covariance_is_widest_along_what_was_not_seen():
 def test_a_short_side_without_its_ends_may_be_a_front_or_part_of_a_flank():
     side = np.column_stack([np.full(60, 12.0), np.linspace(-0.8, 0.8, 60), np.linspace(0.3, 1.2, 60)])
     sigma = [
-        np.sqrt(np.linalg.eigvalsh(box_of_cluster(side, np.array([0, 0, 1.9]), "car", 0.0, ends)[3]))
+        np.sqrt(np.linalg.eigvalsh(fit_box(side, np.array([0, 0, 1.9]), "car", 0.0, ends)[3]))
         for ends in (BOTH, UNSEEN)
     ]
     # Front or flank: the center lies half of the difference between length and width away.
@@ -252,7 +252,7 @@ def test_a_short_side_without_its_ends_may_be_a_front_or_part_of_a_flank():
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_a_handful_of_points_gives_a_finite_box_of_at_least_the_typical_size(category, count):
     cluster = np.array([20.0, 3, 0.5]) + np.random.default_rng(count).normal(0, 0.1, (count, 3))
-    center, size, yaw, covariance = box_of_cluster(cluster, np.array([0, 0, 1.9]), category, 0.0)
+    center, size, yaw, covariance = fit_box(cluster, np.array([0, 0, 1.9]), category, 0.0)
     assert np.isfinite([*center, *size, yaw, *covariance.ravel()]).all()
     assert np.all(size[:2] >= np.array(TYPICAL_SIZE_M[category])[:2])
     assert np.linalg.eigvalsh(covariance).min() > 0

@@ -9,7 +9,7 @@ import pytest
 from worlds import scan, standing
 
 from log2sim.datatypes import TYPICAL_SIZE_M, Measurements
-from log2sim.perception.box_fitting import box_of_cluster, rotate
+from log2sim.perception.box_fitting import fit_box, rotate
 from log2sim.perception.fusion import fuse
 
 T0_NS = 1_700_000_000_000_000_000
@@ -18,7 +18,7 @@ SENSOR = np.array([0.0, 0.0, 1.9])
 
 def row(cluster, category="car", camera="a", score=0.9, *, truncated=False, far=(0.0, 0.0, 0.0), t_ns=T0_NS):
     """One measured object from its points (n, 3) on flat ground."""
-    center, size, yaw, covariance = box_of_cluster(cluster, SENSOR, category, 0.0)
+    center, size, yaw, covariance = fit_box(cluster, SENSOR, category, 0.0)
     return Measurements(
         np.array([t_ns]),
         np.array([category], dtype="<U16"),

@@ -10,7 +10,7 @@ from worlds import Solid, camera_ahead, outline_px, scan, standing
 
 from log2sim.datatypes import TYPICAL_SIZE_M, Log, Measurements, Obstacles, Stream
 from log2sim.geometry import PoseTrack, apply, inverse, project, rotation_from_rpy, transform
-from log2sim.perception.first_pass import Observed
+from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.estimate import apply_homography, refused
 from log2sim.perception.homography_stage import CameraGround, calibrated_ground, fit_cameras, locate_the_rest
@@ -91,13 +91,13 @@ def fit(log, seen, plan=None, method="time-aware"):
 
 
 def test_nothing_is_fitted_when_the_plan_leaves_it_out():
-    plan, fits = fit(log_with(tilted()), Observed(measurements=[unplaced([[1, 2, 3, 4]])]), plan_with(False, "off"))
+    plan, fits = fit(log_with(tilted()), Observations(measurements=[unplaced([[1, 2, 3, 4]])]), plan_with(False, "off"))
     assert fits == {}
     assert not plan.keeps("homography")
 
 
 def test_nothing_is_fitted_when_every_detection_has_points_and_the_plan_says_so():
-    plan, fits = fit(log_with(tilted()), Observed(measurements=[Measurements.empty()] * 5))
+    plan, fits = fit(log_with(tilted()), Observations(measurements=[Measurements.empty()] * 5))
     assert fits == {}
     assert not plan.keeps("homography")
     assert "every detection has LiDAR points" in plan.steps[0].reason
@@ -106,7 +106,7 @@ def test_nothing_is_fitted_when_every_detection_has_points_and_the_plan_says_so(
 def test_a_picture_needs_every_camera():
     plan, fits = fit(
         log_with(tilted()),
-        Observed(measurements=[Measurements.empty()]),
+        Observations(measurements=[Measurements.empty()]),
         plan_with(True, "a top-down picture is asked for"),
     )
     assert list(fits) == ["front"]
@@ -115,13 +115,13 @@ def test_a_picture_needs_every_camera():
 
 def test_a_log_without_correspondences_falls_back_on_the_calibration_and_keeps_the_reason():
     camera = tilted()
-    _, fits = fit(log_with(camera), Observed(measurements=[unplaced([[500, 280, 700, 400]])]))
+    _, fits = fit(log_with(camera), Observations(measurements=[unplaced([[500, 280, 700, 400]])]))
     found = fits["front"]
     assert found.fit.ok
     assert found.source == "calibration and flat ground"
     assert "at least 4" in found.refusal
     low = tilted(at=(1.0, 0.0, 0.05))
-    _, fits = fit(log_with(low), Observed(measurements=[unplaced([[500, 280, 700, 400]])]))
+    _, fits = fit(log_with(low), Observations(measurements=[unplaced([[500, 280, 700, 400]])]))
     assert not fits["front"].fit.ok
     assert fits["front"].source == "none"
 
@@ -136,7 +136,7 @@ def correspondences(camera, count, rng, noise_px=0.0, collinear=False):
 @pytest.mark.parametrize("method", ["time-aware", "min-frame", "per-frame"])
 def test_obstacles_give_the_homography_of_the_true_camera(method):
     camera, rng = tilted(0.06, 0.01), np.random.default_rng(1)
-    seen = Observed(measurements=[unplaced([[500, 280, 700, 400]])])
+    seen = Observations(measurements=[unplaced([[500, 280, 700, 400]])])
     seen.feet["front"] = [correspondences(camera, 300, rng, 0.5)]
     _, fits = fit(log_with(camera), seen, method=method)
     found, truth = fits["front"], calibrated_ground(log_with(camera), camera)
@@ -148,7 +148,7 @@ def test_obstacles_give_the_homography_of_the_true_camera(method):
 
 def test_cars_of_one_lane_are_joined_by_points_of_the_ground():
     camera, rng = tilted(0.06), np.random.default_rng(2)
-    seen = Observed(measurements=[unplaced([[500, 280, 700, 400]])])
+    seen = Observations(measurements=[unplaced([[500, 280, 700, 400]])])
     seen.feet["front"] = [correspondences(camera, 200, rng, 0.3, collinear=True)]
     seen.ground["front"] = [correspondences(camera, 200, rng, 0.3)]
     _, fits = fit(log_with(camera), seen)
@@ -164,7 +164,7 @@ def test_an_obstacle_without_points_is_placed_where_its_foot_is(far, yaw, catego
     size = TYPICAL_SIZE_M[category]
     solid = standing(18.0, 3.0, 0.0, size)
     m = unplaced([outline_px(camera, camera.mount_T_cam, solid)], category=category)
-    seen = Observed(measurements=[m], obstacles=[None])
+    seen = Observations(measurements=[m], obstacles=[None])
     homographies = {"front": CameraGround(camera, calibrated_ground(log, camera), "calibration")}
     row = locate_the_rest(log, synchronize(log, ("front",)), seen, homographies)[0]
     truth = apply(log.ego.map_T_ego[0], np.array([solid.center_m]))[0]
@@ -186,7 +186,7 @@ def test_the_covariance_turns_with_the_ego():
     def covariance(yaw):
         log = log_with(camera, yaw=yaw)
         ground = {"front": CameraGround(camera, calibrated_ground(log, camera), "calibration")}
-        seen = Observed(measurements=[unplaced([box])], obstacles=[None])
+        seen = Observations(measurements=[unplaced([box])], obstacles=[None])
         return locate_the_rest(log, synchronize(log, ("front",)), seen, ground)[0].covariance[0]
 
     along = covariance(0.0)
@@ -207,7 +207,7 @@ def test_boxes_whose_foot_says_nothing_stay_without_a_place(name):
     camera = tilted(0.0)
     log = log_with(camera)
     ground = {"front": CameraGround(camera, calibrated_ground(log, camera), "calibration")}
-    seen = Observed(measurements=[unplaced([LEFT_ALONE[name]])], obstacles=[None])
+    seen = Observations(measurements=[unplaced([LEFT_ALONE[name]])], obstacles=[None])
     row = locate_the_rest(log, synchronize(log, ("front",)), seen, ground)[0]
     assert row.source.tolist() == [""]
     assert np.isnan(row.center_m).all()
@@ -218,7 +218,7 @@ def test_boxes_whose_foot_says_nothing_stay_without_a_place(name):
 )
 def test_without_a_homography_nothing_is_placed(homographies):
     log = log_with(tilted())
-    seen = Observed(measurements=[unplaced([[500, 280, 700, 400]]), Measurements.empty()], obstacles=[None, None])
+    seen = Observations(measurements=[unplaced([[500, 280, 700, 400]]), Measurements.empty()], obstacles=[None, None])
     rows = locate_the_rest(log, synchronize(log, ("front",)), seen, homographies)
     assert [r.source.tolist() for r in rows] == [[""], []]
 
@@ -232,7 +232,7 @@ def test_two_cameras_that_place_one_obstacle_make_one_row_of_it():
         unplaced([outline_px(c, c.mount_T_cam, solid)], category="pedestrian", camera=c.name) for c in (left, right)
     ]
     ground = {c.name: CameraGround(c, calibrated_ground(log, c), "calibration") for c in (left, right)}
-    seen = Observed(measurements=[Measurements.join(rows)], obstacles=[None])
+    seen = Observations(measurements=[Measurements.join(rows)], obstacles=[None])
     out = locate_the_rest(log, synchronize(log, ("front",)), seen, ground)
     assert len(out[0]) == 1
     assert np.hypot(*(out[0].center_m[0] - solid.center_m)[:2]) < 0.3
@@ -248,7 +248,7 @@ def placed_where_rays_go(solids, at=(15.0, 1.0)):
     above = xyz[(owner >= 0) & (xyz[:, 2] > 0.2)].astype(np.float32)
     cloud = Obstacles(T0_NS, np.zeros(3), above, np.zeros(len(above), np.float32), np.array([0, 0, 1.9], np.float32))
     ground = {"front": CameraGround(camera, calibrated_ground(log, camera), "calibration")}
-    seen = Observed(measurements=[unplaced([box])], obstacles=[cloud])
+    seen = Observations(measurements=[unplaced([box])], obstacles=[cloud])
     return locate_the_rest(log, synchronize(log, ("front",)), seen, ground)[0]
 
 

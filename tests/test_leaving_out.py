@@ -16,17 +16,17 @@ import log2sim.perception.lidar.cloud
 import log2sim.pipeline
 import log2sim.plan
 from log2sim import Config, Scenario, reconstruct, replay
-from log2sim.agents.simplify import thin
+from log2sim.agents.simplify import simplify_waypoints
 from log2sim.datatypes import Detections, Frame, Lidar, Log, Measurements, Stream, Sweep, Waypoints
 from log2sim.documents import check
 from log2sim.errors import LogError, RecordError
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.geometry import PoseTrack, transform
 from log2sim.perception.detect.detectors import create_detector
-from log2sim.perception.first_pass import Observed
+from log2sim.perception.first_pass import Observations
 from log2sim.perception.fusion import fuse
 from log2sim.perception.homography_stage import fit_cameras
-from log2sim.perception.lidar.cloud import assemble_cloud, at_rest, to_map
+from log2sim.perception.lidar.cloud import assemble_cloud, is_at_rest, sweep_to_map
 from log2sim.perception.sync import synchronize
 from log2sim.pipeline import Result
 from log2sim.plan import Plan, make_plan, plan_ticks
@@ -154,9 +154,9 @@ def test_rest_is_less_than_a_centimeter_during_the_sweep(speed_mps: float, rests
     log = Log("l", "log2sim", {}, {"top": Lidar("top", "ego", np.eye(4))}, {}, ego)
     points = np.random.default_rng(0).uniform(-30, 30, (200, 3))
     sweep = Sweep(0, points, "lidar", np.linspace(0, 100_000_000, 200).astype(np.int64))
-    assert at_rest(log, "top", sweep) == rests
-    one = to_map(log, "top", sweep, compensate=False)
-    many = to_map(log, "top", sweep, compensate=True)
+    assert is_at_rest(log, "top", sweep) == rests
+    one = sweep_to_map(log, "top", sweep, compensate=False)
+    many = sweep_to_map(log, "top", sweep, compensate=True)
     assert one is not None
     assert many is not None
     assert (np.abs(one[0] - many[0]).max() == 0.0) == rests
@@ -166,7 +166,7 @@ def test_rest_is_less_than_a_centimeter_during_the_sweep(speed_mps: float, rests
 def test_sweeps_that_cannot_be_compensated_are_told(tiny: Log, kind: str, words: str) -> None:
     def read(i: int) -> Sweep:
         sweep = tiny.streams["top"].read(i)
-        mapped = to_map(tiny, "top", sweep, compensate=True)
+        mapped = sweep_to_map(tiny, "top", sweep, compensate=True)
         xyz = mapped[0] if kind == "map" and mapped is not None else sweep.xyz_m
         return Sweep(sweep.stamp_ns, xyz, kind, sweep.t_ns if kind == "map" else None)  # type: ignore[arg-type]
 
@@ -339,13 +339,13 @@ def test_a_box_without_a_foot_in_the_image_needs_no_homography(both: Log) -> Non
     plan = make_plan(both, LABELS)
     schedule = synchronize(both, plan.cameras)
     for bottom_px, wanted in ((250.0, {"back"}), (297.0, {"back"}), (298.0, set()), (300.0, set())):
-        seen = Observed(measurements=[lost("back", bottom_px)], obstacles=[None])
+        seen = Observations(measurements=[lost("back", bottom_px)], obstacles=[None])
         _, fits = fit_cameras(both, schedule, seen, plan, "time-aware", np.random.default_rng(0))
         assert set(fits) == wanted
 
 
 def test_correspondences_that_nobody_reads_are_not_gathered(tiny: Log, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[Observed] = []
+    seen: list[Observations] = []
     monkeypatch.setattr(
         log2sim.pipeline, "fit_cameras", lambda log, schedule, s, plan, *_, **__: (seen.append(s), (plan, {}))[1]
     )
@@ -365,7 +365,7 @@ def test_a_cloud_does_not_sample_the_ground_for_nobody(tiny: Log) -> None:
         assert cloud is not None
         cloud.prepare(ground=ground)
         assert ("ground_sample" in vars(cloud)) == ground
-        assert {"obstacle_columns", "panorama"} <= set(vars(cloud))
+        assert {"obstacle_columns", "azimuth_index"} <= set(vars(cloud))
 
 
 # --- fusion
@@ -426,7 +426,7 @@ def test_a_parked_car_needs_no_smoothing(tiny: Log, monkeypatch: pytest.MonkeyPa
     assert step["reason"].startswith("1 of 3 tracks")
     assert step["saved_how"].startswith("estimated")
     (parked,) = [a for a in without.scenario.others if a.static]
-    monkeypatch.setattr(log2sim.agents.build, "is_standing", lambda track: False)
+    monkeypatch.setattr(log2sim.agents.build, "is_static", lambda track: False)
     full = run(tiny)
     assert entry(full, "smooth parked agents")["kept"]
     smoothed = min(full.scenario.others, key=lambda a: np.hypot(a.waypoints.x_m[0] - 14.0, a.waypoints.y_m[0] + 4.0))
@@ -463,7 +463,7 @@ DRIVE = way(T, 10.0 * T, np.zeros(51), np.full(51, 10.0))
 
 
 def test_constant_motion_keeps_a_waypoint_a_second() -> None:
-    few = thin(DRIVE)
+    few = simplify_waypoints(DRIVE)
     np.testing.assert_allclose(np.diff(few.t_s).max(), 1.0, atol=0.11)
     assert len(few) <= 8
     assert (few.t_s[0], few.t_s[-1]) == (T[0], T[-1])
@@ -471,14 +471,14 @@ def test_constant_motion_keeps_a_waypoint_a_second() -> None:
 
 def test_accelerating_and_turning_keep_what_interpolation_does_not_give_back() -> None:
     braking = way(T, 10.0 * T - 1.5 * T**2, np.zeros(51), 10.0 - 3.0 * T)
-    assert len(thin(braking)) > 15
+    assert len(simplify_waypoints(braking)) > 15
     circle = way(T, 20 * np.sin(T / 2), 20 - 20 * np.cos(T / 2), np.full(51, 10.0))
-    assert len(thin(circle)) > 15
+    assert len(simplify_waypoints(circle)) > 15
 
 
 def test_ends_of_what_was_observed_stay() -> None:
     observed = (T < 1.95) | (T > 3.45)
-    few = thin(way(T, 10.0 * T, np.zeros(51), np.full(51, 10.0), observed))
+    few = simplify_waypoints(way(T, 10.0 * T, np.zeros(51), np.full(51, 10.0), observed))
     assert {19, 20, 34, 35} <= set(np.rint(few.t_s * 10).astype(int))
     assert not few.observed[(few.t_s > 1.95) & (few.t_s < 3.45)].any()
 
@@ -487,14 +487,14 @@ def test_ends_of_what_was_observed_stay() -> None:
 def test_a_waypoint_that_departs_in_any_column_stays(column: str) -> None:
     values = getattr(DRIVE, column).copy()
     values[23] += 0.05
-    assert 23 in np.rint(thin(replace(DRIVE, **{column: values})).t_s * 10).astype(int)
+    assert 23 in np.rint(simplify_waypoints(replace(DRIVE, **{column: values})).t_s * 10).astype(int)
     values[23] += 0.0015 - 0.05
-    assert len(thin(replace(DRIVE, **{column: values}))) == len(thin(DRIVE))
+    assert len(simplify_waypoints(replace(DRIVE, **{column: values}))) == len(simplify_waypoints(DRIVE))
 
 
 def test_the_yaw_may_cross_the_half_turn() -> None:
     yaw = np.where(np.arange(51) % 2, np.pi - 1e-4, -np.pi + 1e-4)
-    assert len(thin(replace(DRIVE, yaw_rad=yaw))) == len(thin(DRIVE))
+    assert len(simplify_waypoints(replace(DRIVE, yaw_rad=yaw))) == len(simplify_waypoints(DRIVE))
 
 
 @pytest.fixture(scope="module")
@@ -535,7 +535,7 @@ def test_few_waypoints_are_as_good_as_all(straight: tuple[Log, Scenario], monkey
 def test_savings_are_the_cost_of_a_piece_times_the_pieces_left_out(both: Log) -> None:
     plan = make_plan(both, LABELS)
     schedule = synchronize(both, plan.cameras)
-    seen = Observed(measurements=[], looked=40, not_looked={"back": 20})
+    seen = Observations(measurements=[], frames_detected=40, frames_skipped={"back": 20})
     clock, costs = StageClock(), Costs()
     clock.seconds.update({"decode": 1.0, "detect": 3.0})
     costs.seconds.update({"moving": 0.8, "standing": 0.1})

@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 from worlds import scan, standing
 
-from log2sim.perception.lidar.azimuth_index import Panorama
+from log2sim.perception.lidar.azimuth_index import AzimuthIndex
 
 SENSOR = np.array([0.0, 0.0, 1.9], dtype=np.float32)
 
 
 def ends_of(solids, of=0, only=None, **options):
-    """Right and left end of one solid's points (or of those that `only` picks), as the panorama tells."""
+    """Right and left end of one solid's points (or of those that `only` picks), as the index tells."""
     xyz, owner = scan(solids, **options)
     members = np.flatnonzero((owner == of) & (xyz[:, 2] > 0.2))
     if only is not None:
         members = members[only(xyz[members])]
     assert len(members) > 20
-    panorama = Panorama.of(xyz.astype(np.float32), SENSOR, owner == -1)
-    return panorama.ends_seen(members).tolist()
+    index = AzimuthIndex.of(xyz.astype(np.float32), SENSOR, owner == -1)
+    return index.ends_visible(members).tolist()
 
 
 WALL = standing(30.0, 0.0, 0.0, (0.5, 60.0, 4.0))
@@ -68,8 +68,8 @@ def test_a_roof_above_what_hides_the_body_ends_where_it_is_seen_to_end():
 def test_a_cloud_of_nothing_else_shows_no_ends():
     xyz, owner = scan([standing(12, 0, 0)])
     alone = xyz[owner == 0].astype(np.float32)
-    panorama = Panorama.of(alone, SENSOR, np.zeros(len(alone), dtype=bool))
-    assert panorama.ends_seen(np.arange(len(alone))).tolist() == [False, False]
+    index = AzimuthIndex.of(alone, SENSOR, np.zeros(len(alone), dtype=bool))
+    assert index.ends_visible(np.arange(len(alone))).tolist() == [False, False]
 
 
 def test_the_turned_world_shows_the_same_ends():
@@ -79,6 +79,6 @@ def test_the_turned_world_shows_the_same_ends():
     for angle in np.linspace(-np.pi, np.pi, 13):
         c, s = np.cos(angle), np.sin(angle)
         turned = xyz @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-        found.append(tuple(Panorama.of(turned.astype(np.float32), SENSOR, owner == -1).ends_seen(members)))
+        found.append(tuple(AzimuthIndex.of(turned.astype(np.float32), SENSOR, owner == -1).ends_visible(members)))
     assert len(set(found)) == 1
     assert found[0] == (True, False)

@@ -9,7 +9,7 @@ import pytest
 from worlds import camera_ahead
 
 from log2sim.geometry import apply, inverse, project, rotation_from_rpy, transform
-from log2sim.perception.lidar.projection import View, in_boxes, see
+from log2sim.perception.lidar.projection import View, points_in_image_boxes, project_points
 
 BROWN = {"distortion_model": "brown", "distortion": (-0.3, 0.1, 0.001, -0.002, -0.02)}
 FISHEYE = {"distortion_model": "fisheye", "distortion": (0.02, -0.01, 0.003, 0.0)}
@@ -30,7 +30,7 @@ def view_of(**changes):
 def test_a_camera_sees_what_projection_puts_into_its_image(lens, far):
     view, points = view_of(**lens), some_points()
     moved = View(view.camera, 0, transform(np.eye(3), far) @ view.map_T_cam)
-    seen = see(moved, np.array(far), np.ascontiguousarray(points.T))
+    seen = project_points(moved, np.array(far), np.ascontiguousarray(points.T))
     in_cam = apply(inverse(view.map_T_cam), points.astype(np.float64))
     uv, inside = project(view.camera, in_cam)
     # Single precision: what lies within a hundredth of a pixel of the border may fall on either side.
@@ -50,12 +50,12 @@ def test_a_camera_sees_what_projection_puts_into_its_image(lens, far):
 @pytest.mark.parametrize("margin", [0.0, 0.15])
 def test_points_in_boxes_are_those_that_plain_comparison_finds(margin):
     view = view_of()
-    seen = see(view, np.zeros(3), np.ascontiguousarray(some_points(20000).T))
+    seen = project_points(view, np.zeros(3), np.ascontiguousarray(some_points(20000).T))
     rng = np.random.default_rng(1)
     corner = rng.uniform([-50, -50], [view.camera.width_px, view.camera.height_px], (40, 2))
     boxes = np.concatenate([corner, corner + rng.uniform(0, 400, (40, 2))], axis=1)
     boxes[3] = np.nan
-    found = in_boxes(seen, boxes, margin)
+    found = points_in_image_boxes(seen, boxes, margin)
     total = 0
     for (u0, v0, u1, v1), rows in zip(boxes, found, strict=True):
         wide, tall = margin * (u1 - u0), margin * (v1 - v0)
@@ -68,16 +68,16 @@ def test_points_in_boxes_are_those_that_plain_comparison_finds(margin):
 
 def test_nothing_in_sight_and_no_boxes():
     view = view_of()
-    none = see(view, np.zeros(3), np.zeros((3, 0), dtype=np.float32))
+    none = project_points(view, np.zeros(3), np.zeros((3, 0), dtype=np.float32))
     assert len(none.index) == 0
-    assert [len(rows) for rows in in_boxes(none, np.array([[0.0, 0, 10, 10]]))] == [0]
-    assert in_boxes(none, np.zeros((0, 4))) == []
+    assert [len(rows) for rows in points_in_image_boxes(none, np.array([[0.0, 0, 10, 10]]))] == [0]
+    assert points_in_image_boxes(none, np.zeros((0, 4))) == []
 
 
 def test_a_large_cloud_before_a_small_one_leaves_nothing_behind():
     view, small = view_of(), np.ascontiguousarray(some_points(300, seed=2).T)
-    before = see(view, np.zeros(3), small)
-    see(view, np.zeros(3), np.ascontiguousarray(some_points(5000, seed=3).T))
-    after = see(view, np.zeros(3), small)
+    before = project_points(view, np.zeros(3), small)
+    project_points(view, np.zeros(3), np.ascontiguousarray(some_points(5000, seed=3).T))
+    after = project_points(view, np.zeros(3), small)
     np.testing.assert_array_equal(before.index, after.index)
     np.testing.assert_array_equal(before.u, after.u)

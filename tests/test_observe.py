@@ -13,8 +13,8 @@ from log2sim.config import Config
 from log2sim.datatypes import Detections, Frame, ImageLabels, Lidar, Log, Stream, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import PoseTrack, apply, inverse, rotation_from_rpy, transform
-from log2sim.perception.first_pass import base_pose, observe, place_of_ego
-from log2sim.perception.frames import Records
+from log2sim.perception.first_pass import base_pose, cloud_origin, observe
+from log2sim.perception.frames import RecordReader
 from log2sim.perception.sync import synchronize
 from log2sim.pipeline import reconstruct
 from log2sim.plan import make_plan
@@ -202,7 +202,7 @@ def test_a_stream_of_which_nothing_can_be_read_is_an_error_that_names_it(stream)
 
 def test_records_count_what_was_read_and_what_was_not():
     log, _ = driving_log(broken={("top", 0)})
-    records = Records(log)
+    records = RecordReader(log)
     assert records.get("top", 0) is None
     with pytest.raises(LogError, match="stream 'top'"):
         records.require_some()
@@ -239,7 +239,7 @@ def test_sensors_on_a_post_need_no_ego():
             row = m.take(m.category == category)
             assert np.hypot(*(row.center_m[0] - solid.center_m)[:2]) < 0.3
     np.testing.assert_array_equal(base_pose(log, T0_NS), np.eye(4))
-    origin, ground = place_of_ego(log, T0_NS)
+    origin, ground = cloud_origin(log, T0_NS)
     np.testing.assert_allclose(origin, [0.0, 0.0, (1.9 + 1.6) / 2])
     assert ground == 0.0
 
@@ -255,7 +255,7 @@ def test_the_ground_under_the_ego_turns_with_its_pitch():
     log, _ = driving_log()
     pose = transform(rotation_from_rpy(0.0, 0.1, 0.0), np.array([5.0, 6.0, 7.0]))
     tilted = replace(log, ego=PoseTrack(STAMPS[:1], pose[None]), ground_z_ego_m=-0.5)
-    origin, ground = place_of_ego(tilted, int(STAMPS[0]))
+    origin, ground = cloud_origin(tilted, int(STAMPS[0]))
     np.testing.assert_allclose(origin, [5, 6, 7])
     assert ground == pytest.approx(7.0 - 0.5 * np.cos(0.1))
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from log2sim.agents.build import Built
+from log2sim.agents.build import AgentCandidate
 from log2sim.agents.duplicates import outside, without_doubles
 from log2sim.datatypes import Agent, Waypoints
 
@@ -23,11 +23,13 @@ def agent(x_m, y_m=0.0, yaw=0.0, category="car", size=(4.4, 1.8, 1.5), t=(0.0, 4
 
 
 def names(*built, ego=None):
-    return [a.id for a in without_doubles([Built(a, e, True) for a, e in built], ego)]
+    return [a.id for a in without_doubles([AgentCandidate(a, e, True) for a, e in built], ego)]
 
 
 def test_of_two_in_one_place_the_one_with_more_evidence_stays():
-    left = without_doubles([Built(agent(10.0), 3.0, True), Built(agent(10.8, size=(5.0, 1.9, 1.6)), 9.0, True)])
+    left = without_doubles(
+        [AgentCandidate(agent(10.0), 3.0, True), AgentCandidate(agent(10.8, size=(5.0, 1.9, 1.6)), 9.0, True)]
+    )
     assert [a.size_m[0] for a in left] == [5.0]
     assert left[0].id == "car-1"
 
@@ -35,7 +37,9 @@ def test_of_two_in_one_place_the_one_with_more_evidence_stays():
 def test_neighbors_bumper_to_bumper_both_stay_and_are_numbered_by_their_start():
     assert names((agent(15.0), 9.0), (agent(10.3), 3.0)) == ["car-1", "car-2"]
     later = replace(agent(30.0).waypoints, t_s=np.linspace(1.0, 4.0, 5))
-    ordered = without_doubles([Built(replace(agent(30.0), waypoints=later), 9.0, True), Built(agent(50.0), 1.0, True)])
+    ordered = without_doubles(
+        [AgentCandidate(replace(agent(30.0), waypoints=later), 9.0, True), AgentCandidate(agent(50.0), 1.0, True)]
+    )
     assert [a.waypoints.x_m[0] for a in ordered] == [50.0, 30.0]
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from worlds import scan, standing
 
-from log2sim.agents.size import heading_of_standing, is_standing, shape_moving, shape_standing
+from log2sim.agents.size import is_static, moving_geometry, parked_heading, static_geometry
 from log2sim.datatypes import TYPICAL_SIZE_M, Measurements, Track
 from log2sim.geometry import rotation_from_rpy
-from log2sim.perception.box_fitting import box_of_cluster, rotate
+from log2sim.perception.box_fitting import fit_box, rotate
 
 T0_NS = 1_700_000_000_000_000_000
 STEP_NS = 100_000_000
@@ -19,7 +19,7 @@ CAR = (4.4, 1.85, 1.6)
 PERSON = (0.7, 0.7, 1.75)
 
 
-def measured(states, size=CAR, category="car", *, sensors=None, noise_m=0.01, ends_seen=(True, True)):
+def measured(states, size=CAR, category="car", *, sensors=None, noise_m=0.01, ends_visible=(True, True)):
     """A track over a box at the states (x, y, yaw), each measured from its sensor (3,) by the box fit."""
     rows = []
     for k, (x, y, yaw) in enumerate(states):
@@ -29,7 +29,7 @@ def measured(states, size=CAR, category="car", *, sensors=None, noise_m=0.01, en
             azimuth_deg=(-180, 180), steps=(900, 32), noise_m=noise_m, seed=k,
         )  # fmt: skip
         cluster = xyz[(owner == 0) & (xyz[:, 2] > 0.2)] + [*sensor[:2], 0.0]
-        center, found, angle, covariance = box_of_cluster(cluster, sensor, category, 0.0, ends_seen)
+        center, found, angle, covariance = fit_box(cluster, sensor, category, 0.0, ends_visible)
         rows.append(
             Measurements(
                 np.array([T0_NS + k * STEP_NS]),
@@ -38,7 +38,7 @@ def measured(states, size=CAR, category="car", *, sensors=None, noise_m=0.01, en
                 np.array(["a"]),
                 np.array([[10.0, 10, 20, 20]]),
                 np.array([False]),
-                np.array([ends_seen]),
+                np.array([ends_visible]),
                 center[None],
                 found[None],
                 np.array([angle]),
@@ -98,29 +98,29 @@ PASSING = [(0.8 * k, 0.0, 1.9) for k in range(25)]  # the sensor drives past at 
 def test_what_stays_stands_and_what_goes_moves(category, jitter_m):
     rng = np.random.default_rng(3)
     xy = np.array([20.0, 3.0]) + rng.normal(0, jitter_m, (30, 2))
-    assert is_standing(bare(xy, category))
-    assert is_standing(bare(xy + np.array([5e5, 5e6]), category))
+    assert is_static(bare(xy, category))
+    assert is_static(bare(xy + np.array([5e5, 5e6]), category))
     for speed in (1.2, 8.0):
         along = np.outer(np.arange(30) * 0.1 * speed, [0.6, 0.8])
-        assert not is_standing(bare(xy + along, category))
+        assert not is_static(bare(xy + along, category))
 
 
 def test_a_few_wild_positions_do_not_make_a_parked_car_move():
     xy = np.tile([20.0, 3.0], (40, 1))
     xy[[7, 23]] += 6.0
-    assert is_standing(bare(xy))
+    assert is_static(bare(xy))
 
 
 def test_of_two_sightings_a_vehicle_stands_and_a_person_walks():
     xy = [[20.0, 3.0], [20.0, 3.1]]
-    assert is_standing(bare(xy, "car"))
-    assert not is_standing(bare(xy, "pedestrian"))
+    assert is_static(bare(xy, "car"))
+    assert not is_static(bare(xy, "pedestrian"))
 
 
 @pytest.mark.parametrize(("x", "y", "yaw_deg"), [(12, 5, 0), (14, -5, 20), (10, 6, 95), (12, -4, 175)])
 def test_a_parked_car_passed_by_is_found_with_its_size_and_yaw(x, y, yaw_deg):
     yaw = np.deg2rad(yaw_deg)
-    shape = shape_standing(measured([(x, y, yaw)] * 25, sensors=PASSING))
+    shape = static_geometry(measured([(x, y, yaw)] * 25, sensors=PASSING))
     assert shape.typical
     # A hundredth of the points is cut at each end, and rays miss the very corners.
     np.testing.assert_allclose(shape.size_m, CAR, atol=0.2)
@@ -134,13 +134,13 @@ def test_a_parked_car_passed_by_is_found_with_its_size_and_yaw(x, y, yaw_deg):
 
 @pytest.mark.parametrize("size", [(3.7, 1.7, 1.5), (5.2, 2.0, 1.9)])
 def test_sizes_that_are_seen_whole_are_kept_and_not_typical_ones(size):
-    shape = shape_standing(measured([(10, 5, 0.1)] * 25, size, sensors=PASSING))
+    shape = static_geometry(measured([(10, 5, 0.1)] * 25, size, sensors=PASSING))
     np.testing.assert_allclose(shape.size_m, size, atol=0.2)
 
 
 def test_a_size_that_is_not_seen_is_the_typical_one():
     behind = [(0.0, 0.0, 0.9)] * 12
-    shape = shape_standing(measured([(12, 0, 0.0)] * 12, sensors=behind))
+    shape = static_geometry(measured([(12, 0, 0.0)] * 12, sensors=behind))
     assert shape.size_m[0] == pytest.approx(TYPICAL_SIZE_M["car"][0], abs=0.1)
     assert apart(shape.yaw_rad, 0.0) < np.deg2rad(3)
     assert np.sqrt(shape.covariance[0, 0, 0]) > 3 * np.sqrt(shape.covariance[0, 1, 1])
@@ -149,7 +149,7 @@ def test_a_size_that_is_not_seen_is_the_typical_one():
 @pytest.mark.parametrize(("shift", "angle"), [((5e5, 5e6, 0.0), 0.0), ((-30.0, 8.0, 0.0), 1.3), ((0, 0, 0), -2.4)])
 def test_a_standing_shape_moves_and_turns_with_the_map(shift, angle):
     track = measured([(12, 5, 0.3)] * 15, sensors=PASSING[:15])
-    here, there = shape_standing(track), shape_standing(moved(track, np.array(shift), angle))
+    here, there = static_geometry(track), static_geometry(moved(track, np.array(shift), angle))
     # Cells that tell persistent points from stray ones lie fixed in the map.
     np.testing.assert_allclose(there.size_m, here.size_m, atol=0.08)
     np.testing.assert_allclose(there.xy_m, rotate(here.xy_m, angle) + shift[:2], atol=0.08)
@@ -161,20 +161,20 @@ def test_points_that_one_tick_lent_from_a_neighbor_are_left_out():
     m = track.measurements
     stray = np.array([16.0, 5.0, 0.5]) + np.random.default_rng(0).normal(0, 0.3, (60, 3))
     mixed = replace(track, measurements=replace(m, cluster=(np.vstack([m.cluster[0], stray]), *m.cluster[1:])))
-    np.testing.assert_allclose(shape_standing(mixed).size_m, shape_standing(track).size_m, atol=0.1)
-    np.testing.assert_allclose(shape_standing(mixed).xy_m, shape_standing(track).xy_m, atol=0.1)
+    np.testing.assert_allclose(static_geometry(mixed).size_m, static_geometry(track).size_m, atol=0.1)
+    np.testing.assert_allclose(static_geometry(mixed).xy_m, static_geometry(track).xy_m, atol=0.1)
 
 
 def test_a_standing_box_lies_where_its_points_are_though_every_tick_was_off():
     track = measured([(12, 5, 0.0)] * 15, sensors=PASSING[:15])
     off = track.measurements.center_m + np.array([0.5, -0.4, 0.0])
-    shape = shape_standing(replace(track, measurements=replace(track.measurements, center_m=off)))
+    shape = static_geometry(replace(track, measurements=replace(track.measurements, center_m=off)))
     assert np.hypot(*(shape.xy_m - [12, 5]).T).max() < 0.1
 
 
 def test_standing_without_points_keeps_the_measured_places_and_the_typical_size():
     track = bare([[20.0, 3.0], [20.1, 3.0], [20.0, 3.1]])
-    shape = shape_standing(track)
+    shape = static_geometry(track)
     np.testing.assert_array_equal(shape.xy_m, track.measurements.center_m[:, :2])
     np.testing.assert_allclose(shape.size_m, TYPICAL_SIZE_M["car"])
     assert shape.yaw_rad is None
@@ -182,7 +182,7 @@ def test_standing_without_points_keeps_the_measured_places_and_the_typical_size(
 
 @pytest.mark.parametrize("size", [(0.6, 0.5, 1.0), (9.5, 3.5, 1.6)])
 def test_what_no_car_can_be_is_not_typical(size):
-    assert not shape_standing(measured([(12, 6, 0.2)] * 15, size, sensors=PASSING[:15])).typical
+    assert not static_geometry(measured([(12, 6, 0.2)] * 15, size, sensors=PASSING[:15])).typical
 
 
 # Moving
@@ -199,7 +199,7 @@ def oncoming(count=25, speed=8.0, y=4.0, heading=np.pi, start_m=30.0):
 def test_a_moving_car_keeps_one_size_and_is_found_within_its_sigma(heading):
     states = oncoming(heading=heading)
     track = measured(states)
-    shape = shape_moving(track, np.full(len(states), heading))
+    shape = moving_geometry(track, np.full(len(states), heading))
     truth = np.array(states)[:, :2]
     np.testing.assert_allclose(shape.size_m, CAR, atol=0.2)
     error = shape.xy_m - truth
@@ -212,7 +212,7 @@ def test_a_moving_car_keeps_one_size_and_is_found_within_its_sigma(heading):
 def test_a_long_car_seen_whole_once_is_long_all_along():
     size = (5.4, 1.9, 1.6)
     states = oncoming(start_m=15.0)
-    shape = shape_moving(measured(states, size), np.full(len(states), np.pi))
+    shape = moving_geometry(measured(states, size), np.full(len(states), np.pi))
     assert shape.size_m[0] == pytest.approx(5.4, abs=0.25)
     assert np.hypot(*(shape.xy_m - np.array(states)[:, :2]).T).max() < 0.35
 
@@ -221,7 +221,7 @@ def test_a_long_car_seen_whole_once_is_long_all_along():
 def test_a_moving_shape_moves_and_turns_with_the_map(shift, angle):
     states = oncoming()
     track, yaw = measured(states), np.full(len(states), np.pi)
-    here, there = shape_moving(track, yaw), shape_moving(moved(track, np.array(shift), angle), yaw + angle)
+    here, there = moving_geometry(track, yaw), moving_geometry(moved(track, np.array(shift), angle), yaw + angle)
     np.testing.assert_allclose(there.size_m, here.size_m, atol=1e-4)
     np.testing.assert_allclose(there.xy_m, rotate(here.xy_m, angle) + shift[:2], atol=1e-4)
     r = rotation_from_rpy(0, 0, angle)[:2, :2]
@@ -231,8 +231,8 @@ def test_a_moving_shape_moves_and_turns_with_the_map(shift, angle):
 def test_what_goes_on_beyond_its_ends_is_less_sure_and_tells_no_size():
     states = oncoming(start_m=15.0)
     yaw = np.full(len(states), np.pi)
-    whole = shape_moving(measured(states, (3.6, 1.7, 1.5)), yaw)
-    cut = shape_moving(measured(states, (3.6, 1.7, 1.5), ends_seen=(False, False)), yaw)
+    whole = moving_geometry(measured(states, (3.6, 1.7, 1.5)), yaw)
+    cut = moving_geometry(measured(states, (3.6, 1.7, 1.5), ends_visible=(False, False)), yaw)
     # The corners of this world are sharp, those that are allowed for are round.
     assert whole.size_m[0] == pytest.approx(3.6, abs=0.25)
     assert cut.size_m[0] == pytest.approx(TYPICAL_SIZE_M["car"][0], abs=0.05)
@@ -241,14 +241,14 @@ def test_what_goes_on_beyond_its_ends_is_less_sure_and_tells_no_size():
 
 def test_a_walker_is_as_tall_as_its_points():
     states = [(10.0, -3 + 0.14 * k, np.pi / 2) for k in range(20)]
-    shape = shape_moving(measured(states, PERSON, "pedestrian"), np.full(20, np.pi / 2))
+    shape = moving_geometry(measured(states, PERSON, "pedestrian"), np.full(20, np.pi / 2))
     assert shape.size_m[2] == pytest.approx(1.75, abs=0.15)
     assert np.hypot(*(shape.xy_m - np.array(states)[:, :2]).T).max() < 0.2
 
 
 def test_moving_without_points_keeps_the_measured_places():
     track = bare([[10.0 + k, 2.0] for k in range(5)])
-    shape = shape_moving(track, np.zeros(5))
+    shape = moving_geometry(track, np.zeros(5))
     np.testing.assert_array_equal(shape.xy_m, track.measurements.center_m[:, :2])
     np.testing.assert_array_equal(shape.covariance, track.measurements.covariance)
     np.testing.assert_allclose(shape.size_m, TYPICAL_SIZE_M["car"])
@@ -270,16 +270,16 @@ def test_traffic_keeps_right_whatever_way_the_box_was_fitted(yaw, left_m, with_i
     flow = path(0.0, 0.0, 0.0)
     flow = np.column_stack([rotate(flow[:, :2], turn), flow[:, 2] + turn])
     xy = rotate(np.array([10.0, left_m]), turn)
-    found = heading_of_standing(yaw + turn, xy, flow)
+    found = parked_heading(yaw + turn, xy, flow)
     assert np.cos(found - turn) * (1 if with_it else -1) > 0.9
     assert apart(found, yaw + turn) < 1e-9
 
 
 def test_without_traffic_nearby_a_heading_stays_as_it_is():
     for flow in (np.zeros((0, 3)), path(500.0, 0.0, 0.0), path(0.0, 0.0, np.pi / 2)):
-        assert heading_of_standing(3.0, np.array([10.0, -2.0]), flow) == pytest.approx(3.0)
+        assert parked_heading(3.0, np.array([10.0, -2.0]), flow) == pytest.approx(3.0)
 
 
 def test_the_nearer_path_has_more_say():
     flow = np.vstack([path(0.0, 3.0, 0.0), path(20.0, -12.0, np.pi)])
-    assert np.cos(heading_of_standing(0.0, np.array([10.0, 0.5]), flow)) > 0.9
+    assert np.cos(parked_heading(0.0, np.array([10.0, 0.5]), flow)) > 0.9

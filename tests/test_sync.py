@@ -11,7 +11,7 @@ from worlds import camera_ahead
 from log2sim.datatypes import Lidar, Log, Stream, Sweep
 from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.geometry import PoseTrack, apply, rotation_from_rpy, transform
-from log2sim.perception.lidar.cloud import to_map
+from log2sim.perception.lidar.cloud import sweep_to_map
 from log2sim.perception.sync import nearest_records, sweep_middle_ns, synchronize
 
 T0_NS = 1_700_000_000_000_000_000
@@ -237,7 +237,7 @@ def test_compensated_points_lie_where_the_world_has_them_whatever_their_own_time
     world = ORIGIN + rng.uniform([-50, -50, 0], [50, 50, 5], (3000, 3))
     t_s = rng.uniform(-0.1, 0.0, 3000)
     log = moving_log()
-    found, seconds = to_map(log, "top", swept(log, world, t_s), compensate=True)
+    found, seconds = sweep_to_map(log, "top", swept(log, world, t_s), compensate=True)
     # 1 rad/s and 50 m may cost 2.5 cm by the module's own word; here it is 0.4 rad/s and 71 m.
     assert np.abs(found - world).max() < 0.02
     near = np.linalg.norm(world - ORIGIN, axis=1) < 8
@@ -249,7 +249,7 @@ def test_compensated_points_lie_where_the_world_has_them_whatever_their_own_time
 def test_without_compensation_points_are_off_by_what_the_ego_moved():
     log, t_s = moving_log(), np.array([-0.1, -0.05, 0.0])
     world = np.tile(on_circle(0.0)[:3, 3] + [30.0, 0.0, 0.0], (3, 1))
-    found, _ = to_map(log, "top", swept(log, world, t_s), compensate=False)
+    found, _ = sweep_to_map(log, "top", swept(log, world, t_s), compensate=False)
     for k, t in enumerate(t_s):
         back = on_circle(0.0) @ np.linalg.inv(on_circle(t))
         np.testing.assert_allclose(found[k], apply(back, world[k][None])[0], atol=1e-6)
@@ -261,14 +261,14 @@ def test_without_point_times_the_whole_sweep_takes_the_pose_of_its_stamp():
     log = moving_log()
     world = ORIGIN + np.array([[10.0, 5.0, 1.0], [20.0, -5.0, 0.0]])
     sweep = replace(swept(log, world, np.zeros(2)), t_ns=None)
-    found, seconds = to_map(log, "top", sweep, compensate=True)
+    found, seconds = sweep_to_map(log, "top", sweep, compensate=True)
     np.testing.assert_allclose(found, world, atol=1e-6)
     assert seconds.tolist() == [0.0, 0.0]
 
 
 def test_points_that_are_already_in_the_map_stay_where_they_are():
     world = ORIGIN + np.array([[1.0, 2.0, 3.0]])
-    found, seconds = to_map(
+    found, seconds = sweep_to_map(
         moving_log(), "top", Sweep(T0_NS, world, "map", np.array([T0_NS - 20 * MS])), compensate=True
     )
     np.testing.assert_array_equal(found, world)
@@ -278,14 +278,14 @@ def test_points_that_are_already_in_the_map_stay_where_they_are():
 @pytest.mark.parametrize("t_s", [[-0.5, -0.05], [0.0, 0.7]])
 def test_a_sweep_during_which_the_pose_is_not_known_gives_nothing(t_s):
     log = moving_log()
-    assert to_map(log, "top", swept(log, ORIGIN + np.ones((2, 3)), np.array(t_s)), compensate=True) is None
+    assert sweep_to_map(log, "top", swept(log, ORIGIN + np.ones((2, 3)), np.array(t_s)), compensate=True) is None
 
 
 def test_all_points_of_one_moment_and_no_points_at_all_are_fine():
     log = moving_log()
     world = ORIGIN + np.array([[10.0, 5.0, 1.0], [20.0, -5.0, 0.0]])
-    found, _ = to_map(log, "top", swept(log, world, np.full(2, -0.03)), compensate=True)
+    found, _ = sweep_to_map(log, "top", swept(log, world, np.full(2, -0.03)), compensate=True)
     np.testing.assert_allclose(found, world, atol=1e-3)
-    none, seconds = to_map(log, "top", swept(log, np.zeros((0, 3)), np.zeros(0)), compensate=True)
+    none, seconds = sweep_to_map(log, "top", swept(log, np.zeros((0, 3)), np.zeros(0)), compensate=True)
     assert none.shape == (0, 3)
     assert seconds.shape == (0,)

@@ -501,7 +501,7 @@ def measured(view: Camera, **changes: object) -> Measurements:
         "camera": np.full(4, view.name),
         "box_px": np.column_stack([uv[:, 0] - 30, uv[:, 1] - 40, uv[:, 0] + 30, uv[:, 1]]),
         "truncated": np.zeros(4, dtype=bool),
-        "ends_seen": np.zeros((4, 2), dtype=bool),
+        "ends_visible": np.zeros((4, 2), dtype=bool),
         "center_m": np.column_stack([feet[:, 0] + 102.2, feet[:, 1] + 50, np.full(4, 0.75)]),
         "size_m": np.tile([4.4, 1.8, 1.5], (4, 1)),
         "yaw_rad": np.zeros(4),

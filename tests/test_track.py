@@ -45,7 +45,7 @@ def seen(
         camera=np.broadcast_to(np.array(name, dtype="<U16"), count).copy(),
         box_px=np.zeros((count, 4)),
         truncated=np.zeros(count, dtype=bool),
-        ends_seen=np.zeros((count, 2), dtype=bool),
+        ends_visible=np.zeros((count, 2), dtype=bool),
         center_m=np.column_stack([xy, np.zeros(count)]),
         size_m=np.tile([4.4, 1.8, 1.5], (count, 1)),
         yaw_rad=np.zeros(count),

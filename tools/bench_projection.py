@@ -13,8 +13,8 @@ import numpy as np
 from bench_table import markdown, optional, timed
 
 from log2sim.geometry import Camera
-from log2sim.perception.box_fitting import middle
-from log2sim.perception.lidar.projection import View, in_boxes, see
+from log2sim.perception.box_fitting import upper_median
+from log2sim.perception.lidar.projection import View, points_in_image_boxes, project_points
 
 Array = np.ndarray[Any, Any]
 
@@ -72,8 +72,10 @@ def with_log2sim(columns: Array, views: list[View], boxes: list[Array]) -> list[
     """As the measurement does it, which keeps the points of a sweep as columns (3, N) for all of its cameras."""
     out = []
     for view, box in zip(views, boxes, strict=True):
-        seen = see(view, np.zeros(3), columns)
-        out += [float(middle(seen.depth[i])) if len(i) else float("nan") for i in in_boxes(seen, box)]
+        seen = project_points(view, np.zeros(3), columns)
+        out += [
+            float(upper_median(seen.depth[i])) if len(i) else float("nan") for i in points_in_image_boxes(seen, box)
+        ]
     return out
 
 

@@ -96,7 +96,7 @@ def to_measurements(boxes: Boxes, view: View) -> list[Measurements]:
         camera=np.full(n, "image_02", dtype="<U16"),
         box_px=boxes.box_px,
         truncated=np.zeros(n, dtype=bool),
-        ends_seen=np.ones((n, 2), dtype=bool),
+        ends_visible=np.ones((n, 2), dtype=bool),
         center_m=apply(pose, center),
         size_m=boxes.size_hwl_m[:, ::-1],
         yaw_rad=np.arctan2(heading[:, 1], heading[:, 0]),

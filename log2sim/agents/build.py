@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.confirmation import SAME_MOMENT_S, is_credible
-from log2sim.agents.lidar_tracking import Sighting, follow
-from log2sim.agents.size import Shape, heading_of_standing, is_standing, shape_moving, shape_standing
+from log2sim.agents.lidar_tracking import LidarMatch, track_with_lidar
+from log2sim.agents.size import TrackGeometry, is_static, moving_geometry, parked_heading, static_geometry
 from log2sim.agents.smooth.smoother import SmoothedTrack, signed_speed, smooth_track
 from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Agent, Obstacles, Track, Waypoints
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
@@ -25,7 +25,7 @@ CENTER_SIGMA_M = {"vehicle": 0.12, "two_wheeler": 0.1, "pedestrian": 0.08, "othe
 # Rear axle to box center, as a share of the length: BMW 320i of CommonRoad's vehicle models, b - overhang, rounded.
 REAR_AXLE_SHARE = {"vehicle": 0.28, "two_wheeler": 0.3}
 STANDING_SPEED_MPS = 0.15
-RIDER_MPS, RIDER_S = 3.0, 0.6
+MIN_RIDER_SPEED_MPS, RIDER_SPEED_BASELINE_S = 3.0, 0.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Timeline:
 
 
 @dataclass(frozen=True, eq=False)
-class Built:
+class AgentCandidate:
     """An agent, how much evidence it has, and whether that is enough to believe in it."""
 
     agent: Agent
@@ -48,7 +48,7 @@ class Built:
     credible: bool
 
 
-def build_agents(
+def estimate_agents(
     tracks: Sequence[Track],
     obstacles: Sequence[Obstacles | None],
     timeline: Timeline,
@@ -56,24 +56,24 @@ def build_agents(
     *,
     smooth: bool,
     costs: Costs | None = None,
-) -> list[Built]:
+) -> list[AgentCandidate]:
     """Agents of all tracks, moving ones first, since the way they go tells which way parked cars point.
 
     `flow` (K, 3) is x, y and heading of the ego's path; `costs` gets the pieces "moving" and "standing".
     """
     costs = costs or Costs()
-    standing = [is_standing(t) for t in tracks]
+    standing = [is_static(t) for t in tracks]
     moving = [as_rider_if_fast(t) for t, s in zip(tracks, standing) if not s]
     built = []
     for track in moving:
         with costs.piece("moving"):
-            built.append(_moving(track, obstacles, timeline, smooth=smooth))
+            built.append(_moving_agent(track, obstacles, timeline, smooth=smooth))
     built = [b for b in built if b.credible]
-    flows = [flow] + [_flow_of(b.agent) for b in built if GROUP_OF[b.agent.category] == "vehicle"]
+    flows = [flow] + [_flow_of_agent(b.agent) for b in built if GROUP_OF[b.agent.category] == "vehicle"]
     everything = np.concatenate(flows)
     for track in (t for t, s in zip(tracks, standing) if s):
         with costs.piece("standing"):
-            built.append(_standing(track, obstacles, timeline, everything))
+            built.append(_static_agent(track, obstacles, timeline, everything))
     return [b for b in built if b.credible]
 
 
@@ -81,31 +81,33 @@ def as_rider_if_fast(track: Track) -> Track:
     """A person who goes faster than people run is a cyclist whose bicycle the detector missed."""
     m = track.measurements
     t = (m.t_ns - m.t_ns[0]) / NS_PER_S
-    if track.category != "pedestrian" or t[-1] < RIDER_S:
+    if track.category != "pedestrian" or t[-1] < RIDER_SPEED_BASELINE_S:
         return track
-    later = np.searchsorted(t, t + RIDER_S)
+    later = np.searchsorted(t, t + RIDER_SPEED_BASELINE_S)
     start = np.flatnonzero(later < len(t))
     later = later[start]
     pace = np.hypot(*(m.center_m[later, :2] - m.center_m[start, :2]).T) / (t[later] - t[start])
     speed = float(np.quantile(pace, 0.75)) if len(pace) else 0.0
-    return replace(track, category="cyclist") if speed > RIDER_MPS else track
+    return replace(track, category="cyclist") if speed > MIN_RIDER_SPEED_MPS else track
 
 
-def _flow_of(agent: Agent) -> Array:
+def _flow_of_agent(agent: Agent) -> Array:
     w = agent.waypoints
     moving = np.abs(w.speed_mps) > 1.5
     return np.stack([w.x_m[moving], w.y_m[moving], w.yaw_rad[moving]], axis=1)
 
 
-def _standing(track: Track, obstacles: Sequence[Obstacles | None], timeline: Timeline, flow: Array) -> Built:
-    shape = shape_standing(track)
+def _static_agent(
+    track: Track, obstacles: Sequence[Obstacles | None], timeline: Timeline, flow: Array
+) -> AgentCandidate:
+    shape = static_geometry(track)
     group = GROUP_OF[track.category]
     xy = shape.xy_m[0]
     yaw = float(np.nan_to_num(shape.yaw_rad)) if shape.yaw_rad is not None else 0.0
-    yaw = heading_of_standing(yaw, xy, flow) if group in ("vehicle", "two_wheeler") else float(wrap_angle(yaw))
+    yaw = parked_heading(yaw, xy, flow) if group in ("vehicle", "two_wheeler") else float(wrap_angle(yaw))
     z = float(np.median(shape.z_m))
     others = [k for k in range(len(timeline.t_ns)) if k not in set(track.tick.tolist())]
-    sightings = _look_for(
+    sightings = _match_lidar(
         obstacles, others, timeline, xy, np.zeros(2), yaw, shape, z, int(timeline.t_ns[track.tick[0]])
     )
     seen = np.unique(np.r_[track.tick, np.array([s.tick for s in sightings], dtype=np.int64)])
@@ -127,20 +129,20 @@ def _standing(track: Track, obstacles: Sequence[Obstacles | None], timeline: Tim
     return _agent(track, shape, waypoints, quality, static=True)
 
 
-def _look_for(
+def _match_lidar(
     obstacles: Sequence[Obstacles | None],
     ticks: Sequence[int],
     timeline: Timeline,
     xy: Array,
     velocity: Array,
     yaw: float,
-    shape: Shape,
+    shape: TrackGeometry,
     z: float,
     start_ns: int,
-) -> list[Sighting]:
+) -> list[LidarMatch]:
     if not ticks:
         return []
-    return follow(
+    return track_with_lidar(
         obstacles,
         ticks,
         timeline.t_ns,
@@ -153,7 +155,9 @@ def _look_for(
     )
 
 
-def _moving(track: Track, obstacles: Sequence[Obstacles | None], timeline: Timeline, *, smooth: bool) -> Built:
+def _moving_agent(
+    track: Track, obstacles: Sequence[Obstacles | None], timeline: Timeline, *, smooth: bool
+) -> AgentCandidate:
     m, group = track.measurements, GROUP_OF[track.category]
     sideways = group in ("pedestrian",)
     t = timeline.seconds(m.t_ns)
@@ -164,11 +168,11 @@ def _moving(track: Track, obstacles: Sequence[Obstacles | None], timeline: Timel
     options: dict[str, Any] = {"jerk_density": JERK_DENSITY.get(group), "sideways": sideways, "yaw_hint_rad": hint}
     xy, covariance = track.measurements.center_m[:, :2], track.measurements.covariance + extra
     rough = smooth_track(t, xy, covariance=covariance, at_s=t, **options)
-    shape = shape_moving(track, _headings(rough, group))
+    shape = moving_geometry(track, _headings(rough, group))
     for _ in range(2):
         rough = smooth_track(t, shape.xy_m, covariance=shape.covariance + extra, at_s=t, **options)
-        shape = shape_moving(track, _headings(rough, group))
-    sightings = _follow_moving(track, rough, shape, obstacles, timeline)
+        shape = moving_geometry(track, _headings(rough, group))
+    sightings = _match_moving(track, rough, shape, obstacles, timeline)
     t_all = np.concatenate([t, timeline.seconds(np.array([s.t_ns for s in sightings], dtype=np.int64))])
     xy_all = np.concatenate([shape.xy_m, np.array([s.xy_m for s in sightings]).reshape(-1, 2)])
     covariance_all = (
@@ -215,18 +219,18 @@ def _first_heading(track: Track, t: Array) -> float | None:
     return course
 
 
-def _follow_moving(
-    track: Track, path: SmoothedTrack, shape: Shape, obstacles: Sequence[Obstacles | None], timeline: Timeline
-) -> list[Sighting]:
+def _match_moving(
+    track: Track, path: SmoothedTrack, shape: TrackGeometry, obstacles: Sequence[Obstacles | None], timeline: Timeline
+) -> list[LidarMatch]:
     """Sightings before, after and in the gaps of a moving track."""
     z = float(np.median(shape.z_m))
     headings = _headings(path, GROUP_OF[track.category])
-    found: list[Sighting] = []
+    found: list[LidarMatch] = []
     ticks, total = track.tick, len(timeline.t_ns)
     spans = [(0, list(range(int(ticks[0]) - 1, -1, -1))), (len(ticks) - 1, list(range(int(ticks[-1]) + 1, total)))]
     spans += [(k, list(range(a + 1, b))) for k, (a, b) in enumerate(pairwise(ticks.tolist())) if b > a + 1]
     for k, wanted in spans:
-        found += _look_for(
+        found += _match_lidar(
             obstacles, wanted, timeline, path.xy_m[k], path.velocity_mps[k], float(headings[k]), shape, z,
             int(track.measurements.t_ns[k]),
         )  # fmt: skip
@@ -234,7 +238,7 @@ def _follow_moving(
 
 
 def _waypoints(
-    path: SmoothedTrack, yaw: Array, shape: Shape, t: Array, at: Array, observed: NDArray[np.bool_]
+    path: SmoothedTrack, yaw: Array, shape: TrackGeometry, t: Array, at: Array, observed: NDArray[np.bool_]
 ) -> Waypoints:
     speed = signed_speed(path.velocity_mps, yaw)
     return Waypoints(
@@ -265,7 +269,9 @@ def _quality(track: Track, sightings: int) -> dict[str, Any]:
     }
 
 
-def _agent(track: Track, shape: Shape, waypoints: Waypoints, quality: dict[str, Any], *, static: bool) -> Built:
+def _agent(
+    track: Track, shape: TrackGeometry, waypoints: Waypoints, quality: dict[str, Any], *, static: bool
+) -> AgentCandidate:
     m = track.measurements
     size = tuple(float(v) for v in shape.size_m)
     group = GROUP_OF[track.category]
@@ -281,7 +287,7 @@ def _agent(track: Track, shape: Shape, waypoints: Waypoints, quality: dict[str, 
         confidence=float(np.clip(strongest.mean(), 0.0, 1.0)),
         quality=quality,
     )
-    return Built(
+    return AgentCandidate(
         agent,
         float(m.score.sum()),
         is_credible(track, strongest, typical=shape.typical),

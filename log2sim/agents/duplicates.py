@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from log2sim.agents.build import Built
+from log2sim.agents.build import AgentCandidate
 from log2sim.datatypes import GROUP_OF, Agent, Waypoints
 from log2sim.geometry import Array, bev_iou, box_corners_bev, polygon_area
 
@@ -19,7 +19,7 @@ SAMPLES = 12
 TOUCHING = 0.05
 
 
-def without_doubles(built: Sequence[Built], ego: Agent | None = None) -> list[Agent]:
+def without_doubles(built: Sequence[AgentCandidate], ego: Agent | None = None) -> list[Agent]:
     """Agents that are in nobody else's place, the ego's included, those with more evidence first; named by category."""
     taken = [ego] if ego is not None else []
     kept: list[Agent] = []

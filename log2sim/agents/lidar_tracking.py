@@ -12,19 +12,19 @@ from log2sim.datatypes import Obstacles
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception import box_fitting
 
-LEAST_POINTS = 8
+MIN_POINTS = 8
 MARGIN_M = 0.5
 SHELL_M = 0.5
 # More points right around the box than this share of those in it: the box sits on something larger.
-CROWDED = 0.6
-MOST_SHIFT_M = 0.8
-MOST_MISSES = 2
+MAX_SHELL_RATIO = 0.6
+MAX_SHIFT_M = 0.8
+MAX_MISSES = 2
 # A box of which less than the rest of this share shows could be anywhere along it.
-MOST_HIDDEN = 0.7
+MAX_HIDDEN_SHARE = 0.7
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class LidarMatch:
     """Where the LiDAR found a tracked box at a tick: `xy_m` (2,), its covariance (2, 2) and the time it was seen."""
 
     tick: int
@@ -34,7 +34,7 @@ class Sighting:
     points: int
 
 
-def follow(
+def track_with_lidar(
     obstacles: Sequence[Obstacles | None],
     ticks: Sequence[int],
     t_ns: NDArray[np.int64],
@@ -45,21 +45,21 @@ def follow(
     yaw_rad: float,
     size_m: Array,
     bottom_m: float,
-) -> list[Sighting]:
+) -> list[LidarMatch]:
     """Look for a box at the ticks given, one after the other, from a known state at `start_ns`.
 
     The box moves with constant velocity, corrected at every sighting; the search ends after two ticks without one.
     """
-    found: list[Sighting] = []
+    found: list[LidarMatch] = []
     position, velocity, last_ns, misses = np.array(xy_m, float), np.array(velocity_mps, float), start_ns, 0
     standing = not velocity.any()
     for tick in ticks:
         cloud = obstacles[tick]
         predicted = position + velocity * ((int(t_ns[tick]) - last_ns) / NS_PER_S)
-        sighting = None if cloud is None else look(cloud, tick, predicted, yaw_rad, size_m, bottom_m)
+        sighting = None if cloud is None else match_box(cloud, tick, predicted, yaw_rad, size_m, bottom_m)
         if sighting is None:
             misses += 1
-            if misses >= MOST_MISSES and not standing:
+            if misses >= MAX_MISSES and not standing:
                 break
             continue
         misses = 0
@@ -76,7 +76,9 @@ def follow(
     return found
 
 
-def look(cloud: Obstacles, tick: int, xy_m: Array, yaw_rad: float, size_m: Array, bottom_m: float) -> Sighting | None:
+def match_box(
+    cloud: Obstacles, tick: int, xy_m: Array, yaw_rad: float, size_m: Array, bottom_m: float
+) -> LidarMatch | None:
     """Find a box of known size and yaw near a predicted center (2,); None where the points do not show it."""
     reach = float(np.hypot(*size_m[:2])) / 2 + MARGIN_M + SHELL_M
     x, y = (xy_m - cloud.origin[:2]).astype(np.float32)
@@ -84,13 +86,13 @@ def look(cloud: Obstacles, tick: int, xy_m: Array, yaw_rad: float, size_m: Array
     near = near[np.abs(cloud.xyz[near, 1] - y) <= reach]
     z = cloud.xyz[near, 2] + np.float32(cloud.origin[2] - bottom_m)
     near = near[(z > 0.15) & (z < size_m[2] + 0.4)]
-    if len(near) < LEAST_POINTS:
+    if len(near) < MIN_POINTS:
         return None
     turned = box_fitting.rotate((cloud.xyz[near, :2] - np.array([x, y])).astype(np.float64), -yaw_rad)
     half = size_m[:2] / 2
     excess = (np.abs(turned) - half).max(axis=1)
     inside = excess <= MARGIN_M
-    if inside.sum() < LEAST_POINTS or (excess > MARGIN_M).sum() > CROWDED * inside.sum():
+    if inside.sum() < MIN_POINTS or (excess > MARGIN_M).sum() > MAX_SHELL_RATIO * inside.sum():
         return None
     low, high = np.quantile(turned[inside], 0.01, axis=0), np.quantile(turned[inside], 0.99, axis=0)
     if np.any(high - low > size_m[:2] + 0.6):
@@ -98,10 +100,10 @@ def look(cloud: Obstacles, tick: int, xy_m: Array, yaw_rad: float, size_m: Array
     sensor = box_fitting.rotate(cloud.sensor[:2].astype(np.float64) + cloud.origin[:2] - xy_m, -yaw_rad)
     center, sigma = box_fitting.complete_box(low, high, size_m[:2], sensor)
     slack = size_m[:2] - (high - low)
-    if np.hypot(*center) > MOST_SHIFT_M or np.any(slack > MOST_HIDDEN * np.maximum(size_m[:2], 1.0)):
+    if np.hypot(*center) > MAX_SHIFT_M or np.any(slack > MAX_HIDDEN_SHARE * np.maximum(size_m[:2], 1.0)):
         return None
     seen_s = float(cloud.t_s[near[inside]].mean())
-    return Sighting(
+    return LidarMatch(
         tick,
         cloud.stamp_ns + round(seen_s * NS_PER_S),
         box_fitting.rotate(center, yaw_rad) + xy_m,

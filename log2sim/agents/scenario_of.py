@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.agents.simplify import thin
+from log2sim.agents.simplify import simplify_waypoints
 from log2sim.config import Config
 from log2sim.datatypes import Agent, Log, Scenario
 from log2sim.geometry import NS_PER_S
@@ -23,14 +23,14 @@ def thinned(agents: Sequence[Agent]) -> list[Agent]:
     """Agents with few waypoints where they move straight at constant speed; `quality` says how many were left out."""
     out = []
     for agent in agents:
-        few = thin(agent.waypoints)
+        few = simplify_waypoints(agent.waypoints)
         left_out = len(agent.waypoints) - len(few)
         quality = {**agent.quality, "waypoints_left_out": left_out} if left_out else agent.quality
         out.append(replace(agent, waypoints=few, quality=quality) if left_out else agent)
     return out
 
 
-def make_scenario(
+def scenario_of(
     log: Log,
     schedule: Schedule,
     config: Config,

@@ -11,22 +11,22 @@ from log2sim.geometry import Array
 # Largest departure of a waypoint left out from the line between those kept: x, y, z, yaw, speed, sigma of the position.
 TOLERANCE_M, TOLERANCE_RAD, TOLERANCE_MPS = 0.01, 0.002, 0.02
 TOLERANCES = np.array([TOLERANCE_M] * 3 + [TOLERANCE_RAD, TOLERANCE_MPS, TOLERANCE_M])
-LONGEST_S = 1.0
+MAX_INTERVAL_S = 1.0
 
 
-def thin(waypoints: Waypoints) -> Waypoints:
-    """The waypoints without those that linear interpolation gives back, at most `LONGEST_S` apart.
+def simplify_waypoints(waypoints: Waypoints) -> Waypoints:
+    """The waypoints without those that linear interpolation gives back, at most `MAX_INTERVAL_S` apart.
 
     Where something begins or ends to be observed both neighbors stay.
     """
-    kept = needed(waypoints)
+    kept = waypoints_to_keep(waypoints)
     if len(kept) == len(waypoints):
         return waypoints
     names = (*Waypoints.FLOATS, "observed")
     return Waypoints(**{k: getattr(waypoints, k)[kept] for k in names})
 
 
-def needed(w: Waypoints) -> NDArray[np.intp]:
+def waypoints_to_keep(w: Waypoints) -> NDArray[np.intp]:
     """Indices (K,) of the waypoints to keep, first and last among them.
 
     Notes
@@ -50,7 +50,7 @@ def needed(w: Waypoints) -> NDArray[np.intp]:
 
 def _between(t: Array, columns: Array, observed: NDArray[np.bool_], start: int, end: int) -> bool:
     """Whether the rows between two are on the line from one to the other, and as observed as these."""
-    if t[end] - t[start] > LONGEST_S or observed[start : end + 1].min() != observed[start : end + 1].max():
+    if t[end] - t[start] > MAX_INTERVAL_S or observed[start : end + 1].min() != observed[start : end + 1].max():
         return False
     share = (t[start + 1 : end] - t[start]) / (t[end] - t[start])
     line = columns[start] + share[:, None] * (columns[end] - columns[start])

@@ -18,22 +18,22 @@ from log2sim.perception import box_fitting
 # Share of the whole sides that are longer: stray points lengthen some, sparse points shorten most.
 SIZE_QUANTILE = 0.85
 # Farther to the left of a path than this is the oncoming side of the road.
-ONCOMING_M = 1.8
+ONCOMING_OFFSET_M = 1.8
 VOXEL_M = 0.15
-PERSISTENT_SHARE = 0.15
-POINTS_A_TICK = 150
+MIN_PERSISTENT_SHARE = 0.15
+MAX_POINTS_PER_TICK = 150
 # Sizes that exist, as factors of the typical one; what looks smaller than the likely ones (length, width, height) was
 # hardly seen whole, or is something else.
-SHORTEST, LONGEST = 0.6, 1.6
-SHORTEST_WHOLE = 0.75
-LEAST_LIKELY = np.array([0.65, 0.72, 0.75])
+MIN_SIZE_FACTOR, MAX_SIZE_FACTOR = 0.6, 1.6
+MIN_WHOLE_SIDE_FACTOR = 0.75
+MIN_LIKELY_FACTORS = np.array([0.65, 0.72, 0.75])
 
-STANDING_MPS = {"vehicle": 0.35, "two_wheeler": 0.3, "pedestrian": 0.2, "other": 0.35}
-STANDING_DRIFT_M = {"vehicle": 1.2, "two_wheeler": 0.8, "pedestrian": 0.5, "other": 1.2}
+MAX_STATIC_SPEED_MPS = {"vehicle": 0.35, "two_wheeler": 0.3, "pedestrian": 0.2, "other": 0.35}
+MAX_STATIC_DRIFT_M = {"vehicle": 1.2, "two_wheeler": 0.8, "pedestrian": 0.5, "other": 1.2}
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
+class TrackGeometry:
     """What a track looks like: `size_m` (3,), and at each of its measurements `xy_m` (n, 2), `covariance` (n, 2, 2),
     `z_m` (n,) of the center, and for a standing one `yaw_rad`, up to half turns. `typical` False: what was seen of it is
     smaller or larger than its category can be, so that it hardly is one.
@@ -47,7 +47,7 @@ class Shape:
     typical: bool = True
 
 
-def is_standing(track: Track) -> bool:
+def is_static(track: Track) -> bool:
     """Whether a track never moves: its robust mean velocity and its drift stay within what changing views explain."""
     m, group = track.measurements, GROUP_OF[track.category]
     if len(m) < 3:
@@ -61,11 +61,11 @@ def is_standing(track: Track) -> bool:
     guess = 2 * np.sqrt(np.linalg.eigvalsh(m.covariance)[:, -1])
     spread = np.quantile(np.hypot(*(xy - np.median(xy, axis=0)).T) - guess, 0.9)
     moved = float(np.hypot(*drift))
-    slow = moved < STANDING_MPS[group] * max(float(span), 1e-9) or moved < 0.35
-    return bool(slow and moved < STANDING_DRIFT_M[group] and spread < 1.5 * STANDING_DRIFT_M[group])
+    slow = moved < MAX_STATIC_SPEED_MPS[group] * max(float(span), 1e-9) or moved < 0.35
+    return bool(slow and moved < MAX_STATIC_DRIFT_M[group] and spread < 1.5 * MAX_STATIC_DRIFT_M[group])
 
 
-def shape_standing(track: Track) -> Shape:
+def static_geometry(track: Track) -> TrackGeometry:
     """One pose and size of a track that stands still, from all its points together."""
     m = track.measurements
     origin = np.append(np.median(m.center_m[:, :2], axis=0), 0.0)
@@ -73,42 +73,42 @@ def shape_standing(track: Track) -> Shape:
     sensor = m.sensor_m[:, :2] - origin[:2]
     typical = np.array(TYPICAL_SIZE_M[track.category])
     if len(cloud) < 5:
-        return _from_measured_centers(track, typical)
+        return _geometry_without_points(track, typical)
     yaw, _ = box_fitting.fit_yaw(cloud[:, :2])
     low, high = box_fitting.extents(cloud[:, :2], yaw)
-    if box_fitting.is_across(high - low, box_fitting.rotate(sensor, -yaw), typical):
+    if box_fitting.axes_swapped(high - low, box_fitting.rotate(sensor, -yaw), typical):
         yaw += np.pi / 2
         low, high = box_fitting.extents(cloud[:, :2], yaw)
     local = box_fitting.rotate(sensor, -yaw)
     with_points = [k for k, c in enumerate(m.cluster) if len(c)]
-    shown = np.array([box_fitting.ends_shown(low, high, local[k], m.ends_seen[k]) for k in with_points]).max(axis=0)
-    size, fits = _completed_size(low[None], high[None], shown[None], typical[:2])
+    shown = np.array([box_fitting.real_ends(low, high, local[k], m.ends_visible[k]) for k in with_points]).max(axis=0)
+    size, fits = _estimate_size(low[None], high[None], shown[None], typical[:2])
     centers, sigmas = box_fitting.place_box(low, high, size, shown)
     center = box_fitting.rotate(centers, yaw) + origin[:2]
     height, z = _height(track)
     covariance = box_fitting.oriented_covariance(sigmas, yaw)
     n = len(m)
     covariance = np.tile(covariance, (n, 1, 1))
-    return Shape(
+    return TrackGeometry(
         np.append(size, height), np.tile(center, (n, 1)), covariance, np.full(n, np.median(z)), float(yaw), fits
     )
 
 
-def shape_moving(track: Track, yaw_rad: Array) -> Shape:
+def moving_geometry(track: Track, yaw_rad: Array) -> TrackGeometry:
     """Size of a moving track and its center at every measurement, given its heading (n,) there."""
     m = track.measurements
     typical = np.array(TYPICAL_SIZE_M[track.category])
     with_points = np.flatnonzero([len(c) >= 4 for c in m.cluster])
     if len(with_points) == 0:
-        return _from_measured_centers(track, typical)
+        return _geometry_without_points(track, typical)
     lows, highs, sensors = np.zeros((len(m), 2)), np.zeros((len(m), 2)), np.zeros((len(m), 2))
     shown = np.zeros((len(m), 2, 2), dtype=np.int64)
     for k in with_points:
         yaw, origin = float(yaw_rad[k]), m.center_m[k, :2]
         lows[k], highs[k] = box_fitting.extents(m.cluster[k][:, :2] - origin, yaw)
         sensors[k] = box_fitting.rotate(m.sensor_m[k, :2] - origin, -yaw)
-        shown[k] = box_fitting.ends_shown(lows[k], highs[k], sensors[k], m.ends_seen[k])
-    size, fits = _completed_size(lows[with_points], highs[with_points], shown[with_points], typical[:2])
+        shown[k] = box_fitting.real_ends(lows[k], highs[k], sensors[k], m.ends_visible[k])
+    size, fits = _estimate_size(lows[with_points], highs[with_points], shown[with_points], typical[:2])
     xy, covariance = m.center_m[:, :2].copy(), m.covariance.copy()
     for k in with_points:
         yaw = float(yaw_rad[k])
@@ -116,12 +116,12 @@ def shape_moving(track: Track, yaw_rad: Array) -> Shape:
         xy[k] = box_fitting.rotate(center, yaw) + m.center_m[k, :2]
         covariance[k] = box_fitting.oriented_covariance(sigma, yaw)
     height, z = _height(track)
-    return Shape(np.append(size, height), xy, covariance, z, None, fits and _tall_enough(height, typical))
+    return TrackGeometry(np.append(size, height), xy, covariance, z, None, fits and _is_tall_enough(height, typical))
 
 
 def _persistent_points(clusters: list[NDArray[np.float64]]) -> Array:
     """Points (n, 3) of cells that several ticks saw, so that what a neighbor lent to one tick falls out."""
-    clusters = [box_fitting.subsample(c, POINTS_A_TICK) for c in clusters if len(c)]
+    clusters = [box_fitting.subsample(c, MAX_POINTS_PER_TICK) for c in clusters if len(c)]
     if not clusters:
         return np.zeros((0, 3))
     points = np.concatenate(clusters)
@@ -130,12 +130,12 @@ def _persistent_points(clusters: list[NDArray[np.float64]]) -> Array:
     _, key = np.unique(cell, axis=0, return_inverse=True)
     seen = np.unique(np.stack([key.ravel(), tick], axis=1), axis=0)
     count = np.bincount(seen[:, 0])
-    return points[count[key.ravel()] >= max(PERSISTENT_SHARE * len(clusters), min(2, len(clusters)))]
+    return points[count[key.ravel()] >= max(MIN_PERSISTENT_SHARE * len(clusters), min(2, len(clusters)))]
 
 
-def _completed_size(low: Array, high: Array, shown: NDArray[np.int64], typical: Array) -> tuple[Array, bool]:
+def _estimate_size(low: Array, high: Array, shown: NDArray[np.int64], typical: Array) -> tuple[Array, bool]:
     """Length and width (2,) from ends (n, 2), (n, 2) of which some are real (n, 2, 2), and whether such an object exists."""
-    low, high = box_fitting.to_corners(low, high, shown, typical[1])
+    low, high = box_fitting.corner_correction(low, high, shown, typical[1])
     seen = high - low
     whole: NDArray[np.bool_] = np.all(shown, axis=2)
     size, raw = np.empty(2), np.empty(2)
@@ -144,12 +144,12 @@ def _completed_size(low: Array, high: Array, shown: NDArray[np.int64], typical: 
         ends = every[whole[:, axis]]
         raw[axis] = np.quantile(ends if len(ends) else np.maximum(every, typical[axis]), SIZE_QUANTILE)
         # A side shorter than any such object's was not seen from end to end after all.
-        ends = ends[ends >= SHORTEST_WHOLE * typical[axis]]
+        ends = ends[ends >= MIN_WHOLE_SIDE_FACTOR * typical[axis]]
         size[axis] = (
             np.quantile(ends, SIZE_QUANTILE) if len(ends) else max(typical[axis], np.quantile(every, SIZE_QUANTILE))
         )
-    likely = bool(((raw >= LEAST_LIKELY[:2] * typical) & (raw <= LONGEST * typical)).all())
-    return np.clip(size, SHORTEST * typical, LONGEST * typical), likely
+    likely = bool(((raw >= MIN_LIKELY_FACTORS[:2] * typical) & (raw <= MAX_SIZE_FACTOR * typical)).all())
+    return np.clip(size, MIN_SIZE_FACTOR * typical, MAX_SIZE_FACTOR * typical), likely
 
 
 def _height(track: Track) -> tuple[float, Array]:
@@ -164,22 +164,22 @@ def _height(track: Track) -> tuple[float, Array]:
     by_lidar = float(np.nanquantile(tops, SIZE_QUANTILE)) if np.isfinite(tops).any() else typical
     by_image = float(np.nanmedian(images)) if np.isfinite(images).any() else typical
     height = max(by_lidar, min(by_image, 1.15 * by_lidar))
-    height = float(np.clip(height, SHORTEST * typical, LONGEST * typical))
+    height = float(np.clip(height, MIN_SIZE_FACTOR * typical, MAX_SIZE_FACTOR * typical))
     return height, bottom + height / 2
 
 
-def _tall_enough(height: float, typical: Array) -> bool:
-    return bool(height >= LEAST_LIKELY[2] * typical[2])
+def _is_tall_enough(height: float, typical: Array) -> bool:
+    return bool(height >= MIN_LIKELY_FACTORS[2] * typical[2])
 
 
-def _from_measured_centers(track: Track, typical: Array) -> Shape:
+def _geometry_without_points(track: Track, typical: Array) -> TrackGeometry:
     m = track.measurements
     height, z = _height(track)
     yaw = float(np.nanmedian(m.yaw_rad)) if np.isfinite(m.yaw_rad).any() else None
-    return Shape(np.append(typical[:2], height), m.center_m[:, :2], m.covariance, z, yaw)
+    return TrackGeometry(np.append(typical[:2], height), m.center_m[:, :2], m.covariance, z, yaw)
 
 
-def heading_of_standing(yaw_rad: float, xy: Array, flow: Array, *, reach_m: float = 40.0) -> float:
+def parked_heading(yaw_rad: float, xy: Array, flow: Array, *, reach_m: float = 40.0) -> float:
     """Choose between the two directions of a standing vehicle: it points the way the traffic of its side goes.
 
     `flow` (K, 3) holds x, y and heading of vehicles that moved; without any near enough the yaw stays as it is.
@@ -197,7 +197,7 @@ def heading_of_standing(yaw_rad: float, xy: Array, flow: Array, *, reach_m: floa
     near = (np.abs(np.cos(flow[:, 2] - yaw_rad)) > 0.7) & (np.abs(along) < reach_m) & (np.abs(left) < reach_m / 3)
     if not near.any():
         return float(wrap_angle(yaw_rad))
-    side = np.where(left[near] > ONCOMING_M, -1.0, 1.0)
+    side = np.where(left[near] > ONCOMING_OFFSET_M, -1.0, 1.0)
     weight = 1.0 / (1.0 + np.abs(left[near]) / 2 + np.abs(along[near]) / 10) ** 2
     vote = np.sum(weight * side * np.sign(np.cos(flow[near, 2] - yaw_rad)))
     return float(wrap_angle(yaw_rad if vote >= 0 else yaw_rad + np.pi))

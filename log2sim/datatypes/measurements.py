@@ -42,7 +42,7 @@ class Measurements:
 
     `t_ns` (M,) int64 when the object was seen (the mean time of its points, else the frame's stamp); `category` (M,) str;
     `score` (M,) of the detector; `camera` (M,) str; `box_px` (M, 4); `truncated` (M,) bool: cut by the image border;
-    `ends_seen` (M, 2) bool: whether the cluster's right and left end, as the sensor sees it, are ends of the object;
+    `ends_visible` (M, 2) bool: whether the cluster's right and left end, as the sensor sees it, are ends of the object;
     `center_m` (M, 3) box center; `size_m` (M, 3) length, width, height; `yaw_rad` (M,) up to quarter turns where only
     LiDAR speaks; `covariance` (M, 2, 2) of the center's x, y in m2; `points` (M,) LiDAR points on the object; `source`
     (M,) "lidar", "topdown" or "" where there is no position yet; `cluster` M arrays (n, 3) of points;
@@ -55,7 +55,7 @@ class Measurements:
     camera: NDArray[np.str_]
     box_px: Array
     truncated: NDArray[np.bool_]
-    ends_seen: NDArray[np.bool_]
+    ends_visible: NDArray[np.bool_]
     center_m: Array
     size_m: Array
     yaw_rad: Array

@@ -12,21 +12,21 @@ from log2sim.datatypes import TYPICAL_SIZE_M
 from log2sim.geometry import Array, wrap_angle
 
 SEARCH_STEP_RAD = np.deg2rad(2.0)
-NEAREST_EDGE_M = 0.03
-MOST_POINTS = 256
+MIN_EDGE_DISTANCE_M = 0.03
+MAX_FIT_POINTS = 256
 SENSOR_SIGMA_M = 0.08
-SIZE_SPREAD = 0.05
-# What an end of a box is, see `ends_shown`.
-SEEN, FACING = 1, 2
+SIZE_SIGMA_SHARE = 0.05
+# What an end of a box is, see `real_ends`.
+SIDE_END, FACING_END = 1, 2
 # Corners are rounded: the outermost point seen from the side lies inside by about this share of the width.
-ROUNDED = 0.08
+CORNER_ROUNDING_SHARE = 0.08
 # A side seen at a flatter angle than this (sine) shows its near end only.
-LEAST_ASPECT = 0.5
+MIN_VIEW_SINE = 0.5
 # A side longer than this share of the typical width is no front or rear.
-LONGER_THAN_WIDE = 1.2
-EITHER_WAY = 0.25
+MAX_WIDTH_FACTOR = 1.2
+AXIS_AMBIGUITY_SHARE = 0.25
 # A size that was completed may be wrong by all of what was added: a uniform spread. Without any real end it is worse.
-SLACK_SIGMA = 12.0**-0.5
+UNIFORM_SIGMA = 12.0**-0.5
 
 
 def fit_yaw(xy_m: Array) -> tuple[float, float]:
@@ -46,13 +46,13 @@ def fit_yaw(xy_m: Array) -> tuple[float, float]:
     Scanners" (IV 2017), section III-B: each point counts by the inverse of its distance to the nearer side. All
     directions are scored at once; cost O(N x 45), with N bounded by an even subsample.
     """
-    points = subsample(xy_m, MOST_POINTS)
+    points = subsample(xy_m, MAX_FIT_POINTS)
     angles = np.arange(0.0, np.pi / 2, SEARCH_STEP_RAD)
     c, s = np.cos(angles), np.sin(angles)
     directions = np.concatenate([np.stack([c, s], axis=1), np.stack([-s, c], axis=1)])  # (2K, 2): along, then across
     distance = _edge_distance(directions @ points.T)
     closeness = np.minimum(distance[: len(angles)], distance[len(angles) :])
-    score = (1.0 / np.maximum(closeness, NEAREST_EDGE_M)).mean(axis=1)
+    score = (1.0 / np.maximum(closeness, MIN_EDGE_DISTANCE_M)).mean(axis=1)
     best = int(np.argmax(score))
     contrast = float(score[best] / np.median(score) - 1.0)
     return float(_parabolic_peak(score, best) * SEARCH_STEP_RAD % (np.pi / 2)), contrast
@@ -106,7 +106,7 @@ def quantile_of_sorted(ordered: Array, share: float) -> Array:
     return np.asarray(ordered[below] + (place - below) * (ordered[above] - ordered[below]), dtype=np.float64)
 
 
-def middle(values: NDArray[Any]) -> float:
+def upper_median(values: NDArray[Any]) -> float:
     """The upper median of values (N,), N > 0; ten times as quick as NumPy's median for a few hundred of them."""
     k = len(values) // 2
     return float(np.partition(values, k)[k])
@@ -118,8 +118,8 @@ def rotate(xy: Array, angle_rad: float) -> Array:
     return np.stack([xy[..., 0] * c - xy[..., 1] * s, xy[..., 0] * s + xy[..., 1] * c], axis=-1)
 
 
-def ends_shown(
-    low: Array, high: Array, sensor: Array, ends_seen: Sequence[bool] | NDArray[np.bool_]
+def real_ends(
+    low: Array, high: Array, sensor: Array, ends_visible: Sequence[bool] | NDArray[np.bool_]
 ) -> NDArray[np.int64]:
     """Which ends of what was seen of a box are ends of the box; everything in axes along and across it.
 
@@ -127,13 +127,13 @@ def ends_shown(
     ----------
     low, high : (2,) ends of the seen points along each axis
     sensor : (2,) where the points were seen from
-    ends_seen : (2,) bool
+    ends_visible : (2,) bool
         Whether the right and the left end of the points, as the sensor sees them, are ends of the object.
 
     Returns
     -------
     shown : (2, 2) int
-        For each axis, what its lower and its upper end are: `FACING` the sensor, `SEEN` from the side, or 0 where the box
+        For each axis, what its lower and its upper end are: `FACING_END` the sensor, `SIDE_END` from the side, or 0 where the box
         may go on.
 
     Notes
@@ -142,18 +142,18 @@ def ends_shown(
     ends that the sensor sees as right and left.
     """
     above, below = sensor > high, sensor < low
-    shown = np.where(np.stack([below, above], axis=1), FACING, 0)
+    shown = np.where(np.stack([below, above], axis=1), FACING_END, 0)
     toward = np.abs(sensor - (low + high) / 2)
     for axis in range(2):
         other = 1 - axis
-        if not (above[other] or below[other]) or toward[other] < LEAST_ASPECT * np.hypot(*toward):
+        if not (above[other] or below[other]) or toward[other] < MIN_VIEW_SINE * np.hypot(*toward):
             continue
         face = high[other] if above[other] else low[other]
         # Seen from below the length, or from beyond the upper end of it for the width, the lower end is on the left.
         low_is_left = (face > sensor[other]) if axis == 0 else (face < sensor[other])
-        right, left = ends_seen
+        right, left = ends_visible
         seen = np.array([left, right] if low_is_left else [right, left], dtype=bool)
-        shown[axis] = np.maximum(shown[axis], np.where(seen, SEEN, 0))
+        shown[axis] = np.maximum(shown[axis], np.where(seen, SIDE_END, 0))
     return shown
 
 
@@ -162,14 +162,14 @@ def complete_box(
     high: Array,
     size_m: Array,
     sensor: Array,
-    ends_seen: Sequence[bool] | NDArray[np.bool_] = (False, False),
+    ends_visible: Sequence[bool] | NDArray[np.bool_] = (False, False),
 ) -> tuple[Array, Array]:
     """Place a box of known size over what was seen of it; everything in axes along and across the box.
 
     Parameters
     ----------
-    low, high, sensor, ends_seen
-        See `ends_shown`.
+    low, high, sensor, ends_visible
+        See `real_ends`.
     size_m : (2,) length and width of the whole box
 
     Returns
@@ -183,51 +183,51 @@ def complete_box(
     The box reaches from its best end to where it was not seen; between two equally good ones, or without any, it is
     centered on the points.
     """
-    return place_box(low, high, size_m, ends_shown(low, high, sensor, ends_seen))
+    return place_box(low, high, size_m, real_ends(low, high, sensor, ends_visible))
 
 
 def place_box(low: Array, high: Array, size_m: Array, shown: NDArray[np.int64]) -> tuple[Array, Array]:
-    """As `complete_box`, with the real ends (2, 2) that `ends_shown` tells."""
-    low, high = to_corners(low, high, shown, size_m[1])
+    """As `complete_box`, with the real ends (2, 2) that `real_ends` tells."""
+    low, high = corner_correction(low, high, shown, size_m[1])
     slack = size_m - (high - low)
     reach = np.sign(shown[:, 1] - shown[:, 0])
-    doubt = np.where(shown.any(axis=1), SLACK_SIGMA, 1.0) * np.maximum(slack, 0.0)
+    doubt = np.where(shown.any(axis=1), UNIFORM_SIGMA, 1.0) * np.maximum(slack, 0.0)
     # Objects of one category differ in size, so what is believed of an end that was not seen is never exact.
-    spread = np.where(shown.all(axis=1), 0.0, SIZE_SPREAD * size_m)
+    spread = np.where(shown.all(axis=1), 0.0, SIZE_SIGMA_SHARE * size_m)
     return (low + high) / 2 - reach * slack / 2, np.sqrt(SENSOR_SIGMA_M**2 + doubt**2 + spread**2)
 
 
-def to_corners(low: Array, high: Array, shown: NDArray[np.int64], width_m: float) -> tuple[Array, Array]:
+def corner_correction(low: Array, high: Array, shown: NDArray[np.int64], width_m: float) -> tuple[Array, Array]:
     """The ends (..., 2), moved out to the corners that are too round for a ray to touch where an end is seen from the side."""
-    outward = np.where(shown == SEEN, ROUNDED * width_m, 0.0)
+    outward = np.where(shown == SIDE_END, CORNER_ROUNDING_SHARE * width_m, 0.0)
     return low - outward[..., 0], high + outward[..., 1]
 
 
-def box_of_cluster(
+def fit_box(
     cluster: Array,
     sensor: Array,
     category: str,
     ground_z: float,
-    ends_seen: Sequence[bool] | NDArray[np.bool_] = (False, False),
+    ends_visible: Sequence[bool] | NDArray[np.bool_] = (False, False),
 ) -> tuple[Array, Array, float, Array]:
     """Center (3,), size (3,), yaw and covariance (2, 2) of the box around a cluster (n, 3) seen from `sensor` (3,).
 
-    The yaw is known up to half turns at best. The typical size completes what was not seen; `ends_seen` as in
-    `ends_shown`.
+    The yaw is known up to half turns at best. The typical size completes what was not seen; `ends_visible` as in
+    `real_ends`.
     """
     typical = np.array(TYPICAL_SIZE_M[category])
     yaw_rad, _ = fit_yaw(cluster[:, :2])
     low, high = extents(cluster[:, :2], yaw_rad)
-    if is_across(high - low, rotate(sensor[:2], -yaw_rad) - (low + high) / 2, typical):
+    if axes_swapped(high - low, rotate(sensor[:2], -yaw_rad) - (low + high) / 2, typical):
         yaw_rad += np.pi / 2
         low, high = np.array([low[1], -high[0]]), np.array([high[1], -low[0]])
     top = float(quantile_of_sorted(np.sort(cluster[:, 2]), 0.98)) - ground_z
     size = np.maximum([*(high - low), top], [*typical[:2], top])
-    center_local, sigma = complete_box(low, high, size[:2], rotate(sensor[:2], -yaw_rad), ends_seen)
+    center_local, sigma = complete_box(low, high, size[:2], rotate(sensor[:2], -yaw_rad), ends_visible)
     center = np.append(rotate(center_local, yaw_rad), ground_z + size[2] / 2)
-    if (high - low).max() <= LONGER_THAN_WIDE * typical[1] and not all(ends_seen):
+    if (high - low).max() <= MAX_WIDTH_FACTOR * typical[1] and not all(ends_visible):
         # So short a side may be a front or what shows of a flank; the two put the center in different places.
-        sigma = np.hypot(sigma, EITHER_WAY * (size[0] - size[1]))
+        sigma = np.hypot(sigma, AXIS_AMBIGUITY_SHARE * (size[0] - size[1]))
     return center, size, float(yaw_rad), oriented_covariance(sigma, yaw_rad)
 
 
@@ -237,14 +237,14 @@ def oriented_covariance(sigma_m: Array, yaw_rad: float) -> Array:
     return axes.T @ np.diag(sigma_m**2) @ axes
 
 
-def is_across(seen_m: Array, sensor: Array, typical: Array) -> bool:
+def axes_swapped(seen_m: Array, sensor: Array, typical: Array) -> bool:
     """Whether a fitted yaw runs across the object, from the extents (2,) along and across it.
 
     `sensor` is one place (2,) or several (K, 2) that it was seen from, along and across from its middle; `typical` the
     category's size.
     """
     # Too long for a width: that side is the length. Both short: what faces the sensor flat-on is front or rear.
-    if seen_m.max() > LONGER_THAN_WIDE * typical[1]:
+    if seen_m.max() > MAX_WIDTH_FACTOR * typical[1]:
         return bool(seen_m[1] > seen_m[0])
     ahead, aside = np.median(np.abs(np.atleast_2d(sensor)), axis=0)
     return bool(aside > ahead)

@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Detections, Log, Measurements, Obstacles, Sweep
 from log2sim.geometry import Array, inverse
 from log2sim.perception.detect.detectors import Detector
-from log2sim.perception.frames import Looker, Records
+from log2sim.perception.frames import FrameDetector, RecordReader
 from log2sim.perception.fusion import fuse
 from log2sim.perception.homography.correspondences import Correspondences, foot_points, pinhole
-from log2sim.perception.lidar.cloud import Cloud, assemble_cloud, at_rest
+from log2sim.perception.lidar.cloud import Cloud, assemble_cloud, is_at_rest
 from log2sim.perception.lidar.measure import measure_view, project_cloud
 from log2sim.perception.lidar.projection import View
 from log2sim.perception.sync import Schedule
 from log2sim.plan import Plan
 from log2sim.stage_clock import StageClock
 
-GROUND_POINTS_A_FRAME = 40
+MAX_GROUND_POINTS_PER_FRAME = 40
 OBSTACLE_REACH_M = 70.0
 OBSTACLE_VOXEL_M = 0.12
 RANK_BITS = 25  # more than the points of any sweep
@@ -32,10 +32,10 @@ BACKGROUND_THREADS = 2
 
 
 @dataclass(eq=False)
-class Observed:
+class Observations:
     """What the first pass found: per tick the measurements of all cameras and the obstacles that the LiDARs saw.
 
-    `sweeps` counts them by how they were compensated, `looked` and `not_looked` the frames; `last_sweep`, and `busiest`,
+    `sweeps` counts them by how they were compensated, `frames_detected` and `frames_skipped` the frames; `last_sweep`, and `busiest`,
     the most measurements of a tick before fusion, tell what stages cost that were left out.
     """
 
@@ -44,12 +44,12 @@ class Observed:
     feet: dict[str, list[Correspondences]] = field(default_factory=dict)
     ground: dict[str, list[Correspondences]] = field(default_factory=dict)
     detections: dict[str, int] = field(default_factory=dict)
-    records: Records | None = None
+    records: RecordReader | None = None
     sweeps: Counter[str] = field(default_factory=Counter)
     last_sweep: tuple[str, Sweep] | None = None
     busiest: Measurements | None = None
-    looked: int = 0
-    not_looked: Mapping[str, int] = field(default_factory=dict)
+    frames_detected: int = 0
+    frames_skipped: Mapping[str, int] = field(default_factory=dict)
 
 
 def observe(
@@ -62,31 +62,31 @@ def observe(
     max_range_m: float,
     clock: StageClock,
     progress: Callable[[int, int], None],
-) -> Observed:
+) -> Observations:
     """Run detection and measurement over all ticks."""
-    out = Observed(feet={c: [] for c in plan.cameras}, ground={c: [] for c in plan.cameras})
-    records = out.records = Records(log)
+    out = Observations(feet={c: [] for c in plan.cameras}, ground={c: [] for c in plan.cameras})
+    records = out.records = RecordReader(log)
     with ThreadPoolExecutor(BACKGROUND_THREADS) as pool:
-        clouds = _Clouds(log, schedule, plan, records, out, pool, max_range_m)
-        looker = Looker(log, schedule, detector, plan, records, pool, clock)
+        clouds = _CloudPrefetcher(log, schedule, plan, records, out, pool, max_range_m)
+        frames = FrameDetector(log, schedule, detector, plan, records, pool, clock)
         clouds.prefetch(0)
         for tick in range(len(schedule)):
-            found = looker.at(tick)
+            found = frames.detections_at(tick)
             with clock.stage("cloud"):
                 ready = [clouds.get(tick, row) for row in range(len(schedule.frames))]
             clouds.prefetch(tick + 1)
             _measure_tick(log, schedule, plan, tick, found, ready, out, mode=mode, max_range_m=max_range_m, clock=clock)
             progress(tick + 1, len(schedule))
     records.require_some()
-    out.looked, out.not_looked = looker.looked, looker.left_out
+    out.frames_detected, out.frames_skipped = frames.detected, frames.skipped
     return out
 
 
-class _Clouds:
+class _CloudPrefetcher:
     """Clouds of coming ticks, made in the background; sweeps are read once, and ticks share the clouds of the same sweeps."""
 
     def __init__(
-        self, log: Log, schedule: Schedule, plan: Plan, records: Records, out: Observed,
+        self, log: Log, schedule: Schedule, plan: Plan, records: RecordReader, out: Observations,
         pool: ThreadPoolExecutor, max_range_m: float,
     ) -> None:  # fmt: skip
         self._log, self._schedule, self._plan, self._records, self._out = log, schedule, plan, records, out
@@ -129,7 +129,7 @@ class _Clouds:
         sweeps = {name: sweep for name, future in reading.items() if (sweep := future.result()) is not None}
         if not sweeps:
             return None
-        origin, ground_z = place_of_ego(self._log, next(iter(sweeps.values())).stamp_ns)
+        origin, ground_z = cloud_origin(self._log, next(iter(sweeps.values())).stamp_ns)
         cloud = assemble_cloud(
             self._log, sweeps, origin=origin, ground_z=ground_z, max_range_m=self._max_range_m,
             compensate=self._plan.keeps("compensate"),
@@ -150,7 +150,7 @@ def _measure_tick(
     tick: int,
     found: dict[str, Detections],
     clouds: Sequence[Cloud | None],
-    out: Observed,
+    out: Observations,
     *,
     mode: str,
     max_range_m: float,
@@ -178,10 +178,10 @@ def compensation_of(log: Log, lidar: str, sweep: Sweep) -> str:
         return "in the map"
     if sweep.t_ns is None:
         return "no times"
-    return "at rest" if at_rest(log, lidar, sweep) else "moving"
+    return "at rest" if is_at_rest(log, lidar, sweep) else "moving"
 
 
-def place_of_ego(log: Log, t_ns: int) -> tuple[Array, float]:
+def cloud_origin(log: Log, t_ns: int) -> tuple[Array, float]:
     """Origin (3,) of a tick's clouds in the map frame, and the height of the ground there.
 
     Without ego it is the middle of the sensors, with the ground taken from `ground_z_ego_m` as a height in the map.
@@ -202,7 +202,7 @@ def _measure_camera(
     tick: int,
     detections: Detections,
     cloud: Cloud | None,
-    out: Observed,
+    out: Observations,
     mode: str,
 ) -> Measurements:
     t_ns = int(log.streams[camera].t_ns[schedule.frames[camera][tick]])
@@ -231,7 +231,7 @@ def _ground_points(view: View, cloud: Cloud, ego_T_map: Array, tick: int) -> Cor
     seen, uv, _ = project_cloud(view, cloud, cloud.ground_sample)
     if len(seen) == 0:
         return Correspondences.join([])
-    step = np.linspace(0, len(seen) - 1, min(GROUND_POINTS_A_FRAME, len(seen))).round().astype(np.intp)
+    step = np.linspace(0, len(seen) - 1, min(MAX_GROUND_POINTS_PER_FRAME, len(seen))).round().astype(np.intp)
     points = cloud.xyz[cloud.ground_sample[seen[step]]].astype(np.float64) + cloud.origin
     xy = (points @ ego_T_map[:3, :3].T + ego_T_map[:3, 3])[:, :2]
     return Correspondences(pinhole(view.camera, uv[step]), xy, np.full(len(step), tick, dtype=np.int64))
@@ -239,7 +239,7 @@ def _ground_points(view: View, cloud: Cloud, ego_T_map: Array, tick: int) -> Cor
 
 def _in_range(log: Log, schedule: Schedule, tick: int, rows: Measurements, max_range_m: float) -> NDArray[np.bool_]:
     """Rows within range of the ego; those without a place stay, for the homography may still give them one."""
-    origin, _ = place_of_ego(log, int(schedule.t_ns[tick]))
+    origin, _ = cloud_origin(log, int(schedule.t_ns[tick]))
     with np.errstate(invalid="ignore"):
         return ~(np.hypot(*(rows.center_m[:, :2] - origin[:2]).T) > max_range_m)
 
@@ -248,11 +248,11 @@ def _obstacles(cloud: Cloud) -> Obstacles:
     """The points above the ground, thinned to one a voxel so that a long log fits in memory."""
     index, xyz = cloud.obstacles, cloud.obstacle_columns.T
     near = np.flatnonzero(np.hypot(xyz[:, 0], xyz[:, 1]) < OBSTACLE_REACH_M)
-    index = index[near[_one_a_voxel(xyz[near], OBSTACLE_VOXEL_M)]]
+    index = index[near[_voxel_sample(xyz[near], OBSTACLE_VOXEL_M)]]
     return Obstacles(cloud.stamp_ns, cloud.origin, cloud.xyz[index], cloud.t_s[index], cloud.sensor)
 
 
-def _one_a_voxel(xyz: NDArray[np.float32], voxel_m: float) -> NDArray[np.intp]:
+def _voxel_sample(xyz: NDArray[np.float32], voxel_m: float) -> NDArray[np.intp]:
     """Indices of the first point of every voxel among points (N, 3), in the order of the points."""
     i, j, k = np.floor(xyz / voxel_m).astype(np.int64).T
     # Voxel and rank in one number: numbers are sorted several times as fast as their places are.

@@ -1,4 +1,4 @@
-"""What the cameras show: records read, images decoded and detected in, and frames left out between two empty looks."""
+"""Camera frames: records read, images decoded, detections in every frame but those between two empty ones."""
 
 from __future__ import annotations
 
@@ -18,8 +18,17 @@ from log2sim.plan import Plan
 from log2sim.stage_clock import StageClock
 
 
-class Records:
-    """Reads records of a log and counts what cannot be read; a stream with nothing readable is an error."""
+class RecordReader:
+    """Read records of a log and count those that cannot be read; safe to share between threads.
+
+    Attributes
+    ----------
+    log : Log
+    read : dict of str to int
+        How many records of each stream were read.
+    failed : dict of str to list of str
+        Messages of the records that could not be read, by stream.
+    """
 
     def __init__(self, log: Log) -> None:
         self.log = log
@@ -28,7 +37,7 @@ class Records:
         self._lock = threading.Lock()
 
     def get(self, stream: str, index: int) -> Any | None:
-        """The record, or None when it cannot be read."""
+        """Read a record; None when it cannot be read."""
         try:
             record = self.log.streams[stream].read(index)
             if isinstance(record, Sweep) and not len(record.xyz_m):
@@ -42,7 +51,13 @@ class Records:
         return record
 
     def require_some(self) -> None:
-        """Raise `LogError` for a stream of which nothing that was asked for could be read."""
+        """Require that every stream of which records were requested gave at least one.
+
+        Raises
+        ------
+        LogError
+            For a stream of which no requested record could be read.
+        """
         for stream, problems in self.failed.items():
             if not self.read.get(stream):
                 raise LogError(
@@ -51,86 +66,93 @@ class Records:
                 )
 
     def summary(self) -> dict[str, Any]:
+        """Summarize the unreadable records for the report: count and first message by stream."""
         return {s: {"count": len(p), "first": p[0]} for s, p in sorted(self.failed.items())}
 
 
-class Looker:
-    """Detections of every tick, in their order.
+class FrameDetector:
+    """Detect objects in the camera frames of every tick, tick by tick in order.
 
-    With a `stride` above 1 every camera is looked at every so many ticks; the frames between two looks that both found
-    nothing are left out, all others are looked at. What shows for shorter than a stride, and only there, is missed.
-    `looked` counts the frames looked at, `left_out` those left out by camera.
+    With a `stride` above 1 the detector first runs at every `stride`-th tick; frames between two such ticks are skipped
+    for cameras in which both found nothing. An object visible for less than a stride, and only there, is missed.
+
+    Attributes
+    ----------
+    detected : int
+        Number of frames in which the detector ran.
+    skipped : dict of str to int
+        Number of frames skipped, by camera.
     """
 
     def __init__(
-        self, log: Log, schedule: Schedule, detector: Detector, plan: Plan, records: Records,
+        self, log: Log, schedule: Schedule, detector: Detector, plan: Plan, reader: RecordReader,
         pool: ThreadPoolExecutor, clock: StageClock,
     ) -> None:  # fmt: skip
         self._log, self._schedule, self._detector, self._plan = log, schedule, detector, plan
-        self._records, self._pool, self._clock = records, pool, clock
-        self._found: dict[int, dict[str, Detections]] = {}
-        self.looked = 0
-        self.left_out: dict[str, int] = {}
+        self._reader, self._pool, self._clock = reader, pool, clock
+        self._pending: dict[int, dict[str, Detections]] = {}
+        self.detected = 0
+        self.skipped: dict[str, int] = {}
 
-    def at(self, tick: int) -> dict[str, Detections]:
-        """Detections by camera at a tick; to be called for every tick, in order."""
+    def detections_at(self, tick: int) -> dict[str, Detections]:
+        """Return the detections of a tick by camera; must be called for every tick in order."""
         last, stride = len(self._schedule) - 1, self._plan.stride
-        if tick not in self._found:
-            self._found[tick] = self._look(tick, self._plan.cameras)
+        if tick not in self._pending:
+            self._pending[tick] = self._detect(tick, self._plan.cameras)
         if stride > 1 and tick < last and tick % stride == 0:
-            self._look_between(tick, min(tick + stride, last))
-        return self._found.pop(tick)
+            self._detect_between(tick, min(tick + stride, last))
+        return self._pending.pop(tick)
 
-    def _look_between(self, start: int, end: int) -> None:
-        self._found[end] = self._look(end, self._plan.cameras)
-        ends = self._found[start], self._found[end]
-        quiet = {c for c in self._plan.cameras if all(c in found and not len(found[c]) for found in ends)}
+    def _detect_between(self, start: int, end: int) -> None:
+        """Detect at the tick `end` and at those before it, except in cameras that are empty at `start` and `end`."""
+        self._pending[end] = self._detect(end, self._plan.cameras)
+        ends = self._pending[start], self._pending[end]
+        empty = {c for c in self._plan.cameras if all(c in found and not len(found[c]) for found in ends)}
         for tick in range(start + 1, end):
-            self._found[tick] = self._look(tick, [c for c in self._plan.cameras if c not in quiet])
-            for camera in sorted(quiet):
+            self._pending[tick] = self._detect(tick, [c for c in self._plan.cameras if c not in empty])
+            for camera in sorted(empty):
                 if self._schedule.frames[camera][tick] >= 0:
-                    self._found[tick][camera] = Detections.empty()
-                    self.left_out[camera] = self.left_out.get(camera, 0) + 1
+                    self._pending[tick][camera] = Detections.empty()
+                    self.skipped[camera] = self.skipped.get(camera, 0) + 1
 
-    def _look(self, tick: int, cameras: Iterable[str]) -> dict[str, Detections]:
-        """Detections of a tick's frames; a frame that cannot be read has none. All frames decode at once, ahead."""
+    def _detect(self, tick: int, cameras: Iterable[str]) -> dict[str, Detections]:
+        """Run the detector on a tick's frames by camera; unreadable frames are left out, all others decode in parallel."""
         frames = self._frames(tick, cameras)
         if self._plan.keeps("decode images"):
             with self._clock.stage("decode"):
-                readable = dict(zip(frames, self._pool.map(_decodes, frames.values())))
+                readable = dict(zip(frames, self._pool.map(_is_readable, frames.values())))
             frames = {name: frame for name, frame in frames.items() if readable[name]}
         with self._clock.stage("detect"):
-            self.looked += len(frames)
+            self.detected += len(frames)
             return {name: self._detector.detect(frame) for name, frame in frames.items()}
 
     def _frames(self, tick: int, cameras: Iterable[str]) -> dict[str, Frame]:
-        """The camera frames of a tick; each decodes its image once, when somebody asks."""
         frames = {}
         for name in cameras:
             index = int(self._schedule.frames[name][tick])
             if index >= 0:
                 stamp = int(self._log.streams[name].t_ns[index])
-                frames[name] = Frame(self._log.cameras[name], stamp, _Once(self._records, name, index))
+                frames[name] = Frame(self._log.cameras[name], stamp, _LazyImage(self._reader, name, index))
         return frames
 
 
-class _Once:
-    """An image that is decoded when first asked for."""
+class _LazyImage:
+    """An image that is decoded at the first call and kept."""
 
-    def __init__(self, records: Records, stream: str, index: int) -> None:
-        self._records, self._stream, self._index = records, stream, index
+    def __init__(self, reader: RecordReader, stream: str, index: int) -> None:
+        self._reader, self._stream, self._index = reader, stream, index
         self._image: NDArray[np.uint8] | None = None
 
     def __call__(self) -> NDArray[np.uint8]:
         if self._image is None:
-            image = self._records.get(self._stream, self._index)
+            image = self._reader.get(self._stream, self._index)
             if image is None:
                 raise RecordError(f"{self._stream}: frame {self._index} cannot be read")
             self._image = image
         return self._image
 
 
-def _decodes(frame: Frame) -> bool:
+def _is_readable(frame: Frame) -> bool:
     try:
         frame.image()
     except RecordError:

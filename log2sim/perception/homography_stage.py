@@ -10,7 +10,7 @@ import numpy as np
 
 from log2sim.datatypes import TYPICAL_SIZE_M, Log, Measurements, Obstacles
 from log2sim.geometry import Array, Camera, inverse, wrap_angle
-from log2sim.perception.first_pass import Observed, base_pose
+from log2sim.perception.first_pass import Observations, base_pose
 from log2sim.perception.fusion import fuse
 from log2sim.perception.homography.correspondences import Correspondences, fit_camera, locate
 from log2sim.perception.homography.estimate import HomographyFit, refused
@@ -19,7 +19,7 @@ from log2sim.plan import Plan
 from log2sim.stage_clock import Costs
 
 # So many rays that go on behind a place say that nothing stands there, unless a part of these as large as this stops.
-LEAST_RAYS, MOST_STOPPED = 5, 0.25
+MIN_RAYS, MOST_STOPPED = 5, 0.25
 # What the LiDAR should have seen and did not is half as sure: it may continue a track and hardly start one.
 UNCONFIRMED = 0.5
 
@@ -37,7 +37,7 @@ class CameraGround:
 def fit_cameras(
     log: Log,
     schedule: Schedule,
-    seen: Observed,
+    seen: Observations,
     plan: Plan,
     method: str,
     rng: np.random.Generator,
@@ -68,7 +68,7 @@ def fit_cameras(
     return plan, grounds
 
 
-def _cameras_in_need(log: Log, seen: Observed) -> set[str]:
+def _cameras_in_need(log: Log, seen: Observations) -> set[str]:
     rows = [(str(m.camera[k]), m.box_px[k]) for m in seen.measurements for k in np.flatnonzero(m.source == "")]
     return {name for name, box_px in rows if _has_foot(log.cameras[name], box_px)}
 
@@ -81,7 +81,7 @@ def _has_foot(camera: Camera, box_px: Array) -> bool:
 def _fit_one(
     log: Log,
     schedule: Schedule,
-    seen: Observed,
+    seen: Observations,
     name: str,
     method: str,
     rng: np.random.Generator,
@@ -118,7 +118,7 @@ def calibrated_ground(log: Log, camera: Camera) -> HomographyFit | None:
 
 
 def locate_the_rest(
-    log: Log, schedule: Schedule, seen: Observed, homographies: Mapping[str, CameraGround], *, across: bool = True
+    log: Log, schedule: Schedule, seen: Observations, homographies: Mapping[str, CameraGround], *, across: bool = True
 ) -> list[Measurements]:
     """Measurements of all ticks, those without LiDAR points placed by their camera's homography where it is able to.
 
@@ -150,9 +150,9 @@ def _locate_tick(
             continue
         if obstacles is not None:
             beyond, stopped = rays_at(obstacles, base, placed, log.ground_z_ego_m, str(m.category[k]))
-            if beyond >= LEAST_RAYS and stopped < MOST_STOPPED * beyond:
+            if beyond >= MIN_RAYS and stopped < MOST_STOPPED * beyond:
                 continue
-            if beyond + stopped >= LEAST_RAYS:
+            if beyond + stopped >= MIN_RAYS:
                 columns["score"][k] *= UNCONFIRMED
         _write(columns, int(k), placed, base, log.ground_z_ego_m, str(m.category[k]))
     placed_rows = Measurements(**columns)

@@ -93,7 +93,9 @@ def synchronize(
     tolerance_ns = round(max_residual_s * NS_PER_S)
     frames, residuals = {}, {}
     for camera in cameras:
-        frames[camera], residuals[camera] = _taken_once(*nearest_records(log.streams[camera].t_ns, ticks, tolerance_ns))
+        frames[camera], residuals[camera] = _assign_frames_once(
+            *nearest_records(log.streams[camera].t_ns, ticks, tolerance_ns)
+        )
     sweeps = {}
     for lidar in log.lidars:
         stream = log.streams[lidar]
@@ -136,7 +138,7 @@ def nearest_records(
     return np.where(near, index, -1), np.where(near, residual_ns / NS_PER_S, np.nan)
 
 
-def _taken_once(
+def _assign_frames_once(
     index: NDArray[np.int64], residual_s: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Let only the nearest tick have a frame that several ticks would take: a frame is evidence for one moment."""

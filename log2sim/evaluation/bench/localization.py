@@ -14,7 +14,7 @@ from log2sim.evaluation.bench.bootstrap import error_of
 from log2sim.evaluation.bench.scores import CUT_M, Judged
 from log2sim.evaluation.metrics.align import Side, truth_side
 from log2sim.geometry import NS_PER_S, Array, Camera, box_iou, inverse, project_boxes
-from log2sim.perception.first_pass import Observed, base_pose
+from log2sim.perception.first_pass import Observations, base_pose
 from log2sim.perception.homography.correspondences import FARTHEST_M, Correspondences, foot_points, pinhole
 from log2sim.perception.homography.estimate import apply_homography
 from log2sim.perception.homography_stage import CameraGround, locate_the_rest
@@ -39,7 +39,12 @@ class Known:
 
 
 def true_places(
-    log: Log, schedule: Schedule, seen: Observed, truth: Scenario, *, when: Literal["measured", "imaged"] = "measured"
+    log: Log,
+    schedule: Schedule,
+    seen: Observations,
+    truth: Scenario,
+    *,
+    when: Literal["measured", "imaged"] = "measured",
 ) -> list[Known]:
     """For every tick the true centers of the objects in the boxes of its measurements.
 
@@ -65,7 +70,7 @@ def true_places(
     return out
 
 
-def lidar_places(seen: Observed, tick_s: float) -> list[Known]:
+def lidar_places(seen: Observations, tick_s: float) -> list[Known]:
     """Where LiDAR has the objects of every tick's measurements; those of half a second are taken for one."""
     return [
         Known(m.center_m[:, :2], np.full(len(m), int(tick * tick_s / BLOCK_S)))
@@ -100,7 +105,7 @@ def _true_xy(side: Side, k: int, pairs: NDArray[np.intp], later_s: Array) -> Arr
     return np.where((pairs >= 0)[:, None], xy, np.nan)
 
 
-def judge_measured(seen: Observed, known: Sequence[Known]) -> Judged:
+def judge_measured(seen: Observations, known: Sequence[Known]) -> Judged:
     """How far measured centers lie from the true ones; `error_m` cuts at 2 m, which objects without a place count as."""
     measured = np.concatenate([m.center_m[:, :2] for m in seen.measurements])
     true, who = np.concatenate([k.xy for k in known]), np.concatenate([k.who for k in known])
@@ -132,7 +137,7 @@ class Held:
     `known` where their centers are and `feet`, in the same order, where LiDAR has their feet.
     """
 
-    seen: Observed
+    seen: Observations
     asked: dict[str, list[Measurements]]
     known: dict[str, list[Known]]
     feet: dict[str, list[Correspondences]]
@@ -141,7 +146,9 @@ class Held:
         return sum(len(m) for rows in self.asked.values() for m in rows)
 
 
-def hold_out(log: Log, schedule: Schedule, seen: Observed, known: Sequence[Known], rng: np.random.Generator) -> Held:
+def hold_out(
+    log: Log, schedule: Schedule, seen: Observations, known: Sequence[Known], rng: np.random.Generator
+) -> Held:
     """Set a part of the measured obstacles within 60 m aside, with what is known of their places at the images' stamps."""
     asked: dict[str, list[Measurements]] = {camera: [] for camera in seen.feet}
     places: dict[str, list[Known]] = {camera: [] for camera in seen.feet}
@@ -223,7 +230,7 @@ def _places(log: Log, schedule: Schedule, tick: int, m: Measurements, ground: Ca
     """Places (M, 2) in the map of the rows of a tick by the homography, that of the tick where it has one of its own."""
     if not len(m):
         return np.zeros((0, 2))
-    seen = Observed(measurements=[m], obstacles=[None])
+    seen = Observations(measurements=[m], obstacles=[None])
     found = locate_the_rest(log, schedule, seen, {ground.camera.name: at_tick(ground, tick)})[0]
     return _in_order(m, found)
 

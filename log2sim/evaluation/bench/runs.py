@@ -24,7 +24,7 @@ from log2sim.evaluation.bench.scores import EVERYTHING, Judged, Scope, check_sco
 from log2sim.evaluation.bench.settings import Grid, Setting
 from log2sim.evaluation.bench.shared_detections import Remembered, detect_once
 from log2sim.geometry import NS_PER_S
-from log2sim.perception.first_pass import Observed, observe
+from log2sim.perception.first_pass import Observations, observe
 from log2sim.perception.homography.correspondences import jitter_m
 from log2sim.perception.homography_stage import CameraGround, fit_cameras
 from log2sim.perception.sync import Schedule
@@ -102,7 +102,7 @@ def make_bed(log: Log, grid: Grid, truth: Scenario | None, tell: Progress, scope
     return Bed(log, plan, schedule, truth, scope, grid, found, {**clock.seconds, "decode": decoding_s})
 
 
-def look(bed: Bed, detect: Setting, measure: Setting, tell: Progress) -> tuple[Observed, dict[str, float]]:
+def look(bed: Bed, detect: Setting, measure: Setting, tell: Progress) -> tuple[Observations, dict[str, float]]:
     """Measure what a detector has found; what was seen and the seconds of all stages up to there."""
     clock, what = StageClock(), detect.name if measure.present else measure.name
     seen = observe(
@@ -120,7 +120,7 @@ def look(bed: Bed, detect: Setting, measure: Setting, tell: Progress) -> tuple[O
 
 
 def run(
-    bed: Bed, settings: Sequence[Setting], first_pass: tuple[Observed, dict[str, float]], tell: Progress
+    bed: Bed, settings: Sequence[Setting], first_pass: tuple[Observations, dict[str, float]], tell: Progress
 ) -> list[Run]:
     """Go on from a first pass to the scenario with every setting, and measure what it is worth.
 
@@ -146,7 +146,7 @@ def run(
     ]
 
 
-def _concluded(bed: Bed, setting: Setting, seen: Observed, clock: StageClock) -> Judged:
+def _concluded(bed: Bed, setting: Setting, seen: Observations, clock: StageClock) -> Judged:
     detector = bed.found[bed.grid.present.name]
     try:
         result = conclude(bed.log, setting.config, bed.plan, detector, bed.schedule, seen, clock)
@@ -155,7 +155,7 @@ def _concluded(bed: Bed, setting: Setting, seen: Observed, clock: StageClock) ->
     return judge_scenario(result.scenario, bed.truth, bed.tick_s, bed.scope)
 
 
-def run_all(bed: Bed, tell: Progress) -> tuple[list[Run], Observed]:
+def run_all(bed: Bed, tell: Progress) -> tuple[list[Run], Observations]:
     """Run every setting, the present one first; also what was seen with it."""
     grid = bed.grid
     warm_up(bed)
@@ -191,14 +191,14 @@ def warm_up(bed: Bed) -> None:
     _concluded(short, bed.grid.present, seen, StageClock())
 
 
-def measured_by(bed: Bed, seen: Observed) -> Judged:
+def measured_by(bed: Bed, seen: Observations) -> Judged:
     """What measured centers are worth; nothing is known without truth."""
     if bed.truth is None:
         return Judged({})
     return judge_measured(seen, true_places(bed.log, bed.schedule, seen, bed.truth))
 
 
-def homography_points(bed: Bed, seen: Observed, tell: Progress) -> list[Point]:
+def homography_points(bed: Bed, seen: Observations, tell: Progress) -> list[Point]:
     """Every method of the homography, judged by obstacles that it was not fitted to; none where no obstacle was measured."""
     truth, seed = bed.truth, bed.grid.present.config.seed
     if truth is not None:

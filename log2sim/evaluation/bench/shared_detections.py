@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Detections, Frame, Log
 from log2sim.errors import RecordError
 from log2sim.perception.detect.detectors import Detector
-from log2sim.perception.frames import Records
+from log2sim.perception.frames import RecordReader
 from log2sim.perception.sync import Schedule
 
 
@@ -69,7 +69,7 @@ def detect_once(
         When no frame of a camera can be read.
     """
     memory = {key: Remembered(d.name, d.default_min_score) for key, d in detectors.items()}
-    records, decoding_s = Records(log), 0.0
+    records, decoding_s = RecordReader(log), 0.0
     for tick in range(len(schedule)):
         for camera, index in schedule.frames.items():
             if index[tick] < 0:

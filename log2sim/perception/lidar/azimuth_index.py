@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.perception.box_fitting import middle
+from log2sim.perception.box_fitting import upper_median
 
 # Beside an end, so far is looked for what the rays reached there, in m at the end's range and as an angle.
-BESIDE_M = 0.5
-LEAST_RAD, MOST_RAD = np.deg2rad(0.6), np.deg2rad(6.0)
+WINDOW_M = 0.5
+MIN_WINDOW_RAD, MAX_WINDOW_RAD = np.deg2rad(0.6), np.deg2rad(6.0)
 # What lies farther behind the end than this is something else.
-BEHIND_M = 0.5
-LEAST_POINTS = 2
+MIN_DEPTH_STEP_M = 0.5
+MIN_RAYS_BEYOND = 2
 TRIM = 0.01
 SLOPE_MARGIN = 0.01
 # A turn in steps that 16 bits hold.
@@ -23,7 +23,7 @@ STEP_RAD = 2 * np.pi / TURN
 
 
 @dataclass(frozen=True, eq=False)
-class Panorama:
+class AzimuthIndex:
     """Points of a cloud around their sensor, by rising azimuth.
 
     `azimuth` (N,) in `STEP_RAD` from -pi, in the map frame; `range_m` (N,); `slope` (N,) height over distance from the
@@ -37,7 +37,7 @@ class Panorama:
     place_of: NDArray[np.intp]
 
     @classmethod
-    def of(cls, xyz: NDArray[np.float32], sensor: NDArray[np.float32], ground: NDArray[np.bool_]) -> Panorama:
+    def of(cls, xyz: NDArray[np.float32], sensor: NDArray[np.float32], ground: NDArray[np.bool_]) -> AzimuthIndex:
         """Sort points (N, 3) around a sensor (3,)."""
         x, y, z = (xyz - sensor).T
         # Whole numbers of 16 bits are sorted by their digits, ten times as fast as angles.
@@ -49,7 +49,7 @@ class Panorama:
         slope = z / np.maximum(range_m, 1e-3)
         return cls(azimuth[order], range_m[order], slope[order], ~ground[order], place_of)
 
-    def ends_seen(self, members: NDArray[np.intp]) -> NDArray[np.bool_]:
+    def ends_visible(self, members: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Whether the right and the left end (2,) of the cluster at rows `members` are ends of its object.
 
         Beside an end of the object, rays at its height reach what is behind it. Where they stop at something nearer, or
@@ -67,16 +67,16 @@ class Panorama:
         cut = round(TRIM * (len(mine) - 1))
         seen = np.zeros(2, dtype=bool)
         for k, (place, sign) in enumerate(((cut, -1), (len(mine) - 1 - cut, 1))):
-            near_end = np.abs(turned - turned[place]) * STEP_RAD < LEAST_RAD
-            range_m = middle(self.range_m[mine[near_end]])
-            width = float(np.clip(BESIDE_M / max(range_m, 1e-3), LEAST_RAD, MOST_RAD)) / STEP_RAD
+            near_end = np.abs(turned - turned[place]) * STEP_RAD < MIN_WINDOW_RAD
+            range_m = upper_median(self.range_m[mine[near_end]])
+            width = float(np.clip(WINDOW_M / max(range_m, 1e-3), MIN_WINDOW_RAD, MAX_WINDOW_RAD)) / STEP_RAD
             edge = int(turned[place]) + start
             beside = self._between(*sorted((edge, edge + sign * round(width))))
             slopes = self.slope[beside]
             beside = beside[(slopes >= low) & (slopes <= high)]
-            farther = self.range_m[beside] > range_m + BEHIND_M
+            farther = self.range_m[beside] > range_m + MIN_DEPTH_STEP_M
             stopped = ~farther & self.obstacle[beside] & ~taken[beside]
-            seen[k] = farther.sum() >= max(LEAST_POINTS, int(stopped.sum()))
+            seen[k] = farther.sum() >= max(MIN_RAYS_BEYOND, int(stopped.sum()))
         return seen
 
     def _between(self, first: int, last: int) -> NDArray[np.intp]:

@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Log, Sweep
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.perception.lidar.azimuth_index import Panorama
+from log2sim.perception.lidar.azimuth_index import AzimuthIndex
 from log2sim.perception.lidar.ground import ON_GROUND_M, estimate_ground
 
 # Rotation is held within one bin: at 1 rad/s and 50 m this is 2.5 cm; translation is interpolated for every point.
 POSE_BIN_NS = 500_000
-MOST_POSE_BINS = 4096
+MAX_POSE_BINS = 4096
 # A sensor that moves less than this during a sweep, its turning taken at 30 m, needs one pose for it.
 AT_REST_M = 0.01
 AT_REST_RAD = AT_REST_M / 30.0
 AT_REST_PROBES = 5
 # Obstacles stand between the road and what hangs over it.
-LOWEST_M, HIGHEST_M = 0.2, 4.2
+MIN_OBSTACLE_HEIGHT_M, MAX_OBSTACLE_HEIGHT_M = 0.2, 4.2
 GROUND_REACH_M = 45.0
 GROUND_SAMPLE = 2000
 
@@ -47,7 +47,9 @@ class Cloud:
     @cached_property
     def obstacles(self) -> NDArray[np.intp]:
         """Indices (n,) of the points that stand on the road."""
-        return np.flatnonzero(~self.ground & (self.height > LOWEST_M) & (self.height < HIGHEST_M))
+        return np.flatnonzero(
+            ~self.ground & (self.height > MIN_OBSTACLE_HEIGHT_M) & (self.height < MAX_OBSTACLE_HEIGHT_M)
+        )
 
     @cached_property
     def columns(self) -> NDArray[np.float32]:
@@ -60,9 +62,9 @@ class Cloud:
         return np.ascontiguousarray(self.xyz[self.obstacles].T)
 
     @cached_property
-    def panorama(self) -> Panorama:
+    def azimuth_index(self) -> AzimuthIndex:
         """The points by azimuth around the sensor."""
-        return Panorama.of(self.xyz, self.sensor, self.ground)
+        return AzimuthIndex.of(self.xyz, self.sensor, self.ground)
 
     @cached_property
     def ground_sample(self) -> NDArray[np.intp]:
@@ -72,10 +74,10 @@ class Cloud:
 
     def prepare(self, *, ground: bool = True) -> None:
         """Compute now, in the thread that makes the cloud, what measuring in it will ask for, its `ground` too or not."""
-        _ = self.obstacle_columns, self.panorama, self.ground_sample if ground else None
+        _ = self.obstacle_columns, self.azimuth_index, self.ground_sample if ground else None
 
 
-def to_map(log: Log, lidar: str, sweep: Sweep, *, compensate: bool) -> tuple[Array, NDArray[np.float32]] | None:
+def sweep_to_map(log: Log, lidar: str, sweep: Sweep, *, compensate: bool) -> tuple[Array, NDArray[np.float32]] | None:
     """Points (N, 3) float64 of a sweep in the map frame and their times (N,) s relative to its stamp.
 
     Returns None where the pose of the sensor is not known at that time. Without point times, at rest, or with `compensate`
@@ -85,12 +87,12 @@ def to_map(log: Log, lidar: str, sweep: Sweep, *, compensate: bool) -> tuple[Arr
     t_s = ((t_ns - sweep.stamp_ns) / NS_PER_S).astype(np.float32)
     if sweep.frame == "map":
         return np.asarray(sweep.xyz_m, dtype=np.float64), t_s
-    one_pose = not compensate or sweep.t_ns is None or len(t_ns) == 0 or at_rest(log, lidar, sweep)
-    xyz = with_one_pose(log, lidar, sweep) if one_pose else with_many_poses(log, lidar, sweep, t_ns)
+    one_pose = not compensate or sweep.t_ns is None or len(t_ns) == 0 or is_at_rest(log, lidar, sweep)
+    xyz = transform_rigidly(log, lidar, sweep) if one_pose else deskew(log, lidar, sweep, t_ns)
     return None if xyz is None else (xyz, t_s)
 
 
-def at_rest(log: Log, lidar: str, sweep: Sweep) -> bool:
+def is_at_rest(log: Log, lidar: str, sweep: Sweep) -> bool:
     """Whether a LiDAR stands still while it takes a sweep with point times, to `AT_REST_M` at 30 m."""
     if sweep.t_ns is None or len(sweep.t_ns) == 0:
         return False
@@ -101,7 +103,7 @@ def at_rest(log: Log, lidar: str, sweep: Sweep) -> bool:
     return bool(valid.all() and moved.max() < AT_REST_M and turned.max() < AT_REST_RAD)
 
 
-def with_one_pose(log: Log, lidar: str, sweep: Sweep) -> Array | None:
+def transform_rigidly(log: Log, lidar: str, sweep: Sweep) -> Array | None:
     """Points (N, 3) in the map, all moved by the pose of the sweep's stamp; None where that is not known."""
     map_T_lidar, valid = log.map_T_sensor(lidar, sweep.stamp_ns)
     if not valid[0]:
@@ -109,10 +111,10 @@ def with_one_pose(log: Log, lidar: str, sweep: Sweep) -> Array | None:
     return np.asarray(sweep.xyz_m @ map_T_lidar[0, :3, :3].T + map_T_lidar[0, :3, 3], dtype=np.float64)
 
 
-def with_many_poses(log: Log, lidar: str, sweep: Sweep, t_ns: NDArray[np.int64]) -> Array | None:
+def deskew(log: Log, lidar: str, sweep: Sweep, t_ns: NDArray[np.int64]) -> Array | None:
     """Points (N, 3) in the map, each moved by the pose of its own time (N,); None where one is not known."""
     first, span = int(t_ns.min()), int(t_ns.max() - t_ns.min())
-    bins = min(max(span // POSE_BIN_NS, 1), MOST_POSE_BINS)
+    bins = min(max(span // POSE_BIN_NS, 1), MAX_POSE_BINS)
     knots = first + (np.arange(bins + 1) * span) // bins
     map_T_lidar, valid = log.map_T_sensor(lidar, knots)
     if not valid.all():
@@ -153,7 +155,7 @@ def assemble_cloud(
     """
     parts, stamp = [], 0
     for name, sweep in sweeps.items():
-        mapped = to_map(log, name, sweep, compensate=compensate)
+        mapped = sweep_to_map(log, name, sweep, compensate=compensate)
         if mapped is None or len(mapped[0]) == 0:
             continue
         stamp = stamp or sweep.stamp_ns

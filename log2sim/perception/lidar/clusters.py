@@ -16,17 +16,17 @@ Index = NDArray[np.intp]
 
 CELL_M = {"vehicle": 0.4, "two_wheeler": 0.3, "pedestrian": 0.25, "other": 0.4}
 # Longest that an object of a category can be: points farther apart belong to several things.
-LONGEST_M = {
+MAX_LENGTH_M = {
     "car": 6.0, "truck": 14.0, "bus": 19.0, "motorcycle": 2.8, "cyclist": 2.4, "bicycle": 2.4, "pedestrian": 1.4, "other": 8.0,
 }  # fmt: skip
-LEAST_POINTS = 4
-MOST_SCORED_POINTS = 400
+MIN_CLUSTER_POINTS = 4
+MAX_SCORED_POINTS = 400
 # A cluster that fills less of the box than this is something in front of the object or behind it.
-LEAST_FILL = 0.12
+MIN_IMAGE_IOU = 0.12
 # Around a box, a margin of this share of its sides is searched for what goes on there, as dense as this at least.
-MARGIN, SAME_DENSITY = 0.15, 0.3
+MARGIN, MIN_DENSITY_RATIO = 0.15, 0.3
 # Boxes that overlap by more are two of one object; a cluster of which more is another box's is that one's.
-SAME_BOX, MOST_FOREIGN = 0.7, 0.5
+DUPLICATE_IOU, MAX_FOREIGN_SHARE = 0.7, 0.5
 
 
 def clusters_of(xy: NDArray[np.floating[Any]], cell_m: float) -> NDArray[np.intp]:
@@ -49,7 +49,7 @@ def _cluster(xy: NDArray[np.floating[Any]], cell_m: float) -> tuple[NDArray[np.i
     return grid[i, j].astype(np.intp) - 1, corner, grid
 
 
-def candidates(
+def candidate_clusters(
     xyz: NDArray[np.float32], uv: NDArray[np.floating[Any]], range_m: Array, box_px: Array, category: str
 ) -> list[tuple[Index, float]]:
     """Clusters of the points (N, 3) inside a box that could be its object, as indices, each with a score in (0, 1].
@@ -68,39 +68,39 @@ def candidates(
     """
     u, v = uv.T
     inside = np.flatnonzero((u >= box_px[0]) & (u <= box_px[2]) & (v >= box_px[1]) & (v <= box_px[3]))
-    if len(inside) < LEAST_POINTS:
+    if len(inside) < MIN_CLUSTER_POINTS:
         return []
     cell_m = CELL_M[GROUP_OF[category]]
     labels, corner, grid = _cluster(xyz[inside, :2], cell_m)
-    structure = _goes_on(xyz, uv, box_px, labels, corner, grid, cell_m)
+    structure = _extends_beyond_box(xyz, uv, box_px, labels, corner, grid, cell_m)
     # Whole numbers of 16 bits are sorted by their digits.
     order, count = np.argsort(labels.astype(np.uint16), kind="stable"), np.bincount(labels)
     first = np.cumsum(count) - count
-    enough = (count >= LEAST_POINTS) & ~structure
+    enough = (count >= MIN_CLUSTER_POINTS) & ~structure
     if not enough.any():
         return []
-    span = np.concatenate(_ends(uv[inside[order]], first), axis=1)
+    span = np.concatenate(_group_extents(uv[inside[order]], first), axis=1)
     middle_m = np.bincount(labels, range_m[inside]) / np.maximum(count, 1)
     nearest_m = middle_m[enough].min()
-    low, high = _ends(xyz[inside[order], :2], first)
+    low, high = _group_extents(xyz[inside[order], :2], first)
     members = {int(g): inside[order[first[g] : first[g] + count[g]]] for g in np.flatnonzero(enough)}
-    too_long = np.hypot(*(high - low).T) > LONGEST_M[category]
-    for g in np.flatnonzero(enough & (too_long | (count > MOST_SCORED_POINTS))).tolist():
-        members[g] = cropped = within_length(xyz, members[g], range_m, LONGEST_M[category])
-        sample = uv[subsample(cropped, MOST_SCORED_POINTS)]
+    too_long = np.hypot(*(high - low).T) > MAX_LENGTH_M[category]
+    for g in np.flatnonzero(enough & (too_long | (count > MAX_SCORED_POINTS))).tolist():
+        members[g] = cropped = crop_to_length(xyz, members[g], range_m, MAX_LENGTH_M[category])
+        sample = uv[subsample(cropped, MAX_SCORED_POINTS)]
         span[g] = np.concatenate([sample.min(axis=0), sample.max(axis=0)])
         middle_m[g] = range_m[cropped].mean()
     fill = box_iou(span, box_px)[:, 0]
     score = fill * np.sqrt(nearest_m / np.maximum(middle_m, 1e-3))
-    return [(points, float(score[g])) for g, points in members.items() if fill[g] >= LEAST_FILL]
+    return [(points, float(score[g])) for g, points in members.items() if fill[g] >= MIN_IMAGE_IOU]
 
 
-def _ends(values: NDArray[Any], first: Index) -> tuple[NDArray[Any], NDArray[Any]]:
+def _group_extents(values: NDArray[Any], first: Index) -> tuple[NDArray[Any], NDArray[Any]]:
     """Smallest and largest values (G, 2), (G, 2) of consecutive groups of rows (N, 2) that begin at `first` (G,)."""
     return np.minimum.reduceat(values, first), np.maximum.reduceat(values, first)
 
 
-def _goes_on(
+def _extends_beyond_box(
     xyz: NDArray[np.float32],
     uv: NDArray[np.floating[Any]],
     box_px: Array,
@@ -124,11 +124,11 @@ def _goes_on(
     within = (u >= box_px[0]) & (u <= box_px[2])
     for rows in (u < box_px[0], u > box_px[2], within & (v < box_px[1])):
         beyond = np.bincount(owner[rows & (owner >= 0)], minlength=len(count))
-        sides += beyond >= np.maximum(SAME_DENSITY * MARGIN * count, 3)
+        sides += beyond >= np.maximum(MIN_DENSITY_RATIO * MARGIN * count, 3)
     return sides >= 2
 
 
-def choose(options: Sequence[Sequence[tuple[Index, float]]], boxes_px: Array, count: int) -> list[Index]:
+def assign_clusters(options: Sequence[Sequence[tuple[Index, float]]], boxes_px: Array, count: int) -> list[Index]:
     """One cluster for each of K boxes, from its candidates over `count` points; empty where none is left.
 
     Notes
@@ -145,8 +145,8 @@ def choose(options: Sequence[Sequence[tuple[Index, float]]], boxes_px: Array, co
         k = max(open_rows, key=lambda r: (len(open_rows[r][0][0]), -r))
         points, _ = open_rows[k].pop(0)
         taken = owner[points]
-        foreign = (taken >= 0) & (overlap[k, np.maximum(taken, 0)] < SAME_BOX)
-        if foreign.mean() <= MOST_FOREIGN:
+        foreign = (taken >= 0) & (overlap[k, np.maximum(taken, 0)] < DUPLICATE_IOU)
+        if foreign.mean() <= MAX_FOREIGN_SHARE:
             chosen[k] = points[~foreign]
             owner[points[taken < 0]] = k
         if len(chosen[k]) or not open_rows[k]:
@@ -154,7 +154,7 @@ def choose(options: Sequence[Sequence[tuple[Index, float]]], boxes_px: Array, co
     return chosen
 
 
-def within_length(xyz: NDArray[np.float32], group: Index, range_m: Array, longest_m: float) -> Index:
+def crop_to_length(xyz: NDArray[np.float32], group: Index, range_m: Array, longest_m: float) -> Index:
     """Cut a cluster that is longer than its object can be around its nearer part."""
     xy = xyz[group, :2]
     if np.hypot(*(xy.max(axis=0) - xy.min(axis=0))) <= longest_m:
@@ -162,15 +162,15 @@ def within_length(xyz: NDArray[np.float32], group: Index, range_m: Array, longes
     near = group[range_m[group] <= np.quantile(range_m[group], 0.4)]
     center = np.median(xyz[near, :2], axis=0)
     kept = group[np.hypot(*(xyz[group, :2] - center).T) <= longest_m / 2]
-    return kept if len(kept) >= LEAST_POINTS else near
+    return kept if len(kept) >= MIN_CLUSTER_POINTS else near
 
 
-def grow(xy_all: NDArray[np.float32], seed: NDArray[np.float32], category: str) -> Index:
+def region_grow(xy_all: NDArray[np.float32], seed: NDArray[np.float32], category: str) -> Index:
     """Indices of all points (N, 2) connected to a seed cluster (n, 2), for an object that the image border cuts.
 
     Bounded by the category's longest size, so that it cannot run along a wall.
     """
-    reach = LONGEST_M[category]
+    reach = MAX_LENGTH_M[category]
     center = np.median(seed, axis=0)
     near = np.flatnonzero(np.abs(xy_all[:, 0] - center[0]) <= reach)
     near = near[np.abs(xy_all[near, 1] - center[1]) <= reach]

@@ -15,10 +15,16 @@ from numpy.typing import NDArray
 from log2sim.datatypes import TYPICAL_SIZE_M, Detections, Measurements
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception import box_fitting
-from log2sim.perception.box_fitting import middle
-from log2sim.perception.lidar.cloud import Cloud, assemble_cloud, at_rest, to_map, with_many_poses, with_one_pose
-from log2sim.perception.lidar.clusters import LEAST_POINTS, MARGIN, candidates, choose, grow
-from log2sim.perception.lidar.projection import View, in_boxes, see
+from log2sim.perception.box_fitting import upper_median
+from log2sim.perception.lidar.cloud import Cloud, assemble_cloud
+from log2sim.perception.lidar.clusters import (
+    MARGIN,
+    MIN_CLUSTER_POINTS,
+    assign_clusters,
+    candidate_clusters,
+    region_grow,
+)
+from log2sim.perception.lidar.projection import View, points_in_image_boxes, project_points
 
 __all__ = [
     "Cloud", "View", "assemble_cloud", "at_rest", "measure_view", "project_cloud", "to_map", "with_many_poses", "with_one_pose",
@@ -39,25 +45,25 @@ def measure_view(view: View, detections: Detections, cloud: Cloud | None, *, mod
 def _measure_robustly(columns: dict[str, Any], view: View, detections: Detections, cloud: Cloud) -> None:
     """Give every box the cluster that is its object, and write what it says into its row."""
     points, columns_m = cloud.obstacles, cloud.obstacle_columns
-    seen = see(view, cloud.origin, columns_m)
+    seen = project_points(view, cloud.origin, columns_m)
     index, uv = points[seen.index], np.stack([seen.u, seen.v], axis=1)
     xyz = columns_m[:, seen.index].T
     range_m = np.linalg.norm(xyz - cloud.sensor, axis=1)
     options = []
-    for k, i in enumerate(in_boxes(seen, detections.box_px, MARGIN)):
-        found = candidates(xyz[i], uv[i], range_m[i], detections.box_px[k], str(detections.category[k]))
+    for k, i in enumerate(points_in_image_boxes(seen, detections.box_px, MARGIN)):
+        found = candidate_clusters(xyz[i], uv[i], range_m[i], detections.box_px[k], str(detections.category[k]))
         options.append([(i[points], score) for points, score in found])
     clusters = list(columns["cluster"])
-    for k, chosen in enumerate(choose(options, detections.box_px, len(index))):
+    for k, chosen in enumerate(assign_clusters(options, detections.box_px, len(index))):
         box, category = detections.box_px[k], str(detections.category[k])
-        if len(chosen) < LEAST_POINTS:
+        if len(chosen) < MIN_CLUSTER_POINTS:
             continue
         members = index[chosen]
         if columns["truncated"][k]:
             mine = np.zeros(len(cloud.xyz), dtype=bool)
-            mine[members] = mine[points[grow(columns_m[:2].T, cloud.xyz[members, :2], category)]] = True
+            mine[members] = mine[points[region_grow(columns_m[:2].T, cloud.xyz[members, :2], category)]] = True
             members = np.flatnonzero(mine)
-        columns["height_px_m"][k] = (box[3] - box[1]) * middle(seen.depth[chosen]) / view.camera.K[1, 1]
+        columns["height_px_m"][k] = (box[3] - box[1]) * upper_median(seen.depth[chosen]) / view.camera.K[1, 1]
         clusters[k] = _fill_row(columns, k, members, category, cloud)
     columns["cluster"] = tuple(clusters)
 
@@ -75,7 +81,7 @@ def _blank(view: View, detections: Detections) -> dict[str, Any]:
         "camera": np.full(m, view.camera.name),
         "box_px": box,
         "truncated": cut,
-        "ends_seen": np.zeros((m, 2), dtype=bool),
+        "ends_visible": np.zeros((m, 2), dtype=bool),
         "center_m": np.full((m, 3), np.nan),
         "size_m": size,
         "yaw_rad": np.full(m, np.nan),
@@ -91,12 +97,12 @@ def _blank(view: View, detections: Detections) -> dict[str, Any]:
 def _fill_row(columns: dict[str, Any], k: int, members: NDArray[np.intp], category: str, cloud: Cloud) -> Array:
     """Write what one cluster says into row `k` and return its points in the map frame."""
     xyz = cloud.xyz[members].astype(np.float64)
-    ground_z = middle(xyz[:, 2] - cloud.height[members])
-    ends_seen = cloud.panorama.ends_seen(members)
-    center, size, yaw, covariance = box_fitting.box_of_cluster(
-        xyz, cloud.sensor.astype(np.float64), category, ground_z, ends_seen
+    ground_z = upper_median(xyz[:, 2] - cloud.height[members])
+    ends_visible = cloud.azimuth_index.ends_visible(members)
+    center, size, yaw, covariance = box_fitting.fit_box(
+        xyz, cloud.sensor.astype(np.float64), category, ground_z, ends_visible
     )
-    columns["ends_seen"][k] = ends_seen
+    columns["ends_visible"][k] = ends_visible
     columns["center_m"][k] = center + cloud.origin
     columns["size_m"][k], columns["yaw_rad"][k], columns["covariance"][k] = size, yaw, covariance
     columns["points"][k], columns["source"][k] = len(members), "lidar"
@@ -107,9 +113,9 @@ def _fill_row(columns: dict[str, Any], k: int, members: NDArray[np.intp], catego
 
 def _measure_as_paper(columns: dict[str, Any], view: View, detections: Detections, cloud: Cloud) -> None:
     """Depth of the point nearest to the box center, extents of all points in the box."""
-    seen = see(view, cloud.origin, cloud.columns)
+    seen = project_points(view, cloud.origin, cloud.columns)
     uv, xyz = np.stack([seen.u, seen.v], axis=1), cloud.xyz[seen.index]
-    for k, inside in enumerate(in_boxes(seen, detections.box_px)):
+    for k, inside in enumerate(points_in_image_boxes(seen, detections.box_px)):
         if len(inside) == 0:
             continue
         box = detections.box_px[k]
@@ -123,6 +129,6 @@ def _measure_as_paper(columns: dict[str, Any], view: View, detections: Detection
 
 def project_cloud(view: View, cloud: Cloud, index: NDArray[np.intp]) -> tuple[NDArray[np.intp], Array, Array]:
     """Which of the cloud's points at `index` the camera sees, their pixels (n, 2) and depths (n,)."""
-    seen = see(view, cloud.origin, np.ascontiguousarray(cloud.xyz[index].T))
+    seen = project_points(view, cloud.origin, np.ascontiguousarray(cloud.xyz[index].T))
     uv = np.stack([seen.u, seen.v], axis=1).astype(np.float64)
     return seen.index, uv, seen.depth.astype(np.float64)

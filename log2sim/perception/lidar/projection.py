@@ -26,7 +26,7 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class ProjectedPoints:
     """Points that a camera sees: `index` (n,) in the cloud, pixels `u` and `v` (n,), `depth` (n,) m along the optical axis."""
 
     index: NDArray[np.intp]
@@ -52,7 +52,7 @@ class _Workspace(threading.local):
 _workspace = _Workspace()
 
 
-def see(view: View, origin: Array, columns: NDArray[np.float32]) -> Seen:
+def project_points(view: View, origin: Array, columns: NDArray[np.float32]) -> ProjectedPoints:
     """Project points given as columns x, y, z (3, N) relative to `origin` (3,) in the map frame.
 
     Notes
@@ -81,10 +81,10 @@ def see(view: View, origin: Array, columns: NDArray[np.float32]) -> Seen:
     index = np.flatnonzero(mark)
     depth = z[index]
     if not lens:
-        return Seen(index, turned[0][index] / depth, turned[1][index] / depth, depth)
+        return ProjectedPoints(index, turned[0][index] / depth, turned[1][index] / depth, depth)
     uv, inside = project(camera, turned[:, index].T)
     u, v = uv[inside].T.astype(np.float32)
-    return Seen(index[inside], u, v, depth[inside])
+    return ProjectedPoints(index[inside], u, v, depth[inside])
 
 
 @lru_cache(maxsize=64)
@@ -101,7 +101,7 @@ def _frustum(camera: Camera) -> tuple[Array, Array]:
     return rays.min(axis=0) - SLACK, rays.max(axis=0) + SLACK
 
 
-def in_boxes(seen: Seen, box_px: Array, margin: float = 0.0) -> list[NDArray[np.intp]]:
+def points_in_image_boxes(seen: ProjectedPoints, box_px: Array, margin: float = 0.0) -> list[NDArray[np.intp]]:
     """Rows of `seen` in each box (M, 4), in their order; boxes are widened by a share of their sides, but not downward.
 
     Notes

@@ -20,17 +20,17 @@ def mosaic_of(log: Log, scenario: Scenario) -> TopdownPicture:
 
     By the cameras that the scenario was made with, or by all of the log where it names none, as truth does.
     """
-    from log2sim.perception.first_pass import place_of_ego
+    from log2sim.perception.first_pass import cloud_origin
 
     used = [str(c["name"]) for c in scenario.cameras if c.get("used") and c["name"] in log.cameras]
     used = used or list(log.cameras)
     stamps = scenario.t0_ns + np.round(np.linspace(0, scenario.duration_s, MOMENTS) * NS_PER_S).astype(np.int64)
-    places = np.array([place_of_ego(log, int(t))[0][:2] for t in stamps])
+    places = np.array([cloud_origin(log, int(t))[0][:2] for t in stamps])
     low, high = places.min(axis=0) - REACH_M, places.max(axis=0) + REACH_M
     extent = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
     mosaic = Mosaic(extent_m=extent, resolution_m=RESOLUTION_M)
     for t in stamps:
-        ground_z = place_of_ego(log, int(t))[1]
+        ground_z = cloud_origin(log, int(t))[1]
         views = []
         for name in used:
             stream = log.streams[name]
