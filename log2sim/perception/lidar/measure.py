@@ -16,7 +16,7 @@ from log2sim.datatypes import TYPICAL_SIZE_M, Detections, Measurements
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception import box_fitting
 from log2sim.perception.box_fitting import upper_median
-from log2sim.perception.lidar.cloud import Cloud, assemble_cloud
+from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.clusters import (
     MARGIN,
     MIN_CLUSTER_POINTS,
@@ -25,10 +25,6 @@ from log2sim.perception.lidar.clusters import (
     region_grow,
 )
 from log2sim.perception.lidar.projection import View, points_in_image_boxes, project_points
-
-__all__ = [
-    "Cloud", "View", "assemble_cloud", "at_rest", "measure_view", "project_cloud", "to_map", "with_many_poses", "with_one_pose",
-]  # fmt: skip
 
 BORDER_PX = 3.0
 KEPT_POINTS = 400
