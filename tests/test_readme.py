@@ -1,12 +1,20 @@
-"""What README.md tells people to type works: commands and options exist, links lead somewhere, code imports."""
+"""What README.md tells people to type works: commands and options exist, links lead somewhere, code imports.
+
+Blocks marked `sh` and `python` run as printed, in order. Blocks marked `console` need data of the reader's or run the tests
+themselves, and blocks marked `text` are no commands: they are only parsed.
+"""
 
 from __future__ import annotations
 
 import ast
 import importlib
 import importlib.util
+import os
 import re
 import shlex
+import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -28,6 +36,14 @@ def blocks() -> Iterator[str]:
         lines = [line[4:] for line in block.split("\n") if line.startswith("    ")]
         if lines:
             yield "\n".join(lines)
+
+
+def runnable_script() -> str:
+    """Blocks marked `sh` and `python` as one bash script that stops at the first line that fails and names it."""
+    lines = ["set -Eeo pipefail", """trap 'echo "failed: $BASH_COMMAND" >&2' ERR"""]
+    for language, block in re.findall(r"^```(sh|python)\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL):
+        lines.append(block if language == "sh" else f"python - <<'END_OF_PYTHON'\n{block}END_OF_PYTHON")
+    return "\n".join(lines)
 
 
 def commands() -> list[str]:
@@ -105,3 +121,50 @@ def _imports(block: str) -> list[ast.ImportFrom]:
     except SyntaxError:
         return []
     return [n for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and (n.module or "").startswith("log2sim")]
+
+
+@pytest.fixture
+def fresh_checkout(tmp_path: Path) -> Path:
+    """A copy of what a clone of this checkout with its uncommitted work would hold."""
+    if shutil.which("git") is None or not (ROOT / ".git").exists():
+        pytest.skip("needs git to tell the files of the checkout from others")
+    listed = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    names = subprocess.run(listed, cwd=ROOT, check=True, capture_output=True, text=True).stdout.split("\0")
+    for name in filter(None, names):
+        if (ROOT / name).is_file():
+            target = tmp_path / "log2sim" / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, target)
+    return tmp_path / "log2sim"
+
+
+@pytest.fixture
+def fresh_environment(tmp_path: Path) -> dict[str, str]:
+    """The variables of a new user's shell, and what pip needs to reach its index; skips where it does not reach it."""
+    kept = re.compile(r"PIP_\w+|SSL_CERT_\w+|REQUESTS_CA_BUNDLE|(https?|no)_proxy", re.IGNORECASE)
+    variables = {name: value for name, value in os.environ.items() if kept.fullmatch(name)}
+    home = tmp_path / "home"
+    home.mkdir()
+    variables |= {"HOME": str(home), "PATH": f"{sys.base_prefix}/bin:/usr/local/bin:/usr/bin:/bin", "LANG": "C.UTF-8"}
+    settings = Path.home() / ".config/pip/pip.conf"
+    if settings.is_file():
+        variables.setdefault("PIP_CONFIG_FILE", str(settings))
+    probe = ["python3", "-m", "pip", "download", "-q", "--no-deps", "--dest", str(tmp_path / "probe"), "typer"]
+    reached = subprocess.run(probe, env=variables, capture_output=True, text=True, check=False)
+    if reached.returncode != 0:
+        pytest.skip(f"pip does not reach its index: {reached.stderr.strip()[-200:]}")
+    return variables
+
+
+@pytest.mark.slow
+def test_every_line_of_the_readme_runs_for_a_new_user(fresh_checkout: Path, fresh_environment: dict[str, str]) -> None:
+    script = runnable_script()
+    ran = subprocess.run(
+        ["bash", "--norc", "-c", script],
+        cwd=fresh_checkout, env=fresh_environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr[-3000:]
+    promised = set(re.findall(r"--(?:out|report) (\S+)", script)) | set(re.findall(r"""\.save\("([^"]+)"\)""", script))
+    missing = sorted(name for name in promised if not (fresh_checkout / name).exists())
+    assert promised, "the README writes no files"
+    assert not missing

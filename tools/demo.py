@@ -8,16 +8,16 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-OUT = Path("out")
-SAMPLE = Path("samples") / "crossing"
+OUT = "out/demo"
+SCENARIO, REPLAY, SAMPLE = f"{OUT}/scenario.json", f"{OUT}/replay.json", "samples/crossing"
 COMMANDS = (
-    ("reconstruct", str(SAMPLE), "--out", "out/scenario.json", "--report", "out/report.json"),
-    ("replay", "out/scenario.json", "--out", "out/replay.json"),
-    ("evaluate", "out/scenario.json", "--truth", str(SAMPLE), "--range", "40", "--out", "out/metrics.json"),
-    ("plot", "out/scenario.json", "--replay", "out/replay.json", "--truth", str(SAMPLE), "--out", "out/tracks.png"),
-    ("view", "out/scenario.json", "--replay", "out/replay.json", "--truth", str(SAMPLE), "--out", "out/view.html"),
-    ("export", "out/scenario.json", "--to", "openscenario", "--out", "out/openscenario"),
-)  # fmt: skip
+    ("reconstruct", SAMPLE, "--out", SCENARIO, "--report", f"{OUT}/report.json"),
+    ("replay", SCENARIO, "--out", REPLAY),
+    ("evaluate", SCENARIO, "--truth", SAMPLE, "--range", "40", "--out", f"{OUT}/metrics.json"),
+    ("plot", SCENARIO, "--replay", REPLAY, "--truth", SAMPLE, "--out", f"{OUT}/tracks.png"),
+    ("view", SCENARIO, "--replay", REPLAY, "--truth", SAMPLE, "--out", f"{OUT}/view.html"),
+    ("export", SCENARIO, "--to", "openscenario", "--out", f"{OUT}/openscenario"),
+)
 
 
 def main() -> None:

