@@ -14,7 +14,7 @@ from scipy.integrate import quad_vec
 from scipy.linalg import expm
 
 from log2sim.agents.smooth.feasibility import broken_limits
-from log2sim.agents.smooth.fixed_interval import Manner, smooth_interval
+from log2sim.agents.smooth.fixed_interval import MotionModel, smooth_interval
 from log2sim.agents.smooth.heading import yaw_of_motion
 from log2sim.agents.smooth.motion_prior import (
     ACCELERATION_PRIOR_MPS2,
@@ -23,7 +23,7 @@ from log2sim.agents.smooth.motion_prior import (
     Observations,
     place_knots,
 )
-from log2sim.agents.smooth.quadratic import band_of, blocks_of, selected_inverse
+from log2sim.agents.smooth.quadratic import from_band, selected_inverse, to_band
 from log2sim.agents.smooth.smoother import SmoothedTrack, estimate_sigma, signed_speed, smooth_track
 from log2sim.geometry import wrap_angle
 
@@ -92,13 +92,13 @@ def test_the_banded_solver_agrees_with_dense_least_squares() -> None:
     # Observations on a smooth way far within their noise keep the robust weights at 1.
     xy = np.column_stack([2.0 * t, 0.2 * t**2]) + rng.normal(0, 1e-4, (12, 2))
     observed = Observations(t, xy, root @ np.swapaxes(root, 1, 2) + 0.04 * np.eye(2))
-    path = smooth_interval(observed, t, Manner(2.0, sideways=True))
+    path = smooth_interval(observed, t, MotionModel(2.0, holonomic=True))
     state, covariance = path.state.reshape(-1, 6), path.covariance
     expected, expected_covariance = dense_solution(observed, t, 2.0)
     assert path.weight.min() > 0.999
     np.testing.assert_allclose(state, expected, rtol=1e-3, atol=1e-3)
     np.testing.assert_allclose(covariance, expected_covariance, rtol=1e-3, atol=1e-6)
-    np.testing.assert_allclose(path.distance, np.hypot(*(xy - state[:, :2]).T), atol=1e-9)
+    np.testing.assert_allclose(path.residual_m, np.hypot(*(xy - state[:, :2]).T), atol=1e-9)
 
 
 def test_states_between_observations_are_those_of_a_knot_there() -> None:
@@ -108,7 +108,7 @@ def test_states_between_observations_are_those_of_a_knot_there() -> None:
     knots = np.unique(np.concatenate([t, asked]))
     expected, expected_covariance = dense_solution(observed, knots, 4.0)
     rows = np.searchsorted(knots, asked)
-    path = smooth_interval(observed, asked, Manner(4.0, sideways=True))
+    path = smooth_interval(observed, asked, MotionModel(4.0, holonomic=True))
     np.testing.assert_allclose(path.state.reshape(-1, 6), expected[rows], atol=2e-3)
     np.testing.assert_allclose(path.covariance, expected_covariance[rows], rtol=1e-3, atol=1e-6)
 
@@ -207,7 +207,7 @@ def test_heading_is_held_at_a_standstill(seed: int) -> None:
 def test_what_never_moves_keeps_its_hint_and_place(hint: float | None) -> None:
     t = DT * np.arange(100)
     xy = np.random.default_rng(5).normal([40.0, -7.0], 0.2, (100, 2))
-    path = smooth_track(t, xy, sigma_m=0.2, yaw_hint_rad=hint)
+    path = smooth_track(t, xy, sigma_m=0.2, motion=MotionModel(heading_rad=hint))
     assert (path.yaw_rad == (hint or 0.0)).all()
     assert np.hypot(*(path.xy_m - [40.0, -7.0]).T).mean() < 0.12
     assert (path.curvature_1pm == 0).all()
@@ -217,7 +217,7 @@ def test_a_vehicle_does_not_slide_sideways() -> None:
     for maneuver in MANEUVERS.values():
         t = DT * np.arange(80)
         xy = maneuver(t) + np.random.default_rng(6).normal(0, 0.1, (80, 2))
-        path = smooth_track(t, xy, sigma_m=0.1, yaw_hint_rad=0.0)
+        path = smooth_track(t, xy, sigma_m=0.1, motion=MotionModel(heading_rad=0.0))
         speed = np.hypot(*path.velocity_mps.T)
         across = path.velocity_mps[:, 1] * np.cos(path.yaw_rad) - path.velocity_mps[:, 0] * np.sin(path.yaw_rad)
         assert np.abs(across[speed > 1.0]).max() < 1e-6
@@ -227,7 +227,7 @@ def test_a_vehicle_does_not_slide_sideways() -> None:
 def test_reversing_keeps_the_heading_and_turns_the_speed() -> None:
     t = DT * np.arange(80)
     for hint, heading in ((None, 0.0), (0.2, 0.0), (np.pi, np.pi)):
-        path = smooth_track(t, reverse(t), sigma_m=0.1, yaw_hint_rad=hint)
+        path = smooth_track(t, reverse(t), sigma_m=0.1, motion=MotionModel(heading_rad=hint))
         assert np.abs(wrap_angle(path.yaw_rad - heading)).max() < 0.02
         speed = signed_speed(path.velocity_mps, path.yaw_rad)
         expected = np.cos(heading) * -2.5 * (t - 4.0)
@@ -237,7 +237,7 @@ def test_reversing_keeps_the_heading_and_turns_the_speed() -> None:
 def test_pedestrians_may_turn_on_the_spot() -> None:
     t = DT * np.arange(80)
     there_and_back = np.column_stack([np.where(t < 4, 1.4 * t, 11.2 - 1.4 * t), 0 * t])
-    path = smooth_track(t, there_and_back, sigma_m=0.05, sideways=True)
+    path = smooth_track(t, there_and_back, sigma_m=0.05, motion=MotionModel(holonomic=True))
     assert np.abs(path.yaw_rad[:30]).max() < 0.1
     assert np.abs(wrap_angle(path.yaw_rad[-30:] - np.pi)).max() < 0.1
 
@@ -294,7 +294,7 @@ def test_a_turned_scene_gives_a_turned_track() -> None:
 
 
 def test_one_position_is_a_place_and_two_are_a_way() -> None:
-    one = smooth_track([3.0], [[5.0, 6.0]], sigma_m=0.2, yaw_hint_rad=0.7)
+    one = smooth_track([3.0], [[5.0, 6.0]], sigma_m=0.2, motion=MotionModel(heading_rad=0.7))
     np.testing.assert_allclose(one.xy_m, [[5.0, 6.0]], atol=1e-9)
     np.testing.assert_allclose(one.velocity_mps, 0.0, atol=1e-9)
     np.testing.assert_allclose(one.covariance, [0.04 * np.eye(2)], rtol=1e-6)
@@ -352,10 +352,10 @@ def test_impossible_motion_is_flagged() -> None:
     t = DT * np.arange(60)
     assert smooth_track(t, turn(t), sigma_m=0.1).flags == ()
     spin = 2.0 * np.column_stack([np.sin(2.0 * t), 1 - np.cos(2.0 * t)])  # 4 m/s on a circle of 2 m
-    assert "curvature" in smooth_track(t, spin, sigma_m=0.01, jerk_density=1e4).flags
-    assert smooth_track(t, spin, sigma_m=0.01, jerk_density=1e4, sideways=True).flags == ()
+    assert "curvature" in smooth_track(t, spin, sigma_m=0.01, motion=MotionModel(1e4)).flags
+    assert smooth_track(t, spin, sigma_m=0.01, motion=MotionModel(1e4, holonomic=True)).flags == ()
     rocket = np.column_stack([10.0 * t**2, 0 * t])
-    assert "acceleration" in smooth_track(t, rocket, sigma_m=0.01, jerk_density=1e4).flags
+    assert "acceleration" in smooth_track(t, rocket, sigma_m=0.01, motion=MotionModel(1e4)).flags
 
 
 def test_knots_stand_no_nearer_than_their_step() -> None:
@@ -452,7 +452,7 @@ def test_what_drives_off_at_the_end_of_its_track_is_not_held() -> None:
         xy = truth + np.random.default_rng(seed).normal(0, 0.03, (100, 2))
         # Even where the positions are said to be far worse than they are.
         for said in (0.03, 0.15):
-            path = smooth_track(t, xy, sigma_m=said, yaw_hint_rad=0.0)
+            path = smooth_track(t, xy, sigma_m=said, motion=MotionModel(heading_rad=0.0))
             assert path.velocity_mps[-1, 0] > 1.5
             assert np.hypot(*path.velocity_mps[t < 7.5].T).max() < 0.1
 
@@ -462,21 +462,21 @@ def test_what_has_just_driven_off_is_not_held_however_badly_it_is_said_to_be_see
     truth = np.column_stack([np.clip(t - 9.2, 0.0, None) ** 2, 0 * t])
     for seed in range(4):
         xy = truth + np.random.default_rng(seed).normal(0, 0.02, (100, 2))
-        assert smooth_track(t, xy, sigma_m=0.2, yaw_hint_rad=0.0).velocity_mps[-1, 0] > 0.1
+        assert smooth_track(t, xy, sigma_m=0.2, motion=MotionModel(heading_rad=0.0)).velocity_mps[-1, 0] > 0.1
 
 
 def test_what_rolls_slowly_goes_along_its_hint() -> None:
     t = DT * np.arange(60)
     for seed in range(6):
         xy = np.column_stack([0.45 * t, 0 * t]) + np.random.default_rng(seed).normal(0, 0.3, (60, 2))
-        path = smooth_track(t, xy, sigma_m=0.3, jerk_density=4.0, yaw_hint_rad=0.0)
+        path = smooth_track(t, xy, sigma_m=0.3, motion=MotionModel(4.0, heading_rad=0.0))
         assert np.sqrt(np.mean(path.velocity_mps[:, 1] ** 2)) < 0.06
 
 
 def test_what_creeps_visibly_is_not_held() -> None:
     t = DT * np.arange(80)
     xy = np.column_stack([0.3 * t, 0 * t]) + np.random.default_rng(3).normal(0, 0.1, (80, 2))
-    path = smooth_track(t, xy, sigma_m=0.1, yaw_hint_rad=0.0)
+    path = smooth_track(t, xy, sigma_m=0.1, motion=MotionModel(heading_rad=0.0))
     assert path.velocity_mps[:, 0].mean() == pytest.approx(0.3, abs=0.05)
 
 
@@ -505,7 +505,9 @@ def test_densities_come_out_as_the_motion_was_made() -> None:
             state = step @ state + root @ rng.normal(size=(3, 2)) * np.sqrt([8.0, 0.2])
         noisy = np.array(xy) + rng.normal(0, 0.1, (120, 2))
         found.append(
-            smooth_interval(Observations(t, noisy, np.tile(0.01 * np.eye(2), (120, 1, 1))), t, Manner()).density
+            smooth_interval(
+                Observations(t, noisy, np.tile(0.01 * np.eye(2), (120, 1, 1))), t, MotionModel()
+            ).jerk_density
         )
     typical = np.exp(np.mean(np.log(found), axis=0))
     assert 8.0 / 2 < typical[0] < 8.0 * 2
@@ -526,7 +528,7 @@ def test_the_selected_inverse_has_the_blocks_of_the_whole_one(count: int) -> Non
     inverse = np.linalg.inv(whole).reshape(blocks.shape)
     np.testing.assert_allclose(on, inverse[k, :, k], atol=1e-12)
     np.testing.assert_allclose(above, inverse[k[:-1], :, k[1:]], atol=1e-12)
-    back = blocks_of(band_of(diagonal, off), size)
+    back = from_band(to_band(diagonal, off), size)
     np.testing.assert_allclose(back[0], diagonal)
     np.testing.assert_allclose(back[1], off)
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from log2sim.agents.confirmation import SAME_MOMENT_S, is_credible
 from log2sim.agents.lidar_tracking import LidarMatch, track_with_lidar
 from log2sim.agents.size import TrackGeometry, is_static, moving_geometry, parked_heading, static_geometry
-from log2sim.agents.smooth.smoother import SmoothedTrack, signed_speed, smooth_track
+from log2sim.agents.smooth.smoother import MotionModel, SmoothedTrack, signed_speed, smooth_track
 from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Agent, Obstacles, Track, Waypoints
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
 from log2sim.perception import box_fitting
@@ -159,18 +159,17 @@ def _moving_agent(
     track: Track, obstacles: Sequence[Obstacles | None], timeline: Timeline, *, smooth: bool
 ) -> AgentCandidate:
     m, group = track.measurements, GROUP_OF[track.category]
-    sideways = group in ("pedestrian",)
     t = timeline.seconds(m.t_ns)
     order = np.flatnonzero(np.r_[True, np.diff(t) > SAME_MOMENT_S])
     track, t = Track(track.category, track.tick[order], m.take(order)), t[order]
     extra = CENTER_SIGMA_M[group] ** 2 * np.eye(2)
     hint = _first_heading(track, t)
-    options: dict[str, Any] = {"jerk_density": JERK_DENSITY.get(group), "sideways": sideways, "yaw_hint_rad": hint}
+    motion = MotionModel(JERK_DENSITY.get(group), holonomic=group == "pedestrian", heading_rad=hint)
     xy, covariance = track.measurements.center_m[:, :2], track.measurements.covariance + extra
-    rough = smooth_track(t, xy, covariance=covariance, at_s=t, **options)
+    rough = smooth_track(t, xy, covariance=covariance, at_s=t, motion=motion)
     shape = moving_geometry(track, _headings(rough, group))
     for _ in range(2):
-        rough = smooth_track(t, shape.xy_m, covariance=shape.covariance + extra, at_s=t, **options)
+        rough = smooth_track(t, shape.xy_m, covariance=shape.covariance + extra, at_s=t, motion=motion)
         shape = moving_geometry(track, _headings(rough, group))
     sightings = _match_moving(track, rough, shape, obstacles, timeline)
     t_all = np.concatenate([t, timeline.seconds(np.array([s.t_ns for s in sightings], dtype=np.int64))])
@@ -184,8 +183,8 @@ def _moving_agent(
     life = np.arange(ticks_all.min(), ticks_all.max() + 1)
     at = timeline.seconds(timeline.t_ns[life])
     if not smooth:
-        options["jerk_density"] = 1e4
-    path = smooth_track(t_all[first], xy_all[first], covariance=covariance_all[first], at_s=at, **options)
+        motion = replace(motion, jerk_density=1e4)
+    path = smooth_track(t_all[first], xy_all[first], covariance=covariance_all[first], at_s=at, motion=motion)
     waypoints = _waypoints(path, _headings(path, group), shape, t, at, np.isin(life, ticks_all))
     quality = _quality(track, len(sightings)) | {
         "observed_share": round(float(np.isin(life, ticks_all).mean()), 3),

@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from log2sim.agents.smooth.heading import yaw_of_motion
-from log2sim.agents.smooth.smoother import SmoothedTrack, smooth_track
+from log2sim.agents.smooth.smoother import MotionModel, SmoothedTrack, smooth_track
 
-__all__ = ["SmoothedTrack", "smooth_track", "yaw_of_motion"]
+__all__ = ["MotionModel", "SmoothedTrack", "smooth_track", "yaw_of_motion"]

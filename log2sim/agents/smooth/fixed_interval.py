@@ -1,4 +1,4 @@
-"""Fixed-interval smoothing of planar positions: outliers, noise and maneuvers estimated, then one banded solve."""
+"""Fixed-interval smoothing of planar positions: outliers, noise and jerk densities estimated, then one banded solve."""
 
 from __future__ import annotations
 
@@ -7,62 +7,100 @@ from functools import cached_property
 
 import numpy as np
 
-from log2sim.agents.smooth.heading import course_is_known, unwrapped, yaw_of_motion
-from log2sim.agents.smooth.jerk_density import FIRM, OPEN, Belief, floor, separate_densities, shared_density
-from log2sim.agents.smooth.likelihood import Readings, carry, carrying, decided, hold, tolerant
-from log2sim.agents.smooth.motion_prior import Chain, Observations, nearest_index
-from log2sim.agents.smooth.quadratic import Minimum, Quadratic, minimize, total
-from log2sim.agents.smooth.zero_velocity import standing_tolerance
+from log2sim.agents.smooth.heading import course_is_known, unwrap, yaw_of_motion
+from log2sim.agents.smooth.jerk_density import (
+    STRONG_PRIOR,
+    WEAK_PRIOR,
+    DensityEstimator,
+    min_density,
+)
+from log2sim.agents.smooth.likelihood import (
+    MeasurementModel,
+    geman_mcclure_weights,
+    inlier_probability,
+    propagate,
+    transition,
+    zero_motion,
+)
+from log2sim.agents.smooth.motion_prior import MotionPrior, Observations, nearest_index
+from log2sim.agents.smooth.quadratic import Minimum, Quadratic, minimize, weighted_sum
+from log2sim.agents.smooth.zero_velocity import zero_velocity_sigma
 from log2sim.geometry import Array
 
-__all__ = ["Manner", "Observations", "Smoothed", "smooth_interval"]
+__all__ = ["MotionModel", "Observations", "Smoothed", "smooth_interval"]
 
-# Jerk density in m2/s5 that lets every maneuver through while outliers are looked for.
+# Jerk density in m2/s5 that follows every maneuver while outliers are searched.
 PERMISSIVE_JERK_DENSITY = 4.0
-TOLERANT_ROUNDS, DECIDING_ROUNDS = 4, 4
-SETTLED = 0.05
-# Noise and maneuvers are looked for on knots this far apart: in between the acceleration is taken as constant, which at the
-# jerk of an emergency brake costs a millimeter.
+MAX_ROBUST_ROUNDS, MAX_REWEIGHTING_ROUNDS = 4, 4
+# Reweighting ends when no weight changes by more.
+MAX_WEIGHT_CHANGE = 0.05
+# Minimum distance of knots while noise and densities are estimated: in between the acceleration is taken as constant, which
+# at the jerk of an emergency brake costs a millimeter.
 SEARCH_STEP_S = 0.39
-LEAST_KNOTS = 4
-# No outlier hides where every residual is within this of the first, least-squares solution.
-CLEAN_SIGMAS = 3.5
-# What stands neither moves nor gathers speed beyond these; what rolls slips sideways by less than this share of its speed,
-# since the heading that it holds is known to some degrees only.
-STANDING_HZ = 10.0
+MIN_KNOTS = 4
+# With every residual of the first least-squares solution below this there is no outlier.
+MAX_CLEAN_SIGMAS = 3.5
+# Ratio of the standard deviations of acceleration and velocity at a standstill.
+STANDSTILL_HZ = 10.0
+# Lateral velocity of a slow vehicle, standard deviation: constant and as a share of its speed, since the heading that it
+# holds is known to some degrees only.
 SLIP_MPS, SLIP_SHARE = 0.03, 0.15
 
 
 @dataclass(frozen=True)
-class Manner:
-    """How an object moves: `jerk_density` in m2/s5 or None to estimate it, `sideways` True where it may go any way,
-    `heading_rad` where its motion does not tell, `scaled` True where the noise is known up to a factor only, `wary` True
-    where observations err by some sigmas more often than Gaussian ones, and by the same amount again and again.
+class MotionModel:
+    """What is known of how an object moves.
+
+    Attributes
+    ----------
+    jerk_density : float, optional
+        Spectral density of the jerk in m2/s5; None to estimate it.
+    holonomic : bool
+        Whether it may move in any direction, as pedestrians do.
+    heading_rad : float, optional
+        Heading where the motion does not give one.
     """
 
     jerk_density: float | None = None
-    sideways: bool = False
+    holonomic: bool = False
     heading_rad: float | None = None
-    scaled: bool = False
-    wary: bool = False
 
     @property
-    def steers(self) -> bool:
-        """Whether how it maneuvers along and across its way is to be estimated separately."""
-        return self.jerk_density is None and not self.sideways
-
-    @property
-    def belief(self) -> Belief:
-        """What is believed about its jerk."""
-        return FIRM if self.wary else OPEN
-
-    def weights(self, squared: Array) -> Array:
-        """How much observations (n,) count, from their squared distances in sigmas."""
-        return tolerant(squared) if self.wary else decided(squared)
+    def density_by_direction(self) -> bool:
+        """Whether the jerk densities along and across the path are estimated separately."""
+        return self.jerk_density is None and not self.holonomic
 
 
 @dataclass(frozen=True, eq=False)
-class _Rough:
+class Smoothed:
+    """A smoothed trajectory at the asked times and what was found out about the observations.
+
+    Attributes
+    ----------
+    state : (T, 3, 2) float64
+        Position in m, velocity in m/s, acceleration in m/s2.
+    covariance : (T, 6, 6) float64
+    yaw_rad : (T,) float64
+    residual_m : (n,) float64
+        Distance of each observation from the trajectory.
+    weight : (n,) float64
+        Weight of each observation in [0, 1].
+    jerk_density : (float, float)
+        Along and across the path, m2/s5.
+    """
+
+    state: Array
+    covariance: Array
+    yaw_rad: Array
+    residual_m: Array
+    weight: Array
+    jerk_density: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class _RobustFit:
+    """State (K, 3, 2), weights (n,), jerk density in m2/s5 and factor on the noise's variance, both axes alike."""
+
     state: Array
     weight: Array
     density: float
@@ -70,166 +108,194 @@ class _Rough:
 
 
 @dataclass(frozen=True, eq=False)
-class Smoothed:
-    """`state` (T, 3, 2): position, velocity, acceleration at the asked times, `covariance` (T, 6, 6) of it, `yaw_rad` (T,);
-    `distance` (n,) in m and `weight` (n,) in [0, 1] of the observations; `density` in m2/s5 along and across the way.
+class _Problem:
+    """All terms as quadratic forms about `state` (K, 3, 2).
+
+    Attributes
+    ----------
+    prior : MotionPrior
+    measurement : MeasurementModel
+    state : (K, 3, 2) float64
+        Reference of the forms.
+    weight : (n,) float64
+    information : (n, 2, 2) float64
+        Inverse covariances of the observations.
+    jerk : (Quadratic, Quadratic)
+        Squared jerk along and across the path.
+    density : (float, float)
+        Jerk densities in m2/s5 along and across the path.
     """
 
-    state: Array
-    covariance: Array
-    yaw_rad: Array
-    distance: Array
-    weight: Array
-    density: tuple[float, float]
-
-
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """Everything as quadratic forms about `state` (K, 3, 2), the first rough solution."""
-
-    chain: Chain
-    readings: Readings
+    prior: MotionPrior
+    measurement: MeasurementModel
     state: Array
     weight: Array
     information: Array
     jerk: tuple[Quadratic, Quadratic]
     density: tuple[float, float]
 
-    def solve(self, held: Quadratic | None = None) -> tuple[Minimum, Array]:
-        """The minimum and the state (K, 3, 2) there."""
-        terms = [(1.0, self.evidence), *((1.0 / d, j) for d, j in zip(self.density, self.jerk))]
-        least = minimize(total(terms if held is None else [*terms, (1.0, held)]))
+    def solve(self, constraints: Quadratic | None = None) -> tuple[Minimum, Array]:
+        """Return the minimum and the state (K, 3, 2) there."""
+        terms = [(1.0, self.likelihood), *((1.0 / d, j) for d, j in zip(self.density, self.jerk))]
+        least = minimize(weighted_sum(terms if constraints is None else [*terms, (1.0, constraints)]))
         return least, self.state + least.step.reshape(self.state.shape)
 
     @cached_property
-    def evidence(self) -> Quadratic:
-        return self.readings.together(self.state, self.information * self.weight[:, None, None])
+    def likelihood(self) -> Quadratic:
+        """Weighted squared residuals."""
+        return self.measurement.coupled_axes(self.state, self.information * self.weight[:, None, None])
 
 
-def smooth_interval(observed: Observations, asked_s: Array, manner: Manner) -> Smoothed:
-    """Most probable trajectory given the positions, under white jerk along and across the way.
+def smooth_interval(observed: Observations, asked_s: Array, motion: MotionModel) -> Smoothed:
+    """Estimate the most probable trajectory given the positions, under white jerk along and across the path.
+
+    Parameters
+    ----------
+    observed : Observations
+    asked_s : (T,) float64, s
+        Times of the result.
+    motion : MotionModel
 
     Notes
     -----
-    For given densities the estimate is that of a Kalman filter with a Rauch-Tung-Striebel smoother for the
-    constant-acceleration model, found in one go; the densities maximize the marginal likelihood. Cost O(n).
+    For given densities the estimate equals that of a Kalman filter with the smoother of Rauch, Tung and Striebel (AIAA
+    Journal 3, 1965) for the constant-acceleration model, found in one banded solve. Jerk densities and the scale of the
+    noise maximize the marginal likelihood; outliers are reweighted iteratively; standstill and the nonholonomic
+    constraint of slow vehicles are pseudo-measurements. Cost O(n).
     """
-    chain = Chain.over(np.concatenate([observed.t_s, asked_s]))
-    problem, least, state = _settle(_pose(chain, Readings.of(observed, chain), manner), manner)
+    prior = MotionPrior.over(np.concatenate([observed.t_s, asked_s]))
+    problem, least, state = _reweight(_problem(prior, MeasurementModel.of(observed, prior), motion))
     covariance = least.covariance()
-    held = _held(problem, state, covariance, manner)
-    if held is not None:
-        least, state = problem.solve(held)
+    constraints = _constraints(problem, state, covariance, motion)
+    if constraints is not None:
+        least, state = problem.solve(constraints)
         covariance = least.covariance()
-    distance = np.hypot(*problem.readings.residual(state).T)
-    state, covariance = _read_off(chain, asked_s, state, covariance)
-    known = course_is_known(state[:, 1], covariance[:, 2:4, 2:4], sideways=manner.sideways, wary=manner.wary)
-    yaw = yaw_of_motion(state[:, 0], state[:, 1], hint_rad=manner.heading_rad, sideways=manner.sideways, known=known)
-    return Smoothed(state, covariance, yaw, distance, problem.weight, problem.density)
-
-
-def _pose(chain: Chain, readings: Readings, manner: Manner) -> _Problem:
-    """Find outliers, noise and densities on a chain of fewer knots, then pose the problem on all of them."""
-    observed = readings.observed
-    few = Chain.over(observed.t_s, SEARCH_STEP_S)
-    read = Readings.of(observed, few)
-    rough = _rough(few, read, manner)
-    information = np.asarray(np.linalg.inv(observed.r * rough.variance_factor), dtype=np.float64)
-    yaw = unwrapped(yaw_of_motion(rough.state[:, 0], rough.state[:, 1], hint_rad=manner.heading_rad))
-    density = (rough.density, rough.density)
-    if manner.steers and len(few) >= LEAST_KNOTS:
-        search = _about(few, read, rough.state, rough.weight, information, yaw)
-        density = separate_densities(few, search.jerk, search.evidence, rough.density, manner.belief)
-    course: Array = np.interp(chain.knots_s, few.knots_s, yaw)
-    problem = _about(chain, readings, carry(few, rough.state, chain.knots_s), rough.weight, information, course)
-    lowest = floor(chain)
-    return replace(problem, density=(max(density[0], lowest), max(density[1], lowest)))
-
-
-def _rough(chain: Chain, readings: Readings, manner: Manner) -> _Rough:
-    """Outliers, noise and one density for both axes, taken apart, which makes the search cheap."""
-    variance = np.trace(readings.observed.r, axis1=1, axis2=2) / 2
-    density = max(PERMISSIVE_JERK_DENSITY if manner.jerk_density is None else manner.jerk_density, floor(chain))
-    state, weight = _without_outliers(chain, readings, variance, density, manner)
-    if manner.jerk_density is not None and not manner.scaled:
-        return _Rough(state, weight, density, 1.0)
-    fixed = readings.apart(state, weight / variance)
-    density, factor = shared_density(
-        chain,
-        state,
-        fixed,
-        float(weight.sum()),
-        scaled=manner.scaled,
-        belief=manner.belief,
-        rounds=1 if manner.steers else 2,
+    residual = np.hypot(*problem.measurement.residual(state).T)
+    state, covariance = _at_times(prior, asked_s, state, covariance)
+    known = course_is_known(
+        state[:, 1], covariance[:, 2:4, 2:4], holonomic=motion.holonomic, correlated=observed.correlated
     )
-    density = density if manner.jerk_density is None else manner.jerk_density
-    state = state + minimize(total([(1.0, fixed), (factor / density, chain.jerk(state))])).step
-    squared = (readings.residual(state) ** 2).sum(axis=1) / (variance * factor)
-    return _Rough(state, manner.weights(squared), density, factor)
+    yaw = yaw_of_motion(state[:, 0], state[:, 1], hint_rad=motion.heading_rad, holonomic=motion.holonomic, known=known)
+    return Smoothed(state, covariance, yaw, residual, problem.weight, problem.density)
 
 
-def _about(chain: Chain, readings: Readings, state: Array, weight: Array, information: Array, yaw: Array) -> _Problem:
-    """The problem as forms about a state (K, 3, 2) with unwrapped headings (K,) that tell along from across."""
+def _weights(observed: Observations, squared: Array) -> Array:
+    """Weights (n,) of observations from their squared residuals in sigmas."""
+    return geman_mcclure_weights(squared) if observed.correlated else inlier_probability(squared)
+
+
+def _problem(prior: MotionPrior, measurement: MeasurementModel, motion: MotionModel) -> _Problem:
+    """Find outliers, noise and densities with fewer knots, then pose the problem on all of them."""
+    observed = measurement.observed
+    few = MotionPrior.over(observed.t_s, SEARCH_STEP_S)
+    coarse = MeasurementModel.of(observed, few)
+    fit = _robust_fit(few, coarse, motion)
+    information = np.asarray(np.linalg.inv(observed.r * fit.variance_factor), dtype=np.float64)
+    yaw = unwrap(yaw_of_motion(fit.state[:, 0], fit.state[:, 1], hint_rad=motion.heading_rad))
+    density = (fit.density, fit.density)
+    if motion.density_by_direction and len(few) >= MIN_KNOTS:
+        forms = few.jerk_by_direction(fit.state, _directions(yaw))
+        search = _Problem(few, coarse, fit.state, fit.weight, information, forms, density)
+        density = _estimator(observed, motion).by_direction(few, search.jerk, search.likelihood, fit.density)
+    course: Array = np.interp(prior.knots_s, few.knots_s, yaw)
+    state = propagate(few, fit.state, prior.knots_s)
+    lowest = min_density(prior)
+    densities = max(density[0], lowest), max(density[1], lowest)
+    forms = prior.jerk_by_direction(state, _directions(course))
+    return _Problem(prior, measurement, state, fit.weight, information, forms, densities)
+
+
+def _directions(yaw: Array) -> Array:
+    """Directions (K-1, 2), unit vectors, along the path between knots with unwrapped headings (K,)."""
     course = (yaw[1:] + yaw[:-1]) / 2
-    along = np.stack([np.cos(course), np.sin(course)], axis=-1)
-    return _Problem(chain, readings, state, weight, information, chain.jerk_by_direction(state, along), (1.0, 1.0))
+    return np.stack([np.cos(course), np.sin(course)], axis=-1)
 
 
-def _settle(problem: _Problem, manner: Manner) -> tuple[_Problem, Minimum, Array]:
-    """Settle which observations are wrong: the problem with their weights, its minimum and the state (K, 3, 2) there."""
-    for _ in range(DECIDING_ROUNDS):
+def _estimator(observed: Observations, motion: MotionModel) -> DensityEstimator:
+    prior = STRONG_PRIOR if observed.correlated else WEAK_PRIOR
+    return DensityEstimator(prior, observed.unknown_scale, rounds=1 if motion.density_by_direction else 2)
+
+
+def _robust_fit(prior: MotionPrior, measurement: MeasurementModel, motion: MotionModel) -> _RobustFit:
+    """Find outliers, noise and one density with both axes treated alike, which makes the search cheap."""
+    observed = measurement.observed
+    variance = np.trace(observed.r, axis1=1, axis2=2) / 2
+    density = PERMISSIVE_JERK_DENSITY if motion.jerk_density is None else motion.jerk_density
+    density = max(density, min_density(prior))
+    state, weight = _without_outliers(prior, measurement, variance, density)
+    if motion.jerk_density is not None and not observed.unknown_scale:
+        return _RobustFit(state, weight, density, 1.0)
+    likelihood = measurement.independent_axes(state, weight / variance)
+    density, factor = _estimator(observed, motion).isotropic(prior, state, likelihood, float(weight.sum()))
+    density = density if motion.jerk_density is None else motion.jerk_density
+    state = state + minimize(weighted_sum([(1.0, likelihood), (factor / density, prior.jerk(state))])).step
+    squared = (measurement.residual(state) ** 2).sum(axis=1) / (variance * factor)
+    return _RobustFit(state, _weights(observed, squared), density, factor)
+
+
+def _without_outliers(
+    prior: MotionPrior, measurement: MeasurementModel, variance: Array, density: float
+) -> tuple[Array, Array]:
+    """State (K, 3, 2) and weights (n,) by iteratively reweighted least squares, both axes alike, with a given density."""
+    start = np.zeros((len(prior), 3, 2))
+    jerk = prior.jerk(start)
+    weight = np.ones(len(variance))
+    for k in range(MAX_ROBUST_ROUNDS + 1):
+        likelihood = measurement.independent_axes(start, weight / variance)
+        state = minimize(weighted_sum([(1.0, likelihood), (1.0 / density, jerk)])).step
+        squared = (measurement.residual(state) ** 2).sum(axis=1) / variance
+        if squared.max() < MAX_CLEAN_SIGMAS**2:
+            break
+        last = k == MAX_ROBUST_ROUNDS
+        weight = _weights(measurement.observed, squared) if last else geman_mcclure_weights(squared)
+    return state, _weights(measurement.observed, squared)
+
+
+def _reweight(problem: _Problem) -> tuple[_Problem, Minimum, Array]:
+    """Reweight the observations until the weights settle: the problem, its minimum and the state (K, 3, 2) there."""
+    for _ in range(MAX_REWEIGHTING_ROUNDS):
         least, state = problem.solve()
-        residual = problem.readings.residual(state)
+        residual = problem.measurement.residual(state)
         squared = np.einsum("na,nab,nb->n", residual, problem.information, residual)
-        weight = manner.weights(squared)
-        if np.abs(weight - problem.weight).max() < SETTLED:
+        weight = _weights(problem.measurement.observed, squared)
+        if np.abs(weight - problem.weight).max() < MAX_WEIGHT_CHANGE:
             return problem, least, state
         problem = replace(problem, weight=weight)
     return problem, *problem.solve()
 
 
-def _without_outliers(
-    chain: Chain, readings: Readings, variance: Array, density: float, manner: Manner
-) -> tuple[Array, Array]:
-    """State (K, 3, 2) and weights (n,) with both axes alike and a given density."""
-    start = np.zeros((len(chain), 3, 2))
-    jerk = chain.jerk(start)
-    weight = np.ones(len(variance))
-    for k in range(TOLERANT_ROUNDS + 1):
-        evidence = readings.apart(start, weight / variance)
-        state = minimize(total([(1.0, evidence), (1.0 / density, jerk)])).step
-        squared = (readings.residual(state) ** 2).sum(axis=1) / variance
-        if squared.max() < CLEAN_SIGMAS**2:
-            break
-        weight = tolerant(squared) if k < TOLERANT_ROUNDS else manner.weights(squared)
-    return state, manner.weights(squared)
+def _constraints(problem: _Problem, state: Array, covariance: Array, motion: MotionModel) -> Quadratic | None:
+    """Pseudo-measurements of zero velocity where it stands and of little side slip where it rolls slowly.
 
-
-def _held(problem: _Problem, state: Array, covariance: Array, manner: Manner) -> Quadratic | None:
-    """What stands does not move, and what rolls slowly goes where it points: None where neither is the case."""
+    None where it does neither.
+    """
     velocity = state[:, 1]
-    tolerance = standing_tolerance(problem.chain.knots_s, problem.readings, problem.weight, state, covariance)
-    still = np.isfinite(tolerance)
-    known = course_is_known(velocity, covariance[:, 2:4, 2:4], sideways=manner.sideways, wary=manner.wary) & ~still
+    sigma = zero_velocity_sigma(problem.prior.knots_s, problem.measurement, problem.weight, state, covariance)
+    still = np.isfinite(sigma)
+    known = ~still & course_is_known(
+        velocity,
+        covariance[:, 2:4, 2:4],
+        holonomic=motion.holonomic,
+        correlated=problem.measurement.observed.correlated,
+    )
     slow = ~known & ~still
-    if manner.sideways or not (known.any() or manner.heading_rad is not None):
+    if motion.holonomic or not (known.any() or motion.heading_rad is not None):
         slow[:] = False
     if not (still.any() or slow.any()):
         return None
-    yaw = yaw_of_motion(state[:, 0], velocity, hint_rad=manner.heading_rad, sideways=manner.sideways, known=known)
+    yaw = yaw_of_motion(state[:, 0], velocity, hint_rad=motion.heading_rad, holonomic=motion.holonomic, known=known)
     across = np.stack([-np.sin(yaw), np.cos(yaw)], axis=-1)
     slip = SLIP_MPS + SLIP_SHARE * np.hypot(*velocity.T)
     about_velocity = (slow / slip**2)[:, None, None] * across[:, :, None] * across[:, None, :]
-    about_velocity = about_velocity + (tolerance**-2)[:, None, None] * np.eye(2)
-    about_acceleration = ((tolerance * STANDING_HZ) ** -2)[:, None, None] * np.eye(2)
-    return hold(problem.state, about_velocity, about_acceleration)
+    about_velocity = about_velocity + (sigma**-2)[:, None, None] * np.eye(2)
+    about_acceleration = ((sigma * STANDSTILL_HZ) ** -2)[:, None, None] * np.eye(2)
+    return zero_motion(problem.state, about_velocity, about_acceleration)
 
 
-def _read_off(chain: Chain, asked_s: Array, state: Array, covariance: Array) -> tuple[Array, Array]:
-    """States (T, 3, 2) and covariances (T, 6, 6) at asked times, each carried over from the nearest knot."""
-    place = nearest_index(chain.knots_s, asked_s)
-    if np.array_equal(chain.knots_s[place], asked_s):
-        return state[place], covariance[place]
-    both = np.einsum("tij,ab->tiajb", carrying(asked_s - chain.knots_s[place]), np.eye(2)).reshape(-1, 6, 6)
-    return carry(chain, state, asked_s), both @ covariance[place] @ np.swapaxes(both, 1, 2)
+def _at_times(prior: MotionPrior, asked_s: Array, state: Array, covariance: Array) -> tuple[Array, Array]:
+    """States (T, 3, 2) and covariances (T, 6, 6) at asked times, each propagated from the nearest knot."""
+    knot = nearest_index(prior.knots_s, asked_s)
+    if np.array_equal(prior.knots_s[knot], asked_s):
+        return state[knot], covariance[knot]
+    both = np.einsum("tij,ab->tiajb", transition(asked_s - prior.knots_s[knot]), np.eye(2)).reshape(-1, 6, 6)
+    return propagate(prior, state, asked_s), both @ covariance[knot] @ np.swapaxes(both, 1, 2)

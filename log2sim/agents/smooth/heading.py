@@ -1,4 +1,4 @@
-"""Heading from motion: where it goes while it goes, held while it stands."""
+"""Heading from motion: the course where the object moves, held where it stands."""
 
 from __future__ import annotations
 
@@ -7,29 +7,31 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array, wrap_angle
 
-# Below this the direction of a smoothed velocity is noise.
-MOVING_MPS = 1.0
-WALKING_MPS = 0.4
-# A course counts where its speed is this many of its own standard deviations: it is known to some ten degrees then. Who
-# may turn on the spot has no heading to hold on to, so less will do.
-COURSE_SIGMAS = {False: 5.0, True: 2.5}
-SLOWEST_COURSE_MPS = {False: 0.5, True: 0.3}
-# Without a course anywhere, the way from end to end tells one if it is longer than this.
-LEAST_WAY_M = 1.0
+# Below these speeds of vehicles and pedestrians the direction of a smoothed velocity is noise.
+MIN_MOVING_MPS = 1.0
+MIN_WALKING_MPS = 0.4
+# A course is known where the speed is this many of its own standard deviations, that is to some ten degrees; by whether
+# the object is holonomic. One that may turn on the spot has no heading to hold, so less will do.
+MIN_COURSE_SIGMAS = {False: 5.0, True: 2.5}
+MIN_COURSE_MPS = {False: 0.5, True: 0.3}
+# What is covered at a lower speed is noise of a standing object.
+MIN_PROGRESS_MPS = 0.2
+# Without a known course, the displacement from end to end tells one if it is longer.
+MIN_DISPLACEMENT_M = 1.0
 
 
 def course_is_known(
-    velocity_mps: Array, covariance: Array, *, sideways: bool = False, wary: bool = False
+    velocity_mps: Array, covariance: Array, *, holonomic: bool = False, correlated: bool = False
 ) -> NDArray[np.bool_]:
-    """Where (T,) the direction of velocities (T, 2) with covariances (T, 2, 2) tells a heading.
+    """Where (T,) the direction of velocities (T, 2) with covariances (T, 2, 2) gives the heading.
 
-    `wary` where the covariances say too little of what repeats from tick to tick: then by speed alone.
+    With `correlated` errors the covariances are too small, so the speed alone decides.
     """
     speed = np.hypot(*velocity_mps.T)
-    if wary:
-        return np.asarray(speed > (WALKING_MPS if sideways else MOVING_MPS))
+    if correlated:
+        return np.asarray(speed > (MIN_WALKING_MPS if holonomic else MIN_MOVING_MPS))
     sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
-    return np.asarray(speed > np.maximum(COURSE_SIGMAS[sideways] * sigma, SLOWEST_COURSE_MPS[sideways]))
+    return np.asarray(speed > np.maximum(MIN_COURSE_SIGMAS[holonomic] * sigma, MIN_COURSE_MPS[holonomic]))
 
 
 def yaw_of_motion(
@@ -37,36 +39,45 @@ def yaw_of_motion(
     velocity_mps: Array,
     *,
     hint_rad: float | None = None,
-    sideways: bool = False,
+    holonomic: bool = False,
     known: NDArray[np.bool_] | None = None,
 ) -> Array:
-    """Heading (T,) in rad of a trajectory (T, 2) with velocities (T, 2), whose course is `known` (T,).
+    """Heading (T,) in rad of a trajectory.
 
-    `hint_rad` is where the vehicle points when it has not moved yet; it also tells driving from reversing. Between two
-    moving parts the heading changes with the distance covered, so what stands does not turn. Without motion and hint: 0.
+    Between two moving parts the heading changes with the distance covered, so what stands does not turn.
+
+    Parameters
+    ----------
+    xy_m : (T, 2) float64, m
+    velocity_mps : (T, 2) float64, m/s
+    hint_rad : float, optional
+        Heading before the first motion; it also tells driving from reversing. Without motion and hint the heading is 0.
+    holonomic : bool
+        True for pedestrians, who turn round instead of moving backward.
+    known : (T,) bool, optional
+        Where the course is known; by default where it is fast enough.
     """
     speed = np.hypot(*velocity_mps.T)
-    moving = speed > (WALKING_MPS if sideways else MOVING_MPS) if known is None else known
+    moving = speed > (MIN_WALKING_MPS if holonomic else MIN_MOVING_MPS) if known is None else known
     if not moving.any():
-        way = xy_m[-1] - xy_m[0]
-        overall = float(np.arctan2(way[1], way[0])) if np.hypot(*way) > LEAST_WAY_M else 0.0
+        displacement = xy_m[-1] - xy_m[0]
+        far = np.hypot(*displacement) > MIN_DISPLACEMENT_M
+        overall = float(np.arctan2(displacement[1], displacement[0])) if far else 0.0
         return np.full(len(xy_m), overall if hint_rad is None else hint_rad)
     course = np.arctan2(velocity_mps[:, 1], velocity_mps[:, 0])
-    # Noise of a standing object adds up as distance; only what is covered at some speed counts.
-    creeping = speed > 0.2
-    step = np.hypot(*np.diff(xy_m, axis=0).T) * (creeping[1:] | creeping[:-1])
-    progress = np.concatenate([[0.0], np.cumsum(step)])
-    # Who walks turns round; only what steers goes backward.
-    angles = unwrapped(course[moving] if sideways else _without_reversals(course[moving], hint_rad))
-    return wrap_angle(np.interp(progress, progress[moving], angles))
+    advancing = speed > MIN_PROGRESS_MPS
+    step = np.hypot(*np.diff(xy_m, axis=0).T) * (advancing[1:] | advancing[:-1])
+    distance = np.concatenate([[0.0], np.cumsum(step)])
+    angles = unwrap(course[moving] if holonomic else _heading_of_course(course[moving], hint_rad))
+    return wrap_angle(np.interp(distance, distance[moving], angles))
 
 
-def unwrapped(angles: Array) -> Array:
-    """Angles (n,) without leaps between neighbors."""
+def unwrap(angles: Array) -> Array:
+    """Angles (n,) without jumps by full turns between neighbors."""
     return np.concatenate([angles[:1], angles[0] + np.cumsum(wrap_angle(np.diff(angles)))])
 
 
-def _without_reversals(course: Array, hint_rad: float | None) -> Array:
+def _heading_of_course(course: Array, hint_rad: float | None) -> Array:
     """Turn courses (n,) into headings: a jump by more than a right angle is a change of gear, not a turn on the spot."""
     first = course[0]
     if hint_rad is not None and abs(float(wrap_angle(first - hint_rad))) > np.pi / 2:

@@ -1,4 +1,4 @@
-"""What observations and assumptions say about a chain of states, each as a quadratic form."""
+"""The measurement model and pseudo-measurements of a chain of states, each as a quadratic form, and robust weights."""
 
 from __future__ import annotations
 
@@ -10,118 +10,136 @@ from numpy.typing import NDArray
 from log2sim.agents.smooth.motion_prior import (
     ACCELERATION_PRIOR_MPS2,
     VELOCITY_PRIOR_MPS,
-    Chain,
+    MotionPrior,
     Observations,
+    kronecker,
     nearest_index,
-    spread,
 )
 from log2sim.agents.smooth.quadratic import Quadratic
 from log2sim.geometry import Array
 
 # Information about position, velocity and acceleration of the first knot.
-BELIEFS = np.array([0.0, VELOCITY_PRIOR_MPS**-2, ACCELERATION_PRIOR_MPS2**-2])
-# Share of positions that are wrong and how much wider they scatter than the others.
-WRONG_SHARE, WRONG_WIDTH = 0.02, 10.0
-# While the trajectory is not yet known, an observation at this many sigmas counts a quarter.
-TOLERANCE_SIGMAS = 3.0
+INITIAL_INFORMATION = np.array([0.0, VELOCITY_PRIOR_MPS**-2, ACCELERATION_PRIOR_MPS2**-2])
+# Prior share of outliers and the ratio of their standard deviation to that of inliers.
+OUTLIER_SHARE, OUTLIER_WIDTH = 0.02, 10.0
+# Scale of the Geman-McClure weights: an observation at this many sigmas counts a quarter.
+GEMAN_MCCLURE_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class Readings:
-    """Observations and how each is read off a chain: knot `place` (n,), and `reading` (n, 3) of its three unknowns.
+class MeasurementModel:
+    """Which state each observation measures, and how.
 
-    `first` are the rows with which another knot begins. All forms contain vague beliefs about the first knot, which make a
-    single observation, or a pair of them, have an answer.
+    All forms contain the vague prior of the first knot, with which a single observation, or two of them, have a solution.
+
+    Attributes
+    ----------
+    observed : Observations
+    knot : (n,) int
+        Index of the knot that each observation measures.
+    design : (n, 3) float64
+        Row that takes the knot's position, velocity and acceleration to the observed position.
+    group_start : (G,) int
+        Rows at which the observations of another knot begin.
     """
 
     observed: Observations
-    place: NDArray[np.intp]
-    reading: Array
-    first: NDArray[np.intp]
+    knot: NDArray[np.intp]
+    design: Array
+    group_start: NDArray[np.intp]
 
     @classmethod
-    def of(cls, observed: Observations, chain: Chain) -> Readings:
-        place = nearest_index(chain.knots_s, observed.t_s)
-        first = np.concatenate([[0], np.flatnonzero(place[1:] > place[:-1]) + 1])
-        return cls(observed, place, taylor(observed.t_s - chain.knots_s[place]), first)
+    def of(cls, observed: Observations, prior: MotionPrior) -> MeasurementModel:
+        """Tie each observation to the nearest knot of a motion prior."""
+        knot = nearest_index(prior.knots_s, observed.t_s)
+        start = np.concatenate([[0], np.flatnonzero(knot[1:] > knot[:-1]) + 1])
+        return cls(observed, knot, position_row(observed.t_s - prior.knots_s[knot]), start)
 
     def residual(self, state: Array) -> Array:
-        """Observed less read (n, 2)."""
-        return self.observed.xy - np.einsum("ni,nia->na", self.reading, state[self.place])
+        """Observed minus predicted positions (n, 2) for a state (K, 3, 2)."""
+        return np.asarray(self.observed.xy - np.einsum("ni,nia->na", self.design, state[self.knot]))
 
-    def apart(self, state: Array, information: Array) -> Quadratic:
-        """Squared residuals under scalar information (n,), over the three unknowns that both axes share."""
+    def independent_axes(self, state: Array, information: Array) -> Quadratic:
+        """Squared residuals with scalar information (n,), over the three unknowns that both axes share."""
         residual = self.residual(state)
-        rows = self.reading * information[:, None]
-        diagonal = self._gather(rows[:, :, None] * self.reading[:, None, :], len(state))
-        pull = self._gather(rows[:, :, None] * residual[:, None, :], len(state))
-        diagonal[0] += np.diag(BELIEFS)
-        pull[0] -= BELIEFS[:, None] * state[0]
-        value = float(information @ (residual**2).sum(axis=1) + BELIEFS @ (state[0] ** 2).sum(axis=1))
-        return Quadratic.of(diagonal, None, pull, value)
+        rows = self.design * information[:, None]
+        diagonal = self._sum_by_knot(rows[:, :, None] * self.design[:, None, :], len(state))
+        gradient = self._sum_by_knot(rows[:, :, None] * residual[:, None, :], len(state))
+        diagonal[0] += np.diag(INITIAL_INFORMATION)
+        gradient[0] -= INITIAL_INFORMATION[:, None] * state[0]
+        value = float(information @ (residual**2).sum(axis=1) + INITIAL_INFORMATION @ (state[0] ** 2).sum(axis=1))
+        return Quadratic.of(diagonal, None, gradient, value)
 
-    def together(self, state: Array, information: Array) -> Quadratic:
-        """Squared residuals under information (n, 2, 2), over all six unknowns of a knot."""
+    def coupled_axes(self, state: Array, information: Array) -> Quadratic:
+        """Squared residuals with information (n, 2, 2), over all six unknowns of a knot."""
         residual = self.residual(state)
         weighted = np.einsum("nab,nb->na", information, residual)
-        h = self.reading
-        diagonal = self._gather(spread(h[:, :, None] * h[:, None, :], information), len(state))
-        pull = self._gather((h[:, :, None] * weighted[:, None, :]).reshape(-1, 6, 1), len(state))
-        believed = np.repeat(BELIEFS, 2)
-        diagonal[0] += np.diag(believed)
-        pull[0, :, 0] -= believed * state[0].ravel()
-        value = float(np.vdot(weighted, residual) + believed @ state[0].ravel() ** 2)
-        return Quadratic.of(diagonal, None, pull, value)
+        h = self.design
+        diagonal = self._sum_by_knot(kronecker(h[:, :, None] * h[:, None, :], information), len(state))
+        gradient = self._sum_by_knot((h[:, :, None] * weighted[:, None, :]).reshape(-1, 6, 1), len(state))
+        initial = np.repeat(INITIAL_INFORMATION, 2)
+        diagonal[0] += np.diag(initial)
+        gradient[0, :, 0] -= initial * state[0].ravel()
+        value = float(np.vdot(weighted, residual) + initial @ state[0].ravel() ** 2)
+        return Quadratic.of(diagonal, None, gradient, value)
 
-    def _gather(self, values: Array, count: int) -> Array:
-        """Sums (K, ...) of the values (n, ...) read off each knot."""
-        gathered = np.zeros((count, *values.shape[1:]))
-        unique = len(self.first) == len(self.place)
-        gathered[self.place[self.first]] = values if unique else np.add.reduceat(values, self.first, axis=0)
-        return gathered
+    def _sum_by_knot(self, values: Array, count: int) -> Array:
+        """Sum values (n, ...) of the observations of each knot to (K, ...)."""
+        sums = np.zeros((count, *values.shape[1:]))
+        unique = len(self.group_start) == len(self.knot)
+        sums[self.knot[self.group_start]] = values if unique else np.add.reduceat(values, self.group_start, axis=0)
+        return sums
 
 
-def taylor(offset_s: Array) -> Array:
-    """How position, velocity and acceleration make a position at an offset (n,): (n, 3)."""
+def position_row(offset_s: Array) -> Array:
+    """Rows (n, 3) that take position, velocity and acceleration to the position after an offset (n,)."""
     return np.stack([np.ones_like(offset_s), offset_s, offset_s**2 / 2], axis=-1)
 
 
-def carrying(offset_s: Array) -> Array:
-    """How a state passes on over an offset (n,) at constant acceleration: (n, 3, 3)."""
+def transition(offset_s: Array) -> Array:
+    """Transition matrices (n, 3, 3) over offsets (n,) at constant acceleration."""
     step = np.zeros((len(offset_s), 3, 3))
-    step[:, 0] = taylor(offset_s)
+    step[:, 0] = position_row(offset_s)
     step[:, 1, 1:] = step[:, 0, :2]
     step[:, 2, 2] = 1.0
     return step
 
 
-def carry(chain: Chain, state: Array, asked_s: Array) -> Array:
-    """States (T, 3, 2) at asked times, each from the nearest knot's (K, 3, 2)."""
-    place = nearest_index(chain.knots_s, asked_s)
-    return carrying(asked_s - chain.knots_s[place]) @ state[place]
+def propagate(prior: MotionPrior, state: Array, t_s: Array) -> Array:
+    """Propagate the state (K, 3, 2) from the nearest knot to each time (T,): (T, 3, 2)."""
+    knot = nearest_index(prior.knots_s, t_s)
+    return transition(t_s - prior.knots_s[knot]) @ state[knot]
 
 
-def hold(state: Array, velocity_information: Array, acceleration_information: Array) -> Quadratic:
-    """Beliefs that velocities and accelerations are zero, with information (K, 2, 2) about each."""
+def zero_motion(state: Array, velocity_information: Array, acceleration_information: Array) -> Quadratic:
+    """Pseudo-measurements of zero velocity and zero acceleration, with information (K, 2, 2) about each."""
     count = len(state)
-    diagonal, pull = np.zeros((count, 6, 6)), np.zeros((count, 6, 1))
+    diagonal, gradient = np.zeros((count, 6, 6)), np.zeros((count, 6, 1))
     diagonal[:, 2:4, 2:4], diagonal[:, 4:, 4:] = velocity_information, acceleration_information
     v = np.einsum("kab,kb->ka", velocity_information, state[:, 1])
     a = np.einsum("kab,kb->ka", acceleration_information, state[:, 2])
-    pull[:, 2:4, 0], pull[:, 4:, 0] = -v, -a
-    return Quadratic.of(diagonal, None, pull, float(np.vdot(v, state[:, 1]) + np.vdot(a, state[:, 2])))
+    gradient[:, 2:4, 0], gradient[:, 4:, 0] = -v, -a
+    return Quadratic.of(diagonal, None, gradient, float(np.vdot(v, state[:, 1]) + np.vdot(a, state[:, 2])))
 
 
-def tolerant(squared: Array) -> Array:
-    """Weights (n,) for squared distances in sigmas before the outliers are known: none is believed or refused wholly."""
-    return np.asarray(1.0 / (1.0 + squared / TOLERANCE_SIGMAS**2) ** 2)
+def geman_mcclure_weights(squared: Array) -> Array:
+    """Robust weights (n,) of squared residuals in sigmas, while the outliers are not yet known.
 
-
-def decided(squared: Array) -> Array:
-    """Probability (n,) that an observation is none of the wrong ones, from its squared distance in sigmas, 1 at none.
-
-    Two Gaussians, the wrong ones' wider. What is right keeps nearly all its weight, unlike under `tolerant`.
+    Notes
+    -----
+    Geman and McClure, Statistical methods for tomographic image reconstruction (1987).
     """
-    odds = WRONG_SHARE / (1.0 - WRONG_SHARE) / WRONG_WIDTH**2
-    exponent = np.minimum(squared, 200.0) / 2.0 * (1.0 - WRONG_WIDTH**-2)
+    return np.asarray(1.0 / (1.0 + squared / GEMAN_MCCLURE_SIGMAS**2) ** 2)
+
+
+def inlier_probability(squared: Array) -> Array:
+    """Probability (n,) of being an inlier, from squared residuals in sigmas, relative to that of a residual of zero.
+
+    Notes
+    -----
+    Mixture of two Gaussians, that of the outliers `OUTLIER_WIDTH` times as wide (expectation step of Dempster, Laird and
+    Rubin, 1977, section 4.3). Inliers keep nearly all their weight, unlike with `geman_mcclure_weights`.
+    """
+    odds = OUTLIER_SHARE / (1.0 - OUTLIER_SHARE) / OUTLIER_WIDTH**2
+    exponent = np.minimum(squared, 200.0) / 2.0 * (1.0 - OUTLIER_WIDTH**-2)
     return np.asarray((1.0 + odds) / (1.0 + odds * np.exp(exponent)))

@@ -1,4 +1,8 @@
-"""Positions that change by white jerk: knots in time, and what the motion model and the observations say about them."""
+"""The motion prior: states at knots in time, tied by a constant-acceleration model that is driven by white jerk.
+
+It is the continuous Wiener process acceleration model of Bar-Shalom, Li and Kirubarajan, Estimation with Applications to
+Tracking and Navigation (2001), section 6.2.3, for uneven steps.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +14,11 @@ from numpy.typing import NDArray
 from log2sim.agents.smooth.quadratic import Quadratic
 from log2sim.geometry import Array
 
-# Knots stand no nearer to each other than this; in between the acceleration is taken as constant, which at 100 m/s3 of
-# jerk costs 0.02 mm. The information that ties two knots grows like the fifth power of the inverse step: 1 ms apart they
-# would leave no digits for the data.
+# Minimum distance of two knots; in between the acceleration is taken as constant, which at 100 m/s3 of jerk costs 0.02 mm.
+# The information that ties two knots grows with the fifth power of the inverse step: 1 ms apart they would leave no digits
+# for the data.
 KNOT_STEP_S = 0.02
-# Vague beliefs about the first state.
+# Standard deviations of the vague prior of the first state.
 VELOCITY_PRIOR_MPS = 40.0
 ACCELERATION_PRIOR_MPS2 = 4.0
 
@@ -25,18 +29,44 @@ _UNIT_INFORMATION = np.linalg.inv(_UNIT_Q)
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Positions `xy` (n, 2) with covariances `r` (n, 2, 2) at times `t_s` (n,)."""
+    """Measured positions with their noise.
+
+    Attributes
+    ----------
+    t_s : (n,) float64, s
+    xy : (n, 2) float64, m
+    r : (n, 2, 2) float64, m2
+        Covariance of each position.
+    unknown_scale : bool
+        Whether `r` is known up to a common factor only.
+    correlated : bool
+        Whether errors repeat from tick to tick and have heavier tails than Gaussian ones, as those of measured boxes.
+    """
 
     t_s: Array
     xy: Array
     r: Array
+    unknown_scale: bool = False
+    correlated: bool = False
 
 
 @dataclass(frozen=True, eq=False)
-class Chain:
-    """Knots (K,) and the motion between them: `step` (K-1, 3, 3) carries position, velocity and acceleration on,
-    `inverse` (K-1, 3, 3) is the information about what is left, at a jerk density of 1, `inverse_before` the same seen from
-    the earlier knot. `diagonal` (K, 3, 3) and `cross` (K-1, 3, 3) are the blocks of the squared jerk.
+class MotionPrior:
+    """Knots and the motion between them, at a jerk density of 1 m2/s5.
+
+    Attributes
+    ----------
+    knots_s : (K,) float64, s
+    step : (K-1, 3, 3) float64
+        Transition of position, velocity and acceleration to the next knot.
+    inverse : (K-1, 3, 3) float64
+        Information about the process noise of each step.
+    inverse_before : (K-1, 3, 3) float64
+        The same, propagated to the earlier knot.
+    cross : (K-1, 3, 3) float64
+        Blocks above the diagonal of the squared jerk.
+    diagonal : (K, 3, 3) float64
+        Blocks on the diagonal of the squared jerk.
     """
 
     knots_s: Array
@@ -47,8 +77,8 @@ class Chain:
     diagonal: Array
 
     @classmethod
-    def over(cls, t_s: Array, step_s: float = KNOT_STEP_S) -> Chain:
-        """Chain with knots out of the times (n,), no nearer to each other than a step."""
+    def over(cls, t_s: Array, step_s: float = KNOT_STEP_S) -> MotionPrior:
+        """Build the prior with knots out of the times (n,), none nearer to another than `step_s`."""
         knots = place_knots(t_s, step_s)
         dt = np.diff(knots)
         # Inverted in units of the step: steps from milliseconds to seconds are equally well conditioned.
@@ -65,54 +95,55 @@ class Chain:
         return cls(knots, step, inverse, before, cross, diagonal)
 
     def __len__(self) -> int:
+        """Return the number of knots."""
         return len(self.knots_s)
 
     def jerk(self, state: Array) -> Quadratic:
-        """Squared jerk of every column of a reference state (K, 3, 2), over a density of 1."""
-        return Quadratic.of(self.diagonal, self.cross, *self._pull(state[1:] - self.step @ state[:-1]))
+        """Squared jerk over the three unknowns that both axes share, about a state (K, 3, 2)."""
+        return Quadratic.of(self.diagonal, self.cross, *self._gradient(state[1:] - self.step @ state[:-1]))
 
     def jerk_by_direction(self, state: Array, direction: Array) -> tuple[Quadratic, Quadratic]:
-        """The squared jerk along and across a direction (K-1, 2) at every step, over all six unknowns of a knot."""
+        """Squared jerk along and across unit directions (K-1, 2) of the steps, over all six unknowns of a knot."""
         outer = direction[:, :, None] * direction[:, None, :]
-        left = state[1:] - self.step @ state[:-1]
-        along = left @ outer
+        noise = state[1:] - self.step @ state[:-1]
+        along = noise @ outer
         # Each step has a direction of its own, so a knot's block takes two of them.
         diagonal = np.zeros((len(self), 6, 6))
-        diagonal[:-1] = spread(self.inverse_before, outer)
-        diagonal[1:] += spread(self.inverse, outer)
-        cross = spread(self.cross, outer)
-        lengthwise = self._part(along, diagonal, cross)
+        diagonal[:-1] = kronecker(self.inverse_before, outer)
+        diagonal[1:] += kronecker(self.inverse, outer)
+        cross = kronecker(self.cross, outer)
+        longitudinal = self._form(along, diagonal, cross)
         np.negative(diagonal, out=diagonal)
         np.negative(cross, out=cross)
         for axis in range(2):  # across is all that is not along
             diagonal[:, axis::2, axis::2] += self.diagonal
             cross[:, axis::2, axis::2] += self.cross
-        return lengthwise, self._part(left - along, diagonal, cross)
+        return longitudinal, self._form(noise - along, diagonal, cross)
 
-    def _part(self, left: Array, diagonal: Array, cross: Array) -> Quadratic:
-        pull, value = self._pull(left)
-        return Quadratic.of(diagonal, cross, pull.reshape(-1, 6, 1), value)
+    def _form(self, noise: Array, diagonal: Array, cross: Array) -> Quadratic:
+        gradient, value = self._gradient(noise)
+        return Quadratic.of(diagonal, cross, gradient.reshape(-1, 6, 1), value)
 
-    def _pull(self, left: Array) -> tuple[Array, float]:
-        """How what is left (K-1, 3, 2) of every step pulls at the knots (K, 3, 2), and its square."""
-        weighted = self.inverse @ left
-        pull = np.zeros((len(self), 3, 2))
-        pull[:-1] = np.swapaxes(self.step, 1, 2) @ weighted
-        pull[1:] -= weighted
-        return pull, float(np.vdot(left, weighted))
+    def _gradient(self, noise: Array) -> tuple[Array, float]:
+        """Negative half gradient (K, 3, 2) of the squared jerk for process noise (K-1, 3, 2), and its value."""
+        weighted = self.inverse @ noise
+        gradient = np.zeros((len(self), 3, 2))
+        gradient[:-1] = np.swapaxes(self.step, 1, 2) @ weighted
+        gradient[1:] -= weighted
+        return gradient, float(np.vdot(noise, weighted))
 
 
-def spread(blocks: Array, over: Array) -> Array:
-    """Blocks (n, 3, 3) of one axis times weights (n, 2, 2) of each pair of axes: (n, 6, 6)."""
+def kronecker(blocks: Array, weights: Array) -> Array:
+    """Kronecker products (n, 6, 6) of blocks (n, 3, 3) of one axis and weights (n, 2, 2) of each pair of axes."""
     product = np.empty((len(blocks), 6, 6))
     for first in range(2):
         for second in range(2):
-            np.multiply(blocks, over[:, first, second, None, None], out=product[:, first::2, second::2])
+            np.multiply(blocks, weights[:, first, second, None, None], out=product[:, first::2, second::2])
     return product
 
 
 def place_knots(t_s: Array, step_s: float = KNOT_STEP_S) -> Array:
-    """Times (K,) out of those given (n,), from the first on, none nearer to the one before than `step_s`."""
+    """Select knots (K,) from times (n,), from the first on, none nearer to the one before than `step_s`."""
     times = np.unique(t_s)
     if np.all(np.diff(times) >= step_s):
         return times
@@ -124,7 +155,7 @@ def place_knots(t_s: Array, step_s: float = KNOT_STEP_S) -> Array:
 
 
 def nearest_index(knots: Array, t: Array) -> NDArray[np.intp]:
-    """Index of the knot nearest to every time."""
+    """Index of the knot nearest to each time."""
     if len(knots) == 1:
         return np.zeros(len(t), dtype=np.intp)
     i = np.clip(np.searchsorted(knots, t), 1, len(knots) - 1)
