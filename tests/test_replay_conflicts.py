@@ -10,7 +10,8 @@ from replay_maneuvers import scenario_of
 from replay_scenes import line
 from test_replay_contacts import SPACING_S, T_S, boxes_of
 
-from log2sim.simulation.metrics.box_tracks import Boxes, rectangles_overlap
+from log2sim.geometry import rectangles_overlap
+from log2sim.simulation.metrics.box_tracks import Boxes
 from log2sim.simulation.metrics.conflicts import conflicts, least
 from log2sim.simulation.metrics.post_encroachment_time import CROSSING_RAD, encroachments
 from log2sim.simulation.metrics.time_to_collision import HORIZON_S, approaches, time_to_touch

@@ -7,8 +7,8 @@ import pytest
 from replay_maneuvers import agent_from, scenario_of
 from scipy.optimize import brentq
 
-from log2sim.geometry import wrap_angle
-from log2sim.simulation.metrics.box_tracks import Boxes, rectangles_overlap
+from log2sim.geometry import rectangles_overlap, wrap_angle
+from log2sim.simulation.metrics.box_tracks import Boxes
 from log2sim.simulation.metrics.collisions import collisions, contacts
 from log2sim.simulation.metrics.continuous_collision import STEPS, Motion, first_touch
 from log2sim.simulation.runner import replay

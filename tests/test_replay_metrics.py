@@ -7,7 +7,8 @@ import pytest
 from replay_maneuvers import agent_from, driven, lane_change, scenario_of
 
 from log2sim.errors import CheckFailed
-from log2sim.simulation.metrics.box_tracks import Boxes, rectangles_overlap
+from log2sim.geometry import rectangles_overlap
+from log2sim.simulation.metrics.box_tracks import Boxes
 from log2sim.simulation.metrics.collisions import LOG_MARGIN_M, LOG_WINDOW_S, collisions, contacts
 from log2sim.simulation.metrics.limits import check_strict, require_strict
 from log2sim.simulation.metrics.summary import summarize

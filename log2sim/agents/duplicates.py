@@ -9,7 +9,7 @@ import numpy as np
 
 from log2sim.agents.build import AgentCandidate
 from log2sim.datatypes import GROUP_OF, Agent, Waypoints
-from log2sim.geometry import Array, bev_iou, box_corners_bev, polygon_area
+from log2sim.geometry import Array, box_corners_bev, overlap_of_smaller
 
 # Two agents that share this much of their boxes for most of the time are one; people stand closer than boxes tell.
 SHARED_AREA = 0.25
@@ -81,14 +81,10 @@ def shared_areas(a: Agent, b: Agent, t_s: Array) -> Array:
     p, q = a.at(t_s), b.at(t_s)
     reach = (np.hypot(*a.size_m[:2]) + np.hypot(*b.size_m[:2])) / 2
     near = p.valid & q.valid & (np.hypot(p.x_m - q.x_m, p.y_m - q.y_m) < reach)
-    boxes_a, boxes_b = (
-        box_corners_bev(np.stack([s.x_m, s.y_m], axis=1), x.size_m[0], x.size_m[1], s.yaw_rad)
+    corners_a, corners_b = (
+        box_corners_bev(np.stack([s.x_m, s.y_m], axis=1)[near], x.size_m[0], x.size_m[1], s.yaw_rad[near])
         for s, x in ((p, a), (q, b))
     )
-    return np.array([_share_of_smaller(*boxes) if n else 0.0 for n, *boxes in zip(near, boxes_a, boxes_b)])
-
-
-def _share_of_smaller(a: Array, b: Array) -> float:
-    """Area that two rectangles (4, 2) share, as a part of the smaller one's."""
-    iou, area_a, area_b = bev_iou(a, b), polygon_area(a), polygon_area(b)
-    return iou / (1 + iou) * (area_a + area_b) / min(area_a, area_b)
+    shares = np.zeros(len(near))
+    shares[near] = overlap_of_smaller(corners_a, corners_b)
+    return shares

@@ -85,10 +85,10 @@ def overlaps(agents: Sequence[Agent], states: Array) -> dict[tuple[int, int], fl
     for k in range(len(agents)):
         near = np.hypot(x[:k] - x[k], y[:k] - y[k]) <= reach[:k] + reach[k]  # False for NaN
         near &= np.abs(z[:k] - z[k]) <= (size[:k, 2] + size[k, 2]) / 2
-        for other in np.flatnonzero(near):
-            share = bev_iou(corners[k], corners[other])
+        others = np.flatnonzero(near)
+        for other, share in zip(others, bev_iou(corners[k], corners[others])):
             if share > TOUCHING_IOU:
-                found[int(other), k] = share
+                found[int(other), k] = float(share)
     return found
 
 

@@ -1,13 +1,26 @@
-"""Rigid transforms, poses over time, cameras and oriented boxes; knows no stage of the method."""
+"""Rigid transforms, poses over time, cameras and oriented boxes; knows no stage of the method.
+
+Transforms are named `dst_T_src` (4x4, float64) so that inner frames cancel: `map_T_cam = map_T_ego @ ego_T_cam`.
+Frames: map (local ENU), ego (ISO 8855: x forward, y left, z up), cam (x right, y down, z forward). Quaternions are
+scalar-first, yaw is counter-clockwise from +x in [-pi, pi).
+"""
 
 from __future__ import annotations
 
 from log2sim.geometry.box_projection import project_boxes
-from log2sim.geometry.boxes import bev_iou, box_corners, box_corners_bev, box_iou, points_in_box, polygon_area
+from log2sim.geometry.boxes import box_corners, box_corners_bev, box_iou, points_in_box
 from log2sim.geometry.camera import NEAREST_DEPTH_M, Camera, Mount, box_lines, distort, fold_radius, project, undistort
+from log2sim.geometry.overlap import (
+    bev_iou,
+    overlap_area,
+    overlap_of_smaller,
+    polygon_area,
+    rectangles_overlap,
+    separating_axes,
+)
 from log2sim.geometry.poses import PoseTrack
+from log2sim.geometry.stamps import NS_PER_S, nearest_index
 from log2sim.geometry.transforms import (
-    NS_PER_S,
     Array,
     apply,
     cos_sin,
@@ -39,13 +52,18 @@ __all__ = [
     "distort",
     "fold_radius",
     "inverse",
+    "nearest_index",
+    "overlap_area",
+    "overlap_of_smaller",
     "points_in_box",
     "polygon_area",
     "project",
     "project_boxes",
     "quaternion_from_rotation",
+    "rectangles_overlap",
     "rotation_from_quaternion",
     "rotation_from_rpy",
+    "separating_axes",
     "slerp",
     "transform",
     "undistort",

@@ -73,7 +73,7 @@ def box_lines(camera: Camera, corners_cam: Array) -> Array:
     lines = np.stack([uv[:, :-1], uv[:, 1:]], axis=2).reshape(-1, 2, 2)
     low, high = lines.min(axis=1), lines.max(axis=1)
     touches = (high >= 0).all(axis=1) & (low[:, 0] < camera.width_px) & (low[:, 1] < camera.height_px)
-    return lines[touches & np.isfinite(lines).all(axis=(1, 2))]
+    return np.asarray(lines[touches & np.isfinite(lines).all(axis=(1, 2))])
 
 
 def _bends(camera: Camera) -> bool:
@@ -177,7 +177,7 @@ def _radial_start(camera: Camera, target: Array) -> Array:
     bent = (distort(camera, ahead) - distort(camera, -ahead))[:, 0] / 2
     wanted = np.hypot(target[:, 0], target[:, 1])
     start = np.interp(wanted, np.maximum.accumulate(bent), radius)
-    return target * np.divide(start, wanted, out=np.ones_like(wanted), where=wanted > 0)[:, None]
+    return np.asarray(target * np.divide(start, wanted, out=np.ones_like(wanted), where=wanted > 0)[:, None])
 
 
 def _newton_step(camera: Camera, xy: Array, error: Array) -> Array:

@@ -1,9 +1,4 @@
-"""Rigid transforms, quaternions, poses over time and oriented boxes.
-
-Transforms are named `dst_T_src` (4x4, float64) so that inner frames cancel: `map_T_cam = map_T_ego @ ego_T_cam`.
-Frames: map (local ENU), ego (ISO 8855: x forward, y left, z up), cam (x right, y down, z forward). Quaternions are
-scalar-first, yaw is counter-clockwise from +x in [-pi, pi).
-"""
+"""Poses over time, interpolated on SE(3)."""
 
 from __future__ import annotations
 
@@ -13,8 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from log2sim.geometry.stamps import NS_PER_S
 from log2sim.geometry.transforms import (
-    NS_PER_S,
     Array,
     quaternion_from_rotation,
     rotation_from_quaternion,
@@ -25,7 +20,18 @@ from log2sim.geometry.transforms import (
 
 @dataclass(frozen=True, eq=False)
 class PoseTrack:
-    """Poses of the ego over time: `t_ns` (P,) int64 strictly increasing, `map_T_ego` (P, 4, 4)."""
+    """Poses of the ego over time.
+
+    Attributes
+    ----------
+    t_ns : (P,) int64
+        Strictly increasing absolute stamps.
+    map_T_ego : (P, 4, 4) float64
+    max_gap_s : float, s
+        Poses are not interpolated between stamps farther apart than this.
+    extrapolate_s : float, s
+        Poses are extrapolated up to this far outside the track.
+    """
 
     t_ns: NDArray[np.int64]
     map_T_ego: Array
@@ -33,6 +39,7 @@ class PoseTrack:
     extrapolate_s: float = 0.2
 
     def __post_init__(self) -> None:
+        """Check that stamps increase and that there is one pose for each."""
         if len(self.t_ns) == 0 or len(self.t_ns) != len(self.map_T_ego):
             raise ValueError("a pose track needs one pose per stamp and at least one of them")
         if np.any(np.diff(self.t_ns) <= 0):
@@ -43,13 +50,13 @@ class PoseTrack:
         return quaternion_from_rotation(self.map_T_ego[:, :3, :3])
 
     def at(self, t_ns: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
-        """Poses at stamps (N,) int64 ns, interpolated on SE(3).
+        """Interpolate the pose at stamps (N,) int64 ns: rotation by slerp, translation linearly.
 
         Returns
         -------
         map_T_ego : (N, 4, 4) float64
         valid : (N,) bool
-            False in gaps longer than `max_gap_s` and more than `extrapolate_s` outside the track.
+            False in gaps longer than `max_gap_s` and farther than `extrapolate_s` outside the track.
         """
         t = np.atleast_1d(np.asarray(t_ns, dtype=np.int64))
         if len(self.t_ns) == 1:

@@ -1,4 +1,4 @@
-"""Rigid transforms, quaternions, poses over time and oriented boxes.
+"""Rigid transforms, rotations and angles.
 
 Transforms are named `dst_T_src` (4x4, float64) so that inner frames cancel: `map_T_cam = map_T_ego @ ego_T_cam`.
 Frames: map (local ENU), ego (ISO 8855: x forward, y left, z up), cam (x right, y down, z forward). Quaternions are
@@ -12,19 +12,20 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-NS_PER_S = 1_000_000_000
+FLOAT32_MILLIMETER_M = 8192.0
+"""From here on neighboring float32 values are 1 mm apart."""
 
-
-NEAR_M = 8192.0
-"""From here on float32 steps by 1 mm."""
-
-NEAR_STEP_M = 1000.0
+OFFSET_STEP_M = 1000.0
 
 
 def whole_kilometers(points: Array) -> Array:
-    """Whole kilometers (D,) to take off points (N, D) so that float32 keeps a millimeter; 0 on axes where all are near."""
+    """Choose the offset (D,), m, in whole kilometers, that leaves points (N, D) small enough for float32 to keep 1 mm.
+
+    It is 0 on axes on which all points are already.
+    """
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    return np.where(np.abs(points).max(axis=0) > NEAR_M, np.round(middle / NEAR_STEP_M) * NEAR_STEP_M, 0.0)
+    offset = np.round(middle / OFFSET_STEP_M) * OFFSET_STEP_M
+    return np.where(np.abs(points).max(axis=0) > FLOAT32_MILLIMETER_M, offset, 0.0)
 
 
 def wrap_angle(angle_rad: ArrayLike) -> Array:
@@ -35,11 +36,11 @@ def wrap_angle(angle_rad: ArrayLike) -> Array:
     Rounding can carry `mod` to its modulus, which would return +pi; that value is folded back.
     """
     wrapped = np.mod(np.asarray(angle_rad, dtype=np.float64) + np.pi, 2 * np.pi) - np.pi
-    return np.where(wrapped >= np.pi, -np.pi, wrapped)
+    return np.asarray(np.where(wrapped >= np.pi, -np.pi, wrapped))
 
 
 def cos_sin(angle_rad: Array) -> tuple[Array, Array]:
-    """Cosine and sine of angles (N,), to the last bits.
+    """Compute cosine and sine (N,), (N,) of angles (N,), to the last bits.
 
     Notes
     -----
@@ -85,11 +86,11 @@ def quaternion_from_rotation(rotation: ArrayLike) -> Array:
             candidates[..., i, j] = squared[..., i] if i == j else sums[min(i, j), max(i, j)]
     q = np.take_along_axis(candidates, pivot[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    return np.where(q[..., :1] < 0, -q, q)
+    return np.asarray(np.where(q[..., :1] < 0, -q, q))
 
 
 def rotation_from_rpy(roll_rad: ArrayLike, pitch_rad: ArrayLike, yaw_rad: ArrayLike) -> Array:
-    """Rotation matrices (..., 3, 3) of intrinsic Z-Y-X angles: R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Compute rotation matrices (..., 3, 3) of intrinsic Z-Y-X angles: R = Rz(yaw) Ry(pitch) Rx(roll)."""
     roll, pitch, yaw = np.broadcast_arrays(*(np.asarray(a, dtype=np.float64) for a in (roll_rad, pitch_rad, yaw_rad)))
     cr, sr, cp, sp, cy, sy = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
     rows = [
@@ -101,7 +102,7 @@ def rotation_from_rpy(roll_rad: ArrayLike, pitch_rad: ArrayLike, yaw_rad: ArrayL
 
 
 def yaw_of(rotation: ArrayLike) -> Array:
-    """Yaw (...) in rad of rotation matrices or transforms (..., 3|4, 3|4)."""
+    """Extract the yaw (...), rad, in [-pi, pi), of rotation matrices or transforms (..., 3|4, 3|4)."""
     r = np.asarray(rotation, dtype=np.float64)
     return wrap_angle(np.arctan2(r[..., 1, 0], r[..., 0, 0]))
 
@@ -121,7 +122,7 @@ def inverse(dst_T_src: Array) -> Array:
 
 
 def apply(dst_T_src: Array, points: ArrayLike) -> Array:
-    """Map points (N, 3) through one transform (4, 4), or each through its own (N, 4, 4)."""
+    """Transform points (N, 3) by one transform (4, 4), or each by its own (N, 4, 4)."""
     p = np.asarray(points, dtype=np.float64)
     if dst_T_src.ndim == 2:
         return p @ dst_T_src[:3, :3].T + dst_T_src[:3, 3]
@@ -133,9 +134,9 @@ def slerp(q0: Array, q1: Array, fraction: Array) -> Array:
     dot = np.sum(q0 * q1, axis=-1)
     q1 = np.where(dot[:, None] < 0, -q1, q1)
     angle = np.arccos(np.clip(np.abs(dot), 0.0, 1.0))
-    small = angle < 1e-6  # there sin(a f) / sin(a) = f up to 1e-13
+    small = angle < 1e-6  # sin(a f) / sin(a) = f up to 1e-13
     sine = np.where(small, 1.0, np.sin(angle))
     w0 = np.where(small, 1 - fraction, np.sin((1 - fraction) * angle) / sine)
     w1 = np.where(small, fraction, np.sin(fraction * angle) / sine)
     q = w0[:, None] * q0 + w1[:, None] * q1
-    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Log, Stream, Sweep
 from log2sim.errors import ConfigError, LogError, RecordError
-from log2sim.geometry import NS_PER_S
+from log2sim.geometry import NS_PER_S, nearest_index
 
 PROBED_RECORDS = 5
 
@@ -129,10 +129,7 @@ def nearest_records(
     This is where the online rule of Bhardwaj & Kalra ends up once the whole log is known: wait for the incoming record if
     it will be nearer than the last one. Of two equally near ones the earlier is taken.
     """
-    after = np.clip(np.searchsorted(stamps_ns, asked_ns), 0, len(stamps_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    take_before = np.abs(stamps_ns[before] - asked_ns) <= np.abs(stamps_ns[after] - asked_ns)
-    index = np.where(take_before, before, after)
+    index = nearest_index(stamps_ns, asked_ns)
     residual_ns = stamps_ns[index] - asked_ns
     near = np.abs(residual_ns) <= tolerance_ns
     return np.where(near, index, -1), np.where(near, residual_ns / NS_PER_S, np.nan)

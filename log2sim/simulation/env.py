@@ -14,8 +14,7 @@ import numpy as np
 
 from log2sim.datatypes import Scenario
 from log2sim.errors import MissingExtra
-from log2sim.geometry import Array, box_corners_bev, wrap_angle
-from log2sim.simulation.metrics.box_tracks import rectangles_overlap
+from log2sim.geometry import Array, box_corners_bev, rectangles_overlap, wrap_angle
 from log2sim.simulation.policy import Controls, EgoState, Observation
 from log2sim.simulation.runner import open_world
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import ImageLabels, Labels, Stream
-from log2sim.geometry import NS_PER_S, Array, Camera, apply, box_corners, inverse, project
+from log2sim.geometry import NS_PER_S, Array, Camera, apply, box_corners, inverse, nearest_index, project
 from log2sim.synth.actors import Actor, EgoMotion
 from log2sim.synth.cameras import frame_stamps
 from log2sim.synth.scene import Scene
@@ -78,7 +78,7 @@ def visible_at(
     for frames in seen.values():
         if not frames:
             continue
-        nearest = _nearest(np.array([f.t_ns for f in frames]), t_ns)
+        nearest = nearest_index(np.array([f.t_ns for f in frames]), t_ns)
         by_camera |= np.array([(f.unoccluded >= MIN_UNOCCLUDED) & (f.inside >= MIN_BOX_INSIDE) for f in frames])[
             nearest
         ]
@@ -88,12 +88,10 @@ def visible_at(
         if len(stamps) == 0:
             continue
         hits = [np.bincount(h[h >= 0], minlength=count) for h in (casts(spec.name, i).hit for i in range(len(stamps)))]
-        by_lidar |= (np.array(hits) >= MIN_LIDAR_POINTS)[_nearest(stamps - round(NS_PER_S / spec.rate_hz / 2), t_ns)]
+        by_lidar |= (np.array(hits) >= MIN_LIDAR_POINTS)[
+            nearest_index(stamps - round(NS_PER_S / spec.rate_hz / 2), t_ns)
+        ]
     return by_camera & by_lidar
-
-
-def _nearest(stamps: NDArray[np.int64], t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.abs(stamps[None, :] - t_ns[:, None]).argmin(1)
 
 
 def labels_2d(seen: Mapping[str, list[Sighting]], actors: tuple[Actor, ...]) -> dict[str, ImageLabels]:

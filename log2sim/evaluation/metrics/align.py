@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, Agent, Scenario
 from log2sim.evaluation.metrics.pairs import Mask
-from log2sim.geometry import NS_PER_S, Array
+from log2sim.geometry import NS_PER_S, Array, nearest_index
 
 MAX_TRUTH_GAP_S = 0.25
 THINNED_GAP_S = 1.05  # waypoints of straight constant motion are left out for up to a second
@@ -106,8 +106,7 @@ def _sample_truth(agent: Agent, t: Array) -> tuple[Array, Array, Array, Array, M
     carried = s.speed_mps * outside
     xy = np.stack([s.x_m + carried * np.cos(s.yaw_rad), s.y_m + carried * np.sin(s.yaw_rad)], -1)
     there = np.abs(outside) <= TRUTH_MARGIN_S
-    nearest = np.abs(t[:, None] - w.t_s[None]).argmin(1)
-    seen = np.ones(len(t), dtype=bool) if w.visible is None else w.visible[nearest]
+    seen = np.ones(len(t), dtype=bool) if w.visible is None else w.visible[nearest_index(w.t_s, t)]
     # A parked truth agent may be written as its first and last waypoint only, and one that moves straight as a few.
     thinned = bool(agent.quality.get("waypoints_left_out"))
     max_gap_s = np.inf if agent.static and len(w) == 2 else THINNED_GAP_S if thinned else MAX_TRUTH_GAP_S

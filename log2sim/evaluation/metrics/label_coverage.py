@@ -7,7 +7,7 @@ import numpy as np
 from log2sim.datatypes import IgnoreRegions, LabelView
 from log2sim.evaluation.metrics.pairs import Index, Mask
 from log2sim.evaluation.metrics.visibility import image_samples
-from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse
+from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse, nearest_index
 
 MIN_REGION_SHARE = 0.5
 MAX_FRAME_LAG_S = 0.15
@@ -58,7 +58,7 @@ def _frames_at(view: LabelView, t_s: Array) -> tuple[Index, Mask, Array]:
     """
     if len(view.t_s) == 0:
         return np.zeros(len(t_s), dtype=np.int64), np.zeros(len(t_s), dtype=bool), np.zeros((len(t_s), 4, 4))
-    frame = np.abs(view.t_s - t_s[:, None]).argmin(1)
+    frame = nearest_index(view.t_s, t_s)
     near = np.abs(view.t_s[frame] - t_s) <= MAX_FRAME_LAG_S
     at_frames = view.map_T_cam
     track = PoseTrack(_to_ns(view.t_s), at_frames)

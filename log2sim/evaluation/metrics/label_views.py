@@ -6,7 +6,7 @@ import numpy as np
 
 from log2sim.datatypes import IgnoreRegions, LabelView, Log
 from log2sim.errors import LogError
-from log2sim.geometry import NS_PER_S, quaternion_from_rotation
+from log2sim.geometry import NS_PER_S, nearest_index, quaternion_from_rotation
 from log2sim.registry import nearest
 
 MAX_STAMP_LAG_NS = 50_000_000
@@ -48,9 +48,7 @@ def _view(log: Log, name: str, t0_ns: int) -> LabelView:
     frame, box = np.zeros(0, dtype=np.int64), np.zeros((0, 4))
     regions = log.ignored_regions.get(name)
     if regions is not None and len(t_ns):
-        right = np.clip(np.searchsorted(t_ns, regions.t_ns), 0, len(t_ns) - 1)
-        left = np.maximum(right - 1, 0)
-        frame = np.where(np.abs(t_ns[left] - regions.t_ns) <= np.abs(t_ns[right] - regions.t_ns), left, right)
+        frame = nearest_index(t_ns, regions.t_ns)
         near = np.abs(t_ns[frame] - regions.t_ns) <= MAX_STAMP_LAG_NS
         frame, box = frame[near], regions.box_px[near]
     rotation = quaternion_from_rotation(poses[:, :3, :3])

@@ -12,7 +12,7 @@ from log2sim.datatypes import Agent, Labels, Log, Scenario, Sweep, Waypoints
 from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.evaluation.metrics.label_views import ignore_regions_of
 from log2sim.evaluation.metrics.visibility import PointGrid, image_shares
-from log2sim.geometry import NS_PER_S, Array, apply, inverse, wrap_angle, yaw_of
+from log2sim.geometry import NS_PER_S, Array, apply, inverse, nearest_index, wrap_angle, yaw_of
 from log2sim.registry import nearest
 
 MIN_POINTS = 20
@@ -131,11 +131,8 @@ def nearest_record(
     if len(stream_t_ns) == 0:
         return np.zeros(len(t_ns), dtype=np.int64), np.zeros(len(t_ns), dtype=bool)
     order = np.argsort(stream_t_ns, kind="stable")
-    sorted_t = stream_t_ns[order]
-    right = np.clip(np.searchsorted(sorted_t, t_ns), 0, len(sorted_t) - 1)
-    left = np.maximum(right - 1, 0)
-    pick = np.where(np.abs(sorted_t[left] - t_ns) <= np.abs(sorted_t[right] - t_ns), left, right)
-    return order[pick], np.abs(sorted_t[pick] - t_ns) <= round(MAX_LAG_S * NS_PER_S)
+    index = order[nearest_index(stream_t_ns[order], t_ns)]
+    return index, np.abs(stream_t_ns[index] - t_ns) <= round(MAX_LAG_S * NS_PER_S)
 
 
 def _points_map(log: Log, lidar: str, sweep: Sweep) -> NDArray[np.floating[Any]]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import NS_PER_S, Array, box_corners_bev, wrap_angle
+from log2sim.geometry import NS_PER_S, Array, rectangles_overlap, wrap_angle
 
 MAX_AGE_S = 0.055  # a box without a partner on the other side of the frame is used up to this age
 MAX_WINDOW_S = 1.1  # labels at 1 Hz and denser are interpolated
@@ -99,27 +99,14 @@ def one_of_each(boxes: Boxes, index: NDArray[np.intp]) -> NDArray[np.intp]:
     reach = np.linalg.norm(size[:, :2], axis=1) / 2
     near = np.linalg.norm(center[:, None] - center, axis=-1) < reach[:, None] + reach
     k, m = np.nonzero(np.tril(near & (stamp[:, None] != stamp), -1))
-    corners = box_corners_bev(center, size[:, 0], size[:, 1], boxes.yaw_rad[index])
-    shared = share_ground(corners[k], corners[m])
+    yaw, step = boxes.yaw_rad[index], center[m] - center[k]
+    shared = rectangles_overlap(step[:, 0], step[:, 1], yaw[k], yaw[m], size[k], size[m])
     earlier = np.zeros(near.shape, dtype=bool)
     earlier[k[shared], m[shared]] = True
     kept = np.ones(len(index), dtype=bool)
     for row in np.flatnonzero(earlier.any(axis=1)):
         kept[row] = not kept[earlier[row]].any()
     return index[kept]
-
-
-def share_ground(a: Array, b: Array) -> NDArray[np.bool_]:
-    """Whether rectangles overlap in pairs (P,), given as corners (P, 4, 2) in order; those that only touch do not.
-
-    Notes
-    -----
-    Separating axes: of two convex shapes that are apart, one has a side that all of the other lies beyond.
-    """
-    sides = np.concatenate([np.diff(corners[:, :3], axis=1) for corners in (a, b)], axis=1)
-    along_a, along_b = (np.einsum("pcd,psd->psc", corners, sides) for corners in (a, b))
-    apart = (along_a.max(-1) <= along_b.min(-1)) | (along_b.max(-1) <= along_a.min(-1))
-    return np.asarray(~apart.any(axis=1))
 
 
 def between(before: Boxes, after: Boxes, t_ns: int) -> Boxes:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array, wrap_angle
+from log2sim.geometry import Array, rectangles_overlap, wrap_angle
 
 LEAP_M = 1.0
 """A step that differs from both its neighbors by more is no motion: at 20 Hz it would take 400 m/s2."""
@@ -111,32 +110,3 @@ class Boxes:
 def spacing_s(t_s: Array) -> float:
     """The time from row to row of evenly spaced times (S,); 1 where there is only one, of which nothing moves."""
     return float(t_s[1] - t_s[0]) if len(t_s) > 1 else 1.0
-
-
-def axes_between(
-    yaw_a: Array, yaw_b: Array, size_a: Array, size_b: Array
-) -> Iterator[tuple[Array, Array, Array, bool]]:
-    """The four axes that may separate rectangles a and b (N,): directions x and y, reach, and whether it is an axis of a.
-
-    The reach (N,) is half of what both rectangles cover of the axis. Method: Gottschalk et al. (1996), in the plane.
-    """
-    turn = yaw_b - yaw_a
-    c, s = np.abs(np.cos(turn)), np.abs(np.sin(turn))
-    half_a, half_b = size_a / 2, size_b / 2
-    for yaw, own, other, of_a in ((yaw_a, half_a, half_b, True), (yaw_b, half_b, half_a, False)):
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        yield cos, sin, own[:, 0] + other[:, 0] * c + other[:, 1] * s, of_a
-        yield -sin, cos, own[:, 1] + other[:, 0] * s + other[:, 1] * c, of_a
-
-
-def rectangles_overlap(
-    dx: Array, dy: Array, yaw_a: Array, yaw_b: Array, size_a: Array, size_b: Array
-) -> NDArray[np.bool_]:
-    """Whether rectangles overlap (N,): `dx`, `dy` lead from a to b, sizes (N, 2 or more) are length and width.
-
-    Rectangles that only touch do not overlap.
-    """
-    apart = np.zeros(len(dx), dtype=bool)
-    for nx, ny, reach, _ in axes_between(yaw_a, yaw_b, size_a, size_b):
-        apart |= np.abs(dx * nx + dy * ny) >= reach
-    return ~apart

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from log2sim.geometry import Array
-from log2sim.simulation.metrics.box_tracks import axes_between
+from log2sim.geometry import Array, separating_axes
 from log2sim.simulation.vehicles.vehicle import Columns
 
 STEPS = 64
@@ -68,7 +67,7 @@ class Motion(Columns):
         relative = np.abs(self.turn_b_rad - self.turn_a_rad) / 2
         radius_a, radius_b = (np.hypot(*size[:2]) for size in (self.size_a_m, self.size_b_m))
         free = _time(np.abs(self.dz_m + u * self.vz_m) - (self.size_a_m[2] + self.size_b_m[2]) / 2, np.abs(self.vz_m))
-        for nx, ny, reach, of_a in axes_between(yaw_a, yaw_b, self.size_a_m.T, self.size_b_m.T):
+        for nx, ny, reach, of_a in separating_axes(yaw_a, yaw_b, self.size_a_m.T, self.size_b_m.T):
             spin, radius = (spin_a, radius_b) if of_a else (spin_b, radius_a)
             rate = np.abs(self.vx_m * nx + self.vy_m * ny) + spin * distance + relative * radius
             free = np.maximum(free, _time(np.abs(dx * nx + dy * ny) - reach, rate))

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array, wrap_angle
-from log2sim.simulation.metrics.box_tracks import Boxes, Rows, rectangles_overlap
+from log2sim.geometry import Array, rectangles_overlap, wrap_angle
+from log2sim.simulation.metrics.box_tracks import Boxes, Rows
 from log2sim.simulation.vehicles.vehicle import Columns
 
 HORIZON_S = 10.0

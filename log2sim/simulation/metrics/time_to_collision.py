@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array
-from log2sim.simulation.metrics.box_tracks import Boxes, Rows, axes_between
+from log2sim.geometry import Array, separating_axes
+from log2sim.simulation.metrics.box_tracks import Boxes, Rows
 from log2sim.simulation.vehicles.vehicle import Columns
 
 HORIZON_S = 10.0
@@ -70,7 +70,7 @@ def time_to_touch(
     interval of time; the rectangles do while all four do. Exact.
     """
     enter, leave = np.full(len(dx), -np.inf), np.full(len(dx), np.inf)
-    for nx, ny, reach, _ in axes_between(yaw_a, yaw_b, size_a, size_b):
+    for nx, ny, reach, _ in separating_axes(yaw_a, yaw_b, size_a, size_b):
         place, rate = dx * nx + dy * ny, vx * nx + vy * ny
         moves = rate != 0
         never = np.where(np.abs(place) < reach, -np.inf, np.inf)  # of a shadow that keeps its place
