@@ -26,7 +26,7 @@ from log2sim.export.exporters import Options, export
 from log2sim.geometry import wrap_angle
 from log2sim.simulation import follower
 from log2sim.simulation.carla.assets import BY_CATEGORY, nearest_assets
-from log2sim.simulation.carla.player import Body, Course, Follower, main, size_table
+from log2sim.simulation.carla.player import CarlaActor, SampledTrajectory, VehicleController, main, size_table
 from log2sim.simulation.vehicles.parameters import parameters_for
 from log2sim.simulation.vehicles.vehicle import VehicleState
 
@@ -52,7 +52,7 @@ def test_data_are_in_the_left_handed_frame_in_degrees(scenario: Scenario, tmp_pa
     """scenario_runner#418, #1047: mirrored logs drive on the wrong side."""
     _, data = written(scenario, tmp_path)
     for logged, entry in zip(scenario.agents, data["agents"]):
-        w, course = logged.waypoints, Course(entry["exact"])
+        w, course = logged.waypoints, SampledTrajectory(entry["exact"])
         assert data["offset_m"] == [0, 0, 0]
         for k in (0, len(w) // 3, len(w) - 1):
             x, y, z, yaw_deg = course.at(float(w.t_s[k]), "x_m", "y_m", "z_m", "yaw_deg")
@@ -150,7 +150,7 @@ def test_the_script_follows_as_the_shim_does() -> None:
     one, parameters = np.ones(1), parameters_for([left_turn()])
     wheelbase, lock = float(parameters.wheelbase_m[0]), float(parameters.max_steer_rad[0])
     limits = (float(parameters.max_throttle_mps2[0]), float(parameters.max_brake_mps2[0]), math.tan(lock) / wheelbase)
-    memory, own = follower.Memory.fresh(1), Follower(*limits)
+    memory, own = follower.ControllerMemory.fresh(1), VehicleController(*limits)
     empty = {f: np.zeros(1) for f in VehicleState.__dataclass_fields__}
     for k in range(300):
         speed = 0.0 if k % 10 == 0 else rng.normal(4, 5)
@@ -172,7 +172,7 @@ def test_the_script_follows_as_the_shim_does() -> None:
 def test_following_is_the_same_in_a_mirror() -> None:
     """The controller runs in CARLA's left-handed frame, where left and right are exchanged."""
     rng = np.random.default_rng(4)
-    one, other = Follower(6.0, 10.0, 0.3), Follower(6.0, 10.0, 0.3)
+    one, other = VehicleController(6.0, 10.0, 0.3), VehicleController(6.0, 10.0, 0.3)
     for _ in range(100):
         x, y, yaw, wx, wy, wyaw, speed, course_speed, accel, curvature = rng.normal(0, 1, 10)
         pedal, bend, _ = one.step((wx, wy, wyaw, course_speed, accel, curvature, 1.0, 0.0), (x, y, yaw), speed, 0.05)
@@ -360,7 +360,7 @@ def test_axles_are_measured_even_if_the_server_knows_them_only_after_a_tick(carl
 
     size_m, spawned = (4.0, 1.8, 1.5), carla.Transform(carla.Location(30.0, -7.0, 0.3), carla.Rotation(yaw=75.0))
     actor = Actor(1, Blueprint("vehicle.audi.a2"), size_m, spawned)
-    body = Body(carla, {}, actor, spawned)
+    body = CarlaActor(carla, {}, actor, spawned)
     assert (body.wheelbase_m, body.axle_m) == pytest.approx((0.6 * 4.0, 0.3 * 4.0))
     actor.advance(0.05)
     actor.velocity = (0.02, 0.01)  # at rest, as far as physics ever is
@@ -374,7 +374,7 @@ def test_inputs_are_shares_of_full_pedal_and_of_the_lock_that_is_left_at_speed(c
     from carla_server import Actor, Blueprint, share
 
     spawned = carla.Transform()
-    body = Body(
+    body = CarlaActor(
         carla,
         {"max_throttle_mps2": 6.0, "max_brake_mps2": 10.0},
         Actor(1, Blueprint("vehicle.audi.a2"), (4.0, 1.8, 1.5), spawned),
@@ -591,7 +591,7 @@ def test_carla_reads_the_exported_road_with_the_ego_in_the_middle_of_a_lane(
 def assert_on_a_lane(carla: ModuleType, data: dict[str, Any], road_path: Path) -> None:
     """The rear axle of the ego at all logged moments against the lane that `carla.Map` has there."""
     road, ego = carla.Map("road", road_path.read_text(encoding="utf-8")), data["agents"][0]
-    course = Course(ego["exact"])
+    course = SampledTrajectory(ego["exact"])
     for t_s in ego["exact"]["t_s"]:
         x, y, z, yaw = course.place(t_s)
         lane = road.get_waypoint(carla.Location(x, y, z)).transform

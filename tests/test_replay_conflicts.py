@@ -11,10 +11,10 @@ from replay_scenes import line
 from test_replay_contacts import SPACING_S, T_S, boxes_of
 
 from log2sim.geometry import rectangles_overlap
-from log2sim.simulation.metrics.box_tracks import Boxes
-from log2sim.simulation.metrics.conflicts import conflicts, least
-from log2sim.simulation.metrics.post_encroachment_time import CROSSING_RAD, encroachments
-from log2sim.simulation.metrics.time_to_collision import HORIZON_S, approaches, time_to_touch
+from log2sim.simulation.metrics.box_tracks import BoxTracks
+from log2sim.simulation.metrics.conflicts import conflicts, most_critical
+from log2sim.simulation.metrics.post_encroachment_time import CROSSING_RAD, post_encroachment_times
+from log2sim.simulation.metrics.time_to_collision import HORIZON_S, time_to_touch, times_to_collision
 from log2sim.simulation.runner import replay
 
 SIZE = np.array([[4.0, 2.0, 1.5]])
@@ -98,7 +98,7 @@ def test_the_least_times_to_collision_are_those_of_all_pairs_at_all_rows():
     together = boxes.present[:, a] & boxes.present[:, b]
     times = np.where(together & (times <= HORIZON_S), times, np.inf)
     expected = {(i, j): t for i, j, t in zip(a.tolist(), b.tolist(), times.min(axis=0)) if np.isfinite(t)}
-    found = approaches(boxes, moves, SPACING_S)
+    found = times_to_collision(boxes, moves, SPACING_S)
     pairs = list(zip(found.a.tolist(), found.b.tolist()))
     assert len(expected) > 40
     assert set(pairs) == set(expected)
@@ -114,7 +114,7 @@ def test_a_follower_that_brakes_has_its_least_time_where_gap_over_speed_is_least
     t = np.arange(0, 4, 1e-4)
     speed = closing - brake * t
     expected = ((gap - closing * t + brake / 2 * t**2) / np.where(speed > 0, speed, np.nan))[speed > 0].min()
-    (found,) = approaches(boxes_of(leader, follower), np.ones(2, bool), SPACING_S).time_s
+    (found,) = times_to_collision(boxes_of(leader, follower), np.ones(2, bool), SPACING_S).time_s
     assert found == pytest.approx(expected, abs=2e-3)
 
 
@@ -126,7 +126,7 @@ def test_velocities_are_of_the_motion_and_not_of_the_heading():
     np.testing.assert_allclose(vy[inner, 0], -4 + 2 * T_S[inner], atol=1e-9)
     assert np.isnan(vx[:20, 0]).all()
     assert (vx[40, 1], vy[40, 1]) == (0.0, 0.0)
-    alone = Boxes(boxes.x_m, boxes.y_m, boxes.z_m, boxes.yaw_rad, boxes.speed_mps + 2.0, boxes.size_m)
+    alone = BoxTracks(boxes.x_m, boxes.y_m, boxes.z_m, boxes.yaw_rad, boxes.speed_mps + 2.0, boxes.size_m)
     assert alone.velocities(SPACING_S)[1][40, 1] == pytest.approx(2 * np.sin(0.5))
 
 
@@ -136,7 +136,7 @@ def test_at_right_angles_it_is_from_the_rear_out_to_the_front_in():
         second = (0.0, lambda t, late_s=late_s: -5 * (t - 1.0 - late_s), -np.pi / 2)
         expected = (1.0 + late_s - 3 / 5) - (1.0 + 3 / 10)
         for tracks, order in (((first, second), (0, 1)), ((second, first), (1, 0))):
-            found = encroachments(boxes_of(*tracks), SPACING_S)
+            found = post_encroachment_times(boxes_of(*tracks), SPACING_S)
             assert (found.first.tolist(), found.second.tolist()) == ([order[0]], [order[1]])
             assert (found.came_row - found.left_row) * SPACING_S == pytest.approx(expected, abs=5e-4)
             assert found.left_row * SPACING_S == pytest.approx(1.3, abs=5e-4)
@@ -145,14 +145,14 @@ def test_at_right_angles_it_is_from_the_rear_out_to_the_front_in():
 def test_who_stops_on_the_crossing_leaves_when_it_drives_on():
     first = (lambda t: np.minimum(10 * (t - 0.5), 0.0) + 10 * np.maximum(t - 2.0, 0), 0.0, 0.0)
     second = (0.0, lambda t: 8 * (t - 3.5), np.pi / 2)
-    found = encroachments(boxes_of(first, second), SPACING_S)
+    found = post_encroachment_times(boxes_of(first, second), SPACING_S)
     assert (found.came_row - found.left_row) * SPACING_S == pytest.approx((3.5 - 3 / 8) - 2.3, abs=5e-4)
 
 
 def test_the_time_between_those_who_collide_is_zero_and_never_negative():
     first = (lambda t: 10 * (t - 1.0), 0.0, 0.0)
     for late_s in (0.0, 0.17, 0.4, 0.85):  # the last is 0.05 s less than it takes to get out of each other's way
-        found = encroachments(
+        found = post_encroachment_times(
             boxes_of(first, (0.0, lambda t, late_s=late_s: 5 * (t - 1.0 - late_s), np.pi / 2)), SPACING_S
         )
         assert np.all(found.came_row == found.left_row)
@@ -160,7 +160,7 @@ def test_the_time_between_those_who_collide_is_zero_and_never_negative():
 
 
 def pairs_of(*tracks):
-    return len(encroachments(boxes_of(*tracks), SPACING_S).first)
+    return len(post_encroachment_times(boxes_of(*tracks), SPACING_S).first)
 
 
 def test_only_who_is_seen_to_leave_and_who_is_seen_to_come_counts():
@@ -182,7 +182,7 @@ def test_only_who_is_seen_to_leave_and_who_is_seen_to_come_counts():
 
 def test_the_shortest_post_encroachment_times_are_those_of_all_rows():
     boxes = town(30, seed=11)
-    found = encroachments(boxes, SPACING_S)
+    found = post_encroachment_times(boxes, SPACING_S)
     pairs = [(min(p), max(p)) for p in zip(found.first.tolist(), found.second.tolist())]
     got = dict(zip(pairs, (found.came_row - found.left_row).tolist()))
     i, j = (g.ravel() for g in np.meshgrid(np.arange(len(T_S)), np.arange(len(T_S)), indexing="ij"))
@@ -216,8 +216,8 @@ def test_it_is_found_up_to_ten_seconds_later_and_not_after(late_s, count):
     x = np.stack([10 * (t - 2.0), 0 * t], axis=1)
     y = np.stack([0 * t, 10 * (t - 2.0 - late_s)], axis=1)
     yaw = np.tile([0.0, np.pi / 2], (400, 1))
-    boxes = Boxes(x, y, 0 * x, yaw, 0 * x + 10, np.tile([4.0, 2.0, 1.5], (2, 1)))
-    found = encroachments(boxes, SPACING_S)
+    boxes = BoxTracks(x, y, 0 * x, yaw, 0 * x + 10, np.tile([4.0, 2.0, 1.5], (2, 1)))
+    found = post_encroachment_times(boxes, SPACING_S)
     assert len(found.first) == count
     # Out at 3 m past the crossing, in at 3 m before: 0.6 s less than they are apart.
     assert np.all(np.abs((found.came_row - found.left_row) * SPACING_S - (late_s - 0.6)) < 5e-4)
@@ -232,11 +232,11 @@ def test_a_new_collision_is_zero_and_one_of_the_log_is_left_out_of_the_least():
         near = conflicts(boxes, np.ones(3, bool), T_S, ids, [{**event, "in_log": in_log}])
         entry = next(e for e in near if e["agents"] == ["ego", "b"])
         assert (entry["contact"], entry["ego"]) == (contact, True)
-        smallest = least([entry], "min_ttc")
+        smallest = most_critical([entry], "min_ttc")
         assert smallest is None if value is None else (smallest["s"], smallest["t_s"]) == (0.0, 2.8)
     assert conflicts(boxes_of(c), np.ones(1, bool), T_S, ["c"], []) == []
     none = np.zeros((len(T_S), 0))
-    assert conflicts(Boxes(none, none, none, none, none, np.zeros((0, 3))), np.zeros(0, bool), T_S, [], []) == []
+    assert conflicts(BoxTracks(none, none, none, none, none, np.zeros((0, 3))), np.zeros(0, bool), T_S, [], []) == []
 
 
 @pytest.mark.parametrize("grade", [-0.1, 0.05, 0.1])

@@ -8,9 +8,9 @@ from replay_maneuvers import agent_from, scenario_of
 from scipy.optimize import brentq
 
 from log2sim.geometry import rectangles_overlap, wrap_angle
-from log2sim.simulation.metrics.box_tracks import Boxes
+from log2sim.simulation.metrics.box_tracks import BoxTracks
 from log2sim.simulation.metrics.collisions import collisions, contacts
-from log2sim.simulation.metrics.continuous_collision import STEPS, Motion, first_touch
+from log2sim.simulation.metrics.continuous_collision import MAX_STEPS, RelativeMotion, first_contact
 from log2sim.simulation.runner import replay
 
 SPACING_S = 0.05
@@ -27,12 +27,12 @@ def boxes_of(*tracks, size=(4.0, 2.0, 1.5)):
         for column, f in ((x, fx), (y, fy), (yaw, fyaw)):
             column[there, k] = (f(T_S) if callable(f) else np.full(len(T_S), f))[there]
     sizes = np.array(size if np.ndim(size) == 2 else [size] * len(tracks), float)
-    return Boxes(x, y, np.where(np.isnan(x), np.nan, 0.8), wrap_angle(yaw), np.zeros(shape), sizes)
+    return BoxTracks(x, y, np.where(np.isnan(x), np.nan, 0.8), wrap_angle(yaw), np.zeros(shape), sizes)
 
 
 def events_of(boxes):
     count = len(boxes.size_m)
-    far = Boxes(*(c + 1e4 * np.arange(count) for c in (boxes.x_m, boxes.y_m)), boxes.z_m, boxes.yaw_rad, boxes.speed_mps, boxes.size_m)  # fmt: skip
+    far = BoxTracks(*(c + 1e4 * np.arange(count) for c in (boxes.x_m, boxes.y_m)), boxes.z_m, boxes.yaw_rad, boxes.speed_mps, boxes.size_m)  # fmt: skip
     return collisions(boxes, far, np.ones(count, bool), T_S, [str(k) for k in range(count)])
 
 
@@ -104,7 +104,7 @@ def random_motions(count, seed):
     place, way = rng.uniform(-9, 9, (2, count)), rng.normal(0, 6, (2, count))
     turn = rng.uniform(-0.6, 0.6, (2, count)) * (rng.uniform(size=count) < 0.7)
     zero = np.zeros(count)
-    return Motion(*place, zero, *way, zero, *rng.uniform(-np.pi, np.pi, (2, count)), *turn, size_a, size_b)
+    return RelativeMotion(*place, zero, *way, zero, *rng.uniform(-np.pi, np.pi, (2, count)), *turn, size_a, size_b)
 
 
 def overlapping(m, u):
@@ -119,26 +119,26 @@ def test_first_touches_are_those_of_a_thousand_moments():
     moments = np.linspace(0, 1, 1025)
     seen = np.stack([overlapping(motion, u) for u in moments])
     ever, first = seen.any(axis=0), moments[np.argmax(seen, axis=0)]
-    found = first_touch(motion)
+    found = first_contact(motion)
     touched = ~np.isnan(found)
     assert 0.2 < ever.mean() < 0.8
-    brief = seen.sum(axis=0) <= 1024 / STEPS
+    brief = seen.sum(axis=0) <= 1024 / MAX_STEPS
     assert not np.any(~touched & ever & ~brief)
     assert np.mean(~touched & ever) < 0.003
     assert overlapping(motion.take(touched), found[touched]).all()
     both = touched & ever & ~brief
     late = found[both] - first[both]
-    assert np.all(late < 1 / STEPS)
+    assert np.all(late < 1 / MAX_STEPS)
     assert np.mean(np.abs(late) < 2 / 1024) > 0.99  # the others graze for less than a step before
 
 
 def test_backward_the_first_touch_is_the_last():
     motion = random_motions(300, seed=5)
-    touched = ~np.isnan(first_touch(motion))
-    last = 1 - first_touch(motion.reversed())
+    touched = ~np.isnan(first_contact(motion))
+    last = 1 - first_contact(motion.reversed())
     assert np.mean(touched == ~np.isnan(last)) > 0.99
     both = touched & ~np.isnan(last)
-    assert np.all(last[both] >= first_touch(motion)[both] - 1e-3)
+    assert np.all(last[both] >= first_contact(motion)[both] - 1e-3)
 
 
 def test_one_that_leaps_over_another_does_not_hit_it():
@@ -163,7 +163,7 @@ def test_boxes_that_appear_inside_each_other_say_so_and_those_of_other_times_do_
 def test_one_alone_and_nobody_hit_nothing():
     assert events_of(boxes_of((lambda t: 5 * t, 0.0, 0.0))) == []
     none = np.zeros((len(T_S), 0))
-    assert events_of(Boxes(none, none, none, none, none, np.zeros((0, 3)))) == []
+    assert events_of(BoxTracks(none, none, none, none, none, np.zeros((0, 3)))) == []
 
 
 def test_the_order_of_agents_does_not_matter():

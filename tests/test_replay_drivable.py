@@ -8,11 +8,23 @@ import numpy as np
 import pytest
 from replay_maneuvers import MANEUVERS, agent_from, driven, ramp
 
-from log2sim.simulation.feasible_trajectory import Limits, _cost, _normal_equations, _Problem, nearest_course
+from log2sim.simulation.feasible_trajectory import (
+    FeasibilityLimits,
+    _cost,
+    _LeastSquares,
+    _normal_equations,
+    fit_trajectory,
+)
 from log2sim.simulation.path import path_of
-from log2sim.simulation.reference import GRID_S, drivable_course, point_reference, tape_reference, vehicle_reference
+from log2sim.simulation.reference import (
+    GRID_S,
+    feasible_trajectory_of,
+    log_reference,
+    point_reference,
+    vehicle_reference,
+)
 
-LIMITS = Limits(offset_m=1.3, max_curvature_1pm=0.27, max_curvature_rate_1pmps=0.37, max_accel_mps2=10.0)
+LIMITS = FeasibilityLimits(offset_m=1.3, max_curvature_1pm=0.27, max_curvature_rate_1pmps=0.37, max_accel_mps2=10.0)
 
 
 def rolling_error(course):
@@ -32,14 +44,14 @@ def rolling_error(course):
 @pytest.mark.parametrize("name", MANEUVERS)
 def test_what_a_vehicle_drove_stays_as_it_is(name):
     path = path_of(MANEUVERS[name](), 1.3)
-    course, departure_m = drivable_course(path, LIMITS)
+    course, departure_m = feasible_trajectory_of(path, LIMITS)
     assert departure_m.max() < 0.06
     assert rolling_error(course).max() < 0.005
 
 
 def test_a_constant_turn_is_found_with_its_curvature_and_speed():
     agent = driven(lambda t: np.full_like(t, 6.0), lambda s: np.full_like(s, -0.1), 4.0)
-    course, _ = drivable_course(path_of(agent, 1.3), LIMITS)
+    course, _ = feasible_trajectory_of(path_of(agent, 1.3), LIMITS)
     inner = slice(3, -3)
     np.testing.assert_allclose(course.curvature_1pm[inner], -0.1, atol=1e-3)
     np.testing.assert_allclose(course.speed_mps[inner], 6.0, atol=1e-2)
@@ -56,7 +68,7 @@ def test_noise_in_position_and_heading_gives_a_course_that_rolls():
         w.yaw_rad + rng.normal(0, 0.15, len(w)),
         w.speed_mps,
     )
-    course, _ = drivable_course(path_of(noisy, 1.3), LIMITS)
+    course, _ = feasible_trajectory_of(path_of(noisy, 1.3), LIMITS)
     x = course.x_m + 1.3 * np.cos(course.yaw_rad) - (w.x_m - noisy.waypoints.x_m[0])[: len(course.t_s)]
     y = course.y_m + 1.3 * np.sin(course.yaw_rad) - (w.y_m - noisy.waypoints.y_m[0])[: len(course.t_s)]
     rms = np.sqrt(np.mean(x**2 + y**2))
@@ -67,7 +79,7 @@ def test_noise_in_position_and_heading_gives_a_course_that_rolls():
 def test_a_turn_tighter_than_full_lock_is_widened_and_flagged():
     agent = driven(lambda t: np.full_like(t, 3.0), lambda s: np.where(s > 4, 0.8, 0.0), 4.0)
     path = path_of(agent, 1.3)
-    course, departure_m = drivable_course(path, LIMITS)
+    course, departure_m = feasible_trajectory_of(path, LIMITS)
     assert np.abs(course.curvature_1pm).max() < 0.30
     assert departure_m.max() > 0.3
     reference = vehicle_reference(path, LIMITS, accel_ahead_s=0.1, curvature_ahead_s=0.1)
@@ -79,7 +91,7 @@ def test_a_turn_tighter_than_full_lock_is_widened_and_flagged():
 def test_a_bend_taken_faster_than_tires_hold_is_widened_and_flagged():
     agent = driven(lambda t: np.full_like(t, 20.0), lambda s: ramp(s, (20, 0), (40, 0.04), (60, 0.04), (80, 0)), 6.0)
     path = path_of(agent, 1.3)
-    course, _ = drivable_course(path, LIMITS)
+    course, _ = feasible_trajectory_of(path, LIMITS)
     assert np.abs(course.speed_mps**2 * course.curvature_1pm).max() < 1.05 * LIMITS.max_lateral_mps2  # 16 in the log
     reference = vehicle_reference(path, LIMITS, accel_ahead_s=0.1, curvature_ahead_s=0.1)
     assert any("distance from what can be driven" in flag for flag in reference.flags)
@@ -92,8 +104,8 @@ def test_boxes_turned_back_to_front_are_outvoted(turned):
     yaw, speed = w.yaw_rad.copy(), w.speed_mps.copy()
     yaw[turned] += np.pi
     speed[turned] *= -1
-    right, _ = drivable_course(path_of(agent, 1.3), LIMITS)
-    course, _ = drivable_course(path_of(agent_from(w.t_s, w.x_m, w.y_m, yaw, speed), 1.3), LIMITS)
+    right, _ = feasible_trajectory_of(path_of(agent, 1.3), LIMITS)
+    course, _ = feasible_trajectory_of(path_of(agent_from(w.t_s, w.x_m, w.y_m, yaw, speed), 1.3), LIMITS)
     np.testing.assert_allclose(course.yaw_rad, right.yaw_rad, atol=0.04)
     np.testing.assert_allclose(course.speed_mps, right.speed_mps, atol=0.1)
 
@@ -102,7 +114,7 @@ def test_a_box_that_jitters_on_the_spot_does_not_turn():
     rng = np.random.default_rng(1)
     t = np.arange(50) * 0.1
     agent = agent_from(t, rng.normal(0, 0.03, 50), rng.normal(0, 0.03, 50), np.full(50, 0.4), np.zeros(50))
-    course, _ = drivable_course(path_of(agent, 1.3), LIMITS)
+    course, _ = feasible_trajectory_of(path_of(agent, 1.3), LIMITS)
     assert np.abs(course.yaw_rad - 0.4).max() < 0.05
     assert np.abs(course.speed_mps).max() < 0.1
 
@@ -113,8 +125,8 @@ def test_shifting_and_turning_the_log_shifts_and_turns_the_course():
     turn, (east, north) = 2.5, (3e6, -2e6)
     x = east + np.cos(turn) * w.x_m - np.sin(turn) * w.y_m
     y = north + np.sin(turn) * w.x_m + np.cos(turn) * w.y_m
-    one, _ = drivable_course(path_of(agent, 1.3), LIMITS)
-    other, _ = drivable_course(path_of(agent_from(w.t_s, x, y, w.yaw_rad + turn, w.speed_mps), 1.3), LIMITS)
+    one, _ = feasible_trajectory_of(path_of(agent, 1.3), LIMITS)
+    other, _ = feasible_trajectory_of(path_of(agent_from(w.t_s, x, y, w.yaw_rad + turn, w.speed_mps), 1.3), LIMITS)
     np.testing.assert_allclose(other.x_m, np.cos(turn) * one.x_m - np.sin(turn) * one.y_m, atol=1e-4)
     np.testing.assert_allclose(other.curvature_1pm, one.curvature_1pm, atol=1e-3)
 
@@ -124,7 +136,7 @@ def test_the_gradient_is_that_of_the_cost():
     state = rng.normal(0, 0.5, (6, 6)) + np.array([0, 0, 0, 3.0, 0, 0])
     state[:, 5] *= 2  # beyond the limit in places
     logged = rng.normal(0, 1, (6, 4)) + np.array([0, 0, 0, 3.0])
-    problem = _Problem(0.1, logged, LIMITS)
+    problem = _LeastSquares(0.1, logged, LIMITS)
     _, gradient = _normal_equations(problem.terms(state), len(state))
     numeric = np.zeros_like(state)
     for index in np.ndindex(state.shape):
@@ -139,7 +151,7 @@ def test_the_band_is_that_of_the_residuals_derivatives():
     rng = np.random.default_rng(0)
     state = rng.normal(0, 0.1, (4, 6)) + np.array([0, 0, 0, 3.0, 0, 0.1])
     state[:, 2] /= 1e5  # the derivatives leave out how turning shortens the chord
-    problem = _Problem(0.1, rng.normal(0, 0.1, (4, 4)) + np.array([0, 0, 0, 3.0]), LIMITS)
+    problem = _LeastSquares(0.1, rng.normal(0, 0.1, (4, 4)) + np.array([0, 0, 0, 3.0]), LIMITS)
     terms = problem.terms(state)
     slopes = np.zeros((sum(len(t.residual) for t in terms), 24))
     for k in range(24):
@@ -155,14 +167,14 @@ def test_the_band_is_that_of_the_residuals_derivatives():
 
 
 def test_two_moments_suffice():
-    course = nearest_course(
+    course = fit_trajectory(
         np.array([0.0, 0.1]), np.array([0.0, 0.5]), np.zeros(2), np.zeros(2), np.full(2, 5.0), LIMITS
     )
     np.testing.assert_allclose(course.x_m + 1.3, [0.0, 0.5], atol=1e-3)
     np.testing.assert_allclose(course.speed_mps, 5.0, atol=1e-2)
 
 
-@pytest.mark.parametrize("make", [point_reference, tape_reference, None])
+@pytest.mark.parametrize("make", [point_reference, log_reference, None])
 def test_rows_on_either_side_of_begin_and_end_lead_straight_through_them(make):
     t = 0.113 + np.arange(30) * 0.1
     path = path_of(agent_from(t, 5 * t, -2 * t, np.full(30, np.arctan2(-2, 5)), np.full(30, np.hypot(5, 2))), 0.0)
@@ -190,7 +202,7 @@ def test_a_life_too_long_to_be_fitted_is_followed_as_logged(monkeypatch):
     monkeypatch.setattr("log2sim.simulation.reference.MAX_KNOTS", 20)
     agent = MANEUVERS["brake to stop and go"]()
     w = agent.waypoints
-    course, departure_m = drivable_course(path_of(agent, 1.3), LIMITS)
+    course, departure_m = feasible_trajectory_of(path_of(agent, 1.3), LIMITS)
     np.testing.assert_allclose(departure_m, 0.0, atol=1e-9)
     np.testing.assert_allclose(course.accel_mps2[22:48], -10 / 3, atol=0.01)
     np.testing.assert_allclose(course.x_m, w.x_m - w.x_m[0] - 1.3, atol=1e-9)

@@ -12,7 +12,7 @@ from log2sim.datatypes import Waypoints
 from log2sim.errors import ScenarioError
 from log2sim.geometry import wrap_angle
 from log2sim.simulation.feasible_trajectory import LOCK_SHARE
-from log2sim.simulation.follower import Memory, follow_vehicles
+from log2sim.simulation.follower import ControllerMemory, follow_vehicles
 from log2sim.simulation.runner import replay
 from log2sim.simulation.vehicles.parameters import parameters_for
 from log2sim.simulation.vehicles.vehicle import VehicleState, step_bicycle
@@ -150,7 +150,7 @@ def chase(behind_m, speed, reference_speed, duration_s, dt_s, change=lambda c: c
     state = VehicleState(
         *(np.array([v], float) for v in (-behind_m, 0, 0, speed, *[0] * (len(vars_of(VehicleState)) - 4)))
     )
-    memory, out = Memory.fresh(1), []
+    memory, out = ControllerMemory.fresh(1), []
     for k in range(round(duration_s / dt_s)):
         row = np.array([[reference_speed * k * dt_s], [0], [0], [reference_speed], [0], [0], [1], [0]], float)
         controls, memory = follow_vehicles(row, state, memory, CAR, dt_s)
@@ -299,7 +299,7 @@ def test_headings_that_flicker_about_pi_are_one_heading():
 @pytest.fixture
 def _exact_numbers(monkeypatch):
     """States as they are, not rounded for the file."""
-    monkeypatch.setattr("log2sim.simulation.replay_result.DIGITS", 12)
+    monkeypatch.setattr("log2sim.simulation.replay_result.STATE_DIGITS", 12)
 
 
 @pytest.mark.usefixtures("_exact_numbers")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from replay_maneuvers import MANEUVERS, OFFSET_M, agent_from, driven, ramp, scenario_of
 
-from log2sim.simulation.follower import GAINS, Memory, follow_points, follow_vehicles
+from log2sim.simulation.follower import GAINS, ControllerMemory, follow_points, follow_vehicles
 from log2sim.simulation.runner import replay
 from log2sim.simulation.vehicles.parameters import parameters_for
 from log2sim.simulation.vehicles.vehicle import PointState, VehicleState, step_bicycle, step_point
@@ -161,7 +161,7 @@ def test_map_offsets_of_a_thousand_kilometers_change_nothing():
 def closed_loop(x, y, yaw, speed, reference_speed, duration_s, dt_s=0.01):
     """States (N, 4) of a car that starts off a reference which goes straight along x from 0."""
     state = VehicleState(*(np.array([v], float) for v in (x, y, yaw, speed, 0, 0, 0, 0)))
-    memory, out = Memory.fresh(1), []
+    memory, out = ControllerMemory.fresh(1), []
     for k in range(round(duration_s / dt_s)):
         stands = float(reference_speed == 0)
         row = np.array([[reference_speed * k * dt_s], [0], [0], [reference_speed], [0], [0], [1], [stands]], float)
@@ -193,7 +193,7 @@ def test_being_late_or_slow_is_made_up_for():
 def controls_at(*, x=0.0, y=0.0, yaw=0.0, speed=10.0, row=(0, 0, 0, 10, 0, 0, 1, 0), dt_s=0.01):
     """Controls and memory of a car that has just begun to follow one row of a table."""
     state = replace_columns(VehicleState, x_m=x, y_m=y, yaw_rad=yaw, speed_mps=speed)
-    return follow_vehicles(np.array(row, float)[:, None], state, Memory.fresh(1), CAR, dt_s)
+    return follow_vehicles(np.array(row, float)[:, None], state, ControllerMemory.fresh(1), CAR, dt_s)
 
 
 def replace_columns(kind, **values):

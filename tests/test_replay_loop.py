@@ -19,8 +19,8 @@ from log2sim.errors import ConfigError
 from log2sim.simulation.path import path_of
 from log2sim.simulation.policy import Controls
 from log2sim.simulation.policy_loading import load_policy
-from log2sim.simulation.reactive.path_table import times_beside
-from log2sim.simulation.rollout import roll
+from log2sim.simulation.reactive.path_table import log_times_of_positions
+from log2sim.simulation.rollout import rollout
 from log2sim.simulation.runner import open_world, replay
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -66,10 +66,10 @@ def test_a_world_that_is_restarted_repeats_itself():
     scene = scenario_of(line("ego", 25, speed=12, duration_s=11), line("f", 0, speed=12, duration_s=11))
     world = open_world(scene, dt_s=0.05, agents="reactive")
     driver = Speed(lambda t: 12.0 if t < 2 else 0.0)
-    first = roll(world, driver)
+    first = rollout(world, driver)
     world.restart()
     assert (world.step, world.tracks()["f"][0].tolist()) == (0, [0])
-    second = roll(world, driver)
+    second = rollout(world, driver)
     assert first["f"][1][3].min() == 0.0  # it had to stop
     for id in ("ego", "f"):
         np.testing.assert_array_equal(first[id][1], second[id][1])
@@ -210,7 +210,7 @@ def test_where_a_way_crosses_over_itself_the_height_is_that_of_the_own_level():
     loop = agent_from(t, x, y, yaw, np.full(len(t), 5.0), id="ego", offset_m=0.01)
     path = path_of(changed(loop, waypoints=changed(loop.waypoints, z_m=0.5 * t)), 0.01)
     late = np.arange(0, 24, 0.05)
-    found = times_beside(path, *path.centers(late)[:2])
+    found = log_times_of_positions(path, *path.centers(late)[:2])
     np.testing.assert_allclose(found, late, atol=0.25)  # a meter of way
 
 

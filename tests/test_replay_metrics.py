@@ -8,7 +8,7 @@ from replay_maneuvers import agent_from, driven, lane_change, scenario_of
 
 from log2sim.errors import CheckFailed
 from log2sim.geometry import rectangles_overlap
-from log2sim.simulation.metrics.box_tracks import Boxes
+from log2sim.simulation.metrics.box_tracks import BoxTracks
 from log2sim.simulation.metrics.collisions import LOG_MARGIN_M, LOG_WINDOW_S, collisions, contacts
 from log2sim.simulation.metrics.limits import check_strict, require_strict
 from log2sim.simulation.metrics.summary import summarize
@@ -95,7 +95,7 @@ def boxes(*tracks, z=None, size=(4.0, 2.0, 1.5)):
     x = np.array([t[1] for t in tracks], float).T
     y = np.tile(np.array([t[0] for t in tracks], float), (len(x), 1))
     zero = np.zeros_like(x)
-    return Boxes(x, y, zero if z is None else zero + np.array(z), zero, zero + 5.0, np.tile(size, (len(tracks), 1)))
+    return BoxTracks(x, y, zero if z is None else zero + np.array(z), zero, zero + 5.0, np.tile(size, (len(tracks), 1)))
 
 
 def test_bridges_and_absent_agents_are_not_hit():
@@ -117,7 +117,7 @@ def test_all_pairs_are_found_as_by_trying_each():
         np.stack([rng.uniform(1, 12, n), rng.uniform(0.5, 3, n), np.ones(n)], axis=1),
     )
     moves = rng.uniform(size=n) < 0.5
-    found = contacts(Boxes(x, y, 0 * x, yaw, 0 * x, size), moves)
+    found = contacts(BoxTracks(x, y, 0 * x, yaw, 0 * x, size), moves)
 
     def corners(k):
         rim = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * size[k, :2] / 2

@@ -15,10 +15,10 @@ from log2sim.errors import ConfigError
 from log2sim.simulation.path import path_of
 from log2sim.simulation.policy import Controls
 from log2sim.simulation.policy_loading import load_policy
-from log2sim.simulation.reactive.idm import demand, drivers_for, respond
-from log2sim.simulation.reactive.path_table import Ways, times_at
+from log2sim.simulation.reactive.idm import idm_parameters, leader_demand, rate_response
+from log2sim.simulation.reactive.path_table import PathTable, log_times_of_distance
 from log2sim.simulation.reactive.swept_corridor import _nearest_edge
-from log2sim.simulation.rollout import roll
+from log2sim.simulation.rollout import rollout
 from log2sim.simulation.runner import open_world
 from log2sim.simulation.runner import replay as run
 
@@ -55,25 +55,25 @@ def test_behind_a_constant_leader_the_gap_is_that_of_the_model_in_equilibrium(le
 
 
 def test_the_demand_of_a_leader_is_the_square_of_desired_to_real_gap():
-    driver = drivers_for([line("a", 0)])
+    driver = idm_parameters([line("a", 0)])
     one = np.ones(1)
     # 10 m/s behind 4 m/s: s* = 2 + 10 * 1 + 10 * 6 / (2 sqrt(1.0 * 1.5))
     desired = 12 + 60 / (2 * np.sqrt(1.5))
-    assert demand(driver, 20 * one, 10 * one, 4 * one)[0] == pytest.approx((desired / 20) ** 2)
-    assert demand(driver, 20 * one, 10 * one, 60 * one)[0] == pytest.approx((2 / 20) ** 2)  # it draws away
-    assert demand(driver, np.inf * one, 10 * one, 4 * one)[0] == 0.0
+    assert leader_demand(driver, 20 * one, 10 * one, 4 * one)[0] == pytest.approx((desired / 20) ** 2)
+    assert leader_demand(driver, 20 * one, 10 * one, 60 * one)[0] == pytest.approx((2 / 20) ** 2)  # it draws away
+    assert leader_demand(driver, np.inf * one, 10 * one, 4 * one)[0] == 0.0
 
 
 def test_a_free_agent_goes_on_at_the_logs_rate_and_accelerates_to_it():
-    driver = drivers_for([line("a", 0)])
+    driver = idm_parameters([line("a", 0)])
     one, none = np.ones(1), np.zeros(1)
-    rate, slope = respond(driver, one, none, 10 * one, -3 * one)
+    rate, slope = rate_response(driver, one, none, 10 * one, -3 * one)
     assert (rate[0], slope[0]) == (1.0, 0.0)
-    rate, slope = respond(driver, 0.5 * one, none, 10 * one, none)
+    rate, slope = rate_response(driver, 0.5 * one, none, 10 * one, none)
     assert slope[0] == pytest.approx((1 - 0.5**4) * 1.0 / 10)
     # The log brakes by 3 m/s2 anyway, so a demand of 2 m/s2 asks for nothing more.
-    assert respond(driver, one, 2 * one, 10 * one, -3 * one)[1][0] == 0.0
-    assert respond(driver, one, 5 * one, 10 * one, -3 * one)[1][0] == pytest.approx(-0.2)
+    assert rate_response(driver, one, 2 * one, 10 * one, -3 * one)[1][0] == 0.0
+    assert rate_response(driver, one, 5 * one, 10 * one, -3 * one)[1][0] == pytest.approx(-0.2)
 
 
 # Interference.
@@ -235,7 +235,7 @@ def test_who_is_not_in_the_way_makes_nobody_brake(other):
     scene = scenario_of(other, line("f", 0, duration_s=12))
     world = open_world(scene, model="kinematic", dt_s=0.05, drives_ego=False, agents=["f"])
     world.traffic._distrusted[:] = True  # the log, which has the other there too, is no excuse
-    stored, columns = roll(world)["f"]
+    stored, columns = rollout(world)["f"]
     np.testing.assert_allclose(columns[0], 25.0 * 0.05 * stored, atol=1e-6)
 
 
@@ -247,7 +247,7 @@ def test_who_cuts_in_at_the_same_speed_is_followed_and_not_braked_for_as_if_he_s
     scene = scenario_of(cutter, line("f", 0, speed=20, duration_s=12))
     world = open_world(scene, model="kinematic", dt_s=0.05, drives_ego=False, agents=["f"])
     world.traffic._distrusted[:] = True
-    _, columns = roll(world)["f"]
+    _, columns = rollout(world)["f"]
     # At a gap of 35.6 m the model brakes by (22 / 35.6)^2 m/s2 at first, and less the farther it falls back.
     assert -0.5 < columns[5].min() < -0.2
     assert columns[3].min() > 18
@@ -351,7 +351,7 @@ def test_the_nearest_edge_within_a_corridor_is_that_of_the_clipped_box():
 def test_feet_on_a_curved_way_are_those_of_a_search_over_all_its_points():
     agent = MANEUVERS["turn of radius 8 m"]()
     path = path_of(agent, 1.3)
-    ways = Ways([path])
+    ways = PathTable([path])
     rng = np.random.default_rng(1)
     fine = np.arange(0, 8, 0.001)
     x, y, *_ = path.at(fine)
@@ -368,7 +368,7 @@ def test_feet_on_a_curved_way_are_those_of_a_search_over_all_its_points():
 def test_the_time_of_the_log_at_a_place_is_found_from_the_way_gone():
     path = path_of(line("a", 0, speed=10, duration_s=10), 0.0)
     t = np.linspace(0, 10, 201)
-    np.testing.assert_allclose(times_at(path, t, 6 * t, 0 * t), 0.6 * t, atol=1e-6)
+    np.testing.assert_allclose(log_times_of_distance(path, t, 6 * t, 0 * t), 0.6 * t, atol=1e-6)
 
 
 def test_controls_of_a_policy_hold_only_for_the_ego():

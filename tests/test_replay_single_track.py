@@ -14,9 +14,9 @@ from log2sim.simulation.vehicles.dynamic import step_dynamic
 from log2sim.simulation.vehicles.parameters import PUBLISHED, parameters_for, published_parameters
 from log2sim.simulation.vehicles.single_track import (
     Chassis,
-    Motion,
     Slips,
-    linear_course,
+    StepInput,
+    linear_displacement,
     linear_slips,
     step_single_track,
 )
@@ -91,11 +91,11 @@ def linear_rates(number, state, steer_rate, accel, h):
     rear = slip - to_rear * yaw_rate / speed
     slips = Slips(np.array([rear]), np.array([rear + wheelbase * yaw_rate / speed - steer]))
     speed1, steer1 = speed + h * accel, steer + h * steer_rate
-    motion = Motion(
+    motion = StepInput(
         *(np.array([v]) for v in (speed, speed1, h * (speed + speed1) / 2, steer, (steer + steer1) / 2, steer1))
     )
     after = linear_slips(slips, motion, p, Chassis.of(p), h)
-    chord, angle, turn = (float(v[0]) for v in linear_course(slips, after, motion, p))
+    chord, angle, turn = (float(v[0]) for v in linear_displacement(slips, after, motion, p))
     curvature = float(after.front[0] - after.rear[0] + steer1) / wheelbase
     later = [chord * math.cos(yaw + angle), chord * math.sin(yaw + angle), h * steer_rate, h * accel, turn]
     later += [speed1 * curvature - yaw_rate, float(after.rear[0]) + to_rear * curvature - slip]

@@ -35,8 +35,8 @@ from vehicle_maneuvers import (
 
 from log2sim.documents import write_json
 from log2sim.geometry import Array, cos_sin
-from log2sim.simulation.vehicles.single_track import Chassis, Motion, Slips, linear_course, linear_slips
-from log2sim.simulation.vehicles.vehicle import roll
+from log2sim.simulation.vehicles.single_track import Chassis, Slips, StepInput, linear_displacement, linear_slips
+from log2sim.simulation.vehicles.vehicle import along_arc
 
 STORE_S = 0.1
 STEPS_S = (0.001, 0.005, 0.01, 0.02, 0.05)
@@ -133,14 +133,14 @@ def stepped(case: Case, model: str, h: float, agents: int) -> Array:
     out = [(0.0, 0.0)]
     for k in range(round(case.duration_s / h)):
         turned, accel = case.inputs((k + 0.5) * h, math.exp)
-        motion = Motion(
+        motion = StepInput(
             speed, speed + h * accel, h * (speed + h * accel / 2), steer, steer + h * turned / 2, steer + h * turned
         )
         if model == "kinematic":
-            x, y, yaw = roll(x, y, yaw, motion.distance_m, np.tan(motion.mean_steer_rad) / p.wheelbase_m)
+            x, y, yaw = along_arc(x, y, yaw, motion.distance_m, np.tan(motion.mean_steer_rad) / p.wheelbase_m)
         else:
             before, slips = slips, linear_slips(slips, motion, p, chassis, h)
-            chord, angle, turn = linear_course(before, slips, motion, p)
+            chord, angle, turn = linear_displacement(before, slips, motion, p)
             cos, sin = cos_sin(yaw + angle)
             x, y, yaw = x + chord * cos, y + chord * sin, yaw + turn
         steer, speed = motion.steer1_rad, motion.speed1_mps
@@ -154,16 +154,16 @@ def known_ahead(case: Case, model: str, h: float) -> Array:
     turned, accel = case.inputs((np.arange(round(case.duration_s / h)) + 0.5) * h, np.exp)
     steer = np.concatenate([[case.steer_rad], case.steer_rad + h * np.cumsum(turned)])
     speed = np.concatenate([[case.speed_mps], case.speed_mps + h * np.cumsum(accel)])
-    motion = Motion(
+    motion = StepInput(
         speed[:-1], speed[1:], h * (speed[:-1] + speed[1:]) / 2, steer[:-1], (steer[:-1] + steer[1:]) / 2, steer[1:]
     )
     if model == "kinematic":
         curvature = np.tan(motion.mean_steer_rad) / VEHICLE.wheelbase_m
         turn = motion.distance_m * curvature
-        dx, dy, _ = roll(0.0 * turn, 0.0 * turn, np.cumsum(turn) - turn, motion.distance_m, curvature)
+        dx, dy, _ = along_arc(0.0 * turn, 0.0 * turn, np.cumsum(turn) - turn, motion.distance_m, curvature)
     else:
         slips = np.array(slip_course(motion, h)).T
-        chord, angle, turn = linear_course(Slips(*slips[:, :-1]), Slips(*slips[:, 1:]), motion, VEHICLE)
+        chord, angle, turn = linear_displacement(Slips(*slips[:, :-1]), Slips(*slips[:, 1:]), motion, VEHICLE)
         cos, sin = cos_sin(np.cumsum(turn) - turn + angle)
         dx, dy = chord * cos, chord * sin
     every = round(STORE_S / h)
@@ -171,7 +171,7 @@ def known_ahead(case: Case, model: str, h: float) -> Array:
     return xy[::every]
 
 
-def slip_course(motion: Motion, h: float) -> list[tuple[float, float]]:
+def slip_course(motion: StepInput, h: float) -> list[tuple[float, float]]:
     """Slip angles at all ends of steps (K + 1): linear in those before, so unit slips tell the maps of all steps at once."""
     zero, one = np.zeros(len(motion.distance_m)), np.ones(len(motion.distance_m))
     units = ((zero, zero), (one, zero), (zero, one))

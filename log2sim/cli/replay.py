@@ -42,7 +42,7 @@ def replay(
     from log2sim.datatypes import Scenario
     from log2sim.documents import check_targets
     from log2sim.errors import ConfigError
-    from log2sim.simulation.backends import host_named
+    from log2sim.simulation.backends import external_simulator
     from log2sim.simulation.metrics.limits import check_limits, parse_limits, require_strict
     from log2sim.simulation.metrics.summary import summarize
     from log2sim.simulation.policy_loading import load_policy
@@ -57,7 +57,7 @@ def replay(
     loaded = Scenario.load(scenario)
     chosen = agents if react is None else list(ids_of(loaded, [react]))
     policy = load_policy(ego) if ego is not None else None
-    moved_by = host_named(simulator, host, port, map)
+    moved_by = external_simulator(simulator, host, port, map)
     with progress(quiet=quiet) as tell:
         result = run(
             loaded, mode=mode, model=model, dt_s=dt, ego=policy, agents=chosen, host=moved_by,

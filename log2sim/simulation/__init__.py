@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from log2sim.simulation.backends import host_named
+from log2sim.simulation.backends import external_simulator
 from log2sim.simulation.metrics.limits import check_limits, check_strict, parse_limits, require_strict
 from log2sim.simulation.policy import Controls, EgoState, Observation, Others, PathAhead, Policy, Route
 from log2sim.simulation.policy_loading import load_policy
@@ -24,7 +24,7 @@ __all__ = [
     "World",
     "check_limits",
     "check_strict",
-    "host_named",
+    "external_simulator",
     "load_policy",
     "open_world",
     "parse_limits",

@@ -1,7 +1,7 @@
 """What the replay asks of a simulator, and the embedded one.
 
 A simulator moves all agents at once by stateless steps. Another vehicle model is made usable by a line in `STEPS`, another
-simulator by giving it the two functions of `Simulator`, and one that runs elsewhere (a game engine) as a `Host`.
+simulator by giving it the two functions of `Simulator`, and one that runs elsewhere (a game engine) as a `ExternalSimulator`.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from pathlib import Path
 
 from log2sim.errors import ConfigError
 from log2sim.registry import nearest
-from log2sim.simulation.simulators import Host
+from log2sim.simulation.simulators import ExternalSimulator
 
-HOSTS = ("own", "carla")
+SIMULATORS = ("own", "carla")
 
 
-def host_named(name: str, address: str | None, port: int | None, map: str | None) -> Host | None:
+def external_simulator(name: str, address: str | None, port: int | None, map: str | None) -> ExternalSimulator | None:
     """The simulator of a name, at an address and port, with a town or an OpenDRIVE file to load; None for the own one.
 
     Raises
@@ -23,18 +23,20 @@ def host_named(name: str, address: str | None, port: int | None, map: str | None
     ConfigError
         When there is none of that name, it has no use for what is given, or the file does not exist.
     """
-    if name not in HOSTS:
-        raise ConfigError(f"unknown simulator '{name}'{nearest(name, list(HOSTS))}; known: {', '.join(HOSTS)}")
+    if name not in SIMULATORS:
+        raise ConfigError(
+            f"unknown simulator '{name}'{nearest(name, list(SIMULATORS))}; known: {', '.join(SIMULATORS)}"
+        )
     if name == "own":
         if not address is port is map is None:
             raise ConfigError("--host, --port and --map are for --simulator carla; add it, or leave them out")
         return None
-    from log2sim.simulation.carla.simulator import CarlaSimulator, Server
+    from log2sim.simulation.carla.simulator import CarlaServer, CarlaSimulator
 
     opendrive = Path(map) if map is not None and map.endswith(".xodr") else None
     if opendrive is not None and not opendrive.is_file():
         raise ConfigError(f"--map: {opendrive}: no such file")
-    own = Server()
+    own = CarlaServer()
     return CarlaSimulator(
-        Server(address or own.host, port or own.port, town=None if opendrive else map, opendrive=opendrive)
+        CarlaServer(address or own.host, port or own.port, town=None if opendrive else map, opendrive=opendrive)
     )

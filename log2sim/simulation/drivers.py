@@ -12,27 +12,34 @@ from log2sim.datatypes import EGO, Agent
 from log2sim.errors import ConfigError
 from log2sim.registry import nearest
 from log2sim.simulation.follower import control_step
-from log2sim.simulation.groups import Crowd, Driven, Fleet, Group, Tape
+from log2sim.simulation.groups import AgentGroup, LogReplayGroup, PedestrianGroup, PolicyVehicle, VehicleGroup
 from log2sim.simulation.path import Path, path_of
-from log2sim.simulation.reactive.groups import Reactive, ReactiveCrowd, ReactiveFleet, ReactiveTape
+from log2sim.simulation.reactive.groups import (
+    ReactiveGroup,
+    ReactiveLogReplayGroup,
+    ReactivePedestrianGroup,
+    ReactiveVehicleGroup,
+)
 from log2sim.simulation.reactive.traffic import Traffic
 from log2sim.simulation.reference import (
-    _vehicle_reference,
+    log_reference,
     point_reference,
-    tape_reference,
+    vehicle_reference_of,
 )
 from log2sim.simulation.simulators import STEPS, EmbeddedSimulator
-from log2sim.simulation.step_clock import Clock
-from log2sim.simulation.vehicles.model_choice import Choice, choose, slipping_reference, understeer
+from log2sim.simulation.step_clock import StepClock
+from log2sim.simulation.vehicles.model_choice import ModelChoice, choose_model, slipping_reference, understeer
 from log2sim.simulation.vehicles.parameters import STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
 
-Cast = dict[str, list[Agent]]
+DriverAssignment = dict[str, list[Agent]]
 """Agents by what drives them: "policy", "reactive", "pid", "exact" or, with one pose for good, "static"."""
 
 
-def cast_agents(agents: Sequence[Agent], mode: str, *, drives_ego: bool, reactive: Collection[str] = ()) -> Cast:
+def assign_drivers(
+    agents: Sequence[Agent], mode: str, *, drives_ego: bool, reactive: Collection[str] = ()
+) -> DriverAssignment:
     """Who is driven by what; ids in `reactive` are of agents that can be."""
-    cast: Cast = {"policy": [], "reactive": [], "pid": [], "exact": [], "static": []}
+    cast: DriverAssignment = {"policy": [], "reactive": [], "pid": [], "exact": [], "static": []}
     for agent in agents:
         if drives_ego and agent.id == EGO:
             cast["policy"].append(agent)
@@ -67,38 +74,48 @@ def reactive_ids(agents: Sequence[Agent], wanted: str | Collection[str], *, driv
     return frozenset(wanted)
 
 
-def groups_of(
-    cast: Mapping[str, Sequence[Agent]], clock: Clock, mode: str = "pid", model: str = "auto"
-) -> tuple[list[Group], dict[str, Choice]]:
+def agent_groups(
+    cast: Mapping[str, Sequence[Agent]], clock: StepClock, mode: str = "pid", model: str = "auto"
+) -> tuple[list[AgentGroup], dict[str, ModelChoice]]:
     """The groups that have agents, and by id the model that moves each vehicle; static agents are in none."""
-    groups: list[Group] = []
-    choices: dict[str, Choice] = {}
-    controlled: list[tuple[str, type[Fleet], type[Crowd]]] = [("policy", Driven, Crowd)]
+    groups: list[AgentGroup] = []
+    choices: dict[str, ModelChoice] = {}
+    controlled: list[tuple[str, type[VehicleGroup], type[PedestrianGroup]]] = [
+        ("policy", PolicyVehicle, PedestrianGroup)
+    ]
     if mode == "pid":
-        controlled += [("reactive", ReactiveFleet, ReactiveCrowd), ("pid", Fleet, Crowd)]
+        controlled += [
+            ("reactive", ReactiveVehicleGroup, ReactivePedestrianGroup),
+            ("pid", VehicleGroup, PedestrianGroup),
+        ]
     for driver, kind, on_foot in controlled:
         wheeled = [a for a in cast[driver] if a.category in WHEELED]
-        groups += _fleets(wheeled, kind, clock, model, choices)
+        groups += _vehicle_groups(wheeled, kind, clock, model, choices)
         walking = [a for a in cast[driver] if a.category not in WHEELED]
         if walking:
             references = [point_reference(path_of(a, 0.0)) for a in walking]
-            groups.append(on_foot(walking, references, *_lives(walking, clock), EmbeddedSimulator(STEPS["kinematic"])))
-    for driver, tape in (("exact", Tape), *([("reactive", ReactiveTape)] if mode == "exact" else [])):
+            groups.append(
+                on_foot(walking, references, *_lifespans(walking, clock), EmbeddedSimulator(STEPS["kinematic"]))
+            )
+    for driver, tape in (
+        ("exact", LogReplayGroup),
+        *([("reactive", ReactiveLogReplayGroup)] if mode == "exact" else []),
+    ):
         agents = list(cast[driver])
         if agents:
-            references = [tape_reference(path_of(a, rear_axle_offset(a))) for a in agents]
-            groups.append(tape(agents, references, *_lives(agents, clock)))
+            references = [log_reference(path_of(a, rear_axle_offset(a))) for a in agents]
+            groups.append(tape(agents, references, *_lifespans(agents, clock)))
     return groups, choices
 
 
-def _fleets(
-    agents: Sequence[Agent], kind: type[Fleet], clock: Clock, model: str, choices: dict[str, Choice]
-) -> list[Group]:
+def _vehicle_groups(
+    agents: Sequence[Agent], kind: type[VehicleGroup], clock: StepClock, model: str, choices: dict[str, ModelChoice]
+) -> list[AgentGroup]:
     """Groups of vehicles, one for each model that moves some of them; what moves each is added to `choices`."""
-    groups: list[Group] = []
-    references = {a.id: _vehicle_reference(a, clock.dt_s) for a in agents}
+    groups: list[AgentGroup] = []
+    references = {a.id: vehicle_reference_of(a, clock.dt_s) for a in agents}
     for a in agents:
-        choices[a.id] = choose(a, references[a.id], parameters_for([a]), model, free=kind is Driven)
+        choices[a.id] = choose_model(a, references[a.id], parameters_for([a]), model, free=kind is PolicyVehicle)
     for name in STEPS:
         moved = [a for a in agents if choices[a.id].model == name]
         if moved:
@@ -109,32 +126,32 @@ def _fleets(
                 ahead_s = STEER_LAG_S + control_step(clock.dt_s) / 2
                 ones = [p.take(slice(i, i + 1)) for i in range(len(moved))]
                 followed = [slipping_reference(r, one, name, ahead_s) for r, one in zip(followed, ones)]
-            groups.append(kind(moved, followed, *_lives(moved, clock), p, EmbeddedSimulator(STEPS[name])))
+            groups.append(kind(moved, followed, *_lifespans(moved, clock), p, EmbeddedSimulator(STEPS[name])))
     return groups
 
 
-def traffic_of(agents: Sequence[Agent], groups: Sequence[Group], clock: Clock) -> Traffic | None:
+def reactive_traffic(agents: Sequence[Agent], groups: Sequence[AgentGroup], clock: StepClock) -> Traffic | None:
     """What the reactive groups decide by, with which they are connected; None where nobody reacts."""
-    reacting = [g for g in groups if isinstance(g, Reactive)]
+    reacting = [g for g in groups if isinstance(g, ReactiveGroup)]
     if not reacting:
         return None
     paths = {a.id: r.path for g in groups for a, r in zip(g.agents, g.references)}
-    driven = next((g.agents[0].id for g in groups if isinstance(g, Driven)), None)
+    driven = next((g.agents[0].id for g in groups if isinstance(g, PolicyVehicle)), None)
     reactive = {a.id for g in reacting for a in g.agents}
-    traffic = Traffic(agents, [paths.get(a.id) or _pose(a) for a in agents], reactive, driven)
+    traffic = Traffic(agents, [paths.get(a.id) or _static_path(a) for a in agents], reactive, driven)
     for group in reacting:
         group.join(traffic, clock)
     return traffic
 
 
-def _pose(agent: Agent) -> Path:
+def _static_path(agent: Agent) -> Path:
     """The path of a static agent: it stands, as long as it lives."""
     w = agent.waypoints
     first = {k: np.full(len(w), getattr(w, k)[0]) for k in ("x_m", "y_m", "z_m", "yaw_rad")}
     return path_of(replace(agent, waypoints=replace(w, **first, speed_mps=np.zeros(len(w)))), 0.0)
 
 
-def _lives(agents: Sequence[Agent], clock: Clock) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _lifespans(agents: Sequence[Agent], clock: StepClock) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """First and last step (A,), (A,) of each agent; the last before the first where a life lies between two steps."""
     begin = np.array([a.waypoints.t_s[0] for a in agents])
     end = np.array([a.waypoints.t_s[-1] for a in agents])

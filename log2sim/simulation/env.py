@@ -38,10 +38,10 @@ LOST_M = 15.0  # so far off the path an episode ends
 
 PICTURE_PX, PICTURE_M = 400, 80.0
 
-Seen = dict[str, Any]
+ObservationArrays = dict[str, Any]
 
 
-class ScenarioEnv(gymnasium.Env[Seen, Any]):
+class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
     """Drive the ego of a scenario among its other agents.
 
     Parameters
@@ -114,7 +114,9 @@ class ScenarioEnv(gymnasium.Env[Seen, Any]):
         spaces: dict[str, Any] = {k: Box(-v, v) for k, v in self._bounds.items()}
         self.observation_space = Dict({**spaces, "others_mask": Box(0, 1, (max_others,), np.int8)})
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[ObservationArrays, dict[str, Any]]:
         """Start the scenario again, at the moment when the ego appears."""
         super().reset(seed=seed)
         self.world.restart()
@@ -123,11 +125,11 @@ class ScenarioEnv(gymnasium.Env[Seen, Any]):
         self._seen, self._begun = self.world.observe(), True
         return self._shown(), {"t_s": self._seen.t_s}
 
-    def step(self, action: Any) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[ObservationArrays, float, bool, bool, dict[str, Any]]:
         """Hold an action for `hold_s`; `ValueError` when it is not two finite numbers."""
         if not self._begun:
             raise gymnasium.error.ResetNeeded("the episode has not begun: call reset() before step()")
-        pedal, wheel = _shares(action)
+        pedal, wheel = _action_values(action)
         brake, throttle = self.accel_limits_mps2
         before_m, begin_s = self._seen.path.progress_m, self._seen.t_s
         self.world.steer(Controls(pedal * (throttle if pedal > 0 else brake), wheel * self.max_steer_rad))
@@ -142,7 +144,7 @@ class ScenarioEnv(gymnasium.Env[Seen, Any]):
             if collides or over:
                 break
         seen = self._seen
-        offset_m = float(_in_frame_of_path(seen)[0])
+        offset_m = float(_path_errors(seen)[0])
         parts = {
             "progress": seen.path.progress_m - before_m,
             "off_path": -OFF_PATH_PER_M_S * abs(offset_m) * (seen.t_s - begin_s),
@@ -155,21 +157,27 @@ class ScenarioEnv(gymnasium.Env[Seen, Any]):
 
     def render(self) -> Any:
         """The surroundings of the ego from above, (400, 400, 3) uint8, its front to the right; None without a render mode."""
-        return _picture(self._seen) if self._begun and self.render_mode == "rgb_array" else None
+        return _rendered(self._seen) if self._begun and self.render_mode == "rgb_array" else None
 
-    def _shown(self) -> Seen:
+    def _shown(self) -> ObservationArrays:
         """The observation as arrays within the bounds of its space."""
         seen, ego = self._seen, self._seen.ego
         ahead = np.arange(1, PATH_ROWS + 1) * PATH_EVERY_M
-        path = (*_in_frame(ego, seen.path.x_m[ahead], seen.path.y_m[ahead]), seen.path.speed_mps[ahead])
+        path = (*_in_ego_frame(ego, seen.path.x_m[ahead], seen.path.y_m[ahead]), seen.path.speed_mps[ahead])
         o, count = seen.others, self._rows
-        velocity = _turned(ego, o.velocity_x_mps, o.velocity_y_mps)
-        columns = (*_in_frame(ego, o.x_m, o.y_m), *velocity, wrap_angle(o.yaw_rad - ego.yaw_rad), o.length_m, o.width_m)
+        velocity = _in_ego_axes(ego, o.velocity_x_mps, o.velocity_y_mps)
+        columns = (
+            *_in_ego_frame(ego, o.x_m, o.y_m),
+            *velocity,
+            wrap_angle(o.yaw_rad - ego.yaw_rad),
+            o.length_m,
+            o.width_m,
+        )
         near = np.stack(columns, axis=1)[:count]
         others = np.zeros((count, 7))
         others[: len(near)] = near
         arrays = {
-            "ego": np.array([ego.speed_mps, ego.accel_mps2, ego.steer_rad, *_in_frame_of_path(seen)]),
+            "ego": np.array([ego.speed_mps, ego.accel_mps2, ego.steer_rad, *_path_errors(seen)]),
             "path": np.stack(path, axis=1),
             "others": others,
         }
@@ -177,7 +185,7 @@ class ScenarioEnv(gymnasium.Env[Seen, Any]):
         return {**shown, "others_mask": (np.arange(count) < len(near)).astype(np.int8)}
 
 
-def _shares(action: Any) -> tuple[float, float]:
+def _action_values(action: Any) -> tuple[float, float]:
     """The pedal and the steering of an action, as shares from -1 to 1."""
     values = np.asarray(action, dtype=np.float64)
     if values.shape != (2,) or not np.isfinite(values).all():
@@ -186,18 +194,18 @@ def _shares(action: Any) -> tuple[float, float]:
     return pedal, wheel
 
 
-def _turned(ego: EgoState, x: Array, y: Array) -> tuple[Array, Array]:
+def _in_ego_axes(ego: EgoState, x: Array, y: Array) -> tuple[Array, Array]:
     """Forward and left components (N,), (N,) of vectors on the map's axes."""
     cos, sin = np.cos(ego.yaw_rad), np.sin(ego.yaw_rad)
     return x * cos + y * sin, y * cos - x * sin
 
 
-def _in_frame(ego: EgoState, x_m: Array, y_m: Array) -> tuple[Array, Array]:
+def _in_ego_frame(ego: EgoState, x_m: Array, y_m: Array) -> tuple[Array, Array]:
     """Points (N,), (N,) of the map seen from the ego's box center: forward, left."""
-    return _turned(ego, x_m - ego.x_m, y_m - ego.y_m)
+    return _in_ego_axes(ego, x_m - ego.x_m, y_m - ego.y_m)
 
 
-def _in_frame_of_path(seen: Observation) -> tuple[Array, Array]:
+def _path_errors(seen: Observation) -> tuple[Array, Array]:
     """Offset of the ego to the left of its path in m, and its heading against it in rad."""
     x, y, yaw = seen.path.x_m[0], seen.path.y_m[0], seen.path.yaw_rad[0]
     dx, dy = seen.ego.x_m - x, seen.ego.y_m - y
@@ -213,7 +221,7 @@ def _collides(seen: Observation) -> bool:
     return bool((level & rectangles_overlap(o.x_m - ego.x_m, o.y_m - ego.y_m, yaw, o.yaw_rad, own, size)).any())
 
 
-def _picture(seen: Observation) -> Any:
+def _rendered(seen: Observation) -> Any:
     """The ego, its path and the others, drawn."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import PolyCollection
@@ -225,8 +233,8 @@ def _picture(seen: Observation) -> Any:
     axes = figure.add_axes((0, 0, 1, 1))
     axes.set(xlim=(-PICTURE_M / 2, PICTURE_M / 2), ylim=(-PICTURE_M / 2, PICTURE_M / 2), aspect="equal")
     axes.axis("off")
-    axes.plot(*_in_frame(ego, seen.path.x_m, seen.path.y_m), color="#9aa5b1", linewidth=1.5)
-    centers = np.stack(_in_frame(ego, o.x_m, o.y_m), axis=1)
+    axes.plot(*_in_ego_frame(ego, seen.path.x_m, seen.path.y_m), color="#9aa5b1", linewidth=1.5)
+    centers = np.stack(_in_ego_frame(ego, o.x_m, o.y_m), axis=1)
     others = box_corners_bev(centers.reshape(-1, 2), o.length_m, o.width_m, o.yaw_rad - ego.yaw_rad)
     axes.add_collection(PolyCollection(list(others), facecolor="#7aa6c2", edgecolor="#33566b"))
     own = box_corners_bev([[0.0, 0.0]], ego.length_m, ego.width_m, 0.0)

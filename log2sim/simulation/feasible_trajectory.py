@@ -27,18 +27,18 @@ JERK_MPS3 = 20.0  # and of what a driver does
 LATERAL_JERK_MPS3 = 20.0
 ROLL_M, ROLL_RAD, ROLL_MPS = 1e-3, 1e-3, 1e-2  # how exactly the wheels roll from knot to knot
 LOCK_SHARE = 0.95  # the rest of the lock is left to the controller
-BOUND = 0.002  # softness of limits, as a share of them
+LIMIT_SIGMA_SHARE = 0.002  # softness of limits, as a share of them
 
-ITERATIONS, TRIALS = 40, 16
-DONE = 1e-4  # relative gain at which the iteration ends
-SLOWEST_RADPS = 0.01
+MAX_ITERATIONS, MAX_DAMPING_TRIALS = 40, 16
+MIN_RELATIVE_GAIN = 1e-4  # relative gain at which the iteration ends
+MIN_YAW_RATE_RADPS = 0.01
 X, Y, YAW, SPEED, ACCEL, CURVATURE = range(6)
 STATES = NEXT = 6  # the next knot's states are counted on
-DAMPED = np.array([1 / POSITION_M, 1 / POSITION_M, 1 / YAW_RAD, 1 / SPEED_MPS, 1.0, 10.0]) ** 2
+DAMPING_SCALE = np.array([1 / POSITION_M, 1 / POSITION_M, 1 / YAW_RAD, 1 / SPEED_MPS, 1.0, 10.0]) ** 2
 
 
 @dataclass(frozen=True)
-class Limits:
+class FeasibilityLimits:
     """What a vehicle can do: curvature and its rate in time, acceleration ahead and sideways; and where its box center is."""
 
     offset_m: float
@@ -49,7 +49,7 @@ class Limits:
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class FeasibleTrajectory:
     """Rear axle at times `t_s` (K,): position in m, yaw in rad (unwrapped), signed speed, acceleration, curvature, all (K,)."""
 
     t_s: Array
@@ -70,7 +70,9 @@ class Course:
         )
 
 
-def nearest_course(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps: Array, limits: Limits) -> Course:
+def fit_trajectory(
+    t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps: Array, limits: FeasibilityLimits
+) -> FeasibleTrajectory:
     """Fit a course to box centers and headings at evenly spaced times (K,), K >= 2.
 
     Notes
@@ -79,17 +81,17 @@ def nearest_course(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps
     residual as well (direct multiple shooting, Bock & Plitt, 1984), which makes every step a banded system: cost O(K).
     Headings and speeds enter by the pseudo-Huber loss, so a few that are far off are outvoted.
     """
-    axis = _axis(yaw_rad)
+    axis = _consistent_heading(yaw_rad)
     away = wrap_angle(yaw_rad - axis)
     logged = np.stack([x_m, y_m, axis + away, np.where(np.abs(away) > np.pi / 2, -speed_mps, speed_mps)], axis=1)
     along = np.gradient(x_m, t_s) * np.cos(axis) + np.gradient(y_m, t_s) * np.sin(axis)
-    state = _first_guess(t_s, x_m, y_m, axis, along, limits)
-    problem = _Problem(float(t_s[1] - t_s[0]), logged, limits)
+    state = _initial_states(t_s, x_m, y_m, axis, along, limits)
+    problem = _LeastSquares(float(t_s[1] - t_s[0]), logged, limits)
     terms = problem.terms(state)
     cost, damping = _cost(terms), 1e-2
-    for _ in range(ITERATIONS):
+    for _ in range(MAX_ITERATIONS):
         band, gradient = _normal_equations(terms, len(state))
-        for _ in range(TRIALS):
+        for _ in range(MAX_DAMPING_TRIALS):
             trial = state - _solve(band, gradient, damping)
             terms = problem.terms(trial)
             gain = cost - _cost(terms)
@@ -99,23 +101,25 @@ def nearest_course(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps
         else:
             break
         state, cost, damping = trial, cost - gain, max(damping / 4, 1e-9)
-        if gain < DONE * cost:
+        if gain < MIN_RELATIVE_GAIN * cost:
             break
-    return Course(t_s, *state.T)
+    return FeasibleTrajectory(t_s, *state.T)
 
 
-def as_logged(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps: Array, limits: Limits) -> Course:
+def unfitted_trajectory(
+    t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps: Array, limits: FeasibilityLimits
+) -> FeasibleTrajectory:
     """The course as the log has it, at times (K,), K >= 1: of a moment, or of a life too long to be fitted."""
-    return Course(t_s, *_first_guess(t_s, x_m, y_m, yaw_rad, speed_mps, limits).T)
+    return FeasibleTrajectory(t_s, *_initial_states(t_s, x_m, y_m, yaw_rad, speed_mps, limits).T)
 
 
-def _axis(yaw: Array) -> Array:
+def _consistent_heading(yaw: Array) -> Array:
     """Headings (K,) without turns of more than a quarter from knot to knot, back to front where the log is so less often."""
     axis = np.unwrap(yaw, period=np.pi)
     return axis + np.pi if np.sum(np.cos(axis - yaw)) < 0 else axis
 
 
-def _first_guess(t_s: Array, x: Array, y: Array, yaw: Array, speed: Array, limits: Limits) -> Array:
+def _initial_states(t_s: Array, x: Array, y: Array, yaw: Array, speed: Array, limits: FeasibilityLimits) -> Array:
     """Rear axles as the log has them, acceleration and curvature within their limits; (K, 6)."""
     guess = np.zeros((len(t_s), STATES))
     guess[:, 0], guess[:, 1] = x - limits.offset_m * np.cos(yaw), y - limits.offset_m * np.sin(yaw)
@@ -126,14 +130,14 @@ def _first_guess(t_s: Array, x: Array, y: Array, yaw: Array, speed: Array, limit
         # As a share of the curvature that lock and grip allow, which leaves slow vehicles that turn on the spot at the lock.
         pace = np.abs(speed)
         most = limits.max_lateral_mps2 / np.maximum(pace**2, limits.max_lateral_mps2 / limits.max_curvature_1pm)
-        guess[:, 5] = most * np.clip(turn / np.maximum(most * pace, SLOWEST_RADPS), -1, 1) * np.sign(speed)
+        guess[:, 5] = most * np.clip(turn / np.maximum(most * pace, MIN_YAW_RATE_RADPS), -1, 1) * np.sign(speed)
     return guess
 
 
 Slopes = dict[int, Array | float]
 
 
-class Term(NamedTuple):
+class ResidualTerm(NamedTuple):
     """Residuals of the knots (K,) or of the ways between them (K - 1,), and their derivatives, by state.
 
     What is `robust` counts by the pseudo-Huber loss, all else by its square.
@@ -145,38 +149,38 @@ class Term(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
+class _LeastSquares:
     """`logged` (K, 4): center x, y, yaw and speed at knots `h_s` apart."""
 
     h_s: float
     logged: Array
-    limits: Limits
+    limits: FeasibilityLimits
 
-    def terms(self, state: Array) -> list[Term]:
+    def terms(self, state: Array) -> list[ResidualTerm]:
         """What the cost is made of: terms of the knots and of the ways between them."""
         return [*self._knots(state), *self._ways(state)]
 
-    def _knots(self, state: Array) -> list[Term]:
+    def _knots(self, state: Array) -> list[ResidualTerm]:
         """What the log says of the knots, and the limits."""
         x, y, yaw, speed, accel, curvature = state.T
         log_x, log_y, log_yaw, log_speed = self.logged.T
         limits, o, scale = self.limits, self.limits.offset_m, math.sqrt(self.h_s / KNOT_S)
         cos, sin = np.cos(yaw), np.sin(yaw)
         place, turn, pace = scale / POSITION_M, scale / YAW_RAD, scale / SPEED_MPS
-        hard, gentle = _beyond(accel, limits.max_accel_mps2, scale)
-        tight, wide = _beyond(curvature, limits.max_curvature_1pm, scale)
-        aside, grip = _beyond(speed**2 * curvature, limits.max_lateral_mps2, scale)
+        hard, gentle = _limit_residual(accel, limits.max_accel_mps2, scale)
+        tight, wide = _limit_residual(curvature, limits.max_curvature_1pm, scale)
+        aside, grip = _limit_residual(speed**2 * curvature, limits.max_lateral_mps2, scale)
         return [
-            Term((x + o * cos - log_x) * place, {X: place, YAW: -o * place * sin}),
-            Term((y + o * sin - log_y) * place, {Y: place, YAW: o * place * cos}),
-            Term(hard, {ACCEL: gentle}),
-            Term(tight, {CURVATURE: wide}),
-            Term(aside, {SPEED: grip * 2 * speed * curvature, CURVATURE: grip * speed**2}),
-            Term((yaw - log_yaw) * turn, {YAW: turn}, robust=True),
-            Term((speed - log_speed) * pace, {SPEED: pace}, robust=True),
+            ResidualTerm((x + o * cos - log_x) * place, {X: place, YAW: -o * place * sin}),
+            ResidualTerm((y + o * sin - log_y) * place, {Y: place, YAW: o * place * cos}),
+            ResidualTerm(hard, {ACCEL: gentle}),
+            ResidualTerm(tight, {CURVATURE: wide}),
+            ResidualTerm(aside, {SPEED: grip * 2 * speed * curvature, CURVATURE: grip * speed**2}),
+            ResidualTerm((yaw - log_yaw) * turn, {YAW: turn}, robust=True),
+            ResidualTerm((speed - log_speed) * pace, {SPEED: pace}, robust=True),
         ]
 
-    def _ways(self, state: Array) -> list[Term]:
+    def _ways(self, state: Array) -> list[ResidualTerm]:
         """Rolling from knot to knot, and the driver's smoothness."""
         h, (a, b) = self.h_s, (state[:-1].T, state[1:].T)
         (_, _, yaw, speed, accel, curvature), (dx, dy, turn, gain, jerk, bend) = (a + b) / 2, b - a
@@ -184,15 +188,15 @@ class _Problem:
         east, north = per_speed * cos, per_speed * sin
         smooth, straight = 1 / (math.sqrt(h * KNOT_S) * JERK_MPS3), 1 / (math.sqrt(h * KNOT_S) * self._curvature_rate)
         return [
-            _between((dx - speed * east) / ROLL_M, X, 1 / ROLL_M, {YAW: speed * north / ROLL_M, SPEED: -east / ROLL_M}),
-            _between((dy - speed * north) / ROLL_M, Y, 1 / ROLL_M, {YAW: -speed * east / ROLL_M, SPEED: -north / ROLL_M}),
-            _between(
+            _transition((dx - speed * east) / ROLL_M, X, 1 / ROLL_M, {YAW: speed * north / ROLL_M, SPEED: -east / ROLL_M}),
+            _transition((dy - speed * north) / ROLL_M, Y, 1 / ROLL_M, {YAW: -speed * east / ROLL_M, SPEED: -north / ROLL_M}),
+            _transition(
                 (turn - h * speed * curvature) / ROLL_RAD, YAW, 1 / ROLL_RAD,
                 {SPEED: -h / ROLL_RAD * curvature, CURVATURE: -h / ROLL_RAD * speed},
             ),
-            _between((gain - h * accel) / ROLL_MPS, SPEED, 1 / ROLL_MPS, {ACCEL: -h / ROLL_MPS}),
-            _between(jerk * smooth, ACCEL, smooth, {}),
-            _between(bend * straight, CURVATURE, straight, {}),
+            _transition((gain - h * accel) / ROLL_MPS, SPEED, 1 / ROLL_MPS, {ACCEL: -h / ROLL_MPS}),
+            _transition(jerk * smooth, ACCEL, smooth, {}),
+            _transition(bend * straight, CURVATURE, straight, {}),
         ]  # fmt: skip
 
     @cached_property
@@ -203,44 +207,44 @@ class _Problem:
         return LATERAL_JERK_MPS3 / np.maximum(pace**2, LATERAL_JERK_MPS3 / steering)
 
 
-def _between(residual: Array, state: int, per_rise: Array | float, per_mean: Slopes) -> Term:
+def _transition(residual: Array, state: int, per_rise: Array | float, per_mean: Slopes) -> ResidualTerm:
     """A term of each knot and the next, by its derivatives: by the rise of one state and by the means of others."""
     halves = {k: slope / 2 for k, slope in per_mean.items()}
-    return Term(
+    return ResidualTerm(
         residual, {state: -per_rise, NEXT + state: per_rise, **halves, **{NEXT + k: s for k, s in halves.items()}}
     )
 
 
-def _cost(terms: list[Term]) -> float:
+def _cost(terms: list[ResidualTerm]) -> float:
     """Half the sum of squares, the pseudo-Huber loss for headings and speeds."""
     return float(
         sum(np.sum(np.sqrt(1 + t.residual**2) - 1) if t.robust else t.residual @ t.residual / 2 for t in terms)
     )
 
 
-def _normal_equations(terms: list[Term], count: int) -> tuple[Array, Array]:
+def _normal_equations(terms: list[ResidualTerm], count: int) -> tuple[Array, Array]:
     """Second derivatives of the cost as a band (K, 6, 12), the diagonal and what is below it, and the gradient (K, 6)."""
     band, gradient = np.zeros((count, STATES, 2 * STATES)), np.zeros((count, STATES))
     for residual, slopes, robust in terms:
         weight = 1 / np.sqrt(1 + residual**2) if robust else 1.0
         for i, slope in slopes.items():
             weighted = weight * slope
-            _at(gradient, i, residual)[:] += weighted * residual
+            _state_rows(gradient, i, residual)[:] += weighted * residual
             for j, other in slopes.items():
                 if j <= i:
-                    _at(band[:, :, i - j], j, residual)[:] += weighted * other
+                    _state_rows(band[:, :, i - j], j, residual)[:] += weighted * other
     return band, gradient
 
 
-def _at(rows: Array, state: int, residual: Array) -> Array:
+def _state_rows(rows: Array, state: int, residual: Array) -> Array:
     """The column of a state in rows (K, 6), as long as a term's residual."""
     knot, column = divmod(state, STATES)
     return rows[knot : knot + len(residual), column]
 
 
-def _beyond(value: Array, limit: float, scale: float) -> tuple[Array, Array]:
+def _limit_residual(value: Array, limit: float, scale: float) -> tuple[Array, Array]:
     """How far values (K,) are beyond a limit of their size, in units of its softness, and the derivative of that."""
-    beyond, unit = value - np.minimum(np.maximum(value, -limit), limit), scale / (BOUND * limit)
+    beyond, unit = value - np.minimum(np.maximum(value, -limit), limit), scale / (LIMIT_SIGMA_SHARE * limit)
     return beyond * unit, (beyond != 0) * unit
 
 
@@ -249,6 +253,6 @@ def _solve(band: Array, gradient: Array, damping: float) -> NDArray[np.float64]:
     from scipy.linalg import solveh_banded
 
     damped = band.copy()
-    damped[:, :, 0] += damping * DAMPED
+    damped[:, :, 0] += damping * DAMPING_SCALE
     flat = damped.reshape(gradient.size, -1).T
     return solveh_banded(flat, gradient.ravel(), lower=True, overwrite_ab=True).reshape(gradient.shape)

@@ -25,7 +25,7 @@ from log2sim.simulation.vehicles.vehicle import (
 
 
 @dataclass(frozen=True)
-class Gains:
+class ControllerGains:
     """Time constants in s, lengths in m. Defaults stay stable with actuator lags of 0.1 s and steps of up to 0.1 s."""
 
     along_s: float = 0.6
@@ -41,7 +41,7 @@ class Gains:
     max_lateral_accel_mps2: float = 9.0  # grip of a dry road
 
 
-GAINS = Gains()
+GAINS = ControllerGains()
 INTEGRAL_LIMIT_MPS2 = 1.0
 INTEGRAL_SHARE = 0.2  # of the curvature that lock and grip allow
 MAX_CONTROL_STEP_S = 0.1
@@ -56,7 +56,7 @@ def control_step(dt_s: float) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Memory(Columns):
+class ControllerMemory(Columns):
     """What the controllers of vehicles remember of the errors along the path and across it, (2, A) each.
 
     `integral` in m/s2 and 1/m; `rate` the filtered derivatives, which are a speed in m/s and the slope toward the path.
@@ -66,13 +66,18 @@ class Memory(Columns):
     rate: Array
 
     @classmethod
-    def fresh(cls, count: int) -> Memory:
+    def fresh(cls, count: int) -> ControllerMemory:
         return cls(np.zeros((2, count)), np.zeros((2, count)))
 
 
 def follow_vehicles(
-    row: Array, state: VehicleState, memory: Memory, parameters: VehicleParameters, dt_s: float, gains: Gains = GAINS
-) -> tuple[VehicleControls, Memory]:
+    row: Array,
+    state: VehicleState,
+    memory: ControllerMemory,
+    parameters: VehicleParameters,
+    dt_s: float,
+    gains: ControllerGains = GAINS,
+) -> tuple[VehicleControls, ControllerMemory]:
     """Controls of vehicles that follow their references.
 
     Parameters
@@ -117,7 +122,7 @@ def follow_vehicles(
     np.copyto(integral[0], 0.0, where=held)
     steer = np.arctan(p.wheelbase_m * given[1] * (1 + p.understeer_s2pm2 * square))
     controls = VehicleControls(given[0], steer, reference_gear < 0)
-    return controls, Memory(integral, rate)
+    return controls, ControllerMemory(integral, rate)
 
 
 def _errors(row: Array, state: VehicleState) -> tuple[Array, Array]:
@@ -137,7 +142,7 @@ def _errors(row: Array, state: VehicleState) -> tuple[Array, Array]:
     return rows(along, across), rows(speed - state.speed_mps, slope)
 
 
-def follow_points(row: Array, state: PointState, gains: Gains = GAINS) -> PointControls:
+def follow_points(row: Array, state: PointState, gains: ControllerGains = GAINS) -> PointControls:
     """Controls of points that follow their references `row` (C, A), as `POINT_COLUMNS`; they may go any way."""
     x, y, _, vx, vy, ax, ay, _ = row
     p, d = 1 / gains.point_s**2, 2 * gains.damping / gains.point_s

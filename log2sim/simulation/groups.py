@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Agent
 from log2sim.geometry import Array, cos_sin, wrap_angle
 from log2sim.simulation.follower import (
-    Memory,
+    ControllerMemory,
     control_step,
     follow_points,
     follow_vehicles,
@@ -26,7 +26,7 @@ from log2sim.simulation.follower import (
 from log2sim.simulation.policy import Controls
 from log2sim.simulation.reference import GRID_S, Reference
 from log2sim.simulation.simulators import Simulator
-from log2sim.simulation.vehicles.model_choice import moving_as
+from log2sim.simulation.vehicles.model_choice import with_slip_states
 from log2sim.simulation.vehicles.vehicle import Columns, PointState, VehicleControls, VehicleParameters, VehicleState
 
 
@@ -48,7 +48,7 @@ class Snapshot(Columns):
     gear: Array
 
 
-class Group(ABC):
+class AgentGroup(ABC):
     """Agents driven alike. `first`, `last` (A,) are the steps between which each agent lives."""
 
     driver = "exact"
@@ -72,7 +72,7 @@ class Group(ABC):
         if len(self.live):
             self._table = np.empty((rows, self.references[0].columns.shape[1], len(self.live)))
             for slot, i in enumerate(self.live):
-                _fill(self._table[:, :, slot], self.references[i], self._row0)
+                _copy_rows(self._table[:, :, slot], self.references[i], self._row0)
 
     def log_times(self, t_s: float) -> Array:
         """When the log was where the living agents are meant to be at a time (A,)."""
@@ -115,7 +115,7 @@ class Group(ABC):
         return np.searchsorted(self.live, index)
 
 
-class Tape(Group):
+class LogReplayGroup(AgentGroup):
     """Agents that are exactly where the log has them."""
 
     def place(self, index: NDArray, t_s: float) -> None:
@@ -131,7 +131,7 @@ class Tape(Group):
         return Snapshot(x, y, wrap_angle(yaw), speed, np.zeros(len(self.live)), unknown, unknown, unknown, unknown)
 
 
-class Fleet(Group):
+class VehicleGroup(AgentGroup):
     """Vehicles that follow their waypoints."""
 
     driver = "pid"
@@ -148,7 +148,7 @@ class Fleet(Group):
         super().__init__(agents, references, first, last)
         self.parameters, self.simulator = parameters, simulator
         self._all = VehicleState.zeros(len(agents))
-        self._all_memory = Memory.fresh(len(agents))
+        self._all_memory = ControllerMemory.fresh(len(agents))
         self._all_commands = VehicleControls(np.zeros(len(agents)), np.zeros(len(agents)), np.zeros(len(agents), bool))
         self._open(self.live)
 
@@ -171,9 +171,9 @@ class Fleet(Group):
         slots = self._slots(index)
         state = start_vehicles(self._exact(index, t_s), self.living.take(slots))
         if self.references[index[0]].slips:  # all of a fleet have the same model
-            state = moving_as(state, lambda at_s: self._exact(index, at_s), t_s)
+            state = with_slip_states(state, lambda at_s: self._exact(index, at_s), t_s)
         self.state.put(slots, state)
-        self.memory.put(slots, Memory.fresh(len(slots)))
+        self.memory.put(slots, ControllerMemory.fresh(len(slots)))
         placed = self.state.take(slots)
         self.commands.put(slots, VehicleControls(placed.pedal_mps2, placed.steer_rad, placed.speed_mps < 0))
 
@@ -194,7 +194,7 @@ class Fleet(Group):
         self.state = self.simulator.step_vehicles(self.state, self.commands, self.living, dt_s)
 
 
-class Driven(Fleet):
+class PolicyVehicle(VehicleGroup):
     """The one vehicle that the user's policy drives, by the controls set before each step."""
 
     driver = "policy"
@@ -209,7 +209,7 @@ class Driven(Fleet):
         self.state = self.simulator.step_vehicles(self.state, self.commands, self.living, dt_s)
 
 
-class Crowd(Group):
+class PedestrianGroup(AgentGroup):
     """Points that follow their waypoints."""
 
     driver = "pid"
@@ -247,7 +247,7 @@ class Crowd(Group):
         self.state = self.simulator.step_points(self.state, follow_points(self.row, self.state), dt_s)
 
 
-def _fill(window: Array, reference: Reference, row0: int) -> None:
+def _copy_rows(window: Array, reference: Reference, row0: int) -> None:
     """Copy the rows from `row0` on of a table to a window (W, C); its first and last row stand for before and after."""
     columns, begin = reference.columns, reference.first_row - row0
     low = min(max(begin, 0), len(window))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent
 from log2sim.geometry import Array, wrap_angle
-from log2sim.simulation.groups import Driven, Group
+from log2sim.simulation.groups import AgentGroup, PolicyVehicle
 from log2sim.simulation.path import Path, path_of
 from log2sim.simulation.policy import (
     PATH_AHEAD_M,
@@ -21,20 +21,22 @@ from log2sim.simulation.policy import (
     PathAhead,
     Route,
 )
-from log2sim.simulation.reactive.path_table import SPACING_M, Ways
+from log2sim.simulation.reactive.path_table import SPACING_M, PathTable
 
 ONE = np.zeros(1, dtype=np.intp)
 
 
-class Observer:
+class PolicyObserver:
     """Observations for the one vehicle that a policy drives, among all groups and static agents."""
 
-    def __init__(self, ego: Driven, groups: Sequence[Group], statics: Sequence[Agent], sight_m: float) -> None:
+    def __init__(
+        self, ego: PolicyVehicle, groups: Sequence[AgentGroup], statics: Sequence[Agent], sight_m: float
+    ) -> None:
         self.ego, self.sight_m = ego, sight_m
         self._path = ego.references[0].path
-        self._way = Ways([self._path])
+        self._way = PathTable([self._path])
         self._groups = [g for g in groups if g is not ego]
-        self._statics = _poses(statics)
+        self._statics = _static_poses(statics)
         lives = [(-np.inf, np.inf) if a.is_permanent else (a.waypoints.t_s[0], a.waypoints.t_s[-1]) for a in statics]
         self._static_lives_s = np.array(lives, dtype=np.float64).reshape(-1, 2)
         self._agents = [_identities(g.agents, [r.path for r in g.references]) for g in self._groups]
@@ -73,7 +75,7 @@ class Observer:
 
     def _route(self, t_s: float) -> Route:
         ahead = np.arange(t_s, min(t_s + ROUTE_AHEAD_S, self._path.t_s[-1]) + ROUTE_STEP_S / 2, ROUTE_STEP_S)
-        return Route(*(_locked(c) for c in (ahead, *self._path.centers(ahead))))
+        return Route(*(_read_only(c) for c in (ahead, *self._path.centers(ahead))))
 
     def _ahead(self) -> PathAhead:
         way, now = self._way, self.ego.snapshot()
@@ -82,7 +84,7 @@ class Observer:
         x, y, cos, sin, at_s = way.along(ONE, self.progress_m + ahead)
         pace = np.abs(way.at(ONE, np.where(np.isnan(at_s), self._path.t_s[-1], at_s)).speed_mps)
         columns = (ahead, x + way.origin_m[0], y + way.origin_m[1], wrap_angle(np.arctan2(sin, cos)), pace, at_s)
-        return PathAhead(self.progress_m, *(_locked(c) for c in columns))
+        return PathAhead(self.progress_m, *(_read_only(c) for c in columns))
 
     def _others(self, ego: EgoState, step: int, t_s: float) -> Others:
         begin_s, end_s = self._static_lives_s.T
@@ -103,7 +105,7 @@ class Observer:
         z = np.array([path.heights(t) for path, t in zip(seen["path"], np.concatenate(log_s)[near])], dtype=np.float64)
         size = (seen[k] for k in ("length_m", "width_m", "height_m"))
         columns = (x, y, z, yaw, speed, speed * np.cos(yaw), speed * np.sin(yaw), *size)
-        return Others(_locked(seen["id"]), _locked(seen["category"]), *(_locked(c) for c in columns))
+        return Others(_read_only(seen["id"]), _read_only(seen["category"]), *(_read_only(c) for c in columns))
 
 
 def _identities(agents: Sequence[Agent], paths: Sequence[Path]) -> NDArray:
@@ -113,13 +115,13 @@ def _identities(agents: Sequence[Agent], paths: Sequence[Path]) -> NDArray:
     return np.array(rows, dtype=[("id", object), ("category", object), *sizes, ("path", object)])
 
 
-def _poses(agents: Sequence[Agent]) -> Array:
+def _static_poses(agents: Sequence[Agent]) -> Array:
     """x, y, yaw and speed (4, A) of agents that stand."""
     first = [(a.waypoints.x_m[0], a.waypoints.y_m[0], a.waypoints.yaw_rad[0], 0.0) for a in agents]
     return np.array(first, dtype=np.float64).reshape(-1, 4).T
 
 
-def _locked(values: NDArray) -> NDArray:
+def _read_only(values: NDArray) -> NDArray:
     """The array, which nobody can change from now on; strings as such and not as objects."""
     out = values.astype(str) if values.dtype == object else np.ascontiguousarray(values)
     out.setflags(write=False)

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Agent
 from log2sim.geometry import Array, wrap_angle
 
-JUMP_M = 2.0
-JUMP_SPEED_MPS = 15.0
+MIN_DISCONTINUITY_M = 2.0
+MIN_DISCONTINUITY_MPS = 15.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ def path_of(agent: Agent, rear_axle_offset_m: float) -> Path:
     if len(w) > 1:
         span = np.diff(w.t_s)
         miss = np.hypot(np.diff(x) - (vx[1:] + vx[:-1]) / 2 * span, np.diff(y) - (vy[1:] + vy[:-1]) / 2 * span)
-        jump = (miss > JUMP_M) & (miss > JUMP_SPEED_MPS * span)
+        jump = (miss > MIN_DISCONTINUITY_M) & (miss > MIN_DISCONTINUITY_MPS * span)
         beside_jump = np.concatenate([jump, [False]]) | np.concatenate([[False], jump])
         swing = np.where(beside_jump, 0.0, rear_axle_offset_m * np.gradient(yaw, w.t_s))
         vx, vy = _tangents(w.t_s, x, y, vx - swing * np.sin(yaw), vy + swing * np.cos(yaw), beside_jump)

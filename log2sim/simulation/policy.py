@@ -128,7 +128,7 @@ Policy = Callable[[Observation], Controls]
 """A function, or an object with `__call__` and, if it keeps something between steps, `reset(scenario)`."""
 
 
-def begin(policy: Policy, scenario: Scenario) -> None:
+def reset_policy(policy: Policy, scenario: Scenario) -> None:
     """Call a policy's `reset(scenario)` if it has one, so that it can be used for one replay after the other."""
     reset = getattr(policy, "reset", None)
     if reset is None:
@@ -139,7 +139,7 @@ def begin(policy: Policy, scenario: Scenario) -> None:
         raise ConfigError(f"policy: reset raised {type(error).__name__}: {error}") from error
 
 
-def ask(policy: Policy, observation: Observation) -> Controls:
+def query_policy(policy: Policy, observation: Observation) -> Controls:
     """Call a policy and check its answer."""
     where = f"policy at {observation.t_s:g} s"
     try:

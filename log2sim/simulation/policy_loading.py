@@ -54,7 +54,7 @@ def load_policy(name: str) -> Policy:
 
 
 def _import_module(name: str) -> ModuleType:
-    with _searched(Path.cwd()):
+    with _first_on_path(Path.cwd()):
         return importlib.import_module(name)
 
 
@@ -64,13 +64,13 @@ def _import_file(path: Path) -> ModuleType:
         raise ImportError(f"{path} is no Python file")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # where dataclasses of the file look for their module
-    with _searched(path.resolve().parent):
+    with _first_on_path(path.resolve().parent):
         spec.loader.exec_module(module)
     return module
 
 
 @contextmanager
-def _searched(folder: Path) -> Iterator[None]:
+def _first_on_path(folder: Path) -> Iterator[None]:
     """Search a folder before all others while something is imported."""
     sys.path.insert(0, str(folder))
     try:

@@ -9,18 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.simulation.groups import Group, Snapshot
+from log2sim.simulation.groups import AgentGroup, Snapshot
 
-Tracks = dict[str, tuple[NDArray[np.intp], Array]]
+RecordedTracks = dict[str, tuple[NDArray[np.intp], Array]]
 """By agent id: the stored steps (S,) and the columns (C, S) of a `Snapshot` at them."""
 
 COLUMNS = tuple(f.name for f in fields(Snapshot))
 
 
-class Record:
+class WindowRecording:
     """Snapshots of a group at every `every`-th step of a window [begin, end), in one array (S, C, A)."""
 
-    def __init__(self, group: Group, begin: int, end: int, every: int) -> None:
+    def __init__(self, group: AgentGroup, begin: int, end: int, every: int) -> None:
         self.group, self.live = group, group.live
         self.steps = np.arange(-(-begin // every) * every, end, every)
         self.rows = np.empty((len(self.steps), len(COLUMNS), len(group.live)))
@@ -44,7 +44,7 @@ class Record:
                 yield group.agents[i].id, steps[alive], self.rows[alive, :, slot].T
 
 
-def tracks_of(records: Iterable[Record]) -> Tracks:
+def merged_tracks(records: Iterable[WindowRecording]) -> RecordedTracks:
     """The tracks that records make, in order of time."""
     parts: dict[str, list[tuple[NDArray[np.intp], Array]]] = {}
     for record in records:

@@ -16,10 +16,10 @@ from log2sim.simulation.feasible_trajectory import (
     KNOT_S,
     LOCK_SHARE,
     MAX_KNOTS,
-    Course,
-    Limits,
-    as_logged,
-    nearest_course,
+    FeasibilityLimits,
+    FeasibleTrajectory,
+    fit_trajectory,
+    unfitted_trajectory,
 )
 from log2sim.simulation.follower import control_step
 from log2sim.simulation.path import Path, hermite, path_of
@@ -62,16 +62,16 @@ POINT_COLUMNS = ("x", "y", "yaw", "velocity_x", "velocity_y", "accel_x", "accel_
 
 def vehicle_reference(
     path: Path,
-    limits: Limits,
+    limits: FeasibilityLimits,
     *,
     accel_ahead_s: float,
     curvature_ahead_s: float,
     max_curvature_1pm: float = MAX_CURVATURE_1PM,
 ) -> Reference:
     """The table of a vehicle. Columns "..._ahead" are those of a later time, which makes up for the actuators' lag."""
-    course, departure_m = drivable_course(path, limits)
-    first, t = _grid(path)
-    motion = _motion(course, t)
+    course, departure_m = feasible_trajectory_of(path, limits)
+    first, t = _grid_times(path)
+    motion = _interpolated(course, t)
     gear, stands = _gears(motion[3])
 
     def rows_at(at_s: Array, motion: Array) -> Array:
@@ -84,13 +84,13 @@ def vehicle_reference(
         return rows.T
 
     def exact(at_s: Array) -> Array:
-        return rows_at(at_s, _motion(course, at_s))
+        return rows_at(at_s, _interpolated(course, at_s))
 
     flags = _flags(path, course, departure_m, max_curvature_1pm)
     return Reference(path, first, rows_at(t, motion), exact, limits.offset_m, flags)
 
 
-def drivable_course(path: Path, limits: Limits) -> tuple[Course, Array]:
+def feasible_trajectory_of(path: Path, limits: FeasibilityLimits) -> tuple[FeasibleTrajectory, Array]:
     """The course of the rear axle that a vehicle can drive, and how far in m (K,) it is from the logged box centers.
 
     Between leaps of the log it is made piece by piece.
@@ -104,16 +104,18 @@ def drivable_course(path: Path, limits: Limits) -> tuple[Course, Array]:
         count = max(int(np.ceil((until_s - begin_s) / KNOT_S - 1e-6)), 1) + 1 if until_s > begin_s else 1
         t = np.linspace(begin_s, until_s, count)
         x, y, yaw, speed = path.at(t)
-        course = (nearest_course if 1 < count <= MAX_KNOTS else as_logged)(t, x, y, yaw, speed, limits)
+        course = (fit_trajectory if 1 < count <= MAX_KNOTS else unfitted_trajectory)(t, x, y, yaw, speed, limits)
         pieces.append(course)
         o = limits.offset_m
         center_x, center_y = course.x_m + o * np.cos(course.yaw_rad), course.y_m + o * np.sin(course.yaw_rad)
         departures.append(np.hypot(center_x - x, center_y - y))
-    whole = Course(*(np.concatenate([getattr(p, f.name) for p in pieces]) for f in fields(Course)))
+    whole = FeasibleTrajectory(
+        *(np.concatenate([getattr(p, f.name) for p in pieces]) for f in fields(FeasibleTrajectory))
+    )
     return whole, np.concatenate(departures)
 
 
-def _motion(course: Course, t_s: Array) -> Array:
+def _interpolated(course: FeasibleTrajectory, t_s: Array) -> Array:
     """Rows x, y, yaw, speed (4, N) at times (N,), by cubics; straight on before the begin of the course and after its end."""
     inside = np.minimum(np.maximum(t_s, course.t_s[0]), course.t_s[-1])
     values, rates = course.motion
@@ -130,8 +132,8 @@ def _motion(course: Course, t_s: Array) -> Array:
 
 def point_reference(path: Path) -> Reference:
     """The table of a point: velocity and acceleration of the smoothed course, on map axes."""
-    first, t = _grid(path)
-    x, y, yaw, logged_speed = _extended(path, t)
+    first, t = _grid_times(path)
+    x, y, yaw, logged_speed = _extrapolated(path, t)
     vx, vy, ax, ay = logged_speed * np.cos(yaw), logged_speed * np.sin(yaw), np.zeros(len(t)), np.zeros(len(t))
     for piece in np.split(np.arange(len(t)), np.searchsorted(t, path.jump_times())):
         if len(piece) > 1:
@@ -141,22 +143,22 @@ def point_reference(path: Path) -> Reference:
 
     def exact(at_s: Array) -> Array:
         smoothed = (np.interp(at_s, t, c) for c in (vx, vy, ax, ay, stands))
-        return np.stack([*_extended(path, at_s)[:3], *smoothed], axis=1)
+        return np.stack([*_extrapolated(path, at_s)[:3], *smoothed], axis=1)
 
-    return Reference(path, first, exact(t), exact, flags=_leaps(path))
+    return Reference(path, first, exact(t), exact, flags=_discontinuity_flags(path))
 
 
-def tape_reference(path: Path) -> Reference:
+def log_reference(path: Path) -> Reference:
     """The table of an agent that is where the log has it: x, y, yaw, logged speed."""
-    first, t = _grid(path)
+    first, t = _grid_times(path)
 
     def exact(at_s: Array) -> Array:
-        return np.stack(_extended(path, at_s), axis=1)
+        return np.stack(_extrapolated(path, at_s), axis=1)
 
     return Reference(path, first, exact(t), exact)
 
 
-def _extended(path: Path, t_s: Array) -> tuple[Array, Array, Array, Array]:
+def _extrapolated(path: Path, t_s: Array) -> tuple[Array, Array, Array, Array]:
     """The path at times (N,), straight on before its begin and after its end: for the rows just outside."""
     x, y, yaw, speed = path.at(t_s)
     before, after = np.minimum(t_s - path.t_s[0], 0.0), np.maximum(t_s - path.t_s[-1], 0.0)
@@ -165,7 +167,7 @@ def _extended(path: Path, t_s: Array) -> tuple[Array, Array, Array, Array]:
     return x, y, yaw, speed
 
 
-def _grid(path: Path) -> tuple[int, Array]:
+def _grid_times(path: Path) -> tuple[int, Array]:
     """First row and the times of all rows that cover the life of a path."""
     first = int(np.floor(path.t_s[0] / GRID_S))
     last = int(np.ceil(path.t_s[-1] / GRID_S))
@@ -197,13 +199,13 @@ def _gears(speed: Array) -> tuple[Array, Array]:
     return gear, stands
 
 
-def _leaps(path: Path) -> tuple[str, ...]:
+def _discontinuity_flags(path: Path) -> tuple[str, ...]:
     return tuple(f"the log leaps at {at:.2f} s" for at in path.jump_times())
 
 
-def _flags(path: Path, course: Course, departure_m: Array, max_curvature_1pm: float) -> tuple[str, ...]:
+def _flags(path: Path, course: FeasibleTrajectory, departure_m: Array, max_curvature_1pm: float) -> tuple[str, ...]:
     """What no vehicle could drive: leaps, and a course that is far from the log or beyond what is feasible all the same."""
-    flags = list(_leaps(path))
+    flags = list(_discontinuity_flags(path))
     for name, values, limit, unit in (
         ("acceleration", course.accel_mps2, MAX_ACCEL_MPS2, "m/s2"),
         ("curvature", course.curvature_1pm, max_curvature_1pm, "1/m"),
@@ -215,11 +217,11 @@ def _flags(path: Path, course: Course, departure_m: Array, max_curvature_1pm: fl
     return tuple(flags)
 
 
-def vehicle_limits(agent: Agent) -> Limits:
+def vehicle_limits(agent: Agent) -> FeasibilityLimits:
     """What a wheeled agent can drive, from its category and length."""
     p = parameters_for([agent])
     wheelbase_m = float(p.wheelbase_m[0])
-    return Limits(
+    return FeasibilityLimits(
         offset_m=float(p.rear_axle_offset_m[0]),
         max_curvature_1pm=LOCK_SHARE * math.tan(p.max_steer_rad[0]) / wheelbase_m,
         max_curvature_rate_1pmps=float(p.max_steer_rate_radps[0]) / wheelbase_m,
@@ -227,7 +229,7 @@ def vehicle_limits(agent: Agent) -> Limits:
     )
 
 
-def _vehicle_reference(agent: Agent, dt_s: float) -> Reference:
+def vehicle_reference_of(agent: Agent, dt_s: float) -> Reference:
     """A vehicle's table: feed-forward is ahead by the actuator's lag and by half the step for which it is held."""
     limits = vehicle_limits(agent)
     return vehicle_reference(

@@ -10,29 +10,29 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, Scenario
 from log2sim.geometry import Array
-from log2sim.simulation.groups import Group
-from log2sim.simulation.metrics.all_metrics import FOLLOWING, assess
-from log2sim.simulation.metrics.tracking_error import Errors, errors_of
+from log2sim.simulation.groups import AgentGroup
+from log2sim.simulation.metrics.all_metrics import LOG_FOLLOWERS, replay_metrics
+from log2sim.simulation.metrics.tracking_error import TrackingErrors, agent_errors
 from log2sim.simulation.path import Path
-from log2sim.simulation.reactive.path_table import times_at, times_beside
-from log2sim.simulation.recording import Tracks
+from log2sim.simulation.reactive.path_table import log_times_of_distance, log_times_of_positions
+from log2sim.simulation.recording import RecordedTracks
 from log2sim.simulation.result import AgentReplay, Commands, Replay
-from log2sim.simulation.step_clock import Clock
-from log2sim.simulation.vehicles.model_choice import Choice
+from log2sim.simulation.step_clock import StepClock
+from log2sim.simulation.vehicles.model_choice import ModelChoice
 
-DIGITS = 6
+STATE_DIGITS = 6
 """Decimals of stored states: a micrometer."""
 
-FINE = 4
+COMMAND_DIGITS = 4
 """Decimals of commands and errors: a tenth of a millimeter."""
 
 
-def assemble(
+def replay_result(
     scenario: Scenario,
-    groups: Sequence[Group],
-    tracks: Tracks,
-    clock: Clock,
-    choices: Mapping[str, Choice],
+    groups: Sequence[AgentGroup],
+    tracks: RecordedTracks,
+    clock: StepClock,
+    choices: Mapping[str, ModelChoice],
     mode: str,
     model: str,
 ) -> Replay:
@@ -40,18 +40,18 @@ def assemble(
     home = {a.id: (g.driver, r.path, r.flags) for g in groups for a, r in zip(g.agents, g.references)}
     agents: list[AgentReplay] = []
     stored: list[NDArray[np.intp]] = []
-    errors: dict[str, Errors] = {}
+    errors: dict[str, TrackingErrors] = {}
     walks = ("pid", "reactive") if mode == "pid" else ()
     for agent in scenario.agents:
         if agent.id not in tracks:
-            replayed, steps = _posed(agent, clock)
+            replayed, steps = _static_agent(agent, clock)
         else:
             driver, path, flags = home[agent.id]
             steps, states = tracks[agent.id]
             t_s: Array = clock.begin_s + steps.astype(np.float64) * clock.dt_s
-            choice = choices.get(agent.id, Choice("point", "") if driver in walks else Choice("none", ""))
-            moved = _moved(agent, driver, choice, path, flags, t_s, states)
-            errors[agent.id] = errors_of(path, moved, follows=driver in FOLLOWING)
+            choice = choices.get(agent.id, ModelChoice("point", "") if driver in walks else ModelChoice("none", ""))
+            moved = _moving_agent(agent, driver, choice, path, flags, t_s, states)
+            errors[agent.id] = agent_errors(path, moved, follows=driver in LOG_FOLLOWERS)
             replayed = _with_errors(moved, errors[agent.id])
         agents.append(replayed)
         stored.append(steps)
@@ -64,43 +64,45 @@ def assemble(
         dt_s=clock.dt_s,
         store_dt_s=round(clock.dt_s * clock.store_every, 9),
         agents=tuple(agents),
-        metrics=assess(agents, stored, paths, errors, clock),
+        metrics=replay_metrics(agents, stored, paths, errors, clock),
     )
 
 
-def _moved(
-    agent: Agent, driver: str, choice: Choice, path: Path, flags: tuple[str, ...], t_s: Array, states: Array
+def _moving_agent(
+    agent: Agent, driver: str, choice: ModelChoice, path: Path, flags: tuple[str, ...], t_s: Array, states: Array
 ) -> AgentReplay:
     x, y, yaw, speed, steer, accel, *told = states
     if driver == "exact":
         x, y, yaw, speed = path.centers(t_s)  # the tables in between are good to half a millimeter, the path is exact
     log_t_s = t_s
     if driver == "reactive":
-        log_t_s = times_at(path, t_s, x, y)
+        log_t_s = log_times_of_distance(path, t_s, x, y)
     elif driver == "policy":
-        log_t_s = times_beside(path, x, y)
+        log_t_s = log_times_of_positions(path, x, y)
     if np.isnan(accel).any():
         accel = np.gradient(speed, t_s) if len(t_s) > 1 else np.zeros(len(t_s))
     z = path.heights(log_t_s)  # of the road there, whenever the log was
-    x, y, z, yaw, speed, steer, accel = (np.round(c, DIGITS) for c in (x, y, z, yaw, speed, steer, accel))
+    x, y, z, yaw, speed, steer, accel = (np.round(c, STATE_DIGITS) for c in (x, y, z, yaw, speed, steer, accel))
     t_s = np.round(t_s, 9)
     pedal, wheel, gear = told
-    commands = Commands(np.round(pedal, FINE), np.round(wheel, FINE), np.where(gear < 0, -1, 1).astype(np.int8))
+    commands = Commands(
+        np.round(pedal, COMMAND_DIGITS), np.round(wheel, COMMAND_DIGITS), np.where(gear < 0, -1, 1).astype(np.int8)
+    )
     return AgentReplay(
         agent.id, agent.category, agent.size_m, driver, choice.model, t_s, x, y, z, yaw, speed, steer, accel, flags,
         choice.reason, None if np.isnan(pedal).any() else commands,
     )  # fmt: skip
 
 
-def _with_errors(agent: AgentReplay, errors: Errors) -> AgentReplay:
+def _with_errors(agent: AgentReplay, errors: TrackingErrors) -> AgentReplay:
     """The agent with its errors, unless it is the log itself."""
     if agent.driver == "exact":
         return agent
-    across, along = (np.round(c, FINE) for c in (errors.across_m, errors.along_m))
+    across, along = (np.round(c, COMMAND_DIGITS) for c in (errors.across_m, errors.along_m))
     return replace(agent, cross_track_m=across, along_track_m=along)
 
 
-def _posed(agent: Agent, clock: Clock) -> tuple[AgentReplay, NDArray[np.intp]]:
+def _static_agent(agent: Agent, clock: StepClock) -> tuple[AgentReplay, NDArray[np.intp]]:
     """An agent with one pose, and the stored steps at which it is there.
 
     A static one with a single waypoint is there all the time; one that lived between two stored steps has that moment.
@@ -112,7 +114,7 @@ def _posed(agent: Agent, clock: Clock) -> tuple[AgentReplay, NDArray[np.intp]]:
     first, last = clock.first_step(np.array([begin_s]))[0], clock.last_step(np.array([until_s]))[0]
     every = clock.store_every
     steps = np.arange(-(-first // every) * every, last + 1, every) if agent.static else np.zeros(0, dtype=np.intp)
-    x, y, z, yaw = (np.full(len(t_s), round(float(c[0]), DIGITS)) for c in (w.x_m, w.y_m, w.z_m, w.yaw_rad))
+    x, y, z, yaw = (np.full(len(t_s), round(float(c[0]), STATE_DIGITS)) for c in (w.x_m, w.y_m, w.z_m, w.yaw_rad))
     speed = np.full(len(t_s), 0.0 if agent.static else float(w.speed_mps[0]))
     zero = np.zeros(len(t_s))
     driver = "static" if agent.static else "exact"

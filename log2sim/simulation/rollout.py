@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent
 from log2sim.simulation.follower import control_step
-from log2sim.simulation.groups import Driven, Group
-from log2sim.simulation.observer import Observer
-from log2sim.simulation.policy import SIGHT_M, Controls, Observation, Policy, ask
+from log2sim.simulation.groups import AgentGroup, PolicyVehicle
+from log2sim.simulation.observer import PolicyObserver
+from log2sim.simulation.policy import SIGHT_M, Controls, Observation, Policy, query_policy
 from log2sim.simulation.reactive.traffic import Traffic
-from log2sim.simulation.recording import Record, Tracks, tracks_of
+from log2sim.simulation.recording import RecordedTracks, WindowRecording, merged_tracks
 from log2sim.simulation.reference import GRID_S
-from log2sim.simulation.simulators import Host
-from log2sim.simulation.step_clock import Clock
-from log2sim.simulation.vehicles.model_choice import Choice
+from log2sim.simulation.simulators import ExternalSimulator
+from log2sim.simulation.step_clock import StepClock
+from log2sim.simulation.vehicles.model_choice import ModelChoice
 
 WINDOW_S = 10.0
 
@@ -48,28 +48,28 @@ class World:
 
     def __init__(
         self,
-        groups: Sequence[Group],
-        clock: Clock,
+        groups: Sequence[AgentGroup],
+        clock: StepClock,
         statics: Sequence[Agent] = (),
         traffic: Traffic | None = None,
-        choices: Mapping[str, Choice] | None = None,
+        choices: Mapping[str, ModelChoice] | None = None,
         sight_m: float = SIGHT_M,
     ) -> None:
         self.groups, self.clock, self.statics, self.traffic = tuple(groups), clock, tuple(statics), traffic
         self.choices = dict(choices or {})
-        self.host: Host | None = None
-        self.ego = next((g for g in groups if isinstance(g, Driven)), None)
-        self._observer = Observer(self.ego, self.groups, self.statics, sight_m) if self.ego is not None else None
-        self._arrivals = [_arrivals(group, clock) for group in groups]
+        self.host: ExternalSimulator | None = None
+        self.ego = next((g for g in groups if isinstance(g, PolicyVehicle)), None)
+        self._observer = PolicyObserver(self.ego, self.groups, self.statics, sight_m) if self.ego is not None else None
+        self._arrivals = [_placements(group, clock) for group in groups]
         self._width = max(1, round(WINDOW_S / clock.dt_s))
         self.restart()
 
     def restart(self) -> None:
         """Go back to the first step; what was stored is forgotten."""
         self.step = 0
-        self._busy: list[tuple[Group, dict[int, NDArray[np.intp]]]] = []
-        self._records: list[Record] = []
-        self._window: list[Record] = []
+        self._busy: list[tuple[AgentGroup, dict[int, NDArray[np.intp]]]] = []
+        self._records: list[WindowRecording] = []
+        self._window: list[WindowRecording] = []
         if self.traffic is not None:
             self.traffic.restart()
         if self.ego is not None:
@@ -119,9 +119,9 @@ class World:
         self.step += 1
         self._arrive()
 
-    def tracks(self) -> Tracks:
+    def tracks(self) -> RecordedTracks:
         """What was stored so far."""
-        return tracks_of(self._records)
+        return merged_tracks(self._records)
 
     def _react(self, traffic: Traffic) -> None:
         """Move everybody by one step, within a long one by parts in which the reactive ones see where the others are."""
@@ -152,16 +152,16 @@ class World:
         for group in self.groups:
             group.open_window(self.step, end, self.t_s, self.clock.time(end))
         self._busy = [(g, a) for g, a in zip(self.groups, self._arrivals) if len(g.live)]
-        self._window = [Record(group, self.step, end, self.clock.store_every) for group, _ in self._busy]
+        self._window = [WindowRecording(group, self.step, end, self.clock.store_every) for group, _ in self._busy]
         self._records += self._window
 
 
-def roll(world: World, policy: Policy | None = None, progress: Progress | None = None) -> Tracks:
+def rollout(world: World, policy: Policy | None = None, progress: Progress | None = None) -> RecordedTracks:
     """Drive a world to its end and return what was stored."""
     told = max(1, round(WINDOW_S / world.clock.dt_s))
     while not world.done:
         if policy is not None and world.ego_lives:
-            world.steer(ask(policy, world.observe()))
+            world.steer(query_policy(policy, world.observe()))
         world.advance()
         if progress is not None and (world.step % told == 0):
             progress(world.step, world.clock.steps)
@@ -170,7 +170,7 @@ def roll(world: World, policy: Policy | None = None, progress: Progress | None =
     return world.tracks()
 
 
-def _arrivals(group: Group, clock: Clock) -> dict[int, NDArray[np.intp]]:
+def _placements(group: AgentGroup, clock: StepClock) -> dict[int, NDArray[np.intp]]:
     """By step, the agents that are put on their references: at the start of their life and after a leap of the log."""
     placed: dict[int, list[int]] = defaultdict(list)
     for i, reference in enumerate(group.references):

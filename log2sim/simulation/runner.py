@@ -7,15 +7,15 @@ from collections.abc import Collection, Sequence
 from log2sim.datatypes import EGO, Agent, Scenario
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.registry import nearest
-from log2sim.simulation.drivers import cast_agents, groups_of, reactive_ids, traffic_of
-from log2sim.simulation.policy import SIGHT_M, Policy, begin
-from log2sim.simulation.recording import Tracks
-from log2sim.simulation.replay_result import assemble
+from log2sim.simulation.drivers import agent_groups, assign_drivers, reactive_ids, reactive_traffic
+from log2sim.simulation.policy import SIGHT_M, Policy, reset_policy
+from log2sim.simulation.recording import RecordedTracks
+from log2sim.simulation.replay_result import replay_result
 from log2sim.simulation.result import Replay
-from log2sim.simulation.rollout import Progress, World, roll
-from log2sim.simulation.simulators import Host
-from log2sim.simulation.step_clock import Clock
-from log2sim.simulation.vehicles.model_choice import MODELS, Choice
+from log2sim.simulation.rollout import Progress, World, rollout
+from log2sim.simulation.simulators import ExternalSimulator
+from log2sim.simulation.step_clock import StepClock
+from log2sim.simulation.vehicles.model_choice import MODELS, ModelChoice
 from log2sim.simulation.vehicles.parameters import WHEELED
 
 MODES = ("pid", "exact")
@@ -32,7 +32,7 @@ def replay(
     ego: Policy | None = None,
     agents: str | Collection[str] = "log",
     sight_m: float = SIGHT_M,
-    host: Host | None = None,
+    host: ExternalSimulator | None = None,
     progress: Progress | None = None,
 ) -> Replay:
     """Replay a scenario and compare it with the log.
@@ -80,23 +80,25 @@ def replay(
         scenario, mode=mode, model=model, dt_s=dt_s, drives_ego=ego is not None, agents=agents, sight_m=sight_m
     )
     if ego is not None:
-        begin(ego, scenario)
+        reset_policy(ego, scenario)
     if host is None:
-        tracks = roll(world, ego, progress)
-        return assemble(scenario, world.groups, tracks, world.clock, world.choices, mode, model)
-    tracks = _roll_elsewhere(world, host, ego, progress)
-    choices = {k: Choice(host.name, "the simulator's own") for k in world.choices}
-    return assemble(scenario, world.groups, tracks, world.clock, choices, mode, host.name)
+        tracks = rollout(world, ego, progress)
+        return replay_result(scenario, world.groups, tracks, world.clock, world.choices, mode, model)
+    tracks = _rollout_externally(world, host, ego, progress)
+    choices = {k: ModelChoice(host.name, "the simulator's own") for k in world.choices}
+    return replay_result(scenario, world.groups, tracks, world.clock, choices, mode, host.name)
 
 
-def _roll_elsewhere(world: World, host: Host, ego: Policy | None, progress: Progress | None) -> Tracks:
+def _rollout_externally(
+    world: World, host: ExternalSimulator, ego: Policy | None, progress: Progress | None
+) -> RecordedTracks:
     """Let a simulator elsewhere move a world to its end; it is left as it was found, whatever happens."""
     if world.clock.dt_s > host.max_dt_s:
         raise ConfigError(f"dt: {world.clock.dt_s} s, {host.name} takes at most {host.max_dt_s:g} s")
     host.open(world.groups, world.clock, world.statics)
     world.host = host
     try:
-        return roll(world, ego, progress)
+        return rollout(world, ego, progress)
     finally:
         host.close()
 
@@ -138,15 +140,15 @@ def open_world(
             raise ScenarioError(f"agent '{agent.id}': {problem}")
     clock = _clock(scenario.agents, dt_s)
     reactive = reactive_ids(scenario.agents, agents, drives_ego=drives_ego)
-    cast = cast_agents(scenario.agents, mode, drives_ego=drives_ego, reactive=reactive)
-    groups, choices = groups_of(cast, clock, mode, model)
-    return World(groups, clock, cast["static"], traffic_of(scenario.agents, groups, clock), choices, sight_m)
+    cast = assign_drivers(scenario.agents, mode, drives_ego=drives_ego, reactive=reactive)
+    groups, choices = agent_groups(cast, clock, mode, model)
+    return World(groups, clock, cast["static"], reactive_traffic(scenario.agents, groups, clock), choices, sight_m)
 
 
-def _clock(agents: Sequence[Agent], dt_s: float) -> Clock:
+def _clock(agents: Sequence[Agent], dt_s: float) -> StepClock:
     begin_s = min((float(a.waypoints.t_s[0]) for a in agents), default=0.0)
     end_s = max((float(a.waypoints.t_s[-1]) for a in agents), default=0.0)
-    clock = Clock.spanning(begin_s, end_s, dt_s)
+    clock = StepClock.spanning(begin_s, end_s, dt_s)
     if clock.steps > MAX_STEPS:
         raise ScenarioError(
             f"waypoints span {end_s - begin_s:g} s, {clock.steps} steps of {dt_s} s; at most {MAX_STEPS} can be run"

@@ -1,7 +1,7 @@
 """What the replay asks of a simulator, and the embedded one.
 
 A simulator moves all agents at once by stateless steps. Another vehicle model is made usable by a line in `STEPS`, another
-simulator by giving it the two functions of `Simulator`, and one that runs elsewhere (a game engine) as a `Host`.
+simulator by giving it the two functions of `Simulator`, and one that runs elsewhere (a game engine) as a `ExternalSimulator`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Simulator(Protocol):
         ...
 
 
-class Host(Protocol):
+class ExternalSimulator(Protocol):
     """A simulator outside this process, which has one clock for all agents: a step of the replay is one tick of it.
 
     `open` seats the groups: their simulators from then on take controls down and leave states as they are. `tick`, called
@@ -63,13 +63,13 @@ class Host(Protocol):
         ...
 
 
-Step = Callable[[VehicleState, VehicleControls, VehicleParameters, float], VehicleState]
+VehicleStep = Callable[[VehicleState, VehicleControls, VehicleParameters, float], VehicleState]
 
 
 class EmbeddedSimulator:
     """Vehicles by one of the models of this package, and point masses."""
 
-    def __init__(self, step: Step) -> None:
+    def __init__(self, step: VehicleStep) -> None:
         self._step = step
 
     def step_vehicles(
@@ -81,4 +81,4 @@ class EmbeddedSimulator:
         return step_point(state, controls, dt_s)
 
 
-STEPS: dict[str, Step] = {"kinematic": step_bicycle, "dynamic": step_dynamic, "single-track": step_single_track}
+STEPS: dict[str, VehicleStep] = {"kinematic": step_bicycle, "dynamic": step_dynamic, "single-track": step_single_track}

@@ -15,7 +15,7 @@ MARGIN = 1e-6  # of a step: a waypoint at 0.3 s is on step 30 of 10 ms
 
 
 @dataclass(frozen=True)
-class Clock:
+class StepClock:
     """Steps at begin_s + n * dt_s for n in [0, steps); every `store_every`-th is stored: about 20 Hz."""
 
     begin_s: float
@@ -23,7 +23,7 @@ class Clock:
     steps: int
 
     @classmethod
-    def spanning(cls, begin_s: float, end_s: float, dt_s: float) -> Clock:
+    def spanning(cls, begin_s: float, end_s: float, dt_s: float) -> StepClock:
         return cls(begin_s, dt_s, math.floor((end_s - begin_s) / dt_s + MARGIN) + 1)
 
     @property

@@ -19,7 +19,7 @@ from log2sim.simulation.vehicles.parameters import WHEELED, parameters_for, rear
 SAMPLE_S = 0.05
 """Spacing of the samples: between them a straight line errs by at most a h^2 / 8 = 3 mm at 10 m/s2."""
 
-LEAP_S = 1e-6  # a leap of the log becomes two samples so far apart
+DISCONTINUITY_S = 1e-6  # a leap of the log becomes two samples so far apart
 
 
 def carla_agents(agents: Sequence[Agent]) -> list[dict[str, Any]]:
@@ -40,7 +40,7 @@ def _agent(agent: Agent, turn: int, span_s: tuple[float, float]) -> dict[str, An
     moves = not agent.static and len(w) > 1
     life_s = span_s if agent.is_permanent else (float(w.t_s[0]), float(w.t_s[-1]))
     path = path_of(agent, rear_axle_offset(agent))
-    exact, pid = _courses(agent, path, drives=moves and wheeled)
+    exact, pid = _trajectories(agent, path, drives=moves and wheeled)
     limits = parameters_for([agent]) if wheeled else None
     return {
         "id": agent.id,
@@ -63,22 +63,24 @@ def _agent(agent: Agent, turn: int, span_s: tuple[float, float]) -> dict[str, An
     }
 
 
-def _courses(agent: Agent, path: Path, *, drives: bool) -> tuple[dict[str, list[float]], dict[str, list[float]] | None]:
+def _trajectories(
+    agent: Agent, path: Path, *, drives: bool
+) -> tuple[dict[str, list[float]], dict[str, list[float]] | None]:
     """Columns of the logged course and, for a vehicle that drives, of the one that it can drive; both of the box center."""
     t_s = _times(agent, path)
     x, y, yaw, _ = path.at(t_s)
     z = path.heights(t_s) - agent.size_m[2] / 2
     origin_x, origin_y = path.origin_m
     if not drives:
-        return {**_mirrored(t_s, x + origin_x, y + origin_y, z, yaw), "curvature_1pm": [0.0] * len(t_s)}, None
+        return {**_left_handed(t_s, x + origin_x, y + origin_y, z, yaw), "curvature_1pm": [0.0] * len(t_s)}, None
     limits = vehicle_limits(agent)
     reference = vehicle_reference(path, limits, accel_ahead_s=0.0, curvature_ahead_s=0.0)
     rear_x, rear_y, rear_yaw, speed, accel, curvature, gear, stands = reference.exact(t_s).T
     center_x, center_y = rear_x + limits.offset_m * np.cos(rear_yaw), rear_y + limits.offset_m * np.sin(rear_yaw)
     bend = {"curvature_1pm": _rounded(-curvature)}
-    exact = {**_mirrored(t_s, x + origin_x, y + origin_y, z, yaw), **bend}
+    exact = {**_left_handed(t_s, x + origin_x, y + origin_y, z, yaw), **bend}
     pid = {
-        **_mirrored(t_s, center_x + origin_x, center_y + origin_y, z, rear_yaw),
+        **_left_handed(t_s, center_x + origin_x, center_y + origin_y, z, rear_yaw),
         **bend,
         "speed_mps": _rounded(speed),
         "accel_mps2": _rounded(accel),
@@ -95,10 +97,12 @@ def _times(agent: Agent, path: Path) -> Array:
     regular = np.arange(path.t_s[0], path.t_s[-1], SAMPLE_S)
     k = np.searchsorted(path.t_s, regular, side="right")
     gap_s = np.minimum(regular - path.t_s[k - 1], path.t_s[np.minimum(k, len(path.t_s) - 1)] - regular)
-    return np.sort(np.concatenate([regular[gap_s > 10 * LEAP_S], path.t_s, path.jump_times() - LEAP_S]))
+    return np.sort(
+        np.concatenate([regular[gap_s > 10 * DISCONTINUITY_S], path.t_s, path.jump_times() - DISCONTINUITY_S])
+    )
 
 
-def _mirrored(t_s: Array, x: Array, y: Array, z: Array, yaw: Array) -> dict[str, list[float]]:
+def _left_handed(t_s: Array, x: Array, y: Array, z: Array, yaw: Array) -> dict[str, list[float]]:
     """Columns in CARLA's left-handed frame."""
     return {
         "t_s": _rounded(t_s, 7),

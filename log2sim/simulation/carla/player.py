@@ -24,7 +24,7 @@ from typing import Any
 
 VERSION = 1
 NO_CLIENT = 5  # exit code
-Place = tuple[float, float, float, float]  # box center x, y, its lowest face z, yaw in rad
+BoxPose = tuple[float, float, float, float]  # box center x, y, its lowest face z, yaw in rad
 MARGIN_S = 1e-6
 ANSWER_S = 10.0  # a server that is there says its version at once, while a world takes long to load
 STANDSTILL_MPS = 0.05  # physics never rests entirely
@@ -52,7 +52,7 @@ class ReplayError(Exception):
         self.code = code
 
 
-class Course:
+class SampledTrajectory:
     """Columns over time, linear in between, held before the first time and after the last."""
 
     def __init__(self, columns: dict[str, list[float]]) -> None:
@@ -66,13 +66,13 @@ class Course:
         share = min(max((t_s - self.t_s[k]) / span, 0.0), 1.0) if span > 0 else 0.0
         return tuple(c[k] + share * (c[after] - c[k]) for c in (self.columns[n] for n in names))
 
-    def place(self, t_s: float) -> Place:
+    def place(self, t_s: float) -> BoxPose:
         """Where the box is."""
         x, y, z, yaw_deg = self.at(t_s, "x_m", "y_m", "z_m", "yaw_deg")
         return x, y, z, math.radians(yaw_deg)
 
 
-class Body:
+class CarlaActor:
     """A CARLA actor that stands for an agent. Its origin need not be where its box is, and no asset has the agent's axles."""
 
     def __init__(self, carla: ModuleType, agent: dict[str, Any], actor: Any, spawned: Any) -> None:
@@ -87,7 +87,7 @@ class Body:
             physics, wheels = actor.get_physics_control(), carla.VehicleWheelLocation
             self.max_steer_rad = math.radians(max([w.max_steer_angle for w in physics.wheels], default=0.0) or 70.0)
             curve = sorted((p.x, p.y) for p in physics.steering_curve) or [(0.0, 1.0)]
-            self._steering = Course({"t_s": [p[0] for p in curve], "share": [p[1] for p in curve]})
+            self._steering = SampledTrajectory({"t_s": [p[0] for p in curve], "share": [p[1] for p in curve]})
             self._front = (wheels.FL_Wheel, wheels.FR_Wheel) if len(physics.wheels) > 2 else (wheels.Front_Wheel,)
             self._shown_deg = 0.0
             self.wheelbase_m, self.axle_m = 0.6 * self.size_m[0], 0.3 * self.size_m[0]
@@ -159,7 +159,7 @@ class Body:
         )
 
 
-class Follower:
+class VehicleController:
     """PID with feed-forward for one vehicle: pedal from the error along the path, curvature from the error across it."""
 
     def __init__(self, max_throttle_mps2: float, max_brake_mps2: float, max_curvature_1pm: float) -> None:
@@ -167,7 +167,7 @@ class Follower:
         self.along_integral = self.across_integral = self.along_rate = self.across_slope = 0.0
 
     @classmethod
-    def of(cls, body: Body) -> Follower:
+    def of(cls, body: CarlaActor) -> VehicleController:
         """A fresh one for an actor."""
         limit = math.tan(min(body.max_steer_rad, 1.4)) / body.wheelbase_m
         return cls(body.agent["max_throttle_mps2"], body.agent["max_brake_mps2"], limit)
@@ -217,16 +217,16 @@ class Follower:
         return limited
 
 
-class Stage:
+class CarlaSession:
     """A CARLA world in synchronous mode, and the actors in it; leaving it removes them and restores the settings."""
 
     def __init__(self, carla: ModuleType, client: Any, world: Any, dt_s: float) -> None:
         self.carla, self.client, self.world, self.dt_s = carla, client, world, dt_s
         self.library = world.get_blueprint_library()
-        self.bodies: dict[str, Body] = {}
+        self.bodies: dict[str, CarlaActor] = {}
         self.notes: list[str] = []
 
-    def __enter__(self) -> Stage:
+    def __enter__(self) -> CarlaSession:
         self._before = self.world.get_settings()
         settings = self.world.get_settings()
         settings.synchronous_mode, settings.fixed_delta_seconds = True, self.dt_s
@@ -242,7 +242,7 @@ class Stage:
         finally:
             self.world.apply_settings(self._before)
 
-    def spawn(self, agent: dict[str, Any], place: Place, physics: bool) -> Body:
+    def spawn(self, agent: dict[str, Any], place: BoxPose, physics: bool) -> CarlaActor:
         """Make the actor of an agent, above its place; it is put there by a command before the next tick."""
         blueprint, size_m = self._blueprint(agent)
         x, y, z, yaw = place
@@ -255,7 +255,7 @@ class Stage:
                 break
         else:
             raise ReplayError(f"agent '{agent['id']}': CARLA could not spawn {blueprint.id} at {x:.1f}, {y:.1f}", 4)
-        body = self.bodies[agent["id"]] = Body(self.carla, agent, actor, above)
+        body = self.bodies[agent["id"]] = CarlaActor(self.carla, agent, actor, above)
         if max(abs(a - b) for a, b in zip(body.size_m, size_m)) > SIZE_DIFFERS_M:
             length, width, height = body.size_m
             self.notes.append(
@@ -295,7 +295,7 @@ class Stage:
             if answer.error:
                 raise ReplayError(f"CARLA refused a command: {answer.error}", 4)
 
-    def watch(self, place: Place) -> None:
+    def watch(self, place: BoxPose) -> None:
         """Put the spectator behind and above a place."""
         x, y, z, yaw = place
         at = self.carla.Location(x - 9.0 * math.cos(yaw), y - 9.0 * math.sin(yaw), z + 5.0)
@@ -304,15 +304,15 @@ class Stage:
         )
 
 
-class Player:
+class ScenarioPlayer:
     """Moves the agents of a scenario, tick by tick."""
 
-    def __init__(self, stage: Stage, data: dict[str, Any], mode: str, *, physics: bool, ground: str) -> None:
+    def __init__(self, stage: CarlaSession, data: dict[str, Any], mode: str, *, physics: bool, ground: str) -> None:
         self.stage, self.carla, self.pid, self.physics = stage, stage.carla, mode == "pid", physics
         self.agents: list[dict[str, Any]] = data["agents"]
-        self.logged = {a["id"]: Course(a["exact"]) for a in self.agents}
-        self.courses = {a["id"]: Course(a["pid"]) for a in self.agents if a["pid"] is not None}
-        self.followers: dict[str, Follower] = {}
+        self.logged = {a["id"]: SampledTrajectory(a["exact"]) for a in self.agents}
+        self.courses = {a["id"]: SampledTrajectory(a["pid"]) for a in self.agents if a["pid"] is not None}
+        self.followers: dict[str, VehicleController] = {}
         self.drift_m: dict[str, list[float]] = {}
         self._map = stage.world.get_map() if ground == "map" else None
 
@@ -367,7 +367,7 @@ class Player:
             start = (x - vx * self.stage.dt_s, y - vy * self.stage.dt_s, z, yaw)
             body = body or self.stage.spawn(agent, start, True)
             if body.is_vehicle:
-                self.followers[name] = Follower.of(body)
+                self.followers[name] = VehicleController.of(body)
             yield self.carla.command.ApplyTransform(body.actor.id, body.transform(*start))
             yield self.carla.command.ApplyTargetVelocity(body.actor.id, self.carla.Vector3D(vx, vy, 0.0))
             now_s = t_s  # the error is none at the end of this tick, so neither is it now
@@ -377,12 +377,12 @@ class Player:
             logged_x, logged_y, *_ = self.logged[name].place(now_s)
             yield self.walk(body, vx + (logged_x - x) / WALKER_S, vy + (logged_y - y) / WALKER_S, yaw)
         else:
-            wanted, axle = self._wanted(course, body.axle_m, now_s), behind(x, y, yaw, body.axle_m)
+            wanted, axle = self._wanted(course, body.axle_m, now_s), point_behind(x, y, yaw, body.axle_m)
             pedal, curvature, reverse = self.followers[name].step(wanted, (*axle, yaw), speed, self.stage.dt_s)
             control = body.control(pedal, curvature, speed, reverse)
             yield self.carla.command.ApplyVehicleControl(body.actor.id, control)
 
-    def _found(self, agent: dict[str, Any], body: Body, t_s: float) -> Place:
+    def _found(self, agent: dict[str, Any], body: CarlaActor, t_s: float) -> BoxPose:
         """Where physics has brought an agent: box center x, y, yaw and speed."""
         x, y, z, yaw, speed = body.pose()
         logged = self.logged[agent["id"]].place(t_s)
@@ -390,14 +390,14 @@ class Player:
         self.drift_m.setdefault(agent["id"], []).append(math.hypot(x - logged[0], y - logged[1]))
         return x, y, yaw, speed
 
-    def _wanted(self, course: Course, axle_m: float, t_s: float) -> tuple[float, ...]:
+    def _wanted(self, course: SampledTrajectory, axle_m: float, t_s: float) -> tuple[float, ...]:
         """The course of the rear axle at a time, with acceleration and curvature of the moment that inputs are for."""
         x, y, _, yaw = course.place(t_s)
         speed, gear, stands = course.at(t_s, "speed_mps", "gear", "stands")
         accel, curvature = course.at(t_s + AHEAD_S + self.stage.dt_s / 2, "accel_mps2", "curvature_1pm")
-        return (*behind(x, y, yaw, axle_m), yaw, speed, accel, curvature, gear, stands)
+        return (*point_behind(x, y, yaw, axle_m), yaw, speed, accel, curvature, gear, stands)
 
-    def walk(self, body: Body, vx: float, vy: float, yaw: float) -> Any:
+    def walk(self, body: CarlaActor, vx: float, vy: float, yaw: float) -> Any:
         """The command that lets a walker go with a velocity, or stand looking ahead."""
         speed = math.hypot(vx, vy)
         way = (vx / speed, vy / speed) if speed > STANDSTILL_MPS else (math.cos(yaw), math.sin(yaw))
@@ -421,7 +421,7 @@ class Player:
         """Whether the log leaps within the tick that begins at a time."""
         return any(t_s + MARGIN_S < leap_s <= t_s + self.stage.dt_s + MARGIN_S for leap_s in agent["leaps_s"])
 
-    def grounded(self, agent: dict[str, Any], place: Place, *, falls: bool = False) -> Place:
+    def grounded(self, agent: dict[str, Any], place: BoxPose, *, falls: bool = False) -> BoxPose:
         """The place at the height of the nearest road; as logged where there is none near, unless the agent `falls` then."""
         if self._map is None:
             return place
@@ -438,7 +438,7 @@ class Player:
             )
         return place
 
-    def require_ground(self, agent: dict[str, Any], z: float, place: Place) -> None:
+    def require_ground(self, agent: dict[str, Any], z: float, place: BoxPose) -> None:
         """Raise `ReplayError` for an agent whose lowest face is far below its place."""
         below_m = self.grounded(agent, place)[2] - z
         if below_m > FALLEN_M:
@@ -449,7 +449,7 @@ class Player:
             )
 
 
-def behind(x: float, y: float, yaw: float, way_m: float) -> tuple[float, float]:
+def point_behind(x: float, y: float, yaw: float, way_m: float) -> tuple[float, float]:
     """The point so far behind a place."""
     return x - way_m * math.cos(yaw), y - way_m * math.sin(yaw)
 
@@ -545,7 +545,7 @@ def drift_table(drift_m: dict[str, list[float]]) -> str:
     return "\n".join(lines)
 
 
-def play(player: Player, data: dict[str, Any], *, follow: str, pace: float) -> None:
+def play(player: ScenarioPlayer, data: dict[str, Any], *, follow: str, pace: float) -> None:
     """All ticks from the first moment to the last."""
     agents, dt_s = data["agents"], player.stage.dt_s
     begin_s, end_s = min(a["begin_s"] for a in agents), max(a["end_s"] for a in agents)
@@ -561,7 +561,7 @@ def play(player: Player, data: dict[str, Any], *, follow: str, pace: float) -> N
             time.sleep(max(dt_s / pace - (time.monotonic() - started), 0.0))
 
 
-def say(text: str) -> None:
+def print_now(text: str) -> None:
     """Print lines for the user, at once."""
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
@@ -612,21 +612,21 @@ def run(words: Sequence[str] | None = None) -> None:
     """Do what the command line says."""
     args = arguments(words)
     data = load_data(args.data)
-    say(size_table(data))
+    print_now(size_table(data))
     if args.table:
         return
     mode = args.mode or data["mode"]
     carla = load_client()
     client = connect(carla, args.host, args.port, args.timeout)
     world = open_world(carla, client, args.map, args.opendrive)
-    with Stage(carla, client, world, args.dt) as stage:
+    with CarlaSession(carla, client, world, args.dt) as stage:
         ground = args.ground or ("map" if mode == "pid" else "log")
-        player = Player(stage, data, mode, physics=args.physics, ground=ground)
+        player = ScenarioPlayer(stage, data, mode, physics=args.physics, ground=ground)
         play(player, data, follow=args.follow, pace=args.pace)
     for note in version_note(client) + stage.notes:
-        say(note)
+        print_now(note)
     if player.drift_m:
-        say(drift_table(player.drift_m))
+        print_now(drift_table(player.drift_m))
 
 
 def main(words: Sequence[str] | None = None) -> int:

@@ -20,8 +20,8 @@ from log2sim.errors import ConfigError, MissingExtra
 from log2sim.geometry import Array, whole_kilometers
 from log2sim.simulation.carla import player
 from log2sim.simulation.carla.data import carla_agents
-from log2sim.simulation.groups import Crowd, Fleet, Group, Tape
-from log2sim.simulation.step_clock import Clock
+from log2sim.simulation.groups import AgentGroup, LogReplayGroup, PedestrianGroup, VehicleGroup
+from log2sim.simulation.step_clock import StepClock
 from log2sim.simulation.vehicles.vehicle import (
     PointControls,
     PointState,
@@ -33,7 +33,7 @@ from log2sim.simulation.vehicles.vehicle import (
 
 
 @dataclass(frozen=True)
-class Server:
+class CarlaServer:
     """Where a CARLA server listens, and the world that it is to load first, if any: a town or an OpenDRIVE file."""
 
     host: str = "127.0.0.1"
@@ -43,7 +43,7 @@ class Server:
     opendrive: Path | None = None
 
 
-class _Seat:
+class _PendingControls:
     """The simulator of one group: takes its controls down for the tick, which moves all groups at once."""
 
     def __init__(self) -> None:
@@ -62,15 +62,15 @@ class _Seat:
 
 
 class CarlaSimulator:
-    """The groups of a replay in a CARLA world; see `log2sim.simulation.simulators.Host`."""
+    """The groups of a replay in a CARLA world; see `log2sim.simulation.simulators.ExternalSimulator`."""
 
     name = "carla"
     max_dt_s = 0.1  # as far as CARLA's physics goes with its substeps
 
-    def __init__(self, server: Server | None = None) -> None:
-        self.server = server or Server()
+    def __init__(self, server: CarlaServer | None = None) -> None:
+        self.server = server or CarlaServer()
 
-    def open(self, groups: Sequence[Group], clock: Clock, statics: Sequence[Agent]) -> None:
+    def open(self, groups: Sequence[AgentGroup], clock: StepClock, statics: Sequence[Agent]) -> None:
         """Connect, and seat the groups.
 
         Raises
@@ -82,32 +82,32 @@ class CarlaSimulator:
         """
         self.clock = clock
         everybody = [a for g in groups for a in g.agents] + list(statics)
-        taped = [a for g in groups if isinstance(g, Tape) and g.keeps_time for a in g.agents] + list(statics)
+        taped = [a for g in groups if isinstance(g, LogReplayGroup) and g.keeps_time for a in g.agents] + list(statics)
         self.offset_m = _offset_m(everybody)
         data = {d["id"]: d for d in carla_agents([_shifted(a, self.offset_m) for a in everybody])}
-        self._data, self._courses = data, {k: player.Course(d["exact"]) for k, d in data.items()}
+        self._data, self._courses = data, {k: player.SampledTrajectory(d["exact"]) for k, d in data.items()}
         self._read: dict[str, tuple[float, float]] = {}
-        with _own_errors():
+        with _translated_errors():
             carla = player.load_client()
             client = player.connect(carla, self.server.host, self.server.port, self.server.timeout_s)
             world = player.open_world(carla, client, self.server.town, self.server.opendrive)
-            self.carla, self.stage = carla, player.Stage(carla, client, world, clock.dt_s)
+            self.carla, self.stage = carla, player.CarlaSession(carla, client, world, clock.dt_s)
             ground = "log" if self.server.town is None and self.server.opendrive is None else "map"
             shown = {"agents": [data[a.id] for a in taped]}
-            self._player = player.Player(self.stage, shown, "exact", physics=False, ground=ground)
-        self._fleets = [(g, _Seat()) for g in groups if isinstance(g, Fleet)]
-        self._crowds = [(g, _Seat()) for g in groups if isinstance(g, Crowd)]
-        self._delayed = [g for g in groups if isinstance(g, Tape) and not g.keeps_time]
+            self._player = player.ScenarioPlayer(self.stage, shown, "exact", physics=False, ground=ground)
+        self._fleets = [(g, _PendingControls()) for g in groups if isinstance(g, VehicleGroup)]
+        self._crowds = [(g, _PendingControls()) for g in groups if isinstance(g, PedestrianGroup)]
+        self._delayed = [g for g in groups if isinstance(g, LogReplayGroup) and not g.keeps_time]
         for fleet, seat in self._fleets:
             fleet.simulator = seat
         for crowd, seat in self._crowds:
             crowd.simulator = seat
-        with _own_errors():
+        with _translated_errors():
             self.stage.__enter__()
 
     def tick(self, step: int) -> None:
         """Move all groups from a step to the next."""
-        with _own_errors():
+        with _translated_errors():
             commands = self._player.commands(self.clock.time(step + 1))
             fleets = [(fleet, seat) for fleet, seat in self._fleets if len(fleet.live)]
             crowds = [(crowd, seat) for crowd, seat in self._crowds if len(crowd.live)]
@@ -132,7 +132,7 @@ class CarlaSimulator:
         """Remove the actors and restore the settings."""
         self.stage.__exit__()
 
-    def _present(self, group: Group, step: int) -> list[int]:
+    def _present(self, group: AgentGroup, step: int) -> list[int]:
         """Slots of the agents that are to be moved; those whose life is over leave CARLA."""
         slots = []
         for slot, i in enumerate(group.live):
@@ -142,7 +142,7 @@ class CarlaSimulator:
                 self.stage.remove(group.agents[i].id)
         return slots
 
-    def _drive(self, group: Fleet, seat: _Seat, slot: int, step: int) -> Iterator[Any]:
+    def _drive(self, group: VehicleGroup, seat: _PendingControls, slot: int, step: int) -> Iterator[Any]:
         """Commands for one vehicle: it is put where its state is unless that came from CARLA, then its inputs."""
         state, i, command = group.state, group.live[slot], self.carla.command
         name, speed = group.agents[i].id, float(state.speed_mps[slot])
@@ -161,7 +161,7 @@ class CarlaSimulator:
         inputs = body.control(float(controls.pedal_mps2[slot]), curvature, speed, bool(controls.reverse[slot]))
         yield command.ApplyVehicleControl(body.actor.id, inputs)
 
-    def _walk(self, group: Crowd, seat: _Seat, step: int) -> Iterator[Any]:
+    def _walk(self, group: PedestrianGroup, seat: _PendingControls, step: int) -> Iterator[Any]:
         """Commands for the points: walkers walk to where the point model leads, things are put there."""
         goal, dt_s = step_point(group.state, seat.points, self.clock.dt_s), self.clock.dt_s
         for slot in self._present(group, step):
@@ -178,7 +178,7 @@ class CarlaSimulator:
             if walks:
                 yield self._player.walk(body, (goal_x - x) / dt_s, (goal_y - y) / dt_s, yaw)
 
-    def _show(self, group: Tape, step: int) -> Iterator[Any]:
+    def _show(self, group: LogReplayGroup, step: int) -> Iterator[Any]:
         """Commands that put agents on their logged way, where they are later than the log."""
         now, dt_s = group.snapshot(), self.clock.dt_s
         for slot in self._present(group, step):
@@ -193,7 +193,7 @@ class CarlaSimulator:
             if walks:
                 yield self._player.walk(body, vx, vy, yaw)
 
-    def _read_fleet(self, group: Fleet, seat: _Seat, step: int) -> None:
+    def _read_fleet(self, group: VehicleGroup, seat: _PendingControls, step: int) -> None:
         """Take over from CARLA where the vehicles are; what it does not tell, actuators, are the commands."""
         state, controls = group.state, seat.vehicles
         x, y, yaw, speed, pedal = (
@@ -212,7 +212,7 @@ class CarlaSimulator:
         seen = {"x_m": x, "y_m": y, "yaw_rad": yaw, "speed_mps": speed, "pedal_mps2": pedal}
         group.state = replace(state, **seen, steer_rad=controls.steer_rad)
 
-    def _read_crowd(self, group: Crowd, step: int) -> None:
+    def _read_crowd(self, group: PedestrianGroup, step: int) -> None:
         """Take over from CARLA where the points are."""
         state, dt_s = group.state, self.clock.dt_s
         x, y = state.x_m.copy(), state.y_m.copy()
@@ -221,17 +221,17 @@ class CarlaSimulator:
             x[slot], y[slot] = self._read[name] = self._from_carla(group, slot, *self.stage.bodies[name].pose()[:2])
         group.state = PointState(x, y, (x - state.x_m) / dt_s, (y - state.y_m) / dt_s)
 
-    def _height(self, group: Group, slot: int, step: int) -> float:
+    def _height(self, group: AgentGroup, slot: int, step: int) -> float:
         """The height of an agent's lowest face where the log was when it is there."""
         course = self._courses[group.agents[group.live[slot]].id]
         return course.place(float(group.log_times(self.clock.time(step))[slot]))[2]
 
-    def _to_carla(self, group: Group, slot: int, x: float, y: float) -> tuple[float, float]:
+    def _to_carla(self, group: AgentGroup, slot: int, x: float, y: float) -> tuple[float, float]:
         """A place of a group's state, which is relative to the agent's first waypoint, in CARLA's frame."""
         i = group.live[slot]
         return x + group.origin_x_m[i] - self.offset_m[0], -(y + group.origin_y_m[i] - self.offset_m[1])
 
-    def _from_carla(self, group: Group, slot: int, x: float, y: float) -> tuple[float, float]:
+    def _from_carla(self, group: AgentGroup, slot: int, x: float, y: float) -> tuple[float, float]:
         """The inverse of `_to_carla`."""
         i = group.live[slot]
         return x + self.offset_m[0] - group.origin_x_m[i], -y + self.offset_m[1] - group.origin_y_m[i]
@@ -251,7 +251,7 @@ def _shifted(agent: Agent, offset_m: tuple[float, float]) -> Agent:
 
 
 @contextmanager
-def _own_errors() -> Iterator[None]:
+def _translated_errors() -> Iterator[None]:
     """Errors of the player and of CARLA's client as those of this package."""
     try:
         yield

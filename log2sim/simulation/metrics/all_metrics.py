@@ -9,26 +9,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.simulation.metrics.box_tracks import Boxes
+from log2sim.simulation.metrics.box_tracks import BoxTracks
 from log2sim.simulation.metrics.collisions import collisions
 from log2sim.simulation.metrics.comfort import comfort
-from log2sim.simulation.metrics.conflicts import conflicts, least
-from log2sim.simulation.metrics.tracking_error import Errors, agent_metrics, overall
+from log2sim.simulation.metrics.conflicts import conflicts, most_critical
+from log2sim.simulation.metrics.tracking_error import TrackingErrors, agent_metrics, scenario_metrics
 from log2sim.simulation.path import Path
 from log2sim.simulation.result import AgentReplay
-from log2sim.simulation.step_clock import Clock
+from log2sim.simulation.step_clock import StepClock
 from log2sim.simulation.vehicles.parameters import WHEELED
 
-FOLLOWING = ("pid", "exact")
+LOG_FOLLOWERS = ("pid", "exact")
 """Drivers that are held against the log."""
 
 
-def assess(
+def replay_metrics(
     agents: Sequence[AgentReplay],
     stored: Sequence[NDArray[np.intp]],
     paths: Mapping[str, Path],
-    errors: Mapping[str, Errors],
-    clock: Clock,
+    errors: Mapping[str, TrackingErrors],
+    clock: StepClock,
 ) -> dict[str, Any]:
     """The metrics of `schemas/replay-1.json`, by agent and overall.
 
@@ -41,7 +41,7 @@ def assess(
         Courses of the agents that move in the log, and how far they are from them.
     """
     ids = [a.id for a in agents]
-    replayed, logged = (_boxes(agents, stored, source, clock) for source in ({}, paths))
+    replayed, logged = (_box_tracks(agents, stored, source, clock) for source in ({}, paths))
     moves = np.array([a.driver != "static" for a in agents], dtype=bool)
     rows = np.arange(len(replayed.x_m), dtype=np.float64)
     t_s = clock.begin_s + rows * (clock.store_every * clock.dt_s)
@@ -51,8 +51,8 @@ def assess(
     by_agent = {
         a.id: {
             **agent_metrics(errors[a.id]),
-            "min_ttc_s": (least(near_of[a.id], "min_ttc") or {}).get("s"),
-            "min_pet_s": (least(near_of[a.id], "pet") or {}).get("s"),
+            "min_ttc_s": (most_critical(near_of[a.id], "min_ttc") or {}).get("s"),
+            "min_pet_s": (most_critical(near_of[a.id], "pet") or {}).get("s"),
             "comfort": _comfort(a, paths[a.id]),
             "collisions": events_of[a.id],
         }
@@ -62,11 +62,11 @@ def assess(
     on_time = {a.id: len(a) for a in agents if a.driver == "pid"}
     on_way = on_time | {a.id: len(a) for a in agents if a.driver == "reactive"}
     return {
-        **overall(by_agent, on_time, on_way),
+        **scenario_metrics(by_agent, on_time, on_way),
         "collisions": events,
         "new_collisions": sum(not e["in_log"] for e in events),
-        "min_ttc": least(near, "min_ttc"),
-        "min_pet": least(near, "pet"),
+        "min_ttc": most_critical(near, "min_ttc"),
+        "min_pet": most_critical(near, "pet"),
         "conflicts": near,
         "by_agent": by_agent,
     }
@@ -88,9 +88,9 @@ def _comfort(agent: AgentReplay, path: Path) -> dict[str, float | bool] | None:
     return comfort(agent.t_s, agent.x_m, agent.y_m, agent.yaw_rad)
 
 
-def _boxes(
-    agents: Sequence[AgentReplay], stored: Sequence[NDArray[np.intp]], paths: Mapping[str, Path], clock: Clock
-) -> Boxes:
+def _box_tracks(
+    agents: Sequence[AgentReplay], stored: Sequence[NDArray[np.intp]], paths: Mapping[str, Path], clock: StepClock
+) -> BoxTracks:
     """Boxes at all stored steps, of the replay or, for agents with a path given, of the log."""
     shape = ((clock.steps - 1) // clock.store_every + 1, len(agents))
     columns = np.full((5, *shape), np.nan)
@@ -106,4 +106,4 @@ def _boxes(
             columns[:, rows, k] = np.array(pose)[:, None]
     size = np.array([a.size_m for a in agents], dtype=np.float64).reshape(-1, 3)
     x, y, z, yaw, speed = columns
-    return Boxes(x, y, z, yaw, speed, size)
+    return BoxTracks(x, y, z, yaw, speed, size)

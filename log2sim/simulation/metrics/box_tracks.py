@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array, rectangles_overlap, wrap_angle
 
-LEAP_M = 1.0
+DISCONTINUITY_M = 1.0
 """A step that differs from both its neighbors by more is no motion: at 20 Hz it would take 400 m/s2."""
 
-Rows = NDArray[np.intp]
+RowIndex = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
-class Boxes:
+class BoxTracks:
     """Boxes of A agents at S times: centers, yaw and speed (S, A), NaN in `x_m` where an agent is absent; sizes (A, 3).
 
     Between two rows a box moves straight on and turns evenly.
@@ -41,12 +41,12 @@ class Boxes:
         return np.hypot(self.size_m[:, 0], self.size_m[:, 1]) / 2
 
     @cached_property
-    def first_row(self) -> Rows:
+    def first_row(self) -> RowIndex:
         """The first row (A,) with the agent; 0 where there is none."""
         return np.argmax(self.present, axis=0) if len(self.x_m) else np.zeros(len(self.size_m), dtype=np.intp)
 
     @cached_property
-    def last_row(self) -> Rows:
+    def last_row(self) -> RowIndex:
         """The last row (A,) with the agent; the last of all where there is none."""
         if not len(self.x_m):
             return np.full(len(self.size_m), -1, dtype=np.intp)
@@ -61,7 +61,7 @@ class Boxes:
             change = np.abs(np.diff(step, axis=0))
             nowhere = np.full((1, step.shape[1]), np.nan)
             least = np.fmin(np.concatenate([nowhere, change]), np.concatenate([change, nowhere]))
-            on[:-1] = ~np.isnan(step) & ~(least > LEAP_M)
+            on[:-1] = ~np.isnan(step) & ~(least > DISCONTINUITY_M)
         return on
 
     def velocities(self, spacing_s: float) -> tuple[Array, Array]:
@@ -86,7 +86,7 @@ class Boxes:
         mean = np.where(np.isnan(after), before, np.where(np.isnan(before), after, (after + before) / 2))
         return np.where(np.isnan(mean) & self.present, alone, mean)
 
-    def poses(self, row: Array | Rows, agent: Rows) -> tuple[Array, Array, Array, Array]:
+    def poses(self, row: Array | RowIndex, agent: RowIndex) -> tuple[Array, Array, Array, Array]:
         """x, y, z and yaw (N,) of agents (N,) at rows (N,) with a fraction, which are within their lives."""
         k = np.floor(row).astype(np.intp)
         fraction = np.where(self.moves_on[k, agent], row - k, 0.0)
@@ -98,7 +98,7 @@ class Boxes:
         turn = wrap_angle(self.yaw_rad[after, agent] - self.yaw_rad[k, agent])
         return x, y, z, self.yaw_rad[k, agent] + np.where(fraction > 0, fraction * turn, 0.0)
 
-    def overlap(self, row_a: Array | Rows, a: Rows, row_b: Array | Rows, b: Rows) -> NDArray[np.bool_]:
+    def overlap(self, row_a: Array | RowIndex, a: RowIndex, row_b: Array | RowIndex, b: RowIndex) -> NDArray[np.bool_]:
         """Whether box a at its row overlaps box b at its own (N,)."""
         xa, ya, za, yaw_a = self.poses(row_a, a)
         xb, yb, zb, yaw_b = self.poses(row_b, b)

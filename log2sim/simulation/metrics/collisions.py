@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array, wrap_angle
-from log2sim.simulation.metrics.box_tracks import Boxes, Rows, spacing_s
-from log2sim.simulation.metrics.continuous_collision import Motion, first_touch
+from log2sim.simulation.metrics.box_tracks import BoxTracks, RowIndex, spacing_s
+from log2sim.simulation.metrics.continuous_collision import RelativeMotion, first_contact
 from log2sim.simulation.vehicles.vehicle import Columns
 
 CHUNK = 20
@@ -29,18 +29,18 @@ LOG_MARGIN_M = 0.1  # or pass with less room than this, which is less than boxes
 class Contacts(Columns):
     """Contacts (N,) of boxes a < b: the rows, with a fraction, of the first and the last overlap within one step."""
 
-    a: Rows
-    b: Rows
+    a: RowIndex
+    b: RowIndex
     first_row: Array
     last_row: Array
 
 
-def contacts(boxes: Boxes, moves: NDArray[np.bool_], only: NDArray[np.bool_] | None = None) -> Contacts:
+def contacts(boxes: BoxTracks, moves: NDArray[np.bool_], only: NDArray[np.bool_] | None = None) -> Contacts:
     """Contacts of two boxes of which one moves, a step at a time; `only` (A,) leaves out all other agents.
 
     Notes
     -----
-    Broad phase: axis-aligned hulls of the circles about the boxes over `CHUNK` rows, sorted. Narrow phase: `first_touch`,
+    Broad phase: axis-aligned hulls of the circles about the boxes over `CHUNK` rows, sorted. Narrow phase: `first_contact`,
     forward for the first overlap and backward for the last. Where an agent leaps or vanishes the boxes are compared at the
     row alone. Cost: A log A and the pairs in reach, a chunk.
     """
@@ -48,51 +48,51 @@ def contacts(boxes: Boxes, moves: NDArray[np.bool_], only: NDArray[np.bool_] | N
     first_row, last_row = np.zeros(len(k)), np.zeros(len(k))
     for begin in range(0, len(k), BATCH):
         part = slice(begin, begin + BATCH)
-        first_row[part], last_row[part] = _steps_of_contact(boxes, k[part], a[part], b[part])
+        first_row[part], last_row[part] = _contact_rows(boxes, k[part], a[part], b[part])
     hit = ~np.isnan(first_row)
     return Contacts(a[hit], b[hit], first_row[hit], last_row[hit])
 
 
 def _candidates(
-    boxes: Boxes, moves: NDArray[np.bool_], only: NDArray[np.bool_] | None
-) -> Iterator[tuple[Rows, Rows, Rows]]:
+    boxes: BoxTracks, moves: NDArray[np.bool_], only: NDArray[np.bool_] | None
+) -> Iterator[tuple[RowIndex, RowIndex, RowIndex]]:
     """Rows and pairs (3, N) that may touch before the next row."""
     for begin in range(0, len(boxes.x_m), CHUNK):
         rows = slice(begin, begin + CHUNK + 1)
-        i, j = _in_reach(boxes.x_m[rows], boxes.y_m[rows], boxes.radius_m, moves, only)
+        i, j = _overlapping_hulls(boxes.x_m[rows], boxes.y_m[rows], boxes.radius_m, moves, only)
         present = boxes.present[begin : begin + CHUNK]
         row, pair = np.nonzero(present[:, i] & present[:, j])
         k, a, b = row + begin, i[pair], j[pair]
-        near = _motion(boxes, k, a, b).may_touch()
+        near = _relative_motion(boxes, k, a, b).may_touch()
         yield k[near], a[near], b[near]
 
 
-def _steps_of_contact(boxes: Boxes, k: Rows, a: Rows, b: Rows) -> tuple[Array, Array]:
+def _contact_rows(boxes: BoxTracks, k: RowIndex, a: RowIndex, b: RowIndex) -> tuple[Array, Array]:
     """Rows (N,), with a fraction, of the first and the last overlap from rows `k` to the next; NaN where there is none."""
-    motion = _motion(boxes, k, a, b)
-    first, last = first_touch(motion), np.zeros(len(k))
+    motion = _relative_motion(boxes, k, a, b)
+    first, last = first_contact(motion), np.zeros(len(k))
     hit = np.flatnonzero(~np.isnan(first))
     on = boxes.moves_on[k[hit], a[hit]] & boxes.moves_on[k[hit], b[hit]]
-    last[hit] = np.where(on, 1.0 - first_touch(motion.take(hit).reversed()), 0.0)
+    last[hit] = np.where(on, 1.0 - first_contact(motion.take(hit).reversed()), 0.0)
     rows = k.astype(np.float64)
     return rows + first, rows + np.fmax(first, last)
 
 
-def _motion(boxes: Boxes, k: Rows, a: Rows, b: Rows) -> Motion:
+def _relative_motion(boxes: BoxTracks, k: RowIndex, a: RowIndex, b: RowIndex) -> RelativeMotion:
     """The motion of pairs (N,) from rows to the next, none where one of them does not get there by moving."""
     after = np.where(boxes.moves_on[k, a] & boxes.moves_on[k, b], k + 1, k)
     x, y, z = (c[k, b] - c[k, a] for c in (boxes.x_m, boxes.y_m, boxes.z_m))
     then_x, then_y, then_z = (c[after, b] - c[after, a] for c in (boxes.x_m, boxes.y_m, boxes.z_m))
     yaw_a, yaw_b = boxes.yaw_rad[k, a], boxes.yaw_rad[k, b]
     turn_a, turn_b = wrap_angle(boxes.yaw_rad[after, a] - yaw_a), wrap_angle(boxes.yaw_rad[after, b] - yaw_b)
-    return Motion(
+    return RelativeMotion(
         x, y, z, then_x - x, then_y - y, then_z - z, yaw_a, yaw_b, turn_a, turn_b, boxes.size_m[a].T, boxes.size_m[b].T
     )
 
 
-def _in_reach(
+def _overlapping_hulls(
     x: Array, y: Array, radius: Array, moves: NDArray[np.bool_], only: NDArray[np.bool_] | None
-) -> tuple[Rows, Rows]:
+) -> tuple[RowIndex, RowIndex]:
     """Pairs (P,), (P,) whose hulls over the rows meet, at least one of them moving."""
     there = ~np.isnan(x).all(axis=0)
     present = np.flatnonzero(there if only is None else there & only)
@@ -111,7 +111,7 @@ def _in_reach(
 
 
 def collisions(
-    replayed: Boxes, logged: Boxes, moves: NDArray[np.bool_], t_s: Array, ids: Sequence[str]
+    replayed: BoxTracks, logged: BoxTracks, moves: NDArray[np.bool_], t_s: Array, ids: Sequence[str]
 ) -> list[dict[str, Any]]:
     """Collisions of a replay in order of time: the pair, first and last contact, relative speed, and if the log has it.
 
@@ -130,7 +130,7 @@ def collisions(
     for (a, b), contact in _by_pair(touching).items():
         in_log = np.interp(logged_contacts.get((a, b), np.zeros((2, 0))), rows, t_s)
         together = max(replayed.first_row[a], replayed.first_row[b])
-        for begin_row, end_row in _runs(contact, SAME_CONTACT_S / spacing_s(t_s)):
+        for begin_row, end_row in _merged_contacts(contact, SAME_CONTACT_S / spacing_s(t_s)):
             begin, end = np.interp([begin_row, end_row], rows, t_s)
             shared = (in_log[0] <= end + LOG_WINDOW_S) & (in_log[1] >= begin - LOG_WINDOW_S)
             events.append(
@@ -155,7 +155,7 @@ def _by_pair(found: Contacts) -> dict[tuple[int, int], Array]:
     return dict(zip(zip(found.a[begins].tolist(), found.b[begins].tolist()), rows))
 
 
-def _runs(contact: Array, gap: float) -> list[tuple[float, float]]:
+def _merged_contacts(contact: Array, gap: float) -> list[tuple[float, float]]:
     """Begin and end of contacts (2, K), those joined that are at most `gap` apart."""
     first, last = contact
     new = np.flatnonzero(first[1:] - last[:-1] > gap) + 1

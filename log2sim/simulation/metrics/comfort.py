@@ -13,7 +13,7 @@ ACCEL_WINDOW_S = 0.75
 JERK_WINDOW_S = 1.5
 """Lengths of the fits. Shorter ones show the steps of a controller and the noise of a log instead of the ride."""
 
-LEAST_ROWS = 5
+MIN_ROWS = 5
 """A window of fewer rows fits no cubic; where rows lie far apart the fits are longer for that."""
 
 LIMITS = {
@@ -46,7 +46,7 @@ def comfort(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array) -> dict[str, flo
     Derivatives of cubics fitted to the positions in a sliding window (Savitzky and Golay, 1964): longitudinal along the
     heading, lateral across it, both of the box center whatever drives it. What changes faster than the window is damped.
     """
-    if len(t_s) < LEAST_ROWS:
+    if len(t_s) < MIN_ROWS:
         return None
     spacing_s = round((t_s[-1] - t_s[0]) / (len(t_s) - 1), 9)  # as times are stored, and the same for all agents
     ax, ay = (_derivative(c, 2, ACCEL_WINDOW_S, spacing_s) for c in (x_m, y_m))
@@ -75,7 +75,7 @@ def comfort(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array) -> dict[str, flo
 def _derivative(values: Array, order: int, window_s: float, spacing_s: float) -> Array:
     """Derivative (S,) of the cubics fitted to a window about each row; near an end of that of the window at the end."""
     longest = len(values) - (len(values) + 1) % 2
-    half = min(max(round(window_s / spacing_s / 2), LEAST_ROWS // 2), longest // 2)
+    half = min(max(round(window_s / spacing_s / 2), MIN_ROWS // 2), longest // 2)
     weights = _weights(half, order, spacing_s)
     values = values - values[0]  # far map offsets would cost digits
     return np.concatenate(

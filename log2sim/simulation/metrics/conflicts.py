@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import EGO
 from log2sim.geometry import Array
-from log2sim.simulation.metrics.box_tracks import Boxes, spacing_s
-from log2sim.simulation.metrics.post_encroachment_time import encroachments
-from log2sim.simulation.metrics.time_to_collision import approaches
+from log2sim.simulation.metrics.box_tracks import BoxTracks, spacing_s
+from log2sim.simulation.metrics.post_encroachment_time import post_encroachment_times
+from log2sim.simulation.metrics.time_to_collision import times_to_collision
 
 Event = Mapping[str, Any]
 
 
 def conflicts(
-    boxes: Boxes, moves: NDArray[np.bool_], t_s: Array, ids: Sequence[str], collisions: Iterable[Event]
+    boxes: BoxTracks, moves: NDArray[np.bool_], t_s: Array, ids: Sequence[str], collisions: Iterable[Event]
 ) -> list[dict[str, Any]]:
     """One record for every pair with a time to collision or a post-encroachment time, the most pressing first.
 
@@ -32,13 +32,13 @@ def conflicts(
     def record(a: int, b: int) -> dict[str, Any]:
         pair = (min(a, b), max(a, b))
         if pair not in by_pair:
-            by_pair[pair] = _empty(ids[pair[0]], ids[pair[1]])
+            by_pair[pair] = _new_record(ids[pair[0]], ids[pair[1]])
         return by_pair[pair]
 
-    close = approaches(boxes, moves, step_s)
+    close = times_to_collision(boxes, moves, step_s)
     for a, b, time_s, row in zip(*(c.tolist() for c in (close.a, close.b, close.time_s, close.row))):
         record(a, b).update(min_ttc_s=round(time_s, 4), min_ttc_t_s=round(float(t_s[row]), 6))
-    crossed = encroachments(boxes, step_s)
+    crossed = post_encroachment_times(boxes, step_s)
     left, came = (np.interp(row, rows, t_s) for row in (crossed.left_row, crossed.came_row))
     for a, b, left_s, came_s in zip(crossed.first.tolist(), crossed.second.tolist(), left.tolist(), came.tolist()):
         record(a, b).update(pet_s=round(came_s - left_s, 4), pet_t_s=round(came_s, 6), pet_first=ids[a])
@@ -50,10 +50,10 @@ def conflicts(
             entry.update(contact="new", min_ttc_s=0.0, min_ttc_t_s=t, pet_s=0.0, pet_t_s=t, pet_first=None)
         elif event["in_log"] and entry["contact"] == "none":
             entry["contact"] = "log"
-    return sorted(by_pair.values(), key=lambda e: (_pressing(e), e["agents"]))
+    return sorted(by_pair.values(), key=lambda e: (_urgency_s(e), e["agents"]))
 
 
-def least(found: Iterable[Event], key: str) -> dict[str, Any] | None:
+def most_critical(found: Iterable[Event], key: str) -> dict[str, Any] | None:
     """The record's `agents`, `t_s` and value `s` with the least `key` ("min_ttc" or "pet"); None where there is none.
 
     Pairs that touch in the log too are left out: boxes of a log err by more than what would part them.
@@ -65,12 +65,12 @@ def least(found: Iterable[Event], key: str) -> dict[str, Any] | None:
     return {"s": first[f"{key}_s"], "t_s": first[f"{key}_t_s"], "agents": list(first["agents"])}
 
 
-def _empty(a: str, b: str) -> dict[str, Any]:
+def _new_record(a: str, b: str) -> dict[str, Any]:
     return {
         "agents": [a, b], "ego": EGO in (a, b), "contact": "none",
         "min_ttc_s": None, "min_ttc_t_s": None, "pet_s": None, "pet_t_s": None, "pet_first": None,
     }  # fmt: skip
 
 
-def _pressing(entry: Event) -> float:
+def _urgency_s(entry: Event) -> float:
     return min((v for v in (entry["min_ttc_s"], entry["pet_s"]) if v is not None), default=np.inf)

@@ -9,14 +9,14 @@ import numpy as np
 from log2sim.geometry import Array, separating_axes
 from log2sim.simulation.vehicles.vehicle import Columns
 
-STEPS = 64
+MAX_STEPS = 64
 """An interval is crossed in at most so many steps; a touch that lasts shorter than one may pass unseen, 0.8 ms of 50 ms."""
 
-HALVINGS = 8  # of the last step: 3 us of 50 ms
+BISECTIONS = 8  # of the last step: 3 us of 50 ms
 
 
 @dataclass(frozen=True, eq=False)
-class Motion(Columns):
+class RelativeMotion(Columns):
     """N pairs over an interval of time: the way from a to b at its begin and how it changes until its end, yaws and turns.
 
     `dx_m`, `dy_m`, `dz_m`, their changes `vx_m`, `vy_m`, `vz_m`, yaws and `turn_*_rad` (N,), sizes (3, N).
@@ -35,9 +35,9 @@ class Motion(Columns):
     size_a_m: Array
     size_b_m: Array
 
-    def reversed(self) -> Motion:
+    def reversed(self) -> RelativeMotion:
         """The same from the end to the begin."""
-        return Motion(
+        return RelativeMotion(
             self.dx_m + self.vx_m, self.dy_m + self.vy_m, self.dz_m + self.vz_m,
             -self.vx_m, -self.vy_m, -self.vz_m,
             self.yaw_a_rad + self.turn_a_rad, self.yaw_b_rad + self.turn_b_rad,
@@ -66,21 +66,23 @@ class Motion(Columns):
         spin_a, spin_b = np.abs(self.turn_a_rad), np.abs(self.turn_b_rad)
         relative = np.abs(self.turn_b_rad - self.turn_a_rad) / 2
         radius_a, radius_b = (np.hypot(*size[:2]) for size in (self.size_a_m, self.size_b_m))
-        free = _time(np.abs(self.dz_m + u * self.vz_m) - (self.size_a_m[2] + self.size_b_m[2]) / 2, np.abs(self.vz_m))
+        free = _gap_duration(
+            np.abs(self.dz_m + u * self.vz_m) - (self.size_a_m[2] + self.size_b_m[2]) / 2, np.abs(self.vz_m)
+        )
         for nx, ny, reach, of_a in separating_axes(yaw_a, yaw_b, self.size_a_m.T, self.size_b_m.T):
             spin, radius = (spin_a, radius_b) if of_a else (spin_b, radius_a)
             rate = np.abs(self.vx_m * nx + self.vy_m * ny) + spin * distance + relative * radius
-            free = np.maximum(free, _time(np.abs(dx * nx + dy * ny) - reach, rate))
+            free = np.maximum(free, _gap_duration(np.abs(dx * nx + dy * ny) - reach, rate))
         return free
 
 
-def first_touch(motion: Motion) -> Array:
+def first_contact(motion: RelativeMotion) -> Array:
     """Share of the interval (N,) after which the boxes first overlap, NaN where they do not.
 
     Notes
     -----
     Conservative advancement (Mirtich, 1996) with separating axes in place of a distance: every step is as long as the
-    boxes stay apart for certain, but at least 1 / `STEPS`; the last step is halved until it says when.
+    boxes stay apart for certain, but at least 1 / `MAX_STEPS`; the last step is halved until it says when.
     """
     touch = np.full(len(motion.dx_m), np.nan)
     active = np.flatnonzero(motion.may_touch())
@@ -89,23 +91,23 @@ def first_touch(motion: Motion) -> Array:
         moving = motion.take(active)
         free = moving.free_for(u)
         hit = free == 0
-        touch[active[hit]] = _halved(moving.take(hit), before[hit], u[hit])
+        touch[active[hit]] = _bisected(moving.take(hit), before[hit], u[hit])
         on = ~hit & (u < 1) & (u + free < 1)
-        active, before, step = active[on], u[on], np.maximum(free[on], 1 / STEPS)
+        active, before, step = active[on], u[on], np.maximum(free[on], 1 / MAX_STEPS)
         u = np.minimum(before + step, 1.0)
     return touch
 
 
-def _halved(motion: Motion, apart: Array, overlapping: Array) -> Array:
+def _bisected(motion: RelativeMotion, apart: Array, overlapping: Array) -> Array:
     """The first share (N,) with an overlap between one without and one with it."""
-    for _ in range(HALVINGS):
+    for _ in range(BISECTIONS):
         middle = (apart + overlapping) / 2
         inside = motion.free_for(middle) == 0
         apart, overlapping = np.where(inside, apart, middle), np.where(inside, middle, overlapping)
     return overlapping
 
 
-def _time(gap: Array, rate: Array) -> Array:
+def _gap_duration(gap: Array, rate: Array) -> Array:
     """How long (N,) a gap lasts that shrinks at a rate; 0 where there is none, inf where it stays."""
     lasts = np.divide(gap, rate, out=np.full(len(gap), np.inf), where=rate > 0)
     return np.where(gap < 0, 0.0, np.maximum(lasts, np.finfo(float).tiny))

@@ -11,8 +11,8 @@ from log2sim.simulation.metrics.comfort import LIMITS as COMFORT
 from log2sim.simulation.metrics.tracking_error import OFF_PATH_M
 from log2sim.simulation.result import Replay
 
-AT_LEAST = ("min_ttc_s", "min_pet_s")
-AT_MOST = (
+LOWER_LIMITS = ("min_ttc_s", "min_pet_s")
+UPPER_LIMITS = (
     "cross_track_max_m", "cross_track_rms_m", "along_track_rms_m", "speed_rms_mps", "yaw_rms_rad", "off_path_share",
     *COMFORT,
 )  # fmt: skip
@@ -30,10 +30,10 @@ def parse_limits(texts: Iterable[str]) -> dict[str, float]:
     for text in texts:
         name, _, value = text.partition("=")
         name = name.strip()
-        if name not in AT_LEAST + AT_MOST:
-            known = ", ".join(AT_LEAST + AT_MOST)
+        if name not in LOWER_LIMITS + UPPER_LIMITS:
+            known = ", ".join(LOWER_LIMITS + UPPER_LIMITS)
             raise ConfigError(
-                f"limit '{text}': no metric '{name}'{nearest(name, [*AT_LEAST, *AT_MOST])}; known: {known}"
+                f"limit '{text}': no metric '{name}'{nearest(name, [*LOWER_LIMITS, *UPPER_LIMITS])}; known: {known}"
             )
         try:
             limits[name] = float(value)
@@ -53,8 +53,8 @@ def check_limits(replay: Replay, limits: Mapping[str, float]) -> list[str]:
         values = by_agent.get(id, {})
         for name, limit in limits.items():
             value = values[name] if name in values else (values.get("comfort") or {}).get(name)
-            if value is not None and (value < limit if name in AT_LEAST else value > limit):
-                side = "at least" if name in AT_LEAST else "at most"
+            if value is not None and (value < limit if name in LOWER_LIMITS else value > limit):
+                side = "at least" if name in LOWER_LIMITS else "at most"
                 broken.append(f"agent '{id}': {name} {value:g}, limit {side} {limit:g}")
     return broken
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array, rectangles_overlap, wrap_angle
-from log2sim.simulation.metrics.box_tracks import Boxes, Rows
+from log2sim.simulation.metrics.box_tracks import BoxTracks, RowIndex
 from log2sim.simulation.vehicles.vehicle import Columns
 
 HORIZON_S = 10.0
@@ -29,11 +29,11 @@ PARTS, ZOOMS = 4, 4
 
 
 @dataclass(frozen=True, eq=False)
-class Encroachments(Columns):
+class PostEncroachmentTimes(Columns):
     """Pairs (N,): who was there first and second, and the rows with a fraction when the one left and the other came."""
 
-    first: Rows
-    second: Rows
+    first: RowIndex
+    second: RowIndex
     left_row: Array
     came_row: Array
 
@@ -41,10 +41,10 @@ class Encroachments(Columns):
 class _Pairs(NamedTuple):
     """Agents `a` and `b` (N,) in blocks or at rows `i` and `j` (N,); `a` is the first to be at the place."""
 
-    a: Rows
-    b: Rows
-    i: Rows
-    j: Rows
+    a: RowIndex
+    b: RowIndex
+    i: RowIndex
+    j: RowIndex
 
     def take(self, index: NDArray | slice) -> _Pairs:
         return _Pairs(*(column[index] for column in self))
@@ -59,7 +59,7 @@ class _Pairs(NamedTuple):
         return _Pairs(self.a[k], self.b[k], i[i <= j], j[i <= j])
 
 
-def encroachments(boxes: Boxes, spacing_s: float) -> Encroachments:
+def post_encroachment_times(boxes: BoxTracks, spacing_s: float) -> PostEncroachmentTimes:
     """The shortest post-encroachment time of every pair whose ways cross, where it is at most `HORIZON_S`.
 
     Notes
@@ -74,27 +74,27 @@ def encroachments(boxes: Boxes, spacing_s: float) -> Encroachments:
     overlap, then the boxes; the row found is divided. Cost: A log A for every 64 rows, then what overlaps.
     """
     lag = HORIZON_S / spacing_s
-    hulls = [_Hulls(boxes, COARSE // FINER**level) for level in range(LEVELS)]
+    hulls = [_SweptRectangles(boxes, COARSE // FINER**level) for level in range(LEVELS)]
     found: list[_Pairs] = []
-    for pairs in _coarse(hulls[0], lag):
+    for pairs in _overlapping_blocks(hulls[0], lag):
         for hull in hulls[1:]:
             pairs = hull.met(pairs.divided())
         found.append(_shortest(_crossings(boxes, pairs.divided(), lag)))
     if not found:
         none = np.zeros(0, dtype=np.intp)
-        return Encroachments(none, none, np.zeros(0), np.zeros(0))
+        return PostEncroachmentTimes(none, none, np.zeros(0), np.zeros(0))
     pairs = _shortest(_Pairs(*(np.concatenate(column) for column in zip(*found))))
     left, came = np.zeros(len(pairs.a)), np.zeros(len(pairs.a))
     for begin in range(0, len(left), BATCH):
         part = slice(begin, begin + BATCH)
         left[part], came[part] = _refined(boxes, pairs.take(part))
-    return Encroachments(pairs.a, pairs.b, left, came)
+    return PostEncroachmentTimes(pairs.a, pairs.b, left, came)
 
 
-class _Hulls:
+class _SweptRectangles:
     """Rectangles (K, A) about what each box covers while it goes through `size` rows to the next, NaN where absent."""
 
-    def __init__(self, boxes: Boxes, size: int) -> None:
+    def __init__(self, boxes: BoxTracks, size: int) -> None:
         count = len(boxes.x_m)
         rows = np.minimum(np.arange(0, count, size)[:, None] + np.arange(size + 1), count - 1)
         self.size = size
@@ -108,9 +108,9 @@ class _Hulls:
         dx, dy = boxes.x_m[rows] - x0[:, None], boxes.y_m[rows] - y0[:, None]
         c, s = np.abs(np.cos(turn)), np.abs(np.sin(turn))
         length, width, height = boxes.size_m.T
-        along = _range(dx * cos[:, None] + dy * sin[:, None], (length * c + width * s) / 2)
-        across = _range(dy * cos[:, None] - dx * sin[:, None], (width * c + length * s) / 2)
-        self.low_m, self.high_m = _range(boxes.z_m[rows], np.broadcast_to(height / 2, rows.shape + height.shape))
+        along = _extent(dx * cos[:, None] + dy * sin[:, None], (length * c + width * s) / 2)
+        across = _extent(dy * cos[:, None] - dx * sin[:, None], (width * c + length * s) / 2)
+        self.low_m, self.high_m = _extent(boxes.z_m[rows], np.broadcast_to(height / 2, rows.shape + height.shape))
         u, v = (along[0] + along[1]) / 2, (across[0] + across[1]) / 2
         self.x_m, self.y_m = x0 + u * cos - v * sin, y0 + u * sin + v * cos
         self.size_m = np.stack([along[1] - along[0], across[1] - across[0]], axis=-1)
@@ -132,12 +132,12 @@ class _Hulls:
         return pairs.take(meet)
 
 
-def _range(values: Array, half: Array) -> tuple[Array, Array]:
+def _extent(values: Array, half: Array) -> tuple[Array, Array]:
     """Least and greatest (K, A) of intervals (K, R, A) about values; NaN where all are."""
     return np.fmin.reduce(values - half, axis=1), np.fmax.reduce(values + half, axis=1)
 
 
-def _coarse(hulls: _Hulls, lag: float) -> Iterator[_Pairs]:
+def _overlapping_blocks(hulls: _SweptRectangles, lag: float) -> Iterator[_Pairs]:
     """Pairs of blocks that overlap, those of two blocks of rows at a time."""
     from scipy.spatial import cKDTree
 
@@ -154,7 +154,7 @@ def _coarse(hulls: _Hulls, lag: float) -> Iterator[_Pairs]:
             yield hulls.met(_Pairs(a, b, np.full(len(a), i), np.full(len(a), j)))
 
 
-def _crossings(boxes: Boxes, pairs: _Pairs, lag: float) -> _Pairs:
+def _crossings(boxes: BoxTracks, pairs: _Pairs, lag: float) -> _Pairs:
     """The pairs of rows at which the boxes cover a place in common that one leaves before the other comes."""
     count = len(boxes.x_m)
     pairs = pairs.take((pairs.i < pairs.j) & (pairs.j < count) & (pairs.j - pairs.i <= lag))
@@ -177,7 +177,7 @@ def _shortest(pairs: _Pairs) -> _Pairs:
     return pairs.take(new)
 
 
-def _refined(boxes: Boxes, pairs: _Pairs) -> tuple[Array, Array]:
+def _refined(boxes: BoxTracks, pairs: _Pairs) -> tuple[Array, Array]:
     """Rows (N,), (N,) with a fraction: of ever finer grids about the moments found the ones nearest in time."""
     a, b, left, came = pairs.a, pairs.b, pairs.i.astype(np.float64), pairs.j.astype(np.float64)
     offset = np.arange(-PARTS, PARTS + 1)

@@ -6,11 +6,11 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from log2sim.simulation.metrics.all_metrics import FOLLOWING
-from log2sim.simulation.metrics.conflicts import least
+from log2sim.simulation.metrics.all_metrics import LOG_FOLLOWERS
+from log2sim.simulation.metrics.conflicts import most_critical
 from log2sim.simulation.result import Replay
 
-MOST_LISTED = 5
+MAX_LISTED = 5
 
 
 def summarize(replay: Replay) -> str:
@@ -23,22 +23,22 @@ def summarize(replay: Replay) -> str:
     near = [e for e in m["conflicts"] if e["ego"] or not driven]
     whose = " of the ego" if driven else ""
     lines = [
-        _errors(replay),
+        _error_line(replay),
         f"{_counted(len(m['collisions']), 'collision')}, {m['new_collisions']} that the log does not have · "
-        f"least time to collision{whose} {_least(near, 'min_ttc')} · post-encroachment time {_least(near, 'pet')}",
+        f"least time to collision{whose} {_critical_time(near, 'min_ttc')} · post-encroachment time {_critical_time(near, 'pet')}",
     ]
-    lines += _models(replay)
+    lines += _model_lines(replay)
     events = sorted(m["collisions"], key=lambda e: (e["in_log"], e["t_s"]))
-    lines += [f"  {_collision(e)}" for e in events[:MOST_LISTED]]
-    if len(events) > MOST_LISTED:
-        lines.append(f"  and {len(events) - MOST_LISTED} more")
+    lines += [f"  {_collision_line(e)}" for e in events[:MAX_LISTED]]
+    if len(events) > MAX_LISTED:
+        lines.append(f"  and {len(events) - MAX_LISTED} more")
     return "\n".join(lines)
 
 
-def _errors(replay: Replay) -> str:
+def _error_line(replay: Replay) -> str:
     """Errors across of all who keep to the way of the log, and those in time of all who also do as it did."""
     m, drivers = replay.metrics, {a.driver for a in replay.agents}
-    on_time = bool(drivers & {*FOLLOWING})
+    on_time = bool(drivers & {*LOG_FOLLOWERS})
     across, along, speed = "-", "-", "-"
     if on_time or "reactive" in drivers:
         across = f"{m['cross_track_rms_m']:.3f} m rms, {m['cross_track_max_m']:.3f} m max"
@@ -47,25 +47,25 @@ def _errors(replay: Replay) -> str:
     return f"cross-track {across} · along-track {along} · speed {speed}"
 
 
-def _models(replay: Replay) -> list[str]:
+def _model_lines(replay: Replay) -> list[str]:
     """How many agents each model moves in one line, and why for the first of those that slip without being asked to."""
     counts = Counter(a.model for a in replay.agents if a.model != "none")
     if not counts:
         return []
     chosen = [a for a in replay.agents if a.model == "dynamic" and replay.model == "auto"]
-    found = [f"  {a.id} dynamic: {a.model_reason}" for a in chosen[:MOST_LISTED]]
-    if len(chosen) > MOST_LISTED:
-        found.append(f"  and {len(chosen) - MOST_LISTED} more")
+    found = [f"  {a.id} dynamic: {a.model_reason}" for a in chosen[:MAX_LISTED]]
+    if len(chosen) > MAX_LISTED:
+        found.append(f"  and {len(chosen) - MAX_LISTED} more")
     return ["models: " + ", ".join(f"{count} {model}" for model, count in counts.most_common()), *found]
 
 
-def _collision(event: Mapping[str, Any]) -> str:
+def _collision_line(event: Mapping[str, Any]) -> str:
     known = ", as in the log" if event["in_log"] else ""
     return f"{' and '.join(event['agents'])} collide at {event['t_s']:.2f} s ({event['relative_speed_mps']:.1f} m/s){known}"
 
 
-def _least(near: Sequence[Mapping[str, Any]], key: str) -> str:
-    found = least(near, key)
+def _critical_time(near: Sequence[Mapping[str, Any]], key: str) -> str:
+    found = most_critical(near, key)
     if found is None:
         return "-"
     return f"{found['s']:.2f} s ({' and '.join(found['agents'])} at {found['t_s']:.2f} s)"

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array, separating_axes
-from log2sim.simulation.metrics.box_tracks import Boxes, Rows
+from log2sim.simulation.metrics.box_tracks import BoxTracks, RowIndex
 from log2sim.simulation.vehicles.vehicle import Columns
 
 HORIZON_S = 10.0
@@ -21,16 +21,16 @@ BLOCK = 256
 
 
 @dataclass(frozen=True, eq=False)
-class Approaches(Columns):
+class TimesToCollision(Columns):
     """Pairs a < b (N,) that approach: their least time to collision and the row where they have it."""
 
-    a: Rows
-    b: Rows
+    a: RowIndex
+    b: RowIndex
     time_s: Array
-    row: Rows
+    row: RowIndex
 
 
-def approaches(boxes: Boxes, moves: NDArray[np.bool_], spacing_s: float) -> Approaches:
+def times_to_collision(boxes: BoxTracks, moves: NDArray[np.bool_], spacing_s: float) -> TimesToCollision:
     """The least time to collision of every pair of which one moves, where it is at most `HORIZON_S`.
 
     Notes
@@ -43,7 +43,7 @@ def approaches(boxes: Boxes, moves: NDArray[np.bool_], spacing_s: float) -> Appr
     found = [np.zeros((4, 0))]
     for begin in range(0, len(boxes.x_m), CHUNK):
         rows = slice(begin, begin + CHUNK)
-        for a, b in _on_course(boxes, vx[rows], vy[rows], rows, moves, spacing_s):
+        for a, b in _candidate_pairs(boxes, vx[rows], vy[rows], rows, moves, spacing_s):
             k, pair = np.nonzero(boxes.present[rows][:, a] & boxes.present[rows][:, b])
             k, i, j = k + begin, a[pair], b[pair]
             dx, dy = boxes.x_m[k, j] - boxes.x_m[k, i], boxes.y_m[k, j] - boxes.y_m[k, i]
@@ -56,9 +56,9 @@ def approaches(boxes: Boxes, moves: NDArray[np.bool_], spacing_s: float) -> Appr
             )  # fmt: skip
             soon = time <= HORIZON_S
             k, i, j, time = k[soon], i[soon], j[soon], time[soon]
-            found.append(_least(np.stack([i, j, time, k])[:, _level(boxes, climb, i, j, k, time)]))
-    a, b, time, row = _least(np.concatenate(found, axis=1))
-    return Approaches(a.astype(np.intp), b.astype(np.intp), time, row.astype(np.intp))
+            found.append(_least_per_pair(np.stack([i, j, time, k])[:, _same_height(boxes, climb, i, j, k, time)]))
+    a, b, time, row = _least_per_pair(np.concatenate(found, axis=1))
+    return TimesToCollision(a.astype(np.intp), b.astype(np.intp), time, row.astype(np.intp))
 
 
 def time_to_touch(
@@ -81,16 +81,18 @@ def time_to_touch(
     return np.where((enter >= 0) & (enter < leave), enter, np.inf)
 
 
-def _level(boxes: Boxes, climb: Array, i: Rows, j: Rows, k: Rows, time_s: Array) -> NDArray[np.bool_]:
+def _same_height(
+    boxes: BoxTracks, climb: Array, i: RowIndex, j: RowIndex, k: RowIndex, time_s: Array
+) -> NDArray[np.bool_]:
     """Whether pairs (N,) are at one height at rows k, or will be after a time, on a slope that both go along."""
     apart_m = boxes.z_m[k, j] - boxes.z_m[k, i]
     then_m = apart_m + time_s * (climb[k, j] - climb[k, i])
     return np.minimum(np.abs(apart_m), np.abs(then_m)) < (boxes.size_m[i, 2] + boxes.size_m[j, 2]) / 2
 
 
-def _on_course(
-    boxes: Boxes, vx: Array, vy: Array, rows: slice, moves: NDArray[np.bool_], spacing_s: float
-) -> Iterator[tuple[Rows, Rows]]:
+def _candidate_pairs(
+    boxes: BoxTracks, vx: Array, vy: Array, rows: slice, moves: NDArray[np.bool_], spacing_s: float
+) -> Iterator[tuple[RowIndex, RowIndex]]:
     """Pairs (P,), (P,) that may meet within the horizon after one of the rows, some at a time.
 
     For some rows each agent is a circle on a straight line, so large that it holds all its places then and, at all its
@@ -133,7 +135,7 @@ def _circles_meet(
     return (dx + t * vx) ** 2 + (dy + t * vy) ** 2 <= reach**2
 
 
-def _least(found: Array) -> Array:
+def _least_per_pair(found: Array) -> Array:
     """Of rows a, b, time and row (4, N) those with the least time of each pair, the earliest where it is twice the same."""
     found = found[:, np.lexsort((found[3], found[2], found[1], found[0]))]
     new = np.ones(found.shape[1], dtype=bool)

@@ -14,14 +14,14 @@ from log2sim.simulation.result import AgentReplay
 
 SEARCH_S = 1.0
 SEARCH_STEP_S = 0.05
-STANDING_MPS = 0.1
+MIN_SEGMENT_MPS = 0.1
 
 OFF_PATH_M = 0.5
 """Farther than this across from its course an agent is off its path: a car of 1.9 m in a lane of 3.5 m has 0.8 m."""
 
 
 @dataclass(frozen=True, eq=False)
-class Errors:
+class TrackingErrors:
     """How far an agent is from the log at its rows (S,): left, ahead, faster and counter-clockwise positive."""
 
     across_m: Array
@@ -30,12 +30,12 @@ class Errors:
     yaw_rad: Array
 
 
-def errors_of(path: Path, agent: AgentReplay, *, follows: bool) -> Errors:
+def agent_errors(path: Path, agent: AgentReplay, *, follows: bool) -> TrackingErrors:
     """Errors of an agent; one that does not follow the log may be far behind or ahead, and keep to its course yet."""
     near_s = agent.t_s if follows else _nearest_times(path, agent.x_m, agent.y_m)
     across, along = tracking_errors(path, agent.t_s, agent.x_m, agent.y_m, near_s)
     _, _, log_yaw, log_speed = path.centers(agent.t_s)
-    return Errors(across, along, agent.speed_mps - log_speed, wrap_angle(agent.yaw_rad - log_yaw))
+    return TrackingErrors(across, along, agent.speed_mps - log_speed, wrap_angle(agent.yaw_rad - log_yaw))
 
 
 def tracking_errors(path: Path, t_s: Array, x_m: Array, y_m: Array, near_s: Array | None = None) -> tuple[Array, Array]:
@@ -52,7 +52,7 @@ def tracking_errors(path: Path, t_s: Array, x_m: Array, y_m: Array, near_s: Arra
     px, py, yaw, _ = path.centers(np.arange(begin_s, end_s + SEARCH_STEP_S, SEARCH_STEP_S))
     ux, uy = np.diff(px), np.diff(py)
     square = ux**2 + uy**2
-    moves = square > (STANDING_MPS * SEARCH_STEP_S) ** 2
+    moves = square > (MIN_SEGMENT_MPS * SEARCH_STEP_S) ** 2
     # Segments near each row (S, K): on each the share of it at which it is nearest.
     reach = round(SEARCH_S / SEARCH_STEP_S)
     middle = np.rint(((t_s if near_s is None else near_s) - begin_s) / SEARCH_STEP_S).astype(np.intp)
@@ -70,7 +70,7 @@ def tracking_errors(path: Path, t_s: Array, x_m: Array, y_m: Array, near_s: Arra
     return left[k] * (dy * cos[k] - dx * sin[k]), along
 
 
-def agent_metrics(errors: Errors) -> dict[str, Any]:
+def agent_metrics(errors: TrackingErrors) -> dict[str, Any]:
     """Tracking errors of one agent, and the share of its rows that are farther than `OFF_PATH_M` from its course."""
     across = np.abs(errors.across_m)
     return {
@@ -83,7 +83,7 @@ def agent_metrics(errors: Errors) -> dict[str, Any]:
     }
 
 
-def overall(
+def scenario_metrics(
     by_agent: Mapping[str, Mapping[str, Any]], on_time: Mapping[str, int], on_way: Mapping[str, int]
 ) -> dict[str, Any]:
     """Errors over all followers, every stored sample counting alike; 0 where nobody follows.

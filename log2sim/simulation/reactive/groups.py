@@ -6,23 +6,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.simulation.groups import Crowd, Fleet, Group, Tape
+from log2sim.simulation.groups import AgentGroup, LogReplayGroup, PedestrianGroup, VehicleGroup
 from log2sim.simulation.reactive.traffic import Traffic
 from log2sim.simulation.reference import GRID_S, POINT_COLUMNS, STANDSTILL_MPS, VEHICLE_COLUMNS
-from log2sim.simulation.step_clock import Clock
+from log2sim.simulation.step_clock import StepClock
 
-SPEEDS = {"speed": "accel_ahead", "velocity_x": "accel_x", "velocity_y": "accel_y"}
+RATE_OF_SPEED = {"speed": "accel_ahead", "velocity_x": "accel_x", "velocity_y": "accel_y"}
 """Columns that go with the rate, and those of their change."""
 
 
-class Reactive(Group):
+class ReactiveGroup(AgentGroup):
     """A group whose agents are at the place of their log that `traffic` says, and pass it at its rate."""
 
     driver = "reactive"
     keeps_time = False
     columns: tuple[str, ...] = ("x", "y", "yaw", "speed")
 
-    def join(self, traffic: Traffic, clock: Clock) -> None:
+    def join(self, traffic: Traffic, clock: StepClock) -> None:
         """Take part in the traffic; to be called once, before anything else."""
         self.traffic, self.clock, self._logged_last = traffic, clock, self.last
         self.index = np.array([traffic.index[a.id] for a in self.agents], dtype=np.intp)
@@ -75,8 +75,8 @@ class Reactive(Group):
             return row
         row = row.copy()
         names = {name: k for k, name in enumerate(self.columns)}
-        speeds = [names[speed] for speed in SPEEDS if speed in names]
-        for speed, change in SPEEDS.items():
+        speeds = [names[speed] for speed in RATE_OF_SPEED if speed in names]
+        for speed, change in RATE_OF_SPEED.items():
             if change in names:
                 row[names[change]] = row[names[change]] * rate**2 + row[names[speed]] * slope
         row[speeds] *= rate
@@ -85,17 +85,17 @@ class Reactive(Group):
         return row
 
 
-class ReactiveFleet(Reactive, Fleet):
+class ReactiveVehicleGroup(ReactiveGroup, VehicleGroup):
     """Vehicles that react."""
 
     columns = VEHICLE_COLUMNS
 
 
-class ReactiveCrowd(Reactive, Crowd):
+class ReactivePedestrianGroup(ReactiveGroup, PedestrianGroup):
     """Points that react."""
 
     columns = POINT_COLUMNS
 
 
-class ReactiveTape(Reactive, Tape):
+class ReactiveLogReplayGroup(ReactiveGroup, LogReplayGroup):
     """Agents that react and are exactly on their logged way."""

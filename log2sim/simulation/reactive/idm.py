@@ -27,7 +27,7 @@ ON_FOOT = (0.5, 0.7, 1.0, 1.5, 4.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Driver(Columns):
+class IdmParameters(Columns):
     """Parameters of the intelligent-driver model, all (A,)."""
 
     time_gap_s: Array
@@ -37,13 +37,13 @@ class Driver(Columns):
     brake_mps2: Array
 
 
-def drivers_for(agents: Sequence[Agent]) -> Driver:
+def idm_parameters(agents: Sequence[Agent]) -> IdmParameters:
     """Parameters of agents by their kind."""
     rows = [ON_WHEELS if a.category in WHEELED else ON_FOOT for a in agents]
-    return Driver(*np.array(rows, dtype=np.float64).reshape(-1, 5).T)
+    return IdmParameters(*np.array(rows, dtype=np.float64).reshape(-1, 5).T)
 
 
-def demand(driver: Driver, gap_m: Array, pace_mps: Array, leader_mps: Array) -> Array:
+def leader_demand(driver: IdmParameters, gap_m: Array, pace_mps: Array, leader_mps: Array) -> Array:
     """How much a leader takes of the free acceleration: (s* / s)^2 of the model; 1 is the gap that is kept at low speed.
 
     Notes
@@ -55,7 +55,9 @@ def demand(driver: Driver, gap_m: Array, pace_mps: Array, leader_mps: Array) -> 
     return (desired / np.maximum(gap_m, MIN_GAP_M)) ** 2
 
 
-def respond(driver: Driver, rate: Array, taken: Array, pace_mps: Array, log_accel_mps2: Array) -> tuple[Array, Array]:
+def rate_response(
+    driver: IdmParameters, rate: Array, taken: Array, pace_mps: Array, log_accel_mps2: Array
+) -> tuple[Array, Array]:
     """Rate and its slope in 1/s, all (A,), of agents whose log goes at `pace_mps` here, with `taken` of all leaders.
 
     Notes

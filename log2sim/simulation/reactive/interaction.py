@@ -8,47 +8,52 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.simulation.reactive.idm import Driver, demand
-from log2sim.simulation.reactive.path_table import EXTENSION_M, Pose, Ways
-from log2sim.simulation.reactive.prediction import Course, of_driven, on_schedule, on_way
-from log2sim.simulation.reactive.swept_corridor import HORIZON_S, Boxes, Corridor, Room, leaders
+from log2sim.simulation.reactive.idm import IdmParameters, leader_demand
+from log2sim.simulation.reactive.path_table import EXTENSION_M, PathTable, Pose
+from log2sim.simulation.reactive.prediction import (
+    Prediction,
+    predict_along_path,
+    predict_by_log,
+    predict_policy_vehicle,
+)
+from log2sim.simulation.reactive.swept_corridor import HORIZON_S, PredictedBoxes, SafetyMargins, SweptCorridor, leaders
 
-LOOK_M = 10.0  # at standstill
+MIN_LOOKAHEAD_M = 10.0  # at standstill
 
-NOW = Room(side_m=0.2, crossing_m=1.0, crossing_s=0.5, behind_m=0.0)
-LOGGED = Room(side_m=0.5, crossing_m=2.5, crossing_s=0.8, behind_m=1.0)
+MARGINS_NOW = SafetyMargins(side_m=0.2, crossing_m=1.0, crossing_s=0.5, behind_m=0.0)
+MARGINS_IN_LOG = SafetyMargins(side_m=0.5, crossing_m=2.5, crossing_s=0.8, behind_m=1.0)
 GAP_M, SPEED_MPS = 0.5, 0.5
 """A situation may be worse than the log's by these, and by the difference of the rooms, and still is the log's."""
 
-NOTICED = 1e-3  # of the free acceleration
-BEND_M = 1.0  # by which ways may leave the hull of a few of their points
+MIN_DEMAND = 1e-3  # of the free acceleration
+PATH_HULL_MARGIN_M = 1.0  # by which ways may leave the hull of a few of their points
 
 Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class TrafficState:
     """All agents (A,) at one time: `t_s` on each one's own log, `rate` at which it goes through that, where it is, its size.
 
     `driven` is the agent that a policy drives, -1 if none is; `reacts` marks those that decide. `course` (A, H) is where all
     are expected to go.
     """
 
-    ways: Ways
-    driver: Driver
+    ways: PathTable
+    driver: IdmParameters
     size_m: Array
     reacts: NDArray[np.bool_]
     driven: int
     t_s: Array
     rate: Array
     pose: Pose
-    course: Course
+    course: Prediction
 
     def reach_m(self, i: Index) -> Array:
         """How far agents (P,) look ahead: to where they could stop in comfort, and a bit."""
         pace, d = np.abs(self.pose.speed_mps[i]), self.driver.take(i)
         stop_m = pace * (d.time_gap_s + HORIZON_S[-1]) + pace**2 / (2 * d.comfort_mps2)
-        return np.minimum(LOOK_M + stop_m + self.size_m[i, 0], EXTENSION_M)
+        return np.minimum(MIN_LOOKAHEAD_M + stop_m + self.size_m[i, 0], EXTENSION_M)
 
     def meeting(self, i: Index, j: Index) -> tuple[Index, Index]:
         """Those of the pairs (P,), (P,) that may come near each other within the horizon."""
@@ -61,7 +66,7 @@ class Moment:
         # In a circle there are many whom four boxes about the way ahead leave out: above all those in other lanes.
         x, y = (np.ascontiguousarray(c[:, ::4].T) for c in self.course[:2])
         swept = self._hull(i, x[:, j], y[:, j])
-        room = radius[j] + self.size_m[i, 1] / 2 + LOGGED.side_m + BEND_M
+        room = radius[j] + self.size_m[i, 1] / 2 + MARGINS_IN_LOG.side_m + PATH_HULL_MARGIN_M
         own = np.flatnonzero(self.reacts)
         ahead = np.linspace(0.0, 1.0, 13)[:, None] * self.reach_m(own)
         x, y, *_ = self.ways.along(own[None], self.pose.distance_m[own] + ahead)
@@ -91,7 +96,7 @@ class Moment:
         return (ahead.min(axis=0), ahead.max(axis=0)), (left.min(axis=0), left.max(axis=0))
 
 
-def excess(m: Moment, i: Index, j: Index, trusted: NDArray[np.bool_]) -> Array:
+def excess_demand(m: TrafficState, i: Index, j: Index, trusted: NDArray[np.bool_]) -> Array:
     """What agents j (P,) take of the free acceleration of agents i (P,) beyond the log; all of it where not `trusted` (P,)."""
     driver, logged_pace = m.driver.take(i), np.abs(m.pose.speed_mps[i])
     pace = m.rate[i] * logged_pace
@@ -99,60 +104,60 @@ def excess(m: Moment, i: Index, j: Index, trusted: NDArray[np.bool_]) -> Array:
     starting = pace[:, None] * HORIZON_S + driver.accel_mps2[:, None] * HORIZON_S**2 / 2
     means = np.where(m.rate[i][:, None] < 1, np.minimum(logged, starting), logged)
     x, y, yaw, speed = (c[j] for c in m.course)
-    found = leaders(m.ways, _corridor(m, i, pace, means), _boxes(m, j, (x, y, yaw, speed)), NOW)
+    found = leaders(m.ways, _corridor(m, i, pace, means), _boxes(m, j, (x, y, yaw, speed)), MARGINS_NOW)
     # Who was first in the log where two reactive ones meet goes first; what is in the way already is waited for.
     first = m.reacts[i] & m.reacts[j] & (found.ahead_s > 0)
     first &= found.own_t_s < m.t_s[j] + m.rate[j] * found.ahead_s
     gap = np.where(first & trusted, np.inf, found.gap_m)
-    taken = demand(driver, gap, pace, found.speed_mps)
+    taken = leader_demand(driver, gap, pace, found.speed_mps)
     t_s = m.t_s[i]
-    k = np.flatnonzero((taken > NOTICED) & trusted & (m.ways.begin_s[j] <= t_s) & (t_s <= m.ways.end_s[j]))
+    k = np.flatnonzero((taken > MIN_DEMAND) & trusted & (m.ways.begin_s[j] <= t_s) & (t_s <= m.ways.end_s[j]))
     if len(k):
-        taken[k] -= _in_log(m, i[k], j[k], gap[k], _corridor(m, i[k], logged_pace[k], logged[k]))
+        taken[k] -= _demand_in_log(m, i[k], j[k], gap[k], _corridor(m, i[k], logged_pace[k], logged[k]))
     return np.maximum(taken, 0.0)
 
 
-def _in_log(m: Moment, i: Index, j: Index, gap_m: Array, corridor: Corridor) -> Array:
+def _demand_in_log(m: TrafficState, i: Index, j: Index, gap_m: Array, corridor: SweptCorridor) -> Array:
     """What agents j (P,) took in the log when agents i (P,) were at this place, as far as it is now as it was then.
 
     The nearer the other is than it was, the less counts; at half the gap nothing does.
     """
-    found = leaders(m.ways, corridor, _boxes(m, j, _logged(m, j, m.t_s[i])), LOGGED)
+    found = leaders(m.ways, corridor, _boxes(m, j, _predict_in_log(m, j, m.t_s[i])), MARGINS_IN_LOG)
     gap = found.gap_m - GAP_M
-    taken = demand(m.driver.take(i), gap, corridor.pace_mps, found.speed_mps - SPEED_MPS)
+    taken = leader_demand(m.driver.take(i), gap, corridor.pace_mps, found.speed_mps - SPEED_MPS)
     known = np.isfinite(gap)
     scale = np.maximum(np.where(known, gap, 0.0) / 2, 1.0)
     lost = np.where(known, np.maximum(np.where(known, gap, 0.0) - gap_m, 0.0) / scale, 1.0)
     return np.maximum(1 - lost, 0.0) * taken
 
 
-def _corridor(m: Moment, i: Index, pace: Array, progress: Array) -> Corridor:
+def _corridor(m: TrafficState, i: Index, pace: Array, progress: Array) -> SweptCorridor:
     reach = float(m.reach_m(i).max())
-    return Corridor(i, m.pose.distance_m[i], m.size_m[i, 0], m.size_m[i, 1], pace, progress, reach)
+    return SweptCorridor(i, m.pose.distance_m[i], m.size_m[i, 0], m.size_m[i, 1], pace, progress, reach)
 
 
-def _boxes(m: Moment, j: Index, course: Course) -> Boxes:
-    return Boxes(*course, m.size_m[j, 0], m.size_m[j, 1])
+def _boxes(m: TrafficState, j: Index, course: Prediction) -> PredictedBoxes:
+    return PredictedBoxes(*course, m.size_m[j, 0], m.size_m[j, 1])
 
 
-def expected(ways: Ways, pose: Pose, t_s: Array, rate: Array, driven: int) -> Course:
+def predict_all(ways: PathTable, pose: Pose, t_s: Array, rate: Array, driven: int) -> Prediction:
     """Where all agents (A,) go from where they are; the driven one as if it kept to its way."""
-    course = on_schedule(ways, np.arange(len(t_s)), t_s, rate)
+    course = predict_by_log(ways, np.arange(len(t_s)), t_s, rate)
     if driven < 0:
         return course
     x, y, yaw, speed = (float(c[driven]) for c in (pose.x_m, pose.y_m, pose.yaw_rad, pose.speed_mps))
-    return _choose(np.arange(len(t_s)) == driven, of_driven(ways, driven, x, y, yaw, speed), course)
+    return _select(np.arange(len(t_s)) == driven, predict_policy_vehicle(ways, driven, x, y, yaw, speed), course)
 
 
-def _logged(m: Moment, j: Index, t_s: Array) -> Course:
+def _predict_in_log(m: TrafficState, j: Index, t_s: Array) -> Prediction:
     """Where agents (P,) were expected to go in the log at times (P,), by the same rules."""
-    course = on_schedule(m.ways, j, t_s, np.ones(len(j)))
+    course = predict_by_log(m.ways, j, t_s, np.ones(len(j)))
     if not np.any(j == m.driven):
         return course
     pose = m.ways.at(j, t_s)
-    return _choose(j == m.driven, on_way(m.ways, m.driven, pose.distance_m, np.abs(pose.speed_mps)), course)
+    return _select(j == m.driven, predict_along_path(m.ways, m.driven, pose.distance_m, np.abs(pose.speed_mps)), course)
 
 
-def _choose(mask: NDArray[np.bool_], one: Course, other: Course) -> Course:
+def _select(mask: NDArray[np.bool_], one: Prediction, other: Prediction) -> Prediction:
     x, y, yaw, speed = (np.where(mask[:, None], a, b) for a, b in zip(one, other))
     return x, y, yaw, speed

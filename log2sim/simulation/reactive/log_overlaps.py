@@ -6,16 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.simulation.metrics.box_tracks import Boxes
+from log2sim.simulation.metrics.box_tracks import BoxTracks
 from log2sim.simulation.metrics.collisions import contacts
-from log2sim.simulation.reactive.path_table import TIME_STEP_S, Ways
+from log2sim.simulation.reactive.path_table import TIME_STEP_S, PathTable
 
-DEEP_M = 0.5  # more than boxes err by
+DEEP_OVERLAP_M = 0.5  # more than boxes err by
 CHUNK = 200
 
 
-def deep_overlaps(ways: Ways, size_m: Array, static: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pairs (A, A) whose logged boxes come to overlap by more than `DEEP_M` although they did not from the start.
+def deep_overlaps(ways: PathTable, size_m: Array, static: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pairs (A, A) whose logged boxes come to overlap by more than `DEEP_OVERLAP_M` although they did not from the start.
 
     Those that overlap from the start are one object seen twice, or a load and its carrier: nothing to brake for.
     """
@@ -28,13 +28,13 @@ def deep_overlaps(ways: Ways, size_m: Array, static: NDArray[np.bool_]) -> NDArr
     begin_s = np.where(stays, -np.inf, ways.begin_s)
     end_s = np.where(stays, np.inf, ways.end_s)
     t_s = np.arange(ways.begin_s[moving].min(), ways.end_s[moving].max() + TIME_STEP_S, TIME_STEP_S)
-    size = np.maximum(size_m - [DEEP_M, DEEP_M, 0.0], 0.1)
+    size = np.maximum(size_m - [DEEP_OVERLAP_M, DEEP_OVERLAP_M, 0.0], 0.1)
     everybody = np.arange(count)
     for part in np.split(t_s, range(CHUNK, len(t_s), CHUNK)):
         pose = ways.at(everybody, part[:, None])
         there = (begin_s <= part[:, None]) & (part[:, None] <= end_s)
         x, y, z, yaw, speed = (np.where(there, c, np.nan) for c in pose[:5])
-        found = contacts(Boxes(x, y, z, yaw, speed, size), moving)
+        found = contacts(BoxTracks(x, y, z, yaw, speed, size), moving)
         a, b = found.a, found.b
         deep[a, b] = True
         at_once = part[found.first_row.astype(np.intp)] <= np.maximum(begin_s[a], begin_s[b]) + TIME_STEP_S

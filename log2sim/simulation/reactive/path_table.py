@@ -17,11 +17,11 @@ SPACING_M = 1.0
 EXTENSION_M = 120.0
 """How far a way goes straight on beyond the end of the log: as far as a driver looks ahead."""
 
-BACK_M, ON_M = 5.0, 20.0
+SEARCH_BACK_M, SEARCH_AHEAD_M = 5.0, 20.0
 """How far from its last place an agent is looked for on its way: so it stays on its branch where ways cross."""
 
 STANDING_MPS = 0.15  # what moves slower stands, and its jitter is no way
-COARSE = 4  # rows between those that a search looks at first
+COARSE_STRIDE = 4  # rows between those that a search looks at first
 
 
 class Pose(NamedTuple):
@@ -36,7 +36,7 @@ class Pose(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Foot:
+class PathProjection:
     """Points seen from the places of a way that are nearest to them: ahead of and left of that place, in m.
 
     `cos`, `sin` is the direction of travel there, `distance_m` the way up to it, `t_s` the log's time there (NaN beyond).
@@ -50,17 +50,17 @@ class Foot:
     t_s: Array
 
 
-class Ways:
+class PathTable:
     """Ways of A agents. Positions are relative to `origin_m`, which keeps digits far from the map's origin."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self.origin_m = paths[0].origin_m if paths else (0.0, 0.0)
         self.begin_s = np.array([p.t_s[0] for p in paths], dtype=np.float64)
         self.end_s = np.array([p.t_s[-1] for p in paths], dtype=np.float64)
-        tables = [_by_time(p, self.origin_m) for p in paths]
-        marks = [_by_distance(t) for t in tables]
-        self._row0, self._rows = _offsets(tables)
-        self._mark0, self.marks = _offsets(marks)
+        tables = [_time_table(p, self.origin_m) for p in paths]
+        marks = [_distance_table(t) for t in tables]
+        self._row0, self._rows = _row_ranges(tables)
+        self._mark0, self.marks = _row_ranges(marks)
         self._poses = np.concatenate([t[:, 1:] for t in tables]) if tables else np.zeros((0, 6))
         self._marks = np.concatenate(marks) if marks else np.zeros((0, 5))
 
@@ -84,10 +84,10 @@ class Ways:
         x, y, cos, sin, t_s = np.moveaxis(low + (place - k)[..., None] * (high - low), -1, 0)
         return x, y, cos, sin, t_s
 
-    def foot(self, agent: NDArray[np.intp], from_m: Array, reach_m: float, x_m: Array, y_m: Array) -> Foot:
+    def foot(self, agent: NDArray[np.intp], from_m: Array, reach_m: float, x_m: Array, y_m: Array) -> PathProjection:
         """The places within `reach_m` from `from_m` (P,) on the ways of agents (P,) that are nearest to points (P, H)."""
         first = np.clip((from_m / SPACING_M).astype(np.intp), 0, self.marks[agent] - 1)
-        ahead = np.arange(0, int(reach_m / SPACING_M) + COARSE, COARSE)
+        ahead = np.arange(0, int(reach_m / SPACING_M) + COARSE_STRIDE, COARSE_STRIDE)
         k = np.minimum(first[:, None] + ahead, self.marks[agent][:, None] - 1)
         near = self._marks[self._mark0[agent][:, None] + k, :2]
         # |a - b|^2 less |a|^2, which is the same for all b.
@@ -98,20 +98,20 @@ class Ways:
             x, y, cos, sin, t_s = np.moveaxis(self._marks[begin + k], -1, 0)
             dx, dy = x_m - x, y_m - y
             forward = dx * cos + dy * sin
-            moved = k + np.clip(np.rint(forward / SPACING_M), -COARSE, COARSE).astype(np.intp)
+            moved = k + np.clip(np.rint(forward / SPACING_M), -COARSE_STRIDE, COARSE_STRIDE).astype(np.intp)
             moved = np.clip(moved, first[:, None], self.marks[agent][:, None] - 1)
             if np.array_equal(moved, k):
                 break
             k = moved
         x, y, cos, sin, t_s = np.moveaxis(self._marks[begin + k], -1, 0)
         dx, dy = x_m - x, y_m - y
-        return Foot(dx * cos + dy * sin, dy * cos - dx * sin, cos, sin, k * SPACING_M, t_s)
+        return PathProjection(dx * cos + dy * sin, dy * cos - dx * sin, cos, sin, k * SPACING_M, t_s)
 
     def beside(self, agent: int, from_m: float, x_m: float, y_m: float) -> float:
         """How far along its way an agent is that is at a place of the map and was at `from_m` before; at least 0."""
-        begin_m = max(from_m - BACK_M, 0.0)
+        begin_m = max(from_m - SEARCH_BACK_M, 0.0)
         x, y = (np.array([[c - o]]) for c, o in zip((x_m, y_m), self.origin_m))
-        foot = self.foot(np.array([agent]), np.array([begin_m]), from_m - begin_m + ON_M, x, y)
+        foot = self.foot(np.array([agent]), np.array([begin_m]), from_m - begin_m + SEARCH_AHEAD_M, x, y)
         return max(float(foot.distance_m[0, 0] + foot.ahead_m[0, 0]), 0.0)
 
     def times(self, agent: NDArray[np.intp], distance_m: Array) -> Array:
@@ -120,26 +120,26 @@ class Ways:
         return np.where(np.isnan(t_s), self.end_s[agent], t_s)
 
 
-def times_beside(path: Path, x_m: Array, y_m: Array) -> Array:
+def log_times_of_positions(path: Path, x_m: Array, y_m: Array) -> Array:
     """When the log was beside the places (S,) of an agent that drives as it likes, one after the other along its path."""
-    way, gone_m = Ways([path]), np.zeros(len(x_m))
+    way, gone_m = PathTable([path]), np.zeros(len(x_m))
     for k, (x, y) in enumerate(zip(x_m.tolist(), y_m.tolist())):
         gone_m[k] = way.beside(0, gone_m[k - 1] if k else 0.0, x, y)
     return way.times(np.zeros(1, dtype=np.intp), gone_m)
 
 
-def times_at(path: Path, t_s: Array, x_m: Array, y_m: Array) -> Array:
+def log_times_of_distance(path: Path, t_s: Array, x_m: Array, y_m: Array) -> Array:
     """When the log was where an agent that goes along its path is (S,): the time of the same distance gone.
 
     An agent that keeps its way yet not its times has its height and its errors from there.
     """
-    table = _by_time(path, path.origin_m)
+    table = _time_table(path, path.origin_m)
     gone = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x_m), np.diff(y_m)))])
     start = float(np.interp(t_s[0], table[:, 0], table[:, 6]))
     return np.maximum(np.minimum(np.interp(start + gone, table[:, 6], table[:, 0]), t_s), path.t_s[0])
 
 
-def _by_time(path: Path, origin_m: tuple[float, float]) -> Array:
+def _time_table(path: Path, origin_m: tuple[float, float]) -> Array:
     """Rows (K, 7) evenly spaced over a life: time, then the columns of a `Pose`."""
     begin, end = path.t_s[0], path.t_s[-1]
     count = int(np.ceil((end - begin) / TIME_STEP_S)) + 1 if end > begin else 1
@@ -153,7 +153,7 @@ def _by_time(path: Path, origin_m: tuple[float, float]) -> Array:
     return np.stack([t_s, x + dx, y + dy, path.heights(t_s), yaw, speed, distance], axis=1)
 
 
-def _by_distance(table: Array) -> Array:
+def _distance_table(table: Array) -> Array:
     """Rows (K, 5) every `SPACING_M` of a way: x, y, direction of travel as cos, sin, and time."""
     t_s, x, y, _, yaw, speed, distance = table.T
     whole = np.arange(int(distance[-1] / SPACING_M) + 1) * SPACING_M
@@ -183,7 +183,7 @@ def _by_distance(table: Array) -> Array:
     return np.concatenate([np.stack([x, y, cos, sin, t], axis=1), beyond])
 
 
-def _offsets(tables: Sequence[Array]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _row_ranges(tables: Sequence[Array]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """First row and number of rows of each table once they are joined."""
     count = np.array([len(t) for t in tables], dtype=np.intp)
     return np.cumsum(count) - count, count

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.simulation.reactive.path_table import Ways
+from log2sim.simulation.reactive.path_table import PathTable
 
 HORIZON_S = np.arange(0.0, 3.01, 0.25)
 """Times (H,) ahead at which others are expected somewhere: a car that crosses at 20 m/s moves by its length in between."""
 
 
-class Boxes(NamedTuple):
+class PredictedBoxes(NamedTuple):
     """Boxes that pairs of agents look at, at the times of the horizon: centers, yaw, speed (P, H), length and width (P,)."""
 
     x_m: Array
@@ -25,7 +25,7 @@ class Boxes(NamedTuple):
     width_m: Array
 
 
-class Corridor(NamedTuple):
+class SweptCorridor(NamedTuple):
     """What agents (P,) are about to sweep: whose way, how far they are on it, their size, how fast they go.
 
     `progress_m` (P, H) is how far they mean to go from here until the times of the horizon, `reach_m` how far they look.
@@ -40,7 +40,7 @@ class Corridor(NamedTuple):
     reach_m: float
 
 
-class Room(NamedTuple):
+class SafetyMargins(NamedTuple):
     """What is kept clear: on both sides, before what crosses as a way and as a time; `behind_m` widens what is ahead."""
 
     side_m: float
@@ -61,7 +61,7 @@ class Leaders(NamedTuple):
     own_t_s: Array
 
 
-def leaders(ways: Ways, corridor: Corridor, boxes: Boxes, room: Room) -> Leaders:
+def leaders(ways: PathTable, corridor: SweptCorridor, boxes: PredictedBoxes, room: SafetyMargins) -> Leaders:
     """For each pair, what the agent has to keep clear of in the other's box, now or within the horizon.
 
     Notes

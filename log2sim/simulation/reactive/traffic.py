@@ -15,18 +15,18 @@ from log2sim.datatypes import Agent
 from log2sim.geometry import Array
 from log2sim.simulation.groups import Snapshot
 from log2sim.simulation.path import Path
-from log2sim.simulation.reactive.idm import drivers_for, respond
-from log2sim.simulation.reactive.interaction import NOTICED, Moment, excess, expected
+from log2sim.simulation.reactive.idm import idm_parameters, rate_response
+from log2sim.simulation.reactive.interaction import MIN_DEMAND, TrafficState, excess_demand, predict_all
 from log2sim.simulation.reactive.log_overlaps import deep_overlaps
-from log2sim.simulation.reactive.path_table import Pose, Ways
+from log2sim.simulation.reactive.path_table import PathTable, Pose
 
-DECIDE_S = 0.1
+DECISION_STEP_S = 0.1
 STANDING_MPS = 0.05  # where the log is slower, its time goes on: waiting for somebody counts as the log's own stop
 CHUNK = 4096  # pairs looked at together
-RELEASE_S, MOST_KEPT = 0.5, 4.0
+RELEASE_S, MAX_KEPT_DEMAND = 0.5, 4.0
 """A demand that is gone fades over this time, so that one at the edge of a conflict does not make an agent hunt."""
 
-SAME_S = 1e-9  # delays that differ by rounding are the same
+SAME_DELAY_S = 1e-9  # delays that differ by rounding are the same
 
 
 class Traffic:
@@ -58,9 +58,9 @@ class Traffic:
         driven: str | None,
     ) -> None:
         self.index = {a.id: k for k, a in enumerate(agents)}
-        self.ways = Ways(paths)
+        self.ways = PathTable(paths)
         self.reacts = np.array([a.id in reactive for a in agents], dtype=bool)
-        self.driver = drivers_for(agents)
+        self.driver = idm_parameters(agents)
         self._static = np.array([a.static for a in agents], dtype=bool)
         self._stays = np.array([a.is_permanent for a in agents], dtype=bool)
         self._driven = self.index[driven] if driven is not None else -1
@@ -81,7 +81,7 @@ class Traffic:
         """
         tau = t_s - self.delay_s
         going = self.reacts & (self.ways.begin_s <= tau) & (tau < self.ways.end_s)
-        if t_s > self._decided_s + DECIDE_S - SAME_S:
+        if t_s > self._decided_s + DECISION_STEP_S - SAME_DELAY_S:
             self._decided_s = t_s
             self._decide(t_s, tau, np.flatnonzero(going), ego)
         rate = np.where(going, np.clip(self.rate + self.rate_slope * dt_s, 0.0, 1.0), 1.0)
@@ -92,19 +92,21 @@ class Traffic:
         """Set the rates of agents `own` (R,) and their slopes."""
         pose = self.ways.at(np.arange(len(tau)), tau)
         pace = np.abs(pose.speed_mps[own])
-        log_accel = (np.abs(self.ways.at(own, tau[own] + DECIDE_S).speed_mps) - pace) / DECIDE_S
+        log_accel = (np.abs(self.ways.at(own, tau[own] + DECISION_STEP_S).speed_mps) - pace) / DECISION_STEP_S
         pose = self._with_ego(pose, ego)
-        course = expected(self.ways, pose, tau, self.rate, self._driven)
-        moment = Moment(self.ways, self.driver, self._size, self.reacts, self._driven, tau, self.rate, pose, course)
+        course = predict_all(self.ways, pose, tau, self.rate, self._driven)
+        moment = TrafficState(
+            self.ways, self.driver, self._size, self.reacts, self._driven, tau, self.rate, pose, course
+        )
         taken = np.zeros(len(tau))
         pairs = moment.meeting(*self._pairs(t_s, tau, own))
         for begin in range(0, len(pairs[0]), CHUNK):
             i, j = (p[begin : begin + CHUNK] for p in pairs)
-            np.maximum.at(taken, i, excess(moment, i, j, ~self._distrusted[i, j]))
-        kept = np.minimum(self._taken, MOST_KEPT) * np.exp(-DECIDE_S / RELEASE_S)
-        taken = np.maximum(taken, np.where(kept > NOTICED, kept, 0.0))
+            np.maximum.at(taken, i, excess_demand(moment, i, j, ~self._distrusted[i, j]))
+        kept = np.minimum(self._taken, MAX_KEPT_DEMAND) * np.exp(-DECISION_STEP_S / RELEASE_S)
+        taken = np.maximum(taken, np.where(kept > MIN_DEMAND, kept, 0.0))
         self._taken = taken
-        rate, slope = respond(self.driver.take(own), self.rate[own], taken[own], pace, log_accel)
+        rate, slope = rate_response(self.driver.take(own), self.rate[own], taken[own], pace, log_accel)
         stands = pace < STANDING_MPS
         self.rate[own], self.rate_slope[own] = np.where(stands, 1.0, rate), np.where(stands, 0.0, slope)
 
@@ -125,7 +127,7 @@ class Traffic:
 
     def _pairs(self, t_s: float, tau: Array, own: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Reactive agents (P,) and those (P,) present that are not to them as the log has it."""
-        differs = (np.abs(self.delay_s[own][:, None] - self.delay_s) > SAME_S) & ~self._static
+        differs = (np.abs(self.delay_s[own][:, None] - self.delay_s) > SAME_DELAY_S) & ~self._static
         if self._driven >= 0:
             differs[:, self._driven] = True
         differs |= self._distrusted[own]

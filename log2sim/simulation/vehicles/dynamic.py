@@ -11,7 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array, cos_sin
-from log2sim.simulation.vehicles.single_track import AGAIN, GAMMA, Chassis, Pair, Slips, grips, inner_steps
+from log2sim.simulation.vehicles.single_track import (
+    GAMMA,
+    STAGE_WEIGHT,
+    Chassis,
+    LinearPair,
+    Slips,
+    axle_grips,
+    inner_steps,
+)
 from log2sim.simulation.vehicles.vehicle import (
     GRAVITY_MPS2,
     VehicleControls,
@@ -19,9 +27,9 @@ from log2sim.simulation.vehicles.vehicle import (
     VehicleState,
     actuate,
     actuation,
-    advance,
+    advance_speed,
     clamp,
-    engaged,
+    engaged_gear,
     sinc,
 )
 
@@ -47,21 +55,21 @@ def step_dynamic(
     count, h = inner_steps(dt_s)
     actuators, target, lag_s, max_rate = actuation(state, controls, p)
     grip = ANTILOCK_SHARE * GRAVITY_MPS2 * p.friction
-    body = Body(state.x_m, state.y_m, state.yaw_rad, state.speed_mps, state.lateral_mps, state.yaw_rate_radps)
+    body = BodyState(state.x_m, state.y_m, state.yaw_rad, state.speed_mps, state.lateral_mps, state.yaw_rate_radps)
     bend = np.tan(state.steer_rad)
     for _ in range(count):
         bend0 = bend
         actuators, (mean_pedal, mean_steer) = actuate(actuators, target, lag_s, max_rate, h)
         bend = np.tan(actuators[1])
-        gear = engaged(body.speed_mps, controls.reverse)
-        drive = Drive(clamp(mean_pedal, -grip, grip), gear, bend0, np.tan(mean_steer), bend)
-        body = slide(body, drive, p, chassis, h)
+        gear = engaged_gear(body.speed_mps, controls.reverse)
+        drive = DriveInput(clamp(mean_pedal, -grip, grip), gear, bend0, np.tan(mean_steer), bend)
+        body = step_body(body, drive, p, chassis, h)
     b, (pedal, steer) = body, actuators
     return VehicleState(b.x_m, b.y_m, b.yaw_rad, b.speed_mps, steer, pedal, b.lateral_mps, b.yaw_rate_radps)
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class DriveInput:
     """What one step of the saturating model is given: the pedal, the gear, and tangents of the steering angle."""
 
     pedal_mps2: Array
@@ -72,7 +80,7 @@ class Drive:
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class BodyState:
     """Rear axle, yaw, its speed along and its velocity to the left of the heading, yaw rate."""
 
     x_m: Array
@@ -83,7 +91,7 @@ class Body:
     yaw_rate_radps: Array
 
 
-def slide(body: Body, drive: Drive, p: VehicleParameters, c: Chassis, h: float) -> Body:
+def step_body(body: BodyState, drive: DriveInput, p: VehicleParameters, c: Chassis, h: float) -> BodyState:
     """One step of the saturating model.
 
     Notes
@@ -97,25 +105,28 @@ def slide(body: Body, drive: Drive, p: VehicleParameters, c: Chassis, h: float) 
     start = Slips(rear, front)
 
     # To the middle of the step.
-    speed1, _, accel = _push(speed, _gain(start, body.yaw_rate_radps, 0.0, d, p, h), d, h)
+    speed1, _, accel = _longitudinal_step(speed, _slip_speed_gain(start, body.yaw_rate_radps, 0.0, d, p, h), d, h)
     mean_speed = (speed + speed1) / 2
-    begin, end, swing = _pulls(speed, speed1, d, p, h)
-    system = _relaxation(mean_speed, accel, start, d, p, c, h / 2)
+    begin, end, swing = _rolling_slip_growth(speed, speed1, d, p, h)
+    system = _slip_equations(mean_speed, accel, start, d, p, c, h / 2)
     middle = system.solve(rear + (begin + end) / 4, front + (begin + end) / 4 + swing / 2)
 
     # All of it. The speed is needed for the slips and follows from them, so it is predicted and then corrected.
     rate = (mean_speed * d.mean_bend + middle.front - middle.rear) / p.wheelbase_m
-    speed1, _, accel = _push(speed, _gain(middle, rate, 2 * (middle.rear - rear), d, p, h), d, h)
-    begin, end, swing = _pulls(speed, speed1, d, p, h)
-    system = _relaxation((speed + speed1) / 2, accel, middle, d, p, c, GAMMA * h)
+    speed1, _, accel = _longitudinal_step(
+        speed, _slip_speed_gain(middle, rate, 2 * (middle.rear - rear), d, p, h), d, h
+    )
+    begin, end, swing = _rolling_slip_growth(speed, speed1, d, p, h)
+    system = _slip_equations((speed + speed1) / 2, accel, middle, d, p, c, GAMMA * h)
     pull = GAMMA * (begin + GAMMA * (end - begin))
     first = system.solve(rear + pull, front + pull + GAMMA * swing)
     pull = GAMMA * end
     last = system.solve(
-        rear + AGAIN * (first.rear - rear) + pull, front + AGAIN * (first.front - front) + pull + GAMMA * swing
+        rear + STAGE_WEIGHT * (first.rear - rear) + pull,
+        front + STAGE_WEIGHT * (first.front - front) + pull + GAMMA * swing,
     )
     rate1 = (speed1 * d.bend1 + last.front - last.rear) / p.wheelbase_m
-    speed1, way, _ = _push(speed, _gain(middle, rate, last.rear - rear, d, p, h), d, h)
+    speed1, way, _ = _longitudinal_step(speed, _slip_speed_gain(middle, rate, last.rear - rear, d, p, h), d, h)
 
     # Along an arc.
     turn = (way * d.mean_bend + h * (front + last.front - rear - last.rear) / 2) / p.wheelbase_m
@@ -123,25 +134,27 @@ def slide(body: Body, drive: Drive, p: VehicleParameters, c: Chassis, h: float) 
     ahead, aside = way * shrink, h * (rear + last.rear) / 2 * shrink
     cos, sin = cos_sin(body.yaw_rad + turn / 2)
     x, y = body.x_m + ahead * cos - aside * sin, body.y_m + ahead * sin + aside * cos
-    return Body(x, y, body.yaw_rad + turn, speed1, last.rear, rate1)
+    return BodyState(x, y, body.yaw_rad + turn, speed1, last.rear, rate1)
 
 
-def _gain(
-    slips: Slips, rate: Array, grown: Array | float, d: Drive, p: VehicleParameters, h: float
+def _slip_speed_gain(
+    slips: Slips, rate: Array, grown: Array | float, d: DriveInput, p: VehicleParameters, h: float
 ) -> NDArray[np.float64]:
     """What slipping adds to the speed within a step, while the lateral velocity of the rear axle grows by `grown`."""
     slip_rate = (slips.front - slips.rear) / p.wheelbase_m
     return h * rate * (slips.rear + p.cg_to_rear_m * slip_rate) - p.cg_to_rear_m * d.mean_bend / p.wheelbase_m * grown
 
 
-def _pulls(speed: Array, speed1: Array, d: Drive, p: VehicleParameters, h: float) -> tuple[Array, Array, Array]:
+def _rolling_slip_growth(
+    speed: Array, speed1: Array, d: DriveInput, p: VehicleParameters, h: float
+) -> tuple[Array, Array, Array]:
     """What rolling asks of the tires, as growth of slip in a step: by its yaw rate at begin and end, and by its change."""
     rolling, rolling1 = speed * d.bend0, speed1 * d.bend1
     each = -h / p.wheelbase_m
     return each * speed * rolling, each * speed1 * rolling1, rolling - rolling1
 
 
-def _push(speed: Array, gain: Array, d: Drive, h: float) -> tuple[Array, Array, Array]:
+def _longitudinal_step(speed: Array, gain: Array, d: DriveInput, h: float) -> tuple[Array, Array, Array]:
     """Speed after a step, the way and the acceleration of the tires; `gain` is what slipping adds to the speed.
 
     Throttle pushes whither the gear says, brakes hold against the motion and end at rest.
@@ -149,13 +162,13 @@ def _push(speed: Array, gain: Array, d: Drive, h: float) -> tuple[Array, Array, 
     push = h * np.maximum(d.pedal_mps2, 0.0) * d.gear
     free = speed + gain + push
     sign = np.sign(free)
-    pace, distance = advance(np.abs(free), np.minimum(d.pedal_mps2, 0.0), h)
+    pace, distance = advance_speed(np.abs(free), np.minimum(d.pedal_mps2, 0.0), h)
     return sign * pace, sign * distance - (gain + push) * (h / 2), (sign * pace - speed - gain) / h
 
 
-def _relaxation(
-    speed: Array, accel: Array, slips: Slips, d: Drive, p: VehicleParameters, c: Chassis, tau: float
-) -> Pair:
+def _slip_equations(
+    speed: Array, accel: Array, slips: Slips, d: DriveInput, p: VehicleParameters, c: Chassis, tau: float
+) -> LinearPair:
     """Equations of an implicit step `tau` for slip velocities (m/s), linear about `slips`.
 
     Secant stiffness is a force over a scale that vanishes at standstill; with the scales as units nothing is divided by
@@ -163,7 +176,7 @@ def _relaxation(
     """
     rear, front = slips.rear, slips.front
     use = accel / (GRAVITY_MPS2 * p.friction)
-    rear_grip, front_grip = grips(accel, p, c)
+    rear_grip, front_grip = axle_grips(accel, p, c)
     ellipse = np.sqrt(np.maximum(1 - use * use, 0.0))
     cos2 = 1 / (1 + d.mean_bend**2)
     rear_scale = np.sqrt(speed**2 + (p.rear_stiffness_1prad * rear) ** 2)
@@ -172,7 +185,7 @@ def _relaxation(
     by_rear = p.rear_stiffness_1prad * rear_grip * ellipse
     by_front = p.front_stiffness_1prad * front_grip * ellipse * cos2 * np.sqrt(cos2)
     rear_turn, front_turn = (speed / p.wheelbase_m * scale for scale in (rear_scale, front_scale))
-    return Pair.of(
+    return LinearPair.of(
         rear_scale + tau * (c.rear * by_rear - rear_turn),
         tau * (c.cross * by_front + front_turn),
         tau * (c.cross * by_rear - rear_turn),

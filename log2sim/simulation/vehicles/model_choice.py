@@ -11,7 +11,7 @@ import numpy as np
 from log2sim.datatypes import Agent
 from log2sim.geometry import Array
 from log2sim.simulation.reference import GRID_S, STANDSTILL_MPS, VEHICLE_COLUMNS, Reference
-from log2sim.simulation.vehicles.single_track import Chassis, grips
+from log2sim.simulation.vehicles.single_track import Chassis, axle_grips
 from log2sim.simulation.vehicles.vehicle import GRAVITY_MPS2, VehicleParameters, VehicleState
 
 YAW, SPEED, ACCEL, CURVATURE = map(VEHICLE_COLUMNS.index, ("yaw", "speed", "accel_ahead", "curvature_ahead"))
@@ -29,39 +29,41 @@ model for planning feasible trajectories for autonomous vehicles?", 2017) take t
 FAST_REVERSE_MPS = 3.0
 """Beyond it tires that slip are steered worse than what rolls: the rear axle leads, and what steers it swings out behind."""
 
-ROUNDS = 4
+LOAD_ITERATIONS = 4
 """Passes in which slips, the drag of slips and the load that this moves settle."""
 
 MAX_FRICTION_USE = 0.95
 """Share of the friction limit beyond which slips are not predicted: they grow without bound."""
 
 
-class Choice(NamedTuple):
+class ModelChoice(NamedTuple):
     """The model of a vehicle, and the reason for it."""
 
     model: str
     reason: str
 
 
-def choose(agent: Agent, reference: Reference, parameters: VehicleParameters, wanted: str, *, free: bool) -> Choice:
+def choose_model(
+    agent: Agent, reference: Reference, parameters: VehicleParameters, wanted: str, *, free: bool
+) -> ModelChoice:
     """The model for a vehicle (`parameters` of shape (1,)) when the user wants `wanted`; `free` vehicles leave their log."""
     if wanted != "auto":
-        return Choice(wanted, "asked for")
+        return ModelChoice(wanted, "asked for")
     if agent.category in TWO_WHEELERS:
-        return Choice("kinematic", "leans into its curves, which slip does not describe")
+        return ModelChoice("kinematic", "leans into its curves, which slip does not describe")
     if free:
-        return Choice("dynamic", "what a policy drives is not known beforehand")
+        return ModelChoice("dynamic", "what a policy drives is not known beforehand")
     speed, curvature = reference.columns[:, SPEED], reference.columns[:, CURVATURE]
     if speed.min() < -FAST_REVERSE_MPS:
-        return Choice(
+        return ModelChoice(
             "kinematic", f"reverses at up to {-speed.min():.1f} m/s, and slips are followed up to {FAST_REVERSE_MPS:g}"
         )
     aside_mps2 = speed**2 * curvature
     # In steady cornering both axles use the same share of their friction, whatever the place of the center of gravity.
-    slip = np.abs(_slip(aside_mps2 / (GRAVITY_MPS2 * parameters.friction), parameters.rear_stiffness_1prad))
+    slip = np.abs(_slip_angle(aside_mps2 / (GRAVITY_MPS2 * parameters.friction), parameters.rear_stiffness_1prad))
     worst = int(np.argmax(slip))
     found = f"{slip[worst]:.3f} rad at {abs(aside_mps2[worst]):.1f} m/s2 sideways, {SLIP_TOLERANCE_RAD:g} are tolerated"
-    return Choice("dynamic" if slip[worst] > SLIP_TOLERANCE_RAD else "kinematic", f"rear tires slip up to {found}")
+    return ModelChoice("dynamic" if slip[worst] > SLIP_TOLERANCE_RAD else "kinematic", f"rear tires slip up to {found}")
 
 
 def understeer(p: VehicleParameters) -> Array:
@@ -81,7 +83,7 @@ def slipping_reference(reference: Reference, p: VehicleParameters, model: str, a
     """
     if len(reference.columns) < 3:
         return replace(reference, slips=True)
-    later_nose, bend, drag = _inverse(reference.columns, p, saturates=model != "single-track")
+    later_nose, bend, drag = _inverse_dynamics(reference.columns, p, saturates=model != "single-track")
     t_s = np.arange(reference.first_row, reference.first_row + len(bend), dtype=np.float64) * GRID_S
     nose = np.interp(t_s, t_s + ahead_s, later_nose)
 
@@ -97,7 +99,7 @@ def slipping_reference(reference: Reference, p: VehicleParameters, model: str, a
     return replace(reference, columns=slipped(reference.columns, t_s), exact=exact, slips=True)
 
 
-def moving_as(state: VehicleState, reference: Callable[[float], Array], t_s: float) -> VehicleState:
+def with_slip_states(state: VehicleState, reference: Callable[[float], Array], t_s: float) -> VehicleState:
     """The state with the lateral velocity and the yaw rate that the reference's rows (C, A) have at a time."""
     before, after = reference(t_s), reference(t_s + GRID_S)  # before its begin a reference goes straight on
     (dx, dy), turn = (after - before)[:2] / GRID_S, (after - before)[YAW]
@@ -105,21 +107,21 @@ def moving_as(state: VehicleState, reference: Callable[[float], Array], t_s: flo
     return replace(state, lateral_mps=np.cos(yaw) * dy - np.sin(yaw) * dx, yaw_rate_radps=turn / GRID_S)
 
 
-def _inverse(columns: Array, p: VehicleParameters, *, saturates: bool) -> tuple[Array, Array, Array]:
+def _inverse_dynamics(columns: Array, p: VehicleParameters, *, saturates: bool) -> tuple[Array, Array, Array]:
     """What slip adds to heading, curvature and acceleration, (K,) each, of the rows of a table, as of the curvature's time."""
     speed, curvature, to_rear, chassis = columns[:, SPEED], columns[:, CURVATURE], p.cg_to_rear_m, Chassis.of(p)
     twist = np.gradient(speed * curvature, GRID_S)
     aside = speed**2 * curvature + to_rear * twist  # acceleration of the center of gravity
     front_force = (p.gyration_m2 * twist + to_rear * aside) / p.wheelbase_m
     drag, bend = np.zeros_like(speed), p.wheelbase_m * curvature
-    for _ in range(ROUNDS if saturates else 1):
+    for _ in range(LOAD_ITERATIONS if saturates else 1):
         accel = columns[:, ACCEL] + drag
-        rear_grip, front_grip = grips(accel, p, chassis)
+        rear_grip, front_grip = axle_grips(accel, p, chassis)
         share = np.clip(accel / (GRAVITY_MPS2 * p.friction), -MAX_FRICTION_USE, MAX_FRICTION_USE)
         ellipse, cos2 = (np.sqrt(1 - share**2), 1 / (1 + bend**2)) if saturates else (1.0, 1.0)
         front_use, rear_use = front_force / (front_grip * ellipse), (aside - front_force) / (rear_grip * ellipse)
-        front = _slip(front_use / np.sqrt(cos2), p.front_stiffness_1prad, saturates=saturates) / cos2
-        rear = _slip(rear_use, p.rear_stiffness_1prad, saturates=saturates)
+        front = _slip_angle(front_use / np.sqrt(cos2), p.front_stiffness_1prad, saturates=saturates) / cos2
+        rear = _slip_angle(rear_use, p.rear_stiffness_1prad, saturates=saturates)
         bend = p.wheelbase_m * curvature + front - rear
         if saturates:
             slip = rear + to_rear / p.wheelbase_m * (front - rear)  # of the center of gravity, beyond that of rolling
@@ -130,7 +132,7 @@ def _inverse(columns: Array, p: VehicleParameters, *, saturates: bool) -> tuple[
     return nose, (bend / p.wheelbase_m + swing) / (1 + understeer(p) * speed**2) - curvature, drag
 
 
-def _slip(use: Array, stiffness_1prad: Array, *, saturates: bool = True) -> Array:
+def _slip_angle(use: Array, stiffness_1prad: Array, *, saturates: bool = True) -> Array:
     """Slip angle at a share of the friction limit, of tires that saturate there or, published, do not."""
     if not saturates:
         return use / stiffness_1prad

@@ -24,7 +24,7 @@ PEDAL_LAG_S = 0.10
 MAX_JERK_MPS3 = 60.0
 
 
-class Build(NamedTuple):
+class VehicleProportions(NamedTuple):
     """How vehicles of a category are built, in shares of length, wheelbase and height, and what they can do."""
 
     wheelbase: float  # of the length
@@ -45,19 +45,19 @@ class Build(NamedTuple):
 # softer, so that they understeer (concept: Bundorf & Leffert, SAE 760713); of trucks about half, as of their tires (Fancher
 # et al., "A Factbook of the Mechanical Properties of the Components for Single-Unit and Articulated Heavy Trucks", 1986).
 # Friction of a dry road: of cars as in the published vehicles below, of truck tires less.
-_CAR = Build(0.61, 0.30, 0.65, 6.0, 10.0, 0.55, 0.38, 12.0, 16.0, 1.0489)
-_CYCLE = Build(0.60, 0.30, 0.80, 3.0, 7.0, 0.45, 0.55, 15.0, 18.0, 0.9)
-_BUILDS: dict[str, Build] = {
+_CAR = VehicleProportions(0.61, 0.30, 0.65, 6.0, 10.0, 0.55, 0.38, 12.0, 16.0, 1.0489)
+_CYCLE = VehicleProportions(0.60, 0.30, 0.80, 3.0, 7.0, 0.45, 0.55, 15.0, 18.0, 0.9)
+_PROPORTIONS: dict[str, VehicleProportions] = {
     "car": _CAR,
-    "truck": Build(0.57, 0.28, 0.75, 4.0, 9.0, 0.50, 0.42, 7.0, 9.0, 0.9),
-    "bus": Build(0.50, 0.22, 0.85, 3.0, 8.0, 0.38, 0.38, 7.0, 9.0, 0.9),
-    "motorcycle": Build(0.66, 0.33, 0.70, 8.0, 10.0, 0.50, 0.40, 15.0, 18.0, 1.0),
+    "truck": VehicleProportions(0.57, 0.28, 0.75, 4.0, 9.0, 0.50, 0.42, 7.0, 9.0, 0.9),
+    "bus": VehicleProportions(0.50, 0.22, 0.85, 3.0, 8.0, 0.38, 0.38, 7.0, 9.0, 0.9),
+    "motorcycle": VehicleProportions(0.66, 0.33, 0.70, 8.0, 10.0, 0.50, 0.40, 15.0, 18.0, 1.0),
     "cyclist": _CYCLE,
     "bicycle": _CYCLE,
 }
 
 
-class Published(NamedTuple):
+class PublishedVehicle(NamedTuple):
     """A vehicle of "CommonRoad: Vehicle Models" (Althoff, Koschi & Manzinger, 2020), appendix A."""
 
     length_m: float
@@ -70,10 +70,14 @@ class Published(NamedTuple):
     max_steer_rad: float
 
 
-PUBLISHED: dict[int, Published] = {
-    1: Published(4.298, 1.674, 0.88392, 1.50876, 0.59436, 1225.8878467253344, 1538.8533713561394, 0.910),
-    2: Published(4.508, 1.610, 1.1561957064, 1.4227170936, 0.61373004, 1093.2952334674046, 1791.5995300122856, 1.066),
-    3: Published(4.569, 1.844, 1.1507916024, 1.3211363976, 0.804490644, 1478.8979637767998, 2473.1176915564442, 1.023),
+PUBLISHED: dict[int, PublishedVehicle] = {
+    1: PublishedVehicle(4.298, 1.674, 0.88392, 1.50876, 0.59436, 1225.8878467253344, 1538.8533713561394, 0.910),
+    2: PublishedVehicle(
+        4.508, 1.610, 1.1561957064, 1.4227170936, 0.61373004, 1093.2952334674046, 1791.5995300122856, 1.066
+    ),
+    3: PublishedVehicle(
+        4.569, 1.844, 1.1507916024, 1.3211363976, 0.804490644, 1478.8979637767998, 2473.1176915564442, 1.023
+    ),
 }
 """1 is a Ford Escort, 2 a BMW 320i, 3 a Volkswagen Vanagon."""
 
@@ -90,7 +94,7 @@ def rear_axle_offset(agent: Agent) -> float:
     """
     if agent.category not in WHEELED:
         return 0.0
-    return agent.rear_axle_offset_m or _BUILDS[agent.category].rear_axle * agent.size_m[0]
+    return agent.rear_axle_offset_m or _PROPORTIONS[agent.category].rear_axle * agent.size_m[0]
 
 
 def parameters_for(agents: Sequence[Agent], *, published: bool = False) -> VehicleParameters:
@@ -101,8 +105,10 @@ def parameters_for(agents: Sequence[Agent], *, published: bool = False) -> Vehic
     Yaw inertia over mass is the product of the distances from the center of gravity to the axles, which holds for the
     published vehicles within 10 %.
     """
-    kind = np.array([_BUILDS[a.category] for a in agents], dtype=np.float64).reshape(-1, len(Build._fields))
-    share = dict(zip(Build._fields, kind.T))
+    kind = np.array([_PROPORTIONS[a.category] for a in agents], dtype=np.float64).reshape(
+        -1, len(VehicleProportions._fields)
+    )
+    share = dict(zip(VehicleProportions._fields, kind.T))
     length_m, _, height_m = np.array([a.size_m for a in agents], dtype=np.float64).reshape(-1, 3).T
     wheelbase_m = share["wheelbase"] * length_m
     cg_to_rear_m = share["cg_to_rear"] * wheelbase_m

@@ -22,9 +22,9 @@ from log2sim.simulation.vehicles.vehicle import (
     VehicleState,
     actuate,
     actuation,
-    advance,
+    advance_speed,
     clamp,
-    engaged,
+    engaged_gear,
     sinc,
 )
 
@@ -34,9 +34,9 @@ MAX_INNER_STEP_S = 0.01
 GAMMA = 1 - math.sqrt(0.5)
 """Of the singly diagonally implicit Runge-Kutta method of two stages that is L-stable and of second order (Alexander, 1977)."""
 
-AGAIN = (1 - GAMMA) / GAMMA
+STAGE_WEIGHT = (1 - GAMMA) / GAMMA
 
-LIFT_SHARE = 0.9
+MAX_LOAD_TRANSFER_SHARE = 0.9
 """Share of an axle's load that drive and brakes may take off it."""
 
 
@@ -66,12 +66,12 @@ def step_single_track(
         speed0, steer0 = speed, steer
         actuators, (mean_pedal, mean_steer) = actuate(actuators, target, lag_s, max_rate, h)
         steer = actuators[1]
-        gear = engaged(speed, controls.reverse)
-        pace, distance = advance(np.abs(speed), mean_pedal, h)
+        gear = engaged_gear(speed, controls.reverse)
+        pace, distance = advance_speed(np.abs(speed), mean_pedal, h)
         speed = gear * pace
-        motion = Motion(speed0, speed, gear * distance, steer0, mean_steer, steer)
+        motion = StepInput(speed0, speed, gear * distance, steer0, mean_steer, steer)
         before, slips = slips, linear_slips(slips, motion, p, chassis, h)
-        chord, angle, turn = linear_course(before, slips, motion, p)
+        chord, angle, turn = linear_displacement(before, slips, motion, p)
         cos, sin = cos_sin(yaw + angle)
         x, y, yaw = x + chord * cos, y + chord * sin, yaw + turn
     cos, sin = cos_sin(yaw)
@@ -97,7 +97,7 @@ class Chassis:
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class StepInput:
     """What one step of the linear model is given: speed and steering angle at its ends, distance, mean steering angle."""
 
     speed0_mps: Array
@@ -116,7 +116,7 @@ class Slips(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class LinearPair:
     """Two linear equations for the slips of an agent, a and b above c and d; solved by Cramer's rule.
 
     What is solved for are the slips in units of their own, which may be zero; the factors are units over determinant.
@@ -142,7 +142,7 @@ class Pair:
         )
 
 
-def linear_slips(slips: Slips, motion: Motion, p: VehicleParameters, c: Chassis, h: float) -> Slips:
+def linear_slips(slips: Slips, motion: StepInput, p: VehicleParameters, c: Chassis, h: float) -> Slips:
     """Slip angles (rad, positive to the left) after a step of the published model.
 
     Notes
@@ -153,13 +153,13 @@ def linear_slips(slips: Slips, motion: Motion, p: VehicleParameters, c: Chassis,
     m, wheelbase = motion, p.wheelbase_m
     speed, accel = (m.speed0_mps + m.speed1_mps) / 2, (m.speed1_mps - m.speed0_mps) / h
     pace, gear = np.abs(speed), np.copysign(1.0, speed)
-    rear_grip, front_grip = grips(accel, p, c)
+    rear_grip, front_grip = axle_grips(accel, p, c)
     by_rear, by_front = rear_grip * p.rear_stiffness_1prad, front_grip * p.front_stiffness_1prad
     # The yaw rate is speed * (front - rear + steer) / wheelbase; it and its growth with the speed move both axles.
     rear_turn = (p.cg_to_rear_m * gear * accel - pace * speed) / wheelbase
     front_turn = -(c.cg_to_front_m * gear * accel + pace * speed) / wheelbase
     tau, turned = GAMMA * h, m.steer1_rad - m.steer0_rad
-    system = Pair.of(
+    system = LinearPair.of(
         pace + tau * (c.rear * by_rear + rear_turn),
         tau * (c.cross * by_front - rear_turn),
         tau * (c.cross * by_rear + front_turn),
@@ -172,10 +172,12 @@ def linear_slips(slips: Slips, motion: Motion, p: VehicleParameters, c: Chassis,
 
     rear, front = slips
     first = stage(rear, front, m.steer0_rad + GAMMA * turned)
-    return stage(rear + AGAIN * (first.rear - rear), front + AGAIN * (first.front - front), m.steer1_rad)
+    return stage(rear + STAGE_WEIGHT * (first.rear - rear), front + STAGE_WEIGHT * (first.front - front), m.steer1_rad)
 
 
-def linear_course(slips0: Slips, slips1: Slips, motion: Motion, p: VehicleParameters) -> tuple[Array, Array, Array]:
+def linear_displacement(
+    slips0: Slips, slips1: Slips, motion: StepInput, p: VehicleParameters
+) -> tuple[Array, Array, Array]:
     """How the center of gravity moves in a step of the published model: chord, its angle to the heading before, turn."""
     (rear, front), (rear1, front1), share = slips0, slips1, p.cg_to_rear_m / p.wheelbase_m
     turn = motion.distance_m * ((front + front1 - rear - rear1) / 2 + motion.mean_steer_rad) / p.wheelbase_m
@@ -185,10 +187,10 @@ def linear_course(slips0: Slips, slips1: Slips, motion: Motion, p: VehicleParame
     return motion.distance_m * sinc(half), before + half, turn
 
 
-def grips(accel: Array, p: VehicleParameters, c: Chassis) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def axle_grips(accel: Array, p: VehicleParameters, c: Chassis) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Force per mass that rear and front axle can bear: friction times load, which moves to the rear with `accel`."""
     lever = p.cg_height_m / GRAVITY_MPS2
-    shift = clamp(lever * accel, -LIFT_SHARE * c.cg_to_front_m, LIFT_SHARE * p.cg_to_rear_m)
+    shift = clamp(lever * accel, -MAX_LOAD_TRANSFER_SHARE * c.cg_to_front_m, MAX_LOAD_TRANSFER_SHARE * p.cg_to_rear_m)
     whole = p.friction * GRAVITY_MPS2 / p.wheelbase_m
     return whole * (c.cg_to_front_m + shift), whole * (p.cg_to_rear_m - shift)
 

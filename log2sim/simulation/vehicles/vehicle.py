@@ -160,9 +160,9 @@ def step_bicycle(
     x, y, yaw, speed = state.x_m, state.y_m, state.yaw_rad, state.speed_mps
     for _ in range(count):
         actuators, (mean_pedal, mean_steer) = actuate(actuators, target, lag_s, max_rate, h)
-        gear = engaged(speed, controls.reverse)
-        pace, distance = advance(np.abs(speed), mean_pedal, h)
-        x, y, yaw = roll(x, y, yaw, gear * distance, np.tan(mean_steer) / parameters.wheelbase_m)
+        gear = engaged_gear(speed, controls.reverse)
+        pace, distance = advance_speed(np.abs(speed), mean_pedal, h)
+        x, y, yaw = along_arc(x, y, yaw, gear * distance, np.tan(mean_steer) / parameters.wheelbase_m)
         speed = gear * pace
     pedal, steer = actuators
     return VehicleState(x, y, yaw, speed, steer, pedal, state.lateral_mps, state.yaw_rate_radps)
@@ -194,7 +194,7 @@ def rows(first: Array | float, second: Array) -> Array:
     return both
 
 
-def roll(x: Array, y: Array, yaw: Array, way: Array, curvature: Array) -> tuple[Array, Array, Array]:
+def along_arc(x: Array, y: Array, yaw: Array, way: Array, curvature: Array) -> tuple[Array, Array, Array]:
     """Position and yaw at the end of an arc of signed length `way`."""
     turn = way * curvature
     chord = way * sinc(turn / 2)
@@ -202,7 +202,7 @@ def roll(x: Array, y: Array, yaw: Array, way: Array, curvature: Array) -> tuple[
     return x + chord * cos, y + chord * sin, yaw + turn
 
 
-def engaged(speed: Array, reverse: NDArray[np.bool_]) -> Array:
+def engaged_gear(speed: Array, reverse: NDArray[np.bool_]) -> Array:
     """Gear: the sign of the motion, at rest that of the lever."""
     return np.sign(speed + TINY * (0.5 - reverse))
 
@@ -230,7 +230,7 @@ def actuate(value: Array, target: Array, lag_s: Array, max_rate: Array, h: float
     return target - near * decay, target - mean_gap
 
 
-def advance(pace: Array, pedal: Array, h: float) -> tuple[Array, Array]:
+def advance_speed(pace: Array, pedal: Array, h: float) -> tuple[Array, Array]:
     """Pace (not negative) after `h` and the distance covered; braking ends at rest, within the step too."""
     after = pace + pedal * h
     distance = (pace + after) * (h / 2)
