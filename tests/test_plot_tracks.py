@@ -12,12 +12,12 @@ from log2sim.datatypes import TYPICAL_SIZE_M, Agent, MapFrame, Scenario, Waypoin
 from log2sim.errors import ConfigError
 from log2sim.simulation.runner import replay
 from log2sim.visualization.plot import shapes
-from log2sim.visualization.plot.animation import Stage
-from log2sim.visualization.plot.layout import Sheet
-from log2sim.visualization.plot.roles import assign
+from log2sim.visualization.plot.animation import AnimatedArtists
+from log2sim.visualization.plot.layout import Layout
+from log2sim.visualization.plot.roles import assign_roles
 from log2sim.visualization.plot.style import PALETTE, printable
 from log2sim.visualization.plot.tracks import plot_tracks, still
-from log2sim.visualization.plot.viewport import View, choose_view, nice_step, time_step_s
+from log2sim.visualization.plot.viewport import Viewport, choose_viewport, nice_step, time_step_s
 
 
 def make_agent(
@@ -127,26 +127,26 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(
         path.write_bytes(b"half")
         raise RuntimeError("disk")
 
-    show = Stage.show
+    show = AnimatedArtists.show
 
-    def fail_later(stage: Stage, t_s: float) -> None:
+    def fail_later(stage: AnimatedArtists, t_s: float) -> None:
         if t_s > 0.55:
             raise RuntimeError("disk")
         show(stage, t_s)
 
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", fail_half_way)
-    monkeypatch.setattr("log2sim.visualization.plot.animation.Stage.show", fail_later)
+    monkeypatch.setattr("log2sim.visualization.plot.animation.AnimatedArtists.show", fail_later)
     with pytest.raises(RuntimeError, match="disk"):
         plot_tracks(crossing(), out, overwrite=True)
     assert out.read_bytes() == b"good"
     assert list(tmp_path.iterdir()) == [out]
 
 
-def draw(scenario: Scenario, **overlays: object) -> Sheet:
-    return still(scenario, assign(scenario), **overlays)  # type: ignore[arg-type]
+def draw(scenario: Scenario, **overlays: object) -> Layout:
+    return still(scenario, assign_roles(scenario), **overlays)  # type: ignore[arg-type]
 
 
-def texts(sheet: Sheet) -> list[str]:
+def texts(sheet: Layout) -> list[str]:
     return [t.get_text() for legend in sheet.figure.legends for t in legend.get_texts()]
 
 
@@ -164,7 +164,7 @@ def test_the_view_holds_every_mover_and_equal_meters_on_both_axes() -> None:
 
 def test_an_outlier_does_not_blow_up_the_view_and_is_reported() -> None:
     scenario = make_scenario(*crossing().agents, make_agent("99", (5000, 0), (5, 0)))
-    assert choose_view(assign(scenario)) == choose_view(assign(crossing()))
+    assert choose_viewport(assign_roles(scenario)) == choose_viewport(assign_roles(crossing()))
     assert "1 outside this view" in texts(draw(scenario))
 
 
@@ -173,8 +173,8 @@ def test_far_map_coordinates_shift_the_view_and_nothing_else() -> None:
         w = agent.waypoints
         return dataclasses.replace(agent, waypoints=dataclasses.replace(w, x_m=w.x_m + 5e5, y_m=w.y_m - 4e6))
 
-    near = choose_view(assign(crossing()))
-    far = choose_view(assign(make_scenario(*(shifted(a) for a in crossing().agents))))
+    near = choose_viewport(assign_roles(crossing()))
+    far = choose_viewport(assign_roles(make_scenario(*(shifted(a) for a in crossing().agents))))
     assert (far.x0, far.x1, far.y0, far.y1) == pytest.approx(
         (near.x0 + 5e5, near.x1 + 5e5, near.y0 - 4e6, near.y1 - 4e6), abs=1e-6
     )
@@ -266,15 +266,15 @@ def test_north_is_named_only_when_the_map_knows_it() -> None:
 
 def test_boxes_have_the_real_size_and_heading() -> None:
     agent = make_agent("1", (3.0, 4.0), (0.0, 2.0))  # drives north: length 4.4 along y, width 1.85 along x
-    corners = shapes.boxes(agent, (3.0, 4.0), np.pi / 2)[0]
+    corners = shapes.footprints(agent, (3.0, 4.0), np.pi / 2)[0]
     expected = [(3 - 0.925, 4 + 2.2), (3 - 0.925, 4 - 2.2), (3 + 0.925, 4 - 2.2), (3 + 0.925, 4 + 2.2)]
     np.testing.assert_allclose(corners, expected, atol=1e-12)
-    assert shapes.noses(corners[None])[0, 2] == pytest.approx((3.0, 6.2))
+    assert shapes.heading_triangles(corners[None])[0, 2] == pytest.approx((3.0, 6.2))
 
 
 def test_arrows_point_the_way_of_travel() -> None:
     xy = np.column_stack([np.linspace(50, 0, 51), np.zeros(51)])
-    heads = shapes.arrows(xy, View(0, 50, -10, 10, m_per_pt=0.1))
+    heads = shapes.arrows(xy, Viewport(0, 50, -10, 10, m_per_pt=0.1))
     assert len(heads) == 5  # 500 pt of way, one each 110 pt
     assert all(head[0, 0] < head[[1, 3], 0].min() for head in heads)
 
@@ -283,15 +283,15 @@ def test_filled_gaps_are_split_from_what_was_seen() -> None:
     agent = make_agent("1", (0.0, 0.0), (1.0, 0.0), count=6)
     observed = np.array([True, True, False, False, True, True])
     agent = dataclasses.replace(agent, waypoints=dataclasses.replace(agent.waypoints, observed=observed))
-    seen, filled = shapes.seen_and_filled(agent)
+    seen, filled = shapes.observed_and_filled(agent)
     assert [part[:, 0].round(6).tolist() for part in seen] == [[0.0, 0.1], [0.4, 0.5]]
     assert [part[:, 0].round(6).tolist() for part in filled] == [[0.1, 0.2, 0.3, 0.4]]
 
 
 def test_colors_of_movers_are_distinct_and_keep_to_rank() -> None:
-    cast = assign(many(20))
-    assert len({role.color for role in cast.movers}) == 21
-    nearest = assign(
+    roles = assign_roles(many(20))
+    assert len({role.color for role in roles.movers}) == 21
+    nearest = assign_roles(
         make_scenario(
             make_agent("ego", (0, 0), (10, 0)), make_agent("a", (0, 50), (5, 0)), make_agent("b", (0, 5), (5, 0))
         )

@@ -22,10 +22,10 @@ from log2sim.datatypes import Agent, Scenario, Waypoints
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array, box_corners_bev, wrap_angle
 from log2sim.simulation.runner import replay
-from log2sim.visualization.page.pack import SCALES, pack, shortened
-from log2sim.visualization.page.writer import page_of, write_page
+from log2sim.visualization.page.document import SCALES, page_document, second_differences
+from log2sim.visualization.page.writer import html_of, write_page
 from log2sim.visualization.plot import style
-from log2sim.visualization.plot.roles import assign
+from log2sim.visualization.plot.roles import assign_roles
 
 ROOT = Path(__file__).resolve().parents[1]
 TRUTH = ROOT / "samples" / "crossing" / "truth.json"
@@ -75,16 +75,16 @@ class Parts(HTMLParser):
 
 def test_columns_come_back_from_their_second_differences() -> None:
     values = np.random.default_rng(0).normal(0, 1e7, 300)
-    summed = np.cumsum(np.cumsum(shortened(values, 1e3))) / 1e3
+    summed = np.cumsum(np.cumsum(second_differences(values, 1e3))) / 1e3
     np.testing.assert_allclose(summed, values, atol=0.5e-3 + 1e-8)
-    assert shortened([2.5], 10) == [25]
-    assert shortened(np.arange(9.0), 1e4)[2:] == [0] * 7
+    assert second_differences([2.5], 10) == [25]
+    assert second_differences(np.arange(9.0), 1e4)[2:] == [0] * 7
 
 
 def test_the_document_holds_every_layer() -> None:
     scenario = Scenario.load(TRUTH)
     replayed = replay(scenario, dt_s=0.1)
-    document = pack(scenario, truth=scenario, replay=replayed)
+    document = page_document(scenario, truth=scenario, replay=replayed)
     assert {k: len(v) for k, v in document["layers"].items()} == {"log": 12, "truth": 12, "replay": 12}
     assert document["end_s"] == scenario.duration_s
     entry = next(e for e in document["layers"]["replay"] if e["id"] == "car_turning")
@@ -94,13 +94,13 @@ def test_the_document_holds_every_layer() -> None:
 
 def test_agents_have_the_colors_of_the_pictures() -> None:
     scenario = Scenario.load(TRUTH)
-    entries = {e["id"]: e for e in pack(scenario)["layers"]["log"]}
-    cast = assign(scenario)
-    assert list(entries) == [r.agent.id for r in cast.movers] + [a.id for a in cast.standing]
-    for role in cast.movers[1:]:
+    entries = {e["id"]: e for e in page_document(scenario)["layers"]["log"]}
+    roles = assign_roles(scenario)
+    assert list(entries) == [r.agent.id for r in roles.movers] + [a.id for a in roles.standing]
+    for role in roles.movers[1:]:
         assert entries[role.agent.id]["color"] == role.color
     assert entries["ego"]["ego"]
-    assert [e["id"] for e in entries.values() if e["standing"]] == [a.id for a in cast.standing]
+    assert [e["id"] for e in entries.values() if e["standing"]] == [a.id for a in roles.standing]
 
 
 def test_the_style_has_the_colors_of_the_pictures() -> None:
@@ -114,7 +114,7 @@ def test_the_style_has_the_colors_of_the_pictures() -> None:
 
 
 def test_the_page_asks_for_nothing_from_outside() -> None:
-    page = page_of({**pack(Scenario.load(TRUTH)), "scales": SCALES})
+    page = html_of({**page_document(Scenario.load(TRUTH)), "scales": SCALES})
     parts = Parts(page)
     assert set(re.findall(r"https?://[^\s\"'<>]+", page)) == {"http://www.w3.org/2000/svg"}  # a name, not a place
     assert not [a for _, a in parts.tags if {"src", "action"} & set(a)]
@@ -130,8 +130,8 @@ def test_the_page_asks_for_nothing_from_outside() -> None:
 
 
 def test_names_in_a_scenario_cannot_become_part_of_the_page() -> None:
-    document = {**pack(made(agent(EVIL, np.arange(5.0), 0.0), name=EVIL)), "scales": SCALES}
-    parts, usual = (Parts(page_of(d)) for d in (document, {**document, "name": "x", "layers": {"log": []}}))
+    document = {**page_document(made(agent(EVIL, np.arange(5.0), 0.0), name=EVIL)), "scales": SCALES}
+    parts, usual = (Parts(html_of(d)) for d in (document, {**document, "name": "x", "layers": {"log": []}}))
     assert [tag for tag, _ in parts.tags] == [tag for tag, _ in usual.tags]
     data = next(text for tag, text in parts.texts if tag == "script")
     assert json.loads(data) == document
@@ -152,7 +152,7 @@ def test_a_page_that_cannot_be_is_refused(tmp_path: Path, monkeypatch: pytest.Mo
     ran = run("view", TRUTH, "--out", tmp_path / "v.png")
     assert ran.code == 2
     assert "must end in .html" in ran.line
-    monkeypatch.setattr("log2sim.visualization.page.pack.MOST_ROWS", 100)
+    monkeypatch.setattr("log2sim.visualization.page.document.MAX_ROWS", 100)
     with pytest.raises(ConfigError, match="1260 waypoints are more than the 100"):
         write_page(Scenario.load(TRUTH), tmp_path / "v.html")
     assert names(tmp_path) == []
@@ -499,7 +499,7 @@ def test_collisions_of_the_replay_are_marked_and_visited(browser: Browser, tmp_p
 def test_a_truth_that_starts_earlier_stands_at_the_same_moments() -> None:
     truth = Scenario.load(TRUTH)
     later = replace(truth, t0_ns=truth.t0_ns + 50_000_000)
-    document = pack(later, truth=truth)
+    document = page_document(later, truth=truth)
     log, known = (next(e for e in document["layers"][k] if e["id"] == "ego") for k in ("log", "truth"))
     first = [e["t_s"][0] / SCALES["t_s"] for e in (log, known)]
     assert first[1] - first[0] == pytest.approx(-0.05)
@@ -549,7 +549,7 @@ def test_the_list_is_put_away_and_an_agent_shown_all_the_same(
     browser: Browser, sample: Path, size: tuple[int, int], first: bool
 ) -> None:
     opened(browser, sample, size=size)
-    script = "return ['cast', 'details'].map((id) => document.getElementById(id).getClientRects().length > 0)"
+    script = "return ['roles', 'details'].map((id) => document.getElementById(id).getClientRects().length > 0)"
     assert browser.run(script) == [first, False]
     browser.press("a")
     assert browser.run(script) == [not first, False]

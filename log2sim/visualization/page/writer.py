@@ -1,4 +1,4 @@
-"""Puts data, script and style into the one page."""
+"""Puts data, script and style into one HTML file."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from typing import Any
 from log2sim.datatypes import Scenario
 from log2sim.documents import refuse_existing, replaced
 from log2sim.errors import ConfigError
-from log2sim.visualization.page.pack import SCALES, pack
+from log2sim.visualization.page.document import SCALES, page_document
 
 SUFFIXES = (".html", ".htm")
-SCRIPTS = (
+SCRIPT_FILES = (
     "track.js",
     "theme.js",
     "map.js",
@@ -30,7 +30,7 @@ SCRIPTS = (
     "timeline.js",
     "main.js",
 )
-"""Parts of the script in the order in which they build on each other."""
+"""Parts of the script in the order of their dependencies."""
 
 
 def write_page(
@@ -41,12 +41,12 @@ def write_page(
     replay: Any = None,
     overwrite: bool = False,
 ) -> None:
-    """Write a page that plays a scenario in a browser, on its own: it asks nothing of any network.
+    """Write a self-contained page that plays a scenario in a browser and loads nothing over the network.
 
     Parameters
     ----------
     truth : Scenario or None
-        Shown as a layer, brought to the scenario's start and map.
+        Shown as a layer, aligned to the scenario's time and map.
     replay : Replay or None
         Shown as a layer, and beside the log in the plots of an agent.
 
@@ -60,14 +60,14 @@ def write_page(
     if out_path.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"{out_path}: a page's name must end in {' or '.join(SUFFIXES)}, not in '{out_path.suffix}'")
     refuse_existing(out_path, overwrite=overwrite)
-    page = page_of({**pack(scenario, truth, replay), "scales": SCALES})
+    page = html_of({**page_document(scenario, truth, replay), "scales": SCALES})
     with replaced(out_path) as temporary:
         temporary.write_text(page, encoding="utf-8")
 
 
-def page_of(document: dict[str, Any]) -> str:
-    """The page as text. Its policy lets the browser run this very script and load nothing at all."""
-    script = '"use strict";\n(() => {\n' + "".join(_file(name) for name in SCRIPTS) + "})();\n"
+def html_of(document: dict[str, Any]) -> str:
+    """Assemble the page; its content security policy allows this script and style by their hashes and nothing else."""
+    script = '"use strict";\n(() => {\n' + "".join(_file(name) for name in SCRIPT_FILES) + "})();\n"
     style = _file("style.css")
     policy = (
         f"default-src 'none'; script-src '{_hash(script)}'; style-src '{_hash(style)}'; img-src data:; "
@@ -77,15 +77,15 @@ def page_of(document: dict[str, Any]) -> str:
         "policy": policy,
         "title": html.escape(document["name"] or "scenario"),
         "style": style,
-        "data": _harmless(document),
+        "data": _escaped_json(document),
         "script": script,
     }
-    # One pass: what is put in is never looked at again, so no name in a scenario can stand for a part of the page.
+    # One pass: inserted text is not searched again, so no name in a scenario can be taken for a placeholder.
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _file("page.html"))
 
 
-def _harmless(document: dict[str, Any]) -> str:
-    """JSON that cannot end the element that it stands in, whatever the names in it."""
+def _escaped_json(document: dict[str, Any]) -> str:
+    """Serialize to JSON that cannot close the element that holds it, whatever the names in it."""
     text = json.dumps(document, separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 

@@ -1,4 +1,4 @@
-"""The moving picture: the sheet of the still with boxes that drive, each with a short tail."""
+"""Animations: the layout of the still picture with moving boxes, each with a short tail."""
 
 from __future__ import annotations
 
@@ -18,53 +18,61 @@ from log2sim.documents import replaced
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
 from log2sim.visualization.plot import drawing, shapes
-from log2sim.visualization.plot.collisions import hits_of
-from log2sim.visualization.plot.layout import SIDE_IN, TOP_IN, WIDTH_IN, Sheet
-from log2sim.visualization.plot.roles import Cast, path
-from log2sim.visualization.plot.scene import base
+from log2sim.visualization.plot.collisions import new_collisions
+from log2sim.visualization.plot.layout import SIDE_IN, TOP_IN, WIDTH_IN, Layout
+from log2sim.visualization.plot.roles import AgentRoles, centers_xy
+from log2sim.visualization.plot.scene import draw_base
 from log2sim.visualization.plot.style import ALARM, FONT, INK, PAPER, halo
-from log2sim.visualization.plot.time_series import DrawnStrips
+from log2sim.visualization.plot.time_series import TimelineCharts
 
 FPS = 10
-MOST_FRAMES = 300
-"""A longer scenario is shown faster, and says so."""
+MAX_FRAMES = 300
+"""A longer scenario is shown faster than real time, and the picture says so."""
 
 TAIL_S = 1.5
-TAIL_ALPHA, WAY_ALPHA = 0.65, 0.22
-"""How much color tails have, and the ways as a whole."""
+TAIL_ALPHA, TRACK_ALPHA = 0.65, 0.22
+"""Opacity of tails and of whole tracks."""
 
 DPI = {".gif": 96, ".mp4": 128}
 
 CLEAR = 255
-"""The index of a .gif that paints nothing; the ones below are colors."""
+"""Palette index of transparent pixels in a .gif; the lower ones are colors."""
 
 SWATCH_PX = 100
-"""Width of what speaks for the colors of agents when a palette is chosen."""
+"""Width of the swatches of agent colors that the palette is chosen with."""
 
 Image = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class Pace:
-    """Frames, and seconds of the scenario a frame."""
+class FrameTiming:
+    """How many frames an animation has and how far apart they are.
+
+    Attributes
+    ----------
+    frames : int
+    step_s : float, s
+        Of the scenario from frame to frame.
+    """
 
     frames: int
     step_s: float
 
     @property
     def speed_up(self) -> float:
+        """Return how many times faster than real time it plays."""
         return self.step_s * FPS
 
 
-def choose_pace(duration_s: float) -> Pace:
-    """Real time where that takes at most `MOST_FRAMES` frames, else so much faster that it does."""
-    frames = min(max(round(duration_s * FPS), 0), MOST_FRAMES - 1) + 1
-    return Pace(frames, duration_s / (frames - 1) if frames > 1 else 1.0 / FPS)
+def choose_frame_timing(duration_s: float) -> FrameTiming:
+    """Choose real time, or as much faster as needed for at most `MAX_FRAMES` frames."""
+    frames = min(max(round(duration_s * FPS), 0), MAX_FRAMES - 1) + 1
+    return FrameTiming(frames, duration_s / (frames - 1) if frames > 1 else 1.0 / FPS)
 
 
 def write_animation(
     scenario: Scenario,
-    cast: Cast,
+    roles: AgentRoles,
     out_path: Path,
     *,
     replay: Any,
@@ -72,47 +80,53 @@ def write_animation(
     background: drawing.Background | None,
     title: str | None,
 ) -> None:
-    """Write a .gif or .mp4; see `tracks.plot_tracks`."""
+    """Write a .gif or .mp4; parameters as in `tracks.plot_tracks`."""
     suffix = out_path.suffix.lower()
-    sheet, step_s, strips = base(
-        scenario, cast, replay=replay, truth=truth, background=background, title=title, moving=True
+    layout, step_s, charts = draw_base(
+        scenario, roles, replay=replay, truth=truth, background=background, title=title, moving=True
     )
-    drawing.draw_tracks(sheet.ax, cast, sheet.view, step_s, alpha=WAY_ALPHA, faint=True)
-    sheet.figure.set_dpi(DPI[suffix])
-    pace = choose_pace(scenario.duration_s)
-    stage = Stage(sheet, cast, replay, truth, pace, strips)
-    frames = _frames(sheet, stage, pace)
+    drawing.draw_tracks(layout.ax, roles, layout.view, step_s, alpha=TRACK_ALPHA, faint=True)
+    layout.figure.set_dpi(DPI[suffix])
+    timing = choose_frame_timing(scenario.duration_s)
+    artists = AnimatedArtists(layout, roles, replay, truth, timing, charts)
+    frames = _frames(layout, artists, timing)
     with replaced(out_path) as temporary:
         if suffix == ".gif":
-            _write_gif(frames, temporary, [role.color for role in cast.movers] + [ALARM])
+            _write_gif(frames, temporary, [role.color for role in roles.movers] + [ALARM])
         else:
             _write_mp4(frames, temporary, out_path)
 
 
-def _frames(sheet: Sheet, stage: Stage, pace: Pace) -> Iterator[Image]:
-    """RGB frames (H, W, 3); what does not move is drawn once."""
-    canvas = sheet.canvas
+def _frames(layout: Layout, artists: AnimatedArtists, timing: FrameTiming) -> Iterator[Image]:
+    """Yield RGB frames (H, W, 3); static artists are drawn once."""
+    canvas: Any = layout.canvas  # its methods have no type hints
     canvas.draw()
-    ground = canvas.copy_from_bbox(sheet.figure.bbox)
-    for k in range(pace.frames):
-        canvas.restore_region(ground)
-        stage.show(k * pace.step_s)
+    background = canvas.copy_from_bbox(layout.figure.bbox)
+    for k in range(timing.frames):
+        canvas.restore_region(background)
+        artists.show(k * timing.step_s)
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-class Stage:
-    """The artists that change from frame to frame; `show` moves them and paints them onto the canvas."""
+class AnimatedArtists:
+    """The artists that change from frame to frame; `show` moves them and draws them onto the canvas."""
 
     def __init__(
-        self, sheet: Sheet, cast: Cast, replay: Any, truth: Scenario | None, pace: Pace, strips: DrawnStrips | None
+        self,
+        layout: Layout,
+        roles: AgentRoles,
+        replay: Any,
+        truth: Scenario | None,
+        timing: FrameTiming,
+        charts: TimelineCharts | None,
     ) -> None:
-        self.sheet, self.cast, self.truth, self.pace, self.strips = sheet, cast, truth, pace, strips
-        if strips is not None:
-            strips.start()
-        self.hit_s, self.hit_xy_m = hits_of(replay)
-        self.hits = drawing.draw_hits(sheet.ax, self.hit_xy_m, animated=True)
+        self.layout, self.roles, self.truth, self.timing, self.charts = layout, roles, truth, timing, charts
+        if charts is not None:
+            charts.start()
+        self.collision_s, self.collision_xy_m = new_collisions(replay)
+        self.collisions = drawing.draw_collisions(layout.ax, self.collision_xy_m, animated=True)
         driven = {a.id: a for a in replay.agents} if replay is not None else {}
-        self.replayed = [(driven[r.agent.id], r) for r in cast.movers if r.agent.id in driven]
+        self.replayed = [(driven[r.agent.id], r) for r in roles.movers if r.agent.id in driven]
         hidden: dict[str, Any] = {"animated": True, "zorder": drawing.BOX}
         self.tails = LineCollection([], linewidths=2.0, capstyle="round", **hidden)
         self.boxes = PolyCollection([], edgecolors=PAPER, linewidths=0.7, **hidden)
@@ -123,51 +137,51 @@ class Stage:
         self.driven = PolyCollection([], facecolors="none", linewidths=1.2, linestyles=[(0, (1, 1.2))], **hidden)
         self.collections = [self.tails, self.boxes, self.noses, self.truths, self.driven]
         for collection in self.collections:
-            sheet.ax.add_collection(collection, autolim=False)
+            layout.ax.add_collection(collection, autolim=False)
         text: dict[str, Any] = {"family": FONT, "fontweight": "bold", "parse_math": False, "animated": True}
         self.labels = [
-            sheet.ax.text(
+            layout.ax.text(
                 0, 0, "ego" if r.is_ego else r.label, color=r.color, fontsize=6.5, path_effects=halo(), clip_on=True,
                 ha="center", va="center", **text,
             )
-            for r in cast.movers
+            for r in roles.movers
         ]  # fmt: skip
-        right, height = 1 - (SIDE_IN + 0.2) / WIDTH_IN, sheet.figure.get_figheight()
-        self.stamp = sheet.figure.text(
+        right, height = 1 - (SIDE_IN + 0.2) / WIDTH_IN, layout.figure.get_figheight()
+        self.stamp = layout.figure.text(
             right, 1 - (TOP_IN - 0.16) / height, "", ha="right", fontsize=11, color=INK, **text
         )
 
     def show(self, t_s: float) -> None:
-        """Paint the moment `t_s` over the ground."""
-        roles = [(r, _pose(r.agent, t_s)) for r in self.cast.movers]
-        present = [(r, pose) for r, pose in roles if pose is not None]
+        """Draw the state at `t_s` over the static artists."""
+        posed = [(r, _pose(r.agent, t_s)) for r in self.roles.movers]
+        present = [(r, pose) for r, pose in posed if pose is not None]
         colors = [to_rgba(r.color, 1.0 if r.leading else 0.6) for r, _ in present]
-        corners = [shapes.boxes(r.agent, pose[:2], pose[2])[0] for r, pose in present]
+        corners = [shapes.footprints(r.agent, pose[:2], pose[2])[0] for r, pose in present]
         self.boxes.set_verts(corners)
         self.boxes.set_facecolor(colors)
-        self.noses.set_verts(list(shapes.noses(np.array(corners))) if corners else [])
+        self.noses.set_verts(list(shapes.heading_triangles(np.array(corners))) if corners else [])
         self.tails.set_segments([_tail(r.agent, t_s) for r, _ in present])
         self.tails.set_color([to_rgba(r.color, TAIL_ALPHA) for r, _ in present])
         self._show_overlays(t_s)
         for collection in self.collections:
-            self.sheet.ax.draw_artist(collection)
-        for label, (role, pose) in zip(self.labels, roles):
+            self.layout.ax.draw_artist(collection)
+        for label, (role, pose) in zip(self.labels, posed):
             if role.leading and pose is not None:
-                top = shapes.boxes(role.agent, pose[:2], pose[2])[0, :, 1].max()
-                label.set_position((pose[0], top + 5.5 * self.sheet.view.m_per_pt))
-                self.sheet.ax.draw_artist(label)
-        self.hits.set_data(*self.hit_xy_m[self.hit_s <= t_s + 1e-6].T)
-        self.sheet.ax.draw_artist(self.hits)
-        fast = "" if self.pace.speed_up < 1.05 else f"  (×{self.pace.speed_up:.1f})"
+                top = shapes.footprints(role.agent, pose[:2], pose[2])[0, :, 1].max()
+                label.set_position((pose[0], top + 5.5 * self.layout.view.m_per_pt))
+                self.layout.ax.draw_artist(label)
+        self.collisions.set_data(*self.collision_xy_m[self.collision_s <= t_s + 1e-6].T)
+        self.layout.ax.draw_artist(self.collisions)
+        fast = "" if self.timing.speed_up < 1.05 else f"  (×{self.timing.speed_up:.1f})"
         self.stamp.set_text(f"t = {t_s:.1f} s{fast}")
-        self.sheet.figure.draw_artist(self.stamp)
-        if self.strips is not None:
-            self.strips.show(t_s)
+        self.layout.figure.draw_artist(self.stamp)
+        if self.charts is not None:
+            self.charts.show(t_s)
 
     def _show_overlays(self, t_s: float) -> None:
         if self.truth is not None:
             there = [(a, _pose(a, t_s)) for a in self.truth.agents]
-            self.truths.set_verts([shapes.boxes(a, pose[:2], pose[2])[0] for a, pose in there if pose is not None])
+            self.truths.set_verts([shapes.footprints(a, pose[:2], pose[2])[0] for a, pose in there if pose is not None])
         if self.replayed:
             verts, colors = [], []
             for driven, role in self.replayed:
@@ -175,14 +189,14 @@ class Stage:
                 if len(t) and t[0] - 1e-6 <= t_s <= t[-1] + 1e-6:
                     x, y = np.interp(t_s, t, driven.x_m), np.interp(t_s, t, driven.y_m)
                     yaw = np.interp(t_s, t, np.unwrap(driven.yaw_rad))
-                    verts.append(shapes.boxes(role.agent, (x, y), yaw)[0])
+                    verts.append(shapes.footprints(role.agent, (x, y), yaw)[0])
                     colors.append(to_rgba(INK if not role.leading else role.color))
             self.driven.set_verts(verts)
             self.driven.set_edgecolor(colors)
 
 
 def _pose(agent: Agent, t_s: float) -> Array | None:
-    """x, y, yaw at a time; None outside the agent's life."""
+    """Return x, y, yaw at a time; None outside the trajectory."""
     if len(agent.waypoints) == 1 and agent.static:
         return np.array([agent.waypoints.x_m[0], agent.waypoints.y_m[0], agent.waypoints.yaw_rad[0]])
     state = agent.at(t_s)
@@ -190,10 +204,10 @@ def _pose(agent: Agent, t_s: float) -> Array | None:
 
 
 def _tail(agent: Agent, t_s: float) -> Array:
-    """The way of the last `TAIL_S` seconds (K, 2)."""
+    """Return the positions (K, 2) of the last `TAIL_S` seconds."""
     t = agent.waypoints.t_s
     now = agent.at(t_s)
-    chosen = path(agent)[(t >= t_s - TAIL_S) & (t <= t_s)]
+    chosen = centers_xy(agent)[(t >= t_s - TAIL_S) & (t <= t_s)]
     return np.concatenate([chosen, [[now.x_m[0], now.y_m[0]]]])
 
 
@@ -204,7 +218,7 @@ def _write_gif(frames: Iterator[Image], path: Path, colors: Sequence[str]) -> No
     palette = Pillow.fromarray(_with_swatches(first, colors)).quantize(CLEAR, dither=Pillow.Dither.NONE)
 
     def changes() -> Iterator[Any]:
-        """Frames in which all that stays as it was is clear, which makes the file several times smaller."""
+        """Yield frames whose unchanged pixels are transparent, which makes the file several times smaller."""
         before = None
         for frame in itertools.chain([first], frames):
             now = np.asarray(Pillow.fromarray(frame).quantize(palette=palette, dither=Pillow.Dither.NONE))
@@ -221,24 +235,24 @@ def _write_gif(frames: Iterator[Image], path: Path, colors: Sequence[str]) -> No
 
 
 def _with_swatches(frame: Image, colors: Sequence[str]) -> Image:
-    """A frame to choose one palette for all of them by: since colors count by area, those that mean something get some."""
+    """Widen a frame by swatches of the agents' colors, since a palette is chosen by area."""
     full = np.array([to_rgb(color) for color in colors])
-    mixes = [alpha * full + (1 - alpha) * np.array(to_rgb(PAPER)) for alpha in (1.0, TAIL_ALPHA, WAY_ALPHA)]
+    mixes = [alpha * full + (1 - alpha) * np.array(to_rgb(PAPER)) for alpha in (1.0, TAIL_ALPHA, TRACK_ALPHA)]
     rgb = np.rint(255 * np.concatenate(mixes)).astype(np.uint8)
     row = np.arange(len(frame)) * len(rgb) // len(frame)
     return np.concatenate([frame, np.repeat(rgb[row][:, None], SWATCH_PX, axis=1)], axis=1)
 
 
-def _write_mp4(frames: Iterator[Image], path: Path, asked_for: Path) -> None:
+def _write_mp4(frames: Iterator[Image], path: Path, requested: Path) -> None:
     import cv2
 
     first = next(frames)
-    height, width = (n // 2 * 2 for n in first.shape[:2])  # the codec wants even sides
-    path.touch()  # says so when nothing can be written here, of which OpenCV tells nothing
+    height, width = (n // 2 * 2 for n in first.shape[:2])  # the codec requires even sides
+    path.touch()  # raises when the file cannot be written, which OpenCV would not report
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), FPS, (width, height))
     try:
         if not writer.isOpened():
-            raise ConfigError(f"{asked_for}: this OpenCV cannot write .mp4; choose a name that ends in .gif")
+            raise ConfigError(f"{requested}: this OpenCV cannot write .mp4; choose a name that ends in .gif")
         writer.write(np.ascontiguousarray(first[:height, :width, ::-1]))
         for frame in frames:
             writer.write(np.ascontiguousarray(frame[:height, :width, ::-1]))

@@ -1,4 +1,4 @@
-"""Where a replay has collisions that its log has not."""
+"""Collisions of a replay that do not occur in its log."""
 
 from __future__ import annotations
 
@@ -9,8 +9,16 @@ import numpy as np
 from log2sim.geometry import Array
 
 
-def hits_of(replay: Any) -> tuple[Array, Array]:
-    """Times (K,) at which new collisions begin, and the places (K, 2) halfway between the centers of the boxes."""
+def new_collisions(replay: Any) -> tuple[Array, Array]:
+    """Find the collisions of a replay that do not occur in the log.
+
+    Returns
+    -------
+    t_s : (K,) float64
+        When each begins.
+    xy_m : (K, 2) float64
+        Midpoints between the centers of both boxes, map frame.
+    """
     if replay is None:
         return np.zeros(0), np.zeros((0, 2))
     events = [e for e in replay.metrics.get("collisions", ()) if not e["in_log"]]

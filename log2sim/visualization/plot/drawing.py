@@ -1,4 +1,4 @@
-"""Draws tracks, boxes and labels onto the map axes. A few collections in all, so 500 agents stay quick."""
+"""Tracks, boxes and labels on the map axes, as a few collections, so that 500 agents stay fast."""
 
 from __future__ import annotations
 
@@ -15,32 +15,42 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Agent, Scenario
 from log2sim.geometry import Array
 from log2sim.visualization.plot import shapes
-from log2sim.visualization.plot.roles import Cast, Role, moves, path
-from log2sim.visualization.plot.style import FONT, HIT, INK, MARKERS, MUTED, PAPER, PARKED_EDGE, PARKED_FACE, halo
-from log2sim.visualization.plot.viewport import CROWD, View
+from log2sim.visualization.plot.roles import AgentRole, AgentRoles, centers_xy, is_moving
+from log2sim.visualization.plot.style import (
+    COLLISION_MARK,
+    FONT,
+    INK,
+    MARKERS,
+    MUTED,
+    PAPER,
+    PARKED_EDGE,
+    PARKED_FACE,
+    halo,
+)
+from log2sim.visualization.plot.viewport import MAX_UNCROWDED_MOVERS, Viewport
 
 BACKGROUND, STANDING, TRUTH, TRACK, MARK, REPLAY, BOX, LABEL = range(1, 9)
-"""Layers, from the bottom up."""
+"""z-order, from the bottom up."""
 
 
 class Background(Protocol):
-    """A picture of the ground, as `topdown.picture.TopdownPicture` is one."""
+    """A top-down picture of the ground, such as `visualization.birdseye.mosaic.TopdownPicture`."""
 
     @property
     def image_bgr(self) -> NDArray[np.uint8]:
-        """(R, C, 3), row 0 in the north."""
+        """Return the image (R, C, 3), row 0 in the north."""
 
     @property
     def alpha(self) -> NDArray[np.uint8]:
-        """(R, C), 0 where nothing is known."""
+        """Return the opacity (R, C), 0 where nothing is known."""
 
     @property
     def extent_m(self) -> tuple[float, float, float, float]:
-        """x0, x1, y0, y1 of the outer edges, map frame."""
+        """Return x0, x1, y0, y1 of the outer edges, m, map frame."""
 
 
 def draw_background(ax: Axes, picture: Background) -> None:
-    """Lay a top-down picture under everything, paled so that tracks stand out."""
+    """Draw a top-down picture below everything, lightened so that tracks stand out."""
     pale = 0.62 * picture.image_bgr[..., ::-1].astype(np.float32) + 0.38 * 255
     rgba = np.dstack([np.rint(pale).astype(np.uint8), (picture.alpha * 0.95).astype(np.uint8)])
     ax.imshow(
@@ -48,13 +58,13 @@ def draw_background(ax: Axes, picture: Background) -> None:
     )
 
 
-def draw_standing(ax: Axes, agents: Sequence[Agent], view: View) -> None:
-    """Quiet gray boxes for what stands; a dot where a box would be too small to see."""
+def draw_standing(ax: Axes, agents: Sequence[Agent], view: Viewport) -> None:
+    """Draw stationary agents as gray boxes; as a dot where the box would be too small to see."""
     if not agents:
         return
-    half_way = [len(a.waypoints) // 2 for a in agents]
-    xy = np.array([path(a)[k] for a, k in zip(agents, half_way)])
-    corners = np.concatenate([shapes.boxes(a, p, a.waypoints.yaw_rad[k]) for a, p, k in zip(agents, xy, half_way)])
+    middle = [len(a.waypoints) // 2 for a in agents]
+    xy = np.array([centers_xy(a)[k] for a, k in zip(agents, middle)])
+    corners = np.concatenate([shapes.footprints(a, p, a.waypoints.yaw_rad[k]) for a, p, k in zip(agents, xy, middle)])
     style: dict[str, Any] = {
         "facecolors": PARKED_FACE,
         "edgecolors": PARKED_EDGE,
@@ -63,7 +73,7 @@ def draw_standing(ax: Axes, agents: Sequence[Agent], view: View) -> None:
     }
     ax.add_collection(PolyCollection(list(corners), **style), autolim=False)
     ax.add_collection(
-        PolyCollection(list(shapes.noses(corners)), facecolors=PARKED_EDGE, linewidths=0, zorder=STANDING),
+        PolyCollection(list(shapes.heading_triangles(corners)), facecolors=PARKED_EDGE, linewidths=0, zorder=STANDING),
         autolim=False,
     )
     small = np.array([max(a.size_m[:2]) < 5 * view.m_per_pt for a in agents])
@@ -71,16 +81,26 @@ def draw_standing(ax: Axes, agents: Sequence[Agent], view: View) -> None:
         ax.plot(xy[small, 0], xy[small, 1], "o", ms=3, mfc=PARKED_FACE, mec=PARKED_EDGE, mew=0.6, zorder=STANDING)
 
 
-def draw_tracks(ax: Axes, cast: Cast, view: View, step_s: float, *, alpha: float = 1.0, faint: bool = False) -> None:
-    """Lines with direction, filled gaps dashed, and time marks.
+def draw_tracks(
+    ax: Axes, roles: AgentRoles, view: Viewport, step_s: float, *, alpha: float = 1.0, faint: bool = False
+) -> None:
+    """Draw tracks as lines with arrowheads, filled gaps dashed, and time marks.
 
-    `alpha` below 1 turns lines into pale ribbons under overlays; `faint` is the ground of an animation: lines only.
+    Parameters
+    ----------
+    alpha : float
+        Below 1 lines become pale ribbons under overlays.
+    faint : bool
+        Lines only, as the background of an animation.
     """
     for leading in (False, True):
-        roles = [r for r in cast.movers if r.leading is leading]
-        _lines(ax, roles, alpha if leading else alpha * 0.5, leading)
+        same_rank = [r for r in roles.movers if r.leading is leading]
+        _lines(ax, same_rank, alpha if leading else alpha * 0.5, leading)
     heads = [
-        (head, role.color) for role in cast.movers if role.leading for head in shapes.arrows(path(role.agent), view)
+        (head, role.color)
+        for role in roles.movers
+        if role.leading
+        for head in shapes.arrows(centers_xy(role.agent), view)
     ]
     if heads and not faint:
         ax.add_collection(
@@ -90,84 +110,84 @@ def draw_tracks(ax: Axes, cast: Cast, view: View, step_s: float, *, alpha: float
             autolim=False,
         )
     if not faint:
-        _time_marks(ax, cast, view, step_s)
+        _time_marks(ax, roles, view, step_s)
 
 
-def draw_ends(ax: Axes, cast: Cast, view: View, *, ghosts_step_s: float | None) -> None:
-    """Boxes at real size: hollow at the start, filled at the end, pale ones at time marks when asked for."""
-    for rank, role in enumerate(reversed(cast.movers)):
-        agent, w, xy = role.agent, role.agent.waypoints, path(role.agent)
+def draw_ends(ax: Axes, roles: AgentRoles, view: Viewport, *, ghosts_step_s: float | None) -> None:
+    """Draw boxes at real size: hollow at the start, filled at the end, pale every `ghosts_step_s` unless None."""
+    for rank, role in enumerate(reversed(roles.movers)):
+        agent, w, xy = role.agent, role.agent.waypoints, centers_xy(role.agent)
         alpha = 1.0 if role.leading else 0.55
-        z = BOX + rank / (len(cast.movers) + 1) * 0.5
+        z = BOX + rank / (len(roles.movers) + 1) * 0.5
         if ghosts_step_s is not None and role.leading:
-            t, at = shapes.marks(agent, ghosts_step_s)
-            apart = shapes.spaced(at, xy[[0, -1]], 1.15 * agent.size_m[0])
+            t, at = shapes.time_marks(agent, ghosts_step_s)
+            apart = shapes.spaced_apart(at, xy[[0, -1]], 1.15 * agent.size_m[0])
             if apart.any():
-                ghost = shapes.boxes(agent, at[apart], agent.at(t[apart]).yaw_rad)
+                ghost = shapes.footprints(agent, at[apart], agent.at(t[apart]).yaw_rad)
                 _polygons(
                     ax, ghost, facecolors=to_rgba(role.color, 0.10), edgecolors=to_rgba(role.color, 0.4), z=TRACK - 0.5
                 )
-        first, last = (shapes.boxes(agent, xy[k], w.yaw_rad[k]) for k in (0, -1))
+        first, last = (shapes.footprints(agent, xy[k], w.yaw_rad[k]) for k in (0, -1))
         _polygons(ax, first, facecolors=to_rgba(PAPER, 0.75), edgecolors=to_rgba(role.color, 0.9 * alpha), z=z - 0.6)
         _polygons(ax, last, facecolors=to_rgba(role.color, 0.92 * alpha), edgecolors=PAPER, z=z)
-        _polygons(ax, shapes.noses(last), facecolors=to_rgba(PAPER, 0.85), edgecolors="none", z=z)
+        _polygons(ax, shapes.heading_triangles(last), facecolors=to_rgba(PAPER, 0.85), edgecolors="none", z=z)
         if max(agent.size_m[:2]) < 9 * view.m_per_pt:
             face = to_rgba(role.color, alpha)
             ax.plot(*xy[-1], MARKERS[role.group], ms=4.2, mfc=face, mec=PAPER, mew=0.7, zorder=z + 0.01)
 
 
 def draw_truth(ax: Axes, truth: Scenario) -> None:
-    """Truth as thin dark dashed lines and hollow dashed boxes."""
-    ways, corners = [], []
+    """Draw the truth as thin dark dashed lines and hollow dashed boxes."""
+    tracks, corners = [], []
     for agent in truth.agents:
-        xy = path(agent)
-        if moves(agent):
-            ways.append(xy)
-        corners.append(shapes.boxes(agent, xy[-1], agent.waypoints.yaw_rad[-1])[0])
+        xy = centers_xy(agent)
+        if is_moving(agent):
+            tracks.append(xy)
+        corners.append(shapes.footprints(agent, xy[-1], agent.waypoints.yaw_rad[-1])[0])
     style: dict[str, Any] = {"linewidths": 0.8, "linestyles": [(0, (3, 2))], "zorder": BOX + 0.8}
-    ax.add_collection(LineCollection(ways, colors=to_rgba(INK, 0.9), **style), autolim=False)
+    ax.add_collection(LineCollection(tracks, colors=to_rgba(INK, 0.9), **style), autolim=False)
     ax.add_collection(PolyCollection(corners, facecolors="none", edgecolors=to_rgba(INK, 0.9), **style), autolim=False)
 
 
-def draw_replay(ax: Axes, replay: Any, cast: Cast) -> None:
-    """The driven way as a dotted line and a dotted box at its end, in the color of the track."""
-    roles = {role.agent.id: role for role in cast.movers}
-    ways, colors, ends, end_colors = [], [], [], []
+def draw_replay(ax: Axes, replay: Any, roles: AgentRoles) -> None:
+    """Draw replayed trajectories as dotted lines with a dotted box at the end, in the color of the track."""
+    role_of = {role.agent.id: role for role in roles.movers}
+    tracks, colors, ends, end_colors = [], [], [], []
     for driven in replay.agents:
-        role = roles.get(driven.id)
+        role = role_of.get(driven.id)
         if role is None or len(driven.t_s) == 0:
             continue
         xy = np.column_stack([driven.x_m, driven.y_m])
-        ways.append(xy)
+        tracks.append(xy)
         colors.append(to_rgba(role.color))
-        ends.append(shapes.boxes(role.agent, xy[-1], np.asarray(driven.yaw_rad)[-1])[0])
+        ends.append(shapes.footprints(role.agent, xy[-1], np.asarray(driven.yaw_rad)[-1])[0])
         end_colors.append(to_rgba(role.color))
     dots: dict[str, Any] = {"linestyles": [(0, (0.1, 2.0))], "linewidths": 1.6, "capstyle": "round"}
-    ax.add_collection(LineCollection(ways, colors=colors, zorder=REPLAY, **dots), autolim=False)
+    ax.add_collection(LineCollection(tracks, colors=colors, zorder=REPLAY, **dots), autolim=False)
     dotted: dict[str, Any] = {"linestyles": [(0, (1, 1.2))], "linewidths": 1.1}
     ax.add_collection(
         PolyCollection(ends, facecolors="none", edgecolors=end_colors, zorder=BOX + 0.7, **dotted), autolim=False
     )
 
 
-def draw_hits(ax: Axes, xy_m: Array, **style: Any) -> Line2D:
-    """Crosses where agents collide that do not in the log."""
-    return ax.plot(*xy_m.T, ls="none", zorder=LABEL - 0.1, **HIT, **style)[0]
+def draw_collisions(ax: Axes, xy_m: Array, **style: Any) -> Line2D:
+    """Mark collisions that do not occur in the log."""
+    return ax.plot(*xy_m.T, ls="none", zorder=LABEL - 0.1, **COLLISION_MARK, **style)[0]
 
 
-def draw_labels(ax: Axes, cast: Cast, view: View, times_step_s: float) -> None:
-    """Names beside the last boxes, and times along the ego's way, each at a free place or not at all."""
-    taken = _occupied(cast, view)
-    for role in cast.movers:
-        anchor = path(role.agent)[-1]
-        if role.leading and view.holds(anchor[None])[0]:
+def draw_labels(ax: Axes, roles: AgentRoles, view: Viewport, times_step_s: float) -> None:
+    """Write labels at the last boxes and times along the ego's track, each at a free place or not at all."""
+    taken = _occupied(roles, view)
+    for role in roles.movers:
+        anchor = centers_xy(role.agent)[-1]
+        if role.leading and view.contains(anchor[None])[0]:
             text = "ego" if role.is_ego else role.label
-            box_half = np.ptp(shapes.boxes(role.agent, anchor, role.agent.waypoints.yaw_rad[-1])[0], axis=0) / 2
+            box_half = np.ptp(shapes.footprints(role.agent, anchor, role.agent.waypoints.yaw_rad[-1])[0], axis=0) / 2
             _write(ax, text, anchor, box_half, taken, view, color=role.color, fontsize=7.0, fontweight="bold")
-    if cast.movers and cast.movers[0].is_ego:
-        ego = cast.movers[0].agent
-        t, xy = shapes.marks(ego, times_step_s)
-        apart = shapes.spaced(xy, path(ego)[[0, -1]], max(ego.size_m[0] / 2, 24 * view.m_per_pt))
+    if roles.movers and roles.movers[0].is_ego:
+        ego = roles.movers[0].agent
+        t, xy = shapes.time_marks(ego, times_step_s)
+        apart = shapes.spaced_apart(xy, centers_xy(ego)[[0, -1]], max(ego.size_m[0] / 2, 24 * view.m_per_pt))
         for when, at in zip(t[apart], xy[apart]):
             around = np.full(2, ego.size_m[1] / 2)
             _write(ax, f"{when:g} s", at, around, taken, view, color=MUTED, fontsize=6.0, fontweight="normal")
@@ -179,10 +199,10 @@ def _write(
     anchor: Array,
     box_half: Array,
     taken: list[tuple[float, float, float, float]],
-    view: View,
+    view: Viewport,
     **style: Any,
 ) -> None:
-    """Write beside a box at the first free place and take that place."""
+    """Write next to a box at the first free place and reserve it in `taken`."""
     size_pt = style["fontsize"]
     half = np.array([0.34 * size_pt * len(text) + 1.0, 0.55 * size_pt]) * view.m_per_pt
     place = _free_place(anchor, half, box_half, taken, view)
@@ -194,26 +214,26 @@ def _write(
 
 
 def _free_place(
-    anchor: Array, half: Array, box_half: Array, taken: list[tuple[float, float, float, float]], view: View
+    anchor: Array, half: Array, box_half: Array, taken: list[tuple[float, float, float, float]], view: Viewport
 ) -> Array | None:
-    """Center of a label of half size (2,) beside a box of half extents (2,), clear of what is taken; None if there is none."""
+    """Find the center of a label of half size (2,) next to a box of half extents (2,), clear of `taken`; None without."""
     pad = 1.5 * view.m_per_pt
     for ring in (0.0, 6.0, 14.0):
         for side in ((1, 1), (-1, 1), (1, -1), (-1, -1), (0, 1), (0, -1), (1, 0), (-1, 0)):
             place = anchor + np.array(side) * (box_half + half + pad + ring * view.m_per_pt)
             low, high = place - half, place + half
-            inside = view.holds(np.stack([low, high])).all()
+            inside = view.contains(np.stack([low, high])).all()
             if inside and not any(low[0] < t[2] and high[0] > t[0] and low[1] < t[3] and high[1] > t[1] for t in taken):
                 return place
     return None
 
 
-def _occupied(cast: Cast, view: View) -> list[tuple[float, float, float, float]]:
-    """Axis-aligned bounds of the last boxes and of points along the leading tracks, which labels keep clear of."""
+def _occupied(roles: AgentRoles, view: Viewport) -> list[tuple[float, float, float, float]]:
+    """Collect the bounds of the last boxes and of points along the leading tracks, which labels keep clear of."""
     out = []
-    for role in cast.movers:
-        xy, w = path(role.agent), role.agent.waypoints
-        corners = shapes.boxes(role.agent, xy[-1], w.yaw_rad[-1])[0]
+    for role in roles.movers:
+        xy, w = centers_xy(role.agent), role.agent.waypoints
+        corners = shapes.footprints(role.agent, xy[-1], w.yaw_rad[-1])[0]
         out.append((*corners.min(axis=0), *corners.max(axis=0)))
         if role.leading:
             r = 1.2 * view.m_per_pt
@@ -222,19 +242,19 @@ def _occupied(cast: Cast, view: View) -> list[tuple[float, float, float, float]]
     return out
 
 
-def _lines(ax: Axes, roles: list[Role], alpha: float, leading: bool) -> None:
-    seen: list[tuple[Array, str]] = []
+def _lines(ax: Axes, roles: list[AgentRole], alpha: float, leading: bool) -> None:
+    observed: list[tuple[Array, str]] = []
     filled: list[tuple[Array, str]] = []
     for role in reversed(roles):
-        for kind, parts in zip((seen, filled), shapes.seen_and_filled(role.agent)):
+        for kind, parts in zip((observed, filled), shapes.observed_and_filled(role.agent)):
             kind.extend((part, role.color) for part in parts)
     ribbon = 1.5 if alpha < 1.0 else 1.0
-    width = [ribbon * (2.4 if c == INK else 1.7) for _, c in seen] if leading else [1.0] * len(seen)
+    width = [ribbon * (2.4 if c == INK else 1.7) for _, c in observed] if leading else [1.0] * len(observed)
     if leading and alpha == 1.0:
-        rim = LineCollection([p for p, _ in seen], colors=to_rgba(PAPER, 0.85), linewidths=[w + 1.6 for w in width])
+        rim = LineCollection([p for p, _ in observed], colors=to_rgba(PAPER, 0.85), linewidths=[w + 1.6 for w in width])
         rim.set(zorder=TRACK - 0.2, capstyle="round")
         ax.add_collection(rim, autolim=False)
-    solid = LineCollection([p for p, _ in seen], colors=[to_rgba(c, alpha) for _, c in seen], linewidths=width)
+    solid = LineCollection([p for p, _ in observed], colors=[to_rgba(c, alpha) for _, c in observed], linewidths=width)
     solid.set(zorder=TRACK, capstyle="round")
     ax.add_collection(solid, autolim=False)
     dashed = LineCollection([p for p, _ in filled], colors=[to_rgba(c, alpha) for _, c in filled], linewidths=1.3)
@@ -242,11 +262,11 @@ def _lines(ax: Axes, roles: list[Role], alpha: float, leading: bool) -> None:
     ax.add_collection(dashed, autolim=False)
 
 
-def _time_marks(ax: Axes, cast: Cast, view: View, step_s: float) -> None:
-    for role in cast.movers:
+def _time_marks(ax: Axes, roles: AgentRoles, view: Viewport, step_s: float) -> None:
+    for role in roles.movers:
         if not role.leading:
             continue
-        t, xy = shapes.marks(role.agent, step_s)
+        t, xy = shapes.time_marks(role.agent, step_s)
         apart = (
             np.concatenate([[True], np.hypot(*np.diff(xy, axis=0).T) > 4 * view.m_per_pt])
             if len(t)
@@ -257,9 +277,9 @@ def _time_marks(ax: Axes, cast: Cast, view: View, step_s: float) -> None:
         )
 
 
-def view_is_crowded(cast: Cast) -> bool:
-    """Whether there are too many movers for ghosts."""
-    return len(cast.movers) > CROWD
+def view_is_crowded(roles: AgentRoles) -> bool:
+    """Tell whether there are too many movers for boxes at time marks."""
+    return len(roles.movers) > MAX_UNCROWDED_MOVERS
 
 
 def _polygons(ax: Axes, corners: Array, *, facecolors: Any, edgecolors: Any, z: float) -> None:

@@ -1,4 +1,4 @@
-"""The sheet of paper: title, map axes, and beside the map the legend, the scale and north."""
+"""Layout of a figure: title, map axes, and beside the map the legend, the scale and the north arrow."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 from matplotlib.ticker import FuncFormatter, MultipleLocator
 
-from log2sim.visualization.plot.roles import Cast, Role
+from log2sim.visualization.plot.roles import AgentRole, AgentRoles
 from log2sim.visualization.plot.style import (
+    COLLISION_MARK,
     CROWD_COLOR,
     FONT,
     FRAME,
     GRID,
-    HIT,
     INK,
     MARKERS,
     MUTED,
@@ -28,33 +28,45 @@ from log2sim.visualization.plot.style import (
     PARKED_FACE,
     printable,
 )
-from log2sim.visualization.plot.viewport import View, nice_step
+from log2sim.visualization.plot.viewport import Viewport, nice_step
 
 WIDTH_IN = 10.0
 LEFT_IN, SIDE_IN, TOP_IN, BOTTOM_IN, GAP_IN = 0.72, 2.3, 0.74, 0.52, 0.2
-LEAST_MAP_IN, MOST_MAP_IN = 3.4, 8.4
+MIN_MAP_IN, MAX_MAP_IN = 3.4, 8.4
 ROW_IN = 0.178
-STRIP_IN, STRIP_GAP_IN, TIME_IN, HEAD_IN = 0.56, 0.12, 0.36, 0.26
-"""Below the map: a strip and the gap below it, the axis of time and the strips' heading."""
+CHART_IN, CHART_GAP_IN, TIME_IN, HEAD_IN = 0.56, 0.12, 0.36, 0.26
+"""Below the map: a chart, the gap below it, the time axis, and the heading of the charts."""
 
 
 @dataclass(frozen=True, eq=False)
-class Sheet:
-    """A figure with its canvas, its map axes, the view they show, and the height in inches below all that is the map's."""
+class Layout:
+    """A figure and its parts.
+
+    Attributes
+    ----------
+    figure : Figure
+    canvas : FigureCanvasAgg
+    ax : Axes
+        Of the map.
+    view : Viewport
+        What the map shows.
+    foot_in : float, inch
+        Height below the map for charts.
+    """
 
     figure: Figure
     canvas: FigureCanvasAgg
     ax: Axes
-    view: View
+    view: Viewport
     foot_in: float = 0.0
 
 
-def make_sheet(view: View, legend_rows: int, *, projected: bool, foot_in: float = 0.0) -> Sheet:
-    """Lay out a sheet whose map has the view's proportions as far as paper allows, above a foot for something else."""
+def make_layout(view: Viewport, legend_rows: int, *, projected: bool, foot_in: float = 0.0) -> Layout:
+    """Lay out a figure whose map has the proportions of the view within limits, above `foot_in` inches for charts."""
     map_width = WIDTH_IN - LEFT_IN - SIDE_IN - GAP_IN
     wanted = map_width * view.height_m / view.width_m
     needed = legend_rows * ROW_IN + 1.0
-    map_height = float(np.clip(max(wanted, needed), LEAST_MAP_IN, MOST_MAP_IN))
+    map_height = float(np.clip(max(wanted, needed), MIN_MAP_IN, MAX_MAP_IN))
     height = map_height + TOP_IN + BOTTOM_IN + foot_in
     figure = Figure(figsize=(WIDTH_IN, height), facecolor=PAPER)
     canvas = FigureCanvasAgg(figure)
@@ -64,23 +76,23 @@ def make_sheet(view: View, legend_rows: int, *, projected: bool, foot_in: float 
     ax.set(xlim=(fitted.x0, fitted.x1), ylim=(fitted.y0, fitted.y1), facecolor="#FBFCFD")
     ax.set_aspect("equal", adjustable="box")
     _axes_style(ax, fitted, projected)
-    return Sheet(figure, canvas, ax, fitted, foot_in)
+    return Layout(figure, canvas, ax, fitted, foot_in)
 
 
-def write_title(sheet: Sheet, title: str, subtitle: str) -> None:
-    """Title and a quieter line under it, flush with the map's left edge."""
-    height = sheet.figure.get_figheight()
+def write_title(layout: Layout, title: str, subtitle: str) -> None:
+    """Write the title and a smaller line below it, flush with the map's left edge."""
+    height = layout.figure.get_figheight()
     style: dict[str, Any] = {"family": FONT, "ha": "left", "va": "baseline", "parse_math": False}
     x = LEFT_IN / WIDTH_IN
-    sheet.figure.text(x, 1 - 0.36 / height, printable(title, 70), fontsize=13, fontweight="bold", color=INK, **style)
-    sheet.figure.text(x, 1 - 0.59 / height, printable(subtitle, 130), fontsize=8, color=MUTED, **style)
+    layout.figure.text(x, 1 - 0.36 / height, printable(title, 70), fontsize=13, fontweight="bold", color=INK, **style)
+    layout.figure.text(x, 1 - 0.59 / height, printable(subtitle, 130), fontsize=8, color=MUTED, **style)
 
 
-def draw_legend(sheet: Sheet, rows: list[tuple[Any, str]]) -> None:
-    """Legend in the column beside the map, so that it covers nothing."""
-    height = sheet.figure.get_figheight()
+def draw_legend(layout: Layout, rows: list[tuple[Any, str]]) -> None:
+    """Draw the legend in the column beside the map, where it covers nothing."""
+    height = layout.figure.get_figheight()
     x = (WIDTH_IN - SIDE_IN) / WIDTH_IN
-    legend = sheet.figure.legend(
+    legend = layout.figure.legend(
         [handle for handle, _ in rows], [text for _, text in rows], loc="upper left", bbox_to_anchor=(x, 1 - TOP_IN / height),
         borderaxespad=0, frameon=False, prop={"family": FONT, "size": 7.0}, handlelength=2.0, labelspacing=0.56,
         handletextpad=0.7, labelcolor=INK,
@@ -90,42 +102,42 @@ def draw_legend(sheet: Sheet, rows: list[tuple[Any, str]]) -> None:
 
 
 def legend_rows(
-    cast: Cast, mark_step_s: float | None, *, truth: bool, replay: bool, hits: int, outside: int
+    roles: AgentRoles, mark_step_s: float | None, *, truth: bool, replay: bool, collisions: int, outside: int
 ) -> list[tuple[Any, str]]:
-    """Handles and texts: leading movers, what is summed up, then what the marks mean where there are marks."""
+    """List handles and texts: leading movers, counts of the others, then the meaning of marks that occur."""
     rows: list[tuple[Any, str]] = []
-    for role in sorted(cast.movers, key=_reading_order):
+    for role in sorted(roles.movers, key=_reading_order):
         if role.leading:
             marker = "s" if role.is_ego else MARKERS[role.group]
             rows.append((_line(role.color, lw=2.4 if role.is_ego else 1.7, marker=marker, ms=4.6), _name(role)))
-    rest = sum(not r.leading for r in cast.movers)
+    rest = sum(not r.leading for r in roles.movers)
     if rest:
         rows.append((_line(CROWD_COLOR, lw=1.0), f"{rest} more moving, farther off"))
-    if cast.standing:
-        rows.append((Patch(fc=PARKED_FACE, ec=PARKED_EDGE, lw=0.6), f"{len(cast.standing)} standing"))
-    if cast.movers and mark_step_s is not None:
+    if roles.standing:
+        rows.append((Patch(fc=PARKED_FACE, ec=PARKED_EDGE, lw=0.6), f"{len(roles.standing)} standing"))
+    if roles.movers and mark_step_s is not None:
         rows.append((Patch(fc=PAPER, ec=MUTED, lw=0.9), "start (hollow), end (filled)"))
         rows.append((_line("none", marker="o", ms=3.2, mfc=PAPER, mec=MUTED, mew=0.9), f"every {mark_step_s:g} s"))
-    if mark_step_s is not None and any(not r.agent.waypoints.observed.all() for r in cast.movers):
+    if mark_step_s is not None and any(not r.agent.waypoints.observed.all() for r in roles.movers):
         rows.append((_line(MUTED, lw=1.3, ls=(0, (2.2, 1.8))), "not observed, filled"))
     if truth:
         rows.append((_line(INK, lw=0.8, ls=(0, (3, 2))), "truth"))
     if replay:
         rows.append((_line(MUTED, lw=1.9, ls=(0, (0.1, 1.6)), dash_capstyle="round"), "replay"))
-    if hits:
-        rows.append((Line2D([], [], ls="none", **{**HIT, "ms": 6.0}), "collides, not in the log"))
+    if collisions:
+        rows.append((Line2D([], [], ls="none", **{**COLLISION_MARK, "ms": 6.0}), "collides, not in the log"))
     if outside:
         rows.append((_line("none"), f"{outside} outside this view"))
     return rows
 
 
-def draw_scale_and_north(sheet: Sheet, *, projected: bool) -> None:
-    """A scale bar of a round length, and where north is, when the map knows, at the foot of the column."""
-    height = sheet.figure.get_figheight()
-    m_per_in = sheet.view.m_per_pt * 72
+def draw_scale_and_north(layout: Layout, *, projected: bool) -> None:
+    """Draw a scale bar of a round length at the foot of the column, and a north arrow on a projected map."""
+    height = layout.figure.get_figheight()
+    m_per_in = layout.view.m_per_pt * 72
     length_m = nice_step(1.35 * m_per_in)
-    x, y, w = WIDTH_IN - SIDE_IN + 0.06, sheet.foot_in + BOTTOM_IN + 0.08, length_m / m_per_in
-    column = sheet.figure.add_axes((0, 0, 1, 1), frameon=False)
+    x, y, w = WIDTH_IN - SIDE_IN + 0.06, layout.foot_in + BOTTOM_IN + 0.08, length_m / m_per_in
+    column = layout.figure.add_axes((0, 0, 1, 1), frameon=False)
     column.set(xlim=(0, WIDTH_IN), ylim=(0, height), xticks=[], yticks=[])
     column.set_zorder(-1)
     for k, face in enumerate((INK, PAPER)):
@@ -140,13 +152,13 @@ def draw_scale_and_north(sheet: Sheet, *, projected: bool) -> None:
         column.text(nx, ny + 0.44, "N", ha="center", **{**style, "fontsize": 8.5, "fontweight": "bold"})
 
 
-def _axes_style(ax: Axes, view: View, projected: bool) -> None:
+def _axes_style(ax: Axes, view: Viewport, projected: bool) -> None:
     names = ("east", "north") if projected else ("map x", "map y")
     ax.set_axisbelow(True)
     ax.grid(True, color=GRID, lw=0.7)
     step_m = nice_step(max(view.width_m, view.height_m) / 5)
     for axis, name, low in zip((ax.xaxis, ax.yaxis), names, (view.x0, view.y0)):
-        # Numbers of seven digits say nothing; what is common to them goes into the axis' name.
+        # Seven-digit tick labels are unreadable; their common part goes into the axis label.
         base_m = float(np.floor(low / 1000) * 1000) if abs(low) >= 1e5 else 0.0
         axis.set_major_locator(MultipleLocator(step_m))
         axis.set_major_formatter(FuncFormatter(lambda v, _, base_m=base_m: f"{v - base_m:.6g}".replace("-", "−")))
@@ -157,13 +169,13 @@ def _axes_style(ax: Axes, view: View, projected: bool) -> None:
         spine.set(color=FRAME, linewidth=0.8)
 
 
-def _reading_order(role: Role) -> tuple[bool, int, str]:
-    """The ego first, then labels as people count: 2 before 10."""
+def _reading_order(role: AgentRole) -> tuple[bool, int, str]:
+    """Sort the ego first, then labels by their number: 2 before 10."""
     digits = "".join(c for c in role.label if c in "0123456789")
     return (not role.is_ego, int(digits) if digits else 0, role.label)
 
 
-def _name(role: Role) -> str:
+def _name(role: AgentRole) -> str:
     speed = float(np.max(np.abs(role.agent.waypoints.speed_mps)))
     moving = f"{speed * 3.6:.0f} km/h" if speed >= 0.15 else "stands"
     if role.is_ego:
@@ -171,7 +183,7 @@ def _name(role: Role) -> str:
     if role.agent.id.startswith(role.agent.category):
         return f"{printable(role.label, 9)} · {printable(role.agent.id, 20)} · {moving}"
     text = f"{printable(role.label, 9)} · {role.agent.category} · {moving}"
-    room = 34 - len(text) - 3  # letters that the column holds
+    room = 34 - len(text) - 3  # 34 letters fit into the column
     return text if role.label == role.agent.id else f"{text} · {printable(role.agent.id, max(room, 4))}"
 
 

@@ -1,4 +1,4 @@
-"""The picture of a scenario from above: who drove where, still or moving."""
+"""The base of still pictures and animations: layout, background, stationary agents, legend and charts."""
 
 from __future__ import annotations
 
@@ -8,55 +8,64 @@ import numpy as np
 
 from log2sim.datatypes import Scenario
 from log2sim.visualization.plot import drawing
-from log2sim.visualization.plot.collisions import hits_of
+from log2sim.visualization.plot.collisions import new_collisions
 from log2sim.visualization.plot.layout import (
-    Sheet,
+    Layout,
     draw_legend,
     draw_scale_and_north,
     legend_rows,
-    make_sheet,
+    make_layout,
     write_title,
 )
-from log2sim.visualization.plot.roles import Cast, moves, path
-from log2sim.visualization.plot.time_series import DrawnStrips, draw_strips, foot_in, story_of
-from log2sim.visualization.plot.viewport import View, choose_view, time_step_s
+from log2sim.visualization.plot.roles import AgentRoles, centers_xy, is_moving
+from log2sim.visualization.plot.time_series import TimelineCharts, charts_height_in, draw_charts, timeline_of
+from log2sim.visualization.plot.viewport import Viewport, choose_viewport, time_step_s
 
 
-def base(
+def draw_base(
     scenario: Scenario,
-    cast: Cast,
+    roles: AgentRoles,
     *,
     replay: Any = None,
     truth: Scenario | None = None,
     background: drawing.Background | None = None,
     title: str | None = None,
     moving: bool = False,
-) -> tuple[Sheet, float, DrawnStrips | None]:
-    """What still and moving pictures share: sheet, background, standing agents, legend; the time step of marks; strips."""
-    chosen = choose_view(cast)
+) -> tuple[Layout, float, TimelineCharts | None]:
+    """Draw what stills and animations share.
+
+    Returns
+    -------
+    layout : Layout
+    step_s : float, s
+        Between time marks.
+    charts : TimelineCharts or None
+        Of the replay; None without a driven agent.
+    """
+    chosen = choose_viewport(roles)
     projected = scenario.map.projection is not None
-    step_s = time_step_s(scenario.duration_s, len(cast.movers), _typical_speed(cast), chosen.width_m / 500)
-    outside = _outside(cast, chosen)
+    step_s = time_step_s(scenario.duration_s, len(roles.movers), _typical_speed(roles), chosen.width_m / 500)
+    outside = _outside(roles, chosen)
     overlays = {"truth": truth is not None, "replay": replay is not None}
-    hits = len(hits_of(replay)[0])
-    rows = legend_rows(cast, None if moving else step_s, hits=hits, outside=outside, **overlays)
-    story = story_of(replay, scenario, cast)
-    sheet = make_sheet(chosen, len(rows), projected=projected, foot_in=foot_in(story))
+    collisions = len(new_collisions(replay)[0])
+    rows = legend_rows(roles, None if moving else step_s, collisions=collisions, outside=outside, **overlays)
+    timeline = timeline_of(replay, scenario, roles)
+    layout = make_layout(chosen, len(rows), projected=projected, foot_in=charts_height_in(timeline))
     if background is not None:
-        drawing.draw_background(sheet.ax, background)
-    sheet.ax.set(xlim=(sheet.view.x0, sheet.view.x1), ylim=(sheet.view.y0, sheet.view.y1))
-    drawing.draw_standing(sheet.ax, cast.standing, sheet.view)
-    draw_legend(sheet, rows)
-    draw_scale_and_north(sheet, projected=projected)
-    write_title(sheet, title or scenario.name or "scenario", _subtitle(scenario, cast))
-    strips = None
-    if story is not None:
-        strips = draw_strips(sheet, story, (0.0, scenario.duration_s), moving=moving)
-    return sheet, step_s, strips
+        drawing.draw_background(layout.ax, background)
+    layout.ax.set(xlim=(layout.view.x0, layout.view.x1), ylim=(layout.view.y0, layout.view.y1))
+    drawing.draw_standing(layout.ax, roles.standing, layout.view)
+    draw_legend(layout, rows)
+    draw_scale_and_north(layout, projected=projected)
+    write_title(layout, title or scenario.name or "scenario", _subtitle(scenario, roles))
+    charts = None
+    if timeline is not None:
+        charts = draw_charts(layout, timeline, (0.0, scenario.duration_s), moving=moving)
+    return layout, step_s, charts
 
 
-def _subtitle(scenario: Scenario, cast: Cast) -> str:
-    moving = sum(moves(r.agent) for r in cast.movers if not r.is_ego)
+def _subtitle(scenario: Scenario, roles: AgentRoles) -> str:
+    moving = sum(is_moving(r.agent) for r in roles.movers if not r.is_ego)
     agents = len(scenario.others)
     parts = [f"{scenario.duration_s:.1f} s", f"{agents} agent{'' if agents == 1 else 's'}, {moving} moving"]
     if scenario.ego is None:
@@ -66,12 +75,12 @@ def _subtitle(scenario: Scenario, cast: Cast) -> str:
     return " · ".join(parts)
 
 
-def _outside(cast: Cast, view: View) -> int:
-    """How many agents are nowhere in the view as it will be shown, or nearly."""
-    agents = [r.agent for r in cast.movers] + list(cast.standing)
-    return sum(not view.holds(path(a)).any() for a in agents)
+def _outside(roles: AgentRoles, view: Viewport) -> int:
+    """Count the agents whose trajectories lie outside the view."""
+    agents = [r.agent for r in roles.movers] + list(roles.standing)
+    return sum(not view.contains(centers_xy(a)).any() for a in agents)
 
 
-def _typical_speed(cast: Cast) -> float:
-    speeds = [float(np.abs(r.agent.waypoints.speed_mps).mean()) for r in cast.movers if moves(r.agent)]
+def _typical_speed(roles: AgentRoles) -> float:
+    speeds = [float(np.abs(r.agent.waypoints.speed_mps).mean()) for r in roles.movers if is_moving(r.agent)]
     return float(np.median(speeds)) if speeds else 0.0

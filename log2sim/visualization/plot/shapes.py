@@ -1,4 +1,4 @@
-"""Geometry of what is drawn: boxes, noses, arrows, runs of a track. Arrays in, arrays out."""
+"""Shapes that are drawn: footprints, heading triangles, arrowheads, contiguous runs of a track."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from log2sim.datatypes import Agent
 from log2sim.geometry import Array, box_corners_bev
-from log2sim.visualization.plot.roles import path
-from log2sim.visualization.plot.viewport import View
+from log2sim.visualization.plot.roles import centers_xy
+from log2sim.visualization.plot.viewport import Viewport
 
-# A track that leaves the sheet by far is no reason to draw for hours.
-MOST_ARROWS = 100
+# Bounds the time for a track that extends far beyond the view.
+MAX_ARROWS = 100
 
 
-def boxes(agent: Agent, xy_m: ArrayLike, yaw_rad: ArrayLike) -> Array:
-    """Footprints (M, 4, 2) of an agent at M poses."""
+def footprints(agent: Agent, xy_m: ArrayLike, yaw_rad: ArrayLike) -> Array:
+    """Compute the footprints (M, 4, 2) of an agent at M poses."""
     return box_corners_bev(xy_m, agent.size_m[0], agent.size_m[1], yaw_rad)
 
 
-def noses(corners: Array, depth: float = 0.42) -> Array:
-    """Triangles (M, 3, 2) in the front of footprints (M, 4, 2), pointing forward; `depth` is a fraction of the length."""
+def heading_triangles(corners: Array, depth: float = 0.42) -> Array:
+    """Compute triangles (M, 3, 2) at the front of footprints (M, 4, 2); `depth` is a fraction of the length."""
     front_left, rear_left, rear_right, front_right = np.moveaxis(corners, 1, 0)
     left, right = front_left + depth * (rear_left - front_left), front_right + depth * (rear_right - front_right)
     inset = 0.2  # narrower than deep, so that it cannot be read as pointing sideways
@@ -31,34 +31,34 @@ def noses(corners: Array, depth: float = 0.42) -> Array:
     )
 
 
-def runs(keep: NDArray[np.bool_]) -> Iterator[slice]:
-    """Slices over points of a track, one a run of kept segments; `keep` (T - 1,) says which segments."""
+def contiguous_runs(keep: NDArray[np.bool_]) -> Iterator[slice]:
+    """Yield slices over points of a track, one for each run of kept segments `keep` (T - 1,)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], keep.astype(np.int8), [0]])))
     for start, stop in zip(edges[::2], edges[1::2]):
         yield slice(int(start), int(stop) + 1)
 
 
-def seen_and_filled(agent: Agent) -> tuple[list[Array], list[Array]]:
-    """Polylines of the observed parts of a track and of its filled gaps."""
-    xy, observed = path(agent), agent.waypoints.observed
-    seen = observed[:-1] & observed[1:]
-    return [xy[s] for s in runs(seen)], [xy[s] for s in runs(~seen)]
+def observed_and_filled(agent: Agent) -> tuple[list[Array], list[Array]]:
+    """Split a track into polylines of its observed parts and of its filled gaps."""
+    xy, observed = centers_xy(agent), agent.waypoints.observed
+    both = observed[:-1] & observed[1:]
+    return [xy[s] for s in contiguous_runs(both)], [xy[s] for s in contiguous_runs(~both)]
 
 
-def arrows(xy_m: Array, view: View, spacing_pt: float = 110.0, size_pt: float = 4.2) -> list[Array]:
-    """Arrowheads (4, 2) along a path, pointing the way of travel, at most one every `spacing_pt` of paper."""
+def arrows(xy_m: Array, view: Viewport, spacing_pt: float = 110.0, size_pt: float = 4.2) -> list[Array]:
+    """Compute arrowheads (4, 2) along positions (T, 2) in the direction of travel, one every `spacing_pt` points."""
     steps = np.hypot(*np.diff(xy_m, axis=0).T)
-    way = np.concatenate([[0.0], np.cumsum(steps)])
-    length = way[-1] / view.m_per_pt
+    arc = np.concatenate([[0.0], np.cumsum(steps)])
+    length = arc[-1] / view.m_per_pt
     if length < 26:
         return []
-    count = min(max(1, round(length / spacing_pt)), MOST_ARROWS)
+    count = min(max(1, round(length / spacing_pt)), MAX_ARROWS)
     size = size_pt * view.m_per_pt
     out = []
     for fraction in (np.arange(count) + 0.5) / count:
-        at = fraction * way[-1]
+        at = fraction * arc[-1]
         here, back, ahead = (
-            np.array([np.interp(s, way, xy_m[:, 0]), np.interp(s, way, xy_m[:, 1])]) for s in (at, at - size, at + size)
+            np.array([np.interp(s, arc, xy_m[:, 0]), np.interp(s, arc, xy_m[:, 1])]) for s in (at, at - size, at + size)
         )
         along = ahead - back
         if np.hypot(*along) == 0:
@@ -79,8 +79,8 @@ def arrows(xy_m: Array, view: View, spacing_pt: float = 110.0, size_pt: float = 
     return out
 
 
-def marks(agent: Agent, step_s: float) -> tuple[Array, Array]:
-    """Times (K,) that are whole multiples of `step_s` within an agent's life, and places (K, 2) there."""
+def time_marks(agent: Agent, step_s: float) -> tuple[Array, Array]:
+    """Return the multiples (K,) of `step_s` within an agent's trajectory and its positions (K, 2) at them."""
     w = agent.waypoints
     t = np.arange(np.ceil(w.t_s[0] / step_s - 1e-9), np.floor(w.t_s[-1] / step_s + 1e-9) + 1) * step_s
     state = agent.at(t) if len(t) else None
@@ -88,8 +88,8 @@ def marks(agent: Agent, step_s: float) -> tuple[Array, Array]:
     return t, xy
 
 
-def spaced(xy_m: Array, ends_m: Array, apart_m: float) -> NDArray[np.bool_]:
-    """Mask (K,) of places along a path that keep a distance from its ends and from the place chosen before."""
+def spaced_apart(xy_m: Array, ends_m: Array, apart_m: float) -> NDArray[np.bool_]:
+    """Mark (K,) the positions that keep a distance from the ends (E, 2) and from the previous marked one."""
     chosen = np.zeros(len(xy_m), dtype=bool)
     others = ends_m
     for k, place in enumerate(xy_m):

@@ -1,4 +1,4 @@
-"""Colors, line widths and letters of the pictures, and text that the font can set."""
+"""Colors, markers and the font of the pictures."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ FRAME = "#B9C1CB"
 PARKED_FACE, PARKED_EDGE = "#D5DAE1", "#A9B2BE"
 PAPER = "#FFFFFF"
 ALARM = "#C8102E"
-HIT: dict[str, Any] = {"marker": "X", "ms": 8.5, "mfc": ALARM, "mec": PAPER, "mew": 0.9}
-"""Collisions that the log does not have."""
+COLLISION_MARK: dict[str, Any] = {"marker": "X", "ms": 8.5, "mfc": ALARM, "mec": PAPER, "mew": 0.9}
+"""Mark of collisions that do not occur in the log."""
 
 PALETTE = (
     "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#882255", "#999933", "#332288", "#44AA99",
     "#AA4499", "#117733", "#CC6677", "#6699CC", "#A6761D", "#661100", "#5E9B2F", "#8C6BB1", "#2F6F7E", "#B8860B",
 )  # fmt: skip
-"""Colors told apart with color vision deficiency: Okabe and Ito (2008) without black and yellow, then Tol's muted set
+"""Colors distinguishable with color vision deficiency: Okabe and Ito (2008) without black and yellow, then Tol's muted set
 (2021) and four more of other lightness."""
 
 MARKERS = {"vehicle": "s", "two_wheeler": "D", "pedestrian": "o", "other": "^"}
@@ -38,12 +38,12 @@ FONT = "DejaVu Sans"
 
 
 def halo(width_pt: float = 2.2) -> list[AbstractPathEffect]:
-    """A white rim that keeps letters readable on lines and pictures."""
+    """Make a white outline that keeps letters readable on lines and pictures."""
     return [withStroke(linewidth=width_pt, foreground=PAPER, alpha=0.9)]
 
 
 def printable(text: str, longest: int = 80) -> str:
-    """`text` in one line, shortened, with "?" for what the font lacks, so that nothing is drawn as an empty box."""
+    """Put text on one line of at most `longest` letters, with "?" for characters that the font lacks."""
     known = _characters()
     line = "".join(c if ord(c) in known else "?" for c in " ".join(text.split()))
     return line if len(line) <= longest else line[: longest - 1] + "…"

@@ -1,4 +1,4 @@
-"""The picture of a scenario from above: who drove where, still or moving."""
+"""Top-down pictures of a scenario: stills and animations."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from log2sim.datatypes import Scenario
 from log2sim.documents import refuse_existing, replaced
 from log2sim.errors import ConfigError
 from log2sim.visualization.plot import drawing
-from log2sim.visualization.plot.collisions import hits_of
+from log2sim.visualization.plot.collisions import new_collisions
 from log2sim.visualization.plot.layout import (
-    Sheet,
+    Layout,
 )
-from log2sim.visualization.plot.roles import Cast, assign
-from log2sim.visualization.plot.scene import base
+from log2sim.visualization.plot.roles import AgentRoles, assign_roles
+from log2sim.visualization.plot.scene import draw_base
 
 STILL, ANIMATED = (".png", ".svg", ".pdf"), (".gif", ".mp4")
 
@@ -32,22 +32,24 @@ def plot_tracks(
     overwrite: bool = False,
     dpi: int = 200,
 ) -> None:
-    """Draw a scenario from above into a file: a still for .png, .svg and .pdf, moving for .gif and .mp4.
+    """Draw a scenario from above into a file: a still for .png, .svg and .pdf, an animation for .gif and .mp4.
 
     Parameters
     ----------
     replay : log2sim.simulation.result.Replay or None
-        Laid over; what the ego did and was told, or the one farthest from its path, goes into strips below the map.
+        Drawn over the scenario; charts below the map show commands and errors of the ego, else of the agent farthest from
+        its path.
     truth : Scenario or None
         Brought to the scenario's start and map.
     background : TopdownPicture or None
-        A picture of the ground in the map frame, laid under everything.
-    dpi : dots per inch of a .png; the sheet is 10 inches wide.
+        A picture of the ground in the map frame, drawn below everything.
+    dpi : int
+        Dots per inch of a .png, which is 10 inches wide.
 
     Raises
     ------
     ConfigError
-        When the name ends in something else, the file exists and `overwrite` is False, or it cannot be written.
+        When the name has another suffix, the file exists and `overwrite` is False, or it cannot be written.
     ScenarioError
         When the truth's map has another projection.
     """
@@ -59,43 +61,43 @@ def plot_tracks(
             f"not in '{out_path.suffix}'"
         )
     refuse_existing(out_path, overwrite=overwrite)
-    cast = assign(scenario)
+    roles = assign_roles(scenario)
     truth = None if truth is None else truth.aligned_to(scenario)
     if suffix in ANIMATED:
         from log2sim.visualization.plot.animation import write_animation
 
-        write_animation(scenario, cast, out_path, replay=replay, truth=truth, background=background, title=title)
+        write_animation(scenario, roles, out_path, replay=replay, truth=truth, background=background, title=title)
         return
-    sheet = still(scenario, cast, replay=replay, truth=truth, background=background, title=title)
-    # Element names in an SVG are random unless salted, and both formats carry the date unless told not to.
+    layout = still(scenario, roles, replay=replay, truth=truth, background=background, title=title)
+    # The same scenario gives the same bytes: no random element names, no dates.
     metadata: dict[str, dict[str, Any]] = {
         ".svg": {"Date": None},
         ".pdf": {"CreationDate": None},
         ".png": {"Software": None},
     }
     with replaced(out_path) as temporary, matplotlib.rc_context({"svg.hashsalt": "log2sim"}):
-        sheet.figure.savefig(temporary, format=suffix[1:], dpi=dpi, metadata=metadata[suffix])
+        layout.figure.savefig(temporary, format=suffix[1:], dpi=dpi, metadata=metadata[suffix])
 
 
 def still(
     scenario: Scenario,
-    cast: Cast,
+    roles: AgentRoles,
     *,
     replay: Any = None,
     truth: Scenario | None = None,
     background: drawing.Background | None = None,
     title: str | None = None,
-) -> Sheet:
-    """The sheet of a still picture."""
-    sheet, step_s, _ = base(scenario, cast, replay=replay, truth=truth, background=background, title=title)
+) -> Layout:
+    """Draw a still picture."""
+    layout, step_s, _ = draw_base(scenario, roles, replay=replay, truth=truth, background=background, title=title)
     overlaid = truth is not None or replay is not None
-    drawing.draw_tracks(sheet.ax, cast, sheet.view, step_s, alpha=0.45 if overlaid else 1.0)
-    ghosts = None if overlaid or drawing.view_is_crowded(cast) else step_s
-    drawing.draw_ends(sheet.ax, cast, sheet.view, ghosts_step_s=ghosts)
+    drawing.draw_tracks(layout.ax, roles, layout.view, step_s, alpha=0.45 if overlaid else 1.0)
+    ghosts = None if overlaid or drawing.view_is_crowded(roles) else step_s
+    drawing.draw_ends(layout.ax, roles, layout.view, ghosts_step_s=ghosts)
     if truth is not None:
-        drawing.draw_truth(sheet.ax, truth)
+        drawing.draw_truth(layout.ax, truth)
     if replay is not None:
-        drawing.draw_replay(sheet.ax, replay, cast)
-        drawing.draw_hits(sheet.ax, hits_of(replay)[1])
-    drawing.draw_labels(sheet.ax, cast, sheet.view, step_s)
-    return sheet
+        drawing.draw_replay(layout.ax, replay, roles)
+        drawing.draw_collisions(layout.ax, new_collisions(replay)[1])
+    drawing.draw_labels(layout.ax, roles, layout.view, step_s)
+    return layout

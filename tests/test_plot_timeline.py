@@ -1,4 +1,4 @@
-"""Strips below the map, marks of collisions, and animations that keep their colors."""
+"""Charts below the map, marks of collisions, and animations that keep their colors."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from log2sim.datatypes import Scenario
 from log2sim.simulation.policy import Controls
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
-from log2sim.visualization.plot.animation import WAY_ALPHA, Pace, Stage
-from log2sim.visualization.plot.collisions import hits_of
-from log2sim.visualization.plot.layout import Sheet
-from log2sim.visualization.plot.roles import assign
-from log2sim.visualization.plot.scene import base
+from log2sim.visualization.plot.animation import TRACK_ALPHA, AnimatedArtists, FrameTiming
+from log2sim.visualization.plot.collisions import new_collisions
+from log2sim.visualization.plot.layout import Layout
+from log2sim.visualization.plot.roles import assign_roles
+from log2sim.visualization.plot.scene import draw_base
 from log2sim.visualization.plot.style import ALARM
-from log2sim.visualization.plot.time_series import story_of
+from log2sim.visualization.plot.time_series import timeline_of
 from log2sim.visualization.plot.tracks import plot_tracks, still
 
 
@@ -43,29 +43,29 @@ def reckless() -> tuple[Scenario, Replay]:
     return scenario, replay(scenario, ego=lambda seen: Controls(2.0, 0.0002))
 
 
-def sheet_of(scenario: Scenario, result: Replay | None) -> Sheet:
-    return still(scenario, assign(scenario), replay=result)
+def layout_of(scenario: Scenario, result: Replay | None) -> Layout:
+    return still(scenario, assign_roles(scenario), replay=result)
 
 
-def strip_axes(sheet: Sheet) -> list:
-    return [ax for ax in sheet.figure.axes if ax.get_legend() is not None]
+def chart_axes(layout: Layout) -> list:
+    return [ax for ax in layout.figure.axes if ax.get_legend() is not None]
 
 
-def test_the_strips_are_of_the_ego_and_else_of_the_worst_follower() -> None:
+def test_the_charts_are_of_the_ego_and_else_of_the_worst_follower() -> None:
     scenario = scene()
-    story = story_of(replay(scenario), scenario, assign(scenario))
-    assert story is not None
-    assert story.role.agent.id == "ego"
+    timeline = timeline_of(replay(scenario), scenario, assign_roles(scenario))
+    assert timeline is not None
+    assert timeline.role.agent.id == "ego"
     scenario = scene(ego="car")
     result = replay(scenario)
     worst = {k: v["cross_track_max_m"] for k, v in result.metrics["by_agent"].items()}
-    story = story_of(result, scenario, assign(scenario))
-    assert story is not None
+    timeline = timeline_of(result, scenario, assign_roles(scenario))
+    assert timeline is not None
     assert worst["turns"] > worst["car"]
-    assert story.role.agent.id == "turns"
+    assert timeline.role.agent.id == "turns"
 
 
-def test_where_only_the_log_drives_there_are_no_strips() -> None:
+def test_where_only_the_log_drives_there_are_no_charts() -> None:
     scenario = scene()
     old = replay(scenario)
     old = dataclasses.replace(
@@ -73,16 +73,16 @@ def test_where_only_the_log_drives_there_are_no_strips() -> None:
         agents=tuple(dataclasses.replace(a, commands=None, cross_track_m=None, along_track_m=None) for a in old.agents),
     )
     for result in (None, replay(scenario, mode="exact"), old):
-        assert story_of(result, scenario, assign(scenario)) is None
-        assert strip_axes(sheet_of(scenario, result)) == []
+        assert timeline_of(result, scenario, assign_roles(scenario)) is None
+        assert chart_axes(layout_of(scenario, result)) == []
 
 
-def test_the_strips_show_what_was_told_done_and_missed() -> None:
+def test_the_charts_show_commands_response_and_errors() -> None:
     scenario, result = reckless()
     ego = result.agent("ego")
     by_label = {
         (ax.get_legend().get_title().get_text().split(" (")[0], k): line
-        for ax in strip_axes(sheet_of(scenario, result))
+        for ax in chart_axes(layout_of(scenario, result))
         for k, line in enumerate([a for a in ax.lines if len(a.get_xdata()) > 2])
     }
     assert ego.commands is not None
@@ -102,33 +102,33 @@ def test_who_walks_has_no_pedal_and_no_wheel() -> None:
     t = np.arange(0, 41) * 0.1
     walker = agent_from(t, 1.2 * t, 0 * t, 0 * t, np.full(41, 1.2), id="w", category="pedestrian", offset_m=0)
     scenario = scenario_of(walker)
-    story = story_of(replay(scenario), scenario, assign(scenario))
-    assert story is not None
-    assert [s.name for s in story.strips] == ["speed", "off the log"]
+    timeline = timeline_of(replay(scenario), scenario, assign_roles(scenario))
+    assert timeline is not None
+    assert [s.name for s in timeline.charts] == ["speed", "off the log"]
 
 
 def test_in_reverse_the_pedal_is_that_of_the_gear() -> None:
     scenario = scenario_of(MANEUVERS["reversing"]())
     result = replay(scenario)
-    story = story_of(result, scenario, assign(scenario))
-    assert story is not None
-    told, done = next(s for s in story.strips if s.name == "pedal").lines
+    timeline = timeline_of(result, scenario, assign_roles(scenario))
+    assert timeline is not None
+    commands, response = next(s for s in timeline.charts if s.name == "pedal").lines
     agent = result.agents[0]
     moving = (agent.t_s > 5.4) & (agent.t_s < 11.5)
-    assert np.corrcoef(told.values[moving], done.values[moving])[0, 1] > 0.8
+    assert np.corrcoef(commands.values[moving], response.values[moving])[0, 1] > 0.8
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("driver", ["pid", "policy"])
 def test_no_writing_of_the_sheet_covers_other_writing(driver: str) -> None:
     scenario, result = reckless()
-    sheet = sheet_of(scenario, result if driver == "policy" else replay(scenario))
-    sheet.canvas.draw()
-    writing = [t for t in sheet.figure.findobj(Text) if t.get_text().strip() and t.get_visible()]
+    layout = layout_of(scenario, result if driver == "policy" else replay(scenario))
+    layout.canvas.draw()
+    writing = [t for t in layout.figure.findobj(Text) if t.get_text().strip() and t.get_visible()]
     extents = [t.get_window_extent() for t in writing]
-    page = sheet.figure.bbox
+    page = layout.figure.bbox
     shown = [(t, e) for t, e in zip(writing, extents) if page.x0 < e.x1 and e.x0 < page.x1]
-    ticks = {id(label) for ax in sheet.figure.axes for label in [*ax.get_xticklabels(), *ax.get_yticklabels()]}
+    ticks = {id(label) for ax in layout.figure.axes for label in [*ax.get_xticklabels(), *ax.get_yticklabels()]}
     for k, (a, ea) in enumerate(shown):
         if id(a) not in ticks:
             assert ea.x0 >= 0
@@ -144,48 +144,48 @@ def test_no_writing_of_the_sheet_covers_other_writing(driver: str) -> None:
 @pytest.mark.slow
 def test_the_map_keeps_its_size_above_the_strips() -> None:
     scenario, result = reckless()
-    plain, with_strips = sheet_of(scenario, None), sheet_of(scenario, result)
+    plain, with_strips = layout_of(scenario, None), layout_of(scenario, result)
     one, other = (s.ax.get_window_extent() for s in (plain, with_strips))
     assert (other.width, other.height) == pytest.approx((one.width, one.height))
     assert with_strips.figure.bbox.y1 - other.y1 == pytest.approx(plain.figure.bbox.y1 - one.y1)
-    assert all(ax.get_window_extent().y1 < other.y0 for ax in strip_axes(with_strips))
+    assert all(ax.get_window_extent().y1 < other.y0 for ax in chart_axes(with_strips))
 
 
 def test_collisions_that_the_log_has_not_are_marked_between_the_boxes() -> None:
     scenario, result = reckless()
     (event,) = [e for e in result.metrics["collisions"] if not e["in_log"]]
-    times, places = hits_of(result)
+    times, places = new_collisions(result)
     assert times.tolist() == [event["t_s"]]
     ego = result.agent("ego")
     middle = (np.interp(event["t_s"], ego.t_s, ego.x_m) + 120.0) / 2
     assert places[0, 0] == pytest.approx(middle)
     assert "collides, not in the log" in [
-        t.get_text() for t in sheet_of(scenario, result).figure.legends[0].get_texts()
+        t.get_text() for t in layout_of(scenario, result).figure.legends[0].get_texts()
     ]
-    assert len(hits_of(replay(scenario))[0]) == 0
+    assert len(new_collisions(replay(scenario))[0]) == 0
     in_log = dataclasses.replace(result, metrics={**result.metrics, "collisions": [{**event, "in_log": True}]})
-    assert len(hits_of(in_log)[0]) == 0
+    assert len(new_collisions(in_log)[0]) == 0
 
 
 def test_the_cursor_moves_and_marks_come_when_it_hits() -> None:
     scenario, result = reckless()
-    cast = assign(scenario)
-    sheet, _, strips = base(scenario, cast, replay=result, moving=True)
-    assert strips is not None
-    stage = Stage(sheet, cast, result, None, Pace(2, 1.0), strips)
-    sheet.canvas.draw()
-    (hit_s,) = hits_of(result)[0]
+    roles = assign_roles(scenario)
+    layout, _, charts = draw_base(scenario, roles, replay=result, moving=True)
+    assert charts is not None
+    artists = AnimatedArtists(layout, roles, result, None, FrameTiming(2, 1.0), charts)
+    layout.canvas.draw()
+    (hit_s,) = new_collisions(result)[0]
     for t_s, marks in ((hit_s - 0.1, 0), (hit_s + 0.1, 1)):
-        stage.show(t_s)
-        assert len(stage.hits.get_xdata()) == marks
-        for _, strip, cursor, dot, value in strips.moving:
+        artists.show(t_s)
+        assert len(artists.collisions.get_xdata()) == marks
+        for _, strip, cursor, dot, value in charts.moving:
             line = strip.lines[-1]
             assert cursor.get_xdata()[0] == t_s
             now = np.interp(t_s, line.t_s, line.values)
             assert dot.get_ydata()[0] == pytest.approx(now)
             assert float(value.get_text().replace("−", "-").strip("°kmh/s²").split()[0]) == pytest.approx(now, abs=0.06)
-    stage.show(scenario.duration_s + 100)
-    assert len(strips.moving[0][3].get_xdata()) == 0
+    artists.show(scenario.duration_s + 100)
+    assert len(charts.moving[0][3].get_xdata()) == 0
 
 
 @pytest.mark.slow
@@ -200,8 +200,8 @@ def test_a_gif_keeps_every_frame_and_the_colors_that_mean_something(tmp_path: Pa
         for frame in (0, 30, 60):
             moving.seek(frame)
             pixels = np.asarray(moving.convert("RGB")).reshape(-1, 3).astype(int)
-            for color in [role.color for role in assign(scenario).movers] + [ALARM]:
+            for color in [role.color for role in assign_roles(scenario).movers] + [ALARM]:
                 full = 255 * np.array(to_rgb(color))
-                for alpha in (1.0, WAY_ALPHA) if color != ALARM else (1.0,):
+                for alpha in (1.0, TRACK_ALPHA) if color != ALARM else (1.0,):
                     near = np.abs(pixels - (alpha * full + (1 - alpha) * 255)).max(axis=1) <= 6
                     assert near.sum() > 10, (frame, color, alpha)

@@ -1,4 +1,4 @@
-"""What the page is given: agents as short columns of integers, in the colors of the pictures."""
+"""The document of a page: agents as short columns of integers, in the colors of the pictures."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from log2sim.datatypes import GROUP_OF, Scenario
 from log2sim.errors import ConfigError
-from log2sim.visualization.plot.roles import Role, assign, moves
+from log2sim.visualization.plot.roles import AgentRole, assign_roles, is_moving
 
 # Columns are stored as whole numbers of 0.1 ms, mm, 0.1 mrad and mm/s.
 SCALES = {"t_s": 1e4, "x_m": 1e3, "y_m": 1e3, "yaw_rad": 1e4, "speed_mps": 1e3}
-MOST_ROWS = 3_000_000
-"""Waypoints of all layers together; a page of so many has about 50 MB."""
+MAX_ROWS = 3_000_000
+"""Waypoints of all layers together; a page with this many has about 50 MB."""
 
 
-def pack(scenario: Scenario, truth: Scenario | None = None, replay: Any = None) -> dict[str, Any]:
-    """The document of a page: name, span of time and one layer each for the log, the truth and the replay.
+def page_document(scenario: Scenario, truth: Scenario | None = None, replay: Any = None) -> dict[str, Any]:
+    """Assemble the document of a page: name, span of time and one layer each for the log, the truth and the replay.
 
     Raises
     ------
@@ -31,16 +31,17 @@ def pack(scenario: Scenario, truth: Scenario | None = None, replay: Any = None) 
     layers = {"log": list(_log(scenario))}
     if truth is not None:
         layers["truth"] = [
-            _entry(a, a.waypoints, standing=not moves(a), static=a.static) for a in truth.aligned_to(scenario).agents
+            _entry(a, a.waypoints, standing=not is_moving(a), static=a.static)
+            for a in truth.aligned_to(scenario).agents
         ]
     if replay is not None:
         stand = {a.id: a.driver == "static" for a in replay.agents}
         layers["replay"] = [_entry(a, a, standing=stand[a.id], static=stand[a.id]) for a in replay.agents if len(a.t_s)]
     entries = [e for layer in layers.values() for e in layer]
     rows = sum(len(e["t_s"]) for e in entries)
-    if rows > MOST_ROWS:
+    if rows > MAX_ROWS:
         raise ConfigError(
-            f"{rows} waypoints are more than the {MOST_ROWS} that a page can hold; take fewer agents, "
+            f"{rows} waypoints are more than the {MAX_ROWS} that a page can hold; take fewer agents, "
             f"such as with `log2sim edit --only`"
         )
     spans = [_span(e) for name in ("log", "replay") for e in layers.get(name, ())]
@@ -55,48 +56,51 @@ def pack(scenario: Scenario, truth: Scenario | None = None, replay: Any = None) 
 
 
 def _events(replay: Any) -> list[dict[str, Any]]:
-    """Collisions of a replay in order of time."""
+    """List the collisions of a replay in order of time."""
     keys = ("t_s", "until_s", "agents", "in_log")
     return [{k: event[k] for k in keys} for event in replay.metrics.get("collisions", ())]
 
 
 def _log(scenario: Scenario) -> Iterator[dict[str, Any]]:
-    """Entries of the scenario's agents in the order of the pictures' legend: movers with their colors, then what stands."""
-    cast = assign(scenario)
-    for role in cast.movers:
+    """Yield the scenario's agents in the order of the pictures' legend: movers with their colors, then stationary ones."""
+    roles = assign_roles(scenario)
+    for role in roles.movers:
         yield {**_entry(role.agent, role.agent.waypoints, standing=False, static=False), **_colors(role)}
-    for agent in cast.standing:
+    for agent in roles.standing:
         yield _entry(agent, agent.waypoints, standing=True, static=agent.static)
 
 
-def _colors(role: Role) -> dict[str, Any]:
+def _colors(role: AgentRole) -> dict[str, Any]:
     return {"ego": True} if role.is_ego else {"color": role.color, "leading": role.leading}
 
 
 def _entry(agent: Any, columns: Any, *, standing: bool, static: bool) -> dict[str, Any]:
-    """An agent of any layer, `columns` being its waypoints or the rows of a replay; `standing` ones are drawn quietly."""
+    """Make the entry of an agent of any layer.
+
+    `columns` are its waypoints or the rows of a replay; `standing` ones are drawn in muted colors.
+    """
     entry = {
         "id": agent.id,
         "category": agent.category,
         "group": GROUP_OF[agent.category],
         "size_m": [round(float(v), 3) for v in agent.size_m[:2]],
         "standing": standing,
-        "always": static and len(columns.t_s) == 1,  # one pose for good
-        **{k: shortened(getattr(columns, k), scale) for k, scale in SCALES.items() if k != "yaw_rad"},
-        "yaw_rad": shortened(np.unwrap(columns.yaw_rad), SCALES["yaw_rad"]),
+        "always": static and len(columns.t_s) == 1,  # one pose during the whole scenario
+        **{k: second_differences(getattr(columns, k), scale) for k, scale in SCALES.items() if k != "yaw_rad"},
+        "yaw_rad": second_differences(np.unwrap(columns.yaw_rad), SCALES["yaw_rad"]),
     }
     observed = getattr(columns, "observed", None)
     return entry if observed is None else {**entry, "filled": _filled(observed)}
 
 
-def shortened(values: ArrayLike, scale: float) -> list[int]:
-    """Second differences of a column (T,) in whole units of 1 / `scale`; summed up twice they give it back exactly."""
+def second_differences(values: ArrayLike, scale: float) -> list[int]:
+    """Compute second differences (T,) of a column in whole units of 1 / `scale`; two cumulative sums restore it exactly."""
     whole = np.rint(np.asarray(values, dtype=np.float64) * scale).astype(np.int64)
-    return np.diff(whole, n=2, prepend=[0, 0]).tolist()
+    return list(np.diff(whole, n=2, prepend=[0, 0]).tolist())
 
 
 def _filled(observed: NDArray[np.bool_]) -> list[int]:
-    """First and last waypoint of each stretch between waypoints that were not both observed, one after the other."""
+    """List the first and last waypoint of each run of segments that are not observed at both ends, one after the other."""
     gap = ~(observed[:-1] & observed[1:])
     return np.flatnonzero(np.diff(gap.astype(np.int8), prepend=0, append=0)).tolist()
 
@@ -107,7 +111,7 @@ def _span(entry: dict[str, Any]) -> tuple[float, float]:
 
 
 def _origin(scenario: Scenario) -> str | None:
-    """Where on Earth the map's origin lies, for people."""
+    """Format latitude and longitude of the map's origin; None when unknown."""
     m = scenario.map
     known = m.latitude_deg is not None and m.longitude_deg is not None
     return f"{m.latitude_deg:.5f}°, {m.longitude_deg:.5f}°" if known else None
