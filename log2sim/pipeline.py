@@ -17,7 +17,7 @@ from log2sim.datatypes import Log, Scenario
 from log2sim.errors import NothingToReconstruct
 from log2sim.perception.detect.detectors import Detector, create_detector
 from log2sim.perception.first_pass import Observations, observe
-from log2sim.perception.homography_stage import fit_cameras, locate_the_rest
+from log2sim.perception.homography_stage import estimation_options, fit_homographies, place_by_homography
 from log2sim.perception.sync import Schedule, synchronize
 from log2sim.plan import Plan, make_plan, plan_ticks
 from log2sim.report import make_report
@@ -110,17 +110,10 @@ def conclude(
     """The second pass: from what was seen, which stays as it is, to the scenario and the report."""
     timeline, costs = Timeline(schedule.t_ns, int(schedule.t_ns[0])), Costs()
     with clock.stage("topdown"):
-        plan, homographies = fit_cameras(
-            log,
-            schedule,
-            seen,
-            plan,
-            config.topdown.method,
-            np.random.default_rng(config.seed),
-            costs,
-            hypotheses=config.topdown.hypotheses or None,
+        plan, homographies = fit_homographies(
+            log, seen, plan, estimation_options(config.topdown), rng=np.random.default_rng(config.seed), costs=costs
         )
-        measurements = locate_the_rest(log, schedule, seen, homographies, across=plan.keeps("fuse"))
+        measurements = place_by_homography(log, seen, homographies, across=plan.keeps("fuse"))
     with clock.stage("track"):
         tracks = track(
             measurements,

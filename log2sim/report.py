@@ -12,8 +12,7 @@ from log2sim.datatypes import Log, Scenario
 from log2sim.documents import rounded
 from log2sim.geometry import NS_PER_S
 from log2sim.perception.first_pass import Observations
-from log2sim.perception.homography.correspondences import jitter_m
-from log2sim.perception.homography_stage import CameraGround
+from log2sim.perception.homography_stage import CameraHomography
 from log2sim.perception.sync import Schedule
 from log2sim.plan import Plan
 from log2sim.stage_clock import StageClock
@@ -28,7 +27,7 @@ def make_report(
     config: Config,
     plan: Plan,
     seen: Observations,
-    homographies: Mapping[str, CameraGround],
+    homographies: Mapping[str, CameraHomography],
     scenario: Scenario,
     clock: StageClock,
 ) -> dict[str, Any]:
@@ -66,7 +65,7 @@ def _without_pose(log: Log, schedule: Schedule) -> dict[str, int]:
     return counts
 
 
-def _homography_entry(ground: CameraGround, method: str) -> dict[str, Any]:
+def _homography_entry(ground: CameraHomography, method: str) -> dict[str, Any]:
     fit = ground.fit
     return {
         "method": method,
@@ -76,7 +75,7 @@ def _homography_entry(ground: CameraGround, method: str) -> dict[str, Any]:
         "correspondences": len(fit.inliers),
         "inliers": int(fit.inliers.sum()),
         "error_m": rounded(fit.error_m, 4),
-        "jitter_m": rounded(jitter_m(fit), 4),
+        "jitter_m": rounded(fit.jitter_m, 4),
         "condition": rounded(fit.condition, 3),
     }
 

@@ -17,8 +17,10 @@ from log2sim.datatypes import Agent, Log, Stream, Waypoints
 from log2sim.errors import RecordError
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.fusion import fuse
-from log2sim.perception.homography.correspondences import Correspondences, fit_camera
-from log2sim.perception.homography_stage import CameraGround
+from log2sim.perception.homography.camera_fit import fit_camera
+from log2sim.perception.homography.correspondences import Correspondences
+from log2sim.perception.homography.estimate import EstimationOptions
+from log2sim.perception.homography_stage import CameraHomography
 from log2sim.perception.lidar.cloud import deskew, transform_rigidly
 from log2sim.perception.sync import Schedule
 from log2sim.plan import Plan
@@ -32,7 +34,7 @@ def settle(
     log: Log,
     schedule: Schedule,
     seen: Observations,
-    grounds: Mapping[str, CameraGround],
+    grounds: Mapping[str, CameraHomography],
     agents: Sequence[Agent],
     clock: StageClock,
     costs: Costs,
@@ -120,7 +122,7 @@ def _compensation(plan: Plan, log: Log, seen: Observations) -> Plan:
     return plan.saved("compensate", left_out * each, _estimate(each, f"a sweep of {name}", 1, left_out))
 
 
-def _homographies(plan: Plan, seen: Observations, grounds: Mapping[str, CameraGround], costs: Costs) -> Plan:
+def _homographies(plan: Plan, seen: Observations, grounds: Mapping[str, CameraHomography], costs: Costs) -> Plan:
     left_out = [c for c in plan.cameras if c not in grounds and (seen.feet.get(c) or seen.ground.get(c))]
     if not left_out:
         return plan
@@ -138,7 +140,7 @@ def _homographies(plan: Plan, seen: Observations, grounds: Mapping[str, CameraGr
     rows = np.linspace(0, len(most.uv) - 1, min(len(most.uv), PROBED_CORRESPONDENCES)).astype(np.intp)
     few = Correspondences(most.uv[rows], most.xy_ego[rows], most.tick[rows])
     rng = np.random.default_rng(0)
-    each = seconds_of(lambda: fit_camera(few, Correspondences.join([]), method="time-aware", rng=rng)) / len(rows)
+    each = seconds_of(lambda: fit_camera(few, Correspondences.join([]), EstimationOptions(), rng=rng)) / len(rows)
     count = sum(len(c.uv) for c in known)
     return plan.saved("homography", count * each, _estimate(each, "a correspondence in a short fit", len(rows), count))
 

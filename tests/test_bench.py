@@ -26,15 +26,15 @@ from log2sim.evaluation.bench.runs import Bed, look, make_bed
 from log2sim.evaluation.bench.scores import CUT_M, Scope, jitter, judge_scenario
 from log2sim.evaluation.bench.settings import choices, make_grid
 from log2sim.evaluation.bench.shared_detections import detect_once
-from log2sim.geometry import Array, Camera
+from log2sim.geometry import Array, Camera, apply_homography
 from log2sim.perception.detect.classes import COCO_80
 from log2sim.perception.detect.layouts import LAYOUTS
 from log2sim.perception.detect.onnx_detector import OnnxDetector
 from log2sim.perception.detect.onnx_model import OnnxModel
 from log2sim.perception.detect.preparation import InputSpec
 from log2sim.perception.first_pass import Observations
-from log2sim.perception.homography.estimate import HomographyFit, apply_homography
-from log2sim.perception.homography_stage import CameraGround, calibrated_ground
+from log2sim.perception.homography.fit import HomographyFit
+from log2sim.perception.homography_stage import CameraHomography, calibrated_homography
 from log2sim.pipeline import schedule_of
 from log2sim.plan import make_plan
 
@@ -279,7 +279,7 @@ def test_a_right_homography_has_no_error_and_a_shifted_one_its_shift(
     (log, truth), (bed, seen, _) = tiny, first_pass
     known = true_places(log, bed.schedule, seen, truth, when="imaged")
     held = hold_out(log, bed.schedule, seen, known, np.random.default_rng(0))
-    base = calibrated_ground(log, log.cameras["front"])
+    base = calibrated_homography(log, log.cameras["front"])
     assert base is not None
     uv = [apply_homography(np.linalg.inv(base.ground_H_image), f.xy_ego)[0] for f in held.feet["front"]]
     exact = replace(held, feet={"front": [replace(f, uv=p) for f, p in zip(held.feet["front"], uv, strict=True)]})
@@ -287,7 +287,7 @@ def test_a_right_homography_has_no_error_and_a_shifted_one_its_shift(
     def judged(shift_m: float) -> dict[str, Any]:
         shift = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, shift_m], [0.0, 0.0, 1.0]])
         fit = replace(base, ground_H_image=shift @ base.ground_H_image)
-        return judge_placed(log, bed.schedule, exact, {"front": CameraGround(log.cameras["front"], fit, "")}).figures
+        return judge_placed(log, exact, {"front": CameraHomography(log.cameras["front"], fit, "")}).figures
 
     assert judged(0.0)["error_m"] == pytest.approx(0.0, abs=1e-6)
     assert judged(0.0)["placed_share"] == 1.0
@@ -299,7 +299,7 @@ def test_a_right_homography_has_no_error_and_a_shifted_one_its_shift(
 def test_a_tick_has_its_own_homography_or_none() -> None:
     each = np.stack([np.eye(3), np.full((3, 3), np.nan)])
     fit = HomographyFit(True, "", 5 * np.eye(3), np.ones(4, bool), 0.1, 1.0, np.array([3, 4]), each)
-    ground = CameraGround(Camera("c", 10, 10, np.eye(3), "ego", np.eye(4)), fit, "obstacles")
+    ground = CameraHomography(Camera("c", 10, 10, np.eye(3), "ego", np.eye(4)), fit, "obstacles")
     assert at_tick(ground, 3).fit.ground_H_image[0, 0] == 1.0
     assert not at_tick(ground, 4).fit.ok
     assert not at_tick(ground, 9).fit.ok

@@ -9,12 +9,17 @@ import pytest
 from worlds import Solid, camera_ahead, outline_px, scan, standing
 
 from log2sim.datatypes import TYPICAL_SIZE_M, Log, Measurements, Obstacles, Stream
-from log2sim.geometry import PoseTrack, apply, inverse, project, rotation_from_rpy, transform
+from log2sim.geometry import PoseTrack, apply, apply_homography, inverse, project, rotation_from_rpy, transform
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography.correspondences import Correspondences
-from log2sim.perception.homography.estimate import apply_homography, refused
-from log2sim.perception.homography_stage import CameraGround, calibrated_ground, fit_cameras, locate_the_rest
-from log2sim.perception.sync import synchronize
+from log2sim.perception.homography.estimate import EstimationOptions
+from log2sim.perception.homography.fit import refused_fit
+from log2sim.perception.homography_stage import (
+    CameraHomography,
+    calibrated_homography,
+    fit_homographies,
+    place_by_homography,
+)
 from log2sim.plan import Plan, Step
 
 T0_NS = 1_700_000_000_000_000_000
@@ -58,7 +63,7 @@ def unplaced(boxes_px, t_ns=T0_NS, category="car", camera="front"):
 @pytest.mark.parametrize(("pitch", "roll"), [(0.0, 0.0), (0.08, 0.03), (-0.04, -0.1)])
 def test_the_calibrations_homography_undoes_the_projection_of_flat_ground(pitch, roll, ground_z):
     camera = tilted(pitch, roll)
-    fit = calibrated_ground(log_with(camera, ground_z=ground_z), camera)
+    fit = calibrated_homography(log_with(camera, ground_z=ground_z), camera)
     rng = np.random.default_rng(0)
     ground = np.column_stack([rng.uniform(5, 60, 300), rng.uniform(-20, 20, 300), np.full(300, ground_z)])
     uv, seen = project(camera, apply(inverse(camera.mount_T_cam), ground))
@@ -72,7 +77,7 @@ def test_the_calibrations_homography_undoes_the_projection_of_flat_ground(pitch,
 
 def test_pixels_above_the_horizon_have_no_ground():
     camera = tilted(0.0)
-    fit = calibrated_ground(log_with(camera), camera)
+    fit = calibrated_homography(log_with(camera), camera)
     _, below = apply_homography(fit.ground_H_image, np.array([[600.0, 299.0], [600.0, 301.0], [0.0, 0.0]]))
     assert below.tolist() == [False, True, False]
 
@@ -80,14 +85,14 @@ def test_pixels_above_the_horizon_have_no_ground():
 @pytest.mark.parametrize("at", [(1.5, 0.0, 0.0), (1.5, 0.0, 0.1), (1.5, 0.0, -1.0)])
 def test_a_camera_on_the_ground_or_below_has_no_homography(at):
     camera = tilted(at=at)
-    assert calibrated_ground(log_with(camera), camera) is None
+    assert calibrated_homography(log_with(camera), camera) is None
     raised = tilted(at=(at[0], at[1], at[2] + 0.7))
-    assert calibrated_ground(log_with(raised, ground_z=0.7), raised) is None
+    assert calibrated_homography(log_with(raised, ground_z=0.7), raised) is None
 
 
 def fit(log, seen, plan=None, method="time-aware"):
-    schedule = synchronize(log, ("front",))
-    return fit_cameras(log, schedule, seen, plan or plan_with(), method, np.random.default_rng(RNG_SEED))
+    rng = np.random.default_rng(RNG_SEED)
+    return fit_homographies(log, seen, plan or plan_with(), EstimationOptions(method), rng=rng)
 
 
 def test_nothing_is_fitted_when_the_plan_leaves_it_out():
@@ -139,7 +144,7 @@ def test_obstacles_give_the_homography_of_the_true_camera(method):
     seen = Observations(measurements=[unplaced([[500, 280, 700, 400]])])
     seen.feet["front"] = [correspondences(camera, 300, rng, 0.5)]
     _, fits = fit(log_with(camera), seen, method=method)
-    found, truth = fits["front"], calibrated_ground(log_with(camera), camera)
+    found, truth = fits["front"], calibrated_homography(log_with(camera), camera)
     assert found.source == "obstacles"
     uv = np.array([[600.0, 550], [400, 450], [900, 480]])
     xy, _ = apply_homography(found.fit.ground_H_image, uv)
@@ -165,8 +170,8 @@ def test_an_obstacle_without_points_is_placed_where_its_foot_is(far, yaw, catego
     solid = standing(18.0, 3.0, 0.0, size)
     m = unplaced([outline_px(camera, camera.mount_T_cam, solid)], category=category)
     seen = Observations(measurements=[m], obstacles=[None])
-    homographies = {"front": CameraGround(camera, calibrated_ground(log, camera), "calibration")}
-    row = locate_the_rest(log, synchronize(log, ("front",)), seen, homographies)[0]
+    homographies = {"front": CameraHomography(camera, calibrated_homography(log, camera), "calibration")}
+    row = place_by_homography(log, seen, homographies)[0]
     truth = apply(log.ego.map_T_ego[0], np.array([solid.center_m]))[0]
     error = (row.center_m[0] - truth)[:2]
     assert row.source.tolist() == ["topdown"]
@@ -185,9 +190,9 @@ def test_the_covariance_turns_with_the_ego():
 
     def covariance(yaw):
         log = log_with(camera, yaw=yaw)
-        ground = {"front": CameraGround(camera, calibrated_ground(log, camera), "calibration")}
+        ground = {"front": CameraHomography(camera, calibrated_homography(log, camera), "calibration")}
         seen = Observations(measurements=[unplaced([box])], obstacles=[None])
-        return locate_the_rest(log, synchronize(log, ("front",)), seen, ground)[0].covariance[0]
+        return place_by_homography(log, seen, ground)[0].covariance[0]
 
     along = covariance(0.0)
     assert along[0, 0] > 4 * along[1, 1]
@@ -206,20 +211,20 @@ LEFT_ALONE = {
 def test_boxes_whose_foot_says_nothing_stay_without_a_place(name):
     camera = tilted(0.0)
     log = log_with(camera)
-    ground = {"front": CameraGround(camera, calibrated_ground(log, camera), "calibration")}
+    ground = {"front": CameraHomography(camera, calibrated_homography(log, camera), "calibration")}
     seen = Observations(measurements=[unplaced([LEFT_ALONE[name]])], obstacles=[None])
-    row = locate_the_rest(log, synchronize(log, ("front",)), seen, ground)[0]
+    row = place_by_homography(log, seen, ground)[0]
     assert row.source.tolist() == [""]
     assert np.isnan(row.center_m).all()
 
 
 @pytest.mark.parametrize(
-    "homographies", [{}, {"front": CameraGround(tilted(), refused("no", 0), "none")}], ids=["none", "refused"]
+    "homographies", [{}, {"front": CameraHomography(tilted(), refused_fit("no", 0), "none")}], ids=["none", "refused"]
 )
 def test_without_a_homography_nothing_is_placed(homographies):
     log = log_with(tilted())
     seen = Observations(measurements=[unplaced([[500, 280, 700, 400]]), Measurements.empty()], obstacles=[None, None])
-    rows = locate_the_rest(log, synchronize(log, ("front",)), seen, homographies)
+    rows = place_by_homography(log, seen, homographies)
     assert [r.source.tolist() for r in rows] == [[""], []]
 
 
@@ -231,15 +236,15 @@ def test_two_cameras_that_place_one_obstacle_make_one_row_of_it():
     rows = [
         unplaced([outline_px(c, c.mount_T_cam, solid)], category="pedestrian", camera=c.name) for c in (left, right)
     ]
-    ground = {c.name: CameraGround(c, calibrated_ground(log, c), "calibration") for c in (left, right)}
+    ground = {c.name: CameraHomography(c, calibrated_homography(log, c), "calibration") for c in (left, right)}
     seen = Observations(measurements=[Measurements.join(rows)], obstacles=[None])
-    out = locate_the_rest(log, synchronize(log, ("front",)), seen, ground)
+    out = place_by_homography(log, seen, ground)
     assert len(out[0]) == 1
     assert np.hypot(*(out[0].center_m[0] - solid.center_m)[:2]) < 0.3
 
 
 def placed_where_rays_go(solids, at=(15.0, 1.0)):
-    """A car's box at a place, and what `locate_the_rest` makes of it where a LiDAR saw these solids."""
+    """A car's box at a place, and what `place_by_homography` makes of it where a LiDAR saw these solids."""
     camera = tilted(0.0)
     log = log_with(camera)
     car = standing(*at)
@@ -247,9 +252,9 @@ def placed_where_rays_go(solids, at=(15.0, 1.0)):
     xyz, owner = scan(solids)
     above = xyz[(owner >= 0) & (xyz[:, 2] > 0.2)].astype(np.float32)
     cloud = Obstacles(T0_NS, np.zeros(3), above, np.zeros(len(above), np.float32), np.array([0, 0, 1.9], np.float32))
-    ground = {"front": CameraGround(camera, calibrated_ground(log, camera), "calibration")}
+    ground = {"front": CameraHomography(camera, calibrated_homography(log, camera), "calibration")}
     seen = Observations(measurements=[unplaced([box])], obstacles=[cloud])
-    return locate_the_rest(log, synchronize(log, ("front",)), seen, ground)[0]
+    return place_by_homography(log, seen, ground)[0]
 
 
 FAR_WALL = standing(22.0, 0.0, 0.0, (0.5, 80.0, 4.0))

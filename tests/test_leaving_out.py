@@ -25,7 +25,8 @@ from log2sim.geometry import PoseTrack, transform
 from log2sim.perception.detect.detectors import create_detector
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.fusion import fuse
-from log2sim.perception.homography_stage import fit_cameras
+from log2sim.perception.homography.estimate import EstimationOptions
+from log2sim.perception.homography_stage import fit_homographies
 from log2sim.perception.lidar.cloud import assemble_cloud, is_at_rest, sweep_to_map
 from log2sim.perception.sync import synchronize
 from log2sim.pipeline import Result
@@ -337,17 +338,16 @@ def lost(camera: str, bottom_px: float) -> Measurements:
 
 def test_a_box_without_a_foot_in_the_image_needs_no_homography(both: Log) -> None:
     plan = make_plan(both, LABELS)
-    schedule = synchronize(both, plan.cameras)
     for bottom_px, wanted in ((250.0, {"back"}), (297.0, {"back"}), (298.0, set()), (300.0, set())):
         seen = Observations(measurements=[lost("back", bottom_px)], obstacles=[None])
-        _, fits = fit_cameras(both, schedule, seen, plan, "time-aware", np.random.default_rng(0))
+        _, fits = fit_homographies(both, seen, plan, EstimationOptions(), rng=np.random.default_rng(0))
         assert set(fits) == wanted
 
 
 def test_correspondences_that_nobody_reads_are_not_gathered(tiny: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[Observations] = []
     monkeypatch.setattr(
-        log2sim.pipeline, "fit_cameras", lambda log, schedule, s, plan, *_, **__: (seen.append(s), (plan, {}))[1]
+        log2sim.pipeline, "fit_homographies", lambda log, s, plan, *_, **__: (seen.append(s), (plan, {}))[1]
     )
     run(tiny, Config.load(detect={"name": "labels"}, topdown={"method": "off"}))
     run(tiny)

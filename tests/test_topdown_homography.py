@@ -11,23 +11,22 @@ import pytest
 from scipy.optimize import least_squares
 
 from log2sim.datatypes import TYPICAL_SIZE_M, Measurements
-from log2sim.geometry import Camera, apply, inverse, project, rotation_from_rpy, transform
-from log2sim.perception.homography.correspondences import (
-    FOOT_SIGMA_PX,
-    Correspondences,
-    fit_camera,
-    foot_points,
-    jitter_m,
-    locate,
-)
-from log2sim.perception.homography.estimate import (
-    METHODS,
-    HomographyFit,
+from log2sim.geometry import (
+    Camera,
+    apply,
     apply_homography,
-    estimate_homography,
-    jacobian,
+    ground_homography,
+    homography_jacobian,
+    inverse,
+    project,
+    rotation_from_rpy,
+    transform,
 )
-from log2sim.visualization.birdseye.ground_view import ground_homography
+from log2sim.perception.homography.camera_fit import FOOT_SIGMA_PX, fit_camera
+from log2sim.perception.homography.correspondences import Correspondences, foot_points
+from log2sim.perception.homography.estimate import METHODS, EstimationOptions, estimate_homography
+from log2sim.perception.homography.fit import HomographyFit
+from log2sim.perception.homography.placement import place_obstacle
 
 K = np.array([[1000.0, 0.0, 640.0], [0.0, 1000.0, 360.0], [0.0, 0.0, 1.0]])
 PROBES_M = np.array([[x, y] for x in (8.0, 15.0, 25.0, 40.0) for y in (-0.3 * x, 0.0, 0.3 * x)])
@@ -65,8 +64,8 @@ class World:
     def fit(self, method: str = "time-aware", seed: int = 0, **sigmas: float) -> HomographyFit:
         sigmas = {"sigma_px": 1.0, "sigma_m": 0.02, **sigmas}
         rng = np.random.default_rng(seed)
-        extra = {"calibrated": {"K": self.K}, "straw-man": {"xy_by_size_m": self.xy}}.get(method, {})
-        return estimate_homography(self.uv, self.xy, self.tick, method=method, rng=rng, **sigmas, **extra)
+        options = EstimationOptions(method, self.K, **sigmas)  # type: ignore[arg-type]
+        return estimate_homography(Correspondences(self.uv, self.xy, self.tick, self.xy), options, rng=rng)
 
 
 def make_world(
@@ -162,7 +161,7 @@ def test_too_few_correspondences_are_refused(method: str) -> None:
         assert f"{count} correspondences" in fit.reason
         assert np.isnan(fit.ground_H_image).all()
         assert fit.inliers.shape == (count,)
-        assert np.isnan(jitter_m(fit))
+        assert np.isnan(fit.jitter_m)
         assert fit.condition == np.inf
 
 
@@ -326,11 +325,11 @@ def test_per_frame_keeps_one_homography_a_tick_and_nan_where_there_is_none() -> 
 
 def test_a_fixed_camera_does_not_jitter() -> None:
     world = make_world(12, each=10)
-    assert jitter_m(world.fit("time-aware")) == 0.0
-    assert jitter_m(world.fit("min-frame")) == 0.0
-    assert jitter_m(world.fit("per-frame")) > 0.05  # one pixel of noise a frame shows
+    assert world.fit("time-aware").jitter_m == 0.0
+    assert world.fit("min-frame").jitter_m == 0.0
+    assert world.fit("per-frame").jitter_m > 0.05  # one pixel of noise a frame shows
     exact = make_world(12, each=10, noise_px=0.0, noise_m=0.0)
-    assert jitter_m(exact.fit("per-frame")) < 1e-7
+    assert exact.fit("per-frame").jitter_m < 1e-7
 
 
 def test_jitter_of_a_nodding_camera_is_how_far_the_ground_moves() -> None:
@@ -349,8 +348,8 @@ def test_jitter_of_a_nodding_camera_is_how_far_the_ground_moves() -> None:
         np.hypot(*(apply_homography(nod[0], uv)[0] - apply_homography(nod[1], uv)[0]).T)
         for uv in [to_image(fit.ground_H_image, np.array([[10.0, 0.0], [20.0, 0.0], [40.0, 0.0]]))]
     ]
-    assert jitter_m(fit) == pytest.approx(np.median(middle), rel=1e-4)
-    assert 0.4 < jitter_m(fit) < 1.2  # 20 m ahead: (18.5^2 / 1.6 + 1.6) * 0.2 degrees = 0.75 m
+    assert fit.jitter_m == pytest.approx(np.median(middle), rel=1e-4)
+    assert 0.4 < fit.jitter_m < 1.2  # 20 m ahead: (18.5^2 / 1.6 + 1.6) * 0.2 degrees = 0.75 m
 
 
 def test_the_horizon_and_above_have_no_ground_position() -> None:
@@ -372,17 +371,17 @@ def test_jacobian_is_that_of_differences() -> None:
     for axis in range(2):
         aside = np.eye(2)[axis] * step
         slope = (apply_homography(h, uv + aside)[0] - apply_homography(h, uv - aside)[0]) / (2 * step)
-        np.testing.assert_allclose(jacobian(h, uv)[:, :, axis], slope, rtol=1e-4, atol=1e-7)
+        np.testing.assert_allclose(homography_jacobian(h, uv)[:, :, axis], slope, rtol=1e-4, atol=1e-7)
 
 
 def test_shapes_and_methods_that_do_not_fit_are_the_callers_mistake() -> None:
-    rng = np.random.default_rng(0)
+    five, tick = np.zeros((5, 2)), np.zeros(5, dtype=np.int64)
     with pytest.raises(ValueError, match=r"\(N, 2\)"):
-        estimate_homography(np.zeros((5, 2)), np.zeros((4, 2)), np.zeros(5), rng=rng)
+        Correspondences(five, five[:4], tick)
     with pytest.raises(ValueError, match=r"\(N, 2\)"):
-        estimate_homography(np.zeros((5, 2)), np.zeros((5, 2)), np.zeros(4), rng=rng)
+        Correspondences(five, five, tick[:4])
     with pytest.raises(ValueError, match="time-aware"):
-        estimate_homography(np.zeros((5, 2)), np.zeros((5, 2)), np.zeros(5), rng=rng, method="frame")
+        estimate_homography(Correspondences(five, five, tick), EstimationOptions("frame"), rng=np.random.default_rng(0))
 
 
 def a_camera_with_lens() -> Camera:
@@ -395,15 +394,11 @@ def foot_pixel(camera: Camera, x: float, y: float) -> np.ndarray:
     return uv[0]
 
 
-def fitted(ground_H_image: np.ndarray) -> HomographyFit:
-    return HomographyFit(True, "", ground_H_image / np.linalg.norm(ground_H_image[2]), np.ones(4, bool), 0.0, 1.0)
-
-
 @pytest.mark.parametrize("camera", [make_camera()[0], a_camera_with_lens()], ids=["pinhole", "lens"])
 @pytest.mark.parametrize("foot", [(10.0, 0.2), (25.0, -6.0), (40.0, 11.0)])
 def test_an_obstacle_stands_behind_its_foot_by_half_its_depth(camera: Camera, foot: tuple[float, float]) -> None:
     u, v = foot_pixel(camera, *foot)
-    placed = locate(fitted(make_camera()[1]), camera, np.array([u - 40, v - 60, u + 40, v]), "car", CAMERA_M)
+    placed = place_obstacle(make_camera()[1], camera, np.array([u - 40, v - 60, u + 40, v]), "car", CAMERA_M)
     assert placed is not None
     ray = np.array(foot) - CAMERA_M
     length, width, _ = TYPICAL_SIZE_M["car"]
@@ -417,7 +412,7 @@ def test_the_covariance_of_a_located_obstacle_lies_along_the_ray_and_grows() -> 
     for x in (10.0, 20.0, 40.0):
         foot = np.add(CAMERA_M, [x, 0.0])
         u, v = foot_pixel(camera, *foot)
-        placed = locate(fitted(h), camera, np.array([u - 20, v - 30, u + 20, v]), "pedestrian", CAMERA_M)
+        placed = place_obstacle(h, camera, np.array([u - 20, v - 30, u + 20, v]), "pedestrian", CAMERA_M)
         assert placed is not None
         variance, axes = np.linalg.eigh(placed[1])
         assert abs(axes[0, 1]) > 0.999
@@ -433,7 +428,7 @@ def test_obstacles_at_the_horizon_and_far_away_are_not_located() -> None:
     camera, h = make_camera()
 
     def at(u: float, v: float) -> object:
-        return locate(fitted(h), camera, np.array([u - 5, v - 10, u + 5, v]), "car", CAMERA_M)
+        return place_obstacle(h, camera, np.array([u - 5, v - 10, u + 5, v]), "car", CAMERA_M)
 
     assert at(640.0, 200.0) is None
     assert at(640.0, 291.0) is None  # a hand's breadth below the horizon, kilometers away
@@ -446,8 +441,8 @@ def test_a_pixel_that_no_ray_reaches_is_not_located() -> None:
     plain = make_camera()[0]
     camera = Camera("front", 1280, 720, K, "ego", plain.mount_T_cam, "brown", (-1.0, 0.0, 0.0, 0.0))
     # r (1 - r^2) is at most 0.385: 385 px from the center.
-    assert locate(fitted(make_camera()[1]), camera, np.array([630.0, 500.0, 650.0, 700.0]), "car", CAMERA_M) is not None
-    assert locate(fitted(make_camera()[1]), camera, np.array([1190.0, 500.0, 1210.0, 700.0]), "car", CAMERA_M) is None
+    assert place_obstacle(make_camera()[1], camera, np.array([630.0, 500.0, 650.0, 700.0]), "car", CAMERA_M) is not None
+    assert place_obstacle(make_camera()[1], camera, np.array([1190.0, 500.0, 1210.0, 700.0]), "car", CAMERA_M) is None
 
 
 def as_correspondences(world: World) -> Correspondences:
@@ -460,7 +455,7 @@ NOTHING = Correspondences.join([])
 def test_a_camera_learns_from_obstacles_first() -> None:
     feet, ground = make_world(20, each=8, noise_px=2.0), make_world(21, each=40, noise_px=0.3)
     fit, source = fit_camera(
-        as_correspondences(feet), as_correspondences(ground), method="time-aware", rng=np.random.default_rng(0)
+        as_correspondences(feet), as_correspondences(ground), EstimationOptions(), rng=np.random.default_rng(0)
     )
     assert source == "obstacles"
     assert len(fit.inliers) == len(feet.uv)
@@ -473,7 +468,7 @@ def test_ground_points_join_where_obstacles_do_not_suffice(case: str) -> None:
     few = make_world(22, ticks=3, each=4)
     feet = {"few": as_correspondences(few), "collinear": as_correspondences(lane), "none": NOTHING}[case]
     ground = make_world(23, each=20, noise_px=0.5)
-    fit, source = fit_camera(feet, as_correspondences(ground), method="time-aware", rng=np.random.default_rng(0))
+    fit, source = fit_camera(feet, as_correspondences(ground), EstimationOptions(), rng=np.random.default_rng(0))
     assert fit.ok
     assert source == "obstacles and ground points"
     assert len(fit.inliers) == len(feet.uv) + len(ground.uv)
@@ -482,7 +477,7 @@ def test_ground_points_join_where_obstacles_do_not_suffice(case: str) -> None:
 
 def test_a_camera_that_saw_nothing_is_refused() -> None:
     for feet in (NOTHING, Correspondences(np.ones((3, 2)), np.ones((3, 2)), np.zeros(3, dtype=np.int64))):
-        fit, source = fit_camera(feet, NOTHING, method="time-aware", rng=np.random.default_rng(0))
+        fit, source = fit_camera(feet, NOTHING, EstimationOptions(), rng=np.random.default_rng(0))
         assert not fit.ok
         assert source == "none"
         assert f"{len(feet.uv)} correspondences" in fit.reason
@@ -583,14 +578,14 @@ def test_feet_know_where_average_sizes_would_put_them() -> None:
 def test_the_straw_man_has_no_lidar_and_calibrated_has_intrinsics() -> None:
     feet = as_correspondences(make_world(24, each=12))
     rng = np.random.default_rng(0)
-    fit, source = fit_camera(feet, feet, method="straw-man", rng=rng)
+    fit, source = fit_camera(feet, feet, EstimationOptions("straw-man"), rng=rng)
     assert not fit.ok
     assert source == "none"
     sized = Correspondences.join([Correspondences(feet.uv, feet.xy_ego, feet.tick, feet.xy_ego), NOTHING])
-    fit, source = fit_camera(sized, NOTHING, method="straw-man", rng=rng)
+    fit, source = fit_camera(sized, NOTHING, EstimationOptions("straw-man"), rng=rng)
     assert fit.ok
     assert source == "obstacles of average size"
-    fit, source = fit_camera(feet, NOTHING, method="calibrated", rng=rng, K=K)
+    fit, source = fit_camera(feet, NOTHING, EstimationOptions("calibrated", K), rng=rng)
     assert fit.ok
     assert source == "obstacles"
     axes = np.linalg.inv(K) @ np.linalg.inv(fit.ground_H_image)

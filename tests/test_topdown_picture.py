@@ -10,8 +10,17 @@ import numpy as np
 import pytest
 
 from log2sim.errors import ConfigError
-from log2sim.geometry import Array, Camera, fold_radius, inverse, rotation_from_rpy, transform, undistort
-from log2sim.visualization.birdseye.ground_view import GroundView, ground_homography
+from log2sim.geometry import (
+    Array,
+    Camera,
+    fold_radius,
+    ground_homography,
+    inverse,
+    rotation_from_rpy,
+    transform,
+    undistort,
+)
+from log2sim.visualization.birdseye.ground_view import GroundView
 from log2sim.visualization.birdseye.mosaic import Mosaic, render_topdown, write_picture
 
 EGO_R_CAM = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])

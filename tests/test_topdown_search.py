@@ -8,18 +8,20 @@ import cv2
 import numpy as np
 import pytest
 
-from log2sim.geometry import rotation_from_rpy
-from log2sim.perception.homography.correspondences import jitter_m
-from log2sim.perception.homography.estimate import (
-    HomographyFit,
-    apply_homography,
-    estimate_homography,
-    ground_from_sizes,
+from log2sim.geometry import apply_homography, rotation_from_rpy
+from log2sim.perception.homography.baselines import ground_from_sizes
+from log2sim.perception.homography.correspondences import Correspondences
+from log2sim.perception.homography.estimate import EstimationOptions, estimate_homography
+from log2sim.perception.homography.fit import HomographyFit
+from log2sim.perception.homography.hypotheses import draw_samples, solve_samples
+from log2sim.perception.homography.normalized import (
+    CHI2_2DOF_99,
+    NormalizedCorrespondences,
+    bounded_losses,
+    squared_errors,
 )
-from log2sim.perception.homography.hypotheses import draw, solve
-from log2sim.perception.homography.pose import nearest_poses, tangent
-from log2sim.perception.homography.refine import free_directions, linearize, noise
-from log2sim.perception.homography.stream import BOUND, Stream, losses, squared_errors
+from log2sim.perception.homography.planar_pose import nearest_poses, pose_tangent
+from log2sim.perception.homography.refine import linearize, noise_factors, scale_free_basis
 
 K = np.array([[2050.0, 0.0, 960.0], [0.0, 2050.0, 640.0], [0.0, 0.0, 1.0]])
 HEIGHT_M = 2.1
@@ -49,15 +51,10 @@ class Nodding:
     poses: np.ndarray
 
     def fit(self, method: str = "time-aware", seed: int = 0, **more: object) -> HomographyFit:
-        given = {"K": K, **more}
-        return estimate_homography(
-            self.uv,
-            self.xy,
-            self.tick,
-            method=method,
-            rng=np.random.default_rng(seed),
-            **given,  # type: ignore[arg-type]
-        )
+        by_size = more.pop("xy_by_size", None)
+        correspondences = Correspondences(self.uv, self.xy, self.tick, by_size)  # type: ignore[arg-type]
+        options = EstimationOptions(method, **{"K": K, **more})  # type: ignore[arg-type]
+        return estimate_homography(correspondences, options, rng=np.random.default_rng(seed))
 
     def error_m(self, each: np.ndarray, ranges_m: tuple[float, ...]) -> float:
         """Median distance on the ground between what homographies of all ticks and the truth say of the same pixels."""
@@ -92,9 +89,9 @@ def nodding(
     return Nodding(np.concatenate(uv), np.concatenate(xy), tick, np.concatenate(clean), np.array(poses))
 
 
-def make_stream(seed: int = 0, **changes: float) -> Stream:
+def make_stream(seed: int = 0, **changes: float) -> NormalizedCorrespondences:
     world = nodding(seed, **changes)  # type: ignore[arg-type]
-    return Stream.of(world.uv, world.xy, world.tick, 1.0, 0.05)
+    return NormalizedCorrespondences.of(world.uv, world.xy, world.tick, 1.0, 0.05)
 
 
 # The camera that pitches.
@@ -105,7 +102,7 @@ def test_a_camera_that_pitches_by_a_tenth_of_a_degree_is_followed(method: str) -
     near, far, still = [], [], []
     for seed in range(4):
         world = nodding(seed, 0.1)
-        fit = world.fit(method, per_tick=True)
+        fit = world.fit(method, pitch_roll=True)
         assert fit.ok, fit.reason
         assert fit.per_tick is not None
         near.append(world.error_m(fit.per_tick, NEAR_M))
@@ -122,7 +119,7 @@ def test_a_camera_that_pitches_by_a_tenth_of_a_degree_is_followed(method: str) -
 def test_a_camera_that_pitches_by_far_more_than_expected_is_followed_too() -> None:
     for seed in range(4):
         world = nodding(seed, 0.4)
-        fit = world.fit(per_tick=True)
+        fit = world.fit(pitch_roll=True)
         assert fit.ok, fit.reason
         assert fit.per_tick is not None
         assert world.error_m(fit.per_tick, NEAR_M) < 0.03
@@ -133,9 +130,9 @@ def test_a_camera_that_pitches_by_far_more_than_expected_is_followed_too() -> No
 @pytest.mark.parametrize("method", ["time-aware", "calibrated"])
 def test_a_camera_that_stands_still_gets_one_homography_though_more_are_asked_for(method: str) -> None:
     world = nodding(5)
-    fit = world.fit(method, per_tick=True)
+    fit = world.fit(method, pitch_roll=True)
     assert fit.per_tick is not None
-    assert jitter_m(fit) < 1e-9
+    assert fit.jitter_m < 1e-9
     assert world.error_m(fit.per_tick, FAR_M) < 0.06
     assert world.fit(method).per_tick is None
 
@@ -146,7 +143,7 @@ def test_ticks_with_few_points_stay_near_the_stream() -> None:
     keep = np.where(world.tick == 3, column < 1, np.where(world.tick == 7, column < 2, True))
     world.uv[world.tick == 11] = np.nan
     few = Nodding(world.uv[keep], world.xy[keep], world.tick[keep], world.clean[keep], world.poses)
-    fit = few.fit(per_tick=True)
+    fit = few.fit(pitch_roll=True)
     assert fit.per_tick is not None
     assert len(fit.per_tick) == 40
     np.testing.assert_array_equal(fit.per_tick[11], fit.ground_H_image)
@@ -165,7 +162,7 @@ def test_ticks_with_few_points_stay_near_the_stream() -> None:
 
 def test_thousands_of_points_in_a_tick_are_no_burden() -> None:
     world = nodding(6, 0.2, cars=1500, ticks=4)
-    fit = world.fit(per_tick=True)
+    fit = world.fit(pitch_roll=True)
     assert fit.ok, fit.reason
     assert fit.per_tick is not None
     assert world.error_m(fit.per_tick, FAR_M) < 0.03
@@ -176,7 +173,7 @@ def test_one_wrong_point_alone_in_its_tick_moves_nothing() -> None:
     keep = (world.tick != 5) | (np.arange(len(world.tick)) % 20 == 0)
     world.uv[np.flatnonzero(world.tick == 5)[0], 1] -= 80.0
     lone = Nodding(world.uv[keep], world.xy[keep], world.tick[keep], world.clean[keep], world.poses)
-    fit = lone.fit(per_tick=True)
+    fit = lone.fit(pitch_roll=True)
     assert fit.per_tick is not None
     still = [np.abs(through(np.linalg.inv(fit.per_tick[5]), np.array([[40.0, 0.0]])) -
              through(np.linalg.inv(fit.ground_H_image), np.array([[40.0, 0.0]]))).max()]  # fmt: skip
@@ -236,13 +233,13 @@ def test_a_homography_knows_how_sure_it_is() -> None:
 def test_calibrated_beats_what_eight_parameters_allow() -> None:
     def limit(world: Nodding) -> np.ndarray:
         uv, xy = world.uv[world.clean], world.xy[world.clean]
-        s = Stream.of(uv, xy, np.zeros(len(uv), dtype=np.int64), 1.0, 0.05)
+        s = NormalizedCorrespondences.of(uv, xy, np.zeros(len(uv), dtype=np.int64), 1.0, 0.05)
         h = s.image_N_px @ image_H_ground() @ np.linalg.inv(s.ground_N_m)
         for _ in range(6):  # Gauss-Newton over the clean correspondences alone, from the truth
             at = linearize(s, h[None])
-            slope = free_directions(h).T @ at.slope[0].reshape(9, -1)
+            slope = scale_free_basis(h).T @ at.slope[0].reshape(9, -1)
             step = np.linalg.lstsq(slope.T, -at.error[0].ravel(), rcond=None)[0]
-            h = h + (free_directions(h) @ step).reshape(3, 3)
+            h = h + (scale_free_basis(h) @ step).reshape(3, 3)
         return s.to_ground_H_image(h)
 
     ours, eight = [], []
@@ -288,7 +285,7 @@ def test_the_tangent_of_a_pose_is_that_of_small_turns_and_shifts() -> None:
     step = 1e-6
     pose = np.linalg.inv(K) @ image_H_ground(3.0, 1.0)
     full = np.column_stack([pose[:, 0], pose[:, 1], pose[:, 2]])
-    derivatives = tangent(K, K @ full)
+    derivatives = pose_tangent(K, K @ full)
     for k, axis in enumerate(np.eye(3)):
         turned = full.copy()
         turned[:, :2] = cv2.Rodrigues(axis * step)[0] @ full[:, :2]
@@ -304,8 +301,8 @@ def test_the_tangent_of_a_pose_is_that_of_small_turns_and_shifts() -> None:
 def test_four_correspondences_give_the_homography_that_opencv_finds() -> None:
     stream = make_stream(outliers=0.0)
     rng = np.random.default_rng(1)
-    rows = draw(stream, rng, 200, across=True)
-    found = solve(stream, rows, keep=10_000)
+    rows = draw_samples(stream, rng, 200, across_ticks=True)
+    found = solve_samples(stream, rows, max_hypotheses=10_000)
     assert 100 < len(found) < 200  # some are drawn twice, some near a line
     reference = []
     for quad in rows.T:
@@ -320,9 +317,9 @@ def test_four_correspondences_give_the_homography_that_opencv_finds() -> None:
 
 def test_hypotheses_see_their_own_points_in_front_and_exactly() -> None:
     stream = make_stream(outliers=0.3)
-    rows = draw(stream, np.random.default_rng(2), 300, across=False)
+    rows = draw_samples(stream, np.random.default_rng(2), 300, across_ticks=False)
     for quad in rows.T:
-        for h in solve(stream, quad[:, None], keep=5):
+        for h in solve_samples(stream, quad[:, None], max_hypotheses=5):
             q = h @ stream.ground[:, quad]
             assert (q[2] > 0).all()
             np.testing.assert_allclose(q[:2] / q[2], stream.image[:, quad], atol=1e-6)
@@ -330,17 +327,17 @@ def test_hypotheses_see_their_own_points_in_front_and_exactly() -> None:
 
 def test_draws_keep_to_one_tick_unless_told_otherwise() -> None:
     stream, rng = make_stream(), np.random.default_rng(0)
-    own = stream.tick[draw(stream, rng, 500, across=False)]
+    own = stream.tick[draw_samples(stream, rng, 500, across_ticks=False)]
     assert (own == own[0]).all()
     assert len(np.unique(own)) == 40
-    mixed = stream.tick[draw(stream, rng, 500, across=True)]
+    mixed = stream.tick[draw_samples(stream, rng, 500, across_ticks=True)]
     assert (mixed == mixed[0]).all(axis=0).mean() < 0.01
 
 
 def test_squared_errors_are_those_of_the_definition() -> None:
     stream = make_stream(3)
     h = stream.image_N_px @ image_H_ground(2.05, 0.1) @ np.linalg.inv(stream.ground_N_m)
-    ours = squared_errors(stream, np.stack([h, -h]), nod=0.01)
+    ours = squared_errors(stream, np.stack([h, -h]), pitch_sigma=0.01)
     for k in range(0, 800, 37):
         (u, v), p = stream.image[:, k], stream.ground[:, k]
         q = h @ p
@@ -372,16 +369,16 @@ def test_whitened_errors_of_clean_data_have_unit_variance() -> None:
     at = linearize(stream, h[None])
     assert np.mean(at.error[0] ** 2, axis=1) == pytest.approx([1.0, 1.0], abs=0.15)
     assert np.mean(at.error[0, 0] * at.error[0, 1]) == pytest.approx(0.0, abs=0.12)
-    assert (at.squared[0] < BOUND).mean() == pytest.approx(0.99, abs=0.012)
+    assert (at.squared[0] < CHI2_2DOF_99).mean() == pytest.approx(0.99, abs=0.012)
 
 
 @pytest.mark.parametrize(("pixel", "place"), [(1.0, 1.0), (2.0, 0.5), (0.5, 2.0), (0.7, 0.7)])
 def test_noise_is_found_from_the_errors(pixel: float, place: float) -> None:
     world = nodding(6, outliers=0.0)
-    stream = Stream.of(world.uv, world.xy, world.tick, 1.0 / pixel, 0.05 / place)
+    stream = NormalizedCorrespondences.of(world.uv, world.xy, world.tick, 1.0 / pixel, 0.05 / place)
     h = stream.image_N_px @ image_H_ground() @ np.linalg.inv(stream.ground_N_m)
     for _ in range(6):
-        stream = stream.with_noise(*noise(stream, linearize(stream, h[None]), 0))
+        stream = stream.with_noise(*noise_factors(stream, linearize(stream, h[None]), 0))
     believed = stream.sigma_image / stream.image_N_px[0, 0], stream.sigma_ground / stream.ground_N_m[0, 0]
     assert believed == pytest.approx((1.0, 0.05), rel=0.12)
 
@@ -393,9 +390,9 @@ def test_bounded_losses_ignore_how_far_an_outlier_is() -> None:
     for far_px in (500.0, 5000.0):
         uv = world.uv.copy()
         uv[0] += [0.0, far_px]
-        stream = Stream.of(uv, world.xy, world.tick, 1.0, 0.05)
+        stream = NormalizedCorrespondences.of(uv, world.xy, world.tick, 1.0, 0.05)
         h = stream.image_N_px @ image_H_ground() @ np.linalg.inv(stream.ground_N_m)
-        values.append(losses(stream, h[None])[0] * len(uv))
+        values.append(bounded_losses(stream, h[None])[0] * len(uv))
     assert values[0] == pytest.approx(values[1], rel=1e-6)
 
 
@@ -417,9 +414,9 @@ def test_average_sizes_place_what_has_them() -> None:
 
 def test_the_straw_man_is_as_good_as_its_sizes_and_says_how_far_off_it_is() -> None:
     world = nodding(8, outliers=0.0)
-    right = world.fit("straw-man", xy_by_size_m=world.xy)
+    right = world.fit("straw-man", xy_by_size=world.xy)
     assert world.error_m(right.ground_H_image, NEAR_M) < 0.5
-    wrong = world.fit("straw-man", xy_by_size_m=1.15 * world.xy)
+    wrong = world.fit("straw-man", xy_by_size=1.15 * world.xy)
     assert wrong.ok
     assert wrong.per_tick is not None
     away = np.median(np.hypot(*(0.15 * world.xy).T))
@@ -433,7 +430,7 @@ def test_the_straw_man_allows_for_sizes_that_differ() -> None:
     world = nodding(8, outliers=0.0)
     sizes = np.random.default_rng(0).normal(1.0, 0.08, (40, 10))
     by_size = world.xy * np.tile(sizes, (1, 2)).reshape(-1, 1)
-    fit = world.fit("straw-man", xy_by_size_m=by_size)
+    fit = world.fit("straw-man", xy_by_size=by_size)
     assert fit.ok, fit.reason
     assert fit.inliers.mean() > 0.6
     assert 0.3 < world.error_m(fit.ground_H_image, FAR_M) < 10.0
@@ -454,19 +451,19 @@ def test_large_offsets_and_stamps_change_nothing(method: str) -> None:
     np.testing.assert_array_equal(plain.inliers, moved.inliers)
 
 
-@pytest.mark.parametrize("per_tick", [False, True])
+@pytest.mark.parametrize("pitch_roll", [False, True])
 @pytest.mark.parametrize("method", ["time-aware", "calibrated"])
-def test_a_line_a_place_and_a_tick_alone_are_refused_or_right(method: str, per_tick: bool) -> None:
+def test_a_line_a_place_and_a_tick_alone_are_refused_or_right(method: str, pitch_roll: bool) -> None:
     x = np.linspace(8.0, 50.0, 60)
     tick = np.arange(60) // 6
     rng = np.random.default_rng(0)
     for xy in (np.column_stack([x, 0.2 * x + 1]), np.column_stack([x, 0 * x]), np.tile([[20.0, 1.0]], (60, 1))):
         for noise_px in (0.0, 1.0):
             uv = through(image_H_ground(), xy) + rng.normal(0.0, noise_px, (60, 2))
-            fit = Nodding(uv, xy, tick, np.ones(60, bool), np.empty(0)).fit(method, per_tick=per_tick)
+            fit = Nodding(uv, xy, tick, np.ones(60, bool), np.empty(0)).fit(method, pitch_roll=pitch_roll)
             assert not fit.ok
             assert len(fit.reason) > 20
     alone = nodding(2, ticks=1, outliers=0.2)
-    fit = alone.fit(method, per_tick=per_tick)
+    fit = alone.fit(method, pitch_roll=pitch_roll)
     assert fit.ok, fit.reason
     assert alone.error_m(fit.ground_H_image, NEAR_M) < 0.5

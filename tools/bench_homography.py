@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from bench_table import markdown, optional, timed
 
-from log2sim.perception.homography.estimate import estimate_homography
+from log2sim.perception.homography.correspondences import Correspondences
+from log2sim.perception.homography.estimate import EstimationOptions, estimate_homography
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 
@@ -232,9 +233,9 @@ class Score:
 def ours(stream: Stream, method: str, repeats: int, **options: Any) -> tuple[Array, float]:
     """log2sim's homographies (T, 3, 3), and seconds."""
     rng = np.random.default_rng(0)
-    fit, seconds = timed(
-        lambda: estimate_homography(stream.uv, stream.xy, stream.tick, method=method, rng=rng, **options), repeats
-    )
+    correspondences = Correspondences(stream.uv, stream.xy, stream.tick, stream.by_size)
+    chosen = EstimationOptions(method, **options)
+    fit, seconds = timed(lambda: estimate_homography(correspondences, chosen, rng=rng), repeats)
     ticks = len(stream.image_H_ground)
     each = fit.per_tick if fit.per_tick is not None else np.repeat(fit.ground_H_image[None], ticks, axis=0)
     return each, seconds
@@ -260,11 +261,11 @@ def answers(
         "log2sim calibrated": ours(stream, "calibrated", repeats, K=K),
     }
     if case.nod_deg:
-        out["log2sim time-aware, per tick"] = ours(stream, "time-aware", repeats, per_tick=True)
-        out["log2sim calibrated, per tick"] = ours(stream, "calibrated", repeats, per_tick=True, K=K)
+        out["log2sim time-aware, per tick"] = ours(stream, "time-aware", repeats, pitch_roll=True)
+        out["log2sim calibrated, per tick"] = ours(stream, "calibrated", repeats, pitch_roll=True, K=K)
     out["log2sim min-frame"] = ours(stream, "min-frame", 1)
     out["log2sim per-frame"] = ours(stream, "per-frame", 1)
-    out["log2sim straw-man"] = ours(stream, "straw-man", 1, xy_by_size_m=stream.by_size)
+    out["log2sim straw-man"] = ours(stream, "straw-man", 1)
     for name, (peer, _) in peers().items():
         single, pooled = (partial(asked, peer, threshold) for threshold in thresholds[name])
         out[f"{name}, each frame"] = timed(partial(by_frames, single, stream, each), 1)

@@ -13,7 +13,7 @@ from log2sim.config import Config
 from log2sim.datatypes import Agent, Log, Scenario
 from log2sim.geometry import NS_PER_S
 from log2sim.perception.detect.detectors import Detector
-from log2sim.perception.homography_stage import CameraGround
+from log2sim.perception.homography_stage import CameraHomography
 from log2sim.perception.sync import Schedule
 from log2sim.plan import Plan
 from log2sim.version import __version__
@@ -36,7 +36,7 @@ def scenario_of(
     config: Config,
     plan: Plan,
     detector: Detector,
-    homographies: Mapping[str, CameraGround],
+    homographies: Mapping[str, CameraHomography],
     ego: Agent | None,
     agents: Sequence[Agent],
 ) -> Scenario:
@@ -60,7 +60,7 @@ def scenario_of(
     )
 
 
-def _camera_entry(name: str, ground: CameraGround | None, used: bool) -> dict[str, Any]:
+def _camera_entry(name: str, ground: CameraHomography | None, used: bool) -> dict[str, Any]:
     if ground is None or not ground.fit.ok:
         return {"name": name, "used": used, "homography": None}
     fit = ground.fit

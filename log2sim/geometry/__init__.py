@@ -10,6 +10,7 @@ from __future__ import annotations
 from log2sim.geometry.box_projection import project_boxes
 from log2sim.geometry.boxes import box_corners, box_corners_bev, box_iou, points_in_box
 from log2sim.geometry.camera import NEAREST_DEPTH_M, Camera, Mount, box_lines, distort, fold_radius, project, undistort
+from log2sim.geometry.homography import apply_homography, ground_homography, homography_jacobian
 from log2sim.geometry.overlap import (
     bev_iou,
     overlap_area,
@@ -43,6 +44,7 @@ __all__ = [
     "Mount",
     "PoseTrack",
     "apply",
+    "apply_homography",
     "bev_iou",
     "box_corners",
     "box_corners_bev",
@@ -51,6 +53,8 @@ __all__ = [
     "cos_sin",
     "distort",
     "fold_radius",
+    "ground_homography",
+    "homography_jacobian",
     "inverse",
     "nearest_index",
     "overlap_area",

@@ -16,7 +16,7 @@ from log2sim.geometry import Array, inverse
 from log2sim.perception.detect.detectors import Detector
 from log2sim.perception.frames import FrameDetector, RecordReader
 from log2sim.perception.fusion import fuse
-from log2sim.perception.homography.correspondences import Correspondences, foot_points, pinhole
+from log2sim.perception.homography.correspondences import Correspondences, foot_points, undistorted_pixels
 from log2sim.perception.lidar.cloud import Cloud, assemble_cloud, is_at_rest
 from log2sim.perception.lidar.measure import measure_view, project_cloud
 from log2sim.perception.lidar.projection import View
@@ -234,7 +234,7 @@ def _ground_points(view: View, cloud: Cloud, ego_T_map: Array, tick: int) -> Cor
     step = np.linspace(0, len(seen) - 1, min(MAX_GROUND_POINTS_PER_FRAME, len(seen))).round().astype(np.intp)
     points = cloud.xyz[cloud.ground_sample[seen[step]]].astype(np.float64) + cloud.origin
     xy = (points @ ego_T_map[:3, :3].T + ego_T_map[:3, 3])[:, :2]
-    return Correspondences(pinhole(view.camera, uv[step]), xy, np.full(len(step), tick, dtype=np.int64))
+    return Correspondences(undistorted_pixels(view.camera, uv[step]), xy, np.full(len(step), tick, dtype=np.int64))
 
 
 def _in_range(log: Log, schedule: Schedule, tick: int, rows: Measurements, max_range_m: float) -> NDArray[np.bool_]:

@@ -1,32 +1,55 @@
-"""The second pass: every camera's homography, and a place for the obstacles that no LiDAR point fell on."""
+"""The homography stage: every camera's homography, and positions for obstacles without LiDAR points."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from log2sim.config import TopdownConfig
 from log2sim.datatypes import TYPICAL_SIZE_M, Log, Measurements, Obstacles
-from log2sim.geometry import Array, Camera, inverse, wrap_angle
+from log2sim.geometry import Array, Camera, ground_homography, inverse, wrap_angle
 from log2sim.perception.first_pass import Observations, base_pose
 from log2sim.perception.fusion import fuse
-from log2sim.perception.homography.correspondences import Correspondences, fit_camera, locate
-from log2sim.perception.homography.estimate import HomographyFit, refused
-from log2sim.perception.sync import Schedule
+from log2sim.perception.homography.camera_fit import fit_camera
+from log2sim.perception.homography.correspondences import Correspondences
+from log2sim.perception.homography.estimate import EstimationOptions
+from log2sim.perception.homography.fit import HomographyFit, refused_fit
+from log2sim.perception.homography.placement import place_obstacle
 from log2sim.plan import Plan
 from log2sim.stage_clock import Costs
 
-# So many rays that go on behind a place say that nothing stands there, unless a part of these as large as this stops.
-MIN_RAYS, MOST_STOPPED = 5, 0.25
-# What the LiDAR should have seen and did not is half as sure: it may continue a track and hardly start one.
-UNCONFIRMED = 0.5
+# A box that ends nearer than this to the lower image border is cut by it and has no foot in the image.
+FOOT_BORDER_PX = 3
+# A camera lower than this sees the ground under too flat an angle, m.
+MIN_CAMERA_HEIGHT_M = 0.2
+# Condition number beyond which a calibrated homography is singular.
+MAX_CONDITION = 1e12
+# Free-space test: with at least this many rays through the box and fewer than this share of them ending in it, the box
+# is empty.
+MIN_RAYS, MAX_STOPPED_SHARE = 5, 0.25
+# Factor on the score of an obstacle where the LiDAR has rays but no points on it: it may continue a track and hardly
+# start one.
+UNCONFIRMED_SCORE = 0.5
+# Rays count as toward the obstacle between these shares of its height, clear of the ground and of its upper edge.
+RAY_HEIGHT_SHARES = (0.2, 0.8)
 
 
 @dataclass(frozen=True, eq=False)
-class CameraGround:
-    """A camera's homography to the ground frame of the ego, and what it was learned from."""
+class CameraHomography:
+    """A camera's homography to the ground frame of the ego.
+
+    Attributes
+    ----------
+    camera : Camera
+    fit : HomographyFit
+    source : str
+        What it was fitted to, "calibration and flat ground" where a fit was refused, "none" where there is none.
+    refusal : str
+        Why the fit to the log was refused, "" otherwise.
+    """
 
     camera: Camera
     fit: HomographyFit
@@ -34,26 +57,29 @@ class CameraGround:
     refusal: str = ""
 
 
-def fit_cameras(
+def estimation_options(config: TopdownConfig) -> EstimationOptions:
+    """Make the options of the estimator from the settings."""
+    return EstimationOptions(config.method, hypotheses=config.hypotheses or None)
+
+
+def fit_homographies(
     log: Log,
-    schedule: Schedule,
-    seen: Observations,
+    observed: Observations,
     plan: Plan,
-    method: str,
+    options: EstimationOptions,
+    *,
     rng: np.random.Generator,
     costs: Costs | None = None,
-    *,
-    hypotheses: int | None = None,
-) -> tuple[Plan, dict[str, CameraGround]]:
-    """Fit the cameras that need it; a refused fit falls back on the calibration, with its reason kept.
+) -> tuple[Plan, dict[str, CameraHomography]]:
+    """Fit the cameras that need a homography.
 
-    A camera needs it when a detection of it has no LiDAR points, but a foot in the image; when a top-down picture is asked
-    for, every one does.
+    A camera needs one when a detection of it has no LiDAR points, but a foot in the image; when a top-down picture is
+    asked for, every camera does. A refused fit is replaced by the calibration, and its reason kept.
     """
     if not plan.keeps("homography"):
         return plan, {}
     reason = next(s.reason for s in plan.steps if s.stage == "homography")
-    wanted = _cameras_in_need(log, seen) if "picture" not in reason else set(plan.cameras)
+    wanted = _cameras_in_need(log, observed) if "picture" not in reason else set(plan.cameras)
     if not wanted:
         return plan.decided(
             "homography",
@@ -61,134 +87,134 @@ def fit_cameras(
             "every detection has LiDAR points or no foot in the image, and no top-down picture is asked for",
         ), {}
     plan = plan.decided("homography", True, f"{reason}: {', '.join(c for c in plan.cameras if c in wanted)}")
-    grounds, costs = {}, costs or Costs()
+    homographies, costs = {}, costs or Costs()
     for camera in (c for c in plan.cameras if c in wanted):
         with costs.piece("homography"):
-            grounds[camera] = _fit_one(log, schedule, seen, camera, method, rng, hypotheses)
-    return plan, grounds
+            homographies[camera] = _fit_one(log, observed, camera, options, rng)
+    return plan, homographies
 
 
-def _cameras_in_need(log: Log, seen: Observations) -> set[str]:
-    rows = [(str(m.camera[k]), m.box_px[k]) for m in seen.measurements for k in np.flatnonzero(m.source == "")]
+def _cameras_in_need(log: Log, observed: Observations) -> set[str]:
+    rows = [(str(m.camera[k]), m.box_px[k]) for m in observed.measurements for k in np.flatnonzero(m.source == "")]
     return {name for name, box_px in rows if _has_foot(log.cameras[name], box_px)}
 
 
 def _has_foot(camera: Camera, box_px: Array) -> bool:
-    """Whether an obstacle touches the ground in the image: a box that its lower border cuts has no foot there."""
-    return bool(box_px[3] <= camera.height_px - 3)
+    """Return whether the obstacle in a box (4,) touches the ground inside the image."""
+    return bool(box_px[3] <= camera.height_px - FOOT_BORDER_PX)
 
 
 def _fit_one(
-    log: Log,
-    schedule: Schedule,
-    seen: Observations,
-    name: str,
-    method: str,
-    rng: np.random.Generator,
-    hypotheses: int | None,
-) -> CameraGround:
+    log: Log, observed: Observations, name: str, options: EstimationOptions, rng: np.random.Generator
+) -> CameraHomography:
     camera = log.cameras[name]
-    feet, ground = Correspondences.join(seen.feet.get(name, [])), Correspondences.join(seen.ground.get(name, []))
-    fit, source = fit_camera(feet, ground, method=method, rng=rng, K=camera.K, hypotheses=hypotheses)
+    feet = Correspondences.join(observed.feet.get(name, []))
+    ground = Correspondences.join(observed.ground.get(name, []))
+    fit, source = fit_camera(feet, ground, replace(options, K=camera.K), rng=rng)
     if fit.ok:
-        return CameraGround(camera, fit, source)
-    calibrated = calibrated_ground(log, camera)
+        return CameraHomography(camera, fit, source)
+    calibrated = calibrated_homography(log, camera)
     if calibrated is None:
-        return CameraGround(camera, fit, "none", fit.reason)
-    return CameraGround(camera, calibrated, "calibration and flat ground", fit.reason)
+        return CameraHomography(camera, fit, "none", fit.reason)
+    return CameraHomography(camera, calibrated, "calibration and flat ground", fit.reason)
 
 
-def calibrated_ground(log: Log, camera: Camera) -> HomographyFit | None:
-    """The homography that the calibration gives for flat ground under the ego; None when the camera lies on it."""
-    base_T_cam = camera.mount_T_cam
-    cam_T_base = inverse(base_T_cam)
-    height = base_T_cam[2, 3] - log.ground_z_ego_m
-    if height < 0.2:
+def calibrated_homography(log: Log, camera: Camera) -> HomographyFit | None:
+    """Make the homography of flat ground under the ego from the calibration; None for a camera near the ground."""
+    if camera.mount_T_cam[2, 3] - log.ground_z_ego_m < MIN_CAMERA_HEIGHT_M:
         return None
-    image_H_ground = camera.K @ np.column_stack(
-        [cam_T_base[:3, 0], cam_T_base[:3, 1], cam_T_base[:3, 2] * log.ground_z_ego_m + cam_T_base[:3, 3]]
-    )
-    if np.linalg.cond(image_H_ground) > 1e12:
+    try:
+        h = ground_homography(camera, camera.mount_T_cam, log.ground_z_ego_m)
+    except np.linalg.LinAlgError:
         return None
-    h = np.asarray(np.linalg.inv(image_H_ground), dtype=np.float64)
+    if np.linalg.cond(h) > MAX_CONDITION:
+        return None
     h /= np.linalg.norm(h[2])
-    # Depth of the ground point seen at a pixel is 1 / w of the inverse mapping, so w is positive where the ground is ahead.
     s = np.linalg.svd(h, compute_uv=False)
-    return HomographyFit(True, "", h, refused("", 0).inliers, float("nan"), float(s[0] / s[-1]))
+    return HomographyFit(True, "", h, refused_fit("", 0).inliers, float("nan"), float(s[0] / s[-1]))
 
 
-def locate_the_rest(
-    log: Log, schedule: Schedule, seen: Observations, homographies: Mapping[str, CameraGround], *, across: bool = True
+def place_by_homography(
+    log: Log, observed: Observations, homographies: Mapping[str, CameraHomography], *, across: bool = True
 ) -> list[Measurements]:
-    """Measurements of all ticks, those without LiDAR points placed by their camera's homography where it is able to.
+    """Place the measurements without LiDAR points by their camera's homography, where it is able to, and fuse each tick.
 
-    `across` says whether several cameras may have seen the same, see `fuse`.
+    `across` says whether several cameras may have seen the same obstacle, see `fuse`. Returns the measurements of all
+    ticks.
     """
-    ticks = zip(seen.measurements, seen.obstacles, strict=True)
-    return [_locate_tick(log, m, o, homographies, across) for m, o in ticks]
+    ticks = zip(observed.measurements, observed.obstacles, strict=True)
+    return [_place_tick(log, m, o, homographies, across) for m, o in ticks]
 
 
-def _locate_tick(
-    log: Log, m: Measurements, obstacles: Obstacles | None, homographies: Mapping[str, CameraGround], across: bool
+def _place_tick(
+    log: Log,
+    m: Measurements,
+    obstacles: Obstacles | None,
+    homographies: Mapping[str, CameraHomography],
+    across: bool,
 ) -> Measurements:
     missing = np.flatnonzero(m.source == "")
     if len(missing) == 0:
         return m
     columns: dict[str, Any] = {k: v.copy() if isinstance(v, np.ndarray) else v for k, v in vars(m).items()}
-    stands: dict[tuple[str, int], tuple[Array, Array]] = {}
+    poses: dict[tuple[str, int], tuple[Array, Array]] = {}
     for k in missing:
-        ground = homographies.get(str(m.camera[k]))
-        if ground is None or not ground.fit.ok or not _has_foot(ground.camera, m.box_px[k]):
+        homography = homographies.get(str(m.camera[k]))
+        if homography is None or not homography.fit.ok or not _has_foot(homography.camera, m.box_px[k]):
             continue
-        frame = (ground.camera.name, int(m.t_ns[k]))
-        if frame not in stands:
-            base = base_pose(log, frame[1])
-            stands[frame] = base, _stand(log, ground.camera, base, frame[1])
-        base, stand = stands[frame]
-        placed = locate(ground.fit, ground.camera, m.box_px[k], str(m.category[k]), stand)
+        frame = (homography.camera.name, int(m.t_ns[k]))
+        if frame not in poses:
+            map_T_base = base_pose(log, frame[1])
+            poses[frame] = map_T_base, _camera_xy(log, homography.camera, map_T_base, frame[1])
+        map_T_base, camera_xy = poses[frame]
+        placed = place_obstacle(
+            homography.fit.ground_H_image, homography.camera, m.box_px[k], str(m.category[k]), camera_xy
+        )
         if placed is None:
             continue
         if obstacles is not None:
-            beyond, stopped = rays_at(obstacles, base, placed, log.ground_z_ego_m, str(m.category[k]))
-            if beyond >= MIN_RAYS and stopped < MOST_STOPPED * beyond:
+            beyond, stopped = count_rays(obstacles, map_T_base, placed, log.ground_z_ego_m, str(m.category[k]))
+            if beyond >= MIN_RAYS and stopped < MAX_STOPPED_SHARE * beyond:
                 continue
             if beyond + stopped >= MIN_RAYS:
-                columns["score"][k] *= UNCONFIRMED
-        _write(columns, int(k), placed, base, log.ground_z_ego_m, str(m.category[k]))
-    placed_rows = Measurements(**columns)
-    return fuse(placed_rows, across=across)
+                columns["score"][k] *= UNCONFIRMED_SCORE
+        _write(columns, int(k), placed, map_T_base, log.ground_z_ego_m)
+    return fuse(Measurements(**columns), across=across)
 
 
-def rays_at(
-    obstacles: Obstacles, base: Array, placed: tuple[Array, Array], ground_z: float, category: str
+def count_rays(
+    obstacles: Obstacles, map_T_base: Array, placed: tuple[Array, Array], ground_z_m: float, category: str
 ) -> tuple[int, int]:
-    """How many rays toward an object of a category, placed at (2,), (2, 2) in the frame `base` (4, 4), went on, and stopped."""
+    """Count the LiDAR rays toward an obstacle that went on behind it, and those that ended before or in it.
+
+    `placed` is its position (2,) and covariance (2, 2) in the frame whose pose is `map_T_base` (4, 4).
+    """
     xy, covariance = placed
     _, width, height = TYPICAL_SIZE_M[category]
-    foot = base[:3, :3] @ np.array([xy[0], xy[1], ground_z]) + base[:3, 3] - obstacles.origin - obstacles.sensor
+    foot = map_T_base[:3, :3] @ np.array([xy[0], xy[1], ground_z_m]) + map_T_base[:3, 3]
+    foot = foot - obstacles.origin - obstacles.sensor
     range_m = float(np.hypot(*foot[:2]))
     sigma_m = float(np.sqrt(xy @ covariance @ xy) / max(np.hypot(*xy), 1e-6))
     azimuth, reach, slope = obstacles.rays
     turned = wrap_angle(azimuth - np.arctan2(foot[1], foot[0]))
     z_there = slope * range_m - foot[2]
-    toward = (np.abs(turned) * range_m < width / 2) & (z_there > 0.2 * height) & (z_there < 0.8 * height)
+    low, high = RAY_HEIGHT_SHARES
+    toward = (np.abs(turned) * range_m < width / 2) & (z_there > low * height) & (z_there < high * height)
     beyond = int((toward & (reach > range_m + width + 2 * sigma_m)).sum())
     return beyond, int(toward.sum()) - beyond
 
 
-def _stand(log: Log, camera: Camera, base: Array, t_ns: int) -> Array:
-    """Where a camera stands (2,) in the ground frame."""
+def _camera_xy(log: Log, camera: Camera, map_T_base: Array, t_ns: int) -> Array:
+    """Return the position (2,) of a camera in the ground frame."""
     map_T_cam, _ = log.map_T_sensor(camera.name, t_ns)
-    return np.asarray((inverse(base) @ map_T_cam[0])[:2, 3], dtype=np.float64)
+    return np.asarray((inverse(map_T_base) @ map_T_cam[0])[:2, 3], dtype=np.float64)
 
 
-def _write(
-    columns: dict[str, Any], k: int, placed: tuple[Array, Array], base: Array, ground_z: float, category: str
-) -> None:
+def _write(columns: dict[str, Any], k: int, placed: tuple[Array, Array], map_T_base: Array, ground_z_m: float) -> None:
     xy, covariance = placed
-    length, width, height = TYPICAL_SIZE_M[category]
-    foot = base[:3, :3] @ np.array([xy[0], xy[1], ground_z]) + base[:3, 3]
+    length, width, height = TYPICAL_SIZE_M[str(columns["category"][k])]
+    foot = map_T_base[:3, :3] @ np.array([xy[0], xy[1], ground_z_m]) + map_T_base[:3, 3]
     columns["center_m"][k] = foot + np.array([0, 0, height / 2])
     columns["size_m"][k] = length, width, height
-    columns["covariance"][k] = base[:2, :2] @ covariance @ base[:2, :2].T
+    columns["covariance"][k] = map_T_base[:2, :2] @ covariance @ map_T_base[:2, :2].T
     columns["source"][k] = "topdown"

@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from extremes.table import Outcome, case
-from log2sim.geometry import Array, Camera, inverse, transform
-from log2sim.perception.homography.correspondences import Correspondences, fit_camera, locate
-from log2sim.perception.homography.estimate import HomographyFit, apply_homography, estimate_homography
+from log2sim.geometry import Array, Camera, apply_homography, inverse, transform
+from log2sim.perception.homography.camera_fit import fit_camera
+from log2sim.perception.homography.correspondences import Correspondences
+from log2sim.perception.homography.estimate import EstimationOptions, estimate_homography
+from log2sim.perception.homography.fit import HomographyFit
+from log2sim.perception.homography.placement import place_obstacle
 
 METHODS = ("time-aware", "min-frame", "per-frame")
 PROBES_M = np.array([[x, y] for x in (8.0, 15.0, 30.0) for y in (-0.3 * x, 0.0, 0.3 * x)])
@@ -45,8 +48,11 @@ def fits_of(xy: Array, uv: Array, ticks: int = 10, noise_px: float = 0.5) -> lis
     """What every method makes of the same correspondences, whose pixels get noise."""
     rng = np.random.default_rng(0)
     noisy, tick = uv + rng.normal(0.0, noise_px, uv.shape), np.arange(len(xy)) * ticks // max(len(xy), 1)
+    correspondences = Correspondences(noisy, xy, tick)
     return [
-        estimate_homography(noisy, xy, tick, method=m, rng=np.random.default_rng(1), sigma_px=1.0, sigma_m=0.02)
+        estimate_homography(
+            correspondences, EstimationOptions(m, sigma_px=1.0, sigma_m=0.02), rng=np.random.default_rng(1)
+        )
         for m in METHODS
     ]
 
@@ -132,7 +138,7 @@ def collinear_with_ground() -> Outcome:
     lane, ground = np.column_stack([x, np.full(100, -1.75)]), spread(400, rng)
     feet = Correspondences(seen_at(lane), lane, np.arange(100))
     points = Correspondences(seen_at(ground) + rng.normal(0, 0.5, ground.shape), ground, np.arange(400) // 4)
-    fit, source = fit_camera(feet, points, method="time-aware", rng=rng)
+    fit, source = fit_camera(feet, points, EstimationOptions(), rng=rng)
     error = homography_error_m(fit) if fit.ok else None
     return Outcome(fit.ok and "ground" in source and error is not None and error < 0.15, source, fit.condition, error)
 
@@ -173,8 +179,7 @@ def horizon() -> Outcome:
     v = 360.0 - 1000.0 * np.tan(np.radians(4.0))
     uv = np.array([[640.0, v - d] for d in (0.01, 1.0, 100.0)])
     places, below = apply_homography(h, uv)
-    fit = HomographyFit(True, "", h, np.ones(4, bool), 0.0, 5.0)
-    located = locate(fit, camera, np.array([600.0, 200.0, 680.0, v - 1.0]), "car", np.zeros(2))
+    located = place_obstacle(h, camera, np.array([600.0, 200.0, 680.0, v - 1.0]), "car", np.zeros(2))
     ok = not below.any() and np.isnan(places).all() and located is None
     return Outcome(bool(ok), "none" if ok else "a place above the horizon")
 
@@ -184,7 +189,6 @@ def near_horizon() -> Outcome:
     camera, h = true_homography()
     v = 360.0 - 1000.0 * np.tan(np.radians(4.0)) + 0.01
     place, below = apply_homography(h, np.array([[640.0, v]]))
-    fit = HomographyFit(True, "", h, np.ones(4, bool), 0.0, 5.0)
-    located = locate(fit, camera, np.array([600.0, 200.0, 680.0, v]), "car", np.zeros(2))
+    located = place_obstacle(h, camera, np.array([600.0, 200.0, 680.0, v]), "car", np.zeros(2))
     ok = bool(below[0] and np.isfinite(place).all() and place[0, 0] > 1e4 and located is None)
     return Outcome(ok, f"{place[0, 0]:.3g} m away, {'not placed' if located is None else 'placed'}")

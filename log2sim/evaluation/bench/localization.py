@@ -13,11 +13,11 @@ from log2sim.datatypes import GROUP_OF, Log, Measurements, Scenario
 from log2sim.evaluation.bench.bootstrap import error_of
 from log2sim.evaluation.bench.scores import CUT_M, Judged
 from log2sim.evaluation.metrics.align import Side, truth_side
-from log2sim.geometry import NS_PER_S, Array, Camera, box_iou, inverse, project_boxes
+from log2sim.geometry import NS_PER_S, Array, Camera, apply_homography, box_iou, inverse, project_boxes
 from log2sim.perception.first_pass import Observations, base_pose
-from log2sim.perception.homography.correspondences import FARTHEST_M, Correspondences, foot_points, pinhole
-from log2sim.perception.homography.estimate import apply_homography
-from log2sim.perception.homography_stage import CameraGround, locate_the_rest
+from log2sim.perception.homography.correspondences import Correspondences, foot_points, undistorted_pixels
+from log2sim.perception.homography.placement import MAX_RANGE_M
+from log2sim.perception.homography_stage import CameraHomography, place_by_homography
 from log2sim.perception.sync import Schedule
 
 LEAST_IOU = 0.5
@@ -155,7 +155,7 @@ def hold_out(
     held: dict[str, list[Correspondences]] = {camera: [] for camera in seen.feet}
     for tick, m in enumerate(seen.measurements):
         xy, who = known[tick].xy, known[tick].who
-        near = np.hypot(*(m.center_m - m.sensor_m)[:, :2].T) <= FARTHEST_M
+        near = np.hypot(*(m.center_m - m.sensor_m)[:, :2].T) <= MAX_RANGE_M
         good = (m.source == "lidar") & ~m.truncated & (m.points >= LEAST_POINTS) & near & np.isfinite(xy[:, 0])
         good &= np.array([len(c) > 0 for c in m.cluster], dtype=bool)
         good &= rng.random(len(m)) < HELD_OUT
@@ -189,13 +189,13 @@ def _without_feet(camera: Camera, parts: Sequence[Correspondences], asked: Seque
     box = np.concatenate([m.box_px for m in asked])
     if not len(box) or not len(feet.uv):
         return feet
-    uv = pinhole(camera, np.column_stack([(box[:, 0] + box[:, 2]) / 2, box[:, 3]]))
+    uv = undistorted_pixels(camera, np.column_stack([(box[:, 0] + box[:, 2]) / 2, box[:, 3]]))
     same = (feet.tick[:, None] == tick) & (np.abs(feet.uv[:, None] - uv).max(axis=2) < SAME_FOOT_PX)
     kept = ~same.any(axis=1)
     return replace(feet, **{name: column[kept] for name, column in vars(feet).items() if column is not None})
 
 
-def judge_placed(log: Log, schedule: Schedule, held: Held, grounds: Mapping[str, CameraGround]) -> Judged:
+def judge_placed(log: Log, held: Held, grounds: Mapping[str, CameraHomography]) -> Judged:
     """How far the homographies alone put the feet of the obstacles that were set aside from where LiDAR has them.
 
     `near_error_m` and `far_error_m` are of those within and beyond 25 m. `center_error_m` and `center_median_m` are of the
@@ -206,7 +206,7 @@ def judge_placed(log: Log, schedule: Schedule, held: Held, grounds: Mapping[str,
     for camera in (c for c in held.asked if c in grounds):
         for tick, (m, known) in enumerate(zip(held.asked[camera], held.known[camera], strict=True)):
             feet.append(_foot_distances(held.feet[camera][tick], at_tick(grounds[camera], tick)))
-            centers.append(np.hypot(*(_places(log, schedule, tick, m, grounds[camera]) - known.xy).T))
+            centers.append(np.hypot(*(_places(log, tick, m, grounds[camera]) - known.xy).T))
             range_m.append(np.hypot(*(known.xy - m.sensor_m[:, :2]).T))
             who.append(known.who)
     d, near, w = np.concatenate(feet), np.concatenate(range_m) < NEAR_M, np.concatenate(who)
@@ -219,23 +219,23 @@ def judge_placed(log: Log, schedule: Schedule, held: Held, grounds: Mapping[str,
     return Judged(judged.figures | extra, judged.parts)
 
 
-def _foot_distances(feet: Correspondences, ground: CameraGround) -> Array:
+def _foot_distances(feet: Correspondences, ground: CameraHomography) -> Array:
     """How far (N,) a homography puts feet from where they are, m; NaN for those above its horizon."""
     if not len(feet.uv):
         return np.zeros(0)
     return np.asarray(np.hypot(*(apply_homography(ground.fit.ground_H_image, feet.uv)[0] - feet.xy_ego).T))
 
 
-def _places(log: Log, schedule: Schedule, tick: int, m: Measurements, ground: CameraGround) -> Array:
+def _places(log: Log, tick: int, m: Measurements, ground: CameraHomography) -> Array:
     """Places (M, 2) in the map of the rows of a tick by the homography, that of the tick where it has one of its own."""
     if not len(m):
         return np.zeros((0, 2))
     seen = Observations(measurements=[m], obstacles=[None])
-    found = locate_the_rest(log, schedule, seen, {ground.camera.name: at_tick(ground, tick)})[0]
+    found = place_by_homography(log, seen, {ground.camera.name: at_tick(ground, tick)})[0]
     return _in_order(m, found)
 
 
-def at_tick(ground: CameraGround, tick: int) -> CameraGround:
+def at_tick(ground: CameraHomography, tick: int) -> CameraHomography:
     """A camera's homography at one tick: its own where every tick has one, and then none where that could not be fitted."""
     fit = ground.fit
     if fit.per_tick is None or not fit.ok:

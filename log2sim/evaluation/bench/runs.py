@@ -25,8 +25,7 @@ from log2sim.evaluation.bench.settings import Grid, Setting
 from log2sim.evaluation.bench.shared_detections import Remembered, detect_once
 from log2sim.geometry import NS_PER_S
 from log2sim.perception.first_pass import Observations, observe
-from log2sim.perception.homography.correspondences import jitter_m
-from log2sim.perception.homography_stage import CameraGround, fit_cameras
+from log2sim.perception.homography_stage import CameraHomography, estimation_options, fit_homographies
 from log2sim.perception.sync import Schedule
 from log2sim.pipeline import conclude, detector_of, schedule_of
 from log2sim.plan import LABELS, Plan, make_plan
@@ -210,7 +209,7 @@ def homography_points(bed: Bed, seen: Observations, tell: Progress) -> list[Poin
         return []
     settings = (*bed.grid.homography, *bed.grid.hypotheses)
     spent: dict[str, list[float]] = {s.name: [] for s in settings}
-    fits: dict[str, dict[str, CameraGround]] = {}
+    fits: dict[str, dict[str, CameraHomography]] = {}
     for repeat in range(REPEATS):
         for k, setting in enumerate(settings):
             begin = time.perf_counter()
@@ -219,32 +218,23 @@ def homography_points(bed: Bed, seen: Observations, tell: Progress) -> list[Poin
             tell("homographies", repeat * len(spent) + k + 1, REPEATS * len(spent))
     out = []
     for setting in settings:
-        judged = judge_placed(bed.log, bed.schedule, held, fits[setting.name])
+        judged = judge_placed(bed.log, held, fits[setting.name])
         figures = judged.figures | fit_figures(fits[setting.name])
         ms = bed.ms_per_tick(min(spent[setting.name]))
         out.append(Point(setting.name, setting.present, ms, figures["error_m"], figures, judged.parts["error_m"]))
     return out
 
 
-def fit(bed: Bed, setting: Setting, held: Held) -> dict[str, CameraGround]:
+def fit(bed: Bed, setting: Setting, held: Held) -> dict[str, CameraHomography]:
     """The homographies of all cameras by one method."""
     plan = bed.plan.decided("homography", True, "a top-down picture is asked for")
-    config = setting.config
-    _, grounds = fit_cameras(
-        bed.log,
-        bed.schedule,
-        held.seen,
-        plan,
-        config.topdown.method,
-        np.random.default_rng(config.seed),
-        hypotheses=config.topdown.hypotheses or None,
-    )
-    return grounds
+    options, rng = estimation_options(setting.config.topdown), np.random.default_rng(setting.config.seed)
+    return fit_homographies(bed.log, held.seen, plan, options, rng=rng)[1]
 
 
-def fit_figures(grounds: Mapping[str, CameraGround]) -> Figures:
+def fit_figures(grounds: Mapping[str, CameraHomography]) -> Figures:
     """What the fits say of themselves: jitter and residual, means over cameras, and how many fell back on the calibration."""
-    jitters = [v for v in (jitter_m(g.fit) for g in grounds.values()) if np.isfinite(v)]
+    jitters = [v for v in (g.fit.jitter_m for g in grounds.values()) if np.isfinite(v)]
     residuals = [g.fit.error_m for g in grounds.values() if np.isfinite(g.fit.error_m)]
     return {
         "jitter_m": float(np.mean(jitters)) if jitters else None,

@@ -1,1 +1,1 @@
-"""Image-to-ground homographies by time-aware RANSAC, and its baselines."""
+"""Image-to-ground homographies by time-aware RANSAC, and the baselines that they are compared with."""

@@ -8,24 +8,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.perception.homography.pose import tangent, unit_pose
-from log2sim.perception.homography.stream import BOUND, Stream
+from log2sim.perception.homography.normalized import CHI2_2DOF_99, NormalizedCorrespondences
+from log2sim.perception.homography.planar_pose import nearest_unit_pose, pose_tangent
 
-# An estimate of the noise starts from what is believed of it, worth so many correspondences, and stays within a factor.
-BELIEVED_ROWS = 20.0
-NOISE_FACTOR = 4.0
-# Of a normal error's square that is cut at BOUND so much remains.
-CUT_SHARE = 0.953
-LEAST_GAIN = 0.02
+# The assumed noise counts as a prior worth this many correspondences; an estimate departs from it by this factor at most.
+NOISE_PRIOR_ROWS = 20.0
+MAX_NOISE_FACTOR = 4.0
+# E[x^2 | x^2 < 9.21] / 2 for a chi-squared variable with 2 degrees of freedom: 1 - 4.605 * 0.01 / 0.99.
+TRUNCATED_VARIANCE_SHARE = 0.953
+# Refinement ends when the summed squared error falls by less than this.
+MIN_LOSS_DECREASE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Linearized:
-    """Errors at homographies and their derivatives.
+class Linearization:
+    """Errors of K homographies on N correspondences, linearized, in normalized units.
 
-    `error` (K, 2, N) in the image, `slope` (K, 9, 2, N) of it by the homography's elements, both whitened, `squared`
-    (K, N), `projected` (K, 2, N), and what else the weights are made of: the `ground` part of the covariance (3, K, N)
-    and the `whiten`ing (3, K, N).
+    Attributes
+    ----------
+    error : (K, 2, N) float64
+        Whitened errors in the image.
+    squared : (K, N) float64
+        Squared norms of `error`; infinite behind the camera.
+    slope : (K, 9, 2, N) float64
+        Derivatives of `error` by the nine elements of the homography.
+    projected : (K, 2, N) float64
+        Ground positions projected into the image.
+    ground : (3, K, N) float64
+        Covariance in the image (uu, uv, vv) of ground noise of standard deviation 1.
+    whiten : (3, K, N) float64
+        Cholesky factors of the inverse covariance: scale of u, scale of v, and the shear of v by u.
     """
 
     error: Array
@@ -36,13 +48,14 @@ class Linearized:
     whiten: Array
 
 
-def linearize(stream: Stream, h: Array, warps: Array | None = None) -> Linearized:
-    """Errors of homographies (K, 3, 3), ground to image, and their derivatives.
+def linearize(data: NormalizedCorrespondences, h: Array, warps: Array | None = None) -> Linearization:
+    """Linearize the errors of homographies (K, 3, 3), ground to image.
 
-    `warps` (N, 3, 3) moves the image of each correspondence, as a pitching camera does; derivatives ignore that.
+    `warps` (N, 3, 3) are homographies of the image applied to each correspondence on top of `h`, as a pitching camera
+    has; the derivatives ignore them, since they are near the identity.
     """
     count = len(h)
-    q = (h.reshape(-1, 3) @ stream.ground).reshape(count, 3, -1)
+    q = (h.reshape(-1, 3) @ data.ground).reshape(count, 3, -1)
     if warps is not None:
         q = np.einsum("nij,kjn->kin", warps, q)
     front = q[:, 2] > 0
@@ -50,72 +63,74 @@ def linearize(stream: Stream, h: Array, warps: Array | None = None) -> Linearize
     projected = q[:, :2] * depth[:, None]
     u, v = projected[:, 0], projected[:, 1]
     a, b, c = h[:, 0, :2, None] * depth[:, None], h[:, 1, :2, None] * depth[:, None], h[:, 2, :2, None] * depth[:, None]
-    # Motion in the image (K, N) by motion on the ground, and the covariance that noise on the ground has there.
+    # Derivatives (K, N) of the pixel by the ground position, and the covariance that ground noise has in the image.
     ux, uy = a[:, 0] - u * c[:, 0], a[:, 1] - u * c[:, 1]
     vx, vy = b[:, 0] - v * c[:, 0], b[:, 1] - v * c[:, 1]
-    ground = np.empty((3, count, len(stream.tick)))
+    ground = np.empty((3, count, len(data.tick)))
     ground[0], ground[1], ground[2] = ux * ux + uy * uy, ux * vx + uy * vy, vx * vx + vy * vy
-    cuu, cuv = stream.sigma_ground**2 * ground[:2]
-    cuu += stream.sigma_image**2
+    cuu, cuv = data.sigma_ground**2 * ground[:2]
+    cuu += data.sigma_image**2
     shear = cuv / cuu
-    # The determinant is a sum of squares and so has no cancellation, even where a hypothesis folds the ground to a line.
-    area = stream.sigma_image**2 * (cuu + stream.sigma_ground**2 * ground[2])
-    area += stream.sigma_ground**4 * (ux * vy - uy * vx) ** 2
+    # The determinant as a sum of squares has no cancellation, even where a hypothesis folds the ground to a line.
+    area = data.sigma_image**2 * (cuu + data.sigma_ground**2 * ground[2])
+    area += data.sigma_ground**4 * (ux * vy - uy * vx) ** 2
     whiten = np.empty_like(ground)
     np.sqrt(area, out=area)
     np.sqrt(cuu, out=cuu)
     wu = np.divide(1.0, cuu, out=whiten[0])
     wv = np.divide(cuu, area, out=whiten[1])
     whiten[2] = shear
-    error = projected - stream.image
+    error = projected - data.image
     error[:, 1] -= shear * error[:, 0]
     error[:, 0] *= wu
     error[:, 1] *= wv
     squared = error[:, 0] * error[:, 0] + error[:, 1] * error[:, 1]
     squared[~front] = np.inf
-    scaled = stream.ground * depth[:, None]
-    slope = np.empty((count, 9, 2, stream.image.shape[1]))
+    scaled = data.ground * depth[:, None]
+    slope = np.empty((count, 9, 2, data.image.shape[1]))
     np.multiply(scaled, wu[:, None], out=slope[:, 0:3, 0])
     slope[:, 3:6, 0] = 0.0
     np.multiply(slope[:, 0:3, 0], -u[:, None], out=slope[:, 6:9, 0])
     np.multiply(scaled, wv[:, None], out=slope[:, 3:6, 1])
     np.multiply(slope[:, 3:6, 1], -shear[:, None], out=slope[:, 0:3, 1])
     np.multiply(slope[:, 3:6, 1], (shear * u - v)[:, None], out=slope[:, 6:9, 1])
-    return Linearized(error, squared, slope, projected, ground, whiten)
+    return Linearization(error, squared, slope, projected, ground, whiten)
 
 
-def refine_many(stream: Stream, h: Array, bounds: tuple[float, ...]) -> Array:
-    """Gauss-Newton steps of homographies (K, 3, 3) at once, one for each of `bounds` on the squared error."""
+def refine_many(data: NormalizedCorrespondences, h: Array, gates: tuple[float, ...]) -> Array:
+    """Take one Gauss-Newton step of all homographies (K, 3, 3) for each of `gates` on the squared error."""
     h = h / np.linalg.norm(h, axis=(1, 2), keepdims=True)
-    for bound in bounds:
-        at = linearize(stream, h)
-        h = np.asarray(h + newton_steps(at, at.squared < bound, h))
+    for gate in gates:
+        linear = linearize(data, h)
+        h = np.asarray(h + newton_steps(linear, linear.squared < gate, h))
         h /= np.linalg.norm(h, axis=(1, 2), keepdims=True)
     return h
 
 
-def refine(stream: Stream, h: Array, rounds: int, image_K: Array | None = None) -> Array:
-    """The homography (3, 3) of least bounded loss near `h`; with intrinsics `image_K` (3, 3) that of a camera."""
-    at = linearize(stream, h[None])
-    loss = float(np.minimum(at.squared, BOUND).sum())
+def refine(data: NormalizedCorrespondences, h: Array, rounds: int, image_K: Array | None = None) -> Array:
+    """Minimize the bounded loss from `h` (3, 3); with intrinsics `image_K` (3, 3) over the poses of that camera."""
+    linear = linearize(data, h[None])
+    loss = float(np.minimum(linear.squared, CHI2_2DOF_99).sum())
     for _ in range(rounds):
-        proposed = step(at, h, image_K)
-        there = linearize(stream, proposed[None])
-        value = float(np.minimum(there.squared, BOUND).sum())
-        if value >= loss:
+        proposed = newton_step(linear, h, image_K)
+        proposed_linear = linearize(data, proposed[None])
+        proposed_loss = float(np.minimum(proposed_linear.squared, CHI2_2DOF_99).sum())
+        if proposed_loss >= loss:
             break
-        gain, h, at, loss = loss - value, proposed, there, value
-        if gain < LEAST_GAIN:
+        decrease, h, linear, loss = loss - proposed_loss, proposed, proposed_linear, proposed_loss
+        if decrease < MIN_LOSS_DECREASE:
             break
     return h
 
 
-def step(at: Linearized, h: Array, image_K: Array | None = None, bound: float = BOUND, k: int = 0) -> Array:
-    """A homography (3, 3) after a Gauss-Newton step from `h`, the `k`-th of those linearized; `h` where there is none."""
-    use = at.squared[k] < bound
-    basis = free_directions(h) if image_K is None else tangent(image_K, h)
-    slope = (at.slope[k] * use).reshape(9, -1)
-    normal, right = basis.T @ (slope @ slope.T) @ basis, basis.T @ (slope @ at.error[k].ravel())
+def newton_step(
+    linear: Linearization, h: Array, image_K: Array | None = None, gate: float = CHI2_2DOF_99, k: int = 0
+) -> Array:
+    """Take a Gauss-Newton step from `h` (3, 3), the `k`-th linearized; returns `h` if the step is undetermined."""
+    use = linear.squared[k] < gate
+    basis = scale_free_basis(h) if image_K is None else pose_tangent(image_K, h)
+    slope = (linear.slope[k] * use).reshape(9, -1)
+    normal, right = basis.T @ (slope @ slope.T) @ basis, basis.T @ (slope @ linear.error[k].ravel())
     size = np.sqrt(np.maximum(np.diagonal(normal), 1e-300))
     try:
         along = np.linalg.solve(normal / size[:, None] / size + 1e-14 * np.eye(len(size)), right / size) / size
@@ -124,26 +139,26 @@ def step(at: Linearized, h: Array, image_K: Array | None = None, bound: float = 
     moved = h - (basis @ along).reshape(3, 3)
     if np.count_nonzero(use) < 4 or not np.isfinite(moved).all():
         return h
-    return moved / np.linalg.norm(moved) if image_K is None else unit_pose(image_K, moved)
+    return np.asarray(moved / np.linalg.norm(moved)) if image_K is None else nearest_unit_pose(image_K, moved)
 
 
-def free_directions(h: Array) -> Array:
-    """Directions (9, 8) across the scale of a homography (3, 3)."""
-    # The reflection that takes the homography to an axis takes the other axes to what is across it (Householder).
+def scale_free_basis(h: Array) -> Array:
+    """Build the orthonormal directions (9, 8) perpendicular to a homography (3, 3), whose scale is free."""
+    # The reflection that takes the homography to an axis takes the other axes to its orthogonal complement (Householder).
     v = h.ravel() / np.linalg.norm(h)
     largest = int(np.argmax(np.abs(v)))
     v[largest] += np.sign(v[largest])
     across = [k for k in range(9) if k != largest]
     out = v[:, None] * (-v[across] / abs(v[largest]))
     out[across, range(8)] += 1.0
-    return out
+    return np.asarray(out)
 
 
-def newton_steps(at: Linearized, use: NDArray[np.bool_], h: Array) -> Array:
-    """Gauss-Newton steps (K, 3, 3) over the correspondences in `use` (K, N); zero where these determine none."""
+def newton_steps(linear: Linearization, use: NDArray[np.bool_], h: Array) -> Array:
+    """Compute Gauss-Newton steps (K, 3, 3) over the correspondences in `use` (K, N); zero where undetermined."""
     count = len(h)
-    slope = (at.slope * use[:, None, None]).reshape(count, 9, -1)
-    normal, right = slope @ slope.swapaxes(1, 2), slope @ at.error.reshape(count, -1, 1)
+    slope = (linear.slope * use[:, None, None]).reshape(count, 9, -1)
+    normal, right = slope @ slope.swapaxes(1, 2), slope @ linear.error.reshape(count, -1, 1)
     # The scale of a homography is free: steps are taken across it, never along it.
     along = h.reshape(count, 9, 1)
     size = np.trace(normal, axis1=1, axis2=2)[:, None, None] / 9
@@ -157,29 +172,31 @@ def newton_steps(at: Linearized, use: NDArray[np.bool_], h: Array) -> Array:
     return np.where((enough & np.isfinite(step).all(axis=(1, 2)))[:, None, None], step, 0.0)
 
 
-def noise(stream: Stream, at: Linearized, parameters: int = 8) -> tuple[float, float]:
-    """How many times larger than believed the noise of pixels and of ground positions is, from the inliers' errors.
+def noise_factors(data: NormalizedCorrespondences, linear: Linearization, parameters: float = 8) -> tuple[float, float]:
+    """Estimate from the inliers by which factors the noise of pixels and of ground positions exceeds the assumed one.
+
+    `parameters` is the number of fitted parameters, subtracted from the degrees of freedom.
 
     Notes
     -----
-    Variance components by Fisher scoring of the normal likelihood; what was believed counts as some further inliers.
+    Variance components by one step of Fisher scoring of the normal likelihood, with the assumed noise as prior.
     """
-    use = at.squared[0] < BOUND
+    use = linear.squared[0] < CHI2_2DOF_99
     count = int(use.sum())
     if 2 * count <= parameters:
         return 1.0, 1.0
-    wu, wv, shear = (a[0, use] for a in at.whiten)
-    error = at.error[0][:, use]
-    # Inverse covariance, and the errors through it.
+    wu, wv, shear = (a[0, use] for a in linear.whiten)
+    error = linear.error[0][:, use]
+    # Inverse covariance, and the errors multiplied by it.
     icc = wv * wv
     iuv, iuu = -shear * icc, wu * wu + shear * shear * icc
     zv = wv * error[1]
     zu = wu * error[0] - shear * zv
-    guu, guv, gvv = at.ground[:, 0, use] * stream.sigma_ground**2
-    pixel = stream.sigma_image**2
-    # Covariance of the ground part through the inverse: a 2x2 matrix for each correspondence.
+    guu, guv, gvv = linear.ground[:, 0, use] * data.sigma_ground**2
+    pixel = data.sigma_image**2
+    # Inverse covariance times the covariance of the ground noise: a 2x2 matrix for each correspondence.
     auu, auv, avu, avv = iuu * guu + iuv * guv, iuu * guv + iuv * gvv, iuv * guu + icc * guv, iuv * guv + icc * gvv
-    told = np.array([pixel * (zu @ zu + zv @ zv), (zu * zu) @ guu + 2 * (zu * zv) @ guv + (zv * zv) @ gvv])
+    score = np.array([pixel * (zu @ zu + zv @ zv), (zu * zu) @ guu + 2 * (zu * zv) @ guv + (zv * zv) @ gvv])
     cross = float(pixel * (auu @ iuu + (auv + avu) @ iuv + avv @ icc))
     fisher = np.array(
         [
@@ -187,7 +204,7 @@ def noise(stream: Stream, at: Linearized, parameters: int = 8) -> tuple[float, f
             [cross, auu @ auu + 2 * auv @ avu + avv @ avv],
         ]
     )
-    told *= 2 * count / (2 * count - parameters) / CUT_SHARE
-    factors = np.linalg.solve(fisher + BELIEVED_ROWS * np.eye(2), told + BELIEVED_ROWS)
-    within = np.sqrt(np.clip(factors, NOISE_FACTOR**-2, NOISE_FACTOR**2))
-    return float(within[0]), float(within[1])
+    score *= 2 * count / (2 * count - parameters) / TRUNCATED_VARIANCE_SHARE
+    variances = np.linalg.solve(fisher + NOISE_PRIOR_ROWS * np.eye(2), score + NOISE_PRIOR_ROWS)
+    factors = np.sqrt(np.clip(variances, MAX_NOISE_FACTOR**-2, MAX_NOISE_FACTOR**2))
+    return float(factors[0]), float(factors[1])

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array, Camera, distort, fold_radius, inverse
+from log2sim.geometry import Array, Camera, distort, fold_radius, ground_homography
 
 _LEVELS = 4
 """Halvings of an image kept to average pixels where many fall into one cell."""
@@ -50,26 +50,6 @@ class GroundView:
     ) -> GroundView:
         """A view of a camera with pose (4, 4) onto the plane z = `ground_z_m` of the frame that the pose is in."""
         return cls(image_bgr, ground_homography(camera, map_T_cam, ground_z_m), camera, signed=True, **options)
-
-
-def ground_homography(camera: Camera, map_T_cam: Array, ground_z_m: float = 0.0) -> Array:
-    """Ground xy (m) of undistorted pixels as `ground_H_image` (3, 3), for the plane z = `ground_z_m`.
-
-    Its third row is positive on pixels below the horizon.
-
-    Raises
-    ------
-    ValueError
-        When the camera lies in the plane, which it then sees edge-on.
-    """
-    if abs(map_T_cam[2, 3] - ground_z_m) < 1e-3:
-        raise ValueError(
-            f"camera '{camera.name}' lies in the ground plane z = {ground_z_m:g} m and cannot look onto it"
-        )
-    cam_T_map = inverse(np.asarray(map_T_cam, dtype=np.float64))
-    r, t = cam_T_map[:3, :3], cam_T_map[:3, 3]
-    image_H_ground = camera.K @ np.column_stack([r[:, 0], r[:, 1], r[:, 2] * ground_z_m + t])
-    return np.linalg.inv(image_H_ground).astype(np.float64)
 
 
 def signed_inverse(view: GroundView) -> Array:

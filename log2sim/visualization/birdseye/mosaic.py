@@ -22,7 +22,6 @@ from log2sim.geometry import Array
 from log2sim.visualization.birdseye.ground_view import (
     GroundView,
     Image,
-    ground_homography,
     look_up,
     sample,
     seen_window,
@@ -30,7 +29,7 @@ from log2sim.visualization.birdseye.ground_view import (
     signed_inverse,
 )
 
-__all__ = ["GroundView", "Mosaic", "TopdownPicture", "ground_homography", "render_topdown", "write_picture"]
+__all__ = ["GroundView", "Mosaic", "TopdownPicture", "render_topdown", "write_picture"]
 
 MAX_CELLS = 36_000_000
 """Cells a picture may have; at 28 bytes a cell while it is built this is 1 GB."""

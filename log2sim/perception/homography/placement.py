@@ -1,0 +1,53 @@
+"""Ground position of an obstacle from its box in the image and the camera's homography."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from log2sim.datatypes import TYPICAL_SIZE_M
+from log2sim.geometry import Array, Camera, apply_homography, homography_jacobian
+from log2sim.perception.homography.camera_fit import FOOT_SIGMA_PX
+from log2sim.perception.homography.correspondences import undistorted_pixels
+
+# Beyond this range one pixel of a camera at car height is several meters.
+MAX_RANGE_M = 60.0
+# Standard deviation, m, of the ground itself and of where the nearest side of an obstacle is, along each axis.
+GROUND_POSITION_SIGMA_M = 0.2
+
+
+def place_obstacle(
+    ground_H_image: Array, camera: Camera, box_px: Array, category: str, camera_xy: Array
+) -> tuple[Array, Array] | None:
+    """Place an obstacle by the middle of the lower edge of its box.
+
+    Parameters
+    ----------
+    ground_H_image : (3, 3) float64
+    camera : Camera
+    box_px : (4,) float64
+    category : str
+        Tells the typical size.
+    camera_xy : (2,) float64
+        Position of the camera in the frame of the ground positions, m.
+
+    Returns
+    -------
+    center : (2,) float64
+        Center of the obstacle on the ground, m.
+    covariance : (2, 2) float64
+    or None
+        Above the horizon and beyond 60 m.
+    """
+    uv = undistorted_pixels(camera, np.array([[(box_px[0] + box_px[2]) / 2, box_px[3]]]))
+    xy, below = apply_homography(ground_H_image, uv)
+    if not below[0] or np.hypot(*(xy[0] - camera_xy)) > MAX_RANGE_M:
+        return None
+    direction = (xy[0] - camera_xy) / np.hypot(*(xy[0] - camera_xy))
+    length, width, _ = TYPICAL_SIZE_M[category]
+    # The foot is on the nearest side. Half of the depth behind it depends on the heading, which is unknown: from half the
+    # width to half the length.
+    depth, depth_sigma = (length + width) / 4, (length - width) / 4
+    slope = homography_jacobian(ground_H_image, uv)[0]
+    covariance = FOOT_SIGMA_PX**2 * slope @ slope.T + np.eye(2) * GROUND_POSITION_SIGMA_M**2
+    covariance = covariance + depth_sigma**2 * np.outer(direction, direction)
+    return xy[0] + direction * depth, covariance
