@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from replay_maneuvers import MANEUVERS, agent_from, driven, ramp
 
+from log2sim.datatypes import Trajectory
 from log2sim.simulation.feasible_trajectory import (
     FeasibilityLimits,
     _cost,
@@ -15,7 +16,6 @@ from log2sim.simulation.feasible_trajectory import (
     _normal_equations,
     fit_trajectory,
 )
-from log2sim.simulation.path import path_of
 from log2sim.simulation.reference import (
     GRID_S,
     feasible_trajectory_of,
@@ -43,7 +43,7 @@ def rolling_error(course):
 
 @pytest.mark.parametrize("name", MANEUVERS)
 def test_what_a_vehicle_drove_stays_as_it_is(name):
-    path = path_of(MANEUVERS[name](), 1.3)
+    path = Trajectory.through(MANEUVERS[name]().waypoints, 1.3)
     course, departure_m = feasible_trajectory_of(path, LIMITS)
     assert departure_m.max() < 0.06
     assert rolling_error(course).max() < 0.005
@@ -51,7 +51,7 @@ def test_what_a_vehicle_drove_stays_as_it_is(name):
 
 def test_a_constant_turn_is_found_with_its_curvature_and_speed():
     agent = driven(lambda t: np.full_like(t, 6.0), lambda s: np.full_like(s, -0.1), 4.0)
-    course, _ = feasible_trajectory_of(path_of(agent, 1.3), LIMITS)
+    course, _ = feasible_trajectory_of(Trajectory.through(agent.waypoints, 1.3), LIMITS)
     inner = slice(3, -3)
     np.testing.assert_allclose(course.curvature_1pm[inner], -0.1, atol=1e-3)
     np.testing.assert_allclose(course.speed_mps[inner], 6.0, atol=1e-2)
@@ -68,7 +68,7 @@ def test_noise_in_position_and_heading_gives_a_course_that_rolls():
         w.yaw_rad + rng.normal(0, 0.15, len(w)),
         w.speed_mps,
     )
-    course, _ = feasible_trajectory_of(path_of(noisy, 1.3), LIMITS)
+    course, _ = feasible_trajectory_of(Trajectory.through(noisy.waypoints, 1.3), LIMITS)
     x = course.x_m + 1.3 * np.cos(course.yaw_rad) - (w.x_m - noisy.waypoints.x_m[0])[: len(course.t_s)]
     y = course.y_m + 1.3 * np.sin(course.yaw_rad) - (w.y_m - noisy.waypoints.y_m[0])[: len(course.t_s)]
     rms = np.sqrt(np.mean(x**2 + y**2))
@@ -78,19 +78,19 @@ def test_noise_in_position_and_heading_gives_a_course_that_rolls():
 
 def test_a_turn_tighter_than_full_lock_is_widened_and_flagged():
     agent = driven(lambda t: np.full_like(t, 3.0), lambda s: np.where(s > 4, 0.8, 0.0), 4.0)
-    path = path_of(agent, 1.3)
+    path = Trajectory.through(agent.waypoints, 1.3)
     course, departure_m = feasible_trajectory_of(path, LIMITS)
     assert np.abs(course.curvature_1pm).max() < 0.30
     assert departure_m.max() > 0.3
     reference = vehicle_reference(path, LIMITS, accel_ahead_s=0.1, curvature_ahead_s=0.1)
     assert any("distance from what can be driven" in flag for flag in reference.flags)
-    fine = path_of(MANEUVERS["turn of radius 8 m"](), 1.3)
+    fine = Trajectory.through(MANEUVERS["turn of radius 8 m"]().waypoints, 1.3)
     assert vehicle_reference(fine, LIMITS, accel_ahead_s=0.1, curvature_ahead_s=0.1).flags == ()
 
 
 def test_a_bend_taken_faster_than_tires_hold_is_widened_and_flagged():
     agent = driven(lambda t: np.full_like(t, 20.0), lambda s: ramp(s, (20, 0), (40, 0.04), (60, 0.04), (80, 0)), 6.0)
-    path = path_of(agent, 1.3)
+    path = Trajectory.through(agent.waypoints, 1.3)
     course, _ = feasible_trajectory_of(path, LIMITS)
     assert np.abs(course.speed_mps**2 * course.curvature_1pm).max() < 1.05 * LIMITS.max_lateral_mps2  # 16 in the log
     reference = vehicle_reference(path, LIMITS, accel_ahead_s=0.1, curvature_ahead_s=0.1)
@@ -104,8 +104,10 @@ def test_boxes_turned_back_to_front_are_outvoted(turned):
     yaw, speed = w.yaw_rad.copy(), w.speed_mps.copy()
     yaw[turned] += np.pi
     speed[turned] *= -1
-    right, _ = feasible_trajectory_of(path_of(agent, 1.3), LIMITS)
-    course, _ = feasible_trajectory_of(path_of(agent_from(w.t_s, w.x_m, w.y_m, yaw, speed), 1.3), LIMITS)
+    right, _ = feasible_trajectory_of(Trajectory.through(agent.waypoints, 1.3), LIMITS)
+    course, _ = feasible_trajectory_of(
+        Trajectory.through(agent_from(w.t_s, w.x_m, w.y_m, yaw, speed).waypoints, 1.3), LIMITS
+    )
     np.testing.assert_allclose(course.yaw_rad, right.yaw_rad, atol=0.04)
     np.testing.assert_allclose(course.speed_mps, right.speed_mps, atol=0.1)
 
@@ -114,7 +116,7 @@ def test_a_box_that_jitters_on_the_spot_does_not_turn():
     rng = np.random.default_rng(1)
     t = np.arange(50) * 0.1
     agent = agent_from(t, rng.normal(0, 0.03, 50), rng.normal(0, 0.03, 50), np.full(50, 0.4), np.zeros(50))
-    course, _ = feasible_trajectory_of(path_of(agent, 1.3), LIMITS)
+    course, _ = feasible_trajectory_of(Trajectory.through(agent.waypoints, 1.3), LIMITS)
     assert np.abs(course.yaw_rad - 0.4).max() < 0.05
     assert np.abs(course.speed_mps).max() < 0.1
 
@@ -125,8 +127,10 @@ def test_shifting_and_turning_the_log_shifts_and_turns_the_course():
     turn, (east, north) = 2.5, (3e6, -2e6)
     x = east + np.cos(turn) * w.x_m - np.sin(turn) * w.y_m
     y = north + np.sin(turn) * w.x_m + np.cos(turn) * w.y_m
-    one, _ = feasible_trajectory_of(path_of(agent, 1.3), LIMITS)
-    other, _ = feasible_trajectory_of(path_of(agent_from(w.t_s, x, y, w.yaw_rad + turn, w.speed_mps), 1.3), LIMITS)
+    one, _ = feasible_trajectory_of(Trajectory.through(agent.waypoints, 1.3), LIMITS)
+    other, _ = feasible_trajectory_of(
+        Trajectory.through(agent_from(w.t_s, x, y, w.yaw_rad + turn, w.speed_mps).waypoints, 1.3), LIMITS
+    )
     np.testing.assert_allclose(other.x_m, np.cos(turn) * one.x_m - np.sin(turn) * one.y_m, atol=1e-4)
     np.testing.assert_allclose(other.curvature_1pm, one.curvature_1pm, atol=1e-3)
 
@@ -177,7 +181,9 @@ def test_two_moments_suffice():
 @pytest.mark.parametrize("make", [point_reference, log_reference, None])
 def test_rows_on_either_side_of_begin_and_end_lead_straight_through_them(make):
     t = 0.113 + np.arange(30) * 0.1
-    path = path_of(agent_from(t, 5 * t, -2 * t, np.full(30, np.arctan2(-2, 5)), np.full(30, np.hypot(5, 2))), 0.0)
+    path = Trajectory.through(
+        agent_from(t, 5 * t, -2 * t, np.full(30, np.arctan2(-2, 5)), np.full(30, np.hypot(5, 2))).waypoints
+    )
     limits = replace(LIMITS, offset_m=0.0)
     reference = make(path) if make else vehicle_reference(path, limits, accel_ahead_s=0.1, curvature_ahead_s=0.1)
     rows = (reference.first_row + np.arange(len(reference.columns))) * GRID_S
@@ -190,7 +196,7 @@ def test_rows_on_either_side_of_begin_and_end_lead_straight_through_them(make):
 
 def test_feed_forward_is_that_of_a_later_time():
     agent = driven(lambda t: ramp(t, (0, 2), (2, 2), (4, 8), (6, 8)), lambda s: ramp(s, (4, 0), (8, 0.1)), 5.0)
-    path = path_of(agent, 1.3)
+    path = Trajectory.through(agent.waypoints, 1.3)
     now = vehicle_reference(path, LIMITS, accel_ahead_s=0.0, curvature_ahead_s=0.0).columns
     later = vehicle_reference(path, LIMITS, accel_ahead_s=0.2, curvature_ahead_s=0.4).columns
     np.testing.assert_allclose(later[:-10, 4], now[10:, 4], atol=1e-9)
@@ -202,7 +208,7 @@ def test_a_life_too_long_to_be_fitted_is_followed_as_logged(monkeypatch):
     monkeypatch.setattr("log2sim.simulation.reference.MAX_KNOTS", 20)
     agent = MANEUVERS["brake to stop and go"]()
     w = agent.waypoints
-    course, departure_m = feasible_trajectory_of(path_of(agent, 1.3), LIMITS)
+    course, departure_m = feasible_trajectory_of(Trajectory.through(agent.waypoints, 1.3), LIMITS)
     np.testing.assert_allclose(departure_m, 0.0, atol=1e-9)
     np.testing.assert_allclose(course.accel_mps2[22:48], -10 / 3, atol=0.01)
     np.testing.assert_allclose(course.x_m, w.x_m - w.x_m[0] - 1.3, atol=1e-9)

@@ -15,8 +15,8 @@ from command_line import run
 from replay_maneuvers import MANEUVERS, agent_from, scenario_of
 from replay_scenes import LENGTH_M, Speed, gap, line, parked, walker
 
+from log2sim.datatypes import Trajectory
 from log2sim.errors import ConfigError
-from log2sim.simulation.path import path_of
 from log2sim.simulation.policy import Controls
 from log2sim.simulation.policy_loading import load_policy
 from log2sim.simulation.reactive.path_table import log_times_of_positions
@@ -208,9 +208,9 @@ def test_where_a_way_crosses_over_itself_the_height_is_that_of_the_own_level():
     yaw = np.clip((t - 4) / 12, 0, 1) * 2.5 * np.pi  # a ramp that turns over the road it left
     x, y = (np.concatenate([[0.0], np.cumsum(0.5 * f(yaw[:-1]))]) for f in (np.cos, np.sin))
     loop = agent_from(t, x, y, yaw, np.full(len(t), 5.0), id="ego", offset_m=0.01)
-    path = path_of(changed(loop, waypoints=changed(loop.waypoints, z_m=0.5 * t)), 0.01)
+    path = Trajectory.through(changed(loop, waypoints=changed(loop.waypoints, z_m=0.5 * t)).waypoints, 0.01)
     late = np.arange(0, 24, 0.05)
-    found = log_times_of_positions(path, *path.centers(late)[:2])
+    found = log_times_of_positions(path, *path.at(late)[:2])
     np.testing.assert_allclose(found, late, atol=0.25)  # a meter of way
 
 

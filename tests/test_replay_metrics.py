@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from replay_maneuvers import agent_from, driven, lane_change, scenario_of
 
+from log2sim.datatypes import Trajectory
 from log2sim.errors import CheckFailed
 from log2sim.geometry import rectangles_overlap
 from log2sim.simulation.metrics.box_tracks import BoxTracks
@@ -13,7 +14,6 @@ from log2sim.simulation.metrics.collisions import LOG_MARGIN_M, LOG_WINDOW_S, co
 from log2sim.simulation.metrics.limits import check_strict, require_strict
 from log2sim.simulation.metrics.summary import summarize
 from log2sim.simulation.metrics.tracking_error import tracking_errors
-from log2sim.simulation.path import path_of
 from log2sim.simulation.runner import replay
 
 T_S = np.arange(0, 41) * 0.1
@@ -30,7 +30,7 @@ def circle(radius_m, speed):
 @pytest.mark.parametrize("late_s", [0.0, 0.32])
 @pytest.mark.parametrize(("radius", "speed", "limit"), [(20.0, 6.0, 2e-3), (8.0, 12.0, 7e-3)])
 def test_on_a_circle_the_error_across_is_the_difference_of_radii_however_late(outward_m, late_s, radius, speed, limit):
-    path = path_of(circle(radius, speed), 0.0)
+    path = Trajectory.through(circle(radius, speed).waypoints, 0.0)
     t = np.linspace(1.2, 2.8, 33)
     angle = speed * (t - late_s) / radius
     r = radius + outward_m
@@ -44,27 +44,33 @@ def test_on_a_straight_line_errors_are_the_components():
     ahead, left = 0.8, 0.3
     x = 5 * t * np.cos(0.5) + ahead * np.cos(0.5) - left * np.sin(0.5)
     y = 5 * t * np.sin(0.5) + ahead * np.sin(0.5) + left * np.cos(0.5)
-    across, along = tracking_errors(path_of(agent, 1.3), t, x, y)
+    across, along = tracking_errors(Trajectory.through(agent.waypoints, 1.3), t, x, y)
     np.testing.assert_allclose(across, left, atol=1e-9)
     np.testing.assert_allclose(along, ahead, atol=1e-9)
 
 
 def test_left_is_positive_when_the_log_reverses_too():
     agent = agent_from(T_S, -2 * T_S, 0 * T_S, 0 * T_S, np.full(41, -2.0))
-    across, along = tracking_errors(path_of(agent, 1.3), np.array([2.0]), np.array([-4.0 + 0.1]), np.array([0.25]))
+    across, along = tracking_errors(
+        Trajectory.through(agent.waypoints, 1.3), np.array([2.0]), np.array([-4.0 + 0.1]), np.array([0.25])
+    )
     assert across[0] == pytest.approx(0.25)
     assert along[0] == pytest.approx(0.1)
 
 
 def test_the_error_across_does_not_depend_on_the_logged_heading_of_what_moves():
     agent = agent_from(T_S, 5 * T_S, 0 * T_S, np.full(41, 0.6), np.full(41, 5.0))
-    across, _ = tracking_errors(path_of(agent, 0.0), np.array([2.0]), np.array([10.0]), np.array([0.5]))
+    across, _ = tracking_errors(
+        Trajectory.through(agent.waypoints, 0.0), np.array([2.0]), np.array([10.0]), np.array([0.5])
+    )
     assert across[0] == pytest.approx(0.5, abs=1e-3)
 
 
 def test_at_a_log_that_stands_the_heading_parts_across_from_along():
     agent = agent_from(T_S, 0 * T_S, 0 * T_S, np.full(41, np.pi / 2), 0 * T_S)
-    across, along = tracking_errors(path_of(agent, 0.0), np.array([2.0]), np.array([0.2]), np.array([-0.6]))
+    across, along = tracking_errors(
+        Trajectory.through(agent.waypoints, 0.0), np.array([2.0]), np.array([0.2]), np.array([-0.6])
+    )
     assert across[0] == pytest.approx(-0.2)
     assert along[0] == pytest.approx(-0.6)
 

@@ -10,9 +10,8 @@ import pytest
 from replay_maneuvers import MANEUVERS, agent_from, driven, ramp, scenario_of
 from replay_scenes import LENGTH_M, Speed, departure, gap, line, parked, walker
 
-from log2sim.datatypes import Scenario
+from log2sim.datatypes import Scenario, Trajectory
 from log2sim.errors import ConfigError
-from log2sim.simulation.path import path_of
 from log2sim.simulation.policy import Controls
 from log2sim.simulation.policy_loading import load_policy
 from log2sim.simulation.reactive.idm import idm_parameters, leader_demand, rate_response
@@ -310,10 +309,10 @@ def test_exact_agents_react_exactly_on_their_way():
     turn = MANEUVERS["turn of radius 8 m"]()
     scene = scenario_of(changed(turn, id="t"), line("ego", 15, 0.0, 5, 8))
     result = replay(scene, mode="exact", ego=stops_at(0, 5), agents="reactive")
-    t, path = result.agent("t"), path_of(turn, 1.3)
+    t, path = result.agent("t"), Trajectory.through(turn.waypoints, 1.3)
     assert t.driver == "reactive"
     assert t.speed_mps[-1] == 0.0
-    x, y, *_ = path.centers(np.arange(0, 8, 0.001))
+    x, y, *_ = path.at(np.arange(0, 8, 0.001))
     assert max(np.hypot(x - a, y - b).min() for a, b in zip(t.x_m, t.y_m)) < 0.01
 
 
@@ -350,11 +349,11 @@ def test_the_nearest_edge_within_a_corridor_is_that_of_the_clipped_box():
 
 def test_feet_on_a_curved_way_are_those_of_a_search_over_all_its_points():
     agent = MANEUVERS["turn of radius 8 m"]()
-    path = path_of(agent, 1.3)
+    path = Trajectory.through(agent.waypoints, 1.3)
     ways = PathTable([path])
     rng = np.random.default_rng(1)
     fine = np.arange(0, 8, 0.001)
-    x, y, *_ = path.at(fine)
+    x, y, *_ = path.relative(fine)
     points = np.stack([x, y], axis=1)[rng.integers(0, len(x), 40)] + rng.uniform(-2, 2, (40, 2))
     foot = ways.foot(np.zeros(40, dtype=int), np.zeros(40), 60.0, points[:, :1], points[:, 1:])
     nearest = np.argmin(np.hypot(points[:, :1] - x, points[:, 1:] - y), axis=1)
@@ -366,7 +365,7 @@ def test_feet_on_a_curved_way_are_those_of_a_search_over_all_its_points():
 
 
 def test_the_time_of_the_log_at_a_place_is_found_from_the_way_gone():
-    path = path_of(line("a", 0, speed=10, duration_s=10), 0.0)
+    path = Trajectory.through(line("a", 0, speed=10, duration_s=10).waypoints, 0.0)
     t = np.linspace(0, 10, 201)
     np.testing.assert_allclose(log_times_of_distance(path, t, 6 * t, 0 * t), 0.6 * t, atol=1e-6)
 

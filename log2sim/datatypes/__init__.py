@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from log2sim.datatypes.agent import Agent, Waypoints
+from log2sim.datatypes.agent import Agent
 from log2sim.datatypes.categories import CATEGORIES, GROUP_OF, GROUPS, TYPICAL_SIZE_M
 from log2sim.datatypes.ignore_regions import IgnoreRegions, LabelView
 from log2sim.datatypes.log import (
@@ -21,6 +21,8 @@ from log2sim.datatypes.measurements import Detections, Measurements
 from log2sim.datatypes.obstacles import Obstacles
 from log2sim.datatypes.scenario import EGO, VERSION, Scenario
 from log2sim.datatypes.tracks import Track
+from log2sim.datatypes.trajectory import Trajectory
+from log2sim.datatypes.waypoints import Waypoints
 
 __all__ = [
     "CATEGORIES",
@@ -47,5 +49,6 @@ __all__ = [
     "Stream",
     "Sweep",
     "Track",
+    "Trajectory",
     "Waypoints",
 ]

@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import EGO, Agent
+from log2sim.datatypes import EGO, Agent, Trajectory
 from log2sim.errors import ConfigError
 from log2sim.registry import nearest
 from log2sim.simulation.follower import control_step
 from log2sim.simulation.groups import AgentGroup, LogReplayGroup, PedestrianGroup, PolicyVehicle, VehicleGroup
-from log2sim.simulation.path import Path, path_of
 from log2sim.simulation.reactive.groups import (
     ReactiveGroup,
     ReactiveLogReplayGroup,
@@ -93,7 +92,7 @@ def agent_groups(
         groups += _vehicle_groups(wheeled, kind, clock, model, choices)
         walking = [a for a in cast[driver] if a.category not in WHEELED]
         if walking:
-            references = [point_reference(path_of(a, 0.0)) for a in walking]
+            references = [point_reference(Trajectory.through(a.waypoints)) for a in walking]
             groups.append(
                 on_foot(walking, references, *_lifespans(walking, clock), EmbeddedSimulator(STEPS["kinematic"]))
             )
@@ -103,7 +102,7 @@ def agent_groups(
     ):
         agents = list(cast[driver])
         if agents:
-            references = [log_reference(path_of(a, rear_axle_offset(a))) for a in agents]
+            references = [log_reference(Trajectory.through(a.waypoints, rear_axle_offset(a))) for a in agents]
             groups.append(tape(agents, references, *_lifespans(agents, clock)))
     return groups, choices
 
@@ -135,20 +134,20 @@ def reactive_traffic(agents: Sequence[Agent], groups: Sequence[AgentGroup], cloc
     reacting = [g for g in groups if isinstance(g, ReactiveGroup)]
     if not reacting:
         return None
-    paths = {a.id: r.path for g in groups for a, r in zip(g.agents, g.references)}
+    trajectories = {a.id: r.trajectory for g in groups for a, r in zip(g.agents, g.references)}
     driven = next((g.agents[0].id for g in groups if isinstance(g, PolicyVehicle)), None)
     reactive = {a.id for g in reacting for a in g.agents}
-    traffic = Traffic(agents, [paths.get(a.id) or _static_path(a) for a in agents], reactive, driven)
+    traffic = Traffic(agents, [trajectories.get(a.id) or _static_trajectory(a) for a in agents], reactive, driven)
     for group in reacting:
         group.join(traffic, clock)
     return traffic
 
 
-def _static_path(agent: Agent) -> Path:
+def _static_trajectory(agent: Agent) -> Trajectory:
     """The path of a static agent: it stands, as long as it lives."""
     w = agent.waypoints
     first = {k: np.full(len(w), getattr(w, k)[0]) for k in ("x_m", "y_m", "z_m", "yaw_rad")}
-    return path_of(replace(agent, waypoints=replace(w, **first, speed_mps=np.zeros(len(w)))), 0.0)
+    return Trajectory.through(replace(w, **first, speed_mps=np.zeros(len(w))))
 
 
 def _lifespans(agents: Sequence[Agent], clock: StepClock) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

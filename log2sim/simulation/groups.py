@@ -56,8 +56,8 @@ class AgentGroup(ABC):
 
     def __init__(self, agents: Sequence[Agent], references: Sequence[Reference], first: NDArray, last: NDArray) -> None:
         self.agents, self.references, self.first, self.last = tuple(agents), tuple(references), first, last
-        self.origin_x_m = np.array([r.path.origin_m[0] for r in references])
-        self.origin_y_m = np.array([r.path.origin_m[1] for r in references])
+        self.origin_x_m = np.array([r.trajectory.origin_m[0] for r in references])
+        self.origin_y_m = np.array([r.trajectory.origin_m[1] for r in references])
         self.offset_m = np.array([r.offset_m for r in references])
         self.live = np.zeros(0, dtype=np.intp)
         self.row = np.zeros((0, 0))

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent
+from log2sim.datatypes import Agent, Trajectory
 from log2sim.geometry import Array, wrap_angle
 from log2sim.simulation.groups import AgentGroup, PolicyVehicle
-from log2sim.simulation.path import Path, path_of
 from log2sim.simulation.policy import (
     PATH_AHEAD_M,
     ROUTE_AHEAD_S,
@@ -33,14 +32,14 @@ class PolicyObserver:
         self, ego: PolicyVehicle, groups: Sequence[AgentGroup], statics: Sequence[Agent], sight_m: float
     ) -> None:
         self.ego, self.sight_m = ego, sight_m
-        self._path = ego.references[0].path
-        self._way = PathTable([self._path])
+        self._trajectory = ego.references[0].trajectory
+        self._way = PathTable([self._trajectory])
         self._groups = [g for g in groups if g is not ego]
         self._statics = _static_poses(statics)
         lives = [(-np.inf, np.inf) if a.is_permanent else (a.waypoints.t_s[0], a.waypoints.t_s[-1]) for a in statics]
         self._static_lives_s = np.array(lives, dtype=np.float64).reshape(-1, 2)
-        self._agents = [_identities(g.agents, [r.path for r in g.references]) for g in self._groups]
-        self._static_agents = _identities(statics, [path_of(a, 0.0) for a in statics])
+        self._agents = [_identities(g.agents, [r.trajectory for r in g.references]) for g in self._groups]
+        self._static_agents = _identities(statics, [Trajectory.through(a.waypoints, 0.0) for a in statics])
         self.restart()
 
     def restart(self) -> None:
@@ -60,7 +59,7 @@ class PolicyObserver:
         return EgoState(
             x_m=float(s.x_m[0]),
             y_m=float(s.y_m[0]),
-            z_m=float(self._path.heights(log_t_s)[0]),
+            z_m=float(self._trajectory.heights(log_t_s)[0]),
             yaw_rad=float(s.yaw_rad[0]),
             speed_mps=float(s.speed_mps[0]),
             accel_mps2=float(s.accel_mps2[0]),
@@ -74,15 +73,16 @@ class PolicyObserver:
         )
 
     def _route(self, t_s: float) -> Route:
-        ahead = np.arange(t_s, min(t_s + ROUTE_AHEAD_S, self._path.t_s[-1]) + ROUTE_STEP_S / 2, ROUTE_STEP_S)
-        return Route(*(_read_only(c) for c in (ahead, *self._path.centers(ahead))))
+        ahead = np.arange(t_s, min(t_s + ROUTE_AHEAD_S, self._trajectory.t_s[-1]) + ROUTE_STEP_S / 2, ROUTE_STEP_S)
+        x, y, _, yaw, speed = self._trajectory.at(ahead)
+        return Route(*(_read_only(c) for c in (ahead, x, y, yaw, speed)))
 
     def _ahead(self) -> PathAhead:
         way, now = self._way, self.ego.snapshot()
         self.progress_m = way.beside(0, self.progress_m, float(now.x_m[0]), float(now.y_m[0]))
         ahead = np.arange(0.0, PATH_AHEAD_M + SPACING_M / 2, SPACING_M)
         x, y, cos, sin, at_s = way.along(ONE, self.progress_m + ahead)
-        pace = np.abs(way.at(ONE, np.where(np.isnan(at_s), self._path.t_s[-1], at_s)).speed_mps)
+        pace = np.abs(way.at(ONE, np.where(np.isnan(at_s), self._trajectory.t_s[-1], at_s)).speed_mps)
         columns = (ahead, x + way.origin_m[0], y + way.origin_m[1], wrap_angle(np.arctan2(sin, cos)), pace, at_s)
         return PathAhead(self.progress_m, *(_read_only(c) for c in columns))
 
@@ -102,17 +102,20 @@ class PolicyObserver:
         near = np.argsort(distance, kind="stable")
         near = near[distance[near] <= self.sight_m]
         x, y, yaw, speed, seen = x[near], y[near], yaw[near], speed[near], np.concatenate(who)[near]
-        z = np.array([path.heights(t) for path, t in zip(seen["path"], np.concatenate(log_s)[near])], dtype=np.float64)
+        z = np.array(
+            [trajectory.heights(t) for trajectory, t in zip(seen["trajectory"], np.concatenate(log_s)[near])],
+            dtype=np.float64,
+        )
         size = (seen[k] for k in ("length_m", "width_m", "height_m"))
         columns = (x, y, z, yaw, speed, speed * np.cos(yaw), speed * np.sin(yaw), *size)
         return Others(_read_only(seen["id"]), _read_only(seen["category"]), *(_read_only(c) for c in columns))
 
 
-def _identities(agents: Sequence[Agent], paths: Sequence[Path]) -> NDArray:
+def _identities(agents: Sequence[Agent], trajectories: Sequence[Trajectory]) -> NDArray:
     """Id, category, size and logged path of agents as records (A,)."""
-    rows = [(a.id, a.category, *a.size_m, path) for a, path in zip(agents, paths)]
+    rows = [(a.id, a.category, *a.size_m, trajectory) for a, trajectory in zip(agents, trajectories)]
     sizes = [(k, np.float64) for k in ("length_m", "width_m", "height_m")]
-    return np.array(rows, dtype=[("id", object), ("category", object), *sizes, ("path", object)])
+    return np.array(rows, dtype=[("id", object), ("category", object), *sizes, ("trajectory", object)])
 
 
 def _static_poses(agents: Sequence[Agent]) -> Array:

@@ -10,7 +10,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent
+from log2sim.datatypes import Agent, Trajectory
+from log2sim.datatypes.trajectory import hermite
 from log2sim.geometry import Array
 from log2sim.simulation.feasible_trajectory import (
     KNOT_S,
@@ -22,7 +23,6 @@ from log2sim.simulation.feasible_trajectory import (
     unfitted_trajectory,
 )
 from log2sim.simulation.follower import control_step
-from log2sim.simulation.path import Path, hermite, path_of
 from log2sim.simulation.vehicles.parameters import PEDAL_LAG_S, STEER_LAG_S, parameters_for
 
 GRID_S = 0.02
@@ -47,7 +47,7 @@ class Reference:
     table are blended in between, across a leap of the log too. What `slips` does not move along its yaw.
     """
 
-    path: Path
+    trajectory: Trajectory
     first_row: int
     columns: Array
     exact: Callable[[Array], Array]
@@ -61,7 +61,7 @@ POINT_COLUMNS = ("x", "y", "yaw", "velocity_x", "velocity_y", "accel_x", "accel_
 
 
 def vehicle_reference(
-    path: Path,
+    trajectory: Trajectory,
     limits: FeasibilityLimits,
     *,
     accel_ahead_s: float,
@@ -69,8 +69,8 @@ def vehicle_reference(
     max_curvature_1pm: float = MAX_CURVATURE_1PM,
 ) -> Reference:
     """The table of a vehicle. Columns "..._ahead" are those of a later time, which makes up for the actuators' lag."""
-    course, departure_m = feasible_trajectory_of(path, limits)
-    first, t = _grid_times(path)
+    course, departure_m = feasible_trajectory_of(trajectory, limits)
+    first, t = _grid_times(trajectory)
     motion = _interpolated(course, t)
     gear, stands = _gears(motion[3])
 
@@ -86,24 +86,28 @@ def vehicle_reference(
     def exact(at_s: Array) -> Array:
         return rows_at(at_s, _interpolated(course, at_s))
 
-    flags = _flags(path, course, departure_m, max_curvature_1pm)
-    return Reference(path, first, rows_at(t, motion), exact, limits.offset_m, flags)
+    flags = _flags(trajectory, course, departure_m, max_curvature_1pm)
+    return Reference(trajectory, first, rows_at(t, motion), exact, limits.offset_m, flags)
 
 
-def feasible_trajectory_of(path: Path, limits: FeasibilityLimits) -> tuple[FeasibleTrajectory, Array]:
+def feasible_trajectory_of(trajectory: Trajectory, limits: FeasibilityLimits) -> tuple[FeasibleTrajectory, Array]:
     """The course of the rear axle that a vehicle can drive, and how far in m (K,) it is from the logged box centers.
 
     Between leaps of the log it is made piece by piece.
     """
-    edges = np.concatenate([[0], np.flatnonzero(path.jump) + 1, [len(path.t_s)]])
+    edges = np.concatenate([[0], np.flatnonzero(trajectory.discontinuous) + 1, [len(trajectory.t_s)]])
     pieces, departures = [], []
     for begin, end in pairwise(edges.tolist()):
         # The course up to a leap goes on as it was; it ends a hair before the moment of the next waypoint.
-        until_s = path.t_s[end - 1] if end == len(path.t_s) else np.nextafter(path.t_s[end], path.t_s[begin])
-        begin_s = path.t_s[begin]
+        until_s = (
+            trajectory.t_s[end - 1]
+            if end == len(trajectory.t_s)
+            else np.nextafter(trajectory.t_s[end], trajectory.t_s[begin])
+        )
+        begin_s = trajectory.t_s[begin]
         count = max(int(np.ceil((until_s - begin_s) / KNOT_S - 1e-6)), 1) + 1 if until_s > begin_s else 1
         t = np.linspace(begin_s, until_s, count)
-        x, y, yaw, speed = path.at(t)
+        x, y, yaw, speed = trajectory.relative(t)
         course = (fit_trajectory if 1 < count <= MAX_KNOTS else unfitted_trajectory)(t, x, y, yaw, speed, limits)
         pieces.append(course)
         o = limits.offset_m
@@ -130,12 +134,12 @@ def _interpolated(course: FeasibleTrajectory, t_s: Array) -> Array:
     return motion
 
 
-def point_reference(path: Path) -> Reference:
+def point_reference(trajectory: Trajectory) -> Reference:
     """The table of a point: velocity and acceleration of the smoothed course, on map axes."""
-    first, t = _grid_times(path)
-    x, y, yaw, logged_speed = _extrapolated(path, t)
+    first, t = _grid_times(trajectory)
+    x, y, yaw, logged_speed = _extrapolated(trajectory, t)
     vx, vy, ax, ay = logged_speed * np.cos(yaw), logged_speed * np.sin(yaw), np.zeros(len(t)), np.zeros(len(t))
-    for piece in np.split(np.arange(len(t)), np.searchsorted(t, path.jump_times())):
+    for piece in np.split(np.arange(len(t)), np.searchsorted(t, trajectory.discontinuity_times())):
         if len(piece) > 1:
             vx[piece], vy[piece] = (_smooth(np.gradient(c[piece], GRID_S)) for c in (x, y))
             ax[piece], ay[piece] = np.gradient(vx[piece], GRID_S), np.gradient(vy[piece], GRID_S)
@@ -143,34 +147,34 @@ def point_reference(path: Path) -> Reference:
 
     def exact(at_s: Array) -> Array:
         smoothed = (np.interp(at_s, t, c) for c in (vx, vy, ax, ay, stands))
-        return np.stack([*_extrapolated(path, at_s)[:3], *smoothed], axis=1)
+        return np.stack([*_extrapolated(trajectory, at_s)[:3], *smoothed], axis=1)
 
-    return Reference(path, first, exact(t), exact, flags=_discontinuity_flags(path))
+    return Reference(trajectory, first, exact(t), exact, flags=_discontinuity_flags(trajectory))
 
 
-def log_reference(path: Path) -> Reference:
+def log_reference(trajectory: Trajectory) -> Reference:
     """The table of an agent that is where the log has it: x, y, yaw, logged speed."""
-    first, t = _grid_times(path)
+    first, t = _grid_times(trajectory)
 
     def exact(at_s: Array) -> Array:
-        return np.stack(_extrapolated(path, at_s), axis=1)
+        return np.stack(_extrapolated(trajectory, at_s), axis=1)
 
-    return Reference(path, first, exact(t), exact)
+    return Reference(trajectory, first, exact(t), exact)
 
 
-def _extrapolated(path: Path, t_s: Array) -> tuple[Array, Array, Array, Array]:
+def _extrapolated(trajectory: Trajectory, t_s: Array) -> tuple[Array, Array, Array, Array]:
     """The path at times (N,), straight on before its begin and after its end: for the rows just outside."""
-    x, y, yaw, speed = path.at(t_s)
-    before, after = np.minimum(t_s - path.t_s[0], 0.0), np.maximum(t_s - path.t_s[-1], 0.0)
-    x = x + before * path.velocity_x_mps[0] + after * path.velocity_x_mps[-1]
-    y = y + before * path.velocity_y_mps[0] + after * path.velocity_y_mps[-1]
+    x, y, yaw, speed = trajectory.relative(t_s)
+    before, after = np.minimum(t_s - trajectory.t_s[0], 0.0), np.maximum(t_s - trajectory.t_s[-1], 0.0)
+    x = x + before * trajectory.velocity_x_mps[0] + after * trajectory.velocity_x_mps[-1]
+    y = y + before * trajectory.velocity_y_mps[0] + after * trajectory.velocity_y_mps[-1]
     return x, y, yaw, speed
 
 
-def _grid_times(path: Path) -> tuple[int, Array]:
+def _grid_times(trajectory: Trajectory) -> tuple[int, Array]:
     """First row and the times of all rows that cover the life of a path."""
-    first = int(np.floor(path.t_s[0] / GRID_S))
-    last = int(np.ceil(path.t_s[-1] / GRID_S))
+    first = int(np.floor(trajectory.t_s[0] / GRID_S))
+    last = int(np.ceil(trajectory.t_s[-1] / GRID_S))
     return first, np.arange(first, last + 1, dtype=np.float64) * GRID_S
 
 
@@ -199,13 +203,15 @@ def _gears(speed: Array) -> tuple[Array, Array]:
     return gear, stands
 
 
-def _discontinuity_flags(path: Path) -> tuple[str, ...]:
-    return tuple(f"the log leaps at {at:.2f} s" for at in path.jump_times())
+def _discontinuity_flags(trajectory: Trajectory) -> tuple[str, ...]:
+    return tuple(f"the log leaps at {at:.2f} s" for at in trajectory.discontinuity_times())
 
 
-def _flags(path: Path, course: FeasibleTrajectory, departure_m: Array, max_curvature_1pm: float) -> tuple[str, ...]:
+def _flags(
+    trajectory: Trajectory, course: FeasibleTrajectory, departure_m: Array, max_curvature_1pm: float
+) -> tuple[str, ...]:
     """What no vehicle could drive: leaps, and a course that is far from the log or beyond what is feasible all the same."""
-    flags = list(_discontinuity_flags(path))
+    flags = list(_discontinuity_flags(trajectory))
     for name, values, limit, unit in (
         ("acceleration", course.accel_mps2, MAX_ACCEL_MPS2, "m/s2"),
         ("curvature", course.curvature_1pm, max_curvature_1pm, "1/m"),
@@ -233,7 +239,7 @@ def vehicle_reference_of(agent: Agent, dt_s: float) -> Reference:
     """A vehicle's table: feed-forward is ahead by the actuator's lag and by half the step for which it is held."""
     limits = vehicle_limits(agent)
     return vehicle_reference(
-        path_of(agent, limits.offset_m),
+        Trajectory.through(agent.waypoints, limits.offset_m),
         limits,
         accel_ahead_s=PEDAL_LAG_S + control_step(dt_s) / 2,
         curvature_ahead_s=STEER_LAG_S + control_step(dt_s) / 2,

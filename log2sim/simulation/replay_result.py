@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, Scenario
+from log2sim.datatypes import Agent, Scenario, Trajectory
 from log2sim.geometry import Array
 from log2sim.simulation.groups import AgentGroup
 from log2sim.simulation.metrics.all_metrics import LOG_FOLLOWERS, replay_metrics
 from log2sim.simulation.metrics.tracking_error import TrackingErrors, agent_errors
-from log2sim.simulation.path import Path
 from log2sim.simulation.reactive.path_table import log_times_of_distance, log_times_of_positions
 from log2sim.simulation.recording import RecordedTracks
 from log2sim.simulation.result import AgentReplay, Commands, Replay
@@ -37,7 +36,7 @@ def replay_result(
     model: str,
 ) -> Replay:
     """The replay of a scenario from the recorded tracks."""
-    home = {a.id: (g.driver, r.path, r.flags) for g in groups for a, r in zip(g.agents, g.references)}
+    home = {a.id: (g.driver, r.trajectory, r.flags) for g in groups for a, r in zip(g.agents, g.references)}
     agents: list[AgentReplay] = []
     stored: list[NDArray[np.intp]] = []
     errors: dict[str, TrackingErrors] = {}
@@ -46,16 +45,16 @@ def replay_result(
         if agent.id not in tracks:
             replayed, steps = _static_agent(agent, clock)
         else:
-            driver, path, flags = home[agent.id]
+            driver, trajectory, flags = home[agent.id]
             steps, states = tracks[agent.id]
             t_s: Array = clock.begin_s + steps.astype(np.float64) * clock.dt_s
             choice = choices.get(agent.id, ModelChoice("point", "") if driver in walks else ModelChoice("none", ""))
-            moved = _moving_agent(agent, driver, choice, path, flags, t_s, states)
-            errors[agent.id] = agent_errors(path, moved, follows=driver in LOG_FOLLOWERS)
+            moved = _moving_agent(agent, driver, choice, trajectory, flags, t_s, states)
+            errors[agent.id] = agent_errors(trajectory, moved, follows=driver in LOG_FOLLOWERS)
             replayed = _with_errors(moved, errors[agent.id])
         agents.append(replayed)
         stored.append(steps)
-    paths = {k: path for k, (_, path, _) in home.items() if k in tracks}
+    trajectories = {k: trajectory for k, (_, trajectory, _) in home.items() if k in tracks}
     return Replay(
         scenario=scenario.name,
         scenario_digest=scenario.digest,
@@ -64,24 +63,30 @@ def replay_result(
         dt_s=clock.dt_s,
         store_dt_s=round(clock.dt_s * clock.store_every, 9),
         agents=tuple(agents),
-        metrics=replay_metrics(agents, stored, paths, errors, clock),
+        metrics=replay_metrics(agents, stored, trajectories, errors, clock),
     )
 
 
 def _moving_agent(
-    agent: Agent, driver: str, choice: ModelChoice, path: Path, flags: tuple[str, ...], t_s: Array, states: Array
+    agent: Agent,
+    driver: str,
+    choice: ModelChoice,
+    trajectory: Trajectory,
+    flags: tuple[str, ...],
+    t_s: Array,
+    states: Array,
 ) -> AgentReplay:
     x, y, yaw, speed, steer, accel, *told = states
     if driver == "exact":
-        x, y, yaw, speed = path.centers(t_s)  # the tables in between are good to half a millimeter, the path is exact
+        x, y, _, yaw, speed = trajectory.at(t_s)  # the reference tables are only good to half a millimeter
     log_t_s = t_s
     if driver == "reactive":
-        log_t_s = log_times_of_distance(path, t_s, x, y)
+        log_t_s = log_times_of_distance(trajectory, t_s, x, y)
     elif driver == "policy":
-        log_t_s = log_times_of_positions(path, x, y)
+        log_t_s = log_times_of_positions(trajectory, x, y)
     if np.isnan(accel).any():
         accel = np.gradient(speed, t_s) if len(t_s) > 1 else np.zeros(len(t_s))
-    z = path.heights(log_t_s)  # of the road there, whenever the log was
+    z = trajectory.heights(log_t_s)  # of the road there, whenever the log was
     x, y, z, yaw, speed, steer, accel = (np.round(c, STATE_DIGITS) for c in (x, y, z, yaw, speed, steer, accel))
     t_s = np.round(t_s, 9)
     pedal, wheel, gear = told

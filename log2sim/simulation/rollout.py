@@ -179,7 +179,7 @@ def _placements(group: AgentGroup, clock: StepClock) -> dict[int, NDArray[np.int
         placed[int(group.first[i])].append(i)
         if group.keeps_time:
             # The table blends the sides of a leap over one row, so the agent is placed again once that is past.
-            leaps = reference.path.jump_times()
+            leaps = reference.trajectory.discontinuity_times()
             for step in clock.first_step(np.concatenate([leaps, leaps + GRID_S])):
                 if group.first[i] < step <= group.last[i]:
                     placed[int(step)].append(i)

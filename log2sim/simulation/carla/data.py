@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from log2sim.datatypes import Agent
+from log2sim.datatypes import Agent, Trajectory
 from log2sim.geometry import Array
 from log2sim.simulation.carla.assets import nearest_assets
-from log2sim.simulation.path import Path, path_of
 from log2sim.simulation.reference import vehicle_limits, vehicle_reference
 from log2sim.simulation.vehicles.parameters import WHEELED, parameters_for, rear_axle_offset
 
@@ -39,8 +38,8 @@ def _agent(agent: Agent, turn: int, span_s: tuple[float, float]) -> dict[str, An
     w, wheeled = agent.waypoints, agent.category in WHEELED
     moves = not agent.static and len(w) > 1
     life_s = span_s if agent.is_permanent else (float(w.t_s[0]), float(w.t_s[-1]))
-    path = path_of(agent, rear_axle_offset(agent))
-    exact, pid = _trajectories(agent, path, drives=moves and wheeled)
+    trajectory = Trajectory.through(agent.waypoints, rear_axle_offset(agent))
+    exact, pid = _trajectories(agent, trajectory, drives=moves and wheeled)
     limits = parameters_for([agent]) if wheeled else None
     return {
         "id": agent.id,
@@ -54,7 +53,7 @@ def _agent(agent: Agent, turn: int, span_s: tuple[float, float]) -> dict[str, An
         ],
         "begin_s": life_s[0],
         "end_s": life_s[1],
-        "leaps_s": [float(t) for t in path.jump_times()],
+        "leaps_s": [float(t) for t in trajectory.discontinuity_times()],
         "drive": None if not moves else "vehicle" if wheeled else "walker" if agent.category == "pedestrian" else None,
         "max_throttle_mps2": None if limits is None else float(limits.max_throttle_mps2[0]),
         "max_brake_mps2": None if limits is None else float(limits.max_brake_mps2[0]),
@@ -64,17 +63,17 @@ def _agent(agent: Agent, turn: int, span_s: tuple[float, float]) -> dict[str, An
 
 
 def _trajectories(
-    agent: Agent, path: Path, *, drives: bool
+    agent: Agent, trajectory: Trajectory, *, drives: bool
 ) -> tuple[dict[str, list[float]], dict[str, list[float]] | None]:
     """Columns of the logged course and, for a vehicle that drives, of the one that it can drive; both of the box center."""
-    t_s = _times(agent, path)
-    x, y, yaw, _ = path.at(t_s)
-    z = path.heights(t_s) - agent.size_m[2] / 2
-    origin_x, origin_y = path.origin_m
+    t_s = _times(agent, trajectory)
+    x, y, yaw, _ = trajectory.relative(t_s)
+    z = trajectory.heights(t_s) - agent.size_m[2] / 2
+    origin_x, origin_y = trajectory.origin_m
     if not drives:
         return {**_left_handed(t_s, x + origin_x, y + origin_y, z, yaw), "curvature_1pm": [0.0] * len(t_s)}, None
     limits = vehicle_limits(agent)
-    reference = vehicle_reference(path, limits, accel_ahead_s=0.0, curvature_ahead_s=0.0)
+    reference = vehicle_reference(trajectory, limits, accel_ahead_s=0.0, curvature_ahead_s=0.0)
     rear_x, rear_y, rear_yaw, speed, accel, curvature, gear, stands = reference.exact(t_s).T
     center_x, center_y = rear_x + limits.offset_m * np.cos(rear_yaw), rear_y + limits.offset_m * np.sin(rear_yaw)
     bend = {"curvature_1pm": _rounded(-curvature)}
@@ -90,15 +89,19 @@ def _trajectories(
     return exact, pid
 
 
-def _times(agent: Agent, path: Path) -> Array:
+def _times(agent: Agent, trajectory: Trajectory) -> Array:
     """When the course is sampled: regularly, at every waypoint, and just before a leap."""
     if agent.static:
-        return path.t_s[:1]
-    regular = np.arange(path.t_s[0], path.t_s[-1], SAMPLE_S)
-    k = np.searchsorted(path.t_s, regular, side="right")
-    gap_s = np.minimum(regular - path.t_s[k - 1], path.t_s[np.minimum(k, len(path.t_s) - 1)] - regular)
+        return trajectory.t_s[:1]
+    regular = np.arange(trajectory.t_s[0], trajectory.t_s[-1], SAMPLE_S)
+    k = np.searchsorted(trajectory.t_s, regular, side="right")
+    gap_s = np.minimum(
+        regular - trajectory.t_s[k - 1], trajectory.t_s[np.minimum(k, len(trajectory.t_s) - 1)] - regular
+    )
     return np.sort(
-        np.concatenate([regular[gap_s > 10 * DISCONTINUITY_S], path.t_s, path.jump_times() - DISCONTINUITY_S])
+        np.concatenate(
+            [regular[gap_s > 10 * DISCONTINUITY_S], trajectory.t_s, trajectory.discontinuity_times() - DISCONTINUITY_S]
+        )
     )
 
 

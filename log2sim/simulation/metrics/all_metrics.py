@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes import Trajectory
 from log2sim.simulation.metrics.box_tracks import BoxTracks
 from log2sim.simulation.metrics.collisions import collisions
 from log2sim.simulation.metrics.comfort import comfort
 from log2sim.simulation.metrics.conflicts import conflicts, most_critical
 from log2sim.simulation.metrics.tracking_error import TrackingErrors, agent_metrics, scenario_metrics
-from log2sim.simulation.path import Path
 from log2sim.simulation.result import AgentReplay
 from log2sim.simulation.step_clock import StepClock
 from log2sim.simulation.vehicles.parameters import WHEELED
@@ -26,7 +26,7 @@ LOG_FOLLOWERS = ("pid", "exact")
 def replay_metrics(
     agents: Sequence[AgentReplay],
     stored: Sequence[NDArray[np.intp]],
-    paths: Mapping[str, Path],
+    trajectories: Mapping[str, Trajectory],
     errors: Mapping[str, TrackingErrors],
     clock: StepClock,
 ) -> dict[str, Any]:
@@ -41,7 +41,7 @@ def replay_metrics(
         Courses of the agents that move in the log, and how far they are from them.
     """
     ids = [a.id for a in agents]
-    replayed, logged = (_box_tracks(agents, stored, source, clock) for source in ({}, paths))
+    replayed, logged = (_box_tracks(agents, stored, source, clock) for source in ({}, trajectories))
     moves = np.array([a.driver != "static" for a in agents], dtype=bool)
     rows = np.arange(len(replayed.x_m), dtype=np.float64)
     t_s = clock.begin_s + rows * (clock.store_every * clock.dt_s)
@@ -53,7 +53,7 @@ def replay_metrics(
             **agent_metrics(errors[a.id]),
             "min_ttc_s": (most_critical(near_of[a.id], "min_ttc") or {}).get("s"),
             "min_pet_s": (most_critical(near_of[a.id], "pet") or {}).get("s"),
-            "comfort": _comfort(a, paths[a.id]),
+            "comfort": _comfort(a, trajectories[a.id]),
             "collisions": events_of[a.id],
         }
         for a in agents
@@ -81,24 +81,26 @@ def _by_agent(records: Iterable[Mapping[str, Any]]) -> dict[str, list[Any]]:
     return found
 
 
-def _comfort(agent: AgentReplay, path: Path) -> dict[str, float | bool] | None:
+def _comfort(agent: AgentReplay, trajectory: Trajectory) -> dict[str, float | bool] | None:
     """Comfort of a vehicle; None for who walks, and where the log leaps."""
-    if agent.category not in WHEELED or len(path.jump_times()):
+    if agent.category not in WHEELED or len(trajectory.discontinuity_times()):
         return None
     return comfort(agent.t_s, agent.x_m, agent.y_m, agent.yaw_rad)
 
 
 def _box_tracks(
-    agents: Sequence[AgentReplay], stored: Sequence[NDArray[np.intp]], paths: Mapping[str, Path], clock: StepClock
+    agents: Sequence[AgentReplay],
+    stored: Sequence[NDArray[np.intp]],
+    trajectories: Mapping[str, Trajectory],
+    clock: StepClock,
 ) -> BoxTracks:
     """Boxes at all stored steps, of the replay or, for agents with a path given, of the log."""
     shape = ((clock.steps - 1) // clock.store_every + 1, len(agents))
     columns = np.full((5, *shape), np.nan)
     for k, (agent, steps) in enumerate(zip(agents, stored)):
         rows = steps // clock.store_every
-        if agent.id in paths:
-            x, y, yaw, speed = paths[agent.id].centers(agent.t_s)
-            columns[:, rows, k] = np.stack([x, y, paths[agent.id].heights(agent.t_s), yaw, speed])
+        if agent.id in trajectories:
+            columns[:, rows, k] = np.stack(trajectories[agent.id].at(agent.t_s))
         elif len(rows) == len(agent):
             columns[:, rows, k] = agent.x_m, agent.y_m, agent.z_m, agent.yaw_rad, agent.speed_mps
         elif len(rows):  # one pose for all rows

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from log2sim.datatypes import Trajectory
 from log2sim.geometry import Array, wrap_angle
-from log2sim.simulation.path import Path
 from log2sim.simulation.result import AgentReplay
 
 SEARCH_S = 1.0
@@ -30,15 +30,17 @@ class TrackingErrors:
     yaw_rad: Array
 
 
-def agent_errors(path: Path, agent: AgentReplay, *, follows: bool) -> TrackingErrors:
+def agent_errors(trajectory: Trajectory, agent: AgentReplay, *, follows: bool) -> TrackingErrors:
     """Errors of an agent; one that does not follow the log may be far behind or ahead, and keep to its course yet."""
-    near_s = agent.t_s if follows else _nearest_times(path, agent.x_m, agent.y_m)
-    across, along = tracking_errors(path, agent.t_s, agent.x_m, agent.y_m, near_s)
-    _, _, log_yaw, log_speed = path.centers(agent.t_s)
-    return TrackingErrors(across, along, agent.speed_mps - log_speed, wrap_angle(agent.yaw_rad - log_yaw))
+    near_s = agent.t_s if follows else _nearest_times(trajectory, agent.x_m, agent.y_m)
+    across, along = tracking_errors(trajectory, agent.t_s, agent.x_m, agent.y_m, near_s)
+    log = trajectory.at(agent.t_s)
+    return TrackingErrors(across, along, agent.speed_mps - log.speed_mps, wrap_angle(agent.yaw_rad - log.yaw_rad))
 
 
-def tracking_errors(path: Path, t_s: Array, x_m: Array, y_m: Array, near_s: Array | None = None) -> tuple[Array, Array]:
+def tracking_errors(
+    trajectory: Trajectory, t_s: Array, x_m: Array, y_m: Array, near_s: Array | None = None
+) -> tuple[Array, Array]:
     """Errors across and along the logged path, (S,) each in m, left and ahead positive.
 
     Along: from the logged box center at the same time, in the direction of its heading. Across: distance from the nearest
@@ -46,10 +48,10 @@ def tracking_errors(path: Path, t_s: Array, x_m: Array, y_m: Array, near_s: Arra
     late in a curve is no error across. Where the nearest point is an end of that course, or the log stands, what lies
     along its direction counts as along.
     """
-    log_x, log_y, log_yaw, _ = path.centers(t_s)
+    log_x, log_y, _, log_yaw, _ = trajectory.at(t_s)
     along = (x_m - log_x) * np.cos(log_yaw) + (y_m - log_y) * np.sin(log_yaw)
-    begin_s, end_s = path.t_s[0] - SEARCH_S, path.t_s[-1] + SEARCH_S
-    px, py, yaw, _ = path.centers(np.arange(begin_s, end_s + SEARCH_STEP_S, SEARCH_STEP_S))
+    begin_s, end_s = trajectory.t_s[0] - SEARCH_S, trajectory.t_s[-1] + SEARCH_S
+    px, py, _, yaw, _ = trajectory.at(np.arange(begin_s, end_s + SEARCH_STEP_S, SEARCH_STEP_S))
     ux, uy = np.diff(px), np.diff(py)
     square = ux**2 + uy**2
     moves = square > (MIN_SEGMENT_MPS * SEARCH_STEP_S) ** 2
@@ -112,14 +114,14 @@ def _mean(values: Mapping[str, float], samples: Mapping[str, int]) -> float:
     return sum(count * values[k] for k, count in samples.items()) / total if total else 0.0
 
 
-def _nearest_times(path: Path, x_m: Array, y_m: Array) -> Array:
+def _nearest_times(trajectory: Trajectory, x_m: Array, y_m: Array) -> Array:
     """The times (S,) at which the log is nearest to places."""
     from scipy.spatial import cKDTree
 
-    t = np.arange(path.t_s[0], path.t_s[-1] + SEARCH_STEP_S / 2, SEARCH_STEP_S)
-    x, y = path.at(t)[:2]
+    t = np.arange(trajectory.t_s[0], trajectory.t_s[-1] + SEARCH_STEP_S / 2, SEARCH_STEP_S)
+    x, y = trajectory.relative(t)[:2]
     _, nearest = cKDTree(np.stack([x, y], axis=1)).query(
-        np.stack([x_m - path.origin_m[0], y_m - path.origin_m[1]], axis=1)
+        np.stack([x_m - trajectory.origin_m[0], y_m - trajectory.origin_m[1]], axis=1)
     )
     return t[nearest]
 

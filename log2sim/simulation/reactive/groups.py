@@ -26,12 +26,12 @@ class ReactiveGroup(AgentGroup):
         """Take part in the traffic; to be called once, before anything else."""
         self.traffic, self.clock, self._logged_last = traffic, clock, self.last
         self.index = np.array([traffic.index[a.id] for a in self.agents], dtype=np.intp)
-        self._end_s = np.array([r.path.t_s[-1] for r in self.references])
+        self._end_s = np.array([r.trajectory.t_s[-1] for r in self.references])
         self._first_row = np.array([r.first_row for r in self.references], dtype=np.intp)
         self._rows = np.array([len(r.columns) for r in self.references], dtype=np.intp)
         self._begin = np.cumsum(self._rows) - self._rows
         self._flat = np.concatenate([r.columns for r in self.references])
-        leaps = [(k, t) for k, r in enumerate(self.references) for t in r.path.jump_times()]
+        leaps = [(k, t) for k, r in enumerate(self.references) for t in r.trajectory.discontinuity_times()]
         # As in the log, who leaps is placed again once the row that blends both sides is past.
         self._leaps = np.array([(k, t + wait) for k, t in leaps for wait in (0.0, GRID_S)]).reshape(-1, 2)
         self._tau = np.full(len(self.agents), -np.inf)

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes import Trajectory
 from log2sim.geometry import Array
-from log2sim.simulation.path import Path
 
 TIME_STEP_S = 0.1  # linear in between: off by a h^2 / 8, a centimeter at 10 m/s2
 SPACING_M = 1.0
@@ -53,11 +53,11 @@ class PathProjection:
 class PathTable:
     """Ways of A agents. Positions are relative to `origin_m`, which keeps digits far from the map's origin."""
 
-    def __init__(self, paths: Sequence[Path]) -> None:
-        self.origin_m = paths[0].origin_m if paths else (0.0, 0.0)
-        self.begin_s = np.array([p.t_s[0] for p in paths], dtype=np.float64)
-        self.end_s = np.array([p.t_s[-1] for p in paths], dtype=np.float64)
-        tables = [_time_table(p, self.origin_m) for p in paths]
+    def __init__(self, trajectories: Sequence[Trajectory]) -> None:
+        self.origin_m = trajectories[0].origin_m if trajectories else (0.0, 0.0)
+        self.begin_s = np.array([p.t_s[0] for p in trajectories], dtype=np.float64)
+        self.end_s = np.array([p.t_s[-1] for p in trajectories], dtype=np.float64)
+        tables = [_time_table(p, self.origin_m) for p in trajectories]
         marks = [_distance_table(t) for t in tables]
         self._row0, self._rows = _row_ranges(tables)
         self._mark0, self.marks = _row_ranges(marks)
@@ -120,37 +120,37 @@ class PathTable:
         return np.where(np.isnan(t_s), self.end_s[agent], t_s)
 
 
-def log_times_of_positions(path: Path, x_m: Array, y_m: Array) -> Array:
+def log_times_of_positions(trajectory: Trajectory, x_m: Array, y_m: Array) -> Array:
     """When the log was beside the places (S,) of an agent that drives as it likes, one after the other along its path."""
-    way, gone_m = PathTable([path]), np.zeros(len(x_m))
+    way, gone_m = PathTable([trajectory]), np.zeros(len(x_m))
     for k, (x, y) in enumerate(zip(x_m.tolist(), y_m.tolist())):
         gone_m[k] = way.beside(0, gone_m[k - 1] if k else 0.0, x, y)
     return way.times(np.zeros(1, dtype=np.intp), gone_m)
 
 
-def log_times_of_distance(path: Path, t_s: Array, x_m: Array, y_m: Array) -> Array:
+def log_times_of_distance(trajectory: Trajectory, t_s: Array, x_m: Array, y_m: Array) -> Array:
     """When the log was where an agent that goes along its path is (S,): the time of the same distance gone.
 
     An agent that keeps its way yet not its times has its height and its errors from there.
     """
-    table = _time_table(path, path.origin_m)
+    table = _time_table(trajectory, trajectory.origin_m)
     gone = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x_m), np.diff(y_m)))])
     start = float(np.interp(t_s[0], table[:, 0], table[:, 6]))
-    return np.maximum(np.minimum(np.interp(start + gone, table[:, 6], table[:, 0]), t_s), path.t_s[0])
+    return np.maximum(np.minimum(np.interp(start + gone, table[:, 6], table[:, 0]), t_s), trajectory.t_s[0])
 
 
-def _time_table(path: Path, origin_m: tuple[float, float]) -> Array:
+def _time_table(trajectory: Trajectory, origin_m: tuple[float, float]) -> Array:
     """Rows (K, 7) evenly spaced over a life: time, then the columns of a `Pose`."""
-    begin, end = path.t_s[0], path.t_s[-1]
+    begin, end = trajectory.t_s[0], trajectory.t_s[-1]
     count = int(np.ceil((end - begin) / TIME_STEP_S)) + 1 if end > begin else 1
     t_s = np.linspace(begin, end, count)
-    x, y, yaw, speed = path.at(t_s)
+    x, y, yaw, speed = trajectory.relative(t_s)
     step = np.hypot(np.diff(x), np.diff(y))
     if count > 1:
         step = np.where(step < STANDING_MPS * (t_s[1] - t_s[0]), 0.0, step)
     distance = np.concatenate([[0.0], np.cumsum(step)])
-    dx, dy = path.origin_m[0] - origin_m[0], path.origin_m[1] - origin_m[1]
-    return np.stack([t_s, x + dx, y + dy, path.heights(t_s), yaw, speed, distance], axis=1)
+    dx, dy = trajectory.origin_m[0] - origin_m[0], trajectory.origin_m[1] - origin_m[1]
+    return np.stack([t_s, x + dx, y + dy, trajectory.heights(t_s), yaw, speed, distance], axis=1)
 
 
 def _distance_table(table: Array) -> Array:

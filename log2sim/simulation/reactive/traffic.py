@@ -11,10 +11,9 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent
+from log2sim.datatypes import Agent, Trajectory
 from log2sim.geometry import Array
 from log2sim.simulation.groups import Snapshot
-from log2sim.simulation.path import Path
 from log2sim.simulation.reactive.idm import idm_parameters, rate_response
 from log2sim.simulation.reactive.interaction import MIN_DEMAND, TrafficState, excess_demand, predict_all
 from log2sim.simulation.reactive.log_overlaps import deep_overlaps
@@ -53,12 +52,12 @@ class Traffic:
     def __init__(
         self,
         agents: Sequence[Agent],
-        paths: Sequence[Path],
+        trajectories: Sequence[Trajectory],
         reactive: Collection[str],
         driven: str | None,
     ) -> None:
         self.index = {a.id: k for k, a in enumerate(agents)}
-        self.ways = PathTable(paths)
+        self.ways = PathTable(trajectories)
         self.reacts = np.array([a.id in reactive for a in agents], dtype=bool)
         self.driver = idm_parameters(agents)
         self._static = np.array([a.static for a in agents], dtype=bool)
