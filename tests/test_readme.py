@@ -100,6 +100,7 @@ def test_every_command_is_documented() -> None:
 def test_scripts_and_links_exist() -> None:
     scripts = set(re.findall(r"(?<![\w/])tools/\w+\.sh", README))
     assert {"tools/demo.sh", "tools/test.sh"} <= scripts
+    assert [s for s in sorted(scripts) if not os.access(ROOT / s, os.X_OK)] == []
     links = re.findall(r"\]\(([^)\s#]+)", README) + re.findall(r"""src=["']([^"']+)""", README)
     for target in (*scripts, *(link for link in links if "://" not in link)):
         assert (ROOT / target).exists(), target

@@ -8,6 +8,7 @@ the squared error over its covariance and dimensions: 1 where the covariance is 
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -31,12 +32,11 @@ COLUMNS = ("rows", "found", "median m", "RMSE m", "depth m", "size m", "yaw deg"
 
 def main() -> int:
     """Print one table a log."""
-    if len(sys.argv) < 2:
-        print(__doc__, file=sys.stderr)
-        return 2
-    for path in sys.argv[1:]:
-        log = open_log(Path(path))
-        truth = _truth(log, Path(path))
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("logs", nargs="+", metavar="LOG", type=Path, help="folder of a log with labels")
+    for path in parser.parse_args().logs:
+        log = open_log(path)
+        truth = _truth(log, path)
         print(f"{log.name}: boxes of the log, vehicles")
         print("| mode | range m | " + " | ".join(COLUMNS) + " |\n|" + "---|" * (len(COLUMNS) + 2))
         for mode in ("paper", "robust"):

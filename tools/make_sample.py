@@ -1,7 +1,11 @@
-"""Make samples/crossing from samples/crossing.toml again; the same bytes for the same seed and library versions."""
+"""Make samples/crossing from samples/crossing.toml again; the same bytes for the same seed and library versions.
+
+python tools/make_sample.py [DIR]
+"""
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
 from pathlib import Path
@@ -17,8 +21,12 @@ LIMIT_BYTES = 8_000_000
 
 def main() -> int:
     """Write the sample and check that it is small enough to ship."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument(
+        "out", nargs="?", metavar="DIR", type=Path, default=SAMPLES / "crossing", help="folder to write"
+    )
+    out = parser.parse_args().out
     begin = time.perf_counter()
-    out = Path(sys.argv[1]) if len(sys.argv) > 1 else SAMPLES / "crossing"
     scene = load_scene(SAMPLES / "crossing.toml")
     write_synthetic(scene, out, seed=SEED, overwrite=True, jpeg_quality=JPEG_QUALITY)
     size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
