@@ -11,7 +11,8 @@ import numpy as np
 from log2sim.agents.build import Timeline, estimate_agents
 from log2sim.agents.duplicates import outside, without_doubles
 from log2sim.agents.ego import ego_agent, ego_flow
-from log2sim.agents.scenario_of import scenario_of, thinned
+from log2sim.agents.scenario_of import scenario_of
+from log2sim.agents.simplify import simplify
 from log2sim.config import Config
 from log2sim.datatypes import Log, Scenario
 from log2sim.errors import NothingToReconstruct
@@ -128,7 +129,7 @@ def conclude(
         ego = ego_agent(log, timeline)
         agents = outside(without_doubles(built, ego), ego)
         # Without an ego the agents' waypoints are all that tells the ticks.
-        agents = thinned(agents) if ego is not None else agents
+        agents = simplify(agents) if ego is not None else agents
     if ego is None and not agents:
         raise NothingToReconstruct(f"{log.name}: no ego poses, and no object was detected in {len(schedule)} ticks")
     with clock.stage("probe savings"):

@@ -508,7 +508,7 @@ def test_few_waypoints_are_as_good_as_all(straight: tuple[Log, Scenario], monkey
     step = entry(few, "every waypoint")
     assert not step["kept"]
     assert step["saved_s"] is not None
-    monkeypatch.setattr(log2sim.pipeline, "thinned", lambda agents: agents)
+    monkeypatch.setattr(log2sim.pipeline, "simplify", lambda agents: agents)
     every = run(log).scenario
     assert every.ego is not None
     ticks = every.ego.waypoints.t_s

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.confirmation import SAME_MOMENT_S, is_credible
-from log2sim.agents.lidar_tracking import LidarMatch, track_with_lidar
+from log2sim.agents.lidar_tracking import BoxState, LidarMatch, track_with_lidar
 from log2sim.agents.size import TrackGeometry, is_static, moving_geometry, parked_heading, static_geometry
 from log2sim.agents.smooth.smoother import MotionModel, SmoothedTrack, signed_speed, smooth_track
 from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Agent, Obstacles, Track, Waypoints
@@ -142,17 +142,10 @@ def _match_lidar(
 ) -> list[LidarMatch]:
     if not ticks:
         return []
-    return track_with_lidar(
-        obstacles,
-        ticks,
-        timeline.t_ns,
-        start_ns=start_ns,
-        xy_m=xy,
-        velocity_mps=velocity,
-        yaw_rad=yaw,
-        size_m=shape.size_m,
-        bottom_m=z - shape.size_m[2] / 2,
+    start = BoxState(
+        start_ns, np.array(xy, float), np.array(velocity, float), yaw, shape.size_m, z - shape.size_m[2] / 2
     )
+    return track_with_lidar(obstacles, ticks, timeline.t_ns, start)
 
 
 def _moving_agent(

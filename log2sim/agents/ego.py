@@ -1,4 +1,4 @@
-"""The last steps: the ego as an agent, few waypoints where few are enough, everything put into a scenario."""
+"""The ego as an agent, from the poses of its log."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ from log2sim.datatypes import Agent, Log, Waypoints
 from log2sim.geometry import Array, yaw_of
 from log2sim.perception.sync import Schedule
 
+# Standard deviation of ego positions from GNSS/INS with RTK or LiDAR odometry.
 EGO_SIGMA_M = 0.02
+MAX_STATIC_DISTANCE_M = 0.3
 
 
 def ego_agent(log: Log, timeline: Timeline) -> Agent | None:
-    """The ego at every tick; None for a log without poses."""
+    """Make the ego an agent with a waypoint at every tick; None for a log without poses at them."""
     if log.ego is None:
         return None
     map_T_ego, valid = log.ego.at(timeline.t_ns)
@@ -38,13 +40,13 @@ def ego_agent(log: Log, timeline: Timeline) -> Agent | None:
     )
     moved = float(np.hypot(np.ptp(center[:, 0]), np.ptp(center[:, 1])))
     return Agent(
-        "ego", "car", (length, width, height), waypoints, static=moved < 0.3, rear_axle_offset_m=vehicle.rear_axle_offset_m,
+        "ego", "car", (length, width, height), waypoints, static=moved < MAX_STATIC_DISTANCE_M, rear_axle_offset_m=vehicle.rear_axle_offset_m,
         quality={"source": "ego poses of the log", "flags": list(path.flags)},
     )  # fmt: skip
 
 
 def ego_flow(log: Log, schedule: Schedule) -> Array:
-    """Places and headings (K, 3) of the ego's path, which parked cars beside it are taken to follow."""
+    """Return x, y and heading (K, 3) of the ego at every tick, as evidence of the direction of traffic."""
     if log.ego is None:
         return np.zeros((0, 3))
     map_T_ego, valid = log.ego.at(schedule.t_ns)

@@ -1,9 +1,9 @@
-"""Following a track where no camera detects it: the LiDAR alone shows that it is still there, and where."""
+"""Tracking by LiDAR alone at ticks without a detection: a box of known size is matched against the points."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,19 +13,38 @@ from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception import box_fitting
 
 MIN_POINTS = 8
+# Points up to this far outside the predicted box count as its own; a shell of this width around them is compared with it.
 MARGIN_M = 0.5
 SHELL_M = 0.5
-# More points right around the box than this share of those in it: the box sits on something larger.
+# With more points in the shell, relative to those in the box, the box is a part of a larger structure.
 MAX_SHELL_RATIO = 0.6
+# Largest distance of a match from its prediction.
 MAX_SHIFT_M = 0.8
 MAX_MISSES = 2
-# A box of which less than the rest of this share shows could be anywhere along it.
+# A match is rejected when a larger share of the box's length or width is unobserved: its position along that axis is
+# undetermined.
 MAX_HIDDEN_SHARE = 0.7
+# Gains of the constant-velocity filter.
+POSITION_GAIN, VELOCITY_GAIN, YAW_GAIN = 0.6, 0.15, 0.3
+# Slower objects keep their yaw.
+MIN_COURSE_SPEED_MPS = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class LidarMatch:
-    """Where the LiDAR found a tracked box at a tick: `xy_m` (2,), its covariance (2, 2) and the time it was seen."""
+    """A tracked box found in the LiDAR points of a tick.
+
+    Attributes
+    ----------
+    tick : int
+    t_ns : int
+        Mean time of its points.
+    xy_m : (2,) float64
+        Center, map frame.
+    covariance : (2, 2) float64
+        Of the center, m2.
+    points : int
+    """
 
     tick: int
     t_ns: int
@@ -34,88 +53,118 @@ class LidarMatch:
     points: int
 
 
-def track_with_lidar(
-    obstacles: Sequence[Obstacles | None],
-    ticks: Sequence[int],
-    t_ns: NDArray[np.int64],
-    *,
-    start_ns: int,
-    xy_m: Array,
-    velocity_mps: Array,
-    yaw_rad: float,
-    size_m: Array,
-    bottom_m: float,
-) -> list[LidarMatch]:
-    """Look for a box at the ticks given, one after the other, from a known state at `start_ns`.
+@dataclass(frozen=True, eq=False)
+class BoxState:
+    """A box of known size and its motion at one time, in the map frame.
 
-    The box moves with constant velocity, corrected at every sighting; the search ends after two ticks without one.
+    Attributes
+    ----------
+    t_ns : int
+    xy_m : (2,) float64
+        Center.
+    velocity_mps : (2,) float64
+        Zero for a static box, which is expected at the same position at every tick.
+    yaw_rad : float
+    size_m : (3,) float64
+        Length, width, height.
+    bottom_m : float
+        Height of its bottom face.
     """
-    found: list[LidarMatch] = []
-    position, velocity, last_ns, misses = np.array(xy_m, float), np.array(velocity_mps, float), start_ns, 0
-    standing = not velocity.any()
+
+    t_ns: int
+    xy_m: Array
+    velocity_mps: Array
+    yaw_rad: float
+    size_m: Array
+    bottom_m: float
+
+
+def track_with_lidar(
+    obstacles: Sequence[Obstacles | None], ticks: Sequence[int], t_ns: NDArray[np.int64], start: BoxState
+) -> list[LidarMatch]:
+    """Match a box at the given ticks, one after the other, from a known state.
+
+    A moving box is predicted with constant velocity, corrected at every match, and lost after `MAX_MISSES` ticks without a
+    match in a row.
+
+    Parameters
+    ----------
+    obstacles : T clouds, None at ticks without LiDAR
+    ticks : sequence of int
+        Forward or backward in time from the state.
+    t_ns : (T,) int64
+        Stamps of all ticks.
+    start : BoxState
+    """
+    matches: list[LidarMatch] = []
+    state, misses, is_static = start, 0, not start.velocity_mps.any()
     for tick in ticks:
         cloud = obstacles[tick]
-        predicted = position + velocity * ((int(t_ns[tick]) - last_ns) / NS_PER_S)
-        sighting = None if cloud is None else match_box(cloud, tick, predicted, yaw_rad, size_m, bottom_m)
-        if sighting is None:
+        predicted = state.xy_m + state.velocity_mps * ((int(t_ns[tick]) - state.t_ns) / NS_PER_S)
+        match = None if cloud is None else match_box(cloud, tick, replace(state, xy_m=predicted))
+        if match is None:
             misses += 1
-            if misses >= MAX_MISSES and not standing:
+            if misses >= MAX_MISSES and not is_static:
                 break
             continue
         misses = 0
-        found.append(sighting)
-        if standing:
-            continue
-        dt = (sighting.t_ns - last_ns) / NS_PER_S
-        expected = position + velocity * dt
-        correction = sighting.xy_m - expected
-        if abs(dt) > 1e-3:
-            velocity = velocity + 0.15 * correction / dt
-            yaw_rad = _turned(yaw_rad, velocity)
-        position, last_ns = expected + 0.6 * correction, sighting.t_ns
-    return found
+        matches.append(match)
+        if not is_static:
+            state = _corrected(state, match)
+    return matches
 
 
-def match_box(
-    cloud: Obstacles, tick: int, xy_m: Array, yaw_rad: float, size_m: Array, bottom_m: float
-) -> LidarMatch | None:
-    """Find a box of known size and yaw near a predicted center (2,); None where the points do not show it."""
-    reach = float(np.hypot(*size_m[:2])) / 2 + MARGIN_M + SHELL_M
-    x, y = (xy_m - cloud.origin[:2]).astype(np.float32)
+def _corrected(state: BoxState, match: LidarMatch) -> BoxState:
+    """Return the state at the time of a match, corrected toward it."""
+    dt_s = (match.t_ns - state.t_ns) / NS_PER_S
+    expected = state.xy_m + state.velocity_mps * dt_s
+    innovation = match.xy_m - expected
+    velocity, yaw_rad = state.velocity_mps, state.yaw_rad
+    if abs(dt_s) > 1e-3:
+        velocity = velocity + VELOCITY_GAIN * innovation / dt_s
+        yaw_rad = _turned(yaw_rad, velocity)
+    position = expected + POSITION_GAIN * innovation
+    return replace(state, t_ns=match.t_ns, xy_m=position, velocity_mps=velocity, yaw_rad=yaw_rad)
+
+
+def match_box(cloud: Obstacles, tick: int, box: BoxState) -> LidarMatch | None:
+    """Match a predicted box against the points of a tick; None where they do not determine its position."""
+    size, yaw_rad = box.size_m, box.yaw_rad
+    reach = float(np.hypot(*size[:2])) / 2 + MARGIN_M + SHELL_M
+    x, y = (box.xy_m - cloud.origin[:2]).astype(np.float32)
     near = np.flatnonzero(np.abs(cloud.xyz[:, 0] - x) <= reach)
     near = near[np.abs(cloud.xyz[near, 1] - y) <= reach]
-    z = cloud.xyz[near, 2] + np.float32(cloud.origin[2] - bottom_m)
-    near = near[(z > 0.15) & (z < size_m[2] + 0.4)]
+    z = cloud.xyz[near, 2] + np.float32(cloud.origin[2] - box.bottom_m)
+    near = near[(z > 0.15) & (z < size[2] + 0.4)]
     if len(near) < MIN_POINTS:
         return None
-    turned = box_fitting.rotate((cloud.xyz[near, :2] - np.array([x, y])).astype(np.float64), -yaw_rad)
-    half = size_m[:2] / 2
-    excess = (np.abs(turned) - half).max(axis=1)
-    inside = excess <= MARGIN_M
-    if inside.sum() < MIN_POINTS or (excess > MARGIN_M).sum() > MAX_SHELL_RATIO * inside.sum():
+    local = box_fitting.rotate((cloud.xyz[near, :2] - np.array([x, y])).astype(np.float64), -yaw_rad)
+    outside_m = (np.abs(local) - size[:2] / 2).max(axis=1)
+    inside = outside_m <= MARGIN_M
+    if inside.sum() < MIN_POINTS or (outside_m > MARGIN_M).sum() > MAX_SHELL_RATIO * inside.sum():
         return None
-    low, high = np.quantile(turned[inside], 0.01, axis=0), np.quantile(turned[inside], 0.99, axis=0)
-    if np.any(high - low > size_m[:2] + 0.6):
+    low, high = np.quantile(local[inside], 0.01, axis=0), np.quantile(local[inside], 0.99, axis=0)
+    if np.any(high - low > size[:2] + 0.6):
         return None
-    sensor = box_fitting.rotate(cloud.sensor[:2].astype(np.float64) + cloud.origin[:2] - xy_m, -yaw_rad)
-    center, sigma = box_fitting.complete_box(low, high, size_m[:2], sensor)
-    slack = size_m[:2] - (high - low)
-    if np.hypot(*center) > MAX_SHIFT_M or np.any(slack > MAX_HIDDEN_SHARE * np.maximum(size_m[:2], 1.0)):
+    sensor = box_fitting.rotate(cloud.sensor[:2].astype(np.float64) + cloud.origin[:2] - box.xy_m, -yaw_rad)
+    center, sigma = box_fitting.complete_box(low, high, size[:2], sensor)
+    hidden = size[:2] - (high - low)
+    if np.hypot(*center) > MAX_SHIFT_M or np.any(hidden > MAX_HIDDEN_SHARE * np.maximum(size[:2], 1.0)):
         return None
-    seen_s = float(cloud.t_s[near[inside]].mean())
+    mean_s = float(cloud.t_s[near[inside]].mean())
     return LidarMatch(
         tick,
-        cloud.stamp_ns + round(seen_s * NS_PER_S),
-        box_fitting.rotate(center, yaw_rad) + xy_m,
+        cloud.stamp_ns + round(mean_s * NS_PER_S),
+        box_fitting.rotate(center, yaw_rad) + box.xy_m,
         box_fitting.oriented_covariance(np.hypot(sigma, 2 * box_fitting.SENSOR_SIGMA_M), yaw_rad),
         int(inside.sum()),
     )
 
 
 def _turned(yaw_rad: float, velocity: Array) -> float:
-    """The yaw, drawn toward the course of what moves fast enough to have one."""
+    """Turn a yaw toward the course of a velocity (2,), up to half turns, if it is fast enough."""
     speed = float(np.hypot(*velocity))
-    if speed < 2.0:
+    if speed < MIN_COURSE_SPEED_MPS:
         return yaw_rad
     course = box_fitting.align_to(float(np.arctan2(velocity[1], velocity[0])), yaw_rad, np.pi)
-    return yaw_rad + 0.3 * float(np.arctan2(np.sin(course - yaw_rad), np.cos(course - yaw_rad)))
+    return yaw_rad + YAW_GAIN * float(np.arctan2(np.sin(course - yaw_rad), np.cos(course - yaw_rad)))

@@ -1,14 +1,12 @@
-"""The last steps: the ego as an agent, few waypoints where few are enough, everything put into a scenario."""
+"""The scenario of a run: agents, cameras, plan and provenance in one record."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from log2sim.agents.simplify import simplify_waypoints
 from log2sim.config import Config
 from log2sim.datatypes import Agent, Log, Scenario
 from log2sim.geometry import NS_PER_S
@@ -17,17 +15,6 @@ from log2sim.perception.homography_stage import CameraHomography
 from log2sim.perception.sync import Schedule
 from log2sim.plan import Plan
 from log2sim.version import __version__
-
-
-def thinned(agents: Sequence[Agent]) -> list[Agent]:
-    """Agents with few waypoints where they move straight at constant speed; `quality` says how many were left out."""
-    out = []
-    for agent in agents:
-        few = simplify_waypoints(agent.waypoints)
-        left_out = len(agent.waypoints) - len(few)
-        quality = {**agent.quality, "waypoints_left_out": left_out} if left_out else agent.quality
-        out.append(replace(agent, waypoints=few, quality=quality) if left_out else agent)
-    return out
 
 
 def scenario_of(
@@ -40,7 +27,7 @@ def scenario_of(
     ego: Agent | None,
     agents: Sequence[Agent],
 ) -> Scenario:
-    """Put everything into the record that `scenario.json` holds."""
+    """Assemble the record that `scenario.json` holds; the ego, if any, is its first agent."""
     return Scenario(
         name=log.name,
         t0_ns=int(schedule.t_ns[0]),

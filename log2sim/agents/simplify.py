@@ -1,23 +1,39 @@
-"""Few waypoints for straight constant motion: those left out lie between their neighbors, within a stated tolerance."""
+"""Simplification of trajectories: waypoints that interpolation restores within a tolerance are left out."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Waypoints
+from log2sim.datatypes import Agent, Waypoints
 from log2sim.geometry import Array
 
-# Largest departure of a waypoint left out from the line between those kept: x, y, z, yaw, speed, sigma of the position.
+# Largest deviation of an omitted waypoint from the line between its neighbors: x, y, z, yaw, speed, sigma of the position.
 TOLERANCE_M, TOLERANCE_RAD, TOLERANCE_MPS = 0.01, 0.002, 0.02
 TOLERANCES = np.array([TOLERANCE_M] * 3 + [TOLERANCE_RAD, TOLERANCE_MPS, TOLERANCE_M])
 MAX_INTERVAL_S = 1.0
 
 
-def simplify_waypoints(waypoints: Waypoints) -> Waypoints:
-    """The waypoints without those that linear interpolation gives back, at most `MAX_INTERVAL_S` apart.
+def simplify(agents: Sequence[Agent]) -> list[Agent]:
+    """Leave out waypoints of straight motion at constant speed; `quality` counts those left out."""
+    return [_simplified(agent) for agent in agents]
 
-    Where something begins or ends to be observed both neighbors stay.
+
+def _simplified(agent: Agent) -> Agent:
+    waypoints = simplify_waypoints(agent.waypoints)
+    omitted = len(agent.waypoints) - len(waypoints)
+    if not omitted:
+        return agent
+    return replace(agent, waypoints=waypoints, quality={**agent.quality, "waypoints_left_out": omitted})
+
+
+def simplify_waypoints(waypoints: Waypoints) -> Waypoints:
+    """Leave out the waypoints that linear interpolation restores, keeping intervals of at most `MAX_INTERVAL_S`.
+
+    Where `observed` changes, both neighbors are kept.
     """
     kept = waypoints_to_keep(waypoints)
     if len(kept) == len(waypoints):
@@ -27,11 +43,11 @@ def simplify_waypoints(waypoints: Waypoints) -> Waypoints:
 
 
 def waypoints_to_keep(w: Waypoints) -> NDArray[np.intp]:
-    """Indices (K,) of the waypoints to keep, first and last among them.
+    """Select the indices (K,) of the waypoints to keep, first and last among them.
 
     Notes
     -----
-    Greedy: from each kept waypoint the next is as far as steps that double, then halve, find it.
+    Greedy: from each kept waypoint the farthest next one is searched with steps that double, then halve.
     """
     columns = np.column_stack([w.x_m, w.y_m, w.z_m, np.unwrap(w.yaw_rad), w.speed_mps, w.sigma_xy_m])
     kept, last = [0], len(w) - 1
@@ -40,7 +56,7 @@ def waypoints_to_keep(w: Waypoints) -> NDArray[np.intp]:
         step, reach = 1, 1
         while step and start + reach < last:
             end = min(start + reach + step, last)
-            if _between(w.t_s, columns, w.observed, start, end):
+            if _is_linear(w.t_s, columns, w.observed, start, end):
                 reach, step = end - start, 2 * step
             else:
                 step //= 2
@@ -48,8 +64,8 @@ def waypoints_to_keep(w: Waypoints) -> NDArray[np.intp]:
     return np.array(kept, dtype=np.intp)
 
 
-def _between(t: Array, columns: Array, observed: NDArray[np.bool_], start: int, end: int) -> bool:
-    """Whether the rows between two are on the line from one to the other, and as observed as these."""
+def _is_linear(t: Array, columns: Array, observed: NDArray[np.bool_], start: int, end: int) -> bool:
+    """Decide whether the rows between two lie on the line between these and share their `observed`."""
     if t[end] - t[start] > MAX_INTERVAL_S or observed[start : end + 1].min() != observed[start : end + 1].max():
         return False
     share = (t[start + 1 : end] - t[start]) / (t[end] - t[start])

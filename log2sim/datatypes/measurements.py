@@ -1,8 +1,4 @@
-"""What flows between the stages: sensors, streams, logs, detections.
-
-Everything is a frozen record of columns. Arrays are never changed once a record holds them. Letters in shapes: N points,
-M boxes, L labels, A agents, T ticks, F frames of a stream.
-"""
+"""Detections of a camera frame and measurements of a tick, as columns with M rows."""
 
 from __future__ import annotations
 
@@ -18,35 +14,71 @@ from log2sim.geometry import Array
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """2D boxes of one camera frame: `box_px` (M, 4) u0, v0, u1, v1, `score` (M,) in [0, 1], `category` (M,) str."""
+    """2D boxes of one camera frame.
+
+    Attributes
+    ----------
+    box_px : (M, 4) float64
+        u0, v0, u1, v1.
+    score : (M,) float64
+        In [0, 1].
+    category : (M,) str
+    """
 
     box_px: Array
     score: Array
     category: NDArray[np.str_]
 
     def __len__(self) -> int:
+        """Return the number of rows."""
         return len(self.box_px)
 
     @classmethod
     def empty(cls) -> Detections:
+        """Return detections without rows."""
         return cls(np.zeros((0, 4)), np.zeros(0), np.zeros(0, dtype="<U16"))
 
     def take(self, index: Any) -> Detections:
-        """The rows at `index` (integers or a mask)."""
+        """Take the rows at `index`, integers or a mask."""
         return Detections(self.box_px[index], self.score[index], self.category[index])
 
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """What the sensors say about the objects of one tick, one row an object, all in the map frame.
+    """Measured objects of one tick, one row an object, in the map frame.
 
-    `t_ns` (M,) int64 when the object was seen (the mean time of its points, else the frame's stamp); `category` (M,) str;
-    `score` (M,) of the detector; `camera` (M,) str; `box_px` (M, 4); `truncated` (M,) bool: cut by the image border;
-    `ends_visible` (M, 2) bool: whether the cluster's right and left end, as the sensor sees it, are ends of the object;
-    `center_m` (M, 3) box center; `size_m` (M, 3) length, width, height; `yaw_rad` (M,) up to quarter turns where only
-    LiDAR speaks; `covariance` (M, 2, 2) of the center's x, y in m2; `points` (M,) LiDAR points on the object; `source`
-    (M,) "lidar", "topdown" or "" where there is no position yet; `cluster` M arrays (n, 3) of points;
-    `sensor_m` (M, 3) where they were seen from; `height_px_m` (M,) height in m that the image box spans at that depth.
+    Attributes
+    ----------
+    t_ns : (M,) int64
+        Mean time of the object's LiDAR points, else the stamp of the camera frame.
+    category : (M,) str
+    score : (M,) float64
+        Of the detector, in [0, 1].
+    camera : (M,) str
+    box_px : (M, 4) float64
+        u0, v0, u1, v1.
+    truncated : (M,) bool
+        Whether the image border cuts the box.
+    ends_visible : (M, 2) bool
+        Whether the right and the left end of the cluster, as seen from the sensor, are ends of the object.
+    center_m : (M, 3) float64
+        Box center.
+    size_m : (M, 3) float64
+        Length, width, height.
+    yaw_rad : (M,) float64
+        Up to quarter turns where it comes from LiDAR alone; NaN where unknown.
+    covariance : (M, 2, 2) float64
+        Of the center's x, y, m2.
+    points : (M,) int64
+        Number of LiDAR points on the object.
+    source : (M,) str
+        "lidar", "topdown", or "" without a position.
+    cluster : M arrays (n, 3) float64
+        LiDAR points, subsampled, m.
+    sensor_m : (M, 3) float64
+        Viewpoint of the points.
+    height_px_m : (M,) float64
+        Height in m that the image box spans at the object's depth.
     """
 
     t_ns: NDArray[np.int64]
@@ -67,17 +99,18 @@ class Measurements:
     height_px_m: Array
 
     def __len__(self) -> int:
+        """Return the number of rows."""
         return len(self.t_ns)
 
     def take(self, index: Any) -> Measurements:
-        """The rows at `index` (integers or a mask)."""
+        """Take the rows at `index`, integers or a mask."""
         rows = np.arange(len(self))[index]
         columns = {k: v[rows] for k, v in vars(self).items() if k != "cluster"}
         return Measurements(**columns, cluster=tuple(self.cluster[i] for i in rows))
 
     @classmethod
     def join(cls, parts: Sequence[Measurements]) -> Measurements:
-        """Rows of several sets, one after the other; an empty sequence gives an empty set."""
+        """Concatenate several sets; an empty sequence gives an empty set."""
         if not parts:
             return cls.empty()
         columns = {k: np.concatenate([getattr(p, k) for p in parts]) for k in vars(parts[0]) if k != "cluster"}
@@ -85,6 +118,7 @@ class Measurements:
 
     @classmethod
     def empty(cls) -> Measurements:
+        """Return measurements without rows."""
         text, none = np.zeros(0, dtype="<U16"), np.zeros(0)
         return cls(
             np.zeros(0, dtype=np.int64), text, none, text, np.zeros((0, 4)), np.zeros(0, dtype=bool),

@@ -1,4 +1,4 @@
-"""Following a track where no camera detects it: the LiDAR alone shows that it is still there, and where."""
+"""LiDAR points above the ground of one tick, kept for tracking and free-space tests."""
 
 from __future__ import annotations
 
@@ -13,8 +13,19 @@ from log2sim.geometry import Array
 
 @dataclass(frozen=True, eq=False)
 class Obstacles:
-    """Points above the ground at one tick: `xyz` (N, 3) float32 relative to `origin` (3,), their times `t_s` (N,) relative
-    to `stamp_ns`, and `sensor` (3,) relative to `origin`.
+    """Points above the ground at one tick, one a voxel.
+
+    Attributes
+    ----------
+    stamp_ns : int
+    origin : (3,) float64
+        m, map frame.
+    xyz : (N, 3) float32
+        m, map axes, relative to `origin`.
+    t_s : (N,) float32
+        Times relative to `stamp_ns`.
+    sensor : (3,) float32
+        Position of the sensor relative to `origin`.
     """
 
     stamp_ns: int
@@ -25,7 +36,7 @@ class Obstacles:
 
     @cached_property
     def rays(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Azimuth (N,) rad in the map frame, distance over ground (N,) and slope (N,) of every point from the sensor."""
+        """Azimuth (N,) rad in the map frame, horizontal distance (N,) m and slope (N,) of every point from the sensor."""
         x, y, z = (self.xyz - self.sensor).T
         reach = np.hypot(x, y)
         return np.arctan2(y, x), reach, z / np.maximum(reach, np.float32(1e-3))

@@ -1,8 +1,4 @@
-"""What flows between the stages: sensors, streams, logs, detections.
-
-Everything is a frozen record of columns. Arrays are never changed once a record holds them. Letters in shapes: N points,
-M boxes, L labels, A agents, T ticks, F frames of a stream.
-"""
+"""Tracks: the measurements of one object over time."""
 
 from __future__ import annotations
 
@@ -16,11 +12,21 @@ from log2sim.datatypes.measurements import Measurements
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """One object over time: `tick` (n,) strictly increasing indices and the measurement (n rows) it got at each."""
+    """One object over time.
+
+    Attributes
+    ----------
+    category : str
+    tick : (n,) int64
+        Strictly increasing indices of ticks.
+    measurements : Measurements
+        n rows, one at each of these ticks.
+    """
 
     category: str
     tick: NDArray[np.int64]
     measurements: Measurements
 
     def __len__(self) -> int:
+        """Return the number of measurements."""
         return len(self.tick)

@@ -1,7 +1,7 @@
-"""Synchronization at camera rate: which frame and which sweep belong to a tick, and by how much they miss it.
+"""Synchronization at camera rate: the camera frames and LiDAR sweeps of every tick, with their residuals.
 
-A tick is one frame of the reference camera. Every other camera contributes its nearest frame. Every camera frame gets the
-nearest sweep, where a sweep's time is the middle of the points that it holds, not the stamp that its driver wrote.
+A tick is a frame of the reference camera. Every other camera contributes its nearest frame. Every camera frame gets the
+nearest sweep, where the time of a sweep is the middle of its point times, not the stamp of its driver.
 """
 
 from __future__ import annotations
@@ -22,11 +22,20 @@ PROBED_RECORDS = 5
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """What belongs together.
+    """Records of every tick.
 
-    `t_ns` (T,) int64 stamps of the ticks; `frames` camera -> (T,) index into its stream, -1 where none is near enough;
-    `sweeps` lidar -> (C, T) index for every camera in the order of `frames`, -1 where none is near enough.
-    `residuals_s` stream -> (T,) signed seconds from what was asked for to what was taken, NaN where nothing was.
+    Attributes
+    ----------
+    reference : str
+        Camera that sets the ticks.
+    t_ns : (T,) int64
+        Stamps of the ticks.
+    frames : mapping of camera to (T,) int64
+        Index into its stream, -1 where no frame is near enough.
+    sweeps : mapping of LiDAR to (C, T) int64
+        Index for every camera in the order of `frames`, -1 where no sweep is near enough.
+    residuals_s : mapping of stream to (T,) float64
+        Time of the record less the requested time, NaN without a record.
     """
 
     reference: str
@@ -36,10 +45,11 @@ class Schedule:
     residuals_s: Mapping[str, NDArray[np.float64]]
 
     def __len__(self) -> int:
+        """Return the number of ticks."""
         return len(self.t_ns)
 
     def summary(self) -> dict[str, Any]:
-        """Residuals a stream for the report: median and largest size in s, and how many ticks have no record."""
+        """Summarize residuals by stream for the report: median and largest magnitude in s, and the number of ticks without a record."""
         return {
             name: {
                 "median_abs_s": float(np.nanmedian(np.abs(r))) if np.isfinite(r).any() else None,
@@ -59,14 +69,14 @@ def synchronize(
     start_s: float | None = None,
     stop_s: float | None = None,
 ) -> Schedule:
-    """Build the schedule of a log for the chosen cameras.
+    """Find the records of every tick for the chosen cameras.
 
     Parameters
     ----------
     reference : str
         Camera that sets the ticks; "" takes the log's own choice, else the first camera.
     max_residual_s : float
-        Farthest that a record may lie from what it is asked for, s.
+        Largest difference between a record's time and the requested time, s.
     start_s, stop_s : float, optional
         Keeps the ticks in [start, stop] seconds after the first one.
 
@@ -108,7 +118,7 @@ def synchronize(
 
 
 def _check_stamps(stream: Stream) -> None:
-    """Raise `LogError` where a search among the stamps would go wrong; a reader puts its records in order."""
+    """Raise `LogError` for a stream without records or with stamps that do not increase."""
     if len(stream.t_ns) == 0:
         raise LogError(f"stream '{stream.name}': has no record; expected at least one, or a log without this sensor")
     late = np.flatnonzero(np.diff(stream.t_ns) <= 0) + 1
@@ -122,12 +132,19 @@ def _check_stamps(stream: Stream) -> None:
 def nearest_records(
     stamps_ns: NDArray[np.int64], asked_ns: NDArray[np.int64], tolerance_ns: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Index (T,) of the record nearest to each asked stamp, -1 beyond the tolerance, and the residual (T,) in s.
+    """Find the record nearest to each requested stamp.
+
+    Returns
+    -------
+    index : (T,) int64
+        -1 beyond the tolerance.
+    residual_s : (T,) float64
+        NaN beyond the tolerance.
 
     Notes
     -----
-    This is where the online rule of Bhardwaj & Kalra ends up once the whole log is known: wait for the incoming record if
-    it will be nearer than the last one. Of two equally near ones the earlier is taken.
+    The offline equivalent of the online rule of Bhardwaj & Kalra, which waits for the incoming record if it will be nearer
+    than the last one. Of two equally near records the earlier is taken.
     """
     index = nearest_index(stamps_ns, asked_ns)
     residual_ns = stamps_ns[index] - asked_ns
@@ -138,7 +155,7 @@ def nearest_records(
 def _assign_frames_once(
     index: NDArray[np.int64], residual_s: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Let only the nearest tick have a frame that several ticks would take: a frame is evidence for one moment."""
+    """Keep a frame that is nearest to several ticks only at the nearest of them, so that no frame counts twice."""
     order = np.lexsort((np.abs(residual_s), index))
     first = np.zeros(len(index), dtype=bool)
     first[order] = np.r_[True, index[order][1:] != index[order][:-1]]
@@ -147,7 +164,9 @@ def _assign_frames_once(
 
 
 def sweep_middle_ns(stream: Stream) -> int:
-    """Middle of a sweep's point times relative to its stamp, ns, from the first sweep that can be read; 0 without point times.
+    """Return the middle of a sweep's point times relative to its stamp, ns; 0 without point times.
+
+    Taken from the first of `PROBED_RECORDS` sweeps that can be read.
 
     Raises
     ------

@@ -1,1 +1,1 @@
-"""LiDAR points inside detection boxes: position, size and heading of the object."""
+"""LiDAR points inside detection boxes: clouds, ground, clusters, and the evidence for position, size and heading."""

@@ -1,4 +1,4 @@
-"""Sweeps brought to the map frame: every point moved by the ego pose of its own moment."""
+"""Sweeps in the map frame, compensated for the motion of their sensor, as one cloud with its ground."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception.lidar.azimuth_index import AzimuthIndex
 from log2sim.perception.lidar.ground import ON_GROUND_M, estimate_ground
 
-# Rotation is held within one bin: at 1 rad/s and 50 m this is 2.5 cm; translation is interpolated for every point.
+# Rotation is constant within a bin, which errs by 2.5 cm at 1 rad/s and 50 m; translation is interpolated for every point.
 POSE_BIN_NS = 500_000
 MAX_POSE_BINS = 4096
-# A sensor that moves less than this during a sweep, its turning taken at 30 m, needs one pose for it.
+# A sensor that moves less than this during a sweep, with its rotation measured at 30 m, needs a single pose.
 AT_REST_M = 0.01
 AT_REST_RAD = AT_REST_M / 30.0
 AT_REST_PROBES = 5
-# Obstacles stand between the road and what hangs over it.
+# Heights above ground of what a vehicle could hit: above the curb, below signs and bridges.
 MIN_OBSTACLE_HEIGHT_M, MAX_OBSTACLE_HEIGHT_M = 0.2, 4.2
 GROUND_REACH_M = 45.0
 GROUND_SAMPLE = 2000
@@ -31,9 +31,21 @@ GROUND_SAMPLE = 2000
 class Cloud:
     """Points of one moment in the map frame.
 
-    `xyz` (N, 3) float32, m, relative to `origin` (3,) float64 in the map frame, so that single precision holds 1e-5 m;
-    `t_s` (N,) float32 seconds relative to `stamp_ns`; `sensor` (3,) float32 where the points were seen from, relative to
-    `origin`; `ground` (N,) bool marks points on the ground; `height` (N,) float32 above the ground.
+    Attributes
+    ----------
+    stamp_ns : int
+    origin : (3,) float64
+        m, map frame. Coordinates are relative to it, so that single precision resolves 1e-5 m.
+    xyz : (N, 3) float32
+        m, map axes, relative to `origin`.
+    t_s : (N,) float32
+        Time of every point relative to `stamp_ns`.
+    sensor : (3,) float32
+        Position of the sensor, mean over several, relative to `origin`.
+    ground : (N,) bool
+        True for points on the ground.
+    height : (N,) float32
+        m above the ground.
     """
 
     stamp_ns: int
@@ -46,42 +58,51 @@ class Cloud:
 
     @cached_property
     def obstacles(self) -> NDArray[np.intp]:
-        """Indices (n,) of the points that stand on the road."""
+        """Indices (n,) of the points above the ground and below what hangs over the road."""
         return np.flatnonzero(
             ~self.ground & (self.height > MIN_OBSTACLE_HEIGHT_M) & (self.height < MAX_OBSTACLE_HEIGHT_M)
         )
 
     @cached_property
     def columns(self) -> NDArray[np.float32]:
-        """The points as columns x, y, z (3, N)."""
+        """The points as rows x, y, z (3, N), contiguous for products."""
         return np.ascontiguousarray(self.xyz.T)
 
     @cached_property
     def obstacle_columns(self) -> NDArray[np.float32]:
-        """The points at `obstacles` as columns (3, n), for the cameras that share the cloud."""
+        """The points at `obstacles` as rows x, y, z (3, n), shared by all cameras."""
         return np.ascontiguousarray(self.xyz[self.obstacles].T)
 
     @cached_property
     def azimuth_index(self) -> AzimuthIndex:
-        """The points by azimuth around the sensor."""
+        """The points sorted by azimuth around the sensor."""
         return AzimuthIndex.of(self.xyz, self.sensor, self.ground)
 
     @cached_property
     def ground_sample(self) -> NDArray[np.intp]:
-        """Indices (n,) of every so-many-th of the ground points near the origin."""
+        """Indices of about `GROUND_SAMPLE` ground points within `GROUND_REACH_M` of the origin, evenly spaced in their order."""
         index = np.flatnonzero(self.ground & (np.hypot(self.xyz[:, 0], self.xyz[:, 1]) < GROUND_REACH_M))
         return index[:: max(len(index) // GROUND_SAMPLE, 1)]
 
     def prepare(self, *, ground: bool = True) -> None:
-        """Compute now, in the thread that makes the cloud, what measuring in it will ask for, its `ground` too or not."""
+        """Fill the cached columns in the calling thread; `ground` includes the sample of ground points."""
         _ = self.obstacle_columns, self.azimuth_index, self.ground_sample if ground else None
 
 
 def sweep_to_map(log: Log, lidar: str, sweep: Sweep, *, compensate: bool) -> tuple[Array, NDArray[np.float32]] | None:
-    """Points (N, 3) float64 of a sweep in the map frame and their times (N,) s relative to its stamp.
+    """Transform a sweep to the map frame.
 
-    Returns None where the pose of the sensor is not known at that time. Without point times, at rest, or with `compensate`
-    off, the whole sweep takes the pose of its stamp.
+    Parameters
+    ----------
+    compensate : bool
+        Whether every point takes the sensor pose of its own time. Sweeps without point times, or of a sensor at rest, take
+        the pose of their stamp in either case.
+
+    Returns
+    -------
+    xyz : (N, 3) float64, m, map frame
+    t_s : (N,) float32
+        Times relative to the sweep's stamp. None is returned instead of both where the sensor's pose is not known.
     """
     t_ns = sweep.t_ns if sweep.t_ns is not None else np.full(len(sweep.xyz_m), sweep.stamp_ns, dtype=np.int64)
     t_s = ((t_ns - sweep.stamp_ns) / NS_PER_S).astype(np.float32)
@@ -93,7 +114,7 @@ def sweep_to_map(log: Log, lidar: str, sweep: Sweep, *, compensate: bool) -> tup
 
 
 def is_at_rest(log: Log, lidar: str, sweep: Sweep) -> bool:
-    """Whether a LiDAR stands still while it takes a sweep with point times, to `AT_REST_M` at 30 m."""
+    """Decide whether a LiDAR moves less than `AT_REST_M`, also at 30 m, during a sweep with point times."""
     if sweep.t_ns is None or len(sweep.t_ns) == 0:
         return False
     probes = np.linspace(0, int(sweep.t_ns.max() - sweep.t_ns.min()), AT_REST_PROBES).astype(np.int64)
@@ -104,7 +125,7 @@ def is_at_rest(log: Log, lidar: str, sweep: Sweep) -> bool:
 
 
 def transform_rigidly(log: Log, lidar: str, sweep: Sweep) -> Array | None:
-    """Points (N, 3) in the map, all moved by the pose of the sweep's stamp; None where that is not known."""
+    """Transform a sweep to the map frame by the pose of its stamp: (N, 3); None where that pose is not known."""
     map_T_lidar, valid = log.map_T_sensor(lidar, sweep.stamp_ns)
     if not valid[0]:
         return None
@@ -112,7 +133,10 @@ def transform_rigidly(log: Log, lidar: str, sweep: Sweep) -> Array | None:
 
 
 def deskew(log: Log, lidar: str, sweep: Sweep, t_ns: NDArray[np.int64]) -> Array | None:
-    """Points (N, 3) in the map, each moved by the pose of its own time (N,); None where one is not known."""
+    """Transform a sweep to the map frame, every point by the pose of its own time (N,): (N, 3).
+
+    None where a pose is not known.
+    """
     first, span = int(t_ns.min()), int(t_ns.max() - t_ns.min())
     bins = min(max(span // POSE_BIN_NS, 1), MAX_POSE_BINS)
     knots = first + (np.arange(bins + 1) * span) // bins
@@ -144,14 +168,22 @@ def assemble_cloud(
     max_range_m: float,
     compensate: bool = True,
 ) -> Cloud | None:
-    """One cloud in the map frame from the sweeps of all LiDARs that belong together, with its ground found.
+    """Merge the simultaneous sweeps of all LiDARs into one cloud in the map frame and estimate its ground.
 
     Parameters
     ----------
-    origin : (3,) map frame
-        Position of the ego (or the sensor); points beyond `max_range_m` of it are left out.
+    sweeps : mapping of LiDAR name to Sweep
+    origin : (3,) float64, m, map frame
+        Position of the ego, or of the sensors; points farther than `max_range_m` along an axis are left out.
     ground_z : float
         Expected height of the ground at the origin, m, map frame.
+    compensate : bool
+        See `sweep_to_map`.
+
+    Returns
+    -------
+    Cloud or None
+        None when no sweep has a known pose and points.
     """
     parts, stamp = [], 0
     for name, sweep in sweeps.items():
@@ -169,6 +201,6 @@ def assemble_cloud(
     xyz, t_s = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
     surface = estimate_ground(xyz, np.zeros(2), ground_z - float(origin[2]))
     height = xyz[:, 2] - surface.at(xyz[:, :2])
-    # A LiDAR far away, of which no point is near, must not move the place that the points were seen from.
+    # A distant LiDAR without points in range must not shift the viewpoint.
     sensor = np.mean([p[2] for p in parts if len(p[0])] or [p[2] for p in parts], axis=0).astype(np.float32)
     return Cloud(stamp, np.asarray(origin, float), xyz, t_s, sensor, np.abs(height) <= ON_GROUND_M, height)

@@ -1,4 +1,4 @@
-"""Which LiDAR points belong to the object in a detector's box."""
+"""Assignment of LiDAR clusters to detection boxes."""
 
 from __future__ import annotations
 
@@ -15,27 +15,29 @@ from log2sim.perception.box_fitting import subsample
 Index = NDArray[np.intp]
 
 CELL_M = {"vehicle": 0.4, "two_wheeler": 0.3, "pedestrian": 0.25, "other": 0.4}
-# Longest that an object of a category can be: points farther apart belong to several things.
+# Longest horizontal extent of an object of a category: points farther apart belong to several objects.
 MAX_LENGTH_M = {
     "car": 6.0, "truck": 14.0, "bus": 19.0, "motorcycle": 2.8, "cyclist": 2.4, "bicycle": 2.4, "pedestrian": 1.4, "other": 8.0,
 }  # fmt: skip
 MIN_CLUSTER_POINTS = 4
 MAX_SCORED_POINTS = 400
-# A cluster that fills less of the box than this is something in front of the object or behind it.
+# A cluster whose image rectangle overlaps the detection box less is an occluder or background.
 MIN_IMAGE_IOU = 0.12
-# Around a box, a margin of this share of its sides is searched for what goes on there, as dense as this at least.
+# Margin around a box, as a share of its sides, and the point density in it, relative to the cluster's, from which on the
+# cluster counts as extending beyond the box.
 MARGIN, MIN_DENSITY_RATIO = 0.15, 0.3
-# Boxes that overlap by more are two of one object; a cluster of which more is another box's is that one's.
+# Boxes with a higher IoU are duplicates and share points. A cluster is rejected when a larger share of its points already
+# belongs to another box.
 DUPLICATE_IOU, MAX_FOREIGN_SHARE = 0.7, 0.5
 
 
 def clusters_of(xy: NDArray[np.floating[Any]], cell_m: float) -> NDArray[np.intp]:
-    """Label (N,) the connected clusters of points (N, 2): neighbors are in touching cells, corners included."""
+    """Label (N,) the connected clusters of points (N, 2): points in adjacent grid cells, diagonals included, are connected."""
     return _cluster(xy, cell_m)[0]
 
 
 def _cluster(xy: NDArray[np.floating[Any]], cell_m: float) -> tuple[NDArray[np.intp], Array, NDArray[Any]]:
-    """Labels (N,) of the clusters, the corner of their grid, and that grid: labels plus one, 0 where empty, with a border."""
+    """Label points on a grid: labels (N,), lower corner (2,) of the grid, and the grid with labels plus one, 0 where empty."""
     import cv2
 
     x, y = xy.T
@@ -52,19 +54,31 @@ def _cluster(xy: NDArray[np.floating[Any]], cell_m: float) -> tuple[NDArray[np.i
 def candidate_clusters(
     xyz: NDArray[np.float32], uv: NDArray[np.floating[Any]], range_m: Array, box_px: Array, category: str
 ) -> list[tuple[Index, float]]:
-    """Clusters of the points (N, 3) inside a box that could be its object, as indices, each with a score in (0, 1].
+    """Find the clusters inside a detection box that could be its object.
 
     Parameters
     ----------
-    xyz, uv, range_m : (N, 3), (N, 2), (N,)
-        Points in and right around the box, their pixels, and their distances from the sensor.
-    box_px : (4,) the detector's box
+    xyz : (N, 3) float32, m
+        Points in the box and in a margin around it.
+    uv : (N, 2) float32
+        Their pixels.
+    range_m : (N,) float
+        Their distances from the sensor.
+    box_px : (4,) float64
+        The detection box: u0, v0, u1, v1.
+    category : str
+
+    Returns
+    -------
+    list of (indices (n,), score)
+        The score, in (0, 1], is the IoU of the cluster's image rectangle with the box, times the square root of the ratio
+        of the nearest cluster's range to its own.
 
     Notes
     -----
-    Every cluster of the points in the box spans a rectangle in the image. The object's own one fills the detector's box;
-    what stands in front covers a part of it, and the background shows only around the object. Of clusters that fill the
-    box alike the nearer one is the object. What goes on outside the box is a wall or a hedge.
+    The rectangle of the object's own cluster fills the box; an occluder covers a part of it, and background is visible
+    only around the object. Of clusters that fill the box equally the nearer one is the object. A cluster that extends
+    beyond the box, such as a wall or a hedge, is left out.
     """
     u, v = uv.T
     inside = np.flatnonzero((u >= box_px[0]) & (u <= box_px[2]) & (v >= box_px[1]) & (v <= box_px[3]))
@@ -72,11 +86,11 @@ def candidate_clusters(
         return []
     cell_m = CELL_M[GROUP_OF[category]]
     labels, corner, grid = _cluster(xyz[inside, :2], cell_m)
-    structure = _extends_beyond_box(xyz, uv, box_px, labels, corner, grid, cell_m)
-    # Whole numbers of 16 bits are sorted by their digits.
+    is_structure = _extends_beyond_box(xyz, uv, box_px, labels, corner, grid, cell_m)
+    # NumPy sorts 16-bit integers by radix.
     order, count = np.argsort(labels.astype(np.uint16), kind="stable"), np.bincount(labels)
     first = np.cumsum(count) - count
-    enough = (count >= MIN_CLUSTER_POINTS) & ~structure
+    enough = (count >= MIN_CLUSTER_POINTS) & ~is_structure
     if not enough.any():
         return []
     span = np.concatenate(_group_extents(uv[inside[order]], first), axis=1)
@@ -96,7 +110,7 @@ def candidate_clusters(
 
 
 def _group_extents(values: NDArray[Any], first: Index) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Smallest and largest values (G, 2), (G, 2) of consecutive groups of rows (N, 2) that begin at `first` (G,)."""
+    """Return the smallest and largest values (G, 2), (G, 2) of consecutive groups of rows (N, 2) that begin at `first` (G,)."""
     return np.minimum.reduceat(values, first), np.maximum.reduceat(values, first)
 
 
@@ -109,7 +123,7 @@ def _extends_beyond_box(
     grid: NDArray[Any],
     cell_m: float,
 ) -> NDArray[np.bool_]:
-    """Which clusters (L,) go on beyond two of the left, the right and the upper side of the box, in its margin."""
+    """Mark the clusters (L,) that extend into the margin beyond two of the left, right and upper side of the box."""
     import cv2
 
     count = np.bincount(labels)
@@ -129,13 +143,24 @@ def _extends_beyond_box(
 
 
 def assign_clusters(options: Sequence[Sequence[tuple[Index, float]]], boxes_px: Array, count: int) -> list[Index]:
-    """One cluster for each of K boxes, from its candidates over `count` points; empty where none is left.
+    """Assign one cluster to each of K boxes.
+
+    Parameters
+    ----------
+    options : K sequences of (indices, score)
+        Candidate clusters of each box, see `candidate_clusters`.
+    boxes_px : (K, 4) float64
+    count : int
+        Number of points that the indices refer to.
+
+    Returns
+    -------
+    K arrays (n,) of indices, empty for a box without a cluster.
 
     Notes
     -----
-    Boxes choose their best candidates, the largest clusters first. Points that are another box's are no longer to be
-    had: what shows of a hidden object is the little around the one that hides it. Boxes that overlap almost wholly are
-    two of one object and share its points.
+    Greedy: the box whose best candidate has the most points is served first, and its points are taken from the candidates
+    of other boxes, except of duplicate boxes. Of an occluded object only the points around its occluder remain.
     """
     chosen: list[Index] = [np.zeros(0, dtype=np.intp)] * len(options)
     overlap = box_iou(boxes_px, boxes_px) if len(options) else np.zeros((0, 0))
@@ -154,21 +179,21 @@ def assign_clusters(options: Sequence[Sequence[tuple[Index, float]]], boxes_px: 
     return chosen
 
 
-def crop_to_length(xyz: NDArray[np.float32], group: Index, range_m: Array, longest_m: float) -> Index:
-    """Cut a cluster that is longer than its object can be around its nearer part."""
+def crop_to_length(xyz: NDArray[np.float32], group: Index, range_m: Array, max_length_m: float) -> Index:
+    """Crop a cluster that exceeds `max_length_m` to the points within half that length of the median of its nearest 40 %."""
     xy = xyz[group, :2]
-    if np.hypot(*(xy.max(axis=0) - xy.min(axis=0))) <= longest_m:
+    if np.hypot(*(xy.max(axis=0) - xy.min(axis=0))) <= max_length_m:
         return group
     near = group[range_m[group] <= np.quantile(range_m[group], 0.4)]
     center = np.median(xyz[near, :2], axis=0)
-    kept = group[np.hypot(*(xyz[group, :2] - center).T) <= longest_m / 2]
+    kept = group[np.hypot(*(xyz[group, :2] - center).T) <= max_length_m / 2]
     return kept if len(kept) >= MIN_CLUSTER_POINTS else near
 
 
 def region_grow(xy_all: NDArray[np.float32], seed: NDArray[np.float32], category: str) -> Index:
-    """Indices of all points (N, 2) connected to a seed cluster (n, 2), for an object that the image border cuts.
+    """Grow a seed cluster (n, 2) to all connected points (N, 2): their indices, for an object that the image border cuts.
 
-    Bounded by the category's longest size, so that it cannot run along a wall.
+    Limited to the longest extent of the category around the seed's median, so that it does not grow along a wall.
     """
     reach = MAX_LENGTH_M[category]
     center = np.median(seed, axis=0)
@@ -179,4 +204,5 @@ def region_grow(xy_all: NDArray[np.float32], seed: NDArray[np.float32], category
     labels = clusters_of(np.vstack([xy_all[near], seed]), CELL_M[GROUP_OF[category]])
     wanted = np.bincount(labels[len(near) :]).argmax()
     kept = near[labels[: len(near)] == wanted]
-    return kept[np.hypot(*(xy_all[kept] - center).T) <= reach]
+    within: Index = kept[np.hypot(*(xy_all[kept] - center).T) <= reach]
+    return within

@@ -1,4 +1,4 @@
-"""The height of the ground under a sweep, for slopes and crests, from the lowest points of every cell."""
+"""Ground height under a cloud, on slopes and crests too, from the lowest points of every grid cell."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from log2sim.geometry import Array
 CELL_M = 1.0
 REACH_M = 100.0
 ROUNDS = 6
-# A cell whose lowest point stands higher than this above the smooth surface holds an object, not ground; ditches and
-# the falling edge of a slope may lie deeper.
+# A cell whose lowest point is higher than this above the smooth surface contains an object; ditches and falling edges of
+# slopes may be deeper.
 ACCEPT_ABOVE_M = 0.2
 ACCEPT_BELOW_M = 0.4
 ON_GROUND_M = 0.2
@@ -22,22 +22,30 @@ ON_GROUND_M = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """Ground heights `z` (K, K) at cell centers of a grid around `center` (2,), all in the frame of the points."""
+    """Ground heights on a grid.
+
+    Attributes
+    ----------
+    center : (2,) float64
+        m, middle of the grid, in the frame of the points.
+    z : (K, K) float64
+        m, heights at the cell centers, first axis along x.
+    """
 
     center: Array
     z: Array
 
     def at(self, xy: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
-        """Height (N,) under positions (N, 2), bilinear, held constant beyond the grid's edge."""
+        """Interpolate the height (N,) under positions (N, 2) bilinearly; constant beyond the grid's edge."""
         k = self.z.shape[0]
         (i, fi), (j, fj) = (self._cell(xy[:, axis], axis) for axis in range(2))
         z, corner = self.z.astype(np.float32).ravel(), i * k + j
         low = z[corner] * (1 - fj) + z[corner + 1] * fj
         high = z[corner + k] * (1 - fj) + z[corner + k + 1] * fj
-        return low * (1 - fi) + high * fi
+        return np.asarray(low * (1 - fi) + high * fi, dtype=np.float32)
 
     def _cell(self, values: NDArray[np.floating[Any]], axis: int) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-        """Index (N,) of the cell center below each coordinate (N,), and the share (N,) of the way to the next one."""
+        """Find the cell center below each coordinate (N,): its index (N,) and the fraction (N,) toward the next one."""
         k = self.z.shape[0]
         place = np.clip((values - self.center[axis]) / CELL_M + (k - 1) / 2, 0, k - 1.001)
         i = place.astype(np.intp)
@@ -45,12 +53,20 @@ class Ground:
 
 
 def estimate_ground(xyz: NDArray[np.floating[Any]], center: Array, z_hint: float) -> Ground:
-    """Estimate the ground under points (N, 3) within `REACH_M` of `center` (2,), near the height `z_hint` at the center.
+    """Estimate the ground under points (N, 3) within `REACH_M` of `center` (2,).
+
+    Parameters
+    ----------
+    xyz : (N, 3) float, m
+    center : (2,) float64, m
+        In the frame of the points.
+    z_hint : float
+        Expected height at the center, m. Without any point the ground is flat at this height.
 
     Notes
     -----
-    A quadratic surface is fitted to the lowest point of every cell by iteratively reweighted least squares, anchored to
-    the road under the ego; what the cells near it still differ by is smoothed and added. Without any point it is flat.
+    A quadratic surface is fitted to the lowest point of every cell by iteratively reweighted least squares, with
+    `z_hint` as an anchor; the smoothed residuals of cells near that surface are added.
     """
     k = int(2 * REACH_M / CELL_M) + 1
     lowest = _lowest_points(xyz, center, k)
@@ -73,7 +89,7 @@ def estimate_ground(xyz: NDArray[np.floating[Any]], center: Array, z_hint: float
 
 
 def _blur(grid: Array) -> Array:
-    """Gaussian mean (K, K) over two cells, and over eight with hardly any weight, for where the near ones are empty."""
+    """Smooth a grid (K, K) by a Gaussian of two cells, plus one of eight cells with weight 1e-3 to fill empty areas."""
     import cv2
 
     single = grid.astype(np.float32)
@@ -82,7 +98,7 @@ def _blur(grid: Array) -> Array:
 
 
 def _lowest_points(xyz: NDArray[np.floating[Any]], center: Array, k: int) -> Array:
-    """The second lowest height in every cell (K, K), so that one false return below the road does not count; inf if empty."""
+    """Find the lowest height in every cell (K, K), without single false returns below the road; inf if empty."""
     i, j = (np.floor((xyz[:, axis] - center[axis]) / CELL_M + k / 2).astype(np.int64) for axis in range(2))
     inside = (i >= 0) & (i < k) & (j >= 0) & (j < k)
     flat, z = (i * k + j)[inside], xyz[inside, 2].astype(np.float64)
@@ -91,13 +107,13 @@ def _lowest_points(xyz: NDArray[np.floating[Any]], center: Array, k: int) -> Arr
     second = np.full(k * k, np.inf)
     above = z > lowest[flat]
     np.minimum.at(second, flat[above], z[above])
-    # Reflections lie clearly below; ground that is merely rough differs by centimeters.
+    # Mirror reflections are decimeters below the road; roughness is centimeters.
     reflected = np.isfinite(second) & (second > lowest + 0.3)
     return np.where(reflected, second, lowest).reshape(k, k)
 
 
 def _fit_surface(terms: Array, z: Array, range_m: Array, z_hint: float) -> Array:
-    """Coefficients (6,) of the quadratic surface: cells above it count ever less, the road under the ego holds it."""
+    """Fit the coefficients (6,) of a quadratic surface robustly; cells above it lose weight twice as fast as those below."""
     anchor = np.zeros((1, 6))
     anchor[0, 0] = 1.0
     nearness = 1.0 / (1.0 + (range_m / 25.0) ** 2)

@@ -1,4 +1,4 @@
-"""Clouds into images: which points a camera sees, and which of them lie in its boxes."""
+"""Projection of clouds into images, and the projected points inside detection boxes."""
 
 from __future__ import annotations
 
@@ -12,13 +12,21 @@ from numpy.typing import NDArray
 from log2sim.geometry import NEAREST_DEPTH_M, Array, Camera, fold_radius, project, undistort
 
 BORDER_SAMPLES = 33
-# Between samples a border bends by less than this, in tangents; no lens of these models sees past the widest.
+# Margin for the curvature of the image border between its samples, and the widest frustum, both as tangents.
 SLACK, WIDEST = 0.01, 20.0
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One camera frame with what is needed to measure in it: `map_T_cam` (4, 4) at its stamp."""
+    """A camera frame: camera, stamp and pose.
+
+    Attributes
+    ----------
+    camera : Camera
+    t_ns : int
+    map_T_cam : (4, 4) float64
+        Pose at the stamp.
+    """
 
     camera: Camera
     t_ns: int
@@ -27,7 +35,17 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class ProjectedPoints:
-    """Points that a camera sees: `index` (n,) in the cloud, pixels `u` and `v` (n,), `depth` (n,) m along the optical axis."""
+    """Points inside an image.
+
+    Attributes
+    ----------
+    index : (n,) int
+        Rows among the points that were projected.
+    u, v : (n,) float32
+        Pixels, u right, v down.
+    depth : (n,) float32
+        m along the optical axis.
+    """
 
     index: NDArray[np.intp]
     u: NDArray[np.float32]
@@ -36,14 +54,14 @@ class ProjectedPoints:
 
 
 class _Workspace(threading.local):
-    """Working memory of a thread, kept from frame to frame: fresh pages cost more than the projection itself."""
+    """Working memory of a thread, reused between frames: allocating pages costs more than the projection itself."""
 
     def __init__(self) -> None:
         self._numbers = np.empty(0, dtype=np.float32)
         self._marks = np.empty(0, dtype=np.bool_)
 
     def take(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Numbers (4, count) and marks (2, count), not initialized."""
+        """Return uninitialized numbers (4, count) and marks (2, count)."""
         if len(self._numbers) < 4 * count:
             self._numbers, self._marks = np.empty(4 * count, dtype=np.float32), np.empty(2 * count, dtype=np.bool_)
         return self._numbers[: 4 * count].reshape(4, count), self._marks[: 2 * count].reshape(2, count)
@@ -53,13 +71,12 @@ _workspace = _Workspace()
 
 
 def project_points(view: View, origin: Array, columns: NDArray[np.float32]) -> ProjectedPoints:
-    """Project points given as columns x, y, z (3, N) relative to `origin` (3,) in the map frame.
+    """Project points given as rows x, y, z (3, N) float32, relative to `origin` (3,) in the map frame.
 
     Notes
     -----
-    One product in single precision turns the points and applies the intrinsics; what is outside the frustum falls out
-    before anything is divided, so that only the few points of the image are. Those go through the lens in double
-    precision where there is one.
+    One product in single precision rotates the points and applies the intrinsics; points outside the frustum are dropped
+    before the division by depth. With a lens distortion the remaining points are projected in double precision.
     """
     camera, cam_R_map = view.camera, view.map_T_cam[:3, :3].T
     offset = cam_R_map @ (origin - view.map_T_cam[:3, 3])
@@ -73,7 +90,7 @@ def project_points(view: View, origin: Array, columns: NDArray[np.float32]) -> P
     z = turned[2]
     np.greater(z, np.float32(NEAREST_DEPTH_M), out=mark)
     for axis in (0, 1):
-        # A pinhole's image begins at zero, which needs no product.
+        # The lower bounds of a pinhole's image are zero.
         edge = np.multiply(z, np.float32(low[axis]), out=bound) if lens else np.float32(0.0)
         mark &= np.greater_equal(turned[axis], edge, out=other)
         np.multiply(z, np.float32(high[axis]), out=bound)
@@ -89,34 +106,39 @@ def project_points(view: View, origin: Array, columns: NDArray[np.float32]) -> P
 
 @lru_cache(maxsize=64)
 def _frustum(camera: Camera) -> tuple[Array, Array]:
-    """Bounds (2,), (2,) of x / z and y / z of the rays that reach the image, from those at its border."""
+    """Bound x / z and y / z, (2,) and (2,), of the rays that reach the image, from samples of its border."""
     along = np.linspace(0.0, 1.0, BORDER_SAMPLES)
     zero, one = np.zeros(BORDER_SAMPLES), np.ones(BORDER_SAMPLES)
     border = np.stack([np.r_[along, along, zero, one], np.r_[zero, one, along, along]], axis=1)
     rays = undistort(camera, border * [camera.width_px, camera.height_px])
     if np.isnan(rays).any():
-        # Pixels that no ray reaches: the lens folds inside the image, and everything up to the fold may be seen.
+        # No ray reaches some border pixels: the lens model folds inside the image, so the fold radius is the bound.
         reach = min(fold_radius(camera), WIDEST)
         return np.full(2, -reach), np.full(2, reach)
     return rays.min(axis=0) - SLACK, rays.max(axis=0) + SLACK
 
 
-def points_in_image_boxes(seen: ProjectedPoints, box_px: Array, margin: float = 0.0) -> list[NDArray[np.intp]]:
-    """Rows of `seen` in each box (M, 4), in their order; boxes are widened by a share of their sides, but not downward.
+def points_in_image_boxes(points: ProjectedPoints, box_px: Array, margin: float = 0.0) -> list[NDArray[np.intp]]:
+    """Find the rows of projected points inside each box (M, 4), in rising order.
+
+    Parameters
+    ----------
+    margin : float
+        Share of its sides by which a box is widened to the left, right and top.
 
     Notes
     -----
-    Points are sorted by whole columns once, by their digits; a box looks only at those between its own.
+    Points are sorted by integer pixel column once; only those in the columns of a box are compared with it.
     """
     if len(box_px) == 0:
         return []
-    column = seen.u.astype(np.uint16)
+    column = points.u.astype(np.uint16)
     order = np.argsort(column, kind="stable")
-    column, u, v = column[order], seen.u[order], seen.v[order]
+    column, u, v = column[order], points.u[order], points.v[order]
     wide, tall = margin * (box_px[:, 2:] - box_px[:, :2]).T
     left, top = box_px[:, 0] - wide, box_px[:, 1] - tall
     right, bottom = box_px[:, 2] + wide, box_px[:, 3]
-    # Boxes may reach out of the image; those of NaN have no points.
+    # Boxes may extend beyond the image; boxes of NaN contain no points.
     first, last = (np.clip(np.nan_to_num(edge), 0, 65535).astype(np.uint16) for edge in (left, right))
     first, last = np.searchsorted(column, first, "left"), np.searchsorted(column, last, "right")
     edges = np.stack([left, top, right, bottom], axis=1).tolist()

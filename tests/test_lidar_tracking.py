@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from worlds import Solid, scan, standing
 
-from log2sim.agents.lidar_tracking import match_box, track_with_lidar
+from log2sim.agents.lidar_tracking import BoxState, match_box, track_with_lidar
 from log2sim.datatypes import Obstacles
 from log2sim.geometry import rotation_from_rpy
 from log2sim.perception.box_fitting import rotate
@@ -28,7 +28,8 @@ def obstacles(solids, *, far=(0.0, 0.0, 0.0), turn=0.0, stamp_ns=T0_NS, t_s=0.0,
 
 
 def seen(cloud, xy, yaw=0.0, bottom=0.0, size=SIZE):
-    return match_box(cloud, 7, np.asarray(xy, dtype=np.float64), yaw, size, bottom)
+    box = BoxState(cloud.stamp_ns, np.asarray(xy, dtype=np.float64), np.zeros(2), yaw, size, bottom)
+    return match_box(cloud, 7, box)
 
 
 @pytest.mark.parametrize(("x", "y", "yaw_deg"), [(12, 3, 20), (18, -5, 90), (25, 4, 150), (15, 0, 5)])
@@ -132,10 +133,8 @@ def drive(states, *, gone=(), **options):
 
 
 def run(clouds, t_ns, ticks, xy, velocity, yaw=0.0, start=0):
-    return track_with_lidar(
-        clouds, ticks, t_ns, start_ns=int(t_ns[start]), xy_m=np.array(xy), velocity_mps=np.array(velocity),
-        yaw_rad=yaw, size_m=SIZE, bottom_m=0.0,
-    )  # fmt: skip
+    state = BoxState(int(t_ns[start]), np.array(xy, dtype=float), np.array(velocity, dtype=float), yaw, SIZE, 0.0)
+    return track_with_lidar(clouds, ticks, t_ns, state)
 
 
 def test_a_moving_car_is_followed_with_its_time():
