@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from extremes.table import FAR_M, Outcome, case
-from log2sim.agents.smooth.smoother import SmoothedTrack, signed_speed, smooth_track
+from log2sim.agents.smooth.smoother import MotionModel, SmoothedTrack, signed_speed, smooth_track
 from log2sim.datatypes import Measurements
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, rotation_from_rpy, transform, wrap_angle, yaw_of
 from log2sim.tracking.tracker import track
@@ -15,9 +15,9 @@ def smoothed_error_m(result: SmoothedTrack, truth: Array) -> float:
     return float(np.hypot(*(result.xy_m - truth).T).max())
 
 
-def smoothing(t: Array, truth: Array, sigma_m: float, **options: float) -> SmoothedTrack:
+def smoothing(t: Array, truth: Array, sigma_m: float, motion: MotionModel | None = None) -> SmoothedTrack:
     noise = np.random.default_rng(5).normal(0.0, sigma_m, truth.shape)
-    return smooth_track(t, truth + noise, sigma_m=sigma_m, **options)
+    return smooth_track(t, truth + noise, sigma_m=sigma_m, motion=motion)
 
 
 def straight(t: Array, speed_mps: float) -> Array:
@@ -80,7 +80,7 @@ def fast() -> Outcome:
 @case("smoothing: standstill", "stays within 3 sigma and its heading turns by less than a degree")
 def standstill() -> Outcome:
     t = np.arange(80) * 0.1
-    result = smoothing(t, np.zeros((80, 2)), 0.1, yaw_hint_rad=0.7)
+    result = smoothing(t, np.zeros((80, 2)), 0.1, motion=MotionModel(heading_rad=0.7))
     turned = float(np.rad2deg(np.abs(wrap_angle(result.yaw_rad - 0.7)).max()))
     outcome = judged(result, np.zeros((80, 2)), 0.3)
     return Outcome(outcome.ok and turned < 1.0, f"turns {turned:.2g} degrees", None, outcome.error)
