@@ -31,7 +31,7 @@ from log2sim.perception.detect.classes import COCO_80
 from log2sim.perception.detect.layouts import LAYOUTS
 from log2sim.perception.detect.onnx_detector import OnnxDetector
 from log2sim.perception.detect.onnx_model import OnnxModel
-from log2sim.perception.detect.preparation import InputSpec
+from log2sim.perception.detect.preprocessing import InputSpec
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography.fit import HomographyFit
 from log2sim.perception.homography_stage import CameraHomography, calibrated_homography

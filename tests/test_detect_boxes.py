@@ -9,10 +9,10 @@ import pytest
 
 from log2sim.datatypes import GROUP_OF, Detections
 from log2sim.geometry import box_iou
-from log2sim.perception.detect.preparation import InputSpec, Preparation, stretch_as_tf1
+from log2sim.perception.detect.preprocessing import InputSpec, Preprocessing, resize_as_tf1
 from log2sim.perception.detect.riders import join_riders
 from log2sim.perception.detect.suppression import suppress
-from log2sim.perception.detect.tiling import MAX_AUTO_TILES, OVERLAP, Tile, auto_count, merge, plan_tiles
+from log2sim.perception.detect.tiling import MAX_AUTO_TILES, OVERLAP, Tile, auto_tile_count, merge, plan_tiles
 
 
 def detections(*rows: tuple[str, float, tuple[float, float, float, float]]) -> Detections:
@@ -89,11 +89,11 @@ def test_tile_is_the_part_of_the_picture_it_names() -> None:
 
 
 def test_number_of_tiles_follows_from_the_shrinking() -> None:
-    assert auto_count(640, 416) == 1
-    assert auto_count(1242, 416) == 3
-    assert auto_count(1920, 416) == 4
-    assert auto_count(8000, 300) == MAX_AUTO_TILES
-    assert auto_count(1920, None) == 1
+    assert auto_tile_count(640, 416) == 1
+    assert auto_tile_count(1242, 416) == 3
+    assert auto_tile_count(1920, 416) == 4
+    assert auto_tile_count(8000, 300) == MAX_AUTO_TILES
+    assert auto_tile_count(1920, None) == 1
 
 
 def test_boxes_cut_by_an_inner_border_are_dropped_and_those_at_the_picture_border_stay() -> None:
@@ -164,7 +164,7 @@ def test_parts_of_a_pair_are_dropped_and_neighbors_stay() -> None:
 
 def test_tf1_resize_samples_at_the_corner() -> None:
     ramp = np.repeat(np.arange(0, 200, 2, dtype=np.uint8)[None, :, None], 100, axis=0).repeat(3, axis=2)
-    small = stretch_as_tf1(ramp, (40, 40))
+    small = resize_as_tf1(ramp, (40, 40))
     # Target column i samples source column 2.5 i, whose value is 5 i; centered sampling would give 5 i + 1.5.
     np.testing.assert_allclose(small[5, :, 0].astype(float), 5.0 * np.arange(40), atol=0.51)
 
@@ -177,8 +177,8 @@ def test_a_mark_in_the_input_maps_back_to_where_it_is_in_the_picture(fit: str, s
     u0, v0, u1, v1 = width // 4, height // 4, width // 2, height // 2
     image[v0:v1, u0:u1] = (10, 20, 250)
     spec = InputSpec("x", 256, 320, False, np.dtype(np.float32))
-    tensor, placement = Preparation(fit, rgb=True, unit=False)(image, spec)  # type: ignore[arg-type]
+    tensor, placement = Preprocessing(fit, rgb=True, unit=False)(image, spec)  # type: ignore[arg-type]
     assert tensor.shape == (1, 3, 256, 320)
     rows, columns = np.nonzero(tensor[0, 0] > 180)  # red comes first
-    found = placement.to_picture(np.array([[columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]], float))
+    found = placement.to_image(np.array([[columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]], float))
     assert found[0] == pytest.approx((u0, v0, u1, v1), abs=1.0)

@@ -11,7 +11,7 @@ from log2sim.datatypes import Detections, Frame, ImageLabels, Labels, Log
 from log2sim.errors import ConfigError
 from log2sim.geometry import Camera, transform
 from log2sim.perception.detect.detectors import create_detector
-from log2sim.perception.detect.label_motion import Boxes, boxes_at, mutual_partners, one_of_each
+from log2sim.perception.detect.label_motion import LabelBoxes, drop_repeated_objects, interpolate_boxes, mutual_nearest
 
 # Looks along map x from the origin, 1000 px focal length.
 CAM_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -106,8 +106,8 @@ def test_labels_too_far_in_time_are_not_used() -> None:
 def test_yaw_is_interpolated_across_pi() -> None:
     stamps = np.array([0, SECOND // 10])
     yaw = np.array([np.pi - 0.1, -np.pi + 0.3])
-    boxes = Boxes(stamps, np.array(["car", "car"]), np.zeros((2, 3)), np.ones((2, 3)), yaw)
-    moved = boxes_at(boxes, SECOND // 20, SECOND // 10)
+    boxes = LabelBoxes(stamps, np.array(["car", "car"]), np.zeros((2, 3)), np.ones((2, 3)), yaw)
+    moved = interpolate_boxes(boxes, SECOND // 20, SECOND // 10)
     assert moved.yaw_rad == pytest.approx([-np.pi + 0.1])
 
 
@@ -126,22 +126,22 @@ def test_boxes_with_a_stamp_each_come_once_and_at_the_time_of_the_frame(speed_mp
     assert lowest == pytest.approx(np.full(4, 300 + 1000 * 0.75 / rear_m), abs=1e-3)
 
 
-def cars(t_ns: list[int], x_m: list[float]) -> Boxes:
+def cars(t_ns: list[int], x_m: list[float]) -> LabelBoxes:
     count = len(x_m)
     center = np.stack([x_m, np.zeros(count), np.zeros(count)], axis=1)
-    return Boxes(np.array(t_ns), np.full(count, "car"), center, np.tile(CAR, (count, 1)), np.zeros(count))
+    return LabelBoxes(np.array(t_ns), np.full(count, "car"), center, np.tile(CAR, (count, 1)), np.zeros(count))
 
 
 def test_one_object_at_two_stamps_counts_once_and_two_at_one_stamp_twice() -> None:
     boxes = cars([0, 0, 50_000_000], [0.0, 3.0, 1.0])
-    assert one_of_each(boxes, np.array([2, 1, 0])).tolist() == [2]
-    assert one_of_each(boxes, np.array([1, 0, 2])).tolist() == [1, 0]
-    assert one_of_each(cars([0, 50_000_000], [0.0, 4.5]), np.array([0, 1])).tolist() == [0, 1]
+    assert drop_repeated_objects(boxes, np.array([2, 1, 0])).tolist() == [2]
+    assert drop_repeated_objects(boxes, np.array([1, 0, 2])).tolist() == [1, 0]
+    assert drop_repeated_objects(cars([0, 50_000_000], [0.0, 4.5]), np.array([0, 1])).tolist() == [0, 1]
 
 
 def test_partner_is_the_nearest_of_both_sides_within_reach() -> None:
     before, after = cars([0, 0, 0], [0.0, 3.0, 90.0]), cars([SECOND // 10] * 2, [3.5, 100.0])
-    own, partner = mutual_partners(before, after)
+    own, partner = mutual_nearest(before, after)
     assert (own.tolist(), partner.tolist()) == ([1], [0])  # the last pair would need 100 m/s
 
 

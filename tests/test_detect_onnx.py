@@ -162,9 +162,9 @@ def picky_model(path: Path, output: NDArray[np.float32], side: int) -> Path:
 def test_a_model_that_refuses_the_sizes_of_other_families_is_recognized(tmp_path: Path) -> None:
     path = picky_model(tmp_path / "m.onnx", zeros(3549, 85), 416)
     assert create_detector(str(path), LOG).layout.name == "yolox"  # type: ignore[attr-defined]
-    with pytest.raises(ConfigError, match=r"m\.onnx: the model fails on a picture \(1, 3, 320, 320\)"):
+    with pytest.raises(ConfigError, match=r"m\.onnx: the model fails on an image \(1, 3, 320, 320\)"):
         create_detector(str(path), LOG, input_px=320)
-    with pytest.raises(ConfigError, match=r"n\.onnx: the model fails on a picture"):
+    with pytest.raises(ConfigError, match=r"n\.onnx: the model fails on an image"):
         create_detector(str(picky_model(tmp_path / "n.onnx", zeros(5, 7), 77)), LOG)
 
 
@@ -258,7 +258,7 @@ BAD_MODELS = {
     "no road users": ({"o": yolov8(3)}, {"names": "['tree', 'dog', 'sky']"}, r"none of its classes.*tree, dog"),
     "names run code": ({"o": yolov8(3)}, {"names": "['tree', 'dog', str('car')]"}, r"metadata 'names'"),
     "unknown output": ({"mask": zeros(5, 7)}, {}, r"'mask' \(1, 5, 7\).*layout=.*yolov8"),
-    "input": ({"o": yolov8()}, {"shape": (1, 7)}, r"'images'.*expected one picture"),
+    "input": ({"o": yolov8()}, {"shape": (1, 7)}, r"'images'.*expected one image"),
     "batch": ({"o": yolov8()}, {"shape": (4, 3, HEIGHT, WIDTH)}, r"3 channels at a time"),
     "channels": ({"o": yolov8()}, {"shape": (1, 1, HEIGHT, WIDTH)}, r"3 channels at a time"),
     "huge input": ({"o": yolov8()}, {"shape": (1, 3, 10**6, 10**6)}, r"at most 8192 px"),

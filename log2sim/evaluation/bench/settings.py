@@ -165,13 +165,13 @@ def _looks(log: Log, config: Config, detector: OnnxDetector) -> list[tuple[str, 
             seen.add(plan)
             looks.append(("tiles", tiles))
     if detector.model.spec.width_px is None and detector.model.spec.height_px is None:
-        looks += [("input_px", side) for side in SIDES_PX if side != detector.layout.preparation.default_px]
+        looks += [("input_px", side) for side in SIDES_PX if side != detector.layout.preprocessing.default_px]
     return looks
 
 
 def _tile_plan(log: Log, config: Config, detector: OnnxDetector, tiles: int) -> tuple[int, ...]:
     """How many pictures a detector looks at for a frame of each camera."""
-    side = detector.model.spec.width_px or detector.layout.preparation.default_px
+    side = detector.model.spec.width_px or detector.layout.preprocessing.default_px
     cameras = [log.cameras[name] for name in config.cameras or log.cameras]
     return tuple(len(plan_tiles(c.width_px, c.height_px, tiles or "auto", side)) for c in cameras)
 

@@ -1,4 +1,4 @@
-"""From a model's classes to the categories of log2sim; classes that are no road users are dropped."""
+"""Mapping from the classes of a model to categories of road users; other classes are dropped."""
 
 from __future__ import annotations
 
@@ -27,12 +27,18 @@ NAMES_LIMIT_CHARS = 1_000_000
 
 @dataclass(frozen=True)
 class Classes:
-    """Which category a model's class index stands for; indices that are left out are no road users."""
+    """Category of each class index of a model; indices that are left out are no road users."""
 
     category_of: Mapping[int, str]
 
     def best(self, class_scores: Array, min_score: float) -> tuple[NDArray[np.intp], Array, NDArray[np.str_]]:
         """Choose categories from scores (N, C): at most one a row and group, so that a rider does not hide the bicycle.
+
+        Parameters
+        ----------
+        class_scores : (N, C) float
+        min_score : float
+            Rows whose best score of a group is lower are left out.
 
         Returns
         -------
@@ -56,9 +62,9 @@ class Classes:
             return np.zeros(0, np.intp), np.zeros(0), np.zeros(0, "<U16")
         return np.concatenate(rows), np.concatenate(scores), np.concatenate(categories)
 
-    def look_up(self, class_id: NDArray[np.number]) -> NDArray[np.str_]:
-        """Categories (N,) of class indices (N,), "" where the class is no road user."""
-        # Through float, because some exporters write ids as such; NaN finds nothing.
+    def categories_of(self, class_id: NDArray[np.number]) -> NDArray[np.str_]:
+        """Return the categories (N,) of class indices (N,), "" where the class is no road user."""
+        # Some exporters write ids as floats; NaN has no category.
         return np.array([self.category_of.get(i, "") for i in np.asarray(class_id, float).tolist()], dtype="<U16")
 
 
@@ -69,7 +75,7 @@ BY_COUNT: Mapping[int, Classes] = {80: COCO_80, 90: COCO_90, 91: COCO_91}
 
 
 def choose_classes(names: str | None, count: int | None, default: Classes, where: str) -> Classes:
-    """Classes of a model: by the names in its metadata, else by their number.
+    """Find out the classes of a model: by the names in its metadata, else by their number.
 
     Parameters
     ----------
@@ -110,6 +116,6 @@ def classes_from_names(names: str, where: str) -> Classes:
     return Classes(known)
 
 
-def groups(category: NDArray[np.str_]) -> NDArray[np.str_]:
-    """Groups (M,) of categories (M,)."""
+def groups_of(category: NDArray[np.str_]) -> NDArray[np.str_]:
+    """Return the groups (M,) of categories (M,)."""
     return np.array([GROUP_OF[name] for name in category.tolist()], dtype="<U16")

@@ -16,20 +16,20 @@ MAX_TILES = 64
 
 
 class Detector(Protocol):
-    """Finds road users in one camera frame.
-
-    `name` goes into the provenance of a scenario, `default_min_score` is the score in [0, 1] below which the boxes of
-    this detector are more often wrong than useful.
-    """
+    """Detector of road users in one camera frame."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Name in the provenance of a scenario."""
+        ...
 
     @property
-    def default_min_score(self) -> float: ...
+    def default_min_score(self) -> float:
+        """Score in [0, 1] below which boxes of this detector are more often wrong than useful."""
+        ...
 
     def detect(self, frame: Frame) -> Detections:
-        """Boxes of one frame, best score first, always the same for the same frame; may be called from threads."""
+        """Detect road users in one frame, best score first; deterministic, and may be called from threads."""
         ...
 
 
@@ -56,7 +56,7 @@ def create_detector(
     max_overlap
         IoU in (0, 1] above which two boxes of one group of categories are the same object.
     tiles
-        1: the whole picture only; N > 1: also N overlapping tiles; "auto": what the picture's size asks for.
+        1: the whole image only; N > 1: also N overlapping tiles; "auto": what the image's size asks for.
     layout
         Output layout of an ONNX file, where it cannot be recognized.
     input_px

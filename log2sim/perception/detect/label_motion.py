@@ -1,4 +1,4 @@
-"""Labeled 3D boxes at the stamp of a frame, from the stamps at which they were drawn, without their ids."""
+"""Interpolation of labeled 3D boxes to the stamp of a camera frame, without their track ids."""
 
 from __future__ import annotations
 
@@ -9,17 +9,32 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import NS_PER_S, Array, rectangles_overlap, wrap_angle
 
-MAX_AGE_S = 0.055  # a box without a partner on the other side of the frame is used up to this age
-MAX_WINDOW_S = 1.1  # labels at 1 Hz and denser are interpolated
-SCATTERED_S = 0.03  # labels closer in time than any sensor's period carry a stamp each
-SCATTERED_WINDOW_S = 0.15  # then the sensor turns at 10 Hz, give or take the object's own motion
+# A box without a partner on the other side of the frame is used up to this age: half a period of 10 Hz and some.
+MAX_AGE_S = 0.055
+# Labels at 1 Hz and denser are interpolated.
+MAX_WINDOW_S = 1.1
+# Labels closer in time than the period of any sensor carry a stamp each; then the sensor turns at 10 Hz.
+SCATTERED_S = 0.03
+SCATTERED_WINDOW_S = 0.15
+# Partners are not farther apart than an object of this speed moves between their stamps.
 MAX_SPEED_MPS = 50.0
+# A difference in size counts this many times a distance between centers: sizes do not change, places do.
 SIZE_WEIGHT = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class Boxes:
-    """Boxes in the map frame: `t_ns` (L,), `category` (L,), `center_m` (L, 3), `size_m` (L, 3), `yaw_rad` (L,)."""
+class LabelBoxes:
+    """Labeled boxes in the map frame.
+
+    Attributes
+    ----------
+    t_ns : (L,) int64
+    category : (L,) str
+    center_m : (L, 3) float64
+    size_m : (L, 3) float64
+        Length, width, height.
+    yaw_rad : (L,) float64
+    """
 
     t_ns: NDArray[np.int64]
     category: NDArray[np.str_]
@@ -27,19 +42,19 @@ class Boxes:
     size_m: Array
     yaw_rad: Array
 
-    def take(self, index: NDArray[np.intp]) -> Boxes:
-        """The rows at `index`."""
-        return Boxes(
+    def take(self, index: NDArray[np.intp]) -> LabelBoxes:
+        """Select the rows at `index`."""
+        return LabelBoxes(
             self.t_ns[index], self.category[index], self.center_m[index], self.size_m[index], self.yaw_rad[index]
         )
 
 
 def window_ns(t_ns: NDArray[np.int64]) -> int:
-    """How far from a frame its labels are looked for: one period of theirs.
+    """Compute the time around a frame in which its labels are searched: one period of the labels, ns.
 
     Notes
     -----
-    Some logs stamp all boxes of a sweep alike, others each by its own points. The latter leave no period to be seen.
+    Some logs stamp all boxes of a sweep alike, others each by its own points, from which no period can be read.
     """
     stamps = np.unique(t_ns)
     period_s = float(np.median(np.diff(stamps))) / NS_PER_S if len(stamps) > 1 else 0.0
@@ -48,36 +63,36 @@ def window_ns(t_ns: NDArray[np.int64]) -> int:
     return round(min(1.05 * period_s, MAX_WINDOW_S) * NS_PER_S)
 
 
-def boxes_at(boxes: Boxes, t_ns: int, window: int) -> Boxes:
-    """Boxes at a stamp: interpolated between the last one before and the first one after it.
+def interpolate_boxes(boxes: LabelBoxes, t_ns: int, window: int) -> LabelBoxes:
+    """Interpolate boxes to a stamp, between the last one before and the first one after it.
 
     Parameters
     ----------
     boxes
-        Boxes of all stamps in rising order.
+        Boxes of all stamps in ascending order.
     window
         From `window_ns`.
 
     Notes
     -----
-    Partners before and after are mutual nearest neighbors in place and size: at 10 Hz a car at 15 m/s is 0.75 m off
-    between two stamps. A box without a partner is new or about to leave, and stays where it was while it is young.
+    Partners before and after are mutual nearest neighbors in place and size: without interpolation a car at 15 m/s is
+    0.75 m off between two stamps at 10 Hz. A box without a partner is kept in its place up to `MAX_AGE_S`.
     """
     low, here, high = np.searchsorted(boxes.t_ns, [t_ns - window, t_ns + 1, t_ns + window + 1])
-    before = boxes.take(one_of_each(boxes, np.arange(here - 1, low - 1, -1)))
-    after = boxes.take(one_of_each(boxes, np.arange(here, high)))
-    i, j = mutual_partners(before, after)
+    before = boxes.take(drop_repeated_objects(boxes, np.arange(here - 1, low - 1, -1)))
+    after = boxes.take(drop_repeated_objects(boxes, np.arange(here, high)))
+    i, j = mutual_nearest(before, after)
     alone_before, alone_after = (
         np.setdiff1d(np.arange(len(before.t_ns)), i),
         np.setdiff1d(np.arange(len(after.t_ns)), j),
     )
     age = round(MAX_AGE_S * NS_PER_S)
     parts = [
-        between(before.take(i), after.take(j), t_ns),
+        interpolate_pairs(before.take(i), after.take(j), t_ns),
         before.take(alone_before[t_ns - before.t_ns[alone_before] <= age]),
         after.take(alone_after[after.t_ns[alone_after] - t_ns <= age]),
     ]
-    return Boxes(
+    return LabelBoxes(
         np.full(sum(len(p.t_ns) for p in parts), t_ns, dtype=np.int64),
         np.concatenate([p.category for p in parts]),
         np.concatenate([p.center_m for p in parts]),
@@ -86,8 +101,8 @@ def boxes_at(boxes: Boxes, t_ns: int, window: int) -> Boxes:
     )
 
 
-def one_of_each(boxes: Boxes, index: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Rows of `index` without those that stand where an earlier row of it, of another stamp, already stands.
+def drop_repeated_objects(boxes: LabelBoxes, index: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Drop rows of `index` that overlap an earlier row of another stamp: the same object once more.
 
     Notes
     -----
@@ -109,18 +124,18 @@ def one_of_each(boxes: Boxes, index: NDArray[np.intp]) -> NDArray[np.intp]:
     return index[kept]
 
 
-def between(before: Boxes, after: Boxes, t_ns: int) -> Boxes:
-    """Boxes at a stamp from pairs of the same object around it; sizes of the nearer one in time."""
+def interpolate_pairs(before: LabelBoxes, after: LabelBoxes, t_ns: int) -> LabelBoxes:
+    """Interpolate pairs of boxes of the same object to a stamp; sizes are those of the nearer one in time."""
     span = (after.t_ns - before.t_ns).astype(np.float64)
     fraction = (t_ns - before.t_ns).astype(np.float64) / span
     center = before.center_m + fraction[:, None] * (after.center_m - before.center_m)
     yaw = wrap_angle(before.yaw_rad + fraction * wrap_angle(after.yaw_rad - before.yaw_rad))
     size = np.where(fraction[:, None] <= 0.5, before.size_m, after.size_m)
-    return Boxes(before.t_ns, before.category, center, size, yaw)
+    return LabelBoxes(before.t_ns, before.category, center, size, yaw)
 
 
-def mutual_partners(a: Boxes, b: Boxes) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Indices of boxes in `a` and `b` that are each other's nearest of the same category and can have got there."""
+def mutual_nearest(a: LabelBoxes, b: LabelBoxes) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Find the indices of boxes in `a` and `b` that are mutual nearest neighbors of one category and within reach."""
     if not len(a.t_ns) or not len(b.t_ns):
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
     distance = np.linalg.norm(a.center_m[:, None] - b.center_m[None], axis=-1)

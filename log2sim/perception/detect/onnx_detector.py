@@ -1,4 +1,4 @@
-"""A detector from an ONNX model: picture and tiles in, boxes of road users out."""
+"""Detector of road users from an ONNX model, run on the whole image and on tiles of it."""
 
 from __future__ import annotations
 
@@ -12,20 +12,37 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Detections, Frame
 from log2sim.errors import ConfigError
 from log2sim.perception.detect.classes import Classes, choose_classes
-from log2sim.perception.detect.layout import Layout, Outputs, describe
+from log2sim.perception.detect.layout import Layout, Outputs, describe_outputs
 from log2sim.perception.detect.layouts import LAYOUTS, named_layout
 from log2sim.perception.detect.onnx_model import OnnxModel, load_model
 from log2sim.perception.detect.riders import join_riders
 from log2sim.perception.detect.suppression import suppress
 from log2sim.perception.detect.tiling import Tile, merge, plan_tiles
 
-SMALLEST_BOX_PX = 2.0
+# Smaller boxes are rounding of the decoder.
+MIN_BOX_PX = 2.0
+# Side of the gray image by whose outputs a layout is recognized.
 PROBE_PX = 320
 
 
 @dataclass(frozen=True, eq=False)
 class OnnxDetector:
-    """A model with the way to read it and the settings to run it with; see `Detector`."""
+    """Detector from a model, its output layout and settings.
+
+    Attributes
+    ----------
+    name : str
+    model : OnnxModel
+    layout : Layout
+    classes : Classes
+    min_score : float
+        Lowest score of a box.
+    max_overlap : float
+        IoU above which two boxes of one group are duplicates.
+    tiles : int or "auto"
+    default_min_score : float
+        Lowest score where none is set.
+    """
 
     name: str
     model: OnnxModel
@@ -37,26 +54,26 @@ class OnnxDetector:
     default_min_score: float
 
     def detect(self, frame: Frame) -> Detections:
-        """Boxes of one frame, best score first."""
+        """Detect road users in one frame, best score first."""
         return self.detect_image(frame.image())
 
     def detect_image(self, image: NDArray[np.uint8]) -> Detections:
-        """Boxes of one picture (H, W, 3) uint8 BGR."""
+        """Detect road users in one image (H, W, 3) uint8 BGR."""
         height, width = image.shape[:2]
-        tiles = plan_tiles(width, height, self.tiles, self.model.spec.width_px or self.layout.preparation.default_px)
+        tiles = plan_tiles(width, height, self.tiles, self.model.spec.width_px or self.layout.preprocessing.default_px)
         found = [(tile, suppress(self._detect_tile(image, tile), self.max_overlap)) for tile in tiles]
         return join_riders(merge(found, width, height, self.max_overlap))
 
     def _detect_tile(self, image: NDArray[np.uint8], tile: Tile) -> Detections:
-        """Boxes of one tile, in px of the whole picture and inside the tile."""
-        tensor, placement = self.layout.preparation(tile.cut(image), self.model.spec)
+        """Detect in one tile; boxes in px of the whole image, clipped to the tile."""
+        tensor, placement = self.layout.preprocessing(tile.cut(image), self.model.spec)
         outputs = self.model.run(tensor)
         found = self.layout.decode(outputs, placement.input_px, self.classes, self.min_score)
-        box = placement.to_picture(found.box_input)
+        box = placement.to_image(found.box_input)
         finite = np.isfinite(box).all(axis=1) & np.isfinite(found.score)
         low, high = np.zeros(2), np.array([tile.u1 - tile.u0, tile.v1 - tile.v0], dtype=np.float64)
         box = np.clip(box, np.tile(low, 2), np.tile(high, 2))
-        kept = finite & np.all(box[:, 2:] - box[:, :2] >= SMALLEST_BOX_PX, axis=1)
+        kept = finite & np.all(box[:, 2:] - box[:, :2] >= MIN_BOX_PX, axis=1)
         origin = np.array([tile.u0, tile.v0, tile.u0, tile.v0], dtype=np.float64)
         score = np.clip(found.score[kept], 0.0, 1.0)
         return Detections(box[kept] + origin, score, found.category[kept].astype("<U16"))
@@ -72,26 +89,26 @@ def open_onnx(
     input_px: int | None = None,
     name: str | None = None,
 ) -> OnnxDetector:
-    """Load a model, find out its layout and its classes by a gray probe picture, and make a detector of it."""
+    """Load a model, recognize its layout and classes by a gray image, and make a detector of it."""
     chosen = named_layout(layout_name) if layout_name is not None else None
     model = load_model(path)
-    layout, outputs = recognize(model, chosen)
+    layout, outputs = recognize_layout(model, chosen)
     try:
         count = layout.class_count(outputs)
         classes = choose_classes(model.metadata.get("names"), count, layout.default_classes, str(path))
         layout.decode(outputs, probe_size(model, layout), classes, 0.5)
     except (IndexError, ValueError, TypeError) as error:
         raise ConfigError(
-            f"{path}: outputs {describe(outputs)} do not fit the layout '{layout.name}' ({error})"
+            f"{path}: outputs {describe_outputs(outputs)} do not fit the layout '{layout.name}' ({error})"
         ) from None
     if input_px is not None:
-        layout = resized(layout, model, input_px)
+        layout = with_input_size(layout, model, input_px)
     score = layout.default_min_score if min_score is None else min_score
     return OnnxDetector(name or path.name, model, layout, classes, score, max_overlap, tiles, layout.default_min_score)
 
 
-def recognize(model: OnnxModel, chosen: Layout | None) -> tuple[Layout, Outputs]:
-    """The layout of a model, by its outputs for a gray picture, with these outputs.
+def recognize_layout(model: OnnxModel, chosen: Layout | None) -> tuple[Layout, Outputs]:
+    """Recognize the layout of a model by its outputs for a gray image; returns both.
 
     Notes
     -----
@@ -101,13 +118,11 @@ def recognize(model: OnnxModel, chosen: Layout | None) -> tuple[Layout, Outputs]
     outputs: Outputs = {}
     failure: ConfigError | None = None
     for layout in [chosen] if chosen is not None else LAYOUTS.values():
-        probe, placement = layout.preparation(np.full((PROBE_PX, PROBE_PX, 3), 114, np.uint8), model.spec)
+        probe, placement = layout.preprocessing(np.full((PROBE_PX, PROBE_PX, 3), 114, np.uint8), model.spec)
         if probe.shape not in tried:
             try:
                 tried[probe.shape] = model.run(probe)
-            except (
-                ConfigError
-            ) as error:  # many models that take any size want multiples of 32, and not every family has one
+            except ConfigError as error:  # many models of any size want multiples of 32, which not every layout gives
                 failure = failure or error
                 tried[probe.shape] = {}
         if not tried[probe.shape]:
@@ -118,24 +133,24 @@ def recognize(model: OnnxModel, chosen: Layout | None) -> tuple[Layout, Outputs]
     if failure is not None and not outputs:
         raise failure
     raise ConfigError(
-        f"{model.path}: outputs {describe(outputs)} are of no layout that is recognized by itself; "
+        f"{model.path}: outputs {describe_outputs(outputs)} are of no layout that is recognized by itself; "
         f"name one with layout=: {', '.join(LAYOUTS)}"
     )
 
 
-def resized(layout: Layout, model: OnnxModel, input_px: int) -> Layout:
-    """The layout with another side of the input, after a run on a gray picture of that size."""
+def with_input_size(layout: Layout, model: OnnxModel, input_px: int) -> Layout:
+    """Return the layout with another side of the input, which the model is tried on."""
     if model.spec.width_px is not None or model.spec.height_px is not None:
         raise ConfigError(
             f"{model.path}: input_px {input_px}: the model takes {model.spec.width_px} x {model.spec.height_px} px and "
             "nothing else; leave input_px out"
         )
-    changed: Any = replace(cast(Any, layout), preparation=replace(layout.preparation, default_px=input_px))
-    model.run(changed.preparation(np.full((PROBE_PX, PROBE_PX, 3), 114, np.uint8), model.spec)[0])
+    changed: Any = replace(cast(Any, layout), preprocessing=replace(layout.preprocessing, default_px=input_px))
+    model.run(changed.preprocessing(np.full((PROBE_PX, PROBE_PX, 3), 114, np.uint8), model.spec)[0])
     return cast(Layout, changed)
 
 
 def probe_size(model: OnnxModel, layout: Layout) -> tuple[int, int]:
-    """Size (width, height) in px of the input that the probe was given."""
-    side = layout.preparation.default_px or PROBE_PX
+    """Return the size (width, height) in px of the input that the gray image was resized to."""
+    side = layout.preprocessing.default_px or PROBE_PX
     return model.spec.width_px or side, model.spec.height_px or side

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.errors import ConfigError
-from log2sim.perception.detect.preparation import InputSpec
+from log2sim.perception.detect.preprocessing import InputSpec
 
-SIZE_LIMIT_BYTES = 2 * 1024**3
-LARGEST_SIDE_PX = 8192
+MAX_FILE_BYTES = 2 * 1024**3
+MAX_INPUT_SIDE_PX = 8192
 DTYPES: Mapping[str, type] = {
     "tensor(float)": np.float32,
     "tensor(float16)": np.float16,
@@ -26,7 +26,16 @@ DTYPES: Mapping[str, type] = {
 
 @dataclass(frozen=True, eq=False)
 class OnnxModel:
-    """A loaded model; `run` may be called from several threads."""
+    """Loaded model; `run` may be called from several threads.
+
+    Attributes
+    ----------
+    path : Path
+    spec : InputSpec
+    metadata : mapping of str to str
+        Custom metadata of the file, such as class names.
+    session : onnxruntime.InferenceSession
+    """
 
     path: Path
     spec: InputSpec
@@ -34,12 +43,12 @@ class OnnxModel:
     session: Any
 
     def run(self, tensor: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """All outputs by name for one input."""
+        """Run the model on one input; returns all outputs by name."""
         names = [output.name for output in self.session.get_outputs()]
         try:
             return dict(zip(names, self.session.run(names, {self.spec.name: tensor}), strict=True))
         except Exception as error:  # ONNX Runtime has many exceptions and no base of its own
-            raise ConfigError(f"{self.path}: the model fails on a picture {tensor.shape}: {one_line(error)}") from None
+            raise ConfigError(f"{self.path}: the model fails on an image {tensor.shape}: {first_line(error)}") from None
 
 
 def load_model(path: Path, *, threads: int | None = None) -> OnnxModel:
@@ -53,7 +62,7 @@ def load_model(path: Path, *, threads: int | None = None) -> OnnxModel:
     Raises
     ------
     ConfigError
-        A missing, oversized or broken file, or a model whose inputs are not one picture.
+        A missing, oversized or broken file, or a model whose inputs are not one image.
     """
     import onnxruntime
 
@@ -67,36 +76,36 @@ def load_model(path: Path, *, threads: int | None = None) -> OnnxModel:
     try:
         session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # as above
-        raise ConfigError(f"{path}: not a model that ONNX Runtime can load: {one_line(error)}") from None
+        raise ConfigError(f"{path}: not a model that ONNX Runtime can load: {first_line(error)}") from None
     metadata = dict(session.get_modelmeta().custom_metadata_map)
     return OnnxModel(path, input_spec(session.get_inputs(), path), metadata, session)
 
 
 def check_file(path: Path) -> None:
-    """Refuse what cannot be a model before anything of it is read."""
+    """Raise `ConfigError` for a file that cannot be a model, before it is read."""
     if not path.is_file():
         raise ConfigError(f"{path}: no such file; give the path of an ONNX model")
     size = path.stat().st_size
-    if size == 0 or size > SIZE_LIMIT_BYTES:
-        raise ConfigError(f"{path}: {size} bytes; expected an ONNX model of 1 to {SIZE_LIMIT_BYTES} bytes")
+    if size == 0 or size > MAX_FILE_BYTES:
+        raise ConfigError(f"{path}: {size} bytes; expected an ONNX model of 1 to {MAX_FILE_BYTES} bytes")
 
 
 def input_spec(inputs: list[Any], path: Path) -> InputSpec:
-    """Describe the model's one picture input."""
+    """Describe the model's single image input."""
     listed = ", ".join(f"'{i.name}' {i.type} {i.shape}" for i in inputs)
     if len(inputs) != 1 or len(inputs[0].shape) != 4 or inputs[0].type not in DTYPES:
-        raise ConfigError(f"{path}: inputs {listed}; expected one picture (1, 3, H, W) or (1, H, W, 3), float or uint8")
+        raise ConfigError(f"{path}: inputs {listed}; expected one image (1, 3, H, W) or (1, H, W, 3), float or uint8")
     batch, *rest = (d if isinstance(d, int) and d > 0 else None for d in inputs[0].shape)
     channels_last = rest[2] == 3 and rest[0] != 3
     height, width = rest[:2] if channels_last else rest[1:]
     if batch not in (None, 1) or (not channels_last and rest[0] != 3):
-        raise ConfigError(f"{path}: input {listed}; expected one picture of 3 channels at a time")
-    if max(height or 1, width or 1) > LARGEST_SIDE_PX:
-        raise ConfigError(f"{path}: input {listed}; expected sides of at most {LARGEST_SIDE_PX} px")
+        raise ConfigError(f"{path}: input {listed}; expected one image of 3 channels at a time")
+    if max(height or 1, width or 1) > MAX_INPUT_SIDE_PX:
+        raise ConfigError(f"{path}: input {listed}; expected sides of at most {MAX_INPUT_SIDE_PX} px")
     return InputSpec(inputs[0].name, height, width, channels_last, np.dtype(DTYPES[inputs[0].type]))
 
 
-def one_line(error: Exception) -> str:
-    """The first line of a message, shortened."""
+def first_line(error: Exception) -> str:
+    """Return the first line of a message, shortened."""
     lines = str(error).strip().splitlines()
     return lines[0][:300] if lines else type(error).__name__

@@ -1,4 +1,4 @@
-"""From the frozen graph of SSD-MobileNetV2 (COCO, 2018) to ONNX, with boxes decoded and suppression left out.
+"""Conversion of the frozen graph of SSD-MobileNetV2 (COCO, 2018) to ONNX, with boxes decoded, without suppression.
 
 Nodes between the preprocessed picture and the two concatenated outputs are translated one by one, constants folded.
 """
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 OPSET = 13
 IR_VERSION = 8
 INPUT_PX = 300
-CLASSES = 91  # with the background, which is column 0
+# With the background, which is column 0.
+CLASSES = 91
 SCALED, SHIFTED = "Preprocessor/mul/x", "Preprocessor/sub/y"
 PICTURE = "Preprocessor/sub"
 ENCODED_BOXES, CLASS_LOGITS = "concat", "concat_1"
@@ -30,7 +31,7 @@ CENTER_VARIANCE, SIZE_VARIANCE = 0.1, 0.2
 
 
 class Converter:
-    """Collects the ONNX nodes and constants while it walks the graph from its outputs to the picture."""
+    """Translation of the graph from its outputs back to the image, collecting ONNX nodes and constants."""
 
     def __init__(self, nodes: dict[str, Node]) -> None:
         from onnx import helper, numpy_helper
@@ -53,13 +54,13 @@ class Converter:
         return name
 
     def constant(self, name: str) -> NDArray[Any] | None:
-        """Value of a node that depends on constants only, else None."""
+        """Return the value of a node that depends on constants only, else None."""
         if name not in self._constants:
             self._constants[name] = self._fold(self._nodes[name])
         return self._constants[name]
 
     def required(self, name: str) -> NDArray[Any]:
-        """Value of a node that has to be constant."""
+        """Return the value of a node that has to be constant, or raise `ValueError`."""
         value = self.constant(name)
         if value is None:
             raise ValueError(f"node '{name}' is not constant")
@@ -82,7 +83,7 @@ class Converter:
         return np.asarray(operation(*known), dtype=np.float32)
 
     def translate(self, name: str) -> str:
-        """ONNX value that stands for a node; pictures are NCHW here and NHWC in the graph."""
+        """Translate a node and return the name of its ONNX value; images are NCHW there and NHWC in the graph."""
         if name not in self._translated:
             self._translated[name] = self._translate(self._nodes[name])
         return self._translated[name]
@@ -166,7 +167,7 @@ def convert(graph: bytes) -> onnx.ModelProto:
 
 
 def normalize_picture(converter: Converter) -> None:
-    """From uint8 NHWC to the graph's own range, NCHW."""
+    """Append the conversion of the image from uint8 NHWC to the value range of the graph, NCHW."""
     from onnx import TensorProto
 
     converter.store("zero", np.float32(0))
@@ -198,7 +199,7 @@ def decode_boxes(converter: Converter, encoded: str, anchors: NDArray[np.float32
 
 
 def anchor_boxes() -> NDArray[np.float32]:
-    """Anchors (1917, 4) center v, u, height, width in 0-1: by layer, cell row by row, then shape.
+    """Build the anchors (1917, 4) center v, u, height, width in 0-1: by layer, cell row by row, then shape.
 
     Notes
     -----

