@@ -306,7 +306,7 @@ MANIFEST_FAULTS = {
     "distortion": (lambda m: first_sensor(m)["intrinsics"].update(distortion=[1.0]), ["sensors[0]", "distortion has 1 values"]),
     "path": (lambda m: first_sensor(m).update(index="../elsewhere.csv"), ["sensors[0].index", "leaves the log folder"]),
     "absolute path": (lambda m: m["ego"].update(poses="/etc/passwd"), ["ego.poses", "leaves the log folder"]),
-    "name twice": (lambda m: m["sensors"][1].update(name="front"), ["sensors[1] 'front'", "stands twice"]),
+    "name twice": (lambda m: m["sensors"][1].update(name="front"), ["sensors[1] 'front'", "occurs twice"]),
     "no ego": (lambda m: m.pop("ego"), ["sensors[0] 'front'", "mounted on the ego"]),
     "two egos": (lambda m: m["ego"].update(gnss="ego/gnss.csv"), ["log.json", "ego"]),
     "reference": (lambda m: m.update(reference_camera="rear"), ["reference_camera", "no camera 'rear'", "front, pole"]),

@@ -15,7 +15,7 @@ import pytest
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import apply, inverse, points_in_box, project, rotation_from_rpy, wrap_angle
 from log2sim.logs.opening import open_log
-from log2sim.logs.pandaset import tie_to_earth
+from log2sim.logs.pandaset import georeference
 from log2sim.logs.pandaset_labels import azimuth_offset_ns, read_labels
 from log2sim.logs.unpickle import read_pickled_table
 
@@ -155,13 +155,13 @@ def test_the_map_is_tied_to_earth_only_where_gnss_shows_its_north() -> None:
     from pyproj import Proj
 
     geodetic, xyz = track(0.0, 80.0)
-    frame, reason = tie_to_earth(geodetic, xyz)
+    frame, reason = georeference(geodetic, xyz)
     assert reason == ""
     x, y = Proj(frame.projection)(geodetic[:, 1], geodetic[:, 0])
     np.testing.assert_allclose(np.stack([x, y], 1), xyz[:, :2], atol=0.01)
     assert frame.altitude_m == pytest.approx(4.0, abs=1e-3)
     for turn, length, words in ((0.1, 80.0, "differ by"), (0.0, 5.0, "moves less than")):
-        frame, reason = tie_to_earth(*track(turn, length))
+        frame, reason = georeference(*track(turn, length))
         assert words in reason
         assert frame.projection is None
 

@@ -8,12 +8,50 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Generic, Literal, Self, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array, Camera, Mount, PoseTrack
+
+T = TypeVar("T")
+
+
+class Deferred(Generic[T]):
+    """A dataclass field that also takes a function of no arguments; it is called when the field is first read.
+
+    For parts of a log that have to be read from large files: opening a log does not wait for what is not used. Without
+    arguments the field has no default.
+    """
+
+    def __init__(self, *default: T) -> None:
+        self._default = default
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        """Remember the name of the field."""
+        self._name = name
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> Self: ...
+
+    @overload
+    def __get__(self, instance: object, owner: type) -> T: ...
+
+    def __get__(self, instance: object | None, owner: type) -> Any:
+        """Return the value; of the class, the default."""
+        if instance is None:
+            if not self._default:
+                raise AttributeError(self._name)
+            return self._default[0]
+        value = instance.__dict__[self._name]
+        if callable(value):
+            value = instance.__dict__[self._name] = value()
+        return value
+
+    def __set__(self, instance: object, value: T | Callable[[], T]) -> None:
+        """Store the value or the function that makes it."""
+        instance.__dict__[self._name] = value
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,15 +102,15 @@ class Stream:
     name : str
         Of the sensor.
     t_ns : (F,) int64
-        Absolute stamps.
+        Absolute stamps, increasing; may be given as a function that reads them.
     read : callable
         Returns record `i`: (H, W, 3) uint8 BGR of a camera, a `Sweep` of a LiDAR. Raises `RecordError` for a record that
         cannot be read. Several threads may call it at once.
     """
 
     name: str
-    t_ns: NDArray[np.int64]
-    read: Callable[[int], Any]
+    t_ns: Deferred[NDArray[np.int64]] = Deferred()
+    read: Callable[[int], Any]  # type: ignore[misc]  # `t_ns` is a descriptor, it has no default
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,6 +232,7 @@ class Log:
     ego_vehicle : EgoVehicle
     map : MapFrame
     labels : Labels or None
+        May be given as a function that reads them.
     image_labels : mapping of str to ImageLabels
         By camera.
     ignored_regions : mapping of str to ImageRegions
@@ -205,7 +244,7 @@ class Log:
     digest : str
         SHA-256 over the log's index.
     notes : tuple of str
-        Remarks of the reader for the report.
+        Remarks of the reader for the report; may be given as a function.
     """
 
     name: str
@@ -216,13 +255,13 @@ class Log:
     ego: PoseTrack | None = None
     ego_vehicle: EgoVehicle = field(default_factory=EgoVehicle)
     map: MapFrame = field(default_factory=MapFrame)
-    labels: Labels | None = None
+    labels: Deferred[Labels | None] = Deferred(None)
     image_labels: Mapping[str, ImageLabels] = field(default_factory=dict)
     ignored_regions: Mapping[str, ImageRegions] = field(default_factory=dict)
     ground_z_ego_m: float = 0.0
     reference_camera: str | None = None
     digest: str = ""
-    notes: tuple[str, ...] = ()
+    notes: Deferred[tuple[str, ...]] = Deferred(())
 
     def map_T_sensor(self, name: str, t_ns: Any) -> tuple[Array, NDArray[np.bool_]]:
         """Interpolate the pose of a sensor.

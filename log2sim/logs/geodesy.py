@@ -1,4 +1,4 @@
-"""Between latitude and longitude and the local map, through PROJ."""
+"""Conversion between geodetic coordinates and the local map, by PROJ."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def poses_from_geodetic(
     *,
     where: str,
 ) -> Array:
-    """Poses (N, 4, 4) in projected coordinates of `map_frame`, before its offset is taken off.
+    """Poses (N, 4, 4) in projected coordinates of `map_frame`, before its offset is subtracted.
 
     Yaw is counter-clockwise from true east and is turned to the grid's east by the meridian convergence.
 

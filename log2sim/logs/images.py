@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes import Stream
 from log2sim.errors import LogError, RecordError
 
-IMAGE_LIMIT_PX = 100_000_000
-IMAGE_LIMIT_BYTES = 256 * 1024 * 1024
+MAX_IMAGE_PX = 100_000_000
+MAX_IMAGE_BYTES = 256 * 1024 * 1024
 
 
 def read_image(path: Path, t_ns: int, width_px: int, height_px: int) -> NDArray[np.uint8]:
@@ -23,21 +24,41 @@ def read_image(path: Path, t_ns: int, width_px: int, height_px: int) -> NDArray[
         When it is missing, truncated, no JPEG or PNG, or not of the size that the calibration is for; names file and stamp.
     """
     where = f"{path} (stamp {t_ns})"
-    data = read_bytes(path, t_ns, IMAGE_LIMIT_BYTES)
+    data = read_bytes(path, t_ns, MAX_IMAGE_BYTES)
     jpeg = data[:2] == b"\xff\xd8"
     width, height = _jpeg_size(data, where) if jpeg else _png_size(data, where)
-    if width * height > IMAGE_LIMIT_PX:
-        raise RecordError(f"{where}: {width}x{height} px, more than the {IMAGE_LIMIT_PX} px that an image may have")
+    if width * height > MAX_IMAGE_PX:
+        raise RecordError(f"{where}: {width}x{height} px, more than the {MAX_IMAGE_PX} px that an image may have")
     if (width, height) != (width_px, height_px):
         raise RecordError(f"{where}: {width}x{height} px, the calibration is for {width_px}x{height_px}")
     return _decode_jpeg(data, where) if jpeg else _decode_png(data, where)
 
 
+def image_stream(name: str, t_ns: NDArray[np.int64], files: list[Path], size_px: tuple[int, int]) -> Stream:
+    """Stream of image files.
+
+    Parameters
+    ----------
+    name : str
+        Of the camera.
+    t_ns : (F,) int64
+    files : list of Path
+        F image files.
+    size_px : (int, int)
+        Width and height that the calibration is for.
+    """
+
+    def read(i: int) -> NDArray[np.uint8]:
+        return read_image(files[i], int(t_ns[i]), *size_px)
+
+    return Stream(name, t_ns, read)
+
+
 def first_image_size(files: list[Path]) -> tuple[int, int]:
-    """Width and height in px of the first of the image files that can be read, from its header."""
+    """Width and height in px of the first readable image file, from its header."""
     for file in files:
         try:
-            data = read_bytes(file, 0, IMAGE_LIMIT_BYTES)
+            data = read_bytes(file, 0, MAX_IMAGE_BYTES)
             return _jpeg_size(data, str(file)) if data[:2] == b"\xff\xd8" else _png_size(data, str(file))
         except RecordError:
             continue
@@ -45,7 +66,7 @@ def first_image_size(files: list[Path]) -> tuple[int, int]:
 
 
 def read_bytes(path: Path, t_ns: int, limit_bytes: int) -> bytes:
-    """The bytes of one record's file, refused when it is missing or larger than `limit_bytes`."""
+    """Read the file of one record; `RecordError` when it is missing or larger than `limit_bytes`."""
     try:
         size = path.stat().st_size
         if size > limit_bytes:
@@ -69,7 +90,8 @@ def _decode_jpeg(data: bytes, where: str) -> NDArray[np.uint8]:
     import simplejpeg
 
     try:
-        return simplejpeg.decode_jpeg(data, colorspace="BGR")
+        image: NDArray[np.uint8] = simplejpeg.decode_jpeg(data, colorspace="BGR")
+        return image
     except ValueError as error:
         raise RecordError(f"{where}: JPEG cannot be decoded: {error}") from None
 

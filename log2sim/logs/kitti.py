@@ -1,7 +1,7 @@
-"""What the KITTI raw drives and the KITTI tracking layout share: the car, its calibration chain, oxts and sweeps.
+"""Shared by the readers of KITTI raw drives and of the KITTI tracking layout: vehicle, calibration chain, oxts, sweeps.
 
 The chain is imu -> velo -> cam 0 -> rectified cam 0 -> camera i. All its links are rigid except the projections P_i, whose
-last column holds the place of camera i beside the rectified camera 0.
+last column holds the position of camera i relative to the rectified camera 0.
 """
 
 from __future__ import annotations
@@ -17,25 +17,33 @@ from numpy.typing import NDArray
 from log2sim.datatypes import EgoVehicle, Lidar, MapFrame, Stream, Sweep
 from log2sim.errors import LogError
 from log2sim.geometry import Array, Camera, inverse, rotation_from_rpy, transform
-from log2sim.logs.images import read_image
 from log2sim.logs.sweeps import read_sweep, sweep_of
 
 EARTH_RADIUS_M = 6378137.0
 ROTATION_TOLERANCE = 1e-3
-TEXT_LIMIT_BYTES = 64 * 1024 * 1024
+MAX_TEXT_BYTES = 64 * 1024 * 1024
 OXTS_FIELDS = 30
 
-# The IMU stands 0.93 m above the road (Geiger et al., Vision meets Robotics, IJRR 2013, fig. 1). That it is 0.30 m ahead of the
+# The IMU is 0.93 m above the road (Geiger et al., Vision meets Robotics, IJRR 2013, fig. 1). That it is 0.30 m ahead of the
 # rear axle was measured: lateral velocity over yaw rate of drive 2011_09_26_0005 gives 0.32 +- 0.03 m. The car's
 # center line is taken to pass under the scanner, 0.32 m to the right of the IMU.
 EGO_T_IMU = transform(np.eye(3), [0.30, 0.32, 0.93])
 # A Volkswagen Passat B6 estate, by its data sheet.
-PASSAT = EgoVehicle(size_m=(4.77, 1.82, 1.52), rear_axle_offset_m=1.25)
+EGO_VEHICLE = EgoVehicle(size_m=(4.77, 1.82, 1.52), rear_axle_offset_m=1.25)
 
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Calibration of one drive: `ego_T_velo`, `ego_T_rect` (4, 4) and P (3, 4) by number of camera."""
+    """Calibration of one drive.
+
+    Attributes
+    ----------
+    ego_T_velo : (4, 4) float64
+    ego_T_rect : (4, 4) float64
+        Pose of the rectified camera 0.
+    projections : mapping of int to (3, 4) float64
+        P by number of camera.
+    """
 
     ego_T_velo: Array
     ego_T_rect: Array
@@ -50,6 +58,7 @@ class Rig:
         )
 
     def lidar(self) -> Lidar:
+        """Return the Velodyne."""
         return Lidar("velodyne", "ego", self.ego_T_velo)
 
 
@@ -61,11 +70,11 @@ def rig_of(velo_T_imu: Array, cam_T_velo: Array, rect_R_cam: Array, projections:
 
 
 def read_text(path: Path) -> str:
-    """A small text file, or a `LogError` that names it."""
+    """Read a small text file; raise a `LogError` that names it where that fails."""
     if not path.is_file():
-        raise LogError(f"{path}: no such file; KITTI keeps it beside the drive's data")
-    if path.stat().st_size > TEXT_LIMIT_BYTES:
-        raise LogError(f"{path}: {path.stat().st_size} bytes, more than the {TEXT_LIMIT_BYTES} that it may have")
+        raise LogError(f"{path}: no such file; KITTI stores it with the drive's data")
+    if path.stat().st_size > MAX_TEXT_BYTES:
+        raise LogError(f"{path}: {path.stat().st_size} bytes, more than the {MAX_TEXT_BYTES} that it may have")
     return path.read_text(encoding="utf-8", errors="replace")
 
 
@@ -82,8 +91,8 @@ def read_calibration(path: Path) -> dict[str, Array]:
     return values
 
 
-def entry(calibration: Mapping[str, Array], path: Path, shape: tuple[int, ...], *keys: str) -> Array:
-    """The first of `keys` that a calibration has, as an array of `shape`."""
+def calibration_entry(calibration: Mapping[str, Array], path: Path, shape: tuple[int, ...], *keys: str) -> Array:
+    """Entry of a calibration under the first of `keys` that it has, as an array of `shape`; `LogError` without one."""
     key = next((k for k in keys if k in calibration), None)
     if key is None:
         raise LogError(f"{path}: no entry '{keys[0]}'; expected {int(np.prod(shape))} numbers after it")
@@ -94,7 +103,7 @@ def entry(calibration: Mapping[str, Array], path: Path, shape: tuple[int, ...], 
 
 
 def checked_rotation(rotation: Array, where: str) -> Array:
-    """The nearest rotation matrix (3, 3), or a `LogError` when it is not one within 1e-3."""
+    """Return the nearest rotation matrix (3, 3); `LogError` when the given one is off by more than 1e-3."""
     off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     determinant = float(np.linalg.det(rotation))
     if off > ROTATION_TOLERANCE or determinant < 0:
@@ -103,11 +112,11 @@ def checked_rotation(rotation: Array, where: str) -> Array:
             f"is allowed), determinant {determinant:.3g} (expected +1); check the calibration"
         )
     u, _, vt = np.linalg.svd(rotation)
-    return u @ vt
+    return np.asarray(u @ vt)
 
 
 def checked_projection(P: Array, where: str) -> Array:
-    """P (3, 4) of a rectified camera, or a `LogError`."""
+    """Return P (3, 4) of a rectified camera; `LogError` when it is none."""
     if not (P[0, 0] > 0 and P[1, 1] > 0 and P[2, 2] == 1 and P[1, 0] == 0 and not P[2, :2].any()):
         raise LogError(f"{where}: K is {P[:, :3].tolist()}, expected positive focal lengths and a last row 0 0 1")
     return P
@@ -158,24 +167,14 @@ def numbered_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
     """Files of a folder by the number that is their name, in the order of the numbers."""
     if not folder.is_dir():
         return {}
-    found = {int(p.stem): p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.stem.isdecimal()}
-    return dict(sorted(found.items()))
-
-
-def image_stream(name: str, t_ns: NDArray[np.int64], files: list[Path], camera: Camera) -> Stream:
-    """Frames of a camera."""
-    size = camera.width_px, camera.height_px
-
-    def read(i: int) -> NDArray[np.uint8]:
-        return read_image(files[i], int(t_ns[i]), *size)
-
-    return Stream(name, t_ns, read)
+    files = {int(p.stem): p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.stem.isdecimal()}
+    return dict(sorted(files.items()))
 
 
 def sweep_stream(
     t_ns: NDArray[np.int64], begin_ns: NDArray[np.int64], end_ns: NDArray[np.int64], files: list[Path]
 ) -> Stream:
-    """Sweeps of the Velodyne, each facing forward at `t_ns` and backward at `begin_ns` and `end_ns`, all (F,)."""
+    """Stream of Velodyne sweeps; the scanner faces forward at `t_ns` and backward at `begin_ns` and `end_ns`, all (F,)."""
 
     def read(i: int) -> Sweep:
         sweep = read_sweep(files[i], int(t_ns[i]))
@@ -194,7 +193,8 @@ def spin_offset_ns(xyz_m: NDArray[np.floating], begin_ns: int, end_ns: int) -> N
     (point to plane, RMS) with this, to 5.7 cm without stamps, to 6.0 cm with the other sense.
     """
     clockwise = -np.arctan2(xyz_m[:, 1], xyz_m[:, 0]) / np.pi
-    return np.round(np.where(clockwise < 0, -clockwise * begin_ns, clockwise * end_ns)).astype(np.int64)
+    offset_ns = np.where(clockwise < 0, -clockwise * begin_ns, clockwise * end_ns)
+    return np.asarray(np.round(offset_ns).astype(np.int64))
 
 
 def digest_of(texts: Iterable[str], files: Iterable[Path]) -> str:

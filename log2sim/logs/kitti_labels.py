@@ -1,4 +1,4 @@
-"""The labels of the KITTI tracking benchmark: boxes of what camera 2 sees, and the parts of its images without labels."""
+"""Labels of the KITTI tracking benchmark: boxes of objects in view of camera 2, and the ignored regions of its images."""
 
 from __future__ import annotations
 
@@ -32,7 +32,18 @@ CAMERA = "image_02"
 
 @dataclass(frozen=True, eq=False)
 class DriveLabels:
-    """What a label file says; nothing without one. `text` is the file."""
+    """Contents of a label file; empty without one.
+
+    Attributes
+    ----------
+    boxes_3d : Labels or None
+    boxes_2d : mapping of str to ImageLabels
+        By camera.
+    ignored : mapping of str to ImageRegions
+        By camera.
+    text : str
+        The file, for the log's digest.
+    """
 
     boxes_3d: Labels | None = None
     boxes_2d: Mapping[str, ImageLabels] = field(default_factory=dict)
@@ -41,17 +52,26 @@ class DriveLabels:
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
-    """Lines (L,) of a label file: `frame`, `track_id`, `type` and the 14 numbers `values` (L, 14) from truncation on."""
+class LabelRows:
+    """Lines of a label file.
+
+    Attributes
+    ----------
+    frame : (L,) int64
+    track_id : (L,) str
+    type : (L,) str
+    values : (L, 14) float64
+        The numbers from truncation on.
+    """
 
     frame: NDArray[np.int64]
     track_id: NDArray[np.str_]
     type: NDArray[np.str_]
     values: Array
 
-    def take(self, index: NDArray[np.bool_]) -> Rows:
-        """The rows of a mask."""
-        return Rows(self.frame[index], self.track_id[index], self.type[index], self.values[index])
+    def take(self, index: NDArray[np.bool_]) -> LabelRows:
+        """Select the rows of a mask."""
+        return LabelRows(self.frame[index], self.track_id[index], self.type[index], self.values[index])
 
 
 def read_labels(
@@ -61,14 +81,14 @@ def read_labels(
 
     Notes
     -----
-    Only what camera 2 sees has labels. There, parts of the image with objects too far, too hidden or too crowded to be
-    labeled are marked by boxes of the type DontCare.
+    Only objects in view of camera 2 have labels. Regions of its images with objects too far, too occluded or too crowded to
+    be labeled are marked by boxes of the type DontCare.
     """
     text = kitti.read_text(path)
     rows = parse_labels(text, path)
-    apart = rows.type == NOT_LABELED
-    empty = rows.take(apart)
-    rows = rows.take(~apart)
+    is_ignored = rows.type == NOT_LABELED
+    ignored = rows.take(is_ignored)
+    rows = rows.take(~is_ignored)
     t_ns = stamp_of(rows.frame)
     category = np.array([CATEGORY_OF[name] for name in rows.type.tolist()], dtype="<U16")
     map_T_ego, known = track.at(t_ns)
@@ -77,13 +97,13 @@ def read_labels(
     return DriveLabels(
         Labels(t_ns[k], rows.track_id[k], category[k], center[k], size[k], yaw[k], cameras=(CAMERA,)),
         {CAMERA: ImageLabels(t_ns, rows.values[:, 3:7], category)},
-        {CAMERA: ImageRegions(stamp_of(empty.frame), empty.values[:, 3:7])},
+        {CAMERA: ImageRegions(stamp_of(ignored.frame), ignored.values[:, 3:7])},
         text,
     )
 
 
-def parse_labels(text: str, path: Path) -> Rows:
-    """The lines of a label file, or a `LogError` that names the one that is wrong."""
+def parse_labels(text: str, path: Path) -> LabelRows:
+    """Parse the lines of a label file; a `LogError` names the one that is wrong."""
     frames, ids, types, values = [], [], [], []
     for k, line in enumerate(text.splitlines(), start=1):
         words = line.split()
@@ -103,7 +123,9 @@ def parse_labels(text: str, path: Path) -> Rows:
         types.append(words[2])
         values.append(row)
     table = np.array(values, dtype=np.float64).reshape(-1, LABEL_FIELDS - 3)
-    return Rows(np.array(frames, dtype=np.int64), np.array(ids, dtype="<U16"), np.array(types, dtype="<U16"), table)
+    return LabelRows(
+        np.array(frames, dtype=np.int64), np.array(ids, dtype="<U16"), np.array(types, dtype="<U16"), table
+    )
 
 
 def boxes_in_map(map_T_rect: Array, values: Array) -> tuple[Array, Array, Array]:
@@ -114,7 +136,7 @@ def boxes_in_map(map_T_rect: Array, values: Array) -> tuple[Array, Array, Array]
     map_T_rect : (L, 4, 4)
         Pose of the rectified camera 0, whose frame the labels are in, at the stamp of each label.
     values : (L, 7)
-        Height, width, length, then x, y, z of the bottom's center, then the rotation about the camera's y axis.
+        Height, width, length, x, y, z of the bottom's center, rotation about the camera's y axis.
     """
     height, width, length = values[:, 0], values[:, 1], values[:, 2]
     center = values[:, 3:6] - np.stack([np.zeros_like(height), height / 2, np.zeros_like(height)], axis=1)

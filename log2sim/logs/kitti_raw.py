@@ -12,17 +12,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Log, Stream
+from log2sim.datatypes import Log, MapFrame, Stream
 from log2sim.errors import LogError
 from log2sim.geometry import Array, Camera, PoseTrack, transform
 from log2sim.logs import kitti
+from log2sim.logs.images import image_stream
 from log2sim.logs.kitti_labels import CAMERA as LABELED_CAMERA
 from log2sim.logs.kitti_labels import DriveLabels, read_labels
-from log2sim.logs.table import in_order
+from log2sim.logs.stamps import strictly_increasing
 
 CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt")
 REFERENCE_CAMERAS = ("image_02", "image_00", "image_03", "image_01")
-MARK = "*_drive_*_sync"
+PATTERN = "*_drive_*_sync"
 LABELS = "label_02.txt"
 _NOT_A_TIME = np.iinfo(np.int64).min
 
@@ -36,19 +37,22 @@ class KittiRawReader:
     )
 
     def matches(self, path: Path) -> bool:
+        """Return whether the folder holds a sequence of this layout."""
         return bool(self._drives(path))
 
     def sequences(self, path: Path) -> list[str]:
+        """Return the names of the sequences, sorted."""
         return sorted(self._drives(path))
 
     def open(self, path: Path, sequence: str) -> Log:
+        """Open a sequence."""
         return _Drive(self._drives(path)[sequence]).log()
 
     def _drives(self, path: Path) -> dict[str, Path]:
         # A drive given as "." has its name only once it is resolved.
         path = path.resolve()
-        places = [path, *path.glob(MARK), *path.glob(f"*/{MARK}")]
-        return {p.name: p for p in places if (p / "oxts" / "data").is_dir() and p.match(MARK)}
+        places = [path, *path.glob(PATTERN), *path.glob(f"*/{PATTERN}")]
+        return {p.name: p for p in places if (p / "oxts" / "data").is_dir() and p.match(PATTERN)}
 
 
 READER = KittiRawReader()
@@ -80,7 +84,7 @@ class _Drive:
             lidars={"velodyne": rig.lidar()} if "velodyne" in streams else {},
             streams=streams,
             ego=track,
-            ego_vehicle=kitti.PASSAT,
+            ego_vehicle=kitti.EGO_VEHICLE,
             map=map_frame,
             labels=labels.boxes_3d,
             image_labels=labels.boxes_2d,
@@ -93,23 +97,25 @@ class _Drive:
     def _rig(self) -> kitti.Rig:
         cam, velo, imu = (self.path.parent / name for name in CALIBRATION)
         c = kitti.read_calibration(cam)
-        rect = kitti.checked_rotation(kitti.entry(c, cam, (3, 3), "R_rect_00"), f"{cam}, entry 'R_rect_00'")
+        rect = kitti.checked_rotation(kitti.calibration_entry(c, cam, (3, 3), "R_rect_00"), f"{cam}, entry 'R_rect_00'")
         projections = {}
         for k in range(4):
             if (self.path / f"image_{k:02d}").is_dir():
                 key = f"P_rect_{k:02d}"
-                projections[k] = kitti.checked_projection(kitti.entry(c, cam, (3, 4), key), f"{cam}, entry '{key}'")
+                projections[k] = kitti.checked_projection(
+                    kitti.calibration_entry(c, cam, (3, 4), key), f"{cam}, entry '{key}'"
+                )
         return kitti.rig_of(_rigid(imu), _rigid(velo), rect, projections)
 
     def _add_camera(
         self, rig: kitti.Rig, number: int, cameras: dict[str, Camera], streams: dict[str, Stream], notes: list[str]
     ) -> None:
         file = self.path.parent / CALIBRATION[0]
-        width, height = kitti.entry(kitti.read_calibration(file), file, (2,), f"S_rect_{number:02d}")
+        width, height = kitti.calibration_entry(kitti.read_calibration(file), file, (2,), f"S_rect_{number:02d}")
         camera = rig.camera(number, round(width), round(height))
         t_ns, files, _ = self._records(camera.name, (".png", ".jpg", ".jpeg"), notes)
         cameras[camera.name] = camera
-        streams[camera.name] = kitti.image_stream(camera.name, t_ns, files, camera)
+        streams[camera.name] = image_stream(camera.name, t_ns, files, (camera.width_px, camera.height_px))
 
     def _sweeps(self, notes: list[str]) -> Stream:
         folder = self.path / "velodyne_points"
@@ -120,7 +126,7 @@ class _Drive:
                 raise LogError(f"{folder}/timestamps_{name}.txt: {len(stamps)} lines, record {numbers.max()} has none")
         return kitti.sweep_stream(t_ns, begin[numbers], end[numbers], files)
 
-    def _poses(self, notes: list[str]) -> tuple[NDArray[np.int64], Array, kitti.MapFrame]:
+    def _poses(self, notes: list[str]) -> tuple[NDArray[np.int64], Array, MapFrame]:
         t_ns, files, _ = self._records("oxts", (".txt",), notes)
         rows = []
         for file in files:
@@ -163,7 +169,7 @@ class _Drive:
         if missing:
             first = np.setdiff1d(np.arange(len(stamps)), numbers)[0]
             notes.append(f"{name}: {missing} of {len(stamps)} records are missing, first at stamp {stamps[first]}")
-        keep, problems = in_order(stamps[numbers], name)
+        keep, problems = strictly_increasing(stamps[numbers], name)
         notes += problems
         numbers = numbers[keep]
         return stamps[numbers], [files[n] for n in numbers.tolist()], numbers
@@ -171,8 +177,8 @@ class _Drive:
 
 def _rigid(path: Path) -> Array:
     calibration = kitti.read_calibration(path)
-    rotation = kitti.checked_rotation(kitti.entry(calibration, path, (3, 3), "R"), f"{path}, entry 'R'")
-    return transform(rotation, kitti.entry(calibration, path, (3,), "T"))
+    rotation = kitti.checked_rotation(kitti.calibration_entry(calibration, path, (3, 3), "R"), f"{path}, entry 'R'")
+    return transform(rotation, kitti.calibration_entry(calibration, path, (3,), "T"))
 
 
 def _stamps(path: Path) -> NDArray[np.int64]:

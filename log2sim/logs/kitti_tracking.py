@@ -12,7 +12,7 @@ from log2sim.datatypes import Log, Stream
 from log2sim.errors import LogError
 from log2sim.geometry import PoseTrack, transform
 from log2sim.logs import kitti
-from log2sim.logs.images import first_image_size
+from log2sim.logs.images import first_image_size, image_stream
 from log2sim.logs.kitti_labels import DriveLabels, read_labels
 
 PERIOD_NS = 100_000_000
@@ -27,13 +27,16 @@ class KittiTrackingReader:
     looks_for = "a folder training/ (or that folder) with calib/NNNN.txt and image_02/NNNN/"
 
     def matches(self, path: Path) -> bool:
+        """Return whether the folder holds a sequence of this layout."""
         return bool(self.sequences(path))
 
     def sequences(self, path: Path) -> list[str]:
+        """Return the names of the sequences, sorted."""
         base = _base(path)
         return sorted(p.stem for p in (base / "calib").glob("*.txt") if (base / "image_02" / p.stem).is_dir())
 
     def open(self, path: Path, sequence: str) -> Log:
+        """Open a sequence."""
         return _Sequence(_base(path), sequence).log()
 
 
@@ -55,12 +58,13 @@ class _Sequence:
         cameras = {}
         for number in rig.projections:
             files = self._files(f"image_{number:02d}", (".png", ".jpg", ".jpeg"))
-            camera = rig.camera(number, *first_image_size(list(files.values())))
+            size_px = first_image_size(list(files.values()))
+            camera = rig.camera(number, *size_px)
             cameras[camera.name] = camera
-            streams[camera.name] = kitti.image_stream(camera.name, _nominal(files), list(files.values()), camera)
+            streams[camera.name] = image_stream(camera.name, _nominal_stamps(files), list(files.values()), size_px)
         if (self.base / "velodyne" / self.name).is_dir():
             sweeps = self._files("velodyne", (".bin",))
-            t_ns = _nominal(sweeps)
+            t_ns = _nominal_stamps(sweeps)
             streams["velodyne"] = kitti.sweep_stream(
                 t_ns, t_ns - PERIOD_NS // 2, t_ns + PERIOD_NS // 2, list(sweeps.values())
             )
@@ -81,7 +85,7 @@ class _Sequence:
             lidars={"velodyne": rig.lidar()} if "velodyne" in streams else {},
             streams=streams,
             ego=track,
-            ego_vehicle=kitti.PASSAT,
+            ego_vehicle=kitti.EGO_VEHICLE,
             map=map_frame,
             labels=labels.boxes_3d,
             image_labels=labels.boxes_2d,
@@ -98,12 +102,14 @@ class _Sequence:
         for k in CAMERA_NUMBERS:
             if (self.base / f"image_{k:02d}" / self.name).is_dir():
                 projections[k] = kitti.checked_projection(
-                    kitti.entry(c, path, (3, 4), f"P{k}"), f"{path}, entry 'P{k}'"
+                    kitti.calibration_entry(c, path, (3, 4), f"P{k}"), f"{path}, entry 'P{k}'"
                 )
-        rect = kitti.checked_rotation(kitti.entry(c, path, (3, 3), "R0_rect", "R_rect"), f"{path}, entry 'R0_rect'")
+        rect = kitti.checked_rotation(
+            kitti.calibration_entry(c, path, (3, 3), "R0_rect", "R_rect"), f"{path}, entry 'R0_rect'"
+        )
         links = []
         for keys in (("Tr_imu_to_velo", "Tr_imu_velo"), ("Tr_velo_to_cam", "Tr_velo_cam")):
-            m = kitti.entry(c, path, (3, 4), *keys)
+            m = kitti.calibration_entry(c, path, (3, 4), *keys)
             links.append(transform(kitti.checked_rotation(m[:, :3], f"{path}, entry '{keys[0]}'"), m[:, 3]))
         return kitti.rig_of(links[0], links[1], rect, projections)
 
@@ -120,5 +126,5 @@ class _Sequence:
         return read_labels(path, rig, track, lambda frame: frame * PERIOD_NS) if path.is_file() else DriveLabels()
 
 
-def _nominal(files: dict[int, Path]) -> NDArray[np.int64]:
+def _nominal_stamps(files: dict[int, Path]) -> NDArray[np.int64]:
     return np.array(list(files), dtype=np.int64) * PERIOD_NS

@@ -1,4 +1,4 @@
-"""The native log folder: `log.json` (schemas/log-1.json) with CSV indexes, images and sweeps beside it."""
+"""Reader of native log folders: `log.json` (schemas/log-1.json), CSV tables, images and sweeps."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, 
 from log2sim.documents import check, inside, read_json
 from log2sim.errors import LogError
 from log2sim.geometry import Array, Camera, PoseTrack, rotation_from_quaternion, transform
-from log2sim.logs.images import read_image
+from log2sim.logs.csv_tables import CsvTable, read_csv_table
+from log2sim.logs.images import image_stream
 from log2sim.logs.native_labels import BOX_2D_COLUMNS, BOX_3D_COLUMNS, REGION_COLUMNS, boxes_2d, boxes_3d, regions_2d
+from log2sim.logs.stamps import strictly_increasing
 from log2sim.logs.sweeps import read_sweep
-from log2sim.logs.table import Table, in_order, read_table
 
 MANIFEST = "log.json"
 
@@ -40,14 +41,17 @@ class NativeReader:
     looks_for = f"a folder with {MANIFEST}"
 
     def matches(self, path: Path) -> bool:
+        """Return whether the folder holds a sequence of this layout."""
         return bool(self.sequences(path))
 
     def sequences(self, path: Path) -> list[str]:
+        """Return the names of the sequences, sorted."""
         if (path / MANIFEST).is_file():
             return [path.resolve().name]
         return sorted(p.parent.name for p in path.glob(f"*/{MANIFEST}"))
 
     def open(self, path: Path, sequence: str) -> Log:
+        """Open a sequence."""
         root = path if (path / MANIFEST).is_file() else path / sequence
         return _Folder(root).log()
 
@@ -56,7 +60,7 @@ READER = NativeReader()
 
 
 class _Folder:
-    """One log folder while it is being opened; collects notes and the digest."""
+    """A log folder while it is opened; collects notes and the digest."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -104,9 +108,9 @@ class _Folder:
 
     def table(
         self, relative: str, field: str, columns: Mapping[str, str], optional: Mapping[str, str] | None = None
-    ) -> Table:
+    ) -> CsvTable:
         """Read a table that the manifest names under `field`."""
-        table = read_table(inside(self.root, relative, f"{self.file}, field '{field}'"), columns, optional)
+        table = read_csv_table(inside(self.root, relative, f"{self.file}, field '{field}'"), columns, optional)
         self.hash.update(table.sha256.encode())
         return table
 
@@ -131,11 +135,11 @@ class _Folder:
             poses = poses_from_geodetic(
                 map_frame, *(table[f] for f in GNSS_FIELDS), where=f"{self.file}, field 'map.projection'"
             )
-        keep, notes = in_order(table["t_ns"], "ego")
+        keep, notes = strictly_increasing(table["t_ns"], "ego")
         self.notes += notes
         return map_frame, PoseTrack(table["t_ns"][keep], poses[keep])
 
-    def _rotations(self, table: Table) -> Array:
+    def _rotations(self, table: CsvTable) -> Array:
         q = table.stack("qw", "qx", "qy", "qz")
         norm = np.linalg.norm(q, axis=1)
         bad = np.flatnonzero(np.abs(norm - 1) > QUATERNION_TOLERANCE)
@@ -143,7 +147,7 @@ class _Folder:
             raise LogError(f"{table.where(bad[0], 'qw,qx,qy,qz')}: norm {norm[bad[0]]:.6g}, expected a unit quaternion")
         return rotation_from_quaternion(q)
 
-    def _not_empty(self, table: Table) -> None:
+    def _not_empty(self, table: CsvTable) -> None:
         if not len(table):
             raise LogError(f"{table.path}: no records below the header; a stream needs at least one")
 
@@ -166,14 +170,14 @@ class _Folder:
         )
 
     def _check_sensors(self, sensors: list[Camera | Lidar], track: PoseTrack | None) -> None:
-        seen: set[str] = set()
+        names: set[str] = set()
         for k, sensor in enumerate(sensors):
             where = f"{self.file}, sensors[{k}] '{sensor.name}'"
-            if sensor.name in seen:
-                raise LogError(f"{where}: the name stands twice; names must be unique")
+            if sensor.name in names:
+                raise LogError(f"{where}: the name occurs twice; names must be unique")
             if sensor.mount == "ego" and track is None:
                 raise LogError(f"{where}: is mounted on the ego, but the log has no 'ego' with poses or gnss")
-            seen.add(sensor.name)
+            names.add(sensor.name)
         reference = self.manifest.get("reference_camera")
         cameras = [s.name for s in sensors if isinstance(s, Camera)]
         if reference is not None and reference not in cameras:
@@ -184,13 +188,13 @@ class _Folder:
     def _stream(self, k: int, entry: Mapping[str, Any], offset: Array) -> Stream:
         table = self.table(entry["index"], f"sensors[{k}].index", INDEX_COLUMNS)
         self._not_empty(table)
-        keep, notes = in_order(table["t_ns"], entry["name"])
+        keep, notes = strictly_increasing(table["t_ns"], entry["name"])
         self.notes += notes
         files = [inside(self.root, str(table["file"][row]), table.where(row, "file")) for row in keep]
         t_ns = table["t_ns"][keep]
         if entry["kind"] == "camera":
-            size = entry["intrinsics"]["width_px"], entry["intrinsics"]["height_px"]
-            return Stream(entry["name"], t_ns, partial(_read_image, files, t_ns, size))
+            size_px = entry["intrinsics"]["width_px"], entry["intrinsics"]["height_px"]
+            return image_stream(entry["name"], t_ns, files, size_px)
         frame = entry.get("points_frame", "lidar")
         return Stream(entry["name"], t_ns, partial(_read_sweep, files, t_ns, frame, offset))
 
@@ -207,12 +211,12 @@ class _Folder:
         labels = boxes_3d(self.table(entry["boxes_3d"], "labels.boxes_3d", BOX_3D_COLUMNS, {"visible": "bool"}))
         return replace(labels, cameras=tuple(entry["cameras"]) if "cameras" in entry else None)
 
-    def _label_table(self, key: str, columns: Mapping[str, str]) -> Table | None:
+    def _label_table(self, key: str, columns: Mapping[str, str]) -> CsvTable | None:
         relative = self.manifest.get("labels", {}).get(key)
         return None if relative is None else self.table(relative, f"labels.{key}", columns)
 
 
-def _check_geodetic(table: Table) -> None:
+def _check_geodetic(table: CsvTable) -> None:
     for field, limit in (("latitude_deg", 90.0), ("longitude_deg", 360.0)):
         bad = np.flatnonzero(np.abs(table[field]) > limit)
         if len(bad):
@@ -221,13 +225,10 @@ def _check_geodetic(table: Table) -> None:
             )
 
 
-def _read_image(files: list[Path], t_ns: NDArray[np.int64], size: tuple[int, int], i: int) -> NDArray[np.uint8]:
-    return read_image(files[i], int(t_ns[i]), *size)
-
-
 def _read_sweep(
     files: list[Path], t_ns: NDArray[np.int64], frame: Literal["lidar", "map"], offset: Array, i: int
 ) -> Sweep:
+    """Read sweep `i`; points in the map frame are shifted by the map's offset (3,)."""
     sweep = read_sweep(files[i], int(t_ns[i]), frame)
     if frame == "map" and offset.any():
         return Sweep(sweep.stamp_ns, sweep.xyz_m.astype(np.float64) - offset, frame, sweep.t_ns)
@@ -235,12 +236,18 @@ def _read_sweep(
 
 
 def _offset(track: PoseTrack | None, sensors: list[Camera | Lidar], labels: Labels | None) -> Array:
-    """Whole kilometers (3,) that bring the log near the map's origin."""
+    """Whole kilometers (3,) by which the log is shifted towards the map's origin."""
     if track is not None:
         first = track.map_T_ego[0, :3, 3]
     else:
-        places = [_mount_T(s)[:3, 3] for s in sensors if s.mount == "map"]
-        first = places[0] if places else labels.center_m[0] if labels is not None and len(labels.t_ns) else np.zeros(3)
+        positions = [_mount_T(s)[:3, 3] for s in sensors if s.mount == "map"]
+        first = (
+            positions[0]
+            if positions
+            else labels.center_m[0]
+            if labels is not None and len(labels.t_ns)
+            else np.zeros(3)
+        )
     return OFFSET_STEP_M * np.round(first / OFFSET_STEP_M) + 0.0
 
 

@@ -1,4 +1,4 @@
-"""The label tables of a native log folder."""
+"""Label tables of a native log folder."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import CATEGORIES, ImageLabels, ImageRegions, Labels
 from log2sim.errors import LogError
 from log2sim.geometry import Array
-from log2sim.logs.table import Table
+from log2sim.logs.csv_tables import CsvTable
 
 SIZE_FIELDS = ("length_m", "width_m", "height_m")
 BOX_3D_FIELDS = ("x_m", "y_m", "z_m", *SIZE_FIELDS, "yaw_rad")
@@ -18,8 +18,8 @@ REGION_COLUMNS = {"t_ns": "int", "camera": "str", **dict.fromkeys(BOX_2D_FIELDS,
 BOX_2D_COLUMNS = {**REGION_COLUMNS, "category": "str"}
 
 
-def boxes_3d(table: Table) -> Labels:
-    """Labels of a table with `BOX_3D_COLUMNS` and perhaps `visible`."""
+def boxes_3d(table: CsvTable) -> Labels:
+    """Labels of a table with `BOX_3D_COLUMNS` and, optionally, `visible`."""
     _check_categories(table)
     size = table.stack(*SIZE_FIELDS)
     if np.any(size <= 0):
@@ -36,20 +36,20 @@ def boxes_3d(table: Table) -> Labels:
     )
 
 
-def boxes_2d(table: Table, cameras: set[str]) -> dict[str, ImageLabels]:
+def boxes_2d(table: CsvTable, cameras: set[str]) -> dict[str, ImageLabels]:
     """Labels by camera of a table with `BOX_2D_COLUMNS`."""
     _check_categories(table)
     box, rows = _boxes(table), _rows_by_camera(table, cameras)
     return {n: ImageLabels(table["t_ns"][r], box[r], table["category"][r]) for n, r in rows.items()}
 
 
-def regions_2d(table: Table, cameras: set[str]) -> dict[str, ImageRegions]:
-    """Parts of images without labels, by camera, of a table with `REGION_COLUMNS`."""
+def regions_2d(table: CsvTable, cameras: set[str]) -> dict[str, ImageRegions]:
+    """Ignored regions by camera of a table with `REGION_COLUMNS`."""
     box, rows = _boxes(table), _rows_by_camera(table, cameras)
     return {n: ImageRegions(table["t_ns"][r], box[r]) for n, r in rows.items()}
 
 
-def _boxes(table: Table) -> Array:
+def _boxes(table: CsvTable) -> Array:
     box = table.stack(*BOX_2D_FIELDS)
     empty = np.flatnonzero((box[:, 2] <= box[:, 0]) | (box[:, 3] <= box[:, 1]))
     if len(empty):
@@ -57,8 +57,8 @@ def _boxes(table: Table) -> Array:
     return box
 
 
-def _rows_by_camera(table: Table, cameras: set[str]) -> dict[str, NDArray[np.bool_]]:
-    """Rows (N,) of each camera that has some."""
+def _rows_by_camera(table: CsvTable, cameras: set[str]) -> dict[str, NDArray[np.bool_]]:
+    """Rows (N,) by camera, of cameras that have some."""
     unknown = np.flatnonzero(~np.isin(table["camera"], sorted(cameras)))
     if len(unknown):
         name = table["camera"][unknown[0]]
@@ -69,7 +69,7 @@ def _rows_by_camera(table: Table, cameras: set[str]) -> dict[str, NDArray[np.boo
     return {n: r for n, r in rows.items() if r.any()}
 
 
-def _check_categories(table: Table) -> None:
+def _check_categories(table: CsvTable) -> None:
     unknown = np.flatnonzero(~np.isin(table["category"], CATEGORIES))
     if len(unknown):
         found = table["category"][unknown[0]]

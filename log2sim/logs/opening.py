@@ -1,4 +1,4 @@
-"""Log readers: a folder of recorded data in, a `Log` out, whatever its layout."""
+"""Open a folder of recorded data as a `Log` with the reader of its format."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ from log2sim.logs.reader import Reader
 
 __all__ = ["Reader", "find_reader", "open_log"]
 
+MAX_LISTED = 20
+
 
 def open_log(path: Path | str, *, format: str = "auto", sequence: str | None = None) -> Log:
-    """Open a log folder; nothing but its index, calibration, poses and labels is read.
+    """Open a log folder; only its index, calibration and poses are read, images and sweeps on request.
 
     Parameters
     ----------
@@ -38,11 +40,11 @@ def open_log(path: Path | str, *, format: str = "auto", sequence: str | None = N
         raise LogError(f"{root}: is a file; give the folder of a log")
     name = find_reader(root) if format == "auto" else format
     reader: Reader = registry.load("log", name)
-    return reader.open(root, _choose(root, name, reader.sequences(root), sequence))
+    return reader.open(root, _select_sequence(root, name, reader.sequences(root), sequence))
 
 
 def find_reader(root: Path) -> str:
-    """The name of the reader that knows the layout of a folder."""
+    """Name of the reader that matches a folder; `LogError` when none does."""
     known = []
     for name in registry.names("log"):
         reader: Reader = registry.load("log", name)
@@ -52,19 +54,22 @@ def find_reader(root: Path) -> str:
     raise LogError(f"{root}: no known log format; a log is one of: {'; '.join(known)}. Force one with --format")
 
 
-def _choose(root: Path, name: str, found: list[str], sequence: str | None) -> str:
-    if not found:
+def _select_sequence(root: Path, name: str, available: list[str], sequence: str | None) -> str:
+    if not available:
         reader: Reader = registry.load("log", name)
         raise LogError(f"{root}: holds no sequence of format '{name}'; expected {reader.looks_for}")
     if sequence is not None:
-        if sequence not in found:
-            hint = registry.nearest(sequence, found)
-            raise ConfigError(f"{root}: no sequence '{sequence}'{hint}; there are: {_listed(found)}")
+        if sequence not in available:
+            hint = registry.nearest(sequence, available)
+            raise ConfigError(f"{root}: no sequence '{sequence}'{hint}; there are: {_joined(available)}")
         return sequence
-    if len(found) > 1:
-        raise ConfigError(f"{root}: holds {len(found)} sequences; choose one with --sequence NAME: {_listed(found)}")
-    return found[0]
+    if len(available) > 1:
+        raise ConfigError(
+            f"{root}: holds {len(available)} sequences; choose one with --sequence NAME: {_joined(available)}"
+        )
+    return available[0]
 
 
-def _listed(names: list[str], most: int = 20) -> str:
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+def _joined(names: list[str]) -> str:
+    more = len(names) - MAX_LISTED
+    return ", ".join(names[:MAX_LISTED]) + (f" and {more} more" if more > 0 else "")

@@ -1,46 +1,44 @@
 """PandaSet sequences: six cameras, a spinning Pandar64 and a forward PandarGT, points and poses in one world frame.
 
-What the data set does not state was measured on sequence 002. The pose of a sweep has x right, y forward, z up, and its origin
-0.325 m above the road (fit of the road within 15 m, 0.319 to 0.337 m over 40 sweeps), as the rear axle does. The Pandar64 turns
+What the data set does not document was measured on sequence 002. The pose of a sweep has x right, y forward, z up, and its
+origin is 0.325 m above the road (fit of the road within 15 m, 0.319 to 0.337 m over 40 sweeps), as the rear axle does. The Pandar64 turns
 clockwise and passes the rear at the stamp of the sweep. The PandarGT keeps its own time, up to 90 ms away from the
-Pandar64's, so that a moving car stands at two places in one file (up to 1 m apart); hence two streams.
+Pandar64's, so that a moving car is at two positions in one file (up to 1 m apart); hence two streams. No index states the
+times of the PandarGT: they are those of its points, so its stamps are read from all sweeps, but only when they are used.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import EgoVehicle, Lidar, Log, MapFrame, Stream, Sweep
+from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream
 from log2sim.documents import read_json
-from log2sim.errors import LogError, RecordError
+from log2sim.errors import LogError
 from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, inverse, rotation_from_quaternion, transform
 from log2sim.logs import kitti
-from log2sim.logs.images import first_image_size, read_image
+from log2sim.logs.images import first_image_size, image_stream
 from log2sim.logs.pandaset_labels import read_labels
-from log2sim.logs.sweeps import sweep_of
-from log2sim.logs.table import in_order
-from log2sim.logs.unpickle import Columns, read_pickled_table
+from log2sim.logs.pandaset_sweeps import LIDARS, SweepFiles
+from log2sim.logs.stamps import strictly_increasing
 
 ROAD_BELOW_POSE_M = 0.325
-# Takes points of the ego frame (x forward, y left, origin on the road) into the frame of the data set's poses.
+# From the ego frame (x forward, y left, origin on the road) to the frame of the data set's poses.
 POSE_T_EGO = transform(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), [0.0, 0.0, -ROAD_BELOW_POSE_M])
 # Fit of azimuth over time (x, y) and of the vertical field of view, -25 to +15 degrees (z), of the Pandar64's points.
 EGO_T_PANDAR64 = transform(np.eye(3), [0.75, 0.0, 1.8 + ROAD_BELOW_POSE_M])
-# Where the PandarGT stands is not known; its points are in the map already, so its mount only says from which side it looks.
-LIDARS: Mapping[str, int] = {"pandar64": 0, "pandargt": 1}
+# The mount of the PandarGT is not documented; its points are in the map already, so the mount only says from which side it looks.
 # A Chrysler Pacifica, by its data sheet.
-PACIFICA = EgoVehicle(size_m=(5.18, 2.02, 1.78), rear_axle_offset_m=1.45)
+EGO_VEHICLE = EgoVehicle(size_m=(5.18, 2.02, 1.78), rear_axle_offset_m=1.45)
 
-GNSS_FAR_M = 20.0
-GNSS_ANGLE_RAD = np.radians(1.0)
+# Camera poses that scatter more about the mount do not fit the ego poses.
+MAX_MOUNT_SPREAD_M = 0.05
+MIN_GNSS_TRACK_M = 20.0
+MAX_GNSS_ANGLE_RAD = np.radians(1.0)
 
 
 class PandaSetReader:
@@ -50,14 +48,17 @@ class PandaSetReader:
     looks_for = "a folder with lidar/poses.json and camera/, or a folder of such folders"
 
     def matches(self, path: Path) -> bool:
+        """Return whether the folder is a sequence or holds some."""
         return bool(self.sequences(path))
 
     def sequences(self, path: Path) -> list[str]:
+        """Return the names of the sequences, sorted."""
         if _is_sequence(path):
             return [path.resolve().name]
         return sorted(p.name for p in path.iterdir() if _is_sequence(p))
 
     def open(self, path: Path, sequence: str) -> Log:
+        """Open a sequence; no sweep and no cuboid is read."""
         return _Sequence(path if _is_sequence(path) else path / sequence).log()
 
 
@@ -76,17 +77,23 @@ class _Sequence:
         notes: list[str] = []
         lidar_t_ns, map_T_pose = _poses(self.path / "lidar")
         map_T_ego = map_T_pose @ POSE_T_EGO
-        keep, problems = in_order(lidar_t_ns, "lidar/timestamps.json")
+        keep, problems = strictly_increasing(lidar_t_ns, "lidar/timestamps.json")
         notes += problems
         track = PoseTrack(lidar_t_ns[keep], map_T_ego[keep])
         cameras, streams = self._cameras(track, notes)
-        files = self._files("lidar", ".gz", len(lidar_t_ns))
-        gt_t_ns = _gt_stamps(files, lidar_t_ns)
-        for lidar in LIDARS:
-            t_ns = lidar_t_ns if lidar == "pandar64" else gt_t_ns
-            streams[lidar] = _sweep_stream(lidar, t_ns, files, notes)
-        cuboids = numbered(self.path / "annotations" / "cuboids", ".gz")
-        records = sorted(self.path.glob("*/*.pkl.gz")) + sorted(self.path.glob("*/*/*.*"))
+        sweeps = SweepFiles(self._files("lidar", ".gz", len(lidar_t_ns)), lidar_t_ns, notes)
+        streams |= {lidar: sweeps.stream(lidar) for lidar in LIDARS}
+        cuboids = numbered_files(self.path / "annotations" / "cuboids", ".gz")
+        map_T_lidar = map_T_ego @ EGO_T_PANDAR64
+
+        @cache
+        def labels() -> Labels | None:
+            return read_labels(cuboids, lidar_t_ns, sweeps.gt_stamps, map_T_lidar, notes) if cuboids else None
+
+        def all_notes() -> tuple[str, ...]:
+            stamps_and_labels = [*(sweeps.index(lidar) for lidar in LIDARS), labels()]
+            return tuple(notes) if stamps_and_labels else ()
+
         return Log(
             name=f"pandaset-{self.path.resolve().name}",
             format=READER.name,
@@ -94,16 +101,19 @@ class _Sequence:
             lidars={lidar: Lidar(lidar, "ego", EGO_T_PANDAR64) for lidar in LIDARS},
             streams=streams,
             ego=track,
-            ego_vehicle=PACIFICA,
+            ego_vehicle=EGO_VEHICLE,
             map=self._map_frame(map_T_pose, notes),
-            labels=read_labels(cuboids, lidar_t_ns, gt_t_ns, map_T_ego @ EGO_T_PANDAR64, notes) if cuboids else None,
+            labels=labels,
             reference_camera="front_camera" if "front_camera" in cameras else None,
-            digest=kitti.digest_of([(self.path / "lidar" / "poses.json").read_text()], records),
-            notes=tuple(notes),
+            digest=kitti.digest_of([(self.path / "lidar" / "poses.json").read_text()], self._records()),
+            notes=all_notes,
         )
 
+    def _records(self) -> list[Path]:
+        return sorted(self.path.glob("*/*.pkl.gz")) + sorted(self.path.glob("*/*/*.*"))
+
     def _files(self, folder: str, suffix: str, count: int) -> dict[int, Path]:
-        files = {k: p for k, p in numbered(self.path / folder, suffix).items() if k < count}
+        files = {k: p for k, p in numbered_files(self.path / folder, suffix).items() if k < count}
         if not files:
             raise LogError(f"{self.path / folder}: no records (NN*{suffix}); a stream needs at least one")
         return files
@@ -118,12 +128,12 @@ class _Sequence:
                 folder.name, width, height, _intrinsics(folder), "ego", _mount(track, t_ns, map_T_cam, folder, notes)
             )
             numbers = np.array(list(files))
-            keep, problems = in_order(t_ns[numbers], folder.name)
+            keep, problems = strictly_increasing(t_ns[numbers], folder.name)
             notes += problems
             t_ns = t_ns[numbers[keep]]
-            chosen = [files[int(n)] for n in numbers[keep]]
             cameras[camera.name] = camera
-            streams[camera.name] = Stream(camera.name, t_ns, partial(_read_image, chosen, t_ns, (width, height)))
+            chosen = [files[int(n)] for n in numbers[keep]]
+            streams[camera.name] = image_stream(camera.name, t_ns, chosen, (width, height))
         if not cameras:
             raise LogError(
                 f"{self.path / 'camera'}: no camera; expected folders with intrinsics.json, poses.json, timestamps.json"
@@ -131,7 +141,7 @@ class _Sequence:
         return cameras, streams
 
     def _map_frame(self, map_T_pose: Array, notes: list[str]) -> MapFrame:
-        """Tie the world frame to Earth where the GNSS track is long enough to show that its axes are east and north."""
+        """Georeference the map where the GNSS track is long enough to show that its axes are east and north."""
         path = self.path / "meta" / "gps.json"
         if not path.is_file():
             return MapFrame()
@@ -141,33 +151,33 @@ class _Sequence:
         except (TypeError, KeyError, ValueError):
             raise LogError(f"{path}: expected a list of records with lat, long and height") from None
         if not len(geodetic) or not np.isfinite(geodetic).all() or np.abs(geodetic[:, 0]).max() >= 90:
-            notes.append("meta/gps.json holds no usable fixes: the place of the map is unknown")
+            notes.append("meta/gps.json holds no usable fixes: the position of the map is unknown")
             return MapFrame()
-        frame, reason = tie_to_earth(geodetic, map_T_pose[: len(geodetic), :3, 3])
+        frame, reason = georeference(geodetic, map_T_pose[: len(geodetic), :3, 3])
         if reason:
             notes.append(f"{reason}: the map is only local and its north is not known")
         return frame
 
 
-def tie_to_earth(geodetic: Array, xyz_map: Array) -> tuple[MapFrame, str]:
-    """The map frame of fixes (N, 3) in deg and m taken at places (N, 3) in the map, and why it has no projection if so.
+def georeference(geodetic: Array, xyz_map: Array) -> tuple[MapFrame, str]:
+    """Map frame of GNSS fixes (N, 3) in deg and m at positions (N, 3) in the map, and why it has no projection if so.
 
-    The map's axes are taken for east and north only if the track reaches 20 m and the best rotation is below 1 degree.
+    The map's axes count as east and north only if the track reaches 20 m and the best rotation is below 1 degree.
     """
     from log2sim.logs.geodesy import geodetic_from_map, poses_from_geodetic, transverse_mercator
 
     n = min(len(geodetic), len(xyz_map))
     latitude, longitude, altitude = (float(v) for v in geodetic[0])
     local = MapFrame(latitude, longitude, altitude)
-    if np.linalg.norm(np.ptp(xyz_map[:, :2], axis=0)) < GNSS_FAR_M:
-        return local, f"the ego moves less than {GNSS_FAR_M:g} m"
+    if np.linalg.norm(np.ptp(xyz_map[:, :2], axis=0)) < MIN_GNSS_TRACK_M:
+        return local, f"the ego moves less than {MIN_GNSS_TRACK_M:g} m"
     first = MapFrame(latitude, longitude, altitude, transverse_mercator(latitude, longitude))
     zero = np.zeros(n)
     lat, lon, alt = geodetic[:n].T
     east_north = poses_from_geodetic(first, lat, lon, alt, zero, zero, zero, where="meta/gps.json")[:, :2, 3]
     a, b = xyz_map[:n, :2] - xyz_map[:n, :2].mean(0), east_north - east_north.mean(0)
     turn = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
-    if abs(turn) > GNSS_ANGLE_RAD:
+    if abs(turn) > MAX_GNSS_ANGLE_RAD:
         return local, f"GNSS and map differ by {np.degrees(turn):.1f} degrees"
     shift = np.append(
         east_north.mean(0) - xyz_map[:n, :2].mean(0), np.mean(geodetic[:n, 2] - altitude - xyz_map[:n, 2])
@@ -176,8 +186,8 @@ def tie_to_earth(geodetic: Array, xyz_map: Array) -> tuple[MapFrame, str]:
     return MapFrame(origin[0], origin[1], origin[2], transverse_mercator(origin[0], origin[1])), ""
 
 
-def numbered(folder: Path, suffix: str) -> dict[int, Path]:
-    """Files of a folder by the number that their name begins with ("07.pkl.gz"), in the order of the numbers."""
+def numbered_files(folder: Path, suffix: str) -> dict[int, Path]:
+    """Files of a folder by the number at the beginning of their name ("07.pkl.gz"), in the order of the numbers."""
     if not folder.is_dir():
         return {}
     names = ((p.name.split(".")[0], p) for p in folder.iterdir() if p.suffix.lower() == suffix)
@@ -219,7 +229,7 @@ def _intrinsics(folder: Path) -> Array:
 
 
 def _mount(track: PoseTrack, t_ns: NDArray[np.int64], map_T_cam: Array, folder: Path, notes: list[str]) -> Array:
-    """The one `ego_T_cam` (4, 4) behind the poses of a camera in the world: medians over its frames.
+    """Mount `ego_T_cam` (4, 4) of a camera from its poses in the world: medians over its frames.
 
     Notes
     -----
@@ -233,60 +243,6 @@ def _mount(track: PoseTrack, t_ns: NDArray[np.int64], map_T_cam: Array, folder: 
     translation = np.median(ego_T_cam[:, :3, 3], axis=0)
     u, _, vt = np.linalg.svd(np.median(ego_T_cam[:, :3, :3], axis=0))
     spread_m = float(np.median(np.linalg.norm(ego_T_cam[:, :3, 3] - translation, axis=1)))
-    if spread_m > 0.05:
+    if spread_m > MAX_MOUNT_SPREAD_M:
         notes.append(f"{folder.name}: its poses and the ego's do not fit together, typically by {spread_m:.2f} m")
     return transform(u @ vt, translation)
-
-
-def _read_image(files: list[Path], t_ns: NDArray[np.int64], size: tuple[int, int], i: int) -> NDArray[np.uint8]:
-    return read_image(files[i], int(t_ns[i]), *size)
-
-
-def _sweep_stream(lidar: str, t_ns: NDArray[np.int64], files: dict[int, Path], notes: list[str]) -> Stream:
-    numbers = np.array(list(files))
-    keep, problems = in_order(t_ns[numbers], lidar)
-    notes += problems
-    stamps = t_ns[numbers[keep]]
-    return Stream(lidar, stamps, partial(_read_sweep, [files[int(n)] for n in numbers[keep]], stamps, LIDARS[lidar]))
-
-
-# Both LiDARs stand in one file and are asked for one after the other.
-@lru_cache(maxsize=4)
-def _read_points(path: Path) -> Columns:
-    return read_pickled_table(path)
-
-
-def _read_sweep(files: list[Path], t_ns: NDArray[np.int64], number: int, i: int) -> Sweep:
-    where = f"{files[i]} (stamp {t_ns[i]})"
-    try:
-        columns = _read_points(files[i])
-        rows = columns["d"] == number
-        xyz = np.stack([columns[k][rows] for k in ("x", "y", "z")], axis=1)
-        t_s = columns["t"][rows]
-        if xyz.dtype.kind != "f" or t_s.dtype.kind != "f":
-            raise RecordError(f"{where}: columns x, y, z, t are {xyz.dtype} and {t_s.dtype}, expected numbers")
-    except KeyError as missing:
-        raise RecordError(f"{where}: no column {missing}; expected x, y, z, i, t, d") from None
-    timed = np.isfinite(t_s) & (np.abs(t_s) < 9e9)
-    xyz, offset_ns = xyz[timed], np.round(t_s[timed] * NS_PER_S).astype(np.int64) - int(t_ns[i])
-    return sweep_of(xyz, int(t_ns[i]), offset_ns, "map")
-
-
-def _gt_stamps(files: dict[int, Path], t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Middle (N,) of the PandarGT's points of each sweep, which no index states; the sweep's stamp where it cannot be read."""
-
-    def middle(item: tuple[int, Path]) -> tuple[int, int]:
-        number, path = item
-        try:
-            columns: Mapping[str, NDArray[Any]] = read_pickled_table(path)
-            t_s = columns["t"][columns["d"] == LIDARS["pandargt"]]
-            ends = (float(np.nanmin(t_s)) + float(np.nanmax(t_s))) / 2 if len(t_s) else np.nan
-        except (RecordError, KeyError, TypeError):
-            ends = np.nan
-        return number, round(ends * NS_PER_S) if np.isfinite(ends) else int(t_ns[number])
-
-    stamps = t_ns.copy()
-    with ThreadPoolExecutor(4) as pool:
-        for number, stamp in pool.map(middle, files.items()):
-            stamps[number] = stamp
-    return stamps

@@ -14,7 +14,7 @@ from log2sim.geometry import Array, apply, inverse, wrap_angle
 from log2sim.logs.unpickle import Columns, read_pickled_table
 
 PERIOD_NS = 100_000_000
-SHORTEST_STEP_NS = 20_000_000
+MIN_STEP_NS = 20_000_000
 
 CATEGORY_OF = {
     "Car": "car",
@@ -36,7 +36,7 @@ CATEGORY_OF = {
     "Tram / Subway": "other",
 }
 # Things that are no road users.
-LEFT_OUT = {
+NO_ROAD_USERS = {
     "Animals - Bird", "Animals - Other", "Cones", "Construction Signs", "Pylons", "Road Barriers", "Rolling Containers",
     "Signs", "Temporary Construction Barriers",
 }  # fmt: skip
@@ -109,7 +109,7 @@ def _frame(c: Columns, t_ns: int, gt_t_ns: int, map_T_lidar: Array, unknown: set
     category = np.array(
         [_category(str(k), str(r)) for k, r in zip(c["label"], c["attributes.rider_status"])], dtype="<U16"
     )
-    unknown.update(str(k) for k, word in zip(c["label"], category) if not word and str(k) not in LEFT_OUT)
+    unknown.update(str(k) for k, word in zip(c["label"], category) if not word and str(k) not in NO_ROAD_USERS)
     uuid, sibling = c["uuid"].astype(np.str_), c["cuboids.sibling_id"].astype(np.str_)
     of_gt = c["cuboids.sensor_id"] == GT_SENSOR
     twin = of_gt & np.isin(sibling, uuid[~of_gt])
@@ -135,7 +135,7 @@ def _increasing(t_ns: NDArray[np.int64], track_id: NDArray[np.str_]) -> NDArray[
     last: dict[str, int] = {}
     keep = []
     for row, (t, track) in enumerate(zip(t_ns.tolist(), track_id.tolist())):
-        if track not in last or t - last[track] >= SHORTEST_STEP_NS:
+        if track not in last or t - last[track] >= MIN_STEP_NS:
             last[track] = t
             keep.append(row)
     return np.array(keep, dtype=np.intp)

@@ -1,4 +1,4 @@
-"""PCD files (Point Cloud Library, version 0.7), ascii and binary."""
+"""PCD files (Point Cloud Library, version 0.7), ASCII and binary."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import NS_PER_S
 
-HEADER_LIMIT_BYTES = 16 * 1024
+MAX_HEADER_BYTES = 16 * 1024
 TIME_FIELDS = ("t_offset_ns", "offset", "t", "timestamp")
 
 
 def parse_pcd(data: bytes, t_ns: int, limit_points: int) -> tuple[NDArray[Any], NDArray[np.int64] | None]:
-    """Points (N, 3) and their times (N,) int64 ns relative to the stamp, or None without a time field.
+    """Parse points (N, 3) and their times (N,) int64 ns relative to the stamp, None without a time field.
 
     A time field is `t_offset_ns`, `offset` or `t` (relative to the stamp) or `timestamp` (absolute); whole numbers are
     nanoseconds, floating-point numbers seconds.
@@ -22,7 +22,7 @@ def parse_pcd(data: bytes, t_ns: int, limit_points: int) -> tuple[NDArray[Any], 
     Raises
     ------
     ValueError
-        When the header or the data are not as the format asks.
+        When the header or the data do not follow the format.
     """
     header, body = _read_header(data)
     layout = _layout(header)
@@ -47,7 +47,7 @@ def _read_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:
     header: dict[str, list[str]] = {}
     start = 0
     while "DATA" not in header:
-        end = data.find(b"\n", start, HEADER_LIMIT_BYTES)
+        end = data.find(b"\n", start, MAX_HEADER_BYTES)
         if end < 0:
             raise ValueError("no PCD header that ends with DATA")
         words = data[start:end].decode("ascii", "replace").split()
@@ -77,7 +77,7 @@ def _layout(header: dict[str, list[str]]) -> np.dtype[Any]:
             raise ValueError(f"PCD header: field '{name}' has TYPE {kind} SIZE {size} COUNT {count}")
         if int(count) > 4096:
             raise ValueError(f"PCD header: field '{name}' has COUNT {count}")
-        # Padding fields are all called "_", so names are made unique by their place.
+        # Padding fields are all called "_", so names are made unique by their index.
         unique = name if names.index(name) == k and name != "_" else f"_{k}"
         spec.append((unique, f"<{code}{size}", () if count == "1" else (int(count),)))
     for axis in ("x", "y", "z"):

@@ -1,4 +1,4 @@
-"""What a log reader offers."""
+"""Protocol of log readers."""
 
 from __future__ import annotations
 
@@ -9,22 +9,56 @@ from log2sim.datatypes import Log
 
 
 class Reader(Protocol):
-    """A log format. `name` is what --format takes, `looks_for` tells a user what a folder of it must hold.
+    """Reader of one log format.
 
-    `matches` and `sequences` only look at names of files; they open none and never raise on a foreign folder.
+    To add a format, write a module with an object that has these members and register it: in `registry.BUILT_IN["log"]`,
+    or in another distribution as an entry point of the group "log2sim.log".
+
+    Attributes
+    ----------
+    name : str
+        Name that `--format` takes.
+    looks_for : str
+        What a folder of this format must contain, for messages.
+
+    Notes
+    -----
+    A `Log` returned by `open` fulfills this contract:
+
+    - **Laziness.** `open` reads the index, calibration and poses. `Stream.read(i)` reads record i when it is called, from
+      any thread, and raises `RecordError` when that record is broken. Where stamps or labels must be read from large
+      files, they are deferred (`log2sim.datatypes.Deferred`).
+    - **Stamps.** All stamps are int64 nanoseconds of one clock. `Stream.t_ns` increases strictly;
+      `log2sim.logs.stamps.strictly_increasing` sorts, drops repetitions and writes the notes. Fractions of seconds are
+      converted with `round`, never through float32.
+    - **Frames.** The map is local, x east, y north where that is known, z up, with coordinates small enough for float32
+      (move whole kilometers to `MapFrame.offset_m`). The ego frame is x forward, y left, z up; its origin is below the
+      middle of the rear axle, at `ground_z_ego_m` above the road. Cameras are x right, y down, z forward.
+      `mount_T_sensor` takes points of the sensor to its mount, the ego or, at the roadside, the map.
+    - **Motion compensation.** A `Sweep` in frame "lidar" holds each point in the sensor's frame at the point's own time;
+      with `t_ns` of the points the motion of the ego is compensated downstream, without it all points count as measured
+      at the stamp. A `Sweep` in frame "map" is already compensated. Rows are finite, in m.
+    - **Images** are (H, W, 3) uint8 BGR of the size of their calibration, never rotated.
+    - **Labels** are in the map frame with sizes as length, width, height, centers of boxes, categories of
+      `log2sim.datatypes.CATEGORIES` and the stamp at which each object was measured, not that of the nearest frame.
+      `Labels.cameras` restricts them to objects in view of these cameras.
+    - **Errors.** An inconsistent log raises `LogError` that names file, record and what was expected; what the format lacks
+      goes into `Log.notes`. `digest` is a SHA-256 over index and calibration and over names and sizes of the records.
     """
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Name that `--format` takes."""
 
     @property
-    def looks_for(self) -> str: ...
+    def looks_for(self) -> str:
+        """What a folder of this format must contain."""
 
     def matches(self, path: Path) -> bool:
-        """Whether the folder is a sequence of this format or a root of such sequences."""
+        """Return whether the folder is a sequence of this format or holds some, by names of files alone."""
 
     def sequences(self, path: Path) -> list[str]:
-        """Names of the sequences at `path`, sorted; one when it is itself a sequence."""
+        """Return the names of the sequences at `path`, sorted; one when it is itself a sequence. Never raises."""
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open the sequence of that name."""

@@ -1,4 +1,4 @@
-"""What is in a log, in numbers, without decoding its records."""
+"""Summary of a log in numbers, without decoding its images and sweeps."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from log2sim.datatypes import Log
 from log2sim.documents import rounded
 from log2sim.geometry import NS_PER_S
 
-GAP_FACTOR = 1.7
+# A step between two stamps that is longer than this many median steps is a gap.
+MIN_GAP_PERIODS = 1.7
 
 
 def summarize(log: Log) -> dict[str, Any]:
-    """A document for people and for JSON: sensors, rates, stamps, gaps, ego, labels and notes of a log."""
+    """Summarize sensors, rates, stamps, gaps, ego, labels and notes of a log as a JSON document."""
     stamps = [s.t_ns for s in log.streams.values()]
     begin, end = min(int(t[0]) for t in stamps), max(int(t[-1]) for t in stamps)
     cameras = {
@@ -25,12 +26,12 @@ def summarize(log: Log) -> dict[str, Any]:
             "size_px": [int(c.width_px), int(c.height_px)],
             "field_of_view_deg": rounded(np.degrees(2 * np.arctan(c.width_px / 2 / c.K[0, 0])), 1),
             "distortion_model": c.distortion_model,
-            **_place(c.mount, c.mount_T_cam),
+            **_mounting(c.mount, c.mount_T_cam),
         }
         for name, c in log.cameras.items()
     }
     lidars = {
-        name: {**summarize_stamps(log.streams[name].t_ns), **_place(s.mount, s.mount_T_lidar)}
+        name: {**summarize_stamps(log.streams[name].t_ns), **_mounting(s.mount, s.mount_T_lidar)}
         for name, s in log.lidars.items()
     }
     return {
@@ -59,10 +60,10 @@ def summarize(log: Log) -> dict[str, Any]:
 
 
 def summarize_stamps(t_ns: NDArray[np.int64]) -> dict[str, Any]:
-    """Count, rate, range and gaps of increasing stamps (F,); a gap is a step of more than 1.7 times the median one."""
+    """Count, rate, range and gaps of increasing stamps (F,)."""
     step = np.diff(t_ns)
     median = float(np.median(step)) if len(step) else 0.0
-    gap = np.flatnonzero(step > GAP_FACTOR * median)
+    gap = np.flatnonzero(step > MIN_GAP_PERIODS * median)
     return {
         "records": len(t_ns),
         "rate_hz": rounded(NS_PER_S / median, 3) if median > 0 else None,
@@ -72,7 +73,7 @@ def summarize_stamps(t_ns: NDArray[np.int64]) -> dict[str, Any]:
     }
 
 
-def _place(mount: str, mount_T_sensor: NDArray[np.float64]) -> dict[str, Any]:
+def _mounting(mount: str, mount_T_sensor: NDArray[np.float64]) -> dict[str, Any]:
     return {"mount": mount, "translation_m": [rounded(v, 4) for v in mount_T_sensor[:3, 3]]}
 
 

@@ -1,8 +1,11 @@
-"""Sweep files of a log: .npz, .npy, .bin and .pcd, with their size known before anything is allocated."""
+"""Sweep files of a log: .npz, .npy, .bin and .pcd; their size is checked before anything is allocated."""
 
 from __future__ import annotations
 
 import io
+import lzma
+import struct
+import tokenize
 import zipfile
 import zlib
 from pathlib import Path
@@ -16,30 +19,37 @@ from log2sim.errors import RecordError
 from log2sim.logs.images import read_bytes
 from log2sim.logs.pcd import parse_pcd
 
-SWEEP_LIMIT_POINTS = 20_000_000
-SWEEP_LIMIT_BYTES = 1024 * 1024 * 1024
+MAX_SWEEP_POINTS = 20_000_000
+MAX_SWEEP_BYTES = 1024 * 1024 * 1024
 
+# What NumPy and zipfile raise for damaged files.
+PARSER_ERRORS = (
+    ValueError, TypeError, KeyError, IndexError, OverflowError, EOFError, OSError, MemoryError, RuntimeError, SyntaxError,
+    struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error, lzma.LZMAError,
+)  # fmt: skip
+
+# Times of points relative to the stamp of their sweep, ns; None when the file has none.
 Offset = NDArray[np.int64] | None
 
 
 def read_sweep(path: Path, t_ns: int, frame: Literal["lidar", "map"] = "lidar") -> Sweep:
-    """Read a sweep; rows that are not finite are left out.
+    """Read a sweep; rows that are not finite are dropped.
 
     Raises
     ------
     RecordError
         When it is missing, truncated, too large or not of the layout that its suffix promises; names file and stamp.
     """
-    data = read_bytes(path, t_ns, SWEEP_LIMIT_BYTES)
+    data = read_bytes(path, t_ns, MAX_SWEEP_BYTES)
     try:
         xyz, offset_ns = _parse(path.suffix.lower(), data, t_ns)
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+    except PARSER_ERRORS as error:
         raise RecordError(f"{path} (stamp {t_ns}): not a readable sweep: {error}") from None
     return sweep_of(xyz, t_ns, offset_ns, frame)
 
 
 def sweep_of(xyz_m: NDArray[Any], t_ns: int, offset_ns: Offset, frame: Literal["lidar", "map"]) -> Sweep:
-    """A `Sweep` of the finite rows of points (N, 3) with stamps `t_ns` + `offset_ns` (N,)."""
+    """Build a `Sweep` of the finite rows of points (N, 3) with stamps `t_ns` + `offset_ns` (N,)."""
     finite = np.isfinite(xyz_m).all(axis=1)
     if not finite.all():
         xyz_m = xyz_m[finite]
@@ -51,14 +61,14 @@ def _parse(suffix: str, data: bytes, t_ns: int) -> tuple[NDArray[Any], Offset]:
     if suffix == ".bin":
         if len(data) % 16:
             raise ValueError(f"{len(data)} bytes, expected four float32 (x, y, z, intensity) a point")
-        _limit(len(data) // 16)
+        _check_count(len(data) // 16)
         return np.frombuffer(data, "<f4").reshape(-1, 4)[:, :3], None
     if suffix == ".npy":
         return _points(_read_npy(io.BytesIO(data), "the array")), None
     if suffix == ".npz":
         return _parse_npz(data)
     if suffix == ".pcd":
-        return parse_pcd(data, t_ns, SWEEP_LIMIT_POINTS)
+        return parse_pcd(data, t_ns, MAX_SWEEP_POINTS)
     raise ValueError(f"unknown suffix '{suffix}', expected .npz, .npy, .bin or .pcd")
 
 
@@ -93,7 +103,7 @@ def _read_npy(stream: IO[bytes], what: str) -> NDArray[Any]:
     shape, fortran, dtype = read_header(stream)
     if dtype.hasobject or dtype.itemsize == 0 or len(shape) not in (1, 2) or (len(shape) == 2 and shape[1] > 64):
         raise ValueError(f"{what} is {dtype} {shape}, expected numbers, (N, 3) or (N,)")
-    _limit(shape[0])
+    _check_count(shape[0])
     size = int(np.prod(shape)) * dtype.itemsize
     data = stream.read(size)
     if len(data) != size:
@@ -101,6 +111,6 @@ def _read_npy(stream: IO[bytes], what: str) -> NDArray[Any]:
     return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C")
 
 
-def _limit(points: int) -> None:
-    if not 0 <= points <= SWEEP_LIMIT_POINTS:
-        raise ValueError(f"{points} points, more than the {SWEEP_LIMIT_POINTS} that a sweep may have")
+def _check_count(points: int) -> None:
+    if not 0 <= points <= MAX_SWEEP_POINTS:
+        raise ValueError(f"{points} points, more than the {MAX_SWEEP_POINTS} that a sweep may have")

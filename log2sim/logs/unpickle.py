@@ -1,7 +1,7 @@
-"""Tables out of pickled pandas DataFrames, without pandas and without running anything that a pickle names.
+"""Reader of pickled pandas DataFrames, without pandas and without executing anything that a pickle names.
 
-Every class that a pickled table refers to is replaced by a small part of our own that only stores its state, so the version
-of pandas or NumPy that wrote the file does not matter, and any other class is refused by name.
+Every class that a pickled table refers to is replaced by a placeholder that only stores its arguments and state, so the
+version of pandas or NumPy that wrote the file does not matter, and any other class is refused by name.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 
 from log2sim.errors import LogError, RecordError
 
-LIMIT_BYTES = 512 * 1024 * 1024
+MAX_TABLE_BYTES = 512 * 1024 * 1024
 
 Columns = dict[str, NDArray[Any]]
 
 
-def read_pickled_table(path: Path, error: type[LogError] = RecordError, limit_bytes: int = LIMIT_BYTES) -> Columns:
-    """Columns (N,) by name of a DataFrame in a .pkl or .pkl.gz file.
+def read_pickled_table(path: Path, error: type[LogError] = RecordError, limit_bytes: int = MAX_TABLE_BYTES) -> Columns:
+    """Read the columns (N,) of a DataFrame from a .pkl or .pkl.gz file.
 
     Raises
     ------
@@ -61,7 +61,7 @@ def _gunzip(packed: bytes, limit_bytes: int) -> bytes:
 
 
 class _Part:
-    """Stands for an object of pandas or NumPy: what it was made of and what state it was given."""
+    """Placeholder for an object of pandas or NumPy: its arguments and its state."""
 
     __slots__ = ("args", "state")
 
@@ -91,8 +91,8 @@ class _Array(_Part): ...
 class _Buffer(_Part): ...
 
 
-class _Known:
-    """A name that a pickle may refer to; calling it makes a part and nothing else."""
+class _Allowed:
+    """A name that a pickle may refer to; a call only makes a placeholder."""
 
     __slots__ = ("make",)
 
@@ -100,8 +100,8 @@ class _Known:
         self.make = make
 
 
-_NAMES: dict[str, _Known] = {
-    name: _Known(make)
+_ALLOWED: dict[str, _Allowed] = {
+    name: _Allowed(make)
     for make, names in (
         (_Frame, ("pandas.DataFrame", "pandas.core.frame.DataFrame")),
         (_Blocks, ("pandas.core.internals.managers.BlockManager", "pandas.core.internals.BlockManager")),
@@ -124,15 +124,15 @@ _NAMES: dict[str, _Known] = {
 }
 
 
-# The C unpickler reserves memory for any index that a memo names; the one in Python does not, and its opcodes can be replaced.
+# The C unpickler allocates memory for any index that a memo names; the one in Python does not, and its opcodes can be replaced.
 class _TableUnpickler(pickle._Unpickler):
     stack: list[Any]
     append: Callable[[Any], None]
     read: Callable[[int], bytes]
     dispatch: ClassVar[dict[int, Any]] = dict(pickle._Unpickler.dispatch)
 
-    def find_class(self, module: str, name: str) -> _Known:
-        known = _NAMES.get(f"{module}.{name}")
+    def find_class(self, module: str, name: str) -> _Allowed:
+        known = _ALLOWED.get(f"{module}.{name}")
         if known is None:
             raise pickle.UnpicklingError(f"it names {module}.{name}, which a table does not need")
         return known
@@ -140,7 +140,7 @@ class _TableUnpickler(pickle._Unpickler):
     def load_call(self) -> None:
         args = self.stack.pop()
         known = self.stack.pop()
-        if not isinstance(known, _Known) or not isinstance(args, tuple):
+        if not isinstance(known, _Allowed) or not isinstance(args, tuple):
             raise pickle.UnpicklingError("it calls something that is not a class of tables")
         self.stack.append(known.make(*args))
 
@@ -190,7 +190,7 @@ def _columns(table: Any) -> Columns:
     columns: Columns = {}
     for values, place in blocks:
         rows = _values(values)
-        for k, column in enumerate(_places(place, len(names))):
+        for k, column in enumerate(_column_indices(place, len(names))):
             columns[names[column]] = rows if rows.ndim == 1 else rows[k]
     if len(set(map(len, columns.values()))) > 1 or len(columns) != len(names):
         raise ValueError("its columns are incomplete")
@@ -198,7 +198,7 @@ def _columns(table: Any) -> Columns:
 
 
 def _layout(manager: _Blocks) -> tuple[list[Any], list[tuple[Any, Any]]]:
-    """Axes, and values with their place of each block, of managers as written before and since pandas 1.3."""
+    """Axes, and values and column positions of each block, of managers as written before and since pandas 1.3."""
     if manager.args:
         blocks, axes = manager.args
         return axes, [(b.args[0], b.args[1]) for b in blocks]
@@ -206,16 +206,16 @@ def _layout(manager: _Blocks) -> tuple[list[Any], list[tuple[Any, Any]]]:
     return inner["axes"], [(b["values"], b["mgr_locs"]) for b in inner["blocks"]]
 
 
-def _places(place: Any, count: int) -> list[int]:
+def _column_indices(place: Any, count: int) -> list[int]:
     if isinstance(place, slice):
         if not all(isinstance(v, int) for v in (place.start, place.stop, place.step)):
-            raise ValueError("a block has no place")
+            raise ValueError("a block has no columns")
         return list(range(count))[place]
     return [int(p) for p in _values(place)]
 
 
 def _values(part: Any) -> NDArray[Any]:
-    """The array behind a part."""
+    """Array that a placeholder stands for."""
     if isinstance(part, _Index):
         return _values(part.args[1]["data"])
     if isinstance(part, _Strings):
@@ -224,7 +224,7 @@ def _values(part: Any) -> NDArray[Any]:
         data, dtype, shape, order = part.args
         return _from_bytes(data, _dtype(dtype), shape, order)
     if not isinstance(part, _Array):
-        raise ValueError(f"a {type(part).__name__.strip('_')} stands where an array was expected")
+        raise ValueError(f"a {type(part).__name__.strip('_')} where an array was expected")
     _, shape, dtype, fortran, data = part.state
     if isinstance(data, list):
         cells = np.empty(len(data), dtype=object)

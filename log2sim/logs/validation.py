@@ -1,4 +1,4 @@
-"""Reads every record of a log and says what is wrong with it."""
+"""Validation of a log: reads every record and reports its problems."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from log2sim.errors import RecordError
 from log2sim.logs.native import READER
 from log2sim.logs.opening import open_log
 
-FAR_POINT_M = 1000.0
+MAX_POINT_DISTANCE_M = 1000.0
 
 
 def validate_log(
@@ -22,7 +22,7 @@ def validate_log(
     sequence: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[str]:
-    """Problems of a log, one line each; none when it is fine.
+    """List the problems of a log, one line each.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def validate_log(
         When the log cannot be opened at all.
     """
     log = open_log(path, format=format, sequence=sequence)
-    # Notes on foreign formats tell what the format lacks; in our own they tell what is wrong with the stamps.
+    # Notes on other formats say what the format lacks; those on native logs say what is wrong with the stamps.
     problems = list(log.notes) if log.format == READER.name else []
     total = sum(len(s.t_ns) for s in log.streams.values())
     done = 0
@@ -57,7 +57,7 @@ def validate_log(
 
 
 def _record(log: Log, stream: Stream, i: int) -> tuple[bool, str] | None:
-    """Whether a record cannot be read, and what is wrong with it."""
+    """Whether a record is unreadable, and its problem; None without one."""
     try:
         record = stream.read(i)
     except RecordError as error:
@@ -67,7 +67,7 @@ def _record(log: Log, stream: Stream, i: int) -> tuple[bool, str] | None:
     where = f"stream '{stream.name}', stamp {stream.t_ns[i]}"
     if not len(record.xyz_m):
         return False, f"{where}: the sweep has no points"
-    if record.frame == "lidar" and float(np.abs(record.xyz_m).max()) > FAR_POINT_M:
+    if record.frame == "lidar" and float(np.abs(record.xyz_m).max()) > MAX_POINT_DISTANCE_M:
         return False, f"{where}: a point is {np.abs(record.xyz_m).max():.0f} m from the LiDAR; are the units meters?"
     if record.t_ns is not None and np.abs(record.t_ns - stream.t_ns[i]).max() > 1_000_000_000:
         return False, f"{where}: the time of a point is more than 1 s off the stamp of its sweep"
@@ -75,7 +75,7 @@ def _record(log: Log, stream: Stream, i: int) -> tuple[bool, str] | None:
 
 
 def _coverage(log: Log) -> list[str]:
-    """Records of sensors on the ego at stamps at which its pose is not known."""
+    """List sensors on the ego with records at stamps where its pose is unknown."""
     problems = []
     for name, stream in log.streams.items():
         known = log.map_T_sensor(name, stream.t_ns)[1]

@@ -1,4 +1,4 @@
-"""Writes any log as a native log folder."""
+"""Writer of native log folders."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from log2sim.geometry import Array, Camera, quaternion_from_rotation, yaw_of
 from log2sim.logs.native import GNSS_COLUMNS, INDEX_COLUMNS, MANIFEST, POSE_COLUMNS
 from log2sim.logs.native_labels import BOX_2D_COLUMNS, BOX_3D_COLUMNS, REGION_COLUMNS
 
-POINT_STEP_M = 1e-3
+POINT_RESOLUTION_M = 1e-3
 # float32 resolves 1 mm up to about 8 km.
-FLOAT32_REACH_M = 8000.0
+MAX_FLOAT32_M = 8000.0
 
 Progress = Callable[[int, int], None]
 
@@ -38,7 +38,7 @@ def write_log(
     sweep: Literal["npz", "npy", "bin"] = "npz",
     progress: Progress | None = None,
 ) -> None:
-    """Write a log as a native log folder, whole or not at all.
+    """Write any log as a native log folder, whole or not at all.
 
     Parameters
     ----------
@@ -176,8 +176,8 @@ def _write_image(image: NDArray[np.uint8], folder: Path, i: int, jpeg_quality: i
 def _write_sweep(sweep: Sweep, folder: Path, i: int, kind: str, offset: Array) -> str:
     name = f"{i:06d}.{kind}"
     xyz = np.asarray(sweep.xyz_m, dtype=np.float64) + (offset if sweep.frame == "map" else 0.0)
-    near = len(xyz) == 0 or float(np.abs(xyz).max()) < FLOAT32_REACH_M
-    xyz = np.round(xyz / POINT_STEP_M) * POINT_STEP_M
+    near = len(xyz) == 0 or float(np.abs(xyz).max()) < MAX_FLOAT32_M
+    xyz = np.round(xyz / POINT_RESOLUTION_M) * POINT_RESOLUTION_M
     if near:
         xyz = xyz.astype(np.float32)
     if kind == "npz":

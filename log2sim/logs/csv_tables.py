@@ -1,4 +1,4 @@
-"""CSV tables of a log, read strictly: what is wrong is named by file, line and field."""
+"""CSV tables of a log, read strictly: errors name file, line and field."""
 
 from __future__ import annotations
 
@@ -16,22 +16,32 @@ from numpy.typing import NDArray
 from log2sim.errors import LogError
 from log2sim.registry import nearest
 
-TABLE_LIMIT_BYTES = 256 * 1024 * 1024
+MAX_TABLE_BYTES = 256 * 1024 * 1024
 # No coordinate on Earth, in any projection, is near this, and no square of it overflows.
-LARGEST_NUMBER = 1e8
+MAX_NUMBER = 1e8
 
 _DTYPE = {"int": np.int64, "float": np.float64}
 _EXPECTED = {
     "int": "a whole number",
-    "float": f"a finite number of at most {LARGEST_NUMBER:g} in size",
+    "float": f"a finite number of at most {MAX_NUMBER:g} in size",
     "bool": "0, 1, true or false",
     "str": "text",
 }
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
-    """Columns of equal length by name, and the line (N,) of the file each row stands on."""
+class CsvTable:
+    """A CSV file with typed columns.
+
+    Attributes
+    ----------
+    path : Path
+    columns : mapping of str to (N,) array
+    line : (N,) int64
+        Line of the file of each row, for messages.
+    sha256 : str
+        Of the file.
+    """
 
     path: Path
     columns: Mapping[str, NDArray[Any]]
@@ -39,21 +49,23 @@ class Table:
     sha256: str
 
     def __len__(self) -> int:
+        """Return the number of rows."""
         return len(self.line)
 
     def __getitem__(self, name: str) -> NDArray[Any]:
+        """Return a column (N,)."""
         return self.columns[name]
 
     def stack(self, *names: str) -> NDArray[np.float64]:
-        """Columns side by side, (N, len(names)) float64."""
+        """Stack columns to (N, len(names)) float64."""
         return np.stack([self.columns[n].astype(np.float64) for n in names], axis=1)
 
     def where(self, row: int, field: str) -> str:
-        """The place of a value, for a message."""
+        """Location of a value, for a message."""
         return f"{self.path}, line {self.line[row]}, field '{field}'"
 
 
-def read_table(path: Path, columns: Mapping[str, str], optional: Mapping[str, str] | None = None) -> Table:
+def read_csv_table(path: Path, columns: Mapping[str, str], optional: Mapping[str, str] | None = None) -> CsvTable:
     """Read a CSV file with a header.
 
     Parameters
@@ -70,8 +82,8 @@ def read_table(path: Path, columns: Mapping[str, str], optional: Mapping[str, st
     kinds = {**columns, **(optional or {})}
     if not path.is_file():
         raise LogError(f"{path}: no such file")
-    if path.stat().st_size > TABLE_LIMIT_BYTES:
-        raise LogError(f"{path}: {path.stat().st_size} bytes, more than the {TABLE_LIMIT_BYTES} that a table may have")
+    if path.stat().st_size > MAX_TABLE_BYTES:
+        raise LogError(f"{path}: {path.stat().st_size} bytes, more than the {MAX_TABLE_BYTES} that a table may have")
     data = path.read_bytes()
     try:
         reader = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
@@ -88,7 +100,7 @@ def read_table(path: Path, columns: Mapping[str, str], optional: Mapping[str, st
             raise LogError(f"{path}, line {n}: {len(row)} fields, the header has {len(header)}")
     cells = {name: [row[k].strip() for _, row in rows[1:]] for k, name in enumerate(header)}
     values = {name: _parse(path, line, name, text, kinds[name]) for name, text in cells.items()}
-    return Table(path, values, line, hashlib.sha256(data).hexdigest())
+    return CsvTable(path, values, line, hashlib.sha256(data).hexdigest())
 
 
 def _check_header(path: Path, header: list[str], columns: Mapping[str, str], kinds: Mapping[str, str]) -> None:
@@ -100,7 +112,7 @@ def _check_header(path: Path, header: list[str], columns: Mapping[str, str], kin
             hint = nearest(name, list(kinds))
             raise LogError(f"{path}, line 1: unknown column '{name}'{hint}; known: {', '.join(kinds)}")
         if header.count(name) > 1:
-            raise LogError(f"{path}, line 1: column '{name}' stands twice")
+            raise LogError(f"{path}, line 1: column '{name}' occurs twice")
 
 
 def _parse(path: Path, line: NDArray[np.int64], name: str, text: list[str], kind: str) -> NDArray[Any]:
@@ -113,39 +125,22 @@ def _parse(path: Path, line: NDArray[np.int64], name: str, text: list[str], kind
     else:
         try:
             values = np.array(text, dtype=np.str_).astype(_DTYPE[kind])
-            good = list(_in_reach(values))
+            good = list(_is_possible(values))
         except (ValueError, OverflowError):
-            values, good = np.zeros(0), [_is(t, kind) for t in text]
+            values, good = np.zeros(0), [_parses(t, kind) for t in text]
     if not all(good):
         k = good.index(False)
         raise LogError(f"{path}, line {line[k]}, field '{name}': '{text[k][:40]}', expected {_EXPECTED[kind]}")
     return values
 
 
-def _is(text: str, kind: str) -> bool:
+def _parses(text: str, kind: str) -> bool:
     try:
-        return bool(_in_reach(np.array([text]).astype(_DTYPE[kind]))[0])
+        return bool(_is_possible(np.array([text]).astype(_DTYPE[kind]))[0])
     except (ValueError, OverflowError):
         return False
 
 
-def _in_reach(values: NDArray[Any]) -> NDArray[np.bool_]:
-    """Which numbers are finite and, unless whole (stamps), not beyond all sense."""
-    return np.isfinite(values) & ((np.abs(values) <= LARGEST_NUMBER) | (values.dtype.kind == "i"))
-
-
-def in_order(t_ns: NDArray[np.int64], what: str) -> tuple[NDArray[np.intp], list[str]]:
-    """Rows to keep so that stamps strictly increase, and notes on what was wrong.
-
-    Late records are put in their place; of several with one stamp the first is kept.
-    """
-    order = np.argsort(t_ns, kind="stable")
-    notes = []
-    late = np.flatnonzero(t_ns[1:] < np.maximum.accumulate(t_ns)[:-1]) + 1
-    if len(late):
-        notes.append(f"{what}: {len(late)} of {len(t_ns)} records out of order, first at stamp {t_ns[late[0]]}; sorted")
-    again = np.flatnonzero(np.diff(t_ns[order]) == 0) + 1
-    if len(again):
-        first = t_ns[order[again[0]]]
-        notes.append(f"{what}: {len(again)} of {len(t_ns)} records repeat a stamp, first at stamp {first}; dropped")
-    return np.delete(order, again), notes
+def _is_possible(values: NDArray[Any]) -> NDArray[np.bool_]:
+    """Which numbers are finite and, unless whole (stamps), at most `MAX_NUMBER`."""
+    return np.asarray(np.isfinite(values) & ((np.abs(values) <= MAX_NUMBER) | (values.dtype.kind == "i")))

@@ -1,0 +1,96 @@
+"""Sweeps of PandaSet: both LiDARs in one pickled table each, times of the PandarGT only in its points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property, lru_cache
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Stream, Sweep
+from log2sim.errors import RecordError
+from log2sim.geometry import NS_PER_S
+from log2sim.logs.stamps import strictly_increasing
+from log2sim.logs.sweeps import sweep_of
+from log2sim.logs.unpickle import Columns, read_pickled_table
+
+# Value of the column "d" by LiDAR.
+LIDARS: Mapping[str, int] = {"pandar64": 0, "pandargt": 1}
+# Unix times beyond this do not fit into int64 nanoseconds.
+MAX_TIME_S = 9e9
+READING_THREADS = 4
+
+
+class SweepFiles:
+    """Files of a sequence, each with the points of both LiDARs; stamps of the PandarGT are read when first used."""
+
+    def __init__(self, files: dict[int, Path], t_ns: NDArray[np.int64], notes: list[str]) -> None:
+        self._files, self._t_ns, self._notes = files, t_ns, notes
+        self._indexes: dict[str, tuple[NDArray[np.int64], list[Path]]] = {}
+        self._lock = Lock()
+
+    def stream(self, lidar: str) -> Stream:
+        """Return the stream of one LiDAR."""
+
+        def read(i: int) -> Sweep:
+            t_ns, files = self.index(lidar)
+            return _read_sweep(files[i], int(t_ns[i]), LIDARS[lidar])
+
+        return Stream(lidar, lambda: self.index(lidar)[0], read)
+
+    def index(self, lidar: str) -> tuple[NDArray[np.int64], list[Path]]:
+        """Return stamps (F,) and files of the sweeps of one LiDAR, in order."""
+        with self._lock:
+            if lidar not in self._indexes:
+                t_ns = self._t_ns if lidar == "pandar64" else self.gt_stamps
+                numbers = np.array(list(self._files))
+                keep, problems = strictly_increasing(t_ns[numbers], lidar)
+                self._notes += problems
+                self._indexes[lidar] = t_ns[numbers[keep]], [self._files[int(n)] for n in numbers[keep]]
+            return self._indexes[lidar]
+
+    @cached_property
+    def gt_stamps(self) -> NDArray[np.int64]:
+        """Middle (N,) of the PandarGT's points of each sweep; the sweep's stamp where it cannot be read."""
+        stamps = self._t_ns.copy()
+        with ThreadPoolExecutor(READING_THREADS) as pool:
+            for number, stamp in zip(self._files, pool.map(_gt_middle_ns, self._files.values())):
+                stamps[number] = stamps[number] if stamp is None else stamp
+        return stamps
+
+
+def _gt_middle_ns(path: Path) -> int | None:
+    try:
+        columns: Mapping[str, NDArray[Any]] = read_pickled_table(path)
+        t_s = columns["t"][columns["d"] == LIDARS["pandargt"]]
+        middle_s = (float(np.nanmin(t_s)) + float(np.nanmax(t_s))) / 2 if len(t_s) else np.nan
+    except (RecordError, KeyError, TypeError):
+        return None
+    return round(middle_s * NS_PER_S) if np.isfinite(middle_s) else None
+
+
+# One file holds the sweeps of both LiDARs, which are read one after the other.
+@lru_cache(maxsize=4)
+def _read_points(path: Path) -> Columns:
+    return read_pickled_table(path)
+
+
+def _read_sweep(path: Path, t_ns: int, number: int) -> Sweep:
+    where = f"{path} (stamp {t_ns})"
+    try:
+        columns = _read_points(path)
+        rows = columns["d"] == number
+        xyz = np.stack([columns[k][rows] for k in ("x", "y", "z")], axis=1)
+        t_s = columns["t"][rows]
+        if xyz.dtype.kind != "f" or t_s.dtype.kind != "f":
+            raise RecordError(f"{where}: columns x, y, z, t are {xyz.dtype} and {t_s.dtype}, expected numbers")
+    except KeyError as missing:
+        raise RecordError(f"{where}: no column {missing}; expected x, y, z, i, t, d") from None
+    timed = np.isfinite(t_s) & (np.abs(t_s) < MAX_TIME_S)
+    xyz, offset_ns = xyz[timed], np.round(t_s[timed] * NS_PER_S).astype(np.int64) - t_ns
+    return sweep_of(xyz, t_ns, offset_ns, "map")

@@ -1,0 +1,258 @@
+"""Parsers of logs on arbitrary bytes raise nothing but our errors; any small log survives writing and reading."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from log2sim.datatypes import EgoVehicle, Lidar, Log, MapFrame, Stream, Sweep
+from log2sim.errors import LogError, RecordError
+from log2sim.geometry import Camera, PoseTrack, rotation_from_rpy, transform
+from log2sim.logs.csv_tables import read_csv_table
+from log2sim.logs.images import read_image
+from log2sim.logs.kitti import parse_oxts
+from log2sim.logs.kitti_labels import parse_labels
+from log2sim.logs.opening import open_log
+from log2sim.logs.sweeps import read_sweep
+from log2sim.logs.unpickle import read_pickled_table
+from log2sim.logs.writer import write_log
+
+quick = settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
+COLUMNS = {"t_ns": "int", "x_m": "float", "name": "str", "flag": "bool"}
+
+
+def npy(array: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array)
+    return stream.getvalue()
+
+
+def npz(**arrays: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)
+    return stream.getvalue()
+
+
+POINTS = np.arange(12.0).reshape(4, 3)
+PCD = (
+    b"VERSION 0.7\nFIELDS x y z t\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA "
+    b"binary\n" + np.arange(8, dtype="<f4").tobytes()
+)
+SWEEPS = {
+    ".bin": np.arange(16, dtype="<f4").tobytes(),
+    ".npy": npy(POINTS),
+    ".npz": npz(xyz_m=POINTS, t_offset_ns=np.arange(4)),
+    ".pcd": PCD,
+}
+
+
+@st.composite
+def damaged(draw: st.DrawFn, sound: bytes) -> bytes:
+    """A sound file with some bytes replaced, removed or inserted, or something else altogether."""
+    data = bytearray(sound)
+    for _ in range(draw(st.integers(0, 4))):
+        begin = draw(st.integers(0, len(data)))
+        end = min(len(data), begin + draw(st.integers(0, 8)))
+        data[begin:end] = draw(st.binary(max_size=8))
+    return draw(st.sampled_from([bytes(data), bytes(data), bytes(data[: len(data) // 2])]) | st.binary(max_size=200))
+
+
+def result_or_refusal(parse: Callable[[], Any], error: type[Exception], where: str) -> Any:
+    """What a parser returns; None for an error that says where, while any other error passes on."""
+    try:
+        return parse()
+    except error as problem:
+        if where not in str(problem):
+            raise AssertionError(f"'{problem}' does not say {where}") from problem
+        return None
+
+
+@pytest.mark.parametrize("suffix", SWEEPS)
+@quick
+@given(data=st.data())
+def test_a_damaged_sweep_is_a_record_error_or_a_sweep(tmp_path: Path, suffix: str, data: st.DataObject) -> None:
+    path = tmp_path / f"sweep{suffix}"
+    path.write_bytes(data.draw(damaged(SWEEPS[suffix])))
+    sweep = result_or_refusal(lambda: read_sweep(path, 10**18), RecordError, str(path))
+    if sweep is not None:
+        assert sweep.xyz_m.shape[1] == 3
+        assert np.isfinite(sweep.xyz_m).all()
+        assert sweep.t_ns is None or sweep.t_ns.shape == (len(sweep.xyz_m),)
+
+
+@quick
+@given(data=damaged(b"t_ns,x_m,name,flag\n1,2.5,a,true\n2,-3e2,b,0\n"))
+def test_a_damaged_table_is_a_log_error_or_a_table(tmp_path: Path, data: bytes) -> None:
+    path = tmp_path / "table.csv"
+    path.write_bytes(data)
+    table = result_or_refusal(lambda: read_csv_table(path, COLUMNS), LogError, str(path))
+    if table is not None:
+        assert {len(table[name]) for name in COLUMNS} == {len(table)}
+        assert np.isfinite(table["x_m"]).all()
+
+
+@quick
+@given(
+    rows=st.lists(
+        st.tuples(
+            st.integers(-(2**63), 2**63 - 1),
+            st.floats(-1e8, 1e8),
+            st.text(st.characters(categories=["L", "N", "P"]), max_size=6),
+            st.booleans(),
+        ),
+        max_size=8,
+    )
+)
+def test_a_written_table_reads_back(tmp_path: Path, rows: list[tuple[int, float, str, bool]]) -> None:
+    import csv
+
+    path = tmp_path / "table.csv"
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        csv.writer(stream).writerows([list(COLUMNS), *rows])
+    table = read_csv_table(path, COLUMNS)
+    back = list(zip(*(table[name].tolist() for name in COLUMNS), strict=True))
+    assert back == [(t, x, name.strip(), flag) for t, x, name, flag in rows]
+
+
+def sound_pickle() -> bytes:
+    pandas = pytest.importorskip("pandas")
+    return pickle.dumps(pandas.DataFrame({"x": np.arange(3.0), "d": np.arange(3), "word": ["a", "b", "c"]}))
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@quick
+@given(data=st.data())
+def test_a_damaged_pickle_is_an_error_or_a_table(tmp_path: Path, packed: bool, data: st.DataObject) -> None:
+    content = data.draw(damaged(sound_pickle()))
+    path = tmp_path / "table.pkl"
+    path.write_bytes(gzip.compress(content) if packed else content)
+    columns = result_or_refusal(lambda: read_pickled_table(path, limit_bytes=10_000_000), RecordError, str(path))
+    assert columns is None or len({len(values) for values in columns.values()}) <= 1
+
+
+@pytest.mark.parametrize("head", [b"", b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\0\x04\0\0\0\x04"])
+@quick
+@given(data=st.binary(max_size=300))
+def test_bytes_that_are_no_image_are_a_record_error(tmp_path: Path, head: bytes, data: bytes) -> None:
+    path = tmp_path / "image.jpg"
+    path.write_bytes(head + data)
+    with pytest.raises(RecordError, match="image"):
+        read_image(path, 0, 4, 4)
+
+
+WORDS = st.sampled_from(["0", "1", "-1", "Car", "DontCare", "nan", "1e400", "x", "3.5", "\n", "\n\n"])
+ANY_TEXT = st.text(max_size=200) | st.lists(WORDS, max_size=60).map(" ".join)
+
+
+@quick
+@given(text=ANY_TEXT)
+def test_any_text_is_a_log_error_or_rows_of_oxts(text: str) -> None:
+    rows = result_or_refusal(lambda: parse_oxts(text, "file"), LogError, "file, line")
+    assert rows is None or (rows.shape[1] == 30 and np.isfinite(rows).all())
+
+
+@quick
+@given(text=ANY_TEXT)
+def test_any_text_is_a_log_error_or_labels_of_kitti(text: str) -> None:
+    rows = result_or_refusal(lambda: parse_labels(text, Path("file")), LogError, "file, line")
+    assert rows is None or (rows.values.shape == (len(rows.frame), 14) and np.isfinite(rows.values).all())
+
+
+@quick
+@given(data=st.data())
+def test_a_damaged_manifest_is_a_log_error_or_a_log(tiny_folder: Path, data: st.DataObject) -> None:
+    manifest = tiny_folder / "log.json"
+    sound = manifest.read_bytes()
+    try:
+        manifest.write_bytes(data.draw(damaged(sound)))
+        open_log(tiny_folder)
+    except LogError:
+        pass
+    finally:
+        manifest.write_bytes(sound)
+
+
+coordinate = st.floats(-500.0, 500.0).map(lambda v: round(v, 3))
+angle = st.floats(-3.0, 3.0)
+
+
+@st.composite
+def small_logs(draw: st.DrawFn) -> Log:
+    """One camera and one LiDAR on an ego, or on a pole, with uneven stamps and arbitrary points."""
+    count = draw(st.integers(2, 4))
+    begin = draw(st.integers(-(10**15), 2 * 10**18))
+    steps = draw(st.lists(st.integers(1, 10**9), min_size=count - 1, max_size=count - 1))
+    t_ns = begin + np.concatenate([[0], np.cumsum(steps)]).astype(np.int64)
+    roadside = draw(st.booleans())
+    mount: Any = "map" if roadside else "ego"
+    pose = transform(
+        rotation_from_rpy(*(draw(angle) for _ in range(3))), np.array([draw(coordinate) for _ in range(3)])
+    )
+    far = draw(st.sampled_from([0.0, 457_000.0])) if roadside else 0.0
+    pose[:3, 3] += far
+    frame: Any = draw(st.sampled_from(["lidar", "map"]))
+    clouds = [
+        np.array(draw(st.lists(st.tuples(coordinate, coordinate, coordinate), max_size=5)), dtype=np.float64).reshape(
+            -1, 3
+        )
+        + (far if frame == "map" else 0.0)
+        for _ in range(count)
+    ]
+    timed = draw(st.booleans())
+    offsets = [np.array([draw(st.integers(-(10**8), 10**8)) for _ in cloud], dtype=np.int64) for cloud in clouds]
+    position = np.array([[draw(coordinate), draw(coordinate), 0.0] for _ in range(count)])
+    ego = PoseTrack(
+        t_ns, transform(rotation_from_rpy(0.0, 0.0, np.array([draw(angle) for _ in range(count)])), position)
+    )
+    K = np.array([[50.0, 0.0, 7.5], [0.0, 50.0, 7.5], [0.0, 0.0, 1.0]])
+    image = np.full((16, 16, 3), draw(st.integers(0, 255)), np.uint8)
+    return Log(
+        name="any",
+        format="memory",
+        cameras={"cam": Camera("cam", 16, 16, K, mount, pose)},
+        lidars={"lidar": Lidar("lidar", mount, pose)},
+        streams={
+            "cam": Stream("cam", t_ns, lambda i: image),
+            "lidar": Stream(
+                "lidar", t_ns, lambda i: Sweep(int(t_ns[i]), clouds[i], frame, t_ns[i] + offsets[i] if timed else None)
+            ),
+        },
+        ego=None if roadside else ego,
+        ego_vehicle=EgoVehicle(),
+        map=MapFrame(),
+    )
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(log=small_logs())
+def test_any_small_log_survives_writing_and_reading(tmp_path: Path, log: Log) -> None:
+    write_log(log, tmp_path / "log", overwrite=True)
+    back = open_log(tmp_path / "log")
+    assert back.notes == ()
+    offset = np.array(back.map.offset_m)
+    for name, stream in log.streams.items():
+        np.testing.assert_array_equal(back.streams[name].t_ns, stream.t_ns)
+        ours, known = log.map_T_sensor(name, stream.t_ns)
+        theirs, also = back.map_T_sensor(name, stream.t_ns)
+        theirs[:, :3, 3] += offset
+        np.testing.assert_array_equal(known, also)
+        np.testing.assert_allclose(theirs, ours, atol=1e-9)
+    for i in range(len(log.streams["lidar"].t_ns)):
+        a, b = log.streams["lidar"].read(i), back.streams["lidar"].read(i)
+        np.testing.assert_allclose(b.xyz_m + (offset if b.frame == "map" else 0.0), a.xyz_m, atol=6e-4)
+        assert b.frame == a.frame
+        assert (a.t_ns is None) == (b.t_ns is None)
+        if a.t_ns is not None:
+            np.testing.assert_array_equal(b.t_ns, a.t_ns)
+        assert np.abs(back.streams["cam"].read(i).astype(int) - log.streams["cam"].read(i)).max() <= 3
