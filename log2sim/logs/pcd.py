@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from log2sim.geometry import NS_PER_S
 
 MAX_HEADER_BYTES = 16 * 1024
+# Unix times beyond this do not fit into int64 nanoseconds.
+MAX_TIME_S = 9e9
 TIME_FIELDS = ("t_offset_ns", "offset", "t", "timestamp")
 
 
@@ -112,4 +114,6 @@ def _offset_ns(values: NDArray[Any], t_ns: int, *, absolute: bool) -> NDArray[np
         return values.astype(np.int64) - (t_ns if absolute else 0)
     seconds = values.astype(np.float64)
     seconds = np.where(np.isfinite(seconds), seconds, 0.0)
+    if np.abs(seconds).max(initial=0.0) > MAX_TIME_S:
+        raise ValueError(f"a point has the time {np.abs(seconds).max():g} s, expected at most {MAX_TIME_S:g}")
     return np.round((seconds - (t_ns / NS_PER_S if absolute else 0.0)) * NS_PER_S).astype(np.int64)
