@@ -1,4 +1,4 @@
-"""The simulator shim: scenarios as vehicles that follow their waypoints, and a place for the user's own ego."""
+"""Simulate scenarios: vehicles follow their logged trajectories, and the user's policy may drive the ego."""
 
 from __future__ import annotations
 

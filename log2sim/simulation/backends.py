@@ -1,8 +1,4 @@
-"""What the replay asks of a simulator, and the embedded one.
-
-A simulator moves all agents at once by stateless steps. Another vehicle model is made usable by a line in `STEPS`, another
-simulator by giving it the two functions of `Simulator`, and one that runs elsewhere (a game engine) as a `ExternalSimulator`.
-"""
+"""The simulators that `--simulator` can name."""
 
 from __future__ import annotations
 
@@ -16,7 +12,8 @@ SIMULATORS = ("own", "carla")
 
 
 def external_simulator(name: str, address: str | None, port: int | None, map: str | None) -> ExternalSimulator | None:
-    """The simulator of a name, at an address and port, with a town or an OpenDRIVE file to load; None for the own one.
+    """Return the simulator of a name, connected by address and port, with a town or OpenDRIVE file to load; None for
+    the embedded one.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Who drives each agent of a scenario, and the groups that this makes."""
+"""Assigns a driver to each agent of a scenario, and builds the groups of agents that are driven alike."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from log2sim.simulation.vehicles.model_choice import ModelChoice, choose_model, 
 from log2sim.simulation.vehicles.parameters import STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
 
 DriverAssignment = dict[str, list[Agent]]
-"""Agents by what drives them: "policy", "reactive", "pid", "exact" or, with one pose for good, "static"."""
+"""Agents by driver: "policy", "reactive", "pid", "exact", or "static" for those that never move."""
 
 
 def assign_drivers(
     agents: Sequence[Agent], mode: str, *, drives_ego: bool, reactive: Collection[str] = ()
 ) -> DriverAssignment:
-    """Who is driven by what; ids in `reactive` are of agents that can be."""
+    """Assign a driver to each agent; `reactive` holds the ids of agents that react, see `reactive_ids`."""
     cast: DriverAssignment = {"policy": [], "reactive": [], "pid": [], "exact": [], "static": []}
     for agent in agents:
         if drives_ego and agent.id == EGO:
@@ -52,7 +52,7 @@ def assign_drivers(
 
 
 def reactive_ids(agents: Sequence[Agent], wanted: str | Collection[str], *, drives_ego: bool) -> frozenset[str]:
-    """Ids of the agents that react: all that can for "reactive", none for "log", or those named.
+    """Return the ids of the agents that react: all that can for "reactive", none for "log", or those named.
 
     Raises
     ------
@@ -76,7 +76,7 @@ def reactive_ids(agents: Sequence[Agent], wanted: str | Collection[str], *, driv
 def agent_groups(
     cast: Mapping[str, Sequence[Agent]], clock: StepClock, mode: str = "pid", model: str = "auto"
 ) -> tuple[list[AgentGroup], dict[str, ModelChoice]]:
-    """The groups that have agents, and by id the model that moves each vehicle; static agents are in none."""
+    """Build the groups that have agents, and choose by id the model that moves each vehicle; static agents are in no group."""
     groups: list[AgentGroup] = []
     choices: dict[str, ModelChoice] = {}
     controlled: list[tuple[str, type[VehicleGroup], type[PedestrianGroup]]] = [
@@ -110,7 +110,7 @@ def agent_groups(
 def _vehicle_groups(
     agents: Sequence[Agent], kind: type[VehicleGroup], clock: StepClock, model: str, choices: dict[str, ModelChoice]
 ) -> list[AgentGroup]:
-    """Groups of vehicles, one for each model that moves some of them; what moves each is added to `choices`."""
+    """Build one group of vehicles for each model in use; the choice for each vehicle is added to `choices`."""
     groups: list[AgentGroup] = []
     references = {a.id: vehicle_reference_of(a, clock.dt_s) for a in agents}
     for a in agents:
@@ -130,7 +130,7 @@ def _vehicle_groups(
 
 
 def reactive_traffic(agents: Sequence[Agent], groups: Sequence[AgentGroup], clock: StepClock) -> Traffic | None:
-    """What the reactive groups decide by, with which they are connected; None where nobody reacts."""
+    """Build the traffic model of the reactive groups and connect them with it; None when no agent reacts."""
     reacting = [g for g in groups if isinstance(g, ReactiveGroup)]
     if not reacting:
         return None
@@ -144,14 +144,14 @@ def reactive_traffic(agents: Sequence[Agent], groups: Sequence[AgentGroup], cloc
 
 
 def _static_trajectory(agent: Agent) -> Trajectory:
-    """The path of a static agent: it stands, as long as it lives."""
+    """Return the trajectory of a static agent: its first pose throughout its lifetime."""
     w = agent.waypoints
     first = {k: np.full(len(w), getattr(w, k)[0]) for k in ("x_m", "y_m", "z_m", "yaw_rad")}
     return Trajectory.through(replace(w, **first, speed_mps=np.zeros(len(w))))
 
 
 def _lifespans(agents: Sequence[Agent], clock: StepClock) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """First and last step (A,), (A,) of each agent; the last before the first where a life lies between two steps."""
+    """Return the first and last step (A,), (A,) of each agent; last < first when an agent lives between two steps only."""
     begin = np.array([a.waypoints.t_s[0] for a in agents])
     end = np.array([a.waypoints.t_s[-1] for a in agents])
     return clock.first_step(begin), clock.last_step(end)

@@ -1,6 +1,6 @@
 """A gymnasium environment in which an agent drives the ego of a scenario (extra `gym`).
 
-import gymnasium, log2sim.replay.env
+import gymnasium, log2sim.simulation.env
 env = gymnasium.make("log2sim/Scenario-v0", scenario="scenario.json")
 """
 
@@ -27,14 +27,14 @@ except ImportError as error:
 ID = "log2sim/Scenario-v0"
 
 PATH_EVERY_M, PATH_ROWS = 5, 10
-# Bounds of what is observed: no road user is faster, brakes harder or is larger.
+# Bounds of the observation space: no road user is faster, brakes harder or is larger.
 MAX_SPEED_MPS, MAX_ACCEL_MPS2, MAX_LENGTH_M, MAX_WIDTH_M = 80.0, 15.0, 60.0, 10.0
-PATH_BOUND_M = 60.0  # the last row of the path is 50 m ahead, seen by an ego that is at most `LOST_M` off it
+PATH_BOUND_M = 60.0  # the last row of the path is 50 m ahead, and the ego is at most `LOST_M` off the path
 
-# What a step costs, in meters of way gone.
+# Costs of a step, in meters of progress.
 OFF_PATH_PER_M_S = 0.2
 COLLISION = 100.0
-LOST_M = 15.0  # so far off the path an episode ends
+LOST_M = 15.0  # distance from the path at which an episode ends
 
 PICTURE_PX, PICTURE_M = 400, 80.0
 
@@ -50,21 +50,21 @@ class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
     dt_s : float
         Simulation step.
     hold_s : float
-        Each action holds for so long: a multiple of `dt_s`.
+        How long each action holds, a multiple of `dt_s`.
     agents : {"reactive", "log"} or collection of str
-        What the other agents do; see `log2sim.simulation.runner.replay`.
+        Behavior of the other agents; see `log2sim.simulation.runner.replay`.
     sight_m : float
-        How far others are seen.
+        Range within which others are observed.
     max_others : int
         Rows for the nearest others.
     render_mode : {"rgb_array"}, optional
 
     Notes
     -----
-    Action, `Box(-1, 1, (2,))` float32: the pedal (full brake to full throttle) and the steering (full lock to the right to
-    full lock to the left), as shares of what the vehicle can do: `accel_limits_mps2`, `max_steer_rad`.
+    Action, `Box(-1, 1, (2,))` float32: the pedal (full brake to full throttle) and the steering (full lock right to full
+    lock left), as shares of the vehicle's limits `accel_limits_mps2` and `max_steer_rad`.
 
-    Observation, a dictionary of float32 boxes; values beyond a bound are put on it:
+    Observation, a dictionary of float32 boxes; values are clipped to their bounds:
 
     - `ego` (5,): speed in m/s, acceleration in m/s2, steering angle in rad, offset from the recorded path in m (left
       positive), heading against it in rad.
@@ -73,10 +73,10 @@ class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
       axes), heading against the ego's in rad, length, width in m. Rows without an agent are 0.
     - `others_mask` (max_others,) int8: 1 where a row has an agent.
 
-    Reward of a step: the way gone along the recorded path in m, less 0.2 per second and meter of offset from it, less 100 for
-    a collision; `info["reward"]` has the parts. The episode terminates with a collision or at the end of the recorded path,
-    and is truncated when the recorded time is over, or the ego leaves the path by more than 15 m. Nothing is random: seeds
-    give the same episode.
+    Reward of a step: progress along the recorded path in m, less 0.2 per second and meter of offset from it, less 100 for
+    a collision; `info["reward"]` holds the terms. The episode terminates with a collision or at the end of the recorded path,
+    and is truncated when the recorded time is over, or when the ego is more than 15 m off the path. The environment is
+    deterministic; the seed has no effect.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
@@ -117,7 +117,7 @@ class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[ObservationArrays, dict[str, Any]]:
-        """Start the scenario again, at the moment when the ego appears."""
+        """Start the scenario again, at the time when the ego appears."""
         super().reset(seed=seed)
         self.world.restart()
         while not self.world.ego_lives:
@@ -156,11 +156,13 @@ class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
         return self._shown(), float(sum(parts.values())), collides or arrived, truncated, info
 
     def render(self) -> Any:
-        """The surroundings of the ego from above, (400, 400, 3) uint8, its front to the right; None without a render mode."""
+        """Draw the surroundings of the ego from above, (400, 400, 3) uint8, ego's front to the right; None without a
+        render mode.
+        """
         return _rendered(self._seen) if self._begun and self.render_mode == "rgb_array" else None
 
     def _shown(self) -> ObservationArrays:
-        """The observation as arrays within the bounds of its space."""
+        """Convert the observation to arrays within the bounds of their spaces."""
         seen, ego = self._seen, self._seen.ego
         ahead = np.arange(1, PATH_ROWS + 1) * PATH_EVERY_M
         path = (*_in_ego_frame(ego, seen.path.x_m[ahead], seen.path.y_m[ahead]), seen.path.speed_mps[ahead])
@@ -186,7 +188,7 @@ class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
 
 
 def _action_values(action: Any) -> tuple[float, float]:
-    """The pedal and the steering of an action, as shares from -1 to 1."""
+    """Check an action and return pedal and steering in [-1, 1]."""
     values = np.asarray(action, dtype=np.float64)
     if values.shape != (2,) or not np.isfinite(values).all():
         raise ValueError(f"action {action!r}: expected two finite numbers from -1 to 1, pedal and steering")
@@ -195,18 +197,18 @@ def _action_values(action: Any) -> tuple[float, float]:
 
 
 def _in_ego_axes(ego: EgoState, x: Array, y: Array) -> tuple[Array, Array]:
-    """Forward and left components (N,), (N,) of vectors on the map's axes."""
+    """Rotate vectors (N,), (N,) from map axes to forward and left of the ego."""
     cos, sin = np.cos(ego.yaw_rad), np.sin(ego.yaw_rad)
     return x * cos + y * sin, y * cos - x * sin
 
 
 def _in_ego_frame(ego: EgoState, x_m: Array, y_m: Array) -> tuple[Array, Array]:
-    """Points (N,), (N,) of the map seen from the ego's box center: forward, left."""
+    """Transform points (N,), (N,) from the map to forward and left of the ego's box center."""
     return _in_ego_axes(ego, x_m - ego.x_m, y_m - ego.y_m)
 
 
 def _path_errors(seen: Observation) -> tuple[Array, Array]:
-    """Offset of the ego to the left of its path in m, and its heading against it in rad."""
+    """Return the ego's offset to the left of its path in m, and its heading relative to it in rad."""
     x, y, yaw = seen.path.x_m[0], seen.path.y_m[0], seen.path.yaw_rad[0]
     dx, dy = seen.ego.x_m - x, seen.ego.y_m - y
     return dy * np.cos(yaw) - dx * np.sin(yaw), wrap_angle(seen.ego.yaw_rad - yaw)
@@ -222,7 +224,7 @@ def _collides(seen: Observation) -> bool:
 
 
 def _rendered(seen: Observation) -> Any:
-    """The ego, its path and the others, drawn."""
+    """Draw the ego, its path and the other agents."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import PolyCollection
     from matplotlib.figure import Figure

@@ -1,8 +1,9 @@
-"""The course nearest to an agent's waypoints that a vehicle can drive.
+"""The feasible trajectory nearest to an agent's waypoints.
 
-Reconstructed waypoints need not fit a vehicle: a heading that is a few degrees off, a box that creeps sideways, a turn
-tighter than full lock. A controller can only trade such faults against each other, with a delay. So they are settled
-beforehand, over the whole life at once: the box centers bind, the headings advise, and the rear axle rolls.
+Reconstructed waypoints need not suit a vehicle: a heading is a few degrees off, a box creeps sideways, a turn is
+tighter than full lock. A controller could only trade such errors against each other, and late. So a trajectory without
+them is fitted beforehand, over the whole lifetime at once: box centers weigh most, headings less, and the rear axle
+rolls without slip.
 """
 
 from __future__ import annotations
@@ -18,39 +19,63 @@ from numpy.typing import NDArray
 from log2sim.geometry import Array, wrap_angle
 
 KNOT_S = 0.1
-MAX_KNOTS = 60_000  # 100 minutes; a longer life is followed as logged
+MAX_KNOTS = 60_000  # 100 minutes; a longer trajectory is followed as logged
 
-POSITION_M = 0.1  # standard deviations of what the log says, at every knot
+POSITION_M = 0.1  # standard deviations of the logged states, at every knot
 YAW_RAD = 0.1
 SPEED_MPS = 0.5
-JERK_MPS3 = 20.0  # and of what a driver does
+JERK_MPS3 = 20.0  # standard deviations of a driver's inputs
 LATERAL_JERK_MPS3 = 20.0
-ROLL_M, ROLL_RAD, ROLL_MPS = 1e-3, 1e-3, 1e-2  # how exactly the wheels roll from knot to knot
-LOCK_SHARE = 0.95  # the rest of the lock is left to the controller
+ROLL_M, ROLL_RAD, ROLL_MPS = 1e-3, 1e-3, 1e-2  # standard deviations of rolling without slip from knot to knot
+LOCK_SHARE = 0.95  # the rest of the steering range is left to the controller
 LIMIT_SIGMA_SHARE = 0.002  # softness of limits, as a share of them
 
 MAX_ITERATIONS, MAX_DAMPING_TRIALS = 40, 16
 MIN_RELATIVE_GAIN = 1e-4  # relative gain at which the iteration ends
 MIN_YAW_RATE_RADPS = 0.01
 X, Y, YAW, SPEED, ACCEL, CURVATURE = range(6)
-STATES = NEXT = 6  # the next knot's states are counted on
+STATES = NEXT = 6  # columns of a knot; those of the next knot follow
 DAMPING_SCALE = np.array([1 / POSITION_M, 1 / POSITION_M, 1 / YAW_RAD, 1 / SPEED_MPS, 1.0, 10.0]) ** 2
 
 
 @dataclass(frozen=True)
 class FeasibilityLimits:
-    """What a vehicle can do: curvature and its rate in time, acceleration ahead and sideways; and where its box center is."""
+    """What a vehicle can do.
+
+    Attributes
+    ----------
+    offset_m : float
+        From the rear axle forward to the box center.
+    max_curvature_1pm : float
+    max_curvature_rate_1pmps : float
+    max_accel_mps2 : float
+    max_lateral_mps2 : float
+        Below the 9 m/s2 of a dry road; the rest is left to the controller.
+    """
 
     offset_m: float
     max_curvature_1pm: float
     max_curvature_rate_1pmps: float
     max_accel_mps2: float
-    max_lateral_mps2: float = 8.0  # of a dry road's grip of 9 m/s2; the rest is left to the controller
+    max_lateral_mps2: float = 8.0
 
 
 @dataclass(frozen=True, eq=False)
 class FeasibleTrajectory:
-    """Rear axle at times `t_s` (K,): position in m, yaw in rad (unwrapped), signed speed, acceleration, curvature, all (K,)."""
+    """States of a rear axle that rolls without slip, at times `t_s` (K,).
+
+    Attributes
+    ----------
+    t_s : (K,) float64, s
+    x_m, y_m : (K,) float64, m
+    yaw_rad : (K,) float64
+        Unwrapped.
+    speed_mps : (K,) float64
+        Negative in reverse.
+    accel_mps2 : (K,) float64
+    curvature_1pm : (K,) float64
+        Positive to the left.
+    """
 
     t_s: Array
     x_m: Array
@@ -62,7 +87,7 @@ class FeasibleTrajectory:
 
     @cached_property
     def motion(self) -> tuple[Array, Array]:
-        """x, y, yaw and speed as rows (4, K), and their derivatives in time (4, K)."""
+        """x, y, yaw and speed as rows (4, K), and their time derivatives (4, K)."""
         cos, sin, v = np.cos(self.yaw_rad), np.sin(self.yaw_rad), self.speed_mps
         return (
             np.stack([self.x_m, self.y_m, self.yaw_rad, v]),
@@ -73,13 +98,13 @@ class FeasibleTrajectory:
 def fit_trajectory(
     t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps: Array, limits: FeasibilityLimits
 ) -> FeasibleTrajectory:
-    """Fit a course to box centers and headings at evenly spaced times (K,), K >= 2.
+    """Fit a feasible trajectory to box centers and headings at evenly spaced times (K,), K >= 2.
 
     Notes
     -----
     Least squares over all knots at once, by Gauss-Newton steps with Levenberg-Marquardt damping. Rolling without slip is a
     residual as well (direct multiple shooting, Bock & Plitt, 1984), which makes every step a banded system: cost O(K).
-    Headings and speeds enter by the pseudo-Huber loss, so a few that are far off are outvoted.
+    Headings and speeds enter by the pseudo-Huber loss, so outliers have little influence.
     """
     axis = _consistent_heading(yaw_rad)
     away = wrap_angle(yaw_rad - axis)
@@ -109,25 +134,25 @@ def fit_trajectory(
 def unfitted_trajectory(
     t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps: Array, limits: FeasibilityLimits
 ) -> FeasibleTrajectory:
-    """The course as the log has it, at times (K,), K >= 1: of a moment, or of a life too long to be fitted."""
+    """Return the logged trajectory at times (K,), K >= 1: for a single time, or a lifetime that is too long to be fitted."""
     return FeasibleTrajectory(t_s, *_initial_states(t_s, x_m, y_m, yaw_rad, speed_mps, limits).T)
 
 
 def _consistent_heading(yaw: Array) -> Array:
-    """Headings (K,) without turns of more than a quarter from knot to knot, back to front where the log is so less often."""
+    """Remove turns of more than a quarter between knots (K,); where the heading flips, the more frequent direction is kept."""
     axis = np.unwrap(yaw, period=np.pi)
     return axis + np.pi if np.sum(np.cos(axis - yaw)) < 0 else axis
 
 
 def _initial_states(t_s: Array, x: Array, y: Array, yaw: Array, speed: Array, limits: FeasibilityLimits) -> Array:
-    """Rear axles as the log has them, acceleration and curvature within their limits; (K, 6)."""
+    """Return logged rear axles with acceleration and curvature clipped to their limits, (K, 6)."""
     guess = np.zeros((len(t_s), STATES))
     guess[:, 0], guess[:, 1] = x - limits.offset_m * np.cos(yaw), y - limits.offset_m * np.sin(yaw)
     guess[:, 2], guess[:, 3] = yaw, speed
     if len(t_s) > 1:
         accel, turn = np.gradient(speed, t_s), np.gradient(yaw, t_s)
         guess[:, 4] = np.clip(accel, -limits.max_accel_mps2, limits.max_accel_mps2)
-        # As a share of the curvature that lock and grip allow, which leaves slow vehicles that turn on the spot at the lock.
+        # As a share of the curvature that steering and grip allow: a slow vehicle that turns on the spot gets full lock.
         pace = np.abs(speed)
         most = limits.max_lateral_mps2 / np.maximum(pace**2, limits.max_lateral_mps2 / limits.max_curvature_1pm)
         guess[:, 5] = most * np.clip(turn / np.maximum(most * pace, MIN_YAW_RATE_RADPS), -1, 1) * np.sign(speed)
@@ -138,9 +163,9 @@ Slopes = dict[int, Array | float]
 
 
 class ResidualTerm(NamedTuple):
-    """Residuals of the knots (K,) or of the ways between them (K - 1,), and their derivatives, by state.
+    """Residuals of knots (K,) or of steps between knots (K - 1,) with their derivatives by state.
 
-    What is `robust` counts by the pseudo-Huber loss, all else by its square.
+    A `robust` term enters by the pseudo-Huber loss, all others by their square.
     """
 
     residual: Array
@@ -150,18 +175,27 @@ class ResidualTerm(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _LeastSquares:
-    """`logged` (K, 4): center x, y, yaw and speed at knots `h_s` apart."""
+    """The least-squares problem of one trajectory.
+
+    Attributes
+    ----------
+    h_s : float
+        Spacing of the knots.
+    logged : (K, 4) float64
+        Box center x, y, yaw and speed at the knots.
+    limits : FeasibilityLimits
+    """
 
     h_s: float
     logged: Array
     limits: FeasibilityLimits
 
     def terms(self, state: Array) -> list[ResidualTerm]:
-        """What the cost is made of: terms of the knots and of the ways between them."""
+        """Return the terms of the cost."""
         return [*self._knots(state), *self._ways(state)]
 
     def _knots(self, state: Array) -> list[ResidualTerm]:
-        """What the log says of the knots, and the limits."""
+        """Return the residuals of the logged states and of the limits."""
         x, y, yaw, speed, accel, curvature = state.T
         log_x, log_y, log_yaw, log_speed = self.logged.T
         limits, o, scale = self.limits, self.limits.offset_m, math.sqrt(self.h_s / KNOT_S)
@@ -181,7 +215,7 @@ class _LeastSquares:
         ]
 
     def _ways(self, state: Array) -> list[ResidualTerm]:
-        """Rolling from knot to knot, and the driver's smoothness."""
+        """Return the residuals of rolling from knot to knot and of smooth driving."""
         h, (a, b) = self.h_s, (state[:-1].T, state[1:].T)
         (_, _, yaw, speed, accel, curvature), (dx, dy, turn, gain, jerk, bend) = (a + b) / 2, b - a
         cos, sin, per_speed = np.cos(yaw), np.sin(yaw), h * np.sinc(turn / (2 * np.pi))
@@ -201,14 +235,14 @@ class _LeastSquares:
 
     @cached_property
     def _curvature_rate(self) -> Array:
-        """Standard deviation (K - 1,) of the rate of curvature: by the steering, and by the passengers when fast."""
+        """Standard deviation (K - 1,) of the curvature rate: limited by the steering, and by comfort at speed."""
         pace = np.maximum(np.abs(self.logged[1:, 3]), np.abs(self.logged[:-1, 3]))
         steering = self.limits.max_curvature_rate_1pmps / 2
         return LATERAL_JERK_MPS3 / np.maximum(pace**2, LATERAL_JERK_MPS3 / steering)
 
 
 def _transition(residual: Array, state: int, per_rise: Array | float, per_mean: Slopes) -> ResidualTerm:
-    """A term of each knot and the next, by its derivatives: by the rise of one state and by the means of others."""
+    """Build a term of each knot and the next, from its derivatives by the difference of one state and by means of others."""
     halves = {k: slope / 2 for k, slope in per_mean.items()}
     return ResidualTerm(
         residual, {state: -per_rise, NEXT + state: per_rise, **halves, **{NEXT + k: s for k, s in halves.items()}}
@@ -216,14 +250,14 @@ def _transition(residual: Array, state: int, per_rise: Array | float, per_mean: 
 
 
 def _cost(terms: list[ResidualTerm]) -> float:
-    """Half the sum of squares, the pseudo-Huber loss for headings and speeds."""
+    """Half the sum of squares, or of the pseudo-Huber loss for headings and speeds."""
     return float(
         sum(np.sum(np.sqrt(1 + t.residual**2) - 1) if t.robust else t.residual @ t.residual / 2 for t in terms)
     )
 
 
 def _normal_equations(terms: list[ResidualTerm], count: int) -> tuple[Array, Array]:
-    """Second derivatives of the cost as a band (K, 6, 12), the diagonal and what is below it, and the gradient (K, 6)."""
+    """Return the Hessian as a band (K, 6, 12), diagonal and below, and the gradient (K, 6)."""
     band, gradient = np.zeros((count, STATES, 2 * STATES)), np.zeros((count, STATES))
     for residual, slopes, robust in terms:
         weight = 1 / np.sqrt(1 + residual**2) if robust else 1.0
@@ -237,13 +271,13 @@ def _normal_equations(terms: list[ResidualTerm], count: int) -> tuple[Array, Arr
 
 
 def _state_rows(rows: Array, state: int, residual: Array) -> Array:
-    """The column of a state in rows (K, 6), as long as a term's residual."""
+    """Return the column of a state in rows (K, 6), cut to the length of a term's residual."""
     knot, column = divmod(state, STATES)
     return rows[knot : knot + len(residual), column]
 
 
 def _limit_residual(value: Array, limit: float, scale: float) -> tuple[Array, Array]:
-    """How far values (K,) are beyond a limit of their size, in units of its softness, and the derivative of that."""
+    """Return how far values (K,) exceed a limit, in units of its softness, and the derivative of that."""
     beyond, unit = value - np.minimum(np.maximum(value, -limit), limit), scale / (LIMIT_SIGMA_SHARE * limit)
     return beyond * unit, (beyond != 0) * unit
 

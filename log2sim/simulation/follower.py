@@ -1,7 +1,7 @@
-"""Controllers that make agents follow their reference: feed-forward from the waypoints and PID feedback.
+"""Controllers that make agents follow their references: feed-forward from the trajectory and PID feedback.
 
-Gains are time constants and a damping ratio, so they hold for every control step: the error along the path and the error
-across it each behave like a damped oscillator with the time constant below, whatever the speed of the vehicle.
+Gains are time constants and a damping ratio, so they hold for every control step: the errors along and across the path
+each behave like a damped oscillator with the time constant below, at any speed of the vehicle.
 """
 
 from __future__ import annotations
@@ -26,40 +26,63 @@ from log2sim.simulation.vehicles.vehicle import (
 
 @dataclass(frozen=True)
 class ControllerGains:
-    """Time constants in s, lengths in m. Defaults stay stable with actuator lags of 0.1 s and steps of up to 0.1 s."""
+    """Gains of the controllers. The defaults are stable with actuator lags of 0.1 s and steps of up to 0.1 s.
+
+    Attributes
+    ----------
+    along_s, across_s : float, s
+        Time constants of the errors along and across the path.
+    across_min_m : float, m
+        At walking pace errors decay over this distance, since a car cannot move sideways.
+    integral_s : float, s
+    derivative_filter_s : float, s
+    damping : float
+    point_s : float, s
+        Time constant of point masses.
+    hold_below_mps, hold_brake_mps2, hold_within_m : float
+        The brake holds a vehicle below this speed that has stopped within this distance; one that stopped earlier
+        drives up.
+    max_lateral_accel_mps2 : float
+        Grip of a dry road.
+    """
 
     along_s: float = 0.6
     across_s: float = 0.6
-    across_min_m: float = 1.5  # at walking pace errors decay over this way, since a car cannot move sideways
+    across_min_m: float = 1.5
     integral_s: float = 4.0
     derivative_filter_s: float = 0.05
     damping: float = 1.0
     point_s: float = 0.3
     hold_below_mps: float = 0.05
     hold_brake_mps2: float = 2.0
-    hold_within_m: float = 0.1  # a vehicle that stopped shorter than this drives up
-    max_lateral_accel_mps2: float = 9.0  # grip of a dry road
+    hold_within_m: float = 0.1
+    max_lateral_accel_mps2: float = 9.0
 
 
 GAINS = ControllerGains()
 INTEGRAL_LIMIT_MPS2 = 1.0
-INTEGRAL_SHARE = 0.2  # of the curvature that lock and grip allow
+INTEGRAL_SHARE = 0.2  # of the curvature that steering and grip allow
 MAX_CONTROL_STEP_S = 0.1
 """Longest time for which controls are held: a third of the shortest time in which an error decays."""
 
-MAX_ALONG_M = 3.0  # how far the arc at the reference is trusted, and what is made up for at once: at 2.5 m/s
+MAX_ALONG_M = 3.0  # longest extrapolation along the arc at the reference; limits catching up to 2.5 m/s
 
 
 def control_step(dt_s: float) -> float:
-    """The part of a simulation step for which controls are held."""
+    """Return the part of a simulation step for which controls are held."""
     return dt_s / max(1, math.ceil(dt_s / MAX_CONTROL_STEP_S - 1e-9))
 
 
 @dataclass(frozen=True, eq=False)
 class ControllerMemory(Columns):
-    """What the controllers of vehicles remember of the errors along the path and across it, (2, A) each.
+    """State of the controllers of vehicles, rows along and across the path, (2, A) each.
 
-    `integral` in m/s2 and 1/m; `rate` the filtered derivatives, which are a speed in m/s and the slope toward the path.
+    Attributes
+    ----------
+    integral : (2, A) float64
+        In m/s2 and 1/m.
+    rate : (2, A) float64
+        Filtered derivatives of the errors: a speed in m/s, and the slope toward the path.
     """
 
     integral: Array
@@ -67,6 +90,7 @@ class ControllerMemory(Columns):
 
     @classmethod
     def fresh(cls, count: int) -> ControllerMemory:
+        """Return the state of `count` controllers that have not run yet."""
         return cls(np.zeros((2, count)), np.zeros((2, count)))
 
 
@@ -78,7 +102,7 @@ def follow_vehicles(
     dt_s: float,
     gains: ControllerGains = GAINS,
 ) -> tuple[VehicleControls, ControllerMemory]:
-    """Controls of vehicles that follow their references.
+    """Compute the controls of vehicles that follow their references.
 
     Parameters
     ----------
@@ -87,9 +111,9 @@ def follow_vehicles(
 
     Notes
     -----
-    Two PID controllers with feed-forward, along the path and across it, are the rows of (2, A) arrays: for a thousand
-    agents a call of numpy costs as much as what it computes. The correction across the path is a curvature that depends on
-    the way driven and not on time, hence nothing is divided by the speed.
+    Two PID controllers with feed-forward, along and across the path, are the rows of (2, A) arrays: with up to a thousand
+    agents the overhead of a NumPy call is as large as the computation. The correction across the path is a curvature that
+    depends on distance and not on time, so nothing is divided by the speed.
     """
     p, reference_gear, stands = parameters, row[6], row[7]
     pace = np.abs(state.speed_mps)
@@ -108,13 +132,13 @@ def follow_vehicles(
     asked = rows(wanted[0] * gear, wanted[1])
     given = np.minimum(np.maximum(asked, rows(-p.max_brake_mps2, -grip)), rows(p.max_throttle_mps2, grip))
 
-    # Anti-windup: nothing is learned from more error of the same sign while an actuator is at its limit, from a vehicle
-    # that is far behind and makes up for it, or from wheels that stand.
-    learns = (given == asked) | (error * wanted <= 0)
-    learns[0] &= np.abs(error[0]) < MAX_ALONG_M
-    learns[1] &= moves
+    # Anti-windup: the integral does not grow while an actuator is at its limit, while a vehicle far behind catches up, or
+    # at standstill.
+    integrates = (given == asked) | (error * wanted <= 0)
+    integrates[0] &= np.abs(error[0]) < MAX_ALONG_M
+    integrates[1] &= moves
     bound = rows(INTEGRAL_LIMIT_MPS2, INTEGRAL_SHARE * grip)
-    integral = memory.integral + (dt_s / gains.integral_s) * pull * learns
+    integral = memory.integral + (dt_s / gains.integral_s) * pull * integrates
     integral = np.minimum(np.maximum(integral, -bound), bound)
 
     held = (stands > 0.5) & (pace < gains.hold_below_mps) & (error[0] * reference_gear < gains.hold_within_m)
@@ -126,10 +150,10 @@ def follow_vehicles(
 
 
 def _errors(row: Array, state: VehicleState) -> tuple[Array, Array]:
-    """Errors along and across the path in m (2, A), and their derivatives: difference in speed, slope toward the path.
+    """Return errors along and across the path in m (2, A), and their derivatives: speed difference, slope toward the path.
 
-    They are those at the foot point: where the reference is `along` ahead, its arc is bent back by that much, so a vehicle
-    that is late in a curve is not pulled inside.
+    They are taken at the foot point: the arc at the reference is followed back by the error along it, so a vehicle that
+    is late in a curve is not pulled inside.
     """
     x, y, yaw, speed, _, curvature, _, _ = row
     cos, sin = cos_sin(yaw)
@@ -143,7 +167,7 @@ def _errors(row: Array, state: VehicleState) -> tuple[Array, Array]:
 
 
 def follow_points(row: Array, state: PointState, gains: ControllerGains = GAINS) -> PointControls:
-    """Controls of points that follow their references `row` (C, A), as `POINT_COLUMNS`; they may go any way."""
+    """Compute the controls of points that follow their references `row` (C, A), as `POINT_COLUMNS`, in any direction."""
     x, y, _, vx, vy, ax, ay, _ = row
     p, d = 1 / gains.point_s**2, 2 * gains.damping / gains.point_s
     return PointControls(
@@ -153,7 +177,7 @@ def follow_points(row: Array, state: PointState, gains: ControllerGains = GAINS)
 
 
 def start_vehicles(row: Array, parameters: VehicleParameters) -> VehicleState:
-    """States of vehicles that are on their references `row` (C, A)."""
+    """Return states of vehicles on their references `row` (C, A)."""
     x, y, yaw, speed, accel, curvature, gear, stands = row
     angle = np.arctan(parameters.wheelbase_m * curvature * (1 + parameters.understeer_s2pm2 * speed**2))
     steer = np.minimum(np.maximum(angle, -parameters.max_steer_rad), parameters.max_steer_rad)
@@ -164,5 +188,5 @@ def start_vehicles(row: Array, parameters: VehicleParameters) -> VehicleState:
 
 
 def start_points(row: Array) -> PointState:
-    """States of points that are on their references `row` (C, A)."""
+    """Return states of points on their references `row` (C, A)."""
     return PointState(row[0].copy(), row[1].copy(), row[3].copy(), row[4].copy())

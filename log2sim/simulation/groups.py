@@ -1,7 +1,7 @@
-"""Groups of agents that are driven alike: followers on wheels, followers on foot, the log itself, the user's policy.
+"""Groups of agents that are driven alike: log replay, vehicles, pedestrians, and the vehicle of the user's policy.
 
-A group owns the state of its agents; what it steps with is stateless. All columns are (A,) over the group's agents that
-live in the current window of time; `live` holds their indices in the group.
+A group owns the state of its agents; the simulator that steps it is stateless. All columns are (A,) over the agents of
+the group that live in the present window of time; `live` holds their indices in the group.
 """
 
 from __future__ import annotations
@@ -32,9 +32,17 @@ from log2sim.simulation.vehicles.vehicle import Columns, PointState, VehicleCont
 
 @dataclass(frozen=True, eq=False)
 class Snapshot(Columns):
-    """Box centers in the map and what drives them, (A,); `accel_mps2` is NaN where the model has no such state.
+    """Box centers and actuators of agents (A,), map frame.
 
-    Commands are those that led here, held over the last step; NaN for agents without.
+    Commands are those held over the last step; NaN for agents without.
+
+    Attributes
+    ----------
+    x_m, y_m, yaw_rad, speed_mps : (A,) float64
+    steer_rad : (A,) float64
+    accel_mps2 : (A,) float64
+        NaN where the model has no such state.
+    pedal_command_mps2, steer_command_rad, gear : (A,) float64
     """
 
     x_m: Array
@@ -49,10 +57,10 @@ class Snapshot(Columns):
 
 
 class AgentGroup(ABC):
-    """Agents driven alike. `first`, `last` (A,) are the steps between which each agent lives."""
+    """Agents driven alike; `first`, `last` (A,) are the steps between which each agent lives."""
 
     driver = "exact"
-    keeps_time = True  # its agents are where the log has them at the same time, after a leap too
+    follows_log_time = True  # its agents are where the log has them at the same time, after a discontinuity too
 
     def __init__(self, agents: Sequence[Agent], references: Sequence[Reference], first: NDArray, last: NDArray) -> None:
         self.agents, self.references, self.first, self.last = tuple(agents), tuple(references), first, last
@@ -64,7 +72,7 @@ class AgentGroup(ABC):
         self.now_s = 0.0
 
     def open_window(self, begin: int, end: int, begin_s: float, end_s: float) -> None:
-        """Make the tables of the agents that live within the steps [begin, end) at hand."""
+        """Prepare the reference tables of the agents that live within the steps [begin, end)."""
         self.live = np.flatnonzero((self.first < end) & (self.last >= begin) & (self.last >= self.first))
         self._row0 = int(np.floor(begin_s / GRID_S))
         rows = int(np.floor(end_s / GRID_S)) + 3 - self._row0
@@ -75,7 +83,7 @@ class AgentGroup(ABC):
                 _copy_rows(self._table[:, :, slot], self.references[i], self._row0)
 
     def log_times(self, t_s: float) -> Array:
-        """When the log was where the living agents are meant to be at a time (A,)."""
+        """Return the times of the log (A,) whose places the living agents follow at a time."""
         return np.full(len(self.live), t_s)
 
     def look_up(self, t_s: float) -> None:
@@ -90,14 +98,14 @@ class AgentGroup(ABC):
 
     @abstractmethod
     def place(self, index: NDArray, t_s: float) -> None:
-        """Put the agents at `index` (of all agents) on their references at a time."""
+        """Put the agents at `index` (of all agents of the group) on their references at a time."""
 
     @abstractmethod
     def snapshot(self) -> Snapshot:
-        """Where the living agents are now."""
+        """Return the present states of the living agents."""
 
     def advance(self, dt_s: float) -> None:
-        """Move the living agents by one step from the time that was looked up; controls are renewed within a long one."""
+        """Move the living agents by one step; within a long step controls are renewed."""
         held_s = control_step(dt_s)
         for part in range(round(dt_s / held_s)):
             if part:
@@ -106,7 +114,7 @@ class AgentGroup(ABC):
 
     @abstractmethod
     def _step(self, dt_s: float) -> None:
-        """Move the living agents with the controls of this moment."""
+        """Move the living agents with their present controls."""
 
     def _exact(self, index: NDArray, t_s: float) -> Array:
         return np.stack([self.references[i].exact(np.array([t_s]))[0] for i in index], axis=1)
@@ -119,12 +127,14 @@ class LogReplayGroup(AgentGroup):
     """Agents that are exactly where the log has them."""
 
     def place(self, index: NDArray, t_s: float) -> None:
+        """Do nothing: the agents are always on their references."""
         pass
 
     def _step(self, dt_s: float) -> None:
         pass
 
     def snapshot(self) -> Snapshot:
+        """Return the states of the log."""
         x, y, yaw, speed = self.row[:4]
         unknown = np.full(len(self.live), np.nan)
         x, y = x + self.origin_x_m[self.live], y + self.origin_y_m[self.live]
@@ -132,7 +142,7 @@ class LogReplayGroup(AgentGroup):
 
 
 class VehicleGroup(AgentGroup):
-    """Vehicles that follow their waypoints."""
+    """Vehicles that follow their trajectories through a vehicle model."""
 
     driver = "pid"
 
@@ -161,6 +171,7 @@ class VehicleGroup(AgentGroup):
         self.commands = self._all_commands.take(live)
 
     def open_window(self, begin: int, end: int, begin_s: float, end_s: float) -> None:
+        """Prepare tables and states of the vehicles that live within the steps [begin, end)."""
         self._all.put(self.live, self.state)
         self._all_memory.put(self.live, self.memory)
         self._all_commands.put(self.live, self.commands)
@@ -168,6 +179,7 @@ class VehicleGroup(AgentGroup):
         self._open(self.live)
 
     def place(self, index: NDArray, t_s: float) -> None:
+        """Put vehicles on their references, with the slip that the reference has there."""
         slots = self._slots(index)
         state = start_vehicles(self._exact(index, t_s), self.living.take(slots))
         if self.references[index[0]].slips:  # all of a fleet have the same model
@@ -178,6 +190,7 @@ class VehicleGroup(AgentGroup):
         self.commands.put(slots, VehicleControls(placed.pedal_mps2, placed.steer_rad, placed.speed_mps < 0))
 
     def snapshot(self) -> Snapshot:
+        """Return the present states of the living vehicles."""
         s, o = self.state, self.offset_m[self.live]
         cos, sin = cos_sin(s.yaw_rad)
         x = s.x_m + o * cos + self.origin_x_m[self.live]
@@ -195,10 +208,10 @@ class VehicleGroup(AgentGroup):
 
 
 class PolicyVehicle(VehicleGroup):
-    """The one vehicle that the user's policy drives, by the controls set before each step."""
+    """The vehicle that the user's policy drives, by the controls set before each step."""
 
     driver = "policy"
-    keeps_time = False
+    follows_log_time = False
     controls = Controls(0.0, 0.0)
 
     def _step(self, dt_s: float) -> None:
@@ -210,7 +223,7 @@ class PolicyVehicle(VehicleGroup):
 
 
 class PedestrianGroup(AgentGroup):
-    """Points that follow their waypoints."""
+    """Pedestrians, and all else without wheels, as point masses that follow their trajectories."""
 
     driver = "pid"
 
@@ -228,15 +241,18 @@ class PedestrianGroup(AgentGroup):
         self.state = self._all.take(self.live)
 
     def open_window(self, begin: int, end: int, begin_s: float, end_s: float) -> None:
+        """Prepare tables and states of the points that live within the steps [begin, end)."""
         self._all.put(self.live, self.state)
         super().open_window(begin, end, begin_s, end_s)
         self.state = self._all.take(self.live)
 
     def place(self, index: NDArray, t_s: float) -> None:
+        """Put points on their references."""
         slots = self._slots(index)
         self.state.put(slots, start_points(self._exact(index, t_s)))
 
     def snapshot(self) -> Snapshot:
+        """Return the present states of the living points."""
         s, yaw = self.state, self.row[2]
         speed = s.velocity_x_mps * np.cos(yaw) + s.velocity_y_mps * np.sin(yaw)
         x, y = s.x_m + self.origin_x_m[self.live], s.y_m + self.origin_y_m[self.live]
@@ -248,7 +264,7 @@ class PedestrianGroup(AgentGroup):
 
 
 def _copy_rows(window: Array, reference: Reference, row0: int) -> None:
-    """Copy the rows from `row0` on of a table to a window (W, C); its first and last row stand for before and after."""
+    """Copy the rows from `row0` on of a table to a window (W, C); its first and last row fill what lies before and after."""
     columns, begin = reference.columns, reference.first_row - row0
     low = min(max(begin, 0), len(window))
     high = min(max(begin + len(columns), low), len(window))

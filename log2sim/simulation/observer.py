@@ -1,4 +1,4 @@
-"""What the policy of the ego sees of a world."""
+"""Builds the observations of the ego's policy."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class PolicyObserver:
     ) -> None:
         self.ego, self.sight_m = ego, sight_m
         self._trajectory = ego.references[0].trajectory
-        self._way = PathTable([self._trajectory])
+        self._path_table = PathTable([self._trajectory])
         self._groups = [g for g in groups if g is not ego]
         self._statics = _static_poses(statics)
         lives = [(-np.inf, np.inf) if a.is_permanent else (a.waypoints.t_s[0], a.waypoints.t_s[-1]) for a in statics]
@@ -43,19 +43,19 @@ class PolicyObserver:
         self.restart()
 
     def restart(self) -> None:
-        """Begin anew."""
+        """Start again at the beginning of the path."""
         self.progress_m = 0.0
 
     def __call__(self, step: int, t_s: float, dt_s: float) -> Observation:
-        """What the policy sees at a step; call it in the order of steps."""
+        """Build the observation at a step; steps must be in order."""
         ahead = self._ahead()
         ego = self._state()
         return Observation(t_s, dt_s, ego, self._others(ego, step, t_s), self._route(t_s), ahead)
 
     def _state(self) -> EgoState:
-        """The ego, at the height of its recorded way at `progress_m`."""
+        """Build the ego's state, at the height of its recorded path at `progress_m`."""
         agent, s, p = self.ego.agents[0], self.ego.snapshot(), self.ego.living
-        log_t_s = self._way.times(ONE, np.array([self.progress_m]))
+        log_t_s = self._path_table.times(ONE, np.array([self.progress_m]))
         return EgoState(
             x_m=float(s.x_m[0]),
             y_m=float(s.y_m[0]),
@@ -78,12 +78,12 @@ class PolicyObserver:
         return Route(*(_read_only(c) for c in (ahead, x, y, yaw, speed)))
 
     def _ahead(self) -> PathAhead:
-        way, now = self._way, self.ego.snapshot()
-        self.progress_m = way.beside(0, self.progress_m, float(now.x_m[0]), float(now.y_m[0]))
+        table, now = self._path_table, self.ego.snapshot()
+        self.progress_m = table.beside(0, self.progress_m, float(now.x_m[0]), float(now.y_m[0]))
         ahead = np.arange(0.0, PATH_AHEAD_M + SPACING_M / 2, SPACING_M)
-        x, y, cos, sin, at_s = way.along(ONE, self.progress_m + ahead)
-        pace = np.abs(way.at(ONE, np.where(np.isnan(at_s), self._trajectory.t_s[-1], at_s)).speed_mps)
-        columns = (ahead, x + way.origin_m[0], y + way.origin_m[1], wrap_angle(np.arctan2(sin, cos)), pace, at_s)
+        x, y, cos, sin, at_s = table.along(ONE, self.progress_m + ahead)
+        pace = np.abs(table.at(ONE, np.where(np.isnan(at_s), self._trajectory.t_s[-1], at_s)).speed_mps)
+        columns = (ahead, x + table.origin_m[0], y + table.origin_m[1], wrap_angle(np.arctan2(sin, cos)), pace, at_s)
         return PathAhead(self.progress_m, *(_read_only(c) for c in columns))
 
     def _others(self, ego: EgoState, step: int, t_s: float) -> Others:
@@ -112,20 +112,20 @@ class PolicyObserver:
 
 
 def _identities(agents: Sequence[Agent], trajectories: Sequence[Trajectory]) -> NDArray:
-    """Id, category, size and logged path of agents as records (A,)."""
+    """Return id, category, size and logged trajectory of agents as records (A,)."""
     rows = [(a.id, a.category, *a.size_m, trajectory) for a, trajectory in zip(agents, trajectories)]
     sizes = [(k, np.float64) for k in ("length_m", "width_m", "height_m")]
     return np.array(rows, dtype=[("id", object), ("category", object), *sizes, ("trajectory", object)])
 
 
 def _static_poses(agents: Sequence[Agent]) -> Array:
-    """x, y, yaw and speed (4, A) of agents that stand."""
+    """Return x, y, yaw and speed (4, A) of static agents."""
     first = [(a.waypoints.x_m[0], a.waypoints.y_m[0], a.waypoints.yaw_rad[0], 0.0) for a in agents]
     return np.array(first, dtype=np.float64).reshape(-1, 4).T
 
 
 def _read_only(values: NDArray) -> NDArray:
-    """The array, which nobody can change from now on; strings as such and not as objects."""
+    """Return the array protected against writing, strings as such and not as objects."""
     out = values.astype(str) if values.dtype == object else np.ascontiguousarray(values)
     out.setflags(write=False)
     return out

@@ -1,7 +1,7 @@
-"""What a user's own driver of the ego sees and answers.
+"""What a user's policy observes and what it returns.
 
-All positions are box centers on the map's axes in m, yaw is counter-clockwise from +x in rad within [-pi, pi), speed is
-along the heading in m/s (negative in reverse gear), time is in s on the scenario's clock. All arrays are read-only.
+Positions are box centers in the map frame in m, yaw is counter-clockwise from +x in rad within [-pi, pi), speed is
+along the heading in m/s (negative in reverse), time is in s on the scenario's clock. All arrays are read-only.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
 
-SIGHT_M = 100.0
+SIGHT_M = 100.0  # default range of observed agents
 ROUTE_AHEAD_S = 10.0
 ROUTE_STEP_S = 0.1
 PATH_AHEAD_M = 100.0
@@ -25,9 +25,16 @@ PATH_AHEAD_M = 100.0
 
 @dataclass(frozen=True)
 class Controls:
-    """Answer of a policy: `accel_mps2` (positive throttle, negative brake), `steer_rad` at the wheels, positive left.
+    """What a policy returns: the commands until its next call.
 
-    Braking ends at standstill. `reverse` engages at standstill; throttle then drives backward.
+    Attributes
+    ----------
+    accel_mps2 : float
+        Positive throttle, negative brake; braking ends at standstill.
+    steer_rad : float
+        At the road wheels, positive left.
+    reverse : bool
+        Engages at standstill; throttle then drives backward.
     """
 
     accel_mps2: float
@@ -37,10 +44,23 @@ class Controls:
 
 @dataclass(frozen=True)
 class EgoState:
-    """The ego: where it is, what its actuators do now (`accel_mps2` along the heading, `steer_rad` at the wheels), its size.
+    """Pose, motion, actuators and size of the ego.
 
-    The rear axle, about which a vehicle turns, is `rear_axle_offset_m` behind the box center, the front one
-    `wheelbase_m` ahead of that. A curvature c takes a steering angle of atan(wheelbase c (1 + understeer speed^2)).
+    A curvature c takes a steering angle of atan(wheelbase c (1 + understeer speed^2)).
+
+    Attributes
+    ----------
+    x_m, y_m, z_m, yaw_rad : float
+        Box center and heading, map frame.
+    speed_mps : float
+    accel_mps2, steer_rad : float
+        Present state of the actuators: along the heading; at the road wheels.
+    length_m, width_m, height_m : float
+    wheelbase_m : float
+        From the rear to the front axle.
+    rear_axle_offset_m : float
+        From the rear axle, about which a vehicle turns, forward to the box center.
+    understeer_s2pm2 : float
     """
 
     x_m: float
@@ -60,10 +80,16 @@ class EgoState:
 
 @dataclass(frozen=True, eq=False)
 class Others:
-    """Agents whose box center is within sight, nearest first, as columns (A,): parked ones too, the ego not.
+    """Other agents whose box center is within range, nearest first, as columns (A,); static ones too.
 
-    `velocity_x_mps`, `velocity_y_mps` are on the map's axes; `id` and `category` are strings. Who is on another level, as
-    `z_m` and `height_m` tell, is in nobody's way.
+    Attributes
+    ----------
+    id, category : (A,) str
+    x_m, y_m, z_m, yaw_rad, speed_mps : (A,) float64
+        An agent on another level, by `z_m` and `height_m`, is no obstacle.
+    velocity_x_mps, velocity_y_mps : (A,) float64, m/s
+        On the axes of the map.
+    length_m, width_m, height_m : (A,) float64
     """
 
     id: NDArray[Any]
@@ -80,12 +106,18 @@ class Others:
     height_m: Array
 
     def __len__(self) -> int:
+        """Return the number of agents."""
         return len(self.x_m)
 
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """Where the recorded ego is in the next 10 s, as columns (T,): every 0.1 s from now to the end of the log."""
+    """States of the recorded ego during the next 10 s, as columns (T,) every 0.1 s until the end of the log.
+
+    Attributes
+    ----------
+    t_s, x_m, y_m, yaw_rad, speed_mps : (T,) float64
+    """
 
     t_s: Array
     x_m: Array
@@ -96,11 +128,23 @@ class Route:
 
 @dataclass(frozen=True, eq=False)
 class PathAhead:
-    """The recorded ego's way from the place beside the ego, whenever it was there, as columns (P,): 100 m, one row a meter.
+    """The recorded ego's path ahead of the ego, whenever it was there, as columns (P,): 100 m, one row a meter.
 
-    `distance_m` is counted from the first row, the nearest to the ego. `yaw_rad` is the direction of travel, `speed_mps`
-    the pace of the log at that place, `t_s` when the log was there. Beyond the end of the log the way goes straight on with
-    the last pace, and `t_s` is NaN. `progress_m` is the way up to the first row.
+    Beyond the end of the log the path goes straight on at the last speed.
+
+    Attributes
+    ----------
+    progress_m : float
+        Distance along the path up to the first row, which is the one nearest to the ego.
+    distance_m : (P,) float64
+        From the first row.
+    x_m, y_m : (P,) float64
+    yaw_rad : (P,) float64
+        Direction of travel.
+    speed_mps : (P,) float64
+        Speed of the log at this place.
+    t_s : (P,) float64
+        When the log was there; NaN beyond its end.
     """
 
     progress_m: float
@@ -114,7 +158,18 @@ class PathAhead:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What a policy sees at `t_s`; its controls then hold for `dt_s`."""
+    """What a policy observes at one time.
+
+    Attributes
+    ----------
+    t_s : float
+    dt_s : float
+        The returned controls hold for this long.
+    ego : EgoState
+    others : Others
+    route : Route
+    path : PathAhead
+    """
 
     t_s: float
     dt_s: float
@@ -125,11 +180,11 @@ class Observation:
 
 
 Policy = Callable[[Observation], Controls]
-"""A function, or an object with `__call__` and, if it keeps something between steps, `reset(scenario)`."""
+"""A function, or an object with `__call__` and, if it has a state of its own, `reset(scenario)`."""
 
 
 def reset_policy(policy: Policy, scenario: Scenario) -> None:
-    """Call a policy's `reset(scenario)` if it has one, so that it can be used for one replay after the other."""
+    """Call a policy's `reset(scenario)` if it has one, so that it can be used for several replays."""
     reset = getattr(policy, "reset", None)
     if reset is None:
         return
@@ -140,12 +195,12 @@ def reset_policy(policy: Policy, scenario: Scenario) -> None:
 
 
 def query_policy(policy: Policy, observation: Observation) -> Controls:
-    """Call a policy and check its answer."""
+    """Call a policy and check what it returns."""
     where = f"policy at {observation.t_s:g} s"
     try:
         answer = policy(observation)
     except Exception as error:
-        # Whatever a user's policy raises is the policy's, and the traceback tells its author where.
+        # A user's policy may raise anything; the chained traceback shows its author where.
         raise ConfigError(f"{where}: raised {type(error).__name__}: {error}") from error
     if not isinstance(answer, Controls):
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""Finds the policy that a name on the command line means."""
+"""Loads the policy that a name on the command line refers to."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from log2sim.simulation.policy import Policy
 
 
 def load_policy(name: str) -> Policy:
-    """The policy that "module:attribute" or "path/to/file.py:attribute" names; dots in the attribute are followed.
+    """Load the policy "module:attribute" or "path/to/file.py:attribute"; the attribute may contain dots.
 
-    A module is looked up in the current folder first, as `python -m` does; a file sees its own folder. A class is called
-    without arguments to make the policy.
+    A module is looked up in the current folder first, as `python -m` does; a file can import from its own folder. A class is
+    instantiated without arguments.
 
     Raises
     ------
     ConfigError
-        When the name has another form, or what it names cannot be imported, made or called.
+        When the name has another form, or cannot be imported, instantiated or called.
     """
     source, colon, attribute = name.rpartition(":")
     if not (source and colon and attribute):
@@ -63,7 +63,7 @@ def _import_file(path: Path) -> ModuleType:
     if spec is None or spec.loader is None:
         raise ImportError(f"{path} is no Python file")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where dataclasses of the file look for their module
+    sys.modules[spec.name] = module  # dataclasses of the file look their module up there
     with _first_on_path(path.resolve().parent):
         spec.loader.exec_module(module)
     return module
@@ -71,7 +71,7 @@ def _import_file(path: Path) -> ModuleType:
 
 @contextmanager
 def _first_on_path(folder: Path) -> Iterator[None]:
-    """Search a folder before all others while something is imported."""
+    """Search a folder before all others during an import."""
     sys.path.insert(0, str(folder))
     try:
         yield

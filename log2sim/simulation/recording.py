@@ -1,4 +1,4 @@
-"""What a group of agents did within a window of time, and the tracks that windows make."""
+"""Records the states of agent groups, one window of time after the other, and joins the windows into tracks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from log2sim.geometry import Array
 from log2sim.simulation.groups import AgentGroup, Snapshot
 
 RecordedTracks = dict[str, tuple[NDArray[np.intp], Array]]
-"""By agent id: the stored steps (S,) and the columns (C, S) of a `Snapshot` at them."""
+"""By agent id: the stored steps (S,) and the columns (C, S) of `Snapshot` at these steps."""
 
 COLUMNS = tuple(f.name for f in fields(Snapshot))
 
@@ -27,14 +27,14 @@ class WindowRecording:
         self.count = 0
 
     def add(self) -> None:
-        """Store where the group is now."""
+        """Store the present state of the group."""
         snapshot = self.group.snapshot()
         for column, name in zip(self.rows[self.count], COLUMNS):
             column[:] = getattr(snapshot, name)
         self.count += 1
 
     def lives(self) -> Iterable[tuple[str, NDArray[np.intp], Array]]:
-        """What was stored so far by agent, cut to its life: id, steps (S,) and columns (C, S)."""
+        """Yield what was stored by agent, cut to its lifetime: id, steps (S,) and columns (C, S)."""
         group, steps = self.group, self.steps[: self.count]
         begin = np.searchsorted(steps, group.first[self.live])
         end = np.searchsorted(steps, group.last[self.live], side="right")
@@ -45,7 +45,7 @@ class WindowRecording:
 
 
 def merged_tracks(records: Iterable[WindowRecording]) -> RecordedTracks:
-    """The tracks that records make, in order of time."""
+    """Join the recordings of each agent in order of time."""
     parts: dict[str, list[tuple[NDArray[np.intp], Array]]] = {}
     for record in records:
         for agent, steps, columns in record.lives():

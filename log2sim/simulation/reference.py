@@ -1,4 +1,4 @@
-"""Tables of what agents follow: for vehicles the rear axle of the course that they can drive, for points their course."""
+"""Reference tables: for vehicles the rear axle of their feasible trajectory, for points the smoothed trajectory."""
 
 from __future__ import annotations
 
@@ -26,25 +26,38 @@ from log2sim.simulation.follower import control_step
 from log2sim.simulation.vehicles.parameters import PEDAL_LAG_S, STEER_LAG_S, parameters_for
 
 GRID_S = 0.02
-"""Spacing of the tables; between their rows a linear course errs by at most a h^2 / 8 = 0.5 mm at 10 m/s2."""
+"""Spacing of the tables; linear interpolation errs by at most a h^2 / 8 = 0.5 mm at 10 m/s2."""
 
 SMOOTHING_S = 0.12
 """Standard deviation of the Gaussian over the velocity of points: one waypoint of a 10 Hz log."""
 
 STANDSTILL_MPS = 0.08
-MIN_RUN_M, MIN_RUN_MPS = 0.3, 0.5  # shorter and slower runs forward or backward are noise of a standing agent
+MIN_RUN_M, MIN_RUN_MPS = 0.3, 0.5  # a movement that is both shorter and slower is noise of a standing agent
 MAX_ACCEL_MPS2 = 10.4  # feasibility limits of Waymax (Gulino et al., 2023, section 3.3)
 MAX_CURVATURE_1PM = 0.3
-MAX_TWO_WHEELER_CURVATURE_1PM = 1.0  # which it does not tell; a bicycle turns within a meter
-MAX_DEPARTURE_M = 0.3  # more than boxes err by
+MAX_TWO_WHEELER_CURVATURE_1PM = 1.0  # not in Waymax; a bicycle turns within a meter
+MAX_DEPARTURE_M = 0.3  # larger than the errors of boxes
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """An agent's table: row k of `columns` (K, C) holds for the time (first_row + k) * GRID_S; see the functions below.
+    """An agent's reference table: row k of `columns` holds for the time (first_row + k) * GRID_S.
 
-    Rows are of the point that is `offset_m` behind the box center. `exact` gives rows (N, C) at any times (N,): rows of the
-    table are blended in between, across a leap of the log too. What `slips` does not move along its yaw.
+    Attributes
+    ----------
+    trajectory : Trajectory
+        The logged box centers.
+    first_row : int
+    columns : (K, C) float64
+        `VEHICLE_COLUMNS`, `POINT_COLUMNS`, or x, y, yaw, speed.
+    exact : callable
+        Rows (N, C) at any times (N,), without blending across rows.
+    offset_m : float
+        From the reference point forward to the box center.
+    flags : tuple of str
+        What in the log cannot be driven.
+    slips : bool
+        Whether the reference holds slip angles, so that it does not move along its yaw.
     """
 
     trajectory: Trajectory
@@ -68,7 +81,7 @@ def vehicle_reference(
     curvature_ahead_s: float,
     max_curvature_1pm: float = MAX_CURVATURE_1PM,
 ) -> Reference:
-    """The table of a vehicle. Columns "..._ahead" are those of a later time, which makes up for the actuators' lag."""
+    """Build the table of a vehicle. Columns "..._ahead" are of a later time, to compensate for the lag of the actuators."""
     course, departure_m = feasible_trajectory_of(trajectory, limits)
     first, t = _grid_times(trajectory)
     motion = _interpolated(course, t)
@@ -91,14 +104,14 @@ def vehicle_reference(
 
 
 def feasible_trajectory_of(trajectory: Trajectory, limits: FeasibilityLimits) -> tuple[FeasibleTrajectory, Array]:
-    """The course of the rear axle that a vehicle can drive, and how far in m (K,) it is from the logged box centers.
+    """Return the feasible trajectory of the rear axle, and its distance in m (K,) from the logged box centers.
 
-    Between leaps of the log it is made piece by piece.
+    Pieces between discontinuities of the log are fitted one by one.
     """
     edges = np.concatenate([[0], np.flatnonzero(trajectory.discontinuous) + 1, [len(trajectory.t_s)]])
     pieces, departures = [], []
     for begin, end in pairwise(edges.tolist()):
-        # The course up to a leap goes on as it was; it ends a hair before the moment of the next waypoint.
+        # A piece before a discontinuity goes on as it was, and ends just before the time of the next waypoint.
         until_s = (
             trajectory.t_s[end - 1]
             if end == len(trajectory.t_s)
@@ -120,7 +133,7 @@ def feasible_trajectory_of(trajectory: Trajectory, limits: FeasibilityLimits) ->
 
 
 def _interpolated(course: FeasibleTrajectory, t_s: Array) -> Array:
-    """Rows x, y, yaw, speed (4, N) at times (N,), by cubics; straight on before the begin of the course and after its end."""
+    """Interpolate x, y, yaw, speed (4, N) at times (N,) by cubics; straight on before the begin and after the end."""
     inside = np.minimum(np.maximum(t_s, course.t_s[0]), course.t_s[-1])
     values, rates = course.motion
     if len(course.t_s) == 1:
@@ -128,14 +141,14 @@ def _interpolated(course: FeasibleTrajectory, t_s: Array) -> Array:
     else:
         i = np.minimum(np.searchsorted(course.t_s, inside, side="right") - 1, len(course.t_s) - 2)
         motion = hermite(values, rates, i, inside - course.t_s[i], course.t_s[i + 1] - course.t_s[i])
-    way = (t_s - inside) * motion[3]
-    motion[0] += way * np.cos(motion[2])
-    motion[1] += way * np.sin(motion[2])
+    beyond_m = (t_s - inside) * motion[3]
+    motion[0] += beyond_m * np.cos(motion[2])
+    motion[1] += beyond_m * np.sin(motion[2])
     return motion
 
 
 def point_reference(trajectory: Trajectory) -> Reference:
-    """The table of a point: velocity and acceleration of the smoothed course, on map axes."""
+    """Build the table of a point mass: velocity and acceleration of the smoothed trajectory, on map axes."""
     first, t = _grid_times(trajectory)
     x, y, yaw, logged_speed = _extrapolated(trajectory, t)
     vx, vy, ax, ay = logged_speed * np.cos(yaw), logged_speed * np.sin(yaw), np.zeros(len(t)), np.zeros(len(t))
@@ -153,7 +166,7 @@ def point_reference(trajectory: Trajectory) -> Reference:
 
 
 def log_reference(trajectory: Trajectory) -> Reference:
-    """The table of an agent that is where the log has it: x, y, yaw, logged speed."""
+    """Build the table of an agent that is placed on the log: x, y, yaw, logged speed."""
     first, t = _grid_times(trajectory)
 
     def exact(at_s: Array) -> Array:
@@ -163,7 +176,7 @@ def log_reference(trajectory: Trajectory) -> Reference:
 
 
 def _extrapolated(trajectory: Trajectory, t_s: Array) -> tuple[Array, Array, Array, Array]:
-    """The path at times (N,), straight on before its begin and after its end: for the rows just outside."""
+    """Evaluate a trajectory at times (N,), straight on before its begin and after its end, for the rows just outside."""
     x, y, yaw, speed = trajectory.relative(t_s)
     before, after = np.minimum(t_s - trajectory.t_s[0], 0.0), np.maximum(t_s - trajectory.t_s[-1], 0.0)
     x = x + before * trajectory.velocity_x_mps[0] + after * trajectory.velocity_x_mps[-1]
@@ -172,14 +185,14 @@ def _extrapolated(trajectory: Trajectory, t_s: Array) -> tuple[Array, Array, Arr
 
 
 def _grid_times(trajectory: Trajectory) -> tuple[int, Array]:
-    """First row and the times of all rows that cover the life of a path."""
+    """Return the first row and the times of all rows that cover the lifetime of a trajectory."""
     first = int(np.floor(trajectory.t_s[0] / GRID_S))
     last = int(np.ceil(trajectory.t_s[-1] / GRID_S))
     return first, np.arange(first, last + 1, dtype=np.float64) * GRID_S
 
 
 def _smooth(values: Array) -> Array:
-    """Gaussian smoothing; the ends are mirrored in a point, so that a straight course stays as it is."""
+    """Apply Gaussian smoothing; the ends are mirrored in a point, so that a straight line is unchanged."""
     if len(values) < 3:
         return values
     reach = min(int(np.ceil(3 * SMOOTHING_S / GRID_S)), len(values) - 1)
@@ -189,7 +202,7 @@ def _smooth(values: Array) -> Array:
 
 
 def _gears(speed: Array) -> tuple[Array, Array]:
-    """For every row the gear, +1 or -1, of the current motion, or of the next one while standing; and whether it stands."""
+    """Return for every row the gear, +1 or -1, of the present or next movement, and whether the agent stands."""
     direction = np.where(np.abs(speed) < STANDSTILL_MPS, 0, np.sign(speed)).astype(int)
     runs: list[NDArray[np.intp]] = np.split(np.arange(len(speed)), np.flatnonzero(np.diff(direction)) + 1)
     gear, stands = np.ones(len(speed)), np.ones(len(speed))
@@ -210,7 +223,7 @@ def _discontinuity_flags(trajectory: Trajectory) -> tuple[str, ...]:
 def _flags(
     trajectory: Trajectory, course: FeasibleTrajectory, departure_m: Array, max_curvature_1pm: float
 ) -> tuple[str, ...]:
-    """What no vehicle could drive: leaps, and a course that is far from the log or beyond what is feasible all the same."""
+    """Describe what cannot be driven: discontinuities, large distance from the log, acceleration or curvature beyond limits."""
     flags = list(_discontinuity_flags(trajectory))
     for name, values, limit, unit in (
         ("acceleration", course.accel_mps2, MAX_ACCEL_MPS2, "m/s2"),
@@ -224,7 +237,7 @@ def _flags(
 
 
 def vehicle_limits(agent: Agent) -> FeasibilityLimits:
-    """What a wheeled agent can drive, from its category and length."""
+    """Return the limits of a wheeled agent, from its category and length."""
     p = parameters_for([agent])
     wheelbase_m = float(p.wheelbase_m[0])
     return FeasibilityLimits(
@@ -236,7 +249,7 @@ def vehicle_limits(agent: Agent) -> FeasibilityLimits:
 
 
 def vehicle_reference_of(agent: Agent, dt_s: float) -> Reference:
-    """A vehicle's table: feed-forward is ahead by the actuator's lag and by half the step for which it is held."""
+    """Build a vehicle's table; feed-forward is ahead by the lag of the actuator and half a control step."""
     limits = vehicle_limits(agent)
     return vehicle_reference(
         Trajectory.through(agent.waypoints, limits.offset_m),

@@ -1,4 +1,4 @@
-"""Puts what was recorded into a `Replay` and measures it."""
+"""Builds a `Replay` from the recorded tracks and evaluates it."""
 
 from __future__ import annotations
 
@@ -35,26 +35,28 @@ def replay_result(
     mode: str,
     model: str,
 ) -> Replay:
-    """The replay of a scenario from the recorded tracks."""
-    home = {a.id: (g.driver, r.trajectory, r.flags) for g in groups for a, r in zip(g.agents, g.references)}
+    """Build the replay of a scenario from the recorded tracks."""
+    source = {a.id: (g.driver, r.trajectory, r.flags) for g in groups for a, r in zip(g.agents, g.references)}
     agents: list[AgentReplay] = []
     stored: list[NDArray[np.intp]] = []
     errors: dict[str, TrackingErrors] = {}
-    walks = ("pid", "reactive") if mode == "pid" else ()
+    point_drivers = ("pid", "reactive") if mode == "pid" else ()
     for agent in scenario.agents:
         if agent.id not in tracks:
             replayed, steps = _static_agent(agent, clock)
         else:
-            driver, trajectory, flags = home[agent.id]
+            driver, trajectory, flags = source[agent.id]
             steps, states = tracks[agent.id]
             t_s: Array = clock.begin_s + steps.astype(np.float64) * clock.dt_s
-            choice = choices.get(agent.id, ModelChoice("point", "") if driver in walks else ModelChoice("none", ""))
+            choice = choices.get(
+                agent.id, ModelChoice("point", "") if driver in point_drivers else ModelChoice("none", "")
+            )
             moved = _moving_agent(agent, driver, choice, trajectory, flags, t_s, states)
             errors[agent.id] = agent_errors(trajectory, moved, follows=driver in LOG_FOLLOWERS)
             replayed = _with_errors(moved, errors[agent.id])
         agents.append(replayed)
         stored.append(steps)
-    trajectories = {k: trajectory for k, (_, trajectory, _) in home.items() if k in tracks}
+    trajectories = {k: trajectory for k, (_, trajectory, _) in source.items() if k in tracks}
     return Replay(
         scenario=scenario.name,
         scenario_digest=scenario.digest,
@@ -76,7 +78,7 @@ def _moving_agent(
     t_s: Array,
     states: Array,
 ) -> AgentReplay:
-    x, y, yaw, speed, steer, accel, *told = states
+    x, y, yaw, speed, steer, accel, pedal, wheel, gear = states
     if driver == "exact":
         x, y, _, yaw, speed = trajectory.at(t_s)  # the reference tables are only good to half a millimeter
     log_t_s = t_s
@@ -86,10 +88,9 @@ def _moving_agent(
         log_t_s = log_times_of_positions(trajectory, x, y)
     if np.isnan(accel).any():
         accel = np.gradient(speed, t_s) if len(t_s) > 1 else np.zeros(len(t_s))
-    z = trajectory.heights(log_t_s)  # of the road there, whenever the log was
+    z = trajectory.heights(log_t_s)  # the height of the road at this place
     x, y, z, yaw, speed, steer, accel = (np.round(c, STATE_DIGITS) for c in (x, y, z, yaw, speed, steer, accel))
     t_s = np.round(t_s, 9)
-    pedal, wheel, gear = told
     commands = Commands(
         np.round(pedal, COMMAND_DIGITS), np.round(wheel, COMMAND_DIGITS), np.where(gear < 0, -1, 1).astype(np.int8)
     )
@@ -100,7 +101,7 @@ def _moving_agent(
 
 
 def _with_errors(agent: AgentReplay, errors: TrackingErrors) -> AgentReplay:
-    """The agent with its errors, unless it is the log itself."""
+    """Add the tracking errors, unless the agent is placed on the log itself."""
     if agent.driver == "exact":
         return agent
     across, along = (np.round(c, COMMAND_DIGITS) for c in (errors.across_m, errors.along_m))
@@ -108,9 +109,9 @@ def _with_errors(agent: AgentReplay, errors: TrackingErrors) -> AgentReplay:
 
 
 def _static_agent(agent: Agent, clock: StepClock) -> tuple[AgentReplay, NDArray[np.intp]]:
-    """An agent with one pose, and the stored steps at which it is there.
+    """Build a static agent, or one that lived between two steps, and the stored steps at which it is present.
 
-    A static one with a single waypoint is there all the time; one that lived between two stored steps has that moment.
+    A permanent agent is present all the time; one that lived between two stored steps has that one moment.
     """
     w = agent.waypoints
     end_s = clock.time(clock.steps - 1)

@@ -20,9 +20,18 @@ VERSION = 1
 
 @dataclass(frozen=True, eq=False)
 class Commands:
-    """What a vehicle was told at its rows (S,), held over the step before: throttle (positive) or brake, steering, gear.
+    """Commands of a vehicle, each held over the step before its row.
 
-    `gear` is 1 forward and -1 backward. What its actuators did is `steer_rad` and `accel_mps2` of the `AgentReplay`.
+    `AgentReplay.steer_rad` and `accel_mps2` hold what the actuators did.
+
+    Attributes
+    ----------
+    pedal_mps2 : (S,) float64, m/s2
+        Throttle (positive) or brake (negative).
+    steer_rad : (S,) float64
+        At the road wheels, positive left.
+    gear : (S,) int8
+        1 forward, -1 reverse.
     """
 
     pedal_mps2: Array
@@ -34,13 +43,35 @@ class Commands:
 
 @dataclass(frozen=True, eq=False)
 class AgentReplay:
-    """What one agent did: box centers in the map as columns (S,), while it lives.
+    """States of one agent during its lifetime.
 
-    `driver` is "static" (one pose, two rows), "exact" (the log), "pid", "reactive" or "policy"; `model` "none", "point",
-    "kinematic", "dynamic", "single-track" or a simulator elsewhere ("carla"), with the reason in `model_reason`.
-    `accel_mps2` is along the heading; `steer_rad` is 0 where nothing steers. `flags` say what in the log cannot be driven.
-    `commands` are None where there is no vehicle model; `cross_track_m`, `along_track_m` (S,) are the distances from the
-    log, left and ahead positive, None for what stands for good.
+    Attributes
+    ----------
+    id, category : str
+    size_m : (3,) tuple of float, m
+        Length, width, height.
+    driver : str
+        "static" (one pose, two rows), "exact" (placed on the log), "pid", "reactive" or "policy".
+    model : str
+        "none", "point", "kinematic", "dynamic", "single-track" or the name of an external simulator.
+    t_s : (S,) float64, s
+    x_m, y_m, z_m : (S,) float64, m
+        Box center, map frame.
+    yaw_rad : (S,) float64
+    speed_mps : (S,) float64, m/s
+        Along the heading.
+    steer_rad : (S,) float64
+        At the road wheels; 0 for agents that do not steer.
+    accel_mps2 : (S,) float64, m/s2
+        Along the heading.
+    flags : tuple of str
+        What in the log cannot be driven.
+    model_reason : str
+        Why this model was chosen.
+    commands : Commands or None
+        None without a vehicle model.
+    cross_track_m, along_track_m : (S,) float64 or None, m
+        Distance from the log, left and ahead positive; None for static agents.
     """
 
     id: str
@@ -66,12 +97,30 @@ class AgentReplay:
     ERRORS = ("cross_track_m", "along_track_m")
 
     def __len__(self) -> int:
+        """Return the number of stored states."""
         return len(self.t_s)
 
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """A replayed scenario. `scenario_digest` is the SHA-256 of the scenario's document, `store_dt_s` the spacing of rows."""
+    """A replayed scenario.
+
+    Attributes
+    ----------
+    scenario : str
+        Name of the scenario.
+    scenario_digest : str
+        SHA-256 of its document.
+    mode, model : str
+        As requested.
+    dt_s : float, s
+        Simulation step.
+    store_dt_s : float, s
+        Spacing of the stored states.
+    agents : tuple of AgentReplay
+    metrics : mapping
+        As in `schemas/replay-1.json`.
+    """
 
     scenario: str
     scenario_digest: str
@@ -83,7 +132,7 @@ class Replay:
     metrics: Mapping[str, Any] = field(default_factory=dict)
 
     def agent(self, id: str) -> AgentReplay:
-        """The agent with an id; `KeyError` when there is none."""
+        """Return the agent with an id; `KeyError` when there is none."""
         for agent in self.agents:
             if agent.id == id:
                 return agent
@@ -105,7 +154,7 @@ class Replay:
             raise ScenarioError(f"{path}: {error}") from None
 
     def to_dict(self) -> dict[str, Any]:
-        """The document of `schemas/replay-1.json`."""
+        """Return the document of `schemas/replay-1.json`."""
         return {
             "replay_version": VERSION,
             "scenario": self.scenario,
@@ -130,7 +179,7 @@ class Replay:
 
 
 def to_scenario(replay: Replay, scenario: Scenario) -> Scenario:
-    """The scenario with its agents where the replay has them: the replay as something to evaluate, plot or export."""
+    """Return the scenario with its agents where the replay has them, to be evaluated, plotted or exported."""
     done = {a.id: a for a in replay.agents}
     agents = []
     for agent in scenario.agents:
@@ -167,7 +216,7 @@ def _agent_to_dict(agent: AgentReplay) -> dict[str, Any]:
 
 def _agent_from_dict(entry: Mapping[str, Any]) -> AgentReplay:
     states = _columns(entry, "states", AgentReplay.COLUMNS)
-    # Files of 0.1.0 have neither commands nor errors.
+    # Files written by 0.1.0 have neither commands nor errors.
     commands = _columns(entry, "commands", Commands.COLUMNS)
     if commands:
         commands["gear"] = commands["gear"].astype(np.int8)
@@ -187,7 +236,7 @@ def _agent_from_dict(entry: Mapping[str, Any]) -> AgentReplay:
 
 
 def _columns(entry: Mapping[str, Any], group: str, keys: Sequence[str]) -> dict[str, Any]:
-    """The columns of a group, which are as long as the times; none where the group is absent."""
+    """Read the columns of a group, which must be as long as the times; none where the group is absent."""
     count = len(entry["states"]["t_s"])
     columns = {k: np.array(v, dtype=np.float64) for k, v in (entry.get(group) or {}).items() if k in keys}
     for key, values in columns.items():

@@ -1,4 +1,4 @@
-"""The loop of a replay: agents appear when their life begins, are driven step by step, and vanish at its end."""
+"""The loop of a replay: agents appear when their lifetime begins, are driven step by step, and are removed at its end."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from log2sim.simulation.simulators import ExternalSimulator
 from log2sim.simulation.step_clock import StepClock
 from log2sim.simulation.vehicles.model_choice import ModelChoice
 
-WINDOW_S = 10.0
+WINDOW_S = 10.0  # reference tables are at hand for the agents that live within this time
 
 Progress = Callable[[int, int], None]
 
@@ -29,21 +29,21 @@ Progress = Callable[[int, int], None]
 class World:
     """All agents on one clock, moved one step at a time.
 
-    Between two calls the world is at `step`, and whose life begins there has been placed. `advance` moves on, until `done`.
-    With a `host`, a simulator elsewhere, groups only give their controls, and its tick moves them.
+    Between two calls the world is at `step`, and agents whose lifetime begins there have been placed. `advance` moves it on,
+    until `done`. With an external simulator in `host`, groups only compute controls, and its tick moves the agents.
 
     Parameters
     ----------
     groups : sequence of Group
     clock : Clock
     statics : sequence of Agent
-        Agents with one pose, in no group.
+        Agents that never move; they are in no group.
     traffic : Traffic, optional
-        What reactive agents decide by.
+        Decides the speeds of reactive agents.
     choices : mapping, optional
         By id, the model that moves each vehicle and why.
     sight_m : float
-        How far the ego's policy sees.
+        Range within which the ego's policy observes other agents.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class World:
         self.restart()
 
     def restart(self) -> None:
-        """Go back to the first step; what was stored is forgotten."""
+        """Go back to the first step and discard what was recorded."""
         self.step = 0
         self._busy: list[tuple[AgentGroup, dict[int, NDArray[np.intp]]]] = []
         self._records: list[WindowRecording] = []
@@ -80,19 +80,21 @@ class World:
 
     @property
     def t_s(self) -> float:
+        """Time of the present step, s."""
         return self.clock.time(self.step)
 
     @property
     def done(self) -> bool:
+        """Whether the last step has been reached."""
         return self.step >= self.clock.steps - 1
 
     @property
     def ego_lives(self) -> bool:
-        """Whether there is an ego to be driven at this step."""
+        """Whether a policy can drive the ego at this step."""
         return self.ego is not None and bool(self.ego.first[0] <= self.step <= self.ego.last[0])
 
     def observe(self) -> Observation:
-        """What the ego's policy sees now; `ValueError` when no policy drives."""
+        """Return the observation for the ego's policy; `ValueError` when no policy drives."""
         if self._observer is None:
             raise ValueError("no policy drives an agent of this world")
         return self._observer(self.step, self.t_s, self.clock.dt_s)
@@ -106,7 +108,7 @@ class World:
         self.ego.controls = controls
 
     def advance(self) -> None:
-        """Move everybody by one step."""
+        """Move all agents by one step."""
         if self.done:
             raise ValueError(f"the world is at its end, {self.t_s:g} s")
         if self.traffic is None:
@@ -120,11 +122,11 @@ class World:
         self._arrive()
 
     def tracks(self) -> RecordedTracks:
-        """What was stored so far."""
+        """Return what has been recorded so far."""
         return merged_tracks(self._records)
 
     def _react(self, traffic: Traffic) -> None:
-        """Move everybody by one step, within a long one by parts in which the reactive ones see where the others are."""
+        """Move all agents by one step, in parts of at most one control step, so that reactive agents respond within a long step."""
         held_s = control_step(self.clock.dt_s)
         for part in range(round(self.clock.dt_s / held_s)):
             t_s = self.t_s + part * held_s
@@ -135,7 +137,7 @@ class World:
                 group.advance(held_s)
 
     def _arrive(self) -> None:
-        """Look up what holds at this step, place whose life begins, and store."""
+        """Update the references of this step, place agents whose lifetime begins, and record states."""
         step, t_s = self.step, self.t_s
         if step % self._width == 0:
             self._open_window()
@@ -157,13 +159,13 @@ class World:
 
 
 def rollout(world: World, policy: Policy | None = None, progress: Progress | None = None) -> RecordedTracks:
-    """Drive a world to its end and return what was stored."""
-    told = max(1, round(WINDOW_S / world.clock.dt_s))
+    """Run a world to its end and return the recorded tracks."""
+    report_every = max(1, round(WINDOW_S / world.clock.dt_s))
     while not world.done:
         if policy is not None and world.ego_lives:
             world.steer(query_policy(policy, world.observe()))
         world.advance()
-        if progress is not None and (world.step % told == 0):
+        if progress is not None and (world.step % report_every == 0):
             progress(world.step, world.clock.steps)
     if progress is not None:
         progress(world.clock.steps, world.clock.steps)
@@ -171,16 +173,16 @@ def rollout(world: World, policy: Policy | None = None, progress: Progress | Non
 
 
 def _placements(group: AgentGroup, clock: StepClock) -> dict[int, NDArray[np.intp]]:
-    """By step, the agents that are put on their references: at the start of their life and after a leap of the log."""
+    """By step, list the agents that are put on their references: at the start of their lifetime and after a discontinuity."""
     placed: dict[int, list[int]] = defaultdict(list)
     for i, reference in enumerate(group.references):
         if group.last[i] < group.first[i]:
             continue
         placed[int(group.first[i])].append(i)
-        if group.keeps_time:
-            # The table blends the sides of a leap over one row, so the agent is placed again once that is past.
-            leaps = reference.trajectory.discontinuity_times()
-            for step in clock.first_step(np.concatenate([leaps, leaps + GRID_S])):
+        if group.follows_log_time:
+            # The table blends both sides of a discontinuity over one row, so the agent is placed again after that row.
+            jumps_s = reference.trajectory.discontinuity_times()
+            for step in clock.first_step(np.concatenate([jumps_s, jumps_s + GRID_S])):
                 if group.first[i] < step <= group.last[i]:
                     placed[int(step)].append(i)
     return {step: np.unique(index) for step, index in placed.items()}

@@ -1,4 +1,4 @@
-"""Replays a scenario: decides who drives each agent, rolls the world out and measures what came of it."""
+"""Replays a scenario: assigns drivers, runs the simulation and evaluates the result."""
 
 from __future__ import annotations
 
@@ -41,26 +41,26 @@ def replay(
     ----------
     scenario : Scenario
     mode : {"pid", "exact"}
-        Agents follow their waypoints by control through a vehicle model, or are where the log has them.
+        "pid": agents follow their trajectories by control through a vehicle model; "exact": they are placed on them.
     model : {"auto", "kinematic", "dynamic", "single-track"}
         How vehicles move: rolling without slip, on tires that slip and saturate, or by the published single-track model
-        with linear tires; "auto" takes for each the simplest that is good enough, `AgentReplay.model_reason` says why.
+        with linear tires. "auto" takes for each vehicle the simplest adequate one; `AgentReplay.model_reason` gives the reason.
     dt_s : float
         Simulation step in s, from 0.0005 to 1; controls are renewed at least every 0.1 s. States are stored about every
         0.05 s, or every step.
     ego : callable, optional
-        `policy(observation) -> Controls` that drives the ego instead, from its first logged state to the end of its life.
+        `policy(observation) -> Controls` that drives the ego, from its first logged state to the end of its lifetime.
         If it has `reset(scenario)`, that is called first.
     agents : {"log", "reactive"} or collection of str
-        Whether the other agents do as the log, or brake along their own way for what the log does not have there: all of
-        them, or those with these ids (the ego too, if it is among them).
+        "log": the other agents follow the log. "reactive": they keep to their logged paths and brake for agents that the log
+        does not have there. A collection: only the agents with these ids react (the ego too, if it is among them).
     sight_m : float
-        How far the ego's policy sees other agents, center to center.
+        Range within which the ego's policy observes other agents, center to center.
     host : Host, optional
-        Simulator elsewhere that moves the agents instead, such as `log2sim.simulation.carla.simulator.CarlaSimulator`; it has its own
+        External simulator that moves the agents, such as `log2sim.simulation.carla.simulator.CarlaSimulator`. It has its own
         vehicle models, so `model` is not used.
     progress : callable, optional
-        Called with the steps done and their number, some times a run.
+        Called now and then with the number of steps done and of all steps.
 
     Raises
     ------
@@ -71,11 +71,12 @@ def replay(
 
     Notes
     -----
-    Static agents and those seen only once have no controller. Tracking errors are taken over the agents that follow; the
-    user's ego has its own by agent. Cost: one step moves all agents that live in the current 10 s at once.
+    Static agents and those observed only once have no controller. Tracking errors are averaged over the agents that follow
+    the log; those of an ego with a policy are in `metrics["by_agent"]`. Cost: one step moves all agents that live within the
+    present 10 s at once.
     """
     if host is not None:
-        model = "kinematic"  # the references of what only rolls suit any other model
+        model = "kinematic"  # its references hold no slip angles of a model, so they suit every simulator
     world = open_world(
         scenario, mode=mode, model=model, dt_s=dt_s, drives_ego=ego is not None, agents=agents, sight_m=sight_m
     )
@@ -92,7 +93,7 @@ def replay(
 def _rollout_externally(
     world: World, host: ExternalSimulator, ego: Policy | None, progress: Progress | None
 ) -> RecordedTracks:
-    """Let a simulator elsewhere move a world to its end; it is left as it was found, whatever happens."""
+    """Let an external simulator run a world to its end; the simulator is restored in any case."""
     if world.clock.dt_s > host.max_dt_s:
         raise ConfigError(f"dt: {world.clock.dt_s} s, {host.name} takes at most {host.max_dt_s:g} s")
     host.open(world.groups, world.clock, world.statics)
@@ -113,14 +114,14 @@ def open_world(
     agents: str | Collection[str] = "log",
     sight_m: float = SIGHT_M,
 ) -> World:
-    """A scenario as a world to be moved step by step: with `drives_ego` by controls of the caller's. See `replay`.
+    """Prepare a scenario for stepwise simulation; with `drives_ego` the caller sets the ego's controls. See `replay`.
 
     Examples
     --------
     >>> world = open_world(scenario)
     >>> while not world.done:
     ...     if world.ego_lives:
-    ...         seen = world.observe()  # an Observation, as policies get it
+    ...         observation = world.observe()
     ...         world.steer(Controls(accel_mps2=1.0, steer_rad=0.0))
     ...     world.advance()
     """
@@ -133,16 +134,16 @@ def open_world(
     if model not in MODELS:
         raise ConfigError(f"unknown vehicle model '{model}'{nearest(model, list(MODELS))}; known: {', '.join(MODELS)}")
     if drives_ego and (scenario.ego is None or scenario.ego.category not in WHEELED):
-        raise ConfigError(f"ego policy: scenario '{scenario.name}' has no agent '{EGO}' on wheels that it could drive")
+        raise ConfigError(f"ego policy: scenario '{scenario.name}' has no agent '{EGO}' with wheels to drive")
     for agent in scenario.agents:
         problem = agent.waypoints.problem()
         if problem is not None:
             raise ScenarioError(f"agent '{agent.id}': {problem}")
     clock = _clock(scenario.agents, dt_s)
     reactive = reactive_ids(scenario.agents, agents, drives_ego=drives_ego)
-    cast = assign_drivers(scenario.agents, mode, drives_ego=drives_ego, reactive=reactive)
-    groups, choices = agent_groups(cast, clock, mode, model)
-    return World(groups, clock, cast["static"], reactive_traffic(scenario.agents, groups, clock), choices, sight_m)
+    assigned = assign_drivers(scenario.agents, mode, drives_ego=drives_ego, reactive=reactive)
+    groups, choices = agent_groups(assigned, clock, mode, model)
+    return World(groups, clock, assigned["static"], reactive_traffic(scenario.agents, groups, clock), choices, sight_m)
 
 
 def _clock(agents: Sequence[Agent], dt_s: float) -> StepClock:

@@ -1,7 +1,8 @@
-"""What the replay asks of a simulator, and the embedded one.
+"""What a replay needs of a simulator, and the embedded one.
 
-A simulator moves all agents at once by stateless steps. Another vehicle model is made usable by a line in `STEPS`, another
-simulator by giving it the two functions of `Simulator`, and one that runs elsewhere (a game engine) as a `ExternalSimulator`.
+A simulator moves all agents at once by stateless steps. To add a vehicle model, add a line to `STEPS`; to add a
+simulator, implement the two methods of `Simulator`, or `ExternalSimulator` for one that runs in another process, such
+as a game engine.
 """
 
 from __future__ import annotations
@@ -29,37 +30,41 @@ class Simulator(Protocol):
     def step_vehicles(
         self, state: VehicleState, controls: VehicleControls, parameters: VehicleParameters, dt_s: float
     ) -> VehicleState:
-        """The state of the vehicles after the step."""
+        """Return the state of the vehicles after the step."""
         ...
 
     def step_points(self, state: PointState, controls: PointControls, dt_s: float) -> PointState:
-        """The state of the points (pedestrians and whatever has no wheels) after the step."""
+        """Return the state of the points (pedestrians and everything without wheels) after the step."""
         ...
 
 
 class ExternalSimulator(Protocol):
-    """A simulator outside this process, which has one clock for all agents: a step of the replay is one tick of it.
+    """A simulator in another process, with one clock for all agents: a step of the replay is one tick of it.
 
-    `open` seats the groups: their simulators from then on take controls down and leave states as they are. `tick`, called
-    when all groups have given their controls, moves everybody and sets the groups' states to what came of it.
+    `open` takes the groups over: from then on their simulators only record the controls. `tick` is called when all
+    groups have set their controls; it moves all agents and writes the new states back into the groups.
     """
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Name of the simulator in results."""
+        ...
 
     @property
-    def max_dt_s(self) -> float: ...
+    def max_dt_s(self) -> float:
+        """Longest step in s that it can take."""
+        ...
 
     def open(self, groups: Sequence[Any], clock: Any, statics: Sequence[Agent]) -> None:
-        """Begin with groups (`log2sim.simulation.groups`), a clock, and agents that stand for good."""
+        """Start with groups (`log2sim.simulation.groups`), a clock, and agents that never move."""
         ...
 
     def tick(self, step: int) -> None:
-        """Move from a step to the next."""
+        """Move all agents from a step to the next."""
         ...
 
     def close(self) -> None:
-        """Leave the simulator as it was found."""
+        """Restore the simulator as it was before `open`."""
         ...
 
 
@@ -75,9 +80,11 @@ class EmbeddedSimulator:
     def step_vehicles(
         self, state: VehicleState, controls: VehicleControls, parameters: VehicleParameters, dt_s: float
     ) -> VehicleState:
+        """Move vehicles by the chosen model."""
         return self._step(state, controls, parameters, dt_s)
 
     def step_points(self, state: PointState, controls: PointControls, dt_s: float) -> PointState:
+        """Move point masses."""
         return step_point(state, controls, dt_s)
 
 

@@ -1,4 +1,4 @@
-"""The steps of a replay."""
+"""The clock of a replay."""
 
 from __future__ import annotations
 
@@ -10,13 +10,21 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array
 
-STORE_S = 0.05
-MARGIN = 1e-6  # of a step: a waypoint at 0.3 s is on step 30 of 10 ms
+STORE_S = 0.05  # spacing of stored states, about 20 Hz
+MARGIN = 1e-6  # in steps, for rounding: a waypoint at 0.3 s is on step 30 of 10 ms
 
 
 @dataclass(frozen=True)
 class StepClock:
-    """Steps at begin_s + n * dt_s for n in [0, steps); every `store_every`-th is stored: about 20 Hz."""
+    """Steps at `begin_s + n * dt_s` for n in [0, `steps`).
+
+    Attributes
+    ----------
+    begin_s : float, s
+    dt_s : float, s
+        Length of a step.
+    steps : int
+    """
 
     begin_s: float
     dt_s: float
@@ -24,19 +32,22 @@ class StepClock:
 
     @classmethod
     def spanning(cls, begin_s: float, end_s: float, dt_s: float) -> StepClock:
+        """Create the clock whose steps cover `begin_s` to `end_s`."""
         return cls(begin_s, dt_s, math.floor((end_s - begin_s) / dt_s + MARGIN) + 1)
 
     @property
     def store_every(self) -> int:
+        """States are stored at every so many steps."""
         return max(1, round(STORE_S / self.dt_s))
 
     def time(self, step: int) -> float:
+        """Return the time of a step in s."""
         return self.begin_s + step * self.dt_s
 
     def first_step(self, t_s: Array) -> NDArray[np.intp]:
-        """The first steps at or after times (N,)."""
+        """Return the first steps at or after times (N,)."""
         return np.ceil((t_s - self.begin_s) / self.dt_s - MARGIN).astype(np.intp)
 
     def last_step(self, t_s: Array) -> NDArray[np.intp]:
-        """The last steps at or before times (N,)."""
+        """Return the last steps at or before times (N,)."""
         return np.floor((t_s - self.begin_s) / self.dt_s + MARGIN).astype(np.intp)

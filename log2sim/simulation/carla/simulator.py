@@ -82,7 +82,9 @@ class CarlaSimulator:
         """
         self.clock = clock
         everybody = [a for g in groups for a in g.agents] + list(statics)
-        taped = [a for g in groups if isinstance(g, LogReplayGroup) and g.keeps_time for a in g.agents] + list(statics)
+        taped = [a for g in groups if isinstance(g, LogReplayGroup) and g.follows_log_time for a in g.agents] + list(
+            statics
+        )
         self.offset_m = _offset_m(everybody)
         data = {d["id"]: d for d in carla_agents([_shifted(a, self.offset_m) for a in everybody])}
         self._data, self._courses = data, {k: player.SampledTrajectory(d["exact"]) for k, d in data.items()}
@@ -97,7 +99,7 @@ class CarlaSimulator:
             self._player = player.ScenarioPlayer(self.stage, shown, "exact", physics=False, ground=ground)
         self._fleets = [(g, _PendingControls()) for g in groups if isinstance(g, VehicleGroup)]
         self._crowds = [(g, _PendingControls()) for g in groups if isinstance(g, PedestrianGroup)]
-        self._delayed = [g for g in groups if isinstance(g, LogReplayGroup) and not g.keeps_time]
+        self._delayed = [g for g in groups if isinstance(g, LogReplayGroup) and not g.follows_log_time]
         for fleet, seat in self._fleets:
             fleet.simulator = seat
         for crowd, seat in self._crowds:

@@ -1,1 +1,1 @@
-"""What came of a replay: errors, contacts, conflicts, comfort, and the limits that a strict replay keeps."""
+"""Metrics of a replay: tracking error, collisions, time to collision, post-encroachment time, comfort."""

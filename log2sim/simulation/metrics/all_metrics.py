@@ -1,4 +1,4 @@
-"""All metrics of a replay: tracking, collisions, pairs that come near each other in time, comfort."""
+"""All metrics of a replay: tracking errors, collisions, conflicts, comfort."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from log2sim.simulation.step_clock import StepClock
 from log2sim.simulation.vehicles.parameters import WHEELED
 
 LOG_FOLLOWERS = ("pid", "exact")
-"""Drivers that are held against the log."""
+"""Drivers that follow the log in place and time."""
 
 
 def replay_metrics(
@@ -30,13 +30,13 @@ def replay_metrics(
     errors: Mapping[str, TrackingErrors],
     clock: StepClock,
 ) -> dict[str, Any]:
-    """The metrics of `schemas/replay-1.json`, by agent and overall.
+    """Compute the metrics of `schemas/replay-1.json`, by agent and overall.
 
     Parameters
     ----------
     agents : sequence of AgentReplay
     stored : sequence of (S,) int
-        The steps of each agent's rows; of a static agent all stored steps at which it is there.
+        The steps of each agent's rows; of a static agent all stored steps at which it is present.
     paths, errors : by id
         Courses of the agents that move in the log, and how far they are from them.
     """
@@ -73,7 +73,7 @@ def replay_metrics(
 
 
 def _by_agent(records: Iterable[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """The records by the id of each of their agents."""
+    """Group records by the id of each of their agents."""
     found: dict[str, list[Any]] = defaultdict(list)
     for record in records:
         for id in record["agents"]:
@@ -82,7 +82,7 @@ def _by_agent(records: Iterable[Mapping[str, Any]]) -> dict[str, list[Any]]:
 
 
 def _comfort(agent: AgentReplay, trajectory: Trajectory) -> dict[str, float | bool] | None:
-    """Comfort of a vehicle; None for who walks, and where the log leaps."""
+    """Return the comfort of a vehicle; None for pedestrians, and where the log has a discontinuity."""
     if agent.category not in WHEELED or len(trajectory.discontinuity_times()):
         return None
     return comfort(agent.t_s, agent.x_m, agent.y_m, agent.yaw_rad)
@@ -94,7 +94,7 @@ def _box_tracks(
     trajectories: Mapping[str, Trajectory],
     clock: StepClock,
 ) -> BoxTracks:
-    """Boxes at all stored steps, of the replay or, for agents with a path given, of the log."""
+    """Return boxes at all stored steps, of the replay or, for agents with a trajectory given, of the log."""
     shape = ((clock.steps - 1) // clock.store_every + 1, len(agents))
     columns = np.full((5, *shape), np.nan)
     for k, (agent, steps) in enumerate(zip(agents, stored)):

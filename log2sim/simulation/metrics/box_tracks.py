@@ -1,4 +1,4 @@
-"""Oriented boxes of all agents over time, and how far apart two of them are."""
+"""Oriented boxes of all agents over time."""
 
 from __future__ import annotations
 
@@ -11,16 +11,21 @@ from numpy.typing import NDArray
 from log2sim.geometry import Array, rectangles_overlap, wrap_angle
 
 DISCONTINUITY_M = 1.0
-"""A step that differs from both its neighbors by more is no motion: at 20 Hz it would take 400 m/s2."""
+"""A step that differs from both neighboring steps by more is a discontinuity: at 20 Hz it would take 400 m/s2."""
 
 RowIndex = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
 class BoxTracks:
-    """Boxes of A agents at S times: centers, yaw and speed (S, A), NaN in `x_m` where an agent is absent; sizes (A, 3).
+    """Boxes of A agents at S times; between two rows a box moves straight and turns evenly.
 
-    Between two rows a box moves straight on and turns evenly.
+    Attributes
+    ----------
+    x_m, y_m, z_m : (S, A) float64, m
+        Box centers; NaN where an agent is absent.
+    yaw_rad, speed_mps : (S, A) float64
+    size_m : (A, 3) float64
     """
 
     x_m: Array
@@ -32,29 +37,29 @@ class BoxTracks:
 
     @cached_property
     def present(self) -> NDArray[np.bool_]:
-        """Where an agent is there (S, A)."""
+        """Where an agent is present (S, A)."""
         return ~np.isnan(self.x_m)
 
     @cached_property
     def radius_m(self) -> Array:
-        """Of the circle about each footprint (A,)."""
+        """Radius of the circle around each footprint (A,)."""
         return np.hypot(self.size_m[:, 0], self.size_m[:, 1]) / 2
 
     @cached_property
     def first_row(self) -> RowIndex:
-        """The first row (A,) with the agent; 0 where there is none."""
+        """First row (A,) with the agent; 0 where there is none."""
         return np.argmax(self.present, axis=0) if len(self.x_m) else np.zeros(len(self.size_m), dtype=np.intp)
 
     @cached_property
     def last_row(self) -> RowIndex:
-        """The last row (A,) with the agent; the last of all where there is none."""
+        """Last row (A,) with the agent; the last of all where there is none."""
         if not len(self.x_m):
             return np.full(len(self.size_m), -1, dtype=np.intp)
         return len(self.x_m) - 1 - np.argmax(self.present[::-1], axis=0)
 
     @cached_property
     def moves_on(self) -> NDArray[np.bool_]:
-        """Where an agent gets from a row to the next by motion (S, A): it is there at both, and the log does not leap."""
+        """Where an agent moves continuously from a row to the next (S, A): it is present at both, without a discontinuity."""
         on = np.zeros(self.x_m.shape, dtype=bool)
         if len(on) > 1:
             step = np.diff(self.x_m, axis=0) + 1j * np.diff(self.y_m, axis=0)
@@ -65,7 +70,7 @@ class BoxTracks:
         return on
 
     def velocities(self, spacing_s: float) -> tuple[Array, Array]:
-        """Velocity on map axes (S, A) twice, NaN where absent: the mean of the steps before and after a row.
+        """Return the velocity on map axes (S, A) twice, NaN where absent: the mean of the steps before and after a row.
 
         An agent with neither step moves along its heading at its speed.
         """
@@ -76,7 +81,7 @@ class BoxTracks:
         )
 
     def climbs(self, spacing_s: float) -> Array:
-        """Vertical velocity (S, A), likewise; 0 for an agent with neither step."""
+        """Return the vertical velocity (S, A) likewise; 0 for an agent with neither step."""
         return self._rates(self.z_m, np.zeros(self.z_m.shape), spacing_s)
 
     def _rates(self, values: Array, alone: Array, spacing_s: float) -> Array:
@@ -87,7 +92,7 @@ class BoxTracks:
         return np.where(np.isnan(mean) & self.present, alone, mean)
 
     def poses(self, row: Array | RowIndex, agent: RowIndex) -> tuple[Array, Array, Array, Array]:
-        """x, y, z and yaw (N,) of agents (N,) at rows (N,) with a fraction, which are within their lives."""
+        """Return x, y, z and yaw (N,) of agents (N,) at fractional rows (N,) within their lifetimes."""
         k = np.floor(row).astype(np.intp)
         fraction = np.where(self.moves_on[k, agent], row - k, 0.0)
         after = np.minimum(k + 1, len(self.x_m) - 1)
@@ -99,7 +104,7 @@ class BoxTracks:
         return x, y, z, self.yaw_rad[k, agent] + np.where(fraction > 0, fraction * turn, 0.0)
 
     def overlap(self, row_a: Array | RowIndex, a: RowIndex, row_b: Array | RowIndex, b: RowIndex) -> NDArray[np.bool_]:
-        """Whether box a at its row overlaps box b at its own (N,)."""
+        """Whether box a at its row overlaps box b at its own row (N,)."""
         xa, ya, za, yaw_a = self.poses(row_a, a)
         xb, yb, zb, yaw_b = self.poses(row_b, b)
         size_a, size_b = self.size_m[a], self.size_m[b]
@@ -108,5 +113,5 @@ class BoxTracks:
 
 
 def spacing_s(t_s: Array) -> float:
-    """The time from row to row of evenly spaced times (S,); 1 where there is only one, of which nothing moves."""
+    """Return the spacing of evenly spaced times (S,); 1 for a single time."""
     return float(t_s[1] - t_s[0]) if len(t_s) > 1 else 1.0

@@ -1,4 +1,4 @@
-"""Contacts of oriented boxes over time, and the collisions of a replay that come of them."""
+"""Contacts of oriented boxes over time, and the collisions that they form."""
 
 from __future__ import annotations
 
@@ -15,19 +15,26 @@ from log2sim.simulation.metrics.continuous_collision import RelativeMotion, firs
 from log2sim.simulation.vehicles.vehicle import Columns
 
 CHUNK = 20
-"""Rows that share one broad phase."""
+"""Rows in one broad phase."""
 
 BATCH = 100_000
-"""Pairs that are looked at together, so that memory stays small."""
+"""Pairs evaluated together, which bounds memory."""
 
-SAME_CONTACT_S = 0.5  # contacts of a pair that are nearer in time are one collision
-LOG_WINDOW_S = 0.5  # a replayed collision is the log's when the log's boxes overlap this near in time,
-LOG_MARGIN_M = 0.1  # or pass with less room than this, which is less than boxes err by
+SAME_CONTACT_S = 0.5  # contacts of a pair that are closer in time form one collision
+LOG_WINDOW_S = 0.5  # the log has a collision too when its boxes overlap within this time of it,
+LOG_MARGIN_M = 0.1  # or pass with a smaller gap than this, which is below the errors of boxes
 
 
 @dataclass(frozen=True, eq=False)
 class Contacts(Columns):
-    """Contacts (N,) of boxes a < b: the rows, with a fraction, of the first and the last overlap within one step."""
+    """Contacts (N,) of boxes a < b.
+
+    Attributes
+    ----------
+    a, b : (N,) int
+    first_row, last_row : (N,) float64
+        Fractional rows of the first and last overlap within one step.
+    """
 
     a: RowIndex
     b: RowIndex
@@ -36,13 +43,13 @@ class Contacts(Columns):
 
 
 def contacts(boxes: BoxTracks, moves: NDArray[np.bool_], only: NDArray[np.bool_] | None = None) -> Contacts:
-    """Contacts of two boxes of which one moves, a step at a time; `only` (A,) leaves out all other agents.
+    """Find contacts of two boxes of which at least one moves, a step at a time; `only` (A,) restricts the agents.
 
     Notes
     -----
     Broad phase: axis-aligned hulls of the circles about the boxes over `CHUNK` rows, sorted. Narrow phase: `first_contact`,
-    forward for the first overlap and backward for the last. Where an agent leaps or vanishes the boxes are compared at the
-    row alone. Cost: A log A and the pairs in reach, a chunk.
+    forward for the first overlap and backward for the last. Where an agent does not move continuously, the boxes are compared
+    at the row alone. Cost: A log A and the pairs in reach, a chunk.
     """
     k, a, b = np.concatenate([np.zeros((3, 0), dtype=np.intp), *_candidates(boxes, moves, only)], axis=1)
     first_row, last_row = np.zeros(len(k)), np.zeros(len(k))
@@ -56,7 +63,7 @@ def contacts(boxes: BoxTracks, moves: NDArray[np.bool_], only: NDArray[np.bool_]
 def _candidates(
     boxes: BoxTracks, moves: NDArray[np.bool_], only: NDArray[np.bool_] | None
 ) -> Iterator[tuple[RowIndex, RowIndex, RowIndex]]:
-    """Rows and pairs (3, N) that may touch before the next row."""
+    """Yield rows and pairs (3, N) that may touch before the next row."""
     for begin in range(0, len(boxes.x_m), CHUNK):
         rows = slice(begin, begin + CHUNK + 1)
         i, j = _overlapping_hulls(boxes.x_m[rows], boxes.y_m[rows], boxes.radius_m, moves, only)
@@ -68,7 +75,7 @@ def _candidates(
 
 
 def _contact_rows(boxes: BoxTracks, k: RowIndex, a: RowIndex, b: RowIndex) -> tuple[Array, Array]:
-    """Rows (N,), with a fraction, of the first and the last overlap from rows `k` to the next; NaN where there is none."""
+    """Return fractional rows (N,) of the first and last overlap from rows `k` to the next; NaN without overlap."""
     motion = _relative_motion(boxes, k, a, b)
     first, last = first_contact(motion), np.zeros(len(k))
     hit = np.flatnonzero(~np.isnan(first))
@@ -79,7 +86,7 @@ def _contact_rows(boxes: BoxTracks, k: RowIndex, a: RowIndex, b: RowIndex) -> tu
 
 
 def _relative_motion(boxes: BoxTracks, k: RowIndex, a: RowIndex, b: RowIndex) -> RelativeMotion:
-    """The motion of pairs (N,) from rows to the next, none where one of them does not get there by moving."""
+    """Return the motion of pairs (N,) from rows to the next; none where one of them does not move continuously."""
     after = np.where(boxes.moves_on[k, a] & boxes.moves_on[k, b], k + 1, k)
     x, y, z = (c[k, b] - c[k, a] for c in (boxes.x_m, boxes.y_m, boxes.z_m))
     then_x, then_y, then_z = (c[after, b] - c[after, a] for c in (boxes.x_m, boxes.y_m, boxes.z_m))
@@ -93,7 +100,7 @@ def _relative_motion(boxes: BoxTracks, k: RowIndex, a: RowIndex, b: RowIndex) ->
 def _overlapping_hulls(
     x: Array, y: Array, radius: Array, moves: NDArray[np.bool_], only: NDArray[np.bool_] | None
 ) -> tuple[RowIndex, RowIndex]:
-    """Pairs (P,), (P,) whose hulls over the rows meet, at least one of them moving."""
+    """Return pairs (P,), (P,) whose hulls over the rows overlap, at least one of them moving."""
     there = ~np.isnan(x).all(axis=0)
     present = np.flatnonzero(there if only is None else there & only)
     low = np.stack([np.nanmin(c[:, present], axis=0) - radius[present] for c in (x, y)])
@@ -113,7 +120,7 @@ def _overlapping_hulls(
 def collisions(
     replayed: BoxTracks, logged: BoxTracks, moves: NDArray[np.bool_], t_s: Array, ids: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Collisions of a replay in order of time: the pair, first and last contact, relative speed, and if the log has it.
+    """List collisions in order of time: pair, first and last contact, relative speed, and whether the log has it too.
 
     `t_s` (S,) are the evenly spaced times of the rows; in between contacts are known to about 0.01 ms.
     """
@@ -147,7 +154,7 @@ def collisions(
 
 
 def _by_pair(found: Contacts) -> dict[tuple[int, int], Array]:
-    """First and last rows (2, K) of each pair's contacts in order of time."""
+    """Group first and last rows (2, K) of contacts by pair, in order of time."""
     found = found.take(np.lexsort((found.first_row, found.b, found.a)))
     new = np.flatnonzero((np.diff(found.a) != 0) | (np.diff(found.b) != 0)) + 1
     rows = np.split(np.stack([found.first_row, found.last_row]), new, axis=1)
@@ -156,14 +163,14 @@ def _by_pair(found: Contacts) -> dict[tuple[int, int], Array]:
 
 
 def _merged_contacts(contact: Array, gap: float) -> list[tuple[float, float]]:
-    """Begin and end of contacts (2, K), those joined that are at most `gap` apart."""
+    """Return begin and end of contacts (2, K), merging those at most `gap` apart."""
     first, last = contact
     new = np.flatnonzero(first[1:] - last[:-1] > gap) + 1
     return [(float(f[0]), float(t[-1])) for f, t in zip(np.split(first, new), np.split(last, new))]
 
 
 def _relative_speed(velocity: Array, row: float, a: int, b: int) -> float:
-    """Relative speed at a row with a fraction, from velocities (2, S, A)."""
+    """Interpolate the relative speed at a fractional row, from velocities (2, S, A)."""
     k = int(row)
     after = min(k + 1, velocity.shape[1] - 1)
     now, then = (velocity[:, r, b] - velocity[:, r, a] for r in (k, after))

@@ -1,4 +1,4 @@
-"""How a ride feels: accelerations and jerk of a box center, smoothed as a body feels them."""
+"""Ride comfort: acceleration and jerk of the box center, smoothed as a body feels them."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from log2sim.geometry import Array
 
 ACCEL_WINDOW_S = 0.75
 JERK_WINDOW_S = 1.5
-"""Lengths of the fits. Shorter ones show the steps of a controller and the noise of a log instead of the ride."""
+"""Lengths of the fits. Shorter ones show the steps of the controller and the noise of the log."""
 
 MIN_ROWS = 5
-"""A window of fewer rows fits no cubic; where rows lie far apart the fits are longer for that."""
+"""Fewest rows of a window: a cubic with one degree of freedom left. With sparse rows the windows are longer."""
 
 LIMITS = {
     "lon_accel_max_mps2": 2.40,
@@ -25,26 +25,26 @@ LIMITS = {
     "yaw_rate_max_radps": 0.95,
     "yaw_accel_max_radps2": 1.93,
 }
-"""Comfort of nuPlan's planning benchmark (Karnchanachari et al., 2024), taken from human drivers of its log."""
+"""Comfort limits of nuPlan's planning benchmark (Karnchanachari et al., 2024), derived from human drivers."""
 
 
 def comfort(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array) -> dict[str, float | bool] | None:
-    """Greatest and RMS acceleration, jerk and rates of turn, and whether all keep to `LIMITS`.
+    """Compute greatest and RMS acceleration, jerk and yaw rates, and whether all are within `LIMITS`.
 
     Parameters
     ----------
     t_s, x_m, y_m, yaw_rad : (S,) float64, s, m and rad
-        Evenly spaced box centers without leaps.
+        Evenly spaced box centers without discontinuities.
 
     Returns
     -------
     dict or None
-        None for fewer than five rows, which no window fits.
+        None for fewer than five rows.
 
     Notes
     -----
     Derivatives of cubics fitted to the positions in a sliding window (Savitzky and Golay, 1964): longitudinal along the
-    heading, lateral across it, both of the box center whatever drives it. What changes faster than the window is damped.
+    heading, lateral across it, both of the box center. Changes faster than the window are damped.
     """
     if len(t_s) < MIN_ROWS:
         return None
@@ -73,7 +73,7 @@ def comfort(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array) -> dict[str, flo
 
 
 def _derivative(values: Array, order: int, window_s: float, spacing_s: float) -> Array:
-    """Derivative (S,) of the cubics fitted to a window about each row; near an end of that of the window at the end."""
+    """Return the derivative (S,) of cubics fitted to a window around each row; near an end, of the window at the end."""
     longest = len(values) - (len(values) + 1) % 2
     half = min(max(round(window_s / spacing_s / 2), MIN_ROWS // 2), longest // 2)
     weights = _weights(half, order, spacing_s)
@@ -89,7 +89,7 @@ def _derivative(values: Array, order: int, window_s: float, spacing_s: float) ->
 
 @lru_cache(maxsize=64)
 def _weights(half: int, order: int, spacing_s: float) -> Array:
-    """Weights (W, W) of the values of a window of W = 2 half + 1 rows in the derivative at each of its rows."""
+    """Return weights (W, W) of the values of a window of W = 2 half + 1 rows in the derivative at each of its rows."""
     at_s = np.arange(-half, half + 1) * spacing_s
     fit = np.linalg.pinv(np.vander(at_s, 4, increasing=True))
     return sum(

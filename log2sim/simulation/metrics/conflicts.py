@@ -1,4 +1,4 @@
-"""Pairs of agents that come near each other in time: how near, when, and whether they collide."""
+"""Conflicts: pairs of agents with a time to collision or a post-encroachment time, and whether they collide."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Event = Mapping[str, Any]
 def conflicts(
     boxes: BoxTracks, moves: NDArray[np.bool_], t_s: Array, ids: Sequence[str], collisions: Iterable[Event]
 ) -> list[dict[str, Any]]:
-    """One record for every pair with a time to collision or a post-encroachment time, the most pressing first.
+    """Return one record for every pair with a time to collision or a post-encroachment time, the most critical first.
 
     Both times of a pair with a collision that the log does not have are 0 when it begins; `contact` is "none", "new" or
     "log".
@@ -54,9 +54,9 @@ def conflicts(
 
 
 def most_critical(found: Iterable[Event], key: str) -> dict[str, Any] | None:
-    """The record's `agents`, `t_s` and value `s` with the least `key` ("min_ttc" or "pet"); None where there is none.
+    """Return `agents`, `t_s` and value `s` of the record with the least `key` ("min_ttc" or "pet"); None without any.
 
-    Pairs that touch in the log too are left out: boxes of a log err by more than what would part them.
+    Pairs that touch in the log too are left out: the errors of logged boxes are larger than the gap between them.
     """
     known = [e for e in found if e[f"{key}_s"] is not None and e["contact"] != "log"]
     if not known:

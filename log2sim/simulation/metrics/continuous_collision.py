@@ -1,4 +1,4 @@
-"""When two boxes that move and turn first touch: conservative advancement, so that nothing passes through between samples."""
+"""Continuous collision detection: when two moving and turning boxes first touch, by conservative advancement."""
 
 from __future__ import annotations
 
@@ -10,16 +10,26 @@ from log2sim.geometry import Array, separating_axes
 from log2sim.simulation.vehicles.vehicle import Columns
 
 MAX_STEPS = 64
-"""An interval is crossed in at most so many steps; a touch that lasts shorter than one may pass unseen, 0.8 ms of 50 ms."""
+"""Most steps in an interval; a contact shorter than one step, 0.8 ms of 50 ms, may be missed."""
 
 BISECTIONS = 8  # of the last step: 3 us of 50 ms
 
 
 @dataclass(frozen=True, eq=False)
 class RelativeMotion(Columns):
-    """N pairs over an interval of time: the way from a to b at its begin and how it changes until its end, yaws and turns.
+    """Relative motion of N pairs of boxes over an interval.
 
-    `dx_m`, `dy_m`, `dz_m`, their changes `vx_m`, `vy_m`, `vz_m`, yaws and `turn_*_rad` (N,), sizes (3, N).
+    Attributes
+    ----------
+    dx_m, dy_m, dz_m : (N,) float64
+        From box a to box b at the begin.
+    vx_m, vy_m, vz_m : (N,) float64
+        Change of these over the interval.
+    yaw_a_rad, yaw_b_rad : (N,) float64
+        At the begin.
+    turn_a_rad, turn_b_rad : (N,) float64
+        Change of these over the interval.
+    size_a_m, size_b_m : (3, N) float64
     """
 
     dx_m: Array
@@ -36,7 +46,7 @@ class RelativeMotion(Columns):
     size_b_m: Array
 
     def reversed(self) -> RelativeMotion:
-        """The same from the end to the begin."""
+        """Return the motion from the end to the begin."""
         return RelativeMotion(
             self.dx_m + self.vx_m, self.dy_m + self.vy_m, self.dz_m + self.vz_m,
             -self.vx_m, -self.vy_m, -self.vz_m,
@@ -45,23 +55,24 @@ class RelativeMotion(Columns):
         )  # fmt: skip
 
     def may_touch(self) -> np.ndarray:
-        """Whether the circles about the footprints meet (N,)."""
-        way = self.vx_m**2 + self.vy_m**2
+        """Whether the circles around the footprints meet (N,)."""
+        square = self.vx_m**2 + self.vy_m**2
         closing = -(self.dx_m * self.vx_m + self.dy_m * self.vy_m)
-        u = np.clip(np.divide(closing, way, out=np.zeros_like(way), where=way > 0), 0.0, 1.0)
+        u = np.clip(np.divide(closing, square, out=np.zeros_like(square), where=square > 0), 0.0, 1.0)
         reach = (np.hypot(*self.size_a_m[:2]) + np.hypot(*self.size_b_m[:2])) / 2
         return np.hypot(self.dx_m + u * self.vx_m, self.dy_m + u * self.vy_m) < reach
 
     def free_for(self, u: Array) -> Array:
-        """Share of the interval (N,) for which boxes stay apart for certain after the shares `u` (N,); 0 where they overlap.
+        """Return the share of the interval (N,) for which boxes certainly stay apart after the shares `u` (N,); 0 in overlap.
 
-        Along an axis of a box the gap shrinks at most at the speed along it plus what both turns add. The largest of these
-        bounds, over the axes with a gap, is safe. A box that only touches gives the smallest positive number.
+        Along an axis of a box the gap shrinks at most at the speed along it plus the contributions of both turns. The
+        largest of these bounds, over the axes with a gap, is safe. Boxes that only touch return the smallest positive
+        number.
         """
         left = 1.0 - u
         dx, dy = self.dx_m + u * self.vx_m, self.dy_m + u * self.vy_m
-        way = np.hypot(self.vx_m, self.vy_m)
-        distance = np.hypot(dx, dy) + 2 * way * left
+        travel = np.hypot(self.vx_m, self.vy_m)
+        distance = np.hypot(dx, dy) + 2 * travel * left
         yaw_a, yaw_b = self.yaw_a_rad + u * self.turn_a_rad, self.yaw_b_rad + u * self.turn_b_rad
         spin_a, spin_b = np.abs(self.turn_a_rad), np.abs(self.turn_b_rad)
         relative = np.abs(self.turn_b_rad - self.turn_a_rad) / 2
@@ -77,12 +88,12 @@ class RelativeMotion(Columns):
 
 
 def first_contact(motion: RelativeMotion) -> Array:
-    """Share of the interval (N,) after which the boxes first overlap, NaN where they do not.
+    """Return the share of the interval (N,) after which the boxes first overlap, NaN where they do not.
 
     Notes
     -----
     Conservative advancement (Mirtich, 1996) with separating axes in place of a distance: every step is as long as the
-    boxes stay apart for certain, but at least 1 / `MAX_STEPS`; the last step is halved until it says when.
+    boxes certainly stay apart, but at least 1 / `MAX_STEPS`; the last step is bisected.
     """
     touch = np.full(len(motion.dx_m), np.nan)
     active = np.flatnonzero(motion.may_touch())
@@ -99,7 +110,7 @@ def first_contact(motion: RelativeMotion) -> Array:
 
 
 def _bisected(motion: RelativeMotion, apart: Array, overlapping: Array) -> Array:
-    """The first share (N,) with an overlap between one without and one with it."""
+    """Bisect for the first share (N,) with an overlap, between one without and one with it."""
     for _ in range(BISECTIONS):
         middle = (apart + overlapping) / 2
         inside = motion.free_for(middle) == 0
@@ -108,6 +119,6 @@ def _bisected(motion: RelativeMotion, apart: Array, overlapping: Array) -> Array
 
 
 def _gap_duration(gap: Array, rate: Array) -> Array:
-    """How long (N,) a gap lasts that shrinks at a rate; 0 where there is none, inf where it stays."""
+    """Return how long (N,) a gap lasts that shrinks at a rate; 0 without a gap, inf for a constant one."""
     lasts = np.divide(gap, rate, out=np.full(len(gap), np.inf), where=rate > 0)
     return np.where(gap < 0, 0.0, np.maximum(lasts, np.finfo(float).tiny))

@@ -1,4 +1,4 @@
-"""Limits that a replay may break: those of every strict replay, and those that the user asks for by name."""
+"""Limits that a replay may break: those of every strict replay, and those that the user gives by name."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ UPPER_LIMITS = (
 
 
 def parse_limits(texts: Iterable[str]) -> dict[str, float]:
-    """Limits by name from texts "name=value".
+    """Parse limits by name from texts "name=value".
 
     Raises
     ------
@@ -45,7 +45,7 @@ def parse_limits(texts: Iterable[str]) -> dict[str, float]:
 
 
 def check_limits(replay: Replay, limits: Mapping[str, float]) -> list[str]:
-    """What breaks the limits asked for: of the ego where a policy drives it, else of every agent that moves."""
+    """Return which of the given limits are broken: by the ego if a policy drives it, else by any agent that moves."""
     driven = [a.id for a in replay.agents if a.driver == "policy"]
     by_agent = replay.metrics["by_agent"]
     broken = []
@@ -60,10 +60,10 @@ def check_limits(replay: Replay, limits: Mapping[str, float]) -> list[str]:
 
 
 def check_strict(replay: Replay, limits: Mapping[str, float] | None = None) -> list[str]:
-    """What breaks a limit of `--strict`: collisions that the log does not have, followers off their path, impossible logs.
+    """Return what breaks a limit of `--strict`: collisions that the log does not have, large errors, infeasible logs.
 
-    Comfort, time to collision and post-encroachment time count where `limits` names them: what a log's drivers did is no
-    failure of a replay.
+    Comfort, time to collision and post-encroachment time count only when named in `limits`: what the drivers of the log did
+    is no failure of a replay.
     """
     broken = [
         f"{' and '.join(e['agents'])} collide at {e['t_s']:.2f} s ({e['relative_speed_mps']:.1f} m/s); the log has no such collision"

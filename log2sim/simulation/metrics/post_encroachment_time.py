@@ -1,4 +1,4 @@
-"""Post-encroachment time: how soon after one has left a place another, who crosses its way, is there."""
+"""Post-encroachment time: the time from one agent leaving a place until another, on a crossing path, is there."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from log2sim.simulation.vehicles.vehicle import Columns
 
 HORIZON_S = 10.0
 CROSSING_RAD = math.radians(30.0)
-"""Headings that differ by less are those of one who follows another, which the time to collision judges."""
+"""Smaller differences of headings are those of car following, which the time to collision covers."""
 
 COARSE, FINER, LEVELS = 64, 4, 3
-"""Rows of the largest blocks, into how many parts these are divided, and the number of sizes."""
+"""Rows of the largest blocks, the factor by which blocks are divided, and the number of sizes."""
 
 BATCH = 2000
-"""Pairs whose times are refined together, so that memory stays small."""
+"""Pairs whose times are refined together, which bounds memory."""
 
 PARTS, ZOOMS = 4, 4
 """A row is divided into so many parts so many times: 50 ms to 0.2 ms."""
@@ -30,7 +30,15 @@ PARTS, ZOOMS = 4, 4
 
 @dataclass(frozen=True, eq=False)
 class PostEncroachmentTimes(Columns):
-    """Pairs (N,): who was there first and second, and the rows with a fraction when the one left and the other came."""
+    """Pairs (N,) of agents on crossing paths.
+
+    Attributes
+    ----------
+    first, second : (N,) int
+        The agent that was at the place first, and second.
+    left_row, came_row : (N,) float64
+        Fractional rows at which the first left and the second arrived.
+    """
 
     first: RowIndex
     second: RowIndex
@@ -47,10 +55,11 @@ class _Pairs(NamedTuple):
     j: RowIndex
 
     def take(self, index: NDArray | slice) -> _Pairs:
+        """Select pairs by index."""
         return _Pairs(*(column[index] for column in self))
 
     def divided(self) -> _Pairs:
-        """All pairs of parts of the blocks, none that has the second before the first."""
+        """Divide the blocks and return all pairs of parts in which the second agent is not before the first."""
         part = np.arange(FINER)
         i = self.i[:, None, None] * FINER + part[:, None]
         j = self.j[:, None, None] * FINER + part
@@ -60,18 +69,18 @@ class _Pairs(NamedTuple):
 
 
 def post_encroachment_times(boxes: BoxTracks, spacing_s: float) -> PostEncroachmentTimes:
-    """The shortest post-encroachment time of every pair whose ways cross, where it is at most `HORIZON_S`.
+    """Find the shortest post-encroachment time of every pair whose paths cross, up to `HORIZON_S`.
 
     Notes
     -----
     Allen, Shin and Cooper (1978): the time from the moment when the first road user has left the area that both cover
     until the second one reaches it. Here it is the least time between two moments at which the boxes of the first and of
-    the second cover a place in common. Where two ways cross that is the same, and it is defined in bends and where ways
-    merge too (FHWA-HRT-08-051, 2008, takes it at positions likewise). It counts if the first is seen to leave and the
-    second to arrive, and if their headings differ there by at least `CROSSING_RAD`.
+    the second cover a place in common. Where two paths cross that is the same, and it is also defined in bends and where
+    paths merge (FHWA-HRT-08-051, 2008, likewise takes it at positions). It counts if the log shows the first leave and the
+    second arrive, and if their headings differ there by at least `CROSSING_RAD`.
 
-    Method: oriented rectangles about what boxes cover during 64 rows are compared, then during 16 and 4 where these
-    overlap, then the boxes; the row found is divided. Cost: A log A for every 64 rows, then what overlaps.
+    Method: oriented rectangles around the areas that boxes sweep during 64 rows are compared, then 16 and 4 rows where these
+    overlap, then the boxes; the time is refined within a row. Cost: A log A for every 64 rows, then the overlapping pairs.
     """
     lag = HORIZON_S / spacing_s
     hulls = [_SweptRectangles(boxes, COARSE // FINER**level) for level in range(LEVELS)]
@@ -92,7 +101,7 @@ def post_encroachment_times(boxes: BoxTracks, spacing_s: float) -> PostEncroachm
 
 
 class _SweptRectangles:
-    """Rectangles (K, A) about what each box covers while it goes through `size` rows to the next, NaN where absent."""
+    """Rectangles (K, A) around the area that each box sweeps during `size` rows; NaN where absent."""
 
     def __init__(self, boxes: BoxTracks, size: int) -> None:
         count = len(boxes.x_m)
@@ -117,7 +126,7 @@ class _SweptRectangles:
         self.radius_m = np.hypot(self.size_m[..., 0], self.size_m[..., 1]) / 2
 
     def met(self, pairs: _Pairs) -> _Pairs:
-        """The pairs whose rectangles overlap in blocks `i` and `j`, with headings that may cross."""
+        """Select the pairs whose rectangles overlap in blocks `i` and `j`, with headings that may cross."""
         inside = np.maximum(pairs.i, pairs.j) < len(self.x_m)
         pairs = pairs.take(inside)
         one, two = (pairs.i, pairs.a), (pairs.j, pairs.b)
@@ -133,12 +142,12 @@ class _SweptRectangles:
 
 
 def _extent(values: Array, half: Array) -> tuple[Array, Array]:
-    """Least and greatest (K, A) of intervals (K, R, A) about values; NaN where all are."""
+    """Return minimum and maximum (K, A) of intervals (K, R, A) around values; NaN where all are."""
     return np.fmin.reduce(values - half, axis=1), np.fmax.reduce(values + half, axis=1)
 
 
 def _overlapping_blocks(hulls: _SweptRectangles, lag: float) -> Iterator[_Pairs]:
-    """Pairs of blocks that overlap, those of two blocks of rows at a time."""
+    """Yield the overlapping pairs of two blocks of rows at a time."""
     from scipy.spatial import cKDTree
 
     count = len(hulls.x_m)
@@ -155,7 +164,7 @@ def _overlapping_blocks(hulls: _SweptRectangles, lag: float) -> Iterator[_Pairs]
 
 
 def _crossings(boxes: BoxTracks, pairs: _Pairs, lag: float) -> _Pairs:
-    """The pairs of rows at which the boxes cover a place in common that one leaves before the other comes."""
+    """Select the pairs of rows at which the boxes cover a common place that one leaves before the other arrives."""
     count = len(boxes.x_m)
     pairs = pairs.take((pairs.i < pairs.j) & (pairs.j < count) & (pairs.j - pairs.i <= lag))
     a, b, i, j = pairs
@@ -168,7 +177,7 @@ def _crossings(boxes: BoxTracks, pairs: _Pairs, lag: float) -> _Pairs:
 
 
 def _shortest(pairs: _Pairs) -> _Pairs:
-    """The pair of rows with the least time between them of every two agents."""
+    """Select the pair of rows with the least time between them for every two agents."""
     low, high = np.minimum(pairs.a, pairs.b), np.maximum(pairs.a, pairs.b)
     pairs = pairs.take(order := np.lexsort((pairs.j, pairs.j - pairs.i, high, low)))
     low, high = low[order], high[order]
@@ -178,7 +187,7 @@ def _shortest(pairs: _Pairs) -> _Pairs:
 
 
 def _refined(boxes: BoxTracks, pairs: _Pairs) -> tuple[Array, Array]:
-    """Rows (N,), (N,) with a fraction: of ever finer grids about the moments found the ones nearest in time."""
+    """Return fractional rows (N,), (N,): the ones nearest in time on ever finer grids around the rows found."""
     a, b, left, came = pairs.a, pairs.b, pairs.i.astype(np.float64), pairs.j.astype(np.float64)
     offset = np.arange(-PARTS, PARTS + 1)
     shape = (len(a), len(offset), len(offset))

@@ -1,4 +1,4 @@
-"""What a replay came to, in a few lines for people."""
+"""Summary of a replay in a few lines of text."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ MAX_LISTED = 5
 
 
 def summarize(replay: Replay) -> str:
-    """Errors in one line, what agents did to each other, what moved them, then the first collisions, new ones first.
+    """Summarize errors, conflicts and models in a line each, and list the first collisions, those not in the log first.
 
-    Where a policy drives the ego, the times are those of the ego. An error that no agent can have is a dash.
+    Where a policy drives the ego, the times are those of the ego. An error that no agent has is shown as a dash.
     """
     m = replay.metrics
     driven = any(a.driver == "policy" for a in replay.agents)
@@ -36,7 +36,7 @@ def summarize(replay: Replay) -> str:
 
 
 def _error_line(replay: Replay) -> str:
-    """Errors across of all who keep to the way of the log, and those in time of all who also do as it did."""
+    """Cross-track errors of agents on the logged path, and the other errors of those that also keep its times."""
     m, drivers = replay.metrics, {a.driver for a in replay.agents}
     on_time = bool(drivers & {*LOG_FOLLOWERS})
     across, along, speed = "-", "-", "-"
@@ -48,7 +48,7 @@ def _error_line(replay: Replay) -> str:
 
 
 def _model_lines(replay: Replay) -> list[str]:
-    """How many agents each model moves in one line, and why for the first of those that slip without being asked to."""
+    """Count the agents of each model, and give the reason for the first of those with the dynamic model by choice."""
     counts = Counter(a.model for a in replay.agents if a.model != "none")
     if not counts:
         return []

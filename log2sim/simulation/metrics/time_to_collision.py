@@ -1,4 +1,4 @@
-"""Time-to-collision: how soon two boxes would meet if both went on as they go now."""
+"""Time to collision: how soon two boxes would meet at constant velocity."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from log2sim.simulation.metrics.box_tracks import BoxTracks, RowIndex
 from log2sim.simulation.vehicles.vehicle import Columns
 
 HORIZON_S = 10.0
-"""Nobody keeps course and speed for longer, so a later meeting says nothing."""
+"""Constant velocity is no prediction over a longer time."""
 
 CHUNK = 20
 BLOCK = 256
@@ -22,7 +22,16 @@ BLOCK = 256
 
 @dataclass(frozen=True, eq=False)
 class TimesToCollision(Columns):
-    """Pairs a < b (N,) that approach: their least time to collision and the row where they have it."""
+    """Pairs a < b (N,) on a collision course.
+
+    Attributes
+    ----------
+    a, b : (N,) int
+    time_s : (N,) float64
+        Least time to collision.
+    row : (N,) int
+        The row at which it occurs.
+    """
 
     a: RowIndex
     b: RowIndex
@@ -31,13 +40,13 @@ class TimesToCollision(Columns):
 
 
 def times_to_collision(boxes: BoxTracks, moves: NDArray[np.bool_], spacing_s: float) -> TimesToCollision:
-    """The least time to collision of every pair of which one moves, where it is at most `HORIZON_S`.
+    """Find the least time to collision of every pair of which at least one moves, up to `HORIZON_S`.
 
     Notes
     -----
     Time-to-collision of Hayward (1972) in the plane: both boxes keep their velocity and their heading; see `time_to_touch`.
-    Boxes that overlap already have none. It is taken at every row, and knows no road: two that pass each other in a bend
-    would collide if they went straight on. Cost: the pairs within reach of each other for every `CHUNK` rows, then those on course.
+    Boxes that overlap already have none. It is evaluated at every row and ignores the road: two agents that pass each other
+    in a bend count as on a collision course. Cost: the pairs in reach for every `CHUNK` rows, then those on course.
     """
     (vx, vy), climb = boxes.velocities(spacing_s), boxes.climbs(spacing_s)
     found = [np.zeros((4, 0))]
@@ -64,9 +73,9 @@ def times_to_collision(boxes: BoxTracks, moves: NDArray[np.bool_], spacing_s: fl
 def time_to_touch(
     dx: Array, dy: Array, vx: Array, vy: Array, yaw_a: Array, yaw_b: Array, size_a: Array, size_b: Array
 ) -> Array:
-    """Time in s (N,) until rectangles touch, inf where they never do or overlap already.
+    """Return the time in s (N,) until rectangles touch, inf where they never do or overlap already.
 
-    `dx`, `dy` lead from a to b and change at `vx`, `vy`. On each separating axis the rectangles' shadows overlap for one
+    `dx`, `dy` lead from a to b and change at `vx`, `vy`. On each separating axis the projections overlap for one
     interval of time; the rectangles do while all four do. Exact.
     """
     enter, leave = np.full(len(dx), -np.inf), np.full(len(dx), np.inf)
@@ -84,7 +93,7 @@ def time_to_touch(
 def _same_height(
     boxes: BoxTracks, climb: Array, i: RowIndex, j: RowIndex, k: RowIndex, time_s: Array
 ) -> NDArray[np.bool_]:
-    """Whether pairs (N,) are at one height at rows k, or will be after a time, on a slope that both go along."""
+    """Whether pairs (N,) are at the same height at rows k, or will be after a time, on a common slope."""
     apart_m = boxes.z_m[k, j] - boxes.z_m[k, i]
     then_m = apart_m + time_s * (climb[k, j] - climb[k, i])
     return np.minimum(np.abs(apart_m), np.abs(then_m)) < (boxes.size_m[i, 2] + boxes.size_m[j, 2]) / 2
@@ -93,10 +102,10 @@ def _same_height(
 def _candidate_pairs(
     boxes: BoxTracks, vx: Array, vy: Array, rows: slice, moves: NDArray[np.bool_], spacing_s: float
 ) -> Iterator[tuple[RowIndex, RowIndex]]:
-    """Pairs (P,), (P,) that may meet within the horizon after one of the rows, some at a time.
+    """Yield pairs (P,), (P,) that may meet within the horizon after one of the rows.
 
-    For some rows each agent is a circle on a straight line, so large that it holds all its places then and, at all its
-    velocities then, all places within the horizon.
+    For these rows each agent is a circle on a straight line, large enough to contain its places and, at all its
+    velocities, the places within the horizon.
     """
     from scipy.spatial import cKDTree
 
@@ -129,14 +138,14 @@ def _candidate_pairs(
 def _circles_meet(
     dx: Array, dy: Array, vx: Array, vy: Array, reach: Array, begin_s: float, end_s: float
 ) -> NDArray[np.bool_]:
-    """Whether points get nearer than `reach` (N,) between two times."""
+    """Whether points come nearer than `reach` (N,) between two times."""
     square, closing = vx * vx + vy * vy, -(dx * vx + dy * vy)
     t = np.clip(np.divide(closing, square, out=np.zeros_like(square), where=square > 0), begin_s, end_s)
     return (dx + t * vx) ** 2 + (dy + t * vy) ** 2 <= reach**2
 
 
 def _least_per_pair(found: Array) -> Array:
-    """Of rows a, b, time and row (4, N) those with the least time of each pair, the earliest where it is twice the same."""
+    """Select from rows a, b, time and row (4, N) those with the least time of each pair, the earliest of equal ones."""
     found = found[:, np.lexsort((found[3], found[2], found[1], found[0]))]
     new = np.ones(found.shape[1], dtype=bool)
     new[1:] = (found[:2, 1:] != found[:2, :-1]).any(axis=0)

@@ -1,4 +1,4 @@
-"""How far a replay is from the log."""
+"""Tracking errors: the distance of a replay from the log."""
 
 from __future__ import annotations
 
@@ -17,12 +17,17 @@ SEARCH_STEP_S = 0.05
 MIN_SEGMENT_MPS = 0.1
 
 OFF_PATH_M = 0.5
-"""Farther than this across from its course an agent is off its path: a car of 1.9 m in a lane of 3.5 m has 0.8 m."""
+"""Cross-track error beyond which an agent is off its path: a 1.9 m wide car in a 3.5 m lane has 0.8 m on each side."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrackingErrors:
-    """How far an agent is from the log at its rows (S,): left, ahead, faster and counter-clockwise positive."""
+    """Distance of an agent from the log at its rows (S,); left, ahead, faster and counter-clockwise are positive.
+
+    Attributes
+    ----------
+    across_m, along_m, speed_mps, yaw_rad : (S,) float64
+    """
 
     across_m: Array
     along_m: Array
@@ -31,7 +36,7 @@ class TrackingErrors:
 
 
 def agent_errors(trajectory: Trajectory, agent: AgentReplay, *, follows: bool) -> TrackingErrors:
-    """Errors of an agent; one that does not follow the log may be far behind or ahead, and keep to its course yet."""
+    """Compute the errors of an agent; one that does not follow the log in time may be far along its path and still on it."""
     near_s = agent.t_s if follows else _nearest_times(trajectory, agent.x_m, agent.y_m)
     across, along = tracking_errors(trajectory, agent.t_s, agent.x_m, agent.y_m, near_s)
     log = trajectory.at(agent.t_s)
@@ -41,12 +46,12 @@ def agent_errors(trajectory: Trajectory, agent: AgentReplay, *, follows: bool) -
 def tracking_errors(
     trajectory: Trajectory, t_s: Array, x_m: Array, y_m: Array, near_s: Array | None = None
 ) -> tuple[Array, Array]:
-    """Errors across and along the logged path, (S,) each in m, left and ahead positive.
+    """Return the errors across and along the logged path, (S,) each in m, left and ahead positive.
 
-    Along: from the logged box center at the same time, in the direction of its heading. Across: distance from the nearest
-    point of the course of logged box centers within `SEARCH_S` of the same time, or of the times `near_s` (S,), so being
-    late in a curve is no error across. Where the nearest point is an end of that course, or the log stands, what lies
-    along its direction counts as along.
+    Along: from the logged box center at the same time, in the direction of its heading. Across: distance from the
+    nearest point of the path of logged box centers within `SEARCH_S` of the same time, or of the times `near_s` (S,),
+    so a delay in a curve is no error across. Where the nearest point is an end of that path, or the log stands, the
+    component along its direction counts as along.
     """
     log_x, log_y, _, log_yaw, _ = trajectory.at(t_s)
     along = (x_m - log_x) * np.cos(log_yaw) + (y_m - log_y) * np.sin(log_yaw)
@@ -67,13 +72,13 @@ def tracking_errors(
     k, dx, dy = near[row, best], dx[row, best], dy[row, best]
     length = np.sqrt(np.where(moves, square, 1.0))
     cos, sin = np.where(moves, ux / length, np.cos(yaw[:-1])), np.where(moves, uy / length, np.sin(yaw[:-1]))
-    # A vehicle that reverses has its left on the other side of its course.
+    # For a vehicle in reverse, left of its heading is right of its direction of travel.
     left = np.where(cos * np.cos(yaw[:-1]) + sin * np.sin(yaw[:-1]) < 0, -1.0, 1.0)
     return left[k] * (dy * cos[k] - dx * sin[k]), along
 
 
 def agent_metrics(errors: TrackingErrors) -> dict[str, Any]:
-    """Tracking errors of one agent, and the share of its rows that are farther than `OFF_PATH_M` from its course."""
+    """Return the tracking errors of one agent, and the share of its rows that are farther than `OFF_PATH_M` from its path."""
     across = np.abs(errors.across_m)
     return {
         "cross_track_rms_m": _rms(errors.across_m),
@@ -88,14 +93,14 @@ def agent_metrics(errors: TrackingErrors) -> dict[str, Any]:
 def scenario_metrics(
     by_agent: Mapping[str, Mapping[str, Any]], on_time: Mapping[str, int], on_way: Mapping[str, int]
 ) -> dict[str, Any]:
-    """Errors over all followers, every stored sample counting alike; 0 where nobody follows.
+    """Average the errors over all followers, every stored sample counting alike; 0 without followers.
 
     Parameters
     ----------
     by_agent : by id
         The errors of each agent.
     on_time, on_way : by id
-        The samples of those who are where the log is at each moment, and of all who keep to its way, however late.
+        The samples of agents that follow the log in time, and of all that keep to its path.
     """
     out: dict[str, Any] = {}
     for key, samples in (
@@ -109,13 +114,13 @@ def scenario_metrics(
 
 
 def _mean(values: Mapping[str, float], samples: Mapping[str, int]) -> float:
-    """Mean of the values that have samples, weighted by their number; 0 without any."""
+    """Return the mean of the values weighted by their samples; 0 without any."""
     total = sum(samples.values())
     return sum(count * values[k] for k, count in samples.items()) / total if total else 0.0
 
 
 def _nearest_times(trajectory: Trajectory, x_m: Array, y_m: Array) -> Array:
-    """The times (S,) at which the log is nearest to places."""
+    """Return the times (S,) at which the log is nearest to places."""
     from scipy.spatial import cKDTree
 
     t = np.arange(trajectory.t_s[0], trajectory.t_s[-1] + SEARCH_STEP_S / 2, SEARCH_STEP_S)

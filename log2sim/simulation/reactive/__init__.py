@@ -1,1 +1,1 @@
-"""Agents that keep to their own recorded ways and brake for what the log does not have there."""
+"""Reactive agents: they keep to their logged paths and brake for agents that the log does not have there."""

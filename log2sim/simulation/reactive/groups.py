@@ -1,4 +1,4 @@
-"""Groups of reactive agents: driven like their kind, on references that they go through at their own rate."""
+"""Groups of reactive agents: controlled like other agents, on references that they pass at their own rate."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from log2sim.simulation.reference import GRID_S, POINT_COLUMNS, STANDSTILL_MPS, 
 from log2sim.simulation.step_clock import StepClock
 
 RATE_OF_SPEED = {"speed": "accel_ahead", "velocity_x": "accel_x", "velocity_y": "accel_y"}
-"""Columns that go with the rate, and those of their change."""
+"""Columns that scale with the rate, and the columns of their derivatives."""
 
 
 class ReactiveGroup(AgentGroup):
-    """A group whose agents are at the place of their log that `traffic` says, and pass it at its rate."""
+    """A group whose agents follow the log at the time and rate that `traffic` decides."""
 
     driver = "reactive"
-    keeps_time = False
+    follows_log_time = False
     columns: tuple[str, ...] = ("x", "y", "yaw", "speed")
 
     def join(self, traffic: Traffic, clock: StepClock) -> None:
-        """Take part in the traffic; to be called once, before anything else."""
+        """Connect the group with the traffic; call it once, before anything else."""
         self.traffic, self.clock, self._logged_last = traffic, clock, self.last
         self.index = np.array([traffic.index[a.id] for a in self.agents], dtype=np.intp)
         self._end_s = np.array([r.trajectory.t_s[-1] for r in self.references])
@@ -32,23 +32,25 @@ class ReactiveGroup(AgentGroup):
         self._begin = np.cumsum(self._rows) - self._rows
         self._flat = np.concatenate([r.columns for r in self.references])
         leaps = [(k, t) for k, r in enumerate(self.references) for t in r.trajectory.discontinuity_times()]
-        # As in the log, who leaps is placed again once the row that blends both sides is past.
+        # As in the log, an agent is placed again after the row that blends both sides of a discontinuity.
         self._leaps = np.array([(k, t + wait) for k, t in leaps for wait in (0.0, GRID_S)]).reshape(-1, 2)
         self._tau = np.full(len(self.agents), -np.inf)
 
     def open_window(self, begin: int, end: int, begin_s: float, end_s: float) -> None:
+        """Prepare the tables; at the first step also reset the lifetimes, which delays extend."""
         if begin == 0:
             self.last, self._tau = self._logged_last, np.full(len(self.agents), -np.inf)
         super().open_window(begin, end, begin_s, end_s)
 
     def log_times(self, t_s: float) -> Array:
+        """Return the log times of the living agents: the present time less their delay."""
         return t_s - self.traffic.delay_s[self.index[self.live]]
 
     def look_up(self, t_s: float) -> None:
-        """Set `row` (C, A) to the references at the places where the agents are."""
+        """Set `row` (C, A) to the references at the agents' log times."""
         self.now_s = t_s
         live, delay = self.live, self.traffic.delay_s[self.index]
-        # Who fell behind lives on until it has come to the end of its log.
+        # A delayed agent lives on until it has reached the end of its log.
         self.last = np.minimum(self.clock.last_step(self._end_s + delay), self.clock.steps - 1)
         tau = t_s - delay
         last = self._rows[live] - 1
@@ -69,7 +71,7 @@ class ReactiveGroup(AgentGroup):
         return self._slowed(np.stack(rows, axis=1), index)
 
     def _slowed(self, row: Array, index: NDArray) -> Array:
-        """The rows (C, N) of agents that pass their places at their rate."""
+        """Scale the rows (C, N) of agents that pass their references at their rate."""
         rate, slope = self.traffic.rate[self.index[index]], self.traffic.rate_slope[self.index[index]]
         if np.all(rate == 1):
             return row
@@ -98,4 +100,4 @@ class ReactivePedestrianGroup(ReactiveGroup, PedestrianGroup):
 
 
 class ReactiveLogReplayGroup(ReactiveGroup, LogReplayGroup):
-    """Agents that react and are exactly on their logged way."""
+    """Agents that react and are placed exactly on their logged path."""

@@ -1,4 +1,4 @@
-"""The intelligent-driver model, for agents that go through their log at a rate."""
+"""The intelligent driver model (IDM), for agents that pass their log at a rate."""
 
 from __future__ import annotations
 
@@ -13,22 +13,35 @@ from log2sim.simulation.vehicles.parameters import WHEELED
 from log2sim.simulation.vehicles.vehicle import Columns
 
 EXPONENT = 4.0
-MIN_GAP_M = 0.1  # shorter gaps, and overlaps, are as bad as this one
-MIN_PACE_MPS = (
-    0.5  # where the log is slower, the rate answers as if it went this fast, or it had no bounds at standstill
+MIN_GAP_M = 0.1  # shorter gaps, and overlaps, count as this one
+MIN_PACE_MPS = 0.5  # where the log is slower, the rate responds as at this speed; it would have no bound at standstill
+HOLD_MPS = 0.2  # a slower agent with a leader is held at standstill,
+HOLD_DEMAND = (
+    0.5  # until the leader's demand falls below this share of the free acceleration: 1.4 times the minimum gap
 )
-HOLD_MPS = 0.2  # who is slower and has somebody in front stands,
-HOLD_DEMAND = 0.5  # until that takes less than this share of the free acceleration: at 1.4 times the gap of standstill
 
-# Time gap in s, gap at standstill in m, acceleration, comfortable braking and hardest braking in m/s2. On wheels: town
-# traffic in Treiber and Kesting, "Traffic Flow Dynamics", 2013, chapter 11. On foot: an arm's length, and a stop in a step.
+# Time gap in s, minimum gap in m, acceleration, comfortable and hardest braking in m/s2. On wheels: town traffic in
+# Treiber and Kesting, "Traffic Flow Dynamics", 2013, chapter 11. On foot: an arm's length, and a stop within one step.
 ON_WHEELS = (1.0, 2.0, 1.0, 1.5, 8.0)
 ON_FOOT = (0.5, 0.7, 1.0, 1.5, 4.0)
 
 
 @dataclass(frozen=True, eq=False)
 class IdmParameters(Columns):
-    """Parameters of the intelligent-driver model, all (A,)."""
+    """Parameters of the intelligent driver model, all (A,).
+
+    Attributes
+    ----------
+    time_gap_s : (A,) float64
+    gap_m : (A,) float64
+        Minimum gap, kept at standstill.
+    accel_mps2 : (A,) float64
+        Free acceleration.
+    comfort_mps2 : (A,) float64
+        Comfortable braking.
+    brake_mps2 : (A,) float64
+        Hardest braking.
+    """
 
     time_gap_s: Array
     gap_m: Array
@@ -38,13 +51,13 @@ class IdmParameters(Columns):
 
 
 def idm_parameters(agents: Sequence[Agent]) -> IdmParameters:
-    """Parameters of agents by their kind."""
+    """Return the parameters of agents by category."""
     rows = [ON_WHEELS if a.category in WHEELED else ON_FOOT for a in agents]
     return IdmParameters(*np.array(rows, dtype=np.float64).reshape(-1, 5).T)
 
 
 def leader_demand(driver: IdmParameters, gap_m: Array, pace_mps: Array, leader_mps: Array) -> Array:
-    """How much a leader takes of the free acceleration: (s* / s)^2 of the model; 1 is the gap that is kept at low speed.
+    """Return the share of the free acceleration that a leader takes: (s* / s)^2 of the model; 1 at the minimum gap at low speed.
 
     Notes
     -----
@@ -58,13 +71,13 @@ def leader_demand(driver: IdmParameters, gap_m: Array, pace_mps: Array, leader_m
 def rate_response(
     driver: IdmParameters, rate: Array, taken: Array, pace_mps: Array, log_accel_mps2: Array
 ) -> tuple[Array, Array]:
-    """Rate and its slope in 1/s, all (A,), of agents whose log goes at `pace_mps` here, with `taken` of all leaders.
+    """Return the rate and its slope in 1/s, (A,) each, of agents whose log goes at `pace_mps` here, with demand `taken`.
 
     Notes
     -----
-    The log's speed at the place is the model's desired speed, so the rate is its v / v0, and the model's acceleration comes
-    on top of the log's. Braking that the log does anyway counts as an answer to the leader. With nothing taken, a rate of 1
-    stays 1: the log.
+    The log's speed at a place is the model's desired speed, so the rate is its v / v0, and the model's acceleration is added
+    to the log's. Braking that the log does anyway counts as a response to the leader. Without demand a rate of 1 stays 1: the
+    agent follows the log.
     """
     logged = rate**2 * log_accel_mps2
     excess = np.maximum(driver.accel_mps2 * taken - np.maximum(-logged, 0.0), 0.0)

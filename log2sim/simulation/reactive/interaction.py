@@ -1,4 +1,4 @@
-"""What others demand of reactive agents at one moment, beyond what they demanded in the log at the same place."""
+"""Demands of other agents on reactive agents at one time, beyond the demands in the log at the same place."""
 
 from __future__ import annotations
 
@@ -18,58 +18,73 @@ from log2sim.simulation.reactive.prediction import (
 )
 from log2sim.simulation.reactive.swept_corridor import HORIZON_S, PredictedBoxes, SafetyMargins, SweptCorridor, leaders
 
-MIN_LOOKAHEAD_M = 10.0  # at standstill
+MIN_LOOKAHEAD_M = 10.0  # also at standstill
 
 MARGINS_NOW = SafetyMargins(side_m=0.2, crossing_m=1.0, crossing_s=0.5, behind_m=0.0)
 MARGINS_IN_LOG = SafetyMargins(side_m=0.5, crossing_m=2.5, crossing_s=0.8, behind_m=1.0)
 GAP_M, SPEED_MPS = 0.5, 0.5
-"""A situation may be worse than the log's by these, and by the difference of the rooms, and still is the log's."""
+"""Tolerances, besides the difference of the margins, within which an interaction counts as that of the log."""
 
-MIN_DEMAND = 1e-3  # of the free acceleration
-PATH_HULL_MARGIN_M = 1.0  # by which ways may leave the hull of a few of their points
+MIN_DEMAND = 1e-3  # share of the free acceleration below which a demand is ignored
+PATH_HULL_MARGIN_M = 1.0  # how far paths may leave the hull of a few of their points
 
 Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
 class TrafficState:
-    """All agents (A,) at one time: `t_s` on each one's own log, `rate` at which it goes through that, where it is, its size.
+    """All agents (A,) at one time.
 
-    `driven` is the agent that a policy drives, -1 if none is; `reacts` marks those that decide. `course` (A, H) is where all
-    are expected to go.
+    Attributes
+    ----------
+    paths : PathTable
+    idm : IdmParameters
+    size_m : (A, 3) float64
+    reacts : (A,) bool
+        Whether an agent is reactive.
+    driven : int
+        The agent that a policy drives, -1 without.
+    t_s : (A,) float64
+        Time on the log of each agent.
+    rate : (A,) float64
+        Rate at which each agent passes its log.
+    pose : Pose
+        Where the agents are, (A,).
+    prediction : Prediction
+        Where they are expected to go, (A, H).
     """
 
-    ways: PathTable
-    driver: IdmParameters
+    paths: PathTable
+    idm: IdmParameters
     size_m: Array
     reacts: NDArray[np.bool_]
     driven: int
     t_s: Array
     rate: Array
     pose: Pose
-    course: Prediction
+    prediction: Prediction
 
     def reach_m(self, i: Index) -> Array:
-        """How far agents (P,) look ahead: to where they could stop in comfort, and a bit."""
-        pace, d = np.abs(self.pose.speed_mps[i]), self.driver.take(i)
+        """Return the look-ahead distance of agents (P,): a comfortable stop and a reserve."""
+        pace, d = np.abs(self.pose.speed_mps[i]), self.idm.take(i)
         stop_m = pace * (d.time_gap_s + HORIZON_S[-1]) + pace**2 / (2 * d.comfort_mps2)
         return np.minimum(MIN_LOOKAHEAD_M + stop_m + self.size_m[i, 0], EXTENSION_M)
 
     def meeting(self, i: Index, j: Index) -> tuple[Index, Index]:
-        """Those of the pairs (P,), (P,) that may come near each other within the horizon."""
+        """Select those of the pairs (P,), (P,) that may come near each other within the horizon."""
         p, radius = self.pose, np.hypot(self.size_m[:, 0], self.size_m[:, 1]) / 2
         reach = self.reach_m(i) + np.abs(p.speed_mps[j]) * HORIZON_S[-1] + radius[i] + radius[j]
         near = (p.x_m[i] - p.x_m[j]) ** 2 + (p.y_m[i] - p.y_m[j]) ** 2 < reach**2
         i, j = i[near], j[near]
         level = self._level(i, j)
         i, j = i[level], j[level]
-        # In a circle there are many whom four boxes about the way ahead leave out: above all those in other lanes.
-        x, y = (np.ascontiguousarray(c[:, ::4].T) for c in self.course[:2])
+        # Four boxes about the path ahead exclude most agents within the circle, above all those in other lanes.
+        x, y = (np.ascontiguousarray(c[:, ::4].T) for c in self.prediction[:2])
         swept = self._hull(i, x[:, j], y[:, j])
         room = radius[j] + self.size_m[i, 1] / 2 + MARGINS_IN_LOG.side_m + PATH_HULL_MARGIN_M
         own = np.flatnonzero(self.reacts)
         ahead = np.linspace(0.0, 1.0, 13)[:, None] * self.reach_m(own)
-        x, y, *_ = self.ways.along(own[None], self.pose.distance_m[own] + ahead)
+        x, y, *_ = self.paths.along(own[None], self.pose.distance_m[own] + ahead)
         meets, slot = np.zeros(len(i), dtype=bool), np.searchsorted(own, i)
         for part in (slice(0, 4), slice(3, 7), slice(6, 10), slice(9, 13)):
             section = self._hull(own, x[part], y[part])
@@ -81,15 +96,15 @@ class TrafficState:
         return i[meets], j[meets]
 
     def _level(self, i: Index, j: Index) -> NDArray[np.bool_]:
-        """Whether agents j (P,) are as high as agents i (P,), or as the ways of these are as far ahead as they are."""
+        """Whether agents j (P,) are at the height of agents i (P,), or of the paths of these that far ahead."""
         p = self.pose
         gap_m = np.hypot(p.x_m[i] - p.x_m[j], p.y_m[i] - p.y_m[j])
-        ahead_m = self.ways.at(i, self.ways.times(i, p.distance_m[i] + gap_m)).z_m
+        ahead_m = self.paths.at(i, self.paths.times(i, p.distance_m[i] + gap_m)).z_m
         apart_m = np.minimum(np.abs(p.z_m[i] - p.z_m[j]), np.abs(ahead_m - p.z_m[j]))
         return apart_m < (self.size_m[i, 2] + self.size_m[j, 2]) / 2
 
     def _hull(self, i: Index, x_m: Array, y_m: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        """Least and greatest of points (N, P), ahead and to the left of agents i (P,)."""
+        """Return minimum and maximum of points (N, P), ahead and to the left of agents i (P,)."""
         cos, sin = np.cos(self.pose.yaw_rad[i]), np.sin(self.pose.yaw_rad[i])
         dx, dy = x_m - self.pose.x_m[i], y_m - self.pose.y_m[i]
         ahead, left = dx * cos + dy * sin, dy * cos - dx * sin
@@ -97,34 +112,38 @@ class TrafficState:
 
 
 def excess_demand(m: TrafficState, i: Index, j: Index, trusted: NDArray[np.bool_]) -> Array:
-    """What agents j (P,) take of the free acceleration of agents i (P,) beyond the log; all of it where not `trusted` (P,)."""
-    driver, logged_pace = m.driver.take(i), np.abs(m.pose.speed_mps[i])
+    """Return the share of the free acceleration of agents i (P,) that agents j (P,) take beyond the log.
+
+    Where the log is not `trusted` (P,), the whole demand counts.
+    """
+    driver, logged_pace = m.idm.take(i), np.abs(m.pose.speed_mps[i])
     pace = m.rate[i] * logged_pace
-    logged = m.ways.at(i[:, None], m.t_s[i][:, None] + HORIZON_S).distance_m - m.pose.distance_m[i][:, None]
+    logged = m.paths.at(i[:, None], m.t_s[i][:, None] + HORIZON_S).distance_m - m.pose.distance_m[i][:, None]
     starting = pace[:, None] * HORIZON_S + driver.accel_mps2[:, None] * HORIZON_S**2 / 2
     means = np.where(m.rate[i][:, None] < 1, np.minimum(logged, starting), logged)
-    x, y, yaw, speed = (c[j] for c in m.course)
-    found = leaders(m.ways, _corridor(m, i, pace, means), _boxes(m, j, (x, y, yaw, speed)), MARGINS_NOW)
-    # Who was first in the log where two reactive ones meet goes first; what is in the way already is waited for.
+    x, y, yaw, speed = (c[j] for c in m.prediction)
+    found = leaders(m.paths, _corridor(m, i, pace, means), _boxes(m, j, (x, y, yaw, speed)), MARGINS_NOW)
+    # Where two reactive agents meet, the one that was first in the log goes first; an obstacle already in the path is
+    # waited for.
     first = m.reacts[i] & m.reacts[j] & (found.ahead_s > 0)
     first &= found.own_t_s < m.t_s[j] + m.rate[j] * found.ahead_s
     gap = np.where(first & trusted, np.inf, found.gap_m)
     taken = leader_demand(driver, gap, pace, found.speed_mps)
     t_s = m.t_s[i]
-    k = np.flatnonzero((taken > MIN_DEMAND) & trusted & (m.ways.begin_s[j] <= t_s) & (t_s <= m.ways.end_s[j]))
+    k = np.flatnonzero((taken > MIN_DEMAND) & trusted & (m.paths.begin_s[j] <= t_s) & (t_s <= m.paths.end_s[j]))
     if len(k):
         taken[k] -= _demand_in_log(m, i[k], j[k], gap[k], _corridor(m, i[k], logged_pace[k], logged[k]))
     return np.maximum(taken, 0.0)
 
 
 def _demand_in_log(m: TrafficState, i: Index, j: Index, gap_m: Array, corridor: SweptCorridor) -> Array:
-    """What agents j (P,) took in the log when agents i (P,) were at this place, as far as it is now as it was then.
+    """Return the demand of agents j (P,) in the log when agents i (P,) were at this place, as far as the log applies now.
 
-    The nearer the other is than it was, the less counts; at half the gap nothing does.
+    The nearer the other agent is than it was in the log, the less of the log's demand counts; at half the gap none.
     """
-    found = leaders(m.ways, corridor, _boxes(m, j, _predict_in_log(m, j, m.t_s[i])), MARGINS_IN_LOG)
+    found = leaders(m.paths, corridor, _boxes(m, j, _predict_in_log(m, j, m.t_s[i])), MARGINS_IN_LOG)
     gap = found.gap_m - GAP_M
-    taken = leader_demand(m.driver.take(i), gap, corridor.pace_mps, found.speed_mps - SPEED_MPS)
+    taken = leader_demand(m.idm.take(i), gap, corridor.pace_mps, found.speed_mps - SPEED_MPS)
     known = np.isfinite(gap)
     scale = np.maximum(np.where(known, gap, 0.0) / 2, 1.0)
     lost = np.where(known, np.maximum(np.where(known, gap, 0.0) - gap_m, 0.0) / scale, 1.0)
@@ -136,26 +155,28 @@ def _corridor(m: TrafficState, i: Index, pace: Array, progress: Array) -> SweptC
     return SweptCorridor(i, m.pose.distance_m[i], m.size_m[i, 0], m.size_m[i, 1], pace, progress, reach)
 
 
-def _boxes(m: TrafficState, j: Index, course: Prediction) -> PredictedBoxes:
-    return PredictedBoxes(*course, m.size_m[j, 0], m.size_m[j, 1])
+def _boxes(m: TrafficState, j: Index, prediction: Prediction) -> PredictedBoxes:
+    return PredictedBoxes(*prediction, m.size_m[j, 0], m.size_m[j, 1])
 
 
-def predict_all(ways: PathTable, pose: Pose, t_s: Array, rate: Array, driven: int) -> Prediction:
-    """Where all agents (A,) go from where they are; the driven one as if it kept to its way."""
-    course = predict_by_log(ways, np.arange(len(t_s)), t_s, rate)
+def predict_all(paths: PathTable, pose: Pose, t_s: Array, rate: Array, driven: int) -> Prediction:
+    """Predict all agents (A,) from where they are; the driven agent as if it kept to its path."""
+    prediction = predict_by_log(paths, np.arange(len(t_s)), t_s, rate)
     if driven < 0:
-        return course
+        return prediction
     x, y, yaw, speed = (float(c[driven]) for c in (pose.x_m, pose.y_m, pose.yaw_rad, pose.speed_mps))
-    return _select(np.arange(len(t_s)) == driven, predict_policy_vehicle(ways, driven, x, y, yaw, speed), course)
+    return _select(np.arange(len(t_s)) == driven, predict_policy_vehicle(paths, driven, x, y, yaw, speed), prediction)
 
 
 def _predict_in_log(m: TrafficState, j: Index, t_s: Array) -> Prediction:
-    """Where agents (P,) were expected to go in the log at times (P,), by the same rules."""
-    course = predict_by_log(m.ways, j, t_s, np.ones(len(j)))
+    """Predict agents (P,) from the log at times (P,), by the same rules."""
+    prediction = predict_by_log(m.paths, j, t_s, np.ones(len(j)))
     if not np.any(j == m.driven):
-        return course
-    pose = m.ways.at(j, t_s)
-    return _select(j == m.driven, predict_along_path(m.ways, m.driven, pose.distance_m, np.abs(pose.speed_mps)), course)
+        return prediction
+    pose = m.paths.at(j, t_s)
+    return _select(
+        j == m.driven, predict_along_path(m.paths, m.driven, pose.distance_m, np.abs(pose.speed_mps)), prediction
+    )
 
 
 def _select(mask: NDArray[np.bool_], one: Prediction, other: Prediction) -> Prediction:

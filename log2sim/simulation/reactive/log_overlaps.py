@@ -1,4 +1,4 @@
-"""Which pairs of agents the log drives into each other, so that it cannot be a model of how to drive."""
+"""Pairs of agents that overlap in the log itself, so that the log cannot be a reference for keeping clear."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from log2sim.simulation.metrics.box_tracks import BoxTracks
 from log2sim.simulation.metrics.collisions import contacts
 from log2sim.simulation.reactive.path_table import TIME_STEP_S, PathTable
 
-DEEP_OVERLAP_M = 0.5  # more than boxes err by
+DEEP_OVERLAP_M = 0.5  # larger than the errors of boxes
 CHUNK = 200
 
 
-def deep_overlaps(ways: PathTable, size_m: Array, static: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pairs (A, A) whose logged boxes come to overlap by more than `DEEP_OVERLAP_M` although they did not from the start.
+def deep_overlaps(paths: PathTable, size_m: Array, static: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the pairs (A, A) whose logged boxes come to overlap by more than `DEEP_OVERLAP_M`, not from the start.
 
-    Those that overlap from the start are one object seen twice, or a load and its carrier: nothing to brake for.
+    Pairs that overlap from the start are one object detected twice, or a load and its carrier: no reason to brake.
     """
     count = len(size_m)
     deep, together = np.zeros((2, count, count), dtype=bool)
-    stays = static & (ways.begin_s == ways.end_s)
+    stays = static & (paths.begin_s == paths.end_s)
     moving = ~static
     if not moving.any():
         return deep
-    begin_s = np.where(stays, -np.inf, ways.begin_s)
-    end_s = np.where(stays, np.inf, ways.end_s)
-    t_s = np.arange(ways.begin_s[moving].min(), ways.end_s[moving].max() + TIME_STEP_S, TIME_STEP_S)
+    begin_s = np.where(stays, -np.inf, paths.begin_s)
+    end_s = np.where(stays, np.inf, paths.end_s)
+    t_s = np.arange(paths.begin_s[moving].min(), paths.end_s[moving].max() + TIME_STEP_S, TIME_STEP_S)
     size = np.maximum(size_m - [DEEP_OVERLAP_M, DEEP_OVERLAP_M, 0.0], 0.1)
     everybody = np.arange(count)
     for part in np.split(t_s, range(CHUNK, len(t_s), CHUNK)):
-        pose = ways.at(everybody, part[:, None])
+        pose = paths.at(everybody, part[:, None])
         there = (begin_s <= part[:, None]) & (part[:, None] <= end_s)
         x, y, z, yaw, speed = (np.where(there, c, np.nan) for c in pose[:5])
         found = contacts(BoxTracks(x, y, z, yaw, speed, size), moving)

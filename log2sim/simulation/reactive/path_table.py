@@ -1,4 +1,4 @@
-"""The ways of many agents' box centers, by time and by distance, in flat tables that are read for all at once."""
+"""The paths of many agents' box centers, by time and by distance, in flat tables that are evaluated for all at once."""
 
 from __future__ import annotations
 
@@ -12,20 +12,31 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Trajectory
 from log2sim.geometry import Array
 
-TIME_STEP_S = 0.1  # linear in between: off by a h^2 / 8, a centimeter at 10 m/s2
+TIME_STEP_S = 0.1  # linear interpolation errs by a h^2 / 8, a centimeter at 10 m/s2
 SPACING_M = 1.0
 EXTENSION_M = 120.0
-"""How far a way goes straight on beyond the end of the log: as far as a driver looks ahead."""
+"""Straight extension of a path beyond the end of the log: as far as a driver looks ahead."""
 
 SEARCH_BACK_M, SEARCH_AHEAD_M = 5.0, 20.0
-"""How far from its last place an agent is looked for on its way: so it stays on its branch where ways cross."""
+"""Range about its last place in which an agent is searched on its path: so it stays on its branch where paths cross."""
 
-STANDING_MPS = 0.15  # what moves slower stands, and its jitter is no way
-COARSE_STRIDE = 4  # rows between those that a search looks at first
+STANDING_MPS = 0.15  # slower movement is jitter of a standing agent and adds no distance
+COARSE_STRIDE = 4  # rows between those of the first pass of a search
 
 
 class Pose(NamedTuple):
-    """Box centers relative to the origin of the ways: yaw unwrapped, signed speed, distance gone since the life began."""
+    """Box centers relative to the origin of the table.
+
+    Attributes
+    ----------
+    x_m, y_m, z_m : float64 array
+    yaw_rad : float64 array
+        Unwrapped.
+    speed_mps : float64 array
+        Signed.
+    distance_m : float64 array
+        Distance traveled since the begin of the trajectory.
+    """
 
     x_m: Array
     y_m: Array
@@ -37,9 +48,18 @@ class Pose(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PathProjection:
-    """Points seen from the places of a way that are nearest to them: ahead of and left of that place, in m.
+    """Points relative to the nearest places of a path.
 
-    `cos`, `sin` is the direction of travel there, `distance_m` the way up to it, `t_s` the log's time there (NaN beyond).
+    Attributes
+    ----------
+    ahead_m, left_m : float64 array
+        Of the point, from that place.
+    cos, sin : float64 array
+        Direction of travel there.
+    distance_m : float64 array
+        Distance along the path up to there.
+    t_s : float64 array
+        Time of the log there; NaN beyond its end.
     """
 
     ahead_m: Array
@@ -51,7 +71,7 @@ class PathProjection:
 
 
 class PathTable:
-    """Ways of A agents. Positions are relative to `origin_m`, which keeps digits far from the map's origin."""
+    """Paths of A agents; positions are relative to `origin_m`, which keeps digits far from the map's origin."""
 
     def __init__(self, trajectories: Sequence[Trajectory]) -> None:
         self.origin_m = trajectories[0].origin_m if trajectories else (0.0, 0.0)
@@ -65,7 +85,7 @@ class PathTable:
         self._marks = np.concatenate(marks) if marks else np.zeros((0, 5))
 
     def at(self, agent: NDArray[np.intp], t_s: Array) -> Pose:
-        """Where agents are at times of the log, broadcast together: held before their life, going straight on after it."""
+        """Return where agents are at times of the log, broadcast together: held before their lifetime, straight on after it."""
         begin, end, rows = self.begin_s[agent], self.end_s[agent], self._rows[agent]
         step = np.where(rows > 1, (end - begin) / np.maximum(rows - 1, 1), 1.0)
         place = np.clip((t_s - begin) / step, 0.0, rows - 1)
@@ -77,7 +97,7 @@ class PathTable:
         return Pose(x + beyond * np.cos(yaw), y + beyond * np.sin(yaw), z, yaw, speed, distance + np.abs(beyond))
 
     def along(self, agent: NDArray[np.intp], distance_m: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """x, y, direction of travel as cos, sin, and the log's time at distances, broadcast together."""
+        """Return x, y, direction of travel as cos, sin, and the log's time at distances, broadcast together."""
         place = np.clip(distance_m / SPACING_M, 0.0, self.marks[agent] - 1)
         k = np.minimum(place.astype(np.intp), self.marks[agent] - 2)
         low, high = self._marks[self._mark0[agent] + k], self._marks[self._mark0[agent] + k + 1]
@@ -85,7 +105,7 @@ class PathTable:
         return x, y, cos, sin, t_s
 
     def foot(self, agent: NDArray[np.intp], from_m: Array, reach_m: float, x_m: Array, y_m: Array) -> PathProjection:
-        """The places within `reach_m` from `from_m` (P,) on the ways of agents (P,) that are nearest to points (P, H)."""
+        """Return the places within `reach_m` from `from_m` (P,) on the paths of agents (P,) that are nearest to points (P, H)."""
         first = np.clip((from_m / SPACING_M).astype(np.intp), 0, self.marks[agent] - 1)
         ahead = np.arange(0, int(reach_m / SPACING_M) + COARSE_STRIDE, COARSE_STRIDE)
         k = np.minimum(first[:, None] + ahead, self.marks[agent][:, None] - 1)
@@ -108,30 +128,30 @@ class PathTable:
         return PathProjection(dx * cos + dy * sin, dy * cos - dx * sin, cos, sin, k * SPACING_M, t_s)
 
     def beside(self, agent: int, from_m: float, x_m: float, y_m: float) -> float:
-        """How far along its way an agent is that is at a place of the map and was at `from_m` before; at least 0."""
+        """Return how far along its path an agent at a place of the map is that was at `from_m` before; at least 0."""
         begin_m = max(from_m - SEARCH_BACK_M, 0.0)
         x, y = (np.array([[c - o]]) for c, o in zip((x_m, y_m), self.origin_m))
         foot = self.foot(np.array([agent]), np.array([begin_m]), from_m - begin_m + SEARCH_AHEAD_M, x, y)
         return max(float(foot.distance_m[0, 0] + foot.ahead_m[0, 0]), 0.0)
 
     def times(self, agent: NDArray[np.intp], distance_m: Array) -> Array:
-        """When the log was at distances along ways, broadcast together; its end for what is beyond."""
+        """Return when the log was at distances along paths, broadcast together; its end for places beyond."""
         t_s = self.along(agent, distance_m)[4]
         return np.where(np.isnan(t_s), self.end_s[agent], t_s)
 
 
 def log_times_of_positions(trajectory: Trajectory, x_m: Array, y_m: Array) -> Array:
-    """When the log was beside the places (S,) of an agent that drives as it likes, one after the other along its path."""
-    way, gone_m = PathTable([trajectory]), np.zeros(len(x_m))
+    """Return when the log was nearest to the successive positions (S,) of an agent that drives freely."""
+    table, gone_m = PathTable([trajectory]), np.zeros(len(x_m))
     for k, (x, y) in enumerate(zip(x_m.tolist(), y_m.tolist())):
-        gone_m[k] = way.beside(0, gone_m[k - 1] if k else 0.0, x, y)
-    return way.times(np.zeros(1, dtype=np.intp), gone_m)
+        gone_m[k] = table.beside(0, gone_m[k - 1] if k else 0.0, x, y)
+    return table.times(np.zeros(1, dtype=np.intp), gone_m)
 
 
 def log_times_of_distance(trajectory: Trajectory, t_s: Array, x_m: Array, y_m: Array) -> Array:
-    """When the log was where an agent that goes along its path is (S,): the time of the same distance gone.
+    """Return when the log had traveled the distance that an agent on its path has, (S,).
 
-    An agent that keeps its way yet not its times has its height and its errors from there.
+    An agent that keeps to its path but not to its times takes its height and its errors from there.
     """
     table = _time_table(trajectory, trajectory.origin_m)
     gone = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x_m), np.diff(y_m)))])
@@ -140,7 +160,7 @@ def log_times_of_distance(trajectory: Trajectory, t_s: Array, x_m: Array, y_m: A
 
 
 def _time_table(trajectory: Trajectory, origin_m: tuple[float, float]) -> Array:
-    """Rows (K, 7) evenly spaced over a life: time, then the columns of a `Pose`."""
+    """Return rows (K, 7) evenly spaced over a lifetime: time, then the columns of `Pose`."""
     begin, end = trajectory.t_s[0], trajectory.t_s[-1]
     count = int(np.ceil((end - begin) / TIME_STEP_S)) + 1 if end > begin else 1
     t_s = np.linspace(begin, end, count)
@@ -154,7 +174,7 @@ def _time_table(trajectory: Trajectory, origin_m: tuple[float, float]) -> Array:
 
 
 def _distance_table(table: Array) -> Array:
-    """Rows (K, 5) every `SPACING_M` of a way: x, y, direction of travel as cos, sin, and time."""
+    """Return rows (K, 5) every `SPACING_M` of a path: x, y, direction of travel as cos, sin, and time."""
     t_s, x, y, _, yaw, speed, distance = table.T
     whole = np.arange(int(distance[-1] / SPACING_M) + 1) * SPACING_M
     moved = np.concatenate([[True], np.diff(distance) > 0])
@@ -184,6 +204,6 @@ def _distance_table(table: Array) -> Array:
 
 
 def _row_ranges(tables: Sequence[Array]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """First row and number of rows of each table once they are joined."""
+    """Return first row and number of rows of each table after concatenation."""
     count = np.array([len(t) for t in tables], dtype=np.intp)
     return np.cumsum(count) - count, count

@@ -1,4 +1,4 @@
-"""Where boxes reach into the corridor that an agent is about to sweep on its own way."""
+"""Where boxes reach into the corridor that an agent will sweep along its own path."""
 
 from __future__ import annotations
 
@@ -11,11 +11,17 @@ from log2sim.geometry import Array
 from log2sim.simulation.reactive.path_table import PathTable
 
 HORIZON_S = np.arange(0.0, 3.01, 0.25)
-"""Times (H,) ahead at which others are expected somewhere: a car that crosses at 20 m/s moves by its length in between."""
+"""Times (H,) ahead at which others are predicted: a car that crosses at 20 m/s moves by its length in between."""
 
 
 class PredictedBoxes(NamedTuple):
-    """Boxes that pairs of agents look at, at the times of the horizon: centers, yaw, speed (P, H), length and width (P,)."""
+    """Boxes of the other agents of pairs (P,) at the times of the horizon (H,).
+
+    Attributes
+    ----------
+    x_m, y_m, yaw_rad, speed_mps : (P, H) float64
+    length_m, width_m : (P,) float64
+    """
 
     x_m: Array
     y_m: Array
@@ -26,9 +32,20 @@ class PredictedBoxes(NamedTuple):
 
 
 class SweptCorridor(NamedTuple):
-    """What agents (P,) are about to sweep: whose way, how far they are on it, their size, how fast they go.
+    """The corridors that agents (P,) will sweep.
 
-    `progress_m` (P, H) is how far they mean to go from here until the times of the horizon, `reach_m` how far they look.
+    Attributes
+    ----------
+    agent : (P,) int
+        Whose path.
+    distance_m : (P,) float64
+        Present distance along it.
+    length_m, width_m : (P,) float64
+    pace_mps : (P,) float64
+    progress_m : (P, H) float64
+        How far they intend to go from here until the times of the horizon.
+    reach_m : float
+        Look-ahead distance.
     """
 
     agent: NDArray[np.intp]
@@ -41,7 +58,17 @@ class SweptCorridor(NamedTuple):
 
 
 class SafetyMargins(NamedTuple):
-    """What is kept clear: on both sides, before what crosses as a way and as a time; `behind_m` widens what is ahead."""
+    """Margins that are kept to other agents.
+
+    Attributes
+    ----------
+    side_m : float
+        On both sides of the corridor.
+    crossing_m, crossing_s : float
+        Before a crossing agent, as a distance and as a time.
+    behind_m : float
+        How far behind the agent's progress another center still counts as ahead.
+    """
 
     side_m: float
     crossing_m: float
@@ -50,9 +77,18 @@ class SafetyMargins(NamedTuple):
 
 
 class Leaders(NamedTuple):
-    """What agents (P,) have to keep clear of: `gap_m` from the front bumper, inf where nothing; its speed along the way.
+    """What agents (P,) have to keep clear of.
 
-    `ahead_s` is when it is in the way (0 where it is now), `own_t_s` the log's time of the agent at that place.
+    Attributes
+    ----------
+    gap_m : (P,) float64
+        From the front bumper; inf without a leader.
+    speed_mps : (P,) float64
+        Of the leader, along the path.
+    ahead_s : (P,) float64
+        When it is in the corridor; 0 if it is now.
+    own_t_s : (P,) float64
+        The log's time of the agent at that place.
     """
 
     gap_m: Array
@@ -61,31 +97,32 @@ class Leaders(NamedTuple):
     own_t_s: Array
 
 
-def leaders(ways: PathTable, corridor: SweptCorridor, boxes: PredictedBoxes, room: SafetyMargins) -> Leaders:
-    """For each pair, what the agent has to keep clear of in the other's box, now or within the horizon.
+def leaders(paths: PathTable, corridor: SweptCorridor, boxes: PredictedBoxes, margins: SafetyMargins) -> Leaders:
+    """Find for each pair what the agent has to keep clear of in the other's box, now or within the horizon.
 
     Notes
     -----
-    A box that is in the corridor and will stay there is followed. One that crosses counts if the agent, going as it means
-    to, comes near it while it is in the corridor. Boxes whose center is behind that of the agent never count. What moves
-    along the way while it comes in has its gap taken back to now, so a cut-in is a leader. Cost: P H reach / 4 distances.
+    A box that is in the corridor and will stay there is followed. A crossing box counts if the agent, at its intended
+    progress, comes near it while it is in the corridor. Boxes whose center is behind that of the agent never count. For a
+    box that moves along the path while it enters, the gap is reduced by its motion until then, so a cut-in is a leader.
+    Cost: P H reach / 4 distances.
     """
     c = corridor
-    foot = ways.foot(c.agent, c.distance_m, c.reach_m, boxes.x_m, boxes.y_m)
+    foot = paths.foot(c.agent, c.distance_m, c.reach_m, boxes.x_m, boxes.y_m)
     cos, sin = np.cos(boxes.yaw_rad), np.sin(boxes.yaw_rad)
     turn_cos, turn_sin = cos * foot.cos + sin * foot.sin, sin * foot.cos - cos * foot.sin
     half_length, half_width = boxes.length_m[:, None] / 2, boxes.width_m[:, None] / 2
-    within = c.width_m[:, None] / 2 + room.side_m
+    within = c.width_m[:, None] / 2 + margins.side_m
     center = foot.distance_m + foot.ahead_m - c.distance_m[:, None]
     inside = np.abs(foot.left_m) < within + half_length * np.abs(turn_sin) + half_width * np.abs(turn_cos)
-    ahead = center > c.progress_m - room.behind_m
-    # Who is once behind within the corridor comes from behind and has to see to it itself.
+    ahead = center > c.progress_m - margins.behind_m
+    # A box that is once behind within the corridor approaches from behind: the other driver is responsible.
     inside &= ahead & ~np.logical_or.accumulate(inside & ~ahead, axis=1)
     gap = center + _nearest_edge(foot.left_m, turn_cos, turn_sin, half_length, half_width, within)
     gap -= c.length_m[:, None] / 2
 
     stays = inside[:, 0] & inside[:, -1]
-    met = inside & (gap <= c.progress_m + room.crossing_m + room.crossing_s * c.pace_mps[:, None])
+    met = inside & (gap <= c.progress_m + margins.crossing_m + margins.crossing_s * c.pace_mps[:, None])
     first = np.where(stays, 0, np.argmax(met, axis=1))
     row = np.arange(len(first))
     ahead_s, speed = HORIZON_S[first], (boxes.speed_mps * turn_cos)[row, first]
@@ -97,10 +134,10 @@ def leaders(ways: PathTable, corridor: SweptCorridor, boxes: PredictedBoxes, roo
 
 
 def _nearest_edge(left: Array, cos: Array, sin: Array, half_length: Array, half_width: Array, within: Array) -> Array:
-    """How far ahead of their center (so negative) rectangles begin within the corridor |y| < `within`, in m.
+    """Return how far ahead of their center (so negative) rectangles begin within the corridor |y| < `within`, in m.
 
-    `left` is the center's place across it, `cos`, `sin` the heading against it. The rearmost corner counts if it is inside,
-    else the point where the edge that leads inward from there enters.
+    `left` is the lateral position of the center, `cos`, `sin` the relative heading. The rearmost corner counts if it is
+    inside, else the point where the edge that leads inward from there enters.
     """
     forward, upward = np.where(cos >= 0, 1.0, -1.0), np.where(sin >= 0, 1.0, -1.0)
     corner_x = -(np.abs(cos) * half_length + np.abs(sin) * half_width)

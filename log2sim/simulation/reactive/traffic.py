@@ -1,7 +1,8 @@
-"""How reactive agents decide: along their own logged way, as the log did, but braking for what the log did not have there.
+"""Decisions of reactive agents: follow the log along their own path, but brake for what the log does not have there.
 
-Each reactive agent lives on its own time: it goes through its log at `rate` (1 as logged, 0 stands), and so falls behind by
-`delay_s`. It never leaves its way, keeps the log's stops, takes up the log's speed of the place again, and makes up nothing.
+Each reactive agent has its own time on the log: it passes the log at `rate` (1 as logged, 0 standing), and so falls
+behind by `delay_s`. It never leaves its path, keeps the log's stops, returns to the log's speed of the place, and never
+catches up.
 """
 
 from __future__ import annotations
@@ -20,33 +21,33 @@ from log2sim.simulation.reactive.log_overlaps import deep_overlaps
 from log2sim.simulation.reactive.path_table import PathTable, Pose
 
 DECISION_STEP_S = 0.1
-STANDING_MPS = 0.05  # where the log is slower, its time goes on: waiting for somebody counts as the log's own stop
-CHUNK = 4096  # pairs looked at together
+STANDING_MPS = 0.05  # where the log is slower, its time goes on: waiting then counts as the log's own stop
+CHUNK = 4096  # pairs evaluated together
 RELEASE_S, MAX_KEPT_DEMAND = 0.5, 4.0
-"""A demand that is gone fades over this time, so that one at the edge of a conflict does not make an agent hunt."""
+"""A demand fades over this time after it ends, so that the rate does not oscillate at the edge of a conflict."""
 
 SAME_DELAY_S = 1e-9  # delays that differ by rounding are the same
 
 
 class Traffic:
-    """Decisions of the reactive ones among the A agents of a scenario; all columns are (A,) over all of them.
+    """Decisions of the reactive agents among the A agents of a scenario; all columns are (A,) over all of them.
 
     Parameters
     ----------
-    agents, paths : sequences
-        All agents, and the courses of their box centers: of static ones, one pose.
+    agents, trajectories : sequences
+        All agents, and the trajectories of their box centers; for static agents one pose.
     reactive : collection of str
-        Ids of those that react.
+        Ids of the reactive agents.
     driven : str, optional
-        Id of the agent whose states are given with each decision, since it need not be where its log is.
+        Id of the agent whose states are given with each decision, since a policy drives it.
 
     Notes
     -----
-    A pair of agents is looked at only while it is not as the log has it: one is driven by a policy, or their delays differ,
-    or the log itself drives them into each other. What a leader demands is compared with what it demanded in the log when
-    the agent was at this place, and only the excess counts; so a log that drives closer than the model would is kept. Of
-    two reactive ones whose ways cross, the one that was there first in the log goes first. Cost: R A comparisons a decision,
-    then some 500 distances for each pair in reach.
+    A pair of agents is evaluated only while it differs from the log: one is driven by a policy, or their delays differ,
+    or they overlap in the log itself. The demand of a leader is compared with its demand in the log when the agent was
+    at this place, and only the excess counts; so a log that drives closer than the model would is reproduced. Where the
+    paths of two reactive agents cross, the one that was there first in the log goes first. Cost: R A comparisons a
+    decision, then some 500 distances for each pair in reach.
     """
 
     def __init__(
@@ -57,29 +58,29 @@ class Traffic:
         driven: str | None,
     ) -> None:
         self.index = {a.id: k for k, a in enumerate(agents)}
-        self.ways = PathTable(trajectories)
+        self.paths = PathTable(trajectories)
         self.reacts = np.array([a.id in reactive for a in agents], dtype=bool)
-        self.driver = idm_parameters(agents)
+        self.idm = idm_parameters(agents)
         self._static = np.array([a.static for a in agents], dtype=bool)
         self._stays = np.array([a.is_permanent for a in agents], dtype=bool)
         self._driven = self.index[driven] if driven is not None else -1
         self._size = np.array([a.size_m for a in agents], dtype=np.float64).reshape(-1, 3)
-        self._distrusted = deep_overlaps(self.ways, self._size, self._static)
+        self._distrusted = deep_overlaps(self.paths, self._size, self._static)
         self.restart()
 
     def restart(self) -> None:
-        """Put everybody on the log's time."""
+        """Reset all agents to the time of the log."""
         count, self._decided_s = len(self.reacts), -np.inf
         self.delay_s, self.rate, self.rate_slope = np.zeros(count), np.ones(count), np.zeros(count)
         self._taken, self._driven_m = np.zeros(count), 0.0
 
     def decide(self, t_s: float, dt_s: float, ego: Snapshot | None) -> None:
-        """Choose how fast the reactive ones go on, and move their time by `dt_s`.
+        """Choose the rates of the reactive agents, and advance their log times by `dt_s`.
 
         `ego` is the state of the driven agent, None if there is none.
         """
         tau = t_s - self.delay_s
-        going = self.reacts & (self.ways.begin_s <= tau) & (tau < self.ways.end_s)
+        going = self.reacts & (self.paths.begin_s <= tau) & (tau < self.paths.end_s)
         if t_s > self._decided_s + DECISION_STEP_S - SAME_DELAY_S:
             self._decided_s = t_s
             self._decide(t_s, tau, np.flatnonzero(going), ego)
@@ -89,13 +90,13 @@ class Traffic:
 
     def _decide(self, t_s: float, tau: Array, own: NDArray[np.intp], ego: Snapshot | None) -> None:
         """Set the rates of agents `own` (R,) and their slopes."""
-        pose = self.ways.at(np.arange(len(tau)), tau)
+        pose = self.paths.at(np.arange(len(tau)), tau)
         pace = np.abs(pose.speed_mps[own])
-        log_accel = (np.abs(self.ways.at(own, tau[own] + DECISION_STEP_S).speed_mps) - pace) / DECISION_STEP_S
+        log_accel = (np.abs(self.paths.at(own, tau[own] + DECISION_STEP_S).speed_mps) - pace) / DECISION_STEP_S
         pose = self._with_ego(pose, ego)
-        course = predict_all(self.ways, pose, tau, self.rate, self._driven)
+        prediction = predict_all(self.paths, pose, tau, self.rate, self._driven)
         moment = TrafficState(
-            self.ways, self.driver, self._size, self.reacts, self._driven, tau, self.rate, pose, course
+            self.paths, self.idm, self._size, self.reacts, self._driven, tau, self.rate, pose, prediction
         )
         taken = np.zeros(len(tau))
         pairs = moment.meeting(*self._pairs(t_s, tau, own))
@@ -105,32 +106,32 @@ class Traffic:
         kept = np.minimum(self._taken, MAX_KEPT_DEMAND) * np.exp(-DECISION_STEP_S / RELEASE_S)
         taken = np.maximum(taken, np.where(kept > MIN_DEMAND, kept, 0.0))
         self._taken = taken
-        rate, slope = rate_response(self.driver.take(own), self.rate[own], taken[own], pace, log_accel)
+        rate, slope = rate_response(self.idm.take(own), self.rate[own], taken[own], pace, log_accel)
         stands = pace < STANDING_MPS
         self.rate[own], self.rate_slope[own] = np.where(stands, 1.0, rate), np.where(stands, 0.0, slope)
 
     def _with_ego(self, pose: Pose, ego: Snapshot | None) -> Pose:
-        """The poses with that of the driven agent, which is where its driver took it."""
+        """Replace the pose of the driven agent by the one to which the policy has driven it."""
         k = self._driven
         if ego is None or k < 0 or not len(ego.x_m):
             return pose
         x, y, yaw, speed = pose.x_m.copy(), pose.y_m.copy(), pose.yaw_rad.copy(), pose.speed_mps.copy()
-        x[k], y[k] = ego.x_m[0] - self.ways.origin_m[0], ego.y_m[0] - self.ways.origin_m[1]
+        x[k], y[k] = ego.x_m[0] - self.paths.origin_m[0], ego.y_m[0] - self.paths.origin_m[1]
         yaw[k], speed[k] = ego.yaw_rad[0], ego.speed_mps[0]
-        # Its height is that of the road where it is, or on a slope nobody would brake for one that fell behind.
-        self._driven_m = self.ways.beside(k, self._driven_m, float(ego.x_m[0]), float(ego.y_m[0]))
+        # Its height is that of the log at this place; by time, nobody would brake for it on a slope if it fell behind.
+        self._driven_m = self.paths.beside(k, self._driven_m, float(ego.x_m[0]), float(ego.y_m[0]))
         z = pose.z_m.copy()
         driven = np.array([k])
-        z[k] = self.ways.at(driven, self.ways.times(driven, np.array([self._driven_m]))).z_m[0]
+        z[k] = self.paths.at(driven, self.paths.times(driven, np.array([self._driven_m]))).z_m[0]
         return pose._replace(x_m=x, y_m=y, z_m=z, yaw_rad=yaw, speed_mps=speed)
 
     def _pairs(self, t_s: float, tau: Array, own: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Reactive agents (P,) and those (P,) present that are not to them as the log has it."""
+        """Return pairs of a reactive agent (P,) and a present agent (P,) whose relation differs from the log."""
         differs = (np.abs(self.delay_s[own][:, None] - self.delay_s) > SAME_DELAY_S) & ~self._static
         if self._driven >= 0:
             differs[:, self._driven] = True
         differs |= self._distrusted[own]
-        differs &= (self.ways.begin_s <= t_s) & (tau <= self.ways.end_s) | self._stays
+        differs &= (self.paths.begin_s <= t_s) & (tau <= self.paths.end_s) | self._stays
         differs[np.arange(len(own)), own] = False
         row, j = np.nonzero(differs)
         return own[row], j

@@ -1,1 +1,1 @@
-"""What moves agents: vehicle models, their parameters, and which of them a maneuver needs."""
+"""Vehicle models, their parameters, and the choice of a model for each vehicle."""

@@ -47,9 +47,9 @@ def step_dynamic(
     Angles are exact. Lateral force of an axle: the magic formula of Pacejka ("Tire and Vehicle Dynamics", 2012, chapter 4)
     with shape factor 1 and no curvature, D sin(arctan(C s)) = D C s / sqrt(1 + (C s)^2) with s the tangent of the slip
     angle: stiffness C at first, D at most. D is friction times load, less what drive and brakes take of it (friction
-    ellipse). The pedal accelerates the rear axle: the drive makes up for what rolling along a curve costs, so that without
-    slip this is the kinematic bicycle, while without friction the momentum stays what it is. That make-up is beyond the
-    friction limit: at full lock, while the yaw rate changes, the sum of forces can exceed it by a seventh.
+    ellipse). The pedal accelerates the rear axle: the drive compensates for the loss of rolling along a curve, so that without
+    slip this is the kinematic bicycle, while without friction the momentum is conserved. This compensation is not part of the
+    friction limit: at full lock, while the yaw rate changes, the sum of forces can exceed the limit by a seventh.
     """
     p, chassis = parameters, Chassis.of(parameters)
     count, h = inner_steps(dt_s)
@@ -70,7 +70,14 @@ def step_dynamic(
 
 @dataclass(frozen=True, eq=False)
 class DriveInput:
-    """What one step of the saturating model is given: the pedal, the gear, and tangents of the steering angle."""
+    """Inputs of one step of the saturating model.
+
+    Attributes
+    ----------
+    pedal_mps2, gear : (A,) float64
+    bend0, mean_bend, bend1 : (A,) float64
+        Tangent of the steering angle at the begin, on average and at the end.
+    """
 
     pedal_mps2: Array
     gear: Array
@@ -81,7 +88,17 @@ class DriveInput:
 
 @dataclass(frozen=True, eq=False)
 class BodyState:
-    """Rear axle, yaw, its speed along and its velocity to the left of the heading, yaw rate."""
+    """State of the rear axle.
+
+    Attributes
+    ----------
+    x_m, y_m, yaw_rad : (A,) float64
+    speed_mps : (A,) float64
+        Along the heading.
+    lateral_mps : (A,) float64
+        To the left of the heading.
+    yaw_rate_radps : (A,) float64
+    """
 
     x_m: Array
     y_m: Array
@@ -92,13 +109,12 @@ class BodyState:
 
 
 def step_body(body: BodyState, drive: DriveInput, p: VehicleParameters, c: Chassis, h: float) -> BodyState:
-    """One step of the saturating model.
+    """Compute one step of the saturating model.
 
     Notes
     -----
-    Unknown are the lateral velocities at which the axles slip. Tires act by their secant stiffness, so every step is
-    dissipative whatever its length; it is that of the slips in the middle, where half an implicit Euler step leads: second
-    order.
+    The unknowns are the lateral velocities at which the axles slip. Tires act by their secant stiffness, so a step of any
+    length is dissipative; the stiffness is that at the middle of the step, from half a step of implicit Euler: second order.
     """
     d, speed, rear = drive, body.speed_mps, body.lateral_mps
     front = rear + p.wheelbase_m * body.yaw_rate_radps - speed * d.bend0
@@ -111,7 +127,7 @@ def step_body(body: BodyState, drive: DriveInput, p: VehicleParameters, c: Chass
     system = _slip_equations(mean_speed, accel, start, d, p, c, h / 2)
     middle = system.solve(rear + (begin + end) / 4, front + (begin + end) / 4 + swing / 2)
 
-    # All of it. The speed is needed for the slips and follows from them, so it is predicted and then corrected.
+    # To the end of the step. The slips depend on the speed and the speed on the slips: it is predicted and then corrected.
     rate = (mean_speed * d.mean_bend + middle.front - middle.rear) / p.wheelbase_m
     speed1, _, accel = _longitudinal_step(
         speed, _slip_speed_gain(middle, rate, 2 * (middle.rear - rear), d, p, h), d, h
@@ -126,12 +142,12 @@ def step_body(body: BodyState, drive: DriveInput, p: VehicleParameters, c: Chass
         front + STAGE_WEIGHT * (first.front - front) + pull + GAMMA * swing,
     )
     rate1 = (speed1 * d.bend1 + last.front - last.rear) / p.wheelbase_m
-    speed1, way, _ = _longitudinal_step(speed, _slip_speed_gain(middle, rate, last.rear - rear, d, p, h), d, h)
+    speed1, distance, _ = _longitudinal_step(speed, _slip_speed_gain(middle, rate, last.rear - rear, d, p, h), d, h)
 
     # Along an arc.
-    turn = (way * d.mean_bend + h * (front + last.front - rear - last.rear) / 2) / p.wheelbase_m
+    turn = (distance * d.mean_bend + h * (front + last.front - rear - last.rear) / 2) / p.wheelbase_m
     shrink = sinc(turn / 2)
-    ahead, aside = way * shrink, h * (rear + last.rear) / 2 * shrink
+    ahead, aside = distance * shrink, h * (rear + last.rear) / 2 * shrink
     cos, sin = cos_sin(body.yaw_rad + turn / 2)
     x, y = body.x_m + ahead * cos - aside * sin, body.y_m + ahead * sin + aside * cos
     return BodyState(x, y, body.yaw_rad + turn, speed1, last.rear, rate1)
@@ -140,7 +156,7 @@ def step_body(body: BodyState, drive: DriveInput, p: VehicleParameters, c: Chass
 def _slip_speed_gain(
     slips: Slips, rate: Array, grown: Array | float, d: DriveInput, p: VehicleParameters, h: float
 ) -> NDArray[np.float64]:
-    """What slipping adds to the speed within a step, while the lateral velocity of the rear axle grows by `grown`."""
+    """Return the speed gained by slipping within a step in which the lateral velocity of the rear axle grows by `grown`."""
     slip_rate = (slips.front - slips.rear) / p.wheelbase_m
     return h * rate * (slips.rear + p.cg_to_rear_m * slip_rate) - p.cg_to_rear_m * d.mean_bend / p.wheelbase_m * grown
 
@@ -148,16 +164,16 @@ def _slip_speed_gain(
 def _rolling_slip_growth(
     speed: Array, speed1: Array, d: DriveInput, p: VehicleParameters, h: float
 ) -> tuple[Array, Array, Array]:
-    """What rolling asks of the tires, as growth of slip in a step: by its yaw rate at begin and end, and by its change."""
+    """Return the growth of slip in a step due to rolling: by the yaw rate at begin and end, and by its change."""
     rolling, rolling1 = speed * d.bend0, speed1 * d.bend1
     each = -h / p.wheelbase_m
     return each * speed * rolling, each * speed1 * rolling1, rolling - rolling1
 
 
 def _longitudinal_step(speed: Array, gain: Array, d: DriveInput, h: float) -> tuple[Array, Array, Array]:
-    """Speed after a step, the way and the acceleration of the tires; `gain` is what slipping adds to the speed.
+    """Return speed after a step, distance, and acceleration of the tires; `gain` is the speed gained by slipping.
 
-    Throttle pushes whither the gear says, brakes hold against the motion and end at rest.
+    Throttle acts in the direction of the gear, brakes act against the motion and end at rest.
     """
     push = h * np.maximum(d.pedal_mps2, 0.0) * d.gear
     free = speed + gain + push
@@ -169,10 +185,10 @@ def _longitudinal_step(speed: Array, gain: Array, d: DriveInput, h: float) -> tu
 def _slip_equations(
     speed: Array, accel: Array, slips: Slips, d: DriveInput, p: VehicleParameters, c: Chassis, tau: float
 ) -> LinearPair:
-    """Equations of an implicit step `tau` for slip velocities (m/s), linear about `slips`.
+    """Build the equations of an implicit step `tau` for slip velocities (m/s), linearized about `slips`.
 
-    Secant stiffness is a force over a scale that vanishes at standstill; with the scales as units nothing is divided by
-    them.
+    Secant stiffness is a force over a scale that vanishes at standstill; with the scales as units, nothing is divided
+    by them.
     """
     rear, front = slips.rear, slips.front
     use = accel / (GRAVITY_MPS2 * p.friction)

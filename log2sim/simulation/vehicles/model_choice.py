@@ -1,4 +1,4 @@
-"""Which model moves each vehicle: the simplest that is good enough for its maneuver, and why."""
+"""Chooses the model of each vehicle: the simplest that is adequate for its maneuver."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ MODELS = ("auto", "kinematic", "dynamic", "single-track")
 TWO_WHEELERS = ("motorcycle", "cyclist", "bicycle")
 
 SLIP_TOLERANCE_RAD = 0.02
-"""Slip angle of the rear tires up to which rolling without slip is good enough: 1.1 degrees, as much as headings in a log err.
+"""Slip angle of the rear tires up to which the kinematic model is adequate: 1.1 degrees, the error of headings in a log.
 
-A car has it at 3.3 m/s2 sideways, a third of what its tires bear. Polack et al. ("The kinematic bicycle model: a consistent
-model for planning feasible trajectories for autonomous vehicles?", 2017) take the kinematic model as valid up to half.
+A car reaches it at 3.3 m/s2 of lateral acceleration, a third of its tires' limit. Polack et al. ("The kinematic bicycle
+model: a consistent model for planning feasible trajectories for autonomous vehicles?", 2017) use it up to half the limit.
 """
 
 FAST_REVERSE_MPS = 3.0
-"""Beyond it tires that slip are steered worse than what rolls: the rear axle leads, and what steers it swings out behind."""
+"""Beyond this speed in reverse the models with slip follow worse than the kinematic one: the steered axle trails."""
 
 LOAD_ITERATIONS = 4
-"""Passes in which slips, the drag of slips and the load that this moves settle."""
+"""Passes until slips, the drag of slips and the load transfer agree."""
 
 MAX_FRICTION_USE = 0.95
 """Share of the friction limit beyond which slips are not predicted: they grow without bound."""
@@ -46,7 +46,7 @@ class ModelChoice(NamedTuple):
 def choose_model(
     agent: Agent, reference: Reference, parameters: VehicleParameters, wanted: str, *, free: bool
 ) -> ModelChoice:
-    """The model for a vehicle (`parameters` of shape (1,)) when the user wants `wanted`; `free` vehicles leave their log."""
+    """Choose the model of a vehicle (`parameters` of shape (1,)) by the user's wish; `free` vehicles leave their log."""
     if wanted != "auto":
         return ModelChoice(wanted, "asked for")
     if agent.category in TWO_WHEELERS:
@@ -67,19 +67,19 @@ def choose_model(
 
 
 def understeer(p: VehicleParameters) -> Array:
-    """Steering angle (A,) beyond that of rolling, per lateral acceleration and wheelbase in s2/m2, while slips are small."""
+    """Return the steering angle (A,) beyond that of rolling, per lateral acceleration and wheelbase in s2/m2, at small slip."""
     compliance = 1 / p.front_stiffness_1prad - 1 / p.rear_stiffness_1prad
     return compliance / (GRAVITY_MPS2 * p.friction * p.wheelbase_m)
 
 
 def slipping_reference(reference: Reference, p: VehicleParameters, model: str, ahead_s: float) -> Reference:
-    """The reference of a vehicle that slips (`p` of shape (1,)), its curvature being that of `ahead_s` later.
+    """Add slip to the reference of a vehicle (`p` of shape (1,)); its curvature column is that of `ahead_s` later.
 
     Notes
     -----
-    The equations of the single-track model solved for what drives them (inverse dynamics): the forces that turn and move
-    the vehicle as the course does, the slips of these forces, the heading that these slips add to the course, and the
-    steering angle; as a curvature of which the follower makes this angle again.
+    Inverse dynamics of the single-track model: the forces that move the vehicle along the trajectory, the slips of these
+    forces, the heading that these slips add, and the steering angle; the latter as the curvature from which the controller
+    computes that angle.
     """
     if len(reference.columns) < 3:
         return replace(reference, slips=True)
@@ -100,15 +100,15 @@ def slipping_reference(reference: Reference, p: VehicleParameters, model: str, a
 
 
 def with_slip_states(state: VehicleState, reference: Callable[[float], Array], t_s: float) -> VehicleState:
-    """The state with the lateral velocity and the yaw rate that the reference's rows (C, A) have at a time."""
-    before, after = reference(t_s), reference(t_s + GRID_S)  # before its begin a reference goes straight on
+    """Set the lateral velocity and the yaw rate to those of the reference's rows (C, A) at a time."""
+    before, after = reference(t_s), reference(t_s + GRID_S)
     (dx, dy), turn = (after - before)[:2] / GRID_S, (after - before)[YAW]
     yaw = (before + after)[YAW] / 2
     return replace(state, lateral_mps=np.cos(yaw) * dy - np.sin(yaw) * dx, yaw_rate_radps=turn / GRID_S)
 
 
 def _inverse_dynamics(columns: Array, p: VehicleParameters, *, saturates: bool) -> tuple[Array, Array, Array]:
-    """What slip adds to heading, curvature and acceleration, (K,) each, of the rows of a table, as of the curvature's time."""
+    """Return what slip adds to heading, curvature and acceleration, (K,) each, for the rows of a table."""
     speed, curvature, to_rear, chassis = columns[:, SPEED], columns[:, CURVATURE], p.cg_to_rear_m, Chassis.of(p)
     twist = np.gradient(speed * curvature, GRID_S)
     aside = speed**2 * curvature + to_rear * twist  # acceleration of the center of gravity
@@ -133,7 +133,7 @@ def _inverse_dynamics(columns: Array, p: VehicleParameters, *, saturates: bool) 
 
 
 def _slip_angle(use: Array, stiffness_1prad: Array, *, saturates: bool = True) -> Array:
-    """Slip angle at a share of the friction limit, of tires that saturate there or, published, do not."""
+    """Return the slip angle at a share of the friction limit, of tires that saturate or, as published, do not."""
     if not saturates:
         return use / stiffness_1prad
     use = np.clip(use, -MAX_FRICTION_USE, MAX_FRICTION_USE)

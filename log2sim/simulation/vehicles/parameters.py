@@ -1,7 +1,6 @@
-"""Parameters of vehicles: by category and size, and those of the published vehicles.
+"""Vehicle parameters: by category and size, and those of published vehicles.
 
-Shares of the size are rules of thumb with the spread of the vehicles on the road; what a scenario knows (size, rear axle)
-comes first.
+Shares of the size are typical values of vehicles on the road; size and rear axle of the scenario take precedence.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from log2sim.datatypes import Agent
 from log2sim.simulation.vehicles.vehicle import VehicleParameters
 
 WHEELED = ("car", "truck", "bus", "motorcycle", "cyclist", "bicycle")
-"""Categories that move as bicycles; all others are points that may also move sideways."""
+"""Categories that move as bicycle models; all others are point masses that may also move sideways."""
 
 STEER_RATE_RADPS = 1.0  # at the road wheels: a full turn of the hand wheel in 0.4 s at a ratio of 16
 STEER_LAG_S = 0.10
@@ -25,15 +24,29 @@ MAX_JERK_MPS3 = 60.0
 
 
 class VehicleProportions(NamedTuple):
-    """How vehicles of a category are built, in shares of length, wheelbase and height, and what they can do."""
+    """Proportions and limits of the vehicles of a category.
 
-    wheelbase: float  # of the length
-    rear_axle: float  # behind the box center, of the length
+    Attributes
+    ----------
+    wheelbase, rear_axle : float
+        As shares of the length; the rear axle behind the box center.
+    max_steer_rad, max_throttle_mps2, max_brake_mps2 : float
+    cg_to_rear : float
+        Of the wheelbase: the share of the weight on the front axle.
+    cg_height : float
+        Of the height.
+    front_stiffness_1prad, rear_stiffness_1prad : float
+        Cornering stiffness over load and friction.
+    friction : float
+    """
+
+    wheelbase: float
+    rear_axle: float
     max_steer_rad: float
     max_throttle_mps2: float
     max_brake_mps2: float
-    cg_to_rear: float  # of the wheelbase: the share of the weight that the front axle bears
-    cg_height: float  # of the height
+    cg_to_rear: float
+    cg_height: float
     front_stiffness_1prad: float
     rear_stiffness_1prad: float
     friction: float
@@ -58,13 +71,22 @@ _PROPORTIONS: dict[str, VehicleProportions] = {
 
 
 class PublishedVehicle(NamedTuple):
-    """A vehicle of "CommonRoad: Vehicle Models" (Althoff, Koschi & Manzinger, 2020), appendix A."""
+    """A vehicle of "CommonRoad: Vehicle Models" (Althoff, Koschi & Manzinger, 2020), appendix A.
+
+    Attributes
+    ----------
+    length_m, width_m : float
+    cg_to_front_m, cg_to_rear_m : float
+    cg_height_m : float
+        Of the sprung mass, as in the single-track model.
+    mass_kg, inertia_kgm2, max_steer_rad : float
+    """
 
     length_m: float
     width_m: float
     cg_to_front_m: float
     cg_to_rear_m: float
-    cg_height_m: float  # of the sprung mass, as the single-track model has it
+    cg_height_m: float
     mass_kg: float
     inertia_kgm2: float
     max_steer_rad: float
@@ -88,7 +110,7 @@ PUBLISHED_MAX_ACCEL_MPS2 = 11.5
 
 
 def rear_axle_offset(agent: Agent) -> float:
-    """Distance in m from the rear axle forward to the box center; 0 in a scenario means that it is not known.
+    """Return the distance in m from the rear axle forward to the box center; 0 in a scenario means unknown.
 
     No wheeled vehicle turns about its box center, so an unknown offset is taken from the length; points have none.
     """
@@ -98,7 +120,7 @@ def rear_axle_offset(agent: Agent) -> float:
 
 
 def parameters_for(agents: Sequence[Agent], *, published: bool = False) -> VehicleParameters:
-    """Parameters (A,) of wheeled agents from their category and size; cars may take the published vehicle nearest in size.
+    """Return parameters (A,) of wheeled agents by category and size; with `published`, cars take the nearest published vehicle.
 
     Notes
     -----
@@ -141,7 +163,7 @@ def parameters_for(agents: Sequence[Agent], *, published: bool = False) -> Vehic
 
 
 def published_parameters(vehicle: int, *, rear_axle_offset_m: float) -> VehicleParameters:
-    """Parameters (1,) of a published vehicle, with the actuators' lags of all others."""
+    """Return the parameters (1,) of a published vehicle, with the actuator lags of all others."""
     v = PUBLISHED[vehicle]
     values = {
         "wheelbase_m": v.cg_to_front_m + v.cg_to_rear_m,

@@ -1,8 +1,8 @@
-"""The published single-track model with linear tires, and what models whose tires slip share. Steps over all agents.
+"""The published single-track model with linear tires, and what the models with slip share. Steps over all agents.
 
-Slip angles relax at a rate of about 200 / v per second, so equations with 1 / v are stiff at walking pace and end at
-standstill. Here they are multiplied by the speed and each step solves for the slips at its end: at standstill the equation
-for the slips turns into "no slip" by itself, which is the kinematic bicycle, and no threshold speed is needed.
+Slip angles relax at a rate of about 200 / v per second, so equations with 1 / v are stiff at walking pace and singular
+at standstill. Here they are multiplied by the speed, and each step solves for the slips at its end: at standstill the
+equation of the slips becomes "no slip", which is the kinematic bicycle, and no threshold speed is needed.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from log2sim.simulation.vehicles.vehicle import (
 )
 
 MAX_INNER_STEP_S = 0.01
-"""Longest step of the integrator; its error falls with the square."""
+"""Longest step of the integrator; the error is of second order."""
 
 GAMMA = 1 - math.sqrt(0.5)
 """Of the singly diagonally implicit Runge-Kutta method of two stages that is L-stable and of second order (Alexander, 1977)."""
@@ -37,7 +37,7 @@ GAMMA = 1 - math.sqrt(0.5)
 STAGE_WEIGHT = (1 - GAMMA) / GAMMA
 
 MAX_LOAD_TRANSFER_SHARE = 0.9
-"""Share of an axle's load that drive and brakes may take off it."""
+"""Largest share of an axle's load that acceleration and braking may transfer."""
 
 
 def step_single_track(
@@ -82,7 +82,13 @@ def step_single_track(
 
 @dataclass(frozen=True, eq=False)
 class Chassis:
-    """How forces at the axles accelerate the axles sideways, per force and mass: rear by rear, either by the other, front."""
+    """Lateral acceleration of the axles per lateral force and mass: of the rear by the rear, of either by the other, of the front.
+
+    Attributes
+    ----------
+    rear, cross, front : (A,) float64
+    cg_to_front_m : (A,) float64
+    """
 
     rear: Array
     cross: Array
@@ -91,6 +97,7 @@ class Chassis:
 
     @classmethod
     def of(cls, p: VehicleParameters) -> Chassis:
+        """Compute the coefficients from vehicle parameters."""
         to_rear, to_front = p.cg_to_rear_m, p.wheelbase_m - p.cg_to_rear_m
         rear, front = 1 + to_rear**2 / p.gyration_m2, 1 + to_front**2 / p.gyration_m2
         return cls(rear, 1 - to_front * to_rear / p.gyration_m2, front, to_front)
@@ -98,7 +105,15 @@ class Chassis:
 
 @dataclass(frozen=True, eq=False)
 class StepInput:
-    """What one step of the linear model is given: speed and steering angle at its ends, distance, mean steering angle."""
+    """Inputs of one step of the linear model.
+
+    Attributes
+    ----------
+    speed0_mps, speed1_mps : (A,) float64
+        At the begin and the end.
+    distance_m : (A,) float64
+    steer0_rad, mean_steer_rad, steer1_rad : (A,) float64
+    """
 
     speed0_mps: Array
     speed1_mps: Array
@@ -109,7 +124,7 @@ class StepInput:
 
 
 class Slips(NamedTuple):
-    """Of the axles: slip angles in rad, or velocities in m/s to the left of the heading beyond those of rolling."""
+    """Slip angles of the axles in rad, or their velocities in m/s to the left of the heading beyond those of rolling."""
 
     rear: Array
     front: Array
@@ -117,9 +132,15 @@ class Slips(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LinearPair:
-    """Two linear equations for the slips of an agent, a and b above c and d; solved by Cramer's rule.
+    """Two linear equations for the slips of an agent, a and b above c and d, solved by Cramer's rule.
 
-    What is solved for are the slips in units of their own, which may be zero; the factors are units over determinant.
+    The unknowns are the slips in units of their own, which may be zero.
+
+    Attributes
+    ----------
+    a, b, c, d : (A,) float64
+    rear_factor, front_factor : (A,) float64
+        Unit over determinant.
     """
 
     a: Array
@@ -131,19 +152,20 @@ class LinearPair:
 
     @classmethod
     def of(cls, a: Array, b: Array, c: Array, d: Array, unit: Slips | None = None) -> Self:
+        """Set up the equations, with the units of the slips."""
         factor = 1 / (a * d - b * c)
         rear, front = (factor, factor) if unit is None else (unit.rear * factor, unit.front * factor)
         return cls(a, b, c, d, rear, front)
 
     def solve(self, rear: Array, front: Array) -> Slips:
-        """The slips for right-hand sides (A,), (A,)."""
+        """Return the slips for right-hand sides (A,), (A,)."""
         return Slips(
             self.rear_factor * (self.d * rear - self.b * front), self.front_factor * (self.a * front - self.c * rear)
         )
 
 
 def linear_slips(slips: Slips, motion: StepInput, p: VehicleParameters, c: Chassis, h: float) -> Slips:
-    """Slip angles (rad, positive to the left) after a step of the published model.
+    """Return the slip angles (rad, positive to the left) after a step of the published model.
 
     Notes
     -----
@@ -178,7 +200,7 @@ def linear_slips(slips: Slips, motion: StepInput, p: VehicleParameters, c: Chass
 def linear_displacement(
     slips0: Slips, slips1: Slips, motion: StepInput, p: VehicleParameters
 ) -> tuple[Array, Array, Array]:
-    """How the center of gravity moves in a step of the published model: chord, its angle to the heading before, turn."""
+    """Return the motion of the center of gravity in a step of the published model: chord, its angle to the old heading, turn."""
     (rear, front), (rear1, front1), share = slips0, slips1, p.cg_to_rear_m / p.wheelbase_m
     turn = motion.distance_m * ((front + front1 - rear - rear1) / 2 + motion.mean_steer_rad) / p.wheelbase_m
     before = rear + share * (front - rear + motion.steer0_rad)
@@ -188,7 +210,7 @@ def linear_displacement(
 
 
 def axle_grips(accel: Array, p: VehicleParameters, c: Chassis) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Force per mass that rear and front axle can bear: friction times load, which moves to the rear with `accel`."""
+    """Return the force per mass that rear and front axle can bear: friction times load, which `accel` transfers to the rear."""
     lever = p.cg_height_m / GRAVITY_MPS2
     shift = clamp(lever * accel, -MAX_LOAD_TRANSFER_SHARE * c.cg_to_front_m, MAX_LOAD_TRANSFER_SHARE * p.cg_to_rear_m)
     whole = p.friction * GRAVITY_MPS2 / p.wheelbase_m
@@ -196,6 +218,6 @@ def axle_grips(accel: Array, p: VehicleParameters, c: Chassis) -> tuple[NDArray[
 
 
 def inner_steps(dt_s: float) -> tuple[int, float]:
-    """Number and length of the steps that make up `dt_s`."""
+    """Return number and length of the integration steps in `dt_s`."""
     count = max(1, math.ceil(dt_s / MAX_INNER_STEP_S - 1e-9))
     return count, dt_s / count

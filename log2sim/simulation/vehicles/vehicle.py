@@ -1,7 +1,8 @@
 """Vehicle models: a kinematic bicycle about the rear axle and a point mass, as steps over all agents at once.
 
-A step takes a state and controls and returns a new state; nothing is kept between steps. Every column has shape (A,).
-The state of a vehicle is that of its rear axle, where the no-slip condition is exact: the axle moves along the heading.
+A step takes a state and controls and returns a new state; the models keep no state between steps. Every column has
+shape (A,). The state of a vehicle is that of its rear axle, where the no-slip condition is exact: the axle moves along
+the heading.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from numpy.typing import NDArray
 from log2sim.geometry import Array, cos_sin
 
 MAX_INNER_STEP_S = 0.02
-"""Longest step over which the mean steering angle stands for its course; the error falls with its square."""
+"""Longest step over which the mean steering angle is used; the error is of second order."""
 
 GRAVITY_MPS2 = 9.81
 
 TINY = 1e-300
-"""Added to what may be zero: it changes no other number, and takes a third of the time of asking where."""
+"""Added where zero would divide: it changes no other number, and takes a third of the time of a mask."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,11 +32,11 @@ class Columns:
 
     @classmethod
     def zeros(cls, count: int) -> Self:
-        """Agents whose columns are all zero."""
+        """Return records of agents whose columns are all zero."""
         return cls(*(np.zeros(count) for _ in fields(cls)))
 
     def take(self, index: Any) -> Self:
-        """The agents at `index` (integers, a slice or a mask)."""
+        """Return the agents at `index` (integers, a slice or a mask)."""
         return type(self)(*(getattr(self, f.name)[..., index] for f in fields(self)))
 
     def put(self, index: Any, other: Self) -> None:
@@ -46,10 +47,20 @@ class Columns:
 
 @dataclass(frozen=True, eq=False)
 class VehicleState(Columns):
-    """Rear axle `x_m`, `y_m`, `yaw_rad` (not wrapped), `speed_mps` (negative in reverse), and what the actuators do.
+    """State of vehicles: rear axle and actuators.
 
-    `pedal_mps2` is throttle (positive) or brake (negative), whatever the gear. `lateral_mps`, the rear axle's velocity to
-    the left, and `yaw_rate_radps` are states of the models that slip; the kinematic bicycle leaves them as they are.
+    Attributes
+    ----------
+    x_m, y_m : (A,) float64
+    yaw_rad : (A,) float64
+        Not wrapped.
+    speed_mps : (A,) float64
+        Negative in reverse.
+    steer_rad : (A,) float64
+    pedal_mps2 : (A,) float64
+        Throttle (positive) or brake (negative), in either gear.
+    lateral_mps, yaw_rate_radps : (A,) float64
+        Velocity of the rear axle to the left and yaw rate: states of the models with slip only.
     """
 
     x_m: Array
@@ -64,7 +75,16 @@ class VehicleState(Columns):
 
 @dataclass(frozen=True, eq=False)
 class VehicleControls(Columns):
-    """Commands: `pedal_mps2` (positive throttle, negative brake), `steer_rad`, and the gear, which engages at standstill."""
+    """Commands of vehicles.
+
+    Attributes
+    ----------
+    pedal_mps2 : (A,) float64
+        Positive throttle, negative brake.
+    steer_rad : (A,) float64
+    reverse : (A,) bool
+        The gear, which engages at standstill.
+    """
 
     pedal_mps2: Array
     steer_rad: Array
@@ -72,7 +92,7 @@ class VehicleControls(Columns):
 
 
 class Actuators(NamedTuple):
-    """Limits, lags and greatest rates of actuators, arrays of one shape."""
+    """Limits, lags and rate limits of actuators, arrays of one shape."""
 
     low: Array
     high: Array
@@ -82,11 +102,24 @@ class Actuators(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class VehicleParameters(Columns):
-    """Size and limits of vehicles, all positive; `rear_axle_offset_m` leads from the rear axle to the box center.
+    """Size and limits of vehicles, all positive.
 
-    Of use to the models that slip: place of the center of gravity, yaw inertia over mass, and of the tires the lateral
-    force at small slip angles per angle and friction limit (cornering stiffness), and friction. `understeer_s2pm2` is for
-    who steers: the share by which lateral acceleration widens the curve, 0 for what rolls without slip.
+    Attributes
+    ----------
+    wheelbase_m : (A,) float64
+    rear_axle_offset_m : (A,) float64
+        From the rear axle forward to the box center.
+    max_steer_rad, max_steer_rate_radps, steer_lag_s : (A,) float64
+    max_throttle_mps2, max_brake_mps2, max_jerk_mps3, pedal_lag_s : (A,) float64
+    cg_to_rear_m, cg_height_m : (A,) float64
+        Place of the center of gravity.
+    gyration_m2 : (A,) float64
+        Yaw inertia over mass.
+    front_stiffness_1prad, rear_stiffness_1prad : (A,) float64
+        Cornering stiffness over the friction limit.
+    friction : (A,) float64
+    understeer_s2pm2 : (A,) float64
+        For the controller: the share by which lateral acceleration widens the curve, 0 without slip.
     """
 
     wheelbase_m: Array
@@ -108,12 +141,12 @@ class VehicleParameters(Columns):
 
     @cached_property
     def max_curvature_1pm(self) -> Array:
-        """At full lock."""
+        """Curvature at full lock."""
         return np.tan(self.max_steer_rad) / self.wheelbase_m
 
     @cached_property
     def actuators(self) -> Actuators:
-        """Of pedal and steering, as rows (2, A)."""
+        """Limits of pedal and steering, as rows (2, A)."""
         return Actuators(
             rows(-self.max_brake_mps2, -self.max_steer_rad),
             rows(self.max_throttle_mps2, self.max_steer_rad),
@@ -124,7 +157,12 @@ class VehicleParameters(Columns):
 
 @dataclass(frozen=True, eq=False)
 class PointState(Columns):
-    """Center `x_m`, `y_m` and its velocity on map axes."""
+    """Centers of point masses and their velocities on map axes.
+
+    Attributes
+    ----------
+    x_m, y_m, velocity_x_mps, velocity_y_mps : (A,) float64
+    """
 
     x_m: Array
     y_m: Array
@@ -150,9 +188,9 @@ def step_bicycle(
 
     Notes
     -----
-    Actuators (first-order lag, rate and saturation limits) are solved in closed form, and so is the arc that the rear axle
-    drives with the mean steering angle of the step: exact for constant steering at any acceleration, of second order in
-    the step otherwise, never unstable. Braking ends at standstill; only the other gear's throttle leads on from there.
+    Actuators (first-order lag, rate and saturation limits) are solved in closed form, and so is the arc of the rear axle at
+    the mean steering angle of the step: exact for constant steering at any acceleration, of second order in the step
+    otherwise, unconditionally stable. Braking ends at standstill; to reverse, the gear must change.
     """
     actuators, target, lag_s, max_rate = actuation(state, controls, parameters)
     count = max(1, math.ceil(dt_s / MAX_INNER_STEP_S - 1e-9))
@@ -183,41 +221,41 @@ def step_point(state: PointState, controls: PointControls, dt_s: float) -> Point
 
 
 def clamp(value: Array, low: Array | float, high: Array | float) -> Array:
-    """Values within limits; `np.clip` takes twice as long on short arrays."""
+    """Clip values to limits; `np.clip` takes twice as long on short arrays."""
     return np.minimum(np.maximum(value, low), high)
 
 
 def rows(first: Array | float, second: Array) -> Array:
-    """Two columns (A,) as one array (2, A); `np.stack` takes three times as long."""
+    """Stack two columns (A,) to one array (2, A); `np.stack` takes three times as long."""
     both = np.empty((2, len(second)))
     both[0], both[1] = first, second
     return both
 
 
-def along_arc(x: Array, y: Array, yaw: Array, way: Array, curvature: Array) -> tuple[Array, Array, Array]:
-    """Position and yaw at the end of an arc of signed length `way`."""
-    turn = way * curvature
-    chord = way * sinc(turn / 2)
+def along_arc(x: Array, y: Array, yaw: Array, distance: Array, curvature: Array) -> tuple[Array, Array, Array]:
+    """Return position and yaw at the end of an arc of signed length `distance`."""
+    turn = distance * curvature
+    chord = distance * sinc(turn / 2)
     cos, sin = cos_sin(yaw + turn / 2)
     return x + chord * cos, y + chord * sin, yaw + turn
 
 
 def engaged_gear(speed: Array, reverse: NDArray[np.bool_]) -> Array:
-    """Gear: the sign of the motion, at rest that of the lever."""
+    """Return the gear: the sign of the motion, at rest that of the selector."""
     return np.sign(speed + TINY * (0.5 - reverse))
 
 
 def actuation(
     state: VehicleState, controls: VehicleControls, parameters: VehicleParameters
 ) -> tuple[Array, Array, Array, Array]:
-    """Pedal and steering (2, A) as they are, then what moves them: where commands within limits lead, lags, greatest rates."""
+    """Return pedal and steering (2, A), then their clipped targets, lags and rate limits."""
     low, high, lag_s, max_rate = parameters.actuators
     target = clamp(rows(controls.pedal_mps2, controls.steer_rad), low, high)
     return rows(state.pedal_mps2, state.steer_rad), target, lag_s, max_rate
 
 
 def actuate(value: Array, target: Array, lag_s: Array, max_rate: Array, h: float) -> tuple[Array, Array]:
-    """Value after `h` and its mean over `h` of an actuator with lag, which moves at `max_rate` while far from the target."""
+    """Return value after `h` and mean over `h` of an actuator with lag, which moves at `max_rate` while far from the target."""
     gap = target - value
     far = np.abs(gap) - max_rate * lag_s
     if not (far > 0).any():  # the same numbers as below, in half the time
@@ -231,7 +269,7 @@ def actuate(value: Array, target: Array, lag_s: Array, max_rate: Array, h: float
 
 
 def advance_speed(pace: Array, pedal: Array, h: float) -> tuple[Array, Array]:
-    """Pace (not negative) after `h` and the distance covered; braking ends at rest, within the step too."""
+    """Return speed (not negative) after `h` and distance covered; braking ends at rest, also within the step."""
     after = pace + pedal * h
     distance = (pace + after) * (h / 2)
     stops = np.flatnonzero(after < 0)
