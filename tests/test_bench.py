@@ -1,4 +1,4 @@
-"""Error against run time: the front, the verdict, what runs share, the figures, and the command with its files."""
+"""Error against run time: the front, the recommendation, what runs share, the figures, and the command with its files."""
 
 from __future__ import annotations
 
@@ -17,13 +17,20 @@ from log2sim.datatypes import Agent, Detections, Frame, Log, Measurements, Scena
 from log2sim.documents import check
 from log2sim.errors import ConfigError, LogError
 from log2sim.evaluation.bench.benchmark import Benchmark, bench
-from log2sim.evaluation.bench.bootstrap import error_of, share_not_worse
+from log2sim.evaluation.bench.bootstrap import confidence_not_worse, error_of
 from log2sim.evaluation.bench.document import document, format_table
 from log2sim.evaluation.bench.label_placement import short_name
-from log2sim.evaluation.bench.localization import at_tick, hold_out, judge_measured, judge_placed, true_places
-from log2sim.evaluation.bench.pareto import Point, judge, pareto_front
-from log2sim.evaluation.bench.runs import Bed, look, make_bed
-from log2sim.evaluation.bench.scores import CUT_M, Scope, jitter, judge_scenario
+from log2sim.evaluation.bench.localization import (
+    at_tick,
+    score_homographies,
+    score_measurements,
+    split_holdout,
+    true_positions,
+)
+from log2sim.evaluation.bench.pareto import Point, pareto_front, recommend
+from log2sim.evaluation.bench.runs import BenchContext, make_context
+from log2sim.evaluation.bench.runs import first_pass as run_first_pass
+from log2sim.evaluation.bench.scores import CUTOFF_M, Scope, jitter, score_scenario
 from log2sim.evaluation.bench.settings import choices, make_grid
 from log2sim.evaluation.bench.shared_detections import detect_once
 from log2sim.geometry import Array, Camera, apply_homography
@@ -38,7 +45,7 @@ from log2sim.perception.homography_stage import CameraHomography, calibrated_hom
 from log2sim.pipeline import schedule_of
 from log2sim.plan import make_plan
 
-FirstPass = tuple[Bed, Observations, dict[str, float]]
+FirstPass = tuple[BenchContext, Observations, dict[str, float]]
 LABELS = Config.load(detect={"name": "labels"})
 
 
@@ -53,8 +60,8 @@ def tiny() -> tuple[Log, Scenario]:
 
 @pytest.fixture(scope="module")
 def first_pass(tiny: tuple[Log, Scenario]) -> FirstPass:
-    bed = make_bed(tiny[0], make_grid(tiny[0], LABELS), tiny[1], silent)
-    return bed, *look(bed, bed.grid.present, bed.grid.measure[0], silent)
+    context = make_context(tiny[0], make_grid(tiny[0], LABELS), tiny[1], silent)
+    return context, *run_first_pass(context, context.grid.present, context.grid.measure[0], silent)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +69,7 @@ def result(tiny: tuple[Log, Scenario]) -> Benchmark:
     return bench(tiny[0], LABELS, truth=tiny[1])
 
 
-# The front and the verdict
+# The front and the recommendation
 
 
 def test_the_front_is_what_nothing_beats() -> None:
@@ -97,42 +104,45 @@ def point(name: str, ms: float, error: float | None, *, present: bool = False, s
 
 def test_less_error_wins_and_of_equal_errors_the_cheaper() -> None:
     now = point("now", 10.0, 1.0, present=True)
-    assert judge([now, point("better", 30.0, 0.5)], "m", 100.0).supported == "better"
-    assert judge([now, point("cheaper", 1.0, 1.02)], "m", 100.0).supported == "cheaper"
-    assert judge([now, point("a", 30.0, 0.5), point("b", 20.0, 0.51)], "m", 100.0).supported == "b"
-    assert judge([now, point("worse", 1.0, 2.0)], "m", 100.0).agrees
+    assert recommend([now, point("better", 30.0, 0.5)], "m", 100.0).supported == "better"
+    assert recommend([now, point("cheaper", 1.0, 1.02)], "m", 100.0).supported == "cheaper"
+    assert recommend([now, point("a", 30.0, 0.5), point("b", 20.0, 0.51)], "m", 100.0).supported == "b"
+    assert recommend([now, point("worse", 1.0, 2.0)], "m", 100.0).agrees
 
 
 def test_a_gain_that_nobody_notices_changes_nothing() -> None:
     now = point("now", 10.0, 1.0, present=True)
-    assert judge([now, point("cheaper", 6.0, 1.0)], "m", 100.0).agrees
-    assert judge([now, point("better", 10.0, 0.98)], "m", 100.0).agrees
+    assert recommend([now, point("cheaper", 6.0, 1.0)], "m", 100.0).agrees
+    assert recommend([now, point("better", 10.0, 0.98)], "m", 100.0).agrees
 
 
 def test_chance_replaces_nothing() -> None:
     now = point("now", 10.0, 1.0, present=True)
     other = replace(now, setting="other", present=False, error=0.8)
-    lucky = replace(other, parts={str(k): ((4.0 if k % 2 else 0.04), 1.0) for k in range(10)})
-    verdict = judge([now, lucky], "m", 100.0)
-    assert verdict.agrees
-    assert "may be better or not" in verdict.reason
-    assert judge([now, replace(other, parts={str(k): (0.64, 1.0) for k in range(10)})], "m", 100.0).supported == "other"
+    lucky = replace(other, by_object={str(k): ((4.0 if k % 2 else 0.04), 1.0) for k in range(10)})
+    recommendation = recommend([now, lucky], "m", 100.0)
+    assert recommendation.agrees
+    assert "may be better or not" in recommendation.reason
+    assert (
+        recommend([now, replace(other, by_object={str(k): (0.64, 1.0) for k in range(10)})], "m", 100.0).supported
+        == "other"
+    )
 
 
 def test_without_an_error_there_is_no_verdict() -> None:
-    verdict = judge([point("now", 1.0, None, present=True), point("other", 1.0, 1.0)], "m", 1.0)
-    assert verdict.supported is None
-    assert not verdict.agrees
+    recommendation = recommend([point("now", 1.0, None, present=True), point("other", 1.0, 1.0)], "m", 1.0)
+    assert recommendation.supported is None
+    assert not recommendation.agrees
 
 
 def test_resampling_knows_sure_and_unsure() -> None:
     ones, twos = {str(k): (1.0, 1.0) for k in range(10)}, {str(k): (4.0, 1.0) for k in range(10)}
-    assert share_not_worse(ones, twos, 0.0) == 1.0
-    assert share_not_worse(twos, ones, 0.0) == 0.0
-    assert share_not_worse(twos, ones, 1.01) == 1.0  # twice the error is within an allowance of 101 %
+    assert confidence_not_worse(ones, twos, 0.0) == 1.0
+    assert confidence_not_worse(twos, ones, 0.0) == 0.0
+    assert confidence_not_worse(twos, ones, 1.01) == 1.0  # twice the error is within an allowance of 101 %
     mixed = {str(k): ((0.0 if k % 2 else 2.0), 1.0) for k in range(10)}
-    assert 0.3 < share_not_worse(mixed, ones, 0.0) < 0.8
-    assert share_not_worse(dict(list(ones.items())[:4]), dict(list(twos.items())[:4]), 0.0) == 0.0
+    assert 0.3 < confidence_not_worse(mixed, ones, 0.0) < 0.8
+    assert confidence_not_worse(dict(list(ones.items())[:4]), dict(list(twos.items())[:4]), 0.0) == 0.0
 
 
 # Figures
@@ -157,24 +167,24 @@ def world(*offsets: tuple[float, float]) -> Scenario:
 
 def test_the_error_counts_distance_misses_and_false_objects() -> None:
     truth = world((0, 0), (0, 0))
-    perfect = judge_scenario(truth, truth, 0.1).figures
+    perfect = score_scenario(truth, truth, 0.1).figures
     assert perfect["error_m"] == 0.0
     assert perfect["recall"] == perfect["precision"] == 1.0
-    shifted = judge_scenario(world((0, 1.0), (0, -1.0)), truth, 0.1).figures
+    shifted = score_scenario(world((0, 1.0), (0, -1.0)), truth, 0.1).figures
     assert shifted["error_m"] == pytest.approx(1.0)
     assert shifted["state_error_m"] == pytest.approx(1.0)
     # One of two is missed: 20 ticks right, 20 missed, each of these half an object that is 2 m off.
-    missed = judge_scenario(world((0, 0)), truth, 0.1).figures
-    assert missed["error_m"] == pytest.approx(np.sqrt(CUT_M**2 * 10 / (20 + 10)))
+    missed = score_scenario(world((0, 0)), truth, 0.1).figures
+    assert missed["error_m"] == pytest.approx(np.sqrt(CUTOFF_M**2 * 10 / (20 + 10)))
     # One is 10 m off, so one is missed and one false: together an object that is 2 m off.
-    lost = judge_scenario(world((0, 0), (0, 10.0)), truth, 0.1).figures
-    assert lost["error_m"] == pytest.approx(np.sqrt(CUT_M**2 * 20 / (20 + 20)))
+    lost = score_scenario(world((0, 0), (0, 10.0)), truth, 0.1).figures
+    assert lost["error_m"] == pytest.approx(np.sqrt(CUTOFF_M**2 * 20 / (20 + 20)))
 
 
 def test_the_parts_of_objects_make_up_the_error() -> None:
-    judged = judge_scenario(world((0, 0.5), (0, 10.0), (0.3, 0.0)), world((0, 0), (0, 0), (0, 0)), 0.1)
-    assert error_of(judged.parts["error_m"]) == pytest.approx(judged.figures["error_m"])
-    assert len(judged.parts["error_m"]) == 4
+    score = score_scenario(world((0, 0.5), (0, 10.0), (0.3, 0.0)), world((0, 0), (0, 0), (0, 0)), 0.1)
+    assert error_of(score.by_object["error_m"]) == pytest.approx(score.figures["error_m"])
+    assert len(score.by_object["error_m"]) == 4
     assert error_of({}) is None
 
 
@@ -203,56 +213,58 @@ def test_jitter_is_the_deviation_of_white_noise_and_not_acceleration() -> None:
 def test_measured_centers_of_a_log_are_near_the_truth_and_outliers_are_cut(
     tiny: tuple[Log, Scenario], first_pass: FirstPass
 ) -> None:
-    (log, truth), (bed, seen, stages_s) = tiny, first_pass
-    known = true_places(log, bed.schedule, seen, truth)
-    good = judge_measured(seen, known).figures
+    (log, truth), (context, seen, stages_s) = tiny, first_pass
+    known = true_positions(log, context.schedule, seen, truth)
+    good = score_measurements(seen, known).figures
     assert good["objects"] >= 20
     assert good["error_m"] < 0.4
     assert {"sync", "detect", "cloud", "measure", "fuse"} <= set(stages_s)
     assert "decode" not in stages_s  # boxes come from the log
     far = replace(seen, measurements=[replace(m, center_m=m.center_m + 50.0) for m in seen.measurements])
-    assert judge_measured(far, known).figures["error_m"] == pytest.approx(CUT_M)
+    assert score_measurements(far, known).figures["error_m"] == pytest.approx(CUTOFF_M)
     lost = replace(seen, measurements=[replace(m, center_m=m.center_m * np.nan) for m in seen.measurements])
-    figures = judge_measured(lost, known).figures
-    assert figures["error_m"] == pytest.approx(CUT_M)
+    figures = score_measurements(lost, known).figures
+    assert figures["error_m"] == pytest.approx(CUTOFF_M)
     assert figures["placed_share"] == 0.0
 
 
 def test_places_are_known_at_the_times_of_the_measurements_and_of_the_images(
     tiny: tuple[Log, Scenario], first_pass: FirstPass
 ) -> None:
-    (log, truth), (bed, seen, _) = tiny, first_pass
+    (log, truth), (context, seen, _) = tiny, first_pass
     later = replace(seen, measurements=[replace(m, t_ns=m.t_ns + 100_000_000) for m in seen.measurements])
     for when, expected_m in (("measured", 0.4), ("imaged", 0.0)):
-        before, after = (true_places(log, bed.schedule, s, truth, when=when) for s in (seen, later))  # type: ignore[arg-type]
+        before, after = (true_positions(log, context.schedule, s, truth, when=when) for s in (seen, later))  # type: ignore[arg-type]
         moved = np.concatenate([np.hypot(*(a.xy - b.xy).T) for a, b in zip(after, before, strict=True)])
         assert np.nanmax(moved) == pytest.approx(expected_m, abs=0.01)  # the car drives at 4 m/s
         assert np.nanmin(moved) == pytest.approx(0.0, abs=1e-9)  # the other one is parked
 
 
 def test_an_object_is_recognized_once_and_only_in_its_group(tiny: tuple[Log, Scenario], first_pass: FirstPass) -> None:
-    (log, truth), (bed, seen, _) = tiny, first_pass
+    (log, truth), (context, seen, _) = tiny, first_pass
     m = seen.measurements[5]
     shifted = replace(m, box_px=m.box_px + np.array([3.0, 0.0, 3.0, 0.0]))
     both = replace(seen, measurements=[*seen.measurements[:5], Measurements.join([m, shifted]), *seen.measurements[6:]])
-    known = true_places(log, bed.schedule, both, truth)[5]
-    alone = true_places(log, bed.schedule, seen, truth)[5]
-    np.testing.assert_array_equal(known.who, np.r_[alone.who, np.full(len(m), -1)])
-    assert (alone.who >= 0).sum() >= 2
+    known = true_positions(log, context.schedule, both, truth)[5]
+    alone = true_positions(log, context.schedule, seen, truth)[5]
+    np.testing.assert_array_equal(known.object_id, np.r_[alone.object_id, np.full(len(m), -1)])
+    assert (alone.object_id >= 0).sum() >= 2
     people = replace(m, category=np.full(len(m), "pedestrian", dtype="<U16"))
     other = replace(seen, measurements=[*seen.measurements[:5], people, *seen.measurements[6:]])
-    who = true_places(log, bed.schedule, other, truth)[5].who
+    who = true_positions(log, context.schedule, other, truth)[5].object_id
     assert (who[m.category == "car"] == -1).all()
 
 
 def test_only_whole_boxes_with_enough_points_are_set_aside(tiny: tuple[Log, Scenario], first_pass: FirstPass) -> None:
-    (log, truth), (bed, seen, _) = tiny, first_pass
-    known = true_places(log, bed.schedule, seen, truth, when="imaged")
+    (log, truth), (context, seen, _) = tiny, first_pass
+    known = true_positions(log, context.schedule, seen, truth, when="imaged")
     spoils: list[dict[str, Any]] = [{"truncated": True}, {"points": 5}, {"source": "topdown"}]
     for spoil in spoils:
         spoiled = [replace(m, **{k: np.full(len(m), v) for k, v in spoil.items()}) for m in seen.measurements]
-        held = hold_out(log, bed.schedule, replace(seen, measurements=spoiled), known, np.random.default_rng(0))
-        assert len(held) == 0, spoil
+        holdout = split_holdout(
+            log, context.schedule, replace(seen, measurements=spoiled), known, np.random.default_rng(0)
+        )
+        assert len(holdout) == 0, spoil
 
 
 def test_names_in_the_picture_say_their_stage_only_where_they_must() -> None:
@@ -262,38 +274,38 @@ def test_names_in_the_picture_say_their_stage_only_where_they_must() -> None:
 
 
 def test_obstacles_set_aside_are_not_fitted_to(tiny: tuple[Log, Scenario], first_pass: FirstPass) -> None:
-    (log, truth), (bed, seen, _) = tiny, first_pass
-    known = true_places(log, bed.schedule, seen, truth, when="imaged")
-    held = hold_out(log, bed.schedule, seen, known, np.random.default_rng(0))
+    (log, truth), (context, seen, _) = tiny, first_pass
+    known = true_positions(log, context.schedule, seen, truth, when="imaged")
+    holdout = split_holdout(log, context.schedule, seen, known, np.random.default_rng(0))
     before = sum(len(f.uv) for parts in seen.feet.values() for f in parts)
-    after = sum(len(f.uv) for parts in held.seen.feet.values() for f in parts)
-    aside = sum(len(f.uv) for parts in held.feet.values() for f in parts)
-    assert aside == len(held) > 0
+    after = sum(len(f.uv) for parts in holdout.seen.feet.values() for f in parts)
+    aside = sum(len(f.uv) for parts in holdout.feet.values() for f in parts)
+    assert aside == len(holdout) > 0
     assert after == before - aside
-    assert all((m.source == "").all() and np.isnan(m.center_m).all() for rows in held.asked.values() for m in rows)
+    assert all((m.source == "").all() and np.isnan(m.center_m).all() for rows in holdout.asked.values() for m in rows)
 
 
 def test_a_right_homography_has_no_error_and_a_shifted_one_its_shift(
     tiny: tuple[Log, Scenario], first_pass: FirstPass
 ) -> None:
-    (log, truth), (bed, seen, _) = tiny, first_pass
-    known = true_places(log, bed.schedule, seen, truth, when="imaged")
-    held = hold_out(log, bed.schedule, seen, known, np.random.default_rng(0))
+    (log, truth), (context, seen, _) = tiny, first_pass
+    known = true_positions(log, context.schedule, seen, truth, when="imaged")
+    holdout = split_holdout(log, context.schedule, seen, known, np.random.default_rng(0))
     base = calibrated_homography(log, log.cameras["front"])
     assert base is not None
-    uv = [apply_homography(np.linalg.inv(base.ground_H_image), f.xy_ego)[0] for f in held.feet["front"]]
-    exact = replace(held, feet={"front": [replace(f, uv=p) for f, p in zip(held.feet["front"], uv, strict=True)]})
+    uv = [apply_homography(np.linalg.inv(base.ground_H_image), f.xy_ego)[0] for f in holdout.feet["front"]]
+    exact = replace(holdout, feet={"front": [replace(f, uv=p) for f, p in zip(holdout.feet["front"], uv, strict=True)]})
 
-    def judged(shift_m: float) -> dict[str, Any]:
+    def score(shift_m: float) -> dict[str, Any]:
         shift = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, shift_m], [0.0, 0.0, 1.0]])
         fit = replace(base, ground_H_image=shift @ base.ground_H_image)
-        return judge_placed(log, exact, {"front": CameraHomography(log.cameras["front"], fit, "")}).figures
+        return score_homographies(log, exact, {"front": CameraHomography(log.cameras["front"], fit, "")}).figures
 
-    assert judged(0.0)["error_m"] == pytest.approx(0.0, abs=1e-6)
-    assert judged(0.0)["placed_share"] == 1.0
-    assert judged(0.7)["error_m"] == judged(0.7)["near_error_m"] == pytest.approx(0.7)
-    assert judged(30.0)["error_m"] == pytest.approx(CUT_M)
-    assert judged(0.0)["center_error_m"] < judged(1.5)["center_error_m"] <= CUT_M
+    assert score(0.0)["error_m"] == pytest.approx(0.0, abs=1e-6)
+    assert score(0.0)["placed_share"] == 1.0
+    assert score(0.7)["error_m"] == score(0.7)["near_error_m"] == pytest.approx(0.7)
+    assert score(30.0)["error_m"] == pytest.approx(CUTOFF_M)
+    assert score(0.0)["center_error_m"] < score(1.5)["center_error_m"] <= CUTOFF_M
 
 
 def test_a_tick_has_its_own_homography_or_none() -> None:
@@ -440,7 +452,7 @@ def test_every_stage_has_a_panel_and_the_figures_fit_each_other(result: Benchmar
         assert len({p.setting for p in panel.points}) == len(panel.points)
         assert all(p.ms_per_tick > 0 for p in panel.points)
         assert any(panel.on_front)
-    grid = result.bed.grid
+    grid = result.context.grid
     settings = sum(map(len, (grid.detect, grid.measure, grid.homography, grid.smooth)))
     assert len(panels["whole run"].points) == settings - 3
     present = next(p for p in panels["whole run"].points if p.present)
@@ -448,7 +460,7 @@ def test_every_stage_has_a_panel_and_the_figures_fit_each_other(result: Benchmar
     assert present.figures["recall"] == 1.0
     measured = {p.setting: p.error for p in panels["measure"].points}
     assert measured["robust"] < 0.5 * measured["paper"]
-    assert panels["measure"].verdict.supported == "robust"
+    assert panels["measure"].recommendation.supported == "robust"
 
 
 def test_the_document_keeps_its_schema_and_says_the_same(result: Benchmark) -> None:
@@ -459,7 +471,7 @@ def test_the_document_keeps_its_schema_and_says_the_same(result: Benchmark) -> N
     for panel, entry in zip(result.panels, out["panels"], strict=True):
         front = {p.setting for p, f in zip(panel.points, panel.on_front, strict=True) if f}
         assert {p["setting"] for p in entry["points"] if p["on_front"]} == front
-        assert entry["supports"]["setting"] == panel.verdict.supported
+        assert entry["supports"]["setting"] == panel.recommendation.supported
         assert all(p["error"] == p["figures"][entry["error"]["figure"]] for p in entry["points"])
 
 
@@ -558,10 +570,10 @@ def test_a_wrong_scope_is_told_before_any_work(
 
 def test_the_scope_narrows_what_is_compared(tiny: tuple[Log, Scenario]) -> None:
     truth = tiny[1]
-    assert judge_scenario(truth, truth, 0.1, Scope(categories=("car",))).figures["error_m"] == 0.0
-    assert judge_scenario(truth, truth, 0.1, Scope(max_range_m=1.0)).figures["error_m"] is None
+    assert score_scenario(truth, truth, 0.1, Scope(categories=("car",))).figures["error_m"] == 0.0
+    assert score_scenario(truth, truth, 0.1, Scope(max_range_m=1.0)).figures["error_m"] is None
     with pytest.raises(ConfigError, match="give --truth"):
-        make_bed(tiny[0], make_grid(tiny[0], LABELS), None, silent, Scope(max_range_m=1.0))
+        make_context(tiny[0], make_grid(tiny[0], LABELS), None, silent, Scope(max_range_m=1.0))
 
 
 def test_ctrl_c_leaves_nothing(tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

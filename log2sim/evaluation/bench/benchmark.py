@@ -1,4 +1,4 @@
-"""Error against run time: the pipeline over methods and settings, on one log and with shared work."""
+"""Error against run time of the pipeline over methods and settings, on one log and with shared work."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from log2sim.config import Config
 from log2sim.datatypes import Log, Scenario
 from log2sim.evaluation.bench.panels import Panel, make_panels
-from log2sim.evaluation.bench.runs import Bed, Progress, make_bed
+from log2sim.evaluation.bench.runs import BenchContext, Progress, make_context
 from log2sim.evaluation.bench.scores import EVERYTHING, Scope
 from log2sim.evaluation.bench.settings import make_grid
 
@@ -16,9 +16,19 @@ __all__ = ["Benchmark", "Panel", "Scope", "bench"]
 
 @dataclass(frozen=True, eq=False)
 class Benchmark:
-    """The panels of a log, and what all runs had in common."""
+    """The result of a benchmark.
 
-    bed: Bed
+    Attributes
+    ----------
+    context : BenchContext
+        What all runs had in common.
+    panels : tuple of Panel
+        One for each stage.
+    notes : tuple of str
+        What could not be measured, and why.
+    """
+
+    context: BenchContext
     panels: tuple[Panel, ...]
     notes: tuple[str, ...]
 
@@ -41,9 +51,9 @@ def bench(
     config : Config, optional
         The present settings; the defaults without.
     truth : Scenario, optional
-        Without it the figures are those that need none.
+        Without it only figures that need no truth are computed.
     scope : Scope
-        What of a scenario is compared with the truth.
+        Which objects are compared with the truth.
     detectors : tuple of str
         Detectors to compare with that of `config`.
     progress : callable, optional
@@ -52,24 +62,24 @@ def bench(
     Raises
     ------
     LogError, ConfigError, MissingExtra
-        For logs and settings that cannot work.
+        For a log that cannot be read, invalid settings, or a detector whose package is missing.
     """
-    tell = progress or (lambda what, done, total: None)
+    report = progress or (lambda what, done, total: None)
     grid = make_grid(log, config or Config(), detectors)
-    bed = make_bed(log, grid, truth, tell, scope)
-    panels = make_panels(bed, tell)
-    return Benchmark(bed, tuple(panels), tuple(_notes(bed, panels)))
+    context = make_context(log, grid, truth, report, scope)
+    panels = make_panels(context, report)
+    return Benchmark(context, tuple(panels), tuple(_notes(context, panels)))
 
 
-def _notes(bed: Bed, panels: list[Panel]) -> list[str]:
+def _notes(context: BenchContext, panels: list[Panel]) -> list[str]:
     notes = []
-    if bed.truth is None:
+    if context.truth is None:
         notes.append(
             "no truth: jitter, gaps, residuals of the homography and consistency with LiDAR are all that is measured"
         )
-    if len(bed.grid.detect) == 1:
+    if len(context.grid.detect) == 1:
         notes.append(
-            f"detector '{bed.grid.detect[0].config.detect.name}' has no setting of tiles or input size to compare"
+            f"detector '{context.grid.detect[0].config.detect.name}' has no setting of tiles or input size to compare"
         )
     if all(p.stage != "homography" for p in panels):
         notes.append("too few obstacles with LiDAR points within 60 m to judge homographies by")

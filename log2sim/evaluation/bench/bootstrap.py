@@ -1,4 +1,4 @@
-"""Errors as sums over objects, so that chance can be told from difference: what if other objects had come by?"""
+"""Paired bootstrap over objects: whether one error is smaller than another by more than chance."""
 
 from __future__ import annotations
 
@@ -6,31 +6,33 @@ from collections.abc import Mapping
 
 import numpy as np
 
-Parts = Mapping[str, tuple[float, float]]
-"""By object: squares that it adds, m2, and how often it counts. The error is the root of one sum over the other."""
+ErrorSums = Mapping[str, tuple[float, float]]
+"""By object: sum of its squared errors, m^2, and their number. The error is the root of the ratio of both sums."""
 
 RESAMPLES = 1000
-LEAST_OBJECTS = 5
+MIN_OBJECTS = 5
 
 
-def error_of(parts: Parts) -> float | None:
-    """Root mean square error of all objects, m; None where nothing counts."""
-    squares, count = (sum(column) for column in zip(*parts.values())) if parts else (0.0, 0.0)
+def error_of(sums: ErrorSums) -> float | None:
+    """Compute the root mean square error, m, of all objects; None without any."""
+    squares, count = (sum(column) for column in zip(*sums.values())) if sums else (0.0, 0.0)
     return float(np.sqrt(squares / count)) if count > 0 else None
 
 
-def share_not_worse(parts: Parts, other: Parts, allowance: float) -> float:
-    """Share of resamples in which an error is no more than another's times `1 + allowance`.
+def confidence_not_worse(sums: ErrorSums, other: ErrorSums, allowance: float) -> float:
+    """Compute the fraction of resamples in which an error is at most another one times `1 + allowance`.
+
+    It is 0 with fewer than `MIN_OBJECTS` objects.
 
     Notes
     -----
-    Paired bootstrap (Efron, 1979) over objects: the ticks of one object are wrong together, so they are drawn together. What
-    only one side has, such as a false object, counts nothing on the other. Too few objects are sure of nothing.
+    Paired bootstrap (Efron, 1979) over objects, because errors of one object at successive ticks are correlated. An object of
+    one side only, such as a false one, adds nothing to the other.
     """
-    names = sorted({*parts, *other})
-    if len(names) < LEAST_OBJECTS:
+    names = sorted({*sums, *other})
+    if len(names) < MIN_OBJECTS:
         return 0.0
-    mine, theirs = (np.array([side.get(n, (0.0, 0.0)) for n in names]).reshape(-1, 2) for side in (parts, other))
+    mine, theirs = (np.array([side.get(n, (0.0, 0.0)) for n in names]).reshape(-1, 2) for side in (sums, other))
     rng = np.random.default_rng(0)
     drawn = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), size=RESAMPLES)
     a, b = drawn @ mine, drawn @ theirs

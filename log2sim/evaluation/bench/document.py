@@ -1,4 +1,4 @@
-"""The result as `bench.json` holds it, and as a short table for a terminal."""
+"""The result as the document of `bench.json` and as a table for the terminal."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from log2sim.geometry import NS_PER_S
 from log2sim.version import __version__
 
 VERSION = 1
-# Figures that the table shows beside the error, in the panels that have them.
+# Figures of the table next to the error, in panels that have them.
 COLUMNS = (
     ("recall", "recall", 3),
     ("precision", "precis.", 3),
@@ -31,20 +31,20 @@ COLUMNS = (
 
 
 def document(result: Benchmark) -> dict[str, Any]:
-    """The document of `schemas/bench-1.json`."""
-    bed, config = result.bed, result.bed.grid.present.config
-    t = bed.schedule.t_ns
+    """Return the document of `schemas/bench-1.json`."""
+    context, config = result.context, result.context.grid.present.config
+    t = context.schedule.t_ns
     out = {
         "bench_version": VERSION,
-        "log": {"name": bed.log.name, "format": bed.log.format, "digest": bed.log.digest},
+        "log": {"name": context.log.name, "format": context.log.format, "digest": context.log.digest},
         "log2sim_version": __version__,
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "ticks": len(t),
         "duration_s": int(t[-1] - t[0]) / NS_PER_S,
-        "cameras": list(bed.plan.cameras),
-        "truth": bed.truth.name if bed.truth is not None else None,
-        "max_range_m": bed.scope.max_range_m,
-        "categories": None if bed.scope.categories is None else list(bed.scope.categories),
+        "cameras": list(context.plan.cameras),
+        "truth": context.truth.name if context.truth is not None else None,
+        "max_range_m": context.scope.max_range_m,
+        "categories": None if context.scope.categories is None else list(context.scope.categories),
         "config": config.to_dict(),
         "notes": list(result.notes),
         "panels": [_panel(p) for p in result.panels],
@@ -54,7 +54,7 @@ def document(result: Benchmark) -> dict[str, Any]:
 
 
 def _panel(panel: Panel) -> dict[str, Any]:
-    verdict = panel.verdict
+    recommendation = panel.recommendation
     return {
         "stage": panel.stage,
         "error": {"figure": panel.error, "label": panel.label, "unit": panel.unit},
@@ -70,16 +70,16 @@ def _panel(panel: Panel) -> dict[str, Any]:
             for p, on_front in zip(panel.points, panel.on_front, strict=True)
         ],
         "supports": {
-            "setting": verdict.supported,
-            "present": verdict.present,
-            "agrees": None if verdict.supported is None else verdict.agrees,
-            "reason": verdict.reason,
+            "setting": recommendation.supported,
+            "present": recommendation.present,
+            "agrees": None if recommendation.supported is None else recommendation.agrees,
+            "reason": recommendation.reason,
         },
     }
 
 
 def _finite(value: Any) -> Any:
-    """Numbers with six decimals, None for those that are not finite, through nested figures."""
+    """Round nested figures to six decimals; None for a number that is not finite."""
     if isinstance(value, Mapping):
         return {k: _finite(v) for k, v in value.items()}
     if isinstance(value, float):
@@ -88,12 +88,12 @@ def _finite(value: Any) -> Any:
 
 
 def format_table(result: Benchmark) -> str:
-    """One block a stage, then what the figures support; '*' is the present setting, '+' a point on the front."""
+    """Format one block for each stage, then the recommendations; '*' is the present setting, '+' on the Pareto front."""
     lines = []
     for panel in result.panels:
         lines += [f"{panel.stage}: {panel.label}", *_rows(panel), ""]
     lines += ["What the figures support:"]
-    lines += [f"  {p.stage:<11} {p.verdict.reason}" for p in result.panels]
+    lines += [f"  {p.stage:<11} {p.recommendation.reason}" for p in result.panels]
     return "\n".join([*lines, *(f"note: {n}" for n in result.notes)])
 
 

@@ -1,4 +1,4 @@
-"""The picture: error against run time, one panel a stage, the settings on the Pareto front joined by a line."""
+"""The figure: error against run time, one panel for each stage, with the Pareto front as a line."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from log2sim.documents import replaced
 from log2sim.evaluation.bench.benchmark import Benchmark
-from log2sim.evaluation.bench.label_placement import write_names
+from log2sim.evaluation.bench.label_placement import place_labels
 from log2sim.evaluation.bench.panels import Panel
 from log2sim.evaluation.bench.pareto import Point
 from log2sim.geometry import Array
@@ -30,14 +30,14 @@ FRONT, CHOSEN = PALETTE[0], PALETTE[4]
 
 
 def write_picture(result: Benchmark, path: Path, *, dpi: int = 150) -> None:
-    """Draw all panels into a PNG, whole or not at all."""
+    """Write all panels into a PNG, atomically."""
     figure = draw(result)
     with replaced(path) as temporary:
         figure.savefig(temporary, format="png", dpi=dpi, metadata={"Software": None})
 
 
 def draw(result: Benchmark) -> Figure:
-    """The figure; its last cell says what the marks mean and what the figures support."""
+    """Draw all panels; the last cell explains the marks and gives the recommendations."""
     rows = -(-(len(result.panels) + 1) // COLUMNS)
     width, height = COLUMNS * CELL_IN[0], rows * CELL_IN[1] + HEAD_IN
     figure = Figure(figsize=(width, height), facecolor=PAPER)
@@ -45,12 +45,12 @@ def draw(result: Benchmark) -> Figure:
     _title(figure, result)
     for k, panel in enumerate(result.panels):
         _draw_panel(figure.add_axes(_cell(k, rows, width, height)), panel)
-    _draw_words(figure.add_axes(_cell(len(result.panels), rows, width, height)), result)
+    _draw_recommendations(figure.add_axes(_cell(len(result.panels), rows, width, height)), result)
     return figure
 
 
 def _cell(k: int, rows: int, width: float, height: float) -> tuple[float, float, float, float]:
-    """Place of the axes of cell `k` as parts of the figure."""
+    """Compute left, bottom, width, height of the axes of cell `k` as fractions of the figure."""
     column, row = k % COLUMNS, k // COLUMNS
     x = column * CELL_IN[0] + MARGIN_IN["left"]
     y = (rows - 1 - row) * CELL_IN[1] + MARGIN_IN["bottom"]
@@ -60,19 +60,19 @@ def _cell(k: int, rows: int, width: float, height: float) -> tuple[float, float,
 
 
 def _title(figure: Figure, result: Benchmark) -> None:
-    bed = result.bed
+    context = result.context
     height = figure.get_figheight()
-    against = f"truth: {bed.truth.name}" if bed.truth is not None else "no truth"
-    counts = [(len(bed.schedule), "tick"), (len(bed.plan.cameras), "camera")]
+    against = f"truth: {context.truth.name}" if context.truth is not None else "no truth"
+    counts = [(len(context.schedule), "tick"), (len(context.plan.cameras), "camera")]
     parts = [f"{n} {what}{'s' * (n != 1)}" for n, what in counts]
-    if bed.truth is not None and bed.scope.max_range_m is not None:
-        parts.append(f"within {bed.scope.max_range_m:g} m")
-    if bed.truth is not None and bed.scope.categories is not None:
-        parts.append(", ".join(bed.scope.categories))
+    if context.truth is not None and context.scope.max_range_m is not None:
+        parts.append(f"within {context.scope.max_range_m:g} m")
+    if context.truth is not None and context.scope.categories is not None:
+        parts.append(", ".join(context.scope.categories))
     text = " · ".join([*parts, against, "one stage's setting changed at a time"])
     style: dict[str, Any] = {"family": FONT, "ha": "left", "va": "baseline", "parse_math": False}
     x = MARGIN_IN["left"] / figure.get_figwidth()
-    title = printable(f"{bed.log.name}: error against run time", 90)
+    title = printable(f"{context.log.name}: error against run time", 90)
     figure.text(x, 1 - 0.38 / height, title, fontsize=13, fontweight="bold", color=INK, **style)
     figure.text(x, 1 - 0.6 / height, printable(text, 150), fontsize=8, color=MUTED, **style)
 
@@ -97,9 +97,9 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
     front = sorted((p.ms_per_tick, float(p.error or 0.0)) for p, f in shown if f)
     ax.step(*zip(*front), where="post", color=FRONT, lw=1.3, alpha=0.55, zorder=2)
     for point, on_front in shown:
-        _mark(ax, point, on_front=on_front, chosen=point.setting == panel.verdict.supported)
+        _mark(ax, point, on_front=on_front, chosen=point.setting == panel.recommendation.supported)
     corners = [k for (a, b), (c, d) in pairwise(front) for k in ((a, b), (c, b), (c, d))]
-    write_names(ax, points, np.column_stack([x, y]), np.array(corners).reshape(-1, 2))
+    place_labels(ax, points, np.column_stack([x, y]), np.array(corners).reshape(-1, 2))
 
 
 def _mark(ax: Axes, point: Point, *, on_front: bool, chosen: bool) -> None:
@@ -123,7 +123,7 @@ def _style(ax: Axes) -> None:
 
 
 def _limits(ax: Axes, x: Array, y: Array) -> None:
-    """A logarithmic axis of time, at least a factor of three wide; errors with room for names."""
+    """Set a logarithmic time axis at least a factor of three wide, and room for labels on the error axis."""
     low, high = np.log10(max(x.min(), 1e-3)), np.log10(max(x.max(), 1e-3))
     wide = max((high - low) * 1.5, np.log10(3.0))
     start, end = 10 ** ((low + high - wide) / 2), 10 ** ((low + high + wide) / 2)
@@ -138,8 +138,8 @@ def _limits(ax: Axes, x: Array, y: Array) -> None:
     ax.set_ylim(max(float(y.min()) - room, -0.4 * room), float(y.max()) + room)
 
 
-def _draw_words(ax: Axes, result: Benchmark) -> None:
-    """What the marks mean, and what the figures support."""
+def _draw_recommendations(ax: Axes, result: Benchmark) -> None:
+    """Draw the legend and the recommendations."""
     ax.set_axis_off()
     ax.set(xlim=(0, 1), ylim=(0, 1))
     mark: dict[str, Any] = {"ls": "none", "mew": 1.1}
@@ -155,7 +155,7 @@ def _draw_words(ax: Axes, result: Benchmark) -> None:
     )  # fmt: skip
     y = 0.92
     for panel in result.panels:
-        for k, line in enumerate(wrap(printable(panel.verdict.reason, 240), 50)):
+        for k, line in enumerate(wrap(printable(panel.recommendation.reason, 240), 50)):
             head = panel.stage if k == 0 else ""
             ax.text(0, y, head, fontsize=7.2, family=FONT, color=INK, weight="bold", va="top", parse_math=False)
             ax.text(0.23, y, line, fontsize=7.2, family=FONT, color=INK, va="top", parse_math=False)

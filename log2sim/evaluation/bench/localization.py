@@ -1,4 +1,4 @@
-"""Where objects were placed, by their LiDAR points or by a homography alone, against where they are."""
+"""Localization error of measurements: by LiDAR points, and by a homography alone on held-out obstacles."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, Log, Measurements, Scenario
 from log2sim.evaluation.bench.bootstrap import error_of
-from log2sim.evaluation.bench.scores import CUT_M, Judged
-from log2sim.evaluation.metrics.align import Side, truth_side
+from log2sim.evaluation.bench.scores import CUTOFF_M, Score
+from log2sim.evaluation.metrics.align import StateTable, truth_states
 from log2sim.geometry import NS_PER_S, Array, Camera, apply_homography, box_iou, inverse, project_boxes
 from log2sim.perception.first_pass import Observations, base_pose
 from log2sim.perception.homography.correspondences import Correspondences, foot_points, undistorted_pixels
@@ -20,103 +20,117 @@ from log2sim.perception.homography.placement import MAX_RANGE_M
 from log2sim.perception.homography_stage import CameraHomography, place_by_homography
 from log2sim.perception.sync import Schedule
 
-LEAST_IOU = 0.5
+MIN_IOU = 0.5
 NEAR_M = 25.0
-HELD_OUT = 0.25
-"""Part of the measured obstacles that homographies are not fitted to, so that they can be judged by them."""
+HOLDOUT_FRACTION = 0.25
+"""Fraction of the measured obstacles that homographies are not fitted to and are scored by."""
 
-LEAST_POINTS = 20
-SAME_FOOT_PX = 0.01
+MIN_POINTS = 20
+MAX_SAME_FOOT_PX = 0.01
 BLOCK_S = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
-    """Where the objects of a tick's measurements are: `xy` (M, 2) in the map, NaN where not known, and `who` (M,) each is."""
+class KnownPositions:
+    """Known positions of the objects of one tick's measurements.
+
+    Attributes
+    ----------
+    xy : (M, 2) float64, m
+        Map frame; NaN where unknown.
+    object_id : (M,) int64
+        Which object each measurement is of, -1 where unknown.
+    """
 
     xy: Array
-    who: NDArray[np.int64]
+    object_id: NDArray[np.int64]
 
 
-def true_places(
+def true_positions(
     log: Log,
     schedule: Schedule,
     seen: Observations,
     truth: Scenario,
     *,
     when: Literal["measured", "imaged"] = "measured",
-) -> list[Known]:
-    """For every tick the true centers of the objects in the boxes of its measurements.
+) -> list[KnownPositions]:
+    """Find, for each tick, the true centers of the objects that its measurements are of.
 
-    They are those at the measurements' own times, or at the stamps of the images. Objects are recognized in the image, by
-    the overlap of boxes, so that a wrong place cannot hide itself.
+    Parameters
+    ----------
+    when : {"measured", "imaged"}
+        At the times of the measurements, or at the stamps of the images.
+
+    Notes
+    -----
+    Measurements are matched with objects by IoU of their boxes in the image, independently of the measured position.
     """
     shift_m = np.array(truth.map.offset_m) - np.array(log.map.offset_m)
-    out = [Known(np.full((len(m), 2), np.nan), np.full(len(m), -1)) for m in seen.measurements]
+    out = [KnownPositions(np.full((len(m), 2), np.nan), np.full(len(m), -1)) for m in seen.measurements]
     for camera, index in schedule.frames.items():
         ticks = np.flatnonzero(index >= 0)
         stamps = log.streams[camera].t_ns[index[ticks]]
-        side = truth_side(truth.others, (stamps - truth.t0_ns) / NS_PER_S, shift_m, None)
+        side = truth_states(truth.others, (stamps - truth.t0_ns) / NS_PER_S, shift_m, None)
         map_T_cam, known = log.map_T_sensor(camera, stamps)
         for k in np.flatnonzero(known):
             m = seen.measurements[ticks[k]]
             rows = np.flatnonzero(m.camera == camera)
             if len(rows) and len(side.ids):
                 boxes = _boxes_in_image(log, camera, side, int(k), inverse(map_T_cam[k]))
-                pairs = _recognized(m.take(rows), side, boxes)
+                pairs = _matched_agents(m.take(rows), side, boxes)
                 later_s = (m.t_ns[rows] - stamps[k]) / NS_PER_S if when == "measured" else np.zeros(len(rows))
                 out[ticks[k]].xy[rows] = _true_xy(side, int(k), pairs, later_s)
-                out[ticks[k]].who[rows] = pairs
+                out[ticks[k]].object_id[rows] = pairs
     return out
 
 
-def lidar_places(seen: Observations, tick_s: float) -> list[Known]:
-    """Where LiDAR has the objects of every tick's measurements; those of half a second are taken for one."""
+def lidar_positions(seen: Observations, tick_s: float) -> list[KnownPositions]:
+    """Take LiDAR positions of each tick's measurements as known; those within `BLOCK_S` count as one object."""
     return [
-        Known(m.center_m[:, :2], np.full(len(m), int(tick * tick_s / BLOCK_S)))
+        KnownPositions(m.center_m[:, :2], np.full(len(m), int(tick * tick_s / BLOCK_S)))
         for tick, m in enumerate(seen.measurements)
     ]
 
 
-def _boxes_in_image(log: Log, camera: str, side: Side, k: int, cam_T_map: Array) -> Array:
-    """Boxes (A, 4) of all truth agents that count at a frame, NaN for the others."""
+def _boxes_in_image(log: Log, camera: str, side: StateTable, k: int, cam_T_map: Array) -> Array:
+    """Project the truth agents that count at a frame: boxes (A, 4), px, NaN for the others."""
     boxes = np.full((len(side.ids), 4), np.nan)
-    rows = np.flatnonzero(side.there[:, k] & side.visible[:, k])
+    rows = np.flatnonzero(side.present[:, k] & side.visible[:, k])
     center = np.column_stack([side.xy_m[rows, k], side.z_m[rows, k]])
     seen = project_boxes(center, side.size_m[rows], side.yaw_rad[rows, k], log.cameras[camera], cam_T_map)
     boxes[rows] = seen.box_px
     return boxes
 
 
-def _recognized(m: Measurements, side: Side, boxes: Array) -> NDArray[np.intp]:
-    """Index (M,) of the truth agent in each measured box, -1 for none: boxes of one group that overlap each other best."""
+def _matched_agents(m: Measurements, side: StateTable, boxes: Array) -> NDArray[np.intp]:
+    """Find the truth agent (M,) of each measured box, -1 for none: mutually best IoU within a group of categories."""
     group = np.array([GROUP_OF[str(c)] for c in m.category])
     overlap = np.nan_to_num(box_iou(m.box_px, boxes))
     overlap = np.where(group[:, None] == side.group, overlap, 0.0)
     best, back = overlap.argmax(axis=1), overlap.argmax(axis=0)
     rows = np.arange(len(m))
-    return np.where((overlap[rows, best] >= LEAST_IOU) & (back[best] == rows), best, -1)
+    return np.where((overlap[rows, best] >= MIN_IOU) & (back[best] == rows), best, -1)
 
 
-def _true_xy(side: Side, k: int, pairs: NDArray[np.intp], later_s: Array) -> Array:
-    """True centers (M, 2) so many seconds (M,) after frame `k`, which are a few hundredths."""
+def _true_xy(side: StateTable, k: int, pairs: NDArray[np.intp], later_s: Array) -> Array:
+    """Extrapolate true centers (M, 2) by `later_s` (M,), a few hundredths of a second, from frame `k`."""
     speed, yaw = side.speed_mps[pairs, k], side.yaw_rad[pairs, k]
     xy = side.xy_m[pairs, k] + (speed * later_s)[:, None] * np.column_stack([np.cos(yaw), np.sin(yaw)])
     return np.where((pairs >= 0)[:, None], xy, np.nan)
 
 
-def judge_measured(seen: Observations, known: Sequence[Known]) -> Judged:
-    """How far measured centers lie from the true ones; `error_m` cuts at 2 m, which objects without a place count as."""
+def score_measurements(seen: Observations, known: Sequence[KnownPositions]) -> Score:
+    """Score measured centers by their distance from the true ones, capped at `CUTOFF_M`; a missing position counts as that."""
     measured = np.concatenate([m.center_m[:, :2] for m in seen.measurements])
-    true, who = np.concatenate([k.xy for k in known]), np.concatenate([k.who for k in known])
+    true, object_id = np.concatenate([k.xy for k in known]), np.concatenate([k.object_id for k in known])
     asked = np.isfinite(true[:, 0])
-    return _judge_distances(np.hypot(*(measured - true)[asked].T), who[asked])
+    return _score_of_distances(np.hypot(*(measured - true)[asked].T), object_id[asked])
 
 
-def _judge_distances(distance: Array, who: NDArray[np.int64]) -> Judged:
-    """Figures of distances (K,), NaN for objects without a place; `who` (K,) says which are one object's."""
-    cut = np.where(distance < CUT_M, distance, CUT_M)
-    squares, count = np.bincount(who, cut**2), np.bincount(who)
+def _score_of_distances(distance: Array, object_id: NDArray[np.int64]) -> Score:
+    """Compute the score of distances (K,), m, NaN for missing positions, of objects (K,)."""
+    cut = np.where(distance < CUTOFF_M, distance, CUTOFF_M)
+    squares, count = np.bincount(object_id, cut**2), np.bincount(object_id)
     parts = {str(k): (float(squares[k]), float(count[k])) for k in np.flatnonzero(count)}
     placed = np.isfinite(distance)
     figures = {
@@ -124,54 +138,63 @@ def _judge_distances(distance: Array, who: NDArray[np.int64]) -> Judged:
         "placed_share": float(placed.mean()) if len(distance) else None,
         "error_m": error_of(parts),
         "median_m": float(np.median(distance[placed])) if placed.any() else None,
-        "farther_than_2_m_share": float(np.mean(cut >= CUT_M)) if len(distance) else None,
+        "farther_than_2_m_share": float(np.mean(cut >= CUTOFF_M)) if len(distance) else None,
     }
-    return Judged(figures, {"error_m": parts})
+    return Score(figures, {"error_m": parts})
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
-    """Measured obstacles kept from the homographies.
+class Holdout:
+    """Measured obstacles that homographies are not fitted to, by camera, one entry for each tick.
 
-    `seen` is what is left to fit to. `asked` holds by camera the obstacles of every tick, their LiDAR place taken away,
-    `known` where their centers are and `feet`, in the same order, where LiDAR has their feet.
+    Attributes
+    ----------
+    seen : Observations
+        What is left to fit to.
+    asked : dict of str to list of Measurements
+        The held-out obstacles without their LiDAR positions.
+    known : dict of str to list of KnownPositions
+        Of their centers.
+    feet : dict of str to list of Correspondences
+        Their foot points by LiDAR.
     """
 
     seen: Observations
     asked: dict[str, list[Measurements]]
-    known: dict[str, list[Known]]
+    known: dict[str, list[KnownPositions]]
     feet: dict[str, list[Correspondences]]
 
     def __len__(self) -> int:
+        """Return the number of held-out obstacles."""
         return sum(len(m) for rows in self.asked.values() for m in rows)
 
 
-def hold_out(
-    log: Log, schedule: Schedule, seen: Observations, known: Sequence[Known], rng: np.random.Generator
-) -> Held:
-    """Set a part of the measured obstacles within 60 m aside, with what is known of their places at the images' stamps."""
+def split_holdout(
+    log: Log, schedule: Schedule, seen: Observations, known: Sequence[KnownPositions], rng: np.random.Generator
+) -> Holdout:
+    """Hold out a random part of the measured obstacles within 60 m, with their known positions at the images' stamps."""
     asked: dict[str, list[Measurements]] = {camera: [] for camera in seen.feet}
-    places: dict[str, list[Known]] = {camera: [] for camera in seen.feet}
-    held: dict[str, list[Correspondences]] = {camera: [] for camera in seen.feet}
+    places: dict[str, list[KnownPositions]] = {camera: [] for camera in seen.feet}
+    holdout: dict[str, list[Correspondences]] = {camera: [] for camera in seen.feet}
     for tick, m in enumerate(seen.measurements):
-        xy, who = known[tick].xy, known[tick].who
+        xy, object_id = known[tick].xy, known[tick].object_id
         near = np.hypot(*(m.center_m - m.sensor_m)[:, :2].T) <= MAX_RANGE_M
-        good = (m.source == "lidar") & ~m.truncated & (m.points >= LEAST_POINTS) & near & np.isfinite(xy[:, 0])
+        good = (m.source == "lidar") & ~m.truncated & (m.points >= MIN_POINTS) & near & np.isfinite(xy[:, 0])
         good &= np.array([len(c) > 0 for c in m.cluster], dtype=bool)
-        good &= rng.random(len(m)) < HELD_OUT
+        good &= rng.random(len(m)) < HOLDOUT_FRACTION
         for camera in asked:
             rows = np.flatnonzero(good & (m.camera == camera))
             stamp = int(log.streams[camera].t_ns[schedule.frames[camera][tick]])
             ego_T_map = inverse(base_pose(log, stamp))
-            held[camera].append(foot_points(log.cameras[camera], m.take(rows), ego_T_map, tick))
-            asked[camera].append(_without_place(m.take(rows), stamp))
-            places[camera].append(Known(xy[rows], who[rows]))
+            holdout[camera].append(foot_points(log.cameras[camera], m.take(rows), ego_T_map, tick))
+            asked[camera].append(_without_position(m.take(rows), stamp))
+            places[camera].append(KnownPositions(xy[rows], object_id[rows]))
     feet = {camera: [_without_feet(log.cameras[camera], parts, asked[camera])] for camera, parts in seen.feet.items()}
-    return Held(replace(seen, feet=feet), asked, places, held)
+    return Holdout(replace(seen, feet=feet), asked, places, holdout)
 
 
-def _without_place(m: Measurements, stamp: int) -> Measurements:
-    """The rows as they were in the image of that stamp, before a LiDAR point fell on them."""
+def _without_position(m: Measurements, stamp: int) -> Measurements:
+    """Reset the rows to detections in the image of that stamp, without LiDAR evidence."""
     return replace(
         m,
         t_ns=np.full(len(m), stamp),
@@ -183,51 +206,51 @@ def _without_place(m: Measurements, stamp: int) -> Measurements:
 
 
 def _without_feet(camera: Camera, parts: Sequence[Correspondences], asked: Sequence[Measurements]) -> Correspondences:
-    """The correspondences of a camera but those of the obstacles that were set aside."""
+    """Drop the correspondences of held-out obstacles."""
     feet = Correspondences.join(parts)
     tick = np.concatenate([np.full(len(m), k) for k, m in enumerate(asked)])
     box = np.concatenate([m.box_px for m in asked])
     if not len(box) or not len(feet.uv):
         return feet
     uv = undistorted_pixels(camera, np.column_stack([(box[:, 0] + box[:, 2]) / 2, box[:, 3]]))
-    same = (feet.tick[:, None] == tick) & (np.abs(feet.uv[:, None] - uv).max(axis=2) < SAME_FOOT_PX)
+    same = (feet.tick[:, None] == tick) & (np.abs(feet.uv[:, None] - uv).max(axis=2) < MAX_SAME_FOOT_PX)
     kept = ~same.any(axis=1)
     return replace(feet, **{name: column[kept] for name, column in vars(feet).items() if column is not None})
 
 
-def judge_placed(log: Log, held: Held, grounds: Mapping[str, CameraHomography]) -> Judged:
-    """How far the homographies alone put the feet of the obstacles that were set aside from where LiDAR has them.
+def score_homographies(log: Log, holdout: Holdout, grounds: Mapping[str, CameraHomography]) -> Score:
+    """Score homographies by the distance of held-out foot points from their LiDAR positions.
 
-    `near_error_m` and `far_error_m` are of those within and beyond 25 m. `center_error_m` and `center_median_m` are of the
-    centers against what is known of these; half of that is a guess of how deep an object is, which can cancel the error
-    of a bad homography. Everything is cut at 2 m, which feet without a place count as.
+    Distances are capped at `CUTOFF_M`, which missing positions count as. `near_error_m` and `far_error_m` are of obstacles
+    within and beyond `NEAR_M`. `center_error_m` and `center_median_m` are of box centers, which also depend on the assumed
+    depth of an object.
     """
-    feet, centers, range_m, who = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)], [np.zeros(0, dtype=np.int64)]
-    for camera in (c for c in held.asked if c in grounds):
-        for tick, (m, known) in enumerate(zip(held.asked[camera], held.known[camera], strict=True)):
-            feet.append(_foot_distances(held.feet[camera][tick], at_tick(grounds[camera], tick)))
+    feet, centers, range_m, object_id = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)], [np.zeros(0, dtype=np.int64)]
+    for camera in (c for c in holdout.asked if c in grounds):
+        for tick, (m, known) in enumerate(zip(holdout.asked[camera], holdout.known[camera], strict=True)):
+            feet.append(_foot_distances(holdout.feet[camera][tick], at_tick(grounds[camera], tick)))
             centers.append(np.hypot(*(_places(log, tick, m, grounds[camera]) - known.xy).T))
             range_m.append(np.hypot(*(known.xy - m.sensor_m[:, :2]).T))
-            who.append(known.who)
-    d, near, w = np.concatenate(feet), np.concatenate(range_m) < NEAR_M, np.concatenate(who)
-    judged, center = _judge_distances(d, w), _judge_distances(np.concatenate(centers), w).figures
-    extra = {
-        f"{name}_error_m": _judge_distances(d[rows], w[rows]).figures["error_m"]
+            object_id.append(known.object_id)
+    d, near, w = np.concatenate(feet), np.concatenate(range_m) < NEAR_M, np.concatenate(object_id)
+    score, center = _score_of_distances(d, w), _score_of_distances(np.concatenate(centers), w).figures
+    figures = {
+        f"{name}_error_m": _score_of_distances(d[rows], w[rows]).figures["error_m"]
         for name, rows in (("near", near), ("far", ~near))
     }
-    extra |= {f"center_{key}": center[key] for key in ("error_m", "median_m")}
-    return Judged(judged.figures | extra, judged.parts)
+    figures |= {f"center_{key}": center[key] for key in ("error_m", "median_m")}
+    return Score(score.figures | figures, score.by_object)
 
 
 def _foot_distances(feet: Correspondences, ground: CameraHomography) -> Array:
-    """How far (N,) a homography puts feet from where they are, m; NaN for those above its horizon."""
+    """Compute the distances (N,), m, of foot points placed by a homography from their positions; NaN above its horizon."""
     if not len(feet.uv):
         return np.zeros(0)
     return np.asarray(np.hypot(*(apply_homography(ground.fit.ground_H_image, feet.uv)[0] - feet.xy_ego).T))
 
 
 def _places(log: Log, tick: int, m: Measurements, ground: CameraHomography) -> Array:
-    """Places (M, 2) in the map of the rows of a tick by the homography, that of the tick where it has one of its own."""
+    """Locate the rows of a tick by the homography: positions (M, 2), m, map frame."""
     if not len(m):
         return np.zeros((0, 2))
     seen = Observations(measurements=[m], obstacles=[None])
@@ -236,7 +259,7 @@ def _places(log: Log, tick: int, m: Measurements, ground: CameraHomography) -> A
 
 
 def at_tick(ground: CameraHomography, tick: int) -> CameraHomography:
-    """A camera's homography at one tick: its own where every tick has one, and then none where that could not be fitted."""
+    """Select a camera's homography of one tick; NaN when homographies are per tick and this one was not fitted."""
     fit = ground.fit
     if fit.per_tick is None or not fit.ok:
         return ground
@@ -246,7 +269,7 @@ def at_tick(ground: CameraHomography, tick: int) -> CameraHomography:
 
 
 def _in_order(asked: Measurements, found: Measurements) -> Array:
-    """Centers (M, 2) of found rows in the order in which they were asked for, by their boxes; NaN for those without."""
+    """Order found centers (M, 2) as requested, matching rows by their boxes; NaN for missing ones."""
     xy = np.full((len(asked), 2), np.nan)
     for box, center in zip(found.box_px, found.center_m):
         xy[np.all(asked.box_px == box, axis=1)] = center[:2]

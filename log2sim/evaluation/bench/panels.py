@@ -1,13 +1,13 @@
-"""Panels: the settings of one stage as points of error against run time, with their front and what they say."""
+"""Panels: the settings of one stage as points of error against run time, with Pareto front and recommendation."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from log2sim.evaluation.bench.pareto import Point, Verdict, front_of, judge
-from log2sim.evaluation.bench.runs import FOR_THE_REPORT, Bed, Progress, Run, homography_points, run_all
-from log2sim.evaluation.bench.scores import Judged
+from log2sim.evaluation.bench.pareto import Point, Recommendation, front_mask, recommend
+from log2sim.evaluation.bench.runs import REPORT_STAGES, BenchContext, BenchRun, Progress, homography_points, run_all
+from log2sim.evaluation.bench.scores import Score
 
 OWN_STAGES = {"detect": ("detect",), "measure": ("measure", "fuse"), "smooth": ("smooth",)}
 
@@ -16,7 +16,18 @@ WITHOUT_TRUTH = "the log has no labels: these figures say how steady a setting i
 
 @dataclass(frozen=True)
 class Panel:
-    """The points of a stage; `error` names the figure that is their error, `label` says what it is, `unit` its unit."""
+    """The settings of a stage.
+
+    Attributes
+    ----------
+    stage : str
+    error, label, unit : str
+        Key of the figure that is the error, its description and its unit.
+    points : tuple of Point
+    on_front : tuple of bool
+        Which points are Pareto-optimal.
+    recommendation : Recommendation
+    """
 
     stage: str
     error: str
@@ -24,10 +35,10 @@ class Panel:
     unit: str
     points: tuple[Point, ...]
     on_front: tuple[bool, ...]
-    verdict: Verdict
+    recommendation: Recommendation
 
 
-# Figure, words and unit of a stage's error with truth, and without.
+# Key, description and unit of a stage's error with truth, and without.
 ERRORS = {
     "detect": (
         ("error_m", "position error, missed and false objects counted", "m"),
@@ -52,57 +63,59 @@ ERRORS = {
 }
 
 
-def make_panels(bed: Bed, tell: Progress) -> list[Panel]:
-    """Run everything and lay it out, one panel a stage and one for whole runs."""
-    runs, seen = run_all(bed, tell)
-    whole_ms = bed.ms_per_tick(runs[0].seconds)
-    known = bed.truth is not None
+def make_panels(context: BenchContext, report: Progress) -> list[Panel]:
+    """Run all settings and make one panel for each stage and one for whole runs."""
+    runs, seen = run_all(context, report)
+    whole_ms = context.ms_per_tick(runs[0].seconds)
+    known = context.truth is not None
     by_stage = {stage: [runs[0], *(r for r in runs[1:] if r.setting.stage == stage)] for stage in OWN_STAGES}
     points = {
-        "detect": [_point(bed, "detect", r) for r in by_stage["detect"]],
-        "measure": [_measure_point(bed, r) for r in by_stage["measure"]],
-        "homography": homography_points(bed, seen, tell),
-        "smooth": [_point(bed, "smooth", r) for r in by_stage["smooth"]],
-        "whole run": [_whole_point(bed, r) for r in runs],
+        "detect": [_point(context, "detect", r) for r in by_stage["detect"]],
+        "measure": [_measure_point(context, r) for r in by_stage["measure"]],
+        "homography": homography_points(context, seen, report),
+        "smooth": [_point(context, "smooth", r) for r in by_stage["smooth"]],
+        "whole run": [_whole_point(context, r) for r in runs],
     }
     return [_panel(stage, own, whole_ms, known) for stage, own in points.items() if own]
 
 
 def _panel(stage: str, points: Sequence[Point], whole_ms: float, known: bool) -> Panel:
     error, label, unit = ERRORS[stage][0 if known else 1]
-    verdict = judge(points, unit, whole_ms)
+    recommendation = recommend(points, unit, whole_ms)
     if not known and stage != "homography":
-        verdict = Verdict(None, verdict.present, WITHOUT_TRUTH)
-    return Panel(stage, error, label, unit, tuple(points), tuple(bool(f) for f in front_of(points)), verdict)
+        recommendation = Recommendation(None, recommendation.present, WITHOUT_TRUTH)
+    return Panel(stage, error, label, unit, tuple(points), tuple(bool(f) for f in front_mask(points)), recommendation)
 
 
-def _name(bed: Bed, stage: str, run: Run) -> str:
-    """The name of a run within a stage: the present run is one of every stage."""
-    return run.setting.name if run.setting.stage == stage else getattr(bed.grid, stage)[0].name
+def _name(context: BenchContext, stage: str, run: BenchRun) -> str:
+    """Name a run within a stage; the present run belongs to every stage."""
+    return run.setting.name if run.setting.stage == stage else getattr(context.grid, stage)[0].name
 
 
-def _point(bed: Bed, stage: str, run: Run) -> Point:
-    ms = bed.ms_per_tick(sum(run.stages_s.get(s, 0.0) for s in OWN_STAGES[stage]))
-    return _judged(_name(bed, stage, run), run.setting.present, ms, run.judged, _error(bed, stage))
+def _point(context: BenchContext, stage: str, run: BenchRun) -> Point:
+    ms = context.ms_per_tick(sum(run.stages_s.get(s, 0.0) for s in OWN_STAGES[stage]))
+    return _scored_point(_name(context, stage, run), run.setting.present, ms, run.score, _error(context, stage))
 
 
-def _judged(name: str, present: bool, ms: float, judged: Judged, error: str) -> Point:
-    return Point(name, present, ms, judged.figures.get(error), judged.figures, judged.parts.get(error, {}))
+def _scored_point(name: str, present: bool, ms: float, score: Score, error: str) -> Point:
+    return Point(name, present, ms, score.figures.get(error), score.figures, score.by_object.get(error, {}))
 
 
-def _measure_point(bed: Bed, run: Run) -> Point:
-    point = _point(bed, "measure", run)
-    if bed.truth is None:
+def _measure_point(context: BenchContext, run: BenchRun) -> Point:
+    point = _point(context, "measure", run)
+    if context.truth is None:
         return point
-    return _judged(point.setting, point.present, point.ms_per_tick, run.measured, "error_m")
+    return _scored_point(point.setting, point.present, point.ms_per_tick, run.measurement_score, "error_m")
 
 
-def _whole_point(bed: Bed, run: Run) -> Point:
+def _whole_point(context: BenchContext, run: BenchRun) -> Point:
     name = "present settings" if run.setting.present else run.setting.key
-    stages = {stage: bed.ms_per_tick(s) for stage, s in run.stages_s.items() if stage not in FOR_THE_REPORT}
-    point = _judged(name, run.setting.present, bed.ms_per_tick(run.seconds), run.judged, _error(bed, "whole run"))
+    stages = {stage: context.ms_per_tick(s) for stage, s in run.stages_s.items() if stage not in REPORT_STAGES}
+    point = _scored_point(
+        name, run.setting.present, context.ms_per_tick(run.seconds), run.score, _error(context, "whole run")
+    )
     return replace(point, figures={**point.figures, "stages_ms_per_tick": stages})
 
 
-def _error(bed: Bed, stage: str) -> str:
-    return ERRORS[stage][0 if bed.truth is not None else 1][0]
+def _error(context: BenchContext, stage: str) -> str:
+    return ERRORS[stage][0 if context.truth is not None else 1][0]

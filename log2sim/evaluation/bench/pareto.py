@@ -1,4 +1,4 @@
-"""Which settings are worth their time: the Pareto front of error against run time, and what it says of the present one."""
+"""Pareto front of error against run time, and the recommended setting of a stage."""
 
 from __future__ import annotations
 
@@ -9,22 +9,33 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from log2sim.evaluation.bench.bootstrap import LEAST_OBJECTS, Parts, share_not_worse
+from log2sim.evaluation.bench.bootstrap import MIN_OBJECTS, ErrorSums, confidence_not_worse
 
 NO_ERROR = "no error of the present setting is known; objects have to be in sight for a second"
-# Errors that differ by less are the same: logs are short, and a few objects more or less move them by as much.
-SAME_ERROR = 0.05
-# Part of the resamples in which a setting must do as well as the present one to take its place.
-SURE = 0.9
-# Nobody notices less than this share of the whole run's time.
-SAME_TIME = 0.05
+# Relative difference of errors that counts as none: on short logs a few objects more or less change them by as much.
+ERROR_TOLERANCE = 0.05
+# Fraction of bootstrap resamples in which a setting must be no worse than the present one to be recommended.
+MIN_CONFIDENCE = 0.9
+# Time saved must exceed this fraction of the whole run's time.
+TIME_TOLERANCE = 0.05
 
 
 @dataclass(frozen=True)
 class Point:
-    """One setting of a stage: its time, its error (None where nothing tells it) and everything else that was measured.
+    """One setting of a stage.
 
-    `parts` is what single objects have in the error, where it is known.
+    Attributes
+    ----------
+    setting : str
+    present : bool
+        Whether it is the present setting.
+    ms_per_tick : float, ms
+    error : float or None
+        None when it cannot be computed.
+    figures : dict
+        Everything else that was measured.
+    by_object : ErrorSums
+        Contributions of single objects to the error, where known.
     """
 
     setting: str
@@ -32,12 +43,20 @@ class Point:
     ms_per_tick: float
     error: float | None
     figures: dict[str, Any] = field(default_factory=dict)
-    parts: Parts = field(default_factory=dict)
+    by_object: ErrorSums = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """The setting that the figures support, None where they cannot tell, and a sentence that says why."""
+class Recommendation:
+    """The recommended setting of a stage.
+
+    Attributes
+    ----------
+    supported : str or None
+        The setting that the figures support; None when they do not decide.
+    present : str
+    reason : str
+    """
 
     supported: str | None
     present: str
@@ -50,7 +69,7 @@ class Verdict:
 
 
 def pareto_front(cost: ArrayLike, error: ArrayLike) -> NDArray[np.bool_]:
-    """Mask (K,) of the points (K,), (K,) that no other beats in one without losing in the other; NaN is never on it."""
+    """Mark (K,) the Pareto-optimal points (K,), (K,); a point with a NaN is never one."""
     c, e = np.asarray(cost, dtype=np.float64), np.asarray(error, dtype=np.float64)
     known = np.isfinite(c) & np.isfinite(e)
     no_worse = (c[None] <= c[:, None]) & (e[None] <= e[:, None])
@@ -59,75 +78,77 @@ def pareto_front(cost: ArrayLike, error: ArrayLike) -> NDArray[np.bool_]:
     return known & ~beaten
 
 
-def front_of(points: Sequence[Point]) -> NDArray[np.bool_]:
-    """Mask (K,) of the points on the front."""
+def front_mask(points: Sequence[Point]) -> NDArray[np.bool_]:
+    """Mark (K,) the points on the Pareto front."""
     return pareto_front([p.ms_per_tick for p in points], [np.nan if p.error is None else p.error for p in points])
 
 
-def judge(points: Sequence[Point], unit: str, whole_ms: float) -> Verdict:
-    """Choose among the settings of a stage: least error, and the cheapest of those whose error is about as small.
+def recommend(points: Sequence[Point], unit: str, whole_ms: float) -> Recommendation:
+    """Recommend a setting of a stage: the fastest of those whose error is within `ERROR_TOLERANCE` of the smallest.
 
-    Another setting takes the present one's place only where that is no matter of chance.
+    Another setting replaces the present one only when it is no worse with `MIN_CONFIDENCE`.
 
     Parameters
     ----------
     points : sequence of Point
         One of them is the present setting.
     unit : str
-        Of the error, for the sentence.
+        Of the error, for the reason.
     whole_ms : float
-        What a tick of a whole run takes, ms; a stage's time is weighed against it.
+        Time of a whole run, ms a tick, which a stage's time is compared with.
     """
     present = next(p for p in points if p.present)
     others = [p for p in points if p.error is not None and p is not present]
     if present.error is None:
-        return Verdict(None, present.setting, NO_ERROR)
+        return Recommendation(None, present.setting, NO_ERROR)
     if not others:
-        return Verdict(present.setting, present.setting, f"there is nothing but {present.setting} to choose")
+        return Recommendation(present.setting, present.setting, f"there is nothing but {present.setting} to choose")
     better = [p for p in others if _gains(p, present, whole_ms)]
-    sure = [p for p in better if _sureness(p, present) >= SURE]
+    sure = [p for p in better if _confidence(p, present) >= MIN_CONFIDENCE]
     if sure:
-        chosen = _choose(sure)
-        return Verdict(chosen.setting, present.setting, _instead(chosen, present, unit))
-    best = _choose(better or others)
+        chosen = _fastest_of_best(sure)
+        return Recommendation(chosen.setting, present.setting, _replacement_text(chosen, present, unit))
+    best = _fastest_of_best(better or others)
     reason = f"{present.setting} stays: {_figures(present, unit)}; "
     if better:
-        reason += f"{best.setting} may be better or not: {_figures(best, unit)}{_sure_words(best, present)}"
+        reason += f"{best.setting} may be better or not: {_figures(best, unit)}{_confidence_text(best, present)}"
     else:
         reason += f"next is {best.setting}: {_figures(best, unit)}"
-    return Verdict(present.setting, present.setting, reason)
+    return Recommendation(present.setting, present.setting, reason)
 
 
 def _gains(point: Point, present: Point, whole_ms: float) -> bool:
-    """Whether a setting looks better than the present one: less error, or about the same in clearly less time."""
+    """Tell whether a setting has less error than the present one, or about the same in clearly less time."""
     error, known = point.error or 0.0, present.error or 0.0
-    cheaper = present.ms_per_tick - point.ms_per_tick > SAME_TIME * whole_ms
-    return error < known * (1 - SAME_ERROR) or (cheaper and error <= known * (1 + SAME_ERROR))
+    cheaper = present.ms_per_tick - point.ms_per_tick > TIME_TOLERANCE * whole_ms
+    return error < known * (1 - ERROR_TOLERANCE) or (cheaper and error <= known * (1 + ERROR_TOLERANCE))
 
 
-def _sureness(point: Point, present: Point) -> float:
-    """Share of resamples in which a setting is no worse than the present one, where the objects' parts are known."""
-    if not point.parts or not present.parts:
+def _confidence(point: Point, present: Point) -> float:
+    """Compute the confidence that a setting is no worse than the present one; 1 when contributions of objects are unknown."""
+    if not point.by_object or not present.by_object:
         return 1.0
-    return share_not_worse(point.parts, present.parts, SAME_ERROR if point.ms_per_tick < present.ms_per_tick else 0.0)
+    return confidence_not_worse(
+        point.by_object, present.by_object, ERROR_TOLERANCE if point.ms_per_tick < present.ms_per_tick else 0.0
+    )
 
 
-def _choose(points: Sequence[Point]) -> Point:
-    """The cheapest of those whose error is about the least."""
+def _fastest_of_best(points: Sequence[Point]) -> Point:
+    """Select the fastest of the points whose error is about the smallest."""
     least = min(p.error or 0.0 for p in points)
-    return min((p for p in points if (p.error or 0.0) <= least * (1 + SAME_ERROR)), key=lambda p: p.ms_per_tick)
+    return min((p for p in points if (p.error or 0.0) <= least * (1 + ERROR_TOLERANCE)), key=lambda p: p.ms_per_tick)
 
 
-def _instead(chosen: Point, present: Point, unit: str) -> str:
+def _replacement_text(chosen: Point, present: Point, unit: str) -> str:
     figures = f"{_figures(chosen, unit)} against {_figures(present, unit)}"
-    return f"{chosen.setting} rather than {present.setting}: {figures}{_sure_words(chosen, present)}"
+    return f"{chosen.setting} rather than {present.setting}: {figures}{_confidence_text(chosen, present)}"
 
 
-def _sure_words(point: Point, present: Point) -> str:
-    if not point.parts:
+def _confidence_text(point: Point, present: Point) -> str:
+    if not point.by_object:
         return ""
-    few = len({*point.parts, *present.parts}) < LEAST_OBJECTS
-    return ", too few objects to tell" if few else f", {_sureness(point, present):.0%} sure"
+    few = len({*point.by_object, *present.by_object}) < MIN_OBJECTS
+    return ", too few objects to tell" if few else f", {_confidence(point, present):.0%} sure"
 
 
 def _figures(point: Point, unit: str) -> str:
@@ -135,5 +156,5 @@ def _figures(point: Point, unit: str) -> str:
 
 
 def short(value: float | None) -> str:
-    """Three digits that count, "-" for None."""
+    """Format with three significant digits, "-" for None."""
     return "-" if value is None else f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"

@@ -1,4 +1,4 @@
-"""What a reconstructed scenario is worth: figures against the truth, and those that need none."""
+"""Scores of a reconstructed scenario: figures against the truth, and figures that need none."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 
 from log2sim.datatypes import Agent, Scenario
 from log2sim.errors import ConfigError
-from log2sim.evaluation.bench.bootstrap import Parts, error_of
+from log2sim.evaluation.bench.bootstrap import ErrorSums, error_of
 from log2sim.evaluation.metrics.evaluator import evaluate
 
-CUT_M = 2.0
-"""Distance from which an object is no longer the one that was meant, m; the metrics match up to it."""
+CUTOFF_M = 2.0
+"""Cutoff distance of GOSPA, m; the metrics match objects up to it."""
 
-AHEAD_S = 1.0
-COPIED = (
+HORIZON_S = 1.0
+EVALUATE_KEYS = (
     "recall",
     "precision",
     "position_rmse_m",
@@ -27,12 +27,12 @@ COPIED = (
     "hota",
     "id_switches",
 )
-"""Figures of `evaluate` that are kept."""
+"""Figures of `evaluate` that a score keeps."""
 
 
 @dataclass(frozen=True)
 class Scope:
-    """What is compared with the truth: objects within `max_range_m` of the ego and of these `categories`; None for all."""
+    """Which objects are compared with the truth: within `max_range_m` of the ego, of these `categories`; None for all."""
 
     max_range_m: float | None = None
     categories: tuple[str, ...] | None = None
@@ -42,7 +42,7 @@ EVERYTHING = Scope()
 
 
 def check_scope(truth: Scenario | None, scope: Scope) -> None:
-    """Raise `ConfigError` for a scope that cannot be, before any work is done for it."""
+    """Raise `ConfigError` for an invalid scope before any work is done."""
     if truth is not None:
         evaluate(truth, truth, max_range_m=scope.max_range_m, categories=scope.categories)
     elif scope != EVERYTHING:
@@ -50,20 +50,30 @@ def check_scope(truth: Scenario | None, scope: Scope) -> None:
 
 
 @dataclass(frozen=True)
-class Judged:
-    """Figures of a run, and of those that are errors the parts that single objects have in them."""
+class Score:
+    """Figures of a run.
+
+    Attributes
+    ----------
+    figures : dict
+    by_object : mapping of str to ErrorSums
+        Contributions of single objects, for figures that are errors.
+    """
 
     figures: dict[str, Any]
-    parts: Mapping[str, Parts] = field(default_factory=dict)
+    by_object: Mapping[str, ErrorSums] = field(default_factory=dict)
 
 
-def judge_scenario(scenario: Scenario, truth: Scenario | None, tick_s: float, scope: Scope = EVERYTHING) -> Judged:
-    """Figures of a scenario; without truth only those that its own waypoints tell.
+def score_scenario(scenario: Scenario, truth: Scenario | None, tick_s: float, scope: Scope = EVERYTHING) -> Score:
+    """Score a scenario; without truth only by figures that need none.
 
-    `error_m`: root mean square of the distances, where a missed and a false object together count as one that is 2 m off.
-    `state_error_m`: how far off an object will be one second later, by its errors of position and speed.
-    `jitter_m`: see `jitter`. `gap_share`: part of the agents' ticks at which the detector did not see them.
-    `smoothing_residual_m`: median over agents of the distances of the measurements from the smoothed path.
+    Notes
+    -----
+    - `error_m`: root mean square position error; a missed and a false object together count as one at `CUTOFF_M`.
+    - `state_error_m`: position error after extrapolation by `HORIZON_S`, from the errors of position and speed.
+    - `jitter_m`: see `jitter`.
+    - `gap_share`: fraction of the agents' ticks without a detection.
+    - `smoothing_residual_m`: median over agents of the distance of measurements from the smoothed trajectory.
     """
     out: dict[str, Any] = {
         "agents": len(scenario.others),
@@ -72,38 +82,38 @@ def judge_scenario(scenario: Scenario, truth: Scenario | None, tick_s: float, sc
         "smoothing_residual_m": _smoothing_residual(scenario),
     }
     if truth is None:
-        return Judged(out)
+        return Score(out)
     found = evaluate(scenario, truth, max_range_m=scope.max_range_m, categories=scope.categories)
     parts = {"error_m": _error_parts(found), "state_error_m": _state_parts(found)}
-    out |= {key: found[key] for key in COPIED} | {key: error_of(p) for key, p in parts.items()}
-    return Judged(out, parts)
+    out |= {key: found[key] for key in EVALUATE_KEYS} | {key: error_of(p) for key, p in parts.items()}
+    return Score(out, parts)
 
 
-def _error_parts(found: Mapping[str, Any]) -> Parts:
-    """What each object adds to `error_m`.
+def _error_parts(found: Mapping[str, Any]) -> ErrorSums:
+    """Compute the contribution of each object to `error_m`.
 
     Notes
     -----
     GOSPA (Rahmathullah et al., 2017) with p = 2 and alpha = 2, divided by the number of objects so that it is a distance:
-    between 0 for a perfect result and the cut-off for one that has nothing right.
+    0 for a perfect result, the cutoff for one without a match.
     """
     parts = {}
     for row in found["agents"]:
         lost = (row["ticks"] - row["matched"]) / 2
         parts[row["id"]] = (
-            row["matched"] * (row["position_rmse_m"] or 0.0) ** 2 + CUT_M**2 * lost,
+            row["matched"] * (row["position_rmse_m"] or 0.0) ** 2 + CUTOFF_M**2 * lost,
             row["matched"] + lost,
         )
     for row in found["false_agents"]:
-        parts[f"false {row['id']}"] = CUT_M**2 * row["false_ticks"] / 2, row["false_ticks"] / 2
+        parts[f"false {row['id']}"] = CUTOFF_M**2 * row["false_ticks"] / 2, row["false_ticks"] / 2
     return parts
 
 
-def _state_parts(found: Mapping[str, Any]) -> Parts:
+def _state_parts(found: Mapping[str, Any]) -> ErrorSums:
     rows = [row for row in found["agents"] if row["matched"]]
     return {
         row["id"]: (
-            row["matched"] * (row["position_rmse_m"] ** 2 + (AHEAD_S * row["speed_rmse_mps"]) ** 2),
+            row["matched"] * (row["position_rmse_m"] ** 2 + (HORIZON_S * row["speed_rmse_mps"]) ** 2),
             row["matched"],
         )
         for row in rows
@@ -111,12 +121,12 @@ def _state_parts(found: Mapping[str, Any]) -> Parts:
 
 
 def jitter(scenario: Scenario, tick_s: float) -> float | None:
-    """Median over moving agents of the noise in their waypoints, m; None when none moves for long enough.
+    """Estimate the noise of waypoints, m: median over moving agents; None when none moves for long enough.
 
     Notes
     -----
-    Third differences lack motion of constant acceleration; of white noise of deviation s they have 20 s2. Where waypoints
-    are farther apart than a tick, the motion between them is the cubic that has their speeds.
+    Third differences vanish for constant acceleration; of white noise with variance s^2 they have variance 20 s^2. Between
+    waypoints farther apart than a tick, motion is the cubic Hermite spline through their positions and velocities.
     """
     if tick_s <= 0:
         return None

@@ -1,4 +1,4 @@
-"""Detections found once and used by every run: each frame is decoded once and goes through all detectors in turn."""
+"""Detections shared by all runs: each frame is decoded once and passed to all detectors in turn."""
 
 from __future__ import annotations
 
@@ -18,10 +18,17 @@ from log2sim.perception.sync import Schedule
 
 
 @dataclass(frozen=True, eq=False)
-class Remembered:
-    """A `Detector` that answers from what another has found; what was never asked or could not be read is empty.
+class RecordedDetections:
+    """A `Detector` that returns recorded detections; none for a frame that was not recorded.
 
-    `seconds` is what the other needed for all of it.
+    Attributes
+    ----------
+    name : str
+    default_min_score : float
+    found : dict of (str, int) to Detections
+        By camera and stamp.
+    spent_s : list of float, s
+        Time of the recorded detector for each frame.
     """
 
     name: str
@@ -31,18 +38,18 @@ class Remembered:
 
     @property
     def seconds(self) -> float:
-        """Time that the detector took for all frames, s."""
+        """Return the time of the recorded detector for all frames, s."""
         return sum(self.spent_s)
 
-    def remember(self, detector: Detector, frame: Frame) -> None:
-        """Ask a detector for the boxes of one frame."""
+    def record(self, detector: Detector, frame: Frame) -> None:
+        """Run a detector on one frame and record the result and its time."""
         begin = time.perf_counter()
         boxes = detector.detect(frame)
         self.spent_s.append(time.perf_counter() - begin)
         self.found[frame.camera.name, frame.t_ns] = boxes
 
     def detect(self, frame: Frame) -> Detections:
-        """Boxes of one frame, from memory."""
+        """Return the recorded boxes of one frame."""
         return self.found.get((frame.camera.name, frame.t_ns), Detections.empty())
 
 
@@ -53,22 +60,22 @@ def detect_once(
     *,
     decode: bool,
     progress: Callable[[int, int], None],
-) -> tuple[dict[str, Remembered], float]:
+) -> tuple[dict[str, RecordedDetections], float]:
     """Run every detector on every frame of a schedule once.
 
-    Detectors take turns on each frame, so that a machine that slows down slows all of them.
+    Detectors take turns on each frame, so that a change of the machine's speed affects all of them.
 
     Returns
     -------
     dict, float
-        What each found, by the same names, and the seconds that decoding took.
+        Recorded detections by the same names, and the seconds of decoding.
 
     Raises
     ------
     LogError
         When no frame of a camera can be read.
     """
-    memory = {key: Remembered(d.name, d.default_min_score) for key, d in detectors.items()}
+    recorded = {key: RecordedDetections(d.name, d.default_min_score) for key, d in detectors.items()}
     records, decoding_s = RecordReader(log), 0.0
     for tick in range(len(schedule)):
         for camera, index in schedule.frames.items():
@@ -81,13 +88,15 @@ def detect_once(
                 continue
             frame = Frame(log.cameras[camera], int(log.streams[camera].t_ns[index[tick]]), partial(_decoded, image))
             for key, detector in detectors.items():
-                memory[key].remember(detector, frame)
+                recorded[key].record(detector, frame)
         progress(tick + 1, len(schedule))
     records.require_some()
-    return memory, decoding_s
+    return recorded, decoding_s
 
 
 def _decoded(image: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
     if image is None:
-        raise RecordError("a detector asked for an image that was not decoded, since no detector was known to need one")
+        raise RecordError(
+            "a detector needs the image, but no image was decoded because all detectors were expected to need none"
+        )
     return image

@@ -1,4 +1,4 @@
-"""Brings a scenario and its truth to the same instants, the same frame and the same columns."""
+"""Samples a scenario and its truth at the same instants, in the same frame, as columns."""
 
 from __future__ import annotations
 
@@ -12,17 +12,31 @@ from log2sim.evaluation.metrics.pairs import Mask
 from log2sim.geometry import NS_PER_S, Array, nearest_index
 
 MAX_TRUTH_GAP_S = 0.25
-THINNED_GAP_S = 1.05  # waypoints of straight constant motion are left out for up to a second
+MAX_SIMPLIFIED_GAP_S = 1.05
+"""Simplified trajectories omit waypoints of straight uniform motion for up to a second."""
+
 TRUTH_MARGIN_S = 0.15
-"""How long beyond its first and last label a truth agent is carried on with its speed, never to be counted."""
+"""A truth agent is extrapolated this far beyond its first and last label, without being counted there."""
 
 
 @dataclass(frozen=True, eq=False)
-class Side:
-    """States of agents as columns: A agents, T ticks; NaN where an agent is not there.
+class StateTable:
+    """States of A agents at T ticks; NaN where an agent is absent.
 
-    `xy_m` (A, T, 2) and `z_m` (A, T) box centers in the scenario's map frame, `yaw_rad` and `speed_mps` (A, T), `size_m` (A, 3),
-    `range_m` (A, T) from the ego's center (infinite without an ego), `visible` (A, T) False where truth must not count.
+    Attributes
+    ----------
+    ids : tuple of str
+    category, group : (A,) str
+    size_m : (A, 3) float64, m
+    xy_m : (A, T, 2) float64, m
+        Box centers, the scenario's map frame.
+    z_m : (A, T) float64, m
+    yaw_rad : (A, T) float64
+    speed_mps : (A, T) float64, m/s
+    range_m : (A, T) float64, m
+        From the ego's center; infinite without an ego.
+    visible : (A, T) bool
+        False where the truth does not count.
     """
 
     ids: tuple[str, ...]
@@ -37,18 +51,18 @@ class Side:
     visible: Mask
 
     @property
-    def there(self) -> Mask:
-        """(A, T) whether each agent exists at each tick."""
+    def present(self) -> Mask:
+        """Mark (A, T) the ticks at which each agent is present."""
         return np.isfinite(self.xy_m[..., 0])
 
 
 def evaluation_ticks_s(scenario: Scenario, truth: Scenario) -> Array:
-    """Instants (T,) to compare at, seconds of the scenario, inside what the truth covers.
+    """Choose the instants (T,), seconds of the scenario, at which to compare; all within the time of the truth.
 
     Notes
     -----
-    The ego's waypoints stand at the ticks. Where they were thinned out (on average more than 0.25 s apart) the
-    waypoints of all agents join, and where those were too, the truth's.
+    These are the times of the ego's waypoints. When they are on average more than 0.25 s apart, which simplification does,
+    the waypoints of all agents are added, and when that is not enough, those of the truth.
     """
     shift_s = (truth.t0_ns - scenario.t0_ns) / NS_PER_S
     ego = scenario.ego
@@ -57,7 +71,7 @@ def evaluation_ticks_s(scenario: Scenario, truth: Scenario) -> Array:
     if not theirs:
         return np.zeros(0)
     first, last = min(t[0] for t in theirs), max(t[-1] for t in theirs)
-    # A scenario in which nobody was found still misses what was there while it ran.
+    # A scenario without agents misses every truth agent during its duration.
     begin = min((t[0] for t in ours), default=0.0)
     end = max((t[-1] for t in ours), default=scenario.duration_s)
     for times in ([] if ego is None else [ego.waypoints.t_s], ours, ours + theirs):
@@ -72,8 +86,8 @@ def evaluation_ticks_s(scenario: Scenario, truth: Scenario) -> Array:
     return t
 
 
-def reconstructed_side(agents: tuple[Agent, ...], ticks_s: Array, ego_xy: Array | None) -> Side:
-    """Sample reconstructed agents at the ticks; `ego_xy` (T, 2) or None."""
+def reconstructed_states(agents: tuple[Agent, ...], ticks_s: Array, ego_xy: Array | None) -> StateTable:
+    """Sample reconstructed agents at the ticks (T,); `ego_xy` (T, 2), m, or None."""
     sampled = [a.at(ticks_s) for a in agents]
     xy = _stack([np.stack([s.x_m, s.y_m], -1) for s in sampled], (len(ticks_s), 2))
     yaw = _stack([s.yaw_rad for s in sampled], (len(ticks_s),))
@@ -82,13 +96,13 @@ def reconstructed_side(agents: tuple[Agent, ...], ticks_s: Array, ego_xy: Array 
     return _side(agents, xy, z, yaw, speed, np.isfinite(yaw), ego_xy)
 
 
-def truth_side(agents: tuple[Agent, ...], ticks_s: Array, shift_m: Array, ego_xy: Array | None) -> Side:
+def truth_states(agents: tuple[Agent, ...], ticks_s: Array, shift_m: Array, ego_xy: Array | None) -> StateTable:
     """Sample truth agents at the ticks (seconds of the truth), moved by `shift_m`.
 
     Notes
     -----
-    `visible` is that of the nearer waypoint, and False in gaps longer than 0.25 s and outside the agent's life, where
-    its interpolated or continued box only keeps a reconstructed agent from being called false.
+    `visible` is that of the nearest waypoint. In gaps longer than 0.25 s and outside the trajectory it is False: there an
+    interpolated or extrapolated box only prevents a reconstructed agent from counting as false.
     """
     columns = [_sample_truth(a, ticks_s) for a in agents]
     xy = _stack([c[0] for c in columns], (len(ticks_s), 2)) + shift_m[:2]
@@ -105,25 +119,25 @@ def _sample_truth(agent: Agent, t: Array) -> tuple[Array, Array, Array, Array, M
     outside = t - np.clip(t, w.t_s[0], w.t_s[-1])
     carried = s.speed_mps * outside
     xy = np.stack([s.x_m + carried * np.cos(s.yaw_rad), s.y_m + carried * np.sin(s.yaw_rad)], -1)
-    there = np.abs(outside) <= TRUTH_MARGIN_S
+    present = np.abs(outside) <= TRUTH_MARGIN_S
     seen = np.ones(len(t), dtype=bool) if w.visible is None else w.visible[nearest_index(w.t_s, t)]
-    # A parked truth agent may be written as its first and last waypoint only, and one that moves straight as a few.
-    thinned = bool(agent.quality.get("waypoints_left_out"))
-    max_gap_s = np.inf if agent.static and len(w) == 2 else THINNED_GAP_S if thinned else MAX_TRUTH_GAP_S
+    # Simplified, a static agent has its first and last waypoint only, and one in straight motion a few.
+    simplified = bool(agent.quality.get("waypoints_left_out"))
+    max_gap_s = np.inf if agent.static and len(w) == 2 else MAX_SIMPLIFIED_GAP_S if simplified else MAX_TRUTH_GAP_S
     labeled = agent.at(t, max_gap_s=float(max_gap_s)).valid
-    nan = np.where(there, 0.0, np.nan)
+    nan = np.where(present, 0.0, np.nan)
     return xy + nan[:, None], s.z_m + nan, s.yaw_rad + nan, s.speed_mps + nan, seen & labeled
 
 
 def _side(
     agents: tuple[Agent, ...], xy: Array, z: Array, yaw: Array, speed: Array, visible: Mask, ego_xy: Array | None
-) -> Side:
+) -> StateTable:
     category = np.array([a.category for a in agents], dtype="<U16")
     if ego_xy is None:
         range_m = np.where(np.isfinite(yaw), np.inf, np.nan)
     else:
         range_m = np.hypot(xy[..., 0] - ego_xy[:, 0], xy[..., 1] - ego_xy[:, 1])
-    return Side(
+    return StateTable(
         ids=tuple(a.id for a in agents),
         category=category,
         group=np.array([GROUP_OF.get(c, "other") for c in category], dtype="<U16"),

@@ -12,10 +12,16 @@ from log2sim.evaluation.metrics.pairs import Index, Mask, Pairs, assign
 
 @dataclass(frozen=True, eq=False)
 class Association:
-    """`match` (A, T) int64: which reconstructed agent each truth agent has at each tick, -1 for none.
+    """Matches of A truth agents and B reconstructed agents at T ticks.
 
-    `used` (B, T) bool: reconstructed agents matched within their group. `absorbed` (B, T) bool: those without a match
-    of their group that stand on a labeled object of another group.
+    Attributes
+    ----------
+    match : (A, T) int64
+        Index of the reconstructed agent, -1 for none.
+    used : (B, T) bool
+        Reconstructed agents matched within their group of categories.
+    absorbed : (B, T) bool
+        Reconstructed agents without such a match that are at a labeled object of another group.
     """
 
     match: NDArray[np.int64]
@@ -28,9 +34,9 @@ def associate(pairs: Pairs, truths: int, others: int, ticks: int) -> Association
 
     Notes
     -----
-    Bernardin and Stiefelhagen (2008), section 2.2.1: first the correspondences of the past that still hold, then
-    the most pairs with the least total distance among the rest. A truth agent remembers its last match over gaps. Where
-    two truth agents remember the same one, the nearer keeps it.
+    Bernardin and Stiefelhagen (2008), section 2.2.1: previous matches within the gate are kept, then the remaining agents
+    are matched with the most pairs and the least total distance. A truth agent keeps its previous match over gaps. When two
+    truth agents have the same previous match, the nearer one keeps it.
     """
     match = np.full((truths, ticks), -1, dtype=np.int64)
     used, absorbed = np.zeros((others, ticks), dtype=bool), np.zeros((others, ticks), dtype=bool)
@@ -51,7 +57,7 @@ def associate(pairs: Pairs, truths: int, others: int, ticks: int) -> Association
 
 
 def _kept(near: Pairs, rows: Index, last: Index) -> Index:
-    """Those of the candidate `rows` that continue the last match of their truth agent; the nearest of rivals."""
+    """Select the candidate `rows` that continue the last match of their truth agent; the nearest of several."""
     rows = rows[last[near.truth[rows]] == near.other[rows]]
     rows = rows[np.argsort(near.distance_m[rows], kind="stable")]
     _, first = np.unique(near.other[rows], return_index=True)
@@ -59,15 +65,15 @@ def _kept(near: Pairs, rows: Index, last: Index) -> Index:
 
 
 def _nearest(near: Pairs, rows: Index, last: Index) -> Index:
-    """Of the candidate `rows` the most pairs with the least total distance."""
+    """Select of the candidate `rows` the most pairs with the least total distance."""
     distance = near.distance_m[rows]
-    # One more pair must always be worth more than any saving in distance.
+    # One more pair always outweighs any saving in distance.
     bonus = 1.0 + distance.sum()
     return rows[assign(near.truth[rows], near.other[rows], bonus - distance)]
 
 
 def switches(match: NDArray[np.int64], counted: Mask) -> Mask:
-    """Mark (A, T) the counted ticks at which a truth agent's match differs from its last one at a counted tick."""
+    """Mark (A, T) identity switches: counted ticks with another match than at the last counted tick with one."""
     held = np.where(counted, match, -1)
     out = np.zeros(match.shape, dtype=bool)
     last = np.full(len(match), -1, dtype=np.int64)
@@ -79,5 +85,5 @@ def switches(match: NDArray[np.int64], counted: Mask) -> Mask:
 
 
 def mota(truth_ticks: int, missed: int, false: int, id_switches: int) -> float | None:
-    """Multiple object tracking accuracy, 1 - (misses + false + switches) / truth; None without truth."""
+    """Compute the multiple object tracking accuracy, 1 - (misses + false + switches) / truth; None without truth."""
     return 1 - (missed + false + id_switches) / truth_ticks if truth_ticks else None

@@ -10,7 +10,7 @@ import numpy as np
 
 from log2sim.datatypes import CATEGORIES, GROUPS, IgnoreRegions, Scenario
 from log2sim.errors import ConfigError, ScenarioError
-from log2sim.evaluation.metrics.align import Side, evaluation_ticks_s, reconstructed_side, truth_side
+from log2sim.evaluation.metrics.align import StateTable, evaluation_ticks_s, reconstructed_states, truth_states
 from log2sim.evaluation.metrics.clear_mot import associate, mota, switches
 from log2sim.evaluation.metrics.hota import hota
 from log2sim.evaluation.metrics.label_coverage import ignored_ticks
@@ -23,15 +23,34 @@ from log2sim.registry import nearest
 
 VERSION = 1
 MIN_COUNTED_S = 1.0
+"""A truth agent counts when its counted ticks make up at least this time."""
+
 RANGES_M = ((0.0, 20.0), (20.0, 40.0), (40.0, 60.0))
 
 
 @dataclass(frozen=True, eq=False)
-class Compared:
-    """Both sides and who is whom: `match` (A, T), `counted`, `switched` (A, T), `false`, `ignored` (B, T) bool."""
+class Comparison:
+    """A truth agents and B reconstructed agents at T ticks, matched.
 
-    truth: Side
-    other: Side
+    Attributes
+    ----------
+    truth, other : StateTable
+        Truth and reconstruction.
+    pairs : Pairs
+    match : (A, T) int64
+        Index of the reconstructed agent, -1 for none.
+    counted : (A, T) bool
+        Ticks at which a truth agent counts.
+    switched : (A, T) bool
+        Identity switches.
+    false : (B, T) bool
+        Ticks at which a reconstructed agent is false.
+    ignored : (B, T) bool
+        Unmatched ticks in ignore regions.
+    """
+
+    truth: StateTable
+    other: StateTable
     pairs: Pairs
     match: Index
     counted: Mask
@@ -52,34 +71,40 @@ def evaluate(
     Parameters
     ----------
     scenario, truth : Scenario
-        May have different start times and map offsets. Agents with the id "ego" are compared apart.
-    max_range_m : float, optional
-        Leaves out what is farther from the ego, on both sides alike.
+        May have different start times and map offsets. The ego (id "ego") is compared separately from the other agents.
+    max_range_m : float, m, optional
+        Only agents within this distance of the ego are compared, in both scenarios.
     categories : sequence of str, optional
-        Categories or groups ("vehicle", "two_wheeler") to look at, on both sides alike.
+        Only agents of these categories or groups ("vehicle", "two_wheeler") are compared, in both scenarios.
 
     Returns
     -------
     dict
-        The document of `schemas/metrics-1.json`; None where a figure cannot be computed.
+        The document of `schemas/metrics-1.json`. Keys carry the unit: `_m` meters, `_mps` m/s, `_deg` degrees, `_s` seconds;
+        recall, precision, MOTA and HOTA are fractions. A figure that cannot be computed is None.
 
     Raises
     ------
     ConfigError
         For an unknown category, a range that is not positive, or a range without an ego to measure it from.
     ScenarioError
-        When the two use different map projections or share no time.
+        When the two use different map projections or do not overlap in time.
+
+    Notes
+    -----
+    CLEAR MOT (Bernardin and Stiefelhagen, 2008) and HOTA (Luiten et al., 2021) with matches by the distance of box centers.
+    Recall and precision count agent-ticks; position, speed and size errors are over matched agent-ticks.
     """
     selected = _selected(categories)
     ticks_s = evaluation_ticks_s(scenario, truth)
     if len(ticks_s) == 0 and scenario.agents and truth.agents:
-        raise ScenarioError(_apart(scenario, truth))
+        raise ScenarioError(_no_common_time(scenario, truth))
     truth_ticks_s = ticks_s + (scenario.t0_ns - truth.t0_ns) / NS_PER_S
     shift_m = truth.shift_to(scenario)
     ego_xy = _ego_xy(scenario, truth, ticks_s, truth_ticks_s, shift_m)
     _check_range(max_range_m, ego_xy)
-    true = truth_side(truth.others, truth_ticks_s, shift_m, ego_xy)
-    ours = reconstructed_side(scenario.others, ticks_s, ego_xy)
+    true = truth_states(truth.others, truth_ticks_s, shift_m, ego_xy)
+    ours = reconstructed_states(scenario.others, ticks_s, ego_xy)
     tick_s = float(np.median(np.diff(ticks_s))) if len(ticks_s) > 1 else 0.0
     compared = _compare(true, ours, tick_s, max_range_m, selected)
     compared = _without_ignored(compared, truth.ignore_regions, truth_ticks_s, shift_m)
@@ -102,26 +127,28 @@ def evaluate(
         "false_agents": false_rows(ours, compared.false, _hit(compared, compared.counted)),
         "ignored_agents": ignored_rows(ours, compared.ignored),
     }
-    return rounded_tree(result)
+    return dict(rounded_tree(result))
 
 
-def _compare(truth: Side, other: Side, tick_s: float, max_range_m: float | None, selected: frozenset[str]) -> Compared:
+def _compare(
+    truth: StateTable, other: StateTable, tick_s: float, max_range_m: float | None, selected: frozenset[str]
+) -> Comparison:
     same_group = truth.group[:, None] == other.group[None]
     pairs = near_pairs(truth.xy_m, other.xy_m, gate_m(truth.size_m[:, 0]), same_group)
     found = associate(pairs, len(truth.ids), len(other.ids), truth.range_m.shape[1])
-    counted = truth.there & truth.visible & _within(truth, max_range_m)
+    counted = truth.present & truth.visible & _within(truth, max_range_m)
     counted &= np.isin(truth.category, list(selected))[:, None]
-    # Stamps jitter, so a second is as many ticks as come nearest to it.
+    # Half a tick of tolerance, since stamps jitter.
     enough = counted.sum(1) * tick_s >= MIN_COUNTED_S - tick_s / 2 if tick_s else np.zeros(len(counted), dtype=bool)
     counted &= enough[:, None]
-    false = other.there & ~found.used & ~found.absorbed & _within(other, max_range_m)
+    false = other.present & ~found.used & ~found.absorbed & _within(other, max_range_m)
     false &= np.isin(other.category, list(selected))[:, None]
     switched = switches(found.match, counted)
-    return Compared(truth, other, pairs, found.match, counted, switched, false, np.zeros_like(false))
+    return Comparison(truth, other, pairs, found.match, counted, switched, false, np.zeros_like(false))
 
 
-def _without_ignored(c: Compared, regions: IgnoreRegions | None, truth_ticks_s: Array, shift_m: Array) -> Compared:
-    """Move false ticks to the ignored ones where the labels could not have told."""
+def _without_ignored(c: Comparison, regions: IgnoreRegions | None, truth_ticks_s: Array, shift_m: Array) -> Comparison:
+    """Move false ticks in ignore regions to the ignored ones."""
     if regions is None:
         return c
     center = np.concatenate([c.other.xy_m, c.other.z_m[..., None]], axis=-1) - shift_m
@@ -129,20 +156,20 @@ def _without_ignored(c: Compared, regions: IgnoreRegions | None, truth_ticks_s: 
     return replace(c, false=c.false & ~ignored, ignored=ignored)
 
 
-def _within(side: Side, max_range_m: float | None) -> Mask:
-    return np.ones_like(side.there) if max_range_m is None else side.range_m <= max_range_m
+def _within(side: StateTable, max_range_m: float | None) -> Mask:
+    return np.ones_like(side.present) if max_range_m is None else side.range_m <= max_range_m
 
 
-def _hit(c: Compared, truth_selected: Mask) -> Mask:
-    """(B, T) whether a reconstructed agent is matched with one of the selected truth ticks."""
+def _hit(c: Comparison, truth_selected: Mask) -> Mask:
+    """Mark (B, T) the ticks at which a reconstructed agent matches a selected truth agent."""
     i, t = np.nonzero(truth_selected & (c.match >= 0))
     hit = np.zeros(c.false.shape, dtype=bool)
     hit[c.match[i, t], t] = True
     return hit
 
 
-def _figures(c: Compared, truth_selected: Mask, other_selected: Mask) -> dict[str, Any]:
-    """All figures over the selected ticks of the truth (A, T) and the selected false ticks (B, T)."""
+def _figures(c: Comparison, truth_selected: Mask, other_selected: Mask) -> dict[str, Any]:
+    """Compute all figures over the selected ticks of the truth (A, T) and the selected false ticks (B, T)."""
     counted, false = c.counted & truth_selected, c.false & other_selected
     hit = _hit(c, counted)
     truth_ticks, matched, wrong = int(counted.sum()), int(hit.sum()), int(false.sum())
@@ -175,7 +202,7 @@ def _figures(c: Compared, truth_selected: Mask, other_selected: Mask) -> dict[st
     }
 
 
-def _by_range(c: Compared) -> dict[str, Any]:
+def _by_range(c: Comparison) -> dict[str, Any]:
     return {
         f"{low:g}-{high:g}": _figures(
             c,
@@ -186,8 +213,8 @@ def _by_range(c: Compared) -> dict[str, Any]:
     }
 
 
-def _by_category(c: Compared) -> dict[str, Any]:
-    """Matched ticks stand under the truth's category, false ones under their own."""
+def _by_category(c: Comparison) -> dict[str, Any]:
+    """Compute the figures by category: of the truth for matched ticks, of the reconstructed agent for false ones."""
     names = set(c.truth.category[c.counted.any(1)]) | set(c.other.category[c.false.any(1)])
     return {
         name: _figures(c, _rows(c.truth.category == name, c.counted), _rows(c.other.category == name, c.false))
@@ -210,7 +237,7 @@ def _selected(categories: Sequence[str] | None) -> frozenset[str]:
     return frozenset(c for name in categories for c in GROUPS.get(name, (name,)))
 
 
-def _apart(scenario: Scenario, truth: Scenario) -> str:
+def _no_common_time(scenario: Scenario, truth: Scenario) -> str:
     spans = [
         f"{min(s.t0_ns / NS_PER_S + float(a.waypoints.t_s[0]) for a in s.agents):.3f} to "
         f"{max(s.t0_ns / NS_PER_S + float(a.waypoints.t_s[-1]) for a in s.agents):.3f} s"
@@ -229,12 +256,12 @@ def _check_range(max_range_m: float | None, ego_xy: Array | None) -> None:
 
 
 def _ego_xy(scenario: Scenario, truth: Scenario, ticks_s: Array, truth_ticks_s: Array, shift_m: Array) -> Array | None:
-    """The ego's path (T, 2), the true one where it is known; None without an ego."""
+    """Return the positions (T, 2) of the ego, the true ones where known; None without an ego."""
     xy: Array | None = None
     if scenario.ego is not None:
-        xy = reconstructed_side((scenario.ego,), ticks_s, None).xy_m[0]
+        xy = reconstructed_states((scenario.ego,), ticks_s, None).xy_m[0]
     if truth.ego is not None:
-        true_xy = truth_side((truth.ego,), truth_ticks_s, shift_m, None).xy_m[0]
+        true_xy = truth_states((truth.ego,), truth_ticks_s, shift_m, None).xy_m[0]
         xy = true_xy if xy is None else np.where(np.isfinite(true_xy), true_xy, xy)
     return xy
 
@@ -244,10 +271,10 @@ def _ego_figures(
 ) -> dict[str, Any] | None:
     if truth.ego is None or scenario.ego is None:
         return None
-    true = truth_side((truth.ego,), truth_ticks_s, shift_m, None)
-    ours = reconstructed_side((scenario.ego,), ticks_s, None)
-    both = true.there & true.visible & ours.there
-    errors = state_errors(true, ours, np.where(ours.there, 0, -1), both)
+    true = truth_states((truth.ego,), truth_ticks_s, shift_m, None)
+    ours = reconstructed_states((scenario.ego,), ticks_s, None)
+    both = true.present & true.visible & ours.present
+    errors = state_errors(true, ours, np.where(ours.present, 0, -1), both)
     return {
         "ticks": int(both.sum()),
         "position_rmse_m": root_mean_square(errors.position_m),

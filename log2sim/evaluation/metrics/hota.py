@@ -1,4 +1,4 @@
-"""Higher order tracking accuracy: detection and association weighed alike."""
+"""Higher order tracking accuracy (HOTA) with its detection and association parts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from log2sim.evaluation.metrics.pairs import Mask, Pairs, assign
 from log2sim.geometry import Array
 
 ALPHAS: Array = np.arange(1, 20) / 20
-"""Localization thresholds 0.05, 0.10, ... 0.95 over which the figures are averaged."""
+"""Similarity thresholds 0.05, 0.10, ... 0.95 over which the figures are averaged."""
 
 
 @dataclass(frozen=True)
@@ -23,14 +23,14 @@ class Hota:
     ass_a: float
 
 
-def hota(pairs: Pairs, truth_there: Mask, other_there: Mask) -> Hota | None:
+def hota(pairs: Pairs, truth_present: Mask, other_present: Mask) -> Hota | None:
     """Score the tracking.
 
     Parameters
     ----------
     pairs : Pairs
-        Candidates; those of agents that are not there and those with similarity 0 are left out.
-    truth_there, other_there : (A, T), (B, T) bool
+        Candidates; those of absent agents and those with similarity 0 are left out.
+    truth_present, other_present : (A, T), (B, T) bool
         Which agents count at which ticks.
 
     Returns
@@ -40,36 +40,36 @@ def hota(pairs: Pairs, truth_there: Mask, other_there: Mask) -> Hota | None:
 
     Notes
     -----
-    Luiten et al., "HOTA", IJCV 129 (2021). Matches of a tick maximize similarity times the global alignment of the two
-    identities, so that the association, not the best single-frame fit, decides. Without any reconstructed agent all are 0.
+    Luiten et al., "HOTA", IJCV 129 (2021). Matches of a tick maximize the sum of similarity times the global alignment of
+    both identities. Without any reconstructed agent all figures are 0.
     """
-    if not truth_there.any():
+    if not truth_present.any():
         return None
-    if not other_there.any():
+    if not other_present.any():
         return Hota(0.0, 0.0, 0.0)
-    there = truth_there[pairs.truth, pairs.tick] & other_there[pairs.other, pairs.tick] & (pairs.similarity > 0)
-    pairs = pairs.take(there)
-    truth_count, other_count = truth_there.sum(1), other_there.sum(1)
-    alignment = _alignment(pairs, truth_count, other_count, truth_there.shape[1])
-    matched = _matched(pairs, alignment[pairs.truth, pairs.other] * pairs.similarity, truth_there.shape[1])
+    present = truth_present[pairs.truth, pairs.tick] & other_present[pairs.other, pairs.tick] & (pairs.similarity > 0)
+    pairs = pairs.take(present)
+    truth_count, other_count = truth_present.sum(1), other_present.sum(1)
+    alignment = _alignment(pairs, truth_count, other_count, truth_present.shape[1])
+    matched = _matched(pairs, alignment[pairs.truth, pairs.other] * pairs.similarity, truth_present.shape[1])
     det_a, ass_a = np.zeros(len(ALPHAS)), np.zeros(len(ALPHAS))
     total = int(truth_count.sum() + other_count.sum())
     for k, alpha in enumerate(ALPHAS):
-        # A similarity that equals the threshold counts, whatever its last bit says.
+        # A similarity equal to the threshold counts, despite rounding.
         hits = matched.take(matched.similarity >= alpha - 1e-12)
         if len(hits.tick) == 0:
             continue
-        # Of one pair of identities: TPA is how often it matched, FNA and FPA how often one was there without the other.
-        pair_code = hits.truth * len(other_there) + hits.other
+        # TPA: how often a pair of identities matched; FNA, FPA: how often one of them was present without the other.
+        pair_code = hits.truth * len(other_present) + hits.other
         code, tpa = np.unique(pair_code, return_counts=True)
-        i, j = np.divmod(code, len(other_there))
+        i, j = np.divmod(code, len(other_present))
         ass_a[k] = np.sum(tpa * tpa / (truth_count[i] + other_count[j] - tpa)) / tpa.sum()
         det_a[k] = tpa.sum() / (total - tpa.sum())
     return Hota(float(np.sqrt(det_a * ass_a).mean()), float(det_a.mean()), float(ass_a.mean()))
 
 
 def _alignment(pairs: Pairs, truth_count: Array, other_count: Array, ticks: int) -> Array:
-    """Jaccard alignment (A, B) of the identities over the whole time, before any one-to-one choice."""
+    """Compute the Jaccard alignment (A, B) of the identities over all ticks, before the one-to-one assignment."""
     row_sum, col_sum = np.zeros((len(truth_count), ticks)), np.zeros((len(other_count), ticks))
     np.add.at(row_sum, (pairs.truth, pairs.tick), pairs.similarity)
     np.add.at(col_sum, (pairs.other, pairs.tick), pairs.similarity)

@@ -1,4 +1,4 @@
-"""Where the labels could not have told whether a reconstructed agent is there."""
+"""Where labels are incomplete: reconstructed agents in ignore regions."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse, nearest_index
 
 MIN_REGION_SHARE = 0.5
 MAX_FRAME_LAG_S = 0.15
-"""A tick is compared with the nearest labeled frame of a camera, and with none that is farther off than this."""
+"""A tick is compared with the nearest labeled frame of a camera within this time."""
 
 
 def ignored_ticks(
     ignore_regions: IgnoreRegions, t_s: Array, center_m: Array, size_m: Array, yaw_rad: Array, asked: Mask
 ) -> Mask:
-    """Mark (B, T) the boxes that no labeled camera shows in a part of its image in which objects were labeled.
+    """Mark (B, T) the boxes that no labeled camera shows in a labeled part of its image.
 
     Parameters
     ----------
@@ -27,12 +27,12 @@ def ignored_ticks(
     center_m, size_m, yaw_rad : (B, T, 3), (B, 3), (B, T)
         Boxes in the truth's map frame.
     asked : (B, T) bool
-        Only these are looked at; all others stay False.
+        The boxes to decide on; all others are False.
 
     Notes
     -----
-    A camera shows a box in a part without labels when at least half of what its image shows of the outline lies in the
-    union of the regions of the nearest frame. One that shows it elsewhere outweighs those.
+    A camera shows a box in an ignore region when at least half of the visible outline lies in the union of the regions of
+    the nearest frame. One camera that shows it in a labeled part suffices to keep it.
     """
     labeled, hidden = np.zeros_like(asked), np.zeros_like(asked)
     for view in ignore_regions.views:
@@ -50,11 +50,11 @@ def ignored_ticks(
 
 
 def _frames_at(view: LabelView, t_s: Array) -> tuple[Index, Mask, Array]:
-    """Index (T,) of the frame nearest to each instant, whether it is near enough, and the camera's poses (T, 4, 4) then.
+    """Find the nearest frame (T,), whether it is within `MAX_FRAME_LAG_S`, and the camera poses (T, 4, 4) at instants (T,).
 
     Notes
     -----
-    Poses are interpolated: at 30 m/s a car is 1.5 m farther half a frame later.
+    Poses are interpolated: at 30 m/s a car moves 1.5 m in half a frame at 10 Hz.
     """
     if len(view.t_s) == 0:
         return np.zeros(len(t_s), dtype=np.int64), np.zeros(len(t_s), dtype=bool), np.zeros((len(t_s), 4, 4))
@@ -71,7 +71,7 @@ def _to_ns(t_s: Array) -> Index:
 
 
 def _inside_any(uv: Array, regions: Array) -> Mask:
-    """Whether pixels (S, 2) lie in some of the regions (R, 4)."""
+    """Mark (S,) the pixels (S, 2) that lie in any of the regions (R, 4)."""
     u, v = uv[:, None, 0], uv[:, None, 1]
     within = (u >= regions[:, 0]) & (u <= regions[:, 2]) & (v >= regions[:, 1]) & (v <= regions[:, 3])
     return np.asarray(within.any(axis=1))

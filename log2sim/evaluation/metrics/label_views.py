@@ -1,4 +1,4 @@
-"""What a log says about where its labels are incomplete, as truth files carry it."""
+"""Ignore regions of a log, as truth files hold them."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from log2sim.geometry import NS_PER_S, nearest_index, quaternion_from_rotation
 from log2sim.registry import nearest
 
 MAX_STAMP_LAG_NS = 50_000_000
-"""A region belongs to the frame nearest to its stamp, and to none that is farther off than this."""
+"""A region belongs to the frame nearest to its stamp within this time."""
 
 
 def ignore_regions_of(log: Log, t0_ns: int) -> IgnoreRegions | None:
-    """Where the labels of a log say nothing; None when they are complete.
+    """Collect the ignore regions of a log; None when its labels are complete.
 
     Parameters
     ----------
     log : Log
-        Its labels may name the cameras in whose view alone they are complete, and it may have ignored regions.
+        Its labels may be limited to the views of some cameras, and it may have ignored regions.
     t0_ns : int
         Start of the truth.
 
     Raises
     ------
     LogError
-        For labels of a camera that the log does not have.
+        When labels refer to a camera that the log does not have.
     """
     only = None if log.labels is None else log.labels.cameras
     if only is None and not log.ignored_regions:
@@ -38,10 +38,10 @@ def ignore_regions_of(log: Log, t0_ns: int) -> IgnoreRegions | None:
                 f"{log.name}: its labels are of camera '{name}'{nearest(name, list(log.cameras))}, which it does not "
                 f"have; there are: {', '.join(log.cameras)}"
             )
-    return IgnoreRegions(tuple(_view(log, name, t0_ns) for name in names), outside_views=only is not None)
+    return IgnoreRegions(tuple(_label_view(log, name, t0_ns) for name in names), outside_views=only is not None)
 
 
-def _view(log: Log, name: str, t0_ns: int) -> LabelView:
+def _label_view(log: Log, name: str, t0_ns: int) -> LabelView:
     t_ns = np.unique(log.streams[name].t_ns) if name in log.streams else np.zeros(0, dtype=np.int64)
     poses, known = log.map_T_sensor(name, t_ns)
     t_ns, poses = t_ns[known], poses[known]

@@ -1,4 +1,4 @@
-"""Which truth agent and which reconstructed agent are near each other at a tick, and one-to-one choices among them."""
+"""Candidate pairs of truth and reconstructed agents at each tick, and one-to-one assignment."""
 
 from __future__ import annotations
 
@@ -17,22 +17,29 @@ GATE_PER_LENGTH = 0.25
 
 
 def gate_m(length_m: Array) -> Array:
-    """Largest distance of two box centers that still are the same agent, by the truth's length (A,), in m.
+    """Compute the gate (A,), m: the largest distance of matching box centers, by the truth's length (A,), m.
 
     Notes
     -----
-    nuScenes matches within 2 m. A partly seen bus or truck has its center off by more than that although it is plainly
-    found, so the gate grows to a quarter of the length once that is more.
+    nuScenes matches within 2 m. The center of a partly visible bus or truck is uncertain by more, so the gate is at least a
+    quarter of the length.
     """
     return np.maximum(GATE_M, GATE_PER_LENGTH * np.asarray(length_m, dtype=np.float64))
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Pairs (P,) within the gate, sorted by tick: columns `tick`, `truth`, `other`, `distance_m`, `similarity`.
+    """Pairs within the gate, sorted by tick.
 
-    `same_group` says whether both belong to the same group of categories. `similarity` is 1 - distance / gate, 0 across
-    groups.
+    Attributes
+    ----------
+    tick : (P,) int64
+    truth, other : (P,) int64
+        Indices of the truth agent and of the reconstructed agent.
+    distance_m : (P,) float64
+    similarity : (P,) float64
+        1 - distance / gate; 0 across groups of categories.
+    same_group : (P,) bool
     """
 
     tick: Index
@@ -43,7 +50,7 @@ class Pairs:
     same_group: Mask
 
     def take(self, index: Mask | Index) -> Pairs:
-        """The rows at `index`."""
+        """Return the rows at `index`."""
         return Pairs(
             self.tick[index],
             self.truth[index],
@@ -54,7 +61,7 @@ class Pairs:
         )
 
     def bounds(self, ticks: int) -> Index:
-        """Row numbers (T + 1,): the pairs of tick t are rows bounds[t] to bounds[t + 1]."""
+        """Return row numbers (T + 1,): the pairs of tick t are rows bounds[t] to bounds[t + 1]."""
         return np.searchsorted(self.tick, np.arange(ticks + 1))
 
 
@@ -64,7 +71,7 @@ def near_pairs(truth_xy: Array, other_xy: Array, gates_m: Array, same_group: Mas
     Parameters
     ----------
     truth_xy, other_xy : (A, T, 2), (B, T, 2) float64, m
-        Box centers in one frame, NaN where an agent is not there.
+        Box centers in one frame, NaN where an agent is absent.
     gates_m : (A,) float64
     same_group : (A, B) bool
     """
@@ -104,7 +111,7 @@ def assign(rows: Index, cols: Index, score: Array) -> Index:
 
     Notes
     -----
-    A pair whose row and column have no other candidate needs no solver, which is nearly every pair in a sparse scene.
+    Pairs whose row and column have no other candidate, nearly all in a sparse scene, are chosen without the solver.
     """
     usable = np.flatnonzero(score > 0)
     if len(usable) == 0:

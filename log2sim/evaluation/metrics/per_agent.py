@@ -1,4 +1,4 @@
-"""Tables agent by agent, for finding out what went wrong."""
+"""Tables of single agents: matched, false and ignored."""
 
 from __future__ import annotations
 
@@ -7,15 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.evaluation.metrics.align import Side
+from log2sim.evaluation.metrics.align import StateTable
 from log2sim.evaluation.metrics.pairs import Index, Mask
 from log2sim.evaluation.metrics.state_errors import median, root_mean_square, state_errors
 
 DIGITS = 6
 
 
-def agent_rows(truth: Side, other: Side, match: Index, counted: Mask, switched: Mask) -> list[dict[str, Any]]:
-    """One row per counted truth agent: whom it was matched with and how far off that was. Sizes are signed errors."""
+def agent_rows(
+    truth: StateTable, other: StateTable, match: Index, counted: Mask, switched: Mask
+) -> list[dict[str, Any]]:
+    """Make one row per counted truth agent: its matches and errors; size errors are signed."""
     errors = state_errors(truth, other, match, counted)
     rows = []
     for i in np.flatnonzero(counted.any(1)):
@@ -43,29 +45,29 @@ def agent_rows(truth: Side, other: Side, match: Index, counted: Mask, switched: 
     return rows
 
 
-def false_rows(other: Side, false: Mask, hit: Mask) -> list[dict[str, Any]]:
-    """One row per reconstructed agent that is false at some tick."""
+def false_rows(other: StateTable, false: Mask, hit: Mask) -> list[dict[str, Any]]:
+    """Make one row per reconstructed agent that is false at some tick."""
     return [
         {
             "id": other.ids[j],
             "category": str(other.category[j]),
             "false_ticks": int(false[j].sum()),
             "matched_ticks": int(hit[j].sum()),
-            "ticks": int(other.there[j].sum()),
+            "ticks": int(other.present[j].sum()),
             "mean_range_m": float(other.range_m[j, false[j]].mean()),
         }
         for j in np.flatnonzero(false.any(1))
     ]
 
 
-def ignored_rows(other: Side, ignored: Mask) -> list[dict[str, Any]]:
-    """One row per reconstructed agent that is ignored at some tick."""
+def ignored_rows(other: StateTable, ignored: Mask) -> list[dict[str, Any]]:
+    """Make one row per reconstructed agent that is ignored at some tick."""
     return [
         {
             "id": other.ids[j],
             "category": str(other.category[j]),
             "ignored_ticks": int(ignored[j].sum()),
-            "ticks": int(other.there[j].sum()),
+            "ticks": int(other.present[j].sum()),
             "mean_range_m": float(other.range_m[j, ignored[j]].mean()),
         }
         for j in np.flatnonzero(ignored.any(1))
@@ -73,7 +75,7 @@ def ignored_rows(other: Side, ignored: Mask) -> list[dict[str, Any]]:
 
 
 def rounded_tree(value: Any) -> Any:
-    """A document with its floats rounded to micrometers and the like; what is not finite becomes None."""
+    """Round all floats of a document to six decimals; a value that is not finite becomes None."""
     if isinstance(value, dict):
         return {k: rounded_tree(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):

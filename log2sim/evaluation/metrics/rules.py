@@ -1,4 +1,4 @@
-"""What was matched and counted how, in words, for the reader of a metrics file."""
+"""The rules of matching and counting as text, for the reader of a metrics file."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from log2sim.datatypes import GROUPS, Scenario
 from log2sim.evaluation.metrics.align import MAX_TRUTH_GAP_S
 from log2sim.evaluation.metrics.label_coverage import MAX_FRAME_LAG_S, MIN_REGION_SHARE
 from log2sim.evaluation.metrics.pairs import GATE_M, GATE_PER_LENGTH
-from log2sim.evaluation.metrics.state_errors import WALKING_MPS
+from log2sim.evaluation.metrics.state_errors import MIN_WALKING_MPS
 
 IGNORED_RULE = (
     "an unmatched reconstructed agent is neither right nor false at the ticks at which the labels could not have told: "
@@ -19,7 +19,7 @@ IGNORED_RULE = (
 
 
 def matching_rules() -> dict[str, Any]:
-    """How agents were matched."""
+    """Describe how agents are matched."""
     return {
         "gate_m": GATE_M,
         "gate_per_length": GATE_PER_LENGTH,
@@ -28,14 +28,14 @@ def matching_rules() -> dict[str, Any]:
         "last match kept while within the gate, then most pairs with least total distance; "
         "categories of one group match freely, across groups a match is neither found nor false",
         "similarity": "HOTA: 1 - distance / gate, mean over thresholds 0.05 to 0.95",
-        "yaw": f"vehicles, two-wheelers and pedestrians of at least {WALKING_MPS:g} m/s; flipped: more than 90 degrees",
+        "yaw": f"vehicles, two-wheelers and pedestrians of at least {MIN_WALKING_MPS:g} m/s; flipped: more than 90 degrees",
         "speed": "signed along the heading; along the true heading where the box is flipped",
         "size": "median over truth agents of the mean absolute error of length, width and height",
     }
 
 
 def counting_rules(truth: Scenario, min_s: float) -> dict[str, Any]:
-    """What was counted; `min_s` is the least time a truth agent has to count for."""
+    """Describe what is counted; `min_s` is the shortest counted time of a truth agent, s."""
     return {
         "min_s": min_s,
         "max_truth_gap_s": MAX_TRUTH_GAP_S,

@@ -7,20 +7,30 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.evaluation.metrics.align import Side
+from log2sim.evaluation.metrics.align import StateTable
 from log2sim.evaluation.metrics.pairs import Index, Mask
 from log2sim.geometry import Array, wrap_angle
 
-WALKING_MPS = 0.5
-"""A pedestrian slower than this has no heading that could be right or wrong."""
+MIN_WALKING_MPS = 0.5
+"""The heading of a slower pedestrian does not count."""
 
 
 @dataclass(frozen=True, eq=False)
 class StateErrors:
-    """One row per matched agent-tick (K,): `truth` and `tick` index it, `other` is the reconstructed agent.
+    """Errors of K matched agent-ticks.
 
-    `position_m` 2D distance of centers, `yaw_rad` absolute in [0, pi] (NaN where yaw does not count), `speed_mps`
-    signed, `size_m` (K, 3) signed length, width, height.
+    Attributes
+    ----------
+    truth, tick, other : (K,) int64
+        Indices of the truth agent, the tick and the reconstructed agent.
+    position_m : (K,) float64
+        2D distance of box centers.
+    yaw_rad : (K,) float64
+        Absolute, in [0, pi]; NaN where yaw does not count.
+    speed_mps : (K,) float64
+        Signed.
+    size_m : (K, 3) float64
+        Signed errors of length, width, height.
     """
 
     truth: Index
@@ -32,7 +42,7 @@ class StateErrors:
     size_m: Array
 
     def take(self, index: Mask) -> StateErrors:
-        """The rows at `index`."""
+        """Return the rows at `index`."""
         return StateErrors(
             self.truth[index],
             self.tick[index],
@@ -44,20 +54,20 @@ class StateErrors:
         )
 
 
-def state_errors(truth: Side, other: Side, match: NDArray[np.int64], counted: Mask) -> StateErrors:
+def state_errors(truth: StateTable, other: StateTable, match: NDArray[np.int64], counted: Mask) -> StateErrors:
     """Compare matched states at the counted ticks.
 
     Notes
     -----
-    Yaw counts for vehicles, two-wheelers and pedestrians of at least 0.5 m/s. A box turned by more than 90 degrees has
-    its speed taken along the truth's heading, so that a flipped box is an error of yaw and not once more of speed.
+    Yaw counts for vehicles, two-wheelers and pedestrians of at least 0.5 m/s. The speed of a box turned by more than 90
+    degrees is taken along the truth's heading, so that a flipped box is an error of yaw only.
     """
     i, t = np.nonzero(counted & (match >= 0))
     j = match[i, t]
     gap = other.xy_m[j, t] - truth.xy_m[i, t]
     yaw = np.abs(wrap_angle(other.yaw_rad[j, t] - truth.yaw_rad[i, t]))
     sign = np.where(yaw > np.pi / 2, -1.0, 1.0)
-    walking = (truth.group[i] != "pedestrian") | (np.abs(truth.speed_mps[i, t]) >= WALKING_MPS)
+    walking = (truth.group[i] != "pedestrian") | (np.abs(truth.speed_mps[i, t]) >= MIN_WALKING_MPS)
     headed = walking & (truth.group[i] != "other")
     return StateErrors(
         truth=i,
@@ -71,7 +81,7 @@ def state_errors(truth: Side, other: Side, match: NDArray[np.int64], counted: Ma
 
 
 def summarize(errors: StateErrors) -> dict[str, float | None]:
-    """Figures over all rows; None where there is nothing to compute one from.
+    """Summarize all rows; a figure without rows is None.
 
     Notes
     -----
@@ -96,7 +106,7 @@ def summarize(errors: StateErrors) -> dict[str, float | None]:
 
 
 def agent_means(agent: Index, values: Array) -> Array:
-    """Mean rows (K', V) of the values (K, V) of each agent that occurs in `agent` (K,)."""
+    """Average values (K, V) over the rows of each agent that occurs in `agent` (K,): (A', V)."""
     names, index, count = np.unique(agent, return_inverse=True, return_counts=True)
     total = np.zeros((len(names), values.shape[1]))
     np.add.at(total, index, values)
@@ -104,10 +114,10 @@ def agent_means(agent: Index, values: Array) -> Array:
 
 
 def root_mean_square(values: Array) -> float | None:
-    """Root of the mean square of (K,) values; None of none."""
+    """Compute the root mean square of values (K,); None without any."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else None
 
 
 def median(values: Array) -> float | None:
-    """Median of (K,) values; None of none."""
+    """Compute the median of values (K,); None without any."""
     return float(np.median(values)) if len(values) else None

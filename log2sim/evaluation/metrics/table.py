@@ -1,4 +1,4 @@
-"""A result as a short table for a terminal."""
+"""Metrics as a table for the terminal."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ COLUMNS = (
 
 
 def format_table(result: Mapping[str, Any]) -> str:
-    """Lay out a result of `evaluate`: one line for all, one per range and category, one for the ego; '-' for none."""
+    """Format a result of `evaluate`: a line for all, for each range and category, and for the ego; '-' for None."""
     lines = [("all", result)]
     lines += [(f"{name} m", figures) for name, figures in (result["by_range"] or {}).items()]
     lines += list(result["by_category"].items())

@@ -1,4 +1,4 @@
-"""Turns the labels of a log into a truth scenario."""
+"""The truth scenario of a log from its labels and ego poses."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from log2sim.registry import nearest
 MIN_POINTS = 20
 MIN_IMAGE_SHARE = 0.5
 MAX_LAG_S = 0.1
-"""A label is compared with the sweep and the frames nearest in time, and with none that is farther off than this."""
+"""A label is compared with the nearest sweep and frames within this time."""
 SPEED_WINDOW_S = 0.25
-STATIC_REACH_M = 0.5
-STATIC_SPEED_MPS = 0.2
+MAX_STATIC_REACH_M = 0.5
+MAX_STATIC_DRIFT_MPS = 0.2
 POINT_TIME_STEP_NS = 1_000_000
 
 Progress = Callable[[int, int], None]
@@ -34,7 +34,7 @@ def truth_from_log(log: Log, *, cameras: Sequence[str] | None = None, progress: 
     ----------
     log : Log
     cameras : sequence of str, optional
-        Cameras that were used; only what they see counts as visible. Default: all.
+        Cameras that were used, all by default; only what they show counts as visible.
     progress : callable, optional
         Called with (sweeps done, all sweeps); every sweep is read once.
 
@@ -48,7 +48,7 @@ def truth_from_log(log: Log, *, cameras: Sequence[str] | None = None, progress: 
     Notes
     -----
     A box is visible when at least half of its outline is inside a used camera's image and at least 20 LiDAR points are in
-    it; a log without cameras or without LiDAR is judged by what it has, one that states visibility is taken at its word.
+    it. Without cameras or without LiDAR the other condition decides; visibility that the log states takes precedence.
     """
     labels = log.labels
     if labels is None or len(labels.t_ns) == 0:
@@ -86,7 +86,7 @@ def truth_from_log(log: Log, *, cameras: Sequence[str] | None = None, progress: 
 
 
 def points_in_labels(log: Log, labels: Labels, progress: Progress | None = None) -> tuple[NDArray[np.int64], int]:
-    """Count the points (L,) inside each box, all LiDARs together, and the sweeps that could not be read."""
+    """Count the points (L,) of all LiDARs inside each box, and the sweeps that could not be read."""
     counts = np.zeros(len(labels.t_ns), dtype=np.int64)
     streams = [(name, log.streams[name]) for name in log.lidars if name in log.streams]
     total, done, unreadable = sum(len(s.t_ns) for _, s in streams), 0, 0
@@ -108,7 +108,7 @@ def points_in_labels(log: Log, labels: Labels, progress: Progress | None = None)
 
 
 def in_some_image(log: Log, labels: Labels, cameras: Sequence[str], asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mark (L,) the boxes that are at least half inside some camera's image; only those `asked` for are looked at."""
+    """Mark (L,) those of the boxes `asked` (L,) that are at least half inside some camera's image."""
     found = np.zeros(len(labels.t_ns), dtype=bool)
     for name in cameras:
         stream = log.streams.get(name)
@@ -127,7 +127,7 @@ def in_some_image(log: Log, labels: Labels, cameras: Sequence[str], asked: NDArr
 def nearest_record(
     stream_t_ns: NDArray[np.int64], t_ns: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Index (L,) of the record nearest to each stamp and whether it is near enough; stamps of a stream need no order."""
+    """Find the record (L,) nearest to each stamp and whether it is within `MAX_LAG_S`; stamps may be in any order."""
     if len(stream_t_ns) == 0:
         return np.zeros(len(t_ns), dtype=np.int64), np.zeros(len(t_ns), dtype=bool)
     order = np.argsort(stream_t_ns, kind="stable")
@@ -154,7 +154,7 @@ def _points_map(log: Log, lidar: str, sweep: Sweep) -> NDArray[np.floating[Any]]
 
 
 def _rows_by_track(labels: Labels) -> list[NDArray[np.int64]]:
-    """Rows of each track in the order of time; of two rows of one track at one stamp the first is kept."""
+    """List the rows of each track in order of time; of two rows of one track at one stamp the first."""
     _, track = np.unique(labels.track_id, return_inverse=True)
     order = np.lexsort((labels.t_ns, track))
     t, k = labels.t_ns[order], track[order]
@@ -170,7 +170,7 @@ def _label_agent(labels: Labels, visible: NDArray[np.bool_], rows: NDArray[np.in
     track_id = str(labels.track_id[rows[0]])
     length, width, height = np.median(labels.size_m[rows], axis=0).tolist()
     return Agent(
-        # The id "ego" is the ego's alone.
+        # The id "ego" is reserved.
         id=track_id if track_id != "ego" else "label-ego",
         category=str(labels.category[rows[0]]),
         size_m=(length, width, height),
@@ -180,7 +180,7 @@ def _label_agent(labels: Labels, visible: NDArray[np.bool_], rows: NDArray[np.in
 
 
 def _ego_poses(log: Log) -> tuple[NDArray[np.int64], Array]:
-    """Stamps (T,) of the reference camera (or of the poses, without one) and the known ego poses (T, 4, 4) there."""
+    """Return stamps (T,) of the reference camera, or of the poses without one, and the ego poses (T, 4, 4) known there."""
     if log.ego is None:
         return np.zeros(0, dtype=np.int64), np.zeros((0, 4, 4))
     name = log.reference_camera or next(iter(log.cameras), None)
@@ -221,22 +221,22 @@ def _waypoints(t_s: Array, center: Array, yaw: Array, speed: Array, visible: NDA
 
 
 def is_static(t_s: Array, xy_m: Array) -> bool:
-    """Whether positions (T, 2) stay within half a meter of their mean without drifting off."""
+    """Tell whether positions (T, 2) stay within half a meter of their mean without drift."""
     if len(t_s) < 2:
         return False
     away = xy_m - xy_m.mean(axis=0)
     since = t_s - t_s.mean()
     drift_mps = np.hypot(*(since @ away / (since @ since)))
-    return bool(np.hypot(away[:, 0], away[:, 1]).max() <= STATIC_REACH_M and drift_mps <= STATIC_SPEED_MPS)
+    return bool(np.hypot(away[:, 0], away[:, 1]).max() <= MAX_STATIC_REACH_M and drift_mps <= MAX_STATIC_DRIFT_MPS)
 
 
 def speed_along(t_s: Array, xy_m: Array, yaw_rad: Array) -> Array:
-    """Speeds (T,) along the heading from positions (T, 2): the slope of a line fitted to a quarter second each side.
+    """Estimate the speed (T,), m/s, along the heading by a line fitted to positions (T, 2) within a quarter second.
 
     Notes
     -----
-    A difference of neighbors would turn 5 cm of label noise into 0.7 m/s; at 10 Hz the fit leaves 0.16 m/s. A waypoint
-    with no neighbor within the window takes the slope to its neighbors, a single one has speed 0.
+    5 cm of label noise give 0.7 m/s in differences of neighbors, 0.16 m/s in the fit at 10 Hz. A waypoint with no neighbor
+    within the window takes the slope to its neighbors, a single one has speed 0.
     """
     if len(t_s) < 2:
         return np.zeros(len(t_s))

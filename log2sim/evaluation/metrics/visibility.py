@@ -1,4 +1,4 @@
-"""Which labeled boxes a camera and a LiDAR could see."""
+"""Visibility of boxes: LiDAR points inside them and the share of their outline in an image."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SAMPLES_PER_SIDE = 32
 
 
 class PointGrid:
-    """Points (N, 3) sorted into columns of 2 x 2 m, so that those near a box are found without looking at all."""
+    """Points (N, 3) sorted into cells of 2 x 2 m, to count those in a box without testing all."""
 
     def __init__(self, points: NDArray[np.floating]) -> None:
         self._corner = points[:, :2].min(axis=0) if len(points) else np.zeros(2)
@@ -24,7 +24,7 @@ class PointGrid:
         self._key, self._points = key[order], points[order].astype(np.float64)
 
     def count(self, center_m: Array, size_m: Array, yaw_rad: float) -> int:
-        """Number of points inside one upright box."""
+        """Count the points inside one upright box."""
         reach = np.hypot(size_m[0], size_m[1]) / 2
         low = np.floor((center_m[:2] - reach - self._corner) / CELL_M).astype(np.int64)
         high = np.floor((center_m[:2] + reach - self._corner) / CELL_M).astype(np.int64)
@@ -40,13 +40,13 @@ class PointGrid:
 
 
 def image_shares(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Array, yaw_rad: Array) -> Array:
-    """Share (M,) of the outline of each box (M) in the map that falls inside the image.
+    """Compute the share (M,) of the outline of each box of the map frame that lies inside the image.
 
     Notes
     -----
-    The outline is the convex hull of the part of the box in front of the camera, on the plane at depth 1, where edges stay
-    straight whatever the lens does. Its share is that of a grid of samples, good to 1 or 2 %: a clipped area would need
-    the border of the image on that plane, which a strongly bent lens model does not always have.
+    The outline is the convex hull of the part of the box in front of the camera on the plane at depth 1, where edges are
+    straight for any lens. The share is that of a grid of samples, accurate to 1 or 2 %: exact clipping would need the
+    image border on that plane, which does not exist for every strong distortion.
     """
     corners = box_corners(center_m, size_m, yaw_rad)
     in_cam = apply(cam_T_map, corners.reshape(-1, 3))
@@ -63,12 +63,12 @@ def image_shares(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Arra
 
 
 def image_samples(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Array, yaw_rad: Array) -> list[Array]:
-    """Pixels (S, 2) spread evenly over what the image shows of the outline of each box (M); none where it shows nothing.
+    """Sample pixels (S, 2) evenly over the part of each box's outline inside the image; none for a box outside.
 
     Notes
     -----
-    As in `image_shares`, but only samples near the view are drawn: a box beside the camera has an outline on the plane at
-    depth 1 so wide that a grid over all of it would step over the image.
+    As in `image_shares`, but with a grid over the view only: next to the camera an outline on the plane at depth 1 can be
+    so wide that a grid over all of it has no sample inside the image.
     """
     corners = apply(cam_T_map, box_corners(center_m, size_m, yaw_rad).reshape(-1, 3)).reshape(-1, 8, 3)
     low, high = _view(camera)
@@ -82,15 +82,15 @@ def image_samples(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Arr
 
 
 def _view(camera: Camera) -> tuple[Array, Array]:
-    """Corners (2,), (2,) of a part of the plane at depth 1 that holds the view: the view itself without a lens."""
+    """Bound the view on the plane at depth 1 by corners (2,), (2,); exact without distortion."""
     size, focal = np.array([camera.width_px, camera.height_px]), np.diag(camera.K)[:2]
     low, high = -camera.K[:2, 2] / focal, (size - camera.K[:2, 2]) / focal
-    # No lens that this plane can hold shows more than three times what its focal length says.
+    # Distortion widens a view on this plane to at most three times that of a pinhole.
     return (low, high) if camera.distortion_model == "none" else (3 * low, 3 * high)
 
 
 def _samples(outline: Array, lowest: Array | float = -np.inf, highest: Array | float = np.inf) -> Array:
-    """Points (S, 2) of a regular grid inside a convex outline (K, 2), counter-clockwise, and between two corners (2,)."""
+    """Make a regular grid of points (S, 2) inside a convex outline (K, 2), counter-clockwise, and between two corners (2,)."""
     if len(outline) < 3:
         return np.zeros((0, 2))
     low, high = np.maximum(outline.min(axis=0), lowest), np.minimum(outline.max(axis=0), highest)
@@ -117,7 +117,7 @@ def _front_outline(corners_cam: Array) -> Array:
 
 
 def convex_hull(points: Array) -> Array:
-    """Convex hull (K, 2), counter-clockwise, of points (N, 2).
+    """Compute the convex hull (K, 2), counter-clockwise, of points (N, 2).
 
     Notes
     -----
