@@ -12,7 +12,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from log2sim.export.exporters import Options, export
 from log2sim.geometry import wrap_angle
 from log2sim.simulation import follower
 from log2sim.simulation.carla.assets import BY_CATEGORY, nearest_assets
+from log2sim.simulation.carla.data import controller_data
 from log2sim.simulation.carla.player import CarlaActor, SampledTrajectory, VehicleController, main, size_table
 from log2sim.simulation.vehicles.parameters import parameters_for
 from log2sim.simulation.vehicles.vehicle import VehicleState
@@ -142,6 +143,8 @@ def test_data_of_something_else_are_refused(text: str, tmp_path: Path, capsys: p
 
 # ---- the controller
 
+GAINS = SimpleNamespace(**controller_data())
+
 
 def test_the_script_follows_as_the_shim_does() -> None:
     """The scalar controller against log2sim.simulation.follower, over 300 steps of random states."""
@@ -150,7 +153,7 @@ def test_the_script_follows_as_the_shim_does() -> None:
     one, parameters = np.ones(1), parameters_for([left_turn()])
     wheelbase, lock = float(parameters.wheelbase_m[0]), float(parameters.max_steer_rad[0])
     limits = (float(parameters.max_throttle_mps2[0]), float(parameters.max_brake_mps2[0]), math.tan(lock) / wheelbase)
-    memory, own = follower.ControllerMemory.fresh(1), VehicleController(*limits)
+    memory, own = follower.ControllerMemory.fresh(1), VehicleController(GAINS, *limits)
     empty = {f: np.zeros(1) for f in VehicleState.__dataclass_fields__}
     for k in range(300):
         speed = 0.0 if k % 10 == 0 else rng.normal(4, 5)
@@ -172,7 +175,7 @@ def test_the_script_follows_as_the_shim_does() -> None:
 def test_following_is_the_same_in_a_mirror() -> None:
     """The controller runs in CARLA's left-handed frame, where left and right are exchanged."""
     rng = np.random.default_rng(4)
-    one, other = VehicleController(6.0, 10.0, 0.3), VehicleController(6.0, 10.0, 0.3)
+    one, other = VehicleController(GAINS, 6.0, 10.0, 0.3), VehicleController(GAINS, 6.0, 10.0, 0.3)
     for _ in range(100):
         x, y, yaw, wx, wy, wyaw, speed, course_speed, accel, curvature = rng.normal(0, 1, 10)
         pedal, bend, _ = one.step((wx, wy, wyaw, course_speed, accel, curvature, 1.0, 0.0), (x, y, yaw), speed, 0.05)

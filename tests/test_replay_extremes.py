@@ -250,7 +250,7 @@ def test_a_teleport_is_flagged_and_not_chased(dt_s, category):
     x, y = np.where(after, 80.0, 4 * t), np.where(after, 30.0 + 4 * (t - 3.0), 0.0)
     agent = agent_from(t, x, y, np.where(after, np.pi / 2, 0.0), 0 * t + 4.0, category=category)
     r = followed(agent, dt_s=dt_s)
-    assert any("leaps at 3.00 s" in flag for flag in r.flags)
+    assert any("discontinuous at 3.00 s" in flag for flag in r.flags)
     before = r.t_s < 3.0 - 1e-6
     np.testing.assert_allclose(r.y_m[before], 0.0, atol=1e-6)
     np.testing.assert_allclose(r.x_m[before], 4 * r.t_s[before], atol=0.05)

@@ -132,7 +132,7 @@ def test_after_a_leap_of_the_log_the_vehicle_goes_on_where_the_log_does(later_s)
     t, x = w.t_s + later_s * (w.t_s > 0), w.x_m + 10 * later_s * (w.t_s > 0)
     leaping = changed(agent, waypoints=changed(w, t_s=t, x_m=x + np.where(w.t_s >= 3.0, 40.0, 0.0)))
     result, metrics, _ = followed(leaping)
-    assert any(f"leaps at {3 + later_s:.2f} s" in flag for flag in result.flags)
+    assert any(f"discontinuous at {3 + later_s:.2f} s" in flag for flag in result.flags)
     assert np.abs(result.y_m).max() < 1e-6
     assert np.abs(np.diff(result.x_m)).max() == pytest.approx(40.5, abs=0.3)
     assert metrics["along_track_rms_m"] < 0.05

@@ -223,7 +223,7 @@ def test_an_ego_that_does_not_brake_has_a_collision_that_the_log_has_not_and_str
         require_strict(reckless)
 
 
-def test_strict_names_leaps_and_vehicles_off_their_path():
+def test_strict_names_discontinuities_and_vehicles_off_their_path():
     t = T_S
     sharp = agent_from(
         t,
@@ -236,7 +236,7 @@ def test_strict_names_leaps_and_vehicles_off_their_path():
     broken = check_strict(replay(scenario_of(sharp)))
     assert any(line.startswith("agent 'sharp'") and "off its path" in line for line in broken)
     leap = agent_from(t, 5 * t + np.where(t > 2.05, 30, 0), 0 * t, 0 * t, np.full(41, 5.0), id="leap")
-    assert any("leaps" in line for line in check_strict(replay(scenario_of(leap))))
+    assert any("discontinuous" in line for line in check_strict(replay(scenario_of(leap))))
 
 
 def test_overall_errors_weigh_every_sample_alike():

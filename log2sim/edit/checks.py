@@ -49,7 +49,9 @@ def _collisions(before: Scenario, after: Scenario, changed: Set[str]) -> Iterato
 def _overlaps(scenario: Scenario, changed: Set[str]) -> Sequence[dict[str, Any]]:
     """Collisions as a replay of the waypoints themselves tells them: pairs of boxes of which one moves or was moved."""
     agents = (replace(a, static=a.static and not (a.id in changed and len(a.waypoints) > 1)) for a in scenario.agents)
-    return replay(replace(scenario, agents=tuple(agents)), mode="exact", dt_s=STEP_S).metrics["collisions"]
+    replayed = replay(replace(scenario, agents=tuple(agents)), mode="exact", dt_s=STEP_S)
+    collisions: Sequence[dict[str, Any]] = replayed.metrics["collisions"]
+    return collisions
 
 
 @dataclass(frozen=True)

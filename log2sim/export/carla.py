@@ -17,7 +17,7 @@ from log2sim.export.exporters import Options
 from log2sim.export.placement import Placement
 from log2sim.export.roads.opendrive import add_road_file
 from log2sim.simulation.carla import player
-from log2sim.simulation.carla.data import carla_agents
+from log2sim.simulation.carla.data import carla_agents, controller_data
 
 MODES = ("exact", "pid")
 
@@ -41,6 +41,7 @@ class Carla:
             "mode": mode,
             "road": road,
             "offset_m": [x, 0.0 - y, z],  # to be added to the coordinates in the file, for those of the map
+            "controller": controller_data(),
             "agents": carla_agents([_placed(a, placement) for a in scenario.agents]),
         }
         text = json.dumps(data, allow_nan=False, ensure_ascii=False)

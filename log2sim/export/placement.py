@@ -27,14 +27,16 @@ class Placement:
 
     def forward(self, states: Array) -> Array:
         """States (N, 4) x, y, z, heading of the scenario in the export."""
-        origin, offset = np.array([*self.origin_m, 0.0]), np.array([*self.offset_m, 0.0])
+        origin: Array = np.array([*self.origin_m, 0.0])
+        offset: Array = np.array([*self.offset_m, 0.0])
         if self.target is None:
             return states - origin
         return self._projected(states + offset, self.projection, self.target) - origin
 
     def back(self, states: Array) -> Array:
         """States (N, 4) of the export in the scenario."""
-        origin, offset = np.array([*self.origin_m, 0.0]), np.array([*self.offset_m, 0.0])
+        origin: Array = np.array([*self.origin_m, 0.0])
+        offset: Array = np.array([*self.offset_m, 0.0])
         if self.target is None:
             return states + origin
         return self._projected(states + origin, self.target, self.projection) - offset

@@ -12,20 +12,19 @@ SIMULATORS = ("own", "carla")
 
 
 def external_simulator(name: str, address: str | None, port: int | None, map: str | None) -> ExternalSimulator | None:
-    """Return the simulator of a name, connected by address and port, with a town or OpenDRIVE file to load; None for
-    the embedded one.
+    """Return the simulator of a name, with an address, port and world (town or OpenDRIVE file); None for the embedded one.
 
     Raises
     ------
     ConfigError
-        When there is none of that name, it has no use for what is given, or the file does not exist.
+        For an unknown name, options that it does not use, or a missing file.
     """
     if name not in SIMULATORS:
         raise ConfigError(
             f"unknown simulator '{name}'{nearest(name, list(SIMULATORS))}; known: {', '.join(SIMULATORS)}"
         )
     if name == "own":
-        if not address is port is map is None:
+        if address is not None or port is not None or map is not None:
             raise ConfigError("--host, --port and --map are for --simulator carla; add it, or leave them out")
         return None
     from log2sim.simulation.carla.simulator import CarlaServer, CarlaSimulator

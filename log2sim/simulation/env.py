@@ -156,9 +156,7 @@ class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
         return self._shown(), float(sum(parts.values())), collides or arrived, truncated, info
 
     def render(self) -> Any:
-        """Draw the surroundings of the ego from above, (400, 400, 3) uint8, ego's front to the right; None without a
-        render mode.
-        """
+        """Draw the surroundings of the ego from above, (400, 400, 3) uint8, its front to the right; None without render mode."""
         return _rendered(self._seen) if self._begun and self.render_mode == "rgb_array" else None
 
     def _shown(self) -> ObservationArrays:
@@ -241,8 +239,8 @@ def _rendered(seen: Observation) -> Any:
     axes.add_collection(PolyCollection(list(others), facecolor="#7aa6c2", edgecolor="#33566b"))
     own = box_corners_bev([[0.0, 0.0]], ego.length_m, ego.width_m, 0.0)
     axes.add_collection(PolyCollection(list(own), facecolor="#1f2933"))
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    canvas.draw()  # type: ignore[no-untyped-call]
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[no-untyped-call]
 
 
 gymnasium.register(ID, entry_point="log2sim.simulation.env:ScenarioEnv")

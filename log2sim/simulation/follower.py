@@ -44,6 +44,11 @@ class ControllerGains:
         drives up.
     max_lateral_accel_mps2 : float
         Grip of a dry road.
+    integral_limit_mps2 : float
+    integral_share : float
+        Limit of the lateral integral, as a share of the curvature that steering and grip allow.
+    max_along_m : float, m
+        Longest extrapolation along the arc at the reference; limits catching up to 2.5 m/s.
     """
 
     along_s: float = 0.6
@@ -57,15 +62,14 @@ class ControllerGains:
     hold_brake_mps2: float = 2.0
     hold_within_m: float = 0.1
     max_lateral_accel_mps2: float = 9.0
+    integral_limit_mps2: float = 1.0
+    integral_share: float = 0.2
+    max_along_m: float = 3.0
 
 
 GAINS = ControllerGains()
-INTEGRAL_LIMIT_MPS2 = 1.0
-INTEGRAL_SHARE = 0.2  # of the curvature that steering and grip allow
 MAX_CONTROL_STEP_S = 0.1
 """Longest time for which controls are held: a third of the shortest time in which an error decays."""
-
-MAX_ALONG_M = 3.0  # longest extrapolation along the arc at the reference; limits catching up to 2.5 m/s
 
 
 def control_step(dt_s: float) -> float:
@@ -119,7 +123,7 @@ def follow_vehicles(
     pace = np.abs(state.speed_mps)
     moves, square = pace > 0, pace * pace
     gear = np.sign(state.speed_mps + TINY * reference_gear)
-    error, raw_rate = _errors(row, state)
+    error, raw_rate = _errors(row, state, gains)
     rate = memory.rate - math.expm1(-dt_s / gains.derivative_filter_s) * (raw_rate - memory.rate)
     damping = 2 * gains.damping * rate
     damping[1] *= gear  # in reverse, turning to the left leads to the right
@@ -135,9 +139,9 @@ def follow_vehicles(
     # Anti-windup: the integral does not grow while an actuator is at its limit, while a vehicle far behind catches up, or
     # at standstill.
     integrates = (given == asked) | (error * wanted <= 0)
-    integrates[0] &= np.abs(error[0]) < MAX_ALONG_M
+    integrates[0] &= np.abs(error[0]) < gains.max_along_m
     integrates[1] &= moves
-    bound = rows(INTEGRAL_LIMIT_MPS2, INTEGRAL_SHARE * grip)
+    bound = rows(gains.integral_limit_mps2, gains.integral_share * grip)
     integral = memory.integral + (dt_s / gains.integral_s) * pull * integrates
     integral = np.minimum(np.maximum(integral, -bound), bound)
 
@@ -149,7 +153,7 @@ def follow_vehicles(
     return controls, ControllerMemory(integral, rate)
 
 
-def _errors(row: Array, state: VehicleState) -> tuple[Array, Array]:
+def _errors(row: Array, state: VehicleState, gains: ControllerGains) -> tuple[Array, Array]:
     """Return errors along and across the path in m (2, A), and their derivatives: speed difference, slope toward the path.
 
     They are taken at the foot point: the arc at the reference is followed back by the error along it, so a vehicle that
@@ -159,7 +163,7 @@ def _errors(row: Array, state: VehicleState) -> tuple[Array, Array]:
     cos, sin = cos_sin(yaw)
     dx, dy = x - state.x_m, y - state.y_m
     along = cos * dx + sin * dy
-    along = np.minimum(np.maximum(along, -MAX_ALONG_M), MAX_ALONG_M)
+    along = np.minimum(np.maximum(along, -gains.max_along_m), gains.max_along_m)
     turn = curvature * along
     across = cos * dy - sin * dx + turn * along / 2
     _, slope = cos_sin(yaw - turn - state.yaw_rad)

@@ -62,7 +62,9 @@ class AgentGroup(ABC):
     driver = "exact"
     follows_log_time = True  # its agents are where the log has them at the same time, after a discontinuity too
 
-    def __init__(self, agents: Sequence[Agent], references: Sequence[Reference], first: NDArray, last: NDArray) -> None:
+    def __init__(
+        self, agents: Sequence[Agent], references: Sequence[Reference], first: NDArray[np.intp], last: NDArray[np.intp]
+    ) -> None:
         self.agents, self.references, self.first, self.last = tuple(agents), tuple(references), first, last
         self.origin_x_m = np.array([r.trajectory.origin_m[0] for r in references])
         self.origin_y_m = np.array([r.trajectory.origin_m[1] for r in references])
@@ -97,7 +99,7 @@ class AgentGroup(ABC):
         self.row = lower + (place - k) * (self._table[k + 1] - lower)
 
     @abstractmethod
-    def place(self, index: NDArray, t_s: float) -> None:
+    def place(self, index: NDArray[np.intp], t_s: float) -> None:
         """Put the agents at `index` (of all agents of the group) on their references at a time."""
 
     @abstractmethod
@@ -116,17 +118,17 @@ class AgentGroup(ABC):
     def _step(self, dt_s: float) -> None:
         """Move the living agents with their present controls."""
 
-    def _exact(self, index: NDArray, t_s: float) -> Array:
+    def _exact(self, index: NDArray[np.intp], t_s: float) -> Array:
         return np.stack([self.references[i].exact(np.array([t_s]))[0] for i in index], axis=1)
 
-    def _slots(self, index: NDArray) -> NDArray:
+    def _slots(self, index: NDArray[np.intp]) -> NDArray[np.intp]:
         return np.searchsorted(self.live, index)
 
 
 class LogReplayGroup(AgentGroup):
     """Agents that are exactly where the log has them."""
 
-    def place(self, index: NDArray, t_s: float) -> None:
+    def place(self, index: NDArray[np.intp], t_s: float) -> None:
         """Do nothing: the agents are always on their references."""
         pass
 
@@ -150,8 +152,8 @@ class VehicleGroup(AgentGroup):
         self,
         agents: Sequence[Agent],
         references: Sequence[Reference],
-        first: NDArray,
-        last: NDArray,
+        first: NDArray[np.intp],
+        last: NDArray[np.intp],
         parameters: VehicleParameters,
         simulator: Simulator,
     ) -> None:
@@ -162,7 +164,7 @@ class VehicleGroup(AgentGroup):
         self._all_commands = VehicleControls(np.zeros(len(agents)), np.zeros(len(agents)), np.zeros(len(agents), bool))
         self._open(self.live)
 
-    def _open(self, live: NDArray) -> None:
+    def _open(self, live: NDArray[np.intp]) -> None:
         self.state, self.memory, self.living = (
             self._all.take(live),
             self._all_memory.take(live),
@@ -178,7 +180,7 @@ class VehicleGroup(AgentGroup):
         super().open_window(begin, end, begin_s, end_s)
         self._open(self.live)
 
-    def place(self, index: NDArray, t_s: float) -> None:
+    def place(self, index: NDArray[np.intp], t_s: float) -> None:
         """Put vehicles on their references, with the slip that the reference has there."""
         slots = self._slots(index)
         state = start_vehicles(self._exact(index, t_s), self.living.take(slots))
@@ -231,8 +233,8 @@ class PedestrianGroup(AgentGroup):
         self,
         agents: Sequence[Agent],
         references: Sequence[Reference],
-        first: NDArray,
-        last: NDArray,
+        first: NDArray[np.intp],
+        last: NDArray[np.intp],
         simulator: Simulator,
     ) -> None:
         super().__init__(agents, references, first, last)
@@ -246,7 +248,7 @@ class PedestrianGroup(AgentGroup):
         super().open_window(begin, end, begin_s, end_s)
         self.state = self._all.take(self.live)
 
-    def place(self, index: NDArray, t_s: float) -> None:
+    def place(self, index: NDArray[np.intp], t_s: float) -> None:
         """Put points on their references."""
         slots = self._slots(index)
         self.state.put(slots, start_points(self._exact(index, t_s)))

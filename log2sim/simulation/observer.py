@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,7 +112,7 @@ class PolicyObserver:
         return Others(_read_only(seen["id"]), _read_only(seen["category"]), *(_read_only(c) for c in columns))
 
 
-def _identities(agents: Sequence[Agent], trajectories: Sequence[Trajectory]) -> NDArray:
+def _identities(agents: Sequence[Agent], trajectories: Sequence[Trajectory]) -> NDArray[Any]:
     """Return id, category, size and logged trajectory of agents as records (A,)."""
     rows = [(a.id, a.category, *a.size_m, trajectory) for a, trajectory in zip(agents, trajectories)]
     sizes = [(k, np.float64) for k in ("length_m", "width_m", "height_m")]
@@ -124,7 +125,7 @@ def _static_poses(agents: Sequence[Agent]) -> Array:
     return np.array(first, dtype=np.float64).reshape(-1, 4).T
 
 
-def _read_only(values: NDArray) -> NDArray:
+def _read_only(values: NDArray[Any]) -> NDArray[Any]:
     """Return the array protected against writing, strings as such and not as objects."""
     out = values.astype(str) if values.dtype == object else np.ascontiguousarray(values)
     out.setflags(write=False)

@@ -50,7 +50,8 @@ def load_policy(name: str) -> Policy:
         raise ConfigError(
             f"policy '{name}': is a {type(target).__name__}, expected a callable policy(observation) -> Controls"
         )
-    return target
+    result: Policy = target
+    return result
 
 
 def _import_module(name: str) -> ModuleType:

@@ -217,7 +217,7 @@ def _gears(speed: Array) -> tuple[Array, Array]:
 
 
 def _discontinuity_flags(trajectory: Trajectory) -> tuple[str, ...]:
-    return tuple(f"the log leaps at {at:.2f} s" for at in trajectory.discontinuity_times())
+    return tuple(f"the log is discontinuous at {at:.2f} s" for at in trajectory.discontinuity_times())
 
 
 def _flags(

@@ -234,7 +234,8 @@ def _standing(start: Element | None, where: str, last_s: float) -> Array:
     if start is None:
         raise ScenarioError(f"{where}: has neither a trajectory nor a position at the start; nothing says where it is")
     pose = _pose(start, where)
-    return np.nan_to_num(np.array([[0.0, *pose], [max(last_s, 1e-3), *pose]]))
+    result: Array = np.nan_to_num(np.array([[0.0, *pose], [max(last_s, 1e-3), *pose]]))
+    return result
 
 
 def _identity(name: str, properties: Mapping[str, str]) -> str:
@@ -296,4 +297,5 @@ def _speed(vertices: Array) -> Array:
     t, x, y, _, heading = vertices.T
     if len(t) < 2 or np.any(np.diff(t) <= 0):
         return np.zeros(len(t))
-    return np.gradient(x, t) * np.cos(heading) + np.gradient(y, t) * np.sin(heading)
+    result: Array = np.gradient(x, t) * np.cos(heading) + np.gradient(y, t) * np.sin(heading)
+    return result

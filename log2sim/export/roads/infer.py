@@ -63,7 +63,7 @@ class Road:
             left = right = aside_m
         probes, tree = self._probes
         near = tree.query(points[:, :2], distance_upper_bound=max(left, right) + PROBE_M)[1]
-        held = near < len(probes)
+        held: NDArray[np.bool_] = near < len(probes)
         x, y, heading = probes[near[held]].T
         dx, dy = points[held, 0] - x, points[held, 1] - y
         along, across = dx * np.cos(heading) + dy * np.sin(heading), dy * np.cos(heading) - dx * np.sin(heading)
@@ -149,7 +149,8 @@ def _monotone(progress: Array) -> Iterator[tuple[int, int, int]]:
 
 def _covered(roads: list[Road], way: Way, aside_m: float | None) -> NDArray[np.bool_]:
     states = way.points[:, [0, 1, 3]]
-    return np.any([road.holds(states, aside_m) for road in roads], axis=0)
+    result: NDArray[np.bool_] = np.any([road.holds(states, aside_m) for road in roads], axis=0)
+    return result
 
 
 def _off_roads(way: Way, roads: list[Road]) -> Iterator[Way]:

@@ -40,7 +40,8 @@ class Piece:
     def end(self) -> Array:
         """x, y, heading (3,) where the piece ends."""
         start = np.array([self.x_m, self.y_m, self.heading_rad])
-        return _along(start, np.array([self.curvature_1pm]), np.array([self.length_m]))[0]
+        result: Array = _along(start, np.array([self.curvature_1pm]), np.array([self.length_m]))[0]
+        return result
 
 
 @dataclass(frozen=True, eq=False)

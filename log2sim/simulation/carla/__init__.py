@@ -1,1 +1,1 @@
-"""CARLA as the simulator: the conversation with a server, the data of a scenario for it, and its assets."""
+"""CARLA as an external simulator: the session with a server, the data of a scenario for it, and its assets."""

@@ -1,8 +1,9 @@
-"""What CARLA can show: its blueprints with the sizes of their boxes, and the one nearest to an agent.
+"""Assets of CARLA: its blueprints with the sizes of their boxes, and the one nearest to an agent.
 
-The sizes are those that a CARLA 0.9.16 server reports for spawned actors (length, width, height, rounded to centimeters), as
-published in tools/carla/snapshots/blueprints_0.9.16.json of the Scenic project. CARLA's boxes include mirrors, riders and
-now and then more: the bus is 3.9 m wide. Police cars, taxis and ambulances are left out; a log's car is none of them.
+The sizes are those that a CARLA 0.9.16 server reports for spawned actors (length, width, height, rounded to
+centimeters), as published in tools/carla/snapshots/blueprints_0.9.16.json of the Scenic project. CARLA's boxes include
+mirrors, riders and sometimes more: the bus is 3.9 m wide. Police cars, taxis and ambulances are left out, since a log's
+category car does not tell them apart.
 """
 
 from __future__ import annotations
@@ -18,7 +19,16 @@ Size = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Asset:
-    """A blueprint and by how much its box is longer, wider and higher than the agent, in m."""
+    """A blueprint and the difference of its size from the agent's.
+
+    Attributes
+    ----------
+    blueprint : str
+    size_m : (3,) tuple of float, m
+        Length, width, height.
+    error_m : (3,) tuple of float, m
+        Size of the blueprint less that of the agent.
+    """
 
     blueprint: str
     size_m: Size
@@ -73,7 +83,7 @@ BICYCLES: Mapping[str, Size] = {
     "vehicle.gazelle.omafiets": (1.84, 0.66, 1.78),
 }
 
-# The box of a walker is its capsule: all adults share one, older and younger children have theirs.
+# The box of a walker is its capsule; adults, older and younger children have one size each.
 _SMALL, _CHILDREN = ("0009", "0010", "0011", "0048", "0049"), ("0012", "0013", "0014")
 
 
@@ -115,7 +125,7 @@ BY_CATEGORY: Mapping[str, Mapping[str, Size]] = {
 
 
 def nearest_assets(agent: Agent, *, turn: int = 0, count: int = 3) -> tuple[Asset, ...]:
-    """The blueprints of an agent's category that are nearest in size (Euclidean over the three lengths), nearest first.
+    """Return the blueprints of an agent's category nearest in size (Euclidean over the three lengths), nearest first.
 
     Among blueprints of one size, such as CARLA's adults, the `turn`-th comes first, so that not all look the same.
     """

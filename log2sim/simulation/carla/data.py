@@ -1,9 +1,10 @@
-"""A scenario as CARLA's script reads it: who looks how, and where each agent is when, in CARLA's frame."""
+"""A scenario as CARLA's script reads it: assets, and the trajectory of each agent in CARLA's frame."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -12,17 +13,23 @@ from numpy.typing import ArrayLike
 from log2sim.datatypes import Agent, Trajectory
 from log2sim.geometry import Array
 from log2sim.simulation.carla.assets import nearest_assets
+from log2sim.simulation.follower import GAINS
 from log2sim.simulation.reference import vehicle_limits, vehicle_reference
-from log2sim.simulation.vehicles.parameters import WHEELED, parameters_for, rear_axle_offset
+from log2sim.simulation.vehicles.parameters import PEDAL_LAG_S, STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
 
 SAMPLE_S = 0.05
-"""Spacing of the samples: between them a straight line errs by at most a h^2 / 8 = 3 mm at 10 m/s2."""
+"""Spacing of the samples; linear interpolation errs by at most a h^2 / 8 = 3 mm at 10 m/s2."""
 
-DISCONTINUITY_S = 1e-6  # a leap of the log becomes two samples so far apart
+DISCONTINUITY_S = 1e-6  # spacing of the two samples at a discontinuity of the log
+
+
+def controller_data() -> dict[str, float]:
+    """Return the gains of the vehicle controller and the lags of its actuators, as `player` reads them."""
+    return {**asdict(GAINS), "pedal_lag_s": PEDAL_LAG_S, "steer_lag_s": STEER_LAG_S}
 
 
 def carla_agents(agents: Sequence[Agent]) -> list[dict[str, Any]]:
-    """Agents as `player` reads them. Their positions should be near the origin: CARLA counts in float32."""
+    """Describe agents as `player` reads them. Their positions should be near the origin: CARLA computes in float32."""
     begin_s = min(float(a.waypoints.t_s[0]) for a in agents)
     end_s = max(float(a.waypoints.t_s[-1]) for a in agents)
     seen: Counter[str] = Counter()
@@ -34,7 +41,7 @@ def carla_agents(agents: Sequence[Agent]) -> list[dict[str, Any]]:
 
 
 def _agent(agent: Agent, turn: int, span_s: tuple[float, float]) -> dict[str, Any]:
-    """One agent; one that stays is there for all of `span_s`, as in log2sim's own simulator."""
+    """Describe one agent; a permanent one is present for all of `span_s`, as in log2sim's own simulator."""
     w, wheeled = agent.waypoints, agent.category in WHEELED
     moves = not agent.static and len(w) > 1
     life_s = span_s if agent.is_permanent else (float(w.t_s[0]), float(w.t_s[-1]))
@@ -53,7 +60,7 @@ def _agent(agent: Agent, turn: int, span_s: tuple[float, float]) -> dict[str, An
         ],
         "begin_s": life_s[0],
         "end_s": life_s[1],
-        "leaps_s": [float(t) for t in trajectory.discontinuity_times()],
+        "discontinuities_s": [float(t) for t in trajectory.discontinuity_times()],
         "drive": None if not moves else "vehicle" if wheeled else "walker" if agent.category == "pedestrian" else None,
         "max_throttle_mps2": None if limits is None else float(limits.max_throttle_mps2[0]),
         "max_brake_mps2": None if limits is None else float(limits.max_brake_mps2[0]),
@@ -65,7 +72,7 @@ def _agent(agent: Agent, turn: int, span_s: tuple[float, float]) -> dict[str, An
 def _trajectories(
     agent: Agent, trajectory: Trajectory, *, drives: bool
 ) -> tuple[dict[str, list[float]], dict[str, list[float]] | None]:
-    """Columns of the logged course and, for a vehicle that drives, of the one that it can drive; both of the box center."""
+    """Return columns of the logged trajectory and, for a vehicle that drives, of the feasible one; both of the box center."""
     t_s = _times(agent, trajectory)
     x, y, yaw, _ = trajectory.relative(t_s)
     z = trajectory.heights(t_s) - agent.size_m[2] / 2
@@ -90,7 +97,7 @@ def _trajectories(
 
 
 def _times(agent: Agent, trajectory: Trajectory) -> Array:
-    """When the course is sampled: regularly, at every waypoint, and just before a leap."""
+    """Return the sample times: regular ones, every waypoint, and one just before a discontinuity."""
     if agent.static:
         return trajectory.t_s[:1]
     regular = np.arange(trajectory.t_s[0], trajectory.t_s[-1], SAMPLE_S)
@@ -106,7 +113,7 @@ def _times(agent: Agent, trajectory: Trajectory) -> Array:
 
 
 def _left_handed(t_s: Array, x: Array, y: Array, z: Array, yaw: Array) -> dict[str, list[float]]:
-    """Columns in CARLA's left-handed frame."""
+    """Convert columns to CARLA's left-handed frame."""
     return {
         "t_s": _rounded(t_s, 7),
         "x_m": _rounded(x),
@@ -117,5 +124,5 @@ def _left_handed(t_s: Array, x: Array, y: Array, z: Array, yaw: Array) -> dict[s
 
 
 def _rounded(values: ArrayLike, digits: int = 4) -> list[float]:
-    """Numbers for the file: a tenth of a millimeter, or of a thousandth of a degree."""
+    """Round for the file: a tenth of a millimeter, or of a thousandth of a degree."""
     return [float(v) for v in np.round(np.asarray(values, dtype=np.float64), digits) + 0.0]

@@ -1,7 +1,7 @@
-"""CARLA as the simulator of a replay: vehicles by its physics, steered by the same controllers as in the shim.
+"""CARLA as the external simulator of a replay: vehicles move by its physics, under the controllers of the embedded replay.
 
-States are read back from CARLA after every tick and controls sent as its vehicles and walkers take them. All conversions of
-frames, pedals and steering are those of `player`, which also is the script that an export writes.
+States are read back from CARLA after every tick, and controls are sent in the form of its vehicles and walkers.
+Conversions of frames, pedals and steering are those of `player`, which is also the script that an export writes.
 """
 
 from __future__ import annotations
@@ -34,7 +34,17 @@ from log2sim.simulation.vehicles.vehicle import (
 
 @dataclass(frozen=True)
 class CarlaServer:
-    """Where a CARLA server listens, and the world that it is to load first, if any: a town or an OpenDRIVE file."""
+    """Address of a CARLA server, and the world that it loads first, if any.
+
+    Attributes
+    ----------
+    host : str
+    port : int
+    timeout_s : float
+    town : str or None
+    opendrive : Path or None
+        An OpenDRIVE file.
+    """
 
     host: str = "127.0.0.1"
     port: int = 2000
@@ -44,7 +54,7 @@ class CarlaServer:
 
 
 class _PendingControls:
-    """The simulator of one group: takes its controls down for the tick, which moves all groups at once."""
+    """The simulator of one group: it records the controls for the tick, which moves all groups at once."""
 
     def __init__(self) -> None:
         self.vehicles = VehicleControls(np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool))
@@ -53,10 +63,12 @@ class _PendingControls:
     def step_vehicles(
         self, state: VehicleState, controls: VehicleControls, parameters: VehicleParameters, dt_s: float
     ) -> VehicleState:
+        """Record the controls of vehicles."""
         self.vehicles = controls
         return state
 
     def step_points(self, state: PointState, controls: PointControls, dt_s: float) -> PointState:
+        """Record the controls of points."""
         self.points = controls
         return state
 
@@ -71,7 +83,7 @@ class CarlaSimulator:
         self.server = server or CarlaServer()
 
     def open(self, groups: Sequence[AgentGroup], clock: StepClock, statics: Sequence[Agent]) -> None:
-        """Connect, and seat the groups.
+        """Connect, and take the groups over.
 
         Raises
         ------
@@ -81,107 +93,106 @@ class CarlaSimulator:
             When no server answers, or it cannot load the world.
         """
         self.clock = clock
-        everybody = [a for g in groups for a in g.agents] + list(statics)
-        taped = [a for g in groups if isinstance(g, LogReplayGroup) and g.follows_log_time for a in g.agents] + list(
-            statics
-        )
-        self.offset_m = _offset_m(everybody)
-        data = {d["id"]: d for d in carla_agents([_shifted(a, self.offset_m) for a in everybody])}
-        self._data, self._courses = data, {k: player.SampledTrajectory(d["exact"]) for k, d in data.items()}
+        all_agents = [a for g in groups for a in g.agents] + list(statics)
+        log_groups = [g for g in groups if isinstance(g, LogReplayGroup)]
+        replayed = [a for g in log_groups if g.follows_log_time for a in g.agents] + list(statics)
+        self.offset_m = _offset_m(all_agents)
+        data = {d["id"]: d for d in carla_agents([_shifted(a, self.offset_m) for a in all_agents])}
+        self._data, self._trajectories = data, {k: player.SampledTrajectory(d["exact"]) for k, d in data.items()}
         self._read: dict[str, tuple[float, float]] = {}
         with _translated_errors():
             carla = player.load_client()
             client = player.connect(carla, self.server.host, self.server.port, self.server.timeout_s)
             world = player.open_world(carla, client, self.server.town, self.server.opendrive)
-            self.carla, self.stage = carla, player.CarlaSession(carla, client, world, clock.dt_s)
+            self.carla, self.session = carla, player.CarlaSession(carla, client, world, clock.dt_s)
             ground = "log" if self.server.town is None and self.server.opendrive is None else "map"
-            shown = {"agents": [data[a.id] for a in taped]}
-            self._player = player.ScenarioPlayer(self.stage, shown, "exact", physics=False, ground=ground)
-        self._fleets = [(g, _PendingControls()) for g in groups if isinstance(g, VehicleGroup)]
-        self._crowds = [(g, _PendingControls()) for g in groups if isinstance(g, PedestrianGroup)]
-        self._delayed = [g for g in groups if isinstance(g, LogReplayGroup) and not g.follows_log_time]
-        for fleet, seat in self._fleets:
-            fleet.simulator = seat
-        for crowd, seat in self._crowds:
-            crowd.simulator = seat
+            shown = {"agents": [data[a.id] for a in replayed]}
+            self._player = player.ScenarioPlayer(self.session, shown, "exact", physics=False, ground=ground)
+        self._vehicle_groups = [(g, _PendingControls()) for g in groups if isinstance(g, VehicleGroup)]
+        self._pedestrian_groups = [(g, _PendingControls()) for g in groups if isinstance(g, PedestrianGroup)]
+        self._delayed = [g for g in log_groups if not g.follows_log_time]
+        for group, pending in self._vehicle_groups:
+            group.simulator = pending
+        for points, pending in self._pedestrian_groups:
+            points.simulator = pending
         with _translated_errors():
-            self.stage.__enter__()
+            self.session.__enter__()
 
     def tick(self, step: int) -> None:
         """Move all groups from a step to the next."""
         with _translated_errors():
             commands = self._player.commands(self.clock.time(step + 1))
-            fleets = [(fleet, seat) for fleet, seat in self._fleets if len(fleet.live)]
-            crowds = [(crowd, seat) for crowd, seat in self._crowds if len(crowd.live)]
-            for fleet, seat in fleets:
-                for slot in self._present(fleet, step):
-                    commands += self._drive(fleet, seat, slot, step)
-            for crowd, seat in crowds:
-                commands += self._walk(crowd, seat, step)
-            for tape in self._delayed:
-                commands += self._show(tape, step)
-            self.stage.send(commands)
-            self.stage.world.tick()
-            for fleet, seat in fleets:
-                self._read_fleet(fleet, seat, step)
-            for crowd, _ in crowds:
-                self._read_crowd(crowd, step)
-            ego = self._courses.get("ego")
+            vehicles = [(group, pending) for group, pending in self._vehicle_groups if len(group.live)]
+            pedestrians = [(points, pending) for points, pending in self._pedestrian_groups if len(points.live)]
+            for group, pending in vehicles:
+                for slot in self._present(group, step):
+                    commands += self._drive(group, pending, slot, step)
+            for points, pending in pedestrians:
+                commands += self._walk(points, pending, step)
+            for delayed in self._delayed:
+                commands += self._show(delayed, step)
+            self.session.send(commands)
+            self.session.world.tick()
+            for group, pending in vehicles:
+                self._read_vehicles(group, pending, step)
+            for points, _ in pedestrians:
+                self._read_points(points, step)
+            ego = self._trajectories.get("ego")
             if ego is not None:
-                self.stage.watch(ego.place(self.clock.time(step + 1)))
+                self.session.watch(ego.place(self.clock.time(step + 1)))
 
     def close(self) -> None:
         """Remove the actors and restore the settings."""
-        self.stage.__exit__()
+        self.session.__exit__()
 
     def _present(self, group: AgentGroup, step: int) -> list[int]:
-        """Slots of the agents that are to be moved; those whose life is over leave CARLA."""
+        """Return the slots of the agents to be moved; those whose lifetime is over are removed from CARLA."""
         slots = []
         for slot, i in enumerate(group.live):
             if group.first[i] <= step < group.last[i]:
                 slots.append(slot)
-            elif group.agents[i].id in self.stage.bodies:
-                self.stage.remove(group.agents[i].id)
+            elif group.agents[i].id in self.session.actors:
+                self.session.remove(group.agents[i].id)
         return slots
 
-    def _drive(self, group: VehicleGroup, seat: _PendingControls, slot: int, step: int) -> Iterator[Any]:
-        """Commands for one vehicle: it is put where its state is unless that came from CARLA, then its inputs."""
+    def _drive(self, group: VehicleGroup, pending: _PendingControls, slot: int, step: int) -> Iterator[Any]:
+        """Yield the commands for one vehicle: its inputs, after its pose unless its state came from CARLA."""
         state, i, command = group.state, group.live[slot], self.carla.command
         name, speed = group.agents[i].id, float(state.speed_mps[slot])
         yaw, offset_m = -float(state.yaw_rad[slot]), float(group.offset_m[i])
-        body = self.stage.bodies.get(name)
-        if body is None or self._read.get(name) != (state.x_m[slot], state.y_m[slot]):
+        actor = self.session.actors.get(name)
+        if actor is None or self._read.get(name) != (state.x_m[slot], state.y_m[slot]):
             x, y = self._to_carla(group, slot, float(state.x_m[slot]), float(state.y_m[slot]))
             center = (x + offset_m * math.cos(yaw), y + offset_m * math.sin(yaw))
             place = self._player.grounded(self._data[name], (*center, self._height(group, slot, step), yaw), falls=True)
-            body = body or self.stage.spawn(self._data[name], place, True)
+            actor = actor or self.session.spawn(self._data[name], place, True)
             velocity = self.carla.Vector3D(speed * math.cos(yaw), speed * math.sin(yaw), 0.0)
-            yield command.ApplyTransform(body.actor.id, body.transform(*place))
-            yield command.ApplyTargetVelocity(body.actor.id, velocity)
-        controls = seat.vehicles
+            yield command.ApplyTransform(actor.handle.id, actor.transform(*place))
+            yield command.ApplyTargetVelocity(actor.handle.id, velocity)
+        controls = pending.vehicles
         curvature = -math.tan(controls.steer_rad[slot]) / float(group.living.wheelbase_m[slot])
-        inputs = body.control(float(controls.pedal_mps2[slot]), curvature, speed, bool(controls.reverse[slot]))
-        yield command.ApplyVehicleControl(body.actor.id, inputs)
+        inputs = actor.control(float(controls.pedal_mps2[slot]), curvature, speed, bool(controls.reverse[slot]))
+        yield command.ApplyVehicleControl(actor.handle.id, inputs)
 
-    def _walk(self, group: PedestrianGroup, seat: _PendingControls, step: int) -> Iterator[Any]:
-        """Commands for the points: walkers walk to where the point model leads, things are put there."""
-        goal, dt_s = step_point(group.state, seat.points, self.clock.dt_s), self.clock.dt_s
+    def _walk(self, group: PedestrianGroup, pending: _PendingControls, step: int) -> Iterator[Any]:
+        """Yield the commands for points: walkers walk to where the point model leads, objects are placed there."""
+        goal, dt_s = step_point(group.state, pending.points, self.clock.dt_s), self.clock.dt_s
         for slot in self._present(group, step):
             name, state = group.agents[group.live[slot]].id, group.state
             yaw = -float(group.row[2][slot])
             x, y = self._to_carla(group, slot, float(state.x_m[slot]), float(state.y_m[slot]))
             goal_x, goal_y = self._to_carla(group, slot, float(goal.x_m[slot]), float(goal.y_m[slot]))
-            body, walks = self.stage.bodies.get(name), self._data[name]["drive"] == "walker"
-            if body is None or not walks or self._read.get(name) != (state.x_m[slot], state.y_m[slot]):
+            actor, walks = self.session.actors.get(name), self._data[name]["drive"] == "walker"
+            if actor is None or not walks or self._read.get(name) != (state.x_m[slot], state.y_m[slot]):
                 at = (x, y) if walks else (goal_x, goal_y)
                 place = self._player.grounded(self._data[name], (*at, self._height(group, slot, step), yaw))
-                body = body or self.stage.spawn(self._data[name], place, walks)
-                yield self.carla.command.ApplyTransform(body.actor.id, body.transform(*place))
+                actor = actor or self.session.spawn(self._data[name], place, walks)
+                yield self.carla.command.ApplyTransform(actor.handle.id, actor.transform(*place))
             if walks:
-                yield self._player.walk(body, (goal_x - x) / dt_s, (goal_y - y) / dt_s, yaw)
+                yield self._player.walk(actor, (goal_x - x) / dt_s, (goal_y - y) / dt_s, yaw)
 
     def _show(self, group: LogReplayGroup, step: int) -> Iterator[Any]:
-        """Commands that put agents on their logged way, where they are later than the log."""
+        """Yield the commands that put delayed agents on their logged path."""
         now, dt_s = group.snapshot(), self.clock.dt_s
         for slot in self._present(group, step):
             name, yaw, speed = group.agents[group.live[slot]].id, -float(now.yaw_rad[slot]), float(now.speed_mps[slot])
@@ -190,22 +201,22 @@ class CarlaSimulator:
             walks = self._data[name]["drive"] == "walker"
             at = (x, y) if walks else (x + vx * dt_s, y + vy * dt_s)
             place = self._player.grounded(self._data[name], (*at, self._height(group, slot, step), yaw))
-            body = self.stage.bodies.get(name) or self.stage.spawn(self._data[name], place, False)
-            yield self.carla.command.ApplyTransform(body.actor.id, body.transform(*place))
+            actor = self.session.actors.get(name) or self.session.spawn(self._data[name], place, False)
+            yield self.carla.command.ApplyTransform(actor.handle.id, actor.transform(*place))
             if walks:
-                yield self._player.walk(body, vx, vy, yaw)
+                yield self._player.walk(actor, vx, vy, yaw)
 
-    def _read_fleet(self, group: VehicleGroup, seat: _PendingControls, step: int) -> None:
-        """Take over from CARLA where the vehicles are; what it does not tell, actuators, are the commands."""
-        state, controls = group.state, seat.vehicles
+    def _read_vehicles(self, group: VehicleGroup, pending: _PendingControls, step: int) -> None:
+        """Read the states of vehicles from CARLA; actuator states, which it does not report, are the commands."""
+        state, controls = group.state, pending.vehicles
         x, y, yaw, speed, pedal = (
             c.copy() for c in (state.x_m, state.y_m, state.yaw_rad, state.speed_mps, state.pedal_mps2)
         )
         for slot in self._present(group, step):
             i = group.live[slot]
             name, o = group.agents[i].id, float(group.offset_m[i])
-            at_x, at_y, at_z, at_yaw, now = self.stage.bodies[name].pose()
-            self._player.require_ground(self._data[name], at_z, self._courses[name].place(self.clock.time(step)))
+            at_x, at_y, at_z, at_yaw, now = self.session.actors[name].pose()
+            self._player.require_ground(self._data[name], at_z, self._trajectories[name].place(self.clock.time(step)))
             at = self._from_carla(group, slot, at_x - o * math.cos(at_yaw), at_y - o * math.sin(at_yaw))
             x[slot], y[slot] = self._read[name] = at
             yaw[slot] = -at_yaw
@@ -214,47 +225,47 @@ class CarlaSimulator:
         seen = {"x_m": x, "y_m": y, "yaw_rad": yaw, "speed_mps": speed, "pedal_mps2": pedal}
         group.state = replace(state, **seen, steer_rad=controls.steer_rad)
 
-    def _read_crowd(self, group: PedestrianGroup, step: int) -> None:
-        """Take over from CARLA where the points are."""
+    def _read_points(self, group: PedestrianGroup, step: int) -> None:
+        """Read the states of points from CARLA."""
         state, dt_s = group.state, self.clock.dt_s
         x, y = state.x_m.copy(), state.y_m.copy()
         for slot in self._present(group, step):
             name = group.agents[group.live[slot]].id
-            x[slot], y[slot] = self._read[name] = self._from_carla(group, slot, *self.stage.bodies[name].pose()[:2])
+            x[slot], y[slot] = self._read[name] = self._from_carla(group, slot, *self.session.actors[name].pose()[:2])
         group.state = PointState(x, y, (x - state.x_m) / dt_s, (y - state.y_m) / dt_s)
 
     def _height(self, group: AgentGroup, slot: int, step: int) -> float:
-        """The height of an agent's lowest face where the log was when it is there."""
-        course = self._courses[group.agents[group.live[slot]].id]
-        return course.place(float(group.log_times(self.clock.time(step))[slot]))[2]
+        """Return the logged height of an agent's lowest face at its present place."""
+        trajectory = self._trajectories[group.agents[group.live[slot]].id]
+        return trajectory.place(float(group.log_times(self.clock.time(step))[slot]))[2]
 
     def _to_carla(self, group: AgentGroup, slot: int, x: float, y: float) -> tuple[float, float]:
-        """A place of a group's state, which is relative to the agent's first waypoint, in CARLA's frame."""
+        """Convert a position of a group's state, relative to the agent's first waypoint, to CARLA's frame."""
         i = group.live[slot]
         return x + group.origin_x_m[i] - self.offset_m[0], -(y + group.origin_y_m[i] - self.offset_m[1])
 
     def _from_carla(self, group: AgentGroup, slot: int, x: float, y: float) -> tuple[float, float]:
-        """The inverse of `_to_carla`."""
+        """Convert a position in CARLA's frame to that of a group's state."""
         i = group.live[slot]
         return x + self.offset_m[0] - group.origin_x_m[i], -y + self.offset_m[1] - group.origin_y_m[i]
 
 
 def _offset_m(agents: Sequence[Agent]) -> tuple[float, float]:
-    """Whole kilometers x, y that bring all agents near CARLA's origin, zero while they are: as for the roads of an export."""
+    """Return whole kilometers x, y that bring all agents near CARLA's origin, zero if they are: as for exported roads."""
     xy: Array = np.concatenate([np.column_stack([a.waypoints.x_m, a.waypoints.y_m]) for a in agents])
     x, y = whole_kilometers(xy)
     return float(x), float(y)
 
 
 def _shifted(agent: Agent, offset_m: tuple[float, float]) -> Agent:
-    """An agent whose coordinates have an offset taken off."""
+    """Subtract an offset from an agent's coordinates."""
     w = agent.waypoints
     return replace(agent, waypoints=replace(w, x_m=w.x_m - offset_m[0], y_m=w.y_m - offset_m[1]))
 
 
 @contextmanager
 def _translated_errors() -> Iterator[None]:
-    """Errors of the player and of CARLA's client as those of this package."""
+    """Raise errors of the player and of CARLA's client as those of this package."""
     try:
         yield
     except player.ReplayError as error:

@@ -55,7 +55,8 @@ class BoxTracks:
         """Last row (A,) with the agent; the last of all where there is none."""
         if not len(self.x_m):
             return np.full(len(self.size_m), -1, dtype=np.intp)
-        return len(self.x_m) - 1 - np.argmax(self.present[::-1], axis=0)
+        result: RowIndex = len(self.x_m) - 1 - np.argmax(self.present[::-1], axis=0)
+        return result
 
     @cached_property
     def moves_on(self) -> NDArray[np.bool_]:

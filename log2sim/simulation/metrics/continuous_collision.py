@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from log2sim.geometry import Array, separating_axes
 from log2sim.simulation.vehicles.vehicle import Columns
@@ -54,13 +55,14 @@ class RelativeMotion(Columns):
             -self.turn_a_rad, -self.turn_b_rad, self.size_a_m, self.size_b_m,
         )  # fmt: skip
 
-    def may_touch(self) -> np.ndarray:
+    def may_touch(self) -> NDArray[np.bool_]:
         """Whether the circles around the footprints meet (N,)."""
         square = self.vx_m**2 + self.vy_m**2
         closing = -(self.dx_m * self.vx_m + self.dy_m * self.vy_m)
         u = np.clip(np.divide(closing, square, out=np.zeros_like(square), where=square > 0), 0.0, 1.0)
         reach = (np.hypot(*self.size_a_m[:2]) + np.hypot(*self.size_b_m[:2])) / 2
-        return np.hypot(self.dx_m + u * self.vx_m, self.dy_m + u * self.vy_m) < reach
+        meets: NDArray[np.bool_] = np.hypot(self.dx_m + u * self.vx_m, self.dy_m + u * self.vy_m) < reach
+        return meets
 
     def free_for(self, u: Array) -> Array:
         """Return the share of the interval (N,) for which boxes certainly stay apart after the shares `u` (N,); 0 in overlap.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +54,7 @@ class _Pairs(NamedTuple):
     i: RowIndex
     j: RowIndex
 
-    def take(self, index: NDArray | slice) -> _Pairs:
+    def take(self, index: NDArray[Any] | slice) -> _Pairs:
         """Select pairs by index."""
         return _Pairs(*(column[index] for column in self))
 

@@ -96,7 +96,10 @@ def _same_height(
     """Whether pairs (N,) are at the same height at rows k, or will be after a time, on a common slope."""
     apart_m = boxes.z_m[k, j] - boxes.z_m[k, i]
     then_m = apart_m + time_s * (climb[k, j] - climb[k, i])
-    return np.minimum(np.abs(apart_m), np.abs(then_m)) < (boxes.size_m[i, 2] + boxes.size_m[j, 2]) / 2
+    result: NDArray[np.bool_] = (
+        np.minimum(np.abs(apart_m), np.abs(then_m)) < (boxes.size_m[i, 2] + boxes.size_m[j, 2]) / 2
+    )
+    return result
 
 
 def _candidate_pairs(

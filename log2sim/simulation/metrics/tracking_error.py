@@ -128,7 +128,8 @@ def _nearest_times(trajectory: Trajectory, x_m: Array, y_m: Array) -> Array:
     _, nearest = cKDTree(np.stack([x, y], axis=1)).query(
         np.stack([x_m - trajectory.origin_m[0], y_m - trajectory.origin_m[1]], axis=1)
     )
-    return t[nearest]
+    result: Array = t[nearest]
+    return result
 
 
 def _rms(values: Array) -> float:

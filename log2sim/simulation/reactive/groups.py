@@ -31,9 +31,9 @@ class ReactiveGroup(AgentGroup):
         self._rows = np.array([len(r.columns) for r in self.references], dtype=np.intp)
         self._begin = np.cumsum(self._rows) - self._rows
         self._flat = np.concatenate([r.columns for r in self.references])
-        leaps = [(k, t) for k, r in enumerate(self.references) for t in r.trajectory.discontinuity_times()]
+        jumps = [(k, t) for k, r in enumerate(self.references) for t in r.trajectory.discontinuity_times()]
         # As in the log, an agent is placed again after the row that blends both sides of a discontinuity.
-        self._leaps = np.array([(k, t + wait) for k, t in leaps for wait in (0.0, GRID_S)]).reshape(-1, 2)
+        self._discontinuities = np.array([(k, t + wait) for k, t in jumps for wait in (0.0, GRID_S)]).reshape(-1, 2)
         self._tau = np.full(len(self.agents), -np.inf)
 
     def open_window(self, begin: int, end: int, begin_s: float, end_s: float) -> None:
@@ -59,18 +59,18 @@ class ReactiveGroup(AgentGroup):
         low = self._flat[self._begin[live] + k]
         high = self._flat[self._begin[live] + np.minimum(k + 1, last)]
         self.row = self._slowed((low + (place - k)[:, None] * (high - low)).T, live)
-        agent, at_s = self._leaps[:, 0].astype(np.intp), self._leaps[:, 1]
-        leapt = (self._tau[agent] < at_s) & (at_s <= tau[agent]) & np.isfinite(self._tau[agent])
+        agent, at_s = self._discontinuities[:, 0].astype(np.intp), self._discontinuities[:, 1]
+        jumped = (self._tau[agent] < at_s) & (at_s <= tau[agent]) & np.isfinite(self._tau[agent])
         self._tau = tau
-        if leapt.any():
-            self.place(np.intersect1d(agent[leapt], live), t_s)
+        if jumped.any():
+            self.place(np.intersect1d(agent[jumped], live), t_s)
 
-    def _exact(self, index: NDArray, t_s: float) -> Array:
+    def _exact(self, index: NDArray[np.intp], t_s: float) -> Array:
         at_s = t_s - self.traffic.delay_s[self.index[index]]
         rows = [self.references[i].exact(np.array([t]))[0] for i, t in zip(index, at_s)]
         return self._slowed(np.stack(rows, axis=1), index)
 
-    def _slowed(self, row: Array, index: NDArray) -> Array:
+    def _slowed(self, row: Array, index: NDArray[np.intp]) -> Array:
         """Scale the rows (C, N) of agents that pass their references at their rate."""
         rate, slope = self.traffic.rate[self.index[index]], self.traffic.rate_slope[self.index[index]]
         if np.all(rate == 1):

@@ -65,7 +65,8 @@ def leader_demand(driver: IdmParameters, gap_m: Array, pace_mps: Array, leader_m
     """
     closing = pace_mps * (pace_mps - leader_mps) / (2 * np.sqrt(driver.accel_mps2 * driver.comfort_mps2))
     desired = driver.gap_m + np.maximum(pace_mps * driver.time_gap_s + closing, 0.0)
-    return (desired / np.maximum(gap_m, MIN_GAP_M)) ** 2
+    result: Array = (desired / np.maximum(gap_m, MIN_GAP_M)) ** 2
+    return result
 
 
 def rate_response(

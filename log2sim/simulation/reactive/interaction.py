@@ -68,7 +68,8 @@ class TrafficState:
         """Return the look-ahead distance of agents (P,): a comfortable stop and a reserve."""
         pace, d = np.abs(self.pose.speed_mps[i]), self.idm.take(i)
         stop_m = pace * (d.time_gap_s + HORIZON_S[-1]) + pace**2 / (2 * d.comfort_mps2)
-        return np.minimum(MIN_LOOKAHEAD_M + stop_m + self.size_m[i, 0], EXTENSION_M)
+        result: Array = np.minimum(MIN_LOOKAHEAD_M + stop_m + self.size_m[i, 0], EXTENSION_M)
+        return result
 
     def meeting(self, i: Index, j: Index) -> tuple[Index, Index]:
         """Select those of the pairs (P,), (P,) that may come near each other within the horizon."""
@@ -101,7 +102,8 @@ class TrafficState:
         gap_m = np.hypot(p.x_m[i] - p.x_m[j], p.y_m[i] - p.y_m[j])
         ahead_m = self.paths.at(i, self.paths.times(i, p.distance_m[i] + gap_m)).z_m
         apart_m = np.minimum(np.abs(p.z_m[i] - p.z_m[j]), np.abs(ahead_m - p.z_m[j]))
-        return apart_m < (self.size_m[i, 2] + self.size_m[j, 2]) / 2
+        result: NDArray[np.bool_] = apart_m < (self.size_m[i, 2] + self.size_m[j, 2]) / 2
+        return result
 
     def _hull(self, i: Index, x_m: Array, y_m: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         """Return minimum and maximum of points (N, P), ahead and to the left of agents i (P,)."""
@@ -147,7 +149,8 @@ def _demand_in_log(m: TrafficState, i: Index, j: Index, gap_m: Array, corridor: 
     known = np.isfinite(gap)
     scale = np.maximum(np.where(known, gap, 0.0) / 2, 1.0)
     lost = np.where(known, np.maximum(np.where(known, gap, 0.0) - gap_m, 0.0) / scale, 1.0)
-    return np.maximum(1 - lost, 0.0) * taken
+    result: Array = np.maximum(1 - lost, 0.0) * taken
+    return result
 
 
 def _corridor(m: TrafficState, i: Index, pace: Array, progress: Array) -> SweptCorridor:

@@ -156,7 +156,8 @@ def log_times_of_distance(trajectory: Trajectory, t_s: Array, x_m: Array, y_m: A
     table = _time_table(trajectory, trajectory.origin_m)
     gone = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x_m), np.diff(y_m)))])
     start = float(np.interp(t_s[0], table[:, 0], table[:, 6]))
-    return np.maximum(np.minimum(np.interp(start + gone, table[:, 6], table[:, 0]), t_s), trajectory.t_s[0])
+    result: Array = np.maximum(np.minimum(np.interp(start + gone, table[:, 6], table[:, 0]), t_s), trajectory.t_s[0])
+    return result
 
 
 def _time_table(trajectory: Trajectory, origin_m: tuple[float, float]) -> Array:

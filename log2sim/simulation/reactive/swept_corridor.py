@@ -147,4 +147,7 @@ def _nearest_edge(left: Array, cos: Array, sin: Array, half_length: Array, half_
     long_side = (forward == upward) == (corner_y < 0)
     across = np.where(long_side, np.abs(sin), np.abs(cos))
     ahead = np.where(long_side, np.abs(cos), np.abs(sin))
-    return corner_x + beside * np.divide(ahead, across, out=np.zeros_like(across), where=(across > 0) & (beside > 0))
+    result: Array = corner_x + beside * np.divide(
+        ahead, across, out=np.zeros_like(across), where=(across > 0) & (beside > 0)
+    )
+    return result

@@ -282,4 +282,5 @@ def sinc(angle: Array) -> Array:
     """sin(angle) / angle, 1 at zero."""
     half = angle / 2 + TINY
     t = np.tan(half)
-    return t / (half * (1 + t * t))
+    result: Array = t / (half * (1 + t * t))
+    return result
