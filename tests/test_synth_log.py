@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from worlds import CAR, PARKED, WALKER, tiny_log, tiny_scene
 
-from log2sim.datatypes import Scenario, Stream
+from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError
 from log2sim.geometry import NS_PER_S, apply, box_corners, inverse
-from log2sim.synth.actors import EgoMotion, actors_of
-from log2sim.synth.labels import Sighting, visible_at
-from log2sim.synth.raycast import GROUND, Cast, cast
+from log2sim.synth.actors import EgoMotion, MovingScene
+from log2sim.synth.labels import FrameVisibility, LidarVisibility, visible_at
+from log2sim.synth.raycast import GROUND, cast_sweep
 from log2sim.synth.write import write_synthetic
 
 WALL = {"center": [25.0, 0.0], "size_m": [2.0, 120.0, 8.0]}
@@ -22,15 +22,14 @@ WALL = {"center": [25.0, 0.0], "size_m": [2.0, 120.0, 8.0]}
 def test_points_of_a_turning_lidar_on_a_moving_ego_lie_on_the_agents_at_their_own_time() -> None:
     scene = tiny_scene(gnss={"position_sigma_m": 0.0})
     log, truth = tiny_log(noise_m=0.0)
-    ego, actors = EgoMotion(scene), actors_of(scene)
-    spec = scene.lidar[0]
-    result = cast(spec, scene, ego, actors, int(log.streams["top"].t_ns[5]), np.random.default_rng(0))
+    moving, spec = MovingScene.of(scene), scene.lidar[0]
+    result = cast_sweep(spec, moving, int(log.streams["top"].t_ns[5]), np.random.default_rng(0))
     t_ns = result.sweep.t_ns
     assert t_ns is not None
-    poses = ego.map_T_ego_ns(t_ns) @ log.lidars["top"].mount_T_lidar
+    poses = moving.ego.map_T_ego_ns(t_ns) @ log.lidars["top"].mount_T_lidar
     points = np.einsum("nij,nj->ni", poses[:, :3, :3], result.sweep.xyz_m.astype(float)) + poses[:, :3, 3]
     assert np.abs(points[result.hit == GROUND, 2]).max() < 0.05
-    for index, actor in enumerate(actors):
+    for index, actor in enumerate(moving.actors):
         rows = np.flatnonzero(result.hit == index)
         assert len(rows) > 20, actor.spec.id
         state = actor.at((t_ns[rows] - scene.start_ns) / NS_PER_S)
@@ -58,10 +57,9 @@ def test_visible_takes_an_unoccluded_third_half_a_box_in_the_image_and_twenty_po
     scene = tiny_scene()
     unoccluded = np.array([0.9, 0.3, 0.9, 0.9])
     inside = np.array([0.6, 1.0, 0.4, 1.0])
-    seen = {"front": [Sighting(scene.start_ns, unoccluded, inside, np.zeros((4, 4)))]}
-    hits = np.repeat([0, 1, 2, 3, -1], [20, 50, 50, 19, 100])
-    stream = Stream("top", np.array([scene.start_ns]), lambda i: None)
-    visible = visible_at(np.array([0.0]), scene, seen, {"top": stream}, lambda name, i: Cast(None, hits), 4)  # type: ignore[arg-type]
+    t_ns = np.array([scene.start_ns])
+    frames = {"front": [FrameVisibility(scene.start_ns, unoccluded, inside, np.zeros((4, 4)))]}
+    visible = visible_at(t_ns, frames, {"top": LidarVisibility(t_ns, np.array([[20, 50, 50, 19]]))}, 4)
     assert visible.tolist() == [[True, False, False, False]]
 
 

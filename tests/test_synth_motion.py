@@ -7,13 +7,13 @@ import pytest
 
 from log2sim.errors import ConfigError
 from log2sim.geometry import wrap_angle
-from log2sim.synth.motion import Trajectory
+from log2sim.synth.motion import TimedPath
 
 TURN = [[0.0, 0.0, 5.0], [30.0, 0.0, 4.0], [30.0, 30.0, 6.0]]
 
 
-def turning(**changes: object) -> Trajectory:
-    return Trajectory(TURN, rounding_m=26.0, where="agent 'a'", **changes)  # type: ignore[arg-type]
+def turning(**changes: object) -> TimedPath:
+    return TimedPath(TURN, rounding_m=26.0, where="agent 'a'", **changes)  # type: ignore[arg-type]
 
 
 def test_heading_is_the_tangent_of_the_path() -> None:
@@ -36,7 +36,7 @@ def test_speed_is_the_change_of_the_position() -> None:
 def test_speed_at_each_waypoint_is_the_one_asked_for() -> None:
     trajectory = turning()
     t = np.linspace(0, 20, 20001)
-    way = trajectory.at(t).way_m
+    way = trajectory.at(t).distance_m
     at_turn = np.argmin(np.abs(way - trajectory.path.at_waypoint_m[1]))
     assert trajectory.at(t[at_turn]).speed_mps[0] == pytest.approx(4.0, abs=0.01)
 
@@ -49,7 +49,7 @@ def test_curvature_and_acceleration_are_those_of_a_vehicle() -> None:
 
 
 def test_a_stop_keeps_place_and_heading_and_then_goes_on() -> None:
-    trajectory = Trajectory(
+    trajectory = TimedPath(
         [[0.0, 0.0, 4.0], [8.0, 0.0, 0.0], [16.0, 3.0, 4.0]], rounding_m=4.0, wait_s=[(1, 2.0)], where="a"
     )
     standing = trajectory.at(np.linspace(4.0, 5.9, 11))  # nearly 8 m at a mean of 2 m/s take nearly 4 s
@@ -63,7 +63,7 @@ def test_a_stop_keeps_place_and_heading_and_then_goes_on() -> None:
 def test_before_the_start_an_agent_comes_along_straight_or_stands() -> None:
     moving = turning(start_s=1.0).at([0.0, 1.0])
     assert np.allclose(moving.xy_m, [[-5.0, 0.0], [0.0, 0.0]], atol=1e-6)
-    standing = Trajectory([[0, 0, 0], [9, 0, 3]], rounding_m=2.0, start_s=2.0, where="a").at([0.0, 1.9, 3.0])
+    standing = TimedPath([[0, 0, 0], [9, 0, 3]], rounding_m=2.0, start_s=2.0, where="a").at([0.0, 1.9, 3.0])
     assert np.allclose(standing.xy_m[:2], 0.0, atol=1e-6)
     assert standing.xy_m[2, 0] > 0.05
 
@@ -81,4 +81,4 @@ def test_before_the_start_an_agent_comes_along_straight_or_stands() -> None:
 )
 def test_impossible_waypoints_name_the_agent_and_the_reason(waypoints: list[list[float]], message: str) -> None:
     with pytest.raises(ConfigError, match=f"agent 'a'.*{message}"):
-        Trajectory(waypoints, rounding_m=5.0, where="agent 'a'")
+        TimedPath(waypoints, rounding_m=5.0, where="agent 'a'")

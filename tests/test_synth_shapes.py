@@ -7,10 +7,11 @@ import pytest
 
 from log2sim.geometry import Array
 from log2sim.synth import people, vehicles
-from log2sim.synth.paint import Look, paint
+from log2sim.synth.paint import paint
 from log2sim.synth.raster import rasterize
 from log2sim.synth.raycast import first_hit
 from log2sim.synth.shapes import Mesh, block, ellipsoid
+from log2sim.synth.surfaces import Appearance
 
 SIZES = {"car": (4.4, 1.8, 1.5), "truck": (7.2, 2.4, 3.0), "bus": (11.0, 2.5, 3.1), "cyclist": (1.76, 0.6, 1.76)}
 
@@ -50,7 +51,7 @@ def test_faces_look_outwards(category: str) -> None:
 @pytest.mark.parametrize("category", SIZES)
 def test_every_part_has_a_color(category: str) -> None:
     mesh = shape(category)
-    look = Look(category, SIZES[category], (200, 30, 30), "sedan")
+    look = Appearance(category, SIZES[category], (200, 30, 30), "sedan")
     rng = np.random.default_rng(0)
     face = rng.integers(len(mesh.faces), size=20000)
     weight = rng.dirichlet([1, 1, 1], size=len(face))[:, :, None]

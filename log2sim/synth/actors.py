@@ -1,4 +1,4 @@
-"""The road users of a scene in motion: their states, shapes and looks at any time."""
+"""The road users of a scene in motion: their states, shapes and appearance at any time."""
 
 from __future__ import annotations
 
@@ -9,20 +9,31 @@ from numpy.typing import ArrayLike, NDArray
 
 from log2sim.geometry import NS_PER_S, Array, rotation_from_rpy, transform, wrap_angle
 from log2sim.synth import people, vehicles
-from log2sim.synth.motion import Motion, Trajectory
-from log2sim.synth.paint import Look
+from log2sim.synth.motion import PathStates, TimedPath
 from log2sim.synth.scene import AgentSpec, Scene
 from log2sim.synth.shapes import Mesh
+from log2sim.synth.surfaces import Appearance
 
 
 @dataclass(frozen=True, eq=False)
-class States:
-    """Box centers (T, 3), headings (T,), speeds along the heading (T,) and ways gone (T,)."""
+class ActorStates:
+    """States of an actor at some times.
+
+    Attributes
+    ----------
+    center_m : (T, 3) float64, m
+        Box centers.
+    yaw_rad : (T,) float64, rad
+    speed_mps : (T,) float64, m/s
+        Along the heading.
+    distance_m : (T,) float64, m
+        Distance covered.
+    """
 
     center_m: Array
     yaw_rad: Array
     speed_mps: Array
-    way_m: Array
+    distance_m: Array
 
     def map_T_agent(self) -> Array:
         """Poses (T, 4, 4) of the box center."""
@@ -31,32 +42,44 @@ class States:
 
 @dataclass(frozen=True, eq=False)
 class Actor:
-    """One road user of a scene."""
+    """One road user of a scene.
+
+    Attributes
+    ----------
+    spec : AgentSpec
+    appearance : Appearance
+    path : TimedPath or None
+        None for a parked one.
+    parked : (float, float, float) or None
+        x, y in m and heading in rad of a parked one.
+    offset_m : float
+        Distance from the guided point forward to the box center.
+    """
 
     spec: AgentSpec
-    look: Look
-    trajectory: Trajectory | None
+    appearance: Appearance
+    path: TimedPath | None
     parked: tuple[float, float, float] | None = None
     offset_m: float = field(default=0.0)
 
-    def at(self, t_s: ArrayLike) -> States:
+    def at(self, t_s: ArrayLike) -> ActorStates:
         """States at times (T,) in s since the start of the log."""
         t = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         motion = self._motion(t)
         heading = np.stack([np.cos(motion.yaw_rad), np.sin(motion.yaw_rad)], 1)
         xy = motion.xy_m + self.offset_m * heading
         center = np.column_stack([xy, np.full(len(t), self.spec.box_m[2] / 2)])
-        return States(center, motion.yaw_rad, motion.speed_mps, motion.way_m)
+        return ActorStates(center, motion.yaw_rad, motion.speed_mps, motion.distance_m)
 
-    def _motion(self, t: Array) -> Motion:
-        if self.trajectory is not None:
-            return self.trajectory.at(t)
+    def _motion(self, t: Array) -> PathStates:
+        if self.path is not None:
+            return self.path.at(t)
         x, y, yaw = self.parked or (0.0, 0.0, 0.0)
         n = len(t)
-        return Motion(np.tile([x, y], (n, 1)), np.full(n, yaw), np.zeros(n), np.zeros(n))
+        return PathStates(np.tile([x, y], (n, 1)), np.full(n, yaw), np.zeros(n), np.zeros(n))
 
     def mesh(self, t_s: float) -> Mesh:
-        """The shape at a time, agent frame."""
+        """Return the shape at a time, agent frame."""
         size, category = self.spec.box_m, self.spec.category
         if category == "car":
             return vehicles.car(size, self.spec.shape)
@@ -66,25 +89,27 @@ class Actor:
             return vehicles.bus(size)
         state = self.at(t_s)
         if category == "cyclist":
-            turn = state.way_m[0] / people.PEDAL_M + self.look.seed / 7
+            turn = state.distance_m[0] / people.PEDAL_M + self.appearance.seed / 7
             return people.cyclist(size, int(np.floor(turn * people.PHASES)) % people.PHASES)
-        turn = state.way_m[0] / (people.STRIDE_M * size[2] / 1.75) + self.look.seed / 7
+        turn = state.distance_m[0] / (people.STRIDE_M * size[2] / 1.75) + self.appearance.seed / 7
         phase = int(np.floor(turn * people.PHASES)) % people.PHASES
-        return people.pedestrian(size, phase, self.trajectory is None)
+        return people.pedestrian(size, phase, self.path is None)
 
 
 def actors_of(scene: Scene) -> tuple[Actor, ...]:
-    """The actors of a scene in its order."""
+    """Make the actors of a scene, in its order."""
     return tuple(_actor(spec, i) for i, spec in enumerate(scene.agent))
 
 
 def _actor(spec: AgentSpec, index: int) -> Actor:
-    look = Look(spec.category, spec.box_m, spec.color, spec.shape, spec.second_color, spec.skin, spec.hair, seed=index)
+    appearance = Appearance(
+        spec.category, spec.box_m, spec.color, spec.shape, spec.second_color, spec.skin, spec.hair, seed=index
+    )
     if spec.pose is not None:
         x, y, yaw_deg = spec.pose
-        return Actor(spec, look, None, (x, y, float(wrap_angle(np.deg2rad(yaw_deg)))))
+        return Actor(spec, appearance, None, (x, y, float(wrap_angle(np.deg2rad(yaw_deg)))))
     rounding = spec.rounding_m if spec.rounding_m is not None else (25.0 if spec.vehicle else 3.0)
-    trajectory = Trajectory(
+    path = TimedPath(
         spec.waypoints,
         rounding_m=rounding,
         wait_s=[(int(k), s) for k, s in spec.wait_s],
@@ -92,7 +117,7 @@ def _actor(spec: AgentSpec, index: int) -> Actor:
         where=f"agent '{spec.id}'",
         vehicle=spec.vehicle,
     )
-    return Actor(spec, look, trajectory, offset_m=spec.rear_axle_offset_m)
+    return Actor(spec, appearance, path, offset_m=spec.rear_axle_offset_m)
 
 
 class EgoMotion:
@@ -101,7 +126,7 @@ class EgoMotion:
     def __init__(self, scene: Scene) -> None:
         ego = scene.ego
         self._start_ns = scene.start_ns
-        self.trajectory = Trajectory(
+        self.path = TimedPath(
             ego.waypoints,
             rounding_m=ego.rounding_m,
             wait_s=[(int(k), s) for k, s in ego.wait_s],
@@ -111,10 +136,35 @@ class EgoMotion:
 
     def map_T_ego(self, t_s: ArrayLike) -> Array:
         """Poses (T, 4, 4) of the rear axle on the ground at times (T,) in s since the start."""
-        motion = self.trajectory.at(t_s)
+        motion = self.path.at(t_s)
         position = np.column_stack([motion.xy_m, np.zeros(len(motion.xy_m))])
         return transform(rotation_from_rpy(0.0, 0.0, motion.yaw_rad), position)
 
     def map_T_ego_ns(self, t_ns: NDArray[np.int64]) -> Array:
-        """The same at absolute stamps."""
+        """Poses (T, 4, 4) at absolute stamps (T,)."""
         return self.map_T_ego((np.asarray(t_ns, np.int64) - self._start_ns) / NS_PER_S)
+
+
+@dataclass(frozen=True, eq=False)
+class MovingScene:
+    """A scene with the motion of everything in it.
+
+    Attributes
+    ----------
+    scene : Scene
+    ego : EgoMotion
+    actors : tuple of Actor
+    """
+
+    scene: Scene
+    ego: EgoMotion
+    actors: tuple[Actor, ...]
+
+    @classmethod
+    def of(cls, scene: Scene) -> MovingScene:
+        """Set a scene in motion."""
+        return cls(scene, EgoMotion(scene), actors_of(scene))
+
+    def seconds(self, t_ns: int) -> float:
+        """Time in s since the start of the log."""
+        return (int(t_ns) - self.scene.start_ns) / NS_PER_S

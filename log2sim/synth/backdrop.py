@@ -1,4 +1,4 @@
-"""What does not move: ground with roads and markings, facades, sky."""
+"""The static parts of a scene: ground with roads and markings, facades."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from log2sim.geometry import Array, box_corners_bev
 from log2sim.synth.scene import Building, Scene
 
 GROUND_M_PER_PX = 0.04
-GROUND_LIMIT_PX = 6000
+MAX_GROUND_PX = 6000
 MARGIN_M = 12.0
 FACADE_M_PER_PX = 0.04
 GAMMA = 2.2
@@ -25,7 +25,21 @@ FLOOR_M, BAY_M = 3.1, 2.7
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """One side of a building: foot (2,), unit direction along it (2,), outward normal (2,), its size and its texture."""
+    """One side of a building.
+
+    Attributes
+    ----------
+    foot_m : (2,) float64, m
+        One end of its foot.
+    along : (2,) float64
+        Unit direction from there along the foot.
+    outward : (2,) float64
+        Unit normal.
+    length_m : float
+    height_m : float
+    texture : (H, W, 3) uint8
+        sRGB, its first row at the ground.
+    """
 
     foot_m: Array
     along: Array
@@ -53,7 +67,7 @@ class Backdrop:
     @cached_property
     def ground(self) -> tuple[NDArray[np.uint8], ...]:
         """The ground from above as a pyramid, each level half as large; the first pixel lies at `corner_m`."""
-        shape = np.minimum(np.ceil(self._extent_m / GROUND_M_PER_PX).astype(int), GROUND_LIMIT_PX)
+        shape = np.minimum(np.ceil(self._extent_m / GROUND_M_PER_PX).astype(int), MAX_GROUND_PX)
         rng = np.random.default_rng([self._seed, 3])
         levels = [_paint_ground(self._scene, self.corner_m, (int(shape[1]), int(shape[0])), rng)]
         while min(levels[-1].shape[:2]) > 64 and len(levels) < 6:
@@ -64,7 +78,7 @@ class Backdrop:
 
 
 def _paint_ground(scene: Scene, low: Array, shape: tuple[int, int], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """The ground as sRGB from above (H, W, 3): columns go east, rows go north."""
+    """Paint the ground from above (H, W, 3), sRGB: columns go east, rows go north."""
     image = np.empty((*shape, 3), np.uint8)
     image[:] = MEADOW
     sidewalk, asphalt, white = (np.zeros(shape, np.uint8) for _ in range(3))
@@ -84,7 +98,7 @@ def _paint_ground(scene: Scene, low: Array, shape: tuple[int, int], rng: np.rand
             for a, b in _dashes(line, 3.0, 3.0) if road.marking == "dashed" else pairwise(line):
                 _stroke(marks, np.array([a, b]), low, 0.14)
         for side in (-1, 1):
-            _stroke(marks, _beside(line, side * (road.width_m / 2 - 0.2)), low, 0.1)
+            _stroke(marks, _parallel(line, side * (road.width_m / 2 - 0.2)), low, 0.1)
         white[(marks > 0) & (crossing == 0)] = 255
     for zebra in scene.zebra:
         for a, b in _dashes(np.array(zebra.line), 0.5, 0.5):
@@ -131,9 +145,9 @@ def _dashes(line: Array, on_m: float, off_m: float) -> list[tuple[Array, Array]]
     return out
 
 
-def _beside(line: Array, left_m: float) -> Array:
+def _parallel(line: Array, left_m: float) -> Array:
     d = np.gradient(line, axis=0)
-    return line + left_m * np.stack([-d[:, 1], d[:, 0]], 1) / np.linalg.norm(d, axis=1, keepdims=True)
+    return np.asarray(line + left_m * np.stack([-d[:, 1], d[:, 0]], 1) / np.linalg.norm(d, axis=1, keepdims=True))
 
 
 def _walls(building: Building, rng: np.random.Generator) -> list[Wall]:
@@ -151,7 +165,7 @@ def _walls(building: Building, rng: np.random.Generator) -> list[Wall]:
 
 
 def _facade(length_m: float, height_m: float, color: Sequence[int], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """A facade (H, W, 3), sRGB, its first row at the ground: a plinth, floors of windows, a cornice."""
+    """Paint a facade (H, W, 3), sRGB, its first row at the ground: a plinth, floors of windows, a cornice."""
     px = 1 / FACADE_M_PER_PX
     h, w = max(8, round(height_m * px)), max(8, round(length_m * px))
     image = np.empty((h, w, 3), np.uint8)

@@ -10,7 +10,7 @@ from log2sim.synth.scene import CameraSpec, Scene
 
 
 def camera_of(spec: CameraSpec) -> Camera:
-    """The pinhole camera that a scene describes; pixel centers are whole numbers."""
+    """Make the pinhole camera that a scene describes; pixel centers are whole numbers."""
     width, height = spec.size_px
     focal = width / 2 / np.tan(np.deg2rad(spec.fov_deg) / 2)
     K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])

@@ -1,17 +1,17 @@
-"""Who sees whom: labels in images and in space, and when an agent counts as visible."""
+"""Labels in images and in space, and when an agent counts as visible."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import ImageLabels, Labels, Stream
-from log2sim.geometry import NS_PER_S, Array, Camera, apply, box_corners, inverse, nearest_index, project
-from log2sim.synth.actors import Actor, EgoMotion
+from log2sim.datatypes import ImageLabels, Labels
+from log2sim.geometry import NS_PER_S, Array, Camera, apply, box_corners, inverse, project
+from log2sim.synth.actors import Actor, MovingScene
 from log2sim.synth.cameras import frame_stamps
 from log2sim.synth.scene import Scene
 
@@ -22,8 +22,19 @@ MIN_LABEL_PX = 8.0  # a smaller box is no label
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
-    """One camera frame: by actor the unoccluded share (A,), the share of its box inside the image (A,), the box (A, 4)."""
+class FrameVisibility:
+    """Visibility of the actors in one camera frame.
+
+    Attributes
+    ----------
+    t_ns : int
+    unoccluded : (A,) float64
+        Share of the silhouette that is visible.
+    inside : (A,) float64
+        Share of the projected box inside the image.
+    box_px : (A, 4) float64, px
+        Box of the visible part; NaN without one.
+    """
 
     t_ns: int
     unoccluded: Array
@@ -31,24 +42,24 @@ class Sighting:
     box_px: Array
 
 
-def sightings(
-    scene: Scene, cameras: Mapping[str, Camera], ego: EgoMotion, actors: tuple[Actor, ...], backdrop: Any
-) -> dict[str, list[Sighting]]:
-    """Look through every camera at every frame."""
-    from log2sim.synth.render import segment
+def visibility_by_camera(
+    moving: MovingScene, cameras: Mapping[str, Camera], backdrop: Any
+) -> dict[str, list[FrameVisibility]]:
+    """Segment every frame of every camera."""
+    from log2sim.synth.render import Snapshot, segment
 
-    out: dict[str, list[Sighting]] = {}
-    for spec in scene.camera:
+    out: dict[str, list[FrameVisibility]] = {}
+    for spec in moving.scene.camera:
         camera = cameras[spec.name]
         out[spec.name] = []
-        for t_ns in frame_stamps(spec, scene):
-            t_s = (int(t_ns) - scene.start_ns) / NS_PER_S
-            map_T_cam = ego.map_T_ego_ns(np.array([t_ns]))[0] @ camera.mount_T_cam
-            seen = segment(camera, map_T_cam, backdrop, actors, t_s)
-            unoccluded = np.array([0.0 if s is None else s.visible_px / s.silhouette_px for s in seen])
-            boxes = np.array([np.full(4, np.nan) if s is None else s.box_px for s in seen]).reshape(-1, 4)
-            inside = np.array([_box_inside(camera, inverse(map_T_cam), a, t_s) for a in actors])
-            out[spec.name].append(Sighting(int(t_ns), unoccluded, inside, boxes))
+        for t_ns in frame_stamps(spec, moving.scene):
+            t_s = moving.seconds(t_ns)
+            map_T_cam = moving.ego.map_T_ego_ns(np.array([t_ns]))[0] @ camera.mount_T_cam
+            parts = segment(camera, map_T_cam, Snapshot(backdrop, moving.actors, t_s))
+            unoccluded = np.array([0.0 if p is None else p.visible_px / p.silhouette_px for p in parts])
+            boxes = np.array([np.full(4, np.nan) if p is None else p.box_px for p in parts]).reshape(-1, 4)
+            inside = np.array([_box_inside(camera, inverse(map_T_cam), a, t_s) for a in moving.actors])
+            out[spec.name].append(FrameVisibility(int(t_ns), unoccluded, inside, boxes))
     return out
 
 
@@ -64,41 +75,55 @@ def _box_inside(camera: Camera, cam_T_map: Array, actor: Actor, t_s: float) -> f
     return float(inside.prod() / (high - low).prod())
 
 
+@dataclass(frozen=True, eq=False)
+class LidarVisibility:
+    """Points of one LiDAR on the actors.
+
+    Attributes
+    ----------
+    t_ns : (F,) int64
+        Middles of the sweeps.
+    points : (F, A) int
+        Points on each actor.
+    """
+
+    t_ns: NDArray[np.int64]
+    points: NDArray[np.intp]
+
+
 def visible_at(
-    t_s: Array,
-    scene: Scene,
-    seen: Mapping[str, list[Sighting]],
-    streams: Mapping[str, Stream],
-    casts: Callable[[str, int], Any],
+    t_ns: NDArray[np.int64],
+    frames: Mapping[str, Sequence[FrameVisibility]],
+    sweeps: Mapping[str, LidarVisibility],
     count: int,
 ) -> NDArray[np.bool_]:
-    """Mask (T, A): the frame of one camera and the sweep of one LiDAR nearest in time both show the agent well."""
-    t_ns = scene.start_ns + np.rint(t_s * NS_PER_S).astype(np.int64)
-    by_camera = np.zeros((len(t_s), count), dtype=bool)
-    for frames in seen.values():
-        if not frames:
-            continue
-        nearest = nearest_index(np.array([f.t_ns for f in frames]), t_ns)
-        by_camera |= np.array([(f.unoccluded >= MIN_UNOCCLUDED) & (f.inside >= MIN_BOX_INSIDE) for f in frames])[
-            nearest
-        ]
+    """Decide which of `count` actors are visible: mask (T, A) at stamps (T,).
+
+    An actor is visible when the frame of one camera and the sweep of one LiDAR nearest in time both show it well.
+    """
+    by_camera = np.zeros((len(t_ns), count), dtype=bool)
+    for parts in frames.values():
+        if parts:
+            shown = np.array([(f.unoccluded >= MIN_UNOCCLUDED) & (f.inside >= MIN_BOX_INSIDE) for f in parts])
+            by_camera |= shown[_nearest(np.array([f.t_ns for f in parts]), t_ns)]
     by_lidar = np.zeros_like(by_camera)
-    for spec in scene.lidar:
-        stamps = streams[spec.name].t_ns
-        if len(stamps) == 0:
-            continue
-        hits = [np.bincount(h[h >= 0], minlength=count) for h in (casts(spec.name, i).hit for i in range(len(stamps)))]
-        by_lidar |= (np.array(hits) >= MIN_LIDAR_POINTS)[
-            nearest_index(stamps - round(NS_PER_S / spec.rate_hz / 2), t_ns)
-        ]
-    return by_camera & by_lidar
+    for sweep in sweeps.values():
+        if len(sweep.t_ns):
+            by_lidar |= (sweep.points >= MIN_LIDAR_POINTS)[_nearest(sweep.t_ns, t_ns)]
+    return np.asarray(by_camera & by_lidar)
 
 
-def labels_2d(seen: Mapping[str, list[Sighting]], actors: tuple[Actor, ...]) -> dict[str, ImageLabels]:
+def _nearest(stamps: NDArray[np.int64], t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.asarray(np.abs(stamps[None, :] - t_ns[:, None]).argmin(1))
+
+
+def labels_2d(
+    frames_by_camera: Mapping[str, list[FrameVisibility]], actors: tuple[Actor, ...]
+) -> dict[str, ImageLabels]:
     """Boxes around the visible parts of agents that are at least a third unoccluded, by camera."""
     category = np.array([a.spec.category for a in actors])
     out = {}
-    for name, frames in seen.items():
+    for name, frames in frames_by_camera.items():
         t_ns, boxes, categories = [], [], []
         for frame in frames:
             big = np.nan_to_num(frame.box_px[:, 2:] - frame.box_px[:, :2]).min(1) >= MIN_LABEL_PX
@@ -115,12 +140,12 @@ def labels_2d(seen: Mapping[str, list[Sighting]], actors: tuple[Actor, ...]) -> 
 
 
 def labels_3d(
-    scene: Scene, seen: Mapping[str, list[Sighting]], actors: tuple[Actor, ...], cameras: Mapping[str, Camera]
+    scene: Scene, frames_by_camera: Mapping[str, list[FrameVisibility]], actors: tuple[Actor, ...]
 ) -> Labels | None:
     """Boxes of all agents at the frames of the first camera."""
     if not scene.camera or not actors:
         return None
-    frames = seen[scene.camera[0].name]
+    frames = frames_by_camera[scene.camera[0].name]
     t_ns = np.array([f.t_ns for f in frames], dtype=np.int64)
     t_s = (t_ns - scene.start_ns) / NS_PER_S
     states = [a.at(t_s) for a in actors]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.synth.paint import Paint
+from log2sim.synth.surfaces import Paint
 
 SUN = np.array([-0.45, -0.5, 0.74]) / np.linalg.norm([-0.45, -0.5, 0.74])
 SUN_LIGHT = np.array([0.80, 0.88, 0.95], np.float32)  # BGR
@@ -26,14 +26,16 @@ def reflected(
     gloss = surface.gloss * (0.35 + 0.65 * (1 - facing) ** 3)
     light += gloss[:, None] * _surroundings(mirrored)
     glint = np.clip(mirrored @ SUN.astype(np.float32), 0, 1) ** 60
-    return (light + (surface.gloss * 2.0 * glint)[:, None]).astype(np.float32)
+    total: NDArray[np.float32] = (light + (surface.gloss * 2.0 * glint)[:, None]).astype(np.float32)
+    return total
 
 
 def _surroundings(direction: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What a mirror would show: sky above, houses around, road below."""
+    """Light (P, 3) that a mirror reflects from a direction (P, 3): sky above, houses around, road below."""
     up = direction[:, 2:]
     sky = HORIZON + (ZENITH - HORIZON) * np.clip(up * 1.6, 0, 1)
     houses = np.float32(0.22)
     blend = np.clip((up - 0.12) / 0.1, 0, 1)
     below = np.clip((-up - 0.02) / 0.08, 0, 1)
-    return ((houses * (1 - blend) + sky * blend) * (1 - below) + 0.09 * below).astype(np.float32)
+    light: NDArray[np.float32] = ((houses * (1 - blend) + sky * blend) * (1 - below) + 0.09 * below).astype(np.float32)
+    return light

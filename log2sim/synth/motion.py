@@ -1,4 +1,4 @@
-"""Trajectories: smooth paths through waypoints and speeds that reach the waypoints' exactly."""
+"""Motion along waypoints: smooth paths, and speeds that equal the given ones at the waypoints."""
 
 from __future__ import annotations
 
@@ -11,29 +11,38 @@ from numpy.typing import ArrayLike
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array, wrap_angle
 
-STEP_M = 0.05  # between the points that a path is smoothed at
+STEP_M = 0.05  # sampling of the polyline that is smoothed
 MAX_CURVATURE_1PM = 0.25
 MAX_ACCELERATION_MPS2 = 3.0
-LONG_BEFORE_S = -1e4
+FIRST_LEG_S = -1e4  # begin of the leg before the first waypoint
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
-    """States at asked times (T,): position of the guided point, heading, speed, way from the first waypoint."""
+class PathStates:
+    """States of the guided point at asked times.
+
+    Attributes
+    ----------
+    xy_m : (T, 2) float64, m
+    yaw_rad : (T,) float64, rad
+    speed_mps : (T,) float64, m/s
+    distance_m : (T,) float64, m
+        Arc length from the first waypoint.
+    """
 
     xy_m: Array
     yaw_rad: Array
     speed_mps: Array
-    way_m: Array
+    distance_m: Array
 
 
-class Path:
-    """A smooth curve along waypoints (W, 2), parametrized by its length and straight beyond its ends.
+class RoundedPath:
+    """A smooth curve along waypoints (W, 2), parametrized by arc length and straight beyond its ends.
 
     Notes
     -----
     The polyline is averaged twice over a window of `rounding_m`: corners become curves whose curvature grows and falls
-    linearly, like a clothoid pair, straight stretches stay straight, and nothing overshoots. A turn by 90 degrees peaks at
+    linearly, like a pair of clothoids, straight parts stay straight, and nothing overshoots. A turn by 90 degrees peaks at
     a curvature of about 5.7 / rounding_m.
     """
 
@@ -57,30 +66,30 @@ class Path:
         self._ends = (length[0], length[::4][-1])
         self.length_m = float(self.at_waypoint_m[-1])
 
-    def at(self, way_m: ArrayLike) -> tuple[Array, Array]:
-        """Points (T, 2) and headings (T,) after `way_m` (T,) meters from the first waypoint."""
-        way = np.asarray(way_m, dtype=np.float64)
-        inside = np.clip(way, *self._ends)
+    def at(self, distance_m: ArrayLike) -> tuple[Array, Array]:
+        """Points (T, 2) and headings (T,) at arc lengths `distance_m` (T,) from the first waypoint."""
+        distance = np.asarray(distance_m, dtype=np.float64)
+        inside = np.clip(distance, *self._ends)
         tangent = self._spline(inside, 1)
         tangent /= np.linalg.norm(tangent, axis=-1, keepdims=True)
-        return self._spline(inside) + tangent * (way - inside)[:, None], np.arctan2(tangent[:, 1], tangent[:, 0])
+        return self._spline(inside) + tangent * (distance - inside)[:, None], np.arctan2(tangent[:, 1], tangent[:, 0])
 
     def curvature_1pm(self) -> Array:
-        """Curvature at every 0.1 m."""
+        """Curvature each 0.1 m."""
         s = np.arange(self._ends[0], self._ends[1], 0.1)
         d, dd = self._spline(s, 1), self._spline(s, 2)
-        return (d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / np.linalg.norm(d, axis=1) ** 3
+        return np.asarray((d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / np.linalg.norm(d, axis=1) ** 3)
 
 
 def _extended(s: Array, at: Array, values: Array) -> Array:
     inner = np.interp(s, at, values)
     before = (values[1] - values[0]) / (at[1] - at[0]) * np.minimum(s - at[0], 0)
     after = (values[-1] - values[-2]) / (at[-1] - at[-2]) * np.maximum(s - at[-1], 0)
-    return inner + before + after
+    return np.asarray(inner + before + after)
 
 
-class Trajectory:
-    """A path with a timetable. Speed goes from waypoint to waypoint by a smooth step, so acceleration has no jumps.
+class TimedPath:
+    """A path with a timetable; between waypoints the speed is a smoothstep, so the acceleration is continuous.
 
     Parameters
     ----------
@@ -89,7 +98,7 @@ class Trajectory:
     wait_s
         How long to stand at a waypoint, by its index; its speed must be 0.
     start_s
-        When the first waypoint is left; before that the agent stands (speed 0) or comes along straight.
+        Time at the first waypoint; before that the agent stands (speed 0) or comes straight.
     where
         Names the agent in messages.
     """
@@ -106,7 +115,7 @@ class Trajectory:
     ) -> None:
         w = np.asarray(waypoints, dtype=np.float64)
         _check_waypoints(w, dict(wait_s), where)
-        self.path = Path(w[:, :2], rounding_m)
+        self.path = RoundedPath(w[:, :2], rounding_m)
         if vehicle:
             peak = float(np.abs(self.path.curvature_1pm()).max())
             if peak > MAX_CURVATURE_1PM:
@@ -116,10 +125,10 @@ class Trajectory:
                 )
         self._legs = _timetable(self.path.at_waypoint_m, w[:, 2], dict(wait_s), start_s, where)
 
-    def at(self, t_s: ArrayLike) -> Motion:
+    def at(self, t_s: ArrayLike) -> PathStates:
         """States at times (T,) in s since the start of the log."""
         t = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
-        begin, span, way, v0, v1 = (self._legs[:, k] for k in range(5))
+        begin, span, start_m, v0, v1 = (self._legs[:, k] for k in range(5))
         i = np.clip(np.searchsorted(begin, t, side="right") - 1, 0, len(begin) - 1)
         finite = np.isfinite(span[i])
         u = np.where(finite, (t - begin[i]) / np.where(finite, span[i], 1.0), 0.0)
@@ -128,9 +137,9 @@ class Trajectory:
         moved = np.where(
             finite, np.where(finite, span[i], 0.0) * (v0[i] * u + dv * (u**3 - u**4 / 2)), v0[i] * (t - begin[i])
         )
-        way_now = way[i] + moved
-        xy, yaw = self.path.at(way_now)
-        return Motion(xy, wrap_angle(yaw), speed, way_now)
+        distance = start_m[i] + moved
+        xy, yaw = self.path.at(distance)
+        return PathStates(xy, wrap_angle(yaw), speed, distance)
 
 
 def _check_waypoints(w: Array, wait_s: dict[int, float], where: str) -> None:
@@ -149,25 +158,25 @@ def _check_waypoints(w: Array, wait_s: dict[int, float], where: str) -> None:
 
 
 def _timetable(at_m: Array, speed: Array, wait_s: dict[int, float], start_s: float, where: str) -> Array:
-    """Legs (L, 5): begin s, span s (inf: constant from here on), way m, speed at begin and end."""
+    """Legs (L, 5): begin in s, duration in s (inf: constant speed from here on), arc length in m, speeds at begin and end."""
     legs: list[tuple[float, float, float, float, float]] = []
     now = start_s
-    legs.append((LONG_BEFORE_S, np.inf, at_m[0] - speed[0] * (start_s - LONG_BEFORE_S), speed[0], speed[0]))
+    legs.append((FIRST_LEG_S, np.inf, at_m[0] - speed[0] * (start_s - FIRST_LEG_S), speed[0], speed[0]))
     for k in range(len(at_m) - 1):
         if k in wait_s:
             legs.append((now, wait_s[k], at_m[k], 0.0, 0.0))
             now += wait_s[k]
-        v0, v1, way = speed[k], speed[k + 1], at_m[k + 1] - at_m[k]
+        v0, v1, length = speed[k], speed[k + 1], at_m[k + 1] - at_m[k]
         if v0 + v1 <= 0:
             raise ConfigError(
-                f"{where}: waypoints {k} and {k + 1} both have speed 0, so the way between them takes forever"
+                f"{where}: waypoints {k} and {k + 1} both have speed 0, so the path between them takes forever"
             )
-        span = 2 * way / (v0 + v1)
+        span = 2 * length / (v0 + v1)
         peak = 1.5 * abs(v1 - v0) / span
         if peak > MAX_ACCELERATION_MPS2 * (1 + 1e-9):
             raise ConfigError(
                 f"{where}: from waypoint {k} to {k + 1} the speed changes with {peak:.1f} m/s2, at most "
-                f"{MAX_ACCELERATION_MPS2:g} is allowed; give the change more way"
+                f"{MAX_ACCELERATION_MPS2:g} is allowed; give the change more distance"
             )
         legs.append((now, span, at_m[k], v0, v1))
         now += span

@@ -1,80 +1,42 @@
-"""Colors of road users: what a point of their surface looks like, by its place on the body.
+"""Colors of road users: procedural textures by position on the body.
 
-Colors are linear BGR in [0, 1]; `gloss` is the share of the surroundings that a surface mirrors.
+Colors are linear BGR in [0, 1].
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.synth.vehicles import BELT, WHEEL_AT, WHEEL_RADIUS_M, Part, roof_line
+from log2sim.synth.surfaces import Appearance, Paint, Patch, linear_bgr
+from log2sim.synth.vehicles import BELT, WHEEL_AT, WHEEL_RADIUS_M, Material, roof_line
 
 GLASS = (0.055, 0.05, 0.045)
 RUBBER = (0.028, 0.027, 0.026)
 
-Index = NDArray[np.int64]
 
-
-@dataclass(frozen=True)
-class Look:
-    """What `paint` knows about an agent. Colors are RGB in 0-255 as a person writes them."""
-
-    category: str
-    size_m: tuple[float, float, float]
-    color: tuple[int, int, int]
-    kind: str = ""
-    second_color: tuple[int, int, int] = (45, 50, 66)
-    skin: tuple[int, int, int] = (196, 150, 122)
-    hair: tuple[int, int, int] = (52, 38, 28)
-    seed: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class Paint:
-    """Surface of P points: `albedo` (P, 3), `gloss` (P,), `glow` (P, 3) own light."""
-
-    albedo: NDArray[np.float32]
-    gloss: NDArray[np.float32]
-    glow: NDArray[np.float32]
-
-
-def linear_bgr(rgb: tuple[int, int, int]) -> NDArray[np.float32]:
-    """Linear BGR of an sRGB color."""
-    return ((np.array(rgb[::-1], dtype=np.float32) / 255) ** np.float32(2.2)).astype(np.float32)
-
-
-def paint(look: Look, part: NDArray[np.int64], points: Array, normals: Array) -> Paint:
-    """Colors at points (P, 3), m, agent frame (box center), with normals (P, 3) and parts (P,)."""
+def paint(look: Appearance, part: NDArray[np.int64], points: Array, normals: Array) -> Paint:
+    """Paint points (P, 3), m, agent frame (box center), with normals (P, 3) and materials (P,)."""
     out = Paint(
         np.zeros((len(part), 3), np.float32), np.zeros(len(part), np.float32), np.zeros((len(part), 3), np.float32)
     )
     z = points[:, 2] + look.size_m[2] / 2
     for value in np.unique(part):
         rows = np.flatnonzero(part == value)
-        _PAINTERS.get(Part(value), _plain)(look, out, rows, points[rows], z[rows], normals[rows], Part(value))
+        patch = Patch(look, out, rows, points[rows], z[rows], normals[rows], Material(value))
+        _PAINTERS.get(Material(value), _plain)(patch)
     return out
 
 
-def _set(out: Paint, rows: Index, mask: NDArray[np.bool_], albedo: Any, gloss: float = 0.0, glow: float = 0.0) -> None:
-    index = rows[mask]
-    out.albedo[index] = albedo
-    out.gloss[index] = gloss
-    out.glow[index] = glow * np.asarray(albedo, np.float32)
-
-
-def _car(look: Look, out: Paint, rows: Index, p: Array, z: Array, n: Array, part: Part) -> None:
+def _car(patch: Patch) -> None:
+    look, p, z, n = patch.look, patch.p, patch.z, patch.n
     length, width, height = look.size_m
     x, y = p[:, 0], p[:, 1]
     u, h = x / length, z / height
     line = roof_line(look.kind)
     top = np.interp(u, line[:, 0], line[:, 1])
-    everywhere = np.ones(len(rows), bool)
-    _set(out, rows, everywhere, linear_bgr(look.color), 0.16)
+    patch.fill(linear_bgr(look.color), 0.16)
     side = np.abs(n[:, 1]) > 0.55
     # Seams of the doors, a dark sill and the handles.
     seams = (
@@ -83,65 +45,62 @@ def _car(look: Look, out: Paint, rows: Index, p: Array, z: Array, n: Array, part
         & (h < BELT)
         & (np.min(np.abs(x[:, None] - length * np.array([0.165, -0.03, -0.235])), 1) < 0.008)
     )
-    _set(out, rows, seams, linear_bgr(look.color) * 0.25)
+    patch.set(seams, linear_bgr(look.color) * 0.25)
     handle = (
         side & (np.abs(h - 0.565) < 0.012) & (np.min(np.abs(x[:, None] - length * np.array([0.0, -0.2])), 1) < 0.07)
     )
-    _set(out, rows, handle, linear_bgr(look.color) * 0.5, 0.1)
-    _set(out, rows, h < 0.225, (0.05, 0.05, 0.05))
+    patch.set(handle, linear_bgr(look.color) * 0.5, 0.1)
+    patch.set(h < 0.225, (0.05, 0.05, 0.05))
     fender = np.min(np.hypot(x[:, None] - length * np.array([WHEEL_AT, -WHEEL_AT]), z[:, None] - WHEEL_RADIUS_M), 1)
-    _set(out, rows, (fender < WHEEL_RADIUS_M + 0.055) & (np.abs(y) > 0.3 * width), (0.008, 0.008, 0.008))
+    patch.set((fender < WHEEL_RADIUS_M + 0.055) & (np.abs(y) > 0.3 * width), (0.008, 0.008, 0.008))
     # Windows: the sides with three pillars, the windshield and the rear window with a frame.
     glass_side = side & (h > BELT + 0.035) & (h < top - 0.075) & (h < 0.93) & (u > -0.40)
     pillar = (
         np.min(np.abs(x[:, None] + 0.12 * (z[:, None] - height * 0.8) - length * np.array([-0.03, -0.245])), 1) < 0.035
     )
-    _set(out, rows, glass_side & ~pillar, GLASS, 0.34)
+    patch.set(glass_side & ~pillar, GLASS, 0.34)
     frame = 0.43 * width - 0.10 * np.clip((h - BELT) / 0.36, 0, 1) * width
     ahead = (n[:, 0] > 0.25) & (h > 0.685) & (h < 0.955) & (np.abs(y) < frame)
     behind = (n[:, 0] < -0.2) & (h > 0.72) & (h < 0.94) & (np.abs(y) < frame * 0.97)
-    _set(out, rows, ahead | behind, GLASS, 0.36)
-    _front(out, rows, y, h, n, u, width)
-    _rear(out, rows, y, h, n, u, width)
+    patch.set(ahead | behind, GLASS, 0.36)
+    _front(patch, h, u)
+    _rear(patch, h, u)
 
 
-def _front(out: Paint, rows: Index, y: Array, h: Array, n: Array, u: Array, width: float) -> None:
+def _front(patch: Patch, h: Array, u: Array) -> None:
+    y, n, width = patch.p[:, 1], patch.n, patch.look.size_m[1]
     front = (u > 0.44) & (n[:, 0] > 0.2)
     lamp = front & (np.abs(y) > 0.27 * width) & (h > 0.415 + 0.06 * (np.abs(y) / width - 0.27)) & (h < 0.515)
-    _set(out, rows, lamp, (0.75, 0.78, 0.78), 0.3, 0.25)
-    _set(
-        out, rows, lamp & (np.abs(np.abs(y) - 0.36 * width) < 0.035) & (np.abs(h - 0.465) < 0.025), (0.2, 0.2, 0.2), 0.3
-    )
+    patch.set(lamp, (0.75, 0.78, 0.78), 0.3, 0.25)
+    patch.set(lamp & (np.abs(np.abs(y) - 0.36 * width) < 0.035) & (np.abs(h - 0.465) < 0.025), (0.2, 0.2, 0.2), 0.3)
     grille = front & (np.abs(y) < 0.23 * width) & (h > 0.37) & (h < 0.47)
-    _set(out, rows, grille, np.where((np.floor(h[grille] * 70) % 2)[:, None] > 0, 0.02, 0.09).astype(np.float32), 0.05)
-    _set(out, rows, front & (np.abs(y) < 0.05) & (np.abs(h - 0.42) < 0.03), (0.6, 0.6, 0.6), 0.3)
-    _set(out, rows, front & (np.abs(y) < 0.36 * width) & (h > 0.235) & (h < 0.305), (0.02, 0.02, 0.02))
-    _set(out, rows, front & (np.abs(y) < 0.26) & (h > 0.30) & (h < 0.37), (0.75, 0.75, 0.75))
-    _set(
-        out,
-        rows,
+    patch.set(grille, np.where((np.floor(h[grille] * 70) % 2)[:, None] > 0, 0.02, 0.09).astype(np.float32), 0.05)
+    patch.set(front & (np.abs(y) < 0.05) & (np.abs(h - 0.42) < 0.03), (0.6, 0.6, 0.6), 0.3)
+    patch.set(front & (np.abs(y) < 0.36 * width) & (h > 0.235) & (h < 0.305), (0.02, 0.02, 0.02))
+    patch.set(front & (np.abs(y) < 0.26) & (h > 0.30) & (h < 0.37), (0.75, 0.75, 0.75))
+    patch.set(
         front & (np.abs(y) < 0.21) & (np.abs(h - 0.335) < 0.018) & (np.floor(y * 22) % 2 > 0),
         (0.05, 0.05, 0.05),
     )
 
 
-def _rear(out: Paint, rows: Index, y: Array, h: Array, n: Array, u: Array, width: float) -> None:
+def _rear(patch: Patch, h: Array, u: Array) -> None:
+    y, n, width = patch.p[:, 1], patch.n, patch.look.size_m[1]
     rear = (u < -0.45) & (n[:, 0] < -0.2)
     lamp = (u < -0.445) & (np.abs(y) > 0.30 * width) & (h > 0.5) & (h < 0.61)
-    _set(out, rows, lamp, (0.02, 0.02, 0.45), 0.15, 0.25)
-    _set(out, rows, lamp & (np.abs(h - 0.535) < 0.012), (0.6, 0.6, 0.7), 0.2)
-    _set(out, rows, rear & (h > 0.635) & (h < 0.645), (0.02, 0.02, 0.02))
-    _set(out, rows, rear & (np.abs(y) < 0.26) & (h > 0.44) & (h < 0.515), (0.75, 0.75, 0.75))
-    _set(
-        out,
-        rows,
+    patch.set(lamp, (0.02, 0.02, 0.45), 0.15, 0.25)
+    patch.set(lamp & (np.abs(h - 0.535) < 0.012), (0.6, 0.6, 0.7), 0.2)
+    patch.set(rear & (h > 0.635) & (h < 0.645), (0.02, 0.02, 0.02))
+    patch.set(rear & (np.abs(y) < 0.26) & (h > 0.44) & (h < 0.515), (0.75, 0.75, 0.75))
+    patch.set(
         rear & (np.abs(y) < 0.21) & (np.abs(h - 0.477) < 0.018) & (np.floor(y * 22) % 2 > 0),
         (0.05, 0.05, 0.05),
     )
-    _set(out, rows, rear & (h > 0.225) & (h < 0.3), (0.03, 0.03, 0.03))
+    patch.set(rear & (h > 0.225) & (h < 0.3), (0.03, 0.03, 0.03))
 
 
-def _wheel(look: Look, out: Paint, rows: Index, p: Array, z: Array, n: Array, part: Part) -> None:
+def _wheel(patch: Patch) -> None:
+    look, p, z, n = patch.look, patch.p, patch.z, patch.n
     length = look.size_m[0]
     big = look.category in ("truck", "bus")
     radius = 0.48 if big else WHEEL_RADIUS_M
@@ -150,19 +109,19 @@ def _wheel(look: Look, out: Paint, rows: Index, p: Array, z: Array, n: Array, pa
     dx = np.take_along_axis(d, np.abs(d).argmin(1)[:, None], 1)[:, 0]
     dz = z - radius
     r, angle = np.hypot(dx, dz) / radius, np.arctan2(dz, dx)
-    _set(out, rows, np.ones(len(rows), bool), RUBBER)
+    patch.fill(RUBBER)
     face = np.abs(n[:, 1]) > 0.8
     rim = face & (r < 0.7)
-    _set(out, rows, rim, (0.42, 0.42, 0.42), 0.15)
+    patch.set(rim, (0.42, 0.42, 0.42), 0.15)
     if big:
-        _set(out, rows, face & (r < 0.62) & (r > 0.28), (0.12, 0.12, 0.12))
-        _set(out, rows, face & (np.abs(r - 0.4) < 0.05) & (np.cos(8 * angle) > 0.5), (0.4, 0.4, 0.4))
+        patch.set(face & (r < 0.62) & (r > 0.28), (0.12, 0.12, 0.12))
+        patch.set(face & (np.abs(r - 0.4) < 0.05) & (np.cos(8 * angle) > 0.5), (0.4, 0.4, 0.4))
         return
-    _set(out, rows, rim & (r < 0.63) & (r > 0.2) & (np.cos(5 * angle) < 0.15), (0.03, 0.03, 0.03))
-    _set(out, rows, face & (r < 0.09), (0.1, 0.1, 0.1))
+    patch.set(rim & (r < 0.63) & (r > 0.2) & (np.cos(5 * angle) < 0.15), (0.03, 0.03, 0.03))
+    patch.set(face & (r < 0.09), (0.1, 0.1, 0.1))
 
 
-def truck_axles(look: Look) -> Array:
+def truck_axles(look: Appearance) -> Array:
     """Axle positions (K,) in m along a truck or bus, as its shape has them."""
     length = look.size_m[0]
     if look.category == "bus":
@@ -171,50 +130,51 @@ def truck_axles(look: Look) -> Array:
     return np.array([front - 0.95, rear + 1.1] if length < 8 else [front - 0.95, rear + 2.4, rear + 1.2])
 
 
-def _cab(look: Look, out: Paint, rows: Index, p: Array, z: Array, n: Array, part: Part) -> None:
+def _cab(patch: Patch) -> None:
+    look, p, z, n = patch.look, patch.p, patch.z, patch.n
     length, width, height = look.size_m
     top, front = 0.8 * height, length / 2
     y, x = p[:, 1], p[:, 0]
-    _set(out, rows, np.ones(len(rows), bool), linear_bgr(look.second_color), 0.12)
-    _set(out, rows, (n[:, 0] > 0.3) & (z > 0.53 * top) & (z < 0.93 * top) & (np.abs(y) < 0.42 * width), GLASS, 0.36)
+    patch.fill(linear_bgr(look.second_color), 0.12)
+    patch.set((n[:, 0] > 0.3) & (z > 0.53 * top) & (z < 0.93 * top) & (np.abs(y) < 0.42 * width), GLASS, 0.36)
     window = (np.abs(n[:, 1]) > 0.6) & (z > 0.55 * top) & (z < 0.9 * top) & (x > front - 1.35) & (x < front - 0.28)
-    _set(out, rows, window, GLASS, 0.34)
+    patch.set(window, GLASS, 0.34)
     nose = n[:, 0] > 0.5
-    _set(
-        out,
-        rows,
+    patch.set(
         nose & (np.abs(y) < 0.34 * width) & (z > 0.27 * top) & (z < 0.47 * top) & (np.floor(z * 14) % 2 > 0),
         (0.03, 0.03, 0.03),
     )
-    _set(out, rows, nose & (z < 0.25 * top), (0.06, 0.06, 0.06))
-    _set(out, rows, nose & (np.abs(y) > 0.32 * width) & (z > 0.25 * top) & (z < 0.33 * top), (0.8, 0.8, 0.8), 0.2, 0.3)
-    _set(out, rows, nose & (np.abs(y) < 0.26) & (z > 0.16 * top) & (z < 0.21 * top), (0.75, 0.75, 0.75))
+    patch.set(nose & (z < 0.25 * top), (0.06, 0.06, 0.06))
+    patch.set(nose & (np.abs(y) > 0.32 * width) & (z > 0.25 * top) & (z < 0.33 * top), (0.8, 0.8, 0.8), 0.2, 0.3)
+    patch.set(nose & (np.abs(y) < 0.26) & (z > 0.16 * top) & (z < 0.21 * top), (0.75, 0.75, 0.75))
     fender = np.hypot(x - (front - 0.95), z - 0.48)
-    _set(out, rows, (fender < 0.56) & (np.abs(n[:, 1]) > 0.5), (0.01, 0.01, 0.01))
+    patch.set((fender < 0.56) & (np.abs(n[:, 1]) > 0.5), (0.01, 0.01, 0.01))
 
 
-def _cargo(look: Look, out: Paint, rows: Index, p: Array, z: Array, n: Array, part: Part) -> None:
+def _cargo(patch: Patch) -> None:
+    look, p, z, n = patch.look, patch.p, patch.z, patch.n
     length, width, height = look.size_m
-    _set(out, rows, np.ones(len(rows), bool), linear_bgr(look.color), 0.03)
+    patch.fill(linear_bgr(look.color), 0.03)
     side, rear = np.abs(n[:, 1]) > 0.7, n[:, 0] < -0.7
-    _set(out, rows, (side | rear) & ((z > height - 0.12) | (z < 0.36 * height + 0.12)), (0.3, 0.3, 0.3))
-    _set(out, rows, side & (np.abs(np.mod(p[:, 0], 0.6) - 0.3) < 0.012), linear_bgr(look.color) * 0.7)
-    _set(out, rows, rear & (np.abs(p[:, 1]) < 0.015), (0.05, 0.05, 0.05))
-    _set(out, rows, rear & (np.abs(np.abs(p[:, 1]) - 0.25) < 0.02) & (z > 0.5 * height), (0.35, 0.35, 0.35))
-    _set(out, rows, rear & (z < 0.36 * height + 0.12) & (np.abs(p[:, 1]) > 0.36 * width), (0.02, 0.02, 0.5), 0.1, 0.25)
-    _set(out, rows, side & (np.abs(z - 0.66 * height) < 0.14 * height) & (np.abs(p[:, 0] + 0.15 * length) < 0.22 * length),
+    patch.set((side | rear) & ((z > height - 0.12) | (z < 0.36 * height + 0.12)), (0.3, 0.3, 0.3))
+    patch.set(side & (np.abs(np.mod(p[:, 0], 0.6) - 0.3) < 0.012), linear_bgr(look.color) * 0.7)
+    patch.set(rear & (np.abs(p[:, 1]) < 0.015), (0.05, 0.05, 0.05))
+    patch.set(rear & (np.abs(np.abs(p[:, 1]) - 0.25) < 0.02) & (z > 0.5 * height), (0.35, 0.35, 0.35))
+    patch.set(rear & (z < 0.36 * height + 0.12) & (np.abs(p[:, 1]) > 0.36 * width), (0.02, 0.02, 0.5), 0.1, 0.25)
+    patch.set(side & (np.abs(z - 0.66 * height) < 0.14 * height) & (np.abs(p[:, 0] + 0.15 * length) < 0.22 * length),
          linear_bgr(look.second_color), 0.03)  # fmt: skip
 
 
-def _bus(look: Look, out: Paint, rows: Index, p: Array, z: Array, n: Array, part: Part) -> None:
+def _bus(patch: Patch) -> None:
+    look, p, z, n = patch.look, patch.p, patch.z, patch.n
     length, width, height = look.size_m
     x, y = p[:, 0], p[:, 1]
-    _set(out, rows, np.ones(len(rows), bool), linear_bgr(look.color), 0.12)
+    patch.fill(linear_bgr(look.color), 0.12)
     side, front, rear = np.abs(n[:, 1]) > 0.55, n[:, 0] > 0.5, n[:, 0] < -0.5
-    _set(out, rows, z < 0.5, (0.06, 0.06, 0.06))
+    patch.set(z < 0.5, (0.06, 0.06, 0.06))
     row = side & (z > 0.43 * height) & (z < 0.80 * height) & (np.abs(x) < 0.475 * length)
-    _set(out, rows, row & (np.mod(x + 0.5 * length, 1.45) > 0.09), GLASS, 0.34)
-    _set(out, rows, side & (np.abs(z - 0.37 * height) < 0.05), linear_bgr(look.second_color), 0.1)
+    patch.set(row & (np.mod(x + 0.5 * length, 1.45) > 0.09), GLASS, 0.34)
+    patch.set(side & (np.abs(z - 0.37 * height) < 0.05), linear_bgr(look.second_color), 0.1)
     doors = (
         side
         & (n[:, 1] < 0)
@@ -222,49 +182,49 @@ def _bus(look: Look, out: Paint, rows: Index, p: Array, z: Array, n: Array, part
         & (z < 0.8 * height)
         & (np.min(np.abs(x[:, None] - length * np.array([0.42, 0.02])), 1) < 0.6)
     )
-    _set(out, rows, doors, GLASS, 0.3)
-    _set(out, rows, doors & (np.mod(x - 0.42 * length + 0.6, 0.6) < 0.05), linear_bgr(look.color) * 0.6)
-    _set(out, rows, front & (z > 0.36 * height) & (z < 0.80 * height) & (np.abs(y) < 0.45 * width), GLASS, 0.36)
-    _set(
-        out,
-        rows,
+    patch.set(doors, GLASS, 0.3)
+    patch.set(doors & (np.mod(x - 0.42 * length + 0.6, 0.6) < 0.05), linear_bgr(look.color) * 0.6)
+    patch.set(front & (z > 0.36 * height) & (z < 0.80 * height) & (np.abs(y) < 0.45 * width), GLASS, 0.36)
+    patch.set(
         front & (z > 0.84 * height) & (z < 0.93 * height) & (np.abs(y) < 0.3 * width),
         (0.02, 0.12, 0.2),
         0.0,
         0.8,
     )
-    _set(out, rows, rear & (z > 0.52 * height) & (z < 0.82 * height) & (np.abs(y) < 0.4 * width), GLASS, 0.34)
-    _set(out, rows, front & (np.abs(y) > 0.32 * width) & (z > 0.7) & (z < 0.95), (0.8, 0.8, 0.8), 0.2, 0.3)
-    _set(out, rows, rear & (np.abs(y) > 0.38 * width) & (z > 0.7) & (z < 1.2), (0.02, 0.02, 0.5), 0.1, 0.25)
-    _set(out, rows, (front | rear) & (np.abs(y) < 0.26) & (z > 0.5) & (z < 0.62), (0.75, 0.75, 0.75))
+    patch.set(rear & (z > 0.52 * height) & (z < 0.82 * height) & (np.abs(y) < 0.4 * width), GLASS, 0.34)
+    patch.set(front & (np.abs(y) > 0.32 * width) & (z > 0.7) & (z < 0.95), (0.8, 0.8, 0.8), 0.2, 0.3)
+    patch.set(rear & (np.abs(y) > 0.38 * width) & (z > 0.7) & (z < 1.2), (0.02, 0.02, 0.5), 0.1, 0.25)
+    patch.set((front | rear) & (np.abs(y) < 0.26) & (z > 0.5) & (z < 0.62), (0.75, 0.75, 0.75))
     fender = np.min(np.hypot(x[:, None] - truck_axles(look), z[:, None] - 0.48), 1)
-    _set(out, rows, side & (fender < 0.57), (0.01, 0.01, 0.01))
+    patch.set(side & (fender < 0.57), (0.01, 0.01, 0.01))
 
 
-def _cloth(look: Look, out: Paint, rows: Index, p: Array, z: Array, n: Array, part: Part) -> None:
-    color = linear_bgr(look.color if part == Part.SHIRT else look.second_color)
+def _cloth(patch: Patch) -> None:
+    look, p, z, n = patch.look, patch.p, patch.z, patch.n
+    color = linear_bgr(look.color if patch.part == Material.SHIRT else look.second_color)
     # Folds: waves that follow the body, fixed to it, so that they move along.
     fold = np.sin(23 * z + 9 * p[:, 1] + look.seed) * np.sin(17 * p[:, 1] - 11 * z + 5 * p[:, 0])
     shade = 1.0 + 0.13 * fold
-    out.albedo[rows] = color * shade[:, None]
-    if part == Part.SHIRT:
+    patch.out.albedo[patch.rows] = color * shade[:, None]
+    if patch.part == Material.SHIRT:
         front = (n[:, 0] > 0.4) & (np.abs(p[:, 1]) < 0.012)
-        _set(out, rows, front, color * 0.4)
+        patch.set(front, color * 0.4)
 
 
-def _plain(look: Look, out: Paint, rows: Index, p: Array, z: Array, n: Array, part: Part) -> None:
+def _plain(patch: Patch) -> None:
+    look = patch.look
     albedo, gloss = {
-        Part.SKIN: (linear_bgr(look.skin), 0.02),
-        Part.HAIR: (linear_bgr(look.hair), 0.03),
-        Part.SHOE: (np.array((0.03, 0.03, 0.035)), 0.05),
-        Part.FRAME: (linear_bgr(look.color)[::-1] * 0.6 + 0.02, 0.15),
-        Part.TIRE: (np.array(RUBBER), 0.02),
-        Part.MIRROR: (linear_bgr(look.color) if look.category == "car" else np.array((0.35, 0.35, 0.35)), 0.12),
-    }.get(part, (np.array((0.02, 0.02, 0.02)), 0.0))
-    _set(out, rows, np.ones(len(rows), bool), albedo, gloss)
+        Material.SKIN: (linear_bgr(look.skin), 0.02),
+        Material.HAIR: (linear_bgr(look.hair), 0.03),
+        Material.SHOE: (np.array((0.03, 0.03, 0.035)), 0.05),
+        Material.FRAME: (linear_bgr(look.color)[::-1] * 0.6 + 0.02, 0.15),
+        Material.TIRE: (np.array(RUBBER), 0.02),
+        Material.MIRROR: (linear_bgr(look.color) if look.category == "car" else np.array((0.35, 0.35, 0.35)), 0.12),
+    }.get(patch.part, (np.array((0.02, 0.02, 0.02)), 0.0))
+    patch.fill(albedo, gloss)
 
 
 _PAINTERS = {
-    Part.CAR_BODY: _car, Part.WHEEL: _wheel, Part.CAB: _cab, Part.CARGO: _cargo, Part.BUS_BODY: _bus,
-    Part.SHIRT: _cloth, Part.TROUSERS: _cloth,
+    Material.CAR_BODY: _car, Material.WHEEL: _wheel, Material.CAB: _cab, Material.CARGO: _cargo, Material.BUS_BODY: _bus,
+    Material.SHIRT: _cloth, Material.TROUSERS: _cloth,
 }  # fmt: skip

@@ -10,15 +10,22 @@ from numpy.typing import NDArray
 from log2sim.geometry import Array
 
 NEAR_M = 0.3
-FRAGMENTS_AT_ONCE = 3_000_000
+MAX_FRAGMENTS_PER_BATCH = 3_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class Fragments:
-    """The nearest surface of a mesh at each pixel (P,) that it covers.
+    """The nearest surface of a mesh at each pixel that it covers.
 
-    `pixel` row-major index into the image, `depth_m` along the optical axis, `face` index, `weight` (P, 3) of the face's
-    vertices, right in space and not only on the screen.
+    Attributes
+    ----------
+    pixel : (P,) int64
+        Row-major index into the image.
+    depth_m : (P,) float32, m
+        Along the optical axis.
+    face : (P,) int64
+    weight : (P, 3) float32
+        Perspective-correct barycentric weights of the face's vertices.
     """
 
     pixel: NDArray[np.int64]
@@ -28,7 +35,7 @@ class Fragments:
 
 
 def rasterize(vertices_cam: Array, faces: NDArray[np.int64], K: Array, width_px: int, height_px: int) -> Fragments:
-    """Find what a pinhole camera sees of a mesh alone.
+    """Rasterize a mesh for a pinhole camera.
 
     Parameters
     ----------
@@ -44,7 +51,7 @@ def rasterize(vertices_cam: Array, faces: NDArray[np.int64], K: Array, width_px:
     first = 0
     while first < len(total):
         base = total[first - 1] if first else 0
-        last = max(first + 1, int(np.searchsorted(total, base + FRAGMENTS_AT_ONCE)))
+        last = max(first + 1, int(np.searchsorted(total, base + MAX_FRAGMENTS_PER_BATCH)))
         parts.append(_covered(triangles.part(slice(first, last)), width_px))
         first = last
     if not parts:
@@ -60,8 +67,25 @@ def rasterize(vertices_cam: Array, faces: NDArray[np.int64], K: Array, width_px:
 
 @dataclass(frozen=True, eq=False)
 class _Triangles:
-    """Faces (F,) by `index` as they lie in the image: `u`, `v`, `inverse_z` (F, 3), signed `area`, and the rectangle of
-    pixels around each: its first column `u0` and row `v0`, its width `span` and the `count` of its pixels."""
+    """Faces in the image.
+
+    Attributes
+    ----------
+    index : (F,) int64
+        Of the face.
+    u, v : (F, 3) float64, px
+        Of the vertices.
+    inverse_z : (F, 3) float64, 1/m
+        Inverse depth of the vertices.
+    area : (F,) float64, px2
+        Twice the signed area.
+    u0, v0 : (F,) int64, px
+        First column and row of the surrounding rectangle.
+    span : (F,) int64, px
+        Width of the rectangle.
+    count : (F,) int64
+        Pixels in the rectangle.
+    """
 
     index: NDArray[np.int64]
     u: Array
@@ -74,6 +98,7 @@ class _Triangles:
     count: NDArray[np.int64]
 
     def part(self, rows: slice | NDArray[np.bool_]) -> _Triangles:
+        """Select faces."""
         return _Triangles(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 

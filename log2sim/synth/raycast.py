@@ -9,18 +9,25 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Sweep
 from log2sim.geometry import NS_PER_S, Array, inverse, rotation_from_rpy, transform
-from log2sim.synth.actors import Actor, EgoMotion
+from log2sim.synth.actors import Actor, MovingScene
 from log2sim.synth.scene import Building, LidarSpec, Scene
 
 GROUND, BUILDING = -1, -2
-PAIRS_AT_ONCE = 400_000
+MAX_PAIRS_PER_BATCH = 400_000
 MESH_MARGIN_M = 1e-6  # rounding of a mesh that fills its box
-GRAZING_RETURN = 0.02  # sine of the angle on the ground below which nothing comes back
+MIN_GRAZING_SINE = 0.02  # of the angle to the ground below which no return comes back
 
 
 @dataclass(frozen=True, eq=False)
-class Cast:
-    """A sweep and what each of its points lies on: `hit` (N,) index of the actor, or GROUND, or BUILDING."""
+class LabeledSweep:
+    """A sweep and what each of its points lies on.
+
+    Attributes
+    ----------
+    sweep : Sweep
+    hit : (N,) int64
+        Index of the actor, GROUND or BUILDING.
+    """
 
     sweep: Sweep
     hit: NDArray[np.int64]
@@ -32,12 +39,13 @@ def ego_T_lidar(spec: LidarSpec) -> Array:
 
 
 def sweep_stamps(spec: LidarSpec, scene: Scene) -> NDArray[np.int64]:
-    """Ends of the sweeps (F,), absolute ns; every sweep lies wholly within the log."""
+    """Stamps (F,) of the ends of the sweeps, absolute ns; every sweep lies wholly within the log."""
     period = 1.0 / spec.rate_hz
     first = int(np.ceil((period * _share(spec) - spec.offset_s) * spec.rate_hz - 1e-9))
     last = int(np.floor((scene.duration_s - spec.offset_s) * spec.rate_hz + 1e-9))
     t = np.arange(first, last + 1) * period + spec.offset_s
-    return scene.start_ns + np.rint(t * NS_PER_S).astype(np.int64)
+    stamps: NDArray[np.int64] = scene.start_ns + np.rint(t * NS_PER_S).astype(np.int64)
+    return stamps
 
 
 def _share(spec: LidarSpec) -> float:
@@ -57,26 +65,25 @@ def ray_pattern(spec: LidarSpec) -> tuple[Array, Array]:
     return directions, np.repeat(ago, len(elevation))
 
 
-def cast(
-    spec: LidarSpec, scene: Scene, ego: EgoMotion, actors: tuple[Actor, ...], stamp_ns: int, rng: np.random.Generator
-) -> Cast:
-    """Cast one sweep; its stamp is its end, and every point is in the lidar frame at its own time."""
+def cast_sweep(spec: LidarSpec, moving: MovingScene, stamp_ns: int, rng: np.random.Generator) -> LabeledSweep:
+    """Cast the rays of one sweep; its stamp is its end, and every point is in the lidar frame at its own time."""
+    scene = moving.scene
     directions, ago_s = ray_pattern(spec)
     t_ns = stamp_ns - np.rint(ago_s * NS_PER_S).astype(np.int64)
     moments, column = np.unique(t_ns, return_inverse=True)
-    map_T_lidar = ego.map_T_ego_ns(moments) @ ego_T_lidar(spec)
+    map_T_lidar = moving.ego.map_T_ego_ns(moments) @ ego_T_lidar(spec)
     origin = map_T_lidar[column, :3, 3]
     ray = np.einsum("nij,nj->ni", map_T_lidar[column, :3, :3], directions)
     distance = np.full(len(ray), np.inf)
     hit = np.full(len(ray), GROUND)
-    down = -ray[:, 2] > GRAZING_RETURN
+    down = -ray[:, 2] > MIN_GRAZING_SINE
     distance[down] = origin[down, 2] / -ray[down, 2]
     for building in scene.building:
         nearer = _box_distance(building, origin, ray)
         closer = nearer < distance
         distance[closer], hit[closer] = nearer[closer], BUILDING
     t_s = (moments - scene.start_ns) / NS_PER_S
-    for index, actor in enumerate(actors):
+    for index, actor in enumerate(moving.actors):
         rows, nearer = _actor_distance(actor, t_s, column, origin, ray)
         closer = nearer < distance[rows]
         distance[rows[closer]], hit[rows[closer]] = nearer[closer], index
@@ -87,7 +94,7 @@ def cast(
     if spec.resolution_m > 0:
         xyz = np.rint(xyz / spec.resolution_m) * spec.resolution_m
     # Column after column in memory, which packs a quarter smaller.
-    return Cast(Sweep(stamp_ns, np.asfortranarray(xyz, dtype=np.float32), "lidar", t_ns[keep]), hit[keep])
+    return LabeledSweep(Sweep(stamp_ns, np.asfortranarray(xyz, dtype=np.float32), "lidar", t_ns[keep]), hit[keep])
 
 
 def _box_distance(building: Building, origin: Array, ray: Array) -> Array:
@@ -120,7 +127,7 @@ def slab_distance(size_m: Array, origin: Array, ray: Array, *, from_inside: bool
 def _actor_distance(
     actor: Actor, t_s: Array, column: NDArray[np.int64], origin: Array, ray: Array
 ) -> tuple[NDArray[np.int64], Array]:
-    """Rays that meet the actor's box, each with the actor where it is at the ray's time, and distances to its shape."""
+    """Rays that meet the actor's box at their own time, and their distances to its shape."""
     states = actor.at(t_s)
     to = states.center_m[column] - origin
     along = np.einsum("ni,ni->n", to, ray)
@@ -142,13 +149,14 @@ def first_hit(origin: Array, ray: Array, triangles: Array) -> Array:
 
     Notes
     -----
-    Moeller and Trumbore (1997), both sides of a triangle count; O(N F) in blocks of bounded size.
+    Moeller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection (1997); both sides of a triangle count; O(N F) in
+    batches of bounded size.
     """
     out = np.full(len(ray), np.inf)
     a = triangles[:, 0]
     e1, e2 = triangles[:, 1] - a, triangles[:, 2] - a
     normal = np.cross(e1, e2)
-    step = max(1, PAIRS_AT_ONCE // max(1, len(triangles)))
+    step = max(1, MAX_PAIRS_PER_BATCH // max(1, len(triangles)))
     for k in range(0, len(ray), step):
         o, d = origin[k : k + step], ray[k : k + step]
         # Every product with a pair of indices is a matrix product: d . n, d . (e x a) and so on.

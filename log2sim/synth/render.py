@@ -15,60 +15,27 @@ from log2sim.synth.backdrop import FACADE_M_PER_PX, GAMMA, GROUND_M_PER_PX, Back
 from log2sim.synth.light import HORIZON, SKY_LIGHT, SUN, SUN_LIGHT, ZENITH, reflected
 from log2sim.synth.paint import paint
 from log2sim.synth.raster import Fragments, rasterize
+from log2sim.synth.render_camera import RenderCamera
 
 HAZE_M = 500.0
-NEAR_M = 0.2
 FAR_M = 2000.0
 OVERSAMPLING = 2
-NOBODY, WALL = -1, -2
+NO_ACTOR, WALL = -1, -2
 _LINEAR = linear_table()
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """A camera at one moment: enlarged K, image size and pose."""
+class Visibility:
+    """Visible part of an actor in an image.
 
-    K: Array
-    width_px: int
-    height_px: int
-    map_T_cam: Array
-
-    @classmethod
-    def of(cls, camera: Camera, map_T_cam: Array, scale: int) -> View:
-        """Whole numbers are pixel centers, before and after enlarging."""
-        K = camera.K * scale
-        K[:2, 2] += (scale - 1) / 2
-        K[2, 2] = 1.0
-        return cls(K, camera.width_px * scale, camera.height_px * scale, map_T_cam)
-
-    def rays(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The map components of all rays with depth 1, as sums of a part by column (W, 3) and a part by row (H, 3)."""
-        u = (np.arange(self.width_px) - self.K[0, 2]) / self.K[0, 0]
-        v = (np.arange(self.height_px) - self.K[1, 2]) / self.K[1, 1]
-        R = self.map_T_cam[:3, :3]
-        return np.outer(u, R[:, 0]).astype(np.float32), (np.outer(v, R[:, 1]) + R[:, 2]).astype(np.float32)
-
-    def polygon(self, points_map: Array) -> NDArray[np.int32]:
-        """Image of a convex polygon (P, 3), clipped where it comes too near, in sixteenths of a pixel; may be empty."""
-        p = apply(inverse(self.map_T_cam), points_map)
-        out = []
-        for a, b in zip(p, np.roll(p, -1, axis=0)):
-            if a[2] >= NEAR_M:
-                out.append(a)
-            if (a[2] >= NEAR_M) != (b[2] >= NEAR_M):
-                out.append(a + (b - a) * (NEAR_M - a[2]) / (b[2] - a[2]))
-        if len(out) < 3:
-            return np.zeros((0, 2), np.int32)
-        q = np.array(out)
-        uv = q[:, :2] / q[:, 2:] * [self.K[0, 0], self.K[1, 1]] + self.K[:2, 2]
-        return np.rint(np.clip(uv, -1e5, 1e5) * 16).astype(np.int32)
-
-
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """What a camera sees of an actor: pixels that show it, pixels of its whole silhouette in the image, box (4,) px.
-
-    The box is that of the visible part, edges of pixels counted from the image's corner.
+    Attributes
+    ----------
+    visible_px : int
+        Pixels that show it.
+    silhouette_px : int
+        Pixels of its whole silhouette in the image.
+    box_px : (4,) float64, px
+        Box of the visible part, edges of pixels counted from the image's corner.
     """
 
     visible_px: int
@@ -76,16 +43,27 @@ class Seen:
     box_px: Array
 
 
-def render(
-    camera: Camera,
-    map_T_cam: Array,
-    backdrop: Backdrop,
-    actors: tuple[Actor, ...],
-    t_s: float,
-    rng: np.random.Generator,
-) -> NDArray[np.uint8]:
-    """An image (H, W, 3) uint8 BGR."""
-    view = View.of(camera, map_T_cam, OVERSAMPLING)
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """Everything in a scene at one time.
+
+    Attributes
+    ----------
+    backdrop : Backdrop
+    actors : tuple of Actor
+    t_s : float
+        Since the start of the log.
+    """
+
+    backdrop: Backdrop
+    actors: tuple[Actor, ...]
+    t_s: float
+
+
+def render(camera: Camera, map_T_cam: Array, snapshot: Snapshot, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Render an image (H, W, 3) uint8 BGR."""
+    backdrop, actors, t_s = snapshot.backdrop, snapshot.actors, snapshot.t_s
+    view = RenderCamera.of(camera, map_T_cam, OVERSAMPLING)
     color, depth, on_ground = _sky_and_ground(view, backdrop)
     _draw_walls(view, backdrop, color, depth)
     _draw_shadows(view, actors, t_s, color, on_ground & (depth < FAR_M))
@@ -103,34 +81,32 @@ def render(
     return _developed(color, rng)
 
 
-def segment(
-    camera: Camera, map_T_cam: Array, backdrop: Backdrop, actors: tuple[Actor, ...], t_s: float
-) -> list[Seen | None]:
-    """What the camera sees of each actor, None for nothing."""
-    view = View.of(camera, map_T_cam, 1)
+def segment(camera: Camera, map_T_cam: Array, snapshot: Snapshot) -> list[Visibility | None]:
+    """Segment an image by actors: the visible part of each, None without one."""
+    view = RenderCamera.of(camera, map_T_cam, 1)
     depth = np.full((view.height_px, view.width_px), np.inf, np.float32)
-    _draw_walls(view, backdrop, None, depth)
-    owner = np.full(depth.size, NOBODY)
+    _draw_walls(view, snapshot.backdrop, None, depth)
+    owner = np.full(depth.size, NO_ACTOR)
     whole = []
-    for index, actor in enumerate(actors):
-        fragments = _fragments(view, actor, t_s)
+    for index, actor in enumerate(snapshot.actors):
+        fragments = _fragments(view, actor, snapshot.t_s)
         near = fragments.depth_m < depth.ravel()[fragments.pixel]
         pixel = fragments.pixel[near]
         depth.ravel()[pixel] = fragments.depth_m[near]
         owner[pixel] = index
         whole.append(len(fragments.pixel))
-    out: list[Seen | None] = []
+    out: list[Visibility | None] = []
     for index, silhouette in enumerate(whole):
         pixel = np.flatnonzero(owner == index) if silhouette else np.zeros(0, int)
         if len(pixel) == 0:
             out.append(None)
             continue
         v, u = np.divmod(pixel, view.width_px)
-        out.append(Seen(len(pixel), silhouette, np.array([u.min(), v.min(), u.max() + 1, v.max() + 1], float)))
+        out.append(Visibility(len(pixel), silhouette, np.array([u.min(), v.min(), u.max() + 1, v.max() + 1], float)))
     return out
 
 
-def _fragments(view: View, actor: Actor, t_s: float) -> Fragments:
+def _fragments(view: RenderCamera, actor: Actor, t_s: float) -> Fragments:
     states = actor.at(t_s)
     cam_T_map = inverse(view.map_T_cam)
     center = apply(cam_T_map, states.center_m)[0]
@@ -144,15 +120,17 @@ def _fragments(view: View, actor: Actor, t_s: float) -> Fragments:
     return rasterize(vertices, mesh.faces, view.K, view.width_px, view.height_px)
 
 
-def _shade(view: View, actor: Actor, t_s: float, fragments: Fragments, near: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Light (P, 3) that comes from an actor's surface."""
+def _shade(
+    view: RenderCamera, actor: Actor, t_s: float, fragments: Fragments, near: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """Light (P, 3) from an actor's surface."""
     mesh, map_T_agent = actor.mesh(t_s), actor.at(t_s).map_T_agent()[0]
     corner = mesh.faces[fragments.face[near]]
     weight = fragments.weight[near][:, :, None]
     points = (mesh.vertices_m.astype(np.float32)[corner] * weight).sum(1)
     normals = (mesh.normals.astype(np.float32)[corner] * weight).sum(1)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
-    surface = paint(actor.look, mesh.part[fragments.face[near]], points, normals)
+    surface = paint(actor.appearance, mesh.part[fragments.face[near]], points, normals)
     R = map_T_agent[:3, :3].astype(np.float32)
     n = normals @ R.T
     to_camera = (view.map_T_cam[:3, 3] - map_T_agent[:3, 3]).astype(np.float32) - points @ R.T
@@ -162,7 +140,7 @@ def _shade(view: View, actor: Actor, t_s: float, fragments: Fragments, near: NDA
 
 
 def _sky_and_ground(
-    view: View, backdrop: Backdrop
+    view: RenderCamera, backdrop: Backdrop
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
     by_column, by_row = view.rays()
     up = by_row[:, None, 2] + by_column[None, :, 2]
@@ -178,8 +156,8 @@ def _sky_and_ground(
     return color, depth, ground
 
 
-def _ground_image(view: View, backdrop: Backdrop, depth: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """The ground texture as the camera sees it, from a level of the pyramid that is as coarse as the rows' pixels."""
+def _ground_image(view: RenderCamera, backdrop: Backdrop, depth: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Warp the ground texture into the image, from the pyramid level whose resolution fits each row."""
     h, w = view.height_px, view.width_px
     cam_T_map = inverse(view.map_T_cam)
     image_H_ground = view.K @ np.column_stack([cam_T_map[:3, 0], cam_T_map[:3, 1], cam_T_map[:3, 3]])
@@ -210,8 +188,10 @@ def _ground_image(view: View, backdrop: Backdrop, depth: NDArray[np.float32]) ->
     return out
 
 
-def _draw_walls(view: View, backdrop: Backdrop, color: NDArray[np.float32] | None, depth: NDArray[np.float32]) -> None:
-    """Draw facades where they are nearer than what is there; with `color` None only their depth."""
+def _draw_walls(
+    view: RenderCamera, backdrop: Backdrop, color: NDArray[np.float32] | None, depth: NDArray[np.float32]
+) -> None:
+    """Draw facades where they are nearer than the depth so far; with `color` None only their depth."""
     eye = view.map_T_cam[:3, 3]
     by_column, by_row = view.rays()
     for wall in backdrop.walls:
@@ -254,9 +234,9 @@ def _draw_walls(view: View, backdrop: Backdrop, color: NDArray[np.float32] | Non
 
 
 def _draw_shadows(
-    view: View, actors: tuple[Actor, ...], t_s: float, color: NDArray[np.float32], ground: NDArray[np.bool_]
+    view: RenderCamera, actors: tuple[Actor, ...], t_s: float, color: NDArray[np.float32], ground: NDArray[np.bool_]
 ) -> None:
-    """Darken the ground where actors keep the sun off it and, right under them, the sky too."""
+    """Darken the ground in the shadow of actors and, right below them, further."""
     sun = np.zeros(ground.shape, np.uint8)
     sky = np.zeros(ground.shape, np.uint8)
     slope = SUN[:2] / SUN[2]

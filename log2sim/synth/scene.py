@@ -16,7 +16,7 @@ from log2sim.datatypes import TYPICAL_SIZE_M
 from log2sim.errors import ConfigError
 from log2sim.model_errors import first_problem
 
-SCENE_LIMIT_BYTES = 4 * 1024 * 1024
+MAX_SCENE_BYTES = 4 * 1024 * 1024
 MAX_COORDINATE_M = 1e7
 
 Number = Annotated[float, Strict()]
@@ -223,8 +223,8 @@ def load_scene(path: Path | str) -> Scene:
     path = Path(path)
     if not path.is_file():
         raise ConfigError(f"{path}: no such file")
-    if path.stat().st_size > SCENE_LIMIT_BYTES:
-        raise ConfigError(f"{path}: {path.stat().st_size} bytes, more than the {SCENE_LIMIT_BYTES} of a scene file")
+    if path.stat().st_size > MAX_SCENE_BYTES:
+        raise ConfigError(f"{path}: {path.stat().st_size} bytes, more than the {MAX_SCENE_BYTES} of a scene file")
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as problem:

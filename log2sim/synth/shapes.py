@@ -1,4 +1,4 @@
-"""Triangle meshes and the primitives that road users are put together from.
+"""Triangle meshes and the primitives that road users are composed of.
 
 A mesh lives in the agent frame: x forward, y left, z up, origin at the center of its box.
 """
@@ -16,7 +16,18 @@ from log2sim.geometry import Array
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """`vertices_m` (V, 3), outward `normals` (V, 3), `faces` (F, 3) int, `part` (F,) int: what the face is made of."""
+    """A triangle mesh.
+
+    Attributes
+    ----------
+    vertices_m : (V, 3) float64, m
+    normals : (V, 3) float64
+        Outward unit normals of the vertices.
+    faces : (F, 3) int64
+        Indices of vertices, counter-clockwise from outside.
+    part : (F,) int64
+        Material of each face.
+    """
 
     vertices_m: Array
     normals: Array
@@ -35,7 +46,7 @@ class Mesh:
 
 
 def merged(meshes: Sequence[Mesh]) -> Mesh:
-    """One mesh of several."""
+    """Concatenate meshes."""
     offsets = np.cumsum([0, *(len(m.vertices_m) for m in meshes)])
     return Mesh(
         np.concatenate([m.vertices_m for m in meshes]),
@@ -46,7 +57,7 @@ def merged(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def surface(vertices: Array, faces: NDArray[np.int64], part: int) -> Mesh:
-    """A smooth mesh: normals of the vertices are the area-weighted means of their faces'."""
+    """Make a smooth mesh: vertex normals are area-weighted means of the face normals."""
     cross = np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]])
     solid = np.linalg.norm(cross, axis=1) > 1e-12
     faces, cross = faces[solid], cross[solid]
@@ -77,14 +88,14 @@ def _fan(ring: Array, part: int) -> Mesh:
 
 
 def _across(axis: Array) -> Array:
-    """A unit vector square to `axis`."""
+    """Find a unit vector perpendicular to `axis`."""
     side = np.array([0.0, 1.0, 0.0]) if abs(axis[1]) < 0.9 * np.linalg.norm(axis) else np.array([1.0, 0.0, 0.0])
     across = np.cross(side, axis)
-    return across / np.linalg.norm(across)
+    return np.asarray(across / np.linalg.norm(across))
 
 
 def limb(points: ArrayLike, radii: Sequence[float], part: int, *, count: int = 10, flat: float = 1.0) -> Mesh:
-    """A round-ended tube along points (P, 3) with a radius at each; `flat` squeezes it across its second axis."""
+    """Make a round-ended tube along points (P, 3) with a radius at each; `flat` scales its second axis."""
     p = np.asarray(points, dtype=np.float64)
     tangent = np.gradient(p, axis=0) if len(p) > 2 else np.repeat(p[1:] - p[:1], 2, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -105,7 +116,7 @@ def limb(points: ArrayLike, radii: Sequence[float], part: int, *, count: int = 1
 
 
 def ellipsoid(center: ArrayLike, radii: ArrayLike, part: int, *, count: int = 14) -> Mesh:
-    """An ellipsoid with its axes along x, y, z."""
+    """Make an ellipsoid with axes along x, y, z."""
     height = np.linspace(-np.pi / 2, np.pi / 2, count // 2 + 2)
     angle = np.arange(count) * 2 * np.pi / count
     c, r = np.asarray(center, dtype=np.float64), np.asarray(radii, dtype=np.float64)
@@ -115,7 +126,7 @@ def ellipsoid(center: ArrayLike, radii: ArrayLike, part: int, *, count: int = 14
 
 
 def block(low: ArrayLike, high: ArrayLike, part: int, *, bevel_m: float = 0.0) -> Mesh:
-    """An upright box with flat sides; `bevel_m` rounds the upright edges and slopes the rims."""
+    """Make an upright box with flat sides; `bevel_m` chamfers the upright edges and the upper rim."""
     (x0, y0, z0), (x1, y1, z1) = np.asarray(low, float), np.asarray(high, float)
     if bevel_m <= 0:
         ring = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
@@ -148,7 +159,7 @@ def _quad(a: Array, b: Array, z0: float, z1: float, part: int) -> Mesh:
 
 
 def disc_wheel(center: ArrayLike, radius_m: float, width_m: float, part: int, *, count: int = 20) -> Mesh:
-    """A wheel that turns about y."""
+    """Make a wheel with its axle along y."""
     x, y, z = np.asarray(center, dtype=np.float64)
     angle = -np.arange(count) * 2 * np.pi / count
     rings = []
@@ -167,7 +178,7 @@ def disc_wheel(center: ArrayLike, radius_m: float, width_m: float, part: int, *,
 
 
 def hoop(center: ArrayLike, radius_m: float, thickness_m: float, part: int, *, count: int = 28) -> Mesh:
-    """A thin tire about y."""
+    """Make a thin tire around an axle along y."""
     c = np.asarray(center, dtype=np.float64)
     angle = -np.arange(count) * 2 * np.pi / count
     out = np.stack([np.cos(angle), np.zeros(count), np.sin(angle)], 1)

@@ -11,8 +11,8 @@ from log2sim.geometry import Array
 from log2sim.synth.shapes import Mesh, block, disc_wheel, loft, merged
 
 
-class Part(IntEnum):
-    """What a face is made of; `paint` turns it into colors."""
+class Material(IntEnum):
+    """Material of a face; `paint` assigns its colors."""
 
     CAR_BODY = 0
     WHEEL = 1
@@ -49,24 +49,24 @@ def roof_line(kind: str) -> Array:
 
 @lru_cache(maxsize=64)
 def car(size_m: tuple[float, float, float], kind: str) -> Mesh:
-    """A car: one skin from nose to tail and four wheels."""
+    """Shape a car: one skin from nose to tail and four wheels."""
     length, width, height = size_m
     line = roof_line(kind)
     u = np.unique(np.concatenate([line[:, 0], np.linspace(-0.47, 0.47, 26)]))
     top = np.interp(u, line[:, 0], line[:, 1])
     rings = np.array([_car_section(ui, ti) for ui, ti in zip(u, top)]) * [length, width, height]
-    skin = loft(rings, Part.CAR_BODY)
+    skin = loft(rings, Material.CAR_BODY)
     floor = block(
-        [-0.42 * length, -0.36 * width, 0.14 * height], [0.42 * length, 0.36 * width, 0.3 * height], Part.CHASSIS
+        [-0.42 * length, -0.36 * width, 0.14 * height], [0.42 * length, 0.36 * width, 0.3 * height], Material.CHASSIS
     )
     wheels = [
         disc_wheel(
-            [s * WHEEL_AT * length, side * (width / 2 - 0.115), WHEEL_RADIUS_M], WHEEL_RADIUS_M, 0.22, Part.WHEEL
+            [s * WHEEL_AT * length, side * (width / 2 - 0.115), WHEEL_RADIUS_M], WHEEL_RADIUS_M, 0.22, Material.WHEEL
         )
         for s in (-1, 1)
         for side in (-1, 1)
     ]
-    mirrors = [block(*_mirror(length, width, height, side), Part.MIRROR, bevel_m=0.03) for side in (-1, 1)]
+    mirrors = [block(*_mirror(length, width, height, side), Material.MIRROR, bevel_m=0.03) for side in (-1, 1)]
     return merged([skin, floor, *wheels, *mirrors]).fitted(size_m)
 
 
@@ -108,19 +108,21 @@ def _car_section(u: float, top: float) -> Array:
 
 @lru_cache(maxsize=32)
 def truck(size_m: tuple[float, float, float]) -> Mesh:
-    """A box truck: cab in front, cargo box behind, three axles."""
+    """Shape a box truck: cab in front, cargo box behind, three axles."""
     length, width, height = size_m
     cab = min(2.1, 0.32 * length)
     front, rear = length / 2, -length / 2
     half = width / 2
     parts = [
         _cab(front - cab, front, 0.92 * half, 0.34, 0.8 * height),
-        block([rear, -half, 0.36 * height], [front - cab - 0.15, half, height], Part.CARGO, bevel_m=0.05),
-        block([rear + 0.1, -0.3 * width, 0.5], [front - 0.4, 0.3 * width, 0.36 * height + 0.02], Part.CHASSIS),
+        block([rear, -half, 0.36 * height], [front - cab - 0.15, half, height], Material.CARGO, bevel_m=0.05),
+        block([rear + 0.1, -0.3 * width, 0.5], [front - 0.4, 0.3 * width, 0.36 * height + 0.02], Material.CHASSIS),
     ]
     radius = 0.48
     axles = (front - 0.95, rear + 1.1) if length < 8 else (front - 0.95, rear + 2.4, rear + 1.2)
-    parts += [disc_wheel([x, side * (half - 0.17), radius], radius, 0.3, Part.WHEEL) for x in axles for side in (-1, 1)]
+    parts += [
+        disc_wheel([x, side * (half - 0.17), radius], radius, 0.3, Material.WHEEL) for x in axles for side in (-1, 1)
+    ]
     return merged(parts).fitted(size_m)
 
 
@@ -142,12 +144,12 @@ def _cab(rear: float, front: float, half: float, low: float, high: float) -> Mes
         ]
         right = [(-y, z) for y, z in left[-2:0:-1]]
         rings.append([(xi, y, z) for y, z in left + right])
-    return loft(np.array(rings), Part.CAB)
+    return loft(np.array(rings), Material.CAB)
 
 
 @lru_cache(maxsize=32)
 def bus(size_m: tuple[float, float, float]) -> Mesh:
-    """A city bus: a long box with rounded edges and two axles."""
+    """Shape a city bus: a long box with rounded edges and two axles."""
     length, width, height = size_m
     half = width / 2
     x = np.array([-0.5, -0.492, -0.48, 0.46, 0.485, 0.5]) * length
@@ -161,8 +163,8 @@ def bus(size_m: tuple[float, float, float]) -> Mesh:
         rings.append([(xi, y, z) for y, z in left + right])
     radius = 0.48
     wheels = [
-        disc_wheel([s * length, side * (half - 0.165), radius], radius, 0.3, Part.WHEEL)
+        disc_wheel([s * length, side * (half - 0.165), radius], radius, 0.3, Material.WHEEL)
         for s in (-0.26, 0.27)
         for side in (-1, 1)
     ]
-    return merged([loft(np.array(rings), Part.BUS_BODY), *wheels]).fitted(size_m)
+    return merged([loft(np.array(rings), Material.BUS_BODY), *wheels]).fitted(size_m)

@@ -1,4 +1,4 @@
-"""Synthetic logs: a scene file becomes a log, as sensors would have recorded it, and its exact truth.
+"""Write a synthetic log, as sensors would have recorded it, with its exact truth.
 
 scene = load_scene("samples/crossing.toml")
 log, truth = synthesize(scene, seed=1)          # records are rendered and cast when they are read
@@ -27,9 +27,9 @@ MANIFEST = "log.json"
 
 def synthesize(scene: Scene, *, seed: int = 0, observe: bool = True) -> tuple[Log, Scenario]:
     """Make a log and its exact truth; see `log2sim.synth.synthesis.synthesize`."""
-    from log2sim.synth.synthesis import synthesize as assemble
+    from log2sim.synth import synthesis
 
-    return assemble(scene, seed=seed, observe=observe)
+    return synthesis.synthesize(scene, seed=seed, observe=observe)
 
 
 def write_synthetic(
