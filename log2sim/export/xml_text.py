@@ -8,7 +8,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from urllib.parse import quote, unquote
 from xml.etree import ElementTree
-from xml.parsers import expat
+
+from defusedxml.common import DefusedXmlException
+from defusedxml.ElementTree import iterparse
 
 from log2sim.errors import LogError, ScenarioError
 
@@ -64,54 +66,36 @@ def write(root: ElementTree.Element, path: Path) -> None:
     path.write_text(f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n', encoding="utf-8", newline="\n")
 
 
-class _Reader:
-    """Builds a tree from expat's events, refusing what a file from a stranger could harm with."""
-
-    def __init__(self, where: Path) -> None:
-        self.where, self.depth = where, 0
-        self.builder = ElementTree.TreeBuilder()
-
-    def start(self, tag: str, attributes: dict[str, str]) -> None:
-        self.depth += 1
-        if self.depth > DEPTH_LIMIT:
-            raise ScenarioError(
-                f"{self.where}: elements nest deeper than {DEPTH_LIMIT}; is this a scenario or road file?"
-            )
-        self.builder.start(tag, attributes)
-
-    def end(self, tag: str) -> None:
-        self.depth -= 1
-        self.builder.end(tag)
-
-    def refuse(self, *_: object) -> None:
-        raise ScenarioError(
-            f"{self.where}: has a document type declaration, which is not read; remove its <!DOCTYPE ...>"
-        )
-
-
 def read(path: Path) -> ElementTree.Element:
     """Parse a file of at most `SIZE_LIMIT_BYTES` without entities, DTDs or anything outside it.
 
     Raises
     ------
     ScenarioError
-        When the file is missing, too large, no XML, or declares a document type.
+        When the file is missing, too large, nested too deeply or no XML, or declares a document type.
     """
     if not path.is_file():
         raise ScenarioError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}; expected an XML file")
     if path.stat().st_size > SIZE_LIMIT_BYTES:
         raise ScenarioError(f"{path}: {path.stat().st_size} bytes, more than the {SIZE_LIMIT_BYTES} that are read")
-    reader, parser = _Reader(path), expat.ParserCreate()
-    parser.buffer_text = True
-    parser.StartElementHandler, parser.EndElementHandler = reader.start, reader.end
-    parser.CharacterDataHandler = reader.builder.data
-    parser.StartDoctypeDeclHandler = reader.refuse
+    depth, root = 0, None
     try:
-        with path.open("rb") as file:
-            parser.ParseFile(file)
-        return reader.builder.close()
-    except (expat.ExpatError, LookupError, ValueError) as problem:  # LookupError: an encoding that nobody knows
+        for event, node in iterparse(path, events=("start", "end"), forbid_dtd=True):
+            depth += 1 if event == "start" else -1
+            root = node if root is None else root
+            if depth > DEPTH_LIMIT:
+                raise ScenarioError(
+                    f"{path}: elements nest deeper than {DEPTH_LIMIT}; is this a scenario or road file?"
+                )
+    except DefusedXmlException:
+        raise ScenarioError(
+            f"{path}: has a document type declaration, which is not read; remove its <!DOCTYPE ...>"
+        ) from None
+    except (ElementTree.ParseError, LookupError, ValueError) as problem:  # LookupError: unknown encoding
         raise ScenarioError(f"{path}: not valid XML: {problem}") from None
+    if root is None:
+        raise ScenarioError(f"{path}: not valid XML: no element found")
+    return root
 
 
 def require_number(value: str | None, where: str) -> float:
