@@ -7,9 +7,9 @@ scalar-first, yaw is counter-clockwise from +x in [-pi, pi).
 
 from __future__ import annotations
 
-from log2sim.geometry.box_projection import project_boxes
+from log2sim.geometry.box_projection import box_lines, outline, project_boxes
 from log2sim.geometry.boxes import box_corners, box_corners_bev, box_iou, points_in_box
-from log2sim.geometry.camera import NEAREST_DEPTH_M, Camera, Mount, box_lines, distort, fold_radius, project, undistort
+from log2sim.geometry.camera import NEAREST_DEPTH_M, Camera, Mount, distort, fold_radius, project, undistort
 from log2sim.geometry.homography import apply_homography, ground_homography, homography_jacobian
 from log2sim.geometry.overlap import (
     bev_iou,
@@ -57,6 +57,7 @@ __all__ = [
     "homography_jacobian",
     "inverse",
     "nearest_index",
+    "outline",
     "overlap_area",
     "overlap_of_smaller",
     "points_in_box",

@@ -1,6 +1,6 @@
 """Projection of points into images and back to rays, for pinhole cameras with and without lens distortion.
 
-Models are OpenCV's: "brown" is Brown-Conrady with k1, k2, p1, p2, k3 and the rational k4..k6, "fisheye" is Kannala-Brandt.
+The lens models are those of OpenCV: "brown" is Brown-Conrady with k1, k2, p1, p2, k3 and the rational k4..k6, "fisheye" is Kannala-Brandt.
 """
 
 from __future__ import annotations
@@ -16,15 +16,43 @@ from numpy.typing import NDArray
 from log2sim.geometry.transforms import Array
 
 NEAREST_DEPTH_M = 0.1
-# Corners of a box joined by edges, as `geometry.box_corners` orders them; the last two cross out the front.
-_EDGES = (
-    (0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7),
-    (0, 7), (3, 4),
-)  # fmt: skip
-# Undistortion: rays of the start table, and rounds of Newton's method, which doubles the digits of that start.
-_TABLE = 1024
-_ROUNDS = 12
+"""Points nearer to the image plane, or behind it, are not projected."""
+
+# Undistortion: entries of the table of initial values, iterations of Newton's method.
+_TABLE_SIZE = 1024
+_ITERATIONS = 12
 _TOLERANCE_PX = 1e-6
+
+
+Mount = Literal["ego", "map"]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera with lens distortion.
+
+    Attributes
+    ----------
+    name : str
+    width_px, height_px : int
+    K : (3, 3) float64, px
+        Camera matrix.
+    mount : {"ego", "map"}
+        Frame that it is fixed in: on the vehicle or at the roadside.
+    mount_T_cam : (4, 4) float64
+    distortion_model : {"none", "brown", "fisheye"}
+    distortion : tuple of float
+        In OpenCV's order: k1, k2, p1, p2[, k3[, k4, k5, k6]] for "brown", k1..k4 for "fisheye".
+    """
+
+    name: str
+    width_px: int
+    height_px: int
+    K: Array
+    mount: Mount
+    mount_T_cam: Array
+    distortion_model: str = "none"
+    distortion: tuple[float, ...] = ()
 
 
 def project(camera: Camera, points_cam: NDArray[np.floating[Any]]) -> tuple[Array, NDArray[np.bool_]]:
@@ -33,7 +61,7 @@ def project(camera: Camera, points_cam: NDArray[np.floating[Any]]) -> tuple[Arra
     Returns
     -------
     uv_px : (N, 2) float64
-        NaN where the point is not in front of the camera, or so far aside that the lens model has folded back.
+        NaN for a point that is not in front of the camera, or outside the invertible range of the lens model.
     valid : (N,) bool
         In front of the camera and inside the image.
     """
@@ -41,64 +69,38 @@ def project(camera: Camera, points_cam: NDArray[np.floating[Any]]) -> tuple[Arra
     front = points[:, 2] > NEAREST_DEPTH_M
     uv = np.full((len(points), 2), np.nan)
     xy = points[front, :2] / points[front, 2:]
-    if _bends(camera):
-        seen = _before_fold(camera, xy)
-        xy = distort(camera, np.where(seen[:, None], xy, np.nan))
+    if _is_distorted(camera):
+        usable = _before_fold(camera, xy)
+        xy = distort(camera, np.where(usable[:, None], xy, np.nan))
     uv[front] = xy @ camera.K[:2, :2].T + camera.K[:2, 2]
     with np.errstate(invalid="ignore"):
         inside = (uv[:, 0] >= 0) & (uv[:, 0] < camera.width_px) & (uv[:, 1] >= 0) & (uv[:, 1] < camera.height_px)
     return uv, inside
 
 
-def box_lines(camera: Camera, corners_cam: Array) -> Array:
-    """Edges (E, 2, 2) in px of a box with corners (8, 3) in the cam frame, clipped at the near plane.
-
-    Notes
-    -----
-    A straight edge is bent by a distorting lens; it is cut into eight pieces then.
-    """
-    ends = np.array([[corners_cam[a], corners_cam[b]] for a, b in _EDGES])
-    ends = ends[(ends[..., 2] > 1.01 * NEAREST_DEPTH_M).any(axis=1)]
-    if len(ends) == 0:
-        return np.zeros((0, 2, 2))
-    near = 1.01 * NEAREST_DEPTH_M
-    for a, b in ((0, 1), (1, 0)):
-        behind = ends[:, a, 2] < near
-        p, q = ends[behind, a], ends[behind, b]
-        ends[behind, a] = q + (p - q) * ((q[:, 2] - near) / (q[:, 2] - p[:, 2]))[:, None]
-    pieces = 1 if camera.distortion_model == "none" else 8
-    f = np.linspace(0, 1, pieces + 1)[None, :, None]
-    points = ends[:, None, 0] * (1 - f) + ends[:, None, 1] * f
-    uv = project(camera, points.reshape(-1, 3))[0].reshape(len(ends), pieces + 1, 2)
-    lines = np.stack([uv[:, :-1], uv[:, 1:]], axis=2).reshape(-1, 2, 2)
-    low, high = lines.min(axis=1), lines.max(axis=1)
-    touches = (high >= 0).all(axis=1) & (low[:, 0] < camera.width_px) & (low[:, 1] < camera.height_px)
-    return np.asarray(lines[touches & np.isfinite(lines).all(axis=(1, 2))])
-
-
-def _bends(camera: Camera) -> bool:
+def _is_distorted(camera: Camera) -> bool:
     return camera.distortion_model != "none" and any(camera.distortion)
 
 
 def _before_fold(camera: Camera, xy: Array) -> NDArray[np.bool_]:
-    """Whether rays (N, 2) lie where the lens model still moves outwards."""
-    seen: NDArray[np.bool_] = (xy * xy).sum(axis=1) < fold_radius(camera) ** 2
+    """Mark (N,) the rays (N, 2) at which the radius in the image still increases with that of the ray."""
+    before: NDArray[np.bool_] = (xy * xy).sum(axis=1) < fold_radius(camera) ** 2
     if camera.distortion_model == "brown":
-        # The tangential terms fold too, but only far outside the view; thrice the view is seen by no such lens.
+        # The tangential terms fold too, but only beyond three times the view.
         half_view = 1.5 * np.array([camera.width_px / camera.K[0, 0], camera.height_px / camera.K[1, 1]])
-        seen &= np.all(np.abs(xy) <= half_view, axis=1)
-    return seen
+        before &= np.all(np.abs(xy) <= half_view, axis=1)
+    return before
 
 
 def fold_radius(camera: Camera) -> float:
-    """Radius in normalized coordinates up to which the lens model moves outwards; infinite when it always does.
+    """Compute the radius of rays, at depth 1, up to which the radius in the image increases; infinite when it always does.
 
     Notes
     -----
-    Beyond it the polynomial turns back, so a point far outside the view would appear inside the image. It is the first
-    zero of the derivative of the radial part, or the pole of the rational model.
+    Beyond it a point far outside the view would be projected into the image. It is the first zero of the derivative of the
+    radial part, or the pole of the rational model.
     """
-    return _fold_radius(camera.distortion_model, tuple(camera.distortion)) if _bends(camera) else float("inf")
+    return _fold_radius(camera.distortion_model, tuple(camera.distortion)) if _is_distorted(camera) else float("inf")
 
 
 @lru_cache(maxsize=256)
@@ -120,8 +122,8 @@ def _first_positive_root(polynomial: Polynomial) -> float:
 
 
 def distort(camera: Camera, xy: Array) -> Array:
-    """Apply the lens to normalized image coordinates (N, 2)."""
-    if not _bends(camera):
+    """Apply the lens distortion to normalized image coordinates (N, 2)."""
+    if not _is_distorted(camera):
         return xy
     x, y = xy[:, 0], xy[:, 1]
     r2 = x * x + y * y
@@ -145,21 +147,21 @@ def distort(camera: Camera, xy: Array) -> Array:
 
 
 def undistort(camera: Camera, uv_px: Array) -> Array:
-    """Normalized image coordinates (N, 2) of pixels (N, 2): rays are (x, y, 1) in the cam frame.
+    """Compute normalized image coordinates (N, 2) of pixels (N, 2): rays are (x, y, 1) in the cam frame.
 
-    NaN for pixels that the lens model reaches from no ray in front of the camera before it folds back.
+    NaN for pixels outside the invertible range of the lens model.
 
     Notes
     -----
-    The radial part alone, inverted by table, starts Newton's method on the whole model. A fixed-point iteration would
-    diverge where pixels move more than twice as far as rays, and creep near the fold.
+    Newton's method on the whole model, from the radial part inverted by a table. The usual fixed-point iteration diverges
+    under strong distortion and converges slowly near the fold.
     """
     target = (np.asarray(uv_px, dtype=np.float64) - camera.K[:2, 2]) @ np.linalg.inv(camera.K[:2, :2]).T
-    if not _bends(camera):
+    if not _is_distorted(camera):
         return target
     tolerance = _TOLERANCE_PX / max(camera.K[0, 0], camera.K[1, 1])
     xy = _radial_start(camera, target)
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         error = distort(camera, xy) - target
         if not np.any(np.abs(error) > 1e-3 * tolerance):
             break
@@ -170,10 +172,10 @@ def undistort(camera: Camera, uv_px: Array) -> Array:
 
 
 def _radial_start(camera: Camera, target: Array) -> Array:
-    """Rays (N, 2) that the radial part of the lens bends to `target` (N, 2); the last one before the fold beyond it."""
-    radius = np.tan(np.linspace(0.0, np.arctan(fold_radius(camera)), _TABLE))[:-1]
-    ahead = np.column_stack([radius, np.zeros(_TABLE - 1)])
-    # The odd part along x is the radial one; the tangential terms are even.
+    """Invert the radial part of the lens at `target` (N, 2): rays (N, 2), beyond the fold the last one before it."""
+    radius = np.tan(np.linspace(0.0, np.arctan(fold_radius(camera)), _TABLE_SIZE))[:-1]
+    ahead = np.column_stack([radius, np.zeros(_TABLE_SIZE - 1)])
+    # The radial part is odd in x, the tangential terms are even.
     bent = (distort(camera, ahead) - distort(camera, -ahead))[:, 0] / 2
     wanted = np.hypot(target[:, 0], target[:, 1])
     start = np.interp(wanted, np.maximum.accumulate(bent), radius)
@@ -181,7 +183,7 @@ def _radial_start(camera: Camera, target: Array) -> Array:
 
 
 def _newton_step(camera: Camera, xy: Array, error: Array) -> Array:
-    """Solve J step = error (N, 2) with the derivative of the lens taken by differences; 0 where it is singular."""
+    """Solve J step = error (N, 2) with the Jacobian J of the lens by central differences; 0 where it is singular."""
     width = 1e-6 * np.maximum(1.0, np.abs(xy).max(axis=1, initial=0.0))
     columns = []
     for axis in range(2):
@@ -196,23 +198,3 @@ def _newton_step(camera: Camera, xy: Array, error: Array) -> Array:
 
 def _padded(coefficients: tuple[float, ...], count: int) -> tuple[float, ...]:
     return tuple(coefficients) + (0.0,) * (count - len(coefficients))
-
-
-Mount = Literal["ego", "map"]
-
-
-@dataclass(frozen=True, eq=False)
-class Camera:
-    """A pinhole camera: `K` (3, 3) px, `mount_T_cam` (4, 4), distortion in OpenCV's order.
-
-    `distortion_model` is "none", "brown" (k1, k2, p1, p2[, k3[, k4, k5, k6]]) or "fisheye" (k1..k4, Kannala-Brandt).
-    """
-
-    name: str
-    width_px: int
-    height_px: int
-    K: Array
-    mount: Mount
-    mount_T_cam: Array
-    distortion_model: str = "none"
-    distortion: tuple[float, ...] = ()

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import NEAREST_DEPTH_M, Array, Camera, apply, box_corners, points_in_box, project
+from log2sim.geometry import NEAREST_DEPTH_M, Array, Camera, apply, box_corners, outline, points_in_box, project
 
-EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 CELL_M = 2.0
 SAMPLES_PER_SIDE = 32
 
@@ -55,7 +54,7 @@ def image_shares(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Arra
     in_cam = in_cam.reshape(-1, 8, 3)
     shares = np.where(seen.all(1), 1.0, 0.0)
     for k in np.flatnonzero(~seen.all(1) & (in_cam[..., 2] > NEAREST_DEPTH_M).any(1)):
-        samples = _samples(convex_hull(_front_outline(in_cam[k])))
+        samples = _samples(convex_hull(outline(in_cam[k])))
         if len(samples):
             _, inside = project(camera, np.column_stack([samples, np.ones(len(samples))]))
             shares[k] = inside.mean()
@@ -74,8 +73,7 @@ def image_samples(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Arr
     low, high = _view(camera)
     found = []
     for box in corners:
-        outline = _front_outline(box) if np.any(box[:, 2] > NEAREST_DEPTH_M) else np.zeros((0, 2))
-        rays = _samples(convex_hull(outline), low, high)
+        rays = _samples(convex_hull(outline(box)), low, high)
         uv, inside = project(camera, np.column_stack([rays, np.ones(len(rays))]))
         found.append(uv[inside])
     return found
@@ -89,31 +87,19 @@ def _view(camera: Camera) -> tuple[Array, Array]:
     return (low, high) if camera.distortion_model == "none" else (3 * low, 3 * high)
 
 
-def _samples(outline: Array, lowest: Array | float = -np.inf, highest: Array | float = np.inf) -> Array:
-    """Make a regular grid of points (S, 2) inside a convex outline (K, 2), counter-clockwise, and between two corners (2,)."""
-    if len(outline) < 3:
+def _samples(polygon: Array, lowest: Array | float = -np.inf, highest: Array | float = np.inf) -> Array:
+    """Make a regular grid of points (S, 2) inside a convex polygon (K, 2), counter-clockwise, and between two corners (2,)."""
+    if len(polygon) < 3:
         return np.zeros((0, 2))
-    low, high = np.maximum(outline.min(axis=0), lowest), np.minimum(outline.max(axis=0), highest)
+    low, high = np.maximum(polygon.min(axis=0), lowest), np.minimum(polygon.max(axis=0), highest)
     if np.any(low >= high):
         return np.zeros((0, 2))
     steps = (np.arange(SAMPLES_PER_SIDE) + 0.5) / SAMPLES_PER_SIDE
     x, y = np.meshgrid(*(low + steps[:, None] * (high - low)).T)
     points = np.stack([x.ravel(), y.ravel()], -1)
-    edge = np.roll(outline, -1, axis=0) - outline
-    to = points[:, None] - outline[None]
+    edge = np.roll(polygon, -1, axis=0) - polygon
+    to = points[:, None] - polygon[None]
     return points[np.all(edge[:, 0] * to[..., 1] - edge[:, 1] * to[..., 0] >= 0, axis=1)]
-
-
-def _front_outline(corners_cam: Array) -> Array:
-    """Points (K, 2) at depth 1 of the corners (8, 3) in front, and of where edges pass the nearest depth."""
-    front = corners_cam[:, 2] > NEAREST_DEPTH_M
-    points = [corners_cam[front]]
-    for i, j in EDGES:
-        if front[i] != front[j]:
-            a, b = corners_cam[i], corners_cam[j]
-            points.append((a + (b - a) * (NEAREST_DEPTH_M - a[2]) / (b[2] - a[2]))[None])
-    stacked = np.concatenate(points)
-    return stacked[:, :2] / stacked[:, 2:]
 
 
 def convex_hull(points: Array) -> Array:
