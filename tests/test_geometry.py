@@ -223,7 +223,7 @@ def test_overlap_of_oriented_boxes_is_opencvs() -> None:
         expected = shared / (size.prod(axis=1).sum() - shared)
         some += 0.05 < expected < 0.95
         assert bev_iou(a, b) == pytest.approx(expected, abs=2e-5)
-        assert bev_iou(b, a) == pytest.approx(bev_iou(a, b), abs=1e-12)
+        assert bev_iou(b, a) == pytest.approx(bev_iou(a, b), abs=1e-10)
         far = np.array([4.5e5, 5.4e6])
         assert bev_iou(a + far, b + far) == pytest.approx(bev_iou(a, b), abs=1e-6)
     assert some > 50
@@ -231,11 +231,11 @@ def test_overlap_of_oriented_boxes_is_opencvs() -> None:
 
 def test_overlap_of_boxes_in_special_places() -> None:
     box = box_corners_bev([[0.0, 0.0]], 4.0, 2.0, 0.3)[0]
-    assert bev_iou(box, box) == pytest.approx(1.0, abs=1e-12)
+    assert 1 - 1e-10 <= bev_iou(box, box) <= 1
     inner = box_corners_bev([[0.0, 0.0]], 2.0, 1.0, 0.3)[0]
-    assert bev_iou(inner, box) == pytest.approx(0.25, abs=1e-12)
+    assert bev_iou(inner, box) == pytest.approx(0.25, abs=1e-10)
     upright = [box_corners_bev([[x, 0.0]], 4.0, 2.0, 0.0)[0] for x in (0.0, 4.0, 2.0, 9.0)]
-    assert [bev_iou(upright[0], other) for other in upright[1:]] == [0.0, pytest.approx(1 / 3), 0.0]
+    assert [bev_iou(upright[0], other) for other in upright[1:]] == [0.0, pytest.approx(1 / 3, abs=1e-10), 0.0]
     assert bev_iou(np.zeros((4, 2)), np.zeros((4, 2))) == 0.0
 
 

@@ -9,6 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from log2sim.geometry.transforms import Array
 
+SNAP_M = 1e-11
+"""Grid that vertices are snapped to. In exact floating point GEOS 3.14 returns no overlap for one in 350 pairs of rectangles
+with collinear edges, which boxes of one road user have."""
+
 
 def overlap_area(a_m: ArrayLike, b_m: ArrayLike) -> Array:
     """Compute the area (...), m^2, that convex polygons share in pairs.
@@ -28,10 +32,12 @@ def overlap_area(a_m: ArrayLike, b_m: ArrayLike) -> Array:
     shape = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
     origin = a[..., :1, :]
     a, b = (np.broadcast_to(p - origin, (*shape, *p.shape[-2:])).reshape(-1, *p.shape[-2:]) for p in (a, b))
+    smaller = np.minimum(polygon_area(a), polygon_area(b))
     area = np.zeros(len(a))
-    usable = np.flatnonzero((polygon_area(a) > 0) & (polygon_area(b) > 0))  # False for NaN
+    usable = np.flatnonzero(smaller > 0)  # False for NaN
     if len(usable):
-        area[usable] = shapely.area(shapely.intersection(shapely.polygons(a[usable]), shapely.polygons(b[usable])))
+        shared = shapely.intersection(shapely.polygons(a[usable]), shapely.polygons(b[usable]), grid_size=SNAP_M)
+        area[usable] = np.minimum(shapely.area(shared), smaller[usable])
     return area.reshape(shape)
 
 
