@@ -11,19 +11,19 @@ import numpy as np
 from log2sim.agents.build import Timeline, estimate_agents
 from log2sim.agents.duplicates import outside, without_doubles
 from log2sim.agents.ego import ego_agent, ego_flow
-from log2sim.agents.scenario_of import scenario_of
+from log2sim.agents.scenario_of import camera_entries, provenance_of, scenario_of
 from log2sim.agents.simplify import simplify
 from log2sim.config import Config
 from log2sim.datatypes import Log, Scenario
 from log2sim.errors import NothingToReconstruct
+from log2sim.outcome import RunOutputs, stage_outcomes
 from log2sim.perception.detect.detectors import Detector, create_detector
 from log2sim.perception.first_pass import Observations, observe
 from log2sim.perception.homography_stage import estimation_options, fit_homographies, place_by_homography
 from log2sim.perception.sync import Schedule, synchronize
-from log2sim.plan import Plan, make_plan, plan_ticks
-from log2sim.report import make_report
-from log2sim.savings import settle
-from log2sim.stage_clock import Costs, StageClock
+from log2sim.plan import Plan, Sensors, Stage, make_plan, select_sensors
+from log2sim.report import report_of
+from log2sim.stage_clock import StageClock
 from log2sim.tracking.tracker import track
 
 Progress = Callable[[str, int, int], None]
@@ -35,6 +35,33 @@ class Result:
 
     scenario: Scenario
     report: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What the stages of one run share.
+
+    Attributes
+    ----------
+    log : Log
+        Without the LiDARs that are out of range.
+    config : Config
+    plan : Plan
+    schedule : Schedule
+        The ticks, and the frames and sweeps of each.
+    detector : Detector
+    clock : StageClock
+    report_progress : callable
+        Called as `report_progress(stage, done, total)`.
+    """
+
+    log: Log
+    config: Config
+    plan: Plan
+    schedule: Schedule
+    detector: Detector
+    clock: StageClock
+    report_progress: Progress
 
 
 def reconstruct(
@@ -49,7 +76,7 @@ def reconstruct(
     config : Config, optional
         Settings; the defaults without.
     picture : bool
-        Whether a top-down picture will be asked for, which needs every camera's homography.
+        Whether a bird's-eye view will be asked for, which needs every camera's homography.
     progress : callable, optional
         Called as `progress(stage, done, total)`.
 
@@ -60,29 +87,22 @@ def reconstruct(
     NothingToReconstruct
         When neither an ego nor any agent was found.
     """
-    config, clock = config or Config(), StageClock()
-    tell = progress or (lambda stage, done, total: None)
-    plan = make_plan(log, config, picture=picture)
+    run = start(log, config or Config(), picture=picture, progress=progress)
+    return second_pass(run, first_pass(run))
+
+
+def start(log: Log, config: Config, *, picture: bool = False, progress: Progress | None = None) -> Run:
+    """Choose the sensors, synchronize them, and plan the run."""
+    clock, sensors = StageClock(), select_sensors(log, config)
     detector = detector_of(log, config)
-    log = plan.narrowed(log)
     with clock.stage("sync"):
-        schedule = schedule_of(log, config, plan)
-    plan = plan_ticks(plan, log, schedule.t_ns, min_life_s=config.track.min_life_s)
-    seen = observe(
-        log,
-        schedule,
-        detector,
-        plan,
-        mode=config.measure.mode,
-        max_range_m=config.measure.max_range_m,
-        clock=clock,
-        progress=lambda done, total: tell("detect and measure", done, total),
-    )
-    return conclude(log, config, plan, detector, schedule, seen, clock)
+        schedule = schedule_of(log, config, sensors)
+    plan = make_plan(log, config, sensors, schedule.t_ns, picture=picture)
+    return Run(sensors.restrict(log), config, plan, schedule, detector, clock, progress or (lambda *_: None))
 
 
 def detector_of(log: Log, config: Config) -> Detector:
-    """The detector that the settings name."""
+    """Create the detector that the settings name."""
     return create_detector(
         config.detect.name,
         log,
@@ -93,11 +113,11 @@ def detector_of(log: Log, config: Config) -> Detector:
     )
 
 
-def schedule_of(log: Log, config: Config, plan: Plan) -> Schedule:
-    """The ticks of a run and what belongs to each."""
+def schedule_of(log: Log, config: Config, sensors: Sensors) -> Schedule:
+    """Synchronize the sensors of a run."""
     return synchronize(
-        log,
-        plan.cameras,
+        sensors.restrict(log),
+        sensors.cameras,
         reference=config.sync.reference,
         max_residual_s=config.sync.max_residual_s,
         start_s=config.start_s,
@@ -105,35 +125,53 @@ def schedule_of(log: Log, config: Config, plan: Plan) -> Schedule:
     )
 
 
-def conclude(
-    log: Log, config: Config, plan: Plan, detector: Detector, schedule: Schedule, seen: Observations, clock: StageClock
-) -> Result:
-    """The second pass: from what was seen, which stays as it is, to the scenario and the report."""
-    timeline, costs = Timeline(schedule.t_ns, int(schedule.t_ns[0])), Costs()
-    with clock.stage("topdown"):
-        plan, homographies = fit_homographies(
-            log, seen, plan, estimation_options(config.topdown), rng=np.random.default_rng(config.seed), costs=costs
-        )
-        measurements = place_by_homography(log, seen, homographies, across=plan.keeps("fuse"))
-    with clock.stage("track"):
+def first_pass(run: Run) -> Observations:
+    """Detect and measure, tick by tick."""
+    return observe(
+        run.log,
+        run.schedule,
+        run.detector,
+        run.plan,
+        mode=run.config.measure.mode,
+        max_range_m=run.config.measure.max_range_m,
+        clock=run.clock,
+        progress=lambda done, total: run.report_progress("detect and measure", done, total),
+    )
+
+
+def second_pass(run: Run, observations: Observations) -> Result:
+    """Go on from the observations, which stay as they are, to the scenario and the report."""
+    log, config, plan, t_ns = run.log, run.config, run.plan, run.schedule.t_ns
+    timeline = Timeline(t_ns, int(t_ns[0]))
+    with run.clock.stage("topdown"):
+        rng = np.random.default_rng(config.seed)
+        homographies = fit_homographies(log, observations, plan, estimation_options(config.topdown), rng=rng)
+        measurements = place_by_homography(log, observations, homographies, across=plan.keeps(Stage.FUSION))
+    with run.clock.stage("track"):
         tracks = track(
             measurements,
-            schedule.t_ns,
+            t_ns,
             birth_score=config.track.birth_score,
             max_gap_s=config.track.max_gap_s,
             min_life_s=config.track.min_life_s,
         )
-    with clock.stage("smooth"):
-        flow = ego_flow(log, schedule)
-        built = estimate_agents(tracks, seen.obstacles, timeline, flow, smooth=config.smooth.enabled, costs=costs)
+    with run.clock.stage("smooth"):
+        flow = ego_flow(log, run.schedule)
+        candidates = estimate_agents(tracks, observations.obstacles, timeline, flow, smooth=config.smooth.enabled)
         ego = ego_agent(log, timeline)
-        agents = outside(without_doubles(built, ego), ego)
-        # Without an ego the agents' waypoints are all that tells the ticks.
+        agents = outside(without_doubles(candidates, ego), ego)
+        # Without an ego the agents' waypoints alone tell the ticks, so all of them stay.
         agents = simplify(agents) if ego is not None else agents
     if ego is None and not agents:
-        raise NothingToReconstruct(f"{log.name}: no ego poses, and no object was detected in {len(schedule)} ticks")
-    with clock.stage("probe savings"):
-        plan = settle(plan, log, schedule, seen, homographies, agents, clock, costs)
-    scenario = scenario_of(log, schedule, config, plan, detector, homographies, ego, agents)
-    report = make_report(log, schedule, config, plan, seen, homographies, scenario, clock)
-    return Result(scenario, report)
+        raise NothingToReconstruct(f"{log.name}: no ego poses, and no object was detected in {len(t_ns)} ticks")
+    outputs = RunOutputs(observations, homographies, tuple(agents), run.clock)
+    outcomes = stage_outcomes(plan, outputs)
+    scenario = scenario_of(
+        log,
+        t_ns,
+        [ego, *agents] if ego is not None else agents,
+        cameras=camera_entries(log, plan.cameras, homographies),
+        plan=[outcome.to_dict() for outcome in outcomes],
+        provenance=provenance_of(log, config, run.detector),
+    )
+    return Result(scenario, report_of(log, config, run.schedule, outputs, outcomes, scenario))

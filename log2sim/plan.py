@@ -1,9 +1,10 @@
-"""What this log needs: decided once, as plain data with a reason for every stage kept or left out."""
+"""What a run needs: the sensors to use and a decision with its reason for every optional part, made once before the run."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from enum import Enum, StrEnum
 from typing import Any
 
 import numpy as np
@@ -17,69 +18,118 @@ from log2sim.registry import nearest
 from log2sim.tracking.tracker import least_hits
 
 LABELS = "labels"
-# An ego that moves less than this while the log lasts blurs no sweep by more; it turns less than this at 30 m.
-STATIC_EGO_M = 0.05
-STATIC_EGO_RAD = STATIC_EGO_M / 30.0
+# Motion of the ego over the whole log that is left uncompensated: half the noise of a LiDAR range, and the angle that
+# moves a point at 30 m by as much.
+MAX_STATIC_EGO_MOTION_M = 0.05
+MAX_STATIC_EGO_TURN_RAD = MAX_STATIC_EGO_MOTION_M / 30.0
 # Largest departure of R R^T from 1: calibration files round to five digits or more.
-LARGEST_SKEW = 1e-3
+MAX_ROTATION_ERROR = 1e-3
 # No LiDAR for vehicles or roadsides measures farther.
-LIDAR_REACH_M = 300.0
+MAX_LIDAR_RANGE_M = 300.0
+
+
+class Stage(StrEnum):
+    """Parts of a run that not every log needs; the values are the names in scenario.json and report.json."""
+
+    ALL_LIDARS = "use of every LiDAR"
+    MOTION_COMPENSATION = "motion compensation"
+    IMAGE_DECODING = "image decoding"
+    DETECTION_IN_EVERY_FRAME = "detection in every frame"
+    HOMOGRAPHY = "homography"
+    FUSION = "fusion of cameras"
+    TRACKING = "tracking"
+    SMOOTHING = "smoothing"
+    SMOOTHING_OF_PARKED_AGENTS = "smoothing of parked agents"
+    WAYPOINT_AT_EVERY_TICK = "waypoint at every tick"
+
+
+class HomographyScope(Enum):
+    """Cameras that get a homography."""
+
+    NONE = "none"
+    CAMERAS_IN_NEED = "cameras with detections that no LiDAR point places"
+    ALL_CAMERAS = "all cameras"
 
 
 @dataclass(frozen=True)
-class Step:
-    """One stage, whether it runs, and why; what leaving it out saved, in s, where that is known, and how it is known."""
+class Decision:
+    """Whether a stage runs, and why.
 
-    stage: str
+    Attributes
+    ----------
+    stage : Stage
+    kept : bool
+    reason : str
+        For people; nothing is decided by it.
+    """
+
+    stage: Stage
     kept: bool
     reason: str
-    saved_s: float | None = None
-    saved_how: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the decision as scenario.json and report.json hold it."""
+        return {"stage": str(self.stage), "kept": self.kept, "reason": self.reason}
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """The sensors of a log that a run uses.
+
+    Attributes
+    ----------
+    cameras : tuple of str
+        Those of the settings, or all.
+    lidars : tuple of str
+        Those within range of the ego's path.
+    lidars_out_of_range : tuple of str
+    """
+
+    cameras: tuple[str, ...]
+    lidars: tuple[str, ...]
+    lidars_out_of_range: tuple[str, ...] = ()
+
+    def restrict(self, log: Log) -> Log:
+        """Return the log without the LiDARs that are out of range; its streams stay."""
+        return replace(log, lidars={name: log.lidars[name] for name in self.lidars})
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The sensors to use and every decision about stages.
+    """The decisions of a run.
 
-    `lidars` are those within reach; detectors look at every frame at each `stride`-th tick, see `log2sim.perception.frames`.
+    Attributes
+    ----------
+    cameras : tuple of str
+        Cameras to use.
+    decisions : tuple of Decision
+        One for every stage.
+    homography : HomographyScope
+        Which cameras get a homography.
+    detector_stride : int
+        Ticks from one detection in all cameras to the next, see `log2sim.perception.frames`.
     """
 
     cameras: tuple[str, ...]
-    steps: tuple[Step, ...]
-    lidars: tuple[str, ...] = ()
-    stride: int = 1
+    decisions: tuple[Decision, ...]
+    homography: HomographyScope = HomographyScope.CAMERAS_IN_NEED
+    detector_stride: int = 1
 
-    def keeps(self, stage: str) -> bool:
-        return next(s.kept for s in self.steps if s.stage == stage)
+    def decision(self, stage: Stage) -> Decision:
+        """Return the decision about a stage."""
+        return next(d for d in self.decisions if d.stage is stage)
 
-    def decided(self, stage: str, kept: bool, reason: str) -> Plan:
-        """The plan with one decision changed, for what only the data can tell."""
-        return replace(self, steps=tuple(Step(stage, kept, reason) if s.stage == stage else s for s in self.steps))
+    def keeps(self, stage: Stage) -> bool:
+        """Return whether a stage runs."""
+        return self.decision(stage).kept
 
-    def saved(self, stage: str, seconds: float, how: str) -> Plan:
-        """The plan with the time that leaving out (a part of) a stage saved."""
-        saved_s = round(max(seconds, 0.0), 4)
-        steps = tuple(replace(s, saved_s=saved_s, saved_how=how) if s.stage == stage else s for s in self.steps)
-        return replace(self, steps=steps)
-
-    def to_list(self) -> list[Mapping[str, Any]]:
-        """The decisions as a scenario states them: the same for the same log and settings."""
-        return [{"stage": s.stage, "kept": s.kept, "reason": s.reason} for s in self.steps]
-
-    def to_report(self) -> list[Mapping[str, Any]]:
-        """The decisions with the seconds that they saved, for the report of this run."""
-        timed = [{"saved_s": s.saved_s, "saved_how": s.saved_how or None} for s in self.steps]
-        return [{**entry, **time} for entry, time in zip(self.to_list(), timed)]
-
-    def narrowed(self, log: Log) -> Log:
-        """The log without the LiDARs that are out of reach."""
-        return (
-            log if len(self.lidars) == len(log.lidars) else replace(log, lidars={n: log.lidars[n] for n in self.lidars})
-        )
+    def variant(self, decision: Decision) -> Plan:
+        """Return a plan with another decision about one stage, for benchmarks that compare plans."""
+        return replace(self, decisions=tuple(decision if d.stage is decision.stage else d for d in self.decisions))
 
 
-def make_plan(log: Log, config: Config, *, picture: bool = False) -> Plan:
-    """Decide what to run.
+def select_sensors(log: Log, config: Config) -> Sensors:
+    """Choose the sensors of a run and check their calibration.
 
     Raises
     ------
@@ -96,23 +146,29 @@ def make_plan(log: Log, config: Config, *, picture: bool = False) -> Plan:
             raise ConfigError(f"--cameras: no camera '{name}'{nearest(name, known)}; the log has {', '.join(known)}")
     cameras = config.cameras or tuple(log.cameras)
     _check_calibration(log, cameras)
-    far = _far_lidars(log, config.measure.max_range_m)
-    lidars = tuple(n for n in log.lidars if n not in far)
-    steps = (
-        _lidars(log, far),
-        _compensation(log, lidars),
-        _decoding(config, picture),
-        Step("every frame", True, "too few ticks to leave any out"),
-        _homography(log, config, picture),
-        _fusion(cameras),
-        Step("track", True, "identities over time are the result"),
-        Step(
-            "smooth", config.smooth.enabled, "measured positions jitter" if config.smooth.enabled else "smooth.enabled=false"
-        ),
-        Step("smooth parked agents", True, "no agent stands still"),
-        Step("every waypoint", True, "no agent moves straight at constant speed"),
-    )  # fmt: skip
-    return Plan(cameras, steps, lidars)
+    far = _lidars_out_of_range(log, config.measure.max_range_m)
+    return Sensors(cameras, tuple(n for n in log.lidars if n not in far), tuple(sorted(far)))
+
+
+def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64], *, picture: bool = False) -> Plan:
+    """Decide what to run at the ticks (T,) of a log; `picture` when a bird's-eye view is asked for."""
+    decodes = _image_decoding(config, picture)
+    stride = least_hits(t_ns, config.track.min_life_s) if decodes.kept else 1
+    scope, homography = _homography(log, config, picture)
+    smooth = config.smooth.enabled
+    decisions = (
+        _lidar_use(log, sensors),
+        _motion_compensation(log, sensors, t_ns),
+        decodes,
+        _detection_in_every_frame(decodes.kept, stride),
+        homography,
+        _fusion(sensors.cameras),
+        Decision(Stage.TRACKING, True, "identities over time are the result"),
+        Decision(Stage.SMOOTHING, smooth, "measured positions are noisy" if smooth else "smooth.enabled=false"),
+        Decision(Stage.SMOOTHING_OF_PARKED_AGENTS, False, "a parked agent has one pose"),
+        Decision(Stage.WAYPOINT_AT_EVERY_TICK, False, "waypoints that interpolation gives back are left out"),
+    )
+    return Plan(sensors.cameras, decisions, scope, max(stride, 1))
 
 
 def _check_calibration(log: Log, cameras: tuple[str, ...]) -> None:
@@ -120,10 +176,10 @@ def _check_calibration(log: Log, cameras: tuple[str, ...]) -> None:
     mounts = {n: log.cameras[n].mount_T_cam for n in cameras} | {n: s.mount_T_lidar for n, s in log.lidars.items()}
     for name, mount_T_sensor in mounts.items():
         rotation = mount_T_sensor[:3, :3]
-        skew = np.abs(rotation @ rotation.T - np.eye(3)).max()
-        if not np.isfinite(mount_T_sensor).all() or not skew < LARGEST_SKEW or np.linalg.det(rotation) < 0:
+        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        if not np.isfinite(mount_T_sensor).all() or not error < MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0:
             raise LogError(
-                f"sensor '{name}': its mounting is not a rotation and a translation (R R^T departs from 1 by {skew:.2g}, "
+                f"sensor '{name}': its mounting is not a rotation and a translation (R R^T departs from 1 by {error:.2g}, "
                 f"det R is {np.linalg.det(rotation):.2g}); expected a right-handed rotation, so check the calibration"
             )
     for name in cameras:
@@ -135,94 +191,89 @@ def _check_calibration(log: Log, cameras: tuple[str, ...]) -> None:
             )
 
 
-def plan_ticks(plan: Plan, log: Log, t_ns: NDArray[np.int64], *, min_life_s: float) -> Plan:
-    """Decide what depends on the ticks (T,): whether the ego moves during them, and how often to look.
-
-    A track needs `least_hits` measurements. What is seen less often between two looks that find nothing would be taken for
-    a false alarm, so that long a camera need not be looked at.
-    """
-    if plan.keeps("compensate") and log.ego is not None:
-        margin = round(log.ego.extrapolate_s * NS_PER_S)
-        during = (log.ego.t_ns >= t_ns[0] - margin) & (log.ego.t_ns <= t_ns[-1] + margin)
-        still = _stillness(log.ego.map_T_ego[during]) if during.sum() > 1 else ""
-        if still:
-            plan = plan.decided("compensate", False, still)
-    if not plan.keeps("decode images"):
-        return plan.decided("every frame", True, "looking costs nothing, for no image is decoded")
-    stride = least_hits(t_ns, min_life_s)
-    if stride < 2:
-        return plan
-    plan = plan.decided("every frame", True, f"no camera sees nothing at two looks {stride} ticks apart")
-    return replace(plan, stride=stride)
-
-
-def _far_lidars(log: Log, max_range_m: float) -> set[str]:
-    """LiDARs fixed in the map that are too far from the ego's whole way to measure anything that counts."""
+def _lidars_out_of_range(log: Log, max_range_m: float) -> set[str]:
+    """Return the LiDARs fixed in the map that are too far from the ego's whole path to measure anything in range of it."""
     if log.ego is None:
         return set()
-    way, limit = log.ego.map_T_ego[:, :2, 3], max_range_m * np.sqrt(2) + LIDAR_REACH_M
+    path, limit_m = log.ego.map_T_ego[:, :2, 3], max_range_m * np.sqrt(2) + MAX_LIDAR_RANGE_M
     fixed = {name: lidar.mount_T_lidar[:2, 3] for name, lidar in log.lidars.items() if lidar.mount == "map"}
-    return {name for name, place in fixed.items() if np.hypot(*(way - place).T).min() > limit}
+    return {name for name, xy in fixed.items() if np.hypot(*(path - xy).T).min() > limit_m}
 
 
-def _lidars(log: Log, far: set[str]) -> Step:
+def _lidar_use(log: Log, sensors: Sensors) -> Decision:
     if not log.lidars:
-        return Step("every LiDAR", False, "the log has no LiDAR")
-    if far:
-        return Step(
-            "every LiDAR", False, f"never within {LIDAR_REACH_M:.0f} m of what counts: {', '.join(sorted(far))}"
-        )
-    return Step("every LiDAR", True, f"{len(log.lidars)} within reach")
+        return Decision(Stage.ALL_LIDARS, False, "the log has no LiDAR")
+    if sensors.lidars_out_of_range:
+        names = ", ".join(sensors.lidars_out_of_range)
+        reason = f"never within {MAX_LIDAR_RANGE_M:.0f} m of the measured area: {names}"
+        return Decision(Stage.ALL_LIDARS, False, reason)
+    return Decision(Stage.ALL_LIDARS, True, f"{len(sensors.lidars)} within range")
 
 
-def _compensation(log: Log, lidars: tuple[str, ...]) -> Step:
-    if not lidars:
-        return Step("compensate", False, "the log has no LiDAR" if not log.lidars else "no LiDAR is within reach")
-    if all(log.lidars[n].mount == "map" for n in lidars):
-        return Step("compensate", False, "the LiDARs stand still in the map")
-    if log.ego is None:
-        return Step("compensate", False, "no ego poses: sensors are taken to stand still")
-    still = _stillness(log.ego.map_T_ego)
-    if still:
-        return Step("compensate", False, still)
-    moved, _ = _motion(log.ego.map_T_ego)
-    return Step("compensate", True, f"the ego moves {moved:.1f} m while sweeps are taken")
+def _motion_compensation(log: Log, sensors: Sensors, t_ns: NDArray[np.int64]) -> Decision:
+    reason = ""
+    if not sensors.lidars:
+        reason = "no LiDAR is within range" if log.lidars else "the log has no LiDAR"
+    elif all(log.lidars[n].mount == "map" for n in sensors.lidars):
+        reason = "the LiDARs are fixed in the map"
+    elif log.ego is None:
+        reason = "no ego poses: sensors are assumed to stand still"
+    if reason or log.ego is None:
+        return Decision(Stage.MOTION_COMPENSATION, False, reason)
+    margin_ns = round(log.ego.extrapolate_s * NS_PER_S)
+    during = (log.ego.t_ns >= t_ns[0] - margin_ns) & (log.ego.t_ns <= t_ns[-1] + margin_ns)
+    moved_m, turned_rad = _motion(log.ego.map_T_ego[during] if during.sum() > 1 else log.ego.map_T_ego)
+    if moved_m < MAX_STATIC_EGO_MOTION_M and turned_rad < MAX_STATIC_EGO_TURN_RAD:
+        reason = f"the ego stands still (moves {moved_m * 100:.1f} cm, turns {np.rad2deg(turned_rad):.2f} degrees)"
+        return Decision(Stage.MOTION_COMPENSATION, False, reason)
+    return Decision(Stage.MOTION_COMPENSATION, True, f"the ego moves {moved_m:.1f} m while sweeps are taken")
 
 
 def _motion(map_T_ego: Array) -> tuple[float, float]:
-    """How far poses (P, 4, 4) spread, m, and the largest angle between the first and any other, rad."""
+    """Return how far poses (P, 4, 4) spread, m, and the largest angle between the first and any other, rad."""
     positions, rotations = map_T_ego[:, :3, 3], map_T_ego[:, :3, :3]
     cosine = (np.einsum("ij,nij->n", rotations[0], rotations) - 1) / 2
     return float((positions.max(axis=0) - positions.min(axis=0)).max()), float(np.arccos(np.clip(cosine, -1, 1)).max())
 
 
-def _stillness(map_T_ego: Array) -> str:
-    """What says that these poses (P, 4, 4) are of an ego that stands still; "" for one that does not."""
-    moved, turned = _motion(map_T_ego)
-    if moved >= STATIC_EGO_M or turned >= STATIC_EGO_RAD:
-        return ""
-    return f"the ego stands still (moves {moved * 100:.1f} cm, turns {np.rad2deg(turned):.2f} degrees)"
-
-
-def _fusion(cameras: tuple[str, ...]) -> Step:
-    if len(cameras) > 1:
-        return Step("fuse", True, f"{len(cameras)} cameras")
-    return Step("fuse", False, "one camera sees no object twice; only doubles of its detector are dropped")
-
-
-def _decoding(config: Config, picture: bool) -> Step:
+def _image_decoding(config: Config, picture: bool) -> Decision:
     if config.detect.name != LABELS:
-        return Step("decode images", True, "the detector looks at every frame")
+        return Decision(Stage.IMAGE_DECODING, True, "the detector needs images")
     if picture:
-        return Step("decode images", True, "a top-down picture is asked for")
-    return Step("decode images", False, "boxes come from the log; no pixel is needed")
+        return Decision(Stage.IMAGE_DECODING, True, "a bird's-eye view is asked for")
+    return Decision(Stage.IMAGE_DECODING, False, "boxes come from the log; no image is needed")
 
 
-def _homography(log: Log, config: Config, picture: bool) -> Step:
+def _detection_in_every_frame(decodes: bool, stride: int) -> Decision:
+    """Decide whether frames may be skipped.
+
+    A track needs `least_hits` measurements. An object that is visible for fewer ticks is not confirmed, so between two
+    frames that many ticks apart in which the detector found nothing, the others need not be decoded.
+    """
+    stage = Stage.DETECTION_IN_EVERY_FRAME
+    if not decodes:
+        return Decision(stage, True, "without decoding a frame costs nothing")
+    if stride < 2:
+        return Decision(stage, True, "the log has too few ticks for its tracks to skip any")
+    return Decision(stage, False, f"frames between two empty ones {stride} ticks apart are skipped")
+
+
+def _homography(log: Log, config: Config, picture: bool) -> tuple[HomographyScope, Decision]:
+    stage = Stage.HOMOGRAPHY
     if config.topdown.method == "off":
-        return Step("homography", False, "topdown.method=off")
+        return HomographyScope.NONE, Decision(stage, False, "topdown.method=off")
     if picture:
-        return Step("homography", True, "a top-down picture is asked for")
-    if not log.lidars:
-        return Step("homography", True, "without LiDAR it is the only way to depth")
-    return Step("homography", True, "detections without LiDAR points may need it")
+        return HomographyScope.ALL_CAMERAS, Decision(stage, True, "a bird's-eye view is asked for")
+    reason = "detections without LiDAR points may need it" if log.lidars else "without LiDAR it alone gives depth"
+    return HomographyScope.CAMERAS_IN_NEED, Decision(stage, True, reason)
+
+
+def _fusion(cameras: tuple[str, ...]) -> Decision:
+    if len(cameras) > 1:
+        return Decision(Stage.FUSION, True, f"{len(cameras)} cameras")
+    return Decision(Stage.FUSION, False, "one camera; only duplicates of its detector are dropped")
+
+
+def to_list(decisions: tuple[Decision, ...]) -> list[Mapping[str, Any]]:
+    """Return decisions as scenario.json holds them."""
+    return [d.to_dict() for d in decisions]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,27 +11,25 @@ from log2sim.config import Config
 from log2sim.datatypes import Log, Scenario
 from log2sim.documents import rounded
 from log2sim.geometry import NS_PER_S
+from log2sim.outcome import Outcome, RunOutputs
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography_stage import CameraHomography
 from log2sim.perception.sync import Schedule
-from log2sim.plan import Plan
-from log2sim.stage_clock import StageClock
 from log2sim.version import __version__
 
 DETECTOR_STAGES = ("detect",)
 
 
-def make_report(
+def report_of(
     log: Log,
-    schedule: Schedule,
     config: Config,
-    plan: Plan,
-    seen: Observations,
-    homographies: Mapping[str, CameraHomography],
+    schedule: Schedule,
+    outputs: RunOutputs,
+    outcomes: Sequence[Outcome],
     scenario: Scenario,
-    clock: StageClock,
 ) -> dict[str, Any]:
     """Assemble the report of a finished run."""
+    clock, observations = outputs.clock, outputs.observations
     ticks, total = len(schedule), clock.total()
     detecting = sum(clock.seconds.get(s, 0.0) for s in DETECTOR_STAGES)
     return {
@@ -44,13 +42,13 @@ def make_report(
         "ticks_per_second": round(ticks / total, 3),
         "ticks_per_second_without_detector": round(ticks / max(total - detecting, 1e-9), 3),
         "stages": clock.table(ticks),
-        "plan": plan.to_report(),
+        "plan": [outcome.to_report() for outcome in outcomes],
         "sync": {"reference": schedule.reference, "streams": schedule.summary()},
         "without_pose": _without_pose(log, schedule),
-        "unreadable": seen.records.summary() if seen.records is not None else {},
-        "detections": seen.detections,
-        "homography": {name: _homography_entry(g, config.topdown.method) for name, g in homographies.items()},
-        "measurements": _measurement_counts(seen),
+        "unreadable": observations.records.summary() if observations.records is not None else {},
+        "detections": observations.detections,
+        "homography": {name: _homography_entry(g, config.topdown.method) for name, g in outputs.homographies.items()},
+        "measurements": _measurement_counts(observations),
         "agents": _agent_counts(scenario),
     }
 

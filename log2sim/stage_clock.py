@@ -60,26 +60,6 @@ class StageClock:
         return time.perf_counter() - self._start
 
 
-class Costs:
-    """Adds up the seconds of pieces of work by name and counts them, to tell what a piece costs."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self.count: dict[str, int] = {}
-
-    @contextmanager
-    def piece(self, name: str) -> Iterator[None]:
-        """Count the block as one piece of `name`."""
-        start = time.perf_counter()
-        yield
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
-        self.count[name] = self.count.get(name, 0) + 1
-
-    def each(self, name: str) -> float | None:
-        """Mean seconds of a piece; None when there was none."""
-        return self.seconds[name] / self.count[name] if self.count.get(name) else None
-
-
 def peak_memory_mib() -> float:
     """Largest resident memory of the process so far, MiB."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -112,7 +112,7 @@ def test_options_reach_the_run(tiny_folder: Path, tmp_path: Path) -> None:
     homography = next(p for p in report["plan"] if p["stage"] == "homography")
     assert not homography["kept"]
     assert "topdown.method=off" in homography["reason"]
-    decoding = next(p for p in report["plan"] if p["stage"] == "decode images")
+    decoding = next(p for p in report["plan"] if p["stage"] == "image decoding")
     assert not decoding["kept"]
 
 

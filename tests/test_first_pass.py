@@ -17,7 +17,7 @@ from log2sim.perception.first_pass import base_pose, cloud_origin, observe
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.sync import synchronize
 from log2sim.pipeline import reconstruct
-from log2sim.plan import make_plan
+from log2sim.plan import make_plan, select_sensors
 from log2sim.stage_clock import StageClock
 
 T0_NS = 1_700_000_000_000_000_000
@@ -90,8 +90,9 @@ def driving_log(*, far=(0.0, 0.0, 0.0), broken=(), cameras=("front",), empty=(),
 def run(log, detector=None, *, config=None, max_range_m=80.0, mode="robust", picture=False, labels=False, reads=None):
     reads = {} if reads is None else reads
     config = config or Config.load(settings=["detect.name=labels"] if labels else [])
-    plan = make_plan(log, config, picture=picture)
-    ticks, schedule = [], synchronize(log, plan.cameras)
+    sensors = select_sensors(log, config)
+    ticks, schedule = [], synchronize(log, sensors.cameras)
+    plan = make_plan(log, config, sensors, schedule.t_ns, picture=picture)
     reads.clear()  # synchronization looks into a sweep
     out = observe(
         log, schedule, detector or Truth(log), plan,

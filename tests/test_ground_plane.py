@@ -20,7 +20,7 @@ from log2sim.perception.homography_stage import (
     fit_homographies,
     place_by_homography,
 )
-from log2sim.plan import Plan, Step
+from log2sim.plan import HomographyScope, Plan
 
 T0_NS = 1_700_000_000_000_000_000
 RNG_SEED = 5
@@ -42,8 +42,8 @@ def tilted(pitch_rad=0.05, roll_rad=0.0, at=(1.5, 0.2, 1.6), **changes):
     return replace(camera, mount_T_cam=mount, **changes)
 
 
-def plan_with(kept=True, reason="detections without LiDAR points may need it"):
-    return Plan(("front",), (Step("homography", kept, reason),))
+def plan_with(scope=HomographyScope.CAMERAS_IN_NEED):
+    return Plan(("front",), (), scope)
 
 
 def unplaced(boxes_px, t_ns=T0_NS, category="car", camera="front"):
@@ -96,37 +96,32 @@ def fit(log, seen, plan=None, method="time-aware"):
 
 
 def test_nothing_is_fitted_when_the_plan_leaves_it_out():
-    plan, fits = fit(log_with(tilted()), Observations(measurements=[unplaced([[1, 2, 3, 4]])]), plan_with(False, "off"))
-    assert fits == {}
-    assert not plan.keeps("homography")
+    seen = Observations(measurements=[unplaced([[1, 2, 3, 4]])])
+    assert fit(log_with(tilted()), seen, plan_with(HomographyScope.NONE)) == {}
 
 
-def test_nothing_is_fitted_when_every_detection_has_points_and_the_plan_says_so():
-    plan, fits = fit(log_with(tilted()), Observations(measurements=[Measurements.empty()] * 5))
-    assert fits == {}
-    assert not plan.keeps("homography")
-    assert "every detection has LiDAR points" in plan.steps[0].reason
+def test_nothing_is_fitted_when_every_detection_has_points():
+    assert fit(log_with(tilted()), Observations(measurements=[Measurements.empty()] * 5)) == {}
 
 
 def test_a_picture_needs_every_camera():
-    plan, fits = fit(
+    fits = fit(
         log_with(tilted()),
         Observations(measurements=[Measurements.empty()]),
-        plan_with(True, "a top-down picture is asked for"),
+        plan_with(HomographyScope.ALL_CAMERAS),
     )
     assert list(fits) == ["front"]
-    assert plan.keeps("homography")
 
 
 def test_a_log_without_correspondences_falls_back_on_the_calibration_and_keeps_the_reason():
     camera = tilted()
-    _, fits = fit(log_with(camera), Observations(measurements=[unplaced([[500, 280, 700, 400]])]))
+    fits = fit(log_with(camera), Observations(measurements=[unplaced([[500, 280, 700, 400]])]))
     found = fits["front"]
     assert found.fit.ok
     assert found.source == "calibration and flat ground"
     assert "at least 4" in found.refusal
     low = tilted(at=(1.0, 0.0, 0.05))
-    _, fits = fit(log_with(low), Observations(measurements=[unplaced([[500, 280, 700, 400]])]))
+    fits = fit(log_with(low), Observations(measurements=[unplaced([[500, 280, 700, 400]])]))
     assert not fits["front"].fit.ok
     assert fits["front"].source == "none"
 
@@ -143,7 +138,7 @@ def test_obstacles_give_the_homography_of_the_true_camera(method):
     camera, rng = tilted(0.06, 0.01), np.random.default_rng(1)
     seen = Observations(measurements=[unplaced([[500, 280, 700, 400]])])
     seen.feet["front"] = [correspondences(camera, 300, rng, 0.5)]
-    _, fits = fit(log_with(camera), seen, method=method)
+    fits = fit(log_with(camera), seen, method=method)
     found, truth = fits["front"], calibrated_homography(log_with(camera), camera)
     assert found.source == "obstacles"
     uv = np.array([[600.0, 550], [400, 450], [900, 480]])
@@ -156,7 +151,7 @@ def test_cars_of_one_lane_are_joined_by_points_of_the_ground():
     seen = Observations(measurements=[unplaced([[500, 280, 700, 400]])])
     seen.feet["front"] = [correspondences(camera, 200, rng, 0.3, collinear=True)]
     seen.ground["front"] = [correspondences(camera, 200, rng, 0.3)]
-    _, fits = fit(log_with(camera), seen)
+    fits = fit(log_with(camera), seen)
     assert fits["front"].fit.ok
     assert fits["front"].source == "obstacles and ground points"
 

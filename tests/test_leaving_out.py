@@ -22,17 +22,16 @@ from log2sim.documents import check
 from log2sim.errors import LogError, RecordError
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.geometry import PoseTrack, transform
+from log2sim.outcome import RunOutputs, stage_outcomes
 from log2sim.perception.detect.detectors import create_detector
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.fusion import fuse
 from log2sim.perception.homography.estimate import EstimationOptions
 from log2sim.perception.homography_stage import fit_homographies
 from log2sim.perception.lidar.cloud import assemble_cloud, is_at_rest, sweep_to_map
-from log2sim.perception.sync import synchronize
 from log2sim.pipeline import Result
-from log2sim.plan import Plan, make_plan, plan_ticks
-from log2sim.savings import settle
-from log2sim.stage_clock import Costs, StageClock
+from log2sim.plan import Decision, Plan, Stage, make_plan, select_sensors
+from log2sim.stage_clock import StageClock
 
 LABELS = Config.load(detect={"name": "labels"})
 FRONT = {"name": "front", "position_m": [1.7, 0.0, 1.5], "size_px": [480, 300], "offset_s": 0.03}
@@ -58,6 +57,11 @@ def farthest_m(a: Scenario, b: Scenario) -> float:
         float(np.hypot(x.waypoints.x_m - y.waypoints.x_m, x.waypoints.y_m - y.waypoints.y_m).max())
         for x, y in zip(a.agents, b.agents)
     )
+
+
+def plan_of(log: Log, config: Config = LABELS, t_ns: np.ndarray | None = None) -> Plan:
+    sensors = select_sensors(log, config)
+    return make_plan(log, config, sensors, log.streams["front"].t_ns if t_ns is None else t_ns)
 
 
 @pytest.fixture(scope="module")
@@ -91,14 +95,13 @@ def swaying(log: Log, amplitude_m: float) -> Log:
 def test_an_ego_that_stands_needs_no_compensation(still: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     log = swaying(still, 0.01)
     without = run(log)
-    left_out = entry(without, "compensate")
+    left_out = entry(without, "motion compensation")
     assert not left_out["kept"]
     assert "stands still" in left_out["reason"]
-    assert left_out["saved_how"].startswith("estimated")
-    monkeypatch.setattr(log2sim.plan, "STATIC_EGO_M", 0.0)
+    monkeypatch.setattr(log2sim.plan, "MAX_STATIC_EGO_MOTION_M", 0.0)
     monkeypatch.setattr(log2sim.perception.lidar.cloud, "AT_REST_M", 0.0)
     full = run(log)
-    assert entry(full, "compensate")["kept"]
+    assert entry(full, "motion compensation")["kept"]
     assert 0.0 < farthest_m(without.scenario, full.scenario) < 0.05
 
 
@@ -109,9 +112,9 @@ def test_an_ego_that_turns_on_the_spot_is_compensated(tiny: Log) -> None:
     pose[:, 0, 0] = pose[:, 1, 1] = np.cos(angle)
     pose[:, 1, 0], pose[:, 0, 1] = np.sin(angle), -np.sin(angle)
     turning = replace(tiny, ego=PoseTrack(tiny.ego.t_ns, pose))
-    assert make_plan(turning, LABELS).keeps("compensate")
+    assert plan_of(turning).keeps(Stage.MOTION_COMPENSATION)
     pose[:, :3, :3] = np.eye(3)
-    assert not make_plan(turning, LABELS).keeps("compensate")
+    assert not plan_of(turning).keeps(Stage.MOTION_COMPENSATION)
 
 
 def test_the_part_of_a_log_in_which_the_ego_stands_needs_no_compensation(tiny: Log) -> None:
@@ -119,10 +122,10 @@ def test_the_part_of_a_log_in_which_the_ego_stands_needs_no_compensation(tiny: L
     t_ns = tiny.ego.t_ns[0] + np.arange(41) * 100_000_000
     x = np.r_[np.zeros(21), np.linspace(0.0, 20.0, 20)]
     ego = PoseTrack(t_ns, transform(np.eye(3), np.column_stack([x, np.zeros(41), np.zeros(41)])))
-    log, plan = replace(tiny, ego=ego), make_plan(replace(tiny, ego=ego), LABELS)
-    assert plan.keeps("compensate")
-    assert not plan_ticks(plan, log, t_ns[:10], min_life_s=0.3).keeps("compensate")
-    assert plan_ticks(plan, log, t_ns[15:25], min_life_s=0.3).keeps("compensate")
+    log = replace(tiny, ego=ego)
+    assert plan_of(log, t_ns=t_ns).keeps(Stage.MOTION_COMPENSATION)
+    assert not plan_of(log, t_ns=t_ns[:10]).keeps(Stage.MOTION_COMPENSATION)
+    assert plan_of(log, t_ns=t_ns[15:25]).keeps(Stage.MOTION_COMPENSATION)
 
 
 def resting_log(tiny: Log) -> Log:
@@ -137,14 +140,12 @@ def resting_log(tiny: Log) -> Log:
 def test_a_sweep_during_which_the_ego_rests_takes_one_pose(tiny: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     log = resting_log(tiny)
     without = run(log)
-    step = entry(without, "compensate")
+    step = entry(without, "motion compensation")
     assert step["kept"]
-    assert "rests during" in step["reason"]
-    assert step["saved_s"] is not None
-    assert step["saved_how"].startswith("estimated")
+    assert "stands still during" in step["reason"]
     monkeypatch.setattr(log2sim.perception.lidar.cloud, "AT_REST_M", 0.0)
     full = run(log)
-    assert "rests" not in entry(full, "compensate")["reason"]
+    assert "stands still" not in entry(full, "motion compensation")["reason"]
     assert farthest_m(without.scenario, full.scenario) < 0.01
 
 
@@ -172,7 +173,7 @@ def test_sweeps_that_cannot_be_compensated_are_told(tiny: Log, kind: str, words:
         return Sweep(sweep.stamp_ns, xyz, kind, sweep.t_ns if kind == "map" else None)  # type: ignore[arg-type]
 
     log = replace(tiny, streams={**tiny.streams, "top": Stream("top", tiny.streams["top"].t_ns, read)})
-    step = entry(run(log), "compensate")
+    step = entry(run(log), "motion compensation")
     assert not step["kept"]
     assert words in step["reason"]
 
@@ -197,20 +198,19 @@ def test_a_lidar_out_of_reach_is_not_read(tiny: Log, monkeypatch: pytest.MonkeyP
     reads: Counter[int] = Counter()
     log = with_roadside_lidar(tiny, 2000.0, reads)
     without = run(log)
-    step = entry(without, "every LiDAR")
+    step = entry(without, "use of every LiDAR")
     assert not step["kept"]
     assert "post" in step["reason"]
-    assert step["saved_s"] > 0
-    assert sum(reads.values()) == 1  # the probe that tells what was saved
-    monkeypatch.setattr(log2sim.plan, "LIDAR_REACH_M", 1e9)
+    assert not reads
+    monkeypatch.setattr(log2sim.plan, "MAX_LIDAR_RANGE_M", 1e9)
     full = run(log)
-    assert entry(full, "every LiDAR")["kept"]
+    assert entry(full, "use of every LiDAR")["kept"]
     assert sum(reads.values()) > 5
     assert_same_agents(without.scenario, full.scenario, within=0.0)  # its points are beyond the range that is measured
 
 
 def test_a_lidar_within_reach_is_kept(tiny: Log) -> None:
-    assert entry(run(with_roadside_lidar(tiny, 60.0, Counter())), "every LiDAR")["kept"]
+    assert entry(run(with_roadside_lidar(tiny, 60.0, Counter())), "use of every LiDAR")["kept"]
 
 
 # --- images and frames
@@ -224,9 +224,7 @@ def test_boxes_of_the_log_need_no_image(tiny: Log) -> None:
     without, full = run(blind), run(tiny)
     assert_same_agents(without.scenario, full.scenario, within=0.0)
     assert without.report["unreadable"] == {}
-    assert entry(without, "decode images")["saved_s"] is None  # nothing to be decoded
-    assert entry(full, "decode images")["saved_s"] > 0
-    assert "times 10" in entry(full, "decode images")["saved_how"]
+    assert not entry(full, "image decoding")["kept"]
 
 
 class Counting:
@@ -271,7 +269,7 @@ def passing() -> Log:
 
 def test_a_camera_that_sees_nothing_is_looked_at_now_and_then(both: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     few, looked = run_counting(both, monkeypatch)
-    step = entry(few, "every frame")
+    step = entry(few, "detection in every frame")
     assert not step["kept"]
     assert "back 6" in step["reason"]  # looks at ticks 0, 3, 6, 9
     assert step["saved_s"] > 0
@@ -279,7 +277,7 @@ def test_a_camera_that_sees_nothing_is_looked_at_now_and_then(both: Log, monkeyp
     assert looked.frames == {"front": 10, "back": 4}
     every, all_frames = run_counting(both, monkeypatch, stride=1)
     assert all_frames.frames == {"front": 10, "back": 10}
-    assert entry(every, "every frame")["kept"]
+    assert entry(every, "detection in every frame")["kept"]
     assert_same_agents(few.scenario, every.scenario, within=0.0)
 
 
@@ -295,8 +293,8 @@ def test_whoever_comes_into_an_empty_view_is_not_missed(passing: Log, monkeypatc
 def test_looks_are_nearer_than_a_track_is_long(ticks: int, stride: int, tiny: Log) -> None:
     config = Config.load(detect={"name": "some.onnx"})
     t_ns = np.arange(ticks) * 100_000_000
-    assert plan_ticks(make_plan(tiny, config), tiny, t_ns, min_life_s=0.3).stride == stride
-    assert plan_ticks(make_plan(tiny, LABELS), tiny, t_ns, min_life_s=0.3).stride == 1
+    assert plan_of(tiny, config, t_ns).detector_stride == stride
+    assert plan_of(tiny, LABELS, t_ns).detector_stride == 1
 
 
 def test_a_look_that_could_not_be_read_found_nothing_out(both: Log, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -319,10 +317,8 @@ def test_without_need_no_homography_is_fitted_and_nothing_changes(tiny: Log) -> 
     without, full = run(tiny), run(tiny, picture=True)
     step = entry(without, "homography")
     assert not step["kept"]
-    assert step["saved_s"] > 0
     assert without.report["homography"] == {}
     assert full.report["homography"]["front"]["ok"]
-    assert entry(full, "homography")["saved_s"] is None
     assert_same_agents(without.scenario, full.scenario, within=0.0)
     off = run(tiny, Config.load(detect={"name": "labels"}, topdown={"method": "off"}))
     assert_same_agents(off.scenario, full.scenario, within=0.0)
@@ -337,18 +333,16 @@ def lost(camera: str, bottom_px: float) -> Measurements:
 
 
 def test_a_box_without_a_foot_in_the_image_needs_no_homography(both: Log) -> None:
-    plan = make_plan(both, LABELS)
+    plan = plan_of(both)
     for bottom_px, wanted in ((250.0, {"back"}), (297.0, {"back"}), (298.0, set()), (300.0, set())):
         seen = Observations(measurements=[lost("back", bottom_px)], obstacles=[None])
-        _, fits = fit_homographies(both, seen, plan, EstimationOptions(), rng=np.random.default_rng(0))
+        fits = fit_homographies(both, seen, plan, EstimationOptions(), rng=np.random.default_rng(0))
         assert set(fits) == wanted
 
 
 def test_correspondences_that_nobody_reads_are_not_gathered(tiny: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[Observations] = []
-    monkeypatch.setattr(
-        log2sim.pipeline, "fit_homographies", lambda log, s, plan, *_, **__: (seen.append(s), (plan, {}))[1]
-    )
+    monkeypatch.setattr(log2sim.pipeline, "fit_homographies", lambda log, s, *_, **__: (seen.append(s), {})[1])
     run(tiny, Config.load(detect={"name": "labels"}, topdown={"method": "off"}))
     run(tiny)
     off, on = seen
@@ -408,10 +402,9 @@ def test_for_one_camera_dropping_doubles_is_all_of_fusion(tiny: Log) -> None:
 
 def test_one_camera_gives_the_same_scenario_with_fusion(tiny: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     without = run(tiny)
-    step = entry(without, "fuse")
+    step = entry(without, "fusion of cameras")
     assert not step["kept"]
-    assert step["saved_s"] is not None
-    monkeypatch.setattr(log2sim.plan, "_fusion", lambda cameras: log2sim.plan.Step("fuse", True, "as a test"))
+    monkeypatch.setattr(log2sim.plan, "_fusion", lambda cameras: Decision(Stage.FUSION, True, "as a test"))
     full = run(tiny)
     assert_same_agents(without.scenario, full.scenario, within=0.0)
 
@@ -421,14 +414,13 @@ def test_one_camera_gives_the_same_scenario_with_fusion(tiny: Log, monkeypatch: 
 
 def test_a_parked_car_needs_no_smoothing(tiny: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     without = run(tiny)
-    step = entry(without, "smooth parked agents")
+    step = entry(without, "smoothing of parked agents")
     assert not step["kept"]
-    assert step["reason"].startswith("1 of 3 tracks")
-    assert step["saved_how"].startswith("estimated")
+    assert step["reason"].startswith("1 of 3 agents")
     (parked,) = [a for a in without.scenario.others if a.static]
     monkeypatch.setattr(log2sim.agents.build, "is_static", lambda track: False)
     full = run(tiny)
-    assert entry(full, "smooth parked agents")["kept"]
+    assert entry(full, "smoothing of parked agents")["kept"]
     smoothed = min(full.scenario.others, key=lambda a: np.hypot(a.waypoints.x_m[0] - 14.0, a.waypoints.y_m[0] + 4.0))
     w = smoothed.waypoints
     assert len(w) >= len(parked.waypoints) == 2
@@ -505,9 +497,8 @@ def straight() -> tuple[Log, Scenario]:
 def test_few_waypoints_are_as_good_as_all(straight: tuple[Log, Scenario], monkeypatch: pytest.MonkeyPatch) -> None:
     log, truth = straight
     few = run(log)
-    step = entry(few, "every waypoint")
+    step = entry(few, "waypoint at every tick")
     assert not step["kept"]
-    assert step["saved_s"] is not None
     monkeypatch.setattr(log2sim.pipeline, "simplify", lambda agents: agents)
     every = run(log).scenario
     assert every.ego is not None
@@ -532,25 +523,14 @@ def test_few_waypoints_are_as_good_as_all(straight: tuple[Log, Scenario], monkey
 # --- the report
 
 
-def test_savings_are_the_cost_of_a_piece_times_the_pieces_left_out(both: Log) -> None:
-    plan = make_plan(both, LABELS)
-    schedule = synchronize(both, plan.cameras)
-    seen = Observations(measurements=[], frames_detected=40, frames_skipped={"back": 20})
-    clock, costs = StageClock(), Costs()
+def test_the_time_saved_by_skipped_frames_is_that_of_the_others() -> None:
+    clock = StageClock()
     clock.seconds.update({"decode": 1.0, "detect": 3.0})
-    costs.seconds.update({"moving": 0.8, "standing": 0.1})
-    costs.count.update({"moving": 4, "standing": 2})
-    settled = settle(plan, both, schedule, seen, {}, [], clock, costs)
-    saved = {s.stage: s.saved_s for s in settled.steps}
-    assert saved["every frame"] == pytest.approx(20 * 4.0 / 40)
-    assert saved["smooth parked agents"] == pytest.approx(2 * (0.2 - 0.05))
-    assert saved["homography"] is None
-    assert "20 of 60 frames" in next(s.reason for s in settled.steps if s.stage == "every frame")
-
-
-def test_nothing_saved_is_never_less_than_nothing() -> None:
-    plan = Plan(("front",), (log2sim.plan.Step("fuse", False, "as a test"),))
-    assert plan.saved("fuse", -1.0, "estimated").steps[0].saved_s == 0.0
+    observations = Observations(frames_detected=40, frames_skipped={"back": 20})
+    plan = Plan(("back",), (Decision(Stage.DETECTION_IN_EVERY_FRAME, False, "empty frames are skipped"),))
+    (outcome,) = stage_outcomes(plan, RunOutputs(observations, {}, (), clock))
+    assert outcome.saved_s == pytest.approx(20 * 4.0 / 40)
+    assert "20 of 60 frames" in outcome.decision.reason
 
 
 def test_seconds_stand_in_the_report_and_not_in_the_scenario(tiny: Log) -> None:

@@ -95,9 +95,9 @@ def test_every_camera_and_every_decision_is_stated(result: Result) -> None:
     assert [c["name"] for c in result.scenario.cameras] == ["front"]
     assert all(c["used"] for c in result.scenario.cameras)
     steps = {p["stage"]: p for p in result.scenario.plan}
-    assert not steps["fuse"]["kept"]  # one camera
-    assert "one camera" in steps["fuse"]["reason"]
-    assert steps["compensate"]["kept"]
+    assert not steps["fusion of cameras"]["kept"]  # one camera
+    assert "one camera" in steps["fusion of cameras"]["reason"]
+    assert steps["motion compensation"]["kept"]
     assert all(p["reason"] for p in result.scenario.plan)
     # Times differ from run to run, so they stand in the report alone.
     timed = ("saved_s", "saved_how")
@@ -229,7 +229,7 @@ def test_one_of_two_cameras_gives_what_a_log_of_that_camera_gives() -> None:
     assert {c["name"]: c["used"] for c in chosen.cameras}["front"]
     assert not {c["name"]: c["used"] for c in chosen.cameras}.get("left", False)
     full = run(both)
-    assert next(p for p in full.report["plan"] if p["stage"] == "fuse")["kept"]
+    assert next(p for p in full.report["plan"] if p["stage"] == "fusion of cameras")["kept"]
     assert set(full.report["detections"]) == {"front", "left"}
 
 

@@ -9,7 +9,7 @@ from log2sim.config import Config
 from log2sim.datatypes import Lidar, Log
 from log2sim.errors import ConfigError, LogError
 from log2sim.geometry import Camera, PoseTrack, transform
-from log2sim.plan import Plan, Step, make_plan
+from log2sim.plan import Decision, HomographyScope, Plan, Stage, make_plan, select_sensors
 
 
 def make_log(
@@ -31,118 +31,116 @@ def make_log(
     )
 
 
-def step(plan: Plan, stage: str) -> Step:
-    (found,) = [s for s in plan.steps if s.stage == stage]
-    return found
+T_NS = np.arange(21, dtype=np.int64) * 100_000_000
 
 
-def decided(stage: str, log: Log | None = None, *settings: str, picture: bool = False) -> tuple[bool, str]:
-    found = step(make_plan(log or make_log(), Config.load(settings=settings), picture=picture), stage)
+def plan_of(log: Log | None = None, config: Config | None = None, *, picture: bool = False) -> Plan:
+    log, config = log or make_log(), config or Config()
+    return make_plan(log, config, select_sensors(log, config), T_NS, picture=picture)
+
+
+def decided(stage: Stage, log: Log | None = None, *settings: str, picture: bool = False) -> tuple[bool, str]:
+    found = plan_of(log, Config.load(settings=settings), picture=picture).decision(stage)
     return found.kept, found.reason
 
 
 def test_every_stage_is_decided_once_with_a_reason() -> None:
-    plan = make_plan(make_log(), Config())
-    stages = [s.stage for s in plan.steps]
-    assert len(set(stages)) == len(stages)
-    assert set(stages) == {
-        "every LiDAR", "compensate", "decode images", "every frame", "homography", "fuse", "track", "smooth",
-        "smooth parked agents", "every waypoint",
-    }  # fmt: skip
-    assert all(s.kept and len(s.reason) > 5 for s in plan.steps)
-    assert plan.to_list() == [{"stage": s.stage, "kept": s.kept, "reason": s.reason} for s in plan.steps]
+    decisions = plan_of().decisions
+    assert [d.stage for d in decisions] == list(Stage)
+    assert all(len(d.reason) > 5 for d in decisions)
+    assert decisions[0].to_dict() == {"stage": "use of every LiDAR", "kept": True, "reason": "1 within range"}
 
 
 def test_without_lidar_there_is_nothing_to_compensate() -> None:
-    assert decided("compensate", make_log(lidars=())) == (False, "the log has no LiDAR")
+    assert decided(Stage.MOTION_COMPENSATION, make_log(lidars=())) == (False, "the log has no LiDAR")
 
 
 def test_without_poses_nothing_can_be_compensated() -> None:
-    kept, reason = decided("compensate", make_log(moved_m=None))
+    kept, reason = decided(Stage.MOTION_COMPENSATION, make_log(moved_m=None))
     assert not kept
     assert "no ego poses" in reason
 
 
 @pytest.mark.parametrize("moved_m", [0.0, 0.049])
 def test_an_ego_that_stands_needs_no_compensation(moved_m: float) -> None:
-    kept, reason = decided("compensate", make_log(moved_m=moved_m))
+    kept, reason = decided(Stage.MOTION_COMPENSATION, make_log(moved_m=moved_m))
     assert not kept
     assert f"{moved_m * 100:.1f} cm" in reason
 
 
 @pytest.mark.parametrize("moved_m", [0.051, 12.5])
 def test_an_ego_that_moves_needs_compensation(moved_m: float) -> None:
-    kept, reason = decided("compensate", make_log(moved_m=moved_m))
+    kept, reason = decided(Stage.MOTION_COMPENSATION, make_log(moved_m=moved_m))
     assert kept
     assert f"{moved_m:.1f} m" in reason
 
 
 def test_boxes_of_the_log_need_no_pixel() -> None:
-    assert not decided("decode images", None, "detect.name=labels")[0]
+    assert not decided(Stage.IMAGE_DECODING, None, "detect.name=labels")[0]
 
 
 def test_a_picture_needs_pixels_even_with_boxes_of_the_log() -> None:
-    kept, reason = decided("decode images", None, "detect.name=labels", picture=True)
+    kept, reason = decided(Stage.IMAGE_DECODING, None, "detect.name=labels", picture=True)
     assert kept
-    assert "picture" in reason
+    assert "bird's-eye view" in reason
 
 
 def test_a_detector_needs_pixels() -> None:
-    assert decided("decode images", None, "detect.name=some.onnx")[0]
+    assert decided(Stage.IMAGE_DECODING, None, "detect.name=some.onnx")[0]
 
 
 def test_a_homography_is_left_out_when_told_so_picture_or_not() -> None:
-    assert decided("homography", None, "topdown.method=off") == (False, "topdown.method=off")
-    assert decided("homography", None, "topdown.method=off", picture=True) == (False, "topdown.method=off")
+    assert decided(Stage.HOMOGRAPHY, None, "topdown.method=off") == (False, "topdown.method=off")
+    assert decided(Stage.HOMOGRAPHY, None, "topdown.method=off", picture=True) == (False, "topdown.method=off")
 
 
 def test_a_homography_is_kept_for_a_picture_without_lidar_and_for_what_lidar_misses() -> None:
-    assert decided("homography", picture=True) == (True, "a top-down picture is asked for")
-    kept, reason = decided("homography", make_log(lidars=()))
-    assert kept
-    assert "without LiDAR" in reason
-    kept, reason = decided("homography")
-    assert kept
-    assert "without LiDAR points" in reason
+    assert plan_of(picture=True).homography is HomographyScope.ALL_CAMERAS
+    assert plan_of(make_log(lidars=())).homography is HomographyScope.CAMERAS_IN_NEED
+    assert plan_of().homography is HomographyScope.CAMERAS_IN_NEED
+    assert plan_of(config=Config.load(settings=["topdown.method=off"]), picture=True).homography is HomographyScope.NONE
+    reasons = [decided(Stage.HOMOGRAPHY, log)[1] for log in (make_log(lidars=()), make_log())]
+    assert "without LiDAR" in reasons[0]
+    assert "without LiDAR points" in reasons[1]
 
 
 def test_one_camera_needs_no_fusion() -> None:
-    assert decided("fuse", make_log(cameras=("front",))) == (
+    assert decided(Stage.FUSION, make_log(cameras=("front",))) == (
         False,
-        "one camera sees no object twice; only doubles of its detector are dropped",
+        "one camera; only duplicates of its detector are dropped",
     )
-    assert not decided("fuse", None, "cameras=left")[0]
-    assert decided("fuse") == (True, "2 cameras")
+    assert not decided(Stage.FUSION, None, "cameras=left")[0]
+    assert decided(Stage.FUSION) == (True, "2 cameras")
 
 
 def test_tracking_is_always_kept() -> None:
-    assert decided("track", make_log(cameras=("front",), lidars=(), moved_m=None), "detect.name=labels")[0]
+    assert decided(Stage.TRACKING, make_log(cameras=("front",), lidars=(), moved_m=None), "detect.name=labels")[0]
 
 
 def test_smoothing_is_left_out_when_told_so() -> None:
-    assert decided("smooth", None, "smooth.enabled=false") == (False, "smooth.enabled=false")
+    assert decided(Stage.SMOOTHING, None, "smooth.enabled=false") == (False, "smooth.enabled=false")
 
 
 def test_cameras_are_all_or_those_asked_for_in_their_order() -> None:
-    assert make_plan(make_log(), Config()).cameras == ("front", "left")
-    assert make_plan(make_log(), Config(cameras=("left", "front"))).cameras == ("left", "front")
+    assert plan_of().cameras == ("front", "left")
+    assert plan_of(config=Config(cameras=("left", "front"))).cameras == ("left", "front")
 
 
 def test_a_camera_that_the_log_lacks_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"no camera 'frnt' \(did you mean 'front'\?\); the log has front, left"):
-        make_plan(make_log(), Config(cameras=("left", "frnt")))
+        select_sensors(make_log(), Config(cameras=("left", "frnt")))
 
 
 def test_a_log_without_cameras_is_refused() -> None:
     with pytest.raises(LogError, match="drive: the log has no camera"):
-        make_plan(make_log(cameras=()), Config())
+        select_sensors(make_log(cameras=()), Config())
 
 
-def test_what_only_the_data_can_tell_changes_one_decision() -> None:
-    plan = make_plan(make_log(), Config())
-    later = plan.decided("homography", False, "every detection has LiDAR points")
-    assert not later.keeps("homography")
-    assert plan.keeps("homography")
-    assert step(later, "homography").reason == "every detection has LiDAR points"
-    assert [s for s in later.steps if s.stage != "homography"] == [s for s in plan.steps if s.stage != "homography"]
-    assert later.cameras == plan.cameras
+def test_a_variant_changes_one_decision() -> None:
+    plan = plan_of()
+    later = plan.variant(Decision(Stage.HOMOGRAPHY, False, "for a comparison"))
+    assert not later.keeps(Stage.HOMOGRAPHY)
+    assert plan.keeps(Stage.HOMOGRAPHY)
+    assert [d for d in later.decisions if d.stage is not Stage.HOMOGRAPHY] == [
+        d for d in plan.decisions if d.stage is not Stage.HOMOGRAPHY
+    ]

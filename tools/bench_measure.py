@@ -22,7 +22,7 @@ from log2sim.evaluation.metrics.truth import truth_from_log
 from log2sim.perception.detect.detectors import create_detector
 from log2sim.perception.first_pass import observe
 from log2sim.perception.sync import synchronize
-from log2sim.plan import make_plan
+from log2sim.plan import make_plan, select_sensors
 from log2sim.stage_clock import StageClock
 
 NEAREST_M = 4.0
@@ -57,7 +57,7 @@ def _measured(log: Log, mode: str) -> Sequence[Measurements]:
     cameras = tuple(log.cameras)
     schedule = synchronize(log, cameras)
     detector = create_detector(config.detect.name, log)
-    plan = make_plan(log, config)
+    plan = make_plan(log, config, select_sensors(log, config), schedule.t_ns)
     seen = observe(
         log, schedule, detector, plan, mode=mode, max_range_m=config.measure.max_range_m, clock=StageClock(),
         progress=lambda done, total: None,

@@ -17,7 +17,6 @@ from log2sim.agents.smooth.smoother import MotionModel, SmoothedTrack, signed_sp
 from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Agent, Obstacles, Track, Waypoints
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
 from log2sim.perception import box_fitting
-from log2sim.stage_clock import Costs
 
 # How fast the acceleration changes of those whose own track is not asked: spectral density of the jerk, m2/s5.
 JERK_DENSITY = {"pedestrian": 2.0}
@@ -55,25 +54,18 @@ def estimate_agents(
     flow: Array,
     *,
     smooth: bool,
-    costs: Costs | None = None,
 ) -> list[AgentCandidate]:
     """Agents of all tracks, moving ones first, since the way they go tells which way parked cars point.
 
-    `flow` (K, 3) is x, y and heading of the ego's path; `costs` gets the pieces "moving" and "standing".
+    `flow` (K, 3) is x, y and heading of the ego's path.
     """
-    costs = costs or Costs()
     standing = [is_static(t) for t in tracks]
     moving = [as_rider_if_fast(t) for t, s in zip(tracks, standing) if not s]
-    built = []
-    for track in moving:
-        with costs.piece("moving"):
-            built.append(_moving_agent(track, obstacles, timeline, smooth=smooth))
+    built = [_moving_agent(track, obstacles, timeline, smooth=smooth) for track in moving]
     built = [b for b in built if b.credible]
     flows = [flow] + [_flow_of_agent(b.agent) for b in built if GROUP_OF[b.agent.category] == "vehicle"]
     everything = np.concatenate(flows)
-    for track in (t for t, s in zip(tracks, standing) if s):
-        with costs.piece("standing"):
-            built.append(_static_agent(track, obstacles, timeline, everything))
+    built += [_static_agent(t, obstacles, timeline, everything) for t, s in zip(tracks, standing) if s]
     return [b for b in built if b.credible]
 
 

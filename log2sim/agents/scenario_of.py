@@ -6,45 +6,53 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from log2sim.config import Config
 from log2sim.datatypes import Agent, Log, Scenario
 from log2sim.geometry import NS_PER_S
 from log2sim.perception.detect.detectors import Detector
 from log2sim.perception.homography_stage import CameraHomography
-from log2sim.perception.sync import Schedule
-from log2sim.plan import Plan
 from log2sim.version import __version__
 
 
 def scenario_of(
     log: Log,
-    schedule: Schedule,
-    config: Config,
-    plan: Plan,
-    detector: Detector,
-    homographies: Mapping[str, CameraHomography],
-    ego: Agent | None,
+    t_ns: NDArray[np.int64],
     agents: Sequence[Agent],
+    *,
+    cameras: Sequence[Mapping[str, Any]],
+    plan: Sequence[Mapping[str, Any]],
+    provenance: Mapping[str, Any],
 ) -> Scenario:
-    """Assemble the record that `scenario.json` holds; the ego, if any, is its first agent."""
+    """Assemble the record that `scenario.json` holds, of the ticks `t_ns` (T,); the ego, if any, is its first agent."""
     return Scenario(
         name=log.name,
-        t0_ns=int(schedule.t_ns[0]),
-        duration_s=float((schedule.t_ns[-1] - schedule.t_ns[0]) / NS_PER_S),
-        agents=(*((ego,) if ego is not None else ()), *agents),
+        t0_ns=int(t_ns[0]),
+        duration_s=float((t_ns[-1] - t_ns[0]) / NS_PER_S),
+        agents=tuple(agents),
         map=log.map,
-        cameras=tuple(_camera_entry(name, homographies.get(name), name in plan.cameras) for name in log.cameras),
-        plan=tuple(plan.to_list()),
-        provenance={
-            "log": {"name": log.name, "format": log.format, "digest": log.digest},
-            "log2sim_version": __version__,
-            "detector": detector.name,
-            "config": config.to_dict(),
-            "seed": config.seed,
-            "history": ["reconstruct"],
-        },
+        cameras=tuple(cameras),
+        plan=tuple(plan),
+        provenance=provenance,
     )
+
+
+def provenance_of(log: Log, config: Config, detector: Detector) -> dict[str, Any]:
+    """Return what a scenario was made from and how: log, version, detector, settings, seed."""
+    return {
+        "log": {"name": log.name, "format": log.format, "digest": log.digest},
+        "log2sim_version": __version__,
+        "detector": detector.name,
+        "config": config.to_dict(),
+        "seed": config.seed,
+        "history": ["reconstruct"],
+    }
+
+
+def camera_entries(log: Log, used: Sequence[str], homographies: Mapping[str, CameraHomography]) -> list[dict[str, Any]]:
+    """Return the cameras of a log with their homographies, as a scenario states them."""
+    return [_camera_entry(name, homographies.get(name), name in used) for name in log.cameras]
 
 
 def _camera_entry(name: str, ground: CameraHomography | None, used: bool) -> dict[str, Any]:

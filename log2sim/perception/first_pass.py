@@ -21,7 +21,7 @@ from log2sim.perception.lidar.cloud import Cloud, assemble_cloud, is_at_rest
 from log2sim.perception.lidar.measure import measure_view, project_cloud
 from log2sim.perception.lidar.projection import View
 from log2sim.perception.sync import Schedule
-from log2sim.plan import Plan
+from log2sim.plan import Plan, Stage
 from log2sim.stage_clock import StageClock
 
 MAX_GROUND_POINTS_PER_FRAME = 40
@@ -35,8 +35,8 @@ BACKGROUND_THREADS = 2
 class Observations:
     """What the first pass found: per tick the measurements of all cameras and the obstacles that the LiDARs saw.
 
-    `sweeps` counts them by how they were compensated, `frames_detected` and `frames_skipped` the frames; `last_sweep`, and `busiest`,
-    the most measurements of a tick before fusion, tell what stages cost that were left out.
+    `sweeps` counts them by how they were compensated (see `compensation_of`), `frames_detected` and `frames_skipped` the
+    frames.
     """
 
     measurements: list[Measurements] = field(default_factory=list)
@@ -46,8 +46,6 @@ class Observations:
     detections: dict[str, int] = field(default_factory=dict)
     records: RecordReader | None = None
     sweeps: Counter[str] = field(default_factory=Counter)
-    last_sweep: tuple[str, Sweep] | None = None
-    busiest: Measurements | None = None
     frames_detected: int = 0
     frames_skipped: Mapping[str, int] = field(default_factory=dict)
 
@@ -119,10 +117,11 @@ class _CloudPrefetcher:
         assert self._out.records is not None
         sweep: Sweep | None = self._records.get(name, index)
         if sweep is not None:
-            kind = compensation_of(self._log, name, sweep) if self._plan.keeps("compensate") else "left out"
+            kind = (
+                compensation_of(self._log, name, sweep) if self._plan.keeps(Stage.MOTION_COMPENSATION) else "left out"
+            )
             with self._counting:
                 self._out.sweeps[kind] += 1
-                self._out.last_sweep = name, sweep
         return sweep
 
     def _make(self, reading: dict[str, Future[Sweep | None]]) -> Cloud | None:
@@ -132,10 +131,10 @@ class _CloudPrefetcher:
         origin, ground_z = cloud_origin(self._log, next(iter(sweeps.values())).stamp_ns)
         cloud = assemble_cloud(
             self._log, sweeps, origin=origin, ground_z=ground_z, max_range_m=self._max_range_m,
-            compensate=self._plan.keeps("compensate"),
+            compensate=self._plan.keeps(Stage.MOTION_COMPENSATION),
         )  # fmt: skip
         if cloud is not None:
-            cloud.prepare(ground=self._plan.keeps("homography"))
+            cloud.prepare(ground=self._plan.keeps(Stage.HOMOGRAPHY))
         return cloud
 
     def get(self, tick: int, row: int) -> Cloud | None:
@@ -165,9 +164,7 @@ def _measure_tick(
     with clock.stage("fuse"):
         joined = Measurements.join(parts)
         joined = joined.take(_in_range(log, schedule, tick, joined, max_range_m))
-        if out.busiest is None or len(joined) > len(out.busiest):
-            out.busiest = joined
-        out.measurements.append(fuse(joined, across=plan.keeps("fuse")) if len(joined) else joined)
+        out.measurements.append(fuse(joined, across=plan.keeps(Stage.FUSION)) if len(joined) else joined)
     with clock.stage("cloud"):
         out.obstacles.append(None if clouds[0] is None else _obstacles(clouds[0]))
 
@@ -212,7 +209,7 @@ def _measure_camera(
         return Measurements.empty()
     view = View(log.cameras[camera], t_ns, map_T_cam[0])
     measured = measure_view(view, detections, cloud, mode=mode)
-    if not plan.keeps("homography"):
+    if not plan.keeps(Stage.HOMOGRAPHY):
         return measured
     ego_T_map = inverse(base_pose(log, t_ns))
     out.feet[camera].append(foot_points(view.camera, measured, ego_T_map, tick))

@@ -14,7 +14,7 @@ from log2sim.datatypes import Detections, Frame, Log, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.perception.detect.detectors import Detector
 from log2sim.perception.sync import Schedule
-from log2sim.plan import Plan
+from log2sim.plan import Plan, Stage
 from log2sim.stage_clock import StageClock
 
 
@@ -96,7 +96,7 @@ class FrameDetector:
 
     def detections_at(self, tick: int) -> dict[str, Detections]:
         """Return the detections of a tick by camera; must be called for every tick in order."""
-        last, stride = len(self._schedule) - 1, self._plan.stride
+        last, stride = len(self._schedule) - 1, self._plan.detector_stride
         if tick not in self._pending:
             self._pending[tick] = self._detect(tick, self._plan.cameras)
         if stride > 1 and tick < last and tick % stride == 0:
@@ -118,7 +118,7 @@ class FrameDetector:
     def _detect(self, tick: int, cameras: Iterable[str]) -> dict[str, Detections]:
         """Run the detector on a tick's frames by camera; unreadable frames are left out, all others decode in parallel."""
         frames = self._frames(tick, cameras)
-        if self._plan.keeps("decode images"):
+        if self._plan.keeps(Stage.IMAGE_DECODING):
             with self._clock.stage("decode"):
                 readable = dict(zip(frames, self._pool.map(_is_readable, frames.values())))
             frames = {name: frame for name, frame in frames.items() if readable[name]}

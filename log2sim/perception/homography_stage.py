@@ -18,8 +18,7 @@ from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.estimate import EstimationOptions
 from log2sim.perception.homography.fit import HomographyFit, refused_fit
 from log2sim.perception.homography.placement import place_obstacle
-from log2sim.plan import Plan
-from log2sim.stage_clock import Costs
+from log2sim.plan import HomographyScope, Plan
 
 # A box that ends nearer than this to the lower image border is cut by it and has no foot in the image.
 FOOT_BORDER_PX = 3
@@ -63,35 +62,17 @@ def estimation_options(config: TopdownConfig) -> EstimationOptions:
 
 
 def fit_homographies(
-    log: Log,
-    observed: Observations,
-    plan: Plan,
-    options: EstimationOptions,
-    *,
-    rng: np.random.Generator,
-    costs: Costs | None = None,
-) -> tuple[Plan, dict[str, CameraHomography]]:
-    """Fit the cameras that need a homography.
+    log: Log, observed: Observations, plan: Plan, options: EstimationOptions, *, rng: np.random.Generator
+) -> dict[str, CameraHomography]:
+    """Fit the cameras that need a homography, by the scope of the plan.
 
-    A camera needs one when a detection of it has no LiDAR points, but a foot in the image; when a top-down picture is
-    asked for, every camera does. A refused fit is replaced by the calibration, and its reason kept.
+    A camera needs one when a detection of it has no LiDAR points, but a foot in the image. A refused fit is replaced by
+    the calibration, and its reason kept.
     """
-    if not plan.keeps("homography"):
-        return plan, {}
-    reason = next(s.reason for s in plan.steps if s.stage == "homography")
-    wanted = _cameras_in_need(log, observed) if "picture" not in reason else set(plan.cameras)
-    if not wanted:
-        return plan.decided(
-            "homography",
-            False,
-            "every detection has LiDAR points or no foot in the image, and no top-down picture is asked for",
-        ), {}
-    plan = plan.decided("homography", True, f"{reason}: {', '.join(c for c in plan.cameras if c in wanted)}")
-    homographies, costs = {}, costs or Costs()
-    for camera in (c for c in plan.cameras if c in wanted):
-        with costs.piece("homography"):
-            homographies[camera] = _fit_one(log, observed, camera, options, rng)
-    return plan, homographies
+    if plan.homography is HomographyScope.NONE:
+        return {}
+    wanted = set(plan.cameras) if plan.homography is HomographyScope.ALL_CAMERAS else _cameras_in_need(log, observed)
+    return {c: _fit_one(log, observed, c, options, rng) for c in plan.cameras if c in wanted}
 
 
 def _cameras_in_need(log: Log, observed: Observations) -> set[str]:

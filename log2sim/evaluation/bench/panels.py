@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from log2sim.evaluation.bench.pareto import Point, Recommendation, front_mask, recommend
-from log2sim.evaluation.bench.runs import REPORT_STAGES, BenchContext, BenchRun, Progress, homography_points, run_all
+from log2sim.evaluation.bench.runs import BenchContext, BenchRun, Progress, homography_points, run_all
 from log2sim.evaluation.bench.scores import Score
 
 OWN_STAGES = {"detect": ("detect",), "measure": ("measure", "fuse"), "smooth": ("smooth",)}
@@ -110,7 +110,7 @@ def _measure_point(context: BenchContext, run: BenchRun) -> Point:
 
 def _whole_point(context: BenchContext, run: BenchRun) -> Point:
     name = "present settings" if run.setting.present else run.setting.key
-    stages = {stage: context.ms_per_tick(s) for stage, s in run.stages_s.items() if stage not in REPORT_STAGES}
+    stages = {stage: context.ms_per_tick(s) for stage, s in run.stages_s.items()}
     point = _scored_point(
         name, run.setting.present, context.ms_per_tick(run.seconds), run.score, _error(context, "whole run")
     )

@@ -27,8 +27,8 @@ from log2sim.geometry import NS_PER_S
 from log2sim.perception.first_pass import Observations, observe
 from log2sim.perception.homography_stage import CameraHomography, estimation_options, fit_homographies
 from log2sim.perception.sync import Schedule
-from log2sim.pipeline import conclude, detector_of, schedule_of
-from log2sim.plan import LABELS, Plan, make_plan
+from log2sim.pipeline import Run, detector_of, schedule_of, second_pass
+from log2sim.plan import LABELS, Decision, HomographyScope, Plan, Stage, make_plan, select_sensors
 from log2sim.stage_clock import StageClock
 
 REPEATS = 3
@@ -37,7 +37,6 @@ REPEATS = 3
 MEASURE_REPEATS = 2
 """Repetitions of the measurement, which takes longer."""
 
-REPORT_STAGES = ("probe savings",)
 
 Progress = Callable[[str, int, int], None]
 Figures = dict[str, Any]
@@ -104,8 +103,8 @@ class BenchRun:
 
     @property
     def seconds(self) -> float:
-        """Return the time of the whole run, s, without stages that only serve its report."""
-        return sum(s for stage, s in self.stages_s.items() if stage not in REPORT_STAGES)
+        """Return the time of the whole run, s."""
+        return sum(self.stages_s.values())
 
 
 def make_context(
@@ -114,16 +113,18 @@ def make_context(
     """Synchronize the log and detect once with every setting of the detector."""
     check_scope(truth, scope)
     config, clock = grid.present.config, StageClock()
-    plan = make_plan(log, config)
-    log = plan.narrowed(log)
+    sensors = select_sensors(log, config)
     with clock.stage("sync"):
-        schedule = schedule_of(log, config, plan)
+        schedule = schedule_of(log, config, sensors)
+    log = sensors.restrict(log)
     detectors = {s.name: detector_of(log, s.config) for s in grid.detect}
     decode = any(s.config.detect.name != LABELS for s in grid.detect)
     found, decoding_s = detect_once(
         log, schedule, detectors, decode=decode, progress=lambda done, total: report("detect", done, total)
     )
-    plan = plan.decided("decode images", False, "detections are remembered")
+    plan = make_plan(log, config, sensors, schedule.t_ns)
+    # Detections are looked up, so that no image is decoded and no frame skipped.
+    plan = replace(plan.variant(Decision(Stage.IMAGE_DECODING, False, "detections are shared")), detector_stride=1)
     return BenchContext(log, plan, schedule, truth, scope, grid, found, {**clock.seconds, "decode": decoding_s})
 
 
@@ -179,7 +180,8 @@ def run_settings(
 def _concluded(context: BenchContext, setting: Setting, seen: Observations, clock: StageClock) -> Score:
     detector = context.found[context.grid.present.name]
     try:
-        result = conclude(context.log, setting.config, context.plan, detector, context.schedule, seen, clock)
+        run = Run(context.log, setting.config, context.plan, context.schedule, detector, clock, lambda *_: None)
+        result = second_pass(run, seen)
     except NothingToReconstruct:
         return Score({"agents": 0})
     return score_scenario(result.scenario, context.truth, context.tick_s, context.scope)
@@ -258,9 +260,9 @@ def homography_points(context: BenchContext, seen: Observations, report: Progres
 
 def fit(context: BenchContext, setting: Setting, holdout: Holdout) -> dict[str, CameraHomography]:
     """Fit the homographies of all cameras by one method."""
-    plan = context.plan.decided("homography", True, "a top-down picture is asked for")
+    plan = replace(context.plan, homography=HomographyScope.ALL_CAMERAS)
     options, rng = estimation_options(setting.config.topdown), np.random.default_rng(setting.config.seed)
-    return fit_homographies(context.log, holdout.seen, plan, options, rng=rng)[1]
+    return fit_homographies(context.log, holdout.seen, plan, options, rng=rng)
 
 
 def fit_figures(grounds: Mapping[str, CameraHomography]) -> Figures:
