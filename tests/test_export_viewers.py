@@ -226,7 +226,8 @@ def test_sweeps_are_thinned_and_put_into_the_map_at_their_points_own_time(scenar
     assert many.t_ns is not None
     step = -(-len(many.xyz_m) // MOST_POINTS)
     poses, _ = log.map_T_sensor("lidar_top", many.t_ns[::step])
-    np.testing.assert_allclose(cloud.points_map[7], (poses[7] @ [*many.xyz_m[7 * step], 1])[:3], atol=1e-9)
+    expected = (poses[7] @ [*many.xyz_m[7 * step], 1])[:3]
+    np.testing.assert_allclose(cloud.points_map[7], expected, atol=1e-3)  # poses hold for half a millisecond
 
 
 def test_a_log_of_another_time_is_refused(scenario: Scenario, log: Log, tmp_path: Path) -> None:

@@ -23,8 +23,7 @@ def ego_agent(log: Log, timeline: Timeline) -> Agent | None:
     if not valid.any():
         return None
     vehicle = log.ego_vehicle
-    length, width, height = vehicle.size_m
-    center = map_T_ego[valid] @ np.array([vehicle.rear_axle_offset_m, 0.0, log.ground_z_ego_m + height / 2, 1.0])
+    center = log.ego_centers(map_T_ego[valid])
     t, yaw = timeline.seconds(timeline.t_ns[valid]), yaw_of(map_T_ego[valid])
     path = smooth_track(t, center[:, :2], sigma_m=EGO_SIGMA_M)
     speed = signed_speed(path.velocity_mps, yaw)
@@ -40,7 +39,7 @@ def ego_agent(log: Log, timeline: Timeline) -> Agent | None:
     )
     moved = float(np.hypot(np.ptp(center[:, 0]), np.ptp(center[:, 1])))
     return Agent(
-        "ego", "car", (length, width, height), waypoints, static=moved < MAX_STATIC_DISTANCE_M, rear_axle_offset_m=vehicle.rear_axle_offset_m,
+        "ego", "car", vehicle.size_m, waypoints, static=moved < MAX_STATIC_DISTANCE_M, rear_axle_offset_m=vehicle.rear_axle_offset_m,
         quality={"source": "ego poses of the log", "flags": list(path.flags)},
     )  # fmt: skip
 

@@ -263,6 +263,12 @@ class Log:
     digest: str = ""
     notes: Deferred[tuple[str, ...]] = Deferred(())
 
+    def ego_centers(self, map_T_ego: Array) -> Array:
+        """Compute the centers (N, 3), m, map frame, of the ego's box at ego poses (N, 4, 4)."""
+        up_m = self.ground_z_ego_m + self.ego_vehicle.size_m[2] / 2
+        center = map_T_ego @ np.array([self.ego_vehicle.rear_axle_offset_m, 0.0, up_m, 1.0])
+        return np.asarray(center[:, :3])
+
     def map_T_sensor(self, name: str, t_ns: Any) -> tuple[Array, NDArray[np.bool_]]:
         """Interpolate the pose of a sensor.
 

@@ -193,7 +193,8 @@ def _newton_step(camera: Camera, xy: Array, error: Array) -> Array:
     (a, c), (b, d) = columns[0].T, columns[1].T
     determinant = a * d - b * c
     adjugate = np.stack([d * error[:, 0] - b * error[:, 1], a * error[:, 1] - c * error[:, 0]], axis=1)
-    return np.divide(adjugate, determinant[:, None], out=np.zeros_like(xy), where=(determinant != 0)[:, None])
+    step = np.divide(adjugate, determinant[:, None], out=np.zeros_like(xy), where=(determinant != 0)[:, None])
+    return np.asarray(step)
 
 
 def _padded(coefficients: tuple[float, ...], count: int) -> tuple[float, ...]:

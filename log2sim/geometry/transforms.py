@@ -126,7 +126,7 @@ def apply(dst_T_src: Array, points: ArrayLike) -> Array:
     p = np.asarray(points, dtype=np.float64)
     if dst_T_src.ndim == 2:
         return p @ dst_T_src[:3, :3].T + dst_T_src[:3, 3]
-    return np.einsum("nij,nj->ni", dst_T_src[:, :3, :3], p) + dst_T_src[:, :3, 3]
+    return np.asarray(np.einsum("nij,nj->ni", dst_T_src[:, :3, :3], p) + dst_T_src[:, :3, 3])
 
 
 def slerp(q0: Array, q1: Array, fraction: Array) -> Array:

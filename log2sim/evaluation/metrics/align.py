@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,7 +94,7 @@ def reconstructed_states(agents: tuple[Agent, ...], ticks_s: Array, ego_xy: Arra
     yaw = _stack([s.yaw_rad for s in sampled], (len(ticks_s),))
     speed = _stack([s.speed_mps for s in sampled], (len(ticks_s),))
     z = _stack([s.z_m for s in sampled], (len(ticks_s),))
-    return _side(agents, xy, z, yaw, speed, np.isfinite(yaw), ego_xy)
+    return _table(agents, ego_xy, xy_m=xy, z_m=z, yaw_rad=yaw, speed_mps=speed, visible=np.isfinite(yaw))
 
 
 def truth_states(agents: tuple[Agent, ...], ticks_s: Array, shift_m: Array, ego_xy: Array | None) -> StateTable:
@@ -110,7 +111,7 @@ def truth_states(agents: tuple[Agent, ...], ticks_s: Array, shift_m: Array, ego_
     yaw = _stack([c[2] for c in columns], (len(ticks_s),))
     speed = _stack([c[3] for c in columns], (len(ticks_s),))
     visible = _stack([c[4].astype(np.float64) for c in columns], (len(ticks_s),)) > 0
-    return _side(agents, xy, z, yaw, speed, visible, ego_xy)
+    return _table(agents, ego_xy, xy_m=xy, z_m=z, yaw_rad=yaw, speed_mps=speed, visible=visible)
 
 
 def _sample_truth(agent: Agent, t: Array) -> tuple[Array, Array, Array, Array, Mask]:
@@ -129,25 +130,20 @@ def _sample_truth(agent: Agent, t: Array) -> tuple[Array, Array, Array, Array, M
     return xy + nan[:, None], s.z_m + nan, s.yaw_rad + nan, s.speed_mps + nan, seen & labeled
 
 
-def _side(
-    agents: tuple[Agent, ...], xy: Array, z: Array, yaw: Array, speed: Array, visible: Mask, ego_xy: Array | None
-) -> StateTable:
+def _table(agents: tuple[Agent, ...], ego_xy: Array | None, **columns: Any) -> StateTable:
+    """Complete the sampled columns with what is constant for each agent, and with the distance from the ego."""
     category = np.array([a.category for a in agents], dtype="<U16")
     if ego_xy is None:
-        range_m = np.where(np.isfinite(yaw), np.inf, np.nan)
+        range_m = np.where(np.isfinite(columns["yaw_rad"]), np.inf, np.nan)
     else:
-        range_m = np.hypot(xy[..., 0] - ego_xy[:, 0], xy[..., 1] - ego_xy[:, 1])
+        range_m = np.hypot(*np.moveaxis(columns["xy_m"] - ego_xy, -1, 0))
     return StateTable(
         ids=tuple(a.id for a in agents),
         category=category,
         group=np.array([GROUP_OF.get(c, "other") for c in category], dtype="<U16"),
         size_m=np.array([a.size_m for a in agents], dtype=np.float64).reshape(-1, 3),
-        xy_m=xy,
-        z_m=z,
-        yaw_rad=yaw,
-        speed_mps=speed,
         range_m=range_m,
-        visible=visible,
+        **columns,
     )
 
 

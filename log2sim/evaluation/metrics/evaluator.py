@@ -151,8 +151,8 @@ def _without_ignored(c: Comparison, regions: IgnoreRegions | None, truth_ticks_s
     """Move false ticks in ignore regions to the ignored ones."""
     if regions is None:
         return c
-    center = np.concatenate([c.other.xy_m, c.other.z_m[..., None]], axis=-1) - shift_m
-    ignored = ignored_ticks(regions, truth_ticks_s, center, c.other.size_m, c.other.yaw_rad, c.false)
+    in_truth_map = replace(c.other, xy_m=c.other.xy_m - shift_m[:2], z_m=c.other.z_m - shift_m[2])
+    ignored = ignored_ticks(regions, truth_ticks_s, in_truth_map, c.false)
     return replace(c, false=c.false & ~ignored, ignored=ignored)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from log2sim.datatypes import IgnoreRegions, LabelView
+from log2sim.evaluation.metrics.align import StateTable
 from log2sim.evaluation.metrics.pairs import Index, Mask
 from log2sim.evaluation.metrics.visibility import image_samples
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse, nearest_index
@@ -14,9 +15,7 @@ MAX_FRAME_LAG_S = 0.15
 """A tick is compared with the nearest labeled frame of a camera within this time."""
 
 
-def ignored_ticks(
-    ignore_regions: IgnoreRegions, t_s: Array, center_m: Array, size_m: Array, yaw_rad: Array, asked: Mask
-) -> Mask:
+def ignored_ticks(ignore_regions: IgnoreRegions, t_s: Array, agents: StateTable, asked: Mask) -> Mask:
     """Mark (B, T) the boxes that no labeled camera shows in a labeled part of its image.
 
     Parameters
@@ -24,8 +23,8 @@ def ignored_ticks(
     ignore_regions : IgnoreRegions
     t_s : (T,)
         Ticks, seconds of the truth.
-    center_m, size_m, yaw_rad : (B, T, 3), (B, 3), (B, T)
-        Boxes in the truth's map frame.
+    agents : StateTable
+        B agents at these ticks, the truth's map frame.
     asked : (B, T) bool
         The boxes to decide on; all others are False.
 
@@ -34,13 +33,14 @@ def ignored_ticks(
     A camera shows a box in an ignore region when at least half of the visible outline lies in the union of the regions of
     the nearest frame. One camera that shows it in a labeled part suffices to keep it.
     """
+    center_m = np.concatenate([agents.xy_m, agents.z_m[..., None]], axis=-1)
     labeled, hidden = np.zeros_like(asked), np.zeros_like(asked)
     for view in ignore_regions.views:
         frame, near, map_T_cam = _frames_at(view, t_s)
         for k in np.flatnonzero(asked.any(0) & near):
             rows = np.flatnonzero(asked[:, k])
             regions = view.region_px[view.region_frame == frame[k]]
-            boxes = center_m[rows, k], size_m[rows], yaw_rad[rows, k]
+            boxes = center_m[rows, k], agents.size_m[rows], agents.yaw_rad[rows, k]
             for row, uv in zip(rows, image_samples(view.camera, inverse(map_T_cam[k]), *boxes)):
                 if len(uv):
                     share = _inside_any(uv, regions).mean()

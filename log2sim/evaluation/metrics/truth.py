@@ -12,7 +12,8 @@ from log2sim.datatypes import Agent, Labels, Log, Scenario, Sweep, Waypoints
 from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.evaluation.metrics.label_views import ignore_regions_of
 from log2sim.evaluation.metrics.visibility import PointGrid, image_shares
-from log2sim.geometry import NS_PER_S, Array, apply, inverse, nearest_index, wrap_angle, yaw_of
+from log2sim.geometry import NS_PER_S, Array, inverse, nearest_index, wrap_angle, yaw_of
+from log2sim.perception.lidar.cloud import sweep_to_map
 from log2sim.registry import nearest
 
 MIN_POINTS = 20
@@ -22,7 +23,6 @@ MAX_LAG_S = 0.1
 SPEED_WINDOW_S = 0.25
 MAX_STATIC_REACH_M = 0.5
 MAX_STATIC_DRIFT_MPS = 0.2
-POINT_TIME_STEP_NS = 1_000_000
 
 Progress = Callable[[int, int], None]
 
@@ -96,15 +96,24 @@ def points_in_labels(log: Log, labels: Labels, progress: Progress | None = None)
             rows = np.flatnonzero((index == i) & near)
             if len(rows):
                 try:
-                    grid = PointGrid(_points_map(log, name, stream.read(i)))
+                    counts[rows] += _points_of_sweep(log, name, stream.read(i), labels, rows)
                 except RecordError:
                     unreadable += 1
-                else:
-                    counts[rows] += [grid.count(labels.center_m[k], labels.size_m[k], labels.yaw_rad[k]) for k in rows]
             done += 1
             if progress is not None:
                 progress(done, total)
     return counts, unreadable
+
+
+def _points_of_sweep(
+    log: Log, lidar: str, sweep: Sweep, labels: Labels, rows: NDArray[np.int64]
+) -> NDArray[np.int64] | int:
+    """Count the points of a sweep inside the boxes at `rows`; 0 when the pose of the LiDAR is unknown."""
+    mapped = sweep_to_map(log, lidar, sweep, compensate=True)
+    if mapped is None:
+        return 0
+    grid = PointGrid(mapped[0])
+    return np.array([grid.count(labels.center_m[k], labels.size_m[k], labels.yaw_rad[k]) for k in rows])
 
 
 def in_some_image(log: Log, labels: Labels, cameras: Sequence[str], asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -133,24 +142,6 @@ def nearest_record(
     order = np.argsort(stream_t_ns, kind="stable")
     index = order[nearest_index(stream_t_ns[order], t_ns)]
     return index, np.abs(stream_t_ns[index] - t_ns) <= round(MAX_LAG_S * NS_PER_S)
-
-
-def _points_map(log: Log, lidar: str, sweep: Sweep) -> NDArray[np.floating[Any]]:
-    """Points (N, 3) in the map; those of unknown ego pose are left out.
-
-    Notes
-    -----
-    Points within a millisecond share a pose: at 30 m/s that is 15 mm at most, and a hundred poses a sweep instead of 100 000.
-    """
-    if sweep.frame == "map" or len(sweep.xyz_m) == 0:
-        return sweep.xyz_m
-    if sweep.t_ns is None:
-        pose, known = log.map_T_sensor(lidar, sweep.stamp_ns)
-        return apply(pose[0], sweep.xyz_m) if known[0] else np.zeros((0, 3))
-    step, which = np.unique(sweep.t_ns // POINT_TIME_STEP_NS, return_inverse=True)
-    poses, known = log.map_T_sensor(lidar, step * POINT_TIME_STEP_NS + POINT_TIME_STEP_NS // 2)
-    keep = known[which]
-    return apply(poses[which[keep]], sweep.xyz_m[keep])
 
 
 def _rows_by_track(labels: Labels) -> list[NDArray[np.int64]]:
@@ -192,8 +183,7 @@ def _ego_poses(log: Log) -> tuple[NDArray[np.int64], Array]:
 
 def _ego_agent(log: Log, t_ns: NDArray[np.int64], map_T_ego: Array, t0_ns: int) -> Agent:
     vehicle = log.ego_vehicle
-    up_m = log.ground_z_ego_m + vehicle.size_m[2] / 2
-    center = apply(map_T_ego, np.tile([vehicle.rear_axle_offset_m, 0.0, up_m], (len(t_ns), 1)))
+    center = log.ego_centers(map_T_ego)
     yaw, t_s = yaw_of(map_T_ego), (t_ns - t0_ns) / NS_PER_S
     static = is_static(t_s, center[:, :2])
     return Agent(

@@ -12,6 +12,7 @@ from log2sim.datatypes import Agent, Log, Scenario, Sweep
 from log2sim.errors import ConfigError, RecordError
 from log2sim.export.sampling import Motion, clock, on_clock
 from log2sim.geometry import NS_PER_S, Array, Camera, apply, box_corners, box_lines, inverse
+from log2sim.perception.lidar.cloud import sweep_to_map
 
 STEP_S = 0.1  # the least rate that readers of OSI traces take, and smooth enough to watch
 PICTURE_PX = 960  # wider pictures are made smaller, so that a minute of several cameras stays a file to hand around
@@ -153,13 +154,8 @@ def _outlines(scenario: Scenario, camera: Camera, cam_T_map: Array, t_ns: int) -
 
 
 def _points_map(log: Log, name: str, sweep: Sweep) -> Array:
-    """Every n-th point of a sweep in the map (N, 3), each seen from where the sensor was at its own time."""
+    """Transform every n-th point of a sweep to the map frame (N, 3); none when the pose of the LiDAR is unknown."""
     kept = slice(None, None, max(1, -(-len(sweep.xyz_m) // MOST_POINTS)))
-    points = sweep.xyz_m[kept].astype(np.float64)
-    if sweep.frame == "map":
-        return points
-    t_ns = np.array([sweep.stamp_ns]) if sweep.t_ns is None else sweep.t_ns[kept]
-    poses, known = log.map_T_sensor(name, t_ns)
-    if sweep.t_ns is None:
-        return apply(poses[0], points) if known[0] else points[:0]
-    return apply(poses[known], points[known])
+    t_ns = None if sweep.t_ns is None else sweep.t_ns[kept]
+    mapped = sweep_to_map(log, name, replace(sweep, xyz_m=sweep.xyz_m[kept], t_ns=t_ns), compensate=True)
+    return np.zeros((0, 3)) if mapped is None else mapped[0]
