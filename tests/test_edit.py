@@ -94,7 +94,7 @@ def test_standing_agents_move_to_the_left_of_their_heading() -> None:
 
 @pytest.mark.parametrize("meters", [10.0, 14.0])
 def test_a_way_cannot_be_moved_beyond_the_point_about_which_it_turns(meters: float) -> None:
-    with pytest.raises(ConfigError, match=r"'car' turns about a point 10\.0\d? m off"):
+    with pytest.raises(ConfigError, match=r"'car' turns with a radius of 10\.0\d? m"):
         only_one(circling(10.0, 6.0), Lateral("car", meters))
     w = only_one(circling(10.0, 6.0), Lateral("car", -meters))  # outward there is room
     np.testing.assert_allclose(np.hypot(w.x_m, w.y_m), 10.0 + meters)
@@ -285,7 +285,7 @@ def test_what_the_source_could_not_drive_either_is_not_told() -> None:
         ([Remove("car"), Remove("parked")], "leaves out every agent"),
         ([Only(())], "leaves out every agent"),
         ([Shift("car", 1.0), Shift("car", 2.0)], "shift: agent 'car' is named twice"),
-        ([Speed("parked", 2.0)], "agent 'parked' stands all the time"),
+        ([Speed("parked", 2.0)], "agent 'parked' is static"),
     ],
 )
 def test_what_cannot_be_done_is_refused(edits: list[Edit], message: str) -> None:

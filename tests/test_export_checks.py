@@ -11,7 +11,7 @@ from export_paths import agent, bend, line, scenario
 
 from log2sim.datatypes import Agent, Scenario
 from log2sim.errors import ScenarioError
-from log2sim.export.checks import overlaps_at_entry, remarks, require_exportable, require_start_as_in_log
+from log2sim.export.checks import export_notes, overlaps_at_entry, require_exportable, require_start_as_in_log
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
 
@@ -77,15 +77,15 @@ def test_what_logs_hold_is_no_error(fine: Agent) -> None:
 def test_agents_in_one_another_when_the_later_one_appears_are_remarked() -> None:
     ego, late = agent(line()), agent(np.full((5, 2), [10.0, 0.5]), "late", yaw_rad=0.3, first_s=1.0)
     assert overlaps_at_entry([ego, late])[0][:2] == (0, 1)
-    assert [r.split(" (")[0] for r in remarks(scenario(late, ego))] == [
-        "agents 'ego' and 'late' stand in one another at 1 s"
-    ]
+    (note,) = export_notes(scenario(late, ego))
+    assert note.startswith("agents 'ego' and 'late' overlap by ")
+    assert " at 1 s, " in note
     for apart in (
         replace(late, waypoints=replace(late.waypoints, t_s=late.waypoints.t_s + 1.0)),  # the ego has passed
         replace(late, waypoints=replace(late.waypoints, t_s=late.waypoints.t_s + 9.0)),  # the ego is gone
         replace(late, waypoints=replace(late.waypoints, z_m=late.waypoints.z_m + 5.0)),  # on a bridge
     ):
-        assert remarks(scenario(ego, apart)) == []
+        assert export_notes(scenario(ego, apart)) == []
 
 
 def test_overlaps_at_entry_agree_with_looking_at_every_pair() -> None:
@@ -123,7 +123,7 @@ def test_overlaps_at_entry_agree_with_looking_at_every_pair() -> None:
 def test_the_sample_has_nothing_to_remark() -> None:
     world = Scenario.load(SAMPLE)
     require_exportable(world)
-    assert remarks(world) == []
+    assert export_notes(world) == []
 
 
 def test_a_start_that_puts_agents_into_one_another_is_refused_unless_the_log_did() -> None:
@@ -131,7 +131,7 @@ def test_a_start_that_puts_agents_into_one_another_is_refused_unless_the_log_did
     apart = np.array([[0.0, 0.0, 0.8, 0.0], [0.0, 5.0, 0.8, 0.0]])
     require_start_as_in_log(agents, apart)
     together = apart * [1, 0.1, 1, 1]
-    with pytest.raises(ScenarioError, match="agents 'ego' and 'beside' would start in one another"):
+    with pytest.raises(ScenarioError, match="agents 'ego' and 'beside' would overlap at the start"):
         require_start_as_in_log(agents, together)
     require_start_as_in_log(agents, together * [[1, 1, 1, 1], [np.nan, 1, 1, 1]])
     require_start_as_in_log([agent(line()), agent(line(start=(0.0, 0.5)), "beside")], together)

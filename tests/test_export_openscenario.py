@@ -106,8 +106,8 @@ def test_nobody_starts_in_another_who_does_not_in_the_log(revision: str, tmp_pat
 def test_a_writer_that_would_put_agents_into_one_another_is_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(openscenario, "starts", lambda parts, revision: np.zeros((len(parts), 4)))
-    with pytest.raises(ScenarioError, match="agents 'ego' and 'guest' would start in one another"):
+    monkeypatch.setattr(openscenario, "start_poses", lambda parts, revision: np.zeros((len(parts), 4)))
+    with pytest.raises(ScenarioError, match="agents 'ego' and 'guest' would overlap at the start"):
         export(guest(), "openscenario", tmp_path / "out")
     assert names(tmp_path) == []
 
@@ -319,4 +319,4 @@ def test_the_command_notes_agents_that_stand_in_one_another(tmp_path: Path) -> N
     world.save(tmp_path / "scenario.json")
     ran = run("export", tmp_path / "scenario.json", "--to", "openscenario", "--out", tmp_path / "out")
     assert ran.code == 0
-    assert "note: agents 'ego' and 'twin' stand in one another at 0 s (overlap 100%)" in ran.out
+    assert "note: agents 'ego' and 'twin' overlap by 100% at 0 s" in ran.out

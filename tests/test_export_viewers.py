@@ -18,7 +18,14 @@ from log2sim import open_log
 from log2sim.datatypes import Log, Scenario, Stream
 from log2sim.errors import ConfigError, RecordError, ScenarioError
 from log2sim.export.exporters import Options, export
-from log2sim.export.viewers.playback import MOST_POINTS, PICTURE_PX, Cloud, Picture, shown_of, steps_of
+from log2sim.export.viewers.playback import (
+    MAX_IMAGE_PX,
+    MAX_SWEEP_POINTS,
+    CameraFrame,
+    ThinnedSweep,
+    agent_steps,
+    viewer_records,
+)
 from log2sim.geometry import NS_PER_S, Camera, apply, box_corners, inverse, points_in_box
 
 SAMPLE = ROOT / "samples" / "crossing"
@@ -142,7 +149,7 @@ def test_points_lie_on_what_the_lidar_saw(scenario: Scenario, log: Log, tmp_path
     clouds = [cloud for _, cloud in on("/lidar/lidar_top", written(scenario, tmp_path, log))]
     assert [f.name for f in clouds[0].fields] == ["x", "y", "z"]
     each = [np.frombuffer(cloud.data, "<f4").reshape(-1, 3).astype(float) for cloud in clouds]
-    assert all(1000 < len(points) <= MOST_POINTS for points in each)
+    assert all(1000 < len(points) <= MAX_SWEEP_POINTS for points in each)
     points = np.concatenate(each)
     assert np.percentile(points[:, 2], 1) > -0.15
     high = points[points[:, 2] > 0.25]
@@ -164,14 +171,14 @@ def test_wide_pictures_are_made_smaller_with_their_calibration(scenario: Scenari
     stream = log.streams["front"]
     big = replace(stream, read=lambda i: np.repeat(np.repeat(stream.read(i), 4, axis=0), 4, axis=1))
     both = [
-        next(shown_of(scenario, replace(log, cameras={"front": c}, lidars={}, streams={"front": s})))
+        next(viewer_records(scenario, replace(log, cameras={"front": c}, lidars={}, streams={"front": s})))
         for c, s in ((wide, big), (camera, stream))
     ]
     a, b = both
-    assert isinstance(a, Picture)
-    assert isinstance(b, Picture)
-    assert a.camera.width_px == PICTURE_PX
-    factor = np.array([896, 520]) / [PICTURE_PX, a.camera.height_px]
+    assert isinstance(a, CameraFrame)
+    assert isinstance(b, CameraFrame)
+    assert a.camera.width_px == MAX_IMAGE_PX
+    factor = np.array([896, 520]) / [MAX_IMAGE_PX, a.camera.height_px]
     for (agent, line), (other, same) in zip(a.outlines, b.outlines, strict=True):
         assert agent is other
         np.testing.assert_allclose((line + 0.5) * factor - 0.5, same, atol=1e-6)
@@ -189,7 +196,7 @@ def test_wide_pictures_are_made_smaller_with_their_calibration(scenario: Scenari
 def test_lenses_have_foxgloves_names(model: str, given: tuple[float, ...], named: str, count: int) -> None:
     foxglove = pytest.importorskip("log2sim.export.viewers.foxglove", exc_type=ImportError)
     camera = Camera("c", 64, 48, np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]), "ego", np.eye(4), model, given)
-    found = {topic: m for _, topic, m in foxglove.shown(Picture(0, camera, None, b"", ()), np.zeros(3))}
+    found = {topic: m for _, topic, m in foxglove.record_messages(CameraFrame(0, camera, None, b"", ()), np.zeros(3))}
     calibration = found["/camera/c/calibration"]
     assert (calibration.distortion_model, len(calibration.D)) == (named, count)
     assert list(calibration.K) == [50, 0, 32, 0, 50, 24, 0, 0, 1]
@@ -220,11 +227,11 @@ def test_sweeps_are_thinned_and_put_into_the_map_at_their_points_own_time(scenar
         sweep, xyz_m=np.tile(sweep.xyz_m, (5, 1)), t_ns=None if sweep.t_ns is None else np.tile(sweep.t_ns, 5)
     )
     stream = replace(log.streams["lidar_top"], t_ns=log.streams["lidar_top"].t_ns[:1], read=lambda _: many)
-    cloud = next(shown_of(scenario, replace(log, streams={"lidar_top": stream})))
-    assert isinstance(cloud, Cloud)
-    assert len(cloud.points_map) <= MOST_POINTS < len(many.xyz_m)
+    cloud = next(viewer_records(scenario, replace(log, streams={"lidar_top": stream})))
+    assert isinstance(cloud, ThinnedSweep)
+    assert len(cloud.points_map) <= MAX_SWEEP_POINTS < len(many.xyz_m)
     assert many.t_ns is not None
-    step = -(-len(many.xyz_m) // MOST_POINTS)
+    step = -(-len(many.xyz_m) // MAX_SWEEP_POINTS)
     poses, _ = log.map_T_sensor("lidar_top", many.t_ns[::step])
     expected = (poses[7] @ [*many.xyz_m[7 * step], 1])[:3]
     np.testing.assert_allclose(cloud.points_map[7], expected, atol=1e-3)  # poses hold for half a millisecond
@@ -338,7 +345,7 @@ def test_rerun_has_pictures_with_lines_and_points(recorded: tuple[Callable[..., 
     }
     sweeps = read("/lidar/lidar_top")
     assert sorted(t for _, t, _ in sweeps if t is not None) == log.streams["lidar_top"].t_ns.tolist()
-    assert all(0 < len(v["Points3D:positions"]) <= MOST_POINTS for _, _, v in sweeps)
+    assert all(0 < len(v["Points3D:positions"]) <= MAX_SWEEP_POINTS for _, _, v in sweeps)
 
 
 @pytest.mark.peers
@@ -370,7 +377,7 @@ def test_rerun_opens_the_mcap_file(scenario: Scenario, log: Log, tmp_path: Path)
 
 def test_who_comes_after_the_last_step_is_shown_at_it() -> None:
     late, once = straight("late", t_s=[1.06, 1.09]), straight("once", t_s=[1.09])
-    steps = steps_of(world(straight("ego", t_s=[0.0, 1.0]), late, once))
+    steps = agent_steps(world(straight("ego", t_s=[0.0, 1.0]), late, once))
     assert [np.flatnonzero(m.valid).tolist() for _, m in steps.moves] == [list(range(11)), [10], [10]]
-    steps = steps_of(world(straight("ego", t_s=[0.0, 0.02]), straight("late", t_s=[0.05, 0.08])))
+    steps = agent_steps(world(straight("ego", t_s=[0.0, 0.02]), straight("late", t_s=[0.05, 0.08])))
     assert [m.valid.tolist() for _, m in steps.moves] == [[True], [True]]

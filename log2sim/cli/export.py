@@ -30,7 +30,7 @@ def export(
 ) -> None:
     """Write a scenario in the format of a simulator or viewer."""
     from log2sim.datatypes import Scenario
-    from log2sim.export.checks import remarks
+    from log2sim.export.checks import export_notes
     from log2sim.export.exporters import Options
     from log2sim.export.exporters import export as run
     from log2sim.logs.opening import open_log
@@ -40,7 +40,7 @@ def export(
     files = run(loaded, to, out, Options(revision, map, mode, opened), overwrite=overwrite)
     for file in files:
         say(f"{file}: written", quiet=quiet)
-    notes = remarks(loaded)
+    notes = export_notes(loaded)
     for note in notes[:MOST_NOTES]:
         say(f"note: {note}", quiet=quiet)
     if len(notes) > MOST_NOTES:

@@ -1,4 +1,4 @@
-"""Scenarios with something changed: an agent later, faster, farther left, or gone."""
+"""Edits of scenarios: an agent later, faster, shifted sideways, or removed."""
 
 from log2sim.edit.apply import Edited, edit
 from log2sim.edit.edits import Edit, Lateral, Only, Remove, Shift, Speed

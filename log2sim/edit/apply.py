@@ -1,4 +1,4 @@
-"""Applies edits to a scenario, checks what came of them and writes them into its provenance."""
+"""Applies edits to a scenario, checks the result and records the edits in its provenance."""
 
 from __future__ import annotations
 
@@ -15,7 +15,14 @@ from log2sim.registry import nearest
 
 @dataclass(frozen=True, eq=False)
 class Edited:
-    """The scenario after edits, and what they brought about that the source did not have."""
+    """The edited scenario, and problems that its source does not have.
+
+    Attributes
+    ----------
+    scenario : Scenario
+    warnings : tuple of str
+        New collisions and infeasible motion.
+    """
 
     scenario: Scenario
     warnings: tuple[str, ...]
@@ -38,14 +45,14 @@ def edit(scenario: Scenario, edits: Sequence[Edit]) -> Edited:
     Returns
     -------
     Edited
-        The scenario, longer where an agent now lives beyond its end, with the edits and the digest of the source in
-        `provenance["edits"]` behind those of earlier runs; and warnings of new collisions and infeasible motion.
+        The scenario, longer where an agent now lives beyond its end, with the edits and the digest of the source appended to
+        `provenance["edits"]`; and warnings of new collisions and infeasible motion.
 
     Raises
     ------
     ConfigError
-        For no edits, an agent that is not there (any more), the same edit twice, nobody left, or an edit that an agent
-        cannot take: a speed of one that stands, a way moved beyond the point about which it turns, a life cut to nothing.
+        For no edits, an unknown or removed agent, the same edit twice, no agent left, or an impossible edit: the speed of a
+        static agent, a path shifted beyond its center of curvature, a trajectory without waypoints left.
     """
     if not edits:
         raise ConfigError("no edits; say what to change, such as a shift of one agent")
@@ -69,7 +76,7 @@ def edit(scenario: Scenario, edits: Sequence[Edit]) -> Edited:
 
 
 def _check_names(scenario: Scenario, edits: Sequence[Edit]) -> None:
-    """Refuse agents that are not there, and a second value for the same."""
+    """Refuse unknown agents, and a second value for the same edit."""
     known, seen = [a.id for a in scenario.agents], set()
     for step in edits:
         for name in step.names:
@@ -86,7 +93,7 @@ def _some(ids: Sequence[str], most: int = 12) -> str:
 
 
 def _history(scenario: Scenario, edits: Sequence[Edit]) -> list[Any]:
-    """Earlier edits and these, one entry a run."""
+    """Append these edits to the earlier ones, one entry a run."""
     earlier = scenario.provenance.get("edits", [])
     if not isinstance(earlier, list):
         raise ScenarioError(f"provenance.edits is {type(earlier).__name__}, expected the list of earlier edits")

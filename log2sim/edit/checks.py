@@ -1,4 +1,4 @@
-"""What an edit brings about that the scenario did not have: collisions, and motion that nobody could drive."""
+"""Checks of an edited scenario: collisions and infeasible motion that the source does not have."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from typing import Any
 import numpy as np
 
 from log2sim.datatypes import GROUP_OF, Agent, Scenario
-from log2sim.edit.motion import STANDING_MPS, chords
+from log2sim.edit.motion import MIN_PATH_MPS, chords
 from log2sim.geometry import Array
 from log2sim.simulation.reference import MAX_ACCEL_MPS2, MAX_CURVATURE_1PM, MAX_TWO_WHEELER_CURVATURE_1PM
 from log2sim.simulation.runner import replay
 
-# As a replay flags them; people turn on the spot.
+# The limits that a replay flags; pedestrians turn on the spot.
 CURVATURE_LIMITS_1PM = {"vehicle": MAX_CURVATURE_1PM, "two_wheeler": MAX_TWO_WHEELER_CURVATURE_1PM}
 STEP_S = 0.05
 SAME_CONTACT_S = 0.5
-WORSE = 1 + 1e-6
+RELATIVE_TOLERANCE = 1 + 1e-6
 
 
 def warnings_of(before: Scenario, after: Scenario) -> tuple[str, ...]:
-    """What is wrong with the edited scenario and was not with its source, a line each, with agent, time and value."""
+    """Return what is wrong with the edited scenario and not with its source, a line each, with agent, time and value."""
     source = {a.id: a for a in before.agents}
     changed = [a for a in after.agents if a is not source[a.id]]
     infeasible = [line for a in changed for line in _infeasible(source[a.id], a)]
@@ -30,7 +30,7 @@ def warnings_of(before: Scenario, after: Scenario) -> tuple[str, ...]:
 
 
 def _collisions(before: Scenario, after: Scenario, changed: Set[str]) -> Iterator[str]:
-    """Overlaps of boxes where the source has none of the same two agents within `SAME_CONTACT_S`."""
+    """Yield overlaps of boxes where the source has none of the same two agents within `SAME_CONTACT_S`."""
     if not changed:
         return
     known: dict[frozenset[str], list[tuple[float, float]]] = {}
@@ -47,7 +47,7 @@ def _collisions(before: Scenario, after: Scenario, changed: Set[str]) -> Iterato
 
 
 def _overlaps(scenario: Scenario, changed: Set[str]) -> Sequence[dict[str, Any]]:
-    """Collisions as a replay of the waypoints themselves tells them: pairs of boxes of which one moves or was moved."""
+    """Return the collisions of an exact replay: pairs of boxes of which one moves or was moved."""
     agents = (replace(a, static=a.static and not (a.id in changed and len(a.waypoints) > 1)) for a in scenario.agents)
     replayed = replay(replace(scenario, agents=tuple(agents)), mode="exact", dt_s=STEP_S)
     collisions: Sequence[dict[str, Any]] = replayed.metrics["collisions"]
@@ -55,43 +55,43 @@ def _overlaps(scenario: Scenario, changed: Set[str]) -> Sequence[dict[str, Any]]
 
 
 @dataclass(frozen=True)
-class Peak:
-    """The largest value of something, and when."""
+class PeakValue:
+    """The largest value of a quantity, and its time."""
 
     value: float
     t_s: float
 
 
 def _infeasible(before: Agent, after: Agent) -> Iterator[str]:
-    """Acceleration and curvature beyond their limits, and beyond what the source has itself."""
+    """Yield acceleration and curvature beyond their limits and beyond those of the source."""
     curvature_limit = CURVATURE_LIMITS_1PM.get(GROUP_OF[after.category], np.inf)
     for what, peak_of, limit, unit in (
         ("acceleration", peak_acceleration, MAX_ACCEL_MPS2, "m/s2"),
         ("curvature", peak_curvature, curvature_limit, "1/m"),
     ):
         peak = peak_of(after)
-        if peak.value > max(limit, peak_of(before).value) * WORSE:
+        if peak.value > max(limit, peak_of(before).value) * RELATIVE_TOLERANCE:
             yield f"agent '{after.id}': {what} {peak.value:.3g} {unit} at {peak.t_s:.2f} s, limit {limit:g} {unit}"
 
 
-def peak_acceleration(agent: Agent) -> Peak:
-    """Largest acceleration in m/s2, along and across the heading together, between two waypoints."""
+def peak_acceleration(agent: Agent) -> PeakValue:
+    """Return the largest acceleration in m/s2, longitudinal and lateral combined, between two waypoints."""
     w = agent.waypoints
     span, speed = np.diff(w.t_s), (w.speed_mps[1:] + w.speed_mps[:-1]) / 2
     _, turn = chords(w)
     return _peak(w.t_s, np.hypot(np.diff(w.speed_mps), speed * turn) / span)
 
 
-def peak_curvature(agent: Agent) -> Peak:
-    """Largest curvature in 1/m between two waypoints, 0 where the agent stands."""
+def peak_curvature(agent: Agent) -> PeakValue:
+    """Return the largest curvature in 1/m between two waypoints, 0 where the agent stands."""
     w = agent.waypoints
     chord, turn = chords(w)
-    moves = np.abs(chord) > STANDING_MPS * np.diff(w.t_s)
+    moves = np.abs(chord) > MIN_PATH_MPS * np.diff(w.t_s)
     return _peak(w.t_s, np.divide(np.abs(turn), np.abs(chord), out=np.zeros(len(turn)), where=moves))
 
 
-def _peak(t_s: Array, values: Array) -> Peak:
+def _peak(t_s: Array, values: Array) -> PeakValue:
     if len(values) == 0:
-        return Peak(0.0, float(t_s[0]))
-    k = int(np.argmax(values >= values.max() / WORSE))  # the first of those that rounding alone tells apart
-    return Peak(float(values[k]), float(t_s[k] + t_s[k + 1]) / 2)
+        return PeakValue(0.0, float(t_s[0]))
+    k = int(np.argmax(values >= values.max() / RELATIVE_TOLERANCE))  # the first of those that are equal up to rounding
+    return PeakValue(float(values[k]), float(t_s[k] + t_s[k + 1]) / 2)

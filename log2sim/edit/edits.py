@@ -1,4 +1,4 @@
-"""The edits: small values that say what to change, and apply it to the agents of a scenario."""
+"""The edits: values that describe a change, and apply it to the agents of a scenario."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from log2sim.datatypes import Agent, Waypoints
-from log2sim.edit.motion import chords, faster, folds, later, to_the_left
+from log2sim.edit.motion import chords, parallel_fails, shifted_in_time, shifted_left, sped_up
 from log2sim.errors import ConfigError
 
 Agents = Mapping[str, Agent]
@@ -28,118 +28,130 @@ class Edit:
         raise NotImplementedError
 
     def applied(self, agents: Agents) -> Agents:
-        """The agents after the edit; those given must include the ones that it names."""
+        """Return the agents after the edit; `agents` must include the named ones."""
         raise NotImplementedError
 
     def to_dict(self) -> dict[str, Any]:
-        """The edit as an entry of a scenario's provenance."""
+        """Return the entry of the edit in a scenario's provenance."""
         return {"kind": self.kind, **asdict(self)}  # type: ignore[call-overload]
 
 
 @dataclass(frozen=True)
 class Only(Edit):
-    """Leaves out everyone but the named agents; the ego too goes unless it is named."""
+    """Keep only the named agents; the ego is removed too unless it is named."""
 
     agents: tuple[str, ...]
     kind: ClassVar[str] = "only"
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Ids of the agents that are kept."""
         return self.agents
 
     def applied(self, agents: Agents) -> Agents:
+        """Keep the named agents."""
         return {k: a for k, a in agents.items() if k in self.agents}
 
     def to_dict(self) -> dict[str, Any]:
+        """Return the entry of the edit in a scenario's provenance."""
         return {"kind": self.kind, "agents": list(self.agents)}
 
 
 @dataclass(frozen=True)
-class _Single(Edit):
+class _AgentEdit(Edit):
     """A change to one agent."""
 
     agent: str
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Id of the agent, as a tuple of one."""
         return (self.agent,)
 
 
 @dataclass(frozen=True)
-class Remove(_Single):
-    """Leaves out an agent."""
+class Remove(_AgentEdit):
+    """Remove an agent."""
 
     kind: ClassVar[str] = "remove"
 
     def applied(self, agents: Agents) -> Agents:
+        """Return all other agents."""
         return {k: a for k, a in agents.items() if k != self.agent}
 
 
 @dataclass(frozen=True)
-class _Motion(_Single):
-    """A change to the waypoints of one agent. What was visible where they were, nobody knows where they are."""
+class _WaypointEdit(_AgentEdit):
+    """A change to the waypoints of one agent; `visible` is dropped, since it is unknown at the new positions."""
 
     def applied(self, agents: Agents) -> Agents:
+        """Replace the waypoints of the agent."""
         agent = agents[self.agent]
         return {**agents, self.agent: replace(agent, waypoints=replace(self.moved(agent), visible=None))}
 
     def moved(self, agent: Agent) -> Waypoints:
-        """The waypoints of the agent after the edit."""
+        """Return the waypoints of the agent after the edit."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
-class Speed(_Motion):
-    """Lets an agent go its way so many times as fast from its first moment on."""
+class Speed(_WaypointEdit):
+    """Scale the speed of an agent on its path, from its first waypoint on."""
 
     factor: float
     kind: ClassVar[str] = "speed"
 
     def __post_init__(self) -> None:
+        """Check the factor."""
         _require(self, self.factor, 0.01, 100.0, "")
 
     def moved(self, agent: Agent) -> Waypoints:
+        """Return the waypoints at scaled times."""
         if agent.static:
-            raise ConfigError(f"speed: agent '{agent.id}' stands all the time and has no speed to change; leave it out")
-        return faster(agent.waypoints, self.factor)
+            raise ConfigError(f"speed: agent '{agent.id}' is static and has no speed to change; leave it out")
+        return sped_up(agent.waypoints, self.factor)
 
 
 @dataclass(frozen=True)
-class Lateral(_Motion):
-    """Moves an agent's way to its left by so many meters, to its right where negative."""
+class Lateral(_WaypointEdit):
+    """Shift an agent's path to its left in meters, to its right where negative."""
 
     meters: float
     kind: ClassVar[str] = "lateral"
 
     def __post_init__(self) -> None:
+        """Check the distance."""
         _require(self, self.meters, -100.0, 100.0, " m")
 
     def moved(self, agent: Agent) -> Waypoints:
+        """Return the waypoints of the parallel path."""
         w = agent.waypoints
-        broken = folds(w, self.meters)
-        if broken.any():
+        fails = parallel_fails(w, self.meters)
+        if fails.any():
             chord, turn = chords(w)
-            room = np.where(broken, np.abs(chord / np.where(broken, turn, 1.0)), np.inf)
-            k = int(np.argmin(room))
+            radius_m = np.where(fails, np.abs(chord / np.where(fails, turn, 1.0)), np.inf)
+            k = int(np.argmin(radius_m))
             raise ConfigError(
-                f"lateral: agent '{agent.id}' turns about a point {room[k]:.2f} m off at {w.t_s[k]:.2f} s, "
-                f"so its way cannot be moved to that side by {abs(self.meters):g} m; choose less than {room[k]:.2f} m"
+                f"lateral: agent '{agent.id}' turns with a radius of {radius_m[k]:.2f} m at {w.t_s[k]:.2f} s, so its path "
+                f"cannot be shifted to that side by {abs(self.meters):g} m; choose less than {radius_m[k]:.2f} m"
             )
-        return to_the_left(w, self.meters)
+        return shifted_left(w, self.meters)
 
 
 @dataclass(frozen=True)
-class Shift(_Motion):
-    """Lets an agent do everything so many seconds later, earlier where negative; before t = 0 there is nothing."""
+class Shift(_WaypointEdit):
+    """Delay an agent by seconds, or advance it where negative; waypoints before t = 0 are cut off."""
 
     seconds: float
     kind: ClassVar[str] = "shift"
 
     def __post_init__(self) -> None:
+        """Check the time."""
         _require(self, self.seconds, -1e5, 1e5, " s")
 
     def moved(self, agent: Agent) -> Waypoints:
-        w = later(agent, self.seconds)
+        """Return the waypoints at shifted times."""
+        w = shifted_in_time(agent, self.seconds)
         if len(w) == 0:
             end_s = float(agent.waypoints.t_s[-1])
             raise ConfigError(
@@ -149,7 +161,7 @@ class Shift(_Motion):
         return w
 
 
-def _require(edit: _Motion, value: float, low: float, high: float, unit: str) -> None:
+def _require(edit: _WaypointEdit, value: float, low: float, high: float, unit: str) -> None:
     if not (math.isfinite(value) and low <= value <= high):
         raise ConfigError(
             f"{edit.kind}: {value:g}{unit} for agent '{edit.agent}', expected a number from {low:g} to {high:g}{unit}"

@@ -1,4 +1,4 @@
-"""What an edit makes of the waypoints of one agent. Waypoints in, waypoints out."""
+"""The effect of edits on the waypoints of one agent."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Agent, Waypoints
 from log2sim.geometry import Array
 
-STANDING_MPS = 0.5  # slower than this a heading says little about a path
+MIN_PATH_MPS = 0.5  # slower waypoints do not define the curvature of a path
 
 
-def later(agent: Agent, seconds: float) -> Waypoints:
-    """Waypoints that are `seconds` later, without what would come before the scenario's start at t = 0.
+def shifted_in_time(agent: Agent, seconds: float) -> Waypoints:
+    """Return waypoints `seconds` later, cut at the scenario's start t = 0.
 
-    Where that cuts between two waypoints, one at t = 0 is put on the line between them. None may be left: (0,) columns.
+    Where that cuts between two waypoints, one at t = 0 is interpolated. None may be left: (0,) columns.
     """
     moved = replace(agent.waypoints, t_s=agent.waypoints.t_s + seconds)
     first = int(np.searchsorted(moved.t_s, 0.0))
@@ -32,19 +32,20 @@ def later(agent: Agent, seconds: float) -> Waypoints:
     return Waypoints(**columns, observed=np.concatenate([seen, kept.observed]))
 
 
-def faster(w: Waypoints, factor: float) -> Waypoints:
-    """Waypoints that are passed `factor` times as fast from the first one on: the same places, at other times."""
+def sped_up(w: Waypoints, factor: float) -> Waypoints:
+    """Return waypoints passed `factor` times as fast from the first one on: the same places at other times."""
     return replace(w, t_s=w.t_s[0] + (w.t_s - w.t_s[0]) / factor, speed_mps=w.speed_mps * factor)
 
 
-def to_the_left(w: Waypoints, meters: float) -> Waypoints:
-    """Waypoints `meters` to the left of their headings, which stay; to the right where negative.
+def shifted_left(w: Waypoints, meters: float) -> Waypoints:
+    """Return waypoints `meters` to the left of their headings, to the right where negative.
 
     Notes
     -----
-    A point fixed to the left of a rigid body moves along the body's heading, `meters` times the yaw rate slower than the
-    body, which is 1 - curvature times `meters` of its speed. So all points of the body, the rear axle among them, drive a
-    parallel curve, and what stands stays turned as it is. `folds` says where no parallel curve exists. The height stays.
+    A point fixed to the left of a rigid body moves along the body's heading, `meters` times the yaw rate slower than
+    the body, which is 1 - curvature times `meters` of its speed. So all points of the body, also the rear axle, drive a
+    parallel curve, and a standing body keeps its heading. `parallel_fails` tells where no parallel curve exists. The
+    height stays.
     """
     yaw = np.unwrap(w.yaw_rad)
     rate = np.gradient(yaw, w.t_s, edge_order=2 if len(w) > 2 else 1) if len(w) > 1 else np.zeros(len(w))
@@ -56,15 +57,15 @@ def to_the_left(w: Waypoints, meters: float) -> Waypoints:
     )
 
 
-def folds(w: Waypoints, meters: float) -> NDArray[np.bool_]:
-    """Mask (T - 1,) of the steps between waypoints that turn about a point no farther off than the parallel path."""
+def parallel_fails(w: Waypoints, meters: float) -> NDArray[np.bool_]:
+    """Mask (T - 1,) of the steps between waypoints whose radius is not larger than the shift."""
     chord, turn = chords(w)
-    moves = np.abs(chord) > STANDING_MPS * np.diff(w.t_s)
+    moves = np.abs(chord) > MIN_PATH_MPS * np.diff(w.t_s)
     return moves & (chord * (chord - meters * turn) <= 0)
 
 
 def chords(w: Waypoints) -> tuple[Array, Array]:
-    """Signed way along the mean heading, m, and change of heading, rad, of the steps between waypoints, (T - 1,) each."""
+    """Return the signed distance along the mean heading, m, and the change of heading, rad, of the steps, (T - 1,) each."""
     yaw = np.unwrap(w.yaw_rad)
     turn, mean = np.diff(yaw), (yaw[1:] + yaw[:-1]) / 2
     return np.diff(w.x_m) * np.cos(mean) + np.diff(w.y_m) * np.sin(mean), turn

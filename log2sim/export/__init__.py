@@ -1,4 +1,4 @@
-"""Scenarios in the formats of other simulators and viewers."""
+"""Export of scenarios to the formats of other simulators and viewers."""
 
 from __future__ import annotations
 

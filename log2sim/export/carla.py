@@ -1,6 +1,6 @@
-"""A scenario for CARLA: a script that replays it through CARLA's Python client, and its data.
+"""Export to CARLA: a script that replays the scenario through CARLA's Python client, and its data.
 
-The script is `log2sim.simulation.carla.player` as it stands there, so what is tested is what is written.
+The script is a copy of `log2sim.simulation.carla.player`, so the tested code is what is written.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from log2sim.datatypes import Agent, Scenario
 from log2sim.errors import ConfigError
 from log2sim.export.exporters import Options
-from log2sim.export.placement import Placement
+from log2sim.export.placement import ExportPlacement
 from log2sim.export.roads.opendrive import add_road_file
 from log2sim.simulation.carla import player
 from log2sim.simulation.carla.data import carla_agents, controller_data
@@ -29,6 +29,7 @@ class Carla:
     loses = "sizes (CARLA's assets have their own; the data list by how much), map origin, cameras, quality, plan, provenance"
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
+        """Write script, data and road."""
         mode = options.mode or "exact"
         if mode not in MODES:
             raise ConfigError(f"--mode: '{mode}', expected one of {', '.join(MODES)}")
@@ -52,8 +53,8 @@ class Carla:
 EXPORTER = Carla()
 
 
-def _placed(agent: Agent, placement: Placement) -> Agent:
-    """An agent in the coordinates of the road."""
+def _placed(agent: Agent, placement: ExportPlacement) -> Agent:
+    """Transform an agent to the coordinates of the road."""
     w = agent.waypoints
     x, y, z, yaw = placement.forward(np.column_stack([w.x_m, w.y_m, w.z_m, w.yaw_rad])).T
     return replace(agent, waypoints=replace(w, x_m=x, y_m=y, z_m=z, yaw_rad=yaw))

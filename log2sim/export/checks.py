@@ -1,4 +1,4 @@
-"""What players of scenario formats rely on and their own checkers miss, looked at before anything is written."""
+"""Checks before an export: what players of scenario formats rely on and their own checkers miss."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from log2sim.datatypes import Agent, Scenario
 from log2sim.errors import ScenarioError
 from log2sim.geometry import Array, bev_iou, box_corners_bev
 
-# Players that count in float32 place what is this far from the middle to 4 mm; beyond, it shakes.
-FARTHEST_M = 65_536.0
-# Steps shorter than this have no direction, and agents that move less none that could be wrong.
+# Players that compute in float32 resolve 4 mm at this distance from the center; beyond, agents jitter.
+MAX_EXTENT_M = 65_536.0
+# Steps shorter than STEP_M have no direction; the direction of agents that move less than MOVED_M is not checked.
 STEP_M, MOVED_M = 0.05, 2.0
-# Boxes of a log touch; what overlaps by less is taken for that.
+# Boxes of a log may touch; a smaller overlap is within their errors.
 TOUCHING_IOU = 0.02
-# Names are escaped where XML needs it; a projection has to stay as it is.
+# Names are escaped in XML; a projection must stay as it is.
 _NO_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def require_exportable(scenario: Scenario) -> None:
-    """Raise `ScenarioError` with all that is wrong with a scenario, naming the agents."""
+    """Raise `ScenarioError` with all defects of a scenario, naming the agents."""
     wrong = [problem for agent in scenario.agents for problem in _problems(agent)]
     if not scenario.agents:
         wrong = ["it has no agents"]
@@ -35,37 +35,37 @@ def require_exportable(scenario: Scenario) -> None:
     projection = scenario.map.projection
     if projection is not None and _NO_XML.search(projection):
         wrong.append(f"map.projection {projection[:60]!a}: holds characters that no XML file can; write a PROJ string")
-    wrong += _repeated(scenario) or ([] if wrong else _scattered(scenario))
+    wrong += _duplicate_ids(scenario) or ([] if wrong else _too_far_apart(scenario))
     if wrong:
         raise ScenarioError(f"scenario '{scenario.name}' cannot be exported:\n  " + "\n  ".join(wrong))
 
 
-def remarks(scenario: Scenario) -> list[str]:
-    """What can be exported and yet may surprise: agents that stand in one another when one of them appears."""
+def export_notes(scenario: Scenario) -> list[str]:
+    """Return notes on what can be exported but may surprise: agents that overlap when one of them appears."""
     found = []
     for a, b, share in overlaps_at_entry(scenario.agents):
         first, second = scenario.agents[a], scenario.agents[b]
         found.append(
-            f"agents '{first.id}' and '{second.id}' stand in one another at {second.waypoints.t_s[0]:g} s (overlap {share:.0%}),"
+            f"agents '{first.id}' and '{second.id}' overlap by {share:.0%} at {second.waypoints.t_s[0]:g} s,"
             " as in the scenario; a simulator with physics pushes them apart"
         )
     return found
 
 
 def require_start_as_in_log(agents: Sequence[Agent], placed: Array) -> None:
-    """Raise unless agents that an export places in one another at its start (A, 4) are so in the scenario too.
+    """Raise when agents overlap at the start of an export, states (A, 4), that do not in the scenario.
 
-    `placed` holds x, y, z of the box center and yaw, NaN for agents that it does not place yet.
+    `placed` holds x, y, z of the box center and yaw, NaN for agents that appear later.
     """
     there = overlaps(agents, _states(agents, max(0.0, min(float(a.waypoints.t_s[0]) for a in agents))))
     for a, b in overlaps(agents, placed.T).keys() - there.keys():
         raise ScenarioError(
-            f"agents '{agents[a].id}' and '{agents[b].id}' would start in one another, which they do not in the scenario"
+            f"agents '{agents[a].id}' and '{agents[b].id}' would overlap at the start, which they do not in the scenario"
         )
 
 
 def overlaps_at_entry(agents: Sequence[Agent]) -> list[tuple[int, int, float]]:
-    """Pairs of agents (indices) whose boxes overlap at the moment when the later of both appears, with their IoU."""
+    """Return pairs of agents (indices) whose boxes overlap when the later of both appears, with their IoU."""
     first_s = np.array([a.waypoints.t_s[0] for a in agents])
     found = []
     for t_s in np.unique(first_s):
@@ -76,7 +76,7 @@ def overlaps_at_entry(agents: Sequence[Agent]) -> list[tuple[int, int, float]]:
 
 
 def overlaps(agents: Sequence[Agent], states: Array) -> dict[tuple[int, int], float]:
-    """IoU by pair of agents (indices, the lower first) whose boxes overlap in states (4, A) x, y, z, yaw; NaN is absent."""
+    """Return the IoU by pair of agents (indices, the lower first) whose boxes overlap in states (4, A); NaN is absent."""
     size = np.array([a.size_m for a in agents]).reshape(-1, 3)
     x, y, z, yaw = states
     reach = np.hypot(size[:, 0], size[:, 1]) / 2
@@ -93,7 +93,7 @@ def overlaps(agents: Sequence[Agent], states: Array) -> dict[tuple[int, int], fl
 
 
 def _states(agents: Sequence[Agent], t_s: float) -> Array:
-    """x, y, z, yaw (4, A) of all agents at a time, NaN for those that are not there."""
+    """Return x, y, z, yaw (4, A) of all agents at a time, NaN for absent ones."""
     states = [a.at(t_s) for a in agents]
     return np.array([[getattr(s, key)[0] for s in states] for key in ("x_m", "y_m", "z_m", "yaw_rad")])
 
@@ -116,7 +116,7 @@ def _problems(agent: Agent) -> list[str]:
 
 
 def _back_to_front(agent: Agent) -> Iterator[str]:
-    """Say when most of the way goes against the heading although the speed says otherwise."""
+    """Describe an agent that mostly moves against its heading although its speed is positive."""
     w = agent.waypoints
     heading = np.unwrap(w.yaw_rad)
     middle = (heading[1:] + heading[:-1]) / 2
@@ -125,7 +125,7 @@ def _back_to_front(agent: Agent) -> Iterator[str]:
     forward = np.where(w.speed_mps[1:] + w.speed_mps[:-1] < 0, -1.0, 1.0)
     against = (step >= STEP_M) & (forward * (dx * np.cos(middle) + dy * np.sin(middle)) < 0)
     moved, wrong = step[step >= STEP_M].sum(), step[against].sum()
-    reach = np.hypot(np.ptp(w.x_m), np.ptp(w.y_m))  # a box that trembles in its place goes far and gets nowhere
+    reach = np.hypot(np.ptp(w.x_m), np.ptp(w.y_m))  # the steps of a box that jitters add up without getting anywhere
     if reach >= MOVED_M and wrong > moved / 2:
         yield (
             f"agent '{agent.id}': goes backward on {wrong:.1f} of {moved:.1f} m while its speed says forward; if its box is"
@@ -133,7 +133,7 @@ def _back_to_front(agent: Agent) -> Iterator[str]:
         )
 
 
-def _repeated(scenario: Scenario) -> list[str]:
+def _duplicate_ids(scenario: Scenario) -> list[str]:
     ids = [a.id for a in scenario.agents]
     return [
         f"agent '{name}': the id occurs twice; ids must be unique"
@@ -141,14 +141,14 @@ def _repeated(scenario: Scenario) -> list[str]:
     ]
 
 
-def _scattered(scenario: Scenario) -> list[str]:
-    """Agents too far from the middle of all for float32, whatever offset is taken."""
+def _too_far_apart(scenario: Scenario) -> list[str]:
+    """Describe agents too far from the center of all for float32."""
     xyz = [np.column_stack([a.waypoints.x_m, a.waypoints.y_m, a.waypoints.z_m]) for a in scenario.agents]
     every = np.concatenate(xyz)
     middle = (every.min(axis=0) + every.max(axis=0)) / 2
     far: NDArray[np.float64] = np.array([np.abs(points - middle).max() for points in xyz])
     return [
         f"agent '{scenario.agents[k].id}': is {far[k] / 1000:.0f} km from the middle of the scenario, expected at most"
-        f" {FARTHEST_M / 1000:.0f} km: players that count in float32 would let it shake; export parts of the scenario"
-        for k in np.flatnonzero(far > FARTHEST_M)
+        f" {MAX_EXTENT_M / 1000:.0f} km: it would jitter in players that compute in float32; export parts of the scenario"
+        for k in np.flatnonzero(far > MAX_EXTENT_M)
     ]  # fmt: skip

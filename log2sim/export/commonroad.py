@@ -1,7 +1,7 @@
-"""Scenarios of CommonRoad: lanelets under the paths, the agents as obstacles, and the ego's way as planning problem.
+"""Export to CommonRoad: lanelets under the paths, agents as obstacles, and the ego's task as planning problem.
 
-Written without CommonRoad's own library: every year's release of it has other modules, all of them pin a protobuf that
-nothing else can be installed with, and its writer cuts decimals off and dates files by the day of writing.
+Written without CommonRoad's own library: each year's release has other modules, all releases pin a protobuf version
+that conflicts with other packages, and its writer truncates decimals and dates files by the day of writing.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from log2sim.export import xml_text
 from log2sim.export.csv_table import write_table
 from log2sim.export.exporters import Options
 from log2sim.export.roads.lanes import Lane, lanes
-from log2sim.export.sampling import Motion, clock, motion, on_clock
+from log2sim.export.sampling import SampledMotion, sample_motion, sample_steps, step_times
 from log2sim.export.xml_text import element
 from log2sim.geometry import NS_PER_S, Array
 
 VERSION = "2020a"
 STEP_S = 0.1
 DECIMALS = 9
-GOAL_S = 1.0  # how far from the recorded time the goal may be reached
+GOAL_S = 1.0  # tolerance of the time at which the goal is reached
 GOAL_LENGTH_M = 6.0
 GOAL_SIDE_M = 1.0
 GOAL_YAW_RAD = 0.35
@@ -37,12 +37,12 @@ TYPE_OF_CATEGORY = {
     "car": "car", "truck": "truck", "bus": "bus", "motorcycle": "motorcycle", "cyclist": "bicycle",
     "bicycle": "bicycle", "pedestrian": "pedestrian", "other": "unknown",
 }  # fmt: skip
-# Static obstacles have types of their own, without people: who stands is a dynamic obstacle that does not move.
+# Static obstacles have types of their own, without pedestrians: those are dynamic obstacles that do not move.
 STATIC_TYPE = dict.fromkeys(("car", "truck", "bus", "motorcycle", "bicycle"), "parkedVehicle") | {"other": "unknown"}
 
 
 class CommonRoad:
-    """`ZAM_<name>-1_1_T-1.xml` of version 2020a, and `agents.csv` with what each of its numbers is in the scenario."""
+    """`ZAM_<name>-1_1_T-1.xml` of version 2020a, and `agents.csv` with the agent behind each of its numbers."""
 
     options: tuple[str, ...] = ()
     loses = (
@@ -51,6 +51,7 @@ class CommonRoad:
     )
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
+        """Write the scenario file and the table of agents."""
         ego, t_s = _ego_and_clock(scenario)
         name = f"ZAM_{_camel_case(scenario.name)}-1_1_T-1"
         root = _root(scenario, name)
@@ -66,26 +67,26 @@ class CommonRoad:
             role = obstacle.tag if obstacle is not None else "left out: not alive at any step"
             table.append((number, agent.id, agent.category, role))
         root.extend(sorted(obstacles, key=lambda o: o.tag != "staticObstacle"))  # the schema wants these first
-        root.append(_planning_problem(ego, first, clock(t_s[0], ego.waypoints.t_s[-1], STEP_S)))
+        root.append(_planning_problem(ego, first, step_times(t_s[0], ego.waypoints.t_s[-1], STEP_S)))
         xml_text.write(root, folder / f"{name}.xml")
         write_table(folder / "agents.csv", table)
 
 
 def _ego_and_clock(scenario: Scenario) -> tuple[Agent, Array]:
-    """The ego, and all steps from its first waypoint to the last of anybody."""
+    """Return the ego, and all steps from its first waypoint to the last of any agent."""
     ego = scenario.ego
     if ego is None:
         raise ScenarioError(
-            f"scenario '{scenario.name}' has no agent 'ego', whose way is CommonRoad's planning problem; name one so"
+            f"scenario '{scenario.name}' has no agent 'ego', which the planning problem needs; give an agent this id"
         )
     start, stop = ego.waypoints.t_s[0], ego.waypoints.t_s[-1]
     if stop - start < STEP_S:
         raise ScenarioError(f"agent 'ego': lives {stop - start:g} s, a planning problem needs {STEP_S} s or more")
-    return ego, clock(start, max(a.waypoints.t_s[-1] for a in scenario.agents), STEP_S)
+    return ego, step_times(start, max(a.waypoints.t_s[-1] for a in scenario.agents), STEP_S)
 
 
 def _camel_case(text: str) -> str:
-    """A name of letters and digits only, as benchmark ids need it."""
+    """Return a name of letters and digits only, as benchmark ids need it."""
     return "".join(word[:1].upper() + word[1:] for word in re.findall("[A-Za-z0-9]+", text))[:50] or "Scenario"
 
 
@@ -104,7 +105,7 @@ def _point(parent: Element, xyz: Array) -> None:
 
 
 def _root(scenario: Scenario, name: str) -> Element:
-    """The document with its head. It is dated by the recording, so that the same scenario gives the same bytes."""
+    """Return the document with its header, dated by the recording so that the same scenario gives the same bytes."""
     root = element("commonRoad", None, commonRoadVersion=VERSION, benchmarkID=name, timeStepSize=_decimal(STEP_S))
     root.set("date", datetime.fromtimestamp(scenario.t0_ns // NS_PER_S, UTC).date().isoformat())
     root.attrib |= {"author": "log2sim", "affiliation": "", "source": xml_text.escaped(scenario.name)}
@@ -119,10 +120,10 @@ def _location(frame: MapFrame) -> Element:
         place |= {"gpsLatitude": _decimal(frame.latitude_deg), "gpsLongitude": _decimal(frame.longitude_deg)}
     location = _texts(element("location"), **place)
     if frame.projection is not None:
-        x, y, _ = frame.offset_m  # what leads from projected coordinates to those of the file
-        way = _texts(element("geoTransformation", location), geoReference=xml_text.escaped(frame.projection))
+        x, y, _ = frame.offset_m  # from projected coordinates to those of the file
+        transformation = _texts(element("geoTransformation", location), geoReference=xml_text.escaped(frame.projection))
         shift = {"xTranslation": _decimal(-x), "yTranslation": _decimal(-y), "zRotation": "0", "scaling": "1"}
-        _texts(element("additionalTransformation", way), **shift)
+        _texts(element("additionalTransformation", transformation), **shift)
     return location
 
 
@@ -136,13 +137,13 @@ def _lanelet(lane: Lane, number: int) -> Element:
 
 
 def _obstacle(agent: Agent, number: int, t_s: Array) -> Element | None:
-    """An agent as obstacle; None for one that is gone before the first step."""
+    """Return an agent as obstacle; None for one that is gone before the first step."""
     if agent.static and agent.category in STATIC_TYPE:
         obstacle = _texts(element("staticObstacle", id=str(number)), type=STATIC_TYPE[agent.category])
         _shape(obstacle, agent)
-        obstacle.append(_state("initialState", motion(agent, agent.waypoints.t_s[:1]), 0, 0))
+        obstacle.append(_state("initialState", sample_motion(agent, agent.waypoints.t_s[:1]), 0, 0))
         return obstacle
-    move = on_clock(agent, t_s, STEP_S, at_least=2)  # an initial state and a trajectory
+    move = sample_steps(agent, t_s, STEP_S, at_least=2)  # an initial state and a trajectory
     steps = np.flatnonzero(move.valid).tolist()
     if len(steps) < 2:
         return None
@@ -162,8 +163,8 @@ def _along(vector: Array, yaw_rad: float) -> float:
     return float(vector[0] * np.cos(yaw_rad) + vector[1] * np.sin(yaw_rad))
 
 
-def _state(tag: str, move: Motion, k: int, step: int) -> Element:
-    """The state at index k of a motion; speed and acceleration are along the heading."""
+def _state(tag: str, move: SampledMotion, k: int, step: int) -> Element:
+    """Return the state at index k of a motion; speed and acceleration are along the heading."""
     yaw = float(move.yaw_rad[k])
     state = element(tag)
     _point(element("position", state), move.position_m[k, :2])
@@ -179,8 +180,8 @@ def _state(tag: str, move: Motion, k: int, step: int) -> Element:
 
 
 def _planning_problem(ego: Agent, number: int, t_s: Array) -> Element:
-    """Drive from where the ego was first to where it was last, about when it was there."""
-    move, last, spare = motion(ego, t_s), len(t_s) - 1, round(GOAL_S / STEP_S)
+    """Return the task of the ego: from its first to its last pose, in about the recorded time."""
+    move, last, spare = sample_motion(ego, t_s), len(t_s) - 1, round(GOAL_S / STEP_S)
     problem = element("planningProblem", id=str(number))
     initial = _state("initialState", move, 0, 0)
     for key in ("yawRate", "slipAngle"):

@@ -1,4 +1,4 @@
-"""One table of all agents: a row for every agent and time, as spreadsheets and data frames read it."""
+"""Export to CSV: one table of all agents, a row for every agent and time."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from log2sim.export.exporters import Options
 COLUMNS = ("t_s", "x_m", "y_m", "z_m", "yaw_rad", "speed_mps", "observed", "sigma_xy_m")
 HEADER = ("id", "category", *COLUMNS, "length_m", "width_m", "height_m", "static", "rear_axle_offset_m", "confidence")
 
-# What spreadsheets take for a formula, and run: a text that begins so and is no number.
+# Texts that spreadsheets execute as a formula: they begin so and are no number.
 FORMULA = re.compile(r"\s*[=+\-@](?!\d+(\.\d+)?$)")
 
 
 def write_table(file: Path, rows: Iterable[Sequence[Any]]) -> None:
-    """Write rows as CSV; texts that a spreadsheet would run as a formula begin with an apostrophe, so that it shows them."""
+    """Write rows as CSV; an apostrophe is put before texts that a spreadsheet would execute as a formula."""
     with file.open("w", newline="", encoding="utf-8") as opened:
         table = csv.writer(opened, lineterminator="\n")
         for row in rows:
@@ -35,6 +35,7 @@ class Csv:
     )
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
+        """Write the table."""
         write_table(folder / "agents.csv", _rows(scenario))
 
 

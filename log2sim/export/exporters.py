@@ -1,4 +1,4 @@
-"""Scenarios in the formats of others. Each format is a plug-in that writes into an empty folder; see `Exporter`."""
+"""Exporters: each format is a plug-in that writes into an empty folder; see `Exporter`."""
 
 from __future__ import annotations
 
@@ -19,10 +19,18 @@ __all__ = ["Exporter", "Options", "export", "formats"]
 
 @dataclass(frozen=True)
 class Options:
-    """What a user may ask of an export; None leaves it to the format. A format names those that it understands.
+    """Options of an export; None leaves the choice to the format, which lists the options that it takes.
 
-    `revision` of the format's standard; `map` a road network that is used instead of an own one; `mode` "exact" or "pid",
-    for scripts that move agents; `log` the recorded log, opened, for formats that also hold its pictures and points.
+    Attributes
+    ----------
+    revision : str or None
+        Of the format's standard.
+    map : Path or None
+        A road network to use in place of an inferred one.
+    mode : str or None
+        "exact" or "pid", for scripts that move agents.
+    log : Log or None
+        The opened log, for formats that also hold its images and points.
     """
 
     revision: str | None = None
@@ -32,13 +40,17 @@ class Options:
 
 
 class Exporter(Protocol):
-    """A format. `options` names the fields of `Options` that it understands, `loses` says what of a scenario it cannot hold."""
+    """A format that scenarios can be written in."""
 
     @property
-    def options(self) -> tuple[str, ...]: ...
+    def options(self) -> tuple[str, ...]:
+        """Names of the fields of `Options` that the format takes."""
+        ...
 
     @property
-    def loses(self) -> str: ...
+    def loses(self) -> str:
+        """What of a scenario the format cannot hold."""
+        ...
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
         """Write files into an empty folder that exists.
@@ -56,14 +68,14 @@ class Exporter(Protocol):
 
 
 def formats() -> list[str]:
-    """Names of all formats, built-in ones first."""
+    """Return the names of all formats, built-in ones first."""
     return registry.names("export")
 
 
 def export(
     scenario: Scenario, to: str, out: Path | str, options: Options | None = None, *, overwrite: bool = False
 ) -> tuple[Path, ...]:
-    """Write a scenario in the format `to` into the folder `out`, all files or none; returns them in order of name.
+    """Write a scenario in the format `to` into the folder `out`, all files or none; return them in order of name.
 
     Raises
     ------
@@ -85,7 +97,7 @@ def export(
     refuse_below_file(folder)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        # Within a folder that exists, since it may be another file system than what is above it.
+        # In the folder itself if it exists, since it may be on another file system than its parent.
         beside = folder if folder.is_dir() else folder.parent
         temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=beside))
     except OSError as error:
@@ -98,7 +110,7 @@ def export(
 
 
 def _move_into(temporary: Path, folder: Path, *, overwrite: bool) -> tuple[Path, ...]:
-    """Move all files of a folder into another, after making sure that all may be."""
+    """Move all files of a folder into another, after checking that all may be written."""
     names = sorted(p.relative_to(temporary) for p in temporary.rglob("*") if p.is_file())
     for name in names:
         refuse_existing(folder / name, overwrite=overwrite)

@@ -1,4 +1,4 @@
-"""Ground-truth traces of ASAM OSI, the Open Simulation Interface, through betterosi."""
+"""Export to ground-truth traces of ASAM OSI, the Open Simulation Interface, through betterosi."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import numpy as np
 from log2sim.datatypes import Agent, MapFrame, Scenario
 from log2sim.errors import MissingExtra
 from log2sim.export.exporters import Options
-from log2sim.export.sampling import Motion, file_name
-from log2sim.export.viewers.playback import steps_of
+from log2sim.export.sampling import SampledMotion, file_name
+from log2sim.export.viewers.playback import agent_steps
 from log2sim.geometry import NS_PER_S
 
 SOURCE = "io.log2sim.scenario"
-AXLE_OF_HEIGHT = 0.2  # height of the wheel hubs over the ground as a share of a vehicle's, since nobody measured it
+AXLE_OF_HEIGHT = 0.2  # height of the wheel hubs above ground as a share of the vehicle's height; not measured
 
-# Names in OSI's `MovingObject.VehicleClassification.Type`; it counts whoever rides with the vehicle.
+# Names in OSI's `MovingObject.VehicleClassification.Type`, whose types include the rider.
 VEHICLE_TYPE = {
     "car": "CAR", "truck": "HEAVY_TRUCK", "bus": "BUS", "motorcycle": "MOTORCYCLE", "cyclist": "BICYCLE", "bicycle": "BICYCLE",
 }  # fmt: skip
@@ -27,19 +27,20 @@ VEHICLE_TYPE = {
 class Osi:
     """`<time>_gt_<OSI>_<protobuf>_<frames>_<name>.osi`: one `GroundTruth` every 0.1 s, stamped with the time of the log.
 
-    Vehicles that are parked are moving objects too, as the standard has it. What an agent is called in the scenario
-    stands in its `source_reference`.
+    Parked vehicles are moving objects too, as in the standard. `source_reference` holds the id and category of each
+    agent.
     """
 
     options: tuple[str, ...] = ()
     loses = "uncertainty and observed flags, whether vehicles are parked, times between steps of 0.1 s, cameras, plan"
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
+        """Write the trace."""
         try:
             import betterosi
         except ImportError:
             raise MissingExtra("export to OSI", "osi") from None
-        steps = steps_of(scenario)
+        steps = agent_steps(scenario)
         head = _head(betterosi, scenario)
         with betterosi.Writer(folder / _trace_name(betterosi, scenario, len(steps.t_ns))) as writer:
             for k, stamp_ns in enumerate(steps.t_ns.tolist()):
@@ -58,7 +59,7 @@ def _stationary(agent: Agent) -> bool:
 
 
 def _trace_name(osi: Any, scenario: Scenario, frames: int) -> str:
-    """The standard's name of a trace file, whose time is the scenario's start."""
+    """Return the file name that the standard prescribes, with the scenario's start time."""
     start = datetime.fromtimestamp(scenario.t0_ns // NS_PER_S, UTC).strftime("%Y%m%dT%H%M%SZ")
     versions = osi.prepare_channel_metadata()
     keys = (osi.OSI_CHANNEL_OSI_VERSION_KEY, osi.OSI_CHANNEL_PROTOBUF_VERSION_KEY)
@@ -67,7 +68,7 @@ def _trace_name(osi: Any, scenario: Scenario, frames: int) -> str:
 
 
 def _head(osi: Any, scenario: Scenario) -> dict[str, Any]:
-    """What all frames have in common."""
+    """Return the fields that all frames share."""
     major, minor, patch = map(int, osi.__version_osi__.split("."))
     head: dict[str, Any] = {
         "version": osi.InterfaceVersion(version_major=major, version_minor=minor, version_patch=patch),
@@ -81,13 +82,13 @@ def _head(osi: Any, scenario: Scenario) -> dict[str, Any]:
 
 
 def _offset(osi: Any, frame: MapFrame) -> Any:
-    """What leads from the coordinates of the trace to those of its projection."""
+    """Return the offset from the coordinates of the trace to those of its projection."""
     x, y, z = frame.offset_m
     return osi.GroundTruth.ProjFrameOffset(position=osi.Vector3d(x=x, y=y, z=z), yaw=0.0)
 
 
-def _place(osi: Any, agent: Agent, move: Motion, k: int) -> dict[str, Any]:
-    """Size and pose of the bounding box, which all objects have. OSI's angles lie in (-pi, pi], ours in [-pi, pi)."""
+def _place(osi: Any, agent: Agent, move: SampledMotion, k: int) -> dict[str, Any]:
+    """Return size and pose of the bounding box. OSI's angles lie in (-pi, pi], ours in [-pi, pi)."""
     length, width, height = map(float, agent.size_m)
     x, y, z = move.position_m[k].tolist()
     yaw = float(move.yaw_rad[k])
@@ -107,7 +108,7 @@ def _identity(osi: Any, number: int, agent: Agent) -> dict[str, Any]:
     return identity
 
 
-def _moving(osi: Any, number: int, agent: Agent, move: Motion, k: int) -> Any:
+def _moving(osi: Any, number: int, agent: Agent, move: SampledMotion, k: int) -> Any:
     (vx, vy), (ax, ay) = move.velocity_mps[k].tolist(), move.acceleration_mps2[k].tolist()
     base = osi.BaseMoving(
         **_place(osi, agent, move, k),
@@ -133,7 +134,7 @@ def _kind(osi: Any, agent: Agent) -> dict[str, Any]:
     }
 
 
-def _still(osi: Any, number: int, agent: Agent, move: Motion, k: int) -> Any:
+def _still(osi: Any, number: int, agent: Agent, move: SampledMotion, k: int) -> Any:
     kind = osi.StationaryObject.Classification
     return osi.StationaryObject(
         base=osi.BaseStationary(**_place(osi, agent, move, k)),

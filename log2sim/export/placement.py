@@ -1,4 +1,4 @@
-"""Where positions of a scenario lie in the coordinates of an export: near its origin, or in those of the user's map."""
+"""Coordinates of an export: near its origin, or those of the user's map."""
 
 from __future__ import annotations
 
@@ -13,11 +13,17 @@ from log2sim.geometry import Array, whole_kilometers, wrap_angle
 
 
 @dataclass(frozen=True)
-class Placement:
-    """Turns local x, y, z, heading of a scenario into those of an export, and back.
+class ExportPlacement:
+    """Converts x, y, z, heading between a scenario and an export.
 
-    Local positions plus `offset_m` are coordinates of `projection`. Without a `target` they stay on these axes, with one
-    they are projected anew; then `origin_m` is subtracted.
+    Positions of the scenario plus `offset_m` are coordinates of `projection`. With a `target` they are projected into
+    it, else they stay on their axes; then `origin_m` is subtracted.
+
+    Attributes
+    ----------
+    origin_m, offset_m : (3,) tuple of float, m
+    projection, target : str or None
+        PROJ strings.
     """
 
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -26,7 +32,7 @@ class Placement:
     target: str | None = None
 
     def forward(self, states: Array) -> Array:
-        """States (N, 4) x, y, z, heading of the scenario in the export."""
+        """Convert states (N, 4) x, y, z, heading from the scenario to the export."""
         origin: Array = np.array([*self.origin_m, 0.0])
         offset: Array = np.array([*self.offset_m, 0.0])
         if self.target is None:
@@ -34,7 +40,7 @@ class Placement:
         return self._projected(states + offset, self.projection, self.target) - origin
 
     def back(self, states: Array) -> Array:
-        """States (N, 4) of the export in the scenario."""
+        """Convert states (N, 4) from the export to the scenario."""
         origin: Array = np.array([*self.origin_m, 0.0])
         offset: Array = np.array([*self.offset_m, 0.0])
         if self.target is None:
@@ -43,7 +49,7 @@ class Placement:
 
     @staticmethod
     def _projected(states: Array, source: str | None, target: str | None) -> Array:
-        """States in another projection; a heading turns by what a step of 1 m along it turns."""
+        """Project states; a heading turns by as much as a step of 1 m along it."""
         transformer = _transformer(str(source), str(target))
         x, y, z, heading = states.T
         east, north = transformer.transform(x, y)
@@ -57,30 +63,30 @@ class Placement:
         return out
 
 
-def near_origin(scenario: Scenario) -> Placement:
+def near_origin(scenario: Scenario) -> ExportPlacement:
     """Subtract whole kilometers, none while all agents are near the map's origin, so that float32 keeps half a millimeter."""
     xyz = np.concatenate(
         [np.column_stack([a.waypoints.x_m, a.waypoints.y_m, a.waypoints.z_m]) for a in scenario.agents]
     )
     x, y, z = whole_kilometers(xyz)
-    return Placement((float(x), float(y), float(z)))
+    return ExportPlacement((float(x), float(y), float(z)))
 
 
-def on_map(frame: MapFrame, projection: str | None, offset_m: tuple[float, float, float]) -> Placement:
-    """Positions in the coordinates of a map: projected coordinates are its own plus its offset.
+def on_map(frame: MapFrame, projection: str | None, offset_m: tuple[float, float, float]) -> ExportPlacement:
+    """Place positions on a map, whose projected coordinates are its own plus its offset.
 
-    Where either side lacks a projection, the scenario's local axes are taken for the map's.
+    Where either side lacks a projection, the scenario's axes are taken to be those of the map.
     """
     if frame.projection is None or not projection:
-        return Placement()
-    if _words(frame.projection) == _words(projection):
+        return ExportPlacement()
+    if _proj_parameters(frame.projection) == _proj_parameters(projection):
         x, y, z = (float(m - s) for m, s in zip(offset_m, frame.offset_m))
-        return Placement((x, y, z))
-    return Placement(offset_m, frame.offset_m, frame.projection, projection)
+        return ExportPlacement((x, y, z))
+    return ExportPlacement(offset_m, frame.offset_m, frame.projection, projection)
 
 
-def _words(projection: str) -> list[str]:
-    """The parameters of a PROJ string in order, without those that only concern heights or name files."""
+def _proj_parameters(projection: str) -> list[str]:
+    """Return the parameters of a PROJ string in order, without those for heights and file names."""
     return sorted(
         w for w in projection.split() if not w.startswith(("+geoidgrids", "+nadgrids", "+vunits", "+no_defs", "+type"))
     )
@@ -92,7 +98,7 @@ def _transformer(source: str, target: str) -> Any:
 
     systems = []
     for text in (source, target):
-        words = _words(text)
+        words = _proj_parameters(text)
         if not any(w.startswith("+proj=") for w in words):
             raise ConfigError(f"'{text[:100]}' is no PROJ string, expected one such as +proj=utm +zone=32")
         try:

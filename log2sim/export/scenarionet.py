@@ -1,7 +1,7 @@
-"""Scenario descriptions of ScenarioNet, which MetaDrive's `ScenarioEnv` replays.
+"""Export to scenario descriptions of ScenarioNet, which MetaDrive's `ScenarioEnv` replays.
 
-The files hold plain Python values and arrays whose pickle names nothing but `numpy.ndarray`, so that they load under
-any version of NumPy and without this package.
+The files hold plain Python values and arrays whose pickle references only `numpy.ndarray`, so that they load under any
+version of NumPy and without this package.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from log2sim.errors import ScenarioError
 from log2sim.export.exporters import Options
 from log2sim.export.placement import near_origin
 from log2sim.export.roads.lanes import lanes
-from log2sim.export.sampling import Motion, clock, file_name, on_clock
+from log2sim.export.sampling import SampledMotion, file_name, sample_steps, step_times
 from log2sim.geometry import NS_PER_S, Array
 
-STEP_S = 0.1  # MetaDrive's step; it takes every file to have it
+STEP_S = 0.1  # MetaDrive assumes this step
 DATASET = "log2sim"
 PROTOCOL = 5
-MOVED_M = 1.0  # from where on MetaDrive's summaries count an object as moving
+MOVED_M = 1.0  # MetaDrive's summaries count an object as moving beyond this
 
-# What MetaDrive knows of participants. It keeps OTHER in the file and does not show it.
+# MetaDrive's types of participants. It keeps OTHER in the file and does not show it.
 TYPE_OF_GROUP = {"vehicle": "VEHICLE", "two_wheeler": "CYCLIST", "pedestrian": "PEDESTRIAN", "other": "OTHER"}
 
 Value = dict[str, Any]
@@ -43,6 +43,7 @@ class ScenarioNet:
     )
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
+        """Write the description and the two tables."""
         description = describe(scenario)
         name = f"sd_{DATASET}_{VERSION}_{file_name(scenario.name)}.pkl"
         _dump(description, folder / name)
@@ -51,7 +52,7 @@ class ScenarioNet:
 
 
 def describe(scenario: Scenario) -> Value:
-    """The scenario description as a dictionary of plain values and arrays with T steps of 0.1 s from the ego's first.
+    """Return the scenario description as a dictionary of plain values and arrays with T steps of 0.1 s from the ego's first.
 
     Raises
     ------
@@ -61,11 +62,11 @@ def describe(scenario: Scenario) -> Value:
     ego = scenario.ego
     if ego is None:
         raise ScenarioError(
-            f"scenario '{scenario.name}' has no agent 'ego', which MetaDrive follows; name one of its agents so"
+            f"scenario '{scenario.name}' has no agent 'ego', which MetaDrive follows; give one of its agents this id"
         )
-    t_s = clock(ego.waypoints.t_s[0], ego.waypoints.t_s[-1], STEP_S)
+    t_s = step_times(ego.waypoints.t_s[0], ego.waypoints.t_s[-1], STEP_S)
     origin = np.array(near_origin(scenario).origin_m)
-    moves = {agent.id: on_clock(agent, t_s, STEP_S) for agent in scenario.agents}
+    moves = {agent.id: sample_steps(agent, t_s, STEP_S) for agent in scenario.agents}
     tracks = {a.id: _track(a, moves[a.id], origin) for a in scenario.agents if moves[a.id].valid.any()}
     left_out = {a.id: "not alive at any step of the ego" for a in scenario.agents if a.id not in tracks}
     features = {
@@ -92,7 +93,7 @@ def describe(scenario: Scenario) -> Value:
 
 
 def _metadata(scenario: Scenario, t_s: Array) -> Value:
-    """Where and when a description of steps at times (T,) was recorded, and how it was made."""
+    """Describe place, time and origin of a description with steps at times (T,)."""
     return {
         "id": scenario.name,
         "scenario_id": scenario.name,
@@ -108,7 +109,7 @@ def _metadata(scenario: Scenario, t_s: Array) -> Value:
     }
 
 
-def _track(agent: Agent, move: Motion, origin: Array) -> Value:
+def _track(agent: Agent, move: SampledMotion, origin: Array) -> Value:
     kind = TYPE_OF_GROUP[GROUP_OF[agent.category]]
     sizes = {key: np.where(move.valid, size, 0.0) for key, size in zip(("length", "width", "height"), agent.size_m)}
     return {
@@ -167,14 +168,14 @@ def _number_summary(objects: Value, features: Value) -> Value:
 
 
 def _without_arrays(value: Any) -> Any:
-    """The same values with lists in the place of arrays, as summaries hold them."""
+    """Replace arrays by lists, as summaries hold them."""
     if isinstance(value, dict):
         return {k: _without_arrays(v) for k, v in value.items()}
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 class _Pickler(pickle.Pickler):
-    """Writes arrays as calls of `numpy.ndarray` over their bytes: NumPy's own way names modules that NumPy 2 moved."""
+    """Pickles arrays as calls of `numpy.ndarray` on their bytes: NumPy's own form references modules that NumPy 2 moved."""
 
     def reducer_override(self, value: Any) -> Any:
         if isinstance(value, np.ndarray):

@@ -1,4 +1,4 @@
-"""XML as formats of simulators need it: numbers in a fixed form, untrusted text made harmless, nothing external read."""
+"""XML as formats of simulators need it: numbers in a fixed form, escaped text, safe parsing."""
 
 from __future__ import annotations
 
@@ -17,35 +17,35 @@ from log2sim.errors import LogError, ScenarioError
 SIZE_LIMIT_BYTES = 256 * 1024 * 1024
 DEPTH_LIMIT = 100
 
-# "$" begins a parameter in OpenSCENARIO, "%" our own escape; everything else of ASCII that prints stays as it is.
+# "$" begins a parameter in OpenSCENARIO, "%" our own escape; all other printable ASCII is unchanged.
 _PLAIN = "".join(c for c in string.printable if c not in "%$" and (c == " " or not c.isspace()))
 
 
 def element(tag: str, parent: ElementTree.Element | None = None, **attributes: str) -> ElementTree.Element:
-    """A new element, within `parent` unless that is None."""
+    """Create an element, within `parent` unless that is None."""
     if parent is None:
         return ElementTree.Element(tag, attributes)
     return ElementTree.SubElement(parent, tag, attributes)
 
 
 def number(value: float, digits: int = 6) -> str:
-    """A finite number with at most so many decimals and no exponent, and never "-0"."""
+    """Format a finite number with a limited number of decimals, without exponent, and never as "-0"."""
     text = f"{value:.{digits}f}".rstrip("0").rstrip(".")
     return "0" if text in ("-0", "") else text
 
 
 def escaped(text: str) -> str:
-    """Any text as printable ASCII that no player takes for a parameter; `unescaped` gives it back."""
+    """Encode any text as printable ASCII that no player takes for a parameter; `unescaped` is the inverse."""
     return quote(text, safe=_PLAIN, errors="replace")
 
 
 def unescaped(text: str) -> str:
-    """What was given to `escaped`, but for halves of surrogate pairs, which no file can hold."""
+    """Decode the text given to `escaped`, except for halves of surrogate pairs, which no file can hold."""
     return unquote(text, errors="replace")
 
 
 def unique_names(texts: Iterable[str]) -> list[str]:
-    """A name of letters, digits, "_", "-" and "." for each text, no two alike even where case is ignored."""
+    """Make names of letters, digits, "_", "-" and ".", one for each text, unique also when case is ignored."""
     names: list[str] = []
     taken: set[str] = set()
     for text in texts:
@@ -99,7 +99,7 @@ def read(path: Path) -> ElementTree.Element:
 
 
 def require_number(value: str | None, where: str) -> float:
-    """A finite number out of an attribute.
+    """Parse a finite number from an attribute.
 
     Raises
     ------

@@ -1,1 +1,1 @@
-"""OpenSCENARIO XML: written in three revisions, and read back."""
+"""OpenSCENARIO XML: written in three revisions, and imported."""

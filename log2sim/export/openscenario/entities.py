@@ -1,4 +1,4 @@
-"""Agents as OpenSCENARIO entities: kind, size about the rear axle, color, axles, and what an import needs back."""
+"""Agents as OpenSCENARIO entities: type, size about the rear axle, color, axles, and properties for an import."""
 
 from __future__ import annotations
 
@@ -12,12 +12,21 @@ from log2sim.datatypes import Agent
 from log2sim.export.xml_text import element, escaped, number
 
 PREFIX = "log2sim."
-"""Begins the names of properties that only `log2sim import` reads."""
+"""Prefix of the properties that only `log2sim import` reads."""
 
 
 @dataclass(frozen=True)
-class Kind:
-    """What OpenSCENARIO asks about a vehicle and logs do not tell; the limits only have to be no obstacle to the log."""
+class VehicleDefaults:
+    """Values that OpenSCENARIO requires and logs do not contain; the limits are only wide enough for the log.
+
+    Attributes
+    ----------
+    category : str
+        OpenSCENARIO's vehicle category.
+    wheel_diameter_m, max_steering_rad, max_speed_mps, max_acceleration_mps2 : float
+    tracks : bool
+        Whether an axle has two wheels.
+    """
 
     category: str
     wheel_diameter_m: float
@@ -27,17 +36,17 @@ class Kind:
     tracks: bool = True
 
 
-KINDS: Mapping[str, Kind] = {
-    "car": Kind("car", 0.65, 0.6, 70.0, 10.0),
-    "truck": Kind("truck", 1.0, 0.7, 40.0, 8.0),
-    "bus": Kind("bus", 1.0, 0.7, 40.0, 8.0),
-    "motorcycle": Kind("motorbike", 0.6, 0.7, 80.0, 12.0, tracks=False),
-    "cyclist": Kind("bicycle", 0.68, 1.0, 20.0, 8.0, tracks=False),
-    "bicycle": Kind("bicycle", 0.68, 1.0, 20.0, 8.0, tracks=False),
-    "other": Kind("van", 0.65, 0.6, 70.0, 10.0),
+VEHICLE_DEFAULTS: Mapping[str, VehicleDefaults] = {
+    "car": VehicleDefaults("car", 0.65, 0.6, 70.0, 10.0),
+    "truck": VehicleDefaults("truck", 1.0, 0.7, 40.0, 8.0),
+    "bus": VehicleDefaults("bus", 1.0, 0.7, 40.0, 8.0),
+    "motorcycle": VehicleDefaults("motorbike", 0.6, 0.7, 80.0, 12.0, tracks=False),
+    "cyclist": VehicleDefaults("bicycle", 0.68, 1.0, 20.0, 8.0, tracks=False),
+    "bicycle": VehicleDefaults("bicycle", 0.68, 1.0, 20.0, 8.0, tracks=False),
+    "other": VehicleDefaults("van", 0.65, 0.6, 70.0, 10.0),
 }
 PEDESTRIAN_MASS_KG = 75.0
-# Axles stand this share of the length apart where the log does not say where the rear one is.
+# Wheelbase as a share of the length where the log has no rear axle, and track as a share of the width.
 WHEELBASE_SHARE, TRACK_SHARE = 0.6, 0.85
 
 
@@ -51,7 +60,7 @@ def add_entity(parent: Element, agent: Agent, name: str, minor: int) -> None:
         )  # fmt: skip
         _add_box(body, agent)
     else:
-        kind = KINDS[agent.category]
+        kind = VEHICLE_DEFAULTS[agent.category]
         body = element("Vehicle", scenario_object, name=agent.category, vehicleCategory=kind.category)
         _add_box(body, agent)
         _add_limits(body, agent, kind)
@@ -65,7 +74,7 @@ def _add_box(parent: Element, agent: Agent) -> None:
     element("Dimensions", box, width=number(width), length=number(length), height=number(height))
 
 
-def _add_limits(parent: Element, agent: Agent, kind: Kind) -> None:
+def _add_limits(parent: Element, agent: Agent, kind: VehicleDefaults) -> None:
     length, width, _ = agent.size_m
     fastest = float(np.abs(agent.waypoints.speed_mps).max())
     acceleration = number(kind.max_acceleration_mps2)
@@ -84,7 +93,7 @@ def _add_limits(parent: Element, agent: Agent, kind: Kind) -> None:
 
 
 def _add_properties(parent: Element, agent: Agent) -> None:
-    """What players use first (`type` and `color` are those of ScenarioRunner), then what brings the agent back."""
+    """Add the properties that players use (`type` and `color` as in ScenarioRunner), then those for an import."""
     w = agent.waypoints
     values = {"type": "ego_vehicle" if agent.id == "ego" else "simulation"}
     if agent.color is not None:

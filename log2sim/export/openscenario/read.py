@@ -1,4 +1,4 @@
-"""A scenario out of an OpenSCENARIO file: all that an export wrote, or the trajectories of anyone else's file."""
+"""Imports a scenario from an OpenSCENARIO file: everything that an export wrote, or the trajectories of other files."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ import numpy as np
 
 from log2sim.datatypes import VERSION, MapFrame, Scenario
 from log2sim.errors import ConfigError, LogError, ScenarioError
-from log2sim.export.openscenario.entities import KINDS, PREFIX
-from log2sim.export.placement import Placement
+from log2sim.export.openscenario.entities import PREFIX, VEHICLE_DEFAULTS
+from log2sim.export.placement import ExportPlacement
 from log2sim.export.xml_text import read, require_number, unescaped
 from log2sim.geometry import Array, wrap_angle
 
-CATEGORY_OF = {kind.category: category for category, kind in reversed(list(KINDS.items()))} | {
+CATEGORY_OF = {kind.category: category for category, kind in reversed(list(VEHICLE_DEFAULTS.items()))} | {
     "van": "car", "semitrailer": "truck", "trailer": "other", "tram": "other", "train": "other",
 }  # fmt: skip
 EGO_NAMES = ("ego", "hero")
@@ -68,7 +68,7 @@ def _scenario(root: Element, path: Path) -> Scenario:
         {
             "scenario_version": VERSION,
             "name": unescaped(parameters["log2sim_name"]) if "log2sim_name" in parameters else title or path.stem,
-            "t0_ns": _whole(parameters.get("log2sim_t0_ns", "0")),
+            "t0_ns": _nanoseconds(parameters.get("log2sim_t0_ns", "0")),
             "duration_s": require_number(
                 parameters.get("log2sim_duration_s", str(last_s)), "parameter log2sim_duration_s"
             ),
@@ -82,7 +82,7 @@ def _scenario(root: Element, path: Path) -> Scenario:
 
 
 def _resolve(root: Element, parameters: Mapping[str, str]) -> None:
-    """Put the values of parameters where attributes name them."""
+    """Replace references to parameters in attributes by their values."""
     for node in root.iter():
         for key, value in node.attrib.items():
             if value.startswith("$"):
@@ -93,7 +93,7 @@ def _resolve(root: Element, parameters: Mapping[str, str]) -> None:
                 node.set(key, parameters[value[1:]])
 
 
-def _whole(text: str) -> int:
+def _nanoseconds(text: str) -> int:
     if not re.fullmatch(r"-?[0-9]{1,19}", text):
         raise ScenarioError(f"parameter log2sim_t0_ns is {text[:40]!r}, expected nanoseconds")
     return int(text)
@@ -112,14 +112,14 @@ def _map(text: str | None) -> MapFrame:
     return frame
 
 
-def _placement(parameters: Mapping[str, str], frame: MapFrame) -> Placement:
+def _placement(parameters: Mapping[str, str], frame: MapFrame) -> ExportPlacement:
     origin = [
         require_number(v, "parameter log2sim_origin_m") for v in parameters.get("log2sim_origin_m", "0 0 0").split()
     ]
     if len(origin) != 3:
         raise ScenarioError("parameter log2sim_origin_m: expected three numbers")
     target = parameters.get("log2sim_projection")
-    return Placement(
+    return ExportPlacement(
         (origin[0], origin[1], origin[2]),
         frame.offset_m,
         frame.projection,
@@ -128,9 +128,10 @@ def _placement(parameters: Mapping[str, str], frame: MapFrame) -> Placement:
 
 
 def _vertices(root: Element) -> dict[str, Array]:
-    """By entity the vertices (V, 5) t, x, y, z, heading of all its trajectories.
+    """Return by entity the vertices (V, 5) t, x, y, z, heading of all its trajectories.
 
-    Many entities may share one trajectory, so a small file may ask for very many vertices: they are counted for each.
+    Many entities may share one trajectory, so a small file may expand to very many vertices: they are counted per
+    entity.
     """
     found: dict[str, list[Array]] = {}
     count = 0
@@ -160,11 +161,11 @@ def _polyline(follow: Element, where: str) -> Array:
     scale, offset = (require_number(timing.get(key), f"{where}: Timing {key}") for key in ("scale", "offset"))
     rows = np.array([[require_number(n.get("time"), f"{where}: Vertex time"), *_pose(n, where)] for n in nodes])
     rows[:, 0] = offset + scale * rows[:, 0]
-    return _headed(rows)
+    return _with_headings(rows)
 
 
-def _headed(rows: Array) -> Array:
-    """Vertices (V, 5) with the direction of travel where no heading is written: nobody means 0 by leaving it out."""
+def _with_headings(rows: Array) -> Array:
+    """Fill in the direction of travel for vertices (V, 5) without a heading: leaving it out does not mean 0."""
     absent = np.isnan(rows[:, 4])
     steps = np.diff(rows[:, 1:3], axis=0)
     moving = np.flatnonzero(np.hypot(*steps.T) > 0)
@@ -178,7 +179,7 @@ def _headed(rows: Array) -> Array:
 
 
 def _pose(node: Element, where: str) -> list[float]:
-    """x, y, z, heading of the `WorldPosition` within an element; NaN for a heading that is not written."""
+    """Return x, y, z, heading of the `WorldPosition` within an element; NaN for a missing heading."""
     world = node.find("Position/WorldPosition")
     if world is None:
         raise ScenarioError(f"{where}: a position that is no <WorldPosition>; only those can be read without the road")
@@ -190,9 +191,9 @@ def _pose(node: Element, where: str) -> list[float]:
 
 
 def _agent(
-    node: Element, vertices: Array | None, starts: Mapping[str, Element], last_s: float, placement: Placement
+    node: Element, vertices: Array | None, starts: Mapping[str, Element], last_s: float, placement: ExportPlacement
 ) -> dict[str, Any]:
-    """The document of one agent."""
+    """Return the document of one agent."""
     name = node.get("name", "")
     where = f"entity '{name[:100]}'"
     body = next((b for b in (node.find(tag) for tag in ("Vehicle", "Pedestrian", "MiscObject")) if b is not None), None)
@@ -205,9 +206,9 @@ def _agent(
     offset_m = require_number(center.get("x"), f"{where}: Center x")
     height_m = require_number(center.get("z"), f"{where}: Center z")
     if vertices is None:
-        vertices = _standing(starts.get(name), where, last_s)
+        vertices = _standing_vertices(starts.get(name), where, last_s)
     return {
-        "id": unescaped(properties[PREFIX + "id"]) if PREFIX + "id" in properties else _identity(name, properties),
+        "id": unescaped(properties[PREFIX + "id"]) if PREFIX + "id" in properties else _agent_id(name, properties),
         "category": properties.get(PREFIX + "category") or _category(body),
         "size_m": size_m,
         "color": _color(properties, where),
@@ -220,7 +221,7 @@ def _agent(
 
 
 def _starts(root: Element) -> dict[str, Element]:
-    """By entity where the file puts it at first."""
+    """Return by entity its initial position in the file."""
     found: dict[str, Element] = {}
     for private in root.iterfind("Storyboard/Init/Actions/Private"):
         teleport = private.find("PrivateAction/TeleportAction")
@@ -229,8 +230,8 @@ def _starts(root: Element) -> dict[str, Element]:
     return found
 
 
-def _standing(start: Element | None, where: str, last_s: float) -> Array:
-    """Vertices (2, 5) of an entity that stands where the file puts it at first."""
+def _standing_vertices(start: Element | None, where: str, last_s: float) -> Array:
+    """Return vertices (2, 5) of an entity that stands at its initial position."""
     if start is None:
         raise ScenarioError(f"{where}: has neither a trajectory nor a position at the start; nothing says where it is")
     pose = _pose(start, where)
@@ -238,7 +239,7 @@ def _standing(start: Element | None, where: str, last_s: float) -> Array:
     return result
 
 
-def _identity(name: str, properties: Mapping[str, str]) -> str:
+def _agent_id(name: str, properties: Mapping[str, str]) -> str:
     return "ego" if properties.get("type") == "ego_vehicle" or name.lower() in EGO_NAMES else name
 
 
@@ -258,11 +259,15 @@ def _color(properties: Mapping[str, str], where: str) -> Mapping[str, Any] | Non
 
 
 def _waypoints(
-    vertices: Array, properties: Mapping[str, str], placement: Placement, center_m: tuple[float, float], where: str
+    vertices: Array,
+    properties: Mapping[str, str],
+    placement: ExportPlacement,
+    center_m: tuple[float, float],
+    where: str,
 ) -> Mapping[str, Any]:
-    """Columns of waypoints of the box center, which is so far ahead of and above the vertices.
+    """Return columns of waypoints of the box center, which is `center_m` ahead of and above the vertices.
 
-    Speeds are those exported, or those along the vertices if somebody added or took some.
+    Speeds are the exported ones, or from the vertices if their number was changed.
     """
     speeds = _column(properties, "speed_mps", where)
     if speeds is not None and len(speeds) == 1:
@@ -293,7 +298,7 @@ def _column(properties: Mapping[str, str], name: str, where: str) -> Array | Non
 
 
 def _speed(vertices: Array) -> Array:
-    """Speed (V,) along the heading from the way between vertices (V, 5)."""
+    """Return the speed (V,) along the heading from vertices (V, 5)."""
     t, x, y, _, heading = vertices.T
     if len(t) < 2 or np.any(np.diff(t) <= 0):
         return np.zeros(len(t))

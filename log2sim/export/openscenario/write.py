@@ -1,4 +1,4 @@
-"""OpenSCENARIO XML 1.0, 1.1 and 1.2 with the OpenDRIVE road under it."""
+"""Export to OpenSCENARIO XML 1.0, 1.1 and 1.2 with an OpenDRIVE road."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from log2sim.errors import ConfigError
 from log2sim.export.checks import require_start_as_in_log
 from log2sim.export.exporters import Options
 from log2sim.export.openscenario.entities import add_entity
-from log2sim.export.openscenario.story import Revision, add_storyboard, parts_of, starts
-from log2sim.export.placement import Placement
+from log2sim.export.openscenario.story import Revision, add_storyboard, agent_stories, start_poses
+from log2sim.export.placement import ExportPlacement
 from log2sim.export.roads.opendrive import add_road_file
 from log2sim.export.xml_text import element, escaped, number, unique_names, write
 from log2sim.geometry import Array
@@ -25,7 +25,7 @@ NEWEST = "1.2"
 
 
 class OpenScenario:
-    """`scenario.xosc` and the road that it names."""
+    """`scenario.xosc` and its road."""
 
     options: tuple[str, ...] = ("revision", "map")
     loses = (
@@ -34,6 +34,7 @@ class OpenScenario:
     )
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
+        """Write the scenario and its road."""
         revision = REVISIONS.get(options.revision or NEWEST)
         if revision is None:
             known = ", ".join(REVISIONS)
@@ -45,12 +46,12 @@ class OpenScenario:
 EXPORTER = OpenScenario()
 
 
-def document(scenario: Scenario, road: str, placement: Placement, revision: Revision) -> Element:
-    """The document of a scenario whose road lies in the file `road` beside it."""
+def document(scenario: Scenario, road: str, placement: ExportPlacement, revision: Revision) -> Element:
+    """Return the document of a scenario whose road is in the file `road` beside it."""
     names = unique_names(a.id for a in scenario.agents)
     duration_s = max(scenario.duration_s, *(float(a.waypoints.t_s[-1]) for a in scenario.agents))
-    parts = parts_of(scenario.agents, names, duration_s, placement)
-    require_start_as_in_log(scenario.agents, _boxes(scenario, starts(parts, revision)))
+    stories = agent_stories(scenario.agents, names, duration_s, placement)
+    require_start_as_in_log(scenario.agents, _boxes(scenario, start_poses(stories, revision)))
     root = element("OpenSCENARIO")
     element(
         "FileHeader", root,
@@ -62,7 +63,7 @@ def document(scenario: Scenario, road: str, placement: Placement, revision: Revi
     entities = element("Entities", root)
     for agent, name in zip(scenario.agents, names):
         add_entity(entities, agent, name, revision.minor)
-    add_storyboard(root, parts, duration_s, revision)
+    add_storyboard(root, stories, duration_s, revision)
     return root
 
 
@@ -74,8 +75,8 @@ def _boxes(scenario: Scenario, references: Array) -> Array:
     return np.column_stack([x + ahead_m * np.cos(heading), y + ahead_m * np.sin(heading), z + height_m / 2, heading])
 
 
-def _add_parameters(root: Element, scenario: Scenario, placement: Placement) -> None:
-    """What an import needs of the scenario as a whole; 1.0 and 1.1 have no properties that belong to no agent."""
+def _add_parameters(root: Element, scenario: Scenario, placement: ExportPlacement) -> None:
+    """Add what an import needs of the scenario as a whole; 1.0 and 1.1 have no properties without an agent."""
     values = {
         "log2sim_name": escaped(scenario.name),
         "log2sim_t0_ns": str(scenario.t0_ns),
@@ -100,5 +101,5 @@ def _date(t0_ns: int) -> str:
 
 
 def _title(name: str) -> str:
-    """The scenario's name, made harmless: at its start "CARLA:" would switch ScenarioRunner to left-handed axes."""
+    """Return the scenario's name, escaped: a leading "CARLA:" would switch ScenarioRunner to left-handed axes."""
     return f"log2sim: {escaped(name)}"

@@ -1,4 +1,4 @@
-"""What players rely on in a road network and checkers of OpenDRIVE miss."""
+"""Checks of road networks: what players rely on and checkers of OpenDRIVE miss."""
 
 from __future__ import annotations
 

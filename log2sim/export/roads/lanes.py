@@ -1,4 +1,4 @@
-"""Lanes as polylines, for formats that want a road under the vehicles: the driven lane of each inferred road."""
+"""Lanes as polylines, for formats that need a road under the vehicles: the driven lane of each inferred road."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from log2sim.datatypes import Scenario
-from log2sim.export.roads.infer import Road, roads_of
+from log2sim.export.roads.infer import InferredRoad, infer_roads
 from log2sim.geometry import Array
 
 SPACING_M = 1.0
@@ -15,9 +15,16 @@ SPACING_M = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Lane:
-    """A lane in its driving direction: `points_m` (N, 3) of its middle on the ground, N >= 2, and `heading_rad` (N,) there.
+    """A lane in its driving direction.
 
-    It was inferred from the path of the agent `agent`.
+    Attributes
+    ----------
+    agent : str
+        Id of the agent whose path it follows.
+    points_m : (N, 3) float64
+        Center line on the ground, N >= 2.
+    heading_rad : (N,) float64
+    width_m : float
     """
 
     agent: str
@@ -33,11 +40,11 @@ class Lane:
 
 
 def lanes(scenario: Scenario) -> list[Lane]:
-    """A lane along the ego's path, and one wherever another vehicle leaves those that there are; the ego's first."""
-    return [_lane(road) for road in roads_of(scenario)]
+    """Return a lane along the ego's path, and one for each other inferred road; the ego's first."""
+    return [_lane(road) for road in infer_roads(scenario)]
 
 
-def _lane(road: Road) -> Lane:
+def _lane(road: InferredRoad) -> Lane:
     stations = np.linspace(0.0, road.line.length_m, max(int(np.ceil(road.line.length_m / SPACING_M)), 1) + 1)
     points = road.line.at(stations)
     row = np.maximum(np.searchsorted(road.elevation[:, 0], stations, side="right") - 1, 0)

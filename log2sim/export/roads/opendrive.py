@@ -10,20 +10,20 @@ import numpy as np
 
 from log2sim.datatypes import MapFrame, Scenario
 from log2sim.errors import ConfigError
-from log2sim.export.placement import Placement, near_origin, on_map
+from log2sim.export.placement import ExportPlacement, near_origin, on_map
 from log2sim.export.roads.checks import require_roads
-from log2sim.export.roads.infer import Road, roads_of
+from log2sim.export.roads.infer import InferredRoad, infer_roads
 from log2sim.export.xml_text import element, escaped, number, read, require_number, write
 
 FILE_NAME = "road.xodr"
-# Positions to 10 nm and angles to 1e-12 rad: pieces that follow each other leave no gap that a checker sees.
+# Positions to 10 nm and angles to 1e-12 rad: no checker finds a gap between consecutive pieces.
 LENGTH_DIGITS, ANGLE_DIGITS, CUBIC_DIGITS = 8, 12, 12
-# A map whose nearest road is farther away is not one of the scenario's place.
+# A map whose nearest road is farther away belongs to another place.
 FAR_M = 1000.0
 
 
-def add_road_file(scenario: Scenario, folder: Path, map_path: Path | None) -> tuple[str, Placement]:
-    """Write the road of a scenario into a folder, or a copy of the user's; returns its name and where agents are on it.
+def add_road_file(scenario: Scenario, folder: Path, map_path: Path | None) -> tuple[str, ExportPlacement]:
+    """Write the road of a scenario into a folder, or a copy of the user's; return its name and the placement of agents on it.
 
     Raises
     ------
@@ -44,7 +44,7 @@ def add_road_file(scenario: Scenario, folder: Path, map_path: Path | None) -> tu
     return FILE_NAME, _placement_on(root, scenario, map_path)
 
 
-def _placement_on(root: Element, scenario: Scenario, map_path: Path) -> Placement:
+def _placement_on(root: Element, scenario: Scenario, map_path: Path) -> ExportPlacement:
     offset, turned = root.find("header/offset"), "0"
     values = [0.0, 0.0, 0.0]
     if offset is not None:
@@ -60,8 +60,8 @@ def _placement_on(root: Element, scenario: Scenario, map_path: Path) -> Placemen
     return placement
 
 
-def _require_near(root: Element, scenario: Scenario, placement: Placement, map_path: Path) -> None:
-    """Raise when no agent comes near any road: then the map is of another place, or in other coordinates."""
+def _require_near(root: Element, scenario: Scenario, placement: ExportPlacement, map_path: Path) -> None:
+    """Raise when no agent is near any road: the map is of another place, or in other coordinates."""
     pieces = list(root.iter("geometry"))
     roads = np.array(
         [[require_number(p.get(key), f"{map_path}: geometry {key}") for key in ("x", "y", "length")] for p in pieces]
@@ -77,10 +77,10 @@ def _require_near(root: Element, scenario: Scenario, placement: Placement, map_p
         )
 
 
-def document(scenario: Scenario, placement: Placement) -> Element:
-    """The OpenDRIVE document of a scenario's roads, about the same origin as the agents."""
+def document(scenario: Scenario, placement: ExportPlacement) -> Element:
+    """Return the OpenDRIVE document of a scenario's roads, with the same origin as the agents."""
     x0, y0, _ = placement.origin_m
-    roads = roads_of(scenario)
+    roads = infer_roads(scenario)
     ends = np.concatenate([r.line.at(np.linspace(0.0, r.line.length_m, 50))[:, :2] for r in roads]) - [x0, y0]
     (west, south), (east, north) = ends.min(axis=0), ends.max(axis=0)
     root = element("OpenDRIVE")
@@ -94,8 +94,8 @@ def document(scenario: Scenario, placement: Placement) -> Element:
     return root
 
 
-def _add_place(header: Element, frame: MapFrame, placement: Placement) -> None:
-    """Where on Earth: projected coordinates are those of the file plus its offset."""
+def _add_place(header: Element, frame: MapFrame, placement: ExportPlacement) -> None:
+    """Add the geographic reference: projected coordinates are those of the file plus its offset."""
     if frame.projection is not None:
         element("geoReference", header).text = frame.projection
     x, y, z = (float(a + b) for a, b in zip(frame.offset_m, placement.origin_m))
@@ -103,7 +103,7 @@ def _add_place(header: Element, frame: MapFrame, placement: Placement) -> None:
         element("offset", header, x=number(x), y=number(y), z=number(z), hdg="0")
 
 
-def _add_road(root: Element, road: Road, road_id: int, placement: Placement) -> None:
+def _add_road(root: Element, road: InferredRoad, road_id: int, placement: ExportPlacement) -> None:
     x0, y0, z0 = placement.origin_m
     parent = element(
         "road", root, name=escaped(road.name), length=number(road.line.length_m, LENGTH_DIGITS), id=str(road_id), junction="-1", rule="RHT"
@@ -125,8 +125,8 @@ def _add_road(root: Element, road: Road, road_id: int, placement: Placement) -> 
     _add_lanes(parent, road)
 
 
-def _add_lanes(parent: Element, road: Road) -> None:
-    """Lane -1 in the middle of the reference line, one lane on either side of it where the road has them."""
+def _add_lanes(parent: Element, road: InferredRoad) -> None:
+    """Add lane -1 centered on the reference line, and one lane on either side of it where the road has them."""
     lanes = element("lanes", parent)
     _add_cubic(lanes, "laneOffset", "s", 0.0, [road.lane_m / 2, 0.0, 0.0, 0.0])
     section = element("laneSection", lanes, s="0")

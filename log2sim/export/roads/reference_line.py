@@ -1,4 +1,4 @@
-"""A path as the reference line of a road: lines and arcs that join without a kink and stay within 1 cm of it."""
+"""Fits the reference line of a road to a path: lines and arcs with continuous tangents, within 1 cm of it."""
 
 from __future__ import annotations
 
@@ -11,23 +11,34 @@ import numpy as np
 
 from log2sim.geometry import Array
 
-# The smoothing spline stays this near the path, and the arcs as near the spline: together below TOLERANCE_M.
+# Largest distance of the smoothing spline from the path, and of the arcs from the spline: together below TOLERANCE_M.
 TOLERANCE_M, SPLINE_M, ARCS_M = 0.01, 0.007, 0.002
-# Points of a path nearer than this are one; between those further apart than this the line from one to the next counts.
-LEAST_STEP_M, LARGEST_STEP_M = 0.01, 0.25
+# Closer points of a path are merged; between points farther apart the path is sampled on their connecting line.
+MIN_STEP_M, MAX_STEP_M = 0.01, 0.25
 SAMPLE_M = 0.2
-# Paths of more than some kilometers are looked at in longer steps, so that no path takes minutes.
-MOST_POINTS = 20_000
-# How far the points may lie from the spline on average, from the calmest curve to the one through all of them.
+# Longer paths are sampled more coarsely, which bounds the run time.
+MAX_POINTS = 20_000
+# RMS distances of the points from the spline that are tried, from the smoothest curve to interpolation.
 SIGMAS_M = (*(SPLINE_M / 2 * 0.7**k for k in range(8)), 0.0)
-SWING = 1.2
-# An arc whose middle is nearer its chord than this is written as a line.
-FLAT_M = 1e-6
+MAX_PARAMETER_SPEED = 1.2
+# An arc with a smaller sagitta is written as a line.
+MAX_LINE_SAGITTA_M = 1e-6
 
 
 @dataclass(frozen=True)
-class Piece:
-    """A line (curvature 0) or an arc from `s_m` on: start, heading, length, curvature (positive to the left)."""
+class LinePiece:
+    """A line (curvature 0) or an arc.
+
+    Attributes
+    ----------
+    s_m : float
+        Station of its start.
+    x_m, y_m, heading_rad : float
+        At its start.
+    length_m : float
+    curvature_1pm : float
+        Positive to the left.
+    """
 
     s_m: float
     x_m: float
@@ -38,7 +49,7 @@ class Piece:
 
     @property
     def end(self) -> Array:
-        """x, y, heading (3,) where the piece ends."""
+        """x, y, heading (3,) at its end."""
         start = np.array([self.x_m, self.y_m, self.heading_rad])
         result: Array = _along(start, np.array([self.curvature_1pm]), np.array([self.length_m]))[0]
         return result
@@ -48,10 +59,11 @@ class Piece:
 class ReferenceLine:
     """Pieces in order of `s_m`, the first at 0, each beginning where the one before ends."""
 
-    pieces: tuple[Piece, ...]
+    pieces: tuple[LinePiece, ...]
 
     @property
     def length_m(self) -> float:
+        """Total length."""
         return self.pieces[-1].s_m + self.pieces[-1].length_m
 
     @cached_property
@@ -59,24 +71,24 @@ class ReferenceLine:
         return np.array([[p.s_m, p.x_m, p.y_m, p.heading_rad, p.curvature_1pm] for p in self.pieces]).T
 
     def at(self, s_m: Array) -> Array:
-        """Points (N, 3) x, y, heading at stations (N,)."""
+        """Return points (N, 3) x, y, heading at stations (N,)."""
         starts = self._columns[0]
         k = np.clip(np.searchsorted(starts, s_m, side="right") - 1, 0, None)
         return _along(self._columns[1:4, k].T, self._columns[4, k], s_m - starts[k])
 
     def extended(self, before_m: float, after_m: float) -> ReferenceLine:
-        """The same with straight lines before and after it, stations counted from the new start."""
+        """Extend by straight lines before and after; stations are counted from the new start."""
         first, (x, y, heading) = self.pieces[0], self.pieces[-1].end
         back = first.heading_rad
         start = (first.x_m - before_m * np.cos(back), first.y_m - before_m * np.sin(back))
         steps = [(*start, back, before_m, 0.0)]
         steps += [(p.x_m, p.y_m, p.heading_rad, p.length_m, p.curvature_1pm) for p in self.pieces]
         steps += [(x, y, heading, after_m, 0.0)]
-        return chained(steps)
+        return joined_pieces(steps)
 
 
 def _along(start: Array, curvature_1pm: Array, along_m: Array) -> Array:
-    """Points (N, 3) x, y, heading at distances (N,) along arcs that begin at (N, 3) or all at (3,)."""
+    """Return points (N, 3) x, y, heading at distances (N,) along arcs that begin at (N, 3) or all at (3,)."""
     x, y, heading = start.T
     turned = curvature_1pm * along_m
     chord = along_m * np.sinc(turned / (2 * np.pi))
@@ -85,9 +97,9 @@ def _along(start: Array, curvature_1pm: Array, along_m: Array) -> Array:
     )
 
 
-def chained(steps: Sequence[tuple[float, float, float, float, float]]) -> ReferenceLine:
-    """Pieces (x, y, heading, length, curvature) one after the other; lines that go straight on become one."""
-    pieces: list[Piece] = []
+def joined_pieces(steps: Sequence[tuple[float, float, float, float, float]]) -> ReferenceLine:
+    """Join pieces (x, y, heading, length, curvature); consecutive collinear lines become one."""
+    pieces: list[LinePiece] = []
     for x, y, heading, length, curvature in steps:
         if length <= 0:
             continue
@@ -95,19 +107,19 @@ def chained(steps: Sequence[tuple[float, float, float, float, float]]) -> Refere
             last = pieces.pop()
             x, y, heading, length = last.x_m, last.y_m, last.heading_rad, last.length_m + length
         s = pieces[-1].s_m + pieces[-1].length_m if pieces else 0.0
-        pieces.append(Piece(s, float(x), float(y), float(heading), float(length), float(curvature)))
+        pieces.append(LinePiece(s, float(x), float(y), float(heading), float(length), float(curvature)))
     return ReferenceLine(tuple(pieces))
 
 
 def straight(x_m: float, y_m: float, heading_rad: float, length_m: float) -> ReferenceLine:
-    """A straight line of a length whose middle is at x, y."""
+    """Return a straight line of a length with its center at x, y."""
     half = length_m / 2
     start = (x_m - half * np.cos(heading_rad), y_m - half * np.sin(heading_rad))
-    return chained([(*start, heading_rad, length_m, 0.0)])
+    return joined_pieces([(*start, heading_rad, length_m, 0.0)])
 
 
 def fit(xy_m: Array) -> tuple[ReferenceLine, Array]:
-    """Lines and arcs along points (N, 2), at least two and each further on than the one before.
+    """Fit lines and arcs to points (N, 2), at least two, in order along the path.
 
     Returns
     -------
@@ -117,8 +129,8 @@ def fit(xy_m: Array) -> tuple[ReferenceLine, Array]:
 
     Notes
     -----
-    A smoothing spline takes the millimeters out of which curvature would be made; then the longest pair of arcs that
-    departs less than `ARCS_M` from it replaces each stretch of it, tangents equal where they join (biarcs: Bolton 1975).
+    A smoothing spline removes millimeter noise, which would become curvature; then each stretch of it is replaced by the
+    longest pair of arcs within `ARCS_M` of it, with continuous tangents (biarcs: Bolton 1975).
     Cost: a banded least-squares problem per spline, and O(N log N) for the arcs.
     """
     samples, sample_of_point = _spline(xy_m)
@@ -132,11 +144,11 @@ def fit(xy_m: Array) -> tuple[ReferenceLine, Array]:
         travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(samples[i : j + 1, :2], axis=0).T))])
         stations[i : j + 1] = s + travelled / travelled[-1] * length
         s += length
-    return chained(steps), np.interp(sample_of_point, np.arange(len(samples)), stations)
+    return joined_pieces(steps), np.interp(sample_of_point, np.arange(len(samples)), stations)
 
 
 def _spline(xy_m: Array) -> tuple[Array, Array]:
-    """Samples (M, 3) x, y, heading of a smooth curve within `SPLINE_M` of points (N, 2), and where those lie among them."""
+    """Return samples (M, 3) x, y, heading of a smooth curve within `SPLINE_M` of points (N, 2), and the points' rows in them."""
     from scipy.interpolate import splev, splprep
 
     straight_on = _straight_samples(xy_m)
@@ -144,16 +156,16 @@ def _spline(xy_m: Array) -> tuple[Array, Array]:
         return straight_on
     steps = np.hypot(*np.diff(xy_m, axis=0).T)
     travelled = np.concatenate([[0.0], np.cumsum(steps)])
-    parts = np.maximum(np.ceil(steps / max(LARGEST_STEP_M, travelled[-1] / MOST_POINTS)).astype(int), 1)
+    parts = np.maximum(np.ceil(steps / max(MAX_STEP_M, travelled[-1] / MAX_POINTS)).astype(int), 1)
     u = np.concatenate([a + np.arange(n) / n * d for a, n, d in zip(travelled, parts, steps)] + [travelled[-1:]])
     dense = np.column_stack([np.interp(u, travelled, xy_m[:, k]) for k in (0, 1)])
-    at = np.linspace(0.0, travelled[-1], int(np.clip(np.ceil(travelled[-1] / SAMPLE_M), 2, MOST_POINTS)) + 1)
+    at = np.linspace(0.0, travelled[-1], int(np.clip(np.ceil(travelled[-1] / SAMPLE_M), 2, MAX_POINTS)) + 1)
     for sigma_m in SIGMAS_M:
-        # Asked for all its output it warns of nothing; what it has not solved the two tests below refuse.
+        # With full output it raises no warnings; the two checks below refuse what it could not solve.
         (tck, _), *_ = splprep(dense.T, u=u, k=min(3, len(u) - 1), s=len(u) * sigma_m**2, full_output=1, quiet=1)
         (x, y), (dx, dy) = splev(at, tck), splev(at, tck, der=1)
-        # Its parameter is the way along the path; where it runs much faster it swings out between two points.
-        calm = np.hypot(dx, dy).max() <= SWING
+        # Its parameter is the distance along the path; a much larger speed means overshoot between two points.
+        calm = np.hypot(dx, dy).max() <= MAX_PARAMETER_SPEED
         if calm and np.hypot(*(np.array(splev(u, tck)) - dense.T)).max() <= SPLINE_M:
             break
     heading = np.unwrap(np.arctan2(dy, dx))
@@ -161,7 +173,7 @@ def _spline(xy_m: Array) -> tuple[Array, Array]:
 
 
 def _straight_samples(xy_m: Array) -> tuple[Array, Array] | None:
-    """The two ends of the line nearest to all points (N, 2) if it is within `SPLINE_M` of them, as `_spline` returns them."""
+    """Return the ends of the line through all points (N, 2) as `_spline` does, or None if it is not within `SPLINE_M` of them."""
     middle = xy_m.mean(axis=0)
     across, along = np.linalg.eigh(np.cov((xy_m - middle).T))[1].T
     along = along if (xy_m[-1] - xy_m[0]) @ along > 0 else -along
@@ -174,13 +186,13 @@ def _straight_samples(xy_m: Array) -> tuple[Array, Array] | None:
 
 
 def _longest_biarcs(samples: Array) -> list[int]:
-    """Indices of the samples (M, 3) between which biarcs stay within `ARCS_M`; each step doubles, then halves."""
+    """Return indices of the samples (M, 3) between which biarcs stay within `ARCS_M`; the step doubles, then is bisected."""
     ends, last = [0], len(samples) - 1
     while ends[-1] < last:
         start, reach, step = ends[-1], 1, 1
         while step and start + reach < last:
             end = min(start + reach + step, last)
-            if _departure(samples[start : end + 1]) <= ARCS_M:
+            if _deviation(samples[start : end + 1]) <= ARCS_M:
                 reach, step = end - start, 2 * step
             else:
                 step //= 2
@@ -188,9 +200,9 @@ def _longest_biarcs(samples: Array) -> list[int]:
     return ends
 
 
-def _departure(samples: Array) -> float:
+def _deviation(samples: Array) -> float:
     """How far the biarc from the first to the last of samples (M, 3) passes from those between."""
-    line = chained(_biarc(samples[0], samples[-1]))
+    line = joined_pieces(_biarc(samples[0], samples[-1]))
     if abs(samples[-1, 2] - samples[0, 2]) > np.pi / 2 or line.length_m == 0:
         return np.inf
     travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(samples[:, :2], axis=0).T))])
@@ -218,6 +230,6 @@ def _arc(start: Array, heading: float, end: Array) -> tuple[float, float, float,
     off = float(
         np.arctan2(np.cos(heading) * chord[1] - np.sin(heading) * chord[0], chord @ [np.cos(heading), np.sin(heading)])
     )
-    if distance * abs(off) / 4 < FLAT_M:
+    if distance * abs(off) / 4 < MAX_LINE_SAGITTA_M:
         return float(start[0]), float(start[1]), heading, distance, 0.0
     return float(start[0]), float(start[1]), heading, distance * off / np.sin(off), 2 * np.sin(off) / distance

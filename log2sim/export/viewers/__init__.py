@@ -1,1 +1,1 @@
-"""Logs and results for viewers: Foxglove's messages and Rerun's recordings."""
+"""Export to viewers: Foxglove's messages and Rerun's recordings."""

@@ -31,21 +31,28 @@ from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from log2sim.datatypes import Agent
-from log2sim.export.viewers.playback import Cloud, Picture, Shown, Steps, Unreadable, rgb_of
+from log2sim.export.viewers.playback import (
+    AgentSteps,
+    CameraFrame,
+    ThinnedSweep,
+    UnreadableRecord,
+    ViewerRecord,
+    rgb_of,
+)
 from log2sim.geometry import NS_PER_S, Array, quaternion_from_rotation, rotation_from_rpy, transform
 
 MAP = "map"
 BOX_ALPHA, PATH_ALPHA = 0.6, 0.9
 LABEL_ABOVE_M = 0.5
 PATH_PX, OUTLINE_PX, TEXT_PX = 2.0, 2.0, 12.0
-PLUMB_BOB = 5  # coefficients of this model; with more it is called rational
+PLUMB_BOB = 5  # number of coefficients of this model; with more it is called rational
 
 Message = tuple[int, str, Any]
-"""When, in ns, on which topic, and what."""
+"""Time in ns, topic and message."""
 
 
-def scene(steps: Steps, origin: Array) -> Iterator[Message]:
-    """Paths first, then at every step the boxes that are there and the ego's frame; positions less `origin` (3,)."""
+def scene_messages(steps: AgentSteps, origin: Array) -> Iterator[Message]:
+    """Yield the paths, then at every step the present boxes and the ego's frame; positions less `origin` (3,)."""
     yield int(steps.t_ns[0]), "/paths", SceneUpdate(entities=[_path(steps, k, origin) for k in range(len(steps.moves))])
     for k, t_ns in enumerate(steps.t_ns.tolist()):
         here = [(a, m.position_m[k] - origin, float(m.yaw_rad[k])) for a, m in steps.moves if m.valid[k]]
@@ -56,14 +63,14 @@ def scene(steps: Steps, origin: Array) -> Iterator[Message]:
                 yield t_ns, "/tf", _frame(t_ns, "ego", _rear_axle(agent, position, yaw))
 
 
-def shown(record: Shown, origin: Array) -> Iterable[Message]:
-    """Messages of one record of the log."""
-    if isinstance(record, Unreadable):
+def record_messages(record: ViewerRecord, origin: Array) -> Iterable[Message]:
+    """Return the messages of one record of the log."""
+    if isinstance(record, UnreadableRecord):
         text = LogMessage(
             timestamp=_stamp(record.t_ns), level=LogMessage.WARNING, name=record.stream, message=record.reason
         )
         return [(record.t_ns, "/log", text)]
-    if isinstance(record, Cloud):
+    if isinstance(record, ThinnedSweep):
         return [(record.t_ns, f"/lidar/{record.lidar}", _cloud(record, origin))]
     return _picture(record, origin)
 
@@ -83,7 +90,7 @@ def _pose(position: Array, yaw_rad: float) -> Pose:
     return Pose(position=Vector3(x=x, y=y, z=z), orientation=turn)
 
 
-def _path(steps: Steps, k: int, origin: Array) -> SceneEntity:
+def _path(steps: AgentSteps, k: int, origin: Array) -> SceneEntity:
     agent, _ = steps.moves[k]
     w = agent.waypoints
     ground = np.column_stack([w.x_m, w.y_m, w.z_m - agent.size_m[2] / 2]) - origin
@@ -118,7 +125,7 @@ def _box(t_ns: int, agent: Agent, position: Array, yaw_rad: float) -> SceneEntit
 
 
 def _rear_axle(agent: Agent, position: Array, yaw_rad: float) -> Array:
-    """The ego frame: at the rear axle, on the ground."""
+    """Return the ego frame: at the rear axle, on the ground."""
     map_T_box = transform(rotation_from_rpy(0.0, 0.0, yaw_rad), position)
     return map_T_box @ transform(np.eye(3), [-agent.rear_axle_offset_m, 0.0, -agent.size_m[2] / 2])
 
@@ -132,7 +139,7 @@ def _frame(t_ns: int, child: str, map_T_child: Array) -> FrameTransform:
     )
 
 
-def _cloud(record: Cloud, origin: Array) -> PointCloud:
+def _cloud(record: ThinnedSweep, origin: Array) -> PointCloud:
     data = (record.points_map - origin).astype("<f4").tobytes()
     columns = [PackedElementField(name=n, offset=4 * i, type=PackedElementField.FLOAT32) for i, n in enumerate("xyz")]
     place = _pose(np.zeros(3), 0.0)
@@ -141,7 +148,7 @@ def _cloud(record: Cloud, origin: Array) -> PointCloud:
     )
 
 
-def _picture(record: Picture, origin: Array) -> Iterator[Message]:
+def _picture(record: CameraFrame, origin: Array) -> Iterator[Message]:
     name, t_ns = record.camera.name, record.t_ns
     stamp, topic = _stamp(t_ns), f"/camera/{name}"
     if record.map_T_cam is not None:
@@ -168,7 +175,7 @@ def _picture(record: Picture, origin: Array) -> Iterator[Message]:
     yield t_ns, f"{topic}/boxes", ImageAnnotations(timestamp=stamp, points=lines, texts=texts)
 
 
-def _calibration(record: Picture) -> CameraCalibration:
+def _calibration(record: CameraFrame) -> CameraCalibration:
     camera = record.camera
     known = {"none": ("", 0), "fisheye": ("kannala_brandt", 4)}
     few = len(camera.distortion) <= PLUMB_BOB

@@ -1,4 +1,4 @@
-"""MCAP files with Foxglove's messages, as Foxglove, Lichtblick and Rerun open them."""
+"""Export to MCAP files with Foxglove's messages, for Foxglove, Lichtblick and Rerun."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from log2sim.errors import MissingExtra, ScenarioError
 from log2sim.export.exporters import Options
 from log2sim.export.placement import near_origin
 from log2sim.export.sampling import file_name
-from log2sim.export.viewers.playback import shown_of, steps_of
+from log2sim.export.viewers.playback import agent_steps, viewer_records
 
 if TYPE_CHECKING:
     from log2sim.export.viewers.foxglove import Message
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 class Mcap:
     """`<name>.mcap`: `/agents`, `/paths`, `/tf`, and with a log `/camera/<name>/...` and `/lidar/<name>`.
 
-    Times are those of the log, to the nanosecond. What was taken off positions stands in the metadata record "log2sim".
+    Times are those of the log, to the nanosecond. The metadata record "log2sim" holds the offset of the positions.
     """
 
     options: tuple[str, ...] = ("log",)
@@ -35,20 +35,23 @@ class Mcap:
     )
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
+        """Write the file."""
         try:
             from mcap_protobuf.writer import Writer
 
             from log2sim.export.viewers import foxglove
         except ImportError:
             raise MissingExtra("export to MCAP", "mcap") from None
-        steps = steps_of(scenario)
+        steps = agent_steps(scenario)
         if steps.t_ns[0] < 0:
             raise ScenarioError(f"scenario '{scenario.name}' starts before 1970, which MCAP has no stamps for")
         placement = near_origin(scenario)
         origin = np.array(placement.origin_m)
-        parts: list[Iterable[Message]] = [foxglove.scene(steps, origin)]
+        parts: list[Iterable[Message]] = [foxglove.scene_messages(steps, origin)]
         if options.log is not None:
-            parts.append(m for record in shown_of(scenario, options.log) for m in foxglove.shown(record, origin))
+            parts.append(
+                m for record in viewer_records(scenario, options.log) for m in foxglove.record_messages(record, origin)
+            )
         with (folder / f"{file_name(scenario.name)}.mcap").open("wb") as file, Writer(file) as writer:
             writer.add_metadata("log2sim", dict(_about(scenario, placement.origin_m)))
             for t_ns, topic, message in heapq.merge(*parts, key=lambda m: m[0]):
@@ -56,7 +59,7 @@ class Mcap:
 
 
 def _about(scenario: Scenario, origin_m: tuple[float, float, float]) -> Iterator[tuple[str, str]]:
-    """Where the map frame of the file lies, as text."""
+    """Describe the map frame of the file, as text."""
     yield "scenario", scenario.name
     yield "position_offset_m", json.dumps(origin_m)
     yield from ((f"map.{key}", json.dumps(value)) for key, value in asdict(scenario.map).items())

@@ -1,4 +1,4 @@
-"""What a viewer is shown of a scenario and its log, whichever viewer: boxes at equal steps, pictures with boxes, points."""
+"""The content for viewers of a scenario and its log: boxes at equal steps, images with boxes, points."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, Log, Scenario, Sweep
 from log2sim.errors import ConfigError, RecordError
-from log2sim.export.sampling import Motion, clock, on_clock
+from log2sim.export.sampling import SampledMotion, sample_steps, step_times
 from log2sim.geometry import NS_PER_S, Array, Camera, apply, box_corners, box_lines, inverse
 from log2sim.perception.lidar.cloud import sweep_to_map
 
-STEP_S = 0.1  # the least rate that readers of OSI traces take, and smooth enough to watch
-PICTURE_PX = 960  # wider pictures are made smaller, so that a minute of several cameras stays a file to hand around
+STEP_S = 0.1  # the lowest rate that readers of OSI traces accept, and smooth to watch
+MAX_IMAGE_PX = 960  # wider images are downscaled, which keeps files of several cameras small
 JPEG_QUALITY = 80
-MOST_POINTS = 10_000
+MAX_SWEEP_POINTS = 10_000
 
-# What everything is drawn in, red, green and blue of 255.
+# Colors as red, green and blue in [0, 255].
 EGO_RGB = (0, 158, 115)
 RGB_OF_CATEGORY = {
     "car": (86, 180, 233), "truck": (0, 114, 178), "bus": (0, 70, 140), "motorcycle": (230, 159, 0), "cyclist": (230, 159, 0),
@@ -28,16 +28,34 @@ RGB_OF_CATEGORY = {
 
 
 @dataclass(frozen=True, eq=False)
-class Steps:
-    """All agents at equal steps: `t_ns` (T,) int64 absolute stamps, and each agent's motion (T,)."""
+class AgentSteps:
+    """All agents at equal steps.
+
+    Attributes
+    ----------
+    t_ns : (T,) int64
+        Absolute time.
+    moves : tuple of (Agent, SampledMotion)
+    """
 
     t_ns: NDArray[np.int64]
-    moves: tuple[tuple[Agent, Motion], ...]
+    moves: tuple[tuple[Agent, SampledMotion], ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
-    """A camera frame: JPEG, the camera of its size, its pose in the map if known, and lines (E, 2, 2) px by agent."""
+class CameraFrame:
+    """A camera image with the boxes of agents.
+
+    Attributes
+    ----------
+    t_ns : int
+    camera : Camera
+        Of the size of the image.
+    map_T_cam : (4, 4) float64 or None
+    jpeg : bytes
+    outlines : tuple of (Agent, (E, 2, 2) float64)
+        Lines of each box, px.
+    """
 
     t_ns: int
     camera: Camera
@@ -47,8 +65,15 @@ class Picture:
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
-    """A LiDAR sweep, thinned: `points_map` (N, 3)."""
+class ThinnedSweep:
+    """A LiDAR sweep with fewer points.
+
+    Attributes
+    ----------
+    t_ns : int
+    lidar : str
+    points_map : (N, 3) float64
+    """
 
     t_ns: int
     lidar: str
@@ -56,31 +81,32 @@ class Cloud:
 
 
 @dataclass(frozen=True)
-class Unreadable:
-    """A record of the log that could not be read, and why."""
+class UnreadableRecord:
+    """A record of the log that could not be read, and the reason."""
 
     t_ns: int
     stream: str
     reason: str
 
 
-Shown = Picture | Cloud | Unreadable
+ViewerRecord = CameraFrame | ThinnedSweep | UnreadableRecord
 
 
 def rgb_of(agent: Agent) -> tuple[int, int, int]:
+    """Return the color of an agent."""
     return EGO_RGB if agent.id == "ego" else RGB_OF_CATEGORY[agent.category]
 
 
-def steps_of(scenario: Scenario) -> Steps:
-    """Every agent every `STEP_S`, from the first waypoint of any to the last."""
+def agent_steps(scenario: Scenario) -> AgentSteps:
+    """Sample every agent every `STEP_S`, from the first waypoint of any agent to the last."""
     ends = [(a.waypoints.t_s[0], a.waypoints.t_s[-1]) for a in scenario.agents]
-    t_s = clock(min(first for first, _ in ends), max(last for _, last in ends), STEP_S)
+    t_s = step_times(min(first for first, _ in ends), max(last for _, last in ends), STEP_S)
     t_ns = scenario.t0_ns + np.round(t_s * NS_PER_S).astype(np.int64)
-    return Steps(t_ns, tuple((agent, on_clock(agent, t_s, STEP_S)) for agent in scenario.agents))
+    return AgentSteps(t_ns, tuple((agent, sample_steps(agent, t_s, STEP_S)) for agent in scenario.agents))
 
 
-def shown_of(scenario: Scenario, log: Log) -> Iterator[Shown]:
-    """Pictures and points of a log within the scenario's time, in order of time; each is read when it is asked for.
+def viewer_records(scenario: Scenario, log: Log) -> Iterator[ViewerRecord]:
+    """Yield images and points of a log within the scenario's time, in order of time; each is read when requested.
 
     Raises
     ------
@@ -101,36 +127,36 @@ def shown_of(scenario: Scenario, log: Log) -> Iterator[Shown]:
             f"'{scenario.name}'; give the log that it was made from"
         )
     for t_ns, name, i in sorted(index):
-        yield _shown(scenario, log, name, i, t_ns)
+        yield _viewer_record(scenario, log, name, i, t_ns)
 
 
-def _shown(scenario: Scenario, log: Log, name: str, i: int, t_ns: int) -> Shown:
+def _viewer_record(scenario: Scenario, log: Log, name: str, i: int, t_ns: int) -> ViewerRecord:
     try:
         record = log.streams[name].read(i)
     except RecordError as error:
-        return Unreadable(t_ns, name, str(error))
+        return UnreadableRecord(t_ns, name, str(error))
     if name in log.cameras:
-        return _picture(scenario, log, log.cameras[name], record, t_ns)
-    return Cloud(t_ns, name, _points_map(log, name, record))
+        return _camera_frame(scenario, log, log.cameras[name], record, t_ns)
+    return ThinnedSweep(t_ns, name, _points_map(log, name, record))
 
 
-def _picture(scenario: Scenario, log: Log, camera: Camera, image_bgr: NDArray[np.uint8], t_ns: int) -> Picture:
+def _camera_frame(scenario: Scenario, log: Log, camera: Camera, image_bgr: NDArray[np.uint8], t_ns: int) -> CameraFrame:
     import cv2
     import simplejpeg
 
-    small = _smaller(camera, min(1.0, PICTURE_PX / camera.width_px))
+    small = _downscaled(camera, min(1.0, MAX_IMAGE_PX / camera.width_px))
     if small is not camera:
         size = (small.width_px, small.height_px)
         image_bgr = np.asarray(cv2.resize(image_bgr, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     jpeg = simplejpeg.encode_jpeg(np.ascontiguousarray(image_bgr), quality=JPEG_QUALITY, colorspace="BGR")
     poses, known = log.map_T_sensor(camera.name, t_ns)
     if not known[0]:
-        return Picture(t_ns, small, None, jpeg, ())
-    return Picture(t_ns, small, poses[0], jpeg, tuple(_outlines(scenario, small, inverse(poses[0]), t_ns)))
+        return CameraFrame(t_ns, small, None, jpeg, ())
+    return CameraFrame(t_ns, small, poses[0], jpeg, tuple(_outlines(scenario, small, inverse(poses[0]), t_ns)))
 
 
-def _smaller(camera: Camera, scale: float) -> Camera:
-    """The camera of the same picture in another size; the middle of the first pixel is (0, 0) in both."""
+def _downscaled(camera: Camera, scale: float) -> Camera:
+    """Return the camera of the same image in another size; the center of the first pixel is (0, 0) in both."""
     if scale == 1.0:
         return camera
     width, height = round(camera.width_px * scale), round(camera.height_px * scale)
@@ -155,7 +181,7 @@ def _outlines(scenario: Scenario, camera: Camera, cam_T_map: Array, t_ns: int) -
 
 def _points_map(log: Log, name: str, sweep: Sweep) -> Array:
     """Transform every n-th point of a sweep to the map frame (N, 3); none when the pose of the LiDAR is unknown."""
-    kept = slice(None, None, max(1, -(-len(sweep.xyz_m) // MOST_POINTS)))
+    kept = slice(None, None, max(1, -(-len(sweep.xyz_m) // MAX_SWEEP_POINTS)))
     t_ns = None if sweep.t_ns is None else sweep.t_ns[kept]
     mapped = sweep_to_map(log, name, replace(sweep, xyz_m=sweep.xyz_m[kept], t_ns=t_ns), compensate=True)
     return np.zeros((0, 3)) if mapped is None else mapped[0]

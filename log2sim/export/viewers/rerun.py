@@ -15,8 +15,17 @@ from log2sim.datatypes import Agent, Log, Scenario
 from log2sim.errors import MissingExtra
 from log2sim.export.exporters import Options
 from log2sim.export.placement import near_origin
-from log2sim.export.sampling import Motion, file_name
-from log2sim.export.viewers.playback import Cloud, Picture, Shown, Steps, Unreadable, rgb_of, shown_of, steps_of
+from log2sim.export.sampling import SampledMotion, file_name
+from log2sim.export.viewers.playback import (
+    AgentSteps,
+    CameraFrame,
+    ThinnedSweep,
+    UnreadableRecord,
+    ViewerRecord,
+    agent_steps,
+    rgb_of,
+    viewer_records,
+)
 from log2sim.geometry import Array
 
 TIMELINE = "time"
@@ -40,6 +49,7 @@ class Rerun:
     )
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
+        """Write the recording."""
         try:
             import rerun
         except ImportError:
@@ -77,18 +87,18 @@ def _parts(scenario: Scenario, log: Log | None) -> Iterator[Part]:
     about = {"scenario": scenario.name, "position_offset_m": placement.origin_m, "map": asdict(scenario.map)}
     yield (), None, rerun.ViewCoordinates.columns(xyz=[rerun.ViewCoordinates.RIGHT_HAND_Z_UP])
     yield ("about",), None, rerun.TextDocument.columns(text=[json.dumps(about, indent=1)])
-    steps = steps_of(scenario)
+    steps = agent_steps(scenario)
     for agent, move in steps.moves:
         yield from _agent(agent, move, steps, origin)
     known: set[str] = set()
-    for record in shown_of(scenario, log) if log is not None else ():
-        if isinstance(record, Picture) and record.camera.name not in known:
+    for record in viewer_records(scenario, log) if log is not None else ():
+        if isinstance(record, CameraFrame) and record.camera.name not in known:
             known.add(record.camera.name)
             yield _pinhole(record)
         yield from _shown(record, origin)
 
 
-def _agent(agent: Agent, move: Motion, steps: Steps, origin: Array) -> Iterator[Part]:
+def _agent(agent: Agent, move: SampledMotion, steps: AgentSteps, origin: Array) -> Iterator[Part]:
     """Box and speed at every step of an agent's life, and its path."""
     import rerun
 
@@ -112,20 +122,20 @@ def _agent(agent: Agent, move: Motion, steps: Steps, origin: Array) -> Iterator[
     yield ("paths", agent.id), None, line
 
 
-def _shown(record: Shown, origin: Array) -> Iterator[Part]:
+def _shown(record: ViewerRecord, origin: Array) -> Iterator[Part]:
     import rerun
 
     t_ns = np.array([record.t_ns])
-    if isinstance(record, Unreadable):
+    if isinstance(record, UnreadableRecord):
         yield ("log", record.stream), t_ns, rerun.TextLog.columns(text=[record.reason], level=["WARN"])
-    elif isinstance(record, Cloud):
+    elif isinstance(record, ThinnedSweep):
         points = rerun.Points3D.columns(positions=record.points_map - origin)
         yield ("lidar", record.lidar), t_ns, points.partition([len(record.points_map)])
     else:
         yield from _picture(record, t_ns, origin)
 
 
-def _pinhole(record: Picture) -> Part:
+def _pinhole(record: CameraFrame) -> Part:
     import rerun
 
     camera = record.camera
@@ -137,7 +147,7 @@ def _pinhole(record: Picture) -> Part:
     )
 
 
-def _picture(record: Picture, t_ns: NDArray[np.int64], origin: Array) -> Iterator[Part]:
+def _picture(record: CameraFrame, t_ns: NDArray[np.int64], origin: Array) -> Iterator[Part]:
     import rerun
 
     place = ("cameras", record.camera.name)
