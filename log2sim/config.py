@@ -1,116 +1,170 @@
-"""Settings of a run: one frozen record a stage, read from defaults, a TOML file and `section.key=value`, in this order.
+"""Settings of a reconstruction: defaults, then a TOML file, then `section.key=value`, then options of the command line.
 
 A setting is here only when users of different logs need different values; everything else is a named constant beside the
-code that uses it.
+code that uses it. The models also give `schemas/config-1.json` and the comments that `log2sim config` prints.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import math
+import json
 import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from log2sim.errors import ConfigError
-from log2sim.registry import nearest
+from log2sim.model_errors import first_problem
 
 CONFIG_LIMIT_BYTES = 1024 * 1024
+KINDS = {
+    "integer": "whole number",
+    "number": "number",
+    "boolean": "true or false",
+    "string": "text",
+    "array": "names separated by commas",
+}
+"""Types of JSON Schema in plain words."""
 
 
-def _choice(*allowed: str) -> Any:
-    return field(default=allowed[0], metadata={"allowed": allowed})
+def _setting(
+    default: Any, description: str, *, unit: str = "", ge: float | None = None, le: float | None = None
+) -> Any:
+    """Declare a setting: its default, meaning, unit, and limits `ge` and `le`, which belong to the range."""
+    return Field(
+        default=default, description=description, json_schema_extra={"unit": unit} if unit else None, ge=ge, le=le
+    )
 
 
-def _number(default: float, low: float, high: float) -> Any:
-    return field(default=default, metadata={"low": low, "high": high})
+def _names(value: Any) -> Any:
+    """Return names from a list or from a text that separates them by commas; anything else is left to the check."""
+    items = value.split(",") if isinstance(value, str) else value
+    if not isinstance(items, (list, tuple)):
+        return value
+    names = tuple(item.strip() if isinstance(item, str) else item for item in items)
+    return tuple(name for name in names if name != "")
 
 
-@dataclass(frozen=True)
-class SyncConfig:
-    """`reference`: camera that sets the ticks, "" for the log's own choice; `max_residual_s`: farthest record still taken."""
+class Section(BaseModel):
+    """Base of all settings: immutable, no unknown key, no conversion of types, no NaN and no infinity."""
 
-    reference: str = ""
-    max_residual_s: float = _number(0.1, 1e-6, 10.0)
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
-
-@dataclass(frozen=True)
-class DetectConfig:
-    """`name`: detector or path of an ONNX file; `min_score`: lowest score that can continue a track, 0 for the detector's own.
-
-    `input_px`: side of the input of a model that takes any size, 0 for what its family takes.
-    """
-
-    name: str = "ssd-mobilenet-v2"
-    min_score: float = _number(0.0, 0.0, 1.0)
-    tiles: int = field(default=0, metadata={"low": 0, "high": 64})
-    layout: str = ""
-    input_px: int = field(default=0, metadata={"low": 0, "high": 8192})
+    @classmethod
+    def choices(cls, key: str) -> tuple[str, ...]:
+        """Return the values that a setting may have, the default first; none for a setting that is free."""
+        annotation = cls.model_fields[key].annotation
+        return get_args(annotation) if get_origin(annotation) is Literal else ()
 
 
-@dataclass(frozen=True)
-class MeasureConfig:
-    """`mode`: "robust" or the paper's; `max_range_m`: obstacles farther from the ego are not measured."""
+class SyncConfig(Section):
+    """Synchronization of the sensors."""
 
-    mode: str = _choice("robust", "paper")
-    max_range_m: float = _number(80.0, 1.0, 1000.0)
-
-
-@dataclass(frozen=True)
-class TopdownConfig:
-    """`method`: how the image-to-ground homography is estimated; "off" leaves it out.
-
-    `hypotheses`: sets of four that RANSAC draws, for the stream or for each frame, 0 for as many as the data need.
-    """
-
-    method: str = _choice("time-aware", "calibrated", "min-frame", "per-frame", "straw-man", "off")
-    hypotheses: int = field(default=0, metadata={"low": 0, "high": 100_000})
+    reference: str = _setting("", "Camera whose frames set the ticks; empty: the log's own choice.")
+    max_residual_s: float = _setting(
+        0.1, "Largest time between a tick and a record that is used for it.", unit="s", ge=1e-6, le=10.0
+    )
 
 
-@dataclass(frozen=True)
-class TrackConfig:
-    """`birth_score`: lowest score that can start a track; `max_gap_s`: longest occlusion that is bridged."""
+class DetectConfig(Section):
+    """Detection in images."""
 
-    birth_score: float = _number(0.4, 0.0, 1.0)
-    max_gap_s: float = _number(3.0, 0.0, 60.0)
-    min_life_s: float = _number(0.3, 0.0, 60.0)
+    name: str = _setting(
+        "ssd-mobilenet-v2", "Detector: ssd-mobilenet-v2, a path to an ONNX model, or labels (boxes of the log)."
+    )
+    min_score: float = _setting(
+        0.0, "Lowest score of a detection that can continue a track; 0: the detector's own.", ge=0.0, le=1.0
+    )
+    tiles: int = _setting(
+        0, "Overlapping tiles that are searched besides the whole image; 0: chosen from the image size.", ge=0, le=64
+    )
+    layout: str = _setting("", "Output layout of an ONNX model; empty: recognized from its outputs.")
+    input_px: int = _setting(
+        0, "Side of the input of an ONNX model that takes any size; 0: usual for its layout.", unit="px", ge=0, le=8192
+    )
 
 
-@dataclass(frozen=True)
-class SmoothConfig:
-    """`enabled`: off keeps the measured positions as they are, for comparison."""
+class MeasureConfig(Section):
+    """Measurement of detected objects by LiDAR."""
 
-    enabled: bool = True
+    mode: Literal["robust", "paper"] = _setting(
+        "robust",
+        "robust: the object's cluster with an oriented box; paper: depth of the point nearest to the center of the "
+        "detection and extents of all its points.",
+    )
+    max_range_m: float = _setting(
+        80.0, "Largest distance from the ego at which objects are measured.", unit="m", ge=1.0, le=1000.0
+    )
 
 
-@dataclass(frozen=True)
-class Config:
+class TopdownConfig(Section):
+    """Homography from each image to the ground."""
+
+    method: Literal["time-aware", "calibrated", "min-frame", "per-frame", "straw-man", "off"] = _setting(
+        "time-aware", "How the homography is estimated; off: not at all."
+    )
+    hypotheses: int = _setting(
+        0, "Samples that RANSAC draws, per camera or per frame; 0: as many as the data need.", ge=0, le=100_000
+    )
+
+
+class TrackConfig(Section):
+    """Tracking over time."""
+
+    birth_score: float = _setting(0.4, "Lowest score of a detection that can start a track.", ge=0.0, le=1.0)
+    max_gap_s: float = _setting(3.0, "Longest occlusion that a track bridges.", unit="s", ge=0.0, le=60.0)
+    min_life_s: float = _setting(0.3, "Shortest track that is kept.", unit="s", ge=0.0, le=60.0)
+
+
+class SmoothConfig(Section):
+    """Smoothing of trajectories."""
+
+    enabled: bool = _setting(True, "Whether trajectories are smoothed; false keeps measured positions, for comparison.")
+
+
+class Config(Section):
     """All settings of a reconstruction."""
 
-    seed: int = field(default=0, metadata={"low": 0, "high": 2**32 - 1})
-    cameras: tuple[str, ...] = ()
-    start_s: float | None = None
-    stop_s: float | None = None
-    sync: SyncConfig = field(default_factory=SyncConfig)
-    detect: DetectConfig = field(default_factory=DetectConfig)
-    measure: MeasureConfig = field(default_factory=MeasureConfig)
-    topdown: TopdownConfig = field(default_factory=TopdownConfig)
-    track: TrackConfig = field(default_factory=TrackConfig)
-    smooth: SmoothConfig = field(default_factory=SmoothConfig)
+    model_config = ConfigDict(
+        title="log2sim settings, version 1",
+        json_schema_extra={"$schema": "https://json-schema.org/draft/2020-12/schema"},
+    )
+
+    seed: int = _setting(0, "Seed of all random numbers.", ge=0, le=2**32 - 1)
+    cameras: Annotated[tuple[str, ...], BeforeValidator(_names)] = _setting(
+        (), "Cameras that are used; empty: all of the log."
+    )
+    start_s: float | None = _setting(None, "First time that is used, from the start of the log.", unit="s")
+    stop_s: float | None = _setting(None, "Last time that is used, from the start of the log.", unit="s")
+    sync: SyncConfig = SyncConfig()
+    detect: DetectConfig = DetectConfig()
+    measure: MeasureConfig = MeasureConfig()
+    topdown: TopdownConfig = TopdownConfig()
+    track: TrackConfig = TrackConfig()
+    smooth: SmoothConfig = SmoothConfig()
 
     @classmethod
     def load(cls, path: Path | str | None = None, settings: Iterable[str] = (), **overrides: Any) -> Config:
-        """Defaults, then the TOML file, then `section.key=value` settings, then keyword overrides that are not None.
+        """Read settings: defaults, then a TOML file, then `section.key=value`, then overrides that are not None.
+
+        Parameters
+        ----------
+        path : path, optional
+            TOML file.
+        settings : iterable of str
+            Entries such as "track.max_gap_s=2".
+        **overrides
+            Settings by name; a section as a document or as its model.
 
         Raises
         ------
         ConfigError
             For an unreadable file, an unknown key (naming the nearest known one) or a value out of its range.
         """
-        document = _read_toml(Path(path)) if path is not None else {}
-        config = _apply(cls(), document, "", str(path))
+        config = cls()
+        if path is not None:
+            config = _merged(config, _read_toml(Path(path)), str(path))
         for setting in settings:
             key, equals, text = setting.partition("=")
             if not equals:
@@ -118,76 +172,80 @@ class Config:
             nested: Any = _parse_value(text)
             for part in reversed(key.strip().split(".")):
                 nested = {part: nested}
-            config = _apply(config, nested, "", f"--set {setting}")
-        return _apply(config, {k: v for k, v in overrides.items() if v is not None}, "", "options")
+            config = _merged(config, nested, f"--set {setting}")
+        return _merged(config, {k: v for k, v in overrides.items() if v is not None}, "options")
+
+    def changed(self, **changes: Any) -> Config:
+        """Return a checked copy with some settings changed; a section takes a document of its changes.
+
+        Raises
+        ------
+        ConfigError
+            For an unknown key or a value out of its range.
+        """
+        return _merged(self, changes, "changes")
 
     def to_dict(self) -> dict[str, Any]:
-        """All settings as a nested document, as it stands in a scenario's provenance."""
-        return {**dataclasses.asdict(self), "cameras": list(self.cameras)}
+        """Return all settings as a nested JSON document, as the provenance of a scenario holds them."""
+        return {**self.model_dump(), "cameras": list(self.cameras)}
 
-    def to_toml(self) -> str:
-        """All settings as TOML that `load` reads back."""
-        document = self.to_dict()
-        lines = [f"{k} = {_toml_value(v)}" for k, v in document.items() if not isinstance(v, dict) and v is not None]
-        for section, values in document.items():
-            if isinstance(values, dict):
-                lines += ["", f"[{section}]", *(f"{k} = {_toml_value(v)}" for k, v in values.items())]
+    def to_toml(self, *, comments: bool = False) -> str:
+        """Write all settings as TOML that `load` reads back, optionally with the meaning of each as a comment."""
+        top = [key for key in type(self).model_fields if not isinstance(getattr(self, key), Section)]
+        lines = _toml_lines(self, top, comments=comments)
+        for key in type(self).model_fields:
+            section = getattr(self, key)
+            if isinstance(section, Section):
+                title = [f"# {section.__doc__}"] if comments else []
+                lines += ["", *title, f"[{key}]", *_toml_lines(section, type(section).model_fields, comments=comments)]
         return "\n".join(lines) + "\n"
 
 
-def _apply(record: Any, document: Mapping[str, Any], prefix: str, where: str) -> Any:
-    """A copy of a settings record with the document's values, each checked."""
-    known = {f.name: f for f in dataclasses.fields(record)}
-    hints = get_type_hints(type(record))
-    changes: dict[str, Any] = {}
-    for key, value in document.items():
-        if key not in known:
-            raise ConfigError(
-                f"{where}: unknown setting '{prefix}{key}'{nearest(key, list(known))}; known: {', '.join(known)}"
-            )
-        current = getattr(record, key)
-        if dataclasses.is_dataclass(current):
-            if dataclasses.is_dataclass(value):
-                changes[key] = value
-                continue
-            if not isinstance(value, Mapping):
-                raise ConfigError(
-                    f"{where}: '{prefix}{key}' is a section; set one of its keys, e.g. {_first_key(current, prefix + key)}"
-                )
-            changes[key] = _apply(current, value, f"{prefix}{key}.", where)
-        else:
-            changes[key] = _checked(value, hints[key], known[key], f"{where}: '{prefix}{key}'")
-    return dataclasses.replace(record, **changes)
+def _merged(config: Config, changes: Mapping[str, Any], where: str) -> Config:
+    """Return checked settings with the changes of a document; `where` begins the message of an error."""
+    try:
+        return Config.model_validate(_deep_merged(config.model_dump(), changes))
+    except ValidationError as problem:
+        raise ConfigError(f"{where}: {first_problem(problem, Config)}") from None
 
 
-def _first_key(record: Any, prefix: str) -> str:
-    return f"{prefix}.{dataclasses.fields(record)[0].name}"
+def _deep_merged(document: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(document)
+    for key, value in changes.items():
+        new = value.model_dump() if isinstance(value, Section) else value
+        old = merged.get(key)
+        merged[key] = _deep_merged(old, new) if isinstance(old, dict) and isinstance(new, Mapping) else new
+    return merged
 
 
-def _checked(value: Any, hint: Any, declared: dataclasses.Field[Any], where: str) -> Any:
-    text = str(hint)
-    if "tuple" in text:
-        items = value.split(",") if isinstance(value, str) else value
-        if not isinstance(items, (list, tuple)) or not all(isinstance(v, str) for v in items):
-            raise ConfigError(f"{where} is {value!r}, expected names separated by commas")
-        return tuple(v.strip() for v in items if v.strip())
-    if hint is bool:
-        if not isinstance(value, bool):
-            raise ConfigError(f"{where} is {value!r}, expected true or false")
-        return value
-    if hint is str:
-        allowed = declared.metadata.get("allowed")
-        if not isinstance(value, str) or (allowed and value not in allowed):
-            raise ConfigError(f"{where} is {value!r}, expected {' or '.join(allowed) if allowed else 'a text'}")
-        return value
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or (hint is int and not isinstance(value, int)):
-        raise ConfigError(f"{where} is {value!r}, expected {'a whole number' if hint is int else 'a number'}")
-    if not math.isfinite(value):
-        raise ConfigError(f"{where} is {value!r}, expected a finite number")
-    low, high = declared.metadata.get("low", float("-inf")), declared.metadata.get("high", float("inf"))
-    if not low <= value <= high:
-        raise ConfigError(f"{where} is {value!r}, expected a number from {low:g} to {high:g}")
-    return value if hint is int else float(value)
+def _schema_of(section: type[Section], key: str) -> dict[str, Any]:
+    """Return the JSON Schema of one setting, of its value where it may be absent."""
+    schema: dict[str, Any] = section.model_json_schema()["properties"][key]
+    return {**schema, **schema.get("anyOf", [{}])[0]}
+
+
+def _toml_lines(section: Section, keys: Iterable[str], *, comments: bool) -> list[str]:
+    lines = []
+    for key in keys:
+        value = getattr(section, key)
+        if comments:
+            lines.append(_comment(_schema_of(type(section), key)))
+        if value is not None:
+            lines.append(f"{key} = {_toml_value(value)}")
+        elif comments:
+            lines.append(f"# {key} = ")
+    return lines
+
+
+def _comment(schema: Mapping[str, Any]) -> str:
+    """Return a setting's meaning and, in brackets, its type or choices, unit, limits and default, as a TOML comment."""
+    facts = [" | ".join(schema["enum"]) if "enum" in schema else KINDS[schema["type"]]]
+    if "unit" in schema:
+        facts.append(f"unit {schema['unit']}")
+    if "minimum" in schema:
+        facts.append(f"from {schema['minimum']:.10g} to {schema['maximum']:.10g}")
+    facts.append("not set by default" if schema["default"] is None else f"default {_toml_value(schema['default'])}")
+    return f"# {schema['description']} [{', '.join(facts)}]"
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
@@ -202,7 +260,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 
 def _parse_value(text: str) -> Any:
-    """A value as TOML would read it; anything else is a text, so that quotes are not needed on the command line."""
+    """Read a value as TOML; anything else is a text, so that quotes are not needed on the command line."""
     try:
         document = tomllib.loads(f"value = {text}")
     except (tomllib.TOMLDecodeError, RecursionError):
@@ -216,5 +274,6 @@ def _toml_value(value: Any) -> str:
     if isinstance(value, (list, tuple)):
         return "[" + ", ".join(_toml_value(v) for v in value) + "]"
     if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+        # The escapes of JSON are TOML's too; DEL is the one character that only TOML wants escaped.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return repr(value)

@@ -34,8 +34,8 @@ def first_problem(error: ValidationError, model: type[BaseModel]) -> str:
         return str(problem["ctx"]["error"])
     if problem["type"] == "extra_forbidden":
         known = list(_schema_at(schema, location[:-1]).get("properties", {}))
-        near = difflib.get_close_matches(str(location[-1]), known, 1, 0.0)
-        hint = f"; did you mean '{_key([*location[:-1], near[0]])}'?" if near else ""
+        near = difflib.get_close_matches(str(location[-1]), known, 1)
+        hint = f"; did you mean '{_key([*location[:-1], near[0]])}'?" if near else f"; known: {', '.join(known)}"
         return f"unknown key '{_key(location)}'{hint}"
     if problem["type"] == "missing" and isinstance(location[-1], str):
         return f"'{_key(location)}' is missing"
@@ -45,7 +45,8 @@ def first_problem(error: ValidationError, model: type[BaseModel]) -> str:
     if isinstance(found, list | tuple) and expected.get("type") == "array":
         return f"'{_key(location)}' has {len(found)} values, expected {_count(expected)}"
     text = repr(found) if len(repr(found)) <= SHOWN_CHARACTERS else f"{repr(found)[:SHOWN_CHARACTERS]}..."
-    return f"'{_key(location)}' is {text}, expected {_expected(expected)}" if location else str(problem["msg"])
+    wanted = "a finite number" if problem["type"] == "finite_number" else _expected(expected)
+    return f"'{_key(location)}' is {text}, expected {wanted}" if location else str(problem["msg"])
 
 
 def _key(location: Sequence[Any]) -> str:
@@ -81,9 +82,11 @@ def _expected(schema: dict[str, Any]) -> str:
     if kind in ("number", "integer"):
         low = schema.get("minimum", schema.get("exclusiveMinimum"))
         high = schema.get("maximum", schema.get("exclusiveMaximum"))
-        limits = [] if low is None else [f" from {low:g}"]
-        limits += [] if high is None else [f" to {high:g}"]
+        limits = [] if low is None else [f" from {low:.10g}"]
+        limits += [] if high is None else [f" to {high:.10g}"]
         return ("a whole number" if kind == "integer" else "a number") + "".join(limits)
+    if kind == "object" and "properties" in schema:
+        return f"a table with {', '.join(schema['properties'])}"
     if kind == "string" and "pattern" in schema:
         return "letters, digits, '_' and '-' only"
     return {"string": "text", "array": "a list", "object": "a table", "boolean": "true or false"}.get(kind, kind)

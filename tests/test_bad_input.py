@@ -132,14 +132,14 @@ LOG_FAULTS: dict[str, tuple[Change, tuple[str, ...], int, list[str]]] = {
     "no time left": (lambda f: None, ("--start", "100"), 2, ["--start", "no frame of 'front'", "0.9"]),
     "start NaN": (lambda f: None, ("--start", "nan"), 2, ["start_s", "nan", "finite"]),
     "start text": (lambda f: None, ("--start", "soon"), 2, ["'--start'", "number"]),
-    "unknown section": (lambda f: None, ("--set", "detct.name=labels"), 2, ["--set detct.name=labels", "did you mean 'detect'", "known"]),
-    "unknown key": (lambda f: None, ("--set", "detect.nam=x"), 2, ["'detect.nam'", "did you mean 'name'"]),
+    "unknown section": (lambda f: None, ("--set", "detct.name=labels"), 2, ["--set detct.name=labels", "did you mean 'detect'"]),
+    "unknown key": (lambda f: None, ("--set", "detect.nam=x"), 2, ["'detect.nam'", "did you mean 'detect.name'"]),
     "no value": (lambda f: None, ("--set", "detect.name"), 2, ["--set detect.name", "section.key=value"]),
     "value out of range": (lambda f: None, ("--set", "measure.max_range_m=0"), 2, ["measure.max_range_m", "1 to 1000"]),
     "two lines in a value": (lambda f: None, ("--set", "sync.reference=1\nseed=2"), 2, ["sync.reference"]),
     "broken TOML": (lambda f: (f.parent / "c.toml").write_text("a = ["), ("--config", "{out}/../c.toml"), 2, ["c.toml", "not valid TOML"]),
     "unknown key in TOML": (lambda f: (f.parent / "c.toml").write_text('[sync]\nreferenc = "a"'), ("--config", "{out}/../c.toml"), 2,
-                            ["c.toml", "'sync.referenc'", "did you mean 'reference'"]),
+                            ["c.toml", "'sync.referenc'", "did you mean 'sync.reference'"]),
     "missing TOML": (lambda f: None, ("--config", "none.toml"), 2, ["none.toml", "no such config file"]),
     "unreadable model": (lambda f: (f.parent / "m.onnx").write_bytes(b"hello"), ("--detector", "{out}/../m.onnx"), 2, ["m.onnx", "not a model"]),
     "missing model": (lambda f: None, ("--detector", "none.onnx"), 2, ["none.onnx", "no such file"]),
@@ -378,7 +378,7 @@ def test_a_traceback_only_with_debug(tmp_path: Path) -> None:
 
 
 def test_an_error_of_ours_inside_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("log2sim.config.Config.to_toml", lambda self: 1 / 0)
+    monkeypatch.setattr("log2sim.config.Config.to_toml", lambda self, **_: 1 / 0)
     ran = run("config")
     assert ran.code == 1
     assert (

@@ -29,7 +29,7 @@ LABELS = Config.load(detect={"name": "labels"})
 
 
 def run(log: Log, **changes: Any) -> Result:
-    return reconstruct(log, replace(LABELS, **changes) if changes else LABELS)
+    return reconstruct(log, LABELS.changed(**changes))
 
 
 @pytest.fixture(scope="module")

@@ -1,10 +1,11 @@
-"""Write the JSON Schemas that are generated from models: schemas/scene-1.json."""
+"""Write the JSON Schemas that are generated from models: schemas/config-1.json and schemas/scene-1.json."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
 
+from log2sim.config import Config
 from log2sim.synth.scene import scene_schema
 
 SCHEMAS = Path(__file__).resolve().parent.parent / "schemas"
@@ -12,7 +13,7 @@ SCHEMAS = Path(__file__).resolve().parent.parent / "schemas"
 
 def main() -> None:
     """Write every generated schema."""
-    for name, schema in {"scene-1": scene_schema()}.items():
+    for name, schema in {"config-1": Config.model_json_schema(), "scene-1": scene_schema()}.items():
         (SCHEMAS / f"{name}.json").write_text(json.dumps(schema, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 

@@ -15,4 +15,4 @@ def config(
     """
     from log2sim.config import Config
 
-    say(Config.load(file, settings or ()).to_toml().rstrip())
+    say(Config.load(file, settings or ()).to_toml(comments=True).rstrip())

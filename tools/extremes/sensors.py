@@ -58,7 +58,7 @@ def lost_ego() -> Outcome:
 @case("log: one frame", "a scenario of one moment")
 def one_frame() -> Outcome:
     with folder_of(lambda f: None) as folder:
-        result = reconstruct(open_log(folder), replace(LABELS, start_s=0.2, stop_s=0.2))
+        result = reconstruct(open_log(folder), LABELS.changed(start_s=0.2, stop_s=0.2))
     ok, found = known_and_finite(result, 1)
     return Outcome(ok and result.scenario.duration_s == 0.0, found)
 

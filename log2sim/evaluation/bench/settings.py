@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from log2sim.config import Config
+from log2sim.config import Config, Section
 from log2sim.datatypes import Log
 from log2sim.perception.detect.onnx_detector import OnnxDetector
 from log2sim.perception.detect.tiling import plan_tiles
@@ -105,14 +104,13 @@ def _hypotheses(config: Config) -> list[Setting]:
 
 def with_changes(config: Config, section: str, **changes: Any) -> Config:
     """Return a copy of the settings with changes in one section."""
-    return dataclasses.replace(config, **{section: dataclasses.replace(getattr(config, section), **changes)})
+    return config.changed(**{section: changes})
 
 
-def choices(section: Any, key: str) -> list[str]:
+def choices(section: Section, key: str) -> list[str]:
     """List the allowed values of a setting, the present one first, without the one that leaves the stage out."""
     present = getattr(section, key)
-    allowed = next(f.metadata["allowed"] for f in dataclasses.fields(section) if f.name == key)
-    return [value for value in dict.fromkeys([present, *allowed]) if value != NO_METHOD]
+    return [value for value in dict.fromkeys([present, *section.choices(key)]) if value != NO_METHOD]
 
 
 def _choices(stage: str, config: Config, section: str, key: str) -> tuple[Setting, ...]:
@@ -124,9 +122,9 @@ def _choices(stage: str, config: Config, section: str, key: str) -> tuple[Settin
 
 def _smooth_settings(config: Config) -> list[Setting]:
     """List smoothing on and off, and all values of its other settings."""
-    fields = dataclasses.fields(config.smooth)
-    switches = [f.name for f in fields if isinstance(getattr(config.smooth, f.name), bool)]
-    named = [f.name for f in fields if "allowed" in f.metadata]
+    keys = type(config.smooth).model_fields
+    switches = [key for key in keys if isinstance(getattr(config.smooth, key), bool)]
+    named = [key for key in keys if config.smooth.choices(key)]
     out = [Setting("smooth", _smooth_name(config, switches, named), config, True)]
     for key in switches:
         other = with_changes(config, "smooth", **{key: not getattr(config.smooth, key)})
