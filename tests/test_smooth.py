@@ -432,6 +432,37 @@ def test_no_yaw_leaps_or_swings_at_the_ends(maneuvers: ModuleType, sigma: float)
         assert np.degrees(np.abs(wrap_angle(np.diff(path.yaw_rad)))).max() < 8
 
 
+@pytest.mark.parametrize("rate_hz", [2, 4, 20])
+def test_errors_follow_the_number_of_observations_and_nothing_else_of_the_rate(
+    maneuvers: ModuleType, rate_hz: int
+) -> None:
+    by_rate = {}
+    for rate in (rate_hz, 10):
+        rows = []
+        for maneuver in maneuvers.MANEUVERS:
+            for truth, t, xy in maneuvers.rate_worlds(maneuver, rate, 0.2, seeds=3):
+                path = smooth_track(t, xy, sigma_m=0.2, at_s=truth.t_s)
+                estimate = path.xy_m, path.velocity_mps, path.yaw_rad, path.curvature_1pm
+                rows.append(maneuvers.errors_of(truth, *estimate))
+        by_rate[rate] = np.median(rows, axis=0)
+    ratio = by_rate[rate_hz] / by_rate[10]
+    assert ratio[0] == pytest.approx(np.sqrt(10 / rate_hz), rel=0.25)
+    assert (ratio[1:3] < 1.25 * max(1.0, np.sqrt(10 / rate_hz))).all()
+
+
+@pytest.mark.parametrize("rate_hz", [2, 4, 10, 20])
+@pytest.mark.parametrize("sigma", [0.05, 0.15])
+def test_a_queue_stands_and_rolls_at_every_rate(maneuvers: ModuleType, rate_hz: int, sigma: float) -> None:
+    verdicts = []
+    for truth, t, xy in maneuvers.rate_worlds(maneuvers.QUEUE, rate_hz, sigma, seeds=6):
+        path = smooth_track(t, xy, sigma_m=sigma, at_s=truth.t_s, motion=MotionModel(heading_rad=0.4))
+        verdicts.append(maneuvers.standing_verdicts(truth, path.velocity_mps))
+    found, wrong = np.mean(verdicts, axis=0)
+    # It takes some observations to tell a stop of 2 s from rolling.
+    assert found > {2: 0.4, 4: 0.55, 10: 0.65, 20: 0.65}[rate_hz]
+    assert wrong < 0.05
+
+
 def test_what_stands_neither_creeps_nor_turns_not_even_at_its_last_stamp() -> None:
     t = DT * np.arange(120)
     for sigma in (0.05, 0.15, 0.3):

@@ -14,6 +14,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import smoothing_worlds
 from bench_table import markdown, optional
 
 from log2sim.agents.smooth.smoother import smooth_track
@@ -212,4 +213,36 @@ def run(*, quick: bool) -> tuple[str, str]:
         "Four maneuvers of 20 s at 10 Hz, a tenth of the samples missing. Root mean square errors over all 201 times, also"
         " the missing ones: position m / velocity m/s / yaw degrees / curvature 1/m, by the noise of the positions."
     )
-    return "Smoothing", f"{told}\n\n{markdown(['method', 'ms a track', *cases], rows)}"
+    return (
+        "Smoothing",
+        f"{told}\n\n{markdown(['method', 'ms a track', *cases], rows)}\n\n{by_rate(seeds=2 if quick else 8)}",
+    )
+
+
+def by_rate(seeds: int) -> str:
+    """Errors and verdicts about standing by rate of the observations."""
+    rows = []
+    for rate_hz in smoothing_worlds.RATES_HZ:
+        cells = [f"{rate_hz} Hz"]
+        for sigma_m in (0.1, 0.3):
+            off, verdicts = [], []
+            for name in smoothing_worlds.MANEUVERS:
+                for truth, t_s, xy_m in smoothing_worlds.rate_worlds(name, rate_hz, sigma_m, seeds):
+                    path = smooth_track(t_s, xy_m, sigma_m=sigma_m, at_s=truth.t_s)
+                    estimate = path.xy_m, path.velocity_mps, path.yaw_rad, path.curvature_1pm
+                    off.append(smoothing_worlds.errors_of(truth, *estimate))
+            for truth, t_s, xy_m in smoothing_worlds.rate_worlds(smoothing_worlds.QUEUE, rate_hz, sigma_m, seeds):
+                path = smooth_track(t_s, xy_m, sigma_m=sigma_m, at_s=truth.t_s)
+                verdicts.append(smoothing_worlds.standing_verdicts(truth, path.velocity_mps))
+            cells.append(" / ".join(f"{v:.{d}f}" for v, d in zip(np.median(off, axis=0), (3, 3, 2, 4))))
+            cells += [f"{100 * share:.0f} %" for share in np.mean(verdicts, axis=0)]
+        rows.append(cells)
+    head = [
+        "rate",
+        *(f"{c}, {s} m" for s in (0.1, 0.3) for c in ("errors", "standing found", "moving taken for standing")),
+    ]
+    text = (
+        "log2sim by rate of the observations, errors at 20 Hz between and at them. Standing: a queue that stands for 2, 3 and"
+        " 5 s, rolls at 0.4 m/s and drives; shares of the time at which it stands, and at which it is faster than 0.2 m/s."
+    )
+    return f"{text}\n\n{markdown(head, rows)}"

@@ -14,8 +14,12 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 PERIOD_S, FRAMES, SUBSTEPS = 0.1, 201, 20
 MANEUVERS = ("lane change", "turn", "stop and go", "slalom")
+# Stop and go in a queue: standing for 2, 3 and 5 s, rolling at 0.4 m/s, driving in between.
+QUEUE = "queue"
+RATES_HZ = (2, 4, 10, 20)
 MISSING_SHARE = 0.1
 MOVING_MPS = 1.0
+STANDING_MPS, SURELY_MOVING_MPS = 0.05, 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +46,10 @@ class World:
     valid: NDArray[np.bool_]
 
 
-def truth_of(maneuver: str) -> Truth:
+def truth_of(maneuver: str, period_s: float = PERIOD_S) -> Truth:
     """Truth of a maneuver: speed and yaw rate in closed form, integrated at a twentieth of the period."""
-    t = np.arange((FRAMES - 1) * SUBSTEPS + 1, dtype=np.float64) * (PERIOD_S / SUBSTEPS)
+    frames = round((FRAMES - 1) * PERIOD_S / period_s) + 1
+    t = np.arange((frames - 1) * SUBSTEPS + 1, dtype=np.float64) * (period_s / SUBSTEPS)
     speed, yaw_rate = _controls(maneuver, t)
     yaw = 0.4 + _integral(yaw_rate, t)
     velocity = speed[:, None] * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
@@ -74,6 +79,10 @@ def _controls(maneuver: str, t: Array) -> tuple[Array, Array]:
         return speed, 0.004 * speed * np.sin(0.5 * t)
     if maneuver == "slalom":
         return np.full_like(t, 10.0), 0.4 * np.sin(2 * np.pi * t / 5.0)
+    if maneuver == QUEUE:
+        times = [0.0, 2.0, 4.0, 5.5, 7.0, 10.0, 11.5, 12.0, 15.0, 16.0, 18.0, 20.0]
+        speeds = [0.0, 0.0, 3.0, 3.0, 0.0, 0.0, 0.4, 0.4, 0.4, 0.0, 0.0, 0.0]
+        return np.interp(t, times, speeds), np.zeros_like(t)
     raise ValueError(f"unknown maneuver {maneuver!r}; known: {', '.join(MANEUVERS)}")
 
 
@@ -137,3 +146,19 @@ def best_spline_errors(world: World) -> Array:
     # The strengths lie as far below and above the usual ones as the noise does.
     tried = [errors_of(world.truth, *spline_estimate(world, k)) for k in np.logspace(-4.0, 2.5, 27)]
     return min(tried, key=lambda errors: float(errors[0]))
+
+
+def rate_worlds(maneuver: str, rate_hz: int, sigma_m: float, seeds: int = 6) -> Iterator[tuple[Truth, Array, Array]]:
+    """The truth at 20 Hz, and times (n,) and noisy positions (n, 2) at another rate that divides it, by seed."""
+    truth = truth_of(maneuver, 1.0 / RATES_HZ[-1])
+    rows = np.arange(0, len(truth.t_s), RATES_HZ[-1] // rate_hz)
+    for seed in range(seeds):
+        rng = np.random.default_rng([seed, rate_hz])
+        kept = rows[(rng.random(len(rows)) >= MISSING_SHARE) | (rows == 0) | (rows == rows[-1])]
+        yield truth, truth.t_s[kept], truth.xy_m[kept] + rng.normal(0.0, sigma_m, (len(kept), 2))
+
+
+def standing_verdicts(truth: Truth, velocity_mps: Array) -> tuple[float, float]:
+    """Shares of the times at which it stands, and at which it moves by more than 0.2 m/s, that are taken for standing."""
+    called = np.hypot(*velocity_mps.T) < STANDING_MPS
+    return float(called[truth.speed_mps == 0].mean()), float(called[truth.speed_mps > SURELY_MOVING_MPS].mean())

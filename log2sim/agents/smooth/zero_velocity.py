@@ -14,7 +14,7 @@ from log2sim.geometry import Array
 
 # Candidates are spans in which the smoothed speed stays below this, plus as many of its standard deviations.
 CANDIDATE_MPS, CANDIDATE_SIGMAS = 0.4, 2.0
-MIN_SPAN_S, MIN_OBSERVATIONS = 0.8, 6
+MIN_SPAN_S, MIN_OBSERVATIONS = 0.8, 4
 # A drift is motion when it is this significant and faster than the outline of a standing object seems to move.
 DRIFT_SIGMAS, MIN_DRIFT_MPS = 3.0, 0.05
 SCATTER_SIGMAS = 3.0
@@ -71,8 +71,9 @@ def _trim_to_standstill(measurement: MeasurementModel, rows: NDArray[np.intp], s
     while len(rows) >= MIN_OBSERVATIONS and t[rows[-1]] - t[rows[0]] >= MIN_SPAN_S:
         first, last = _end_discrepancies(t[rows], xy[rows], information[rows])
         if max(first, last) < 1.0:
-            # Where one end was cut off, what is next to it is in doubt.
-            margin = max(len(rows) // 10, 2)
+            # Where one end was cut off, the observations next to it are in doubt; one is enough where it covers the edge.
+            step_s = (t[rows[-1]] - t[rows[0]]) / (len(rows) - 1)
+            margin = max(len(rows) // 10, 1 if step_s > EDGE_S else 2)
             return rows[margin * (rows[0] > begin) : len(rows) - margin * (rows[-1] < end)]
         cut = max(len(rows) // 10, 1)
         if first == last:
@@ -101,7 +102,7 @@ def _end_discrepancies(t: Array, xy: Array, information: Array) -> tuple[float, 
     )
     if whole >= 1.0:
         return whole, whole
-    quarter = max(len(t) // 4, MIN_OBSERVATIONS // 3)
+    quarter = max(len(t) // 4, 1 if len(t) < 6 else 2)
     parts = slice(quarter), slice(quarter, -quarter), slice(-quarter, None)
     sums = [float(information[part].sum()) for part in parts]
     means = [information[part] @ xy[part] / s for part, s in zip(parts, sums)]
