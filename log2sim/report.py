@@ -75,6 +75,7 @@ def _homography_entry(ground: CameraHomography, method: str) -> dict[str, Any]:
         "error_m": rounded(fit.error_m, 4),
         "jitter_m": rounded(fit.jitter_m, 4),
         "condition": rounded(fit.condition, 3),
+        "pitch_roll": None if fit.pitch_roll is None else fit.pitch_roll.to_dict(),
     }
 
 

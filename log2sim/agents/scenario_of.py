@@ -70,5 +70,6 @@ def _camera_entry(name: str, ground: CameraHomography | None, used: bool) -> dic
             "correspondences": len(fit.inliers),
             "error_m": finite_error,
             "condition": float(fit.condition),
+            "pitch_roll": None if fit.pitch_roll is None else fit.pitch_roll.to_dict(),
         },
     }

@@ -123,15 +123,18 @@ def place_by_homography(
     `across` says whether several cameras may have seen the same obstacle, see `fuse`. Returns the measurements of all
     ticks.
     """
-    ticks = zip(observed.measurements, observed.obstacles, strict=True)
-    return [_place_tick(log, m, o, homographies, across) for m, o in ticks]
+    out = []
+    for tick, (m, obstacles) in enumerate(zip(observed.measurements, observed.obstacles, strict=True)):
+        h = {name: homography.fit.at_tick(tick) for name, homography in homographies.items()}
+        out.append(_place_tick(log, m, obstacles, {name: v for name, v in h.items() if v is not None}, across))
+    return out
 
 
 def _place_tick(
     log: Log,
     m: Measurements,
     obstacles: Obstacles | None,
-    homographies: Mapping[str, CameraHomography],
+    ground_H_image: Mapping[str, Array],
     across: bool,
 ) -> Measurements:
     missing = np.flatnonzero(m.source == "")
@@ -140,17 +143,15 @@ def _place_tick(
     columns: dict[str, Any] = {k: v.copy() if isinstance(v, np.ndarray) else v for k, v in vars(m).items()}
     poses: dict[tuple[str, int], tuple[Array, Array]] = {}
     for k in missing:
-        homography = homographies.get(str(m.camera[k]))
-        if homography is None or not homography.fit.ok or not _has_foot(homography.camera, m.box_px[k]):
+        camera = log.cameras.get(str(m.camera[k]))
+        if camera is None or camera.name not in ground_H_image or not _has_foot(camera, m.box_px[k]):
             continue
-        frame = (homography.camera.name, int(m.t_ns[k]))
+        frame = (camera.name, int(m.t_ns[k]))
         if frame not in poses:
             map_T_base = base_pose(log, frame[1])
-            poses[frame] = map_T_base, _camera_xy(log, homography.camera, map_T_base, frame[1])
+            poses[frame] = map_T_base, _camera_xy(log, camera, map_T_base, frame[1])
         map_T_base, camera_xy = poses[frame]
-        placed = place_obstacle(
-            homography.fit.ground_H_image, homography.camera, m.box_px[k], str(m.category[k]), camera_xy
-        )
+        placed = place_obstacle(ground_H_image[camera.name], camera, m.box_px[k], str(m.category[k]), camera_xy)
         if placed is None:
             continue
         if obstacles is not None:

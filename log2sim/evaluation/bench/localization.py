@@ -259,13 +259,10 @@ def _places(log: Log, tick: int, m: Measurements, ground: CameraHomography) -> A
 
 
 def at_tick(ground: CameraHomography, tick: int) -> CameraHomography:
-    """Select a camera's homography of one tick; NaN when homographies are per tick and this one was not fitted."""
-    fit = ground.fit
-    if fit.per_tick is None or not fit.ok:
-        return ground
-    k = np.flatnonzero(fit.ticks == tick)
-    own = fit.per_tick[k[0]] if len(k) else np.full((3, 3), np.nan)
-    return replace(ground, fit=replace(fit, ground_H_image=own, ok=bool(np.isfinite(own).all())))
+    """Select a camera's homography of one tick; refused when the tick has none."""
+    own = ground.fit.at_tick(tick)
+    h = np.full((3, 3), np.nan) if own is None else own
+    return replace(ground, fit=replace(ground.fit, ground_H_image=h, per_tick=None, ok=own is not None))
 
 
 def _in_order(asked: Measurements, found: Measurements) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +54,11 @@ class Correspondences:
     def __len__(self) -> int:
         """Return the number of correspondences."""
         return len(self.uv)
+
+    def take(self, index: Any) -> Correspondences:
+        """Select the rows at `index` (integers or a mask)."""
+        by_size = None if self.xy_by_size is None else self.xy_by_size[index]
+        return Correspondences(self.uv[index], self.xy_ego[index], self.tick[index], by_size)
 
     @classmethod
     def join(cls, parts: Sequence[Correspondences]) -> Correspondences:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.documents import rounded
 from log2sim.geometry import Array, apply_homography
 from log2sim.perception.homography.normalized import CHI2_2DOF_99
 from log2sim.perception.homography.ransac import RobustFit
@@ -15,6 +16,44 @@ from log2sim.perception.homography.validation import validate_fit
 
 # Ground points straight ahead, m, at which the jitter of a homography is measured.
 JITTER_PROBES_M = np.array([[10.0, 0.0], [20.0, 0.0], [40.0, 0.0]])
+
+
+@dataclass(frozen=True)
+class PitchRoll:
+    """Outcome of the decision, with the movement that was estimated.
+
+    Attributes
+    ----------
+    per_tick : bool
+        Whether each tick has its own pitch and roll.
+    source : str
+        Correspondences that the angles were estimated from.
+    pitch_sigma_deg, roll_sigma_deg : float
+        Standard deviations of the angles over the ticks, degrees.
+    held_out_px : (float, float)
+        Median error of held-out correspondences in the image with one homography and with one a tick, px.
+    significance : float
+        Fall of the held-out loss in standard errors.
+    """
+
+    per_tick: bool
+    source: str
+    pitch_sigma_deg: float
+    roll_sigma_deg: float
+    held_out_px: tuple[float, float]
+    significance: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Convert to a JSON document, as it is written in scenarios and reports."""
+        before, after = self.held_out_px
+        return {
+            "per_tick": self.per_tick,
+            "source": self.source,
+            "pitch_sigma_deg": rounded(self.pitch_sigma_deg, 4),
+            "roll_sigma_deg": rounded(self.roll_sigma_deg, 4),
+            "held_out_px": {"fixed": rounded(before, 3), "per_tick": rounded(after, 3)},
+            "significance": rounded(self.significance, 2),
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,9 +78,11 @@ class HomographyFit:
     ticks : (T,) int64
         Ticks that had correspondences, ascending.
     per_tick : (T, 3, 3) float64 or None
-        One homography a tick, where the method has them; NaN where a tick has none.
+        One homography a tick, where the camera pitches or the method fits single frames; NaN where a tick has none.
     sigma_m : float
         Standard deviation of the homography on the ground, m, one spread of the inliers from their mean.
+    pitch_roll : PitchRoll or None
+        Whether each tick has its own pitch and roll, and by how much they vary; None where that was not tested.
     """
 
     ok: bool
@@ -53,6 +94,18 @@ class HomographyFit:
     ticks: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     per_tick: Array | None = None
     sigma_m: float = float("nan")
+    pitch_roll: PitchRoll | None = None
+
+    def at_tick(self, tick: int) -> Array | None:
+        """Return the homography (3, 3) of a tick; None where a method of single frames has none for it."""
+        if not self.ok:
+            return None
+        if self.per_tick is None:
+            return self.ground_H_image
+        k = int(np.searchsorted(self.ticks, tick))
+        if k < len(self.ticks) and self.ticks[k] == tick:
+            return np.asarray(self.per_tick[k]) if np.isfinite(self.per_tick[k]).all() else None
+        return None if self.pitch_roll is None else self.ground_H_image
 
     @property
     def jitter_m(self) -> float:
