@@ -17,7 +17,7 @@ from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
 from log2sim.visualization.plot.animation import TRACK_ALPHA, AnimatedArtists, FrameTiming
 from log2sim.visualization.plot.collisions import new_collisions
-from log2sim.visualization.plot.layout import Layout
+from log2sim.visualization.plot.layout import FigureLayout
 from log2sim.visualization.plot.roles import assign_roles
 from log2sim.visualization.plot.scene import draw_base
 from log2sim.visualization.plot.style import ALARM
@@ -43,11 +43,11 @@ def reckless() -> tuple[Scenario, Replay]:
     return scenario, replay(scenario, ego=lambda seen: Controls(2.0, 0.0002))
 
 
-def layout_of(scenario: Scenario, result: Replay | None) -> Layout:
+def layout_of(scenario: Scenario, result: Replay | None) -> FigureLayout:
     return still(scenario, assign_roles(scenario), replay=result)
 
 
-def chart_axes(layout: Layout) -> list:
+def chart_axes(layout: FigureLayout) -> list:
     return [ax for ax in layout.figure.axes if ax.get_legend() is not None]
 
 
@@ -92,8 +92,8 @@ def test_the_charts_show_commands_response_and_errors() -> None:
         (("pedal", 0), ego.commands.pedal_mps2),
         (("pedal", 1), ego.accel_mps2),
         (("steering", 0), np.degrees(ego.commands.steer_rad)),
-        (("off the log", 1), ego.cross_track_m),
-        (("off the log", 0), ego.along_track_m),
+        (("tracking error", 1), ego.cross_track_m),
+        (("tracking error", 0), ego.along_track_m),
     ):
         np.testing.assert_allclose(by_label[key].get_ydata(), expected)
 
@@ -104,7 +104,7 @@ def test_who_walks_has_no_pedal_and_no_wheel() -> None:
     scenario = scenario_of(walker)
     timeline = timeline_of(replay(scenario), scenario, assign_roles(scenario))
     assert timeline is not None
-    assert [s.name for s in timeline.charts] == ["speed", "off the log"]
+    assert [s.name for s in timeline.charts] == ["speed", "tracking error"]
 
 
 def test_in_reverse_the_pedal_is_that_of_the_gear() -> None:
@@ -159,7 +159,7 @@ def test_collisions_that_the_log_has_not_are_marked_between_the_boxes() -> None:
     ego = result.agent("ego")
     middle = (np.interp(event["t_s"], ego.t_s, ego.x_m) + 120.0) / 2
     assert places[0, 0] == pytest.approx(middle)
-    assert "collides, not in the log" in [
+    assert "collision, not in the log" in [
         t.get_text() for t in layout_of(scenario, result).figure.legends[0].get_texts()
     ]
     assert len(new_collisions(replay(scenario))[0]) == 0

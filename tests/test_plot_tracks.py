@@ -13,7 +13,7 @@ from log2sim.errors import ConfigError
 from log2sim.simulation.runner import replay
 from log2sim.visualization.plot import shapes
 from log2sim.visualization.plot.animation import AnimatedArtists
-from log2sim.visualization.plot.layout import Layout
+from log2sim.visualization.plot.layout import FigureLayout
 from log2sim.visualization.plot.roles import assign_roles
 from log2sim.visualization.plot.style import PALETTE, printable
 from log2sim.visualization.plot.tracks import plot_tracks, still
@@ -142,11 +142,11 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(
     assert list(tmp_path.iterdir()) == [out]
 
 
-def draw(scenario: Scenario, **overlays: object) -> Layout:
+def draw(scenario: Scenario, **overlays: object) -> FigureLayout:
     return still(scenario, assign_roles(scenario), **overlays)  # type: ignore[arg-type]
 
 
-def texts(sheet: Layout) -> list[str]:
+def texts(sheet: FigureLayout) -> list[str]:
     return [t.get_text() for legend in sheet.figure.legends for t in legend.get_texts()]
 
 
@@ -212,7 +212,7 @@ def test_every_kind_of_scene_can_be_drawn(tmp_path: Path, scenario: Scenario, su
 
 def test_a_crowd_of_500_is_summed_up_in_the_legend() -> None:
     rows = texts(draw(many(500)))
-    assert f"{500 - len(PALETTE)} more moving, farther off" in rows
+    assert f"{500 - len(PALETTE)} more moving, farther away" in rows
     assert len(rows) <= len(PALETTE) + 8
 
 

@@ -19,7 +19,7 @@ from log2sim.errors import ConfigError
 from log2sim.geometry import Array
 from log2sim.visualization.plot import drawing, shapes
 from log2sim.visualization.plot.collisions import new_collisions
-from log2sim.visualization.plot.layout import SIDE_IN, TOP_IN, WIDTH_IN, Layout
+from log2sim.visualization.plot.layout import SIDE_IN, TOP_IN, WIDTH_IN, FigureLayout
 from log2sim.visualization.plot.roles import AgentRoles, centers_xy
 from log2sim.visualization.plot.scene import draw_base
 from log2sim.visualization.plot.style import ALARM, FONT, INK, PAPER, halo
@@ -97,7 +97,7 @@ def write_animation(
             _write_mp4(frames, temporary, out_path)
 
 
-def _frames(layout: Layout, artists: AnimatedArtists, timing: FrameTiming) -> Iterator[Image]:
+def _frames(layout: FigureLayout, artists: AnimatedArtists, timing: FrameTiming) -> Iterator[Image]:
     """Yield RGB frames (H, W, 3); static artists are drawn once."""
     canvas: Any = layout.canvas  # its methods have no type hints
     canvas.draw()
@@ -113,7 +113,7 @@ class AnimatedArtists:
 
     def __init__(
         self,
-        layout: Layout,
+        layout: FigureLayout,
         roles: AgentRoles,
         replay: Any,
         truth: Scenario | None,

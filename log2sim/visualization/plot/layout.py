@@ -30,6 +30,9 @@ from log2sim.visualization.plot.style import (
 )
 from log2sim.visualization.plot.viewport import Viewport, nice_step
 
+MIN_SPEED_MPS = 0.15
+"""A slower agent is called stationary: its speed would be 0 km/h."""
+
 WIDTH_IN = 10.0
 LEFT_IN, SIDE_IN, TOP_IN, BOTTOM_IN, GAP_IN = 0.72, 2.3, 0.74, 0.52, 0.2
 MIN_MAP_IN, MAX_MAP_IN = 3.4, 8.4
@@ -39,7 +42,7 @@ CHART_IN, CHART_GAP_IN, TIME_IN, HEAD_IN = 0.56, 0.12, 0.36, 0.26
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class FigureLayout:
     """A figure and its parts.
 
     Attributes
@@ -61,7 +64,7 @@ class Layout:
     foot_in: float = 0.0
 
 
-def make_layout(view: Viewport, legend_rows: int, *, projected: bool, foot_in: float = 0.0) -> Layout:
+def make_layout(view: Viewport, legend_rows: int, *, projected: bool, foot_in: float = 0.0) -> FigureLayout:
     """Lay out a figure whose map has the proportions of the view within limits, above `foot_in` inches for charts."""
     map_width = WIDTH_IN - LEFT_IN - SIDE_IN - GAP_IN
     wanted = map_width * view.height_m / view.width_m
@@ -76,10 +79,10 @@ def make_layout(view: Viewport, legend_rows: int, *, projected: bool, foot_in: f
     ax.set(xlim=(fitted.x0, fitted.x1), ylim=(fitted.y0, fitted.y1), facecolor="#FBFCFD")
     ax.set_aspect("equal", adjustable="box")
     _axes_style(ax, fitted, projected)
-    return Layout(figure, canvas, ax, fitted, foot_in)
+    return FigureLayout(figure, canvas, ax, fitted, foot_in)
 
 
-def write_title(layout: Layout, title: str, subtitle: str) -> None:
+def write_title(layout: FigureLayout, title: str, subtitle: str) -> None:
     """Write the title and a smaller line below it, flush with the map's left edge."""
     height = layout.figure.get_figheight()
     style: dict[str, Any] = {"family": FONT, "ha": "left", "va": "baseline", "parse_math": False}
@@ -88,7 +91,7 @@ def write_title(layout: Layout, title: str, subtitle: str) -> None:
     layout.figure.text(x, 1 - 0.59 / height, printable(subtitle, 130), fontsize=8, color=MUTED, **style)
 
 
-def draw_legend(layout: Layout, rows: list[tuple[Any, str]]) -> None:
+def draw_legend(layout: FigureLayout, rows: list[tuple[Any, str]]) -> None:
     """Draw the legend in the column beside the map, where it covers nothing."""
     height = layout.figure.get_figheight()
     x = (WIDTH_IN - SIDE_IN) / WIDTH_IN
@@ -112,26 +115,26 @@ def legend_rows(
             rows.append((_line(role.color, lw=2.4 if role.is_ego else 1.7, marker=marker, ms=4.6), _name(role)))
     rest = sum(not r.leading for r in roles.movers)
     if rest:
-        rows.append((_line(CROWD_COLOR, lw=1.0), f"{rest} more moving, farther off"))
+        rows.append((_line(CROWD_COLOR, lw=1.0), f"{rest} more moving, farther away"))
     if roles.standing:
-        rows.append((Patch(fc=PARKED_FACE, ec=PARKED_EDGE, lw=0.6), f"{len(roles.standing)} standing"))
+        rows.append((Patch(fc=PARKED_FACE, ec=PARKED_EDGE, lw=0.6), f"{len(roles.standing)} stationary"))
     if roles.movers and mark_step_s is not None:
         rows.append((Patch(fc=PAPER, ec=MUTED, lw=0.9), "start (hollow), end (filled)"))
         rows.append((_line("none", marker="o", ms=3.2, mfc=PAPER, mec=MUTED, mew=0.9), f"every {mark_step_s:g} s"))
     if mark_step_s is not None and any(not r.agent.waypoints.observed.all() for r in roles.movers):
-        rows.append((_line(MUTED, lw=1.3, ls=(0, (2.2, 1.8))), "not observed, filled"))
+        rows.append((_line(MUTED, lw=1.3, ls=(0, (2.2, 1.8))), "not observed, interpolated"))
     if truth:
         rows.append((_line(INK, lw=0.8, ls=(0, (3, 2))), "truth"))
     if replay:
         rows.append((_line(MUTED, lw=1.9, ls=(0, (0.1, 1.6)), dash_capstyle="round"), "replay"))
     if collisions:
-        rows.append((Line2D([], [], ls="none", **{**COLLISION_MARK, "ms": 6.0}), "collides, not in the log"))
+        rows.append((Line2D([], [], ls="none", **{**COLLISION_MARK, "ms": 6.0}), "collision, not in the log"))
     if outside:
         rows.append((_line("none"), f"{outside} outside this view"))
     return rows
 
 
-def draw_scale_and_north(layout: Layout, *, projected: bool) -> None:
+def draw_scale_and_north(layout: FigureLayout, *, projected: bool) -> None:
     """Draw a scale bar of a round length at the foot of the column, and a north arrow on a projected map."""
     height = layout.figure.get_figheight()
     m_per_in = layout.view.m_per_pt * 72
@@ -177,7 +180,7 @@ def _reading_order(role: AgentRole) -> tuple[bool, int, str]:
 
 def _name(role: AgentRole) -> str:
     speed = float(np.max(np.abs(role.agent.waypoints.speed_mps)))
-    moving = f"{speed * 3.6:.0f} km/h" if speed >= 0.15 else "stands"
+    moving = f"{speed * 3.6:.0f} km/h" if speed >= MIN_SPEED_MPS else "stationary"
     if role.is_ego:
         return f"ego · {moving}"
     if role.agent.id.startswith(role.agent.category):

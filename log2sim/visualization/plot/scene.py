@@ -10,7 +10,7 @@ from log2sim.datatypes import Scenario
 from log2sim.visualization.plot import drawing
 from log2sim.visualization.plot.collisions import new_collisions
 from log2sim.visualization.plot.layout import (
-    Layout,
+    FigureLayout,
     draw_legend,
     draw_scale_and_north,
     legend_rows,
@@ -31,7 +31,7 @@ def draw_base(
     background: drawing.Background | None = None,
     title: str | None = None,
     moving: bool = False,
-) -> tuple[Layout, float, TimelineCharts | None]:
+) -> tuple[FigureLayout, float, TimelineCharts | None]:
     """Draw what stills and animations share.
 
     Returns

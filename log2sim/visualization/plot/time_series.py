@@ -22,7 +22,7 @@ from log2sim.visualization.plot.layout import (
     SIDE_IN,
     TIME_IN,
     WIDTH_IN,
-    Layout,
+    FigureLayout,
 )
 from log2sim.visualization.plot.roles import AgentRole, AgentRoles
 from log2sim.visualization.plot.style import ALARM, FONT, FRAME, GRID, INK, MUTED, PAPER, halo, printable
@@ -115,12 +115,12 @@ def _strips(agent: Any, role: AgentRole) -> tuple[Chart, ...]:
         # The pedal acts along the gear's direction, which in reverse is against the heading.
         response = agent.accel_mps2 * commands.gear
         out += [
-            Chart("pedal", "m/s²", 1.0, (Curve("told", t, commands.pedal_mps2, "ribbon"), Curve("done", t, response))),
+            Chart("pedal", "m/s²", 1.0, (Curve("command", t, commands.pedal_mps2, "ribbon"), Curve("response", t, response))),
             Chart(
                 "steering", "°", 2.0,
                 (
-                    Curve("told", t, np.degrees(commands.steer_rad), "ribbon"),
-                    Curve("done", t, np.degrees(agent.steer_rad)),
+                    Curve("command", t, np.degrees(commands.steer_rad), "ribbon"),
+                    Curve("response", t, np.degrees(agent.steer_rad)),
                 ),
             ),
         ]  # fmt: skip
@@ -128,7 +128,7 @@ def _strips(agent: Any, role: AgentRole) -> tuple[Chart, ...]:
         Curve("along (+ ahead)", t, agent.along_track_m, "muted"),
         Curve("across (+ left)", t, agent.cross_track_m),
     )
-    return (*out, Chart("off the log", "m", 0.1, lines))
+    return (*out, Chart("tracking error", "m", 0.1, lines))
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +172,7 @@ class TimelineCharts:
 
 
 def draw_charts(
-    layout: Layout, timeline: AgentTimeline, span_s: tuple[float, float], *, moving: bool
+    layout: FigureLayout, timeline: AgentTimeline, span_s: tuple[float, float], *, moving: bool
 ) -> TimelineCharts:
     """Draw the charts below the map; a still shows the largest values, an animation the present ones."""
     height = layout.figure.get_figheight()

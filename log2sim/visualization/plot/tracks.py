@@ -13,7 +13,7 @@ from log2sim.errors import ConfigError
 from log2sim.visualization.plot import drawing
 from log2sim.visualization.plot.collisions import new_collisions
 from log2sim.visualization.plot.layout import (
-    Layout,
+    FigureLayout,
 )
 from log2sim.visualization.plot.roles import AgentRoles, assign_roles
 from log2sim.visualization.plot.scene import draw_base
@@ -87,7 +87,7 @@ def still(
     truth: Scenario | None = None,
     background: drawing.Background | None = None,
     title: str | None = None,
-) -> Layout:
+) -> FigureLayout:
     """Draw a still picture."""
     layout, step_s, _ = draw_base(scenario, roles, replay=replay, truth=truth, background=background, title=title)
     overlaid = truth is not None or replay is not None
