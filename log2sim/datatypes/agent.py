@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from log2sim.datatypes.categories import CATEGORIES
+from log2sim.datatypes.trajectory import Trajectory
 from log2sim.datatypes.waypoints import Waypoints
 from log2sim.errors import ScenarioError
-from log2sim.geometry import Array, wrap_angle
+from log2sim.geometry import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +80,13 @@ class Agent:
         """Whether it is a static agent with a single waypoint, which is present during the whole scenario."""
         return self.static and len(self.waypoints) == 1
 
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """The spline through the waypoints."""
+        return Trajectory.through(self.waypoints, self.rear_axle_offset_m)
+
     def at(self, t_s: ArrayLike, max_gap_s: float = math.inf, margin_s: float = 1e-6) -> AgentStates:
-        """Interpolate the trajectory linearly, yaw along the shorter arc.
+        """Evaluate the trajectory at times: positions by cubics with the logged velocities, yaw along the shorter arc.
 
         Parameters
         ----------
@@ -95,9 +102,8 @@ class Agent:
             i = np.clip(np.searchsorted(w.t_s, t, side="right") - 1, 0, len(w) - 2)
             on_waypoint = np.minimum(np.abs(t - w.t_s[i]), np.abs(w.t_s[i + 1] - t)) <= margin_s
             valid &= on_waypoint | (w.t_s[i + 1] - w.t_s[i] <= max_gap_s)
-        columns = {k: np.interp(t, w.t_s, getattr(w, k)) for k in ("x_m", "y_m", "z_m", "speed_mps")}
-        columns["yaw_rad"] = wrap_angle(np.interp(t, w.t_s, np.unwrap(w.yaw_rad)))
-        return AgentStates(valid=valid, **{k: np.where(valid, v, np.nan) for k, v in columns.items()})
+        states = self.trajectory.at(t)
+        return AgentStates(valid=valid, **{k: np.where(valid, v, np.nan) for k, v in states._asdict().items()})
 
 
 def agent_to_dict(agent: Agent) -> dict[str, Any]:

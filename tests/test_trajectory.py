@@ -1,0 +1,130 @@
+"""Trajectories against closed forms and their invariances."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from log2sim.datatypes import Agent, Trajectory, Waypoints
+from log2sim.geometry import Array, wrap_angle
+
+finite = st.floats(-50.0, 50.0)
+
+
+def waypoints(t_s: Array, x: Array, y: Array, yaw: Array, speed: Array) -> Waypoints:
+    t, x, y, yaw, speed = (np.asarray(c, dtype=np.float64) + np.zeros(len(t_s)) for c in (t_s, x, y, yaw, speed))
+    return Waypoints(t, x, y, 0.1 * t, yaw, speed, np.ones(len(t), bool), np.zeros(len(t)))
+
+
+@st.composite
+def rides(draw: st.DrawFn) -> Waypoints:
+    """Waypoints of a smooth ride: an arc with constant acceleration, at irregular times."""
+    count = draw(st.integers(2, 12))
+    steps = draw(st.lists(st.floats(0.05, 0.5), min_size=count - 1, max_size=count - 1))
+    t = np.concatenate([[0.0], np.cumsum(steps)]) + draw(st.floats(-5.0, 5.0))
+    since = t - t[0]
+    speed0, accel, curvature = draw(st.floats(0.0, 20.0)), draw(st.floats(0.0, 2.0)), draw(st.floats(-0.05, 0.05))
+    yaw0 = draw(st.floats(-np.pi, np.pi))
+    fine = np.linspace(0.0, since[-1], 4001)
+    way = speed0 * fine + accel * fine**2 / 2
+    yaw = yaw0 + curvature * way
+    vx, vy = (speed0 + accel * fine) * np.cos(yaw), (speed0 + accel * fine) * np.sin(yaw)
+    x = np.concatenate([[0.0], np.cumsum((vx[1:] + vx[:-1]) / 2 * np.diff(fine))]) + draw(finite)
+    y = np.concatenate([[0.0], np.cumsum((vy[1:] + vy[:-1]) / 2 * np.diff(fine))]) + draw(finite)
+    at = (np.interp(since, fine, c) for c in (x, y, yaw, speed0 + accel * fine))
+    return waypoints(t, *at)
+
+
+def between(w: Waypoints, count: int = 101) -> Array:
+    return np.linspace(w.t_s[0], w.t_s[-1], count)
+
+
+@given(rides())
+@settings(max_examples=60, deadline=None)
+def test_at_a_waypoint_the_state_is_the_waypoint(w: Waypoints) -> None:
+    states = Trajectory.through(w).at(w.t_s)
+    for key in ("x_m", "y_m", "z_m", "speed_mps"):
+        np.testing.assert_allclose(getattr(states, key), getattr(w, key), atol=1e-9)
+    np.testing.assert_allclose(wrap_angle(states.yaw_rad - w.yaw_rad), 0.0, atol=1e-9)
+
+
+@given(rides(), finite, finite, st.floats(-np.pi, np.pi))
+@settings(max_examples=60, deadline=None)
+def test_a_rigid_motion_of_the_map_moves_all_states_alike(w: Waypoints, dx: float, dy: float, turn: float) -> None:
+    cos, sin = np.cos(turn), np.sin(turn)
+    moved = waypoints(
+        w.t_s, dx + cos * w.x_m - sin * w.y_m, dy + sin * w.x_m + cos * w.y_m, w.yaw_rad + turn, w.speed_mps
+    )
+    a, b = (Trajectory.through(v, 1.3).at(between(w)) for v in (w, moved))
+    np.testing.assert_allclose(b.x_m, dx + cos * a.x_m - sin * a.y_m, atol=1e-6)
+    np.testing.assert_allclose(b.y_m, dy + sin * a.x_m + cos * a.y_m, atol=1e-6)
+    np.testing.assert_allclose(wrap_angle(b.yaw_rad - a.yaw_rad - turn), 0.0, atol=1e-9)
+
+
+@given(rides(), st.floats(-1000.0, 1000.0))
+@settings(max_examples=40, deadline=None)
+def test_a_shift_of_time_shifts_the_trajectory(w: Waypoints, later_s: float) -> None:
+    later = waypoints(w.t_s + later_s, w.x_m, w.y_m, w.yaw_rad, w.speed_mps)
+    a, b = Trajectory.through(w).at(between(w)), Trajectory.through(later).at(between(w) + later_s)
+    np.testing.assert_allclose([b.x_m, b.y_m, b.speed_mps], [a.x_m, a.y_m, a.speed_mps], atol=1e-6)
+
+
+@given(rides())
+@settings(max_examples=40, deadline=None)
+def test_the_trajectory_is_continuous_with_the_logged_velocity(w: Waypoints) -> None:
+    t = between(w, 2001)
+    states = Trajectory.through(w).at(t)
+    step = np.hypot(np.diff(states.x_m), np.diff(states.y_m))
+    assert np.all(step <= (w.speed_mps.max() * 1.5 + 1.0) * (t[1] - t[0]) + 1e-9)
+
+
+@given(st.floats(-30.0, 30.0), st.floats(-np.pi, np.pi))
+@settings(max_examples=60, deadline=None)
+def test_constant_velocity_is_exact(speed: float, yaw: float) -> None:
+    t = np.array([0.0, 0.1, 0.35, 1.0, 1.1])
+    w = waypoints(t, 3.0 + speed * np.cos(yaw) * t, -2.0 + speed * np.sin(yaw) * t, yaw, speed)
+    states = Trajectory.through(w).at(between(w))
+    np.testing.assert_allclose(states.x_m, 3.0 + speed * np.cos(yaw) * between(w), atol=1e-9)
+    np.testing.assert_allclose(states.y_m, -2.0 + speed * np.sin(yaw) * between(w), atol=1e-9)
+    np.testing.assert_allclose(states.speed_mps, speed, atol=1e-9)
+
+
+def test_a_circle_is_followed_to_a_millimeter_where_chords_cut_it_by_centimeters() -> None:
+    t = np.arange(0.0, 4.01, 0.25)
+    rate, radius = 0.5, 10.0
+    w = waypoints(
+        t, radius * np.cos(rate * t), radius * np.sin(rate * t), wrap_angle(rate * t + np.pi / 2), rate * radius
+    )
+    states = Trajectory.through(w).at(between(w, 1001))
+    assert np.abs(np.hypot(states.x_m, states.y_m) - radius).max() < 1e-3
+    assert radius * (1 - np.cos(rate * 0.125)) > 0.01
+
+
+@given(st.floats(2.5, 3.1), st.floats(2.5, 3.1))
+@settings(max_examples=30, deadline=None)
+def test_yaw_takes_the_shorter_arc(before: float, after: float) -> None:
+    w = waypoints(np.array([0.0, 1.0]), 0.0, 0.0, np.array([before, -after]), 0.0)
+    yaw = Trajectory.through(w).at(between(w)).yaw_rad
+    assert np.all(np.abs(yaw) >= 2.5 - 1e-9)
+    assert np.all((-np.pi <= yaw) & (yaw < np.pi))
+
+
+def test_before_a_discontinuity_the_agent_goes_straight_on() -> None:
+    t = np.arange(0.0, 2.01, 0.1)
+    w = waypoints(t, 5 * t + np.where(t > 1.05, 30.0, 0.0), 0.0, 0.0, 5.0)
+    trajectory = Trajectory.through(w)
+    assert trajectory.discontinuity_times() == pytest.approx([1.1])
+    np.testing.assert_allclose(trajectory.at(np.array([1.05, 1.0999])).x_m, [5.25, 5.4995], atol=1e-9)
+    assert trajectory.at(np.array([1.1])).x_m == pytest.approx([35.5])
+
+
+def test_an_agent_is_where_its_trajectory_is_and_nowhere_outside_it() -> None:
+    t = np.arange(0.0, 1.01, 0.1)
+    w = waypoints(t, 8 * t + t**2, 0.3 * t, 0.04, 8 + 2 * t)
+    agent = Agent("a", "car", (4.0, 1.8, 1.5), w, rear_axle_offset_m=1.3)
+    inside, at = np.array([0.0, 0.05, 0.83, 1.0]), Trajectory.through(w, 1.3)
+    np.testing.assert_array_equal(agent.at(inside).x_m, at.at(inside).x_m)
+    assert agent.at([-0.1, 1.1]).valid.tolist() == [False, False]
+    assert np.isnan(agent.at([-0.1, 1.1]).x_m).all()
