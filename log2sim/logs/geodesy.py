@@ -27,20 +27,20 @@ def transverse_mercator(latitude_deg: float, longitude_deg: float) -> str:
     return f"+proj=tmerc +lat_0={latitude_deg!r} +lon_0={longitude_deg!r} +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m +no_defs"
 
 
-def poses_from_geodetic(
-    map_frame: MapFrame,
-    latitude_deg: Array,
-    longitude_deg: Array,
-    altitude_m: Array,
-    roll_rad: Array,
-    pitch_rad: Array,
-    yaw_rad: Array,
-    *,
-    where: str,
-) -> Array:
+def poses_from_geodetic(map_frame: MapFrame, position: Array, attitude_rad: Array, *, where: str) -> Array:
     """Poses (N, 4, 4) in projected coordinates of `map_frame`, before its offset is subtracted.
 
     Yaw is counter-clockwise from true east and is turned to the grid's east by the meridian convergence.
+
+    Parameters
+    ----------
+    map_frame : MapFrame
+    position : (N, 3) float64
+        Latitude and longitude in deg, altitude in m.
+    attitude_rad : (N, 3) float64, rad
+        Roll, pitch, yaw.
+    where : str
+        Names the projection in messages.
 
     Raises
     ------
@@ -48,12 +48,14 @@ def poses_from_geodetic(
         When the projection is not one that PROJ knows or does not reach the points; begins with `where`.
     """
     forward = _projection(map_frame, where)
+    latitude_deg, longitude_deg, altitude_m = (np.ascontiguousarray(c) for c in position.T)
+    roll_rad, pitch_rad, yaw_rad = attitude_rad.T
     x, y = forward(longitude_deg, latitude_deg)
-    north_x, north_y = forward(longitude_deg, np.asarray(latitude_deg) + NORTH_STEP_DEG)
+    north_x, north_y = forward(longitude_deg, latitude_deg + NORTH_STEP_DEG)
     if not (np.isfinite(x).all() and np.isfinite(north_x).all()):
         raise LogError(f"{where}: the projection '{map_frame.projection}' does not reach the GNSS fixes of the log")
     convergence = np.arctan2(-(north_x - x), north_y - y)
-    z = np.asarray(altitude_m) - (map_frame.altitude_m or 0.0)
+    z = altitude_m - (map_frame.altitude_m or 0.0)
     return transform(rotation_from_rpy(roll_rad, pitch_rad, yaw_rad + convergence), np.stack([x, y, z], axis=-1))
 
 

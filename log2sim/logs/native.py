@@ -133,7 +133,10 @@ class _Folder:
             _check_geodetic(table)
             map_frame = map_frame_of(map_frame, *(float(table[f][0]) for f in GNSS_FIELDS[:3]))
             poses = poses_from_geodetic(
-                map_frame, *(table[f] for f in GNSS_FIELDS), where=f"{self.file}, field 'map.projection'"
+                map_frame,
+                table.stack(*GNSS_FIELDS[:3]),
+                table.stack(*GNSS_FIELDS[3:]),
+                where=f"{self.file}, field 'map.projection'",
             )
         keep, notes = strictly_increasing(table["t_ns"], "ego")
         self.notes += notes

@@ -172,9 +172,7 @@ def georeference(geodetic: Array, xyz_map: Array) -> tuple[MapFrame, str]:
     if np.linalg.norm(np.ptp(xyz_map[:, :2], axis=0)) < MIN_GNSS_TRACK_M:
         return local, f"the ego moves less than {MIN_GNSS_TRACK_M:g} m"
     first = MapFrame(latitude, longitude, altitude, transverse_mercator(latitude, longitude))
-    zero = np.zeros(n)
-    lat, lon, alt = geodetic[:n].T
-    east_north = poses_from_geodetic(first, lat, lon, alt, zero, zero, zero, where="meta/gps.json")[:, :2, 3]
+    east_north = poses_from_geodetic(first, geodetic[:n], np.zeros((n, 3)), where="meta/gps.json")[:, :2, 3]
     a, b = xyz_map[:n, :2] - xyz_map[:n, :2].mean(0), east_north - east_north.mean(0)
     turn = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
     if abs(turn) > MAX_GNSS_ANGLE_RAD:

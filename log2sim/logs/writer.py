@@ -8,6 +8,7 @@ import json
 import secrets
 import shutil
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -68,7 +69,7 @@ def write_log(
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
     try:
         temporary.mkdir(parents=True)
-        _write(log, temporary, jpeg_quality, ego, sweep, progress)
+        _write(log, temporary, _Encoding(jpeg_quality, ego, sweep), progress)
         if target.exists():
             shutil.rmtree(target)
         temporary.rename(target)
@@ -88,7 +89,16 @@ def _refuse(target: Path, overwrite: bool) -> None:
         raise ConfigError(f"{target}: exists and is no log folder, so it is not replaced; choose another name")
 
 
-def _write(log: Log, root: Path, jpeg_quality: int, ego: str, sweep: str, progress: Progress | None) -> None:
+@dataclass(frozen=True)
+class _Encoding:
+    """How images, ego poses and sweeps are stored: JPEG quality, "poses" or "gnss", suffix of the sweep files."""
+
+    jpeg_quality: int
+    ego: str
+    sweep: str
+
+
+def _write(log: Log, root: Path, encoding: _Encoding, progress: Progress | None) -> None:
     total = sum(len(s.t_ns) for s in log.streams.values())
     done = 0
     offset = np.array(log.map.offset_m)
@@ -100,10 +110,10 @@ def _write(log: Log, root: Path, jpeg_quality: int, ego: str, sweep: str, progre
         for i in range(len(stream.t_ns)):
             record = stream.read(i)
             if isinstance(record, Sweep):
-                files.append(_write_sweep(record, folder, i, sweep, offset))
+                files.append(_write_sweep(record, folder, i, encoding.sweep, offset))
                 frames.add(record.frame)
             else:
-                files.append(_write_image(record, folder, i, jpeg_quality))
+                files.append(_write_image(record, folder, i, encoding.jpeg_quality))
             done += 1
             if progress is not None:
                 progress(done, total)
@@ -112,7 +122,7 @@ def _write(log: Log, root: Path, jpeg_quality: int, ego: str, sweep: str, progre
         if "map" in frames:
             entry["points_frame"] = "map"
         _write_index(stream, files, root / entry["index"])
-    _write_ego(log, root, manifest, ego)
+    _write_ego(log, root, manifest, encoding.ego)
     _write_labels(log, root, manifest, offset)
     check(manifest, "log-1", ConfigError)
     (root / MANIFEST).write_text(json.dumps(manifest, indent=1, allow_nan=False) + "\n", encoding="utf-8")

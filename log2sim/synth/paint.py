@@ -16,27 +16,27 @@ GLASS = (0.055, 0.05, 0.045)
 RUBBER = (0.028, 0.027, 0.026)
 
 
-def paint(look: Appearance, part: NDArray[np.int64], points: Array, normals: Array) -> Paint:
+def paint(appearance: Appearance, part: NDArray[np.int64], points: Array, normals: Array) -> Paint:
     """Paint points (P, 3), m, agent frame (box center), with normals (P, 3) and materials (P,)."""
     out = Paint(
         np.zeros((len(part), 3), np.float32), np.zeros(len(part), np.float32), np.zeros((len(part), 3), np.float32)
     )
-    z = points[:, 2] + look.size_m[2] / 2
+    z = points[:, 2] + appearance.size_m[2] / 2
     for value in np.unique(part):
         rows = np.flatnonzero(part == value)
-        patch = Patch(look, out, rows, points[rows], z[rows], normals[rows], Material(value))
+        patch = Patch(appearance, out, rows, points[rows], z[rows], normals[rows], Material(value))
         _PAINTERS.get(Material(value), _plain)(patch)
     return out
 
 
 def _car(patch: Patch) -> None:
-    look, p, z, n = patch.look, patch.p, patch.z, patch.n
-    length, width, height = look.size_m
+    appearance, p, z, n = patch.appearance, patch.p, patch.z, patch.n
+    length, width, height = appearance.size_m
     x, y = p[:, 0], p[:, 1]
     u, h = x / length, z / height
-    line = roof_line(look.kind)
+    line = roof_line(appearance.kind)
     top = np.interp(u, line[:, 0], line[:, 1])
-    patch.fill(linear_bgr(look.color), 0.16)
+    patch.fill(linear_bgr(appearance.color), 0.16)
     side = np.abs(n[:, 1]) > 0.55
     # Seams of the doors, a dark sill and the handles.
     seams = (
@@ -45,11 +45,11 @@ def _car(patch: Patch) -> None:
         & (h < BELT)
         & (np.min(np.abs(x[:, None] - length * np.array([0.165, -0.03, -0.235])), 1) < 0.008)
     )
-    patch.set(seams, linear_bgr(look.color) * 0.25)
+    patch.set(seams, linear_bgr(appearance.color) * 0.25)
     handle = (
         side & (np.abs(h - 0.565) < 0.012) & (np.min(np.abs(x[:, None] - length * np.array([0.0, -0.2])), 1) < 0.07)
     )
-    patch.set(handle, linear_bgr(look.color) * 0.5, 0.1)
+    patch.set(handle, linear_bgr(appearance.color) * 0.5, 0.1)
     patch.set(h < 0.225, (0.05, 0.05, 0.05))
     fender = np.min(np.hypot(x[:, None] - length * np.array([WHEEL_AT, -WHEEL_AT]), z[:, None] - WHEEL_RADIUS_M), 1)
     patch.set((fender < WHEEL_RADIUS_M + 0.055) & (np.abs(y) > 0.3 * width), (0.008, 0.008, 0.008))
@@ -68,7 +68,7 @@ def _car(patch: Patch) -> None:
 
 
 def _front(patch: Patch, h: Array, u: Array) -> None:
-    y, n, width = patch.p[:, 1], patch.n, patch.look.size_m[1]
+    y, n, width = patch.p[:, 1], patch.n, patch.appearance.size_m[1]
     front = (u > 0.44) & (n[:, 0] > 0.2)
     lamp = front & (np.abs(y) > 0.27 * width) & (h > 0.415 + 0.06 * (np.abs(y) / width - 0.27)) & (h < 0.515)
     patch.set(lamp, (0.75, 0.78, 0.78), 0.3, 0.25)
@@ -85,7 +85,7 @@ def _front(patch: Patch, h: Array, u: Array) -> None:
 
 
 def _rear(patch: Patch, h: Array, u: Array) -> None:
-    y, n, width = patch.p[:, 1], patch.n, patch.look.size_m[1]
+    y, n, width = patch.p[:, 1], patch.n, patch.appearance.size_m[1]
     rear = (u < -0.45) & (n[:, 0] < -0.2)
     lamp = (u < -0.445) & (np.abs(y) > 0.30 * width) & (h > 0.5) & (h < 0.61)
     patch.set(lamp, (0.02, 0.02, 0.45), 0.15, 0.25)
@@ -100,11 +100,11 @@ def _rear(patch: Patch, h: Array, u: Array) -> None:
 
 
 def _wheel(patch: Patch) -> None:
-    look, p, z, n = patch.look, patch.p, patch.z, patch.n
-    length = look.size_m[0]
-    big = look.category in ("truck", "bus")
+    appearance, p, z, n = patch.appearance, patch.p, patch.z, patch.n
+    length = appearance.size_m[0]
+    big = appearance.category in ("truck", "bus")
     radius = 0.48 if big else WHEEL_RADIUS_M
-    axles = np.array([WHEEL_AT, -WHEEL_AT]) * length if not big else truck_axles(look)
+    axles = np.array([WHEEL_AT, -WHEEL_AT]) * length if not big else truck_axles(appearance)
     d = p[:, 0][:, None] - axles
     dx = np.take_along_axis(d, np.abs(d).argmin(1)[:, None], 1)[:, 0]
     dz = z - radius
@@ -121,21 +121,21 @@ def _wheel(patch: Patch) -> None:
     patch.set(face & (r < 0.09), (0.1, 0.1, 0.1))
 
 
-def truck_axles(look: Appearance) -> Array:
+def truck_axles(appearance: Appearance) -> Array:
     """Axle positions (K,) in m along a truck or bus, as its shape has them."""
-    length = look.size_m[0]
-    if look.category == "bus":
+    length = appearance.size_m[0]
+    if appearance.category == "bus":
         return np.array([-0.26, 0.27]) * length
     front, rear = length / 2, -length / 2
     return np.array([front - 0.95, rear + 1.1] if length < 8 else [front - 0.95, rear + 2.4, rear + 1.2])
 
 
 def _cab(patch: Patch) -> None:
-    look, p, z, n = patch.look, patch.p, patch.z, patch.n
-    length, width, height = look.size_m
+    appearance, p, z, n = patch.appearance, patch.p, patch.z, patch.n
+    length, width, height = appearance.size_m
     top, front = 0.8 * height, length / 2
     y, x = p[:, 1], p[:, 0]
-    patch.fill(linear_bgr(look.second_color), 0.12)
+    patch.fill(linear_bgr(appearance.second_color), 0.12)
     patch.set((n[:, 0] > 0.3) & (z > 0.53 * top) & (z < 0.93 * top) & (np.abs(y) < 0.42 * width), GLASS, 0.36)
     window = (np.abs(n[:, 1]) > 0.6) & (z > 0.55 * top) & (z < 0.9 * top) & (x > front - 1.35) & (x < front - 0.28)
     patch.set(window, GLASS, 0.34)
@@ -152,29 +152,29 @@ def _cab(patch: Patch) -> None:
 
 
 def _cargo(patch: Patch) -> None:
-    look, p, z, n = patch.look, patch.p, patch.z, patch.n
-    length, width, height = look.size_m
-    patch.fill(linear_bgr(look.color), 0.03)
+    appearance, p, z, n = patch.appearance, patch.p, patch.z, patch.n
+    length, width, height = appearance.size_m
+    patch.fill(linear_bgr(appearance.color), 0.03)
     side, rear = np.abs(n[:, 1]) > 0.7, n[:, 0] < -0.7
     patch.set((side | rear) & ((z > height - 0.12) | (z < 0.36 * height + 0.12)), (0.3, 0.3, 0.3))
-    patch.set(side & (np.abs(np.mod(p[:, 0], 0.6) - 0.3) < 0.012), linear_bgr(look.color) * 0.7)
+    patch.set(side & (np.abs(np.mod(p[:, 0], 0.6) - 0.3) < 0.012), linear_bgr(appearance.color) * 0.7)
     patch.set(rear & (np.abs(p[:, 1]) < 0.015), (0.05, 0.05, 0.05))
     patch.set(rear & (np.abs(np.abs(p[:, 1]) - 0.25) < 0.02) & (z > 0.5 * height), (0.35, 0.35, 0.35))
     patch.set(rear & (z < 0.36 * height + 0.12) & (np.abs(p[:, 1]) > 0.36 * width), (0.02, 0.02, 0.5), 0.1, 0.25)
     patch.set(side & (np.abs(z - 0.66 * height) < 0.14 * height) & (np.abs(p[:, 0] + 0.15 * length) < 0.22 * length),
-         linear_bgr(look.second_color), 0.03)  # fmt: skip
+         linear_bgr(appearance.second_color), 0.03)  # fmt: skip
 
 
 def _bus(patch: Patch) -> None:
-    look, p, z, n = patch.look, patch.p, patch.z, patch.n
-    length, width, height = look.size_m
+    appearance, p, z, n = patch.appearance, patch.p, patch.z, patch.n
+    length, width, height = appearance.size_m
     x, y = p[:, 0], p[:, 1]
-    patch.fill(linear_bgr(look.color), 0.12)
+    patch.fill(linear_bgr(appearance.color), 0.12)
     side, front, rear = np.abs(n[:, 1]) > 0.55, n[:, 0] > 0.5, n[:, 0] < -0.5
     patch.set(z < 0.5, (0.06, 0.06, 0.06))
     row = side & (z > 0.43 * height) & (z < 0.80 * height) & (np.abs(x) < 0.475 * length)
     patch.set(row & (np.mod(x + 0.5 * length, 1.45) > 0.09), GLASS, 0.34)
-    patch.set(side & (np.abs(z - 0.37 * height) < 0.05), linear_bgr(look.second_color), 0.1)
+    patch.set(side & (np.abs(z - 0.37 * height) < 0.05), linear_bgr(appearance.second_color), 0.1)
     doors = (
         side
         & (n[:, 1] < 0)
@@ -183,7 +183,7 @@ def _bus(patch: Patch) -> None:
         & (np.min(np.abs(x[:, None] - length * np.array([0.42, 0.02])), 1) < 0.6)
     )
     patch.set(doors, GLASS, 0.3)
-    patch.set(doors & (np.mod(x - 0.42 * length + 0.6, 0.6) < 0.05), linear_bgr(look.color) * 0.6)
+    patch.set(doors & (np.mod(x - 0.42 * length + 0.6, 0.6) < 0.05), linear_bgr(appearance.color) * 0.6)
     patch.set(front & (z > 0.36 * height) & (z < 0.80 * height) & (np.abs(y) < 0.45 * width), GLASS, 0.36)
     patch.set(
         front & (z > 0.84 * height) & (z < 0.93 * height) & (np.abs(y) < 0.3 * width),
@@ -195,15 +195,15 @@ def _bus(patch: Patch) -> None:
     patch.set(front & (np.abs(y) > 0.32 * width) & (z > 0.7) & (z < 0.95), (0.8, 0.8, 0.8), 0.2, 0.3)
     patch.set(rear & (np.abs(y) > 0.38 * width) & (z > 0.7) & (z < 1.2), (0.02, 0.02, 0.5), 0.1, 0.25)
     patch.set((front | rear) & (np.abs(y) < 0.26) & (z > 0.5) & (z < 0.62), (0.75, 0.75, 0.75))
-    fender = np.min(np.hypot(x[:, None] - truck_axles(look), z[:, None] - 0.48), 1)
+    fender = np.min(np.hypot(x[:, None] - truck_axles(appearance), z[:, None] - 0.48), 1)
     patch.set(side & (fender < 0.57), (0.01, 0.01, 0.01))
 
 
 def _cloth(patch: Patch) -> None:
-    look, p, z, n = patch.look, patch.p, patch.z, patch.n
-    color = linear_bgr(look.color if patch.part == Material.SHIRT else look.second_color)
+    appearance, p, z, n = patch.appearance, patch.p, patch.z, patch.n
+    color = linear_bgr(appearance.color if patch.part == Material.SHIRT else appearance.second_color)
     # Folds: waves that follow the body, fixed to it, so that they move along.
-    fold = np.sin(23 * z + 9 * p[:, 1] + look.seed) * np.sin(17 * p[:, 1] - 11 * z + 5 * p[:, 0])
+    fold = np.sin(23 * z + 9 * p[:, 1] + appearance.seed) * np.sin(17 * p[:, 1] - 11 * z + 5 * p[:, 0])
     shade = 1.0 + 0.13 * fold
     patch.out.albedo[patch.rows] = color * shade[:, None]
     if patch.part == Material.SHIRT:
@@ -212,14 +212,17 @@ def _cloth(patch: Patch) -> None:
 
 
 def _plain(patch: Patch) -> None:
-    look = patch.look
+    appearance = patch.appearance
     albedo, gloss = {
-        Material.SKIN: (linear_bgr(look.skin), 0.02),
-        Material.HAIR: (linear_bgr(look.hair), 0.03),
+        Material.SKIN: (linear_bgr(appearance.skin), 0.02),
+        Material.HAIR: (linear_bgr(appearance.hair), 0.03),
         Material.SHOE: (np.array((0.03, 0.03, 0.035)), 0.05),
-        Material.FRAME: (linear_bgr(look.color)[::-1] * 0.6 + 0.02, 0.15),
+        Material.FRAME: (linear_bgr(appearance.color)[::-1] * 0.6 + 0.02, 0.15),
         Material.TIRE: (np.array(RUBBER), 0.02),
-        Material.MIRROR: (linear_bgr(look.color) if look.category == "car" else np.array((0.35, 0.35, 0.35)), 0.12),
+        Material.MIRROR: (
+            linear_bgr(appearance.color) if appearance.category == "car" else np.array((0.35, 0.35, 0.35)),
+            0.12,
+        ),
     }.get(patch.part, (np.array((0.02, 0.02, 0.02)), 0.0))
     patch.fill(albedo, gloss)
 

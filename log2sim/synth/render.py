@@ -20,7 +20,7 @@ from log2sim.synth.render_camera import RenderCamera
 HAZE_M = 500.0
 FAR_M = 2000.0
 OVERSAMPLING = 2
-NO_ACTOR, WALL = -1, -2
+NO_ACTOR = -1
 _LINEAR = linear_table()
 
 

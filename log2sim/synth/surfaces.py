@@ -75,7 +75,7 @@ class Patch:
 
     Attributes
     ----------
-    look : Appearance
+    appearance : Appearance
     out : Paint
         Of all points of the actor.
     rows : (Q,) int64
@@ -89,7 +89,7 @@ class Patch:
     part : Material
     """
 
-    look: Appearance
+    appearance: Appearance
     out: Paint
     rows: Index
     p: Array

@@ -8,12 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from log2sim.agents.smooth.heading import course_is_known, unwrap, yaw_of_motion
-from log2sim.agents.smooth.jerk_density import (
-    STRONG_PRIOR,
-    WEAK_PRIOR,
-    DensityEstimator,
-    min_density,
-)
+from log2sim.agents.smooth.jerk_density import STRONG_PRIOR, WEAK_PRIOR, DensityEstimator, min_density
 from log2sim.agents.smooth.likelihood import (
     MeasurementModel,
     geman_mcclure_weights,
