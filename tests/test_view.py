@@ -96,11 +96,11 @@ def test_agents_have_the_colors_of_the_pictures() -> None:
     scenario = Scenario.load(TRUTH)
     entries = {e["id"]: e for e in page_document(scenario)["layers"]["log"]}
     roles = assign_roles(scenario)
-    assert list(entries) == [r.agent.id for r in roles.movers] + [a.id for a in roles.standing]
+    assert list(entries) == [r.agent.id for r in roles.movers] + [a.id for a in roles.stationary]
     for role in roles.movers[1:]:
         assert entries[role.agent.id]["color"] == role.color
     assert entries["ego"]["ego"]
-    assert [e["id"] for e in entries.values() if e["standing"]] == [a.id for a in roles.standing]
+    assert [e["id"] for e in entries.values() if e["stationary"]] == [a.id for a in roles.stationary]
 
 
 def test_the_style_has_the_colors_of_the_pictures() -> None:
@@ -282,7 +282,7 @@ def test_boxes_have_their_size_color_and_heading(browser: Browser, tmp_path: Pat
     assert inside == [rgb(style.INK)] * 4
     outside = [at(2.2, 0.0), at(-2.2, 0.0), at(0.0, 1.2), at(0.0, -1.2), at(2.0, 1.4)]
     assert rgb(style.INK) not in outside
-    assert min(at(1.2, 0.0)) > 200 > max(at(-1.2, 0.0))  # the nose is at the front
+    assert min(at(1.2, 0.0)) > 200 > max(at(-1.2, 0.0))  # the heading mark is at the front
     corners = box_corners_bev([[3.0, -2.0]], 4.0, 2.0, 0.6)[0] - [3.0, -2.0]
     just_in = center + 0.93 * scale * corners[0] * [1, -1]
     assert pixel(browser, just_in) == rgb(style.INK)
@@ -522,7 +522,7 @@ def test_the_list_is_searched(browser: Browser, sample: Path) -> None:
     opened(browser, sample)
     shown = "return [...document.querySelectorAll('#agents .id')].map((e) => e.textContent)"
     assert len(browser.run(shown)) == 12
-    browser.press("/", *"standing car")
+    browser.press("/", *"stationary car")
     assert browser.run(shown) == ["car_parked", "car_parked_north"]
     assert time_of(browser) == 0.0  # letters of a search are no commands
     browser.press(ENTER)

@@ -1,4 +1,4 @@
-// Mouse, fingers and keys.
+// Mouse, touch and keys.
 
 const CLICK_PX = 5;
 
@@ -8,7 +8,7 @@ const listenToPointers = (canvas, act) => {
   let travelled = 0;
   const spread = () => {
     const [a, b] = [...down.values()];
-    return { x: (a.x + b.x) / 2, y: (a.y + b.y) / 2, apart: Math.max(Math.hypot(a.x - b.x, a.y - b.y), 1) };
+    return { x: (a.x + b.x) / 2, y: (a.y + b.y) / 2, distance: Math.max(Math.hypot(a.x - b.x, a.y - b.y), 1) };
   };
   canvas.addEventListener("pointerdown", (event) => {
     if (event.button > 0) return;
@@ -17,26 +17,26 @@ const listenToPointers = (canvas, act) => {
     down.set(event.pointerId, { x: event.offsetX, y: event.offsetY });
   });
   canvas.addEventListener("pointermove", (event) => {
-    const held = down.get(event.pointerId);
-    if (!held) return event.pointerType === "mouse" && act.hover(event.offsetX, event.offsetY);
+    const pointer = down.get(event.pointerId);
+    if (!pointer) return event.pointerType === "mouse" && act.hover(event.offsetX, event.offsetY);
     const before = down.size === 2 ? spread() : null;
-    const dx = event.offsetX - held.x, dy = event.offsetY - held.y;
+    const dx = event.offsetX - pointer.x, dy = event.offsetY - pointer.y;
     travelled += Math.hypot(dx, dy);
-    [held.x, held.y] = [event.offsetX, event.offsetY];
+    [pointer.x, pointer.y] = [event.offsetX, event.offsetY];
     if (before) {
       const after = spread();
       act.drag(after.x - before.x, after.y - before.y);
-      act.zoom(after.apart / before.apart, after.x, after.y);
+      act.zoom(after.distance / before.distance, after.x, after.y);
       travelled = Infinity;
     } else if (travelled > CLICK_PX) act.drag(dx, dy);
   });
-  const lift = (event) => {
+  const release = (event) => {
     if (down.delete(event.pointerId) && event.type === "pointerup" && down.size === 0 && travelled <= CLICK_PX) {
       act.click(event.offsetX, event.offsetY, event.pointerType === "touch" ? 14 : 5);
     }
   };
-  canvas.addEventListener("pointerup", lift);
-  canvas.addEventListener("pointercancel", lift);
+  canvas.addEventListener("pointerup", release);
+  canvas.addEventListener("pointercancel", release);
   canvas.addEventListener("pointerleave", () => act.hover(null));
   canvas.addEventListener("wheel", (event) => {
     event.preventDefault();
@@ -46,7 +46,7 @@ const listenToPointers = (canvas, act) => {
   canvas.addEventListener("dblclick", (event) => act.zoom(2, event.offsetX, event.offsetY));
 };
 
-// keys: [names for people, what it does, keys of the event, action(event)]; silent: [keys of the event, action(event)]
+// keys: [displayed names, description, keys of the event, action(event)]; silent: [keys of the event, action(event)]
 const listenToKeys = (keys, silent) => {
   const actions = new Map();
   for (const [names, run] of [...keys.map(([, , names, run]) => [names, run]), ...silent]) {
@@ -63,7 +63,7 @@ const listenToKeys = (keys, silent) => {
     run(event);
   });
   window.addEventListener("keyup", (event) => {
-    if (event.key === " " && event.target instanceof HTMLButtonElement) event.preventDefault();  // it would press it too
+    if (event.key === " " && event.target instanceof HTMLButtonElement) event.preventDefault();  // the key would also press the button
   });
   for (const [names, what] of keys) byId("keys").append(element("dt", {}, names), element("dd", {}, what));
 };

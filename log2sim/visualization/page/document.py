@@ -31,12 +31,14 @@ def page_document(scenario: Scenario, truth: Scenario | None = None, replay: Any
     layers = {"log": list(_log(scenario))}
     if truth is not None:
         layers["truth"] = [
-            _entry(a, a.waypoints, standing=not is_moving(a), static=a.static)
+            _entry(a, a.waypoints, stationary=not is_moving(a), static=a.static)
             for a in truth.aligned_to(scenario).agents
         ]
     if replay is not None:
-        stand = {a.id: a.driver == "static" for a in replay.agents}
-        layers["replay"] = [_entry(a, a, standing=stand[a.id], static=stand[a.id]) for a in replay.agents if len(a.t_s)]
+        static = {a.id: a.driver == "static" for a in replay.agents}
+        layers["replay"] = [
+            _entry(a, a, stationary=static[a.id], static=static[a.id]) for a in replay.agents if len(a.t_s)
+        ]
     entries = [e for layer in layers.values() for e in layer]
     rows = sum(len(e["t_s"]) for e in entries)
     if rows > MAX_ROWS:
@@ -65,27 +67,27 @@ def _log(scenario: Scenario) -> Iterator[dict[str, Any]]:
     """Yield the scenario's agents in the order of the pictures' legend: movers with their colors, then stationary ones."""
     roles = assign_roles(scenario)
     for role in roles.movers:
-        yield {**_entry(role.agent, role.agent.waypoints, standing=False, static=False), **_colors(role)}
-    for agent in roles.standing:
-        yield _entry(agent, agent.waypoints, standing=True, static=agent.static)
+        yield {**_entry(role.agent, role.agent.waypoints, stationary=False, static=False), **_colors(role)}
+    for agent in roles.stationary:
+        yield _entry(agent, agent.waypoints, stationary=True, static=agent.static)
 
 
 def _colors(role: AgentRole) -> dict[str, Any]:
     return {"ego": True} if role.is_ego else {"color": role.color, "leading": role.leading}
 
 
-def _entry(agent: Any, columns: Any, *, standing: bool, static: bool) -> dict[str, Any]:
+def _entry(agent: Any, columns: Any, *, stationary: bool, static: bool) -> dict[str, Any]:
     """Make the entry of an agent of any layer.
 
-    `columns` are its waypoints or the rows of a replay; `standing` ones are drawn in muted colors.
+    `columns` are its waypoints or the rows of a replay; `stationary` ones are drawn in muted colors.
     """
     entry = {
         "id": agent.id,
         "category": agent.category,
         "group": GROUP_OF[agent.category],
         "size_m": [round(float(v), 3) for v in agent.size_m[:2]],
-        "standing": standing,
-        "always": static and len(columns.t_s) == 1,  # one pose during the whole scenario
+        "stationary": stationary,
+        "permanent": static and len(columns.t_s) == 1,  # one pose during the whole scenario
         **{k: second_differences(getattr(columns, k), scale) for k, scale in SCALES.items() if k != "yaw_rad"},
         "yaw_rad": second_differences(np.unwrap(columns.yaw_rad), SCALES["yaw_rad"]),
     }

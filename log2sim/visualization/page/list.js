@@ -1,6 +1,6 @@
-// The list of agents, searched. Names come from the file: they are only ever set as text.
+// The searchable list of agents. Names come from the file and are only set as text.
 
-const MOST_ROWS = 500;
+const MAX_ROWS = 500;
 const SHAPES = {
   vehicle: "M2 2h8v8h-8z", two_wheeler: "M6 .8L11.2 6 6 11.2.8 6z",
   pedestrian: "M6 1.5a4.5 4.5 0 1 1 0 9a4.5 4.5 0 1 1 0-9z", other: "M6 1.2L11 10.4H1z",
@@ -15,7 +15,7 @@ const mark = (track) => {
   const path = document.createElementNS("http://www.w3.org/2000/svg", "path");
   path.setAttribute("d", SHAPES[track.group]);
   path.style.fill = track.fill;
-  path.style.stroke = track.standing ? track.edge : "none";
+  path.style.stroke = track.stationary ? track.edge : "none";
   svg.append(path);
   return svg;
 };
@@ -39,20 +39,20 @@ class List {
   show() {
     const words = byId("search").value.toLowerCase().split(/\s+/).filter(Boolean);
     const found = this.tracks.filter((track) => {
-      const text = `${track.id} ${track.category} ${track.standing ? "standing" : "moving"}`.toLowerCase();
+      const text = `${track.id} ${track.category} ${track.stationary ? "stationary" : "moving"}`.toLowerCase();
       return words.every((word) => text.includes(word));
     });
     this.rows.clear();
-    byId("agents").replaceChildren(...found.slice(0, MOST_ROWS).map((track) => this.row(track)));
+    byId("agents").replaceChildren(...found.slice(0, MAX_ROWS).map((track) => this.row(track)));
     this.dim();
-    const rest = found.length - MOST_ROWS;
+    const rest = found.length - MAX_ROWS;
     byId("more").hidden = rest <= 0 && found.length > 0;
-    byId("more").textContent = found.length ? `${rest} more; search for them` : "No agent is called so.";
+    byId("more").textContent = found.length ? `${rest} more; search for them` : "No agent matches.";
   }
 
   row(track) {
     const button = element("button", { type: "button" });
-    const kind = track.standing ? `${track.category}, standing` : track.category;
+    const kind = track.stationary ? `${track.category}, stationary` : track.category;
     button.append(mark(track), element("span", { class: "id" }, track.id), element("span", { class: "kind" }, kind));
     button.setAttribute("aria-pressed", track === this.chosen);
     button.addEventListener("click", () => this.actions.choose(track === this.chosen ? null : track));
@@ -70,10 +70,10 @@ class List {
     this.rows.get(track)?.setAttribute("aria-pressed", true);
   }
 
-  // Dim the rows of those that are not there now.
+  // Dim the rows of absent agents.
   dim() {
     for (const [track, row] of this.rows) {
-      if (row.dimmed !== !track.there) row.classList.toggle("away", (row.dimmed = !track.there));
+      if (row.dimmed !== !track.present) row.classList.toggle("away", (row.dimmed = !track.present));
     }
   }
 }

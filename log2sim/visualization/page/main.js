@@ -1,4 +1,4 @@
-// What people can do, and the start.
+// Actions of the user, and the start.
 
 const LAYER_NAMES = { log: "Log", truth: "Truth", replay: "Replay", trails: "Trails", names: "Names" };
 let fitted = false;
@@ -7,35 +7,35 @@ const choose = (track) => {
   state.chosen = track;
   list.choose(track);
   details.choose(track);
-  drawLife();
-  remember();
-  wake();
+  drawPresence();
+  updateAddress();
+  requestDraw();
 };
 
-// Choose an agent and bring it into sight, if it is there now.
-const visit = (track) => {
+// Choose an agent and move the map so that it is visible, if it is present.
+const chooseVisible = (track) => {
   choose(track);
   if (track === null) return;
   track.moveTo(state.t);
   const sx = view.sx(track.px), sy = view.sy(track.py);
-  if (track.there && !(sx > 20 && sy > 20 && sx < view.width - 20 && sy < view.height - 20)) [view.x, view.y] = [track.px, track.py];
+  if (track.present && !(sx > 20 && sy > 20 && sx < view.width - 20 && sy < view.height - 20)) [view.x, view.y] = [track.px, track.py];
 };
 
 const hover = (track) => {
   if (track === state.hovered) return;
   state.hovered = track;
   byId("map").classList.toggle("over", track !== null);
-  wake();
+  requestDraw();
 };
 
 // The agent under a point of the screen, the nearest center first.
-const under = (sx, sy, margin) => {
+const agentAt = (sx, sy, margin) => {
   const x = view.mx(sx), y = view.my(sy), reach = margin / view.scale;
-  let best = null, least = Infinity;
+  let best = null, closest = Infinity;
   for (const track of tracks) {
-    if (!state.shown.log || !track.there || !track.holds(x, y, reach)) continue;
+    if (!state.shown.log || !track.present || !track.contains(x, y, reach)) continue;
     const distance = Math.hypot(track.px - x, track.py - y);
-    if (distance < least) [best, least] = [track, distance];
+    if (distance < closest) [best, closest] = [track, distance];
   }
   return best;
 };
@@ -43,21 +43,21 @@ const under = (sx, sy, margin) => {
 const follow = (on) => {
   state.follow = on && (ego !== null || state.chosen !== null);
   byId("follow").setAttribute("aria-pressed", state.follow);
-  wake();
+  requestDraw();
 };
 
 const zoom = (factor, sx = view.width / 2, sy = view.height / 2) => {
   view.zoom(factor, sx, sy);
-  wake();
+  requestDraw();
 };
 
 const fit = () => {
   follow(false);
   view.fit(tracks, { left: 24, right: 56, top: 76, bottom: 44 });
-  wake();
+  requestDraw();
 };
 
-// Beside the map the list is there until it is put away; on a narrow screen it is away until asked for.
+// The list is shown beside the map until hidden; on a narrow screen it is hidden until shown.
 const showList = () => {
   const narrow = matchMedia("(max-width: 720px)").matches && state.chosen !== null;
   if (narrow) choose(null);
@@ -68,7 +68,7 @@ const toggle = (layer) => {
   if (!(layer in LAYER_NAMES) || (data.layers[layer] === undefined && layer in { truth: 0, replay: 0 })) return;
   state.shown[layer] = !state.shown[layer];
   byId(`layer-${layer}`).setAttribute("aria-pressed", state.shown[layer]);
-  wake();
+  requestDraw();
 };
 
 const resize = () => {
@@ -78,7 +78,7 @@ const resize = () => {
     fitted = true;
   }
   details.show();
-  drawLife();
+  drawPresence();
   draw(performance.now());
 };
 
@@ -112,41 +112,41 @@ const listen = () => {
     [["r"], () => toggle("replay")], [["l"], () => toggle("names")], [["/"], () => byId("search").focus()],
   ]);
   listenToPointers(byId("map"), {
-    drag: (dx, dy) => { follow(false); view.drag(dx, dy); wake(); },
+    drag: (dx, dy) => { follow(false); view.drag(dx, dy); requestDraw(); },
     zoom,
-    click: (sx, sy, margin) => choose(under(sx, sy, margin)),
-    hover: (sx, sy) => hover(sx === null ? null : under(sx, sy, 3)),
+    click: (sx, sy, margin) => choose(agentAt(sx, sy, margin)),
+    hover: (sx, sy) => hover(sx === null ? null : agentAt(sx, sy, 3)),
   });
-  window.addEventListener("hashchange", recall);
+  window.addEventListener("hashchange", readAddress);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
-    dress(data.layers);
+    applyTheme(data.layers);
     list.show();
     details.show();
-    drawLife();
-    wake();
+    drawPresence();
+    requestDraw();
   });
   new ResizeObserver(resize).observe(byId("map"));
-  watchSharpness();
+  watchPixelRatio();
 };
 
-// Paint anew when the window comes onto a screen of another sharpness.
-const watchSharpness = () => {
+// Draw again when the window moves to a screen with another pixel ratio.
+const watchPixelRatio = () => {
   const now = matchMedia(`(resolution: ${window.devicePixelRatio}dppx)`);
   now.addEventListener("change", () => {
     resize();
-    watchSharpness();
+    watchPixelRatio();
   }, { once: true });
 };
 
 const neighbor = (step) => {
   const here = tracks.indexOf(state.chosen), count = tracks.length;
-  if (count) visit(tracks[here < 0 ? (step > 0 ? 0 : count - 1) : (here + step + count) % count]);
+  if (count) chooseVisible(tracks[here < 0 ? (step > 0 ? 0 : count - 1) : (here + step + count) % count]);
 };
 
-const list = new List(tracks, { choose: visit, hover }), details = new Details(data, seek);
+const list = new List(tracks, { choose: chooseVisible, hover }), details = new Details(data, seek);
 
 const start = () => {
-  const moving = tracks.filter((track) => !track.standing && !track.ego).length, agents = tracks.length - (ego ? 1 : 0);
+  const moving = tracks.filter((track) => !track.stationary && !track.ego).length, agents = tracks.length - (ego ? 1 : 0);
   const parts = [`${(data.end - data.begin).toFixed(1)} s`, `${agents} agent${agents === 1 ? "" : "s"}, ${moving} moving`];
   if (!ego) parts.push("no ego");
   if (data.origin) parts.push(`origin ${data.origin}`);
@@ -166,10 +166,10 @@ const start = () => {
   showPlay();
   listen();
   resize();
-  recall();
+  readAddress();
 };
 
-// For scripts and tests in the browser's console.
+// For scripts and tests.
 window.log2sim = {
   get time() { return state.t; },
   set time(t) { seek(t); },
@@ -177,17 +177,17 @@ window.log2sim = {
   get chosen() { return state.chosen?.id ?? null; },
   choose: (id) => choose(tracks.find((track) => track.id === id) ?? null),
   play, pause,
-  // Where on the canvas the middle of an agent is, in CSS pixels; null when it is not there.
+  // Position of an agent's center on the canvas, CSS pixels; null when it is absent.
   placeOf: (id) => {
     const track = tracks.find((other) => other.id === id);
     track?.moveTo(state.t);
-    return track?.there ? [view.sx(track.px), view.sy(track.py)] : null;
+    return track?.present ? [view.sx(track.px), view.sy(track.py)] : null;
   },
-  // Its heading in rad, counter-clockwise from east; null when it is not there.
+  // Its heading in rad, counter-clockwise from east; null when it is absent.
   headingOf: (id) => {
     const track = tracks.find((other) => other.id === id);
     track?.moveTo(state.t);
-    return track?.there ? track.pyaw : null;
+    return track?.present ? track.pyaw : null;
   },
   get pixelsPerMeter() { return view.scale; },
 };

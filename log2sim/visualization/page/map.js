@@ -1,4 +1,4 @@
-// What part of the map is in sight, in CSS pixels: x to the right, y up in the map and down on the screen.
+// The visible part of the map, in CSS pixels: x to the right, y up in the map and down on the screen.
 
 const SCALES_PX_PER_M = [0.02, 400];
 
@@ -24,7 +24,7 @@ class View {
     this.y += dy / this.scale;
   }
 
-  // Zoom so that the place under a point of the screen stays there.
+  // Zoom so that the position under a point of the screen stays fixed.
   zoom(factor, sx, sy) {
     const x = this.mx(sx), y = this.my(sy);
     this.scale = Math.min(Math.max(this.scale * factor, SCALES_PX_PER_M[0]), SCALES_PX_PER_M[1]);
@@ -32,7 +32,7 @@ class View {
     this.y += y - this.my(sy);
   }
 
-  // Show the movers' ways but for what lies far off, as the pictures do, with room for what covers the edges.
+  // Show the tracks of movers without far outliers, as the pictures do, inside the controls at the edges.
   fit(tracks, inset) {
     const box = extent(tracks);
     const width = Math.max(this.width - inset.left - inset.right, 40);
@@ -43,8 +43,8 @@ class View {
   }
 }
 
-// Places of some tracks, at most 24 of each.
-const places = (tracks) =>
+// Positions of tracks, at most 25 of each.
+const positions = (tracks) =>
   tracks.flatMap((track) => {
     const step = Math.max(1, Math.ceil(track.t.length / 24)), out = [];
     for (let k = 0; k < track.t.length; k += step) out.push([track.x[k], track.y[k]]);
@@ -54,17 +54,17 @@ const places = (tracks) =>
 
 const middle = (values) => values.sort((a, b) => a - b)[values.length >> 1];
 
-// West, east, south, north of what belongs in sight: the ego's way, movers within 60 m or three quartiles, what stands nearby.
+// West, east, south, north of what to show: the ego's track, movers within 60 m or three quartiles, stationary agents nearby.
 const extent = (tracks) => {
-  const ego = tracks.find((track) => track.ego), movers = tracks.filter((track) => !track.standing);
-  const points = places(movers.length ? movers : tracks);
+  const ego = tracks.find((track) => track.ego), movers = tracks.filter((track) => !track.stationary);
+  const points = positions(movers.length ? movers : tracks);
   if (!points.length) return [-10, 10, -10, 10];
-  const core = ego ? places([ego]) : [[middle(points.map((p) => p[0])), middle(points.map((p) => p[1]))]];
+  const core = ego ? positions([ego]) : [[middle(points.map((p) => p[0])), middle(points.map((p) => p[1]))]];
   const far = (p) => Math.min(...core.map((c) => Math.hypot(p[0] - c[0], p[1] - c[1])));
   const distances = points.map(far).sort((a, b) => a - b);
   const limit = Math.max(60, movers.length > 12 ? 2 * distances[distances.length >> 1] : 3 * distances[(distances.length * 3) >> 2]);
   let kept = points.filter((p) => far(p) <= limit);
-  if (ego) kept = kept.concat(places(tracks.filter((track) => track.standing)).filter((p) => far(p) <= 25));
+  if (ego) kept = kept.concat(positions(tracks.filter((track) => track.stationary)).filter((p) => far(p) <= 25));
   const box = [Infinity, -Infinity, Infinity, -Infinity];
   for (const [x, y] of kept) {
     box[0] = Math.min(box[0], x - 5);

@@ -1,4 +1,4 @@
-// Colors, from the style sheet and from the agents: all strings are made here, none while drawing.
+// Colors from the style sheet and the agents; all strings are made here, none while drawing.
 
 const theme = {};
 
@@ -10,7 +10,7 @@ const luminance = (rgb) => {
   return 0.2126 * r + 0.7152 * g + 0.0722 * b;
 };
 
-// The color, moved towards white on dark ground until it stands out three to one.
+// The color, mixed with white on a dark background until its contrast is three to one.
 const readable = (rgb, ground) => {
   const below = luminance(ground);
   let out = rgb;
@@ -22,7 +22,7 @@ const readable = (rgb, ground) => {
 
 const css = ([r, g, b], alpha) => `rgba(${r},${g},${b},${alpha})`;
 
-const dress = (layers) => {
+const applyTheme = (layers) => {
   const style = getComputedStyle(document.documentElement);
   for (const name of ["paper", "ground", "ink", "muted", "grid", "frame", "parked-face", "parked-edge", "accent", "alert"]) {
     theme[name.replace("-", "_")] = style.getPropertyValue(`--${name}`).trim();
@@ -32,19 +32,19 @@ const dress = (layers) => {
   theme.figures = `11px ${theme.font}`;
   const ground = channels(theme.ground), ink = channels(theme.ink);
   theme.halo = css(channels(theme.paper), 0.9);
-  theme.nose = css(channels(theme.paper), 0.85);
+  theme.headingMark = css(channels(theme.paper), 0.85);
   theme.truth = css(ink, 0.9);
   const colors = new Map();
   for (const track of layers.log) {
     const rgb = track.ego ? ink : track.base ? readable(channels(track.base), ground) : channels(theme.parked_face);
-    const strength = track.leading || track.standing ? 1 : 0.6;
+    const strength = track.leading || track.stationary ? 1 : 0.6;
     track.line = css(rgb, 1);
     track.fill = css(rgb, strength);
     track.pale = css(rgb, 0.22);
     track.trail = css(rgb, 0.65 * strength);
-    track.edge = track.standing ? theme.parked_edge : theme.paper;
-    track.nose = track.standing ? theme.parked_edge : theme.nose;
-    colors.set(track.id, track.standing ? theme.parked_edge : track.line);
+    track.edge = track.stationary ? theme.parked_edge : theme.paper;
+    track.headingMark = track.stationary ? theme.parked_edge : theme.headingMark;
+    colors.set(track.id, track.stationary ? theme.parked_edge : track.line);
   }
   for (const track of layers.replay ?? []) track.line = colors.get(track.id) ?? theme.ink;
   for (const track of layers.truth ?? []) track.line = theme.truth;

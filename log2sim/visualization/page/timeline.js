@@ -1,15 +1,15 @@
-// Time: where it is, how fast it goes, and the address that names the moment.
+// Time, playback rate, and the address with time and agent.
 
 const RATES = [0.1, 0.2, 0.5, 1, 2, 5, 10];
 const PLAY = "M6 3.5v13l11-6.5z", PAUSE = "M5.5 3.5h3.2v13H5.5zM11.3 3.5h3.2v13h-3.2z";
-const MOST_MARKS = 300;
+const MAX_MARKS = 300;
 let writing = 0;
 
 const seek = (t) => {
   if (!Number.isFinite(t)) return;
   state.t = Math.min(Math.max(t, data.begin), data.end);
-  wake();
-  if (!state.playing) remember();
+  requestDraw();
+  if (!state.playing) updateAddress();
 };
 
 const play = () => {
@@ -17,13 +17,13 @@ const play = () => {
   state.playing = true;
   before = performance.now();
   showPlay();
-  wake();
+  requestDraw();
 };
 
 const pause = () => {
   state.playing = false;
   showPlay();
-  remember();
+  updateAddress();
 };
 
 const showPlay = () => {
@@ -36,49 +36,49 @@ const setRate = (step) => {
   byId("rate").textContent = `${state.rate}×`;
 };
 
-// The life of the chosen agent above the slider, pale where nobody saw it.
-const drawLife = () => {
-  const canvas = byId("life"), pen = sharpPen(canvas), track = state.chosen;
+// When the chosen agent is present, above the slider; pale where it was not observed.
+const drawPresence = () => {
+  const canvas = byId("presence"), ctx = scaledContext(canvas), track = state.chosen;
   if (!track || !canvas.clientWidth) return;
   const sx = (t) => ((t - data.begin) / Math.max(data.end - data.begin, 1e-3)) * canvas.clientWidth;
   const bar = (from, to, color) => {
-    pen.fillStyle = color;
-    pen.fillRect(sx(from), 0, Math.max(sx(to) - sx(from), 2), canvas.clientHeight);
+    ctx.fillStyle = color;
+    ctx.fillRect(sx(from), 0, Math.max(sx(to) - sx(from), 2), canvas.clientHeight);
   };
-  if (track.always) bar(data.begin, data.end, theme.parked_edge);
+  if (track.permanent) bar(data.begin, data.end, theme.parked_edge);
   else if (track.t.length === 1) bar(track.first, track.first, track.line);
   for (let k = 0, from = 0; k + 1 < track.t.length; k++) {
     if (k + 2 < track.t.length && track.filled[k + 1] === track.filled[k]) continue;
-    bar(track.t[from], track.t[k + 1], track.filled[k] ? track.pale : track.standing ? theme.parked_edge : track.line);
+    bar(track.t[from], track.t[k + 1], track.filled[k] ? track.pale : track.stationary ? theme.parked_edge : track.line);
     from = k + 1;
   }
 };
 
-// A mark under the slider for each collision of the replay, red where the log has none.
+// A mark below the slider for each collision of the replay, red unless it is in the log.
 const markEvents = () => {
   const whole = Math.max(data.end - data.begin, 1e-3), inset = 8;  // half the slider's knob, where its ends are
-  byId("events").append(...data.events.slice(0, MOST_MARKS).map((event) => {
+  byId("events").append(...data.events.slice(0, MAX_MARKS).map((event) => {
     const what = `${event.agents.join(" and ")} collide at ${event.t_s.toFixed(2)} s${event.in_log ? ", in the log too" : ""}`;
     const button = element("button", { type: "button", title: what, "aria-label": what, class: event.in_log ? "known" : "new" });
     button.style.left = `calc(${inset}px + (100% - ${2 * inset}px) * ${(event.t_s - data.begin) / whole})`;
-    button.addEventListener("click", () => visitEvent(event));
+    button.addEventListener("click", () => showEvent(event));
     return button;
   }));
 };
 
-const visitEvent = (event) => {
+const showEvent = (event) => {
   pause();
   seek(event.t_s);
-  visit(tracks.find((track) => event.agents.includes(track.id)) ?? null);
+  chooseVisible(tracks.find((track) => event.agents.includes(track.id)) ?? null);
 };
 
 const nextEvent = () => {
   const next = data.events.find((event) => event.t_s > state.t + 1e-6) ?? data.events[0];
-  if (next) visitEvent(next);
+  if (next) showEvent(next);
 };
 
-// The address names the moment and the agent, so that it can be passed on; browsers let it change a few times a second.
-const remember = () => {
+// The address holds time and agent, so that a link can be shared; browsers limit how often it changes.
+const updateAddress = () => {
   clearTimeout(writing);
   writing = setTimeout(() => {
     const parts = new URLSearchParams({ t: state.t.toFixed(2) });
@@ -86,12 +86,12 @@ const remember = () => {
     try {
       history.replaceState(null, "", `#${parts}`);
     } catch {
-      // Some browsers do not let a page that was opened as a file do so.
+      // Some browsers do not allow this for pages opened as files.
     }
   }, 300);
 };
 
-const recall = () => {
+const readAddress = () => {
   const parts = new URLSearchParams(location.hash.slice(1));
   const t = parts.get("t"), id = parts.get("agent");
   if (id !== null) choose(tracks.find((track) => track.id === id) ?? null);

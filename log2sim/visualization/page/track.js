@@ -1,4 +1,4 @@
-// Agents over time. Columns are decoded once; where an agent is now stands in its own fields, so that nothing is made per frame.
+// Agents over time. Columns are decoded once; the present state is kept in fields, so that no frame allocates memory.
 
 const sums = (differences, scale) => {
   const out = new Float64Array(differences.length);
@@ -14,7 +14,7 @@ const sums = (differences, scale) => {
 class Track {
   constructor(entry, scales) {
     Object.assign(this, {
-      id: entry.id, category: entry.category, group: entry.group, standing: entry.standing, always: entry.always,
+      id: entry.id, category: entry.category, group: entry.group, stationary: entry.stationary, permanent: entry.permanent,
       ego: entry.ego === true, leading: entry.leading === true || entry.ego === true, base: entry.color ?? null,
       length: entry.size_m[0], width: entry.size_m[1],
       t: sums(entry.t_s, scales.t_s), x: sums(entry.x_m, scales.x_m), y: sums(entry.y_m, scales.y_m),
@@ -25,13 +25,13 @@ class Track {
     for (let k = 0; k < edges.length; k += 2) this.filled.fill(1, edges[k], edges[k + 1]);
     this.first = this.t[0];
     this.last = this.t[this.t.length - 1];
-    this.there = this.guessed = false;
+    this.present = this.interpolated = false;
     this.k = 0;
     this.px = this.py = this.pyaw = this.pv = 0;
     this.fill = this.edge = this.pale = this.line = "";  // set by the theme
   }
 
-  // Index of the last waypoint not after t, from where the search left off.
+  // Index of the last waypoint not after t, starting at the previous result.
   find(t) {
     const times = this.t, n = times.length;
     let k = this.k;
@@ -45,11 +45,11 @@ class Track {
     return (this.k = low);
   }
 
-  // Take the place at time t: linear between waypoints, as everywhere in log2sim.
+  // Set the state at time t, linearly interpolated between waypoints.
   moveTo(t) {
     const slack = 1e-4;
-    this.there = this.always || (t >= this.first - slack && t <= this.last + slack);
-    if (!this.there) return;
+    this.present = this.permanent || (t >= this.first - slack && t <= this.last + slack);
+    if (!this.present) return;
     const k = this.find(t), n = this.t.length;
     if (k + 1 === n || t <= this.t[k]) {
       this.set(this.x[k], this.y[k], this.yaw[k], this.v[k], n > 1 && this.filled[Math.min(k, n - 2)] === 1);
@@ -65,26 +65,26 @@ class Track {
     );
   }
 
-  set(x, y, yaw, v, guessed) {
+  set(x, y, yaw, v, interpolated) {
     this.px = x;
     this.py = y;
     this.pyaw = yaw;
     this.pv = v;
-    this.guessed = guessed;
+    this.interpolated = interpolated;
   }
 
-  // Whether a place in the map is within the box, or nearer to it than a margin.
-  holds(x, y, margin) {
+  // Whether a position in the map is inside the box or within a margin of it.
+  contains(x, y, margin) {
     const dx = x - this.px, dy = y - this.py, c = Math.cos(this.pyaw), s = Math.sin(this.pyaw);
     return Math.abs(dx * c + dy * s) <= this.length / 2 + margin && Math.abs(dy * c - dx * s) <= this.width / 2 + margin;
   }
 }
 
-// The agent of another layer that is this one: by id, else the one that stays nearest while both are there.
+// The same agent in another layer: by id, else the nearest on average while both are present.
 const counterpart = (track, layer) => {
   const named = layer.find((other) => other.id === track.id);
   if (named) return named;
-  let best = null, least = 2.0;
+  let best = null, closest = 2.0;
   for (const other of layer) {
     const first = Math.max(track.first, other.first), last = Math.min(track.last, other.last);
     if (other.group !== track.group || last - first < 0.3 * (track.last - track.first)) continue;
@@ -96,7 +96,7 @@ const counterpart = (track, layer) => {
       other.moveTo(t);
       sum += Math.hypot(track.px - other.px, track.py - other.py);
     }
-    if (sum / samples < least) [best, least] = [other, sum / samples];
+    if (sum / samples < closest) [best, closest] = [other, sum / samples];
   }
   return best;
 };

@@ -26,7 +26,7 @@ SCRIPT_FILES = (
     "list.js",
     "details.js",
     "controls.js",
-    "stage.js",
+    "state.js",
     "timeline.js",
     "main.js",
 )

@@ -29,7 +29,7 @@ from log2sim.visualization.plot.style import (
 )
 from log2sim.visualization.plot.viewport import MAX_UNCROWDED_MOVERS, Viewport
 
-BACKGROUND, STANDING, TRUTH, TRACK, MARK, REPLAY, BOX, LABEL = range(1, 9)
+BACKGROUND, STATIONARY, TRUTH, TRACK, MARK, REPLAY, BOX, LABEL = range(1, 9)
 """z-order, from the bottom up."""
 
 
@@ -58,7 +58,7 @@ def draw_background(ax: Axes, picture: Background) -> None:
     )
 
 
-def draw_standing(ax: Axes, agents: Sequence[Agent], view: Viewport) -> None:
+def draw_stationary(ax: Axes, agents: Sequence[Agent], view: Viewport) -> None:
     """Draw stationary agents as gray boxes; as a dot where the box would be too small to see."""
     if not agents:
         return
@@ -69,16 +69,18 @@ def draw_standing(ax: Axes, agents: Sequence[Agent], view: Viewport) -> None:
         "facecolors": PARKED_FACE,
         "edgecolors": PARKED_EDGE,
         "linewidths": 0.6,
-        "zorder": STANDING,
+        "zorder": STATIONARY,
     }
     ax.add_collection(PolyCollection(list(corners), **style), autolim=False)
     ax.add_collection(
-        PolyCollection(list(shapes.heading_triangles(corners)), facecolors=PARKED_EDGE, linewidths=0, zorder=STANDING),
+        PolyCollection(
+            list(shapes.heading_triangles(corners)), facecolors=PARKED_EDGE, linewidths=0, zorder=STATIONARY
+        ),
         autolim=False,
     )
     small = np.array([max(a.size_m[:2]) < 5 * view.m_per_pt for a in agents])
     if small.any():
-        ax.plot(xy[small, 0], xy[small, 1], "o", ms=3, mfc=PARKED_FACE, mec=PARKED_EDGE, mew=0.6, zorder=STANDING)
+        ax.plot(xy[small, 0], xy[small, 1], "o", ms=3, mfc=PARKED_FACE, mec=PARKED_EDGE, mew=0.6, zorder=STATIONARY)
 
 
 def draw_tracks(

@@ -49,7 +49,7 @@ class AgentRoles:
     """All agents of a scenario; the ego, if there is one, is the first mover even when it is stationary."""
 
     movers: tuple[AgentRole, ...]
-    standing: tuple[Agent, ...]
+    stationary: tuple[Agent, ...]
 
 
 def assign_roles(scenario: Scenario, max_leading: int = len(PALETTE)) -> AgentRoles:

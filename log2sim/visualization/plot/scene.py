@@ -54,7 +54,7 @@ def draw_base(
     if background is not None:
         drawing.draw_background(layout.ax, background)
     layout.ax.set(xlim=(layout.view.x0, layout.view.x1), ylim=(layout.view.y0, layout.view.y1))
-    drawing.draw_standing(layout.ax, roles.standing, layout.view)
+    drawing.draw_stationary(layout.ax, roles.stationary, layout.view)
     draw_legend(layout, rows)
     draw_scale_and_north(layout, projected=projected)
     write_title(layout, title or scenario.name or "scenario", _subtitle(scenario, roles))
@@ -77,7 +77,7 @@ def _subtitle(scenario: Scenario, roles: AgentRoles) -> str:
 
 def _outside(roles: AgentRoles, view: Viewport) -> int:
     """Count the agents whose trajectories lie outside the view."""
-    agents = [r.agent for r in roles.movers] + list(roles.standing)
+    agents = [r.agent for r in roles.movers] + list(roles.stationary)
     return sum(not view.contains(centers_xy(a)).any() for a in agents)
 
 

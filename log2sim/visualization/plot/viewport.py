@@ -17,7 +17,7 @@ REACH_M = 60.0
 MAX_UNCROWDED_MOVERS = 12
 """With more movers there are fewer time marks, and the view keeps to where most of them are."""
 
-STANDING_REACH_M = 25.0
+STATIONARY_REACH_M = 25.0
 """Stationary agents closer than this to the ego's trajectory are in view."""
 
 
@@ -77,9 +77,9 @@ def choose_viewport(roles: AgentRoles) -> Viewport:
     median of all movers.
     """
     movers = [centers_xy(role.agent) for role in roles.movers]
-    standing = np.concatenate([centers_xy(a)[:1] for a in roles.standing]) if roles.standing else np.zeros((0, 2))
+    stationary = np.concatenate([centers_xy(a)[:1] for a in roles.stationary]) if roles.stationary else np.zeros((0, 2))
     if not movers:
-        points = standing if len(standing) else np.zeros((1, 2))
+        points = stationary if len(stationary) else np.zeros((1, 2))
         core = np.median(points, axis=0)[None]
         return _around(_near(points, core, _limit(points, core)))
     few = [p[np.linspace(0, len(p) - 1, min(len(p), 24)).round().astype(int)] for p in movers]
@@ -88,7 +88,7 @@ def choose_viewport(roles: AgentRoles) -> Viewport:
     everything = np.concatenate(movers)
     kept = _near(everything, core, _limit(np.concatenate(few), core, crowd=len(movers) > MAX_UNCROWDED_MOVERS))
     if ego:
-        kept = np.concatenate([kept, _near(standing, core, STANDING_REACH_M)])
+        kept = np.concatenate([kept, _near(stationary, core, STATIONARY_REACH_M)])
     return _around(kept)
 
 

@@ -1,4 +1,4 @@
-// What there is, what is shown of it, and the frames: drawn while something moves and else not at all.
+// Data, display state and animation frames, which are only drawn while something moves.
 
 const data = load(byId("data").textContent);
 const tracks = data.layers.log, ego = tracks.find((track) => track.ego) ?? null;
@@ -7,11 +7,11 @@ const state = {
   t: data.begin, rate: 1, playing: false, follow: false, chosen: null, hovered: null,
   shown: { log: true, truth: true, replay: true, trails: true, names: true },
 };
-dress(data.layers);
+applyTheme(data.layers);
 const view = new View(), painter = new Painter(byId("map"), view);
 let queued = false, before = 0, dimmed = 0, labelled = "";
 
-const wake = () => {
+const requestDraw = () => {
   if (!queued) {
     queued = true;
     requestAnimationFrame(frame);
@@ -29,14 +29,14 @@ const frame = (now) => {
   }
   before = now;
   draw(now);
-  if (state.playing) wake();
+  if (state.playing) requestDraw();
 };
 
 const draw = (now) => {
   const leader = state.follow ? (state.chosen ?? ego) : null;
   if (leader) {
     leader.moveTo(state.t);
-    if (leader.there) [view.x, view.y] = [leader.px, leader.py];
+    if (leader.present) [view.x, view.y] = [leader.px, leader.py];
   }
   painter.paint(data, state.t, state.shown, state.chosen, state.hovered);
   const text = state.t.toFixed(2);
