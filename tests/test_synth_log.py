@@ -136,6 +136,13 @@ def test_a_2d_label_lies_within_the_projected_box_and_fills_most_of_it() -> None
         assert np.prod(box[2:] - box[:2]) > 0.7 * np.prod(high - low)
 
 
+def test_an_empty_street_has_a_log_and_a_truth_of_the_ego_alone() -> None:
+    log, truth = tiny_log([], duration_s=0.2)
+    assert [a.id for a in truth.agents] == ["ego"]
+    assert log.labels is None
+    assert len(log.image_labels["front"].t_ns) == 0
+
+
 def test_buildings_stop_rays() -> None:
     log, _ = tiny_log([], building=[WALL], noise_m=0.0, observe=False)
     xyz = log.streams["top"].read(0).xyz_m

@@ -135,7 +135,7 @@ def _caster(moving: MovingScene, seed: int) -> Caster:
 def _lidar_visibility(spec: LidarSpec, stream: Stream, cast: Caster, moving: MovingScene) -> LidarVisibility:
     count = len(moving.actors)
     hits = (cast(spec.name, i).hit for i in range(len(stream.t_ns)))
-    points = np.array([np.bincount(h[h >= 0], minlength=count) for h in hits]).reshape(-1, count)
+    points = np.array([np.bincount(h[h >= 0], minlength=count) for h in hits]).reshape(len(stream.t_ns), count)
     return LidarVisibility(stream.t_ns - round(NS_PER_S / spec.rate_hz / 2), points)
 
 
