@@ -1,4 +1,4 @@
-"""log2sim: driving logs of cameras, LiDAR and GNSS/IMU in, scenarios that a simulator can run out."""
+"""Reconstruct driving logs (cameras, LiDAR, GNSS/IMU) as scenarios that a simulator can run."""
 
 from __future__ import annotations
 
@@ -39,5 +39,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """The public names, imported or not."""
+    """List the public names, imported or not."""
     return sorted({*globals(), *__all__})

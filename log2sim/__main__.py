@@ -1,4 +1,4 @@
-"""`python -m log2sim` is `log2sim`."""
+"""Run the command line as `python -m log2sim`."""
 
 from log2sim.cli import main
 

@@ -1,4 +1,4 @@
-"""Files written whole or not at all, and paths of a log that stay inside it."""
+"""JSON documents: atomic writing, strict reading, validation against `schemas/`; paths that stay inside a log."""
 
 from __future__ import annotations
 
@@ -17,19 +17,25 @@ from typing import Any
 from log2sim.errors import ConfigError, Log2SimError, LogError
 
 JSON_LIMIT_BYTES = 512 * 1024 * 1024
-_HALF_PAIR = re.compile(r"\\u[dD][89a-fA-F]")
+_SURROGATE_ESCAPE = re.compile(r"\\u[dD][89a-fA-F]")
 
 
 @contextmanager
 def replaced(path: Path | str) -> Iterator[Path]:
-    """Yield a temporary name beside `path` that is renamed to it when the block ends well and removed when it does not."""
+    """Yield a temporary path beside `path`, renamed to it when the block succeeds and removed when it fails.
+
+    Raises
+    ------
+    ConfigError
+        For a path that cannot be written.
+    """
     target = Path(path)
     if target.is_dir():
         raise ConfigError(f"{target}: is a folder; give the name of a file")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"{target.parent}: cannot be made a folder: {error.strerror}") from error
+        raise ConfigError(f"{target.parent}: cannot be created as a folder: {error.strerror}") from error
     temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
     try:
         yield temporary
@@ -74,13 +80,19 @@ def check_targets(*paths: Path | str | None, overwrite: bool) -> None:
 
 
 def write_json(path: Path | str, value: Any) -> None:
-    """Write JSON (no NaN, no infinity), whole or not at all."""
+    """Write JSON (no NaN, no infinity) atomically."""
     with replaced(path) as temporary:
         temporary.write_text(json.dumps(value, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def read_json(path: Path | str, error: type[LogError] = LogError) -> Any:
-    """Read a JSON file; anything wrong with it becomes `error` naming the file and the place."""
+    """Read a JSON file.
+
+    Raises
+    ------
+    error
+        For a file that is missing, too large, not valid JSON, or has a number that is not finite; with its position.
+    """
     path = Path(path)
     if path.is_dir():
         raise error(f"{path}: is a folder; expected a JSON file, such as the scenario.json that `reconstruct` writes")
@@ -91,19 +103,19 @@ def read_json(path: Path | str, error: type[LogError] = LogError) -> Any:
     try:
         text = path.read_text(encoding="utf-8")
         value = json.loads(text, parse_constant=_refuse, parse_float=_finite)
-        if _HALF_PAIR.search(text):  # an escape may stand for half a surrogate pair, which no file can hold
+        if _SURROGATE_ESCAPE.search(text):  # JSON can escape an unpaired surrogate, which UTF-8 cannot encode
             json.dumps(value, ensure_ascii=False).encode()
         return value
     except _NotFinite as problem:
         raise error(
-            f"{path}: {_place_in(text)} is {problem}, expected a finite number; write one, or null where it may be absent"
+            f"{path}: {_location_of_not_finite(text)} is {problem}, expected a finite number; write one, or null where the schema allows it"
         ) from None
     except json.JSONDecodeError as problem:
         raise error(f"{path}: not valid JSON at line {problem.lineno}, column {problem.colno}: {problem.msg}") from None
     except UnicodeEncodeError as problem:
         half = problem.object[problem.start : problem.end][:1]
         raise error(
-            f"{path}: a text holds {half!a}, half a surrogate pair, which no file can; write the whole"
+            f"{path}: a text has {half!a}, an unpaired surrogate, which UTF-8 cannot encode; correct the text"
         ) from None
     except (UnicodeDecodeError, RecursionError, ValueError) as problem:
         raise error(f"{path}: not valid JSON: {problem}") from None
@@ -122,22 +134,22 @@ def _finite(word: str) -> float:
     return value if math.isfinite(value) else _refuse(word)
 
 
-def _place_in(text: str) -> str:
-    """Where the first number of a JSON text that is not finite stands."""
+def _location_of_not_finite(text: str) -> str:
+    """Return where the first number of a JSON text is that is not finite."""
     try:
-        return _place_not_finite(json.loads(text)) or "the document"
-    except (ValueError, RecursionError):  # what follows it is no JSON either, or nested without end
+        return _path_of_not_finite(json.loads(text)) or "the document"
+    except (ValueError, RecursionError):  # another error follows it, or too deep nesting
         return "a number"
 
 
-def _place_not_finite(value: Any) -> str | None:
-    """Where the first number that is not finite stands, as "a.b[3]"; None when there is none."""
+def _path_of_not_finite(value: Any) -> str | None:
+    """Return the path of the first number that is not finite, as "a.b[3]"; None when there is none."""
     if isinstance(value, float):
         return None if math.isfinite(value) else ""
     if not isinstance(value, (dict, list)):
         return None
     for key, item in value.items() if isinstance(value, dict) else enumerate(value):
-        place = _place_not_finite(item)
+        place = _path_of_not_finite(item)
         if place is not None:
             step = f"[{key}]" if isinstance(key, int) else f"{key}"
             return step + ("." if place and not place.startswith("[") else "") + place
@@ -145,7 +157,13 @@ def _place_not_finite(value: Any) -> str | None:
 
 
 def inside(root: Path, relative: str, what: str) -> Path:
-    """Resolve a path that a log names, and refuse one that leaves the log's folder (also through a symbolic link)."""
+    """Resolve a path that a log names.
+
+    Raises
+    ------
+    LogError
+        For a path outside the log's folder, also through a symbolic link.
+    """
     try:
         resolved = (root / relative).resolve()
     except (OSError, RuntimeError, ValueError) as problem:  # a loop of symbolic links, a zero byte
@@ -158,21 +176,28 @@ def inside(root: Path, relative: str, what: str) -> Path:
 
 
 def rounded(value: float, digits: int) -> float | None:
-    """A float for JSON with so many decimals; None when it is not finite."""
+    """Round a float to a number of decimals for JSON; None when it is not finite."""
     return round(float(value), digits) if math.isfinite(value) else None
 
 
 @cache
 def load_schema(name: str) -> dict[str, Any]:
-    """The schema `name` ("log-1", "scenario-1", "replay-1", "report-1", "metrics-1", "bench-1") as a document."""
+    """Load a schema by name, such as "scenario-1"."""
     beside_source = Path(__file__).resolve().parent.parent / "schemas" / f"{name}.json"
-    if beside_source.is_file():
-        return json.loads(beside_source.read_text(encoding="utf-8"))
-    return json.loads(resources.files("log2sim_schemas").joinpath(f"{name}.json").read_text(encoding="utf-8"))
+    installed = resources.files("log2sim_schemas") if not beside_source.is_file() else None
+    file = installed.joinpath(f"{name}.json") if installed is not None else beside_source
+    document: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    return document
 
 
 def check(document: Any, name: str, error: type[Log2SimError]) -> None:
-    """Raise `error` naming the first field that breaks the schema and what was expected there."""
+    """Validate a document against a schema.
+
+    Raises
+    ------
+    error
+        Naming the first field that violates the schema and what was expected there.
+    """
     problem = next(_validator()(load_schema(name)).iter_errors(document), None)
     if problem is None:
         return
@@ -186,26 +211,26 @@ def check(document: Any, name: str, error: type[Log2SimError]) -> None:
 
 @cache
 def _validator() -> Any:
-    """A validator that looks at columns of plain numbers as a whole: one by one, a long scenario takes seconds."""
+    """Return a validator that checks columns of plain numbers at once: item by item, a long scenario takes seconds."""
     from jsonschema import Draft202012Validator
     from jsonschema.validators import extend
 
     item_by_item = Draft202012Validator.VALIDATORS["items"]
 
     def items(validator: Any, expected: Any, values: Any, schema: Any) -> Any:
-        if not _all_right(expected, values):
+        if not _column_is_valid(expected, values):
             yield from item_by_item(validator, expected, values, schema)
 
     return extend(Draft202012Validator, {"items": items})
 
 
-PLAIN: dict[str, set[type]] = {"number": {int, float}, "integer": {int}, "boolean": {bool}}
+_COLUMN_TYPES: dict[str, set[type]] = {"number": {int, float}, "integer": {int}, "boolean": {bool}}
 
 
-def _all_right(expected: Any, values: Any) -> bool:
-    """Whether values are a list of plain ones that keep to `expected`; False also where that takes a closer look."""
+def _column_is_valid(expected: Any, values: Any) -> bool:
+    """Whether values are a column of plain values that matches `expected`; False also where only the full check can tell."""
     if not isinstance(values, list) or not values or set(expected) - {"type", "minimum", "maximum"}:
         return False
-    if not set(map(type, values)) <= PLAIN.get(expected.get("type", ""), set()):
+    if not set(map(type, values)) <= _COLUMN_TYPES.get(expected.get("type", ""), set()):
         return False
-    return min(values) >= expected.get("minimum", -math.inf) and max(values) <= expected.get("maximum", math.inf)
+    return bool(min(values) >= expected.get("minimum", -math.inf) and max(values) <= expected.get("maximum", math.inf))

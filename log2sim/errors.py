@@ -12,13 +12,13 @@ from typing import Any
 
 
 class Log2SimError(Exception):
-    """Base of all errors that a user can cause and mend."""
+    """Base of all errors that a user can cause and correct."""
 
     exit_code = 1
 
 
 class ConfigError(Log2SimError):
-    """A setting, option or name that is not known or out of its range."""
+    """A setting, option or name that is unknown or out of range."""
 
     exit_code = 2
 
@@ -30,7 +30,7 @@ class LogError(Log2SimError):
 
 
 class ScenarioError(LogError):
-    """A scenario, replay or truth file that breaks its schema or holds impossible values."""
+    """A scenario, replay or truth file that violates its schema or has impossible values."""
 
 
 class RecordError(LogError):
@@ -38,7 +38,7 @@ class RecordError(LogError):
 
 
 class NothingToReconstruct(Log2SimError):
-    """The log is fine, yet nothing in it can become an agent."""
+    """A valid log without ego poses in which no object was detected."""
 
     exit_code = 4
 
@@ -54,7 +54,7 @@ class MissingExtra(Log2SimError):
 
 
 class CheckFailed(Log2SimError):
-    """A limit asked for with --strict is broken."""
+    """A limit was exceeded and --strict was given."""
 
     exit_code = 6
 
@@ -94,7 +94,7 @@ def install_command(extra: str) -> str:
 
 
 def _origin() -> dict[str, Any]:
-    """The content of `direct_url.json`; empty for a package from an index."""
+    """Read `direct_url.json`; empty for a package from an index."""
     from importlib.metadata import PackageNotFoundError, distribution
 
     try:

@@ -1,4 +1,4 @@
-"""Plug-ins by name: tables that import nothing until a name is chosen, open to third parties through entry points."""
+"""Plug-ins by name, imported when they are used: built-in ones and those of other packages (entry points)."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ BUILT_IN: dict[str, dict[str, str]] = {
 }
 
 
-SPOKEN = {"log": "log format", "export": "export format"}
+KIND_LABELS = {"log": "log format", "export": "export format"}
 
 
 def names(kind: str) -> list[str]:
-    """Names of all plug-ins of a kind ("log", "detector", "export"), built-in ones first."""
+    """List the plug-ins of a kind ("log", "detector", "export"), built-in ones first."""
     return list(BUILT_IN[kind]) + sorted(e.name for e in entry_points(group=f"log2sim.{kind}"))
 
 
@@ -56,11 +56,11 @@ def load(kind: str, name: str) -> Any:
         if entry.name == name:
             return entry.load()
     raise ConfigError(
-        f"unknown {SPOKEN.get(kind, kind)} '{name}'{nearest(name, names(kind))}; known: {', '.join(names(kind))}"
+        f"unknown {KIND_LABELS.get(kind, kind)} '{name}'{nearest(name, names(kind))}; known: {', '.join(names(kind))}"
     )
 
 
 def nearest(word: str, known: list[str]) -> str:
-    """A hint " (did you mean ...?)" or nothing."""
+    """Return a hint " (did you mean '...'?)", or "" when no known word is similar."""
     close = difflib.get_close_matches(word, known, n=1)
     return f" (did you mean '{close[0]}'?)" if close else ""

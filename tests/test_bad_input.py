@@ -402,5 +402,5 @@ def test_interrupting_leaves_nothing(tmp_path: Path) -> None:
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=30)
     assert process.returncode == 130
-    assert err == "log2sim: interrupted; nothing half-written was left\n"
+    assert err == "log2sim: interrupted; no incomplete file was left\n"
     assert names(tmp_path / "work") == []

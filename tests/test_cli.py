@@ -73,7 +73,7 @@ def test_reconstruct_says_what_came_out_and_writes_nothing_unasked(tiny_folder: 
     ran = run("reconstruct", tiny_folder, "--out", tmp_path / "s.json", "--detector", "labels")
     assert ran.code == 0
     assert names(tmp_path) == ["s.json"]
-    assert "s.json: 3 agents (1 standing) over 0.9 s" in ran.out
+    assert "s.json: 3 agents (1 static) over 0.9 s" in ran.out
     assert "detect and measure: 10 of 10" in ran.err
     again = run("reconstruct", tiny_folder, "--out", tmp_path / "s.json", "--detector", "labels")
     assert again.code == 2

@@ -113,7 +113,7 @@ def test_nothing_is_written_where_a_folder_or_a_file_stands(tmp_path: Path) -> N
     (tmp_path / "file").write_text("x")
     with pytest.raises(ConfigError, match="is a folder"), replaced(tmp_path):
         pytest.fail("the block must not run")
-    with pytest.raises(ConfigError, match="cannot be made a folder"), replaced(tmp_path / "file" / "result.json"):
+    with pytest.raises(ConfigError, match="cannot be created as a folder"), replaced(tmp_path / "file" / "result.json"):
         pytest.fail("the block must not run")
     assert os.listdir(tmp_path) == ["file"]
 
@@ -191,7 +191,7 @@ def test_half_a_surrogate_pair_is_refused_where_it_is_read(tmp_path: Path) -> No
     path.write_text(r'{"whole": "\ud83d\ude97", "escaped": "\\ud83d"}')
     assert read_json(path) == {"whole": "\U0001f697", "escaped": "\\ud83d"}
     path.write_text(r'{"name": ["a\uD83Db"]}')
-    with pytest.raises(ScenarioError, match=r"holds '\\ud83d', half a surrogate pair"):
+    with pytest.raises(ScenarioError, match=r"has '\\ud83d', an unpaired surrogate"):
         read_json(path, ScenarioError)
 
 

@@ -209,7 +209,7 @@ def test_the_command_lists_collisions_and_broken_limits_and_leaves_with_6_when_s
     assert said.code == 0
     assert "least time to collision 2.5" in said.out
     assert "(ego and wall at" in said.out
-    assert "limit broken: agent 'ego': min_ttc_s" in said.out
+    assert "limit exceeded: agent 'ego': min_ttc_s" in said.out
     strict = run("replay", tmp_path / "s.json", "--limit", "min_ttc_s=3", "--strict")
     assert strict.code == 6
     assert "min_ttc_s" in strict.err

@@ -1,16 +1,13 @@
-"""Error against run time over methods and settings."""
+"""Compare methods and settings by error and run time."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from log2sim.cli.options import ConfigFile, Format, LogPath, Overwrite, Quiet, Sequence, Settings, say
-
-if TYPE_CHECKING:
-    pass
 from log2sim.cli.truth import truth_at
 
 
@@ -19,26 +16,33 @@ def bench(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for bench.json and bench.png.")],
     truth: Annotated[
         Path | None,
-        typer.Option(metavar="TRUTH", help="Scenario file, or a log with labels; LOG itself if it has any."),
+        typer.Option(
+            metavar="TRUTH", help="Ground truth: a scenario file or a log with labels; default: LOG, if it has labels."
+        ),
     ] = None,
     detector: Annotated[
-        list[str] | None, typer.Option(metavar="NAME|MODEL.onnx|labels", help="May be given several times to compare.")
+        list[str] | None,
+        typer.Option(
+            metavar="NAME|MODEL.onnx|labels", help="Detector, see reconstruct; repeat the option to compare several."
+        ),
     ] = None,
     format: Format = "auto",
     sequence: Sequence = None,
     cameras: Annotated[str | None, typer.Option(metavar="A,B", help="Use only these cameras.")] = None,
     range: Annotated[
-        float | None, typer.Option(metavar="M", help="Compare only within so many meters of the ego.")
+        float | None, typer.Option(metavar="M", help="Compare agents up to this distance from the ego, in m.")
     ] = None,
-    categories: Annotated[str | None, typer.Option(metavar="A,B", help="Compare only these, e.g. vehicle.")] = None,
-    start: Annotated[float | None, typer.Option(help="First second.")] = None,
-    stop: Annotated[float | None, typer.Option(help="Last second.")] = None,
+    categories: Annotated[
+        str | None, typer.Option(metavar="A,B", help="Compare only these categories or groups, e.g. vehicle.")
+    ] = None,
+    start: Annotated[float | None, typer.Option(help="First time to use, in s from the start of the log.")] = None,
+    stop: Annotated[float | None, typer.Option(help="Last time to use, in s from the start of the log.")] = None,
     config: ConfigFile = None,
     settings: Settings = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Draw error against run time over methods and settings."""
+    """Compare methods and settings by error and run time."""
     from log2sim.cli.progress import progress
     from log2sim.config import Config
     from log2sim.documents import check_targets, write_json
@@ -58,8 +62,10 @@ def bench(
     used = chosen.cameras or tuple(opened.cameras)
     known = truth_at(truth or log, used, sequence) if truth is not None or labeled else None
     scope = Scope(range, tuple(c.strip() for c in categories.split(",")) if categories else None)
-    with progress(quiet=quiet) as tell:
-        result = run(opened, chosen, truth=known, scope=scope, detectors=tuple(detector or ()), progress=tell)
+    with progress(quiet=quiet) as report_progress:
+        result = run(
+            opened, chosen, truth=known, scope=scope, detectors=tuple(detector or ()), progress=report_progress
+        )
     write_json(out / "bench.json", document(result))
     write_picture(result, out / "bench.png")
     say(format_table(result), quiet=quiet)

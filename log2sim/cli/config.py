@@ -1,4 +1,4 @@
-"""Print the settings."""
+"""Print all settings with their meaning."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ def config(
 ) -> None:
     """Print all settings as TOML.
 
-    The defaults, or what a file and --set make of them.
+    Each with its meaning, unit, choices and default; with --config or --set, the values that these give.
     """
     from log2sim.config import Config
 

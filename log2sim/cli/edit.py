@@ -1,4 +1,4 @@
-"""Change a scenario."""
+"""Edit a scenario."""
 
 from __future__ import annotations
 
@@ -21,22 +21,21 @@ def edit(
     scenario: ScenarioPath,
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Scenario file to write.")],
     shift: Annotated[
-        Changes, typer.Option(metavar="AGENT=SECONDS", help="Later by so much, earlier if negative.")
+        Changes, typer.Option(metavar="AGENT=SECONDS", help="Delay an agent; negative: advance it.")
     ] = None,
-    speed: Annotated[Changes, typer.Option(metavar="AGENT=FACTOR", help="So many times as fast.")] = None,
+    speed: Annotated[Changes, typer.Option(metavar="AGENT=FACTOR", help="Multiply the speed of an agent.")] = None,
     lateral: Annotated[
-        Changes, typer.Option(metavar="AGENT=METERS", help="To its left by so much, right if negative.")
+        Changes, typer.Option(metavar="AGENT=METERS", help="Move an agent to its left; negative: to its right.")
     ] = None,
-    remove: Annotated[Changes, typer.Option(metavar="AGENT", help="Without this agent.")] = None,
-    only: Annotated[Changes, typer.Option(metavar="A,B", help="Only these; the ego is 'ego'.")] = None,
+    remove: Annotated[Changes, typer.Option(metavar="A,B", help="Remove agents.")] = None,
+    only: Annotated[Changes, typer.Option(metavar="A,B", help="Keep only these agents; the ego is 'ego'.")] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit 6 when a check fails.")] = False,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Change who is in a scenario, when, how fast and where.
+    """Edit the agents of a scenario: their presence, timing, speed and lateral position.
 
-    All options but --out may be given several times. They apply in this order, however they are written: only, remove,
-    speed, lateral, shift.
+    All options but --out may be given several times. They are applied in this order: only, remove, speed, lateral, shift.
     """
     from log2sim.datatypes import Scenario
     from log2sim.documents import check_targets
@@ -44,7 +43,7 @@ def edit(
 
     check_targets(out, overwrite=overwrite)
     loaded = Scenario.load(scenario)
-    # A shift comes last, so that no other edit misses what it cuts off before the start.
+    # A shift comes last: it may cut off waypoints before the start that other edits need.
     edits = [
         *_choices(loaded, only, remove),
         *_motions({"speed": speed, "lateral": lateral, "shift": shift}),
@@ -64,7 +63,7 @@ def edit(
 
 
 def _choices(scenario: Scenario, only: Changes, remove: Changes) -> Iterator[Edit]:
-    """The edits that say who is there."""
+    """Yield the edits that keep or remove agents."""
     from log2sim.edit.edits import Only, Remove
 
     if only:
@@ -73,14 +72,14 @@ def _choices(scenario: Scenario, only: Changes, remove: Changes) -> Iterator[Edi
 
 
 def ids_of(scenario: Scenario, entries: Iterable[str]) -> Iterator[str]:
-    """The ids that entries such as "A,B" name; an id of the scenario may itself hold a comma."""
+    """Yield the ids in entries such as "A,B"; an id of the scenario may itself contain a comma."""
     known = {a.id for a in scenario.agents}
     for entry in entries:
         yield from [entry] if entry in known else (name.strip() for name in entry.split(","))
 
 
 def _motions(changes: dict[str, Changes]) -> Iterator[Edit]:
-    """The edits that say when, how fast and where."""
+    """Yield the edits of timing, speed and lateral position."""
     from log2sim.edit.edits import Lateral, Shift, Speed
     from log2sim.errors import ConfigError
 

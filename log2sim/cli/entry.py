@@ -57,7 +57,7 @@ app.command(name="import")(import_.import_)
 
 
 def main() -> None:
-    """Run the command line; every error of ours becomes one clear message and its exit code."""
+    """Run the command line; every `Log2SimError` becomes one message and its exit code."""
     arguments = [a for a in sys.argv[1:] if a != "--debug"]
     debug = len(arguments) != len(sys.argv) - 1
     try:
@@ -83,5 +83,5 @@ def main() -> None:
             sys.exit(2)
         fail(f"{format_message()} (see log2sim --help)", getattr(error, "exit_code", 2))
     if code == INTERRUPTED:  # typer returns it for Ctrl-C within a command
-        fail("interrupted; nothing half-written was left", INTERRUPTED)
+        fail("interrupted; no incomplete file was left", INTERRUPTED)
     sys.exit(code if isinstance(code, int) else 0)

@@ -9,7 +9,7 @@ import typer
 
 from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, say
 
-MOST_NOTES = 5
+MAX_NOTES = 5
 FORMATS = "openscenario, carla, csv, scenarionet, commonroad, osi, mcap, rerun"  # written out: --help imports nothing
 
 
@@ -17,13 +17,14 @@ def export(
     scenario: ScenarioPath,
     to: Annotated[str, typer.Option("--to", metavar="FORMAT", help=f"One of {FORMATS}.")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write into.")],
-    revision: Annotated[str | None, typer.Option(help="openscenario: 1.0, 1.1 or 1.2.")] = None,
+    revision: Annotated[str | None, typer.Option(help="openscenario: version 1.0, 1.1 or 1.2.")] = None,
     map: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="openscenario, carla: OpenDRIVE to use, not an own.")
+        Path | None,
+        typer.Option(metavar="FILE", help="openscenario, carla: OpenDRIVE file to use instead of a generated one."),
     ] = None,
-    mode: Annotated[str | None, typer.Option(help="carla: exact or pid.")] = None,
+    mode: Annotated[str | None, typer.Option(help="carla: how agents move, exact or pid.")] = None,
     log: Annotated[
-        Path | None, typer.Option(metavar="LOG", help="mcap, rerun: log whose pictures and points go along.")
+        Path | None, typer.Option(metavar="LOG", help="mcap, rerun: log whose images and points are included.")
     ] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -41,7 +42,7 @@ def export(
     for file in files:
         say(f"{file}: written", quiet=quiet)
     notes = export_notes(loaded)
-    for note in notes[:MOST_NOTES]:
+    for note in notes[:MAX_NOTES]:
         say(f"note: {note}", quiet=quiet)
-    if len(notes) > MOST_NOTES:
-        say(f"note: and {len(notes) - MOST_NOTES} more such pairs", quiet=quiet)
+    if len(notes) > MAX_NOTES:
+        say(f"note: and {len(notes) - MAX_NOTES} more", quiet=quiet)

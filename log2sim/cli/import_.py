@@ -1,4 +1,4 @@
-"""Turn a file of another simulator back into a scenario."""
+"""Convert a file of another simulator to a scenario."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def import_(
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Turn an OpenSCENARIO file back into a scenario."""
+    """Convert an OpenSCENARIO file to a scenario."""
     from log2sim.documents import check_targets
     from log2sim.export.openscenario.read import load
 

@@ -1,4 +1,4 @@
-"""Describe a log."""
+"""Describe the content of a log."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from log2sim.cli.options import Format, LogPath, Sequence, say
 
 
 def inspect(log: LogPath, format: Format = "auto", sequence: Sequence = None) -> None:
-    """Say what a log holds, as JSON."""
+    """Describe the content of a log as JSON."""
     import json
 
     from log2sim.logs.opening import open_log

@@ -13,13 +13,17 @@ ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A scenar
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
 Format = Annotated[str, typer.Option(help="Log format: auto, log2sim, kitti, kitti-tracking, pandaset.")]
-Sequence = Annotated[str | None, typer.Option(help="Which sequence, when the folder holds several.")]
-Settings = Annotated[list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change a setting.")]
-ConfigFile = Annotated[Path | None, typer.Option("--config", metavar="FILE.toml", help="Settings file.")]
+Sequence = Annotated[str | None, typer.Option(help="Sequence to open, when the folder has several.")]
+Settings = Annotated[
+    list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change a setting; see log2sim config.")
+]
+ConfigFile = Annotated[
+    Path | None, typer.Option("--config", metavar="FILE.toml", help="File with settings; see log2sim config.")
+]
 
 
 def fail(message: str, code: int) -> NoReturn:
-    """Print an error and leave."""
+    """Print an error and exit with a code."""
     sys.stderr.write(f"log2sim: {message}\n")
     sys.exit(code)
 
@@ -32,5 +36,5 @@ def say(text: str, *, quiet: bool = False) -> None:
 
 
 def counted(count: int, noun: str) -> str:
-    """A number of things, in words."""
+    """Format a count with its noun, such as "1 agent" or "2 agents"."""
     return f"{count} {noun}{'s' * (count != 1)}"

@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from log2sim.cli.options import Overwrite, ScenarioPath, Sequence
-
-if TYPE_CHECKING:
-    pass
 from log2sim.cli.truth import load_replay, load_truth
 
 
 def plot(
     scenario: ScenarioPath,
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help=".png .svg .pdf, or .gif .mp4.")],
-    replay: Annotated[Path | None, typer.Option(metavar="REPLAY", help="Replay to lay over.")] = None,
-    truth: Annotated[Path | None, typer.Option(metavar="TRUTH", help="Scenario file, or a log with labels.")] = None,
-    background: Annotated[Path | None, typer.Option(metavar="LOG", help="Log whose cameras paint the ground.")] = None,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FILE", help="Image (.png .svg .pdf) or animation (.gif .mp4) to write.")
+    ],
+    replay: Annotated[Path | None, typer.Option(metavar="REPLAY", help="Replay to draw over the scenario.")] = None,
+    truth: Annotated[
+        Path | None, typer.Option(metavar="TRUTH", help="Ground truth: a scenario file or a log with labels.")
+    ] = None,
+    background: Annotated[
+        Path | None,
+        typer.Option(metavar="LOG", help="Log whose camera images are projected onto the ground as background."),
+    ] = None,
     sequence: Sequence = None,
     overwrite: Overwrite = False,
 ) -> None:

@@ -1,4 +1,4 @@
-"""Progress for people: a bar on a terminal, a plain line now and then elsewhere, nothing when quiet."""
+"""Progress: bars on a terminal, a plain line every few seconds elsewhere, nothing with --quiet."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ LINE_EVERY_S = 5.0
 
 @contextmanager
 def progress(*, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """Yield a function `tell(stage, done, total)`."""
+    """Yield a function `report_progress(stage, done, total)`."""
     if quiet:
         yield lambda stage, done, total: None
     elif sys.stderr.isatty():
-        with _bars() as tell:
-            yield tell
+        with _bars() as report_progress:
+            yield report_progress
     else:
         yield _lines()
 
@@ -31,21 +31,21 @@ def _bars() -> Iterator[Callable[[str, int, int], None]]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
         tasks: dict[str, object] = {}
 
-        def tell(stage: str, done: int, total: int) -> None:
+        def report_progress(stage: str, done: int, total: int) -> None:
             if stage not in tasks:
                 tasks[stage] = bars.add_task(stage, total=total)
             bars.update(tasks[stage], completed=done, total=total)  # type: ignore[arg-type]
 
-        yield tell
+        yield report_progress
 
 
 def _lines() -> Callable[[str, int, int], None]:
     last = [time.monotonic()]
 
-    def tell(stage: str, done: int, total: int) -> None:
+    def report_progress(stage: str, done: int, total: int) -> None:
         now = time.monotonic()
         if done == total or now - last[0] >= LINE_EVERY_S:
             last[0] = now
             sys.stderr.write(f"{stage}: {done} of {total}\n")
 
-    return tell
+    return report_progress

@@ -16,16 +16,22 @@ def reconstruct(
     format: Format = "auto",
     sequence: Sequence = None,
     detector: Annotated[
-        str | None, typer.Option(metavar="NAME|MODEL.onnx|labels", help="What finds the objects.")
+        str | None,
+        typer.Option(
+            metavar="NAME|MODEL.onnx|labels",
+            help="Detector: ssd-mobilenet-v2, a path to an ONNX model, or labels (boxes of the log).",
+        ),
     ] = None,
     cameras: Annotated[str | None, typer.Option(metavar="A,B", help="Use only these cameras.")] = None,
-    start: Annotated[float | None, typer.Option(help="First second.")] = None,
-    stop: Annotated[float | None, typer.Option(help="Last second.")] = None,
+    start: Annotated[float | None, typer.Option(help="First time to use, in s from the start of the log.")] = None,
+    stop: Annotated[float | None, typer.Option(help="Last time to use, in s from the start of the log.")] = None,
     config: ConfigFile = None,
     settings: Settings = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of everything random.")] = None,
-    report: Annotated[Path | None, typer.Option(metavar="FILE.json", help="Write the report.")] = None,
-    topdown: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Write the fused top-down picture.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
+    report: Annotated[Path | None, typer.Option(metavar="FILE.json", help="Report file to write.")] = None,
+    topdown: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="Bird's-eye image of all cameras to write.")
+    ] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
@@ -47,8 +53,8 @@ def reconstruct(
     opened = open_log(log, format=format, sequence=sequence)
     for note in opened.notes:
         say(f"note: {note}", quiet=quiet)
-    with progress(quiet=quiet) as tell:
-        result = run(opened, chosen, picture=topdown is not None, progress=tell)
+    with progress(quiet=quiet) as report_progress:
+        result = run(opened, chosen, picture=topdown is not None, progress=report_progress)
     if topdown is not None:
         from log2sim.visualization.birdseye.mosaic import write_picture
         from log2sim.visualization.birdseye.of_log import mosaic_of
@@ -57,21 +63,24 @@ def reconstruct(
     if report is not None:
         write_json(report, result.report)
     result.scenario.save(out)
-    for note in left_out(result.report):
+    for note in unused_records(result.report):
         say(f"note: {note}", quiet=quiet)
     counts = result.report["agents"]
     say(
-        f"{out}: {counts['total']} agents ({counts['static']} standing) over {result.scenario.duration_s:.1f} s, "
+        f"{out}: {counts['total']} agents ({counts['static']} static) over {result.scenario.duration_s:.1f} s, "
         f"{result.report['ticks_per_second']:.1f} ticks/s",
         quiet=quiet,
     )
 
 
-def left_out(report: dict[str, Any]) -> list[str]:
-    """What of a log a run could not use, a line each."""
-    unread = report["unreadable"].items()
-    lost = report["without_pose"].items()
+def unused_records(report: dict[str, Any]) -> list[str]:
+    """List what a run could not use of a log, a line for each stream."""
+    unreadable = report["unreadable"].items()
+    without_pose = report["without_pose"].items()
     return [
-        *(f"{name}: {u['count']} records could not be read, first: {u['first']}" for name, u in unread),
-        *(f"{name}: {count} frames left out, since no ego pose is known at their stamps" for name, count in lost),
+        *(f"{name}: {u['count']} records could not be read, first: {u['first']}" for name, u in unreadable),
+        *(
+            f"{name}: {count} frames skipped, since no ego pose is known at their stamps"
+            for name, count in without_pose
+        ),
     ]

@@ -1,4 +1,4 @@
-"""Let vehicles drive a scenario."""
+"""Simulate a scenario."""
 
 from __future__ import annotations
 
@@ -13,30 +13,37 @@ from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, say
 def replay(
     scenario: ScenarioPath,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Replay file to write.")] = None,
-    mode: Annotated[str, typer.Option(help="pid or exact.")] = "pid",
+    mode: Annotated[
+        str, typer.Option(help="pid: vehicles follow their trajectories by a controller; exact: no controller.")
+    ] = "pid",
     model: Annotated[str, typer.Option(help="Vehicle model: auto, kinematic, dynamic or single-track.")] = "auto",
-    dt: Annotated[float, typer.Option(help="Step in s, from 0.0005 to 1.")] = 0.01,
+    dt: Annotated[float, typer.Option(help="Time step in s, from 0.0005 to 1.")] = 0.01,
     ego: Annotated[
         str | None, typer.Option(metavar="MODULE|FILE.py:ATTRIBUTE", help="Policy that drives the ego.")
     ] = None,
-    agents: Annotated[str, typer.Option(help="What the others do: log, or reactive (brake for what is new).")] = "log",
-    react: Annotated[str | None, typer.Option(metavar="ID,ID", help="Only these react.")] = None,
-    simulator: Annotated[str, typer.Option(help="own, or carla: a CARLA server moves the agents.")] = "own",
-    host: Annotated[str | None, typer.Option(help="With carla: where its server runs, else 127.0.0.1.")] = None,
-    port: Annotated[int | None, typer.Option(help="With carla: its port, else 2000.", min=1, max=65535)] = None,
-    map: Annotated[str | None, typer.Option(metavar="TOWN|FILE.xodr", help="With carla: world to load first.")] = None,
+    agents: Annotated[
+        str,
+        typer.Option(help="Behavior of the other agents: log (as recorded) or reactive (brake to avoid collisions)."),
+    ] = "log",
+    react: Annotated[str | None, typer.Option(metavar="ID,ID", help="Make only these agents reactive.")] = None,
+    simulator: Annotated[str, typer.Option(help="own, or carla: agents move in a CARLA server.")] = "own",
+    host: Annotated[str | None, typer.Option(help="carla: address of the server, default 127.0.0.1.")] = None,
+    port: Annotated[int | None, typer.Option(help="carla: port of the server, default 2000.", min=1, max=65535)] = None,
+    map: Annotated[str | None, typer.Option(metavar="TOWN|FILE.xodr", help="carla: map to load first.")] = None,
     strict: Annotated[
         bool,
-        typer.Option("--strict", help="Exit 6 when a limit is broken: of --limit, new collisions, far off the path."),
+        typer.Option(
+            "--strict", help="Exit 6 when a limit is exceeded: --limit, new collisions, distance from the path."
+        ),
     ] = False,
     limit: Annotated[
         list[str] | None,
-        typer.Option(metavar="METRIC=VALUE", help="Tell who breaks it, e.g. min_ttc_s=1; see --strict."),
+        typer.Option(metavar="METRIC=VALUE", help="Report agents beyond this limit, e.g. min_ttc_s=1; see --strict."),
     ] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Let vehicles drive a scenario."""
+    """Simulate a scenario."""
     from log2sim.cli.edit import ids_of
     from log2sim.cli.progress import progress
     from log2sim.datatypes import Scenario
@@ -52,16 +59,16 @@ def replay(
     if out is not None and out.resolve() == scenario.resolve():
         raise ConfigError(f"{out}: is the scenario itself, which a replay must not replace; choose another name")
     if react is not None and agents != "log":
-        raise ConfigError("--react names the agents that react, --agents reactive means all: give one of them")
+        raise ConfigError("--react selects the reactive agents and --agents reactive selects all: give one of the two")
     limits = parse_limits(limit or ())
     loaded = Scenario.load(scenario)
     chosen = agents if react is None else list(ids_of(loaded, [react]))
     policy = load_policy(ego) if ego is not None else None
     moved_by = external_simulator(simulator, host, port, map)
-    with progress(quiet=quiet) as tell:
+    with progress(quiet=quiet) as report_progress:
         result = run(
             loaded, mode=mode, model=model, dt_s=dt, ego=policy, agents=chosen, host=moved_by,
-            progress=lambda done, total: tell("replay", done, total),
+            progress=lambda done, total: report_progress("replay", done, total),
         )  # fmt: skip
     if out is not None:
         result.save(out)
@@ -69,4 +76,4 @@ def replay(
     if strict:
         require_strict(result, limits)
     for broken in check_limits(result, limits):
-        say(f"limit broken: {broken}", quiet=quiet)
+        say(f"limit exceeded: {broken}", quiet=quiet)

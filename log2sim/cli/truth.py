@@ -1,4 +1,4 @@
-"""Truth and replays that several commands load."""
+"""Load ground truth and replays, as several commands need them."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ if TYPE_CHECKING:
 
 
 def load_replay(path: Path, scenario: Scenario, *, quiet: bool = False) -> Replay:
-    """A replay to show with a scenario; says so when it is one of another."""
+    """Load a replay to show with a scenario; warn when it belongs to another scenario."""
     from log2sim.simulation.result import Replay as Replayed
 
     loaded = Replayed.load(path)
     known = {a.id for a in scenario.agents}
-    strangers = [a.id for a in loaded.agents if a.id not in known]
+    unknown = [a.id for a in loaded.agents if a.id not in known]
     if loaded.scenario != scenario.name:
-        say(f"warning: {path} replays '{loaded.scenario}', not '{scenario.name}'; nothing need fit", quiet=quiet)
-    elif strangers:
-        count = f"{len(strangers)} of its {len(loaded.agents)} agents"
+        say(f"warning: {path} replays '{loaded.scenario}', not '{scenario.name}'; the two may not match", quiet=quiet)
+    elif unknown:
+        count = f"{len(unknown)} of its {len(loaded.agents)} agents"
         say(f"warning: {path} replays another version of '{scenario.name}': {count} are not in it", quiet=quiet)
     return loaded
 
 
 def load_truth(path: Path, scenario: Scenario, sequence: str | None) -> Scenario:
-    """Truth for a scenario, of what the cameras saw that were used for it; see `truth_at`."""
+    """Load the ground truth of a scenario, for the cameras that it used; see `truth_at`."""
     return truth_at(path, [str(c["name"]) for c in scenario.cameras if c.get("used")], sequence)
 
 
 def truth_at(path: Path, used: Iterable[str], sequence: str | None) -> Scenario:
-    """Truth from a scenario file, or from a log: its own `truth.json`, else its labels seen by the cameras that were used."""
+    """Load ground truth from a scenario file or a log: its `truth.json`, else its labels in view of the cameras used."""
     from log2sim.datatypes import Scenario as Truth
 
     if not path.is_dir():

@@ -1,4 +1,4 @@
-"""Check files and logs."""
+"""Validate files and logs."""
 
 from __future__ import annotations
 
@@ -11,13 +11,16 @@ from log2sim.cli.options import Format, Sequence, say
 
 
 def validate(
-    path: Annotated[Path, typer.Argument(metavar="FILE_OR_LOG", help="A scenario, a replay, or a log folder.")],
+    path: Annotated[
+        Path,
+        typer.Argument(metavar="FILE_OR_LOG", help="Scenario, replay, report, metrics or bench file, or a log folder."),
+    ],
     format: Format = "auto",
     sequence: Sequence = None,
 ) -> None:
-    """Check a file or every record of a log.
+    """Validate a file, or every record of a log.
 
-    Exits with 3 and the problems, if there are any.
+    Exits with 3 and lists the problems, if there are any.
     """
     from log2sim.errors import LogError
 

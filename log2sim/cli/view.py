@@ -1,4 +1,4 @@
-"""Write a page that plays a scenario in a browser."""
+"""Write an interactive HTML page of a scenario."""
 
 from __future__ import annotations
 
@@ -13,13 +13,15 @@ from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, Sequence, counte
 def view(
     scenario: ScenarioPath,
     out: Annotated[Path, typer.Option("--out", metavar="FILE.html", help="Page to write.")],
-    truth: Annotated[Path | None, typer.Option(metavar="TRUTH", help="Scenario file, or a log with labels.")] = None,
+    truth: Annotated[
+        Path | None, typer.Option(metavar="TRUTH", help="Ground truth: a scenario file or a log with labels.")
+    ] = None,
     replay: Annotated[Path | None, typer.Option(metavar="REPLAY", help="Replay to show as a layer.")] = None,
     sequence: Sequence = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Make a page that plays a scenario in a browser."""
+    """Write an interactive HTML page of a scenario."""
     from log2sim.cli.truth import load_replay, load_truth
     from log2sim.datatypes import Scenario
     from log2sim.documents import check_targets
