@@ -240,7 +240,7 @@ def test_frames_without_ego_pose_are_told(log_folder: Path) -> None:
     assert ran.code == 0
     # Poses end at 0.38 s and hold for 0.2 s more: the frames at 0.03 to 0.53 s have one.
     assert report_of(log_folder)["without_pose"] == {"front": 4}
-    assert "note: front: 4 frames left out" in ran.out
+    assert "note: front: 4 frames skipped" in ran.out
 
 
 def agent(change: Callable[[dict[str, Any]], Any]) -> Callable[[dict[str, Any]], Any]:
