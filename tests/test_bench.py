@@ -278,11 +278,13 @@ def test_obstacles_set_aside_are_not_fitted_to(tiny: tuple[Log, Scenario], first
     known = true_positions(log, context.schedule, seen, truth, when="imaged")
     holdout = split_holdout(log, context.schedule, seen, known, np.random.default_rng(0))
     before = sum(len(f.uv) for parts in seen.feet.values() for f in parts)
-    after = sum(len(f.uv) for parts in holdout.seen.feet.values() for f in parts)
+    after = sum(len(f.uv) for parts in holdout.observations.feet.values() for f in parts)
     aside = sum(len(f.uv) for parts in holdout.feet.values() for f in parts)
     assert aside == len(holdout) > 0
     assert after == before - aside
-    assert all((m.source == "").all() and np.isnan(m.center_m).all() for rows in holdout.asked.values() for m in rows)
+    assert all(
+        (m.source == "").all() and np.isnan(m.center_m).all() for rows in holdout.obstacles.values() for m in rows
+    )
 
 
 def test_a_right_homography_has_no_error_and_a_shifted_one_its_shift(

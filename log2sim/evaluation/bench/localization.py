@@ -49,7 +49,7 @@ class KnownPositions:
 def true_positions(
     log: Log,
     schedule: Schedule,
-    seen: Observations,
+    observations: Observations,
     truth: Scenario,
     *,
     when: Literal["measured", "imaged"] = "measured",
@@ -66,65 +66,65 @@ def true_positions(
     Measurements are matched with objects by IoU of their boxes in the image, independently of the measured position.
     """
     shift_m = np.array(truth.map.offset_m) - np.array(log.map.offset_m)
-    out = [KnownPositions(np.full((len(m), 2), np.nan), np.full(len(m), -1)) for m in seen.measurements]
+    out = [KnownPositions(np.full((len(m), 2), np.nan), np.full(len(m), -1)) for m in observations.measurements]
     for camera, index in schedule.frames.items():
         ticks = np.flatnonzero(index >= 0)
         stamps = log.streams[camera].t_ns[index[ticks]]
-        side = truth_states(truth.others, (stamps - truth.t0_ns) / NS_PER_S, shift_m, None)
+        table = truth_states(truth.others, (stamps - truth.t0_ns) / NS_PER_S, shift_m, None)
         map_T_cam, known = log.map_T_sensor(camera, stamps)
         for k in np.flatnonzero(known):
-            m = seen.measurements[ticks[k]]
+            m = observations.measurements[ticks[k]]
             rows = np.flatnonzero(m.camera == camera)
-            if len(rows) and len(side.ids):
-                boxes = _boxes_in_image(log, camera, side, int(k), inverse(map_T_cam[k]))
-                pairs = _matched_agents(m.take(rows), side, boxes)
+            if len(rows) and len(table.ids):
+                boxes = _boxes_in_image(log, camera, table, int(k), inverse(map_T_cam[k]))
+                pairs = _matched_agents(m.take(rows), table, boxes)
                 later_s = (m.t_ns[rows] - stamps[k]) / NS_PER_S if when == "measured" else np.zeros(len(rows))
-                out[ticks[k]].xy[rows] = _true_xy(side, int(k), pairs, later_s)
+                out[ticks[k]].xy[rows] = _true_xy(table, int(k), pairs, later_s)
                 out[ticks[k]].object_id[rows] = pairs
     return out
 
 
-def lidar_positions(seen: Observations, tick_s: float) -> list[KnownPositions]:
+def lidar_positions(observations: Observations, tick_s: float) -> list[KnownPositions]:
     """Take LiDAR positions of each tick's measurements as known; those within `BLOCK_S` count as one object."""
     return [
         KnownPositions(m.center_m[:, :2], np.full(len(m), int(tick * tick_s / BLOCK_S)))
-        for tick, m in enumerate(seen.measurements)
+        for tick, m in enumerate(observations.measurements)
     ]
 
 
-def _boxes_in_image(log: Log, camera: str, side: StateTable, k: int, cam_T_map: Array) -> Array:
+def _boxes_in_image(log: Log, camera: str, table: StateTable, k: int, cam_T_map: Array) -> Array:
     """Project the truth agents that count at a frame: boxes (A, 4), px, NaN for the others."""
-    boxes = np.full((len(side.ids), 4), np.nan)
-    rows = np.flatnonzero(side.present[:, k] & side.visible[:, k])
-    center = np.column_stack([side.xy_m[rows, k], side.z_m[rows, k]])
-    seen = project_boxes(center, side.size_m[rows], side.yaw_rad[rows, k], log.cameras[camera], cam_T_map)
-    boxes[rows] = seen.box_px
+    boxes = np.full((len(table.ids), 4), np.nan)
+    rows = np.flatnonzero(table.present[:, k] & table.visible[:, k])
+    center = np.column_stack([table.xy_m[rows, k], table.z_m[rows, k]])
+    projected = project_boxes(center, table.size_m[rows], table.yaw_rad[rows, k], log.cameras[camera], cam_T_map)
+    boxes[rows] = projected.box_px
     return boxes
 
 
-def _matched_agents(m: Measurements, side: StateTable, boxes: Array) -> NDArray[np.intp]:
+def _matched_agents(m: Measurements, table: StateTable, boxes: Array) -> NDArray[np.intp]:
     """Find the truth agent (M,) of each measured box, -1 for none: mutually best IoU within a group of categories."""
     group = np.array([GROUP_OF[str(c)] for c in m.category])
     overlap = np.nan_to_num(box_iou(m.box_px, boxes))
-    overlap = np.where(group[:, None] == side.group, overlap, 0.0)
+    overlap = np.where(group[:, None] == table.group, overlap, 0.0)
     best, back = overlap.argmax(axis=1), overlap.argmax(axis=0)
     rows = np.arange(len(m))
     return np.where((overlap[rows, best] >= MIN_IOU) & (back[best] == rows), best, -1)
 
 
-def _true_xy(side: StateTable, k: int, pairs: NDArray[np.intp], later_s: Array) -> Array:
+def _true_xy(table: StateTable, k: int, pairs: NDArray[np.intp], later_s: Array) -> Array:
     """Extrapolate true centers (M, 2) by `later_s` (M,), a few hundredths of a second, from frame `k`."""
-    speed, yaw = side.speed_mps[pairs, k], side.yaw_rad[pairs, k]
-    xy = side.xy_m[pairs, k] + (speed * later_s)[:, None] * np.column_stack([np.cos(yaw), np.sin(yaw)])
+    speed, yaw = table.speed_mps[pairs, k], table.yaw_rad[pairs, k]
+    xy = table.xy_m[pairs, k] + (speed * later_s)[:, None] * np.column_stack([np.cos(yaw), np.sin(yaw)])
     return np.where((pairs >= 0)[:, None], xy, np.nan)
 
 
-def score_measurements(seen: Observations, known: Sequence[KnownPositions]) -> Score:
+def score_measurements(observations: Observations, known: Sequence[KnownPositions]) -> Score:
     """Score measured centers by their distance from the true ones, capped at `CUTOFF_M`; a missing position counts as that."""
-    measured = np.concatenate([m.center_m[:, :2] for m in seen.measurements])
+    measured = np.concatenate([m.center_m[:, :2] for m in observations.measurements])
     true, object_id = np.concatenate([k.xy for k in known]), np.concatenate([k.object_id for k in known])
-    asked = np.isfinite(true[:, 0])
-    return _score_of_distances(np.hypot(*(measured - true)[asked].T), object_id[asked])
+    known_rows = np.isfinite(true[:, 0])
+    return _score_of_distances(np.hypot(*(measured - true)[known_rows].T), object_id[known_rows])
 
 
 def _score_of_distances(distance: Array, object_id: NDArray[np.int64]) -> Score:
@@ -149,9 +149,9 @@ class Holdout:
 
     Attributes
     ----------
-    seen : Observations
+    observations : Observations
         What is left to fit to.
-    asked : dict of str to list of Measurements
+    obstacles : dict of str to list of Measurements
         The held-out obstacles without their LiDAR positions.
     known : dict of str to list of KnownPositions
         Of their centers.
@@ -159,38 +159,41 @@ class Holdout:
         Their foot points by LiDAR.
     """
 
-    seen: Observations
-    asked: dict[str, list[Measurements]]
+    observations: Observations
+    obstacles: dict[str, list[Measurements]]
     known: dict[str, list[KnownPositions]]
     feet: dict[str, list[Correspondences]]
 
     def __len__(self) -> int:
         """Return the number of held-out obstacles."""
-        return sum(len(m) for rows in self.asked.values() for m in rows)
+        return sum(len(m) for rows in self.obstacles.values() for m in rows)
 
 
 def split_holdout(
-    log: Log, schedule: Schedule, seen: Observations, known: Sequence[KnownPositions], rng: np.random.Generator
+    log: Log, schedule: Schedule, observations: Observations, known: Sequence[KnownPositions], rng: np.random.Generator
 ) -> Holdout:
     """Hold out a random part of the measured obstacles within 60 m, with their known positions at the images' stamps."""
-    asked: dict[str, list[Measurements]] = {camera: [] for camera in seen.feet}
-    places: dict[str, list[KnownPositions]] = {camera: [] for camera in seen.feet}
-    holdout: dict[str, list[Correspondences]] = {camera: [] for camera in seen.feet}
-    for tick, m in enumerate(seen.measurements):
+    obstacles: dict[str, list[Measurements]] = {camera: [] for camera in observations.feet}
+    places: dict[str, list[KnownPositions]] = {camera: [] for camera in observations.feet}
+    holdout: dict[str, list[Correspondences]] = {camera: [] for camera in observations.feet}
+    for tick, m in enumerate(observations.measurements):
         xy, object_id = known[tick].xy, known[tick].object_id
         near = np.hypot(*(m.center_m - m.sensor_m)[:, :2].T) <= MAX_RANGE_M
         good = (m.source == "lidar") & ~m.truncated & (m.points >= MIN_POINTS) & near & np.isfinite(xy[:, 0])
         good &= np.array([len(c) > 0 for c in m.cluster], dtype=bool)
         good &= rng.random(len(m)) < HOLDOUT_FRACTION
-        for camera in asked:
+        for camera in obstacles:
             rows = np.flatnonzero(good & (m.camera == camera))
             stamp = int(log.streams[camera].t_ns[schedule.frames[camera][tick]])
             ego_T_map = inverse(base_pose(log, stamp))
             holdout[camera].append(foot_points(log.cameras[camera], m.take(rows), ego_T_map, tick))
-            asked[camera].append(_without_position(m.take(rows), stamp))
+            obstacles[camera].append(_without_position(m.take(rows), stamp))
             places[camera].append(KnownPositions(xy[rows], object_id[rows]))
-    feet = {camera: [_without_feet(log.cameras[camera], parts, asked[camera])] for camera, parts in seen.feet.items()}
-    return Holdout(replace(seen, feet=feet), asked, places, holdout)
+    feet = {
+        camera: [_without_feet(log.cameras[camera], parts, obstacles[camera])]
+        for camera, parts in observations.feet.items()
+    }
+    return Holdout(replace(observations, feet=feet), obstacles, places, holdout)
 
 
 def _without_position(m: Measurements, stamp: int) -> Measurements:
@@ -205,11 +208,13 @@ def _without_position(m: Measurements, stamp: int) -> Measurements:
     )
 
 
-def _without_feet(camera: Camera, parts: Sequence[Correspondences], asked: Sequence[Measurements]) -> Correspondences:
+def _without_feet(
+    camera: Camera, parts: Sequence[Correspondences], obstacles: Sequence[Measurements]
+) -> Correspondences:
     """Drop the correspondences of held-out obstacles."""
     feet = Correspondences.join(parts)
-    tick = np.concatenate([np.full(len(m), k) for k, m in enumerate(asked)])
-    box = np.concatenate([m.box_px for m in asked])
+    tick = np.concatenate([np.full(len(m), k) for k, m in enumerate(obstacles)])
+    box = np.concatenate([m.box_px for m in obstacles])
     if not len(box) or not len(feet.uv):
         return feet
     uv = undistorted_pixels(camera, np.column_stack([(box[:, 0] + box[:, 2]) / 2, box[:, 3]]))
@@ -226,8 +231,8 @@ def score_homographies(log: Log, holdout: Holdout, grounds: Mapping[str, CameraH
     depth of an object.
     """
     feet, centers, range_m, object_id = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)], [np.zeros(0, dtype=np.int64)]
-    for camera in (c for c in holdout.asked if c in grounds):
-        for tick, (m, known) in enumerate(zip(holdout.asked[camera], holdout.known[camera], strict=True)):
+    for camera in (c for c in holdout.obstacles if c in grounds):
+        for tick, (m, known) in enumerate(zip(holdout.obstacles[camera], holdout.known[camera], strict=True)):
             feet.append(_foot_distances(holdout.feet[camera][tick], at_tick(grounds[camera], tick)))
             centers.append(np.hypot(*(_places(log, tick, m, grounds[camera]) - known.xy).T))
             range_m.append(np.hypot(*(known.xy - m.sensor_m[:, :2]).T))
@@ -253,8 +258,8 @@ def _places(log: Log, tick: int, m: Measurements, ground: CameraHomography) -> A
     """Locate the rows of a tick by the homography: positions (M, 2), m, map frame."""
     if not len(m):
         return np.zeros((0, 2))
-    seen = Observations(measurements=[m], obstacles=[None])
-    found = place_by_homography(log, seen, {ground.camera.name: at_tick(ground, tick)})[0]
+    observations = Observations(measurements=[m], obstacles=[None])
+    found = place_by_homography(log, observations, {ground.camera.name: at_tick(ground, tick)})[0]
     return _in_order(m, found)
 
 
@@ -265,9 +270,9 @@ def at_tick(ground: CameraHomography, tick: int) -> CameraHomography:
     return replace(ground, fit=replace(ground.fit, ground_H_image=h, per_tick=None, ok=own is not None))
 
 
-def _in_order(asked: Measurements, found: Measurements) -> Array:
+def _in_order(requested: Measurements, found: Measurements) -> Array:
     """Order found centers (M, 2) as requested, matching rows by their boxes; NaN for missing ones."""
-    xy = np.full((len(asked), 2), np.nan)
+    xy = np.full((len(requested), 2), np.nan)
     for box, center in zip(found.box_px, found.center_m):
-        xy[np.all(asked.box_px == box, axis=1)] = center[:2]
+        xy[np.all(requested.box_px == box, axis=1)] = center[:2]
     return xy

@@ -65,14 +65,14 @@ ERRORS = {
 
 def make_panels(context: BenchContext, report: Progress) -> list[Panel]:
     """Run all settings and make one panel for each stage and one for whole runs."""
-    runs, seen = run_all(context, report)
+    runs, observations = run_all(context, report)
     whole_ms = context.ms_per_tick(runs[0].seconds)
     known = context.truth is not None
     by_stage = {stage: [runs[0], *(r for r in runs[1:] if r.setting.stage == stage)] for stage in OWN_STAGES}
     points = {
         "detect": [_point(context, "detect", r) for r in by_stage["detect"]],
         "measure": [_measure_point(context, r) for r in by_stage["measure"]],
-        "homography": homography_points(context, seen, report),
+        "homography": homography_points(context, observations, report),
         "smooth": [_point(context, "smooth", r) for r in by_stage["smooth"]],
         "whole run": [_whole_point(context, r) for r in runs],
     }

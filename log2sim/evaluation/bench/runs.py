@@ -133,7 +133,7 @@ def first_pass(
 ) -> tuple[Observations, dict[str, float]]:
     """Measure what a detector found; returns the observations and the seconds of all stages so far."""
     clock, what = StageClock(), detect.name if measure.present else measure.name
-    seen = observe(
+    observations = observe(
         context.log,
         context.schedule,
         context.found[detect.name],
@@ -144,7 +144,7 @@ def first_pass(
         progress=lambda done, total: report(f"measure ({what})", done, total),
     )
     shared = {k: v for k, v in context.shared_s.items() if k != "decode" or detect.config.detect.name != LABELS}
-    return seen, {**clock.seconds, **shared, "detect": context.found[detect.name].seconds}
+    return observations, {**clock.seconds, **shared, "detect": context.found[detect.name].seconds}
 
 
 def run_settings(
@@ -157,13 +157,13 @@ def run_settings(
 
     Settings take turns `REPEATS` times; the least time of each stage counts.
     """
-    (seen, before_s), measurement_score = observed, score_of_measurements(context, observed[0])
+    (observations, before_s), measurement_score = observed, score_of_measurements(context, observed[0])
     scores: dict[str, Score] = {}
     spent: dict[str, list[dict[str, float]]] = {s.key: [] for s in settings}
     for repeat in range(REPEATS):
         for k, setting in enumerate(settings):
             clock = StageClock()
-            scores[setting.key] = _concluded(context, setting, seen, clock)
+            scores[setting.key] = _concluded(context, setting, observations, clock)
             spent[setting.key].append(clock.seconds)
             report("track and smooth", repeat * len(settings) + k + 1, REPEATS * len(settings))
     return [
@@ -177,11 +177,11 @@ def run_settings(
     ]
 
 
-def _concluded(context: BenchContext, setting: Setting, seen: Observations, clock: StageClock) -> Score:
+def _concluded(context: BenchContext, setting: Setting, observations: Observations, clock: StageClock) -> Score:
     detector = context.found[context.grid.present.name]
     try:
         run = Run(context.log, setting.config, context.plan, context.schedule, detector, clock, lambda *_: None)
-        result = second_pass(run, seen)
+        result = second_pass(run, observations)
     except NothingToReconstruct:
         return Score({"agents": 0})
     return score_scenario(result.scenario, context.truth, context.tick_s, context.scope)
@@ -192,14 +192,16 @@ def run_all(context: BenchContext, report: Progress) -> tuple[list[BenchRun], Ob
     grid = context.grid
     warm_up(context)
     passes = [[first_pass(context, grid.present, s, report) for s in grid.measure] for _ in range(MEASURE_REPEATS)]
-    seen = [one for one, _ in passes[-1]]
-    stages_s = [{k: min(each[n][1][k] for each in passes) for k in passes[0][n][1]} for n in range(len(seen))]
-    runs = run_settings(context, (grid.present, *grid.homography[1:], *grid.smooth[1:]), (seen[0], stages_s[0]), report)
+    observations = [one for one, _ in passes[-1]]
+    stages_s = [{k: min(each[n][1][k] for each in passes) for k in passes[0][n][1]} for n in range(len(observations))]
+    runs = run_settings(
+        context, (grid.present, *grid.homography[1:], *grid.smooth[1:]), (observations[0], stages_s[0]), report
+    )
     for n, setting in enumerate(grid.measure[1:], 1):
-        runs += run_settings(context, [setting], (seen[n], stages_s[n]), report)
+        runs += run_settings(context, [setting], (observations[n], stages_s[n]), report)
     for setting in grid.detect[1:]:
         runs += run_settings(context, [setting], first_pass(context, setting, grid.measure[0], report), report)
-    return _share_clouds(runs), seen[0]
+    return _share_clouds(runs), observations[0]
 
 
 def _share_clouds(runs: Sequence[BenchRun]) -> list[BenchRun]:
@@ -219,25 +221,25 @@ def warm_up(context: BenchContext) -> None:
         residuals_s={name: r[:1] for name, r in s.residuals_s.items()},
     )
     short = replace(context, schedule=first)
-    seen, _ = first_pass(short, context.grid.present, context.grid.measure[0], lambda what, done, total: None)
-    _concluded(short, context.grid.present, seen, StageClock())
+    observations, _ = first_pass(short, context.grid.present, context.grid.measure[0], lambda what, done, total: None)
+    _concluded(short, context.grid.present, observations, StageClock())
 
 
-def score_of_measurements(context: BenchContext, seen: Observations) -> Score:
+def score_of_measurements(context: BenchContext, observations: Observations) -> Score:
     """Score the measured centers; empty without truth."""
     if context.truth is None:
         return Score({})
-    return score_measurements(seen, true_positions(context.log, context.schedule, seen, context.truth))
+    return score_measurements(observations, true_positions(context.log, context.schedule, observations, context.truth))
 
 
-def homography_points(context: BenchContext, seen: Observations, report: Progress) -> list[Point]:
+def homography_points(context: BenchContext, observations: Observations, report: Progress) -> list[Point]:
     """Score every homography method on held-out obstacles; empty when no obstacle was measured."""
     truth, seed = context.truth, context.grid.present.config.seed
     if truth is not None:
-        known = true_positions(context.log, context.schedule, seen, truth, when="imaged")
+        known = true_positions(context.log, context.schedule, observations, truth, when="imaged")
     else:
-        known = lidar_positions(seen, context.tick_s)
-    holdout = split_holdout(context.log, context.schedule, seen, known, np.random.default_rng(seed))
+        known = lidar_positions(observations, context.tick_s)
+    holdout = split_holdout(context.log, context.schedule, observations, known, np.random.default_rng(seed))
     if not len(holdout):
         return []
     settings = (*context.grid.homography, *context.grid.hypotheses)
@@ -262,7 +264,7 @@ def fit(context: BenchContext, setting: Setting, holdout: Holdout) -> dict[str, 
     """Fit the homographies of all cameras by one method."""
     plan = replace(context.plan, homography=HomographyScope.ALL_CAMERAS)
     options, rng = estimation_options(setting.config.topdown), np.random.default_rng(setting.config.seed)
-    return fit_homographies(context.log, holdout.seen, plan, options, rng=rng)
+    return fit_homographies(context.log, holdout.observations, plan, options, rng=rng)
 
 
 def fit_figures(grounds: Mapping[str, CameraHomography]) -> Figures:

@@ -46,7 +46,7 @@ def check_scope(truth: Scenario | None, scope: Scope) -> None:
     if truth is not None:
         evaluate(truth, truth, max_range_m=scope.max_range_m, categories=scope.categories)
     elif scope != EVERYTHING:
-        raise ConfigError("a range or categories were asked for, but without truth nothing is compared; give --truth")
+        raise ConfigError("a range or categories are given, but without truth nothing is compared; give --truth")
 
 
 @dataclass(frozen=True)
@@ -156,8 +156,8 @@ def _gap_share(scenario: Scenario, tick_s: float) -> float | None:
     ]
     if not lives or tick_s <= 0:
         return None
-    seen, ticks = (sum(v) for v in zip(*((n, life / tick_s + 1) for n, life in lives)))
-    return float(np.clip(1 - seen / ticks, 0.0, 1.0))
+    detected, ticks = (sum(v) for v in zip(*((n, life / tick_s + 1) for n, life in lives)))
+    return float(np.clip(1 - detected / ticks, 0.0, 1.0))
 
 
 def _smoothing_residual(scenario: Scenario) -> float | None:

@@ -118,16 +118,16 @@ def _sample_truth(agent: Agent, t: Array) -> tuple[Array, Array, Array, Array, M
     w = agent.waypoints
     s = agent.at(np.clip(t, w.t_s[0], w.t_s[-1]))
     outside = t - np.clip(t, w.t_s[0], w.t_s[-1])
-    carried = s.speed_mps * outside
-    xy = np.stack([s.x_m + carried * np.cos(s.yaw_rad), s.y_m + carried * np.sin(s.yaw_rad)], -1)
+    step = s.speed_mps * outside
+    xy = np.stack([s.x_m + step * np.cos(s.yaw_rad), s.y_m + step * np.sin(s.yaw_rad)], -1)
     present = np.abs(outside) <= TRUTH_MARGIN_S
-    seen = np.ones(len(t), dtype=bool) if w.visible is None else w.visible[nearest_index(w.t_s, t)]
+    visible = np.ones(len(t), dtype=bool) if w.visible is None else w.visible[nearest_index(w.t_s, t)]
     # Simplified, a static agent has its first and last waypoint only, and one in straight motion a few.
     simplified = bool(agent.quality.get("waypoints_left_out"))
     max_gap_s = np.inf if agent.static and len(w) == 2 else MAX_SIMPLIFIED_GAP_S if simplified else MAX_TRUTH_GAP_S
     labeled = agent.at(t, max_gap_s=float(max_gap_s)).valid
     nan = np.where(present, 0.0, np.nan)
-    return xy + nan[:, None], s.z_m + nan, s.yaw_rad + nan, s.speed_mps + nan, seen & labeled
+    return xy + nan[:, None], s.z_m + nan, s.yaw_rad + nan, s.speed_mps + nan, visible & labeled
 
 
 def _table(agents: tuple[Agent, ...], ego_xy: Array | None, **columns: Any) -> StateTable:

@@ -252,7 +252,7 @@ def _check_range(max_range_m: float | None, ego_xy: Array | None) -> None:
     if not max_range_m > 0:
         raise ConfigError(f"range is {max_range_m:g} m; it must be greater than 0")
     if ego_xy is None:
-        raise ConfigError("a range was asked for, but neither the scenario nor the truth has an ego to measure it from")
+        raise ConfigError("a range is given, but neither the scenario nor the truth has an ego to measure it from")
 
 
 def _ego_xy(scenario: Scenario, truth: Scenario, ticks_s: Array, truth_ticks_s: Array, shift_m: Array) -> Array | None:

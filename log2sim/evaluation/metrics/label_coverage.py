@@ -15,7 +15,7 @@ MAX_FRAME_LAG_S = 0.15
 """A tick is compared with the nearest labeled frame of a camera within this time."""
 
 
-def ignored_ticks(ignore_regions: IgnoreRegions, t_s: Array, agents: StateTable, asked: Mask) -> Mask:
+def ignored_ticks(ignore_regions: IgnoreRegions, t_s: Array, agents: StateTable, candidates: Mask) -> Mask:
     """Mark (B, T) the boxes that no labeled camera shows in a labeled part of its image.
 
     Parameters
@@ -25,7 +25,7 @@ def ignored_ticks(ignore_regions: IgnoreRegions, t_s: Array, agents: StateTable,
         Ticks, seconds of the truth.
     agents : StateTable
         B agents at these ticks, the truth's map frame.
-    asked : (B, T) bool
+    candidates : (B, T) bool
         The boxes to decide on; all others are False.
 
     Notes
@@ -34,19 +34,19 @@ def ignored_ticks(ignore_regions: IgnoreRegions, t_s: Array, agents: StateTable,
     the nearest frame. One camera that shows it in a labeled part suffices to keep it.
     """
     center_m = np.concatenate([agents.xy_m, agents.z_m[..., None]], axis=-1)
-    labeled, hidden = np.zeros_like(asked), np.zeros_like(asked)
+    labeled, hidden = np.zeros_like(candidates), np.zeros_like(candidates)
     for view in ignore_regions.views:
         frame, near, map_T_cam = _frames_at(view, t_s)
-        for k in np.flatnonzero(asked.any(0) & near):
-            rows = np.flatnonzero(asked[:, k])
+        for k in np.flatnonzero(candidates.any(0) & near):
+            rows = np.flatnonzero(candidates[:, k])
             regions = view.region_px[view.region_frame == frame[k]]
             boxes = center_m[rows, k], agents.size_m[rows], agents.yaw_rad[rows, k]
             for row, uv in zip(rows, image_samples(view.camera, inverse(map_T_cam[k]), *boxes)):
                 if len(uv):
                     share = _inside_any(uv, regions).mean()
                     (hidden if share >= MIN_REGION_SHARE else labeled)[row, k] = True
-    unseen = asked & ~hidden & ~labeled if ignore_regions.outside_views else np.zeros_like(asked)
-    return (hidden & ~labeled) | unseen
+    outside = candidates & ~hidden & ~labeled if ignore_regions.outside_views else np.zeros_like(candidates)
+    return (hidden & ~labeled) | outside
 
 
 def _frames_at(view: LabelView, t_s: Array) -> tuple[Index, Mask, Array]:

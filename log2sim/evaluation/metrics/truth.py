@@ -116,8 +116,8 @@ def _points_of_sweep(
     return np.array([grid.count(labels.center_m[k], labels.size_m[k], labels.yaw_rad[k]) for k in rows])
 
 
-def in_some_image(log: Log, labels: Labels, cameras: Sequence[str], asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mark (L,) those of the boxes `asked` (L,) that are at least half inside some camera's image."""
+def in_some_image(log: Log, labels: Labels, cameras: Sequence[str], candidates: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mark (L,) those of the boxes `candidates` (L,) that are at least half inside some camera's image."""
     found = np.zeros(len(labels.t_ns), dtype=bool)
     for name in cameras:
         stream = log.streams.get(name)
@@ -125,7 +125,7 @@ def in_some_image(log: Log, labels: Labels, cameras: Sequence[str], asked: NDArr
             continue
         index, near = nearest_record(stream.t_ns, labels.t_ns)
         poses, known = log.map_T_sensor(name, stream.t_ns)
-        open_rows = np.flatnonzero(asked & ~found & near & known[index])
+        open_rows = np.flatnonzero(candidates & ~found & near & known[index])
         for i in np.unique(index[open_rows]):
             rows = open_rows[index[open_rows] == i]
             boxes = labels.center_m[rows], labels.size_m[rows], labels.yaw_rad[rows]

@@ -50,10 +50,10 @@ def image_shares(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Arra
     corners = box_corners(center_m, size_m, yaw_rad)
     in_cam = apply(cam_T_map, corners.reshape(-1, 3))
     _, in_image = project(camera, in_cam)
-    seen = in_image.reshape(-1, 8)
+    corner_inside = in_image.reshape(-1, 8)
     in_cam = in_cam.reshape(-1, 8, 3)
-    shares = np.where(seen.all(1), 1.0, 0.0)
-    for k in np.flatnonzero(~seen.all(1) & (in_cam[..., 2] > NEAREST_DEPTH_M).any(1)):
+    shares = np.where(corner_inside.all(1), 1.0, 0.0)
+    for k in np.flatnonzero(~corner_inside.all(1) & (in_cam[..., 2] > NEAREST_DEPTH_M).any(1)):
         samples = _samples(convex_hull(outline(in_cam[k])))
         if len(samples):
             _, inside = project(camera, np.column_stack([samples, np.ones(len(samples))]))
