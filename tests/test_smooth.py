@@ -20,7 +20,7 @@ from log2sim.agents.smooth.motion_prior import (
     ACCELERATION_PRIOR_MPS2,
     KNOT_STEP_S,
     VELOCITY_PRIOR_MPS,
-    Observations,
+    NoisyPositions,
     place_knots,
 )
 from log2sim.agents.smooth.quadratic import from_band, selected_inverse, to_band
@@ -53,7 +53,7 @@ def reverse(t: np.ndarray) -> np.ndarray:
 MANEUVERS = {"straight": straight, "turn": turn, "stop": stop, "reverse": reverse}
 
 
-def dense_solution(observed: Observations, knots: np.ndarray, density: float) -> tuple[np.ndarray, np.ndarray]:
+def dense_solution(observed: NoisyPositions, knots: np.ndarray, density: float) -> tuple[np.ndarray, np.ndarray]:
     """States (K, 6) and covariances (K, 6, 6): all knots' process noise integrated numerically, one dense system."""
     f = np.zeros((3, 3))
     f[0, 1] = f[1, 2] = 1.0
@@ -91,7 +91,7 @@ def test_the_banded_solver_agrees_with_dense_least_squares() -> None:
     root = rng.normal(0, 0.2, (12, 2, 2))
     # Observations on a smooth way far within their noise keep the robust weights at 1.
     xy = np.column_stack([2.0 * t, 0.2 * t**2]) + rng.normal(0, 1e-4, (12, 2))
-    observed = Observations(t, xy, root @ np.swapaxes(root, 1, 2) + 0.04 * np.eye(2))
+    observed = NoisyPositions(t, xy, root @ np.swapaxes(root, 1, 2) + 0.04 * np.eye(2))
     path = smooth_interval(observed, t, MotionModel(2.0, holonomic=True))
     state, covariance = path.state.reshape(-1, 6), path.covariance
     expected, expected_covariance = dense_solution(observed, t, 2.0)
@@ -103,7 +103,7 @@ def test_the_banded_solver_agrees_with_dense_least_squares() -> None:
 
 def test_states_between_observations_are_those_of_a_knot_there() -> None:
     t = np.array([0.0, 0.4, 0.8, 1.2, 1.6])
-    observed = Observations(t, np.column_stack([t**2, 0 * t]), np.tile(0.01 * np.eye(2), (5, 1, 1)))
+    observed = NoisyPositions(t, np.column_stack([t**2, 0 * t]), np.tile(0.01 * np.eye(2), (5, 1, 1)))
     asked = np.array([0.2, 0.5, 1.6, 2.0])
     knots = np.unique(np.concatenate([t, asked]))
     expected, expected_covariance = dense_solution(observed, knots, 4.0)
@@ -537,7 +537,7 @@ def test_densities_come_out_as_the_motion_was_made() -> None:
         noisy = np.array(xy) + rng.normal(0, 0.1, (120, 2))
         found.append(
             smooth_interval(
-                Observations(t, noisy, np.tile(0.01 * np.eye(2), (120, 1, 1))), t, MotionModel()
+                NoisyPositions(t, noisy, np.tile(0.01 * np.eye(2), (120, 1, 1))), t, MotionModel()
             ).jerk_density
         )
     typical = np.exp(np.mean(np.log(found), axis=0))

@@ -6,6 +6,7 @@ from log2sim.datatypes.agent import Agent
 from log2sim.datatypes.categories import CATEGORIES, GROUP_OF, GROUPS, TYPICAL_SIZE_M
 from log2sim.datatypes.ignore_regions import IgnoreRegions, LabelView
 from log2sim.datatypes.log import (
+    Deferred,
     EgoVehicle,
     Frame,
     ImageLabels,
@@ -32,6 +33,7 @@ __all__ = [
     "TYPICAL_SIZE_M",
     "VERSION",
     "Agent",
+    "Deferred",
     "Detections",
     "EgoVehicle",
     "Frame",

@@ -44,7 +44,7 @@ class Visibility:
 
 
 @dataclass(frozen=True, eq=False)
-class Snapshot:
+class SceneInstant:
     """Everything in a scene at one time.
 
     Attributes
@@ -60,9 +60,9 @@ class Snapshot:
     t_s: float
 
 
-def render(camera: Camera, map_T_cam: Array, snapshot: Snapshot, rng: np.random.Generator) -> NDArray[np.uint8]:
+def render(camera: Camera, map_T_cam: Array, instant: SceneInstant, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Render an image (H, W, 3) uint8 BGR."""
-    backdrop, actors, t_s = snapshot.backdrop, snapshot.actors, snapshot.t_s
+    backdrop, actors, t_s = instant.backdrop, instant.actors, instant.t_s
     view = RenderCamera.of(camera, map_T_cam, OVERSAMPLING)
     color, depth, on_ground = _sky_and_ground(view, backdrop)
     _draw_walls(view, backdrop, color, depth)
@@ -81,15 +81,15 @@ def render(camera: Camera, map_T_cam: Array, snapshot: Snapshot, rng: np.random.
     return _developed(color, rng)
 
 
-def segment(camera: Camera, map_T_cam: Array, snapshot: Snapshot) -> list[Visibility | None]:
+def segment(camera: Camera, map_T_cam: Array, instant: SceneInstant) -> list[Visibility | None]:
     """Segment an image by actors: the visible part of each, None without one."""
     view = RenderCamera.of(camera, map_T_cam, 1)
     depth = np.full((view.height_px, view.width_px), np.inf, np.float32)
-    _draw_walls(view, snapshot.backdrop, None, depth)
+    _draw_walls(view, instant.backdrop, None, depth)
     owner = np.full(depth.size, NO_ACTOR)
     whole = []
-    for index, actor in enumerate(snapshot.actors):
-        fragments = _fragments(view, actor, snapshot.t_s)
+    for index, actor in enumerate(instant.actors):
+        fragments = _fragments(view, actor, instant.t_s)
         near = fragments.depth_m < depth.ravel()[fragments.pixel]
         pixel = fragments.pixel[near]
         depth.ravel()[pixel] = fragments.depth_m[near]

@@ -17,12 +17,12 @@ from log2sim.agents.smooth.likelihood import (
     transition,
     zero_motion,
 )
-from log2sim.agents.smooth.motion_prior import MotionPrior, Observations, nearest_index
+from log2sim.agents.smooth.motion_prior import MotionPrior, NoisyPositions, nearest_index
 from log2sim.agents.smooth.quadratic import Minimum, Quadratic, minimize, weighted_sum
 from log2sim.agents.smooth.zero_velocity import zero_velocity_sigma
 from log2sim.geometry import Array
 
-__all__ = ["MotionModel", "Observations", "Smoothed", "smooth_interval"]
+__all__ = ["MotionModel", "NoisyPositions", "Smoothed", "smooth_interval"]
 
 # Jerk density in m2/s5 that follows every maneuver while outliers are searched.
 PERMISSIVE_JERK_DENSITY = 4.0
@@ -141,12 +141,12 @@ class _Problem:
         return self.measurement.coupled_axes(self.state, self.information * self.weight[:, None, None])
 
 
-def smooth_interval(observed: Observations, asked_s: Array, motion: MotionModel) -> Smoothed:
+def smooth_interval(observed: NoisyPositions, asked_s: Array, motion: MotionModel) -> Smoothed:
     """Estimate the most probable trajectory given the positions, under white jerk along and across the path.
 
     Parameters
     ----------
-    observed : Observations
+    observed : NoisyPositions
     asked_s : (T,) float64, s
         Times of the result.
     motion : MotionModel
@@ -174,7 +174,7 @@ def smooth_interval(observed: Observations, asked_s: Array, motion: MotionModel)
     return Smoothed(state, covariance, yaw, residual, problem.weight, problem.density)
 
 
-def _weights(observed: Observations, squared: Array) -> Array:
+def _weights(observed: NoisyPositions, squared: Array) -> Array:
     """Weights (n,) of observations from their squared residuals in sigmas."""
     return geman_mcclure_weights(squared) if observed.correlated else inlier_probability(squared)
 
@@ -206,7 +206,7 @@ def _directions(yaw: Array) -> Array:
     return np.stack([np.cos(course), np.sin(course)], axis=-1)
 
 
-def _estimator(observed: Observations, motion: MotionModel) -> DensityEstimator:
+def _estimator(observed: NoisyPositions, motion: MotionModel) -> DensityEstimator:
     prior = STRONG_PRIOR if observed.correlated else WEAK_PRIOR
     return DensityEstimator(prior, observed.unknown_scale, rounds=1 if motion.density_by_direction else 2)
 

@@ -11,7 +11,7 @@ from log2sim.agents.smooth.motion_prior import (
     ACCELERATION_PRIOR_MPS2,
     VELOCITY_PRIOR_MPS,
     MotionPrior,
-    Observations,
+    NoisyPositions,
     kronecker,
     nearest_index,
 )
@@ -34,7 +34,7 @@ class MeasurementModel:
 
     Attributes
     ----------
-    observed : Observations
+    observed : NoisyPositions
     knot : (n,) int
         Index of the knot that each observation measures.
     design : (n, 3) float64
@@ -43,13 +43,13 @@ class MeasurementModel:
         Rows at which the observations of another knot begin.
     """
 
-    observed: Observations
+    observed: NoisyPositions
     knot: NDArray[np.intp]
     design: Array
     group_start: NDArray[np.intp]
 
     @classmethod
-    def of(cls, observed: Observations, prior: MotionPrior) -> MeasurementModel:
+    def of(cls, observed: NoisyPositions, prior: MotionPrior) -> MeasurementModel:
         """Tie each observation to the nearest knot of a motion prior."""
         knot = nearest_index(prior.knots_s, observed.t_s)
         start = np.concatenate([[0], np.flatnonzero(knot[1:] > knot[:-1]) + 1])

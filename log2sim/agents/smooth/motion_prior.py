@@ -28,7 +28,7 @@ _UNIT_INFORMATION = np.linalg.inv(_UNIT_Q)
 
 
 @dataclass(frozen=True, eq=False)
-class Observations:
+class NoisyPositions:
     """Measured positions with their noise.
 
     Attributes

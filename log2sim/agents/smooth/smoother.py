@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from log2sim.agents.smooth.feasibility import broken_limits
 from log2sim.agents.smooth.fixed_interval import MotionModel, smooth_interval
-from log2sim.agents.smooth.motion_prior import Observations
+from log2sim.agents.smooth.motion_prior import NoisyPositions
 from log2sim.geometry import Array, wrap_angle
 
 __all__ = ["MotionModel", "SmoothedTrack", "smooth_track"]
@@ -101,7 +101,7 @@ def smooth_track(
     # Far from the origin the normal equations would lose digits, so everything is relative to the first position.
     origin = xy[use][0]
     unknown_scale, correlated = sigma_m is None and covariance is None, covariance is not None
-    path = smooth_interval(Observations(t[use], xy[use] - origin, r, unknown_scale, correlated), asked, motion)
+    path = smooth_interval(NoisyPositions(t[use], xy[use] - origin, r, unknown_scale, correlated), asked, motion)
     velocity, acceleration = path.state[:, 1], path.state[:, 2]
     curvature = _curvature(velocity, acceleration)
     residual = np.full(len(t), np.nan)
