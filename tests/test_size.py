@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from worlds import scan, standing
 
-from log2sim.agents.size import is_static, moving_geometry, parked_heading, static_geometry
+from log2sim.agents.size import moving_geometry, static_geometry
+from log2sim.agents.standing import is_static, parked_heading
 from log2sim.datatypes import TYPICAL_SIZE_M, Measurements, Track
 from log2sim.geometry import rotation_from_rpy
 from log2sim.perception.box_fitting import fit_box, rotate

@@ -97,7 +97,7 @@ def one_category_each(boxes: Boxes) -> Boxes:
 def rows_online(boxes: Boxes, measurements: Sequence[Measurements]) -> Rows:
     """What the tracker says frame by frame, from that frame and those before it."""
     first = np.searchsorted(boxes.frame, np.arange(len(measurements)))
-    tracker = ForwardTracker(birth_score=0.0, whole_boxes=True)
+    tracker = ForwardTracker(birth_score=0.0, period_s=PERIOD_NS / NS_PER_S, whole_boxes=True)
     latest = np.zeros(len(boxes), dtype=np.int64)  # row of the last detection, by track
     parts: list[tuple[Index, Index, Index, Index, Array]] = []
     for frame, found in enumerate(measurements):

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from log2sim.agents.confirmation import SAME_MOMENT_S, is_credible
 from log2sim.agents.lidar_tracking import BoxState, LidarMatch, track_with_lidar
-from log2sim.agents.size import TrackGeometry, is_static, moving_geometry, parked_heading, static_geometry
+from log2sim.agents.size import TrackGeometry, moving_geometry, static_geometry
 from log2sim.agents.smooth.smoother import MotionModel, SmoothedTrack, signed_speed, smooth_track
+from log2sim.agents.standing import Side, is_static, parked_heading, side_of_traffic
 from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Agent, Obstacles, Track, Waypoints
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
 from log2sim.perception import box_fitting
@@ -64,8 +65,8 @@ def estimate_agents(
     built = [_moving_agent(track, obstacles, timeline, smooth=smooth) for track in moving]
     built = [b for b in built if b.credible]
     flows = [flow] + [_flow_of_agent(b.agent) for b in built if GROUP_OF[b.agent.category] == "vehicle"]
-    everything = np.concatenate(flows)
-    built += [_static_agent(t, obstacles, timeline, everything) for t, s in zip(tracks, standing) if s]
+    everything, side = np.concatenate(flows), side_of_traffic(flows)
+    built += [_static_agent(t, obstacles, timeline, everything, side) for t, s in zip(tracks, standing) if s]
     return [b for b in built if b.credible]
 
 
@@ -90,13 +91,14 @@ def _flow_of_agent(agent: Agent) -> Array:
 
 
 def _static_agent(
-    track: Track, obstacles: Sequence[Obstacles | None], timeline: Timeline, flow: Array
+    track: Track, obstacles: Sequence[Obstacles | None], timeline: Timeline, flow: Array, side: Side
 ) -> AgentCandidate:
     shape = static_geometry(track)
     group = GROUP_OF[track.category]
     xy = shape.xy_m[0]
     yaw = float(np.nan_to_num(shape.yaw_rad)) if shape.yaw_rad is not None else 0.0
-    yaw = parked_heading(yaw, xy, flow) if group in ("vehicle", "two_wheeler") else float(wrap_angle(yaw))
+    steers = group in ("vehicle", "two_wheeler")
+    yaw = parked_heading(yaw, xy, flow, side=side) if steers else float(wrap_angle(yaw))
     z = float(np.median(shape.z_m))
     others = [k for k in range(len(timeline.t_ns)) if k not in set(track.tick.tolist())]
     sightings = _match_lidar(

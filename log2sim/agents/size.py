@@ -11,25 +11,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Track
-from log2sim.geometry import NS_PER_S, Array, wrap_angle
+from log2sim.datatypes import MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M, Track
+from log2sim.geometry import Array
 from log2sim.perception import box_fitting
 
 # Share of the whole sides that are longer: stray points lengthen some, sparse points shorten most.
 SIZE_QUANTILE = 0.85
-# Farther to the left of a path than this is the oncoming side of the road.
-ONCOMING_OFFSET_M = 1.8
+# Stray points lie outside an object by less than this.
+MAX_TRIM_M = 0.1
 VOXEL_M = 0.15
 MIN_PERSISTENT_SHARE = 0.15
 MAX_POINTS_PER_TICK = 150
-# Sizes that exist, as factors of the typical one; what looks smaller than the likely ones (length, width, height) was
-# hardly seen whole, or is something else.
-MIN_SIZE_FACTOR, MAX_SIZE_FACTOR = 0.6, 1.6
+# A side shorter than this share of the typical one was hardly seen from end to end.
 MIN_WHOLE_SIDE_FACTOR = 0.75
-MIN_LIKELY_FACTORS = np.array([0.65, 0.72, 0.75])
-
-MAX_STATIC_SPEED_MPS = {"vehicle": 0.35, "two_wheeler": 0.3, "pedestrian": 0.2, "other": 0.35}
-MAX_STATIC_DRIFT_M = {"vehicle": 1.2, "two_wheeler": 0.8, "pedestrian": 0.5, "other": 1.2}
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,24 +41,6 @@ class TrackGeometry:
     typical: bool = True
 
 
-def is_static(track: Track) -> bool:
-    """Whether a track never moves: its robust mean velocity and its drift stay within what changing views explain."""
-    m, group = track.measurements, GROUP_OF[track.category]
-    if len(m) < 3:
-        return group == "vehicle"
-    t = (m.t_ns - m.t_ns[0]) / NS_PER_S
-    xy = m.center_m[:, :2]
-    third = max(len(m) // 3, 1)
-    drift = np.median(xy[-third:], axis=0) - np.median(xy[:third], axis=0)
-    span = np.median(t[-third:]) - np.median(t[:third])
-    # Where little of it shows its center is a guess, so what the covariance explains is no motion.
-    guess = 2 * np.sqrt(np.linalg.eigvalsh(m.covariance)[:, -1])
-    spread = np.quantile(np.hypot(*(xy - np.median(xy, axis=0)).T) - guess, 0.9)
-    moved = float(np.hypot(*drift))
-    slow = moved < MAX_STATIC_SPEED_MPS[group] * max(float(span), 1e-9) or moved < 0.35
-    return bool(slow and moved < MAX_STATIC_DRIFT_M[group] and spread < 1.5 * MAX_STATIC_DRIFT_M[group])
-
-
 def static_geometry(track: Track) -> TrackGeometry:
     """One pose and size of a track that stands still, from all its points together."""
     m = track.measurements
@@ -75,14 +51,14 @@ def static_geometry(track: Track) -> TrackGeometry:
     if len(cloud) < 5:
         return _geometry_without_points(track, typical)
     yaw, _ = box_fitting.fit_yaw(cloud[:, :2])
-    low, high = box_fitting.extents(cloud[:, :2], yaw)
+    low, high = box_fitting.extents(cloud[:, :2], yaw, max_trim_m=MAX_TRIM_M)
     if box_fitting.axes_swapped(high - low, box_fitting.rotate(sensor, -yaw), typical):
         yaw += np.pi / 2
-        low, high = box_fitting.extents(cloud[:, :2], yaw)
+        low, high = box_fitting.extents(cloud[:, :2], yaw, max_trim_m=MAX_TRIM_M)
     local = box_fitting.rotate(sensor, -yaw)
     with_points = [k for k, c in enumerate(m.cluster) if len(c)]
     shown = np.array([box_fitting.real_ends(low, high, local[k], m.ends_visible[k]) for k in with_points]).max(axis=0)
-    size, fits = _estimate_size(low[None], high[None], shown[None], typical[:2])
+    size, fits = _estimate_size(low[None], high[None], shown[None], track.category)
     centers, sigmas = box_fitting.place_box(low, high, size, shown)
     center = box_fitting.rotate(centers, yaw) + origin[:2]
     height, z = _height(track)
@@ -105,10 +81,10 @@ def moving_geometry(track: Track, yaw_rad: Array) -> TrackGeometry:
     shown = np.zeros((len(m), 2, 2), dtype=np.int64)
     for k in with_points:
         yaw, origin = float(yaw_rad[k]), m.center_m[k, :2]
-        lows[k], highs[k] = box_fitting.extents(m.cluster[k][:, :2] - origin, yaw)
+        lows[k], highs[k] = box_fitting.extents(m.cluster[k][:, :2] - origin, yaw, max_trim_m=MAX_TRIM_M)
         sensors[k] = box_fitting.rotate(m.sensor_m[k, :2] - origin, -yaw)
         shown[k] = box_fitting.real_ends(lows[k], highs[k], sensors[k], m.ends_visible[k])
-    size, fits = _estimate_size(lows[with_points], highs[with_points], shown[with_points], typical[:2])
+    size, fits = _estimate_size(lows[with_points], highs[with_points], shown[with_points], track.category)
     xy, covariance = m.center_m[:, :2].copy(), m.covariance.copy()
     for k in with_points:
         yaw = float(yaw_rad[k])
@@ -116,7 +92,9 @@ def moving_geometry(track: Track, yaw_rad: Array) -> TrackGeometry:
         xy[k] = box_fitting.rotate(center, yaw) + m.center_m[k, :2]
         covariance[k] = box_fitting.oriented_covariance(sigma, yaw)
     height, z = _height(track)
-    return TrackGeometry(np.append(size, height), xy, covariance, z, None, fits and _is_tall_enough(height, typical))
+    return TrackGeometry(
+        np.append(size, height), xy, covariance, z, None, fits and height > MIN_SIZE_M[track.category][2]
+    )
 
 
 def _persistent_points(clusters: list[NDArray[np.float64]]) -> Array:
@@ -133,8 +111,9 @@ def _persistent_points(clusters: list[NDArray[np.float64]]) -> Array:
     return points[count[key.ravel()] >= max(MIN_PERSISTENT_SHARE * len(clusters), min(2, len(clusters)))]
 
 
-def _estimate_size(low: Array, high: Array, shown: NDArray[np.int64], typical: Array) -> tuple[Array, bool]:
+def _estimate_size(low: Array, high: Array, shown: NDArray[np.int64], category: str) -> tuple[Array, bool]:
     """Length and width (2,) from ends (n, 2), (n, 2) of which some are real (n, 2, 2), and whether such an object exists."""
+    typical, smallest, largest = (np.array(t[category][:2]) for t in (TYPICAL_SIZE_M, MIN_SIZE_M, MAX_SIZE_M))
     low, high = box_fitting.corner_correction(low, high, shown, typical[1])
     seen = high - low
     whole: NDArray[np.bool_] = np.all(shown, axis=2)
@@ -143,13 +122,12 @@ def _estimate_size(low: Array, high: Array, shown: NDArray[np.int64], typical: A
         every = seen[:, axis]
         ends = every[whole[:, axis]]
         raw[axis] = np.quantile(ends if len(ends) else np.maximum(every, typical[axis]), SIZE_QUANTILE)
-        # A side shorter than any such object's was not seen from end to end after all.
         ends = ends[ends >= MIN_WHOLE_SIDE_FACTOR * typical[axis]]
         size[axis] = (
             np.quantile(ends, SIZE_QUANTILE) if len(ends) else max(typical[axis], np.quantile(every, SIZE_QUANTILE))
         )
-    likely = bool(((raw >= MIN_LIKELY_FACTORS[:2] * typical) & (raw <= MAX_SIZE_FACTOR * typical)).all())
-    return np.clip(size, MIN_SIZE_FACTOR * typical, MAX_SIZE_FACTOR * typical), likely
+    likely = bool(((raw >= smallest) & (raw <= largest)).all())
+    return np.clip(size, smallest, largest), likely
 
 
 def _height(track: Track) -> tuple[float, Array]:
@@ -164,12 +142,8 @@ def _height(track: Track) -> tuple[float, Array]:
     by_lidar = float(np.nanquantile(tops, SIZE_QUANTILE)) if np.isfinite(tops).any() else typical
     by_image = float(np.nanmedian(images)) if np.isfinite(images).any() else typical
     height = max(by_lidar, min(by_image, 1.15 * by_lidar))
-    height = float(np.clip(height, MIN_SIZE_FACTOR * typical, MAX_SIZE_FACTOR * typical))
+    height = float(np.clip(height, MIN_SIZE_M[track.category][2], MAX_SIZE_M[track.category][2]))
     return height, bottom + height / 2
-
-
-def _is_tall_enough(height: float, typical: Array) -> bool:
-    return bool(height >= MIN_LIKELY_FACTORS[2] * typical[2])
 
 
 def _geometry_without_points(track: Track, typical: Array) -> TrackGeometry:
@@ -177,27 +151,3 @@ def _geometry_without_points(track: Track, typical: Array) -> TrackGeometry:
     height, z = _height(track)
     yaw = float(np.nanmedian(m.yaw_rad)) if np.isfinite(m.yaw_rad).any() else None
     return TrackGeometry(np.append(typical[:2], height), m.center_m[:, :2], m.covariance, z, yaw)
-
-
-def parked_heading(yaw_rad: float, xy: Array, flow: Array, *, reach_m: float = 40.0) -> float:
-    """Choose between the two directions of a standing vehicle: it points the way the traffic of its side goes.
-
-    `flow` (K, 3) holds x, y and heading of vehicles that moved; without any near enough the yaw stays as it is.
-
-    Notes
-    -----
-    Traffic keeps right: what stands to the right of a moving vehicle's path points along it, what stands clearly to its
-    left points against it. Each moment of each path votes, the nearer to the side the more.
-    """
-    if len(flow) == 0:
-        return float(wrap_angle(yaw_rad))
-    to = xy - flow[:, :2]
-    c, s = np.cos(flow[:, 2]), np.sin(flow[:, 2])
-    along, left = to[:, 0] * c + to[:, 1] * s, -to[:, 0] * s + to[:, 1] * c
-    near = (np.abs(np.cos(flow[:, 2] - yaw_rad)) > 0.7) & (np.abs(along) < reach_m) & (np.abs(left) < reach_m / 3)
-    if not near.any():
-        return float(wrap_angle(yaw_rad))
-    side = np.where(left[near] > ONCOMING_OFFSET_M, -1.0, 1.0)
-    weight = 1.0 / (1.0 + np.abs(left[near]) / 2 + np.abs(along[near]) / 10) ** 2
-    vote = np.sum(weight * side * np.sign(np.cos(flow[near, 2] - yaw_rad)))
-    return float(wrap_angle(yaw_rad if vote >= 0 else yaw_rad + np.pi))

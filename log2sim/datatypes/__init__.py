@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from log2sim.datatypes.agent import Agent
-from log2sim.datatypes.categories import CATEGORIES, GROUP_OF, GROUPS, TYPICAL_SIZE_M
+from log2sim.datatypes.categories import CATEGORIES, GROUP_OF, GROUPS, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M
 from log2sim.datatypes.ignore_regions import IgnoreRegions, LabelView
 from log2sim.datatypes.log import (
     Deferred,
@@ -30,6 +30,8 @@ __all__ = [
     "EGO",
     "GROUPS",
     "GROUP_OF",
+    "MAX_SIZE_M",
+    "MIN_SIZE_M",
     "TYPICAL_SIZE_M",
     "VERSION",
     "Agent",

@@ -1,34 +1,66 @@
-"""What flows between the stages: sensors, streams, logs, detections.
-
-Everything is a frozen record of columns. Arrays are never changed once a record holds them. Letters in shapes: N points,
-M boxes, L labels, A agents, T ticks, F frames of a stream.
-"""
+"""What an agent can be: one table with the sizes and motions of each category, and where they are from."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
-CATEGORIES = ("car", "truck", "bus", "motorcycle", "cyclist", "bicycle", "pedestrian", "other")
+Size = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Category:
+    """What is known of a category before anything was measured; sizes are length, width, height in m.
+
+    Attributes
+    ----------
+    group : str
+        Categories of one group are confused by detectors and labelers, and therefore associated with each other.
+    typical_size_m : Size
+        Of what was not seen from end to end.
+    min_size_m, max_size_m : Size
+        What is smaller was hardly seen whole, what is larger is several things.
+    """
+
+    group: str
+    typical_size_m: Size
+    min_size_m: Size
+    max_size_m: Size
+
+
+# Typical sizes lie between the mean labels of KITTI and nuScenes, which are the anchors of PointPillars (Lang et al., CVPR
+# 2019: car 3.9, 1.6, 1.56; pedestrian 0.8, 0.6, 1.73; cyclist 1.76, 0.6, 1.73) and CBGS (Zhu et al., 2019: car 4.63, 1.97,
+# 1.74; truck 6.93, 2.51, 2.84; bus 10.5, 2.94, 3.47; motorcycle 2.11, 0.77, 1.47; bicycle 1.7, 0.6, 1.28; pedestrian 0.73,
+# 0.67, 1.77). Limits:
+# - car, vans included: Smart Fortwo 2.7 m, sports cars 1.2 m high; Mercedes Sprinter up to 6.0 x 2.0 x 2.8 m without mirrors.
+# - truck, bus: Directive 96/53/EC, Annex I allows 18.75 m for road trains and articulated buses, 2.6 m of width, which
+#   mirrors and loads exceed in the cloud, and 4.0 m of height. Britain's double-deckers have 4.4 m. North America's semi-
+#   trailers have 22.4 m (AASHTO, "Green Book" 2018, design vehicle WB-67).
+# - motorcycle: Regulation (EU) 168/2013, Annex II allows 4.0 x 2.0 x 2.5 m, of which two-wheelers use less.
+# - cyclist, bicycle: DIN 79008 and the like; tandems and cargo bicycles have up to 2.6 m.
+# - pedestrian: body depth and shoulder breadth of adults (DIN 33402-2) and the stride of a tall one; children from 1 m.
+# - other: trailers, 12 m by the same directive; carts and animals.
+CATEGORY: Mapping[str, Category] = {
+    "car": Category("vehicle", (4.4, 1.85, 1.6), (2.7, 1.35, 1.2), (6.0, 2.3, 2.8)),
+    "truck": Category("vehicle", (7.0, 2.4, 2.9), (4.5, 1.7, 2.0), (22.4, 3.0, 4.3)),
+    "bus": Category("vehicle", (11.5, 2.7, 3.2), (5.5, 1.9, 2.3), (18.75, 3.0, 4.4)),
+    "motorcycle": Category("two_wheeler", (2.1, 0.8, 1.5), (1.3, 0.5, 0.9), (2.8, 1.3, 2.2)),
+    "cyclist": Category("two_wheeler", (1.75, 0.65, 1.75), (1.1, 0.4, 1.1), (2.6, 1.1, 2.3)),
+    "bicycle": Category("two_wheeler", (1.75, 0.6, 1.1), (1.1, 0.4, 0.7), (2.6, 1.1, 1.5)),
+    "pedestrian": Category("pedestrian", (0.7, 0.7, 1.75), (0.4, 0.4, 1.0), (1.4, 1.2, 2.3)),
+    "other": Category("other", (3.0, 1.8, 1.8), (0.5, 0.4, 0.4), (12.0, 3.0, 4.0)),
+}
+
+CATEGORIES = tuple(CATEGORY)
 """What an agent can be. A `cyclist` is a bicycle with its rider, a `bicycle` has none; vans are cars."""
 
+GROUP_OF: Mapping[str, str] = {name: category.group for name, category in CATEGORY.items()}
+
 GROUPS: Mapping[str, tuple[str, ...]] = {
-    "vehicle": ("car", "truck", "bus"),
-    "two_wheeler": ("motorcycle", "cyclist", "bicycle"),
-    "pedestrian": ("pedestrian",),
-    "other": ("other",),
+    group: tuple(name for name in CATEGORIES if GROUP_OF[name] == group) for group in dict.fromkeys(GROUP_OF.values())
 }
 """Categories that detectors and labelers confuse and that are therefore associated with each other."""
 
-GROUP_OF: Mapping[str, str] = {category: group for group, members in GROUPS.items() for category in members}
-
-# Mean length, width, height in m of KITTI's and PandaSet's labels, rounded; used where nothing was measured.
-TYPICAL_SIZE_M: Mapping[str, tuple[float, float, float]] = {
-    "car": (4.4, 1.85, 1.6),
-    "truck": (7.0, 2.4, 2.9),
-    "bus": (11.5, 2.7, 3.2),
-    "motorcycle": (2.1, 0.8, 1.5),
-    "cyclist": (1.75, 0.65, 1.75),
-    "bicycle": (1.75, 0.6, 1.1),
-    "pedestrian": (0.7, 0.7, 1.75),
-    "other": (3.0, 1.8, 1.8),
-}
+TYPICAL_SIZE_M: Mapping[str, Size] = {name: category.typical_size_m for name, category in CATEGORY.items()}
+MIN_SIZE_M: Mapping[str, Size] = {name: category.min_size_m for name, category in CATEGORY.items()}
+MAX_SIZE_M: Mapping[str, Size] = {name: category.max_size_m for name, category in CATEGORY.items()}

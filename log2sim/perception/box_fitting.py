@@ -90,13 +90,17 @@ def subsample(points: NDArray[Any], max_count: int) -> NDArray[Any]:
     return points[np.linspace(0, len(points) - 1, max_count).round().astype(np.int64)]
 
 
-def extents(xy_m: Array, yaw_rad: float, trim: float = 0.01) -> tuple[Array, Array]:
+def extents(xy_m: Array, yaw_rad: float, trim: float = 0.01, max_trim_m: float = np.inf) -> tuple[Array, Array]:
     """Measure the lower and upper ends (2,), (2,) of points (N, 2) along the length and width axes of a yaw.
 
-    The ends are the quantiles `trim` and 1 - `trim`, so that a few stray points do not stretch a box.
+    The ends are the quantiles `trim` and 1 - `trim`, so that a few stray points do not stretch a box, but at most
+    `max_trim_m` inside the third outermost point: the far ends of a long object close by hold few of its points.
     """
     local = np.sort(rotate(xy_m, -yaw_rad), axis=0)
-    return quantile_of_sorted(local, trim), quantile_of_sorted(local, 1 - trim)
+    third = min(2, (len(local) - 1) // 2)
+    low = np.minimum(quantile_of_sorted(local, trim), local[third] + max_trim_m)
+    high = np.maximum(quantile_of_sorted(local, 1 - trim), local[-1 - third] - max_trim_m)
+    return low, high
 
 
 def quantile_of_sorted(ordered: Array, share: float) -> Array:

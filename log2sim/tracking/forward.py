@@ -19,7 +19,8 @@ NOT_ALLOWED = 1e6
 OTHER_GROUP_COST = 6.0
 RELATED = (("pedestrian", "two_wheeler"), ("two_wheeler", "pedestrian"))
 TENTATIVE_HITS = 3
-TENTATIVE_AGE_S = 0.45
+# A track ends after so many ticks without a measurement; a confirmed one lives on for as long as its velocity predicts it.
+MAX_MISSES = 3
 CONFIRMED_AGE_S = 1.2
 
 _NAMES = tuple(GROUPS)
@@ -46,7 +47,7 @@ def track_forward(
     measurements: Sequence[Measurements], t_ns: NDArray[np.int64], *, birth_score: float, whole_boxes: bool = False
 ) -> list[Tracklet]:
     """Assign the measurements of T ticks (stamps (T,)) to tracklets, which come in the order of their births."""
-    tracker = ForwardTracker(birth_score=birth_score, whole_boxes=whole_boxes)
+    tracker = ForwardTracker(birth_score=birth_score, period_s=period_of(t_ns), whole_boxes=whole_boxes)
     log: list[tuple[Index, NDArray[np.int64], Index]] = []
     for tick, found in enumerate(measurements):
         rows, number = tracker.step(found, int(t_ns[tick]))
@@ -60,6 +61,11 @@ def track_forward(
     return [Tracklet(ticks[i], rows[i], means[k]) for k, i in enumerate(np.split(order, cuts))] if len(order) else []
 
 
+def period_of(t_ns: NDArray[np.int64]) -> float:
+    """Median time between ticks (T,), s; 0 for a single one."""
+    return float(np.median(np.diff(t_ns))) / NS_PER_S if len(t_ns) > 1 else 0.0
+
+
 class ForwardTracker:
     """Tracks that live now, as columns; `step` is causal.
 
@@ -68,8 +74,11 @@ class ForwardTracker:
     measurements come from a 3D detector: their centers do not move with the view and their yaw is the axis of motion.
     """
 
-    def __init__(self, *, birth_score: float, whole_boxes: bool = False) -> None:
+    def __init__(self, *, birth_score: float, period_s: float, whole_boxes: bool = False) -> None:
         self.birth_score = birth_score
+        # Stamps jitter by less than half a period.
+        self._tentative_age_s = (MAX_MISSES + 1.5) * period_s
+        self._confirmed_age_s = max(CONFIRMED_AGE_S, self._tentative_age_s)
         self.whole_boxes = whole_boxes
         self.number = np.zeros(0, dtype=np.intp)
         self.mean, self.covariance = np.zeros((0, 4)), np.zeros((0, 4, 4))
@@ -112,7 +121,7 @@ class ForwardTracker:
     def _advance(self, now_ns: int) -> None:
         """Drop the tracks that were not seen for too long and carry the others to now."""
         age_s = (now_ns - self.seen_ns) / NS_PER_S
-        alive = age_s <= np.where(self.hits >= TENTATIVE_HITS, CONFIRMED_AGE_S, TENTATIVE_AGE_S)
+        alive = age_s <= np.where(self.hits >= TENTATIVE_HITS, self._confirmed_age_s, self._tentative_age_s)
         if not alive.all():
             self._ended.append((self.number[~alive], self.mean[~alive]))
             self.number, self.mean, self.covariance = self.number[alive], self.mean[alive], self.covariance[alive]

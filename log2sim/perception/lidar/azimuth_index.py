@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,9 @@ MIN_WINDOW_RAD, MAX_WINDOW_RAD = np.deg2rad(0.6), np.deg2rad(6.0)
 MIN_DEPTH_STEP_M = 0.5
 MIN_RAYS_BEYOND = 2
 # Share of a cluster's points skipped at each end, so that a stray one is not taken for the end.
-TRIM = 0.01
+TRIM, MAX_TRIMMED_POINTS = 0.01, 2
+# Points this near to an end form the face that ends there; a corner has more than this share of their variance across.
+FACE_M, MAX_FLATNESS = 1.5, 0.05
 SLOPE_MARGIN = 0.01
 # Azimuths are integer steps that fit into 16 bits; one turn has this many.
 STEPS_PER_TURN = 60_000
@@ -83,20 +86,35 @@ class AzimuthIndex:
         slope, is_member = self.slope[mine], np.zeros(len(self.azimuth), dtype=bool)
         is_member[mine] = True
         low, high = slope.min() - SLOPE_MARGIN, slope.max() + SLOPE_MARGIN
-        cut = round(TRIM * (len(mine) - 1))
+        cut = min(round(TRIM * (len(mine) - 1)), MAX_TRIMMED_POINTS)
         visible = np.zeros(2, dtype=bool)
         for k, (end, sign) in enumerate(((cut, -1), (len(mine) - 1 - cut, 1))):
             near_end = np.abs(turned - turned[end]) * STEP_RAD < MIN_WINDOW_RAD
             range_m = upper_median(self.range_m[mine[near_end]])
             width = float(np.clip(WINDOW_M / max(range_m, 1e-3), MIN_WINDOW_RAD, MAX_WINDOW_RAD)) / STEP_RAD
             edge = int(turned[end]) + start
-            window = self._between(*sorted((edge, edge + sign * round(width))))
+            window = self._between(*sorted((edge + 2 * sign, edge + sign * round(width))))
             slopes = self.slope[window]
-            window = window[(slopes >= low) & (slopes <= high)]
-            beyond = self.range_m[window] > range_m + MIN_DEPTH_STEP_M
-            blocked = ~beyond & self.obstacle[window] & ~is_member[window]
+            window = window[(slopes >= low) & (slopes <= high) & ~is_member[window]]
+            surface_m = np.maximum(self._extended_face_range(mine, mine[end], self.azimuth[window]), range_m)
+            beyond = self.range_m[window] > surface_m + MIN_DEPTH_STEP_M
+            blocked = ~beyond & self.obstacle[window]
             visible[k] = beyond.sum() >= max(MIN_RAYS_BEYOND, int(blocked.sum()))
         return visible
+
+    def _extended_face_range(
+        self, mine: NDArray[np.intp], end: np.intp, azimuth: NDArray[np.uint16]
+    ) -> NDArray[np.float64]:
+        """Range (n,) in m at azimuths (n,) of the face that ends at row `end`, were it to go on; 0 at a corner."""
+        xy = self.range_m[mine, None] * _direction(self.azimuth[mine])
+        face = xy[np.hypot(*(xy - self.range_m[end] * _direction(self.azimuth[end])).T) < FACE_M]
+        spread, axes = np.linalg.eigh(np.cov(face.T)) if len(face) > 2 else (np.ones(2), np.eye(2))
+        if spread[0] > MAX_FLATNESS * spread[1]:
+            return np.zeros(len(azimuth))
+        center, along, ray = face.mean(axis=0), axes[:, 1], _direction(azimuth)
+        sine = ray[:, 0] * along[1] - ray[:, 1] * along[0]
+        meets_m = (center[0] * along[1] - center[1] * along[0]) / np.where(sine == 0, np.inf, sine)
+        return np.where(meets_m > 0, meets_m, np.inf)
 
     def _between(self, first: int, last: int) -> NDArray[np.intp]:
         """Find the rows with an azimuth from `first` up to `last`, less than a turn later."""
@@ -104,3 +122,9 @@ class AzimuthIndex:
         bounds = [first, min(last, STEPS_PER_TURN - 1), max(last - STEPS_PER_TURN, 0)]
         a, b, wrapped = np.searchsorted(self.azimuth, np.array(bounds, np.uint16))
         return np.concatenate([np.arange(a, b), np.arange(wrapped)])
+
+
+def _direction(azimuth: Any) -> NDArray[np.float64]:
+    """Unit vectors (..., 2) of azimuths (...) in steps."""
+    angle = np.asarray(azimuth) * STEP_RAD
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)

@@ -8,17 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF
+from log2sim.datatypes import GROUP_OF, MAX_SIZE_M
 from log2sim.geometry import Array, box_iou
 from log2sim.perception.box_fitting import subsample
 
 Index = NDArray[np.intp]
 
 CELL_M = {"vehicle": 0.4, "two_wheeler": 0.3, "pedestrian": 0.25, "other": 0.4}
-# Longest horizontal extent of an object of a category: points farther apart belong to several objects.
-MAX_LENGTH_M = {
-    "car": 6.0, "truck": 14.0, "bus": 19.0, "motorcycle": 2.8, "cyclist": 2.4, "bicycle": 2.4, "pedestrian": 1.4, "other": 8.0,
-}  # fmt: skip
 MIN_CLUSTER_POINTS = 4
 MAX_SCORED_POINTS = 400
 # A cluster whose image rectangle overlaps the detection box less is an occluder or background.
@@ -98,9 +94,9 @@ def candidate_clusters(
     nearest_m = middle_m[enough].min()
     low, high = _group_extents(xyz[inside[order], :2], first)
     members = {int(g): inside[order[first[g] : first[g] + count[g]]] for g in np.flatnonzero(enough)}
-    too_long = np.hypot(*(high - low).T) > MAX_LENGTH_M[category]
+    too_long = np.hypot(*(high - low).T) > MAX_SIZE_M[category][0]
     for g in np.flatnonzero(enough & (too_long | (count > MAX_SCORED_POINTS))).tolist():
-        members[g] = cropped = crop_to_length(xyz, members[g], range_m, MAX_LENGTH_M[category])
+        members[g] = cropped = crop_to_length(xyz, members[g], range_m, MAX_SIZE_M[category][0])
         sample = uv[subsample(cropped, MAX_SCORED_POINTS)]
         span[g] = np.concatenate([sample.min(axis=0), sample.max(axis=0)])
         middle_m[g] = range_m[cropped].mean()
@@ -195,7 +191,7 @@ def region_grow(xy_all: NDArray[np.float32], seed: NDArray[np.float32], category
 
     Limited to the longest extent of the category around the seed's median, so that it does not grow along a wall.
     """
-    reach = MAX_LENGTH_M[category]
+    reach = MAX_SIZE_M[category][0]
     center = np.median(seed, axis=0)
     near = np.flatnonzero(np.abs(xy_all[:, 0] - center[0]) <= reach)
     near = near[np.abs(xy_all[near, 1] - center[1]) <= reach]

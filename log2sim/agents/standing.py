@@ -1,0 +1,237 @@
+"""Vehicles and people that stand still: which tracks do, and which way a parked vehicle points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from itertools import combinations
+
+import numpy as np
+
+from log2sim.datatypes import GROUP_OF, Measurements, Track
+from log2sim.geometry import NS_PER_S, Array, wrap_angle
+from log2sim.perception import box_fitting
+from log2sim.tracking.motion import CENTER_SIGMA_M
+
+
+class Side(IntEnum):
+    """Side of the road that traffic keeps to."""
+
+    RIGHT = 1
+    LEFT = -1
+
+
+# A slower mean velocity, or one that its own uncertainty explains, is none.
+MAX_STATIC_SPEED_MPS = {"vehicle": 0.35, "two_wheeler": 0.3, "pedestrian": 0.2, "other": 0.35}
+MAX_STATIC_DRIFT_M = {"vehicle": 1.2, "two_wheeler": 0.8, "pedestrian": 0.5, "other": 1.2}
+SIGNIFICANT_SIGMAS, EXCLUDED_SIGMAS = 2.0, 3.0
+SPREAD_QUANTILE = 0.9
+# What an end that was seen is off by: rounded corners, gaps between rays.
+END_SIGMA_M = 0.25
+# Tuning constant of Cauchy's weights with 95 % efficiency for normal errors (Holland & Welsch, 1977).
+CAUCHY_SIGMAS = 2.385
+REWEIGHTINGS = 5
+# Traffic that meets does so on one road: this far apart at most, and further apart than one lane's traffic wanders.
+ROAD_M, LANE_M = 20.0, 1.8
+PATH_SAMPLES = 40
+OPPOSITE_COS, PARALLEL_COS = -0.7, 0.7
+REACH_M = 40.0
+# Assumed where no traffic meets: two thirds of the world's people and 72 % of its roads keep right (Lucas, "Which side of the
+# road do they drive on?", 2005).
+USUAL_SIDE = Side.RIGHT
+
+
+def is_static(track: Track) -> bool:
+    """Whether a track never moves: its robust mean velocity and its drift stay within what changing views explain.
+
+    Notes
+    -----
+    The center of a vehicle is a guess as long as parts of it are hidden, and of a long one off by meters: one whose center
+    seems to move still stands if the ends that were seen stand, and are known well enough to exclude its motion.
+    """
+    m, group = track.measurements, GROUP_OF[track.category]
+    if len(m) < 3:
+        return group == "vehicle"
+    t = (m.t_ns - m.t_ns[0]) / NS_PER_S
+    center = _motion_of_centers(t, m, CENTER_SIGMA_M[group])
+    if _is_none(center, float(t[-1]), group):
+        return True
+    ends = _motion_of_ends(t, m) if group == "vehicle" else None
+    if ends is None or not _is_none(ends, float(t[-1]), group):
+        return False
+    excess = float(np.hypot(*center.velocity) - np.hypot(*ends.velocity))
+    return ends.sigma_mps < max(center.sigma_mps, excess / EXCLUDED_SIGMAS)
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """Uniform motion of what was seen of a track.
+
+    Attributes
+    ----------
+    velocity : (2,) float64
+        In m/s, along any two axes.
+    sigma_mps : float
+        Its standard deviation.
+    spread_m : float
+        How far nine of ten positions lie from their mean at most, beyond what their uncertainty explains.
+    """
+
+    velocity: Array
+    sigma_mps: float
+    spread_m: float
+
+
+def _is_none(motion: _Motion, span_s: float, group: str) -> bool:
+    """Whether a motion is so slow, or so uncertain, that it is taken for none."""
+    speed = float(np.hypot(*motion.velocity))
+    drift = speed * span_s
+    slow = (
+        speed < max(MAX_STATIC_SPEED_MPS[group], SIGNIFICANT_SIGMAS * motion.sigma_mps) or drift < CENTER_SIGMA_M[group]
+    )
+    return bool(slow and drift < MAX_STATIC_DRIFT_M[group] and motion.spread_m < 1.5 * MAX_STATIC_DRIFT_M[group])
+
+
+def _motion_of_centers(t: Array, m: Measurements, sigma_m: float) -> _Motion:
+    """Motion of box centers; `sigma_m` is what changing views add to their noise."""
+    xy = m.center_m[:, :2] - np.median(m.center_m[:, :2], axis=0)
+    largest: Array = np.linalg.eigvalsh(m.covariance)[:, -1].astype(np.float64)
+    center, velocity, sigma_mps = robust_line(t, xy, largest + sigma_m**2)
+    # Where little of it shows its center is a guess, so what the covariance explains is no motion.
+    spread = np.hypot(*(xy - center).T) - 2 * np.sqrt(largest)
+    return _Motion(velocity, sigma_mps, float(np.quantile(spread, SPREAD_QUANTILE)))
+
+
+def _motion_of_ends(t: Array, m: Measurements) -> _Motion | None:
+    """Motion of the ends that were seen; None unless ends were seen most of the time on both axes."""
+    rows = np.flatnonzero([len(c) > 0 for c in m.cluster])
+    if len(rows) < 3:
+        return None
+    yaw, origin = float(m.yaw_rad[rows[np.argmax(m.points[rows])]]), m.center_m[rows[0], :2]
+    ends, shown = np.zeros((len(rows), 2, 2)), np.zeros((len(rows), 2, 2), dtype=bool)
+    for k, row in enumerate(rows):
+        low, high = box_fitting.extents(m.cluster[row][:, :2] - origin, yaw)
+        sensor = box_fitting.rotate(m.sensor_m[row, :2] - origin, -yaw)
+        ends[k] = np.stack([low, high], axis=1)
+        shown[k] = box_fitting.real_ends(low, high, sensor, m.ends_visible[row]) > 0
+    # Between its points an end may lie that none of them shows.
+    gap = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=1) / np.sqrt(m.points[rows])
+    variance = END_SIGMA_M**2 + gap**2
+    velocity, sigma, spread = np.zeros(2), np.zeros(2), np.zeros(2)
+    for axis in range(2):
+        if np.any(shown[:, axis], axis=1).mean() <= 0.5:
+            return None
+        # What is rigid moves with both ends: where one stands, the other only shows more and more of it.
+        slowest = np.inf
+        for end in np.flatnonzero(shown[:, axis].mean(axis=0) > 0.25):
+            seen = np.flatnonzero(shown[:, axis, end])
+            place, speed, sigma_mps = robust_line(t[rows[seen]], ends[seen, axis, end, None], variance[seen])
+            if abs(speed[0]) < slowest:
+                slowest = abs(float(speed[0]))
+                velocity[axis], sigma[axis] = speed[0], sigma_mps
+                apart = np.abs(ends[seen, axis, end] - place[0]) - 2 * np.sqrt(variance[seen])
+                spread[axis] = np.quantile(apart, SPREAD_QUANTILE)
+    return _Motion(velocity, float(sigma.max()), float(spread.max()))
+
+
+def robust_line(t: Array, xy: Array, variance: Array) -> tuple[Array, Array, float]:
+    """Fit uniform motion to positions by weighted least squares that outliers move little.
+
+    Parameters
+    ----------
+    t : (n,) float64, s
+    xy : (n, d) float64, m
+    variance : (n,) float64, m2
+        Of a position in each direction.
+
+    Returns
+    -------
+    center : (d,)
+        The weighted mean of the positions.
+    velocity : (d,)
+        In m/s; zero where all times are the same.
+    sigma_mps : float
+        Standard deviation of the velocity in each direction, larger where positions scatter more than their variances say
+        (Birge, 1932), infinite where all times are the same.
+
+    Notes
+    -----
+    Iteratively reweighted by Cauchy's function of the residuals (Holland & Welsch, "Robust regression using iteratively
+    reweighted least-squares", 1977).
+    """
+    weight, robust = 1.0 / variance, np.ones(len(t))
+    for _ in range(REWEIGHTINGS):
+        w = weight * robust
+        mean_t, center = w @ t / w.sum(), w @ xy / w.sum()
+        known = float(w @ (t - mean_t) ** 2)
+        velocity = (w * (t - mean_t)) @ (xy - center) / known if known > 0 else np.zeros(xy.shape[1])
+        residual = xy - center - (t - mean_t)[:, None] * velocity
+        squared = weight * (residual**2).sum(axis=1)
+        robust = 1.0 / (1.0 + squared / CAUCHY_SIGMAS**2)
+    scatter = float(squared.mean()) / xy.shape[1]
+    return center, velocity, (max(scatter, 1.0) / known) ** 0.5 if known > 0 else np.inf
+
+
+def side_of_traffic(paths: Sequence[Array]) -> Side:
+    """Which side of the road the traffic of a log keeps to, from vehicles that meet each other.
+
+    Parameters
+    ----------
+    paths : sequence of (K, 3) float64
+        x, y in m and heading in rad of each vehicle that moved, the ego among them.
+
+    Returns
+    -------
+    side : Side
+        `Side.RIGHT` or `Side.LEFT`; `USUAL_SIDE` where no two vehicles meet, or as many on the one side as on the other.
+
+    Notes
+    -----
+    Each pair of vehicles of opposite headings has one vote: where the oncoming one passes on the left, traffic keeps
+    right.
+    """
+    votes = 0.0
+    thinned = [p[np.linspace(0, len(p) - 1, min(len(p), PATH_SAMPLES)).astype(np.intp)] for p in paths if len(p)]
+    for one, other in combinations(thinned, 2):
+        to = other[None, :, :2] - one[:, None, :2]
+        c, s = np.cos(one[:, 2])[:, None], np.sin(one[:, 2])[:, None]
+        left = c * to[..., 1] - s * to[..., 0]
+        near = np.hypot(to[..., 0], to[..., 1]) < ROAD_M
+        meets = near & (np.cos(one[:, None, 2] - other[None, :, 2]) < OPPOSITE_COS) & (np.abs(left) > LANE_M)
+        if meets.any():
+            votes += np.sign(np.median(left[meets]))
+    return Side(int(np.sign(votes))) if votes else USUAL_SIDE
+
+
+def parked_heading(yaw_rad: float, xy: Array, flow: Array, *, side: Side = USUAL_SIDE) -> float:
+    """Choose between the two directions of a standing vehicle: it points the way the traffic of its side goes.
+
+    Parameters
+    ----------
+    yaw_rad : float
+        Known up to half a turn.
+    xy : (2,) float64, m
+    flow : (K, 3) float64
+        x, y in m and heading in rad of vehicles that moved; without any near enough the yaw stays as it is.
+    side : Side
+        From `side_of_traffic`.
+
+    Notes
+    -----
+    What stands on a moving vehicle's own side of the road points along its path, what stands beyond the oncoming lane
+    points against it. Each moment of each path votes, the nearer to the side the more.
+    """
+    if len(flow) == 0:
+        return float(wrap_angle(yaw_rad))
+    to = xy - flow[:, :2]
+    c, s = np.cos(flow[:, 2]), np.sin(flow[:, 2])
+    along, left = to[:, 0] * c + to[:, 1] * s, -to[:, 0] * s + to[:, 1] * c
+    parallel = np.abs(np.cos(flow[:, 2] - yaw_rad)) > PARALLEL_COS
+    near = parallel & (np.abs(along) < REACH_M) & (np.abs(left) < REACH_M / 3)
+    if not near.any():
+        return float(wrap_angle(yaw_rad))
+    direction = np.where(side * left[near] > LANE_M, -1.0, 1.0)
+    weight = 1.0 / (1.0 + np.abs(left[near]) / 2 + np.abs(along[near]) / 10) ** 2
+    vote = np.sum(weight * direction * np.sign(np.cos(flow[near, 2] - yaw_rad)))
+    return float(wrap_angle(yaw_rad if vote >= 0 else yaw_rad + np.pi))

@@ -1,0 +1,103 @@
+"""Logs of other kinds than the sample: slow and fast sensors, left-hand traffic, long trucks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from worlds import tiny_log
+
+from log2sim.config import Config
+from log2sim.datatypes import Log, Scenario, Stream
+from log2sim.evaluation.metrics.evaluator import evaluate
+from log2sim.pipeline import reconstruct
+
+pytestmark = pytest.mark.slow
+LABELS = Config.load(None, ["detect.name=labels"])
+AROUND = {"azimuth_deg": [-130.0, 130.0], "channels": 20, "elevation_deg": [-18.0, 3.0]}
+
+
+def sensors(rate_hz: float = 10.0, step_deg: float = 0.8) -> dict[str, Any]:
+    """Three small cameras and a coarse LiDAR that see all but what is behind."""
+    cameras = [
+        {"name": name, "position_m": [1.5, 0.0, 1.6], "yaw_deg": yaw, "fov_deg": 90.0, "size_px": [400, 240],
+         "offset_s": 0.03, "rate_hz": rate_hz}
+        for name, yaw in (("front", 0.0), ("left", 85.0), ("right", -85.0))
+    ]  # fmt: skip
+    lidar = {
+        "name": "top",
+        "position_m": [1.2, 0.0, 1.9],
+        "rate_hz": rate_hz,
+        "range_m": 60.0,
+        "azimuth_step_deg": step_deg,
+    }
+    return {"camera": cameras, "lidar": [lidar | AROUND]}
+
+
+def every(log: Log, step: int) -> Log:
+    """The log with every so-many-th record."""
+
+    def thin(s: Stream) -> Stream:
+        return replace(s, t_ns=s.t_ns[::step], read=lambda i: s.read(i * step))
+
+    return replace(log, streams={name: thin(s) for name, s in log.streams.items()})
+
+
+@pytest.fixture(scope="module")
+def world_at_20_hz() -> tuple[Log, Scenario]:
+    agents = [
+        {"id": "ahead", "category": "car", "waypoints": [[14.0, 0.0, 7.0], [80.0, 0.0, 9.0]]},
+        {"id": "oncoming", "category": "car", "waypoints": [[55.0, 3.5, 8.0], [-60.0, 3.5, 8.0]]},
+        {"id": "parked", "category": "car", "pose": [22.0, -4.0, 0.0]},
+        {"id": "walker", "category": "pedestrian", "waypoints": [[16.0, -6.5, 1.4], [8.0, -6.5, 1.4]]},
+    ]
+    ego = {"waypoints": [[0.0, 0.0, 6.0], [40.0, 0.0, 7.0]], "poses": "poses"}
+    return tiny_log(agents, duration_s=4.5, ego=ego, **sensors(20.0))
+
+
+@pytest.mark.parametrize("rate_hz", [20, 10, 2])
+def test_everybody_is_found_at_any_rate(world_at_20_hz: tuple[Log, Scenario], rate_hz: int) -> None:
+    log, truth = world_at_20_hz
+    found = evaluate(reconstruct(every(log, 20 // rate_hz), LABELS).scenario, truth)
+    assert found["recall"] >= 0.95
+    assert found["precision"] >= 0.9
+    assert found["position_median_m"] < 0.3
+    assert found["id_switches"] == 0
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0], ids=["right-hand traffic", "left-hand traffic"])
+def test_parked_cars_point_the_way_of_their_side(side: float) -> None:
+    parked = {
+        "own_1": (12.0, -2.6, 0),
+        "own_2": (22.0, -2.6, 0),
+        "other_1": (15.0, 6.2, 180),
+        "other_2": (25.0, 6.2, 180),
+    }
+    agents: list[dict[str, Any]] = [
+        {"id": name, "category": "car", "pose": [x, y * side, yaw]} for name, (x, y, yaw) in parked.items()
+    ]
+    agents.append(
+        {"id": "oncoming", "category": "car", "waypoints": [[45.0, 3.6 * side, 9.0], [-60.0, 3.6 * side, 9.0]]}
+    )
+    ego = {"waypoints": [[0.0, 0.0, 5.0], [40.0, 0.0, 6.0]], "poses": "poses"}
+    log, truth = tiny_log(agents, duration_s=3.5, ego=ego, **sensors())
+    found = evaluate(reconstruct(log, LABELS).scenario, truth)
+    assert found["recall"] >= 0.95
+    assert found["yaw_flipped"] == 0.0
+
+
+@pytest.mark.parametrize("speed_mps", [0.0, 4.0])
+def test_a_truck_seen_from_end_to_end_over_time_is_as_long_as_it_is(speed_mps: float) -> None:
+    truck: dict[str, Any] = {"id": "truck", "category": "truck", "size_m": [18.0, 2.55, 3.6]}
+    truck |= {"waypoints": [[30.0, 6.5, 4.0], [-60.0, 6.5, 4.0]]} if speed_mps else {"pose": [12.0, 6.5, 180.0]}
+    ego = {"waypoints": [[0.0, 0.0, 3.0], [40.0, 0.0, 3.0]], "poses": "poses"}
+    log, truth = tiny_log([truck], duration_s=6.0, ego=ego, **sensors(step_deg=0.5))
+    scenario = reconstruct(log, LABELS).scenario
+    (found,) = evaluate(scenario, truth)["agents"]
+    assert abs(found["length_error_m"]) < 0.5
+    assert found["position_rmse_m"] < (0.5 if not speed_mps else 2.5)
+    (agent,) = (a for a in scenario.others if a.category == "truck")
+    assert agent.static == (speed_mps == 0.0)
+    assert np.ptp(agent.waypoints.x_m) > 10.0 or agent.static
