@@ -15,7 +15,7 @@ from log2sim.agents.lidar_tracking import BoxState, LidarMatch, track_with_lidar
 from log2sim.agents.size import TrackGeometry, moving_geometry, static_geometry
 from log2sim.agents.smooth.smoother import MotionModel, SmoothedTrack, signed_speed, smooth_track
 from log2sim.agents.standing import Side, is_static, parked_heading, side_of_traffic
-from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Agent, Obstacles, Track, Waypoints
+from log2sim.datatypes import GROUP_OF, STANDSTILL_MPS, TYPICAL_SIZE_M, Agent, Obstacles, Track, Waypoints
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
 from log2sim.perception import box_fitting
 
@@ -24,7 +24,6 @@ JERK_DENSITY = {"pedestrian": 2.0}
 CENTER_SIGMA_M = {"vehicle": 0.12, "two_wheeler": 0.1, "pedestrian": 0.08, "other": 0.15}
 # Rear axle to box center, as a share of the length: BMW 320i of CommonRoad's vehicle models, b - overhang, rounded.
 REAR_AXLE_SHARE = {"vehicle": 0.28, "two_wheeler": 0.3}
-STANDING_SPEED_MPS = 0.15
 MIN_RIDER_SPEED_MPS, RIDER_SPEED_BASELINE_S = 3.0, 0.6
 
 
@@ -233,7 +232,7 @@ def _waypoints(
         y_m=path.xy_m[:, 1],
         z_m=np.interp(at, t, _running_median(shape.z_m)),
         yaw_rad=yaw,
-        speed_mps=np.where(np.abs(speed) < STANDING_SPEED_MPS, 0.0, speed),
+        speed_mps=np.where(np.abs(speed) < STANDSTILL_MPS, 0.0, speed),
         observed=observed,
         sigma_xy_m=np.sqrt(np.trace(path.covariance, axis1=1, axis2=2) / 2),
     )

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from log2sim.agents.build import STANDING_SPEED_MPS, Timeline
+from log2sim.agents.build import Timeline
 from log2sim.agents.smooth.smoother import signed_speed, smooth_track
-from log2sim.datatypes import Agent, Log, Waypoints
+from log2sim.datatypes import STANDSTILL_DRIFT_M, STANDSTILL_MPS, Agent, Log, Waypoints
 from log2sim.geometry import Array, yaw_of
 from log2sim.perception.sync import Schedule
 
 # Standard deviation of ego positions from GNSS/INS with RTK or LiDAR odometry.
 EGO_SIGMA_M = 0.02
-MAX_STATIC_DISTANCE_M = 0.3
 
 
 def ego_agent(log: Log, timeline: Timeline) -> Agent | None:
@@ -33,13 +32,13 @@ def ego_agent(log: Log, timeline: Timeline) -> Agent | None:
         y_m=path.xy_m[:, 1],
         z_m=center[:, 2],
         yaw_rad=yaw,
-        speed_mps=np.where(np.abs(speed) < STANDING_SPEED_MPS, 0.0, speed),
+        speed_mps=np.where(np.abs(speed) < STANDSTILL_MPS, 0.0, speed),
         observed=np.ones(len(t), dtype=bool),
         sigma_xy_m=np.sqrt(np.trace(path.covariance, axis1=1, axis2=2) / 2),
     )
     moved = float(np.hypot(np.ptp(center[:, 0]), np.ptp(center[:, 1])))
     return Agent(
-        "ego", "car", vehicle.size_m, waypoints, static=moved < MAX_STATIC_DISTANCE_M, rear_axle_offset_m=vehicle.rear_axle_offset_m,
+        "ego", "car", vehicle.size_m, waypoints, static=moved < STANDSTILL_DRIFT_M, rear_axle_offset_m=vehicle.rear_axle_offset_m,
         quality={"source": "ego poses of the log", "flags": list(path.flags)},
     )  # fmt: skip
 

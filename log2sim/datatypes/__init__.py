@@ -22,7 +22,7 @@ from log2sim.datatypes.measurements import Detections, Measurements
 from log2sim.datatypes.obstacles import Obstacles
 from log2sim.datatypes.scenario import EGO, VERSION, Scenario
 from log2sim.datatypes.tracks import Track
-from log2sim.datatypes.trajectory import Trajectory
+from log2sim.datatypes.trajectory import STANDSTILL_DRIFT_M, STANDSTILL_MPS, Trajectory
 from log2sim.datatypes.waypoints import Waypoints
 
 __all__ = [
@@ -32,6 +32,8 @@ __all__ = [
     "GROUP_OF",
     "MAX_SIZE_M",
     "MIN_SIZE_M",
+    "STANDSTILL_DRIFT_M",
+    "STANDSTILL_MPS",
     "TYPICAL_SIZE_M",
     "VERSION",
     "Agent",

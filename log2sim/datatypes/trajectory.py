@@ -11,6 +11,12 @@ from numpy.typing import NDArray
 from log2sim.datatypes.waypoints import Waypoints
 from log2sim.geometry import Array, wrap_angle
 
+STANDSTILL_MPS = 0.15
+"""An agent stands when it is slower: half a kilometer per hour, the standard deviation of smoothed speeds of distant boxes."""
+
+STANDSTILL_DRIFT_M = 2.0 * STANDSTILL_MPS
+"""How far a standing agent may seem to move: 2 s at that speed, after which a smoothed drift is seen as motion."""
+
 MIN_DISCONTINUITY_M = 2.0
 """A waypoint is discontinuous when it is farther than this from where the speeds lead, and"""
 

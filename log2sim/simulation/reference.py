@@ -31,7 +31,9 @@ GRID_S = 0.02
 SMOOTHING_S = 0.12
 """Standard deviation of the Gaussian over the velocity of points: one waypoint of a 10 Hz log."""
 
-STANDSTILL_MPS = 0.08
+REFERENCE_HOLD_MPS = 0.08
+"""The brake holds while the reference is slower: below `STANDSTILL_MPS`, so that a start is not delayed."""
+
 MIN_RUN_M, MIN_RUN_MPS = 0.3, 0.5  # a movement that is both shorter and slower is noise of a standing agent
 MAX_ACCEL_MPS2 = 10.4  # feasibility limits of Waymax (Gulino et al., 2023, section 3.3)
 MAX_CURVATURE_1PM = 0.3
@@ -156,7 +158,7 @@ def point_reference(trajectory: Trajectory) -> Reference:
         if len(piece) > 1:
             vx[piece], vy[piece] = (_smooth(np.gradient(c[piece], GRID_S)) for c in (x, y))
             ax[piece], ay[piece] = np.gradient(vx[piece], GRID_S), np.gradient(vy[piece], GRID_S)
-    stands = (np.hypot(vx, vy) < STANDSTILL_MPS).astype(np.float64)
+    stands = (np.hypot(vx, vy) < REFERENCE_HOLD_MPS).astype(np.float64)
 
     def exact(at_s: Array) -> Array:
         smoothed = (np.interp(at_s, t, c) for c in (vx, vy, ax, ay, stands))
@@ -203,7 +205,7 @@ def _smooth(values: Array) -> Array:
 
 def _gears(speed: Array) -> tuple[Array, Array]:
     """Return for every row the gear, +1 or -1, of the present or next movement, and whether the agent stands."""
-    direction = np.where(np.abs(speed) < STANDSTILL_MPS, 0, np.sign(speed)).astype(int)
+    direction = np.where(np.abs(speed) < REFERENCE_HOLD_MPS, 0, np.sign(speed)).astype(int)
     runs: list[NDArray[np.intp]] = np.split(np.arange(len(speed)), np.flatnonzero(np.diff(direction)) + 1)
     gear, stands = np.ones(len(speed)), np.ones(len(speed))
     begin = 0

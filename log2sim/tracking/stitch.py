@@ -18,8 +18,8 @@ FORBIDDEN = 1e6
 # Where both ends could meet anywhere within this (one sigma), meeting proves nothing.
 VAGUE_M = 2.0
 # An object that stands still is the same object however long it was hidden, if it stands where it stood.
-STANDING_MPS = 0.5
-STANDING_APART_M = 1.0
+MAX_STATIONARY_MPS = 0.5
+MAX_STATIONARY_OFFSET_M = 1.0
 # What lies farther back says nothing about the end; the filter has forgotten it.
 MEMORY = 20
 
@@ -68,13 +68,13 @@ def _meeting_costs(ends: _Ends, max_gap_s: float) -> Array:
     """Cost (A, A) of the second track being the first one's continuation, `FORBIDDEN` where it cannot be."""
     cost = np.full((len(ends.group), len(ends.group)), FORBIDDEN)
     gap_s = (ends.first_ns[None, :] - ends.last_ns[:, None]) / NS_PER_S
-    stands, stood = (np.hypot(*state[:, 2:].T) < STANDING_MPS for state in (ends.last[0], ends.first[0]))
+    stands, stood = (np.hypot(*state[:, 2:].T) < MAX_STATIONARY_MPS for state in (ends.last[0], ends.first[0]))
     still = stands[:, None] & stood[None, :]
     a, b = np.nonzero((gap_s > 0) & (still | (gap_s <= max_gap_s)) & (ends.group[:, None] == ends.group[None, :]))
     gap_s, still = gap_s[a, b], still[a, b]
     last, first = ends.last[0][a], ends.first[0][b]
     apart = np.hypot(*(last - first)[:, :2].T)
-    stood = still & (apart < STANDING_APART_M)
+    stood = still & (apart < MAX_STATIONARY_OFFSET_M)
     cost[a[stood], b[stood]] = apart[stood]
     half = gap_s[:, None] / 2
     beside = np.hypot(*(last[:, :2] + half * last[:, 2:] - first[:, :2] + half * first[:, 2:]).T)

@@ -20,7 +20,7 @@ DRIFT_SIGMAS, MIN_DRIFT_MPS = 3.0, 0.05
 SCATTER_SIGMAS = 3.0
 MIN_WEIGHT = 0.25
 # Standard deviation of the velocity at a standstill, and near the edges of a span, where it decays within the time that follows.
-STANDING_MPS = 0.005
+STANDSTILL_SIGMA_MPS = 0.005
 EDGE_MPS, EDGE_S = 1.0, 0.4
 # The first and the last quarter of a span are off its middle when it is this significant and this far.
 END_SIGMAS, MIN_END_STEP_M = 2.5, 0.03
@@ -59,7 +59,7 @@ def zero_velocity_sigma(
             end = last if last == len(knots_s) - 1 and span[-1] == inside[-1] else measurement.knot[span[-1]]
             since = np.inf if begin == 0 else knots_s[begin : end + 1] - knots_s[begin]
             until = np.inf if end == len(knots_s) - 1 else knots_s[end] - knots_s[begin : end + 1]
-            out[begin : end + 1] = STANDING_MPS + EDGE_MPS * np.exp(-np.minimum(since, until) / EDGE_S)
+            out[begin : end + 1] = STANDSTILL_SIGMA_MPS + EDGE_MPS * np.exp(-np.minimum(since, until) / EDGE_S)
     return out
 
 

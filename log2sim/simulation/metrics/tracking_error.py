@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.datatypes import Trajectory
+from log2sim.datatypes import STANDSTILL_MPS, Trajectory
 from log2sim.geometry import Array, wrap_angle
 from log2sim.simulation.result import AgentReplay
 
 SEARCH_S = 1.0
 SEARCH_STEP_S = 0.05
-MIN_SEGMENT_MPS = 0.1
 
 OFF_PATH_M = 0.5
 """Cross-track error beyond which an agent is off its path: a 1.9 m wide car in a 3.5 m lane has 0.8 m on each side."""
@@ -59,7 +58,7 @@ def tracking_errors(
     px, py, _, yaw, _ = trajectory.at(np.arange(begin_s, end_s + SEARCH_STEP_S, SEARCH_STEP_S))
     ux, uy = np.diff(px), np.diff(py)
     square = ux**2 + uy**2
-    moves = square > (MIN_SEGMENT_MPS * SEARCH_STEP_S) ** 2
+    moves = square > (STANDSTILL_MPS * SEARCH_STEP_S) ** 2
     # Segments near each row (S, K): on each the share of it at which it is nearest.
     reach = round(SEARCH_S / SEARCH_STEP_S)
     middle = np.rint(((t_s if near_s is None else near_s) - begin_s) / SEARCH_STEP_S).astype(np.intp)

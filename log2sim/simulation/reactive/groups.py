@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from log2sim.geometry import Array
 from log2sim.simulation.groups import AgentGroup, LogReplayGroup, PedestrianGroup, VehicleGroup
 from log2sim.simulation.reactive.traffic import Traffic
-from log2sim.simulation.reference import GRID_S, POINT_COLUMNS, STANDSTILL_MPS, VEHICLE_COLUMNS
+from log2sim.simulation.reference import GRID_S, POINT_COLUMNS, REFERENCE_HOLD_MPS, VEHICLE_COLUMNS
 from log2sim.simulation.step_clock import StepClock
 
 RATE_OF_SPEED = {"speed": "accel_ahead", "velocity_x": "accel_x", "velocity_y": "accel_y"}
@@ -83,7 +83,7 @@ class ReactiveGroup(AgentGroup):
                 row[names[change]] = row[names[change]] * rate**2 + row[names[speed]] * slope
         row[speeds] *= rate
         if "stands" in names:
-            row[names["stands"]] = np.maximum(row[names["stands"]], np.hypot.reduce(row[speeds]) < STANDSTILL_MPS)
+            row[names["stands"]] = np.maximum(row[names["stands"]], np.hypot.reduce(row[speeds]) < REFERENCE_HOLD_MPS)
         return row
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Trajectory
+from log2sim.datatypes import STANDSTILL_MPS, Trajectory
 from log2sim.geometry import Array
 
 TIME_STEP_S = 0.1  # linear interpolation errs by a h^2 / 8, a centimeter at 10 m/s2
@@ -20,7 +20,6 @@ EXTENSION_M = 120.0
 SEARCH_BACK_M, SEARCH_AHEAD_M = 5.0, 20.0
 """Range about its last place in which an agent is searched on its path: so it stays on its branch where paths cross."""
 
-STANDING_MPS = 0.15  # slower movement is jitter of a standing agent and adds no distance
 COARSE_STRIDE = 4  # rows between those of the first pass of a search
 
 
@@ -168,7 +167,7 @@ def _time_table(trajectory: Trajectory, origin_m: tuple[float, float]) -> Array:
     x, y, yaw, speed = trajectory.relative(t_s)
     step = np.hypot(np.diff(x), np.diff(y))
     if count > 1:
-        step = np.where(step < STANDING_MPS * (t_s[1] - t_s[0]), 0.0, step)
+        step = np.where(step < STANDSTILL_MPS * (t_s[1] - t_s[0]), 0.0, step)
     distance = np.concatenate([[0.0], np.cumsum(step)])
     dx, dy = trajectory.origin_m[0] - origin_m[0], trajectory.origin_m[1] - origin_m[1]
     return np.stack([t_s, x + dx, y + dy, trajectory.heights(t_s), yaw, speed, distance], axis=1)

@@ -12,7 +12,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, Trajectory
+from log2sim.datatypes import STANDSTILL_MPS, Agent, Trajectory
 from log2sim.geometry import Array
 from log2sim.simulation.groups import Snapshot
 from log2sim.simulation.reactive.idm import idm_parameters, rate_response
@@ -21,7 +21,6 @@ from log2sim.simulation.reactive.log_overlaps import deep_overlaps
 from log2sim.simulation.reactive.path_table import PathTable, Pose
 
 DECISION_STEP_S = 0.1
-STANDING_MPS = 0.05  # where the log is slower, its time goes on: waiting then counts as the log's own stop
 CHUNK = 4096  # pairs evaluated together
 RELEASE_S, MAX_KEPT_DEMAND = 0.5, 4.0
 """A demand fades over this time after it ends, so that the rate does not oscillate at the edge of a conflict."""
@@ -107,7 +106,7 @@ class Traffic:
         taken = np.maximum(taken, np.where(kept > MIN_DEMAND, kept, 0.0))
         self._taken = taken
         rate, slope = rate_response(self.idm.take(own), self.rate[own], taken[own], pace, log_accel)
-        stands = pace < STANDING_MPS
+        stands = pace < STANDSTILL_MPS  # the log's time goes on: waiting then counts as the log's own stop
         self.rate[own], self.rate_slope[own] = np.where(stands, 1.0, rate), np.where(stands, 0.0, slope)
 
     def _with_ego(self, pose: Pose, ego: Snapshot | None) -> Pose:

@@ -10,7 +10,7 @@ import numpy as np
 
 from log2sim.datatypes import Agent
 from log2sim.geometry import Array
-from log2sim.simulation.reference import GRID_S, STANDSTILL_MPS, VEHICLE_COLUMNS, Reference
+from log2sim.simulation.reference import GRID_S, REFERENCE_HOLD_MPS, VEHICLE_COLUMNS, Reference
 from log2sim.simulation.vehicles.single_track import Chassis, axle_grips
 from log2sim.simulation.vehicles.vehicle import GRAVITY_MPS2, VehicleParameters, VehicleState
 
@@ -127,7 +127,7 @@ def _inverse_dynamics(columns: Array, p: VehicleParameters, *, saturates: bool) 
             slip = rear + to_rear / p.wheelbase_m * (front - rear)  # of the center of gravity, beyond that of rolling
             drag = speed * np.abs(speed) * curvature * slip
     nose = np.sign(speed) * rear
-    moving = np.abs(speed) > STANDSTILL_MPS
+    moving = np.abs(speed) > REFERENCE_HOLD_MPS
     swing = np.where(moving, np.gradient(nose, GRID_S) / np.where(moving, speed, 1.0), 0.0)
     return nose, (bend / p.wheelbase_m + swing) / (1 + understeer(p) * speed**2) - curvature, drag
 

@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 from matplotlib.ticker import FuncFormatter, MultipleLocator
 
+from log2sim.datatypes import STANDSTILL_MPS
 from log2sim.visualization.plot.roles import AgentRole, AgentRoles
 from log2sim.visualization.plot.style import (
     COLLISION_MARK,
@@ -29,9 +30,6 @@ from log2sim.visualization.plot.style import (
     printable,
 )
 from log2sim.visualization.plot.viewport import Viewport, nice_step
-
-MIN_SPEED_MPS = 0.15
-"""A slower agent is called stationary: its speed would be 0 km/h."""
 
 WIDTH_IN = 10.0
 LEFT_IN, SIDE_IN, TOP_IN, BOTTOM_IN, GAP_IN = 0.72, 2.3, 0.74, 0.52, 0.2
@@ -180,7 +178,7 @@ def _reading_order(role: AgentRole) -> tuple[bool, int, str]:
 
 def _name(role: AgentRole) -> str:
     speed = float(np.max(np.abs(role.agent.waypoints.speed_mps)))
-    moving = f"{speed * 3.6:.0f} km/h" if speed >= MIN_SPEED_MPS else "stationary"
+    moving = f"{speed * 3.6:.0f} km/h" if speed >= STANDSTILL_MPS else "stationary"
     if role.is_ego:
         return f"ego · {moving}"
     if role.agent.id.startswith(role.agent.category):
