@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from log2sim.datatypes import GROUP_OF, Scenario
+from log2sim.datatypes import GROUP_OF, Agent, Scenario, Trajectory
 from log2sim.errors import ConfigError
 from log2sim.visualization.plot.roles import AgentRole, assign_roles, is_moving
 
 # Columns are stored as whole numbers of 0.1 ms, mm, 0.1 mrad and mm/s.
-SCALES = {"t_s": 1e4, "x_m": 1e3, "y_m": 1e3, "yaw_rad": 1e4, "speed_mps": 1e3}
+SCALES = {"t_s": 1e4, "x_m": 1e3, "y_m": 1e3, "yaw_rad": 1e4, "speed_mps": 1e3, "vx_mps": 1e3, "vy_mps": 1e3}
+WAYPOINT_COLUMNS = ("t_s", "x_m", "y_m", "speed_mps")
 MAX_ROWS = 3_000_000
 """Waypoints of all layers together; a page with this many has about 50 MB."""
 
@@ -88,11 +89,21 @@ def _entry(agent: Any, columns: Any, *, stationary: bool, static: bool) -> dict[
         "size_m": [round(float(v), 3) for v in agent.size_m[:2]],
         "stationary": stationary,
         "permanent": static and len(columns.t_s) == 1,  # one pose during the whole scenario
-        **{k: second_differences(getattr(columns, k), scale) for k, scale in SCALES.items() if k != "yaw_rad"},
+        **{k: second_differences(getattr(columns, k), scale) for k, scale in SCALES.items() if k in WAYPOINT_COLUMNS},
         "yaw_rad": second_differences(np.unwrap(columns.yaw_rad), SCALES["yaw_rad"]),
     }
-    observed = getattr(columns, "observed", None)
-    return entry if observed is None else {**entry, "filled": _filled(observed)}
+    if not isinstance(agent, Agent):
+        return entry
+    return {**entry, **_tangents(agent.trajectory), "filled": _filled(columns.observed)}
+
+
+def _tangents(trajectory: Trajectory) -> dict[str, list[int]]:
+    """Return the velocities of the spline at the waypoints and the indices of steps over which the log jumps."""
+    return {
+        "vx_mps": second_differences(trajectory.velocity_x_mps, SCALES["vx_mps"]),
+        "vy_mps": second_differences(trajectory.velocity_y_mps, SCALES["vy_mps"]),
+        "jumps": np.flatnonzero(trajectory.discontinuous).tolist(),
+    }
 
 
 def second_differences(values: ArrayLike, scale: float) -> list[int]:

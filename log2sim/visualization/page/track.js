@@ -11,6 +11,15 @@ const sums = (differences, scale) => {
   return out;
 };
 
+// Value between waypoints k and k + 1 by their slopes, straight on over a jump of the log, linear without slopes.
+const between = (values, slopes, k, share, span, jump) => {
+  const rise = values[k + 1] - values[k];
+  if (slopes === null) return values[k] + share * rise;
+  const first = span * slopes[k], last = span * slopes[k + 1];
+  if (jump) return values[k] + share * first;
+  return values[k] + share * (first + share * (3 * rise - 2 * first - last + share * (first + last - 2 * rise)));
+};
+
 class Track {
   constructor(entry, scales) {
     Object.assign(this, {
@@ -20,6 +29,10 @@ class Track {
       t: sums(entry.t_s, scales.t_s), x: sums(entry.x_m, scales.x_m), y: sums(entry.y_m, scales.y_m),
       yaw: sums(entry.yaw_rad, scales.yaw_rad), v: sums(entry.speed_mps, scales.speed_mps),
     });
+    this.vx = entry.vx_mps ? sums(entry.vx_mps, scales.vx_mps) : null;  // only agents of scenarios follow a spline
+    this.vy = entry.vy_mps ? sums(entry.vy_mps, scales.vy_mps) : null;
+    this.jumps = new Uint8Array(this.t.length);
+    for (const k of entry.jumps ?? []) this.jumps[k] = 1;
     this.filled = new Uint8Array(Math.max(this.t.length - 1, 0));
     const edges = entry.filled ?? [];
     for (let k = 0; k < edges.length; k += 2) this.filled.fill(1, edges[k], edges[k + 1]);
@@ -45,7 +58,7 @@ class Track {
     return (this.k = low);
   }
 
-  // Set the state at time t, linearly interpolated between waypoints.
+  // Set the state at time t: position by the cubic Hermite spline of log2sim's trajectories, yaw and speed linearly.
   moveTo(t) {
     const slack = 1e-4;
     this.present = this.permanent || (t >= this.first - slack && t <= this.last + slack);
@@ -55,11 +68,11 @@ class Track {
       this.set(this.x[k], this.y[k], this.yaw[k], this.v[k], n > 1 && this.filled[Math.min(k, n - 2)] === 1);
       return;
     }
-    const share = (t - this.t[k]) / (this.t[k + 1] - this.t[k]);
+    const span = this.t[k + 1] - this.t[k], share = (t - this.t[k]) / span, jump = this.jumps[k] === 1;
     this.set(
-      this.x[k] + share * (this.x[k + 1] - this.x[k]),
-      this.y[k] + share * (this.y[k + 1] - this.y[k]),
-      this.yaw[k] + share * (this.yaw[k + 1] - this.yaw[k]),
+      between(this.x, this.vx, k, share, span, jump),
+      between(this.y, this.vy, k, share, span, jump),
+      jump ? this.yaw[k] : this.yaw[k] + share * (this.yaw[k + 1] - this.yaw[k]),
       this.v[k] + share * (this.v[k + 1] - this.v[k]),
       this.filled[k] === 1,
     );
