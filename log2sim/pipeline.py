@@ -64,9 +64,7 @@ class Run:
     report_progress: Progress
 
 
-def reconstruct(
-    log: Log, config: Config | None = None, *, picture: bool = False, progress: Progress | None = None
-) -> Result:
+def reconstruct(log: Log, config: Config | None = None, *, progress: Progress | None = None) -> Result:
     """Reconstruct the scenario of a log.
 
     Parameters
@@ -75,8 +73,6 @@ def reconstruct(
         From `open_log`.
     config : Config, optional
         Settings; the defaults without.
-    picture : bool
-        Whether a bird's-eye view will be asked for, which needs every camera's homography.
     progress : callable, optional
         Called as `progress(stage, done, total)`.
 
@@ -87,17 +83,17 @@ def reconstruct(
     NothingToReconstruct
         When neither an ego nor any agent was found.
     """
-    run = start(log, config or Config(), picture=picture, progress=progress)
+    run = start(log, config or Config(), progress=progress)
     return second_pass(run, first_pass(run))
 
 
-def start(log: Log, config: Config, *, picture: bool = False, progress: Progress | None = None) -> Run:
+def start(log: Log, config: Config, *, progress: Progress | None = None) -> Run:
     """Choose the sensors, synchronize them, and plan the run."""
     clock, sensors = StageClock(), select_sensors(log, config)
     detector = detector_of(log, config)
     with clock.stage("sync"):
         schedule = schedule_of(log, config, sensors)
-    plan = make_plan(log, config, sensors, schedule.t_ns, picture=picture)
+    plan = make_plan(log, config, sensors, schedule.t_ns)
     return Run(sensors.restrict(log), config, plan, schedule, detector, clock, progress or (lambda *_: None))
 
 

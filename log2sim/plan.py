@@ -150,11 +150,11 @@ def select_sensors(log: Log, config: Config) -> Sensors:
     return Sensors(cameras, tuple(n for n in log.lidars if n not in far), tuple(sorted(far)))
 
 
-def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64], *, picture: bool = False) -> Plan:
-    """Decide what to run at the ticks (T,) of a log; `picture` when a bird's-eye view is asked for."""
-    decodes = _image_decoding(config, picture)
+def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64]) -> Plan:
+    """Decide what to run at the ticks (T,) of a log."""
+    decodes = _image_decoding(config)
     stride = least_hits(t_ns, config.track.min_life_s) if decodes.kept else 1
-    scope, homography = _homography(log, config, picture)
+    scope, homography = _homography(log, config)
     smooth = config.smooth.enabled
     decisions = (
         _lidar_use(log, sensors),
@@ -236,11 +236,9 @@ def _motion(map_T_ego: Array) -> tuple[float, float]:
     return float((positions.max(axis=0) - positions.min(axis=0)).max()), float(np.arccos(np.clip(cosine, -1, 1)).max())
 
 
-def _image_decoding(config: Config, picture: bool) -> Decision:
+def _image_decoding(config: Config) -> Decision:
     if config.detect.name != LABELS:
         return Decision(Stage.IMAGE_DECODING, True, "the detector needs images")
-    if picture:
-        return Decision(Stage.IMAGE_DECODING, True, "a bird's-eye view is asked for")
     return Decision(Stage.IMAGE_DECODING, False, "boxes come from the log; no image is needed")
 
 
@@ -258,12 +256,10 @@ def _detection_in_every_frame(decodes: bool, stride: int) -> Decision:
     return Decision(stage, False, f"frames between two empty ones {stride} ticks apart are skipped")
 
 
-def _homography(log: Log, config: Config, picture: bool) -> tuple[HomographyScope, Decision]:
+def _homography(log: Log, config: Config) -> tuple[HomographyScope, Decision]:
     stage = Stage.HOMOGRAPHY
     if config.topdown.method == "off":
         return HomographyScope.NONE, Decision(stage, False, "topdown.method=off")
-    if picture:
-        return HomographyScope.ALL_CAMERAS, Decision(stage, True, "a bird's-eye view is asked for")
     reason = "detections without LiDAR points may need it" if log.lidars else "without LiDAR it alone gives depth"
     return HomographyScope.CAMERAS_IN_NEED, Decision(stage, True, reason)
 

@@ -87,12 +87,12 @@ def driving_log(*, far=(0.0, 0.0, 0.0), broken=(), cameras=("front",), empty=(),
     return log, reads
 
 
-def run(log, detector=None, *, config=None, max_range_m=80.0, mode="robust", picture=False, labels=False, reads=None):
+def run(log, detector=None, *, config=None, max_range_m=80.0, mode="robust", labels=False, reads=None):
     reads = {} if reads is None else reads
     config = config or Config.load(settings=["detect.name=labels"] if labels else [])
     sensors = select_sensors(log, config)
     ticks, schedule = [], synchronize(log, sensors.cameras)
-    plan = make_plan(log, config, sensors, schedule.t_ns, picture=picture)
+    plan = make_plan(log, config, sensors, schedule.t_ns)
     reads.clear()  # synchronization looks into a sweep
     out = observe(
         log, schedule, detector or Truth(log), plan,

@@ -29,8 +29,8 @@ from log2sim.perception.fusion import fuse
 from log2sim.perception.homography.estimate import EstimationOptions
 from log2sim.perception.homography_stage import fit_homographies
 from log2sim.perception.lidar.cloud import assemble_cloud, is_at_rest, sweep_to_map
-from log2sim.pipeline import Result
-from log2sim.plan import Decision, Plan, Stage, make_plan, select_sensors
+from log2sim.pipeline import Result, first_pass, second_pass, start
+from log2sim.plan import Decision, HomographyScope, Plan, Stage, make_plan, select_sensors
 from log2sim.stage_clock import StageClock
 
 LABELS = Config.load(detect={"name": "labels"})
@@ -314,7 +314,9 @@ def test_a_look_that_could_not_be_read_found_nothing_out(both: Log, monkeypatch:
 
 
 def test_without_need_no_homography_is_fitted_and_nothing_changes(tiny: Log) -> None:
-    without, full = run(tiny), run(tiny, picture=True)
+    without, every_camera = run(tiny), start(tiny, LABELS)
+    every_camera = replace(every_camera, plan=replace(every_camera.plan, homography=HomographyScope.ALL_CAMERAS))
+    full = second_pass(every_camera, first_pass(every_camera))
     step = entry(without, "homography")
     assert not step["kept"]
     assert without.report["homography"] == {}

@@ -34,13 +34,13 @@ def make_log(
 T_NS = np.arange(21, dtype=np.int64) * 100_000_000
 
 
-def plan_of(log: Log | None = None, config: Config | None = None, *, picture: bool = False) -> Plan:
+def plan_of(log: Log | None = None, config: Config | None = None) -> Plan:
     log, config = log or make_log(), config or Config()
-    return make_plan(log, config, select_sensors(log, config), T_NS, picture=picture)
+    return make_plan(log, config, select_sensors(log, config), T_NS)
 
 
-def decided(stage: Stage, log: Log | None = None, *settings: str, picture: bool = False) -> tuple[bool, str]:
-    found = plan_of(log, Config.load(settings=settings), picture=picture).decision(stage)
+def decided(stage: Stage, log: Log | None = None, *settings: str) -> tuple[bool, str]:
+    found = plan_of(log, Config.load(settings=settings)).decision(stage)
     return found.kept, found.reason
 
 
@@ -79,26 +79,18 @@ def test_boxes_of_the_log_need_no_pixel() -> None:
     assert not decided(Stage.IMAGE_DECODING, None, "detect.name=labels")[0]
 
 
-def test_a_picture_needs_pixels_even_with_boxes_of_the_log() -> None:
-    kept, reason = decided(Stage.IMAGE_DECODING, None, "detect.name=labels", picture=True)
-    assert kept
-    assert "bird's-eye view" in reason
-
-
 def test_a_detector_needs_pixels() -> None:
     assert decided(Stage.IMAGE_DECODING, None, "detect.name=some.onnx")[0]
 
 
-def test_a_homography_is_left_out_when_told_so_picture_or_not() -> None:
+def test_a_homography_is_left_out_when_told_so() -> None:
     assert decided(Stage.HOMOGRAPHY, None, "topdown.method=off") == (False, "topdown.method=off")
-    assert decided(Stage.HOMOGRAPHY, None, "topdown.method=off", picture=True) == (False, "topdown.method=off")
 
 
-def test_a_homography_is_kept_for_a_picture_without_lidar_and_for_what_lidar_misses() -> None:
-    assert plan_of(picture=True).homography is HomographyScope.ALL_CAMERAS
+def test_a_homography_is_kept_without_lidar_and_for_what_lidar_misses() -> None:
     assert plan_of(make_log(lidars=())).homography is HomographyScope.CAMERAS_IN_NEED
     assert plan_of().homography is HomographyScope.CAMERAS_IN_NEED
-    assert plan_of(config=Config.load(settings=["topdown.method=off"]), picture=True).homography is HomographyScope.NONE
+    assert plan_of(config=Config.load(settings=["topdown.method=off"])).homography is HomographyScope.NONE
     reasons = [decided(Stage.HOMOGRAPHY, log)[1] for log in (make_log(lidars=()), make_log())]
     assert "without LiDAR" in reasons[0]
     assert "without LiDAR points" in reasons[1]

@@ -38,8 +38,8 @@ def plot(
     picture = None
     if background is not None:
         from log2sim.logs.opening import open_log
-        from log2sim.visualization.birdseye.of_log import mosaic_of
+        from log2sim.visualization.birdseye.of_log import birdseye_of_log
 
-        picture = mosaic_of(open_log(background, sequence=sequence), loaded)
+        picture = birdseye_of_log(open_log(background, sequence=sequence), loaded)
     known = load_truth(truth, loaded, sequence) if truth is not None else None
     plot_tracks(loaded, out, replay=replayed, truth=known, background=picture, overwrite=overwrite)

@@ -54,12 +54,12 @@ def reconstruct(
     for note in opened.notes:
         say(f"note: {note}", quiet=quiet)
     with progress(quiet=quiet) as report_progress:
-        result = run(opened, chosen, picture=topdown is not None, progress=report_progress)
+        result = run(opened, chosen, progress=report_progress)
     if topdown is not None:
-        from log2sim.visualization.birdseye.mosaic import write_picture
-        from log2sim.visualization.birdseye.of_log import mosaic_of
+        from log2sim.visualization.birdseye.mosaic import write_image
+        from log2sim.visualization.birdseye.of_log import birdseye_of_log
 
-        write_picture(mosaic_of(opened, result.scenario), topdown, overwrite=overwrite)
+        write_image(birdseye_of_log(opened, result.scenario), topdown, overwrite=overwrite)
     if report is not None:
         write_json(report, result.report)
     result.scenario.save(out)

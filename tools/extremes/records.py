@@ -128,7 +128,7 @@ def cut_image() -> Outcome:
         file = sorted((folder / "front").glob("*.jpg"))[1]
         file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
 
-    result = result_of(cut, picture=True)
+    result = result_of(cut, decode_images=True)
     ok, found = known_and_finite(result, 2)
     count = result.report["unreadable"].get("front", {}).get("count", 0)
     return Outcome(ok and count == 1, f"{found}, {count} unreadable")
@@ -141,7 +141,7 @@ def cut_images() -> Outcome:
             file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
 
     try:
-        result_of(cut, picture=True)
+        result_of(cut, decode_images=True)
     except LogError as error:
         return Outcome("stream 'front'" in str(error), "refused: stream 'front'")
     return Outcome(False, "accepted")

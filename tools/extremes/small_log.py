@@ -6,6 +6,7 @@ import csv
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -16,7 +17,8 @@ from log2sim import Config, Scenario, open_log, reconstruct
 from log2sim.datatypes import Log
 from log2sim.errors import Log2SimError, LogError
 from log2sim.logs.writer import write_log
-from log2sim.pipeline import Result
+from log2sim.pipeline import Result, first_pass, second_pass, start
+from log2sim.plan import Decision, Stage
 from log2sim.synth.scene import scene_from_table
 from log2sim.synth.synthesis import synthesize
 
@@ -71,9 +73,13 @@ def folder_of(change: Callable[[Path], object]) -> Iterator[Path]:
         yield folder
 
 
-def result_of(change: Callable[[Path], object], *, picture: bool = False) -> Result:
+def result_of(change: Callable[[Path], object], *, decode_images: bool = False) -> Result:
+    """Reconstruct the changed log, whose images are decoded only where asked for: boxes come from its labels."""
     with folder_of(change) as folder:
-        return reconstruct(open_log(folder), LABELS, picture=picture)
+        run = start(open_log(folder), LABELS)
+        if decode_images:
+            run = replace(run, plan=run.plan.variant(Decision(Stage.IMAGE_DECODING, True, "images are asked for")))
+        return second_pass(run, first_pass(run))
 
 
 @lru_cache

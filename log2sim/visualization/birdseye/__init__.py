@@ -1,1 +1,1 @@
-"""The fused bird's-eye view: every camera's view of the ground on one raster of the map."""
+"""Bird's-eye view: cameras mapped onto one raster of the ground by inverse perspective mapping."""

@@ -1,8 +1,7 @@
-"""The fused top-down picture: every camera's view of the road laid onto one raster of the map or ego frame.
+"""Bird's-eye view by inverse perspective mapping: images of several cameras and ticks on one raster of the ground.
 
-A camera sees the road through a homography, so a cell of the raster finds its color at one place of each image. Where
-several cameras or ticks see the same cell, the one that resolves the ground finest weighs most, seams are feathered and
-exposures balanced. Only the ground is right: whatever stands on it leans away from the camera.
+Where several cameras or ticks see the same cell, the one that resolves the ground finest weighs most, seams are feathered
+and exposures are balanced. Only the ground is mapped rightly: objects above it lean away from the camera.
 """
 
 from __future__ import annotations
@@ -22,24 +21,34 @@ from log2sim.geometry import Array
 from log2sim.visualization.birdseye.ground_view import (
     GroundView,
     Image,
-    look_up,
-    sample,
-    seen_window,
-    shown_mask,
+    project_cells,
+    sample_colors,
     signed_inverse,
+    visible_window,
 )
 
-__all__ = ["GroundView", "Mosaic", "TopdownPicture", "render_topdown", "write_picture"]
+__all__ = ["BirdsEyeView", "GroundView", "Mosaic", "render_birdseye", "write_image"]
 
+# At 28 bytes a cell while it is accumulated this is 1 GB.
 MAX_CELLS = 36_000_000
-"""Cells a picture may have; at 28 bytes a cell while it is built this is 1 GB."""
 
 
 @dataclass(frozen=True, eq=False)
-class TopdownPicture:
-    """A north-up raster: `image_bgr` (R, C, 3) uint8, `alpha` (R, C) uint8, 0 where no camera saw the ground.
+class BirdsEyeView:
+    """North-up raster of the ground.
 
-    `extent_m` is x0, x1, y0, y1 of the outer edges, row 0 lies at y1; `frame` is "map" or "ego".
+    Attributes
+    ----------
+    image_bgr : (R, C, 3) uint8
+        Row 0 is the northernmost.
+    alpha : (R, C) uint8
+        0 where no camera saw the ground.
+    extent_m : (float, float, float, float)
+        x0, x1, y0, y1 of the outer edges, m.
+    resolution_m : float
+        Edge of a cell, m.
+    frame : str
+        "map" or "ego".
     """
 
     image_bgr: Image
@@ -50,19 +59,19 @@ class TopdownPicture:
 
     @property
     def coverage(self) -> NDArray[np.bool_]:
-        """Cells (R, C) that a camera saw."""
+        """Mask (R, C) of the cells that a camera saw."""
         return self.alpha > 0
 
 
-def render_topdown(
+def render_birdseye(
     views: Sequence[GroundView],
     *,
     extent_m: tuple[float, float, float, float],
     resolution_m: float = 0.05,
     coarsest_m: float = 0.6,
     frame: str = "map",
-) -> TopdownPicture:
-    """Lay the views of one tick onto one raster; `Mosaic` does the same over many ticks.
+) -> BirdsEyeView:
+    """Render the views of one tick; `Mosaic` does the same over many ticks.
 
     Parameters
     ----------
@@ -72,17 +81,17 @@ def render_topdown(
     """
     mosaic = Mosaic(extent_m=extent_m, resolution_m=resolution_m, coarsest_m=coarsest_m, frame=frame)
     mosaic.add(views)
-    return mosaic.picture()
+    return mosaic.image()
 
 
 class Mosaic:
-    """Accumulates views, tick after tick, into one picture of the road.
+    """Accumulator of views, tick after tick, into one bird's-eye view.
 
     Notes
     -----
-    Colors are averaged with the square of the image's resolution on the ground as weight, so the nearest look at a cell
-    decides its color and far looks only fill what is left. Gains that level exposure follow Brown and Lowe (2007),
-    section 6, anchored in what the mosaic already holds.
+    Colors are averaged with the square of the image's resolution on the ground as weight, so the nearest view of a cell
+    decides its color and far views only fill the rest. Gains that balance exposures follow Brown and Lowe (2007), section
+    6, relative to what the mosaic already holds.
     """
 
     def __init__(
@@ -104,7 +113,7 @@ class Mosaic:
         self._opacity = np.zeros((rows, columns), dtype=np.float32)
 
     def add(self, views: Sequence[GroundView]) -> None:
-        """Lay the views of one tick over what is there."""
+        """Add the views of one tick."""
         layers = [layer for layer in (self._warp(view) for view in views) if layer is not None]
         for layer, gain in zip(layers, self._gains(layers)):
             place = (layer.rows, layer.columns)
@@ -112,26 +121,25 @@ class Mosaic:
             self._weight[place] += layer.weight
             np.maximum(self._opacity[place], layer.opacity, out=self._opacity[place])
 
-    def picture(self) -> TopdownPicture:
-        """The picture so far."""
+    def image(self) -> BirdsEyeView:
+        """Compose the image of all views so far."""
         seen = self._weight > 0
         color = np.divide(self._sum, self._weight[..., None], out=np.zeros_like(self._sum), where=seen[..., None])
         image = np.clip(np.rint(color), 0, 255).astype(np.uint8)
         alpha = np.where(seen, np.maximum(np.rint(255 * self._opacity), 1), 0).astype(np.uint8)
-        return TopdownPicture(image, alpha, self.extent_m, self.resolution_m, self.frame)
+        return BirdsEyeView(image, alpha, self.extent_m, self.resolution_m, self.frame)
 
     def _warp(self, view: GroundView) -> _Layer | None:
-        """Colors and weights of one view over the part of the raster that it sees."""
+        """Warp one view onto the part of the raster that it sees."""
         x0, _, _, y1 = self.extent_m
         d = self.resolution_m
         ground_H_cell = np.array([[d, 0, x0 + d / 2], [0, -d, y1 - d / 2], [0, 0, 1]])
         image_H_cell = signed_inverse(view) @ ground_H_cell
-        height, width = view.image_bgr.shape[:2]
-        window = seen_window(view, image_H_cell, self._weight.shape, self.coarsest_m / d)
+        window = visible_window(view, image_H_cell, self._weight.shape, self.coarsest_m / d)
         if window is None:
             return None
         rows, columns = window
-        uv, scale, opacity = look_up(
+        uv, scale, opacity = project_cells(
             view,
             image_H_cell,
             np.arange(rows.start, rows.stop),
@@ -140,14 +148,11 @@ class Mosaic:
         )
         if not np.any(opacity > 0):
             return None
-        if view.exclude_px is not None and len(view.exclude_px):
-            shown = cv2.remap(shown_mask(view.exclude_px, height, width), *uv, cv2.INTER_LINEAR)
-            opacity = opacity * (shown.astype(np.float32) / np.float32(255))
         weight = opacity * scale**4 * np.float32(view.weight)
-        return _Layer(rows, columns, sample(view.image_bgr, uv, scale), weight, opacity)
+        return _Layer(rows, columns, sample_colors(view.image_bgr, uv, scale), weight, opacity)
 
     def _gains(self, layers: list[_Layer]) -> Array:
-        """Gains (L, 3), one a layer and color channel, that level the colors where layers overlap."""
+        """Compute the gains (L, 3) of layers and color channels that balance exposures where layers overlap."""
         anchor = _Layer(
             slice(0, self._weight.shape[0]),
             slice(0, self._weight.shape[1]),
@@ -174,51 +179,52 @@ class Mosaic:
         return np.exp(np.clip(np.linalg.solve(normal, right), -0.7, 0.7)) if count else right
 
 
-def write_picture(picture: TopdownPicture, path: Path | str, *, overwrite: bool = False) -> None:
-    """Write a picture as PNG with its coverage as alpha channel, or as JPEG on white, whole or not at all."""
+def write_image(view: BirdsEyeView, path: Path | str, *, overwrite: bool = False) -> None:
+    """Write a bird's-eye view as PNG with alpha channel, or as JPEG on white, whole or not at all."""
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in (".png", ".jpg", ".jpeg"):
-        raise ConfigError(f"{path}: a top-down picture is written as .png, .jpg or .jpeg, not '{path.suffix}'")
+        raise ConfigError(f"{path}: a bird's-eye view is written as .png, .jpg or .jpeg, not '{path.suffix}'")
     refuse_existing(path, overwrite=overwrite)
     if suffix == ".png":
-        image = np.dstack([picture.image_bgr, picture.alpha])
+        image = np.dstack([view.image_bgr, view.alpha])
     else:
-        alpha = picture.alpha[..., None] / 255.0
-        image = np.rint(picture.image_bgr * alpha + 255 * (1 - alpha)).astype(np.uint8)
+        alpha = view.alpha[..., None] / 255.0
+        image = np.rint(view.image_bgr * alpha + 255 * (1 - alpha)).astype(np.uint8)
     with replaced(path) as temporary:
         done, data = cv2.imencode(suffix, image)
         if not done:
-            raise ConfigError(f"{path}: OpenCV cannot encode a picture of {image.shape[1]} x {image.shape[0]} px")
+            raise ConfigError(f"{path}: OpenCV cannot encode an image of {image.shape[1]} x {image.shape[0]} px")
         temporary.write_bytes(data.tobytes())
 
 
 @dataclass(frozen=True, eq=False)
 class _Layer:
+    """Colors of one view on a window of the raster; with `weighted` they are still to be divided by `weight`."""
+
     rows: slice
     columns: slice
     color: NDArray[Any]
     weight: NDArray[np.float32]
     opacity: NDArray[np.float32]
     weighted: bool = False
-    """Whether `color` is a sum that is still to be divided by `weight`."""
 
 
 def _raster_shape(extent_m: tuple[float, float, float, float], resolution_m: float) -> tuple[int, int]:
     x0, x1, y0, y1 = extent_m
     if not (np.all(np.isfinite(extent_m)) and x1 > x0 and y1 > y0 and resolution_m > 0):
-        raise ConfigError(f"top-down picture: extent {extent_m} at {resolution_m} m a cell has no area")
+        raise ConfigError(f"bird's-eye view: extent {extent_m} at {resolution_m} m a cell has no area")
     rows, columns = round(np.ceil((y1 - y0) / resolution_m - 1e-6)), round(np.ceil((x1 - x0) / resolution_m - 1e-6))
     if rows * columns > MAX_CELLS or max(rows, columns) >= 32767:
         raise ConfigError(
-            f"top-down picture: {columns} x {rows} cells, more than the {MAX_CELLS} allowed (32766 an edge); "
+            f"bird's-eye view: {columns} x {rows} cells, more than the {MAX_CELLS} allowed (32766 an edge); "
             f"choose a resolution coarser than {resolution_m:g} m or a smaller extent"
         )
     return rows, columns
 
 
 def _log_ratio(a: _Layer, b: _Layer, step: int = 4, fewest: int = 100) -> Array | None:
-    """Log of a's mean color over b's (3,) on cells that both see well; None when these are too few."""
+    """Compute the logarithm (3,) of the ratio of mean colors on cells that both layers see well; None if too few."""
     r0, r1 = max(a.rows.start, b.rows.start), min(a.rows.stop, b.rows.stop)
     c0, c1 = max(a.columns.start, b.columns.start), min(a.columns.stop, b.columns.stop)
     if r0 >= r1 or c0 >= c1:
@@ -237,4 +243,4 @@ def _log_ratio(a: _Layer, b: _Layer, step: int = 4, fewest: int = 100) -> Array 
     for color, weight, _, weighted in part:
         values = color[both].astype(np.float64)
         means.append((values / weight[both][:, None] if weighted else values).mean(axis=0))
-    return np.log(np.maximum(means[0], 1.0) / np.maximum(means[1], 1.0))
+    return np.asarray(np.log(np.maximum(means[0], 1.0) / np.maximum(means[1], 1.0)))

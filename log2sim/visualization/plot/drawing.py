@@ -34,7 +34,7 @@ BACKGROUND, STATIONARY, TRUTH, TRACK, MARK, REPLAY, BOX, LABEL = range(1, 9)
 
 
 class Background(Protocol):
-    """A top-down picture of the ground, such as `visualization.birdseye.mosaic.TopdownPicture`."""
+    """Bird's-eye view of the ground, such as `visualization.birdseye.mosaic.BirdsEyeView`."""
 
     @property
     def image_bgr(self) -> NDArray[np.uint8]:

@@ -41,7 +41,7 @@ def plot_tracks(
         its path.
     truth : Scenario or None
         Brought to the scenario's start and map.
-    background : TopdownPicture or None
+    background : BirdsEyeView or None
         A picture of the ground in the map frame, drawn below everything.
     dpi : int
         Dots per inch of a .png, which is 10 inches wide.

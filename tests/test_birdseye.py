@@ -1,4 +1,4 @@
-"""The fused top-down picture against a ground whose every point is known."""
+"""The fused bird's-eye view against a ground whose every point is known."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from log2sim.geometry import (
     undistort,
 )
 from log2sim.visualization.birdseye.ground_view import GroundView
-from log2sim.visualization.birdseye.mosaic import Mosaic, render_topdown, write_picture
+from log2sim.visualization.birdseye.mosaic import Mosaic, render_birdseye, write_image
 
 EGO_R_CAM = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
 K = np.array([[800.0, 0, 640], [0, 800.0, 360], [0, 0, 1]])
@@ -91,7 +91,7 @@ def two_cameras() -> list[GroundView]:
 
 
 def test_two_cameras_reproduce_the_checkerboard_within_5_cm(two_cameras: list[GroundView]) -> None:
-    picture = render_topdown(two_cameras, extent_m=(0, 10, -8, 8), resolution_m=0.05)
+    picture = render_birdseye(two_cameras, extent_m=(0, 10, -8, 8), resolution_m=0.05)
     assert picture.coverage.mean() > 0.6
     assert wrong_cells(picture, edge_m=0.05) == 0.0
 
@@ -99,7 +99,7 @@ def test_two_cameras_reproduce_the_checkerboard_within_5_cm(two_cameras: list[Gr
 def test_a_shift_of_15_cm_would_be_noticed(two_cameras: list[GroundView]) -> None:
     shift = np.array([[1, 0, 0.15], [0, 1, 0], [0, 0, 1.0]])
     moved = [GroundView(v.image_bgr, shift @ v.ground_H_image, v.camera, signed=True) for v in two_cameras]
-    assert wrong_cells(render_topdown(moved, extent_m=(0, 10, -8, 8)), edge_m=0.05) > 0.02
+    assert wrong_cells(render_birdseye(moved, extent_m=(0, 10, -8, 8)), edge_m=0.05) > 0.02
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -109,14 +109,14 @@ def test_cells_show_their_own_center(axis: int) -> None:
     view = GroundView.from_pose(
         shoot(camera, pose(0), ground_of=lambda xy: 20 + 30 * (xy[:, axis] % 7.5)), camera, pose(0)
     )
-    picture = render_topdown([view], extent_m=(4.5, 7.2, 0.3, 2.0) if axis == 0 else (4.5, 7.2, 0.3, 1.6))
+    picture = render_birdseye([view], extent_m=(4.5, 7.2, 0.3, 2.0) if axis == 0 else (4.5, 7.2, 0.3, 1.6))
     expected = 20 + 30 * cell_centers(picture)[axis]
     assert picture.coverage.all()
     assert abs(float(np.mean(picture.image_bgr[..., 0] - expected))) < 0.2
 
 
 def test_far_map_coordinates_and_another_ground_height_change_nothing(two_cameras: list[GroundView]) -> None:
-    near = render_topdown(two_cameras, extent_m=(0, 10, -8, 8))
+    near = render_birdseye(two_cameras, extent_m=(0, 10, -8, 8))
     offset = np.array([5e5, 5e6, 300.0])
     far_views = []
     for view, p in zip(two_cameras, (pose(30, 0, 0.5), pose(-30, 0, -0.5))):
@@ -124,7 +124,7 @@ def test_far_map_coordinates_and_another_ground_height_change_nothing(two_camera
         far[:3, 3] += offset
         far_views.append(GroundView.from_pose(view.image_bgr, make_camera(), far, 300.0))
     extent = (offset[0], offset[0] + 10, offset[1] - 8, offset[1] + 8)
-    far_picture = render_topdown(far_views, extent_m=extent)
+    far_picture = render_birdseye(far_views, extent_m=extent)
     assert np.mean(np.abs(near.image_bgr.astype(int) - far_picture.image_bgr.astype(int)) > 8) < 0.002
 
 
@@ -134,7 +134,7 @@ def test_far_map_coordinates_and_another_ground_height_change_nothing(two_camera
 def test_distorted_cameras_are_straightened(model: str, distortion: tuple[float, ...]) -> None:
     camera = make_camera(model, distortion, halved=2)
     view = GroundView.from_pose(shoot(camera, pose(0)), camera, pose(0))
-    picture = render_topdown([view], extent_m=(0, 7, -5, 5))
+    picture = render_birdseye([view], extent_m=(0, 7, -5, 5))
     assert wrong_cells(picture, edge_m=0.06) == 0.0
 
 
@@ -146,21 +146,21 @@ def test_a_lens_model_that_folds_back_is_cut_where_it_turns() -> None:
 
 def test_nothing_above_the_horizon_or_behind_the_camera_is_covered() -> None:
     white = np.full((720, 1280, 3), 255, dtype=np.uint8)
-    picture = render_topdown(
+    picture = render_birdseye(
         [GroundView.from_pose(white, make_camera(), pose(0))], extent_m=(-30, 30, -30, 30), resolution_m=0.1
     )
     x, _ = cell_centers(picture)
     assert picture.coverage[x > 0].any()
     assert not picture.coverage[x < 0].any()
     up = GroundView.from_pose(white, make_camera(), pose(0, pitch_deg=-40.0))
-    assert not render_topdown([up], extent_m=(-30, 30, -30, 30), resolution_m=0.1).coverage.any()
+    assert not render_birdseye([up], extent_m=(-30, 30, -30, 30), resolution_m=0.1).coverage.any()
 
 
 @pytest.mark.parametrize("scale", [1.0, -1.0, 1e-6])
 def test_a_homography_of_any_scale_and_sign_gives_the_same_picture(two_cameras: list[GroundView], scale: float) -> None:
     unsigned = [GroundView(v.image_bgr, v.ground_H_image * scale) for v in two_cameras]
-    a = render_topdown(two_cameras, extent_m=(0, 10, -8, 8))
-    b = render_topdown(unsigned, extent_m=(0, 10, -8, 8))
+    a = render_birdseye(two_cameras, extent_m=(0, 10, -8, 8))
+    b = render_birdseye(unsigned, extent_m=(0, 10, -8, 8))
     np.testing.assert_array_equal(a.coverage, b.coverage)
     assert np.abs(a.image_bgr.astype(int) - b.image_bgr.astype(int)).max() <= 2
 
@@ -185,7 +185,7 @@ def test_exposures_are_leveled_where_cameras_overlap() -> None:
     camera = make_camera()
     poses = (pose(12), pose(-12))
     views = [GroundView.from_pose(shoot(camera, p, gain=g), camera, p) for p, g in zip(poses, (1.0, 0.7))]
-    picture = render_topdown(views, extent_m=(3, 9, -5, 5))
+    picture = render_birdseye(views, extent_m=(3, 9, -5, 5))
     x, y = cell_centers(picture)
     bright = (checker(np.column_stack([x.ravel(), y.ravel()])) > 130).reshape(x.shape)
     inner = np.minimum(np.abs(x - np.rint(x)), np.abs(y - np.rint(y))) > 0.2
@@ -196,23 +196,8 @@ def test_exposures_are_leveled_where_cameras_overlap() -> None:
     assert 0.93 < left / right < 1.07  # 1.43 before
 
 
-def test_obstacles_are_left_out_and_filled_by_another_tick() -> None:
-    camera = make_camera()
-    blocked = shoot(camera, pose(0))
-    blocked[300:500, 500:800] = (0, 0, 255)
-    mosaic = Mosaic(extent_m=(0, 10, -5, 5))
-    mosaic.add([GroundView.from_pose(blocked, camera, pose(0), exclude_px=np.array([[490.0, 290, 810, 510]]))])
-    hole = mosaic.picture()
-    mosaic.add([GroundView.from_pose(shoot(camera, pose(0, 0.4, 0.3)), camera, pose(0, 0.4, 0.3))])
-    filled = mosaic.picture()
-    assert filled.coverage.sum() > hole.coverage.sum() + 1000
-    seen = filled.image_bgr[filled.coverage].astype(int)
-    assert np.abs(seen[:, 2] - seen[:, 0]).max() < 40  # nothing red
-    assert wrong_cells(filled, edge_m=0.06) < 0.001
-
-
 def test_a_picture_without_views_is_empty() -> None:
-    picture = render_topdown([], extent_m=(0, 1, 0, 2), resolution_m=0.1)
+    picture = render_birdseye([], extent_m=(0, 1, 0, 2), resolution_m=0.1)
     assert picture.image_bgr.shape == (20, 10, 3)
     assert not picture.coverage.any()
 
@@ -221,21 +206,21 @@ def test_a_picture_without_views_is_empty() -> None:
     "extent", [(0.0, 0.0, 0.0, 1.0), (0.0, np.nan, 0.0, 1.0), (0.0, 1e5, 0.0, 1e5), (0.0, 1e9, 0.0, 0.05)]
 )
 def test_an_extent_without_area_or_too_large_is_refused(extent: tuple[float, float, float, float]) -> None:
-    with pytest.raises(ConfigError, match="top-down picture"):
+    with pytest.raises(ConfigError, match="bird's-eye view"):
         Mosaic(extent_m=extent)
 
 
 def test_a_written_png_carries_coverage_and_other_names_are_refused(
     tmp_path: Path, two_cameras: list[GroundView]
 ) -> None:
-    picture = render_topdown(two_cameras, extent_m=(0, 10, -8, 8), resolution_m=0.1)
-    write_picture(picture, tmp_path / "a.png")
+    picture = render_birdseye(two_cameras, extent_m=(0, 10, -8, 8), resolution_m=0.1)
+    write_image(picture, tmp_path / "a.png")
     image = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(image[..., 3], picture.alpha)
     np.testing.assert_array_equal(image[..., :3], picture.image_bgr)
-    write_picture(picture, tmp_path / "a.jpg")
+    write_image(picture, tmp_path / "a.jpg")
     with pytest.raises(ConfigError, match=r"\.png"):
-        write_picture(picture, tmp_path / "a.gif")
+        write_image(picture, tmp_path / "a.gif")
     with pytest.raises(ConfigError, match="--overwrite"):
-        write_picture(picture, tmp_path / "a.png")
+        write_image(picture, tmp_path / "a.png")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.jpg", "a.png"]
