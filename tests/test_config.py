@@ -7,7 +7,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 from pydantic import ValidationError
@@ -181,6 +181,7 @@ CONFIGS = st.fixed_dictionaries(
 
 
 @given(CONFIGS, st.booleans())
+@settings(deadline=None)
 def test_toml_loads_back_as_the_same_settings(document: dict[str, object], comments: bool) -> None:
     config = Config.load(**document)
     assert Config.load(**tomllib.loads(config.to_toml(comments=comments))) == config

@@ -7,6 +7,8 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from log2sim import documents
 from log2sim.documents import inside, read_json, refuse_existing, replaced, rounded, write_json
@@ -141,6 +143,24 @@ def test_json_comes_back_as_it_was(tmp_path: Path) -> None:
     write_json(tmp_path / "a.json", value)
     assert read_json(tmp_path / "a.json") == value
     assert (tmp_path / "a.json").read_text(encoding="utf-8").endswith("\n")
+
+
+TEXTS = st.text(st.characters(exclude_categories=["Cs"]))
+DOCUMENTS = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**63) | st.floats(allow_nan=False, allow_infinity=False) | TEXTS,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(TEXTS, inner, max_size=4),
+    max_leaves=20,
+)
+
+
+@given(value=DOCUMENTS)
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_document_is_read_as_it_was_written(tmp_path: Path, value: object) -> None:
+    write_json(tmp_path / "a.json", value)
+    read = read_json(tmp_path / "a.json")
+    assert read == value
+    assert repr(read) == repr(value)  # not 1 for 1.0 or True, not 0.0 for -0.0
+    assert os.listdir(tmp_path) == ["a.json"]
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), object()])
