@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from log2sim.agents.simplify import TOLERANCE_M
-from log2sim.datatypes import Agent
+from log2sim.datatypes import Agent, Measurements
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography_stage import CameraHomography
 from log2sim.plan import Decision, HomographyScope, Plan, Stage
@@ -21,6 +21,8 @@ class RunOutputs:
     Attributes
     ----------
     observations : Observations
+    measurements : sequence of Measurements
+        Fused, by tick.
     homographies : mapping of str to CameraHomography
         By camera.
     agents : tuple of Agent
@@ -29,6 +31,7 @@ class RunOutputs:
     """
 
     observations: Observations
+    measurements: Sequence[Measurements]
     homographies: Mapping[str, CameraHomography]
     agents: tuple[Agent, ...]
     clock: StageClock

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.agents.build import Timeline, estimate_agents
+from log2sim.agents.candidate import Timeline, confirm
 from log2sim.agents.duplicates import outside, without_doubles
-from log2sim.agents.ego import ego_agent, ego_flow
+from log2sim.agents.ego import ego_agent, ego_path
+from log2sim.agents.estimate import estimate_agents
 from log2sim.agents.scenario_of import camera_entries, provenance_of, scenario_of
 from log2sim.agents.simplify import simplify
 from log2sim.config import Config
@@ -19,6 +20,7 @@ from log2sim.errors import NothingToReconstruct
 from log2sim.outcome import RunOutputs, stage_outcomes
 from log2sim.perception.detect.detectors import Detector, create_detector
 from log2sim.perception.first_pass import Observations, observe
+from log2sim.perception.fusion import fuse
 from log2sim.perception.homography_stage import estimation_options, fit_homographies, place_by_homography
 from log2sim.perception.sync import Schedule, synchronize
 from log2sim.plan import Plan, Sensors, Stage, make_plan, select_sensors
@@ -142,7 +144,9 @@ def second_pass(run: Run, observations: Observations) -> Result:
     with run.clock.stage("topdown"):
         rng = np.random.default_rng(config.seed)
         homographies = fit_homographies(log, observations, plan, estimation_options(config.topdown), rng=rng)
-        measurements = place_by_homography(log, observations, homographies, across=plan.keeps(Stage.FUSION))
+        placed = place_by_homography(log, observations, homographies)
+    with run.clock.stage("fuse"):
+        measurements = fuse(placed, across=plan.keeps(Stage.FUSION))
     with run.clock.stage("track"):
         tracks = track(
             measurements,
@@ -152,15 +156,15 @@ def second_pass(run: Run, observations: Observations) -> Result:
             min_life_s=config.track.min_life_s,
         )
     with run.clock.stage("smooth"):
-        flow = ego_flow(log, run.schedule)
-        candidates = estimate_agents(tracks, observations.obstacles, timeline, flow, smooth=config.smooth.enabled)
+        path = ego_path(log, run.schedule)
+        candidates = estimate_agents(tracks, observations.obstacles, timeline, path, smooth=config.smooth.enabled)
         ego = ego_agent(log, timeline)
-        agents = outside(without_doubles(candidates, ego), ego)
+        agents = outside(without_doubles(confirm(candidates), ego), ego)
         # Without an ego the agents' waypoints alone tell the ticks, so all of them stay.
         agents = simplify(agents) if ego is not None else agents
     if ego is None and not agents:
         raise NothingToReconstruct(f"{log.name}: no ego poses, and no object was detected in {len(t_ns)} ticks")
-    outputs = RunOutputs(observations, homographies, tuple(agents), run.clock)
+    outputs = RunOutputs(observations, measurements, homographies, tuple(agents), run.clock)
     outcomes = stage_outcomes(plan, outputs)
     scenario = scenario_of(
         log,

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from log2sim.config import Config
-from log2sim.datatypes import Log, Scenario
+from log2sim.datatypes import Log, Measurements, Scenario
 from log2sim.documents import rounded
 from log2sim.geometry import NS_PER_S
 from log2sim.outcome import Outcome, RunOutputs
-from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography_stage import CameraHomography
 from log2sim.perception.sync import Schedule
 from log2sim.version import __version__
@@ -48,7 +47,7 @@ def report_of(
         "unreadable": observations.records.summary() if observations.records is not None else {},
         "detections": observations.detections,
         "homography": {name: _homography_entry(g, config.topdown.method) for name, g in outputs.homographies.items()},
-        "measurements": _measurement_counts(observations),
+        "measurements": _measurement_counts(outputs.measurements),
         "agents": _agent_counts(scenario),
     }
 
@@ -79,8 +78,8 @@ def _homography_entry(ground: CameraHomography, method: str) -> dict[str, Any]:
     }
 
 
-def _measurement_counts(seen: Observations) -> dict[str, Any]:
-    sources = np.concatenate([m.source for m in seen.measurements]) if seen.measurements else np.zeros(0, dtype="<U16")
+def _measurement_counts(measurements: Sequence[Measurements]) -> dict[str, Any]:
+    sources = Measurements.join(measurements).source
     return {"total": len(sources), "with_lidar": int((sources == "lidar").sum())}
 
 

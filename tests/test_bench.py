@@ -218,7 +218,7 @@ def test_measured_centers_of_a_log_are_near_the_truth_and_outliers_are_cut(
     good = score_measurements(seen, known).figures
     assert good["objects"] >= 20
     assert good["error_m"] < 0.4
-    assert {"sync", "detect", "cloud", "measure", "fuse"} <= set(stages_s)
+    assert {"sync", "detect", "cloud", "measure"} <= set(stages_s)
     assert "decode" not in stages_s  # boxes come from the log
     far = replace(seen, measurements=[replace(m, center_m=m.center_m + 50.0) for m in seen.measurements])
     assert score_measurements(far, known).figures["error_m"] == pytest.approx(CUTOFF_M)

@@ -15,6 +15,7 @@ from log2sim.errors import LogError, RecordError
 from log2sim.geometry import PoseTrack, apply, inverse, rotation_from_rpy, transform
 from log2sim.perception.first_pass import base_pose, cloud_origin, observe
 from log2sim.perception.frames import RecordReader
+from log2sim.perception.fusion import fuse
 from log2sim.perception.sync import synchronize
 from log2sim.pipeline import reconstruct
 from log2sim.plan import make_plan, select_sensors
@@ -112,7 +113,7 @@ def test_every_tick_has_every_object_at_its_place_in_the_map(far):
         for solid, category in zip(SOLIDS, CATEGORIES):
             row = m.take(m.category == category)
             assert np.hypot(*(row.center_m[0] - solid.center_m - far)[:2]) < 0.3
-            assert row.center_m[0, 2] - row.size_m[0, 2] / 2 == pytest.approx(far[2], abs=0.1)
+            assert row.bottom_m[0] == pytest.approx(far[2], abs=0.1)
             assert row.t_ns[0] == STAMPS[k]
     assert out.detections == {"front": TICKS * 2}
 
@@ -156,7 +157,8 @@ def test_each_record_is_read_once_and_images_only_if_they_are_needed():
     assert set(reads) == {("top", i) for i in range(TICKS)}
     assert set(reads.values()) == {1}
     assert len(detector.frames) == 2 * TICKS
-    assert [len(m) for m in out.measurements] == [2] * TICKS  # seen by two cameras, joined
+    assert [len(m) for m in out.measurements] == [4] * TICKS  # two objects, seen by two cameras
+    assert [len(m) for m in fuse(out.measurements)] == [2] * TICKS
     log, reads = driving_log(cameras=("front", "left"))
     run(log, Truth(log, looks=True), reads=reads)
     assert reads == {(s, i): 1 for s in ("front", "left", "top") for i in range(TICKS)}

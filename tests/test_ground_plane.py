@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from worlds import Solid, camera_ahead, outline_px, scan, standing
 
-from log2sim.datatypes import TYPICAL_SIZE_M, Log, Measurements, Obstacles, Stream
+from log2sim.datatypes import TYPICAL_SIZE_M, Detections, Log, Measurements, Obstacles, Stream
 from log2sim.geometry import PoseTrack, apply, apply_homography, inverse, project, rotation_from_rpy, transform
 from log2sim.perception.first_pass import Observations
+from log2sim.perception.fusion import fuse
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.estimate import EstimationOptions
 from log2sim.perception.homography.fit import refused_fit
@@ -49,14 +50,8 @@ def plan_with(scope=HomographyScope.CAMERAS_IN_NEED):
 def unplaced(boxes_px, t_ns=T0_NS, category="car", camera="front"):
     """Rows of one frame without a position."""
     m = len(boxes_px)
-    size = np.tile(TYPICAL_SIZE_M[category], (m, 1))
-    nan = np.full(m, np.nan)
-    return Measurements(
-        np.full(m, t_ns), np.full(m, category, dtype="<U16"), np.full(m, 0.9), np.full(m, camera),
-        np.asarray(boxes_px, float), np.zeros(m, dtype=bool), np.zeros((m, 2), dtype=bool), np.full((m, 3), np.nan), size, nan,
-        np.full((m, 2, 2), np.nan), np.zeros(m, dtype=np.int64), np.full(m, "", dtype="<U16"),
-        tuple(np.zeros((0, 3)) for _ in range(m)), np.zeros((m, 3)), nan,
-    )  # fmt: skip
+    detections = Detections(np.asarray(boxes_px, float), np.full(m, 0.9), np.full(m, category, dtype="<U16"))
+    return Measurements.unplaced(detections, t_ns=t_ns, camera=camera, sensor_m=np.zeros(3))
 
 
 @pytest.mark.parametrize("ground_z", [0.0, -0.35])
@@ -173,7 +168,8 @@ def test_an_obstacle_without_points_is_placed_where_its_foot_is(far, yaw, catego
     assert error @ np.linalg.solve(row.covariance[0], error) < 9.21
     assert np.hypot(*error) < 0.15 + 0.35 * (size[0] - size[1])
     assert row.center_m[0, 2] == pytest.approx(truth[2], abs=1e-6)
-    assert row.size_m[0].tolist() == list(size)
+    assert row.bottom_m[0] == pytest.approx(truth[2] - size[2] / 2, abs=1e-6)
+    assert np.isnan(row.low_m).all()  # nothing of its extents was observed
     # The rows of the first pass are left as they were.
     assert m.source.tolist() == [""]
     assert np.isnan(m.center_m).all()
@@ -233,7 +229,7 @@ def test_two_cameras_that_place_one_obstacle_make_one_row_of_it():
     ]
     ground = {c.name: CameraHomography(c, calibrated_homography(log, c), "calibration") for c in (left, right)}
     seen = Observations(measurements=[Measurements.join(rows)], obstacles=[None])
-    out = place_by_homography(log, seen, ground)
+    out = fuse(place_by_homography(log, seen, ground))
     assert len(out[0]) == 1
     assert np.hypot(*(out[0].center_m[0] - solid.center_m)[:2]) < 0.3
 

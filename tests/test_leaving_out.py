@@ -11,7 +11,7 @@ import pytest
 from test_pipeline import assert_same_agents
 from worlds import CAR, PARKED, scan, standing, tiny_log
 
-import log2sim.agents.build
+import log2sim.agents.estimate
 import log2sim.perception.lidar.cloud
 import log2sim.pipeline
 import log2sim.plan
@@ -25,7 +25,7 @@ from log2sim.geometry import PoseTrack, transform
 from log2sim.outcome import RunOutputs, stage_outcomes
 from log2sim.perception.detect.detectors import create_detector
 from log2sim.perception.first_pass import Observations
-from log2sim.perception.fusion import fuse
+from log2sim.perception.fusion import fuse_tick
 from log2sim.perception.homography.estimate import EstimationOptions
 from log2sim.perception.homography_stage import fit_homographies
 from log2sim.perception.lidar.cloud import assemble_cloud, is_at_rest, sweep_to_map
@@ -328,10 +328,8 @@ def test_without_need_no_homography_is_fitted_and_nothing_changes(tiny: Log) -> 
 
 def lost(camera: str, bottom_px: float) -> Measurements:
     """A row of a camera without LiDAR points, whose box ends at a height in the image."""
-    row = {k: np.zeros((1, *v.shape[1:]), v.dtype) for k, v in vars(Measurements.empty()).items() if k != "cluster"}
-    row |= {"camera": np.array([camera]), "category": np.array(["car"]), "source": np.array([""], dtype="<U16")}
-    row |= {"box_px": np.array([[10.0, 10.0, 60.0, bottom_px]])}
-    return Measurements(**row, cluster=(np.zeros((0, 3)),))
+    detections = Detections(np.array([[10.0, 10.0, 60.0, bottom_px]]), np.ones(1), np.array(["car"]))
+    return Measurements.unplaced(detections, t_ns=0, camera=camera, sensor_m=np.zeros(3))
 
 
 def test_a_box_without_a_foot_in_the_image_needs_no_homography(both: Log) -> None:
@@ -397,7 +395,7 @@ def doubled_rows(log: Log) -> Measurements:
 def test_for_one_camera_dropping_doubles_is_all_of_fusion(tiny: Log) -> None:
     rows = doubled_rows(tiny)
     assert (rows.source == "lidar").sum() >= 6
-    without, full = fuse(rows, across=False), fuse(rows)
+    without, full = fuse_tick(rows, across=False), fuse_tick(rows)
     assert len(full) < len(rows)
     assert_same_rows(without, full)
 
@@ -420,7 +418,7 @@ def test_a_parked_car_needs_no_smoothing(tiny: Log, monkeypatch: pytest.MonkeyPa
     assert not step["kept"]
     assert step["reason"].startswith("1 of 3 agents")
     (parked,) = [a for a in without.scenario.others if a.static]
-    monkeypatch.setattr(log2sim.agents.build, "is_static", lambda track: False)
+    monkeypatch.setattr(log2sim.agents.estimate, "is_static", lambda track: False)
     full = run(tiny)
     assert entry(full, "smoothing of parked agents")["kept"]
     smoothed = min(full.scenario.others, key=lambda a: np.hypot(a.waypoints.x_m[0] - 14.0, a.waypoints.y_m[0] + 4.0))
@@ -530,7 +528,7 @@ def test_the_time_saved_by_skipped_frames_is_that_of_the_others() -> None:
     clock.seconds.update({"decode": 1.0, "detect": 3.0})
     observations = Observations(frames_detected=40, frames_skipped={"back": 20})
     plan = Plan(("back",), (Decision(Stage.DETECTION_IN_EVERY_FRAME, False, "empty frames are skipped"),))
-    (outcome,) = stage_outcomes(plan, RunOutputs(observations, {}, (), clock))
+    (outcome,) = stage_outcomes(plan, RunOutputs(observations, [], {}, (), clock))
     assert outcome.saved_s == pytest.approx(20 * 4.0 / 40)
     assert "20 of 60 frames" in outcome.decision.reason
 

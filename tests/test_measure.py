@@ -20,6 +20,11 @@ SENSOR = (0.0, 0.0, 1.9)
 PERSON = (0.7, 0.7, 1.75)
 
 
+def height_of(rows):
+    """Height of the only row's points above its ground."""
+    return (rows.top_m - rows.bottom_m).item()
+
+
 def view_ahead(far=(0.0, 0.0, 0.0), yaw=0.0):
     camera = camera_ahead(yaw_rad=yaw, at=(0.0, 0.0, 0.0))
     at = np.array(far) + np.array([0.0, 0.0, 1.6])
@@ -72,7 +77,7 @@ def test_a_free_car_is_measured_within_its_own_sigma(x, y, yaw_deg):
     assert apart(row.yaw_rad[0], car.yaw_rad) < np.deg2rad(4)
     assert np.hypot(*error) < 0.6
     assert error @ np.linalg.solve(row.covariance[0], error) < 13.8  # 99.9 %, two degrees of freedom
-    assert row.center_m[0, 2] - row.size_m[0, 2] / 2 == pytest.approx(0.0, abs=0.02)
+    assert row.bottom_m[0] == pytest.approx(0.0, abs=0.02)
     on_car = int(((owner == 0) & (world[:, 2] > ON_GROUND_M)).sum())
     assert 0.8 * on_car <= row.points[0] <= on_car
     assert (owners(row.cluster[0], world, owner) == 0).all()
@@ -86,7 +91,7 @@ def test_other_categories_are_found_too(category):
     row = measure_view(view, boxes(view, [solid], [category]), cloud_of(world))
     assert row.source[0] == "lidar"
     assert np.hypot(*(row.center_m[0] - solid.center_m)[:2]) < 0.1 + 0.1 * size[0]
-    assert row.size_m[0, 2] == pytest.approx(size[2], abs=0.25)
+    assert height_of(row) == pytest.approx(size[2], abs=0.25)
     assert (owners(row.cluster[0], world, owner) == 0).mean() > 0.98
 
 
@@ -100,7 +105,7 @@ def test_map_coordinates_of_any_size_change_nothing_else(far):
     np.testing.assert_allclose(there.center_m - far, here.center_m, atol=1e-3)
     np.testing.assert_allclose(there.cluster[0] - far, here.cluster[0], atol=1e-6)
     np.testing.assert_allclose(there.sensor_m[0] - far, SENSOR, atol=1e-6)
-    for column in ("size_m", "yaw_rad", "covariance", "points", "height_px_m"):
+    for column in ("low_m", "high_m", "yaw_rad", "covariance", "points", "height_px_m"):
         np.testing.assert_allclose(getattr(there, column), getattr(here, column), rtol=1e-3, atol=1e-3)
 
 
@@ -114,7 +119,7 @@ def test_turning_the_world_turns_the_measurement(angle):
     there = measure_view(turned_view, boxes(view, [car]), cloud_of(turned))
     # Cells of clustering and steps of the yaw search stay where they are, so a point or two may differ.
     np.testing.assert_allclose(rotate(there.center_m[:, :2], -angle), here.center_m[:, :2], atol=0.08)
-    np.testing.assert_allclose(there.size_m, here.size_m, atol=0.08)
+    np.testing.assert_allclose(there.high_m - there.low_m, here.high_m - here.low_m, atol=0.08)
     assert apart(there.yaw_rad[0], here.yaw_rad[0] + angle) < np.deg2rad(1.5)
 
 
@@ -200,7 +205,7 @@ def test_ground_in_the_box_and_branches_above_it_are_left_out():
     tall.box_px[0] += [-20, -200, 20, 60]
     row = measure_view(view, tall, cloud_of(world))
     assert (owners(row.cluster[0], world, owner) == 0).all()
-    assert row.size_m[0, 2] < 2.0
+    assert height_of(row) < 2.0
 
 
 def test_boxes_cut_by_the_images_border_are_marked_and_use_points_beyond_it():
@@ -264,7 +269,7 @@ def test_boxes_without_points_come_back_without_a_place(name, mode):
     assert np.isnan(rows.covariance).all()
     assert np.isnan(rows.yaw_rad).all()
     assert rows.cluster[0].shape == (0, 3)
-    assert rows.size_m[0].tolist() == list(TYPICAL_SIZE_M["truck"])
+    assert np.isnan([*rows.low_m[0], *rows.high_m[0], rows.bottom_m[0], rows.top_m[0]]).all()
     assert (rows.t_ns[0], rows.score[0], rows.camera[0]) == (T0_NS, 0.7, "front")
 
 
@@ -307,9 +312,11 @@ def test_degenerate_clusters_give_finite_boxes(shape):
     world = np.column_stack([np.full(40, 11.8), y, z])
     row = measure_view(view, boxes(view, [standing(14, 0, 0, (4.4, 0.5, 1.6))]), cloud_of(world))
     assert row.source.tolist() == ["lidar"]
-    assert np.isfinite([*row.center_m[0], *row.size_m[0], row.yaw_rad[0], *row.covariance[0].ravel()]).all()
+    assert np.isfinite(
+        [*row.center_m[0], *row.low_m[0], *row.high_m[0], row.yaw_rad[0], *row.covariance[0].ravel()]
+    ).all()
     assert np.linalg.eigvalsh(row.covariance[0]).min() > 0
-    assert row.size_m[0].min() > 0
+    assert (row.high_m >= row.low_m).all()
 
 
 def test_the_stamp_is_the_mean_time_of_the_objects_own_points():
@@ -339,7 +346,7 @@ def test_heights_count_from_the_ground_not_from_the_map():
     world, owner = scan([car], slope=tuple(slope), noise_m=0.01)
     row = measure_view(view, boxes(view, [car]), cloud_of(world, height=world[:, 2] - world[:, :2] @ slope))
     assert row.center_m[0, 2] == pytest.approx(car.center_m[2], abs=0.15)
-    assert row.size_m[0, 2] == pytest.approx(1.6, abs=0.2)
+    assert height_of(row) == pytest.approx(1.6, abs=0.2)
     assert (owners(row.cluster[0], world, owner) == 0).all()
 
 
@@ -359,7 +366,7 @@ def test_paper_mode_is_the_point_nearest_to_the_box_center_and_the_extent_of_all
     middle = (box[:2] + box[2:]) / 2
     best = min(np.flatnonzero(inside), key=lambda k: np.hypot(*(uv[k] - middle)))
     np.testing.assert_allclose(row.center_m[0], world[best], atol=1e-5)
-    np.testing.assert_allclose(row.size_m[0], world[inside].max(0) - world[inside].min(0), atol=1e-5)
+    np.testing.assert_allclose([*(row.high_m - row.low_m)[0], height_of(row)], np.ptp(world[inside], axis=0), atol=1e-5)
     assert row.points[0] == inside.sum()
 
 
@@ -371,14 +378,14 @@ def test_paper_mode_falls_for_the_occluder_that_robust_mode_sees_through():
     robust = measure_view(view, found, cloud_of(world), mode="robust")
     assert abs(paper.center_m[0, 0] - 8.0) < 0.5
     assert abs(robust.center_m[0, 0] - 16.0) < 0.5
-    assert paper.size_m[0, 0] > 5
+    assert (paper.high_m - paper.low_m)[0, 0] > 5
 
 
 def test_paper_mode_gives_a_single_point_a_size():
     view = view_ahead()
     row = measure_view(view, boxes(view, [standing(14, 0)]), cloud_of(np.array([[12.0, 0, 0.8]])), mode="paper")
     np.testing.assert_allclose(row.center_m[0], [12, 0, 0.8], atol=1e-6)
-    np.testing.assert_allclose(row.size_m[0], 0.1)
+    np.testing.assert_allclose([*(row.high_m - row.low_m)[0], height_of(row)], 0.1)
 
 
 # Projection of clouds

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from log2sim.agents.build import AgentCandidate
+from log2sim.agents.candidate import AgentCandidate
 from log2sim.agents.duplicates import outside, without_doubles
 from log2sim.datatypes import Agent, Waypoints
 

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds import scan, standing
+from worlds import measured_row, rows_at, scan, standing
 
 from log2sim.agents.size import moving_geometry, static_geometry
 from log2sim.agents.standing import is_static, parked_heading
 from log2sim.datatypes import TYPICAL_SIZE_M, Measurements, Track
 from log2sim.geometry import rotation_from_rpy
-from log2sim.perception.box_fitting import fit_box, rotate
+from log2sim.perception.box_fitting import rotate
 
 T0_NS = 1_700_000_000_000_000_000
 STEP_NS = 100_000_000
@@ -30,42 +30,15 @@ def measured(states, size=CAR, category="car", *, sensors=None, noise_m=0.01, en
             azimuth_deg=(-180, 180), steps=(900, 32), noise_m=noise_m, seed=k,
         )  # fmt: skip
         cluster = xyz[(owner == 0) & (xyz[:, 2] > 0.2)] + [*sensor[:2], 0.0]
-        center, found, angle, covariance = fit_box(cluster, sensor, category, 0.0, ends_visible)
-        rows.append(
-            Measurements(
-                np.array([T0_NS + k * STEP_NS]),
-                np.array([category], dtype="<U16"),
-                np.array([0.9]),
-                np.array(["a"]),
-                np.array([[10.0, 10, 20, 20]]),
-                np.array([False]),
-                np.array([ends_visible]),
-                center[None],
-                found[None],
-                np.array([angle]),
-                covariance[None],
-                np.array([len(cluster)]),
-                np.array(["lidar"], dtype="<U16"),
-                (cluster,),
-                sensor[None],
-                np.array([size[2]]),
-            )
-        )
+        row = measured_row(cluster, sensor, category, ends_visible=ends_visible, t_ns=T0_NS + k * STEP_NS)
+        rows.append(replace(row, height_px_m=np.array([size[2]])))
     return Track(category, np.arange(len(rows)), Measurements.join(rows))
 
 
 def bare(xy, category="car", step_s=0.1):
     """A track of measured centers without points."""
-    xy = np.asarray(xy, dtype=np.float64)
-    n, size = len(xy), np.array(TYPICAL_SIZE_M[category])
-    m = Measurements(
-        T0_NS + np.round(np.arange(n) * step_s * 1e9).astype(np.int64), np.full(n, category, dtype="<U16"),
-        np.full(n, 0.9), np.full(n, "a"), np.zeros((n, 4)), np.zeros(n, dtype=bool), np.zeros((n, 2), dtype=bool),
-        np.column_stack([xy, np.full(n, size[2] / 2)]), np.tile(size, (n, 1)), np.full(n, np.nan),
-        np.tile(np.eye(2) * 0.25, (n, 1, 1)), np.zeros(n, dtype=np.int64), np.full(n, "topdown", dtype="<U16"),
-        tuple(np.zeros((0, 3)) for _ in range(n)), np.zeros((n, 3)), np.full(n, np.nan),
-    )  # fmt: skip
-    return Track(category, np.arange(n), m)
+    t_ns = T0_NS + np.round(np.arange(len(xy)) * step_s * 1e9).astype(np.int64)
+    return Track(category, np.arange(len(xy)), rows_at(xy, category, t_ns=t_ns))
 
 
 def moved(track, shift, angle=0.0):
@@ -80,6 +53,7 @@ def moved(track, shift, angle=0.0):
         measurements=replace(
             m, center_m=go(m.center_m), sensor_m=go(m.sensor_m), cluster=tuple(go(c) for c in m.cluster),
             yaw_rad=m.yaw_rad + angle, covariance=r @ m.covariance @ r.T,
+            bottom_m=m.bottom_m + shift[2], top_m=m.top_m + shift[2],
         ),
     )  # fmt: skip
 
@@ -122,7 +96,7 @@ def test_of_two_sightings_a_vehicle_stands_and_a_person_walks():
 def test_a_parked_car_passed_by_is_found_with_its_size_and_yaw(x, y, yaw_deg):
     yaw = np.deg2rad(yaw_deg)
     shape = static_geometry(measured([(x, y, yaw)] * 25, sensors=PASSING))
-    assert shape.typical
+    assert shape.is_likely
     # A hundredth of the points is cut at each end, and rays miss the very corners.
     np.testing.assert_allclose(shape.size_m, CAR, atol=0.2)
     assert apart(shape.yaw_rad, yaw) < np.deg2rad(2)
@@ -183,7 +157,7 @@ def test_standing_without_points_keeps_the_measured_places_and_the_typical_size(
 
 @pytest.mark.parametrize("size", [(0.6, 0.5, 1.0), (9.5, 3.5, 1.6)])
 def test_what_no_car_can_be_is_not_typical(size):
-    assert not static_geometry(measured([(12, 6, 0.2)] * 15, size, sensors=PASSING[:15])).typical
+    assert not static_geometry(measured([(12, 6, 0.2)] * 15, size, sensors=PASSING[:15])).is_likely
 
 
 # Moving

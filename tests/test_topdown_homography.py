@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from log2sim.datatypes import TYPICAL_SIZE_M, Measurements
+from log2sim.datatypes import TYPICAL_SIZE_M, Detections, Measurements
 from log2sim.geometry import (
     Camera,
     apply,
@@ -489,25 +489,18 @@ def measured(view: Camera, **changes: object) -> Measurements:
     uv = np.array([foot_pixel(view, *f) for f in feet])
     across = np.linspace(-0.9, 0.9, 60)
     cluster = tuple(np.column_stack([np.full(60, f[0] + 100), f[1] + across + 50, np.full(60, 0.7)]) for f in feet)
+    box_px = np.column_stack([uv[:, 0] - 30, uv[:, 1] - 40, uv[:, 0] + 30, uv[:, 1]])
+    detections = Detections(box_px, np.ones(4), np.full(4, "car"))
+    sensor = np.array([101.5, 50.2, 1.6])
+    rows = Measurements.unplaced(detections, t_ns=0, camera=view.name, sensor_m=sensor)
     columns: dict[str, object] = {
-        "t_ns": np.zeros(4, dtype=np.int64),
-        "category": np.full(4, "car"),
-        "score": np.ones(4),
-        "camera": np.full(4, view.name),
-        "box_px": np.column_stack([uv[:, 0] - 30, uv[:, 1] - 40, uv[:, 0] + 30, uv[:, 1]]),
-        "truncated": np.zeros(4, dtype=bool),
-        "ends_visible": np.zeros((4, 2), dtype=bool),
         "center_m": np.column_stack([feet[:, 0] + 102.2, feet[:, 1] + 50, np.full(4, 0.75)]),
-        "size_m": np.tile([4.4, 1.8, 1.5], (4, 1)),
-        "yaw_rad": np.zeros(4),
-        "covariance": np.tile(np.eye(2) * 0.01, (4, 1, 1)),
+        "bottom_m": np.zeros(4),
         "points": np.full(4, 60),
         "source": np.full(4, "lidar"),
         "cluster": cluster,
-        "sensor_m": np.tile([101.5, 50.2, 1.6], (4, 1)),
-        "height_px_m": np.full(4, 1.5),
     }
-    return Measurements(**{**columns, **changes})  # type: ignore[arg-type]
+    return replace(rows, **{**columns, **changes})  # type: ignore[arg-type]
 
 
 EGO_T_MAP = transform(np.eye(3), [-100.0, -50.0, 0.0])

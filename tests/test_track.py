@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.integrate import quad_vec
 from scipy.linalg import expm
+from worlds import rows_at
 
 from log2sim.datatypes import Measurements, Track
 from log2sim.geometry import NS_PER_S
+from log2sim.tracking.category import decide_category
 from log2sim.tracking.forward import track_forward
 from log2sim.tracking.motion import CENTER_SIGMA_M, innovation, measurement_noise, predict, update
-from log2sim.tracking.stitch import category_of, stitch
+from log2sim.tracking.stitch import stitch
 from log2sim.tracking.tracker import least_hits, track
 
 PERIOD_S = 0.1
@@ -37,25 +40,9 @@ def seen(
     sigma_m: float = 0.1,
 ) -> Measurements:
     """Measurements at places (M, 2); `name` is the truth, hidden in the camera's name, which tracking does not read."""
-    count = len(xy)
-    return Measurements(
-        t_ns=np.full(count, t_ns, dtype=np.int64),
-        category=np.broadcast_to(np.array(category, dtype="<U16"), count).copy(),
-        score=np.full(count, score),
-        camera=np.broadcast_to(np.array(name, dtype="<U16"), count).copy(),
-        box_px=np.zeros((count, 4)),
-        truncated=np.zeros(count, dtype=bool),
-        ends_visible=np.zeros((count, 2), dtype=bool),
-        center_m=np.column_stack([xy, np.zeros(count)]),
-        size_m=np.tile([4.4, 1.8, 1.5], (count, 1)),
-        yaw_rad=np.zeros(count),
-        covariance=np.tile(np.eye(2) * sigma_m**2, (count, 1, 1)),
-        points=np.full(count, 50),
-        source=np.broadcast_to(np.array(source, dtype="<U16"), count).copy(),
-        cluster=(np.zeros((0, 3)),) * count,
-        sensor_m=np.zeros((count, 3)),
-        height_px_m=np.full(count, 1.5),
-    )
+    camera = np.array(name, dtype="<U16")
+    rows = rows_at(xy, category, sigma_m=sigma_m, source=source, camera=camera, score=score, t_ns=t_ns)
+    return replace(rows, yaw_rad=np.zeros(len(xy)), points=np.full(len(xy), 50))
 
 
 def record(
@@ -347,10 +334,11 @@ def test_the_category_is_that_of_most_of_the_score() -> None:
         seen(np.zeros((1, 2)), START_NS, category=c, score=s)
         for c, s in (("car", 0.3), ("car", 0.3), ("car", 0.3), ("truck", 0.95))
     ]
-    assert category_of(Measurements.join(rows)) == "truck"
-    assert category_of(Measurements.join(rows[:3])) == "car"
+    assert decide_category(Measurements.join(rows)) == "truck"
+    assert decide_category(Measurements.join(rows[:3])) == "car"
     assert (
-        category_of(Measurements.join([rows[3], seen(np.zeros((1, 2)), START_NS, category="bus", score=0.95)])) == "bus"
+        decide_category(Measurements.join([rows[3], seen(np.zeros((1, 2)), START_NS, category="bus", score=0.95)]))
+        == "bus"
     )
 
 
@@ -358,3 +346,27 @@ def test_tracks_come_in_the_order_of_their_start() -> None:
     ways = {"late": line(0, 0, 5, 0), "right": line(50, 9, 5, 0), "left": line(-50, -9, 5, 0)}
     tracks = track(*record(ways, 30, hidden={"late": (0, 10)}), **OPTIONS)
     assert names_of(tracks) == [["left"], ["right"], ["late"]]
+
+
+@pytest.mark.parametrize(
+    ("speed_mps", "category"), [(1.4, "pedestrian"), (2.7, "pedestrian"), (3.4, "cyclist"), (6.0, "cyclist")]
+)
+@pytest.mark.parametrize("period_s", [0.05, 0.1, 0.25])
+def test_a_pedestrian_faster_than_people_run_is_a_cyclist_at_any_rate(speed_mps, category, period_s) -> None:
+    t_ns = stamps(round(3.0 / period_s), period_s)
+    xy = np.column_stack([speed_mps * (t_ns - t_ns[0]) / NS_PER_S, np.zeros(len(t_ns))])
+    rows = seen(xy, t_ns, category="pedestrian")
+    assert decide_category(rows) == category
+    assert decide_category(seen(xy, t_ns, category="car")) == "car"
+
+
+def test_a_few_wrong_positions_do_not_make_a_pedestrian_a_cyclist() -> None:
+    t_ns = stamps(40)
+    xy = np.zeros((40, 2))
+    xy[[10, 25]] += 5.0
+    assert decide_category(seen(xy, t_ns, category="pedestrian")) == "pedestrian"
+
+
+def test_a_track_too_short_to_have_a_speed_keeps_its_category() -> None:
+    rows = seen(np.array([[0.0, 0.0], [4.0, 0.0]]), stamps(2), category="pedestrian")
+    assert decide_category(rows) == "pedestrian"

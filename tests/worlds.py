@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Log, Scenario
+from log2sim.datatypes import TYPICAL_SIZE_M, Detections, Log, Measurements, Scenario
 from log2sim.geometry import Array, Camera, Mount, apply, box_corners, inverse, rotation_from_rpy, transform
+from log2sim.perception.box_completion import place_boxes
+from log2sim.perception.box_fitting import fit_extents, top_of
 from log2sim.synth.scene import Scene, scene_from_table
 from log2sim.synth.synthesis import synthesize
 
@@ -157,3 +159,44 @@ def outline_px(camera: Camera, map_T_cam: Array, solid: Solid) -> Array:
     uv = corners[:, :2] / corners[:, 2:] * [camera.K[0, 0], camera.K[1, 1]] + camera.K[:2, 2]
     wide = np.array([camera.width_px, camera.height_px])
     return np.concatenate([np.clip(uv.min(axis=0), 0, wide), np.clip(uv.max(axis=0), 0, wide)])
+
+
+def measured_row(
+    cluster,
+    sensor=(0.0, 0.0, 1.9),
+    category="car",
+    *,
+    camera="a",
+    score=0.9,
+    bottom_m=0.0,
+    ends_visible=(False, False),
+    t_ns=0,
+    **columns,
+):
+    """Measure one object from its points (n, 3) in the map; `columns` replace others of the row."""
+    detections = Detections(np.array([[10.0, 20, 30, 40]]) + score, np.array([score]), np.array([category], "<U16"))
+    row = Measurements.unplaced(detections, t_ns=t_ns, camera=camera, sensor_m=np.asarray(sensor, dtype=float))
+    cluster, typical = np.asarray(cluster, dtype=float), np.array(TYPICAL_SIZE_M[category])
+    yaw, low, high = fit_extents((cluster - sensor)[:, :2], typical)
+    evidence = {
+        "cluster": (cluster,), "points": np.array([len(cluster)]), "yaw_rad": np.array([yaw]), "low_m": low[None],
+        "high_m": high[None], "ends_visible": np.array([ends_visible]), "bottom_m": np.array([bottom_m]),
+        "top_m": np.array([top_of(cluster[:, 2])]), "height_px_m": np.array([1.6]),
+    }  # fmt: skip
+    return place_boxes(replace(row, **evidence | columns))
+
+
+def rows_at(xy, category="car", *, sigma_m=0.5, source="topdown", camera="a", score=0.9, t_ns=0, **columns):
+    """Measure objects at positions (M, 2) on flat ground without LiDAR points; `columns` replace others of the rows."""
+    xy = np.asarray(xy, dtype=float)
+    m = len(xy)
+    names = np.broadcast_to(np.array(category, dtype="<U16"), m).copy()
+    height = np.array([TYPICAL_SIZE_M[str(c)][2] for c in names]).reshape(m)
+    detections = Detections(np.zeros((m, 4)), np.full(m, score), names)
+    rows = Measurements.unplaced(detections, t_ns=0, camera="", sensor_m=np.zeros(3))
+    known = {
+        "t_ns": np.broadcast_to(t_ns, m).astype(np.int64), "camera": np.broadcast_to(np.array(camera, "<U16"), m).copy(),
+        "center_m": np.column_stack([xy, height / 2]), "covariance": np.tile(np.eye(2) * sigma_m**2, (m, 1, 1)),
+        "source": np.broadcast_to(np.array(source, dtype="<U16"), m).copy(), "bottom_m": np.zeros(m),
+    }  # fmt: skip
+    return replace(rows, **known | columns)

@@ -19,6 +19,7 @@ import numpy as np
 from log2sim import Config, Scenario, open_log
 from log2sim.datatypes import GROUP_OF, Log, Measurements
 from log2sim.evaluation.metrics.truth import truth_from_log
+from log2sim.perception.box_completion import provisional_sizes
 from log2sim.perception.detect.detectors import create_detector
 from log2sim.perception.first_pass import observe
 from log2sim.perception.sync import synchronize
@@ -86,7 +87,7 @@ def _error(rows: Measurements, i: int, agents: Sequence[Any], t0_ns: int) -> dic
         error = place - [state.x_m[0], state.y_m[0]]
         if np.hypot(*error) < best:
             best = float(np.hypot(*error))
-            size = np.abs(np.asarray(rows.size_m[i, :2]) - agent.size_m[:2])
+            size = np.abs(provisional_sizes(rows)[i] - agent.size_m[:2])
             turn = (rows.yaw_rad[i] - state.yaw_rad[0] + np.pi / 2) % np.pi - np.pi / 2
             out |= {
                 "found": True, "error_m": best, "depth_m": float(error @ toward) / out["range_m"],

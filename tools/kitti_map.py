@@ -89,6 +89,8 @@ def to_measurements(boxes: Boxes, view: View) -> list[Measurements]:
     ahead = np.column_stack([np.cos(boxes.yaw_rad), np.zeros(n), -np.sin(boxes.yaw_rad)])
     heading = np.einsum("nij,nj->ni", pose[:, :3, :3], ahead)
     sigma = SIGMA_M + SIGMA_PER_M * np.hypot(center[:, 0], center[:, 2])
+    half_m = boxes.size_hwl_m[:, :0:-1] / 2
+    map_center = apply(pose, center)
     everything = Measurements(
         t_ns=boxes.frame * PERIOD_NS,
         category=np.array([CATEGORY_OF[c] for c in boxes.category.tolist()], dtype="<U16"),
@@ -97,14 +99,17 @@ def to_measurements(boxes: Boxes, view: View) -> list[Measurements]:
         box_px=boxes.box_px,
         truncated=np.zeros(n, dtype=bool),
         ends_visible=np.ones((n, 2), dtype=bool),
-        center_m=apply(pose, center),
-        size_m=boxes.size_hwl_m[:, ::-1],
+        low_m=-half_m,
+        high_m=half_m,
+        bottom_m=map_center[:, 2] - boxes.size_hwl_m[:, 0] / 2,
+        top_m=map_center[:, 2] + boxes.size_hwl_m[:, 0] / 2,
+        center_m=map_center,
         yaw_rad=np.arctan2(heading[:, 1], heading[:, 0]),
         covariance=sigma[:, None, None] ** 2 * np.eye(2),
         points=np.zeros(n, dtype=np.int64),
         source=np.full(n, "lidar", dtype="<U16"),
         cluster=(np.zeros((0, 3)),) * n,
-        sensor_m=pose[:, :3, 3],
+        sensor_m=map_center,
         height_px_m=boxes.size_hwl_m[:, 0],
     )
     cuts = np.searchsorted(boxes.frame, np.arange(len(view.map_T_cam) + 1))

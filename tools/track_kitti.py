@@ -180,7 +180,8 @@ def as_seen(rows: Rows, boxes: Boxes, measurements: Measurements, view: View, fi
     columns = {**vars(boxes.take(rows.model)), "frame": rows.frame, "track_id": rows.track, "score": rows.score}
     columns |= {"category": rows.category}
     center = np.column_stack([rows.xy_m, measurements.center_m[rows.model, 2]])
-    in_camera = from_map(center, measurements.size_m[rows.model], measurements.yaw_rad[rows.model], rows.frame, view)
+    size = boxes.size_hwl_m[rows.model, ::-1]
+    in_camera = from_map(center, size, measurements.yaw_rad[rows.model], rows.frame, view)
     # In the image the detector knows better than a box around a box.
     in_camera["box_px"] = np.where((rows.source < 0)[:, None], in_camera["box_px"], boxes.box_px[rows.model])
     columns |= in_camera

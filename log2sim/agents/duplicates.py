@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from log2sim.agents.build import AgentCandidate
+from log2sim.agents.candidate import AgentCandidate
 from log2sim.datatypes import GROUP_OF, Agent, Waypoints
 from log2sim.geometry import Array, box_corners_bev, overlap_of_smaller
 

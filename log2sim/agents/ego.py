@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from log2sim.agents.build import Timeline
+from log2sim.agents.candidate import Timeline
 from log2sim.agents.smooth.smoother import signed_speed, smooth_track
 from log2sim.datatypes import STANDSTILL_DRIFT_M, STANDSTILL_MPS, Agent, Log, Waypoints
 from log2sim.geometry import Array, yaw_of
@@ -43,7 +43,7 @@ def ego_agent(log: Log, timeline: Timeline) -> Agent | None:
     )  # fmt: skip
 
 
-def ego_flow(log: Log, schedule: Schedule) -> Array:
+def ego_path(log: Log, schedule: Schedule) -> Array:
     """Return x, y and heading (K, 3) of the ego at every tick, as evidence of the direction of traffic."""
     if log.ego is None:
         return np.zeros((0, 3))

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Obstacles
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.perception import box_fitting
+from log2sim.perception.box_completion import SENSOR_SIGMA_M, complete_box, oriented_covariance, real_ends
+from log2sim.perception.box_fitting import align_to, rotate
 
 MIN_POINTS = 8
 # Points up to this far outside the predicted box count as its own; a shell of this width around them is compared with it.
@@ -138,7 +139,7 @@ def match_box(cloud: Obstacles, tick: int, box: BoxState) -> LidarMatch | None:
     near = near[(z > 0.15) & (z < size[2] + 0.4)]
     if len(near) < MIN_POINTS:
         return None
-    local = box_fitting.rotate((cloud.xyz[near, :2] - np.array([x, y])).astype(np.float64), -yaw_rad)
+    local = rotate((cloud.xyz[near, :2] - np.array([x, y])).astype(np.float64), -yaw_rad)
     outside_m = (np.abs(local) - size[:2] / 2).max(axis=1)
     inside = outside_m <= MARGIN_M
     if inside.sum() < MIN_POINTS or (outside_m > MARGIN_M).sum() > MAX_SHELL_RATIO * inside.sum():
@@ -146,8 +147,8 @@ def match_box(cloud: Obstacles, tick: int, box: BoxState) -> LidarMatch | None:
     low, high = np.quantile(local[inside], 0.01, axis=0), np.quantile(local[inside], 0.99, axis=0)
     if np.any(high - low > size[:2] + 0.6):
         return None
-    sensor = box_fitting.rotate(cloud.sensor[:2].astype(np.float64) + cloud.origin[:2] - box.xy_m, -yaw_rad)
-    center, sigma = box_fitting.complete_box(low, high, size[:2], sensor)
+    sensor = rotate(cloud.sensor[:2].astype(np.float64) + cloud.origin[:2] - box.xy_m, -yaw_rad)
+    center, sigma = complete_box(low, high, size[:2], real_ends(low, high, sensor, np.zeros(2, dtype=bool)))
     hidden = size[:2] - (high - low)
     if np.hypot(*center) > MAX_SHIFT_M or np.any(hidden > MAX_HIDDEN_SHARE * np.maximum(size[:2], 1.0)):
         return None
@@ -155,8 +156,8 @@ def match_box(cloud: Obstacles, tick: int, box: BoxState) -> LidarMatch | None:
     return LidarMatch(
         tick,
         cloud.stamp_ns + round(mean_s * NS_PER_S),
-        box_fitting.rotate(center, yaw_rad) + box.xy_m,
-        box_fitting.oriented_covariance(np.hypot(sigma, 2 * box_fitting.SENSOR_SIGMA_M), yaw_rad),
+        rotate(center, yaw_rad) + box.xy_m,
+        oriented_covariance(np.hypot(sigma, 2 * SENSOR_SIGMA_M), yaw_rad),
         int(inside.sum()),
     )
 
@@ -166,5 +167,5 @@ def _turned(yaw_rad: float, velocity: Array) -> float:
     speed = float(np.hypot(*velocity))
     if speed < MIN_COURSE_SPEED_MPS:
         return yaw_rad
-    course = box_fitting.align_to(float(np.arctan2(velocity[1], velocity[0])), yaw_rad, np.pi)
+    course = align_to(float(np.arctan2(velocity[1], velocity[0])), yaw_rad, np.pi)
     return yaw_rad + YAW_GAIN * float(np.arctan2(np.sin(course - yaw_rad), np.cos(course - yaw_rad)))

@@ -1,7 +1,8 @@
-"""One constant size for every track, and its positions measured anew against it.
+"""Size and final positions of a track from the evidence of all its measurements.
 
-A single sweep sees two sides of an object at best. Over a track every side shows at some time, so lengths that were seen
-whole are kept, and each position is found again by laying the whole box against the sides that were seen.
+A single sweep sees two sides of an object at best. Over a track each side may be seen from end to end at some time; these
+lengths give one constant size, and the position at each measurement follows by aligning the whole box with the observed
+ends.
 """
 
 from __future__ import annotations
@@ -13,24 +14,40 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M, Track
 from log2sim.geometry import Array
-from log2sim.perception import box_fitting
+from log2sim.perception import box_completion, box_fitting
+from log2sim.perception.lidar.clusters import MIN_CLUSTER_POINTS
 
-# Share of the whole sides that are longer: stray points lengthen some, sparse points shorten most.
+# Quantile of the lengths of fully observed sides that is taken for the size: stray points lengthen some, sparse points
+# shorten most.
 SIZE_QUANTILE = 0.85
-# Stray points lie outside an object by less than this.
+# Stray points are outside an object by less than this.
 MAX_TRIM_M = 0.1
+# Points of a static object are persistent if so many of the ticks have points in their cell.
 VOXEL_M = 0.15
 MIN_PERSISTENT_SHARE = 0.15
 MAX_POINTS_PER_TICK = 150
-# A side shorter than this share of the typical one was hardly seen from end to end.
+# Fewer persistent points do not show a shape.
+MIN_STATIC_POINTS = 5
+# A side shorter than this share of the typical one was not observed from end to end.
 MIN_WHOLE_SIDE_FACTOR = 0.75
 
 
 @dataclass(frozen=True, eq=False)
 class TrackGeometry:
-    """What a track looks like: `size_m` (3,), and at each of its measurements `xy_m` (n, 2), `covariance` (n, 2, 2),
-    `z_m` (n,) of the center, and for a standing one `yaw_rad`, up to half turns. `typical` False: what was seen of it is
-    smaller or larger than its category can be, so that it hardly is one.
+    """Size of a track, and the center of its box at each of its n measurements.
+
+    Attributes
+    ----------
+    size_m : (3,) float64
+        Length, width, height.
+    xy_m : (n, 2) float64
+    covariance : (n, 2, 2) float64
+        Of `xy_m`, m2.
+    z_m : (n,) float64
+    yaw_rad : float, optional
+        Of a static track, up to half turns.
+    is_likely : bool
+        Whether the observed size is one of its category.
     """
 
     size_m: Array
@@ -38,67 +55,65 @@ class TrackGeometry:
     covariance: Array
     z_m: Array
     yaw_rad: float | None = None
-    typical: bool = True
+    is_likely: bool = True
 
 
 def static_geometry(track: Track) -> TrackGeometry:
-    """One pose and size of a track that stands still, from all its points together."""
+    """Estimate one pose and size of a static track from all its points together."""
     m = track.measurements
     origin = np.append(np.median(m.center_m[:, :2], axis=0), 0.0)
     cloud = _persistent_points([c - origin for c in m.cluster])
-    sensor = m.sensor_m[:, :2] - origin[:2]
+    if len(cloud) < MIN_STATIC_POINTS:
+        return _geometry_without_points(track)
     typical = np.array(TYPICAL_SIZE_M[track.category])
-    if len(cloud) < 5:
-        return _geometry_without_points(track, typical)
+    sensor = m.sensor_m[:, :2] - origin[:2]
     yaw, _ = box_fitting.fit_yaw(cloud[:, :2])
     low, high = box_fitting.extents(cloud[:, :2], yaw, max_trim_m=MAX_TRIM_M)
     if box_fitting.axes_swapped(high - low, box_fitting.rotate(sensor, -yaw), typical):
         yaw += np.pi / 2
         low, high = box_fitting.extents(cloud[:, :2], yaw, max_trim_m=MAX_TRIM_M)
-    local = box_fitting.rotate(sensor, -yaw)
-    with_points = [k for k, c in enumerate(m.cluster) if len(c)]
-    shown = np.array([box_fitting.real_ends(low, high, local[k], m.ends_visible[k]) for k in with_points]).max(axis=0)
-    size, fits = _estimate_size(low[None], high[None], shown[None], track.category)
-    centers, sigmas = box_fitting.place_box(low, high, size, shown)
-    center = box_fitting.rotate(centers, yaw) + origin[:2]
+    with_points = np.array([len(c) > 0 for c in m.cluster])
+    views = box_fitting.rotate(sensor[with_points], -yaw)
+    # An end that is real from one viewpoint is real.
+    real = box_completion.real_ends(low, high, views, m.ends_visible[with_points]).max(axis=0)
+    size, is_likely = _estimate_size(low[None], high[None], real[None], track.category)
+    center, sigma = box_completion.complete_box(low, high, size, real)
     height, z = _height(track)
-    covariance = box_fitting.oriented_covariance(sigmas, yaw)
     n = len(m)
-    covariance = np.tile(covariance, (n, 1, 1))
     return TrackGeometry(
-        np.append(size, height), np.tile(center, (n, 1)), covariance, np.full(n, np.median(z)), float(yaw), fits
+        np.append(size, height),
+        np.tile(box_fitting.rotate(center, yaw) + origin[:2], (n, 1)),
+        np.tile(box_completion.oriented_covariance(sigma, yaw), (n, 1, 1)),
+        np.full(n, np.median(z)),
+        float(yaw),
+        is_likely,
     )
 
 
 def moving_geometry(track: Track, yaw_rad: Array) -> TrackGeometry:
-    """Size of a moving track and its center at every measurement, given its heading (n,) there."""
+    """Estimate the size of a moving track, and its center at every measurement, given its heading (n,) there."""
     m = track.measurements
-    typical = np.array(TYPICAL_SIZE_M[track.category])
-    with_points = np.flatnonzero([len(c) >= 4 for c in m.cluster])
-    if len(with_points) == 0:
-        return _geometry_without_points(track, typical)
-    lows, highs, sensors = np.zeros((len(m), 2)), np.zeros((len(m), 2)), np.zeros((len(m), 2))
-    shown = np.zeros((len(m), 2, 2), dtype=np.int64)
-    for k in with_points:
-        yaw, origin = float(yaw_rad[k]), m.center_m[k, :2]
-        lows[k], highs[k] = box_fitting.extents(m.cluster[k][:, :2] - origin, yaw, max_trim_m=MAX_TRIM_M)
-        sensors[k] = box_fitting.rotate(m.sensor_m[k, :2] - origin, -yaw)
-        shown[k] = box_fitting.real_ends(lows[k], highs[k], sensors[k], m.ends_visible[k])
-    size, fits = _estimate_size(lows[with_points], highs[with_points], shown[with_points], track.category)
+    rows = np.flatnonzero([len(c) >= MIN_CLUSTER_POINTS for c in m.cluster])
+    if len(rows) == 0:
+        return _geometry_without_points(track)
+    yaw, sensor = yaw_rad[rows], m.sensor_m[rows, :2]
+    xy_of = {k: m.cluster[k][:, :2] - m.sensor_m[k, :2] for k in rows}
+    ends = [box_fitting.extents(xy_of[k], float(yaw_rad[k]), max_trim_m=MAX_TRIM_M) for k in rows]
+    low, high = (np.array(e) for e in zip(*ends))
+    real = box_completion.real_ends(low, high, np.zeros_like(low), m.ends_visible[rows])
+    size, is_likely = _estimate_size(low, high, real, track.category)
+    center, sigma = box_completion.complete_box(low, high, size, real)
     xy, covariance = m.center_m[:, :2].copy(), m.covariance.copy()
-    for k in with_points:
-        yaw = float(yaw_rad[k])
-        center, sigma = box_fitting.place_box(lows[k], highs[k], size, shown[k])
-        xy[k] = box_fitting.rotate(center, yaw) + m.center_m[k, :2]
-        covariance[k] = box_fitting.oriented_covariance(sigma, yaw)
+    xy[rows] = box_fitting.rotate(center, yaw) + sensor
+    covariance[rows] = box_completion.oriented_covariance(sigma, yaw)
     height, z = _height(track)
     return TrackGeometry(
-        np.append(size, height), xy, covariance, z, None, fits and height > MIN_SIZE_M[track.category][2]
+        np.append(size, height), xy, covariance, z, None, is_likely and height > MIN_SIZE_M[track.category][2]
     )
 
 
 def _persistent_points(clusters: list[NDArray[np.float64]]) -> Array:
-    """Points (n, 3) of cells that several ticks saw, so that what a neighbor lent to one tick falls out."""
+    """Keep the points (n, 3) of cells with points at several ticks, without those that belong to a neighbor at a single one."""
     clusters = [box_fitting.subsample(c, MAX_POINTS_PER_TICK) for c in clusters if len(c)]
     if not clusters:
         return np.zeros((0, 3))
@@ -111,12 +126,12 @@ def _persistent_points(clusters: list[NDArray[np.float64]]) -> Array:
     return points[count[key.ravel()] >= max(MIN_PERSISTENT_SHARE * len(clusters), min(2, len(clusters)))]
 
 
-def _estimate_size(low: Array, high: Array, shown: NDArray[np.int64], category: str) -> tuple[Array, bool]:
-    """Length and width (2,) from ends (n, 2), (n, 2) of which some are real (n, 2, 2), and whether such an object exists."""
+def _estimate_size(low: Array, high: Array, real: NDArray[np.int64], category: str) -> tuple[Array, bool]:
+    """Estimate length and width (2,) from ends (n, 2), (n, 2) of which some are real (n, 2, 2), and whether they are likely."""
     typical, smallest, largest = (np.array(t[category][:2]) for t in (TYPICAL_SIZE_M, MIN_SIZE_M, MAX_SIZE_M))
-    low, high = box_fitting.corner_correction(low, high, shown, typical[1])
+    low, high = box_completion.corner_correction(low, high, real, typical[1])
     seen = high - low
-    whole: NDArray[np.bool_] = np.all(shown, axis=2)
+    whole: NDArray[np.bool_] = np.all(real, axis=2)
     size, raw = np.empty(2), np.empty(2)
     for axis in range(2):
         every = seen[:, axis]
@@ -131,23 +146,21 @@ def _estimate_size(low: Array, high: Array, shown: NDArray[np.int64], category: 
 
 
 def _height(track: Track) -> tuple[float, Array]:
-    """Height of the object and z (n,) of its center: points reach its top where the LiDAR looks that high."""
+    """Estimate the height of the object and z (n,) of its center: points reach its top where the LiDAR sees that high."""
     m = track.measurements
-    bottom = m.center_m[:, 2] - m.size_m[:, 2] / 2
-    tops = np.array(
-        [float(np.quantile(c[:, 2], 0.98)) - b if len(c) >= 4 else np.nan for c, b in zip(m.cluster, bottom)]
-    )
-    images = np.where(m.truncated, np.nan, m.height_px_m)
+    by_lidar_m = (m.top_m - m.bottom_m)[[len(c) >= MIN_CLUSTER_POINTS for c in m.cluster]]
+    by_image_m = np.where(m.truncated, np.nan, m.height_px_m)
     typical = TYPICAL_SIZE_M[track.category][2]
-    by_lidar = float(np.nanquantile(tops, SIZE_QUANTILE)) if np.isfinite(tops).any() else typical
-    by_image = float(np.nanmedian(images)) if np.isfinite(images).any() else typical
+    by_lidar = float(np.quantile(by_lidar_m, SIZE_QUANTILE)) if len(by_lidar_m) else typical
+    by_image = float(np.nanmedian(by_image_m)) if np.isfinite(by_image_m).any() else typical
     height = max(by_lidar, min(by_image, 1.15 * by_lidar))
     height = float(np.clip(height, MIN_SIZE_M[track.category][2], MAX_SIZE_M[track.category][2]))
-    return height, bottom + height / 2
+    return height, m.bottom_m + height / 2
 
 
-def _geometry_without_points(track: Track, typical: Array) -> TrackGeometry:
-    m = track.measurements
+def _geometry_without_points(track: Track) -> TrackGeometry:
+    """Take the typical size and the provisional positions."""
+    m, typical = track.measurements, np.array(TYPICAL_SIZE_M[track.category])
     height, z = _height(track)
     yaw = float(np.nanmedian(m.yaw_rad)) if np.isfinite(m.yaw_rad).any() else None
     return TrackGeometry(np.append(typical[:2], height), m.center_m[:, :2], m.covariance, z, yaw)

@@ -12,6 +12,7 @@ import numpy as np
 from log2sim.datatypes import GROUP_OF, Measurements, Track
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
 from log2sim.perception import box_fitting
+from log2sim.perception.box_completion import real_ends
 from log2sim.tracking.motion import CENTER_SIGMA_M
 
 
@@ -109,12 +110,10 @@ def _motion_of_ends(t: Array, m: Measurements) -> _Motion | None:
     if len(rows) < 3:
         return None
     yaw, origin = float(m.yaw_rad[rows[np.argmax(m.points[rows])]]), m.center_m[rows[0], :2]
-    ends, shown = np.zeros((len(rows), 2, 2)), np.zeros((len(rows), 2, 2), dtype=bool)
-    for k, row in enumerate(rows):
-        low, high = box_fitting.extents(m.cluster[row][:, :2] - origin, yaw)
-        sensor = box_fitting.rotate(m.sensor_m[row, :2] - origin, -yaw)
-        ends[k] = np.stack([low, high], axis=1)
-        shown[k] = box_fitting.real_ends(low, high, sensor, m.ends_visible[row]) > 0
+    both = [box_fitting.extents(m.cluster[k][:, :2] - origin, yaw) for k in rows]
+    ends = np.stack([np.stack(e, axis=1) for e in both])
+    sensor = box_fitting.rotate(m.sensor_m[rows, :2] - origin, -yaw)
+    shown = real_ends(ends[..., 0], ends[..., 1], sensor, m.ends_visible[rows]) > 0
     # Between its points an end may lie that none of them shows.
     gap = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=1) / np.sqrt(m.points[rows])
     variance = END_SIGMA_M**2 + gap**2

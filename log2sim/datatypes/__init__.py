@@ -18,7 +18,7 @@ from log2sim.datatypes.log import (
     Stream,
     Sweep,
 )
-from log2sim.datatypes.measurements import Detections, Measurements
+from log2sim.datatypes.measurements import BoxEvidence, Detections, Measurements
 from log2sim.datatypes.obstacles import Obstacles
 from log2sim.datatypes.scenario import EGO, VERSION, Scenario
 from log2sim.datatypes.tracks import Track
@@ -37,6 +37,7 @@ __all__ = [
     "TYPICAL_SIZE_M",
     "VERSION",
     "Agent",
+    "BoxEvidence",
     "Deferred",
     "Detections",
     "EgoVehicle",

@@ -1,10 +1,10 @@
-"""Detections of a camera frame and measurements of a tick, as columns with M rows."""
+"""Detections of a camera frame, the evidence for objects at a tick, and measurements, which add a position; M rows each."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,8 +44,8 @@ class Detections:
 
 
 @dataclass(frozen=True, eq=False)
-class Measurements:
-    """Measured objects of one tick, one row an object, in the map frame.
+class BoxEvidence:
+    """What a camera and the LiDARs observed of each object, map frame; nothing unobserved is completed.
 
     Attributes
     ----------
@@ -59,26 +59,22 @@ class Measurements:
         u0, v0, u1, v1.
     truncated : (M,) bool
         Whether the image border cuts the box.
-    ends_visible : (M, 2) bool
-        Whether the right and the left end of the cluster, as seen from the sensor, are ends of the object.
-    center_m : (M, 3) float64
-        Box center.
-    size_m : (M, 3) float64
-        Length, width, height.
-    yaw_rad : (M,) float64
-        Up to quarter turns where it comes from LiDAR alone; NaN where unknown.
-    covariance : (M, 2, 2) float64
-        Of the center's x, y, m2.
+    height_px_m : (M,) float64
+        Height in m that the image box spans at the object's depth; NaN without points.
     points : (M,) int64
         Number of LiDAR points on the object.
-    source : (M,) str
-        "lidar", "topdown", or "" without a position.
     cluster : M arrays (n, 3) float64
-        LiDAR points, subsampled, m.
+        These points, subsampled, m.
     sensor_m : (M, 3) float64
-        Viewpoint of the points.
-    height_px_m : (M,) float64
-        Height in m that the image box spans at the object's depth.
+        Viewpoint.
+    yaw_rad : (M,) float64
+        Direction of the object's length up to half turns, for short sides up to quarter turns; NaN without points.
+    low_m, high_m : (M, 2) float64
+        Ends of the points along the length and the width axis, relative to the viewpoint; NaN without points.
+    ends_visible : (M, 2) bool
+        Whether the right and the left end of the points, as seen from the viewpoint, are ends of the object.
+    bottom_m, top_m : (M,) float64
+        Heights of the ground under the object and of its highest points; NaN where unknown.
     """
 
     t_ns: NDArray[np.int64]
@@ -87,26 +83,46 @@ class Measurements:
     camera: NDArray[np.str_]
     box_px: Array
     truncated: NDArray[np.bool_]
-    ends_visible: NDArray[np.bool_]
-    center_m: Array
-    size_m: Array
-    yaw_rad: Array
-    covariance: Array
+    height_px_m: Array
     points: NDArray[np.int64]
-    source: NDArray[np.str_]
     cluster: tuple[NDArray[np.float64], ...]
     sensor_m: Array
-    height_px_m: Array
+    yaw_rad: Array
+    low_m: Array
+    high_m: Array
+    ends_visible: NDArray[np.bool_]
+    bottom_m: Array
+    top_m: Array
 
     def __len__(self) -> int:
         """Return the number of rows."""
         return len(self.t_ns)
 
-    def take(self, index: Any) -> Measurements:
+    def take(self, index: Any) -> Self:
         """Take the rows at `index`, integers or a mask."""
         rows = np.arange(len(self))[index]
         columns = {k: v[rows] for k, v in vars(self).items() if k != "cluster"}
-        return Measurements(**columns, cluster=tuple(self.cluster[i] for i in rows))
+        return type(self)(**columns, cluster=tuple(self.cluster[i] for i in rows))
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements(BoxEvidence):
+    """Evidence for the objects of one tick with a provisional position of each, for gating and tracking.
+
+    Attributes
+    ----------
+    center_m : (M, 3) float64
+        Box center, m, NaN without a position. It assumes the typical size of the category where no end was observed; the
+        final size and positions are estimated from the evidence of a whole track.
+    covariance : (M, 2, 2) float64
+        Of the center's x, y, m2.
+    source : (M,) str
+        "lidar", "topdown", or "" without a position.
+    """
+
+    center_m: Array
+    covariance: Array
+    source: NDArray[np.str_]
 
     @classmethod
     def join(cls, parts: Sequence[Measurements]) -> Measurements:
@@ -119,8 +135,30 @@ class Measurements:
     @classmethod
     def empty(cls) -> Measurements:
         """Return measurements without rows."""
-        text, none = np.zeros(0, dtype="<U16"), np.zeros(0)
+        return cls.unplaced(Detections.empty(), t_ns=0, camera="", sensor_m=np.zeros(3))
+
+    @classmethod
+    def unplaced(cls, detections: Detections, *, t_ns: int, camera: str, sensor_m: Array) -> Measurements:
+        """Return a row a detection (M,) of a camera frame, without LiDAR points and without a position."""
+        m = len(detections)
         return cls(
-            np.zeros(0, dtype=np.int64), text, none, text, np.zeros((0, 4)), np.zeros(0, dtype=bool),
-            np.zeros((0, 2), dtype=bool), np.zeros((0, 3)), np.zeros((0, 3)), none, np.zeros((0, 2, 2)), np.zeros(0, dtype=np.int64), text, (), np.zeros((0, 3)), none,
-        )  # fmt: skip
+            t_ns=np.full(m, t_ns, dtype=np.int64),
+            category=detections.category,
+            score=detections.score,
+            camera=np.full(m, camera),
+            box_px=detections.box_px,
+            truncated=np.zeros(m, dtype=bool),
+            height_px_m=np.full(m, np.nan),
+            points=np.zeros(m, dtype=np.int64),
+            cluster=tuple(np.zeros((0, 3)) for _ in range(m)),
+            sensor_m=np.tile(sensor_m, (m, 1)),
+            yaw_rad=np.full(m, np.nan),
+            low_m=np.full((m, 2), np.nan),
+            high_m=np.full((m, 2), np.nan),
+            ends_visible=np.zeros((m, 2), dtype=bool),
+            bottom_m=np.full(m, np.nan),
+            top_m=np.full(m, np.nan),
+            center_m=np.full((m, 3), np.nan),
+            covariance=np.full((m, 2, 2), np.nan),
+            source=np.full(m, "", dtype="<U16"),
+        )

@@ -15,7 +15,6 @@ from log2sim.datatypes import Detections, Log, Measurements, Obstacles, Sweep
 from log2sim.geometry import Array, inverse
 from log2sim.perception.detect.detectors import Detector
 from log2sim.perception.frames import FrameDetector, RecordReader
-from log2sim.perception.fusion import fuse
 from log2sim.perception.homography.correspondences import Correspondences, foot_points, undistorted_pixels
 from log2sim.perception.lidar.cloud import Cloud, assemble_cloud, is_at_rest
 from log2sim.perception.lidar.measure import measure_view, project_cloud
@@ -161,10 +160,8 @@ def _measure_tick(
         for camera, cloud in zip(schedule.frames, clouds, strict=True):
             if camera in found:
                 parts.append(_measure_camera(log, schedule, plan, camera, tick, found[camera], cloud, out, mode))
-    with clock.stage("fuse"):
         joined = Measurements.join(parts)
-        joined = joined.take(_in_range(log, schedule, tick, joined, max_range_m))
-        out.measurements.append(fuse(joined, across=plan.keeps(Stage.FUSION)) if len(joined) else joined)
+        out.measurements.append(joined.take(_in_range(log, schedule, tick, joined, max_range_m)))
     with clock.stage("cloud"):
         out.obstacles.append(None if clouds[0] is None else _obstacles(clouds[0]))
 
@@ -238,7 +235,7 @@ def _in_range(log: Log, schedule: Schedule, tick: int, rows: Measurements, max_r
     """Rows within range of the ego; those without a place stay, for the homography may still give them one."""
     origin, _ = cloud_origin(log, int(schedule.t_ns[tick]))
     with np.errstate(invalid="ignore"):
-        return ~(np.hypot(*(rows.center_m[:, :2] - origin[:2]).T) > max_range_m)
+        return np.asarray(~(np.hypot(*(rows.center_m[:, :2] - origin[:2]).T) > max_range_m))
 
 
 def _obstacles(cloud: Cloud) -> Obstacles:

@@ -12,7 +12,6 @@ from log2sim.config import TopdownConfig
 from log2sim.datatypes import TYPICAL_SIZE_M, Log, Measurements, Obstacles
 from log2sim.geometry import Array, Camera, ground_homography, inverse, wrap_angle
 from log2sim.perception.first_pass import Observations, base_pose
-from log2sim.perception.fusion import fuse
 from log2sim.perception.homography.camera_fit import fit_camera
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.estimate import EstimationOptions
@@ -116,17 +115,13 @@ def calibrated_homography(log: Log, camera: Camera) -> HomographyFit | None:
 
 
 def place_by_homography(
-    log: Log, observed: Observations, homographies: Mapping[str, CameraHomography], *, across: bool = True
+    log: Log, observed: Observations, homographies: Mapping[str, CameraHomography]
 ) -> list[Measurements]:
-    """Place the measurements without LiDAR points by their camera's homography, where it is able to, and fuse each tick.
-
-    `across` says whether several cameras may have seen the same obstacle, see `fuse`. Returns the measurements of all
-    ticks.
-    """
+    """Place the measurements without LiDAR points by their camera's homography, where it is able to, at every tick."""
     out = []
     for tick, (m, obstacles) in enumerate(zip(observed.measurements, observed.obstacles, strict=True)):
         h = {name: homography.fit.at_tick(tick) for name, homography in homographies.items()}
-        out.append(_place_tick(log, m, obstacles, {name: v for name, v in h.items() if v is not None}, across))
+        out.append(_place_tick(log, m, obstacles, {name: v for name, v in h.items() if v is not None}))
     return out
 
 
@@ -135,7 +130,6 @@ def _place_tick(
     m: Measurements,
     obstacles: Obstacles | None,
     ground_H_image: Mapping[str, Array],
-    across: bool,
 ) -> Measurements:
     missing = np.flatnonzero(m.source == "")
     if len(missing) == 0:
@@ -161,7 +155,7 @@ def _place_tick(
             if beyond + stopped >= MIN_RAYS:
                 columns["score"][k] *= UNCONFIRMED_SCORE
         _write(columns, int(k), placed, map_T_base, log.ground_z_ego_m)
-    return fuse(Measurements(**columns), across=across)
+    return Measurements(**columns)
 
 
 def count_rays(
@@ -194,9 +188,9 @@ def _camera_xy(log: Log, camera: Camera, map_T_base: Array, t_ns: int) -> Array:
 
 def _write(columns: dict[str, Any], k: int, placed: tuple[Array, Array], map_T_base: Array, ground_z_m: float) -> None:
     xy, covariance = placed
-    length, width, height = TYPICAL_SIZE_M[str(columns["category"][k])]
+    height = TYPICAL_SIZE_M[str(columns["category"][k])][2]
     foot = map_T_base[:3, :3] @ np.array([xy[0], xy[1], ground_z_m]) + map_T_base[:3, 3]
     columns["center_m"][k] = foot + np.array([0, 0, height / 2])
-    columns["size_m"][k] = length, width, height
+    columns["bottom_m"][k] = foot[2]
     columns["covariance"][k] = map_T_base[:2, :2] @ covariance @ map_T_base[:2, :2].T
     columns["source"][k] = "topdown"

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, Measurements, Track
 from log2sim.geometry import NS_PER_S, Array
+from log2sim.tracking.category import voted_category
 from log2sim.tracking.motion import ACCELERATION_MPS2, first_velocity, measurement_noise, predict, update
 
 # 99.9 % of the squared Mahalanobis distance with 4 degrees of freedom.
@@ -133,10 +134,4 @@ def _concatenate(parts: Sequence[Track]) -> Track:
     if len(parts) == 1:
         return parts[0]
     m = Measurements.join([p.measurements for p in parts])
-    return Track(category_of(m), np.concatenate([p.tick for p in parts]), m)
-
-
-def category_of(m: Measurements) -> str:
-    """The category that got most of the score over a track's life; ties go to the first by name."""
-    names, index = np.unique(m.category, return_inverse=True)
-    return str(names[np.argmax(np.bincount(index, weights=m.score))])
+    return Track(voted_category(m), np.concatenate([p.tick for p in parts]), m)

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Measurements, Track
 from log2sim.geometry import NS_PER_S
+from log2sim.tracking.category import decide_category, voted_category
 from log2sim.tracking.forward import track_forward
-from log2sim.tracking.stitch import category_of, stitch
-
-__all__ = ["category_of", "track"]
+from log2sim.tracking.stitch import stitch
 
 
 def track(
@@ -44,10 +44,12 @@ def track(
     tracks = []
     for t in tracklets:
         rows = everything.take(first_row[t.ticks] + t.rows)
-        tracks.append(Track(category_of(rows), t.ticks, rows))
+        tracks.append(Track(voted_category(rows), t.ticks, rows))
     joined = stitch(tracks, t_ns, max_gap_s=max_gap_s, whole_boxes=whole_boxes)
     least = least_hits(t_ns, min_life_s)
     kept = [t for t in joined if len(t) >= least]
+    if not whole_boxes:
+        kept = [replace(t, category=decide_category(t.measurements)) for t in kept]
     return sorted(kept, key=lambda t: (int(t.tick[0]), float(t.measurements.center_m[0, 0])))
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from extremes.table import FAR_M, Outcome, case
 from log2sim.agents.smooth.smoother import MotionModel, SmoothedTrack, signed_speed, smooth_track
-from log2sim.datatypes import Measurements
+from log2sim.datatypes import Detections, Measurements
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, rotation_from_rpy, transform, wrap_angle, yaw_of
 from log2sim.tracking.tracker import track
 
@@ -139,14 +141,12 @@ def pose_gap() -> Outcome:
 def measured(xy: Array, t_ns: int) -> Measurements:
     """Cars measured at places (M, 2), each with its number in the name of its camera, which tracking does not read."""
     n = len(xy)
-    blank = {k: np.zeros((n, *v.shape[1:]), v.dtype) for k, v in vars(Measurements.empty()).items() if k != "cluster"}
-    blank |= {
-        "t_ns": np.full(n, t_ns, dtype=np.int64), "category": np.full(n, "car"), "score": np.full(n, 0.9),
-        "camera": np.arange(n).astype("<U16"), "center_m": np.column_stack([xy, np.zeros(n)]),
-        "size_m": np.tile([4.4, 1.8, 1.5], (n, 1)), "covariance": np.tile(0.01 * np.eye(2), (n, 1, 1)),
-        "points": np.full(n, 50), "source": np.full(n, "lidar"),
-    }  # fmt: skip
-    return Measurements(**blank, cluster=(np.zeros((0, 3)),) * n)
+    detections = Detections(np.zeros((n, 4)), np.full(n, 0.9), np.full(n, "car"))
+    rows = Measurements.unplaced(detections, t_ns=t_ns, camera="", sensor_m=np.zeros(3))
+    return replace(
+        rows, camera=np.arange(n).astype("<U16"), center_m=np.column_stack([xy, np.zeros(n)]), yaw_rad=np.zeros(n),
+        covariance=np.tile(0.01 * np.eye(2), (n, 1, 1)), points=np.full(n, 50), source=np.full(n, "lidar"),
+    )  # fmt: skip
 
 
 def tracks_of(start: Array, velocity: Array, ticks_ns: Array) -> Outcome:

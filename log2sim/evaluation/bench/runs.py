@@ -25,6 +25,7 @@ from log2sim.evaluation.bench.settings import Grid, Setting
 from log2sim.evaluation.bench.shared_detections import RecordedDetections, detect_once
 from log2sim.geometry import NS_PER_S
 from log2sim.perception.first_pass import Observations, observe
+from log2sim.perception.fusion import fuse
 from log2sim.perception.homography_stage import CameraHomography, estimation_options, fit_homographies
 from log2sim.perception.sync import Schedule
 from log2sim.pipeline import Run, detector_of, schedule_of, second_pass
@@ -229,7 +230,9 @@ def score_of_measurements(context: BenchContext, observations: Observations) -> 
     """Score the measured centers; empty without truth."""
     if context.truth is None:
         return Score({})
-    return score_measurements(observations, true_positions(context.log, context.schedule, observations, context.truth))
+    across = context.plan.keeps(Stage.FUSION)
+    fused = replace(observations, measurements=fuse(observations.measurements, across=across))
+    return score_measurements(fused, true_positions(context.log, context.schedule, fused, context.truth))
 
 
 def homography_points(context: BenchContext, observations: Observations, report: Progress) -> list[Point]:

@@ -90,7 +90,7 @@ def foot_points(camera: Camera, measured: Measurements, ego_T_map: Array, tick: 
         direction = measured.center_m[k, :2] - sensor
         direction /= np.hypot(*direction)
         nearest = np.quantile((cluster - sensor) @ direction, NEAREST_SIDE_QUANTILE)
-        foot = np.append(sensor + direction * nearest, measured.center_m[k, 2] - measured.size_m[k, 2] / 2)
+        foot = np.append(sensor + direction * nearest, measured.bottom_m[k])
         box = measured.box_px[k]
         xy.append((ego_T_map[:3, :3] @ foot + ego_T_map[:3, 3])[:2])
         uv.append([(box[0] + box[2]) / 2, box[3]])

@@ -200,5 +200,4 @@ def region_grow(xy_all: NDArray[np.float32], seed: NDArray[np.float32], category
     labels = clusters_of(np.vstack([xy_all[near], seed]), CELL_M[GROUP_OF[category]])
     wanted = np.bincount(labels[len(near) :]).argmax()
     kept = near[labels[: len(near)] == wanted]
-    within: Index = kept[np.hypot(*(xy_all[kept] - center).T) <= reach]
-    return within
+    return np.asarray(kept[np.hypot(*(xy_all[kept] - center).T) <= reach])

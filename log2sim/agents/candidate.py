@@ -1,0 +1,93 @@
+"""Agent candidates: an agent made of a track, with the evidence for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.agents.confirmation import is_credible
+from log2sim.agents.size import TrackGeometry
+from log2sim.datatypes import GROUP_OF, Agent, Track, Waypoints
+from log2sim.geometry import NS_PER_S, Array
+
+# Distance from the rear axle to the box center as a share of the length: BMW 320i of CommonRoad's vehicle models, rounded.
+REAR_AXLE_SHARE = {"vehicle": 0.28, "two_wheeler": 0.3}
+# Number of the best detections whose mean score is the confidence. Independent detections would multiply; those of a video
+# are not independent, so the confidence saturates.
+CONFIDENCE_DETECTIONS = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Timeline:
+    """The ticks of a run.
+
+    Attributes
+    ----------
+    t_ns : (T,) int64
+    t0_ns : int
+        Start of the scenario.
+    """
+
+    t_ns: NDArray[np.int64]
+    t0_ns: int
+
+    def seconds(self, t_ns: NDArray[np.int64]) -> Array:
+        """Convert stamps to seconds since the start."""
+        return np.asarray((t_ns - self.t0_ns) / NS_PER_S, dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class AgentCandidate:
+    """An agent that is not confirmed yet.
+
+    Attributes
+    ----------
+    agent : Agent
+    evidence : float
+        Sum of the scores of its detections.
+    credible : bool
+        Whether the evidence suffices.
+    """
+
+    agent: Agent
+    evidence: float
+    credible: bool
+
+
+def candidate_of(
+    track: Track, geometry: TrackGeometry, waypoints: Waypoints, quality: dict[str, Any], *, static: bool
+) -> AgentCandidate:
+    """Make a candidate of a track, its geometry and its waypoints; `quality` is added to that of the track."""
+    m = track.measurements
+    strongest = np.sort(m.score)[-CONFIDENCE_DETECTIONS:]
+    length, width, height = (float(v) for v in geometry.size_m)
+    agent = Agent(
+        id="",
+        category=track.category,
+        size_m=(length, width, height),
+        waypoints=waypoints,
+        static=static,
+        rear_axle_offset_m=round(REAR_AXLE_SHARE.get(GROUP_OF[track.category], 0.0) * length, 3),
+        confidence=float(np.clip(strongest.mean(), 0.0, 1.0)),
+        quality=_quality_of(track) | quality,
+    )
+    return AgentCandidate(agent, float(m.score.sum()), is_credible(track, strongest, typical=geometry.is_likely))
+
+
+def confirm(candidates: Sequence[AgentCandidate]) -> list[AgentCandidate]:
+    """Keep the candidates with enough evidence."""
+    return [c for c in candidates if c.credible]
+
+
+def _quality_of(track: Track) -> dict[str, Any]:
+    m = track.measurements
+    return {
+        "detections": len(m),
+        "without_lidar": int((m.source != "lidar").sum()),
+        "points_median": float(np.median(m.points)),
+        "score_max": round(float(m.score.max()), 4),
+    }

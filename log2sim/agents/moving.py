@@ -1,0 +1,171 @@
+"""Moving agents: size once, LiDAR matches at ticks without a detection, and a smoothed trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.agents.candidate import REAR_AXLE_SHARE, AgentCandidate, Timeline, candidate_of
+from log2sim.agents.confirmation import SAME_MOMENT_S
+from log2sim.agents.lidar_tracking import BoxState, LidarMatch, track_with_lidar
+from log2sim.agents.size import TrackGeometry, moving_geometry
+from log2sim.agents.smooth.fixed_interval import MotionModel
+from log2sim.agents.smooth.smoother import SmoothedTrack, signed_speed, smooth_track
+from log2sim.datatypes import GROUP_OF, STANDSTILL_MPS, TYPICAL_SIZE_M, Obstacles, Track, Waypoints
+from log2sim.geometry import Array, wrap_angle
+from log2sim.perception.box_fitting import align_to
+
+# Spectral density of the jerk, m2/s5, of groups for which it is not estimated.
+JERK_DENSITY = {"pedestrian": 2.0}
+# Without smoothing: so large that the trajectory follows the positions.
+UNSMOOTHED_JERK_DENSITY = 1e4
+# Standard deviation of box centers beyond their covariance: points are no exact outlines.
+CENTER_SIGMA_M = {"vehicle": 0.12, "two_wheeler": 0.1, "pedestrian": 0.08, "other": 0.15}
+# A shorter displacement does not give a course.
+MIN_COURSE_DISTANCE_M = 0.3
+# Heights of the ground under a track are smoothed by a median over this many measurements on either side.
+HEIGHT_MEDIAN_HALF = 4
+
+
+@dataclass(frozen=True, eq=False)
+class _Positions:
+    """Positions of an object in rising time.
+
+    Attributes
+    ----------
+    t_s : (n,) float64
+    xy_m : (n, 2) float64
+    covariance : (n, 2, 2) float64
+    tick : (n,) int64
+    """
+
+    t_s: Array
+    xy_m: Array
+    covariance: Array
+    tick: NDArray[np.int64]
+
+
+def moving_candidate(
+    track: Track, obstacles: Sequence[Obstacles | None], timeline: Timeline, *, smooth: bool
+) -> AgentCandidate:
+    """Make an agent with a waypoint at every tick from its first to its last observation.
+
+    Notes
+    -----
+    A first smoothing of the provisional positions gives the headings. With these the evidence gives one size and, by laying
+    the whole box against the observed ends, the final positions. LiDAR matches before, after and between the detections
+    join them, and a second smoothing gives the trajectory.
+    """
+    track = _one_at_a_moment(track)
+    m, group = track.measurements, GROUP_OF[track.category]
+    t = timeline.seconds(m.t_ns)
+    noise = CENTER_SIGMA_M[group] ** 2 * np.eye(2)
+    motion = MotionModel(JERK_DENSITY.get(group), holonomic=group == "pedestrian", heading_rad=_first_heading(track))
+    rough = smooth_track(t, m.center_m[:, :2], covariance=m.covariance + noise, at_s=t, motion=motion)
+    headings = _headings(rough, group)
+    geometry = moving_geometry(track, headings)
+    matches = _lidar_matches(track, rough, headings, geometry, obstacles, timeline)
+    positions = _all_positions(track, geometry, matches, timeline)
+    life = np.arange(positions.tick.min(), positions.tick.max() + 1)
+    at = timeline.seconds(timeline.t_ns[life])
+    if not smooth:
+        motion = replace(motion, jerk_density=UNSMOOTHED_JERK_DENSITY)
+    path = smooth_track(positions.t_s, positions.xy_m, covariance=positions.covariance + noise, at_s=at, motion=motion)
+    observed = np.isin(life, positions.tick)
+    residual = path.residual_m[path.inlier]
+    quality = {
+        "lidar_only": len(matches),
+        "observed_share": round(float(observed.mean()), 3),
+        "smoothing_residual_rms_m": round(float(np.sqrt(np.nanmean(residual**2))), 4) if len(residual) else None,
+        "flags": list(path.flags),
+    }
+    z = np.interp(at, t, _running_median(geometry.z_m))
+    return candidate_of(track, geometry, _waypoints(path, _headings(path, group), z, observed), quality, static=False)
+
+
+def _one_at_a_moment(track: Track) -> Track:
+    """Drop measurements at the time of the previous one: frames that share a sweep measure the same points."""
+    t_ns = track.measurements.t_ns
+    rows = np.flatnonzero(np.r_[True, np.diff(t_ns) > SAME_MOMENT_S * 1e9])
+    return replace(track, tick=track.tick[rows], measurements=track.measurements.take(rows))
+
+
+def _headings(path: SmoothedTrack, group: str) -> Array:
+    """Return the heading (T,) of the body: the course of its center, less the slip angle of a turning center.
+
+    The center of a vehicle that turns about a point level with its rear axle moves at atan(offset x curvature) to it.
+    """
+    if group not in REAR_AXLE_SHARE:
+        return path.yaw_rad
+    offset = REAR_AXLE_SHARE[group] * TYPICAL_SIZE_M["car" if group == "vehicle" else "cyclist"][0]
+    return wrap_angle(path.yaw_rad - np.arcsin(np.clip(offset * path.curvature_1pm, -0.5, 0.5)))
+
+
+def _first_heading(track: Track) -> float | None:
+    """Return the course from the first to the last quarter of a track, or the yaw of its first box if that is short."""
+    xy, count = track.measurements.center_m[:, :2], max(len(track) // 4, 1)
+    displacement = np.median(xy[-count:], axis=0) - np.median(xy[:count], axis=0)
+    if np.hypot(*displacement) >= MIN_COURSE_DISTANCE_M:
+        return float(np.arctan2(displacement[1], displacement[0]))
+    yaws = track.measurements.yaw_rad[np.isfinite(track.measurements.yaw_rad)]
+    return align_to(float(yaws[0]), 0.0, np.pi) if len(yaws) else None
+
+
+def _lidar_matches(
+    track: Track,
+    path: SmoothedTrack,
+    headings: Array,
+    geometry: TrackGeometry,
+    obstacles: Sequence[Obstacles | None],
+    timeline: Timeline,
+) -> list[LidarMatch]:
+    """Match the box before, after and in the gaps of its track."""
+    tick, total = track.tick.tolist(), len(timeline.t_ns)
+    spans = [(0, range(tick[0] - 1, -1, -1)), (len(tick) - 1, range(tick[-1] + 1, total))]
+    spans += [(k, range(a + 1, b)) for k, (a, b) in enumerate(pairwise(tick))]
+    bottom_m = float(np.median(geometry.z_m)) - geometry.size_m[2] / 2
+    matches = []
+    for k, wanted in spans:
+        start = BoxState(
+            int(track.measurements.t_ns[k]), path.xy_m[k], path.velocity_mps[k], float(headings[k]),
+            geometry.size_m, bottom_m,
+        )  # fmt: skip
+        matches += track_with_lidar(obstacles, wanted, timeline.t_ns, start)
+    return matches
+
+
+def _all_positions(
+    track: Track, geometry: TrackGeometry, matches: Sequence[LidarMatch], timeline: Timeline
+) -> _Positions:
+    """Merge the positions of measurements and LiDAR matches, one at a moment."""
+    t_ns = np.concatenate([track.measurements.t_ns, np.array([m.t_ns for m in matches], dtype=np.int64)])
+    t_s = timeline.seconds(t_ns)
+    xy = np.concatenate([geometry.xy_m, np.array([m.xy_m for m in matches]).reshape(-1, 2)])
+    covariance = np.concatenate([geometry.covariance, np.array([m.covariance for m in matches]).reshape(-1, 2, 2)])
+    tick = np.concatenate([track.tick, np.array([m.tick for m in matches], dtype=np.int64)])
+    rows = np.argsort(t_s, kind="stable")
+    rows = rows[np.r_[True, np.diff(t_s[rows]) > SAME_MOMENT_S]]
+    return _Positions(t_s[rows], xy[rows], covariance[rows], tick)
+
+
+def _waypoints(path: SmoothedTrack, yaw: Array, z_m: Array, observed: NDArray[np.bool_]) -> Waypoints:
+    speed = signed_speed(path.velocity_mps, yaw)
+    return Waypoints(
+        t_s=path.t_s,
+        x_m=path.xy_m[:, 0],
+        y_m=path.xy_m[:, 1],
+        z_m=z_m,
+        yaw_rad=yaw,
+        speed_mps=np.where(np.abs(speed) < STANDSTILL_MPS, 0.0, speed),
+        observed=observed,
+        sigma_xy_m=np.sqrt(np.trace(path.covariance, axis1=1, axis2=2) / 2),
+    )
+
+
+def _running_median(values: Array) -> Array:
+    padded = np.pad(values, HEIGHT_MEDIAN_HALF, mode="edge")
+    return np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * HEIGHT_MEDIAN_HALF + 1), axis=1)

@@ -1,0 +1,142 @@
+"""Completion of partly observed boxes: which ends are real, and where the whole box is.
+
+All functions work in the length and width axes of the boxes; leading dimensions (...) are boxes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import TYPICAL_SIZE_M, BoxEvidence, Measurements
+from log2sim.geometry import Array
+from log2sim.perception.box_fitting import MAX_WIDTH_FACTOR, rotate
+
+# Standard deviation of an observed end: range noise of a LiDAR and the spacing of its rays.
+SENSOR_SIGMA_M = 0.08
+# Standard deviation of sizes within a category, as a share of the size.
+SIZE_SIGMA_SHARE = 0.05
+# Kinds of observed ends, see `real_ends`.
+SIDE_END, FACING_END = 1, 2
+# Corners are rounded: the outermost point seen from the side is inside the box by about this share of the width.
+CORNER_ROUNDING_SHARE = 0.08
+# A side seen at a smaller angle than this (sine) shows its near end only.
+MIN_VIEW_SINE = 0.5
+# Share of length minus width by which a center is uncertain when its short side may be a front or a part of a flank.
+AXIS_AMBIGUITY_SHARE = 0.25
+# Standard deviation of a uniform error, as a share of its range: a completed side may be wrong by all that was added.
+UNIFORM_SIGMA = 12.0**-0.5
+
+
+def real_ends(low: Array, high: Array, sensor: Array, ends_visible: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Decide which ends of the observed extents are ends of the box.
+
+    Parameters
+    ----------
+    low, high : (..., 2) float64, m
+        Ends of the observed points along each axis.
+    sensor : (..., 2) float64, m
+        Viewpoint, in the same axes.
+    ends_visible : (..., 2) bool
+        Whether the right and the left end of the points, as seen from the sensor, are ends of the object.
+
+    Returns
+    -------
+    real : (..., 2, 2) int
+        For each axis, the kind of its lower and upper end: `FACING_END` for a side that faces the sensor, `SIDE_END` for
+        one observed from the side, 0 where the box may extend beyond the points.
+
+    Notes
+    -----
+    A side that faces the sensor is real. A side seen at a flat angle shows its near end only; otherwise its ends are the
+    right and left ends of the points.
+    """
+    above, below = sensor > high, sensor < low
+    real = np.where(np.stack([below, above], axis=-1), FACING_END, 0)
+    offset = np.abs(sensor - (low + high) / 2)
+    distance = np.hypot(offset[..., 0], offset[..., 1])
+    right, left = np.asarray(ends_visible)[..., 0], np.asarray(ends_visible)[..., 1]
+    for axis in range(2):
+        other = 1 - axis
+        is_side = (above[..., other] | below[..., other]) & (offset[..., other] >= MIN_VIEW_SINE * distance)
+        # The lower end of the length is on the left when the sensor is on the lower side of the box, that of the width when
+        # the sensor is beyond the upper end of the length.
+        low_is_left = below[..., other] if axis == 0 else above[..., other]
+        visible = np.stack([np.where(low_is_left, left, right), np.where(low_is_left, right, left)], axis=-1)
+        side = np.where(is_side[..., None] & visible, SIDE_END, 0)
+        real[..., axis, :] = np.maximum(real[..., axis, :], side)
+    return real
+
+
+def complete_box(low: Array, high: Array, size_m: Array, real: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Place a box of known size over its observed extents.
+
+    Parameters
+    ----------
+    low, high : (..., 2) float64, m
+        Ends of the observed points along each axis.
+    size_m : (2,) or (..., 2) float64, m
+        Length and width of the whole box.
+    real : (..., 2, 2) int
+        Kinds of the ends, see `real_ends`.
+
+    Returns
+    -------
+    center : (..., 2) float64, m
+    sigma_m : (..., 2) float64
+        Its standard deviation along each axis.
+
+    Notes
+    -----
+    The box is aligned with its better real end; between two equally good ends, or without any, it is centered on the
+    points.
+    """
+    low, high = corner_correction(low, high, real, size_m[..., 1])
+    slack = size_m - (high - low)
+    better = np.sign(real[..., 1] - real[..., 0])
+    doubt = np.where(real.any(axis=-1), UNIFORM_SIGMA, 1.0) * np.maximum(slack, 0.0)
+    # Objects of one category differ in size, so the position of an unobserved end is never exact.
+    spread = np.where(real.all(axis=-1), 0.0, SIZE_SIGMA_SHARE * size_m)
+    return (low + high) / 2 - better * slack / 2, np.sqrt(SENSOR_SIGMA_M**2 + doubt**2 + spread**2)
+
+
+def corner_correction(low: Array, high: Array, real: NDArray[np.int64], width_m: Array | float) -> tuple[Array, Array]:
+    """Move ends (..., 2) observed from the side outward to the corner of the box, which is too round to be hit there."""
+    outward = np.where(real == SIDE_END, CORNER_ROUNDING_SHARE * np.asarray(width_m)[..., None, None], 0.0)
+    return np.asarray(low - outward[..., 0]), np.asarray(high + outward[..., 1])
+
+
+def oriented_covariance(sigma_m: Array, yaw_rad: Array | float) -> Array:
+    """Build covariances (..., 2, 2) of positions with standard deviations (..., 2) along the axes of yaws (...)."""
+    axes = np.stack([rotate(np.array([1.0, 0.0]), yaw_rad), rotate(np.array([0.0, 1.0]), yaw_rad)], axis=-1)
+    return np.asarray(axes * (sigma_m**2)[..., None, :] @ np.swapaxes(axes, -1, -2))
+
+
+def provisional_sizes(evidence: BoxEvidence) -> Array:
+    """Return the typical length and width (M, 2), or the observed extents where these are larger."""
+    typical = np.array([TYPICAL_SIZE_M[str(c)][:2] for c in evidence.category]).reshape(-1, 2)
+    return np.asarray(np.fmax(typical, evidence.high_m - evidence.low_m))
+
+
+def place_boxes(evidence: BoxEvidence) -> Measurements:
+    """Place every row (M,) with LiDAR extents by completing its box with the typical size of its category.
+
+    Rows without extents get no position. The position is provisional: see `Measurements`.
+    """
+    placed = np.isfinite(evidence.low_m[:, 0])
+    low, high, yaw, size = evidence.low_m, evidence.high_m, evidence.yaw_rad, provisional_sizes(evidence)
+    local, sigma = complete_box(low, high, size, real_ends(low, high, np.zeros_like(low), evidence.ends_visible))
+    width = np.array([TYPICAL_SIZE_M[str(c)][1] for c in evidence.category])
+    # So short a side may be a front or a visible part of a flank, for which the centers differ.
+    ambiguous = ((high - low).max(axis=1) <= MAX_WIDTH_FACTOR * width) & ~evidence.ends_visible.all(axis=1)
+    extra = np.where(ambiguous, AXIS_AMBIGUITY_SHARE * (size[:, 0] - size[:, 1]), 0.0)
+    xy = evidence.sensor_m[:, :2] + rotate(local, yaw)
+    z = (evidence.bottom_m + evidence.top_m) / 2
+    return Measurements(
+        **{f.name: getattr(evidence, f.name) for f in fields(BoxEvidence)},
+        center_m=np.column_stack([xy, z]),
+        covariance=oriented_covariance(np.hypot(sigma, extra[:, None]), yaw),
+        source=np.where(placed, "lidar", "").astype("<U16"),
+    )
