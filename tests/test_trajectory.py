@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -128,3 +130,10 @@ def test_an_agent_is_where_its_trajectory_is_and_nowhere_outside_it() -> None:
     np.testing.assert_array_equal(agent.at(inside).x_m, at.at(inside).x_m)
     assert agent.at([-0.1, 1.1]).valid.tolist() == [False, False]
     assert np.isnan(agent.at([-0.1, 1.1]).x_m).all()
+
+
+@pytest.mark.parametrize("key", ["x_m", "observed", "visible"])
+def test_a_column_of_another_length_is_refused_at_once(key: str) -> None:
+    w = waypoints(np.arange(4.0), 0.0, 0.0, 0.0, 0.0)
+    with pytest.raises(ValueError, match=f"{key} has 3 values, t_s has 4"):
+        replace(w, **{key: np.zeros(3, dtype=bool)})

@@ -43,6 +43,13 @@ class Waypoints:
 
     FLOATS = ("t_s", "x_m", "y_m", "z_m", "yaw_rad", "speed_mps", "sigma_xy_m")
 
+    def __post_init__(self) -> None:
+        """Check that all columns have one length; `ValueError` names the one that has another."""
+        for key in (*self.FLOATS, "observed", "visible"):
+            column = getattr(self, key)
+            if column is not None and len(column) != len(self.t_s):
+                raise ValueError(f"waypoints: {key} has {len(column)} values, t_s has {len(self.t_s)}")
+
     def __len__(self) -> int:
         """Return the number of waypoints."""
         return len(self.t_s)
