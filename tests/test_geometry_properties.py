@@ -106,14 +106,14 @@ def test_overlap_is_symmetric_and_bounded(a: Rectangle, b: Rectangle) -> None:
     assert float(bev_iou(p, p)) == pytest.approx(1.0)
 
 
-@given(RECTANGLES, st.floats(0.3, 9), st.floats(-10, 10))
-def test_overlap_of_boxes_with_collinear_edges_is_that_of_their_intervals(
-    a: Rectangle, length_m: float, ahead_m: float
-) -> None:
-    xy, size, yaw = a
-    other = box_corners_bev(xy + ahead_m * np.array([np.cos(yaw), np.sin(yaw)]), length_m, size[1], yaw)[0]
-    along = min(size[0] / 2, ahead_m + length_m / 2) - max(-size[0] / 2, ahead_m - length_m / 2)
-    assert float(overlap_area(corners(a), other)) == pytest.approx(max(along, 0.0) * size[1], abs=1e-7)
+def test_overlap_of_boxes_with_collinear_edges_is_that_of_their_intervals() -> None:
+    rng, n = np.random.default_rng(0), 3000
+    xy, yaw, width = rng.uniform(-2, 2, (n, 2)), rng.uniform(-4, 4, n), rng.uniform(0.3, 5, n)
+    length, ahead = rng.uniform(0.3, 8, (2, n)), rng.uniform(-5, 5, n)
+    a = box_corners_bev(xy, length[0], width, yaw)
+    b = box_corners_bev(xy + ahead[:, None] * np.column_stack([np.cos(yaw), np.sin(yaw)]), length[1], width, yaw)
+    along = np.minimum(length[0] / 2, ahead + length[1] / 2) - np.maximum(-length[0] / 2, ahead - length[1] / 2)
+    np.testing.assert_allclose(overlap_area(a, b), np.maximum(along, 0.0) * width, atol=1e-9)
 
 
 @given(RECTANGLES, RECTANGLES, ANGLE, METERS, METERS)
