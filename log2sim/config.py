@@ -101,8 +101,8 @@ class MeasureConfig(Section):
 class TopdownConfig(Section):
     """Homography from each image to the ground."""
 
-    method: Literal["time-aware", "calibrated", "min-frame", "per-frame", "straw-man", "off"] = _setting(
-        "time-aware", "How the homography is estimated; off: not at all."
+    method: Literal["time-aware", "calibrated", "min-frame", "per-frame", "per-frame-skimage", "straw-man", "off"] = (
+        _setting("time-aware", "How the homography is estimated; off: not at all.")
     )
     hypotheses: int = _setting(
         0, "Samples that RANSAC draws, per camera or per frame; 0: as many as the data need.", ge=0, le=100_000

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array, apply_homography
-from log2sim.perception.homography.baselines import fit_frames, sigma_from_sizes_m
+from log2sim.perception.homography.baselines import fit_frames, ransac_skimage, sigma_from_sizes_m
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.fit import HomographyFit, refused_fit, validated_fit
 from log2sim.perception.homography.normalized import NormalizedCorrespondences
@@ -23,7 +24,7 @@ from log2sim.perception.homography.ransac import (
 )
 
 STREAM_METHODS = ("time-aware", "calibrated")
-FRAME_METHODS = ("min-frame", "per-frame", "straw-man")
+FRAME_METHODS = ("min-frame", "per-frame", "per-frame-skimage", "straw-man")
 METHODS = (*STREAM_METHODS, *FRAME_METHODS)
 # Condition number of intrinsics beyond which they count as singular; a lens of 1e5 px has 1e5.
 MAX_CONDITION = 1e12
@@ -36,7 +37,7 @@ class EstimationOptions:
     Attributes
     ----------
     method : str
-        "time-aware", "calibrated", "min-frame", "per-frame" or "straw-man".
+        One of `METHODS`.
     K : (3, 3) float64 or None
         Intrinsics, px, which "calibrated" needs.
     pitch_roll : bool
@@ -103,8 +104,10 @@ def estimate_homography(
     if options.method in STREAM_METHODS:
         fit = _fit_stream(data, options, rng)
     else:
-        schedule = options.schedule(RANSAC_SCHEDULE_OF_A_FRAME)
-        fit = fit_frames(data, rng, schedule, keep_all=options.method != "min-frame")
+        estimate = partial(ransac, rng=rng, schedule=options.schedule(RANSAC_SCHEDULE_OF_A_FRAME))
+        if options.method == "per-frame-skimage":
+            estimate = partial(ransac_skimage, rng=rng, trials=options.hypotheses)
+        fit = fit_frames(data, estimate, keep_all=options.method != "min-frame")
     fit = _of_all_rows(fit, correspondences.tick, rows, of_stream=options.method in STREAM_METHODS)
     if options.method == "straw-man" and fit.ok:
         offset = apply_homography(fit.ground_H_image, uv)[0] - correspondences.xy_ego
