@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from log2sim.agents.candidate import Timeline, confirm
-from log2sim.agents.duplicates import outside, without_doubles
+from log2sim.agents.duplicates import suppress_duplicates, trim_ego_overlap
 from log2sim.agents.ego import ego_agent, ego_path
 from log2sim.agents.estimate import estimate_agents
 from log2sim.agents.scenario_of import camera_entries, provenance_of, scenario_of
@@ -159,7 +159,7 @@ def second_pass(run: Run, observations: Observations) -> Result:
         path = ego_path(log, run.schedule)
         candidates = estimate_agents(tracks, observations.obstacles, timeline, path, smooth=config.smooth.enabled)
         ego = ego_agent(log, timeline)
-        agents = outside(without_doubles(confirm(candidates), ego), ego)
+        agents = trim_ego_overlap(suppress_duplicates(confirm(candidates), ego), ego)
         # Without an ego the agents' waypoints alone tell the ticks, so all of them stay.
         agents = simplify(agents) if ego is not None else agents
     if ego is None and not agents:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from log2sim.agents.candidate import AgentCandidate
-from log2sim.agents.duplicates import outside, without_doubles
+from log2sim.agents.duplicates import suppress_duplicates, trim_ego_overlap
 from log2sim.datatypes import Agent, Waypoints
 
 
@@ -23,11 +23,11 @@ def agent(x_m, y_m=0.0, yaw=0.0, category="car", size=(4.4, 1.8, 1.5), t=(0.0, 4
 
 
 def names(*built, ego=None):
-    return [a.id for a in without_doubles([AgentCandidate(a, e, True) for a, e in built], ego)]
+    return [a.id for a in suppress_duplicates([AgentCandidate(a, e, True) for a, e in built], ego)]
 
 
 def test_of_two_in_one_place_the_one_with_more_evidence_stays():
-    left = without_doubles(
+    left = suppress_duplicates(
         [AgentCandidate(agent(10.0), 3.0, True), AgentCandidate(agent(10.8, size=(5.0, 1.9, 1.6)), 9.0, True)]
     )
     assert [a.size_m[0] for a in left] == [5.0]
@@ -37,7 +37,7 @@ def test_of_two_in_one_place_the_one_with_more_evidence_stays():
 def test_neighbors_bumper_to_bumper_both_stay_and_are_numbered_by_their_start():
     assert names((agent(15.0), 9.0), (agent(10.3), 3.0)) == ["car-1", "car-2"]
     later = replace(agent(30.0).waypoints, t_s=np.linspace(1.0, 4.0, 5))
-    ordered = without_doubles(
+    ordered = suppress_duplicates(
         [AgentCandidate(replace(agent(30.0), waypoints=later), 9.0, True), AgentCandidate(agent(50.0), 1.0, True)]
     )
     assert [a.waypoints.x_m[0] for a in ordered] == [50.0, 30.0]
@@ -78,21 +78,21 @@ def passing(y_m):
 
 def test_a_way_that_ends_in_the_ego_is_cut_where_it_enters():
     ego = agent(0.0)
-    (cut,) = outside([passing(0.3)], ego)
+    (cut,) = trim_ego_overlap([passing(0.3)], ego)
     # Both are 4.4 m long: they meet when the centers are that far apart, at 2.24 s; waypoints stand every second.
     assert cut.waypoints.t_s.tolist() == [0.0, 1.0, 2.0]
     assert cut.waypoints.x_m.tolist() == [-10.0, -7.5, -5.0]
     backward = replace(passing(0.3), waypoints=replace(passing(0.3).waypoints, x_m=passing(0.3).waypoints.x_m[::-1]))
-    assert outside([backward], ego)[0].waypoints.t_s.tolist() == [2.0, 3.0, 4.0]
+    assert trim_ego_overlap([backward], ego)[0].waypoints.t_s.tolist() == [2.0, 3.0, 4.0]
 
 
 @pytest.mark.parametrize("y_m", [1.85, -2.5])
 def test_who_passes_beside_the_ego_keeps_the_whole_way(y_m):
-    (kept,) = outside([passing(y_m)], agent(0.0))
+    (kept,) = trim_ego_overlap([passing(y_m)], agent(0.0))
     assert kept.waypoints.t_s.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
 
 
 def test_without_an_ego_and_for_what_stands_nothing_is_cut():
-    assert outside([passing(0.0)], None)[0].waypoints.t_s[-1] == 4.0
+    assert trim_ego_overlap([passing(0.0)], None)[0].waypoints.t_s[-1] == 4.0
     parked = replace(agent(3.0), static=True)
-    assert outside([parked], agent(0.0))[0] is parked
+    assert trim_ego_overlap([parked], agent(0.0))[0] is parked

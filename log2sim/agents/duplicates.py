@@ -19,7 +19,7 @@ SAMPLES = 12
 TOUCHING = 0.05
 
 
-def without_doubles(built: Sequence[AgentCandidate], ego: Agent | None = None) -> list[Agent]:
+def suppress_duplicates(built: Sequence[AgentCandidate], ego: Agent | None = None) -> list[Agent]:
     """Agents that are in nobody else's place, the ego's included, those with more evidence first; named by category."""
     taken = [ego] if ego is not None else []
     kept: list[Agent] = []
@@ -35,7 +35,7 @@ def without_doubles(built: Sequence[AgentCandidate], ego: Agent | None = None) -
     return named
 
 
-def outside(agents: Sequence[Agent], ego: Agent | None) -> list[Agent]:
+def trim_ego_overlap(agents: Sequence[Agent], ego: Agent | None) -> list[Agent]:
     """Moving agents without the beginnings and ends of their ways that lie in the ego's box, where nobody can have been.
 
     There an agent was followed by what little of it the sensors showed beside the ego.
