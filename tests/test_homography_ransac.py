@@ -1,4 +1,4 @@
-"""Parts of the homography estimators against closed forms and second methods, and what they reach on nodding cameras."""
+"""Parts of the homography estimators against closed forms and second methods, and what they reach on pitching cameras."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def through(h: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 @dataclass
-class Nodding:
+class PitchingStream:
     """A stream of box feet seen by a camera that may pitch and roll in each tick."""
 
     uv: np.ndarray
@@ -65,9 +65,9 @@ class Nodding:
         return float(np.median(np.hypot(*np.moveaxis(np.array(found) - truth, -1, 0))))
 
 
-def nodding(
-    seed: int, nod_deg: float = 0.0, *, cars: int = 10, ticks: int = 40, noise_px: float = 1.0, outliers: float = 0.3
-) -> Nodding:
+def pitching_stream(
+    seed: int, pitch_deg: float = 0.0, *, cars: int = 10, ticks: int = 40, noise_px: float = 1.0, outliers: float = 0.3
+) -> PitchingStream:
     """Cars 6-60 m ahead, two feet each; in each tick the same number of outliers, half of them swapped, half too high."""
     rng = np.random.default_rng([seed, 77])
     x, y = rng.uniform(6.0, 60.0, (ticks, cars)), rng.uniform(-9.0, 9.0, (ticks, cars))
@@ -75,7 +75,7 @@ def nodding(
     uv, xy, clean, poses = [], [], [], []
     for k in range(ticks):
         feet = np.concatenate([np.column_stack([x[k], y[k] + s]) for s in (0.9, -0.9)])
-        poses.append(image_H_ground(2.0 + nod_deg * rng.normal(), nod_deg * rng.normal()))
+        poses.append(image_H_ground(2.0 + pitch_deg * rng.normal(), pitch_deg * rng.normal()))
         pixel = through(poses[-1], feet) + rng.normal(0.0, noise_px, feet.shape)
         ground = feet + rng.normal(0.0, 0.05, feet.shape)
         wrong = rng.permutation(2 * cars)[: round(2 * cars * outliers)]
@@ -86,11 +86,11 @@ def nodding(
         xy.append(ground)
         clean.append(~np.isin(np.arange(2 * cars), wrong))
     tick = np.repeat(np.arange(ticks), 2 * cars)
-    return Nodding(np.concatenate(uv), np.concatenate(xy), tick, np.concatenate(clean), np.array(poses))
+    return PitchingStream(np.concatenate(uv), np.concatenate(xy), tick, np.concatenate(clean), np.array(poses))
 
 
 def make_stream(seed: int = 0, **changes: float) -> NormalizedCorrespondences:
-    world = nodding(seed, **changes)  # type: ignore[arg-type]
+    world = pitching_stream(seed, **changes)  # type: ignore[arg-type]
     return NormalizedCorrespondences.of(world.uv, world.xy, world.tick, 1.0, 0.05)
 
 
@@ -101,7 +101,7 @@ def make_stream(seed: int = 0, **changes: float) -> NormalizedCorrespondences:
 def test_a_camera_that_pitches_by_a_tenth_of_a_degree_is_followed(method: str) -> None:
     near, far, still = [], [], []
     for seed in range(4):
-        world = nodding(seed, 0.1)
+        world = pitching_stream(seed, 0.1)
         fit = world.fit(method, pitch_roll=True)
         assert fit.ok, fit.reason
         assert fit.per_tick is not None
@@ -118,7 +118,7 @@ def test_a_camera_that_pitches_by_a_tenth_of_a_degree_is_followed(method: str) -
 
 def test_a_camera_that_pitches_by_far_more_than_expected_is_followed_too() -> None:
     for seed in range(4):
-        world = nodding(seed, 0.4)
+        world = pitching_stream(seed, 0.4)
         fit = world.fit(pitch_roll=True)
         assert fit.ok, fit.reason
         assert fit.per_tick is not None
@@ -129,7 +129,7 @@ def test_a_camera_that_pitches_by_far_more_than_expected_is_followed_too() -> No
 
 @pytest.mark.parametrize("method", ["time-aware", "calibrated"])
 def test_a_camera_that_stands_still_gets_one_homography_though_more_are_asked_for(method: str) -> None:
-    world = nodding(5)
+    world = pitching_stream(5)
     fit = world.fit(method, pitch_roll=True)
     assert fit.per_tick is not None
     assert fit.jitter_m < 1e-9
@@ -138,11 +138,11 @@ def test_a_camera_that_stands_still_gets_one_homography_though_more_are_asked_fo
 
 
 def test_ticks_with_few_points_stay_near_the_stream() -> None:
-    world = nodding(6, 0.1, outliers=0.0)
+    world = pitching_stream(6, 0.1, outliers=0.0)
     column = np.arange(len(world.tick)) % 20
     keep = np.where(world.tick == 3, column < 1, np.where(world.tick == 7, column < 2, True))
     world.uv[world.tick == 11] = np.nan
-    few = Nodding(world.uv[keep], world.xy[keep], world.tick[keep], world.clean[keep], world.poses)
+    few = PitchingStream(world.uv[keep], world.xy[keep], world.tick[keep], world.clean[keep], world.poses)
     fit = few.fit(pitch_roll=True)
     assert fit.per_tick is not None
     assert len(fit.per_tick) == 40
@@ -161,7 +161,7 @@ def test_ticks_with_few_points_stay_near_the_stream() -> None:
 
 
 def test_thousands_of_points_in_a_tick_are_no_burden() -> None:
-    world = nodding(6, 0.2, cars=1500, ticks=4)
+    world = pitching_stream(6, 0.2, cars=1500, ticks=4)
     fit = world.fit(pitch_roll=True)
     assert fit.ok, fit.reason
     assert fit.per_tick is not None
@@ -169,10 +169,10 @@ def test_thousands_of_points_in_a_tick_are_no_burden() -> None:
 
 
 def test_one_wrong_point_alone_in_its_tick_moves_nothing() -> None:
-    world = nodding(7, 0.05, outliers=0.0)
+    world = pitching_stream(7, 0.05, outliers=0.0)
     keep = (world.tick != 5) | (np.arange(len(world.tick)) % 20 == 0)
     world.uv[np.flatnonzero(world.tick == 5)[0], 1] -= 80.0
-    lone = Nodding(world.uv[keep], world.xy[keep], world.tick[keep], world.clean[keep], world.poses)
+    lone = PitchingStream(world.uv[keep], world.xy[keep], world.tick[keep], world.clean[keep], world.poses)
     fit = lone.fit(pitch_roll=True)
     assert fit.per_tick is not None
     still = [np.abs(through(np.linalg.inv(fit.per_tick[5]), np.array([[40.0, 0.0]])) -
@@ -189,7 +189,7 @@ def test_many_outliers_are_overcome_even_where_no_frame_has_four_good_correspond
     cars: int, outliers: float, method: str
 ) -> None:
     for seed in range(4):
-        world = nodding(seed, cars=cars, outliers=outliers)
+        world = pitching_stream(seed, cars=cars, outliers=outliers)
         fit = world.fit(method)
         assert fit.ok, fit.reason
         away = through(fit.ground_H_image, through(image_H_ground(), world.xy)) - world.xy
@@ -199,14 +199,14 @@ def test_many_outliers_are_overcome_even_where_no_frame_has_four_good_correspond
 
 @pytest.mark.parametrize("method", ["time-aware", "calibrated", "min-frame"])
 def test_95_percent_outliers_are_refused(method: str) -> None:
-    fit = nodding(1, outliers=0.95).fit(method)
+    fit = pitching_stream(1, outliers=0.95).fit(method)
     assert not fit.ok
     assert "agree" in fit.reason or "determine" in fit.reason
 
 
 def test_noise_that_was_believed_wrongly_costs_little() -> None:
     def error(**sigmas: float) -> float:
-        worlds = [nodding(seed, noise_px=0.7) for seed in range(6)]
+        worlds = [pitching_stream(seed, noise_px=0.7) for seed in range(6)]
         return float(np.mean([w.error_m(w.fit(**sigmas).ground_H_image, FAR_M) for w in worlds]))
 
     known = error(sigma_px=0.7, sigma_m=0.05)
@@ -217,7 +217,7 @@ def test_noise_that_was_believed_wrongly_costs_little() -> None:
 def test_a_homography_knows_how_sure_it_is() -> None:
     ratios = []
     for seed in range(30):
-        world = nodding(seed, cars=4, ticks=10, outliers=0.2)
+        world = pitching_stream(seed, cars=4, ticks=10, outliers=0.2)
         fit = world.fit()
         middle, spread = world.xy[fit.inliers].mean(axis=0), world.xy[fit.inliers].std(axis=0)
         reach = float(np.sqrt((spread**2).sum() / 2))
@@ -231,7 +231,7 @@ def test_a_homography_knows_how_sure_it_is() -> None:
 
 
 def test_calibrated_beats_what_eight_parameters_allow() -> None:
-    def limit(world: Nodding) -> np.ndarray:
+    def limit(world: PitchingStream) -> np.ndarray:
         uv, xy = world.uv[world.clean], world.xy[world.clean]
         s = NormalizedCorrespondences.of(uv, xy, np.zeros(len(uv), dtype=np.int64), 1.0, 0.05)
         h = s.image_N_px @ image_H_ground() @ np.linalg.inv(s.ground_N_m)
@@ -244,7 +244,7 @@ def test_calibrated_beats_what_eight_parameters_allow() -> None:
 
     ours, eight = [], []
     for seed in range(10):
-        world = nodding(seed, cars=3, ticks=20)
+        world = pitching_stream(seed, cars=3, ticks=20)
         fit = world.fit("calibrated")
         assert fit.ok
         ours.append(world.error_m(fit.ground_H_image, NEAR_M))
@@ -253,7 +253,7 @@ def test_calibrated_beats_what_eight_parameters_allow() -> None:
 
 
 def test_calibrated_gives_a_homography_that_a_camera_can_have() -> None:
-    fit = nodding(3, cars=3).fit("calibrated")
+    fit = pitching_stream(3, cars=3).fit("calibrated")
     axes = np.linalg.inv(K) @ np.linalg.inv(fit.ground_H_image)
     gram = axes[:, :2].T @ axes[:, :2]
     assert gram[0, 1] == pytest.approx(0.0, abs=1e-8 * gram[0, 0])
@@ -261,7 +261,7 @@ def test_calibrated_gives_a_homography_that_a_camera_can_have() -> None:
 
 
 def test_calibrated_needs_intrinsics_that_are_some() -> None:
-    world = nodding(0, ticks=4)
+    world = pitching_stream(0, ticks=4)
     with pytest.raises(ValueError, match="intrinsics"):
         world.fit("calibrated", K=None)
     for singular in (np.zeros((3, 3)), np.diag([2050.0, 0.0, 1.0]), np.full((3, 3), np.nan)):
@@ -374,7 +374,7 @@ def test_whitened_errors_of_clean_data_have_unit_variance() -> None:
 
 @pytest.mark.parametrize(("pixel", "place"), [(1.0, 1.0), (2.0, 0.5), (0.5, 2.0), (0.7, 0.7)])
 def test_noise_is_found_from_the_errors(pixel: float, place: float) -> None:
-    world = nodding(6, outliers=0.0)
+    world = pitching_stream(6, outliers=0.0)
     stream = NormalizedCorrespondences.of(world.uv, world.xy, world.tick, 1.0 / pixel, 0.05 / place)
     h = stream.image_N_px @ image_H_ground() @ np.linalg.inv(stream.ground_N_m)
     for _ in range(6):
@@ -384,7 +384,7 @@ def test_noise_is_found_from_the_errors(pixel: float, place: float) -> None:
 
 
 def test_bounded_losses_ignore_how_far_an_outlier_is() -> None:
-    world = nodding(7, outliers=0.0)
+    world = pitching_stream(7, outliers=0.0)
     h = None
     values = []
     for far_px in (500.0, 5000.0):
@@ -413,7 +413,7 @@ def test_average_sizes_place_what_has_them() -> None:
 
 
 def test_the_straw_man_is_as_good_as_its_sizes_and_says_how_far_off_it_is() -> None:
-    world = nodding(8, outliers=0.0)
+    world = pitching_stream(8, outliers=0.0)
     right = world.fit("straw-man", xy_by_size=world.xy)
     assert world.error_m(right.ground_H_image, NEAR_M) < 0.5
     wrong = world.fit("straw-man", xy_by_size=1.15 * world.xy)
@@ -427,7 +427,7 @@ def test_the_straw_man_is_as_good_as_its_sizes_and_says_how_far_off_it_is() -> N
 
 
 def test_the_straw_man_allows_for_sizes_that_differ() -> None:
-    world = nodding(8, outliers=0.0)
+    world = pitching_stream(8, outliers=0.0)
     sizes = np.random.default_rng(0).normal(1.0, 0.08, (40, 10))
     by_size = world.xy * np.tile(sizes, (1, 2)).reshape(-1, 1)
     fit = world.fit("straw-man", xy_by_size=by_size)
@@ -441,9 +441,11 @@ def test_the_straw_man_allows_for_sizes_that_differ() -> None:
 
 @pytest.mark.parametrize("method", ["time-aware", "calibrated"])
 def test_large_offsets_and_stamps_change_nothing(method: str) -> None:
-    world = nodding(9)
+    world = pitching_stream(9)
     plain = world.fit(method)
-    far = Nodding(world.uv, np.add(world.xy, [5e5, 5e6]), world.tick * 100_000_000 + 10**18, world.clean, world.poses)
+    far = PitchingStream(
+        world.uv, np.add(world.xy, [5e5, 5e6]), world.tick * 100_000_000 + 10**18, world.clean, world.poses
+    )
     moved = far.fit(method)
     uv = through(image_H_ground(), np.array([[10.0, 1.0], [30.0, -4.0], [60.0, 3.0]]))
     a, b = (apply_homography(f.ground_H_image, uv)[0] for f in (plain, moved))
@@ -460,10 +462,10 @@ def test_a_line_a_place_and_a_tick_alone_are_refused_or_right(method: str, pitch
     for xy in (np.column_stack([x, 0.2 * x + 1]), np.column_stack([x, 0 * x]), np.tile([[20.0, 1.0]], (60, 1))):
         for noise_px in (0.0, 1.0):
             uv = through(image_H_ground(), xy) + rng.normal(0.0, noise_px, (60, 2))
-            fit = Nodding(uv, xy, tick, np.ones(60, bool), np.empty(0)).fit(method, pitch_roll=pitch_roll)
+            fit = PitchingStream(uv, xy, tick, np.ones(60, bool), np.empty(0)).fit(method, pitch_roll=pitch_roll)
             assert not fit.ok
             assert len(fit.reason) > 20
-    alone = nodding(2, ticks=1, outliers=0.2)
+    alone = pitching_stream(2, ticks=1, outliers=0.2)
     fit = alone.fit(method, pitch_roll=pitch_roll)
     assert fit.ok, fit.reason
     assert alone.error_m(fit.ground_H_image, NEAR_M) < 0.5

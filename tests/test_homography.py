@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
 from log2sim.datatypes import TYPICAL_SIZE_M, Detections, Measurements
@@ -583,3 +585,23 @@ def test_the_straw_man_has_no_lidar_and_calibrated_has_intrinsics() -> None:
     assert source == "obstacles"
     axes = np.linalg.inv(K) @ np.linalg.inv(fit.ground_H_image)
     assert np.linalg.norm(axes[:, 0]) == pytest.approx(np.linalg.norm(axes[:, 1]), rel=1e-6)
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    yaw_rad=st.floats(-np.pi, np.pi),
+    shift_m=st.tuples(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4)),
+    pixel_scale=st.floats(0.25, 4.0),
+)
+def test_a_rotated_and_shifted_ground_and_scaled_pixels_give_the_same_places(
+    yaw_rad: float, shift_m: tuple[float, float], pixel_scale: float
+) -> None:
+    world = make_world(31, ticks=10, each=10, noise_px=0.0, noise_m=0.0, outliers=0.2)
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    turn = np.array([[c, -s], [s, c]])
+    moved = World(world.truth, world.uv * pixel_scale, world.xy @ turn.T + shift_m, world.tick, world.clean)
+    fit = moved.fit(sigma_px=pixel_scale)
+    mapped, below = apply_homography(fit.ground_H_image, to_image(world.truth, PROBES_M) * pixel_scale)
+    assert below.all()
+    np.testing.assert_allclose(mapped, PROBES_M @ turn.T + shift_m, atol=1e-4)
+    np.testing.assert_array_equal(fit.inliers, world.clean)
