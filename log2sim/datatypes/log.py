@@ -13,6 +13,7 @@ from typing import Any, Generic, Literal, Self, TypeVar, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes.labels import ImageLabels, ImageRegions, Labels
 from log2sim.geometry import Array, Camera, Mount, PoseTrack
 
 T = TypeVar("T")
@@ -111,71 +112,6 @@ class Stream:
     name: str
     t_ns: Deferred[NDArray[np.int64]] = Deferred()
     read: Callable[[int], Any]  # type: ignore[misc]  # `t_ns` is a descriptor, it has no default
-
-
-@dataclass(frozen=True, eq=False)
-class Labels:
-    """Labeled 3D boxes of a log in the map frame, one row a box and stamp.
-
-    Attributes
-    ----------
-    t_ns : (L,) int64
-        Absolute stamps.
-    track_id : (L,) str
-    category : (L,) str
-    center_m : (L, 3) float64, m
-        Box centers.
-    size_m : (L, 3) float64, m
-        Length, width, height.
-    yaw_rad : (L,) float64
-    visible : (L,) bool or None
-        As the log states it; None where it states nothing and visibility is computed.
-    cameras : tuple of str or None
-        The cameras in whose images alone objects were labeled; None when they were labeled all around.
-    """
-
-    t_ns: NDArray[np.int64]
-    track_id: NDArray[np.str_]
-    category: NDArray[np.str_]
-    center_m: Array
-    size_m: Array
-    yaw_rad: Array
-    visible: NDArray[np.bool_] | None = None
-    cameras: tuple[str, ...] | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class ImageLabels:
-    """Labeled 2D boxes of one camera.
-
-    Attributes
-    ----------
-    t_ns : (L,) int64
-        Absolute stamp of the frame.
-    box_px : (L, 4) float64, px
-        u0, v0, u1, v1.
-    category : (L,) str
-    """
-
-    t_ns: NDArray[np.int64]
-    box_px: Array
-    category: NDArray[np.str_]
-
-
-@dataclass(frozen=True, eq=False)
-class ImageRegions:
-    """Parts of the images of one camera in which objects were left without labels.
-
-    Attributes
-    ----------
-    t_ns : (L,) int64
-        Absolute stamp of the frame.
-    box_px : (L, 4) float64, px
-        u0, v0, u1, v1.
-    """
-
-    t_ns: NDArray[np.int64]
-    box_px: Array
 
 
 @dataclass(frozen=True)
