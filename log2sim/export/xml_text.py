@@ -95,7 +95,8 @@ def read(path: Path) -> ElementTree.Element:
         raise ScenarioError(f"{path}: not valid XML: {problem}") from None
     if root is None:
         raise ScenarioError(f"{path}: not valid XML: no element found")
-    return root
+    result: ElementTree.Element = root
+    return result
 
 
 def require_number(value: str | None, where: str) -> float:

@@ -238,7 +238,8 @@ class _LeastSquares:
         """Standard deviation (K - 1,) of the curvature rate: limited by the steering, and by comfort at speed."""
         pace = np.maximum(np.abs(self.logged[1:, 3]), np.abs(self.logged[:-1, 3]))
         steering = self.limits.max_curvature_rate_1pmps / 2
-        return LATERAL_JERK_MPS3 / np.maximum(pace**2, LATERAL_JERK_MPS3 / steering)
+        result: Array = LATERAL_JERK_MPS3 / np.maximum(pace**2, LATERAL_JERK_MPS3 / steering)
+        return result
 
 
 def _transition(residual: Array, state: int, per_rise: Array | float, per_mean: Slopes) -> ResidualTerm:
@@ -289,4 +290,7 @@ def _solve(band: Array, gradient: Array, damping: float) -> NDArray[np.float64]:
     damped = band.copy()
     damped[:, :, 0] += damping * DAMPING_SCALE
     flat = damped.reshape(gradient.size, -1).T
-    return solveh_banded(flat, gradient.ravel(), lower=True, overwrite_ab=True).reshape(gradient.shape)
+    result: NDArray[np.float64] = solveh_banded(flat, gradient.ravel(), lower=True, overwrite_ab=True).reshape(
+        gradient.shape
+    )
+    return result

@@ -200,7 +200,8 @@ class VehicleController:
         limited = clamp(wanted * gear, -self.max_brake, self.max_throttle)
         if held:
             self.along_integral = 0.0
-            return -g.hold_brake_mps2
+            result: float = -g.hold_brake_mps2
+            return result
         # Anti-windup: no integration while the actuator is at its limit, or the vehicle far behind.
         if abs(along) < g.max_along_m and (limited == wanted * gear or along * wanted <= 0):
             grown = self.along_integral + along * dt_s / (g.along_s**2 * g.integral_s)
@@ -485,7 +486,8 @@ def load_client() -> ModuleType:
         import carla
     except ImportError as error:
         raise ReplayError(f"CARLA's Python client is needed: pip install carla ({error})", NO_CLIENT) from None
-    return carla
+    result: ModuleType = carla
+    return result
 
 
 def connect(carla: ModuleType, host: str, port: int, timeout_s: float) -> Any:
