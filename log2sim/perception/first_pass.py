@@ -32,10 +32,23 @@ BACKGROUND_THREADS = 2
 
 @dataclass(eq=False)
 class Observations:
-    """What the first pass found: per tick the measurements of all cameras and the obstacles that the LiDARs saw.
+    """Results of the first pass, by tick.
 
-    `sweeps` counts them by how they were compensated (see `compensation_of`), `frames_detected` and `frames_skipped` the
-    frames.
+    Attributes
+    ----------
+    measurements : T Measurements
+        Of all cameras, not fused; rows without LiDAR points have no position.
+    obstacles : T Obstacles, None at ticks without LiDAR
+    feet, ground : dict of str to list of Correspondences
+        Foot points of measured objects and ground points of the LiDAR, by camera.
+    detections : dict of str to int
+        Number of detections by camera.
+    records : RecordReader, optional
+    sweeps : Counter of str
+        Number of sweeps by how they were compensated, see `compensation_of`.
+    frames_detected : int
+    frames_skipped : mapping of str to int
+        By camera.
     """
 
     measurements: list[Measurements] = field(default_factory=list)
@@ -80,7 +93,7 @@ def observe(
 
 
 class _CloudPrefetcher:
-    """Clouds of coming ticks, made in the background; sweeps are read once, and ticks share the clouds of the same sweeps."""
+    """Make the clouds of coming ticks in the background; ticks share the clouds of the same sweeps, each read once."""
 
     def __init__(
         self, log: Log, schedule: Schedule, plan: Plan, records: RecordReader, out: Observations,
@@ -93,7 +106,7 @@ class _CloudPrefetcher:
         self._clouds: dict[tuple[int, ...], Future[Cloud | None]] = {}
 
     def _key(self, tick: int, row: int) -> tuple[int, ...]:
-        """The sweep of every LiDAR, -1 for none, that a camera of a tick uses."""
+        """Return the sweep of every LiDAR, -1 for none, that a camera of a tick uses."""
         return tuple(int(index[row, tick]) for index in self._schedule.sweeps.values())
 
     def prefetch(self, tick: int) -> None:
@@ -137,7 +150,7 @@ class _CloudPrefetcher:
         return cloud
 
     def get(self, tick: int, row: int) -> Cloud | None:
-        """The cloud for the camera in a row of the schedule; waits until it is made."""
+        """Return the cloud for the camera in a row of the schedule; waits until it is made."""
         return self._clouds[self._key(tick, row)].result()
 
 
@@ -221,7 +234,7 @@ def base_pose(log: Log, t_ns: int) -> Array:
 
 
 def _ground_points(view: View, cloud: Cloud, ego_T_map: Array, tick: int) -> Correspondences:
-    """An even sample of the LiDAR's ground points that the camera sees."""
+    """Sample the LiDAR's ground points that the camera sees evenly."""
     seen, uv, _ = project_cloud(view, cloud, cloud.ground_sample)
     if len(seen) == 0:
         return Correspondences.join([])
@@ -232,14 +245,14 @@ def _ground_points(view: View, cloud: Cloud, ego_T_map: Array, tick: int) -> Cor
 
 
 def _in_range(log: Log, schedule: Schedule, tick: int, rows: Measurements, max_range_m: float) -> NDArray[np.bool_]:
-    """Rows within range of the ego; those without a place stay, for the homography may still give them one."""
+    """Mark the rows within range of the ego, and those without a position, which a homography may still place."""
     origin, _ = cloud_origin(log, int(schedule.t_ns[tick]))
     with np.errstate(invalid="ignore"):
         return np.asarray(~(np.hypot(*(rows.center_m[:, :2] - origin[:2]).T) > max_range_m))
 
 
 def _obstacles(cloud: Cloud) -> Obstacles:
-    """The points above the ground, thinned to one a voxel so that a long log fits in memory."""
+    """Take the points above the ground, one a voxel, so that a long log fits in memory."""
     index, xyz = cloud.obstacles, cloud.obstacle_columns.T
     near = np.flatnonzero(np.hypot(xyz[:, 0], xyz[:, 1]) < OBSTACLE_REACH_M)
     index = index[near[_voxel_sample(xyz[near], OBSTACLE_VOXEL_M)]]
@@ -247,7 +260,7 @@ def _obstacles(cloud: Cloud) -> Obstacles:
 
 
 def _voxel_sample(xyz: NDArray[np.float32], voxel_m: float) -> NDArray[np.intp]:
-    """Indices of the first point of every voxel among points (N, 3), in the order of the points."""
+    """Return the indices of the first point of every voxel among points (N, 3), in the order of the points."""
     i, j, k = np.floor(xyz / voxel_m).astype(np.int64).T
     # Voxel and rank in one number: numbers are sorted several times as fast as their places are.
     ordered = np.sort((((i * 4096 + j) * 4096 + k) << RANK_BITS) + np.arange(len(xyz)))
