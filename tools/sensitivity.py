@@ -135,9 +135,13 @@ def figures_of(case: Case, config: Config, *, again: bool = False) -> Figures:
     """What a reconstruction is worth; `again` also runs the first pass."""
     import log2sim.pipeline as pipeline
 
+    observe = pipeline.observe
     if not again:
         pipeline.observe = lambda *a, **k: case.observations
-    result = evaluate(pipeline.reconstruct(case.log, config).scenario, case.truth, max_range_m=RANGE_M)
+    try:
+        result = evaluate(pipeline.reconstruct(case.log, config).scenario, case.truth, max_range_m=RANGE_M)
+    finally:
+        pipeline.observe = observe
     return {key: result[key] for key in RESOLUTION}
 
 
