@@ -124,7 +124,8 @@ class HomographyFit:
         ground = np.array([apply_homography(h, uv)[0] for h in known])
         if len(ground) < 2:
             return float("nan")
-        return float(np.nanmedian(np.hypot(*np.moveaxis(np.diff(ground, axis=0), -1, 0))))
+        moved = np.hypot(*np.moveaxis(np.diff(ground, axis=0), -1, 0))
+        return float(np.median(moved[np.isfinite(moved)])) if np.isfinite(moved).any() else float("nan")
 
 
 def refused_fit(reason: str, count: int, ticks: NDArray[Any] | None = None) -> HomographyFit:
