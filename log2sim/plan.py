@@ -15,7 +15,7 @@ from log2sim.datatypes import Log
 from log2sim.errors import ConfigError, LogError
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.registry import nearest
-from log2sim.tracking.tracker import least_hits
+from log2sim.tracking.tracker import min_hits
 
 LABELS = "labels"
 # Motion of the ego over the whole log that is left uncompensated: half the noise of a LiDAR range, and the angle that
@@ -153,7 +153,7 @@ def select_sensors(log: Log, config: Config) -> Sensors:
 def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64]) -> Plan:
     """Decide what to run at the ticks (T,) of a log."""
     decodes = _image_decoding(config)
-    stride = least_hits(t_ns, config.track.min_life_s) if decodes.kept else 1
+    stride = min_hits(t_ns, config.track.min_life_s) if decodes.kept else 1
     scope, homography = _homography(log, config)
     smooth = config.smooth.enabled
     decisions = (
@@ -245,7 +245,7 @@ def _image_decoding(config: Config) -> Decision:
 def _detection_in_every_frame(decodes: bool, stride: int) -> Decision:
     """Decide whether frames may be skipped.
 
-    A track needs `least_hits` measurements. An object that is visible for fewer ticks is not confirmed, so between two
+    A track needs `min_hits` measurements. An object that is visible for fewer ticks is not confirmed, so between two
     frames that many ticks apart in which the detector found nothing, the others need not be decoded.
     """
     stage = Stage.DETECTION_IN_EVERY_FRAME

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from log2sim.geometry import NEAREST_DEPTH_M, Camera, distort, fold_radius, project, undistort
+from log2sim.geometry import MIN_DEPTH_M, Camera, distort, fold_radius, project, undistort
 
 K = np.array([[900.0, 0.0, 655.0], [0.0, 880.0, 350.0], [0.0, 0.0, 1.0]])
 
@@ -50,7 +50,7 @@ def reference_pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
 def test_pixels_are_opencvs(model: str, distortion: tuple[float, ...]) -> None:
     camera, points = make_camera(model, distortion), view_points(np.random.default_rng(1))
     uv, valid = project(camera, points)
-    front = points[:, 2] > NEAREST_DEPTH_M
+    front = points[:, 2] > MIN_DEPTH_M
     expected = reference_pixels(camera, points[front])
     np.testing.assert_allclose(uv[front], expected, atol=1e-7)
     assert np.isnan(uv[~front]).all()
@@ -187,7 +187,7 @@ def test_no_points_and_no_pixels() -> None:
 
 
 def test_depth_is_tested_before_it_divides() -> None:
-    points = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, -5.0], [0.0, 0.0, NEAREST_DEPTH_M], [0.0, 0.0, 0.2], [np.nan] * 3])
+    points = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, -5.0], [0.0, 0.0, MIN_DEPTH_M], [0.0, 0.0, 0.2], [np.nan] * 3])
     for model, distortion in LENSES:
         uv, valid = project(make_camera(model, distortion), points)
         assert valid.tolist() == [False, False, False, True, False], model

@@ -246,7 +246,7 @@ def run_counting(log: Log, monkeypatch: pytest.MonkeyPatch, stride: int | None =
     detector = Counting(log)
     monkeypatch.setattr(log2sim.pipeline, "create_detector", lambda *a, **k: detector)
     if stride is not None:
-        monkeypatch.setattr(log2sim.plan, "least_hits", lambda *a: stride)
+        monkeypatch.setattr(log2sim.plan, "min_hits", lambda *a: stride)
     result = run(log, Config.load(detect={"name": "counting.onnx"}))
     return result, detector
 

@@ -17,7 +17,7 @@ from log2sim.tracking.category import decide_category
 from log2sim.tracking.forward import track_forward
 from log2sim.tracking.motion import CENTER_SIGMA_M, innovation, measurement_noise, predict, update
 from log2sim.tracking.stitch import stitch
-from log2sim.tracking.tracker import least_hits, track
+from log2sim.tracking.tracker import min_hits, track
 
 PERIOD_S = 0.1
 START_NS = 1_700_000_000_000_000_000
@@ -312,8 +312,8 @@ def test_short_lives_are_false_alarms_except_in_a_log_as_short() -> None:
     assert track(found, t_ns, **OPTIONS) == []
     assert len(track(found, t_ns, **{**OPTIONS, "min_life_s": 0.2})) == 1
     assert len(track(found[:1], t_ns[:1], **OPTIONS)) == 1
-    assert [least_hits(stamps(n), 0.3) for n in (1, 2, 3, 4, 10, 100)] == [1, 1, 2, 2, 3, 3]
-    assert least_hits(stamps(100, 0.02), 0.3) == 15
+    assert [min_hits(stamps(n), 0.3) for n in (1, 2, 3, 4, 10, 100)] == [1, 1, 2, 2, 3, 3]
+    assert min_hits(stamps(100, 0.02), 0.3) == 15
 
 
 def test_cars_and_pedestrians_are_never_one_and_riders_may_be() -> None:

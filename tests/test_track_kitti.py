@@ -142,7 +142,8 @@ def test_boxes_go_to_the_map_and_back() -> None:
     view = View(poses @ transform(EGO_R_CAM, np.zeros(3)), P)
     made = replace(random_boxes(40, 4), frame=np.arange(40))
     m = to_measurements(made, view)
-    back = [from_map(k.center_m, k.size_m, k.yaw_rad, np.array([i]), view) for i, k in enumerate(m)]
+    size = [np.column_stack([k.high_m - k.low_m, k.top_m - k.bottom_m]) for k in m]
+    back = [from_map(k.center_m, size[i], k.yaw_rad, np.array([i]), view) for i, k in enumerate(m)]
     np.testing.assert_allclose(np.concatenate([b["bottom_m"] for b in back]), made.bottom_m, atol=0.1)
     np.testing.assert_allclose(np.concatenate([b["size_hwl_m"] for b in back]), made.size_hwl_m)
     difference = np.concatenate([b["yaw_rad"] for b in back]) - made.yaw_rad

@@ -44,7 +44,7 @@ def read_view(calib: Path, ego_motion: Path | None, frames: int) -> View:
     are not used. Without it the axes of the car stand for the map.
     """
     c = kitti.read_calibration(calib)
-    P = kitti.entry(c, calib, (3, 4), "P2")
+    P = kitti.calibration_entry(c, calib, (3, 4), "P2")
     if ego_motion is None:
         return View(np.repeat(transform(EGO_R_CAM, np.zeros(3))[None], frames, axis=0), P)
     rows = _poses(ego_motion)
@@ -70,12 +70,14 @@ def _poses(path: Path) -> Array:
 
 def _rect_T_imu(c: Mapping[str, Array], path: Path) -> Array:
     rect = transform(
-        kitti.checked_rotation(kitti.entry(c, path, (3, 3), "R0_rect", "R_rect"), f"{path}, entry 'R0_rect'"),
+        kitti.checked_rotation(
+            kitti.calibration_entry(c, path, (3, 3), "R0_rect", "R_rect"), f"{path}, entry 'R0_rect'"
+        ),
         np.zeros(3),
     )
     links = []
     for keys in (("Tr_velo_to_cam", "Tr_velo_cam"), ("Tr_imu_to_velo", "Tr_imu_velo")):
-        m = kitti.entry(c, path, (3, 4), *keys)
+        m = kitti.calibration_entry(c, path, (3, 4), *keys)
         links.append(transform(kitti.checked_rotation(m[:, :3], f"{path}, entry '{keys[0]}'"), m[:, 3]))
     return np.asarray(rect @ links[0] @ links[1], dtype=np.float64)
 

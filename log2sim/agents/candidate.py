@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.agents.confirmation import is_credible
+from log2sim.agents.confirmation import is_confirmed
 from log2sim.agents.size import TrackGeometry
 from log2sim.datatypes import GROUP_OF, Agent, Track, Waypoints
 from log2sim.geometry import NS_PER_S, Array
@@ -42,20 +42,20 @@ class Timeline:
 
 @dataclass(frozen=True, eq=False)
 class AgentCandidate:
-    """An agent that is not confirmed yet.
+    """An agent made of one track, before duplicates are removed.
 
     Attributes
     ----------
     agent : Agent
     evidence : float
         Sum of the scores of its detections.
-    credible : bool
-        Whether the evidence suffices.
+    confirmed : bool
+        Whether the confidence of the track suffices.
     """
 
     agent: Agent
     evidence: float
-    credible: bool
+    confirmed: bool
 
 
 def candidate_of(
@@ -75,12 +75,12 @@ def candidate_of(
         confidence=float(np.clip(strongest.mean(), 0.0, 1.0)),
         quality=_quality_of(track) | quality,
     )
-    return AgentCandidate(agent, float(m.score.sum()), is_credible(track, strongest, typical=geometry.is_likely))
+    return AgentCandidate(agent, float(m.score.sum()), is_confirmed(track, strongest, typical=geometry.is_likely))
 
 
 def confirm(candidates: Sequence[AgentCandidate]) -> list[AgentCandidate]:
-    """Keep the candidates with enough evidence."""
-    return [c for c in candidates if c.credible]
+    """Keep the confirmed candidates."""
+    return [c for c in candidates if c.confirmed]
 
 
 def _quality_of(track: Track) -> dict[str, Any]:

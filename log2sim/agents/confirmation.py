@@ -1,4 +1,4 @@
-"""Which tracks are believed: what is there is detected most of the time, and surely."""
+"""Confirmation of tracks: an object that exists is detected at most ticks and with high scores."""
 
 from __future__ import annotations
 
@@ -7,25 +7,36 @@ import numpy as np
 from log2sim.datatypes import Track
 from log2sim.geometry import NS_PER_S, Array
 
-# Share of ticks with a detection times the score of the best ones.
-LEAST_CREDIT = 0.3
-LEAST_CREDIT_OF_ODD_SHAPES = 0.6
+# Limits of `track_confidence`; a track whose size is unlikely for its category needs more evidence.
+MIN_TRACK_CONFIDENCE = 0.3
+MIN_TRACK_CONFIDENCE_UNLIKELY_SIZE = 0.6
 HIDDEN_S = 1.0
 SAME_MOMENT_S = 1e-3
 
 
-def is_credible(track: Track, strongest: Array, *, typical: bool) -> bool:
-    """Whether a track deserves belief, from the scores of its best detections; more is asked of untypical sizes."""
-    return credit(track, strongest) >= (LEAST_CREDIT if typical else LEAST_CREDIT_OF_ODD_SHAPES)
+def is_confirmed(track: Track, strongest: Array, *, typical: bool) -> bool:
+    """Return whether the confidence of a track suffices.
+
+    Parameters
+    ----------
+    track : Track
+    strongest : (K,) float64
+        Scores of the best detections of the track.
+    typical : bool
+        Whether the size is likely for the category; an unlikely size needs a higher confidence.
+    """
+    return track_confidence(track, strongest) >= (
+        MIN_TRACK_CONFIDENCE if typical else MIN_TRACK_CONFIDENCE_UNLIKELY_SIZE
+    )
 
 
-def credit(track: Track, strongest: Array) -> float:
-    """How much a track deserves belief, in [0, 1]: detected how often while it could be, times how surely.
+def track_confidence(track: Track, strongest: Array) -> float:
+    """Return the confidence of a track in [0, 1]: its detection rate times the mean score (K,) of its best detections.
 
-    A gap longer than `HIDDEN_S` counts as being hidden, at the price of half of that time.
+    A gap longer than `HIDDEN_S` counts as an occlusion: half of `HIDDEN_S` of it enters the detection rate.
     """
     t = np.sort((track.measurements.t_ns - track.measurements.t_ns[0]) / NS_PER_S)
-    # Frames that share a sweep measure at one moment, and that counts once.
+    # Frames that share a sweep measure at the same time, which counts once.
     t = t[np.r_[True, np.diff(t) > SAME_MOMENT_S]]
     steps = np.diff(t)
     if len(steps) == 0:

@@ -1,4 +1,4 @@
-"""Nobody is where somebody else is: doubles are dropped, and ways are cut where they enter the ego."""
+"""Duplicate agents are removed, and trajectories are trimmed where they overlap the ego."""
 
 from __future__ import annotations
 
@@ -11,20 +11,24 @@ from log2sim.agents.candidate import AgentCandidate
 from log2sim.datatypes import GROUP_OF, Agent, Waypoints
 from log2sim.geometry import Array, box_corners_bev, overlap_of_smaller
 
-# Two agents that share this much of their boxes for most of the time are one; people stand closer than boxes tell.
+# Two agents whose overlap exceeds this share of the smaller box for most of the time are duplicates. Pedestrians are compared
+# by distance, since the boxes of two people who stand close together overlap.
 SHARED_AREA = 0.25
 SAME_PERSON_M = 0.35
 SAMPLES = 12
-# Boxes that share less than this of the smaller one only touch.
+# An overlap below this share of the smaller box is contact only.
 TOUCHING = 0.05
 
 
 def suppress_duplicates(built: Sequence[AgentCandidate], ego: Agent | None = None) -> list[Agent]:
-    """Agents that are in nobody else's place, the ego's included, those with more evidence first; named by category."""
+    """Keep, of the agents that overlap, the one with the most evidence, and none that overlaps the ego.
+
+    The kept ones are sorted by their first time and named by category.
+    """
     taken = [ego] if ego is not None else []
     kept: list[Agent] = []
     for candidate in sorted(built, key=lambda b: -b.evidence):
-        if not any(_same_place(candidate.agent, other) for other in (*taken, *kept)):
+        if not any(_are_duplicates(candidate.agent, other) for other in (*taken, *kept)):
             kept.append(candidate.agent)
     agents = sorted(kept, key=lambda a: (float(a.waypoints.t_s[0]), float(a.waypoints.x_m[0])))
     count: dict[str, int] = {}
@@ -36,15 +40,16 @@ def suppress_duplicates(built: Sequence[AgentCandidate], ego: Agent | None = Non
 
 
 def trim_ego_overlap(agents: Sequence[Agent], ego: Agent | None) -> list[Agent]:
-    """Moving agents without the beginnings and ends of their ways that lie in the ego's box, where nobody can have been.
+    """Trim the beginnings and ends of trajectories that overlap the box of the ego; static agents stay as they are.
 
-    There an agent was followed by what little of it the sensors showed beside the ego.
+    There the sensors of the ego see too little of an agent to locate it.
     """
     return list(agents) if ego is None else [_outside(a, ego) for a in agents]
 
 
 def _outside(agent: Agent, ego: Agent) -> Agent:
-    if agent.static or not _ways_meet(agent, ego):
+    """Return the agent from its first to its last waypoint that does not overlap the ego."""
+    if agent.static or not _extents_meet(agent, ego):
         return agent
     w = agent.waypoints
     apart = shared_areas(agent, ego, w.t_s) <= TOUCHING
@@ -55,10 +60,10 @@ def _outside(agent: Agent, ego: Agent) -> Agent:
     return replace(agent, waypoints=Waypoints(**columns))
 
 
-def _same_place(a: Agent, b: Agent) -> bool:
-    """Whether two agents overlap for most of the time that both are there."""
+def _are_duplicates(a: Agent, b: Agent) -> bool:
+    """Return whether two agents overlap for most of the time that they have in common."""
     first, last = max(a.waypoints.t_s[0], b.waypoints.t_s[0]), min(a.waypoints.t_s[-1], b.waypoints.t_s[-1])
-    if last < first or not _ways_meet(a, b):
+    if last < first or not _extents_meet(a, b):
         return False
     t = np.linspace(first, last, SAMPLES)
     if {GROUP_OF[a.category], GROUP_OF[b.category]} == {"pedestrian"}:
@@ -67,8 +72,8 @@ def _same_place(a: Agent, b: Agent) -> bool:
     return bool(np.median(shared_areas(a, b, t)) > SHARED_AREA)
 
 
-def _ways_meet(a: Agent, b: Agent) -> bool:
-    """Whether the rectangles around two agents' ways come as near as their boxes could ever touch; quick to tell."""
+def _extents_meet(a: Agent, b: Agent) -> bool:
+    """Return whether the axis-aligned extents of two trajectories are near enough for the boxes to touch, a cheap test."""
     reach = (np.hypot(*a.size_m[:2]) + np.hypot(*b.size_m[:2])) / 2
     return all(
         p.min() - q.max() <= reach and q.min() - p.max() <= reach
@@ -77,7 +82,7 @@ def _ways_meet(a: Agent, b: Agent) -> bool:
 
 
 def shared_areas(a: Agent, b: Agent, t_s: Array) -> Array:
-    """Area that two agents' boxes share at times (T,), as parts (T,) of the smaller one's; 0 where one is not there."""
+    """Return the overlap (T,) of two agents' boxes at times (T,) as a share of the smaller box; 0 where one is absent."""
     p, q = a.at(t_s), b.at(t_s)
     reach = (np.hypot(*a.size_m[:2]) + np.hypot(*b.size_m[:2])) / 2
     near = p.valid & q.valid & (np.hypot(p.x_m - q.x_m, p.y_m - q.y_m) < reach)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry.boxes import box_corners, points_in_box
-from log2sim.geometry.camera import NEAREST_DEPTH_M, Camera, project
+from log2sim.geometry.camera import MIN_DEPTH_M, Camera, project
 from log2sim.geometry.transforms import Array, inverse
 
 # Edges and faces by corners in the order of `box_corners`; the last two edges cross out the front.
@@ -17,7 +17,7 @@ EDGES = (
     (0, 7), (3, 4),
 )  # fmt: skip
 FACES = ((0, 1, 2, 3), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
-NEAR_M = 1.01 * NEAREST_DEPTH_M
+NEAR_M = 1.01 * MIN_DEPTH_M
 """Boxes are clipped at this depth, so that every clipped vertex can be projected."""
 
 NEAR_PLANE: Array = np.array([[0.0, 0.0, 1.0, -NEAR_M]])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from log2sim.geometry.transforms import Array
 
-NEAREST_DEPTH_M = 0.1
+MIN_DEPTH_M = 0.1
 """Points nearer to the image plane, or behind it, are not projected."""
 
 # Undistortion: entries of the table of initial values, iterations of Newton's method.
@@ -66,7 +66,7 @@ def project(camera: Camera, points_cam: NDArray[np.floating[Any]]) -> tuple[Arra
         In front of the camera and inside the image.
     """
     points = np.asarray(points_cam)
-    front = points[:, 2] > NEAREST_DEPTH_M
+    front = points[:, 2] > MIN_DEPTH_M
     uv = np.full((len(points), 2), np.nan)
     xy = points[front, :2] / points[front, 2:]
     if _is_distorted(camera):

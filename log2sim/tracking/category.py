@@ -1,4 +1,4 @@
-"""The category of a track, decided once from all its measurements: scores of the detector and speed."""
+"""The category of a track, decided from the detector scores and the speed of all its measurements."""
 
 from __future__ import annotations
 

@@ -36,7 +36,16 @@ Index = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class Tracklet:
-    """What a track was given, by `ticks` (n,) and `rows` (n,) of their measurements, and its last state `mean` (4,)."""
+    """Measurements assigned to one track.
+
+    Attributes
+    ----------
+    ticks : (n,) int64
+    rows : (n,) int64
+        Row of the measurement in its tick.
+    mean : (4,) float64
+        Last state: x, y, vx, vy in the map.
+    """
 
     ticks: NDArray[np.int64]
     rows: NDArray[np.int64]
@@ -62,16 +71,28 @@ def track_forward(
 
 
 def period_of(t_ns: NDArray[np.int64]) -> float:
-    """Median time between ticks (T,), s; 0 for a single one."""
+    """Return the median time between ticks (T,), s; 0 for a single one."""
     return float(np.median(np.diff(t_ns))) / NS_PER_S if len(t_ns) > 1 else 0.0
 
 
 class ForwardTracker:
-    """Tracks that live now, as columns; `step` is causal.
+    """Active tracks, one row each; `step` is causal.
 
-    `number` (A,) names the tracks in the order of their births, `mean` (A, 4) and `covariance` (A, 4, 4) are their states at
-    the last tick, `seen_ns` (A,) when each got a measurement last, `hits` (A,) how many it has. `whole_boxes` says that the
-    measurements come from a 3D detector: their centers do not move with the view and their yaw is the axis of motion.
+    Attributes
+    ----------
+    number : (A,) intp
+        Index of the track in the order of births.
+    mean : (A, 4) float64
+        States x, y, vx, vy in the map at the last tick.
+    covariance : (A, 4, 4) float64
+    seen_ns : (A,) int64
+        Time of the last measurement.
+    hits : (A,) int64
+        Number of measurements.
+    birth_score : float
+        Lowest score that can start a track.
+    whole_boxes : bool
+        Whether the measurements come from a 3D detector: centers that do not move with the view, yaw along the motion.
     """
 
     def __init__(self, *, birth_score: float, period_s: float, whole_boxes: bool = False) -> None:
@@ -89,10 +110,10 @@ class ForwardTracker:
         self._ended: list[tuple[Index, Array]] = []
 
     def step(self, found: Measurements, now_ns: int) -> tuple[Index, Index]:
-        """Take the measurements of a tick; returns the rows that went to tracks and the numbers of these tracks.
+        """Take the measurements of a tick; return the rows assigned to tracks and the numbers of these tracks.
 
         Those with a score of at least the birth score may start a track; weaker ones only continue one (Zhang et al.,
-        "ByteTrack", ECCV 2022), after the strong ones had their choice.
+        "ByteTrack", ECCV 2022), after the strong ones are assigned.
         """
         self._advance(now_ns)
         rows = np.flatnonzero(found.source != "")
@@ -113,13 +134,13 @@ class ForwardTracker:
         return rows[taken], numbers
 
     def last_states(self) -> Array:
-        """States (N, 4) of all tracks that ever were, by number, when they ended or now."""
+        """Return the last states (N, 4) of all tracks, ended ones included, by number."""
         ended = [*self._ended, (self.number, self.mean)]
         number = np.concatenate([n for n, _ in ended])
         return np.concatenate([m for _, m in ended])[np.argsort(number)]
 
     def _advance(self, now_ns: int) -> None:
-        """Drop the tracks that were not seen for too long and carry the others to now."""
+        """End the tracks without a recent measurement and predict the others to `now_ns`."""
         age_s = (now_ns - self.seen_ns) / NS_PER_S
         alive = age_s <= np.where(self.hits >= TENTATIVE_HITS, self._confirmed_age_s, self._tentative_age_s)
         if not alive.all():
@@ -132,7 +153,7 @@ class ForwardTracker:
         self._now_ns = now_ns
 
     def _choose(self, columns: _Columns, strong: NDArray[np.bool_]) -> tuple[Index, Index]:
-        """Tracks and measurements that belong together: the cheapest assignment inside the gate, strong ones first.
+        """Return tracks and measurements of the cheapest assignment inside the gate, strong measurements first.
 
         The cost is the negative log-likelihood.
         """

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array
 
-# How fast an object of a group can be when it is first seen, and how fast its velocity may change (standard deviations).
+# Standard deviations of the initial velocity and of the change of the velocity in 1 s, by group.
 FIRST_SPEED_MPS = {"vehicle": 8.0, "two_wheeler": 4.0, "pedestrian": 1.5, "other": 3.0}
 ACCELERATION_MPS2 = {"vehicle": 2.5, "two_wheeler": 1.5, "pedestrian": 1.0, "other": 1.5}
-# What steers starts along its own axis; this share of its first speed may point across.
+# A vehicle moves along its axis: lateral share of the initial velocity.
 ACROSS_SHARE = {"vehicle": 0.4, "two_wheeler": 0.4, "pedestrian": 1.0, "other": 1.0}
-# What a box center moves by when other sides of the object come into view.
+# Displacement of the box center when other sides of the object become visible.
 CENTER_SIGMA_M = {"vehicle": 0.35, "two_wheeler": 0.2, "pedestrian": 0.15, "other": 0.35}
 
 _DIAGONAL, _PLACE, _SPEED = np.arange(4), np.arange(2), np.arange(2, 4)
@@ -38,7 +38,7 @@ def predict(mean: Array, covariance: Array, dt_s: Array | float, acceleration: A
 
 
 def innovation(mean: Array, covariance: Array, xy: Array, r: Array, age_s: Array) -> tuple[Array, Array]:
-    """Squared Mahalanobis distance and log-determinant, both (A, M), of measurements (M, 2) against states (A, 4).
+    """Return squared Mahalanobis distances and log-determinants, both (A, M), of measurements (M, 2) against states (A, 4).
 
     `age_s` (M,) is when each was measured relative to the states: a sweep sees an object before or after the tick.
     """
@@ -67,7 +67,7 @@ def update(mean: Array, covariance: Array, xy: Array, r: Array, age_s: Array) ->
 
 
 def measurement_noise(covariance: Array, groups: NDArray[Any], *, whole_boxes: bool = False) -> Array:
-    """Noise (M, 2, 2) of box centers: the sensor's and what changing views add, which is nothing to whole boxes."""
+    """Return the noise (M, 2, 2) of box centers: the sensor's, and for partial views that of the changing view."""
     if whole_boxes:
         return covariance
     extra = np.array([CENTER_SIGMA_M[g] for g in groups.tolist()])
@@ -75,12 +75,11 @@ def measurement_noise(covariance: Array, groups: NDArray[Any], *, whole_boxes: b
 
 
 def first_velocity(yaw_rad: Array, groups: NDArray[Any], *, whole_boxes: bool = False) -> Array:
-    """Covariance (M, 2, 2) of the velocity of what was seen once: along the axis of a whole box more than across."""
+    """Return the initial covariance (M, 2, 2) of velocities; for whole boxes it is larger along the axis than across."""
     along = np.array([FIRST_SPEED_MPS[g] for g in groups.tolist()])
     if not whole_boxes:
         return (along**2)[:, None, None] * np.eye(2)
     across = along * np.array([ACROSS_SHARE[g] for g in groups.tolist()])
     axis = np.stack([np.cos(yaw_rad), np.sin(yaw_rad)], axis=-1)
-    return (across**2)[:, None, None] * np.eye(2) + (along**2 - across**2)[:, None, None] * axis[:, :, None] * axis[
-        :, None, :
-    ]
+    excess = (along**2 - across**2)[:, None, None] * axis[:, :, None] * axis[:, None, :]
+    return np.asarray((across**2)[:, None, None] * np.eye(2) + excess)

@@ -1,4 +1,4 @@
-"""Where tracks were at every tick of their lives: the tracker's own filter forward, then backward, all tracks at once."""
+"""Smoothed states of tracks at every tick: the tracker's filter forward, then backward, all tracks at once."""
 
 from __future__ import annotations
 
@@ -15,8 +15,17 @@ from log2sim.tracking.motion import ACCELERATION_MPS2, first_velocity, measureme
 
 @dataclass(frozen=True, eq=False)
 class Paths:
-    """One row a track and tick of its life, by track: `track`, `tick` (N,), `row` (N,) of the measurement in the track or -1
-    in a gap, `mean` (N, 4) x, y, vx, vy in the map and `covariance` (N, 4, 4).
+    """Smoothed states, one row a track and tick, sorted by track.
+
+    Attributes
+    ----------
+    track : (N,) int64
+    tick : (N,) int64
+    row : (N,) int64
+        Row of the measurement in the track, -1 in a gap.
+    mean : (N, 4) float64
+        x, y, vx, vy in the map.
+    covariance : (N, 4, 4) float64
     """
 
     track: NDArray[np.int64]
@@ -29,14 +38,14 @@ class Paths:
 def smooth_paths(
     tracks: Sequence[Track], t_ns: NDArray[np.int64], *, whole_boxes: bool = False, before: int = 0, after: int = 0
 ) -> Paths:
-    """Most probable states of all tracks at all ticks from their first to their last measurement.
+    """Estimate the states of all tracks at all ticks from their first to their last measurement.
 
-    They go on for `before` ticks into the past and `after` ticks into the future, as far as there are ticks.
+    They are extended by `before` ticks into the past and `after` ticks into the future, as far as there are ticks.
 
     Notes
     -----
-    Kalman filter and Rauch-Tung-Striebel smoother. All tracks go side by side, each from its own first tick on, so the cost is
-    that of the longest life.
+    Kalman filter and Rauch-Tung-Striebel smoother. All tracks are processed in parallel, each from its own first tick on, so
+    the number of steps is the length of the longest track.
     """
     if not tracks:
         none = np.zeros(0, dtype=np.int64)
@@ -50,17 +59,17 @@ def smooth_paths(
     for k, t in enumerate(tracks):
         row[start[k] + t.tick - first[k]] = np.arange(len(t))
     grid = _Grid(tracks, start, length, np.asarray(t_ns, dtype=np.int64)[tick], row, whole_boxes=whole_boxes)
-    paths = Paths(track, tick, row, *grid.smoothed())
+    paths = Paths(track, tick, row, *grid.smooth())
     ends = [start + length - 1 + 0 * k for k in range(after)], [start + 0 * k for k in range(before)]
     steps = [np.full(len(tracks), k + 1) for k in range(after)], [np.full(len(tracks), -k - 1) for k in range(before)]
     origin, step = np.concatenate([*ends[0], *ends[1], start[:0]]), np.concatenate([*steps[0], *steps[1], start[:0]])
-    return _prolonged(paths, origin, step, grid.noise, t_ns) if len(origin) else paths
+    return _extended(paths, origin, step, grid.noise, t_ns) if len(origin) else paths
 
 
-def _prolonged(
+def _extended(
     paths: Paths, origin: NDArray[np.int64], step: NDArray[np.int64], noise: Array, t_ns: NDArray[np.int64]
 ) -> Paths:
-    """The paths with rows predicted `step` (K,) ticks from the rows `origin` (K,), in the order of tracks and ticks."""
+    """Add to the paths rows predicted `step` (K,) ticks from the rows `origin` (K,), in the order of tracks and ticks."""
     tick = paths.tick[origin] + step
     there = (tick >= 0) & (tick < len(t_ns))
     origin, tick = origin[there], tick[there]
@@ -96,7 +105,8 @@ class _Grid:
         )
         self.age_s[at] = (m.t_ns - t_ns[at]) / NS_PER_S
 
-    def smoothed(self) -> tuple[Array, Array]:
+    def smooth(self) -> tuple[Array, Array]:
+        """Return the smoothed states (N, 4) and covariances (N, 4, 4)."""
         mean, covariance = np.zeros((len(self.xy), 4)), np.zeros((len(self.xy), 4, 4))
         ahead_mean, ahead_covariance = mean.copy(), covariance.copy()
         mean[self.start, :2], covariance[self.start, :2, :2] = self.xy[self.start], self.r[self.start]

@@ -1,4 +1,4 @@
-"""Stitching: tracklets that an occlusion cut in pieces become one track again."""
+"""Stitching of tracks that an occlusion interrupted."""
 
 from __future__ import annotations
 
@@ -16,18 +16,29 @@ from log2sim.tracking.motion import ACCELERATION_MPS2, first_velocity, measureme
 # 99.9 % of the squared Mahalanobis distance with 4 degrees of freedom.
 GATE = 18.5
 FORBIDDEN = 1e6
-# Where both ends could meet anywhere within this (one sigma), meeting proves nothing.
-VAGUE_M = 2.0
-# An object that stands still is the same object however long it was hidden, if it stands where it stood.
+# Largest standard deviation of the position difference; above it agreement is no evidence.
+MAX_POSITION_SIGMA_M = 2.0
+# A stationary object is joined across a gap of any length if its position stays within the offset.
 MAX_STATIONARY_MPS = 0.5
 MAX_STATIONARY_OFFSET_M = 1.0
-# What lies farther back says nothing about the end; the filter has forgotten it.
-MEMORY = 20
+# Number of measurements from the end of a track that the filter uses; earlier ones no longer influence the state.
+END_MEASUREMENTS = 20
 
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
-    """Stamps (A,), states (A, 4) and covariances (A, 4, 4) of tracks at both ends, from one filter pass in each direction."""
+    """States of tracks at both ends, from one filter pass in each direction.
+
+    Attributes
+    ----------
+    first_ns : (A,) int64
+    last_ns : (A,) int64
+    first : tuple of (A, 4) and (A, 4, 4) float64
+        States and covariances.
+    last : tuple of (A, 4) and (A, 4, 4) float64
+        States and covariances.
+    group : (A,) str
+    """
 
     first_ns: NDArray[np.int64]
     last_ns: NDArray[np.int64]
@@ -39,16 +50,16 @@ class _Ends:
 def stitch(
     tracks: Sequence[Track], t_ns: NDArray[np.int64], *, max_gap_s: float, whole_boxes: bool = False
 ) -> list[Track]:
-    """Join tracks whose ends meet, cheapest pairs first, until nothing meets any more.
+    """Join tracks whose ends agree, by optimal assignment, until no pair is left.
 
-    Both ends are carried to the middle of the gap with the uncertainty that the gap adds, and must agree there in place
-    and speed.
+    Both ends are predicted to the middle of the gap and must agree there in position and velocity, within their
+    uncertainty.
     """
     from scipy.optimize import linear_sum_assignment
 
     current = list(tracks)
     while len(current) > 1:
-        cost = _meeting_costs(_ends(current, whole_boxes=whole_boxes), max_gap_s)
+        cost = _joining_costs(_ends(current, whole_boxes=whole_boxes), max_gap_s)
         i, j = linear_sum_assignment(cost)
         met = cost[i, j] < FORBIDDEN
         if not met.any():
@@ -65,8 +76,8 @@ def stitch(
     return current
 
 
-def _meeting_costs(ends: _Ends, max_gap_s: float) -> Array:
-    """Cost (A, A) of the second track being the first one's continuation, `FORBIDDEN` where it cannot be."""
+def _joining_costs(ends: _Ends, max_gap_s: float) -> Array:
+    """Return the cost (A, A) of continuing the first track with the second, `FORBIDDEN` where that is impossible."""
     cost = np.full((len(ends.group), len(ends.group)), FORBIDDEN)
     gap_s = (ends.first_ns[None, :] - ends.last_ns[:, None]) / NS_PER_S
     stands, stood = (np.hypot(*state[:, 2:].T) < MAX_STATIONARY_MPS for state in (ends.last[0], ends.first[0]))
@@ -79,8 +90,8 @@ def _meeting_costs(ends: _Ends, max_gap_s: float) -> Array:
     cost[a[stood], b[stood]] = apart[stood]
     half = gap_s[:, None] / 2
     beside = np.hypot(*(last[:, :2] + half * last[:, 2:] - first[:, :2] + half * first[:, 2:]).T)
-    # Farther apart than this no allowed uncertainty brings them together.
-    near = np.flatnonzero(~stood & (gap_s <= max_gap_s) & (beside <= np.sqrt(GATE) * VAGUE_M))
+    # Beyond this distance no allowed uncertainty passes the gate.
+    near = np.flatnonzero(~stood & (gap_s <= max_gap_s) & (beside <= np.sqrt(GATE) * MAX_POSITION_SIGMA_M))
     a, b, half = a[near], b[near], gap_s[near] / 2
     noise = np.array([ACCELERATION_MPS2[g] for g in ends.group[a].tolist()])
     forward = predict(ends.last[0][a], ends.last[1][a], half, noise)
@@ -88,9 +99,9 @@ def _meeting_costs(ends: _Ends, max_gap_s: float) -> Array:
     difference, covariance = forward[0] - backward[0], forward[1] + backward[1]
     squared = np.einsum("ni,ni->n", difference, np.linalg.solve(covariance, difference[..., None])[..., 0])
     place = covariance[:, :2, :2]
-    sure = np.sqrt(np.linalg.eigvalsh(place)[:, -1]) <= VAGUE_M
+    sure = np.sqrt(np.linalg.eigvalsh(place)[:, -1]) <= MAX_POSITION_SIGMA_M
     good = sure & (squared <= GATE)
-    # 4 degrees of freedom; an uncertain meeting must not win over a sure one, hence the determinant.
+    # The determinant keeps an uncertain agreement from costing less than a certain one.
     cost[a[good], b[good]] = squared[good] + np.log(np.linalg.det(place[good])) + 10.0
     return cost
 
@@ -101,8 +112,8 @@ def _ends(tracks: Sequence[Track], *, whole_boxes: bool) -> _Ends:
     return _Ends(
         np.array([m.t_ns[0] for m in parts]),
         np.array([m.t_ns[-1] for m in parts]),
-        _filtered([np.arange(len(m))[:MEMORY][::-1] for m in parts], parts, group, whole_boxes=whole_boxes),
-        _filtered([np.arange(len(m))[-MEMORY:] for m in parts], parts, group, whole_boxes=whole_boxes),
+        _filtered([np.arange(len(m))[:END_MEASUREMENTS][::-1] for m in parts], parts, group, whole_boxes=whole_boxes),
+        _filtered([np.arange(len(m))[-END_MEASUREMENTS:] for m in parts], parts, group, whole_boxes=whole_boxes),
         group,
     )
 
@@ -110,7 +121,7 @@ def _ends(tracks: Sequence[Track], *, whole_boxes: bool) -> _Ends:
 def _filtered(
     orders: Sequence[NDArray[np.intp]], parts: Sequence[Measurements], group: NDArray[np.str_], *, whole_boxes: bool
 ) -> tuple[Array, Array]:
-    """Filter states (A, 4) and covariances (A, 4, 4) of all tracks after the last of the rows that each is given in order."""
+    """Filter the rows of every track in the given orders; return the final states (A, 4) and covariances (A, 4, 4)."""
     count = np.array([len(o) for o in orders])
     start = np.cumsum(count) - count
     xy = np.concatenate([m.center_m[o, :2] for m, o in zip(parts, orders)])

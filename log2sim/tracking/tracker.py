@@ -24,7 +24,7 @@ def track(
     min_life_s: float,
     whole_boxes: bool = False,
 ) -> list[Track]:
-    """Turn the measurements of T ticks into tracks, longest lives first by their start.
+    """Turn the measurements of T ticks into tracks, sorted by their first tick.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def track(
     whole_boxes : bool
         Whether the measurements come from a 3D detector: centers that do not move with the view, yaw along the motion.
     min_life_s : float
-        Tracks seen for a shorter time, after stitching, are taken for false alarms, unless the log itself is as short.
+        Shorter tracks, after stitching, are dropped as false alarms, unless the log itself is as short.
     """
     tracklets = track_forward(measurements, t_ns, birth_score=birth_score, whole_boxes=whole_boxes)
     everything = Measurements.join(measurements)
@@ -46,15 +46,15 @@ def track(
         rows = everything.take(first_row[t.ticks] + t.rows)
         tracks.append(Track(voted_category(rows), t.ticks, rows))
     joined = stitch(tracks, t_ns, max_gap_s=max_gap_s, whole_boxes=whole_boxes)
-    least = least_hits(t_ns, min_life_s)
-    kept = [t for t in joined if len(t) >= least]
+    required = min_hits(t_ns, min_life_s)
+    kept = [t for t in joined if len(t) >= required]
     if not whole_boxes:
         kept = [replace(t, category=decide_category(t.measurements)) for t in kept]
     return sorted(kept, key=lambda t: (int(t.tick[0]), float(t.measurements.center_m[0, 0])))
 
 
-def least_hits(t_ns: NDArray[np.int64], min_life_s: float) -> int:
-    """How many measurements a track needs: so many ticks as the least life lasts, and one in a log of one tick."""
+def min_hits(t_ns: NDArray[np.int64], min_life_s: float) -> int:
+    """Return the number of measurements that a track needs: the ticks in `min_life_s`, 1 in a log of one or two ticks."""
     if len(t_ns) < 3:
         return 1
     period_s = float(np.median(np.diff(t_ns))) / NS_PER_S

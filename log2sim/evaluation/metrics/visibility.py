@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import NEAREST_DEPTH_M, Array, Camera, apply, box_corners, outline, points_in_box, project
+from log2sim.geometry import MIN_DEPTH_M, Array, Camera, apply, box_corners, outline, points_in_box, project
 
 CELL_M = 2.0
 SAMPLES_PER_SIDE = 32
@@ -53,7 +53,7 @@ def image_shares(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Arra
     corner_inside = in_image.reshape(-1, 8)
     in_cam = in_cam.reshape(-1, 8, 3)
     shares = np.where(corner_inside.all(1), 1.0, 0.0)
-    for k in np.flatnonzero(~corner_inside.all(1) & (in_cam[..., 2] > NEAREST_DEPTH_M).any(1)):
+    for k in np.flatnonzero(~corner_inside.all(1) & (in_cam[..., 2] > MIN_DEPTH_M).any(1)):
         samples = _samples(convex_hull(outline(in_cam[k])))
         if len(samples):
             _, inside = project(camera, np.column_stack([samples, np.ones(len(samples))]))

@@ -125,6 +125,6 @@ class AzimuthIndex:
 
 
 def _direction(azimuth: Any) -> NDArray[np.float64]:
-    """Unit vectors (..., 2) of azimuths (...) in steps."""
+    """Return unit vectors (..., 2) of azimuths (...) in steps."""
     angle = np.asarray(azimuth) * STEP_RAD
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)

@@ -196,7 +196,7 @@ def region_grow(xy_all: NDArray[np.float32], seed: NDArray[np.float32], category
     near = np.flatnonzero(np.abs(xy_all[:, 0] - center[0]) <= reach)
     near = near[np.abs(xy_all[near, 1] - center[1]) <= reach]
     if len(near) == 0:
-        return near
+        return np.zeros(0, dtype=np.intp)
     labels = clusters_of(np.vstack([xy_all[near], seed]), CELL_M[GROUP_OF[category]])
     wanted = np.bincount(labels[len(near) :]).argmax()
     kept = near[labels[: len(near)] == wanted]

@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import NEAREST_DEPTH_M, Array, Camera, fold_radius, project, undistort
+from log2sim.geometry import MIN_DEPTH_M, Array, Camera, fold_radius, project, undistort
 
 BORDER_SAMPLES = 33
 # Margin for the curvature of the image border between its samples, and the widest frustum, both as tangents.
@@ -88,7 +88,7 @@ def project_points(view: View, origin: Array, columns: NDArray[np.float32]) -> P
     np.matmul((K @ cam_R_map).astype(np.float32), columns, out=turned)
     turned += (K @ offset).astype(np.float32)[:, None]
     z = turned[2]
-    np.greater(z, np.float32(NEAREST_DEPTH_M), out=mark)
+    np.greater(z, np.float32(MIN_DEPTH_M), out=mark)
     for axis in (0, 1):
         # The lower bounds of a pinhole's image are zero.
         edge = np.multiply(z, np.float32(low[axis]), out=bound) if lens else np.float32(0.0)
