@@ -57,8 +57,10 @@ def moving_candidate(
     Notes
     -----
     A first smoothing of the provisional positions gives the headings. With these the evidence gives one size and, by laying
-    the whole box against the observed ends, the final positions. LiDAR matches before, after and between the detections
-    join them, and a second smoothing gives the trajectory.
+    the whole box against the observed ends, better positions; smoothed, they give better headings and the final
+    positions. LiDAR matches before, after and between the detections join them, and the last smoothing gives the
+    trajectory. Without the second smoothing, cars beside a parked one are taken for it (PandaSet 002 with labeled boxes:
+    two identity switches, speed RMSE 0.59 instead of 0.27 m/s).
     """
     track = _one_at_a_moment(track)
     m, group = track.measurements, GROUP_OF[track.category]
@@ -66,6 +68,9 @@ def moving_candidate(
     noise = CENTER_SIGMA_M[group] ** 2 * np.eye(2)
     motion = MotionModel(JERK_DENSITY.get(group), holonomic=group == "pedestrian", heading_rad=_first_heading(track))
     rough = smooth_track(t, m.center_m[:, :2], covariance=m.covariance + noise, at_s=t, motion=motion)
+    headings = _headings(rough, group)
+    geometry = moving_geometry(track, headings)
+    rough = smooth_track(t, geometry.xy_m, covariance=geometry.covariance + noise, at_s=t, motion=motion)
     headings = _headings(rough, group)
     geometry = moving_geometry(track, headings)
     matches = _lidar_matches(track, rough, headings, geometry, obstacles, timeline)
