@@ -56,10 +56,13 @@ def reconstruct(
     with progress(quiet=quiet) as report_progress:
         result = run(opened, chosen, progress=report_progress)
     if topdown is not None:
+        from log2sim.perception.frames import RecordReader
         from log2sim.visualization.birdseye.mosaic import write_image
         from log2sim.visualization.birdseye.of_log import birdseye_of_log
 
-        write_image(birdseye_of_log(opened, result.scenario), topdown, overwrite=overwrite)
+        reader = RecordReader(opened)
+        write_image(birdseye_of_log(opened, result.scenario, reader), topdown, overwrite=overwrite)
+        result.report["unreadable"] = {**reader.summary(), **result.report["unreadable"]}
     if report is not None:
         write_json(report, result.report)
     result.scenario.save(out)

@@ -44,7 +44,9 @@ class RecordReader:
                 raise RecordError(f"sweep at stamp {record.stamp_ns} has no finite point")
         except RecordError as error:
             with self._lock:
-                self.failed.setdefault(stream, []).append(str(error))
+                problems = self.failed.setdefault(stream, [])
+                if str(error) not in problems:  # a record that is asked for again fails again
+                    problems.append(str(error))
             return None
         with self._lock:
             self.read[stream] = self.read.get(stream, 0) + 1

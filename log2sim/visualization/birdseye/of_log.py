@@ -9,8 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from log2sim.datatypes import Log, Scenario
-from log2sim.errors import RecordError
-from log2sim.geometry import NS_PER_S
+from log2sim.geometry import NS_PER_S, nearest_index
+from log2sim.perception.first_pass import cloud_origin
+from log2sim.perception.frames import RecordReader
 from log2sim.visualization.birdseye.ground_view import GroundView
 from log2sim.visualization.birdseye.mosaic import BirdsEyeView, Mosaic
 
@@ -21,13 +22,18 @@ MARGIN_M = 35.0
 RESOLUTION_M = 0.06
 
 
-def birdseye_of_log(log: Log, scenario: Scenario) -> BirdsEyeView:
+def birdseye_of_log(log: Log, scenario: Scenario, reader: RecordReader | None = None) -> BirdsEyeView:
     """Map the ground around the ego's path, or around the sensors of a roadside log.
 
-    The cameras are those that the scenario was made with, or all of the log where it names none, as truth does.
-    """
-    from log2sim.perception.first_pass import cloud_origin
+    The cameras are those that the scenario was made with, or all of the log where it names none, as truth does. `reader`
+    counts the images that cannot be read.
 
+    Raises
+    ------
+    LogError
+        When no image of a camera can be read.
+    """
+    reader = reader or RecordReader(log)
     used = [str(c["name"]) for c in scenario.cameras if c.get("used") and c["name"] in log.cameras]
     used = used or list(log.cameras)
     stamps = scenario.t0_ns + np.round(np.linspace(0, scenario.duration_s, TICKS) * NS_PER_S).astype(np.int64)
@@ -40,14 +46,13 @@ def birdseye_of_log(log: Log, scenario: Scenario) -> BirdsEyeView:
         views = []
         for name in used:
             stream = log.streams[name]
-            i = int(np.argmin(np.abs(stream.t_ns - t)))
+            i = int(nearest_index(stream.t_ns, t)[0])
             map_T_cam, known = log.map_T_sensor(name, stream.t_ns[i])
             if not known[0]:
                 continue
-            try:
-                image = stream.read(i)
-            except RecordError:
-                continue
-            views.append(GroundView.from_pose(image, log.cameras[name], map_T_cam[0], ground_z))
+            image = reader.get(name, i)
+            if image is not None:
+                views.append(GroundView.from_pose(image, log.cameras[name], map_T_cam[0], ground_z))
         mosaic.add(views)
+    reader.require_some()
     return mosaic.image()
