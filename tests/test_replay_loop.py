@@ -306,7 +306,7 @@ def test_the_command_line_lets_agents_react(tmp_path):
     for options, said in (
         (("--agents", "smart"), "expected log or reactive"),
         (("--react", "h"), "there is none of that id"),
-        (("--react", "f", "--agents", "reactive"), "give one of them"),
+        (("--react", "f", "--agents", "reactive"), "--react"),
     ):
         ran = run("replay", tmp_path / "s.json", *options)
         assert ran.code == 2
