@@ -298,7 +298,7 @@ def test_what_nobody_observed_is_pale(browser: Browser, tmp_path: Path) -> None:
     assert text_of(browser, "agent-now").endswith("yes")
     browser.run("log2sim.time = 1.5")
     assert min(pixel(browser, place_of(browser, "ego") + behind)) > 150
-    assert text_of(browser, "agent-now").endswith("no, filled in between")
+    assert text_of(browser, "agent-now").endswith("no, interpolated")
 
 
 def test_a_click_on_an_agent_shows_its_panel(browser: Browser, sample: Path) -> None:
@@ -529,7 +529,7 @@ def test_the_list_is_searched(browser: Browser, sample: Path) -> None:
     assert browser.run("return log2sim.chosen") == "car_parked"
     browser.run("const s = document.getElementById('search'); s.value = 'xyz'; s.dispatchEvent(new Event('input'))")
     assert browser.run(shown) == []
-    assert text_of(browser, "more") == "No agent is called so."
+    assert text_of(browser, "more") == "No agent matches."
 
 
 def test_an_agent_chosen_from_the_list_comes_into_sight(browser: Browser, tmp_path: Path) -> None:
@@ -549,7 +549,7 @@ def test_the_list_is_put_away_and_an_agent_shown_all_the_same(
     browser: Browser, sample: Path, size: tuple[int, int], first: bool
 ) -> None:
     opened(browser, sample, size=size)
-    script = "return ['roles', 'details'].map((id) => document.getElementById(id).getClientRects().length > 0)"
+    script = "return ['agent-list', 'details'].map((id) => document.getElementById(id).getClientRects().length > 0)"
     assert browser.run(script) == [first, False]
     browser.press("a")
     assert browser.run(script) == [not first, False]
