@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import Enum, StrEnum
 from typing import Any
@@ -268,8 +267,3 @@ def _fusion(cameras: tuple[str, ...]) -> Decision:
     if len(cameras) > 1:
         return Decision(Stage.FUSION, True, f"{len(cameras)} cameras")
     return Decision(Stage.FUSION, False, "one camera; only duplicates of its detector are dropped")
-
-
-def to_list(decisions: tuple[Decision, ...]) -> list[Mapping[str, Any]]:
-    """Return decisions as scenario.json holds them."""
-    return [d.to_dict() for d in decisions]

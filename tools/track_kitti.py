@@ -20,13 +20,13 @@ from pathlib import Path
 import numpy as np
 from kitti_boxes import Boxes, read_detections, write_tracks
 from kitti_map import PERIOD_NS, View, from_map, hidden_share, read_view, to_measurements
+from kitti_paths import smooth_paths
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Measurements, Track
 from log2sim.errors import Log2SimError, LogError
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.tracking.forward import ForwardTracker
-from log2sim.tracking.path import smooth_paths
 from log2sim.tracking.tracker import track
 
 # A detector that finds a rider on a bicycle often finds a pedestrian there as well.

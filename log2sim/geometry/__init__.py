@@ -20,7 +20,7 @@ from log2sim.geometry.overlap import (
     separating_axes,
 )
 from log2sim.geometry.poses import PoseTrack
-from log2sim.geometry.stamps import NS_PER_S, nearest_index
+from log2sim.geometry.stamps import NS_PER_S, nearest_index, period_of
 from log2sim.geometry.transforms import (
     Array,
     apply,
@@ -60,6 +60,7 @@ __all__ = [
     "outline",
     "overlap_area",
     "overlap_of_smaller",
+    "period_of",
     "points_in_box",
     "polygon_area",
     "project",

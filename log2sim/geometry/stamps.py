@@ -10,6 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 NS_PER_S = 1_000_000_000
 
 
+def period_of(t_ns: NDArray[np.int64]) -> float:
+    """Return the median period of stamps (T,), s; 0 for a single one."""
+    return float(np.median(np.diff(t_ns))) / NS_PER_S if len(t_ns) > 1 else 0.0
+
+
 def nearest_index(stamps: NDArray[Any], t: ArrayLike) -> NDArray[np.int64]:
     """Find the nearest stamp to each time.
 

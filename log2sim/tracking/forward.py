@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, GROUPS, Measurements
-from log2sim.geometry import NS_PER_S, Array
+from log2sim.geometry import NS_PER_S, Array, period_of
 from log2sim.tracking.motion import ACCELERATION_MPS2, first_velocity, innovation, measurement_noise, predict, update
 
-# 99.9 % of the squared Mahalanobis distance with 2 degrees of freedom.
-GATE = 13.8
+# Gate: 99.9 % quantile of the squared Mahalanobis distance with 2 degrees of freedom.
+CHI2_2DOF_999 = 13.8
 NOT_ALLOWED = 1e6
 # A rider is taken for a pedestrian now and then and the other way round; it costs as much as 2.4 sigma.
 OTHER_GROUP_COST = 6.0
@@ -68,11 +68,6 @@ def track_forward(
     cuts = np.flatnonzero(np.diff(number[order])) + 1
     means = tracker.last_states()
     return [Tracklet(ticks[i], rows[i], means[k]) for k, i in enumerate(np.split(order, cuts))] if len(order) else []
-
-
-def period_of(t_ns: NDArray[np.int64]) -> float:
-    """Return the median time between ticks (T,), s; 0 for a single one."""
-    return float(np.median(np.diff(t_ns))) / NS_PER_S if len(t_ns) > 1 else 0.0
 
 
 class ForwardTracker:
@@ -164,7 +159,7 @@ class ForwardTracker:
             return none, none
         squared, log_determinant = innovation(self.mean, self.covariance, columns.xy, columns.r, columns.age_s)
         cost = squared + log_determinant + _GROUP_COST[self._group[:, None], columns.group]
-        cost[(squared > GATE) | (cost >= NOT_ALLOWED / 2)] = NOT_ALLOWED
+        cost[(squared > CHI2_2DOF_999) | (cost >= NOT_ALLOWED / 2)] = NOT_ALLOWED
         chosen = []
         for stage in (strong, ~strong):
             rows = np.flatnonzero(stage)

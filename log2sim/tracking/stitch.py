@@ -13,8 +13,8 @@ from log2sim.geometry import NS_PER_S, Array
 from log2sim.tracking.category import voted_category
 from log2sim.tracking.motion import ACCELERATION_MPS2, first_velocity, measurement_noise, predict, update
 
-# 99.9 % of the squared Mahalanobis distance with 4 degrees of freedom.
-GATE = 18.5
+# Gate: 99.9 % quantile of the squared Mahalanobis distance with 4 degrees of freedom.
+CHI2_4DOF_999 = 18.5
 FORBIDDEN = 1e6
 # Largest standard deviation of the position difference; above it agreement is no evidence.
 MAX_POSITION_SIGMA_M = 2.0
@@ -61,10 +61,10 @@ def stitch(
     while len(current) > 1:
         cost = _joining_costs(_ends(current, whole_boxes=whole_boxes), max_gap_s)
         i, j = linear_sum_assignment(cost)
-        met = cost[i, j] < FORBIDDEN
-        if not met.any():
+        joins = cost[i, j] < FORBIDDEN
+        if not joins.any():
             break
-        following = dict(zip(i[met].tolist(), j[met].tolist()))
+        following = dict(zip(i[joins].tolist(), j[joins].tolist()))
         heads = sorted(set(range(len(current))) - set(following.values()))
         joined = []
         for head in heads:
@@ -80,29 +80,33 @@ def _joining_costs(ends: _Ends, max_gap_s: float) -> Array:
     """Return the cost (A, A) of continuing the first track with the second, `FORBIDDEN` where that is impossible."""
     cost = np.full((len(ends.group), len(ends.group)), FORBIDDEN)
     gap_s = (ends.first_ns[None, :] - ends.last_ns[:, None]) / NS_PER_S
-    stands, stood = (np.hypot(*state[:, 2:].T) < MAX_STATIONARY_MPS for state in (ends.last[0], ends.first[0]))
-    still = stands[:, None] & stood[None, :]
-    a, b = np.nonzero((gap_s > 0) & (still | (gap_s <= max_gap_s)) & (ends.group[:, None] == ends.group[None, :]))
-    gap_s, still = gap_s[a, b], still[a, b]
+    ends_stationary, starts_stationary = (
+        np.hypot(*state[:, 2:].T) < MAX_STATIONARY_MPS for state in (ends.last[0], ends.first[0])
+    )
+    stationary = ends_stationary[:, None] & starts_stationary[None, :]
+    a, b = np.nonzero((gap_s > 0) & (stationary | (gap_s <= max_gap_s)) & (ends.group[:, None] == ends.group[None, :]))
+    gap_s, stationary = gap_s[a, b], stationary[a, b]
     last, first = ends.last[0][a], ends.first[0][b]
-    apart = np.hypot(*(last - first)[:, :2].T)
-    stood = still & (apart < MAX_STATIONARY_OFFSET_M)
-    cost[a[stood], b[stood]] = apart[stood]
+    offset_m = np.hypot(*(last - first)[:, :2].T)
+    same_place = stationary & (offset_m < MAX_STATIONARY_OFFSET_M)
+    cost[a[same_place], b[same_place]] = offset_m[same_place]
     half = gap_s[:, None] / 2
-    beside = np.hypot(*(last[:, :2] + half * last[:, 2:] - first[:, :2] + half * first[:, 2:]).T)
+    midpoint_offset_m = np.hypot(*(last[:, :2] + half * last[:, 2:] - first[:, :2] + half * first[:, 2:]).T)
     # Beyond this distance no allowed uncertainty passes the gate.
-    near = np.flatnonzero(~stood & (gap_s <= max_gap_s) & (beside <= np.sqrt(GATE) * MAX_POSITION_SIGMA_M))
+    near = np.flatnonzero(
+        ~same_place & (gap_s <= max_gap_s) & (midpoint_offset_m <= np.sqrt(CHI2_4DOF_999) * MAX_POSITION_SIGMA_M)
+    )
     a, b, half = a[near], b[near], gap_s[near] / 2
     noise = np.array([ACCELERATION_MPS2[g] for g in ends.group[a].tolist()])
     forward = predict(ends.last[0][a], ends.last[1][a], half, noise)
     backward = predict(ends.first[0][b], ends.first[1][b], -half, noise)
     difference, covariance = forward[0] - backward[0], forward[1] + backward[1]
     squared = np.einsum("ni,ni->n", difference, np.linalg.solve(covariance, difference[..., None])[..., 0])
-    place = covariance[:, :2, :2]
-    sure = np.sqrt(np.linalg.eigvalsh(place)[:, -1]) <= MAX_POSITION_SIGMA_M
-    good = sure & (squared <= GATE)
+    position_covariance = covariance[:, :2, :2]
+    certain = np.sqrt(np.linalg.eigvalsh(position_covariance)[:, -1]) <= MAX_POSITION_SIGMA_M
+    good = certain & (squared <= CHI2_4DOF_999)
     # The determinant keeps an uncertain agreement from costing less than a certain one.
-    cost[a[good], b[good]] = squared[good] + np.log(np.linalg.det(place[good])) + 10.0
+    cost[a[good], b[good]] = squared[good] + np.log(np.linalg.det(position_covariance[good])) + 10.0
     return cost
 
 

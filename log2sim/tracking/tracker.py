@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Measurements, Track
-from log2sim.geometry import NS_PER_S
+from log2sim.geometry import period_of
 from log2sim.tracking.category import decide_category, voted_category
 from log2sim.tracking.forward import track_forward
 from log2sim.tracking.stitch import stitch
@@ -57,5 +57,4 @@ def min_hits(t_ns: NDArray[np.int64], min_life_s: float) -> int:
     """Return the number of measurements that a track needs: the ticks in `min_life_s`, 1 in a log of one or two ticks."""
     if len(t_ns) < 3:
         return 1
-    period_s = float(np.median(np.diff(t_ns))) / NS_PER_S
-    return max(2, min(round(min_life_s / period_s), len(t_ns) // 2))
+    return max(2, min(round(min_life_s / period_of(t_ns)), len(t_ns) // 2))

@@ -23,7 +23,7 @@ from log2sim.evaluation.bench.pareto import Point
 from log2sim.evaluation.bench.scores import EVERYTHING, Scope, Score, check_scope, score_scenario
 from log2sim.evaluation.bench.settings import Grid, Setting
 from log2sim.evaluation.bench.shared_detections import RecordedDetections, detect_once
-from log2sim.geometry import NS_PER_S
+from log2sim.geometry import period_of
 from log2sim.perception.first_pass import Observations, observe
 from log2sim.perception.fusion import fuse
 from log2sim.perception.homography_stage import CameraHomography, estimation_options, fit_homographies
@@ -74,8 +74,7 @@ class BenchContext:
     @property
     def tick_s(self) -> float:
         """Median time between two ticks, s; 0 for a single one."""
-        t = self.schedule.t_ns
-        return float(np.median(np.diff(t))) / NS_PER_S if len(t) > 1 else 0.0
+        return period_of(self.schedule.t_ns)
 
     def ms_per_tick(self, seconds: float) -> float:
         """Convert seconds of the whole log to milliseconds a tick."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import NS_PER_S, Array, rectangles_overlap, wrap_angle
+from log2sim.geometry import NS_PER_S, Array, period_of, rectangles_overlap, wrap_angle
 
 # A box without a partner on the other side of the frame is used up to this age: half a period of 10 Hz and some.
 MAX_AGE_S = 0.055
@@ -57,7 +57,7 @@ def window_ns(t_ns: NDArray[np.int64]) -> int:
     Some logs stamp all boxes of a sweep alike, others each by its own points, from which no period can be read.
     """
     stamps = np.unique(t_ns)
-    period_s = float(np.median(np.diff(stamps))) / NS_PER_S if len(stamps) > 1 else 0.0
+    period_s = period_of(stamps)
     if period_s < SCATTERED_S:
         return round(SCATTERED_WINDOW_S * NS_PER_S)
     return round(min(1.05 * period_s, MAX_WINDOW_S) * NS_PER_S)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from test_track import OPTIONS, line, names_of, record, seen, stamps
@@ -9,8 +12,10 @@ from test_track import OPTIONS, line, names_of, record, seen, stamps
 from log2sim.datatypes import Measurements, Track
 from log2sim.geometry import NS_PER_S
 from log2sim.tracking.motion import ACCELERATION_MPS2, FIRST_SPEED_MPS, first_velocity, measurement_noise, predict
-from log2sim.tracking.path import smooth_paths
 from log2sim.tracking.tracker import track
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
+from kitti_paths import smooth_paths
 
 
 def a_track(ticks: list[int], t_ns: np.ndarray, seed: int = 0, category: str = "car", sigma_m: float = 0.3) -> Track:
