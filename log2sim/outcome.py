@@ -1,4 +1,4 @@
-"""What came of a plan: what each stage did, told by the counts that the stages return."""
+"""What came of a plan: what each stage did, from the counts that the stages return."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Outcome:
     decision : Decision
         As planned, or as the data turned out: a stage that was planned and had nothing to do was not kept.
     saved_s : float or None
-        Seconds that leaving out (a part of) the stage saved, None where the run cannot tell.
+        Seconds that leaving out (a part of) the stage saved, None where unknown.
     saved_how : str or None
         How `saved_s` was estimated.
     """

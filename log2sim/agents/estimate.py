@@ -25,7 +25,7 @@ def estimate_agents(
     *,
     smooth: bool,
 ) -> list[AgentCandidate]:
-    """Make a candidate of every track, moving ones first, since moving traffic tells which way parked vehicles point.
+    """Make a candidate of every track, moving ones first, since parked vehicles point with the moving traffic.
 
     Parameters
     ----------

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M, Track
+from log2sim.datatypes import CATEGORY, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M, Track
 from log2sim.geometry import Array
 from log2sim.perception import box_completion, box_fitting
 from log2sim.perception.lidar.clusters import MIN_CLUSTER_POINTS
@@ -24,9 +24,6 @@ SIZE_QUANTILE = 0.85
 MAX_TRIM_M = 0.1
 # Points of a static object are persistent if so many of the ticks have points in their cell.
 VOXEL_M = 0.15
-# Length of a striding person as a share of the height: steps of a fast walk have about half of it (Winter, "Biomechanics
-# and Motor Control of Human Movement"), arms and feet add the rest.
-MAX_STRIDE_PER_HEIGHT = 0.8
 MIN_PERSISTENT_SHARE = 0.15
 MAX_POINTS_PER_TICK = 150
 # Fewer persistent points do not show a shape.
@@ -89,7 +86,7 @@ def static_geometry(track: Track) -> TrackGeometry:
         np.tile(box_completion.oriented_covariance(sigma, yaw), (n, 1, 1)),
         np.full(n, np.median(z)),
         float(yaw),
-        is_likely and _has_human_proportions(size, height, track.category),
+        is_likely and _is_likely_height(size, height, track.category),
     )
 
 
@@ -111,13 +108,13 @@ def moving_geometry(track: Track, yaw_rad: Array) -> TrackGeometry:
     covariance[rows] = box_completion.oriented_covariance(sigma, yaw)
     height, z = _height(track)
     is_likely = is_likely and height > MIN_SIZE_M[track.category][2]
-    is_likely = is_likely and _has_human_proportions(size, height, track.category)
+    is_likely = is_likely and _is_likely_height(size, height, track.category)
     return TrackGeometry(np.append(size, height), xy, covariance, z, None, is_likely)
 
 
-def _has_human_proportions(size_m: Array, height_m: float, category: str) -> bool:
-    """Return whether a pedestrian is no longer than a stride; True for other categories."""
-    return category != "pedestrian" or bool(size_m.max() <= MAX_STRIDE_PER_HEIGHT * height_m)
+def _is_likely_height(size_m: Array, height_m: float, category: str) -> bool:
+    """Return whether the height fits the category and the length (2,) and width of the object."""
+    return bool(size_m.max() <= CATEGORY[category].max_length_per_height * height_m)
 
 
 def _persistent_points(clusters: list[NDArray[np.float64]]) -> Array:

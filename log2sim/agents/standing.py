@@ -1,4 +1,4 @@
-"""Vehicles and people that stand still: which tracks do, and which way a parked vehicle points."""
+"""Static objects: which tracks do not move, and which way a parked vehicle points."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ class Side(IntEnum):
     LEFT = -1
 
 
-# A slower mean velocity, or one that its own uncertainty explains, is none.
+# A mean velocity below this, or within its own uncertainty, is no motion. The drift is the velocity times the duration.
 MAX_STATIC_SPEED_MPS = {"vehicle": 0.35, "two_wheeler": 0.3, "pedestrian": 0.2, "other": 0.35}
 MAX_STATIC_DRIFT_M = {"vehicle": 1.2, "two_wheeler": 0.8, "pedestrian": 0.5, "other": 1.2}
 SIGNIFICANT_SIGMAS, EXCLUDED_SIGMAS = 2.0, 3.0
 SPREAD_QUANTILE = 0.9
-# What an end that was seen is off by: rounded corners, gaps between rays.
+# Error of an observed end: rounded corners, gaps between rays.
 END_SIGMA_M = 0.25
 # Tuning constant of Cauchy's weights with 95 % efficiency for normal errors (Holland & Welsch, 1977).
 CAUCHY_SIGMAS = 2.385
 REWEIGHTINGS = 5
-# Traffic that meets does so on one road: this far apart at most, and further apart than one lane's traffic wanders.
+# Vehicles that meet on one road pass each other within the road's width, and farther to the side than vehicles of one lane.
 ROAD_M, LANE_M = 20.0, 1.8
 PATH_SAMPLES = 40
 OPPOSITE_COS, PARALLEL_COS = -0.7, 0.7
@@ -44,12 +44,12 @@ USUAL_SIDE = Side.RIGHT
 
 
 def is_static(track: Track) -> bool:
-    """Whether a track never moves: its robust mean velocity and its drift stay within what changing views explain.
+    """Return whether a track never moves: its robust velocity and drift are within the errors that changing views cause.
 
     Notes
     -----
-    The center of a vehicle is a guess as long as parts of it are hidden, and of a long one off by meters: one whose center
-    seems to move still stands if the ends that were seen stand, and are known well enough to exclude its motion.
+    While parts of a vehicle are hidden its center is uncertain, by meters for a long one. A vehicle whose center seems to
+    move is static if its observed ends do not move and are accurate enough to exclude the motion of the center.
     """
     m, group = track.measurements, GROUP_OF[track.category]
     if len(m) < 3:
@@ -67,7 +67,7 @@ def is_static(track: Track) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """Uniform motion of what was seen of a track.
+    """Uniform motion fitted to the observations of a track.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class _Motion:
     sigma_mps : float
         Its standard deviation.
     spread_m : float
-        How far nine of ten positions lie from their mean at most, beyond what their uncertainty explains.
+        The `SPREAD_QUANTILE` of the distances from the mean position, less two standard deviations of each.
     """
 
     velocity: Array
@@ -85,7 +85,7 @@ class _Motion:
 
 
 def _is_none(motion: _Motion, span_s: float, group: str) -> bool:
-    """Whether a motion is so slow, or so uncertain, that it is taken for none."""
+    """Return whether a motion is too slow or too uncertain to count as one."""
     speed = float(np.hypot(*motion.velocity))
     drift = speed * span_s
     slow = (
@@ -95,17 +95,17 @@ def _is_none(motion: _Motion, span_s: float, group: str) -> bool:
 
 
 def _motion_of_centers(t: Array, m: Measurements, sigma_m: float) -> _Motion:
-    """Motion of box centers; `sigma_m` is what changing views add to their noise."""
+    """Fit the motion of box centers; `sigma_m` is the noise that changing views add."""
     xy = m.center_m[:, :2] - np.median(m.center_m[:, :2], axis=0)
     largest: Array = np.linalg.eigvalsh(m.covariance)[:, -1].astype(np.float64)
     center, velocity, sigma_mps = robust_line(t, xy, largest + sigma_m**2)
-    # Where little of it shows its center is a guess, so what the covariance explains is no motion.
+    # Within its covariance a center has not moved.
     spread = np.hypot(*(xy - center).T) - 2 * np.sqrt(largest)
     return _Motion(velocity, sigma_mps, float(np.quantile(spread, SPREAD_QUANTILE)))
 
 
 def _motion_of_ends(t: Array, m: Measurements) -> _Motion | None:
-    """Motion of the ends that were seen; None unless ends were seen most of the time on both axes."""
+    """Fit the motion of the observed ends; None unless both axes have one at most measurements."""
     rows = np.flatnonzero([len(c) > 0 for c in m.cluster])
     if len(rows) < 3:
         return None
@@ -113,24 +113,24 @@ def _motion_of_ends(t: Array, m: Measurements) -> _Motion | None:
     both = [box_fitting.extents(m.cluster[k][:, :2] - origin, yaw) for k in rows]
     ends = np.stack([np.stack(e, axis=1) for e in both])
     sensor = box_fitting.rotate(m.sensor_m[rows, :2] - origin, -yaw)
-    shown = real_ends(ends[..., 0], ends[..., 1], sensor, m.ends_visible[rows]) > 0
-    # Between its points an end may lie that none of them shows.
+    real = real_ends(ends[..., 0], ends[..., 1], sensor, m.ends_visible[rows]) > 0
+    # The end may lie between two points of the cluster.
     gap = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=1) / np.sqrt(m.points[rows])
     variance = END_SIGMA_M**2 + gap**2
     velocity, sigma, spread = np.zeros(2), np.zeros(2), np.zeros(2)
     for axis in range(2):
-        if np.any(shown[:, axis], axis=1).mean() <= 0.5:
+        if np.any(real[:, axis], axis=1).mean() <= 0.5:
             return None
-        # What is rigid moves with both ends: where one stands, the other only shows more and more of it.
+        # A rigid object moves with both ends: if one is static, the other moves because more of the object becomes visible.
         slowest = np.inf
-        for end in np.flatnonzero(shown[:, axis].mean(axis=0) > 0.25):
-            seen = np.flatnonzero(shown[:, axis, end])
-            place, speed, sigma_mps = robust_line(t[rows[seen]], ends[seen, axis, end, None], variance[seen])
+        for end in np.flatnonzero(real[:, axis].mean(axis=0) > 0.25):
+            visible = np.flatnonzero(real[:, axis, end])
+            mean, speed, sigma_mps = robust_line(t[rows[visible]], ends[visible, axis, end, None], variance[visible])
             if abs(speed[0]) < slowest:
                 slowest = abs(float(speed[0]))
                 velocity[axis], sigma[axis] = speed[0], sigma_mps
-                apart = np.abs(ends[seen, axis, end] - place[0]) - 2 * np.sqrt(variance[seen])
-                spread[axis] = np.quantile(apart, SPREAD_QUANTILE)
+                excess_m = np.abs(ends[visible, axis, end] - mean[0]) - 2 * np.sqrt(variance[visible])
+                spread[axis] = np.quantile(excess_m, SPREAD_QUANTILE)
     return _Motion(velocity, float(sigma.max()), float(spread.max()))
 
 
@@ -173,7 +173,7 @@ def robust_line(t: Array, xy: Array, variance: Array) -> tuple[Array, Array, flo
 
 
 def side_of_traffic(paths: Sequence[Array]) -> Side:
-    """Which side of the road the traffic of a log keeps to, from vehicles that meet each other.
+    """Infer the side of the road that traffic keeps to, from vehicles that meet each other.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ def side_of_traffic(paths: Sequence[Array]) -> Side:
 
 
 def parked_heading(yaw_rad: float, xy: Array, flow: Array, *, side: Side = USUAL_SIDE) -> float:
-    """Choose between the two directions of a standing vehicle: it points the way the traffic of its side goes.
+    """Choose between the two directions of a parked vehicle: that of the traffic on its side of the road.
 
     Parameters
     ----------
@@ -218,8 +218,8 @@ def parked_heading(yaw_rad: float, xy: Array, flow: Array, *, side: Side = USUAL
 
     Notes
     -----
-    What stands on a moving vehicle's own side of the road points along its path, what stands beyond the oncoming lane
-    points against it. Each moment of each path votes, the nearer to the side the more.
+    A vehicle parked on a moving vehicle's own side of the road points along its path, one parked beyond the oncoming lane
+    against it. Every position of every path votes, weighted by its nearness.
     """
     if len(flow) == 0:
         return float(wrap_angle(yaw_rad))

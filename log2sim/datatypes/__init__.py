@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from log2sim.datatypes.agent import Agent
-from log2sim.datatypes.categories import CATEGORIES, GROUP_OF, GROUPS, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M
+from log2sim.datatypes.categories import CATEGORIES, CATEGORY, GROUP_OF, GROUPS, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M
 from log2sim.datatypes.ignore_regions import IgnoreRegions, LabelView
 from log2sim.datatypes.labels import ImageLabels, ImageRegions, Labels
 from log2sim.datatypes.log import (
@@ -25,6 +25,7 @@ from log2sim.datatypes.waypoints import Waypoints
 
 __all__ = [
     "CATEGORIES",
+    "CATEGORY",
     "EGO",
     "GROUPS",
     "GROUP_OF",

@@ -17,15 +17,18 @@ class Category:
     group : str
         Categories of one group are confused by detectors and labelers, and therefore associated with each other.
     typical_size_m : Size
-        Of what was not seen from end to end.
+        Of an object that was not observed from end to end.
     min_size_m, max_size_m : Size
-        What is smaller was hardly seen whole, what is larger is several things.
+        A smaller object was hardly observed whole, a larger one is several objects.
+    max_length_per_height : float
+        Longest side as a share of the height; infinite where the category has no such limit.
     """
 
     group: str
     typical_size_m: Size
     min_size_m: Size
     max_size_m: Size
+    max_length_per_height: float = float("inf")
 
 
 # Typical sizes lie between the mean labels of KITTI and nuScenes, which are the anchors of PointPillars (Lang et al., CVPR
@@ -38,7 +41,9 @@ class Category:
 #   trailers have 22.4 m (AASHTO, "Green Book" 2018, design vehicle WB-67).
 # - motorcycle: Regulation (EU) 168/2013, Annex II allows 4.0 x 2.0 x 2.5 m, of which two-wheelers use less.
 # - cyclist, bicycle: DIN 79008 and the like; tandems and cargo bicycles have up to 2.6 m.
-# - pedestrian: body depth and shoulder breadth of adults (DIN 33402-2) and the stride of a tall one; children from 1 m.
+# - pedestrian: body depth and shoulder breadth of adults (DIN 33402-2) and the stride of a tall one; children from 1 m;
+#   a stride and swinging arms make a person at most 0.8 times as long as tall (step lengths: Winter, "Biomechanics and Motor
+#   Control of Human Movement").
 # - other: trailers, 12 m by the same directive; carts and animals.
 CATEGORY: Mapping[str, Category] = {
     "car": Category("vehicle", (4.4, 1.85, 1.6), (2.7, 1.35, 1.2), (6.0, 2.3, 2.8)),
@@ -47,7 +52,7 @@ CATEGORY: Mapping[str, Category] = {
     "motorcycle": Category("two_wheeler", (2.1, 0.8, 1.5), (1.3, 0.5, 0.9), (2.8, 1.3, 2.2)),
     "cyclist": Category("two_wheeler", (1.75, 0.65, 1.75), (1.1, 0.4, 1.1), (2.6, 1.1, 2.3)),
     "bicycle": Category("two_wheeler", (1.75, 0.6, 1.1), (1.1, 0.4, 0.7), (2.6, 1.1, 1.5)),
-    "pedestrian": Category("pedestrian", (0.7, 0.7, 1.75), (0.4, 0.4, 1.0), (1.4, 1.2, 2.3)),
+    "pedestrian": Category("pedestrian", (0.7, 0.7, 1.75), (0.4, 0.4, 1.0), (1.4, 1.2, 2.3), max_length_per_height=0.8),
     "other": Category("other", (3.0, 1.8, 1.8), (0.5, 0.4, 0.4), (12.0, 3.0, 4.0)),
 }
 

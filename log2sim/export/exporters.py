@@ -98,8 +98,8 @@ def export(
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         # In the folder itself if it exists, since it may be on another file system than its parent.
-        beside = folder if folder.is_dir() else folder.parent
-        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=beside))
+        parent = folder if folder.is_dir() else folder.parent
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=parent))
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be written: {error.strerror or error}") from error
     try:

@@ -235,11 +235,11 @@ def base_pose(log: Log, t_ns: int) -> Array:
 
 def _ground_points(view: View, cloud: Cloud, ego_T_map: Array, tick: int) -> Correspondences:
     """Sample the LiDAR's ground points that the camera sees evenly."""
-    seen, uv, _ = project_cloud(view, cloud, cloud.ground_sample)
-    if len(seen) == 0:
+    visible, uv, _ = project_cloud(view, cloud, cloud.ground_sample)
+    if len(visible) == 0:
         return Correspondences.join([])
-    step = np.linspace(0, len(seen) - 1, min(MAX_GROUND_POINTS_PER_FRAME, len(seen))).round().astype(np.intp)
-    points = cloud.xyz[cloud.ground_sample[seen[step]]].astype(np.float64) + cloud.origin
+    step = np.linspace(0, len(visible) - 1, min(MAX_GROUND_POINTS_PER_FRAME, len(visible))).round().astype(np.intp)
+    points = cloud.xyz[cloud.ground_sample[visible[step]]].astype(np.float64) + cloud.origin
     xy = (points @ ego_T_map[:3, :3].T + ego_T_map[:3, 3])[:, :2]
     return Correspondences(undistorted_pixels(view.camera, uv[step]), xy, np.full(len(step), tick, dtype=np.int64))
 

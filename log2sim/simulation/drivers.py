@@ -38,17 +38,17 @@ def assign_drivers(
     agents: Sequence[Agent], mode: str, *, drives_ego: bool, reactive: Collection[str] = ()
 ) -> DriverAssignment:
     """Assign a driver to each agent; `reactive` holds the ids of agents that react, see `reactive_ids`."""
-    cast: DriverAssignment = {"policy": [], "reactive": [], "pid": [], "exact": [], "static": []}
+    assignment: DriverAssignment = {"policy": [], "reactive": [], "pid": [], "exact": [], "static": []}
     for agent in agents:
         if drives_ego and agent.id == EGO:
-            cast["policy"].append(agent)
+            assignment["policy"].append(agent)
         elif agent.static:
-            cast["static"].append(agent)
+            assignment["static"].append(agent)
         elif agent.id in reactive:
-            cast["reactive"].append(agent)
+            assignment["reactive"].append(agent)
         else:
-            cast[mode if len(agent.waypoints) > 1 else "exact"].append(agent)
-    return cast
+            assignment[mode if len(agent.waypoints) > 1 else "exact"].append(agent)
+    return assignment
 
 
 def reactive_ids(agents: Sequence[Agent], wanted: str | Collection[str], *, drives_ego: bool) -> frozenset[str]:
@@ -74,7 +74,7 @@ def reactive_ids(agents: Sequence[Agent], wanted: str | Collection[str], *, driv
 
 
 def agent_groups(
-    cast: Mapping[str, Sequence[Agent]], clock: StepClock, mode: str = "pid", model: str = "auto"
+    assignment: Mapping[str, Sequence[Agent]], clock: StepClock, mode: str = "pid", model: str = "auto"
 ) -> tuple[list[AgentGroup], dict[str, ModelChoice]]:
     """Build the groups that have agents, and choose by id the model that moves each vehicle; static agents are in no group."""
     groups: list[AgentGroup] = []
@@ -88,9 +88,9 @@ def agent_groups(
             ("pid", VehicleGroup, PedestrianGroup),
         ]
     for driver, kind, on_foot in controlled:
-        wheeled = [a for a in cast[driver] if a.category in WHEELED]
+        wheeled = [a for a in assignment[driver] if a.category in WHEELED]
         groups += _vehicle_groups(wheeled, kind, clock, model, choices)
-        walking = [a for a in cast[driver] if a.category not in WHEELED]
+        walking = [a for a in assignment[driver] if a.category not in WHEELED]
         if walking:
             references = [point_reference(Trajectory.through(a.waypoints)) for a in walking]
             groups.append(
@@ -100,7 +100,7 @@ def agent_groups(
         ("exact", LogReplayGroup),
         *([("reactive", ReactiveLogReplayGroup)] if mode == "exact" else []),
     ):
-        agents = list(cast[driver])
+        agents = list(assignment[driver])
         if agents:
             references = [log_reference(Trajectory.through(a.waypoints, rear_axle_offset(a))) for a in agents]
             groups.append(tape(agents, references, *_lifespans(agents, clock)))

@@ -95,7 +95,7 @@ class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
         self.scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
         self.world = open_world(self.scenario, dt_s=dt_s, agents=agents, sight_m=sight_m)
         self.render_mode, self._steps = render_mode, max(1, round(hold_s / dt_s))
-        self._seen: Observation
+        self._observation: Observation
         self._begun = False
         ego = self.world.ego
         if ego is None:  # open_world refuses such a scenario
@@ -122,8 +122,8 @@ class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
         self.world.restart()
         while not self.world.ego_lives:
             self.world.advance()
-        self._seen, self._begun = self.world.observe(), True
-        return self._shown(), {"t_s": self._seen.t_s}
+        self._observation, self._begun = self.world.observe(), True
+        return self._shown(), {"t_s": self._observation.t_s}
 
     def step(self, action: Any) -> tuple[ObservationArrays, float, bool, bool, dict[str, Any]]:
         """Hold an action for `hold_s`; `ValueError` when it is not two finite numbers."""
@@ -131,7 +131,7 @@ class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
             raise gymnasium.error.ResetNeeded("the episode has not begun: call reset() before step()")
         pedal, wheel = _action_values(action)
         brake, throttle = self.accel_limits_mps2
-        before_m, begin_s = self._seen.path.progress_m, self._seen.t_s
+        before_m, begin_s = self._observation.path.progress_m, self._observation.t_s
         self.world.steer(Controls(pedal * (throttle if pedal > 0 else brake), wheel * self.max_steer_rad))
         collides = over = False
         for _ in range(self._steps):
@@ -139,32 +139,35 @@ class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
             over = self.world.done or not self.world.ego_lives
             if not self.world.ego_lives:
                 break
-            self._seen = self.world.observe()
-            collides = _collides(self._seen)
+            self._observation = self.world.observe()
+            collides = _collides(self._observation)
             if collides or over:
                 break
-        seen = self._seen
-        offset_m = float(_path_errors(seen)[0])
+        observation = self._observation
+        offset_m = float(_path_errors(observation)[0])
         parts = {
-            "progress": seen.path.progress_m - before_m,
-            "off_path": -OFF_PATH_PER_M_S * abs(offset_m) * (seen.t_s - begin_s),
+            "progress": observation.path.progress_m - before_m,
+            "off_path": -OFF_PATH_PER_M_S * abs(offset_m) * (observation.t_s - begin_s),
             "collision": -COLLISION * collides,
         }
-        arrived = bool(np.isnan(seen.path.t_s[1]))
+        arrived = bool(np.isnan(observation.path.t_s[1]))
         truncated = not (collides or arrived) and (over or abs(offset_m) > LOST_M)
-        info = {"t_s": seen.t_s, "collision": collides, "reward": parts}
+        info = {"t_s": observation.t_s, "collision": collides, "reward": parts}
         return self._shown(), float(sum(parts.values())), collides or arrived, truncated, info
 
     def render(self) -> Any:
         """Draw the surroundings of the ego from above, (400, 400, 3) uint8, its front to the right; None without render mode."""
-        return _rendered(self._seen) if self._begun and self.render_mode == "rgb_array" else None
+        return _rendered(self._observation) if self._begun and self.render_mode == "rgb_array" else None
 
     def _shown(self) -> ObservationArrays:
         """Convert the observation to arrays within the bounds of their spaces."""
-        seen, ego = self._seen, self._seen.ego
+        observation, ego = self._observation, self._observation.ego
         ahead = np.arange(1, PATH_ROWS + 1) * PATH_EVERY_M
-        path = (*_in_ego_frame(ego, seen.path.x_m[ahead], seen.path.y_m[ahead]), seen.path.speed_mps[ahead])
-        o, count = seen.others, self._rows
+        path = (
+            *_in_ego_frame(ego, observation.path.x_m[ahead], observation.path.y_m[ahead]),
+            observation.path.speed_mps[ahead],
+        )
+        o, count = observation.others, self._rows
         velocity = _in_ego_axes(ego, o.velocity_x_mps, o.velocity_y_mps)
         columns = (
             *_in_ego_frame(ego, o.x_m, o.y_m),
@@ -177,7 +180,7 @@ class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
         others = np.zeros((count, 7))
         others[: len(near)] = near
         arrays = {
-            "ego": np.array([ego.speed_mps, ego.accel_mps2, ego.steer_rad, *_path_errors(seen)]),
+            "ego": np.array([ego.speed_mps, ego.accel_mps2, ego.steer_rad, *_path_errors(observation)]),
             "path": np.stack(path, axis=1),
             "others": others,
         }
@@ -205,15 +208,15 @@ def _in_ego_frame(ego: EgoState, x_m: Array, y_m: Array) -> tuple[Array, Array]:
     return _in_ego_axes(ego, x_m - ego.x_m, y_m - ego.y_m)
 
 
-def _path_errors(seen: Observation) -> tuple[Array, Array]:
+def _path_errors(observation: Observation) -> tuple[Array, Array]:
     """Return the ego's offset to the left of its path in m, and its heading relative to it in rad."""
-    x, y, yaw = seen.path.x_m[0], seen.path.y_m[0], seen.path.yaw_rad[0]
-    dx, dy = seen.ego.x_m - x, seen.ego.y_m - y
-    return dy * np.cos(yaw) - dx * np.sin(yaw), wrap_angle(seen.ego.yaw_rad - yaw)
+    x, y, yaw = observation.path.x_m[0], observation.path.y_m[0], observation.path.yaw_rad[0]
+    dx, dy = observation.ego.x_m - x, observation.ego.y_m - y
+    return dy * np.cos(yaw) - dx * np.sin(yaw), wrap_angle(observation.ego.yaw_rad - yaw)
 
 
-def _collides(seen: Observation) -> bool:
-    o, ego = seen.others, seen.ego
+def _collides(observation: Observation) -> bool:
+    o, ego = observation.others, observation.ego
     own = np.broadcast_to([ego.length_m, ego.width_m], (len(o), 2))
     size = np.stack([o.length_m, o.width_m], axis=1)
     yaw = np.full(len(o), ego.yaw_rad)
@@ -221,19 +224,19 @@ def _collides(seen: Observation) -> bool:
     return bool((level & rectangles_overlap(o.x_m - ego.x_m, o.y_m - ego.y_m, yaw, o.yaw_rad, own, size)).any())
 
 
-def _rendered(seen: Observation) -> Any:
+def _rendered(observation: Observation) -> Any:
     """Draw the ego, its path and the other agents."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import PolyCollection
     from matplotlib.figure import Figure
 
-    ego, o = seen.ego, seen.others
+    ego, o = observation.ego, observation.others
     figure = Figure(figsize=(PICTURE_PX / 100, PICTURE_PX / 100), dpi=100)
     canvas = FigureCanvasAgg(figure)
     axes = figure.add_axes((0, 0, 1, 1))
     axes.set(xlim=(-PICTURE_M / 2, PICTURE_M / 2), ylim=(-PICTURE_M / 2, PICTURE_M / 2), aspect="equal")
     axes.axis("off")
-    axes.plot(*_in_ego_frame(ego, seen.path.x_m, seen.path.y_m), color="#9aa5b1", linewidth=1.5)
+    axes.plot(*_in_ego_frame(ego, observation.path.x_m, observation.path.y_m), color="#9aa5b1", linewidth=1.5)
     centers = np.stack(_in_ego_frame(ego, o.x_m, o.y_m), axis=1)
     others = box_corners_bev(centers.reshape(-1, 2), o.length_m, o.width_m, o.yaw_rad - ego.yaw_rad)
     axes.add_collection(PolyCollection(list(others), facecolor="#7aa6c2", edgecolor="#33566b"))

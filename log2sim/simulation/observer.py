@@ -80,7 +80,7 @@ class PolicyObserver:
 
     def _ahead(self) -> PathAhead:
         table, now = self._path_table, self.ego.snapshot()
-        self.progress_m = table.beside(0, self.progress_m, float(now.x_m[0]), float(now.y_m[0]))
+        self.progress_m = table.progress_near(0, self.progress_m, float(now.x_m[0]), float(now.y_m[0]))
         ahead = np.arange(0.0, PATH_AHEAD_M + SPACING_M / 2, SPACING_M)
         x, y, cos, sin, at_s = table.along(ONE, self.progress_m + ahead)
         pace = np.abs(table.at(ONE, np.where(np.isnan(at_s), self._trajectory.t_s[-1], at_s)).speed_mps)

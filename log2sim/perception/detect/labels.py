@@ -99,10 +99,10 @@ def project_labels(boxes: LabelBoxes, camera: Camera, cam_T_map: NDArray[np.floa
 
     Occluded boxes are kept: a LiDAR on the roof often sees what the camera does not.
     """
-    seen = project_boxes(boxes.center_m, boxes.size_m, boxes.yaw_rad, camera, cam_T_map)
-    box_px = seen.box_px
-    large = seen.valid.copy()
-    large[seen.valid] = np.all(box_px[seen.valid, 2:] - box_px[seen.valid, :2] >= MIN_SIDE_PX, axis=1)
+    projected = project_boxes(boxes.center_m, boxes.size_m, boxes.yaw_rad, camera, cam_T_map)
+    box_px = projected.box_px
+    large = projected.valid.copy()
+    large[projected.valid] = np.all(box_px[projected.valid, 2:] - box_px[projected.valid, :2] >= MIN_SIDE_PX, axis=1)
     kept = np.flatnonzero(large)
-    kept = kept[np.argsort(seen.range_m[kept], kind="stable")]
+    kept = kept[np.argsort(projected.range_m[kept], kind="stable")]
     return Detections(box_px[kept], np.ones(len(kept)), boxes.category[kept].astype("<U16"))

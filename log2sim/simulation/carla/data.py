@@ -32,11 +32,11 @@ def carla_agents(agents: Sequence[Agent]) -> list[dict[str, Any]]:
     """Describe agents as `player` reads them. Their positions should be near the origin: CARLA computes in float32."""
     begin_s = min(float(a.waypoints.t_s[0]) for a in agents)
     end_s = max(float(a.waypoints.t_s[-1]) for a in agents)
-    seen: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
     described = []
     for agent in agents:
-        described.append(_agent(agent, seen[agent.category], (begin_s, end_s)))
-        seen[agent.category] += 1
+        described.append(_agent(agent, counts[agent.category], (begin_s, end_s)))
+        counts[agent.category] += 1
     return described
 
 

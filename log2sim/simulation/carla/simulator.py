@@ -222,8 +222,8 @@ class CarlaSimulator:
             yaw[slot] = -at_yaw
             pedal[slot] = (now - speed[slot]) / self.clock.dt_s * (-1.0 if now < 0 else 1.0)
             speed[slot] = now
-        seen = {"x_m": x, "y_m": y, "yaw_rad": yaw, "speed_mps": speed, "pedal_mps2": pedal}
-        group.state = replace(state, **seen, steer_rad=controls.steer_rad)
+        measured = {"x_m": x, "y_m": y, "yaw_rad": yaw, "speed_mps": speed, "pedal_mps2": pedal}
+        group.state = replace(state, **measured, steer_rad=controls.steer_rad)
 
     def _read_points(self, group: PedestrianGroup, step: int) -> None:
         """Read the states of points from CARLA."""

@@ -126,7 +126,7 @@ class PathTable:
         dx, dy = x_m - x, y_m - y
         return PathProjection(dx * cos + dy * sin, dy * cos - dx * sin, cos, sin, k * SPACING_M, t_s)
 
-    def beside(self, agent: int, from_m: float, x_m: float, y_m: float) -> float:
+    def progress_near(self, agent: int, from_m: float, x_m: float, y_m: float) -> float:
         """Return how far along its path an agent at a place of the map is that was at `from_m` before; at least 0."""
         begin_m = max(from_m - SEARCH_BACK_M, 0.0)
         x, y = (np.array([[c - o]]) for c, o in zip((x_m, y_m), self.origin_m))
@@ -143,7 +143,7 @@ def log_times_of_positions(trajectory: Trajectory, x_m: Array, y_m: Array) -> Ar
     """Return when the log was nearest to the successive positions (S,) of an agent that drives freely."""
     table, gone_m = PathTable([trajectory]), np.zeros(len(x_m))
     for k, (x, y) in enumerate(zip(x_m.tolist(), y_m.tolist())):
-        gone_m[k] = table.beside(0, gone_m[k - 1] if k else 0.0, x, y)
+        gone_m[k] = table.progress_near(0, gone_m[k - 1] if k else 0.0, x, y)
     return table.times(np.zeros(1, dtype=np.intp), gone_m)
 
 

@@ -118,7 +118,7 @@ class Traffic:
         x[k], y[k] = ego.x_m[0] - self.paths.origin_m[0], ego.y_m[0] - self.paths.origin_m[1]
         yaw[k], speed[k] = ego.yaw_rad[0], ego.speed_mps[0]
         # Its height is that of the log at this place; by time, nobody would brake for it on a slope if it fell behind.
-        self._driven_m = self.paths.beside(k, self._driven_m, float(ego.x_m[0]), float(ego.y_m[0]))
+        self._driven_m = self.paths.progress_near(k, self._driven_m, float(ego.x_m[0]), float(ego.y_m[0]))
         z = pose.z_m.copy()
         driven = np.array([k])
         z[k] = self.paths.at(driven, self.paths.times(driven, np.array([self._driven_m]))).z_m[0]
