@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from log2sim.datatypes.agent import Agent
+from log2sim.datatypes.boxes3d import Boxes3D
 from log2sim.datatypes.categories import CATEGORIES, CATEGORY, GROUP_OF, GROUPS, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M
 from log2sim.datatypes.ignore_regions import IgnoreRegions, LabelView
 from log2sim.datatypes.labels import ImageLabels, ImageRegions, Labels
@@ -37,6 +38,7 @@ __all__ = [
     "VERSION",
     "Agent",
     "BoxEvidence",
+    "Boxes3D",
     "Deferred",
     "Detections",
     "EgoVehicle",
