@@ -1,0 +1,1 @@
+"""Detection of road users in clouds: grid, network, decoding."""
