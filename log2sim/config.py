@@ -85,6 +85,25 @@ class DetectConfig(Section):
     )
 
 
+class LidarConfig(Section):
+    """Detection in clouds."""
+
+    decode: Literal["centers", "votes"] = _setting(
+        "centers",
+        "centers: a box for every peak of the network's map of centers; votes: a box for every cluster of cells by where "
+        "they vote their object's center to be (Zou et al. 2021).",
+    )
+    sweeps: int = _setting(1, "Successive clouds that the network sees as one.", ge=1, le=10)
+    range_m: float = _setting(
+        0.0,
+        "Largest distance from the LiDAR, along x and along y of the map, at which objects are detected; 0: the network's "
+        "own.",
+        unit="m",
+        ge=0.0,
+        le=250.0,
+    )
+
+
 class MeasureConfig(Section):
     """Measurement of detected objects by LiDAR."""
 
@@ -139,6 +158,7 @@ class Config(Section):
     stop_s: float | None = _setting(None, "Last time that is used, from the start of the log.", unit="s")
     sync: SyncConfig = SyncConfig()
     detect: DetectConfig = DetectConfig()
+    lidar: LidarConfig = LidarConfig()
     measure: MeasureConfig = MeasureConfig()
     topdown: TopdownConfig = TopdownConfig()
     track: TrackConfig = TrackConfig()

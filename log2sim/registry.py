@@ -20,6 +20,9 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "ssd-mobilenet-v2": "log2sim.perception.detect.ssd_mobilenet:create",
         "labels": "log2sim.perception.detect.labels:create",
     },
+    "lidar_detector": {
+        "labels": "log2sim.perception.detect3d.labels:create",
+    },
     "export": {
         "openscenario": "log2sim.export.openscenario.write:EXPORTER",
         "carla": "log2sim.export.carla:EXPORTER",
@@ -33,11 +36,11 @@ BUILT_IN: dict[str, dict[str, str]] = {
 }
 
 
-KIND_LABELS = {"log": "log format", "export": "export format"}
+KIND_LABELS = {"log": "log format", "lidar_detector": "LiDAR detector", "export": "export format"}
 
 
 def names(kind: str) -> list[str]:
-    """List the plug-ins of a kind ("log", "detector", "export"), built-in ones first."""
+    """List the plug-ins of a kind ("log", "detector", "lidar_detector", "export"), built-in ones first."""
     return list(BUILT_IN[kind]) + sorted(e.name for e in entry_points(group=f"log2sim.{kind}"))
 
 

@@ -19,6 +19,9 @@ from test_layers import RANKED, ROOT
 from log2sim import Config, Scenario, open_log, reconstruct, registry, replay
 from log2sim.datatypes import Log
 from log2sim.export.exporters import export
+from log2sim.perception.detect3d.detectors import create_lidar_detector
+from log2sim.perception.first_pass import cloud_origin
+from log2sim.perception.lidar.cloud import assemble_cloud
 from log2sim.simulation import runner, simulators
 
 TEXT = (ROOT / "log2sim" / "README.md").read_text(encoding="utf-8")
@@ -65,7 +68,7 @@ def test_the_pipeline_calls_the_functions_of_the_table_in_their_order() -> None:
 
 
 def test_there_is_an_example_for_each_kind_of_plug_in() -> None:
-    assert len(EXAMPLES) == 4
+    assert len(EXAMPLES) == 5
     for kind in registry.BUILT_IN:
         assert f"kind `{kind}`" in TEXT
     entry = tomllib.loads(re.findall(r"```toml\n(.*?)```", TEXT, re.DOTALL)[0])
@@ -90,6 +93,18 @@ def test_the_detector_runs(tiny_folder: Path, monkeypatch: pytest.MonkeyPatch) -
     result = reconstruct(log, Config.load(detect={"name": "center"}))
     assert result.scenario.provenance["detector"] == "center"
     assert result.report["detections"]["front"] == result.report["ticks"]
+
+
+def test_the_lidar_detector_runs(tiny_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    example("HighestPoint", monkeypatch)
+    register("lidar_detector", "highest", "create_highest", monkeypatch)
+    log: Log = open_log(tiny_folder)
+    detector = create_lidar_detector("lidar:highest", log, Config().lidar)
+    origin, ground_z = cloud_origin(log, int(log.streams["top"].t_ns[0]))
+    cloud = assemble_cloud(log, {"top": log.streams["top"].read(0)}, origin=origin, ground_z=ground_z, max_range_m=60.0)
+    assert cloud is not None
+    found = detector.detect(cloud)
+    assert found.center_m[0, 2] + 0.75 == pytest.approx(cloud.xyz[cloud.height.argmax(), 2] + origin[2])
 
 
 def test_the_exporter_writes(tiny_scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,67 @@
+"""3D boxes of road users in clouds: from a network through ONNX Runtime, or from the 3D labels of the log."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from log2sim import registry
+from log2sim.config import LidarConfig
+from log2sim.datatypes import Boxes3D, Log
+from log2sim.errors import ConfigError
+from log2sim.perception.lidar.cloud import Cloud
+
+PREFIX = "lidar:"
+
+
+class LidarDetector(Protocol):
+    """Detector of road users in one cloud."""
+
+    @property
+    def name(self) -> str:
+        """Name in the provenance of a scenario."""
+        ...
+
+    def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
+        """Detect road users in one cloud, best score first; deterministic, and may be called from threads.
+
+        Parameters
+        ----------
+        cloud
+            All LiDARs of one moment.
+        earlier
+            Clouds of earlier moments, which make the grid denser; only points of `cloud` count as points of a box.
+        """
+        ...
+
+
+def create_lidar_detector(name: str, log: Log, settings: LidarConfig) -> LidarDetector:
+    """Make a detector for the clouds of a log.
+
+    Parameters
+    ----------
+    name
+        "lidar:" and a registered name ("vehicle", "roadside", "labels", plug-ins of others) or the path of an `.onnx` file.
+    log
+        The log whose clouds it will see; `labels` takes its boxes from there.
+    settings
+        Decoding and range.
+
+    Raises
+    ------
+    ConfigError
+        An unknown name, or a file that is no usable network.
+    MissingExtra
+        The detector's package is not installed.
+    """
+    if not name.startswith(PREFIX):
+        raise ConfigError(
+            f"LiDAR detector '{name}': expected a name that begins with '{PREFIX}', such as lidar:vehicle"
+        )
+    rest = name.removeprefix(PREFIX)
+    try:
+        create = registry.load("lidar_detector", rest)
+    except ConfigError as error:
+        raise ConfigError(f"{error}, or {PREFIX} and the path of an ONNX file (ending in .onnx)") from None
+    detector: LidarDetector = create(log, settings)
+    return detector
