@@ -20,6 +20,7 @@ from log2sim.geometry.overlap import (
     separating_axes,
 )
 from log2sim.geometry.poses import PoseTrack
+from log2sim.geometry.rectangles import rectangle_iou, rectangle_overlap, upright_box_iou
 from log2sim.geometry.stamps import NS_PER_S, nearest_index, period_of
 from log2sim.geometry.transforms import (
     Array,
@@ -66,6 +67,8 @@ __all__ = [
     "project",
     "project_boxes",
     "quaternion_from_rotation",
+    "rectangle_iou",
+    "rectangle_overlap",
     "rectangles_overlap",
     "rotation_from_quaternion",
     "rotation_from_rpy",
@@ -73,6 +76,7 @@ __all__ = [
     "slerp",
     "transform",
     "undistort",
+    "upright_box_iou",
     "whole_kilometers",
     "wrap_angle",
     "yaw_of",

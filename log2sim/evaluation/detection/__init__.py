@@ -1,0 +1,18 @@
+"""Detected 3D boxes against true ones: average precision, precision and recall, calibration of scores."""
+
+from __future__ import annotations
+
+from log2sim.evaluation.detection.boxes import SceneBoxes
+from log2sim.evaluation.detection.matching import Criterion, Matches, match
+from log2sim.evaluation.detection.precision import PrecisionRecall, average_precision, operating_point, precision_recall
+
+__all__ = [
+    "Criterion",
+    "Matches",
+    "PrecisionRecall",
+    "SceneBoxes",
+    "average_precision",
+    "match",
+    "operating_point",
+    "precision_recall",
+]

@@ -1,0 +1,121 @@
+"""Precision and recall over the score, average precision, and the figures at one score."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from log2sim.evaluation.detection.boxes import SceneBoxes
+from log2sim.evaluation.detection.matching import Criterion, Matches, match
+from log2sim.geometry import Array
+
+ROUNDING = 1e-9
+NUSCENES_FLOOR = 0.1
+"""nuScenes leaves out what lies below this precision and this recall."""
+
+
+@dataclass(frozen=True, eq=False)
+class PrecisionRecall:
+    """Precision and recall at each distinct score, greatest first.
+
+    Attributes
+    ----------
+    score : (K,) float64
+        Boxes of this score and above are reported.
+    precision, recall : (K,) float64
+    truths : int
+        Number of counted true boxes.
+    """
+
+    score: Array
+    precision: Array
+    recall: Array
+    truths: int
+
+    def best_precision(self, recall: Array) -> Array:
+        """Return the greatest precision at or beyond recalls (R,), 0 where none is reached."""
+        at_least = np.maximum.accumulate(self.precision[::-1])[::-1]
+        k = np.searchsorted(self.recall, recall - ROUNDING)
+        return np.where(k < len(at_least), np.append(at_least, 0.0)[k], 0.0)
+
+    def average(self, recall_points: int = 40) -> float | None:
+        """Average the best precision over recalls; None without true boxes.
+
+        Parameters
+        ----------
+        recall_points : {40, 11}
+            40: recalls 1/40 to 1, KITTI's rule since 2019, which drops the first of 41 points (Simonelli et al., ICCV 2019);
+            11: recalls 0 to 1 (PASCAL VOC; Everingham et al., IJCV 2010), KITTI's rule before.
+        """
+        if recall_points not in (40, 11):
+            raise ValueError(f"recall_points is {recall_points}, expected 40 or 11")
+        at = np.arange(1, 41) / 40 if recall_points == 40 else np.arange(11) / 10
+        return float(self.best_precision(at).mean()) if self.truths else None
+
+    def nuscenes_average(self) -> float | None:
+        """Average as nuScenes does (Caesar et al., CVPR 2020, section 3.1); None without true boxes.
+
+        Notes
+        -----
+        Over recalls 0.11 to 1 in steps of 0.01, of the precision above 0.1, scaled to 1. The precision is the best one at or
+        beyond each recall; nuScenes interpolates between neighbors instead.
+        """
+        if not self.truths:
+            return None
+        above = np.maximum(self.best_precision(np.arange(11, 101) / 100) - NUSCENES_FLOOR, 0)
+        return float(above.mean() / (1 - NUSCENES_FLOOR))
+
+
+def precision_recall(found: SceneBoxes, matches: Matches) -> PrecisionRecall:
+    """Compute the curve of matched boxes; boxes of equal score come together."""
+    rows = np.flatnonzero(matches.right | matches.false)
+    rows = rows[np.argsort(-found.score[rows], kind="stable")]
+    score = found.score[rows]
+    last = np.flatnonzero(np.append(score[1:] != score[:-1], len(score) > 0))
+    right = np.cumsum(matches.right[rows])[last]
+    recall = right / matches.truths if matches.truths else np.zeros(len(last))
+    return PrecisionRecall(score[last], right / (last + 1), recall, matches.truths)
+
+
+def average_precision(
+    found: SceneBoxes, truth: SceneBoxes, criterion: Criterion, recall_points: int = 40
+) -> float | None:
+    """Compute the average precision of the boxes of one class; None without counted true boxes.
+
+    Parameters
+    ----------
+    found, truth : SceneBoxes
+    criterion : Criterion
+    recall_points : {40, 11}
+        As in `PrecisionRecall.average`.
+    """
+    return precision_recall(found, match(found, truth, criterion)).average(recall_points)
+
+
+def operating_point(found: SceneBoxes, matches: Matches, min_score: float) -> dict[str, Any]:
+    """Count what is right when only boxes of at least a score are reported.
+
+    Returns
+    -------
+    dict
+        "true_positives", "false_positives", "false_negatives", and "precision", "recall", "f1" and
+        "precision_times_recall", which are None where nothing was reported or nothing was there to be found. Some authors
+        call the last one mean average precision, which it is not: it is one point of the curve.
+    """
+    reported = found.score >= min_score
+    right = int(np.count_nonzero(matches.right & reported))
+    false = int(np.count_nonzero(matches.false & reported))
+    precision = right / (right + false) if right + false else None
+    recall = right / matches.truths if matches.truths else None
+    both = precision is not None and recall is not None
+    return {
+        "true_positives": right,
+        "false_positives": false,
+        "false_negatives": matches.truths - right,
+        "precision": precision,
+        "recall": recall,
+        "f1": 2 * right / (2 * right + false + matches.truths - right) if both else None,
+        "precision_times_recall": precision * recall if precision is not None and recall is not None else None,
+    }
