@@ -26,6 +26,8 @@ KINDS = {
     "array": "names separated by commas",
 }
 """Types of JSON Schema in plain words."""
+LIDAR_PREFIX = "lidar:"
+"""Names of detectors in LiDAR sweeps begin with it."""
 
 
 def _setting(
@@ -71,7 +73,9 @@ class DetectConfig(Section):
     """Detection in images."""
 
     name: str = _setting(
-        "ssd-mobilenet-v2", "Detector: ssd-mobilenet-v2, a path to an ONNX model, or labels (boxes of the log)."
+        "ssd-mobilenet-v2",
+        "Detector in images: ssd-mobilenet-v2, a path to an ONNX model, or labels (boxes of the log); in LiDAR sweeps: "
+        "lidar:vehicle, lidar:roadside, lidar:FILE.onnx or lidar:labels; both, joined by +.",
     )
     min_score: float = _setting(
         0.0, "Lowest score of a detection that can continue a track; 0: the detector's own.", ge=0.0, le=1.0
@@ -83,6 +87,22 @@ class DetectConfig(Section):
     input_px: int = _setting(
         0, "Side of the input of an ONNX model that takes any size; 0: usual for its layout.", unit="px", ge=0, le=8192
     )
+
+    @property
+    def in_images(self) -> str:
+        """Name of the detector in images, "" where LiDAR sweeps alone are searched."""
+        return self._names()[0]
+
+    @property
+    def in_sweeps(self) -> str:
+        """Name of the detector in LiDAR sweeps with its prefix "lidar:", "" where images alone are searched."""
+        return self._names()[1]
+
+    def _names(self) -> tuple[str, str]:
+        if self.name.startswith(LIDAR_PREFIX):
+            return "", self.name
+        images, plus, sweeps = self.name.rpartition("+" + LIDAR_PREFIX)
+        return (images, LIDAR_PREFIX + sweeps) if plus else (self.name, "")
 
 
 class LidarConfig(Section):

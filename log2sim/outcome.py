@@ -93,7 +93,7 @@ def _compensation(planned: Decision, observations: Observations) -> Outcome:
 def _detection(planned: Decision, outputs: RunOutputs) -> Outcome:
     observations, seconds = outputs.observations, outputs.clock.seconds
     skipped, detected = sum(observations.frames_skipped.values()), observations.frames_detected
-    if planned.kept:
+    if planned.kept or not detected:
         return Outcome(planned)
     if not skipped:
         return Outcome(Decision(planned.stage, True, "no camera was empty long enough to skip a frame"))

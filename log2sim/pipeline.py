@@ -19,12 +19,14 @@ from log2sim.datatypes import Log, Scenario
 from log2sim.errors import NothingToReconstruct
 from log2sim.outcome import RunOutputs, stage_outcomes
 from log2sim.perception.detect.detectors import Detector, create_detector
+from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector
 from log2sim.perception.first_pass import Observations, observe
 from log2sim.perception.fusion import fuse
 from log2sim.perception.homography_stage import estimation_options, fit_homographies, place_by_homography
 from log2sim.perception.sync import Schedule, synchronize
-from log2sim.plan import Plan, Sensors, Stage, make_plan, select_sensors
+from log2sim.plan import Plan, Stage, make_plan
 from log2sim.report import report_of
+from log2sim.sensors import Sensors, select_sensors
 from log2sim.stage_clock import StageClock
 from log2sim.tracking.tracker import track
 
@@ -40,6 +42,27 @@ class Result:
 
 
 @dataclass(frozen=True, eq=False)
+class Detectors:
+    """The detectors of a run.
+
+    Attributes
+    ----------
+    images : Detector, optional
+        Searches the frames of all cameras.
+    sweeps : LidarDetector, optional
+        Searches the clouds.
+    """
+
+    images: Detector | None
+    sweeps: LidarDetector | None
+
+    @property
+    def name(self) -> str:
+        """Names of both, joined by +."""
+        return "+".join(detector.name for detector in (self.images, self.sweeps) if detector is not None)
+
+
+@dataclass(frozen=True, eq=False)
 class Run:
     """What the stages of one run share.
 
@@ -51,7 +74,7 @@ class Run:
     plan : Plan
     schedule : Schedule
         The ticks, and the frames and sweeps of each.
-    detector : Detector
+    detectors : Detectors
     clock : StageClock
     report_progress : callable
         Called as `report_progress(stage, done, total)`.
@@ -61,7 +84,7 @@ class Run:
     config: Config
     plan: Plan
     schedule: Schedule
-    detector: Detector
+    detectors: Detectors
     clock: StageClock
     report_progress: Progress
 
@@ -92,17 +115,26 @@ def reconstruct(log: Log, config: Config | None = None, *, progress: Progress | 
 def start(log: Log, config: Config, *, progress: Progress | None = None) -> Run:
     """Choose the sensors, synchronize them, and plan the run."""
     clock, sensors = StageClock(), select_sensors(log, config)
-    detector = detector_of(log, config)
+    detectors = detectors_of(log, config)
     with clock.stage("sync"):
         schedule = schedule_of(log, config, sensors)
     plan = make_plan(log, config, sensors, schedule.t_ns)
-    return Run(sensors.restrict(log), config, plan, schedule, detector, clock, progress or (lambda *_: None))
+    return Run(sensors.restrict(log), config, plan, schedule, detectors, clock, progress or (lambda *_: None))
+
+
+def detectors_of(log: Log, config: Config) -> Detectors:
+    """Create the detectors that the settings name."""
+    sweeps = config.detect.in_sweeps
+    return Detectors(
+        detector_of(log, config) if config.detect.in_images else None,
+        create_lidar_detector(sweeps, log, config.lidar) if sweeps else None,
+    )
 
 
 def detector_of(log: Log, config: Config) -> Detector:
-    """Create the detector that the settings name."""
+    """Create the detector in images that the settings name."""
     return create_detector(
-        config.detect.name,
+        config.detect.in_images,
         log,
         min_score=config.detect.min_score or None,
         tiles=config.detect.tiles or "auto",
@@ -128,12 +160,14 @@ def first_pass(run: Run) -> Observations:
     return observe(
         run.log,
         run.schedule,
-        run.detector,
+        run.detectors.images,
         run.plan,
         mode=run.config.measure.mode,
         max_range_m=run.config.measure.max_range_m,
         clock=run.clock,
         progress=lambda done, total: run.report_progress("detect and measure", done, total),
+        lidar_detector=run.detectors.sweeps,
+        sweeps=run.config.lidar.sweeps,
     )
 
 
@@ -146,7 +180,7 @@ def second_pass(run: Run, observations: Observations) -> Result:
         homographies = fit_homographies(log, observations, plan, estimation_options(config.topdown), rng=rng)
         placed = place_by_homography(log, observations, homographies)
     with run.clock.stage("fuse"):
-        measurements = fuse(placed, across=plan.keeps(Stage.FUSION))
+        measurements = fuse(placed, across=plan.keeps(Stage.FUSION) or plan.keeps(Stage.FUSION_WITH_LIDAR))
     with run.clock.stage("track"):
         tracks = track(
             measurements,
@@ -172,6 +206,6 @@ def second_pass(run: Run, observations: Observations) -> Result:
         [ego, *agents] if ego is not None else agents,
         cameras=camera_entries(log, plan.cameras, homographies),
         plan=[outcome.to_dict() for outcome in outcomes],
-        provenance=provenance_of(log, config, run.detector),
+        provenance=provenance_of(log, config, run.detectors.name),
     )
     return Result(scenario, report_of(log, config, run.schedule, outputs, outcomes, scenario))

@@ -1,4 +1,4 @@
-"""What a run needs: the sensors to use and a decision with its reason for every optional part, made once before the run."""
+"""What a run needs: a decision with its reason for every optional part, made once before the run."""
 
 from __future__ import annotations
 
@@ -11,20 +11,16 @@ from numpy.typing import NDArray
 
 from log2sim.config import Config
 from log2sim.datatypes import Log
-from log2sim.errors import ConfigError, LogError
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.registry import nearest
+from log2sim.sensors import MAX_LIDAR_RANGE_M, Sensors
 from log2sim.tracking.tracker import min_hits
 
 LABELS = "labels"
+NO_CAMERA = "LiDAR sweeps alone are searched; no camera is used"
 # Motion of the ego over the whole log that is left uncompensated: half the noise of a LiDAR range, and the angle that
 # moves a point at 30 m by as much.
 MAX_STATIC_EGO_MOTION_M = 0.05
 MAX_STATIC_EGO_TURN_RAD = MAX_STATIC_EGO_MOTION_M / 30.0
-# Largest departure of R R^T from 1: calibration files round to five digits or more.
-MAX_ROTATION_ERROR = 1e-3
-# No LiDAR for vehicles or roadsides measures farther.
-MAX_LIDAR_RANGE_M = 300.0
 
 
 class Stage(StrEnum):
@@ -34,8 +30,10 @@ class Stage(StrEnum):
     MOTION_COMPENSATION = "motion compensation"
     IMAGE_DECODING = "image decoding"
     DETECTION_IN_EVERY_FRAME = "detection in every frame"
+    DETECTION_IN_SWEEPS = "detection in LiDAR sweeps"
     HOMOGRAPHY = "homography"
     FUSION = "fusion of cameras"
+    FUSION_WITH_LIDAR = "fusion of cameras and LiDAR"
     TRACKING = "tracking"
     SMOOTHING = "smoothing"
     SMOOTHING_OF_PARKED_AGENTS = "smoothing of parked agents"
@@ -72,28 +70,6 @@ class Decision:
 
 
 @dataclass(frozen=True)
-class Sensors:
-    """The sensors of a log that a run uses.
-
-    Attributes
-    ----------
-    cameras : tuple of str
-        Those of the settings, or all.
-    lidars : tuple of str
-        Those within range of the ego's path.
-    lidars_out_of_range : tuple of str
-    """
-
-    cameras: tuple[str, ...]
-    lidars: tuple[str, ...]
-    lidars_out_of_range: tuple[str, ...] = ()
-
-    def restrict(self, log: Log) -> Log:
-        """Return the log without the LiDARs that are out of range; its streams stay."""
-        return replace(log, lidars={name: log.lidars[name] for name in self.lidars})
-
-
-@dataclass(frozen=True)
 class Plan:
     """The decisions of a run.
 
@@ -102,7 +78,7 @@ class Plan:
     cameras : tuple of str
         Cameras to use.
     decisions : tuple of Decision
-        One for every stage.
+        One for every stage; the stages of a detector in LiDAR sweeps only with one.
     homography : HomographyScope
         Which cameras get a homography.
     detector_stride : int
@@ -120,33 +96,11 @@ class Plan:
 
     def keeps(self, stage: Stage) -> bool:
         """Return whether a stage runs."""
-        return self.decision(stage).kept
+        return any(d.kept for d in self.decisions if d.stage is stage)
 
     def variant(self, decision: Decision) -> Plan:
         """Return a plan with another decision about one stage, for benchmarks that compare plans."""
         return replace(self, decisions=tuple(decision if d.stage is decision.stage else d for d in self.decisions))
-
-
-def select_sensors(log: Log, config: Config) -> Sensors:
-    """Choose the sensors of a run and check their calibration.
-
-    Raises
-    ------
-    ConfigError
-        For a camera that the log does not have.
-    LogError
-        For a log without any camera, or with a calibration that no sensor can have.
-    """
-    if not log.cameras:
-        raise LogError(f"{log.name}: the log has no camera; log2sim runs at camera rate and needs at least one")
-    for name in config.cameras:
-        if name not in log.cameras:
-            known = list(log.cameras)
-            raise ConfigError(f"--cameras: no camera '{name}'{nearest(name, known)}; the log has {', '.join(known)}")
-    cameras = config.cameras or tuple(log.cameras)
-    _check_calibration(log, cameras)
-    far = _lidars_out_of_range(log, config.measure.max_range_m)
-    return Sensors(cameras, tuple(n for n in log.lidars if n not in far), tuple(sorted(far)))
 
 
 def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64]) -> Plan:
@@ -159,44 +113,17 @@ def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64
         _lidar_use(log, sensors),
         _motion_compensation(log, sensors, t_ns),
         decodes,
-        _detection_in_every_frame(decodes.kept, stride),
+        _detection_in_every_frame(config, decodes.kept, stride),
+        *_detection_in_sweeps(config),
         homography,
         _fusion(sensors.cameras),
+        *_fusion_with_lidar(config),
         Decision(Stage.TRACKING, True, "identities over time are the result"),
         Decision(Stage.SMOOTHING, smooth, "measured positions are noisy" if smooth else "smooth.enabled=false"),
         Decision(Stage.SMOOTHING_OF_PARKED_AGENTS, False, "a parked agent has one pose"),
         Decision(Stage.WAYPOINT_AT_EVERY_TICK, False, "waypoints that interpolation gives back are left out"),
     )
     return Plan(sensors.cameras, decisions, scope, max(stride, 1))
-
-
-def _check_calibration(log: Log, cameras: tuple[str, ...]) -> None:
-    """Raise `LogError` for a mounting that is no rigid motion and for intrinsics that project nothing."""
-    mounts = {n: log.cameras[n].mount_T_cam for n in cameras} | {n: s.mount_T_lidar for n, s in log.lidars.items()}
-    for name, mount_T_sensor in mounts.items():
-        rotation = mount_T_sensor[:3, :3]
-        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-        if not np.isfinite(mount_T_sensor).all() or not error < MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0:
-            raise LogError(
-                f"sensor '{name}': its mounting is not a rotation and a translation (R R^T departs from 1 by {error:.2g}, "
-                f"det R is {np.linalg.det(rotation):.2g}); expected a right-handed rotation, so check the calibration"
-            )
-    for name in cameras:
-        k = log.cameras[name].K
-        if not np.isfinite(k).all() or k[0, 0] <= 0 or k[1, 1] <= 0 or k[2].tolist() != [0, 0, 1]:
-            raise LogError(
-                f"camera '{name}': its intrinsics K are {k.tolist()}; expected finite numbers, positive focal lengths and "
-                "0, 0, 1 in the last row"
-            )
-
-
-def _lidars_out_of_range(log: Log, max_range_m: float) -> set[str]:
-    """Return the LiDARs fixed in the map that are too far from the ego's whole path to measure anything in range of it."""
-    if log.ego is None:
-        return set()
-    path, limit_m = log.ego.map_T_ego[:, :2, 3], max_range_m * np.sqrt(2) + MAX_LIDAR_RANGE_M
-    fixed = {name: lidar.mount_T_lidar[:2, 3] for name, lidar in log.lidars.items() if lidar.mount == "map"}
-    return {name for name, xy in fixed.items() if np.hypot(*(path - xy).T).min() > limit_m}
 
 
 def _lidar_use(log: Log, sensors: Sensors) -> Decision:
@@ -236,18 +163,22 @@ def _motion(map_T_ego: Array) -> tuple[float, float]:
 
 
 def _image_decoding(config: Config) -> Decision:
-    if config.detect.name != LABELS:
+    if not config.detect.in_images:
+        return Decision(Stage.IMAGE_DECODING, False, NO_CAMERA)
+    if config.detect.in_images != LABELS:
         return Decision(Stage.IMAGE_DECODING, True, "the detector needs images")
     return Decision(Stage.IMAGE_DECODING, False, "boxes come from the log; no image is needed")
 
 
-def _detection_in_every_frame(decodes: bool, stride: int) -> Decision:
+def _detection_in_every_frame(config: Config, decodes: bool, stride: int) -> Decision:
     """Decide whether frames may be skipped.
 
     A track needs `min_hits` measurements. An object that is visible for fewer ticks is not confirmed, so between two
     frames that many ticks apart in which the detector found nothing, the others need not be decoded.
     """
     stage = Stage.DETECTION_IN_EVERY_FRAME
+    if not config.detect.in_images:
+        return Decision(stage, False, NO_CAMERA)
     if not decodes:
         return Decision(stage, True, "without decoding a frame costs nothing")
     if stride < 2:
@@ -257,13 +188,33 @@ def _detection_in_every_frame(decodes: bool, stride: int) -> Decision:
 
 def _homography(log: Log, config: Config) -> tuple[HomographyScope, Decision]:
     stage = Stage.HOMOGRAPHY
+    if not config.detect.in_images:
+        return HomographyScope.NONE, Decision(stage, False, NO_CAMERA)
     if config.topdown.method == "off":
         return HomographyScope.NONE, Decision(stage, False, "topdown.method=off")
     reason = "detections without LiDAR points may need it" if log.lidars else "without LiDAR it alone gives depth"
     return HomographyScope.CAMERAS_IN_NEED, Decision(stage, True, reason)
 
 
+def _detection_in_sweeps(config: Config) -> tuple[Decision, ...]:
+    """Decide about the detector in LiDAR sweeps; nothing is stated without one."""
+    name = config.detect.in_sweeps
+    return (Decision(Stage.DETECTION_IN_SWEEPS, True, f"detector '{name}'"),) if name else ()
+
+
+def _fusion_with_lidar(config: Config) -> tuple[Decision, ...]:
+    """Decide whether detections of images and of sweeps are joined; nothing is stated without a detector in sweeps."""
+    stage = Stage.FUSION_WITH_LIDAR
+    if not config.detect.in_sweeps:
+        return ()
+    if not config.detect.in_images:
+        return (Decision(stage, False, NO_CAMERA),)
+    return (Decision(stage, True, "boxes of images and of sweeps are evidence for the same objects"),)
+
+
 def _fusion(cameras: tuple[str, ...]) -> Decision:
+    if not cameras:
+        return Decision(Stage.FUSION, False, NO_CAMERA)
     if len(cameras) > 1:
         return Decision(Stage.FUSION, True, f"{len(cameras)} cameras")
     return Decision(Stage.FUSION, False, "one camera; only duplicates of its detector are dropped")

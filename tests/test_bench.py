@@ -43,7 +43,7 @@ from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography.fit import HomographyFit
 from log2sim.perception.homography_stage import CameraHomography, calibrated_homography
 from log2sim.pipeline import schedule_of
-from log2sim.plan import select_sensors
+from log2sim.sensors import select_sensors
 
 FirstPass = tuple[BenchContext, Observations, dict[str, float]]
 LABELS = Config.load(detect={"name": "labels"})

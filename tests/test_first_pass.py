@@ -13,12 +13,14 @@ from log2sim.config import Config
 from log2sim.datatypes import Detections, Frame, ImageLabels, Lidar, Log, Stream, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import PoseTrack, apply, inverse, rotation_from_rpy, transform
-from log2sim.perception.first_pass import base_pose, cloud_origin, observe
+from log2sim.perception.first_pass import base_pose, observe
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.fusion import fuse
+from log2sim.perception.lidar.cloud import cloud_origin
 from log2sim.perception.sync import synchronize
 from log2sim.pipeline import reconstruct
-from log2sim.plan import make_plan, select_sensors
+from log2sim.plan import make_plan
+from log2sim.sensors import select_sensors
 from log2sim.stage_clock import StageClock
 
 T0_NS = 1_700_000_000_000_000_000

@@ -9,7 +9,8 @@ from log2sim.config import Config
 from log2sim.datatypes import Lidar, Log
 from log2sim.errors import ConfigError, LogError
 from log2sim.geometry import Camera, PoseTrack, transform
-from log2sim.plan import Decision, HomographyScope, Plan, Stage, make_plan, select_sensors
+from log2sim.plan import Decision, HomographyScope, Plan, Stage, make_plan
+from log2sim.sensors import select_sensors
 
 
 def make_log(
@@ -45,8 +46,11 @@ def decided(stage: Stage, log: Log | None = None, *settings: str) -> tuple[bool,
 
 
 def test_every_stage_is_decided_once_with_a_reason() -> None:
-    decisions = plan_of().decisions
+    decisions = plan_of(config=Config.load(settings=["detect.name=labels+lidar:labels"])).decisions
     assert [d.stage for d in decisions] == list(Stage)
+    in_sweeps = [Stage.DETECTION_IN_SWEEPS, Stage.FUSION_WITH_LIDAR]
+    assert [d.stage for d in plan_of().decisions] == [s for s in Stage if s not in in_sweeps]
+    assert not plan_of().keeps(Stage.DETECTION_IN_SWEEPS)
     assert all(len(d.reason) > 5 for d in decisions)
     assert decisions[0].to_dict() == {"stage": "use of every LiDAR", "kept": True, "reason": "1 within range"}
 

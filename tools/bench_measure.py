@@ -23,7 +23,8 @@ from log2sim.perception.box_completion import provisional_sizes
 from log2sim.perception.detect.detectors import create_detector
 from log2sim.perception.first_pass import observe
 from log2sim.perception.sync import synchronize
-from log2sim.plan import make_plan, select_sensors
+from log2sim.plan import make_plan
+from log2sim.sensors import select_sensors
 from log2sim.stage_clock import StageClock
 
 NEAREST_M = 4.0

@@ -113,6 +113,10 @@ def to_measurements(boxes: Boxes, view: View) -> list[Measurements]:
         cluster=(np.zeros((0, 3)),) * n,
         sensor_m=map_center,
         height_px_m=boxes.size_hwl_m[:, 0],
+        box_center_m=np.full((n, 3), np.nan),
+        box_size_m=np.full((n, 3), np.nan),
+        box_yaw_rad=np.full(n, np.nan),
+        heading_score=np.full(n, np.nan),
     )
     cuts = np.searchsorted(boxes.frame, np.arange(len(view.map_T_cam) + 1))
     return [everything.take(slice(a, b)) for a, b in pairwise(cuts)]

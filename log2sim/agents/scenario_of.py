@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from log2sim.config import Config
 from log2sim.datatypes import Agent, Log, Scenario
 from log2sim.geometry import NS_PER_S
-from log2sim.perception.detect.detectors import Detector
 from log2sim.perception.homography_stage import CameraHomography
 from log2sim.version import __version__
 
@@ -38,12 +37,12 @@ def scenario_of(
     )
 
 
-def provenance_of(log: Log, config: Config, detector: Detector) -> dict[str, Any]:
-    """Return what a scenario was made from and how: log, version, detector, settings, seed."""
+def provenance_of(log: Log, config: Config, detector: str) -> dict[str, Any]:
+    """Return what a scenario was made from and how: log, version, name of the detector, settings, seed."""
     return {
         "log": {"name": log.name, "format": log.format, "digest": log.digest},
         "log2sim_version": __version__,
-        "detector": detector.name,
+        "detector": detector,
         "config": config.to_dict(),
         "seed": config.seed,
         "history": ["reconstruct"],

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes.boxes3d import Boxes3D
 from log2sim.geometry import Array
 
 
@@ -45,7 +46,7 @@ class Detections:
 
 @dataclass(frozen=True, eq=False)
 class BoxEvidence:
-    """What a camera and the LiDARs observed of each object, map frame; nothing unobserved is completed.
+    """What cameras and LiDARs observed of each object, map frame; nothing unobserved is completed but by a 3D detector.
 
     Attributes
     ----------
@@ -55,8 +56,9 @@ class BoxEvidence:
     score : (M,) float64
         Of the detector, in [0, 1].
     camera : (M,) str
+        "" for an object that no camera detected.
     box_px : (M, 4) float64
-        u0, v0, u1, v1.
+        u0, v0, u1, v1; NaN without camera.
     truncated : (M,) bool
         Whether the image border cuts the box.
     height_px_m : (M,) float64
@@ -75,6 +77,14 @@ class BoxEvidence:
         Whether the right and the left end of the points, as seen from the viewpoint, are ends of the object.
     bottom_m, top_m : (M,) float64
         Heights of the ground under the object and of its highest points; NaN where unknown.
+    box_center_m : (M, 3) float64
+        Center of the box that a detector found in the LiDAR's sweep, m; NaN without one, as in the next three.
+    box_size_m : (M, 3) float64
+        Its length, width, height, m.
+    box_yaw_rad : (M,) float64
+        Its heading.
+    heading_score : (M,) float64
+        Probability in [0.5, 1] that its front and back are not swapped.
     """
 
     t_ns: NDArray[np.int64]
@@ -93,6 +103,10 @@ class BoxEvidence:
     ends_visible: NDArray[np.bool_]
     bottom_m: Array
     top_m: Array
+    box_center_m: Array
+    box_size_m: Array
+    box_yaw_rad: Array
+    heading_score: Array
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -138,6 +152,19 @@ class Measurements(BoxEvidence):
         return cls.unplaced(Detections.empty(), t_ns=0, camera="", sensor_m=np.zeros(3))
 
     @classmethod
+    def of_boxes(cls, boxes: Boxes3D, sensor_m: Array) -> Measurements:
+        """Return a row for each box (M,) of a 3D detector, seen from a sensor (3,), without LiDAR points and position."""
+        found = Detections(np.full((len(boxes), 4), np.nan), boxes.score, boxes.category)
+        return replace(
+            cls.unplaced(found, t_ns=0, camera="", sensor_m=sensor_m),
+            t_ns=boxes.t_ns,
+            box_center_m=boxes.center_m,
+            box_size_m=boxes.size_m,
+            box_yaw_rad=boxes.yaw_rad,
+            heading_score=boxes.heading_score,
+        )
+
+    @classmethod
     def unplaced(cls, detections: Detections, *, t_ns: int, camera: str, sensor_m: Array) -> Measurements:
         """Return a row a detection (M,) of a camera frame, without LiDAR points and without a position."""
         m = len(detections)
@@ -158,6 +185,10 @@ class Measurements(BoxEvidence):
             ends_visible=np.zeros((m, 2), dtype=bool),
             bottom_m=np.full(m, np.nan),
             top_m=np.full(m, np.nan),
+            box_center_m=np.full((m, 3), np.nan),
+            box_size_m=np.full((m, 3), np.nan),
+            box_yaw_rad=np.full(m, np.nan),
+            heading_score=np.full(m, np.nan),
             center_m=np.full((m, 3), np.nan),
             covariance=np.full((m, 2, 2), np.nan),
             source=np.full(m, "", dtype="<U16"),

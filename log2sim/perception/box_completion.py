@@ -22,6 +22,9 @@ SIZE_SIGMA_SHARE = 0.05
 SIDE_END, FACING_END = 1, 2
 # Corners are rounded: the outermost point seen from the side is inside the box by about this share of the width.
 CORNER_ROUNDING_SHARE = 0.08
+# Standard deviation of a center that a 3D detector estimates, per axis: with many points, and the number of points with which
+# its variance is twice that.
+BOX_SIGMA_M, BOX_SIGMA_POINTS = 0.15, 20.0
 # A side seen at a smaller angle than this (sine) shows its near end only.
 MIN_VIEW_SINE = 0.5
 # Share of length minus width by which a center is uncertain when its short side may be a front or a part of a flank.
@@ -114,24 +117,50 @@ def oriented_covariance(sigma_m: Array, yaw_rad: Array | float) -> Array:
     return np.asarray(axes * (sigma_m**2)[..., None, :] @ np.swapaxes(axes, -1, -2))
 
 
+def box_sigma(points: NDArray[np.int64]) -> Array:
+    """Return the standard deviations (M,), m, of centers that a 3D detector estimates from so many points (M,)."""
+    return np.asarray(BOX_SIGMA_M * np.sqrt(1 + BOX_SIGMA_POINTS / np.maximum(points, 1)))
+
+
+def weighted_center(local: Array, sigma_m: Array, box_local: Array, box_sigma_m: Array) -> tuple[Array, Array]:
+    """Average centers (..., 2) of completed boxes with those of a 3D detector by their variances along each axis.
+
+    Where one of the two is NaN the other is taken.
+
+    Returns
+    -------
+    center : (..., 2) float64, m
+    sigma_m : (..., 2) float64
+    """
+    missing, unseen = np.isnan(box_local), np.isnan(local)
+    share = np.where(missing, 0.0, np.where(unseen, 1.0, sigma_m**2 / (sigma_m**2 + box_sigma_m**2)))
+    center = np.where(missing, local, np.where(unseen, box_local, local + share * (box_local - local)))
+    return center, np.where(missing, sigma_m, np.sqrt(share) * box_sigma_m)
+
+
 def provisional_sizes(evidence: BoxEvidence) -> Array:
-    """Return the typical length and width (M, 2), or the observed extents where these are larger."""
+    """Return length and width (M, 2) of a 3D detector, else the typical ones, or the observed extents where these are larger."""
     typical = np.array([TYPICAL_SIZE_M[str(c)][:2] for c in evidence.category]).reshape(-1, 2)
-    return np.asarray(np.fmax(typical, evidence.high_m - evidence.low_m))
+    known = np.where(np.isnan(evidence.box_size_m[:, :2]), typical, evidence.box_size_m[:, :2])
+    return np.asarray(np.fmax(known, evidence.high_m - evidence.low_m))
 
 
 def place_boxes(evidence: BoxEvidence) -> Measurements:
     """Place every row (M,) with LiDAR extents by completing its box with the typical size of its category.
 
-    Rows without extents get no position. The position is provisional: see `Measurements`.
+    A box of a 3D detector gives the size instead, and its center is averaged with that of the completed box. Rows with
+    neither extents nor box get no position. The position is provisional: see `Measurements`.
     """
-    placed = np.isfinite(evidence.low_m[:, 0])
+    has_box = np.isfinite(evidence.box_yaw_rad)
+    placed = np.isfinite(evidence.low_m[:, 0]) | has_box
     low, high, yaw, size = evidence.low_m, evidence.high_m, evidence.yaw_rad, provisional_sizes(evidence)
     local, sigma = complete_box(low, high, size, real_ends(low, high, np.zeros_like(low), evidence.ends_visible))
     width = np.array([TYPICAL_SIZE_M[str(c)][1] for c in evidence.category])
     # So short a side may be a front or a visible part of a flank, for which the centers differ.
-    ambiguous = ((high - low).max(axis=1) <= MAX_WIDTH_FACTOR * width) & ~evidence.ends_visible.all(axis=1)
+    ambiguous = ((high - low).max(axis=1) <= MAX_WIDTH_FACTOR * width) & ~evidence.ends_visible.all(axis=1) & ~has_box
     extra = np.where(ambiguous, AXIS_AMBIGUITY_SHARE * (size[:, 0] - size[:, 1]), 0.0)
+    box_local = rotate(evidence.box_center_m[:, :2] - evidence.sensor_m[:, :2], -yaw)
+    local, sigma = weighted_center(local, sigma, box_local, box_sigma(evidence.points)[:, None])
     xy = evidence.sensor_m[:, :2] + rotate(local, yaw)
     z = (evidence.bottom_m + evidence.top_m) / 2
     return Measurements(

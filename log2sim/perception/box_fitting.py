@@ -13,6 +13,10 @@ SEARCH_STEP_RAD = np.deg2rad(2.0)
 # Distances to an edge below the noise of a LiDAR score alike.
 MIN_EDGE_DISTANCE_M = 0.03
 MAX_FIT_POINTS = 256
+MIN_CONTRAST = 0.1
+# A yaw known from elsewhere is corrected by at least so many points, and by no more than it can be wrong.
+MIN_YAW_POINTS = 30
+MAX_YAW_CORRECTION_RAD = np.deg2rad(12.0)
 # A side longer than this multiple of the typical width is not a front or rear.
 MAX_WIDTH_FACTOR = 1.2
 # Quantile of the points' heights that is taken for the top, robust to stray points.
@@ -44,6 +48,19 @@ def fit_extents(points: Array, typical: Array) -> tuple[float, Array, Array]:
     return float(yaw_rad), low, high
 
 
+def fit_extents_near(points: Array, yaw_rad: float) -> tuple[float, Array, Array]:
+    """Fit the extents of points (n, 2), relative to the viewpoint, where the yaw is known roughly; see `fit_extents`.
+
+    The direction of the sides corrects the yaw where the points show it.
+    """
+    if len(points) >= MIN_YAW_POINTS:
+        fitted, contrast = fit_yaw(points)
+        fitted = align_to(fitted, yaw_rad, np.pi / 2)
+        if contrast >= MIN_CONTRAST and abs(float(wrap_angle(fitted - yaw_rad))) <= MAX_YAW_CORRECTION_RAD:
+            yaw_rad = fitted
+    return yaw_rad, *extents(points, yaw_rad)
+
+
 def fit_yaw(xy_m: Array) -> tuple[float, float]:
     """Find the yaw of the rectangle whose sides are nearest to the points (N, 2), up to quarter turns.
 
@@ -52,8 +69,8 @@ def fit_yaw(xy_m: Array) -> tuple[float, float]:
     yaw_rad : float
         In [0, pi/2).
     contrast : float
-        Score of the best direction over the median score, less 1: 0 for a round or shapeless cluster; below about 0.1 the
-        yaw carries no information.
+        Score of the best direction over the median score, less 1: 0 for a round or shapeless cluster; below about
+        `MIN_CONTRAST` the yaw carries no information.
 
     Notes
     -----

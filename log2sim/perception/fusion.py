@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Measurements
 from log2sim.perception.box_completion import place_boxes, provisional_sizes
-from log2sim.perception.box_fitting import fit_extents, rotate, top_of
+from log2sim.perception.box_fitting import fit_extents, fit_extents_near, rotate, top_of
 
 # Clusters are one object when this share of the points of either is inside the extents of the other.
 MIN_SHARED_POINTS = 0.4
@@ -19,6 +19,8 @@ MARGIN_M = 0.15
 MIN_DRIVER_SHARE = 0.8
 # Truncated boxes lose to whole ones of the same score.
 TRUNCATED_SCORE_FACTOR = 0.7
+# What a detector in LiDAR sweeps adds to a row.
+BOX_COLUMNS = ("box_center_m", "box_size_m", "box_yaw_rad", "heading_score")
 # Squared Mahalanobis distance of two independent positions, 2 degrees of freedom, 99 %.
 CHI2_2DOF_99 = 9.21
 
@@ -79,6 +81,9 @@ def _gated_pairs(rows: Measurements) -> NDArray[np.bool_]:
     other_camera = (rows.camera[:, None] != rows.camera) & placed[:, None] & placed
     same_place = other_camera & (squared <= CHI2_2DOF_99 * determinant)
     gated = np.where(with_points[:, None] & with_points, near, same_place) & (group[:, None] == group)
+    # Boxes that a detector found in one sweep are different objects.
+    from_sweep = rows.camera == ""
+    gated &= ~(from_sweep[:, None] & from_sweep)
     return np.asarray(gated, dtype=bool)
 
 
@@ -110,9 +115,12 @@ def _join(rows: Measurements, leader: int, members: NDArray[np.intp]) -> Measure
     if not others or not with_points[leader]:
         return row
     merged = [leader, *others]
+    boxed = rows.take([next((m for m in merged if np.isfinite(rows.box_yaw_rad[m])), leader)])
+    row = replace(row, **{column: getattr(boxed, column) for column in BOX_COLUMNS})
     cluster = np.concatenate([rows.cluster[m] for m in merged])
-    xyz = cluster - row.sensor_m[0]
-    yaw, low, high = fit_extents(xyz[:, :2], np.array(TYPICAL_SIZE_M[str(row.category[0])]))
+    xyz, box_yaw = cluster - row.sensor_m[0], float(row.box_yaw_rad[0])
+    typical = np.array(TYPICAL_SIZE_M[str(row.category[0])])
+    yaw, low, high = fit_extents_near(xyz[:, :2], box_yaw) if np.isfinite(box_yaw) else fit_extents(xyz[:, :2], typical)
     return place_boxes(replace(
         row, cluster=(cluster,), yaw_rad=np.array([yaw]), low_m=low[None], high_m=high[None],
         top_m=np.array([top_of(cluster[:, 2])]),

@@ -1,7 +1,8 @@
-"""Synchronization at camera rate: the camera frames and LiDAR sweeps of every tick, with their residuals.
+"""Synchronization: the camera frames and LiDAR sweeps of every tick, with their residuals.
 
 A tick is a frame of the reference camera. Every other camera contributes its nearest frame. Every camera frame gets the
-nearest sweep, where the time of a sweep is the middle of its point times, not the stamp of its driver.
+nearest sweep, where the time of a sweep is the middle of its point times, not the stamp of its driver. Without cameras a
+tick is a sweep of the reference LiDAR.
 """
 
 from __future__ import annotations
@@ -27,13 +28,13 @@ class Schedule:
     Attributes
     ----------
     reference : str
-        Camera that sets the ticks.
+        Camera that sets the ticks, or LiDAR where no camera is used.
     t_ns : (T,) int64
         Stamps of the ticks.
     frames : mapping of camera to (T,) int64
         Index into its stream, -1 where no frame is near enough.
     sweeps : mapping of LiDAR to (C, T) int64
-        Index for every camera in the order of `frames`, -1 where no sweep is near enough.
+        Index for every camera in the order of `frames`, one row without cameras; -1 where no sweep is near enough.
     residuals_s : mapping of stream to (T,) float64
         Time of the record less the requested time, NaN without a record.
     """
@@ -47,6 +48,16 @@ class Schedule:
     def __len__(self) -> int:
         """Return the number of ticks."""
         return len(self.t_ns)
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of `sweeps`."""
+        return max(len(self.frames), 1)
+
+    @property
+    def reference_row(self) -> int:
+        """Row of `sweeps` that belongs to the reference."""
+        return list(self.frames).index(self.reference) if self.frames else 0
 
     def summary(self) -> dict[str, Any]:
         """Summarize residuals by stream for the report: median and largest magnitude in s, and the number of ticks without a record."""
@@ -73,8 +84,11 @@ def synchronize(
 
     Parameters
     ----------
+    cameras : tuple of str
+        Without any, the sweeps of a LiDAR are the ticks.
     reference : str
-        Camera that sets the ticks; "" takes the log's own choice, else the first camera.
+        Camera that sets the ticks; "" takes the log's own choice, else the first camera. Without cameras the LiDAR; ""
+        takes the one with the most sweeps.
     max_residual_s : float
         Largest difference between a record's time and the requested time, s.
     start_s, stop_s : float, optional
@@ -87,12 +101,12 @@ def synchronize(
     ConfigError
         When the reference is unknown or no tick is left.
     """
-    reference = reference or (log.reference_camera if log.reference_camera in cameras else "") or cameras[0]
-    if reference not in cameras:
-        raise ConfigError(f"sync.reference: camera '{reference}' is not used; used: {', '.join(cameras)}")
+    reference = _reference(log, cameras, reference)
     for name in (*cameras, *log.lidars):
         _check_stamps(log.streams[name])
     ticks = log.streams[reference].t_ns
+    if not cameras:
+        ticks = ticks + sweep_middle_ns(log.streams[reference])
     seconds = (ticks - ticks[0]) / NS_PER_S
     keep = (seconds >= (start_s if start_s is not None else -np.inf)) & (
         seconds <= (stop_s if stop_s is not None else np.inf)
@@ -110,11 +124,25 @@ def synchronize(
     for lidar in log.lidars:
         stream = log.streams[lidar]
         middle = stream.t_ns + sweep_middle_ns(stream)
-        asked = np.stack([np.where(frames[c] >= 0, log.streams[c].t_ns[frames[c]], ticks) for c in cameras])
+        stamps = [np.where(frames[c] >= 0, log.streams[c].t_ns[frames[c]], ticks) for c in cameras]
+        asked = np.stack(stamps or [ticks])
         index, _ = nearest_records(middle, asked.ravel(), tolerance_ns)
         sweeps[lidar] = index.reshape(asked.shape)
-        _, residuals[lidar] = nearest_records(middle, asked[cameras.index(reference)], tolerance_ns)
+        row = cameras.index(reference) if cameras else 0
+        _, residuals[lidar] = nearest_records(middle, asked[row], tolerance_ns)
     return Schedule(reference, ticks, frames, sweeps, residuals)
+
+
+def _reference(log: Log, cameras: tuple[str, ...], wanted: str) -> str:
+    """Choose the sensor that sets the ticks: a camera, or a LiDAR without cameras."""
+    if not cameras:
+        if wanted and wanted not in log.lidars:
+            raise ConfigError(f"sync.reference: LiDAR '{wanted}' is not used; used: {', '.join(log.lidars)}")
+        return wanted or max(log.lidars, key=lambda name: len(log.streams[name].t_ns))
+    reference = wanted or (log.reference_camera if log.reference_camera in cameras else "") or cameras[0]
+    if reference not in cameras:
+        raise ConfigError(f"sync.reference: camera '{reference}' is not used; used: {', '.join(cameras)}")
+    return reference
 
 
 def _check_stamps(stream: Stream) -> None:

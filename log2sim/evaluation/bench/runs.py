@@ -28,8 +28,9 @@ from log2sim.perception.first_pass import Observations, observe
 from log2sim.perception.fusion import fuse
 from log2sim.perception.homography_stage import CameraHomography, estimation_options, fit_homographies
 from log2sim.perception.sync import Schedule
-from log2sim.pipeline import Run, detector_of, schedule_of, second_pass
-from log2sim.plan import LABELS, Decision, HomographyScope, Plan, Stage, make_plan, select_sensors
+from log2sim.pipeline import Detectors, Run, detector_of, schedule_of, second_pass
+from log2sim.plan import LABELS, Decision, HomographyScope, Plan, Stage, make_plan
+from log2sim.sensors import select_sensors
 from log2sim.stage_clock import StageClock
 
 REPEATS = 3
@@ -178,9 +179,9 @@ def run_settings(
 
 
 def _concluded(context: BenchContext, setting: Setting, observations: Observations, clock: StageClock) -> Score:
-    detector = context.found[context.grid.present.name]
+    detectors = Detectors(context.found[context.grid.present.name], None)
     try:
-        run = Run(context.log, setting.config, context.plan, context.schedule, detector, clock, lambda *_: None)
+        run = Run(context.log, setting.config, context.plan, context.schedule, detectors, clock, lambda *_: None)
         result = second_pass(run, observations)
     except NothingToReconstruct:
         return Score({"agents": 0})

@@ -204,3 +204,25 @@ def assemble_cloud(
     # A distant LiDAR without points in range must not shift the viewpoint.
     sensor = np.mean([p[2] for p in parts if len(p[0])] or [p[2] for p in parts], axis=0).astype(np.float32)
     return Cloud(stamp, np.asarray(origin, float), xyz, t_s, sensor, np.abs(height) <= ON_GROUND_M, height)
+
+
+def compensation_of(log: Log, lidar: str, sweep: Sweep) -> str:
+    """How a sweep is compensated: "in the map" before, "no times" to do it with, "at rest" or "moving"."""
+    if sweep.frame == "map":
+        return "in the map"
+    if sweep.t_ns is None:
+        return "no times"
+    return "at rest" if is_at_rest(log, lidar, sweep) else "moving"
+
+
+def cloud_origin(log: Log, t_ns: int) -> tuple[Array, float]:
+    """Origin (3,) of a tick's clouds in the map frame, and the height of the ground there.
+
+    Without ego it is the middle of the sensors, with the ground taken from `ground_z_ego_m` as a height in the map.
+    """
+    if log.ego is not None:
+        map_T_ego, _ = log.ego.at(t_ns)
+        ground = map_T_ego[0] @ np.array([0.0, 0.0, log.ground_z_ego_m, 1.0])
+        return map_T_ego[0, :3, 3].copy(), float(ground[2])
+    places = [log.map_T_sensor(name, t_ns)[0][0, :3, 3] for name in (*log.lidars, *log.cameras)]
+    return np.mean(places, axis=0), log.ground_z_ego_m

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import TYPICAL_SIZE_M, Detections, Measurements
 from log2sim.geometry import NS_PER_S, Array, Camera
 from log2sim.perception.box_completion import place_boxes
-from log2sim.perception.box_fitting import fit_extents, subsample, top_of, upper_median
+from log2sim.perception.box_fitting import fit_extents, fit_extents_near, subsample, top_of, upper_median
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.clusters import (
     MARGIN,
@@ -49,7 +49,7 @@ def _cut_by_border(camera: Camera, box_px: Array) -> NDArray[np.bool_]:
     return np.asarray((box_px[:, :2] < BORDER_PX).any(axis=1) | (box_px[:, 2:] > border).any(axis=1))
 
 
-def _writable(rows: Measurements) -> dict[str, Any]:
+def writable(rows: Measurements) -> dict[str, Any]:
     """Copy the columns of rows, so that they can be written."""
     return {k: list(v) if isinstance(v, tuple) else v.copy() for k, v in vars(rows).items()}
 
@@ -65,7 +65,7 @@ def _measure_robustly(rows: Measurements, view: View, cloud: Cloud) -> Measureme
     for k, i in enumerate(points_in_image_boxes(visible, rows.box_px, MARGIN)):
         found = candidate_clusters(xyz[i], uv[i], range_m[i], rows.box_px[k], str(rows.category[k]))
         options.append([(i[members], score) for members, score in found])
-    columns = _writable(rows)
+    columns = writable(rows)
     for k, chosen in enumerate(assign_clusters(options, rows.box_px, len(index))):
         if len(chosen) < MIN_CLUSTER_POINTS:
             continue
@@ -75,15 +75,16 @@ def _measure_robustly(rows: Measurements, view: View, cloud: Cloud) -> Measureme
             members = np.union1d(members, grown)
         box = rows.box_px[k]
         columns["height_px_m"][k] = (box[3] - box[1]) * upper_median(visible.depth[chosen]) / view.camera.K[1, 1]
-        _write_evidence(columns, k, members, cloud)
+        write_evidence(columns, k, members, cloud)
     return place_boxes(Measurements(**columns | {"cluster": tuple(columns["cluster"])}))
 
 
-def _write_evidence(columns: dict[str, Any], k: int, members: NDArray[np.intp], cloud: Cloud) -> None:
-    """Write what the points at `members` (n,) show into row `k`."""
+def write_evidence(columns: dict[str, Any], k: int, members: NDArray[np.intp], cloud: Cloud) -> None:
+    """Write what the points at `members` (n,) show into row `k`; a box of a 3D detector tells the length from the width."""
     xyz = cloud.xyz[members].astype(np.float64)
+    xy, box_yaw = xyz[:, :2] - cloud.sensor[:2], float(columns["box_yaw_rad"][k])
     typical = np.array(TYPICAL_SIZE_M[str(columns["category"][k])])
-    yaw, low, high = fit_extents(xyz[:, :2] - cloud.sensor[:2], typical)
+    yaw, low, high = fit_extents_near(xy, box_yaw) if np.isfinite(box_yaw) else fit_extents(xy, typical)
     columns["yaw_rad"][k], columns["low_m"][k], columns["high_m"][k] = yaw, low, high
     columns["ends_visible"][k] = cloud.azimuth_index.ends_visible(members)
     columns["bottom_m"][k] = upper_median(xyz[:, 2] - cloud.height[members]) + cloud.origin[2]
@@ -98,7 +99,7 @@ def _measure_as_paper(rows: Measurements, view: View, cloud: Cloud) -> Measureme
     """Take the depth of the point nearest to the box center, and the extents of all points in the box."""
     visible = project_points(view, cloud.origin, cloud.columns)
     uv, xyz = np.stack([visible.u, visible.v], axis=1), cloud.xyz[visible.index]
-    columns = _writable(rows)
+    columns = writable(rows)
     for k, inside in enumerate(points_in_image_boxes(visible, rows.box_px)):
         if len(inside) == 0:
             continue

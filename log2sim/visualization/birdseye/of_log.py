@@ -10,8 +10,8 @@ import numpy as np
 
 from log2sim.datatypes import Log, Scenario
 from log2sim.geometry import NS_PER_S, nearest_index
-from log2sim.perception.first_pass import cloud_origin
 from log2sim.perception.frames import RecordReader
+from log2sim.perception.lidar.cloud import cloud_origin
 from log2sim.visualization.birdseye.ground_view import GroundView
 from log2sim.visualization.birdseye.mosaic import BirdsEyeView, Mosaic
 

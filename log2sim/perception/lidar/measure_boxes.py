@@ -1,0 +1,46 @@
+"""Measurement of boxes that a detector found in a cloud: their points are evidence as those of image boxes are."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Boxes3D, Measurements
+from log2sim.perception.box_completion import place_boxes
+from log2sim.perception.box_fitting import rotate
+from log2sim.perception.detect3d.box_points import points_of_boxes
+from log2sim.perception.lidar.cloud import Cloud
+from log2sim.perception.lidar.clusters import MIN_CLUSTER_POINTS
+from log2sim.perception.lidar.measure import writable, write_evidence
+
+# A box is wrong by less than this at each side; neighbors are farther away.
+BOX_MARGIN_M = 0.2
+
+
+def measure_boxes(boxes: Boxes3D, cloud: Cloud) -> Measurements:
+    """Measure boxes (M,) found in a cloud; a row with too few points of its own keeps the position of its box."""
+    columns = writable(Measurements.of_boxes(boxes, cloud.sensor + cloud.origin))
+    columns["yaw_rad"][:] = boxes.yaw_rad
+    columns["points"][:] = boxes.points
+    for end, sign in (("bottom_m", -0.5), ("top_m", 0.5)):
+        columns[end][:] = boxes.center_m[:, 2] + sign * boxes.size_m[:, 2]
+    for k, members in enumerate(_members(boxes, cloud)):
+        if len(members) >= MIN_CLUSTER_POINTS:
+            write_evidence(columns, k, members, cloud)
+    return place_boxes(Measurements(**columns | {"cluster": tuple(columns["cluster"])}))
+
+
+def _members(boxes: Boxes3D, cloud: Cloud) -> list[NDArray[np.intp]]:
+    """Find the points of the cloud above the ground in each box, somewhat widened; each point belongs to one box."""
+    center = boxes.center_m - cloud.origin
+    found = points_of_boxes(cloud.obstacle_columns.T, center, boxes.size_m + 2 * BOX_MARGIN_M, boxes.yaw_rad)
+    local = rotate(cloud.obstacle_columns.T[found.point, :2] - center[found.box, :2], -boxes.yaw_rad[found.box])
+    outside_m = (np.abs(local) - boxes.size_m[found.box, :2] / 2).max(axis=1)
+    # Of several boxes that hold a point, it is deepest in its own.
+    order = np.lexsort((outside_m, found.point))
+    own = order[np.r_[True, np.diff(found.point[order]) != 0]] if len(order) else order
+    own = np.sort(own)
+    edges = np.searchsorted(found.box[own], np.arange(len(boxes) + 1))
+    return [cloud.obstacles[found.point[own[a:b]]] for a, b in pairwise(edges)]

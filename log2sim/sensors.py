@@ -1,0 +1,109 @@
+"""The sensors of a log that a run uses, with their calibration checked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from log2sim.config import Config
+from log2sim.datatypes import Log
+from log2sim.errors import ConfigError, LogError
+from log2sim.registry import nearest
+
+# Largest departure of R R^T from 1: calibration files round to five digits or more.
+MAX_ROTATION_ERROR = 1e-3
+# No LiDAR for vehicles or roadsides measures farther.
+MAX_LIDAR_RANGE_M = 300.0
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """The sensors of a log that a run uses.
+
+    Attributes
+    ----------
+    cameras : tuple of str
+        Those of the settings, or all; none where LiDAR sweeps alone are searched.
+    lidars : tuple of str
+        Those within range of the ego's path.
+    lidars_out_of_range : tuple of str
+    """
+
+    cameras: tuple[str, ...]
+    lidars: tuple[str, ...]
+    lidars_out_of_range: tuple[str, ...] = ()
+
+    def restrict(self, log: Log) -> Log:
+        """Return the log without the LiDARs that are out of range; its streams stay."""
+        return replace(log, lidars={name: log.lidars[name] for name in self.lidars})
+
+
+def select_sensors(log: Log, config: Config) -> Sensors:
+    """Choose the sensors of a run and check their calibration.
+
+    Raises
+    ------
+    ConfigError
+        For a camera that the log does not have or that the detector does not use.
+    LogError
+        For a log without a sensor that the detector needs, or with a calibration that no sensor can have.
+    """
+    cameras = _cameras(log, config)
+    _check_calibration(log, cameras)
+    far = _lidars_out_of_range(log, config.measure.max_range_m)
+    lidars = tuple(n for n in log.lidars if n not in far)
+    if config.detect.in_sweeps and not lidars:
+        found = f"no LiDAR within range ({', '.join(sorted(far))} are too far)" if far else "no LiDAR"
+        raise LogError(f"{log.name}: the log has {found}; detector '{config.detect.in_sweeps}' needs one")
+    return Sensors(cameras, lidars, tuple(sorted(far)))
+
+
+def _cameras(log: Log, config: Config) -> tuple[str, ...]:
+    """Return the cameras to use: those of the settings, or all; none where LiDAR sweeps alone are searched."""
+    if not config.detect.in_images:
+        if config.cameras:
+            raise ConfigError(
+                f"--cameras: detector '{config.detect.name}' uses no camera; name one for images too, for instance "
+                f"'ssd-mobilenet-v2+{config.detect.in_sweeps}', or leave --cameras out"
+            )
+        return ()
+    if not log.cameras:
+        raise LogError(
+            f"{log.name}: the log has no camera, which detector '{config.detect.in_images}' needs; a detector in LiDAR "
+            "sweeps needs none, for instance --detector lidar:vehicle"
+        )
+    for name in config.cameras:
+        if name not in log.cameras:
+            known = list(log.cameras)
+            raise ConfigError(f"--cameras: no camera '{name}'{nearest(name, known)}; the log has {', '.join(known)}")
+    return config.cameras or tuple(log.cameras)
+
+
+def _check_calibration(log: Log, cameras: tuple[str, ...]) -> None:
+    """Raise `LogError` for a mounting that is no rigid motion and for intrinsics that project nothing."""
+    mounts = {n: log.cameras[n].mount_T_cam for n in cameras} | {n: s.mount_T_lidar for n, s in log.lidars.items()}
+    for name, mount_T_sensor in mounts.items():
+        rotation = mount_T_sensor[:3, :3]
+        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        if not np.isfinite(mount_T_sensor).all() or not error < MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0:
+            raise LogError(
+                f"sensor '{name}': its mounting is not a rotation and a translation (R R^T departs from 1 by {error:.2g}, "
+                f"det R is {np.linalg.det(rotation):.2g}); expected a right-handed rotation, so check the calibration"
+            )
+    for name in cameras:
+        k = log.cameras[name].K
+        if not np.isfinite(k).all() or k[0, 0] <= 0 or k[1, 1] <= 0 or k[2].tolist() != [0, 0, 1]:
+            raise LogError(
+                f"camera '{name}': its intrinsics K are {k.tolist()}; expected finite numbers, positive focal lengths and "
+                "0, 0, 1 in the last row"
+            )
+
+
+def _lidars_out_of_range(log: Log, max_range_m: float) -> set[str]:
+    """Return the LiDARs fixed in the map that are too far from the ego's whole path to measure anything in range of it."""
+    if log.ego is None:
+        return set()
+    path, limit_m = log.ego.map_T_ego[:, :2, 3], max_range_m * np.sqrt(2) + MAX_LIDAR_RANGE_M
+    fixed = {name: lidar.mount_T_lidar[:2, 3] for name, lidar in log.lidars.items() if lidar.mount == "map"}
+    return {name for name, xy in fixed.items() if np.hypot(*(path - xy).T).min() > limit_m}
