@@ -46,6 +46,7 @@ def visibility_by_camera(
     moving: MovingScene, cameras: Mapping[str, Camera], backdrop: Any
 ) -> dict[str, list[FrameVisibility]]:
     """Segment every frame of every camera."""
+    from log2sim.synth.bodies import Body
     from log2sim.synth.render import SceneInstant, segment
 
     out: dict[str, list[FrameVisibility]] = {}
@@ -55,7 +56,8 @@ def visibility_by_camera(
         for t_ns in frame_stamps(spec, moving.scene):
             t_s = moving.seconds(t_ns)
             map_T_cam = moving.ego.map_T_ego_ns(np.array([t_ns]))[0] @ camera.mount_T_cam
-            parts = segment(camera, map_T_cam, SceneInstant(backdrop, moving.actors, t_s))
+            bodies = [Body.of(actor, t_s) for actor in moving.actors]
+            parts = segment(camera, map_T_cam, SceneInstant(backdrop, bodies))
             unoccluded = np.array([0.0 if p is None else p.visible_px / p.silhouette_px for p in parts])
             boxes = np.array([np.full(4, np.nan) if p is None else p.box_px for p in parts]).reshape(-1, 4)
             inside = np.array([_box_inside(camera, inverse(map_T_cam), a, t_s) for a in moving.actors])

@@ -32,12 +32,17 @@ TORSO = (
 def pedestrian(size_m: tuple[float, float, float], phase: int, standing: bool) -> Mesh:
     """Shape a person on foot at step `phase` of `PHASES`; the box holds the whole gait, whose ends legs reach twice a stride."""
     low, high = _gait_extent(standing)
-    return _grounded(_walker(2 * np.pi * phase / PHASES, standing)).fitted(size_m, low, high)
+    return _step(phase, standing).fitted(size_m, low, high)
+
+
+@lru_cache(maxsize=2 * PHASES)
+def _step(phase: int, standing: bool) -> Mesh:
+    return _grounded(_walker(2 * np.pi * phase / PHASES, standing))
 
 
 @lru_cache(maxsize=2)
 def _gait_extent(standing: bool) -> tuple[Array, Array]:
-    poses = [_grounded(_walker(2 * np.pi * k / PHASES, standing)).vertices_m for k in range(PHASES)]
+    poses = [_step(k, standing).vertices_m for k in range(PHASES)]
     return np.min([p.min(0) for p in poses], axis=0), np.max([p.max(0) for p in poses], axis=0)
 
 
@@ -101,10 +106,12 @@ def _head(center: Array) -> list[Mesh]:
 @lru_cache(maxsize=256)
 def cyclist(size_m: tuple[float, float, float], phase: int) -> Mesh:
     """Shape a bicycle with its rider at `phase` of `PHASES` of a turn of the pedals."""
-    return _rider(2 * np.pi * phase / PHASES).fitted(size_m)
+    return _rider(phase).fitted(size_m)
 
 
-def _rider(phase: float) -> Mesh:
+@lru_cache(maxsize=PHASES)
+def _rider(step: int) -> Mesh:
+    phase = 2 * np.pi * step / PHASES
     radius = 0.34
     rear, front = np.array([-0.53, 0.0, radius]), np.array([0.53, 0.0, radius])
     crank, seat, head = np.array([-0.08, 0.0, 0.28]), np.array([-0.26, 0.0, 0.92]), np.array([0.38, 0.0, 0.88])

@@ -2,36 +2,59 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
+from log2sim.synth.shapes import cross_products
 
 NEAR_M = 0.3
-MAX_FRAGMENTS_PER_BATCH = 3_000_000
+MIN_VOLUME_M3 = 1e-12  # of the tetrahedron of a face and the camera, below which the face is seen edge-on
+
+Index = NDArray[np.int32]
 
 
 @dataclass(frozen=True, eq=False)
 class Fragments:
-    """The nearest surface of a mesh at each pixel that it covers.
+    """The nearest surface of a mesh at each pixel that it covers, by ascending row and column.
 
     Attributes
     ----------
-    pixel : (P,) int64
-        Row-major index into the image.
+    u, v : (P,) int32
+        Column and row.
     depth_m : (P,) float32, m
         Along the optical axis.
-    face : (P,) int64
-    weight : (P, 3) float32
-        Perspective-correct barycentric weights of the face's vertices.
+    face : (P,) int32
+    planes : (F, 3 vertices, 3) float64
+        For each face and each of its vertices the coefficients of u, v and 1 of a linear function of the image: the
+        barycentric weight of the vertex divided by the depth.
     """
 
-    pixel: NDArray[np.int64]
+    u: Index
+    v: Index
     depth_m: NDArray[np.float32]
-    face: NDArray[np.int64]
-    weight: NDArray[np.float32]
+    face: Index
+    planes: Array
+
+    def pixel(self, width_px: int) -> Index:
+        """Row-major indices (P,) into an image."""
+        return self.v * np.int32(width_px) + self.u
+
+    def part(self, rows: NDArray[Any]) -> Fragments:
+        """Select fragments."""
+        return Fragments(self.u[rows], self.v[rows], self.depth_m[rows], self.face[rows], self.planes)
+
+    def interpolated(self, values: Array, faces: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Interpolate values (V, 3) of the vertices with the right perspective: (P, 3), each divided by its depth."""
+        by_face = np.einsum("fik,fic->kcf", self.planes, values[faces]).astype(np.float32)
+        u, v = self.u.astype(np.float32), self.v.astype(np.float32)
+        out = np.empty((len(u), 3), np.float32)
+        for c in range(3):
+            out[:, c] = by_face[0, c][self.face] * u + by_face[1, c][self.face] * v + by_face[2, c][self.face]
+        return out
 
 
 def rasterize(vertices_cam: Array, faces: NDArray[np.int64], K: Array, width_px: int, height_px: int) -> Fragments:
@@ -41,101 +64,94 @@ def rasterize(vertices_cam: Array, faces: NDArray[np.int64], K: Array, width_px:
     ----------
     vertices_cam : (V, 3) float64, m, cam frame
     faces : (F, 3) int
-        Counter-clockwise from outside; faces that look away are left out, and so are those nearer than `NEAR_M`.
+        Counter-clockwise from outside; faces that look away are left out, and so is what is nearer than `NEAR_M`.
     K : (3, 3) float64, px
         Pixel centers are whole numbers, as in OpenCV.
+
+    Notes
+    -----
+    Edge functions in homogeneous coordinates, so that faces which reach behind the camera need no clipping: Olano & Greer,
+    Triangle Scan Conversion using 2D Homogeneous Coordinates (Graphics Hardware 1997).
     """
-    triangles = _on_screen(vertices_cam, faces, K, width_px, height_px)
-    total = np.cumsum(triangles.count)
-    parts = []
-    first = 0
-    while first < len(total):
-        base = total[first - 1] if first else 0
-        last = max(first + 1, int(np.searchsorted(total, base + MAX_FRAGMENTS_PER_BATCH)))
-        parts.append(_covered(triangles.part(slice(first, last)), width_px))
-        first = last
-    if not parts:
-        nothing = np.zeros(0, np.int64)
-        return Fragments(nothing, np.zeros(0, np.float32), nothing, np.zeros((0, 3), np.float32))
-    pixel, nearness, face, weight = (np.concatenate(columns) for columns in zip(*parts))
-    order = np.lexsort((-nearness, pixel))
-    first_of_pixel = np.ones(len(order), dtype=bool)
-    first_of_pixel[1:] = pixel[order][1:] != pixel[order][:-1]
-    keep = order[first_of_pixel]
-    return Fragments(pixel[keep], np.float32(1.0) / nearness[keep].astype(np.float32), face[keep], weight[keep])
+    triangles = vertices_cam[faces]  # (F, 3 vertices, 3)
+    planes, facing = _edge_planes(triangles, K)
+    low, high = _row_ranges(triangles, K, height_px)
+    kept = np.flatnonzero(facing & (high > low) & (triangles[:, :, 2].max(1) > NEAR_M)).astype(np.int32)
+    height = (high - low)[kept]
+    face = np.repeat(kept, height)
+    v = _counted(height) + np.repeat(low[kept], height)
+    first, length, nearness_at_0, slope = _spans(planes, face, v, width_px)
+    row = np.repeat(np.arange(len(face), dtype=np.int32), length)
+    u = _counted(length) + first[row]
+    nearness = nearness_at_0[row] + slope[row] * u
+    v = v[row]
+    nearest = _nearest(v * np.int32(width_px) + u, nearness)
+    depth = (1.0 / nearness[nearest]).astype(np.float32)
+    return Fragments(u[nearest], v[nearest], depth, face[row[nearest]], planes)
 
 
-@dataclass(frozen=True, eq=False)
-class _Triangles:
-    """Faces in the image.
-
-    Attributes
-    ----------
-    index : (F,) int64
-        Of the face.
-    u, v : (F, 3) float64, px
-        Of the vertices.
-    inverse_z : (F, 3) float64, 1/m
-        Inverse depth of the vertices.
-    area : (F,) float64, px2
-        Twice the signed area.
-    u0, v0 : (F,) int64, px
-        First column and row of the surrounding rectangle.
-    span : (F,) int64, px
-        Width of the rectangle.
-    count : (F,) int64
-        Pixels in the rectangle.
-    """
-
-    index: NDArray[np.int64]
-    u: Array
-    v: Array
-    inverse_z: Array
-    area: Array
-    u0: NDArray[np.int64]
-    v0: NDArray[np.int64]
-    span: NDArray[np.int64]
-    count: NDArray[np.int64]
-
-    def part(self, rows: slice | NDArray[np.bool_]) -> _Triangles:
-        """Select faces."""
-        return _Triangles(*(getattr(self, f.name)[rows] for f in fields(self)))
+def _counted(counts: Index) -> Index:
+    """0, 1, 2 ... within each of several runs."""
+    ends = np.cumsum(counts, dtype=np.int32)
+    total = int(ends[-1]) if len(ends) else 0
+    return np.arange(total, dtype=np.int32) - np.repeat(ends - counts, counts)
 
 
-def _on_screen(vertices_cam: Array, faces: NDArray[np.int64], K: Array, width_px: int, height_px: int) -> _Triangles:
-    tri = vertices_cam[faces]  # (F, 3 vertices, 3)
-    outward = np.cross(tri[:, 1] - tri[:, 0], tri[:, 2] - tri[:, 0])
-    keep = (np.einsum("fi,fi->f", outward, tri[:, 0]) < 0) & (tri[:, :, 2].min(1) > NEAR_M)
-    tri = tri[keep]
-    inverse_z = 1.0 / tri[:, :, 2]
-    u = tri[:, :, 0] * inverse_z * K[0, 0] + K[0, 2]
-    v = tri[:, :, 1] * inverse_z * K[1, 1] + K[1, 2]
-    u0, u1 = (np.clip(x, 0, width_px).astype(np.int64) for x in (np.ceil(u.min(1)), np.floor(u.max(1)) + 1))
-    v0, v1 = (np.clip(x, 0, height_px).astype(np.int64) for x in (np.ceil(v.min(1)), np.floor(v.max(1)) + 1))
-    area = (u[:, 1] - u[:, 0]) * (v[:, 2] - v[:, 0]) - (u[:, 2] - u[:, 0]) * (v[:, 1] - v[:, 0])
-    count = np.maximum(u1 - u0, 0) * np.maximum(v1 - v0, 0)
-    triangles = _Triangles(np.flatnonzero(keep), u, v, inverse_z, area, u0, v0, u1 - u0, count)
-    return triangles.part((count > 0) & (np.abs(area) > 1e-9))
+def _edge_planes(triangles: Array, K: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Weights over depth as linear functions of u, v, 1: (F, 3, 3); and whether a face looks at the camera (F,)."""
+    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    normals = np.stack([cross_products(b, c), cross_products(c, a), cross_products(a, b)], 1)
+    volume = np.einsum("fi,fi->f", a, normals[:, 0])
+    facing = volume < -MIN_VOLUME_M3
+    by_ray = normals / np.where(facing, volume, -1.0)[:, None, None]
+    slope_u, slope_v = by_ray[..., 0] / K[0, 0], by_ray[..., 1] / K[1, 1]
+    constant = by_ray[..., 2] - slope_u * K[0, 2] - slope_v * K[1, 2]
+    return np.stack([slope_u, slope_v, constant], 2), facing
 
 
-def _covered(
-    t: _Triangles, width_px: int
-) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int64], NDArray[np.float32]]:
-    """Pixel, inverse depth, face and weights of every sample inside a face."""
-    row = np.repeat(np.arange(len(t.index)), t.count)
-    k = np.arange(t.count.sum()) - np.repeat(np.cumsum(t.count) - t.count, t.count)
-    du, dv = (x.astype(np.float32) for x in (k % t.span[row], k // t.span[row]))
-    # Edge functions relative to the corner of each face's own rectangle, where float32 has digits to spare.
-    ru, rv = t.u - t.u0[:, None], t.v - t.v0[:, None]
-    weights = []
-    for a, b in ((1, 2), (2, 0), (0, 1)):
-        slope_u, slope_v = (rv[:, a] - rv[:, b]) / t.area, (ru[:, b] - ru[:, a]) / t.area
-        constant = (ru[:, a] * rv[:, b] - ru[:, b] * rv[:, a]) / t.area
-        c, su, sv = (x.astype(np.float32)[row] for x in (constant, slope_u, slope_v))
-        weights.append(c + su * du + sv * dv)
-    inside = (weights[0] >= 0) & (weights[1] >= 0) & (weights[2] >= 0)
-    pixel = (t.v0[row] + k // t.span[row])[inside] * width_px + (t.u0[row] + k % t.span[row])[inside]
-    row = row[inside]
-    weight = np.stack([w[inside] for w in weights], 1) * t.inverse_z.astype(np.float32)[row]
-    nearness = weight.sum(1)
-    return pixel, nearness, t.index[row], weight / nearness[:, None]
+def _row_ranges(triangles: Array, K: Array, height_px: int) -> tuple[Index, Index]:
+    """Rows that faces can touch, from (F,) to before (F,); all rows where a face reaches behind the near plane."""
+    z = triangles[:, :, 2]
+    ahead = z.min(1) > NEAR_M
+    v = triangles[:, :, 1] / np.where(ahead[:, None], z, 1.0) * K[1, 1] + K[1, 2]
+    low = np.where(ahead, np.clip(np.ceil(v.min(1)), 0, height_px), 0).astype(np.int32)
+    high = np.where(ahead, np.clip(np.floor(v.max(1)) + 1, 0, height_px), height_px).astype(np.int32)
+    return low, high
+
+
+def _spans(planes: Array, face: Index, v: Index, width_px: int) -> tuple[Index, Index, Array, Array]:
+    """First column and number of columns of faces on rows (R,), and 1 / depth as a constant and a slope along each row."""
+    low, high = np.zeros(len(v)), np.full(len(v), width_px - 1.0)
+    constant, slope = np.zeros(len(v)), np.zeros(len(v))
+    for vertex in range(3):
+        coefficients = planes[:, vertex].T
+        a, b = coefficients[0][face], coefficients[1][face] * v + coefficients[2][face]
+        _narrow(low, high, a, b)
+        constant += b
+        slope += a
+    _narrow(low, high, -slope, 1 / NEAR_M - constant)
+    first = np.ceil(low).astype(np.int32)
+    length = np.maximum(np.floor(high).astype(np.int32) - first + 1, 0)
+    return first, length, constant, slope
+
+
+def _narrow(low: Array, high: Array, slope: Array, constant: Array) -> None:
+    """Narrow ranges (R,) in place to where slope * u + constant >= 0."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        root = np.clip(-constant / slope, -1.0, 1e7)  # within what an int32 holds
+    np.maximum(low, root, out=low, where=slope > 0)
+    np.minimum(high, root, out=high, where=slope < 0)
+    high[(slope == 0) & (constant < 0)] = -1.0
+
+
+def _nearest(pixel: Index, nearness: Array) -> Index:
+    """Index of the nearest sample of each pixel, by ascending pixel."""
+    if len(pixel) == 0:
+        return np.zeros(0, np.int32)
+    at = pixel - pixel.min()
+    best = np.zeros(int(at.max()) + 1)
+    np.maximum.at(best, at, nearness)
+    winners = np.flatnonzero(nearness == best[at]).astype(np.int32)
+    slot = np.full(len(best), -1, np.int32)
+    slot[at[winners]] = winners
+    return slot[slot >= 0]

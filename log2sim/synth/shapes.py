@@ -45,6 +45,13 @@ class Mesh:
         return Mesh((self.vertices_m - (low + high) / 2) * scale, normals, self.faces, self.part)
 
 
+def cross_products(a: Array, b: Array) -> Array:
+    """Cross products (..., 3), several times faster for small arrays than NumPy's."""
+    x = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    y = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    return np.stack([x, y, a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]], -1)
+
+
 def merged(meshes: Sequence[Mesh]) -> Mesh:
     """Concatenate meshes."""
     offsets = np.cumsum([0, *(len(m.vertices_m) for m in meshes)])
@@ -58,12 +65,11 @@ def merged(meshes: Sequence[Mesh]) -> Mesh:
 
 def surface(vertices: Array, faces: NDArray[np.int64], part: int) -> Mesh:
     """Make a smooth mesh: vertex normals are area-weighted means of the face normals."""
-    cross = np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]])
+    cross = cross_products(vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]])
     solid = np.linalg.norm(cross, axis=1) > 1e-12
     faces, cross = faces[solid], cross[solid]
-    normals = np.zeros_like(vertices)
-    for k in range(3):
-        np.add.at(normals, faces[:, k], cross)
+    corners = faces.T.ravel()
+    normals: Array = np.stack([np.bincount(corners, np.tile(c, 3), len(vertices)) for c in cross.T], 1).astype(float)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.where(length > 0, normals / np.where(length > 0, length, 1.0), [0.0, 0.0, 1.0])
     return Mesh(vertices, normals, faces, np.full(len(faces), part))
@@ -90,7 +96,7 @@ def _fan(ring: Array, part: int) -> Mesh:
 def _across(axis: Array) -> Array:
     """Find a unit vector perpendicular to `axis`."""
     side = np.array([0.0, 1.0, 0.0]) if abs(axis[1]) < 0.9 * np.linalg.norm(axis) else np.array([1.0, 0.0, 0.0])
-    across = np.cross(side, axis)
+    across = cross_products(side, axis)
     return np.asarray(across / np.linalg.norm(across))
 
 
@@ -110,7 +116,7 @@ def limb(points: ArrayLike, radii: Sequence[float], part: int, *, count: int = 1
     for center, radius, axis in stations:
         across = u - axis * np.dot(u, axis)
         across /= np.linalg.norm(across)
-        over = np.cross(axis, across)
+        over = cross_products(axis, across)
         rings.append(center + radius * (np.cos(angle)[:, None] * across * flat + np.sin(angle)[:, None] * over))
     return loft(np.array(rings), part, caps=False)
 

@@ -99,11 +99,13 @@ class Patch:
 
     def set(self, mask: NDArray[np.bool_], albedo: Any, gloss: float = 0.0, glow: float = 0.0) -> None:
         """Paint the points of a mask (Q,)."""
-        index = self.rows[mask]
-        self.out.albedo[index] = albedo
-        self.out.gloss[index] = gloss
-        self.out.glow[index] = glow * np.asarray(albedo, np.float32)
+        self._put(self.rows[mask], albedo, gloss, glow)
 
     def fill(self, albedo: Any, gloss: float = 0.0) -> None:
         """Paint all points."""
-        self.set(np.ones(len(self.rows), bool), albedo, gloss)
+        self._put(self.rows, albedo, gloss, 0.0)
+
+    def _put(self, index: Index, albedo: Any, gloss: float, glow: float) -> None:
+        self.out.albedo[index] = albedo
+        self.out.gloss[index] = gloss
+        self.out.glow[index] = glow * np.asarray(albedo, np.float32)

@@ -90,11 +90,13 @@ def _image_streams(moving: MovingScene, cameras: dict[str, Camera], seed: int) -
     scene = moving.scene
 
     def read(camera: Camera, index: int, t_ns: NDArray[np.int64], i: int) -> NDArray[np.uint8]:
+        from log2sim.synth.bodies import Body
         from log2sim.synth.render import SceneInstant, render
 
         map_T_cam = moving.ego.map_T_ego_ns(t_ns[i : i + 1])[0] @ camera.mount_T_cam
         rng = np.random.default_rng([seed, 2, index, i])
-        instant = SceneInstant(_backdrop(scene, seed), moving.actors, moving.seconds(t_ns[i]))
+        bodies = [Body.of(actor, moving.seconds(t_ns[i])) for actor in moving.actors]
+        instant = SceneInstant(_backdrop(scene, seed), bodies)
         return render(camera, map_T_cam, instant, rng)
 
     out = {}
