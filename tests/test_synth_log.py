@@ -44,7 +44,7 @@ def test_from_a_fast_turning_ego_a_wall_is_flat_when_every_point_has_its_own_pos
     log, _ = tiny_log([], ego=curve, building=[WALL], noise_m=0.0, observe=False)
     sweep = log.streams["top"].read(6)
     scene = tiny_scene([], ego=curve)
-    poses = EgoMotion(scene).map_T_ego_ns(sweep.t_ns) @ log.lidars["top"].mount_T_lidar
+    poses = EgoMotion(scene.ego, scene.start_ns).map_T_ego_ns(sweep.t_ns) @ log.lidars["top"].mount_T_lidar
     points = np.einsum("nij,nj->ni", poses[:, :3, :3], sweep.xyz_m.astype(float)) + poses[:, :3, 3]
     wall = points[points[:, 2] > 0.3]
     assert len(wall) > 200
@@ -167,7 +167,7 @@ def test_measured_poses_are_off_by_about_the_noise_that_was_asked_for() -> None:
     log, truth = tiny_log(observe=False, gnss={"position_sigma_m": 0.05, "angle_sigma_deg": 0.1}, duration_s=60.0)
     scene = tiny_scene(duration_s=60.0)
     assert log.ego is not None
-    exact = EgoMotion(scene).map_T_ego_ns(log.ego.t_ns)
+    exact = EgoMotion(scene.ego, scene.start_ns).map_T_ego_ns(log.ego.t_ns)
     error = log.ego.map_T_ego[:, :3, 3] - exact[:, :3, 3]
     assert 0.025 < error.std() < 0.08
     assert truth.duration_s == 60.0

@@ -7,12 +7,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from log2sim.geometry import NS_PER_S, Array, rotation_from_rpy, transform, wrap_angle
+from log2sim.geometry import NS_PER_S, Array, Mount, rotation_from_rpy, transform, wrap_angle
 from log2sim.synth import people, vehicles
 from log2sim.synth.motion import PathStates, TimedPath
-from log2sim.synth.scene import AgentSpec, Scene
+from log2sim.synth.scene import AgentSpec, Ego, Scene
 from log2sim.synth.shapes import Mesh
 from log2sim.synth.surfaces import Appearance
+
+EGO_COLOR = (198, 200, 204)  # as sensors at the roadside see it
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,9 +125,8 @@ def _actor(spec: AgentSpec, index: int) -> Actor:
 class EgoMotion:
     """The exact motion of the recording vehicle."""
 
-    def __init__(self, scene: Scene) -> None:
-        ego = scene.ego
-        self._start_ns = scene.start_ns
+    def __init__(self, ego: Ego, start_ns: int) -> None:
+        self._start_ns = start_ns
         self.path = TimedPath(
             ego.waypoints,
             rounding_m=ego.rounding_m,
@@ -145,6 +146,13 @@ class EgoMotion:
         return self.map_T_ego((np.asarray(t_ns, np.int64) - self._start_ns) / NS_PER_S)
 
 
+def _ego_body(ego: Ego, motion: EgoMotion) -> Actor:
+    # The id "ego" is refused in scene files, so nothing is validated here.
+    spec = AgentSpec.model_construct(id="ego", category="car", size_m=ego.size_m, color=EGO_COLOR, shape="sedan")
+    appearance = Appearance("car", ego.size_m, EGO_COLOR, "sedan")
+    return Actor(spec, appearance, motion.path, offset_m=ego.rear_axle_offset_m)
+
+
 @dataclass(frozen=True, eq=False)
 class MovingScene:
     """A scene with the motion of everything in it.
@@ -152,18 +160,34 @@ class MovingScene:
     Attributes
     ----------
     scene : Scene
-    ego : EgoMotion
+    ego : EgoMotion or None
     actors : tuple of Actor
+        Without the ego.
+    ego_body : Actor or None
+        The ego as others see it.
     """
 
     scene: Scene
-    ego: EgoMotion
+    ego: EgoMotion | None
     actors: tuple[Actor, ...]
+    ego_body: Actor | None
 
     @classmethod
     def of(cls, scene: Scene) -> MovingScene:
         """Set a scene in motion."""
-        return cls(scene, EgoMotion(scene), actors_of(scene))
+        motion = None if scene.ego is None else EgoMotion(scene.ego, scene.start_ns)
+        body = None if scene.ego is None or motion is None else _ego_body(scene.ego, motion)
+        return cls(scene, motion, actors_of(scene), body)
+
+    def map_T_mount(self, mount: Mount, t_ns: NDArray[np.int64]) -> Array:
+        """Poses (T, 4, 4) of what a sensor is fixed to, at absolute stamps (T,)."""
+        if mount == "map" or self.ego is None:
+            return np.repeat(np.eye(4)[None], len(t_ns), axis=0)
+        return self.ego.map_T_ego_ns(t_ns)
+
+    def seen_from(self, mount: Mount) -> tuple[Actor, ...]:
+        """List all that a sensor can see: the actors, and as the last the ego where the sensor is not on it."""
+        return self.actors if mount == "ego" or self.ego_body is None else (*self.actors, self.ego_body)
 
     def seconds(self, t_ns: int) -> float:
         """Time in s since the start of the log."""

@@ -16,7 +16,7 @@ def camera_of(spec: CameraSpec) -> Camera:
     K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
     forward_T_cam = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0.0]])
     rotation = rotation_from_rpy(0.0, -np.deg2rad(spec.pitch_deg), np.deg2rad(spec.yaw_deg)) @ forward_T_cam
-    return Camera(spec.name, width, height, K, "ego", transform(rotation, np.array(spec.position_m)))
+    return Camera(spec.name, width, height, K, spec.mount, transform(rotation, np.array(spec.position_m)))
 
 
 def frame_stamps(spec: CameraSpec, scene: Scene) -> NDArray[np.int64]:

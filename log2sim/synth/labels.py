@@ -13,6 +13,7 @@ from log2sim.datatypes import ImageLabels, Labels
 from log2sim.geometry import NS_PER_S, Array, Camera, apply, box_corners, inverse, project
 from log2sim.synth.actors import Actor, MovingScene
 from log2sim.synth.cameras import frame_stamps
+from log2sim.synth.raycast import sweep_stamps
 from log2sim.synth.scene import Scene
 
 MIN_UNOCCLUDED = 1 / 3
@@ -55,9 +56,9 @@ def visibility_by_camera(
         out[spec.name] = []
         for t_ns in frame_stamps(spec, moving.scene):
             t_s = moving.seconds(t_ns)
-            map_T_cam = moving.ego.map_T_ego_ns(np.array([t_ns]))[0] @ camera.mount_T_cam
-            bodies = [Body.of(actor, t_s) for actor in moving.actors]
-            parts = segment(camera, map_T_cam, SceneInstant(backdrop, bodies))
+            map_T_cam = moving.map_T_mount(camera.mount, np.array([t_ns]))[0] @ camera.mount_T_cam
+            bodies = [Body.of(actor, t_s) for actor in moving.seen_from(spec.mount)]
+            parts = segment(camera, map_T_cam, SceneInstant(backdrop, bodies))[: len(moving.actors)]
             unoccluded = np.array([0.0 if p is None else p.visible_px / p.silhouette_px for p in parts])
             boxes = np.array([np.full(4, np.nan) if p is None else p.box_px for p in parts]).reshape(-1, 4)
             inside = np.array([_box_inside(camera, inverse(map_T_cam), a, t_s) for a in moving.actors])
@@ -144,11 +145,13 @@ def labels_2d(
 def labels_3d(
     scene: Scene, frames_by_camera: Mapping[str, list[FrameVisibility]], actors: tuple[Actor, ...]
 ) -> Labels | None:
-    """Boxes of all agents at the frames of the first camera."""
-    if not scene.camera or not actors:
+    """Boxes of all agents at the frames of the first camera, without one at the sweeps of the first LiDAR."""
+    if not actors or not (scene.camera or scene.lidar):
         return None
-    frames = frames_by_camera[scene.camera[0].name]
-    t_ns = np.array([f.t_ns for f in frames], dtype=np.int64)
+    if scene.camera:
+        t_ns = np.array([f.t_ns for f in frames_by_camera[scene.camera[0].name]], dtype=np.int64)
+    else:
+        t_ns = sweep_stamps(scene.lidar[0], scene)
     t_s = (t_ns - scene.start_ns) / NS_PER_S
     states = [a.at(t_s) for a in actors]
     return Labels(

@@ -12,7 +12,7 @@ from log2sim.geometry import NS_PER_S, Array, inverse, rotation_from_rpy, transf
 from log2sim.synth.actors import Actor, MovingScene
 from log2sim.synth.scene import Building, LidarSpec, Scene
 
-GROUND, BUILDING = -1, -2
+GROUND, BUILDING, EGO = -1, -2, -3
 MAX_PAIRS_PER_BATCH = 400_000
 MESH_MARGIN_M = 1e-6  # rounding of a mesh that fills its box
 MIN_GRAZING_SINE = 0.02  # of the angle to the ground below which no return comes back
@@ -26,16 +26,17 @@ class LabeledSweep:
     ----------
     sweep : Sweep
     hit : (N,) int64
-        Index of the actor, GROUND or BUILDING.
+        Index of the actor, GROUND, BUILDING or EGO.
     """
 
     sweep: Sweep
     hit: NDArray[np.int64]
 
 
-def ego_T_lidar(spec: LidarSpec) -> Array:
-    """Pose of the LiDAR on the ego."""
-    return transform(rotation_from_rpy(0.0, 0.0, np.deg2rad(spec.yaw_deg)), np.array(spec.position_m))
+def mount_T_lidar(spec: LidarSpec) -> Array:
+    """Pose of the LiDAR on its mount."""
+    roll, pitch, yaw = np.deg2rad([spec.roll_deg, -spec.pitch_deg, spec.yaw_deg])
+    return transform(rotation_from_rpy(roll, pitch, yaw), np.array(spec.position_m))
 
 
 def sweep_stamps(spec: LidarSpec, scene: Scene) -> NDArray[np.int64]:
@@ -71,7 +72,7 @@ def cast_sweep(spec: LidarSpec, moving: MovingScene, stamp_ns: int, rng: np.rand
     directions, ago_s = ray_pattern(spec)
     t_ns = stamp_ns - np.rint(ago_s * NS_PER_S).astype(np.int64)
     moments, column = np.unique(t_ns, return_inverse=True)
-    map_T_lidar = moving.ego.map_T_ego_ns(moments) @ ego_T_lidar(spec)
+    map_T_lidar = moving.map_T_mount(spec.mount, moments) @ mount_T_lidar(spec)
     origin = map_T_lidar[column, :3, 3]
     ray = np.einsum("nij,nj->ni", map_T_lidar[column, :3, :3], directions)
     distance = np.full(len(ray), np.inf)
@@ -83,10 +84,10 @@ def cast_sweep(spec: LidarSpec, moving: MovingScene, stamp_ns: int, rng: np.rand
         closer = nearer < distance
         distance[closer], hit[closer] = nearer[closer], BUILDING
     t_s = (moments - scene.start_ns) / NS_PER_S
-    for index, actor in enumerate(moving.actors):
+    for index, actor in enumerate(moving.seen_from(spec.mount)):
         rows, nearer = _actor_distance(actor, t_s, column, origin, ray)
         closer = nearer < distance[rows]
-        distance[rows[closer]], hit[rows[closer]] = nearer[closer], index
+        distance[rows[closer]], hit[rows[closer]] = nearer[closer], index if index < len(moving.actors) else EGO
     # Drawn for every ray, so that a change of the scene moves no other ray's noise.
     noise, lost = rng.normal(0.0, 1.0, len(ray)) * spec.noise_m, rng.random(len(ray)) < spec.dropout
     keep = (distance <= spec.range_m) & (distance > 0.5) & ~lost

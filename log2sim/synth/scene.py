@@ -1,7 +1,7 @@
 """Scene files: the description of a synthetic log as pydantic models, from which the JSON Schema `scene-1` is generated.
 
-Map frame: x east, y north, z up, in m; the ground is z = 0. Sensors are mounted on the ego: x forward, y left, z up, origin
-at the middle of the rear axle on the ground; yaw counter-clockwise, pitch positive upwards.
+Map frame: x east, y north, z up, in m; the ground is z = 0. Sensors are mounted on the ego (x forward, y left, z up, origin
+at the middle of the rear axle on the ground) or in the map; yaw counter-clockwise, pitch positive upwards.
 """
 
 from __future__ import annotations
@@ -143,12 +143,13 @@ class AgentSpec(Table):
 
 
 class CameraSpec(Table):
-    """A pinhole camera on the ego."""
+    """A pinhole camera on the ego or at the roadside."""
 
     name: Name = key("Unique name of letters, digits, '_' and '-'.")
-    position_m: Vec3 = key("Position [x, y, z] on the ego.", unit="m")
-    yaw_deg: Number = key("Viewing direction, 0 forward, counter-clockwise.", 0.0, "deg")
-    pitch_deg: Number = key("Viewing direction, positive upwards.", 0.0, "deg", ge=-60, le=60)
+    mount: Literal["ego", "map"] = key("What it is fixed to: the ego, or the map for one at the roadside.", "ego")
+    position_m: Vec3 = key("Position [x, y, z] on its mount.", unit="m")
+    yaw_deg: Number = key("Viewing direction, 0 along the mount's x axis, counter-clockwise.", 0.0, "deg")
+    pitch_deg: Number = key("Viewing direction, positive upwards.", 0.0, "deg", ge=-90, le=60)
     fov_deg: Number = key("Horizontal field of view.", 70.0, "deg", ge=5, le=150)
     size_px: tuple[Pixels, Pixels] = key("Width and height of the image.", (960, 600), "px")
     rate_hz: Number = key("Frame rate.", 10.0, "Hz", ge=0.1, le=200)
@@ -156,11 +157,17 @@ class CameraSpec(Table):
 
 
 class LidarSpec(Table):
-    """A spinning LiDAR on the ego. It turns clockwise over `azimuth_deg`, from the left (high) to the right (low)."""
+    """A spinning LiDAR on the ego or at the roadside.
+
+    It turns clockwise over `azimuth_deg`, from the left (high) to the right (low). First it is rolled, then pitched, then turned.
+    """
 
     name: Name = key("Unique name of letters, digits, '_' and '-'.")
-    position_m: Vec3 = key("Position [x, y, z] on the ego.", unit="m")
-    yaw_deg: Number = key("Direction of azimuth 0, 0 forward, counter-clockwise.", 0.0, "deg")
+    mount: Literal["ego", "map"] = key("What it is fixed to: the ego, or the map for one at the roadside.", "ego")
+    position_m: Vec3 = key("Position [x, y, z] on its mount.", unit="m")
+    yaw_deg: Number = key("Direction of azimuth 0, 0 along the mount's x axis, counter-clockwise.", 0.0, "deg")
+    pitch_deg: Number = key("Tilt of azimuth 0, positive upwards.", 0.0, "deg", ge=-90, le=90)
+    roll_deg: Number = key("Tilt to the right, seen along azimuth 0.", 0.0, "deg", ge=-180, le=180)
     channels: Whole = key("Number of channels, spread evenly over `elevation_deg`.", 32, ge=1, le=256)
     elevation_deg: Vec2 = key("Lowest and highest channel.", (-24.0, 6.0), "deg")
     channels_deg: Annotated[tuple[Angle, ...], Field(min_length=1, max_length=256)] = key(
@@ -189,7 +196,7 @@ class Scene(Table):
 
     name: str = key("Name of the log and the scenario.")
     duration_s: Number = key("Length of the log.", unit="s", ge=0.1, le=600)
-    ego: Ego = key("The recording vehicle.")
+    ego: Ego | None = key("The recording vehicle; none where all sensors are mounted in the map.", None)
     start_ns: Whole = key(
         "Stamp of the log's begin, Unix time.", 1_700_000_000_000_000_000, "ns", ge=0, le=9_000_000_000_000_000_000
     )
@@ -203,12 +210,15 @@ class Scene(Table):
     gnss: Gnss = key("Errors of the ego's poses.", Gnss())
 
     @model_validator(mode="after")
-    def _unique_names(self) -> Self:
+    def _unique_names_and_mounts(self) -> Self:
         sensors = [c.name for c in self.camera] + [d.name for d in self.lidar]
         for kind, names in (("agent", [a.id for a in self.agent]), ("sensor", sensors)):
             for name in names:
                 if names.count(name) > 1:
                     raise ValueError(f"{kind} '{name}' occurs twice; names must be unique")
+        on_ego = [s.name for s in self.camera if s.mount == "ego"] + [s.name for s in self.lidar if s.mount == "ego"]
+        if on_ego and self.ego is None:
+            raise ValueError(f"sensor '{on_ego[0]}' is mounted on the ego, but there is no [ego]; use mount = \"map\"")
         return self
 
 

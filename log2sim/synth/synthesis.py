@@ -14,7 +14,7 @@ from log2sim.datatypes import Agent, EgoVehicle, Lidar, Log, MapFrame, Scenario,
 from log2sim.errors import ConfigError
 from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, rotation_from_rpy, transform, wrap_angle
 from log2sim.synth import raycast
-from log2sim.synth.actors import ActorStates, MovingScene
+from log2sim.synth.actors import Actor, ActorStates, EgoMotion, MovingScene
 from log2sim.synth.cameras import camera_of, frame_stamps
 from log2sim.synth.labels import (
     FrameVisibility,
@@ -53,7 +53,7 @@ def synthesize(scene: Scene, *, seed: int = 0, observe: bool = True) -> tuple[Lo
     """
     moving = MovingScene.of(scene)
     cameras = {spec.name: camera_of(spec) for spec in scene.camera}
-    lidars = {spec.name: Lidar(spec.name, "ego", raycast.ego_T_lidar(spec)) for spec in scene.lidar}
+    lidars = {spec.name: Lidar(spec.name, spec.mount, raycast.mount_T_lidar(spec)) for spec in scene.lidar}
     cast = _caster(moving, seed)
     streams = _image_streams(moving, cameras, seed)
     for spec in scene.lidar:
@@ -74,8 +74,8 @@ def synthesize(scene: Scene, *, seed: int = 0, observe: bool = True) -> tuple[Lo
         cameras=cameras,
         lidars=lidars,
         streams=streams,
-        ego=_measured_poses(moving, np.random.default_rng([seed, 1])),
-        ego_vehicle=EgoVehicle(scene.ego.size_m, scene.ego.rear_axle_offset_m),
+        ego=None if moving.ego is None else _measured_poses(moving.ego, scene, np.random.default_rng([seed, 1])),
+        ego_vehicle=EgoVehicle() if scene.ego is None else EgoVehicle(scene.ego.size_m, scene.ego.rear_axle_offset_m),
         map=truth.map,
         labels=labels_3d(scene, frames, moving.actors) if observe else None,
         image_labels=labels_2d(frames, moving.actors) if observe else {},
@@ -93,9 +93,9 @@ def _image_streams(moving: MovingScene, cameras: dict[str, Camera], seed: int) -
         from log2sim.synth.bodies import Body
         from log2sim.synth.render import SceneInstant, render
 
-        map_T_cam = moving.ego.map_T_ego_ns(t_ns[i : i + 1])[0] @ camera.mount_T_cam
+        map_T_cam = moving.map_T_mount(camera.mount, t_ns[i : i + 1])[0] @ camera.mount_T_cam
         rng = np.random.default_rng([seed, 2, index, i])
-        bodies = [Body.of(actor, moving.seconds(t_ns[i])) for actor in moving.actors]
+        bodies = [Body.of(actor, moving.seconds(t_ns[i])) for actor in moving.seen_from(camera.mount)]
         instant = SceneInstant(_backdrop(scene, seed), bodies)
         return render(camera, map_T_cam, instant, rng)
 
@@ -145,9 +145,8 @@ def _reader(cast: Caster, name: str) -> Callable[[int], Any]:
     return lambda i: cast(name, i).sweep
 
 
-def _measured_poses(moving: MovingScene, rng: np.random.Generator) -> PoseTrack:
+def _measured_poses(ego: EgoMotion, scene: Scene, rng: np.random.Generator) -> PoseTrack:
     """Poses of GNSS and IMU: each coordinate with a first-order Gauss-Markov error."""
-    scene = moving.scene
     count = int(np.floor(scene.duration_s * scene.gnss.rate_hz + 1e-9)) + 1
     t = np.arange(count) / scene.gnss.rate_hz
     sigma = np.array([scene.gnss.position_sigma_m] * 3 + [np.deg2rad(scene.gnss.angle_sigma_deg)] * 3)
@@ -156,7 +155,7 @@ def _measured_poses(moving: MovingScene, rng: np.random.Generator) -> PoseTrack:
     error[0] = rng.normal(0, 1, 6) * sigma
     for k in range(1, count):
         error[k] = keep * error[k - 1] + np.sqrt(1 - keep**2) * rng.normal(0, 1, 6) * sigma
-    exact = moving.ego.map_T_ego(t)
+    exact = ego.map_T_ego(t)
     turn = transform(rotation_from_rpy(error[:, 3], error[:, 4], error[:, 5]), np.zeros((count, 3)))
     poses = exact @ turn
     poses[:, :3, 3] = exact[:, :3, 3] + error[:, :3]
@@ -165,7 +164,7 @@ def _measured_poses(moving: MovingScene, rng: np.random.Generator) -> PoseTrack:
 
 def _truth(moving: MovingScene, t_s: Array, visible: NDArray[np.bool_] | None, seed: int) -> Scenario:
     scene = moving.scene
-    agents = [_ego_agent(moving, t_s)]
+    agents = [] if moving.ego_body is None else [_ego_agent(moving.ego_body, t_s)]
     for index, actor in enumerate(moving.actors):
         rgb = list(actor.spec.color)
         agents.append(
@@ -190,15 +189,9 @@ def _truth(moving: MovingScene, t_s: Array, visible: NDArray[np.bool_] | None, s
     return Scenario(scene.name, scene.start_ns, float(t_s[-1]), tuple(agents), frame, provenance=provenance)
 
 
-def _ego_agent(moving: MovingScene, t_s: Array) -> Agent:
-    scene, motion = moving.scene, moving.ego.path.at(t_s)
-    heading = np.stack([np.cos(motion.yaw_rad), np.sin(motion.yaw_rad)], 1)
-    xy = motion.xy_m + scene.ego.rear_axle_offset_m * heading
-    center = np.column_stack([xy, np.full(len(t_s), scene.ego.size_m[2] / 2)])
-    states = ActorStates(center, motion.yaw_rad, motion.speed_mps, motion.distance_m)
-    return Agent(
-        "ego", "car", scene.ego.size_m, _waypoints(t_s, states, None), rear_axle_offset_m=scene.ego.rear_axle_offset_m
-    )
+def _ego_agent(ego: Actor, t_s: Array) -> Agent:
+    waypoints = _waypoints(t_s, ego.at(t_s), None)
+    return Agent("ego", "car", ego.spec.box_m, waypoints, rear_axle_offset_m=ego.offset_m)
 
 
 def _waypoints(t_s: Array, states: ActorStates, visible: NDArray[np.bool_] | None) -> Waypoints:

@@ -63,7 +63,7 @@ def write_synthetic(
     _refuse(target, overwrite)
     log, truth = synthesize(scene, seed=seed)
     staging = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
-    poses: Literal["gnss", "poses"] = "gnss" if scene.ego.poses == "gnss" else "poses"
+    poses: Literal["gnss", "poses"] = scene.ego.poses if scene.ego is not None else "poses"
     try:
         write_log(log, staging, jpeg_quality=jpeg_quality, ego=poses, progress=progress)
         truth.save(staging / TRUTH_FILE)
