@@ -122,6 +122,7 @@ class LidarConfig(Section):
         ge=0.0,
         le=250.0,
     )
+    min_score: float = _setting(0.0, "Lowest score of a box; 0: the network's own for each group.", ge=0.0, le=1.0)
 
 
 class MeasureConfig(Section):

@@ -21,6 +21,8 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "labels": "log2sim.perception.detect.labels:create",
     },
     "lidar_detector": {
+        "vehicle": "log2sim.perception.detect3d.network_detector:create_vehicle",
+        "roadside": "log2sim.perception.detect3d.network_detector:create_roadside",
         "labels": "log2sim.perception.detect3d.labels:create",
     },
     "export": {

@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from lidar_networks import write_network
 from test_layers import RANKED, ROOT
 
 from log2sim import Config, Scenario, open_log, reconstruct, registry, replay
@@ -68,7 +69,7 @@ def test_the_pipeline_calls_the_functions_of_the_table_in_their_order() -> None:
 
 
 def test_there_is_an_example_for_each_kind_of_plug_in() -> None:
-    assert len(EXAMPLES) == 5
+    assert len(EXAMPLES) == 6
     for kind in registry.BUILT_IN:
         assert f"kind `{kind}`" in TEXT
     entry = tomllib.loads(re.findall(r"```toml\n(.*?)```", TEXT, re.DOTALL)[0])
@@ -105,6 +106,15 @@ def test_the_lidar_detector_runs(tiny_folder: Path, monkeypatch: pytest.MonkeyPa
     assert cloud is not None
     found = detector.detect(cloud)
     assert found.center_m[0, 2] + 0.75 == pytest.approx(cloud.xyz[cloud.height.argmax(), 2] + origin[2])
+
+
+def test_the_network_describes_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module: Any = example("describe", monkeypatch)
+    bare = write_network(tmp_path / "bare.onnx")
+    module.describe(str(bare), str(tmp_path / "mine.onnx"))
+    log = Log("made", "log2sim", {}, {}, {})
+    detector: Any = create_lidar_detector(f"lidar:{tmp_path / 'mine.onnx'}", log, Config().lidar)
+    assert detector.network.info.name == "mine"
 
 
 def test_the_exporter_writes(tiny_scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Protocol
 
 from log2sim import registry
@@ -45,7 +46,7 @@ def create_lidar_detector(name: str, log: Log, settings: LidarConfig) -> LidarDe
     log
         The log whose clouds it will see; `labels` takes its boxes from there.
     settings
-        Decoding and range.
+        Decoding, range and lowest score.
 
     Raises
     ------
@@ -59,6 +60,10 @@ def create_lidar_detector(name: str, log: Log, settings: LidarConfig) -> LidarDe
             f"LiDAR detector '{name}': expected a name that begins with '{PREFIX}', such as lidar:vehicle"
         )
     rest = name.removeprefix(PREFIX)
+    if rest.lower().endswith(".onnx"):
+        from log2sim.perception.detect3d.network_detector import open_network
+
+        return open_network(Path(rest), settings, name=f"{PREFIX}{Path(rest).name}")
     try:
         create = registry.load("lidar_detector", rest)
     except ConfigError as error:

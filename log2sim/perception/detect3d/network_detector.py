@@ -1,0 +1,147 @@
+"""LiDAR detectors from networks: cloud to grid, network, decoding, points of each box, score, suppression, map frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.config import LidarConfig
+from log2sim.datatypes import Boxes3D, Log
+from log2sim.errors import ConfigError
+from log2sim.geometry import NS_PER_S
+from log2sim.perception.detect3d.box_points import points_of_boxes
+from log2sim.perception.detect3d.centers import decode_centers
+from log2sim.perception.detect3d.grid import grid_window, rasterize
+from log2sim.perception.detect3d.level_boxes import LevelBoxes, sigmoid
+from log2sim.perception.detect3d.level_points import ground_under, level_points, sensor_xy, stack_points
+from log2sim.perception.detect3d.network import Network, load_network
+from log2sim.perception.detect3d.suppression import suppress
+from log2sim.perception.detect3d.votes import MIN_SCORE, decode_votes
+from log2sim.perception.lidar.cloud import Cloud
+from log2sim.perception.lidar.ground import ON_GROUND_M
+
+WEIGHTS = Path(__file__).parent / "weights"
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkDetector:
+    """Detector from a network and settings.
+
+    Attributes
+    ----------
+    name : str
+    network : Network
+    decode : "centers" or "votes"
+        See `LidarConfig`.
+    range_m : float
+        Largest distance from the sensor along x and along y, m.
+    min_score : float or None
+        Lowest score of a box; None for the network's own of each group.
+    """
+
+    name: str
+    network: Network
+    decode: Literal["centers", "votes"]
+    range_m: float
+    min_score: float | None
+
+    def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
+        """Detect road users in one cloud, best score first; points of `earlier` clouds make the grid denser."""
+        info = self.network.info
+        xyz, index = level_points(cloud, self.range_m)
+        if not len(xyz):
+            return Boxes3D.empty()
+        stacked = np.concatenate([xyz, stack_points(cloud, earlier, self.range_m)]) if earlier else xyz
+        low, shape = grid_window(stacked, cell_m=info.cell_m, range_m=self.range_m, center=sensor_xy(cloud))
+        grid = rasterize(stacked, cell_m=info.cell_m, low=low, shape=shape)
+        maps = self.network.run(grid)
+        found = decode_centers(maps, info, low) if self.decode == "centers" else decode_votes(maps, grid, info, low)
+        return self._boxes(found, xyz, index, cloud)
+
+    def _boxes(self, found: LevelBoxes, xyz: NDArray[np.float32], index: NDArray[np.intp], cloud: Cloud) -> Boxes3D:
+        """Score boxes by their points, choose among those that overlap and place them in the map."""
+        if self.decode == "centers":
+            # The same peak twice needs no count of points, which takes longest.
+            found = found.take(suppress(found.rectangles, found.strength(self.network.info), found.group, across=False))
+        above = np.flatnonzero(xyz[:, 2] > ON_GROUND_M)
+        xyz, index = xyz.take(above, axis=0), index.take(above)
+        inside = points_of_boxes(xyz, found.center_m, found.size_m, found.yaw_rad)
+        points = inside.count
+        score = self._scores(found, points, cloud)
+        # What holds no point is nothing that the LiDAR saw.
+        good = np.flatnonzero((points > 0) & (score >= self._least(found)))
+        kept = good[suppress(found.rectangles.take(good), score[good], found.group[good])]
+        found, inside = found.take(kept), inside.take(kept)
+        center = found.center_m + cloud.origin
+        center[:, 2] += ground_under(found.center_m[:, :2], inside, xyz, cloud.xyz[index, 2] - cloud.height[index])
+        t_ns = cloud.stamp_ns + np.round(inside.mean(cloud.t_s[index]) * NS_PER_S).astype(np.int64)
+        return Boxes3D(
+            t_ns, center, found.size_m, found.yaw_rad, found.heading_score, found.category, score[kept], points[kept]
+        )
+
+    def _scores(self, found: LevelBoxes, points: NDArray[np.int64], cloud: Cloud) -> NDArray[np.float64]:
+        """Return the score (M,) of each box: calibrated, or the mean class probability of a cluster."""
+        if self.decode == "votes":
+            return sigmoid(found.heat)
+        range_m = np.hypot(*(found.center_m[:, :2] - sensor_xy(cloud)).T)
+        return found.score(self.network.info, points, range_m)
+
+    def _least(self, found: LevelBoxes) -> NDArray[np.float64]:
+        """Return the least score (M,) that each box needs."""
+        if self.min_score is not None:
+            return np.full(len(found), self.min_score)
+        if self.decode == "votes":
+            return np.full(len(found), MIN_SCORE)
+        info = self.network.info
+        return np.array([info.min_score[group] for group in info.groups])[found.group]
+
+
+def open_network(path: Path, settings: LidarConfig, *, name: str) -> NetworkDetector:
+    """Make a detector of a network's file.
+
+    Raises
+    ------
+    ConfigError
+        A file that is no usable network, or a range that its grid cannot cover.
+    """
+    network = load_network(path)
+    limit = network.info.max_range_m
+    if settings.range_m > limit:
+        raise ConfigError(
+            f"lidar.range_m {settings.range_m:g}: {path} has cells of {network.info.cell_m:g} m, with which a grid covers "
+            f"up to {limit:g} m"
+        )
+    range_m = settings.range_m or network.info.range_m
+    return NetworkDetector(name, network, settings.decode, range_m, settings.min_score or None)
+
+
+def create_vehicle(log: Log, settings: LidarConfig) -> NetworkDetector:
+    """Make the detector `lidar:vehicle`, for LiDARs on vehicles."""
+    return open_shipped("vehicle", settings)
+
+
+def create_roadside(log: Log, settings: LidarConfig) -> NetworkDetector:
+    """Make the detector `lidar:roadside`, for LiDARs beside the road."""
+    return open_shipped("roadside", settings)
+
+
+def open_shipped(name: str, settings: LidarConfig) -> NetworkDetector:
+    """Make a detector of a network that is part of the package.
+
+    Raises
+    ------
+    ConfigError
+        When its file is missing.
+    """
+    path = WEIGHTS / f"{name}.onnx"
+    if not path.is_file():
+        raise ConfigError(
+            f"detector 'lidar:{name}': its network {path} is missing; install log2sim anew, or give lidar: and the path of "
+            "another ONNX file"
+        )
+    return open_network(path, settings, name=f"lidar:{name}")

@@ -1,0 +1,341 @@
+"""LiDAR detectors from networks: the file and what it says of itself, and clouds through the whole chain, bad ones too."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+from lidar_networks import INFO, empty_maps, encode, info, write_network
+from numpy.typing import ArrayLike, NDArray
+
+from log2sim.config import LidarConfig
+from log2sim.datatypes import Log
+from log2sim.errors import ConfigError
+from log2sim.geometry import Array
+from log2sim.perception.detect3d import level_points, network, network_detector
+from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector
+from log2sim.perception.detect3d.network import Network, NetworkInfo
+from log2sim.perception.detect3d.network_detector import NetworkDetector
+from log2sim.perception.lidar.cloud import Cloud
+
+ORIGIN = np.array([5000.0, -300.0, 12.0])
+LOG = Log("made", "log2sim", {}, {}, {})
+
+
+def cloud_of(level: ArrayLike, *, slope: Sequence[float] = (0.0, 0.0), t_s: ArrayLike = 0.0, **changes: Any) -> Cloud:
+    """A cloud of points (N, 3) relative to `ORIGIN` whose z is the height above a ground with a slope."""
+    xyz = np.asarray(level, np.float32).reshape(-1, 3).copy()
+    height = xyz[:, 2].copy()
+    if any(slope):
+        xyz[:, 2] += xyz[:, :2] @ np.asarray(slope, np.float32)
+    stamps = np.broadcast_to(np.asarray(t_s, np.float32), len(xyz)).copy()
+    sensor = np.array([0, 0, 2], np.float32)
+    return replace(Cloud(10**18, ORIGIN, xyz, stamps, sensor, np.abs(height) <= 0.2, height), **changes)
+
+
+def solid(x: float, y: float, length: float = 4.0, width: float = 1.8, height: float = 1.5, yaw: float = 0.0) -> Array:
+    """Points (N, 3) in a box that stands on the ground, 0.2 m within its faces, and a ground of 1 m cells around it."""
+    axes = [np.linspace(-s / 2 + 0.2, s / 2 - 0.2, 8) for s in (length, width)] + [np.linspace(0.3, height - 0.2, 5)]
+    u, v, z = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3).T
+    inner = np.stack([x + u * np.cos(yaw) - v * np.sin(yaw), y + u * np.sin(yaw) + v * np.cos(yaw), z], axis=1)
+    gx, gy = np.meshgrid(np.arange(-30.0, 31), np.arange(-30.0, 31))
+    return np.concatenate([inner, np.stack([gx.ravel(), gy.ravel(), np.zeros(gx.size)], axis=1)])
+
+
+@dataclass(frozen=True, eq=False)
+class FixedNetwork:
+    """A network that finds given boxes (x, y, z, length, width, height, yaw) wherever the grid is."""
+
+    boxes: Sequence[tuple[str, Sequence[float]]]
+    info: NetworkInfo
+    seen: list[NDArray[np.float32]]
+
+    def run(self, grid: NDArray[np.float32]) -> NDArray[np.float32]:
+        self.seen.append(grid)
+        maps = empty_maps(grid.shape[1] // 2, grid.shape[2] // 2)
+        for category, box in self.boxes:
+            encode(maps, box, category, low=self.low, cells=1)
+        return maps
+
+    @property
+    def low(self) -> Array:
+        return np.array([-32.0, -32.0])
+
+
+def fixed(monkeypatch: pytest.MonkeyPatch, *boxes: tuple[str, Sequence[float]], **settings: Any) -> NetworkDetector:
+    """A detector that finds the boxes, on a grid of always the same window."""
+    chosen: dict[str, Any] = {"decode": "centers", "min_score": None, "info": info(), **settings}
+    known = FixedNetwork(boxes, chosen["info"], [])
+    monkeypatch.setattr(network_detector, "grid_window", lambda *_, **__: (known.low, (256, 256)))
+    return NetworkDetector("fixed", known, chosen["decode"], 40.0, chosen["min_score"])  # type: ignore[arg-type]
+
+
+BOX = (10.0, 6.0, 0.75, 4.0, 1.8, 1.5, 0.6)
+
+
+@pytest.mark.parametrize("decode", ["centers", "votes"])
+def test_a_box_lands_in_the_map_with_its_points_and_their_time(
+    decode: Literal["centers", "votes"], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    level = solid(10, 6, yaw=0.6)
+    inside = 8 * 8 * 5
+    t_s = np.where(np.arange(len(level)) < inside, 0.03, -1.0)
+    found = fixed(monkeypatch, ("truck", BOX), decode=decode).detect(cloud_of(level, t_s=t_s))
+    np.testing.assert_allclose(found.center_m, [ORIGIN + BOX[:3]], atol=1e-4)
+    np.testing.assert_allclose(found.size_m, [BOX[3:6]], rtol=1e-4)
+    np.testing.assert_allclose(found.yaw_rad, [0.6], atol=1e-4)
+    assert (found.category.tolist(), found.points.tolist()) == (["truck"], [inside])
+    assert abs(int(found.t_ns[0]) - 10**18 - 30_000_000) < 1000
+    assert found.heading_score[0] == pytest.approx(1.0, abs=1e-4)
+
+
+def test_on_a_slope_the_box_stands_on_the_ground_under_its_center(monkeypatch: pytest.MonkeyPatch) -> None:
+    level = solid(10, 6, yaw=0.6)
+    # Only the near end is seen.
+    level = level[(level[:, 2] == 0) | (level[:, 0] < 9.5)]
+    found = fixed(monkeypatch, ("car", BOX)).detect(cloud_of(level, slope=(0.1, -0.05)))
+    assert found.center_m[0, 2] == pytest.approx(ORIGIN[2] + 0.1 * 10 - 0.05 * 6 + 0.75, abs=0.01)
+
+
+def test_boxes_without_points_and_below_the_least_score_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    cloud, empty = cloud_of(solid(10, 6, yaw=0.6)), (20.0, -6.0, *BOX[2:])
+    assert len(fixed(monkeypatch, ("car", BOX), ("car", empty)).detect(cloud)) == 1
+    strict = info(min_score={"vehicle": 0.99, "two_wheeler": 0.0, "pedestrian": 0.0})
+    assert len(fixed(monkeypatch, ("car", BOX), info=strict).detect(cloud)) == 0
+    assert len(fixed(monkeypatch, ("car", BOX), info=strict, min_score=0.5).detect(cloud)) == 1
+
+
+def test_score_grows_with_points_as_calibrated(monkeypatch: pytest.MonkeyPatch) -> None:
+    weights = {g: [-4.0, 0.0, 0.0, 1.0, -0.1] for g in INFO["groups"]}
+    detector = fixed(monkeypatch, ("car", BOX), info=info(calibration=weights), min_score=0.0)
+    found = detector.detect(cloud_of(solid(10, 6, yaw=0.6)))
+    expected = 1 / (1 + np.exp(4 - np.log(321) + 0.1 * np.hypot(10, 6) / 10))
+    assert found.score[0] == pytest.approx(expected, abs=1e-6)
+
+
+def test_earlier_clouds_are_in_the_grid_but_not_among_the_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    cloud, shift = cloud_of(solid(10, 6, yaw=0.6)), np.array([3.0, -2.0, 5.0])
+    again = cloud_of(solid(10, 6, yaw=0.6) - np.array([3.0, -2.0, 0]), origin=ORIGIN + shift)
+    detector = fixed(monkeypatch, ("car", BOX))
+    one, two = detector.detect(cloud), detector.detect(cloud, [again])
+    first, second = detector.network.seen  # type: ignore[attr-defined]
+    assert one.points.tolist() == two.points.tolist()
+    assert np.array_equal(first[3] > 0, second[3] > 0)
+    np.testing.assert_allclose(np.expm1(3 * second[3]), 2 * np.expm1(3 * first[3]), rtol=1e-4)
+    np.testing.assert_allclose(second[0], first[0], atol=1e-5)
+
+
+def taller_is_hotter(folder: Path, **changes: Any) -> Path:
+    """A network for which a cell whose highest point is above 1.2 m is a car of 3 x 3 x 2 m in its middle."""
+    weight, bias = np.zeros((25, 12)), np.zeros(25)
+    weight[0, 0], bias[:3] = 40.0, [-24.0, -9.0, -9.0]
+    bias[8:14] = 0, 0, 1.0, *np.log([3.0, 3.0, 2.0])
+    bias[15], bias[17] = 1.0, 1.0
+    return write_network(folder / "taller.onnx", {**INFO, **changes}, weight=weight, bias=bias)
+
+
+@pytest.fixture
+def detector(tmp_path: Path) -> LidarDetector:
+    return create_lidar_detector(f"lidar:{taller_is_hotter(tmp_path)}", LOG, LidarConfig())
+
+
+POLES = np.array([[8.1, 3.1], [-11.2, 14.3], [20.4, -17.3]])
+
+
+def poles(turns: int = 0) -> Array:
+    """Three people-sized heaps of points whose tops are 1.4 to 1.8 m high, turned by quarters around the sensor."""
+    z = np.linspace(0.3, 1.4, 12)
+    heaps = [np.column_stack([np.tile(p, (12, 1)), z + 0.2 * k]) for k, p in enumerate(POLES)]
+    level = np.concatenate([*heaps, solid(0, 0, 0.5, 0.5, 0.6)])
+    x, y = level[:, :2].T
+    for _ in range(turns):
+        x, y = -y, x
+    return np.column_stack([x, y, level[:, 2]])
+
+
+def test_a_network_from_a_file_finds_what_it_looks_for(detector: LidarDetector) -> None:
+    found = detector.detect(cloud_of(poles()))
+    assert detector.name == "lidar:taller.onnx"
+    assert found.points.tolist() == [12, 12, 12]
+    assert np.all(np.diff(found.score) < 0)
+    nearest = found.center_m[::-1, :2] - ORIGIN[:2] - POLES
+    assert np.abs(nearest).max() <= 0.25 + 1e-4
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_a_turned_cloud_gives_turned_boxes(detector: LidarDetector, turns: int) -> None:
+    found, turned = detector.detect(cloud_of(poles())), detector.detect(cloud_of(poles(turns)))
+    x, y = (found.center_m - ORIGIN)[:, :2].T
+    for _ in range(turns):
+        x, y = -y, x
+    # The window may begin at either of the two cells of a cell of the maps.
+    np.testing.assert_allclose((turned.center_m - ORIGIN)[:, :2], np.stack([x, y], axis=1), atol=0.5)
+    np.testing.assert_allclose(turned.score, found.score, rtol=1e-6)
+    assert turned.points.tolist() == found.points.tolist()
+
+
+def test_range_and_score_follow_the_settings(tmp_path: Path) -> None:
+    path = taller_is_hotter(tmp_path)
+    near = create_lidar_detector(f"lidar:{path}", LOG, LidarConfig(range_m=15.0)).detect(cloud_of(poles()))
+    assert len(near) == 2
+    sure = create_lidar_detector(f"lidar:{path}", LOG, LidarConfig(min_score=0.999)).detect(cloud_of(poles()))
+    assert len(sure) == 2
+
+
+def test_points_of_nan_change_nothing(detector: LidarDetector) -> None:
+    level = np.insert(poles(), [3, 20, 40], np.nan, axis=0)
+    assert detector.detect(cloud_of(level)).points.tolist() == [12, 12, 12]
+
+
+@pytest.mark.parametrize(
+    "level",
+    [
+        np.zeros((0, 3)),
+        np.full((10, 3), np.nan),
+        np.full((10, 3), np.inf),
+        np.random.default_rng(0).uniform(-1, 1, (10, 3)),
+        np.random.default_rng(0).uniform(20, 60, (50_000, 3)),
+        np.full((1000, 3), 500.0),
+        np.full((1000, 3), [10.0, 10.0, -3.0]),
+    ],
+    ids=["none", "nan", "inf", "ten", "sky", "far", "below"],
+)
+@pytest.mark.parametrize("decode", ["centers", "votes"])
+def test_clouds_without_anything_to_find_give_no_boxes(level: Array, decode: str, tmp_path: Path) -> None:
+    chosen = create_lidar_detector(f"lidar:{taller_is_hotter(tmp_path)}", LOG, LidarConfig(decode=decode))  # type: ignore[arg-type]
+    assert len(chosen.detect(cloud_of(level))) == 0
+    assert len(chosen.detect(cloud_of(level), [cloud_of(level)])) == 0
+
+
+def test_a_sensor_that_is_nowhere_is_taken_to_be_at_the_origin(detector: LidarDetector) -> None:
+    cloud = cloud_of(poles(), sensor=np.full(3, np.nan, np.float32))
+    assert len(detector.detect(cloud)) == 3
+
+
+def test_five_million_points_are_thinned_out(detector: LidarDetector) -> None:
+    rng = np.random.default_rng(0)
+    level = rng.uniform(-60, 60, (5_000_000, 3)).astype(np.float32) * np.array([1, 1, 0.01], np.float32)
+    cloud = cloud_of(level)
+    xyz, index = level_points.level_points(cloud, 40.0)
+    assert 0.4 * level_points.MAX_POINTS < len(xyz) <= level_points.MAX_POINTS
+    assert np.array_equal(xyz[:, :2], level[index, :2])
+    start = time.process_time()
+    detector.detect(cloud)
+    assert time.process_time() - start < 5.0
+
+
+def test_many_peaks_on_a_noisy_map_are_decoded_quickly(tmp_path: Path) -> None:
+    path = taller_is_hotter(tmp_path, min_score=dict.fromkeys(INFO["groups"], 0.0))
+    rng = np.random.default_rng(0)
+    level = rng.uniform(-40, 40, (100_000, 3)) * [1, 1, 0.04]
+    chosen = create_lidar_detector(f"lidar:{path}", LOG, LidarConfig())
+    start = time.process_time()
+    assert 50 < len(chosen.detect(cloud_of(level))) <= 300
+    assert time.process_time() - start < 2.0
+
+
+def without(key: str) -> dict[str, Any]:
+    return {k: v for k, v in INFO.items() if k != key}
+
+
+@pytest.mark.parametrize(
+    ("metadata", "message"),
+    [
+        (None, r"no entry 'log2sim\.lidar', a JSON document with cell_m"),
+        ("{", r"'log2sim\.lidar'.*JSON"),
+        ("[1]", r"'log2sim\.lidar'"),
+        (without("stride"), r"'stride' is missing"),
+        ({**INFO, "version": 2}, r"'version' is 2, expected 1"),
+        ({**INFO, "cell_m": -1.0}, r"'cell_m' is -1\.0, expected a number from 0\.05 to 2"),
+        ({**INFO, "cell_m": "NaN"}, r"'cell_m'"),
+        ({**INFO, "range_m": 1000.0}, r"'range_m' is 1000, expected at most 512 cells"),
+        ({**INFO, "groups": ["vehicle", "vehicle"]}, r"'groups' has 'vehicle' twice or unknown"),
+        ({**INFO, "groups": ["plane"]}, r"expected some of vehicle, two_wheeler"),
+        ({**INFO, "categories": {**INFO["categories"], "vehicle": ["tank"]}}, r"'categories\.vehicle' is \['tank'\]"),
+        ({**INFO, "calibration": {}}, r"'calibration\.vehicle' is missing or has not 5 numbers"),
+        ({**INFO, "min_score": {"vehicle": 2.0}}, r"'min_score\.vehicle' is missing or no number from 0 to 1"),
+        ({**INFO, "groups": ["vehicle"]}, r"output 'maps' is float32 \(1, 25, 32, 32\).*expected float32 \(1, 19, 32, 32\)"),
+        ({**INFO, "stride": 4}, r"expected float32 \(1, 25, 16, 16\)"),
+    ],
+    ids=range(15),
+)  # fmt: skip
+def test_metadata_that_cannot_be_are_one_clear_line(metadata: Any, message: str, tmp_path: Path) -> None:
+    path = write_network(tmp_path / "bad.onnx", metadata)
+    with pytest.raises(ConfigError, match=message) as caught:
+        create_lidar_detector(f"lidar:{path}", LOG, LidarConfig())
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+def test_metadata_without_end_are_not_read(tmp_path: Path) -> None:
+    path = write_network(tmp_path / "bad.onnx", json.dumps(INFO) + " " * network.METADATA_LIMIT_CHARS)
+    with pytest.raises(ConfigError, match="characters; expected at most"):
+        network.load_network(path)
+
+
+@pytest.mark.parametrize(
+    ("made", "message"),
+    [
+        ({"inputs": (1, 8, "h", "w")}, "'grid' has 8 channels; expected 12"),
+        ({"inputs": (1, 12, 64, 64)}, "export it with free height and width"),
+        ({"names": ("image", "maps")}, r"inputs 'image'.*not a network for clouds; expected one input 'grid'"),
+        ({"names": ("grid", "boxes")}, r"outputs boxes: not a network for clouds"),
+        ({"key": "names"}, "no entry"),
+    ],
+    ids=["channels", "fixed", "input", "output", "key"],
+)
+def test_networks_of_another_kind_are_one_clear_line(made: dict[str, Any], message: str, tmp_path: Path) -> None:
+    path = write_network(tmp_path / "other.onnx", INFO, **made)
+    with pytest.raises(ConfigError, match=message):
+        network.load_network(path)
+
+
+def test_files_that_are_no_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "file.onnx"
+    with pytest.raises(ConfigError, match="no such file"):
+        network.load_network(path)
+    path.write_bytes(b"")
+    with pytest.raises(ConfigError, match="0 bytes; expected an ONNX network"):
+        network.load_network(path)
+    path.write_bytes(b"not a network")
+    with pytest.raises(ConfigError, match="not a network that ONNX Runtime can load"):
+        network.load_network(path)
+    monkeypatch.setattr(network, "MAX_FILE_BYTES", 5)
+    with pytest.raises(ConfigError, match="13 bytes; expected an ONNX network of 1 to 5 bytes"):
+        network.load_network(path)
+
+
+def test_a_2d_detector_is_no_lidar_detector(yolox_model: Path) -> None:
+    with pytest.raises(ConfigError, match=r"inputs 'images' .*not a network for clouds"):
+        create_lidar_detector(f"lidar:{yolox_model}", LOG, LidarConfig())
+
+
+def test_a_range_that_no_grid_covers_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(
+        ConfigError, match=r"lidar\.range_m 200: .*cells of 0\.25 m, with which a grid covers up to 128 m"
+    ):
+        create_lidar_detector(f"lidar:{taller_is_hotter(tmp_path)}", LOG, LidarConfig(range_m=200.0))
+
+
+@pytest.mark.parametrize("name", ["vehicle", "roadside"])
+def test_missing_weights_are_one_clear_line(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(network_detector, "WEIGHTS", tmp_path)
+    with pytest.raises(ConfigError, match=rf"detector 'lidar:{name}': its network .*{name}\.onnx is missing"):
+        create_lidar_detector(f"lidar:{name}", LOG, LidarConfig())
+    taller_is_hotter(tmp_path).rename(tmp_path / f"{name}.onnx")
+    assert create_lidar_detector(f"lidar:{name}", LOG, LidarConfig()).name == f"lidar:{name}"
+
+
+def test_maps_that_change_their_shape_are_noticed() -> None:
+    class Session:
+        def run(self, *_: Any) -> list[NDArray[np.float32]]:
+            return [np.zeros((1, 25, 3, 3), np.float32)]
+
+    with pytest.raises(ConfigError, match=r"some\.onnx: output 'maps' is float32 \(1, 25, 3, 3\)"):
+        Network(Path("some.onnx"), info(), Session()).run(np.zeros((12, 64, 64), np.float32))
