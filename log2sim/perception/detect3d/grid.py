@@ -98,7 +98,7 @@ def rasterize(xyz: NDArray[np.float32], *, cell_m: float, low: Array, shape: tup
     out[2].fill(np.inf)
     np.maximum.at(out[0], flat, z)
     np.minimum.at(out[2], flat, z)
-    for channel, values in ((1, z), (10, x - i), (11, y - j)):
+    for channel, values in ((1, z), (10, x - i.astype(np.float32)), (11, y - j.astype(np.float32))):
         np.add.at(out[channel], flat, values)
         out[channel, used] *= share
     empty = count == 0

@@ -1,0 +1,355 @@
+"""A fast LiDAR for objects made of convex polytopes over a smooth terrain.
+
+Every object is tested only against the rays of its angular window, nearest objects first, and what is wholly hidden is
+not tested at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import Array
+from log2sim.synth.lidar_models import LidarModel
+from log2sim.synth.polytopes import Material, Polytope
+from log2sim.synth.returns import REFLECTANCE, ReturnModel, backscattered, detected, disturbed, reflected
+
+GROUND, NOTHING = -1, -2
+MIN_RANGE_M = 0.4
+NEWTON_STEPS = 3
+# Departure of the ground's surface from the ray that Newton's method must reach.
+MAX_GROUND_ERROR_M = 0.03
+WINDOW_MARGIN_RAD = 0.012
+LEAF_MEAN_PATH_M = 0.5
+# Share of rays that a wire mesh or a net lets through.
+MESH_OPENNESS = 0.65
+
+
+class Terrain(Protocol):
+    """Height of the ground."""
+
+    def height(self, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return heights (N,) at positions, m."""
+        ...
+
+    def slope(self, x: NDArray[np.float32], y: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return derivatives (N,), (N,) of the height along x and y."""
+        ...
+
+    def relief(self, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return what is too small for `height`, such as kerbs (N,), m."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """An object for the caster.
+
+    Attributes
+    ----------
+    parts : tuple of Polytope
+    position_m : (3,) float64, m
+        Middle of its floor at time 0.
+    yaw_rad : float
+    velocity_mps : (2,) float64, m/s
+    glass_passes : float
+        Share of rays that its windows let through.
+    """
+
+    parts: tuple[Polytope, ...]
+    position_m: Array
+    yaw_rad: float
+    velocity_mps: Array
+    glass_passes: float = 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class SensorState:
+    """Where a LiDAR is during a sweep.
+
+    Attributes
+    ----------
+    rotation : (3, 3) float64
+        From the sensor to the level frame.
+    position_m : (3,) float64, m
+        At time 0, the middle of the sweep.
+    velocity_mps : (2,) float64, m/s
+    """
+
+    rotation: Array
+    position_m: Array
+    velocity_mps: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Returns:
+    """Points of a sweep, motion compensated.
+
+    Attributes
+    ----------
+    xyz_m : (N, 3) float32, m
+        Level frame.
+    intensity : (N,) float32
+        In [0, 1].
+    t_s : (N,) float32
+        Relative to the middle of the sweep.
+    hit : (N,) int32
+        Index of the object, or GROUND.
+    line : (N,) int32
+        Line of the sensor.
+    """
+
+    xyz_m: NDArray[np.float32]
+    intensity: NDArray[np.float32]
+    t_s: NDArray[np.float32]
+    hit: NDArray[np.int32]
+    line: NDArray[np.int32]
+
+
+@dataclass(eq=False)
+class _Buffers:
+    """What each ray (L, A) meets first."""
+
+    direction: NDArray[np.float32]
+    column_s: NDArray[np.float32]
+    range_m: NDArray[np.float32]
+    hit: NDArray[np.int32]
+    material: NDArray[np.int8]
+    incidence: NDArray[np.float32]
+
+
+def cast_polytopes(
+    model: LidarModel,
+    sensor: SensorState,
+    solids: Sequence[Solid],
+    terrain: Terrain,
+    rng: np.random.Generator,
+    returns: ReturnModel | None = None,
+) -> Returns:
+    """Cast a sweep.
+
+    Parameters
+    ----------
+    model : LidarModel
+    sensor : SensorState
+    solids : sequence of Solid
+    terrain : Terrain
+    rng : Generator
+        Draws reflectances, losses and noise.
+    returns : ReturnModel, optional
+        By default the noise of the model and no more.
+    """
+    buffers = _cast_ground(model, sensor, terrain)
+    azimuth, elevation = model.azimuths_rad(), model.elevations_rad()
+    windows = [_window(solid, sensor) for solid in solids]
+    for index in np.argsort([w.near_m for w in windows]).tolist():
+        _cast_solid(buffers, solids[index], index, windows[index], sensor, azimuth, elevation, rng)
+    return _returned(buffers, sensor, len(solids), rng, returns or ReturnModel(model.noise_m, 0.0, 0.0), model.range_m)
+
+
+def _cast_ground(model: LidarModel, sensor: SensorState, terrain: Terrain) -> _Buffers:
+    """Make the rays and intersect them with the terrain by Newton's method."""
+    azimuth, elevation = model.azimuths_rad(), model.elevations_rad()
+    flat = np.cos(elevation)[:, None]
+    rays = np.stack(
+        [
+            flat * np.cos(azimuth),
+            flat * np.sin(azimuth),
+            np.broadcast_to(np.sin(elevation)[:, None], (len(elevation), len(azimuth))),
+        ],
+        -1,
+    )
+    direction = (rays @ sensor.rotation.T).astype(np.float32)
+    # The sweep turns clockwise: its share of the full turn is the share of its period.
+    span = (model.azimuth_deg[1] - model.azimuth_deg[0]) / 360.0 / model.rate_hz
+    column_s = ((np.arange(len(azimuth)) + 0.5) / len(azimuth) - 0.5) * span
+    shape = direction.shape[:2]
+    out = _Buffers(
+        direction,
+        column_s.astype(np.float32),
+        np.full(shape, np.inf, np.float32),
+        np.full(shape, NOTHING, np.int32),
+        np.zeros(shape, np.int8),
+        np.ones(shape, np.float32),
+    )
+    # A street rises by a fifth at most.
+    line, col = np.nonzero(direction[..., 2] < 0.15)
+    d = direction[line, col]
+    drift = out.column_s[col, None] * np.append(sensor.velocity_mps, 0)
+    start = (sensor.position_m + drift).astype(np.float32)
+    height = start[:, 2] - terrain.height(start[:, 0], start[:, 1])
+    limit = np.float32(model.range_m)
+    t = np.minimum(height / np.maximum(-d[:, 2], np.float32(0.02)), limit)
+    error = np.zeros_like(t)
+    for _ in range(NEWTON_STEPS):
+        x, y = start[:, 0] + t * d[:, 0], start[:, 1] + t * d[:, 1]
+        error = start[:, 2] + t * d[:, 2] - terrain.height(x, y)
+        sx, sy = terrain.slope(x, y)
+        t = np.clip(t - error / np.minimum(d[:, 2] - sx * d[:, 0] - sy * d[:, 1], np.float32(-0.004)), 0, 2 * limit)
+    x, y = start[:, 0] + t * d[:, 0], start[:, 1] + t * d[:, 1]
+    error = start[:, 2] + t * d[:, 2] - terrain.height(x, y)
+    ok = (np.abs(error) < MAX_GROUND_ERROR_M) & (t > MIN_RANGE_M) & (t < limit)
+    sx, sy = terrain.slope(x, y)
+    facing = -(d[:, 2] - sx * d[:, 0] - sy * d[:, 1])
+    ok &= facing > 0.005
+    t = t - terrain.relief(x, y) / np.maximum(facing, np.float32(0.02))
+    line, col = line[ok], col[ok]
+    out.range_m[line, col], out.hit[line, col], out.incidence[line, col] = t[ok], GROUND, facing[ok]
+    return out
+
+
+@dataclass(frozen=True)
+class _Window:
+    """Angles in the sensor's frame that may see an object; azimuth from a middle one, less than half a turn each way."""
+
+    near_m: float
+    azimuth: float
+    half: tuple[float, float]
+    elevation: tuple[float, float]
+
+
+def _window(solid: Solid, sensor: SensorState) -> _Window:
+    low = np.min([p.low for p in solid.parts], axis=0)
+    high = np.max([p.high for p in solid.parts], axis=0)
+    c, s = np.cos(solid.yaw_rad), np.sin(solid.yaw_rad)
+    rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    local = rotation.T @ (sensor.position_m - solid.position_m)
+    near = float(np.linalg.norm(np.maximum(np.maximum(low - local, local - high), 0)))
+    # Points of the box's surface, so dense that the greatest elevation is not missed between them.
+    steps = np.linspace(0, 1, 5)
+    u, v, w = np.meshgrid(steps, steps, [0.0, 1.0], indexing="ij")
+    grid = low + np.column_stack([u.ravel(), v.ravel(), w.ravel()]) * (high - low)
+    points = ((grid @ rotation.T + solid.position_m) - sensor.position_m) @ sensor.rotation
+    azimuth, flat = np.arctan2(points[:, 1], points[:, 0]), np.hypot(points[:, 0], points[:, 1])
+    elevation = np.arctan2(points[:, 2], flat)
+    margin = WINDOW_MARGIN_RAD + 0.3 / max(near, 0.3) * float(np.linalg.norm((high - low)[:2])) / 16
+    middle = float(np.arctan2(np.sin(azimuth).mean(), np.cos(azimuth).mean()))
+    off = (azimuth - middle + np.pi) % (2 * np.pi) - np.pi
+    if near < 1.0 or np.ptp(off) > 5.5:
+        off = np.array([-np.pi, np.pi])
+    return _Window(
+        near,
+        middle,
+        (float(off.min()) - margin, float(off.max()) + margin),
+        (float(elevation.min()) - margin, float(elevation.max()) + margin),
+    )
+
+
+def _columns(window: _Window, azimuth: Array) -> NDArray[np.intp]:
+    """Return the firings (C,) within a window, which may lie across the sweep's seam."""
+    off = (azimuth - window.azimuth + np.pi) % (2 * np.pi) - np.pi
+    return np.flatnonzero((off >= window.half[0]) & (off <= window.half[1]))
+
+
+def _cast_solid(
+    buffers: _Buffers, solid: Solid, index: int, window: _Window, sensor: SensorState, azimuth: Array, elevation: Array,
+    rng: np.random.Generator,
+) -> None:  # fmt: skip
+    rows = np.flatnonzero((elevation >= window.elevation[0]) & (elevation <= window.elevation[1]))
+    cols = _columns(window, azimuth)
+    if not len(rows) or not len(cols):
+        return
+    # Rays that meet something nearer than the object's nearest point need no test.
+    lines, firings = np.nonzero(buffers.range_m[np.ix_(rows, cols)] > window.near_m)
+    if not len(lines):
+        return
+    lines, firings = rows[lines], cols[firings]
+    c, s = np.cos(solid.yaw_rad), np.sin(solid.yaw_rad)
+    to_object = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    direction = to_object.astype(np.float32) @ buffers.direction[lines, firings].T
+    origin = to_object @ (sensor.position_m - solid.position_m)
+    drift = to_object @ np.append(sensor.velocity_mps - solid.velocity_mps, 0.0)
+    normals = np.concatenate([p.normals for p in solid.parts])
+    offsets = np.concatenate([p.offsets for p in solid.parts])
+    faces = np.array([len(p.offsets) for p in solid.parts])
+    starts = np.cumsum(faces) - faces
+    slope = normals @ direction
+    gap = (offsets - normals @ origin.astype(np.float32))[:, None]
+    moving = np.abs(drift).max() > 0.1
+    if moving:
+        gap = gap - (normals @ drift.astype(np.float32))[:, None] * buffers.column_s[firings]
+    slope[slope == 0] = np.float32(1e-12)
+    crossing = gap / slope
+    entering = slope < 0
+    enter, leave = np.empty((2, len(solid.parts), len(lines)), np.float32)
+    latest, earliest = (
+        np.where(entering, crossing, np.float32(-np.inf)),
+        np.where(entering, np.float32(np.inf), crossing),
+    )
+    for k, (start, count) in enumerate(zip(starts, faces, strict=True)):
+        latest[start : start + count].max(axis=0, out=enter[k])
+        earliest[start : start + count].min(axis=0, out=leave[k])
+    met = (enter < leave) & (enter > MIN_RANGE_M)
+    enter = np.where(met, enter, np.float32(np.inf))
+    for k in np.flatnonzero(met.any(axis=1)).tolist():
+        material = solid.parts[k].material
+        if material in (Material.LEAVES, Material.GLASS, Material.MESH):
+            enter[k] = _passed(enter[k], leave[k], material, solid, rng)
+    part = enter.argmin(axis=0)
+    ray = np.arange(len(lines))
+    t = enter[part, ray]
+    nearer = np.flatnonzero(t < buffers.range_m[lines, firings])
+    if not len(nearer):
+        return
+    line, firing, part, t = lines[nearer], firings[nearer], part[nearer], t[nearer]
+    face_start = starts[part]
+    # The face that a ray enters by is that of the latest crossing.
+    facing = np.full(len(nearer), np.float32(0.7))
+    for k in np.unique(part):
+        if solid.parts[k].material != Material.LEAVES:
+            m = part == k
+            own = slice(starts[k], starts[k] + faces[k])
+            entered = latest[own][:, nearer[m]].argmax(axis=0)
+            facing[m] = -slope[face_start[m] + entered, nearer[m]]
+    buffers.range_m[line, firing] = t
+    buffers.hit[line, firing] = index
+    buffers.material[line, firing] = np.array([p.material for p in solid.parts], np.int8)[part]
+    buffers.incidence[line, firing] = facing
+
+
+def _passed(
+    enter: NDArray[np.float32], leave: NDArray[np.float32], material: Material, solid: Solid, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """Let rays through what is not solid: leaves by a mean free path, windows and nets by a share."""
+    met = np.flatnonzero(np.isfinite(enter))
+    out = enter.copy()
+    if material == Material.LEAVES:
+        depth = rng.exponential(LEAF_MEAN_PATH_M, len(met)).astype(np.float32)
+        inside = depth < leave[met] - enter[met]
+        out[met] = np.where(inside, enter[met] + depth, np.float32(np.inf))
+    else:
+        share = solid.glass_passes if material == Material.GLASS else MESH_OPENNESS
+        out[met[rng.random(len(met)) < share]] = np.inf
+    return out
+
+
+def _returned(
+    buffers: _Buffers, sensor: SensorState, count: int, rng: np.random.Generator, model: ReturnModel, range_m: float
+) -> Returns:
+    """Draw what comes back of each ray."""
+    hit_range = np.where(buffers.range_m < range_m, buffers.range_m, np.float32(np.inf))
+    early = backscattered(hit_range.ravel(), model.weather, rng).reshape(hit_range.shape)
+    from_air = early < hit_range
+    line, firing = np.nonzero(np.isfinite(hit_range) | from_air)
+    t = np.where(from_air, early, hit_range)[line, firing].astype(np.float32)
+    air = from_air[line, firing]
+    hit = np.where(air, GROUND, buffers.hit[line, firing]).astype(np.int32)
+    material = buffers.material[line, firing]
+    low, high = np.array([REFLECTANCE[m] for m in Material], np.float32).T
+    # One draw for each object and material, and a little for each ray.
+    draw = rng.random((count + 2, len(Material)), dtype=np.float32)[hit + 2, material]
+    speckle = np.exp(0.25 * rng.standard_normal(len(t), dtype=np.float32))
+    reflectance = (low[material] + (high - low)[material] * draw) * speckle
+    signal = reflected(t, reflectance, buffers.incidence[line, firing], model.weather)
+    kept = detected(signal, model, rng) | air
+    line, firing, t, hit, reflectance = line[kept], firing[kept], t[kept], hit[kept], reflectance[kept]
+    intensity = np.clip(reflectance * buffers.incidence[line, firing], 0.003, 1)
+    t = disturbed(t, model, rng)
+    t_s = buffers.column_s[firing]
+    start = sensor.position_m.astype(np.float32) + t_s[:, None] * np.append(sensor.velocity_mps, 0).astype(np.float32)
+    xyz = start + t[:, None] * buffers.direction[line, firing]
+    return Returns(xyz, intensity.astype(np.float32), t_s, hit, line.astype(np.int32))

@@ -1,0 +1,154 @@
+"""Train the LiDAR detector on simulated clouds: generate, fit, export, check, in one command that resumes.
+
+pip install 'log2sim[train]'
+python tools/train_lidar.py vehicle --out DIR             # everything, with the settings of the shipped weights
+python tools/train_lidar.py vehicle --out DIR --scenes 200 --steps 300     # a toy
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from lidar_training.losses import loss_of
+from lidar_training.network import BevNetwork
+from lidar_training.samples import Shard, augmented, draw_sample, grid_of, window_of, write_shard
+from lidar_training.targets import targets_of
+
+PER_SHARD = 100
+BATCH = 4
+PEAK_RATE, WARM_UP_STEPS = 2.5e-3, 100
+MAX_GRADIENT_NORM = 10.0
+CELLS = 256
+CELL_M = {"vehicle": 0.25, "roadside": 0.1875}
+SCENES = {"vehicle": 12_000, "roadside": 12_000}
+STEPS = {"vehicle": 24_000, "roadside": 16_000}
+CHECKPOINT_S = 60.0
+
+
+def generate(mount: str, out: Path, scenes: int, seed: int) -> None:
+    """Draw scenes into shards; those that are there already are kept."""
+    out.mkdir(parents=True, exist_ok=True)
+    for shard in range(math.ceil(scenes / PER_SHARD)):
+        path = out / f"{mount}-{seed}-{shard:04d}.npz"
+        if path.exists():
+            continue
+        begun = time.process_time()
+        write_shard(path, [draw_sample(mount, (seed, shard, k)) for k in range(PER_SHARD)])
+        print(f"{path.name}: {(time.process_time() - begun) / PER_SHARD * 1e3:.0f} ms of CPU a scene", flush=True)
+
+
+class Pool:
+    """Samples of all shards that are there; new ones are taken up as they come."""
+
+    def __init__(self, folder: Path, mount: str) -> None:
+        self._folder, self._mount, self._shards = folder, mount, {}
+
+    def refresh(self) -> int:
+        """Take up new shards; return how many there are."""
+        for path in sorted(self._folder.glob(f"{self._mount}-*.npz")):
+            if path.name not in self._shards:
+                self._shards[path.name] = Shard(path)
+        return len(self._shards)
+
+    def draw(self, rng: np.random.Generator):
+        """Draw a sample."""
+        shard = self._shards[sorted(self._shards)[rng.integers(len(self._shards))]]
+        return shard[int(rng.integers(len(shard)))]
+
+
+def batch_of(pool: Pool, cell_m: float, rng: np.random.Generator):
+    """Draw a batch: grids and targets."""
+    samples, lows, grids = [], [], []
+    for _ in range(BATCH):
+        sample = augmented(pool.draw(rng), rng)
+        low = window_of(rng, CELLS, cell_m)
+        samples.append(sample)
+        lows.append(low)
+        grids.append(grid_of(sample, low, CELLS, cell_m))
+    return torch.from_numpy(np.stack(grids)), targets_of(samples, lows, CELLS, cell_m)
+
+
+def fit(mount: str, data: Path, out: Path, steps: int, seed: int, init: Path | None = None) -> None:
+    """Train, or go on from the checkpoint in `out`."""
+    torch.set_num_threads(1)
+    torch.manual_seed(seed)
+    network = BevNetwork().to(memory_format=torch.channels_last)
+    optimizer = torch.optim.AdamW(network.parameters(), PEAK_RATE, weight_decay=1e-2)
+    checkpoint, step = out / "checkpoint.pt", 0
+    if init is not None:
+        network.load_state_dict(torch.load(init, weights_only=True)["mean"])
+    mean = {k: v.clone() for k, v in network.state_dict().items()}
+    if checkpoint.exists():
+        state = torch.load(checkpoint, weights_only=True)
+        network.load_state_dict(state["network"])
+        optimizer.load_state_dict(state["optimizer"])
+        mean, step = state["mean"], state["step"]
+    pool, begun, saved, parts = Pool(data, mount), time.process_time(), time.time(), []
+    while pool.refresh() == 0:
+        time.sleep(2)
+    while step < steps:
+        rng = np.random.default_rng([seed, 7, step])  # of the step alone, so that a resumed run draws the same
+        if step % 50 == 0:
+            pool.refresh()
+        grid, targets = batch_of(pool, CELL_M[mount], rng)
+        rate = PEAK_RATE * min(1, step / WARM_UP_STEPS + 0.05) * (0.5 + 0.5 * math.cos(math.pi * step / steps)) + 1e-5
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+        maps = network(grid.to(memory_format=torch.channels_last))
+        loss, named = loss_of(maps, targets, grid)
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), MAX_GRADIENT_NORM)
+        optimizer.step()
+        step += 1
+        _average(mean, network, min(0.999, step / (step + 50)))
+        parts.append(named)
+        if step % 100 == 0:
+            text = " ".join(f"{k} {np.mean([p[k] for p in parts]):.3f}" for k in parts[0])
+            print(f"step {step}, {time.process_time() - begun:.0f} s of CPU, {text}", flush=True)
+            parts = []
+        if time.time() - saved > CHECKPOINT_S or step == steps:
+            saved = time.time()
+            state = {"network": network.state_dict(), "optimizer": optimizer.state_dict(), "mean": mean, "step": step}
+            torch.save(state, out / "checkpoint.part")
+            (out / "checkpoint.part").replace(checkpoint)
+
+
+def _average(mean: dict[str, torch.Tensor], network: BevNetwork, keep: float) -> None:
+    """Move the averaged weights a little toward the network's."""
+    with torch.no_grad():
+        for name, value in network.state_dict().items():
+            if value.dtype.is_floating_point:
+                mean[name].mul_(keep).add_(value, alpha=1 - keep)
+            else:
+                mean[name] = value.clone()
+
+
+def main() -> None:
+    """Run the steps that are asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("mount", choices=("vehicle", "roadside"))
+    parser.add_argument("--out", type=Path, required=True, help="folder of shards, checkpoints and results")
+    parser.add_argument("--scenes", type=int)
+    parser.add_argument("--steps", type=int)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", choices=("generate", "fit"))
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    if options.only in (None, "generate"):
+        generate(options.mount, options.out / "data", options.scenes or SCENES[options.mount], options.seed)
+    if options.only in (None, "fit"):
+        fit(options.mount, options.out / "data", options.out, options.steps or STEPS[options.mount], options.seed)
+
+
+if __name__ == "__main__":
+    main()
