@@ -13,7 +13,8 @@ from log2sim.synth.lidar_models import LIDAR_MODELS, LidarModel, lidar_model
 from log2sim.synth.polytope_caster import GROUND, SensorState, Solid, cast_polytopes
 from log2sim.synth.polytopes import Material, box, column, ellipsoid, prism, tube, wheel
 from log2sim.synth.returns import ReturnModel, Weather, backscattered, detected, reflected
-from log2sim.synth.traffic import Road, Surface, draw_scene, labeled_cloud
+from log2sim.synth.traffic import Road, Surface, labeled_cloud
+from log2sim.synth.traffic_random import draw_scene
 from log2sim.synth.traffic_shapes import ROAD_USERS
 
 FLAT = Surface(np.zeros(5), np.zeros((0, 4)), (), 0.0)
@@ -49,7 +50,11 @@ def test_a_slope_is_met_on_its_surface() -> None:
 def test_rays_meet_the_faces_of_a_box_of_any_pose(yaw: float, bearing: float, distance: float, pitch: float) -> None:
     """Every point lies on the surface of the box or of the ground, and every ray that a slab test says hits does."""
     half = np.array([2.2, 0.9, 0.75])
-    thing = solid([box((-2.2, -0.9, 0), (2.2, 0.9, 1.5), Material.WALL)], distance * np.array([np.cos(bearing), np.sin(bearing)]), yaw)
+    thing = solid(
+        [box((-2.2, -0.9, 0), (2.2, 0.9, 1.5), Material.WALL)],
+        distance * np.array([np.cos(bearing), np.sin(bearing)]),
+        yaw,
+    )
     state = sensor(3.6, pitch)
     cloud = cast_polytopes(FINE, state, [thing], FLAT, np.random.default_rng(0), EXACT)
     local = (cloud.xyz_m - thing.position_m - [0, 0, 0.75]) @ rotation_from_rpy(0, 0, yaw)
@@ -65,7 +70,9 @@ def test_rays_meet_the_faces_of_a_box_of_any_pose(yaw: float, bearing: float, di
         near, far = np.sort([(-half - origin) / turned, (half - origin) / turned], axis=0)
     enter, leave = near.max(axis=1), far.min(axis=1)
     sure = (leave - enter > 1e-3) & (enter > 0.5)
-    ambiguous = (np.abs(leave - enter) <= 1e-3) | ((near[:, 2] >= enter - 1e-3) & (np.abs(origin[2] + enter * turned[:, 2] + 0.75) < 1e-3))
+    ambiguous = (np.abs(leave - enter) <= 1e-3) | (
+        (near[:, 2] >= enter - 1e-3) & (np.abs(origin[2] + enter * turned[:, 2] + 0.75) < 1e-3)
+    )
     assert sure.sum() - ambiguous.sum() <= on_box.sum() <= (sure | ambiguous).sum()
 
 
@@ -112,7 +119,8 @@ def test_a_nearer_object_hides_a_farther_one() -> None:
     front = solid([box((-1, -5, 0), (1, 5, 4), Material.WALL)], (8, 0), 0.0)
     behind = solid([box((-1, -2, 0), (1, 2, 2), Material.WALL)], (20, 0), 0.0)
     cloud = cast_polytopes(FINE, sensor(), [behind, front], FLAT, np.random.default_rng(0), EXACT)
-    assert (cloud.hit == 1).any() and not (cloud.hit == 0).any()
+    assert (cloud.hit == 1).any()
+    assert not (cloud.hit == 0).any()
 
 
 def test_windows_let_as_many_rays_through_as_they_are_told() -> None:
@@ -121,14 +129,16 @@ def test_windows_let_as_many_rays_through_as_they_are_told() -> None:
     cloud = cast_polytopes(FINE, sensor(), [pane, wall], FLAT, np.random.default_rng(0), EXACT)
     through = np.abs(cloud.xyz_m[:, 1]) < 4
     panes, walls = (cloud.hit[through] == 0).sum(), (cloud.hit[through] == 1).sum()
-    assert panes > 100 and walls > panes
+    assert panes > 100
+    assert walls > panes
 
 
 def test_leaves_return_from_inside_their_volume() -> None:
     crown = ellipsoid((1.5, 1.5, 1.5), (0, 0, 1.5), Material.LEAVES)
     cloud = cast_polytopes(FINE, sensor(), [solid([crown], (8, 0), 0.0)], FLAT, np.random.default_rng(0), EXACT)
     depth = cloud.xyz_m[cloud.hit == 0, 0] - 8
-    assert depth.max() > 0.3 and depth.min() < -0.9  # not only its surface
+    assert depth.max() > 0.3
+    assert depth.min() < -0.9
 
 
 def test_an_object_that_moves_during_the_sweep_is_drawn_out() -> None:
@@ -161,7 +171,8 @@ def test_road_users_fill_their_boxes(category: str) -> None:
         corners = np.concatenate([p.vertices() for p in parts])
         low, high = corners.min(axis=0), corners.max(axis=0)
         # Mirrors, handlebars and feet may stand out by a hand's breadth.
-        assert low[2] > -0.06 and abs(high[2] - height) < 0.2, (category, seed)
+        assert low[2] > -0.06, (category, seed)
+        assert abs(high[2] - height) < 0.2, (category, seed)
         assert np.all(np.abs((high - low)[:2] - (length, width)) < (0.35, 0.35)), (category, seed)
 
 
@@ -179,7 +190,8 @@ def test_road_users_fill_their_boxes(category: str) -> None:
 def test_bounds_hold_all_corners(part) -> None:
     corners = part.vertices()
     assert len(corners) >= 8
-    assert (corners >= part.low - 1e-4).all() and (corners <= part.high + 1e-4).all()
+    assert (corners >= part.low - 1e-4).all()
+    assert (corners <= part.high + 1e-4).all()
     assert np.allclose(np.linalg.norm(part.normals, axis=1), 1, atol=1e-5)
 
 
@@ -271,7 +283,8 @@ def test_sensors_of_ones_own(tmp_path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text("elevation_deg = [-10, -5, 0]\nazimuth_deg = [-30, 30]\nrange_m = 40\n")
     model = lidar_model(str(path))
-    assert model.name == "mine" and len(model.azimuths_rad()) == 300
+    assert model.name == "mine"
+    assert len(model.azimuths_rad()) == 300
     for text, word in (("elevation = [1]", "elevation"), ("elevation_deg = [100]", "elevation_deg"), ("x = [", "TOML")):
         path.write_text(text)
         with pytest.raises(ConfigError, match=word):

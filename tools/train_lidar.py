@@ -20,17 +20,18 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from lidar_training.losses import loss_of
 from lidar_training.network import BevNetwork
-from lidar_training.samples import Shard, augmented, draw_sample, grid_of, window_of, write_shard
+from lidar_training.samples import Sample, Shard, augmented, draw_sample, grid_of, window_of, write_shard
 from lidar_training.targets import targets_of
 
 PER_SHARD = 100
+FIRST_SHARDS, STEPS_PER_SHARD = 4, 100
 BATCH = 4
 PEAK_RATE, WARM_UP_STEPS = 2.5e-3, 100
 MAX_GRADIENT_NORM = 10.0
 CELLS = 256
 CELL_M = {"vehicle": 0.25, "roadside": 0.1875}
-SCENES = {"vehicle": 12_000, "roadside": 12_000}
-STEPS = {"vehicle": 24_000, "roadside": 16_000}
+SCENES = {"vehicle": 5_000, "roadside": 4_000}
+STEPS = {"vehicle": 8_000, "roadside": 5_000}
 CHECKPOINT_S = 60.0
 
 
@@ -38,7 +39,7 @@ def generate(mount: str, out: Path, scenes: int, seed: int) -> None:
     """Draw scenes into shards; those that are there already are kept."""
     out.mkdir(parents=True, exist_ok=True)
     for shard in range(math.ceil(scenes / PER_SHARD)):
-        path = out / f"{mount}-{seed}-{shard:04d}.npz"
+        path = out / shard_name(mount, seed, shard)
         if path.exists():
             continue
         begun = time.process_time()
@@ -47,22 +48,32 @@ def generate(mount: str, out: Path, scenes: int, seed: int) -> None:
 
 
 class Pool:
-    """Samples of all shards that are there; new ones are taken up as they come."""
+    """Samples of the shards that a step may use; waits for those that are still being generated.
 
-    def __init__(self, folder: Path, mount: str) -> None:
-        self._folder, self._mount, self._shards = folder, mount, {}
+    How many these are depends on the step alone, so that fitting beside generating gives the same weights as after it.
+    """
 
-    def refresh(self) -> int:
-        """Take up new shards; return how many there are."""
-        for path in sorted(self._folder.glob(f"{self._mount}-*.npz")):
-            if path.name not in self._shards:
-                self._shards[path.name] = Shard(path)
-        return len(self._shards)
+    def __init__(self, folder: Path, mount: str, seed: int, scenes: int) -> None:
+        self._paths = [folder / shard_name(mount, seed, k) for k in range(math.ceil(scenes / PER_SHARD))]
+        self._shards: list[Shard] = []
 
-    def draw(self, rng: np.random.Generator):
+    def prepare(self, step: int) -> None:
+        """Load what a step may use."""
+        while len(self._shards) < min(len(self._paths), FIRST_SHARDS + step // STEPS_PER_SHARD):
+            path = self._paths[len(self._shards)]
+            while not path.exists():
+                time.sleep(2)
+            self._shards.append(Shard(path))
+
+    def draw(self, rng: np.random.Generator) -> Sample:
         """Draw a sample."""
-        shard = self._shards[sorted(self._shards)[rng.integers(len(self._shards))]]
+        shard = self._shards[rng.integers(len(self._shards))]
         return shard[int(rng.integers(len(shard)))]
+
+
+def shard_name(mount: str, seed: int, number: int) -> str:
+    """Name a file of samples."""
+    return f"{mount}-{seed}-{number:04d}.npz"
 
 
 def batch_of(pool: Pool, cell_m: float, rng: np.random.Generator):
@@ -77,28 +88,23 @@ def batch_of(pool: Pool, cell_m: float, rng: np.random.Generator):
     return torch.from_numpy(np.stack(grids)), targets_of(samples, lows, CELLS, cell_m)
 
 
-def fit(mount: str, data: Path, out: Path, steps: int, seed: int, init: Path | None = None) -> None:
+def fit(mount: str, data: Path, out: Path, *, scenes: int, steps: int, seed: int) -> None:
     """Train, or go on from the checkpoint in `out`."""
     torch.set_num_threads(1)
     torch.manual_seed(seed)
     network = BevNetwork().to(memory_format=torch.channels_last)
     optimizer = torch.optim.AdamW(network.parameters(), PEAK_RATE, weight_decay=1e-2)
     checkpoint, step = out / "checkpoint.pt", 0
-    if init is not None:
-        network.load_state_dict(torch.load(init, weights_only=True)["mean"])
     mean = {k: v.clone() for k, v in network.state_dict().items()}
     if checkpoint.exists():
         state = torch.load(checkpoint, weights_only=True)
         network.load_state_dict(state["network"])
         optimizer.load_state_dict(state["optimizer"])
         mean, step = state["mean"], state["step"]
-    pool, begun, saved, parts = Pool(data, mount), time.process_time(), time.time(), []
-    while pool.refresh() == 0:
-        time.sleep(2)
+    pool, begun, saved, parts = Pool(data, mount, seed, scenes), time.process_time(), time.time(), []
     while step < steps:
         rng = np.random.default_rng([seed, 7, step])  # of the step alone, so that a resumed run draws the same
-        if step % 50 == 0:
-            pool.refresh()
+        pool.prepare(step)
         grid, targets = batch_of(pool, CELL_M[mount], rng)
         rate = PEAK_RATE * min(1, step / WARM_UP_STEPS + 0.05) * (0.5 + 0.5 * math.cos(math.pi * step / steps)) + 1e-5
         for group in optimizer.param_groups:
@@ -147,7 +153,8 @@ def main() -> None:
     if options.only in (None, "generate"):
         generate(options.mount, options.out / "data", options.scenes or SCENES[options.mount], options.seed)
     if options.only in (None, "fit"):
-        fit(options.mount, options.out / "data", options.out, options.steps or STEPS[options.mount], options.seed)
+        scenes, steps = options.scenes or SCENES[options.mount], options.steps or STEPS[options.mount]
+        fit(options.mount, options.out / "data", options.out, scenes=scenes, steps=steps, seed=options.seed)
 
 
 if __name__ == "__main__":

@@ -151,11 +151,33 @@ def building(length: float, rng: np.random.Generator) -> Parts:
     return tuple(parts)
 
 
+def own_car(height: float, rng: np.random.Generator) -> Parts:
+    """Draw what a LiDAR at a height sees of the car under it: roof, hood and trunk, which hide the ground close by."""
+    roof = height - rng.uniform(0.1, 0.4)
+    hood = roof - rng.uniform(0.4, 0.7)
+    back = rng.uniform(-1.6, -0.8)
+    return (
+        box((back, -0.65, 0.3), (rng.uniform(0.3, 0.9), 0.65, roof), Material.PAINT),
+        box((back - 0.8, -0.9, 0.2), (rng.uniform(1.8, 2.6), 0.9, hood), Material.PAINT),
+    )
+
+
+def stand(rng: np.random.Generator) -> Parts:
+    """Draw something slim of a person's height that is none: a meter, a pump, a pillar, a wrapped tree, a hydrant."""
+    height, width = rng.uniform(0.7, 2.2), rng.uniform(0.15, 0.5)
+    parts = [box((-width / 2, -width * 0.35, 0), (width / 2, width * 0.35, height), Material.METAL)]
+    if rng.random() < 0.4:
+        top = rng.uniform(0.2, 0.5)
+        parts.append(box((-top / 2, -top / 2, height), (top / 2, top / 2, height + top), Material.METAL))
+    return tuple(parts)
+
+
 SMALL: dict[str, tuple[float, float, Callable[[np.random.Generator], Parts]]] = {
-    "tree": (0.2, 0.4, tree),
+    "tree": (0.18, 0.4, tree),
     "bush": (0.2, 0.9, bush),
-    "grass": (0.12, 0.3, grass),
-    "pole": (0.22, 0.2, pole),
+    "grass": (0.14, 0.3, grass),
+    "pole": (0.2, 0.2, pole),
+    "stand": (0.08, 0.3, stand),
     "bin": (0.1, 0.8, bin_),
     "container": (0.05, 3.5, container),
     "bench": (0.05, 1.0, bench),

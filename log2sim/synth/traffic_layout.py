@@ -83,7 +83,7 @@ def draw_layout(
 ) -> list[TrafficObject]:
     """Draw the objects of a scene."""
     out = _Layout(surface, roads, rng)
-    # The sensor's own car, or its pole.
+    # The place of the sensor's own car, or of its pole.
     out.circles.append((0.0, 0.0, 0.5 if mount == "roadside" else 2.4))
     for road in roads:
         _traffic(out, road)
@@ -202,7 +202,7 @@ def _roadside(out: _Layout, road: Road) -> None:
                 xy, direction = road.at(s + rng.normal(0, 0.5), side * d)
                 if not out.on_road(xy):
                     out.add_thing(kind, xy, direction, draw(rng), radius)
-    for _ in range(rng.poisson(16)):
+    for _ in range(rng.poisson(26)):
         kind = str(rng.choice(kinds, p=shares / shares.sum()))
         _, radius, draw = clutter.SMALL[kind]
         d = rng.choice([-1, 1]) * (half + abs(rng.normal(0, 6)) + 0.3)

@@ -42,7 +42,7 @@ _CARS = {
     "pickup": _Body((5.6, 0.25), (1.95, 0.06), (1.85, 0.07), (0.38, 0.5), 0.05, 0.15, 0.15),
 }
 _CAR_SHARES = {
-    "small": 0.08, "hatch": 0.18, "sedan": 0.24, "wagon": 0.1, "suv": 0.17, "large suv": 0.09, "van": 0.05, "pickup": 0.09,
+    "small": 0.11, "hatch": 0.2, "sedan": 0.22, "wagon": 0.1, "suv": 0.17, "large suv": 0.08, "van": 0.05, "pickup": 0.07,
 }  # fmt: skip
 
 
