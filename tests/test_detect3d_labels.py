@@ -97,19 +97,23 @@ def test_points_of_boxes_are_those_of_each_box_alone(scale: float) -> None:
     center, size = center * scale, size * scale
     xyz = (rng.uniform(-35, 35, (4000, 3)) * [1, 1, 0.1] * scale).astype(np.float32)
     xyz[7] = np.nan
-    found = points_of_boxes(xyz, center, size, yaw)
-    expected = [np.flatnonzero(points_in_box(xyz.astype(float), *box)) for box in zip(center, size, yaw)]
+    usable = rng.random(4000) < 0.8
+    found = points_of_boxes(xyz, center, size, yaw, usable)
+    expected = [np.flatnonzero(points_in_box(xyz.astype(float), *box) & usable) for box in zip(center, size, yaw)]
     for k, index in enumerate(expected):
         assert sorted(found.point[found.box == k].tolist()) == index.tolist()
     assert found.count.tolist() == [len(e) for e in expected]
     assert sum(found.count) > 100
     z = found.mean(xyz[:, 2])
+    some = found.sample(10)
+    assert some.count.tolist() == [-(-len(e) // max(-(-len(e) // 10), 1)) for e in expected]
+    assert set(zip(some.box.tolist(), some.point.tolist())) <= set(zip(found.box.tolist(), found.point.tolist()))
     np.testing.assert_allclose(z, [xyz[e, 2].mean(dtype=float) if len(e) else 0.0 for e in expected], atol=1e-5 * scale)
 
 
 def test_without_boxes_or_points_there_are_no_pairs() -> None:
-    box = np.zeros((1, 3)), np.ones((1, 3)), np.zeros(1)
-    assert points_of_boxes(np.zeros((0, 3), np.float32), *box).count.tolist() == [0]
-    assert points_of_boxes(np.zeros((3, 3), np.float32), *(b[:0] for b in box)).count.tolist() == []
-    assert points_of_boxes(np.full((3, 3), np.nan, np.float32), *box).count.tolist() == [0]
-    assert points_of_boxes(np.zeros((3, 3), np.float32), *box).count.tolist() == [3]
+    box, all_three = (np.zeros((1, 3)), np.ones((1, 3)), np.zeros(1)), np.ones(3, bool)
+    assert points_of_boxes(np.zeros((0, 3), np.float32), *box, all_three[:0]).count.tolist() == [0]
+    assert points_of_boxes(np.zeros((3, 3), np.float32), *(b[:0] for b in box), all_three).count.tolist() == []
+    assert points_of_boxes(np.full((3, 3), np.nan, np.float32), *box, all_three).count.tolist() == [0]
+    assert points_of_boxes(np.zeros((3, 3), np.float32), *box, all_three).count.tolist() == [3]

@@ -42,6 +42,13 @@ class PointsOfBoxes:
         pairs = np.repeat(starts[index], counts[index]) + ramp(counts[index])
         return PointsOfBoxes(np.repeat(np.arange(len(index)), counts[index]), self.point[pairs], len(index))
 
+    def sample(self, most: int) -> PointsOfBoxes:
+        """Take at most `most` pairs of each box, evenly spaced in their order."""
+        counts = self.count
+        step = -(-counts // most)
+        chosen = np.flatnonzero(ramp(counts) % np.maximum(step, 1).take(self.box) == 0)
+        return PointsOfBoxes(self.box.take(chosen), self.point.take(chosen), self.boxes)
+
     @property
     def count(self) -> NDArray[np.int64]:
         """Number of points in each box (M,)."""
@@ -54,7 +61,13 @@ class PointsOfBoxes:
         return np.divide(total, count, out=np.zeros(self.boxes), where=count > 0)
 
 
-def points_of_boxes(xyz: NDArray[np.floating[Any]], center_m: Array, size_m: Array, yaw_rad: Array) -> PointsOfBoxes:
+def points_of_boxes(
+    xyz: NDArray[np.floating[Any]],
+    center_m: Array,
+    size_m: Array,
+    yaw_rad: Array,
+    usable: NDArray[np.bool_] | None = None,
+) -> PointsOfBoxes:
     """Find the points in each of many upright boxes.
 
     Parameters
@@ -64,6 +77,8 @@ def points_of_boxes(xyz: NDArray[np.floating[Any]], center_m: Array, size_m: Arr
     center_m, size_m : (M, 3) float64, m
         Length, width, height.
     yaw_rad : (M,) float64
+    usable : (N,) bool, optional
+        The points that count; by default all.
 
     Notes
     -----
@@ -80,17 +95,18 @@ def points_of_boxes(xyz: NDArray[np.floating[Any]], center_m: Array, size_m: Arr
     )
     reach += MARGIN_M
     low, high = center_m[:, :2] - reach, center_m[:, :2] + reach
-    box, candidate = candidates(xyz, CoarseGrid.around(low, high), low, high)
-    # Row by row and in the points' own precision: this is where the time goes.
+    box, place, order = candidates(xyz, usable, CoarseGrid.around(low, high), low, high)
+    # Column by column, in the points' own precision and the order of their cells: this is where the time goes.
+    columns = np.ascontiguousarray(xyz.take(order, axis=0).T)
     center, (length, width, height) = center_m.T.astype(xyz.dtype), half.T.astype(xyz.dtype)
     c, s = (v.astype(xyz.dtype).take(box) for v in (c, s))
-    x, y, z = (xyz[:, axis].take(candidate) - center[axis].take(box) for axis in range(3))
+    x, y, z = (columns[axis].take(place) - center[axis].take(box) for axis in range(3))
     inside = np.flatnonzero(
         (np.abs(x * c + y * s) <= length.take(box))
         & (np.abs(y * c - x * s) <= width.take(box))
         & (np.abs(z) <= height.take(box))
     )
-    return PointsOfBoxes(box.take(inside), candidate.take(inside), len(center_m))
+    return PointsOfBoxes(box.take(inside), order.take(place.take(inside)), len(center_m))
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,14 +146,18 @@ class CoarseGrid:
 
 
 def candidates(
-    xyz: NDArray[np.floating[Any]], grid: CoarseGrid, low: Array, high: Array
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Pair each box with the points in the cells that its bounding rectangle `low` to `high`, (M, 2) each, touches.
+    xyz: NDArray[np.floating[Any]], usable: NDArray[np.bool_] | None, grid: CoarseGrid, low: Array, high: Array
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Pair each box with the usable points in the cells that its bounding rectangle `low` to `high`, (M, 2) each, touches.
 
     Returns
     -------
-    box, point : (K,) int
-        Indices, ordered by box.
+    box : (K,) int
+        Ascending.
+    place : (K,) int
+        Place of the point in `order`.
+    order : (n,) int
+        Indices of points, ordered by cell.
     """
     first, last = (np.clip((v - grid.corner) // grid.cell, 0, grid.shape - 2).astype(np.intp) for v in (low, high))
     # One run of cells for each box and each of its rows.
@@ -148,13 +168,14 @@ def candidates(
     count = int(grid.shape.prod())
     touched = np.cumsum(np.bincount(begin, minlength=count) - np.bincount(end, minlength=count)) > 0
     code = grid.index_of(xyz)
-    near = np.flatnonzero(touched.take(code))
+    inside = touched.take(code)
+    near = np.flatnonzero(inside if usable is None else inside & usable)
     code = code.take(near)
     order = near.take(np.argsort(code, kind="stable"))
     edges = np.concatenate([[0], np.cumsum(np.bincount(code, minlength=count))])
     start = edges[begin]
     length = edges[end] - start
-    return np.repeat(box, length), order.take(np.repeat(start, length) + ramp(length))
+    return np.repeat(box, length), np.repeat(start, length) + ramp(length), order
 
 
 def ramp(counts: NDArray[np.intp]) -> NDArray[np.intp]:

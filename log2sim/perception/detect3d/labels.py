@@ -44,9 +44,7 @@ class LabelBoxDetector:
         near = np.all(away <= self.max_range_m, axis=1)
         found, local = found.take(np.flatnonzero(near)), local[near]
         # Points on the ground count for no box: a box whose lower face is 5 cm too low would gain hundreds.
-        points = points_of_boxes(
-            cloud.xyz.take(np.flatnonzero(~cloud.ground), axis=0), local, found.size_m, found.yaw_rad
-        ).count
+        points = points_of_boxes(cloud.xyz, local, found.size_m, found.yaw_rad, ~cloud.ground).count
         seen = np.flatnonzero(points > 0)
         seen = seen[np.lexsort((np.hypot(*away[near][seen].T), -points[seen]))]
         found, one = found.take(seen), np.ones(len(seen))

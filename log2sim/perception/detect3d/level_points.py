@@ -17,6 +17,7 @@ MAX_POINTS = 1_000_000
 # The ground under a box is a plane. Where points reach less than this to all sides it is taken as level.
 PLANE_REACH_M = 0.05
 MAX_SLOPE = 0.4
+PLANE_POINTS = 64
 
 
 def level_points(cloud: Cloud, range_m: float) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
@@ -79,26 +80,32 @@ def _cropped(cloud: Cloud, center: Array, range_m: float) -> tuple[NDArray[np.fl
     return xyz, index
 
 
-def ground_under(xy: Array, inside: PointsOfBoxes, xyz: NDArray[np.float32], ground_z: NDArray[np.float32]) -> Array:
+def ground_under(xy: Array, inside: PointsOfBoxes, cloud: Cloud, index: NDArray[np.intp]) -> Array:
     """Estimate the height (M,) of the ground under positions (M, 2) by a plane through that under the points of each box.
 
     Parameters
     ----------
     xy : (M, 2) float64, m
-        Centers of the boxes.
+        Centers of the boxes, relative to the cloud's origin.
     inside : PointsOfBoxes
-        Each of the boxes has at least one of the points.
-    xyz : (n, 3) float32, m
-    ground_z : (n,) float32, m
-        Height of the ground under each point.
+        Each box has at least one point.
+    cloud : Cloud
+    index : (n,) int
+        Of the points that `inside` numbers in the cloud.
+
+    Returns
+    -------
+    (M,) float64, m
+        Relative to the cloud's origin.
 
     Notes
     -----
     A car is seen from one side: on a slope of 10 % the ground under its points is 0.1 to 0.2 m off that under its center.
     """
-    box, point = inside.box, inside.point
-    x, y = (xyz[point, :2] - xy[box]).T
-    z = ground_z[point].astype(np.float64)
+    inside = inside.sample(PLANE_POINTS)
+    box, point = inside.box, index.take(inside.point)
+    x, y = (cloud.xyz[:, axis].take(point) - xy[:, axis].take(box) for axis in range(2))
+    z = (cloud.xyz[:, 2].take(point) - cloud.height.take(point)).astype(np.float64)
     count = inside.count
 
     def mean(values: Array) -> Array:

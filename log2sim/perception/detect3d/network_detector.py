@@ -68,9 +68,8 @@ class NetworkDetector:
         if self.decode == "centers":
             # The same peak twice needs no count of points, which takes longest.
             found = found.take(suppress(found.rectangles, found.strength(self.network.info), found.group, across=False))
-        above = np.flatnonzero(xyz[:, 2] > ON_GROUND_M)
-        xyz, index = xyz.take(above, axis=0), index.take(above)
-        inside = points_of_boxes(xyz, found.center_m, found.size_m, found.yaw_rad)
+        above = xyz[:, 2] > ON_GROUND_M
+        inside = points_of_boxes(xyz, found.center_m, found.size_m, found.yaw_rad, above)
         points = inside.count
         score = self._scores(found, points, cloud)
         # What holds no point is nothing that the LiDAR saw.
@@ -78,8 +77,8 @@ class NetworkDetector:
         kept = good[suppress(found.rectangles.take(good), score[good], found.group[good])]
         found, inside = found.take(kept), inside.take(kept)
         center = found.center_m + cloud.origin
-        center[:, 2] += ground_under(found.center_m[:, :2], inside, xyz, cloud.xyz[index, 2] - cloud.height[index])
-        t_ns = cloud.stamp_ns + np.round(inside.mean(cloud.t_s[index]) * NS_PER_S).astype(np.int64)
+        center[:, 2] += ground_under(found.center_m[:, :2], inside, cloud, index)
+        t_ns = cloud.stamp_ns + np.round(inside.mean(cloud.t_s.take(index)) * NS_PER_S).astype(np.int64)
         return Boxes3D(
             t_ns, center, found.size_m, found.yaw_rad, found.heading_score, found.category, score[kept], points[kept]
         )
