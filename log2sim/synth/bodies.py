@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array, apply, inverse
 from log2sim.synth.actors import Actor
+from log2sim.synth.lamps import Lamp, lamplight
 from log2sim.synth.light import Light, reflected
 from log2sim.synth.paint import paint
 from log2sim.synth.raster import Fragments, rasterize
@@ -26,6 +27,21 @@ SHADOW_RANGE_M = 80.0
 NOBODY = -1
 
 Samples = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Lighting:
+    """Light on bodies.
+
+    Attributes
+    ----------
+    light : Light
+    lamps : tuple of Lamp
+    """
+
+    light: Light
+    lamps: tuple[Lamp, ...] = ()
+
 
 Painter = Callable[[NDArray[np.int64], Samples, Samples], Paint]  # of materials, points and normals
 
@@ -69,7 +85,7 @@ def fragments_of(view: RenderCamera, body: Body) -> Fragments | None:
     return fragments if len(fragments.u) else None
 
 
-def draw_bodies(view: RenderCamera, bodies: Sequence[Body], light: Light, color: Image, depth: Image) -> None:
+def draw_bodies(view: RenderCamera, bodies: Sequence[Body], lit: Lighting, color: Image, depth: Image) -> None:
     """Draw bodies where they are nearer than the depth (H, W) so far, softening their outlines."""
     fine = view.enlarged(SAMPLES)
     nearest = np.full(fine.width_px * fine.height_px, np.inf, np.float32)
@@ -92,7 +108,7 @@ def draw_bodies(view: RenderCamera, bodies: Sequence[Body], light: Light, color:
         pixel = fragments.pixel(fine.width_px)
         left = np.flatnonzero(owner[pixel] == index)
         if len(left):
-            samples[pixel[left]] = _colors(view, fine, bodies[index], light, fragments.part(left))
+            samples[pixel[left]] = _colors(view, fine, bodies[index], lit, fragments.part(left))
     _resolve(view, samples.reshape(fine.height_px, fine.width_px, 3), owner.reshape(fine.height_px, -1), color)
     _bring_forward(depth, nearest.reshape(fine.height_px, -1))
 
@@ -103,23 +119,23 @@ def _coarse(fragments: Fragments, width_px: int) -> NDArray[np.int32]:
 
 
 def _colors(
-    view: RenderCamera, fine: RenderCamera, body: Body, light: Light, fragments: Fragments
+    view: RenderCamera, fine: RenderCamera, body: Body, lit: Lighting, fragments: Fragments
 ) -> NDArray[np.float32]:
     """Light (P, 3) from samples of a body; those of one pixel share theirs if there are many."""
     count = len(fragments.u)
     if count <= MAX_SHADED_SAMPLES:
-        return shade(fine, body, light, fragments)
+        return shade(fine, body, lit, fragments)
     coarse = _coarse(fragments, view.width_px)
     coarse -= coarse.min()
     slot = np.full(int(coarse.max()) + 1, -1, np.int32)
     slot[coarse] = np.arange(count, dtype=np.int32)
     chosen = np.flatnonzero(slot >= 0)
-    shaded = shade(fine, body, light, fragments.part(slot[chosen]))
+    shaded = shade(fine, body, lit, fragments.part(slot[chosen]))
     slot[chosen] = np.arange(len(chosen), dtype=np.int32)
     return shaded[slot[coarse]]
 
 
-def shade(view: RenderCamera, body: Body, light: Light, fragments: Fragments) -> NDArray[np.float32]:
+def shade(view: RenderCamera, body: Body, lit: Lighting, fragments: Fragments) -> NDArray[np.float32]:
     """Light (P, 3) from fragments of a body, dimmed by haze."""
     R, eye = body.map_T_body[:3, :3].astype(np.float32), view.map_T_cam[:3, 3] - body.map_T_body[:3, 3]
     rays = view.directions(fragments.u, fragments.v).astype(np.float32)
@@ -129,7 +145,12 @@ def shade(view: RenderCamera, body: Body, light: Light, fragments: Fragments) ->
     surface = body.painter(body.mesh.part[fragments.face], points, normals)
     to_camera = rays / -np.sqrt(np.einsum("pi,pi->p", rays, rays))[:, None]
     height = np.asarray(points[:, 2] + np.float32(body.size_m[2] / 2), np.float32)
-    return light.hazy(reflected(light, surface, normals @ R.T, to_camera, height), fragments.depth_m)
+    turned = normals @ R.T
+    lamps = None
+    if lit.lamps:
+        offset = body.map_T_body[:3, 3].astype(np.float32)
+        lamps = lamplight(lit.lamps, lit.light.exposure, points @ R.T + offset, turned)
+    return lit.light.hazy(reflected(lit.light, surface, turned, to_camera, height, lamps), fragments.depth_m)
 
 
 def _resolve(view: RenderCamera, samples: Image, owner: NDArray[np.int16], color: Image) -> None:
@@ -153,12 +174,12 @@ def _bring_forward(depth: Image, nearest: Image) -> None:
 
 
 def draw_shadows(
-    view: RenderCamera, bodies: Sequence[Body], light: Light, color: Image, ground: NDArray[np.bool_]
+    view: RenderCamera, bodies: Sequence[Body], lit: Lighting, color: Image, ground: NDArray[np.bool_]
 ) -> None:
     """Darken the ground (H, W) in the shadow of bodies and, right below them, further."""
     sun = np.zeros(ground.shape, np.uint8)
     sky = np.zeros(ground.shape, np.uint8)
-    slope = np.divide(light.sun[:2], light.sun[2])
+    slope = np.divide(lit.light.sun[:2], lit.light.sun[2])
     for body in bodies:
         if np.linalg.norm(body.map_T_body[:2, 3] - view.map_T_cam[:2, 3]) > SHADOW_RANGE_M:
             continue
@@ -178,6 +199,6 @@ def draw_shadows(
     soft_sun, soft_sky = (
         cv2.GaussianBlur(m[band], (0, 0), s) * np.float32(1 / 255) for m, s in ((sun, 1.6), (sky, 1.8))
     )
-    share = light.sun_share()
+    share = lit.light.sun_share()
     factor = (1 - share * soft_sun) * (1 - 0.5 * soft_sky)
     color[band] *= np.where(ground[band], factor, np.float32(1))[..., None]

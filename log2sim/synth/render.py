@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array, Camera
 from log2sim.synth.backdrop import Backdrop
-from log2sim.synth.bodies import NOBODY, Body, draw_bodies, draw_shadows, fragments_of
+from log2sim.synth.bodies import NOBODY, Body, Lighting, draw_bodies, draw_shadows, fragments_of
 from log2sim.synth.facades import draw_buildings, hide_behind_buildings
+from log2sim.synth.lamps import Lamp, glare, light_scenery, nearest_lamps
 from log2sim.synth.light import NOON, Light
+from log2sim.synth.rain import draw_rain, mirror_sky
 from log2sim.synth.raster import Fragments
 from log2sim.synth.render_camera import RenderCamera
 from log2sim.synth.scenery import FAR_M, GAMMA, Image, draw_ground, draw_sky
@@ -50,23 +52,32 @@ class SceneInstant:
     backdrop : Backdrop
     bodies : sequence of Body
     light : Light
+    lamps : sequence of Lamp
+        Headlights and street lights that are on.
     """
 
     backdrop: Backdrop
     bodies: Sequence[Body]
     light: Light = NOON
+    lamps: Sequence[Lamp] = ()
 
 
 def render(camera: Camera, map_T_cam: Array, instant: SceneInstant, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Render an image (H, W, 3) uint8 BGR."""
     view, light = RenderCamera.of(camera, map_T_cam), instant.light
+    lit = Lighting(light, nearest_lamps(view, instant.lamps))
     color, depth = draw_sky(view, light)
     draw_ground(view, instant.backdrop.ground, light, color, depth)
-    draw_shadows(view, instant.bodies, light, color, depth < FAR_M)
+    ground = depth.copy()
+    draw_shadows(view, instant.bodies, lit, color, ground < FAR_M)
     draw_buildings(view, instant.backdrop.buildings, light, color, depth)
+    light_scenery(view, lit.lamps, light, color, depth)
+    mirror_sky(view, light, color, (ground < FAR_M) & (depth == ground))
     color = light.hazy(color, depth)
-    draw_bodies(view, instant.bodies, light, color, depth)
-    return _developed(color, rng)
+    draw_bodies(view, instant.bodies, lit, color, depth)
+    glare(view, lit.lamps, light, color, depth)
+    draw_rain(view, light, color, rng)
+    return _developed(color, light, rng)
 
 
 def segment(camera: Camera, map_T_cam: Array, instant: SceneInstant) -> list[Visibility | None]:
@@ -96,11 +107,11 @@ def _visibility(visible: Fragments, silhouette: int) -> Visibility | None:
     return Visibility(len(u), silhouette, np.array([u.min(), v.min(), u.max() + 1, v.max() + 1], float))
 
 
-def _developed(color: Image, rng: np.random.Generator) -> NDArray[np.uint8]:
+def _developed(color: Image, light: Light, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Lens blur, sensor noise and gamma."""
     image = cv2.GaussianBlur(color, (3, 3), LENS_BLUR_PX)
     np.clip(image, 0, 1, out=image)
     np.power(image, np.float32(1 / GAMMA), out=image)
     image *= 255
-    image += rng.standard_normal(image.shape[:2], dtype=np.float32)[..., None] * np.float32(GRAIN)
+    image += rng.standard_normal(image.shape[:2], dtype=np.float32)[..., None] * np.float32(GRAIN * light.noise)
     return np.asarray(cv2.convertScaleAbs(np.maximum(image, 0, out=image)), np.uint8)

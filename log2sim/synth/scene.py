@@ -80,6 +80,15 @@ class Building(Table):
     color: Color = key("Color of the facade, RGB 0 to 255.", (190, 180, 165))
 
 
+class Environment(Table):
+    """Light and weather, for pictures and clouds."""
+
+    light: Literal["noon", "overcast", "dusk", "night"] = key("Time of day and clouds.", "noon")
+    weather: Literal["clear", "rain", "fog"] = key("What is in the air.", "clear")
+    visibility_m: Number = key("Meteorological visibility in fog.", 120.0, "m", ge=10, le=1000)
+    rain_mm_h: Number = key("Rate of rain.", 15.0, "mm/h", ge=0.1, le=200)
+
+
 class Ego(Table):
     """The recording vehicle; its waypoints guide the middle of its rear axle."""
 
@@ -208,6 +217,7 @@ class Scene(Table):
     camera: tuple[CameraSpec, ...] = key("Cameras.", ())
     lidar: tuple[LidarSpec, ...] = key("LiDARs.", ())
     gnss: Gnss = key("Errors of the ego's poses.", Gnss())
+    environment: Environment = key("Light and weather.", Environment())
 
     @model_validator(mode="after")
     def _unique_names_and_mounts(self) -> Self:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,9 @@ from log2sim.synth.labels import (
     visible_at,
 )
 from log2sim.synth.scene import LidarSpec, Scene
+
+if TYPE_CHECKING:
+    from log2sim.synth.lamps import Lamp
 
 Caster = Callable[[str, int], raycast.LabeledSweep]
 
@@ -87,7 +90,9 @@ def synthesize(scene: Scene, *, seed: int = 0, observe: bool = True) -> tuple[Lo
 
 
 def _image_streams(moving: MovingScene, cameras: dict[str, Camera], seed: int) -> dict[str, Stream]:
-    scene = moving.scene
+    from log2sim.synth.light import light_of
+
+    scene, light = moving.scene, light_of(moving.scene.environment)
 
     def read(camera: Camera, index: int, t_ns: NDArray[np.int64], i: int) -> NDArray[np.uint8]:
         from log2sim.synth.bodies import Body
@@ -96,7 +101,8 @@ def _image_streams(moving: MovingScene, cameras: dict[str, Camera], seed: int) -
         map_T_cam = moving.map_T_mount(camera.mount, t_ns[i : i + 1])[0] @ camera.mount_T_cam
         rng = np.random.default_rng([seed, 2, index, i])
         bodies = [Body.of(actor, moving.seconds(t_ns[i])) for actor in moving.seen_from(camera.mount)]
-        instant = SceneInstant(_backdrop(scene, seed), bodies)
+        lamps = lamps_on(moving, map_T_cam, int(t_ns[i])) if light.lamps > 0 else ()
+        instant = SceneInstant(_backdrop(scene, seed), bodies, light, lamps)
         return render(camera, map_T_cam, instant, rng)
 
     out = {}
@@ -108,6 +114,20 @@ def _image_streams(moving: MovingScene, cameras: dict[str, Camera], seed: int) -
             )
         out[spec.name] = Stream(spec.name, stamps, _bound(read, cameras[spec.name], index, stamps))
     return out
+
+
+def lamps_on(moving: MovingScene, map_T_cam: Array, t_ns: int) -> tuple[Lamp, ...]:
+    """List the headlights of all that drives and the street lights around a camera."""
+    from log2sim.synth.lamps import headlights, street_lights
+
+    lamps = list(street_lights(moving.scene.road, map_T_cam[:2, 3]))
+    driving = (*moving.actors, *([] if moving.ego_body is None else [moving.ego_body]))
+    for actor in driving:
+        if actor.spec.vehicle and actor.path is not None:
+            pose = actor.at(moving.seconds(t_ns)).map_T_agent()[0]
+            pose[2, 3] = 0.0
+            lamps += headlights(pose, actor.spec.box_m[0] / 2, actor.spec.box_m[1])
+    return tuple(lamps)
 
 
 def _bound(read: Callable[..., Any], *arguments: Any) -> Callable[[int], Any]:
