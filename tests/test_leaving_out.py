@@ -15,6 +15,7 @@ import log2sim.agents.estimate
 import log2sim.perception.lidar.cloud
 import log2sim.pipeline
 import log2sim.plan
+import log2sim.sensors
 from log2sim import Config, Scenario, reconstruct, replay
 from log2sim.agents.simplify import simplify_waypoints
 from log2sim.datatypes import Detections, Frame, Lidar, Log, Measurements, Stream, Sweep, Waypoints
@@ -203,7 +204,7 @@ def test_a_lidar_out_of_reach_is_not_read(tiny: Log, monkeypatch: pytest.MonkeyP
     assert not step["kept"]
     assert "post" in step["reason"]
     assert not reads
-    monkeypatch.setattr(log2sim.plan, "MAX_LIDAR_RANGE_M", 1e9)
+    monkeypatch.setattr(log2sim.sensors, "MAX_LIDAR_RANGE_M", 1e9)
     full = run(log)
     assert entry(full, "use of every LiDAR")["kept"]
     assert sum(reads.values()) > 5
