@@ -209,7 +209,7 @@ def test_without_lidar_the_cameras_alone_find_who_is_there(tiny: tuple[Log, Scen
 
 def test_without_camera_there_are_no_ticks_and_it_says_so(tiny: tuple[Log, Scenario]) -> None:
     log, _ = tiny
-    with pytest.raises(LogError, match="no camera, which detector .* needs"):
+    with pytest.raises(LogError, match=r"no camera, which detector .* needs"):
         run(replace(log, cameras={}, streams={"top": log.streams["top"]}, image_labels={}, reference_camera=None))
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.agents.box_votes import mean_box_axis, mean_box_center, typical_box_size
 from log2sim.datatypes import CATEGORY, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M, Track
 from log2sim.geometry import Array
 from log2sim.perception import box_completion, box_fitting
@@ -28,6 +29,9 @@ MIN_PERSISTENT_SHARE = 0.15
 MAX_POINTS_PER_TICK = 150
 # Fewer persistent points do not show a shape.
 MIN_STATIC_POINTS = 5
+# Standard deviations of a side observed from end to end (stray points lengthen it, gaps between rays shorten it), and of the
+# sizes that a 3D detector estimates, as a share.
+WHOLE_SIDE_SIGMA_M, BOX_SIZE_SIGMA_SHARE = 0.15, 0.07
 # A side shorter than this share of the typical one was not observed from end to end.
 MIN_WHOLE_SIDE_FACTOR = 0.75
 
@@ -65,19 +69,19 @@ def static_geometry(track: Track) -> TrackGeometry:
     cloud = _persistent_points([c - origin for c in m.cluster])
     if len(cloud) < MIN_STATIC_POINTS:
         return _geometry_without_points(track)
-    typical = np.array(TYPICAL_SIZE_M[track.category])
     sensor = m.sensor_m[:, :2] - origin[:2]
-    yaw, _ = box_fitting.fit_yaw(cloud[:, :2])
-    low, high = box_fitting.extents(cloud[:, :2], yaw, max_trim_m=MAX_TRIM_M)
-    if box_fitting.axes_swapped(high - low, box_fitting.rotate(sensor, -yaw), typical):
-        yaw += np.pi / 2
-        low, high = box_fitting.extents(cloud[:, :2], yaw, max_trim_m=MAX_TRIM_M)
+    yaw, low, high = _static_extents(track, cloud[:, :2], sensor)
     with_points = np.array([len(c) > 0 for c in m.cluster])
     views = box_fitting.rotate(sensor[with_points], -yaw)
     # An end that is real from one viewpoint is real.
     real = box_completion.real_ends(low, high, views, m.ends_visible[with_points]).max(axis=0)
-    size, is_likely = _estimate_size(low[None], high[None], real[None], track.category)
+    known = typical_box_size(m)
+    size, is_likely = _estimate_size(low[None], high[None], real[None], track.category, known)
     center, sigma = box_completion.complete_box(low, high, size, real)
+    box_xy, box_sigma_m = mean_box_center(m)
+    center, sigma = box_completion.weighted_center(
+        center, sigma, box_fitting.rotate(box_xy - origin[:2], -yaw), _with_size_error(box_sigma_m, known, size)
+    )
     height, z = _height(track)
     n = len(m)
     return TrackGeometry(
@@ -88,6 +92,27 @@ def static_geometry(track: Track) -> TrackGeometry:
         float(yaw),
         is_likely and _is_likely_height(size, height, track.category),
     )
+
+
+def _static_extents(track: Track, xy: Array, sensor: Array) -> tuple[float, Array, Array]:
+    """Fit yaw and ends (2,), (2,) of the points (n, 2) of a static track, seen from sensors (K, 2)."""
+    axis = mean_box_axis(track.measurements)
+    yaw = box_fitting.fit_yaw(xy)[0] if axis is None else box_fitting.corrected_yaw(xy, axis)
+    low, high = box_fitting.extents(xy, yaw, max_trim_m=MAX_TRIM_M)
+    typical = np.array(TYPICAL_SIZE_M[track.category])
+    if axis is None and box_fitting.axes_swapped(high - low, box_fitting.rotate(sensor, -yaw), typical):
+        yaw += np.pi / 2
+        low, high = box_fitting.extents(xy, yaw, max_trim_m=MAX_TRIM_M)
+    return yaw, low, high
+
+
+def _with_size_error(sigma_m: Array | float, box_size_m: Array | None, size_m: Array) -> Array:
+    """Widen standard deviations of box centers by half the error of the box sizes (..., 3), given the true size (2,).
+
+    A box of the wrong size has one end in its place at best.
+    """
+    error = np.zeros(2) if box_size_m is None else (box_size_m[..., :2] - size_m) / 2
+    return np.hypot(sigma_m, error)
 
 
 def moving_geometry(track: Track, yaw_rad: Array) -> TrackGeometry:
@@ -101,8 +126,14 @@ def moving_geometry(track: Track, yaw_rad: Array) -> TrackGeometry:
     ends = [box_fitting.extents(xy_of[k], float(yaw_rad[k]), max_trim_m=MAX_TRIM_M) for k in rows]
     low, high = (np.array(e) for e in zip(*ends))
     real = box_completion.real_ends(low, high, np.zeros_like(low), m.ends_visible[rows])
-    size, is_likely = _estimate_size(low, high, real, track.category)
+    size, is_likely = _estimate_size(low, high, real, track.category, typical_box_size(m))
     center, sigma = box_completion.complete_box(low, high, size, real)
+    center, sigma = box_completion.weighted_center(
+        center,
+        sigma,
+        box_fitting.rotate(m.box_center_m[rows, :2] - sensor, -yaw),
+        _with_size_error(box_completion.box_sigma(m.points[rows])[:, None], m.box_size_m[rows], size),
+    )
     xy, covariance = m.center_m[:, :2].copy(), m.covariance.copy()
     xy[rows] = box_fitting.rotate(center, yaw) + sensor
     covariance[rows] = box_completion.oriented_covariance(sigma, yaw)
@@ -131,9 +162,16 @@ def _persistent_points(clusters: list[NDArray[np.float64]]) -> Array:
     return points[count[key.ravel()] >= max(MIN_PERSISTENT_SHARE * len(clusters), min(2, len(clusters)))]
 
 
-def _estimate_size(low: Array, high: Array, real: NDArray[np.int64], category: str) -> tuple[Array, bool]:
-    """Estimate length and width (2,) from ends (n, 2), (n, 2) of which some are real (n, 2, 2), and whether they are likely."""
+def _estimate_size(
+    low: Array, high: Array, real: NDArray[np.int64], category: str, known: Array | None
+) -> tuple[Array, bool]:
+    """Estimate length and width (2,) from ends (n, 2), (n, 2) of which some are real (n, 2, 2), and whether they are likely.
+
+    A side of which never both ends were observed is `known` (3,) from a 3D detector, or typical of the category. What
+    was observed and what is known are averaged by their variances.
+    """
     typical, smallest, largest = (np.array(t[category][:2]) for t in (TYPICAL_SIZE_M, MIN_SIZE_M, MAX_SIZE_M))
+    typical = typical if known is None else known[:2]
     low, high = box_completion.corner_correction(low, high, real, typical[1])
     seen = high - low
     whole: NDArray[np.bool_] = np.all(real, axis=2)
@@ -146,6 +184,10 @@ def _estimate_size(low: Array, high: Array, real: NDArray[np.int64], category: s
         size[axis] = (
             np.quantile(ends, SIZE_QUANTILE) if len(ends) else max(typical[axis], np.quantile(every, SIZE_QUANTILE))
         )
+        if known is not None:
+            known_variance = (BOX_SIZE_SIGMA_SHARE * known[axis]) ** 2
+            share = WHOLE_SIDE_SIGMA_M**2 / (WHOLE_SIDE_SIGMA_M**2 + known_variance)
+            size[axis] += share * (known[axis] - size[axis])
     likely = bool(((raw >= smallest) & (raw <= largest)).all())
     return np.clip(size, smallest, largest), likely
 
@@ -155,7 +197,8 @@ def _height(track: Track) -> tuple[float, Array]:
     m = track.measurements
     by_lidar_m = (m.top_m - m.bottom_m)[[len(c) >= MIN_CLUSTER_POINTS for c in m.cluster]]
     by_image_m = np.where(m.truncated, np.nan, m.height_px_m)
-    typical = TYPICAL_SIZE_M[track.category][2]
+    known = typical_box_size(m)
+    typical = TYPICAL_SIZE_M[track.category][2] if known is None else float(known[2])
     by_lidar = float(np.quantile(by_lidar_m, SIZE_QUANTILE)) if len(by_lidar_m) else typical
     by_image = float(np.nanmedian(by_image_m)) if np.isfinite(by_image_m).any() else typical
     height = max(by_lidar, min(by_image, 1.15 * by_lidar))
@@ -164,8 +207,11 @@ def _height(track: Track) -> tuple[float, Array]:
 
 
 def _geometry_without_points(track: Track) -> TrackGeometry:
-    """Take the typical size and the provisional positions."""
+    """Take the size of a 3D detector or the typical one, and the provisional positions."""
     m, typical = track.measurements, np.array(TYPICAL_SIZE_M[track.category])
+    known, yaw = typical_box_size(m), mean_box_axis(m)
+    typical = typical if known is None else known
     height, z = _height(track)
-    yaw = float(np.nanmedian(m.yaw_rad)) if np.isfinite(m.yaw_rad).any() else None
+    if yaw is None and np.isfinite(m.yaw_rad).any():
+        yaw = float(np.nanmedian(m.yaw_rad))
     return TrackGeometry(np.append(typical[:2], height), m.center_m[:, :2], m.covariance, z, yaw)

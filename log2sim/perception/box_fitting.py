@@ -23,7 +23,7 @@ MAX_WIDTH_FACTOR = 1.2
 TOP_QUANTILE = 0.98
 
 
-def fit_extents(points: Array, typical: Array) -> tuple[float, Array, Array]:
+def fit_extents(points: Array, typical: Array, known_yaw_rad: float | None = None) -> tuple[float, Array, Array]:
     """Fit the length axis and the extents of points seen from the origin.
 
     Parameters
@@ -32,14 +32,19 @@ def fit_extents(points: Array, typical: Array) -> tuple[float, Array, Array]:
         Relative to the viewpoint.
     typical : (3,) float64, m
         Size of the category, to tell the length from the width.
+    known_yaw_rad : float, optional
+        Rough yaw from elsewhere, which tells it instead.
 
     Returns
     -------
     yaw_rad : float
-        Up to half turns at best.
+        Up to half turns at best without a known one.
     low, high : (2,) float64, m
         Ends along the length and the width axis, relative to the viewpoint.
     """
+    if known_yaw_rad is not None:
+        yaw_rad = corrected_yaw(points, known_yaw_rad)
+        return yaw_rad, *extents(points, yaw_rad)
     yaw_rad, _ = fit_yaw(points)
     low, high = extents(points, yaw_rad)
     if axes_swapped(high - low, -(low + high) / 2, typical):
@@ -48,17 +53,14 @@ def fit_extents(points: Array, typical: Array) -> tuple[float, Array, Array]:
     return float(yaw_rad), low, high
 
 
-def fit_extents_near(points: Array, yaw_rad: float) -> tuple[float, Array, Array]:
-    """Fit the extents of points (n, 2), relative to the viewpoint, where the yaw is known roughly; see `fit_extents`.
-
-    The direction of the sides corrects the yaw where the points show it.
-    """
-    if len(points) >= MIN_YAW_POINTS:
-        fitted, contrast = fit_yaw(points)
-        fitted = align_to(fitted, yaw_rad, np.pi / 2)
-        if contrast >= MIN_CONTRAST and abs(float(wrap_angle(fitted - yaw_rad))) <= MAX_YAW_CORRECTION_RAD:
-            yaw_rad = fitted
-    return yaw_rad, *extents(points, yaw_rad)
+def corrected_yaw(points: Array, yaw_rad: float) -> float:
+    """Correct a yaw that is known roughly by the direction of the sides of points (n, 2), where they show it."""
+    if len(points) < MIN_YAW_POINTS:
+        return yaw_rad
+    fitted, contrast = fit_yaw(points)
+    fitted = align_to(fitted, yaw_rad, np.pi / 2)
+    known = contrast >= MIN_CONTRAST and abs(float(wrap_angle(fitted - yaw_rad))) <= MAX_YAW_CORRECTION_RAD
+    return fitted if known else yaw_rad
 
 
 def fit_yaw(xy_m: Array) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Measurements
 from log2sim.perception.box_completion import place_boxes, provisional_sizes
-from log2sim.perception.box_fitting import fit_extents, fit_extents_near, rotate, top_of
+from log2sim.perception.box_fitting import fit_extents, rotate, top_of
 
 # Clusters are one object when this share of the points of either is inside the extents of the other.
 MIN_SHARED_POINTS = 0.4
@@ -120,7 +120,7 @@ def _join(rows: Measurements, leader: int, members: NDArray[np.intp]) -> Measure
     cluster = np.concatenate([rows.cluster[m] for m in merged])
     xyz, box_yaw = cluster - row.sensor_m[0], float(row.box_yaw_rad[0])
     typical = np.array(TYPICAL_SIZE_M[str(row.category[0])])
-    yaw, low, high = fit_extents_near(xyz[:, :2], box_yaw) if np.isfinite(box_yaw) else fit_extents(xyz[:, :2], typical)
+    yaw, low, high = fit_extents(xyz[:, :2], typical, None if np.isnan(box_yaw) else box_yaw)
     return place_boxes(replace(
         row, cluster=(cluster,), yaw_rad=np.array([yaw]), low_m=low[None], high_m=high[None],
         top_m=np.array([top_of(cluster[:, 2])]),

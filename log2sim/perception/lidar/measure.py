@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import TYPICAL_SIZE_M, Detections, Measurements
 from log2sim.geometry import NS_PER_S, Array, Camera
 from log2sim.perception.box_completion import place_boxes
-from log2sim.perception.box_fitting import fit_extents, fit_extents_near, subsample, top_of, upper_median
+from log2sim.perception.box_fitting import fit_extents, subsample, top_of, upper_median
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.clusters import (
     MARGIN,
@@ -84,7 +84,7 @@ def write_evidence(columns: dict[str, Any], k: int, members: NDArray[np.intp], c
     xyz = cloud.xyz[members].astype(np.float64)
     xy, box_yaw = xyz[:, :2] - cloud.sensor[:2], float(columns["box_yaw_rad"][k])
     typical = np.array(TYPICAL_SIZE_M[str(columns["category"][k])])
-    yaw, low, high = fit_extents_near(xy, box_yaw) if np.isfinite(box_yaw) else fit_extents(xy, typical)
+    yaw, low, high = fit_extents(xy, typical, None if np.isnan(box_yaw) else box_yaw)
     columns["yaw_rad"][k], columns["low_m"][k], columns["high_m"][k] = yaw, low, high
     columns["ends_visible"][k] = cloud.azimuth_index.ends_visible(members)
     columns["bottom_m"][k] = upper_median(xyz[:, 2] - cloud.height[members]) + cloud.origin[2]

@@ -1,0 +1,73 @@
+"""What the boxes of a 3D detector say about a whole track: size, axis, center, and which end is the front."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from log2sim.datatypes import BoxEvidence
+from log2sim.geometry import Array
+from log2sim.perception.box_completion import box_sigma
+
+# Errors of one detector about one object are alike at neighboring ticks: correlation between any two of them.
+TICK_CORRELATION = 0.5
+# A probability nearer to 1 is not believed: networks are surer than right.
+MAX_HEADING_SCORE = 0.99
+# A box turned farther than this from the axis of the object says nothing about its front.
+MIN_AXIS_COS = 0.7
+
+
+def independent(count: int) -> float:
+    """Return how many independent ticks are worth as much as `count` correlated ones, at most 1 / `TICK_CORRELATION`."""
+    return count / (1 + (count - 1) * TICK_CORRELATION) if count else 0.0
+
+
+def typical_box_size(m: BoxEvidence) -> Array | None:
+    """Return the size (3,) of the boxes of a track, the median weighted by their points; None without boxes."""
+    rows = np.flatnonzero(np.isfinite(m.box_yaw_rad))
+    if len(rows) == 0:
+        return None
+    weight = box_sigma(m.points[rows]) ** -2
+    return np.array([weighted_median(m.box_size_m[rows, axis], weight) for axis in range(3)])
+
+
+def mean_box_center(m: BoxEvidence) -> tuple[Array, float]:
+    """Return the robust mean (2,) of the box centers of a track that stands, and its standard deviation; NaN without boxes."""
+    rows = np.flatnonzero(np.isfinite(m.box_yaw_rad))
+    if len(rows) == 0:
+        return np.full(2, np.nan), np.nan
+    sigma = box_sigma(m.points[rows])
+    center = np.array([weighted_median(m.box_center_m[rows, axis], sigma**-2) for axis in range(2)])
+    return center, float(np.median(sigma)) / np.sqrt(independent(len(rows)))
+
+
+def mean_box_axis(m: BoxEvidence) -> float | None:
+    """Return the mean yaw of the boxes of a track, in rad up to half turns; None without boxes."""
+    rows = np.flatnonzero(np.isfinite(m.box_yaw_rad))
+    if len(rows) == 0:
+        return None
+    weight, doubled = box_sigma(m.points[rows]) ** -2, 2 * m.box_yaw_rad[rows]
+    return float(np.arctan2(weight @ np.sin(doubled), weight @ np.cos(doubled))) / 2
+
+
+def heading_log_odds(m: BoxEvidence, yaw_rad: float) -> float:
+    """Return the log-odds that the object of a track points along a yaw rather than backward; 0 without boxes.
+
+    Notes
+    -----
+    The sum of the log-odds of all ticks, scaled down to that of as many independent ones (`independent`).
+    """
+    rows = np.flatnonzero(np.isfinite(m.box_yaw_rad))
+    along = np.cos(m.box_yaw_rad[rows] - yaw_rad)
+    rows, along = rows[np.abs(along) >= MIN_AXIS_COS], along[np.abs(along) >= MIN_AXIS_COS]
+    if len(rows) == 0:
+        return 0.0
+    p = np.clip(m.heading_score[rows], 0.5, MAX_HEADING_SCORE)
+    votes = np.sign(along) * np.log(p / (1 - p))
+    return float(votes.mean()) * independent(len(rows))
+
+
+def weighted_median(values: Array, weight: Array) -> float:
+    """Return the smallest of the values (N,), N > 0, that half of the weight (N,) does not exceed."""
+    order = np.argsort(values, kind="stable")
+    reached = np.cumsum(weight[order])
+    return float(values[order[np.searchsorted(reached, reached[-1] / 2)]])
