@@ -16,6 +16,7 @@ from log2sim.perception.detect.detectors import Detector
 from log2sim.perception.detect3d.detectors import LidarDetector
 from log2sim.perception.frames import FrameDetector, RecordReader
 from log2sim.perception.homography.correspondences import Correspondences, foot_points, undistorted_pixels
+from log2sim.perception.late_fusion import join_with_images, match_boxes
 from log2sim.perception.lidar.cloud import Cloud, cloud_origin
 from log2sim.perception.lidar.measure import measure_view, project_cloud
 from log2sim.perception.lidar.measure_boxes import measure_boxes
@@ -129,27 +130,34 @@ class _FirstPass:
         self, tick: int, found: dict[str, Detections], clouds: Sequence[Cloud | None], boxes: Boxes3D | None
     ) -> None:
         """Measure the detections of a tick, each camera's in its cloud and boxes in that of the reference."""
-        parts: list[Measurements] = []
-        for camera, cloud in zip(self.schedule.frames, clouds):
-            if camera in found:
-                parts.append(self._measure_camera(camera, tick, found[camera], cloud))
+        views = {name: view for name in found if (view := self._view(name, tick)) is not None}
+        measured = {
+            camera: self._measure_camera(views[camera], tick, found[camera], cloud)
+            for camera, cloud in zip(self.schedule.frames, clouds)
+            if camera in views
+        }
+        for camera in found:
+            self.out.detections[camera] = self.out.detections.get(camera, 0) + len(found[camera])
         reference = clouds[self.schedule.reference_row]
-        if boxes is not None and reference is not None:
-            parts.append(measure_boxes(boxes, reference))
-        joined = Measurements.join(parts)
+        if boxes is None or reference is None:
+            joined = Measurements.join(list(measured.values()))
+        else:
+            in_sweep = measure_boxes(boxes, reference)
+            frames = [match_boxes(in_sweep, rows, views[camera]) for camera, rows in measured.items()]
+            joined = join_with_images(in_sweep, frames)
         self.out.measurements.append(joined.take(self._in_range(tick, joined)))
 
-    def _measure_camera(self, camera: str, tick: int, detections: Detections, cloud: Cloud | None) -> Measurements:
+    def _view(self, camera: str, tick: int) -> View | None:
+        """Return a camera's frame of a tick; None where its pose is not known."""
         t_ns = int(self.log.streams[camera].t_ns[self.schedule.frames[camera][tick]])
         map_T_cam, known = self.log.map_T_sensor(camera, t_ns)
-        self.out.detections[camera] = self.out.detections.get(camera, 0) + len(detections)
-        if not known[0]:
-            return Measurements.empty()
-        view = View(self.log.cameras[camera], t_ns, map_T_cam[0])
+        return View(self.log.cameras[camera], t_ns, map_T_cam[0]) if known[0] else None
+
+    def _measure_camera(self, view: View, tick: int, detections: Detections, cloud: Cloud | None) -> Measurements:
         measured = measure_view(view, detections, cloud, mode=self.mode)
         if not self.plan.keeps(Stage.HOMOGRAPHY):
             return measured
-        ego_T_map = inverse(base_pose(self.log, t_ns))
+        ego_T_map, camera = inverse(base_pose(self.log, view.t_ns)), view.camera.name
         self.out.feet[camera].append(foot_points(view.camera, measured, ego_T_map, tick))
         if cloud is not None:
             self.out.ground[camera].append(_ground_points(view, cloud, ego_T_map, tick))
