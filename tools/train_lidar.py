@@ -8,6 +8,7 @@ python tools/train_lidar.py vehicle --out DIR --scenes 200 --steps 300     # a t
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import sys
 import time
@@ -18,10 +19,17 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+from lidar_training.clouds import draw_example
+from lidar_training.export import calibrate, describe, description, export_onnx, quantize
 from lidar_training.losses import loss_of
 from lidar_training.network import BevNetwork
+from lidar_training.report import report
 from lidar_training.samples import Sample, Shard, augmented, draw_sample, grid_of, window_of, write_shard
 from lidar_training.targets import targets_of
+
+from log2sim.config import LidarConfig
+from log2sim.perception.detect3d.network import load_network
+from log2sim.perception.detect3d.network_detector import open_network
 
 PER_SHARD = 100
 FIRST_SHARDS, STEPS_PER_SHARD = 4, 100
@@ -33,6 +41,11 @@ CELL_M = {"vehicle": 0.25, "roadside": 0.1875}
 SCENES = {"vehicle": 5_000, "roadside": 4_000}
 STEPS = {"vehicle": 8_000, "roadside": 5_000}
 CHECKPOINT_S = 60.0
+# Largest |x| and |y| from the sensor at run time; the roadside sensor sees cars to some 25 m.
+RANGE_M = {"vehicle": 40.0, "roadside": 30.0}
+QUANTIZATION_CLOUDS = 24
+# Integer weights ship where they cost less F1 than this.
+MAX_QUANTIZATION_LOSS = 0.004
 
 
 def generate(mount: str, out: Path, scenes: int, seed: int) -> None:
@@ -139,6 +152,45 @@ def _average(mean: dict[str, torch.Tensor], network: BevNetwork, keep: float) ->
                 mean[name] = value.clone()
 
 
+def finish(mount: str, out: Path, *, seed: int, scenes: int, steps: int, examples: int) -> None:
+    """Export, calibrate, quantize and report; the files that ship are in `out` afterwards."""
+    calibration = [draw_example(mount, (seed, 1_000_000, k)) for k in range(examples)]
+    test = [draw_example(mount, (seed, 2_000_000, k)) for k in range(examples)]
+    info, exact = description(mount, CELL_M[mount], RANGE_M[mount]), out / f"{mount}-float32.onnx"
+    export_onnx(out / "checkpoint.pt", exact, info)
+    info["calibration"] = calibrate(exact, calibration)
+    describe(exact, info)
+    small = out / f"{mount}-int8.onnx"
+    quantize(exact, small, calibration[:QUANTIZATION_CLOUDS])
+    card = {"mount": mount, "seed": seed, "scenes": scenes, "steps": steps, "batch": BATCH, "torch": torch.__version__}
+    reports = {}
+    for path in (exact, small):
+        # Eight bits shift the scores a little, so each file has its own calibration.
+        info["calibration"] = calibrate(path, calibration) if path is small else info["calibration"]
+        describe(path, info)
+        detector = open_network(path, LidarConfig(), name=mount)
+        reports[path.name] = report(detector, test, range_m=RANGE_M[mount])
+        line = {
+            k: {m: round(v[m], 4) for m in ("precision", "recall", "f1")}
+            for k, v in reports[path.name].items()
+            if isinstance(v, dict)
+        }
+        print(path.name, f"{path.stat().st_size / 1e6:.2f} MB", json.dumps(line), flush=True)
+    loss = reports[exact.name]["all"]["f1"] - reports[small.name]["all"]["f1"]
+    chosen = small if loss < MAX_QUANTIZATION_LOSS else exact
+    card |= {
+        "file": "int8" if chosen is small else "float32",
+        "loss_of_f1_by_int8": round(loss, 4),
+        "simulated": reports[chosen.name],
+    }
+    info = json.loads(load_network(chosen).info.model_dump_json()) | {
+        "card": {k: card[k] for k in ("seed", "scenes", "steps", "file")}
+    }
+    (out / f"{mount}.onnx").write_bytes(chosen.read_bytes())
+    describe(out / f"{mount}.onnx", info)
+    (out / f"{mount}.json").write_text(json.dumps(card, indent=1) + "\n")
+
+
 def main() -> None:
     """Run the steps that are asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -147,14 +199,17 @@ def main() -> None:
     parser.add_argument("--scenes", type=int)
     parser.add_argument("--steps", type=int)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", choices=("generate", "fit"))
+    parser.add_argument("--only", choices=("generate", "fit", "finish"))
+    parser.add_argument("--examples", type=int, default=150, help="scenes to calibrate with, and as many to test with")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
+    scenes, steps = options.scenes or SCENES[options.mount], options.steps or STEPS[options.mount]
     if options.only in (None, "generate"):
-        generate(options.mount, options.out / "data", options.scenes or SCENES[options.mount], options.seed)
+        generate(options.mount, options.out / "data", scenes, options.seed)
     if options.only in (None, "fit"):
-        scenes, steps = options.scenes or SCENES[options.mount], options.steps or STEPS[options.mount]
         fit(options.mount, options.out / "data", options.out, scenes=scenes, steps=steps, seed=options.seed)
+    if options.only in (None, "finish"):
+        finish(options.mount, options.out, seed=options.seed, scenes=scenes, steps=steps, examples=options.examples)
 
 
 if __name__ == "__main__":

@@ -9,8 +9,8 @@ from torch import Tensor
 from lidar_training.network import AXIS, BOX, CATEGORY, DIRECTION, HEAT, QUALITY, SEGMENT, VOTE
 from lidar_training.targets import Targets
 
-# Positions decide an overlap more than heights do.
-BOX_WEIGHTS = (1.0, 1.0, 0.5, 0.8, 0.8, 0.5)
+# Meters of x, y, z and logarithms of length, width, height.
+BOX_WEIGHTS = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
 VEHICLE_CATEGORIES, TWO_WHEELER_CATEGORIES = 3, 2
 
 

@@ -1,0 +1,177 @@
+"""From a checkpoint to the file that ships: ONNX with its description, calibrated scores, integer weights where they cost nothing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from lidar_training.clouds import GROUP_OF, Example
+from lidar_training.network import IN_CHANNELS, BevNetwork
+from log2sim.config import LidarConfig
+from log2sim.evaluation.detection.boxes import SceneBoxes
+from log2sim.evaluation.detection.matching import Criterion, match
+from log2sim.perception.detect3d.box_points import points_of_boxes
+from log2sim.perception.detect3d.centers import decode_centers
+from log2sim.perception.detect3d.grid import grid_window, rasterize
+from log2sim.perception.detect3d.level_points import level_points, sensor_xy
+from log2sim.perception.detect3d.network import METADATA_KEY, load_network
+from log2sim.perception.detect3d.network_detector import NetworkDetector, open_network
+from log2sim.perception.detect3d.suppression import suppress
+from log2sim.perception.lidar.ground import ON_GROUND_M
+
+GROUPS = ("vehicle", "two_wheeler", "pedestrian")
+CATEGORIES = {
+    "vehicle": ["car", "truck", "bus"],
+    "two_wheeler": ["motorcycle", "cyclist"],
+    "pedestrian": ["pedestrian"],
+}
+# What a score is the probability of. Outlines of people are too small for an overlap to say much.
+RIGHT = {
+    "vehicle": Criterion("iou_bev", 0.5),
+    "two_wheeler": Criterion("center_m", 1.0),
+    "pedestrian": Criterion("center_m", 1.0),
+}
+MIN_SCORE = 0.1
+MAX_EXPORT_ERROR = 1e-4
+RIDGE = 1e-3
+RAW_CALIBRATION = [0.0, 1.0, 0.0, 0.0, 0.0]
+
+
+def export_onnx(checkpoint: Path, path: Path, info: dict[str, Any]) -> None:
+    """Write the averaged weights of a checkpoint as ONNX and check that both compute the same.
+
+    Raises
+    ------
+    RuntimeError
+        When they differ by more than `MAX_EXPORT_ERROR`.
+    """
+    network = BevNetwork()
+    network.load_state_dict(torch.load(checkpoint, weights_only=True)["mean"])
+    network.eval()
+    axes = {0: "batch", 2: "x", 3: "y"}
+    torch.onnx.export(
+        network, (torch.zeros(1, IN_CHANNELS, 128, 96),), str(path), input_names=["grid"], output_names=["maps"],
+        opset_version=17, dynamo=False, dynamic_axes={"grid": axes, "maps": axes},
+    )  # fmt: skip
+    describe(path, info)
+    grid = np.random.default_rng(0).random((IN_CHANNELS, 192, 256), dtype=np.float32)
+    with torch.no_grad():
+        expected = network(torch.from_numpy(grid[None]))[0].numpy()
+    error = float(np.abs(load_network(path).run(grid) - expected).max())
+    if not error < MAX_EXPORT_ERROR:
+        raise RuntimeError(f"{path}: ONNX and torch differ by {error:.2g}, more than {MAX_EXPORT_ERROR:g}")
+
+
+def describe(path: Path, info: dict[str, Any]) -> None:
+    """Write the description of a network into its file."""
+    import onnx
+
+    model = onnx.load(path)
+    del model.metadata_props[:]
+    entry = model.metadata_props.add()
+    entry.key, entry.value = METADATA_KEY, json.dumps(info)
+    onnx.save(model, path)
+
+
+def description(mount: str, cell_m: float, range_m: float) -> dict[str, Any]:
+    """Make the description of a network whose scores are not calibrated yet."""
+    return {
+        "version": 1,
+        "name": mount,
+        "cell_m": cell_m,
+        "stride": 2,
+        "range_m": range_m,
+        "groups": list(GROUPS),
+        "categories": CATEGORIES,
+        "calibration": dict.fromkeys(GROUPS, RAW_CALIBRATION),
+        "min_score": dict.fromkeys(GROUPS, MIN_SCORE),
+        "card": {},
+    }
+
+
+def calibrate(path: Path, examples: list[Example]) -> dict[str, list[float]]:
+    """Fit the weights of the scores to what is right in scenes that were not trained on."""
+    detector = open_network(path, LidarConfig(), name="raw")
+    features: dict[str, list[np.ndarray]] = {g: [] for g in GROUPS}
+    right: dict[str, list[np.ndarray]] = {g: [] for g in GROUPS}
+    for example in examples:
+        found, columns = _raw_boxes(detector, example)
+        for group in GROUPS:
+            own = found.category == group
+            truth = group_of(example.truth, group)
+            matches = match(found.take(own), truth, RIGHT[group])
+            counted = matches.right | matches.false
+            features[group].append(columns[own][counted])
+            right[group].append(matches.right[counted])
+    return {g: logistic(np.concatenate(features[g]), np.concatenate(right[g])).tolist() for g in GROUPS}
+
+
+def group_of(boxes: SceneBoxes, group: str) -> SceneBoxes:
+    """Take the boxes of one group of categories."""
+    return boxes.take(np.array([GROUP_OF.get(str(c)) == group for c in boxes.category], bool))
+
+
+def _raw_boxes(detector: NetworkDetector, example: Example) -> tuple[SceneBoxes, np.ndarray]:
+    """Return boxes with their groups as categories, not scored, and the features (M, 5) of their scores."""
+    info, cloud = detector.network.info, example.cloud
+    xyz, _ = level_points(cloud, detector.range_m)
+    low, shape = grid_window(xyz, cell_m=info.cell_m, range_m=detector.range_m, center=sensor_xy(cloud))
+    maps = detector.network.run(rasterize(xyz, cell_m=info.cell_m, low=low, shape=shape))
+    found = decode_centers(maps, info, low)
+    found = found.take(suppress(found.rectangles, found.heat, found.group, across=False))
+    above = xyz[xyz[:, 2] > ON_GROUND_M]
+    points = points_of_boxes(above, found.center_m, found.size_m, found.yaw_rad).count
+    range_m = np.hypot(*(found.center_m[:, :2] - sensor_xy(cloud)).T)
+    columns = np.column_stack([np.ones(len(found)), found.heat, found.quality, np.log1p(points), range_m / 10])
+    some = np.flatnonzero(points > 0)
+    boxes = np.column_stack([found.center_m, found.size_m, found.yaw_rad])
+    names = np.array(info.groups)[found.group]
+    score = 1 / (1 + np.exp(-found.heat))
+    return SceneBoxes.of(boxes, names, score, points=points, range_m=range_m).take(some), columns[some]
+
+
+def logistic(features: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Fit a logistic regression by Newton's method, with a ridge that keeps rare groups finite."""
+    weights = np.array(RAW_CALIBRATION)
+    prior = weights.copy()
+    for _ in range(30):
+        p = 1 / (1 + np.exp(-np.clip(features @ weights, -30, 30)))
+        gradient = features.T @ (p - right) / len(right) + RIDGE * (weights - prior)
+        hessian = (features * (p * (1 - p))[:, None]).T @ features / len(right) + RIDGE * np.eye(len(weights))
+        step = np.linalg.solve(hessian, gradient)
+        weights = weights - step
+        if np.abs(step).max() < 1e-8:
+            break
+    return np.round(weights, 5)
+
+
+def quantize(path: Path, out: Path, examples: list[Example]) -> None:
+    """Write the network with 8-bit weights and activations, calibrated on clouds."""
+    from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
+
+    network = load_network(path)
+    info = network.info
+
+    class Grids(CalibrationDataReader):
+        """Grids of the examples, one by one."""
+
+        def __init__(self) -> None:
+            self._left = iter(examples)
+
+        def get_next(self) -> dict[str, np.ndarray] | None:
+            example = next(self._left, None)
+            if example is None:
+                return None
+            xyz, _ = level_points(example.cloud, info.range_m)
+            low, shape = grid_window(xyz, cell_m=info.cell_m, range_m=info.range_m, center=sensor_xy(example.cloud))
+            return {"grid": rasterize(xyz, cell_m=info.cell_m, low=low, shape=shape)[None]}
+
+    quantize_static(
+        str(path), str(out), Grids(), quant_format=QuantFormat.QDQ, per_channel=True,
+        activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8, nodes_to_exclude=["/head/Conv"],
+    )  # fmt: skip
+    describe(out, json.loads(info.model_dump_json()))

@@ -1,0 +1,76 @@
+"""How good a detector is on simulated scenes: by group, range and points, and whether its scores are probabilities."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lidar_training.clouds import Example
+from lidar_training.export import GROUPS, RIGHT, group_of
+from log2sim.datatypes import Boxes3D
+from log2sim.evaluation.detection.boxes import SceneBoxes
+from log2sim.evaluation.detection.matching import match
+from log2sim.evaluation.detection.precision import operating_point, precision_recall
+from log2sim.perception.detect3d.detectors import LidarDetector
+
+SCORE = 0.5
+RANGES_M = ((0, 15), (15, 30), (30, 50))
+POINTS = ((5, 10), (10, 20), (20, 50), (50, 10**9))
+BINS = 10
+
+
+def found_boxes(boxes: Boxes3D) -> SceneBoxes:
+    """Return detections as a table of one scene."""
+    rows = np.column_stack([boxes.center_m, boxes.size_m, boxes.yaw_rad])
+    return SceneBoxes.of(rows, boxes.category, boxes.score, points=boxes.points)
+
+
+def report(detector: LidarDetector, examples: list[Example], *, range_m: float) -> dict[str, Any]:
+    """Evaluate a detector on examples."""
+    found = [found_boxes(detector.detect(e.cloud)) for e in examples]
+    out: dict[str, Any] = {"scenes": len(examples), "score": SCORE, "max_range_m": range_m}
+    totals = np.zeros(3)
+    for group in GROUPS:
+        f = SceneBoxes.join([group_of(boxes, group) for boxes in found])
+        t = SceneBoxes.join([group_of(e.truth, group) for e in examples])
+        f, t = f.take(f.range_m < range_m), t.ignoring(t.range_m >= range_m)
+        matches = match(f, t, RIGHT[group])
+        point = operating_point(f, matches, SCORE)
+        totals += [point["true_positives"], point["false_positives"], point["false_negatives"]]
+        right = np.flatnonzero(matches.right & (f.score >= SCORE))
+        off = np.abs((f.box[right, 6] - t.box[matches.truth[right], 6] + np.pi) % (2 * np.pi) - np.pi)
+        hit = np.zeros(len(t), bool)
+        hit[matches.truth[right]] = True
+        counted = ~t.ignored
+        out[group] = {
+            "match": str(RIGHT[group]),
+            "truths": matches.truths,
+            "average_precision": precision_recall(f, matches).average(40),
+            **{k: point[k] for k in ("precision", "recall", "f1")},
+            "headings_flipped": float((off > np.pi / 2).mean()) if len(off) else None,
+            "recall_by_range_m": {
+                f"{a}-{b}": _share(hit[counted & (t.range_m >= a) & (t.range_m < b)]) for a, b in RANGES_M
+            },
+            "recall_by_points": {f"{a}+": _share(hit[counted & (t.points >= a) & (t.points < b)]) for a, b in POINTS},
+            "calibration": _reliability(f.score, matches.right, matches.right | matches.false),
+        }
+    tp, fp, fn = totals
+    out["all"] = {"precision": tp / (tp + fp), "recall": tp / (tp + fn), "f1": 2 * tp / (2 * tp + fp + fn)}
+    return out
+
+
+def _share(hit: np.ndarray) -> list[float | int]:
+    """Return the share of true values and how many there are."""
+    return [round(float(hit.mean()), 4) if len(hit) else 0.0, len(hit)]
+
+
+def _reliability(score: np.ndarray, right: np.ndarray, counted: np.ndarray) -> list[list[float | int]]:
+    """Return mean score, share that is right, and count in bins of the score."""
+    score, right = score[counted], right[counted]
+    place = np.minimum((score * BINS).astype(int), BINS - 1)
+    return [
+        [round(float(score[place == k].mean()), 4), round(float(right[place == k].mean()), 4), int((place == k).sum())]
+        for k in range(BINS)
+        if (place == k).any()
+    ]
