@@ -24,6 +24,7 @@ COMMANDS = (
     "edit",
     "plot",
     "view",
+    "detect",
     "evaluate",
     "bench",
     "synth",

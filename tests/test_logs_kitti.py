@@ -87,8 +87,8 @@ def tracking(tmp_path: Path) -> Path:
     )
     (base / "label_02" / "0007.txt").write_text(
         "0 -1 DontCare -1 -1 -10 1 1 9 9 -1000 -1000 -1000 -10 -1 -1 -1\n"
-        "1 5 Van 0 0 -1.8 1 2 30 20 2.0 1.8 4.4 -4.5 1.8 13.4 -1.6\n"
-        "2 6 Person_sitting 0 0 -1.8 1 2 30 20 1.2 0.6 0.8 2 1.8 9 0\n"
+        "1 5 Van 0 1 -1.8 1 2 30 20 2.0 1.8 4.4 -4.5 1.8 13.4 -1.6\n"
+        "2 6 Person_sitting 0 2 -1.8 1 2 30 20 1.2 0.6 0.8 2 1.8 9 0\n"
     )
     return tmp_path
 
@@ -166,6 +166,8 @@ def test_labels_become_boxes_in_the_map(tracking: Path) -> None:
     log = open_log(tracking)
     labels = log.labels
     assert labels.category.tolist() == ["car", "pedestrian"]
+    assert labels.kind.tolist() == ["Van", "Person_sitting"]
+    assert labels.occlusion.tolist() == [1, 2]
     assert labels.t_ns.tolist() == [100_000_000, 200_000_000]
     np.testing.assert_allclose(labels.size_m[0], [4.4, 1.8, 2.0])
     map_T_cam, _ = log.map_T_sensor("image_02", labels.t_ns[:1])

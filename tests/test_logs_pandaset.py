@@ -137,6 +137,22 @@ def test_cuboids_become_one_row_an_object_with_rising_stamps(tmp_path: Path) -> 
     assert notes == ["labels left out because their kind is not known: Saucer"]
 
 
+def test_of_two_cuboids_of_an_object_one_naming_the_other_is_enough(tmp_path: Path) -> None:
+    file = {0: tmp_path / "00.pkl.gz"}
+    cuboids(
+        file[0],
+        [
+            {"uuid": "gt-1", "cuboids.sibling_id": "spin-", "cuboids.sensor_id": 1},
+            {"uuid": "spin-1", "cuboids.sibling_id": "gt-1", "cuboids.sensor_id": 0},
+            {"uuid": "gt-2", "cuboids.sibling_id": "spin-2", "cuboids.sensor_id": 1},
+            {"uuid": "spin-2", "cuboids.sibling_id": "-", "cuboids.sensor_id": 0},
+        ],
+    )
+    t_ns = np.array([10**9])
+    labels = read_labels(file, t_ns, t_ns, np.eye(4)[None], [])
+    assert labels.track_id.tolist() == ["spin-1", "spin-2"]
+
+
 def track(turn_rad: float, length_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Fixes and map positions of a drive to the north-east; the map is turned by `turn_rad` against east and north."""
     from pyproj import Geod

@@ -11,6 +11,7 @@ import typer
 from log2sim.cli import (
     bench,
     config,
+    detect,
     edit,
     evaluate,
     export,
@@ -49,7 +50,7 @@ def root(version: Annotated[bool, typer.Option("--version", help="Print the vers
 
 
 for command in (
-    reconstruct.reconstruct, replay.replay, synth.synth, edit.edit, plot.plot, evaluate.evaluate, bench.bench,
+    reconstruct.reconstruct, detect.detect, replay.replay, synth.synth, edit.edit, plot.plot, evaluate.evaluate, bench.bench,
     inspect.inspect, validate.validate, config.config, view.view, export.export,
 ):  # fmt: skip
     app.command()(command)

@@ -13,7 +13,9 @@ from log2sim.cli.options import Format, Sequence, say
 def validate(
     path: Annotated[
         Path,
-        typer.Argument(metavar="FILE_OR_LOG", help="Scenario, replay, report, metrics or bench file, or a log folder."),
+        typer.Argument(
+            metavar="FILE_OR_LOG", help="Scenario, replay, boxes, report, metrics or bench file, or a log folder."
+        ),
     ],
     format: Format = "auto",
     sequence: Sequence = None,
@@ -39,6 +41,7 @@ def _validate_file(path: Path) -> None:
     from log2sim.datatypes import Scenario
     from log2sim.documents import check, read_json
     from log2sim.errors import ScenarioError
+    from log2sim.evaluation.detection.boxes_file import DetectedBoxes, is_boxes_document
     from log2sim.simulation.result import Replay
 
     document = read_json(path, ScenarioError)
@@ -47,6 +50,10 @@ def _validate_file(path: Path) -> None:
         Replay.load(path)
     elif "metrics_version" in keys:
         check(document, "metrics-1", ScenarioError)
+    elif "detection_metrics_version" in keys:
+        check(document, "detection-metrics-1", ScenarioError)
+    elif is_boxes_document(document):
+        DetectedBoxes.load(path)
     elif "report_version" in keys:
         check(document, "report-1", ScenarioError)
     elif "bench_version" in keys:

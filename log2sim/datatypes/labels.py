@@ -29,6 +29,10 @@ class Labels:
         As the log states it; None where it states nothing and visibility is computed.
     cameras : tuple of str or None
         The cameras in whose images alone objects were labeled; None when they were labeled all around.
+    kind : (L,) str or None
+        The log's own word for the category, such as "Van"; None where the log has none of its own.
+    occlusion : (L,) int64 or None
+        0 fully visible, 1 partly occluded, 2 largely occluded, 3 unknown, as the log states it.
     """
 
     t_ns: NDArray[np.int64]
@@ -39,6 +43,8 @@ class Labels:
     yaw_rad: Array
     visible: NDArray[np.bool_] | None = None
     cameras: tuple[str, ...] | None = None
+    kind: NDArray[np.str_] | None = None
+    occlusion: NDArray[np.int64] | None = None
 
 
 @dataclass(frozen=True, eq=False)

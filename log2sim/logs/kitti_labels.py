@@ -95,7 +95,17 @@ def read_labels(
     center, size, yaw = boxes_in_map(map_T_ego @ rig.ego_T_rect, rows.values[:, 7:14])
     k = known
     return DriveLabels(
-        Labels(t_ns[k], rows.track_id[k], category[k], center[k], size[k], yaw[k], cameras=(CAMERA,)),
+        Labels(
+            t_ns[k],
+            rows.track_id[k],
+            category[k],
+            center[k],
+            size[k],
+            yaw[k],
+            cameras=(CAMERA,),
+            kind=rows.type[k],
+            occlusion=rows.values[k, 1].astype(np.int64),
+        ),
         {CAMERA: ImageLabels(t_ns, rows.values[:, 3:7], category)},
         {CAMERA: ImageRegions(stamp_of(ignored.frame), ignored.values[:, 3:7])},
         text,

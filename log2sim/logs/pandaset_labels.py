@@ -112,7 +112,8 @@ def _frame(c: Columns, t_ns: int, gt_t_ns: int, map_T_lidar: Array, unknown: set
     unknown.update(str(k) for k, word in zip(c["label"], category) if not word and str(k) not in NO_ROAD_USERS)
     uuid, sibling = c["uuid"].astype(np.str_), c["cuboids.sibling_id"].astype(np.str_)
     of_gt = c["cuboids.sensor_id"] == GT_SENSOR
-    twin = of_gt & np.isin(sibling, uuid[~of_gt])
+    # In sequence 002 one of the two names the other by a part of its uuid only.
+    twin = of_gt & (np.isin(sibling, uuid[~of_gt]) | np.isin(uuid, sibling[~of_gt]))
     # A cuboid of the PandarGT alone still belongs to the track of its twin.
     track_id = np.where(of_gt & (np.char.str_len(sibling) > 1), sibling, uuid)
     center = np.stack([c[f"position.{k}"] for k in "xyz"], axis=1).astype(np.float64)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -49,6 +49,23 @@ class Criterion:
 
 
 @dataclass(frozen=True, eq=False)
+class Pairs:
+    """Pairs of found and true boxes that may match.
+
+    Attributes
+    ----------
+    found, truth : (P,) int64
+        Rows of both tables.
+    value : (P,) float64
+        IoU or distance.
+    """
+
+    found: NDArray[np.int64]
+    truth: NDArray[np.int64]
+    value: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Matches:
     """The true box of each found one.
 
@@ -72,6 +89,10 @@ class Matches:
     false: NDArray[np.bool_]
     truths: int
 
+    def excusing(self, rows: NDArray[np.bool_]) -> Matches:
+        """Return matches in which the boxes of a mask (M,) are not false where they match nothing."""
+        return replace(self, false=self.false & ~rows)
+
 
 def match(found: SceneBoxes, truth: SceneBoxes, criterion: Criterion) -> Matches:
     """Match found and true boxes of all scenes one to one, best score first.
@@ -81,6 +102,12 @@ def match(found: SceneBoxes, truth: SceneBoxes, criterion: Criterion) -> Matches
     found, truth : SceneBoxes
         Of one class: categories are not compared.
     criterion : Criterion
+    """
+    return assign(found, truth, candidate_pairs(found, truth, criterion), criterion)
+
+
+def assign(found: SceneBoxes, truth: SceneBoxes, pairs: Pairs, criterion: Criterion) -> Matches:
+    """Choose among candidate pairs, which do not depend on what is ignored; see `match`.
 
     Notes
     -----
@@ -89,7 +116,7 @@ def match(found: SceneBoxes, truth: SceneBoxes, criterion: Criterion) -> Matches
     lets true boxes choose, which gives the same counts wherever a found box can match one true box only, as above an IoU of
     one half. Found boxes beyond the first on one true box are false, ignored true boxes included, as in KITTI.
     """
-    i, j, value = candidate_pairs(found, truth, criterion)
+    i, j, value = pairs.found, pairs.truth, pairs.value
     closeness = -value if criterion.measure == "center_m" else value
     order = np.lexsort((j, -closeness, truth.ignored[j], i, -found.score[i], found.ignored[i]))
     partner, of_pair = np.full(len(found), -1, dtype=np.int64), np.full(len(found), np.nan)
@@ -100,15 +127,12 @@ def match(found: SceneBoxes, truth: SceneBoxes, criterion: Criterion) -> Matches
     matched = partner >= 0
     to_counted = matched.copy()
     to_counted[matched] = ~truth.ignored[partner[matched]]
-    return Matches(
-        partner, of_pair, to_counted & ~found.ignored, ~matched & ~found.ignored, int(np.count_nonzero(~truth.ignored))
-    )
+    counted = int(np.count_nonzero(~truth.ignored))
+    return Matches(partner, of_pair, to_counted & ~found.ignored, ~matched & ~found.ignored, counted)
 
 
-def candidate_pairs(
-    found: SceneBoxes, truth: SceneBoxes, criterion: Criterion
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """List the pairs of boxes of one scene that meet a criterion: rows of `found` (P,), of `truth` (P,), and values (P,)."""
+def candidate_pairs(found: SceneBoxes, truth: SceneBoxes, criterion: Criterion) -> Pairs:
+    """List the pairs of boxes of one scene that meet a criterion."""
     rows_i, rows_j, values = [], [], []
     for i, j in _pairs_in_scenes(found.scene, truth.scene):
         a, b = found.box[i], truth.box[j]
@@ -125,8 +149,8 @@ def candidate_pairs(
         rows_j.append(j[near])
         values.append(value[near])
     if not values:
-        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0)
-    return np.concatenate(rows_i), np.concatenate(rows_j), np.concatenate(values)
+        return Pairs(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))
+    return Pairs(np.concatenate(rows_i), np.concatenate(rows_j), np.concatenate(values))
 
 
 def _pairs_in_scenes(

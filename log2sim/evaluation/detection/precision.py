@@ -12,6 +12,8 @@ from log2sim.evaluation.detection.matching import Criterion, Matches, match
 from log2sim.geometry import Array
 
 ROUNDING = 1e-9
+SAMPLES = 40
+"""Steps of recall of KITTI's published program."""
 NUSCENES_FLOOR = 0.1
 """nuScenes leaves out what lies below this precision and this recall."""
 
@@ -65,7 +67,32 @@ class PrecisionRecall:
         if not self.truths:
             return None
         above = np.maximum(self.best_precision(np.arange(11, 101) / 100) - NUSCENES_FLOOR, 0)
-        return float(above.mean() / (1 - NUSCENES_FLOOR))
+        return min(float(above.mean() / (1 - NUSCENES_FLOOR)), 1.0)
+
+    def sampled_average(self, recall_points: int = 40) -> float | None:
+        """Average as KITTI's published program does; None without true boxes.
+
+        Notes
+        -----
+        The program looks at no more than 41 of the scores of right boxes, those at which the recall is nearest to 0, 1/40 and
+        so on; points that are not reached count 0, and the last right box counts as one more point, which adds up to 1/40. With
+        fewer than 40 true boxes even a perfect detector gets less than 1: take `average` for small sets, and this figure to
+        compare with published ones.
+        """
+        if not self.truths:
+            return None
+        right = np.round(self.recall * self.truths).astype(np.int64)
+        of_curve = np.repeat(np.arange(len(self.score)), np.diff(right, prepend=0))
+        sampled, reached, aim = np.zeros(SAMPLES + 1), 0, 0.0
+        for n, k in enumerate(of_curve.tolist(), start=1):
+            here, following = n / self.truths, (n + 1) / self.truths
+            if n < len(of_curve) and following - aim < aim - here:
+                continue
+            sampled[reached] = self.precision[k]
+            reached += 1
+            aim += 1 / SAMPLES  # summed as there, since rounding decides where two scores are equally near
+        best = np.maximum.accumulate(sampled[::-1])[::-1]
+        return float(best[1:].mean() if recall_points == 40 else best[::4].mean())
 
 
 def precision_recall(found: SceneBoxes, matches: Matches) -> PrecisionRecall:

@@ -1,0 +1,55 @@
+"""Detect road users in the LiDAR sweeps of a log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from log2sim.cli.options import ConfigFile, Format, LogPath, Overwrite, Quiet, Sequence, Settings, counted, say
+
+
+def detect(
+    log: LogPath,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Boxes file to write.")],
+    detector: Annotated[
+        str,
+        typer.Option(
+            metavar="lidar:NAME|lidar:MODEL.onnx",
+            help="Detector in LiDAR sweeps: lidar:vehicle, lidar:roadside, lidar:MODEL.onnx, or lidar:labels (boxes of "
+            "the log).",
+        ),
+    ] = "lidar:vehicle",
+    format: Format = "auto",
+    sequence: Sequence = None,
+    start: Annotated[float | None, typer.Option(help="First time to use, in s from the start of the log.")] = None,
+    stop: Annotated[float | None, typer.Option(help="Last time to use, in s from the start of the log.")] = None,
+    config: ConfigFile = None,
+    settings: Settings = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Detect road users in the LiDAR sweeps of a log."""
+    from log2sim.cli.progress import progress
+    from log2sim.config import Config
+    from log2sim.documents import check_targets
+    from log2sim.evaluation.detection.detect_log import detect_log
+    from log2sim.logs.opening import open_log
+
+    check_targets(out, overwrite=overwrite)
+    changes: dict[str, Any] = {"start_s": start, "stop_s": stop, "detect": {"name": detector}}
+    chosen = Config.load(config, settings or (), **changes)
+    opened = open_log(log, format=format, sequence=sequence)
+    for note in opened.notes:
+        say(f"note: {note}", quiet=quiet)
+    with progress(quiet=quiet) as report_progress:
+        result = detect_log(opened, chosen, progress=lambda done, total: report_progress("detect", done, total))
+    result.found.save(out)
+    for name, unread in result.unreadable.items():
+        say(f"note: {name}: {unread['count']} records could not be read, first: {unread['first']}", quiet=quiet)
+    if result.left_out:
+        say(f"note: {counted(result.left_out, 'sweep')} left out, without points or a known pose", quiet=quiet)
+    boxes = sum(len(found) for found in result.found.boxes)
+    words = f"{boxes} box{'es' * (boxes != 1)} in {counted(len(result.found.t_ns), 'sweep')}"
+    say(f"{out}: {words} by {result.found.detector}", quiet=quiet)

@@ -1,0 +1,74 @@
+"""Run a LiDAR detector over the sweeps of a log."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from log2sim.config import Config
+from log2sim.datatypes import Log
+from log2sim.errors import ConfigError, LogError
+from log2sim.evaluation.detection.boxes_file import DetectedBoxes
+from log2sim.evaluation.detection.sweep_clouds import clouds, stamps_of
+from log2sim.perception.frames import RecordReader
+from log2sim.pipeline import start
+
+
+@dataclass(frozen=True, eq=False)
+class LogDetections:
+    """Boxes of a log, and what could not be searched.
+
+    Attributes
+    ----------
+    found : DetectedBoxes
+    left_out : int
+        Sweeps that cannot be read or have no pose.
+    unreadable : dict
+        Count and first message by stream.
+    """
+
+    found: DetectedBoxes
+    left_out: int
+    unreadable: dict[str, Any]
+
+
+def detect_log(log: Log, config: Config, *, progress: Callable[[int, int], None] | None = None) -> LogDetections:
+    """Detect road users in the sweeps of a log.
+
+    Parameters
+    ----------
+    log : Log
+    config : Config
+        `detect.name` is a LiDAR detector, such as "lidar:vehicle"; its settings are in the section `lidar`.
+    progress : callable, optional
+        Called with (sweeps done, all sweeps).
+
+    Raises
+    ------
+    ConfigError
+        For a detector that is none for LiDARs, or when no sweep is left.
+    LogError
+        For a log without LiDAR, or when no sweep can be searched.
+    """
+    if config.detect.in_images or not config.detect.in_sweeps:
+        raise ConfigError(
+            f"detector '{config.detect.name}': 3D boxes are detected in LiDAR sweeps alone; expected a name that begins with "
+            "'lidar:', such as lidar:vehicle"
+        )
+    run = start(log, config)
+    records, detector = RecordReader(run.log), run.detectors.sweeps
+    of_sweeps, stamps, boxes = stamps_of(run), [], []
+    for searched in clouds(run, records, detector):
+        if searched.cloud is not None:
+            stamps.append(of_sweeps[searched.tick])
+            boxes.append(searched.boxes)
+        if progress is not None:
+            progress(searched.tick + 1, len(run.schedule))
+    records.require_some()
+    if not stamps:
+        raise LogError(f"{log.name}: none of the {len(run.schedule)} sweeps has a known pose and points")
+    found = DetectedBoxes(log.name, run.detectors.name, np.array(stamps, dtype=np.int64), tuple(boxes))
+    return LogDetections(found, len(run.schedule) - len(stamps), records.summary())

@@ -1,0 +1,75 @@
+"""Figures of detected boxes as a table for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from log2sim.evaluation.detection.matching import Criterion
+
+AVERAGES = {
+    "kitti": (("ap_r40", "AP R40"), ("ap_r11", "AP R11"), ("ap_r40_published", "publ. R40")),
+    "dair": (("ap_r40", "AP R40"), ("ap_r11", "AP R11")),
+    "center": (("ap_nuscenes", "AP nuSc"), ("ap_r40", "AP R40")),
+}
+AT_SCORE = (
+    ("precision", "precis."),
+    ("recall", "recall"),
+    ("f1", "F1"),
+    ("precision_times_recall", "P x R"),
+    ("heading_over_90_deg", "> 90 deg"),
+)
+
+
+def format_table(result: Mapping[str, Any]) -> str:
+    """Format a result of `evaluate_boxes`; '-' for None.
+
+    Classes without a true and a found box, categories that are all of their group, and the looser limits of difficulties are
+    left out; the document has them.
+    """
+    columns = (*AVERAGES[result["protocol"]], *AT_SCORE)
+    cells = [["class", "objects", "match", "truths", *(title for _, title in columns)]]
+    notes: list[str] = []
+    shown: list[Any] = []
+    for name, figures in result["classes"].items():
+        rows = [row for row in _rows(figures) if row["truths"] or row["true_positives"] + row["false_positives"]]
+        if rows and rows not in shown:
+            shown.append(rows)
+            for row in rows:
+                match = str(Criterion(**row["match"]))
+                values = [_cell(row[key]) for key, _ in columns]
+                cells.append([name, row["objects"], match, str(row["truths"]), *values])
+        scores = figures["calibration"]
+        error = scores["expected_calibration_error"]
+        if rows and shown[-1] is rows and error is not None:
+            where = f"{scores['boxes']} boxes, {Criterion(**scores['match'])}"
+            notes.append(f"{name}: expected calibration error of the scores {error:.3f} ({where})")
+    widths = [max(len(row[k]) for row in cells) for k in range(len(cells[0]))]
+    lines = ["  ".join(_aligned(row, widths)).rstrip() for row in cells]
+    return "\n".join([*lines, *notes, _scope(result)])
+
+
+def _rows(figures: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    limit = figures["calibration"]["match"]["limit"]
+    rows = [row for row in figures["figures"] if row["objects"] == "all" or row["match"]["limit"] == limit]
+    return [*rows, *figures["by_range"], *(figures["by_points"] or [])]
+
+
+def _scope(result: Mapping[str, Any]) -> str:
+    sweeps, skipped = result["sweeps"], result["sweeps_without_labels"]
+    parts = [
+        f"{sweeps} labeled sweep{'s' * (sweeps != 1)}" + (f" ({skipped} without labels left out)" if skipped else "")
+    ]
+    if result["reference_camera"] is not None:
+        parts.append(f"boxes that {result['reference_camera']} shows")
+    if result["max_range_m"] is not None:
+        parts.append(f"up to {result['max_range_m']:g} m")
+    return f"{'; '.join(parts)}; precision, recall and what follows at scores from {result['min_score']:g}"
+
+
+def _aligned(row: list[str], widths: list[int]) -> list[str]:
+    return [c.ljust(w) if k < 3 else c.rjust(w) for k, (c, w) in enumerate(zip(row, widths, strict=True))]
+
+
+def _cell(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"

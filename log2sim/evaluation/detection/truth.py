@@ -1,0 +1,163 @@
+"""True boxes of the sweeps in which a detector searched, from the labels of a log."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.config import Config
+from log2sim.datatypes import Log
+from log2sim.errors import LogError
+from log2sim.evaluation.detection.boxes import SceneBoxes
+from log2sim.evaluation.detection.label_tracks import MAX_LAG_NS, MAX_PERIODS, LabelTracks
+from log2sim.evaluation.detection.sweep_clouds import clouds, middle_ns, only_ticks, stamps_of
+from log2sim.geometry import NS_PER_S, Array, nearest_index, period_of
+from log2sim.perception.detect3d.box_points import points_of_boxes
+from log2sim.perception.frames import RecordReader
+from log2sim.perception.lidar.cloud import cloud_origin
+from log2sim.pipeline import Run, start
+
+MAX_STAMP_ERROR_NS = 1_000_000
+"""Stamps of one sweep differ by rounding at most this much."""
+
+
+@dataclass(frozen=True, eq=False)
+class SweepTruth:
+    """Labels by sweep; L rows.
+
+    Attributes
+    ----------
+    labeled : (F,) bool
+        Whether each of the sweeps asked for is labeled.
+    boxes : SceneBoxes
+        Their scenes are indices of sweeps; points are None for a log without LiDAR.
+    origin_m : (F, 3) float64
+        From where ranges are measured, map frame: the ego, or the middle of the sensors.
+    kind : (L,) str
+        The log's own word for the category, "" where it has none.
+    occlusion : (L,) int64
+        As the log states it; 0 where it states nothing.
+    """
+
+    labeled: NDArray[np.bool_]
+    boxes: SceneBoxes
+    origin_m: Array
+    kind: NDArray[np.str_]
+    occlusion: NDArray[np.int64]
+
+
+def truth_of_sweeps(
+    log: Log, t_ns: NDArray[np.int64], *, progress: Callable[[int, int], None] | None = None
+) -> SweepTruth:
+    """Assign the labels of a log to sweeps and count the points in each.
+
+    Parameters
+    ----------
+    log : Log
+    t_ns : (F,) int64
+        Stamps of the sweeps, absolute, increasing.
+    progress : callable, optional
+        Called with (sweeps done, all sweeps); every sweep is read once.
+
+    Raises
+    ------
+    LogError
+        When the log has no labels, or none of these sweeps.
+
+    Notes
+    -----
+    A turning LiDAR sees objects at different times of a sweep, and labels may have the stamps of cameras. Each label is moved
+    along its track to the mean time of the points in it, which is where a detector finds the object: at 15 m/s and 10 Hz it
+    is up to 0.75 m off otherwise.
+    """
+    labels = log.labels
+    if labels is None or len(labels.t_ns) == 0:
+        raise LogError(f"{log.name}: the log has no labeled 3D boxes; name a log with labels as truth")
+    run = _run_of(log)
+    middle = t_ns + (0 if run is None else middle_ns(run))
+    tracks = LabelTracks.of(labels)
+    labeled = labeled_sweeps(np.sort(labels.t_ns), middle, tracks.period_s)
+    if not labeled.any():
+        raise LogError(
+            f"{log.name}: none of the {len(t_ns)} sweeps is labeled; they last from {t_ns[0] / NS_PER_S:.3f} to "
+            f"{t_ns[-1] / NS_PER_S:.3f} s, the labels from {labels.t_ns.min() / NS_PER_S:.3f} to "
+            f"{labels.t_ns.max() / NS_PER_S:.3f} s; are both of one log?"
+        )
+    sweep, track = tracks.present(middle)
+    sweep, track = sweep[labeled[sweep]], track[labeled[sweep]]
+    seen_ns, points = middle[sweep], None
+    if run is not None:
+        seen_ns, points = _seen(run, t_ns, sweep, track, tracks, middle, progress)
+    pose, rows = tracks.at(track, seen_ns)
+    origin = np.array([cloud_origin(log, int(t))[0] for t in t_ns])
+    box = np.column_stack([pose[:, :3], labels.size_m[rows], pose[:, 3]])
+    away = np.hypot(*(box[:, :2] - origin[sweep, :2]).T)
+    none = np.zeros(len(rows), dtype=np.int64)
+    return SweepTruth(
+        labeled,
+        SceneBoxes.of(box, labels.category[rows], scene=sweep, points=points, range_m=away),
+        origin,
+        np.full(len(rows), "") if labels.kind is None else labels.kind[rows],
+        none if labels.occlusion is None else labels.occlusion[rows],
+    )
+
+
+def _run_of(log: Log) -> Run | None:
+    """Plan to read all sweeps of a log; None without a LiDAR."""
+    if not any(len(log.streams[name].t_ns) for name in log.lidars if name in log.streams):
+        return None
+    return start(log, Config().changed(detect={"name": "lidar:labels"}, measure={"max_range_m": 200.0}))
+
+
+def labeled_sweeps(labels_t_ns: NDArray[np.int64], middle_ns: NDArray[np.int64], period_s: float) -> NDArray[np.bool_]:
+    """Mark (F,) the sweeps that are labeled: those near a label and, where every sweep is labeled, all between labels.
+
+    Parameters
+    ----------
+    labels_t_ns : (L,) int64
+        Sorted stamps of all labels.
+    middle_ns : (F,) int64
+        Middles of the sweeps.
+    period_s : float
+        Time between labels of one object.
+    """
+    near = np.abs(labels_t_ns[nearest_index(labels_t_ns, middle_ns)] - middle_ns) <= MAX_LAG_NS
+    if period_s > MAX_PERIODS * period_of(middle_ns):
+        return np.asarray(near)
+    return np.asarray(near | ((middle_ns >= labels_t_ns[0]) & (middle_ns <= labels_t_ns[-1])))
+
+
+def _seen(
+    run: Run,
+    t_ns: NDArray[np.int64],
+    sweep: NDArray[np.int64],
+    track: NDArray[np.int64],
+    tracks: LabelTracks,
+    middle: NDArray[np.int64],
+    progress: Callable[[int, int], None] | None,
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Find when (L,) the LiDARs saw each object, the middle of the sweep without points, and its number of points (L,)."""
+    stamps, labels = stamps_of(run), run.log.labels
+    assert labels is not None
+    tick = nearest_index(stamps, t_ns)
+    known = np.flatnonzero(np.abs(stamps[tick] - t_ns) <= MAX_STAMP_ERROR_NS)
+    seen_ns, counts = middle[sweep], np.zeros(len(sweep), dtype=np.int64)
+    needed = known[np.isin(known, sweep)]
+    for done, searched in enumerate(clouds(only_ticks(run, tick[needed]), RecordReader(run.log), None), start=1):
+        mine = np.flatnonzero(sweep == needed[searched.tick])
+        if searched.cloud is not None:
+            above = ~searched.cloud.ground
+            for _ in range(2):  # where labels are in the middle of the sweep, then where they were seen
+                pose, rows = tracks.at(track[mine], seen_ns[mine])
+                local = pose[:, :3] - searched.cloud.origin
+                inside = points_of_boxes(searched.cloud.xyz[above], local, labels.size_m[rows], pose[:, 3])
+                mean_s = inside.mean(searched.cloud.t_s[above])
+                mean_ns = searched.cloud.stamp_ns + np.round(mean_s * NS_PER_S).astype(np.int64)
+                counts[mine] = inside.count
+                seen_ns[mine] = np.where(inside.count > 0, mean_ns, seen_ns[mine])
+        if progress is not None:
+            progress(done, len(needed))
+    return seen_ns, counts

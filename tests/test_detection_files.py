@@ -1,0 +1,355 @@
+"""The boxes file, truth by sweep, and the commands that write and judge boxes."""
+
+from __future__ import annotations
+
+import copy
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_line import names, run
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from worlds import tiny_log
+
+from log2sim.config import Config
+from log2sim.datatypes import Boxes3D, ImageRegions, Labels, Log
+from log2sim.documents import check
+from log2sim.errors import ConfigError, LogError
+from log2sim.evaluation.detection.boxes_file import DetectedBoxes
+from log2sim.evaluation.detection.detect_log import detect_log
+from log2sim.evaluation.detection.evaluation import Options, evaluate_boxes
+from log2sim.evaluation.detection.label_tracks import LabelTracks
+from log2sim.evaluation.detection.truth import labeled_sweeps, truth_of_sweeps
+from log2sim.geometry import points_in_box
+from log2sim.perception.lidar.cloud import sweep_to_map
+
+NS = 1_000_000_000
+T0_NS = 1_700_000_000 * NS
+LABELS = Config().changed(detect={"name": "lidar:labels"}, stop_s=0.75)
+"""Labels end before the last sweeps do."""
+
+
+def some_boxes(count: int, t_ns: int, seed: int = 0) -> Boxes3D:
+    rng = np.random.default_rng(seed)
+    return Boxes3D(
+        np.full(count, t_ns), rng.uniform(-1e6, 1e6, (count, 3)), rng.uniform(0.5, 9, (count, 3)),
+        rng.uniform(-3, 3, count), rng.uniform(0.5, 1, count), np.array(["car", "pedestrian", "bus"])[np.arange(count) % 3],
+        rng.random(count), rng.integers(0, 500, count),
+    )  # fmt: skip
+
+
+def some_file() -> DetectedBoxes:
+    t_ns = NS * np.array([5, 6, 8])
+    return DetectedBoxes(
+        "drive", "lidar:test", t_ns, (some_boxes(3, 5 * NS), Boxes3D.empty(), some_boxes(1, 8 * NS, 1))
+    )
+
+
+def document(tmp_path: Path) -> dict[str, Any]:
+    some_file().save(tmp_path / "boxes.json")
+    loaded: dict[str, Any] = json.loads((tmp_path / "boxes.json").read_text())
+    return loaded
+
+
+def test_boxes_come_back_as_they_were(tmp_path: Path) -> None:
+    saved = some_file()
+    saved.save(tmp_path / "boxes.json")
+    assert names(tmp_path) == ["boxes.json"]
+    loaded = DetectedBoxes.load(tmp_path / "boxes.json")
+    assert (loaded.log, loaded.detector, loaded.t_ns.tolist()) == ("drive", "lidar:test", saved.t_ns.tolist())
+    for before, after in zip(saved.boxes, loaded.boxes, strict=True):
+        for name, column in vars(before).items():
+            if column.dtype.kind == "f":
+                np.testing.assert_allclose(getattr(after, name), column, atol=0.6e-4)
+            else:
+                assert getattr(after, name).tolist() == column.tolist()
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        (("frames", 0, "boxes", 1, "score"), 1.5, r"frames\[0\].boxes\[1\].score: 1.5 is greater"),
+        (("frames", 0, "boxes", 1, "score"), None, r"frames\[0\].boxes\[1\].score"),
+        (("frames", 0, "boxes", 0, "points"), True, r"frames\[0\].boxes\[0\].points"),
+        (("frames", 0, "boxes", 0, "points"), 3.5, r"frames\[0\].boxes\[0\].points"),
+        (("frames", 0, "boxes", 2, "category"), "tank", r"frames\[0\].boxes\[2\].category: 'tank'"),
+        (("frames", 0, "boxes", 2, "category"), ["car"], r"frames\[0\].boxes\[2\].category"),
+        (("frames", 0, "boxes", 0, "size_m"), [4, 0, 2], r"frames\[0\].boxes\[0\].size_m\[1\]: 0"),
+        (("frames", 0, "boxes", 0, "center_m"), [4, 0], r"frames\[0\].boxes\[0\].center_m"),
+        (("frames", 0, "boxes", 0, "center_m"), "abc", r"frames\[0\].boxes\[0\].center_m"),
+        (("frames", 0, "boxes", 0, "extra"), 1, "extra"),
+        (("frames", 0, "boxes"), {}, r"frames\[0\].boxes"),
+        (("frames", 1, "boxes"), "", r"frames\[1\].boxes"),
+        (("frames", 1, "t_ns"), "6", r"frames\[1\].t_ns"),
+        (("frames", 1, "t_ns"), 5 * NS, r"frames\[1\].t_ns: .* does not follow"),
+        (("frames", 2, "t_ns"), 2**70, "does not fit into 64 bits"),
+        (("frames",), None, "frames"),
+        (("version",), 2, "version"),
+        (("format",), "else", "not a boxes file"),
+    ],
+)
+def test_a_wrong_file_is_refused_with_the_place(
+    tmp_path: Path, place: tuple[Any, ...], value: Any, message: str
+) -> None:
+    spoiled = document(tmp_path)
+    at = spoiled
+    for key in place[:-1]:
+        at = at[key]
+    at[place[-1]] = value
+    (tmp_path / "bad.json").write_text(json.dumps(spoiled))
+    with pytest.raises(LogError, match=message) as error:
+        DetectedBoxes.load(tmp_path / "bad.json")
+    assert str(error.value).startswith(str(tmp_path / "bad.json"))
+
+
+VALUES = st.one_of(st.none(), st.booleans(), st.integers(-3, 3), st.floats(-2, 2), st.sampled_from(["car", "x"]))
+
+
+@given(
+    key=st.sampled_from(["center_m", "size_m", "yaw_rad", "heading_score", "category", "score", "points"]),
+    value=st.one_of(VALUES, st.lists(VALUES, min_size=2, max_size=4)),
+)
+@settings(max_examples=150, deadline=None)
+def test_checking_by_columns_accepts_what_the_schema_accepts(
+    tmp_path_factory: pytest.TempPathFactory, key: str, value: Any
+) -> None:
+    changed = document(tmp_path_factory.mktemp("boxes"))
+    changed["frames"][0]["boxes"][1][key] = value
+
+    def accepts(function: Any, *arguments: Any) -> bool:
+        try:
+            function(copy.deepcopy(changed), *arguments)
+        except LogError:
+            return False
+        return True
+
+    assert accepts(DetectedBoxes.from_dict) == accepts(check, "boxes-1", LogError)
+
+
+@pytest.fixture(scope="module")
+def tiny() -> Log:
+    return tiny_log()[0]
+
+
+def test_truth_counts_points_and_ranges_as_one_would_by_hand(tiny: Log) -> None:
+    t_ns = tiny.streams["top"].t_ns
+    truth = truth_of_sweeps(tiny, t_ns)
+    assert truth.labeled.all()
+    assert len(truth.boxes) == 3 * len(t_ns)
+    sweep = 4
+    mapped = sweep_to_map(tiny, "top", tiny.streams["top"].read(sweep), compensate=True)
+    assert mapped is not None
+    rows = np.flatnonzero(truth.boxes.scene == sweep)
+    assert len(rows) == 3
+    for k in rows:
+        box = truth.boxes.box[k]
+        # Points within 0.2 m of the ground count for no box.
+        above = mapped[0][mapped[0][:, 2] > 0.2]
+        assert truth.boxes.points[k] == pytest.approx(
+            points_in_box(above, box[:3], box[3:6], box[6]).sum(), rel=0.05, abs=2
+        )
+    ego = tiny.ego.at(int(t_ns[sweep]))[0][0, :2, 3]
+    np.testing.assert_allclose(truth.boxes.range_m[rows], np.hypot(*(truth.boxes.box[rows, :2] - ego).T))
+
+
+def test_labels_are_moved_to_the_moment_at_which_the_lidar_saw_them(tiny: Log) -> None:
+    # The car drives at 4 m/s along x; labels have the camera's stamps, points their own.
+    t_ns = tiny.streams["top"].t_ns
+    truth = truth_of_sweeps(tiny, t_ns)
+    car = np.flatnonzero(tiny.labels.track_id == "car")[0]
+    start_m = tiny.labels.center_m[car, 0] - 4.0 * (tiny.labels.t_ns[car] - T0_NS) / NS
+    for sweep in (3, 6):
+        box = truth.boxes.box[(truth.boxes.scene == sweep) & (np.abs(truth.boxes.box[:, 1] - 2.0) < 1e-6)]
+        assert box.shape == (1, 7)
+        read = tiny.streams["top"].read(sweep)
+        mapped = sweep_to_map(tiny, "top", read, compensate=True)
+        assert mapped is not None
+        inside = points_in_box(mapped[0], box[0, :3], box[0, 3:6], box[0, 6]) & (mapped[0][:, 2] > 0.2)
+        seen_s = (read.t_ns[inside].mean() - T0_NS) / NS
+        assert box[0, 0] == pytest.approx(start_m + 4.0 * seen_s, abs=0.01)
+
+
+def labels_at(*stamps_s: float, track: str = "a", mps: float = 10.0) -> Labels:
+    t_s, n = np.array(stamps_s), len(stamps_s)
+    center = np.stack([mps * t_s, np.zeros(n), np.ones(n)], axis=1)
+    yaw = np.where(t_s < 0.45, np.pi - 0.01, -np.pi + 0.01)
+    return Labels(
+        np.round(t_s * NS).astype(np.int64), np.full(n, track), np.full(n, "car"), center, np.ones((n, 3)), yaw
+    )
+
+
+def test_tracks_are_followed_between_labels_and_not_over_gaps() -> None:
+    tracks = LabelTracks.of(labels_at(0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.9, 1.0))
+    assert tracks.period_s == pytest.approx(0.1)
+    asked = np.array([-0.07, -0.05, 0.25, 0.54, 0.7, 0.86, 1.05, 1.07])
+    moment, track = tracks.present(np.round(asked * NS).astype(np.int64))
+    assert asked[moment].tolist() == [-0.05, 0.25, 0.54, 0.86, 1.05]
+    pose, row = tracks.at(track, np.round(asked[moment] * NS).astype(np.int64))
+    np.testing.assert_allclose(pose[:, 0], 10 * asked[moment], atol=1e-6)
+    assert row.tolist() == [0, 2, 5, 6, 7]
+    turned, _ = tracks.at(np.zeros(1, dtype=np.int64), np.array([450_000_000]))
+    assert abs(abs(turned[0, 3]) - np.pi) < 1e-6
+
+
+def test_a_single_label_holds_for_a_moment() -> None:
+    tracks = LabelTracks.of(labels_at(1.0))
+    moment, track = tracks.present(np.array([930, 950, 1050, 1070]) * 1_000_000)
+    assert moment.tolist() == [1, 2]
+    assert tracks.at(track, np.array([950, 1050]) * 1_000_000)[0][:, 0].tolist() == [10.0, 10.0]
+
+
+def test_sweeps_between_labels_of_every_sweep_are_labeled_and_those_between_sparse_ones_are_not() -> None:
+    middle = np.arange(20) * NS // 10
+    dense = np.r_[middle[2:8], middle[12:15]]
+    assert np.flatnonzero(labeled_sweeps(dense, middle, 0.1)).tolist() == list(range(2, 15))
+    sparse = middle[[0, 5, 10]] + 3_000_000
+    assert np.flatnonzero(labeled_sweeps(sparse, middle, 0.5)).tolist() == [0, 5, 10]
+    assert labeled_sweeps(dense, middle[4:5], 0.1).tolist() == [True]
+
+
+def test_labels_as_detector_are_found_again_by_every_protocol(tiny: Log) -> None:
+    done: list[tuple[int, int]] = []
+    found = detect_log(tiny, LABELS, progress=lambda *step: done.append(step)).found
+    assert done[-1] == (len(found.t_ns),) * 2
+    assert found.t_ns.tolist() == tiny.streams["top"].t_ns[:8].tolist()
+    for protocol in ("kitti", "dair", "center"):
+        result = evaluate_boxes(found, tiny, Options(protocol))
+        check(result, "detection-metrics-1", LogError)
+        name = "car" if protocol == "kitti" else "vehicle"
+        for class_name in (name, "pedestrian"):
+            row = result["classes"][class_name]["figures"][0]
+            assert row["truths"] >= 8
+            assert row["precision"] == row["recall"] == row["ap_r40"] == 1
+        assert result["sweeps"] == len(found.t_ns)
+        assert result["sweeps_without_labels"] == 0
+
+
+def moved(found: DetectedBoxes, by_m: float) -> DetectedBoxes:
+    boxes = tuple(replace(b, center_m=b.center_m + np.array([by_m, 0, 0])) for b in found.boxes)
+    return replace(found, boxes=boxes)
+
+
+def test_distances_of_centers_decide_as_stated(tiny: Log) -> None:
+    found = moved(detect_log(tiny, LABELS).found, 0.9)
+    rows = evaluate_boxes(found, tiny, Options("center"))["classes"]["vehicle"]["figures"]
+    assert {r["match"]["limit"]: r["recall"] for r in rows} == {0.5: 0, 1.0: 1, 2.0: 1, 4.0: 1}
+
+
+def test_what_is_out_of_range_counts_for_nothing(tiny: Log) -> None:
+    found = detect_log(tiny, LABELS).found
+    far = evaluate_boxes(found, tiny, Options("center", max_range_m=13.5))
+    row = far["classes"]["vehicle"]["figures"][0]
+    whole = evaluate_boxes(found, tiny, Options("center"))["classes"]["vehicle"]["figures"][0]
+    assert 0 < row["truths"] < whole["truths"]
+    assert row["true_positives"] == row["truths"]
+    assert row["false_positives"] == 0
+
+
+def test_where_nothing_was_labeled_nothing_is_false(tiny: Log) -> None:
+    found = moved(detect_log(tiny, LABELS).found, 5.0)
+    stamps = tiny.streams["front"].t_ns
+    nowhere = ImageRegions(stamps, np.tile([0.0, 0, 480, 300], (len(stamps), 1)))
+
+    def false(log: Log, protocol: str) -> int:
+        row = evaluate_boxes(found, log, Options(protocol))["classes"]["pedestrian"]["figures"][0]
+        return int(row["false_positives"])
+
+    for protocol in ("kitti", "dair"):
+        assert false(tiny, protocol) > 5
+        assert false(replace(tiny, ignored_regions={"front": nowhere}), protocol) == 0
+    # Labels of one camera only: a box behind it can be neither right nor false.
+    behind = moved(found, -60.0)
+    only = replace(tiny, labels=replace(tiny.labels, cameras=("front",)))
+    rows = [evaluate_boxes(behind, log, Options("dair"))["classes"]["vehicle"]["figures"][0] for log in (tiny, only)]
+    assert rows[0]["false_positives"] > 5
+    assert rows[1]["false_positives"] == 0
+
+
+def test_kinds_of_the_log_are_ignored_where_the_protocol_says_so(tiny: Log) -> None:
+    found = detect_log(tiny, LABELS).found
+    labels = tiny.labels
+    kind = np.where(labels.track_id == "parked", "Van", "Car")
+    result = evaluate_boxes(found, replace(tiny, labels=replace(labels, kind=kind)), Options("kitti"))
+    row = result["classes"]["car"]["figures"][0]
+    plain = evaluate_boxes(found, tiny, Options("kitti"))["classes"]["car"]["figures"][0]
+    assert row["truths"] < plain["truths"]
+    assert row["false_positives"] == 0
+
+
+def test_a_log_of_another_time_and_one_without_labels_are_refused(tiny: Log) -> None:
+    found = detect_log(tiny, LABELS).found
+    later = replace(found, t_ns=found.t_ns + 3600 * NS)
+    with pytest.raises(LogError, match="are both of one log"):
+        evaluate_boxes(later, tiny, Options("center"))
+    with pytest.raises(LogError, match="no labeled 3D boxes"):
+        evaluate_boxes(found, replace(tiny, labels=None), Options("center"))
+    with pytest.raises(LogError, match="of no sweep"):
+        evaluate_boxes(replace(found, t_ns=found.t_ns[:0], boxes=()), tiny, Options("center"))
+    with pytest.raises(ConfigError, match="need a camera"):
+        evaluate_boxes(found, replace(tiny, cameras={}), Options("kitti"))
+
+
+def test_options_name_what_is_wrong() -> None:
+    with pytest.raises(ConfigError, match=r"'kiti' \(did you mean 'kitti'"):
+        Options("kiti")
+    with pytest.raises(ConfigError, match="--score"):
+        Options("kitti", min_score=1.5)
+    with pytest.raises(ConfigError, match="--range: 0 m"):
+        Options("kitti", max_range_m=0.0)
+    with pytest.raises(ConfigError, match="has no 'truck'"):
+        Options("kitti", classes=["truck"]).chosen()
+    assert [c.name for c in Options("center", classes=["two_wheeler", "bus"]).chosen()] == ["two_wheeler", "bus"]
+
+
+def test_detect_and_evaluate_as_commands(tiny_folder: Path, tmp_path: Path) -> None:
+    boxes, metrics, picture = (tmp_path / n for n in ("boxes.json", "metrics.json", "scores.png"))
+    ran = run("detect", tiny_folder, "--detector", "lidar:labels", "--start", 0.3, "--stop", 0.6, "--out", boxes)
+    assert ran.code == 0, ran.err
+    assert "in 4 sweeps by lidar:labels" in ran.out
+    assert run("validate", boxes).code == 0
+    ran = run("evaluate", boxes, "--truth", tiny_folder, "--protocol", "dair", "--out", metrics, "--plot", picture)
+    assert ran.code == 0, ran.err
+    assert "IoU 3D > 0.5" in ran.out
+    assert "expected calibration error of the scores 0.000" in ran.out
+    assert run("validate", metrics).code == 0
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+    assert names(tmp_path) == ["boxes.json", "metrics.json", "scores.png"]
+    assert run("evaluate", boxes, "--truth", tiny_folder, "--quiet").out == ""
+    assert run("detect", tiny_folder, "--detector", "lidar:labels", "--out", boxes).code == 2
+
+
+def test_commands_say_in_a_line_what_they_cannot_do(tiny_folder: Path, tiny_scenario: Path, tmp_path: Path) -> None:
+    boxes = tmp_path / "boxes.json"
+    for detector in ("labels", "ssd-mobilenet-v2+lidar:labels"):
+        ran = run("detect", tiny_folder, "--detector", detector, "--out", boxes)
+        assert ran.code == 2
+        assert "begins with 'lidar:'" in ran.line
+    assert (
+        "unknown LiDAR detector 'lables' (did you mean 'labels'?)"
+        in run("detect", tiny_folder, "--detector", "lidar:lables", "--out", boxes).line
+    )
+    assert run("detect", tiny_folder, "--detector", "lidar:labels", "--start", 99, "--out", boxes).code == 2
+    assert names(tmp_path) == []
+    assert run("detect", tiny_folder, "--detector", "lidar:labels", "--out", boxes, "--quiet").out == ""
+    assert "--protocol: unknown protocol" in run("evaluate", boxes, "--truth", tiny_folder, "--protocol", "coco").line
+    assert "is no folder" in run("evaluate", boxes, "--truth", boxes).line
+    ran = run("evaluate", tiny_scenario, "--truth", tiny_folder, "--score", 0.4)
+    assert ran.code == 2
+    assert "--score: is for boxes" in ran.line
+
+
+def test_a_log_without_lidar_is_refused(tiny: Log) -> None:
+    with pytest.raises(LogError, match="no LiDAR"):
+        detect_log(replace(tiny, lidars={}), LABELS)
+
+
+def test_truth_of_a_log_without_sweeps_knows_no_points(tiny: Log) -> None:
+    found = detect_log(tiny, LABELS).found
+    result = evaluate_boxes(found, replace(tiny, lidars={}), Options("dair"))
+    assert result["min_points"] is None
+    assert result["classes"]["vehicle"]["by_points"] is None
+    assert result["classes"]["vehicle"]["figures"][0]["recall"] > 0.9
