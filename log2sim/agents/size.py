@@ -156,10 +156,11 @@ def _persistent_points(clusters: list[NDArray[np.float64]]) -> Array:
     points = np.concatenate(clusters)
     tick = np.repeat(np.arange(len(clusters)), [len(c) for c in clusters])
     cell = np.floor(points[:, :2] / VOXEL_M).astype(np.int64)
-    _, key = np.unique(cell, axis=0, return_inverse=True)
-    seen = np.unique(np.stack([key.ravel(), tick], axis=1), axis=0)
-    count = np.bincount(seen[:, 0])
-    return points[count[key.ravel()] >= max(MIN_PERSISTENT_SHARE * len(clusters), min(2, len(clusters)))]
+    cell -= cell.min(axis=0)
+    # Cell and tick in one number: sorting numbers is ten times as fast as sorting rows.
+    _, key = np.unique(cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1], return_inverse=True)
+    count = np.bincount(np.unique(key * len(clusters) + tick) // len(clusters))
+    return points[count[key] >= max(MIN_PERSISTENT_SHARE * len(clusters), min(2, len(clusters)))]
 
 
 def _estimate_size(

@@ -15,7 +15,7 @@ MIN_EDGE_DISTANCE_M = 0.03
 MAX_FIT_POINTS = 256
 MIN_CONTRAST = 0.1
 # A yaw known from elsewhere is corrected by at least so many points, and by no more than it can be wrong.
-MIN_YAW_POINTS = 30
+MIN_YAW_POINTS, MAX_CORRECTION_POINTS = 30, 128
 MAX_YAW_CORRECTION_RAD = np.deg2rad(12.0)
 # A side longer than this multiple of the typical width is not a front or rear.
 MAX_WIDTH_FACTOR = 1.2
@@ -57,7 +57,7 @@ def corrected_yaw(points: Array, yaw_rad: float) -> float:
     """Correct a yaw that is known roughly by the direction of the sides of points (n, 2), where they show it."""
     if len(points) < MIN_YAW_POINTS:
         return yaw_rad
-    fitted, contrast = fit_yaw(points)
+    fitted, contrast = fit_yaw(subsample(points, MAX_CORRECTION_POINTS))
     fitted = align_to(fitted, yaw_rad, np.pi / 2)
     known = contrast >= MIN_CONTRAST and abs(float(wrap_angle(fitted - yaw_rad))) <= MAX_YAW_CORRECTION_RAD
     return fitted if known else yaw_rad

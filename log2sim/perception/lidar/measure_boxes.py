@@ -34,13 +34,17 @@ def measure_boxes(boxes: Boxes3D, cloud: Cloud) -> Measurements:
 
 def _members(boxes: Boxes3D, cloud: Cloud) -> list[NDArray[np.intp]]:
     """Find the points of the cloud above the ground in each box, somewhat widened; each point belongs to one box."""
-    center = boxes.center_m - cloud.origin
-    found = points_of_boxes(cloud.obstacle_columns.T, center, boxes.size_m + 2 * BOX_MARGIN_M, boxes.yaw_rad)
-    local = rotate(cloud.obstacle_columns.T[found.point, :2] - center[found.box, :2], -boxes.yaw_rad[found.box])
-    outside_m = (np.abs(local) - boxes.size_m[found.box, :2] / 2).max(axis=1)
+    center, xyz = boxes.center_m - cloud.origin, cloud.xyz[cloud.obstacles]
+    found = points_of_boxes(xyz, center, boxes.size_m + 2 * BOX_MARGIN_M, boxes.yaw_rad)
+    own = np.ones(len(found.point), dtype=bool)
     # Of several boxes that hold a point, it is deepest in its own.
-    order = np.lexsort((outside_m, found.point))
-    own = order[np.r_[True, np.diff(found.point[order]) != 0]] if len(order) else order
-    own = np.sort(own)
+    shared = np.flatnonzero(np.bincount(found.point, minlength=len(xyz))[found.point] > 1)
+    if len(shared):
+        point, box = found.point[shared], found.box[shared]
+        local = rotate(xyz[point, :2] - center[box, :2], -boxes.yaw_rad[box])
+        outside_m = (np.abs(local) - boxes.size_m[box, :2] / 2).max(axis=1)
+        order = np.lexsort((outside_m, point))
+        own[shared[order[np.r_[False, np.diff(point[order]) == 0]]]] = False
     edges = np.searchsorted(found.box[own], np.arange(len(boxes) + 1))
-    return [cloud.obstacles[found.point[own[a:b]]] for a, b in pairwise(edges)]
+    members = cloud.obstacles[found.point[own]]
+    return [members[a:b] for a, b in pairwise(edges)]
