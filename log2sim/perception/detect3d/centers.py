@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.perception.detect3d.level_boxes import LevelBoxes, MapCells, boxes_of_cells
+from log2sim.perception.detect3d.level_boxes import LevelBoxes, boxes_of_cells, cells_around
 from log2sim.perception.detect3d.network import NetworkInfo
 
 # Fainter peaks are hardly ever objects: a calibrated score can raise them but by their points and range.
@@ -28,10 +28,13 @@ def decode_centers(maps: NDArray[np.float32], info: NetworkInfo, low: Array) -> 
     Notes
     -----
     Zhou, Wang and Kraehenbuehl (2019), "Objects as Points": a cell of the greatest heat among its eight neighbors is an
-    object's center.
+    object's center. Networks are taught an object's box in the cells around its center too; the mean over those that mean
+    the same object errs less than the box of a single cell.
     """
     group, flat = peaks(maps[info.channels.heat])
-    return boxes_of_cells(MapCells.at(maps, flat, info, low), group, info)
+    cells = cells_around(maps, flat, group, info, low)
+    heat = maps.reshape(len(maps), -1)[info.channels.heat][group, flat].astype(np.float64)
+    return boxes_of_cells(cells, group, heat, info)
 
 
 def peaks(heat: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -18,6 +18,12 @@ MIN_SIDE_M, MAX_SIDE_M = 0.1, 30.0
 MAX_OFFSET_M = 15.0
 MIN_CENTER_HEIGHT_M, MAX_CENTER_HEIGHT_M = -1.0, 5.0
 MAX_LOGIT = 30.0
+# Cells on each side of a center whose boxes are averaged: 0.5 m, within which boxes are taught for all but the slimmest.
+AROUND_CELLS = 1
+# Centers this part of a width apart may be of one object.
+SAME_CENTER_WIDTHS = 0.5
+# Cells whose heat is a smaller part of the center's are of the background, where no box is taught.
+MIN_HEAT_SHARE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,24 +65,27 @@ class LevelBoxes:
         """The boxes seen from above."""
         return Rectangles(self.center_m[:, :2], self.size_m[:, :2], self.yaw_rad)
 
-    def strength(self, info: NetworkInfo) -> Array:
-        """Compute the part (M,) of the score's logit that does not depend on points and range."""
-        weights = self._weights(info)
-        return np.asarray(weights[0] + weights[1] * self.heat + weights[2] * self.quality)
+    def terms(self, points: NDArray[np.int64], range_m: Array) -> Array:
+        """Return what the score is computed from: (5, M), the terms of `NetworkInfo.calibration`.
 
-    def score(self, info: NetworkInfo, points: NDArray[np.int64], range_m: Array) -> Array:
-        """Compute the probability (M,) that each box is right, with its number of points and its range (M,), m."""
-        weights = self._weights(info)
-        return sigmoid(self.strength(info) + weights[3] * np.log1p(points) + weights[4] * range_m / 10.0)
+        Parameters
+        ----------
+        points : (M,) int64
+            Number of points in each box.
+        range_m : (M,) float64
+            Distance of the centers from the sensor in the plane.
+        """
+        return np.stack([np.ones(len(self)), self.heat, self.quality, np.log1p(points), range_m / 10.0])
 
-    def _weights(self, info: NetworkInfo) -> Array:
-        """Take the calibration (5, M) of each box's group."""
-        return np.array([info.calibration[group] for group in info.groups])[self.group].T
+    def score(self, info: NetworkInfo, terms: Array) -> Array:
+        """Compute the probability (M,) that each box is right from the first terms of the calibration, (up to 5, M)."""
+        weights = np.array([info.calibration[group] for group in info.groups])[self.group, : len(terms)]
+        return sigmoid((weights.T * terms).sum(axis=0))
 
 
 @dataclass(frozen=True, eq=False)
 class MapCells:
-    """Values of the maps at K cells.
+    """Values of the maps at K cells, or means of several cells each: all channels are such that means make sense.
 
     Attributes
     ----------
@@ -94,18 +103,58 @@ class MapCells:
         """Gather the cells at flat indices (K,) of maps (C, h, w) whose lower corner is at `low` (2,), m."""
         i, j = np.divmod(flat, maps.shape[2])
         middle = np.asarray(low) + (np.stack([i, j], axis=1) + 0.5) * (info.stride * info.cell_m)
-        return cls(middle, maps.reshape(len(maps), -1)[:, flat].astype(np.float64))
+        return cls(middle, maps.reshape(len(maps), -1).take(flat, axis=1).astype(np.float64))
+
+    def means(self, owner: NDArray[np.intp], weight: Array, count: int) -> MapCells:
+        """Average the cells of each of `count` owners (K,) with weights (K,); NaN for an owner without weight.
+
+        Cells with a value that is not finite count for nothing.
+        """
+        rows = np.concatenate([self.middle_m.T, self.values])
+        weight = np.where(np.isfinite(rows).all(axis=0), weight, 0.0)
+        rows = np.where(weight > 0, rows, 0.0) * weight
+        with np.errstate(invalid="ignore"):
+            mean = np.stack([np.bincount(owner, row, count) for row in rows]) / np.bincount(owner, weight, count)
+        return MapCells(mean[:2].T, mean[2:])
 
 
-def boxes_of_cells(cells: MapCells, group: NDArray[np.intp], info: NetworkInfo) -> LevelBoxes:
-    """Decode the box that each cell (K,) regresses for its group (K,); boxes that are not finite are left out."""
+def cells_around(
+    maps: NDArray[np.float32], flat: NDArray[np.intp], group: NDArray[np.intp], info: NetworkInfo, low: Array
+) -> MapCells:
+    """Average the cells around each of some cells (K,) whose boxes are centered where that of the cell itself is.
+
+    Cells are weighted by their heat for the group (K,). `maps`, `flat` and `low` are as for `MapCells.at`.
+    """
+    h, w = maps.shape[1:]
+    step = np.arange(-AROUND_CELLS, AROUND_CELLS + 1)
+    di, dj = (d.ravel() for d in np.meshgrid(step, step, indexing="ij"))
+    i, j = flat[:, None] // w + di, flat[:, None] % w + dj
+    inside = ((i >= 0) & (i < h) & (j >= 0) & (j < w)).ravel()
+    cells = MapCells.at(maps, np.where(inside, (i * w + j).ravel(), 0), info, low)
+    owner = np.repeat(np.arange(len(flat)), len(di))
+    own = owner * len(di) + len(di) // 2
+    x, y, _, _, width, _ = cells.values[info.channels.box]
+    with np.errstate(over="ignore", invalid="ignore"):
+        center = cells.middle_m.T + np.stack([x, y])
+        same = inside & (np.hypot(*(center - center[:, own])) < SAME_CENTER_WIDTHS * np.exp(width[own]))
+    heat = sigmoid(cells.values[info.channels.heat][group[owner], np.arange(len(owner))])
+    return cells.means(owner, np.where(same & (heat >= MIN_HEAT_SHARE * heat[own]), heat, 0.0), len(flat))
+
+
+def boxes_of_cells(cells: MapCells, group: NDArray[np.intp], heat: Array, info: NetworkInfo) -> LevelBoxes:
+    """Decode the box that each cell (K,) regresses for its group (K,); boxes that are not finite are left out.
+
+    Parameters
+    ----------
+    heat : (K,) float64
+        Logit of the object being there.
+    """
     channels, values = info.channels, cells.values
     box = values[channels.box]
     offset = np.clip(box[:2].T, -MAX_OFFSET_M, MAX_OFFSET_M)
     height = np.clip(box[2:3].T, MIN_CENTER_HEIGHT_M, MAX_CENTER_HEIGHT_M)
     size = np.exp(np.clip(box[3:6].T, np.log(MIN_SIDE_M), np.log(MAX_SIDE_M)))
     yaw, heading_score = headings(values[channels.axis], values[channels.direction])
-    heat = values[channels.heat][group, np.arange(len(group))]
     found = LevelBoxes(
         np.concatenate([cells.middle_m + offset, height], axis=1),
         size,

@@ -14,7 +14,7 @@ from log2sim.config import LidarConfig
 from log2sim.datatypes import Boxes3D, Log
 from log2sim.errors import ConfigError
 from log2sim.geometry import NS_PER_S
-from log2sim.perception.detect3d.box_points import points_of_boxes
+from log2sim.perception.detect3d.box_points import PointsOfBoxes, points_of_boxes
 from log2sim.perception.detect3d.centers import decode_centers
 from log2sim.perception.detect3d.grid import grid_window, rasterize
 from log2sim.perception.detect3d.level_boxes import LevelBoxes, sigmoid
@@ -26,6 +26,27 @@ from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.ground import ON_GROUND_M
 
 WEIGHTS = Path(__file__).parent / "weights"
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Boxes of a cloud before the weak ones and those that overlap are left out.
+
+    Attributes
+    ----------
+    boxes : M LevelBoxes
+    inside : PointsOfBoxes
+        Their points above the ground.
+    index : (n,) int
+        Of the points that `inside` numbers in the cloud.
+    terms : (5, M) float64
+        See `LevelBoxes.terms`.
+    """
+
+    boxes: LevelBoxes
+    inside: PointsOfBoxes
+    index: NDArray[np.intp]
+    terms: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,43 +73,44 @@ class NetworkDetector:
 
     def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
         """Detect road users in one cloud, best score first; points of `earlier` clouds make the grid denser."""
-        info = self.network.info
-        xyz, index = level_points(cloud, self.range_m)
-        if not len(xyz):
-            return Boxes3D.empty()
-        stacked = np.concatenate([xyz, stack_points(cloud, earlier, self.range_m)]) if earlier else xyz
-        low, shape = grid_window(stacked, cell_m=info.cell_m, range_m=self.range_m, center=sensor_xy(cloud))
-        grid = rasterize(stacked, cell_m=info.cell_m, low=low, shape=shape)
-        maps = self.network.run(grid)
-        found = decode_centers(maps, info, low) if self.decode == "centers" else decode_votes(maps, grid, info, low)
-        return self._boxes(found, xyz, index, cloud)
-
-    def _boxes(self, found: LevelBoxes, xyz: NDArray[np.float32], index: NDArray[np.intp], cloud: Cloud) -> Boxes3D:
-        """Score boxes by their points, choose among those that overlap and place them in the map."""
-        if self.decode == "centers":
-            # The same peak twice needs no count of points, which takes longest.
-            found = found.take(suppress(found.rectangles, found.strength(self.network.info), found.group, across=False))
-        above = xyz[:, 2] > ON_GROUND_M
-        inside = points_of_boxes(xyz, found.center_m, found.size_m, found.yaw_rad, above)
-        points = inside.count
-        score = self._scores(found, points, cloud)
+        found = self.candidates(cloud, earlier)
+        boxes, points = found.boxes, found.inside.count
+        score = sigmoid(boxes.heat) if self.decode == "votes" else boxes.score(self.network.info, found.terms)
         # What holds no point is nothing that the LiDAR saw.
-        good = np.flatnonzero((points > 0) & (score >= self._least(found)))
-        kept = good[suppress(found.rectangles.take(good), score[good], found.group[good])]
-        found, inside = found.take(kept), inside.take(kept)
-        center = found.center_m + cloud.origin
-        center[:, 2] += ground_under(found.center_m[:, :2], inside, cloud, index)
-        t_ns = cloud.stamp_ns + np.round(inside.mean(cloud.t_s.take(index)) * NS_PER_S).astype(np.int64)
+        good = np.flatnonzero((points > 0) & (score >= self._least(boxes)))
+        kept = good[suppress(boxes.rectangles.take(good), score[good], boxes.group[good])]
+        boxes, inside = boxes.take(kept), found.inside.take(kept)
+        center = boxes.center_m + cloud.origin
+        center[:, 2] += ground_under(boxes.center_m[:, :2], inside, cloud, found.index)
+        t_ns = cloud.stamp_ns + np.round(inside.mean(cloud.t_s.take(found.index)) * NS_PER_S).astype(np.int64)
         return Boxes3D(
-            t_ns, center, found.size_m, found.yaw_rad, found.heading_score, found.category, score[kept], points[kept]
+            t_ns, center, boxes.size_m, boxes.yaw_rad, boxes.heading_score, boxes.category, score[kept], points[kept]
         )
 
-    def _scores(self, found: LevelBoxes, points: NDArray[np.int64], cloud: Cloud) -> NDArray[np.float64]:
-        """Return the score (M,) of each box: calibrated, or the mean class probability of a cluster."""
+    def candidates(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Candidates:
+        """Find all boxes that may be road users, of those on one peak or cluster the strongest.
+
+        Notes
+        -----
+        The calibration of a network is fitted to the terms of these.
+        """
+        info = self.network.info
+        xyz, index = level_points(cloud, self.range_m)
+        stacked = np.concatenate([xyz, stack_points(cloud, earlier, self.range_m)]) if earlier else xyz
+        low, shape = grid_window(stacked[:, :2], cell_m=info.cell_m, range_m=self.range_m, center=sensor_xy(cloud))
+        grid = rasterize(stacked, cell_m=info.cell_m, low=low, shape=shape)
+        maps = self.network.run(grid)
         if self.decode == "votes":
-            return sigmoid(found.heat)
-        range_m = np.hypot(*(found.center_m[:, :2] - sensor_xy(cloud)).T)
-        return found.score(self.network.info, points, range_m)
+            boxes = decode_votes(maps, grid, info, low)
+        else:
+            boxes = decode_centers(maps, info, low)
+            # One peak more than once needs no count of points, which takes longest.
+            first = boxes.score(info, boxes.terms(np.zeros(len(boxes), np.int64), np.zeros(len(boxes)))[:3])
+            boxes = boxes.take(suppress(boxes.rectangles, first, boxes.group, across=False))
+        above = xyz[:, 2] > ON_GROUND_M
+        inside = points_of_boxes(xyz, boxes.center_m, boxes.size_m, boxes.yaw_rad, above)
+        range_m = np.hypot(*(boxes.center_m[:, :2] - sensor_xy(cloud)).T)
+        return Candidates(boxes, inside, index, boxes.terms(inside.count, range_m))
 
     def _least(self, found: LevelBoxes) -> NDArray[np.float64]:
         """Return the least score (M,) that each box needs."""

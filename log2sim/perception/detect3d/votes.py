@@ -12,14 +12,11 @@ from numpy.typing import NDArray
 from log2sim.datatypes import GROUPS, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M
 from log2sim.geometry import Array
 from log2sim.perception.detect3d.level_boxes import (
-    MAX_LOGIT,
     MAX_OFFSET_M,
     LevelBoxes,
     MapCells,
     boxes_of_cells,
-    categories_of,
-    category_logits,
-    headings,
+    cells_around,
 )
 from log2sim.perception.detect3d.network import NetworkInfo
 
@@ -46,20 +43,25 @@ def decode_votes(maps: NDArray[np.float32], grid: NDArray[np.float32], info: Net
         Its input, by whose greatest heights cells of the ground and empty ones are left out.
     low : (2,) float64, m
         Lower corner of both.
+
+    Notes
+    -----
+    The box is that which the network regresses around the middle of the cluster: only there is it taught, and the mean
+    over all cells of the cluster is much worse.
     """
     flat, probability = foreground(maps, grid, info)
     cells = MapCells.at(maps, flat, info, low)
     vote = cells.middle_m + np.clip(cells.values[info.channels.vote].T, -MAX_OFFSET_M, MAX_OFFSET_M)
-    finite = np.isfinite(cells.values).all(axis=0)
-    cells, vote, probability = (
-        MapCells(cells.middle_m[finite], cells.values[:, finite]),
-        vote[finite],
-        probability[:, finite],
-    )
-    if not len(vote):
-        return boxes_of_cells(cells, np.zeros(0, np.intp), info)
+    valid = np.flatnonzero(np.isfinite(cells.values).all(axis=0))
+    vote, probability = vote[valid], probability[:, valid]
     label = cluster(vote, probability.argmax(axis=0), bandwidths_m(info))
-    return boxes_of_clusters(cells, probability, label, info)
+    center, group, mean = summarize(vote, probability, label)
+    i, j = np.floor((center - low) / (info.stride * info.cell_m)).astype(np.intp).T
+    h, w = maps.shape[1:]
+    middle = np.clip(i, 0, h - 1) * w + np.clip(j, 0, w - 1)
+    logit = np.log(mean) - np.log1p(-np.minimum(mean, 1 - 1e-12))
+    found = boxes_of_cells(cells_around(maps, middle, group, info, low), group, logit, info)
+    return found.take(usual_height(found, info))
 
 
 def foreground(
@@ -161,42 +163,35 @@ def mean_shift(vote: Array, bandwidth_m: float) -> tuple[Array, NDArray[np.intp]
     return mode * side + corner, inverse[index]
 
 
-def boxes_of_clusters(cells: MapCells, probability: Array, label: NDArray[np.intp], info: NetworkInfo) -> LevelBoxes:
-    """Average the boxes that the cells of each cluster regress, weighted by the probability of the cluster's class.
+def summarize(vote: Array, probability: Array, label: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp], Array]:
+    """Find center, class and class probability of each of K clusters.
 
-    Clusters whose height is not one of their category are left out.
+    Parameters
+    ----------
+    vote : (n, 2) float64, m
+    probability : (G, n) float64
+    label : (n,) int
+        Cluster of each vote.
+
+    Returns
+    -------
+    center : (K, 2) float64, m
+        Mean vote of the cells of the cluster's class, weighted by its probability.
+    group : (K,) int
+        The class that most cells have, each counted by its probability.
+    mean : (K,) float64
+        Mean probability of that class over all cells.
     """
-    count = int(label.max()) + 1
+    count = int(label.max(initial=-1)) + 1
     best = probability.argmax(axis=0)
     support = [np.bincount(label, p * (best == k), minlength=count) for k, p in enumerate(probability)]
     group = np.argmax(support, axis=0)
-    of_class = np.bincount(label, probability[group[label], np.arange(len(label))], minlength=count)
-    mean = of_class / np.bincount(label, minlength=count)
-    own = np.flatnonzero(best == group[label])
-    label, weight = label[own], probability[group[label[own]], own]
-    each = boxes_of_cells(MapCells(cells.middle_m[own], cells.values[:, own]), group[label], info)
+    of_class = probability[group[label], np.arange(len(label))]
+    mean = np.bincount(label, of_class, minlength=count) / np.bincount(label, minlength=count)
+    weight = np.where(best == group[label], of_class, 0.0)
     total = np.bincount(label, weight, minlength=count)
-
-    def average(values: Array) -> Array:
-        """Average rows of values (..., n) over the clusters: (..., count)."""
-        return np.asarray(np.apply_along_axis(lambda row: np.bincount(label, weight * row, count) / total, -1, values))
-
-    values = cells.values[:, own]
-    yaw, heading_score = headings(average(values[info.channels.axis]), average(values[info.channels.direction]))
-    logits = {name: average(v) for name, v in category_logits(values, info).items()}
-    category = categories_of(logits, group, info)
-    logit = np.clip(np.log(mean) - np.log1p(-np.minimum(mean, 1 - 1e-12)), -MAX_LOGIT, MAX_LOGIT)
-    found = LevelBoxes(
-        average(each.center_m.T).T,
-        np.exp(average(np.log(each.size_m.T))).T,
-        yaw,
-        heading_score,
-        group,
-        category,
-        logit,
-        average(each.quality),
-    )
-    return found.take(usual_height(found, info))
+    center = np.stack([np.bincount(label, weight * v, minlength=count) / total for v in vote.T], axis=1)
+    return center, group, mean
 
 
 def usual_height(found: LevelBoxes, info: NetworkInfo) -> NDArray[np.bool_]:
