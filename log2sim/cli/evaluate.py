@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from log2sim.cli.options import Overwrite, Quiet, Sequence, say
 from log2sim.cli.truth import load_truth
+
+if TYPE_CHECKING:
+    from log2sim.datatypes import Log, Scenario
 
 PROTOCOL = "center"
 
@@ -46,72 +50,74 @@ def evaluate(
     quiet: Quiet = False,
 ) -> None:
     """Compare a scenario, or detected boxes, with the ground truth."""
-    from log2sim.documents import check_targets, read_json
+    from log2sim.documents import check_targets, read_json, write_json
     from log2sim.errors import ConfigError, ScenarioError
     from log2sim.evaluation.detection.boxes_file import is_boxes_document
 
     check_targets(out, plot, overwrite=overwrite)
     document = read_json(path, ScenarioError)
     wanted = [c.strip() for c in categories.split(",")] if categories else None
+    only_boxes = {"--protocol": protocol, "--score": score, "--plot": plot}
     if is_boxes_document(document):
         options = {"protocol": protocol or PROTOCOL, "max_range_m": range, "classes": wanted}
-        if score is not None:
-            options["min_score"] = score
-        _evaluate_boxes(document, path, truth, sequence, options, out, plot, quiet=quiet)
-        return
-    given = [
-        name for name, value in (("--protocol", protocol), ("--score", score), ("--plot", plot)) if value is not None
-    ]
-    if given:
-        raise ConfigError(f"{given[0]}: is for boxes of `log2sim detect`; {path} is no boxes file, so leave it out")
-    _evaluate_scenario(document, path, truth, sequence, range, wanted, out, quiet=quiet)
+        options |= {} if score is None else {"min_score": score}
+        result, table = _boxes_figures(path, document, _log_of(truth, sequence), options, quiet=quiet)
+    else:
+        for name in (name for name, value in only_boxes.items() if value is not None):
+            raise ConfigError(f"{name}: is for boxes of `log2sim detect`; {path} is no boxes file, so leave it out")
+        scenario = _scenario(path, document)
+        result, table = _scenario_figures(scenario, load_truth(truth, scenario, sequence), range, wanted)
+    if out is not None:
+        write_json(out, result)
+    if plot is not None:
+        from log2sim.visualization.plot.reliability import write_reliability
+
+        write_reliability({name: figures["calibration"] for name, figures in result["classes"].items()}, plot)
+    say(table, quiet=quiet)
 
 
-def _evaluate_scenario(
-    document: Any,
-    path: Path,
-    truth: Path,
-    sequence: str | None,
-    max_range_m: float | None,
-    categories: list[str] | None,
-    out: Path | None,
-    *,
-    quiet: bool,
-) -> None:
+def _scenario(path: Path, document: Any) -> Scenario:
     from log2sim.datatypes import Scenario
-    from log2sim.documents import write_json
     from log2sim.errors import ScenarioError
+
+    try:
+        return Scenario.from_dict(document)
+    except ScenarioError as error:
+        raise ScenarioError(f"{path}: {error}") from None
+
+
+def _scenario_figures(
+    scenario: Scenario, truth: Scenario, max_range_m: float | None, categories: list[str] | None
+) -> tuple[dict[str, Any], str]:
     from log2sim.evaluation.metrics.evaluator import evaluate as run
     from log2sim.evaluation.metrics.table import format_table
 
-    try:
-        loaded = Scenario.from_dict(document)
-    except ScenarioError as error:
-        raise ScenarioError(f"{path}: {error}") from None
-    result = run(loaded, load_truth(truth, loaded, sequence), max_range_m=max_range_m, categories=categories)
-    if out is not None:
-        write_json(out, result)
-    say(format_table(result), quiet=quiet)
+    result = run(scenario, truth, max_range_m=max_range_m, categories=categories)
+    return result, format_table(result)
 
 
-def _evaluate_boxes(
-    document: Any,
-    path: Path,
-    truth: Path,
-    sequence: str | None,
-    options: dict[str, Any],
-    out: Path | None,
-    plot: Path | None,
-    *,
-    quiet: bool,
-) -> None:
+def _log_of(path: Path, sequence: str | None) -> Callable[[], Log]:
+    """Return a function that opens the log with the true boxes, once everything else is known to be right."""
+
+    def opened() -> Log:
+        from log2sim.errors import LogError
+        from log2sim.logs.opening import open_log
+
+        if path.is_file():
+            raise LogError(f"{path}: is a file; the truth of boxes is the folder of a log with labels")
+        return open_log(path, sequence=sequence)
+
+    return opened
+
+
+def _boxes_figures(
+    path: Path, document: Any, truth: Callable[[], Log], options: dict[str, Any], *, quiet: bool
+) -> tuple[dict[str, Any], str]:
     from log2sim.cli.progress import progress
-    from log2sim.documents import write_json
     from log2sim.errors import LogError
     from log2sim.evaluation.detection.boxes_file import DetectedBoxes
     from log2sim.evaluation.detection.evaluation import Options, evaluate_boxes
     from log2sim.evaluation.detection.table import format_table
-    from log2sim.logs.opening import open_log
 
     chosen = Options(**options)
     chosen.chosen()
@@ -119,17 +125,8 @@ def _evaluate_boxes(
         detected = DetectedBoxes.from_dict(document)
     except LogError as error:
         raise LogError(f"{path}: {error}") from None
-    if not truth.is_dir():
-        raise LogError(f"{truth}: is no folder; the truth of boxes is a log with labels")
-    opened = open_log(truth, sequence=sequence)
     with progress(quiet=quiet) as report_progress:
         result = evaluate_boxes(
-            detected, opened, chosen, progress=lambda done, total: report_progress("count points", done, total)
+            detected, truth(), chosen, progress=lambda done, total: report_progress("count points", done, total)
         )
-    if out is not None:
-        write_json(out, result)
-    if plot is not None:
-        from log2sim.visualization.plot.reliability import write_reliability
-
-        write_reliability({name: figures["calibration"] for name, figures in result["classes"].items()}, plot)
-    say(format_table(result), quiet=quiet)
+    return result, format_table(result)

@@ -25,6 +25,8 @@ class LabelTracks:
     t_ns : (L,) int64
     pose : (L, 4) float64
         Center x, y, z and yaw.
+    size_m : (rows of the log's labels, 3) float64
+        In the order of the log.
     row : (L,) int64
         Index in the log's labels.
     first : (K + 1,) int64
@@ -35,6 +37,7 @@ class LabelTracks:
 
     t_ns: NDArray[np.int64]
     pose: Array
+    size_m: Array
     row: NDArray[np.int64]
     first: NDArray[np.int64]
     period_s: float
@@ -51,6 +54,7 @@ class LabelTracks:
         return cls(
             t,
             np.column_stack([labels.center_m[order], labels.yaw_rad[order]]),
+            labels.size_m,
             order.astype(np.int64),
             np.append(np.flatnonzero(np.diff(k, prepend=-1)), len(order)).astype(np.int64),
             float(np.median(steps)) / NS_PER_S if len(steps) else 0.0,

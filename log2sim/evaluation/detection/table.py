@@ -24,35 +24,44 @@ AT_SCORE = (
 def format_table(result: Mapping[str, Any]) -> str:
     """Format a result of `evaluate_boxes`; '-' for None.
 
-    Classes without a true and a found box, categories that are all of their group, and the looser limits of difficulties are
-    left out; the document has them.
+    Left out are classes without a true and a found box, categories that are all of their group, rows without true boxes,
+    and the looser limits of difficulties; the document has them.
     """
     columns = (*AVERAGES[result["protocol"]], *AT_SCORE)
     cells = [["class", "objects", "match", "truths", *(title for _, title in columns)]]
-    notes: list[str] = []
-    shown: list[Any] = []
+    shown: dict[str, list[Mapping[str, Any]]] = {}
     for name, figures in result["classes"].items():
-        rows = [row for row in _rows(figures) if row["truths"] or row["true_positives"] + row["false_positives"]]
-        if rows and rows not in shown:
-            shown.append(rows)
-            for row in rows:
-                match = str(Criterion(**row["match"]))
-                values = [_cell(row[key]) for key, _ in columns]
-                cells.append([name, row["objects"], match, str(row["truths"]), *values])
-        scores = figures["calibration"]
-        error = scores["expected_calibration_error"]
-        if rows and shown[-1] is rows and error is not None:
-            where = f"{scores['boxes']} boxes, {Criterion(**scores['match'])}"
-            notes.append(f"{name}: expected calibration error of the scores {error:.3f} ({where})")
+        rows = _rows(figures)
+        if rows and rows not in shown.values():
+            shown[name] = rows
+    for name, rows in shown.items():
+        for row in rows:
+            values = [_cell(row[key]) for key, _ in columns]
+            cells.append([name, row["objects"], str(Criterion(**row["match"])), str(row["truths"]), *values])
     widths = [max(len(row[k]) for row in cells) for k in range(len(cells[0]))]
     lines = ["  ".join(_aligned(row, widths)).rstrip() for row in cells]
-    return "\n".join([*lines, *notes, _scope(result)])
+    scores = [_score_note(name, result["classes"][name]["calibration"]) for name in shown]
+    return "\n".join([*lines, *filter(None, scores), _scope(result)])
 
 
 def _rows(figures: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Select the rows of a class."""
     limit = figures["calibration"]["match"]["limit"]
-    rows = [row for row in figures["figures"] if row["objects"] == "all" or row["match"]["limit"] == limit]
-    return [*rows, *figures["by_range"], *(figures["by_points"] or [])]
+    everything = [row for row in figures["figures"] if row["objects"] == "all"]
+    parts = [row for row in figures["figures"] if row["objects"] != "all" and row["match"]["limit"] == limit]
+    parts += [*figures["by_range"], *(figures["by_points"] or [])]
+    if not any(row["truths"] for row in (*everything, *parts)):
+        # Only false boxes, which one match tells as well as all.
+        return [row for row in everything[:1] if row["false_positives"]]
+    return [*everything, *(row for row in parts if row["truths"])]
+
+
+def _score_note(name: str, scores: Mapping[str, Any]) -> str:
+    error = scores["expected_calibration_error"]
+    if error is None:
+        return ""
+    where = f"{scores['boxes']} boxes, {Criterion(**scores['match'])}"
+    return f"{name}: expected calibration error of the scores {error:.3f} ({where})"
 
 
 def _scope(result: Mapping[str, Any]) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.config import Config
-from log2sim.datatypes import Log
+from log2sim.datatypes import Labels, Log
 from log2sim.errors import LogError
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.label_tracks import MAX_LAG_NS, MAX_PERIODS, LabelTracks
@@ -17,7 +17,7 @@ from log2sim.evaluation.detection.sweep_clouds import clouds, middle_ns, only_ti
 from log2sim.geometry import NS_PER_S, Array, nearest_index, period_of
 from log2sim.perception.detect3d.box_points import points_of_boxes
 from log2sim.perception.frames import RecordReader
-from log2sim.perception.lidar.cloud import cloud_origin
+from log2sim.perception.lidar.cloud import Cloud, cloud_origin
 from log2sim.pipeline import Run, start
 
 MAX_STAMP_ERROR_NS = 1_000_000
@@ -81,27 +81,31 @@ def truth_of_sweeps(
     tracks = LabelTracks.of(labels)
     labeled = labeled_sweeps(np.sort(labels.t_ns), middle, tracks.period_s)
     if not labeled.any():
-        raise LogError(
-            f"{log.name}: none of the {len(t_ns)} sweeps is labeled; they last from {t_ns[0] / NS_PER_S:.3f} to "
-            f"{t_ns[-1] / NS_PER_S:.3f} s, the labels from {labels.t_ns.min() / NS_PER_S:.3f} to "
-            f"{labels.t_ns.max() / NS_PER_S:.3f} s; are both of one log?"
-        )
+        raise LogError(_nothing_in_common(log, labels, t_ns))
     sweep, track = tracks.present(middle)
     sweep, track = sweep[labeled[sweep]], track[labeled[sweep]]
-    seen_ns, points = middle[sweep], None
+    seen = Sightings(sweep, track, middle[sweep], None)
     if run is not None:
-        seen_ns, points = _seen(run, t_ns, sweep, track, tracks, middle, progress)
-    pose, rows = tracks.at(track, seen_ns)
+        seen = _seen_by_lidar(run, t_ns, tracks, seen, progress)
+    pose, rows = tracks.at(track, seen.t_ns)
     origin = np.array([cloud_origin(log, int(t))[0] for t in t_ns])
     box = np.column_stack([pose[:, :3], labels.size_m[rows], pose[:, 3]])
     away = np.hypot(*(box[:, :2] - origin[sweep, :2]).T)
-    none = np.zeros(len(rows), dtype=np.int64)
     return SweepTruth(
         labeled,
-        SceneBoxes.of(box, labels.category[rows], scene=sweep, points=points, range_m=away),
+        SceneBoxes.of(box, labels.category[rows], scene=sweep, points=seen.points, range_m=away),
         origin,
         np.full(len(rows), "") if labels.kind is None else labels.kind[rows],
-        none if labels.occlusion is None else labels.occlusion[rows],
+        np.zeros(len(rows), dtype=np.int64) if labels.occlusion is None else labels.occlusion[rows],
+    )
+
+
+def _nothing_in_common(log: Log, labels: Labels, t_ns: NDArray[np.int64]) -> str:
+    times = ((v.min() / NS_PER_S, v.max() / NS_PER_S) for v in (t_ns, labels.t_ns))
+    (first, last), (first_label, last_label) = times
+    return (
+        f"{log.name}: none of the {len(t_ns)} sweeps is labeled; they last from {first:.3f} to {last:.3f} s, the labels "
+        f"from {first_label:.3f} to {last_label:.3f} s; are both of one log?"
     )
 
 
@@ -130,34 +134,53 @@ def labeled_sweeps(labels_t_ns: NDArray[np.int64], middle_ns: NDArray[np.int64],
     return np.asarray(near | ((middle_ns >= labels_t_ns[0]) & (middle_ns <= labels_t_ns[-1])))
 
 
-def _seen(
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """Labeled objects in sweeps; L rows.
+
+    Attributes
+    ----------
+    sweep, track : (L,) int64
+        Indices of both.
+    t_ns : (L,) int64
+        When the LiDARs saw the object, the middle of the sweep where they did not.
+    points : (L,) int64 or None
+        Points above the ground in its box.
+    """
+
+    sweep: NDArray[np.int64]
+    track: NDArray[np.int64]
+    t_ns: NDArray[np.int64]
+    points: NDArray[np.int64] | None
+
+
+def _seen_by_lidar(
     run: Run,
     t_ns: NDArray[np.int64],
-    sweep: NDArray[np.int64],
-    track: NDArray[np.int64],
     tracks: LabelTracks,
-    middle: NDArray[np.int64],
+    asked: Sightings,
     progress: Callable[[int, int], None] | None,
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Find when (L,) the LiDARs saw each object, the middle of the sweep without points, and its number of points (L,)."""
-    stamps, labels = stamps_of(run), run.log.labels
-    assert labels is not None
+) -> Sightings:
+    """Read the sweeps with stamps (F,) to find when objects were seen and with how many points."""
+    stamps = stamps_of(run)
     tick = nearest_index(stamps, t_ns)
     known = np.flatnonzero(np.abs(stamps[tick] - t_ns) <= MAX_STAMP_ERROR_NS)
-    seen_ns, counts = middle[sweep], np.zeros(len(sweep), dtype=np.int64)
-    needed = known[np.isin(known, sweep)]
+    seen_ns, points = asked.t_ns.copy(), np.zeros(len(asked.sweep), dtype=np.int64)
+    needed = known[np.isin(known, asked.sweep)]
     for done, searched in enumerate(clouds(only_ticks(run, tick[needed]), RecordReader(run.log), None), start=1):
-        mine = np.flatnonzero(sweep == needed[searched.tick])
+        mine = np.flatnonzero(asked.sweep == needed[searched.tick])
         if searched.cloud is not None:
-            above = ~searched.cloud.ground
-            for _ in range(2):  # where labels are in the middle of the sweep, then where they were seen
-                pose, rows = tracks.at(track[mine], seen_ns[mine])
-                local = pose[:, :3] - searched.cloud.origin
-                inside = points_of_boxes(searched.cloud.xyz[above], local, labels.size_m[rows], pose[:, 3])
-                mean_s = inside.mean(searched.cloud.t_s[above])
-                mean_ns = searched.cloud.stamp_ns + np.round(mean_s * NS_PER_S).astype(np.int64)
-                counts[mine] = inside.count
-                seen_ns[mine] = np.where(inside.count > 0, mean_ns, seen_ns[mine])
+            for _ in range(2):  # where objects are in the middle of the sweep, then where they were seen
+                pose, rows = tracks.at(asked.track[mine], seen_ns[mine])
+                points[mine], mean_ns = points_above_ground(searched.cloud, pose, tracks.size_m[rows])
+                seen_ns[mine] = np.where(points[mine] > 0, mean_ns, seen_ns[mine])
         if progress is not None:
             progress(done, len(needed))
-    return seen_ns, counts
+    return Sightings(asked.sweep, asked.track, seen_ns, points)
+
+
+def points_above_ground(cloud: Cloud, pose: Array, size_m: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Count the points (M,) above the ground in boxes with poses (M, 4), x, y, z, yaw, and average their stamps (M,), ns."""
+    above = ~cloud.ground
+    inside = points_of_boxes(cloud.xyz[above], pose[:, :3] - cloud.origin, size_m, pose[:, 3])
+    return inside.count, cloud.stamp_ns + np.round(inside.mean(cloud.t_s[above]) * NS_PER_S).astype(np.int64)

@@ -51,7 +51,7 @@ def _draw(axes: Axes, name: str, table: Mapping[str, Any]) -> None:
     score, precision = [b["mean_score"] for b in bins], [b["precision"] for b in bins]
     axes.plot([0, 1], [0, 1], color=FRAME, lw=1, zorder=1)
     axes.plot(score, precision, color=PALETTE[0], lw=1.2, zorder=2)
-    axes.scatter(score, precision, s=area, color=PALETTE[0], edgecolor=PAPER, lw=0.6, zorder=3)
+    axes.scatter(score, precision, s=area, color=PALETTE[0], edgecolor=PAPER, lw=0.6, zorder=3, clip_on=False)
     axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal")
     axes.grid(color=GRID, lw=0.6)
     axes.set_axisbelow(True)
