@@ -119,6 +119,18 @@ def test_score_grows_with_points_as_calibrated(monkeypatch: pytest.MonkeyPatch) 
     assert found.score[0] == pytest.approx(expected, abs=1e-6)
 
 
+def test_a_person_in_a_car_that_proves_weak_by_range_does_not_take_the_car_away(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    weights = {"vehicle": [0, 1, 0, 0, 0], "two_wheeler": [0, 1, 0, 0, 0], "pedestrian": [2, 1, 0, 0, -5]}
+    person = (11.1, 6.5, 0.75, 0.8, 0.8, 1.5, 0.0)
+    detector = fixed(monkeypatch, ("car", BOX), ("pedestrian", person), info=info(calibration=weights), min_score=0.0)
+    cloud = cloud_of(solid(10, 6, yaw=0.6))
+    assert detector.candidates(cloud).inside.count.min() > 0
+    assert detector.candidates(cloud).terms[1].tolist() == pytest.approx([4.0, 4.0])
+    assert detector.detect(cloud).category.tolist() == ["car"]
+
+
 def test_earlier_clouds_are_in_the_grid_but_not_among_the_points(monkeypatch: pytest.MonkeyPatch) -> None:
     cloud, shift = cloud_of(solid(10, 6, yaw=0.6)), np.array([3.0, -2.0, 5.0])
     again = cloud_of(solid(10, 6, yaw=0.6) - np.array([3.0, -2.0, 0]), origin=ORIGIN + shift)
