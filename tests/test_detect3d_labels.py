@@ -12,8 +12,8 @@ from log2sim import registry
 from log2sim.config import Config, LidarConfig
 from log2sim.datatypes import Boxes3D, Log
 from log2sim.errors import ConfigError
-from log2sim.geometry import Array, points_in_box
-from log2sim.perception.detect3d.box_points import points_of_boxes
+from log2sim.geometry import Array, box_corners_bev, points_in_box
+from log2sim.perception.detect3d.box_points import bounding_reach, most_points, points_of_boxes
 from log2sim.perception.detect3d.detectors import create_lidar_detector
 from log2sim.perception.lidar.cloud import Cloud
 
@@ -109,6 +109,21 @@ def test_points_of_boxes_are_those_of_each_box_alone(scale: float) -> None:
     assert some.count.tolist() == [-(-len(e) // max(-(-len(e) // 10), 1)) for e in expected]
     assert set(zip(some.box.tolist(), some.point.tolist())) <= set(zip(found.box.tolist(), found.point.tolist()))
     np.testing.assert_allclose(z, [xyz[e, 2].mean(dtype=float) if len(e) else 0.0 for e in expected], atol=1e-5 * scale)
+
+
+def test_no_box_holds_more_points_than_the_cells_that_it_touches() -> None:
+    rng = np.random.default_rng(8)
+    center, size, yaw = random_boxes(rng, 50)
+    xyz = (rng.uniform(-40, 40, (20_000, 3)) * [1, 1, 0.1]).astype(np.float32)
+    counts, *_ = np.histogram2d(xyz[:, 0], xyz[:, 1], bins=(80, 70), range=((-20, 20), (-10, 25)))
+    reach = bounding_reach(size, yaw)
+    most = most_points(counts.astype(np.float32), np.array([-20.0, -10.0]), 0.5, center[:, :2], reach)
+    inside = (xyz[:, 0] >= -20) & (xyz[:, 0] < 20) & (xyz[:, 1] >= -10) & (xyz[:, 1] < 25)
+    assert np.all(most >= points_of_boxes(xyz[inside], center, size, yaw).count)
+    low, high = center[:, :2] - reach - 0.5, center[:, :2] + reach + 0.5
+    around = [int((np.all((xyz[inside, :2] >= a) & (xyz[inside, :2] <= b), axis=1)).sum()) for a, b in zip(low, high)]
+    assert np.all(most <= around)
+    np.testing.assert_allclose(2 * reach, np.ptp(box_corners_bev(center[:, :2], *size[:, :2].T, yaw), axis=1))
 
 
 def test_without_boxes_or_points_there_are_no_pairs() -> None:

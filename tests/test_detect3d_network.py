@@ -131,6 +131,23 @@ def test_a_person_in_a_car_that_proves_weak_by_range_does_not_take_the_car_away(
     assert detector.detect(cloud).category.tolist() == ["car"]
 
 
+@pytest.mark.parametrize("per_point", [0.5, -0.5])
+def test_boxes_that_cannot_reach_the_least_score_are_left_out_early_and_no_others(
+    per_point: float, tmp_path: Path
+) -> None:
+    weights = {group: [0, 1, 0, per_point, -0.3] for group in INFO["groups"]}
+    path = taller_is_hotter(tmp_path, calibration=weights, min_score=dict.fromkeys(INFO["groups"], 0.6))
+    rng = np.random.default_rng(0)
+    cloud = cloud_of(rng.uniform(-40, 40, (3000, 3)) * [1, 1, 0.04])
+    detector: Any = create_lidar_detector(f"lidar:{path}", LOG, LidarConfig())
+    found = detector.detect(cloud)
+    everything = detector.candidates(cloud)
+    score = everything.boxes.score(detector.network.info, everything.terms)
+    good = np.flatnonzero((everything.inside.count > 0) & (score >= 0.6))
+    assert len(good) < len(detector.candidates(cloud, weak=False).boxes) < len(everything.boxes)
+    np.testing.assert_allclose(found.score, np.sort(score[good])[::-1])
+
+
 def test_earlier_clouds_are_in_the_grid_but_not_among_the_points(monkeypatch: pytest.MonkeyPatch) -> None:
     cloud, shift = cloud_of(solid(10, 6, yaw=0.6)), np.array([3.0, -2.0, 5.0])
     again = cloud_of(solid(10, 6, yaw=0.6) - np.array([3.0, -2.0, 0]), origin=ORIGIN + shift)

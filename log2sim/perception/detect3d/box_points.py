@@ -90,10 +90,7 @@ def points_of_boxes(
         return PointsOfBoxes(none, none, len(center_m))
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     half = np.asarray(size_m, np.float64) / 2
-    reach = np.stack(
-        [np.abs(c) * half[:, 0] + np.abs(s) * half[:, 1], np.abs(s) * half[:, 0] + np.abs(c) * half[:, 1]], 1
-    )
-    reach += MARGIN_M
+    reach = bounding_reach(size_m, yaw_rad) + MARGIN_M
     low, high = center_m[:, :2] - reach, center_m[:, :2] + reach
     box, place, order = candidates(xyz, usable, CoarseGrid.around(low, high), low, high)
     # Column by column, in the points' own precision and the order of their cells: this is where the time goes.
@@ -107,6 +104,30 @@ def points_of_boxes(
         & (np.abs(z) <= height.take(box))
     )
     return PointsOfBoxes(box.take(inside), order.take(place.take(inside)), len(center_m))
+
+
+def most_points(counts: NDArray[np.float32], low: Array, cell_m: float, center_m: Array, reach_m: Array) -> Array:
+    """Add up counts in cells (H, W) within bounding rectangles (M,): at least as many as there are points in each.
+
+    Parameters
+    ----------
+    low : (2,) float64, m
+        Lower corner of the cells.
+    center_m, reach_m : (M, 2) float64, m
+        Centers and half sides of the rectangles.
+
+    Notes
+    -----
+    By a table of sums (Crow, SIGGRAPH 1984), in time that does not depend on the sizes of the rectangles.
+    """
+    import cv2
+
+    table = cv2.integral(counts, sdepth=cv2.CV_64F)
+    limit = np.array(counts.shape)
+    first = np.clip(np.floor((center_m - reach_m - low) / cell_m), 0, limit).astype(np.intp)
+    last = np.clip(np.ceil((center_m + reach_m - low) / cell_m), 0, limit).astype(np.intp)
+    (i0, j0), (i1, j1) = first.T, last.T
+    return np.asarray(table[i1, j1] - table[i0, j1] - table[i1, j0] + table[i0, j0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,6 +164,13 @@ class CoarseGrid:
             outside = xyz.dtype.type(self.shape[axis] - 1)
             place.append(np.where((at >= 0) & (at < outside), at, outside).astype(np.uint16))
         return np.asarray(place[0] * np.uint16(self.shape[1]) + place[1])
+
+
+def bounding_reach(size_m: Array, yaw_rad: Array) -> Array:
+    """Compute half the sides (M, 2), m, of the bounding rectangles along x and y of boxes, size (M, 2 or more)."""
+    c, s = np.abs(np.cos(yaw_rad)), np.abs(np.sin(yaw_rad))
+    half = np.asarray(size_m, np.float64) / 2
+    return np.stack([c * half[:, 0] + s * half[:, 1], s * half[:, 0] + c * half[:, 1]], axis=1)
 
 
 def candidates(

@@ -65,12 +65,12 @@ class LevelBoxes:
         """The boxes seen from above."""
         return Rectangles(self.center_m[:, :2], self.size_m[:, :2], self.yaw_rad)
 
-    def terms(self, points: NDArray[np.int64], range_m: Array) -> Array:
+    def terms(self, points: NDArray[Any], range_m: Array) -> Array:
         """Return what the score is computed from: (5, M), the terms of `NetworkInfo.calibration`.
 
         Parameters
         ----------
-        points : (M,) int64
+        points : (M,) int or float
             Number of points in each box.
         range_m : (M,) float64
             Distance of the centers from the sensor in the plane.
@@ -105,16 +105,16 @@ class MapCells:
         middle = np.asarray(low) + (np.stack([i, j], axis=1) + 0.5) * (info.stride * info.cell_m)
         return cls(middle, maps.reshape(len(maps), -1).take(flat, axis=1).astype(np.float64))
 
-    def means(self, owner: NDArray[np.intp], weight: Array, count: int) -> MapCells:
-        """Average the cells of each of `count` owners (K,) with weights (K,); NaN for an owner without weight.
+    def means(self, weight: Array) -> MapCells:
+        """Average cells that follow each other by weights (K, n), K n of them; NaN where none has a weight.
 
         Cells with a value that is not finite count for nothing.
         """
         rows = np.concatenate([self.middle_m.T, self.values])
+        rows = rows.reshape(len(rows), *weight.shape)
         weight = np.where(np.isfinite(rows).all(axis=0), weight, 0.0)
-        rows = np.where(weight > 0, rows, 0.0) * weight
         with np.errstate(invalid="ignore"):
-            mean = np.stack([np.bincount(owner, row, count) for row in rows]) / np.bincount(owner, weight, count)
+            mean = np.einsum("rkn,kn->rk", np.where(weight > 0, rows, 0.0), weight) / weight.sum(axis=1)
         return MapCells(mean[:2].T, mean[2:])
 
 
@@ -129,16 +129,15 @@ def cells_around(
     step = np.arange(-AROUND_CELLS, AROUND_CELLS + 1)
     di, dj = (d.ravel() for d in np.meshgrid(step, step, indexing="ij"))
     i, j = flat[:, None] // w + di, flat[:, None] % w + dj
-    inside = ((i >= 0) & (i < h) & (j >= 0) & (j < w)).ravel()
-    cells = MapCells.at(maps, np.where(inside, (i * w + j).ravel(), 0), info, low)
-    owner = np.repeat(np.arange(len(flat)), len(di))
-    own = owner * len(di) + len(di) // 2
-    x, y, _, _, width, _ = cells.values[info.channels.box]
+    inside = (i >= 0) & (i < h) & (j >= 0) & (j < w)
+    cells = MapCells.at(maps, np.where(inside, i * w + j, 0).ravel(), info, low)
+    own = slice(len(di) // 2, len(di) // 2 + 1)
+    x, y, _, _, width, _ = cells.values[info.channels.box].reshape(6, *i.shape)
     with np.errstate(over="ignore", invalid="ignore"):
-        center = cells.middle_m.T + np.stack([x, y])
-        same = inside & (np.hypot(*(center - center[:, own])) < SAME_CENTER_WIDTHS * np.exp(width[own]))
-    heat = sigmoid(cells.values[info.channels.heat][group[owner], np.arange(len(owner))])
-    return cells.means(owner, np.where(same & (heat >= MIN_HEAT_SHARE * heat[own]), heat, 0.0), len(flat))
+        x, y = (v + middle.reshape(i.shape) for v, middle in zip((x, y), cells.middle_m.T, strict=True))
+        same = np.hypot(x - x[:, own], y - y[:, own]) < SAME_CENTER_WIDTHS * np.exp(width[:, own])
+    heat = sigmoid(cells.values[info.channels.heat].reshape(len(info.groups), *i.shape)[group, np.arange(len(flat))])
+    return cells.means(np.where(inside & same & (heat >= MIN_HEAT_SHARE * heat[:, own]), heat, 0.0))
 
 
 def boxes_of_cells(cells: MapCells, group: NDArray[np.intp], heat: Array, info: NetworkInfo) -> LevelBoxes:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from log2sim.config import LidarConfig
 from log2sim.datatypes import Boxes3D, Log
 from log2sim.errors import ConfigError
-from log2sim.geometry import NS_PER_S
-from log2sim.perception.detect3d.box_points import PointsOfBoxes, points_of_boxes
+from log2sim.geometry import NS_PER_S, Array
+from log2sim.perception.detect3d.box_points import PointsOfBoxes, bounding_reach, most_points, points_of_boxes
 from log2sim.perception.detect3d.centers import decode_centers
 from log2sim.perception.detect3d.grid import grid_window, rasterize
 from log2sim.perception.detect3d.level_boxes import LevelBoxes, sigmoid
@@ -73,7 +73,7 @@ class NetworkDetector:
 
     def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
         """Detect road users in one cloud, best score first; points of `earlier` clouds make the grid denser."""
-        found = self.candidates(cloud, earlier)
+        found = self.candidates(cloud, earlier, weak=False)
         boxes, points = found.boxes, found.inside.count
         score = sigmoid(boxes.heat) if self.decode == "votes" else boxes.score(self.network.info, found.terms)
         # What holds no point is nothing that the LiDAR saw.
@@ -87,30 +87,47 @@ class NetworkDetector:
             t_ns, center, boxes.size_m, boxes.yaw_rad, boxes.heading_score, boxes.category, score[kept], points[kept]
         )
 
-    def candidates(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Candidates:
+    def candidates(self, cloud: Cloud, earlier: Sequence[Cloud] = (), *, weak: bool = True) -> Candidates:
         """Find all boxes that may be road users, of those on one peak or cluster the strongest.
+
+        Parameters
+        ----------
+        weak : bool
+            Whether boxes that cannot reach the least score are among them.
 
         Notes
         -----
         The calibration of a network is fitted to the terms of these.
         """
-        info = self.network.info
+        info, sensor = self.network.info, sensor_xy(cloud)
         xyz, index = level_points(cloud, self.range_m)
         stacked = np.concatenate([xyz, stack_points(cloud, earlier, self.range_m)]) if earlier else xyz
-        low, shape = grid_window(stacked[:, :2], cell_m=info.cell_m, range_m=self.range_m, center=sensor_xy(cloud))
+        low, shape = grid_window(stacked[:, :2], cell_m=info.cell_m, range_m=self.range_m, center=sensor)
         grid = rasterize(stacked, cell_m=info.cell_m, low=low, shape=shape)
         maps = self.network.run(grid)
         if self.decode == "votes":
             boxes = decode_votes(maps, grid, info, low)
         else:
             boxes = decode_centers(maps, info, low)
-            # One peak more than once needs no count of points, which takes longest.
-            first = boxes.score(info, boxes.terms(np.zeros(len(boxes), np.int64), np.zeros(len(boxes)))[:3])
+            boxes = boxes if weak else boxes.take(self._may_suffice(boxes, grid, low, sensor))
+            first = boxes.score(info, boxes.terms(np.zeros(len(boxes)), ranges_m(boxes, sensor)))
             boxes = boxes.take(suppress(boxes.rectangles, first, boxes.group, across=False))
-        above = xyz[:, 2] > ON_GROUND_M
-        inside = points_of_boxes(xyz, boxes.center_m, boxes.size_m, boxes.yaw_rad, above)
-        range_m = np.hypot(*(boxes.center_m[:, :2] - sensor_xy(cloud)).T)
-        return Candidates(boxes, inside, index, boxes.terms(inside.count, range_m))
+        inside = points_of_boxes(xyz, boxes.center_m, boxes.size_m, boxes.yaw_rad, xyz[:, 2] > ON_GROUND_M)
+        return Candidates(boxes, inside, index, boxes.terms(inside.count, ranges_m(boxes, sensor)))
+
+    def _may_suffice(
+        self, boxes: LevelBoxes, grid: NDArray[np.float32], low: Array, sensor: Array
+    ) -> NDArray[np.bool_]:
+        """Mark boxes (M,) that reach the least score with as many points as they may hold, or with none.
+
+        Points are counted for these alone, as counting takes longest.
+        """
+        info, reach = self.network.info, bounding_reach(boxes.size_m, boxes.yaw_rad)
+        counts = np.rint(np.expm1(3 * grid[3]))
+        most = most_points(counts, low, info.cell_m, boxes.center_m[:, :2], reach)
+        range_m = ranges_m(boxes, sensor)
+        best = np.maximum(*(boxes.score(info, boxes.terms(points, range_m)) for points in (most, 0 * most)))
+        return np.asarray(best >= self._least(boxes))
 
     def _least(self, found: LevelBoxes) -> NDArray[np.float64]:
         """Return the least score (M,) that each box needs."""
@@ -120,6 +137,11 @@ class NetworkDetector:
             return np.full(len(found), MIN_SCORE)
         info = self.network.info
         return np.array([info.min_score[group] for group in info.groups])[found.group]
+
+
+def ranges_m(boxes: LevelBoxes, sensor: Array) -> Array:
+    """Compute the distances (M,), m, of centers from the sensor at (2,) in the plane."""
+    return np.asarray(np.hypot(*(boxes.center_m[:, :2] - sensor).T))
 
 
 def open_network(path: Path, settings: LidarConfig, *, name: str) -> NetworkDetector:
