@@ -1,0 +1,55 @@
+"""Train the network of Zou et al. (2021), a roadside LiDAR's, on shards of tools/train_lidar.py, and export it.
+
+pip install 'log2sim[train]'
+python tools/train_lidar.py roadside --out DIR --only generate
+python tools/train_zou2021.py --data DIR/data --out OUT --steps 1500
+log2sim reconstruct LOG --detector lidar:OUT/zou2021.onnx --set lidar.decode=votes
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import torch
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from lidar_training.fitting import FitPlan, fit
+from lidar_training.mixing import Mixture, shards_in, zou2021_loss
+from lidar_training.zou2021 import Zou2021Network
+from lidar_training.zou2021_export import export_zou2021
+
+
+def train(data: list[Path], out: Path, *, steps: int, seed: int, start: Path | None, share: float = 1.0) -> Path:
+    """Train, or go on from the checkpoint in `out`, and export the averaged weights; returns the ONNX file."""
+    out.mkdir(parents=True, exist_ok=True)
+    torch.manual_seed(seed)
+    network = Zou2021Network(share).to(memory_format=torch.channels_last)
+    if start is not None:
+        network.load_state_dict(torch.load(start, weights_only=True)["mean"])
+    mixture = Mixture(shards_in(data))
+    plan = FitPlan(steps, seed, checkpoint=out / "checkpoint.pt")
+    mean = fit(network, lambda n, rng: zou2021_loss(n, mixture.draw(rng), rng), plan)
+    network.load_state_dict(mean)
+    path = out / "zou2021.onnx"
+    export_zou2021(network, path, {"steps": steps, "seed": seed, "samples": sum(map(len, mixture.simulated))})
+    return path
+
+
+def main() -> None:
+    """Read the command line and train."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, nargs="+", required=True, help="folders of shards")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the checkpoint and the ONNX file")
+    parser.add_argument("--steps", type=int, default=1500)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--start", type=Path, help="checkpoint of another run to start from")
+    options = parser.parse_args()
+    path = train(options.data, options.out, steps=options.steps, seed=options.seed, start=options.start)
+    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
+
+
+if __name__ == "__main__":
+    main()
