@@ -14,6 +14,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "log2sim": "log2sim.logs.native:READER",
         "kitti": "log2sim.logs.kitti_raw:READER",
         "kitti-tracking": "log2sim.logs.kitti_tracking:READER",
+        "kitti-object": "log2sim.logs.kitti_object:READER",
         "pandaset": "log2sim.logs.pandaset:READER",
     },
     "detector": {

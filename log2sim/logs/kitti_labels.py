@@ -85,14 +85,37 @@ def read_labels(
     be labeled are marked by boxes of the type DontCare.
     """
     text = kitti.read_text(path)
-    rows = parse_labels(text, path)
+    return labels_of_rows(parse_labels(text, path), rig.ego_T_rect, track, stamp_of, text)
+
+
+def labels_of_rows(
+    rows: LabelRows,
+    ego_T_rect: Array,
+    track: PoseTrack,
+    stamp_of: Callable[[NDArray[np.int64]], NDArray[np.int64]],
+    text: str,
+) -> DriveLabels:
+    """Place the rows of label files in the map; those of unlabeled regions become regions of the image.
+
+    Parameters
+    ----------
+    rows : LabelRows
+    ego_T_rect : (4, 4) float64
+        Pose of the rectified camera 0.
+    track : PoseTrack
+        Poses of the ego.
+    stamp_of : callable
+        Gives the stamps (L,) of frame numbers (L,).
+    text : str
+        The files, for the log's digest.
+    """
     is_ignored = rows.type == NOT_LABELED
     ignored = rows.take(is_ignored)
     rows = rows.take(~is_ignored)
     t_ns = stamp_of(rows.frame)
     category = np.array([CATEGORY_OF[name] for name in rows.type.tolist()], dtype="<U16")
     map_T_ego, known = track.at(t_ns)
-    center, size, yaw = boxes_in_map(map_T_ego @ rig.ego_T_rect, rows.values[:, 7:14])
+    center, size, yaw = boxes_in_map(map_T_ego @ ego_T_rect, rows.values[:, 7:14])
     k = known
     return DriveLabels(
         Labels(

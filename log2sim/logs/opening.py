@@ -22,7 +22,7 @@ def open_log(path: Path | str, *, format: str = "auto", sequence: str | None = N
     path : Path or str
         A sequence, or a root that holds one or several.
     format : str
-        Name of a reader ("log2sim", "kitti", "kitti-tracking", "pandaset", or a plug-in's), or "auto" to find it.
+        Name of a reader ("log2sim", "kitti", "kitti-tracking", "kitti-object", "pandaset", or a plug-in's), or "auto" to find it.
     sequence : str, optional
         Which sequence of a root; needed only when it holds several.
 

@@ -1,0 +1,225 @@
+"""The layout of the KITTI object detection benchmark: training/{image_2, velodyne, calib, label_2}, single frames.
+
+The frames of a split become one log, in which the ego stands still and a frame is taken every 100 s, so that nothing connects
+them: a log to detect in and to evaluate with, not to track in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Labels, Log, Stream, Sweep
+from log2sim.errors import LogError
+from log2sim.geometry import Array, Camera, PoseTrack, apply, inverse, transform
+from log2sim.logs import kitti
+from log2sim.logs.images import first_image_size, image_stream
+from log2sim.logs.kitti_labels import CAMERA, DriveLabels, LabelRows, labels_of_rows, parse_labels
+from log2sim.logs.sweeps import read_sweep, sweep_of
+
+SPLITS = ("training", "testing")
+PERIOD_NS = 100_000_000_000
+IMAGES = "image_2"
+SINGLE_FRAMES = (
+    "single frames: each is taken to be 100 s after the one before, and the ego to stand still; use detect and evaluate"
+)
+EGO_R_RECT = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""The ego has the axes of the rectified camera 0, in which labels stand upright."""
+LIDAR_HEIGHT_M = 1.73
+"""Of KITTI's car (Geiger et al., IJRR 2013, fig. 1), for frames whose calibration does not tell."""
+
+
+class KittiObjectReader:
+    """Reader of the object detection layout; the root is a split or the parent of splits."""
+
+    name = "kitti-object"
+    looks_for = "a folder training/ (or that folder) with velodyne/NNNNNN.bin and calib/NNNNNN.txt"
+
+    def matches(self, path: Path) -> bool:
+        """Return whether the folder holds a split of this layout."""
+        return bool(self._splits(path))
+
+    def sequences(self, path: Path) -> list[str]:
+        """Return the names of the splits, sorted."""
+        return sorted(self._splits(path))
+
+    def open(self, path: Path, sequence: str) -> Log:
+        """Open a split."""
+        return _Split(self._splits(path)[sequence]).log()
+
+    def _splits(self, path: Path) -> dict[str, Path]:
+        path = path.resolve()
+        places = [path, *(path / name for name in SPLITS)]
+        return {p.name: p for p in places if (p / "calib").is_dir() and any((p / "velodyne").glob("*.bin"))}
+
+
+READER = KittiObjectReader()
+
+
+@dataclass(frozen=True, eq=False)
+class _Calibration:
+    """Calibration of one frame.
+
+    Attributes
+    ----------
+    ego_T_rect : (4, 4) float64
+        For an ego on the ground below the LiDAR of this frame.
+    rect_T_velo : (4, 4) float64
+    P : (3, 4) float64
+        From the rectified camera 0 to the image; may hold a rotation.
+    knows_ground : bool
+        Whether the height of the LiDAR is known from that of the IMU.
+    """
+
+    ego_T_rect: Array
+    rect_T_velo: Array
+    P: Array
+    knows_ground: bool
+
+    @classmethod
+    def read(cls, path: Path) -> _Calibration:
+        """Read a calibration file."""
+        c = kitti.read_calibration(path)
+
+        def rigid(key: str) -> Array:
+            m = kitti.calibration_entry(c, path, (3, 4), key)
+            return transform(kitti.checked_rotation(m[:, :3], f"{path}, entry '{key}'"), m[:, 3])
+
+        rect = kitti.calibration_entry(c, path, (3, 3), "R0_rect", "R_rect")
+        P = kitti.calibration_entry(c, path, (3, 4), "P2")
+        if not np.linalg.det(P[:, :3]) > 0:
+            raise LogError(
+                f"{path}, entry 'P2': {P.tolist()} looks at nothing; expected intrinsics, or these and a rotation"
+            )
+        velo_T_imu = rigid("Tr_imu_to_velo") if "Tr_imu_to_velo" in c else np.eye(4)
+        knows_ground = not np.array_equal(velo_T_imu, np.eye(4))
+        if not knows_ground:
+            velo_T_imu = transform(np.eye(3), [0.0, 0.0, kitti.EGO_T_IMU[2, 3] - LIDAR_HEIGHT_M])
+        rect_R_cam = kitti.checked_rotation(rect, f"{path}, entry 'R0_rect'")
+        rect_T_velo = transform(rect_R_cam, np.zeros(3)) @ rigid("Tr_velo_to_cam")
+        velo_ego = (kitti.EGO_T_IMU @ inverse(velo_T_imu))[:3, 3]
+        ego_T_rect = transform(EGO_R_RECT, velo_ego - EGO_R_RECT @ rect_T_velo[:3, 3])
+        return cls(ego_T_rect, rect_T_velo, P, knows_ground)
+
+    def camera(self, width_px: int, height_px: int) -> Camera:
+        """Make the camera."""
+        K, cam_R_rect = intrinsics_and_rotation(self.P[:, :3])
+        cam_T_rect = transform(cam_R_rect, np.linalg.solve(K, self.P[:, 3] / np.linalg.norm(self.P[2, :3])))
+        return Camera(CAMERA, width_px, height_px, K, "ego", self.ego_T_rect @ inverse(cam_T_rect))
+
+
+def intrinsics_and_rotation(M: Array) -> tuple[Array, Array]:
+    """Split the left part (3, 3) of a projection, of positive determinant, into intrinsics and a rotation.
+
+    Notes
+    -----
+    RQ decomposition (Hartley and Zisserman, "Multiple View Geometry", A4.1.1), by QR of the reversed rows.
+    """
+    q, r = np.linalg.qr(M[::-1].T)
+    K, rotation = r.T[::-1, ::-1], q.T[::-1]
+    sign = np.sign(np.diag(K))
+    K, rotation = K * sign, sign[:, None] * rotation
+    return np.asarray(K / K[2, 2]), np.asarray(rotation)
+
+
+@dataclass(frozen=True, eq=False)
+class _Split:
+    base: Path
+
+    @cached_property
+    def sweeps(self) -> dict[int, Path]:
+        """Files by number of frame."""
+        return kitti.numbered_files(self.base / "velodyne", (".bin",))
+
+    def log(self) -> Log:
+        calibrations, texts = self._calibrations()
+        first = next(iter(calibrations.values()))
+        t_ns = _stamps(self.sweeps)
+        streams = {"velodyne": self._velodyne(t_ns, [calibrations[n] for n in self.sweeps], first)}
+        cameras = {}
+        images = kitti.numbered_files(self.base / IMAGES, (".png", ".jpg", ".jpeg"))
+        if images:
+            size_px = first_image_size(list(images.values()))
+            cameras[CAMERA] = first.camera(*size_px)
+            streams[CAMERA] = image_stream(CAMERA, _stamps(images), list(images.values()), size_px)
+        ego = PoseTrack(t_ns, np.repeat(np.eye(4)[None], len(t_ns), axis=0))
+        labels = self._labels(first, ego)
+        ground_z_m = 0.0 if first.knows_ground else _ground_under(labels.boxes_3d)
+        notes = [SINGLE_FRAMES]
+        others = sum(not np.allclose(c.P, first.P, rtol=1e-2, atol=1e-3) for c in calibrations.values())
+        if others:
+            notes.append(f"{others} of {len(t_ns)} frames have another P2 by more than 1 %; that of the first is used")
+        return Log(
+            name=f"kitti-object-{self.base.name}",
+            format=READER.name,
+            cameras=cameras,
+            lidars={"velodyne": kitti.Rig(first.ego_T_rect @ first.rect_T_velo, first.ego_T_rect, {}).lidar()},
+            streams=streams,
+            ego=ego,
+            ego_vehicle=kitti.EGO_VEHICLE,
+            labels=labels.boxes_3d,
+            image_labels=labels.boxes_2d,
+            ignored_regions=labels.ignored,
+            ground_z_ego_m=ground_z_m,
+            reference_camera=CAMERA if cameras else None,
+            digest=kitti.digest_of([*texts, labels.text], self.sweeps.values()),
+            notes=tuple(notes),
+        )
+
+    def _calibrations(self) -> tuple[dict[int, _Calibration], list[str]]:
+        """Return calibrations by number of frame, and the different texts of their files; most frames share one."""
+        known: dict[str, _Calibration] = {}
+        found = {}
+        for number, file in self.sweeps.items():
+            path = self.base / "calib" / f"{file.stem}.txt"
+            text = kitti.read_text(path)
+            if text not in known:
+                known[text] = _Calibration.read(path)
+            found[number] = known[text]
+        return found, list(known)
+
+    def _velodyne(self, t_ns: NDArray[np.int64], calibrations: list[_Calibration], first: _Calibration) -> Stream:
+        """Stream of the sweeps in the map frame, each by its own calibration, so that labels fit them."""
+        files = list(self.sweeps.values())
+
+        def read(i: int) -> Sweep:
+            sweep = read_sweep(files[i], int(t_ns[i]))
+            points = apply(first.ego_T_rect @ calibrations[i].rect_T_velo, sweep.xyz_m.astype(np.float64))
+            return sweep_of(points, sweep.stamp_ns, None, "map")
+
+        return Stream("velodyne", t_ns, read)
+
+    def _labels(self, first: _Calibration, ego: PoseTrack) -> DriveLabels:
+        """Read the labels of all frames; each object is a track of its own."""
+        parts, texts = [], []
+        for number, file in self.sweeps.items():
+            path = self.base / "label_2" / f"{file.stem}.txt"
+            if path.is_file():
+                text = kitti.read_text(path)
+                lines = [
+                    f"{number} {number}-{k} {line}" if line.strip() else "" for k, line in enumerate(text.splitlines())
+                ]
+                parts.append(parse_labels("\n".join(lines), path))
+                texts.append(text)
+        if not parts:
+            return DriveLabels()
+        rows = LabelRows(
+            *(np.concatenate([getattr(p, k) for p in parts]) for k in ("frame", "track_id", "type", "values"))
+        )
+        return labels_of_rows(rows, first.ego_T_rect, ego, lambda frame: frame * PERIOD_NS, "\n".join(texts))
+
+
+def _ground_under(labels: Labels | None) -> float:
+    """Return the median height of the lower faces of labels, ego frame; 0 without labels."""
+    if labels is None or not len(labels.t_ns):
+        return 0.0
+    return float(np.median(labels.center_m[:, 2] - labels.size_m[:, 2] / 2))
+
+
+def _stamps(files: Mapping[int, Path]) -> NDArray[np.int64]:
+    return np.array(list(files), dtype=np.int64) * PERIOD_NS
