@@ -9,6 +9,7 @@ import pytest
 from worlds import CAR, PARKED, tiny_log, tiny_scene
 
 from log2sim.geometry import transform
+from log2sim.synth.actors import MovingScene
 from log2sim.synth.lamps import (
     BEAM_HALF_WIDTH,
     HEADLIGHT_REACH_M,
@@ -19,6 +20,8 @@ from log2sim.synth.lamps import (
     street_lights,
 )
 from log2sim.synth.light import NIGHT, NOON, light_of
+from log2sim.synth.raycast import AIR, BUILDING, GROUND, USUAL_REFLECTANCE, cast_sweep
+from log2sim.synth.returns import BACKSCATTER_SHARE, MIN_SIGNAL, REFERENCE_RANGE_M
 from log2sim.synth.scene import Environment, Road
 
 
@@ -92,3 +95,41 @@ def test_an_unknown_light_is_an_error() -> None:
     with pytest.raises(Exception, match="light"):
         tiny_scene(environment={"light": "midnight"})
     assert NIGHT.exposure > NOON.exposure
+
+
+def sweep(seed: int = 0, **environment: Any) -> tuple[np.ndarray, np.ndarray]:
+    scene = tiny_scene([], environment=environment, building=[{"center": [31.0, 0.0], "size_m": [2.0, 80.0, 12.0]}])
+    moving = MovingScene.of(scene)
+    result = cast_sweep(scene.lidar[0], moving, scene.start_ns + 500_000_000, np.random.default_rng(seed))
+    return np.linalg.norm(result.sweep.xyz_m, axis=1), result.hit
+
+
+def test_fog_takes_returns_by_the_square_of_what_it_lets_through() -> None:
+    clear, hit = sweep()
+    previous = 1.0
+    for visibility in (400.0, 100.0, 60.0, 30.0):
+        fog, fog_hit = sweep(weather="fog", visibility_m=visibility)
+        share = (fog_hit == BUILDING).sum() / (hit == BUILDING).sum()
+        assert share <= previous + 0.02
+        previous = share
+        # A return is lost where reflectance * exp(-2 * 3.912 / V * r) / (r / 60)^2 falls below the threshold.
+        r = clear[hit == BUILDING]
+        signal = USUAL_REFLECTANCE * np.exp(-2 * 3.912 / visibility * r) / (r / REFERENCE_RANGE_M) ** 2
+        air = BACKSCATTER_SHARE * (1 - np.exp(-3.912 / visibility * 15.0))
+        expected = (np.clip(1.15 - MIN_SIGNAL / signal, 0, 1) * (1 - air)).mean()
+        assert share == pytest.approx(expected, abs=0.03)
+        assert (fog_hit == AIR).any()
+        assert fog[fog_hit == AIR].max() < 15.2
+    assert previous < 0.2
+    assert np.all(hit != AIR)
+
+
+def test_rain_takes_less_than_fog_and_clear_weather_nothing() -> None:
+    clear, hit = sweep()
+    again, same = sweep(visibility_m=30.0)  # a key of fog in clear weather
+    assert np.array_equal(clear, again)
+    assert np.array_equal(hit, same)
+    _, rain = sweep(weather="rain", rain_mm_h=30.0)
+    _, fog = sweep(weather="fog", visibility_m=50.0)
+    assert (fog >= GROUND).sum() < (rain >= GROUND).sum()
+    assert len(rain) > 0.9 * len(hit)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.synth.returns import Weather
 from log2sim.synth.scene import Environment
 from log2sim.synth.surfaces import Paint
 
@@ -14,7 +15,6 @@ Color = tuple[float, float, float]
 
 HOUSES, ROAD = 0.22, 0.09  # light from them relative to the sky's on a surface, as seen in a mirror
 WET_ALBEDO = 0.62  # of a wet road relative to a dry one
-CONTRAST_THRESHOLD = 0.02  # of a dark target at the meteorological visibility
 
 
 @dataclass(frozen=True)
@@ -107,21 +107,21 @@ NIGHT = Light(
 LIGHTS = {"noon": NOON, "overcast": OVERCAST, "dusk": DUSK, "night": NIGHT}
 
 
+def weather_of(environment: Environment) -> Weather:
+    """Weather of a scene as it weakens light and a LiDAR's returns."""
+    return Weather(environment.weather, environment.visibility_m, environment.rain_mm_h)
+
+
 def light_of(environment: Environment) -> Light:
     """Light of a scene's environment: fog and rain hide the sun and gray the sky, lamps are on.
 
-    Notes
-    -----
-    In fog, extinction follows from the visibility V as -ln(0.02) / V (Koschmieder, 1924). Rain of rate R in mm/h takes
-    1.076 R^0.67 dB/km (Carbonneau & Wisely, SPIE 1998).
+    Rain takes light besides what clear air takes, fog so much more that the air does not count.
     """
     light = LIGHTS[environment.light]
     if environment.weather == "clear":
         return light
     fog = environment.weather == "fog"
-    extinction = -np.log(CONTRAST_THRESHOLD) / environment.visibility_m
-    if not fog:
-        extinction = light.extinction_per_m + 1.076 * environment.rain_mm_h**0.67 * np.log(10) / 10 / 1000
+    extinction = weather_of(environment).extinction_per_m + (0.0 if fog else light.extinction_per_m)
     sky = np.add(light.sky_color, np.multiply(light.sun_color, 0.5 * light.sun[2]))
     gray = (sky + 2 * sky.mean()) / 3 * (1.0 if fog else 0.8)
     return replace(
@@ -130,7 +130,7 @@ def light_of(environment: Environment) -> Light:
         sky_color=_color(gray),
         horizon=_color(gray * 0.92),
         zenith=_color(gray * (0.88 if fog else 0.7)),
-        extinction_per_m=float(extinction),
+        extinction_per_m=extinction,
         lamps=max(light.lamps, 3.0),
         wetness=0.3 if fog else 1.0,
         rain_mm_h=0.0 if fog else environment.rain_mm_h,

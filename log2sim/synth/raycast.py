@@ -10,11 +10,15 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Sweep
 from log2sim.geometry import NS_PER_S, Array, inverse, rotation_from_rpy, transform
 from log2sim.synth.actors import Actor, MovingScene
+from log2sim.synth.light import weather_of
+from log2sim.synth.returns import ReturnModel, Weather, backscattered, detected, reflected
 from log2sim.synth.scene import Building, LidarSpec, Scene
 
-GROUND, BUILDING, EGO = -1, -2, -3
+GROUND, BUILDING, EGO, AIR = -1, -2, -3, -4
 MAX_PAIRS_PER_BATCH = 400_000
 MESH_MARGIN_M = 1e-6  # rounding of a mesh that fills its box
+MIN_RANGE_M = 0.5
+USUAL_REFLECTANCE = np.float32(0.3)  # of what a mesh stands for, where weather decides what comes back
 MIN_GRAZING_SINE = 0.02  # of the angle to the ground below which no return comes back
 
 
@@ -26,7 +30,7 @@ class LabeledSweep:
     ----------
     sweep : Sweep
     hit : (N,) int64
-        Index of the actor, GROUND, BUILDING or EGO.
+        Index of the actor, GROUND, BUILDING, EGO or AIR.
     """
 
     sweep: Sweep
@@ -90,12 +94,27 @@ def cast_sweep(spec: LidarSpec, moving: MovingScene, stamp_ns: int, rng: np.rand
         distance[rows[closer]], hit[rows[closer]] = nearer[closer], index if index < len(moving.actors) else EGO
     # Drawn for every ray, so that a change of the scene moves no other ray's noise.
     noise, lost = rng.normal(0.0, 1.0, len(ray)) * spec.noise_m, rng.random(len(ray)) < spec.dropout
-    keep = (distance <= spec.range_m) & (distance > 0.5) & ~lost
+    distance[distance > spec.range_m] = np.inf
+    _through_air(distance, hit, weather_of(scene.environment), rng)
+    keep = np.isfinite(distance) & (distance > MIN_RANGE_M) & ~lost
     xyz = directions[keep] * (distance + noise)[keep, None]
     if spec.resolution_m > 0:
         xyz = np.rint(xyz / spec.resolution_m) * spec.resolution_m
     # Column after column in memory, which packs a quarter smaller.
     return LabeledSweep(Sweep(stamp_ns, np.asfortranarray(xyz, dtype=np.float32), "lidar", t_ns[keep]), hit[keep])
+
+
+def _through_air(distance: Array, hit: NDArray[np.int64], weather: Weather, rng: np.random.Generator) -> None:
+    """Lose returns (N,) to rain and fog and let others come back from the air, in place; nothing in clear weather."""
+    if weather.kind == "clear":
+        return
+    air = backscattered(distance.astype(np.float32), weather, rng)
+    solid = np.isfinite(distance)
+    usual = np.ones(int(solid.sum()), np.float32)
+    signal = reflected(distance[solid].astype(np.float32), usual * USUAL_REFLECTANCE, usual, weather)
+    distance[np.flatnonzero(solid)[~detected(signal, ReturnModel(dropout=0.0), rng)]] = np.inf
+    early = np.isfinite(air)
+    distance[early], hit[early] = air[early], AIR
 
 
 def _box_distance(building: Building, origin: Array, ray: Array) -> Array:
