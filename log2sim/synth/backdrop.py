@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from log2sim.geometry import Array, box_corners_bev
 from log2sim.synth.grain import grain
 from log2sim.synth.ground import Ground
+from log2sim.synth.polytope_caster import Terrain
 from log2sim.synth.scene import Building, Scene
 
 FACADE_M_PER_PX = 0.04
@@ -59,6 +60,7 @@ class Backdrop:
     """The ground and the facades of a scene, painted when and where they are looked at."""
 
     def __init__(self, scene: Scene, seed: int) -> None:
+        self.terrain: Terrain | None = None  # level
         self.ground = Ground(scene.road, scene.zebra, seed)
         self.buildings = tuple(_walls(building, (seed, 5, k)) for k, building in enumerate(scene.building))
 

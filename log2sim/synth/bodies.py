@@ -58,12 +58,18 @@ class Body:
     size_m : (float, float, float)
         Of the box.
     painter : Painter
+    passes : (K,) float32 or None
+        Share of samples through which one sees what is behind, by material; None for a solid body.
+    reach_m : float or None
+        Diameter around the origin that holds the mesh; None if the box holds it.
     """
 
     mesh: Mesh
     map_T_body: Array
     size_m: tuple[float, float, float]
     painter: Painter
+    passes: NDArray[np.float32] | None = None
+    reach_m: float | None = None
 
     @classmethod
     def of(cls, actor: Actor, t_s: float) -> Body:
@@ -75,14 +81,23 @@ class Body:
 def fragments_of(view: RenderCamera, body: Body) -> Fragments | None:
     """Rasterize a body; None where it is outside the picture."""
     cam_T_body = inverse(view.map_T_cam) @ body.map_T_body
-    radius = float(np.linalg.norm(body.size_m)) / 2
+    radius = (body.reach_m or float(np.linalg.norm(body.size_m))) / 2
     center = cam_T_body[:3, 3]
     reach = (view.width_px + view.height_px) / view.K[0, 0]
     if center[2] < -radius or np.hypot(center[0], center[1]) - radius > reach * (center[2] + radius):
         return None
     vertices = apply(cam_T_body, body.mesh.vertices_m)
     fragments = rasterize(vertices, body.mesh.faces, view.K, view.width_px, view.height_px)
+    if body.passes is not None:
+        fragments = fragments.part(np.flatnonzero(_stops(fragments, body.passes[body.mesh.part[fragments.face]])))
     return fragments if len(fragments.u) else None
+
+
+def _stops(fragments: Fragments, passes: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Decide for each sample whether something stops the ray, by a hash of its place."""
+    mixed = fragments.u.astype(np.uint32) * np.uint32(73856093) ^ fragments.v.astype(np.uint32) * np.uint32(19349663)
+    mixed = (mixed ^ (mixed >> np.uint32(13))) * np.uint32(1274126177)
+    return np.asarray((mixed >> np.uint32(16)).astype(np.float32) / 65536 >= passes)
 
 
 def draw_bodies(view: RenderCamera, bodies: Sequence[Body], lit: Lighting, color: Image, depth: Image) -> None:
@@ -183,13 +198,16 @@ def draw_shadows(
     for body in bodies:
         if np.linalg.norm(body.map_T_body[:2, 3] - view.map_T_cam[:2, 3]) > SHADOW_RANGE_M:
             continue
+        if len(body.mesh.vertices_m) == 0:
+            continue
         vertices = apply(body.map_T_body, body.mesh.vertices_m)
-        height = vertices[:, 2] - vertices[:, 2].min()
-        cast = (vertices[:, :2] - slope * vertices[:, 2:]).astype(np.float32)
+        floor = body.map_T_body[2, 3] - body.size_m[2] / 2
+        height = vertices[:, 2] - floor
+        cast = (vertices[:, :2] - slope * height[:, None]).astype(np.float32)
         below = vertices[height < 0.25 * body.size_m[2] + 0.05, :2].astype(np.float32)
         for mask, points in ((sun, cast), (sky, below)):
             hull = cv2.convexHull(points)[:, 0]
-            polygon = view.polygon(np.column_stack([hull, np.zeros(len(hull))]).astype(float))
+            polygon = view.polygon(np.column_stack([hull, np.full(len(hull), floor)]).astype(float))
             if len(polygon):
                 cv2.fillConvexPoly(mask, polygon, 255, cv2.LINE_AA, 4)
     rows = np.flatnonzero(sun.any(1) | sky.any(1))

@@ -8,7 +8,7 @@ x = i * its length, its first row at y = j * its length: columns go east, rows g
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -33,6 +33,7 @@ MARKING, ASPHALT, PAVING, CURB, MEADOW = (
 )
 CURB_M = 0.12
 SLAB_PX, JOINT_SHADE = 25, 0.86  # paving slabs of 1 m with joints of one fine pixel
+MAX_CIRCLE_PX = 2e4  # from a tile to the center of a circle that is drawn
 SUBPIXELS = 2  # masks are drawn so much finer than tiles
 
 Mask = NDArray[np.uint8]
@@ -129,18 +130,24 @@ class Stroke:
 
 
 class _Strokes:
-    """Strokes that are drawn together, found by where they are."""
+    """Strokes that are drawn together, as pieces of straight lines that are found by where they are."""
 
     def __init__(self, strokes: Sequence[Stroke]) -> None:
-        self._strokes = strokes
-        half = np.array([s.width_m / 2 for s in strokes]).reshape(-1, 1)
-        self._low = np.array([s.line.min(0) for s in strokes]).reshape(-1, 2) - half
-        self._high = np.array([s.line.max(0) for s in strokes]).reshape(-1, 2) + half
+        lines = [s.line for s in strokes if len(s.line) > 1]
+        counts = [len(line) - 1 for line in lines]
+        self._begin = np.concatenate([np.zeros((0, 2)), *(line[:-1] for line in lines)])
+        self._end = np.concatenate([np.zeros((0, 2)), *(line[1:] for line in lines)])
+        self._width = np.repeat([s.width_m for s in strokes if len(s.line) > 1], counts)
+        # Where a piece continues another one, a disk fills the gap between their square ends.
+        self._joined = np.concatenate([np.zeros(0, bool), *(np.arange(n) > 0 for n in counts)])
 
-    def within(self, low: Array, high: Array) -> list[Stroke]:
-        """Return those whose surrounding rectangle reaches between two corners (2,)."""
-        near = (self._high >= low) & (self._low <= high)
-        return [self._strokes[int(k)] for k in np.flatnonzero(near[:, 0] & near[:, 1])]
+    def within(self, low: Array, high: Array) -> Iterator[tuple[Array, Array, float, bool]]:
+        """Yield begin, end, width and whether it continues another one, of pieces that may reach between two corners (2,)."""
+        half = self._width[:, None] / 2
+        near = np.maximum(self._begin, self._end) + half >= low
+        near &= np.minimum(self._begin, self._end) - half <= high
+        for k in np.flatnonzero(near[:, 0] & near[:, 1]):
+            yield self._begin[k], self._end[k], float(self._width[k]), bool(self._joined[k])
 
 
 class _Canvas:
@@ -152,34 +159,30 @@ class _Canvas:
 
     def drawn(self, strokes: _Strokes) -> Mask | None:
         """Share of each pixel (TILE_PX, TILE_PX) from 0 to 255 that is covered; None where nothing is."""
-        near = strokes.within(self._low - self._step, self._high + self._step)
-        if not near:
+        mask: Mask | None = None
+        for begin, end, width, joined in strokes.within(self._low - self._step, self._high + self._step):
+            if mask is None:
+                mask = np.zeros((TILE_PX * SUBPIXELS,) * 2, np.uint8)
+            self._draw(mask, begin, end, width, joined=joined)
+        if mask is None:
             return None
-        mask = np.zeros((TILE_PX * SUBPIXELS,) * 2, np.uint8)
-        for stroke in near:
-            self._draw(mask, stroke.line, stroke.width_m)
         share = np.asarray(cv2.resize(mask, (TILE_PX, TILE_PX), interpolation=cv2.INTER_AREA), np.uint8)
         return share if cv2.countNonZero(share) else None
 
-    def _draw(self, mask: Mask, line: Array, width_m: float) -> None:
-        """Draw a polyline with square ends; one that is thinner than a pixel is fainter instead."""
+    def _draw(self, mask: Mask, begin: Array, end: Array, width_m: float, *, joined: bool) -> None:
+        """Draw a piece with square ends; one that is thinner than a pixel is fainter instead."""
         shade = round(255 * min(1.0, width_m / self._step))
         # OpenCV also draws the outline of a polygon, half a pixel to each side.
-        half = max(width_m - self._step, 0.0) / 2
-        points = (line - self._low) / self._step - 0.5
-        for a, b in pairwise(points):
-            d = b - a
-            length = float(np.hypot(d[0], d[1]))
-            if length == 0:
-                continue
-            across = np.array([-d[1], d[0]]) / length * (half / self._step)
-            corners = np.clip(np.array([a + across, b + across, b - across, a - across]), -1e6, 1e6)
-            cv2.fillConvexPoly(mask, np.rint(corners * 16).astype(np.int32), shade, cv2.LINE_8, 4)
-        if width_m > 2 * self._step:
-            for p in points[1:-1]:
-                if np.all(np.abs(p) < 2e4):
-                    center = (round(p[0] * 16), round(p[1] * 16))
-                    cv2.circle(mask, center, round(half / self._step * 16), shade, -1, 8, 4)
+        half = max(width_m / self._step - 1.0, 0.0) / 2
+        (ax, ay), (bx, by) = (((p - self._low) / self._step - 0.5).tolist() for p in (begin, end))
+        length = float(np.hypot(bx - ax, by - ay))
+        if length == 0:
+            return
+        x, y = (ay - by) / length * half, (bx - ax) / length * half
+        corners = np.array([(ax + x, ay + y), (bx + x, by + y), (bx - x, by - y), (ax - x, ay - y)])
+        cv2.fillConvexPoly(mask, np.rint(np.clip(corners, -1e6, 1e6) * 16).astype(np.int32), shade, cv2.LINE_8, 4)
+        if joined and half > 1 and max(abs(ax), abs(ay)) < MAX_CIRCLE_PX:
+            cv2.circle(mask, (round(ax * 16), round(ay * 16)), round(half * 16), shade, -1, 8, 4)
 
 
 def _blend(
@@ -200,7 +203,9 @@ def _markings(line: Array, road: Road) -> list[Stroke]:
     """List the line in the middle and those along both sides."""
     pieces: list[Array] = []
     if road.marking != "none":
-        pieces = _dashes(line, 3.0, 3.0) if road.marking == "dashed" else [line]
+        for k in range(1, road.lanes):
+            border = _parallel(line, (k / road.lanes - 0.5) * road.width_m) if 2 * k != road.lanes else line
+            pieces += _dashes(border, 3.0, 3.0) if road.marking == "dashed" else [border]
     sides = [Stroke(_parallel(line, side * (road.width_m / 2 - 0.2)), 0.1) for side in (-1, 1)]
     return [Stroke(piece, 0.14) for piece in pieces] + sides
 

@@ -17,19 +17,19 @@ MIN_AREA_M2 = 1e-7
 MIN_VOLUME = 1e-5  # of three unit normals that meet in a point
 
 
-def mesh_of(parts: Sequence[Polytope], center_z_m: float) -> Mesh:
-    """Make the mesh of an object, flat-shaded, each face in the material of its part.
+def meshes_of(objects: Sequence[Sequence[Polytope]], center_z_m: Sequence[float]) -> list[Mesh]:
+    """Make the meshes of objects, flat-shaded.
 
     Parameters
     ----------
-    parts
-        In the object's frame, which has its origin on the floor.
+    objects
+        Parts of each, in its frame, which has its origin on the floor.
     center_z_m
-        Height of the mesh's origin in that frame.
+        Height of each mesh's origin in that frame.
 
     Returns
     -------
-    Mesh
+    list of Mesh
         `part` holds the index of the part of each face.
 
     Notes
@@ -37,20 +37,29 @@ def mesh_of(parts: Sequence[Polytope], center_z_m: float) -> Mesh:
     Corners are where triples of planes meet inside all others; around each face they are ordered by angle. Polytopes with
     equally many faces are worked on together.
     """
+    flat = [polytope for parts in objects for polytope in parts]
+    owner = np.repeat(np.arange(len(objects)), [len(parts) for parts in objects])
+    local = np.concatenate([np.arange(len(parts)) for parts in objects]) if flat else np.zeros(0, np.int64)
     by_count: dict[int, list[int]] = {}
-    for index, polytope in enumerate(parts):
+    for index, polytope in enumerate(flat):
         by_count.setdefault(len(polytope.offsets), []).append(index)
-    triangles, normals, part = [], [], []
+    corners, normals, polytopes = [np.zeros((0, 3, 3))], [np.zeros((0, 3))], [np.zeros(0, np.int64)]
     for rows in by_count.values():
-        planes = np.array([parts[k].normals for k in rows], dtype=np.float64)
-        offsets = np.array([parts[k].offsets for k in rows], dtype=np.float64)
-        corner, normal, owner = _faces(planes, offsets)
-        triangles.append(corner)
+        planes = np.array([flat[k].normals for k in rows], dtype=np.float64)
+        offsets = np.array([flat[k].offsets for k in rows], dtype=np.float64)
+        corner, normal, row = _faces(planes, offsets)
+        corners.append(corner)
         normals.append(normal)
-        part.append(np.array(rows)[owner])
-    vertices = np.concatenate(triangles).reshape(-1, 3) - [0.0, 0.0, center_z_m]
-    faces = np.arange(len(vertices)).reshape(-1, 3)
-    return Mesh(vertices, np.repeat(np.concatenate(normals), 3, axis=0), faces, np.concatenate(part))
+        polytopes.append(np.array(rows)[row])
+    corner, normal, polytope_of = np.concatenate(corners), np.concatenate(normals), np.concatenate(polytopes)
+    order = np.argsort(owner[polytope_of], kind="stable")
+    ends = np.cumsum(np.bincount(owner[polytope_of], minlength=len(objects)))[:-1]
+    out = []
+    for k, z in zip(np.split(order, ends), center_z_m):
+        vertices = corner[k].reshape(-1, 3) - [0.0, 0.0, z]
+        faces = np.arange(len(vertices)).reshape(-1, 3)
+        out.append(Mesh(vertices, np.repeat(normal[k], 3, axis=0), faces, local[polytope_of[k]]))
+    return out
 
 
 def _faces(planes: Array, offsets: Array) -> tuple[Array, Array, NDArray[np.int64]]:

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array, Camera
-from log2sim.synth.backdrop import Backdrop
+from log2sim.synth.backdrop import Wall
 from log2sim.synth.bodies import NOBODY, Body, Lighting, draw_bodies, draw_shadows, fragments_of
 from log2sim.synth.facades import draw_buildings, hide_behind_buildings
+from log2sim.synth.ground import Ground
 from log2sim.synth.lamps import Lamp, glare, light_scenery, nearest_lamps
 from log2sim.synth.light import NOON, Light
+from log2sim.synth.polytope_caster import Terrain
 from log2sim.synth.rain import draw_rain, mirror_sky
 from log2sim.synth.raster import Fragments
 from log2sim.synth.render_camera import RenderCamera
 from log2sim.synth.scenery import FAR_M, GAMMA, Image, draw_ground, draw_sky
+from log2sim.synth.terrain_view import draw_terrain
 
 LENS_BLUR_PX = 0.45
 GRAIN = 0.8  # standard deviation of the sensor's noise, of 255
@@ -43,20 +47,28 @@ class Visibility:
     box_px: Array
 
 
+class Scenery(Protocol):
+    """The static parts of a scene: the ground's colors, its terrain (None where it is level) and the sides of buildings."""
+
+    ground: Ground
+    terrain: Terrain | None
+    buildings: tuple[tuple[Wall, ...], ...]
+
+
 @dataclass(frozen=True, eq=False)
 class SceneInstant:
     """Everything in a scene at one time.
 
     Attributes
     ----------
-    backdrop : Backdrop
+    backdrop : Scenery
     bodies : sequence of Body
     light : Light
     lamps : sequence of Lamp
         Headlights and street lights that are on.
     """
 
-    backdrop: Backdrop
+    backdrop: Scenery
     bodies: Sequence[Body]
     light: Light = NOON
     lamps: Sequence[Lamp] = ()
@@ -67,7 +79,10 @@ def render(camera: Camera, map_T_cam: Array, instant: SceneInstant, rng: np.rand
     view, light = RenderCamera.of(camera, map_T_cam), instant.light
     lit = Lighting(light, nearest_lamps(view, instant.lamps))
     color, depth = draw_sky(view, light)
-    draw_ground(view, instant.backdrop.ground, light, color, depth)
+    if instant.backdrop.terrain is None:
+        draw_ground(view, instant.backdrop.ground, light, color, depth)
+    else:
+        draw_terrain(view, instant.backdrop.ground, instant.backdrop.terrain, light, color, depth)
     ground = depth.copy()
     draw_shadows(view, instant.bodies, lit, color, ground < FAR_M)
     draw_buildings(view, instant.backdrop.buildings, light, color, depth)

@@ -60,7 +60,8 @@ class Road(Table):
 
     line: Line = key("Center line, points [x, y].", unit="m")
     width_m: Number = key("Width of the carriageway.", 7.0, "m", ge=1, le=60)
-    marking: Literal["dashed", "solid", "none"] = key("Center marking.", "dashed")
+    lanes: Whole = key("Number of lanes of equal width.", 2, ge=1, le=12)
+    marking: Literal["dashed", "solid", "none"] = key("Marking between lanes.", "dashed")
     sidewalk_m: Number = key("Width of the sidewalk on each side.", 2.5, "m", ge=0, le=20)
 
 
