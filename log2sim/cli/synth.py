@@ -1,34 +1,102 @@
-"""Generate a synthetic log."""
+"""Generate synthetic data: the log of a scene file, or random traffic."""
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from log2sim.cli.options import Overwrite, Quiet, say
+from log2sim.errors import ConfigError
+
+
+class Traffic(StrEnum):
+    """Where the LiDAR of random traffic is."""
+
+    vehicle = "vehicle"
+    roadside = "roadside"
+
+
+class Layout(StrEnum):
+    """Layout of data of random traffic."""
+
+    kitti = "kitti"
+    log2sim = "log2sim"
+
+
+class LightName(StrEnum):
+    """Light of a scene."""
+
+    noon = "noon"
+    overcast = "overcast"
+    dusk = "dusk"
+    night = "night"
+
+
+class WeatherName(StrEnum):
+    """Weather of a scene."""
+
+    clear = "clear"
+    rain = "rain"
+    fog = "fog"
 
 
 def synth(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="Scene file.")],
-    out: Annotated[Path, typer.Option("--out", metavar="LOG", help="Log folder to write.")],
-    seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 0,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
+    scene: Annotated[Path | None, typer.Argument(metavar="[SCENE.toml]", help="Scene file.")] = None,
+    traffic: Annotated[
+        Traffic | None,
+        typer.Option(help="Instead of a scene file: random traffic around a LiDAR on a vehicle or at the roadside."),
+    ] = None,
+    scenes: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of random scenes.")] = 10,
+    sensor: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="LiDAR of random scenes: a name, a TOML file, or random. [default: hdl64e, rslidar16-roadside]",
+        ),
+    ] = None,
+    layout: Annotated[
+        Layout, typer.Option(help="Layout of random scenes: KITTI's object layout or a log folder each.")
+    ] = Layout.kitti,
+    duration: Annotated[
+        float, typer.Option(min=0.5, max=60.0, help="Length of each log of random traffic in s.")
+    ] = 5.0,
+    light: Annotated[LightName | None, typer.Option(help="Light; random scenes draw it otherwise.")] = None,
+    weather: Annotated[WeatherName | None, typer.Option(help="Weather; random scenes draw it otherwise.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Generate a synthetic log with exact ground truth."""
+    """Generate a synthetic log with exact ground truth, or random traffic for training and tests."""
     from log2sim.cli.progress import progress
     from log2sim.synth.scene import load_scene
     from log2sim.synth.write import write_synthetic
 
-    loaded = load_scene(scene)
+    if (scene is None) == (traffic is None):
+        raise ConfigError("give either a scene file or --traffic vehicle or --traffic roadside")
     with progress(quiet=quiet) as report_progress:
-        write_synthetic(
-            loaded,
-            out,
-            seed=seed,
-            overwrite=overwrite,
-            progress=lambda done, total: report_progress("synthesize", done, total),
-        )
+        if scene is not None:
+            loaded = load_scene(scene)
+            changes = {k: v.value for k, v in (("light", light), ("weather", weather)) if v is not None}
+            environment = loaded.environment.model_copy(update=changes)
+            write_synthetic(
+                loaded.model_copy(update={"environment": environment}),
+                out,
+                seed=seed,
+                overwrite=overwrite,
+                progress=lambda done, total: report_progress("synthesize", done, total),
+            )
+        elif traffic is not None:
+            from log2sim.synth.traffic_data import TrafficSettings, write_traffic
+
+            settings = TrafficSettings(
+                traffic.value, scenes, seed, sensor, layout.value, duration,
+                None if light is None else light.value, None if weather is None else weather.value,
+            )  # fmt: skip
+            write_traffic(
+                settings, out, overwrite=overwrite, progress=lambda done, total: report_progress("scenes", done, total)
+            )
     say(f"{out}: written", quiet=quiet)

@@ -15,7 +15,7 @@ from log2sim.synth.actors import Actor
 from log2sim.synth.lamps import Lamp, lamplight
 from log2sim.synth.light import Light, reflected
 from log2sim.synth.paint import paint
-from log2sim.synth.raster import Fragments, rasterize
+from log2sim.synth.raster import NEAR_M, Fragments, rasterize
 from log2sim.synth.render_camera import RenderCamera
 from log2sim.synth.scenery import Image
 from log2sim.synth.shapes import Mesh
@@ -78,6 +78,30 @@ class Body:
         return cls(actor.mesh(t_s), pose, actor.spec.box_m, partial(paint, actor.appearance))
 
 
+def near_first(view: RenderCamera, bodies: Sequence[Body]) -> list[int]:
+    """Order bodies by the distance of their middles from the camera, so that those behind others are found early."""
+    return sorted(
+        range(len(bodies)), key=lambda k: float(np.linalg.norm(bodies[k].map_T_body[:3, 3] - view.map_T_cam[:3, 3]))
+    )
+
+
+def is_hidden(view: RenderCamera, body: Body, nearest: Image) -> bool:
+    """Decide whether all pixels around a body show something nearer, by a flat depth image."""
+    if len(body.mesh.vertices_m) == 0:
+        return True
+    ends = np.stack([body.mesh.vertices_m.min(0), body.mesh.vertices_m.max(0)])
+    corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), -1).reshape(-1, 3)
+    p = apply(inverse(view.map_T_cam) @ body.map_T_body, corners)
+    near = float(p[:, 2].min())
+    if near < NEAR_M:
+        return False
+    uv = p[:, :2] / p[:, 2:] * np.diag(view.K)[:2] + view.K[:2, 2]
+    size = [view.width_px, view.height_px]
+    low, high = (np.clip(np.floor(v), 0, size).astype(int) for v in (uv.min(0), uv.max(0) + 1))
+    part = nearest.reshape(view.height_px, view.width_px)[low[1] : high[1], low[0] : high[0]]
+    return part.size == 0 or float(part.max()) < near
+
+
 def fragments_of(view: RenderCamera, body: Body) -> Fragments | None:
     """Rasterize a body; None where it is outside the picture."""
     cam_T_body = inverse(view.map_T_cam) @ body.map_T_body
@@ -106,8 +130,10 @@ def draw_bodies(view: RenderCamera, bodies: Sequence[Body], lit: Lighting, color
     nearest = np.full(fine.width_px * fine.height_px, np.inf, np.float32)
     owner = np.full(len(nearest), NOBODY, np.int16)
     drawn: dict[int, Fragments] = {}
-    for index, body in enumerate(bodies):
-        fragments = fragments_of(fine, body)
+    for index in near_first(fine, bodies):
+        if is_hidden(fine, bodies[index], nearest):
+            continue
+        fragments = fragments_of(fine, bodies[index])
         if fragments is None:
             continue
         pixel = fragments.pixel(fine.width_px)

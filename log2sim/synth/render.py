@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array, Camera
 from log2sim.synth.backdrop import Wall
-from log2sim.synth.bodies import NOBODY, Body, Lighting, draw_bodies, draw_shadows, fragments_of
+from log2sim.synth.bodies import NOBODY, Body, Lighting, draw_bodies, draw_shadows, fragments_of, is_hidden, near_first
 from log2sim.synth.facades import draw_buildings, hide_behind_buildings
 from log2sim.synth.ground import Ground
 from log2sim.synth.lamps import Lamp, glare, light_scenery, nearest_lamps
@@ -40,19 +40,33 @@ class Visibility:
         Pixels of its whole silhouette in the image.
     box_px : (4,) float64, px
         Box of the visible part, edges of pixels counted from the image's corner.
+    silhouette_box_px : (4,) float64, px
+        Box of the whole silhouette in the image.
     """
 
     visible_px: int
     silhouette_px: int
     box_px: Array
+    silhouette_box_px: Array
 
 
 class Scenery(Protocol):
-    """The static parts of a scene: the ground's colors, its terrain (None where it is level) and the sides of buildings."""
+    """The static parts of a scene."""
 
-    ground: Ground
-    terrain: Terrain | None
-    buildings: tuple[tuple[Wall, ...], ...]
+    @property
+    def ground(self) -> Ground:
+        """Colors of the ground."""
+        ...
+
+    @property
+    def terrain(self) -> Terrain | None:
+        """Heights of the ground, None where it is level."""
+        ...
+
+    @property
+    def buildings(self) -> tuple[tuple[Wall, ...], ...]:
+        """Sides of each building."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,25 +115,26 @@ def segment(camera: Camera, map_T_cam: Array, instant: SceneInstant) -> list[Vis
     depth = np.full((view.height_px, view.width_px), np.inf, np.float32)
     hide_behind_buildings(view, instant.backdrop.buildings, depth)
     nearest, owner = depth.ravel(), np.full(depth.size, NOBODY)
-    whole: list[Fragments | None] = []
-    for index, body in enumerate(instant.bodies):
-        whole.append(fragments := fragments_of(view, body))
+    whole: list[Fragments | None] = [None] * len(instant.bodies)
+    for index in near_first(view, instant.bodies):
+        body = instant.bodies[index]
+        fragments = None if is_hidden(view, body, nearest) else fragments_of(view, body)
+        whole[index] = fragments
         if fragments is not None:
             pixel = fragments.pixel(view.width_px)
             near = fragments.depth_m < nearest[pixel]
             nearest[pixel[near]] = fragments.depth_m[near]
             owner[pixel[near]] = index
     return [
-        None if f is None else _visibility(f.part(owner[f.pixel(view.width_px)] == k), len(f.u))
-        for k, f in enumerate(whole)
+        None if f is None else _visibility(f, f.part(owner[f.pixel(view.width_px)] == k)) for k, f in enumerate(whole)
     ]
 
 
-def _visibility(visible: Fragments, silhouette: int) -> Visibility | None:
-    u, v = visible.u, visible.v
-    if len(u) == 0:
+def _visibility(silhouette: Fragments, visible: Fragments) -> Visibility | None:
+    if len(visible.u) == 0:
         return None
-    return Visibility(len(u), silhouette, np.array([u.min(), v.min(), u.max() + 1, v.max() + 1], float))
+    boxes = (np.array([f.u.min(), f.v.min(), f.u.max() + 1, f.v.max() + 1], float) for f in (visible, silhouette))
+    return Visibility(len(visible.u), len(silhouette.u), *boxes)
 
 
 def _developed(color: Image, light: Light, rng: np.random.Generator) -> NDArray[np.uint8]:

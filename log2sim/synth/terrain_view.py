@@ -93,5 +93,8 @@ def _from_tiles(ground: Ground, level: int, x: Image, y: Image, seen: Flags) -> 
     for row, column in zip(*np.nonzero(touched)):
         tile = ground.tile(level, low[0] + int(column), low[1] + int(row))
         mosaic[row * TILE_PX : (row + 1) * TILE_PX, column * TILE_PX : (column + 1) * TILE_PX] = tile
-    u, v = (x - np.float32(low[0]) * side) / step - np.float32(0.5), (y - np.float32(low[1]) * side) / step - np.float32(0.5)
+    u, v = (
+        (x - np.float32(low[0]) * side) / step - np.float32(0.5),
+        (y - np.float32(low[1]) * side) / step - np.float32(0.5),
+    )
     return np.asarray(cv2.remap(mosaic, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)

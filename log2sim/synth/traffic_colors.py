@@ -25,7 +25,14 @@ LOAD_COLORS: tuple[Rgb, ...] = ((226, 226, 222), (60, 92, 150), (170, 40, 36), (
 CLOTHES: tuple[Rgb, ...] = (
     (40, 42, 50), (52, 66, 104), (150, 40, 44), (70, 96, 70), (196, 190, 180), (110, 84, 60), (208, 140, 50), (90, 92, 96),
 )  # fmt: skip
-WALLS: tuple[Rgb, ...] = ((196, 182, 158), (176, 158, 146), (186, 186, 180), (188, 168, 140), (150, 120, 100), (208, 204, 196))
+WALLS: tuple[Rgb, ...] = (
+    (196, 182, 158),
+    (176, 158, 146),
+    (186, 186, 180),
+    (188, 168, 140),
+    (150, 120, 100),
+    (208, 204, 196),
+)
 FIXED: dict[Material, Rgb] = {
     Material.GROUND: (120, 112, 96),
     Material.GLASS: (62, 68, 74),
@@ -92,7 +99,15 @@ def look_of(item: TrafficObject, rng: np.random.Generator) -> Look:
     gloss = np.array([GLOSS.get(Material(m), 0.0) for m in material], np.float32)
     skin, hair = SKINS[rng.integers(len(SKINS))], HAIRS[rng.integers(len(HAIRS))]
     return Look(
-        item.category, item.kind, item.size_m, material, color, gloss, linear_bgr(trousers), linear_bgr(skin), linear_bgr(hair)
+        item.category,
+        item.kind,
+        item.size_m,
+        material,
+        color,
+        gloss,
+        linear_bgr(trousers),
+        linear_bgr(skin),
+        linear_bgr(hair),
     )
 
 

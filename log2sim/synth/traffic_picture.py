@@ -63,7 +63,9 @@ class TrafficPainter:
         self._looks = [look_of(item, rng) for item in scene.objects]
         self._meshes: dict[int, Mesh] = {}
 
-    def instant(self, scene: TrafficScene, light: Light, camera: Camera, map_T_cam: Array) -> tuple[SceneInstant, NDArray[np.int64]]:
+    def instant(
+        self, scene: TrafficScene, light: Light, camera: Camera, map_T_cam: Array
+    ) -> tuple[SceneInstant, NDArray[np.int64]]:
         """Take the scene at one time: what a camera may see, and the index of the object that each body is."""
         seen = [k for k, item in enumerate(scene.objects) if item.kind != OWN_CAR and _in_view(item, camera, map_T_cam)]
         self._make([k for k in seen if k not in self._meshes], scene)
@@ -73,7 +75,9 @@ class TrafficPainter:
 
     def _make(self, rows: list[int], scene: TrafficScene) -> None:
         objects = [scene.objects[k] for k in rows]
-        for k, item, mesh in zip(rows, objects, meshes_of([o.parts for o in objects], [o.size_m[2] / 2 for o in objects])):
+        for k, item, mesh in zip(
+            rows, objects, meshes_of([o.parts for o in objects], [o.size_m[2] / 2 for o in objects])
+        ):
             self._meshes[k] = _rounded(mesh, np.array([p.material for p in item.parts]))
 
 
@@ -96,7 +100,7 @@ def lamps_of(scene: TrafficScene) -> tuple[Lamp, ...]:
             pose = transform(rotation_from_rpy(0.0, 0.0, item.yaw_rad), item.position_m)
             lamps += headlights(pose, item.size_m[0] / 2, item.size_m[1])
         elif item.kind == "pole" and item.size_m[2] > MIN_STREET_LAMP_M:
-            lamps.append(Lamp(item.position_m + [0.0, 0.0, item.size_m[2]]))
+            lamps.append(Lamp(item.position_m + np.array([0.0, 0.0, item.size_m[2]])))
     if scene.mount == "vehicle":
         R, position = scene.sensor.rotation, scene.sensor.position_m
         ground = np.append(position[:2], scene.surface.elevation(position))
@@ -106,7 +110,7 @@ def lamps_of(scene: TrafficScene) -> tuple[Lamp, ...]:
 
 
 def _in_view(item: TrafficObject, camera: Camera, map_T_cam: Array) -> bool:
-    center = item.position_m + [0.0, 0.0, item.size_m[2] / 2]
+    center = item.position_m + np.array([0.0, 0.0, item.size_m[2] / 2])
     p = map_T_cam[:3, :3].T @ (center - map_T_cam[:3, 3])
     # Parts of clutter, such as crowns of trees, may lie off the middle.
     low, high = (np.array([getattr(part, end) for part in item.parts]) for end in ("low", "high"))
@@ -119,7 +123,7 @@ def _in_view(item: TrafficObject, camera: Camera, map_T_cam: Array) -> bool:
 
 
 def _body(item: TrafficObject, mesh: Mesh, look: Look) -> Body:
-    center = item.position_m + [0.0, 0.0, item.size_m[2] / 2]
+    center = item.position_m + np.array([0.0, 0.0, item.size_m[2] / 2])
     pose = transform(rotation_from_rpy(0.0, 0.0, item.yaw_rad), center)
     reach = 2 * float(np.abs(mesh.vertices_m).max()) if len(mesh.vertices_m) else 0.0
     return Body(mesh, pose, item.size_m, look.painter(), passes=look.passes(), reach_m=reach)
