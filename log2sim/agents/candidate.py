@@ -9,16 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.agents.confirmation import is_confirmed
+from log2sim.agents.confirmation import agent_confidence, is_confirmed
 from log2sim.agents.size import TrackGeometry
 from log2sim.datatypes import GROUP_OF, Agent, Track, Waypoints
 from log2sim.geometry import NS_PER_S, Array
 
 # Distance from the rear axle to the box center as a share of the length: BMW 320i of CommonRoad's vehicle models, rounded.
 REAR_AXLE_SHARE = {"vehicle": 0.28, "two_wheeler": 0.3}
-# Number of the best detections whose mean score is the confidence. Independent detections would multiply; those of a video
-# are not independent, so the confidence saturates.
-CONFIDENCE_DETECTIONS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +60,6 @@ def candidate_of(
 ) -> AgentCandidate:
     """Make a candidate of a track, its geometry and its waypoints; `quality` is added to that of the track."""
     m = track.measurements
-    strongest = np.sort(m.score)[-CONFIDENCE_DETECTIONS:]
     length, width, height = (float(v) for v in geometry.size_m)
     agent = Agent(
         id="",
@@ -72,10 +68,10 @@ def candidate_of(
         waypoints=waypoints,
         static=static,
         rear_axle_offset_m=round(REAR_AXLE_SHARE.get(GROUP_OF[track.category], 0.0) * length, 3),
-        confidence=float(np.clip(strongest.mean(), 0.0, 1.0)),
+        confidence=float(np.clip(agent_confidence(track), 0.0, 1.0)),
         quality=_quality_of(track) | quality,
     )
-    return AgentCandidate(agent, float(m.score.sum()), is_confirmed(track, strongest, typical=geometry.is_likely))
+    return AgentCandidate(agent, float(m.score.sum()), is_confirmed(track, typical=geometry.is_likely))
 
 
 def confirm(candidates: Sequence[AgentCandidate]) -> list[AgentCandidate]:

@@ -3,44 +3,86 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from log2sim.agents.box_votes import independent
 from log2sim.datatypes import Track
 from log2sim.geometry import NS_PER_S, Array
+from log2sim.perception.late_fusion import logit, probability
 
-# Limits of `track_confidence`; a track whose size is unlikely for its category needs more evidence.
+# Limits of `image_confidence`; a track whose size is unlikely for its category needs more evidence.
 MIN_TRACK_CONFIDENCE = 0.3
 MIN_TRACK_CONFIDENCE_UNLIKELY_SIZE = 0.6
+# Limit of `sweep_confidence`, which is a probability: more likely an object than not.
+MIN_SWEEP_CONFIDENCE = 0.5
+# Number of the best detections whose mean score is the confidence. Independent detections would multiply; those of a video
+# are not independent, so the confidence saturates.
+CONFIDENCE_DETECTIONS = 5
 HIDDEN_S = 1.0
 SAME_MOMENT_S = 1e-3
 
 
-def is_confirmed(track: Track, strongest: Array, *, typical: bool) -> bool:
-    """Return whether the confidence of a track suffices.
+def is_confirmed(track: Track, *, typical: bool) -> bool:
+    """Return whether the detections of a track in images or those in LiDAR sweeps suffice.
 
     Parameters
     ----------
     track : Track
-    strongest : (K,) float64
-        Scores of the best detections of the track.
     typical : bool
         Whether the size is likely for the category; an unlikely size needs a higher confidence.
     """
-    return track_confidence(track, strongest) >= (
-        MIN_TRACK_CONFIDENCE if typical else MIN_TRACK_CONFIDENCE_UNLIKELY_SIZE
-    )
+    least = MIN_TRACK_CONFIDENCE if typical else MIN_TRACK_CONFIDENCE_UNLIKELY_SIZE
+    return image_confidence(track) >= least or sweep_confidence(track) >= MIN_SWEEP_CONFIDENCE
 
 
-def track_confidence(track: Track, strongest: Array) -> float:
-    """Return the confidence of a track in [0, 1]: its detection rate times the mean score (K,) of its best detections.
+def agent_confidence(track: Track) -> float:
+    """Return the confidence of an agent in [0, 1] from the scores of its track."""
+    best = float(_strongest(track.measurements.score).mean())
+    if np.isnan(track.measurements.box_yaw_rad).all():
+        return best
+    return max(sweep_confidence(track), best if image_confidence(track) >= MIN_TRACK_CONFIDENCE else 0.0)
+
+
+def image_confidence(track: Track) -> float:
+    """Return the share of its ticks at which a track is detected in images, times the mean of the best scores there."""
+    m = track.measurements
+    in_image = np.isnan(m.box_yaw_rad) | (m.camera != "")
+    if not in_image.any():
+        return 0.0
+    return detection_rate(m.t_ns) * float(in_image.mean()) * float(_strongest(m.score[in_image]).mean())
+
+
+def sweep_confidence(track: Track) -> float:
+    """Return the probability that a track is an object, from its boxes in LiDAR sweeps; 0 without any.
+
+    Notes
+    -----
+    The scores are calibrated probabilities, so their log-odds add up, scaled down to those of as many independent ticks. A
+    long false track has a few high scores by chance, which is why not the best alone count.
+    """
+    m = track.measurements
+    in_sweep = np.isfinite(m.box_yaw_rad)
+    if not in_sweep.any():
+        return 0.0
+    log_odds = float(logit(m.score[in_sweep]).mean()) * independent(int(in_sweep.sum()))
+    return detection_rate(m.t_ns) * float(probability(np.array(log_odds)))
+
+
+def detection_rate(t_ns: NDArray[np.int64]) -> float:
+    """Return the share of ticks with a detection between the first and the last of stamps (n,).
 
     A gap longer than `HIDDEN_S` counts as an occlusion: half of `HIDDEN_S` of it enters the detection rate.
     """
-    t = np.sort((track.measurements.t_ns - track.measurements.t_ns[0]) / NS_PER_S)
+    t = np.sort((t_ns - t_ns[0]) / NS_PER_S)
     # Frames that share a sweep measure at the same time, which counts once.
     t = t[np.r_[True, np.diff(t) > SAME_MOMENT_S]]
     steps = np.diff(t)
     if len(steps) == 0:
-        return float(strongest.mean())
+        return 1.0
     period = float(np.median(steps[steps <= np.median(steps)]))
     expected = 1 + float(np.where(steps > HIDDEN_S, HIDDEN_S / 2, steps).sum()) / max(period, 1e-3)
-    return min(len(t) / expected, 1.0) * float(strongest.mean())
+    return min(len(t) / expected, 1.0)
+
+
+def _strongest(score: Array) -> Array:
+    return np.sort(score)[-CONFIDENCE_DETECTIONS:]

@@ -19,7 +19,7 @@ from log2sim.perception.homography.correspondences import Correspondences, foot_
 from log2sim.perception.late_fusion import join_with_images, match_boxes
 from log2sim.perception.lidar.cloud import Cloud, cloud_origin
 from log2sim.perception.lidar.measure import measure_view, project_cloud
-from log2sim.perception.lidar.measure_boxes import measure_boxes
+from log2sim.perception.lidar.measure_boxes import measure_boxes, outside_ego
 from log2sim.perception.lidar.projection import View
 from log2sim.perception.prefetch import CloudOptions, CloudPrefetcher, obstacles_of
 from log2sim.perception.sync import Schedule
@@ -142,7 +142,7 @@ class _FirstPass:
         if boxes is None or reference is None:
             joined = Measurements.join(list(measured.values()))
         else:
-            in_sweep = measure_boxes(boxes, reference)
+            in_sweep = measure_boxes(outside_ego(self.log, boxes), reference)
             frames = [match_boxes(in_sweep, rows, views[camera]) for camera, rows in measured.items()]
             joined = join_with_images(in_sweep, frames)
         self.out.measurements.append(joined.take(self._in_range(tick, joined)))

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Boxes3D, Measurements
+from log2sim.datatypes import Boxes3D, Log, Measurements
 from log2sim.perception.box_completion import place_boxes
 from log2sim.perception.box_fitting import rotate
 from log2sim.perception.detect3d.box_points import points_of_boxes
@@ -17,6 +17,8 @@ from log2sim.perception.lidar.measure import writable, write_evidence
 
 # A box is wrong by less than this at each side; neighbors are farther away.
 BOX_MARGIN_M = 0.2
+# Mirrors reach so far beyond a vehicle's width, and boxes around them half as far again.
+EGO_MARGIN_M = 0.4
 
 
 def measure_boxes(boxes: Boxes3D, cloud: Cloud) -> Measurements:
@@ -30,6 +32,18 @@ def measure_boxes(boxes: Boxes3D, cloud: Cloud) -> Measurements:
         if len(members) >= MIN_CLUSTER_POINTS:
             write_evidence(columns, k, members, cloud)
     return place_boxes(Measurements(**columns | {"cluster": tuple(columns["cluster"])}))
+
+
+def outside_ego(log: Log, boxes: Boxes3D) -> Boxes3D:
+    """Leave out the boxes on the ego: a LiDAR sees the roof, the mirrors and the rider of its own vehicle."""
+    if log.ego is None or not len(boxes):
+        return boxes
+    map_T_ego, known = log.ego.at(boxes.t_ns)
+    axis = map_T_ego[:, :2, 0]
+    offset = (boxes.center_m - log.ego_centers(map_T_ego))[:, :2]
+    along, across = (offset * axis).sum(axis=1), axis[:, 0] * offset[:, 1] - axis[:, 1] * offset[:, 0]
+    length, width = np.array(log.ego_vehicle.size_m[:2]) / 2 + EGO_MARGIN_M
+    return boxes.take(~(known & (np.abs(along) < length) & (np.abs(across) < width)))
 
 
 def _members(boxes: Boxes3D, cloud: Cloud) -> list[NDArray[np.intp]]:
