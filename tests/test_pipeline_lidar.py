@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pytest
 from worlds import CAR, PARKED, WALKER, tiny_log, tiny_table
 
-from log2sim.config import Config
-from log2sim.datatypes import Agent, Log, Scenario
+from log2sim.config import Config, LidarConfig
+from log2sim.datatypes import Agent, Boxes3D, Detections, Frame, Log, Scenario
 from log2sim.errors import ConfigError, LogError
 from log2sim.evaluation.metrics.evaluator import evaluate
-from log2sim.pipeline import Result, reconstruct
+from log2sim.geometry import inverse, project_boxes, wrap_angle
+from log2sim.perception.detect.detectors import create_detector
+from log2sim.perception.detect3d.detectors import create_lidar_detector
+from log2sim.perception.lidar.cloud import Cloud
+from log2sim.pipeline import Detectors, Result, first_pass, reconstruct, second_pass, start
 
 ALL_AROUND = [{**tiny_table()["lidar"][0], "azimuth_deg": [-180.0, 180.0], "azimuth_step_deg": 1.0, "channels": 20}]
 BEHIND = PARKED | {"id": "behind", "pose": [-9.0, 4.0, 200.0]}
@@ -94,3 +99,94 @@ def test_sensors_that_a_detector_needs_are_asked_for(world: tuple[Log, Scenario]
         run(replace(log, cameras={}), "labels+lidar:labels")
     with pytest.raises(ConfigError, match=r"sync\.reference: LiDAR 'front' is not used; used: top"):
         run(log, "lidar:labels", "sync.reference=front")
+
+
+@dataclass(frozen=True)
+class Images:
+    """Image boxes of the labels, some of them changed."""
+
+    log: Log
+    change: Callable[[Frame, Detections], Detections]
+    name: str = "changed"
+    default_min_score: float = 0.0
+
+    def detect(self, frame: Frame) -> Detections:
+        return self.change(frame, create_detector("labels", self.log).detect(frame))
+
+
+@dataclass(frozen=True)
+class Sweeps:
+    """Boxes of the labels, some of them changed."""
+
+    log: Log
+    change: Callable[[Boxes3D], Boxes3D]
+    name: str = "lidar:changed"
+
+    def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
+        return self.change(create_lidar_detector("lidar:labels", self.log, LidarConfig()).detect(cloud))
+
+
+def run_with(log: Log, images: Images | None, sweeps: Sweeps | None) -> Result:
+    name = "+".join(["labels"] * (images is not None) + ["lidar:labels"] * (sweeps is not None))
+    started = start(log, Config.load(settings=[f"detect.name={name}"]))
+    started = replace(started, detectors=Detectors(images, sweeps))
+    return second_pass(started, first_pass(started))
+
+
+def nothing(frame: Frame, found: Detections) -> Detections:
+    return Detections.empty()
+
+
+@pytest.mark.parametrize(("score", "agents"), [(0.9, 4), (0.45, 1)])
+def test_what_a_blind_camera_misses_is_found_where_the_lidar_is_sure(
+    world: tuple[Log, Scenario], score: float, agents: int
+) -> None:
+    log, _ = world
+    sweeps = Sweeps(log, lambda boxes: replace(boxes, score=np.full(len(boxes), score)))
+    found = run_with(log, Images(log, nothing), sweeps).scenario.others
+    # Behind the ego no camera could see it, so a score of 0.45 starts a track; it must be likely to become an agent.
+    assert len(found) == (agents if score > 0.5 else 0)
+
+
+def test_a_false_image_box_is_doubted_where_the_lidar_sees_something_else() -> None:
+    container = {"center": [14.0, 6.0], "size_m": [4.4, 1.8, 1.6], "color": [190, 180, 170]}
+    log, _ = tiny_log([CAR], lidar=ALL_AROUND, building=[container])
+
+    def more(frame: Frame, found: Detections) -> Detections:
+        cam_T_map = inverse(log.map_T_sensor("front", frame.t_ns)[0][0])
+        center, size = np.array([[14.0, 6.0, 0.8]]), np.array([[4.4, 1.8, 1.6]])
+        px = project_boxes(center, size, np.zeros(1), frame.camera, cam_T_map).box_px
+        false = Detections(px, np.array([0.55]), np.array(["car"]))
+        return Detections(*(np.concatenate([getattr(d, k) for d in (found, false)]) for k in vars(found)))
+
+    alone, both = (run_with(log, Images(log, more), s) for s in (None, Sweeps(log, lambda boxes: boxes)))
+    assert nearest(alone, (14.0, 6.0)) is not None
+    assert nearest(both, (14.0, 6.0)) is None
+    assert len(both.scenario.others) == 1
+
+
+@pytest.mark.parametrize("yaw_deg", [10.0, 190.0])
+def test_which_way_a_parked_car_points_is_told_by_the_boxes(yaw_deg: float) -> None:
+    log, _ = tiny_log([CAR, PARKED | {"pose": [14.0, -4.0, yaw_deg]}], lidar=ALL_AROUND)
+
+    def unsure(boxes: Boxes3D) -> Boxes3D:
+        """One in four boxes is turned round, as it says."""
+        turned = np.where(np.random.default_rng(int(boxes.t_ns.sum()) % 2**31).random(len(boxes)) < 0.25, np.pi, 0.0)
+        return replace(boxes, yaw_rad=boxes.yaw_rad + turned, heading_score=np.full(len(boxes), 0.75))
+
+    for change in (lambda boxes: boxes, unsure):
+        parked = nearest(run_with(log, None, Sweeps(log, change)), (14.0, -4.0))
+        assert parked is not None
+        assert abs(wrap_angle(parked.waypoints.yaw_rad[0] - np.deg2rad(yaw_deg))) < np.deg2rad(5)
+    # Traffic alone says that it points along with the ego and the other car.
+    without = nearest(run(log, "labels"), (14.0, -4.0))
+    assert without is not None
+    assert abs(wrap_angle(without.waypoints.yaw_rad[0] - np.deg2rad(10.0))) < np.deg2rad(5)
+
+
+def test_a_moving_car_points_where_it_goes_whatever_the_boxes_say(world: tuple[Log, Scenario]) -> None:
+    log, _ = world
+    backward = Sweeps(log, lambda boxes: replace(boxes, yaw_rad=boxes.yaw_rad + np.pi))
+    car = next(a for a in run_with(log, None, backward).scenario.others if not a.static and a.category == "car")
+    assert abs(wrap_angle(car.waypoints.yaw_rad)).max() < np.deg2rad(10)
+    assert (car.waypoints.speed_mps > 2).all()

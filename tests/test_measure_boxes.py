@@ -1,0 +1,189 @@
+"""Boxes found in a cloud as evidence: their points, ends and yaw; the boxes' own estimates over a track."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from worlds import Solid, scan, standing
+
+from log2sim.agents.box_votes import heading_log_odds, independent, mean_box_axis, typical_box_size, weighted_median
+from log2sim.agents.confirmation import agent_confidence, image_confidence, is_confirmed, sweep_confidence
+from log2sim.agents.size import moving_geometry, static_geometry
+from log2sim.datatypes import Boxes3D, EgoVehicle, Log, Measurements, Track
+from log2sim.geometry import NS_PER_S, PoseTrack, rotation_from_rpy, transform, wrap_angle
+from log2sim.perception.box_completion import BOX_SIGMA_M, box_sigma, weighted_center
+from log2sim.perception.lidar.cloud import Cloud
+from log2sim.perception.lidar.measure_boxes import measure_boxes, outside_ego
+
+ORIGIN = np.array([500.0, -200.0, 3.0])
+SENSOR = (0.0, 0.0, 1.9)
+
+
+def cloud_of(solids: list[Solid], *, turn_rad: float = 0.0, flip: float = 1.0, noise_m: float = 0.01) -> Cloud:
+    """A sweep all around over flat ground, turned about the sensor or mirrored in y."""
+    xyz, owner = scan(solids, azimuth_deg=(-180.0, 180.0), steps=(1440, 40), noise_m=noise_m, seed=1)
+    xyz = (xyz * [1.0, flip, 1.0]) @ rotation_from_rpy(0, 0, turn_rad).T
+    height = xyz[:, 2].astype(np.float32)
+    near = np.flatnonzero(np.abs(xyz[:, :2]).max(axis=1) < 70)
+    ground = (owner < 0)[near]
+    return Cloud(
+        NS_PER_S, ORIGIN, xyz[near].astype(np.float32), np.zeros(len(near), np.float32), np.array(SENSOR, np.float32),
+        ground, height[near],
+    )  # fmt: skip
+
+
+def boxes_of(solids: list[Solid], *, turn_rad: float = 0.0, flip: float = 1.0, yaw_error_rad: float = 0.0) -> Boxes3D:
+    m = len(solids)
+    center = np.array([s.center_m for s in solids]).reshape(-1, 3) * [1.0, flip, 1.0]
+    return Boxes3D(
+        np.full(m, NS_PER_S), center @ rotation_from_rpy(0, 0, turn_rad).T + ORIGIN,
+        np.array([s.size_m for s in solids]).reshape(-1, 3),
+        np.array([flip * (s.yaw_rad + yaw_error_rad) + turn_rad for s in solids]), np.full(m, 0.9),
+        np.full(m, "car", dtype="<U16"), np.full(m, 0.8), np.full(m, 40),
+    )  # fmt: skip
+
+
+CARS = [standing(12.0, 5.0, 20.0), standing(-15.0, 3.0, 170.0), standing(4.0, -18.0, -80.0)]
+
+
+def test_boxes_have_their_points_and_places_all_around() -> None:
+    rows = measure_boxes(boxes_of(CARS), cloud_of(CARS))
+    assert (rows.source == "lidar").all()
+    assert (rows.camera == "").all()
+    for k, car in enumerate(CARS):
+        assert len(rows.cluster[k]) > 30
+        assert np.hypot(*(rows.center_m[k] - car.center_m - ORIGIN)[:2]) < 0.1
+        assert abs(wrap_angle(rows.yaw_rad[k] - car.yaw_rad)) < np.deg2rad(2)
+    np.testing.assert_allclose(rows.bottom_m, ORIGIN[2], atol=0.05)
+
+
+def test_points_correct_a_yaw_that_is_somewhat_wrong_and_keep_its_direction() -> None:
+    rows = measure_boxes(boxes_of(CARS, yaw_error_rad=np.deg2rad(6)), cloud_of(CARS))
+    for k, car in enumerate(CARS):
+        assert abs(wrap_angle(rows.yaw_rad[k] - car.yaw_rad)) < np.deg2rad(2)
+
+
+def test_a_box_without_points_keeps_its_own_place() -> None:
+    ghost = [standing(30.0, 30.0)]
+    rows = measure_boxes(boxes_of(ghost), cloud_of(CARS))
+    assert len(rows.cluster[0]) == 0
+    np.testing.assert_allclose(rows.center_m, boxes_of(ghost).center_m)
+    assert rows.points[0] == 40
+    assert rows.source.tolist() == ["lidar"]
+
+
+def test_a_point_belongs_to_one_box_only() -> None:
+    cars = [standing(12.0, 5.0), standing(12.0, 6.95)]
+    rows = measure_boxes(boxes_of(cars), cloud_of(cars))
+    one, other = ({tuple(p) for p in cluster.round(4)} for cluster in rows.cluster)
+    assert one
+    assert other
+    assert not one & other
+    assert max(p[1] for p in one) - ORIGIN[1] < 6.0
+
+
+@pytest.mark.parametrize(("turn_deg", "flip"), [(73.0, 1.0), (180.0, 1.0), (0.0, -1.0), (-140.0, -1.0)])
+def test_turning_and_mirroring_the_world_turns_and_mirrors_the_rows(turn_deg: float, flip: float) -> None:
+    turn = float(np.deg2rad(turn_deg))
+    here = measure_boxes(boxes_of(CARS), cloud_of(CARS))
+    there = measure_boxes(boxes_of(CARS, turn_rad=turn, flip=flip), cloud_of(CARS, turn_rad=turn, flip=flip))
+    expected = ((here.center_m - ORIGIN) * [1.0, flip, 1.0]) @ rotation_from_rpy(0, 0, turn).T + ORIGIN
+    np.testing.assert_allclose(there.center_m, expected, atol=0.03)
+    np.testing.assert_allclose(wrap_angle(there.yaw_rad - (flip * here.yaw_rad + turn)), 0.0, atol=0.01)
+    ends = here.ends_visible if flip > 0 else here.ends_visible[:, ::-1]
+    assert (there.ends_visible == ends).mean() > 0.8
+
+
+def test_the_ego_itself_is_no_object() -> None:
+    poses = transform(rotation_from_rpy(0, 0, np.deg2rad(90)), ORIGIN)
+    log = Log(
+        "l", "t", {}, {}, {}, PoseTrack(np.array([9, 11]) * NS_PER_S // 10, np.stack([poses, poses])), EgoVehicle()
+    )
+    found = boxes_of([standing(x, y) for x, y in ((0.0, 1.4), (-1.2, 2.0), (0.0, 4.5), (-2.5, 1.4))])
+    kept = outside_ego(log, found)
+    np.testing.assert_allclose(kept.center_m - ORIGIN, [[0.0, 4.5, 0.8], [-2.5, 1.4, 0.8]])
+    assert len(outside_ego(replace(log, ego=None), found)) == 4
+
+
+def test_the_better_of_two_centers_counts_more_and_a_missing_one_not_at_all() -> None:
+    a, b, sigma = np.zeros((3, 2)), np.ones((3, 2)), np.full((3, 2), 0.1)
+    a[2], b[1] = np.nan, np.nan
+    center, left = weighted_center(a, sigma, b, 3 * sigma)
+    np.testing.assert_allclose(center, [[0.1, 0.1], [0, 0], [1, 1]])
+    np.testing.assert_allclose(left[:, 0], [0.1 * 0.9**0.5, 0.1, 0.3])
+    assert box_sigma(np.array([10**9]))[0] == pytest.approx(BOX_SIGMA_M)
+    assert (np.diff(box_sigma(np.array([0, 5, 20, 100]))) <= 0).all()
+
+
+def track_of(
+    ticks: int, score: float | np.ndarray = 0.8, *, heading: float = 0.9, camera: str = "", **moved: float
+) -> Track:
+    """A track of one car by boxes of sweeps, which turns by `flip` radians at a share `flipped` of its ticks."""
+    rows = Measurements.join([measure_boxes(boxes_of(CARS[:1]), cloud_of(CARS[:1]))] * ticks)
+    yaw = rows.box_yaw_rad.copy()
+    yaw[: round(ticks * moved.get("flipped", 0.0))] += np.pi
+    t_ns = NS_PER_S + np.arange(ticks) * NS_PER_S // 10
+    rows = replace(
+        rows, t_ns=t_ns, score=np.broadcast_to(score, ticks).astype(float), box_yaw_rad=yaw,
+        heading_score=np.full(ticks, heading), camera=np.full(ticks, camera),
+    )  # fmt: skip
+    return Track("car", np.arange(ticks), rows)
+
+
+def test_more_ticks_are_surer_about_the_front_up_to_a_limit() -> None:
+    yaw = CARS[0].yaw_rad
+    odds = [heading_log_odds(track_of(n).measurements, yaw) for n in (1, 3, 30)]
+    assert 0 < odds[0] < odds[1] < odds[2] < 2 * odds[0] + 1e-9
+    np.testing.assert_allclose(heading_log_odds(track_of(3).measurements, yaw + np.pi), -odds[1])
+    assert heading_log_odds(track_of(10, flipped=0.8).measurements, yaw) < 0
+    assert heading_log_odds(track_of(10, flipped=0.5).measurements, yaw) == pytest.approx(0.0)
+    assert heading_log_odds(track_of(3).measurements, yaw + np.pi / 2) == 0.0
+    assert independent(1) == 1
+    assert independent(10**6) == pytest.approx(2.0)
+
+
+def test_the_axis_of_boxes_does_not_mind_flips_and_the_median_no_outlier() -> None:
+    m = track_of(10, flipped=0.5).measurements
+    assert abs(wrap_angle(2 * (mean_box_axis(m) - CARS[0].yaw_rad))) < 0.02
+    sizes = m.box_size_m.copy()
+    sizes[:3] = 40.0
+    np.testing.assert_allclose(typical_box_size(replace(m, box_size_m=sizes)), CARS[0].size_m)
+    assert weighted_median(np.array([3.0, 1.0, 2.0]), np.array([10.0, 1.0, 1.0])) == 3.0
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_sides_never_seen_have_the_size_of_the_boxes(moving: bool) -> None:
+    van = [standing(14.0, 0.0, 0.0, (5.6, 2.0, 2.1))]
+    row = measure_boxes(boxes_of(van), cloud_of(van))
+    track = Track("car", np.arange(8), Measurements.join([row] * 8))
+    shape = moving_geometry(track, np.zeros(8)) if moving else static_geometry(track)
+    assert shape.size_m[0] == pytest.approx(5.6, abs=0.15)
+    np.testing.assert_allclose(shape.xy_m[0], np.array([14.0, 0.0]) + ORIGIN[:2], atol=0.15)
+
+
+def test_a_long_false_track_with_a_few_high_scores_is_not_confirmed() -> None:
+    score = np.full(60, 0.25)
+    score[[3, 20, 31, 44, 50]] = 0.9
+    false, true = track_of(60, score), track_of(60, 0.7)
+    assert sweep_confidence(false) < 0.3
+    assert not is_confirmed(false, typical=True)
+    assert is_confirmed(true, typical=True)
+    assert agent_confidence(true) == pytest.approx(sweep_confidence(true))
+    assert image_confidence(true) == 0.0
+
+
+def test_what_the_image_confirms_needs_no_sweep() -> None:
+    assert is_confirmed(track_of(20, 0.45, camera="front"), typical=True)
+    assert not is_confirmed(track_of(20, 0.45), typical=True)
+
+
+def test_a_track_seen_at_every_third_tick_is_no_object() -> None:
+    whole = track_of(60, 0.7)
+    rows = np.arange(0, 60, 3)
+    sparse = Track("car", whole.tick[rows], replace(whole.measurements.take(rows)))
+    # The stamps of every third tick alone look complete; the gaps show against two neighbors.
+    pairs = np.sort(np.r_[rows, rows[::3] + 1])
+    gappy = Track("car", whole.tick[pairs], whole.measurements.take(pairs))
+    assert sweep_confidence(gappy) < sweep_confidence(sparse) <= sweep_confidence(whole)
