@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array
+from log2sim.geometry import Array, rotation_from_rpy, wrap_angle
 from log2sim.synth.lidar_models import LidarModel
 from log2sim.synth.polytopes import Material, Polytope
 from log2sim.synth.returns import REFLECTANCE, ReturnModel, backscattered, detected, disturbed, reflected
@@ -145,9 +145,9 @@ def cast_polytopes(
     """
     buffers = _cast_ground(model, sensor, terrain)
     azimuth, elevation = model.azimuths_rad(), model.elevations_rad()
-    windows = [_window(solid, sensor) for solid in solids]
-    for index in np.argsort([w.near_m for w in windows]).tolist():
-        _cast_solid(buffers, solids[index], index, windows[index], sensor, azimuth, elevation, rng)
+    windows = _windows(solids, sensor)
+    for index in np.argsort(windows.near_m, kind="stable").tolist():
+        _cast_solid(buffers, solids[index], index, windows, sensor, azimuth, elevation, rng)
     return _returned(buffers, sensor, len(solids), rng, returns or ReturnModel(model.noise_m, 0.0, 0.0), model.range_m)
 
 
@@ -202,59 +202,59 @@ def _cast_ground(model: LidarModel, sensor: SensorState, terrain: Terrain) -> _B
     return out
 
 
-@dataclass(frozen=True)
-class _Window:
-    """Angles in the sensor's frame that may see an object; azimuth from a middle one, less than half a turn each way."""
+@dataclass(frozen=True, eq=False)
+class _Windows:
+    """Angles in the sensor's frame that may see each of S objects; azimuths around a middle one, less than half a turn each way."""
 
-    near_m: float
-    azimuth: float
-    half: tuple[float, float]
-    elevation: tuple[float, float]
+    near_m: Array
+    azimuth: Array
+    half: Array
+    elevation: Array
+    low: Array
+    high: Array
 
 
-def _window(solid: Solid, sensor: SensorState) -> _Window:
-    low = np.min([p.low for p in solid.parts], axis=0)
-    high = np.max([p.high for p in solid.parts], axis=0)
-    c, s = np.cos(solid.yaw_rad), np.sin(solid.yaw_rad)
-    rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    local = rotation.T @ (sensor.position_m - solid.position_m)
-    near = float(np.linalg.norm(np.maximum(np.maximum(low - local, local - high), 0)))
-    # Points of the box's surface, so dense that the greatest elevation is not missed between them.
+def _windows(solids: Sequence[Solid], sensor: SensorState) -> _Windows:
+    """Find the window of every object from points on its bounding box."""
+    low = np.array([np.min([p.low for p in solid.parts], axis=0) for solid in solids]).reshape(-1, 3)
+    high = np.array([np.max([p.high for p in solid.parts], axis=0) for solid in solids]).reshape(-1, 3)
+    position = np.array([solid.position_m for solid in solids]).reshape(-1, 3)
+    rotation = rotation_from_rpy(0.0, 0.0, np.array([solid.yaw_rad for solid in solids]))
+    local = np.einsum("sji,sj->si", rotation, sensor.position_m - position)
+    near = np.linalg.norm(np.maximum(np.maximum(low - local, local - high), 0), axis=1)
+    # So dense that the greatest elevation is not missed between them.
     steps = np.linspace(0, 1, 5)
     u, v, w = np.meshgrid(steps, steps, [0.0, 1.0], indexing="ij")
-    grid = low + np.column_stack([u.ravel(), v.ravel(), w.ravel()]) * (high - low)
-    points = ((grid @ rotation.T + solid.position_m) - sensor.position_m) @ sensor.rotation
-    azimuth, flat = np.arctan2(points[:, 1], points[:, 0]), np.hypot(points[:, 0], points[:, 1])
-    elevation = np.arctan2(points[:, 2], flat)
-    margin = WINDOW_MARGIN_RAD + 0.3 / max(near, 0.3) * float(np.linalg.norm((high - low)[:2])) / 16
-    middle = float(np.arctan2(np.sin(azimuth).mean(), np.cos(azimuth).mean()))
-    off = (azimuth - middle + np.pi) % (2 * np.pi) - np.pi
-    if near < 1.0 or np.ptp(off) > 5.5:
-        off = np.array([-np.pi, np.pi])
-    return _Window(
-        near,
-        middle,
-        (float(off.min()) - margin, float(off.max()) + margin),
-        (float(elevation.min()) - margin, float(elevation.max()) + margin),
+    grid = low[:, None] + np.column_stack([u.ravel(), v.ravel(), w.ravel()]) * (high - low)[:, None]
+    points = (grid @ rotation.transpose(0, 2, 1) + (position - sensor.position_m)[:, None]) @ sensor.rotation
+    azimuth, flat = np.arctan2(points[..., 1], points[..., 0]), np.hypot(points[..., 0], points[..., 1])
+    elevation = np.arctan2(points[..., 2], flat)
+    margin = WINDOW_MARGIN_RAD + 0.3 / np.maximum(near, 0.3) * np.linalg.norm((high - low)[:, :2], axis=1) / 16
+    middle = np.arctan2(np.sin(azimuth).mean(axis=1), np.cos(azimuth).mean(axis=1))
+    off = wrap_angle(azimuth - middle[:, None])
+    half = np.column_stack([off.min(axis=1) - margin, off.max(axis=1) + margin])
+    half[(near < 1.0) | (np.ptp(off, axis=1) > 5.5)] = -np.pi, np.pi
+    return _Windows(
+        near, middle, half, np.column_stack([elevation.min(axis=1) - margin, elevation.max(axis=1) + margin]), low, high
     )
 
 
-def _columns(window: _Window, azimuth: Array) -> NDArray[np.intp]:
+def _columns(windows: _Windows, index: int, azimuth: Array) -> NDArray[np.intp]:
     """Return the firings (C,) within a window, which may lie across the sweep's seam."""
-    off = (azimuth - window.azimuth + np.pi) % (2 * np.pi) - np.pi
-    return np.flatnonzero((off >= window.half[0]) & (off <= window.half[1]))
+    off = (azimuth - windows.azimuth[index] + np.pi) % (2 * np.pi) - np.pi
+    return np.flatnonzero((off >= windows.half[index, 0]) & (off <= windows.half[index, 1]))
 
 
 def _cast_solid(
-    buffers: _Buffers, solid: Solid, index: int, window: _Window, sensor: SensorState, azimuth: Array, elevation: Array,
+    buffers: _Buffers, solid: Solid, index: int, windows: _Windows, sensor: SensorState, azimuth: Array, elevation: Array,
     rng: np.random.Generator,
 ) -> None:  # fmt: skip
-    rows = np.flatnonzero((elevation >= window.elevation[0]) & (elevation <= window.elevation[1]))
-    cols = _columns(window, azimuth)
+    rows = np.flatnonzero((elevation >= windows.elevation[index, 0]) & (elevation <= windows.elevation[index, 1]))
+    cols = _columns(windows, index, azimuth)
     if not len(rows) or not len(cols):
         return
     # Rays that meet something nearer than the object's nearest point need no test.
-    lines, firings = np.nonzero(buffers.range_m[np.ix_(rows, cols)] > window.near_m)
+    lines, firings = np.nonzero(buffers.range_m[np.ix_(rows, cols)] > windows.near_m[index])
     if not len(lines):
         return
     lines, firings = rows[lines], cols[firings]
@@ -263,13 +263,28 @@ def _cast_solid(
     direction = to_object.astype(np.float32) @ buffers.direction[lines, firings].T
     origin = to_object @ (sensor.position_m - solid.position_m)
     drift = to_object @ np.append(sensor.velocity_mps - solid.velocity_mps, 0.0)
+    moving = np.abs(drift).max() > 0.1
+    start = origin[:, None].astype(np.float32)
+    if moving:
+        start = start + drift[:, None].astype(np.float32) * buffers.column_s[firings]
+    direction[direction == 0] = np.float32(1e-12)
+    # Most rays of the window pass the bounding box; the parts need not be tested for them.
+    with np.errstate(over="ignore"):
+        ends = (
+            (windows.low[index].astype(np.float32)[:, None] - start) / direction,
+            (windows.high[index].astype(np.float32)[:, None] - start) / direction,
+        )
+    first, last = np.minimum(*ends).max(axis=0), np.maximum(*ends).min(axis=0)
+    met = np.flatnonzero((first <= last) & (last > 0) & (first < buffers.range_m[lines, firings]))
+    if not len(met):
+        return
+    lines, firings, direction = lines[met], firings[met], direction[:, met]
     normals = np.concatenate([p.normals for p in solid.parts])
     offsets = np.concatenate([p.offsets for p in solid.parts])
     faces = np.array([len(p.offsets) for p in solid.parts])
     starts = np.cumsum(faces) - faces
     slope = normals @ direction
     gap = (offsets - normals @ origin.astype(np.float32))[:, None]
-    moving = np.abs(drift).max() > 0.1
     if moving:
         gap = gap - (normals @ drift.astype(np.float32))[:, None] * buffers.column_s[firings]
     slope[slope == 0] = np.float32(1e-12)
@@ -280,12 +295,12 @@ def _cast_solid(
         np.where(entering, crossing, np.float32(-np.inf)),
         np.where(entering, np.float32(np.inf), crossing),
     )
-    for k, (start, count) in enumerate(zip(starts, faces, strict=True)):
-        latest[start : start + count].max(axis=0, out=enter[k])
-        earliest[start : start + count].min(axis=0, out=leave[k])
-    met = (enter < leave) & (enter > MIN_RANGE_M)
-    enter = np.where(met, enter, np.float32(np.inf))
-    for k in np.flatnonzero(met.any(axis=1)).tolist():
+    for k, (begin, count) in enumerate(zip(starts.tolist(), faces.tolist(), strict=True)):
+        latest[begin : begin + count].max(axis=0, out=enter[k])
+        earliest[begin : begin + count].min(axis=0, out=leave[k])
+    crossed = (enter < leave) & (enter > MIN_RANGE_M)
+    enter = np.where(crossed, enter, np.float32(np.inf))
+    for k in np.flatnonzero(crossed.any(axis=1)).tolist():
         material = solid.parts[k].material
         if material in (Material.LEAVES, Material.GLASS, Material.MESH):
             enter[k] = _passed(enter[k], leave[k], material, solid, rng)

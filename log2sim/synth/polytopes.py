@@ -85,8 +85,9 @@ def prism(profile: Sequence[tuple[float, float]], width: float, material: Materi
         Lean of the sides inward, m per m of height.
     """
     points = np.asarray(profile, np.float64)
-    edges = np.roll(points, -1, axis=0) - points
-    normals = np.column_stack([edges[:, 1], np.zeros(len(edges)), -edges[:, 0]])
+    edges = points[np.r_[1 : len(points), 0]] - points
+    normals = np.zeros((len(edges), 3))
+    normals[:, 0], normals[:, 2] = edges[:, 1], -edges[:, 0]
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     offsets = normals[:, 0] * points[:, 0] + normals[:, 2] * points[:, 1]
     k = 1 / np.hypot(1, taper)
@@ -105,7 +106,7 @@ def prism(profile: Sequence[tuple[float, float]], width: float, material: Materi
 
 def box(low: Sequence[float], high: Sequence[float], material: Material) -> Polytope:
     """Make a box from its lowest and highest corner (3,), m."""
-    return _made(np.vstack([np.eye(3), -np.eye(3)]), np.append(high, -np.asarray(low)), low, high, material)
+    return _made(_FACES, np.array([*high, -low[0], -low[1], -low[2]]), low, high, material)
 
 
 def column(
@@ -131,15 +132,24 @@ def tube(radius: float, x: tuple[float, float], z: float, material: Material, *,
     return _made(normals, offsets, (x[0], -reach, z - reach), (x[1], reach, z + reach), material)
 
 
-def wheel(radius: float, width: float, x: float, y: float) -> Polytope:
-    """Make a wheel, standing on the ground, that rolls along x, m."""
+def _tread() -> Array:
+    """Return the normals (10, 3) of a wheel: eight around its axle, two along it."""
     angles = (np.arange(8) + 0.5) * np.pi / 4
     around = np.column_stack([np.cos(angles), np.zeros(8), np.sin(angles)])
-    normals = np.vstack([around, [[0, 1, 0], [0, -1, 0]]])
-    offsets = np.append(radius + around[:, 0] * x + around[:, 2] * radius, [y + width / 2, width / 2 - y])
+    return np.vstack([around, [[0, 1, 0], [0, -1, 0]]])
+
+
+_TREAD = _tread()
+_FACES = np.vstack([np.eye(3), -np.eye(3)])
+
+
+def wheel(radius: float, width: float, x: float, y: float) -> Polytope:
+    """Make a wheel, standing on the ground, that rolls along x, m."""
+    offsets = radius + _TREAD[:, 0] * x + _TREAD[:, 2] * radius
+    offsets[8:] = y + width / 2, width / 2 - y
     reach = radius / np.cos(np.pi / 8)
     return _made(
-        normals,
+        _TREAD,
         offsets,
         (x - reach, y - width / 2, radius - reach),
         (x + reach, y + width / 2, radius + reach),

@@ -26,15 +26,17 @@ class _Layout:
     roads: tuple[Road, ...]
     rng: np.random.Generator
     objects: list[TrafficObject] = field(default_factory=list)
-    circles: list[tuple[float, float, float]] = field(default_factory=list)
+    circles: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     def is_free(self, circles: Array, margin: float = 0.0) -> bool:
         """Decide whether circles (K, 3: x, y, radius) meet none that is taken."""
-        if not self.circles:
-            return True
-        taken = np.array(self.circles)
-        distance = np.hypot(circles[:, None, 0] - taken[:, 0], circles[:, None, 1] - taken[:, 1])
-        return bool((distance > circles[:, None, 2] + taken[:, 2] + margin).all())
+        dx, dy = (circles[:, None, axis] - self.circles[:, axis] for axis in range(2))
+        reach = circles[:, None, 2] + self.circles[:, 2] + margin
+        return not bool(((dx * dx + dy * dy <= reach * reach) & (reach > 0)).any())
+
+    def take(self, circles: Array) -> None:
+        """Mark circles (K, 3) as taken."""
+        self.circles = np.concatenate([self.circles, circles])
 
     def on_road(self, xy: Array) -> bool:
         """Decide whether a position is on a carriageway."""
@@ -49,7 +51,7 @@ class _Layout:
         circles = _covering(xy, yaw, size)
         if not self.is_free(circles, margin):
             return False
-        self.circles.extend(map(tuple, circles))
+        self.take(circles)
         self.objects.append(
             TrafficObject(category, np.append(xy, self.surface.elevation(xy)), yaw, size, parts, speed, turn)
         )
@@ -61,7 +63,7 @@ class _Layout:
         if radius and not self.is_free(circle):
             return False
         if radius:
-            self.circles.append((float(xy[0]), float(xy[1]), radius))
+            self.take(circle)
         low, high = np.min([p.low for p in parts], axis=0), np.max([p.high for p in parts], axis=0)
         size = (float(high[0] - low[0]), float(high[1] - low[1]), float(high[2]))
         self.objects.append(TrafficObject("", np.append(xy, self.surface.elevation(xy)), yaw, size, parts, kind=kind))
@@ -84,7 +86,7 @@ def draw_layout(
     """Draw the objects of a scene."""
     out = _Layout(surface, roads, rng)
     # The place of the sensor's own car, or of its pole.
-    out.circles.append((0.0, 0.0, 0.5 if mount == "roadside" else 2.4))
+    out.take(np.array([[0.0, 0.0, 0.5 if mount == "roadside" else 2.4]]))
     for road in roads:
         _traffic(out, road)
     _parked(out, roads[0])
