@@ -36,10 +36,11 @@ FIRST_SHARDS, STEPS_PER_SHARD = 4, 100
 BATCH = 4
 PEAK_RATE, WARM_UP_STEPS = 2.5e-3, 100
 MAX_GRADIENT_NORM = 10.0
-CELLS = 256
+# Side of the square grids of training; a roadside sensor sees cars to some 25 m.
+CELLS = {"vehicle": 256, "roadside": 192}
 CELL_M = {"vehicle": 0.25, "roadside": 0.1875}
-SCENES = {"vehicle": 5_000, "roadside": 4_000}
-STEPS = {"vehicle": 8_000, "roadside": 5_000}
+SCENES = {"vehicle": 4_000, "roadside": 3_000}
+STEPS = {"vehicle": 5_500, "roadside": 4_500}
 CHECKPOINT_S = 60.0
 # Largest |x| and |y| from the sensor at run time; the roadside sensor sees cars to some 25 m.
 RANGE_M = {"vehicle": 40.0, "roadside": 30.0}
@@ -89,16 +90,17 @@ def shard_name(mount: str, seed: int, number: int) -> str:
     return f"{mount}-{seed}-{number:04d}.npz"
 
 
-def batch_of(pool: Pool, cell_m: float, rng: np.random.Generator):
+def batch_of(pool: Pool, mount: str, rng: np.random.Generator):
     """Draw a batch: grids and targets."""
+    cells, cell_m = CELLS[mount], CELL_M[mount]
     samples, lows, grids = [], [], []
     for _ in range(BATCH):
         sample = augmented(pool.draw(rng), rng)
-        low = window_of(rng, CELLS, cell_m)
+        low = window_of(rng, cells, cell_m)
         samples.append(sample)
         lows.append(low)
-        grids.append(grid_of(sample, low, CELLS, cell_m))
-    return torch.from_numpy(np.stack(grids)), targets_of(samples, lows, CELLS, cell_m)
+        grids.append(grid_of(sample, low, cells, cell_m))
+    return torch.from_numpy(np.stack(grids)), targets_of(samples, lows, cells, cell_m)
 
 
 def fit(mount: str, data: Path, out: Path, *, scenes: int, steps: int, seed: int) -> None:
@@ -118,7 +120,7 @@ def fit(mount: str, data: Path, out: Path, *, scenes: int, steps: int, seed: int
     while step < steps:
         rng = np.random.default_rng([seed, 7, step])  # of the step alone, so that a resumed run draws the same
         pool.prepare(step)
-        grid, targets = batch_of(pool, CELL_M[mount], rng)
+        grid, targets = batch_of(pool, mount, rng)
         rate = PEAK_RATE * min(1, step / WARM_UP_STEPS + 0.05) * (0.5 + 0.5 * math.cos(math.pi * step / steps)) + 1e-5
         for group in optimizer.param_groups:
             group["lr"] = rate

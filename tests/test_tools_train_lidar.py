@@ -1,0 +1,191 @@
+"""Training of the LiDAR detector: samples, targets, loss, and a toy from scenes to a file that detects."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the extra 'train'")
+pytest.importorskip("onnx", reason="needs the extra 'train'")
+
+TOOLS = Path(__file__).parents[1] / "tools"
+sys.path.insert(0, str(TOOLS))
+
+import train_lidar  # noqa: E402
+from lidar_training.clouds import draw_example  # noqa: E402
+from lidar_training.export import calibrate, describe, description, export_onnx, logistic  # noqa: E402
+from lidar_training.losses import loss_of  # noqa: E402
+from lidar_training.network import BOX, CATEGORY, HEAT, OUT_CHANNELS, SEGMENT, VOTE, BevNetwork  # noqa: E402
+from lidar_training.samples import CATEGORIES, Sample, Shard, augmented, draw_sample, grid_of, write_shard  # noqa: E402
+from lidar_training.targets import targets_of  # noqa: E402
+
+from log2sim.config import LidarConfig  # noqa: E402
+from log2sim.perception.detect3d.centers import decode_centers  # noqa: E402
+from log2sim.perception.detect3d.network import NetworkInfo  # noqa: E402
+from log2sim.perception.detect3d.network_detector import open_network  # noqa: E402
+
+CELLS, CELL_M = 128, 0.25
+LOW = np.array([-16.0, -16.0])
+
+
+def sample(*rows: tuple[float, float, float, str], points: int = 50) -> Sample:
+    boxes = np.array([[x, y, 0.8, 4.5, 1.8, 1.6, yaw] for x, y, yaw, _ in rows], np.float32).reshape(-1, 7)
+    return Sample(
+        np.zeros((0, 3), np.float32),
+        boxes,
+        np.array([CATEGORIES.index(c) for *_, c in rows]),
+        np.full(len(rows), points),
+    )
+
+
+def maps_of(targets) -> np.ndarray:
+    """Return maps of a network that answers exactly what the targets ask for."""
+    maps = np.zeros((OUT_CHANNELS, CELLS // 2, CELLS // 2), np.float32)
+    heat = targets.heat[0].numpy()
+    maps[HEAT] = np.log(np.clip(heat, 1e-3, 0.999) / (1 - np.clip(heat, 1e-3, 0.999)))
+    maps[BOX], maps[14:18] = targets.box[0, :6], targets.box[0, 6:]
+    for code in range(5):
+        maps[CATEGORY][code] = 10.0 * (targets.category[0] == code)
+    return maps
+
+
+def test_decoding_undoes_the_targets() -> None:
+    rows = [
+        (3.1, -4.2, 0.3, "car"),
+        (-8.0, 6.5, 2.8, "truck"),
+        (9.4, 9.1, -1.9, "cyclist"),
+        (-2.0, -9.9, -3.0, "pedestrian"),
+    ]
+    truth = sample(*rows)
+    info = NetworkInfo.model_validate(description("vehicle", CELL_M, 16.0))
+    found = decode_centers(maps_of(targets_of([truth], [LOW], CELLS, CELL_M)), info, LOW)
+    strong = found.take(found.heat > 5)
+    assert len(strong) == len(rows)
+    for row, (x, y, yaw, category) in zip(truth.boxes, rows, strict=True):
+        k = int(np.argmin(np.hypot(strong.center_m[:, 0] - x, strong.center_m[:, 1] - y)))
+        assert np.allclose(strong.center_m[k], row[:3], atol=1e-3)
+        assert np.allclose(strong.size_m[k], row[3:6], rtol=1e-4)
+        assert np.cos(strong.yaw_rad[k] - yaw) > 0.9999
+        assert strong.category[k] == category
+
+
+def test_an_object_with_few_points_is_neither_asked_for_nor_punished() -> None:
+    targets = targets_of([sample((0, 0, 0, "car"), points=2)], [LOW], CELLS, CELL_M)
+    assert targets.heat.max() == 0
+    assert 0 < (targets.considered == 0).sum() < 100
+    maps = torch.zeros(1, OUT_CHANNELS, 64, 64)
+    grid = torch.zeros(1, 12, CELLS, CELLS)
+    quiet, _ = loss_of(maps, targets, grid)
+    loud = maps.clone()
+    loud[0, 0][targets.considered[0, 0] == 0] = 8.0
+    assert float(loss_of(loud, targets, grid)[0]) <= float(quiet)
+
+
+def test_the_loss_of_right_answers_is_lowest() -> None:
+    targets = targets_of([sample((3, -4, 0.3, "car"), (-8, 6, 2.8, "pedestrian"))], [LOW], CELLS, CELL_M)
+    grid = torch.ones(1, 12, CELLS, CELLS)
+    right = torch.from_numpy(maps_of(targets))[None]
+    for group in range(4):
+        right[0, SEGMENT][group] = 10.0 * (targets.segment[0] == group)
+    right[0, VOTE] = targets.vote[0]
+    right[0, 18] = 6.0
+    best, parts = loss_of(right, targets, grid)
+    assert parts["box"] == pytest.approx(0, abs=1e-6)
+    for channel in (0, 8, 11, 14, 16, 20, 23):
+        worse = right.clone()
+        worse[0, channel] += 15.0 if channel == 20 else 1.5  # the focal loss forgives small doubts
+        assert float(loss_of(worse, targets, grid)[0]) > float(best), channel
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_augmentation_moves_points_and_boxes_alike(seed: int) -> None:
+    """Points on a box's corner stay there, turned, mirrored and all."""
+    c, s = np.cos(0.7), np.sin(0.7)
+    corner = np.array([[5 + 2.25 * c - 0.9 * s, 3 + 2.25 * s + 0.9 * c, 1.0]], np.float32).repeat(200, axis=0)
+    truth = sample((5, 3, 0.7, "car"), points=200)
+    out = augmented(replace(truth, xyz_m=corner), np.random.default_rng(seed))
+    x, y, *_, yaw = out.boxes[0]
+    dx, dy = out.xyz_m[0, 0] - x, out.xyz_m[0, 1] - y
+    assert abs(dx * np.cos(yaw) + dy * np.sin(yaw) - 2.25) < 1e-3
+    assert abs(abs(dy * np.cos(yaw) - dx * np.sin(yaw)) - 0.9) < 1e-3
+
+
+def test_shards_keep_samples_to_half_a_step(tmp_path) -> None:
+    samples = [draw_sample("roadside", (1, k)) for k in range(2)]
+    write_shard(tmp_path / "s.npz", samples)
+    shard = Shard(tmp_path / "s.npz")
+    assert len(shard) == 2
+    for a, b in zip(samples, (shard[0], shard[1]), strict=True):
+        assert np.abs(a.xyz_m - b.xyz_m).max() <= 0.0026
+        assert np.array_equal(a.boxes, b.boxes)
+        assert np.array_equal(a.points, b.points)
+    assert grid_of(shard[0], LOW, CELLS, CELL_M).shape == (12, CELLS, CELLS)
+
+
+def test_a_calibration_of_known_odds_is_found() -> None:
+    rng = np.random.default_rng(0)
+    features = np.column_stack([np.ones(20_000), rng.normal(0, 2, (20_000, 4))])
+    weights = np.array([-0.5, 0.8, 0.3, 0.2, -0.4])
+    right = rng.random(20_000) < 1 / (1 + np.exp(-features @ weights))
+    assert np.allclose(logistic(features, right), weights, atol=0.06)
+
+
+def test_onnx_equals_torch_and_detects_nothing_untrained(tmp_path) -> None:
+    torch.manual_seed(0)
+    torch.save({"mean": BevNetwork().state_dict()}, tmp_path / "c.pt")
+    path = tmp_path / "n.onnx"
+    export_onnx(tmp_path / "c.pt", path, description("vehicle", CELL_M, 16.0))  # raises where they differ
+    example = draw_example("vehicle", (4, 4))
+    assert len(open_network(path, LidarConfig(min_score=0.3), name="x").detect(example.cloud)) == 0
+    info = description("vehicle", CELL_M, 16.0)
+    info["calibration"] = calibrate(path, [example])
+    describe(path, info)
+    assert open_network(path, LidarConfig(), name="x").network.info.calibration["vehicle"] == tuple(
+        info["calibration"]["vehicle"]
+    )
+
+
+def test_a_resumed_run_gives_the_weights_of_one_that_was_not_stopped(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(train_lidar, "PER_SHARD", 2)
+    monkeypatch.setattr(train_lidar, "CELLS", {"roadside": 64})
+    weights = []
+    for name, stops in (("whole", (4,)), ("parts", (2, 4))):
+        out = tmp_path / name
+        train_lidar.generate("roadside", out / "data", 4, 3)
+        for k, stop in enumerate(stops):
+            # The learning rate follows the number of steps in all, so a stop is a failure in the middle.
+            limit = {"scenes": 4, "steps": 4, "seed": 3}
+            if k + 1 < len(stops):
+                with monkeypatch.context() as patched:
+                    patched.setattr(train_lidar, "CHECKPOINT_S", -1.0)
+                    real = train_lidar.batch_of
+                    calls = iter(range(100))
+
+                    def stopping(*arguments, real=real, calls=calls, stop=stop):
+                        if next(calls) == stop:
+                            raise KeyboardInterrupt
+                        return real(*arguments)
+
+                    patched.setattr(train_lidar, "batch_of", stopping)
+                    with pytest.raises(KeyboardInterrupt):
+                        train_lidar.fit("roadside", out / "data", out, **limit)
+            else:
+                train_lidar.fit("roadside", out / "data", out, **limit)
+        weights.append(torch.load(out / "checkpoint.pt", weights_only=True)["network"])
+    assert all(torch.equal(a, b) for a, b in zip(weights[0].values(), weights[1].values(), strict=True))
+
+
+@pytest.mark.slow
+def test_a_toy_learns_to_find_vehicles(tmp_path) -> None:
+    """A minute from nothing: what it finds on fresh scenes is mostly right."""
+    train_lidar.generate("roadside", tmp_path / "data", 100, 5)
+    train_lidar.fit("roadside", tmp_path / "data", tmp_path, scenes=100, steps=220, seed=5)
+    train_lidar.finish("roadside", tmp_path, seed=5, scenes=100, steps=220, examples=25)
+    card = json.loads((tmp_path / "roadside.json").read_text())
+    assert card["simulated"]["vehicle"]["average_precision"] > 0.25
+    assert (tmp_path / "roadside.onnx").stat().st_size < 1_000_000
