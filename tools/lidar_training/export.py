@@ -15,14 +15,10 @@ from lidar_training.network import IN_CHANNELS, BevNetwork
 from log2sim.config import LidarConfig
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.matching import Criterion, match
-from log2sim.perception.detect3d.box_points import points_of_boxes
-from log2sim.perception.detect3d.centers import decode_centers
 from log2sim.perception.detect3d.grid import grid_window, rasterize
 from log2sim.perception.detect3d.level_points import level_points, sensor_xy
 from log2sim.perception.detect3d.network import METADATA_KEY, load_network
 from log2sim.perception.detect3d.network_detector import NetworkDetector, open_network
-from log2sim.perception.detect3d.suppression import suppress
-from log2sim.perception.lidar.ground import ON_GROUND_M
 
 GROUPS = ("vehicle", "two_wheeler", "pedestrian")
 CATEGORIES = {
@@ -121,27 +117,21 @@ def group_of(boxes: SceneBoxes, group: str) -> SceneBoxes:
 
 def _raw_boxes(detector: NetworkDetector, example: Example) -> tuple[SceneBoxes, np.ndarray]:
     """Return boxes with their groups as categories, not scored, and the features (M, 5) of their scores."""
-    info, cloud = detector.network.info, example.cloud
-    xyz, _ = level_points(cloud, detector.range_m)
-    low, shape = grid_window(xyz, cell_m=info.cell_m, range_m=detector.range_m, center=sensor_xy(cloud))
-    maps = detector.network.run(rasterize(xyz, cell_m=info.cell_m, low=low, shape=shape))
-    found = decode_centers(maps, info, low)
-    found = found.take(suppress(found.rectangles, found.heat, found.group, across=False))
-    above = xyz[xyz[:, 2] > ON_GROUND_M]
-    points = points_of_boxes(above, found.center_m, found.size_m, found.yaw_rad).count
-    range_m = np.hypot(*(found.center_m[:, :2] - sensor_xy(cloud)).T)
-    columns = np.column_stack([np.ones(len(found)), found.heat, found.quality, np.log1p(points), range_m / 10])
+    found = detector.candidates(example.cloud)
+    boxes, points = found.boxes, found.inside.count
+    rows = np.column_stack([boxes.center_m, boxes.size_m, boxes.yaw_rad])
+    names = np.array(detector.network.info.groups)[boxes.group]
     some = np.flatnonzero(points > 0)
-    boxes = np.column_stack([found.center_m, found.size_m, found.yaw_rad])
-    names = np.array(info.groups)[found.group]
-    score = 1 / (1 + np.exp(-found.heat))
-    return SceneBoxes.of(boxes, names, score, points=points, range_m=range_m).take(some), columns[some]
+    table = SceneBoxes.of(rows, names, 1 / (1 + np.exp(-boxes.heat)), points=points)
+    return table.take(some), found.terms.T[some]
 
 
 def logistic(features: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Fit a logistic regression by Newton's method, with a ridge that keeps rare groups finite."""
     weights = np.array(RAW_CALIBRATION)
     prior = weights.copy()
+    if not len(right):
+        return weights
     for _ in range(30):
         p = 1 / (1 + np.exp(-np.clip(features @ weights, -30, 30)))
         gradient = features.T @ (p - right) / len(right) + RIDGE * (weights - prior)
@@ -171,7 +161,7 @@ def quantize(path: Path, out: Path, examples: list[Example]) -> None:
             if example is None:
                 return None
             xyz, _ = level_points(example.cloud, info.range_m)
-            low, shape = grid_window(xyz, cell_m=info.cell_m, range_m=info.range_m, center=sensor_xy(example.cloud))
+            low, shape = grid_window(xyz[:, :2], cell_m=info.cell_m, range_m=info.range_m, center=sensor_xy(example.cloud))
             return {"grid": rasterize(xyz, cell_m=info.cell_m, low=low, shape=shape)[None]}
 
     quantize_static(
