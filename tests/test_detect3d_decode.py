@@ -98,7 +98,9 @@ def test_peaks_are_greatest_among_their_neighbors_and_strongest_first() -> None:
     group, flat = peaks(heat)
     padded = np.pad(heat, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
     around = np.max([padded[:, i : i + 30, j : j + 20] for i in range(3) for j in range(3)], axis=0)
-    expected = {(g, int(i * 20 + j)) for g, i, j in np.argwhere((heat == around) & (heat >= np.log(MIN_HEAT / (1 - MIN_HEAT))))}
+    expected = {
+        (g, int(i * 20 + j)) for g, i, j in np.argwhere((heat == around) & (heat >= np.log(MIN_HEAT / (1 - MIN_HEAT))))
+    }
     assert set(zip(group.tolist(), flat.tolist())) == expected
     assert np.all(np.diff(heat.reshape(2, -1)[group, flat]) <= 0)
 

@@ -46,7 +46,8 @@ def sample(*rows: tuple[float, float, float, str], points: int = 50) -> Sample:
 def maps_of(targets) -> np.ndarray:
     """Return maps of a network that answers exactly what the targets ask for."""
     maps = np.zeros((OUT_CHANNELS, CELLS // 2, CELLS // 2), np.float32)
-    heat = targets.heat[0].numpy()
+    # The detector averages boxes over neighbors of a peak; where no box is asked for, this network is sure of nothing.
+    heat = targets.heat[0].numpy() * targets.regressed[0].numpy()
     maps[HEAT] = np.log(np.clip(heat, 1e-3, 0.999) / (1 - np.clip(heat, 1e-3, 0.999)))
     maps[BOX], maps[14:18] = targets.box[0, :6], targets.box[0, 6:]
     for code in range(5):

@@ -161,7 +161,9 @@ def quantize(path: Path, out: Path, examples: list[Example]) -> None:
             if example is None:
                 return None
             xyz, _ = level_points(example.cloud, info.range_m)
-            low, shape = grid_window(xyz[:, :2], cell_m=info.cell_m, range_m=info.range_m, center=sensor_xy(example.cloud))
+            low, shape = grid_window(
+                xyz[:, :2], cell_m=info.cell_m, range_m=info.range_m, center=sensor_xy(example.cloud)
+            )
             return {"grid": rasterize(xyz, cell_m=info.cell_m, low=low, shape=shape)[None]}
 
     quantize_static(

@@ -54,7 +54,8 @@ def grid_window(
     first, last = (np.clip(np.floor((v - corner) / cell_m), 0, limit - 1) for v in (low, high))
     needed = last - first + 1
     count = np.maximum(np.ceil(needed / SIZE_MULTIPLE) * SIZE_MULTIPLE, min(MIN_SIZE_CELLS, limit))
-    start = np.clip(first - (count - needed) // 2, 0, limit - count)
+    # Even, so that the cells of the maps, twice as large, lie alike in every window.
+    start = np.clip(first - (count - needed) // 2, 0, limit - count) // 2 * 2
     return corner + start * cell_m, (int(count[0]), int(count[1]))
 
 
@@ -86,27 +87,28 @@ def rasterize(xyz: NDArray[np.float32], *, cell_m: float, low: Array, shape: tup
     out = np.zeros((CHANNELS, h * w), np.float32)
     if len(inside) == 0:
         return out.reshape(CHANNELS, h, w)
-    x, y, z = x[inside], y[inside], z[inside]
-    i, j = x.astype(np.int32), y.astype(np.int32)
-    flat = i.astype(np.intp) * w + j
-    one = np.float32(1)
-    count = np.zeros(h * w, np.float32)
-    np.add.at(count, flat, one)
+    x, y, z = x.take(inside), y.take(inside), z.take(inside)
+    i, j = x.astype(np.intp), y.astype(np.intp)
+    cell = i * w + j
+    count = np.bincount(cell, minlength=h * w)
     used = np.flatnonzero(count)
-    share = one / count[used]
-    out[0].fill(-np.inf)
-    out[2].fill(np.inf)
-    np.maximum.at(out[0], flat, z)
-    np.minimum.at(out[2], flat, z)
-    for channel, values in ((1, z), (10, x - i.astype(np.float32)), (11, y - j.astype(np.float32))):
-        np.add.at(out[channel], flat, values)
-        out[channel, used] *= share
-    empty = count == 0
-    out[0, empty], out[2, empty] = 0, 0
-    out[:3] /= 2
-    out[3, used] = np.log1p(count[used]) / 3
-    slices = np.searchsorted(np.array(SLICE_EDGES_M[1:-1], np.float32), z)
-    np.add.at(out[4:10].reshape(-1), slices * (h * w) + flat, one)
-    out[4:10, used] = np.log1p(out[4:10, used]) / 2
-    out[10:12, used] -= np.float32(0.5)
+    # One column for each cell with points, which are a tenth of all.
+    number = np.empty(h * w, np.intp)
+    number[used] = np.arange(len(used))
+    column, points = number.take(cell), count.take(used).astype(np.float32)
+    values = np.empty((CHANNELS, len(used)), np.float32)
+    values[0].fill(-np.inf)
+    values[2].fill(np.inf)
+    np.maximum.at(values[0], column, z)
+    np.minimum.at(values[2], column, z)
+    for channel, of_points in ((1, z), (10, x - i.astype(np.float32)), (11, y - j.astype(np.float32))):
+        values[channel] = np.bincount(column, of_points, minlength=len(used)) / points
+    values[:3] /= 2
+    values[3] = np.log1p(points) / 3
+    values[10:12] -= np.float32(0.5)
+    for edge in np.array(SLICE_EDGES_M[1:-1], np.float32):
+        column += (z > edge) * len(used)
+    values[4:10] = np.log1p(np.bincount(column, minlength=6 * len(used)).astype(np.float32)).reshape(6, -1) / 2
+    for channel in range(CHANNELS):
+        out[channel, used] = values[channel]
     return out.reshape(CHANNELS, h, w)
