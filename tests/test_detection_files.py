@@ -247,6 +247,14 @@ def test_what_is_out_of_range_counts_for_nothing(tiny: Log) -> None:
     assert 0 < row["truths"] < whole["truths"]
     assert row["true_positives"] == row["truths"]
     assert row["false_positives"] == 0
+    astray = moved(found, 40.0)
+    false = [
+        evaluate_boxes(astray, tiny, Options("center", max_range_m=m))["classes"]["vehicle"]["figures"][0][
+            "false_positives"
+        ]
+        for m in (30.0, 100.0)
+    ]
+    assert false[0] == 0 < false[1]
 
 
 def test_where_nothing_was_labeled_nothing_is_false(tiny: Log) -> None:

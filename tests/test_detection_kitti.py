@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from log2sim.datatypes import ImageRegions, Log
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.class_figures import ClassBoxes, class_figures
+from log2sim.evaluation.detection.class_figures import ClassBoxes, class_figures, overall
 from log2sim.evaluation.detection.image_views import ImageViews, image_views
 from log2sim.evaluation.detection.matching import Criterion, candidate_pairs, match
 from log2sim.evaluation.detection.precision import precision_recall
@@ -100,11 +100,29 @@ def test_figures_by_range_and_by_points_count_false_boxes_where_they_are():
     by_points = {r["objects"]: counts(r) for r in result["by_points"]}
     assert by_points == {
         "5-9 points": (0, 0, 1, 0), "10-19 points": (1, 1, 0, 0), "20-49 points": (0, 0, 0, 0), "50+ points": (1, 1, 0, 0),
+        "20+ points": (1, 1, 0, 0),
     }  # fmt: skip
     assert [row["objects"] for row in result["figures"]] == ["all"] * 4
     assert class_figures(
         ClassBoxes(found, replace(truth, points=None), none(found), none(found)), CAR, 0.5
     )["by_points"] is None  # fmt: skip
+
+
+def test_classes_are_added_up_and_categories_of_a_group_count_once():
+    truth = row_of([10.0, 20.0], points=[60, 12])
+    found = row_of([10.0, 40.0], score=0.9, points=[55, 30])
+    vehicles = class_figures(ClassBoxes(found, truth, none(found), none(found)), CAR, 0.5)
+    people = {
+        **class_figures(ClassBoxes(found, truth, none(found), none(found)), CAR, 0.5),
+        "categories": ["pedestrian"],
+    }
+    group = {**vehicles, "categories": ["car", "truck"]}
+    rows = {r["objects"]: r for r in overall({"vehicle": group, "pedestrian": people, "car": vehicles})}
+    assert counts(rows["all"]) == (4, 2, 2, 2)
+    assert rows["all"]["f1"] == 0.5
+    assert rows["all"]["precision_times_recall"] == 0.25
+    assert counts(rows["20+ points"]) == (2, 2, 2, 0)
+    assert counts(rows["15-30 m"]) == (2, 0, 0, 2)
 
 
 def test_scores_are_compared_with_the_share_of_right_boxes():
@@ -134,7 +152,7 @@ def facing_camera(distortion=0.0):
 
 def test_views_know_height_truncation_and_regions_without_labels():
     stamps = np.array([0, 100_000_000])
-    region = ImageRegions(np.array([10_000_000]), np.array([[560.0, 0, 1200, 370]]))
+    region = ImageRegions(np.full(2, 10_000_000), np.array([[560.0, 0, 1200, 370], [0, 0, 9, 9]]))
     log = Log("made", "test", {"front": facing_camera()}, {}, {}, ignored_regions={"front": region})
     boxes = np.array([[20.0, 0, 0.8, 2, 2, 1.6, 0], [-20, 0, 0.8, 2, 2, 1.6, 0], [7, 6, 0.8, 0.01, 2, 1.6, 0]])
     seen = image_views(log, "front", stamps, SceneBoxes.of(boxes), truncation=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,13 +13,14 @@ from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.calibration import calibration
 from log2sim.evaluation.detection.image_views import ImageViews
 from log2sim.evaluation.detection.matching import Criterion, Matches, Pairs, assign, candidate_pairs
-from log2sim.evaluation.detection.precision import operating_point, precision_recall
+from log2sim.evaluation.detection.precision import operating_point, precision_recall, rates
 from log2sim.evaluation.detection.protocols import DIFFICULTIES, MIN_POINTS, ObjectClass
 from log2sim.geometry import wrap_angle
 
 Mask = NDArray[np.bool_]
 RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0), (50.0, np.inf))
-POINTS = ((MIN_POINTS, 9), (10, 19), (20, 49), (50, np.inf))
+POINTS = ((MIN_POINTS, 9), (10, 19), (20, 49), (50, np.inf), (20, np.inf))
+"""The last one joins the two before."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,3 +193,21 @@ def headings(objects: Objects, matches: Matches, min_score: float) -> float | No
 def match_entry(criterion: Criterion) -> dict[str, Any]:
     """Return a criterion as a document."""
     return {"measure": criterion.measure, "limit": criterion.limit}
+
+
+def overall(classes: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Add up the counts of classes, each by its own first match, for all objects and for each range and number of points.
+
+    Categories whose group is among the classes count once.
+    """
+    members = {name: set(figures["categories"]) for name, figures in classes.items()}
+    whole = [
+        figures for name, figures in classes.items() if not any(members[name] < other for other in members.values())
+    ]
+    counts: dict[str, list[int]] = {}
+    for figures in whole:
+        for row in (figures["figures"][0], *figures["by_range"], *(figures["by_points"] or [])):
+            sums = counts.setdefault(row["objects"], [0, 0, 0])
+            for k, key in enumerate(("true_positives", "false_positives", "false_negatives")):
+                sums[k] += row[key]
+    return [{"objects": name, "truths": c[0] + c[2], **rates(*c)} for name, c in counts.items()]

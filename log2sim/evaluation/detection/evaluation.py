@@ -13,7 +13,7 @@ from log2sim.datatypes import Log
 from log2sim.errors import ConfigError, LogError
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.boxes_file import DetectedBoxes
-from log2sim.evaluation.detection.class_figures import ClassBoxes, class_figures
+from log2sim.evaluation.detection.class_figures import ClassBoxes, class_figures, overall
 from log2sim.evaluation.detection.image_views import ImageViews, image_views
 from log2sim.evaluation.detection.protocols import MIN_POINTS, PROTOCOLS, ObjectClass, Protocol
 from log2sim.evaluation.detection.truth import SweepTruth, truth_of_sweeps
@@ -112,6 +112,7 @@ def evaluate_boxes(
     truth = truth_of_sweeps(log, detected.t_ns, progress=progress)
     found = found_in_sweeps(detected, truth)
     sides = _sides(log, detected.t_ns, found, truth, camera)
+    figures = {c.name: class_figures(_class_boxes(sides, c, options, protocol), c, options.min_score) for c in classes}
     return {
         "detection_metrics_version": VERSION,
         "log": detected.log,
@@ -124,9 +125,8 @@ def evaluate_boxes(
         "sweeps_without_labels": int((~truth.labeled).sum()),
         "reference_camera": camera,
         "min_points": None if truth.boxes.points is None else MIN_POINTS,
-        "classes": {
-            c.name: class_figures(_class_boxes(sides, c, options, protocol), c, options.min_score) for c in classes
-        },
+        "overall": overall(figures),
+        "classes": figures,
     }
 
 

@@ -132,17 +132,21 @@ def operating_point(found: SceneBoxes, matches: Matches, min_score: float) -> di
         call the last one mean average precision, which it is not: it is one point of the curve.
     """
     reported = found.score >= min_score
-    right = int(np.count_nonzero(matches.right & reported))
-    false = int(np.count_nonzero(matches.false & reported))
+    right, false = (int(np.count_nonzero(rows & reported)) for rows in (matches.right, matches.false))
+    return rates(right, false, matches.truths - right)
+
+
+def rates(right: int, false: int, missed: int) -> dict[str, Any]:
+    """Compute the figures of `operating_point` from its counts."""
     precision = right / (right + false) if right + false else None
-    recall = right / matches.truths if matches.truths else None
+    recall = right / (right + missed) if right + missed else None
     both = precision is not None and recall is not None
     return {
         "true_positives": right,
         "false_positives": false,
-        "false_negatives": matches.truths - right,
+        "false_negatives": missed,
         "precision": precision,
         "recall": recall,
-        "f1": 2 * right / (2 * right + false + matches.truths - right) if both else None,
+        "f1": 2 * right / (2 * right + false + missed) if both else None,
         "precision_times_recall": precision * recall if precision is not None and recall is not None else None,
     }

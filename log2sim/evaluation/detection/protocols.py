@@ -13,7 +13,8 @@ from log2sim.evaluation.detection.image_views import ImageViews
 from log2sim.evaluation.detection.matching import Criterion
 
 MIN_POINTS = 5
-"""True boxes with fewer points are ignored, outside KITTI's difficulties (the least of LEVEL_1 of Waymo is more than 5)."""
+"""True boxes with fewer points are ignored, outside KITTI's difficulties: they show no extent (Waymo's level 1 asks for more
+than 5)."""
 
 
 @dataclass(frozen=True)
@@ -104,13 +105,14 @@ PROTOCOLS: Mapping[str, Protocol] = {
         ),
         of_camera=True,
     ),
-    # Yu et al. (CVPR 2022), whose class "Car" is all vehicles and whose "Cyclist" includes motorcycles.
+    # Yu et al. (CVPR 2022), whose class "Car" is all vehicles and whose "Cyclist" includes motorcycles; and 0.3, which suits
+    # small things that are seen from the roadside as well.
     "dair": Protocol(
         "dair",
         (
             ObjectClass("vehicle", VEHICLES, _ious(0.5)),
-            ObjectClass("pedestrian", PEOPLE, _ious(0.25)),
-            ObjectClass("two_wheeler", RIDERS, _ious(0.25)),
+            ObjectClass("pedestrian", PEOPLE, _ious(0.25, 0.3)),
+            ObjectClass("two_wheeler", RIDERS, _ious(0.25, 0.3)),
         ),
     ),
     "center": Protocol(

@@ -38,6 +38,11 @@ def format_table(result: Mapping[str, Any]) -> str:
         for row in rows:
             values = [_cell(row[key]) for key, _ in columns]
             cells.append([name, row["objects"], str(Criterion(**row["match"])), str(row["truths"]), *values])
+    if len(shown) > 1:
+        for row in result["overall"]:
+            if row["truths"]:
+                values = [_cell(row.get(key)) for key, _ in columns]
+                cells.append(["all classes", row["objects"], "each its first", str(row["truths"]), *values])
     widths = [max(len(row[k]) for row in cells) for k in range(len(cells[0]))]
     lines = ["  ".join(_aligned(row, widths)).rstrip() for row in cells]
     scores = [_score_note(name, result["classes"][name]["calibration"]) for name in shown]
