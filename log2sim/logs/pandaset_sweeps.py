@@ -21,6 +21,9 @@ from log2sim.logs.unpickle import Columns, read_pickled_table
 
 # Value of the column "d" by LiDAR.
 LIDARS: Mapping[str, int] = {"pandar64": 0, "pandargt": 1}
+COLUMNS = ("x", "y", "z", "t", "d")
+# Tables that are kept from the reading of the stamps until their sweeps are read, so that they are decompressed once.
+MAX_KEPT_BYTES = 256 * 1024**2
 # Unix times beyond this do not fit into int64 nanoseconds.
 MAX_TIME_S = 9e9
 READING_THREADS = 4
@@ -32,14 +35,14 @@ class SweepFiles:
     def __init__(self, files: dict[int, Path], t_ns: NDArray[np.int64], notes: list[str]) -> None:
         self._files, self._t_ns, self._notes = files, t_ns, notes
         self._indexes: dict[str, tuple[NDArray[np.int64], list[Path]]] = {}
-        self._lock = Lock()
+        self._lock, self._kept = Lock(), _KeptTables()
 
     def stream(self, lidar: str) -> Stream:
         """Return the stream of one LiDAR."""
 
         def read(i: int) -> Sweep:
             t_ns, files = self.index(lidar)
-            return _read_sweep(files[i], int(t_ns[i]), LIDARS[lidar])
+            return _read_sweep(self._kept.take(files[i], lidar), files[i], int(t_ns[i]), LIDARS[lidar])
 
         return Stream(lidar, lambda: self.index(lidar)[0], read)
 
@@ -59,17 +62,51 @@ class SweepFiles:
         """Middle (N,) of the PandarGT's points of each sweep; the sweep's stamp where it cannot be read."""
         stamps = self._t_ns.copy()
         with ThreadPoolExecutor(READING_THREADS) as pool:
-            for number, stamp in zip(self._files, pool.map(_gt_middle_ns, self._files.values())):
+            for number, stamp in zip(self._files, pool.map(self._gt_middle_ns, self._files.values())):
                 stamps[number] = stamps[number] if stamp is None else stamp
         return stamps
 
+    def _gt_middle_ns(self, path: Path) -> int | None:
+        try:
+            columns = read_pickled_table(path)
+            self._kept.add(path, columns)
+        except RecordError:
+            return None
+        return _gt_middle_ns(columns)
 
-def _gt_middle_ns(path: Path) -> int | None:
+
+class _KeptTables:
+    """Tables whose sweeps are still to be read, up to `MAX_KEPT_BYTES`; safe to share between threads."""
+
+    def __init__(self) -> None:
+        self._tables: dict[Path, tuple[Columns, set[str]]] = {}
+        self._bytes, self._lock = 0, Lock()
+
+    def add(self, path: Path, columns: Columns) -> None:
+        """Keep the columns of a table that a sweep needs, if there is room."""
+        needed = {name: columns[name] for name in COLUMNS if name in columns}
+        size = sum(column.nbytes for column in needed.values())
+        with self._lock:
+            if self._bytes + size <= MAX_KEPT_BYTES:
+                self._tables[path] = {name: column.copy() for name, column in needed.items()}, set()
+                self._bytes += size
+
+    def take(self, path: Path, lidar: str) -> Columns | None:
+        """Return a table for one LiDAR, None where it is not kept; forget it when all LiDARs have got it."""
+        with self._lock:
+            columns, read = self._tables.get(path, (None, set()))
+            read.add(lidar)
+            if columns is not None and len(read) == len(LIDARS):
+                del self._tables[path]
+                self._bytes -= sum(column.nbytes for column in columns.values())
+            return columns
+
+
+def _gt_middle_ns(columns: Mapping[str, NDArray[Any]]) -> int | None:
     try:
-        columns: Mapping[str, NDArray[Any]] = read_pickled_table(path)
         t_s = columns["t"][columns["d"] == LIDARS["pandargt"]]
         middle_s = (float(np.nanmin(t_s)) + float(np.nanmax(t_s))) / 2 if len(t_s) else np.nan
-    except (RecordError, KeyError, TypeError):
+    except (KeyError, TypeError):
         return None
     return round(middle_s * NS_PER_S) if np.isfinite(middle_s) else None
 
@@ -80,10 +117,10 @@ def _read_points(path: Path) -> Columns:
     return read_pickled_table(path)
 
 
-def _read_sweep(path: Path, t_ns: int, number: int) -> Sweep:
+def _read_sweep(kept: Columns | None, path: Path, t_ns: int, number: int) -> Sweep:
     where = f"{path} (stamp {t_ns})"
     try:
-        columns = _read_points(path)
+        columns = _read_points(path) if kept is None else kept
         rows = columns["d"] == number
         xyz = np.stack([columns[k][rows] for k in ("x", "y", "z")], axis=1)
         t_s = columns["t"][rows]

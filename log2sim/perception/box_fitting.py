@@ -16,7 +16,7 @@ MAX_FIT_POINTS = 256
 MIN_CONTRAST = 0.1
 # A yaw known from elsewhere is corrected by at least so many points, and by no more than it can be wrong.
 MIN_YAW_POINTS, MAX_CORRECTION_POINTS = 30, 128
-MAX_YAW_CORRECTION_RAD = np.deg2rad(12.0)
+CORRECTIONS_RAD = np.arange(-7, 8) * SEARCH_STEP_RAD
 # A side longer than this multiple of the typical width is not a front or rear.
 MAX_WIDTH_FACTOR = 1.2
 # Quantile of the points' heights that is taken for the top, robust to stray points.
@@ -57,10 +57,12 @@ def corrected_yaw(points: Array, yaw_rad: float) -> float:
     """Correct a yaw that is known roughly by the direction of the sides of points (n, 2), where they show it."""
     if len(points) < MIN_YAW_POINTS:
         return yaw_rad
-    fitted, contrast = fit_yaw(subsample(points, MAX_CORRECTION_POINTS))
-    fitted = align_to(fitted, yaw_rad, np.pi / 2)
-    known = contrast >= MIN_CONTRAST and abs(float(wrap_angle(fitted - yaw_rad))) <= MAX_YAW_CORRECTION_RAD
-    return fitted if known else yaw_rad
+    angles = yaw_rad + CORRECTIONS_RAD
+    score = _closeness(subsample(points, MAX_CORRECTION_POINTS), angles)
+    best = int(np.argmax(score))
+    if best in (0, len(angles) - 1) or score[best] / np.median(score) - 1.0 < MIN_CONTRAST:
+        return yaw_rad
+    return float(angles[0] + _parabolic_peak(score, best) * SEARCH_STEP_RAD)
 
 
 def fit_yaw(xy_m: Array) -> tuple[float, float]:
@@ -80,18 +82,21 @@ def fit_yaw(xy_m: Array) -> tuple[float, float]:
     Scanners" (IV 2017), section III-B: a point scores the inverse of its distance to the nearer side. Cost O(45 N), with N
     limited to `MAX_FIT_POINTS` by an even subsample.
     """
-    points = subsample(xy_m, MAX_FIT_POINTS)
-    angles = np.arange(0.0, np.pi / 2, SEARCH_STEP_RAD)
+    score = _closeness(subsample(xy_m, MAX_FIT_POINTS), np.arange(0.0, np.pi / 2, SEARCH_STEP_RAD))
+    best = int(np.argmax(score))
+    contrast = float(score[best] / np.median(score) - 1.0)
+    return float(_parabolic_peak(score, best) * SEARCH_STEP_RAD % (np.pi / 2)), contrast
+
+
+def _closeness(points: Array, angles: Array) -> Array:
+    """Score (K,) the directions of a rectangle's sides by how near points (N, 2) are to them."""
     c, s = np.cos(angles), np.sin(angles)
     directions = np.concatenate(
         [np.stack([c, s], axis=1), np.stack([-s, c], axis=1)]
     )  # (2K, 2): length axes, then width axes
     distance = _edge_distance(directions @ points.T)
     closeness = np.minimum(distance[: len(angles)], distance[len(angles) :])
-    score = (1.0 / np.maximum(closeness, MIN_EDGE_DISTANCE_M)).mean(axis=1)
-    best = int(np.argmax(score))
-    contrast = float(score[best] / np.median(score) - 1.0)
-    return float(_parabolic_peak(score, best) * SEARCH_STEP_RAD % (np.pi / 2)), contrast
+    return np.asarray((1.0 / np.maximum(closeness, MIN_EDGE_DISTANCE_M)).mean(axis=1))
 
 
 def _edge_distance(offsets: Array) -> Array:

@@ -26,6 +26,7 @@ SLOPE_MARGIN = 0.01
 # Azimuths are integer steps that fit into 16 bits; one turn has this many.
 STEPS_PER_TURN = 60_000
 STEP_RAD = 2 * np.pi / STEPS_PER_TURN
+MIN_WINDOW_STEPS = round(MIN_WINDOW_RAD / STEP_RAD)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,38 +79,43 @@ class AzimuthIndex:
         Next to an end of the object, rays at its height reach what lies behind it. If they stop at something nearer, if
         they hit the same surface, or if there are no rays at all, the object may extend beyond what was seen.
         """
-        mine = self.rank[members]
-        # Azimuths relative to half a turn before one of its points, so that no cluster wraps around.
-        start = int(self.azimuth[mine[0]]) - STEPS_PER_TURN // 2
-        turned = (self.azimuth[mine].astype(np.int64) - start) % STEPS_PER_TURN
-        order = np.argsort(turned, kind="stable")
-        mine, turned = mine[order], turned[order]
+        mine = np.sort(self.rank[members])
+        azimuth = self.azimuth[mine].astype(np.int64)
+        if azimuth[-1] - azimuth[0] > STEPS_PER_TURN // 2:
+            # The cluster lies across the azimuth at which a turn begins.
+            later = int(np.searchsorted(azimuth, STEPS_PER_TURN // 2))
+            mine = np.concatenate([mine[later:], mine[:later]])
+            azimuth = np.concatenate([azimuth[later:] - STEPS_PER_TURN, azimuth[:later]])
         slope, is_member = self.slope[mine], np.zeros(len(self.azimuth), dtype=bool)
         is_member[mine] = True
-        xy = self.range_m[mine, None] * _direction(self.azimuth[mine])
         low, high = slope.min() - SLOPE_MARGIN, slope.max() + SLOPE_MARGIN
+        ranges = self.range_m[mine]
         cut = min(round(TRIM * (len(mine) - 1)), MAX_TRIMMED_POINTS)
         visible = np.zeros(2, dtype=bool)
+        xy: NDArray[np.float64] | None = None
         for k, (end, sign) in enumerate(((cut, -1), (len(mine) - 1 - cut, 1))):
-            near_end = np.abs(turned - turned[end]) * STEP_RAD < MIN_WINDOW_RAD
-            range_m = upper_median(self.range_m[mine[near_end]])
-            width = float(np.clip(WINDOW_M / max(range_m, 1e-3), MIN_WINDOW_RAD, MAX_WINDOW_RAD)) / STEP_RAD
-            edge = int(turned[end]) + start
+            edge = int(azimuth[end])
+            first, last = np.searchsorted(azimuth, (edge - MIN_WINDOW_STEPS + 1, edge + MIN_WINDOW_STEPS))
+            range_m = upper_median(ranges[first:last])
+            width = min(max(WINDOW_M / max(range_m, 1e-3), MIN_WINDOW_RAD), MAX_WINDOW_RAD) / STEP_RAD
             window = self._between(*sorted((edge + 2 * sign, edge + sign * round(width))))
             slopes = self.slope[window]
-            window = window[(slopes >= low) & (slopes <= high) & ~is_member[window]]
-            surface_m = np.maximum(_extended_face_range(xy, xy[end], self.azimuth[window]), range_m)
-            beyond = self.range_m[window] > surface_m + MIN_DEPTH_STEP_M
-            blocked = ~beyond & self.obstacle[window]
+            beside = np.flatnonzero((slopes >= low) & (slopes <= high) & ~is_member[window])
+            if len(beside) < MIN_RAYS_BEYOND:
+                continue
+            xy = ranges[:, None] * _direction(self.azimuth[mine]) if xy is None else xy
+            face_m = _extended_face_range(xy, xy[end], self.azimuth[window][beside])
+            beyond = self.range_m[window][beside] > np.maximum(face_m, range_m) + MIN_DEPTH_STEP_M
+            blocked = ~beyond & self.obstacle[window][beside]
             visible[k] = beyond.sum() >= max(MIN_RAYS_BEYOND, int(blocked.sum()))
         return visible
 
-    def _between(self, first: int, last: int) -> NDArray[np.intp]:
+    def _between(self, first: int, last: int) -> slice | NDArray[np.intp]:
         """Find the rows with an azimuth from `first` up to `last`, less than a turn later."""
         first, last = first % STEPS_PER_TURN, first % STEPS_PER_TURN + last - first
-        bounds = [first, min(last, STEPS_PER_TURN - 1), max(last - STEPS_PER_TURN, 0)]
-        a, b, wrapped = np.searchsorted(self.azimuth, np.array(bounds, np.uint16))
-        return np.concatenate([np.arange(a, b), np.arange(wrapped)])
+        bounds = np.array([first, min(last, STEPS_PER_TURN - 1), max(last - STEPS_PER_TURN, 0)], np.uint16)
+        a, b, wrapped = np.searchsorted(self.azimuth, bounds).tolist()
+        return np.concatenate([np.arange(a, b), np.arange(wrapped)]) if wrapped else slice(a, b)
 
 
 def _extended_face_range(
