@@ -1,0 +1,158 @@
+"""Times of the LiDAR detector and of the simulated LiDAR, one thread.
+
+python tools/bench_lidar.py [--log PANDASET] [--log KITTI] [--write BENCHMARKS.md]
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from bench_table import markdown, replace_section
+
+from log2sim.config import LidarConfig
+from log2sim.logs.opening import open_log
+from log2sim.perception.detect3d.grid import grid_window, rasterize
+from log2sim.perception.detect3d.level_points import level_points, sensor_xy
+from log2sim.perception.detect3d.network_detector import NetworkDetector, open_shipped
+from log2sim.perception.first_pass import cloud_origin
+from log2sim.perception.lidar.cloud import Cloud, assemble_cloud
+from log2sim.synth.lidar_models import LIDAR_MODELS
+from log2sim.synth.traffic import Mount, labeled_cloud
+from log2sim.synth.traffic_random import draw_scene
+
+SWEEPS = 12
+REPEATS = 5
+
+
+def fastest_ms(call: Callable[[], Any]) -> float:
+    """The least of a few times of the processor, ms: other programs only ever add to it."""
+    times = []
+    for _ in range(REPEATS):
+        begun = time.process_time()
+        call()
+        times.append(time.process_time() - begun)
+    return 1e3 * min(times)
+
+
+def clouds_of_log(path: str) -> list[tuple[Cloud, float]]:
+    """Clouds of some sweeps of a log, and the time that leveling and motion compensation of each took."""
+    log = open_log(path)
+    stream = log.streams[next(iter(log.lidars))]
+    out = []
+    for k in np.linspace(0, len(stream.t_ns) - 1, SWEEPS).astype(int):
+        sweeps = {name: log.streams[name].read(min(k, len(log.streams[name].t_ns) - 1)) for name in log.lidars}
+        origin, ground_z = cloud_origin(log, int(stream.t_ns[k]))
+
+        def assemble(sweeps: Any = sweeps, origin: Any = origin, ground_z: float = ground_z) -> Cloud | None:
+            return assemble_cloud(log, sweeps, origin=origin, ground_z=ground_z, max_range_m=50.0)
+
+        cloud = assemble()
+        if cloud is not None:
+            out.append((cloud, fastest_ms(assemble)))
+    return out
+
+
+def simulated_clouds(mount: Mount, lidar: str) -> list[tuple[Cloud, float]]:
+    """Clouds of random scenes, and the time that leveling each took."""
+    from lidar_training.clouds import level
+
+    out = []
+    for k in range(SWEEPS):
+        rng = np.random.default_rng([11, k])
+        scene = draw_scene(mount, rng, lidar=LIDAR_MODELS[lidar])
+        points = labeled_cloud(scene, rng).xyz_m
+        sensor = scene.sensor.position_m
+        out.append((level(points, sensor), fastest_ms(lambda points=points, sensor=sensor: level(points, sensor))))
+    return out
+
+
+def row(name: str, clouds: list[tuple[Cloud, float]], detector: NetworkDetector) -> list[str]:
+    """Median times of the steps of one detector on some clouds."""
+    info, columns = detector.network.info, []
+    for cloud, leveling in clouds:
+        xyz, _ = level_points(cloud, detector.range_m)
+        low, shape = grid_window(xyz[:, :2], cell_m=info.cell_m, range_m=detector.range_m, center=sensor_xy(cloud))
+        grid = rasterize(xyz, cell_m=info.cell_m, low=low, shape=shape)
+        raster = fastest_ms(
+            lambda xyz=xyz, low=low, shape=shape: rasterize(xyz, cell_m=info.cell_m, low=low, shape=shape)
+        )
+        network = fastest_ms(lambda grid=grid: detector.network.run(grid))
+        whole = fastest_ms(lambda cloud=cloud: detector.detect(cloud))
+        columns.append(
+            [len(xyz), shape[0] * shape[1], leveling, raster, network, whole - raster - network, whole, whole / network]
+        )
+    m = np.median(columns, axis=0)
+    return [name, f"{m[0]:.0f}", f"{m[1] / 1e3:.0f}k", *(f"{v:.1f}" for v in m[2:7]), f"{m[7]:.2f}"]
+
+
+def generator_rows() -> list[list[str]]:
+    """Scenes a second of the simulated LiDAR."""
+    rows = []
+    for mount, lidar in (
+        ("vehicle", "hdl64e"),
+        ("vehicle", "pandar64"),
+        ("vehicle", "os1-128"),
+        ("roadside", "rslidar16-roadside"),
+    ):
+        draw, cast, points = [], [], []
+        for k in range(SWEEPS):
+            rng = np.random.default_rng([12, k])
+            begun = time.process_time()
+            scene = draw_scene(mount, rng, lidar=LIDAR_MODELS[lidar])
+            drawn = time.process_time()
+            points.append(len(labeled_cloud(scene, rng).xyz_m))
+            draw.append(drawn - begun)
+            cast.append(time.process_time() - drawn)
+        rows.append([
+            lidar, f"{np.median(points):.0f}", f"{1e3 * np.median(draw):.0f}", f"{1e3 * np.median(cast):.0f}",
+            f"{1 / np.mean(np.add(draw, cast)):.1f}",
+        ])  # fmt: skip
+    return rows
+
+
+def main() -> None:
+    """Measure and print, or write into a file."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--log", action="append", default=[], help="log with a LiDAR on a vehicle; may be repeated")
+    parser.add_argument("--write", type=Path)
+    options = parser.parse_args()
+    cv2.setNumThreads(1)
+    vehicle, roadside = (open_shipped(name, LidarConfig()) for name in ("vehicle", "roadside"))
+    rows = [row(open_log(path).name, clouds_of_log(path), vehicle) for path in options.log]
+    rows.append(row("simulated, HDL-64E", simulated_clouds("vehicle", "hdl64e"), vehicle))
+    rows.append(row("simulated, roadside of 16 lines", simulated_clouds("roadside", "rslidar16-roadside"), roadside))
+    head = [
+        "clouds",
+        "points in range",
+        "cells",
+        "leveling",
+        "grid",
+        "network",
+        "decoding",
+        "cloud to boxes",
+        "over network alone",
+    ]
+    text = (
+        "## LiDAR detection: time\n\nMilliseconds of the processor, one thread, medians over a dozen sweeps of the least of five runs. "
+        'Leveling (motion compensation and the ground) is part of every run with a LiDAR and not of "cloud to boxes".\n\n'
+        + markdown(head, rows)
+        + "\n\n## Simulated LiDAR: time\n\nMilliseconds of the processor a scene: drawing the world, casting the sweep.\n\n"
+        + markdown(["sensor", "points", "draw", "cast", "scenes/s"], generator_rows())
+    )
+    if options.write:
+        replace_section(options.write, "lidar", text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
