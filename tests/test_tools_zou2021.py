@@ -33,6 +33,9 @@ from log2sim.perception.detect3d.network_detector import open_network
 from log2sim.perception.detect3d.votes import decode_votes
 from log2sim.perception.lidar.cloud import Cloud
 
+# Threads that wait for a busy core are slower than one.
+torch.set_num_threads(1)
+
 BOXES = np.array(
     [[4.0, 3.0, 0.8, 4.5, 1.8, 1.6, 0.4], [-6.0, 5.0, 1.6, 9.0, 2.5, 3.2, -2.0], [2.0, -5.0, 0.86, 0.6, 0.6, 1.72, 1.0],
      [-5.0, -6.0, 0.8, 1.8, 0.7, 1.6, 2.8]]

@@ -68,9 +68,14 @@ class LogSweep:
 
     def labeled(self, xyz: Array) -> NDArray[np.bool_]:
         """Mark the points (N, 3), relative to the cloud's origin, where road users have labels."""
-        if not self.views:
-            return np.ones(len(xyz), bool)
-        return np.any([view.shows(xyz) for view in self.views], axis=0)
+        return labeled_by(self.views, xyz)
+
+
+def labeled_by(views: tuple[LogView, ...], xyz: Array) -> NDArray[np.bool_]:
+    """Mark the points (N, 3) that one of the views shows in a labeled part; all where there are no views."""
+    if not views:
+        return np.ones(len(xyz), bool)
+    return np.any([view.shows(xyz) for view in views], axis=0)
 
 
 def read_sweeps(log: Log, every: int = 1) -> list[LogSweep]:
