@@ -285,6 +285,7 @@ def test_kinds_of_the_log_are_ignored_where_the_protocol_says_so(tiny: Log) -> N
     row = result["classes"]["car"]["figures"][0]
     plain = evaluate_boxes(found, tiny, Options("kitti"))["classes"]["car"]["figures"][0]
     assert row["truths"] < plain["truths"]
+    assert not result["occlusion_known"]
     assert row["false_positives"] == 0
 
 

@@ -119,6 +119,7 @@ def test_its_labels_as_detector_are_perfect_by_kittis_rules(root: Path) -> None:
         for r in result["classes"]["car"]["figures"]
         if r["match"] == {"measure": "iou_3d", "limit": 0.7}
     }
+    assert result["occlusion_known"]
     # Vans are ignored.
     assert [rows[name]["truths"] for name in ("all", "easy", "moderate")] == [3, 2, 3]
     assert rows["all"]["ap_r40"] == rows["easy"]["ap_r40"] == 1

@@ -124,6 +124,7 @@ def evaluate_boxes(
         "sweeps": int(truth.labeled.sum()),
         "sweeps_without_labels": int((~truth.labeled).sum()),
         "reference_camera": camera,
+        "occlusion_known": None if camera is None else log.labels is not None and log.labels.occlusion is not None,
         "min_points": None if truth.boxes.points is None else MIN_POINTS,
         "overall": overall(figures),
         "classes": figures,

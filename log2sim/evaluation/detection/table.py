@@ -76,6 +76,8 @@ def _scope(result: Mapping[str, Any]) -> str:
     ]
     if result["reference_camera"] is not None:
         parts.append(f"boxes that {result['reference_camera']} shows")
+        if not result["occlusion_known"]:
+            parts.append("difficulties without occlusion, which the labels do not state")
     if result["max_range_m"] is not None:
         parts.append(f"up to {result['max_range_m']:g} m")
     return f"{'; '.join(parts)}; precision, recall and what follows at scores from {result['min_score']:g}"
