@@ -204,11 +204,16 @@ def test_a_single_label_holds_for_a_moment() -> None:
 
 def test_sweeps_between_labels_of_every_sweep_are_labeled_and_those_between_sparse_ones_are_not() -> None:
     middle = np.arange(20) * NS // 10
+
+    def labeled(stamps: Any, period_s: float, asked: Any = middle, told: Any = None) -> list[int]:
+        found = replace(labels_at(*(np.asarray(stamps) / NS)), labeled_ns=told)
+        return np.flatnonzero(labeled_sweeps(found, asked, period_s)).tolist()
+
     dense = np.r_[middle[2:8], middle[12:15]]
-    assert np.flatnonzero(labeled_sweeps(dense, middle, 0.1)).tolist() == list(range(2, 15))
-    sparse = middle[[0, 5, 10]] + 3_000_000
-    assert np.flatnonzero(labeled_sweeps(sparse, middle, 0.5)).tolist() == [0, 5, 10]
-    assert labeled_sweeps(dense, middle[4:5], 0.1).tolist() == [True]
+    assert labeled(dense, 0.1) == list(range(2, 15))
+    assert labeled(middle[[0, 5, 10]] + 3_000_000, 0.5) == [0, 5, 10]
+    assert labeled(dense, 0.1, asked=middle[4:5]) == [0]
+    assert labeled(dense, 0.1, told=middle[[0, 3, 19]]) == [0, 3, 19]
 
 
 def test_labels_as_detector_are_found_again_by_every_protocol(tiny: Log) -> None:

@@ -33,6 +33,8 @@ class Labels:
         The log's own word for the category, such as "Van"; None where the log has none of its own.
     occlusion : (L,) int64 or None
         0 fully visible, 1 partly occluded, 2 largely occluded, 3 unknown, as the log states it.
+    labeled_ns : (F,) int64 or None
+        Increasing stamps of all that was labeled, also where nothing was there; None where the log does not tell.
     """
 
     t_ns: NDArray[np.int64]
@@ -45,6 +47,7 @@ class Labels:
     cameras: tuple[str, ...] | None = None
     kind: NDArray[np.str_] | None = None
     occlusion: NDArray[np.int64] | None = None
+    labeled_ns: NDArray[np.int64] | None = None
 
 
 @dataclass(frozen=True, eq=False)

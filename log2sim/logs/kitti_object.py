@@ -7,7 +7,7 @@ them: a log to detect in and to evaluate with, not to track in.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -196,7 +196,7 @@ class _Split:
 
     def _labels(self, first: _Calibration, ego: PoseTrack) -> DriveLabels:
         """Read the labels of all frames; each object is a track of its own."""
-        parts, texts = [], []
+        parts, texts, labeled = [], [], []
         for number, file in self.sweeps.items():
             path = self.base / "label_2" / f"{file.stem}.txt"
             if path.is_file():
@@ -206,12 +206,15 @@ class _Split:
                 ]
                 parts.append(parse_labels("\n".join(lines), path))
                 texts.append(text)
+                labeled.append(number * PERIOD_NS)
         if not parts:
             return DriveLabels()
         rows = LabelRows(
             *(np.concatenate([getattr(p, k) for p in parts]) for k in ("frame", "track_id", "type", "values"))
         )
-        return labels_of_rows(rows, first.ego_T_rect, ego, lambda frame: frame * PERIOD_NS, "\n".join(texts))
+        found = labels_of_rows(rows, first.ego_T_rect, ego, lambda frame: frame * PERIOD_NS, "\n".join(texts))
+        assert found.boxes_3d is not None
+        return replace(found, boxes_3d=replace(found.boxes_3d, labeled_ns=np.array(labeled, dtype=np.int64)))
 
 
 def _ground_under(labels: Labels | None) -> float:

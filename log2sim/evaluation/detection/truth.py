@@ -79,7 +79,7 @@ def truth_of_sweeps(
     run = _run_of(log)
     middle = t_ns + (0 if run is None else middle_ns(run))
     tracks = LabelTracks.of(labels)
-    labeled = labeled_sweeps(np.sort(labels.t_ns), middle, tracks.period_s)
+    labeled = labeled_sweeps(labels, middle, tracks.period_s)
     if not labeled.any():
         raise LogError(_nothing_in_common(log, labels, t_ns))
     sweep, track = tracks.present(middle)
@@ -116,22 +116,23 @@ def _run_of(log: Log) -> Run | None:
     return start(log, Config().changed(detect={"name": "lidar:labels"}, measure={"max_range_m": 200.0}))
 
 
-def labeled_sweeps(labels_t_ns: NDArray[np.int64], middle_ns: NDArray[np.int64], period_s: float) -> NDArray[np.bool_]:
+def labeled_sweeps(labels: Labels, middle_ns: NDArray[np.int64], period_s: float) -> NDArray[np.bool_]:
     """Mark (F,) the sweeps that are labeled: those near a label and, where every sweep is labeled, all between labels.
 
     Parameters
     ----------
-    labels_t_ns : (L,) int64
-        Sorted stamps of all labels.
+    labels : Labels
+        At least one; where they tell what was labeled, only sweeps near that are.
     middle_ns : (F,) int64
         Middles of the sweeps.
     period_s : float
         Time between labels of one object.
     """
-    near = np.abs(labels_t_ns[nearest_index(labels_t_ns, middle_ns)] - middle_ns) <= MAX_LAG_NS
-    if period_s > MAX_PERIODS * period_of(middle_ns):
+    stamps = np.sort(labels.t_ns) if labels.labeled_ns is None else labels.labeled_ns
+    near = np.abs(stamps[nearest_index(stamps, middle_ns)] - middle_ns) <= MAX_LAG_NS
+    if labels.labeled_ns is not None or period_s > MAX_PERIODS * period_of(middle_ns):
         return np.asarray(near)
-    return np.asarray(near | ((middle_ns >= labels_t_ns[0]) & (middle_ns <= labels_t_ns[-1])))
+    return np.asarray(near | ((middle_ns >= stamps[0]) & (middle_ns <= stamps[-1])))
 
 
 @dataclass(frozen=True, eq=False)
