@@ -18,8 +18,9 @@ def reconstruct(
     detector: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME|MODEL.onnx|labels",
-            help="Detector: ssd-mobilenet-v2, a path to an ONNX model, or labels (boxes of the log).",
+            metavar="NAME|MODEL.onnx|labels|lidar:NAME",
+            help="Detector in images: ssd-mobilenet-v2, a path to an ONNX model, or labels (boxes of the log); in LiDAR "
+            "sweeps: lidar:vehicle, lidar:roadside, lidar:MODEL.onnx, lidar:labels; both: NAME+lidar:NAME.",
         ),
     ] = None,
     cameras: Annotated[str | None, typer.Option(metavar="A,B", help="Use only these cameras.")] = None,

@@ -30,11 +30,15 @@ def load_replay(path: Path, scenario: Scenario, *, quiet: bool = False) -> Repla
 
 def load_truth(path: Path, scenario: Scenario, sequence: str | None) -> Scenario:
     """Load the ground truth of a scenario, for the cameras that it used; see `truth_at`."""
-    return truth_at(path, [str(c["name"]) for c in scenario.cameras if c.get("used")], sequence)
+    used = [str(c["name"]) for c in scenario.cameras if c.get("used")]
+    return truth_at(path, used if scenario.cameras else None, sequence)
 
 
-def truth_at(path: Path, used: Iterable[str], sequence: str | None) -> Scenario:
-    """Load ground truth from a scenario file or a log: its `truth.json`, else its labels in view of the cameras used."""
+def truth_at(path: Path, used: Iterable[str] | None, sequence: str | None) -> Scenario:
+    """Load ground truth from a scenario file or a log: its `truth.json`, else its labels in view of the sensors used.
+
+    Without any camera used, what the LiDARs show counts as visible; None stands for all cameras of the log.
+    """
     from log2sim.datatypes import Scenario as Truth
 
     if not path.is_dir():
@@ -45,4 +49,6 @@ def truth_at(path: Path, used: Iterable[str], sequence: str | None) -> Scenario:
     from log2sim.logs.opening import open_log
 
     log: Log = open_log(path, sequence=sequence)
-    return truth_from_log(log, cameras=[name for name in used if name in log.cameras] or None)
+    names = None if used is None else list(used)
+    known = None if names is None else [name for name in names if name in log.cameras]
+    return truth_from_log(log, cameras=None if names and not known else known)

@@ -9,6 +9,7 @@ from typing import Any
 
 from log2sim.config import Config, Section
 from log2sim.datatypes import Log
+from log2sim.errors import ConfigError
 from log2sim.perception.detect.onnx_detector import OnnxDetector
 from log2sim.perception.detect.tiling import plan_tiles
 from log2sim.pipeline import detector_of
@@ -146,6 +147,11 @@ def _smooth_name(config: Config, switches: Sequence[str], named: Sequence[str]) 
 def _detector_settings(log: Log, config: Config, detectors: Sequence[str]) -> list[Setting]:
     """List every detector with all distinct numbers of tiles, and with other input sizes where the model accepts them."""
     names = list(dict.fromkeys([config.detect.name, *detectors]))
+    for name in names:
+        if with_changes(config, "detect", name=name).detect.in_sweeps:
+            raise ConfigError(
+                f"bench: compares detectors in images, and '{name}' searches LiDAR sweeps; see log2sim detect"
+            )
     out: list[Setting] = []
     for name in names:
         own = config if name == config.detect.name else with_changes(config, "detect", name=name, layout="", input_px=0)
