@@ -160,7 +160,7 @@ def test_a_resumed_run_gives_the_weights_of_one_that_was_not_stopped(tmp_path, m
         train_lidar.generate("roadside", out / "data", 4, 3)
         for k, stop in enumerate(stops):
             # The learning rate follows the number of steps in all, so a stop is a failure in the middle.
-            limit = {"scenes": 4, "steps": 4, "seed": 3}
+            rounds = [train_lidar.Round(3, 4, 4)]
             if k + 1 < len(stops):
                 with monkeypatch.context() as patched:
                     patched.setattr(train_lidar, "CHECKPOINT_S", -1.0)
@@ -174,10 +174,10 @@ def test_a_resumed_run_gives_the_weights_of_one_that_was_not_stopped(tmp_path, m
 
                     patched.setattr(train_lidar, "batch_of", stopping)
                     with pytest.raises(KeyboardInterrupt):
-                        train_lidar.fit("roadside", out / "data", out, **limit)
+                        train_lidar.fit("roadside", out / "data", out, rounds)
             else:
-                train_lidar.fit("roadside", out / "data", out, **limit)
-        weights.append(torch.load(out / "checkpoint.pt", weights_only=True)["network"])
+                train_lidar.fit("roadside", out / "data", out, rounds)
+        weights.append(torch.load(out / "round-1.pt", weights_only=True)["network"])
     assert all(torch.equal(a, b) for a, b in zip(weights[0].values(), weights[1].values(), strict=True))
 
 
@@ -185,8 +185,8 @@ def test_a_resumed_run_gives_the_weights_of_one_that_was_not_stopped(tmp_path, m
 def test_a_toy_learns_to_find_vehicles(tmp_path) -> None:
     """A minute from nothing: what it finds on fresh scenes is mostly right."""
     train_lidar.generate("roadside", tmp_path / "data", 100, 5)
-    train_lidar.fit("roadside", tmp_path / "data", tmp_path, scenes=100, steps=220, seed=5)
-    train_lidar.finish("roadside", tmp_path, seed=5, scenes=100, steps=220, examples=25)
+    train_lidar.fit("roadside", tmp_path / "data", tmp_path, [train_lidar.Round(5, 100, 220)])
+    train_lidar.finish("roadside", tmp_path, [train_lidar.Round(5, 100, 220)], examples=25)
     card = json.loads((tmp_path / "roadside.json").read_text())
     assert card["simulated"]["vehicle"]["average_precision"] > 0.25
     assert (tmp_path / "roadside.onnx").stat().st_size < 1_000_000

@@ -12,6 +12,8 @@ import json
 import math
 import sys
 import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -34,13 +36,39 @@ from log2sim.perception.detect3d.network_detector import open_network
 PER_SHARD = 100
 FIRST_SHARDS, STEPS_PER_SHARD = 4, 100
 BATCH = 4
-PEAK_RATE, WARM_UP_STEPS = 2.5e-3, 100
+WARM_UP_STEPS = 100
 MAX_GRADIENT_NORM = 10.0
 # Side of the square grids of training; a roadside sensor sees cars to some 25 m.
 CELLS = {"vehicle": 256, "roadside": 192}
 CELL_M = {"vehicle": 0.25, "roadside": 0.1875}
-SCENES = {"vehicle": 4_000, "roadside": 3_000}
-STEPS = {"vehicle": 5_500, "roadside": 4_500}
+
+
+@dataclass(frozen=True)
+class Round:
+    """A part of the training: it starts with the averaged weights of the one before and draws from all scenes so far.
+
+    Attributes
+    ----------
+    seed : int
+        Of its scenes and of its order.
+    scenes : int
+        Generated for it.
+    steps : int
+    rate : float
+        Greatest learning rate; it falls to zero as a cosine.
+    """
+
+    seed: int
+    scenes: int
+    steps: int
+    rate: float = 2.5e-3
+
+
+# The second round of the vehicle has scenes with a second LiDAR and more clutter, which pictures of misses asked for.
+ROUNDS = {
+    "vehicle": (Round(1, 4_000, 5_500), Round(2, 2_000, 4_000, rate=1.2e-3)),
+    "roadside": (Round(1, 3_000, 4_500),),
+}
 CHECKPOINT_S = 60.0
 # Largest |x| and |y| from the sensor at run time; the roadside sensor sees cars to some 25 m.
 RANGE_M = {"vehicle": 40.0, "roadside": 30.0}
@@ -67,13 +95,17 @@ class Pool:
     How many these are depends on the step alone, so that fitting beside generating gives the same weights as after it.
     """
 
-    def __init__(self, folder: Path, mount: str, seed: int, scenes: int) -> None:
-        self._paths = [folder / shard_name(mount, seed, k) for k in range(math.ceil(scenes / PER_SHARD))]
+    def __init__(self, folder: Path, mount: str, rounds: Sequence[Round]) -> None:
+        self._paths = [
+            folder / shard_name(mount, r.seed, k) for r in rounds for k in range(math.ceil(r.scenes / PER_SHARD))
+        ]
+        earlier = sum(math.ceil(r.scenes / PER_SHARD) for r in rounds[:-1])
+        self._first = earlier + FIRST_SHARDS
         self._shards: list[Shard] = []
 
     def prepare(self, step: int) -> None:
         """Load what a step may use."""
-        while len(self._shards) < min(len(self._paths), FIRST_SHARDS + step // STEPS_PER_SHARD):
+        while len(self._shards) < min(len(self._paths), self._first + step // STEPS_PER_SHARD):
             path = self._paths[len(self._shards)]
             while not path.exists():
                 time.sleep(2)
@@ -83,6 +115,11 @@ class Pool:
         """Draw a sample."""
         shard = self._shards[rng.integers(len(self._shards))]
         return shard[int(rng.integers(len(shard)))]
+
+
+def checkpoint_path(out: Path, number: int) -> Path:
+    """Return where the state of a round is kept."""
+    return out / f"round-{number}.pt"
 
 
 def shard_name(mount: str, seed: int, number: int) -> str:
@@ -103,25 +140,30 @@ def batch_of(pool: Pool, mount: str, rng: np.random.Generator):
     return torch.from_numpy(np.stack(grids)), targets_of(samples, lows, cells, cell_m)
 
 
-def fit(mount: str, data: Path, out: Path, *, scenes: int, steps: int, seed: int) -> None:
-    """Train, or go on from the checkpoint in `out`."""
+def fit(mount: str, data: Path, out: Path, rounds: Sequence[Round]) -> None:
+    """Train the last of some rounds, or go on from its checkpoint in `out`; the earlier ones are complete."""
     torch.set_num_threads(1)
-    torch.manual_seed(seed)
+    this, number = rounds[-1], len(rounds)
+    torch.manual_seed(this.seed)
     network = BevNetwork().to(memory_format=torch.channels_last)
-    optimizer = torch.optim.AdamW(network.parameters(), PEAK_RATE, weight_decay=1e-2)
-    checkpoint, step = out / "checkpoint.pt", 0
+    if number > 1:
+        before = torch.load(checkpoint_path(out, number - 1), weights_only=True)
+        network.load_state_dict(before["mean"])
+    optimizer = torch.optim.AdamW(network.parameters(), this.rate, weight_decay=1e-2)
+    checkpoint, step = checkpoint_path(out, number), 0
     mean = {k: v.clone() for k, v in network.state_dict().items()}
     if checkpoint.exists():
         state = torch.load(checkpoint, weights_only=True)
         network.load_state_dict(state["network"])
         optimizer.load_state_dict(state["optimizer"])
         mean, step = state["mean"], state["step"]
-    pool, begun, saved, parts = Pool(data, mount, seed, scenes), time.process_time(), time.time(), []
+    pool, begun, saved, parts = Pool(data, mount, rounds), time.process_time(), time.time(), []
+    steps, seed = this.steps, this.seed
     while step < steps:
         rng = np.random.default_rng([seed, 7, step])  # of the step alone, so that a resumed run draws the same
         pool.prepare(step)
         grid, targets = batch_of(pool, mount, rng)
-        rate = PEAK_RATE * min(1, step / WARM_UP_STEPS + 0.05) * (0.5 + 0.5 * math.cos(math.pi * step / steps)) + 1e-5
+        rate = this.rate * min(1, step / WARM_UP_STEPS + 0.05) * (0.5 + 0.5 * math.cos(math.pi * step / steps)) + 1e-5
         for group in optimizer.param_groups:
             group["lr"] = rate
         maps = network(grid.to(memory_format=torch.channels_last))
@@ -140,8 +182,8 @@ def fit(mount: str, data: Path, out: Path, *, scenes: int, steps: int, seed: int
         if time.time() - saved > CHECKPOINT_S or step == steps:
             saved = time.time()
             state = {"network": network.state_dict(), "optimizer": optimizer.state_dict(), "mean": mean, "step": step}
-            torch.save(state, out / "checkpoint.part")
-            (out / "checkpoint.part").replace(checkpoint)
+            torch.save(state, checkpoint.with_suffix(".part"))
+            checkpoint.with_suffix(".part").replace(checkpoint)
 
 
 def _average(mean: dict[str, torch.Tensor], network: BevNetwork, keep: float) -> None:
@@ -154,17 +196,18 @@ def _average(mean: dict[str, torch.Tensor], network: BevNetwork, keep: float) ->
                 mean[name] = value.clone()
 
 
-def finish(mount: str, out: Path, *, seed: int, scenes: int, steps: int, examples: int) -> None:
+def finish(mount: str, out: Path, rounds: Sequence[Round], examples: int) -> None:
     """Export, calibrate, quantize and report; the files that ship are in `out` afterwards."""
+    seed = rounds[0].seed
     calibration = [draw_example(mount, (seed, 1_000_000, k)) for k in range(examples)]
     test = [draw_example(mount, (seed, 2_000_000, k)) for k in range(examples)]
     info, exact = description(mount, CELL_M[mount], RANGE_M[mount]), out / f"{mount}-float32.onnx"
-    export_onnx(out / "checkpoint.pt", exact, info)
+    export_onnx(checkpoint_path(out, len(rounds)), exact, info)
     info["calibration"] = calibrate(exact, calibration)
     describe(exact, info)
     small = out / f"{mount}-int8.onnx"
     quantize(exact, small, calibration[:QUANTIZATION_CLOUDS])
-    card = {"mount": mount, "seed": seed, "scenes": scenes, "steps": steps, "batch": BATCH, "torch": torch.__version__}
+    card = {"mount": mount, "rounds": [asdict(r) for r in rounds], "batch": BATCH, "torch": torch.__version__}
     reports = {}
     for path in (exact, small):
         # Eight bits shift the scores a little, so each file has its own calibration.
@@ -185,9 +228,7 @@ def finish(mount: str, out: Path, *, seed: int, scenes: int, steps: int, example
         "loss_of_f1_by_int8": round(loss, 4),
         "simulated": reports[chosen.name],
     }
-    info = json.loads(load_network(chosen).info.model_dump_json()) | {
-        "card": {k: card[k] for k in ("seed", "scenes", "steps", "file")}
-    }
+    info = json.loads(load_network(chosen).info.model_dump_json()) | {"card": {k: card[k] for k in ("rounds", "file")}}
     (out / f"{mount}.onnx").write_bytes(chosen.read_bytes())
     describe(out / f"{mount}.onnx", info)
     (out / f"{mount}.json").write_text(json.dumps(card, indent=1) + "\n")
@@ -198,20 +239,25 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("mount", choices=("vehicle", "roadside"))
     parser.add_argument("--out", type=Path, required=True, help="folder of shards, checkpoints and results")
-    parser.add_argument("--scenes", type=int)
-    parser.add_argument("--steps", type=int)
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--scenes", type=int, help="a single round with as many scenes")
+    parser.add_argument("--steps", type=int, help="a single round with as many steps")
+    parser.add_argument("--seed", type=int, default=1, help="with --scenes or --steps")
     parser.add_argument("--only", choices=("generate", "fit", "finish"))
     parser.add_argument("--examples", type=int, default=150, help="scenes to calibrate with, and as many to test with")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    scenes, steps = options.scenes or SCENES[options.mount], options.steps or STEPS[options.mount]
-    if options.only in (None, "generate"):
-        generate(options.mount, options.out / "data", scenes, options.seed)
-    if options.only in (None, "fit"):
-        fit(options.mount, options.out / "data", options.out, scenes=scenes, steps=steps, seed=options.seed)
+    rounds = ROUNDS[options.mount]
+    if options.steps or options.scenes:
+        first = rounds[0]
+        rounds = (Round(options.seed, options.scenes or first.scenes, options.steps or first.steps),)
+    data = options.out / "data"
+    for number in range(1, len(rounds) + 1):
+        if options.only in (None, "generate"):
+            generate(options.mount, data, rounds[number - 1].scenes, rounds[number - 1].seed)
+        if options.only in (None, "fit"):
+            fit(options.mount, data, options.out, rounds[:number])
     if options.only in (None, "finish"):
-        finish(options.mount, options.out, seed=options.seed, scenes=scenes, steps=steps, examples=options.examples)
+        finish(options.mount, options.out, rounds, options.examples)
 
 
 if __name__ == "__main__":

@@ -170,6 +170,8 @@ class TrafficScene:
     lidar : LidarModel
     sensor : SensorState
     returns : ReturnModel
+    second : (LidarModel, SensorState) or None
+        Another LiDAR that sees the scene too.
     """
 
     mount: Mount
@@ -179,6 +181,7 @@ class TrafficScene:
     lidar: LidarModel
     sensor: SensorState
     returns: ReturnModel
+    second: tuple[LidarModel, SensorState] | None = None
 
     def at(self, t_s: float) -> TrafficScene:
         """Return the scene at another time; the sensor stays in the origin's frame and moves with its velocity."""
@@ -202,7 +205,11 @@ class TrafficScene:
             )
             for o in self.objects
         ]
-        return cast_polytopes(self.lidar, self.sensor, solids, self.surface, rng, self.returns)
+        one = cast_polytopes(self.lidar, self.sensor, solids, self.surface, rng, self.returns)
+        if self.second is None:
+            return one
+        two = cast_polytopes(*self.second, solids, self.surface, rng, self.returns)
+        return Returns(**{k: np.concatenate([v, getattr(two, k)]) for k, v in vars(one).items()})
 
 
 @dataclass(frozen=True, eq=False)

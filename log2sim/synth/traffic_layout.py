@@ -204,7 +204,7 @@ def _roadside(out: _Layout, road: Road) -> None:
                 xy, direction = road.at(s + rng.normal(0, 0.5), side * d)
                 if not out.on_road(xy):
                     out.add_thing(kind, xy, direction, draw(rng), radius)
-    for _ in range(rng.poisson(26)):
+    for _ in range(rng.poisson(rng.choice([16, 26, 45]))):
         kind = str(rng.choice(kinds, p=shares / shares.sum()))
         _, radius, draw = clutter.SMALL[kind]
         d = rng.choice([-1, 1]) * (half + abs(rng.normal(0, 6)) + 0.3)

@@ -47,7 +47,10 @@ def draw_scene(
         mixed=float(rng.uniform(0, 0.006)),
         weather=weather,
     )
-    return TrafficScene(mount, roads, surface, tuple(objects), model, sensor, returns)
+    second = (
+        _draw_second(sensor, sensor_forward, rng) if mount == "vehicle" and not lidar and rng.random() < 0.2 else None
+    )
+    return TrafficScene(mount, roads, surface, tuple(objects), model, sensor, returns, second)
 
 
 def _draw_roads(mount: Mount, rng: np.random.Generator) -> tuple[tuple[Road, ...], float]:
@@ -127,6 +130,18 @@ def _draw_sensor(
         velocity = speed * np.array([np.cos(forward), np.sin(forward)])
     rotation = rotation_from_rpy(roll, pitch, forward)
     return SensorState(rotation, np.array([0.0, 0.0, height]), velocity)
+
+
+def _draw_second(sensor: SensorState, forward: float, rng: np.random.Generator) -> tuple[LidarModel, SensorState]:
+    """Draw a second LiDAR: a solid-state one that looks forward, or one of a few lines at a corner."""
+    if rng.random() < 0.6:
+        model, yaw = LIDAR_MODELS[str(rng.choice(["pandargt", "rslidar-m1"]))], forward
+    else:
+        model, yaw = LIDAR_MODELS["vlp16"], float(rng.uniform(-np.pi, np.pi))
+    offset = np.array([rng.uniform(-1.0, 0.6), rng.uniform(-0.8, 0.8), rng.uniform(-0.4, 0.1)])
+    place = sensor.position_m + rotation_from_rpy(0.0, 0.0, forward) @ offset
+    pitch = np.deg2rad(rng.normal(0, 1.0))
+    return model, SensorState(rotation_from_rpy(0.0, pitch, yaw), place, sensor.velocity_mps)
 
 
 def _draw_weather(rng: np.random.Generator) -> Weather:
