@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from log2sim.geometry import Array, apply, inverse, rotation_from_rpy, transform
 from log2sim.synth.render import Visibility
 from log2sim.synth.traffic import TrafficObject
-from log2sim.synth.traffic_rig import Rig
+from log2sim.synth.traffic_rig import FORWARD_R_CAM, Rig
 
 FOLDERS = {"image_2": ".png", "velodyne": ".bin", "calib": ".txt", "label_2": ".txt"}
 TYPES = {"car": "Car", "truck": "Truck", "pedestrian": "Pedestrian", "cyclist": "Cyclist"}
@@ -29,6 +29,8 @@ MIN_LABEL_PX, MIN_REGION_PX, MIN_VISIBLE = 12.0, 5.0, 0.1
 OCCLUSION_LIMITS = (0.8, 0.4)
 BOX_GRID = 7  # points along each edge of a box, for the share of it in the picture
 PNG_COMPRESSION = 1
+# The IMU of KITTI's car: the LiDAR is so far ahead of it and to its left, it is so high above the ground.
+LIDAR_FROM_IMU_M, IMU_HEIGHT_M = (0.81, -0.32), 0.93
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +70,15 @@ def calibration_text(rig: Rig) -> str:
     P = np.column_stack([rig.camera.K @ cam_R_level, np.zeros(3)])
     level_T_lidar = inverse(rig.map_T_level) @ rig.map_T_lidar
     rows = {f"P{k}": P for k in range(4)}
-    rows |= {"R0_rect": np.eye(3), "Tr_velo_to_cam": level_T_lidar[:3], "Tr_imu_to_velo": np.eye(4)[:3]}
+    rows |= {"R0_rect": np.eye(3), "Tr_velo_to_cam": level_T_lidar[:3], "Tr_imu_to_velo": _lidar_T_imu(rig)[:3]}
     return "".join(f"{name}: {' '.join(f'{v:.12e}' for v in np.ravel(values))}\n" for name, values in rows.items())
+
+
+def _lidar_T_imu(rig: Rig) -> Array:
+    """Place KITTI's IMU, by which readers know how high the LiDAR is above the ground."""
+    level = rig.map_T_level[:3, :3] @ FORWARD_R_CAM.T
+    away = np.append(LIDAR_FROM_IMU_M, rig.lidar_height_m - IMU_HEIGHT_M)
+    return np.asarray(inverse(transform(level.T @ rig.map_T_lidar[:3, :3], away)))
 
 
 def label_text(objects: Sequence[TrafficObject], seen: Sequence[Visibility | None], rig: Rig) -> str:

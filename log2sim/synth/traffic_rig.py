@@ -36,12 +36,15 @@ class Rig:
     map_T_lidar : (4, 4) float64
     map_T_level : (4, 4) float64
         A frame at the camera with x right, y down along gravity and z forward: the camera's own where it looks level.
+    lidar_height_m : float
+        Above the ground below it.
     """
 
     camera: Camera
     map_T_cam: Array
     map_T_lidar: Array
     map_T_level: Array
+    lidar_height_m: float
 
 
 def camera_for(mount: Mount) -> tuple[int, int, Array]:
@@ -64,7 +67,8 @@ def rig_of(scene: TrafficScene) -> Rig:
     level = transform(rotation_from_rpy(0.0, 0.0, yaw) @ FORWARD_R_CAM, eye)
     map_T_cam = transform(rotation_from_rpy(0.0, pitch, yaw) @ FORWARD_R_CAM, eye)
     width, height, K = camera_for(scene.mount)
-    return Rig(Camera("camera", width, height, K, "map", map_T_cam), map_T_cam, transform(R, position), level)
+    camera = Camera("camera", width, height, K, "map", map_T_cam)
+    return Rig(camera, map_T_cam, transform(R, position), level, float(position[2] - scene.surface.elevation(position)))
 
 
 def mount_T_cam_of(mount: Mount, rig: Rig) -> Array:
