@@ -14,10 +14,11 @@ from scipy.spatial import ConvexHull
 from log2sim.errors import ConfigError
 from log2sim.geometry import apply, box_corners, inverse
 from log2sim.logs.opening import open_log
-from log2sim.synth.bodies import Body, fragments_of
+from log2sim.synth.bodies import Body, samples_of
 from log2sim.synth.light import NOON
 from log2sim.synth.polytope_mesh import meshes_of
 from log2sim.synth.polytopes import Material
+from log2sim.synth.raster import nearest_of
 from log2sim.synth.render import SceneInstant, segment
 from log2sim.synth.render_camera import RenderCamera
 from log2sim.synth.returns import ReturnModel, Weather
@@ -71,10 +72,9 @@ def test_points_of_the_cloud_lie_on_what_the_picture_shows(seed: int, mount: str
     depth = np.full(color.shape[:2], FAR_M, np.float32)
     draw_terrain(view, instant.backdrop.ground, scene.surface, NOON, color, depth)
     for body in instant.bodies:
-        fragments = fragments_of(view, body)
-        if fragments is not None:
-            pixel = fragments.pixel(view.width_px)
-            depth.ravel()[pixel] = np.minimum(depth.ravel()[pixel], fragments.depth_m)
+        fragments = nearest_of(samples_of(view, body))
+        pixel = fragments.pixel(view.width_px)
+        depth.ravel()[pixel] = np.minimum(depth.ravel()[pixel], fragments.depth_m)
     p = apply(inverse(map_T_cam), scene.cast(np.random.default_rng(0)).xyz_m.astype(float))
     p = p[(p[:, 2] > 2.0) & (p[:, 2] < 40.0)]
     u, v = np.rint(p[:, :2] / p[:, 2:] * np.diag(rig.camera.K)[:2] + rig.camera.K[:2, 2]).astype(int).T

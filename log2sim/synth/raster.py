@@ -57,6 +57,95 @@ class Fragments:
         return out
 
 
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """All pixels that the faces of a mesh cover, row by row of each face.
+
+    Attributes
+    ----------
+    pixel : (P,) int32
+        Row-major index into the image.
+    nearness : (P,) float32, 1/m
+        Inverse depth.
+    row : (P,) int32
+        Which row of which face.
+    row_face, row_v : (R,) int32
+        Face and row of the image of each row.
+    planes : (F, 3 vertices, 3) float64
+        As in `Fragments`.
+    width_px : int
+    """
+
+    pixel: Index
+    nearness: NDArray[np.float32]
+    row: Index
+    row_face: Index
+    row_v: Index
+    planes: Array
+    width_px: int
+
+    @classmethod
+    def of(
+        cls, vertices_cam: Array, faces: NDArray[np.int64], K: Array, width_px: int, height_px: int,
+        passes: NDArray[np.float32] | None = None,
+    ) -> Samples:  # fmt: skip
+        """Cover the faces of a mesh, as `rasterize` describes; `passes` (F,) is the share of samples to leave out of each."""
+        triangles = vertices_cam[faces]  # (F, 3 vertices, 3)
+        planes, facing = _edge_planes(triangles, K)
+        low, high = _row_ranges(triangles, K, height_px)
+        kept = np.flatnonzero(facing & (high > low) & (triangles[:, :, 2].max(1) > NEAR_M)).astype(np.int32)
+        # Near faces last, so that they are written over far ones.
+        kept = kept[np.argsort(-triangles[kept, :, 2].sum(1))]
+        height = (high - low)[kept]
+        face = np.repeat(kept, height)
+        v = _counted(height) + np.repeat(low[kept], height)
+        first, length, constant, slope = _spans(planes, face, v, width_px)
+        along = _counted(length)
+        begin = (constant + slope * first).astype(np.float32)
+        nearness = np.repeat(begin, length) + np.repeat(slope.astype(np.float32), length) * along.astype(np.float32)
+        pixel = np.repeat(v * np.int32(width_px) + first, length) + along
+        row = np.repeat(np.arange(len(face), dtype=np.int32), length)
+        out = cls(pixel, nearness, row, face, v, planes, width_px)
+        if passes is None:
+            return out
+        stopped = _hashed(pixel) >= passes[face][row]
+        return cls(pixel[stopped], nearness[stopped], row[stopped], face, v, planes, width_px)
+
+    def fragments(self, rows: Index) -> Fragments:
+        """Select samples that are seen."""
+        row = self.row[rows]
+        v = self.row_v[row]
+        u = self.pixel[rows] - v * np.int32(self.width_px)
+        return Fragments(u, v, np.reciprocal(self.nearness[rows]), self.row_face[row], self.planes)
+
+
+class ZBuffer:
+    """The nearest of all samples that were added, and which one it is.
+
+    Parameters
+    ----------
+    nearness : (N,) float32, 1/m
+        Inverse depth of the background of each pixel; changed in place.
+    """
+
+    def __init__(self, nearness: NDArray[np.float32]) -> None:
+        self.nearness = nearness
+        self._winner = np.full(len(nearness), -1, np.int32)
+        self._count = 0
+
+    def add(self, samples: Samples) -> tuple[Fragments, Index, int]:
+        """Add samples: those that are the nearest so far, their pixels, and the number of the first of them."""
+        won = _win(self.nearness, samples.pixel, samples.nearness)
+        pixel, first = samples.pixel[won], self._count
+        self._count += len(won)
+        self._winner[pixel] = np.arange(first, self._count, dtype=np.int32)
+        return samples.fragments(won), pixel, first
+
+    def still_seen(self, pixel: Index, first: int) -> NDArray[np.intp]:
+        """Which of added samples (P,), given by their pixels and the number of the first, nothing has hidden since."""
+        return np.flatnonzero(self._winner[pixel] == np.arange(first, first + len(pixel), dtype=np.int32))
+
+
 def rasterize(vertices_cam: Array, faces: NDArray[np.int64], K: Array, width_px: int, height_px: int) -> Fragments:
     """Rasterize a mesh for a pinhole camera.
 
@@ -73,21 +162,19 @@ def rasterize(vertices_cam: Array, faces: NDArray[np.int64], K: Array, width_px:
     Edge functions in homogeneous coordinates, so that faces which reach behind the camera need no clipping: Olano & Greer,
     Triangle Scan Conversion using 2D Homogeneous Coordinates (Graphics Hardware 1997).
     """
-    triangles = vertices_cam[faces]  # (F, 3 vertices, 3)
-    planes, facing = _edge_planes(triangles, K)
-    low, high = _row_ranges(triangles, K, height_px)
-    kept = np.flatnonzero(facing & (high > low) & (triangles[:, :, 2].max(1) > NEAR_M)).astype(np.int32)
-    height = (high - low)[kept]
-    face = np.repeat(kept, height)
-    v = _counted(height) + np.repeat(low[kept], height)
-    first, length, nearness_at_0, slope = _spans(planes, face, v, width_px)
-    row = np.repeat(np.arange(len(face), dtype=np.int32), length)
-    u = _counted(length) + first[row]
-    nearness = nearness_at_0[row] + slope[row] * u
-    v = v[row]
-    nearest = _nearest(v * np.int32(width_px) + u, nearness)
-    depth = (1.0 / nearness[nearest]).astype(np.float32)
-    return Fragments(u[nearest], v[nearest], depth, face[row[nearest]], planes)
+    return nearest_of(Samples.of(vertices_cam, faces, K, width_px, height_px))
+
+
+def nearest_of(samples: Samples) -> Fragments:
+    """Select the nearest sample of each pixel, by ascending pixel."""
+    return samples.fragments(_nearest(samples.pixel, samples.nearness))
+
+
+def _hashed(pixel: Index) -> NDArray[np.float32]:
+    """Numbers (P,) in [0, 1) that look random and depend on the pixel alone."""
+    mixed = pixel.astype(np.uint32) * np.uint32(2654435761)
+    mixed = (mixed ^ (mixed >> np.uint32(15))) * np.uint32(1274126177)
+    return np.asarray((mixed >> np.uint32(16)).astype(np.float32) / 65536)
 
 
 def _counted(counts: Index) -> Index:
@@ -144,14 +231,28 @@ def _narrow(low: Array, high: Array, slope: Array, constant: Array) -> None:
     high[(slope == 0) & (constant < 0)] = -1.0
 
 
-def _nearest(pixel: Index, nearness: Array) -> Index:
+def _win(best: NDArray[np.float32], at: Index, nearness: NDArray[np.float32]) -> Index:
+    """Bring values (N,) up to those of samples (P,) and return the samples that have them then.
+
+    Where several samples fall on one place, NumPy keeps the last; what is greater than that tries again.
+    """
+    left = np.flatnonzero(nearness > best[at]).astype(np.int32)
+    candidates = left
+    while len(left):
+        places, values = at[left], nearness[left]
+        best[places] = values
+        left = left[values > best[places]]
+    won: Index = candidates[nearness[candidates] == best[at[candidates]]]
+    return won
+
+
+def _nearest(pixel: Index, nearness: NDArray[np.float32]) -> Index:
     """Index of the nearest sample of each pixel, by ascending pixel."""
     if len(pixel) == 0:
         return np.zeros(0, np.int32)
     at = pixel - pixel.min()
-    best = np.zeros(int(at.max()) + 1)
-    np.maximum.at(best, at, nearness)
-    winners = np.flatnonzero(nearness == best[at]).astype(np.int32)
+    best = np.zeros(int(at.max()) + 1, np.float32)
+    winners = _win(best, at, nearness)
     slot = np.full(len(best), -1, np.int32)
     slot[at[winners]] = winners
     return slot[slot >= 0]

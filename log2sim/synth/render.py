@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array, Camera
 from log2sim.synth.backdrop import Wall
-from log2sim.synth.bodies import NOBODY, Body, Lighting, draw_bodies, draw_shadows, fragments_of, is_hidden, near_first
+from log2sim.synth.bodies import Body, Lighting, draw_bodies, draw_shadows, is_hidden, near_first, samples_of
 from log2sim.synth.facades import draw_buildings, hide_behind_buildings
 from log2sim.synth.ground import Ground
 from log2sim.synth.lamps import Lamp, glare, light_scenery, nearest_lamps
 from log2sim.synth.light import NOON, Light
 from log2sim.synth.polytope_caster import Terrain
 from log2sim.synth.rain import draw_rain, mirror_sky
-from log2sim.synth.raster import Fragments
+from log2sim.synth.raster import Fragments, ZBuffer, nearest_of
 from log2sim.synth.render_camera import RenderCamera
 from log2sim.synth.scenery import FAR_M, GAMMA, Image, draw_ground, draw_sky
 from log2sim.synth.terrain_view import draw_terrain
@@ -114,20 +114,16 @@ def segment(camera: Camera, map_T_cam: Array, instant: SceneInstant) -> list[Vis
     view = RenderCamera.of(camera, map_T_cam)
     depth = np.full((view.height_px, view.width_px), np.inf, np.float32)
     hide_behind_buildings(view, instant.backdrop.buildings, depth)
-    nearest, owner = depth.ravel(), np.full(depth.size, NOBODY)
-    whole: list[Fragments | None] = [None] * len(instant.bodies)
+    buffer = ZBuffer(np.reciprocal(depth).ravel())
+    out: list[Visibility | None] = [None] * len(instant.bodies)
+    added: dict[int, tuple[Fragments, NDArray[np.int32], int, Fragments]] = {}
     for index in near_first(view, instant.bodies):
-        body = instant.bodies[index]
-        fragments = None if is_hidden(view, body, nearest) else fragments_of(view, body)
-        whole[index] = fragments
-        if fragments is not None:
-            pixel = fragments.pixel(view.width_px)
-            near = fragments.depth_m < nearest[pixel]
-            nearest[pixel[near]] = fragments.depth_m[near]
-            owner[pixel[near]] = index
-    return [
-        None if f is None else _visibility(f, f.part(owner[f.pixel(view.width_px)] == k)) for k, f in enumerate(whole)
-    ]
+        if not is_hidden(view, instant.bodies[index], buffer.nearness):
+            samples = samples_of(view, instant.bodies[index])
+            added[index] = (*buffer.add(samples), nearest_of(samples))
+    for index, (fragments, pixel, first, silhouette) in added.items():
+        out[index] = _visibility(silhouette, fragments.part(buffer.still_seen(pixel, first)))
+    return out
 
 
 def _visibility(silhouette: Fragments, visible: Fragments) -> Visibility | None:

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.synth.bodies import Painter, Samples
+from log2sim.synth.bodies import Painter, Values
 from log2sim.synth.polytope_caster import MESH_OPENNESS
 from log2sim.synth.polytopes import Material
 from log2sim.synth.surfaces import Paint, linear_bgr
@@ -115,7 +115,7 @@ def _choice(rng: np.random.Generator, pool: list[Rgb], shares: list[float]) -> R
     return pool[rng.choice(len(pool), p=np.array(shares) / np.sum(shares))]
 
 
-def _paint(look: Look, part: NDArray[np.int64], points: Samples, normals: Samples) -> Paint:
+def _paint(look: Look, part: NDArray[np.int64], points: Values, normals: Values) -> Paint:
     out = Paint(look.color[part], look.gloss[part], np.zeros((len(part), 3), np.float32))
     z = points[:, 2] + np.float32(look.size_m[2] / 2)
     material = look.material[part]
@@ -131,9 +131,7 @@ def _paint(look: Look, part: NDArray[np.int64], points: Samples, normals: Sample
     return out
 
 
-def _vehicle(
-    look: Look, out: Paint, material: NDArray[np.int64], points: Samples, z: Samples, normals: Samples
-) -> None:
+def _vehicle(look: Look, out: Paint, material: NDArray[np.int64], points: Values, z: Values, normals: Values) -> None:
     """Paint lamps, plates and the sills of windows."""
     length, width, height = look.size_m
     low = min(1.1, 0.62 * height)
@@ -149,7 +147,7 @@ def _vehicle(
         out.glow[mask] = glow * np.asarray(color, np.float32)
 
 
-def _person(look: Look, out: Paint, material: NDArray[np.int64], z: Samples, normals: Samples) -> None:
+def _person(look: Look, out: Paint, material: NDArray[np.int64], z: Values, normals: Values) -> None:
     """Paint trousers, hands' height, face and hair by their heights."""
     cloth = material == Material.CLOTH
     share = z / np.float32(look.size_m[2])
@@ -160,7 +158,7 @@ def _person(look: Look, out: Paint, material: NDArray[np.int64], z: Samples, nor
     out.albedo[cloth & (share < 0.045) & (look.category == "pedestrian")] = (0.03, 0.03, 0.03)
 
 
-def _front(out: Paint, material: NDArray[np.int64], points: Samples, z: Samples, normals: Samples) -> None:
+def _front(out: Paint, material: NDArray[np.int64], points: Values, z: Values, normals: Values) -> None:
     """Paint floors of windows on a house."""
     wall = (material == Material.WALL) & (np.abs(normals[:, 2]) < 0.5)
     along = np.where(np.abs(normals[:, 1]) > 0.5, points[:, 0], points[:, 1])
@@ -173,7 +171,7 @@ def _front(out: Paint, material: NDArray[np.int64], points: Samples, z: Samples,
     out.albedo[wall & (z < 0.7)] *= np.float32(0.7)
 
 
-def _mottled(points: Samples) -> Samples:
+def _mottled(points: Values) -> Values:
     """Light and dark patches (P,) of leaves."""
     patches = np.sin(7.1 * points[:, 0] + 3.3 * points[:, 2]) * np.sin(6.3 * points[:, 1] - 4.7 * points[:, 2])
     fine = np.sin(23.0 * points[:, 0] + 17.0 * points[:, 1]) * np.sin(29.0 * points[:, 2] - 13.0 * points[:, 1])

@@ -22,7 +22,7 @@ from log2sim.synth.shapes import Mesh
 from log2sim.synth.traffic import Road, TrafficObject, TrafficScene
 from log2sim.synth.traffic_colors import VEHICLES, Look, look_of
 
-ROAD_REACH_M, ROAD_STEP_M = 240.0, 4.0
+ROAD_REACH_M, MAX_SAGITTA_M = 240.0, 0.02
 SIDEWALK_M = 2.5
 MIN_STREET_LAMP_M = 5.0
 OWN_CAR = "own car"
@@ -59,8 +59,8 @@ class TrafficPainter:
     def __init__(self, scene: TrafficScene, seed: int) -> None:
         painted = [painted_road(road, scene.surface.kerb_m > 0) for road in scene.roads]
         self.backdrop = TrafficBackdrop(Ground(painted, (), GRAIN_SEED), scene.surface)
-        rng = np.random.default_rng([seed, 7])
-        self._looks = [look_of(item, rng) for item in scene.objects]
+        self._seed = seed
+        self._looks: dict[int, Look] = {}
         self._meshes: dict[int, Mesh] = {}
 
     def instant(
@@ -78,15 +78,18 @@ class TrafficPainter:
         for k, item, mesh in zip(
             rows, objects, meshes_of([o.parts for o in objects], [o.size_m[2] / 2 for o in objects])
         ):
+            self._looks[k] = look_of(item, np.random.default_rng([self._seed, 7, k]))
             self._meshes[k] = _rounded(mesh, np.array([p.material for p in item.parts]))
 
 
 def painted_road(road: Road, kerbs: bool) -> PaintedRoad:
     """Turn an arc into the polyline that is painted on the ground."""
-    s = np.arange(-ROAD_REACH_M, ROAD_REACH_M + 1, ROAD_STEP_M)
-    if road.curvature_per_m:
-        # Less than half a turn, so that the road does not meet itself.
-        s = s[np.abs(s * road.curvature_per_m) < 0.45 * np.pi]
+    bend = abs(road.curvature_per_m)
+    # Less than half a turn, so that the road does not meet itself.
+    reach = min(ROAD_REACH_M, 0.45 * np.pi / max(bend, 1e-9))
+    # A chord of length s departs from its arc by s^2 / 8 times the curvature.
+    step = np.sqrt(8 * MAX_SAGITTA_M / max(bend, 1e-9))
+    s = np.linspace(-reach, reach, int(np.ceil(2 * reach / step)) + 1)
     line = tuple((float(p[0]), float(p[1])) for p in (road.at(float(v), 0.0)[0] for v in s))
     sidewalk = SIDEWALK_M if kerbs else 0.0
     return PaintedRoad(line=line, width_m=2 * road.half_width_m, lanes=road.lanes, sidewalk_m=sidewalk)
@@ -125,8 +128,7 @@ def _in_view(item: TrafficObject, camera: Camera, map_T_cam: Array) -> bool:
 def _body(item: TrafficObject, mesh: Mesh, look: Look) -> Body:
     center = item.position_m + np.array([0.0, 0.0, item.size_m[2] / 2])
     pose = transform(rotation_from_rpy(0.0, 0.0, item.yaw_rad), center)
-    reach = 2 * float(np.abs(mesh.vertices_m).max()) if len(mesh.vertices_m) else 0.0
-    return Body(mesh, pose, item.size_m, look.painter(), passes=look.passes(), reach_m=reach)
+    return Body(mesh, pose, item.size_m, look.painter(), passes=look.passes())
 
 
 def _rounded(mesh: Mesh, material: NDArray[np.int64]) -> Mesh:
