@@ -63,7 +63,11 @@ class Section(BaseModel):
 class SyncConfig(Section):
     """Synchronization of the sensors."""
 
-    reference: str = _setting("", "Camera whose frames set the ticks; empty: the log's own choice.")
+    reference: str = _setting(
+        "",
+        "Camera whose frames set the ticks, without cameras the LiDAR whose sweeps do; empty: the log's own choice, of "
+        "LiDARs the one with the most sweeps.",
+    )
     max_residual_s: float = _setting(
         0.1, "Largest time between a tick and a record that is used for it.", unit="s", ge=1e-6, le=10.0
     )

@@ -77,6 +77,11 @@ def test_only_what_is_confused_can_be_the_same(one: str, other: str, same: bool)
     assert (found.partner[0] >= 0) == same
 
 
+def test_long_names_are_not_cut() -> None:
+    short = replace(in_sweep((20, 2)), category=np.array(["car"]))
+    assert joined(short, in_image((20, 2), category="truck")).category.tolist() == ["truck"]
+
+
 def test_a_shift_too_far_for_the_image_is_another_object() -> None:
     found = joined(in_sweep((20, 2)), in_image((20, -2)))
     assert len(found) == 2

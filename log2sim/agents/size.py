@@ -77,7 +77,7 @@ def static_geometry(track: Track) -> TrackGeometry:
     real = box_completion.real_ends(low, high, views, m.ends_visible[with_points]).max(axis=0)
     known = typical_box_size(m)
     size, is_likely = _estimate_size(low[None], high[None], real[None], track.category, known)
-    center, sigma = box_completion.complete_box(low, high, size, real)
+    center, sigma = box_completion.complete_box(low, high, size, real, known is not None)
     box_xy, box_sigma_m = mean_box_center(m)
     center, sigma = box_completion.weighted_center(
         center, sigma, box_fitting.rotate(box_xy - origin[:2], -yaw), _with_size_error(box_sigma_m, known, size)
@@ -127,7 +127,8 @@ def moving_geometry(track: Track, yaw_rad: Array) -> TrackGeometry:
     low, high = (np.array(e) for e in zip(*ends))
     real = box_completion.real_ends(low, high, np.zeros_like(low), m.ends_visible[rows])
     size, is_likely = _estimate_size(low, high, real, track.category, typical_box_size(m))
-    center, sigma = box_completion.complete_box(low, high, size, real)
+    has_box = np.isfinite(m.box_yaw_rad[rows])
+    center, sigma = box_completion.complete_box(low, high, size, real, has_box)
     center, sigma = box_completion.weighted_center(
         center,
         sigma,

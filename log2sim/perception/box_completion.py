@@ -24,7 +24,7 @@ SIDE_END, FACING_END = 1, 2
 CORNER_ROUNDING_SHARE = 0.08
 # Standard deviation of a center that a 3D detector estimates, per axis: with many points, and the number of points with which
 # its variance is twice that.
-BOX_SIGMA_M, BOX_SIGMA_POINTS = 0.15, 20.0
+BOX_SIGMA_M, BOX_SIGMA_POINTS = 0.2, 20.0
 # A side seen at a smaller angle than this (sine) shows its near end only.
 MIN_VIEW_SINE = 0.5
 # Share of length minus width by which a center is uncertain when its short side may be a front or a part of a flank.
@@ -73,7 +73,9 @@ def real_ends(low: Array, high: Array, sensor: Array, ends_visible: NDArray[np.b
     return real
 
 
-def complete_box(low: Array, high: Array, size_m: Array, real: NDArray[np.int64]) -> tuple[Array, Array]:
+def complete_box(
+    low: Array, high: Array, size_m: Array, real: NDArray[np.int64], known: NDArray[np.bool_] | bool = False
+) -> tuple[Array, Array]:
     """Place a box of known size over its observed extents.
 
     Parameters
@@ -84,6 +86,8 @@ def complete_box(low: Array, high: Array, size_m: Array, real: NDArray[np.int64]
         Length and width of the whole box.
     real : (..., 2, 2) int
         Kinds of the ends, see `real_ends`.
+    known : (...) bool
+        Whether a 3D detector tells the size, so that what is added to the points beyond a real end is no guess.
 
     Returns
     -------
@@ -99,7 +103,8 @@ def complete_box(low: Array, high: Array, size_m: Array, real: NDArray[np.int64]
     low, high = corner_correction(low, high, real, size_m[..., 1])
     slack = size_m - (high - low)
     better = np.sign(real[..., 1] - real[..., 0])
-    doubt = np.where(real.any(axis=-1), UNIFORM_SIGMA, 1.0) * np.maximum(slack, 0.0)
+    one_end = np.where(np.asarray(known)[..., None], 0.0, UNIFORM_SIGMA)
+    doubt = np.where(real.any(axis=-1), one_end, 1.0) * np.maximum(slack, 0.0)
     # Objects of one category differ in size, so the position of an unobserved end is never exact.
     spread = np.where(real.all(axis=-1), 0.0, SIZE_SIGMA_SHARE * size_m)
     return (low + high) / 2 - better * slack / 2, np.sqrt(SENSOR_SIGMA_M**2 + doubt**2 + spread**2)
@@ -154,7 +159,8 @@ def place_boxes(evidence: BoxEvidence) -> Measurements:
     has_box = np.isfinite(evidence.box_yaw_rad)
     placed = np.isfinite(evidence.low_m[:, 0]) | has_box
     low, high, yaw, size = evidence.low_m, evidence.high_m, evidence.yaw_rad, provisional_sizes(evidence)
-    local, sigma = complete_box(low, high, size, real_ends(low, high, np.zeros_like(low), evidence.ends_visible))
+    real = real_ends(low, high, np.zeros_like(low), evidence.ends_visible)
+    local, sigma = complete_box(low, high, size, real, has_box)
     width = np.array([TYPICAL_SIZE_M[str(c)][1] for c in evidence.category])
     # So short a side may be a front or a visible part of a flank, for which the centers differ.
     ambiguous = ((high - low).max(axis=1) <= MAX_WIDTH_FACTOR * width) & ~evidence.ends_visible.all(axis=1) & ~has_box

@@ -136,12 +136,13 @@ def _with_partners(boxes: Measurements, frames: Sequence[ImageMatches], weights:
         mine = mine[frame.iou[mine] * frame.rows.score[frame.partner[mine]] > best[mine]]
         theirs = frame.partner[mine]
         best[mine] = frame.iou[mine] * frame.rows.score[theirs]
-        for name in ("camera", "box_px", "truncated", "height_px_m"):
-            column = getattr(frame.rows, name)[theirs]
-            columns[name] = columns[name].astype(np.promote_types(columns[name].dtype, column.dtype))
-            columns[name][mine] = column
         sure = frame.iou[mine] >= MIN_CATEGORY_IOU
-        columns["category"][mine[sure]] = frame.rows.category[theirs[sure]]
+        for name in ("camera", "box_px", "truncated", "height_px_m", "category"):
+            taken = sure if name == "category" else np.ones(len(mine), dtype=bool)
+            column = getattr(frame.rows, name)[theirs[taken]]
+            # Texts of fixed width would be cut.
+            columns[name] = columns[name].astype(np.promote_types(columns[name].dtype, column.dtype))
+            columns[name][mine[taken]] = column
         columns["score"][mine] = weights.score(
             frame.rows.score[theirs], boxes.score[mine], frame.iou[mine], range_m[mine]
         )
