@@ -287,3 +287,24 @@ def test_a_frame_of_a_scene_without_road_users_has_no_labels() -> None:
     frame = frame_of(empty, environment, 0)
     assert frame.labels == ""
     assert len(frame.points) > 1000
+
+
+def test_our_own_reader_of_the_layout_finds_the_boxes_on_the_points(kitti: Path) -> None:
+    log = open_log(kitti)
+    labels = log.labels
+    assert log.format == "kitti-object"
+    assert labels is not None
+    assert log.ego is not None
+    stated = [k for i in range(3) for k, _ in Frame(kitti / "training", i).labels if k != "DontCare"]
+    assert len(labels.t_ns) == len(stated)
+    inside = 0
+    for i, stamp in enumerate(log.streams["velodyne"].t_ns):
+        sweep = log.streams["velodyne"].read(i)
+        assert sweep.frame == "map"
+        for k in np.flatnonzero(labels.t_ns == stamp):
+            local = sweep.xyz_m - labels.center_m[k]
+            c, s = np.cos(labels.yaw_rad[k]), np.sin(labels.yaw_rad[k])
+            flat, half = local[:, :2] @ np.array([[c, -s], [s, c]]), labels.size_m[k] / 2
+            above = (local[:, 2] > -half[2] + 0.2) & (local[:, 2] < half[2])
+            inside += int((np.all(np.abs(flat) < half[:2], axis=1) & above).sum())
+    assert inside > 100
