@@ -97,6 +97,13 @@ def test_the_eight_channels_say_what_the_paper_names(grid: np.ndarray) -> None:
     np.testing.assert_allclose(out[3] * z.DISTANCE_UNIT_M, np.hypot(y[None, :], x[:, None]) * z.CELL_M, atol=1e-4)
 
 
+def test_a_part_of_a_window_has_the_directions_and_distances_of_the_whole(grid: np.ndarray) -> None:
+    whole = z.PaperGrid()(torch.from_numpy(grid[None]))
+    part = torch.from_numpy(grid[None, :, 16:80, 32:96])
+    middle = torch.tensor([[(64 - 48) * z.CELL_M, (56 - 64) * z.CELL_M]])
+    torch.testing.assert_close(z.PaperGrid()(part, middle), whole[:, :, 16:80, 32:96])
+
+
 def test_targets_are_the_classes_of_the_points_in_cells_that_are_not_empty(grid: np.ndarray, targets: Any) -> None:
     label = targets.label[0].numpy()
     np.testing.assert_array_equal(label == IGNORED, grid[3] == 0)
@@ -311,7 +318,7 @@ def test_figures_count_all_groups_together_at_one_score(sample: Sample) -> None:
     rows[3, 1] += 12
     rows[4, 0] += 0.9
     detector = Fixed(rows, ["car", "truck", "pedestrian", "car", "cyclist"], [0.9, 0.8, 0.7, 0.6, 0.3])
-    result = table_rows.judged(detector, scenes)  # type: ignore[arg-type]
+    result = table_rows.judged({"fixed": detector}, scenes)["fixed"]  # type: ignore[dict-item]
     f = table_rows.figures(result, table_rows.OVERLAP, 0.5)
     # Of 4 truths a scene 3 are found at .5, beside one false box; the rider is found by center only.
     assert f["truths"] == 8

@@ -21,7 +21,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -37,11 +39,10 @@ from lidar_training.table_rows import CENTER, MATCHES, best_score, figures, judg
 from lidar_training.zou2021 import Zou2021Network
 from lidar_training.zou2021_export import export_zou2021
 
-from log2sim.config import LidarConfig
 from log2sim.logs.opening import open_log
 from log2sim.perception.detect3d.detectors import LidarDetector
-from log2sim.perception.detect3d.network import load_network
-from log2sim.perception.detect3d.network_detector import WEIGHTS, open_network
+from log2sim.perception.detect3d.network import Network, load_network
+from log2sim.perception.detect3d.network_detector import WEIGHTS, NetworkDetector
 
 CHOICE_SEED, TEST_SEED = 3_000_000, 4_000_000
 """Scenes that training and calibration never draw."""
@@ -107,39 +108,43 @@ class Table:
             print(name, flush=True)
         return json.loads(path.read_text())
 
-    def score_of(self, kind: str, decode: str, network: Path) -> float:
-        """Choose the score at which a detector reports, on simulated scenes of its mount."""
-        return best_score(judged(detector_of(network, decode), self.simulated(MOUNT[kind], CHOICE_SEED)))
-
     def rows(self) -> Iterator[tuple[str, str, str, dict[str, Any]]]:
         """Yield training, detector, test and figures of all rows."""
         for kind, network in self.networks.items():
-            for decode in VARIANTS[kind]:
-                yield from self._tests(kind, decode, network, "simulated", [f"simulated, {MOUNT[kind]}", *self.logs])
+            yield from self._tests(kind, network, "simulated", [f"simulated, {MOUNT[kind]}", *self.logs])
         for kind in self.checkpoints:
             for share in SHARES:
                 for other in self.logs if share else ("none",):
                     network = self.fine_tuned(kind, other, share)
-                    source = f"simulated + {share:.0%} {other}" if share else f"simulated, {self.steps} steps more"
-                    for decode in VARIANTS[kind]:
-                        yield from self._tests(kind, decode, network, source, [n for n in self.logs if n != other])
+                    source = f"simulated, then {self.steps} steps with {share:.0%} of {other}"
+                    source = source if share else f"simulated, then {self.steps} steps more"
+                    yield from self._tests(kind, network, source, [n for n in self.logs if n != other])
 
     def _tests(
-        self, kind: str, decode: str, network: Path, source: str, tests: list[str]
+        self, kind: str, path: Path, source: str, tests: list[str]
     ) -> Iterator[tuple[str, str, str, dict[str, Any]]]:
-        slug = "".join(c if c.isalnum() else "_" for c in f"{kind} {decode} {source}")
-        score = self.row(f"score_{slug}", lambda: {"score": self.score_of(kind, decode, network)})["score"]
+        slug = _slug(f"{kind} {source}")
+        network = LastRun(load_network(path))
+        detectors = {decode: detector_of(network, decode) for decode in VARIANTS[kind]}
+
+        def choose() -> dict[str, Any]:
+            result = judged(detectors, self.simulated(MOUNT[kind], CHOICE_SEED))
+            return {decode: best_score(r) for decode, r in result.items()}
+
+        score = self.row(f"score_{slug}", choose)
         for test in tests:
 
             def make(test: str = test) -> dict[str, Any]:
                 scenes = self.sweeps[test] if test in self.logs else self.simulated(MOUNT[kind], TEST_SEED)
-                result = judged(detector_of(network, decode), scenes)
-                return {"score": score, "scenes": len(scenes)} | {
-                    name: figures(result, criteria, score) for name, criteria in MATCHES.items()
+                return {
+                    decode: {"score": score[decode], "scenes": len(scenes)}
+                    | {name: figures(result, criteria, score[decode]) for name, criteria in MATCHES.items()}
+                    for decode, result in judged(detectors, scenes).items()
                 }
 
-            name = "".join(c if c.isalnum() else "_" for c in test)
-            yield source, NAMES[kind, decode], test, self.row(f"{slug}__{name}", make)
+            row = self.row(f"{slug}__{_slug(test)}", make)
+            for decode in VARIANTS[kind]:
+                yield source, NAMES[kind, decode], test, row[decode]
 
     def fine_tuned(self, kind: str, other: str, share: float) -> Path:
         """Go on training a network for some steps, with a share of a log's sweeps in half of each batch."""
@@ -171,12 +176,29 @@ class Table:
 _drawn: dict[tuple[str, int], list[Example]] = {}  # scenes by mount and seed
 
 
-def detector_of(path: Path, decode: str) -> LidarDetector:
-    """Open a network with one of the decodings: centers, votes, or a box around the points of each cluster."""
+def _slug(text: str) -> str:
+    return "".join(c if c.isalnum() else "_" for c in text)
+
+
+class LastRun:
+    """A network that remembers its last answer, for several decodings of one grid."""
+
+    def __init__(self, network: Network) -> None:
+        self.info, self._network = network.info, network
+        self._grid, self._maps = np.zeros(0, np.float32), np.zeros(0, np.float32)
+
+    def run(self, grid: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Compute the maps of a grid."""
+        if not np.array_equal(grid, self._grid):
+            self._grid, self._maps = grid, self._network.run(grid)
+        return self._maps
+
+
+def detector_of(network: Any, decode: str) -> LidarDetector:
+    """Decode a network by centers, by votes, or by votes with a box around the points of each cluster."""
     if decode == "points":
-        return ClusterBoxDetector("points", load_network(path), RANGE_M, MIN_SCORE)
-    settings = LidarConfig(decode=decode, range_m=RANGE_M, min_score=MIN_SCORE)
-    return open_network(path, settings, name=path.stem)
+        return ClusterBoxDetector(decode, network, RANGE_M, MIN_SCORE)
+    return NetworkDetector(decode, network, decode, RANGE_M, MIN_SCORE)
 
 
 def render(rows: Iterator[tuple[str, str, str, dict[str, Any]]]) -> str:

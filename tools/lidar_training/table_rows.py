@@ -39,26 +39,31 @@ class Judged:
     truth: dict[str, SceneBoxes]
 
 
-def judged(detector: LidarDetector, scenes: Scenes) -> Judged:
-    """Search all scenes; what was found where nothing was labeled is ignored."""
-    found, truth = [], []
+def judged(detectors: dict[str, LidarDetector], scenes: Scenes) -> dict[str, Judged]:
+    """Search all scenes with several detectors; what was found where nothing was labeled is ignored."""
+    found: dict[str, list[SceneBoxes]] = {name: [] for name in detectors}
+    truth = []
     for scene in scenes:
-        cloud, boxes = scene.cloud, detector.detect(scene.cloud)
-        rows = np.column_stack([boxes.center_m - cloud.origin, boxes.size_m, boxes.yaw_rad])
-        away = np.hypot(*(rows[:, :2] - cloud.sensor[:2]).T)
-        table = SceneBoxes.of(rows, boxes.category, boxes.score, points=boxes.points, range_m=away)
-        if isinstance(scene, LogSweep) and len(rows):
-            table = table.ignoring(~scene.labeled(rows[:, :3]))
-        found.append(table)
+        for name, detector in detectors.items():
+            found[name].append(_search(detector, scene))
         t = scene.truth
         truth.append(t.ignoring((t.points < MIN_COUNTED_POINTS) | np.isin(t.category, UNCOUNTED)))
-    out = Judged({}, {})
-    for group in GROUPS:
-        f = SceneBoxes.join([group_of(table, group) for table in found])
-        t = SceneBoxes.join([group_of(table, group) for table in truth])
-        out.found[group] = f.take(f.range_m < MAX_RANGE_M[group])
-        out.truth[group] = t.ignoring(t.range_m >= MAX_RANGE_M[group])
+    true = {group: SceneBoxes.join([group_of(table, group) for table in truth]) for group in GROUPS}
+    true = {group: t.ignoring(t.range_m >= MAX_RANGE_M[group]) for group, t in true.items()}
+    out = {}
+    for name, tables in found.items():
+        by_group = {group: SceneBoxes.join([group_of(table, group) for table in tables]) for group in GROUPS}
+        out[name] = Judged({g: f.take(f.range_m < MAX_RANGE_M[g]) for g, f in by_group.items()}, true)
     return out
+
+
+def _search(detector: LidarDetector, scene: Example | LogSweep) -> SceneBoxes:
+    """Search one scene; boxes relative to the cloud's origin."""
+    cloud, boxes = scene.cloud, detector.detect(scene.cloud)
+    rows = np.column_stack([boxes.center_m - cloud.origin, boxes.size_m, boxes.yaw_rad])
+    away = np.hypot(*(rows[:, :2] - cloud.sensor[:2]).T)
+    table = SceneBoxes.of(rows, boxes.category, boxes.score, points=boxes.points, range_m=away)
+    return table.ignoring(~scene.labeled(rows[:, :3])) if isinstance(scene, LogSweep) and len(rows) else table
 
 
 def figures(result: Judged, criteria: dict[str, Criterion], min_score: float) -> dict[str, Any]:

@@ -40,12 +40,20 @@ NO_CENTER_LOGIT = -9.0
 class PaperGrid(nn.Module):
     """The paper's 8 channels from the 12 of `log2sim.perception.detect3d.grid`."""
 
-    def forward(self, grid: Tensor) -> Tensor:
-        """Map grids (B, 12, H, W) to (B, 8, H, W)."""
+    def forward(self, grid: Tensor, middle_m: Tensor | None = None) -> Tensor:
+        """Map grids (B, 12, H, W) to (B, 8, H, W).
+
+        Parameters
+        ----------
+        middle_m : (B, 2), optional
+            From the middle of each grid to that of the window which it is a part of; by default it is the whole window.
+        """
         x = (torch.arange(grid.shape[2], dtype=grid.dtype) + 0.5 - grid.shape[2] / 2) * CELL_M
         y = (torch.arange(grid.shape[3], dtype=grid.dtype) + 0.5 - grid.shape[3] / 2) * CELL_M
         zero = torch.zeros_like(grid[:, :1])
         x, y = x.view(1, 1, -1, 1) + zero, y.view(1, 1, 1, -1) + zero
+        if middle_m is not None:
+            x, y = x - middle_m[:, 0].view(-1, 1, 1, 1), y - middle_m[:, 1].view(-1, 1, 1, 1)
         direction, distance = torch.atan2(y, x) / torch.pi, torch.sqrt(x * x + y * y) / DISTANCE_UNIT_M
         count = grid[:, 3:4]
         filled = (count > 0).to(grid.dtype)
@@ -91,9 +99,9 @@ class Zou2021Network(nn.Module):
         self.d4 = _layers(_conv(2 * c64, c64), _up(c64, c48))
         self.d5 = nn.Sequential(*_layers(_conv(2 * c48, c48)), nn.ConvTranspose2d(c48, PAPER_OUTPUTS, 4, 2, 1))
 
-    def forward(self, grid: Tensor) -> Tensor:
-        """Map grids (B, 12, H, W), H and W even, to the paper's outputs (B, 11, H, W)."""
-        s2 = self.c1(self.grid(grid))
+    def forward(self, grid: Tensor, middle_m: Tensor | None = None) -> Tensor:
+        """Map grids (B, 12, H, W), H and W even, to the paper's outputs (B, 11, H, W); `middle_m` as in `PaperGrid`."""
+        s2 = self.c1(self.grid(grid, middle_m))
         s4 = self.c2(s2)
         s8 = self.c3(s4)
         s16 = self.c4(s8)
