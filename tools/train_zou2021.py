@@ -21,6 +21,8 @@ from lidar_training.mixing import Mixture, shards_in, zou2021_loss
 from lidar_training.zou2021 import Zou2021Network
 from lidar_training.zou2021_export import export_zou2021
 
+PEAK_RATE = 2e-3
+
 
 def train(data: list[Path], out: Path, *, steps: int, seed: int, start: Path | None, share: float = 1.0) -> Path:
     """Train, or go on from the checkpoint in `out`, and export the averaged weights; returns the ONNX file."""
@@ -30,11 +32,13 @@ def train(data: list[Path], out: Path, *, steps: int, seed: int, start: Path | N
     if start is not None:
         network.load_state_dict(torch.load(start, weights_only=True)["mean"])
     mixture = Mixture(shards_in(data))
-    plan = FitPlan(steps, seed, checkpoint=out / "checkpoint.pt")
+    plan = FitPlan(steps, seed, PEAK_RATE, out / "checkpoint.pt")
     mean = fit(network, lambda n, rng: zou2021_loss(n, mixture.draw(rng), rng), plan)
     network.load_state_dict(mean)
     path = out / "zou2021.onnx"
-    export_zou2021(network, path, {"steps": steps, "seed": seed, "samples": sum(map(len, mixture.simulated))})
+    export_zou2021(
+        network, path, {"steps": steps, "seed": seed, "share": share, "samples": sum(map(len, mixture.simulated))}
+    )
     return path
 
 
@@ -45,9 +49,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of the checkpoint and the ONNX file")
     parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--share", type=float, default=1.0, help="share of the paper's channels")
     parser.add_argument("--start", type=Path, help="checkpoint of another run to start from")
     options = parser.parse_args()
-    path = train(options.data, options.out, steps=options.steps, seed=options.seed, start=options.start)
+    path = train(
+        options.data, options.out, steps=options.steps, seed=options.seed, start=options.start, share=options.share
+    )
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
 
 

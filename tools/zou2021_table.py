@@ -153,10 +153,11 @@ class Table:
             return path
         real = [sample_of(s) for s in self.sweeps[other]] if share else []
         real = real[:: round(1 / share)] if share else []
-        network = BevNetwork() if kind == "vehicle" else Zou2021Network()
+        info = load_network(self.networks[kind]).info
+        network = BevNetwork() if kind == "vehicle" else Zou2021Network(info.card["share"])
         network.load_state_dict(torch.load(self.checkpoints[kind], weights_only=True)["mean"])
         network = network.to(memory_format=torch.channels_last)
-        loss = centers_loss(load_network(self.networks[kind]).info.cell_m) if kind == "vehicle" else zou2021_loss
+        loss = centers_loss(info.cell_m) if kind == "vehicle" else zou2021_loss
         mixture = Mixture(shards_in(self.data), real)
         mean = fit(
             network, lambda n, rng: loss(n, mixture.draw(rng), rng), FitPlan(self.steps, seed=5, peak_rate=FINE_RATE)
@@ -165,11 +166,10 @@ class Table:
         part = path.with_suffix(".part.onnx")
         if kind == "vehicle":
             torch.save({"mean": mean}, self.work / "fine.pt")
-            info = json.loads(load_network(self.networks[kind]).info.model_dump_json()) | {"card": card}
-            export_onnx(self.work / "fine.pt", part, info)
+            export_onnx(self.work / "fine.pt", part, json.loads(info.model_dump_json()) | {"card": card})
         else:
             network.load_state_dict(mean)
-            export_zou2021(network, part, card)
+            export_zou2021(network, part, card | {"share": info.card["share"]})
         return part.replace(path)
 
 

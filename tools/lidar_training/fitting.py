@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-WARM_UP_STEPS = 100
+WARM_UP_STEPS = 50
 MAX_GRADIENT_NORM = 10.0
 CHECKPOINT_S = 60.0
 REPORT_STEPS = 50
