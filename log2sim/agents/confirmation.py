@@ -13,7 +13,8 @@ from log2sim.perception.late_fusion import logit, probability
 # Limits of `image_confidence`; a track whose size is unlikely for its category needs more evidence.
 MIN_TRACK_CONFIDENCE = 0.3
 MIN_TRACK_CONFIDENCE_UNLIKELY_SIZE = 0.6
-# Limit of `sweep_confidence`, which is a probability: an invented vehicle in the way costs a simulation twice what a missing one does.
+# Limit of `sweep_confidence`, which is a probability: an invented vehicle in the way costs a simulation twice what a missing
+# one does.
 MIN_SWEEP_CONFIDENCE = 2 / 3
 # Number of the best detections whose mean score is the confidence. Independent detections would multiply; those of a video
 # are not independent, so the confidence saturates.
