@@ -6,6 +6,7 @@ python tools/bench_lidar.py [--log PANDASET] [--log KITTI] [--write BENCHMARKS.m
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import time
 from collections.abc import Callable
@@ -23,7 +24,7 @@ from log2sim.config import LidarConfig
 from log2sim.logs.opening import open_log
 from log2sim.perception.detect3d.grid import grid_window, rasterize
 from log2sim.perception.detect3d.level_points import level_points, sensor_xy
-from log2sim.perception.detect3d.network_detector import NetworkDetector, open_shipped
+from log2sim.perception.detect3d.network_detector import WEIGHTS, NetworkDetector, open_shipped
 from log2sim.perception.first_pass import cloud_origin
 from log2sim.perception.lidar.cloud import Cloud, assemble_cloud
 from log2sim.synth.lidar_models import LIDAR_MODELS
@@ -120,6 +121,40 @@ def generator_rows() -> list[list[str]]:
     return rows
 
 
+def cards() -> str:
+    """Tables of what the shipped networks find in simulated scenes, from their model cards."""
+    out = ["## LiDAR detection: simulated scenes\n"]
+    for name in ("vehicle", "roadside"):
+        card = json.loads((WEIGHTS / f"{name}.json").read_text())
+        figures, rows, bins = card["simulated"], [], []
+        for group in ("vehicle", "two_wheeler", "pedestrian"):
+            f = figures[group]
+            shares = {**f["recall_by_range_m"], **f["recall_by_points"]}
+            flipped = "-" if f["headings_flipped"] is None else f"{f['headings_flipped']:.3f}"
+            rows.append([
+                group, f["match"], str(f["truths"]), *(f"{f[k]:.3f}" for k in ("average_precision", "precision", "recall", "f1")),
+                flipped, *(f"{share:.2f}" if count else "-" for share, count in shares.values()),
+            ])  # fmt: skip
+            bins.append([group, *(f"{right:.2f} ({count})" for _, right, count in f["calibration"])])
+        first = figures["vehicle"]
+        head = ["group", "match", "truths", "AP R40", "precision", "recall", "F1", "headings > 90 deg"]
+        head += [f"recall {k} m" for k in first["recall_by_range_m"]] + [
+            f"recall {k} points" for k in first["recall_by_points"]
+        ]
+        rounds = "; ".join(f"{r['scenes']} scenes, {r['steps']} steps" for r in card["rounds"])
+        out.append(
+            f"### lidar:{name}\n\n{figures['scenes']} scenes that were not trained on, objects of 5 points and more within "
+            f"{figures['max_range_m']:g} m, precision and recall at a score of {figures['score']:g}. Trained on {rounds} of "
+            f"{card['batch']} clouds.\n\n{markdown(head, rows)}\n\nShare of boxes that are right by their score (count):\n\n"
+            + markdown(
+                ["group", *(f"{k / 10:.1f}-{(k + 1) / 10:.1f}" for k in range(1, 1 + max(len(b) for b in bins) - 1))],
+                bins,
+            )
+            + "\n"
+        )
+    return "\n".join(out)
+
+
 def main() -> None:
     """Measure and print, or write into a file."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -149,6 +184,7 @@ def main() -> None:
         + "\n\n## Simulated LiDAR: time\n\nMilliseconds of the processor a scene: drawing the world, casting the sweep.\n\n"
         + markdown(["sensor", "points", "draw", "cast", "scenes/s"], generator_rows())
     )
+    text += "\n\n" + cards()
     if options.write:
         replace_section(options.write, "lidar", text)
     print(text)
