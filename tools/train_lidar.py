@@ -67,7 +67,7 @@ class Round:
 # The second round of the vehicle has scenes with a second LiDAR and more clutter, which pictures of misses asked for.
 ROUNDS = {
     "vehicle": (Round(1, 4_000, 5_500), Round(2, 2_000, 4_000, rate=1.2e-3)),
-    "roadside": (Round(1, 3_000, 4_500), Round(2, 2_000, 5_000, rate=1.2e-3)),
+    "roadside": (Round(1, 3_000, 4_500), Round(2, 400, 5_000, rate=1.2e-3)),
 }
 CHECKPOINT_S = 60.0
 # Largest |x| and |y| from the sensor at run time; the roadside sensor sees cars to some 25 m.
