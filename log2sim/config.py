@@ -73,13 +73,17 @@ class SyncConfig(Section):
     )
 
 
+AUTO = "auto"
+
+
 class DetectConfig(Section):
     """Detection in images."""
 
     name: str = _setting(
-        "ssd-mobilenet-v2",
+        AUTO,
         "Detector in images: ssd-mobilenet-v2, a path to an ONNX model, or labels (boxes of the log); in LiDAR sweeps: "
-        "lidar:vehicle, lidar:roadside, lidar:FILE.onnx or lidar:labels; both, joined by +.",
+        "lidar:vehicle, lidar:roadside, lidar:FILE.onnx or lidar:labels; both, joined by +; auto: ssd-mobilenet-v2 where "
+        "there are cameras, joined with lidar:vehicle, or lidar:roadside where no LiDAR is on a vehicle.",
     )
     min_score: float = _setting(
         0.0, "Lowest score of a detection that can continue a track; 0: the detector's own.", ge=0.0, le=1.0

@@ -26,7 +26,7 @@ from log2sim.perception.homography_stage import estimation_options, fit_homograp
 from log2sim.perception.sync import Schedule, synchronize
 from log2sim.plan import Plan, Stage, make_plan
 from log2sim.report import report_of
-from log2sim.sensors import Sensors, select_sensors
+from log2sim.sensors import Sensors, choose_detector, select_sensors
 from log2sim.stage_clock import StageClock
 from log2sim.tracking.tracker import track
 
@@ -114,6 +114,7 @@ def reconstruct(log: Log, config: Config | None = None, *, progress: Progress | 
 
 def start(log: Log, config: Config, *, progress: Progress | None = None) -> Run:
     """Choose the sensors, synchronize them, and plan the run."""
+    config = choose_detector(log, config)
     clock, sensors = StageClock(), select_sensors(log, config)
     detectors = detectors_of(log, config)
     with clock.stage("sync"):

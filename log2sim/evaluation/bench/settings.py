@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from log2sim.config import Config, Section
+from log2sim.config import AUTO, Config, Section
 from log2sim.datatypes import Log
 from log2sim.errors import ConfigError
 from log2sim.perception.detect.onnx_detector import OnnxDetector
 from log2sim.perception.detect.tiling import plan_tiles
 from log2sim.pipeline import detector_of
+from log2sim.sensors import IMAGE_DETECTOR
 
 TILES = (0, 1, 2, 3, 5)
 """Numbers of tiles to try besides the present one; 0 is "auto"."""
@@ -83,6 +84,8 @@ def make_grid(log: Log, config: Config, detectors: Sequence[str] = ()) -> Grid:
     ConfigError, MissingExtra
         For a detector that cannot be loaded.
     """
+    if config.detect.name == AUTO:
+        config = with_changes(config, "detect", name=IMAGE_DETECTOR)
     if config.topdown.method == NO_METHOD:
         config = with_changes(config, "topdown", method=choices(config.topdown, "method")[0])
     return Grid(
