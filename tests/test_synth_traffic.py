@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from log2sim.errors import ConfigError
 from log2sim.geometry import rotation_from_rpy
 from log2sim.synth.lidar_models import LIDAR_MODELS, LidarModel, lidar_model
-from log2sim.synth.polytope_caster import GROUND, SensorState, Solid, cast_polytopes
+from log2sim.synth.polytope_caster import GROUND, cast_polytopes
+from log2sim.synth.polytope_hits import SensorState, Solid
 from log2sim.synth.polytopes import Material, box, column, ellipsoid, prism, tube, wheel
 from log2sim.synth.returns import ReturnModel, Weather, backscattered, detected, reflected
 from log2sim.synth.traffic import Road, Surface, labeled_cloud

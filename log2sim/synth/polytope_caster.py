@@ -13,20 +13,15 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array, rotation_from_rpy, wrap_angle
 from log2sim.synth.lidar_models import LidarModel
-from log2sim.synth.polytopes import Material, Polytope
+from log2sim.synth.polytope_hits import MIN_RANGE_M, Rays, SensorState, Solid, cast_solid, windows_of
+from log2sim.synth.polytopes import Material
 from log2sim.synth.returns import REFLECTANCE, ReturnModel, backscattered, detected, disturbed, reflected
 
 GROUND, NOTHING = -1, -2
-MIN_RANGE_M = 0.4
 NEWTON_STEPS = 3
 # Departure of the ground's surface from the ray that Newton's method must reach.
 MAX_GROUND_ERROR_M = 0.03
-WINDOW_MARGIN_RAD = 0.012
-LEAF_MEAN_PATH_M = 0.5
-# Share of rays that a wire mesh or a net lets through.
-MESH_OPENNESS = 0.65
 
 
 class Terrain(Protocol):
@@ -43,46 +38,6 @@ class Terrain(Protocol):
     def relief(self, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return what is too small for `height`, such as kerbs (N,), m."""
         ...
-
-
-@dataclass(frozen=True, eq=False)
-class Solid:
-    """An object for the caster.
-
-    Attributes
-    ----------
-    parts : tuple of Polytope
-    position_m : (3,) float64, m
-        Middle of its floor at time 0.
-    yaw_rad : float
-    velocity_mps : (2,) float64, m/s
-    glass_passes : float
-        Share of rays that its windows let through.
-    """
-
-    parts: tuple[Polytope, ...]
-    position_m: Array
-    yaw_rad: float
-    velocity_mps: Array
-    glass_passes: float = 0.6
-
-
-@dataclass(frozen=True, eq=False)
-class SensorState:
-    """Where a LiDAR is during a sweep.
-
-    Attributes
-    ----------
-    rotation : (3, 3) float64
-        From the sensor to the level frame.
-    position_m : (3,) float64, m
-        At time 0, the middle of the sweep.
-    velocity_mps : (2,) float64, m/s
-    """
-
-    rotation: Array
-    position_m: Array
-    velocity_mps: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,18 +65,6 @@ class Returns:
     line: NDArray[np.int32]
 
 
-@dataclass(eq=False)
-class _Buffers:
-    """What each ray (L, A) meets first."""
-
-    direction: NDArray[np.float32]
-    column_s: NDArray[np.float32]
-    range_m: NDArray[np.float32]
-    hit: NDArray[np.int32]
-    material: NDArray[np.int8]
-    incidence: NDArray[np.float32]
-
-
 def cast_polytopes(
     model: LidarModel,
     sensor: SensorState,
@@ -143,19 +86,18 @@ def cast_polytopes(
     returns : ReturnModel, optional
         By default the noise of the model and no more.
     """
-    buffers = _cast_ground(model, sensor, terrain)
-    azimuth, elevation = model.azimuths_rad(), model.elevations_rad()
-    windows = _windows(solids, sensor)
+    rays = _cast_ground(model, sensor, terrain)
+    windows = windows_of(solids, sensor)
     for index in np.argsort(windows.near_m, kind="stable").tolist():
-        _cast_solid(buffers, solids[index], index, windows, sensor, azimuth, elevation, rng)
-    return _returned(buffers, sensor, len(solids), rng, returns or ReturnModel(model.noise_m, 0.0, 0.0), model.range_m)
+        cast_solid(rays, solids[index], index, windows, sensor, rng)
+    return _returned(rays, sensor, len(solids), rng, returns or ReturnModel(model.noise_m, 0.0, 0.0), model.range_m)
 
 
-def _cast_ground(model: LidarModel, sensor: SensorState, terrain: Terrain) -> _Buffers:
+def _cast_ground(model: LidarModel, sensor: SensorState, terrain: Terrain) -> Rays:
     """Make the rays and intersect them with the terrain by Newton's method."""
     azimuth, elevation = model.azimuths_rad(), model.elevations_rad()
     flat = np.cos(elevation)[:, None]
-    rays = np.stack(
+    directions = np.stack(
         [
             flat * np.cos(azimuth),
             flat * np.sin(azimuth),
@@ -163,12 +105,14 @@ def _cast_ground(model: LidarModel, sensor: SensorState, terrain: Terrain) -> _B
         ],
         -1,
     )
-    direction = (rays @ sensor.rotation.T).astype(np.float32)
+    direction = (directions @ sensor.rotation.T).astype(np.float32)
     # The sweep turns clockwise: its share of the full turn is the share of its period.
     span = (model.azimuth_deg[1] - model.azimuth_deg[0]) / 360.0 / model.rate_hz
     column_s = ((np.arange(len(azimuth)) + 0.5) / len(azimuth) - 0.5) * span
     shape = direction.shape[:2]
-    out = _Buffers(
+    out = Rays(
+        azimuth,
+        elevation,
         direction,
         column_s.astype(np.float32),
         np.full(shape, np.inf, np.float32),
@@ -202,169 +146,29 @@ def _cast_ground(model: LidarModel, sensor: SensorState, terrain: Terrain) -> _B
     return out
 
 
-@dataclass(frozen=True, eq=False)
-class _Windows:
-    """Angles in the sensor's frame that may see each of S objects; azimuths around a middle one, less than half a turn each way."""
-
-    near_m: Array
-    azimuth: Array
-    half: Array
-    elevation: Array
-    low: Array
-    high: Array
-
-
-def _windows(solids: Sequence[Solid], sensor: SensorState) -> _Windows:
-    """Find the window of every object from points on its bounding box."""
-    low = np.array([np.min([p.low for p in solid.parts], axis=0) for solid in solids]).reshape(-1, 3)
-    high = np.array([np.max([p.high for p in solid.parts], axis=0) for solid in solids]).reshape(-1, 3)
-    position = np.array([solid.position_m for solid in solids]).reshape(-1, 3)
-    rotation = rotation_from_rpy(0.0, 0.0, np.array([solid.yaw_rad for solid in solids]))
-    local = np.einsum("sji,sj->si", rotation, sensor.position_m - position)
-    near = np.linalg.norm(np.maximum(np.maximum(low - local, local - high), 0), axis=1)
-    # So dense that the greatest elevation is not missed between them.
-    steps = np.linspace(0, 1, 5)
-    u, v, w = np.meshgrid(steps, steps, [0.0, 1.0], indexing="ij")
-    grid = low[:, None] + np.column_stack([u.ravel(), v.ravel(), w.ravel()]) * (high - low)[:, None]
-    points = (grid @ rotation.transpose(0, 2, 1) + (position - sensor.position_m)[:, None]) @ sensor.rotation
-    azimuth, flat = np.arctan2(points[..., 1], points[..., 0]), np.hypot(points[..., 0], points[..., 1])
-    elevation = np.arctan2(points[..., 2], flat)
-    margin = WINDOW_MARGIN_RAD + 0.3 / np.maximum(near, 0.3) * np.linalg.norm((high - low)[:, :2], axis=1) / 16
-    middle = np.arctan2(np.sin(azimuth).mean(axis=1), np.cos(azimuth).mean(axis=1))
-    off = wrap_angle(azimuth - middle[:, None])
-    half = np.column_stack([off.min(axis=1) - margin, off.max(axis=1) + margin])
-    half[(near < 1.0) | (np.ptp(off, axis=1) > 5.5)] = -np.pi, np.pi
-    return _Windows(
-        near, middle, half, np.column_stack([elevation.min(axis=1) - margin, elevation.max(axis=1) + margin]), low, high
-    )
-
-
-def _columns(windows: _Windows, index: int, azimuth: Array) -> NDArray[np.intp]:
-    """Return the firings (C,) within a window, which may lie across the sweep's seam."""
-    off = (azimuth - windows.azimuth[index] + np.pi) % (2 * np.pi) - np.pi
-    return np.flatnonzero((off >= windows.half[index, 0]) & (off <= windows.half[index, 1]))
-
-
-def _cast_solid(
-    buffers: _Buffers, solid: Solid, index: int, windows: _Windows, sensor: SensorState, azimuth: Array, elevation: Array,
-    rng: np.random.Generator,
-) -> None:  # fmt: skip
-    rows = np.flatnonzero((elevation >= windows.elevation[index, 0]) & (elevation <= windows.elevation[index, 1]))
-    cols = _columns(windows, index, azimuth)
-    if not len(rows) or not len(cols):
-        return
-    # Rays that meet something nearer than the object's nearest point need no test.
-    lines, firings = np.nonzero(buffers.range_m[np.ix_(rows, cols)] > windows.near_m[index])
-    if not len(lines):
-        return
-    lines, firings = rows[lines], cols[firings]
-    c, s = np.cos(solid.yaw_rad), np.sin(solid.yaw_rad)
-    to_object = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-    direction = to_object.astype(np.float32) @ buffers.direction[lines, firings].T
-    origin = to_object @ (sensor.position_m - solid.position_m)
-    drift = to_object @ np.append(sensor.velocity_mps - solid.velocity_mps, 0.0)
-    moving = np.abs(drift).max() > 0.1
-    start = origin[:, None].astype(np.float32)
-    if moving:
-        start = start + drift[:, None].astype(np.float32) * buffers.column_s[firings]
-    direction[direction == 0] = np.float32(1e-12)
-    # Most rays of the window pass the bounding box; the parts need not be tested for them.
-    with np.errstate(over="ignore"):
-        ends = (
-            (windows.low[index].astype(np.float32)[:, None] - start) / direction,
-            (windows.high[index].astype(np.float32)[:, None] - start) / direction,
-        )
-    first, last = np.minimum(*ends).max(axis=0), np.maximum(*ends).min(axis=0)
-    met = np.flatnonzero((first <= last) & (last > 0) & (first < buffers.range_m[lines, firings]))
-    if not len(met):
-        return
-    lines, firings, direction = lines[met], firings[met], direction[:, met]
-    normals = np.concatenate([p.normals for p in solid.parts])
-    offsets = np.concatenate([p.offsets for p in solid.parts])
-    faces = np.array([len(p.offsets) for p in solid.parts])
-    starts = np.cumsum(faces) - faces
-    slope = normals @ direction
-    gap = (offsets - normals @ origin.astype(np.float32))[:, None]
-    if moving:
-        gap = gap - (normals @ drift.astype(np.float32))[:, None] * buffers.column_s[firings]
-    slope[slope == 0] = np.float32(1e-12)
-    crossing = gap / slope
-    entering = slope < 0
-    enter, leave = np.empty((2, len(solid.parts), len(lines)), np.float32)
-    latest, earliest = (
-        np.where(entering, crossing, np.float32(-np.inf)),
-        np.where(entering, np.float32(np.inf), crossing),
-    )
-    for k, (begin, count) in enumerate(zip(starts.tolist(), faces.tolist(), strict=True)):
-        latest[begin : begin + count].max(axis=0, out=enter[k])
-        earliest[begin : begin + count].min(axis=0, out=leave[k])
-    crossed = (enter < leave) & (enter > MIN_RANGE_M)
-    enter = np.where(crossed, enter, np.float32(np.inf))
-    for k in np.flatnonzero(crossed.any(axis=1)).tolist():
-        material = solid.parts[k].material
-        if material in (Material.LEAVES, Material.GLASS, Material.MESH):
-            enter[k] = _passed(enter[k], leave[k], material, solid, rng)
-    part = enter.argmin(axis=0)
-    ray = np.arange(len(lines))
-    t = enter[part, ray]
-    nearer = np.flatnonzero(t < buffers.range_m[lines, firings])
-    if not len(nearer):
-        return
-    line, firing, part, t = lines[nearer], firings[nearer], part[nearer], t[nearer]
-    face_start = starts[part]
-    # The face that a ray enters by is that of the latest crossing.
-    facing = np.full(len(nearer), np.float32(0.7))
-    for k in np.unique(part):
-        if solid.parts[k].material != Material.LEAVES:
-            m = part == k
-            own = slice(starts[k], starts[k] + faces[k])
-            entered = latest[own][:, nearer[m]].argmax(axis=0)
-            facing[m] = -slope[face_start[m] + entered, nearer[m]]
-    buffers.range_m[line, firing] = t
-    buffers.hit[line, firing] = index
-    buffers.material[line, firing] = np.array([p.material for p in solid.parts], np.int8)[part]
-    buffers.incidence[line, firing] = facing
-
-
-def _passed(
-    enter: NDArray[np.float32], leave: NDArray[np.float32], material: Material, solid: Solid, rng: np.random.Generator
-) -> NDArray[np.float32]:
-    """Let rays through what is not solid: leaves by a mean free path, windows and nets by a share."""
-    met = np.flatnonzero(np.isfinite(enter))
-    out = enter.copy()
-    if material == Material.LEAVES:
-        depth = rng.exponential(LEAF_MEAN_PATH_M, len(met)).astype(np.float32)
-        inside = depth < leave[met] - enter[met]
-        out[met] = np.where(inside, enter[met] + depth, np.float32(np.inf))
-    else:
-        share = solid.glass_passes if material == Material.GLASS else MESH_OPENNESS
-        out[met[rng.random(len(met)) < share]] = np.inf
-    return out
-
-
 def _returned(
-    buffers: _Buffers, sensor: SensorState, count: int, rng: np.random.Generator, model: ReturnModel, range_m: float
+    rays: Rays, sensor: SensorState, count: int, rng: np.random.Generator, model: ReturnModel, range_m: float
 ) -> Returns:
     """Draw what comes back of each ray."""
-    hit_range = np.where(buffers.range_m < range_m, buffers.range_m, np.float32(np.inf))
+    hit_range = np.where(rays.range_m < range_m, rays.range_m, np.float32(np.inf))
     early = backscattered(hit_range.ravel(), model.weather, rng).reshape(hit_range.shape)
     from_air = early < hit_range
     line, firing = np.nonzero(np.isfinite(hit_range) | from_air)
     t = np.where(from_air, early, hit_range)[line, firing].astype(np.float32)
     air = from_air[line, firing]
-    hit = np.where(air, GROUND, buffers.hit[line, firing]).astype(np.int32)
-    material = buffers.material[line, firing]
+    hit = np.where(air, GROUND, rays.hit[line, firing]).astype(np.int32)
+    material = rays.material[line, firing]
     low, high = np.array([REFLECTANCE[m] for m in Material], np.float32).T
     # One draw for each object and material, and a little for each ray.
     draw = rng.random((count + 2, len(Material)), dtype=np.float32)[hit + 2, material]
     speckle = np.exp(0.25 * rng.standard_normal(len(t), dtype=np.float32))
     reflectance = (low[material] + (high - low)[material] * draw) * speckle
-    signal = reflected(t, reflectance, buffers.incidence[line, firing], model.weather)
+    signal = reflected(t, reflectance, rays.incidence[line, firing], model.weather)
     kept = detected(signal, model, rng) | air
     line, firing, t, hit, reflectance = line[kept], firing[kept], t[kept], hit[kept], reflectance[kept]
-    intensity = np.clip(reflectance * buffers.incidence[line, firing], 0.003, 1)
+    intensity = np.clip(reflectance * rays.incidence[line, firing], 0.003, 1)
     t = disturbed(t, model, rng)
-    t_s = buffers.column_s[firing]
+    t_s = rays.column_s[firing]
     start = sensor.position_m.astype(np.float32) + t_s[:, None] * np.append(sensor.velocity_mps, 0).astype(np.float32)
-    xyz = start + t[:, None] * buffers.direction[line, firing]
+    xyz = start + t[:, None] * rays.direction[line, firing]
     return Returns(xyz, intensity.astype(np.float32), t_s, hit, line.astype(np.int32))

@@ -62,6 +62,10 @@ class Polytope:
         return np.unique(points[inside].round(6), axis=0)
 
 
+Shape = tuple[tuple[float, float, float], tuple[Polytope, ...]]
+"""Length, width, height in m of an object, and its parts."""
+
+
 def _made(normals: Array, offsets: Array, low: Sequence[float], high: Sequence[float], material: Material) -> Polytope:
     return Polytope(
         np.asarray(normals, np.float32),

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array, wrap_angle
 from log2sim.synth.lidar_models import LidarModel
-from log2sim.synth.polytope_caster import Returns, SensorState, Solid, cast_polytopes
+from log2sim.synth.polytope_caster import Returns, cast_polytopes
+from log2sim.synth.polytope_hits import SensorState, Solid
 from log2sim.synth.polytopes import Polytope
 from log2sim.synth.returns import ReturnModel
 

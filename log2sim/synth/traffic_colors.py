@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.synth.bodies import Painter, Values
-from log2sim.synth.polytope_caster import MESH_OPENNESS
+from log2sim.synth.polytope_hits import MESH_OPENNESS
 from log2sim.synth.polytopes import Material
 from log2sim.synth.surfaces import Paint, linear_bgr
 from log2sim.synth.traffic import TrafficObject

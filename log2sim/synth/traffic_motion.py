@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from log2sim.geometry import Array, rotation_from_rpy
-from log2sim.synth.polytope_caster import SensorState
+from log2sim.synth.polytope_hits import SensorState
 from log2sim.synth.traffic import TrafficObject, TrafficScene
 
 STEP_S = 0.1

@@ -6,7 +6,7 @@ import numpy as np
 
 from log2sim.geometry import rotation_from_rpy
 from log2sim.synth.lidar_models import LIDAR_MODELS, LidarModel
-from log2sim.synth.polytope_caster import SensorState
+from log2sim.synth.polytope_hits import SensorState
 from log2sim.synth.returns import ReturnModel, Weather
 from log2sim.synth.traffic import Mount, Road, Surface, TrafficObject, TrafficScene
 from log2sim.synth.traffic_clutter import own_car
