@@ -37,6 +37,7 @@ from log2sim.logs.opening import open_log
 from log2sim.perception.detect3d.network_detector import WEIGHTS, open_network
 
 TEST_SHARE = 0.15
+PEAK_RATE = 2e-3
 MIN_SCORE = 0.05
 
 
@@ -58,7 +59,7 @@ def train(pairs: list[Pair], out: Path, *, steps: int, seed: int) -> Path:
         batch = Batch.of(inputs_of(pair, mirrored=bool(rng.random() < 0.5)), rng)
         return loss_of_anchors(*batch.run(n), batch)
 
-    mean = fit(network, step, FitPlan(steps, seed, checkpoint=out / "checkpoint.pt"))
+    mean = fit(network, step, FitPlan(steps, seed, PEAK_RATE, out / "checkpoint.pt"))
     network.load_state_dict(mean)
     path = out / "two_stream.onnx"
     export_two_stream(network, path)

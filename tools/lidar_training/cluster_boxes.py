@@ -1,4 +1,7 @@
-"""Boxes around the points of clusters of votes, as Zou et al. (2021) make them; their sizes are those of what was hit."""
+"""Boxes around the points of clusters of votes, as Zou et al. (2021) make them; their sizes are those of what was hit.
+
+How the paper turns its boxes is not said. Here a box is the smallest around the points, its front where the cells' headings are.
+"""
 
 from __future__ import annotations
 
@@ -89,9 +92,11 @@ class ClusterBoxDetector:
         yaw, heading_score, category, score = rows
         kept = [k for k in np.argsort(-score) if len(points[k]) >= MIN_POINTS and score[k] >= self.min_score]
         center, size, t_ns = np.zeros((len(kept), 3)), np.zeros((len(kept), 3)), np.zeros(len(kept), np.int64)
+        turned = np.array(yaw)
         for row, k in enumerate(kept):
             p = xyz[points[k]].astype(np.float64)
-            c, s = np.cos(yaw[k]), np.sin(yaw[k])
+            turned[k] = axis_of(p[:, :2], yaw[k])
+            c, s = np.cos(turned[k]), np.sin(turned[k])
             along = p[:, :2] @ np.array([[c, -s], [s, c]])
             low, high = along.min(axis=0), along.max(axis=0)
             size[row] = *np.maximum(high - low, MIN_SIDE_M), max(p[:, 2].max(), MIN_SIDE_M)
@@ -100,5 +105,17 @@ class ClusterBoxDetector:
             t_ns[row] = cloud.stamp_ns + round(float(cloud.t_s[index[points[k]]].mean()) * 1e9)
         n = np.array([len(points[k]) for k in kept], np.int64)
         return Boxes3D(
-            t_ns, center + cloud.origin, size, yaw[kept], heading_score[kept], category[kept], score[kept], n
+            t_ns, center + cloud.origin, size, turned[kept], heading_score[kept], category[kept], score[kept], n
         )
+
+
+def axis_of(xy: NDArray[np.float64], yaw: float) -> float:
+    """Return the heading along the longer side of the smallest rectangle around points (N, 2), on the side of `yaw`."""
+    import cv2
+
+    middle = xy.mean(axis=0)
+    corners = cv2.boxPoints(cv2.minAreaRect((xy - middle).astype(np.float32))).astype(np.float64)
+    sides = corners[1:3] - corners[:2]
+    x, y = sides[np.argmax(np.hypot(*sides.T))]
+    forward = np.sign(x * np.cos(yaw) + y * np.sin(yaw)) or 1.0
+    return float(np.arctan2(forward * y, forward * x))
