@@ -1,4 +1,4 @@
-"""Synthetic logs with exact truth from scene files."""
+"""Synthetic data: logs with exact truth from scene files, and random traffic seen by a fast simulated LiDAR."""
 
 from __future__ import annotations
 
