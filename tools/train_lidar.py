@@ -216,12 +216,12 @@ def finish(mount: str, out: Path, rounds: Sequence[Round], examples: int) -> Non
         detector = open_network(path, LidarConfig(), name=mount)
         reports[path.name] = report(detector, test, range_m=RANGE_M[mount])
         line = {
-            k: {m: round(v[m], 4) for m in ("precision", "recall", "f1")}
+            k: {m: v[m] and round(v[m], 4) for m in ("precision", "recall", "f1")}
             for k, v in reports[path.name].items()
             if isinstance(v, dict)
         }
         print(path.name, f"{path.stat().st_size / 1e6:.2f} MB", json.dumps(line), flush=True)
-    loss = reports[exact.name]["all"]["f1"] - reports[small.name]["all"]["f1"]
+    loss = (reports[exact.name]["all"]["f1"] or 0.0) - (reports[small.name]["all"]["f1"] or 0.0)
     chosen = small if loss < MAX_QUANTIZATION_LOSS else exact
     card |= {
         "file": "int8" if chosen is small else "float32",

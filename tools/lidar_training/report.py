@@ -56,7 +56,8 @@ def report(detector: LidarDetector, examples: list[Example], *, range_m: float) 
             "calibration": _reliability(f.score, matches.right, matches.right | matches.false),
         }
     tp, fp, fn = totals
-    out["all"] = {"precision": tp / (tp + fp), "recall": tp / (tp + fn), "f1": 2 * tp / (2 * tp + fp + fn)}
+    precision = tp / (tp + fp) if tp + fp else None
+    out["all"] = {"precision": precision, "recall": tp / max(tp + fn, 1), "f1": 2 * tp / max(2 * tp + fp + fn, 1)}
     return out
 
 
