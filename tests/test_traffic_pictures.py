@@ -15,6 +15,7 @@ from log2sim.errors import ConfigError
 from log2sim.geometry import apply, box_corners, inverse
 from log2sim.logs.opening import open_log
 from log2sim.synth.bodies import Body, samples_of
+from log2sim.synth.ground import Ground
 from log2sim.synth.light import NOON
 from log2sim.synth.polytope_mesh import meshes_of
 from log2sim.synth.polytopes import Material
@@ -23,7 +24,7 @@ from log2sim.synth.render import SceneInstant, segment
 from log2sim.synth.render_camera import RenderCamera
 from log2sim.synth.returns import ReturnModel, Weather
 from log2sim.synth.scenery import FAR_M
-from log2sim.synth.terrain_view import draw_terrain
+from log2sim.synth.terrain_view import draw_terrain, sampled_ground
 from log2sim.synth.traffic import TrafficObject, TrafficScene
 from log2sim.synth.traffic_data import TrafficSettings, draw_traffic, frame_of, write_traffic
 from log2sim.synth.traffic_motion import run_of
@@ -308,3 +309,12 @@ def test_our_own_reader_of_the_layout_finds_the_boxes_on_the_points(kitti: Path)
             above = (local[:, 2] > -half[2] + 0.2) & (local[:, 2] < half[2])
             inside += int((np.all(np.abs(flat) < half[:2], axis=1) & above).sum())
     assert inside > 100
+
+
+def test_a_row_of_a_picture_may_see_near_and_far_ground() -> None:
+    """On a slope the rays of one row meet the ground from a meter to two kilometers away, more than fits at one resolution."""
+    ground = Ground([], (), 0)
+    x = np.linspace(1, 2000, 400, dtype=np.float32)[None].repeat(3, axis=0)
+    colors = sampled_ground(ground, 0, x, np.zeros_like(x), np.ones(x.shape, bool))
+    assert colors.shape == (3, 400, 3)
+    assert np.ptp(colors.reshape(-1, 3).astype(int), axis=0).max() < 60  # a meadow all over

@@ -16,6 +16,7 @@ from log2sim.synth.scenery import FAR_M, MIN_FALL, Image, Texture, linear
 
 NEWTON_STEPS = 3
 MAX_ERROR_M = 0.05  # of the terrain's height where a ray meets it
+MAX_MOSAIC_TILES = 24  # along a side: 113 MB at most
 REACH_M = 250.0  # beyond which the ground is as level as it is under the camera
 Flags = NDArray[np.bool_]
 
@@ -74,14 +75,19 @@ def _sampled(ground: Ground, view: RenderCamera, x: Image, y: Image, away: Image
     edges = np.concatenate([[0], np.flatnonzero(np.diff(level)) + 1, [len(level)]])
     for first, last in pairwise(edges):
         part = slice(int(first), int(last))
-        out[part] = _from_tiles(ground, int(level[first]), x[part], y[part], seen[part])
+        out[part] = sampled_ground(ground, int(level[first]), x[part], y[part], seen[part])
     return out
 
 
-def _from_tiles(ground: Ground, level: int, x: Image, y: Image, seen: Flags) -> Texture:
-    step = np.float32(GROUND_M_PER_PX * 2**level)
+def sampled_ground(ground: Ground, level: int, x: Image, y: Image, seen: Flags) -> Texture:
+    """Colors (H, W, 3) of positions (H, W) from tiles of a level, or of a coarser one where they would be too many."""
     if not seen.any():
         return np.zeros((*x.shape, 3), np.uint8)
+    # On a slope, rays of one row meet the ground near by and far away: coarser tiles, so that all of them fit into memory.
+    extent = max(float(np.ptp(x[seen])), float(np.ptp(y[seen])))
+    while level < LEVELS - 1 and extent > MAX_MOSAIC_TILES * TILE_PX * GROUND_M_PER_PX * 2**level:
+        level += 1
+    step = np.float32(GROUND_M_PER_PX * 2**level)
     side = step * np.float32(TILE_PX)
     i, j = (np.floor(v[seen] / side).astype(np.int64) for v in (x, y))
     low = (int(i.min()), int(j.min()))
