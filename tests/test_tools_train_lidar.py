@@ -17,6 +17,7 @@ TOOLS = Path(__file__).parents[1] / "tools"
 sys.path.insert(0, str(TOOLS))
 
 import train_lidar  # noqa: E402
+from lidar_training import fitting  # noqa: E402
 from lidar_training.clouds import draw_example  # noqa: E402
 from lidar_training.export import calibrate, describe, description, export_onnx, logistic  # noqa: E402
 from lidar_training.losses import loss_of  # noqa: E402
@@ -163,7 +164,7 @@ def test_a_resumed_run_gives_the_weights_of_one_that_was_not_stopped(tmp_path, m
             rounds = [train_lidar.Round(3, 4, 4)]
             if k + 1 < len(stops):
                 with monkeypatch.context() as patched:
-                    patched.setattr(train_lidar, "CHECKPOINT_S", -1.0)
+                    patched.setattr(fitting, "CHECKPOINT_S", -1.0)
                     real = train_lidar.batch_of
                     calls = iter(range(100))
 

@@ -199,7 +199,7 @@ def test_a_toy_learns_one_pair_is_exported_and_finds_its_objects(pair: Pair, tmp
     batch = two_stream.Batch.of(inputs.inputs_of(pair))
     losses: list[float] = []
 
-    def step(n: Any, rng: np.random.Generator) -> Any:
+    def step(n: Any, rng: np.random.Generator, _: int) -> Any:
         loss, parts = two_stream.loss_of_anchors(*batch.run(n), batch)
         losses.append(float(loss.detach()))
         return loss, parts

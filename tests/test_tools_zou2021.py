@@ -164,7 +164,7 @@ def test_a_toy_learns_one_scene_is_exported_and_finds_its_objects(sample: Sample
     batch, goal = torch.from_numpy(grid[None]), cell_targets([sample], [LOW], grid[None], z.CELL_M)
     losses: list[float] = []
 
-    def step(n: Any, rng: np.random.Generator) -> Any:
+    def step(n: Any, rng: np.random.Generator, _: int) -> Any:
         loss, parts = z.loss_of_cells(n(batch), goal)
         losses.append(float(loss.detach()))
         return loss, parts
@@ -232,7 +232,7 @@ def test_a_fit_that_was_cut_off_goes_on_to_the_same_weights(tmp_path: Path, monk
         torch.manual_seed(0)
         done = 0
 
-        def step(network: Any, rng: np.random.Generator) -> Any:
+        def step(network: Any, rng: np.random.Generator, _: int) -> Any:
             nonlocal done
             if done == stop_at:
                 raise KeyboardInterrupt

@@ -18,11 +18,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor, nn
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+from lidar_training import fitting
 from lidar_training.clouds import draw_example
 from lidar_training.export import calibrate, describe, description, export_onnx, quantize
+from lidar_training.fitting import FitPlan
 from lidar_training.losses import loss_of
 from lidar_training.network import BevNetwork
 from lidar_training.report import report
@@ -37,7 +40,6 @@ PER_SHARD = 100
 FIRST_SHARDS, STEPS_PER_SHARD = 4, 100
 BATCH = 4
 WARM_UP_STEPS = 100
-MAX_GRADIENT_NORM = 10.0
 # Side of the square grids of training; a roadside sensor sees cars to some 25 m.
 CELLS = {"vehicle": 256, "roadside": 192}
 CELL_M = {"vehicle": 0.25, "roadside": 0.1875}
@@ -69,7 +71,6 @@ ROUNDS = {
     "vehicle": (Round(1, 4_000, 5_500), Round(2, 2_000, 4_000, rate=1.2e-3)),
     "roadside": (Round(1, 3_000, 4_500), Round(2, 400, 5_000, rate=1.2e-3)),
 }
-CHECKPOINT_S = 60.0
 # Largest |x| and |y| from the sensor at run time; the roadside sensor sees cars to some 25 m.
 RANGE_M = {"vehicle": 40.0, "roadside": 30.0}
 QUANTIZATION_CLOUDS = 24
@@ -142,58 +143,21 @@ def batch_of(pool: Pool, mount: str, rng: np.random.Generator):
 
 def fit(mount: str, data: Path, out: Path, rounds: Sequence[Round]) -> None:
     """Train the last of some rounds, or go on from its checkpoint in `out`; the earlier ones are complete."""
-    torch.set_num_threads(1)
     this, number = rounds[-1], len(rounds)
     torch.manual_seed(this.seed)
     network = BevNetwork().to(memory_format=torch.channels_last)
     if number > 1:
         before = torch.load(checkpoint_path(out, number - 1), weights_only=True)
         network.load_state_dict(before["mean"])
-    optimizer = torch.optim.AdamW(network.parameters(), this.rate, weight_decay=1e-2)
-    checkpoint, step = checkpoint_path(out, number), 0
-    mean = {k: v.clone() for k, v in network.state_dict().items()}
-    if checkpoint.exists():
-        state = torch.load(checkpoint, weights_only=True)
-        network.load_state_dict(state["network"])
-        optimizer.load_state_dict(state["optimizer"])
-        mean, step = state["mean"], state["step"]
-    pool, begun, saved, parts = Pool(data, mount, rounds), time.process_time(), time.time(), []
-    steps, seed = this.steps, this.seed
-    while step < steps:
-        rng = np.random.default_rng([seed, 7, step])  # of the step alone, so that a resumed run draws the same
+    pool = Pool(data, mount, rounds)
+
+    def step_loss(network: nn.Module, rng: np.random.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
         pool.prepare(step)
         grid, targets = batch_of(pool, mount, rng)
-        rate = this.rate * min(1, step / WARM_UP_STEPS + 0.05) * (0.5 + 0.5 * math.cos(math.pi * step / steps)) + 1e-5
-        for group in optimizer.param_groups:
-            group["lr"] = rate
-        maps = network(grid.to(memory_format=torch.channels_last))
-        loss, named = loss_of(maps, targets, grid)
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), MAX_GRADIENT_NORM)
-        optimizer.step()
-        step += 1
-        _average(mean, network, min(0.999, step / (step + 50)))
-        parts.append(named)
-        if step % 100 == 0:
-            text = " ".join(f"{k} {np.mean([p[k] for p in parts]):.3f}" for k in parts[0])
-            print(f"step {step}, {time.process_time() - begun:.0f} s of CPU, {text}", flush=True)
-            parts = []
-        if time.time() - saved > CHECKPOINT_S or step == steps:
-            saved = time.time()
-            state = {"network": network.state_dict(), "optimizer": optimizer.state_dict(), "mean": mean, "step": step}
-            torch.save(state, checkpoint.with_suffix(".part"))
-            checkpoint.with_suffix(".part").replace(checkpoint)
+        return loss_of(network(grid.to(memory_format=torch.channels_last)), targets, grid)
 
-
-def _average(mean: dict[str, torch.Tensor], network: BevNetwork, keep: float) -> None:
-    """Move the averaged weights a little toward the network's."""
-    with torch.no_grad():
-        for name, value in network.state_dict().items():
-            if value.dtype.is_floating_point:
-                mean[name].mul_(keep).add_(value, alpha=1 - keep)
-            else:
-                mean[name] = value.clone()
+    plan = FitPlan(this.steps, this.seed, this.rate, checkpoint_path(out, number), WARM_UP_STEPS)
+    fitting.fit(network, step_loss, plan)
 
 
 def finish(mount: str, out: Path, rounds: Sequence[Round], examples: int) -> None:

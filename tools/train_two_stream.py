@@ -54,7 +54,7 @@ def train(pairs: list[Pair], out: Path, *, steps: int, seed: int) -> Path:
     torch.manual_seed(seed)
     network = TwoStream().to(memory_format=torch.channels_last)
 
-    def step(n: torch.nn.Module, rng: np.random.Generator) -> Any:
+    def step(n: torch.nn.Module, rng: np.random.Generator, _: int) -> Any:
         pair = pairs[int(rng.integers(len(pairs)))]
         batch = Batch.of(inputs_of(pair, mirrored=bool(rng.random() < 0.5)), rng)
         return loss_of_anchors(*batch.run(n), batch)

@@ -33,7 +33,7 @@ def train(data: list[Path], out: Path, *, steps: int, seed: int, start: Path | N
         network.load_state_dict(torch.load(start, weights_only=True)["mean"])
     mixture = Mixture(shards_in(data))
     plan = FitPlan(steps, seed, PEAK_RATE, out / "checkpoint.pt")
-    mean = fit(network, lambda n, rng: zou2021_loss(n, mixture.draw(rng), rng), plan)
+    mean = fit(network, lambda n, rng, _: zou2021_loss(n, mixture.draw(rng), rng), plan)
     network.load_state_dict(mean)
     path = out / "zou2021.onnx"
     export_zou2021(

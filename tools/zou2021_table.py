@@ -160,7 +160,7 @@ class Table:
         loss = centers_loss(info.cell_m) if kind == "vehicle" else zou2021_loss
         mixture = Mixture(shards_in(self.data), real)
         mean = fit(
-            network, lambda n, rng: loss(n, mixture.draw(rng), rng), FitPlan(self.steps, seed=5, peak_rate=FINE_RATE)
+            network, lambda n, rng, _: loss(n, mixture.draw(rng), rng), FitPlan(self.steps, seed=5, peak_rate=FINE_RATE)
         )
         card = {"steps": self.steps, "log": other, "share": share}
         part = path.with_suffix(".part.onnx")

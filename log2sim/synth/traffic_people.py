@@ -36,21 +36,14 @@ def pedestrian(rng: np.random.Generator) -> Shape:
     parts = _torso(rng, height, base=hips, lean=rng.uniform(0, 0.1))
     for side in (1, -1):
         x = side * stride
-        parts.append(
-            prism([(x - 0.07, 0.0), (x + 0.1, 0.0), (0.09, hips + 0.03), (-0.09, hips + 0.03)], 0.15, Material.CLOTH)
-            if stride < 0.05
-            else prism(sorted_profile(x, hips), 0.15, Material.CLOTH)
-        )
+        ankle, hip = ((0.07, 0.1), 0.09) if stride < 0.05 else ((0.08, 0.12), 0.1)
+        profile = [(x - ankle[0], 0.0), (x + ankle[1], 0.0), (hip, hips + 0.03), (-hip, hips + 0.03)]
+        parts.append(prism(profile, 0.15, Material.CLOTH))
     if rng.random() < 0.25:
         parts.append(box((-0.32, -0.16, hips + 0.05), (-0.1, 0.16, hips + 0.27 * height), Material.CLOTH))
     length = float(np.clip(max(p.high[0] for p in parts) - min(p.low[0] for p in parts), 0.35, 1.1))
     width = float(max(p.high[1] for p in parts) - min(p.low[1] for p in parts))
     return (length, width, height), tuple(parts)
-
-
-def sorted_profile(x: float, hips: float) -> list[tuple[float, float]]:
-    """Return the side profile of a leg whose foot is at x, counter-clockwise."""
-    return [(x - 0.08, 0.0), (x + 0.12, 0.0), (0.1, hips + 0.03), (-0.1, hips + 0.03)]
 
 
 def _two_wheels(reach: float, radius: float, width: float) -> list[Polytope]:

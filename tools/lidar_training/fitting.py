@@ -12,13 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-WARM_UP_STEPS = 50
 MAX_GRADIENT_NORM = 10.0
 CHECKPOINT_S = 60.0
 REPORT_STEPS = 50
 LAST_RATE = 1e-5
 
-StepLoss = Callable[[nn.Module, np.random.Generator], tuple[Tensor, dict[str, float]]]
+StepLoss = Callable[[nn.Module, np.random.Generator, int], tuple[Tensor, dict[str, float]]]
 
 
 @dataclass(frozen=True)
@@ -32,6 +31,8 @@ class FitPlan:
         Each step draws from it and its own number, so that a resumed run draws the same.
     peak_rate : float
         Of AdamW, reached after the warm-up; falls by a cosine to the last step.
+    warm_up_steps : int
+        In which the rate rises.
     checkpoint : Path or None
         File that is written every minute, and from which a run goes on.
     """
@@ -40,6 +41,7 @@ class FitPlan:
     seed: int = 1
     peak_rate: float = 1e-3
     checkpoint: Path | None = None
+    warm_up_steps: int = 50
 
 
 def fit(network: nn.Module, step_loss: StepLoss, plan: FitPlan) -> dict[str, Tensor]:
@@ -57,7 +59,7 @@ def fit(network: nn.Module, step_loss: StepLoss, plan: FitPlan) -> dict[str, Ten
     while step < plan.steps:
         for group in optimizer.param_groups:
             group["lr"] = rate_at(step, plan)
-        loss, parts = step_loss(network, np.random.default_rng([plan.seed, 7, step]))
+        loss, parts = step_loss(network, np.random.default_rng([plan.seed, 7, step]), step)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), MAX_GRADIENT_NORM)
@@ -77,7 +79,7 @@ def fit(network: nn.Module, step_loss: StepLoss, plan: FitPlan) -> dict[str, Ten
 
 def rate_at(step: int, plan: FitPlan) -> float:
     """Return the learning rate of a step."""
-    warm = min(1.0, step / WARM_UP_STEPS + 0.05)
+    warm = min(1.0, step / plan.warm_up_steps + 0.05)
     return plan.peak_rate * warm * (0.5 + 0.5 * math.cos(math.pi * step / plan.steps)) + LAST_RATE
 
 
