@@ -178,7 +178,7 @@ def main() -> None:
         "over network alone",
     ]
     text = (
-        "## LiDAR detection: time\n\nMilliseconds of the processor, one thread, medians over a dozen sweeps of the least of five runs. "
+        "## LiDAR detection: time\n\n`OPENBLAS_NUM_THREADS=1 python tools/bench_lidar.py --log PANDASET/002 --log KITTI/2011_09_26 --write BENCHMARKS.md`. Milliseconds of the processor, one thread, medians over a dozen sweeps of the least of five runs. "
         'Leveling (motion compensation and the ground) is part of every run with a LiDAR and not of "cloud to boxes".\n\n'
         + markdown(head, rows)
         + "\n\n## Simulated LiDAR: time\n\nMilliseconds of the processor a scene: drawing the world, casting the sweep.\n\n"

@@ -8,17 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.evaluation.detection.boxes import SceneBoxes
+from log2sim.evaluation.detection.protocols import MIN_POINTS
 from log2sim.geometry import Array
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.ground import ON_GROUND_M, estimate_ground
 from log2sim.synth.traffic import Mount, TrafficScene, labeled_cloud
 from log2sim.synth.traffic_random import draw_scene
-
-GROUP_OF = {
-    "car": "vehicle", "truck": "vehicle", "bus": "vehicle", "motorcycle": "two_wheeler", "cyclist": "two_wheeler",
-    "bicycle": "two_wheeler", "pedestrian": "pedestrian",
-}  # fmt: skip
-MIN_COUNTED_POINTS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +41,6 @@ def draw_example(mount: Mount, seed: tuple[int, ...]) -> Example:
     labeled = labeled_cloud(scene, rng)
     cloud = level(labeled.xyz_m, scene.sensor.position_m)
     seen = labeled.points > 0
-    ignored = (labeled.points < MIN_COUNTED_POINTS) | np.isin(labeled.category, ("bicycle", "other"))
+    ignored = (labeled.points < MIN_POINTS) | np.isin(labeled.category, ("bicycle", "other"))
     truth = SceneBoxes.of(labeled.boxes, labeled.category, points=labeled.points, ignored=ignored).take(seen)
     return Example(cloud, truth, scene)

@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from lidar_training.clouds import GROUP_OF, Example
+from lidar_training.clouds import Example
 from lidar_training.network import IN_CHANNELS, BevNetwork
+from lidar_training.targets import GROUPS
 from log2sim.config import LidarConfig
+from log2sim.datatypes import GROUP_OF
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.matching import Criterion, match
 from log2sim.perception.detect3d.grid import grid_window, rasterize
@@ -20,7 +22,6 @@ from log2sim.perception.detect3d.level_points import level_points, sensor_xy
 from log2sim.perception.detect3d.network import METADATA_KEY, load_network
 from log2sim.perception.detect3d.network_detector import NetworkDetector, open_network
 
-GROUPS = ("vehicle", "two_wheeler", "pedestrian")
 CATEGORIES = {
     "vehicle": ["car", "truck", "bus"],
     "two_wheeler": ["motorcycle", "cyclist"],

@@ -7,17 +7,18 @@ from typing import Any
 import numpy as np
 
 from lidar_training.clouds import Example
-from lidar_training.export import GROUPS, RIGHT, group_of
+from lidar_training.export import RIGHT, group_of
+from lidar_training.targets import GROUPS
 from log2sim.datatypes import Boxes3D
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.matching import match
+from log2sim.evaluation.detection.calibration import calibration
+from log2sim.evaluation.detection.matching import Matches, match
 from log2sim.evaluation.detection.precision import operating_point, precision_recall
 from log2sim.perception.detect3d.detectors import LidarDetector
 
 SCORE = 0.5
 RANGES_M = ((0, 15), (15, 30), (30, 50))
 POINTS = ((5, 10), (10, 20), (20, 50), (50, 10**9))
-BINS = 10
 
 
 def found_boxes(boxes: Boxes3D) -> SceneBoxes:
@@ -53,7 +54,7 @@ def report(detector: LidarDetector, examples: list[Example], *, range_m: float) 
                 f"{a}-{b}": _share(hit[counted & (t.range_m >= a) & (t.range_m < b)]) for a, b in RANGES_M
             },
             "recall_by_points": {f"{a}+": _share(hit[counted & (t.points >= a) & (t.points < b)]) for a, b in POINTS},
-            "calibration": _reliability(f.score, matches.right, matches.right | matches.false),
+            "calibration": _reliability(f, matches),
         }
     tp, fp, fn = totals
     precision = tp / (tp + fp) if tp + fp else None
@@ -66,12 +67,7 @@ def _share(hit: np.ndarray) -> list[float | int]:
     return [round(float(hit.mean()), 4) if len(hit) else 0.0, len(hit)]
 
 
-def _reliability(score: np.ndarray, right: np.ndarray, counted: np.ndarray) -> list[list[float | int]]:
-    """Return mean score, share that is right, and count in bins of the score."""
-    score, right = score[counted], right[counted]
-    place = np.minimum((score * BINS).astype(int), BINS - 1)
-    return [
-        [round(float(score[place == k].mean()), 4), round(float(right[place == k].mean()), 4), int((place == k).sum())]
-        for k in range(BINS)
-        if (place == k).any()
-    ]
+def _reliability(found: SceneBoxes, matches: Matches) -> list[list[float | int]]:
+    """Return mean score, share that is right, and count of the bins of the score that have boxes."""
+    bins = calibration(found, matches)["bins"]
+    return [[round(b["mean_score"], 4), round(b["precision"], 4), b["boxes"]] for b in bins if b["boxes"]]

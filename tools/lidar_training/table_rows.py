@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from lidar_training.clouds import MIN_COUNTED_POINTS, Example
-from lidar_training.export import GROUPS, group_of
+from lidar_training.clouds import Example
+from lidar_training.export import group_of
 from lidar_training.real_logs import LogSweep
+from lidar_training.targets import GROUPS
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.matching import Criterion, match
 from log2sim.evaluation.detection.precision import average_precision, operating_point
+from log2sim.evaluation.detection.protocols import MIN_POINTS
 from log2sim.perception.detect3d.detectors import LidarDetector
 
 # Two-wheelers and people are hit by a handful of points beyond.
@@ -47,7 +49,7 @@ def judged(detectors: dict[str, LidarDetector], scenes: Scenes) -> dict[str, Jud
         for name, detector in detectors.items():
             found[name].append(_search(detector, scene))
         t = scene.truth
-        truth.append(t.ignoring((t.points < MIN_COUNTED_POINTS) | np.isin(t.category, UNCOUNTED)))
+        truth.append(t.ignoring((t.points < MIN_POINTS) | np.isin(t.category, UNCOUNTED)))
     true = {group: SceneBoxes.join([group_of(table, group) for table in truth]) for group in GROUPS}
     true = {group: t.ignoring(t.range_m >= MAX_RANGE_M[group]) for group, t in true.items()}
     out = {}

@@ -9,8 +9,10 @@ import torch
 from torch import Tensor
 
 from lidar_training.samples import CATEGORIES, Sample
+from log2sim.datatypes import GROUP_OF
 
-GROUP_OF = {"car": 0, "truck": 0, "bus": 0, "motorcycle": 1, "cyclist": 1, "pedestrian": 2}
+# In the order of the channels of heat.
+GROUPS = ("vehicle", "two_wheeler", "pedestrian")
 # An object with fewer points is neither asked for nor punished.
 MIN_POINTS = 4
 STRIDE = 2
@@ -77,7 +79,7 @@ def targets_of(samples: list[Sample], lows: list[np.ndarray], cells: int, cell_m
             if points < MIN_POINTS or name == "bicycle" or not (0 <= u < n and 0 <= v < n):
                 considered[(k, 0, *area)][inside] = 0
                 continue
-            group = GROUP_OF[name]
+            group = GROUPS.index(GROUP_OF[name])
             peak = np.exp(
                 -0.5
                 * (

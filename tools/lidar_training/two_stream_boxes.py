@@ -12,14 +12,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from lidar_training.clouds import GROUP_OF, MIN_COUNTED_POINTS
 from lidar_training.export import MAX_EXPORT_ERROR
 from lidar_training.pairs import Pair
 from lidar_training.two_stream import BEV_CHANNELS, IMAGE_CHANNELS, TwoStream
 from lidar_training.two_stream_inputs import CLASSES, IMAGE_PX, SHAPE, decode, inputs_of
+from log2sim.datatypes import GROUP_OF
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.matching import Criterion
 from log2sim.evaluation.detection.precision import average_precision
+from log2sim.evaluation.detection.protocols import MIN_POINTS
 from log2sim.perception.detect3d.detectors import LidarDetector
 from log2sim.perception.detect3d.suppression import Rectangles, suppress
 
@@ -141,4 +142,4 @@ def truth_of(pair: Pair, kind: str) -> SceneBoxes:
     t = t.take(np.array([GROUP_OF.get(c) == group for c in t.category.tolist()], bool))
     assert t.points is not None
     away = np.hypot(t.box[:, 0], t.box[:, 1])
-    return t.ignoring((t.category != kind) | (t.points < MIN_COUNTED_POINTS) | (away >= MAX_RANGE_M))
+    return t.ignoring((t.category != kind) | (t.points < MIN_POINTS) | (away >= MAX_RANGE_M))
