@@ -11,11 +11,11 @@ from log2sim.errors import ConfigError
 
 BUILT_IN: dict[str, dict[str, str]] = {
     "log": {
-        "log2sim": "log2sim.logs.native:READER",
-        "kitti": "log2sim.logs.kitti_raw:READER",
-        "kitti-tracking": "log2sim.logs.kitti_tracking:READER",
-        "kitti-object": "log2sim.logs.kitti_object:READER",
-        "pandaset": "log2sim.logs.pandaset:READER",
+        "log2sim": "log2sim.logs.native.reader:READER",
+        "kitti": "log2sim.logs.kitti.raw:READER",
+        "kitti-tracking": "log2sim.logs.kitti.tracking:READER",
+        "kitti-object": "log2sim.logs.kitti.object:READER",
+        "pandaset": "log2sim.logs.pandaset.reader:READER",
     },
     "detector": {
         "ssd-mobilenet-v2": "log2sim.perception.detect.ssd_mobilenet:create",

@@ -40,7 +40,7 @@ def tiny_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The log of `worlds.tiny_log` as a folder with its truth; tests that change it take `log_folder`."""
     from worlds import tiny_log
 
-    from log2sim.logs.writer import write_log
+    from log2sim.logs.native.writer import write_log
 
     folder = tmp_path_factory.mktemp("tiny") / "tiny"
     log, truth = tiny_log()

@@ -18,7 +18,7 @@ from log2sim.evaluation.detection.matching import Criterion, candidate_pairs, ma
 from log2sim.evaluation.detection.precision import precision_recall
 from log2sim.evaluation.detection.protocols import DIFFICULTIES, PROTOCOLS
 from log2sim.geometry import Camera, transform
-from log2sim.logs.kitti_labels import CATEGORY_OF, parse_labels
+from log2sim.logs.kitti.labels import CATEGORY_OF, parse_labels
 
 CAR = PROTOCOLS["kitti"].classes[0]
 NAMES = [d.name for d in DIFFICULTIES]

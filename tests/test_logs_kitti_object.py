@@ -14,7 +14,7 @@ from log2sim.errors import ConfigError, LogError
 from log2sim.evaluation.detection.detect_log import detect_log
 from log2sim.evaluation.detection.evaluation import Options, evaluate_boxes
 from log2sim.geometry import apply, inverse, points_in_box, project, rotation_from_rpy, transform
-from log2sim.logs.kitti_object import intrinsics_and_rotation
+from log2sim.logs.kitti.object import intrinsics_and_rotation
 
 K = np.array([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]])
 # x right, y down, z forward of the level camera 0 along the LiDAR's -y, -z, x.

@@ -14,8 +14,8 @@ import pytest
 from worlds import tiny_log
 
 from log2sim.errors import LogError, RecordError
+from log2sim.logs.native.writer import write_log
 from log2sim.logs.opening import open_log
-from log2sim.logs.writer import write_log
 
 SWEEP_SUFFIXES = (".bin", ".npz", ".npy", ".pcd", ".gz")
 _listeners: list[list[str]] = []

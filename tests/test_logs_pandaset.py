@@ -15,9 +15,9 @@ import pytest
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import apply, inverse, points_in_box, project, rotation_from_rpy, wrap_angle
 from log2sim.logs.opening import open_log
-from log2sim.logs.pandaset import georeference
-from log2sim.logs.pandaset_labels import azimuth_offset_ns, read_labels
-from log2sim.logs.unpickle import read_pickled_table
+from log2sim.logs.pandaset.labels import azimuth_offset_ns, read_labels
+from log2sim.logs.pandaset.reader import georeference
+from log2sim.logs.pandaset.unpickle import read_pickled_table
 
 
 def frame_columns() -> dict[str, object]:

@@ -17,14 +17,14 @@ from hypothesis import strategies as st
 from log2sim.datatypes import EgoVehicle, Lidar, Log, MapFrame, Stream, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import Camera, PoseTrack, rotation_from_rpy, transform
-from log2sim.logs.csv_tables import read_csv_table
 from log2sim.logs.images import read_image
-from log2sim.logs.kitti import parse_oxts
-from log2sim.logs.kitti_labels import parse_labels
+from log2sim.logs.kitti.drive import parse_oxts
+from log2sim.logs.kitti.labels import parse_labels
+from log2sim.logs.native.csv_tables import read_csv_table
+from log2sim.logs.native.writer import write_log
 from log2sim.logs.opening import open_log
+from log2sim.logs.pandaset.unpickle import read_pickled_table
 from log2sim.logs.sweeps import read_sweep
-from log2sim.logs.unpickle import read_pickled_table
-from log2sim.logs.writer import write_log
 
 quick = settings(
     max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]

@@ -16,8 +16,8 @@ from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.evaluation.metrics.label_views import ignore_regions_of
 from log2sim.evaluation.metrics.truth import truth_from_log
 from log2sim.geometry import Camera, box_corners, transform
+from log2sim.logs.native.writer import write_log
 from log2sim.logs.opening import open_log
-from log2sim.logs.writer import write_log
 
 T_S = np.arange(21) / 10
 CAR = (4.0, 2.0, 1.5)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Measurements
 from log2sim.errors import LogError
 from log2sim.geometry import Array, apply, box_corners, inverse, rotation_from_quaternion, transform
-from log2sim.logs import kitti
+from log2sim.logs.kitti import drive
 
 PERIOD_NS = 100_000_000
 CATEGORY_OF = {"Car": "car", "Pedestrian": "pedestrian", "Cyclist": "cyclist"}
@@ -43,8 +43,8 @@ def read_view(calib: Path, ego_motion: Path | None, frames: int) -> View:
     The ego motion holds t x y z qx qy qz qw of the IMU, one row a frame in order; its stamps are not those of the frames and
     are not used. Without it the axes of the car stand for the map.
     """
-    c = kitti.read_calibration(calib)
-    P = kitti.calibration_entry(c, calib, (3, 4), "P2")
+    c = drive.read_calibration(calib)
+    P = drive.calibration_entry(c, calib, (3, 4), "P2")
     if ego_motion is None:
         return View(np.repeat(transform(EGO_R_CAM, np.zeros(3))[None], frames, axis=0), P)
     rows = _poses(ego_motion)
@@ -55,7 +55,7 @@ def read_view(calib: Path, ego_motion: Path | None, frames: int) -> View:
 
 
 def _poses(path: Path) -> Array:
-    lines = [line.split() for line in kitti.read_text(path).splitlines() if line.strip()]
+    lines = [line.split() for line in drive.read_text(path).splitlines() if line.strip()]
     for k, words in enumerate(lines, start=1):
         if len(words) != 8:
             raise LogError(f"{path}, line {k}: {len(words)} columns, expected 8: t x y z qx qy qz qw")
@@ -70,15 +70,15 @@ def _poses(path: Path) -> Array:
 
 def _rect_T_imu(c: Mapping[str, Array], path: Path) -> Array:
     rect = transform(
-        kitti.checked_rotation(
-            kitti.calibration_entry(c, path, (3, 3), "R0_rect", "R_rect"), f"{path}, entry 'R0_rect'"
+        drive.checked_rotation(
+            drive.calibration_entry(c, path, (3, 3), "R0_rect", "R_rect"), f"{path}, entry 'R0_rect'"
         ),
         np.zeros(3),
     )
     links = []
     for keys in (("Tr_velo_to_cam", "Tr_velo_cam"), ("Tr_imu_to_velo", "Tr_imu_velo")):
-        m = kitti.calibration_entry(c, path, (3, 4), *keys)
-        links.append(transform(kitti.checked_rotation(m[:, :3], f"{path}, entry '{keys[0]}'"), m[:, 3]))
+        m = drive.calibration_entry(c, path, (3, 4), *keys)
+        links.append(transform(drive.checked_rotation(m[:, :3], f"{path}, entry '{keys[0]}'"), m[:, 3]))
     return np.asarray(rect @ links[0] @ links[1], dtype=np.float64)
 
 

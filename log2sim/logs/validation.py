@@ -9,7 +9,7 @@ import numpy as np
 
 from log2sim.datatypes import Log, Stream, Sweep
 from log2sim.errors import RecordError
-from log2sim.logs.native import READER
+from log2sim.logs.native.reader import READER
 from log2sim.logs.opening import open_log
 
 MAX_POINT_DISTANCE_M = 1000.0

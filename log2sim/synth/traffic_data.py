@@ -128,7 +128,7 @@ def _write_frame(
 def _write_log(
     settings: TrafficSettings, scene: TrafficScene, environment: Environment, root: Path, index: int
 ) -> None:
-    from log2sim.logs.writer import write_log
+    from log2sim.logs.native.writer import write_log
 
     name = _scene_name(index)
     log = log_of(scene, environment, name, settings.duration_s, _scene_seed(settings, index))

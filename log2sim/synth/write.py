@@ -57,7 +57,7 @@ def write_synthetic(
     ConfigError
         When the folder may not be replaced or cannot be written.
     """
-    from log2sim.logs.writer import write_log
+    from log2sim.logs.native.writer import write_log
 
     target = Path(out)
     _refuse(target, overwrite)

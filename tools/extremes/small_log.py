@@ -16,7 +16,7 @@ from extremes.table import Outcome
 from log2sim import Config, Scenario, open_log, reconstruct
 from log2sim.datatypes import Log
 from log2sim.errors import Log2SimError, LogError
-from log2sim.logs.writer import write_log
+from log2sim.logs.native.writer import write_log
 from log2sim.pipeline import Result, first_pass, second_pass, start
 from log2sim.plan import Decision, Stage
 from log2sim.synth.scene import scene_from_table

@@ -16,9 +16,9 @@ from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, 
 from log2sim.documents import check, inside, read_json
 from log2sim.errors import LogError
 from log2sim.geometry import Array, Camera, PoseTrack, rotation_from_quaternion, transform
-from log2sim.logs.csv_tables import CsvTable, read_csv_table
 from log2sim.logs.images import image_stream
-from log2sim.logs.native_labels import BOX_2D_COLUMNS, BOX_3D_COLUMNS, REGION_COLUMNS, boxes_2d, boxes_3d, regions_2d
+from log2sim.logs.native.csv_tables import CsvTable, read_csv_table
+from log2sim.logs.native.labels import BOX_2D_COLUMNS, BOX_3D_COLUMNS, REGION_COLUMNS, boxes_2d, boxes_3d, regions_2d
 from log2sim.logs.stamps import strictly_increasing
 from log2sim.logs.sweeps import read_sweep
 

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Log, Stream
 from log2sim.errors import LogError
 from log2sim.geometry import PoseTrack, transform
-from log2sim.logs import kitti
+from log2sim.logs.digest import digest_of
 from log2sim.logs.images import first_image_size, image_stream
-from log2sim.logs.kitti_labels import DriveLabels, read_labels
+from log2sim.logs.kitti import drive
+from log2sim.logs.kitti.labels import DriveLabels, read_labels
 
 PERIOD_NS = 100_000_000
 CAMERA_NUMBERS = (2, 3)
@@ -65,19 +66,19 @@ class _Sequence:
         if (self.base / "velodyne" / self.name).is_dir():
             sweeps = self._files("velodyne", (".bin",))
             t_ns = _nominal_stamps(sweeps)
-            streams["velodyne"] = kitti.sweep_stream(
+            streams["velodyne"] = drive.sweep_stream(
                 t_ns, t_ns - PERIOD_NS // 2, t_ns + PERIOD_NS // 2, list(sweeps.values())
             )
         oxts_file = self.base / "oxts" / f"{self.name}.txt"
-        oxts = kitti.read_text(oxts_file)
-        rows = kitti.parse_oxts(oxts, str(oxts_file))
+        oxts = drive.read_text(oxts_file)
+        rows = drive.parse_oxts(oxts, str(oxts_file))
         if not len(rows):
             raise LogError(f"{oxts_file}: no records; a stream needs at least one")
-        poses, map_frame = kitti.poses_from_oxts(rows)
+        poses, map_frame = drive.poses_from_oxts(rows)
         track = PoseTrack(np.arange(len(rows), dtype=np.int64) * PERIOD_NS, poses)
         labels = self._labels(rig, track)
         records = sorted(p for folder in streams for p in (self.base / folder / self.name).iterdir())
-        calibration = kitti.read_text(self.base / "calib" / f"{self.name}.txt")
+        calibration = drive.read_text(self.base / "calib" / f"{self.name}.txt")
         return Log(
             name=f"kitti-tracking-{self.name}",
             format=READER.name,
@@ -85,43 +86,43 @@ class _Sequence:
             lidars={"velodyne": rig.lidar()} if "velodyne" in streams else {},
             streams=streams,
             ego=track,
-            ego_vehicle=kitti.EGO_VEHICLE,
+            ego_vehicle=drive.EGO_VEHICLE,
             map=map_frame,
             labels=labels.boxes_3d,
             image_labels=labels.boxes_2d,
             ignored_regions=labels.ignored,
             reference_camera="image_02",
-            digest=kitti.digest_of([calibration, oxts, labels.text], records),
+            digest=digest_of([calibration, oxts, labels.text], records),
             notes=(NO_STAMPS,),
         )
 
-    def _rig(self) -> kitti.Rig:
+    def _rig(self) -> drive.Rig:
         path = self.base / "calib" / f"{self.name}.txt"
-        c = kitti.read_calibration(path)
+        c = drive.read_calibration(path)
         projections = {}
         for k in CAMERA_NUMBERS:
             if (self.base / f"image_{k:02d}" / self.name).is_dir():
-                projections[k] = kitti.checked_projection(
-                    kitti.calibration_entry(c, path, (3, 4), f"P{k}"), f"{path}, entry 'P{k}'"
+                projections[k] = drive.checked_projection(
+                    drive.calibration_entry(c, path, (3, 4), f"P{k}"), f"{path}, entry 'P{k}'"
                 )
-        rect = kitti.checked_rotation(
-            kitti.calibration_entry(c, path, (3, 3), "R0_rect", "R_rect"), f"{path}, entry 'R0_rect'"
+        rect = drive.checked_rotation(
+            drive.calibration_entry(c, path, (3, 3), "R0_rect", "R_rect"), f"{path}, entry 'R0_rect'"
         )
         links = []
         for keys in (("Tr_imu_to_velo", "Tr_imu_velo"), ("Tr_velo_to_cam", "Tr_velo_cam")):
-            m = kitti.calibration_entry(c, path, (3, 4), *keys)
-            links.append(transform(kitti.checked_rotation(m[:, :3], f"{path}, entry '{keys[0]}'"), m[:, 3]))
-        return kitti.rig_of(links[0], links[1], rect, projections)
+            m = drive.calibration_entry(c, path, (3, 4), *keys)
+            links.append(transform(drive.checked_rotation(m[:, :3], f"{path}, entry '{keys[0]}'"), m[:, 3]))
+        return drive.rig_of(links[0], links[1], rect, projections)
 
     def _files(self, folder: str, suffixes: tuple[str, ...]) -> dict[int, Path]:
-        files = kitti.numbered_files(self.base / folder / self.name, suffixes)
+        files = drive.numbered_files(self.base / folder / self.name, suffixes)
         if not files:
             raise LogError(
                 f"{self.base / folder / self.name}: no records ({', '.join(suffixes)}); a stream needs at least one"
             )
         return files
 
-    def _labels(self, rig: kitti.Rig, track: PoseTrack) -> DriveLabels:
+    def _labels(self, rig: drive.Rig, track: PoseTrack) -> DriveLabels:
         path = self.base / "label_02" / f"{self.name}.txt"
         return read_labels(path, rig, track, lambda frame: frame * PERIOD_NS) if path.is_file() else DriveLabels()
 

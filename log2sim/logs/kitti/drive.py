@@ -6,8 +6,7 @@ last column holds the position of camera i relative to the rectified camera 0.
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -195,14 +194,3 @@ def spin_offset_ns(xyz_m: NDArray[np.floating], begin_ns: int, end_ns: int) -> N
     clockwise = -np.arctan2(xyz_m[:, 1], xyz_m[:, 0]) / np.pi
     offset_ns = np.where(clockwise < 0, -clockwise * begin_ns, clockwise * end_ns)
     return np.asarray(np.round(offset_ns).astype(np.int64))
-
-
-def digest_of(texts: Iterable[str], files: Iterable[Path]) -> str:
-    """SHA-256 over calibration and index texts and over names and sizes of the records."""
-    value = hashlib.sha256()
-    for text in texts:
-        value.update(text.encode())
-    for file in files:
-        size = file.stat().st_size if file.exists() else -1
-        value.update(f"{file.parent.name}/{file.name} {size}\n".encode())
-    return value.hexdigest()

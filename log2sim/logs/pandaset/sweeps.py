@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Stream, Sweep
 from log2sim.errors import RecordError
 from log2sim.geometry import NS_PER_S
+from log2sim.logs.pandaset.unpickle import Columns, read_pickled_table
 from log2sim.logs.stamps import strictly_increasing
 from log2sim.logs.sweeps import sweep_of
-from log2sim.logs.unpickle import Columns, read_pickled_table
 
 # Value of the column "d" by LiDAR.
 LIDARS: Mapping[str, int] = {"pandar64": 0, "pandargt": 1}

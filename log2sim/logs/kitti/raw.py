@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Log, MapFrame, Stream
 from log2sim.errors import LogError
 from log2sim.geometry import Array, Camera, PoseTrack, transform
-from log2sim.logs import kitti
+from log2sim.logs.digest import digest_of
 from log2sim.logs.images import image_stream
-from log2sim.logs.kitti_labels import CAMERA as LABELED_CAMERA
-from log2sim.logs.kitti_labels import DriveLabels, read_labels
+from log2sim.logs.kitti import drive
+from log2sim.logs.kitti.labels import CAMERA as LABELED_CAMERA
+from log2sim.logs.kitti.labels import DriveLabels, read_labels
 from log2sim.logs.stamps import strictly_increasing
 
 CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt")
@@ -76,7 +77,7 @@ class _Drive:
             raise LogError(f"{self.path}: neither images (image_00 to image_03) nor velodyne_points in it")
         track = PoseTrack(ego_t_ns, poses)
         labels = self._labels(rig, track)
-        texts = [kitti.read_text(self.path.parent / name) for name in CALIBRATION]
+        texts = [drive.read_text(self.path.parent / name) for name in CALIBRATION]
         return Log(
             name=self.path.name,
             format=READER.name,
@@ -84,34 +85,34 @@ class _Drive:
             lidars={"velodyne": rig.lidar()} if "velodyne" in streams else {},
             streams=streams,
             ego=track,
-            ego_vehicle=kitti.EGO_VEHICLE,
+            ego_vehicle=drive.EGO_VEHICLE,
             map=map_frame,
             labels=labels.boxes_3d,
             image_labels=labels.boxes_2d,
             ignored_regions=labels.ignored,
             reference_camera=next((c for c in REFERENCE_CAMERAS if c in cameras), None),
-            digest=kitti.digest_of([*texts, labels.text], sorted(self.path.glob("*/data/*"))),
+            digest=digest_of([*texts, labels.text], sorted(self.path.glob("*/data/*"))),
             notes=tuple(notes),
         )
 
-    def _rig(self) -> kitti.Rig:
+    def _rig(self) -> drive.Rig:
         cam, velo, imu = (self.path.parent / name for name in CALIBRATION)
-        c = kitti.read_calibration(cam)
-        rect = kitti.checked_rotation(kitti.calibration_entry(c, cam, (3, 3), "R_rect_00"), f"{cam}, entry 'R_rect_00'")
+        c = drive.read_calibration(cam)
+        rect = drive.checked_rotation(drive.calibration_entry(c, cam, (3, 3), "R_rect_00"), f"{cam}, entry 'R_rect_00'")
         projections = {}
         for k in range(4):
             if (self.path / f"image_{k:02d}").is_dir():
                 key = f"P_rect_{k:02d}"
-                projections[k] = kitti.checked_projection(
-                    kitti.calibration_entry(c, cam, (3, 4), key), f"{cam}, entry '{key}'"
+                projections[k] = drive.checked_projection(
+                    drive.calibration_entry(c, cam, (3, 4), key), f"{cam}, entry '{key}'"
                 )
-        return kitti.rig_of(_rigid(imu), _rigid(velo), rect, projections)
+        return drive.rig_of(_rigid(imu), _rigid(velo), rect, projections)
 
     def _add_camera(
-        self, rig: kitti.Rig, number: int, cameras: dict[str, Camera], streams: dict[str, Stream], notes: list[str]
+        self, rig: drive.Rig, number: int, cameras: dict[str, Camera], streams: dict[str, Stream], notes: list[str]
     ) -> None:
         file = self.path.parent / CALIBRATION[0]
-        width, height = kitti.calibration_entry(kitti.read_calibration(file), file, (2,), f"S_rect_{number:02d}")
+        width, height = drive.calibration_entry(drive.read_calibration(file), file, (2,), f"S_rect_{number:02d}")
         camera = rig.camera(number, round(width), round(height))
         t_ns, files, _ = self._records(camera.name, (".png", ".jpg", ".jpeg"), notes)
         cameras[camera.name] = camera
@@ -124,20 +125,20 @@ class _Drive:
         for name, stamps in (("start", begin), ("end", end)):
             if len(stamps) <= numbers.max():
                 raise LogError(f"{folder}/timestamps_{name}.txt: {len(stamps)} lines, record {numbers.max()} has none")
-        return kitti.sweep_stream(t_ns, begin[numbers], end[numbers], files)
+        return drive.sweep_stream(t_ns, begin[numbers], end[numbers], files)
 
     def _poses(self, notes: list[str]) -> tuple[NDArray[np.int64], Array, MapFrame]:
         t_ns, files, _ = self._records("oxts", (".txt",), notes)
         rows = []
         for file in files:
-            record = kitti.parse_oxts(kitti.read_text(file), str(file))
+            record = drive.parse_oxts(drive.read_text(file), str(file))
             if len(record) != 1:
                 raise LogError(f"{file}: {len(record)} lines, expected one oxts record")
             rows.append(record[0])
-        poses, map_frame = kitti.poses_from_oxts(np.array(rows))
+        poses, map_frame = drive.poses_from_oxts(np.array(rows))
         return t_ns, poses, map_frame
 
-    def _labels(self, rig: kitti.Rig, track: PoseTrack) -> DriveLabels:
+    def _labels(self, rig: drive.Rig, track: PoseTrack) -> DriveLabels:
         path, times = self.path / LABELS, self.path / LABELED_CAMERA / "timestamps.txt"
         if not path.is_file():
             return DriveLabels()
@@ -158,7 +159,7 @@ class _Drive:
     ) -> tuple[NDArray[np.int64], list[Path], NDArray[np.intp]]:
         """Stamps, files and numbers of the records of a stream, in order; a record that is not there is a gap."""
         folder = self.path / name
-        files = kitti.numbered_files(folder / "data", suffixes)
+        files = drive.numbered_files(folder / "data", suffixes)
         if not files:
             raise LogError(f"{folder}/data: no records ({', '.join(suffixes)}); a stream needs at least one")
         stamps = _stamps(folder / "timestamps.txt")
@@ -176,13 +177,13 @@ class _Drive:
 
 
 def _rigid(path: Path) -> Array:
-    calibration = kitti.read_calibration(path)
-    rotation = kitti.checked_rotation(kitti.calibration_entry(calibration, path, (3, 3), "R"), f"{path}, entry 'R'")
-    return transform(rotation, kitti.calibration_entry(calibration, path, (3,), "T"))
+    calibration = drive.read_calibration(path)
+    rotation = drive.checked_rotation(drive.calibration_entry(calibration, path, (3, 3), "R"), f"{path}, entry 'R'")
+    return transform(rotation, drive.calibration_entry(calibration, path, (3,), "T"))
 
 
 def _stamps(path: Path) -> NDArray[np.int64]:
-    lines = kitti.read_text(path).split("\n")
+    lines = drive.read_text(path).split("\n")
     while lines and not lines[-1].strip():
         lines.pop()
     stamps = np.zeros(len(lines), dtype=np.int64)

@@ -20,10 +20,10 @@ from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream
 from log2sim.documents import read_json
 from log2sim.errors import LogError
 from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, inverse, rotation_from_quaternion, transform
-from log2sim.logs import kitti
+from log2sim.logs.digest import digest_of
 from log2sim.logs.images import first_image_size, image_stream
-from log2sim.logs.pandaset_labels import read_labels
-from log2sim.logs.pandaset_sweeps import LIDARS, SweepFiles
+from log2sim.logs.pandaset.labels import read_labels
+from log2sim.logs.pandaset.sweeps import LIDARS, SweepFiles
 from log2sim.logs.stamps import strictly_increasing
 
 ROAD_BELOW_POSE_M = 0.325
@@ -105,7 +105,7 @@ class _Sequence:
             map=self._map_frame(map_T_pose, notes),
             labels=labels,
             reference_camera="front_camera" if "front_camera" in cameras else None,
-            digest=kitti.digest_of([(self.path / "lidar" / "poses.json").read_text()], self._records()),
+            digest=digest_of([(self.path / "lidar" / "poses.json").read_text()], self._records()),
             notes=all_notes,
         )
 

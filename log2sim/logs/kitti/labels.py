@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import ImageLabels, ImageRegions, Labels
 from log2sim.errors import LogError
 from log2sim.geometry import Array, PoseTrack, apply, wrap_angle
-from log2sim.logs import kitti
+from log2sim.logs.kitti import drive
 
 CATEGORY_OF = {
     "Car": "car",
@@ -75,7 +75,7 @@ class LabelRows:
 
 
 def read_labels(
-    path: Path, rig: kitti.Rig, track: PoseTrack, stamp_of: Callable[[NDArray[np.int64]], NDArray[np.int64]]
+    path: Path, rig: drive.Rig, track: PoseTrack, stamp_of: Callable[[NDArray[np.int64]], NDArray[np.int64]]
 ) -> DriveLabels:
     """Read a label file; `stamp_of` gives the stamps (L,) of frame numbers (L,).
 
@@ -84,7 +84,7 @@ def read_labels(
     Only objects in view of camera 2 have labels. Regions of its images with objects too far, too occluded or too crowded to
     be labeled are marked by boxes of the type DontCare.
     """
-    text = kitti.read_text(path)
+    text = drive.read_text(path)
     return labels_of_rows(parse_labels(text, path), rig.ego_T_rect, track, stamp_of, text)
 
 

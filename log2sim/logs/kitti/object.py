@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Labels, Log, Stream, Sweep
 from log2sim.errors import LogError
 from log2sim.geometry import Array, Camera, PoseTrack, apply, inverse, transform
-from log2sim.logs import kitti
+from log2sim.logs.digest import digest_of
 from log2sim.logs.images import first_image_size, image_stream
-from log2sim.logs.kitti_labels import CAMERA, DriveLabels, LabelRows, labels_of_rows, parse_labels
+from log2sim.logs.kitti import drive
+from log2sim.logs.kitti.labels import CAMERA, DriveLabels, LabelRows, labels_of_rows, parse_labels
 from log2sim.logs.sweeps import read_sweep, sweep_of
 
 SPLITS = ("training", "testing")
@@ -84,14 +85,14 @@ class _Calibration:
     @classmethod
     def read(cls, path: Path) -> _Calibration:
         """Read a calibration file."""
-        c = kitti.read_calibration(path)
+        c = drive.read_calibration(path)
 
         def rigid(key: str) -> Array:
-            m = kitti.calibration_entry(c, path, (3, 4), key)
-            return transform(kitti.checked_rotation(m[:, :3], f"{path}, entry '{key}'"), m[:, 3])
+            m = drive.calibration_entry(c, path, (3, 4), key)
+            return transform(drive.checked_rotation(m[:, :3], f"{path}, entry '{key}'"), m[:, 3])
 
-        rect = kitti.calibration_entry(c, path, (3, 3), "R0_rect", "R_rect")
-        P = kitti.calibration_entry(c, path, (3, 4), "P2")
+        rect = drive.calibration_entry(c, path, (3, 3), "R0_rect", "R_rect")
+        P = drive.calibration_entry(c, path, (3, 4), "P2")
         if not np.linalg.det(P[:, :3]) > 0:
             raise LogError(
                 f"{path}, entry 'P2': {P.tolist()} looks at nothing; expected intrinsics, or these and a rotation"
@@ -99,10 +100,10 @@ class _Calibration:
         velo_T_imu = rigid("Tr_imu_to_velo") if "Tr_imu_to_velo" in c else np.eye(4)
         knows_ground = not np.array_equal(velo_T_imu, np.eye(4))
         if not knows_ground:
-            velo_T_imu = transform(np.eye(3), [0.0, 0.0, kitti.EGO_T_IMU[2, 3] - LIDAR_HEIGHT_M])
-        rect_R_cam = kitti.checked_rotation(rect, f"{path}, entry 'R0_rect'")
+            velo_T_imu = transform(np.eye(3), [0.0, 0.0, drive.EGO_T_IMU[2, 3] - LIDAR_HEIGHT_M])
+        rect_R_cam = drive.checked_rotation(rect, f"{path}, entry 'R0_rect'")
         rect_T_velo = transform(rect_R_cam, np.zeros(3)) @ rigid("Tr_velo_to_cam")
-        velo_ego = (kitti.EGO_T_IMU @ inverse(velo_T_imu))[:3, 3]
+        velo_ego = (drive.EGO_T_IMU @ inverse(velo_T_imu))[:3, 3]
         ego_T_rect = transform(EGO_R_RECT, velo_ego - EGO_R_RECT @ rect_T_velo[:3, 3])
         return cls(ego_T_rect, rect_T_velo, P, knows_ground)
 
@@ -134,7 +135,7 @@ class _Split:
     @cached_property
     def sweeps(self) -> dict[int, Path]:
         """Files by number of frame."""
-        return kitti.numbered_files(self.base / "velodyne", (".bin",))
+        return drive.numbered_files(self.base / "velodyne", (".bin",))
 
     def log(self) -> Log:
         calibrations, texts = self._calibrations()
@@ -142,7 +143,7 @@ class _Split:
         t_ns = _stamps(self.sweeps)
         streams = {"velodyne": self._velodyne(t_ns, [calibrations[n] for n in self.sweeps], first)}
         cameras = {}
-        images = kitti.numbered_files(self.base / IMAGES, (".png", ".jpg", ".jpeg"))
+        images = drive.numbered_files(self.base / IMAGES, (".png", ".jpg", ".jpeg"))
         if images:
             size_px = first_image_size(list(images.values()))
             cameras[CAMERA] = first.camera(*size_px)
@@ -158,16 +159,16 @@ class _Split:
             name=f"kitti-object-{self.base.name}",
             format=READER.name,
             cameras=cameras,
-            lidars={"velodyne": kitti.Rig(first.ego_T_rect @ first.rect_T_velo, first.ego_T_rect, {}).lidar()},
+            lidars={"velodyne": drive.Rig(first.ego_T_rect @ first.rect_T_velo, first.ego_T_rect, {}).lidar()},
             streams=streams,
             ego=ego,
-            ego_vehicle=kitti.EGO_VEHICLE,
+            ego_vehicle=drive.EGO_VEHICLE,
             labels=labels.boxes_3d,
             image_labels=labels.boxes_2d,
             ignored_regions=labels.ignored,
             ground_z_ego_m=ground_z_m,
             reference_camera=CAMERA if cameras else None,
-            digest=kitti.digest_of([*texts, labels.text], self.sweeps.values()),
+            digest=digest_of([*texts, labels.text], self.sweeps.values()),
             notes=tuple(notes),
         )
 
@@ -177,7 +178,7 @@ class _Split:
         found = {}
         for number, file in self.sweeps.items():
             path = self.base / "calib" / f"{file.stem}.txt"
-            text = kitti.read_text(path)
+            text = drive.read_text(path)
             if text not in known:
                 known[text] = _Calibration.read(path)
             found[number] = known[text]
@@ -200,7 +201,7 @@ class _Split:
         for number, file in self.sweeps.items():
             path = self.base / "label_2" / f"{file.stem}.txt"
             if path.is_file():
-                text = kitti.read_text(path)
+                text = drive.read_text(path)
                 lines = [
                     f"{number} {number}-{k} {line}" if line.strip() else "" for k, line in enumerate(text.splitlines())
                 ]

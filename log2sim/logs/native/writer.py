@@ -19,8 +19,8 @@ from log2sim.datatypes import Lidar, Log, Stream, Sweep
 from log2sim.documents import check
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array, Camera, quaternion_from_rotation, yaw_of
-from log2sim.logs.native import GNSS_COLUMNS, INDEX_COLUMNS, MANIFEST, POSE_COLUMNS
-from log2sim.logs.native_labels import BOX_2D_COLUMNS, BOX_3D_COLUMNS, REGION_COLUMNS
+from log2sim.logs.native.labels import BOX_2D_COLUMNS, BOX_3D_COLUMNS, REGION_COLUMNS
+from log2sim.logs.native.reader import GNSS_COLUMNS, INDEX_COLUMNS, MANIFEST, POSE_COLUMNS
 
 POINT_RESOLUTION_M = 1e-3
 # float32 resolves 1 mm up to about 8 km.

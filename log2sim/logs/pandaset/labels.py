@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Labels
 from log2sim.errors import LogError
 from log2sim.geometry import Array, apply, inverse, wrap_angle
-from log2sim.logs.unpickle import Columns, read_pickled_table
+from log2sim.logs.pandaset.unpickle import Columns, read_pickled_table
 
 PERIOD_NS = 100_000_000
 MIN_STEP_NS = 20_000_000

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import CATEGORIES, ImageLabels, ImageRegions, Labels
 from log2sim.errors import LogError
 from log2sim.geometry import Array
-from log2sim.logs.csv_tables import CsvTable
+from log2sim.logs.native.csv_tables import CsvTable
 
 SIZE_FIELDS = ("length_m", "width_m", "height_m")
 BOX_3D_FIELDS = ("x_m", "y_m", "z_m", *SIZE_FIELDS, "yaw_rad")

@@ -1,0 +1,1 @@
+"""KITTI: raw drives, the tracking layout and the object layout."""

@@ -1,0 +1,1 @@
+"""Log2sim's own log folders: reader and writer."""

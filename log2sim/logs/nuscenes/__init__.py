@@ -1,0 +1,1 @@
+"""nuScenes: tables, sweeps and annotations of version 1.0."""
