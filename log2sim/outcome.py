@@ -80,9 +80,9 @@ def _compensation(planned: Decision, observations: Observations) -> Outcome:
     counts, total = observations.sweeps, sum(observations.sweeps.values())
     if not planned.kept or not total:
         return Outcome(planned)
-    if counts["in the map"] == total:
+    if counts["in the log"] == total:
         return Outcome(Decision(planned.stage, False, "the sweeps of the log are compensated already"))
-    if counts["in the map"] + counts["no times"] == total:
+    if counts["in the log"] + counts["no times"] == total:
         return Outcome(Decision(planned.stage, False, "the points have no times of their own"))
     if counts["at rest"]:
         reason = f"{planned.reason}; it stands still during {counts['at rest']} of {total} sweeps"

@@ -83,15 +83,19 @@ class Sweep:
     xyz_m : (N, 3) float32 or float64, m
         Finite points in `frame`.
     frame : {"lidar", "map"}
-        "lidar": the sensor's frame at each point's own time; "map": already motion-compensated.
+        "lidar": the sensor's frame; "map": already motion-compensated.
     t_ns : (N,) int64 or None
-        Absolute stamps of the points; None when the log has none.
+        Absolute stamps at which the points were measured; None when the log has none.
+    compensated_ns : int or None
+        For the frame "lidar": the stamp of the sensor's pose to which all points are compensated already; None where each
+        point is in the sensor's frame at its own time.
     """
 
     stamp_ns: int
     xyz_m: NDArray[np.floating[Any]]
     frame: Literal["lidar", "map"] = "lidar"
     t_ns: NDArray[np.int64] | None = None
+    compensated_ns: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,11 +111,14 @@ class Stream:
     read : callable
         Returns record `i`: (H, W, 3) uint8 BGR of a camera, a `Sweep` of a LiDAR. Raises `RecordError` for a record that
         cannot be read. Several threads may call it at once.
+    encoded : callable or None
+        Returns the image of record `i` as the bytes of a JPEG or PNG file, as the log holds it; None where it holds none.
     """
 
     name: str
     t_ns: Deferred[NDArray[np.int64]] = Deferred()
     read: Callable[[int], Any]  # type: ignore[misc]  # `t_ns` is a descriptor, it has no default
+    encoded: Callable[[int], bytes] | None = None
 
 
 @dataclass(frozen=True)
@@ -181,6 +188,8 @@ class Log:
         SHA-256 over the log's index.
     notes : tuple of str
         Remarks of the reader for the report; may be given as a function.
+    details : mapping of str to Any
+        What only this format has, as JSON values, for `log2sim inspect`; for example the topics of a bag.
     """
 
     name: str
@@ -198,6 +207,7 @@ class Log:
     reference_camera: str | None = None
     digest: str = ""
     notes: Deferred[tuple[str, ...]] = Deferred(())
+    details: Mapping[str, Any] = field(default_factory=dict)
 
     def ego_centers(self, map_T_ego: Array) -> Array:
         """Compute the centers (N, 3), m, map frame, of the ego's box at ego poses (N, 4, 4)."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from log2sim.geometry.box_projection import box_lines, outline, project_boxes
 from log2sim.geometry.boxes import box_corners, box_corners_bev, box_iou, points_in_box
-from log2sim.geometry.camera import MIN_DEPTH_M, Camera, Mount, distort, fold_radius, project, undistort
+from log2sim.geometry.camera import MIN_DEPTH_M, Camera, Mount, RollingShutter, distort, fold_radius, project, undistort
 from log2sim.geometry.homography import apply_homography, ground_homography, homography_jacobian
 from log2sim.geometry.overlap import (
     bev_iou,
@@ -44,6 +44,7 @@ __all__ = [
     "Camera",
     "Mount",
     "PoseTrack",
+    "RollingShutter",
     "apply",
     "apply_homography",
     "bev_iou",

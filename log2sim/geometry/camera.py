@@ -27,6 +27,22 @@ _TOLERANCE_PX = 1e-6
 Mount = Literal["ego", "map"]
 
 
+@dataclass(frozen=True)
+class RollingShutter:
+    """Reading of an image line by line.
+
+    Attributes
+    ----------
+    direction : {"down", "up", "right", "left"}
+        Way in the image in which lines, or columns, are read one after the other.
+    readout_s : float, s
+        From the first line to the last.
+    """
+
+    direction: Literal["down", "up", "right", "left"]
+    readout_s: float
+
+
 @dataclass(frozen=True, eq=False)
 class Camera:
     """A pinhole camera with lens distortion.
@@ -43,6 +59,8 @@ class Camera:
     distortion_model : {"none", "brown", "fisheye"}
     distortion : tuple of float
         In OpenCV's order: k1, k2, p1, p2[, k3[, k4, k5, k6]] for "brown", k1..k4 for "fisheye".
+    rolling_shutter : RollingShutter or None
+        None for a global shutter, or where the log does not tell.
     """
 
     name: str
@@ -53,6 +71,12 @@ class Camera:
     mount_T_cam: Array
     distortion_model: str = "none"
     distortion: tuple[float, ...] = ()
+    rolling_shutter: RollingShutter | None = None
+
+    @property
+    def rectified(self) -> bool:
+        """Whether the images are free of lens distortion."""
+        return not _is_distorted(self)
 
 
 def project(camera: Camera, points_cam: NDArray[np.floating[Any]]) -> tuple[Array, NDArray[np.bool_]]:

@@ -16,22 +16,38 @@ MAX_IMAGE_BYTES = 256 * 1024 * 1024
 
 
 def read_image(path: Path, t_ns: int, width_px: int, height_px: int) -> NDArray[np.uint8]:
-    """Read an image as (H, W, 3) uint8 BGR.
+    """Read an image file as (H, W, 3) uint8 BGR; raise `RecordError` as `decode_image` does, or when it is missing."""
+    return decode_image(read_bytes(path, t_ns, MAX_IMAGE_BYTES), f"{path} (stamp {t_ns})", (width_px, height_px))
+
+
+def decode_image(data: bytes, where: str, size_px: tuple[int, int]) -> NDArray[np.uint8]:
+    """Decode a JPEG or PNG file as (H, W, 3) uint8 BGR.
+
+    Parameters
+    ----------
+    data : bytes
+    where : str
+        Names file and stamp in errors.
+    size_px : (int, int)
+        Width and height that the calibration is for.
 
     Raises
     ------
     RecordError
-        When it is missing, truncated, no JPEG or PNG, or not of the size that the calibration is for; names file and stamp.
+        When it is truncated, no JPEG or PNG, or of another size.
     """
-    where = f"{path} (stamp {t_ns})"
-    data = read_bytes(path, t_ns, MAX_IMAGE_BYTES)
     jpeg = data[:2] == b"\xff\xd8"
-    width, height = _jpeg_size(data, where) if jpeg else _png_size(data, where)
+    width, height = image_size(data, where)
     if width * height > MAX_IMAGE_PX:
         raise RecordError(f"{where}: {width}x{height} px, more than the {MAX_IMAGE_PX} px that an image may have")
-    if (width, height) != (width_px, height_px):
-        raise RecordError(f"{where}: {width}x{height} px, the calibration is for {width_px}x{height_px}")
+    if (width, height) != size_px:
+        raise RecordError(f"{where}: {width}x{height} px, the calibration is for {size_px[0]}x{size_px[1]}")
     return _decode_jpeg(data, where) if jpeg else _decode_png(data, where)
+
+
+def image_size(data: bytes, where: str) -> tuple[int, int]:
+    """Return width and height in px of a JPEG or PNG file from its header; `RecordError` for anything else."""
+    return _jpeg_size(data, where) if data[:2] == b"\xff\xd8" else _png_size(data, where)
 
 
 def image_stream(name: str, t_ns: NDArray[np.int64], files: list[Path], size_px: tuple[int, int]) -> Stream:
@@ -51,15 +67,17 @@ def image_stream(name: str, t_ns: NDArray[np.int64], files: list[Path], size_px:
     def read(i: int) -> NDArray[np.uint8]:
         return read_image(files[i], int(t_ns[i]), *size_px)
 
-    return Stream(name, t_ns, read)
+    def encoded(i: int) -> bytes:
+        return read_bytes(files[i], int(t_ns[i]), MAX_IMAGE_BYTES)
+
+    return Stream(name, t_ns, read, encoded)
 
 
 def first_image_size(files: list[Path]) -> tuple[int, int]:
     """Width and height in px of the first readable image file, from its header."""
     for file in files:
         try:
-            data = read_bytes(file, 0, MAX_IMAGE_BYTES)
-            return _jpeg_size(data, str(file)) if data[:2] == b"\xff\xd8" else _png_size(data, str(file))
+            return image_size(read_bytes(file, 0, MAX_IMAGE_BYTES), str(file))
         except RecordError:
             continue
     raise LogError(f"{files[0].parent}: none of its {len(files)} images can be read")

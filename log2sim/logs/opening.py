@@ -1,4 +1,4 @@
-"""Open a folder of recorded data as a `Log` with the reader of its format."""
+"""Open a folder or a file of recorded data as a `Log` with the reader of its format."""
 
 from __future__ import annotations
 
@@ -15,43 +15,52 @@ MAX_LISTED = 20
 
 
 def open_log(path: Path | str, *, format: str = "auto", sequence: str | None = None) -> Log:
-    """Open a log folder; only its index, calibration and poses are read, images and sweeps on request.
+    """Open a log; only its index, calibration and poses are read, images and sweeps on request.
 
     Parameters
     ----------
     path : Path or str
-        A sequence, or a root that holds one or several.
+        A sequence, or a folder that holds one or several; the file itself for formats of one file, such as a ROS bag.
     format : str
-        Name of a reader ("log2sim", "kitti", "kitti-tracking", "kitti-object", "pandaset", or a plug-in's), or "auto" to find it.
+        Name of a reader (`log2sim.registry.names("log")` lists them), or "auto" to find it.
     sequence : str, optional
         Which sequence of a root; needed only when it holds several.
 
     Raises
     ------
     LogError
-        When the folder is missing, no reader knows its layout, or its contents are inconsistent.
+        When the path is missing, no reader knows its layout, or its contents are inconsistent.
     ConfigError
         When the format is unknown, or the sequence is missing, unknown or ambiguous.
     """
     root = Path(path)
     if not root.exists():
-        raise LogError(f"{root}: no such folder; give the folder of a log")
-    if not root.is_dir():
-        raise LogError(f"{root}: is a file; give the folder of a log")
+        raise LogError(f"{root}: no such folder; give the folder of a log, or its file")
     name = find_reader(root) if format == "auto" else format
     reader: Reader = registry.load("log", name)
+    if not _may_read(reader, root):
+        raise LogError(f"{root}: is a file, which format '{name}' cannot be; expected {reader.looks_for}")
     return reader.open(root, _select_sequence(root, name, reader.sequences(root), sequence))
 
 
 def find_reader(root: Path) -> str:
-    """Name of the reader that matches a folder; `LogError` when none does."""
-    known = []
-    for name in registry.names("log"):
-        reader: Reader = registry.load("log", name)
-        if reader.matches(root):
+    """Name of the reader that matches a folder or file; `LogError` when none does."""
+    readers: dict[str, Reader] = {name: registry.load("log", name) for name in registry.names("log")}
+    for name, reader in readers.items():
+        if _may_read(reader, root) and reader.matches(root):
             return name
-        known.append(f"{name} ({reader.looks_for})")
-    raise LogError(f"{root}: no known log format; a log is one of: {'; '.join(known)}. Force one with --format")
+    if root.is_file():
+        suffixes = ", ".join(f"*{suffix}" for reader in readers.values() for suffix in reader.suffixes)
+        raise LogError(
+            f"{root}: is a file of no known log format; give the folder of a log{', or a file ' * bool(suffixes)}{suffixes}"
+        )
+    known = "; ".join(f"{name} ({reader.looks_for})" for name, reader in readers.items())
+    raise LogError(f"{root}: no known log format; a log is one of: {known}. Force one with --format")
+
+
+def _may_read(reader: Reader, root: Path) -> bool:
+    """Return whether a path is a folder, or a file with a suffix of the format."""
+    return root.is_dir() or root.suffix.lower() in reader.suffixes
 
 
 def _select_sequence(root: Path, name: str, available: list[str], sequence: str | None) -> str:

@@ -20,6 +20,8 @@ class Reader(Protocol):
         Name that `--format` takes.
     looks_for : str
         What a folder of this format must contain, for messages.
+    suffixes : tuple of str
+        Of files that are logs by themselves, in lower case (".bag"); none for formats that are folders.
 
     Notes
     -----
@@ -28,6 +30,8 @@ class Reader(Protocol):
     - **Laziness.** `open` reads the index, calibration and poses. `Stream.read(i)` reads record i when it is called, from
       any thread, and raises `RecordError` when that record is broken. Where stamps or labels must be read from large
       files, they are deferred (`log2sim.datatypes.Deferred`).
+    - **Poses** are kept at every stamp at which the log holds one, be it that of an image or of a sweep: `Log.ego` is the union.
+      Its stamps may be 1 ns apart, so speeds are never differences of neighbors.
     - **Stamps.** All stamps are int64 nanoseconds of one clock. `Stream.t_ns` increases strictly;
       `log2sim.logs.stamps.strictly_increasing` sorts, drops repetitions and writes the notes. Fractions of seconds are
       converted with `round`, never through float32.
@@ -35,10 +39,13 @@ class Reader(Protocol):
       (move whole kilometers to `MapFrame.offset_m`). The ego frame is x forward, y left, z up; its origin is below the
       middle of the rear axle, at `ground_z_ego_m` above the road. Cameras are x right, y down, z forward.
       `mount_T_sensor` takes points of the sensor to its mount, the ego or, at the roadside, the map.
-    - **Motion compensation.** A `Sweep` in frame "lidar" holds each point in the sensor's frame at the point's own time;
-      with `t_ns` of the points the motion of the ego is compensated downstream, without it all points count as measured
-      at the stamp. A `Sweep` in frame "map" is already compensated. Rows are finite, in m.
-    - **Images** are (H, W, 3) uint8 BGR of the size of their calibration, never rotated.
+    - **Sweeps.** `Sweep.stamp_ns` is the log's reference stamp, be it the start, the middle or the end of the turn. `t_ns` are the
+      times at which points were measured, or None. In frame "lidar" each point is in the sensor's frame at its own time, and the
+      motion of the ego is compensated downstream where there are times; with `compensated_ns` all points are in the sensor's frame
+      as it was at that stamp, as data sets that compensate give them. Frame "map" is compensated too. Rows are finite, in m.
+    - **Images** are (H, W, 3) uint8 BGR of the size of their calibration, never rotated. The stamp of an image is the middle of the
+      exposure of its middle line where the log tells it. `Camera.distortion_model` is "none" for rectified images;
+      `Camera.rolling_shutter` says how lines are read. `Stream.encoded` gives the file of an image as the log holds it.
     - **Labels** are in the map frame with sizes as length, width, height, centers of boxes, categories of
       `log2sim.datatypes.CATEGORIES` and the stamp at which each object was measured, not that of the nearest frame.
       `Labels.cameras` restricts them to objects in view of these cameras.
@@ -54,8 +61,12 @@ class Reader(Protocol):
     def looks_for(self) -> str:
         """What a folder of this format must contain."""
 
+    @property
+    def suffixes(self) -> tuple[str, ...]:
+        """Suffixes of files that are logs by themselves."""
+
     def matches(self, path: Path) -> bool:
-        """Return whether the folder is a sequence of this format or holds some, by names of files alone."""
+        """Return whether the folder or file is a sequence of this format or holds some, by names and magic bytes alone."""
 
     def sequences(self, path: Path) -> list[str]:
         """Return the names of the sequences at `path`, sorted; one when it is itself a sequence. Never raises."""

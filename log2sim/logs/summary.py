@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from log2sim.geometry import NS_PER_S
 
 # A step between two stamps that is longer than this many median steps is a gap.
 MIN_GAP_PERIODS = 1.7
+MIN_SPEED_STEP_NS = 100_000_000
 
 
 def summarize(log: Log) -> dict[str, Any]:
@@ -26,6 +28,8 @@ def summarize(log: Log) -> dict[str, Any]:
             "size_px": [int(c.width_px), int(c.height_px)],
             "field_of_view_deg": rounded(np.degrees(2 * np.arctan(c.width_px / 2 / c.K[0, 0])), 1),
             "distortion_model": c.distortion_model,
+            "rectified": c.rectified,
+            "rolling_shutter": None if c.rolling_shutter is None else asdict(c.rolling_shutter),
             **_mounting(c.mount, c.mount_T_cam),
         }
         for name, c in log.cameras.items()
@@ -54,6 +58,7 @@ def summarize(log: Log) -> dict[str, Any]:
         "labels": _labels(log),
         "image_labels": {name: _counts(boxes.category) for name, boxes in log.image_labels.items()},
         "ignored_regions": {name: len(regions.t_ns) for name, regions in log.ignored_regions.items()},
+        "details": dict(log.details),
         "notes": list(log.notes),
         "digest": log.digest,
     }
@@ -80,13 +85,16 @@ def _mounting(mount: str, mount_T_sensor: NDArray[np.float64]) -> dict[str, Any]
 def _ego(log: Log) -> dict[str, Any] | None:
     if log.ego is None:
         return None
-    position = log.ego.map_T_ego[:, :3, 3]
+    # Poses may be nanoseconds apart: steps of a tenth of a second tell the path and its speed.
+    first, last = int(log.ego.t_ns[0]), int(log.ego.t_ns[-1])
+    chosen = np.unique(np.searchsorted(log.ego.t_ns, np.append(np.arange(first, last, MIN_SPEED_STEP_NS), last)))
+    position, t_ns = log.ego.map_T_ego[chosen, :3, 3], log.ego.t_ns[chosen]
     steps = np.linalg.norm(np.diff(position[:, :2], axis=0), axis=1)
-    seconds = np.diff(log.ego.t_ns) / NS_PER_S
+    seconds = np.diff(t_ns) / NS_PER_S
     return {
         **summarize_stamps(log.ego.t_ns),
         "distance_m": rounded(steps.sum(), 2),
-        "top_speed_mps": rounded((steps / seconds).max(), 2) if len(steps) else None,
+        "top_speed_mps": rounded((steps / seconds)[seconds > 0.5 * MIN_SPEED_STEP_NS / NS_PER_S].max(initial=0.0), 2),
         "size_m": list(log.ego_vehicle.size_m),
     }
 

@@ -48,13 +48,20 @@ def read_sweep(path: Path, t_ns: int, frame: Literal["lidar", "map"] = "lidar") 
     return sweep_of(xyz, t_ns, offset_ns, frame)
 
 
-def sweep_of(xyz_m: NDArray[Any], t_ns: int, offset_ns: Offset, frame: Literal["lidar", "map"]) -> Sweep:
+def sweep_of(
+    xyz_m: NDArray[Any],
+    t_ns: int,
+    offset_ns: Offset,
+    frame: Literal["lidar", "map"],
+    compensated_ns: int | None = None,
+) -> Sweep:
     """Build a `Sweep` of the finite rows of points (N, 3) with stamps `t_ns` + `offset_ns` (N,)."""
     finite = np.isfinite(xyz_m).all(axis=1)
     if not finite.all():
         xyz_m = xyz_m[finite]
         offset_ns = None if offset_ns is None else offset_ns[finite]
-    return Sweep(t_ns, xyz_m, frame, None if offset_ns is None else t_ns + offset_ns.astype(np.int64))
+    point_ns = None if offset_ns is None else t_ns + offset_ns.astype(np.int64)
+    return Sweep(t_ns, xyz_m, frame, point_ns, compensated_ns)
 
 
 def _parse(suffix: str, data: bytes, t_ns: int) -> tuple[NDArray[Any], Offset]:

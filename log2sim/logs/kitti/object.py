@@ -40,6 +40,7 @@ class KittiObjectReader:
 
     name = "kitti-object"
     looks_for = "a folder training/ (or that folder) with velodyne/NNNNNN.bin and calib/NNNNNN.txt"
+    suffixes = ()
 
     def matches(self, path: Path) -> bool:
         """Return whether the folder holds a split of this layout."""

@@ -36,6 +36,7 @@ class KittiRawReader:
     looks_for = (
         "a folder DATE_drive_NNNN_sync with oxts/data, its date folder with calib_cam_to_cam.txt, or their parent"
     )
+    suffixes = ()
 
     def matches(self, path: Path) -> bool:
         """Return whether the folder holds a sequence of this layout."""

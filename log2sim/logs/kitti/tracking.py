@@ -26,6 +26,7 @@ class KittiTrackingReader:
 
     name = "kitti-tracking"
     looks_for = "a folder training/ (or that folder) with calib/NNNN.txt and image_02/NNNN/"
+    suffixes = ()
 
     def matches(self, path: Path) -> bool:
         """Return whether the folder holds a sequence of this layout."""

@@ -39,6 +39,7 @@ class NativeReader:
 
     name = "log2sim"
     looks_for = f"a folder with {MANIFEST}"
+    suffixes = ()
 
     def matches(self, path: Path) -> bool:
         """Return whether the folder holds a sequence of this layout."""

@@ -46,6 +46,7 @@ class PandaSetReader:
 
     name = "pandaset"
     looks_for = "a folder with lidar/poses.json and camera/, or a folder of such folders"
+    suffixes = ()
 
     def matches(self, path: Path) -> bool:
         """Return whether the folder is a sequence or holds some."""

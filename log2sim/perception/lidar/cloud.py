@@ -96,7 +96,7 @@ def sweep_to_map(log: Log, lidar: str, sweep: Sweep, *, compensate: bool) -> tup
     ----------
     compensate : bool
         Whether every point takes the sensor pose of its own time. Sweeps without point times, or of a sensor at rest, take
-        the pose of their stamp in either case.
+        the pose of their stamp in either case; sweeps that are compensated already take the pose of the stamp to which they are.
 
     Returns
     -------
@@ -108,9 +108,14 @@ def sweep_to_map(log: Log, lidar: str, sweep: Sweep, *, compensate: bool) -> tup
     t_s = ((t_ns - sweep.stamp_ns) / NS_PER_S).astype(np.float32)
     if sweep.frame == "map":
         return np.asarray(sweep.xyz_m, dtype=np.float64), t_s
-    one_pose = not compensate or sweep.t_ns is None or len(t_ns) == 0 or is_at_rest(log, lidar, sweep)
+    one_pose = not compensate or not has_motion(sweep) or is_at_rest(log, lidar, sweep)
     xyz = transform_rigidly(log, lidar, sweep) if one_pose else deskew(log, lidar, sweep, t_ns)
     return None if xyz is None else (xyz, t_s)
+
+
+def has_motion(sweep: Sweep) -> bool:
+    """Return whether a sweep holds the motion of its sensor, with the times to compensate it."""
+    return sweep.frame == "lidar" and sweep.compensated_ns is None and sweep.t_ns is not None and len(sweep.t_ns) > 0
 
 
 def is_at_rest(log: Log, lidar: str, sweep: Sweep) -> bool:
@@ -125,8 +130,12 @@ def is_at_rest(log: Log, lidar: str, sweep: Sweep) -> bool:
 
 
 def transform_rigidly(log: Log, lidar: str, sweep: Sweep) -> Array | None:
-    """Transform a sweep to the map frame by the pose of its stamp: (N, 3); None where that pose is not known."""
-    map_T_lidar, valid = log.map_T_sensor(lidar, sweep.stamp_ns)
+    """Transform a sweep to the map frame by one pose: (N, 3); None where that pose is not known.
+
+    It is the pose at the stamp of the sweep or, of a compensated sweep, at the stamp to which it is compensated.
+    """
+    stamp_ns = sweep.stamp_ns if sweep.compensated_ns is None else sweep.compensated_ns
+    map_T_lidar, valid = log.map_T_sensor(lidar, stamp_ns)
     if not valid[0]:
         return None
     return np.asarray(sweep.xyz_m @ map_T_lidar[0, :3, :3].T + map_T_lidar[0, :3, 3], dtype=np.float64)
@@ -207,9 +216,9 @@ def assemble_cloud(
 
 
 def compensation_of(log: Log, lidar: str, sweep: Sweep) -> str:
-    """How a sweep is compensated: "in the map" before, "no times" to do it with, "at rest" or "moving"."""
-    if sweep.frame == "map":
-        return "in the map"
+    """How a sweep is compensated: "in the log" already, "no times" to do it with, "at rest" or "moving"."""
+    if sweep.frame == "map" or sweep.compensated_ns is not None:
+        return "in the log"
     if sweep.t_ns is None:
         return "no times"
     return "at rest" if is_at_rest(log, lidar, sweep) else "moving"
