@@ -171,10 +171,15 @@ def _label_agent(labels: Labels, visible: NDArray[np.bool_], rows: NDArray[np.in
 
 
 def _ego_poses(log: Log) -> tuple[NDArray[np.int64], Array]:
-    """Return stamps (T,) of the reference camera, or of the poses without one, and the ego poses (T, 4, 4) known there."""
+    """Return stamps (T,) and the ego poses (T, 4, 4) known there.
+
+    The stamps are those of the reference camera, without cameras of the LiDAR with the most sweeps, else of the poses.
+    """
     if log.ego is None:
         return np.zeros(0, dtype=np.int64), np.zeros((0, 4, 4))
     name = log.reference_camera or next(iter(log.cameras), None)
+    if name is None:
+        name = max(log.lidars, key=lambda lidar: len(log.streams[lidar].t_ns), default=None)
     stream = None if name is None else log.streams.get(name)
     t_ns = log.ego.t_ns if stream is None or len(stream.t_ns) == 0 else np.unique(stream.t_ns)
     poses, known = log.ego.at(t_ns)
