@@ -19,8 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.errors import LogError, RecordError
+from log2sim.logs.pandaset.arrow_text import decode_text
 
 MAX_TABLE_BYTES = 512 * 1024 * 1024
+# Cells that become objects of Python: a few bytes of a pickle can name the same text again and again.
+MAX_TEXT_CELLS = 10_000_000
 
 Columns = dict[str, NDArray[Any]]
 
@@ -82,6 +85,18 @@ class _Index(_Part): ...
 class _Strings(_Part): ...
 
 
+class _ArrowStrings(_Part): ...
+
+
+class _ArrowArray(_Part): ...
+
+
+class _ArrowType(_Part): ...
+
+
+class _Bytes(_Part): ...
+
+
 class _Dtype(_Part): ...
 
 
@@ -113,7 +128,13 @@ _ALLOWED: dict[str, _Allowed] = {
         (_Index, ("pandas.core.indexes.numeric.Int64Index", "pandas.indexes.numeric.Int64Index")),
         (_Strings, ("pandas._libs.arrays.__pyx_unpickle_NDArrayBacked",)),
         (_Part, ("pandas.arrays.StringArray", "pandas.core.arrays.string_.StringArray")),
+        (_Part, ("pandas.NA", "pandas._libs.missing.NA")),
         (_Part, ("pandas.StringDtype", "pandas.core.arrays.string_.StringDtype")),
+        (_ArrowStrings, ("pandas.arrays.ArrowStringArray", "pandas.core.arrays.string_arrow.ArrowStringArray")),
+        (_ArrowStrings, ("pandas.core.arrays.string_arrow.ArrowStringArrayNumpySemantics",)),
+        (_ArrowArray, ("pyarrow.lib._restore_array",)),
+        (_ArrowType, ("pyarrow.lib.type_for_alias",)),
+        (_Bytes, ("pyarrow.lib.py_buffer", "builtins.bytearray", "__builtin__.bytearray")),
         (_Array, ("numpy._core.multiarray._reconstruct", "numpy.core.multiarray._reconstruct")),
         (_Buffer, ("numpy._core.numeric._frombuffer", "numpy.core.numeric._frombuffer")),
         (_Part, ("numpy.ndarray",)),
@@ -188,8 +209,12 @@ def _columns(table: Any) -> Columns:
     axes, blocks = _layout(manager)
     names = [str(n) for n in _values(axes[0]).tolist()]
     columns: Columns = {}
+    texts = 0
     for values, place in blocks:
         rows = _values(values)
+        texts += rows.size if rows.dtype == object else 0
+        if texts > MAX_TEXT_CELLS:
+            raise ValueError(f"more than the {MAX_TEXT_CELLS} texts that a table may have")
         for k, column in enumerate(_column_indices(place, len(names))):
             columns[names[column]] = rows if rows.ndim == 1 else rows[k]
     if len(set(map(len, columns.values()))) > 1 or len(columns) != len(names):
@@ -220,6 +245,8 @@ def _values(part: Any) -> NDArray[Any]:
         return _values(part.args[1]["data"])
     if isinstance(part, _Strings):
         return _values(next(p for p in part.state if isinstance(p, (_Array, _Buffer))))
+    if isinstance(part, _ArrowStrings):
+        return _arrow_values(part.state.get("_pa_array", part.state.get("_data")))
     if isinstance(part, _Buffer):
         data, dtype, shape, order = part.args
         return _from_bytes(data, _dtype(dtype), shape, order)
@@ -231,6 +258,24 @@ def _values(part: Any) -> NDArray[Any]:
         cells[:] = data
         return cells.reshape(shape, order="F" if fortran else "C")
     return _from_bytes(data, _dtype(dtype), shape, "F" if fortran else "C")
+
+
+def _arrow_values(part: Any) -> NDArray[Any]:
+    """Texts of an Arrow array."""
+    if not isinstance(part, _ArrowArray):
+        raise ValueError(f"a {type(part).__name__.strip('_')} where the text of an ArrowStringArray was expected")
+    kind, length, _, start, buffers, *_ = part.args[0]
+    name = kind.args[0] if isinstance(kind, _ArrowType) else str(kind)
+    return decode_text(name, length, start, [_arrow_bytes(buffer) for buffer in buffers])
+
+
+def _arrow_bytes(part: Any) -> bytes | bytearray | None:
+    """Return the bytes of a buffer; a length, for which `bytearray` would make so many zeros, is refused."""
+    while isinstance(part, _Bytes):
+        (part,) = part.args
+    if part is not None and not isinstance(part, (bytes, bytearray)):
+        raise ValueError("a buffer of an ArrowStringArray has no data")
+    return part
 
 
 def _from_bytes(data: Any, dtype: np.dtype[Any], shape: Any, order: Any) -> NDArray[Any]:
