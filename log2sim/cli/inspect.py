@@ -1,15 +1,50 @@
-"""Describe the content of a log."""
+"""Describe the content of a log, or draw one of its moments."""
 
 from __future__ import annotations
 
-from log2sim.cli.options import Format, LogPath, Sequence, say
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from log2sim.cli.options import Cameras, Format, LogPath, Overwrite, Sequence, camera_names, say
+from log2sim.errors import ConfigError
 
 
-def inspect(log: LogPath, format: Format = "auto", sequence: Sequence = None) -> None:
-    """Describe the content of a log as JSON."""
+def inspect(
+    log: LogPath,
+    format: Format = "auto",
+    sequence: Sequence = None,
+    overlay: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.png",
+            help="Instead draw one tick: LiDAR points and labeled boxes on all images, and from above.",
+        ),
+    ] = None,
+    at: Annotated[
+        float | None, typer.Option(help="Time to draw, in s after the first tick. [default: middle of the log]")
+    ] = None,
+    cameras: Cameras = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Describe the content of a log as JSON, or draw one of its ticks."""
     import json
 
+    from log2sim.documents import check_targets
     from log2sim.logs.opening import open_log
     from log2sim.logs.summary import summarize
 
-    say(json.dumps(summarize(open_log(log, format=format, sequence=sequence)), indent=2))
+    if overlay is None and (at is not None or cameras is not None):
+        raise ConfigError("--at and --cameras choose what --overlay FILE.png draws; name the picture too")
+    names = camera_names(cameras)
+    check_targets(overlay, overwrite=overwrite)
+    opened = open_log(log, format=format, sequence=sequence)
+    if overlay is None:
+        say(json.dumps(summarize(opened), indent=2))
+        return
+    from log2sim.visualization.overlay.moment import read_moment
+    from log2sim.visualization.overlay.picture import write_overlay
+
+    write_overlay(read_moment(opened, names, at), overlay, overwrite=overwrite)
+    say(f"{overlay}: written")

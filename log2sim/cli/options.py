@@ -8,6 +8,8 @@ from typing import Annotated, NoReturn
 
 import typer
 
+from log2sim.errors import ConfigError
+
 LogPath = Annotated[Path, typer.Argument(metavar="LOG", help="Folder of a log.")]
 ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A scenario.json.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")]
@@ -17,6 +19,7 @@ Sequence = Annotated[str | None, typer.Option(help="Sequence to open, when the f
 Settings = Annotated[
     list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change a setting; see log2sim config.")
 ]
+Cameras = Annotated[str | None, typer.Option(metavar="A,B", help="Use only these cameras.")]
 ConfigFile = Annotated[
     Path | None, typer.Option("--config", metavar="FILE.toml", help="File with settings; see log2sim config.")
 ]
@@ -33,6 +36,20 @@ def say(text: str, *, quiet: bool = False) -> None:
     if not quiet:
         sys.stdout.write(text + "\n")
         sys.stdout.flush()
+
+
+def camera_names(text: str | None) -> tuple[str, ...]:
+    """Split what `--cameras` takes; none stands for all.
+
+    Raises
+    ------
+    ConfigError
+        When it is empty.
+    """
+    names = tuple(name.strip() for name in (text or "").split(",") if name.strip())
+    if text is not None and not names:
+        raise ConfigError("--cameras: is empty; name cameras separated by commas, or leave it out to use all")
+    return names
 
 
 def counted(count: int, noun: str) -> str:

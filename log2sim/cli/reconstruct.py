@@ -7,7 +7,18 @@ from typing import Annotated, Any
 
 import typer
 
-from log2sim.cli.options import ConfigFile, Format, LogPath, Overwrite, Quiet, Sequence, Settings, say
+from log2sim.cli.options import (
+    Cameras,
+    ConfigFile,
+    Format,
+    LogPath,
+    Overwrite,
+    Quiet,
+    Sequence,
+    Settings,
+    camera_names,
+    say,
+)
 
 
 def reconstruct(
@@ -23,7 +34,7 @@ def reconstruct(
             "sweeps: lidar:vehicle, lidar:roadside, lidar:MODEL.onnx, lidar:labels; both: NAME+lidar:NAME.",
         ),
     ] = None,
-    cameras: Annotated[str | None, typer.Option(metavar="A,B", help="Use only these cameras.")] = None,
+    cameras: Cameras = None,
     start: Annotated[float | None, typer.Option(help="First time to use, in s from the start of the log.")] = None,
     stop: Annotated[float | None, typer.Option(help="Last time to use, in s from the start of the log.")] = None,
     config: ConfigFile = None,
@@ -40,15 +51,18 @@ def reconstruct(
     from log2sim.cli.progress import progress
     from log2sim.config import Config
     from log2sim.documents import check_targets, write_json
-    from log2sim.errors import ConfigError, MissingExtra
+    from log2sim.errors import MissingExtra
     from log2sim.logs.opening import open_log
     from log2sim.pipeline import reconstruct as run
     from log2sim.sensors import IMAGE_DETECTOR, choose_detector
 
     check_targets(out, report, topdown, overwrite=overwrite)
-    if cameras is not None and not cameras.replace(",", "").strip():
-        raise ConfigError("--cameras: is empty; name cameras separated by commas, or leave it out to use all")
-    changes: dict[str, Any] = {"cameras": cameras, "start_s": start, "stop_s": stop, "seed": seed}
+    changes: dict[str, Any] = {
+        "cameras": None if cameras is None else camera_names(cameras),
+        "start_s": start,
+        "stop_s": stop,
+        "seed": seed,
+    }
     if detector is not None:
         changes["detect"] = {"name": detector}
     chosen = Config.load(config, settings or (), **changes)

@@ -21,6 +21,7 @@ from log2sim.geometry.overlap import (
 )
 from log2sim.geometry.poses import PoseTrack
 from log2sim.geometry.rectangles import rectangle_iou, rectangle_overlap, upright_box_iou
+from log2sim.geometry.rolling_shutter import line_time_s, project_moving
 from log2sim.geometry.stamps import NS_PER_S, nearest_index, period_of
 from log2sim.geometry.transforms import (
     Array,
@@ -58,6 +59,7 @@ __all__ = [
     "ground_homography",
     "homography_jacobian",
     "inverse",
+    "line_time_s",
     "nearest_index",
     "outline",
     "overlap_area",
@@ -67,6 +69,7 @@ __all__ = [
     "polygon_area",
     "project",
     "project_boxes",
+    "project_moving",
     "quaternion_from_rotation",
     "rectangle_iou",
     "rectangle_overlap",
