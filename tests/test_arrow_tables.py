@@ -1,0 +1,264 @@
+"""Feather and parquet files as NumPy columns: every kind, limits before allocation, damaged files, single rows."""
+
+from __future__ import annotations
+
+import struct
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from log2sim.errors import LogError, MissingExtra, RecordError
+from log2sim.logs import parquet_rows
+from log2sim.logs.arrow_ipc import claimed_size
+from log2sim.logs.arrow_tables import TableLimits, read_columns
+from log2sim.logs.parquet_rows import ParquetRows
+
+pa = pytest.importorskip("pyarrow")
+feather = pytest.importorskip("pyarrow.feather")
+parquet = pytest.importorskip("pyarrow.parquet")
+
+KINDS = {
+    "half": "float", "single": "float", "gaps": "float", "count": "int", "flag": "bool", "name": "text", "code": "text",
+    "picture": "bytes", "pose": "floats", "scan": "floats", "ids": "ints",
+}  # fmt: skip
+
+
+def table(rows: int = 5) -> Any:
+    """Rows 0..N-1; every value follows from its row."""
+    n = np.arange(rows)
+    return pa.table(
+        {
+            "half": pa.array(n.astype(np.float16)),
+            "single": pa.array(n.astype(np.float32) / 3),
+            "gaps": pa.array([None if k % 3 == 1 else k + 0.5 for k in n]),
+            "count": pa.array((n * 3).astype(np.uint16)),
+            "flag": pa.array(n % 2 == 0),
+            "name": pa.array([None if k == 2 else f"é{k}" for k in n]).dictionary_encode(),
+            "code": pa.array(n.astype(np.int8)),
+            "picture": pa.array([bytes([k % 256]) * (k + 1) for k in n.tolist()]),
+            "pose": pa.FixedSizeListArray.from_arrays(pa.array(np.arange(rows * 4) / 7), 4),
+            "scan": pa.array([None if k == 3 else [k / 2] * k for k in n.tolist()], pa.list_(pa.float32())),
+            "ids": pa.array([list(range(k % 3)) for k in n.tolist()], pa.large_list(pa.int16())),
+        }
+    )
+
+
+def write(path: Path, what: Any, **options: Any) -> Path:
+    if path.suffix == ".parquet":
+        parquet.write_table(what, path, **options)
+    else:
+        feather.write_feather(what, path, **options)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("a.parquet", {}),
+        ("a.parquet", {"row_group_size": 2, "compression": "zstd"}),
+        ("a.feather", {"compression": "lz4"}),
+        ("a.feather", {"compression": "zstd", "chunksize": 2}),
+        ("a.feather", {"compression": "uncompressed"}),
+    ],
+)
+def test_every_kind_of_column_comes_back(tmp_path: Path, name: str, options: dict[str, Any]) -> None:
+    columns = read_columns(write(tmp_path / name, table(), **options), KINDS)
+    n = np.arange(5)
+    assert list(columns) == list(KINDS)
+    assert columns["half"].dtype == np.float32
+    np.testing.assert_array_equal(columns["half"], n)
+    np.testing.assert_array_equal(columns["single"], n.astype(np.float32) / 3)
+    np.testing.assert_array_equal(columns["gaps"], [0.5, np.nan, 2.5, 3.5, np.nan])
+    assert columns["count"].dtype == np.int64
+    np.testing.assert_array_equal(columns["count"], n * 3)
+    assert columns["flag"].tolist() == [True, False, True, False, True]
+    assert columns["name"].tolist() == ["é0", "é1", None, "é3", "é4"]
+    assert columns["code"].tolist() == ["0", "1", "2", "3", "4"]
+    assert columns["picture"][3] == b"\x03\x03\x03\x03"
+    np.testing.assert_allclose(columns["pose"], np.arange(20).reshape(5, 4) / 7)
+    assert columns["scan"][3] is None
+    assert [len(s) for s in columns["scan"][[0, 1, 2, 4]]] == [0, 1, 2, 4]
+    np.testing.assert_array_equal(columns["scan"][4], np.full(4, 2.0, np.float32))
+    assert [i.tolist() for i in columns["ids"]] == [[], [0], [0, 1], [], [0]]
+
+
+def test_lists_of_a_slice_are_those_of_its_rows(tmp_path: Path) -> None:
+    columns = read_columns(write(tmp_path / "a.feather", table(9).slice(4, 3)), KINDS)
+    assert [len(s) for s in columns["scan"]] == [4, 5, 6]
+    np.testing.assert_allclose(columns["pose"], np.arange(16, 28).reshape(3, 4) / 7)
+
+
+@pytest.mark.parametrize("name", ["a.feather", "a.parquet"])
+@pytest.mark.parametrize(
+    ("column", "kind", "words"),
+    [
+        ("nothing", "int", "no column 'nothing'; expected nothing, found half, single"),
+        ("single", "int", "column 'single': is float with 0 missing values, expected whole numbers"),
+        ("name", "float", "column 'name': is string, expected numbers"),
+        ("single", "text", "expected text"),
+        ("name", "bytes", "expected bytes"),
+        ("count", "floats", "expected a list of numbers a row"),
+        ("code", "bool", "expected true or false"),
+    ],
+)
+def test_another_content_is_named_with_file_and_column(
+    tmp_path: Path, name: str, column: str, kind: str, words: str
+) -> None:
+    path = write(tmp_path / name, table())
+    with pytest.raises(RecordError, match=r"a\.\w+: ") as caught:
+        read_columns(path, {column: kind}, error=RecordError)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_optional_column_may_be_absent(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.feather", table())
+    assert list(read_columns(path, {"nothing": "int", "count": "int"}, optional=("nothing",))) == ["count"]
+    assert read_columns(path, {"nothing": "int"}, optional=("nothing",)) == {}
+
+
+@pytest.mark.parametrize("name", ["a.feather", "a.parquet"])
+def test_limits_hold_before_anything_is_unpacked(tmp_path: Path, name: str) -> None:
+    """64 MB of zeros pack to less than one."""
+    path = write(tmp_path / name, pa.table({"x": pa.array(np.zeros(8_000_000))}), compression="zstd")
+    assert path.stat().st_size < 1_000_000
+    for limits, words in (
+        (TableLimits(rows=7_999_999), "8000000 rows, more than the 7999999"),
+        (TableLimits(unpacked_bytes=10_000_000), "more than the 10000000 that a table may have"),
+    ):
+        before = pa.total_allocated_bytes()
+        with pytest.raises(LogError, match=words):
+            read_columns(path, {"x": "float"}, limits=limits)
+        assert pa.total_allocated_bytes() - before < 1_000_000
+    if name.endswith("feather"):
+        with pytest.raises(LogError, match="that the file may have"):
+            read_columns(path, {"x": "float"}, limits=TableLimits(file_bytes=1000))
+
+
+def test_the_claim_of_an_arrow_file_is_what_it_unpacks_to(tmp_path: Path) -> None:
+    """Sizes by pyarrow's own account of an uncompressed copy; buffers are padded to 8 or 64 bytes."""
+    for options in ({"compression": "lz4"}, {"compression": "uncompressed"}, {"compression": "zstd", "chunksize": 30}):
+        path = write(tmp_path / "a.feather", table(100), **options)
+        rows, size = claimed_size(path.read_bytes())
+        assert rows == 100
+        assert size == pytest.approx(table(100).nbytes, rel=0.35)
+
+
+def test_a_false_size_of_a_compressed_buffer_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.feather", pa.table({"x": pa.array(np.zeros(1000))}), compression="lz4")
+    data = path.read_bytes()
+    at = data.index(struct.pack("<q", 8000))
+    path.write_bytes(data[:at] + struct.pack("<q", 2**50) + data[at + 8 :])
+    with pytest.raises(LogError, match=r"a\.feather: unpacks to 1125899906842624 bytes, more than"):
+        read_columns(path, {"x": "float"})
+
+
+def test_offsets_that_leave_their_text_are_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.feather", pa.table({"w": ["abc", "de"]}), compression="uncompressed")
+    data = path.read_bytes()
+    at = data.index(struct.pack("<3i", 0, 3, 5))
+    path.write_bytes(data[:at] + struct.pack("<3i", 0, 3, 2**31 - 1) + data[at + 12 :])
+    with pytest.raises(LogError, match=r"a\.feather: .*[Oo]ffset"):
+        read_columns(path, {"w": "text"})
+
+
+@pytest.mark.parametrize("name", ["a.feather", "a.parquet"])
+def test_damaged_files_are_read_or_refused(tmp_path: Path, name: str) -> None:
+    """Cut anywhere, and with bytes changed anywhere: a table comes out or one line, never anything else."""
+    path = write(tmp_path / name, table(), compression="zstd")
+    whole, rng = path.read_bytes(), np.random.default_rng(7)
+    damaged = [whole[:k] for k in np.linspace(0, len(whole) - 1, 40).astype(int)]
+    for _ in range(150):
+        other = bytearray(whole)
+        for k in rng.integers(0, len(whole), 3):
+            other[k] = rng.integers(0, 256)
+        damaged.append(bytes(other))
+    refused = []
+    for data in damaged:
+        path.write_bytes(data)
+        try:
+            assert len({len(v) for v in read_columns(path, KINDS).values()}) == 1
+        except LogError as error:
+            refused.append(str(error))
+    assert len(refused) > 60
+    assert all(line.startswith(str(path)) and "\n" not in line for line in refused)
+
+
+def test_what_is_no_table_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.feather"
+    with pytest.raises(LogError, match=r"a\.feather: no such file"):
+        read_columns(path, {"x": "float"})
+    for data in (b"", b"hello", b"FEA1" + bytes(50)):
+        path.write_bytes(data)
+        with pytest.raises(LogError, match="neither an Arrow"):
+            read_columns(path, {"x": "float"})
+    write(path, pa.table([pa.array([1.0]), pa.array([2.0])], names=["x", "x"]))
+    with pytest.raises(LogError, match="2 columns 'x', expected one"):
+        read_columns(path, {"x": "float"})
+
+
+@pytest.mark.parametrize("name", ["a.feather", "a.parquet"])
+@pytest.mark.parametrize("extension", ["arrow.py_extension_type", "arrow.uuid"])
+def test_extension_types_are_refused(tmp_path: Path, name: str, extension: str) -> None:
+    pickled = "" if extension == "arrow.uuid" else "cos\nsystem\n(S'touch x'\ntR."
+    marks = {"ARROW:extension:name": extension, "ARROW:extension:metadata": pickled}
+    field = pa.field("x", pa.binary(16), metadata=marks)
+    write(tmp_path / name, pa.table([pa.array([bytes(16)], pa.binary(16))], schema=pa.schema([field])))
+    with pytest.raises(LogError, match="extension type"):
+        read_columns(tmp_path / name, {"x": "bytes"})
+
+
+def test_without_pyarrow_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(MissingExtra, match="parquet"):
+        read_columns(tmp_path / "a.feather", {"x": "float"})
+    with pytest.raises(MissingExtra, match="parquet"):
+        ParquetRows(tmp_path / "a.parquet", {"x": "float"}).read(0)
+
+
+@pytest.mark.parametrize("group", [7, 1000])
+def test_rows_in_any_order_are_those_of_the_columns(
+    tmp_path: Path, group: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(parquet_rows, "MAX_KEPT_BYTES", 5_000)
+    path = write(tmp_path / "a.parquet", table(40), row_group_size=group)
+    columns, rows = read_columns(path, KINDS), ParquetRows(path, {**KINDS, "x": "int"}, optional=("x",))
+    assert len(rows) == 40
+
+    def check(k: int) -> None:
+        row = rows.read(k)
+        assert list(row) == list(KINDS)
+        for name, value in row.items():
+            np.testing.assert_array_equal(value, columns[name][k])
+
+    for k in [0, 1, 39, 3, 3, 2, *range(40)]:
+        check(k)
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(check, np.random.default_rng(0).permutation(40).tolist()))
+
+
+def test_rows_of_a_damaged_file_are_lost_one_by_one(tmp_path: Path) -> None:
+    """Three row groups; the pages of the middle one are overwritten."""
+    words = pa.table({"x": pa.array(np.random.default_rng(0).random(300)), "n": pa.array(np.arange(300))})
+    path = write(tmp_path / "a.parquet", words, row_group_size=100, use_dictionary=False)
+    chunk = parquet.ParquetFile(path).metadata.row_group(1).column(0)
+    data = bytearray(path.read_bytes())
+    data[chunk.data_page_offset : chunk.data_page_offset + 60] = bytes(60)
+    path.write_bytes(bytes(data))
+    rows = ParquetRows(path, {"x": "float", "n": "int"})
+    assert rows.read(10)["n"] == 10
+    for _ in range(2):
+        with pytest.raises(RecordError, match=r"a\.parquet, row 150: "):
+            rows.read(150)
+    assert rows.read(250)["n"] == 250
+    assert rows.read(20)["n"] == 20
+    with pytest.raises(RecordError, match="row 300: no such row; there are 300"):
+        rows.read(300)
+    with pytest.raises(LogError, match="no column 'y'"):
+        len(ParquetRows(path, {"y": "float"}))
+    with pytest.raises(LogError, match="more than the 10 that"):
+        len(ParquetRows(path, {"x": "float"}, limits=TableLimits(rows=10)))
