@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from log2sim.geometry import apply, inverse, points_in_box, project, rotation_fr
 from log2sim.logs.opening import open_log
 from log2sim.logs.pandaset.labels import azimuth_offset_ns, read_labels
 from log2sim.logs.pandaset.reader import georeference
+from log2sim.logs.pandaset.sweeps import SweepFiles
 
 
 def test_a_label_is_timed_by_its_direction() -> None:
@@ -21,14 +24,14 @@ def test_a_label_is_timed_by_its_direction() -> None:
     np.testing.assert_array_equal(azimuth_offset_ns(xyz), [0, -25_000_000, -50_000_000, -75_000_000, -100_000_000])
 
 
-def cuboids(path: Path, rows: list[dict[str, object]]) -> None:
+def cuboids(path: Path, rows: list[dict[str, object]], without: Sequence[str] = ()) -> None:
     pandas = pytest.importorskip("pandas")
     whole = {
         "uuid": "u", "label": "Car", "yaw": 0.0, "position.x": 0.0, "position.y": 0.0, "position.z": 0.0, "dimensions.x": 1.8,
         "dimensions.y": 4.4, "dimensions.z": 1.5, "attributes.rider_status": np.nan, "cuboids.sibling_id": "-",
         "cuboids.sensor_id": -1,
     }  # fmt: skip
-    pandas.DataFrame([whole | row for row in rows]).to_pickle(path)
+    pandas.DataFrame([whole | row for row in rows]).drop(columns=list(without)).to_pickle(path)
 
 
 def test_cuboids_become_one_row_an_object_with_rising_stamps(tmp_path: Path) -> None:
@@ -66,6 +69,43 @@ def test_of_two_cuboids_of_an_object_one_naming_the_other_is_enough(tmp_path: Pa
     t_ns = np.array([10**9])
     labels = read_labels(file, t_ns, t_ns, np.eye(4)[None], [])
     assert labels.track_id.tolist() == ["spin-1", "spin-2"]
+
+
+def test_a_column_of_attributes_may_be_absent(tmp_path: Path) -> None:
+    """The second sweep says nothing on riders, as frame 79 of sequence 002; the third neither on the two LiDARs."""
+    columns = ("attributes.rider_status", "cuboids.sibling_id", "cuboids.sensor_id")
+    files = {k: tmp_path / f"{k:02d}.pkl.gz" for k in range(3)}
+    objects = [("ridden", "With Rider"), ("pushed", "Without Rider"), ("parked", np.nan)]
+    rows = [{"uuid": name, "label": "Bicycle", "attributes.rider_status": rider} for name, rider in objects]
+    for k, file in files.items():
+        cuboids(file, rows, without=columns[: [0, 1, 3][k]])
+    notes: list[str] = []
+    t_ns = np.arange(3) * 100_000_000 + 10**9
+    labels = read_labels(files, t_ns, t_ns, np.eye(4)[None].repeat(3, 0), notes)
+    assert labels.track_id.tolist() == ["ridden", "pushed", "parked"] * 3
+    assert labels.category.tolist() == ["cyclist", "bicycle", "bicycle"] * 3
+    assert notes == ["1 bicycles of which no sweep says whether somebody rides them are taken as unridden"]
+
+
+def test_a_needed_column_of_the_cuboids_is_named(tmp_path: Path) -> None:
+    cuboids(tmp_path / "00.pkl.gz", [{}], without=("position.x",))
+    with pytest.raises(LogError, match=r"00\.pkl\.gz: no column 'position\.x'"):
+        read_labels({0: tmp_path / "00.pkl.gz"}, np.array([1]), np.array([1]), np.eye(4)[None], [])
+
+
+def test_times_of_the_second_lidar_are_interpolated_over_missing_sweeps(tmp_path: Path) -> None:
+    """It is 30 ms late at first and 36 ms at last; the second file is missing, the third is no table."""
+    pandas = pytest.importorskip("pandas")
+    t_ns = np.arange(5) * 100_000_000 + 10**9
+    files = {k: tmp_path / f"{k:02d}.pkl.gz" for k in (0, 2, 4)}
+    for k in (0, 4):
+        late_s = t_ns[k] / 1e9 + 0.030 + 0.0015 * k
+        times = np.array([t_ns[k] / 1e9, late_s - 0.05, late_s + 0.05])
+        place = np.zeros(3)
+        pandas.DataFrame({"x": place, "y": place, "z": place, "t": times, "d": [0, 1, 1]}).to_pickle(files[k])
+    files[2].write_bytes(b"no table")
+    stamps = SweepFiles(files, t_ns, []).gt_stamps
+    np.testing.assert_allclose(stamps - t_ns, [30e6, 31.5e6, 33e6, 34.5e6, 36e6], atol=1000)
 
 
 def track(turn_rad: float, length_m: float) -> tuple[np.ndarray, np.ndarray]:
@@ -217,3 +257,50 @@ def test_faults_of_a_sequence_are_named(sequence: Path, tmp_path: Path) -> None:
     poses.write_text(json.dumps(records))
     with pytest.raises(LogError, match=r"lidar/poses.json: record 4.*unit quaternion"):
         open_log(broken)
+
+
+def linked_part(sequence: Path, folder: Path, count: int = 5) -> Path:
+    """The first records of two cameras and of the LiDARs, as links."""
+    for name in ("lidar", "camera/front_camera", "camera/back_camera", "meta", "annotations/cuboids"):
+        (folder / name).mkdir(parents=True)
+        for file in (sequence / name).iterdir():
+            if not file.name[:2].isdigit() or int(file.name[:2]) < count:
+                (folder / name / file.name).symlink_to(file.resolve())
+    return folder
+
+
+@pytest.mark.real
+def test_missing_records_are_gaps(sequence: Path, tmp_path: Path) -> None:
+    part = linked_part(sequence, tmp_path / "003")
+    (part / "lidar" / "02.pkl.gz").unlink()
+    for file in (part / "camera" / "back_camera").glob("*.jpg"):
+        file.unlink()
+    log = open_log(part)
+    assert list(log.cameras) == ["front_camera"]
+    steps = np.diff(log.streams["pandar64"].t_ns) / 1e8
+    np.testing.assert_allclose(steps, [1, 2, 1], atol=0.02)
+    # The PandarGT's first two sweeps of this sequence are one and the same.
+    np.testing.assert_allclose(np.diff(log.streams["pandargt"].t_ns)[1:] / 1e8, [2, 1], atol=0.1)
+    stamps = log.labels.t_ns
+    # The cuboids of the missing sweep are still labels.
+    assert np.sum((stamps > log.ego.t_ns[1] + 5_000_000) & (stamps <= log.ego.t_ns[2])) > 20
+    for words in (r"lidar: \d+ of \d+ records are missing, first number 02", "camera/back_camera: "):
+        assert any(re.match(words, note) for note in log.notes), words
+    for file in (part / "lidar").glob("*.gz"):
+        file.unlink()
+    log = open_log(part)
+    assert list(log.streams) == ["front_camera"]
+    assert not log.lidars
+    assert len(log.labels.t_ns) > 100
+
+
+@pytest.mark.real
+def test_opening_reads_neither_sweeps_nor_cuboids(sequence: Path, tmp_path: Path) -> None:
+    part = linked_part(sequence, tmp_path / "003")
+    for file in (*(part / "lidar").glob("*.gz"), *(part / "annotations" / "cuboids").glob("*.gz")):
+        file.unlink()
+        file.write_bytes(b"not a table")
+    log = open_log(part)
+    assert log.streams["front_camera"].read(0).shape == (1080, 1920, 3)
+    with pytest.raises(LogError, match=r"\d\d\.pkl\.gz: not a pickled table"):
+        _ = log.labels

@@ -42,9 +42,13 @@ NO_ROAD_USERS = {
 }  # fmt: skip
 COLUMNS = (
     "uuid", "label", "yaw", "position.x", "position.y", "position.z", "dimensions.x", "dimensions.y", "dimensions.z",
-    "attributes.rider_status", "cuboids.sibling_id", "cuboids.sensor_id",
 )  # fmt: skip
+# Columns that a file lacks where no object of its sweep has the attribute, and what stands for it then.
+OPTIONAL: dict[str, str | int] = {"attributes.rider_status": "", "cuboids.sibling_id": "-", "cuboids.sensor_id": -1}
+RIDER = {"With Rider": "cyclist", "Without Rider": "bicycle"}
 GT_SENSOR = 1
+# Stands for a bicycle of which one sweep does not say whether somebody rides it.
+UNKNOWN_RIDER = "bicycle?"
 
 
 def read_labels(
@@ -81,6 +85,7 @@ def read_labels(
         raise LogError(f"{next(iter(files.values())).parent}: no cuboids of the sweeps of this log")
     keep = _increasing(columns[0], columns[1])
     t_ns, track_id, category, center, size, yaw = (c[keep] for c in columns)
+    category = _settle_riders(track_id, category, notes)
     return Labels(t_ns, track_id, category, center, size, yaw)
 
 
@@ -97,6 +102,8 @@ def _checked(table: Columns, path: Path) -> Columns:
     for name in COLUMNS:
         if name not in table:
             raise LogError(f"{path}: no column '{name}'; expected cuboids with {', '.join(COLUMNS)}")
+    count = len(table["uuid"])
+    table = {name: np.full(count, value) for name, value in OPTIONAL.items()} | table
     numbers = [n for n in COLUMNS if n.startswith(("yaw", "position", "dimensions"))]
     for name in numbers:
         if table[name].dtype.kind not in "fiu" or not np.isfinite(table[name]).all():
@@ -127,8 +134,22 @@ def _frame(c: Columns, t_ns: int, gt_t_ns: int, map_T_lidar: Array, unknown: set
 
 def _category(label: str, rider: str) -> str:
     if label == "Bicycle":
-        return "cyclist" if rider == "With Rider" else "bicycle"
+        return RIDER.get(rider, UNKNOWN_RIDER)
     return CATEGORY_OF.get(label, "")
+
+
+def _settle_riders(track_id: NDArray[np.str_], category: NDArray[np.str_], notes: list[str]) -> NDArray[np.str_]:
+    """Categories in which a bicycle of unknown rider is what it is in most other sweeps; without any, a bicycle."""
+    settled = category.copy()
+    alone = 0
+    for track in np.unique(track_id[category == UNKNOWN_RIDER]):
+        rows = track_id == track
+        words, counts = np.unique(category[rows & (category != UNKNOWN_RIDER)], return_counts=True)
+        settled[rows & (category == UNKNOWN_RIDER)] = words[np.argmax(counts)] if len(words) else "bicycle"
+        alone += not len(words)
+    if alone:
+        notes.append(f"{alone} bicycles of which no sweep says whether somebody rides them are taken as unridden")
+    return settled
 
 
 def _increasing(t_ns: NDArray[np.int64], track_id: NDArray[np.str_]) -> NDArray[np.intp]:

@@ -82,8 +82,11 @@ class _Sequence:
         notes += problems
         track = PoseTrack(lidar_t_ns[keep], map_T_ego[keep])
         cameras, streams = self._cameras(track, notes)
-        sweeps = SweepFiles(self._files("lidar", ".gz", len(lidar_t_ns)), lidar_t_ns, notes)
-        streams |= {lidar: sweeps.stream(lidar) for lidar in LIDARS}
+        sweeps = SweepFiles(self._files("lidar", ".gz", len(lidar_t_ns), notes), lidar_t_ns, notes)
+        lidars = {lidar: Lidar(lidar, "ego", EGO_T_PANDAR64) for lidar in (LIDARS if sweeps.files else ())}
+        streams |= {lidar: sweeps.stream(lidar) for lidar in lidars}
+        if not streams:
+            raise LogError(f"{self.path}: neither images nor sweeps are there; a log needs at least one record")
         cuboids = numbered_files(self.path / "annotations" / "cuboids", ".gz")
         map_T_lidar = map_T_ego @ EGO_T_PANDAR64
 
@@ -92,14 +95,14 @@ class _Sequence:
             return read_labels(cuboids, lidar_t_ns, sweeps.gt_stamps, map_T_lidar, notes) if cuboids else None
 
         def all_notes() -> tuple[str, ...]:
-            stamps_and_labels = [*(sweeps.index(lidar) for lidar in LIDARS), labels()]
+            stamps_and_labels = [*(sweeps.index(lidar) for lidar in lidars), labels()]
             return tuple(notes) if stamps_and_labels else ()
 
         return Log(
             name=f"pandaset-{self.path.resolve().name}",
             format=READER.name,
             cameras=cameras,
-            lidars={lidar: Lidar(lidar, "ego", EGO_T_PANDAR64) for lidar in LIDARS},
+            lidars=lidars,
             streams=streams,
             ego=track,
             ego_vehicle=EGO_VEHICLE,
@@ -113,17 +116,21 @@ class _Sequence:
     def _records(self) -> list[Path]:
         return sorted(self.path.glob("*/*.pkl.gz")) + sorted(self.path.glob("*/*/*.*"))
 
-    def _files(self, folder: str, suffix: str, count: int) -> dict[int, Path]:
+    def _files(self, folder: str, suffix: str, count: int, notes: list[str]) -> dict[int, Path]:
+        """Find the records of a sensor by their number and note missing ones: they are gaps."""
         files = {k: p for k, p in numbered_files(self.path / folder, suffix).items() if k < count}
-        if not files:
-            raise LogError(f"{self.path / folder}: no records (NN*{suffix}); a stream needs at least one")
+        missing = sorted(set(range(count)) - set(files))
+        if missing:
+            notes.append(f"{folder}: {len(missing)} of {count} records are missing, first number {missing[0]:02d}")
         return files
 
     def _cameras(self, track: PoseTrack, notes: list[str]) -> tuple[dict[str, Camera], dict[str, Stream]]:
         cameras, streams = {}, {}
         for folder in sorted(p for p in (self.path / "camera").iterdir() if (p / "intrinsics.json").is_file()):
             t_ns, map_T_cam = _poses(folder)
-            files = self._files(f"camera/{folder.name}", ".jpg", len(t_ns))
+            files = self._files(f"camera/{folder.name}", ".jpg", len(t_ns), notes)
+            if not files:
+                continue
             width, height = first_image_size(list(files.values()))
             camera = Camera(
                 folder.name, width, height, _intrinsics(folder), "ego", _mount(track, t_ns, map_T_cam, folder, notes)
@@ -136,8 +143,8 @@ class _Sequence:
             chosen = [files[int(n)] for n in numbers[keep]]
             streams[camera.name] = image_stream(camera.name, t_ns, chosen, (width, height))
         if not cameras:
-            raise LogError(
-                f"{self.path / 'camera'}: no camera; expected folders with intrinsics.json, poses.json, timestamps.json"
+            notes.append(
+                "no images: camera/ has no folder with intrinsics.json, poses.json, timestamps.json and images"
             )
         return cameras, streams
 

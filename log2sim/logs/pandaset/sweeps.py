@@ -33,7 +33,7 @@ class SweepFiles:
     """Files of a sequence, each with the points of both LiDARs; stamps of the PandarGT are read when first used."""
 
     def __init__(self, files: dict[int, Path], t_ns: NDArray[np.int64], notes: list[str]) -> None:
-        self._files, self._t_ns, self._notes = files, t_ns, notes
+        self.files, self._t_ns, self._notes = files, t_ns, notes
         self._indexes: dict[str, tuple[NDArray[np.int64], list[Path]]] = {}
         self._lock, self._kept = Lock(), _KeptTables()
 
@@ -51,20 +51,25 @@ class SweepFiles:
         with self._lock:
             if lidar not in self._indexes:
                 t_ns = self._t_ns if lidar == "pandar64" else self.gt_stamps
-                numbers = np.array(list(self._files))
+                numbers = np.array(list(self.files))
                 keep, problems = strictly_increasing(t_ns[numbers], lidar)
                 self._notes += problems
-                self._indexes[lidar] = t_ns[numbers[keep]], [self._files[int(n)] for n in numbers[keep]]
+                self._indexes[lidar] = t_ns[numbers[keep]], [self.files[int(n)] for n in numbers[keep]]
             return self._indexes[lidar]
 
     @cached_property
     def gt_stamps(self) -> NDArray[np.int64]:
-        """Middle (N,) of the PandarGT's points of each sweep; the sweep's stamp where it cannot be read."""
-        stamps = self._t_ns.copy()
+        """Middle (N,) of the PandarGT's points of each sweep.
+
+        Where a sweep is missing or cannot be read, the stamp of the Pandar64 moved as those next to it.
+        """
         with ThreadPoolExecutor(READING_THREADS) as pool:
-            for number, stamp in zip(self._files, pool.map(self._gt_middle_ns, self._files.values())):
-                stamps[number] = stamps[number] if stamp is None else stamp
-        return stamps
+            middles = zip(self.files, pool.map(self._gt_middle_ns, self.files.values()))
+            known = {number: stamp - int(self._t_ns[number]) for number, stamp in middles if stamp is not None}
+        if not known:
+            return self._t_ns.copy()
+        moved = np.interp(np.arange(len(self._t_ns)), list(known), list(known.values()))
+        return np.asarray(self._t_ns + np.round(moved).astype(np.int64))
 
     def _gt_middle_ns(self, path: Path) -> int | None:
         try:
