@@ -196,6 +196,8 @@ class _Folder:
         self.notes += notes
         files = [inside(self.root, str(table["file"][row]), table.where(row, "file")) for row in keep]
         t_ns = table["t_ns"][keep]
+        for file in files:
+            self.hash.update(f"{file.name} {file.stat().st_size if file.exists() else -1}\n".encode())
         if entry["kind"] == "camera":
             size_px = entry["intrinsics"]["width_px"], entry["intrinsics"]["height_px"]
             return image_stream(entry["name"], t_ns, files, size_px)
