@@ -176,6 +176,69 @@ def test_a_roadside_log_needs_no_ego(tmp_path: Path) -> None:
     assert back.map_T_sensor("pole", back.streams["pole"].t_ns)[1].all()
 
 
+def test_the_images_of_a_log_are_copied_as_they_are(folder: Path, tmp_path: Path) -> None:
+    write_log(open_log(folder), tmp_path / "copy")
+    for name in ("front", "pole"):
+        for k in range(FRAMES):
+            file = f"{name}/{k:06d}.jpg"
+            assert (tmp_path / "copy" / file).read_bytes() == (folder / file).read_bytes()
+
+
+def test_records_that_cannot_be_read_are_left_out_where_that_is_wanted(folder: Path, tmp_path: Path) -> None:
+    (folder / "top" / "000001.npz").write_bytes(b"torn")
+    (folder / "front" / "000002.jpg").unlink()
+    with pytest.raises(RecordError, match=r"000002\.jpg|000001\.npz"):
+        write_log(open_log(folder), tmp_path / "copy")
+    assert not (tmp_path / "copy").exists()
+    problems: list[str] = []
+    write_log(open_log(folder), tmp_path / "copy", problems=problems)
+    assert [("front" in p, "top" in p) for p in problems] == [(True, False), (False, True)]
+    copy = open_log(tmp_path / "copy")
+    assert {name: len(stream.t_ns) for name, stream in copy.streams.items()} == {
+        "front": 4,
+        "pole": 5,
+        "top": 4,
+        "world": 5,
+    }
+    assert validate_log(tmp_path / "copy") == []
+    for file in (folder / "world").glob("*.npz"):
+        file.write_bytes(b"torn")
+    with pytest.raises(LogError, match="'world': none of its 5 records"):
+        write_log(open_log(folder), tmp_path / "none", problems=[])
+    assert not (tmp_path / "none").exists()
+
+
+def test_sweeps_of_one_stream_are_of_one_kind(tmp_path: Path) -> None:
+    log = make_log()
+    t_ns = log.streams["top"].t_ns
+
+    def read(i: int) -> Sweep:
+        return replace(log.streams["top"].read(i), compensated_ns=int(t_ns[i]) if i else None)
+
+    mixed = replace(log, streams={**log.streams, "top": Stream("top", t_ns, read)})
+    with pytest.raises(ConfigError, match="are not compensated"):
+        write_log(mixed, tmp_path / "log")
+
+
+def test_an_occlusion_is_a_number_from_0_to_3(folder: Path) -> None:
+    file = folder / "labels" / "boxes_3d.csv"
+    file.write_text(file.read_text().replace("visible", "occlusion"))
+    assert open_log(folder).labels.occlusion.tolist() == [1, 0, 1, 0, 1]
+    edit_line(file, 4, f"{T0_NS},a,car,1,2,3,4,2,1,0,4")
+    with pytest.raises(LogError, match="line 4, field 'occlusion': 4, expected 0, 1, 2 or 3"):
+        open_log(folder)
+
+
+def test_a_log_without_poses_stays_one(tmp_path: Path) -> None:
+    log = replace(make_log(), ego=None)
+    write_log(log, tmp_path / "log")
+    back = open_log(tmp_path / "log")
+    assert back.ego is None
+    assert back.ego_vehicle == log.ego_vehicle
+    assert back.ground_z_ego_m == log.ground_z_ego_m
+    assert back.cameras["front"].mount == "ego"
+
+
 def test_late_and_repeated_records_are_put_right_and_noted(folder: Path) -> None:
     index = folder / "front" / "index.csv"
     rows = index.read_text().splitlines()

@@ -9,14 +9,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from log2sim.datatypes import EgoVehicle, Lidar, Log, MapFrame, Stream, Sweep
+from log2sim.datatypes import CATEGORIES, EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, Sweep
 from log2sim.errors import LogError, RecordError
-from log2sim.geometry import Camera, PoseTrack, rotation_from_rpy, transform
+from log2sim.geometry import Camera, PoseTrack, RollingShutter, rotation_from_rpy, transform
 from log2sim.logs.images import read_image
 from log2sim.logs.kitti.drive import parse_oxts
 from log2sim.logs.kitti.labels import parse_labels
@@ -217,20 +218,61 @@ def small_logs(draw: st.DrawFn) -> Log:
     )
     K = np.array([[50.0, 0.0, 7.5], [0.0, 50.0, 7.5], [0.0, 0.0, 1.0]])
     image = np.full((16, 16, 3), draw(st.integers(0, 255)), np.uint8)
+    png = cv2.imencode(".png", image)[1].tobytes()
+    shutter = draw(
+        st.none() | st.builds(RollingShutter, st.sampled_from(["down", "up", "right", "left"]), st.floats(0.0, 0.1))
+    )
+    # Points in the map are compensated as they are.
+    at_ns = t_ns + draw(st.integers(-(10**8), 10**8)) if frame == "lidar" and draw(st.booleans()) else None
     return Log(
         name="any",
         format="memory",
-        cameras={"cam": Camera("cam", 16, 16, K, mount, pose)},
+        cameras={"cam": Camera("cam", 16, 16, K, mount, pose, rolling_shutter=shutter)},
         lidars={"lidar": Lidar("lidar", mount, pose)},
         streams={
-            "cam": Stream("cam", t_ns, lambda i: image),
+            "cam": Stream("cam", t_ns, lambda i: image, draw(st.sampled_from([None, lambda i: png]))),
             "lidar": Stream(
-                "lidar", t_ns, lambda i: Sweep(int(t_ns[i]), clouds[i], frame, t_ns[i] + offsets[i] if timed else None)
+                "lidar",
+                t_ns,
+                lambda i: Sweep(
+                    int(t_ns[i]),
+                    clouds[i],
+                    frame,
+                    t_ns[i] + offsets[i] if timed else None,
+                    None if at_ns is None else int(at_ns[i]),
+                ),
             ),
         },
         ego=None if roadside else ego,
         ego_vehicle=EgoVehicle(),
         map=MapFrame(),
+        labels=draw(st.none() | labels_of(t_ns, far)),
+    )
+
+
+@st.composite
+def labels_of(draw: st.DrawFn, t_ns: np.ndarray, far: float) -> Labels:
+    """Some labels, with any of the columns that may be absent."""
+    count = draw(st.integers(0, 4))
+
+    def column(values: st.SearchStrategy[Any], dtype: Any) -> np.ndarray:
+        return np.array([draw(values) for _ in range(count)], dtype=dtype)
+
+    word = st.text(st.characters(categories=["L", "N", "P"]), min_size=1, max_size=6)
+    center = np.array([[draw(coordinate) + far for _ in range(3)] for _ in range(count)]).reshape(-1, 3)
+    size = np.array([[draw(st.floats(0.01, 30.0)) for _ in range(3)] for _ in range(count)]).reshape(-1, 3)
+    return Labels(
+        t_ns=column(st.sampled_from(t_ns.tolist()), np.int64),
+        track_id=column(word, np.str_),
+        category=column(st.sampled_from(CATEGORIES), np.str_),
+        center_m=center,
+        size_m=size,
+        yaw_rad=column(angle, np.float64),
+        visible=column(st.booleans(), bool) if draw(st.booleans()) else None,
+        cameras=draw(st.sampled_from([None, ("cam",)])),
+        kind=column(word, np.str_) if draw(st.booleans()) else None,
+        occlusion=column(st.integers(0, 3), np.int64) if draw(st.booleans()) else None,
+        labeled_ns=t_ns[: draw(st.integers(0, len(t_ns)))] if draw(st.booleans()) else None,
     )
 
 
@@ -251,8 +293,28 @@ def test_any_small_log_survives_writing_and_reading(tmp_path: Path, log: Log) ->
     for i in range(len(log.streams["lidar"].t_ns)):
         a, b = log.streams["lidar"].read(i), back.streams["lidar"].read(i)
         np.testing.assert_allclose(b.xyz_m + (offset if b.frame == "map" else 0.0), a.xyz_m, atol=6e-4)
-        assert b.frame == a.frame
+        assert (b.frame, b.stamp_ns, b.compensated_ns) == (a.frame, a.stamp_ns, a.compensated_ns)
         assert (a.t_ns is None) == (b.t_ns is None)
         if a.t_ns is not None:
             np.testing.assert_array_equal(b.t_ns, a.t_ns)
         assert np.abs(back.streams["cam"].read(i).astype(int) - log.streams["cam"].read(i)).max() <= 3
+    assert back.cameras["cam"].rolling_shutter == log.cameras["cam"].rolling_shutter
+    encoded = log.streams["cam"].encoded
+    if encoded is not None:
+        assert back.streams["cam"].encoded(0) == encoded(0)
+    assert (back.labels is None) == (log.labels is None)
+    if log.labels is not None:
+        assert back.labels.cameras == log.labels.cameras
+        for column in (
+            "t_ns",
+            "track_id",
+            "category",
+            "size_m",
+            "yaw_rad",
+            "visible",
+            "kind",
+            "occlusion",
+            "labeled_ns",
+        ):
+            np.testing.assert_array_equal(getattr(back.labels, column), getattr(log.labels, column), err_msg=column)
+        np.testing.assert_allclose(back.labels.center_m + offset, log.labels.center_m, atol=1e-9)

@@ -13,18 +13,25 @@ from log2sim.logs.native.csv_tables import CsvTable
 SIZE_FIELDS = ("length_m", "width_m", "height_m")
 BOX_3D_FIELDS = ("x_m", "y_m", "z_m", *SIZE_FIELDS, "yaw_rad")
 BOX_3D_COLUMNS = {"t_ns": "int", "track_id": "str", "category": "str", **dict.fromkeys(BOX_3D_FIELDS, "float")}
+BOX_3D_OPTIONAL = {"visible": "bool", "kind": "str", "occlusion": "int"}
+LABELED_COLUMNS = {"t_ns": "int"}
+OCCLUSIONS = (0, 1, 2, 3)
 BOX_2D_FIELDS = ("u0_px", "v0_px", "u1_px", "v1_px")
 REGION_COLUMNS = {"t_ns": "int", "camera": "str", **dict.fromkeys(BOX_2D_FIELDS, "float")}
 BOX_2D_COLUMNS = {**REGION_COLUMNS, "category": "str"}
 
 
 def boxes_3d(table: CsvTable) -> Labels:
-    """Labels of a table with `BOX_3D_COLUMNS` and, optionally, `visible`."""
+    """Labels of a table with `BOX_3D_COLUMNS` and, optionally, some of `BOX_3D_OPTIONAL`."""
     _check_categories(table)
     size = table.stack(*SIZE_FIELDS)
     if np.any(size <= 0):
         row, column = np.argwhere(size <= 0)[0]
         raise LogError(f"{table.where(row, SIZE_FIELDS[column])}: {size[row, column]:g}, expected a size above 0")
+    occlusion = table.columns.get("occlusion")
+    if occlusion is not None and not np.isin(occlusion, OCCLUSIONS).all():
+        row = int(np.argmin(np.isin(occlusion, OCCLUSIONS)))
+        raise LogError(f"{table.where(row, 'occlusion')}: {occlusion[row]}, expected 0, 1, 2 or 3")
     return Labels(
         table["t_ns"],
         table["track_id"],
@@ -33,6 +40,8 @@ def boxes_3d(table: CsvTable) -> Labels:
         size,
         table["yaw_rad"],
         table.columns.get("visible"),
+        kind=table.columns.get("kind"),
+        occlusion=occlusion,
     )
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,22 +14,32 @@ from numpy.typing import NDArray
 from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, Sweep
 from log2sim.documents import check, inside, read_json
 from log2sim.errors import LogError
-from log2sim.geometry import Array, Camera, PoseTrack, rotation_from_quaternion, transform
+from log2sim.geometry import Array, Camera, PoseTrack, RollingShutter, rotation_from_quaternion, transform
 from log2sim.logs.images import image_stream
 from log2sim.logs.native.csv_tables import CsvTable, read_csv_table
-from log2sim.logs.native.labels import BOX_2D_COLUMNS, BOX_3D_COLUMNS, REGION_COLUMNS, boxes_2d, boxes_3d, regions_2d
+from log2sim.logs.native.labels import (
+    BOX_2D_COLUMNS,
+    BOX_3D_COLUMNS,
+    BOX_3D_OPTIONAL,
+    LABELED_COLUMNS,
+    REGION_COLUMNS,
+    boxes_2d,
+    boxes_3d,
+    regions_2d,
+)
+from log2sim.logs.native.offset import offset_of, shifted_camera, shifted_labels, shifted_lidar, shifted_poses
 from log2sim.logs.stamps import strictly_increasing
 from log2sim.logs.sweeps import read_sweep
 
 MANIFEST = "log.json"
 
 INDEX_COLUMNS = {"t_ns": "int", "file": "str"}
+COMPENSATED = {"compensated_ns": "int"}
 POSE_COLUMNS = {"t_ns": "int", **dict.fromkeys(("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"), "float")}
 GNSS_FIELDS = ("latitude_deg", "longitude_deg", "altitude_m", "roll_rad", "pitch_rad", "yaw_rad")
 GNSS_COLUMNS = {"t_ns": "int", **dict.fromkeys(GNSS_FIELDS, "float")}
 
 QUATERNION_TOLERANCE = 1e-3
-OFFSET_STEP_M = 1000.0
 DISTORTION_LENGTHS: Mapping[str, tuple[int, ...]] = {"none": (0,), "brown": (4, 5, 8), "fisheye": (4,)}
 
 
@@ -78,12 +87,12 @@ class _Folder:
         m = self.manifest
         map_frame, track = self._ego()
         sensors = [self._sensor(k, entry) for k, entry in enumerate(m["sensors"])]
-        self._check_sensors(sensors, track)
+        self._check_sensors(sensors)
         labels = self._labels()
         boxes, regions = self._label_table("boxes_2d", BOX_2D_COLUMNS), self._label_table("ignored_2d", REGION_COLUMNS)
-        offset = _offset(track, sensors, labels)
-        cameras = {s.name: _shifted_camera(s, offset) for s in sensors if isinstance(s, Camera)}
-        lidars = {s.name: _shifted_lidar(s, offset) for s in sensors if isinstance(s, Lidar)}
+        offset = offset_of(track, sensors, labels)
+        cameras = {s.name: shifted_camera(s, offset) for s in sensors if isinstance(s, Camera)}
+        lidars = {s.name: shifted_lidar(s, offset) for s in sensors if isinstance(s, Lidar)}
         ego = m.get("ego", {})
         default = EgoVehicle()
         length, width, height = (float(v) for v in ego.get("size_m", default.size_m))
@@ -93,12 +102,12 @@ class _Folder:
             cameras=cameras,
             lidars=lidars,
             streams={e["name"]: self._stream(k, e, offset) for k, e in enumerate(m["sensors"])},
-            ego=None if track is None else PoseTrack(track.t_ns, _shifted(track.map_T_ego, offset)),
+            ego=None if track is None else PoseTrack(track.t_ns, shifted_poses(track.map_T_ego, offset)),
             ego_vehicle=EgoVehicle(
                 (length, width, height), float(ego.get("rear_axle_offset_m", default.rear_axle_offset_m))
             ),
             map=replace(map_frame, offset_m=tuple(offset.tolist())),
-            labels=None if labels is None else _shifted_labels(labels, offset),
+            labels=None if labels is None else shifted_labels(labels, offset),
             image_labels={} if boxes is None else boxes_2d(boxes, set(cameras)),
             ignored_regions={} if regions is None else regions_2d(regions, set(cameras)),
             ground_z_ego_m=float(ego.get("ground_z_m", 0.0)),
@@ -119,7 +128,7 @@ class _Folder:
         m = self.manifest.get("map", {})
         map_frame = MapFrame(m.get("latitude_deg"), m.get("longitude_deg"), m.get("altitude_m"), m.get("projection"))
         ego = self.manifest.get("ego")
-        if ego is None:
+        if ego is None or not {"poses", "gnss"} & set(ego):
             return map_frame, None
         if "poses" in ego:
             table = self.table(ego["poses"], "ego.poses", POSE_COLUMNS)
@@ -169,18 +178,23 @@ class _Folder:
             expected = " or ".join(map(str, DISTORTION_LENGTHS[model]))
             raise LogError(f"{where}: intrinsics.distortion has {len(distortion)} values, '{model}' takes {expected}")
         K = np.array([[i["fx_px"], 0.0, i["cx_px"]], [0.0, i["fy_px"], i["cy_px"]], [0.0, 0.0, 1.0]])
+        lines = i.get("rolling_shutter")
+        shutter = None if lines is None else RollingShutter(lines["direction"], float(lines["readout_s"]))
         return Camera(
-            entry["name"], i["width_px"], i["height_px"], K, entry["mount"], mount_T_sensor, model, distortion
+            entry["name"], i["width_px"], i["height_px"], K, entry["mount"], mount_T_sensor, model, distortion, shutter
         )
 
-    def _check_sensors(self, sensors: list[Camera | Lidar], track: PoseTrack | None) -> None:
+    def _check_sensors(self, sensors: list[Camera | Lidar]) -> None:
         names: set[str] = set()
         for k, sensor in enumerate(sensors):
             where = f"{self.file}, sensors[{k}] '{sensor.name}'"
             if sensor.name in names:
                 raise LogError(f"{where}: the name occurs twice; names must be unique")
-            if sensor.mount == "ego" and track is None:
-                raise LogError(f"{where}: is mounted on the ego, but the log has no 'ego' with poses or gnss")
+            if sensor.mount == "ego" and "ego" not in self.manifest:
+                raise LogError(
+                    f"{where}: is mounted on the ego, but the log has no 'ego' with poses or gnss; an empty 'ego' says "
+                    "that its poses are not known"
+                )
             names.add(sensor.name)
         reference = self.manifest.get("reference_camera")
         cameras = [s.name for s in sensors if isinstance(s, Camera)]
@@ -190,7 +204,9 @@ class _Folder:
             )
 
     def _stream(self, k: int, entry: Mapping[str, Any], offset: Array) -> Stream:
-        table = self.table(entry["index"], f"sensors[{k}].index", INDEX_COLUMNS)
+        frame = entry.get("points_frame", "lidar")
+        compensable = COMPENSATED if entry["kind"] == "lidar" and frame == "lidar" else None
+        table = self.table(entry["index"], f"sensors[{k}].index", INDEX_COLUMNS, compensable)
         self._not_empty(table)
         keep, notes = strictly_increasing(table["t_ns"], entry["name"])
         self.notes += notes
@@ -201,8 +217,9 @@ class _Folder:
         if entry["kind"] == "camera":
             size_px = entry["intrinsics"]["width_px"], entry["intrinsics"]["height_px"]
             return image_stream(entry["name"], t_ns, files, size_px)
-        frame = entry.get("points_frame", "lidar")
-        return Stream(entry["name"], t_ns, partial(_read_sweep, files, t_ns, frame, offset))
+        compensated = table.columns.get("compensated_ns")
+        sweeps = _SweepFiles(files, t_ns, frame, offset, None if compensated is None else compensated[keep])
+        return Stream(entry["name"], t_ns, sweeps.read)
 
     def _labels(self) -> Labels | None:
         entry = self.manifest.get("labels", {})
@@ -214,8 +231,13 @@ class _Folder:
                 raise LogError(
                     f"{self.file}, field 'labels.cameras': no camera '{name}'; there are: {', '.join(sorted(names))}"
                 )
-        labels = boxes_3d(self.table(entry["boxes_3d"], "labels.boxes_3d", BOX_3D_COLUMNS, {"visible": "bool"}))
-        return replace(labels, cameras=tuple(entry["cameras"]) if "cameras" in entry else None)
+        labels = boxes_3d(self.table(entry["boxes_3d"], "labels.boxes_3d", BOX_3D_COLUMNS, BOX_3D_OPTIONAL))
+        labeled = self._label_table("labeled", LABELED_COLUMNS)
+        return replace(
+            labels,
+            cameras=tuple(entry["cameras"]) if "cameras" in entry else None,
+            labeled_ns=None if labeled is None else np.unique(labeled["t_ns"]),
+        )
 
     def _label_table(self, key: str, columns: Mapping[str, str]) -> CsvTable | None:
         relative = self.manifest.get("labels", {}).get(key)
@@ -231,49 +253,21 @@ def _check_geodetic(table: CsvTable) -> None:
             )
 
 
-def _read_sweep(
-    files: list[Path], t_ns: NDArray[np.int64], frame: Literal["lidar", "map"], offset: Array, i: int
-) -> Sweep:
-    """Read sweep `i`; points in the map frame are shifted by the map's offset (3,)."""
-    sweep = read_sweep(files[i], int(t_ns[i]), frame)
-    if frame == "map" and offset.any():
-        return Sweep(sweep.stamp_ns, sweep.xyz_m.astype(np.float64) - offset, frame, sweep.t_ns)
-    return sweep
+@dataclass(frozen=True, eq=False)
+class _SweepFiles:
+    """Sweeps of one LiDAR: files, stamps (F,), the frame of the points, the map's offset (3,), stamps of compensation (F,)."""
 
+    files: list[Path]
+    t_ns: NDArray[np.int64]
+    frame: Literal["lidar", "map"]
+    offset: Array
+    compensated_ns: NDArray[np.int64] | None
 
-def _offset(track: PoseTrack | None, sensors: list[Camera | Lidar], labels: Labels | None) -> Array:
-    """Whole kilometers (3,) by which the log is shifted towards the map's origin."""
-    if track is not None:
-        first = track.map_T_ego[0, :3, 3]
-    else:
-        positions = [_mount_T(s)[:3, 3] for s in sensors if s.mount == "map"]
-        first = (
-            positions[0]
-            if positions
-            else labels.center_m[0]
-            if labels is not None and len(labels.t_ns)
-            else np.zeros(3)
-        )
-    return OFFSET_STEP_M * np.round(first / OFFSET_STEP_M) + 0.0
-
-
-def _mount_T(sensor: Camera | Lidar) -> Array:
-    return sensor.mount_T_cam if isinstance(sensor, Camera) else sensor.mount_T_lidar
-
-
-def _shifted(map_T_x: Array, offset: Array) -> Array:
-    out = map_T_x.copy()
-    out[..., :3, 3] -= offset
-    return out
-
-
-def _shifted_camera(camera: Camera, offset: Array) -> Camera:
-    return camera if camera.mount == "ego" else replace(camera, mount_T_cam=_shifted(camera.mount_T_cam, offset))
-
-
-def _shifted_lidar(lidar: Lidar, offset: Array) -> Lidar:
-    return lidar if lidar.mount == "ego" else Lidar(lidar.name, lidar.mount, _shifted(lidar.mount_T_lidar, offset))
-
-
-def _shifted_labels(labels: Labels, offset: Array) -> Labels:
-    return replace(labels, center_m=labels.center_m - offset)
+    def read(self, i: int) -> Sweep:
+        """Read sweep `i`; points in the map frame are shifted by the map's offset."""
+        sweep = read_sweep(self.files[i], int(self.t_ns[i]), self.frame)
+        if self.compensated_ns is not None:
+            return replace(sweep, compensated_ns=int(self.compensated_ns[i]))
+        if self.frame == "map" and self.offset.any():
+            return replace(sweep, xyz_m=sweep.xyz_m.astype(np.float64) - self.offset)
+        return sweep

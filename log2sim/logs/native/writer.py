@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import secrets
 import shutil
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,14 +15,17 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Lidar, Log, Stream, Sweep
 from log2sim.documents import check
-from log2sim.errors import ConfigError
-from log2sim.geometry import Array, Camera, quaternion_from_rotation, yaw_of
-from log2sim.logs.native.labels import BOX_2D_COLUMNS, BOX_3D_COLUMNS, REGION_COLUMNS
-from log2sim.logs.native.reader import GNSS_COLUMNS, INDEX_COLUMNS, MANIFEST, POSE_COLUMNS
+from log2sim.errors import ConfigError, LogError, RecordError
+from log2sim.geometry import Array, Camera, quaternion_from_rotation
+from log2sim.logs.images import image_size
+from log2sim.logs.native.reader import COMPENSATED, INDEX_COLUMNS, MANIFEST
+from log2sim.logs.native.table_writer import write_ego, write_labels, write_table
 
 POINT_RESOLUTION_M = 1e-3
 # float32 resolves 1 mm up to about 8 km.
 MAX_FLOAT32_M = 8000.0
+
+JPEG_MAGIC = b"\xff\xd8"
 
 Progress = Callable[[int, int], None]
 
@@ -38,6 +39,7 @@ def write_log(
     ego: Literal["poses", "gnss"] = "poses",
     sweep: Literal["npz", "npy", "bin"] = "npz",
     progress: Progress | None = None,
+    problems: list[str] | None = None,
 ) -> None:
     """Write any log as a native log folder, whole or not at all.
 
@@ -49,13 +51,15 @@ def write_log(
     overwrite : bool
         Replace a log folder of that name; a folder that is no log is never replaced.
     jpeg_quality : int
-        1 to 100.
+        1 to 100, of images that the log does not hold as files; those are copied.
     ego : "poses" or "gnss"
         "gnss" writes latitude, longitude and angles; the log's map then needs a projection.
     sweep : "npz", "npy" or "bin"
         Points are rounded to 1 mm. Only "npz" keeps the stamps of the points.
     progress : callable, optional
         Called as `progress(done, total)` after each record.
+    problems : list of str, optional
+        Takes why records cannot be read, which are then left out. Without it the first one is an error.
 
     Raises
     ------
@@ -63,23 +67,30 @@ def write_log(
         When the folder exists and may not be replaced, or cannot be written.
     RecordError
         When a record of the log cannot be read.
+    LogError
+        When none of a stream can be read.
     """
     target = Path(path)
-    _refuse(target, overwrite)
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
+    refuse_target(target, overwrite=overwrite)
+    suffix = secrets.token_hex(4)
+    temporary, replaced = (target.with_name(f".{target.name}.{suffix}{end}") for end in ("", ".old"))
     try:
         temporary.mkdir(parents=True)
-        _write(log, temporary, _Encoding(jpeg_quality, ego, sweep), progress)
+        _Writer(log, temporary, _Encoding(jpeg_quality, ego, sweep), progress, problems).write()
         if target.exists():
-            shutil.rmtree(target)
+            target.rename(replaced)
         temporary.rename(target)
     except OSError as error:
         raise ConfigError(f"{target}: cannot be written: {error.strerror or error}") from error
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        if replaced.exists() and not target.exists():
+            replaced.rename(target)
+        for folder in (temporary, replaced):
+            shutil.rmtree(folder, ignore_errors=True)
 
 
-def _refuse(target: Path, overwrite: bool) -> None:
+def refuse_target(target: Path, *, overwrite: bool) -> None:
+    """Raise `ConfigError` where no log folder may be written."""
     if not target.exists():
         return
     empty = target.is_dir() and not any(target.iterdir())
@@ -98,34 +109,82 @@ class _Encoding:
     sweep: str
 
 
-def _write(log: Log, root: Path, encoding: _Encoding, progress: Progress | None) -> None:
-    total = sum(len(s.t_ns) for s in log.streams.values())
-    done = 0
-    offset = np.array(log.map.offset_m)
-    manifest = _manifest(log, offset)
-    for entry in manifest["sensors"]:
-        stream, folder = log.streams[entry["name"]], root / entry["name"]
-        folder.mkdir()
-        files, frames = [], set()
-        for i in range(len(stream.t_ns)):
-            record = stream.read(i)
-            if isinstance(record, Sweep):
-                files.append(_write_sweep(record, folder, i, encoding.sweep, offset))
-                frames.add(record.frame)
+@dataclass(eq=False)
+class _Rows:
+    """What the index of one stream gets: rows of stamp, file and, where sweeps are compensated, its stamp."""
+
+    rows: list[tuple[int, str]] = field(default_factory=list)
+    compensated_ns: list[int] = field(default_factory=list)
+    frames: set[str] = field(default_factory=set)
+
+    def write(self, name: str, path: Path) -> None:
+        """Write the index; `ConfigError` where the sweeps differ in kind."""
+        if len(self.frames) > 1:
+            raise ConfigError(f"stream '{name}' mixes sweeps in the lidar and in the map frame; write one kind")
+        if not self.compensated_ns:
+            write_table(path, INDEX_COLUMNS, self.rows)
+            return
+        if len(self.compensated_ns) < len(self.rows):
+            raise ConfigError(f"stream '{name}' mixes sweeps that are and that are not compensated; write one kind")
+        rows = [(*row, t) for row, t in zip(self.rows, self.compensated_ns)]
+        write_table(path, [*INDEX_COLUMNS, *COMPENSATED], rows)
+
+
+@dataclass(frozen=True, eq=False)
+class _Writer:
+    """Writes one log into an empty folder."""
+
+    log: Log
+    root: Path
+    encoding: _Encoding
+    progress: Progress | None
+    problems: list[str] | None
+
+    def write(self) -> None:
+        """Write the records of all streams, then the tables and the manifest."""
+        offset = np.array(self.log.map.offset_m)
+        manifest = _manifest(self.log, offset)
+        total = sum(len(s.t_ns) for s in self.log.streams.values())
+        done = 0
+        for entry in manifest["sensors"]:
+            stream, folder = self.log.streams[entry["name"]], self.root / entry["name"]
+            folder.mkdir()
+            index = _Rows()
+            for i in range(len(stream.t_ns)):
+                self._write_record(stream, i, folder, index, offset)
+                done += 1
+                if self.progress is not None:
+                    self.progress(done, total)
+            if not index.rows:
+                raise LogError(f"stream '{stream.name}': none of its {len(stream.t_ns)} records can be read")
+            if "map" in index.frames:
+                entry["points_frame"] = "map"
+            index.write(stream.name, self.root / entry["index"])
+        write_ego(self.log, self.root, manifest, self.encoding.ego)
+        write_labels(self.log, self.root, manifest, offset)
+        check(manifest, "log-1", ConfigError)
+        (self.root / MANIFEST).write_text(json.dumps(manifest, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+    def _write_record(self, stream: Stream, i: int, folder: Path, index: _Rows, offset: Array) -> None:
+        t_ns = int(stream.t_ns[i])
+        try:
+            if stream.encoded is not None:
+                file = _copy_image(stream.encoded(i), folder, i, t_ns)
             else:
-                files.append(_write_image(record, folder, i, encoding.jpeg_quality))
-            done += 1
-            if progress is not None:
-                progress(done, total)
-        if len(frames) > 1:
-            raise ConfigError(f"stream '{stream.name}' mixes sweeps in the lidar and in the map frame; write one kind")
-        if "map" in frames:
-            entry["points_frame"] = "map"
-        _write_index(stream, files, root / entry["index"])
-    _write_ego(log, root, manifest, encoding.ego)
-    _write_labels(log, root, manifest, offset)
-    check(manifest, "log-1", ConfigError)
-    (root / MANIFEST).write_text(json.dumps(manifest, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+                record = stream.read(i)
+                if isinstance(record, Sweep):
+                    file = _write_sweep(record, folder, i, self.encoding.sweep, offset)
+                    index.frames.add(record.frame)
+                    if record.compensated_ns is not None:
+                        index.compensated_ns.append(int(record.compensated_ns))
+                else:
+                    file = _write_image(record, folder, i, self.encoding.jpeg_quality)
+        except RecordError as error:
+            if self.problems is None:
+                raise
+            self.problems.append(f"stream '{stream.name}': {error}")
+            return
+        index.rows.append((t_ns, file))
 
 
 def _manifest(log: Log, offset: Array) -> dict[str, Any]:
@@ -171,7 +230,16 @@ def _sensor(sensor: Camera | Lidar, offset: Array) -> dict[str, Any]:
             "distortion_model": sensor.distortion_model,
             "distortion": [float(d) for d in sensor.distortion],
         }
+        if sensor.rolling_shutter is not None:
+            entry["intrinsics"]["rolling_shutter"] = asdict(sensor.rolling_shutter)
     return entry
+
+
+def _copy_image(data: bytes, folder: Path, i: int, t_ns: int) -> str:
+    image_size(data, f"{folder.name}, stamp {t_ns}")  # an image, or a RecordError
+    name = f"{i:06d}.{'jpg' if data[:2] == JPEG_MAGIC else 'png'}"
+    (folder / name).write_bytes(data)
+    return f"{folder.name}/{name}"
 
 
 def _write_image(image: NDArray[np.uint8], folder: Path, i: int, jpeg_quality: int) -> str:
@@ -202,79 +270,3 @@ def _write_sweep(sweep: Sweep, folder: Path, i: int, kind: str, offset: Array) -
     else:
         (folder / name).write_bytes(np.pad(xyz.astype("<f4"), ((0, 0), (0, 1))).tobytes())
     return f"{folder.name}/{name}"
-
-
-def _write_index(stream: Stream, files: list[str], path: Path) -> None:
-    _write_table(path, INDEX_COLUMNS, zip(stream.t_ns.tolist(), files))
-
-
-def _write_ego(log: Log, root: Path, manifest: dict[str, Any], kind: str) -> None:
-    if log.ego is None:
-        return
-    (root / "ego").mkdir(exist_ok=True)
-    vehicle = log.ego_vehicle
-    manifest["ego"] = {
-        kind: f"ego/{kind}.csv",
-        "size_m": [float(v) for v in vehicle.size_m],
-        "rear_axle_offset_m": float(vehicle.rear_axle_offset_m),
-        "ground_z_m": float(log.ground_z_ego_m),
-    }
-    poses = log.ego.map_T_ego
-    if kind == "poses":
-        values = np.hstack([poses[:, :3, 3] + log.map.offset_m, quaternion_from_rotation(poses[:, :3, :3])])
-        _write_table(root / "ego/poses.csv", POSE_COLUMNS, _rows(log.ego.t_ns, values))
-        return
-    if log.map.projection is None:
-        raise ConfigError(
-            f"log '{log.name}': its map has no projection, so its ego cannot be written as GNSS; write poses"
-        )
-    from log2sim.logs.geodesy import geodetic_from_map
-
-    latitude, longitude, altitude, convergence = geodetic_from_map(log.map, poses[:, :3, 3], f"log '{log.name}'")
-    pitch = -np.arcsin(np.clip(poses[:, 2, 0], -1, 1))
-    roll = np.arctan2(poses[:, 2, 1], poses[:, 2, 2])
-    values = np.stack([latitude, longitude, altitude, roll, pitch, yaw_of(poses) - convergence], axis=1)
-    _write_table(root / "ego/gnss.csv", GNSS_COLUMNS, _rows(log.ego.t_ns, values))
-
-
-def _write_labels(log: Log, root: Path, manifest: dict[str, Any], offset: Array) -> None:
-    entry: dict[str, Any] = {}
-    if log.labels is not None:
-        b = log.labels
-        entry["boxes_3d"] = "labels/boxes_3d.csv"
-        values = np.hstack([b.center_m + offset, b.size_m, b.yaw_rad[:, None]])
-        columns, rows = dict(BOX_3D_COLUMNS), _rows(b.t_ns, values, b.track_id, b.category)
-        if b.visible is not None:
-            columns["visible"] = "bool"
-            rows = [(*row, int(v)) for row, v in zip(rows, b.visible)]
-        _write_table(root / entry["boxes_3d"], columns, rows)
-        if b.cameras is not None:
-            entry["cameras"] = list(b.cameras)
-    if log.image_labels:
-        entry["boxes_2d"] = "labels/boxes_2d.csv"
-        rows = []
-        for name, boxes in log.image_labels.items():
-            camera = np.full(len(boxes.t_ns), name)
-            rows += [(*row, str(c)) for row, c in zip(_rows(boxes.t_ns, boxes.box_px, camera), boxes.category)]
-        _write_table(root / entry["boxes_2d"], BOX_2D_COLUMNS, rows)
-    if log.ignored_regions:
-        entry["ignored_2d"] = "labels/ignored_2d.csv"
-        rows = []
-        for name, regions in log.ignored_regions.items():
-            rows += _rows(regions.t_ns, regions.box_px, np.full(len(regions.t_ns), name))
-        _write_table(root / entry["ignored_2d"], REGION_COLUMNS, rows)
-    if entry:
-        manifest["labels"] = entry
-
-
-def _rows(t_ns: NDArray[np.int64], values: Array, *words: NDArray[np.str_]) -> list[tuple[Any, ...]]:
-    return [(t, *(str(w) for w in text), *v) for t, v, *text in zip(t_ns.tolist(), values.tolist(), *words)]
-
-
-def _write_table(path: Path, columns: Iterable[str], rows: Iterable[Sequence[Any]]) -> None:
-    path.parent.mkdir(exist_ok=True)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(rows)
-    path.write_text(text.getvalue(), encoding="utf-8")
