@@ -1,0 +1,180 @@
+"""Range images to points: beams, columns, the pose of each pixel, and the compressed matrices of version 1.
+
+Rows are beams from the highest to the lowest, columns directions from the rear over the left, the front and the right to the
+rear, so that the TOP LiDAR, which turns clockwise, measures them from the first to the last.
+"""
+
+from __future__ import annotations
+
+import zlib
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import Array, apply, inverse, rotation_from_rpy, transform
+from log2sim.logs.waymo.messages import range_image_parts
+from log2sim.logs.waymo.segment import LaserCalibration, RangeImages
+from log2sim.logs.waymo.wire import BYTES, WireError, fields_of, varints
+
+# The TOP LiDAR has 64 x 2650 pixels of 4 channels, its poses have 6.
+MAX_PIXELS = 1_000_000
+MAX_CHANNELS = 16
+MAX_MATRIX_BYTES = 64 * 1024 * 1024
+
+
+def read_range_images(laser: bytes) -> RangeImages:
+    """Decompress the range images of a Laser message of version 1.
+
+    Raises
+    ------
+    WireError
+        When they are damaged, too large or not of the layout (H, W, C).
+    """
+    returns, poses = [], None
+    for number, ranges, pixel_poses in sorted(range_image_parts(laser)):
+        if ranges:
+            returns.append(read_matrix(ranges))
+        if pixel_poses and number == 1:
+            poses = read_matrix(pixel_poses)
+    return checked(returns, poses)
+
+
+def read_matrix(compressed: bytes) -> NDArray[np.float32]:
+    """Decompress a MatrixFloat (H, W, C)."""
+    decompressor = zlib.decompressobj()
+    try:
+        data = decompressor.decompress(compressed, MAX_MATRIX_BYTES)
+    except zlib.error as error:
+        raise WireError(f"a range image cannot be decompressed: {error}") from None
+    if decompressor.unconsumed_tail:
+        raise WireError(f"a range image unpacks to more than {MAX_MATRIX_BYTES} bytes")
+    if not decompressor.eof:
+        raise WireError("a range image is truncated")
+    parts, dims = [], list[int]()
+    for f in fields_of(data):
+        if f.kind != BYTES:
+            continue
+        if f.number == 1:
+            parts.append(_floats(data[f.begin : f.end]))
+        elif f.number == 2:
+            dims = _dims(data[f.begin : f.end])
+    return shaped(np.concatenate(parts) if parts else np.zeros(0, np.float32), dims)
+
+
+def shaped(values: NDArray[Any], dims: list[int]) -> NDArray[np.float32]:
+    """Return values as (H, W, C) float32; `WireError` when `dims` are not three or do not fit."""
+    if len(dims) != 3 or not 0 < dims[2] <= MAX_CHANNELS or not 0 < dims[0] * dims[1] <= MAX_PIXELS or min(dims) <= 0:
+        raise WireError(f"a range image has the shape {dims[:8]}, expected rows, columns, channels")
+    if len(values) != dims[0] * dims[1] * dims[2]:
+        raise WireError(f"a range image has {len(values)} values, expected {' x '.join(map(str, dims))}")
+    return np.asarray(values, dtype=np.float32).reshape(dims)
+
+
+def checked(returns: list[NDArray[np.float32]], poses: NDArray[np.float32] | None) -> RangeImages:
+    """Return the range images of one LiDAR; `WireError` when there are none or their shapes differ."""
+    shapes = {image.shape[:2] for image in returns}
+    if len(shapes) != 1:
+        raise WireError(f"range images of {len(shapes)} shapes, expected one or two returns of the same")
+    if poses is not None and poses.shape != (*next(iter(shapes)), 6):
+        raise WireError(f"poses of the pixels have the shape {poses.shape}, expected {(*next(iter(shapes)), 6)}")
+    return RangeImages(tuple(returns), poses)
+
+
+def points_of(
+    images: RangeImages, laser: LaserCalibration, world_T_vehicle: Array
+) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Turn the range images of one LiDAR into points.
+
+    Parameters
+    ----------
+    images : RangeImages
+    laser : LaserCalibration
+    world_T_vehicle : (4, 4) float64
+        Pose that defines the vehicle's frame.
+
+    Returns
+    -------
+    xyz_m : (N, 3) float32, m, lidar frame
+        Of all returns, in the lidar's frame as it was at `world_T_vehicle`.
+    turn : (N,) float64
+        Share of the turn, in [0, 1), at which the middle of each point's column was measured.
+
+    Notes
+    -----
+    After comments of RangeImage in dataset.proto: each pixel is taken to the world by the pose of the vehicle at its own time
+    and back by `world_T_vehicle`. Range images without such poses are made of points in the vehicle's frame already.
+    """
+    height, width = images.returns[0].shape[:2]
+    inclination, azimuth = row_inclinations(laser, height), column_azimuths(laser, width)
+    parts, turns = [], []
+    for image in images.returns:
+        row, column = np.nonzero((image[..., 0] > 0) & np.isfinite(image[..., 0]))
+        reach = image[row, column, 0].astype(np.float64)
+        level = np.cos(inclination[row]) * reach
+        xyz = np.stack(
+            [np.cos(azimuth)[column] * level, np.sin(azimuth)[column] * level, np.sin(inclination)[row] * reach], axis=1
+        )
+        if images.poses is not None:
+            xyz = _compensated(xyz, images.poses[row, column], laser.vehicle_T_lidar, world_T_vehicle)
+        parts.append(xyz.astype(np.float32))
+        turns.append((column + 0.5) / width)
+    return np.concatenate(parts), np.concatenate(turns)
+
+
+def row_inclinations(laser: LaserCalibration, height: int) -> Array:
+    """Inclination (H,) rad of each row.
+
+    Raises
+    ------
+    WireError
+        When the number of beams is another than that of rows.
+    """
+    beams = laser.inclinations_rad
+    if not len(beams):
+        low, high = laser.limits_rad
+        beams = low + (np.arange(height) + 0.5) / height * (high - low)
+    if len(beams) != height:
+        raise WireError(f"a range image has {height} rows, the calibration {len(beams)} beams")
+    return beams[::-1]
+
+
+def column_azimuths(laser: LaserCalibration, width: int) -> Array:
+    """Azimuth (W,) rad of each column in the lidar's frame: columns are even in the vehicle's."""
+    yaw = np.arctan2(laser.vehicle_T_lidar[1, 0], laser.vehicle_T_lidar[0, 0])
+    return np.asarray(np.pi - 2 * np.pi * (np.arange(width) + 0.5) / width - yaw)
+
+
+def turn_of(xyz_vehicle: Array, laser: LaserCalibration) -> Array:
+    """Share (N,) of the turn, in [0, 1), at which a LiDAR looks at points (N, 3), m, of the vehicle's frame."""
+    x, y = (xyz_vehicle[:, k] - laser.vehicle_T_lidar[k, 3] for k in (0, 1))
+    return np.asarray(np.mod((np.pi - np.arctan2(y, x)) / (2 * np.pi), 1.0))
+
+
+def _compensated(xyz: Array, pixel_poses: NDArray[np.float32], vehicle_T_lidar: Array, world_T_vehicle: Array) -> Array:
+    """Points (N, 3) of the lidar's frame at their own times, in its frame at `world_T_vehicle`."""
+    usable = np.asarray(np.isfinite(pixel_poses).all(axis=1))
+    if not usable.all():
+        raise WireError(f"{np.sum(~usable)} of {len(usable)} pixels with a range have no finite pose")
+    roll, pitch, yaw, *position = pixel_poses.astype(np.float64).T
+    # The difference of the large positions is taken first, so that it keeps its digits.
+    from_pose = np.stack(position, axis=1) - world_T_vehicle[:3, 3]
+    world_axes_T_pixel = transform(rotation_from_rpy(roll, pitch, yaw), from_pose)
+    vehicle_T_world_axes = inverse(transform(world_T_vehicle[:3, :3], np.zeros(3)))
+    in_world_axes = apply(world_axes_T_pixel, apply(vehicle_T_lidar, xyz))
+    return apply(inverse(vehicle_T_lidar), apply(vehicle_T_world_axes, in_world_axes))
+
+
+def _floats(data: bytes) -> NDArray[np.float32]:
+    if len(data) % 4:
+        raise WireError(f"a range image has {len(data)} bytes of values, expected floats of 4")
+    return np.frombuffer(data, "<f4")
+
+
+def _dims(data: bytes) -> list[int]:
+    """Read the dimensions of a MatrixShape, packed or one field each."""
+    out: list[int] = []
+    for f in fields_of(data):
+        if f.number == 1:
+            out += varints(data[f.begin : f.end]) if f.kind == BYTES else [f.value]
+    return out

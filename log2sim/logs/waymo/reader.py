@@ -1,0 +1,207 @@
+"""Reader of version 1 of the Waymo Open Dataset: TFRecords of `Frame` messages, one file a segment.
+
+Opening reads the lengths of the records and, of each frame, poses, stamps and the offsets of everything else; pictures, range
+images and labels are skipped. The format is that of dataset.proto and label.proto (github.com/waymo-research/waymo-open-dataset).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from log2sim.datatypes import Log
+from log2sim.errors import LogError, RecordError
+from log2sim.logs.digest import digest_of
+from log2sim.logs.waymo.assembly import log_of
+from log2sim.logs.waymo.messages import (
+    FrameIndex,
+    Span,
+    read_box,
+    read_calibration,
+    read_camera_labels,
+    read_index,
+    segment_name,
+    take_index,
+)
+from log2sim.logs.waymo.range_images import read_range_images
+from log2sim.logs.waymo.segment import (
+    CAMERAS,
+    BoxTable,
+    CameraCalibration,
+    FrameRow,
+    LaserCalibration,
+    RangeImages,
+    Segment,
+)
+from log2sim.logs.waymo.tfrecord import RecordFile, starts_like_tfrecord
+from log2sim.logs.waymo.wire import WireError
+
+SUFFIX = ".tfrecord"
+MAX_STAMP_US = 9_000_000_000_000_000
+
+Calibration = tuple[dict[int, CameraCalibration], dict[int, LaserCalibration], dict[str, str]]
+
+
+class WaymoReader:
+    """Reader of segments of version 1; the root is a file or a folder of files."""
+
+    name = "waymo"
+    looks_for = "a .tfrecord file of the Waymo Open Dataset (perception, version 1), or a folder of such files"
+    suffixes = (SUFFIX,)
+
+    def matches(self, path: Path) -> bool:
+        """Return whether the file is a TFRecord file, or the folder holds some."""
+        return any(starts_like_tfrecord(file) for file in _files(path))
+
+    def sequences(self, path: Path) -> list[str]:
+        """Return the names of the files without their suffix, sorted."""
+        return [file.name.removesuffix(SUFFIX) for file in _files(path)]
+
+    def open(self, path: Path, sequence: str) -> Log:
+        """Open a segment; no picture, range image or label is read."""
+        return _SegmentFile(path if path.is_file() else path / f"{sequence}{SUFFIX}").log()
+
+
+READER = WaymoReader()
+
+
+def _files(path: Path) -> list[Path]:
+    try:
+        return [path] if path.is_file() else sorted(file for file in path.glob(f"*{SUFFIX}") if file.is_file())
+    except OSError:
+        return []
+
+
+@dataclass(eq=False)
+class _Frames:
+    """Usable frames of a file: number of the record and index of each, why others are not, and what all share."""
+
+    record: list[int] = field(default_factory=list)
+    index: list[FrameIndex] = field(default_factory=list)
+    kept_out: list[str] = field(default_factory=list)
+    context: bytes = b""
+    name: str = ""
+    calibration: Calibration = field(default_factory=lambda: ({}, {}, {}))
+
+
+class _SegmentFile:
+    def __init__(self, path: Path) -> None:
+        self.path, self.file = path, RecordFile(path)
+
+    def log(self) -> Log:
+        self.frames = frames = self._read_frames()
+        notes = [*self.file.notes]
+        if frames.kept_out:
+            notes.append(f"{len(frames.kept_out)} of {len(self.file.spans)} records kept out; {frames.kept_out[0]}")
+        if not frames.index:
+            raise LogError(f"{self.path}: no usable frame; {'; '.join(notes) or 'the file is empty'}")
+        index, (cameras, lasers, stats) = frames.index, frames.calibration
+        projected = any(f.projected_labels for f in index)
+        drawn = any(f.camera_labels for f in index)
+        segment = Segment(
+            name=frames.name,
+            cameras=cameras,
+            lasers=lasers,
+            frames=[_row(f) for f in index],
+            image=self._image,
+            ranges=self._ranges,
+            boxes=self._boxes if any(f.labels for f in index) else None,
+            image_boxes=(lambda camera: self._image_boxes(camera, projected)) if projected or drawn else None,
+            image_boxes_are_projected=projected,
+            where=self._where,
+            details={**stats, "frames": len(index)},
+            notes=notes,
+        )
+        stamps = " ".join(str(f.stamp_us) for f in index)
+        return log_of(segment, READER.name, digest_of([frames.name, frames.context.hex(), stamps], [self.path]))
+
+    def _read_frames(self) -> _Frames:
+        """Read the index of every frame of the segment to which the first one belongs."""
+        out = _Frames()
+        for k in range(len(self.file.spans)):
+            try:
+                with self.file.window(k) as window:
+                    index = read_index(window)
+                    name = segment_name(window, index.context)
+                    if not out.index:
+                        out.context, out.name = take_index(window, index.context), name
+                        out.calibration = read_calibration(out.context)
+            except (WireError, OSError) as error:
+                out.kept_out.append(f"record {k}: not a readable frame: {error}")
+                continue
+            problem = _problem(index, name, out.name)
+            if problem:
+                out.kept_out.append(f"record {k}: {problem}")
+                continue
+            out.record.append(k)
+            out.index.append(index)
+        return out
+
+    def _where(self, frame: int) -> str:
+        return f"{self.path}: record {self.frames.record[frame]}"
+
+    def _data(self, frame: int) -> bytes:
+        stamp = self.frames.index[frame].stamp_us
+        return self.file.read(self.frames.record[frame], f"record {self.frames.record[frame]}, stamp {stamp} us")
+
+    def _image(self, frame: int, camera: int) -> bytes:
+        _, (begin, end) = self.frames.index[frame].images[camera]
+        return self._data(frame)[begin:end]
+
+    def _ranges(self, frame: int, laser: int) -> RangeImages:
+        begin, end = self.frames.index[frame].lasers[laser]
+        data = self._data(frame)[begin:end]
+        try:
+            return read_range_images(data)
+        except WireError as error:
+            raise RecordError(f"{self._where(frame)}, LiDAR {laser}: {error}") from None
+
+    def _boxes(self) -> BoxTable:
+        def boxes(data: bytes) -> list[tuple[str, int, list[float]]]:
+            box = read_box(data, 3)
+            return [] if box is None else [box]
+
+        rows = self._labels(lambda index: index.labels, boxes)
+        return BoxTable.of(rows, 3)
+
+    def _image_boxes(self, camera: int, projected: bool) -> BoxTable:
+        def boxes(data: bytes) -> list[tuple[str, int, list[float]]]:
+            number, found = read_camera_labels(data)
+            return found if number == camera else []
+
+        rows = self._labels(lambda index: index.projected_labels if projected else index.camera_labels, boxes)
+        return BoxTable.of(rows, 2)
+
+    def _labels(
+        self, spans: Callable[[FrameIndex], list[Span]], boxes: Callable[[bytes], list[tuple[str, int, list[float]]]]
+    ) -> list[tuple[int, str, int, list[float]]]:
+        """Rows of frame, id, type and box from the spans of messages; a message that cannot be read is left out."""
+        rows = []
+        for k, (record, index) in enumerate(zip(self.frames.record, self.frames.index)):
+            with self.file.window(record) as window:
+                for span in spans(index):
+                    try:
+                        rows += [(k, *box) for box in boxes(take_index(window, span))]
+                    except WireError:
+                        continue
+        return rows
+
+
+def _row(index: FrameIndex) -> FrameRow:
+    # `_problem` keeps others out.
+    assert index.stamp_us is not None
+    assert index.pose is not None
+    images = {number: times for number, (times, _) in index.images.items() if number in CAMERAS}
+    return FrameRow(index.stamp_us * 1000, index.pose, images, tuple(index.lasers))
+
+
+def _problem(index: FrameIndex, name: str, expected: str) -> str:
+    """Why a frame cannot be used; empty when it can."""
+    if index.stamp_us is None or not 0 < index.stamp_us < MAX_STAMP_US:
+        return f"timestamp_micros is {index.stamp_us}, expected microseconds since 1970"
+    if index.pose is None:
+        return "no rigid pose"
+    if name != expected:
+        return f"of segment '{name}', the file's first frame is of '{expected}'; expected one segment a file"
+    return ""

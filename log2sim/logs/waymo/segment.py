@@ -1,0 +1,251 @@
+"""What both versions of the data set hold of a segment, before it becomes a log.
+
+Letters in shapes: F frames, I images, B boxes, H rows and W columns of a range image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import NS_PER_S, Array
+
+# Enumerations of dataset.proto and label.proto, by their numbers.
+CAMERAS = {
+    1: "FRONT", 2: "FRONT_LEFT", 3: "FRONT_RIGHT", 4: "SIDE_LEFT", 5: "SIDE_RIGHT", 6: "REAR_LEFT", 7: "REAR", 8: "REAR_RIGHT",
+}  # fmt: skip
+LASERS = {1: "TOP", 2: "FRONT", 3: "SIDE_LEFT", 4: "SIDE_RIGHT", 5: "REAR"}
+TYPES = {1: "vehicle", 2: "pedestrian", 3: "sign", 4: "cyclist"}
+TOP = 1
+FRONT_CAMERA = 1
+
+# Unix times beyond this do not fit into int64 nanoseconds.
+MAX_TIME_S = 9e9
+ROTATION_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class CameraCalibration:
+    """Calibration of a camera as the data set has it.
+
+    Attributes
+    ----------
+    intrinsic : (9,) float64
+        f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3.
+    vehicle_T_camera : (4, 4) float64
+        The camera's frame has x forward, y left, z up.
+    width_px, height_px : int
+    direction : int
+        RollingShutterReadOutDirection.
+    """
+
+    intrinsic: Array
+    vehicle_T_camera: Array
+    width_px: int
+    height_px: int
+    direction: int
+
+
+@dataclass(frozen=True, eq=False)
+class LaserCalibration:
+    """Calibration of a LiDAR.
+
+    Attributes
+    ----------
+    vehicle_T_lidar : (4, 4) float64
+    inclinations_rad : (n,) float64
+        Of the beams from the lowest to the highest; empty where they are spread evenly between the limits.
+    limits_rad : (2,) tuple of float
+        Lowest and highest inclination.
+    """
+
+    vehicle_T_lidar: Array
+    inclinations_rad: Array
+    limits_rad: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class ImageTimes:
+    """When an image was taken, and from where.
+
+    Attributes
+    ----------
+    world_T_vehicle : (4, 4) float64 or None
+        Pose of the vehicle at `pose_s`.
+    pose_s, shutter_s, trigger_s, readout_done_s : float, s
+        Unix times, and the duration of the exposure of one line; 0 where the data set has none.
+    """
+
+    world_T_vehicle: Array | None
+    pose_s: float
+    shutter_s: float
+    trigger_s: float
+    readout_done_s: float
+
+    def middle_ns(self) -> int | None:
+        """Return the middle of the exposure of the middle line; None where the data set does not tell it.
+
+        Notes
+        -----
+        The first line is exposed from the trigger on, the last one until its readout at the end (comments of CameraImage in
+        dataset.proto): half a shutter after the trigger and half a shutter before the end lie the middles of both.
+        """
+        if not 0 < self.trigger_s <= self.readout_done_s < MAX_TIME_S:
+            return self.pose_ns()
+        return round((self.trigger_s + (self.readout_done_s - self.trigger_s) / 2) * NS_PER_S)
+
+    def readout_s(self) -> float | None:
+        """Return the time from the middle of the first line's exposure to that of the last one's."""
+        span_s = self.readout_done_s - self.trigger_s - self.shutter_s
+        return span_s if self.trigger_s > 0 and 0 < span_s < 1 else None
+
+    def pose_ns(self) -> int | None:
+        """Return the stamp of the pose; None where the data set has none."""
+        return round(self.pose_s * NS_PER_S) if 0 < self.pose_s < MAX_TIME_S else None
+
+
+@dataclass(frozen=True, eq=False)
+class FrameRow:
+    """One frame: a turn of the TOP LiDAR with the images taken during it.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Of the first column of the TOP LiDAR's turn.
+    world_T_vehicle : (4, 4) float64
+        Pose that defines the frame of points and labels, about the middle of the turn.
+    images : mapping of camera number to ImageTimes
+    lasers : tuple of int
+        Numbers of the LiDARs with points.
+    """
+
+    stamp_ns: int
+    world_T_vehicle: Array
+    images: Mapping[int, ImageTimes]
+    lasers: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class RangeImages:
+    """Range images of one LiDAR in one frame.
+
+    Attributes
+    ----------
+    returns : tuple of (H, W, C) float32
+        First channel: range in m, not positive where nothing returned.
+    poses : (H, W, 6) float32 or None
+        Roll, pitch, yaw, x, y, z of the vehicle in the world at the time of each pixel.
+    """
+
+    returns: tuple[NDArray[np.float32], ...]
+    poses: NDArray[np.float32] | None
+
+
+@dataclass(frozen=True, eq=False)
+class BoxTable:
+    """Labeled boxes, in 3D in the vehicle's frame or upright in an image.
+
+    Attributes
+    ----------
+    frame : (B,) int64
+        Index of the frame.
+    track_id : (B,) str
+    kind : (B,) int64
+        Type by its number in label.proto.
+    center : (B, 3) or (B, 2) float64
+        m, or px.
+    size : (B, 3) or (B, 2) float64
+        Length, width, height in m, or length (along u) and width (along v) in px.
+    heading_rad : (B,) float64
+    """
+
+    frame: NDArray[np.int64]
+    track_id: NDArray[np.str_]
+    kind: NDArray[np.int64]
+    center: Array
+    size: Array
+    heading_rad: Array
+
+    @classmethod
+    def of(cls, rows: list[tuple[int, str, int, Any]], dimensions: int) -> BoxTable:
+        """Build the table of rows of frame, id, type and box, (2 dimensions + 1,) numbers: center, size, heading."""
+        box = np.array([row[3] for row in rows], dtype=np.float64).reshape(-1, 2 * dimensions + 1)
+        return cls(
+            np.array([row[0] for row in rows], dtype=np.int64),
+            np.array([row[1] for row in rows], dtype=np.str_),
+            np.array([row[2] for row in rows], dtype=np.int64),
+            box[:, :dimensions],
+            box[:, dimensions : 2 * dimensions],
+            box[:, -1],
+        )
+
+    def take(self, rows: NDArray[Any]) -> BoxTable:
+        """Return some of the rows."""
+        return BoxTable(
+            self.frame[rows],
+            self.track_id[rows],
+            self.kind[rows],
+            self.center[rows],
+            self.size[rows],
+            self.heading_rad[rows],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """One segment of either version, with functions that read its records.
+
+    Attributes
+    ----------
+    name : str
+    cameras : mapping of number to CameraCalibration
+    lasers : mapping of number to LaserCalibration
+    frames : list of FrameRow
+        Not yet in order.
+    image : callable
+        Returns the JPEG of a frame by index and camera by number; raises `RecordError`.
+    ranges : callable
+        Returns the range images of a frame by index and LiDAR by number; raises `RecordError`.
+    boxes : callable or None
+        Reads the 3D labels; None for a segment without any.
+    image_boxes : callable or None
+        Reads the 2D labels of a camera by number; None for a segment without any.
+    image_boxes_are_projected : bool
+        Whether `image_boxes` are the 3D labels projected into the images, not drawn in them.
+    where : callable
+        Names a frame by index in errors.
+    details : mapping
+        For `log2sim inspect`.
+    notes : list of str
+    """
+
+    name: str
+    cameras: Mapping[int, CameraCalibration]
+    lasers: Mapping[int, LaserCalibration]
+    frames: list[FrameRow]
+    image: Callable[[int, int], bytes]
+    ranges: Callable[[int, int], RangeImages]
+    boxes: Callable[[], BoxTable] | None
+    image_boxes: Callable[[int], BoxTable] | None
+    image_boxes_are_projected: bool
+    where: Callable[[int], str]
+    details: Mapping[str, Any] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+def rigid(numbers: Array) -> Array | None:
+    """Return the transform (4, 4) of 16 numbers in rows, its rotation made exact; None when they are none."""
+    if numbers.shape != (16,) or not np.isfinite(numbers).all() or np.abs(numbers).max() > 1e9:
+        return None
+    out = numbers.reshape(4, 4).copy()
+    rotation = out[:3, :3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        return None
+    # Version 2 may hold them in single precision.
+    u, _, vt = np.linalg.svd(rotation)
+    out[:3, :3], out[3] = u @ vt, (0.0, 0.0, 0.0, 1.0)
+    return out

@@ -1,0 +1,332 @@
+"""Waymo: checksums, records, the wire format and range images, each against its description."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import SHARED
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from log_encoders.waymo import (
+    Ranges,
+    bitwise_crc32c,
+    compressed,
+    fixed64,
+    laser_message,
+    message,
+    record,
+    varint,
+    whole,
+)
+
+from log2sim.errors import LogError, RecordError
+from log2sim.geometry import apply, inverse, rotation_from_rpy, transform
+from log2sim.logs.waymo import tfrecord
+from log2sim.logs.waymo.crc32c import LANES, crc32c, masked_crc32c
+from log2sim.logs.waymo.range_images import (
+    column_azimuths,
+    points_of,
+    read_matrix,
+    read_range_images,
+    row_inclinations,
+    turn_of,
+)
+from log2sim.logs.waymo.segment import LaserCalibration, RangeImages
+from log2sim.logs.waymo.tfrecord import RecordFile, starts_like_tfrecord
+from log2sim.logs.waymo.wire import BYTES, WireError, doubles, fields_of, varints
+
+LASER = LaserCalibration(np.eye(4), np.array([-0.3, -0.1, 0.0, 0.05]), (0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("message_", "crc"),
+    [
+        (bytes(32), 0x8A9136AA),
+        (b"\xff" * 32, 0x62A8AB43),
+        (bytes(range(32)), 0x46DD794E),
+        (bytes(range(31, -1, -1)), 0x113FDB5C),
+        (bytes.fromhex("01c00000000000000000000000000000140000000000040000000014000000182800000000000000"
+                       "0200000000000000"), 0xD9963A56),
+        (b"123456789", 0xE3069283),
+    ],
+)  # fmt: skip
+def test_the_crc_is_that_of_rfc_3720(message_: bytes, crc: int) -> None:
+    """Vectors of RFC 3720, B.4, and the check value of the catalog of CRC parameters."""
+    assert crc32c(message_) == crc
+
+
+@pytest.mark.parametrize("size", [0, 1, 1023, 1024, 1025, 4 * LANES - 4, 4 * LANES, 4 * LANES + 3, 12 * LANES + 5])
+def test_the_crc_in_lanes_is_that_byte_by_byte(size: int) -> None:
+    data = np.random.default_rng(size).bytes(size)
+    assert crc32c(data) == bitwise_crc32c(data)
+
+
+def test_one_changed_bit_anywhere_changes_the_crc() -> None:
+    data = bytearray(np.random.default_rng(0).bytes(70_001))
+    before = crc32c(bytes(data))
+    for place in (0, 3, 4, 20_000, 69_999, 70_000):
+        data[place] ^= 16
+        assert crc32c(bytes(data)) != before
+        data[place] ^= 16
+
+
+def records_file(path: Path, *parts: bytes) -> Path:
+    path.write_bytes(b"".join(parts))
+    return path
+
+
+def test_records_are_found_and_read(tmp_path: Path) -> None:
+    texts = [b"one", b"", b"three" * 1000]
+    file = RecordFile(records_file(tmp_path / "a", *(record(t) for t in texts)))
+    assert [file.read(k, "") for k in range(3)] == texts
+    assert file.notes == []
+    with file.window(2) as window:
+        assert window.peek(4990, 20) == b"threethree"
+        assert window.take(0, 4000) == texts[2][:4000]
+
+
+@pytest.mark.parametrize("cut", [1, 4, 7, 20, 23, 24])
+def test_a_truncated_last_record_alone_is_kept_out(tmp_path: Path, cut: int) -> None:
+    whole_file = record(b"one") + record(b"second!!")
+    file = RecordFile(records_file(tmp_path / "a", whole_file[:-cut]))
+    assert [file.read(k, "") for k in range(len(file.spans))] == [b"one"]
+    assert cut == 24 or ("record 1 at offset 19" in file.notes[0] and "truncated" in file.notes[0])
+    assert len(file.notes) == (cut != 24)
+
+
+def test_damaged_data_lose_their_record_only(tmp_path: Path) -> None:
+    data = bytearray(record(b"one") + record(b"second") + record(b"third"))
+    data[19 + 12] ^= 1
+    file = RecordFile(records_file(tmp_path / "a.tfrecord", bytes(data)))
+    assert file.read(0, "") == b"one"
+    assert file.read(2, "") == b"third"
+    with pytest.raises(
+        RecordError, match=r"a\.tfrecord \(frame 1\): damaged: the CRC of its 6 bytes at offset 31 is 0x"
+    ):
+        file.read(1, "frame 1")
+
+
+def test_a_damaged_length_keeps_out_what_cannot_be_found(tmp_path: Path) -> None:
+    whole_file = bytearray(record(b"one") + record(b"second") + record(b"third"))
+    wrong_crc = whole_file.copy()
+    wrong_crc[19 + 9] ^= 1
+    file = RecordFile(records_file(tmp_path / "a", bytes(wrong_crc)))
+    assert [file.read(k, "") for k in range(2)] == [b"one", b"third"]
+    assert "record 1 at offset 19: the CRC of its length is wrong; kept out" in file.notes[0]
+    wrong_length = whole_file.copy()
+    wrong_length[19 + 1] = 200
+    file = RecordFile(records_file(tmp_path / "b", bytes(wrong_length)))
+    assert len(file.spans) == 1
+    assert "it and what follows are kept out" in file.notes[0]
+
+
+def test_what_is_no_tfrecord_is_refused(tmp_path: Path) -> None:
+    for data in (b"hello, this is a text file", bytes(100)):
+        path = records_file(tmp_path / "a.tfrecord", data)
+        assert not starts_like_tfrecord(path)
+        with pytest.raises(LogError, match="expected a TFRecord file"):
+            RecordFile(path)
+    assert not starts_like_tfrecord(tmp_path / "missing")
+    assert not starts_like_tfrecord(tmp_path)
+
+
+def test_a_record_that_claims_too_much_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    length = struct.pack("<Q", 1 << 40)
+    path = records_file(tmp_path / "a", length + struct.pack("<I", masked_crc32c(length)))
+    with path.open("r+b") as file:
+        file.truncate((1 << 40) + 16)  # a sparse file
+    with pytest.raises(LogError, match="more than the"):
+        RecordFile(path)
+
+
+def test_a_record_is_read_once_for_all_its_streams(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = RecordFile(records_file(tmp_path / "a", *(record(bytes([k])) for k in range(9))))
+    checked = []
+    monkeypatch.setattr(tfrecord, "masked_crc32c", lambda data: checked.append(data) or masked_crc32c(data))
+    for k in (0, 0, 1, 0, 1, 2):
+        file.read(k, "")
+    assert checked == [b"\0", b"\1", b"\2"]
+
+
+@given(st.integers(0, 2**64 - 1), st.floats(allow_nan=False), st.binary(max_size=300))
+def test_fields_are_those_that_were_written(number: int, real: float, text: bytes) -> None:
+    data = whole(1, number) + fixed64(2, real) + message(3, text) + message(300, b"")
+    a, b, c, d = fields_of(data)
+    assert (a.number, a.value, b.number, b.real(), c.number) == (1, number, 2, real, 3)
+    assert data[c.begin : c.end] == text
+    assert (d.number, d.kind, d.end) == (300, BYTES, len(data))
+
+
+@given(st.binary(max_size=60))
+def test_arbitrary_bytes_are_fields_or_an_error(data: bytes) -> None:
+    with suppress(WireError):
+        assert all(0 <= f.begin <= f.end <= len(data) for f in fields_of(data))
+
+
+def test_repeated_numbers_are_read_packed_or_not() -> None:
+    values = [1.5, -2.0, 1e300]
+    loose = b"".join(fixed64(2, v) for v in values)
+    packed = message(2, struct.pack("<3d", *values))
+    for data in (loose, packed):
+        np.testing.assert_array_equal(doubles(data, list(fields_of(data))), values)
+    assert varints(varint(3) + varint(2650) + varint(6)) == [3, 2650, 6]
+
+
+def test_rows_and_columns_look_where_the_schema_says() -> None:
+    """Rows from the top beam down; columns from the rear over the left, in the azimuth of the vehicle."""
+    np.testing.assert_array_equal(row_inclinations(LASER, 4), [0.05, 0.0, -0.1, -0.3])
+    even = LaserCalibration(np.eye(4), np.zeros(0), (-0.5, 0.3))
+    np.testing.assert_allclose(row_inclinations(even, 4), [0.2, 0.0, -0.2, -0.4])
+    np.testing.assert_allclose(np.degrees(column_azimuths(LASER, 4)), [135.0, 45.0, -45.0, -135.0])
+    turned = LaserCalibration(
+        transform(rotation_from_rpy(0, 0, np.radians(148.0)), [1, 2, 3.0]), LASER.inclinations_rad, (0, 0)
+    )
+    in_vehicle = apply(turned.vehicle_T_lidar, [[np.cos(a), np.sin(a), 0.0] for a in column_azimuths(turned, 4)]) - [
+        1,
+        2,
+        3,
+    ]
+    np.testing.assert_allclose(
+        np.degrees(np.arctan2(in_vehicle[:, 1], in_vehicle[:, 0])), [135, 45, -45, -135], atol=1e-9
+    )
+    np.testing.assert_allclose(turn_of(in_vehicle + np.array([1, 2, 3]), turned), [0.125, 0.375, 0.625, 0.875])
+    with pytest.raises(WireError, match="5 rows, the calibration 4 beams"):
+        row_inclinations(LASER, 5)
+
+
+def range_image(points: dict[tuple[int, int], float], shape: tuple[int, int] = (4, 8)) -> np.ndarray:
+    image = np.full((*shape, 4), -1.0, np.float32)
+    for place, reach in points.items():
+        image[(*place, 0)] = reach
+    return image
+
+
+def test_both_returns_become_points_and_pixels_without_return_do_not() -> None:
+    first, second = range_image({(1, 4): 20.0, (1, 0): 10.0, (2, 2): 0.0}), range_image({(1, 3): 8.0, (0, 0): np.nan})
+    laser = read_range_images(laser_message(1, Ranges([first, second])))
+    assert len(laser.returns) == 2
+    assert laser.poses is None
+    xyz, turn = points_of(laser, LASER, np.eye(4))
+    a = np.pi / 8
+    np.testing.assert_allclose(
+        xyz,
+        [[-10 * np.cos(a), 10 * np.sin(a), 0], [20 * np.cos(a), -20 * np.sin(a), 0], [8 * np.cos(a), 8 * np.sin(a), 0]],
+        atol=1e-5,
+    )
+    np.testing.assert_allclose(turn, [0.5 / 8, 4.5 / 8, 3.5 / 8])
+
+
+def test_points_are_taken_through_the_poses_of_their_pixels() -> None:
+    """At 10 m/s and turning, far from the world's zero: in the lidar's frame at the one pose, to the 4 mm of float32."""
+    rng = np.random.default_rng(2)
+    mount = transform(rotation_from_rpy(0.01, -0.02, 2.5), [1.4, 0.1, 2.1])
+    laser = LaserCalibration(mount, LASER.inclinations_rad, (0, 0))
+    image = range_image({(r, c): float(rng.uniform(3, 70)) for r in range(4) for c in range(8)})
+    place = np.array([-25211.3, 42391.1, -160.6])
+    angles, moved = rng.normal(0, 0.02, (8, 3)) + np.array([0, 0, 1.9]), rng.normal(0, 0.5, (8, 3))
+    world_T_vehicle = transform(rotation_from_rpy(*angles.T), place + moved)
+    poses = np.broadcast_to(np.concatenate([angles, place + moved], axis=1), (4, 8, 6)).astype(np.float32)
+    xyz, turn = points_of(RangeImages((image,), poses), laser, world_T_vehicle[3])
+    own, _ = points_of(RangeImages((image,), None), laser, world_T_vehicle[3])
+    column = np.round(turn * 8 - 0.5).astype(int)
+    expected = apply(inverse(world_T_vehicle[3] @ mount), apply(world_T_vehicle[column] @ mount, own))
+    assert np.abs(xyz - own).max() > 0.3
+    np.testing.assert_allclose(xyz, expected, atol=0.004)
+    np.testing.assert_allclose(xyz[column == 3], own[column == 3], atol=0.004)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "words"),
+    [
+        (b"not zlib", "cannot be decompressed"),
+        (compressed(np.zeros((4, 8, 4), np.float32))[:-3], "truncated"),
+        (zlib.compress(bytes(100 * 1024 * 1024)), "unpacks to more than"),
+        (zlib.compress(message(1, bytes(16)) + message(2, whole(1, 2) + whole(1, 2))), "shape [2, 2]"),
+        (zlib.compress(message(1, bytes(16)) + message(2, whole(1, 2) + whole(1, 2) + whole(1, 4))), "4 values"),
+        (zlib.compress(message(1, bytes(15)) + message(2, whole(1, 1) * 3)), "15 bytes"),
+        (zlib.compress(message(2, whole(1, 2**63) * 3)), "shape [9223372036854775808"),
+        (zlib.compress(b"\xff\xff"), "varint"),
+        (zlib.compress(b""), "shape []"),
+    ],
+)
+def test_a_damaged_matrix_is_refused_in_one_line(matrix: bytes, words: str) -> None:
+    with pytest.raises(WireError) as caught:
+        read_matrix(matrix)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_range_images_of_unequal_shapes_are_refused() -> None:
+    with pytest.raises(WireError, match="2 shapes"):
+        read_range_images(laser_message(1, Ranges([np.zeros((4, 8, 4), np.float32), np.zeros((4, 9, 4), np.float32)])))
+    with pytest.raises(WireError, match="poses of the pixels"):
+        read_range_images(laser_message(1, Ranges([np.zeros((4, 8, 4), np.float32)], np.zeros((4, 9, 6), np.float32))))
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.data())
+def test_a_damaged_laser_gives_points_or_an_error(data: st.DataObject) -> None:
+    image = np.full((4, 8, 4), 5.0, np.float32)
+    laser = bytearray(laser_message(1, Ranges([image, image], np.zeros((4, 8, 6), np.float32))))
+    for _ in range(data.draw(st.integers(1, 4))):
+        laser[data.draw(st.integers(0, len(laser) - 1))] = data.draw(st.integers(0, 255))
+    with suppress(WireError):
+        xyz, turn = points_of(read_range_images(bytes(laser)), LASER, np.eye(4))
+        assert len(xyz) == len(turn)
+        assert np.all((turn >= 0) & (turn < 1))
+
+
+@pytest.fixture(scope="module")
+def recorded_cloud() -> np.ndarray:
+    """A recorded cloud (N, 3) in the vehicle's frame: the first 59 158 points are pixels of the TOP LiDAR, row by row."""
+    import lzma
+
+    path = SHARED / "data" / "waymo" / "openpcdet_waymo_0004.npy.xz"
+    if not path.is_file():
+        pytest.skip("the recorded cloud is not beside this checkout (../shared/data/waymo)")
+    with lzma.open(path) as file:
+        return np.load(file)[:, :3].astype(np.float64)
+
+
+# The mount of the TOP LiDAR in the recorded frame, which is of another segment.
+TOP_MOUNT = transform(rotation_from_rpy(0.0, 0.0, np.radians(148.0)), [1.43, 0.0, 2.184])
+
+
+@pytest.mark.real
+def test_recorded_pixels_run_as_the_columns_do(recorded_cloud: np.ndarray) -> None:
+    """In the order of the recorded pixels the share of the turn rises along a row, and rows go from the top beam down."""
+    laser = LaserCalibration(TOP_MOUNT, np.zeros(0), (0.0, 0.0))
+    top = recorded_cloud[:55_000]
+    step = np.diff(turn_of(top, laser))
+    new_row = step < -0.5
+    assert 20 < new_row.sum() < 60
+    assert np.mean(step[~new_row & (np.abs(step) < 0.5)] > 0) > 0.95
+    inclination = np.arcsin((top - TOP_MOUNT[:3, 3])[:, 2] / np.linalg.norm(top - TOP_MOUNT[:3, 3], axis=1))
+    per_row = [np.median(part) for part in np.split(inclination, np.flatnonzero(new_row) + 1) if len(part) > 500]
+    assert np.all(np.diff(per_row) < 0)
+
+
+@pytest.mark.real
+def test_a_recorded_cloud_survives_a_range_image(recorded_cloud: np.ndarray) -> None:
+    """A recorded cloud, sorted into the pixels of the TOP LiDAR's layout by the schema, is decoded to within half a pixel."""
+    rows, columns, low, high = 200, 2650, -0.4, 0.12
+    laser = LaserCalibration(TOP_MOUNT, np.linspace(low, high, rows), (0.0, 0.0))
+    own = apply(inverse(TOP_MOUNT), recorded_cloud)
+    reach = np.linalg.norm(own, axis=1)
+    inclination = np.arcsin(own[:, 2] / reach)
+    seen = (inclination > low) & (inclination < high)
+    row = rows - 1 - np.round((inclination - low) / (high - low) * (rows - 1)).astype(int)
+    column = np.floor(turn_of(recorded_cloud, laser) * columns).astype(int)
+    image = np.full((rows, columns, 4), -1.0, np.float32)
+    image[row[seen], column[seen], 0] = reach[seen]
+    decoded, _ = points_of(read_range_images(laser_message(1, Ranges([image]))), laser, np.eye(4))
+    last = {(r, c): k for k, r, c in zip(np.flatnonzero(seen), row[seen], column[seen])}
+    source = np.array([last[place] for place in zip(*np.nonzero(image[..., 0] > 0))])
+    off = np.linalg.norm(decoded - own[source], axis=1) / reach[source]
+    assert len(decoded) > 50_000
+    assert off.max() <= np.hypot(np.pi / columns, (high - low) / (rows - 1) / 2) * 1.001
