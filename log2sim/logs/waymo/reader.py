@@ -113,8 +113,8 @@ class _SegmentFile:
             details={**stats, "frames": len(index)},
             notes=notes,
         )
-        stamps = " ".join(str(f.stamp_us) for f in index)
-        return log_of(segment, READER.name, digest_of([frames.name, frames.context.hex(), stamps], [self.path]))
+        records = [f"{f.stamp_us} {self.file.spans[k][1]}" for k, f in zip(frames.record, index)]
+        return log_of(segment, READER.name, digest_of([frames.name, frames.context.hex(), *records], []))
 
     def _read_frames(self) -> _Frames:
         """Read the index of every frame of the segment to which the first one belongs."""

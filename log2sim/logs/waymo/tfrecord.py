@@ -22,7 +22,7 @@ MAX_RECORDS = 20_000
 # Records whose bytes are kept: the streams of a frame share it, and ticks are read some ahead.
 MAX_KEPT_RECORDS = 3
 # Bytes read at once where only headers of fields are wanted; images between them are skipped.
-BLOCK_BYTES = 2048
+BLOCK_BYTES = 512
 
 
 def starts_like_tfrecord(path: Path) -> bool:
