@@ -17,6 +17,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "kitti-object": "log2sim.logs.kitti.object:READER",
         "pandaset": "log2sim.logs.pandaset.reader:READER",
         "waymo": "log2sim.logs.waymo.reader:READER",
+        "ros": "log2sim.logs.ros.reader:READER",
     },
     "detector": {
         "ssd-mobilenet-v2": "log2sim.perception.detect.ssd_mobilenet:create",

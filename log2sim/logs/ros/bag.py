@@ -1,0 +1,201 @@
+"""A recording as topics: the messages of all its files in the order of recording, read by number."""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.errors import LogError, RecordError
+from log2sim.logs.ros.containers import Channel, Container
+from log2sim.logs.ros.recordings import Recording, recorded_files
+from log2sim.logs.sweeps import PARSER_ERRORS
+
+ENCODINGS = ("ros1", "cdr")
+STAMP = slice(4, 12)
+"""Bytes of header.stamp in a message: after the sequence number in ROS 1, after the encapsulation in CDR."""
+NAME_BYTES = 272
+"""Of a message that hold its stamp and its frame_id."""
+
+
+@dataclass(frozen=True, eq=False)
+class Topic:
+    """Messages of one topic; M is their number, i counts them in the order of recording.
+
+    Attributes
+    ----------
+    name, msgtype, encoding, definition : str
+        As in `containers.Channel`.
+    file : (M,) int
+        Index of the file of each message.
+    entry : (M,) int
+        Its number there.
+    recorded_ns : (M,) int64
+        When the recorder received it.
+    """
+
+    name: str
+    msgtype: str
+    encoding: str
+    definition: str
+    file: NDArray[np.intp]
+    entry: NDArray[np.intp]
+    recorded_ns: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        """Return the number of messages."""
+        return len(self.entry)
+
+
+class Bag:
+    """The files of a recording.
+
+    Attributes
+    ----------
+    topics : dict of str to Topic
+        Sorted by name.
+    notes : list of str
+    digest : str
+        SHA-256 over names, sizes and indexes of the files.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        self.notes: list[str] = []
+        paths, compression = recorded_files(recording, self.notes)
+        self.files: list[Container] = []
+        for path in paths:
+            try:
+                self.files.append(open_container(path, compression))
+            except (LogError, OSError) as error:
+                # One damaged part of a split recording leaves the others.
+                if len(paths) == 1:
+                    raise LogError(str(error)) from None
+                self.notes.append(f"{error}; that part of the recording is left out")
+        if not self.files:
+            raise LogError(f"{recording.place}: none of its {len(paths)} files can be read")
+        self.notes += [note for file in self.files for note in file.notes]
+        self.topics = self._join()
+        self.digest = self._digest()
+
+    def read(self, topic: Topic, i: int, limit_bytes: int | None = None) -> bytes:
+        """Read message `i` of a topic, or its first `limit_bytes`; `RecordError` where it is damaged."""
+        file = self.files[int(topic.file[i])]
+        try:
+            return file.message(int(topic.entry[i]), limit_bytes)
+        except PARSER_ERRORS as problem:
+            raise RecordError(f"{self.where(topic, i)}: cannot be read: {problem}") from None
+
+    def where(self, topic: Topic, i: int) -> str:
+        """Name file, topic and message `i` in errors."""
+        path = self.files[int(topic.file[i])].path
+        return f"{path}, topic '{topic.name}', message {i} (recorded at {topic.recorded_ns[i]})"
+
+    def collect(self, wanted: Mapping[str, int | None]) -> dict[str, list[bytes | None]]:
+        """Read all messages of some topics, or their first bytes, in one pass through the files.
+
+        Parameters
+        ----------
+        wanted : mapping of str to int or None
+            Topics with the number of bytes; None for whole messages.
+
+        Returns
+        -------
+        dict of str to list of bytes or None
+            By topic, in the order of recording; None for a damaged message.
+        """
+        topics = [self.topics[name] for name in wanted]
+        found: dict[str, list[bytes | None]] = {t.name: [None] * len(t) for t in topics}
+        if not topics:
+            return found
+        number = np.concatenate([np.full(len(t), k) for k, t in enumerate(topics)])
+        row = np.concatenate([np.arange(len(t)) for t in topics])
+        order = np.lexsort((np.concatenate([t.entry for t in topics]), np.concatenate([t.file for t in topics])))
+        for k, i in zip(number[order].tolist(), row[order].tolist()):
+            with suppress(RecordError):
+                found[topics[k].name][i] = self.read(topics[k], i, wanted[topics[k].name])
+        return found
+
+    def frame_id(self, topic: Topic) -> str:
+        """Name of the frame in the header of the first message that can be read; "" without one."""
+        for i in range(len(topic)):
+            try:
+                return frame_of(self.read(topic, i, NAME_BYTES), topic.encoding)
+            except (RecordError, struct.error, IndexError):
+                continue
+        return ""
+
+    def _join(self) -> dict[str, Topic]:
+        parts: dict[tuple[str, str, str], list[tuple[int, int]]] = {}
+        for f, file in enumerate(self.files):
+            for c, channel in enumerate(file.channels):
+                name = "/" + "/".join(part for part in channel.topic.split("/") if part)
+                parts.setdefault((name, channel.msgtype, channel.encoding), []).append((f, c))
+        topics: dict[str, Topic] = {}
+        for (name, msgtype, encoding), places in sorted(parts.items()):
+            topic = self._topic((name, msgtype, encoding), places)
+            other = topics.get(name)
+            if other is not None:
+                kept, left = (topic, other) if len(topic) > len(other) else (other, topic)
+                self.notes.append(f"{name}: has two types; {len(left)} messages of {left.msgtype} are left out")
+                topic = kept
+            topics[name] = topic
+        return topics
+
+    def _topic(self, key: tuple[str, str, str], places: Sequence[tuple[int, int]]) -> Topic:
+        file, entry, recorded = [], [], []
+        for f in dict.fromkeys(f for f, _ in places):
+            entries = self.files[f].entries
+            rows = np.flatnonzero(np.isin(entries.channel, [c for g, c in places if g == f]))
+            file.append(np.full(len(rows), f))
+            entry.append(rows)
+            recorded.append(entries.t_ns[rows])
+        first: Channel = self.files[places[0][0]].channels[places[0][1]]
+        return Topic(*key, first.definition, np.concatenate(file), np.concatenate(entry), np.concatenate(recorded))
+
+    def _digest(self) -> str:
+        value = hashlib.sha256()
+        for file in self.files:
+            value.update(f"{file.path.name} {file.path.stat().st_size}\n".encode())
+            for column in (file.entries.channel, file.entries.t_ns):
+                value.update(np.ascontiguousarray(column).astype("<i8").tobytes())
+        return value.hexdigest()
+
+
+def open_container(path: Path, compression: str = "") -> Container:
+    """Open one file of a recording by its magic bytes; `LogError` for anything else."""
+    from log2sim.logs.ros import mcap, rosbag1, sqlite
+
+    with path.open("rb") as stream:
+        head = stream.read(16)
+    if not head:
+        raise LogError(f"{path}: is empty; expected a ROS bag or an MCAP file")
+    if head.startswith(b"#ROSBAG"):
+        return rosbag1.Rosbag1(path)
+    if head.startswith(mcap.MAGIC):
+        return mcap.Mcap(path)
+    if head == sqlite.MAGIC:
+        return sqlite.SqliteBag(path, compression)
+    raise LogError(f"{path}: neither a ROS 1 bag nor MCAP nor an SQLite database by its first bytes")
+
+
+def stamp_of(head: bytes, encoding: str) -> int:
+    """Stamp in ns of a message that begins with a header."""
+    seconds, nanoseconds = struct.unpack(_order(head, encoding) + "iI", head[STAMP])
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+
+def frame_of(head: bytes, encoding: str) -> str:
+    """Return the frame_id of a message that begins with a header."""
+    (size,) = struct.unpack_from(_order(head, encoding) + "I", head, STAMP.stop)
+    return head[STAMP.stop + 4 : STAMP.stop + 4 + size].rstrip(b"\0").decode("utf-8", "replace").lstrip("/")
+
+
+def _order(head: bytes, encoding: str) -> str:
+    """Byte order: little in ROS 1, told by the second byte in CDR."""
+    return "<" if encoding == "ros1" or head[1] & 1 else ">"

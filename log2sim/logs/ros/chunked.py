@@ -1,0 +1,148 @@
+"""Files of chunks, as ROS 1 bags and MCAP have them: bytes by position, decompression with a limit, a cache of chunks."""
+
+from __future__ import annotations
+
+import bz2
+import importlib
+import os
+import threading
+import weakref
+import zlib
+from collections import OrderedDict
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from log2sim.errors import MissingExtra
+from log2sim.logs.ros.containers import checked_size
+
+MAX_CHUNK_BYTES = 512 * 1024 * 1024
+CACHED_BYTES = 64 * 1024 * 1024
+"""Of decompressed chunks; the last one is kept whatever its size."""
+
+
+class Chunk(NamedTuple):
+    """A chunk: where its stored bytes lie in the file, and what they unpack to."""
+
+    position: int
+    stored_bytes: int
+    size_bytes: int
+    compression: str
+    crc: int = 0
+
+
+class ChunkedFile:
+    """Reads ranges of a file and of the unpacked chunks in it, from any thread."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.chunks: list[Chunk] = []
+        self.size = path.stat().st_size
+        self._handle = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
+        weakref.finalize(self, os.close, self._handle)
+        self._lock = threading.Lock()
+        self._cache: OrderedDict[int, bytes] = OrderedDict()
+        self._intact: set[int] = set()
+
+    def at(self, position: int, count: int) -> bytes:
+        """Read `count` bytes; `ValueError` where the file ends before."""
+        if count < 0 or position < 0 or position + count > self.size:
+            raise ValueError(f"{count} bytes at byte {position} of a file of {self.size}; it is truncated or damaged")
+        with self._lock:
+            os.lseek(self._handle, position, os.SEEK_SET)
+            parts, missing = [], count
+            while missing and (part := os.read(self._handle, missing)):
+                parts.append(part)
+                missing -= len(part)
+        if missing:
+            raise ValueError(f"{count} bytes at byte {position}, but the file ends {missing} bytes before")
+        return b"".join(parts)
+
+    def within(self, chunk: int, offset: int, count: int) -> bytes:
+        """Read up to `count` bytes from `offset` of a chunk, or of the file for chunk -1; fewer at its end."""
+        if chunk < 0:
+            return self.at(offset, min(count, self.size - offset))
+        c = self.chunks[chunk]
+        if not 0 <= offset < c.size_bytes:
+            raise ValueError(f"message at byte {offset} of a chunk of {c.size_bytes}")
+        count = min(count, c.size_bytes - offset)
+        if c.compression in ("", "none"):
+            return self.at(c.position + offset, count)
+        return self.unpacked(chunk)[offset : offset + count]
+
+    def unpacked(self, chunk: int) -> bytes:
+        """Bytes of a chunk, decompressed and checked."""
+        with self._lock:
+            if chunk in self._cache:
+                self._cache.move_to_end(chunk)
+                return self._cache[chunk]
+        c = self.chunks[chunk]
+        if c.size_bytes > MAX_CHUNK_BYTES or c.stored_bytes > MAX_CHUNK_BYTES:
+            raise ValueError(f"a chunk of {c.size_bytes} bytes, more than the {MAX_CHUNK_BYTES} that it may have")
+        data = decompress(self.at(c.position, c.stored_bytes), c.compression, c.size_bytes)
+        if c.crc and zlib.crc32(data) != c.crc:
+            raise ValueError(f"the CRC of the chunk at byte {c.position} is wrong")
+        with self._lock:
+            self._cache[chunk] = data
+            self._intact.add(chunk)
+            while len(self._cache) > 1 and sum(map(len, self._cache.values())) > CACHED_BYTES:
+                self._cache.popitem(last=False)
+        return data
+
+    def check(self, chunk: int) -> None:
+        """Check the CRC of a chunk that has one, once; `ValueError` where it is wrong."""
+        if chunk >= 0 and self.chunks[chunk].crc and chunk not in self._intact:
+            self.unpacked(chunk)
+
+
+def decompress(data: bytes, method: str, size_bytes: int) -> bytes:
+    """Decompress data that unpack to `size_bytes`, without allocating more.
+
+    Raises
+    ------
+    ValueError, OSError, RuntimeError, EOFError
+        For damaged data, and for data that unpack to another size.
+    MissingExtra
+        Where the library of the method is not installed.
+    """
+    checked = min(size_bytes, MAX_CHUNK_BYTES)
+    unpacked = data if method in ("", "none") else decompress_head(data, method, checked + 1)
+    if len(unpacked) != size_bytes:
+        found = f"more than {checked}" if len(unpacked) > checked else f"{len(unpacked)}"
+        raise ValueError(f"unpacks to {found} bytes, expected {size_bytes}")
+    return unpacked
+
+
+def decompress_message(data: bytes, method: str, limit_bytes: int | None) -> bytes:
+    """Decompress a message that was compressed by itself, or its first `limit_bytes`."""
+    if not method:
+        return data
+    if limit_bytes is not None:
+        return decompress_head(data, method, limit_bytes)
+    unpacked = decompress_head(data, method, checked_size(MAX_CHUNK_BYTES // 2) + 1)
+    checked_size(len(unpacked))
+    return unpacked
+
+
+def decompress_head(data: bytes, method: str, limit_bytes: int) -> bytes:
+    """Decompress at most the first `limit_bytes` of data; `zstd` damage is a `ValueError` like that of the others."""
+    decompressor = _decompressor(method)
+    try:
+        head: bytes = decompressor.decompress(data, max_length=limit_bytes)
+    except Exception as error:  # the libraries have errors of their own
+        raise ValueError(f"damaged {method} data: {error}") from None
+    return head
+
+
+def _decompressor(method: str) -> Any:
+    if method == "bz2":
+        return bz2.BZ2Decompressor()
+    # Python has zstd from 3.14 on.
+    names = {"lz4": ("lz4.frame",), "zstd": ("compression.zstd", "backports.zstd")}.get(method, ())
+    for name in names:
+        with suppress(ImportError):
+            module = importlib.import_module(name)
+            return module.LZ4FrameDecompressor() if method == "lz4" else module.ZstdDecompressor()
+    if names:
+        raise MissingExtra(f"reading {method} compression of a bag", "ros")
+    raise ValueError(f"unknown compression '{method[:20]}'; known: none, bz2, lz4, zstd")

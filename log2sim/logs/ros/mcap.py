@@ -1,0 +1,191 @@
+"""MCAP files (https://mcap.dev/spec), by their summary, or by all records where it is missing."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from log2sim.errors import LogError
+from log2sim.logs.ros.chunked import Chunk, ChunkedFile
+from log2sim.logs.ros.containers import Channel, EntryList, checked_size, normalized_type
+from log2sim.logs.sweeps import PARSER_ERRORS
+
+MAGIC = b"\x89MCAP0\r\n"
+FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, DATA_END = 2, 3, 4, 5, 6, 7, 8, 15
+RECORD_HEAD = struct.Struct("<BQ")
+MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+CHUNK_HEAD = struct.Struct("<QQQI")
+FOOTER_BYTES = RECORD_HEAD.size + 20 + len(MAGIC)
+MAX_RECORD_BYTES = 64 * 1024 * 1024
+"""Of schemas, channels and indexes."""
+
+
+class Mcap(ChunkedFile):
+    """An MCAP file."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.notes: list[str] = []
+        self.channels: list[Channel] = []
+        self._numbers: dict[int, int] = {}
+        self._schemas: dict[int, tuple[str, str, str]] = {}
+        self._list = EntryList()
+        if self.size < len(MAGIC) or self.at(0, len(MAGIC)) != MAGIC:
+            raise LogError(f"{path}: does not begin with the magic bytes of MCAP")
+        try:
+            indexed = self._read_summary()
+        except PARSER_ERRORS as problem:
+            indexed = False
+            self.notes.append(f"{path.name}: its index is missing or damaged ({problem}); it was read whole")
+        if not indexed:
+            self.channels, self._numbers, self._list, self.chunks = [], {}, EntryList(), []
+            self._scan()
+        self.entries = self._list.entries()
+
+    def message(self, k: int, limit_bytes: int | None = None) -> bytes:
+        """Read message `k`, or its first `limit_bytes`."""
+        chunk, place = int(self.entries.chunk[k]), int(self.entries.place[k])
+        op, size, *_ = MESSAGE_HEAD.unpack(self.within(chunk, place, MESSAGE_HEAD.size))
+        if op != MESSAGE or size < 22:
+            raise ValueError("no message where the index says so")
+        wanted = checked_size(size - 22)
+        if limit_bytes is None:
+            self.check(chunk)
+        else:
+            wanted = min(wanted, limit_bytes)
+        data = self.within(chunk, place + MESSAGE_HEAD.size, wanted) if wanted else b""
+        if len(data) != wanted:
+            raise ValueError(f"{len(data)} of {wanted} bytes; the chunk is truncated")
+        return data
+
+    def _read_summary(self) -> bool:
+        """Read the summary; False when it does not lead to all messages."""
+        footer = self.at(self.size - FOOTER_BYTES, FOOTER_BYTES)
+        if footer[-len(MAGIC) :] != MAGIC or footer[0] != FOOTER:
+            raise ValueError("the recording was not closed")
+        (position,) = struct.unpack_from("<Q", footer, RECORD_HEAD.size)
+        if not position:
+            return False
+        chunks = []
+        while position < self.size - FOOTER_BYTES:
+            op, size = RECORD_HEAD.unpack(self.at(position, RECORD_HEAD.size))
+            if op in (SCHEMA, CHANNEL, CHUNK_INDEX):
+                data = self._small(position, size)
+                if op == CHUNK_INDEX:
+                    chunks.append(data)
+                else:
+                    self._declare(op, data)
+            position += RECORD_HEAD.size + size
+        if not chunks or not self.channels:
+            return False
+        for data in chunks:
+            self._index_chunk(data)
+        return True
+
+    def _small(self, position: int, size: int) -> bytes:
+        if size > MAX_RECORD_BYTES:
+            raise ValueError(f"record of {size} bytes at byte {position}")
+        return self.at(position + RECORD_HEAD.size, size)
+
+    def _declare(self, op: int, data: bytes) -> None:
+        """Take over a schema or a channel."""
+        if op == SCHEMA:
+            (number,) = struct.unpack_from("<H", data)
+            name, position = _text(data, 2)
+            encoding, position = _text(data, position)
+            definition, _ = _text(data, position)
+            self._schemas[number] = (name, encoding, definition)
+            return
+        number, schema = struct.unpack_from("<HH", data)
+        topic, position = _text(data, 4)
+        encoding, _ = _text(data, position)
+        name, language, definition = self._schemas.get(schema, ("", "", ""))
+        if number not in self._numbers:
+            self._numbers[number] = len(self.channels)
+            text = definition if language in ("ros1msg", "ros2msg") else ""
+            self.channels.append(Channel(topic, normalized_type(name), encoding, text))
+
+    def _index_chunk(self, data: bytes) -> None:
+        """Read the indexes of the messages of a chunk, or the chunk where it has none."""
+        start, _, size = struct.unpack_from("<QQI", data, 16)
+        offsets = [struct.unpack_from("<HQ", data, p)[1] for p in range(36, 36 + size, 10)]
+        number = len(self.chunks)
+        try:
+            self._add_chunk(start)
+            for offset in offsets:
+                self._index_messages(number, offset)
+            if not offsets:
+                self._walk(number)
+        except PARSER_ERRORS as problem:
+            self.notes.append(f"{self.path.name}: the chunk at byte {start} cannot be read: {problem}")
+
+    def _index_messages(self, chunk: int, position: int) -> None:
+        op, size = RECORD_HEAD.unpack(self.at(position, RECORD_HEAD.size))
+        if op != MESSAGE_INDEX:
+            raise ValueError("its index is damaged")
+        data = self._small(position, size)
+        channel, length = struct.unpack_from("<HI", data)
+        pairs = np.frombuffer(data[6 : 6 + length], "<u8").reshape(-1, 2).astype(np.int64)
+        self._list.add_block(self._numbers[channel], pairs[:, 0], chunk, pairs[:, 1])
+
+    def _add_chunk(self, position: int) -> int:
+        """Add the chunk whose record begins at a byte; return where that record ends."""
+        op, size = RECORD_HEAD.unpack(self.at(position, RECORD_HEAD.size))
+        if op != CHUNK:
+            raise ValueError("no chunk where the index says so")
+        start = position + RECORD_HEAD.size
+        head = self.at(start, min(size, 256))
+        _, _, unpacked, crc = CHUNK_HEAD.unpack_from(head)
+        compression, offset = _text(head, CHUNK_HEAD.size)
+        (stored,) = struct.unpack_from("<Q", head, offset)
+        self.chunks.append(Chunk(start + offset + 8, stored, unpacked, compression, crc))
+        return int(start + size)
+
+    def _scan(self) -> None:
+        """Find all messages by walking the records, up to where the file is cut."""
+        position = len(MAGIC)
+        while position + RECORD_HEAD.size <= self.size:
+            op, size = RECORD_HEAD.unpack(self.at(position, RECORD_HEAD.size))
+            if op in (DATA_END, FOOTER):
+                return
+            try:
+                if position + RECORD_HEAD.size + size > self.size:
+                    raise ValueError(f"the file ends within a record of {size} bytes")
+                if op == CHUNK:
+                    self._add_chunk(position)
+                    self._walk(len(self.chunks) - 1)
+                elif op in (SCHEMA, CHANNEL):
+                    self._declare(op, self._small(position, size))
+                elif op == MESSAGE:
+                    self._add_message(self.at(position, MESSAGE_HEAD.size), -1, position)
+            except PARSER_ERRORS as problem:
+                self.notes.append(f"{self.path.name}: the record at byte {position} is left out: {problem}")
+            position += RECORD_HEAD.size + size
+
+    def _add_message(self, head: bytes, chunk: int, place: int) -> None:
+        _, _, channel, _, t_ns, _ = MESSAGE_HEAD.unpack(head)
+        self._list.add(self._numbers[channel], t_ns, chunk, place)
+
+    def _walk(self, number: int) -> None:
+        data, position = self.unpacked(number), 0
+        while position < len(data):
+            op, size = RECORD_HEAD.unpack_from(data, position)
+            end = position + RECORD_HEAD.size + size
+            if end > len(data):
+                raise ValueError("a record is longer than its chunk")
+            if op in (SCHEMA, CHANNEL):
+                self._declare(op, data[position + RECORD_HEAD.size : end])
+            elif op == MESSAGE:
+                self._add_message(data[position : position + MESSAGE_HEAD.size], number, position)
+            position = end
+
+
+def _text(data: bytes, position: int) -> tuple[str, int]:
+    """Text after its length, and where it ends."""
+    (size,) = struct.unpack_from("<I", data, position)
+    end = position + 4 + size
+    if end > len(data):
+        raise ValueError("a text is longer than its record")
+    return data[position + 4 : end].decode("utf-8", "replace"), end

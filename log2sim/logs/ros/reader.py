@@ -1,0 +1,304 @@
+"""ROS 1 bags, ROS 2 bags and MCAP files as logs."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Lidar, Log, MapFrame, Stream, Sweep
+from log2sim.errors import ConfigError, LogError, RecordError
+from log2sim.geometry import Array, Camera, Mount, PoseTrack, inverse
+from log2sim.logs.ros import calibration, ego
+from log2sim.logs.ros.bag import NAME_BYTES, Bag, Topic
+from log2sim.logs.ros.clouds import DEFAULT_PERIOD_NS, sweep_from
+from log2sim.logs.ros.frames import FrameTree
+from log2sim.logs.ros.messages import decode, decode_bytes
+from log2sim.logs.ros.pictures import encoded_from, image_from, image_from_compressed
+from log2sim.logs.ros.poses import FoundPoses, PoseSources
+from log2sim.logs.ros.recordings import SUFFIXES, find_recordings
+from log2sim.logs.ros.roles import COMPRESSED, FIXED_FRAMES, Roles, assign_roles
+from log2sim.logs.ros.settings import CameraTopic, LidarTopic, TopicSettings, read_settings
+from log2sim.logs.ros.stamping import Stamped, note_other_clocks, stamp_messages
+
+MAX_LISTED = 8
+
+
+class RosReader:
+    """Reader of ROS 1 bags, rosbag2 folders and databases, and MCAP files."""
+
+    name = "ros"
+    looks_for = "a ROS bag: a .bag, .db3 or .mcap file, a rosbag2 folder with metadata.yaml, or a folder of bags"
+    suffixes = SUFFIXES
+
+    def matches(self, path: Path) -> bool:
+        """Return whether the path is a recording or holds some, by names alone."""
+        return bool(find_recordings(path))
+
+    def sequences(self, path: Path) -> list[str]:
+        """Return the names of the recordings, sorted."""
+        return sorted(find_recordings(path))
+
+    def open(self, path: Path, sequence: str) -> Log:
+        """Open a recording: its index, the stamps of its messages, its transforms and poses."""
+        recording = find_recordings(path)[sequence]
+        settings, file = read_settings(recording.settings)
+        return _Opening(sequence, Bag(recording), settings, file).log()
+
+
+READER = RosReader()
+
+
+class _Opening:
+    """One log while it is opened; collects notes."""
+
+    def __init__(self, name: str, bag: Bag, settings: TopicSettings, file: Path | None) -> None:
+        self.name, self.bag, self.settings, self.file = name, bag, settings, file
+        self.roles: Roles = assign_roles(bag, settings, file)
+        self.notes = [*bag.notes, *self.roles.notes]
+        self.messages = bag.collect(self._wanted())
+        self.tree = FrameTree()
+        for topic in self.roles.topics.get("tf", ()):
+            self._add_transforms(bag.topics[topic])
+        self.tree.add_static(settings.static_transforms)
+
+    def log(self) -> Log:
+        sensors = list(self._sensors().values())
+        if not sensors:
+            raise LogError(f"{self.name}: no images with CameraInfo and no point clouds in it; {self._list_topics()}")
+        base, why = ego.choose_base(
+            self.tree, [s.frame for s in sensors], self._pose_frames(), FIXED_FRAMES, self.settings.ego.base_frame
+        )
+        frame = ego.ego_frame(base, self.settings.ego, self.tree, {c.frame for c in self.roles.cameras.values()})
+        found, considered = self._poses(base)
+        stamped = self._stamps()
+        mounts = self._mounts(frame, found)
+        cameras = self._cameras(mounts)
+        lidars = {n: Lidar(n, *mounts[n]) for n in self.roles.lidars if n in mounts}
+        streams = {n: self._camera_stream(cameras[n], stamped[n]) for n in cameras}
+        streams |= {n: self._lidar_stream(n, stamped[n]) for n in lidars}
+        if not streams:
+            raise LogError(f"{self.name}: none of its sensors can be used: {'; '.join(self.notes)}")
+        track = None if found is None else PoseTrack(found.t_ns, found.map_T_base @ frame.base_T_ego)
+        self._note_poses(found, considered, base)
+        ground_m = self._ground_m(frame, lidars, streams)
+        self.notes += frame.notes
+        return Log(
+            name=self.name,
+            format=READER.name,
+            cameras=cameras,
+            lidars=lidars,
+            streams=streams,
+            ego=track,
+            ego_vehicle=frame.vehicle,
+            map=MapFrame() if found is None else found.map,
+            ground_z_ego_m=ground_m,
+            reference_camera=self._reference_camera(cameras, streams),
+            digest=self.bag.digest,
+            notes=tuple(self.notes),
+            details={
+                "settings": None if self.file is None else self.file.name,
+                "files": [container.path.name for container in self.bag.files],
+                "topics": self.roles.table(self.bag),
+                "base_frame": {"name": base, "reason": why},
+                "poses": considered,
+                "frames": self.tree.describe(),
+            },
+        )
+
+    def _sensors(self) -> dict[str, CameraTopic | LidarTopic]:
+        return {**self.roles.lidars, **self.roles.cameras}
+
+    def _wanted(self) -> dict[str, int | None]:
+        """Topics that are read at opening, with the number of bytes; None for whole messages."""
+        roles = self.roles
+        heads: dict[str, int | None] = {s.topic: NAME_BYTES for s in self._sensors().values()}
+        infos = {c.info for c in roles.cameras.values() if c.info}
+        kinds = ("tf", "odometry", "pose", "gnss", "imu")
+        return heads | dict.fromkeys([*infos, *(name for kind in kinds for name in roles.topics.get(kind, ()))])
+
+    def _add_transforms(self, topic: Topic) -> None:
+        damaged = 0
+        for i, raw in enumerate(self.messages[topic.name]):
+            try:
+                if raw is None:
+                    raise RecordError("damaged")
+                self.tree.add(decode_bytes(topic, raw, self.bag.where(topic, i)).transforms)
+            except RecordError:
+                damaged += 1
+        if damaged:
+            self.notes.append(f"{topic.name}: {damaged} of {len(topic)} messages are damaged and left out")
+
+    def _pose_frames(self) -> list[str]:
+        """Frames whose poses the odometry topics give."""
+        frames = []
+        for name in self.roles.topics.get("odometry", ()):
+            topic = self.bag.topics[name]
+            raw = next((raw for raw in self.messages[name] if raw is not None), None)
+            if raw is not None:
+                frames.append(decode_bytes(topic, raw, name).child_frame_id.lstrip("/"))
+        return [frame for frame in frames if frame]
+
+    def _poses(self, base: str | None) -> tuple[FoundPoses | None, list[dict[str, Any]]]:
+        wanted = self.settings.poses
+        if base is None or wanted.source == "none":
+            return None, []
+        sources = PoseSources(self.bag, self.roles.topics, self.messages, self.tree, base, wanted, self.settings.map)
+        found, considered = sources.find()
+        if found is None and (wanted.source != "auto" or wanted.topic):
+            reasons = "; ".join(f"{c['topic']}: {c['reason']}" for c in considered) or "the recording has no such topic"
+            raise ConfigError(f"{self.file}: 'poses' asks for source '{wanted.source}', which gives none: {reasons}")
+        return found, considered
+
+    def _note_poses(self, found: FoundPoses | None, considered: list[dict[str, Any]], base: str | None) -> None:
+        if found is not None:
+            self.notes += found.notes
+            others = [f"{c['source']} {c['topic']}" for c in considered if not c["used"]]
+            instead = f"; others: {', '.join(others)}" if others else ""
+            self.notes.append(f"poses of '{base}' are from {found.source} {found.topic}{instead}")
+        elif base is not None:
+            reasons = "; ".join(f"{c['topic']}: {c['reason']}" for c in considered)
+            self.notes.append(f"no poses of '{base}' in the recording{': ' * bool(reasons)}{reasons}")
+
+    def _stamps(self) -> dict[str, Stamped]:
+        stamped, delays = {}, {}
+        for name, sensor in self._sensors().items():
+            topic = self.bag.topics[sensor.topic]
+            recorded = sensor.stamps == "recorded"
+            stamped[name] = stamp_messages(topic, self.messages[topic.name], self.notes, recorded=recorded)
+            delays[topic.name] = stamped[name].delay_s
+        for kind in ("odometry", "pose", "gnss", "imu"):
+            for name in self.roles.topics.get(kind, ()):
+                topic = self.bag.topics[name]
+                delays[name] = stamp_messages(topic, self.messages[name], []).delay_s
+        note_other_clocks(delays, self.notes)
+        return stamped
+
+    def _mounts(self, frame: ego.EgoFrame, found: FoundPoses | None) -> dict[str, tuple[Mount, Array]]:
+        """Pose of each sensor that has one, on the ego or, without a vehicle, in the map."""
+        mounts: dict[str, tuple[Mount, Array]] = {}
+        for name, sensor in self._sensors().items():
+            if frame.base is None:
+                mounts[name] = ("map", self._in_map(sensor))
+                continue
+            base_T_sensor = self.tree.mount(frame.base, sensor.frame)
+            if base_T_sensor is None:
+                self.notes.append(
+                    f"{sensor.topic}: left out, since no fixed transform leads from its frame '{sensor.frame}' to "
+                    f"'{frame.base}'; give one as [[static_transforms]] in the settings"
+                )
+                continue
+            mounts[name] = ("ego", inverse(frame.base_T_ego) @ base_T_sensor)
+        return mounts
+
+    def _in_map(self, sensor: CameraTopic | LidarTopic) -> Array:
+        root = self.tree.rigid_root(sensor.frame)
+        mount = self.tree.mount(root, sensor.frame)
+        return np.eye(4) if mount is None else mount
+
+    def _cameras(self, mounts: dict[str, tuple[Mount, Array]]) -> dict[str, Camera]:
+        cameras = {}
+        frames = [c.frame for c in self.roles.cameras.values()]
+        for name, chosen in self.roles.cameras.items():
+            if name not in mounts:
+                continue
+            try:
+                if chosen.intrinsics is not None:
+                    cameras[name] = calibration.camera_from_intrinsics(name, chosen.intrinsics, *mounts[name])
+                else:
+                    stereo = frames.count(chosen.frame) > 1
+                    cameras[name] = calibration.camera_from_info(
+                        name, self._info(chosen), mounts[name], rectified=bool(chosen.rectified), stereo=stereo
+                    )
+            except calibration.CalibrationProblem as problem:
+                self.notes.append(
+                    f"{chosen.topic}: left out: {problem}; give cameras.{name}.info or cameras.{name}.intrinsics in the settings"
+                )
+        return cameras
+
+    def _info(self, chosen: CameraTopic) -> Any:
+        """First readable CameraInfo of a camera; a later one that differs is noted."""
+        if not chosen.info:
+            raise calibration.CalibrationProblem("no CameraInfo belongs to it by namespace or frame")
+        topic, first, info = self.bag.topics[chosen.info], b"", None
+        for i, raw in enumerate(self.messages[chosen.info]):
+            if raw is None:
+                continue
+            try:
+                # A header of constant length precedes the calibration.
+                if info is None:
+                    info, first = decode_bytes(topic, raw, self.bag.where(topic, i)), raw[12:]
+                elif raw[12:] != first:
+                    self.notes.append(
+                        f"{chosen.info}: changes at message {i}; the first calibration is used throughout"
+                    )
+                    break
+            except RecordError:
+                continue
+        if info is None:
+            raise calibration.CalibrationProblem(f"no message of {chosen.info} can be read")
+        return info
+
+    def _camera_stream(self, camera: Camera, stamped: Stamped) -> Stream:
+        topic = self.bag.topics[self.roles.cameras[camera.name].topic]
+        compressed = topic.msgtype == COMPRESSED
+        size = camera.width_px, camera.height_px
+        read = partial(_read_image, self.bag, topic, stamped.row, size, compressed)
+        encoded = partial(_read_encoded, self.bag, topic, stamped.row) if compressed else None
+        return Stream(camera.name, stamped.t_ns, read, encoded)
+
+    def _lidar_stream(self, name: str, stamped: Stamped) -> Stream:
+        settings = self.roles.lidars[name]
+        return Stream(name, stamped.t_ns, partial(_read_sweep, self.bag, settings, stamped))
+
+    def _ground_m(self, frame: ego.EgoFrame, lidars: dict[str, Lidar], streams: dict[str, Stream]) -> float:
+        if frame.ground_z_m is not None:
+            return frame.ground_z_m
+        for name, lidar in lidars.items():
+            try:
+                ground_m = ego.measure_ground_m(streams[name].read(0), lidar.mount_T_lidar)
+            except RecordError as problem:
+                self.notes.append(f"{name}: {problem}")
+                continue
+            self.notes.append(
+                f"the road is {ground_m:.2f} m above the origin of '{frame.base}', measured in the first sweep of {name} "
+                "(ego.ground_z_m)"
+            )
+            return ground_m
+        self.notes.append(f"the height of the road in '{frame.base}' is not known; taken as 0 (ego.ground_z_m)")
+        return 0.0
+
+    def _reference_camera(self, cameras: dict[str, Camera], streams: dict[str, Stream]) -> str | None:
+        wanted = self.settings.reference_camera
+        if wanted is None:
+            return max(cameras, key=lambda name: len(streams[name].t_ns), default=None)
+        if wanted not in cameras:
+            raise ConfigError(
+                f"{self.file}: 'reference_camera' is '{wanted}'; there are: {', '.join(cameras) or 'none'}"
+            )
+        return wanted
+
+    def _list_topics(self) -> str:
+        topics = [f"{t.name} ({t.msgtype}, {len(t)})" for t in self.bag.topics.values()]
+        more = f" and {len(topics) - MAX_LISTED} more" if len(topics) > MAX_LISTED else ""
+        return f"its topics are {', '.join(topics[:MAX_LISTED])}{more}" if topics else "it has no topics"
+
+
+def _read_image(
+    bag: Bag, topic: Topic, row: NDArray[np.intp], size_px: tuple[int, int], compressed: bool, i: int
+) -> NDArray[np.uint8]:
+    message, where = decode(bag, topic, int(row[i])), bag.where(topic, int(row[i]))
+    return (image_from_compressed if compressed else image_from)(message, where, size_px)
+
+
+def _read_encoded(bag: Bag, topic: Topic, row: NDArray[np.intp], i: int) -> bytes:
+    return encoded_from(decode(bag, topic, int(row[i])), bag.where(topic, int(row[i])))
+
+
+def _read_sweep(bag: Bag, settings: LidarTopic, stamped: Stamped, i: int) -> Sweep:
+    topic, row = bag.topics[settings.topic], int(stamped.row[i])
+    period_ns = float(np.median(np.diff(stamped.t_ns))) if len(stamped.t_ns) > 1 else DEFAULT_PERIOD_NS
+    return sweep_from(decode(bag, topic, row), int(stamped.t_ns[i]), period_ns, settings, bag.where(topic, row))
