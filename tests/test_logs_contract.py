@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from log_encoders import kitti, kitti_object, native, pandaset, waymo
+from log_encoders import kitti, kitti_object, native, pandaset, ros, waymo
 from log_encoders.world import RED, labels_at, world_log
 
 from log2sim import registry
@@ -88,6 +88,7 @@ ENCODERS: dict[str, Encoder] = {
         {"front_camera": "camera/front_camera/*.jpg", "pandar64": "lidar/*.pkl.gz"}, encode_two_below(pandaset.encode),
     ),
     "waymo": Encoder(waymo.encode, {"FRONT": "front", "LIDAR_TOP": "top"}, several=encode_two_below(waymo.encode)),
+    "ros": Encoder(ros.encode, several=encode_two_below(ros.encode), labels=False),
 }  # fmt: skip
 
 

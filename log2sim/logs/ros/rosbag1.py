@@ -18,7 +18,7 @@ MAX_HEADER_BYTES = 1024 * 1024
 MAX_INDEX_BYTES = 256 * 1024 * 1024
 MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 # A record begins with its header; that of a message is about 40 bytes.
-FIRST_BYTES = 4096
+FIRST_BYTES = 512
 
 
 class Record(NamedTuple):

@@ -19,8 +19,8 @@ from log2sim.logs.ros.chunked import decompress_message
 from log2sim.logs.ros.containers import MAX_MESSAGE_BYTES, MAX_MESSAGES, Channel, Entries, checked_size, normalized_type
 
 MAGIC = b"SQLite format 3\x00"
-# Compressed messages hold their stamp within these bytes of zstd.
-COMPRESSED_HEAD_BYTES = 1024
+# A block of zstd (RFC 8878: 128 KiB) has to be there whole before its first byte can be unpacked.
+COMPRESSED_HEAD_BYTES = 129 * 1024
 
 
 class SqliteBag:
