@@ -11,6 +11,8 @@ from log2sim.errors import ConfigError
 
 BUILT_IN: dict[str, dict[str, str]] = {
     "log": {
+        # Before "log2sim": nuScenes has a table log.json as well.
+        "nuscenes": "log2sim.logs.nuscenes.reader:READER",
         "log2sim": "log2sim.logs.native.reader:READER",
         "kitti": "log2sim.logs.kitti.raw:READER",
         "kitti-tracking": "log2sim.logs.kitti.tracking:READER",

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from log_encoders import kitti, kitti_object, native, pandaset, ros, waymo
+from log_encoders import kitti, kitti_object, native, nuscenes, pandaset, ros, waymo
 from log_encoders.world import RED, labels_at, world_log
 
 from log2sim import registry
@@ -89,6 +89,10 @@ ENCODERS: dict[str, Encoder] = {
     ),
     "waymo": Encoder(waymo.encode, {"FRONT": "front", "LIDAR_TOP": "top"}, several=encode_two_below(waymo.encode)),
     "ros": Encoder(ros.encode, several=encode_two_below(ros.encode), labels=False),
+    "nuscenes": Encoder(
+        nuscenes.encode_world, records={"front": "samples/front/*", "top": "samples/top/*"},
+        several=encode_two_below(nuscenes.encode_world),
+    ),
 }  # fmt: skip
 
 

@@ -1,0 +1,250 @@
+"""nuScenes, version 1.0 of the tables: scenes of 20 s with six cameras at 12 Hz and a LiDAR at 20 Hz, labeled at 2 Hz.
+
+The stamp of an image is the trigger of its exposure, that of a sweep the end of its turn. Every record has an ego pose of
+its own. Those of can_bus are the same ones (to 1 mm on scene-0103) at 50 Hz without roll and pitch, so they are not read;
+neither is radar.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream
+from log2sim.documents import read_json
+from log2sim.errors import LogError
+from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, whole_kilometers
+from log2sim.logs.digest import digest_of
+from log2sim.logs.images import MAX_IMAGE_PX, first_image_size, image_stream
+from log2sim.logs.nuscenes.labels import read_labels
+from log2sim.logs.nuscenes.scene import Channel, Scene
+from log2sim.logs.nuscenes.sweeps import sweep_stream
+from log2sim.logs.nuscenes.tables import DATA, SCENES, Record, Tables, numbers_of
+
+REFERENCE_CAMERA = "CAM_FRONT"
+LABELED_LIDAR = "LIDAR_TOP"
+# A Renault Zoe by its data sheet: wheelbase 2.588 m, overhangs 0.839 m in front and 0.657 m behind.
+EGO_VEHICLE = EgoVehicle(size_m=(4.084, 1.73, 1.562), rear_axle_offset_m=1.385)
+# South-western corners of the maps, which are the origins of their coordinates, latitude and longitude, and the sphere on
+# which the nuScenes devkit converts positions (export_poses).
+MAP_ORIGIN_DEG = {
+    "boston-seaport": (42.336849169438615, -71.05785369873047),
+    "singapore-onenorth": (1.2882100868743724, 103.78475189208984),
+    "singapore-hollandvillage": (1.2993652317780957, 103.78217697143555),
+    "singapore-queenstown": (1.2782562240223188, 103.76741409301758),
+}
+EARTH_RADIUS_M = 6378137.0
+# Heights of a drive on real ground vary more.
+MAX_FLAT_M = 0.001
+
+
+class NuScenesReader:
+    """Reader of nuScenes; the root holds folders of tables (v1.0-mini), or is one."""
+
+    name = "nuscenes"
+    looks_for = (
+        "a folder of nuScenes tables with scene.json and sample_data.json (v1.0-mini), or the folder that holds it"
+    )
+    suffixes = ()
+
+    def matches(self, path: Path) -> bool:
+        """Return whether the folder holds tables, or is a folder of tables."""
+        return bool(_versions(path))
+
+    def sequences(self, path: Path) -> list[str]:
+        """Return the names of the scenes, sorted; with the version in front where there are several."""
+        return sorted(_scenes(path))
+
+    def open(self, path: Path, sequence: str) -> Log:
+        """Open a scene; the tables are read but for the annotations, no image and no sweep."""
+        tables, name = _scenes(path)[sequence]
+        record = next(record for record in _scene_records(tables) if record["name"] == name)
+        return _SceneReader(Scene(tables, record)).log()
+
+
+READER = NuScenesReader()
+
+
+def _versions(path: Path) -> list[Path]:
+    """Folders of tables at a path."""
+    return [path] if _is_version(path) else sorted(p for p in path.iterdir() if _is_version(p))
+
+
+def _is_version(path: Path) -> bool:
+    return (path / f"{SCENES}.json").is_file() and (path / f"{DATA}.json").is_file()
+
+
+def _scenes(path: Path) -> dict[str, tuple[Tables, str]]:
+    """Tables and name in them of the scenes by sequence; a broken list of scenes is one, so that opening it tells why."""
+    versions = _versions(path)
+    scenes = {}
+    for folder in versions:
+        tables = Tables(folder)
+        try:
+            names = [record["name"] for record in _scene_records(tables)]
+        except LogError:
+            names = [folder.name]
+        scenes.update({f"{folder.name}/{name}" if len(versions) > 1 else name: (tables, name) for name in names})
+    return scenes
+
+
+def _scene_records(tables: Tables) -> list[Record]:
+    path = tables.path(SCENES)
+    records = read_json(path)
+    if not isinstance(records, list) or not all(
+        isinstance(r, dict) and isinstance(r.get("name"), str) for r in records
+    ):
+        raise LogError(f"{path}: expected a list of records with a name")
+    return records
+
+
+class _SceneReader:
+    """Builds the log of one scene."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene, self.tables, self.notes = scene, scene.tables, scene.notes
+        self.root = scene.tables.folder.resolve().parent
+        self.files: list[Path] = []
+
+    def log(self) -> Log:
+        """Read the tables and return the log."""
+        scene, ego = self.scene, self.scene.ego
+        offset_m = whole_kilometers(ego.map_T_ego[:, :3, 3])
+        map_T_ego = ego.map_T_ego.copy()
+        map_T_ego[:, :3, 3] -= offset_m
+        track = PoseTrack(ego.t_ns, map_T_ego)
+        cameras, lidars, streams = self._sensors(track)
+        self._note_flat(map_T_ego)
+        self._note_span(streams)
+
+        @cache
+        def labels() -> Labels | None:
+            return read_labels(scene, self._labeled_lidar(), offset_m, self.notes)
+
+        def all_notes() -> tuple[str, ...]:
+            labels()
+            return tuple(self.notes)
+
+        return Log(
+            name=f"nuscenes-{scene.record['name']}",
+            format=READER.name,
+            cameras=cameras,
+            lidars=lidars,
+            streams=streams,
+            ego=track,
+            ego_vehicle=EGO_VEHICLE,
+            map=self._map_frame(offset_m),
+            labels=labels,
+            reference_camera=REFERENCE_CAMERA if REFERENCE_CAMERA in cameras else None,
+            digest=self._digest(),
+            notes=all_notes,
+            details=self._details(),
+        )
+
+    def _labeled_lidar(self) -> Channel | None:
+        """Return the LiDAR in whose sweeps objects were labeled."""
+        lidars = {name: c for name, c in self.scene.channels.items() if c.modality == "lidar"}
+        return lidars.get(LABELED_LIDAR) or next(iter(lidars.values()), None)
+
+    def _sensors(self, track: PoseTrack) -> tuple[dict[str, Camera], dict[str, Lidar], dict[str, Stream]]:
+        cameras: dict[str, Camera] = {}
+        lidars: dict[str, Lidar] = {}
+        streams: dict[str, Stream] = {}
+        unused, missing = [], 0
+        for name, channel in self.scene.channels.items():
+            if channel.modality not in ("camera", "lidar"):
+                unused.append(name)
+                continue
+            records, t_ns, files = channel.present(self.root, self.tables.path(DATA))
+            missing += len(channel.records) - len(files)
+            if len(files) < len(channel.records):
+                left_out = "; the sensor is left out" if not files else ""
+                self.notes.append(
+                    f"{name}: {len(channel.records) - len(files)} of {len(channel.records)} files are missing{left_out}"
+                )
+            if not files:
+                continue
+            self.files += files
+            if channel.modality == "camera":
+                cameras[name] = self._camera(channel, records[0], files)
+                streams[name] = image_stream(name, t_ns, files, (cameras[name].width_px, cameras[name].height_px))
+            else:
+                lidars[name] = Lidar(name, "ego", channel.ego_T_sensor)
+                streams[name] = self._sweeps(channel, track, t_ns, files)
+        if not streams:
+            raise LogError(
+                f"{self.root}: none of the {missing} images and sweeps of scene '{self.scene.record['name']}' "
+                "is there; unpack its samples and sweeps beside the tables"
+            )
+        if unused:
+            self.notes.append(f"not read, as log2sim makes no use of radar: {', '.join(unused)}")
+        return cameras, lidars, streams
+
+    def _camera(self, channel: Channel, record: Record, files: list[Path]) -> Camera:
+        K = numbers_of([channel.calibration], "camera_intrinsic", (3, 3), self.tables.path("calibrated_sensor"))[0]
+        if not (K[0, 0] > 0 and K[1, 1] > 0 and K[2].tolist() == [0, 0, 1]):
+            raise LogError(
+                f"{self.tables.path('calibrated_sensor')}: {channel.name}: camera_intrinsic is {K.tolist()}, "
+                "expected positive focal lengths and a last row 0 0 1"
+            )
+        width, height = record.get("width"), record.get("height")
+        stated = all(isinstance(v, int) and 0 < v <= MAX_IMAGE_PX for v in (width, height))
+        width, height = (width, height) if stated else first_image_size(files)
+        return Camera(channel.name, int(width or 0), int(height or 0), K, "ego", channel.ego_T_sensor)
+
+    def _sweeps(self, channel: Channel, track: PoseTrack, t_ns: NDArray[np.int64], files: list[Path]) -> Stream:
+        def poses(stamps: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
+            map_T_ego, known = track.at(stamps)
+            return map_T_ego @ channel.ego_T_sensor, known
+
+        return sweep_stream(channel.name, t_ns, files, poses)
+
+    def _note_flat(self, map_T_ego: Array) -> None:
+        climb = float(np.degrees(np.abs(np.arcsin(np.clip(map_T_ego[:, 2, 0], -1, 1))).max()))
+        if np.ptp(map_T_ego[:, 2, 3]) < MAX_FLAT_M:
+            self.notes.append(
+                f"ego poses have no height (z is constant) though they pitch by up to {climb:.1f} degrees: "
+                "the map is as flat as the log states it"
+            )
+
+    def _note_span(self, streams: dict[str, Stream]) -> None:
+        """Note that records with files last much shorter than the scene."""
+        of_scene = [c.t_ns for c in self.scene.channels.values() if c.modality in ("camera", "lidar")]
+        whole_s = float(max(t[-1] for t in of_scene) - min(t[0] for t in of_scene)) / NS_PER_S
+        stamps = [stream.t_ns for stream in streams.values()]
+        there_s = float(max(t[-1] for t in stamps) - min(t[0] for t in stamps)) / NS_PER_S
+        if there_s < whole_s - 1.0:
+            self.notes.append(
+                f"images and sweeps that are there last {there_s:.1f} s of the {whole_s:.1f} s of the scene; "
+                "labels and ego poses cover all of it, a scenario only that part"
+            )
+
+    def _map_frame(self, offset_m: Array) -> MapFrame:
+        place = MAP_ORIGIN_DEG.get(self.scene.location)
+        offset = (float(offset_m[0]), float(offset_m[1]), float(offset_m[2]))
+        if place is None:
+            self.notes.append(f"log.json: location '{self.scene.location[:40]}' is not known: the map is only local")
+            return MapFrame(offset_m=offset)
+        latitude, longitude = place
+        sphere = f"+proj=aeqd +R={EARTH_RADIUS_M:.0f} +x_0=0 +y_0=0 +units=m +no_defs"
+        projection = f"{sphere} +lat_0={latitude!r} +lon_0={longitude!r}"
+        return MapFrame(latitude, longitude, None, projection, offset)
+
+    def _details(self) -> dict[str, object]:
+        keys = ("name", "description")
+        return {
+            "tables": self.tables.folder.resolve().name,
+            "scene": {key: str(self.scene.record.get(key, "")) for key in keys},
+            "location": self.scene.location,
+            "key_frames": len(self.scene.samples),
+        }
+
+    def _digest(self) -> str:
+        scene = self.scene
+        index = [scene.record, scene.samples, scene.data, [c.calibration for c in scene.channels.values()]]
+        poses = [scene.ego.t_ns.tobytes().hex(), scene.ego.map_T_ego.tobytes().hex()]
+        return digest_of([json.dumps(index, sort_keys=True), *poses], self.files)

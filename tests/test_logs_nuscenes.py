@@ -1,0 +1,418 @@
+"""nuScenes: scanning of tables, versions and missing files, times of points and labels on a world with exact truth, the recorded scene."""
+
+from __future__ import annotations
+
+import json
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from conftest import SHARED
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from log_encoders.nuscenes import TURN_NS, encode, hdl32_world
+from log_encoders.world import labels_at
+
+from log2sim.datatypes import Labels, Log
+from log2sim.errors import ConfigError, LogError, RecordError
+from log2sim.geometry import NS_PER_S, apply, inverse, points_in_box
+from log2sim.logs.nuscenes import tables
+from log2sim.logs.nuscenes.labels import turn_ends
+from log2sim.logs.nuscenes.sweeps import FIRING_NS, read_sweep, seen_offset_ns
+from log2sim.logs.opening import open_log
+from log2sim.perception.lidar.cloud import deskew, transform_rigidly
+
+KEY_EVERY = 5
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The world with every fifth sweep a key frame; tests only read it."""
+    return encode(hdl32_world(), tmp_path_factory.mktemp("nuscenes"), key_every=KEY_EVERY)
+
+
+@pytest.fixture
+def spoilable(root: Path, tmp_path: Path) -> Path:
+    """The tables to be changed, beside the images and sweeps of `root`."""
+    folder = tmp_path / "data"
+    (folder / "v1.0-mini").mkdir(parents=True)
+    for file in (root / "v1.0-mini").iterdir():
+        (folder / "v1.0-mini" / file.name).write_bytes(file.read_bytes())
+    for file in root.glob("s*/*/*"):
+        target = folder / file.relative_to(root)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.hardlink_to(file)
+    return folder
+
+
+def edit(root: Path, table: str, change: Callable[[list[dict[str, Any]]], object]) -> None:
+    """Change the rows of a table."""
+    path = root / "v1.0-mini" / f"{table}.json"
+    rows = json.loads(path.read_text())
+    change(rows)
+    path.write_text(json.dumps(rows))
+
+
+words = st.text(st.sampled_from('ab{}[]",:\\/ \n\tü\u2028"token"'), max_size=8)
+values = st.one_of(words, st.integers(), st.booleans(), st.none(), st.lists(st.floats(allow_nan=False), max_size=3))
+records = st.fixed_dictionaries(
+    {"token": words}, optional={"sample_token": words, "x": values, "{": values, "b\\": words}
+)
+
+
+@given(st.lists(records, max_size=12), st.sets(words, max_size=4), st.data())
+@settings(max_examples=150, deadline=None)
+def test_scanning_finds_what_parsing_the_whole_table_finds(
+    tmp_path_factory: pytest.TempPathFactory, rows: list[dict[str, Any]], wanted: set[str], data: st.DataObject
+) -> None:
+    form = data.draw(
+        st.sampled_from([{}, {"indent": 0}, {"indent": 3}, {"separators": (",", ":")}, {"separators": (" , ", " : ")}])
+    )
+    text = json.dumps(rows, ensure_ascii=data.draw(st.booleans()), **form)
+    path = tmp_path_factory.mktemp("scan") / "table.json"
+    path.write_text(
+        data.draw(st.sampled_from(["", "\n", " "])) + text + data.draw(st.sampled_from(["", "\n\n"])), "utf-8"
+    )
+    longest = max((len(json.dumps(row, **form).encode()) for row in rows), default=0)
+    with patch.object(tables, "MAX_RECORD_BYTES", longest + 64):
+        for key in ("token", "sample_token"):
+            found = list(tables.scan_records(path, key, wanted, chunk_bytes=data.draw(st.integers(1, 400))))
+            assert found == [row for row in rows if row.get(key) in wanted]
+
+
+def test_scanning_a_large_table_takes_little_memory(tmp_path: Path) -> None:
+    row = {"token": "0" * 32, "sample_token": "1" * 32, "filename": "sweeps/" + "x" * 300, "prev": "", "next": ""}
+    one = json.dumps(row, indent=0)
+    wanted = one.replace("1" * 32, "2" * 32)
+    path = tmp_path / "sample_data.json"
+    path.write_text("[" + (one + ",") * 50_000 + wanted + "," + (one + ",") * 50_000 + wanted + "]")
+    tracemalloc.start()
+    found = list(tables.scan_records(path, "sample_token", ["2" * 32]))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(found) == 2
+    assert peak < 5 * tables.CHUNK_BYTES < path.stat().st_size
+
+
+def test_points_are_where_and_when_the_world_has_them(root: Path) -> None:
+    """The file order gives the times; rays without a return are not points."""
+    log, world = open_log(root), hdl32_world()
+    for i in (0, 4, 8):
+        ours, truth = log.streams["top"].read(i), world.streams["top"].read(i)
+        assert ours.compensated_ns == ours.stamp_ns == truth.stamp_ns
+        in_map, expected = transform_rigidly(log, "top", ours), deskew(world, "top", truth, truth.t_ns)
+        assert ours.t_ns is not None
+        assert len(in_map) == len(expected)
+        assert np.abs(ours.t_ns - np.sort(truth.t_ns)).max() < 5000
+        # The order within a firing is that of the rings, for both.
+        order = np.argsort(truth.t_ns, kind="stable")
+        assert np.abs(in_map - expected[order]).max() < 2e-3
+
+
+def test_rays_without_a_return_are_left_out_at_any_speed(tmp_path: Path) -> None:
+    """At 40 m/s the sensor is 2 m farther at the end of a turn, so that the first of these rays lie 2 m behind."""
+    firings, stamp_ns = 1085, 10**18
+    ago_s = (firings - 1 - np.arange(firings)) * FIRING_NS / NS_PER_S
+    rows = np.zeros((firings, 32, 5), "<f4")
+    rows[..., 1], rows[..., 4] = -40.0 * ago_s[:, None], np.arange(32)
+    rows[::7, 5, :3] += [0.0, 1.2, 0.0]
+    rows.tofile(tmp_path / "x.pcd.bin")
+
+    def poses(t_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        map_T_lidar = np.repeat(np.eye(4)[None], len(t_ns), axis=0)
+        map_T_lidar[:, 1, 3] = 40.0 * (t_ns - stamp_ns) / NS_PER_S
+        return map_T_lidar, np.ones(len(t_ns), dtype=bool)
+
+    sweep = read_sweep(tmp_path / "x.pcd.bin", stamp_ns, poses)
+    np.testing.assert_array_equal(sweep.xyz_m, rows[::7, 5, :3])
+    np.testing.assert_array_equal(sweep.t_ns - stamp_ns, np.round(-ago_s[::7] * NS_PER_S))
+
+
+def test_points_in_another_order_have_no_times(root: Path, spoilable: Path) -> None:
+    file = sorted(spoilable.glob("samples/top/*"))[0]
+    rows = np.fromfile(file, "<f4").reshape(-1, 5)
+    file.unlink()
+    rows[::-1].tofile(file)
+    sweep, ordered = open_log(spoilable).streams["top"].read(0), open_log(root).streams["top"].read(0)
+    assert sweep.t_ns is None
+    assert sweep.compensated_ns == sweep.stamp_ns
+    np.testing.assert_array_equal(sweep.xyz_m[::-1], ordered.xyz_m)
+
+
+def test_the_turn_is_clockwise_from_the_left() -> None:
+    left, front, right, back = [-1.0, -1e-9, 0], [0, 1.0, 0], [1.0, 0, 0], [0, -1.0, 0]
+    turned = seen_offset_ns(np.array([left, front, right, back, [-1.0, 1e-9, 0]]))
+    np.testing.assert_allclose(turned / TURN_NS, [0, -0.75, -0.5, -0.25, -1], atol=1e-8)
+
+
+def test_labels_between_key_frames_are_those_of_the_world(root: Path) -> None:
+    """Objects move straight on, so that interpolation is exact at every turn of the LiDAR."""
+    log, world = open_log(root), hdl32_world()
+    labels = log.labels
+    assert labels is not None
+    key_ns = world.streams["top"].t_ns[::KEY_EVERY]
+    np.testing.assert_array_equal(labels.labeled_ns, key_ns - TURN_NS // 2)
+    assert len(labels.t_ns) > 3 * len(np.unique(labels.track_id)) * len(key_ns)
+    for token in np.unique(labels.track_id):
+        rows = labels.track_id == token
+        t_ns = labels.t_ns[rows]
+        assert (np.diff(t_ns) >= 10_000_000).all()
+        assert (np.diff(t_ns) <= 1.3 * TURN_NS).all()
+        track = track_like(world.labels, labels, rows)
+        center, size, yaw = labels_at(world.labels, t_ns, track)
+        np.testing.assert_allclose(labels.center_m[rows], center, atol=1e-3)
+        np.testing.assert_allclose(labels.size_m[rows], np.tile(size, (rows.sum(), 1)))
+        np.testing.assert_allclose(labels.yaw_rad[rows], yaw, atol=1e-6)
+        map_T_lidar = log.map_T_sensor("top", t_ns)[0]
+        offset = seen_offset_ns(apply(inverse(map_T_lidar), labels.center_m[rows]))
+        assert np.abs((t_ns - offset)[:, None] - key_ns).min(axis=0).max() < 1_000_000
+
+
+def track_like(truth: Labels, labels: Labels, rows: np.ndarray) -> str:
+    """The track of the world that has the size of a track of the log."""
+    sizes = {str(track): truth.size_m[truth.track_id == track][0] for track in np.unique(truth.track_id)}
+    return min(sizes, key=lambda track: np.abs(sizes[track] - labels.size_m[rows][0]).sum())
+
+
+def test_turns_are_filled_in_where_tables_know_key_frames_alone() -> None:
+    t_ns = np.array([0, 50, 102, 600, 675]) * 1_000_000
+    ends = turn_ends(t_ns) // 1_000_000
+    np.testing.assert_allclose(
+        ends, [0, 50, 102, 151, 201, 251, 301, 351, 400, 450, 500, 550, 600, 637, 675], atol=1.01
+    )
+    np.testing.assert_array_equal(turn_ends(t_ns[:1]), t_ns[:1])
+
+
+def test_categories_follow_kinds_and_attributes(root: Path, spoilable: Path) -> None:
+    def kinds(rows: list[dict[str, Any]]) -> None:
+        names = {row["name"]: row for row in rows}
+        names["vehicle.car"]["name"], names["human.pedestrian.adult"]["name"] = "vehicle.bicycle", "animal"
+
+    def riders(rows: list[dict[str, Any]]) -> None:
+        token = json.loads((spoilable / "v1.0-mini" / "attribute.json").read_text())[0]["token"]
+        for row in rows:
+            ridden = abs(row["size"][1] - 4.4) < 0.1
+            row.update(attribute_tokens=[token] if ridden else [], visibility_token="" if ridden else "1")
+
+    edit(spoilable, "category", kinds)
+    edit(spoilable, "sample_annotation", riders)
+    log = open_log(spoilable)
+    labels = log.labels
+    assert labels is not None
+    moving = np.abs(labels.size_m[:, 0] - 4.4) < 0.1
+    assert set(labels.category[moving]) == {"cyclist"}
+    assert set(labels.category[~moving]) == {"bicycle"}
+    assert set(labels.kind) == {"vehicle.bicycle"}
+    np.testing.assert_array_equal(labels.visible, moving)
+    assert "animal (2)" in " ".join(log.notes)
+
+
+def test_a_scene_without_annotations_has_no_labels(spoilable: Path) -> None:
+    edit(spoilable, "sample_annotation", list.clear)
+    log = open_log(spoilable)
+    assert log.labels is None
+    assert any("no annotations" in note for note in log.notes)
+
+
+def test_files_of_a_partial_download_are_left_out_and_counted(root: Path, spoilable: Path) -> None:
+    whole = open_log(root)
+    for file in [*spoilable.glob("sweeps/top/*"), *spoilable.glob("s*/front/*")]:
+        file.unlink()
+    log = open_log(spoilable)
+    np.testing.assert_array_equal(log.streams["top"].t_ns, whole.streams["top"].t_ns[::KEY_EVERY])
+    assert set(log.streams) == {"top"}
+    assert log.reference_camera is None
+    sweeps, frames = (len(whole.streams[name].t_ns) for name in ("top", "front"))
+    assert f"top: {sweeps - len(log.streams['top'].t_ns)} of {sweeps} files are missing" in log.notes
+    assert f"front: {frames} of {frames} files are missing; the sensor is left out" in log.notes
+    assert any(note.endswith("RADAR_FRONT") for note in log.notes)
+    np.testing.assert_array_equal(log.ego.t_ns, whole.ego.t_ns)
+    for file in spoilable.glob("samples/top/*"):
+        file.unlink()
+    with pytest.raises(LogError, match="none of the 20 images and sweeps of scene 'world' is there"):
+        open_log(spoilable)
+
+
+def test_scenes_of_several_versions_are_told_apart(root: Path, spoilable: Path) -> None:
+    assert open_log(root / "v1.0-mini").name == open_log(root).name == "nuscenes-world"
+    other = spoilable / "v1.0-test"
+    other.mkdir()
+    for file in (root / "v1.0-mini").iterdir():
+        (other / file.name).write_bytes(file.read_bytes())
+    with pytest.raises(ConfigError, match=r"v1\.0-mini/world, v1\.0-test/world"):
+        open_log(spoilable)
+    assert open_log(spoilable, sequence="v1.0-test/world").details["tables"] == "v1.0-test"
+
+
+def test_the_order_of_records_has_no_effect(root: Path, spoilable: Path) -> None:
+    for table in ("sample", "sample_data", "ego_pose", "sample_annotation"):
+        edit(spoilable, table, list.reverse)
+    log, other = open_log(root), open_log(spoilable)
+    for name in log.streams:
+        np.testing.assert_array_equal(log.streams[name].t_ns, other.streams[name].t_ns)
+    np.testing.assert_array_equal(log.ego.map_T_ego, other.ego.map_T_ego)
+    np.testing.assert_array_equal(log.labels.t_ns, other.labels.t_ns)
+
+
+def test_the_map_lies_where_the_development_kit_puts_it(root: Path) -> None:
+    """The destination on a sphere by bearing and distance from the south-western corner."""
+    from pyproj import Proj
+
+    frame, x, y = open_log(root).map, 599.8, 1647.6
+    longitude, latitude = Proj(frame.projection)(x, y, inverse=True)
+    angle, bearing = np.hypot(x, y) / 6378137.0, np.arctan2(x, y)
+    lat0, lon0 = np.radians([42.336849169438615, -71.05785369873047])
+    lat = np.arcsin(np.sin(lat0) * np.cos(angle) + np.cos(lat0) * np.sin(angle) * np.cos(bearing))
+    lon = lon0 + np.arctan2(np.sin(bearing) * np.sin(angle) * np.cos(lat0), np.cos(angle) - np.sin(lat0) * np.sin(lat))
+    np.testing.assert_allclose([latitude, longitude], np.degrees([lat, lon]), atol=1e-9)
+
+
+def remove(root: Path, table: str) -> None:
+    (root / "v1.0-mini" / f"{table}.json").unlink()
+
+
+def cut(root: Path, table: str) -> None:
+    path = root / "v1.0-mini" / f"{table}.json"
+    path.write_text(path.read_text()[:-200])
+
+
+def spoil_first(key: str, value: Any) -> Callable[[Path, str], None]:
+    def change(root: Path, table: str) -> None:
+        edit(root, table, lambda rows: rows[0].update({key: value}))
+
+    return change
+
+
+def break_first(root: Path, table: str) -> None:
+    path = root / "v1.0-mini" / f"{table}.json"
+    path.write_text(path.read_text().replace('"timestamp": ', '"timestamp": oops', 1))
+
+
+@pytest.mark.parametrize(
+    ("table", "spoil", "expected"),
+    [
+        ("ego_pose", remove, "ego_pose.json: cannot be read: No such file"),
+        ("sensor", remove, "sensor.json: no such file"),
+        ("sample_annotation", remove, "sample_annotation.json: cannot be read: No such file"),
+        ("sample_data", cut, "sample_data.json: not valid JSON: it does not end with ']'"),
+        ("scene", cut, "scene.json: not valid JSON at line"),
+        ("sample_data", break_first, "sample_data.json, byte"),
+        ("calibrated_sensor", lambda r, t: edit(r, t, list.pop), "no record with token '"),
+        ("ego_pose", lambda r, t: edit(r, t, list.clear), "ego_pose.json: no record with token '"),
+        ("sensor", lambda r, t: edit(r, t, list.clear), "sensor.json: no record with token '"),
+        ("category", lambda r, t: edit(r, t, list.clear), "category.json: no record with token '"),
+        ("sample", lambda r, t: edit(r, t, list.clear), "sample.json: no sample of scene 'world'"),
+        ("sample_data", spoil_first("timestamp", 1.5), "'timestamp' is 1.5, expected whole microseconds"),
+        ("sample_data", spoil_first("timestamp", 10**18), "expected whole microseconds"),
+        ("sample_data", spoil_first("filename", "../../etc/passwd"), "leaves the log folder"),
+        ("sample_data", spoil_first("filename", 7), "'filename' is 7, expected a text"),
+        ("ego_pose", spoil_first("rotation", [1, 1, 0, 0]), "expected a unit quaternion"),
+        ("ego_pose", spoil_first("translation", [0, 0]), "'translation' is [0, 0], expected 3 finite numbers"),
+        ("calibrated_sensor", spoil_first("rotation", "x"), "'rotation' is 'x', expected 4 finite numbers"),
+        (
+            "calibrated_sensor",
+            lambda r, t: edit(r, t, lambda rows: rows[1].update(camera_intrinsic=[])),
+            "expected 3 x 3",
+        ),
+        ("sample_annotation", spoil_first("size", [1, "a", 2]), "'size' is [1, 'a', 2], expected 3 finite numbers"),
+        ("sample_annotation", spoil_first("instance_token", "nobody"), "no record with token 'nobody'"),
+    ],
+)
+def test_errors_name_the_table_and_what_was_expected(
+    spoilable: Path, table: str, spoil: Callable[[Path, str], None], expected: str
+) -> None:
+    spoil(spoilable, table)
+    with pytest.raises(LogError) as caught:
+        _ = open_log(spoilable).labels
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_sweep_of_half_a_point_costs_that_sweep_only(spoilable: Path) -> None:
+    file = sorted(spoilable.glob("samples/top/*"))[0]
+    data = file.read_bytes()
+    file.unlink()
+    file.write_bytes(data[:-7])
+    stream = open_log(spoilable).streams["top"]
+    with pytest.raises(RecordError, match=r"694393 bytes, expected five float32 \(x, y, z, intensity, ring\) a point"):
+        stream.read(0)
+    assert len(stream.read(1).xyz_m) > 100
+
+
+def test_coordinates_of_far_maps_are_made_small(root: Path, spoilable: Path) -> None:
+    def far(rows: list[dict[str, Any]]) -> None:
+        for row in rows:
+            row["translation"][0] += 50_000
+
+    edit(spoilable, "ego_pose", far)
+    edit(spoilable, "sample_annotation", far)
+    log, near = open_log(spoilable), open_log(root)
+    assert log.map.offset_m == (50_000, 0, 0)
+    np.testing.assert_allclose(log.ego.map_T_ego, near.ego.map_T_ego, atol=1e-6)
+    np.testing.assert_allclose(log.labels.center_m, near.labels.center_m, atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Log:
+    folder = SHARED / "data" / "nuscenes_mini"
+    if not folder.is_dir():
+        pytest.skip("the recorded scene is not beside this checkout (../shared/data)")
+    return open_log(folder)
+
+
+@pytest.mark.real
+def test_the_recorded_scene_has_what_its_tables_say(scene: Log) -> None:
+    assert scene.format == "nuscenes"
+    assert scene.reference_camera == "CAM_FRONT"
+    assert {name: len(stream.t_ns) for name, stream in scene.streams.items() if name != "LIDAR_TOP"} == {
+        f"CAM_{name}": 2 for name in ("BACK", "BACK_LEFT", "BACK_RIGHT", "FRONT", "FRONT_LEFT", "FRONT_RIGHT")
+    }
+    assert len(scene.ego.t_ns) == 281
+    assert len(scene.labels.labeled_ns) == 40
+    assert len(np.unique(scene.labels.track_id)) > 100
+    assert "LIDAR_TOP: 40 of 41 files are missing" in scene.notes
+    assert any("last 0.5 s of the 19.4 s" in note for note in scene.notes)
+
+
+@pytest.mark.real
+def test_recorded_points_are_compensated_to_the_end_of_their_turn() -> None:
+    """Rays without a return lie where the sensor was; the first ones are a turn's way behind, the last ones at the origin."""
+    file = next((SHARED / "data" / "nuscenes_mini" / "sweeps" / "LIDAR_TOP").glob("*.bin"), None)
+    if file is None:
+        pytest.skip("the recorded sweep is not beside this checkout (../shared/data)")
+    firings = np.fromfile(file, "<f4").reshape(-1, 32, 5)[..., :3].astype(float)
+    speed_mps = 8.56  # of the CAN bus
+    same = [np.unique(rows, axis=0, return_counts=True) for rows in firings[[0, -1]]]
+    first, last = (rows[np.argmax(count)] for rows, count in same)
+    assert np.linalg.norm(last) < 1e-4
+    assert -first[1] == pytest.approx(speed_mps * len(firings) * FIRING_NS / NS_PER_S, rel=0.02)
+    assert np.abs(first[[0, 2]]).max() < 0.03
+
+
+@pytest.mark.real
+def test_recorded_points_are_timed_by_their_direction_too(scene: Log) -> None:
+    sweep = scene.streams["LIDAR_TOP"].read(0)
+    assert sweep.t_ns is not None
+    far = np.linalg.norm(sweep.xyz_m, axis=1) > 15
+    difference = (sweep.t_ns - sweep.stamp_ns - seen_offset_ns(sweep.xyz_m))[far]
+    wrapped = (difference + TURN_NS // 2) % TURN_NS - TURN_NS // 2
+    assert np.percentile(np.abs(wrapped), 99) < 200_000
+
+
+@pytest.mark.real
+def test_the_recorded_road_is_at_the_ego_s_origin_and_boxes_hold_points(scene: Log) -> None:
+    sweep = scene.streams["LIDAR_TOP"].read(0)
+    xyz = transform_rigidly(scene, "LIDAR_TOP", sweep)
+    ego = apply(inverse(scene.ego.at(sweep.stamp_ns)[0][0]), xyz)
+    road = (np.abs(ego[:, 0]) < 15) & (np.abs(ego[:, 1]) < 3) & (np.abs(ego[:, 2]) < 0.4)
+    assert np.median(ego[road, 2]) == pytest.approx(0, abs=0.03)
+    labels = scene.labels
+    now = (labels.t_ns > sweep.stamp_ns - TURN_NS) & (labels.t_ns <= sweep.stamp_ns) & (labels.category == "car")
+    near = np.flatnonzero(now & (np.linalg.norm(labels.center_m - xyz.mean(axis=0), axis=1) < 40))
+    counts = [points_in_box(xyz, labels.center_m[k], labels.size_m[k] + 0.1, labels.yaw_rad[k]).sum() for k in near]
+    assert len(counts) >= 2
+    assert min(counts) >= 10
