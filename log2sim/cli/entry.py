@@ -11,6 +11,7 @@ import typer
 from log2sim.cli import (
     bench,
     config,
+    convert,
     detect,
     edit,
     evaluate,
@@ -51,7 +52,7 @@ def root(version: Annotated[bool, typer.Option("--version", help="Print the vers
 
 for command in (
     reconstruct.reconstruct, detect.detect, replay.replay, synth.synth, edit.edit, plot.plot, evaluate.evaluate, bench.bench,
-    inspect.inspect, validate.validate, config.config, view.view, export.export,
+    inspect.inspect, validate.validate, convert.convert, config.config, view.view, export.export,
 ):  # fmt: skip
     app.command()(command)
 app.command(name="import")(import_.import_)

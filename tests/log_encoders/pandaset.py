@@ -47,6 +47,7 @@ def _points(log: Log, k: int) -> dict[str, Array]:
     sweep = log.streams[LIDAR].read(k)
     poses = log.map_T_sensor(LIDAR, sweep.t_ns)[0]
     xyz = np.einsum("nij,nj->ni", poses[:, :3, :3], sweep.xyz_m) + poses[:, :3, 3]
+    xyz = np.round(xyz, 3)
     ahead = np.flatnonzero(np.abs(np.arctan2(sweep.xyz_m[:, 1], sweep.xyz_m[:, 0])) < GT_HALF_VIEW_RAD)
     sensor = np.zeros(len(xyz), dtype=np.int64)
     sensor[ahead[::GT_SHARE]] = 1

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Labels, Log
+from log2sim.datatypes import Labels, Lidar, Log
 from log2sim.errors import ConfigError
-from log2sim.geometry import Array, quaternion_from_rotation, yaw_of
+from log2sim.geometry import Array, Camera, quaternion_from_rotation, yaw_of
 from log2sim.logs.native.labels import (
     BOX_2D_COLUMNS,
     BOX_3D_COLUMNS,
@@ -26,7 +26,7 @@ from log2sim.logs.native.reader import GNSS_COLUMNS, POSE_COLUMNS
 
 def write_ego(log: Log, root: Path, manifest: dict[str, Any], kind: str) -> None:
     """Write the ego's poses, or the same as GNSS fixes, and describe the ego in the manifest."""
-    sensors = (*log.cameras.values(), *log.lidars.values())
+    sensors: list[Camera | Lidar] = [*log.cameras.values(), *log.lidars.values()]
     if log.ego is None and all(sensor.mount == "map" for sensor in sensors):
         return
     vehicle = log.ego_vehicle

@@ -1,0 +1,64 @@
+"""Write a log, or a part of it, as a folder of log2sim's own layout."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from log2sim.cli.options import (
+    Cameras,
+    Format,
+    LogPath,
+    Overwrite,
+    Quiet,
+    Sequence,
+    camera_names,
+    counted,
+    say,
+)
+from log2sim.errors import ConfigError
+
+
+def convert(
+    log: LogPath,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
+    format: Format = "auto",
+    sequence: Sequence = None,
+    start: Annotated[float | None, typer.Option(help="First time to keep, in s from the start of the log.")] = None,
+    stop: Annotated[float | None, typer.Option(help="Last time to keep, in s from the start of the log.")] = None,
+    cameras: Cameras = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write any log, or a part of it, as a log folder of log2sim; images are copied as they are."""
+    from log2sim.cli.progress import progress
+    from log2sim.documents import refuse_below_file
+    from log2sim.logs.excerpt import cut_log
+    from log2sim.logs.native.writer import refuse_target, write_log
+    from log2sim.logs.opening import open_log
+
+    names = camera_names(cameras)
+    refuse_below_file(out)
+    refuse_target(out, overwrite=overwrite)
+    if out.resolve() in (log.resolve(), *log.resolve().parents):
+        raise ConfigError(f"{out}: holds the log that is converted; choose another folder")
+    part = cut_log(open_log(log, format=format, sequence=sequence), cameras=names, start_s=start, stop_s=stop)
+    for note in part.notes:
+        say(f"note: {note}", quiet=quiet)
+    problems: list[str] = []
+    with progress(quiet=quiet) as report_progress:
+        write_log(
+            part,
+            out,
+            overwrite=overwrite,
+            jpeg_quality=95,
+            progress=lambda done, total: report_progress("convert", done, total),
+            problems=problems,
+        )
+    for problem in problems:
+        say(f"note: left out: {problem}", quiet=quiet)
+    records = sum(len(stream.t_ns) for stream in part.streams.values()) - len(problems)
+    size_mb = sum(file.stat().st_size for file in out.rglob("*") if file.is_file()) / 1e6
+    say(f"{out}: {counted(records, 'record')} of {counted(len(part.streams), 'sensor')}, {size_mb:.1f} MB", quiet=quiet)

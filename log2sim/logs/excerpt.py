@@ -1,0 +1,177 @@
+"""A part of a log: fewer cameras, a shorter time. Nothing is read but stamps."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import ImageLabels, ImageRegions, Labels, Log, Stream
+from log2sim.errors import ConfigError
+from log2sim.geometry import NS_PER_S, PoseTrack
+from log2sim.registry import nearest
+
+# Beyond the first and the last tick, so that each still finds its nearest sweep, which may be a turn of 10 Hz away.
+RECORD_MARGIN_NS = 200_000_000
+# Stamps of labels and frames of one moment differ by rounding in some logs.
+STAMP_TOLERANCE_NS = 1_000_000
+
+
+@dataclass(frozen=True)
+class _Span:
+    """First and last stamp of the ticks that are kept, absolute ns."""
+
+    first_ns: int
+    last_ns: int
+
+    def contains(self, t_ns: NDArray[np.int64], margin_ns: int) -> NDArray[np.bool_]:
+        """Mark the stamps (N,) in the span, widened on both sides."""
+        return np.asarray((t_ns >= self.first_ns - margin_ns) & (t_ns <= self.last_ns + margin_ns))
+
+
+def cut_log(log: Log, *, cameras: Sequence[str] = (), start_s: float | None = None, stop_s: float | None = None) -> Log:
+    """Restrict a log to some cameras and to a time.
+
+    Parameters
+    ----------
+    log : Log
+    cameras : sequence of str
+        All where it is empty. LiDARs are always kept.
+    start_s, stop_s : float, optional
+        Ticks, the frames of the reference camera or else the sweeps of a LiDAR, are kept from `start_s` to `stop_s`, s after
+        the first one. Other records reach up to `RECORD_MARGIN_NS` beyond them, poses and labels to the next one.
+
+    Raises
+    ------
+    ConfigError
+        For an unknown camera, and where no tick is left.
+    """
+    for name in cameras:
+        if name not in log.cameras:
+            known = list(log.cameras)
+            there = ", ".join(known) or "none"
+            raise ConfigError(f"--cameras: no camera '{name}'{nearest(name, known)}; the log has {there}")
+    if not cameras and start_s is None and stop_s is None:
+        return log
+    chosen = {name: camera for name, camera in log.cameras.items() if not cameras or name in cameras}
+    streams = {name: log.streams[name] for name in (*chosen, *log.lidars)}
+    reference = _reference(log, list(chosen))
+    ticks = log.streams[reference].t_ns
+    span = None if start_s is None and stop_s is None else _span(ticks, reference, start_s, stop_s)
+    notes: list[str] = []
+    if span is not None:
+        margins = {name: 0 if name == reference else RECORD_MARGIN_NS for name in streams}
+        streams = {name: _cut_stream(stream, span, margins[name]) for name, stream in streams.items()}
+        notes = [f"{name}: no record from --start to --stop" for name, s in streams.items() if not len(s.t_ns)]
+        streams = {name: stream for name, stream in streams.items() if len(stream.t_ns)}
+    kept = {name: chosen[name] for name in chosen if name in streams}
+    return Log(
+        name=log.name,
+        format=log.format,
+        cameras=kept,
+        lidars={name: lidar for name, lidar in log.lidars.items() if name in streams},
+        streams=streams,
+        ego=log.ego if log.ego is None or span is None else _cut_poses(log.ego, span),
+        ego_vehicle=log.ego_vehicle,
+        map=log.map,
+        labels=lambda: _cut_labels(log.labels, list(kept), span),
+        image_labels={n: _cut_image_labels(labels, span) for n, labels in log.image_labels.items() if n in kept},
+        ignored_regions={n: _cut_regions(regions, span) for n, regions in log.ignored_regions.items() if n in kept},
+        ground_z_ego_m=log.ground_z_ego_m,
+        reference_camera=log.reference_camera if log.reference_camera in kept else None,
+        digest=hashlib.sha256(f"{log.digest} {sorted(streams)} {span}".encode()).hexdigest(),
+        notes=lambda: (*log.notes, *notes),
+        details=log.details,
+    )
+
+
+def _reference(log: Log, cameras: list[str]) -> str:
+    """Choose the sensor whose records are the ticks, as reconstruction does."""
+    if cameras:
+        return log.reference_camera if log.reference_camera in cameras else cameras[0]
+    return max(log.lidars, key=lambda name: len(log.streams[name].t_ns))
+
+
+def _span(ticks: NDArray[np.int64], reference: str, start_s: float | None, stop_s: float | None) -> _Span:
+    seconds = (ticks - ticks[0]) / NS_PER_S
+    low, high = -np.inf if start_s is None else start_s, np.inf if stop_s is None else stop_s
+    kept = ticks[(seconds >= low) & (seconds <= high)]
+    if not len(kept):
+        raise ConfigError(f"--start/--stop leave no record of '{reference}', which lasts {seconds[-1]:.3f} s")
+    return _Span(int(kept[0]), int(kept[-1]))
+
+
+def _cut_stream(stream: Stream, span: _Span, margin_ns: int) -> Stream:
+    rows = np.flatnonzero(span.contains(stream.t_ns, margin_ns)).tolist()
+    encoded = stream.encoded
+    return Stream(
+        stream.name,
+        stream.t_ns[rows],
+        _shifted(stream.read, rows),
+        None if encoded is None else _shifted(encoded, rows),
+    )
+
+
+def _shifted(read: Callable[[int], Any], rows: list[int]) -> Callable[[int], Any]:
+    return lambda i: read(rows[i])
+
+
+def _cut_poses(track: PoseTrack, span: _Span) -> PoseTrack:
+    """Keep the poses of the records and one beyond on either side, for interpolation."""
+    inside = np.flatnonzero(span.contains(track.t_ns, 2 * RECORD_MARGIN_NS))
+    first = np.searchsorted(track.t_ns, span.first_ns) if not len(inside) else inside[0]
+    last = first if not len(inside) else inside[-1]
+    rows = slice(max(int(first) - 1, 0), int(last) + 2)
+    return replace(track, t_ns=track.t_ns[rows], map_T_ego=track.map_T_ego[rows])
+
+
+def _cut_labels(labels: Labels | None, cameras: list[str], span: _Span | None) -> Labels | None:
+    """Keep the labels of each track in the span and one beyond on either side; none where no labeled camera is left."""
+    if labels is None or (labels.cameras is not None and not set(labels.cameras) & set(cameras)):
+        return None
+    seen = None if labels.cameras is None else tuple(name for name in labels.cameras if name in cameras)
+    if span is None:
+        return replace(labels, cameras=seen)
+    keep = np.zeros(len(labels.t_ns), dtype=bool)
+    for track in np.unique(labels.track_id):
+        keep |= _with_neighbors(labels.t_ns, np.flatnonzero(labels.track_id == track), span)
+    labeled = labels.labeled_ns
+    if labeled is not None:
+        labeled = labeled[_with_neighbors(labeled, np.arange(len(labeled)), span)]
+    optional = ("cameras", "labeled_ns")
+    columns: dict[str, Any] = {
+        name: column if column is None else column[keep]
+        for name, column in vars(labels).items()
+        if name not in optional
+    }
+    return Labels(**{**columns, "cameras": seen, "labeled_ns": labeled})
+
+
+def _with_neighbors(t_ns: NDArray[np.int64], rows: NDArray[np.intp], span: _Span) -> NDArray[np.bool_]:
+    """Mark (N,) those of `rows` in the span, and of the others the last before and the first after it."""
+    mark = np.zeros(len(t_ns), dtype=bool)
+    mark[rows[span.contains(t_ns[rows], 0)]] = True
+    before, after = rows[t_ns[rows] < span.first_ns], rows[t_ns[rows] > span.last_ns]
+    if len(before):
+        mark[before[np.argmax(t_ns[before])]] = True
+    if len(after):
+        mark[after[np.argmin(t_ns[after])]] = True
+    return mark
+
+
+def _cut_image_labels(labels: ImageLabels, span: _Span | None) -> ImageLabels:
+    if span is None:
+        return labels
+    rows = span.contains(labels.t_ns, RECORD_MARGIN_NS + STAMP_TOLERANCE_NS)
+    return ImageLabels(labels.t_ns[rows], labels.box_px[rows], labels.category[rows])
+
+
+def _cut_regions(regions: ImageRegions, span: _Span | None) -> ImageRegions:
+    if span is None:
+        return regions
+    rows = span.contains(regions.t_ns, RECORD_MARGIN_NS + STAMP_TOLERANCE_NS)
+    return ImageRegions(regions.t_ns[rows], regions.box_px[rows])

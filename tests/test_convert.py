@@ -1,0 +1,169 @@
+"""Any log as a log folder: the same scenario comes of it, and of a part what comes of that part."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import names, run
+from log_encoders import kitti, native, pandaset
+from log_encoders.world import make_world, world_log
+
+from log2sim.config import Config
+from log2sim.datatypes import Log, Scenario, Stream
+from log2sim.errors import ConfigError
+from log2sim.logs.excerpt import RECORD_MARGIN_NS, cut_log
+from log2sim.logs.opening import open_log
+from log2sim.logs.validation import validate_log
+from log2sim.pipeline import reconstruct
+
+TWO_CAMERAS = [
+    {"name": "front", "position_m": [1.7, 0.0, 1.5], "size_px": [480, 300], "offset_s": 0.05},
+    {"name": "left", "position_m": [1.2, 0.6, 1.5], "yaw_deg": 60.0, "size_px": [320, 200], "offset_s": 0.02},
+]
+
+
+def scenario_of(path: Path, **changes: object) -> Scenario:
+    return reconstruct(open_log(path), Config.load(detect={"name": "labels"}, **changes)).scenario
+
+
+def assert_same(ours: Scenario, theirs: Scenario, atol_m: float) -> None:
+    """The same agents in the same places at the same times; ids and map origins may differ."""
+    assert ours.t0_ns == theirs.t0_ns
+    assert len(ours.agents) == len(theirs.agents)
+    shift = np.subtract(ours.map.offset_m, theirs.map.offset_m)
+    for a in ours.agents:
+        b = next(b for b in theirs.agents if b.id == a.id)
+        assert (a.category, a.static) == (b.category, b.static)
+        np.testing.assert_allclose(a.size_m, b.size_m, atol=atol_m)
+        np.testing.assert_allclose(a.waypoints.t_s, b.waypoints.t_s, atol=1e-6)
+        for column, offset in (("x_m", shift[0]), ("y_m", shift[1]), ("z_m", shift[2])):
+            np.testing.assert_allclose(getattr(a.waypoints, column) + offset, getattr(b.waypoints, column), atol=atol_m)
+
+
+@pytest.mark.parametrize(
+    "encode", [native.encode, kitti.encode_raw, pandaset.encode], ids=["log2sim", "kitti", "pandaset"]
+)
+def test_a_converted_log_gives_the_same_scenario(tmp_path: Path, encode: Callable[[Log, Path], Path]) -> None:
+    path = encode(world_log(), tmp_path / "from")
+    ran = run("convert", path, "--out", tmp_path / "to")
+    assert ran.code == 0, ran.err
+    assert "records of" in ran.out
+    assert validate_log(tmp_path / "to") == []
+    before, after = scenario_of(path), scenario_of(tmp_path / "to")
+    assert len(before.agents) >= 3
+    assert_same(after, before, atol_m=0.005)
+    log, back = open_log(path), open_log(tmp_path / "to")
+    assert {n: s.t_ns.tolist() for n, s in back.streams.items()} == {n: s.t_ns.tolist() for n, s in log.streams.items()}
+    for name in log.cameras:
+        assert back.streams[name].encoded(2) == log.streams[name].encoded(2)
+
+
+def test_a_part_gives_what_reconstruction_makes_of_that_part(tmp_path: Path) -> None:
+    path = native.encode(make_world(camera=TWO_CAMERAS), tmp_path)
+    ran = run("convert", path, "--out", tmp_path / "part", "--start", "0.2", "--stop", "0.7", "--cameras", "front")
+    assert ran.code == 0, ran.err
+    part = open_log(tmp_path / "part")
+    assert list(part.cameras) == ["front"]
+    assert len(part.streams["front"].t_ns) == 6
+    assert set(part.image_labels) == {"front"}
+    assert not (tmp_path / "part" / "left").exists()
+    assert_same(scenario_of(tmp_path / "part"), scenario_of(path, start_s=0.2, stop_s=0.7, cameras=("front",)), 0.005)
+
+
+def test_what_surrounds_a_part_is_kept_for_interpolation() -> None:
+    log = world_log()
+    part = cut_log(log, start_s=0.3, stop_s=0.5)
+    first, last = (int(part.streams["front"].t_ns[k]) for k in (0, -1))
+    assert last - first == 200_000_000
+    for stamps in (part.ego.t_ns, part.streams["top"].t_ns, part.labels.t_ns):
+        assert stamps.min() < first
+        assert stamps.max() > last
+        assert (np.abs(stamps - (first + last) // 2) < 100_000_000 + 3 * RECORD_MARGIN_NS).all()
+    for track in np.unique(log.labels.track_id):
+        assert (part.labels.track_id == track).sum() == 5
+    for i, t in enumerate(part.streams["top"].t_ns):
+        k = int(np.searchsorted(log.streams["top"].t_ns, t))
+        assert part.streams["top"].read(i) is log.streams["top"].read(k)
+    assert part.digest != log.digest
+    assert cut_log(log) is log
+
+
+def test_labels_stay_with_their_cameras() -> None:
+    log = make_world(camera=TWO_CAMERAS)
+    labeled = replace(log, labels=replace(log.labels, cameras=("left",)))
+    assert cut_log(labeled, cameras=("left",)).labels.cameras == ("left",)
+    assert cut_log(labeled, cameras=("front",)).labels is None
+    assert cut_log(labeled, cameras=("front",)).reference_camera == "front"
+    assert cut_log(labeled, cameras=("left",)).reference_camera is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--cameras", "frnt"), "no camera 'frnt' (did you mean 'front'?)"),
+        (("--start", "5"), "leave no record of 'front'"),
+        (("--start", "0.5", "--stop", "0.1"), "leave no record"),
+        (("--cameras", ","), "--cameras: is empty"),
+    ],
+)
+def test_a_part_that_is_none_is_refused(
+    tiny_folder: Path, tmp_path: Path, arguments: tuple[str, ...], words: str
+) -> None:
+    ran = run("convert", tiny_folder, "--out", tmp_path / "to", *arguments)
+    assert ran.code == 2
+    assert words in ran.line
+    assert names(tmp_path) == []
+
+
+def test_nothing_is_lost_or_left_behind(log_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = names(tmp_path)
+    for out, words in ((log_folder, "exists already"), (tmp_path, "exists already")):
+        assert words in run("convert", log_folder, "--out", out).line
+    assert "holds the log" in run("convert", log_folder, "--out", log_folder, "--overwrite").line
+    assert "no log folder" in run("convert", log_folder, "--out", tmp_path, "--overwrite").line
+
+    def interrupted(data: bytes, folder: Path, i: int, t_ns: int) -> str:
+        if i == 3:
+            raise KeyboardInterrupt
+        return f"{folder.name}/{i}"
+
+    monkeypatch.setattr("log2sim.logs.native.writer._copy_image", interrupted)
+    ran = run("convert", log_folder, "--out", tmp_path / "to")
+    assert ran.code == 130
+    assert names(tmp_path) == before
+
+
+def test_a_damaged_record_is_left_out_and_said(log_folder: Path, tmp_path: Path) -> None:
+    sweeps = sorted(log_folder.glob("top/*.npz"))
+    sweeps[2].write_bytes(b"torn")
+    ran = run("convert", log_folder, "--out", tmp_path / "to")
+    assert ran.code == 0
+    assert f"left out: stream 'top': {sweeps[2]}" in ran.out
+    assert len(open_log(tmp_path / "to").streams["top"].t_ns) == len(sweeps) - 1
+
+
+def test_a_sensor_without_records_in_the_part_is_left_out() -> None:
+    log = world_log()
+    late = replace(log, streams={**log.streams, "top": Stream("top", log.streams["top"].t_ns + 10**11, lambda i: None)})
+    part = cut_log(late, start_s=0.0, stop_s=0.5)
+    assert list(part.lidars) == []
+    assert "top: no record from --start to --stop" in part.notes
+    with pytest.raises(ConfigError, match="leave no record of 'top'"):
+        cut_log(replace(log, cameras={}), start_s=7.0)
+
+
+@pytest.mark.slow
+@pytest.mark.real
+@pytest.mark.parametrize("path", ["kitti_tracking", "pandaset/002"])
+def test_a_part_of_a_recorded_log_gives_the_same_scenario(real_data: Path, tmp_path: Path, path: str) -> None:
+    cameras = {"kitti_tracking": ("image_02",), "pandaset/002": ("front_camera",)}[path]
+    arguments = ("--start", 1, "--stop", 2.5, "--cameras", *cameras)
+    ran = run("convert", real_data / path, "--out", tmp_path / "to", *arguments)
+    assert ran.code == 0, ran.err
+    assert validate_log(tmp_path / "to") == []
+    theirs = scenario_of(real_data / path, start_s=1.0, stop_s=2.5, cameras=cameras)
+    assert_same(scenario_of(tmp_path / "to"), theirs, atol_m=0.02)
