@@ -20,6 +20,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "pandaset": "log2sim.logs.pandaset.reader:READER",
         "waymo": "log2sim.logs.waymo.reader:READER",
         "ros": "log2sim.logs.ros.reader:READER",
+        "argoverse2": "log2sim.logs.argoverse.reader:READER",
     },
     "detector": {
         "ssd-mobilenet-v2": "log2sim.perception.detect.ssd_mobilenet:create",

@@ -159,6 +159,17 @@ def test_gaps_and_ends_of_a_pose_track_are_not_valid() -> None:
     assert at_s(track, asked)[1].tolist() == [False, True, True, True, False, False, True, False, False]
 
 
+def test_beyond_its_ends_a_pose_track_goes_on_at_the_speed_of_poses_some_time_apart() -> None:
+    """The last two poses are 1 ns apart, and so are the first two; their places differ by a tenth of a millimeter."""
+    track = pose_track([0.0, 1e-9, 0.02, 0.1, 0.2, 0.2 + 1e-9])
+    track.map_T_ego[[1, -1], 0, 3] += 1e-4
+    asked = [-0.1, 0.05, 0.2, 0.3]
+    poses, valid = at_s(track, asked)
+    assert valid.all()
+    np.testing.assert_allclose(poses[:, 0, 3], 10.0 * np.array(asked), atol=1e-3)
+    np.testing.assert_allclose(yaw_of(poses), 0.4 * np.array(asked), atol=1e-4)
+
+
 def test_a_single_pose_holds_for_a_moment() -> None:
     poses, valid = at_s(pose_track([1.0]), [0.79, 0.8, 1.0, 1.2, 1.21])
     assert valid.tolist() == [False, True, True, True, False]

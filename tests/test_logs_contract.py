@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from log_encoders import kitti, kitti_object, native, nuscenes, pandaset, ros, waymo
+from log_encoders import argoverse, kitti, kitti_object, native, nuscenes, pandaset, ros, waymo
 from log_encoders.world import RED, labels_at, world_log
 
 from log2sim import registry
@@ -92,6 +92,11 @@ ENCODERS: dict[str, Encoder] = {
     "nuscenes": Encoder(
         nuscenes.encode_world, records={"front": "samples/front/*", "top": "samples/top/*"},
         several=encode_two_below(nuscenes.encode_world),
+    ),
+    "argoverse2": Encoder(
+        argoverse.encode, {"ring_front_center": "front", "up_lidar": "top"},
+        {"ring_front_center": "sensors/cameras/ring_front_center/*.jpg", "up_lidar": "sensors/lidar/*.feather"},
+        encode_two_below(argoverse.encode), tolerance_m=0.05,
     ),
 }  # fmt: skip
 

@@ -17,6 +17,9 @@ from log2sim.geometry.transforms import (
     transform,
 )
 
+# Poses of some logs are 1 ns apart; beyond the ends of a track motion is taken from poses at least this far apart, if there are.
+MIN_EXTRAPOLATION_BASE_NS = 10_000_000
+
 
 @dataclass(frozen=True, eq=False)
 class PoseTrack:
@@ -62,15 +65,24 @@ class PoseTrack:
         if len(self.t_ns) == 1:
             near = np.abs(t - self.t_ns[0]) <= round(self.extrapolate_s * NS_PER_S)
             return np.repeat(self.map_T_ego, len(t), axis=0), near
-        i = np.clip(np.searchsorted(self.t_ns, t, side="right") - 1, 0, len(self.t_ns) - 2)
-        span = (self.t_ns[i + 1] - self.t_ns[i]).astype(np.float64)
+        i, k = self._neighbors(t)
+        span = (self.t_ns[k] - self.t_ns[i]).astype(np.float64)
         fraction = (t - self.t_ns[i]).astype(np.float64) / span
         q = self._quaternions
         position = self.map_T_ego[:, :3, 3]
         poses = transform(
-            rotation_from_quaternion(slerp(q[i], q[i + 1], fraction)),
-            position[i] + fraction[:, None] * (position[i + 1] - position[i]),
+            rotation_from_quaternion(slerp(q[i], q[k], fraction)),
+            position[i] + fraction[:, None] * (position[k] - position[i]),
         )
         margin = round(self.extrapolate_s * NS_PER_S)
         inside = (t >= self.t_ns[0] - margin) & (t <= self.t_ns[-1] + margin)
         return poses, inside & ((span <= self.max_gap_s * NS_PER_S) | np.isin(t, self.t_ns))
+
+    def _neighbors(self, t_ns: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows (N,) before and after stamps; outside the track its end and a row some time away, never two at nearly one time."""
+        last = len(self.t_ns) - 1
+        after = np.clip(np.searchsorted(self.t_ns, t_ns, side="right"), 1, last)
+        second = min(int(np.searchsorted(self.t_ns, self.t_ns[0] + MIN_EXTRAPOLATION_BASE_NS)), last)
+        second_last = max(int(np.searchsorted(self.t_ns, self.t_ns[-1] - MIN_EXTRAPOLATION_BASE_NS, side="right")) - 1, 0)
+        start, end = t_ns < self.t_ns[0], t_ns > self.t_ns[-1]
+        return np.where(end, second_last, after - 1), np.where(start, second, after)

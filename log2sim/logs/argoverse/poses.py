@@ -1,0 +1,72 @@
+"""Transforms in the tables of Argoverse 2: quaternion and translation in seven columns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.errors import LogError
+from log2sim.geometry import Array, PoseTrack, rotation_from_quaternion, transform
+from log2sim.logs.arrow_tables import read_columns
+from log2sim.logs.arrow_values import Kind
+from log2sim.logs.stamps import strictly_increasing
+
+QUATERNION = ("qw", "qx", "qy", "qz")
+TRANSLATION = ("tx_m", "ty_m", "tz_m")
+TRANSFORM: Mapping[str, Kind] = dict.fromkeys((*QUATERNION, *TRANSLATION), "float")
+MAX_NORM_ERROR = 1e-3
+KM_M = 1000.0
+
+
+def read_ego_track(path: Path, notes: list[str]) -> tuple[PoseTrack, tuple[float, float, float]]:
+    """Read `city_SE3_egovehicle.feather`.
+
+    Returns
+    -------
+    track : PoseTrack
+        Every row of the file, in a map whose origin is whole kilometers away from that of the city.
+    offset_m : (3,) tuple of float, m
+        From the city's frame to the map: city = map + `offset_m`.
+    """
+    columns = read_columns(path, {"timestamp_ns": "int", **TRANSFORM})
+    city_T_ego = transforms_of(columns, path)
+    if not len(city_T_ego):
+        raise LogError(f"{path}: no poses; expected at least one")
+    keep, problems = strictly_increasing(columns["timestamp_ns"], path.name)
+    notes += problems
+    east, north = (float(v) for v in np.floor(city_T_ego[keep[0], :2, 3] / KM_M) * KM_M)
+    map_T_ego = city_T_ego[keep].copy()
+    map_T_ego[:, :3, 3] -= [east, north, 0.0]
+    return PoseTrack(columns["timestamp_ns"][keep], map_T_ego), (east, north, 0.0)
+
+
+def read_mounts(path: Path) -> dict[str, Array]:
+    """Read `egovehicle_SE3_sensor.feather`: `ego_T_sensor` (4, 4) by sensor."""
+    columns = read_columns(path, {"sensor_name": "text", **TRANSFORM})
+    mounts = transforms_of(columns, path)
+    return {str(name): mount for name, mount in zip(columns["sensor_name"], mounts)}
+
+
+def transforms_of(columns: Mapping[str, NDArray[Any]], path: Path) -> Array:
+    """Build transforms (N, 4, 4) of the columns `TRANSFORM`, each (N,).
+
+    Raises
+    ------
+    LogError
+        When one is not finite or its quaternion not of length 1; names file and row.
+    """
+    q = np.stack([columns[k].astype(np.float64) for k in QUATERNION], axis=1)
+    position = np.stack([columns[k].astype(np.float64) for k in TRANSLATION], axis=1)
+    norm = np.linalg.norm(q, axis=1)
+    bad = np.flatnonzero(~(np.abs(norm - 1) < MAX_NORM_ERROR) | ~np.isfinite(position).all(axis=1))
+    if len(bad):
+        k = int(bad[0])
+        raise LogError(
+            f"{path}, row {k}: quaternion {q[k].tolist()}, translation {position[k].tolist()}, expected finite numbers "
+            "and a quaternion of length 1"
+        )
+    return transform(rotation_from_quaternion(q), position)
