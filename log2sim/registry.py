@@ -19,6 +19,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "kitti-object": "log2sim.logs.kitti.object:READER",
         "pandaset": "log2sim.logs.pandaset.reader:READER",
         "waymo": "log2sim.logs.waymo.reader:READER",
+        "waymo-parquet": "log2sim.logs.waymo.parquet_reader:READER",
         "ros": "log2sim.logs.ros.reader:READER",
         "argoverse2": "log2sim.logs.argoverse.reader:READER",
     },

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from log_encoders import argoverse, kitti, kitti_object, native, nuscenes, pandaset, ros, waymo
+from log_encoders import argoverse, kitti, kitti_object, native, nuscenes, pandaset, ros, waymo, waymo_parquet
 from log_encoders.world import RED, labels_at, world_log
 
 from log2sim import registry
@@ -88,6 +88,9 @@ ENCODERS: dict[str, Encoder] = {
         {"front_camera": "camera/front_camera/*.jpg", "pandar64": "lidar/*.pkl.gz"}, encode_two_below(pandaset.encode),
     ),
     "waymo": Encoder(waymo.encode, {"FRONT": "front", "LIDAR_TOP": "top"}, several=encode_two_below(waymo.encode)),
+    "waymo-parquet": Encoder(
+        waymo_parquet.encode, {"FRONT": "front", "LIDAR_TOP": "top"}, several=encode_two_below(waymo_parquet.encode)
+    ),
     "ros": Encoder(ros.encode, several=encode_two_below(ros.encode), labels=False),
     "nuscenes": Encoder(
         nuscenes.encode_world, records={"front": "samples/front/*", "top": "samples/top/*"},

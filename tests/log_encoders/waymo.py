@@ -24,6 +24,7 @@ from log2sim.geometry import (
     transform,
     yaw_of,
 )
+from log2sim.logs.waymo.crc32c import masked_crc32c
 from log_encoders.world import labels_at
 
 PERIOD_NS = 100_000_000
@@ -166,6 +167,8 @@ def top_ranges(log: Log, lidar: str, k: int, laser: Laser, width: int) -> Ranges
     returns = [np.full((*shape, 4), -1.0, np.float32) for _ in range(2)]
     for number, image in enumerate(returns):
         chosen = (np.arange(len(x)) % 5 == 0) == (number == 1)
+        # Intensity and elongation, which no reader needs.
+        image[..., 1:3] = np.random.default_rng([k, number]).random((*shape, 2))
         image[row[chosen], column[chosen], 0] = np.sqrt(x * x + y * y + z * z)[chosen]
     poses = np.zeros((*shape, 6), np.float32)
     assert sweep.t_ns is not None
@@ -333,14 +336,9 @@ def message(number: int, body: bytes) -> bytes:
 
 
 def record(data: bytes) -> bytes:
-    """Frame data as a TFRecord does."""
+    """Frame data as a TFRecord does; the checksum is compared with `bitwise_crc32c` and published vectors elsewhere."""
     length = struct.pack("<Q", len(data))
-    return length + struct.pack("<I", masked_crc(length)) + data + struct.pack("<I", masked_crc(data))
-
-
-def masked_crc(data: bytes) -> int:
-    crc = bitwise_crc32c(data)
-    return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
+    return length + struct.pack("<I", masked_crc32c(length)) + data + struct.pack("<I", masked_crc32c(data))
 
 
 def bitwise_crc32c(data: Iterable[int]) -> int:

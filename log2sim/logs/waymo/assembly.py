@@ -162,7 +162,8 @@ class _Assembly:
                 raise RecordError(f"{where}, {name} (stamp {stamp_ns}): {error}") from None
             # Nothing tells how the short-range LiDARs turn.
             timed = self.times.at_turn(np.broadcast_to(row, len(turn)), turn) - stamp_ns if number == TOP else None
-            return sweep_of(xyz_m, stamp_ns, timed, "lidar", stamp_ns)
+            raw = number == TOP and self.segment.pixel_poses_are_missing
+            return sweep_of(xyz_m, stamp_ns, timed, "lidar", None if raw else stamp_ns)
 
         return Stream(name, stamps, read)
 
@@ -225,6 +226,10 @@ class _Assembly:
         notes = self.notes
         if f"LIDAR_{LASERS[TOP]}" in lidars:
             notes.append("no times of points: those of the TOP LiDAR are estimated from the column of the range image")
+            if self.segment.pixel_poses_are_missing:
+                notes.append(
+                    "the poses of the pixels are missing: points of the TOP LiDAR are as measured, not compensated"
+                )
         if set(lidars) - {f"LIDAR_{LASERS[TOP]}"}:
             notes.append("no times of points of the short-range LiDARs")
         if self.segment.boxes is not None:

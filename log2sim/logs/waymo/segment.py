@@ -216,6 +216,8 @@ class Segment:
         Reads the 2D labels of a camera by number; None for a segment without any.
     image_boxes_are_projected : bool
         Whether `image_boxes` are the 3D labels projected into the images, not drawn in them.
+    pixel_poses_are_missing : bool
+        Whether range images of the TOP LiDAR come without the poses that belong to them.
     where : callable
         Names a frame by index in errors.
     details : mapping
@@ -233,6 +235,7 @@ class Segment:
     image_boxes: Callable[[int], BoxTable] | None
     image_boxes_are_projected: bool
     where: Callable[[int], str]
+    pixel_poses_are_missing: bool = False
     details: Mapping[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
