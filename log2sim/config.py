@@ -73,6 +73,17 @@ class SyncConfig(Section):
     )
 
 
+class PosesConfig(Section):
+    """Poses of the ego."""
+
+    source: Literal["given", "lidar", "camera", "auto"] = _setting(
+        "given",
+        "given: the log's own, and for a log without any what auto takes; lidar: odometry of the LiDAR on the ego; camera: "
+        "motion of a camera above the ground; auto: lidar where the log has no poses or the LiDAR shows that they are worse, "
+        "camera where it has neither, else given.",
+    )
+
+
 AUTO = "auto"
 
 
@@ -185,6 +196,7 @@ class Config(Section):
     )
     start_s: float | None = _setting(None, "First time that is used, from the start of the log.", unit="s")
     stop_s: float | None = _setting(None, "Last time that is used, from the start of the log.", unit="s")
+    poses: PosesConfig = PosesConfig()
     sync: SyncConfig = SyncConfig()
     detect: DetectConfig = DetectConfig()
     lidar: LidarConfig = LidarConfig()

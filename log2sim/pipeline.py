@@ -17,6 +17,7 @@ from log2sim.agents.simplify import simplify
 from log2sim.config import Config
 from log2sim.datatypes import Log, Scenario
 from log2sim.errors import NothingToReconstruct
+from log2sim.localization.choice import GIVEN, PoseChoice, localize
 from log2sim.outcome import RunOutputs, stage_outcomes
 from log2sim.perception.detect.detectors import Detector, create_detector
 from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector
@@ -35,10 +36,20 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """A reconstructed scenario and the report of the run (`schemas/report-1.json`)."""
+    """What came of a run.
+
+    Attributes
+    ----------
+    scenario : Scenario
+    report : dict
+        A document of `schemas/report-1.json`.
+    log : Log
+        As it was used: with the poses that were chosen, without the LiDARs that are out of range.
+    """
 
     scenario: Scenario
     report: dict[str, Any]
+    log: Log
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +89,8 @@ class Run:
     clock : StageClock
     report_progress : callable
         Called as `report_progress(stage, done, total)`.
+    poses : PoseChoice
+        Where the poses of `log` come from.
     """
 
     log: Log
@@ -87,6 +100,7 @@ class Run:
     detectors: Detectors
     clock: StageClock
     report_progress: Progress
+    poses: PoseChoice = GIVEN
 
 
 def reconstruct(log: Log, config: Config | None = None, *, progress: Progress | None = None) -> Result:
@@ -113,14 +127,17 @@ def reconstruct(log: Log, config: Config | None = None, *, progress: Progress | 
 
 
 def start(log: Log, config: Config, *, progress: Progress | None = None) -> Run:
-    """Choose the sensors, synchronize them, and plan the run."""
+    """Choose the poses and the sensors, synchronize these, and plan the run."""
+    clock, report_progress = StageClock(), progress or (lambda *_: None)
+    with clock.stage("poses"):
+        log, poses = localize(log, config, progress=report_progress)
     config = choose_detector(log, config)
-    clock, sensors = StageClock(), select_sensors(log, config)
+    sensors = select_sensors(log, config)
     detectors = detectors_of(log, config)
     with clock.stage("sync"):
         schedule = schedule_of(log, config, sensors)
     plan = make_plan(log, config, sensors, schedule.t_ns)
-    return Run(sensors.restrict(log), config, plan, schedule, detectors, clock, progress or (lambda *_: None))
+    return Run(sensors.restrict(log), config, plan, schedule, detectors, clock, report_progress, poses)
 
 
 def detectors_of(log: Log, config: Config) -> Detectors:
@@ -193,7 +210,7 @@ def second_pass(run: Run, observations: Observations) -> Result:
     with run.clock.stage("smooth"):
         path = ego_path(log, run.schedule)
         candidates = estimate_agents(tracks, observations.obstacles, timeline, path, smooth=config.smooth.enabled)
-        ego = ego_agent(log, timeline)
+        ego = ego_agent(log, timeline, run.poses.origin)
         agents = trim_ego_overlap(suppress_duplicates(confirm(candidates), ego), ego)
         # Without an ego the agents' waypoints alone tell the ticks, so all of them stay.
         agents = simplify(agents) if ego is not None else agents
@@ -207,6 +224,7 @@ def second_pass(run: Run, observations: Observations) -> Result:
         [ego, *agents] if ego is not None else agents,
         cameras=camera_entries(log, plan.cameras, homographies),
         plan=[outcome.to_dict() for outcome in outcomes],
-        provenance=provenance_of(log, config, run.detectors.name),
+        provenance=provenance_of(log, config, run.detectors.name, run.poses.to_provenance()),
     )
-    return Result(scenario, report_of(log, config, run.schedule, outputs, outcomes, scenario))
+    report = report_of(log, config, run.schedule, outputs, outcomes, scenario)
+    return Result(scenario, {**report, "poses": run.poses.to_dict()}, log)

@@ -14,8 +14,11 @@ from log2sim.perception.sync import Schedule
 EGO_SIGMA_M = 0.02
 
 
-def ego_agent(log: Log, timeline: Timeline) -> Agent | None:
-    """Make the ego an agent with a waypoint at every tick; None for a log without poses at them."""
+def ego_agent(log: Log, timeline: Timeline, source: str = "ego poses of the log") -> Agent | None:
+    """Make the ego an agent with a waypoint at every tick; None for a log without poses at them.
+
+    `source` says where the poses come from.
+    """
     if log.ego is None:
         return None
     map_T_ego, valid = log.ego.at(timeline.t_ns)
@@ -39,7 +42,7 @@ def ego_agent(log: Log, timeline: Timeline) -> Agent | None:
     moved = float(np.hypot(np.ptp(center[:, 0]), np.ptp(center[:, 1])))
     return Agent(
         "ego", "car", vehicle.size_m, waypoints, static=moved < STANDSTILL_DRIFT_M, rear_axle_offset_m=vehicle.rear_axle_offset_m,
-        quality={"source": "ego poses of the log", "flags": list(path.flags)},
+        quality={"source": source, "flags": list(path.flags)},
     )  # fmt: skip
 
 

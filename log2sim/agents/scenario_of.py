@@ -37,12 +37,13 @@ def scenario_of(
     )
 
 
-def provenance_of(log: Log, config: Config, detector: str) -> dict[str, Any]:
-    """Return what a scenario was made from and how: log, version, name of the detector, settings, seed."""
+def provenance_of(log: Log, config: Config, detector: str, poses: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a scenario was made from and how: log, version, name of the detector, source of the poses, settings, seed."""
     return {
         "log": {"name": log.name, "format": log.format, "digest": log.digest},
         "log2sim_version": __version__,
         "detector": detector,
+        "poses": dict(poses),
         "config": config.to_dict(),
         "seed": config.seed,
         "history": ["reconstruct"],

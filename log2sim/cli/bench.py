@@ -50,6 +50,7 @@ def bench(
     from log2sim.evaluation.bench.document import document, format_table
     from log2sim.evaluation.bench.figure import write_picture
     from log2sim.evaluation.bench.scores import Scope
+    from log2sim.localization.choice import localize
     from log2sim.logs.opening import open_log
 
     check_targets(out / "bench.json", out / "bench.png", overwrite=overwrite)
@@ -58,9 +59,11 @@ def bench(
         changes["detect"] = {"name": detector[0]}
     chosen = Config.load(config, settings or (), **changes)
     opened = open_log(log, format=format, sequence=sequence)
+    opened, choice = localize(opened, chosen)
     labeled = opened.labels is not None or (log / "truth.json").is_file()
+    made = {"poses": choice.to_provenance()}
     used = chosen.cameras or tuple(opened.cameras)
-    known = truth_at(truth or log, used, sequence) if truth is not None or labeled else None
+    known = truth_at(truth or log, used, sequence, provenance=made) if truth is not None or labeled else None
     scope = Scope(range, tuple(c.strip() for c in categories.split(",")) if categories else None)
     with progress(quiet=quiet) as report_progress:
         result = run(

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from log2sim.cli.options import ConfigFile, Format, LogPath, Overwrite, Quiet, Sequence, Settings, counted, say
+from log2sim.cli.options import ConfigFile, Format, LogPath, Overwrite, Poses, Quiet, Sequence, Settings, counted, say
 
 
 def detect(
@@ -25,6 +25,7 @@ def detect(
     sequence: Sequence = None,
     start: Annotated[float | None, typer.Option(help="First time to use, in s from the start of the log.")] = None,
     stop: Annotated[float | None, typer.Option(help="Last time to use, in s from the start of the log.")] = None,
+    poses: Poses = None,
     config: ConfigFile = None,
     settings: Settings = None,
     overwrite: Overwrite = False,
@@ -32,6 +33,7 @@ def detect(
 ) -> None:
     """Detect road users in the LiDAR sweeps of a log."""
     from log2sim.cli.progress import progress
+    from log2sim.cli.reconstruct import pose_notes
     from log2sim.config import Config
     from log2sim.documents import check_targets
     from log2sim.evaluation.detection.detect_log import detect_log
@@ -39,6 +41,8 @@ def detect(
 
     check_targets(out, overwrite=overwrite)
     changes: dict[str, Any] = {"start_s": start, "stop_s": stop, "detect": {"name": detector}}
+    if poses is not None:
+        changes["poses"] = {"source": poses}
     chosen = Config.load(config, settings or (), **changes)
     opened = open_log(log, format=format, sequence=sequence)
     for note in opened.notes:
@@ -46,6 +50,8 @@ def detect(
     with progress(quiet=quiet) as report_progress:
         result = detect_log(opened, chosen, progress=lambda done, total: report_progress("detect", done, total))
     result.found.save(out)
+    for line in pose_notes(result.poses.to_dict()):
+        say(line, quiet=quiet)
     for name, unread in result.unreadable.items():
         say(f"note: {name}: {unread['count']} records could not be read, first: {unread['first']}", quiet=quiet)
     if result.left_out:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from log2sim.cli.options import Overwrite, Quiet, Sequence, say
+from log2sim.cli.options import Overwrite, Poses, Quiet, Sequence, say
 from log2sim.cli.truth import load_truth
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ def evaluate(
         typer.Option(metavar="TRUTH", help="Ground truth: a log with labels or, for a scenario, a scenario file."),
     ],
     sequence: Sequence = None,
+    poses: Poses = None,
     range: Annotated[
         float | None, typer.Option(metavar="M", help="Compare agents or boxes up to this distance from the ego, in m.")
     ] = None,
@@ -61,11 +63,16 @@ def evaluate(
     if is_boxes_document(document):
         options = {"protocol": protocol or PROTOCOL, "max_range_m": range, "classes": wanted}
         options |= {} if score is None else {"min_score": score}
-        result, table = _boxes_figures(path, document, _log_of(truth, sequence), options, quiet=quiet)
+        result, table = _boxes_figures(
+            path, document, _log_of(truth, sequence, _stated(document.get("poses"), poses)), options, quiet=quiet
+        )
     else:
         for name in (name for name, value in only_boxes.items() if value is not None):
             raise ConfigError(f"{name}: is for boxes of `log2sim detect`; {path} is no boxes file, so leave it out")
         scenario = _scenario(path, document)
+        if poses is not None:
+            stated = _stated(scenario.provenance.get("poses"), poses)
+            scenario = replace(scenario, provenance={**scenario.provenance, **stated})
         result, table = _scenario_figures(scenario, load_truth(truth, scenario, sequence), range, wanted)
     if out is not None:
         write_json(out, result)
@@ -74,6 +81,18 @@ def evaluate(
 
         write_reliability({name: figures["calibration"] for name, figures in result["classes"].items()}, plot)
     say(table, quiet=quiet)
+
+
+def _stated(made_with: Any, asked: str | None) -> dict[str, Any]:
+    """Return the provenance of poses: as stated by what is evaluated, or as asked for."""
+    from log2sim.config import PosesConfig
+    from log2sim.errors import ConfigError
+
+    if asked is None or asked == "auto":
+        return {} if made_with is None else {"poses": made_with}
+    if asked not in PosesConfig.choices("source"):
+        raise ConfigError(f"--poses {asked}: expected {', '.join(PosesConfig.choices('source'))}")
+    return {"poses": {**(made_with if isinstance(made_with, dict) else {}), "source": asked}}
 
 
 def _scenario(path: Path, document: Any) -> Scenario:
@@ -96,16 +115,17 @@ def _scenario_figures(
     return result, format_table(result)
 
 
-def _log_of(path: Path, sequence: str | None) -> Callable[[], Log]:
+def _log_of(path: Path, sequence: str | None, provenance: dict[str, Any]) -> Callable[[], Log]:
     """Return a function that opens the log with the true boxes, once everything else is known to be right."""
 
     def opened() -> Log:
         from log2sim.errors import LogError
+        from log2sim.localization.choice import localize_like
         from log2sim.logs.opening import open_log
 
         if path.is_file():
             raise LogError(f"{path}: is a file; the truth of boxes is the folder of a log with labels")
-        return open_log(path, sequence=sequence)
+        return localize_like(open_log(path, sequence=sequence), provenance)
 
     return opened
 

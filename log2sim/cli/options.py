@@ -25,6 +25,16 @@ ConfigFile = Annotated[
 ]
 
 
+Poses = Annotated[
+    str | None,
+    typer.Option(
+        metavar="given|lidar|camera|auto",
+        help="Ego poses: the log's own, from LiDAR odometry (extra odometry), from the motion of a camera, or what fits to the "
+        "sensors best. Default: the log's own; what fits best for a log without any.",
+    ),
+]
+
+
 def fail(message: str, code: int) -> NoReturn:
     """Print an error and exit with a code."""
     sys.stderr.write(f"log2sim: {message}\n")

@@ -13,6 +13,7 @@ from log2sim.cli.options import (
     Format,
     LogPath,
     Overwrite,
+    Poses,
     Quiet,
     Sequence,
     Settings,
@@ -37,6 +38,7 @@ def reconstruct(
     cameras: Cameras = None,
     start: Annotated[float | None, typer.Option(help="First time to use, in s from the start of the log.")] = None,
     stop: Annotated[float | None, typer.Option(help="Last time to use, in s from the start of the log.")] = None,
+    poses: Poses = None,
     config: ConfigFile = None,
     settings: Settings = None,
     seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
@@ -65,6 +67,8 @@ def reconstruct(
     }
     if detector is not None:
         changes["detect"] = {"name": detector}
+    if poses is not None:
+        changes["poses"] = {"source": poses}
     chosen = Config.load(config, settings or (), **changes)
     opened = open_log(log, format=format, sequence=sequence)
     for note in opened.notes:
@@ -74,13 +78,15 @@ def reconstruct(
         say(f"note: no image is searched: {MissingExtra(IMAGE_DETECTOR, 'coco')}", quiet=quiet)
     with progress(quiet=quiet) as report_progress:
         result = run(opened, chosen, progress=report_progress)
+    for line in pose_notes(result.report["poses"]):
+        say(line, quiet=quiet)
     if topdown is not None:
         from log2sim.perception.frames import RecordReader
         from log2sim.visualization.birdseye.mosaic import write_image
         from log2sim.visualization.birdseye.of_log import birdseye_of_log
 
-        reader = RecordReader(opened)
-        write_image(birdseye_of_log(opened, result.scenario, reader), topdown, overwrite=overwrite)
+        reader = RecordReader(result.log)
+        write_image(birdseye_of_log(result.log, result.scenario, reader), topdown, overwrite=overwrite)
         result.report["unreadable"] = {**reader.summary(), **result.report["unreadable"]}
     if report is not None:
         write_json(report, result.report)
@@ -93,6 +99,13 @@ def reconstruct(
         f"{result.report['ticks_per_second']:.1f} ticks/s",
         quiet=quiet,
     )
+
+
+def pose_notes(poses: dict[str, Any]) -> list[str]:
+    """Say which poses were used and why, and what is doubtful about them; nothing of the log's own where no others were asked for."""
+    if poses["source"] == poses["asked"] == "given" or poses["source"] == "none":
+        return []
+    return [f"poses: {poses['source']} ({poses['reason']})", *(f"note: {note}" for note in poses["notes"])]
 
 
 def unused_records(report: dict[str, Any]) -> list[str]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from log2sim.cli.options import say
 
@@ -31,13 +31,16 @@ def load_replay(path: Path, scenario: Scenario, *, quiet: bool = False) -> Repla
 def load_truth(path: Path, scenario: Scenario, sequence: str | None) -> Scenario:
     """Load the ground truth of a scenario, for the cameras that it used; see `truth_at`."""
     used = [str(c["name"]) for c in scenario.cameras if c.get("used")]
-    return truth_at(path, used if scenario.cameras else None, sequence)
+    return truth_at(path, used if scenario.cameras else None, sequence, provenance=scenario.provenance)
 
 
-def truth_at(path: Path, used: Iterable[str] | None, sequence: str | None) -> Scenario:
+def truth_at(
+    path: Path, used: Iterable[str] | None, sequence: str | None, *, provenance: Mapping[str, Any] | None = None
+) -> Scenario:
     """Load ground truth from a scenario file or a log: its `truth.json`, else its labels in view of the sensors used.
 
-    Without any camera used, what the LiDARs show counts as visible; None stands for all cameras of the log.
+    Without any camera used, what the LiDARs show counts as visible; None stands for all cameras of the log. The labels are
+    placed by the poses that `provenance` states, so that both are in the same map.
     """
     from log2sim.datatypes import Scenario as Truth
 
@@ -46,9 +49,10 @@ def truth_at(path: Path, used: Iterable[str] | None, sequence: str | None) -> Sc
     if (path / "truth.json").is_file():
         return Truth.load(path / "truth.json")
     from log2sim.evaluation.metrics.truth import truth_from_log
+    from log2sim.localization.choice import localize_like
     from log2sim.logs.opening import open_log
 
-    log: Log = open_log(path, sequence=sequence)
+    log: Log = localize_like(open_log(path, sequence=sequence), provenance or {})
     names = None if used is None else list(used)
     known = None if names is None else [name for name in names if name in log.cameras]
     return truth_from_log(log, cameras=None if names and not known else known)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,19 +31,23 @@ class DetectedBoxes:
         Absolute stamps of the sweeps, increasing; also of those in which nothing was found.
     boxes : F Boxes3D
         Map frame of the log.
+    poses : mapping of str to Any
+        Where the poses come from that place them there, see `PoseChoice.to_provenance`.
     """
 
     log: str
     detector: str
     t_ns: NDArray[np.int64]
     boxes: tuple[Boxes3D, ...]
+    poses: Mapping[str, Any] = field(default_factory=dict)
 
     def save(self, path: Path | str) -> None:
         """Write the file under a temporary name and rename it."""
         frames = [
             {"t_ns": int(t), "boxes": _to_rows(found)} for t, found in zip(self.t_ns.tolist(), self.boxes, strict=True)
         ]
-        document = {"format": FORMAT, "version": VERSION, "log": self.log, "detector": self.detector, "frames": frames}
+        document = {"format": FORMAT, "version": VERSION, "log": self.log, "detector": self.detector}
+        document |= ({"poses": dict(self.poses)} if self.poses else {}) | {"frames": frames}
         write_json(path, document)
 
     @classmethod
@@ -81,7 +86,7 @@ class DetectedBoxes:
                 f"frames[{late[0]}].t_ns: {t_ns[late[0]]} does not follow {t_ns[late[0] - 1]}; expected increasing stamps"
             )
         boxes = tuple(_from_rows(f["boxes"], int(t)) for f, t in zip(frames, t_ns, strict=True))
-        return cls(document["log"], document["detector"], t_ns, boxes)
+        return cls(document["log"], document["detector"], t_ns, boxes, document.get("poses", {}))
 
 
 def is_boxes_document(document: Any) -> bool:

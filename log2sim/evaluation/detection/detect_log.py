@@ -13,6 +13,7 @@ from log2sim.datatypes import Log
 from log2sim.errors import ConfigError, LogError
 from log2sim.evaluation.detection.boxes_file import DetectedBoxes
 from log2sim.evaluation.detection.sweep_clouds import clouds, stamps_of
+from log2sim.localization.choice import PoseChoice
 from log2sim.perception.frames import RecordReader
 from log2sim.pipeline import start
 
@@ -28,11 +29,14 @@ class LogDetections:
         Sweeps that cannot be read or have no pose.
     unreadable : dict
         Count and first message by stream.
+    poses : PoseChoice
+        Where the poses come from that place the boxes in the map.
     """
 
     found: DetectedBoxes
     left_out: int
     unreadable: dict[str, Any]
+    poses: PoseChoice
 
 
 def detect_log(log: Log, config: Config, *, progress: Callable[[int, int], None] | None = None) -> LogDetections:
@@ -70,5 +74,7 @@ def detect_log(log: Log, config: Config, *, progress: Callable[[int, int], None]
     records.require_some()
     if not stamps:
         raise LogError(f"{log.name}: none of the {len(run.schedule)} sweeps has a known pose and points")
-    found = DetectedBoxes(log.name, run.detectors.name, np.array(stamps, dtype=np.int64), tuple(boxes))
-    return LogDetections(found, len(run.schedule) - len(stamps), records.summary())
+    found = DetectedBoxes(
+        log.name, run.detectors.name, np.array(stamps, dtype=np.int64), tuple(boxes), run.poses.to_provenance()
+    )
+    return LogDetections(found, len(run.schedule) - len(stamps), records.summary(), run.poses)

@@ -1,0 +1,1 @@
+"""Where the ego was: the log's own poses, or others from LiDAR odometry or camera motion."""

@@ -1,0 +1,287 @@
+"""Which poses a run uses: those of the log, or others that are estimated from its sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from log2sim.config import Config
+from log2sim.datatypes import Log
+from log2sim.documents import rounded
+from log2sim.errors import ConfigError, LogError
+from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse
+from log2sim.localization.alignment import fit_to_given, level_on_ground
+from log2sim.localization.ego_sweeps import densest_lidar, lidars_on_ego, read_ego_sweep
+from log2sim.localization.odometry import Odometry, run_odometry
+from log2sim.localization.registration import is_installed
+from log2sim.localization.replaced import replace_poses
+from log2sim.localization.verdict import compare_with_given, unsure_share
+
+# Without given poses odometry is still taken where up to this share of its poses is poorly held or predicted.
+MAX_UNSURE_SHARE_ALONE = 0.5
+# Sweeps this long before and after the time that is used are registered too.
+MARGIN_S = 1.0
+
+Progress = Callable[[str, int, int], None]
+
+ORIGINS = {"given": "ego poses of the log", "lidar": "LiDAR odometry", "camera": "camera motion"}
+"""What a scenario says about the ego by the source of its poses."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseChoice:
+    """Where the poses of a run come from, and why.
+
+    Attributes
+    ----------
+    asked : str
+        As the settings say.
+    source : {"given", "lidar", "camera", "none"}
+        "none": no sensor is on an ego whose pose would have to be known.
+    reason : str
+        For people.
+    excess_m : mapping of str to float
+        How far given poses are off against each other by the surroundings, beyond what odometry leaves: "neighbors",
+        "apart"; empty where nothing was compared.
+    scatter_m : mapping of str to mapping of str to float
+        RMS distance between upright surfaces of pairs of sweeps by the poses "given" and "lidar".
+    estimate : mapping of str to Any
+        Figures of the odometry, JSON values; empty where none was run.
+    notes : tuple of str
+        What is doubtful about estimated poses.
+    during_ns : (int, int), optional
+        First and last stamp of what poses were estimated from; None for the whole log.
+    """
+
+    asked: str
+    source: str
+    reason: str
+    excess_m: Mapping[str, float | None] = field(default_factory=dict)
+    scatter_m: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
+    estimate: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    during_ns: tuple[int, int] | None = None
+
+    @property
+    def origin(self) -> str:
+        """Name what the ego's path comes from."""
+        return ORIGINS.get(self.source, "none")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the entry `poses` of `schemas/report-1.json`."""
+        return {
+            "asked": self.asked,
+            "source": self.source,
+            "reason": self.reason,
+            "scatter_m": {name: dict(values) for name, values in self.scatter_m.items()},
+            "excess_m": dict(self.excess_m),
+            "estimate": dict(self.estimate),
+            "notes": list(self.notes),
+        }
+
+    def to_provenance(self) -> dict[str, Any]:
+        """Return what `localize_like` needs to find the same poses again."""
+        during = {} if self.during_ns is None else {"during_ns": list(self.during_ns)}
+        return {"source": self.source, **during}
+
+
+GIVEN = PoseChoice("given", "given", "the log's own poses")
+
+
+def localize(log: Log, config: Config, *, progress: Progress | None = None) -> tuple[Log, PoseChoice]:
+    """Return the log with the poses that the settings ask for, and where they come from.
+
+    Parameters
+    ----------
+    log : Log
+    config : Config
+        `poses.source`, and `start_s` and `stop_s`, outside of which nothing is estimated.
+    progress : callable, optional
+        Called as `progress(stage, done, total)`.
+
+    Raises
+    ------
+    ConfigError
+        For poses from a sensor that the log does not have.
+    LogError
+        For a log without poses whose sensors do not show how the ego moves.
+    MissingExtra
+        For LiDAR odometry without its library.
+    """
+    return _localize(_Request(log, config.poses.source, during_ns(log, config), progress or (lambda *_: None)))
+
+
+def localize_like(log: Log, provenance: Mapping[str, Any], *, progress: Progress | None = None) -> Log:
+    """Return a log with the poses that something was made with, as its provenance states them under "poses".
+
+    Without such an entry these are the log's own.
+
+    Raises
+    ------
+    LogError, MissingExtra
+        As `localize` does.
+    """
+    entry = provenance.get("poses")
+    source, during = (
+        ("given", None) if not isinstance(entry, Mapping) else (entry.get("source"), entry.get("during_ns"))
+    )
+    if source not in ORIGINS:
+        return log
+    window = (int(during[0]), int(during[1])) if isinstance(during, Sequence) and len(during) == 2 else None
+    return _localize(_Request(log, source, window, progress or (lambda *_: None)))[0]
+
+
+@dataclass(frozen=True, eq=False)
+class _Request:
+    """What to localize, how, and from which part."""
+
+    log: Log
+    asked: str
+    during_ns: tuple[int, int] | None
+    progress: Progress
+
+    def answer(self, source: str, reason: str, **found: Any) -> PoseChoice:
+        """Return the choice of a source."""
+        return PoseChoice(self.asked, source, reason, during_ns=self.during_ns, **found)
+
+
+def _localize(request: _Request) -> tuple[Log, PoseChoice]:
+    log, asked = request.log, request.asked
+    mounts = _mounts(log)
+    if log.ego is None and "ego" not in mounts:
+        return log, PoseChoice(asked, "none", "all sensors are fixed in the map")
+    if log.ego is not None and asked == "given":
+        return log, GIVEN
+    if log.ego is None and "map" in mounts:
+        reason = "the log has no poses that relate the ego's sensors to those fixed in the map"
+        return log, PoseChoice(asked, "none", reason)
+    if asked == "camera" or (log.ego is None and asked != "lidar" and not lidars_on_ego(log)):
+        return _by_camera(request)
+    return _by_lidar(request)
+
+
+def _mounts(log: Log) -> set[str]:
+    """Return what the sensors of a log are fixed to."""
+    return {c.mount for c in log.cameras.values()} | {lidar.mount for lidar in log.lidars.values()}
+
+
+def _by_camera(request: _Request) -> tuple[Log, PoseChoice]:
+    raise LogError(f"{request.log.name}: the log has neither ego poses nor a LiDAR on the ego")
+
+
+def _by_lidar(request: _Request) -> tuple[Log, PoseChoice]:
+    """Estimate poses by LiDAR odometry; where the log has poses and may keep them, decide which are better."""
+    log, asked = request.log, request.asked
+    may_keep = log.ego is not None and asked == "auto"
+    if may_keep and not is_installed():
+        reason = "not compared with LiDAR odometry, whose extra 'odometry' is not installed"
+        return log, PoseChoice(asked, "given", reason)
+    lidar = densest_lidar(log)
+    if lidar is None:
+        if may_keep:
+            return log, PoseChoice(asked, "given", "the log has no LiDAR on the ego to compare them with")
+        raise ConfigError(
+            f"--poses {asked}: {log.name} has no LiDAR on the ego that can be read; choose given or camera"
+        )
+    try:
+        found = run_odometry(
+            log,
+            lidar,
+            during_ns=request.during_ns,
+            progress=lambda done, total: request.progress("odometry", done, total),
+        )
+    except LogError as problem:
+        if not may_keep:
+            raise
+        return log, PoseChoice(asked, "given", f"nothing to compare them with: {problem}")
+    track, frame = _in_map(log, found)
+    estimate = {**_figures(found, track, log.ego), "frame": frame}
+    if may_keep and log.ego is not None:
+        verdict = compare_with_given(log, found, track)
+        choice = request.answer(
+            "given" if verdict.keep else "lidar", verdict.reason, excess_m=verdict.excess_m, scatter_m=verdict.scatter_m,
+            estimate=estimate, notes=_doubts(log, found),
+        )  # fmt: skip
+        return (log if verdict.keep else replace_poses(log, track)), choice
+    unsure = unsure_share(found)
+    if log.ego is None and unsure > MAX_UNSURE_SHARE_ALONE:
+        raise LogError(
+            f"{log.name}: the log has no ego poses, and LiDAR odometry cannot tell how the ego moves: {unsure:.0%} of the "
+            "sweeps show too little that holds it, as in a tunnel or on an empty road; give poses"
+        )
+    reason = "as asked" if asked == "lidar" else "the log has no poses"
+    return replace_poses(log, track), request.answer("lidar", reason, estimate=estimate, notes=_doubts(log, found))
+
+
+def during_ns(log: Log, config: Config) -> tuple[int, int] | None:
+    """Return the first and last stamp for which poses are needed; None for all."""
+    if config.start_s is None and config.stop_s is None:
+        return None
+    stamps = [s.t_ns for s in log.streams.values() if len(s.t_ns)]
+    first, last = min(int(t[0]) for t in stamps), max(int(t[-1]) for t in stamps)
+    begin = first if config.start_s is None else first + round((config.start_s - MARGIN_S) * NS_PER_S)
+    # Sensors may begin at different times; seconds count from the first tick of the reference, which is not chosen yet.
+    latest = max(int(t[0]) for t in stamps)
+    end = last if config.stop_s is None else latest + round((config.stop_s + MARGIN_S) * NS_PER_S)
+    return begin, end
+
+
+def _in_map(log: Log, found: Odometry) -> tuple[PoseTrack, str]:
+    """Place the path of the odometry in the map of the log, or on the ground under its first sweep."""
+    period_s = float(np.median(np.diff(found.t_ns))) / NS_PER_S
+    raw = PoseTrack(found.t_ns, found.odom_T_ego, max(1.0, 2.5 * period_s))
+    map_T_odom = None if log.ego is None else fit_to_given(raw, log.ego)
+    frame = "fitted to the given poses"
+    if map_T_odom is None:
+        map_T_odom, frame = _level(log, found)
+    return replace(raw, map_T_ego=map_T_odom @ raw.map_T_ego), frame
+
+
+def _level(log: Log, found: Odometry) -> tuple[Array, str]:
+    index = int(np.searchsorted(log.streams[found.lidar].t_ns, found.t_ns[0]))
+    sweep = read_ego_sweep(log, found.lidar, min(index, len(log.streams[found.lidar].t_ns) - 1))
+    level = None if sweep is None else level_on_ground(sweep.xyz_m, log.ground_z_ego_m)
+    if level is None:
+        return np.eye(4), "the ego's at the first sweep"
+    return level, "the ego's at the first sweep, level on the ground"
+
+
+def _figures(found: Odometry, track: PoseTrack, given: PoseTrack | None) -> dict[str, Any]:
+    """Collect the figures of an odometry for the report."""
+    out = {
+        "lidar": found.lidar,
+        "sweeps": found.sweeps,
+        "poses": len(found.t_ns),
+        "predicted": int(found.predicted.sum()),
+        "degenerate": int(found.degenerate.sum()),
+        "problems": found.problems,
+        "path_m": rounded(found.path_m, 3),
+        "overlap_median": rounded(float(np.nanmedian(found.overlap)), 4),
+        "residual_median": rounded(float(np.nanmedian(found.residual)), 4),
+        "constraint_median": rounded(float(np.nanmedian(found.constraint)), 4),
+    }
+    if given is not None:
+        map_T_ego, known = given.at(track.t_ns)
+        if known.any():
+            off = inverse(map_T_ego[known]) @ track.map_T_ego[known]
+            out["given_difference_rms_m"] = rounded(float(np.sqrt(np.mean(np.sum(off[:, :3, 3] ** 2, axis=1)))), 4)
+    return out
+
+
+def _doubts(log: Log, found: Odometry) -> tuple[str, ...]:
+    """List what is doubtful about the poses of an odometry that replace those of a log."""
+    notes = []
+    if log.ego is not None and "map" in _mounts(log):
+        notes.append("sensors fixed in the map stay there, labels move with the ego: they may not fit to each other")
+    if found.degenerate.any():
+        count = f"{int(found.degenerate.sum())} of {len(found.t_ns)}"
+        notes.append(f"LiDAR odometry: {count} sweeps show too little that holds one direction of motion")
+    if found.predicted.any():
+        notes.append(f"LiDAR odometry: {int(found.predicted.sum())} of {len(found.t_ns)} poses are predicted")
+    if found.problems:
+        told = ", ".join(f"{reason} ({count})" for reason, count in found.problems.items())
+        notes.append(f"LiDAR odometry: sweeps that gave no pose: {told}")
+    return tuple(notes)
