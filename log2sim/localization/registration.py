@@ -27,7 +27,7 @@ MIN_OVERLAP = 0.35
 # constraint of 0.001. Noise of the normals raises that: simulated tunnels have 0.001 to 0.015, streets 0.006 to 0.1. Where it is
 # low, the fit is repeated from a start farther along that direction than a voxel; it is held if the fit comes back.
 INFORMATION_OF_POINT = 500.0
-DOUBTFUL_CONSTRAINT = 0.03
+MIN_CONSTRAINT, DOUBTFUL_CONSTRAINT = 0.002, 0.03
 PROBE_M = 1.5 * MAP_VOXEL_M
 MIN_RETURN = 0.5
 
@@ -120,8 +120,8 @@ class SurfaceMap:
 
     def holds(self, surfaces: Any, fit: Fit) -> bool:
         """Tell whether a fit holds every direction of motion, by fitting again from a start shifted along the weakest one."""
-        if fit.constraint >= DOUBTFUL_CONSTRAINT:
-            return True
+        if not MIN_CONSTRAINT <= fit.constraint < DOUBTFUL_CONSTRAINT:
+            return fit.constraint >= DOUBTFUL_CONSTRAINT
         shift = np.zeros((4, 4))
         shift[:3, 3] = PROBE_M * fit.weakest
         again = self._library.align(self._voxels, surfaces, fit.pose + shift, max_iterations=MAX_ITERATIONS)

@@ -14,7 +14,6 @@ from extremes.small_log import LABELS, folder_of, known_and_finite, refused, ref
 from extremes.table import Outcome, case
 from log2sim import open_log, reconstruct
 from log2sim.datatypes import Log
-from log2sim.errors import NothingToReconstruct
 
 
 @case("log: one camera", "all agents, no fusion")
@@ -50,9 +49,9 @@ def no_ego() -> Outcome:
     return Outcome(ok and result.scenario.ego is None, found)
 
 
-@case("log: no ego pose, sensors on the ego", "refused: nothing has a place")
+@case("log: no ego pose, sensors on the ego", "refused: an empty street does not show how the ego moves")
 def lost_ego() -> Outcome:
-    return refused_log(replace(small_log(), ego=None, labels=None), "no ego poses", NothingToReconstruct)
+    return refused_log(replace(small_log(), ego=None, labels=None), "cannot tell how the ego moves")
 
 
 @case("log: one frame", "a scenario of one moment")
