@@ -45,7 +45,7 @@ def evaluate(
         typer.Option(metavar="S", help="Of boxes: score from which precision and recall count them. Default: 0.5."),
     ] = None,
     plot: Annotated[
-        Path | None, typer.Option(metavar="FILE.png", help="Of boxes: reliability diagram of the scores to write.")
+        Path | None, typer.Option(metavar="FILE.png", help="Reliability diagram of confidences or scores to write.")
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Metrics file to write.")] = None,
     overwrite: Overwrite = False,
@@ -59,7 +59,7 @@ def evaluate(
     check_targets(out, plot, overwrite=overwrite)
     document = read_json(path, ScenarioError)
     wanted = [c.strip() for c in categories.split(",")] if categories else None
-    only_boxes = {"--protocol": protocol, "--score": score, "--plot": plot}
+    only_boxes = {"--protocol": protocol, "--score": score}
     if is_boxes_document(document):
         options = {"protocol": protocol or PROTOCOL, "max_range_m": range, "classes": wanted}
         options |= {} if score is None else {"min_score": score}
@@ -77,9 +77,7 @@ def evaluate(
     if out is not None:
         write_json(out, result)
     if plot is not None:
-        from log2sim.visualization.plot.reliability import write_reliability
-
-        write_reliability({name: figures["calibration"] for name, figures in result["classes"].items()}, plot)
+        _plot_reliability(result, plot)
     say(table, quiet=quiet)
 
 
@@ -93,6 +91,32 @@ def _stated(made_with: Any, asked: str | None) -> dict[str, Any]:
     if asked not in PosesConfig.choices("source"):
         raise ConfigError(f"--poses {asked}: expected {', '.join(PosesConfig.choices('source'))}")
     return {"poses": {**(made_with if isinstance(made_with, dict) else {}), "source": asked}}
+
+
+def _plot_reliability(result: dict[str, Any], path: Path) -> None:
+    """Write the diagrams of the scores of each class, or of confidences: of ticks, of agents, and of the ticks of each kind."""
+    from log2sim.visualization.plot.reliability import Reliability, write_reliability
+
+    if "classes" in result:
+        keys = ("boxes", "mean_score", "precision")
+        tables = [(name, "boxes", figures["calibration"]) for name, figures in result["classes"].items()]
+    else:
+        keys = ("count", "mean_confidence", "right")
+        found = result["correctness"]
+        tables = [("all", noun, found["calibration"][noun]) for noun in ("ticks", "agents")]
+        kinds = found["by_kind"] if len(found["by_kind"]) > 1 else {}
+        tables += [(name, "ticks", figures["calibration"]["ticks"]) for name, figures in kinds.items()]
+    diagrams = [
+        Reliability(
+            name,
+            noun,
+            table["expected_calibration_error"],
+            tuple((b[keys[0]], b[keys[1]], b[keys[2]]) for b in table["bins"] if b[keys[0]]),
+        )
+        for name, noun, table in tables
+        if table[keys[0]]
+    ]
+    write_reliability(diagrams, path)
 
 
 def _scenario(path: Path, document: Any) -> Scenario:

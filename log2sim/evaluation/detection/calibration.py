@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.matching import Matches
-
-BINS = 10
+from log2sim.evaluation.metrics.calibration import reliability
 
 
 def calibration(found: SceneBoxes, matches: Matches) -> dict[str, Any]:
@@ -23,23 +20,22 @@ def calibration(found: SceneBoxes, matches: Matches) -> dict[str, Any]:
 
     Notes
     -----
-    Naeini, Cooper, Hauskrecht (AAAI 2015): the mean difference between score and precision, weighted by boxes. Ignored boxes
-    are left out; scores outside 0 to 1 are in the outermost bins.
+    See `reliability`. Ignored boxes are left out.
     """
     judged = matches.right | matches.false
-    score, right = found.score[judged], matches.right[judged]
-    of_bin = np.clip((score * BINS).astype(np.int64), 0, BINS - 1)
-    count = np.bincount(of_bin, minlength=BINS)
-    scores, rights = (np.bincount(of_bin, weights=v, minlength=BINS) for v in (score, right))
+    table = reliability(found.score[judged], matches.right[judged])
     bins = [
         {
-            "low": k / BINS,
-            "high": (k + 1) / BINS,
-            "boxes": int(count[k]),
-            "mean_score": float(scores[k] / count[k]) if count[k] else None,
-            "precision": float(rights[k] / count[k]) if count[k] else None,
+            "low": b["low"],
+            "high": b["high"],
+            "boxes": b["count"],
+            "mean_score": b["mean_confidence"],
+            "precision": b["right"],
         }
-        for k in range(BINS)
+        for b in table["bins"]
     ]
-    error = float(np.abs(scores - rights).sum() / count.sum()) if len(score) else None
-    return {"boxes": len(score), "expected_calibration_error": error, "bins": bins}
+    return {
+        "boxes": table["count"],
+        "expected_calibration_error": table["expected_calibration_error"],
+        "bins": bins,
+    }

@@ -38,6 +38,8 @@ class StateTable:
         From the ego's center; infinite without an ego.
     visible : (A, T) bool
         False where the truth does not count.
+    labeled : (A, T) bool
+        False where the truth's state is interpolated over a gap of its labels or extrapolated.
     """
 
     ids: tuple[str, ...]
@@ -50,6 +52,7 @@ class StateTable:
     speed_mps: Array
     range_m: Array
     visible: Mask
+    labeled: Mask
 
     @property
     def present(self) -> Mask:
@@ -94,7 +97,8 @@ def reconstructed_states(agents: tuple[Agent, ...], ticks_s: Array, ego_xy: Arra
     yaw = _stack([s.yaw_rad for s in sampled], (len(ticks_s),))
     speed = _stack([s.speed_mps for s in sampled], (len(ticks_s),))
     z = _stack([s.z_m for s in sampled], (len(ticks_s),))
-    return _table(agents, ego_xy, xy_m=xy, z_m=z, yaw_rad=yaw, speed_mps=speed, visible=np.isfinite(yaw))
+    there = np.isfinite(yaw)
+    return _table(agents, ego_xy, xy_m=xy, z_m=z, yaw_rad=yaw, speed_mps=speed, visible=there, labeled=there)
 
 
 def truth_states(agents: tuple[Agent, ...], ticks_s: Array, shift_m: Array, ego_xy: Array | None) -> StateTable:
@@ -110,11 +114,13 @@ def truth_states(agents: tuple[Agent, ...], ticks_s: Array, shift_m: Array, ego_
     z = _stack([c[1] for c in columns], (len(ticks_s),)) + shift_m[2]
     yaw = _stack([c[2] for c in columns], (len(ticks_s),))
     speed = _stack([c[3] for c in columns], (len(ticks_s),))
-    visible = _stack([c[4].astype(np.float64) for c in columns], (len(ticks_s),)) > 0
-    return _table(agents, ego_xy, xy_m=xy, z_m=z, yaw_rad=yaw, speed_mps=speed, visible=visible)
+    visible, labeled = (_stack([c[k].astype(np.float64) for c in columns], (len(ticks_s),)) > 0 for k in (4, 5))
+    return _table(
+        agents, ego_xy, xy_m=xy, z_m=z, yaw_rad=yaw, speed_mps=speed, visible=visible & labeled, labeled=labeled
+    )
 
 
-def _sample_truth(agent: Agent, t: Array) -> tuple[Array, Array, Array, Array, Mask]:
+def _sample_truth(agent: Agent, t: Array) -> tuple[Array, Array, Array, Array, Mask, Mask]:
     w = agent.waypoints
     s = agent.at(np.clip(t, w.t_s[0], w.t_s[-1]))
     outside = t - np.clip(t, w.t_s[0], w.t_s[-1])
@@ -127,7 +133,7 @@ def _sample_truth(agent: Agent, t: Array) -> tuple[Array, Array, Array, Array, M
     max_gap_s = np.inf if agent.static and len(w) == 2 else MAX_SIMPLIFIED_GAP_S if simplified else MAX_TRUTH_GAP_S
     labeled = agent.at(t, max_gap_s=float(max_gap_s)).valid
     nan = np.where(present, 0.0, np.nan)
-    return xy + nan[:, None], s.z_m + nan, s.yaw_rad + nan, s.speed_mps + nan, visible & labeled
+    return xy + nan[:, None], s.z_m + nan, s.yaw_rad + nan, s.speed_mps + nan, visible, labeled
 
 
 def _table(agents: tuple[Agent, ...], ego_xy: Array | None, **columns: Any) -> StateTable:

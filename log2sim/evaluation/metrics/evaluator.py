@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from log2sim.datatypes import CATEGORIES, GROUPS, IgnoreRegions, Scenario
+from log2sim.datatypes import CATEGORIES, GROUPS, Scenario
 from log2sim.errors import ConfigError, ScenarioError
-from log2sim.evaluation.metrics.align import StateTable, evaluation_ticks_s, reconstructed_states, truth_states
-from log2sim.evaluation.metrics.clear_mot import associate, mota, switches
+from log2sim.evaluation.metrics.align import evaluation_ticks_s, reconstructed_states, truth_states
+from log2sim.evaluation.metrics.clear_mot import mota
+from log2sim.evaluation.metrics.comparison import (
+    MIN_COUNTED_S,
+    Comparison,
+    Selection,
+    compare,
+    matched_ticks,
+    without_ignored,
+)
+from log2sim.evaluation.metrics.correctness import correctness
 from log2sim.evaluation.metrics.hota import hota
-from log2sim.evaluation.metrics.label_coverage import ignored_ticks
-from log2sim.evaluation.metrics.pairs import Index, Mask, Pairs, gate_m, near_pairs
+from log2sim.evaluation.metrics.pairs import Mask
 from log2sim.evaluation.metrics.per_agent import agent_rows, false_rows, ignored_rows, rounded_tree
 from log2sim.evaluation.metrics.rules import counting_rules, matching_rules
 from log2sim.evaluation.metrics.state_errors import median, root_mean_square, state_errors, summarize
@@ -22,41 +29,7 @@ from log2sim.geometry import NS_PER_S, Array
 from log2sim.registry import nearest
 
 VERSION = 1
-MIN_COUNTED_S = 1.0
-"""A truth agent counts when its counted ticks make up at least this time."""
-
 RANGES_M = ((0.0, 20.0), (20.0, 40.0), (40.0, 60.0))
-
-
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """A truth agents and B reconstructed agents at T ticks, matched.
-
-    Attributes
-    ----------
-    truth, other : StateTable
-        Truth and reconstruction.
-    pairs : Pairs
-    match : (A, T) int64
-        Index of the reconstructed agent, -1 for none.
-    counted : (A, T) bool
-        Ticks at which a truth agent counts.
-    switched : (A, T) bool
-        Identity switches.
-    false : (B, T) bool
-        Ticks at which a reconstructed agent is false.
-    ignored : (B, T) bool
-        Unmatched ticks in ignore regions.
-    """
-
-    truth: StateTable
-    other: StateTable
-    pairs: Pairs
-    match: Index
-    counted: Mask
-    switched: Mask
-    false: Mask
-    ignored: Mask
 
 
 def evaluate(
@@ -106,8 +79,8 @@ def evaluate(
     true = truth_states(truth.others, truth_ticks_s, shift_m, ego_xy)
     ours = reconstructed_states(scenario.others, ticks_s, ego_xy)
     tick_s = float(np.median(np.diff(ticks_s))) if len(ticks_s) > 1 else 0.0
-    compared = _compare(true, ours, tick_s, max_range_m, selected)
-    compared = _without_ignored(compared, truth.ignore_regions, truth_ticks_s, shift_m)
+    compared = compare(true, ours, tick_s, Selection(max_range_m, selected))
+    compared = without_ignored(compared, truth.ignore_regions, truth_ticks_s, shift_m)
     everywhere = np.ones_like(compared.counted), np.ones_like(compared.false)
     result = {
         "metrics_version": VERSION,
@@ -120,58 +93,21 @@ def evaluate(
         **_figures(compared, *everywhere),
         "by_range": None if ego_xy is None else _by_range(compared),
         "by_category": _by_category(compared),
+        "correctness": correctness(compared, scenario.others, ticks_s, ranged=ego_xy is not None),
         "ego": _ego_figures(scenario, truth, ticks_s, truth_ticks_s, shift_m),
         "matching": matching_rules(),
         "counting": counting_rules(truth, MIN_COUNTED_S),
         "agents": agent_rows(true, ours, compared.match, compared.counted, compared.switched),
-        "false_agents": false_rows(ours, compared.false, _hit(compared, compared.counted)),
+        "false_agents": false_rows(ours, compared.false, matched_ticks(compared, compared.counted)),
         "ignored_agents": ignored_rows(ours, compared.ignored),
     }
     return dict(rounded_tree(result))
 
 
-def _compare(
-    truth: StateTable, other: StateTable, tick_s: float, max_range_m: float | None, selected: frozenset[str]
-) -> Comparison:
-    same_group = truth.group[:, None] == other.group[None]
-    pairs = near_pairs(truth.xy_m, other.xy_m, gate_m(truth.size_m[:, 0]), same_group)
-    found = associate(pairs, len(truth.ids), len(other.ids), truth.range_m.shape[1])
-    counted = truth.present & truth.visible & _within(truth, max_range_m)
-    counted &= np.isin(truth.category, list(selected))[:, None]
-    # Half a tick of tolerance, since stamps jitter.
-    enough = counted.sum(1) * tick_s >= MIN_COUNTED_S - tick_s / 2 if tick_s else np.zeros(len(counted), dtype=bool)
-    counted &= enough[:, None]
-    false = other.present & ~found.used & ~found.absorbed & _within(other, max_range_m)
-    false &= np.isin(other.category, list(selected))[:, None]
-    switched = switches(found.match, counted)
-    return Comparison(truth, other, pairs, found.match, counted, switched, false, np.zeros_like(false))
-
-
-def _without_ignored(c: Comparison, regions: IgnoreRegions | None, truth_ticks_s: Array, shift_m: Array) -> Comparison:
-    """Move false ticks in ignore regions to the ignored ones."""
-    if regions is None:
-        return c
-    in_truth_map = replace(c.other, xy_m=c.other.xy_m - shift_m[:2], z_m=c.other.z_m - shift_m[2])
-    ignored = ignored_ticks(regions, truth_ticks_s, in_truth_map, c.false)
-    return replace(c, false=c.false & ~ignored, ignored=ignored)
-
-
-def _within(side: StateTable, max_range_m: float | None) -> Mask:
-    return np.ones_like(side.present) if max_range_m is None else side.range_m <= max_range_m
-
-
-def _hit(c: Comparison, truth_selected: Mask) -> Mask:
-    """Mark (B, T) the ticks at which a reconstructed agent matches a selected truth agent."""
-    i, t = np.nonzero(truth_selected & (c.match >= 0))
-    hit = np.zeros(c.false.shape, dtype=bool)
-    hit[c.match[i, t], t] = True
-    return hit
-
-
 def _figures(c: Comparison, truth_selected: Mask, other_selected: Mask) -> dict[str, Any]:
     """Compute all figures over the selected ticks of the truth (A, T) and the selected false ticks (B, T)."""
     counted, false = c.counted & truth_selected, c.false & other_selected
-    hit = _hit(c, counted)
+    hit = matched_ticks(c, counted)
     truth_ticks, matched, wrong = int(counted.sum()), int(hit.sum()), int(false.sum())
     agents, found = counted.any(1), (counted & (c.match >= 0)).sum(1) >= 0.5 * counted.sum(1)
     ours, real = (hit | false).any(1), hit.sum(1) >= false.sum(1)

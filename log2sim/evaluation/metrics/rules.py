@@ -9,6 +9,14 @@ from log2sim.evaluation.metrics.align import MAX_TRUTH_GAP_S
 from log2sim.evaluation.metrics.label_coverage import MAX_FRAME_LAG_S, MIN_REGION_SHARE
 from log2sim.evaluation.metrics.pairs import GATE_M, GATE_PER_LENGTH
 from log2sim.evaluation.metrics.state_errors import MIN_WALKING_MPS
+from log2sim.evaluation.metrics.verdicts import (
+    MAX_SIZE_ERROR_SHARE,
+    MAX_SPEED_ERROR_MPS,
+    MAX_STANDING_MPS,
+    MEASURES,
+    MIN_MOVING_MPS,
+    MIN_SIZE_ERROR_M,
+)
 
 IGNORED_RULE = (
     "an unmatched reconstructed agent is neither right nor false at the ticks at which the labels could not have told: "
@@ -44,4 +52,28 @@ def counting_rules(truth: Scenario, min_s: float) -> dict[str, Any]:
         "visible or not, counted or not, matches it, but for the ignored ones",
         "ignored": IGNORED_RULE if truth.ignore_regions is not None else "none; the truth claims to be complete",
         "visible": truth.provenance.get("visible", "as the truth file states; all where it states nothing"),
+    }
+
+
+def correctness_rules(max_wrong_share: float, min_confidence: float) -> dict[str, Any]:
+    """Describe what is wrong with an agent, and when a scenario doubts one; see `verdicts.judge`."""
+    return {
+        "judged": "ticks of a reconstructed agent at which it matches a labeled object, or matches none and the labels "
+        "could have told; shares are of these ticks, ranges those of the reconstructed agent",
+        "invented": "no labeled object of its kind, matched or not, within the gate of the matching",
+        "duplicate": "such an object is within the gate, but another agent matches it",
+        "wrong_speed": f"matched, and the speed along the true heading is off by more than {MAX_SPEED_ERROR_MPS:g} m/s",
+        "wrong_motion": f"matched, and stands (below {MAX_STANDING_MPS:g} m/s) while the truth moves (from "
+        f"{MIN_MOVING_MPS:g} m/s), moves while it stands, or both move (from {MAX_STANDING_MPS:g} m/s) more than 90 "
+        "degrees apart",
+        "backwards": "matched, and the heading is off by more than 90 degrees; standing pedestrians and category other "
+        "have none",
+        "wrong_size": f"matched, and the length or width is off by more than {MAX_SIZE_ERROR_SHARE:.0%} of the true one "
+        f"and by more than {MIN_SIZE_ERROR_M:g} m",
+        "wrong_class": "the matched object, or the nearest within the gate, has another category; no reason to be wrong",
+        "wrong": f"at a tick, any of {', '.join(MEASURES)}; of agents, and likewise for each measure, more than "
+        f"{max_wrong_share:.0%} of the ticks",
+        "doubted": f"the scenario gives the agent a flag or a confidence below {min_confidence:g}",
+        "sigma": "nees: mean of squared position errors of matched ticks over two times the squared sigma, 1 expected; "
+        "median, 0.69 expected; within_95: share inside of the 95 % circle, 0.95 expected",
     }

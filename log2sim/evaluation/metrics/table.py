@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from log2sim.evaluation.metrics.correctness_table import correctness_lines
+
 COLUMNS = (
     ("recall", "recall", 3),
     ("precision", "precis.", 3),
@@ -20,7 +22,10 @@ COLUMNS = (
 
 
 def format_table(result: Mapping[str, Any]) -> str:
-    """Format a result of `evaluate`: a line for all, for each range and category, and for the ego; '-' for None."""
+    """Format a result of `evaluate`: a line for all, for each range and category, and for the ego; '-' for None.
+
+    A second table says what is wrong with the agents, and the worst are named.
+    """
     lines = [("all", result)]
     lines += [(f"{name} m", figures) for name, figures in (result["by_range"] or {}).items()]
     lines += list(result["by_category"].items())
@@ -33,7 +38,7 @@ def format_table(result: Mapping[str, Any]) -> str:
         cells.append(["ego", "", *(_cell(ego[key], digits) if key in ego else "" for key, _, digits in COLUMNS)])
     widths = [max(len(row[k]) for row in cells) for k in range(len(cells[0]))]
     rows = [[row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:]))] for row in cells]
-    return "\n".join("  ".join(row).rstrip() for row in rows)
+    return "\n".join(["  ".join(row).rstrip() for row in rows] + correctness_lines(result["correctness"]))
 
 
 def _cell(value: float | None, digits: int) -> str:

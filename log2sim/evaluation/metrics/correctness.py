@@ -1,0 +1,222 @@
+"""How many reconstructed agents are wrong, in what, and whether the scenario doubts them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import CATEGORIES, GROUPS, Agent
+from log2sim.evaluation.metrics.align import StateTable
+from log2sim.evaluation.metrics.calibration import normalized_errors, reliability
+from log2sim.evaluation.metrics.comparison import Comparison
+from log2sim.evaluation.metrics.pairs import Mask
+from log2sim.evaluation.metrics.rules import correctness_rules
+from log2sim.evaluation.metrics.verdicts import REPORTED, Verdicts, judge
+from log2sim.geometry import Array
+
+RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0), (50.0, np.inf))
+MAX_WRONG_SHARE = 0.2
+"""An agent is wrong when more of its ticks are. Trackers are scored alike: "mostly tracked" is 80 % of a life (Wu and
+Nevatia, CVPR 2006; Li, Huang, Nevatia, CVPR 2009)."""
+
+MIN_TRUSTED_CONFIDENCE = 0.5
+"""Below, an agent is more likely wrong than right by its own account."""
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedAgents:
+    """B reconstructed agents with verdicts at T ticks, and what the scenario says of itself.
+
+    Attributes
+    ----------
+    states : StateTable
+    verdicts : Verdicts
+    wrong : (B, T) bool
+    confidence : (B,) float64
+    reasons : tuple of tuple of str
+        Why the scenario doubts each agent; empty where it does not.
+    sigma_m : (B, T) float64, m
+        Standard deviation of the position for each axis.
+    """
+
+    states: StateTable
+    verdicts: Verdicts
+    wrong: Mask
+    confidence: Array
+    reasons: tuple[tuple[str, ...], ...]
+    sigma_m: Array
+
+    @property
+    def doubted(self) -> Mask:
+        """Mark (B,) the agents that the scenario doubts."""
+        return np.array([bool(r) for r in self.reasons], dtype=bool)
+
+
+def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, *, ranged: bool) -> dict[str, Any]:
+    """Judge the reconstructed agents and summarize by kind, category and range.
+
+    Parameters
+    ----------
+    c : Comparison
+    agents : sequence of Agent
+        The B reconstructed agents of the comparison.
+    ticks_s : (T,) float64, s
+    ranged : bool
+        Whether there is an ego to measure ranges from.
+
+    Returns
+    -------
+    dict
+        The part `correctness` of a document of `schemas/metrics-1.json`.
+    """
+    verdicts = judge(c)
+    sigma = [np.interp(ticks_s, a.waypoints.t_s, a.waypoints.sigma_xy_m) for a in agents]
+    judged = JudgedAgents(
+        states=c.other,
+        verdicts=verdicts,
+        wrong=verdicts.wrong,
+        confidence=np.array([a.confidence for a in agents], dtype=np.float64),
+        reasons=tuple(doubts(a) for a in agents),
+        sigma_m=np.stack(sigma) if sigma else np.zeros((0, len(ticks_s))),
+    )
+    everything = np.ones_like(verdicts.judged)
+    kinds, categories = _present(judged, c.other.group, GROUPS), _present(judged, c.other.category, CATEGORIES)
+    return {
+        "rules": correctness_rules(MAX_WRONG_SHARE, MIN_TRUSTED_CONFIDENCE),
+        **_detailed(judged, everything, ranged=ranged),
+        "by_kind": {k: _detailed(judged, _rows(c.other.group == k, everything), ranged=ranged) for k in kinds},
+        "by_category": {k: _figures(judged, _rows(c.other.category == k, everything)) for k in categories},
+        "confusion": _confusion(judged, c.truth.category),
+        "judged_agents": _agent_rows(judged, c.truth),
+    }
+
+
+def doubts(agent: Agent) -> tuple[str, ...]:
+    """Name the reasons for which a scenario doubts an agent: its flags, and a confidence below one half."""
+    low = ("confidence",) if agent.confidence < MIN_TRUSTED_CONFIDENCE else ()
+    return (*low, *(str(flag) for flag in agent.quality.get("flags") or ()))
+
+
+def _present(j: JudgedAgents, column: NDArray[np.str_], names: Iterable[str]) -> list[str]:
+    """List those of the names that the selected agents have in a column (B,)."""
+    known = set(column[(j.verdicts.judged | j.verdicts.undecided).any(axis=1)].tolist())
+    return [name for name in names if name in known]
+
+
+def _rows(which: Mask, like: Mask) -> Mask:
+    return np.broadcast_to(which[:, None], like.shape)
+
+
+def _detailed(j: JudgedAgents, selected: Mask, *, ranged: bool) -> dict[str, Any]:
+    """Compute the figures of the selected ticks, their calibration, and the figures by range."""
+    by_range = {
+        f"{low:g}-{high:g}" if np.isfinite(high) else f"{low:g}-": _figures(
+            j, selected & (j.states.range_m >= low) & (j.states.range_m < high)
+        )
+        for low, high in RANGES_M
+    }
+    return {
+        **_figures(j, selected),
+        "calibration": _calibration(j, selected),
+        "by_range": by_range if ranged else None,
+    }
+
+
+def _figures(j: JudgedAgents, selected: Mask) -> dict[str, Any]:
+    """Count the selected judged ticks and their agents, and the wrong and doubted ones among them."""
+    v, ticks = j.verdicts, j.verdicts.judged & selected
+    wrong_agents, right_agents = _wrong_agents(ticks, j.wrong), ticks.any(axis=1) & ~_wrong_agents(ticks, j.wrong)
+    doubted = j.doubted
+    at_doubted = _rows(doubted, ticks)
+    matched = ticks & (v.matched >= 0)
+    return {
+        "agents": int(ticks.any(axis=1).sum()),
+        "ticks": int(ticks.sum()),
+        "undecided_ticks": int((v.undecided & selected).sum()),
+        "matched_ticks": int(matched.sum()),
+        **{name: _share(ticks, mask) for name, mask in v.measures.items()},
+        "wrong": _share(ticks, j.wrong),
+        "doubted": {
+            "wrong_ticks": _mean(at_doubted[ticks & j.wrong]),
+            "right_ticks": _mean(at_doubted[ticks & ~j.wrong]),
+            "wrong_agents": _mean(doubted[wrong_agents]),
+            "right_agents": _mean(doubted[right_agents]),
+        },
+        "sigma": normalized_errors(v.error_m[matched], j.sigma_m[matched]),
+    }
+
+
+def _share(ticks: Mask, mask: Mask) -> dict[str, Any]:
+    """Summarize one measure: its share of the ticks, its ticks, and the agents that are wrong by it."""
+    hit = ticks & mask
+    return {"share": _mean(mask[ticks]), "ticks": int(hit.sum()), "agents": int(_wrong_agents(ticks, mask).sum())}
+
+
+def _wrong_agents(ticks: Mask, mask: Mask) -> Mask:
+    """Mark (B,) the agents of which more than `MAX_WRONG_SHARE` of the ticks are marked."""
+    return np.asarray((ticks & mask).sum(axis=1) > MAX_WRONG_SHARE * ticks.sum(axis=1))
+
+
+def _mean(values: Mask) -> float | None:
+    return float(values.mean()) if len(values) else None
+
+
+def _calibration(j: JudgedAgents, selected: Mask) -> dict[str, Any]:
+    """Compare confidences with the right ticks and the right agents."""
+    ticks = j.verdicts.judged & selected
+    agents = ticks.any(axis=1)
+    return {
+        "ticks": reliability(np.broadcast_to(j.confidence[:, None], ticks.shape)[ticks], ~j.wrong[ticks]),
+        "agents": reliability(j.confidence[agents], ~_wrong_agents(ticks, j.wrong)[agents]),
+    }
+
+
+def _confusion(j: JudgedAgents, true_category: NDArray[np.str_]) -> dict[str, Any]:
+    """Count, by category of the agent and of what is there, judged ticks, and agents by what is there most of the time."""
+    names = np.array([*CATEGORIES, "nothing"])
+    place = {str(name): k for k, name in enumerate(names)}
+    true_place = np.array([*(place[str(c)] for c in true_category), len(CATEGORIES)], dtype=np.int64)
+    ours = np.array([place[str(c)] for c in j.states.category], dtype=np.int64)
+    judged = j.verdicts.judged
+    row, _ = np.nonzero(judged)
+    seen = np.zeros((len(ours), len(names)), dtype=np.int64)
+    np.add.at(seen, (row, true_place[j.verdicts.taken_for[judged]]), 1)
+    rows = np.flatnonzero(judged.any(axis=1))
+    ticks, agents = (np.zeros((len(CATEGORIES), len(names)), dtype=np.int64) for _ in range(2))
+    np.add.at(ticks, ours, seen)
+    np.add.at(agents, (ours[rows], seen[rows].argmax(axis=1)), 1)
+    return {"ticks": _matrix(ticks, names), "agents": _matrix(agents, names)}
+
+
+def _matrix(counts: NDArray[np.int64], names: NDArray[np.str_]) -> dict[str, dict[str, int]]:
+    return {
+        str(names[r]): {str(names[k]): int(counts[r, k]) for k in np.flatnonzero(counts[r])}
+        for r in np.flatnonzero(counts.any(axis=1))
+    }
+
+
+def _agent_rows(j: JudgedAgents, truth: StateTable) -> list[dict[str, Any]]:
+    """Make one row for each judged agent."""
+    v, rows = j.verdicts, []
+    for k in np.flatnonzero(v.judged.any(axis=1)):
+        ticks = v.judged[k]
+        there, count = np.unique(v.taken_for[k, ticks], return_counts=True)
+        rows.append(
+            {
+                "id": j.states.ids[k],
+                "category": str(j.states.category[k]),
+                "ticks": int(ticks.sum()),
+                "wrong_ticks": int((j.wrong[k] & ticks).sum()),
+                **{f"{name}_ticks": int((v.measures[name][k] & ticks).sum()) for name in REPORTED},
+                "taken_for": {truth.ids[i] if i >= 0 else "nothing": int(n) for i, n in zip(there, count)},
+                "confidence": float(j.confidence[k]),
+                "doubted": bool(j.reasons[k]),
+                "doubts": list(j.reasons[k]),
+                "mean_range_m": float(j.states.range_m[k, ticks].mean()),
+            }
+        )
+    return rows

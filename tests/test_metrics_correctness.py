@@ -1,0 +1,398 @@
+"""What is wrong with reconstructed agents: each measure in closed form, who is doubted, invariances, properties."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from command_line import run
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from metric_scenes import T_S, agent, moved, scenario, shifted, world
+
+from log2sim.datatypes import CATEGORIES, Agent, Scenario
+from log2sim.documents import check
+from log2sim.errors import ScenarioError
+from log2sim.evaluation.metrics.evaluator import evaluate
+from log2sim.evaluation.metrics.table import format_table
+from log2sim.evaluation.metrics.verdicts import MEASURES, REPORTED
+
+TICKS = len(T_S)
+WALK = {"category": "pedestrian", "size_m": (0.6, 0.6, 1.7)}
+
+
+def judged(ours, truth, **kwargs):
+    ours, truth = (s if isinstance(s, Scenario) else scenario(*s) for s in (ours, truth))
+    return evaluate(ours, truth, **kwargs)["correctness"]
+
+
+def faults(found):
+    """Ticks of each measure that is true somewhere."""
+    return {name: found[name]["ticks"] for name in (*REPORTED, "wrong") if found[name]["ticks"]}
+
+
+def driving(id, speed, *, yaw=0.0, true_speed=5.0, **kwargs):
+    """An agent that moves with 5 m/s along x and says it has another speed and heading."""
+    return agent(id, true_speed * T_S, yaw=yaw, speed=speed, **kwargs)
+
+
+def test_a_perfect_scenario_has_nothing_wrong():
+    found = judged(world(), world())
+    assert faults(found) == {}
+    assert (found["agents"], found["ticks"], found["undecided_ticks"], found["matched_ticks"]) == (5, 155, 0, 155)
+    assert found["doubted"] == {"wrong_ticks": None, "right_ticks": 0.0, "wrong_agents": None, "right_agents": 0.0}
+    assert list(found["by_kind"]) == ["vehicle", "two_wheeler", "pedestrian"]
+    assert list(found["by_category"]) == ["car", "cyclist", "pedestrian"]
+    assert found["confusion"]["ticks"] == {
+        "car": {"car": 62},
+        "cyclist": {"cyclist": 31},
+        "pedestrian": {"pedestrian": 62},
+    }
+    assert found["calibration"]["agents"]["expected_calibration_error"] == 0.0
+
+
+@pytest.mark.parametrize(("offset", "invented"), [(1.99, False), (2.01, True)])
+def test_invented_is_what_has_no_labeled_object_within_2_m(offset, invented):
+    found = judged([agent("x", offset)], [agent("a", 0.0)])
+    assert faults(found) == ({"invented": TICKS, "wrong": TICKS} if invented else {})
+    assert found["invented"] == {"share": float(invented), "ticks": TICKS * invented, "agents": int(invented)}
+
+
+def test_around_a_long_vehicle_the_gate_is_a_quarter_of_its_length():
+    bus = [agent("a", 0.0, category="bus", size_m=(12.0, 2.5, 3.0))]
+    bus_like = {"category": "bus", "size_m": (12.0, 2.5, 3.0)}
+    assert faults(judged([agent("x", 2.9, **bus_like)], bus)) == {}
+    assert faults(judged([agent("x", 3.1, **bus_like)], bus)) == {"invented": TICKS, "wrong": TICKS}
+
+
+def test_a_second_agent_at_an_object_is_a_duplicate_even_where_the_object_is_hidden():
+    for visible in (True, False):
+        truth = [agent("a", 0.0, visible=visible), agent("b", 30.0)]
+        found = judged([agent("x", 0.0), agent("y", 1.5)], truth)
+        assert faults(found) == {"duplicate": TICKS, "wrong": TICKS}
+        assert [(r["id"], r["taken_for"]) for r in found["judged_agents"]] == [("x", {"a": TICKS}), ("y", {"a": TICKS})]
+
+
+def test_an_object_of_another_kind_is_no_object_of_the_kind():
+    found = judged([agent("x", 0.0, category="cyclist")], [agent("a", 0.0, category="pedestrian")])
+    assert faults(found) == {"invented": TICKS, "wrong_class": TICKS, "wrong": TICKS}
+    assert found["confusion"] == {
+        "ticks": {"cyclist": {"pedestrian": TICKS}},
+        "agents": {"cyclist": {"pedestrian": 1}},
+    }
+
+
+def test_another_category_of_the_kind_is_confusion_but_not_wrong():
+    found = judged([agent("x", 0.0, category="truck")], [agent("a", 0.0)])
+    assert faults(found) == {"wrong_class": TICKS}
+    assert found["confusion"]["ticks"] == {"truck": {"car": TICKS}}
+    assert found["judged_agents"][0]["wrong_ticks"] == 0
+
+
+def test_the_matched_object_tells_the_class_not_a_nearer_one_of_another_kind():
+    truth = [agent("a", 1.0), agent("b", 0.1, category="pedestrian")]
+    assert faults(judged([agent("x", 0.0)], truth)) == {}
+
+
+@pytest.mark.parametrize(("speed", "wrong"), [(4.01, {}), (5.99, {}), (3.99, 1), (6.01, 1)])
+def test_a_speed_is_wrong_from_1_mps(speed, wrong):
+    expected = {"wrong_speed": TICKS, "wrong": TICKS} if wrong else {}
+    assert faults(judged([driving("x", speed)], [driving("a", 5.0)])) == expected
+
+
+def test_turned_round_with_the_right_motion_is_backwards_only():
+    found = judged([driving("x", -5.0, yaw=np.pi)], [driving("a", 5.0)])
+    assert faults(found) == {"backwards": TICKS, "wrong": TICKS}
+
+
+def test_reversing_where_the_truth_drives_is_wrong_motion():
+    found = judged([driving("x", -5.0)], [driving("a", 5.0)])
+    assert faults(found) == {"wrong_speed": TICKS, "wrong_motion": TICKS, "wrong": TICKS}
+    turned = judged([driving("x", 5.0, yaw=np.pi)], [driving("a", 5.0)])
+    assert faults(turned) == {"wrong_speed": TICKS, "wrong_motion": TICKS, "backwards": TICKS, "wrong": TICKS}
+
+
+@pytest.mark.parametrize(
+    ("ours", "true", "wrong"),
+    [(0.0, 0.99, False), (0.0, 1.01, True), (0.49, 1.3, True), (0.51, 1.3, False), (1.01, 0.0, True),
+     (0.99, 0.0, False), (1.2, 0.49, True), (1.2, 0.51, False), (-0.6, 0.4, False), (-0.51, 0.51, True)],
+)  # fmt: skip
+def test_standing_and_moving_are_told_apart_with_a_margin(ours, true, wrong):
+    found = judged(
+        [agent("x", true * T_S, speed=ours)], [agent("a", true * T_S, speed=true, visible=True, static=False)]
+    )
+    assert ("wrong_motion" in faults(found)) == wrong
+
+
+@pytest.mark.parametrize(
+    ("degrees", "wrong"), [(89.0, False), (91.0, True), (-91.0, True), (270.5, False), (181.0, True)]
+)
+def test_backwards_is_more_than_90_degrees_the_short_way_round(degrees, wrong):
+    found = judged([agent("x", 0.0, yaw=np.radians(degrees))], [agent("a", 0.0)])
+    assert faults(found) == ({"backwards": TICKS, "wrong": TICKS} if wrong else {})
+
+
+def test_standing_pedestrians_have_no_heading():
+    assert faults(judged([agent("x", 0.0, yaw=3.0, **WALK)], [agent("a", 0.0, **WALK)])) == {}
+    truth = agent("a", T_S, speed=1.0, **WALK)
+    assert faults(judged([agent("x", T_S, yaw=np.pi, speed=-1.0, **WALK)], [truth])) == {"backwards": 31, "wrong": 31}
+
+
+@pytest.mark.parametrize(
+    ("size", "wrong"),
+    [((5.49, 1.8, 1.5), False), ((5.51, 1.8, 1.5), True), ((3.29, 1.8, 1.5), True), ((4.4, 2.26, 1.5), True),
+     ((4.4, 2.24, 1.5), False), ((4.4, 1.8, 9.9), False)],
+)  # fmt: skip
+def test_a_size_is_wrong_by_a_quarter_of_length_or_width(size, wrong):
+    found = judged([agent("x", 0.0, size_m=size)], [agent("a", 0.0)])
+    assert faults(found) == ({"wrong_size": TICKS, "wrong": TICKS} if wrong else {})
+
+
+@pytest.mark.parametrize(("length", "wrong"), [(0.89, False), (0.91, True)])
+def test_a_small_size_is_never_wrong_by_less_than_30_cm(length, wrong):
+    ours = agent("x", 0.0, category="pedestrian", size_m=(length, 0.6, 1.7))
+    assert ("wrong_size" in faults(judged([ours], [agent("a", 0.0, **WALK)]))) == wrong
+
+
+@pytest.mark.parametrize(("ticks", "agents"), [(6, 0), (7, 1)])
+def test_an_agent_is_wrong_when_more_than_a_fifth_of_its_ticks_are(ticks, agents):
+    away = np.where(np.arange(TICKS) < ticks, 50.0, 0.0)
+    found = judged([agent("x", 0.0, away)], [agent("a", 0.0)])
+    assert found["invented"] == {"share": pytest.approx(ticks / TICKS, abs=1e-6), "ticks": ticks, "agents": agents}
+    assert found["judged_agents"][0]["invented_ticks"] == ticks
+
+
+def test_doubt_is_a_flag_or_a_confidence_below_one_half():
+    ours = [
+        agent("right", 0.0, confidence=0.9),
+        agent("flagged", 20.0, confidence=0.9, quality={"flags": ["curvature"]}),
+        agent("unsure", 40.0, confidence=0.49),
+        agent("sure", 60.0, confidence=0.5),
+    ]
+    truth = [agent("a", 0.0), agent("b", 20.0)]
+    found = judged(ours, truth)
+    assert found["doubted"] == {"wrong_ticks": 0.5, "right_ticks": 0.5, "wrong_agents": 0.5, "right_agents": 0.5}
+    assert {r["id"]: r["doubts"] for r in found["judged_agents"]} == {
+        "right": [], "flagged": ["curvature"], "unsure": ["confidence"], "sure": [],
+    }  # fmt: skip
+
+
+def test_confidence_is_compared_with_right_ticks_and_right_agents():
+    half = np.where(np.arange(TICKS) < 10, 0.0, 50.0)
+    found = judged(
+        [agent("x", 0.0, half, confidence=0.75), agent("y", 20.0, confidence=0.95)], [agent("a", 0.0), agent("b", 20.0)]
+    )
+    ticks, agents = found["calibration"]["ticks"], found["calibration"]["agents"]
+    assert ticks["expected_calibration_error"] == pytest.approx((0.75 - 10 / 31 + 0.05) / 2, abs=1e-6)
+    assert agents["expected_calibration_error"] == pytest.approx((0.75 + 0.05) / 2)
+    assert [(b["low"], b["count"], b["right"]) for b in agents["bins"] if b["count"]] == [(0.7, 1, 0.0), (0.9, 1, 1.0)]
+
+
+def test_sigma_is_compared_with_the_errors_by_range():
+    def with_sigma(a, first, last):
+        return replace(a, waypoints=replace(a.waypoints, sigma_xy_m=np.linspace(first, last, TICKS)))
+
+    truth = [agent("ego", 0.0), agent("a", 10.0), agent("b", 40.0)]
+    ours = [
+        agent("ego", 0.0),
+        with_sigma(agent("x", 10.3, 0.4), 0.5, 0.5),
+        with_sigma(agent("y", 40.0, 1.0), 0.25, 0.25),
+    ]
+    found = judged(ours, truth)
+    assert found["by_range"]["0-15"]["sigma"]["nees"] == pytest.approx(0.5)
+    assert found["by_range"]["30-50"]["sigma"]["nees"] == pytest.approx(8.0)
+    assert found["sigma"]["nees"] == pytest.approx(4.25)
+    assert (found["by_range"]["15-30"]["sigma"]["nees"], found["sigma"]["within_95"]) == (None, 0.5)
+    thinned = with_sigma(ours[1], 0.5, 1.5)
+    w = thinned.waypoints
+    ends = {k: getattr(w, k)[[0, -1]] for k in (*w.FLOATS, "observed")}
+    thinned = replace(thinned, static=True, waypoints=replace(w, **ends))
+    expected = np.mean(0.5**2 / 2 / np.linspace(0.5, 1.5, TICKS) ** 2)
+    assert judged([ours[0], thinned], truth)["sigma"]["nees"] == pytest.approx(expected, rel=1e-4)
+
+
+def test_ranges_are_those_of_the_reconstructed_agent_and_end_where_the_next_begins():
+    ego = agent("ego", 0.0)
+    xs = (5.0, 15.0, 29.9, 30.0, 50.0, 90.0)
+    found = judged([ego, *(agent(f"x{k}", x) for k, x in enumerate(xs))], [ego, agent("a", 0.0, 60.0)])
+    assert {k: v["agents"] for k, v in found["by_range"].items()} == {"0-15": 1, "15-30": 2, "30-50": 1, "50-": 2}
+    limited = judged(
+        [ego, *(agent(f"x{k}", x) for k, x in enumerate(xs))], [ego, agent("a", 0.0, 60.0)], max_range_m=30.0
+    )
+    assert (limited["agents"], limited["by_range"]["50-"]["ticks"]) == (4, 0)
+    assert judged([agent("x", 0.0)], [agent("a", 0.0)])["by_range"] is None
+
+
+def test_gaps_of_the_labels_say_nothing_of_states_nor_of_presence():
+    kept = (T_S < 1.05) | (T_S > 1.95)
+    truth = [agent("ego", 0.0), agent("a", T_S[kept], 5.0, speed=1.0, t_s=T_S[kept])]
+    found = judged([agent("ego", 0.0), agent("x", T_S, 5.0, speed=9.0), agent("y", T_S, 6.0)], truth)
+    gap = int((~kept).sum())
+    assert (found["ticks"], found["undecided_ticks"]) == (2 * (TICKS - gap), 2 * gap)
+    assert faults(found)["duplicate"] == faults(found)["wrong_speed"] == TICKS - gap
+
+
+def test_categories_narrow_what_is_judged():
+    found = judged(world(), world(), categories=["pedestrian"])
+    assert (found["agents"], list(found["by_category"])) == (2, ["pedestrian"])
+
+
+def test_nothing_to_judge_gives_no_figures():
+    for ours, truth in (([], world()), (world(), []), ([], [])):
+        found = judged(ours, truth)
+        assert (found["agents"], found["ticks"], found["invented"]["share"]) == (0, 0, None)
+        assert found["judged_agents"] == []
+
+
+def broken():
+    """The world with one agent of each fault."""
+    car = {"size_m": (7.0, 2.8, 1.5), "confidence": 0.88}
+    rest = [a for a in world().agents if a.id not in ("a", "b")]
+    return scenario(
+        *rest, agent("car-18", 10 + 5 * T_S, 3.0, speed=-5.0, yaw=np.pi, **car), agent("car-9", 15.0, -4.0, yaw=-2.0),
+        agent("car-10", 15.0, -4.5, confidence=0.3), agent("ghost", 90.0, quality={"flags": ["jump"]}),
+    )  # fmt: skip
+
+
+def test_a_result_keeps_its_schema_and_the_worst_agents_are_named():
+    result = evaluate(broken(), world())
+    check(result, "metrics-1", ScenarioError)
+    json.dumps(result, allow_nan=False)
+    text = format_table(result)
+    assert "car-18: backwards in 31, wrong size in 31 of 31 ticks, confidence 0.88, not doubted" in text
+    assert "ghost: invented in 31 of 31 ticks, confidence 1.00, doubted (jump)" in text
+    assert text.index("car-18:") < text.index("ghost:")
+    assert "expected calibration error" in text
+
+
+def test_a_document_without_its_figures_breaks_the_schema():
+    result = evaluate(broken(), world())
+    for path in (
+        ("invented",),
+        ("by_kind", "vehicle", "sigma"),
+        ("calibration", "agents"),
+        ("judged_agents", 0, "doubted"),
+    ):
+        spoiled = json.loads(json.dumps(result))
+        part = spoiled["correctness"]
+        for key in path[:-1]:
+            part = part[key]
+        del part[path[-1]]
+        with pytest.raises(ScenarioError):
+            check(spoiled, "metrics-1", ScenarioError)
+
+
+def test_the_command_writes_them_and_draws_the_reliability(tmp_path):
+    broken().save(tmp_path / "s.json")
+    world().save(tmp_path / "t.json")
+    ran = run(
+        "evaluate", tmp_path / "s.json", "--truth", tmp_path / "t.json", "--out", tmp_path / "m.json",
+        "--plot", tmp_path / "r.png",
+    )  # fmt: skip
+    assert ran.code == 0, ran.err
+    assert "car-18: backwards in 31" in ran.out
+    document = json.loads((tmp_path / "m.json").read_text())
+    check(document, "metrics-1", ScenarioError)
+    assert document["correctness"]["invented"]["agents"] == 1
+    assert (tmp_path / "r.png").read_bytes()[1:4] == b"PNG"
+
+
+def without_names(found):
+    """The figures without ids, agents in an order of their own."""
+    rows = [{k: v for k, v in r.items() if k not in ("id", "taken_for")} for r in found["judged_agents"]]
+    return {**found, "judged_agents": sorted(rows, key=str)}
+
+
+def test_names_order_place_and_heading_of_the_world_make_no_difference():
+    def turned(s, angle, dx):
+        c, n = np.cos(angle), np.sin(angle)
+        agents = [
+            replace(
+                a,
+                id=a.id if a.id == "ego" else f"{k}-{a.id}",
+                waypoints=replace(
+                    w, x_m=c * w.x_m - n * w.y_m + dx, y_m=n * w.x_m + c * w.y_m, yaw_rad=w.yaw_rad + angle
+                ),
+            )
+            for k, a in enumerate(s.agents)
+            for w in [a.waypoints]
+        ]
+        return replace(s, agents=tuple(agents[::-1]))
+
+    def flat(value):
+        if isinstance(value, dict):
+            return {k: flat(v) for k, v in value.items()}
+        return (
+            [flat(v) for v in value]
+            if isinstance(value, list)
+            else value
+            if value is None
+            else pytest.approx(value, abs=2e-6)
+        )
+
+    ours = shifted(broken(), 0.3)
+    ours = replace(ours, agents=tuple(moved(a, sigma_xy_m=np.full(TICKS, 0.2)) for a in ours.agents))
+    plain = without_names(judged(ours, world()))
+    other = without_names(judged(turned(ours, 1.1, 1e4), turned(world(), 1.1, 1e4)))
+    rules = plain.pop("rules")
+    assert other.pop("rules") == rules
+    plain_rows, other_rows = plain.pop("judged_agents"), other.pop("judged_agents")
+    assert other == {k: flat(v) for k, v in plain.items()}
+    assert [{**r, "mean_range_m": 0} for r in other_rows] == [{**r, "mean_range_m": 0} for r in plain_rows]
+
+
+@st.composite
+def scenes(draw) -> list[Agent]:
+    """Up to five agents on a small plot."""
+    agents = []
+    for k in range(draw(st.integers(0, 5))):
+        spot = st.floats(-4, 4)
+        agents.append(
+            agent(
+                f"n{k}", draw(spot), draw(spot), yaw=draw(st.floats(-3, 3)), speed=draw(st.floats(-3, 3)),
+                category=draw(st.sampled_from(CATEGORIES)), t_s=T_S[: draw(st.integers(2, 12))],
+                size_m=(draw(st.floats(0.5, 9)), 1.8, 1.5), confidence=draw(st.floats(0, 1)),
+            )
+        )  # fmt: skip
+    return agents
+
+
+def shares(figures):
+    yield from (figures[name]["share"] for name in (*REPORTED, "wrong"))
+    yield from figures["doubted"].values()
+
+
+@settings(max_examples=40, deadline=None)
+@given(scenes(), scenes())
+def test_shares_are_shares_and_parts_add_up(ours, truth):
+    found = judged(ours, truth)
+    assert all(s is None or 0 <= s <= 1 for s in shares(found))
+    wrong = found["wrong"]["ticks"]
+    assert max(found[name]["ticks"] for name in MEASURES) <= wrong <= sum(found[name]["ticks"] for name in MEASURES)
+    assert found["matched_ticks"] + found["invented"]["ticks"] + found["duplicate"]["ticks"] == found["ticks"]
+    for parts in (found["by_kind"], found["by_category"]):
+        for name in ("ticks", "agents", "undecided_ticks"):
+            assert sum(part[name] for part in parts.values()) == found[name]
+    rows = found["judged_agents"]
+    assert sum(row["wrong_ticks"] for row in rows) == wrong
+    assert sum(n for row in found["confusion"]["ticks"].values() for n in row.values()) == found["ticks"]
+    assert sum(n for row in found["confusion"]["agents"].values() for n in row.values()) == found["agents"] == len(rows)
+
+
+@settings(max_examples=15, deadline=None)
+@given(scenes(), scenes())
+def test_doubting_everything_doubts_all_that_is_wrong_and_all_that_is_right(ours, truth):
+    found = judged([replace(a, confidence=0.2) for a in ours], truth)
+    assert all(s in (None, 1.0) for s in found["doubted"].values())
+
+
+@settings(max_examples=15, deadline=None)
+@given(scenes())
+def test_false_ticks_are_invented_or_duplicate(ours):
+    # Precision does not count what is at an object of another kind.
+    truth = [agent("a", 0.0), agent("b", 3.0, 1.0, category="cyclist")]
+    whole = evaluate(scenario(*ours), scenario(*truth))
+    found = whole["correctness"]
+    assert whole["counts"]["false_ticks"] <= found["invented"]["ticks"] + found["duplicate"]["ticks"]
