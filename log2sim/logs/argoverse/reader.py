@@ -113,13 +113,18 @@ class _Folder:
         map_frame = map_frame_of(city, offset_m, notes)
         notes.append("stamps do not count from 1970: only their differences mean anything")
         annotations = self.path / ANNOTATIONS
-        if annotations.is_file():
-            notes.append("objects were labeled only within 5 m of the drivable area")
+        notes.append(
+            "objects were labeled only within 5 m of the drivable area"
+            if annotations.is_file()
+            else f"no labels: {ANNOTATIONS} is missing, as in test splits"
+        )
         upper = mounts.get("up_lidar", np.eye(4))[:2, 3]
+
+        swept = streams["up_lidar"].t_ns if "up_lidar" in streams else np.zeros(0, dtype=np.int64)
 
         @cache
         def labels() -> Labels | None:
-            return read_labels(annotations, ego, upper, notes) if annotations.is_file() else None
+            return read_labels(annotations, ego, upper, swept, notes) if annotations.is_file() else None
 
         def all_notes() -> tuple[str, ...]:
             labels()
