@@ -14,7 +14,8 @@ def validate(
     path: Annotated[
         Path,
         typer.Argument(
-            metavar="FILE_OR_LOG", help="Scenario, replay, boxes, report, metrics or bench file, or a log folder."
+            metavar="FILE_OR_LOG",
+            help="Scenario, replay, boxes, report, metrics or bench file, or a log: a folder, or the file of a bag.",
         ),
     ],
     format: Format = "auto",
@@ -25,8 +26,9 @@ def validate(
     Exits with 3 and lists the problems, if there are any.
     """
     from log2sim.errors import LogError
+    from log2sim.logs.opening import is_log_file
 
-    if path.is_dir():
+    if path.is_dir() or is_log_file(path):
         from log2sim.logs.validation import validate_log
 
         problems = validate_log(path, format=format, sequence=sequence)

@@ -58,6 +58,11 @@ def find_reader(root: Path) -> str:
     raise LogError(f"{root}: no known log format; a log is one of: {known}. Force one with --format")
 
 
+def is_log_file(path: Path) -> bool:
+    """Return whether a file has a suffix of a format of which a file is a log."""
+    return path.is_file() and any(_may_read(registry.load("log", name), path) for name in registry.names("log"))
+
+
 def _may_read(reader: Reader, root: Path) -> bool:
     """Return whether a path is a folder, or a file with a suffix of the format."""
     return root.is_dir() or root.suffix.lower() in reader.suffixes
