@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bz2
+import re
 import struct
 import sys
 from collections.abc import Callable, Iterator
