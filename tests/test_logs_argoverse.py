@@ -20,6 +20,7 @@ from log2sim.logs.argoverse.cities import CITIES, map_frame_of
 from log2sim.logs.argoverse.labels import CATEGORY_OF, NO_ROAD_USERS, read_labels, seen_after_ns
 from log2sim.logs.argoverse.reader import ANNOTATIONS, INTRINSICS, MOUNTS, POSES, READER
 from log2sim.logs.opening import open_log
+from log2sim.logs.summary import summarize
 
 feather = pytest.importorskip("pyarrow.feather")
 
@@ -94,6 +95,8 @@ def test_every_pose_is_kept_also_those_1_ns_apart(encoded: Path) -> None:
     assert log.ego.t_ns.tolist() == rows
     assert np.diff(log.ego.t_ns).min() == 1
     assert np.abs(log.ego.map_T_ego[:, :2, 3]).max() < 1000
+    # Poses at the stamps of all sensors have no period of which one could be missing.
+    assert summarize(log)["ego"]["gaps"] == []
 
 
 # City coordinates and their places by the tests of the data set's development kit, and the origins that it states.

@@ -35,9 +35,8 @@ POSES = "city_SE3_egovehicle.feather"
 MOUNTS, INTRINSICS = "calibration/egovehicle_SE3_sensor.feather", "calibration/intrinsics.feather"
 ANNOTATIONS = "annotations.feather"
 ROAD_Z_EGO_M = -0.33
-# A Ford Fusion Hybrid: 4.87 x 1.85 x 1.48 m by its data sheet; the mirrors add 0.27 m, and the bumpers are 1.07 m and 0.95 m
-# from the axles, 2.85 m apart.
-EGO_VEHICLE = EgoVehicle(size_m=(4.87, 2.12, 1.48), rear_axle_offset_m=1.365)
+# A Ford Fusion Hybrid, by its data sheet; that does not say how far it reaches behind the rear axle: 1.1 m is an estimate.
+EGO_VEHICLE = EgoVehicle(size_m=(4.87, 1.85, 1.48), rear_axle_offset_m=1.335)
 REFERENCE_CAMERA = "ring_front_center"
 # A log below a folder of splits of a folder of data sets: argoverse2/sensor/val/LOG.
 MAX_DEPTH = 3
