@@ -95,9 +95,11 @@ def _cameras(log: Log, config: Config) -> tuple[str, ...]:
             )
         return ()
     if not log.cameras:
+        usual = "roadside" if log.lidars and all(lidar.mount == "map" for lidar in log.lidars.values()) else "vehicle"
+        name = "labels" if config.detect.in_images == "labels" else usual
         raise LogError(
             f"{log.name}: the log has no camera, which detector '{config.detect.in_images}' needs; a detector in LiDAR "
-            "sweeps needs none, for instance --detector lidar:vehicle"
+            f"sweeps needs none, for instance --detector lidar:{name}"
         )
     for name in config.cameras:
         if name not in log.cameras:

@@ -350,7 +350,7 @@ def test_commands_say_in_a_line_what_they_cannot_do(tiny_folder: Path, tiny_scen
     assert names(tmp_path) == []
     assert run("detect", tiny_folder, "--detector", "lidar:labels", "--out", boxes, "--quiet").out == ""
     assert "--protocol: unknown protocol" in run("evaluate", boxes, "--truth", tiny_folder, "--protocol", "coco").line
-    assert "is a file" in run("evaluate", boxes, "--truth", boxes).line
+    assert "is a file and no log" in run("evaluate", boxes, "--truth", boxes).line
     ran = run("evaluate", tiny_scenario, "--truth", tiny_folder, "--score", 0.4)
     assert ran.code == 2
     assert "--score: is for boxes" in ran.line

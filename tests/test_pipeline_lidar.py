@@ -95,7 +95,7 @@ def test_sensors_that_a_detector_needs_are_asked_for(world: tuple[Log, Scenario]
         run(log, "lidar:labels", "cameras=front")
     with pytest.raises(LogError, match="the log has no LiDAR; detector 'lidar:labels' needs one"):
         run(replace(log, lidars={}), "labels+lidar:labels")
-    with pytest.raises(LogError, match=r"no camera, which detector 'labels' needs; .* --detector lidar:vehicle"):
+    with pytest.raises(LogError, match=r"no camera, which detector 'labels' needs; .* --detector lidar:labels"):
         run(replace(log, cameras={}), "labels+lidar:labels")
     with pytest.raises(ConfigError, match=r"sync\.reference: LiDAR 'front' is not used; used: top"):
         run(log, "lidar:labels", "sync.reference=front")

@@ -26,17 +26,22 @@ def export(
     log: Annotated[
         Path | None, typer.Option(metavar="LOG", help="mcap, rerun: log whose images and points are included.")
     ] = None,
+    ego: Annotated[
+        str | None, typer.Option(metavar="AGENT", help="Agent to take as the ego, where the scenario has none.")
+    ] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
     """Write a scenario in the format of a simulator or viewer."""
     from log2sim.datatypes import Scenario
     from log2sim.export.checks import export_notes
-    from log2sim.export.exporters import Options
+    from log2sim.export.exporters import Options, with_ego
     from log2sim.export.exporters import export as run
     from log2sim.logs.opening import open_log
 
     loaded = Scenario.load(scenario)
+    if ego is not None:
+        loaded = with_ego(loaded, ego)
     opened = open_log(log) if log is not None else None
     files = run(loaded, to, out, Options(revision, map, mode, opened), overwrite=overwrite)
     for file in files:

@@ -9,12 +9,13 @@ from typing import Annotated, NoReturn
 import typer
 
 from log2sim.errors import ConfigError
+from log2sim.registry import BUILT_IN
 
-LogPath = Annotated[Path, typer.Argument(metavar="LOG", help="Folder of a log.")]
+LogPath = Annotated[Path, typer.Argument(metavar="LOG", help="Folder or file of a log.")]
 ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A scenario.json.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
-Format = Annotated[str, typer.Option(help="Log format: auto, log2sim, kitti, kitti-tracking, kitti-object, pandaset.")]
+Format = Annotated[str, typer.Option(help=f"Log format: auto, {', '.join(BUILT_IN['log'])}.")]
 Sequence = Annotated[str | None, typer.Option(help="Sequence to open, when the folder has several.")]
 Settings = Annotated[
     list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change a setting; see log2sim config.")

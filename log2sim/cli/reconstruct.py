@@ -53,7 +53,7 @@ def reconstruct(
     from log2sim.cli.progress import progress
     from log2sim.config import Config
     from log2sim.documents import check_targets, write_json
-    from log2sim.errors import MissingExtra
+    from log2sim.errors import ConfigError, MissingExtra
     from log2sim.logs.opening import open_log
     from log2sim.pipeline import reconstruct as run
     from log2sim.sensors import IMAGE_DETECTOR, choose_detector
@@ -71,6 +71,8 @@ def reconstruct(
         changes["poses"] = {"source": poses}
     chosen = Config.load(config, settings or (), **changes)
     opened = open_log(log, format=format, sequence=sequence)
+    if topdown is not None and not opened.cameras:
+        raise ConfigError(f"--topdown: {opened.name}: the log has no camera, so there is no picture of the ground")
     for note in opened.notes:
         say(f"note: {note}", quiet=quiet)
     chosen = choose_detector(opened, chosen)

@@ -43,14 +43,14 @@ def truth_at(
     placed by the poses that `provenance` states, so that both are in the same map.
     """
     from log2sim.datatypes import Scenario as Truth
+    from log2sim.logs.opening import is_log_path, open_log
 
-    if not path.is_dir():
+    if not is_log_path(path):
         return Truth.load(path)
     if (path / "truth.json").is_file():
         return Truth.load(path / "truth.json")
     from log2sim.evaluation.metrics.truth import truth_from_log
     from log2sim.localization.choice import localize_like
-    from log2sim.logs.opening import open_log
 
     log: Log = localize_like(open_log(path, sequence=sequence), provenance or {})
     names = None if used is None else list(used)

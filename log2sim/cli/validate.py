@@ -13,25 +13,26 @@ from log2sim.cli.options import Format, Sequence, say
 def validate(
     path: Annotated[
         Path,
-        typer.Argument(
-            metavar="FILE_OR_LOG",
-            help="Scenario, replay, boxes, report, metrics or bench file, or a log: a folder, or the file of a bag.",
-        ),
+        typer.Argument(metavar="FILE_OR_LOG", help="Scenario, replay, boxes, report, metrics or bench file, or a log."),
     ],
     format: Format = "auto",
     sequence: Sequence = None,
 ) -> None:
     """Validate a file, or every record of a log.
 
-    Exits with 3 and lists the problems, if there are any.
+    Exits with 3 and lists the problems, if there are any. Gaps between records are no problem; they are noted.
     """
     from log2sim.errors import LogError
-    from log2sim.logs.opening import is_log_file
+    from log2sim.logs.opening import is_log_path
 
-    if path.is_dir() or is_log_file(path):
-        from log2sim.logs.validation import validate_log
+    if is_log_path(path):
+        from log2sim.logs.opening import open_log
+        from log2sim.logs.validation import list_gaps, validate_log
 
-        problems = validate_log(path, format=format, sequence=sequence)
+        opened = open_log(path, format=format, sequence=sequence)
+        problems = validate_log(opened)
+        for gap in list_gaps(opened):
+            say(f"note: {gap}")
         if problems:
             raise LogError(f"{path}: {len(problems)} problem{'s' * (len(problems) > 1)}\n  " + "\n  ".join(problems))
     else:

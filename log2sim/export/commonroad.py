@@ -77,7 +77,7 @@ def _ego_and_clock(scenario: Scenario) -> tuple[Agent, Array]:
     ego = scenario.ego
     if ego is None:
         raise ScenarioError(
-            f"scenario '{scenario.name}' has no agent 'ego', which the planning problem needs; give an agent this id"
+            f"scenario '{scenario.name}' has no agent 'ego', which the planning problem needs; choose one with --ego AGENT"
         )
     start, stop = ego.waypoints.t_s[0], ego.waypoints.t_s[-1]
     if stop - start < STEP_S:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -107,6 +107,24 @@ def export(
         return _move_into(temporary, folder, overwrite=overwrite)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def with_ego(scenario: Scenario, agent: str) -> Scenario:
+    """Call one of the agents "ego", as scenarios of roadside sensors need it for formats with an ego.
+
+    Raises
+    ------
+    ConfigError
+        When the scenario has another ego or no such agent.
+    """
+    ids = [a.id for a in scenario.agents]
+    if agent not in ids:
+        known = ", ".join(ids) or "none"
+        raise ConfigError(f"--ego: no agent '{agent}'{registry.nearest(agent, ids)}; the scenario has {known}")
+    if scenario.ego is not None and agent != "ego":
+        raise ConfigError(f"--ego {agent}: scenario '{scenario.name}' has an ego already; leave the option out")
+    agents = tuple(replace(a, id="ego") if a.id == agent else a for a in scenario.agents)
+    return replace(scenario, agents=agents)
 
 
 def _move_into(temporary: Path, folder: Path, *, overwrite: bool) -> tuple[Path, ...]:

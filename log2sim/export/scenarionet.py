@@ -62,7 +62,7 @@ def describe(scenario: Scenario) -> Value:
     ego = scenario.ego
     if ego is None:
         raise ScenarioError(
-            f"scenario '{scenario.name}' has no agent 'ego', which MetaDrive follows; give one of its agents this id"
+            f"scenario '{scenario.name}' has no agent 'ego', which MetaDrive follows; choose one with --ego AGENT"
         )
     t_s = step_times(ego.waypoints.t_s[0], ego.waypoints.t_s[-1], STEP_S)
     origin = np.array(near_origin(scenario).origin_m)

@@ -11,12 +11,13 @@ from log2sim.datatypes import Log, Stream, Sweep
 from log2sim.errors import RecordError
 from log2sim.logs.native.reader import READER
 from log2sim.logs.opening import open_log
+from log2sim.logs.summary import summarize_stamps
 
 MAX_POINT_DISTANCE_M = 1000.0
 
 
 def validate_log(
-    path: Path | str,
+    path: Path | str | Log,
     *,
     format: str = "auto",
     sequence: str | None = None,
@@ -27,7 +28,7 @@ def validate_log(
     Parameters
     ----------
     path, format, sequence
-        As for `open_log`.
+        As for `open_log`; or an open log.
     progress : callable, optional
         Called as `progress(done, total)` after each record.
 
@@ -36,7 +37,7 @@ def validate_log(
     LogError
         When the log cannot be opened at all.
     """
-    log = open_log(path, format=format, sequence=sequence)
+    log = path if isinstance(path, Log) else open_log(path, format=format, sequence=sequence)
     # Notes on other formats say what the format lacks; those on native logs say what is wrong with the stamps.
     problems = list(log.notes) if log.format == READER.name else []
     total = sum(len(s.t_ns) for s in log.streams.values())
@@ -74,8 +75,26 @@ def _record(log: Log, stream: Stream, i: int) -> tuple[bool, str] | None:
     return None
 
 
+def list_gaps(log: Log) -> list[str]:
+    """List the streams in which records seem to be missing, by the steps between their stamps, one line each."""
+    lines = []
+    for name, stream in log.streams.items():
+        summary = summarize_stamps(stream.t_ns)
+        if summary["gaps"]:
+            longest = max(summary["gaps"], key=lambda gap: float(gap["length_s"]))
+            count = len(summary["gaps"])
+            lines.append(
+                f"stream '{name}': {count} gap{'s' * (count > 1)} in its records at {summary['rate_hz']:g} Hz, the longest of "
+                f"{longest['length_s']:g} s after stamp {longest['after_ns']}"
+            )
+    return lines
+
+
 def _coverage(log: Log) -> list[str]:
     """List sensors on the ego with records at stamps where its pose is unknown."""
+    on_ego = [n for n in log.streams if (log.cameras.get(n) or log.lidars[n]).mount == "ego"]
+    if log.ego is None and on_ego:
+        return [f"the log has no poses of the ego, on which {', '.join(on_ego)} are mounted"]
     problems = []
     for name, stream in log.streams.items():
         known = log.map_T_sensor(name, stream.t_ns)[1]

@@ -102,14 +102,15 @@ def visible_at(
 ) -> NDArray[np.bool_]:
     """Decide which of `count` actors are visible: mask (T, A) at stamps (T,).
 
-    An actor is visible when the frame of one camera and the sweep of one LiDAR nearest in time both show it well.
+    An actor is visible when the frame of one camera and the sweep of one LiDAR nearest in time both show it well. Without
+    cameras, or without LiDARs, the others decide.
     """
-    by_camera = np.zeros((len(t_ns), count), dtype=bool)
+    by_camera = np.full((len(t_ns), count), not frames)
     for parts in frames.values():
         if parts:
             shown = np.array([(f.unoccluded >= MIN_UNOCCLUDED) & (f.inside >= MIN_BOX_INSIDE) for f in parts])
             by_camera |= shown[_nearest(np.array([f.t_ns for f in parts]), t_ns)]
-    by_lidar = np.zeros_like(by_camera)
+    by_lidar = np.full_like(by_camera, not sweeps)
     for sweep in sweeps.values():
         if len(sweep.t_ns):
             by_lidar |= (sweep.points >= MIN_LIDAR_POINTS)[_nearest(sweep.t_ns, t_ns)]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from log2sim.datatypes import Log, Scenario
+from log2sim.errors import LogError
 from log2sim.geometry import NS_PER_S, nearest_index
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.lidar.cloud import cloud_origin
@@ -31,11 +32,13 @@ def birdseye_of_log(log: Log, scenario: Scenario, reader: RecordReader | None = 
     Raises
     ------
     LogError
-        When no image of a camera can be read.
+        When the log has no camera, or no image of a camera can be read.
     """
     reader = reader or RecordReader(log)
     used = [str(c["name"]) for c in scenario.cameras if c.get("used") and c["name"] in log.cameras]
     used = used or list(log.cameras)
+    if not used:
+        raise LogError(f"{log.name}: the log has no camera, so there is no picture of the ground")
     stamps = scenario.t0_ns + np.round(np.linspace(0, scenario.duration_s, TICKS) * NS_PER_S).astype(np.int64)
     places = np.array([cloud_origin(log, int(t))[0][:2] for t in stamps])
     low, high = places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M

@@ -32,7 +32,7 @@ MIN_DEPTH_M, MAX_DEPTH_M = 2.0, 100.0
 MAX_TILE_PX = 1100
 MAX_POINTS = 60_000
 TILE_IN, HEAD_IN, FOOT_IN, CAPTION_IN, SIDE_IN = 5.2, 0.4, 0.5, 0.36, 0.85
-ABOVE_REACH_M = 60.0
+ABOVE_REACH_M, MAX_HEIGHT_M = 60.0, 3.0
 MOTION = {
     "in the log": "compensated in the log",
     "no times": "not compensated: no point times",
@@ -131,9 +131,12 @@ def _draw_above(ax: Axes, moment: Moment, aspect: float) -> tuple[str, str]:
     for sweep in moment.sweeps:
         local = sweep.xyz - [*origin[:2], ground_z]
         local = local[:: max(1, len(local) // (2 * MAX_POINTS))]
+        size = float(np.clip(2e4 / max(len(local), 1), 0.35, 3.0))
+        # The ground in the middle of the colors, so that it stands out from the paper.
         ax.scatter(
-            local[:, 0], local[:, 1], c=np.clip(local[:, 2], -0.5, 3.0), s=0.35, linewidths=0, cmap="viridis", zorder=2
-        )
+            local[:, 0], local[:, 1], c=local[:, 2], s=size, linewidths=0, cmap="viridis", zorder=2,
+            vmin=-MAX_HEIGHT_M, vmax=MAX_HEIGHT_M,
+        )  # fmt: skip
     boxes = moment.boxes
     corners = box_corners_bev(boxes.center_m[:, :2] - origin[:2], boxes.size_m[:, 0], boxes.size_m[:, 1], boxes.yaw_rad)
     colors = [COLORS[CATEGORY[str(c)].group] for c in boxes.category]
@@ -169,6 +172,9 @@ def _draw_frame(figure: Figure, moment: Moment) -> None:
     figure.text(0.06 / width, 1 - 0.08 / height, printable(title, 160), fontsize=9, color=INK, **text)
     notes = "; ".join(moment.notes)
     figure.text(0.06 / width, 1 - 0.27 / height, printable(notes, 220), fontsize=6.5, color="#C8102E", **text)
+    _draw_legend(figure)
+    if not moment.shots:
+        return
     bar = figure.add_axes(((width - 0.6) / width, 0.25, 0.12 / width, 0.5))
     scale = figure.colorbar(ScalarMappable(LogNorm(MIN_DEPTH_M, MAX_DEPTH_M), DEPTHS), cax=bar)
     depths = (2, 5, 10, 20, 50, 100)
@@ -176,6 +182,9 @@ def _draw_frame(figure: Figure, moment: Moment) -> None:
     bar.minorticks_off()
     bar.tick_params(labelsize=6.5, colors=MUTED, length=2)
     bar.set_title("depth, m", fontsize=6.5, color=MUTED, family=FONT)
+
+
+def _draw_legend(figure: Figure) -> None:
     groups = list(dict.fromkeys(CATEGORY[c].group for c in CATEGORIES))
     handles = [Line2D([], [], color=COLORS[g], lw=1.6, label=f"3D label: {g.replace('_', '-')}") for g in groups]
     handles.append(Line2D([], [], color=IMAGE_BOX_COLOR, lw=1.6, ls=(0, (3, 2)), label="2D label"))

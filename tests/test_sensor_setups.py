@@ -1,0 +1,161 @@
+"""Logs with LiDARs alone, with sensors at the roadside, and without poses: every command works or says in a line why not."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_line import names, run
+from worlds import tiny_log, tiny_table
+
+from log2sim import registry
+from log2sim.datatypes import Scenario
+from log2sim.logs.native.writer import write_log
+
+TOP, FRONT = tiny_table()["lidar"][0], tiny_table()["camera"][0]
+POLE = {
+    **TOP, "name": "pole", "mount": "map", "position_m": [0.0, -6.0, 5.0], "yaw_deg": 20.0, "elevation_deg": [-40.0, -2.0],
+    "channels": 40,
+}  # fmt: skip
+EYE = {**FRONT, "name": "eye", "mount": "map", "position_m": [0.0, -6.0, 5.0], "yaw_deg": 20.0, "pitch_deg": -12.0}
+# What each log lacks or adds against one camera and one LiDAR on an ego, and the detector of its labels.
+SETUPS: dict[str, tuple[dict[str, Any], str]] = {
+    "lidar": ({"camera": []}, "lidar:labels"),
+    "roadside-lidar": ({"camera": [], "lidar": [POLE], "ego": None}, "lidar:labels"),
+    "roadside": ({"camera": [EYE], "lidar": [POLE], "ego": None}, "labels"),
+    "roadside-camera": ({"camera": [EYE], "lidar": [], "ego": None}, "labels"),
+    "car-and-roadside": ({"camera": [EYE], "lidar": [POLE, TOP]}, "labels"),
+}
+# The others hold nothing that these do not; they take as long again.
+EACH = [name if name in ("lidar", "roadside") else pytest.param(name, marks=pytest.mark.slow) for name in SETUPS]
+CAMERALESS = ("lidar", "roadside-lidar")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Path, Path]]:
+    """The log of a setup and the scenario of its labels, each made once."""
+    root, known = tmp_path_factory.mktemp("setups"), {}
+
+    def make(name: str) -> tuple[Path, Path]:
+        if name not in known:
+            changes, detector = SETUPS[name]
+            log, truth = tiny_log(name=name, **changes)
+            write_log(log, root / name)
+            truth.save(root / name / "truth.json")
+            scenario = root / f"{name}.json"
+            ran = run("reconstruct", root / name, "--out", scenario, "--detector", detector, "--quiet")
+            assert ran.code == 0, ran.err
+            known[name] = root / name, scenario
+        return known[name]
+
+    return make
+
+
+@pytest.mark.parametrize("name", EACH)
+def test_a_log_is_described_checked_and_drawn(
+    made: Callable[[str], tuple[Path, Path]], name: str, tmp_path: Path
+) -> None:
+    log, _ = made(name)
+    summary = json.loads(run("inspect", log).out)
+    assert (summary["ego"] is None) == name.startswith("roadside")
+    ran = run("validate", log)
+    assert (ran.code, ran.out) == (0, f"{log}: valid\n")
+    assert run("inspect", log, "--overlay", tmp_path / "o.png").code == 0
+    assert run("convert", log, "--out", tmp_path / "part", "--start", "0.3", "--stop", "0.6", "--quiet").code == 0
+    assert run("validate", tmp_path / "part").code == 0
+
+
+@pytest.mark.parametrize("name", EACH)
+def test_the_scenario_is_that_of_the_world(made: Callable[[str], tuple[Path, Path]], name: str, tmp_path: Path) -> None:
+    log, scenario = made(name)
+    loaded = Scenario.load(scenario)
+    assert (loaded.ego is None) == name.startswith("roadside")
+    for k, truth in enumerate((log, log / "truth.json")):
+        assert run("evaluate", scenario, "--truth", truth, "--out", tmp_path / f"{k}.json", "--quiet").code == 0
+        figures = json.loads((tmp_path / f"{k}.json").read_text())
+        assert figures["recall"] == 1.0
+        assert figures["precision"] == 1.0
+        assert figures["position_rmse_m"] < 0.4
+
+
+@pytest.mark.parametrize("name", EACH)
+def test_the_scenario_is_drawn_replayed_changed_and_exported(
+    made: Callable[[str], tuple[Path, Path]], name: str, tmp_path: Path
+) -> None:
+    log, scenario = made(name)
+    first = Scenario.load(scenario).others[0].id
+    commands = [
+        ("replay", scenario, "--out", tmp_path / "r.json"),
+        ("replay", scenario, "--out", tmp_path / "reactive.json", "--agents", "reactive"),
+        ("plot", scenario, "--out", tmp_path / "p.png", "--replay", tmp_path / "r.json", "--truth", log),
+        ("view", scenario, "--out", tmp_path / "v.html", "--replay", tmp_path / "r.json", "--truth", log),
+        ("edit", scenario, "--out", tmp_path / "e.json", "--remove", first),
+    ]
+    for command in commands:
+        ran = run(*command, "--quiet") if command[0] != "plot" else run(*command)
+        assert ran.code == 0, (command, ran.err)
+    ego = ("--ego", first) if name.startswith("roadside") else ()
+    for format in registry.names("export"):
+        if format == "rerun":
+            continue  # needs its package
+        ran = run("export", scenario, "--to", format, "--out", tmp_path / format, *ego, "--quiet")
+        assert ran.code == 0, (format, ran.err)
+        assert names(tmp_path / format)
+
+
+def test_formats_with_an_ego_say_how_to_choose_one(made: Callable[[str], tuple[Path, Path]], tmp_path: Path) -> None:
+    _, scenario = made("roadside")
+    for format in ("scenarionet", "commonroad"):
+        assert "choose one with --ego AGENT" in run("export", scenario, "--to", format, "--out", tmp_path / format).line
+    ran = run("export", scenario, "--to", "csv", "--out", tmp_path / "csv", "--ego", "car-9")
+    assert "no agent 'car-9' (did you mean 'car-" in ran.line
+    _, driven = made("lidar")
+    ran = run("export", driven, "--to", "csv", "--out", tmp_path / "csv", "--ego", "car-1")
+    assert "has an ego already" in ran.line
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", CAMERALESS)
+def test_what_needs_a_camera_says_so(made: Callable[[str], tuple[Path, Path]], name: str, tmp_path: Path) -> None:
+    log, scenario = made(name)
+    out = tmp_path / "out.json"
+    assert "--detector lidar:labels" in run("reconstruct", log, "--out", out, "--detector", "labels").line
+    usual = "lidar:vehicle" if name == "lidar" else "lidar:roadside"
+    assert f"--detector {usual}" in run("reconstruct", log, "--out", out, "--detector", "ssd-mobilenet-v2").line
+    picture = tmp_path / "ground.png"
+    ran = run("reconstruct", log, "--out", out, "--detector", "lidar:labels", "--topdown", picture)
+    assert "no camera, so there is no picture of the ground" in ran.line
+    assert "no camera, so there is no picture" in run("plot", scenario, "--out", picture, "--background", log).line
+    assert "bench compares methods for images" in run("bench", log, "--out", tmp_path / "bench").line
+    assert names(tmp_path) == []
+
+
+def test_what_needs_a_lidar_says_so(made: Callable[[str], tuple[Path, Path]], tmp_path: Path) -> None:
+    log, _ = made("roadside-camera")
+    for command in ("reconstruct", "detect"):
+        assert "no LiDAR" in run(command, log, "--out", tmp_path / "o.json", "--detector", "lidar:labels").line
+
+
+def test_a_log_without_poses_is_named_as_such(tmp_path: Path) -> None:
+    log, _ = tiny_log()
+    write_log(replace(log, ego=None), tmp_path / "log")
+    ran = run("validate", tmp_path / "log")
+    assert ran.code == 3
+    assert "no poses of the ego, on which front, top are mounted" in ran.err
+
+
+def test_gaps_are_noted_and_missing_files_are_problems(log_folder: Path) -> None:
+    index = log_folder / "top" / "index.csv"
+    lines = index.read_text().splitlines()
+    index.write_text("\n".join([*lines[:4], *lines[6:]]) + "\n")
+    ran = run("validate", log_folder)
+    assert ran.code == 0
+    assert "note: stream 'top': 1 gap in its records at 10 Hz, the longest of 0.3 s after stamp" in ran.out
+    (log_folder / "front" / "000003.jpg").unlink()
+    ran = run("validate", log_folder)
+    assert ran.code == 3
+    assert "000003.jpg" in ran.err
