@@ -93,6 +93,13 @@ def test_lists_of_a_slice_are_those_of_its_rows(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["a.feather", "a.parquet"])
+def test_lists_of_one_length_may_be_missing(tmp_path: Path, name: str) -> None:
+    shapes = pa.array([[64, 2650, 4], None, [200, 600, 4]], pa.list_(pa.int32(), 3))
+    column = read_columns(write(tmp_path / name, pa.table({"shape": shapes})), {"shape": "ints"})["shape"]
+    assert [None if cell is None else cell.tolist() for cell in column] == [[64, 2650, 4], None, [200, 600, 4]]
+
+
+@pytest.mark.parametrize("name", ["a.feather", "a.parquet"])
 @pytest.mark.parametrize(
     ("column", "kind", "words"),
     [

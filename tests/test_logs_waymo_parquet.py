@@ -203,3 +203,21 @@ def test_recorded_poses_alone_are_no_log(recorded_poses: Path, tmp_path: Path) -
     shutil.copy(recorded_poses, tmp_path / "vehicle_pose" / "segment.parquet")
     with pytest.raises(LogError, match="segment: 199 frames with neither images nor range images"):
         open_log(tmp_path)
+
+
+def test_a_file_with_one_sensor_after_the_other_is_read_as_well(tmp_path: Path) -> None:
+    from pyarrow import parquet
+
+    segment = waymo.segment_of(world_log())
+    laser = waymo.Laser(np.eye(4), np.zeros(0), (-0.5, 0.5))
+    image = waymo.Ranges([np.full((6, 8, 4), 5.0, np.float32)])
+    frames = [replace(frame, lasers={**frame.lasers, 2: image}) for frame in segment.frames[:3]]
+    two = replace(segment, lasers={**segment.lasers, 2: laser}, frames=frames)
+    by_frame, by_sensor = (waymo_parquet.write(two, tmp_path / name) for name in ("frames", "sensors"))
+    table = parquet.read_table(component(by_sensor, "lidar"))
+    parquet.write_table(table.sort_by("key.laser_name"), component(by_sensor, "lidar"))
+    one, other = map(open_log, (by_frame, by_sensor))
+    for name, stream in one.streams.items():
+        for i in (2, 0, 1):
+            a, b = stream.read(i), other.streams[name].read(i)
+            np.testing.assert_array_equal(*((a, b) if name == "FRONT" else (a.xyz_m, b.xyz_m)))

@@ -72,10 +72,13 @@ def _lists(column: Any, kind: Literal["float", "int"]) -> NDArray[Any]:
     import pyarrow
 
     types = pyarrow.types
-    if types.is_fixed_size_list(column.type) and not column.null_count:
-        return _numbers(column.flatten(), kind).reshape(len(column), column.type.list_size)
     if types.is_fixed_size_list(column.type):
-        column = column.cast(pyarrow.list_(column.type.value_type))
+        # `flatten` leaves out the values below missing lists, which are missing themselves.
+        numbers = _numbers(column.flatten(), kind).reshape(-1, column.type.list_size)
+        if not column.null_count:
+            return numbers
+        present = iter(numbers)
+        return _objects([next(present) if t else None for t in column.is_valid().to_pylist()])
     if not (types.is_list(column.type) or types.is_large_list(column.type)):
         raise ValueError(f"is {column.type}, expected a list of numbers a row")
     ends = column.offsets.to_numpy(zero_copy_only=False)

@@ -33,7 +33,7 @@ def write(segment: Segment, folder: Path) -> Path:
 
     for component, rows in components_of(segment).items():
         (folder / component).mkdir(parents=True, exist_ok=True)
-        columns = {name: [row[name] for row in rows] for name in rows[0]} if rows else {SEGMENT: []}
+        columns = {name: [row.get(name) for row in rows] for name in rows[0]} if rows else {SEGMENT: []}
         table = pyarrow.table({name: column(pyarrow, name, values) for name, values in columns.items()})
         parquet.write_table(table, folder / component / f"{segment.name}.parquet")
     return folder

@@ -46,17 +46,7 @@ def labels_of(
     start of the frame. On its sample the camera's label of a cyclist at 8.5 m/s is 13 px from the box at this time, 24 px
     from the box at the start; its box is 37 px wide.
     """
-    kind = np.array([TYPES.get(int(k), "unknown") for k in table.kind], dtype=np.str_)
-    usable = (table.size > 0).all(axis=1) & np.isfinite(table.size).all(axis=1) & np.isfinite(table.heading_rad)
-    usable &= (np.abs(table.center) < MAX_COORDINATE_M).all(axis=1)
-    road_user = np.isin(kind, list(CATEGORY_OF))
-    if (road_user & ~usable).any():
-        notes.append(f"{np.sum(road_user & ~usable)} labels without a position or size left out")
-    if (~road_user).any():
-        left_out = ", ".join(f"{np.sum(kind == word)} '{word}'" for word in np.unique(kind[~road_user]))
-        notes.append(f"labels left out as no road users: {left_out}")
-    rows = np.flatnonzero(usable & road_user)
-    table, kind = table.take(rows), kind[rows]
+    table, kind = _road_users(table, notes)
     turn = None if top is None else turn_of(table.center, top)
     t_ns = times.pose_ns[table.frame] if turn is None else times.at_turn(table.frame, turn)
     keep = _rising(t_ns, table.track_id)
@@ -73,6 +63,21 @@ def labels_of(
         kind=kind,
         labeled_ns=times.pose_ns,
     )
+
+
+def _road_users(table: BoxTable, notes: list[str]) -> tuple[BoxTable, NDArray[np.str_]]:
+    """Select the usable boxes of road users; return them with the words for their kinds."""
+    kind = np.array([TYPES.get(int(k), "unknown") for k in table.kind], dtype=np.str_)
+    usable = (table.size > 0).all(axis=1) & np.isfinite(table.size).all(axis=1) & np.isfinite(table.heading_rad)
+    usable &= (np.abs(table.center) < MAX_COORDINATE_M).all(axis=1)
+    road_user = np.isin(kind, list(CATEGORY_OF))
+    if (road_user & ~usable).any():
+        notes.append(f"{np.sum(road_user & ~usable)} labels without a position or size left out")
+    if (~road_user).any():
+        left_out = ", ".join(f"{np.sum(kind == word)} '{word}'" for word in np.unique(kind[~road_user]))
+        notes.append(f"labels left out as no road users: {left_out}")
+    rows = np.flatnonzero(usable & road_user)
+    return table.take(rows), kind[rows]
 
 
 def image_labels_of(table: BoxTable, stamps_ns: NDArray[np.int64], size_px: tuple[int, int]) -> ImageLabels:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array, apply, inverse, rotation_from_rpy, transform
+from log2sim.geometry import Array, apply, inverse, rotation_from_rpy
 from log2sim.logs.waymo.messages import range_image_parts
 from log2sim.logs.waymo.segment import LaserCalibration, RangeImages
 from log2sim.logs.waymo.wire import BYTES, WireError, fields_of, varints
@@ -159,10 +159,8 @@ def _compensated(xyz: Array, pixel_poses: NDArray[np.float32], vehicle_T_lidar: 
     roll, pitch, yaw, *position = pixel_poses.astype(np.float64).T
     # The difference of the large positions is taken first, so that it keeps its digits.
     from_pose = np.stack(position, axis=1) - world_T_vehicle[:3, 3]
-    world_axes_T_pixel = transform(rotation_from_rpy(roll, pitch, yaw), from_pose)
-    vehicle_T_world_axes = inverse(transform(world_T_vehicle[:3, :3], np.zeros(3)))
-    in_world_axes = apply(world_axes_T_pixel, apply(vehicle_T_lidar, xyz))
-    return apply(inverse(vehicle_T_lidar), apply(vehicle_T_world_axes, in_world_axes))
+    turned = np.einsum("nij,nj->ni", rotation_from_rpy(roll, pitch, yaw), apply(vehicle_T_lidar, xyz))
+    return apply(inverse(vehicle_T_lidar), (turned + from_pose) @ world_T_vehicle[:3, :3])
 
 
 def _floats(data: bytes) -> NDArray[np.float32]:
