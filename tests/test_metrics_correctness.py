@@ -15,9 +15,11 @@ from metric_scenes import T_S, agent, moved, scenario, shifted, world
 from log2sim.datatypes import CATEGORIES, Agent, Scenario
 from log2sim.documents import check
 from log2sim.errors import ScenarioError
+from log2sim.evaluation.metrics.align import reconstructed_states, truth_states
+from log2sim.evaluation.metrics.comparison import Selection, compare
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.evaluation.metrics.table import format_table
-from log2sim.evaluation.metrics.verdicts import MEASURES, REPORTED
+from log2sim.evaluation.metrics.verdicts import MEASURES, REPORTED, judge
 
 TICKS = len(T_S)
 WALK = {"category": "pedestrian", "size_m": (0.6, 0.6, 1.7)}
@@ -96,6 +98,20 @@ def test_the_matched_object_tells_the_class_not_a_nearer_one_of_another_kind():
     assert faults(judged([agent("x", 0.0)], truth)) == {}
 
 
+def test_a_duplicate_is_taken_for_what_it_doubles_not_for_a_nearer_object_of_another_kind():
+    truth = [agent("a", 0.0), agent("b", 1.6, category="pedestrian")]
+    found = judged([agent("x", 0.0), agent("y", 1.5)], truth)
+    assert faults(found) == {"duplicate": TICKS, "wrong": TICKS}
+
+
+def test_the_matched_object_tells_the_class_not_a_nearer_one_of_the_kind():
+    truth = [agent("a", 0.0, category="truck"), agent("b", 2.6)]
+    # y matches b, which leaves a to x.
+    found = judged([agent("x", 1.4, category="truck"), agent("y", 2.6)], truth)
+    assert faults(found) == {}
+    assert [r["taken_for"] for r in found["judged_agents"]] == [{"a": TICKS}, {"b": TICKS}]
+
+
 @pytest.mark.parametrize(("speed", "wrong"), [(4.01, {}), (5.99, {}), (3.99, 1), (6.01, 1)])
 def test_a_speed_is_wrong_from_1_mps(speed, wrong):
     expected = {"wrong_speed": TICKS, "wrong": TICKS} if wrong else {}
@@ -156,11 +172,12 @@ def test_a_small_size_is_never_wrong_by_less_than_30_cm(length, wrong):
     assert ("wrong_size" in faults(judged([ours], [agent("a", 0.0, **WALK)]))) == wrong
 
 
-@pytest.mark.parametrize(("ticks", "agents"), [(6, 0), (7, 1)])
+@pytest.mark.parametrize(("ticks", "agents"), [(2, 0), (3, 1)])
 def test_an_agent_is_wrong_when_more_than_a_fifth_of_its_ticks_are(ticks, agents):
-    away = np.where(np.arange(TICKS) < ticks, 50.0, 0.0)
-    found = judged([agent("x", 0.0, away)], [agent("a", 0.0)])
-    assert found["invented"] == {"share": pytest.approx(ticks / TICKS, abs=1e-6), "ticks": ticks, "agents": agents}
+    away = np.where(np.arange(10) < ticks, 50.0, 0.0)
+    found = judged([agent("x", 0.0, away, t_s=T_S[:10])], [agent("a", 0.0)])
+    assert found["invented"] == {"share": ticks / 10, "ticks": ticks, "agents": agents}
+    assert found["wrong"]["agents"] == agents
     assert found["judged_agents"][0]["invented_ticks"] == ticks
 
 
@@ -170,12 +187,14 @@ def test_doubt_is_a_flag_or_a_confidence_below_one_half():
         agent("flagged", 20.0, confidence=0.9, quality={"flags": ["curvature"]}),
         agent("unsure", 40.0, confidence=0.49),
         agent("sure", 60.0, confidence=0.5),
+        agent("both", 80.0, confidence=0.1, quality={"flags": ["jump"]}),
     ]
     truth = [agent("a", 0.0), agent("b", 20.0)]
     found = judged(ours, truth)
-    assert found["doubted"] == {"wrong_ticks": 0.5, "right_ticks": 0.5, "wrong_agents": 0.5, "right_agents": 0.5}
+    twice = {"wrong": pytest.approx(2 / 3, abs=1e-6), "right": 0.5}
+    assert found["doubted"] == {f"{k}_{unit}": twice[k] for unit in ("ticks", "agents") for k in ("wrong", "right")}
     assert {r["id"]: r["doubts"] for r in found["judged_agents"]} == {
-        "right": [], "flagged": ["curvature"], "unsure": ["confidence"], "sure": [],
+        "right": [], "flagged": ["curvature"], "unsure": ["confidence"], "sure": [], "both": ["confidence", "jump"],
     }  # fmt: skip
 
 
@@ -234,6 +253,19 @@ def test_gaps_of_the_labels_say_nothing_of_states_nor_of_presence():
     assert faults(found)["duplicate"] == faults(found)["wrong_speed"] == TICKS - gap
 
 
+def test_what_is_not_selected_is_not_judged_at_all():
+    ego_xy = np.zeros((TICKS, 2))
+    ours = reconstructed_states((driving("x", 9.0, yaw=np.pi), agent("y", 0.0, 9.0, category="truck")), T_S, ego_xy)
+    truth = truth_states((driving("a", 5.0), agent("b", 0.0, 9.0)), T_S, np.zeros(3), ego_xy)
+    found = judge(compare(truth, ours, 0.1, Selection(8.0, frozenset(["car"]))))
+    near = np.array([5 * T_S <= 8.0, np.zeros(TICKS, dtype=bool)])
+    assert np.array_equal(found.judged, near)
+    assert np.array_equal(found.wrong, near)
+    assert np.array_equal(np.isfinite(found.error_m[..., 0]), near)
+    for mask in (*found.measures.values(), found.matched >= 0, found.taken_for >= 0, found.undecided):
+        assert not np.any(mask & ~near)
+
+
 def test_categories_narrow_what_is_judged():
     found = judged(world(), world(), categories=["pedestrian"])
     assert (found["agents"], list(found["by_category"])) == (2, ["pedestrian"])
@@ -263,7 +295,7 @@ def test_a_result_keeps_its_schema_and_the_worst_agents_are_named():
     text = format_table(result)
     assert "car-18: backwards in 31, wrong size in 31 of 31 ticks, confidence 0.88, not doubted" in text
     assert "ghost: invented in 31 of 31 ticks, confidence 1.00, doubted (jump)" in text
-    assert text.index("car-18:") < text.index("ghost:")
+    assert text.index("car-18:") < text.index("car-10:") < text.index("ghost:")
     assert "expected calibration error" in text
 
 

@@ -103,6 +103,9 @@ def test_only_the_agent_in_a_region_is_ignored():
     assert result["hota"] == pytest.approx(np.sqrt(0.5), abs=1e-6)
     assert result["recall"] == plain["recall"] == 1.0
     assert "outline" in result["counting"]["ignored"]
+    found = result["correctness"]
+    assert (found["ticks"], found["undecided_ticks"], found["invented"]["ticks"]) == (42, 21, 21)
+    assert [row["id"] for row in found["judged_agents"]] == ["a", "out"]
 
 
 @pytest.mark.parametrize(
