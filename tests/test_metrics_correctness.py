@@ -172,6 +172,22 @@ def test_a_small_size_is_never_wrong_by_less_than_30_cm(length, wrong):
     assert ("wrong_size" in faults(judged([ours], [agent("a", 0.0, **WALK)]))) == wrong
 
 
+@pytest.mark.parametrize(("gap", "inside"), [(0.01, False), (-0.01, True)])
+@pytest.mark.parametrize("turned", [0.0, np.pi / 2])
+def test_an_agent_in_the_ego_is_wrong(gap, inside, turned):
+    """An ego that drives, and an agent beside it, parallel or across, that may pass through it."""
+    reach = 1.8 if turned == 0 else (1.8 + 4.4) / 2
+    ego = agent("ego", 5 * T_S, speed=5.0)
+    found = judged([ego, agent("x", 5 * T_S, reach + gap, yaw=turned)], [ego, agent("far", 99.0)])
+    assert faults(found) == {"invented": 31, "wrong": 31} | ({"in_ego": 31} if inside else {})
+
+
+def test_an_agent_in_the_ego_is_right_where_its_truth_is_in_it_and_else_wrong():
+    ego = agent("ego", 0.0)
+    assert faults(judged([ego, agent("x", 0.0, 1.5)], [ego, agent("a", 0.0, 1.75)])) == {}
+    assert faults(judged([ego, agent("x", 0.0, 1.5)], [ego, agent("a", 0.0, 1.85)])) == {"in_ego": 31, "wrong": 31}
+
+
 @pytest.mark.parametrize(("ticks", "agents"), [(2, 0), (3, 1)])
 def test_an_agent_is_wrong_when_more_than_a_fifth_of_its_ticks_are(ticks, agents):
     away = np.where(np.arange(10) < ticks, 50.0, 0.0)
@@ -257,7 +273,7 @@ def test_what_is_not_selected_is_not_judged_at_all():
     ego_xy = np.zeros((TICKS, 2))
     ours = reconstructed_states((driving("x", 9.0, yaw=np.pi), agent("y", 0.0, 9.0, category="truck")), T_S, ego_xy)
     truth = truth_states((driving("a", 5.0), agent("b", 0.0, 9.0)), T_S, np.zeros(3), ego_xy)
-    found = judge(compare(truth, ours, 0.1, Selection(8.0, frozenset(["car"]))))
+    found = judge(compare(truth, ours, 0.1, Selection(8.0, frozenset(["car"]))), None)
     near = np.array([5 * T_S <= 8.0, np.zeros(TICKS, dtype=bool)])
     assert np.array_equal(found.judged, near)
     assert np.array_equal(found.wrong, near)

@@ -148,6 +148,17 @@ def test_only_logs_labeled_by_camera_ignore_what_no_camera_shows():
     assert counts(behind, truth_with(outside=True))[1:] == (0, 21)
 
 
+def test_what_is_in_the_ego_is_invented_even_where_no_camera_shows_it():
+    ego = agent("ego", -20.0)
+    truth = replace(scenario(ego, agent("a", 30.0, 10.0)), ignore_regions=IgnoreRegions((view(),), outside_views=True))
+    ours = scenario(ego, agent("a", 30.0, 10.0), agent("behind", -30.0), agent("phantom", -21.0, 0.5))
+    found, false, ignored = counts(ours, truth)
+    assert (false, ignored) == (0, 42)
+    judged = found["correctness"]
+    assert (judged["invented"]["ticks"], judged["in_ego"]["ticks"], judged["undecided_ticks"]) == (21, 21, 21)
+    assert [row["id"] for row in judged["judged_agents"]] == ["a", "phantom"]
+
+
 def test_an_agent_that_a_camera_shows_in_part_is_in_its_view():
     # The view is 45 degrees to each side. At y = 22 the car's right rear corner alone is inside it.
     assert counts(one(20.0, 22.0), truth_with(view(), outside=True))[1:] == (21, 0)

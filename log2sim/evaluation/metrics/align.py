@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -118,6 +118,20 @@ def truth_states(agents: tuple[Agent, ...], ticks_s: Array, shift_m: Array, ego_
     return _table(
         agents, ego_xy, xy_m=xy, z_m=z, yaw_rad=yaw, speed_mps=speed, visible=visible & labeled, labeled=labeled
     )
+
+
+def ego_states(
+    scenario: Scenario, truth: Scenario, ticks_s: Array, truth_ticks_s: Array, shift_m: Array
+) -> StateTable | None:
+    """Sample the ego as one row, the true one at the ticks at which it is known; None without an ego."""
+    ours = None if scenario.ego is None else reconstructed_states((scenario.ego,), ticks_s, None)
+    if truth.ego is None:
+        return ours
+    true = truth_states((truth.ego,), truth_ticks_s, shift_m, None)
+    if ours is None:
+        return true
+    xy_m = np.where(true.present[..., None], true.xy_m, ours.xy_m)
+    return replace(true, xy_m=xy_m, yaw_rad=np.where(true.present, true.yaw_rad, ours.yaw_rad))
 
 
 def _sample_truth(agent: Agent, t: Array) -> tuple[Array, Array, Array, Array, Mask, Mask]:

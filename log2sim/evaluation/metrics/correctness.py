@@ -56,7 +56,7 @@ class JudgedAgents:
         return np.array([bool(r) for r in self.reasons], dtype=bool)
 
 
-def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, *, ranged: bool) -> dict[str, Any]:
+def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: StateTable | None) -> dict[str, Any]:
     """Judge the reconstructed agents and summarize by kind, category and range.
 
     Parameters
@@ -65,15 +65,15 @@ def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, *, range
     agents : sequence of Agent
         The B reconstructed agents of the comparison.
     ticks_s : (T,) float64, s
-    ranged : bool
-        Whether there is an ego to measure ranges from.
+    ego : StateTable or None
+        One row; without it there are no figures by range.
 
     Returns
     -------
     dict
         The part `correctness` of a document of `schemas/metrics-1.json`.
     """
-    verdicts = judge(c)
+    verdicts, ranged = judge(c, ego), ego is not None
     sigma = [np.interp(ticks_s, a.waypoints.t_s, a.waypoints.sigma_xy_m) for a in agents]
     judged = JudgedAgents(
         states=c.other,

@@ -10,6 +10,7 @@ from log2sim.evaluation.metrics.verdicts import MEASURES
 COLUMNS = (
     ("invented", "invented"),
     ("duplicate", "duplicate"),
+    ("in_ego", "in ego"),
     ("wrong_speed", "speed"),
     ("wrong_motion", "motion"),
     ("backwards", "backwards"),

@@ -9,7 +9,7 @@ import numpy as np
 
 from log2sim.datatypes import CATEGORIES, GROUPS, Scenario
 from log2sim.errors import ConfigError, ScenarioError
-from log2sim.evaluation.metrics.align import evaluation_ticks_s, reconstructed_states, truth_states
+from log2sim.evaluation.metrics.align import ego_states, evaluation_ticks_s, reconstructed_states, truth_states
 from log2sim.evaluation.metrics.clear_mot import mota
 from log2sim.evaluation.metrics.comparison import (
     MIN_COUNTED_S,
@@ -74,7 +74,8 @@ def evaluate(
         raise ScenarioError(_no_common_time(scenario, truth))
     truth_ticks_s = ticks_s + (scenario.t0_ns - truth.t0_ns) / NS_PER_S
     shift_m = truth.shift_to(scenario)
-    ego_xy = _ego_xy(scenario, truth, ticks_s, truth_ticks_s, shift_m)
+    ego = ego_states(scenario, truth, ticks_s, truth_ticks_s, shift_m)
+    ego_xy = None if ego is None else ego.xy_m[0]
     _check_range(max_range_m, ego_xy)
     true = truth_states(truth.others, truth_ticks_s, shift_m, ego_xy)
     ours = reconstructed_states(scenario.others, ticks_s, ego_xy)
@@ -93,7 +94,7 @@ def evaluate(
         **_figures(compared, *everywhere),
         "by_range": None if ego_xy is None else _by_range(compared),
         "by_category": _by_category(compared),
-        "correctness": correctness(compared, scenario.others, ticks_s, ranged=ego_xy is not None),
+        "correctness": correctness(compared, scenario.others, ticks_s, ego),
         "ego": _ego_figures(scenario, truth, ticks_s, truth_ticks_s, shift_m),
         "matching": matching_rules(),
         "counting": counting_rules(truth, MIN_COUNTED_S),
@@ -189,17 +190,6 @@ def _check_range(max_range_m: float | None, ego_xy: Array | None) -> None:
         raise ConfigError(f"range is {max_range_m:g} m; it must be greater than 0")
     if ego_xy is None:
         raise ConfigError("a range is given, but neither the scenario nor the truth has an ego to measure it from")
-
-
-def _ego_xy(scenario: Scenario, truth: Scenario, ticks_s: Array, truth_ticks_s: Array, shift_m: Array) -> Array | None:
-    """Return the positions (T, 2) of the ego, the true ones where known; None without an ego."""
-    xy: Array | None = None
-    if scenario.ego is not None:
-        xy = reconstructed_states((scenario.ego,), ticks_s, None).xy_m[0]
-    if truth.ego is not None:
-        true_xy = truth_states((truth.ego,), truth_ticks_s, shift_m, None).xy_m[0]
-        xy = true_xy if xy is None else np.where(np.isfinite(true_xy), true_xy, xy)
-    return xy
 
 
 def _ego_figures(

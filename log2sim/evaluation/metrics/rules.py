@@ -62,6 +62,8 @@ def correctness_rules(max_wrong_share: float, min_confidence: float) -> dict[str
         "could have told; shares are of these ticks, ranges those of the reconstructed agent",
         "invented": "no labeled object of its kind, matched or not, within the gate of the matching",
         "duplicate": "such an object is within the gate, but another agent matches it",
+        "in_ego": "its footprint overlaps the ego's, and that of the labeled object that it matches does not; judged also "
+        "where the labels could not have told",
         "wrong_speed": f"matched, and the speed along the true heading is off by more than {MAX_SPEED_ERROR_MPS:g} m/s",
         "wrong_motion": f"matched, and stands (below {MAX_STANDING_MPS:g} m/s) while the truth moves (from "
         f"{MIN_MOVING_MPS:g} m/s), moves while it stands, or both move (from {MAX_STANDING_MPS:g} m/s) more than 90 "

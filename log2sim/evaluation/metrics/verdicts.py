@@ -11,7 +11,7 @@ from log2sim.evaluation.metrics.align import StateTable
 from log2sim.evaluation.metrics.comparison import Comparison
 from log2sim.evaluation.metrics.pairs import Index, Mask
 from log2sim.evaluation.metrics.state_errors import StateErrors, state_errors
-from log2sim.geometry import Array
+from log2sim.geometry import Array, rectangles_overlap
 
 MAX_SPEED_ERROR_MPS = 1.0
 """Six standard deviations of a speed from labels with 5 cm of noise at 10 Hz, 0.16 m/s; see `truth.speed_along`."""
@@ -26,7 +26,7 @@ MAX_SIZE_ERROR_SHARE = 0.25
 MIN_SIZE_ERROR_M = 0.3
 """A smaller error of a length or width is never wrong: stride and arms change the box of a person by as much."""
 
-MEASURES = ("invented", "duplicate", "wrong_speed", "wrong_motion", "backwards", "wrong_size")
+MEASURES = ("invented", "duplicate", "in_ego", "wrong_speed", "wrong_motion", "backwards", "wrong_size")
 """An agent is wrong at a tick when at least one of these is true of it."""
 
 REPORTED = (*MEASURES, "wrong_class")
@@ -66,8 +66,8 @@ class Verdicts:
         return np.asarray(np.any([self.measures[name] for name in MEASURES], axis=0))
 
 
-def judge(c: Comparison) -> Verdicts:
-    """Judge every selected tick of every reconstructed agent.
+def judge(c: Comparison, ego: StateTable | None) -> Verdicts:
+    """Judge every selected tick of every reconstructed agent; `ego` has one row.
 
     Notes
     -----
@@ -77,6 +77,7 @@ def judge(c: Comparison) -> Verdicts:
 
     - `invented`: no labeled object of its kind is within the gate, matched or not.
     - `duplicate`: one is, but another agent matches it.
+    - `in_ego`: its footprint overlaps that of the ego, and that of the labeled object that it matches does not.
     - `wrong_speed`: the speed is off by more than 1 m/s. Both are signed along the true heading, so an agent that is only
       turned round has none.
     - `wrong_motion`: stands (below 0.5 m/s) while the truth moves (from 1 m/s), moves while it stands, or both move (from
@@ -86,22 +87,21 @@ def judge(c: Comparison) -> Verdicts:
     - `wrong_class`: the labeled object there has another category. Not among `MEASURES`: within a kind, logs draw the
       borders differently (pickups, vans), and an agent at an object of another kind is `invented` already.
 
-    An agent that matches nothing has no state errors. The labels cannot tell in ignore regions (`label_coverage`), and not
-    where the only labeled object within the gate is interpolated over a gap of its labels.
+    An agent that matches nothing has no state errors. The labels cannot tell in ignore regions (`label_coverage`) unless
+    the ego is there, and not where the only labeled object within the gate is interpolated over a gap of its labels.
     """
     truth, other = c.truth, c.other
     matched = _partners(c)
     same = c.pairs.take(c.pairs.same_group)
     near, near_labeled = (_marked(c.false.shape, same.other[k], same.tick[k]) for k in (slice(None), _labeled_rows(c)))
-    lone = c.selected & (matched < 0) & ~c.ignored
+    in_ego = _in_ego(truth, other, matched, ego)
+    lone = c.selected & (matched < 0) & (in_ego | ~c.ignored)
     invented, duplicate = lone & ~near, lone & near_labeled
-    tick = np.broadcast_to(np.arange(matched.shape[1]), matched.shape)
-    known = c.selected & (matched >= 0)
-    known[known] = truth.labeled[matched[known], tick[known]]
+    known = c.selected & _of_matched(matched, truth.labeled)
     judged = known | invented | duplicate
     errors = state_errors(truth, other, c.match, truth.labeled)
     errors = errors.take(known[errors.other, errors.tick])
-    measures = {"invented": invented, "duplicate": duplicate}
+    measures = {"invented": invented, "duplicate": duplicate, "in_ego": in_ego & judged}
     measures |= {k: _at(errors, wrong, judged.shape) for k, wrong in _state_verdicts(truth, other, errors).items()}
     taken_for = np.where(judged, _nearest(c, matched), -1)
     measures["wrong_class"] = (taken_for >= 0) & (_category(truth, taken_for) != other.category[:, None])
@@ -126,6 +126,34 @@ def _state_verdicts(truth: StateTable, other: StateTable, errors: StateErrors) -
         "backwards": np.nan_to_num(errors.yaw_rad) > np.pi / 2,
         "wrong_size": np.any(off_m > limit_m, axis=1),
     }
+
+
+def _in_ego(truth: StateTable, other: StateTable, matched: Index, ego: StateTable | None) -> Mask:
+    """Mark (B, T) the agents in the ego whose matched truth is not."""
+    if ego is None:
+        return np.zeros(matched.shape, dtype=bool)
+    return _overlapping(other, ego) & ~_of_matched(matched, _overlapping(truth, ego))
+
+
+def _overlapping(side: StateTable, ego: StateTable) -> Mask:
+    """Mark (A, T) the agents whose footprint overlaps that of the ego."""
+    away = ego.xy_m - side.xy_m
+    reach_m = (np.hypot(side.size_m[:, 0], side.size_m[:, 1]) + np.hypot(ego.size_m[0, 0], ego.size_m[0, 1])) / 2
+    near = np.hypot(away[..., 0], away[..., 1]) < reach_m[:, None]
+    i, t = np.nonzero(near)
+    ego_size_m = np.broadcast_to(ego.size_m, (len(i), 3))
+    near[i, t] = rectangles_overlap(
+        away[i, t, 0], away[i, t, 1], side.yaw_rad[i, t], ego.yaw_rad[0, t], side.size_m[i], ego_size_m
+    )
+    return np.asarray(near)
+
+
+def _of_matched(matched: Index, of_truth: Mask) -> Mask:
+    """Look up (B, T) what is marked (A, T) of the matched truth agents; False without a match."""
+    mask = matched >= 0
+    _, tick = np.nonzero(mask)
+    mask[mask] = of_truth[matched[mask], tick]
+    return mask
 
 
 def _partners(c: Comparison) -> Index:
