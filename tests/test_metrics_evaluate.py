@@ -238,6 +238,18 @@ def test_ticks_where_the_ego_was_thinned_out_come_from_the_others():
     assert evaluate(scenario(ego, agent("x", T_S)), scenario(ego, agent("a", T_S)))["ticks"] == 31
 
 
+def test_a_truth_that_stamps_every_label_by_itself_does_not_multiply_the_ticks():
+    """Twice a second on our side, 20 labels a second for each of 40 agents, each at its own moment, in the truth."""
+    ours, labels = np.arange(7) / 2, np.arange(61) / 20
+    scattered = [agent(f"a{k}", 5.0 * k, 9.0, t_s=labels + k * 0.0012) for k in range(40)]
+    result = evaluate(
+        scenario(agent("ego", 5 * ours, t_s=ours, speed=5.0), agent("x", 0.0, 9.0, t_s=ours)),
+        scenario(agent("ego", 5 * ours, t_s=ours, speed=5.0), *scattered),
+    )
+    assert 60 <= result["ticks"] <= 152
+    assert result["ego"]["ticks"] == len(ours)
+
+
 def test_start_time_and_map_offset_make_no_difference():
     plain = evaluate(shifted(world(), 0.3), world())
     s = shifted(world(), 0.3)

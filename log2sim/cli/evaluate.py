@@ -145,9 +145,9 @@ def _log_of(path: Path, sequence: str | None, provenance: dict[str, Any]) -> Cal
     def opened() -> Log:
         from log2sim.errors import LogError
         from log2sim.localization.choice import localize_like
-        from log2sim.logs.opening import is_log_path, open_log
+        from log2sim.logs.opening import is_log_file, open_log
 
-        if path.is_file() and not is_log_path(path):
+        if path.is_file() and not is_log_file(path):
             raise LogError(f"{path}: is a file and no log; the truth of boxes is a log with labels")
         return localize_like(open_log(path, sequence=sequence), provenance)
 

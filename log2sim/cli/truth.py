@@ -43,9 +43,9 @@ def truth_at(
     placed by the poses that `provenance` states, so that both are in the same map.
     """
     from log2sim.datatypes import Scenario as Truth
-    from log2sim.logs.opening import is_log_path, open_log
+    from log2sim.logs.opening import is_log_file, open_log
 
-    if not is_log_path(path):
+    if not (path.is_dir() or is_log_file(path)):
         return Truth.load(path)
     if (path / "truth.json").is_file():
         return Truth.load(path / "truth.json")

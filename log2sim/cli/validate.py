@@ -13,7 +13,10 @@ from log2sim.cli.options import Format, Sequence, say
 def validate(
     path: Annotated[
         Path,
-        typer.Argument(metavar="FILE_OR_LOG", help="Scenario, replay, boxes, report, metrics or bench file, or a log."),
+        typer.Argument(
+            metavar="FILE_OR_LOG",
+            help="Scenario, replay, boxes, report, metrics or bench file, or a log: a folder, or the file of a bag.",
+        ),
     ],
     format: Format = "auto",
     sequence: Sequence = None,
@@ -23,10 +26,9 @@ def validate(
     Exits with 3 and lists the problems, if there are any. Gaps between records are no problem; they are noted.
     """
     from log2sim.errors import LogError
-    from log2sim.logs.opening import is_log_path
+    from log2sim.logs.opening import is_log_file, open_log
 
-    if is_log_path(path):
-        from log2sim.logs.opening import open_log
+    if path.is_dir() or is_log_file(path):
         from log2sim.logs.validation import list_gaps, validate_log
 
         opened = open_log(path, format=format, sequence=sequence)

@@ -43,15 +43,6 @@ def open_log(path: Path | str, *, format: str = "auto", sequence: str | None = N
     return reader.open(root, _select_sequence(root, name, reader.sequences(root), sequence))
 
 
-def is_log_path(path: Path | str) -> bool:
-    """Return whether a path is a folder, or a file with a suffix of a log format."""
-    path = Path(path)
-    suffix = path.suffix.lower()
-    if path.is_dir() or suffix in ("", ".json"):
-        return path.is_dir()
-    return any(suffix in registry.load("log", name).suffixes for name in registry.names("log"))
-
-
 def find_reader(root: Path) -> str:
     """Name of the reader that matches a folder or file; `LogError` when none does."""
     readers: dict[str, Reader] = {name: registry.load("log", name) for name in registry.names("log")}
@@ -65,6 +56,11 @@ def find_reader(root: Path) -> str:
         )
     known = "; ".join(f"{name} ({reader.looks_for})" for name, reader in readers.items())
     raise LogError(f"{root}: no known log format; a log is one of: {known}. Force one with --format")
+
+
+def is_log_file(path: Path) -> bool:
+    """Return whether a file has a suffix of a format of which a file is a log."""
+    return path.is_file() and any(_may_read(registry.load("log", name), path) for name in registry.names("log"))
 
 
 def _may_read(reader: Reader, root: Path) -> bool:

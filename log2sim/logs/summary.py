@@ -16,6 +16,7 @@ from log2sim.geometry import NS_PER_S
 # A step between two stamps that is longer than this many median steps is a gap.
 MIN_GAP_PERIODS = 1.7
 MIN_SPEED_STEP_NS = 100_000_000
+MAX_EGO_STEP_NS = 100_000_000
 
 
 def summarize(log: Log) -> dict[str, Any]:
@@ -64,11 +65,11 @@ def summarize(log: Log) -> dict[str, Any]:
     }
 
 
-def summarize_stamps(t_ns: NDArray[np.int64]) -> dict[str, Any]:
-    """Count, rate, range and gaps of increasing stamps (F,)."""
+def summarize_stamps(t_ns: NDArray[np.int64], min_gap_ns: int = 0) -> dict[str, Any]:
+    """Count, rate, range and gaps of increasing stamps (F,); gaps are longer than `min_gap_ns`."""
     step = np.diff(t_ns)
     median = float(np.median(step)) if len(step) else 0.0
-    gap = np.flatnonzero(step > MIN_GAP_PERIODS * median)
+    gap = np.flatnonzero(step > max(MIN_GAP_PERIODS * median, min_gap_ns))
     return {
         "records": len(t_ns),
         "rate_hz": rounded(NS_PER_S / median, 3) if median > 0 else None,
@@ -92,7 +93,8 @@ def _ego(log: Log) -> dict[str, Any] | None:
     steps = np.linalg.norm(np.diff(position[:, :2], axis=0), axis=1)
     seconds = np.diff(t_ns) / NS_PER_S
     return {
-        **summarize_stamps(log.ego.t_ns),
+        # Poses at the stamps of all sensors are no regular series; nothing is missing where there are ten in a second.
+        **summarize_stamps(log.ego.t_ns, MAX_EGO_STEP_NS),
         "distance_m": rounded(steps.sum(), 2),
         "top_speed_mps": rounded((steps / seconds)[seconds > 0.5 * MIN_SPEED_STEP_NS / NS_PER_S].max(initial=0.0), 2),
         "size_m": list(log.ego_vehicle.size_m),

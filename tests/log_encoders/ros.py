@@ -67,7 +67,7 @@ def write(messages: Iterator[Message] | Maker, folder: Path, name: str, style: S
         if style.compression:
             writer.set_compression(BagWriter.CompressionFormat[style.compression.upper()])
     else:
-        path = folder / f"{name}_rosbag2"
+        path = folder / f"{name}_{style.container}"
         plugin = StoragePlugin.SQLITE3 if style.container == "db3" else StoragePlugin.MCAP
         writer = Rosbag2Writer(path, version=9, storage_plugin=plugin)
         if style.compression:

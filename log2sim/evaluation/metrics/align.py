@@ -16,6 +16,9 @@ MAX_TRUTH_GAP_S = 0.25
 MAX_SIMPLIFIED_GAP_S = 1.05
 """Simplified trajectories omit waypoints of straight uniform motion for up to a second."""
 
+MIN_TICK_S = 0.02
+"""Instants taken from the waypoints of all agents are not nearer to each other: some logs stamp every label by itself."""
+
 TRUTH_MARGIN_S = 0.15
 """A truth agent is extrapolated this far beyond its first and last label, without being counted there."""
 
@@ -66,7 +69,7 @@ def evaluation_ticks_s(scenario: Scenario, truth: Scenario) -> Array:
     Notes
     -----
     These are the times of the ego's waypoints. When they are on average more than 0.25 s apart, which simplification does,
-    the waypoints of all agents are added, and when that is not enough, those of the truth.
+    the waypoints of all agents are added, and when that is not enough, those of the truth, at least `MIN_TICK_S` apart.
     """
     shift_s = (truth.t0_ns - scenario.t0_ns) / NS_PER_S
     ego = scenario.ego
@@ -78,16 +81,31 @@ def evaluation_ticks_s(scenario: Scenario, truth: Scenario) -> Array:
     # A scenario without agents misses every truth agent during its duration.
     begin = min((t[0] for t in ours), default=0.0)
     end = max((t[-1] for t in ours), default=scenario.duration_s)
-    for times in ([] if ego is None else [ego.waypoints.t_s], ours, ours + theirs):
+    ego_t_s = np.zeros(0) if ego is None else ego.waypoints.t_s
+    for times in ([] if ego is None else [ego_t_s], ours, ours + theirs):
         if not times:
             continue
         # Agents of one tick may differ in the last digits of their stamps.
         _, index = np.unique(np.round(np.concatenate(times), 4), return_index=True)
         t = np.sort(np.concatenate(times)[index])
+        t = _thinned(t, ego_t_s)
         t = t[(t >= max(first, begin) - TRUTH_MARGIN_S) & (t <= min(last, end) + TRUTH_MARGIN_S)]
         if len(t) > 1 and (t[-1] - t[0]) / (len(t) - 1) <= MAX_TRUTH_GAP_S:
             break
     return t
+
+
+def _thinned(t_s: Array, wanted_s: Array) -> Array:
+    """Keep of increasing instants (T,) those wanted, and others at least `MIN_TICK_S` from these and each other."""
+    wanted = np.isin(t_s, wanted_s)
+    away = np.full(len(t_s), np.inf)
+    if wanted.any():
+        away = np.abs(t_s - t_s[wanted][nearest_index(t_s[wanted], t_s)])
+    keep, last_s = wanted.copy(), -np.inf
+    for k in np.flatnonzero(away >= MIN_TICK_S):
+        if t_s[k] - last_s >= MIN_TICK_S:
+            keep[k], last_s = True, t_s[k]
+    return t_s[keep]
 
 
 def reconstructed_states(agents: tuple[Agent, ...], ticks_s: Array, ego_xy: Array | None) -> StateTable:

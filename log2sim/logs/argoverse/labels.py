@@ -46,6 +46,10 @@ CATEGORY_OF = {
     "WHEELCHAIR": "other",
     "STROLLER": "other",
 }
+NO_ROAD_USERS = {
+    "BOLLARD", "CONSTRUCTION_CONE", "CONSTRUCTION_BARREL", "STOP_SIGN", "SIGN", "MOBILE_PEDESTRIAN_SIGN",
+    "MOBILE_PEDESTRIAN_CROSSING_SIGN", "MESSAGE_BOARD_TRAILER", "TRAFFIC_LIGHT_TRAILER", "DOG", "ANIMAL",
+}  # fmt: skip
 # People who ride, by what they ride: both have boxes of their own.
 RIDDEN_BY = {"BICYCLIST": "BICYCLE", "MOTORCYCLIST": "MOTORCYCLE", "WHEELED_RIDER": "WHEELED_DEVICE"}
 # Between the centers of a rider and of the vehicle below, in the plane: less than half a bicycle.
@@ -58,7 +62,9 @@ PERIOD_NS = 100_000_000
 HALF_TURN_NS = PERIOD_NS // 2
 
 
-def read_labels(path: Path, ego: PoseTrack, upper_lidar_xy: Array, notes: list[str]) -> Labels:
+def read_labels(
+    path: Path, ego: PoseTrack, upper_lidar_xy: Array, swept_ns: NDArray[np.int64], notes: list[str]
+) -> Labels:
     """Read `annotations.feather`.
 
     Parameters
@@ -67,6 +73,8 @@ def read_labels(path: Path, ego: PoseTrack, upper_lidar_xy: Array, notes: list[s
     ego : PoseTrack
     upper_lidar_xy : (2,) float64, m
         Position of the upper LiDAR, ego frame.
+    swept_ns : (F,) int64
+        Stamps of the sweeps that are there.
     notes : list of str
         Takes what was left out.
 
@@ -86,15 +94,15 @@ def read_labels(path: Path, ego: PoseTrack, upper_lidar_xy: Array, notes: list[s
     if not known.all():
         notes.append(f"{np.sum(~known)} labels left out because the ego's pose is not known at their stamps")
     category = np.array([CATEGORY_OF.get(k, "") for k in kinds], dtype="<U16")
-    left_out = Counter(kinds[keep & (category == "")].tolist())
-    if left_out:
-        words = ", ".join(f"{kind} ({count})" for kind, count in left_out.most_common())
-        notes.append(f"labels left out because they are no road users: {words}")
+    _note_left_out(kinds[keep & (category == "")], notes)
     keep &= known & (category != "")
     keep &= _first_of_track(columns["timestamp_ns"], columns["track_uuid"].astype(np.str_))
     map_T_box = map_T_ego @ ego_T_box
     after_ns = seen_after_ns(ego_T_box[:, :2, 3] - upper_lidar_xy)
-    labeled = np.unique(columns["timestamp_ns"]) + HALF_TURN_NS
+    labeled = np.unique(columns["timestamp_ns"])
+    missing = len(labeled) - int(np.isin(labeled, swept_ns).sum())
+    if missing:
+        notes.append(f"sweeps are missing at {missing} of the {len(labeled)} stamps that were labeled")
     return Labels(
         t_ns=(columns["timestamp_ns"] + after_ns)[keep],
         track_id=columns["track_uuid"].astype(np.str_)[keep],
@@ -104,8 +112,16 @@ def read_labels(path: Path, ego: PoseTrack, upper_lidar_xy: Array, notes: list[s
         yaw_rad=np.arctan2(map_T_box[keep, 1, 0], map_T_box[keep, 0, 0]),
         visible=columns["num_interior_pts"][keep] > 0,
         kind=kinds[keep],
-        labeled_ns=labeled,
+        labeled_ns=labeled + HALF_TURN_NS,
     )
+
+
+def _note_left_out(kinds: NDArray[np.str_], notes: list[str]) -> None:
+    for why, known in (("they are no road users", True), ("their kind is not known", False)):
+        counts = Counter(kind for kind in kinds.tolist() if (kind in NO_ROAD_USERS) == known)
+        if counts:
+            words = ", ".join(f"{kind} ({count})" for kind, count in counts.most_common())
+            notes.append(f"labels left out because {why}: {words}")
 
 
 def seen_after_ns(xy_lidar: Array) -> NDArray[np.int64]:

@@ -35,9 +35,8 @@ POSES = "city_SE3_egovehicle.feather"
 MOUNTS, INTRINSICS = "calibration/egovehicle_SE3_sensor.feather", "calibration/intrinsics.feather"
 ANNOTATIONS = "annotations.feather"
 ROAD_Z_EGO_M = -0.33
-# A Ford Fusion Hybrid: 4.87 x 1.85 x 1.48 m by its data sheet; the mirrors add 0.27 m, and the bumpers are 1.07 m and 0.95 m
-# from the axles, 2.85 m apart.
-EGO_VEHICLE = EgoVehicle(size_m=(4.87, 2.12, 1.48), rear_axle_offset_m=1.365)
+# A Ford Fusion Hybrid, by its data sheet; that does not say how far it reaches behind the rear axle: 1.1 m is an estimate.
+EGO_VEHICLE = EgoVehicle(size_m=(4.87, 1.85, 1.48), rear_axle_offset_m=1.335)
 REFERENCE_CAMERA = "ring_front_center"
 # A log below a folder of splits of a folder of data sets: argoverse2/sensor/val/LOG.
 MAX_DEPTH = 3
@@ -113,13 +112,18 @@ class _Folder:
         map_frame = map_frame_of(city, offset_m, notes)
         notes.append("stamps do not count from 1970: only their differences mean anything")
         annotations = self.path / ANNOTATIONS
-        if annotations.is_file():
-            notes.append("objects were labeled only within 5 m of the drivable area")
+        notes.append(
+            "objects were labeled only within 5 m of the drivable area"
+            if annotations.is_file()
+            else f"no labels: {ANNOTATIONS} is missing, as in test splits"
+        )
         upper = mounts.get("up_lidar", np.eye(4))[:2, 3]
+
+        swept = streams["up_lidar"].t_ns if "up_lidar" in streams else np.zeros(0, dtype=np.int64)
 
         @cache
         def labels() -> Labels | None:
-            return read_labels(annotations, ego, upper, notes) if annotations.is_file() else None
+            return read_labels(annotations, ego, upper, swept, notes) if annotations.is_file() else None
 
         def all_notes() -> tuple[str, ...]:
             labels()

@@ -63,4 +63,5 @@ def _read_points(path: Path) -> dict[str, NDArray[Any]]:
         raise RecordError(
             f"{path}, column 'offset_ns': {offset_ns.min()} to {offset_ns.max()}, expected less than 1 s from the stamp"
         )
-    return columns
+    finite = np.isfinite(columns["x"]) & np.isfinite(columns["y"]) & np.isfinite(columns["z"])
+    return columns if finite.all() else {name: column[finite] for name, column in columns.items()}

@@ -43,6 +43,7 @@ class ChunkedFile:
         self._lock = threading.Lock()
         self._cache: OrderedDict[int, bytes] = OrderedDict()
         self._intact: set[int] = set()
+        self._damaged: dict[int, str] = {}
 
     def at(self, position: int, count: int) -> bytes:
         """Read `count` bytes; `ValueError` where the file ends before."""
@@ -71,22 +72,31 @@ class ChunkedFile:
         return self.unpacked(chunk)[offset : offset + count]
 
     def unpacked(self, chunk: int) -> bytes:
-        """Bytes of a chunk, decompressed and checked."""
+        """Bytes of a chunk, decompressed and checked; a damaged one is not tried again."""
         with self._lock:
             if chunk in self._cache:
                 self._cache.move_to_end(chunk)
                 return self._cache[chunk]
-        c = self.chunks[chunk]
-        if c.size_bytes > MAX_CHUNK_BYTES or c.stored_bytes > MAX_CHUNK_BYTES:
-            raise ValueError(f"a chunk of {c.size_bytes} bytes, more than the {MAX_CHUNK_BYTES} that it may have")
-        data = decompress(self.at(c.position, c.stored_bytes), c.compression, c.size_bytes)
-        if c.crc and zlib.crc32(data) != c.crc:
-            raise ValueError(f"the CRC of the chunk at byte {c.position} is wrong")
+        if chunk in self._damaged:
+            raise ValueError(self._damaged[chunk])
+        try:
+            data = self._unpack(self.chunks[chunk])
+        except (ValueError, OSError, EOFError) as problem:
+            self._damaged[chunk] = str(problem)
+            raise
         with self._lock:
             self._cache[chunk] = data
             self._intact.add(chunk)
             while len(self._cache) > 1 and sum(map(len, self._cache.values())) > CACHED_BYTES:
                 self._cache.popitem(last=False)
+        return data
+
+    def _unpack(self, chunk: Chunk) -> bytes:
+        if max(chunk.size_bytes, chunk.stored_bytes) > MAX_CHUNK_BYTES:
+            raise ValueError(f"a chunk of {chunk.size_bytes} bytes, more than the {MAX_CHUNK_BYTES} that it may have")
+        data = decompress(self.at(chunk.position, chunk.stored_bytes), chunk.compression, chunk.size_bytes)
+        if chunk.crc and zlib.crc32(data) != chunk.crc:
+            raise ValueError(f"the CRC of the chunk at byte {chunk.position} is wrong")
         return data
 
     def check(self, chunk: int) -> None:

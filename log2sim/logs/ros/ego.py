@@ -69,11 +69,12 @@ def choose_base(
         return given, "the settings name it"
     pose_frames = list(pose_frames)
     known = tree.frames | set(pose_frames) | set(sensor_frames)
-    named = next((frame for frame in BASE_FRAMES if frame in known), None)
-    if named is not None:
-        return named, "by its name"
-    if pose_frames:
-        return pose_frames[0], "odometry gives its poses"
+    reasons = {frame: "by its name" for frame in BASE_FRAMES if frame in known}
+    reasons |= {frame: "odometry gives its poses" for frame in pose_frames if frame not in reasons}
+    # One that sensors are fixed to goes before one that they are not.
+    ordered = sorted(reasons, key=lambda f: all(tree.mount(f, sensor) is None for sensor in sensor_frames))
+    if ordered:
+        return ordered[0], reasons[ordered[0]]
     for frame in sensor_frames:
         root = tree.rigid_root(frame)
         if root not in fixed_frames:

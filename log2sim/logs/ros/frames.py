@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +17,8 @@ from log2sim.logs.ros.settings import StaticTransform
 # Transforms that are sent again and again with the same values are static, as those of ROS 1 on /tf.
 SAME_TRANSFORM = 1e-9
 MAX_QUATERNION_ERROR = 0.05
+# Position, and the quaternion scalar-first.
+Numbers = tuple[float, float, float, float, float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,24 +39,28 @@ class FrameTree:
     """Frames by name; each has at most one parent, which is checked where a frame is used."""
 
     def __init__(self) -> None:
-        self._rows: dict[str, dict[str, list[tuple[int, Array]]]] = {}
+        self._rows: dict[str, dict[str, list[tuple[int, Numbers]]]] = {}
         self._edges: dict[str, dict[str, Edge]] = {}
+        self.refused = 0
+        """Transforms that were left out, since their values are not finite or their quaternions no rotations."""
 
     def add(self, transforms: Iterable[Any]) -> None:
-        """Add transforms of a TFMessage; those without a rotation are left out."""
+        """Add transforms of a TFMessage."""
         for message in transforms:
-            stamp = message.header.stamp
-            pose = pose_of(message.transform.translation, message.transform.rotation)
-            if pose is not None:
-                t_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
-                parents = self._rows.setdefault(message.child_frame_id.lstrip("/"), {})
-                parents.setdefault(message.header.frame_id.lstrip("/"), []).append((t_ns, pose))
+            stamp, t, q = message.header.stamp, message.transform.translation, message.transform.rotation
+            if not is_pose(t, q):
+                self.refused += 1
+                continue
+            t_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+            parents = self._rows.setdefault(message.child_frame_id.lstrip("/"), {})
+            row = t_ns, (t.x, t.y, t.z, q.w, q.x, q.y, q.z)
+            parents.setdefault(message.header.frame_id.lstrip("/"), []).append(row)
 
     def add_static(self, given: Iterable[StaticTransform]) -> None:
         """Add transforms of the settings, which replace those of the recording."""
         for entry in given:
-            pose = transform(rotation_from_quaternion(entry.rotation_wxyz), entry.translation_m)
-            self._rows[entry.child.lstrip("/")] = {entry.parent.lstrip("/"): [(0, pose)]}
+            row = 0, (*entry.translation_m, *entry.rotation_wxyz)
+            self._rows[entry.child.lstrip("/")] = {entry.parent.lstrip("/"): [row]}
 
     @property
     def frames(self) -> set[str]:
@@ -144,9 +151,10 @@ class FrameTree:
         built = self._edges.setdefault(child, {})
         if parent not in built:
             rows = self._rows[child][parent]
-            order = np.argsort(np.array([t for t, _ in rows], dtype=np.int64), kind="stable")
-            t_ns = np.array([rows[k][0] for k in order], dtype=np.int64)
-            built[parent] = Edge(parent, t_ns, np.array([rows[k][1] for k in order]))
+            t_ns, values = np.array([t for t, _ in rows], dtype=np.int64), np.array([v for _, v in rows])
+            order = np.argsort(t_ns, kind="stable")
+            poses = transform(rotation_from_quaternion(values[order, 3:]), values[order, :3])
+            built[parent] = Edge(parent, t_ns[order], poses)
         return built[parent]
 
 
@@ -162,9 +170,13 @@ def edge_at(edge: Edge, t_ns: NDArray[np.int64]) -> Array:
 
 def pose_of(translation: Any, rotation: Any) -> Array | None:
     """Pose (4, 4) of a position and a quaternion message; None where the quaternion is no rotation or a value not finite."""
-    q = np.array([rotation.w, rotation.x, rotation.y, rotation.z])
-    t = np.array([translation.x, translation.y, translation.z])
-    norm = float(np.linalg.norm(q))
-    if not (np.isfinite(t).all() and abs(norm - 1) < MAX_QUATERNION_ERROR):
+    if not is_pose(translation, rotation):
         return None
-    return transform(rotation_from_quaternion(q), t)
+    q = np.array([rotation.w, rotation.x, rotation.y, rotation.z])
+    return transform(rotation_from_quaternion(q), np.array([translation.x, translation.y, translation.z]))
+
+
+def is_pose(translation: Any, rotation: Any) -> bool:
+    """Whether the values are finite and the quaternion has a norm near 1."""
+    norm = math.hypot(rotation.w, rotation.x, rotation.y, rotation.z)
+    return math.isfinite(translation.x + translation.y + translation.z) and abs(norm - 1) < MAX_QUATERNION_ERROR

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import MapFrame
 from log2sim.errors import RecordError
-from log2sim.geometry import Array, PoseTrack, transform, whole_kilometers, wrap_angle, yaw_of
+from log2sim.geometry import NS_PER_S, Array, PoseTrack, transform, whole_kilometers, wrap_angle, yaw_of
 from log2sim.logs.ros.bag import Bag
 from log2sim.logs.ros.frames import FrameTree, pose_of
 from log2sim.logs.ros.messages import decode_bytes
@@ -25,6 +25,8 @@ from log2sim.logs.stamps import strictly_increasing
 
 MAP_FRAMES = ("map", "world", "earth", "utm")
 MIN_POSES = 2
+# A topic of single goals or starting points is no trajectory.
+MIN_COVERED_SHARE = 0.5
 # Where the vehicle moves, its course tells whether the heading of the IMU counts from the east.
 MIN_COURSE_STEP_M = 1.0
 MAX_COURSE_ERROR_DEG = 30.0
@@ -63,6 +65,8 @@ class PoseSources:
         The vehicle's frame.
     settings : PoseSettings
     map : MapSettings
+    span_ns : (int, int)
+        First and last stamp of the sensors.
     """
 
     bag: Bag
@@ -72,6 +76,7 @@ class PoseSources:
     base: str
     settings: PoseSettings
     map: MapSettings
+    span_ns: tuple[int, int]
 
     def find(self) -> tuple[FoundPoses | None, list[dict[str, Any]]]:
         """Find the poses of the first source that has some, and what was considered, as JSON."""
@@ -85,8 +90,7 @@ class PoseSources:
                 continue
             try:
                 poses = read(topic)
-                if len(poses.t_ns) < MIN_POSES:
-                    raise NoPoses(f"it gives {len(poses.t_ns)} poses")
+                self._check_coverage(poses.t_ns)
                 found = _near_origin(poses)
                 reason = f"{len(poses.t_ns)} poses, the first source of the order that has some"
                 reason = reason if self.settings.source == "auto" else f"{len(poses.t_ns)} poses, as the settings tell"
@@ -94,6 +98,13 @@ class PoseSources:
             except NoPoses as problem:
                 considered.append({"source": source, "topic": topic, "used": False, "reason": str(problem)})
         return found, considered
+
+    def _check_coverage(self, t_ns: NDArray[np.int64]) -> None:
+        begin, end = self.span_ns
+        covered_ns = max(0, min(end, int(t_ns[-1])) - max(begin, int(t_ns[0]))) if len(t_ns) else 0
+        if len(t_ns) < MIN_POSES or covered_ns < MIN_COVERED_SHARE * (end - begin):
+            seconds = f"{covered_ns / NS_PER_S:.1f} of {(end - begin) / NS_PER_S:.1f} s"
+            raise NoPoses(f"it gives {len(t_ns)} poses in {seconds} of the sensors")
 
     def _candidates(self) -> list[tuple[str, str, Callable[[str], FoundPoses]]]:
         wanted = self.settings
@@ -103,7 +114,13 @@ class PoseSources:
         else:
             mapped = [frame for frame in above if frame in MAP_FRAMES][-1:]
             others = [frame for frame in above[-1:] if frame not in MAP_FRAMES]
-        by_count = {kind: sorted(names, key=lambda n: -len(self.bag.topics[n])) for kind, names in self.topics.items()}
+        topics = self.bag.topics
+        # Poses in the map go before those in the frame of an odometry, then those that come more often.
+        by_count = {
+            kind: sorted(names, key=lambda n: (self.bag.frame_id(topics[n]) not in MAP_FRAMES, -len(topics[n])))
+            for kind, names in self.topics.items()
+            if kind in ("odometry", "pose", "gnss")
+        }
         ordered = [
             *(("tf", frame, self._from_tf) for frame in mapped),
             *(("odometry", name, self._from_odometry) for name in by_count.get("odometry", ())),

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from log2sim.datatypes import Lidar, Log, MapFrame, Stream, Sweep
+from log2sim.datatypes import Lidar, Log, MapFrame, Stream
 from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.geometry import Array, Camera, Mount, PoseTrack, inverse
 from log2sim.logs.ros import calibration, ego
 from log2sim.logs.ros.bag import NAME_BYTES, Bag, Topic
-from log2sim.logs.ros.clouds import DEFAULT_PERIOD_NS, sweep_from
 from log2sim.logs.ros.frames import FrameTree
-from log2sim.logs.ros.messages import decode, decode_bytes
-from log2sim.logs.ros.pictures import encoded_from, image_from, image_from_compressed
+from log2sim.logs.ros.messages import decode_bytes
 from log2sim.logs.ros.poses import FoundPoses, PoseSources
 from log2sim.logs.ros.recordings import SUFFIXES, find_recordings
-from log2sim.logs.ros.roles import COMPRESSED, FIXED_FRAMES, Roles, assign_roles
+from log2sim.logs.ros.roles import FIXED_FRAMES, Roles, assign_roles
 from log2sim.logs.ros.settings import CameraTopic, LidarTopic, TopicSettings, read_settings
 from log2sim.logs.ros.stamping import Stamped, note_other_clocks, stamp_messages
+from log2sim.logs.ros.streams import camera_stream, lidar_stream
 
 MAX_LISTED = 8
 
@@ -63,6 +60,8 @@ class _Opening:
         self.tree = FrameTree()
         for topic in self.roles.topics.get("tf", ()):
             self._add_transforms(bag.topics[topic])
+        if self.tree.refused:
+            self.notes.append(f"{self.tree.refused} transforms are not finite or no rotations; left out")
         self.tree.add_static(settings.static_transforms)
 
     def log(self) -> Log:
@@ -73,13 +72,14 @@ class _Opening:
             self.tree, [s.frame for s in sensors], self._pose_frames(), FIXED_FRAMES, self.settings.ego.base_frame
         )
         frame = ego.ego_frame(base, self.settings.ego, self.tree, {c.frame for c in self.roles.cameras.values()})
-        found, considered = self._poses(base)
         stamped = self._stamps()
+        span_ns = min(int(s.t_ns[0]) for s in stamped.values()), max(int(s.t_ns[-1]) for s in stamped.values())
+        found, considered = self._poses(base, span_ns)
         mounts = self._mounts(frame, found)
         cameras = self._cameras(mounts)
         lidars = {n: Lidar(n, *mounts[n]) for n in self.roles.lidars if n in mounts}
-        streams = {n: self._camera_stream(cameras[n], stamped[n]) for n in cameras}
-        streams |= {n: self._lidar_stream(n, stamped[n]) for n in lidars}
+        streams = {n: camera_stream(self.bag, self.roles.cameras[n], stamped[n], c) for n, c in cameras.items()}
+        streams |= {n: lidar_stream(self.bag, n, self.roles.lidars[n], stamped[n]) for n in lidars}
         if not streams:
             raise LogError(f"{self.name}: none of its sensors can be used: {'; '.join(self.notes)}")
         track = None if found is None else PoseTrack(found.t_ns, found.map_T_base @ frame.base_T_ego)
@@ -142,11 +142,13 @@ class _Opening:
                 frames.append(decode_bytes(topic, raw, name).child_frame_id.lstrip("/"))
         return [frame for frame in frames if frame]
 
-    def _poses(self, base: str | None) -> tuple[FoundPoses | None, list[dict[str, Any]]]:
+    def _poses(self, base: str | None, span_ns: tuple[int, int]) -> tuple[FoundPoses | None, list[dict[str, Any]]]:
         wanted = self.settings.poses
         if base is None or wanted.source == "none":
             return None, []
-        sources = PoseSources(self.bag, self.roles.topics, self.messages, self.tree, base, wanted, self.settings.map)
+        sources = PoseSources(
+            self.bag, self.roles.topics, self.messages, self.tree, base, wanted, self.settings.map, span_ns
+        )
         found, considered = sources.find()
         if found is None and (wanted.source != "auto" or wanted.topic):
             reasons = "; ".join(f"{c['topic']}: {c['reason']}" for c in considered) or "the recording has no such topic"
@@ -242,18 +244,6 @@ class _Opening:
             raise calibration.CalibrationProblem(f"no message of {chosen.info} can be read")
         return info
 
-    def _camera_stream(self, camera: Camera, stamped: Stamped) -> Stream:
-        topic = self.bag.topics[self.roles.cameras[camera.name].topic]
-        compressed = topic.msgtype == COMPRESSED
-        size = camera.width_px, camera.height_px
-        read = partial(_read_image, self.bag, topic, stamped.row, size, compressed)
-        encoded = partial(_read_encoded, self.bag, topic, stamped.row) if compressed else None
-        return Stream(camera.name, stamped.t_ns, read, encoded)
-
-    def _lidar_stream(self, name: str, stamped: Stamped) -> Stream:
-        settings = self.roles.lidars[name]
-        return Stream(name, stamped.t_ns, partial(_read_sweep, self.bag, settings, stamped))
-
     def _ground_m(self, frame: ego.EgoFrame, lidars: dict[str, Lidar], streams: dict[str, Stream]) -> float:
         if frame.ground_z_m is not None:
             return frame.ground_z_m
@@ -285,20 +275,3 @@ class _Opening:
         topics = [f"{t.name} ({t.msgtype}, {len(t)})" for t in self.bag.topics.values()]
         more = f" and {len(topics) - MAX_LISTED} more" if len(topics) > MAX_LISTED else ""
         return f"its topics are {', '.join(topics[:MAX_LISTED])}{more}" if topics else "it has no topics"
-
-
-def _read_image(
-    bag: Bag, topic: Topic, row: NDArray[np.intp], size_px: tuple[int, int], compressed: bool, i: int
-) -> NDArray[np.uint8]:
-    message, where = decode(bag, topic, int(row[i])), bag.where(topic, int(row[i]))
-    return (image_from_compressed if compressed else image_from)(message, where, size_px)
-
-
-def _read_encoded(bag: Bag, topic: Topic, row: NDArray[np.intp], i: int) -> bytes:
-    return encoded_from(decode(bag, topic, int(row[i])), bag.where(topic, int(row[i])))
-
-
-def _read_sweep(bag: Bag, settings: LidarTopic, stamped: Stamped, i: int) -> Sweep:
-    topic, row = bag.topics[settings.topic], int(stamped.row[i])
-    period_ns = float(np.median(np.diff(stamped.t_ns))) if len(stamped.t_ns) > 1 else DEFAULT_PERIOD_NS
-    return sweep_from(decode(bag, topic, row), int(stamped.t_ns[i]), period_ns, settings, bag.where(topic, row))

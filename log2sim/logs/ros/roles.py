@@ -172,10 +172,7 @@ def _drop_unlisted(topics: Iterable[Topic], listed: set[str], kind: str, roles: 
 def _one_per_camera(topics: list[Topic], roles: Roles) -> list[Topic]:
     """Of the images of one camera (raw, rectified, in color, compressed) the best."""
     groups: dict[str, list[Topic]] = {}
-    for topic in topics:
-        if _DERIVED_IMAGE.search(topic.name.lower()):
-            roles.reasons[topic.name] = ("unused", "by its name no picture of a camera")
-            continue
+    for topic in _not_derived(topics, _DERIVED_IMAGE, "by its name no picture of a camera", roles):
         base = _image_base(topic.name)
         parent, _, last = base.rpartition("/")
         groups.setdefault(parent if last.startswith("image") and parent else base, []).append(topic)
@@ -185,15 +182,22 @@ def _one_per_camera(topics: list[Topic], roles: Roles) -> list[Topic]:
 def _one_per_frame(bag: Bag, topics: list[Topic], roles: Roles) -> list[Topic]:
     """Of the clouds in one frame the one that comes from the sensor."""
     groups: dict[str, list[Topic]] = {}
-    for topic in topics:
+    for topic in _not_derived(topics, _DERIVED_CLOUD, "by its name no cloud of a sensor", roles):
         frame = bag.frame_id(topic)
-        if _DERIVED_CLOUD.search(topic.name.lower()):
-            roles.reasons[topic.name] = ("unused", "by its name no cloud of a sensor")
-        elif frame in FIXED_FRAMES:
+        if frame in FIXED_FRAMES:
             roles.reasons[topic.name] = ("unused", f"its points are in the fixed frame '{frame}', not in a sensor's")
         else:
             groups.setdefault(frame, []).append(topic)
     return _best_of(groups, lambda t: (-len(t), len(t.name), t.name), "cloud of the same frame", roles)
+
+
+def _not_derived(topics: list[Topic], words: re.Pattern[str], why: str, roles: Roles) -> list[Topic]:
+    """Leave out topics whose names tell that they are computed from others; none where all names do."""
+    kept = [topic for topic in topics if not words.search(topic.name.lower())]
+    for topic in topics if kept else ():
+        if topic not in kept:
+            roles.reasons[topic.name] = ("unused", why)
+    return kept or topics
 
 
 def _best_of(groups: Mapping[str, list[Topic]], rank: Callable[[Topic], Any], what: str, roles: Roles) -> list[Topic]:

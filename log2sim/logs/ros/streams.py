@@ -1,0 +1,46 @@
+"""Streams of images and clouds; their messages are decoded when they are read."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Stream, Sweep
+from log2sim.geometry import Camera
+from log2sim.logs.ros.bag import Bag
+from log2sim.logs.ros.clouds import DEFAULT_PERIOD_NS, sweep_from
+from log2sim.logs.ros.messages import decode
+from log2sim.logs.ros.pictures import encoded_from, image_from, image_from_compressed
+from log2sim.logs.ros.roles import COMPRESSED
+from log2sim.logs.ros.settings import CameraTopic, LidarTopic
+from log2sim.logs.ros.stamping import Stamped
+
+
+def camera_stream(bag: Bag, chosen: CameraTopic, stamped: Stamped, camera: Camera) -> Stream:
+    """Stream of the images of a camera; of compressed ones also as files."""
+    topic, size_px = bag.topics[chosen.topic], (camera.width_px, camera.height_px)
+    compressed = topic.msgtype == COMPRESSED
+
+    def read(i: int) -> NDArray[np.uint8]:
+        row = int(stamped.row[i])
+        convert = image_from_compressed if compressed else image_from
+        return convert(decode(bag, topic, row), bag.where(topic, row), size_px)
+
+    def encoded(i: int) -> bytes:
+        row = int(stamped.row[i])
+        return encoded_from(decode(bag, topic, row), bag.where(topic, row))
+
+    return Stream(camera.name, stamped.t_ns, read, encoded if compressed else None)
+
+
+def lidar_stream(bag: Bag, name: str, chosen: LidarTopic, stamped: Stamped) -> Stream:
+    """Stream of the sweeps of a LiDAR."""
+    topic = bag.topics[chosen.topic]
+    period_ns = float(np.median(np.diff(stamped.t_ns))) if len(stamped.t_ns) > 1 else DEFAULT_PERIOD_NS
+
+    def read(i: int) -> Sweep:
+        row = int(stamped.row[i])
+        message, where = decode(bag, topic, row), bag.where(topic, row)
+        return sweep_from(message, int(stamped.t_ns[i]), period_ns, chosen, where)
+
+    return Stream(name, stamped.t_ns, read)

@@ -1,0 +1,466 @@
+"""What can be wrong with a bag: damage, missing parts, topics that say too little, settings that say something else."""
+
+from __future__ import annotations
+
+import bz2
+import re
+import struct
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import SHARED
+from log_encoders import ros
+from log_encoders.ros import Maker, Message, Style
+from log_encoders.world import world_log
+from typer.testing import CliRunner
+
+from log2sim import open_log
+from log2sim.cli import app
+from log2sim.datatypes import Log, Stream
+from log2sim.errors import ConfigError, LogError, MissingExtra, RecordError
+from log2sim.geometry import NS_PER_S, transform
+from log2sim.logs.ros import messages as ros_messages
+from log2sim.logs.ros.chunked import decompress
+from log2sim.logs.ros.messages import definition_fields
+from log2sim.logs.ros.recordings import find_recordings
+
+CONTAINERS = ("bag", "db3", "mcap")
+
+
+def bag_of(folder: Path, style: Style, keep: Callable[[Message], Message | None] = lambda m: m) -> Path:
+    """The world's messages, each as `keep` returns it, as a bag."""
+    kept = (keep(message) for message in Maker(world_log(), style))
+    return ros.write([m for m in kept if m is not None], folder, "world", style)  # type: ignore[arg-type]
+
+
+def without(*topics: str) -> Callable[[Message], Message | None]:
+    return lambda m: None if m[2] in topics else m
+
+
+def renamed(names: dict[str, str]) -> Callable[[Message], Message]:
+    return lambda m: (m[0], m[1], names.get(m[2], m[2]), *m[3:])
+
+
+def with_settings(path: Path, text: str) -> Path:
+    path.with_name(f"{path.stem}.topics.toml").write_text(text)
+    return path
+
+
+def readable(stream: Stream) -> list[bool]:
+    found = []
+    for i in range(len(stream.t_ns)):
+        try:
+            stream.read(i)
+            found.append(True)
+        except RecordError as error:
+            # The problem of a record is one line.
+            found.append("\n" in str(error))
+    return found
+
+
+def table(log: Log) -> dict[str, tuple[str, str]]:
+    return {t["topic"]: (t["role"], t["reason"]) for t in log.details["topics"]}
+
+
+def file_of(path: Path) -> Path:
+    return path if path.is_file() else next(path.glob("*.db3"))
+
+
+@pytest.mark.parametrize("style", [Style("bag", "bz2"), Style("mcap", "storage")], ids=["bag", "mcap"])
+def test_a_damaged_chunk_costs_its_records_only(style: Style, tmp_path: Path) -> None:
+    path = bag_of(tmp_path, style)
+    whole = open_log(path)
+    data = bytearray(path.read_bytes())
+    magic = b"BZh9" if style.container == "bag" else b"\x28\xb5\x2f\xfd"
+    starts = [match.start() for match in re.finditer(re.escape(magic), data)]
+    assert len(starts) > 1
+    data[starts[-1] + 40 : starts[-1] + 60] = bytes(20)
+    path.write_bytes(data)
+    log = open_log(path)
+    lost = 0
+    for name, stream in log.streams.items():
+        assert len(stream.t_ns) == len(whole.streams[name].t_ns)
+        good = np.array(readable(stream))
+        lost += int((~good).sum())
+        np.testing.assert_array_equal(stream.t_ns[good], whole.streams[name].t_ns[good])
+        # What is lost stands where it was, but for what the recorder's delay varies.
+        assert np.abs(stream.t_ns - whole.streams[name].t_ns).max() < 0.02 * NS_PER_S
+    assert 0 < lost < sum(len(s.t_ns) for s in log.streams.values()) - 4
+    assert any("messages are damaged, first at stamp" in note for note in log.notes)
+
+
+@pytest.mark.parametrize("compression", ["", "lz4"])
+def test_a_bag_that_was_not_closed_is_read_whole(compression: str, tmp_path: Path) -> None:
+    path = bag_of(tmp_path, Style("bag", compression))
+    whole = open_log(path)
+    data = bytearray(path.read_bytes())
+    place = data.index(b"index_pos=") + len(b"index_pos=")
+    data[place : place + 8] = bytes(8)
+    path.write_bytes(data)
+    log = open_log(path)
+    assert {n: s.t_ns.tolist() for n, s in log.streams.items()} == {
+        n: s.t_ns.tolist() for n, s in whole.streams.items()
+    }
+    assert any("its index is missing or damaged (the recording was not closed)" in note for note in log.notes)
+
+
+@pytest.mark.parametrize("container", ["bag", "mcap"])
+def test_a_truncated_file_keeps_what_is_before_the_cut(container: str, tmp_path: Path) -> None:
+    path = bag_of(tmp_path, Style(container))
+    whole = open_log(path)
+    file = file_of(path)
+    file.write_bytes(file.read_bytes()[: int(0.6 * file.stat().st_size)])
+    log = open_log(path)
+    count = sum(sum(readable(stream)) for stream in log.streams.values())
+    assert 0 < count < sum(len(s.t_ns) for s in whole.streams.values())
+    assert log.notes
+
+
+def test_a_database_with_damaged_pages_loses_what_is_on_them(tmp_path: Path) -> None:
+    path = bag_of(tmp_path, Style("db3"))
+    whole, file = open_log(path), file_of(path)
+    data = bytearray(file.read_bytes())
+    middle = len(data) // 2 // 4096 * 4096
+    data[middle : middle + 40 * 4096] = b"\xff" * 40 * 4096
+    file.write_bytes(data)
+    log = open_log(path)
+    count = sum(sum(readable(stream)) for stream in log.streams.values())
+    assert 0 < count < sum(len(s.t_ns) for s in whole.streams.values())
+    # SQLite refuses a file that is shorter than it says.
+    file.write_bytes(data[:middle])
+    with pytest.raises(LogError, match="not a readable rosbag2 database: database disk image is malformed"):
+        open_log(path)
+
+
+def test_a_wrong_crc_is_an_error_of_the_records_of_that_chunk(tmp_path: Path) -> None:
+    path = bag_of(tmp_path, Style("mcap"))
+    data = bytearray(path.read_bytes())
+    # The last chunk: opcode 6, length, two stamps, size, CRC. The static transforms are in the first.
+    place, chunks = 8, []
+    while data[place] != 15:
+        chunks += [place] * (data[place] == 6)
+        place += 9 + struct.unpack_from("<Q", data, place + 1)[0]
+    data[chunks[-1] + 9 + 24 : chunks[-1] + 9 + 28] = b"\1\2\3\4"
+    path.write_bytes(data)
+    log = open_log(path)
+    assert [all(readable(stream)) for stream in log.streams.values()] == [False, False]
+    with pytest.raises(RecordError, match="the CRC of the chunk at byte"):
+        log.streams["front"].read(9)
+    assert len(log.streams["front"].read(0))
+
+
+def test_data_that_unpack_to_more_than_they_say_are_refused() -> None:
+    bomb = bz2.compress(bytes(16 << 20))
+    assert len(bomb) < 200
+    with pytest.raises(ValueError, match="unpacks to more than 1000 bytes, expected 1000"):
+        decompress(bomb, "bz2", 1000)
+    with pytest.raises(ValueError, match="unpacks to 1000 bytes, expected 1125899906842624"):
+        decompress(bz2.compress(bytes(1000)), "bz2", 1 << 50)
+    with pytest.raises(ValueError, match="damaged zstd data"):
+        decompress(b"no zstd at all", "zstd", 100)
+    with pytest.raises(ValueError, match="unknown compression 'rar'"):
+        decompress(b"", "rar", 100)
+
+
+def test_files_that_are_no_bags_are_refused_in_one_line(tmp_path: Path) -> None:
+    import sqlite3
+
+    for name, data, message in [
+        ("a.bag", b"", "is empty"), ("b.bag", b"#ROSBAG V1.2\n", "expected a ROS 1 bag of that version"),
+        ("c.mcap", b"words", "neither a ROS 1 bag nor MCAP"), ("d.db3", b"SQLite format 3\0" + bytes(90), "not a readable rosbag2 database"),
+    ]:  # fmt: skip
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(LogError, match=message):
+            open_log(tmp_path / name)
+    for number, statement in enumerate(
+        ("CREATE TABLE topics(id)", "CREATE VIEW messages AS SELECT 1 AS id, 1 AS topic_id")
+    ):
+        path = tmp_path / f"e{number}.db3"
+        with sqlite3.connect(path) as database:
+            database.execute(statement)
+        database.close()
+        with pytest.raises(LogError, match=r"no table '(topics|messages)' in it"):
+            open_log(path)
+
+
+def test_a_missing_part_of_a_split_bag_is_a_gap(tmp_path: Path) -> None:
+    """Three parts, the middle one missing; the static transforms are in the first part alone."""
+    messages = sorted(Maker(world_log(), Style("bag")), key=lambda m: m[1])
+    third = len(messages) // 3
+    for k in range(3):
+        part = messages[k * third : (k + 1) * third if k < 2 else None]
+        ros.write(iter(part), tmp_path, f"drive_2024-05-01-10-0{k}-00_{k}", Style("bag"))
+    whole = open_log(tmp_path)
+    assert whole.name == "drive"
+    assert [len(s.t_ns) for s in whole.streams.values()] == [len(s.t_ns) for s in world_log().streams.values()]
+    next(tmp_path.glob("*_1.bag")).unlink()
+    log = open_log(tmp_path)
+    assert set(log.streams) == set(whole.streams)
+    assert any("1 of 3 files of the recording are missing, first part 1" in note for note in log.notes)
+
+
+def test_a_missing_file_of_a_rosbag2_folder_is_named(tmp_path: Path) -> None:
+    path = bag_of(tmp_path, Style("db3"))
+    metadata = path / "metadata.yaml"
+    name = file_of(path).name
+    metadata.write_text(metadata.read_text().replace(f"- {name}", f"- {name}\n  - /etc/world_1.db3"))
+    log = open_log(path)
+    assert any("1 of 2 files of the recording are missing: world_1.db3" in note for note in log.notes)
+    metadata.write_text(metadata.read_text().replace(f"- {name}", "- gone.db3"))
+    with pytest.raises(LogError, match=r"none of the files that it names is there: gone\.db3"):
+        open_log(path)
+    metadata.write_text("rosbag2_bagfile_information: [1, 2")
+    with pytest.raises(LogError, match="not the metadata of a rosbag2 recording"):
+        open_log(path)
+
+
+def test_several_bags_of_a_folder_are_several_sequences(tmp_path: Path) -> None:
+    for name in ("run_1.bag", "run_2.bag", "other.mcap", "part_0.db3", "part_1.db3"):
+        (tmp_path / name).write_bytes(b"x")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "metadata.yaml").write_text("")
+    (tmp_path / "folder" / "folder_0.db3").write_bytes(b"x")
+    found = find_recordings(tmp_path)
+    assert set(found) == {"run_1", "run_2", "other", "part", "folder"}
+    assert [p.name for p in found["part"].files] == ["part_0.db3", "part_1.db3"]
+    assert find_recordings(tmp_path / "nothing") == {}
+
+
+def test_topics_have_roles_with_reasons(tmp_path: Path) -> None:
+    path = bag_of(tmp_path, Style("mcap"), renamed({"/top/points": "/sensing/top/points_raw"}))
+    roles = table(open_log(path))
+    assert roles["/front/image_raw/compressed"] == ("camera front", "by its type, calibrated by /front/camera_info")
+    assert roles["/front/camera_info"][0] == "calibration of front"
+    assert roles["/sensing/top/points_raw"] == ("lidar top", "by its type, in the frame 'top'")
+    assert roles["/tf"][0] == roles["/tf_static"][0] == "tf"
+
+
+def several_images(log: Log) -> Iterator[Message]:
+    """A camera that is also recorded raw, a depth image, a second cloud of the same frame, a map of points."""
+    for message in Maker(log, Style("bag", raw="rgb8")):
+        yield message
+        t_ns, recorded, topic, kind, content = message
+        if kind.endswith("/Image"):
+            yield t_ns, recorded, "/front/depth/image_rect", kind, content
+        if kind.endswith("PointCloud2"):
+            yield t_ns, recorded, "/top/filtered_points", kind, content
+            yield t_ns, recorded, "/top/points_also", kind, content
+            shifted = replace(content, header=replace(content.header, frame_id="map"))
+            yield t_ns, recorded, "/whole_world", kind, shifted
+    for t_ns, recorded, topic, kind, content in Maker(log, Style("bag")):
+        if "compressed" in topic:
+            yield t_ns, recorded, topic, kind, content
+
+
+def test_of_several_topics_of_one_sensor_the_best_is_taken(tmp_path: Path) -> None:
+    path = ros.write(several_images(world_log()), tmp_path, "world", Style("bag"))
+    log = open_log(path)
+    assert set(log.streams) == {"front", "top"}
+    roles = table(log)
+    assert roles["/front/image_raw/compressed"] == ("unused", "image of the same camera as /front/image_raw")
+    assert roles["/front/depth/image_rect"] == ("unused", "by its name no picture of a camera")
+    assert roles["/top/points_also"] == ("unused", "cloud of the same frame as /top/points")
+    assert roles["/top/filtered_points"] == ("unused", "by its name no cloud of a sensor")
+    assert "fixed frame 'map'" in roles["/whole_world"][1]
+
+
+def test_a_camera_without_calibration_is_left_out_and_says_how_to_give_it(tmp_path: Path) -> None:
+    path = bag_of(tmp_path, Style("bag"), without("/front/camera_info"))
+    log = open_log(path)
+    assert set(log.streams) == {"top"}
+    note = next(note for note in log.notes if "no CameraInfo belongs to it" in note)
+    assert "cameras.front.intrinsics in the settings" in note
+    K = world_log().cameras["front"].K
+    given = (
+        f"width_px = 480, height_px = 300, fx_px = {K[0, 0]}, fy_px = {K[1, 1]}, cx_px = {K[0, 2]}, cy_px = {K[1, 2]}"
+    )
+    settings = f'[cameras.eye]\ntopic = "/front/image_raw/compressed"\nintrinsics = {{ {given} }}\n'
+    named = open_log(with_settings(path, settings))
+    assert set(named.streams) == {"eye", "top"}
+    np.testing.assert_array_equal(named.cameras["eye"].K, K)
+    np.testing.assert_array_equal(named.streams["eye"].read(0), world_log().streams["front"].read(0))
+
+
+def test_a_sensor_without_a_transform_is_left_out_and_says_how_to_give_it(tmp_path: Path) -> None:
+    def lacks_top(message: Message) -> Message:
+        if message[2] == "/tf_static":
+            message[4].transforms = [t for t in message[4].transforms if t.child_frame_id != "top"]
+        return message
+
+    path = bag_of(tmp_path, Style("mcap"), lacks_top)
+    log = open_log(path)
+    assert set(log.streams) == {"front"}
+    note = next(note for note in log.notes if "no fixed transform" in note)
+    assert "its frame 'top' to 'base_link'; give one as [[static_transforms]]" in note
+    x, y, z = world_log().lidars["top"].mount_T_lidar[:3, 3].tolist()
+    settings = f'[[static_transforms]]\nparent = "base_link"\nchild = "top"\ntranslation_m = [{x}, {y}, {z}]\n'
+    again = open_log(with_settings(path, settings))
+    np.testing.assert_allclose(again.lidars["top"].mount_T_lidar, world_log().lidars["top"].mount_T_lidar, atol=1e-12)
+
+
+def test_a_bag_of_one_lidar_alone_has_its_frame_and_the_road_below_it(tmp_path: Path) -> None:
+    path = bag_of(tmp_path, Style("bag"), lambda m: m if m[2] == "/top/points" else None)
+    log = open_log(path)
+    assert log.ego is None
+    np.testing.assert_array_equal(log.lidars["top"].mount_T_lidar, np.eye(4))
+    height = world_log().lidars["top"].mount_T_lidar[2, 3]
+    assert log.ground_z_ego_m == pytest.approx(-height, abs=0.05)
+    assert any(note.startswith("no poses of 'top' in the recording") for note in log.notes)
+    assert any("measured in the first sweep" in note for note in log.notes)
+
+
+def test_sensors_that_stand_still_are_mounted_in_the_map(tmp_path: Path) -> None:
+    def at_the_roadside(message: Message) -> Message | None:
+        for link in message[4].transforms if message[2] == "/tf_static" else ():
+            link.header = replace(link.header, frame_id="world")
+        return None if message[2] == "/tf" else message
+
+    log = open_log(bag_of(tmp_path, Style("bag"), at_the_roadside))
+    assert log.ego is None
+    assert log.cameras["front"].mount == log.lidars["top"].mount == "map"
+    np.testing.assert_allclose(log.lidars["top"].mount_T_lidar, world_log().lidars["top"].mount_T_lidar, atol=1e-12)
+
+
+def test_an_unknown_layout_of_a_known_type_is_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = bag_of(tmp_path, Style("bag"))
+    data = path.read_bytes()
+    old, new = b"uint32 point_step", b"uint32 point_dist"
+    assert old in data
+    path.write_bytes(data.replace(old, new))
+    log = open_log(path)
+    assert set(log.streams) == {"front"}
+    note = next(note for note in log.notes if note.startswith("/top/points: not used"))
+    assert "has the fields header, height, width, fields, is_bigendian, point_dist" in note
+
+
+def test_fields_of_a_definition_are_found() -> None:
+    text = (
+        "# words\nint8 GREEN=1\nstring NAME = x\nstd_msgs/Header header\nfloat64[36] c # row\nint32[<=4] d\n"
+        + "=" * 80
+        + "\nMSG: a\nint8 e"
+    )
+    assert definition_fields(text) == ["header", "c", "d"]
+
+
+def test_header_stamps_that_are_zero_or_of_another_clock_are_noted(tmp_path: Path) -> None:
+    def spoiled(message: Message) -> Message:
+        header = getattr(message[4], "header", None)
+        if message[2].startswith("/front/image"):
+            header.stamp = replace(header.stamp, sec=0, nanosec=0)
+        if message[2] == "/top/points":
+            header.stamp = replace(header.stamp, sec=header.stamp.sec - 1000)
+        return message
+
+    path = bag_of(tmp_path, Style("mcap", poses="odometry"), spoiled)
+    log = open_log(path)
+    assert any("/front/image_raw/compressed: its header stamps are all 0" in note for note in log.notes)
+    assert any("/top/points: its header stamps are" in note and "not synchronized" in note for note in log.notes)
+    np.testing.assert_array_equal(log.streams["front"].t_ns, world_log().streams["front"].t_ns + ros.IMAGE_DELAY_NS)
+    settings = '[lidars.top]\ntopic = "/top/points"\nstamps = "recorded"\n'
+    told = open_log(with_settings(path, settings))
+    np.testing.assert_array_equal(told.streams["top"].t_ns, world_log().streams["top"].t_ns + ros.OTHER_DELAY_NS)
+
+
+def test_an_imu_whose_heading_is_not_the_course_is_noted(tmp_path: Path) -> None:
+    def turned(message: Message) -> Message:
+        if message[2] == "/gnss/imu":
+            q = message[4].orientation
+            q.w, q.x, q.y, q.z = (0.7071067811865476 * v for v in (q.w - q.z, q.x - q.y, q.y + q.x, q.z + q.w))
+        return message
+
+    placed = replace(
+        world_log().map, latitude_deg=48.0, longitude_deg=11.0, altitude_m=0.0, projection="+proj=utm +zone=32"
+    )
+    world = replace(world_log(), map=placed)
+    style = Style("bag", poses="gnss", ego_T_base=transform(np.eye(3), [0.3, 0.0, 0.9]))
+    for turn, expected in ((lambda m: m, False), (turned, True)):
+        folder = tmp_path / str(expected)
+        path = ros.write((turn(m) for m in Maker(world, style)), folder, "world", style)
+        log = open_log(path)
+        assert any("degrees off the direction of travel" in note for note in log.notes) == expected
+
+
+WRONG_SETTINGS = {
+    '[cameras.front]\ntopic = "/front/image"': "'cameras.front.topic' is '/front/image', but .*did you mean '/front/image_raw/compressed'",
+    '[lidars.top]\ntopic = "/front/camera_info"': "holds sensor_msgs/msg/CameraInfo, expected sensor_msgs/msg/PointCloud2",
+    '[lidars.top]\ntopik = "/top/points"': "unknown key 'lidars.top.topik'; did you mean 'lidars.top.topic'",
+    '[lidars.top]\ntopic = "/top/points"\ntime_unit = "minutes"': "'lidars.top.time_unit' is 'minutes', expected one of",
+    '[poses]\nsource = "gnss"': "asks for source 'gnss', which gives none",
+    "[ego]\norigin_m = [1.0, 2.0]": "'ego.origin_m' has 2 values",
+    'reference_camera = "rear"': "'reference_camera' is 'rear'; there are: front",
+    "[ego\n": "not valid TOML",
+    '[[static_transforms]]\nparent = "a"\nchild = "b"\nrotation_wxyz = [1.0, 1.0, 0.0, 0.0]': "has norm 1.41421",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return bag_of(tmp_path_factory.mktemp("plain"), Style("bag"))
+
+
+@pytest.mark.parametrize("text", WRONG_SETTINGS)
+def test_wrong_settings_are_named(text: str, plain: Path) -> None:
+    with pytest.raises(ConfigError, match=WRONG_SETTINGS[text]) as caught:
+        open_log(with_settings(plain, text))
+    assert "\n" not in str(caught.value)
+    assert "world.topics.toml" in str(caught.value)
+    plain.with_name("world.topics.toml").unlink()
+
+
+def test_the_source_of_the_poses_is_chosen_in_order_and_can_be_told(tmp_path: Path) -> None:
+    kinds = ("tf", "odometry", "pose")
+    messages = [m for kind in kinds for m in Maker(world_log(), Style("bag", poses=kind)) if kind == "tf" or "/" + kind in m[2] or "pose" in m[2]]  # fmt: skip
+    path = ros.write(iter(messages), tmp_path, "world", Style("bag"))
+    log = open_log(path)
+    assert [(c["source"], c["used"]) for c in log.details["poses"]] == [
+        ("tf", True),
+        ("odometry", False),
+        ("pose", False),
+    ]
+    told = open_log(with_settings(path, '[poses]\nsource = "pose"\n'))
+    assert [(c["source"], c["topic"]) for c in told.details["poses"]] == [("pose", "/localization/pose")]
+    nothing = open_log(with_settings(path, '[poses]\nsource = "none"\n'))
+    assert nothing.ego is None
+
+
+def test_a_bag_without_sensors_says_what_it_has(tmp_path: Path) -> None:
+    path = bag_of(tmp_path, Style("bag"), lambda m: m if m[2] == "/tf" else None)
+    with pytest.raises(
+        LogError, match=r"no images .* and no point clouds in it; its topics are /tf \(tf2_msgs/msg/TFMessage"
+    ):
+        open_log(path)
+
+
+@pytest.mark.parametrize("module", ["rosbags.typesys", "lz4.frame", "ruamel.yaml"])
+def test_a_missing_library_names_the_extra(module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = bag_of(tmp_path, Style("db3") if module == "ruamel.yaml" else Style("bag", "lz4"))
+    ros_messages.typestore.cache_clear()
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(MissingExtra, match="needs the extra 'ros'"):
+        open_log(path)
+    ros_messages.typestore.cache_clear()
+
+
+def test_inspect_and_validate_take_the_file_of_a_bag(plain: Path) -> None:
+    shown = CliRunner().invoke(app, ["inspect", str(plain)])
+    assert shown.exit_code == 0
+    assert '"role": "lidar top"' in shown.output
+    assert CliRunner().invoke(app, ["validate", str(plain)]).exit_code == 0
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(("name", "topic"), [
+    ("example-lz4.bag", r"/turtle2/color_sensor \(turtlesim/msg/Color, 1344\)"), ("example-bz2.bag", r"/tf \(tf/msg/tfMessage, 2688\)"),
+    ("ego_db3", r"/localization/kinematic_state \(nav_msgs/msg/Odometry, 2130\)"),
+])  # fmt: skip
+def test_recorded_bags_without_sensors_list_their_topics(name: str, topic: str, tmp_path: Path) -> None:
+    source = SHARED / "data" / "ros" / name
+    if not source.exists():
+        pytest.skip("recorded bags are not beside this checkout (../shared/data/ros)")
+    with pytest.raises(LogError, match=topic) as caught:
+        open_log(source)
+    assert "\n" not in str(caught.value)
