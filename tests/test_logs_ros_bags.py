@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -464,3 +465,44 @@ def test_recorded_bags_without_sensors_list_their_topics(name: str, topic: str, 
     with pytest.raises(LogError, match=topic) as caught:
         open_log(source)
     assert "\n" not in str(caught.value)
+
+
+def write_mcap(path: Path, ros1: bool, **options: Any) -> Path:
+    """The world by the writer of the format's authors, its messages in the encoding of ROS 1 or 2."""
+    from mcap.writer import Writer
+
+    store, style = ros.typestore(ros1), Style("bag" if ros1 else "mcap")
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=200_000, **options)
+        writer.start(profile="ros1" if ros1 else "ros2")
+        channels: dict[str, int] = {}
+        for t_ns, recorded, topic, kind, message in sorted(Maker(world_log(), style), key=lambda m: m[1]):
+            if topic not in channels:
+                definition, _ = store.generate_msgdef(kind, ros_version=1 if ros1 else 2)
+                name = kind.replace("/msg/", "/") if ros1 else kind
+                schema = writer.register_schema(name, "ros1msg" if ros1 else "ros2msg", definition.encode())
+                channels[topic] = writer.register_channel(topic, "ros1" if ros1 else "cdr", schema)
+            data = bytes(store.serialize_ros1(message, kind) if ros1 else store.serialize_cdr(message, kind))
+            writer.add_message(channels[topic], recorded, data, t_ns)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("options", ["chunks", "lz4", "no chunks", "no index", "no summary"])
+@pytest.mark.parametrize("ros1", [True, False], ids=["ros1", "ros2"])
+def test_mcap_files_of_its_own_writer_are_read(ros1: bool, options: str, tmp_path: Path) -> None:
+    from mcap.writer import CompressionType, IndexType
+
+    plain = {"compression": CompressionType.NONE}
+    chosen: dict[str, Any] = {
+        "chunks": plain, "lz4": {"compression": CompressionType.LZ4}, "no chunks": {"use_chunking": False},
+        "no index": plain | {"index_types": IndexType.NONE},
+        "no summary": plain | {"index_types": IndexType.NONE, "use_statistics": False, "repeat_channels": False,
+                       "repeat_schemas": False, "use_summary_offsets": False},
+    }[options]  # fmt: skip
+    log = open_log(write_mcap(tmp_path / "world.mcap", ros1, **chosen))
+    for name, stream in world_log().streams.items():
+        np.testing.assert_array_equal(log.streams[name].t_ns, stream.t_ns)
+    np.testing.assert_array_equal(log.streams["top"].read(5).xyz_m, world_log().streams["top"].read(5).xyz_m)
+    np.testing.assert_array_equal(log.streams["front"].read(5), world_log().streams["front"].read(5))
+    assert not any("damaged" in note or "missing" in note for note in log.notes)

@@ -13,7 +13,7 @@ from log2sim.logs.ros.containers import Channel, EntryList, checked_size, normal
 from log2sim.logs.sweeps import PARSER_ERRORS
 
 MAGIC = b"\x89MCAP0\r\n"
-FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, DATA_END = 2, 3, 4, 5, 6, 7, 8, 15
+FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, STATISTICS, DATA_END = 2, 3, 4, 5, 6, 7, 8, 11, 15
 RECORD_HEAD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 CHUNK_HEAD = struct.Struct("<QQQI")
@@ -68,7 +68,7 @@ class Mcap(ChunkedFile):
         (position,) = struct.unpack_from("<Q", footer, RECORD_HEAD.size)
         if not position:
             return False
-        chunks = []
+        chunks, expected = [], None
         while position < self.size - FOOTER_BYTES:
             op, size = RECORD_HEAD.unpack(self.at(position, RECORD_HEAD.size))
             if op in (SCHEMA, CHANNEL, CHUNK_INDEX):
@@ -77,12 +77,15 @@ class Mcap(ChunkedFile):
                     chunks.append(data)
                 else:
                     self._declare(op, data)
+            elif op == STATISTICS:
+                (expected,) = struct.unpack("<Q", self.at(position + RECORD_HEAD.size, 8))
             position += RECORD_HEAD.size + size
         if not chunks or not self.channels:
             return False
         for data in chunks:
             self._index_chunk(data)
-        return True
+        # Messages may also lie between the chunks, where no index leads.
+        return expected in (None, self._list.count) or bool(self.notes)
 
     def _small(self, position: int, size: int) -> bytes:
         if size > MAX_RECORD_BYTES:

@@ -12,6 +12,7 @@ from functools import cache
 from typing import Any
 
 from log2sim.errors import MissingExtra, RecordError
+from log2sim.logs.ros import livox
 from log2sim.logs.ros.bag import ENCODINGS, Bag, Topic
 
 _TF_MESSAGE = "geometry_msgs/TransformStamped[] transforms\n"
@@ -43,10 +44,12 @@ def find_layout_problem(topic: Topic) -> str | None:
     """Say why messages of a topic cannot be decoded; None when they can."""
     if topic.encoding not in ENCODINGS:
         return f"its messages are encoded as '{topic.encoding}', only ros1 and cdr are read"
-    known = typestore(topic.encoding).fielddefs.get(ALIASES.get(topic.msgtype, topic.msgtype))
-    if known is None:
-        return f"{topic.msgtype} is no type that log2sim knows"
-    expected = [name for name, _ in known[1]]
+    if topic.msgtype in livox.TYPES:
+        expected = livox.FIELDS
+    else:
+        expected = [
+            name for name, _ in typestore(topic.encoding).fielddefs[ALIASES.get(topic.msgtype, topic.msgtype)][1]
+        ]
     found = definition_fields(topic.definition)
     if topic.definition and found != expected:
         return f"its definition of {topic.msgtype} has the fields {', '.join(found)}, expected {', '.join(expected)}"

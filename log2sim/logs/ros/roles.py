@@ -10,6 +10,7 @@ from typing import Any
 
 from log2sim import registry
 from log2sim.errors import ConfigError
+from log2sim.logs.ros import livox
 from log2sim.logs.ros.bag import Bag, Topic
 from log2sim.logs.ros.messages import find_layout_problem
 from log2sim.logs.ros.settings import CameraTopic, LidarTopic, TopicSettings
@@ -20,7 +21,7 @@ ODOMETRY, FIX, IMU = "nav_msgs/msg/Odometry", "sensor_msgs/msg/NavSatFix", "sens
 POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 KINDS = {
-    IMAGE: "camera", COMPRESSED: "camera", CLOUD: "lidar", CAMERA_INFO: "camera info", ODOMETRY: "odometry",
+    IMAGE: "camera", **dict.fromkeys(livox.TYPES, "lidar"), COMPRESSED: "camera", CLOUD: "lidar", CAMERA_INFO: "camera info", ODOMETRY: "odometry",
     FIX: "gnss", IMU: "imu", **dict.fromkeys(POSES, "pose"), **dict.fromkeys(TRANSFORMS, "tf"),
 }  # fmt: skip
 FIXED_FRAMES = ("map", "world", "earth", "odom")

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Stream, Sweep
 from log2sim.geometry import Camera
+from log2sim.logs.ros import livox
 from log2sim.logs.ros.bag import Bag
 from log2sim.logs.ros.clouds import DEFAULT_PERIOD_NS, sweep_from
 from log2sim.logs.ros.messages import decode
@@ -39,8 +40,10 @@ def lidar_stream(bag: Bag, name: str, chosen: LidarTopic, stamped: Stamped) -> S
     period_ns = float(np.median(np.diff(stamped.t_ns))) if len(stamped.t_ns) > 1 else DEFAULT_PERIOD_NS
 
     def read(i: int) -> Sweep:
-        row = int(stamped.row[i])
-        message, where = decode(bag, topic, row), bag.where(topic, row)
-        return sweep_from(message, int(stamped.t_ns[i]), period_ns, chosen, where)
+        row, t_ns = int(stamped.row[i]), int(stamped.t_ns[i])
+        where = bag.where(topic, row)
+        if topic.msgtype in livox.TYPES:
+            return livox.sweep_from_livox(bag.read(topic, row), topic.encoding, t_ns, chosen, where)
+        return sweep_from(decode(bag, topic, row), t_ns, period_ns, chosen, where)
 
     return Stream(name, stamped.t_ns, read)
