@@ -161,7 +161,7 @@ def test_data_that_unpack_to_more_than_they_say_are_refused() -> None:
         decompress(bomb, "bz2", 1000)
     with pytest.raises(ValueError, match="unpacks to 1000 bytes, expected 1125899906842624"):
         decompress(bz2.compress(bytes(1000)), "bz2", 1 << 50)
-    with pytest.raises(ValueError, match="damaged zstd data"):
+    with pytest.raises(ValueError, match="damaged compressed data"):
         decompress(b"no zstd at all", "zstd", 100)
     with pytest.raises(ValueError, match="unknown compression 'rar'"):
         decompress(b"", "rar", 100)
@@ -387,7 +387,7 @@ def test_an_imu_whose_heading_is_not_the_course_is_noted(tmp_path: Path) -> None
 
 WRONG_SETTINGS = {
     '[cameras.front]\ntopic = "/front/image"': "'cameras.front.topic' is '/front/image', but .*did you mean '/front/image_raw/compressed'",
-    '[lidars.top]\ntopic = "/front/camera_info"': "holds sensor_msgs/msg/CameraInfo, expected sensor_msgs/msg/PointCloud2",
+    '[lidars.top]\ntopic = "/front/camera_info"': "holds sensor_msgs/msg/CameraInfo, expected .*sensor_msgs/msg/PointCloud2",
     '[lidars.top]\ntopik = "/top/points"': "unknown key 'lidars.top.topik'; did you mean 'lidars.top.topic'",
     '[lidars.top]\ntopic = "/top/points"\ntime_unit = "minutes"': "'lidars.top.time_unit' is 'minutes', expected one of",
     '[poses]\nsource = "gnss"': "asks for source 'gnss', which gives none",

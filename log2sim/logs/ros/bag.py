@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.errors import LogError, RecordError
-from log2sim.logs.ros.containers import Channel, Container
+from log2sim.logs.ros.containers import MAX_MESSAGE_BYTES, Channel, Container
 from log2sim.logs.ros.recordings import Recording, recorded_files
 from log2sim.logs.sweeps import PARSER_ERRORS
 
@@ -116,9 +116,10 @@ class Bag:
         number = np.concatenate([np.full(len(t), k) for k, t in enumerate(topics)])
         row = np.concatenate([np.arange(len(t)) for t in topics])
         order = np.lexsort((np.concatenate([t.entry for t in topics]), np.concatenate([t.file for t in topics])))
+        limits = [MAX_MESSAGE_BYTES if wanted[t.name] is None else wanted[t.name] for t in topics]
         for k, i in zip(number[order].tolist(), row[order].tolist()):
             with suppress(RecordError):
-                found[topics[k].name][i] = self.read(topics[k], i, wanted[topics[k].name])
+                found[topics[k].name][i] = self.read(topics[k], i, limits[k])
         return found
 
     def frame_id(self, topic: Topic) -> str:

@@ -10,6 +10,7 @@ import weakref
 import zlib
 from collections import OrderedDict
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from log2sim.errors import MissingExtra
 from log2sim.logs.ros.containers import checked_size
 
 MAX_CHUNK_BYTES = 512 * 1024 * 1024
+READ_BYTES = 16 * 1024
 CACHED_BYTES = 64 * 1024 * 1024
 """Of decompressed chunks; the last one is kept whatever its size."""
 
@@ -40,10 +42,11 @@ class ChunkedFile:
         self.size = path.stat().st_size
         self._handle = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
         weakref.finalize(self, os.close, self._handle)
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._cache: OrderedDict[int, bytes] = OrderedDict()
         self._intact: set[int] = set()
         self._damaged: dict[int, str] = {}
+        self._begun: _BegunChunk | None = None
 
     def at(self, position: int, count: int) -> bytes:
         """Read `count` bytes; `ValueError` where the file ends before."""
@@ -59,8 +62,11 @@ class ChunkedFile:
             raise ValueError(f"{count} bytes at byte {position}, but the file ends {missing} bytes before")
         return b"".join(parts)
 
-    def within(self, chunk: int, offset: int, count: int) -> bytes:
-        """Read up to `count` bytes from `offset` of a chunk, or of the file for chunk -1; fewer at its end."""
+    def within(self, chunk: int, offset: int, count: int, *, ahead: bool = False) -> bytes:
+        """Read up to `count` bytes from `offset` of a chunk, or of the file for chunk -1; fewer at its end.
+
+        With `ahead` a compressed chunk is unpacked only as far as needed, for callers that go through the file in order.
+        """
         if chunk < 0:
             return self.at(offset, min(count, self.size - offset))
         c = self.chunks[chunk]
@@ -69,7 +75,29 @@ class ChunkedFile:
         count = min(count, c.size_bytes - offset)
         if c.compression in ("", "none"):
             return self.at(c.position + offset, count)
+        if ahead and chunk not in self._cache:
+            with self._lock:
+                return bytes(self._unpacked_up_to(chunk, offset + count)[offset : offset + count])
         return self.unpacked(chunk)[offset : offset + count]
+
+    def _unpacked_up_to(self, number: int, end: int) -> bytearray:
+        """First bytes of a compressed chunk, at least `end` of them; what is stored behind them is not read."""
+        chunk = self.chunks[number]
+        begun = self._begun
+        if begun is None or begun.number != number:
+            begun = self._begun = _BegunChunk(number, decompressor_of(chunk.compression))
+        while len(begun.data) < end:
+            left = chunk.stored_bytes - begun.read_bytes
+            if number in self._damaged or not left:
+                raise ValueError(self._damaged.get(number, f"unpacks to {len(begun.data)} bytes only"))
+            part = self.at(chunk.position + begun.read_bytes, min(left, READ_BYTES))
+            begun.read_bytes += len(part)
+            try:
+                # More than the chunk says that it holds is not unpacked.
+                begun.data += unpack_part(begun.decompressor, part, chunk.size_bytes + 1 - len(begun.data))
+            except ValueError as problem:
+                self._damaged[number] = str(problem)
+        return begun.data
 
     def unpacked(self, chunk: int) -> bytes:
         """Bytes of a chunk, decompressed and checked; a damaged one is not tried again."""
@@ -105,6 +133,16 @@ class ChunkedFile:
             self.unpacked(chunk)
 
 
+@dataclass
+class _BegunChunk:
+    """A chunk that is unpacked from its beginning on: its number, and how much of it was read and unpacked."""
+
+    number: int
+    decompressor: Any
+    read_bytes: int = 0
+    data: bytearray = field(default_factory=bytearray)
+
+
 def decompress(data: bytes, method: str, size_bytes: int) -> bytes:
     """Decompress data that unpack to `size_bytes`, without allocating more.
 
@@ -135,16 +173,21 @@ def decompress_message(data: bytes, method: str, limit_bytes: int | None) -> byt
 
 
 def decompress_head(data: bytes, method: str, limit_bytes: int) -> bytes:
-    """Decompress at most the first `limit_bytes` of data; `zstd` damage is a `ValueError` like that of the others."""
-    decompressor = _decompressor(method)
+    """Decompress at most the first `limit_bytes` of data; `ValueError` where they are damaged."""
+    return unpack_part(decompressor_of(method), data, limit_bytes)
+
+
+def unpack_part(decompressor: Any, data: bytes, limit_bytes: int) -> bytes:
+    """Unpack the next part of compressed data into at most `limit_bytes`; `ValueError` where it is damaged."""
     try:
-        head: bytes = decompressor.decompress(data, max_length=limit_bytes)
+        unpacked: bytes = decompressor.decompress(data, max_length=limit_bytes)
     except Exception as error:  # the libraries have errors of their own
-        raise ValueError(f"damaged {method} data: {error}") from None
-    return head
+        raise ValueError(f"damaged compressed data: {error}") from None
+    return unpacked
 
 
-def _decompressor(method: str) -> Any:
+def decompressor_of(method: str) -> Any:
+    """Decompressor of a method; `MissingExtra` where its library is not installed."""
     if method == "bz2":
         return bz2.BZ2Decompressor()
     # Python has zstd from 3.14 on.

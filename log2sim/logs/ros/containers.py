@@ -69,7 +69,11 @@ class Container(Protocol):
     notes: list[str]
 
     def message(self, k: int, limit_bytes: int | None = None) -> bytes:
-        """Read message `k`, or its first `limit_bytes`; raise one of `sweeps.PARSER_ERRORS` where it is damaged."""
+        """Read message `k`, or its first `limit_bytes`; raise one of `sweeps.PARSER_ERRORS` where it is damaged.
+
+        With a limit, messages are best asked for in their order: chunks are then unpacked as far as needed only, and their
+        checksums are not checked.
+        """
 
 
 class EntryList:

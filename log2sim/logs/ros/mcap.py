@@ -47,7 +47,8 @@ class Mcap(ChunkedFile):
     def message(self, k: int, limit_bytes: int | None = None) -> bytes:
         """Read message `k`, or its first `limit_bytes`."""
         chunk, place = int(self.entries.chunk[k]), int(self.entries.place[k])
-        op, size, *_ = MESSAGE_HEAD.unpack(self.within(chunk, place, MESSAGE_HEAD.size))
+        ahead = limit_bytes is not None
+        op, size, *_ = MESSAGE_HEAD.unpack(self.within(chunk, place, MESSAGE_HEAD.size, ahead=ahead))
         if op != MESSAGE or size < 22:
             raise ValueError("no message where the index says so")
         wanted = checked_size(size - 22)
@@ -55,7 +56,7 @@ class Mcap(ChunkedFile):
             self.check(chunk)
         else:
             wanted = min(wanted, limit_bytes)
-        data = self.within(chunk, place + MESSAGE_HEAD.size, wanted) if wanted else b""
+        data = self.within(chunk, place + MESSAGE_HEAD.size, wanted, ahead=ahead) if wanted else b""
         if len(data) != wanted:
             raise ValueError(f"{len(data)} of {wanted} bytes; the chunk is truncated")
         return data

@@ -68,7 +68,8 @@ class Rosbag1(ChunkedFile):
     def message(self, k: int, limit_bytes: int | None = None) -> bytes:
         """Read message `k`, or its first `limit_bytes`."""
         chunk, place = int(self.entries.chunk[k]), int(self.entries.place[k])
-        first = self.within(chunk, place, FIRST_BYTES)
+        ahead = limit_bytes is not None
+        first = self.within(chunk, place, FIRST_BYTES, ahead=ahead)
         record = parse_record(first, 0, place)
         if record.op != MESSAGE:
             raise ValueError("no message where the index says so")
@@ -77,7 +78,7 @@ class Rosbag1(ChunkedFile):
         wanted = size if limit_bytes is None else min(size, limit_bytes)
         if start + wanted <= len(first):
             return first[start : start + wanted]
-        data = self.within(chunk, record.position, wanted)
+        data = self.within(chunk, record.position, wanted, ahead=ahead)
         if len(data) != wanted:
             raise ValueError(f"{len(data)} of {wanted} bytes; the chunk is truncated")
         return data
