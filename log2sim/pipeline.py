@@ -17,7 +17,8 @@ from log2sim.agents.simplify import simplify
 from log2sim.config import Config
 from log2sim.datatypes import Log, Scenario
 from log2sim.errors import NothingToReconstruct
-from log2sim.localization.choice import GIVEN, PoseChoice, localize
+from log2sim.localization.choice import localize
+from log2sim.localization.pose_choice import GIVEN, PoseChoice
 from log2sim.outcome import RunOutputs, stage_outcomes
 from log2sim.perception.detect.detectors import Detector, create_detector
 from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector

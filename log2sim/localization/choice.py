@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from log2sim.config import Config
 from log2sim.datatypes import Log
 from log2sim.documents import rounded
 from log2sim.errors import ConfigError, LogError
-from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse
+from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse, nearest_index, period_of
 from log2sim.localization.alignment import fit_to_given, level_on_ground
+from log2sim.localization.camera_motion import CameraPath, follow_camera, motion_camera
 from log2sim.localization.ego_sweeps import densest_lidar, lidars_on_ego, read_ego_sweep
 from log2sim.localization.odometry import Odometry, run_odometry
+from log2sim.localization.pose_choice import GIVEN, ORIGINS, PoseChoice
 from log2sim.localization.registration import is_installed
 from log2sim.localization.replaced import replace_poses
 from log2sim.localization.verdict import compare_with_given, unsure_share
@@ -26,69 +29,6 @@ MAX_UNSURE_SHARE_ALONE = 0.5
 MARGIN_S = 1.0
 
 Progress = Callable[[str, int, int], None]
-
-ORIGINS = {"given": "ego poses of the log", "lidar": "LiDAR odometry", "camera": "camera motion"}
-"""What a scenario says about the ego by the source of its poses."""
-
-
-@dataclass(frozen=True, eq=False)
-class PoseChoice:
-    """Where the poses of a run come from, and why.
-
-    Attributes
-    ----------
-    asked : str
-        As the settings say.
-    source : {"given", "lidar", "camera", "none"}
-        "none": no sensor is on an ego whose pose would have to be known.
-    reason : str
-        For people.
-    excess_m : mapping of str to float
-        How far given poses are off against each other by the surroundings, beyond what odometry leaves: "neighbors",
-        "apart"; empty where nothing was compared.
-    scatter_m : mapping of str to mapping of str to float
-        RMS distance between upright surfaces of pairs of sweeps by the poses "given" and "lidar".
-    estimate : mapping of str to Any
-        Figures of the odometry, JSON values; empty where none was run.
-    notes : tuple of str
-        What is doubtful about estimated poses.
-    during_ns : (int, int), optional
-        First and last stamp of what poses were estimated from; None for the whole log.
-    """
-
-    asked: str
-    source: str
-    reason: str
-    excess_m: Mapping[str, float | None] = field(default_factory=dict)
-    scatter_m: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
-    estimate: Mapping[str, Any] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-    during_ns: tuple[int, int] | None = None
-
-    @property
-    def origin(self) -> str:
-        """Name what the ego's path comes from."""
-        return ORIGINS.get(self.source, "none")
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the entry `poses` of `schemas/report-1.json`."""
-        return {
-            "asked": self.asked,
-            "source": self.source,
-            "reason": self.reason,
-            "scatter_m": {name: dict(values) for name, values in self.scatter_m.items()},
-            "excess_m": dict(self.excess_m),
-            "estimate": dict(self.estimate),
-            "notes": list(self.notes),
-        }
-
-    def to_provenance(self) -> dict[str, Any]:
-        """Return what `localize_like` needs to find the same poses again."""
-        during = {} if self.during_ns is None else {"during_ns": list(self.during_ns)}
-        return {"source": self.source, **during}
-
-
-GIVEN = PoseChoice("given", "given", "the log's own poses")
 
 
 def localize(log: Log, config: Config, *, progress: Progress | None = None) -> tuple[Log, PoseChoice]:
@@ -169,7 +109,19 @@ def _mounts(log: Log) -> set[str]:
 
 
 def _by_camera(request: _Request) -> tuple[Log, PoseChoice]:
-    raise LogError(f"{request.log.name}: the log has neither ego poses nor a LiDAR on the ego")
+    """Estimate poses by the motion of a camera."""
+    log = request.log
+    found = follow_camera(
+        log, motion_camera(log), during_ns=request.during_ns,
+        progress=lambda done, total: request.progress("camera motion", done, total),
+    )  # fmt: skip
+    track, frame = _in_map(log, PoseTrack(found.t_ns, found.start_T_ego, _max_gap_s(found.t_ns)))
+    estimate = {**_camera_figures(found), **_difference(track, log.ego), "frame": frame}
+    notes = ["camera motion is planar, and some percent of its path may be wrong"]
+    if found.predicted.any():
+        notes.append(f"camera motion: {int(found.predicted.sum())} of {len(found.t_ns)} poses are predicted")
+    reason = "as asked" if request.asked == "camera" else "the log has no poses and no LiDAR on the ego"
+    return replace_poses(log, track), request.answer("camera", reason, estimate=estimate, notes=tuple(notes))
 
 
 def _by_lidar(request: _Request) -> tuple[Log, PoseChoice]:
@@ -186,6 +138,9 @@ def _by_lidar(request: _Request) -> tuple[Log, PoseChoice]:
         raise ConfigError(
             f"--poses {asked}: {log.name} has no LiDAR on the ego that can be read; choose given or camera"
         )
+    stamps = log.streams[lidar].t_ns
+    if log.ego is None and len(stamps) == 1:
+        return _of_one_sweep(request, lidar, stamps)
     try:
         found = run_odometry(
             log,
@@ -197,8 +152,8 @@ def _by_lidar(request: _Request) -> tuple[Log, PoseChoice]:
         if not may_keep:
             raise
         return log, PoseChoice(asked, "given", f"nothing to compare them with: {problem}")
-    track, frame = _in_map(log, found)
-    estimate = {**_figures(found, track, log.ego), "frame": frame}
+    track, frame = _in_map(log, PoseTrack(found.t_ns, found.odom_T_ego, _max_gap_s(found.t_ns)), lidar)
+    estimate = {**_figures(found), **_difference(track, log.ego), "frame": frame}
     if may_keep and log.ego is not None:
         verdict = compare_with_given(log, found, track)
         choice = request.answer(
@@ -216,6 +171,15 @@ def _by_lidar(request: _Request) -> tuple[Log, PoseChoice]:
     return replace_poses(log, track), request.answer("lidar", reason, estimate=estimate, notes=_doubts(log, found))
 
 
+def _of_one_sweep(request: _Request, lidar: str, t_ns: NDArray[np.int64]) -> tuple[Log, PoseChoice]:
+    """Take the ego's frame at the only sweep of a log as its map."""
+    track, frame = _in_map(request.log, PoseTrack(t_ns, np.eye(4)[None]), lidar)
+    estimate = {"lidar": lidar, "sweeps": 1, "poses": 1, "frame": frame}
+    return replace_poses(request.log, track), request.answer(
+        "lidar", "the log has no poses and a single sweep, whose frame is the map", estimate=estimate
+    )
+
+
 def during_ns(log: Log, config: Config) -> tuple[int, int] | None:
     """Return the first and last stamp for which poses are needed; None for all."""
     if config.start_s is None and config.stop_s is None:
@@ -229,29 +193,31 @@ def during_ns(log: Log, config: Config) -> tuple[int, int] | None:
     return begin, end
 
 
-def _in_map(log: Log, found: Odometry) -> tuple[PoseTrack, str]:
-    """Place the path of the odometry in the map of the log, or on the ground under its first sweep."""
-    period_s = float(np.median(np.diff(found.t_ns))) / NS_PER_S
-    raw = PoseTrack(found.t_ns, found.odom_T_ego, max(1.0, 2.5 * period_s))
-    map_T_odom = None if log.ego is None else fit_to_given(raw, log.ego)
+def _max_gap_s(t_ns: NDArray[np.int64]) -> float:
+    """Return the gap over which estimated poses are interpolated, s: one missing record more than usual."""
+    return max(1.0, 2.5 * period_of(t_ns))
+
+
+def _in_map(log: Log, estimated: PoseTrack, lidar: str | None = None) -> tuple[PoseTrack, str]:
+    """Place an estimated path in the map of the log, or on the ground under its first sweep, and say which."""
+    map_T_start = None if log.ego is None else fit_to_given(estimated, log.ego)
     frame = "fitted to the given poses"
-    if map_T_odom is None:
-        map_T_odom, frame = _level(log, found)
-    return replace(raw, map_T_ego=map_T_odom @ raw.map_T_ego), frame
+    if map_T_start is None:
+        level = None if lidar is None else _level(log, lidar, int(estimated.t_ns[0]))
+        frame = "the ego's at the first pose" + ("" if level is None else ", level on the ground")
+        map_T_start = np.eye(4) if level is None else level
+    return replace(estimated, map_T_ego=map_T_start @ estimated.map_T_ego), frame
 
 
-def _level(log: Log, found: Odometry) -> tuple[Array, str]:
-    index = int(np.searchsorted(log.streams[found.lidar].t_ns, found.t_ns[0]))
-    sweep = read_ego_sweep(log, found.lidar, min(index, len(log.streams[found.lidar].t_ns) - 1))
-    level = None if sweep is None else level_on_ground(sweep.xyz_m, log.ground_z_ego_m)
-    if level is None:
-        return np.eye(4), "the ego's at the first sweep"
-    return level, "the ego's at the first sweep, level on the ground"
+def _level(log: Log, lidar: str, t_ns: int) -> Array | None:
+    """Return the pose (4, 4) of the ego that puts the ground of the sweep at a stamp level; None where none is seen."""
+    sweep = read_ego_sweep(log, lidar, int(nearest_index(log.streams[lidar].t_ns, t_ns)[0]))
+    return None if sweep is None else level_on_ground(sweep.xyz_m, log.ground_z_ego_m)
 
 
-def _figures(found: Odometry, track: PoseTrack, given: PoseTrack | None) -> dict[str, Any]:
+def _figures(found: Odometry) -> dict[str, Any]:
     """Collect the figures of an odometry for the report."""
-    out = {
+    return {
         "lidar": found.lidar,
         "sweeps": found.sweeps,
         "poses": len(found.t_ns),
@@ -259,16 +225,38 @@ def _figures(found: Odometry, track: PoseTrack, given: PoseTrack | None) -> dict
         "degenerate": int(found.degenerate.sum()),
         "problems": found.problems,
         "path_m": rounded(found.path_m, 3),
-        "overlap_median": rounded(float(np.nanmedian(found.overlap)), 4),
-        "residual_median": rounded(float(np.nanmedian(found.residual)), 4),
-        "constraint_median": rounded(float(np.nanmedian(found.constraint)), 4),
+        "overlap_median": _median(found.overlap),
+        "residual_median": _median(found.residual),
+        "constraint_median": _median(found.constraint),
     }
-    if given is not None:
-        map_T_ego, known = given.at(track.t_ns)
-        if known.any():
-            off = inverse(map_T_ego[known]) @ track.map_T_ego[known]
-            out["given_difference_rms_m"] = rounded(float(np.sqrt(np.mean(np.sum(off[:, :3, 3] ** 2, axis=1)))), 4)
-    return out
+
+
+def _camera_figures(found: CameraPath) -> dict[str, Any]:
+    """Collect the figures of camera motion for the report."""
+    steps = np.diff(found.start_T_ego[:, :3, 3], axis=0)
+    return {
+        "camera": found.camera,
+        "frames": found.frames,
+        "poses": len(found.t_ns),
+        "predicted": int(found.predicted.sum()),
+        "path_m": rounded(float(np.linalg.norm(steps, axis=1).sum()), 3),
+        "points_on_road_median": found.on_road,
+    }
+
+
+def _median(values: Array) -> float | None:
+    """Return the median of what is known, rounded."""
+    known = values[np.isfinite(values)]
+    return rounded(float(np.median(known)), 4) if len(known) else None
+
+
+def _difference(track: PoseTrack, given: PoseTrack | None) -> dict[str, Any]:
+    """Compute how far the positions of estimated poses are from given ones; nothing where there are none."""
+    map_T_ego, known = (track.map_T_ego, np.zeros(1, dtype=bool)) if given is None else given.at(track.t_ns)
+    if not known.any():
+        return {}
+    off = inverse(map_T_ego[known]) @ track.map_T_ego[known]
+    return {"given_difference_rms_m": rounded(float(np.sqrt(np.mean(np.sum(off[:, :3, 3] ** 2, axis=1)))), 4)}
 
 
 def _doubts(log: Log, found: Odometry) -> tuple[str, ...]:

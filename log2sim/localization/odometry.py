@@ -19,9 +19,8 @@ MAX_ACCELERATION_MPS2, MAX_JUMP_M = 12.0, 0.5
 # The first motion is searched forward and backward in steps within which a fit finds its way, up to these speeds.
 SEARCH_STEP_M, MAX_SPEED_MPS, MAX_REVERSE_MPS = 1.0, 50.0, 5.0
 # A compensation by another motion than the one found is repeated from these differences over a sweep on.
-REPEAT_FROM_M, REPEAT_FROM_RAD = 0.05, 0.002
+REPEAT_FROM_M, REPEAT_FROM_RAD = 0.1, 0.005
 MAX_COASTING_S = 1.0
-MIN_REGISTERED = 3
 
 Progress = Callable[[int, int], None]
 
@@ -104,12 +103,12 @@ def run_odometry(
         run.add(read_ego_sweep(log, lidar, i))
         if progress is not None:
             progress(done, len(index))
-    paths = [p for p in run.finished() if sum(step.fit is not None for step in p) >= MIN_REGISTERED]
+    paths = [p for p in run.finished() if any(step.fit is not None for step in p)]
     if not paths:
         found = ", ".join(f"{reason}: {count}" for reason, count in run.problems.items()) or "too few sweeps"
         raise LogError(
             f"{log.name}: LiDAR odometry found no motion in the {len(index)} sweeps of '{lidar}' ({found}); expected at "
-            f"least {MIN_REGISTERED} sweeps in succession that show the same surroundings"
+            "least two in succession that show the same surroundings"
         )
     best = max(paths, key=lambda p: p[-1].t_ns - p[0].t_ns)
     lost = sum(len(p) for p in paths) - len(best)

@@ -13,7 +13,7 @@ from log2sim.datatypes import Log
 from log2sim.errors import ConfigError, LogError
 from log2sim.evaluation.detection.boxes_file import DetectedBoxes
 from log2sim.evaluation.detection.sweep_clouds import clouds, stamps_of
-from log2sim.localization.choice import PoseChoice
+from log2sim.localization.pose_choice import PoseChoice
 from log2sim.perception.frames import RecordReader
 from log2sim.pipeline import start
 

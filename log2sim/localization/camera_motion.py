@@ -1,0 +1,286 @@
+"""Motion of the ego from the images of one camera whose height above the ground is known.
+
+Points are followed from image to image and give the rotation (essential matrix, Nister, PAMI 2004). The path in meters comes
+from the road before the camera, seen from above: where it lies in the image follows from the mount of the camera. From above
+the texture of the road moves as a rigid picture, whereas in the image it grows, which makes its points seem slower.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Log
+from log2sim.errors import LogError, RecordError
+from log2sim.geometry import NS_PER_S, Array, Camera, rotation_from_rpy, transform, undistort, yaw_of
+from log2sim.localization.road_view import (
+    GUESS_STEP_M,
+    MIN_CORNER,
+    ROAD_PX_PER_M,
+    FollowSettings,
+    RoadView,
+    follow_points,
+)
+
+MIN_HEIGHT_M = 0.4
+# Brightness, 0 to 255, below which an image shows noise only; night under street lights has 20 or more.
+MIN_BRIGHTNESS = 8.0
+MAX_WIDTH_PX = 1000
+MAX_POINTS, SPACING_PX = 900, 9
+WINDOW_PX, LEVELS = 21, 4
+MIN_FOLLOWED, MIN_ON_ROAD = 30, 12
+TOLERANCE_PX = 0.7
+STANDING_PX = 0.25
+ROTATION_ROUNDS, MIN_ROTATION_SHARE = 8, 0.5
+MAX_SPEED_MPS = 50.0
+MAX_PREDICTED_S = 1.0
+# Yaw rates of vehicles are below 1 rad/s; a steeper turn of two images is a wrong essential matrix.
+MAX_YAW_RATE_RADPS = 1.5
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPath:
+    """Poses of the ego on a plane, in the ego's frame at the first image.
+
+    Attributes
+    ----------
+    camera : str
+    t_ns : (P,) int64
+        Increasing stamps.
+    start_T_ego : (P, 4, 4) float64
+    predicted : (P,) bool
+        Whether an image showed too little, so that the pose is predicted by constant velocity.
+    frames : int
+        Number of images.
+    on_road : float
+        Median number of points on the road that agree on the motion.
+    """
+
+    camera: str
+    t_ns: NDArray[np.int64]
+    start_T_ego: Array
+    predicted: NDArray[np.bool_]
+    frames: int
+    on_road: float
+
+
+def motion_camera(log: Log) -> str:
+    """Choose the camera on the ego to follow: the log's reference where it is one, else the one that looks ahead most.
+
+    Raises
+    ------
+    LogError
+        Where no camera is on the ego, or the height of none is known.
+    """
+    names = [
+        n for n, c in log.cameras.items() if c.mount == "ego" and n in log.streams and len(log.streams[n].t_ns) > 1
+    ]
+    if not names:
+        raise LogError(
+            f"{log.name}: the log has no ego poses, no LiDAR and no camera on the ego that show how it moves"
+        )
+    high = [n for n in names if height_m(log, log.cameras[n]) >= MIN_HEIGHT_M]
+    if not high:
+        low = height_m(log, log.cameras[names[0]])
+        raise LogError(
+            f"{log.name}: camera motion has no scale: camera '{names[0]}' is mounted {low:.2f} m above the ground; expected "
+            f"at least {MIN_HEIGHT_M} m, so state the mount, or give poses"
+        )
+    ahead = max(high, key=lambda n: float(log.cameras[n].mount_T_cam[0, 2]))
+    return log.reference_camera if log.reference_camera in high else ahead
+
+
+def height_m(log: Log, camera: Camera) -> float:
+    """Return the height of a camera above the road, m."""
+    return float(camera.mount_T_cam[2, 3]) - log.ground_z_ego_m
+
+
+def follow_camera(
+    log: Log, name: str, *, during_ns: tuple[int, int] | None = None, progress: Progress | None = None
+) -> CameraPath:
+    """Estimate the path of the ego from the images of a camera.
+
+    Raises
+    ------
+    LogError
+        Where the images are too dark, or show too little of the road for most of their time.
+
+    Notes
+    -----
+    The road is taken for a plane on which the ego does not pitch or roll. Scale and heading drift: expect some percent of
+    the path.
+    """
+    stream = log.streams[name]
+    index = np.arange(len(stream.t_ns))
+    if during_ns is not None:
+        index = index[(stream.t_ns >= during_ns[0]) & (stream.t_ns <= during_ns[1])]
+    follower = _Follower(log, log.cameras[name])
+    t_ns, poses, predicted = [], [np.eye(4)], [False]
+    last, motion, motion_s, dark, unreadable = None, np.eye(4), 1.0, 0, 0
+    for done, i in enumerate(index.tolist(), 1):
+        gray = follower.prepare(stream.read, i)
+        unreadable += gray is None
+        if gray is not None:
+            dark += float(gray.mean()) < MIN_BRIGHTNESS
+            t_ns.append(int(stream.t_ns[i]))
+            if last is not None:
+                dt_s = (t_ns[-1] - t_ns[-2]) / NS_PER_S
+                found = follower.motion(last, gray, dt_s)
+                predicted.append(found is None)
+                motion = _scaled(motion, dt_s / motion_s) if found is None else found
+                motion_s = dt_s
+                poses.append(poses[-1] @ motion)
+            last = gray
+        if progress is not None:
+            progress(done, len(index))
+    _check(log, name, len(index), len(t_ns), dark, np.array(predicted))
+    return CameraPath(
+        name,
+        np.array(t_ns, dtype=np.int64),
+        np.stack(poses),
+        np.array(predicted),
+        len(index),
+        float(np.median(follower.agreed)) if follower.agreed else 0.0,
+    )
+
+
+def _check(log: Log, name: str, frames: int, read: int, dark: int, predicted: NDArray[np.bool_]) -> None:
+    """Raise `LogError` for a path that is mostly a guess."""
+    where = f"{log.name}: camera motion by '{name}'"
+    if read < 2:
+        raise LogError(f"{where}: {read} of {frames} images can be read; expected two at least")
+    if dark > read / 2:
+        raise LogError(f"{where}: {dark} of {read} images are too dark to show motion; give poses")
+    if predicted[1:].mean() > 0.5:
+        raise LogError(
+            f"{where}: {int(predicted.sum())} of {read} images show too little of the road to tell how far the ego moves; "
+            "give poses"
+        )
+
+
+def _scaled(motion: Array, share: float) -> Array:
+    """Return a share of a motion on the plane."""
+    yaw = float(yaw_of(motion)) * share
+    return transform(rotation_from_rpy(0.0, 0.0, yaw), motion[:3, 3] * share)
+
+
+class _Follower:
+    """Motion between two images of one camera.
+
+    `agreed` collects the numbers of points on the road that agreed on each motion.
+    """
+
+    def __init__(self, log: Log, camera: Camera) -> None:
+        self.camera, self.height_m = camera, height_m(log, camera)
+        self.scale = min(1.0, MAX_WIDTH_PX / camera.width_px)
+        self.road = RoadView(camera, self.height_m, self.scale)
+        self.agreed: list[int] = []
+        self.last_mps = np.zeros(2)
+
+    def prepare(self, read: Callable[[int], NDArray[np.uint8]], i: int) -> NDArray[np.uint8] | None:
+        """Read an image as shades of gray, at most `MAX_WIDTH_PX` wide; None where it cannot be read."""
+        import cv2
+
+        try:
+            gray = cv2.cvtColor(read(i), cv2.COLOR_BGR2GRAY)
+        except RecordError:
+            return None
+        small = (
+            gray
+            if self.scale == 1
+            else cv2.resize(gray, None, fx=self.scale, fy=self.scale, interpolation=cv2.INTER_AREA)
+        )
+        return np.asarray(small, dtype=np.uint8)
+
+    def motion(self, first: NDArray[np.uint8], second: NDArray[np.uint8], dt_s: float) -> Array | None:
+        """Estimate the pose (4, 4) of the ego at the second image in its frame at the first; None where too little is seen."""
+        from_px, to_px = _followed(first, second)
+        if len(from_px) < MIN_FOLLOWED:
+            return None
+        if np.median(np.linalg.norm(to_px - from_px, axis=1)) < STANDING_PX:
+            return np.eye(4)
+        from_xy, to_xy = (undistort(self.camera, px / self.scale) for px in (from_px, to_px))
+        turn = self._turn(from_xy, to_xy)
+        if turn is None or abs(turn) > MAX_YAW_RATE_RADPS * dt_s:
+            return None
+        shift = self._shift(first, second, turn, dt_s)
+        self.last_mps = self.last_mps if shift is None else shift / dt_s
+        return None if shift is None else transform(rotation_from_rpy(0.0, 0.0, turn), np.append(shift, 0.0))
+
+    def _turn(self, from_xy: Array, to_xy: Array) -> float | None:
+        """Estimate the yaw, rad, of the ego between normalized image points (N, 2)."""
+        import cv2
+
+        threshold = TOLERANCE_PX / self.scale / float(self.camera.K[0, 0])
+        ego_R_cam = self.camera.mount_T_cam[:3, :3]
+        only = _pure_rotation(from_xy, to_xy, threshold)
+        if only is not None:
+            return float(yaw_of(ego_R_cam @ only.T @ ego_R_cam.T))
+        essential, mask = cv2.findEssentialMat(from_xy, to_xy, np.eye(3), cv2.RANSAC, 0.999, threshold)
+        if essential is None or essential.shape != (3, 3):
+            return None
+        _, second_R_first, _, _ = cv2.recoverPose(essential, from_xy, to_xy, np.eye(3), mask=mask)
+        return float(yaw_of(ego_R_cam @ second_R_first.T @ ego_R_cam.T))
+
+    def _shift(self, first: NDArray[np.uint8], second: NDArray[np.uint8], turn: float, dt_s: float) -> Array | None:
+        """Estimate the translation (2,), m, from the texture of the road, near the last motion or else from several guesses."""
+        views = self.road.view(first), self.road.view(second)
+        found = self._shift_near(*views, turn, self.last_mps * dt_s)
+        if found is None:
+            steps = np.arange(0.0, MAX_SPEED_MPS * dt_s, GUESS_STEP_M)
+            tried = [self._shift_near(*views, turn, np.array([step, 0.0])) for step in steps.tolist()]
+            found = max((t for t in tried if t is not None), key=lambda t: t[1], default=None)
+        if found is None:
+            return None
+        self.agreed.append(found[1])
+        return found[0]
+
+    def _shift_near(
+        self, first: NDArray[np.uint8], second: NDArray[np.uint8], turn: float, guess_m: Array
+    ) -> tuple[Array, int] | None:
+        """Find the translation (2,), m, that most points of two views of the road agree on, and their number."""
+        begin, end = self.road.followed(first, second, guess_m)
+        cos, sin = np.cos(turn), np.sin(turn)
+        shifts = begin - end @ np.array([[cos, sin], [-sin, cos]])
+        if len(shifts) < MIN_ON_ROAD:
+            return None
+        # A pixel moves the point where a ray meets the road by its squared distance over the height.
+        away = np.hypot(*(begin - self.camera.mount_T_cam[:2, 3]).T)
+        sigma = TOLERANCE_PX * (1 / ROAD_PX_PER_M + away**2 / (float(self.camera.K[0, 0]) * self.scale * self.height_m))
+        apart = np.linalg.norm(shifts[:, None] - shifts[None], axis=2)
+        agree = apart < 2 * np.hypot(sigma[:, None], sigma[None])
+        best = agree[int(np.argmax((agree / sigma[None] ** 2).sum(axis=1)))]
+        if best.sum() < MIN_ON_ROAD:
+            return None
+        weight = 1 / sigma[best] ** 2
+        return (shifts[best] * weight[:, None]).sum(axis=0) / weight.sum(), int(best.sum())
+
+
+def _pure_rotation(from_xy: Array, to_xy: Array, tolerance: float) -> Array | None:
+    """Fit `second_R_first` (3, 3) to normalized image points (N, 2) without translation; None where it does not explain most.
+
+    While the ego hardly moves the essential matrix is left to chance. By iteratively reweighted least squares.
+    """
+    first, second = (np.column_stack([xy, np.ones(len(xy))]) for xy in (from_xy, to_xy))
+    first, second = (rays / np.linalg.norm(rays, axis=1)[:, None] for rays in (first, second))
+    weight, off = np.ones(len(first)), np.zeros(len(first))
+    rotation = np.eye(3)
+    for _ in range(ROTATION_ROUNDS):
+        u, _, vt = np.linalg.svd((second * weight[:, None]).T @ first)
+        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        off = np.linalg.norm(second - first @ rotation.T, axis=1)
+        weight = 1 / (1 + (off / tolerance) ** 2) ** 2
+    return rotation if np.mean(off < tolerance) > MIN_ROTATION_SHARE else None
+
+
+def _followed(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[Array, Array]:
+    """Follow corners from one image to the next: pixels (N, 2) in both."""
+    import cv2
+
+    corners = cv2.goodFeaturesToTrack(first, MAX_POINTS, MIN_CORNER, SPACING_PX)
+    return follow_points(first, second, corners, FollowSettings(WINDOW_PX, LEVELS))
