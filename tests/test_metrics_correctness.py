@@ -90,6 +90,9 @@ def test_another_category_of_the_kind_is_confusion_but_not_wrong():
     found = judged([agent("x", 0.0, category="truck")], [agent("a", 0.0)])
     assert faults(found) == {"wrong_class": TICKS}
     assert found["confusion"]["ticks"] == {"truck": {"car": TICKS}}
+    text = format_table(evaluate(scenario(agent("x", 0.0, category="truck")), scenario(agent("a", 0.0))))
+    assert "class: car as truck (1 agent, 31 ticks)" in text
+    assert "class:" not in format_table(evaluate(world(), world()))
     assert found["judged_agents"][0]["wrong_ticks"] == 0
 
 

@@ -27,7 +27,17 @@ def correctness_lines(found: Mapping[str, Any]) -> list[str]:
     if not found["ticks"]:
         return []
     title = "wrong of the reconstructed agents' ticks (agents), doubted of these ticks, and errors over sigma (NEES, 1 is right):"
-    return ["", title, *_table(found), "", *_calibration_lines(found), "", *_worst_lines(found["judged_agents"])]
+    confused = _confused_line(found["confusion"])
+    return [
+        "",
+        title,
+        *_table(found),
+        *confused,
+        "",
+        *_calibration_lines(found),
+        "",
+        *_worst_lines(found["judged_agents"]),
+    ]
 
 
 def _table(found: Mapping[str, Any]) -> list[str]:
@@ -45,6 +55,18 @@ def _table(found: Mapping[str, Any]) -> list[str]:
     widths = [max(len(row[k]) for row in cells) for k in range(len(cells[0]))]
     rows = [[row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:]))] for row in cells]
     return ["  ".join(row).rstrip() for row in rows]
+
+
+def _confused_line(confusion: Mapping[str, Any]) -> list[str]:
+    """Say which categories are taken for which, most agents first; no line without any."""
+    agents, ticks = confusion["agents"], confusion["ticks"]
+    pairs = [(true, ours) for ours, row in ticks.items() for true in row if true not in (ours, "nothing")]
+    counts = {(true, ours): (agents.get(ours, {}).get(true, 0), ticks[ours][true]) for true, ours in pairs}
+    parts = [
+        f"{true} as {ours} ({_noun(counts[true, ours][0], 'agent')}, {_noun(counts[true, ours][1], 'tick')})"
+        for true, ours in sorted(pairs, key=lambda pair: (*(-n for n in counts[pair]), pair))
+    ]
+    return [f"class: {', '.join(parts)}"] if parts else []
 
 
 def _calibration_lines(found: Mapping[str, Any]) -> list[str]:
