@@ -1,7 +1,7 @@
-"""nuScenes, version 1.0, by the schema of its development kit: tables of flat records, samples and sweeps, .pcd.bin files.
+"""nuScenes, version 1.0, by the schema of its development kit: tables of flat records, samples and sweeps.
 
-Points are written as a Velodyne HDL-32E fires: 32 rings in turn every 46.08 us up to the stamp, all in the frame of the LiDAR
-at the stamp (x right, y forward), rays without a return at range 0.
+Points are written as a Velodyne HDL-32E fires: 32 rings in turn every 46.08 us up to the stamp, all in the frame of the
+LiDAR at the stamp (x right, y forward), rays without a return at range 0.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from log2sim.geometry import Array, apply, inverse, quaternion_from_rotation, ro
 from log_encoders.world import labels_at, make_world
 
 FIRINGS, RINGS, FIRING_NS, TURN_NS = 1085, 32, 46_080, 50_000_000
+# Of the world's LiDAR: the firings of its view, of which it has every third.
+VIEW_FIRINGS, FIRING_STEP = 543, 3
 KIND_OF = {
     "car": "vehicle.car", "truck": "vehicle.truck", "bus": "vehicle.bus.rigid", "motorcycle": "vehicle.motorcycle",
     "bicycle": "vehicle.bicycle", "cyclist": "vehicle.bicycle", "pedestrian": "human.pedestrian.adult",
@@ -35,13 +37,15 @@ WORLD_T_LIDAR = transform(rotation_from_rpy(0.0, 0.0, -np.pi / 2), np.zeros(3))
 
 
 @cache
-def hdl32_world(**changes: Any) -> Log:
-    """The world of the other encoders, seen by a LiDAR of 32 rings whose view of half a circle takes 50 ms, as a whole turn does."""
+def hdl32_world() -> Log:
+    """The world of the other encoders; its LiDAR has 32 rings and sees a quarter of a circle in half a turn's time."""
+    view_deg = 180.0 * 10.0 * VIEW_FIRINGS * FIRING_NS / 1e9
     lidar = {
         "name": "top", "position_m": [0.75, 0.0, 2.125], "channels": RINGS, "elevation_deg": [-20.0, 2.0],
-        "azimuth_deg": [-90.0, 90.0], "azimuth_step_deg": 180.0 / FIRINGS, "range_m": 60.0,
+        "azimuth_deg": [-view_deg, view_deg], "azimuth_step_deg": 2 * view_deg * FIRING_STEP / VIEW_FIRINGS,
+        "range_m": 60.0,
     }  # fmt: skip
-    return make_world(lidar=[lidar], **changes)
+    return make_world(lidar=[lidar])
 
 
 def encode_world(log: Log, folder: Path) -> Path:
@@ -135,8 +139,8 @@ class _Scene:
         for row in self.rows["sample_data"]:
             row["sample_token"] = tokens[min(int(np.searchsorted(self.samples, row["sample_token"])), len(tokens) - 1)]
         scene = {
-            "token": self.token("scene"), "log_token": self.token("log"), "nbr_samples": len(tokens), "name": self.log.name,
-            "description": "{a} \"world\"", "first_sample_token": tokens[0], "last_sample_token": tokens[-1],
+            "token": self.token("scene"), "log_token": self.token("log"), "nbr_samples": len(tokens),
+            "name": self.log.name, "description": "{a} \"world\"", "first_sample_token": tokens[0], "last_sample_token": tokens[-1],
         }  # fmt: skip
         self.rows["scene"].append(scene)
         self.rows["log"].append(

@@ -42,6 +42,8 @@ WITH_RIDER = "cycle.with_rider"
 HARDLY_VISIBLE = "1"
 # An object that passes the seam of the turn would be seen twice within a few ms.
 MIN_STEP_NS = 10_000_000
+# Key frames are 0.4 to 0.6 s apart; over more than a missing one nothing is interpolated.
+MAX_GAP_NS = 1_100_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,14 +117,16 @@ def read_labels(scene: Scene, lidar: Channel | None, offset_m: Array, notes: lis
 
 
 def turn_ends(t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Stamps of all turns of the LiDAR: those known (F,), and further ones about every 50 ms where they are farther apart.
+    """Stamps of all turns of the LiDAR: those known (F,), and others about every 50 ms where they are farther apart.
 
-    Tables with key frames alone know two turns a second.
+    Tables with key frames alone know two turns a second. What is nearer than 10 ms to the one before is no turn.
     """
-    missing = np.maximum(np.round(np.diff(t_ns) / TURN_NS).astype(np.int64) - 1, 0)
+    t_ns = t_ns[np.diff(t_ns, prepend=t_ns[0] - MIN_STEP_NS) >= MIN_STEP_NS]
+    step = np.diff(t_ns)
+    missing = np.where(step <= MAX_GAP_NS, np.maximum(np.round(step / TURN_NS).astype(np.int64) - 1, 0), 0)
     first = np.repeat(np.arange(len(missing)), missing)
     number = np.arange(len(first)) - np.repeat(np.cumsum(missing) - missing, missing) + 1
-    step_ns = (np.diff(t_ns) // (missing + 1))[first]
+    step_ns = (step // (missing + 1))[first]
     return np.union1d(t_ns, t_ns[first] + number * step_ns)
 
 
@@ -139,10 +143,11 @@ def _between(
     scene: Scene, lidar: Channel | None, rows: _Rows, stamps: NDArray[np.int64], ends_ns: NDArray[np.int64]
 ) -> _Rows:
     """Interpolate annotations of one instance in consecutive samples (S,) at the turns that end between them."""
-    same = (rows.track_id[1:] == rows.track_id[:-1]) & (np.diff(rows.t_ns) > 0)
+    step_ns = np.diff(rows.t_ns)
+    same = (rows.track_id[1:] == rows.track_id[:-1]) & (step_ns > 0) & (step_ns <= MAX_GAP_NS)
     before = np.flatnonzero(same & (np.diff(rows.sample) == 1))
     first = np.searchsorted(ends_ns, stamps[rows.sample[before]], side="right")
-    count = np.searchsorted(ends_ns, stamps[rows.sample[before + 1]]) - first
+    count = np.maximum(np.searchsorted(ends_ns, stamps[rows.sample[before + 1]]) - first, 0)
     pair = np.repeat(before, count)
     end_ns = ends_ns[np.repeat(first, count) + np.arange(len(pair)) - np.repeat(np.cumsum(count) - count, count)]
     begin_ns, span_ns = rows.t_ns[pair], rows.t_ns[pair + 1] - rows.t_ns[pair]
@@ -225,7 +230,7 @@ def _category(kind: str, attributes: set[str]) -> str:
 def _tokens(annotation: Record, path: Path) -> list[Any]:
     tokens = annotation.get("attribute_tokens", [])
     if not isinstance(tokens, list):
-        raise LogError(f"{path}, token '{str(annotation.get('token'))[:40]}': 'attribute_tokens' is no list")
+        raise LogError(f"{path}, token {str(annotation.get('token'))[:40]!a}: 'attribute_tokens' is no list")
     return tokens
 
 

@@ -1,8 +1,8 @@
 """nuScenes, version 1.0 of the tables: scenes of 20 s with six cameras at 12 Hz and a LiDAR at 20 Hz, labeled at 2 Hz.
 
-The stamp of an image is the trigger of its exposure, that of a sweep the end of its turn. Every record has an ego pose of
-its own. Those of can_bus are the same ones (to 1 mm on scene-0103) at 50 Hz without roll and pitch, so they are not read;
-neither is radar.
+The stamp of an image is the trigger of its exposure, that of a sweep the end of its turn. Every record has an ego pose
+of its own. Those of can_bus are the same ones (to 1 mm on scene-0103) at 50 Hz without roll and pitch, so they are not
+read; neither is radar.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from log2sim.logs.images import MAX_IMAGE_PX, first_image_size, image_stream
 from log2sim.logs.nuscenes.labels import read_labels
 from log2sim.logs.nuscenes.scene import Channel, Scene
 from log2sim.logs.nuscenes.sweeps import sweep_stream
-from log2sim.logs.nuscenes.tables import DATA, SCENES, Record, Tables, numbers_of
+from log2sim.logs.nuscenes.tables import DATA, SCENES, Record, Tables, numbers_of, text_of
 
 REFERENCE_CAMERA = "CAM_FRONT"
 LABELED_LIDAR = "LIDAR_TOP"
 # A Renault Zoe by its data sheet: wheelbase 2.588 m, overhangs 0.839 m in front and 0.657 m behind.
 EGO_VEHICLE = EgoVehicle(size_m=(4.084, 1.73, 1.562), rear_axle_offset_m=1.385)
-# South-western corners of the maps, which are the origins of their coordinates, latitude and longitude, and the sphere on
-# which the nuScenes devkit converts positions (export_poses).
+# South-western corners of the maps, which are the origins of their coordinates, latitude and longitude, and the sphere
+# on which the nuScenes devkit converts positions (export_poses).
 MAP_ORIGIN_DEG = {
     "boston-seaport": (42.336849169438615, -71.05785369873047),
     "singapore-onenorth": (1.2882100868743724, 103.78475189208984),
@@ -79,7 +79,7 @@ def _is_version(path: Path) -> bool:
 
 
 def _scenes(path: Path) -> dict[str, tuple[Tables, str]]:
-    """Tables and name in them of the scenes by sequence; a broken list of scenes is one, so that opening it tells why."""
+    """Tables and name of the scenes by sequence; a broken list of scenes is one, so that opening it tells why."""
     versions = _versions(path)
     scenes = {}
     for folder in versions:
@@ -95,10 +95,10 @@ def _scenes(path: Path) -> dict[str, tuple[Tables, str]]:
 def _scene_records(tables: Tables) -> list[Record]:
     path = tables.path(SCENES)
     records = read_json(path)
-    if not isinstance(records, list) or not all(
-        isinstance(r, dict) and isinstance(r.get("name"), str) for r in records
-    ):
-        raise LogError(f"{path}: expected a list of records with a name")
+    if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
+        raise LogError(f"{path}: expected a list of records")
+    for record in records:
+        text_of(record, "name", path)
     return records
 
 
@@ -227,7 +227,7 @@ class _SceneReader:
         place = MAP_ORIGIN_DEG.get(self.scene.location)
         offset = (float(offset_m[0]), float(offset_m[1]), float(offset_m[2]))
         if place is None:
-            self.notes.append(f"log.json: location '{self.scene.location[:40]}' is not known: the map is only local")
+            self.notes.append(f"log.json: location {self.scene.location[:40]!a} is not known: the map is only local")
             return MapFrame(offset_m=offset)
         latitude, longitude = place
         sphere = f"+proj=aeqd +R={EARTH_RADIUS_M:.0f} +x_0=0 +y_0=0 +units=m +no_defs"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -23,6 +24,9 @@ from log2sim.logs.nuscenes.tables import (
     text_of,
 )
 from log2sim.logs.stamps import strictly_increasing
+
+# Names of sensors become names of files.
+CHANNEL = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +114,10 @@ class Scene:
                     "which calibrated_sensor.json names"
                 )
             name = text_of(sensor, "channel", self.tables.path("sensor"))
+            if not CHANNEL.fullmatch(name):
+                raise LogError(
+                    f"{self.tables.path('sensor')}: channel {name[:40]!a}, expected letters, digits, _ and -"
+                )
             by_name.setdefault(name, []).append((record, calibration | {"modality": sensor.get("modality")}))
         return {name: self._channel(name, by_name[name]) for name in sorted(by_name)}
 

@@ -1,6 +1,6 @@
 """LiDAR files of nuScenes: .pcd.bin, which are no PCD files but rows of five float32.
 
-Verified on sweeps of two vehicles (n008, n015). Files keep the order of firing: 32 rings in turn, 1084 and 1086 firings.
+Verified on sweeps of two vehicles (n008, n015). Files keep the order of firing: 32 rings in turn, 1084 and 1086 times.
 Rays without a return are stored with range 0 and compensated like the others, so they lie where the sensor was: on a
 straight path that ends at the origin with the last firing. The first one is 0.425 m behind at a speed of 8.5 m/s, the
 way of 50 ms. Hence all points are in the frame of the sensor at the end of the turn, which is the stamp. It begins at

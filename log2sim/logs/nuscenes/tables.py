@@ -63,7 +63,7 @@ class Tables:
         if len(found) < len(wanted):
             missing = min(wanted - found.keys())
             raise LogError(
-                f"{path}: no record with token '{missing[:40]}', which another table names "
+                f"{path}: no record with token {missing[:40]!a}, which another table names "
                 f"({len(wanted) - len(found)} of {len(wanted)} are missing)"
             )
         return found
@@ -84,7 +84,7 @@ def scan_records(path: Path, key: str, values: Collection[str], chunk_bytes: int
         For a table that is missing or does not begin and end as a list, or a wanted record that is not valid JSON.
     """
     wanted = frozenset(values)
-    plain = frozenset(value.encode() for value in wanted)
+    plain = frozenset(value.encode(errors="replace") for value in wanted)
     entry = re.compile(rb'"' + re.escape(key.encode()) + rb'"\s*:\s*"([^"]*)"')
     for data, begin, end, offset in _windows(path, chunk_bytes):
         found = entry.findall(data, begin)
@@ -145,10 +145,10 @@ def _record_around(data: bytes, at: int, where: str) -> Record:
 
 
 def text_of(record: Record, key: str, path: Path) -> str:
-    """Return a text of a record; `LogError` when it has none."""
+    """Return a text of a record; `LogError` when it has none or one that cannot be printed in a line."""
     value = record.get(key)
-    if not isinstance(value, str):
-        raise LogError(f"{_place(record, path)}: '{key}' is {_shown(value)}, expected a text")
+    if not isinstance(value, str) or not value.isprintable():
+        raise LogError(f"{_place(record, path)}: '{key}' is {_shown(value)}, expected a text in one line")
     return value
 
 
@@ -179,7 +179,7 @@ def numbers_of(records: list[Record], key: str, shape: tuple[int, ...], path: Pa
 def quaternions_of(records: list[Record], path: Path) -> Array:
     """Return the rotations of records, unit quaternions (R, 4) scalar-first; `LogError` for one that is not."""
     q = numbers_of(records, "rotation", (4,), path)
-    bad = np.flatnonzero(np.abs(np.linalg.norm(q, axis=1) - 1) > 1e-3)
+    bad = np.flatnonzero(np.abs(np.linalg.norm(np.clip(q, -2, 2), axis=1) - 1) > 1e-3)
     if len(bad):
         raise LogError(
             f"{_place(records[bad[0]], path)}: 'rotation' is {q[bad[0]].tolist()}, expected a unit quaternion"
@@ -188,7 +188,7 @@ def quaternions_of(records: list[Record], path: Path) -> Array:
 
 
 def _place(record: Record, path: Path) -> str:
-    return f"{path}, token '{str(record.get('token'))[:40]}'"
+    return f"{path}, token {str(record.get('token'))[:40]!a}"
 
 
 def _shown(value: Any) -> str:
