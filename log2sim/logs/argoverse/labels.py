@@ -14,8 +14,8 @@ from log2sim.datatypes import Labels
 from log2sim.errors import LogError
 from log2sim.geometry import Array, PoseTrack
 from log2sim.logs.argoverse.poses import TRANSFORM, transforms_of
-from log2sim.logs.arrow_tables import read_columns
-from log2sim.logs.arrow_values import Kind
+from log2sim.logs.arrow.tables import read_columns
+from log2sim.logs.arrow.values import Kind
 
 SIZE = ("length_m", "width_m", "height_m")
 COLUMNS: dict[str, Kind] = {

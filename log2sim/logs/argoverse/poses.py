@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from log2sim.errors import LogError
 from log2sim.geometry import Array, PoseTrack, rotation_from_quaternion, transform
-from log2sim.logs.arrow_tables import read_columns
-from log2sim.logs.arrow_values import Kind
+from log2sim.logs.arrow.tables import read_columns
+from log2sim.logs.arrow.values import Kind
 from log2sim.logs.stamps import strictly_increasing
 
 QUATERNION = ("qw", "qx", "qy", "qz")

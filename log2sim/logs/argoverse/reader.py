@@ -26,8 +26,8 @@ from log2sim.logs.argoverse.cities import find_city, map_frame_of
 from log2sim.logs.argoverse.labels import read_labels
 from log2sim.logs.argoverse.poses import read_ego_track, read_mounts
 from log2sim.logs.argoverse.sweeps import LIDARS, sweep_stream
-from log2sim.logs.arrow_tables import read_columns
-from log2sim.logs.arrow_values import Kind
+from log2sim.logs.arrow.tables import read_columns
+from log2sim.logs.arrow.values import Kind
 from log2sim.logs.digest import digest_of
 from log2sim.logs.images import MAX_IMAGE_PX, image_stream
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Stream, Sweep
 from log2sim.errors import RecordError
 from log2sim.geometry import Array, apply, inverse
-from log2sim.logs.arrow_tables import TableLimits, read_columns
-from log2sim.logs.arrow_values import Kind
+from log2sim.logs.arrow.tables import TableLimits, read_columns
+from log2sim.logs.arrow.values import Kind
 from log2sim.logs.sweeps import MAX_SWEEP_BYTES, MAX_SWEEP_POINTS, sweep_of
 
 # First laser number of each LiDAR. On the sample log the elevations of a laser's points, seen from the LiDAR that this table

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from log2sim.errors import LogError
 from log2sim.geometry import Array
-from log2sim.logs.arrow_tables import read_columns
-from log2sim.logs.arrow_values import Kind
+from log2sim.logs.arrow.tables import read_columns
+from log2sim.logs.arrow.values import Kind
 from log2sim.logs.waymo.segment import CAMERAS, LASERS, BoxTable, CameraCalibration, ImageTimes, LaserCalibration, rigid
 
 Columns = dict[str, NDArray[Any]]

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.logs.arrow_tables import read_columns
-from log2sim.logs.arrow_values import Kind
-from log2sim.logs.parquet_rows import ParquetRows, Row
+from log2sim.logs.arrow.tables import read_columns
+from log2sim.logs.arrow.values import Kind
+from log2sim.logs.arrow.parquet_rows import ParquetRows, Row
 from log2sim.logs.waymo.components import CAMERA, STAMP, Columns, numbers_of
 
 
@@ -22,7 +22,7 @@ class RecordColumns:
     Attributes
     ----------
     kinds : mapping of str to str
-        What each column holds, as for `log2sim.logs.arrow_tables.read_columns`.
+        What each column holds, as for `log2sim.logs.arrow.tables.read_columns`.
     optional : collection of str
         Names that may be absent.
     """

@@ -1,6 +1,6 @@
 """Columns of feather (Arrow IPC) and parquet files as NumPy arrays; needs the extra "parquet" (pyarrow).
 
-`read_columns` reads chosen columns of a whole file, `log2sim.logs.parquet_rows.ParquetRows` single rows of a large parquet
+`read_columns` reads chosen columns of a whole file, `log2sim.logs.arrow.parquet_rows.ParquetRows` single rows of a large parquet
 file. What a feather file claims (rows, sizes once decompressed) is checked against `TableLimits` before anything is allocated;
 parquet files are unpacked piece by piece up to the limits. What pyarrow returns is validated before it is used: pyarrow itself
 trusts the offsets of text and lists that it reads.
@@ -17,8 +17,8 @@ from typing import Any
 from numpy.typing import NDArray
 
 from log2sim.errors import LogError, MissingExtra
-from log2sim.logs.arrow_ipc import ARROW_MAGIC, claimed_size
-from log2sim.logs.arrow_values import Kind, values_of
+from log2sim.logs.arrow.ipc import ARROW_MAGIC, claimed_size
+from log2sim.logs.arrow.values import Kind, values_of
 
 PARQUET_MAGIC = b"PAR1"
 # Before this version a file could make pyarrow unpickle (CVE-2023-47248); it is also the least that the extra asks for.

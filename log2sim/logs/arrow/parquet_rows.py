@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from log2sim.errors import LogError, RecordError
-from log2sim.logs.arrow_tables import LIMITS, TableLimits, check_rows, checked_schema, import_pyarrow, told_errors
-from log2sim.logs.arrow_values import Kind, values_of
+from log2sim.logs.arrow.tables import LIMITS, TableLimits, check_rows, checked_schema, import_pyarrow, told_errors
+from log2sim.logs.arrow.values import Kind, values_of
 
 # Rows that were read a moment ago or on the way to others are kept up to this size.
 MAX_KEPT_BYTES = 256 * 1024**2
@@ -30,7 +30,7 @@ class ParquetRows:
     ----------
     path : Path
     wanted : mapping of str to str
-        The columns of a row and what they hold, as for `log2sim.logs.arrow_tables.read_columns`.
+        The columns of a row and what they hold, as for `log2sim.logs.arrow.tables.read_columns`.
     optional : collection of str
         Names out of `wanted` that may be absent.
     limits : TableLimits

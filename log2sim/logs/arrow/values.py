@@ -11,7 +11,7 @@ Kind = Literal["float", "int", "bool", "text", "bytes", "floats", "ints"]
 
 
 def values_of(column: Any, kind: Kind) -> NDArray[Any]:
-    """Convert a validated pyarrow array of N values; `log2sim.logs.arrow_tables.read_columns` describes the kinds.
+    """Convert a validated pyarrow array of N values; `log2sim.logs.arrow.tables.read_columns` describes the kinds.
 
     Raises
     ------

@@ -1,0 +1,1 @@
+"""Feather and parquet files as NumPy columns, with limits."""
