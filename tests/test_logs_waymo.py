@@ -172,6 +172,14 @@ def test_labels_drawn_in_images_serve_where_none_are_projected(segment: waymo.Se
     assert "labels of images are the boxes drawn in them" in log.notes
 
 
+def test_zones_without_labels_are_counted(segment: waymo.Segment, tmp_path: Path) -> None:
+    frames = [waymo.frame_message(segment, frame) for frame in segment.frames[:3]]
+    zone = waymo.message(7, waymo.fixed64(1, 1.0) * 3 + waymo.fixed64(2, 2.0) * 3)
+    path = tmp_path / "a.tfrecord"
+    path.write_bytes(b"".join(waymo.record(data) for data in (frames[0] + 2 * zone, frames[1], frames[2] + zone)))
+    assert "2 of 3 frames have zones in which objects are not labeled" in open_log(path).notes
+
+
 def test_a_camera_looks_along_its_x_axis() -> None:
     """Closed form: u = f (-y / x), v = f (-z / x) with OpenCV's lens on both, in the data set's axes."""
     rng = np.random.default_rng(5)
@@ -228,9 +236,9 @@ def test_opening_reads_neither_pictures_nor_points(
 ) -> None:
     big = waymo.Ranges([np.random.default_rng(0).normal(size=(64, 200, 4)).astype(np.float32)])
     path = write(changed(segment, lambda f: f.lasers.update({1: big}), *range(10)), tmp_path / "a.tfrecord")
-    read = []
-    pread = tfrecord.os.pread
-    monkeypatch.setattr(tfrecord.os, "pread", lambda file, size, at: read.append(size) or pread(file, size, at))
+    read: list[int] = []
+    read_at = tfrecord.read_at
+    monkeypatch.setattr(tfrecord, "read_at", lambda file, at, size: read.append(size) or read_at(file, at, size))
     monkeypatch.setattr(tfrecord.RecordFile, "read", None)
     log = open_log(path)
     assert len(log.streams["LIDAR_TOP"].t_ns) == 10
@@ -318,6 +326,28 @@ def test_a_segment_with_pictures_alone_has_no_lidar(segment: waymo.Segment, tmp_
     assert list(log.streams) == ["FRONT"]
     assert log.labels is not None
     assert "the frames hold no range images: there are no sweeps" in log.notes
+
+
+def test_a_segment_without_pictures_takes_the_middle_of_the_turn(segment: waymo.Segment, tmp_path: Path) -> None:
+    log = open_log(write(changed(segment, lambda frame: frame.images.clear(), *range(10)), tmp_path / "a.tfrecord"))
+    assert not log.cameras
+    assert log.reference_camera is None
+    starts = np.array([frame.stamp_us * 1000 for frame in segment.frames])
+    np.testing.assert_array_equal(log.streams["LIDAR_TOP"].t_ns, starts + waymo.PERIOD_NS // 2)
+    assert any("is missing there: the middle of the LiDAR's turn is assumed" in note for note in log.notes)
+
+
+def test_a_pose_that_is_not_that_of_the_front_image_is_told(segment: waymo.Segment, tmp_path: Path) -> None:
+    def move(frame: waymo.Frame) -> None:
+        moved = frame.images[1].world_T_vehicle.copy()
+        moved[0, 3] += 0.5
+        frame.images[1] = replace(frame.images[1], world_T_vehicle=moved)
+
+    log = open_log(write(changed(segment, move, 3), tmp_path / "a.tfrecord"))
+    assert any("up to 0.50 m from that of the FRONT image" in note for note in log.notes)
+    assert log.ego is not None
+    pose, _ = log.ego.at(log.streams["LIDAR_TOP"].t_ns[3])
+    np.testing.assert_allclose(pose[0, :3, 3] + waymo.WORLD_OFFSET_M, segment.frames[3].world_T_vehicle[:3, 3])
 
 
 def test_a_sensor_without_calibration_is_left_out_with_a_note(segment: waymo.Segment, tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ from log2sim.logs.waymo.range_images import (
 )
 from log2sim.logs.waymo.segment import LaserCalibration, RangeImages
 from log2sim.logs.waymo.tfrecord import RecordFile, starts_like_tfrecord
-from log2sim.logs.waymo.wire import BYTES, WireError, doubles, fields_of, varints
+from log2sim.logs.waymo.wire import BYTES, WireError, doubles, doubles_by_number, fields_of, varints
 
 LASER = LaserCalibration(np.eye(4), np.array([-0.3, -0.1, 0.0, 0.05]), (0.0, 0.0))
 
@@ -175,6 +175,13 @@ def test_repeated_numbers_are_read_packed_or_not() -> None:
     for data in (loose, packed):
         np.testing.assert_array_equal(doubles(data, list(fields_of(data))), values)
     assert varints(varint(3) + varint(2650) + varint(6)) == [3, 2650, 6]
+
+
+@given(st.lists(st.tuples(st.integers(1, 40), st.floats(allow_nan=False))), st.booleans())
+def test_doubles_are_read_by_their_numbers(values: list[tuple[int, float]], mixed: bool) -> None:
+    """With numbers of more than one byte and among other fields as well."""
+    data = b"".join(fixed64(number, value) + (whole(9, number) if mixed else b"") for number, value in values)
+    assert doubles_by_number(data) == values
 
 
 def test_rows_and_columns_look_where_the_schema_says() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from log2sim.geometry import Array
 from log2sim.logs.waymo.segment import CameraCalibration, ImageTimes, LaserCalibration, rigid
 from log2sim.logs.waymo.tfrecord import RecordWindow
-from log2sim.logs.waymo.wire import BYTES, VARINT, Field, WireError, doubles, fields, fields_of, text
+from log2sim.logs.waymo.wire import BYTES, VARINT, Field, WireError, doubles, doubles_by_number, fields, fields_of, text
 
 # Calibration, poses and labels; a larger field of these is none of the data set's.
 MAX_INDEX_BYTES = 16 * 1024 * 1024
@@ -34,6 +34,7 @@ class FrameIndex:
     lasers : dict of LiDAR number to Span of its message
         Only those with a range image.
     labels, camera_labels, projected_labels : list of Span
+    no_label_zones : int
     """
 
     context: Span = (0, 0)
@@ -44,6 +45,7 @@ class FrameIndex:
     labels: list[Span] = field(default_factory=list)
     camera_labels: list[Span] = field(default_factory=list)
     projected_labels: list[Span] = field(default_factory=list)
+    no_label_zones: int = 0
 
 
 def read_index(window: RecordWindow) -> FrameIndex:
@@ -71,6 +73,8 @@ def read_index(window: RecordWindow) -> FrameIndex:
             _add_laser(window, span, index)
         elif f.number == 6:
             index.labels.append(span)
+        elif f.number == 7:
+            index.no_label_zones += 1
         elif f.number == 8:
             index.camera_labels.append(span)
         elif f.number == 9:
@@ -179,7 +183,7 @@ def read_box(data: bytes, dimensions: int) -> tuple[str, int, list[float]] | Non
     box = _submessage(data, found, 1)
     if box is None:
         return None
-    values = {f.number: f.real() for f in fields_of(box) if f.kind != BYTES}
+    values = dict(doubles_by_number(box))
     # Label.Box holds the width, 4, before the length, 5.
     order = (1, 2, 3, 5, 4, 6, 7) if dimensions == 3 else (1, 2, 5, 4, 7)
     track_id = text(data, found[4][-1]) if 4 in found else ""
@@ -232,4 +236,5 @@ def _submessage(data: bytes, found: dict[int, list[Field]], number: int) -> byte
 
 def _transform(data: bytes) -> Any:
     """Return the pose (4, 4) of a Transform; None when it is none."""
-    return rigid(doubles(data, [f for f in fields_of(data) if f.number == 1]))
+    plain = [value for number, value in doubles_by_number(data) if number == 1]
+    return rigid(np.array(plain) if plain else doubles(data, [f for f in fields_of(data) if f.number == 1]))

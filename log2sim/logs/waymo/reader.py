@@ -6,7 +6,8 @@ images and labels are skipped. The format is that of dataset.proto and label.pro
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -40,6 +41,8 @@ from log2sim.logs.waymo.wire import WireError
 SUFFIX = ".tfrecord"
 MAX_STAMP_US = 9_000_000_000_000_000
 
+# Frame, id, type and numbers of a box.
+LabelRow = tuple[int, str, int, list[float]]
 Calibration = tuple[dict[int, CameraCalibration], dict[int, LaserCalibration], dict[str, str]]
 
 
@@ -97,8 +100,11 @@ class _SegmentFile:
         if not frames.index:
             raise LogError(f"{self.path}: no usable frame; {'; '.join(notes) or 'the file is empty'}")
         index, (cameras, lasers, stats) = frames.index, frames.calibration
-        projected = any(f.projected_labels for f in index)
-        drawn = any(f.camera_labels for f in index)
+        self.projected = any(f.projected_labels for f in index)
+        self.boxes_by_camera: dict[int, list[LabelRow]] | None = None
+        zones = sum(f.no_label_zones > 0 for f in index)
+        if zones:
+            notes.append(f"{zones} of {len(index)} frames have zones in which objects are not labeled")
         segment = Segment(
             name=frames.name,
             cameras=cameras,
@@ -107,8 +113,8 @@ class _SegmentFile:
             image=self._image,
             ranges=self._ranges,
             boxes=self._boxes if any(f.labels for f in index) else None,
-            image_boxes=(lambda camera: self._image_boxes(camera, projected)) if projected or drawn else None,
-            image_boxes_are_projected=projected,
+            image_boxes=self._image_boxes if any(f.projected_labels or f.camera_labels for f in index) else None,
+            image_boxes_are_projected=self.projected,
             where=self._where,
             details={**stats, "frames": len(index)},
             notes=notes,
@@ -158,34 +164,35 @@ class _SegmentFile:
             raise RecordError(f"{self._where(frame)}, LiDAR {laser}: {error}") from None
 
     def _boxes(self) -> BoxTable:
-        def boxes(data: bytes) -> list[tuple[str, int, list[float]]]:
-            box = read_box(data, 3)
-            return [] if box is None else [box]
-
-        rows = self._labels(lambda index: index.labels, boxes)
+        rows: list[LabelRow] = []
+        for frame, data in self._messages(lambda index: index.labels):
+            with suppress(WireError):
+                box = read_box(data, 3)
+                rows += [] if box is None else [(frame, *box)]
         return BoxTable.of(rows, 3)
 
-    def _image_boxes(self, camera: int, projected: bool) -> BoxTable:
-        def boxes(data: bytes) -> list[tuple[str, int, list[float]]]:
-            number, found = read_camera_labels(data)
-            return found if number == camera else []
+    def _image_boxes(self, camera: int) -> BoxTable:
+        if self.boxes_by_camera is None:
+            self.boxes_by_camera = self._boxes_of_cameras()
+        return BoxTable.of(self.boxes_by_camera.get(camera, []), 2)
 
-        rows = self._labels(lambda index: index.projected_labels if projected else index.camera_labels, boxes)
-        return BoxTable.of(rows, 2)
+    def _boxes_of_cameras(self) -> dict[int, list[LabelRow]]:
+        """Read the labels of all images, by camera."""
+        out: dict[int, list[LabelRow]] = {}
+        spans = (lambda index: index.projected_labels) if self.projected else (lambda index: index.camera_labels)
+        for frame, data in self._messages(spans):
+            with suppress(WireError):
+                number, boxes = read_camera_labels(data)
+                out.setdefault(number, []).extend((frame, *box) for box in boxes)
+        return out
 
-    def _labels(
-        self, spans: Callable[[FrameIndex], list[Span]], boxes: Callable[[bytes], list[tuple[str, int, list[float]]]]
-    ) -> list[tuple[int, str, int, list[float]]]:
-        """Rows of frame, id, type and box from the spans of messages; a message that cannot be read is left out."""
-        rows = []
+    def _messages(self, spans: Callable[[FrameIndex], list[Span]]) -> Iterator[tuple[int, bytes]]:
+        """Yield frame and bytes of messages of all frames; those that are too large are left out."""
         for k, (record, index) in enumerate(zip(self.frames.record, self.frames.index)):
             with self.file.window(record) as window:
                 for span in spans(index):
-                    try:
-                        rows += [(k, *box) for box in boxes(take_index(window, span))]
-                    except WireError:
-                        continue
-        return rows
+                    with suppress(WireError):
+                        yield k, take_index(window, span)
 
 
 def _row(index: FrameIndex) -> FrameRow:

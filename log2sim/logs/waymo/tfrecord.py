@@ -6,9 +6,9 @@ A record is its length (uint64, little-endian), the masked CRC-32C of these 8 by
 
 from __future__ import annotations
 
-import os
 import struct
 from collections import OrderedDict
+from io import SEEK_END, FileIO
 from pathlib import Path
 from threading import Lock
 
@@ -101,21 +101,21 @@ class RecordFile:
     def _walk(self) -> list[tuple[int, int]]:
         """Find offset and size of the data of all whole records by their lengths."""
         try:
-            with self.path.open("rb") as file:
-                return self._spans(file.fileno(), os.fstat(file.fileno()).st_size)
+            with self.path.open("rb", buffering=0) as file:
+                return self._spans(file, file.seek(0, SEEK_END))
         except OSError as error:
             raise LogError(f"{self.path}: cannot be read: {error.strerror}") from None
 
-    def _spans(self, file: int, total: int) -> list[tuple[int, int]]:
+    def _spans(self, file: FileIO, total: int) -> list[tuple[int, int]]:
         spans: list[tuple[int, int]] = []
         offset = number = 0
         while offset < total:
-            header = os.pread(file, HEADER_BYTES, offset)
+            header = read_at(file, offset, HEADER_BYTES)
             size, where = _length_of(header), f"{self.path}: record {number} at offset {offset}"
             if len(header) == HEADER_BYTES and size is None:
                 end = offset + HEADER_BYTES + int.from_bytes(header[:8], "little") + FOOTER_BYTES
                 # A length with a wrong CRC that leads to the next record or to the end of the file is right all the same.
-                if end != total and (end > total or _length_of(os.pread(file, HEADER_BYTES, end)) is None):
+                if end != total and (end > total or _length_of(read_at(file, end, HEADER_BYTES)) is None):
                     if not spans:
                         raise LogError(f"{where}: the CRC of its length is wrong; expected a TFRecord file")
                     self.notes.append(f"{where}: the CRC of its length is wrong: it and what follows are kept out")
@@ -155,14 +155,20 @@ class RecordWindow:
         end = min(begin + count, self.size)
         if not self._block_begin <= begin or end > self._block_begin + len(self._block):
             wanted = min(BLOCK_BYTES, self.size - begin)
-            self._block, self._block_begin = os.pread(self._file.fileno(), wanted, self._begin + begin), begin
+            self._block, self._block_begin = read_at(self._file, self._begin + begin, wanted), begin
         return self._block[begin - self._block_begin : end - self._block_begin]
 
     def take(self, begin: int, end: int) -> bytes:
         """Return the bytes of a span."""
         if end - begin <= BLOCK_BYTES:
             return self.peek(begin, end - begin)
-        return os.pread(self._file.fileno(), end - begin, self._begin + begin)
+        return read_at(self._file, self._begin + begin, end - begin)
+
+
+def read_at(file: FileIO, begin: int, count: int) -> bytes:
+    """Read up to `count` bytes at an offset, fewer at the end of the file."""
+    file.seek(begin)
+    return file.read(count) or b""
 
 
 def _length_of(header: bytes) -> int | None:
