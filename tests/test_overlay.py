@@ -145,6 +145,15 @@ def test_what_cannot_be_read_is_said(log: Log) -> None:
     assert "is torn" in texts(moment)
 
 
+def test_the_tick_with_the_most_records_is_drawn_unless_another_is_asked_for(log: Log) -> None:
+    top = log.streams["top"]
+    one = replace(log, streams={**log.streams, "top": Stream("top", top.t_ns[:1], top.read)})
+    assert len(read_moment(one).sweeps) == 1
+    assert read_moment(one).at_s <= 0.2
+    assert read_moment(one, at_s=0.5).at_s == pytest.approx(0.5)
+    assert read_moment(log).at_s > 0.2
+
+
 @pytest.mark.parametrize("at_s", [-1.0, 99.0])
 def test_a_time_outside_the_log_is_refused(log: Log, at_s: float) -> None:
     with pytest.raises(ConfigError, match="ticks from 0 to"):

@@ -6,9 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds import camera_ahead
+from scipy.optimize import brentq
+from worlds import Solid, camera_ahead, scan
 
-from log2sim.geometry import apply, inverse, project, rotation_from_rpy, transform
+from log2sim.datatypes import Log
+from log2sim.geometry import PoseTrack, RollingShutter, apply, inverse, project, rotation_from_rpy, transform
+from log2sim.perception.lidar import projection
 from log2sim.perception.lidar.projection import View, points_in_image_boxes, project_points
 
 BROWN = {"distortion_model": "brown", "distortion": (-0.3, 0.1, 0.001, -0.002, -0.02)}
@@ -81,3 +84,65 @@ def test_a_large_cloud_before_a_small_one_leaves_nothing_behind():
     after = project_points(view, np.zeros(3), small)
     np.testing.assert_array_equal(before.index, after.index)
     np.testing.assert_array_equal(before.u, after.u)
+
+
+READOUT_S = 0.05
+T_NS = 10**18
+
+
+def moving_log(lens, direction="right", mount="ego"):
+    """A camera that looks to the side of an ego at 15 m/s on a curve, and reads its columns one after the other."""
+    shutter = None if direction is None else RollingShutter(direction, READOUT_S)
+    camera = replace(camera_ahead(mount=mount, at=(1.0, 0.8, 1.6), yaw_rad=np.pi / 2), rolling_shutter=shutter, **lens)
+    t_s = np.linspace(-0.2, 0.2, 81)
+    yaw = 0.3 + 0.5 * t_s
+    position = np.array([400.0, -300.0, 20.0]) + np.outer(15.0 * t_s, [np.cos(0.3), np.sin(0.3), 0.0])
+    poses = transform(rotation_from_rpy(0 * yaw, 0 * yaw, yaw), position)
+    track = PoseTrack(T_NS + np.round(t_s * 1e9).astype(np.int64), poses)
+    return Log("moving", "memory", {"front": camera}, {}, {}, ego=track)
+
+
+def seen_by_lines(log, points):
+    """Where points (N, 3) of the map are seen: the column that is read at t shows the point as the camera is at t."""
+    camera, out = log.cameras["front"], []
+
+    def at(point, t):
+        pose = log.map_T_sensor("front", T_NS + round(t * 1e9))[0][0]
+        return project(camera, apply(inverse(pose), point[None]))[0][0]
+
+    for point in points:
+        t = brentq(
+            lambda t, p=point: at(p, t)[0] - (0.5 + t / READOUT_S) * camera.width_px, -READOUT_S, READOUT_S, xtol=1e-9
+        )
+        out.append(at(point, t))
+    return np.array(out)
+
+
+@pytest.mark.parametrize("lens", [{}, BROWN], ids=["pinhole", "brown"])
+def test_a_box_in_an_image_read_column_by_column_holds_the_points_of_its_object(lens):
+    log = moving_log(lens)
+    map_T_ego = log.ego.at(T_NS)[0][0]
+    seen, owner = scan([Solid((3.0, 7.0, 0.8))], azimuth_deg=(30.0, 120.0))
+    on_car = apply(map_T_ego, seen[owner == 0][::40])
+    uv = seen_by_lines(log, on_car)
+    assert len(uv) > 50
+    assert ((uv > 0) & (uv < [1200, 600])).all()
+    box = np.concatenate([uv.min(axis=0), uv.max(axis=0)])
+    origin = map_T_ego[:3, 3]
+    columns = np.ascontiguousarray((on_car - origin).T.astype(np.float32))
+    view = projection.view_of(log, "front", T_NS)
+    found = project_points(view, origin, columns)
+    assert found.index.tolist() == list(range(len(on_car)))
+    np.testing.assert_allclose(np.stack([found.u, found.v], axis=1), uv, atol=0.02)
+    assert [len(rows) for rows in points_in_image_boxes(found, box[None] + [-0.1, -0.1, 0.1, 0.1])] == [len(on_car)]
+    # The pose of the middle alone puts some of them beside the box.
+    middle = project_points(replace(view, cam_T_map_at=None), origin, columns)
+    assert np.abs(middle.u - found.u[middle.index]).max() > 10
+    assert len(points_in_image_boxes(middle, box[None])[0]) < len(on_car)
+
+
+def test_only_cameras_that_move_while_they_are_read_take_several_poses():
+    assert projection.view_of(moving_log({}), "front", T_NS).cam_T_map_at is not None
+    assert projection.view_of(moving_log({}, direction=None), "front", T_NS).cam_T_map_at is None
+    assert projection.view_of(moving_log({}, mount="map"), "front", T_NS).cam_T_map_at is None
+    assert projection.view_of(moving_log({}), "front", T_NS + 10**10) is None

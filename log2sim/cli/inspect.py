@@ -23,7 +23,7 @@ def inspect(
         ),
     ] = None,
     at: Annotated[
-        float | None, typer.Option(help="Time to draw, in s after the first tick. [default: middle of the log]")
+        float | None, typer.Option(help="Time to draw, in s after the first tick. [default: in the middle]")
     ] = None,
     cameras: Cameras = None,
     overwrite: Overwrite = False,

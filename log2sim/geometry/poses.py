@@ -83,6 +83,8 @@ class PoseTrack:
         last = len(self.t_ns) - 1
         after = np.clip(np.searchsorted(self.t_ns, t_ns, side="right"), 1, last)
         second = min(int(np.searchsorted(self.t_ns, self.t_ns[0] + MIN_EXTRAPOLATION_BASE_NS)), last)
-        second_last = max(int(np.searchsorted(self.t_ns, self.t_ns[-1] - MIN_EXTRAPOLATION_BASE_NS, side="right")) - 1, 0)
+        second_last = max(
+            int(np.searchsorted(self.t_ns, self.t_ns[-1] - MIN_EXTRAPOLATION_BASE_NS, side="right")) - 1, 0
+        )
         start, end = t_ns < self.t_ns[0], t_ns > self.t_ns[-1]
         return np.where(end, second_last, after - 1), np.where(start, second, after)

@@ -14,7 +14,7 @@ from log2sim.geometry.transforms import Array
 # Poses during the readout; between them image coordinates are interpolated. A camera that turns at 1 rad/s with 2000 px focal
 # length and 0.1 s of readout moves its image by 12 px between two of them, of which interpolation leaves less than 0.1 px.
 KNOTS = 17
-ITERATIONS = 2
+ITERATIONS = 3
 
 
 def line_time_s(camera: Camera, uv_px: Array) -> Array:

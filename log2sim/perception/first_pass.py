@@ -20,7 +20,7 @@ from log2sim.perception.late_fusion import join_with_images, match_boxes
 from log2sim.perception.lidar.cloud import Cloud, cloud_origin
 from log2sim.perception.lidar.measure import measure_view, project_cloud
 from log2sim.perception.lidar.measure_boxes import measure_boxes, outside_ego
-from log2sim.perception.lidar.projection import View
+from log2sim.perception.lidar.projection import View, view_of
 from log2sim.perception.prefetch import CloudOptions, CloudPrefetcher, obstacles_of
 from log2sim.perception.sync import Schedule
 from log2sim.plan import Plan, Stage
@@ -150,8 +150,7 @@ class _FirstPass:
     def _view(self, camera: str, tick: int) -> View | None:
         """Return a camera's frame of a tick; None where its pose is not known."""
         t_ns = int(self.log.streams[camera].t_ns[self.schedule.frames[camera][tick]])
-        map_T_cam, known = self.log.map_T_sensor(camera, t_ns)
-        return View(self.log.cameras[camera], t_ns, map_T_cam[0]) if known[0] else None
+        return view_of(self.log, camera, t_ns)
 
     def _measure_camera(self, view: View, tick: int, detections: Detections, cloud: Cloud | None) -> Measurements:
         measured = measure_view(view, detections, cloud, mode=self.mode)

@@ -3,17 +3,32 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import MIN_DEPTH_M, Array, Camera, fold_radius, project, undistort
+from log2sim.datatypes import Log
+from log2sim.geometry import (
+    MIN_DEPTH_M,
+    NS_PER_S,
+    Array,
+    Camera,
+    fold_radius,
+    inverse,
+    project,
+    project_moving,
+    transform,
+    undistort,
+)
 
 BORDER_SAMPLES = 33
 # Margin for the curvature of the image border between its samples, and the widest frustum, both as tangents.
 SLACK, WIDEST = 0.01, 20.0
+# By how much, as a tangent, a point may move in the image while it is read: 0.05 s at 1 rad/s and 30 m/s past what is 10 m away.
+READOUT_SLACK = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,11 +41,14 @@ class View:
     t_ns : int
     map_T_cam : (4, 4) float64
         Pose at the stamp.
+    cam_T_map_at : callable or None
+        Transforms (K, 4, 4) at times (K,), s, relative to the stamp, for an image whose lines are exposed one after the other.
     """
 
     camera: Camera
     t_ns: int
     map_T_cam: Array
+    cam_T_map_at: Callable[[Array], Array] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +69,30 @@ class ProjectedPoints:
     u: NDArray[np.float32]
     v: NDArray[np.float32]
     depth: NDArray[np.float32]
+
+
+def view_of(log: Log, camera: str, t_ns: int) -> View | None:
+    """Return the view of a camera's frame at its stamp; None where its pose is not known."""
+    map_T_cam, known = log.map_T_sensor(camera, t_ns)
+    if not known[0]:
+        return None
+    sensor = log.cameras[camera]
+    moves = sensor.rolling_shutter is not None and sensor.mount == "ego"
+    return View(sensor, t_ns, map_T_cam[0], poses_around(log, camera, t_ns) if moves else None)
+
+
+def poses_around(log: Log, camera: str, t_ns: int) -> Callable[[Array], Array]:
+    """Return a function of times (K,), s, relative to a stamp: transforms (K, 4, 4) of the map to a camera.
+
+    Where no pose is known it is that of the stamp, which must be known.
+    """
+
+    def cam_T_map_at(t_s: Array) -> Array:
+        stamps = t_ns + np.round(np.append(t_s, 0.0) * NS_PER_S).astype(np.int64)
+        map_T_cam, known = log.map_T_sensor(camera, stamps)
+        return inverse(np.where(known[:-1, None, None], map_T_cam[:-1], map_T_cam[-1]))
+
+    return cam_T_map_at
 
 
 class _Workspace(threading.local):
@@ -76,8 +118,11 @@ def project_points(view: View, origin: Array, columns: NDArray[np.float32]) -> P
     Notes
     -----
     One product in single precision rotates the points and applies the intrinsics; points outside the frustum are dropped
-    before the division by depth. With a lens distortion the remaining points are projected in double precision.
+    before the division by depth. With a lens distortion the remaining points are projected in double precision; so they are
+    where the camera moves while its lines are read, each point by the pose at the time of its line.
     """
+    if view.cam_T_map_at is not None:
+        return _project_by_lines(view, origin, columns)
     camera, cam_R_map = view.camera, view.map_T_cam[:3, :3].T
     offset = cam_R_map @ (origin - view.map_T_cam[:3, 3])
     lens = camera.distortion_model != "none"
@@ -102,6 +147,22 @@ def project_points(view: View, origin: Array, columns: NDArray[np.float32]) -> P
     uv, inside = project(camera, turned[:, index].T)
     u, v = uv[inside].T.astype(np.float32)
     return ProjectedPoints(index[inside], u, v, depth[inside])
+
+
+def _project_by_lines(view: View, origin: Array, columns: NDArray[np.float32]) -> ProjectedPoints:
+    """Project points as `project_points` does, each by the pose at which its line is exposed."""
+    assert view.cam_T_map_at is not None
+    cam_T_map_at = view.cam_T_map_at
+    offset = view.map_T_cam[:3, :3].T @ (origin - view.map_T_cam[:3, 3])
+    rough = view.map_T_cam[:3, :3].T.astype(np.float32) @ columns + offset.astype(np.float32)[:, None]
+    low, high = (edge.astype(np.float32)[:, None] for edge in _frustum(view.camera))
+    near = (rough[:2] >= (low - READOUT_SLACK) * rough[2]) & (rough[:2] <= (high + READOUT_SLACK) * rough[2])
+    index = np.flatnonzero(near.all(axis=0) & (rough[2] > MIN_DEPTH_M))
+    map_T_origin = transform(np.eye(3), origin)
+    points = columns[:, index].T.astype(np.float64)
+    uv, depth, inside = project_moving(view.camera, points, lambda t_s: cam_T_map_at(t_s) @ map_T_origin)
+    u, v = uv[inside].T.astype(np.float32)
+    return ProjectedPoints(index[inside], u, v, depth[inside].astype(np.float32))
 
 
 @lru_cache(maxsize=64)

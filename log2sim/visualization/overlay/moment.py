@@ -18,13 +18,13 @@ from log2sim.geometry import (
     apply,
     box_corners,
     box_lines,
-    inverse,
     line_time_s,
     project_boxes,
     project_moving,
 )
 from log2sim.perception.detect.label_motion import MAX_AGE_S, LabelBoxes, interpolate_pairs, window_ns
 from log2sim.perception.lidar.cloud import compensation_of, sweep_to_map
+from log2sim.perception.lidar.projection import poses_around
 from log2sim.perception.sync import Schedule, synchronize
 
 # Stamps of labels and frames of one moment differ by rounding in some logs.
@@ -124,7 +124,7 @@ def read_moment(log: Log, cameras: Sequence[str] = (), at_s: float | None = None
     cameras : sequence of str
         All of the log where it is empty.
     at_s : float, optional
-        Time of the tick since the first one, s; the middle of the log by default.
+        Time of the tick since the first one, s; by default in the middle of those with the most records.
 
     Raises
     ------
@@ -188,7 +188,10 @@ def _standing(log: Log) -> Log:
 
 def _find_tick(schedule: Schedule, at_s: float | None) -> int:
     if at_s is None:
-        return len(schedule) // 2
+        rows = [*schedule.frames.values(), *(index[schedule.reference_row] for index in schedule.sweeps.values())]
+        records = np.sum([index >= 0 for index in rows], axis=0)
+        fullest = np.flatnonzero(records == records.max())
+        return int(fullest[len(fullest) // 2])
     seconds = (schedule.t_ns - schedule.t_ns[0]) / NS_PER_S
     slack = 0.5 * float(np.diff(seconds).max(initial=0.0)) + 1e-9
     if not -slack <= at_s <= seconds[-1] + slack:
@@ -246,7 +249,7 @@ def _shot(log: Log, schedule: Schedule, reader: _SweepReader, row: int, tick: in
         return replace(shot, problem="no ego pose at the stamp of the image")
     sweeps = reader.at(schedule, row, tick)
     points = np.concatenate([s.xyz for s in sweeps]) if sweeps else np.zeros((0, 3))
-    uv, depth, valid = project_moving(camera, points, lambda t_s: _cam_T_map(log, name, t_ns, t_s))
+    uv, depth, valid = project_moving(camera, points, poses_around(log, name, t_ns))
     return replace(
         shot,
         uv_px=uv[valid],
@@ -256,24 +259,15 @@ def _shot(log: Log, schedule: Schedule, reader: _SweepReader, row: int, tick: in
     )
 
 
-def _cam_T_map(log: Log, name: str, t_ns: int, t_s: Array) -> Array:
-    """Compute poses (K, 4, 4) at times (K,) around a stamp; where none is known, that of the stamp."""
-    at = t_ns + np.round(t_s * NS_PER_S).astype(np.int64)
-    map_T_cam, known = log.map_T_sensor(name, np.append(at, t_ns))
-    map_T_cam[:-1][~known[:-1]] = map_T_cam[-1]
-    return np.array([inverse(pose) for pose in map_T_cam[:-1]])
-
-
 def _wireframes(log: Log, camera: Camera, t_ns: int) -> tuple[tuple[Array, str], ...]:
     """Project the edges of the labels at a stamp; each box takes the pose of the line that shows its center."""
     boxes = labels_at(log.labels, t_ns)
-    seen = project_boxes(
-        boxes.center_m, boxes.size_m, boxes.yaw_rad, camera, _cam_T_map(log, camera.name, t_ns, np.zeros(1))[0]
-    )
+    cam_T_map_at = poses_around(log, camera.name, t_ns)
+    seen = project_boxes(boxes.center_m, boxes.size_m, boxes.yaw_rad, camera, cam_T_map_at(np.zeros(1))[0])
     out = []
     for i in np.flatnonzero(seen.valid):
         middle_px = seen.box_px[i].reshape(2, 2).mean(axis=0)[None]
-        cam_T_map = _cam_T_map(log, camera.name, t_ns, line_time_s(camera, middle_px))[0]
+        cam_T_map = cam_T_map_at(line_time_s(camera, middle_px))[0]
         corners = box_corners(boxes.center_m[i], boxes.size_m[i], boxes.yaw_rad[i])[0]
         out.append((box_lines(camera, apply(cam_T_map, corners)), str(boxes.category[i])))
     return tuple(out)
