@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from log_encoders import waymo
 from log_encoders.world import labels_at, world_log
 
+from log2sim.config import Config
 from log2sim.datatypes import Log, Stream
 from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.geometry import Camera, apply, box_iou, inverse, points_in_box, project, project_boxes, wrap_angle
@@ -23,6 +24,7 @@ from log2sim.logs.opening import open_log
 from log2sim.logs.waymo import tfrecord
 from log2sim.logs.waymo.assembly import PACIFICA, camera_of, ego_vehicle_of
 from log2sim.logs.waymo.segment import CameraCalibration, LaserCalibration
+from log2sim.pipeline import reconstruct
 
 START_BYTES = 12
 
@@ -447,3 +449,35 @@ def test_the_recorded_boxes_project_onto_their_projected_labels(recorded: Log) -
     assert np.median(overlaps) > 0.97
     assert min(overlaps) > 0.8
     assert isinstance(recorded.cameras["FRONT"], Camera)
+
+
+@pytest.mark.real
+def test_the_recorded_frame_is_reconstructed_from_its_labels(recorded: Log) -> None:
+    """One moment without LiDAR: objects are placed by the road that the cameras see, the near ones to about a meter."""
+    scenario = reconstruct(recorded, Config.load(detect={"name": "labels"})).scenario
+    assert recorded.labels is not None
+    assert scenario.ego is not None
+    at = {agent.id: np.array([agent.waypoints.x_m[0], agent.waypoints.y_m[0]]) for agent in scenario.agents}
+    ego = at.pop("ego")
+    near = [place for place in at.values() if np.linalg.norm(place - ego) < 30.0]
+    off = [np.linalg.norm(recorded.labels.center_m[:, :2] - place, axis=1).min() for place in near]
+    assert len(near) >= 10
+    assert np.median(off) < 1.5
+
+
+@pytest.mark.slow
+def test_the_scenario_is_that_of_the_world_itself(world: Log, log: Log) -> None:
+    """Written in the format and read again, by pictures with LiDAR and by LiDAR alone."""
+    for detector in ("labels", "lidar:labels"):
+        ours, theirs = (
+            {agent.id: agent for agent in reconstruct(of, Config.load(detect={"name": detector})).scenario.agents}
+            for of in (log, world)
+        )
+        assert set(ours) == set(theirs)
+        for name, agent in theirs.items():
+            t_s = agent.waypoints.t_s[[0, -1]]
+            for axis in ("x_m", "y_m"):
+                # Where a scenario begins differs by the stamps of the first tick.
+                np.testing.assert_allclose(
+                    getattr(ours[name].at(t_s, margin_s=0.1), axis), getattr(agent.at(t_s), axis), atol=0.15
+                )
