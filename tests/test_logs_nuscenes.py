@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from log_encoders.nuscenes import TURN_NS, encode, hdl32_world
 from log_encoders.world import labels_at
 
+from log2sim import Config, reconstruct
 from log2sim.datatypes import Labels, Log
 from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.geometry import NS_PER_S, apply, inverse, points_in_box
@@ -396,6 +397,23 @@ def test_coordinates_of_far_maps_are_made_small(root: Path, spoilable: Path) -> 
     np.testing.assert_allclose(log.labels.center_m, near.labels.center_m, atol=1e-6)
 
 
+def test_key_frames_alone_give_a_scenario(tmp_path: Path) -> None:
+    """Ticks of a download without sweeps are its key frames, here five in a second."""
+    root = encode(hdl32_world(), tmp_path, key_every=2)
+    for file in root.glob("sweeps/*/*"):
+        file.unlink()
+    log, world = open_log(root), hdl32_world()
+    assert {len(stream.t_ns) for stream in log.streams.values()} == {5}
+    scenario = reconstruct(log, Config.load(detect={"name": "lidar:labels"})).scenario
+    cars = [agent for agent in scenario.others if agent.category == "car"]
+    assert len(cars) == 2
+    moving = max(cars, key=lambda agent: float(agent.waypoints.speed_mps.max()))
+    assert moving.waypoints.speed_mps == pytest.approx(4.0, abs=0.3)
+    t_ns = scenario.t0_ns + np.round(moving.waypoints.t_s * NS_PER_S).astype(np.int64)
+    center, _, _ = labels_at(world.labels, t_ns, "car")
+    np.testing.assert_allclose(np.stack([moving.waypoints.x_m, moving.waypoints.y_m], axis=1), center[:, :2], atol=0.2)
+
+
 @pytest.fixture(scope="module")
 def scene() -> Log:
     folder = SHARED / "data" / "nuscenes_mini"
@@ -461,3 +479,10 @@ def test_the_recorded_road_is_at_the_ego_s_origin_and_boxes_hold_points(scene: L
     counts = [points_in_box(xyz, labels.center_m[k], labels.size_m[k] + 0.1, labels.yaw_rad[k]).sum() for k in near]
     assert len(counts) >= 2
     assert min(counts) >= 10
+
+
+@pytest.mark.real
+def test_a_scenario_lasts_as_long_as_the_recorded_images_that_are_there(scene: Log) -> None:
+    result = reconstruct(scene, Config.load(detect={"name": "labels"}))
+    assert result.scenario.duration_s == pytest.approx(0.5, abs=0.1)
+    assert len(result.scenario.agents) > 10
