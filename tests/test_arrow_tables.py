@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from log2sim.errors import LogError, MissingExtra, RecordError
-from log2sim.logs import parquet_rows
+from log2sim.logs.arrow import parquet_rows
 from log2sim.logs.arrow.ipc import claimed_size
-from log2sim.logs.arrow.tables import TableLimits, read_columns
 from log2sim.logs.arrow.parquet_rows import ParquetRows
+from log2sim.logs.arrow.tables import TableLimits, read_columns
 
 pa = pytest.importorskip("pyarrow")
 feather = pytest.importorskip("pyarrow.feather")

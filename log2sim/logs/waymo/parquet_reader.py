@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Log
 from log2sim.errors import RecordError
+from log2sim.logs.arrow.parquet_rows import Row
 from log2sim.logs.arrow.tables import read_columns
 from log2sim.logs.arrow.values import Kind
 from log2sim.logs.digest import digest_of
-from log2sim.logs.arrow.parquet_rows import Row
 from log2sim.logs.waymo import components
 from log2sim.logs.waymo.assembly import log_of
 from log2sim.logs.waymo.components import IMAGE, LASER, LIDAR_RETURNS, PIXEL_POSES, STAMP

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from log2sim.logs.arrow.parquet_rows import ParquetRows, Row
 from log2sim.logs.arrow.tables import read_columns
 from log2sim.logs.arrow.values import Kind
-from log2sim.logs.arrow.parquet_rows import ParquetRows, Row
 from log2sim.logs.waymo.components import CAMERA, STAMP, Columns, numbers_of
 
 
