@@ -227,11 +227,12 @@ def compensation_of(log: Log, lidar: str, sweep: Sweep) -> str:
 def cloud_origin(log: Log, t_ns: int) -> tuple[Array, float]:
     """Origin (3,) of a tick's clouds in the map frame, and the height of the ground there.
 
-    Without ego it is the middle of the sensors, with the ground taken from `ground_z_ego_m` as a height in the map.
+    Without ego it is the middle of the sensors whose poses are known, with the ground taken from `ground_z_ego_m` as a height in the map.
     """
     if log.ego is not None:
         map_T_ego, _ = log.ego.at(t_ns)
         ground = map_T_ego[0] @ np.array([0.0, 0.0, log.ground_z_ego_m, 1.0])
         return map_T_ego[0, :3, 3].copy(), float(ground[2])
-    places = [log.map_T_sensor(name, t_ns)[0][0, :3, 3] for name in (*log.lidars, *log.cameras)]
-    return np.mean(places, axis=0), log.ground_z_ego_m
+    poses = [log.map_T_sensor(name, t_ns) for name in (*log.lidars, *log.cameras)]
+    places = [map_T_sensor[0, :3, 3] for map_T_sensor, known in poses if known[0]]
+    return np.mean(places, axis=0) if places else np.zeros(3), log.ground_z_ego_m
