@@ -39,11 +39,14 @@ class Scatter:
     Attributes
     ----------
     neighbors_m, apart_m : (K,) float64, m
-        RMS over the surfaces of each pair of neighbors, and of sweeps `APART_S` apart; NaN for a pair that shows too little.
+        RMS over the surfaces of each pair of neighbors, and of sweeps `apart_s` apart; NaN for a pair that shows too little.
+    apart_s : float, s
+        `APART_S`, or half of a shorter log.
     """
 
     neighbors_m: Array
     apart_m: Array
+    apart_s: float
 
 
 def compare_poses(log: Log, lidar: str, tracks: Mapping[str, PoseTrack], t_ns: NDArray[np.int64]) -> dict[str, Scatter]:
@@ -70,10 +73,9 @@ def compare_poses(log: Log, lidar: str, tracks: Mapping[str, PoseTrack], t_ns: N
             found[name].append(_distances(library, sweeps, track))
     table = {name: np.array(rows).reshape(-1, 2) for name, rows in found.items()}
     usable = np.isfinite(np.stack(list(table.values()))).all(axis=0)
-    return {
-        name: Scatter(np.where(usable[:, 0], rows[:, 0], np.nan), np.where(usable[:, 1], rows[:, 1], np.nan))
-        for name, rows in table.items()
-    }
+    apart_s = float(np.median(t_ns[second] - t_ns[first])) / NS_PER_S
+    columns = {name: np.where(usable, rows, np.nan) for name, rows in table.items()}
+    return {name: Scatter(rows[:, 0], rows[:, 1], apart_s) for name, rows in columns.items()}
 
 
 def _distances(library: ModuleType, sweeps: list[EgoSweep | None], track: PoseTrack) -> tuple[float, float]:

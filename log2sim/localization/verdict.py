@@ -56,7 +56,11 @@ def compare_with_given(log: Log, found: Odometry, track: PoseTrack) -> Verdict:
     both = compare_poses(log, found.lidar, {"given": log.ego, "lidar": track}, found.t_ns)
     scatter = {source: {name: _rms(_column(rows, name)) for name in PAIRS_OF} for source, rows in both.items()}
     excess = {name: _excess(_column(both["given"], name), _column(both["lidar"], name)) for name in PAIRS_OF}
-    words, unsure, covered = _words(scatter), unsure_share(found), len(found.t_ns) / max(found.sweeps, 1)
+    words, unsure, covered = (
+        _words(scatter, both["given"].apart_s),
+        unsure_share(found),
+        len(found.t_ns) / max(found.sweeps, 1),
+    )
     if unsure > MAX_UNSURE_SHARE:
         return Verdict(True, f"LiDAR odometry is not sure of {unsure:.0%} of its poses; {words}", excess, scatter)
     if covered < MIN_COVERED_SHARE:
@@ -100,10 +104,10 @@ def _rms(values: Array) -> float | None:
     return rounded(float(np.sqrt(np.mean(finite**2))), 4) if len(finite) else None
 
 
-def _words(scatter: dict[str, Figures]) -> str:
+def _words(scatter: dict[str, Figures], apart_s: float) -> str:
     """Describe both scatters in words."""
     parts = []
-    for name, label in (("apart", "of sweeps seconds apart"), ("neighbors", "of successive sweeps")):
+    for name, label in (("apart", f"of sweeps {apart_s:.1f} s apart"), ("neighbors", "of successive sweeps")):
         given, lidar = scatter["given"][name], scatter["lidar"][name]
         if given is not None and lidar is not None:
             parts.append(f"{label} by {given:.3f} m with the given poses, by {lidar:.3f} m with odometry")
