@@ -87,7 +87,8 @@ def read_labels(scene: Scene, lidar: Channel | None, offset_m: Array, notes: lis
     Notes
     -----
     A box fits the points where they were measured, and the LiDAR sees different directions at different times of its
-    turn: that of a car at 9.5 m/s in the rear ends 2 cm from its points, which were measured 16 ms before the stamp.
+    turn. Of the one fast car with points at hand, the box ends 2 cm from points of 16 ms before the stamp, in which it
+    drove 15 cm.
     Between annotations of an instance in consecutive samples boxes are added for each turn of the LiDAR: positions
     linear, yaw the shorter way, size, category and visibility of the nearer one. `labeled_ns` are the samples alone.
     """
