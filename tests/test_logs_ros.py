@@ -89,13 +89,13 @@ def test_messages_are_those_that_another_library_reads(style: Style, tmp_path: P
     assert {name: len(topic) - 1 for name, topic in bag.topics.items()} == count
 
 
-@pytest.mark.parametrize("poses", ["odometry", "pose", "gnss"])
+@pytest.mark.parametrize("poses", ["odometry", "pose", "covariance", "gnss"])
 def test_every_source_of_poses_gives_the_poses_that_were_written(poses: str, tmp_path: Path) -> None:
     style = Style(poses=poses, ego_T_base=transform(np.eye(3), EGO_T_IMU[:3, 3]))
     log = open_log(written(geodetic_world(), tmp_path, style))
     # GNSS keeps micrometers: PROJ there and back, heading by a difference of 1 m.
     assert_same_log(log, geodetic_world(), 1e-5 if poses == "gnss" else 1e-9)
-    assert [c["source"] for c in log.details["poses"] if c["used"]] == [poses]
+    assert [c["source"] for c in log.details["poses"] if c["used"]] == ["pose" if poses == "covariance" else poses]
 
 
 def test_the_scenario_is_that_of_the_log_in_every_container(tmp_path: Path) -> None:
@@ -130,6 +130,15 @@ def assert_close(ours: Any, theirs: Any, tolerance: float = 1e-6) -> None:
         assert ours == pytest.approx(theirs, abs=tolerance)
     else:
         assert ours == theirs
+
+
+def test_an_antenna_and_an_imu_have_their_own_places(tmp_path: Path) -> None:
+    turned, aside = (
+        transform(rotation_from_rpy(0.1, -0.2, 2.0), [0.5, 0.1, 0.4]),
+        transform(np.eye(3), [-0.8, 0.4, 1.6]),
+    )
+    style = Style(poses="gnss", base_T_imu=turned, base_T_antenna=aside)
+    assert_same_log(open_log(written(geodetic_world(), tmp_path, style)), geodetic_world(), 1e-5)
 
 
 @pytest.mark.parametrize("encoding", ["rgb8", "bgr8"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bz2
 import re
+import shutil
 import struct
 import sys
 from collections.abc import Callable, Iterator
@@ -25,7 +26,8 @@ from log2sim.datatypes import Log, Stream
 from log2sim.errors import ConfigError, LogError, MissingExtra, RecordError
 from log2sim.geometry import NS_PER_S, transform
 from log2sim.logs.ros import messages as ros_messages
-from log2sim.logs.ros.chunked import decompress
+from log2sim.logs.ros.bag import open_container
+from log2sim.logs.ros.chunked import ChunkedFile, decompress
 from log2sim.logs.ros.messages import definition_fields
 from log2sim.logs.ros.recordings import find_recordings
 
@@ -71,12 +73,12 @@ def file_of(path: Path) -> Path:
     return path if path.is_file() else next(path.glob("*.db3"))
 
 
-@pytest.mark.parametrize("style", [Style("bag", "bz2"), Style("mcap", "storage")], ids=["bag", "mcap"])
+@pytest.mark.parametrize("style", [Style("bag", "lz4"), Style("mcap", "storage")], ids=["bag", "mcap"])
 def test_a_damaged_chunk_costs_its_records_only(style: Style, tmp_path: Path) -> None:
     path = bag_of(tmp_path, style)
     whole = open_log(path)
     data = bytearray(path.read_bytes())
-    magic = b"BZh9" if style.container == "bag" else b"\x28\xb5\x2f\xfd"
+    magic = b"\x04\x22\x4d\x18" if style.container == "bag" else b"\x28\xb5\x2f\xfd"
     starts = [match.start() for match in re.finditer(re.escape(magic), data)]
     assert len(starts) > 1
     data[starts[-1] + 40 : starts[-1] + 60] = bytes(20)
@@ -154,6 +156,54 @@ def test_a_wrong_crc_is_an_error_of_the_records_of_that_chunk(tmp_path: Path) ->
     assert len(log.streams["front"].read(0))
 
 
+@pytest.mark.parametrize("container", ["bag", "mcap"])
+def test_a_chunk_that_unpacks_to_more_than_it_says_is_damaged(container: str, tmp_path: Path) -> None:
+    """The first chunk says that it ends soon after its first message; nothing is unpacked beyond that."""
+    path = bag_of(tmp_path, Style("bag", "bz2") if container == "bag" else Style("mcap", "storage"))
+    says = int(open_container(path).entries.place[0]) + 200
+    data = bytearray(path.read_bytes())
+    if container == "bag":
+        place = data.index(b"size=") + 5
+        data[place : place + 4] = struct.pack("<I", says)
+    else:
+        place = 8
+        while data[place] != 6:
+            place += 9 + struct.unpack_from("<Q", data, place + 1)[0]
+        data[place + 25 : place + 33] = struct.pack("<Q", says)
+    path.write_bytes(data)
+    file = open_container(path)
+    assert isinstance(file, ChunkedFile)
+    file.message(0, 12)
+    assert file._begun is not None
+    assert len(file._begun.data) <= says + 1
+    with pytest.raises(ValueError, match=f"unpacks to more than {says} bytes"):
+        file.message(0)
+
+
+def test_messages_of_mcap_between_chunks_are_found(tmp_path: Path) -> None:
+    """One message that no index leads to is inserted behind the last chunk; the statistics count it."""
+    path = write_mcap(tmp_path / "world.mcap", False)
+    before = open_container(path)
+    data = path.read_bytes()
+    place, last = 8, 0
+    while data[place] != 15:
+        place += 9 + struct.unpack_from("<Q", data, place + 1)[0]
+    content = before.message(0)
+    record = struct.pack("<BQHIQQ", 5, 22 + len(content), 1, 0, 77, 77) + content
+    summary, offsets = struct.unpack_from("<QQ", data, len(data) - 28)
+    grown = bytearray(data[:place] + record + data[place:])
+    struct.pack_into("<QQ", grown, len(grown) - 28, summary + len(record), offsets + len(record))
+    last = summary + len(record)
+    while grown[last] != 11:
+        last += 9 + struct.unpack_from("<Q", grown, last + 1)[0]
+    struct.pack_into("<Q", grown, last + 9, len(before.entries.t_ns) + 1)
+    path.write_bytes(grown)
+    after = open_container(path)
+    assert len(after.entries.t_ns) == len(before.entries.t_ns) + 1
+    k = int(np.flatnonzero(after.entries.t_ns == 77)[0])
+    assert after.message(k) == content
+
+
 def test_data_that_unpack_to_more_than_they_say_are_refused() -> None:
     bomb = bz2.compress(bytes(16 << 20))
     assert len(bomb) < 200
@@ -211,6 +261,10 @@ def test_a_missing_file_of_a_rosbag2_folder_is_named(tmp_path: Path) -> None:
     metadata.write_text(metadata.read_text().replace(f"- {name}", f"- {name}\n  - /etc/world_1.db3"))
     log = open_log(path)
     assert any("1 of 2 files of the recording are missing: world_1.db3" in note for note in log.notes)
+    outside = tmp_path / "world_1.db3"
+    shutil.copy(path / name, outside)
+    metadata.write_text(metadata.read_text().replace("/etc/world_1.db3", str(outside)))
+    assert len(open_log(path).streams["top"].t_ns) == len(log.streams["top"].t_ns)
     metadata.write_text(metadata.read_text().replace(f"- {name}", "- gone.db3"))
     with pytest.raises(LogError, match=r"none of the files that it names is there: gone\.db3"):
         open_log(path)

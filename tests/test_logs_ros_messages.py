@@ -352,7 +352,7 @@ LIVOX = (
 )
 
 
-@pytest.mark.parametrize("frame", ["livox_frame", "l"])
+@pytest.mark.parametrize("frame", ["livox_frame", "l", "of7char"])
 @pytest.mark.parametrize("ros1", [True, False])
 def test_clouds_of_the_livox_driver_are_those_that_another_library_writes(ros1: bool, frame: str) -> None:
     name = "livox_ros_driver2/msg/CustomMsg"

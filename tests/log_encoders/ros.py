@@ -30,8 +30,8 @@ class Style:
     """How a log is written.
 
     `container` is "bag", "db3" or "mcap", `compression` of its chunks or messages "", "lz4", "bz2", "storage" or "message";
-    `poses` is "tf", "odometry", "pose", "gnss" or "none"; with GNSS `ego_T_base` places the IMU, which is then the only frame
-    of the vehicle. `raw` images are of this encoding; "" writes PNG files.
+    `poses` is "tf", "odometry", "pose", "covariance", "gnss" or "none"; with GNSS `ego_T_base` places the IMU, which is then the only frame
+    of the vehicle unless `base_T_imu` and `base_T_antenna` name two others. `raw` images are of this encoding; "" writes PNG files.
     """
 
     container: str = "mcap"
@@ -40,6 +40,8 @@ class Style:
     ego_T_base: Array | None = None
     raw: str = ""
     point_times: bool = True
+    base_T_imu: Array | None = None
+    base_T_antenna: Array | None = None
 
     @property
     def base(self) -> str:
@@ -159,6 +161,8 @@ class Maker:
         mounts = {n: c.mount_T_cam for n, c in self.log.cameras.items()}
         mounts |= {n: s.mount_T_lidar for n, s in self.log.lidars.items()}
         links = [self.transform(begin, self.style.base, name, base_T_ego @ mount) for name, mount in mounts.items()]
+        for frame, pose in (("imu", self.style.base_T_imu), ("antenna", self.style.base_T_antenna)):
+            links += [] if pose is None else [self.transform(begin, self.style.base, frame, pose)]
         yield self.message(begin, "/tf_static", "tf2_msgs/msg/TFMessage", self.transforms(*links))
 
     def cloud(self, name: str, i: int) -> Any:
@@ -227,6 +231,10 @@ class Maker:
             if kind == "tf":
                 message = self.transforms(self.transform(t_ns, "map", self.style.base, pose))
                 yield self.message(t_ns, "/tf", "tf2_msgs/msg/TFMessage", message)
+            elif kind == "covariance":
+                stated = self.make("geometry_msgs/msg/PoseWithCovariance", pose=self.pose(pose), covariance=zero)
+                name = "geometry_msgs/msg/PoseWithCovarianceStamped"
+                yield self.message(t_ns, "/localization/pose", name, self.make(name, header=header, pose=stated))
             elif kind == "pose":
                 message = self.make("geometry_msgs/msg/PoseStamped", header=header, pose=self.pose(pose))
                 yield self.message(t_ns, "/localization/pose", "geometry_msgs/msg/PoseStamped", message)
@@ -241,23 +249,30 @@ class Maker:
 
     def fixes(self, poses: Array) -> Iterator[Message]:
         assert self.log.ego is not None
-        latitude, longitude, altitude, convergence = geodetic_from_map(self.log.map, poses[:, :3, 3], "map")
+        base_T_imu, base_T_antenna = self.style.base_T_imu, self.style.base_T_antenna
+        imu = poses if base_T_imu is None else poses @ base_T_imu
+        antenna = poses if base_T_antenna is None else poses @ base_T_antenna
+        latitude, longitude, altitude, convergence = geodetic_from_map(self.log.map, antenna[:, :3, 3], "map")
+        frames = (
+            (self.style.base if base_T_imu is None else "imu"),
+            (self.style.base if base_T_antenna is None else "antenna"),
+        )
         zero = np.zeros(9)
         for k, t_ns in enumerate(self.log.ego.t_ns.tolist()):
             turn = np.array([
                 [np.cos(convergence[k]), np.sin(convergence[k]), 0.0], [-np.sin(convergence[k]), np.cos(convergence[k]), 0.0],
                 [0.0, 0.0, 1.0],
             ])  # fmt: skip
-            header = self.header(t_ns, self.style.base)
-            imu = self.make(
-                "sensor_msgs/msg/Imu", header=header, orientation=self.quaternion(turn @ poses[k, :3, :3]),
+            heads = [self.header(t_ns, frame) for frame in frames]
+            attitude = self.make(
+                "sensor_msgs/msg/Imu", header=heads[0], orientation=self.quaternion(turn @ imu[k, :3, :3]),
                 orientation_covariance=zero, angular_velocity=self.vector(zero), angular_velocity_covariance=zero,
                 linear_acceleration=self.vector(zero), linear_acceleration_covariance=zero,
             )  # fmt: skip
-            yield self.message(t_ns, "/gnss/imu", "sensor_msgs/msg/Imu", imu)
+            yield self.message(t_ns, "/gnss/imu", "sensor_msgs/msg/Imu", attitude)
             status = self.make("sensor_msgs/msg/NavSatStatus", status=0, service=1)
             fix = self.make(
-                "sensor_msgs/msg/NavSatFix", header=header, status=status, latitude=float(latitude[k]),
+                "sensor_msgs/msg/NavSatFix", header=heads[1], status=status, latitude=float(latitude[k]),
                 longitude=float(longitude[k]), altitude=float(altitude[k]), position_covariance=zero, position_covariance_type=0,
             )  # fmt: skip
             yield self.message(t_ns, "/gnss/fix", "sensor_msgs/msg/NavSatFix", fix)

@@ -117,7 +117,8 @@ class _Opening:
         roles = self.roles
         heads: dict[str, int | None] = {s.topic: NAME_BYTES for s in self._sensors().values()}
         infos = {c.info for c in roles.cameras.values() if c.info}
-        kinds = ("tf", "odometry", "pose", "gnss", "imu")
+        # An IMU is read for the orientation that fixes lack.
+        kinds = ("tf", "odometry", "pose", "gnss") + (("imu",) if "gnss" in roles.topics else ())
         return heads | dict.fromkeys([*infos, *(name for kind in kinds for name in roles.topics.get(kind, ()))])
 
     def _add_transforms(self, topic: Topic) -> None:
@@ -172,7 +173,7 @@ class _Opening:
             recorded = sensor.stamps == "recorded"
             stamped[name] = stamp_messages(topic, self.messages[topic.name], self.notes, recorded=recorded)
             delays[topic.name] = stamped[name].delay_s
-        for kind in ("odometry", "pose", "gnss", "imu"):
+        for kind in ("odometry", "pose", "gnss"):
             for name in self.roles.topics.get(kind, ()):
                 topic = self.bag.topics[name]
                 delays[name] = stamp_messages(topic, self.messages[name], []).delay_s

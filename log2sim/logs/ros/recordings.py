@@ -46,7 +46,7 @@ def find_recordings(path: Path) -> dict[str, Recording]:
     A folder with metadata.yaml is one recording. Bags of one name that are numbered from 0 are parts of one recording; other
     bags of a folder are recordings of their own.
     """
-    path = path.resolve()
+    path = path.absolute()
     try:
         if path.is_file():
             return {path.stem: _file_recording(path, path.parent)}
