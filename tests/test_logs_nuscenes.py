@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from log_encoders.nuscenes import TURN_NS, encode, hdl32_world
 from log_encoders.world import labels_at
 
-from log2sim import Config, reconstruct
+from log2sim import Config, reconstruct, registry
 from log2sim.datatypes import Labels, Log
 from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.geometry import NS_PER_S, apply, inverse, points_in_box
@@ -247,6 +247,13 @@ def test_files_of_a_partial_download_are_left_out_and_counted(root: Path, spoila
         file.unlink()
     with pytest.raises(LogError, match="none of the 20 images and sweeps of scene 'world' is there"):
         open_log(spoilable)
+
+
+def test_the_table_log_json_is_no_log_of_ours(root: Path) -> None:
+    """Whichever order readers are asked in."""
+    native = registry.load("log", "log2sim")
+    assert not native.matches(root)
+    assert not native.matches(root / "v1.0-mini")
 
 
 def test_scenes_of_several_versions_are_told_apart(root: Path, spoilable: Path) -> None:

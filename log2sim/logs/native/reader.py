@@ -56,9 +56,9 @@ class NativeReader:
 
     def sequences(self, path: Path) -> list[str]:
         """Return the names of the sequences, sorted."""
-        if (path / MANIFEST).is_file():
+        if _is_manifest(path / MANIFEST):
             return [path.resolve().name]
-        return sorted(p.parent.name for p in path.glob(f"*/{MANIFEST}"))
+        return sorted(p.parent.name for p in path.glob(f"*/{MANIFEST}") if _is_manifest(p))
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a sequence."""
@@ -67,6 +67,15 @@ class NativeReader:
 
 
 READER = NativeReader()
+
+
+def _is_manifest(path: Path) -> bool:
+    """Return whether a log.json may be ours: the table of that name of nuScenes is a list."""
+    try:
+        with path.open("rb") as file:
+            return not file.read(64).lstrip().startswith(b"[")
+    except OSError:
+        return False
 
 
 class _Folder:
