@@ -11,6 +11,8 @@ from log2sim.errors import ConfigError
 
 BUILT_IN: dict[str, dict[str, str]] = {
     "log": {
+        # Before "log2sim": a folder of nuScenes tables has a log.json as well.
+        "nuscenes": "log2sim.logs.nuscenes.reader:READER",
         "log2sim": "log2sim.logs.native.reader:READER",
         "kitti": "log2sim.logs.kitti.raw:READER",
         "kitti-tracking": "log2sim.logs.kitti.tracking:READER",
@@ -18,7 +20,6 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "pandaset": "log2sim.logs.pandaset.reader:READER",
         "waymo": "log2sim.logs.waymo.reader:READER",
         "waymo-parquet": "log2sim.logs.waymo.parquet_reader:READER",
-        "nuscenes": "log2sim.logs.nuscenes.reader:READER",
         "argoverse2": "log2sim.logs.argoverse.reader:READER",
         "ros": "log2sim.logs.ros.reader:READER",
     },
