@@ -94,7 +94,8 @@ def test_what_surrounds_a_part_is_kept_for_interpolation() -> None:
 
 def test_labels_stay_with_their_cameras() -> None:
     log = make_world(camera=TWO_CAMERAS)
-    labeled = replace(log, labels=replace(log.labels, cameras=("left",)))
+    labeled = replace(log, labels=replace(log.labels, cameras=("left",), never_labeled=("bicycle",)))
+    assert cut_log(labeled, start_s=0.2).labels.never_labeled == ("bicycle",)
     assert cut_log(labeled, cameras=("left",)).labels.cameras == ("left",)
     assert cut_log(labeled, cameras=("front",)).labels is None
     assert cut_log(labeled, cameras=("front",)).reference_camera == "front"

@@ -63,6 +63,7 @@ def make_log(shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0), map_frame: M
             np.tile([4.4, 1.8, 1.5], (FRAMES, 1)),
             np.linspace(-1, 1, FRAMES),
             np.arange(FRAMES) % 2 == 0,
+            never_labeled=("bicycle", "other"),
         ),
         image_labels={
             "front": ImageLabels(t[:2], np.array([[1.0, 2, 30, 20], [2, 3, 31, 22]]), np.array(["car", "bus"]))
@@ -112,6 +113,7 @@ def test_what_is_written_reads_back(folder: Path) -> None:
     assert back.streams["world"].read(2).t_ns is None
     for field in ("t_ns", "track_id", "category", "center_m", "size_m", "yaw_rad", "visible"):
         np.testing.assert_array_equal(getattr(back.labels, field), getattr(log.labels, field))
+    assert back.labels.never_labeled == log.labels.never_labeled
     np.testing.assert_array_equal(back.image_labels["front"].box_px, log.image_labels["front"].box_px)
     assert validate_log(folder) == []
 

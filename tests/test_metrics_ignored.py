@@ -140,6 +140,21 @@ def test_a_match_across_categories_is_not_ignored():
     assert (false, ignored) == (0, 0)
 
 
+def test_what_is_never_labeled_is_ignored_unless_it_matches_a_label():
+    def kinds(category):
+        return scenario(
+            agent("a", 30.0, 10.0), agent("x", 20.0, category=category), agent("y", 10.0, category="bicycle")
+        )
+
+    rider = agent("rider", 10.0, category="cyclist")
+    truth = scenario(agent("a", 30.0, 10.0), rider, ignore_regions=IgnoreRegions((), False, ("bicycle",)))
+    found, false, ignored = counts(kinds("bicycle"), truth)
+    assert (false, ignored, found["precision"]) == (0, 21, 1.0)
+    assert found["correctness"]["undecided_ticks"] == 21
+    assert counts(kinds("motorcycle"), truth)[1:] == (21, 0)
+    assert counts(kinds("bicycle"), replace(truth, ignore_regions=None))[1:] == (21, 0)
+
+
 def test_only_logs_labeled_by_camera_ignore_what_no_camera_shows():
     behind = one(-20.0)
     assert counts(behind, truth_with(view()))[1:] == (21, 0)
@@ -287,6 +302,7 @@ def test_a_truth_file_keeps_its_views(tmp_path):
     lens = replace(CAMERA, distortion_model="brown", distortion=(0.1, -0.01, 0.001, 0.002))
     seen = replace(view([[1.5, 2, 30, 40]], camera=lens), rotation_wxyz=q / np.linalg.norm(q, axis=1)[:, None])
     truth = truth_with(seen, view(), outside=True)
+    truth = replace(truth, ignore_regions=replace(truth.ignore_regions, categories=("bicycle",)))
     truth.save(tmp_path / "truth.json")
     again = Scenario.load(tmp_path / "truth.json")
     assert again.to_dict() == truth.to_dict()
@@ -340,7 +356,11 @@ def test_a_log_hands_its_regions_to_the_truth():
     np.testing.assert_allclose(seen.map_T_cam, log.map_T_sensor("front", t_ns)[0], atol=1e-9)
     all_around = replace(log, labels=replace(log.labels, cameras=None))
     assert not ignore_regions_of(all_around, 0).outside_views
-    assert ignore_regions_of(replace(all_around, ignored_regions={}), 0) is None
+    plain = replace(all_around, ignored_regions={})
+    assert ignore_regions_of(plain, 0) is None
+    partly = replace(plain, labels=replace(plain.labels, never_labeled=("bicycle",)))
+    regions = ignore_regions_of(partly, 0)
+    assert (regions.views, regions.outside_views, regions.categories) == ((), False, ("bicycle",))
     with pytest.raises(LogError, match=r"labels are of camera 'fronr'.*there are: front"):
         ignore_regions_of(labeled_by_camera(log, t_ns[:1], [EVERYWHERE], ("fronr",)), 0)
 

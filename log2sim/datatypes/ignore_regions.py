@@ -58,14 +58,18 @@ class IgnoreRegions:
         One for each labeled camera.
     outside_views : bool
         Whether objects outside all views were left without labels too.
+    categories : tuple of str
+        Categories that were left without labels everywhere.
     """
 
     views: tuple[LabelView, ...]
     outside_views: bool
+    categories: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the part `unlabeled` of a document of `schemas/scenario-1.json`."""
-        return {"outside_views": self.outside_views, "views": [_view_to_dict(v) for v in self.views]}
+        document = {"outside_views": self.outside_views, "views": [_view_to_dict(v) for v in self.views]}
+        return {**document, "categories": list(self.categories)} if self.categories else document
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> IgnoreRegions:
@@ -77,7 +81,7 @@ class IgnoreRegions:
             When columns do not fit each other.
         """
         views = tuple(_view_from_dict(v, f"unlabeled.views[{k}]") for k, v in enumerate(document["views"]))
-        return cls(views, bool(document["outside_views"]))
+        return cls(views, bool(document["outside_views"]), tuple(document.get("categories", ())))
 
 
 def _view_to_dict(view: LabelView) -> dict[str, Any]:

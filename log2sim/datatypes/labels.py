@@ -35,6 +35,8 @@ class Labels:
         0 fully visible, 1 partly occluded, 2 largely occluded, 3 unknown, as the log states it.
     labeled_ns : (F,) int64 or None
         Increasing stamps of all that was labeled, also where nothing was there; None where the log does not tell.
+    never_labeled : tuple of str
+        Categories that got no 3D boxes by the log's rules, such as bicycles without riders in KITTI.
     """
 
     t_ns: NDArray[np.int64]
@@ -48,6 +50,7 @@ class Labels:
     kind: NDArray[np.str_] | None = None
     occlusion: NDArray[np.int64] | None = None
     labeled_ns: NDArray[np.int64] | None = None
+    never_labeled: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -84,6 +84,7 @@ def moved_labels(labels: Labels | None, change: Replacement) -> Labels | None:
         rows(labels.kind),
         rows(labels.occlusion),
         labels.labeled_ns,
+        labels.never_labeled,
     )
 
 

@@ -142,13 +142,13 @@ def _cut_labels(labels: Labels | None, cameras: list[str], span: _Span | None) -
     labeled = labels.labeled_ns
     if labeled is not None:
         labeled = labeled[_with_neighbors(labeled, np.arange(len(labeled)), span)]
-    optional = ("cameras", "labeled_ns")
+    optional = ("cameras", "labeled_ns", "never_labeled")
     columns: dict[str, Any] = {
         name: column if column is None else column[keep]
         for name, column in vars(labels).items()
         if name not in optional
     }
-    return Labels(**{**columns, "cameras": seen, "labeled_ns": labeled})
+    return Labels(**{**columns, "cameras": seen, "labeled_ns": labeled, "never_labeled": labels.never_labeled})
 
 
 def _with_neighbors(t_ns: NDArray[np.int64], rows: NDArray[np.intp], span: _Span) -> NDArray[np.bool_]:

@@ -80,11 +80,22 @@ def compare(truth: StateTable, other: StateTable, tick_s: float, selection: Sele
 
 
 def without_ignored(c: Comparison, regions: IgnoreRegions | None, truth_ticks_s: Array, shift_m: Array) -> Comparison:
-    """Move false ticks in ignore regions to the ignored ones; `shift_m` is that from the truth's map to the scenario's."""
+    """Move false ticks in ignore regions, and of categories never labeled, to the ignored ones.
+
+    Parameters
+    ----------
+    c : Comparison
+    regions : IgnoreRegions or None
+        None where the labels are complete.
+    truth_ticks_s : (T,) float64, s
+    shift_m : (3,) float64, m
+        From the truth's map to the scenario's.
+    """
     if regions is None:
         return c
     in_truth_map = replace(c.other, xy_m=c.other.xy_m - shift_m[:2], z_m=c.other.z_m - shift_m[2])
-    ignored = ignored_ticks(regions, truth_ticks_s, in_truth_map, c.false)
+    never = c.false & np.isin(c.other.category, regions.categories)[:, None]
+    ignored = never | ignored_ticks(regions, truth_ticks_s, in_truth_map, c.false & ~never)
     return replace(c, false=c.false & ~ignored, ignored=ignored)
 
 

@@ -19,7 +19,7 @@ def ignore_regions_of(log: Log, t0_ns: int) -> IgnoreRegions | None:
     Parameters
     ----------
     log : Log
-        Its labels may be limited to the views of some cameras, and it may have ignored regions.
+        Its labels may be limited to the views of some cameras and to some categories, and it may have ignored regions.
     t0_ns : int
         Start of the truth.
 
@@ -29,7 +29,8 @@ def ignore_regions_of(log: Log, t0_ns: int) -> IgnoreRegions | None:
         When labels refer to a camera that the log does not have.
     """
     only = None if log.labels is None else log.labels.cameras
-    if only is None and not log.ignored_regions:
+    never = () if log.labels is None else log.labels.never_labeled
+    if only is None and not log.ignored_regions and not never:
         return None
     names = list(log.ignored_regions) if only is None else list(only)
     for name in names:
@@ -38,7 +39,8 @@ def ignore_regions_of(log: Log, t0_ns: int) -> IgnoreRegions | None:
                 f"{log.name}: its labels are of camera '{name}'{nearest(name, list(log.cameras))}, which it does not "
                 f"have; there are: {', '.join(log.cameras)}"
             )
-    return IgnoreRegions(tuple(_label_view(log, name, t0_ns) for name in names), outside_views=only is not None)
+    views = tuple(_label_view(log, name, t0_ns) for name in names)
+    return IgnoreRegions(views, outside_views=only is not None, categories=never)
 
 
 def _label_view(log: Log, name: str, t0_ns: int) -> LabelView:

@@ -22,7 +22,7 @@ IGNORED_RULE = (
     "an unmatched reconstructed agent is neither right nor false at the ticks at which the labels could not have told: "
     f"every labeled camera that shows it (a frame within {MAX_FRAME_LAG_S:g} s) has at least {MIN_REGION_SHARE:g} of its "
     "outline inside the image in regions left without labels, or no labeled camera shows any of it and only what these "
-    "cameras see was labeled"
+    "cameras see was labeled, or its category was never labeled"
 )
 
 

@@ -26,6 +26,9 @@ CATEGORY_OF = {
     "Misc": "other",
 }
 NOT_LABELED = "DontCare"
+NEVER_LABELED = ("bicycle",)
+"""No class is for bicycles without riders (Geiger et al., "Vision meets robotics", 2013, section III)."""
+
 LABEL_FIELDS = 17
 CAMERA = "image_02"
 
@@ -128,6 +131,7 @@ def labels_of_rows(
             cameras=(CAMERA,),
             kind=rows.type[k],
             occlusion=rows.values[k, 1].astype(np.int64),
+            never_labeled=NEVER_LABELED,
         ),
         {CAMERA: ImageLabels(t_ns, rows.values[:, 3:7], category)},
         {CAMERA: ImageRegions(stamp_of(ignored.frame), ignored.values[:, 3:7])},

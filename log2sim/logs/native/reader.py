@@ -246,6 +246,7 @@ class _Folder:
             labels,
             cameras=tuple(entry["cameras"]) if "cameras" in entry else None,
             labeled_ns=None if labeled is None else np.unique(labeled["t_ns"]),
+            never_labeled=tuple(entry.get("never_labeled", ())),
         )
 
     def _label_table(self, key: str, columns: Mapping[str, str]) -> CsvTable | None:

@@ -90,6 +90,8 @@ def _write_boxes_3d(b: Labels, root: Path, entry: dict[str, Any], offset: Array)
     write_table(root / entry["boxes_3d"], columns, rows)
     if b.cameras is not None:
         entry["cameras"] = list(b.cameras)
+    if b.never_labeled:
+        entry["never_labeled"] = list(b.never_labeled)
     if b.labeled_ns is not None:
         entry["labeled"] = "labels/labeled.csv"
         write_table(root / entry["labeled"], LABELED_COLUMNS, ((t,) for t in b.labeled_ns.tolist()))
