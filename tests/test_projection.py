@@ -10,7 +10,16 @@ from scipy.optimize import brentq
 from worlds import Solid, camera_ahead, scan
 
 from log2sim.datatypes import Log
-from log2sim.geometry import PoseTrack, RollingShutter, apply, inverse, project, rotation_from_rpy, transform
+from log2sim.geometry import (
+    PoseTrack,
+    RollingShutter,
+    apply,
+    box_corners,
+    inverse,
+    project,
+    rotation_from_rpy,
+    transform,
+)
 from log2sim.perception.lidar import projection
 from log2sim.perception.lidar.projection import View, points_in_image_boxes, project_points
 
@@ -146,3 +155,21 @@ def test_only_cameras_that_move_while_they_are_read_take_several_poses():
     assert projection.view_of(moving_log({}, direction=None), "front", T_NS).cam_T_map_at is None
     assert projection.view_of(moving_log({}, mount="map"), "front", T_NS).cam_T_map_at is None
     assert projection.view_of(moving_log({}), "front", T_NS + 10**10) is None
+
+
+def test_a_box_is_projected_by_the_pose_of_the_line_that_shows_its_middle():
+    log = moving_log({})
+    map_T_ego = log.ego.at(T_NS)[0][0]
+    view = projection.view_of(log, "front", T_NS)
+    local = np.array([[3.5, 9.0, 0.8], [-2.5, 12.0, 0.8], [1.0, -30.0, 0.8]])
+    center, yaw = apply(map_T_ego, local), np.full(3, 0.2)
+    size = np.tile([0.8, 0.6, 1.7], (3, 1))
+    found = projection.project_boxes_in_view(view, center, size, yaw)
+    assert found.valid.tolist() == [True, True, False]
+    middle = projection.project_boxes_in_view(replace(view, cam_T_map_at=None), center, size, yaw)
+    for i in range(2):
+        corners = seen_by_lines(log, box_corners(center[i], size[i], yaw[i])[0])
+        box = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
+        # A small box is seen within a few lines.
+        assert found.box_px[i] == pytest.approx(box, abs=2.0)
+        assert np.abs(middle.box_px[i] - box).max() > 5

@@ -7,7 +7,7 @@ scalar-first, yaw is counter-clockwise from +x in [-pi, pi).
 
 from __future__ import annotations
 
-from log2sim.geometry.box_projection import box_lines, outline, project_boxes
+from log2sim.geometry.box_projection import ProjectedBoxes, box_lines, outline, project_boxes
 from log2sim.geometry.boxes import box_corners, box_corners_bev, box_iou, points_in_box
 from log2sim.geometry.camera import MIN_DEPTH_M, Camera, Mount, RollingShutter, distort, fold_radius, project, undistort
 from log2sim.geometry.homography import apply_homography, ground_homography, homography_jacobian
@@ -45,6 +45,7 @@ __all__ = [
     "Camera",
     "Mount",
     "PoseTrack",
+    "ProjectedBoxes",
     "RollingShutter",
     "apply",
     "apply_homography",

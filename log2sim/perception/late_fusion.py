@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, Measurements
-from log2sim.geometry import Array, box_iou, inverse, project_boxes
-from log2sim.perception.lidar.projection import View
+from log2sim.geometry import Array, box_iou
+from log2sim.perception.lidar.projection import View, project_boxes_in_view
 
 # Boxes that overlap less are different objects.
 MIN_IOU = 0.3
@@ -89,8 +89,7 @@ class ImageMatches:
 
 def match_boxes(boxes: Measurements, rows: Measurements, view: View) -> ImageMatches:
     """Match the boxes of a sweep (M,) with the measured detections (N,) of a camera frame, the best pairs first."""
-    cam_T_map = inverse(view.map_T_cam)
-    projected = project_boxes(boxes.box_center_m, boxes.box_size_m, boxes.box_yaw_rad, view.camera, cam_T_map)
+    projected = project_boxes_in_view(view, boxes.box_center_m, boxes.box_size_m, boxes.box_yaw_rad)
     height = np.where(projected.valid, projected.box_px[:, 3] - projected.box_px[:, 1], 0.0)
     partner, best = np.full(len(boxes), -1), np.zeros(len(boxes))
     iou = np.where(_may_be_same(boxes, rows), box_iou(np.nan_to_num(projected.box_px), rows.box_px), 0.0)

@@ -10,13 +10,12 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from log2sim import registry
 from log2sim.datatypes import CATEGORIES, Detections, Frame, ImageLabels, Log
 from log2sim.errors import ConfigError
-from log2sim.geometry import Camera, inverse, project_boxes
 from log2sim.perception.detect.label_motion import LabelBoxes, interpolate_boxes, window_ns
+from log2sim.perception.lidar.projection import View, project_boxes_in_view, view_of
 
 # Smaller boxes are left out, as detectors do not find them.
 MIN_SIDE_PX = 6.0
@@ -46,10 +45,10 @@ class LabelDetector:
         if labels is not None:
             return boxes_of_frame(labels, frame.t_ns)
         boxes, window = self._boxes
-        map_T_cam, known = self.log.map_T_sensor(frame.camera.name, frame.t_ns)
-        if not len(boxes.t_ns) or not known[0]:
+        view = view_of(self.log, frame.camera.name, frame.t_ns)
+        if not len(boxes.t_ns) or view is None:
             return Detections.empty()
-        return project_labels(interpolate_boxes(boxes, frame.t_ns, window), frame.camera, inverse(map_T_cam[0]))
+        return project_labels(interpolate_boxes(boxes, frame.t_ns, window), view)
 
     @cached_property
     def _boxes(self) -> tuple[LabelBoxes, int]:
@@ -94,12 +93,12 @@ def boxes_of_frame(labels: ImageLabels, t_ns: int) -> Detections:
     return found.take(np.all(box[:, 2:] - box[:, :2] >= MIN_SIDE_PX, axis=1))
 
 
-def project_labels(boxes: LabelBoxes, camera: Camera, cam_T_map: NDArray[np.float64]) -> Detections:
-    """Project boxes into a camera's image; those that are large enough, nearest first.
+def project_labels(boxes: LabelBoxes, view: View) -> Detections:
+    """Project boxes into a frame; those that are large enough, nearest first.
 
     Occluded boxes are kept: a LiDAR on the roof often sees what the camera does not.
     """
-    projected = project_boxes(boxes.center_m, boxes.size_m, boxes.yaw_rad, camera, cam_T_map)
+    projected = project_boxes_in_view(view, boxes.center_m, boxes.size_m, boxes.yaw_rad)
     box_px = projected.box_px
     large = projected.valid.copy()
     large[projected.valid] = np.all(box_px[projected.valid, 2:] - box_px[projected.valid, :2] >= MIN_SIDE_PX, axis=1)

@@ -16,9 +16,12 @@ from log2sim.geometry import (
     NS_PER_S,
     Array,
     Camera,
+    ProjectedBoxes,
     fold_radius,
     inverse,
+    line_time_s,
     project,
+    project_boxes,
     project_moving,
     transform,
     undistort,
@@ -163,6 +166,23 @@ def _project_by_lines(view: View, origin: Array, columns: NDArray[np.float32]) -
     uv, depth, inside = project_moving(view.camera, points, lambda t_s: cam_T_map_at(t_s) @ map_T_origin)
     u, v = uv[inside].T.astype(np.float32)
     return ProjectedPoints(index[inside], u, v, depth[inside].astype(np.float32))
+
+
+def project_boxes_in_view(view: View, center_m: Array, size_m: Array, yaw_rad: Array) -> ProjectedBoxes:
+    """Project upright boxes (L, 3), (L, 3), (L,) of the map frame into a frame; see `log2sim.geometry.project_boxes`.
+
+    Where the camera moves while its lines are read, each box takes the pose at the time of the line that shows its middle.
+    """
+    seen = project_boxes(center_m, size_m, yaw_rad, view.camera, inverse(view.map_T_cam))
+    if view.cam_T_map_at is None or not seen.valid.any():
+        return seen
+    box, valid, range_m = seen.box_px.copy(), seen.valid.copy(), seen.range_m.copy()
+    rows = np.flatnonzero(valid)
+    middle_px = (box[rows, :2] + box[rows, 2:]) / 2
+    for i, cam_T_map in zip(rows, view.cam_T_map_at(line_time_s(view.camera, middle_px))):
+        one = project_boxes(center_m[i : i + 1], size_m[i : i + 1], yaw_rad[i : i + 1], view.camera, cam_T_map)
+        valid[i], box[i], range_m[i] = one.valid[0], one.box_px[0], one.range_m[0]
+    return ProjectedBoxes(valid, box, range_m)
 
 
 @lru_cache(maxsize=64)

@@ -19,12 +19,11 @@ from log2sim.geometry import (
     box_corners,
     box_lines,
     line_time_s,
-    project_boxes,
     project_moving,
 )
 from log2sim.perception.detect.label_motion import MAX_AGE_S, LabelBoxes, interpolate_pairs, window_ns
 from log2sim.perception.lidar.cloud import compensation_of, sweep_to_map
-from log2sim.perception.lidar.projection import poses_around
+from log2sim.perception.lidar.projection import poses_around, project_boxes_in_view, view_of
 from log2sim.perception.sync import Schedule, synchronize
 
 # Stamps of labels and frames of one moment differ by rounding in some logs.
@@ -263,7 +262,10 @@ def _wireframes(log: Log, camera: Camera, t_ns: int) -> tuple[tuple[Array, str],
     """Project the edges of the labels at a stamp; each box takes the pose of the line that shows its center."""
     boxes = labels_at(log.labels, t_ns)
     cam_T_map_at = poses_around(log, camera.name, t_ns)
-    seen = project_boxes(boxes.center_m, boxes.size_m, boxes.yaw_rad, camera, cam_T_map_at(np.zeros(1))[0])
+    view = view_of(log, camera.name, t_ns)
+    if view is None:
+        return ()
+    seen = project_boxes_in_view(view, boxes.center_m, boxes.size_m, boxes.yaw_rad)
     out = []
     for i in np.flatnonzero(seen.valid):
         middle_px = seen.box_px[i].reshape(2, 2).mean(axis=0)[None]
