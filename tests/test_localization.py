@@ -206,10 +206,12 @@ def test_everything_keeps_its_place_in_the_frame_of_the_ego() -> None:
 
 def test_labels_without_a_pose_are_left_out_and_images_and_notes_stay() -> None:
     log = labeled()
+    log = replace(log, labels=replace(log.labels, never_labeled=("bicycle",)))
     half = len(log.ego.t_ns) // 2
     short = PoseTrack(log.ego.t_ns[:half], log.ego.map_T_ego[:half], extrapolate_s=0.0)
     new = replace_poses(log, short)
     assert set(new.labels.t_ns.tolist()) == {t for t in log.labels.t_ns.tolist() if t <= short.t_ns[-1]}
+    assert new.labels.never_labeled == log.labels.never_labeled
     assert new.notes == log.notes
     assert new.image_labels is log.image_labels
     assert new.streams["front"] is log.streams["front"]
