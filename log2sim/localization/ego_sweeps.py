@@ -23,6 +23,8 @@ from log2sim.localization.moving_points import move_points
 
 # Nearer returns are of the ego's own body; farther ones are too sparse for surfaces.
 MIN_RANGE_M, MAX_RANGE_M = 2.5, 100.0
+# More points change neither the path nor the scatter of parked cars on recorded drives, and take time.
+MAX_POINTS = 60_000
 PROBED_SWEEPS = 3
 COVERAGE_VOXEL_M = 0.5
 
@@ -86,20 +88,25 @@ def read_ego_sweep(log: Log, lidar: str, index: int) -> EgoSweep | None:
 
 
 def ego_sweep_of(log: Log, lidar: str, sweep: Sweep) -> EgoSweep | None:
-    """Bring a sweep into the ego's frame; points of the map frame go back by the log's own poses at their own times."""
+    """Bring a sweep into the ego's frame; points of the map frame go back by the log's own poses at their own times.
+
+    Of more than `MAX_POINTS` every second, third ... is taken.
+    """
     ego_T_lidar = log.lidars[lidar].mount_T_lidar
-    stamp_ns, t_ns = int(sweep.stamp_ns), sweep.t_ns
+    step = max(-(-len(sweep.xyz_m) // MAX_POINTS), 1)
+    stamp_ns, t_ns = int(sweep.stamp_ns), None if sweep.t_ns is None else sweep.t_ns[::step]
+    measured = sweep.xyz_m[::step]
     if sweep.frame == "map":
         track = log.ego
         if track is None:
             return None
-        times = np.full(len(sweep.xyz_m), stamp_ns, dtype=np.int64) if t_ns is None else t_ns
-        known = move_points(sweep.xyz_m, times, lambda t: (inverse(track.at(t)[0]), track.at(t)[1]))
+        times = np.full(len(measured), stamp_ns, dtype=np.int64) if t_ns is None else t_ns
+        known = move_points(measured, times, lambda t: (inverse(track.at(t)[0]), track.at(t)[1]))
         if known is None:
             return None
         xyz = known
     else:
-        xyz = apply(ego_T_lidar, sweep.xyz_m)
+        xyz = apply(ego_T_lidar, measured)
         if sweep.compensated_ns is not None:
             stamp_ns, t_ns = int(sweep.compensated_ns), None
     away = np.linalg.norm(xyz - ego_T_lidar[:3, 3], axis=1)
