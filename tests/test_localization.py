@@ -317,6 +317,8 @@ def test_truth_of_labels_moves_with_the_poses_of_the_scenario() -> None:
     np.testing.assert_array_equal(again.labels.center_m, new.labels.center_m)
     assert localize_like(log, {}) is log
     assert localize_like(log, {"poses": {"source": "given"}}) is log
+    for spoiled in ({"source": ["lidar"]}, {"source": "gps"}, ["lidar"], "lidar", None, {}):
+        assert localize_like(log, {"poses": spoiled}) is log
 
 
 def test_given_poses_are_not_touched() -> None:

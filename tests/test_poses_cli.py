@@ -63,6 +63,13 @@ def test_evaluate_places_the_labels_by_the_poses_of_the_scenario(noisy: Path, by
     assert same["ego"]["position_rmse_m"] < 0.1 < other["ego"]["position_rmse_m"]
 
 
+def test_a_truth_in_a_map_of_its_own_is_pointed_out(noisy: Path, by_lidar: Path, tmp_path: Path) -> None:
+    truth = tmp_path / "truth.json"
+    truth.write_bytes(by_lidar.read_bytes())
+    assert "note: the scenario's poses are estimated (lidar), " in run("evaluate", by_lidar, "--truth", truth).out
+    assert "note: " not in run("evaluate", by_lidar, "--truth", noisy).out
+
+
 def test_boxes_say_by_which_poses_they_are_placed(noisy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     boxes = noisy.parent / "boxes.json"
     assert run("detect", noisy, "--detector", "lidar:labels", "--poses", "lidar", "--out", boxes).code == 0

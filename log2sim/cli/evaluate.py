@@ -73,6 +73,8 @@ def evaluate(
         if poses is not None:
             stated = _stated(scenario.provenance.get("poses"), poses)
             scenario = replace(scenario, provenance={**scenario.provenance, **stated})
+        if (note := _other_map(scenario, truth)) is not None:
+            say(f"note: {note}", quiet=quiet)
         result, table = _scenario_figures(scenario, load_truth(truth, scenario, sequence), range, wanted)
     if out is not None:
         write_json(out, result)
@@ -91,6 +93,15 @@ def _stated(made_with: Any, asked: str | None) -> dict[str, Any]:
     if asked not in PosesConfig.choices("source"):
         raise ConfigError(f"--poses {asked}: expected {', '.join(PosesConfig.choices('source'))}")
     return {"poses": {**(made_with if isinstance(made_with, dict) else {}), "source": asked}}
+
+
+def _other_map(scenario: Scenario, truth: Path) -> str | None:
+    """Say where a scenario of estimated poses is compared with a truth that cannot be placed by them; None elsewhere."""
+    made_with = scenario.provenance.get("poses")
+    source = made_with.get("source") if isinstance(made_with, dict) else None
+    if source not in ("lidar", "camera") or not (truth.suffix == ".json" or (truth / "truth.json").is_file()):
+        return None
+    return f"the scenario's poses are estimated ({source}), {truth} has its own: what the two maps differ by counts as error"
 
 
 def _plot_reliability(result: dict[str, Any], path: Path) -> None:

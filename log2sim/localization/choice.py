@@ -65,12 +65,13 @@ def localize_like(log: Log, provenance: Mapping[str, Any], *, progress: Progress
         As `localize` does.
     """
     entry = provenance.get("poses")
-    source, during = (
-        ("given", None) if not isinstance(entry, Mapping) else (entry.get("source"), entry.get("during_ns"))
-    )
-    if source not in ORIGINS:
+    entry = entry if isinstance(entry, Mapping) else {}
+    source, during = entry.get("source"), entry.get("during_ns")
+    if not isinstance(source, str) or source not in ORIGINS:
         return log
-    window = (int(during[0]), int(during[1])) if isinstance(during, Sequence) and len(during) == 2 else None
+    window = None
+    if isinstance(during, Sequence) and len(during) == 2 and all(type(t) is int for t in during):
+        window = (int(during[0]), int(during[1]))
     return _localize(_Request(log, source, window, progress or (lambda *_: None)))[0]
 
 

@@ -94,7 +94,9 @@ def _coverage(log: Log) -> list[str]:
     """List sensors on the ego with records at stamps where its pose is unknown."""
     on_ego = [n for n in log.streams if (log.cameras.get(n) or log.lidars[n]).mount == "ego"]
     if log.ego is None and on_ego:
-        return [f"the log has no poses of the ego, on which {', '.join(on_ego)} are mounted"]
+        return [
+            f"the log has no poses of the ego, on which {', '.join(on_ego)} are mounted; reconstruct estimates them"
+        ]
     problems = []
     for name, stream in log.streams.items():
         known = log.map_T_sensor(name, stream.t_ns)[1]
