@@ -222,6 +222,27 @@ def test_sweeps_of_one_stream_are_of_one_kind(tmp_path: Path) -> None:
         write_log(mixed, tmp_path / "log")
 
 
+@pytest.mark.parametrize("road_m", [0.0, 641.5, 1612.0])
+def test_the_road_of_a_roadside_log_keeps_its_height_in_the_map(tmp_path: Path, road_m: float) -> None:
+    log = make_log((0.0, 0.0, road_m))
+    fixed = replace(
+        log,
+        cameras={"pole": log.cameras["pole"]},
+        lidars={"world": log.lidars["world"]},
+        streams={name: log.streams[name] for name in ("pole", "world")},
+        ego=None,
+        reference_camera=None,
+        image_labels={},
+        ground_z_ego_m=road_m,
+    )
+    write_log(fixed, tmp_path / "log")
+    for _ in range(2):
+        back = open_log(tmp_path / "log")
+        assert back.ground_z_ego_m + back.map.offset_m[2] == pytest.approx(road_m)
+        assert back.cameras["pole"].mount_T_cam[2, 3] - back.ground_z_ego_m == pytest.approx(6.0)
+        write_log(back, tmp_path / "log", overwrite=True)
+
+
 def test_an_occlusion_is_a_number_from_0_to_3(folder: Path) -> None:
     file = folder / "labels" / "boxes_3d.csv"
     file.write_text(file.read_text().replace("visible", "occlusion"))

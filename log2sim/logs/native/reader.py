@@ -103,6 +103,8 @@ class _Folder:
         cameras = {s.name: shifted_camera(s, offset) for s in sensors if isinstance(s, Camera)}
         lidars = {s.name: shifted_lidar(s, offset) for s in sensors if isinstance(s, Lidar)}
         ego = m.get("ego", {})
+        # Without an ego the height of the road is one of the map.
+        roadside = track is None and all(sensor.mount == "map" for sensor in sensors)
         default = EgoVehicle()
         length, width, height = (float(v) for v in ego.get("size_m", default.size_m))
         return Log(
@@ -119,7 +121,7 @@ class _Folder:
             labels=None if labels is None else shifted_labels(labels, offset),
             image_labels={} if boxes is None else boxes_2d(boxes, set(cameras)),
             ignored_regions={} if regions is None else regions_2d(regions, set(cameras)),
-            ground_z_ego_m=float(ego.get("ground_z_m", 0.0)),
+            ground_z_ego_m=float(ego.get("ground_z_m", 0.0)) - (float(offset[2]) if roadside else 0.0),
             reference_camera=m.get("reference_camera"),
             digest=self.hash.hexdigest(),
             notes=tuple(self.notes),

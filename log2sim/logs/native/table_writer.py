@@ -28,6 +28,8 @@ def write_ego(log: Log, root: Path, manifest: dict[str, Any], kind: str) -> None
     """Write the ego's poses, or the same as GNSS fixes, and describe the ego in the manifest."""
     sensors: list[Camera | Lidar] = [*log.cameras.values(), *log.lidars.values()]
     if log.ego is None and all(sensor.mount == "map" for sensor in sensors):
+        # Without an ego the height of the road is one of the map.
+        manifest["ego"] = {"ground_z_m": float(log.ground_z_ego_m) + log.map.offset_m[2]}
         return
     vehicle = log.ego_vehicle
     manifest["ego"] = {
