@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -28,8 +29,9 @@ from log2sim.geometry import NS_PER_S, transform
 from log2sim.logs.ros import messages as ros_messages
 from log2sim.logs.ros.bag import open_container
 from log2sim.logs.ros.chunked import ChunkedFile, decompress
-from log2sim.logs.ros.messages import definition_fields
+from log2sim.logs.ros.messages import decode_bytes, definition_fields
 from log2sim.logs.ros.recordings import find_recordings
+from log2sim.logs.ros.stamping import note_other_clocks
 
 CONTAINERS = ("bag", "db3", "mcap")
 
@@ -215,6 +217,30 @@ def test_data_that_unpack_to_more_than_they_say_are_refused() -> None:
         decompress(b"no zstd at all", "zstd", 100)
     with pytest.raises(ValueError, match="unknown compression 'rar'"):
         decompress(b"", "rar", 100)
+
+
+@pytest.mark.parametrize("style", [Style("bag"), Style("bag", "lz4"), Style("mcap", "storage"), Style("db3")], ids=lambda s: f"{s.container}-{s.compression}")
+def test_any_damage_is_told_in_one_line(style: Style, tmp_path: Path) -> None:
+    """Random bytes at random places, most of them where headers and indexes are."""
+    rng = np.random.default_rng(7)
+    path = bag_of(tmp_path, style)
+    file = file_of(path)
+    data = np.frombuffer(file.read_bytes(), np.uint8)
+    for _ in range(12):
+        places = np.concatenate([rng.integers(0, len(data), 8), rng.integers(0, 6000, 4), -rng.integers(1, 6000, 4)])
+        damaged = data.copy()
+        damaged[places] = rng.integers(0, 256, len(places))
+        file.write_bytes(damaged.tobytes())
+        try:
+            log = open_log(path)
+        except LogError as error:
+            lines = str(error).splitlines()
+        else:
+            lines = [""]
+            assert all("\n" not in note for note in log.notes)
+            for stream in log.streams.values():
+                readable(stream)
+        assert len(lines) == 1
 
 
 def test_files_that_are_no_bags_are_refused_in_one_line(tmp_path: Path) -> None:
@@ -418,6 +444,23 @@ def test_header_stamps_that_are_zero_or_of_another_clock_are_noted(tmp_path: Pat
     settings = '[lidars.top]\ntopic = "/top/points"\nstamps = "recorded"\n'
     told = open_log(with_settings(path, settings))
     np.testing.assert_array_equal(told.streams["top"].t_ns, world_log().streams["top"].t_ns + ros.OTHER_DELAY_NS)
+
+
+def test_of_two_clocks_that_of_the_recorder_is_right() -> None:
+    notes: list[str] = []
+    note_other_clocks({"/camera": 0.06, "/lidar": 1.5e9, "/told": None}, notes)
+    assert [note.split(":")[0] for note in notes] == ["/lidar"]
+    note_other_clocks({"/camera": 3600.02, "/lidar": 3600.1}, notes)  # recorded anew an hour later
+    assert len(notes) == 1
+
+
+@pytest.mark.parametrize(("raw", "message"), [
+    (b"", "encapsulation missing"), (b"\0\7" + bytes(20), "encapsulation 0007, only plain CDR"), (b"\0\1" + b"\xff" * 9, "not a readable"),
+])  # fmt: skip
+def test_bytes_that_are_no_message_are_an_error_of_the_record(raw: bytes, message: str) -> None:
+    topic = SimpleNamespace(name="/t", msgtype="sensor_msgs/msg/Image", encoding="cdr")
+    with pytest.raises(RecordError, match=f"^here: {message}"):
+        decode_bytes(topic, raw, "here")
 
 
 def test_an_imu_whose_heading_is_not_the_course_is_noted(tmp_path: Path) -> None:

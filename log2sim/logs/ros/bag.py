@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.errors import LogError, RecordError
-from log2sim.logs.ros.containers import MAX_MESSAGE_BYTES, Channel, Container
+from log2sim.logs.ros.containers import MAX_MESSAGE_BYTES, Channel, Container, one_line, printable
 from log2sim.logs.ros.recordings import Recording, recorded_files
 from log2sim.logs.sweeps import PARSER_ERRORS
 
@@ -89,7 +89,7 @@ class Bag:
         try:
             return file.message(int(topic.entry[i]), limit_bytes)
         except PARSER_ERRORS as problem:
-            raise RecordError(f"{self.where(topic, i)}: cannot be read: {problem}") from None
+            raise RecordError(f"{self.where(topic, i)}: cannot be read: {one_line(problem)}") from None
 
     def where(self, topic: Topic, i: int) -> str:
         """Name file, topic and message `i` in errors."""
@@ -194,7 +194,8 @@ def stamp_of(head: bytes, encoding: str) -> int:
 def frame_of(head: bytes, encoding: str) -> str:
     """Return the frame_id of a message that begins with a header."""
     (size,) = struct.unpack_from(_order(head, encoding) + "I", head, STAMP.stop)
-    return head[STAMP.stop + 4 : STAMP.stop + 4 + size].rstrip(b"\0").decode("utf-8", "replace").lstrip("/")
+    name = head[STAMP.stop + 4 : STAMP.stop + 4 + size].rstrip(b"\0").decode("utf-8", "replace")
+    return printable(name).lstrip("/")
 
 
 def _order(head: bytes, encoding: str) -> str:

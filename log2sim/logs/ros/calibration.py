@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from log2sim.geometry import Array, Camera, Mount, inverse, transform
+from log2sim.logs.ros.containers import printable
 from log2sim.logs.ros.settings import Intrinsics
 
 BROWN, FISHEYE = ("plumb_bob", "rational_polynomial", "radtan", ""), ("equidistant", "fisheye", "kannala_brandt4")
@@ -69,7 +70,7 @@ def camera_from_info(
 
 def _lens(info: Any) -> tuple[str, tuple[float, ...]]:
     values = np.asarray(_field(info, "D"), dtype=np.float64).ravel()
-    kind = str(info.distortion_model).strip().lower()
+    kind = printable(info.distortion_model).strip().lower()
     if not values.any():
         return "none", ()
     if not np.isfinite(values).all():

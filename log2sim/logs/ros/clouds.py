@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Sweep
 from log2sim.errors import RecordError
+from log2sim.logs.ros.containers import printable
 from log2sim.logs.ros.settings import LidarTopic
 from log2sim.logs.sweeps import MAX_SWEEP_POINTS, sweep_of
 
@@ -98,10 +99,10 @@ def _dtype(message: Any, step: int, where: str) -> np.dtype[Any]:
     names, formats, offsets = [], [], []
     for point_field in message.fields:
         code = DATATYPES.get(int(point_field.datatype))
-        count = max(1, int(point_field.count))
-        if code is None or count > step or not point_field.name or point_field.name in names:
+        count, name = max(1, int(point_field.count)), printable(point_field.name)
+        if code is None or count > step or not name or name in names:
             continue
-        names.append(str(point_field.name))
+        names.append(name)
         formats.append(order + code if count == 1 else f"({count},){order}{code}")
         offsets.append(int(point_field.offset))
     try:

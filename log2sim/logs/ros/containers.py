@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Protocol
 
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_MESSAGE_BYTES = 256 * 1024 * 1024
+MAX_NAME_CHARACTERS = 256
 MAX_MESSAGES = 20_000_000
 """In one file; the index of as many takes half a gigabyte."""
 
@@ -87,6 +89,8 @@ class EntryList:
     def add(self, channel: int, t_ns: int, chunk: int, place: int) -> None:
         """Append one message."""
         self._grow(1)
+        if not 0 <= t_ns < 1 << 63:
+            raise ValueError(f"the recorder's stamp is {t_ns}, no time in ns")
         self._rows.append((channel, t_ns, chunk, place))
 
     def add_block(self, channel: int, t_ns: NDArray[np.int64], chunk: int, place: NDArray[np.int64]) -> None:
@@ -108,10 +112,21 @@ class EntryList:
             raise ValueError(f"more than the {MAX_MESSAGES} messages that a file may have")
 
 
+@lru_cache(maxsize=4096)
+def printable(text: str) -> str:
+    """Return a name of a recording in one line that can be shown, whatever a damaged file has in its place."""
+    return "".join(c if c.isprintable() else "?" for c in text[:MAX_NAME_CHARACTERS])
+
+
+def one_line(problem: Exception) -> str:
+    """Return the text of an error as one line of printable characters."""
+    return printable(" ".join(str(problem).split())) or type(problem).__name__
+
+
 def normalized_type(name: str) -> str:
     """Name of a message type as ROS 2 writes it: "sensor_msgs/Image" becomes "sensor_msgs/msg/Image"."""
-    parts = name.split("/")
-    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
+    parts = printable(name).split("/")
+    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else "/".join(parts)
 
 
 def checked_size(size_bytes: int) -> int:

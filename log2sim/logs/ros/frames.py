@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from log2sim.errors import LogError
 from log2sim.geometry import Array, PoseTrack, inverse, rotation_from_quaternion, transform
+from log2sim.logs.ros.containers import printable
 from log2sim.logs.ros.settings import StaticTransform
 
 # Transforms that are sent again and again with the same values are static, as those of ROS 1 on /tf.
@@ -52,9 +53,9 @@ class FrameTree:
                 self.refused += 1
                 continue
             t_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
-            parents = self._rows.setdefault(message.child_frame_id.lstrip("/"), {})
+            parents = self._rows.setdefault(printable(message.child_frame_id).lstrip("/"), {})
             row = t_ns, (t.x, t.y, t.z, q.w, q.x, q.y, q.z)
-            parents.setdefault(message.header.frame_id.lstrip("/"), []).append(row)
+            parents.setdefault(printable(message.header.frame_id).lstrip("/"), []).append(row)
 
     def add_static(self, given: Iterable[StaticTransform]) -> None:
         """Add transforms of the settings, which replace those of the recording."""

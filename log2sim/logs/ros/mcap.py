@@ -9,7 +9,7 @@ import numpy as np
 
 from log2sim.errors import LogError
 from log2sim.logs.ros.chunked import Chunk, ChunkedFile
-from log2sim.logs.ros.containers import Channel, EntryList, checked_size, normalized_type
+from log2sim.logs.ros.containers import Channel, EntryList, checked_size, normalized_type, one_line, printable
 from log2sim.logs.sweeps import PARSER_ERRORS
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -38,7 +38,7 @@ class Mcap(ChunkedFile):
             indexed = self._read_summary()
         except PARSER_ERRORS as problem:
             indexed = False
-            self.notes.append(f"{path.name}: its index is missing or damaged ({problem}); it was read whole")
+            self.notes.append(f"{path.name}: its index is missing or damaged ({one_line(problem)}); it was read whole")
         if not indexed:
             self.channels, self._numbers, self._list, self.chunks = [], {}, EntryList(), []
             self._scan()
@@ -109,7 +109,7 @@ class Mcap(ChunkedFile):
         if number not in self._numbers:
             self._numbers[number] = len(self.channels)
             text = definition if language in ("ros1msg", "ros2msg") else ""
-            self.channels.append(Channel(topic, normalized_type(name), encoding, text))
+            self.channels.append(Channel(printable(topic), normalized_type(name), printable(encoding), text))
 
     def _index_chunk(self, data: bytes) -> None:
         """Read the indexes of the messages of a chunk, or the chunk where it has none."""
@@ -123,7 +123,7 @@ class Mcap(ChunkedFile):
             if not offsets:
                 self._walk(number)
         except PARSER_ERRORS as problem:
-            self.notes.append(f"{self.path.name}: the chunk at byte {start} cannot be read: {problem}")
+            self.notes.append(f"{self.path.name}: the chunk at byte {start} cannot be read: {one_line(problem)}")
 
     def _index_messages(self, chunk: int, position: int) -> None:
         op, size = RECORD_HEAD.unpack(self.at(position, RECORD_HEAD.size))
@@ -165,7 +165,7 @@ class Mcap(ChunkedFile):
                 elif op == MESSAGE:
                     self._add_message(self.at(position, MESSAGE_HEAD.size), -1, position)
             except PARSER_ERRORS as problem:
-                self.notes.append(f"{self.path.name}: the record at byte {position} is left out: {problem}")
+                self.notes.append(f"{self.path.name}: the record at byte {position} is left out: {one_line(problem)}")
             position += RECORD_HEAD.size + size
 
     def _add_message(self, head: bytes, chunk: int, place: int) -> None:

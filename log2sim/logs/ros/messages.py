@@ -14,11 +14,13 @@ from typing import Any
 from log2sim.errors import MissingExtra, RecordError
 from log2sim.logs.ros import livox
 from log2sim.logs.ros.bag import ENCODINGS, Bag, Topic
+from log2sim.logs.ros.containers import one_line
 
 _TF_MESSAGE = "geometry_msgs/TransformStamped[] transforms\n"
 # ROS 1 called it so before tf2.
 ALIASES = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
 _FIELD = re.compile(r"^\s*[\w/<>=]+(?:\[[<>=\d]*\])?\s+(?P<name>[A-Za-z]\w*)\s*(?P<constant>=)?")
+PLAIN_CDR = (b"\0\0", b"\0\1")
 _COMPILING = threading.Lock()
 
 
@@ -29,6 +31,8 @@ def decode(bag: Bag, topic: Topic, i: int) -> Any:
 
 def decode_bytes(topic: Topic, raw: bytes, where: str) -> Any:
     """Decode the bytes of a message; `RecordError`, beginning with `where`, when they are damaged."""
+    if topic.encoding == "cdr" and raw[:2] not in PLAIN_CDR:
+        raise RecordError(f"{where}: encapsulation {raw[:2].hex() or 'missing'}, only plain CDR (0000, 0001) is read")
     store = typestore(topic.encoding)
     kind = ALIASES.get(topic.msgtype, topic.msgtype)
     try:
@@ -36,8 +40,7 @@ def decode_bytes(topic: Topic, raw: bytes, where: str) -> Any:
         with _COMPILING:
             return store.deserialize_ros1(raw, kind) if topic.encoding == "ros1" else store.deserialize_cdr(raw, kind)
     except Exception as problem:  # rosbags raises whatever its compiled code runs into
-        reason = " ".join(str(problem).split())[:120] or type(problem).__name__
-        raise RecordError(f"{where}: not a readable {topic.msgtype}: {reason}") from None
+        raise RecordError(f"{where}: not a readable {topic.msgtype}: {one_line(problem)}") from None
 
 
 def find_layout_problem(topic: Topic) -> str | None:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from log2sim.errors import RecordError
 from log2sim.logs.images import MAX_IMAGE_PX, decode_image, image_size
+from log2sim.logs.ros.containers import printable
 
 # Encodings of sensor_msgs/image_encodings.hpp: channels, bytes of each, conversion of OpenCV to BGR.
 # OpenCV names Bayer patterns by their second row and column, ROS by the first pixel.
@@ -40,7 +41,7 @@ def image_from(message: Any, where: str, size_px: tuple[int, int]) -> NDArray[np
     if (width, height) != size_px or width * height > MAX_IMAGE_PX:
         raise RecordError(f"{where}: {width}x{height} px, the calibration is for {size_px[0]}x{size_px[1]}")
     if message.encoding not in ENCODINGS:
-        raise RecordError(f"{where}: encoding '{message.encoding[:30]}' is not one of {', '.join(ENCODINGS)}")
+        raise RecordError(f"{where}: encoding '{printable(message.encoding)}' is not one of {', '.join(ENCODINGS)}")
     channels, depth, conversion = ENCODINGS[message.encoding]
     line = width * channels * depth
     data = np.asarray(message.data, dtype=np.uint8)
@@ -70,5 +71,5 @@ def encoded_from(message: Any, where: str) -> bytes:
     try:
         image_size(data, where)
     except RecordError as error:
-        raise RecordError(f"{error} (its format says '{str(message.format)[:40]}')") from None
+        raise RecordError(f"{error} (its format says '{printable(message.format)}')") from None
     return data

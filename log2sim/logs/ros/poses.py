@@ -18,6 +18,7 @@ from log2sim.datatypes import MapFrame
 from log2sim.errors import RecordError
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, transform, whole_kilometers, wrap_angle, yaw_of
 from log2sim.logs.ros.bag import Bag
+from log2sim.logs.ros.containers import printable
 from log2sim.logs.ros.frames import FrameTree, pose_of
 from log2sim.logs.ros.messages import decode_bytes
 from log2sim.logs.ros.settings import MapSettings, PoseSettings
@@ -157,7 +158,7 @@ class PoseSources:
 
     def _from_odometry(self, name: str) -> FoundPoses:
         messages, stamps = self._decoded(name)
-        child = next((m.child_frame_id.lstrip("/") for m in messages), "")
+        child = next((printable(m.child_frame_id).lstrip("/") for m in messages), "")
         child_T_base = self.tree.mount(child, self.base)
         notes: tuple[str, ...] = ()
         if child_T_base is None:
@@ -225,7 +226,7 @@ class PoseSources:
         reasons = []
         for name in sorted(topics, key=lambda n: (n.rpartition("/")[0] != parent, -len(self.bag.topics[n]))):
             messages, stamps = self._decoded(name)
-            messages_frame = next((m.header.frame_id.lstrip("/") for m in messages), "")
+            messages_frame = next((printable(m.header.frame_id).lstrip("/") for m in messages), "")
             imu_T_base = self.tree.mount(messages_frame, self.base)
             if imu_T_base is None:
                 reasons.append(f"no transform from '{messages_frame}' of {name} to '{self.base}'")

@@ -12,6 +12,7 @@ from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.geometry import Array, Camera, Mount, PoseTrack, inverse
 from log2sim.logs.ros import calibration, ego
 from log2sim.logs.ros.bag import NAME_BYTES, Bag, Topic
+from log2sim.logs.ros.containers import printable
 from log2sim.logs.ros.frames import FrameTree
 from log2sim.logs.ros.messages import decode_bytes
 from log2sim.logs.ros.poses import FoundPoses, PoseSources
@@ -140,7 +141,7 @@ class _Opening:
             topic = self.bag.topics[name]
             raw = next((raw for raw in self.messages[name] if raw is not None), None)
             if raw is not None:
-                frames.append(decode_bytes(topic, raw, name).child_frame_id.lstrip("/"))
+                frames.append(printable(decode_bytes(topic, raw, name).child_frame_id).lstrip("/"))
         return [frame for frame in frames if frame]
 
     def _poses(self, base: str | None, span_ns: tuple[int, int]) -> tuple[FoundPoses | None, list[dict[str, Any]]]:
@@ -162,6 +163,8 @@ class _Opening:
             others = [f"{c['source']} {c['topic']}" for c in considered if not c["used"]]
             instead = f"; others: {', '.join(others)}" if others else ""
             self.notes.append(f"poses of '{base}' are from {found.source} {found.topic}{instead}")
+        elif self.settings.poses.source == "none":
+            self.notes.append("poses of the recording are not used, as the settings tell")
         elif base is not None:
             reasons = "; ".join(f"{c['topic']}: {c['reason']}" for c in considered)
             self.notes.append(f"no poses of '{base}' in the recording{': ' * bool(reasons)}{reasons}")
@@ -255,8 +258,8 @@ class _Opening:
                 self.notes.append(f"{name}: {problem}")
                 continue
             self.notes.append(
-                f"the road is {ground_m:.2f} m above the origin of '{frame.base}', measured in the first sweep of {name} "
-                "(ego.ground_z_m)"
+                f"the road is at z = {ground_m:.2f} m of the ego in the frame '{frame.base}', measured in the first sweep of "
+                f"{name} (ego.ground_z_m)"
             )
             return ground_m
         self.notes.append(f"the height of the road in '{frame.base}' is not known; taken as 0 (ego.ground_z_m)")

@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from log2sim.errors import LogError, MissingExtra
+from log2sim.logs.ros.containers import one_line
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 METADATA = "metadata.yaml"
@@ -145,6 +146,5 @@ def _read_metadata(path: Path) -> dict[str, Any]:
         if not isinstance(document, dict):
             raise TypeError("no table")
     except (YAMLError, ValueError, TypeError, KeyError, RecursionError) as problem:
-        first = " ".join(str(problem).split())[:200]
-        raise LogError(f"{path}: not the metadata of a rosbag2 recording: {first}") from None
+        raise LogError(f"{path}: not the metadata of a rosbag2 recording: {one_line(problem)}") from None
     return document

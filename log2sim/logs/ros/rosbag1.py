@@ -10,7 +10,7 @@ import numpy as np
 
 from log2sim.errors import LogError
 from log2sim.logs.ros.chunked import Chunk, ChunkedFile
-from log2sim.logs.ros.containers import Channel, EntryList, checked_size, normalized_type
+from log2sim.logs.ros.containers import Channel, EntryList, checked_size, normalized_type, one_line, printable
 from log2sim.logs.sweeps import PARSER_ERRORS
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -60,7 +60,7 @@ class Rosbag1(ChunkedFile):
             self.channels, self._numbers, self._list, self.chunks = [], {}, EntryList(), []
             self._scan()
             self.notes.append(
-                f"{path.name}: its index is missing or damaged ({problem}); {self._list.count} messages were found by "
+                f"{path.name}: its index is missing or damaged ({one_line(problem)}); {self._list.count} messages were found by "
                 "reading it whole"
             )
         self.entries = self._list.entries()
@@ -119,7 +119,7 @@ class Rosbag1(ChunkedFile):
                 self._list.add_block(channel, seconds * 1_000_000_000 + nanoseconds, number, offset)
                 position = record.end
         except PARSER_ERRORS as problem:
-            self.notes.append(f"{self.path.name}: the chunk at byte {position} cannot be read: {problem}")
+            self.notes.append(f"{self.path.name}: the chunk at byte {position} cannot be read: {one_line(problem)}")
 
     def _add_chunk(self, record: Record) -> int:
         compression = record.fields[b"compression"].decode("ascii", "replace")
@@ -138,7 +138,7 @@ class Rosbag1(ChunkedFile):
         )
         # The name in the record's header is the one that the topic was recorded under.
         topic = record.fields.get(b"topic", topic.encode()).decode("utf-8", "replace")
-        self.channels.append(Channel(topic, normalized_type(kind), "ros1", definition))
+        self.channels.append(Channel(printable(topic), normalized_type(kind), "ros1", definition))
 
     def _scan(self) -> None:
         """Find all messages by walking the file, up to where it is cut."""
@@ -151,7 +151,7 @@ class Rosbag1(ChunkedFile):
                 elif record.op == CHUNK:
                     self._walk(self._add_chunk(record))
             except PARSER_ERRORS as problem:
-                self.notes.append(f"{self.path.name}: unreadable from byte {position}: {problem}")
+                self.notes.append(f"{self.path.name}: unreadable from byte {position}: {one_line(problem)}")
                 return
             position = record.end
 

@@ -16,7 +16,16 @@ from numpy.typing import NDArray
 
 from log2sim.errors import LogError
 from log2sim.logs.ros.chunked import decompress_message
-from log2sim.logs.ros.containers import MAX_MESSAGE_BYTES, MAX_MESSAGES, Channel, Entries, checked_size, normalized_type
+from log2sim.logs.ros.containers import (
+    MAX_MESSAGE_BYTES,
+    MAX_MESSAGES,
+    Channel,
+    Entries,
+    checked_size,
+    normalized_type,
+    one_line,
+    printable,
+)
 
 MAGIC = b"SQLite format 3\x00"
 # A block of zstd (RFC 8878: 128 KiB) has to be there whole before its first byte can be unpacked.
@@ -38,12 +47,12 @@ class SqliteBag:
         try:
             self._database = sqlite3.connect(uri, uri=True, check_same_thread=False)
         except sqlite3.Error as problem:
-            raise LogError(f"{path}: cannot be opened as an SQLite database: {problem}") from None
+            raise LogError(f"{path}: cannot be opened as an SQLite database: {one_line(problem)}") from None
         weakref.finalize(self, self._database.close)
         try:
             self._read_index(compression)
         except (sqlite3.Error, UnicodeDecodeError, TypeError, KeyError) as problem:
-            raise LogError(f"{path}: not a readable rosbag2 database: {problem}") from None
+            raise LogError(f"{path}: not a readable rosbag2 database: {one_line(problem)}") from None
 
     def message(self, k: int, limit_bytes: int | None = None) -> bytes:
         """Read message `k`, or its first `limit_bytes`."""
@@ -57,7 +66,7 @@ class SqliteBag:
                 size = checked_size(len(blob))
                 data = blob.read(size if wanted is None else min(size, wanted))
         except sqlite3.Error as problem:
-            raise ValueError(f"the database cannot be read there: {problem}") from None
+            raise ValueError(f"the database cannot be read there: {one_line(problem)}") from None
         return decompress_message(data, compression, limit_bytes)
 
     def _read_index(self, compression: str) -> None:
@@ -81,7 +90,13 @@ class SqliteBag:
                 }
         rows = list(database.execute("SELECT id, name, type, serialization_format FROM topics ORDER BY id"))
         self.channels = [
-            Channel(str(topic), normalized_type(str(kind)), str(encoding), definitions.get(str(kind), ""), compression)
+            Channel(
+                printable(str(topic)),
+                normalized_type(str(kind)),
+                printable(str(encoding)),
+                definitions.get(str(kind), ""),
+                compression,
+            )
             for _, topic, kind, encoding in rows
         ]
         table: NDArray[np.int64] = np.fromiter(chain.from_iterable(self._rows()), dtype=np.int64).reshape(-1, 3)
@@ -104,4 +119,4 @@ class SqliteBag:
                     raise LogError(f"{self.path}: more than the {MAX_MESSAGES} messages that a file may have")
                 yield row
         except sqlite3.Error as problem:
-            self.notes.append(f"{self.path.name}: damaged after {count} messages: {problem}")
+            self.notes.append(f"{self.path.name}: damaged after {count} messages: {one_line(problem)}")

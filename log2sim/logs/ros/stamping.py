@@ -71,7 +71,8 @@ def note_other_clocks(delays_s: Mapping[str, float | None], notes: list[str]) ->
     known = {name: delay for name, delay in delays_s.items() if delay is not None}
     if not known:
         return
-    usual_s = float(np.median(list(known.values())))
+    # The middle one by size: of two, that of the recorder's clock.
+    usual_s = sorted(known.values(), key=abs)[(len(known) - 1) // 2]
     for name, delay_s in known.items():
         if abs(delay_s - usual_s) > MAX_CLOCK_DIFFERENCE_S:
             notes.append(
