@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -90,6 +90,24 @@ def test_what_surrounds_a_part_is_kept_for_interpolation() -> None:
         assert part.streams["top"].read(i) is log.streams["top"].read(k)
     assert part.digest != log.digest
     assert cut_log(log) is log
+
+
+def test_every_field_of_labels_is_kept() -> None:
+    log = world_log()
+    n = len(log.labels.t_ns)
+    full = replace(
+        log.labels,
+        visible=np.arange(n) % 2 == 0,
+        cameras=("front",),
+        kind=log.labels.category,
+        occlusion=np.arange(n) % 4,
+        labeled_ns=np.unique(log.labels.t_ns),
+        never_labeled=("bicycle",),
+    )
+    assert all(getattr(full, f.name) is not None for f in fields(full))
+    part = cut_log(replace(log, labels=full), start_s=0.0, stop_s=100.0).labels
+    for field in fields(full):
+        np.testing.assert_array_equal(getattr(part, field.name), getattr(full, field.name))
 
 
 def test_labels_stay_with_their_cameras() -> None:

@@ -273,6 +273,7 @@ def labels_of(draw: st.DrawFn, t_ns: np.ndarray, far: float) -> Labels:
         kind=column(word, np.str_) if draw(st.booleans()) else None,
         occlusion=column(st.integers(0, 3), np.int64) if draw(st.booleans()) else None,
         labeled_ns=t_ns[: draw(st.integers(0, len(t_ns)))] if draw(st.booleans()) else None,
+        never_labeled=draw(st.sampled_from([(), ("bicycle", "bus")])),
     )
 
 
@@ -305,6 +306,7 @@ def test_any_small_log_survives_writing_and_reading(tmp_path: Path, log: Log) ->
     assert (back.labels is None) == (log.labels is None)
     if log.labels is not None:
         assert back.labels.cameras == log.labels.cameras
+        assert back.labels.never_labeled == log.labels.never_labeled
         for column in (
             "t_ns",
             "track_id",
