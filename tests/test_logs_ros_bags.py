@@ -25,7 +25,7 @@ from log2sim import open_log
 from log2sim.cli import app
 from log2sim.datatypes import Log, Stream
 from log2sim.errors import ConfigError, LogError, MissingExtra, RecordError
-from log2sim.geometry import NS_PER_S, transform
+from log2sim.geometry import NS_PER_S, RollingShutter, transform
 from log2sim.logs.ros import messages as ros_messages
 from log2sim.logs.ros.bag import open_container
 from log2sim.logs.ros.chunked import ChunkedFile, decompress
@@ -219,7 +219,11 @@ def test_data_that_unpack_to_more_than_they_say_are_refused() -> None:
         decompress(b"", "rar", 100)
 
 
-@pytest.mark.parametrize("style", [Style("bag"), Style("bag", "lz4"), Style("mcap", "storage"), Style("db3")], ids=lambda s: f"{s.container}-{s.compression}")
+@pytest.mark.parametrize(
+    "style",
+    [Style("bag"), Style("bag", "lz4"), Style("mcap", "storage"), Style("db3")],
+    ids=lambda s: f"{s.container}-{s.compression}",
+)
 def test_any_damage_is_told_in_one_line(style: Style, tmp_path: Path) -> None:
     """Random bytes at random places, most of them where headers and indexes are."""
     rng = np.random.default_rng(7)
@@ -461,6 +465,20 @@ def test_bytes_that_are_no_message_are_an_error_of_the_record(raw: bytes, messag
     topic = SimpleNamespace(name="/t", msgtype="sensor_msgs/msg/Image", encoding="cdr")
     with pytest.raises(RecordError, match=f"^here: {message}"):
         decode_bytes(topic, raw, "here")
+
+
+def test_offsets_and_shutters_are_as_told(plain: Path) -> None:
+    settings = (
+        '[cameras.front]\ntopic = "/front/image_raw/compressed"\noffset_s = -0.01\n'
+        'rolling_shutter = { direction = "down", readout_s = 0.02 }\n[lidars.top]\ntopic = "/top/points"\noffset_s = 0.5\n'
+    )
+    log, world = open_log(with_settings(plain, settings)), world_log()
+    plain.with_name("world.topics.toml").unlink()
+    np.testing.assert_array_equal(log.streams["front"].t_ns, world.streams["front"].t_ns - 10_000_000)
+    assert log.cameras["front"].rolling_shutter == RollingShutter("down", 0.02)
+    ours, theirs = (one.streams["top"].read(3) for one in (log, world))
+    assert ours.stamp_ns == log.streams["top"].t_ns[3] == theirs.stamp_ns + 500_000_000
+    np.testing.assert_array_equal(ours.t_ns, theirs.t_ns + 500_000_000)
 
 
 def test_an_imu_whose_heading_is_not_the_course_is_noted(tmp_path: Path) -> None:

@@ -166,19 +166,19 @@ class PoseSources:
                 raise NoPoses(f"it is of the frame '{child}', from which there is no transform to '{self.base}'")
             notes = (f"{name}: names no child_frame_id; taken as the pose of '{self.base}'",)
             child_T_base = np.eye(4)
-        return self._of_messages(name, "odometry", stamps, [m.pose.pose for m in messages], child_T_base, notes)
+        return self._of_messages(name, stamps, [m.pose.pose for m in messages], child_T_base, notes)
 
     def _from_poses(self, name: str) -> FoundPoses:
         messages, stamps = self._decoded(name)
         covariance = self.bag.topics[name].msgtype.endswith("PoseWithCovarianceStamped")
         poses = [m.pose.pose if covariance else m.pose for m in messages]
         notes = (f"{name}: does not say whose pose it is; taken as that of '{self.base}'",)
-        return self._of_messages(name, "pose", stamps, poses, np.eye(4), notes)
+        return self._of_messages(name, stamps, poses, np.eye(4), notes)
 
     def _of_messages(
-        self, name: str, source: str, stamps: NDArray[np.int64], messages: list[Any], child_T_base: Array,
-        notes: tuple[str, ...],
-    ) -> FoundPoses:  # fmt: skip
+        self, name: str, stamps: NDArray[np.int64], messages: list[Any], child_T_base: Array, notes: tuple[str, ...]
+    ) -> FoundPoses:
+        source = "odometry" if name in self.topics.get("odometry", ()) else "pose"
         poses = [pose_of(m.position, m.orientation) for m in messages]
         valid = np.array([p is not None for p in poses], dtype=bool)
         if not valid.any():

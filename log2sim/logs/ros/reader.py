@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from log2sim.datatypes import Lidar, Log, MapFrame, Stream
 from log2sim.errors import ConfigError, LogError, RecordError
-from log2sim.geometry import Array, Camera, Mount, PoseTrack, inverse
+from log2sim.geometry import NS_PER_S, Array, Camera, Mount, PoseTrack, RollingShutter, inverse
 from log2sim.logs.ros import calibration, ego
 from log2sim.logs.ros.bag import NAME_BYTES, Bag, Topic
 from log2sim.logs.ros.containers import printable
@@ -100,15 +101,18 @@ class _Opening:
             reference_camera=self._reference_camera(cameras, streams),
             digest=self.bag.digest,
             notes=tuple(self.notes),
-            details={
-                "settings": None if self.file is None else self.file.name,
-                "files": [container.path.name for container in self.bag.files],
-                "topics": self.roles.table(self.bag),
-                "base_frame": {"name": base, "reason": why},
-                "poses": considered,
-                "frames": self.tree.describe(),
-            },
+            details=self._details(base, why, considered),
         )
+
+    def _details(self, base: str | None, why: str, considered: list[dict[str, Any]]) -> dict[str, Any]:
+        return {
+            "settings": None if self.file is None else self.file.name,
+            "files": [container.path.name for container in self.bag.files],
+            "topics": self.roles.table(self.bag),
+            "base_frame": {"name": base, "reason": why},
+            "poses": considered,
+            "frames": self.tree.describe(),
+        }
 
     def _sensors(self) -> dict[str, CameraTopic | LidarTopic]:
         return {**self.roles.lidars, **self.roles.cameras}
@@ -176,6 +180,8 @@ class _Opening:
             recorded = sensor.stamps == "recorded"
             stamped[name] = stamp_messages(topic, self.messages[topic.name], self.notes, recorded=recorded)
             delays[topic.name] = stamped[name].delay_s
+            offset_ns = round(sensor.offset_s * NS_PER_S)
+            stamped[name] = replace(stamped[name], t_ns=stamped[name].t_ns + offset_ns)
         for kind in ("odometry", "pose", "gnss"):
             for name in self.roles.topics.get(kind, ()):
                 topic = self.bag.topics[name]
@@ -219,6 +225,9 @@ class _Opening:
                     cameras[name] = calibration.camera_from_info(
                         name, self._info(chosen), mounts[name], rectified=bool(chosen.rectified), stereo=stereo
                     )
+                if chosen.rolling_shutter is not None:
+                    shutter = RollingShutter(chosen.rolling_shutter.direction, chosen.rolling_shutter.readout_s)
+                    cameras[name] = replace(cameras[name], rolling_shutter=shutter)
             except calibration.CalibrationProblem as problem:
                 self.notes.append(
                     f"{chosen.topic}: left out: {problem}; give cameras.{name}.info or cameras.{name}.intrinsics in the settings"

@@ -14,6 +14,7 @@ from log2sim.errors import ConfigError
 from log2sim.model_errors import first_problem
 
 MAX_SETTINGS_BYTES = 1024 * 1024
+MAX_OFFSET_S = 10.0
 QUATERNION_TOLERANCE = 1e-3
 DISTORTION_LENGTHS = {"none": (0,), "brown": (4, 5, 8), "fisheye": (4,)}
 NAME = r"^[A-Za-z0-9_-]+$"
@@ -52,11 +53,19 @@ class Intrinsics(Section):
         return self
 
 
+class ReadLines(Section):
+    """Rolling shutter of a camera, as `log2sim.geometry.RollingShutter` has it."""
+
+    direction: Literal["down", "up", "right", "left"]
+    readout_s: float = Field(gt=0, le=1)
+
+
 class CameraTopic(Section):
     """A camera.
 
     `rectified` tells whether the images are free of distortion, so that P of the CameraInfo is theirs; without it the name
-    of the topic decides. `info` and `frame` default to what names and headers say.
+    of the topic decides. `info` and `frame` default to what names and headers say. `offset_s` is added to the stamps, so that
+    they are of the middle of the exposure and of the LiDAR's clock.
     """
 
     topic: str
@@ -64,6 +73,8 @@ class CameraTopic(Section):
     frame: str = ""
     rectified: bool | None = None
     stamps: Literal["header", "recorded"] = "header"
+    offset_s: float = Field(default=0.0, ge=-MAX_OFFSET_S, le=MAX_OFFSET_S)
+    rolling_shutter: ReadLines | None = None
     intrinsics: Intrinsics | None = None
 
 
@@ -72,7 +83,8 @@ class LidarTopic(Section):
 
     `time_field` is the field of the points' times ("none": there is none), `time_unit` its unit; both are recognized by
     default. `stamp` tells whether the header's stamp is the start or the end of the sweep; by default times that are not
-    negative count from it, and negative ones before it. `compensated`: a node has moved all points to that stamp.
+    negative count from it, and negative ones before it. `compensated`: a node has moved all points to that stamp. `offset_s` is
+    added to all stamps.
     """
 
     topic: str
@@ -82,6 +94,7 @@ class LidarTopic(Section):
     stamp: Literal["auto", "start", "end"] = "auto"
     compensated: bool = False
     stamps: Literal["header", "recorded"] = "header"
+    offset_s: float = Field(default=0.0, ge=-MAX_OFFSET_S, le=MAX_OFFSET_S)
 
 
 class StaticTransform(Section):
