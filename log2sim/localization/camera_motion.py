@@ -112,7 +112,7 @@ def follow_camera(
 
     Notes
     -----
-    The road is taken for a plane on which the ego does not pitch or roll. Scale and heading drift: expect some percent of
+    The road is taken for a plane, to which the ego is level on average. Scale and heading drift: expect some percent of
     the path.
     """
     stream = log.streams[name]
@@ -206,28 +206,28 @@ class _Follower:
             return np.eye(4)
         from_xy, to_xy = (undistort(self.camera, px / self.scale) for px in (from_px, to_px))
         turn = self._turn(from_xy, to_xy)
-        if turn is None or abs(turn) > MAX_YAW_RATE_RADPS * dt_s:
+        if turn is None or abs(float(yaw_of(turn))) > MAX_YAW_RATE_RADPS * dt_s:
             return None
         shift = self._shift(first, second, turn, dt_s)
         self.last_mps = self.last_mps if shift is None else shift / dt_s
-        return None if shift is None else transform(rotation_from_rpy(0.0, 0.0, turn), np.append(shift, 0.0))
+        return None if shift is None else transform(rotation_from_rpy(0.0, 0.0, yaw_of(turn)), np.append(shift, 0.0))
 
-    def _turn(self, from_xy: Array, to_xy: Array) -> float | None:
-        """Estimate the yaw, rad, of the ego between normalized image points (N, 2)."""
+    def _turn(self, from_xy: Array, to_xy: Array) -> Array | None:
+        """Estimate the rotation (3, 3) of the ego at the second image in its frame at the first, from normalized points (N, 2)."""
         import cv2
 
         threshold = TOLERANCE_PX / self.scale / float(self.camera.K[0, 0])
         ego_R_cam = self.camera.mount_T_cam[:3, :3]
         only = _pure_rotation(from_xy, to_xy, threshold)
         if only is not None:
-            return float(yaw_of(ego_R_cam @ only.T @ ego_R_cam.T))
+            return ego_R_cam @ only.T @ ego_R_cam.T
         essential, mask = cv2.findEssentialMat(from_xy, to_xy, np.eye(3), cv2.RANSAC, 0.999, threshold)
         if essential is None or essential.shape != (3, 3):
             return None
         _, second_R_first, _, _ = cv2.recoverPose(essential, from_xy, to_xy, np.eye(3), mask=mask)
-        return float(yaw_of(ego_R_cam @ second_R_first.T @ ego_R_cam.T))
+        return np.asarray(ego_R_cam @ second_R_first.T @ ego_R_cam.T)
 
-    def _shift(self, first: NDArray[np.uint8], second: NDArray[np.uint8], turn: float, dt_s: float) -> Array | None:
+    def _shift(self, first: NDArray[np.uint8], second: NDArray[np.uint8], turn: Array, dt_s: float) -> Array | None:
         """Estimate the translation (2,), m, from the texture of the road, near the last motion or else from several guesses."""
         views = self.road.view(first), self.road.view(second)
         found = self._shift_near(*views, turn, self.last_mps * dt_s)
@@ -241,16 +241,20 @@ class _Follower:
         return found[0]
 
     def _shift_near(
-        self, first: NDArray[np.uint8], second: NDArray[np.uint8], turn: float, guess_m: Array
+        self, first: NDArray[np.uint8], second: NDArray[np.uint8], turn: Array, guess_m: Array
     ) -> tuple[Array, int] | None:
         """Find the translation (2,), m, that most points of two views of the road agree on, and their number."""
         begin, end = self.road.followed(first, second, guess_m)
-        cos, sin = np.cos(turn), np.sin(turn)
-        shifts = begin - end @ np.array([[cos, sin], [-sin, cos]])
-        if len(shifts) < MIN_ON_ROAD:
+        if len(begin) < MIN_ON_ROAD:
             return None
+        # A car nods by some tenths of a degree, which moves the road at 8 m by as many decimeters: what the rotation says of
+        # it is taken out of the second view.
+        mount = self.camera.mount_T_cam[:2, 3]
+        rays = np.column_stack([end - mount, np.full(len(end), -self.height_m)]) @ turn.T
+        shifts = begin - mount - rays[:, :2] * (self.height_m / -rays[:, 2])[:, None]
+        shifts = shifts + mount - rotation_from_rpy(0.0, 0.0, yaw_of(turn))[:2, :2] @ mount
         # A pixel moves the point where a ray meets the road by its squared distance over the height.
-        away = np.hypot(*(begin - self.camera.mount_T_cam[:2, 3]).T)
+        away = np.hypot(*(begin - mount).T)
         sigma = TOLERANCE_PX * (1 / ROAD_PX_PER_M + away**2 / (float(self.camera.K[0, 0]) * self.scale * self.height_m))
         apart = np.linalg.norm(shifts[:, None] - shifts[None], axis=2)
         agree = apart < 2 * np.hypot(sigma[:, None], sigma[None])
