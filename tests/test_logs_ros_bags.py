@@ -336,6 +336,8 @@ def several_images(log: Log) -> Iterator[Message]:
             yield t_ns, recorded, "/top/points_also", kind, content
             shifted = replace(content, header=replace(content.header, frame_id="map"))
             yield t_ns, recorded, "/whole_world", kind, shifted
+            joined = replace(content, header=replace(content.header, frame_id="base_link"))
+            yield t_ns, recorded, "/concatenated", kind, joined
     for t_ns, recorded, topic, kind, content in Maker(log, Style("bag")):
         if "compressed" in topic:
             yield t_ns, recorded, topic, kind, content
@@ -351,6 +353,7 @@ def test_of_several_topics_of_one_sensor_the_best_is_taken(tmp_path: Path) -> No
     assert roles["/top/points_also"] == ("unused", "cloud of the same frame as /top/points")
     assert roles["/top/filtered_points"] == ("unused", "by its name no cloud of a sensor")
     assert "fixed frame 'map'" in roles["/whole_world"][1]
+    assert roles["/concatenated"] == ("unused", "its points are in 'base_link', so they are of several sensors")
 
 
 def test_a_camera_without_calibration_is_left_out_and_says_how_to_give_it(tmp_path: Path) -> None:

@@ -276,6 +276,14 @@ def test_rectified_images_have_the_projection_and_the_turned_axes() -> None:
         np.testing.assert_allclose(uv[0], expected[:2] / expected[2])
 
 
+def test_rectified_images_without_a_projection_have_the_camera_matrix() -> None:
+    info = camera_info(D=[-0.3, 0.1, 0, 0, 0], P=np.zeros((3, 4)))
+    camera = camera_from_info("front", info, ("ego", POSE), rectified=True)
+    assert camera.rectified
+    np.testing.assert_array_equal(camera.K, K)
+    np.testing.assert_array_equal(camera.mount_T_cam, POSE)
+
+
 def tf(parent: str, child: str, xyz: Any, t_s: float = 0.0, q: Any = (1.0, 0.0, 0.0, 0.0)) -> SimpleNamespace:
     vector = SimpleNamespace(x=float(xyz[0]), y=float(xyz[1]), z=float(xyz[2]))
     turn = SimpleNamespace(w=q[0], x=q[1], y=q[2], z=q[3])

@@ -50,15 +50,15 @@ def camera_from_info(
     mount, mount_T_cam = pose
     model, distortion = "none", tuple[float, ...]()
     K, P = _matrix(info, "K", (3, 3)), _matrix(info, "P", (3, 4))
-    if rectified and P[0, 0] > 0:
+    if rectified and P[0, 0] > 0 and P[1, 1] > 0 and np.isfinite(P).all():
         rotation = _matrix(info, "R", (3, 3))
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > ROTATION_TOLERANCE:
+        if not np.abs(rotation @ rotation.T - np.eye(3)).max() <= ROTATION_TOLERANCE:
             rotation = np.eye(3)
         mount_T_cam = mount_T_cam @ inverse(transform(rotation, np.zeros(3)))
         if stereo:
-            mount_T_cam = mount_T_cam @ inverse(transform(np.eye(3), np.linalg.solve(P[:, :3], P[:, 3])))
+            mount_T_cam = mount_T_cam @ inverse(transform(np.eye(3), _offset(P)))
         K = P[:, :3]
-    else:
+    elif not rectified:
         model, distortion = _lens(info)
     if not (K[0, 0] > 0 and K[1, 1] > 0 and np.isfinite(K).all()):
         raise CalibrationProblem(f"its focal lengths are {K[0, 0]:g} and {K[1, 1]:g} px: the camera is not calibrated")
@@ -66,6 +66,13 @@ def camera_from_info(
     if not (width > 0 and height > 0):
         raise CalibrationProblem(f"its size is {width}x{height} px")
     return Camera(name, width, height, K, mount, mount_T_cam, model, distortion)
+
+
+def _offset(P: Array) -> Array:
+    """Position (3,) of the second camera of a stereo pair in the frame of both: P = K [I | t]."""
+    K = np.triu(P[:, :3])
+    K[2, 2] = 1.0
+    return np.asarray(np.linalg.solve(K, P[:, 3]))
 
 
 def _lens(info: Any) -> tuple[str, tuple[float, ...]]:

@@ -12,6 +12,7 @@ from log2sim import registry
 from log2sim.errors import ConfigError
 from log2sim.logs.ros import livox
 from log2sim.logs.ros.bag import Bag, Topic
+from log2sim.logs.ros.ego import BASE_FRAMES
 from log2sim.logs.ros.messages import find_layout_problem
 from log2sim.logs.ros.settings import CameraTopic, LidarTopic, TopicSettings
 
@@ -189,6 +190,10 @@ def _one_per_frame(bag: Bag, topics: list[Topic], roles: Roles) -> list[Topic]:
             roles.reasons[topic.name] = ("unused", f"its points are in the fixed frame '{frame}', not in a sensor's")
         else:
             groups.setdefault(frame, []).append(topic)
+    if set(groups) - set(BASE_FRAMES):
+        for frame in set(groups) & set(BASE_FRAMES):
+            for topic in groups.pop(frame):
+                roles.reasons[topic.name] = ("unused", f"its points are in '{frame}', so they are of several sensors")
     return _best_of(groups, lambda t: (-len(t), len(t.name), t.name), "cloud of the same frame", roles)
 
 
