@@ -282,6 +282,14 @@ def test_a_tunnel_keeps_the_given_poses_and_says_why() -> None:
     assert log is tunnel()
 
 
+def test_an_empty_plain_keeps_the_given_poses() -> None:
+    log, _ = drive([], STRAIGHT, duration_s=1.0, sigma_m=0.3)
+    choice = localize(log, Config.load(poses=AUTO))[1]
+    assert choice.source == "given"
+    with pytest.raises(LogError, match="cannot tell how the ego moves"):
+        localize(without_poses(log), Config())
+
+
 def test_odometry_that_is_asked_for_in_a_tunnel_says_that_it_is_doubtful() -> None:
     choice = localize(tunnel(), Config.load(poses=LIDAR))[1]
     assert choice.source == "lidar"

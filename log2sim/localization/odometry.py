@@ -171,15 +171,16 @@ class _Run:
         if first is None:
             return
         dt_s = (sweep.t_ref_ns - first.t_ref_ns) / NS_PER_S
-        fit = None if dt_s > MAX_COASTING_S else self._first_fit(first, sweep, dt_s)
-        if fit is None:
+        found = None if dt_s > MAX_COASTING_S else self._first_fit(first, sweep, dt_s)
+        if found is None:
             self._count("no overlap with the sweep before")
             return
-        self.path = [_Step(first.t_ref_ns, np.eye(4)), _Step(sweep.t_ref_ns, fit.pose, fit)]
+        fit, held = found
+        self.path = [_Step(first.t_ref_ns, np.eye(4), held=held), _Step(sweep.t_ref_ns, fit.pose, fit, held=held)]
         self.motion, self.motion_s, self.first = fit.pose, dt_s, None
 
-    def _first_fit(self, first: EgoSweep, sweep: EgoSweep, dt_s: float) -> Fit | None:
-        """Fit two sweeps without a motion before them, and once more with this motion taken out of both."""
+    def _first_fit(self, first: EgoSweep, sweep: EgoSweep, dt_s: float) -> tuple[Fit, bool] | None:
+        """Fit two sweeps without a motion before them, and once more with this motion taken out of both; whether it is held."""
         reach = np.arange(-MAX_REVERSE_MPS * dt_s, MAX_SPEED_MPS * dt_s + SEARCH_STEP_M, SEARCH_STEP_M)
         shifts = reach[np.argsort(np.abs(reach))]
         best = None
@@ -203,8 +204,9 @@ class _Run:
         fit = self.map.fit(source, best.pose)
         if fit.overlap < MIN_OVERLAP:
             return None
+        held = self.map.holds(source, fit)
         self.map.insert(source, fit.pose)
-        return fit
+        return fit, held
 
     def _follow(self, sweep: EgoSweep) -> None:
         """Register a sweep from the pose that constant velocity predicts."""
