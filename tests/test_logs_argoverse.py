@@ -17,7 +17,7 @@ from log2sim.datatypes import Log, MapFrame, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import PoseTrack, apply, inverse, points_in_box
 from log2sim.logs.argoverse.cities import CITIES, map_frame_of
-from log2sim.logs.argoverse.labels import CATEGORY_OF, NO_ROAD_USERS, read_labels, seen_after_ns
+from log2sim.logs.argoverse.labels import CATEGORY_OF, NO_ROAD_USERS, read_labels, scan_time_ns
 from log2sim.logs.argoverse.reader import ANNOTATIONS, INTRINSICS, MOUNTS, POSES, READER
 from log2sim.logs.opening import open_log
 from log2sim.logs.summary import summarize
@@ -141,8 +141,8 @@ def test_an_object_is_seen_between_the_passages_of_both_lidars() -> None:
     xy = np.stack([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))], axis=1)
     upper_ms = (144.0 - degrees) / 3.6
     lower_ms = (upper_ms + 50) % 100
-    np.testing.assert_allclose(seen_after_ns(xy) / 1e6, (upper_ms + lower_ms) / 2, atol=1e-5)
-    np.testing.assert_allclose(seen_after_ns(xy) / 1e6, [25.03, 50, 73.33, 25.03, 50], atol=0.01)
+    np.testing.assert_allclose(scan_time_ns(xy) / 1e6, (upper_ms + lower_ms) / 2, atol=1e-5)
+    np.testing.assert_allclose(scan_time_ns(xy) / 1e6, [25.03, 50, 73.33, 25.03, 50], atol=0.01)
 
 
 def box(kind: str, x: float, z: float = 0.5, **other: object) -> dict[str, object]:

@@ -23,8 +23,9 @@ from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.geometry import NS_PER_S, apply, inverse, points_in_box
 from log2sim.logs.nuscenes import tables
 from log2sim.logs.nuscenes.labels import turn_ends
-from log2sim.logs.nuscenes.sweeps import FIRING_NS, read_sweep, seen_offset_ns
+from log2sim.logs.nuscenes.sweeps import FIRING_NS, read_sweep
 from log2sim.logs.opening import open_log
+from log2sim.logs.spinning import compute_scan_offset_ns
 from log2sim.perception.lidar.cloud import deskew, transform_rigidly
 
 KEY_EVERY = 5
@@ -146,7 +147,7 @@ def test_points_in_another_order_have_no_times(root: Path, spoilable: Path) -> N
 
 def test_the_turn_is_clockwise_from_the_left() -> None:
     left, front, right, back = [-1.0, -1e-9, 0], [0, 1.0, 0], [1.0, 0, 0], [0, -1.0, 0]
-    turned = seen_offset_ns(np.array([left, front, right, back, [-1.0, 1e-9, 0]]))
+    turned = compute_scan_offset_ns(np.array([left, front, right, back, [-1.0, 1e-9, 0]]), TURN_NS)
     np.testing.assert_allclose(turned / TURN_NS, [0, -0.75, -0.5, -0.25, -1], atol=1e-8)
 
 
@@ -169,7 +170,7 @@ def test_labels_between_key_frames_are_those_of_the_world(root: Path) -> None:
         np.testing.assert_allclose(labels.size_m[rows], np.tile(size, (rows.sum(), 1)))
         np.testing.assert_allclose(labels.yaw_rad[rows], yaw, atol=1e-6)
         map_T_lidar = log.map_T_sensor("top", t_ns)[0]
-        offset = seen_offset_ns(apply(inverse(map_T_lidar), labels.center_m[rows]))
+        offset = compute_scan_offset_ns(apply(inverse(map_T_lidar), labels.center_m[rows]), TURN_NS)
         assert np.abs((t_ns - offset)[:, None] - key_ns).min(axis=0).max() < 1_000_000
 
 
@@ -239,8 +240,8 @@ def test_files_of_a_partial_download_are_left_out_and_counted(root: Path, spoila
     assert set(log.streams) == {"top"}
     assert log.reference_camera is None
     sweeps, frames = (len(whole.streams[name].t_ns) for name in ("top", "front"))
-    assert f"top: {sweeps - len(log.streams['top'].t_ns)} of {sweeps} files are missing" in log.notes
-    assert f"front: {frames} of {frames} files are missing; the sensor is left out" in log.notes
+    assert f"top: {sweeps - len(log.streams['top'].t_ns)} of {sweeps} records are missing" in log.notes
+    assert f"front: {frames} of {frames} records are missing; the sensor is left out" in log.notes
     assert any(note.endswith("RADAR_FRONT") for note in log.notes)
     np.testing.assert_array_equal(log.ego.t_ns, whole.ego.t_ns)
     for file in spoilable.glob("samples/top/*"):
@@ -439,7 +440,7 @@ def test_the_recorded_scene_has_what_its_tables_say(scene: Log) -> None:
     assert len(scene.ego.t_ns) == 281
     assert len(scene.labels.labeled_ns) == 40
     assert len(np.unique(scene.labels.track_id)) > 100
-    assert "LIDAR_TOP: 40 of 41 files are missing" in scene.notes
+    assert "LIDAR_TOP: 40 of 41 records are missing" in scene.notes
     assert any("last 0.5 s of the 19.4 s" in note for note in scene.notes)
 
 
@@ -468,7 +469,7 @@ def test_recorded_points_are_timed_by_their_direction_too(scene: Log) -> None:
     sweep = scene.streams["LIDAR_TOP"].read(0)
     assert sweep.t_ns is not None
     far = np.linalg.norm(sweep.xyz_m, axis=1) > 15
-    difference = (sweep.t_ns - sweep.stamp_ns - seen_offset_ns(sweep.xyz_m))[far]
+    difference = (sweep.t_ns - sweep.stamp_ns - compute_scan_offset_ns(sweep.xyz_m, TURN_NS))[far]
     wrapped = (difference + TURN_NS // 2) % TURN_NS - TURN_NS // 2
     assert np.percentile(np.abs(wrapped), 99) < 200_000
 

@@ -13,15 +13,17 @@ import pytest
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import apply, inverse, points_in_box, project, rotation_from_rpy, wrap_angle
 from log2sim.logs.opening import open_log
-from log2sim.logs.pandaset.labels import azimuth_offset_ns, read_labels
+from log2sim.logs.pandaset.labels import PERIOD_NS, read_labels
 from log2sim.logs.pandaset.reader import georeference
 from log2sim.logs.pandaset.sweeps import SweepFiles
+from log2sim.logs.spinning import compute_scan_offset_ns
 
 
 def test_a_label_is_timed_by_its_direction() -> None:
     """Clockwise, the rear at the stamp: right 25 ms, front 50 ms, left 75 ms before."""
     xyz = np.array([[-1.0, -1e-12, 0], [0, -1, 0], [1, 0, 0], [0, 1, 0], [-1, 1e-12, 0]])
-    np.testing.assert_array_equal(azimuth_offset_ns(xyz), [0, -25_000_000, -50_000_000, -75_000_000, -100_000_000])
+    offset_ns = compute_scan_offset_ns(xyz, PERIOD_NS)
+    np.testing.assert_array_equal(offset_ns, [0, -25_000_000, -50_000_000, -75_000_000, -100_000_000])
 
 
 def cuboids(path: Path, rows: list[dict[str, object]], without: Sequence[str] = ()) -> None:
@@ -52,7 +54,10 @@ def test_cuboids_become_one_row_an_object_with_rising_stamps(tmp_path: Path) -> 
     np.testing.assert_allclose(labels.center_m[1:, 0], [9.1, 9.0])
     np.testing.assert_allclose(labels.size_m[0], [4.4, 1.8, 1.5])
     np.testing.assert_allclose(labels.yaw_rad, np.pi / 2)
-    assert notes == ["labels left out because their kind is not known: Saucer"]
+    assert notes == [
+        "labels left out because they are no road users: Cones (1)",
+        "labels left out because their kind is not known: Saucer (1)",
+    ]
 
 
 def test_of_two_cuboids_of_an_object_one_naming_the_other_is_enough(tmp_path: Path) -> None:

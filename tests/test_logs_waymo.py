@@ -106,7 +106,7 @@ def test_boxes_are_where_the_lidar_saw_them(world: Log, log: Log) -> None:
         np.testing.assert_allclose(log.labels.size_m[rows], np.tile(size, (len(rows), 1)))
         np.testing.assert_allclose(wrap_angle(log.labels.yaw_rad[rows] - yaw), 0, atol=1e-3)
     assert set(log.labels.category) == {"car", "pedestrian"}
-    assert "labels left out as no road users: 10 'sign'" in log.notes
+    assert "labels left out because they are no road users: sign (10)" in log.notes
 
 
 def test_a_box_holds_the_points_that_were_measured_at_its_time(log: Log) -> None:
@@ -294,7 +294,7 @@ def test_frames_without_a_use_are_kept_out_with_a_note(segment: waymo.Segment, t
     path.write_bytes(b"".join(map(waymo.record, whole)))
     log = open_log(path)
     assert len(log.streams["LIDAR_TOP"].t_ns) == 2
-    assert any(note.startswith("4 of 6 records kept out; record 1: no rigid pose") for note in log.notes)
+    assert any(note.startswith("4 of 6 records left out; record 1: no rigid pose") for note in log.notes)
 
 
 @pytest.mark.parametrize(
@@ -427,7 +427,7 @@ def test_the_recorded_frame_has_its_cameras_and_labels(recorded: Log) -> None:
     }
     kinds, counts = np.unique(recorded.labels.kind, return_counts=True)
     assert dict(zip(kinds.tolist(), counts.tolist())) == {"cyclist": 1, "pedestrian": 12, "vehicle": 37}
-    assert "labels left out as no road users: 25 'sign'" in recorded.notes
+    assert "labels left out because they are no road users: sign (25)" in recorded.notes
     assert all(c.rolling_shutter and c.rolling_shutter.direction == "right" for c in recorded.cameras.values())
     assert recorded.map.offset_m == (-25000.0, 42000.0, 0.0)
 

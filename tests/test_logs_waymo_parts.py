@@ -117,12 +117,12 @@ def test_a_damaged_length_keeps_out_what_cannot_be_found(tmp_path: Path) -> None
     wrong_crc[19 + 9] ^= 1
     file = RecordFile(records_file(tmp_path / "a", bytes(wrong_crc)))
     assert [file.read(k, "") for k in range(2)] == [b"one", b"third"]
-    assert "record 1 at offset 19: the CRC of its length is wrong; kept out" in file.notes[0]
+    assert "record 1 at offset 19: the CRC of its length is wrong; left out" in file.notes[0]
     wrong_length = whole_file.copy()
     wrong_length[19 + 1] = 200
     file = RecordFile(records_file(tmp_path / "b", bytes(wrong_length)))
     assert len(file.spans) == 1
-    assert "it and what follows are kept out" in file.notes[0]
+    assert "it and what follows are left out" in file.notes[0]
 
 
 def test_what_is_no_tfrecord_is_refused(tmp_path: Path) -> None:

@@ -132,7 +132,8 @@ class MapFrame:
     projection : str or None
         A PROJ string; None for a map that is only local.
     offset_m : (3,) tuple of float, m
-        Whole kilometers taken off large map coordinates, so that the rest keeps its digits.
+        What was taken off large map coordinates so that the rest keeps its digits, in whole kilometers; where the coordinates of
+        the log do not count from the origin of `projection`, the distance between the two origins is added.
     """
 
     latitude_deg: float | None = None

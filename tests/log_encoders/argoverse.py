@@ -10,7 +10,7 @@ import pytest
 
 from log2sim.datatypes import Log
 from log2sim.geometry import Array, apply, inverse, quaternion_from_rotation, transform
-from log2sim.logs.argoverse.labels import seen_after_ns
+from log2sim.logs.argoverse.labels import scan_time_ns
 from log_encoders.world import labels_at
 
 CAMERA, LIDAR = "front", "top"
@@ -109,7 +109,7 @@ def _boxes(log: Log, stamp: int) -> list[dict[str, Any]]:
         for _ in range(5):
             center, size, yaw = labels_at(log.labels, t_ns, str(track))
             axle_T_box = axle_T_city @ CITY_T_MAP @ _box_pose(center[0], yaw[0])
-            t_ns = stamp + int(seen_after_ns(axle_T_box[None, :2, 3] - lidar_xy)[0])
+            t_ns = stamp + int(scan_time_ns(axle_T_box[None, :2, 3] - lidar_xy)[0])
         category = str(log.labels.category[log.labels.track_id == track][0])
         pose = {name: float(column[0]) for name, column in columns_of(axle_T_box[None]).items()}
         rows.append(

@@ -10,8 +10,9 @@ import pytest
 
 from log2sim.datatypes import Log
 from log2sim.geometry import Array, apply, inverse, quaternion_from_rotation
-from log2sim.logs.pandaset.labels import azimuth_offset_ns
+from log2sim.logs.pandaset.labels import PERIOD_NS
 from log2sim.logs.pandaset.reader import POSE_T_EGO
+from log2sim.logs.spinning import compute_scan_offset_ns
 from log_encoders.world import labels_at
 
 CAMERA, LIDAR = "front", "top"
@@ -63,7 +64,7 @@ def _cuboids(log: Log, stamp_ns: int) -> dict[str, list[object]]:
         t_ns = stamp_ns
         for _ in range(5):
             center, size, yaw = labels_at(log.labels, t_ns, str(track))
-            t_ns = stamp_ns + int(azimuth_offset_ns(apply(lidar_T_map, center))[0])
+            t_ns = stamp_ns + int(compute_scan_offset_ns(apply(lidar_T_map, center), PERIOD_NS)[0])
         category = str(log.labels.category[log.labels.track_id == track][0])
         row = {
             "uuid": str(track), "label": LABEL_OF[category], "yaw": float(yaw[0] - np.pi / 2), "stationary": False,

@@ -1,8 +1,7 @@
-"""Annotations of Argoverse 2 as labels: categories, riders on their vehicles, and when objects were seen."""
+"""Annotations of Argoverse 2 as labels: categories, riders joined with their vehicles, and when objects were scanned."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,8 @@ from log2sim.geometry import Array, PoseTrack
 from log2sim.logs.argoverse.poses import TRANSFORM, transforms_of
 from log2sim.logs.arrow.tables import read_columns
 from log2sim.logs.arrow.values import Kind
+from log2sim.logs.notes import note_left_out
+from log2sim.logs.spinning import compute_turn_share
 
 SIZE = ("length_m", "width_m", "height_m")
 COLUMNS: dict[str, Kind] = {
@@ -81,10 +82,10 @@ def read_labels(
     Notes
     -----
     A box is in the ego frame of its sweep's stamp, the start of the sweep, as the points are. It is drawn around the points
-    of both LiDARs, which see an object half a turn apart and each where it was at that time; ego motion alone is compensated.
-    Hence the time of a box is the mean of both passages (`seen_after_ns`), not the stamp. In the two sweeps of the sample log,
+    of both LiDARs, which scan an object half a turn apart and each where it was at that time; ego motion alone is compensated.
+    Hence the time of a box is the mean of both passages (`scan_time_ns`), not the stamp. In the two sweeps of the sample log,
     of the points on cars that drive faster than 5 m/s, moved by the car's speed to the time of the box, 99.6 % lie in the box
-    with this time and 89 % with the stamp; of two cars at 10 m/s, whose rear the LiDARs see, all and 24 to 30 %.
+    with this time and 89 % with the stamp; of two cars at 10 m/s, whose rear the LiDARs hit, all and 24 to 30 %.
     """
     columns = _checked(read_columns(path, COLUMNS), path)
     ego_T_box = transforms_of(columns, path)
@@ -94,11 +95,11 @@ def read_labels(
     if not known.all():
         notes.append(f"{np.sum(~known)} labels left out because the ego's pose is not known at their stamps")
     category = np.array([CATEGORY_OF.get(k, "") for k in kinds], dtype="<U16")
-    _note_left_out(kinds[keep & (category == "")], notes)
+    note_left_out(kinds[keep & (category == "")].tolist(), NO_ROAD_USERS, notes)
     keep &= known & (category != "")
     keep &= _first_of_track(columns["timestamp_ns"], columns["track_uuid"].astype(np.str_))
     map_T_box = map_T_ego @ ego_T_box
-    after_ns = seen_after_ns(ego_T_box[:, :2, 3] - upper_lidar_xy)
+    after_ns = scan_time_ns(ego_T_box[:, :2, 3] - upper_lidar_xy)
     labeled = np.unique(columns["timestamp_ns"])
     missing = len(labeled) - int(np.isin(labeled, swept_ns).sum())
     if missing:
@@ -116,18 +117,15 @@ def read_labels(
     )
 
 
-def _note_left_out(kinds: NDArray[np.str_], notes: list[str]) -> None:
-    for why, known in (("they are no road users", True), ("their kind is not known", False)):
-        counts = Counter(kind for kind in kinds.tolist() if (kind in NO_ROAD_USERS) == known)
-        if counts:
-            words = ", ".join(f"{kind} ({count})" for kind, count in counts.most_common())
-            notes.append(f"labels left out because {why}: {words}")
+def scan_time_ns(xy_lidar: Array) -> NDArray[np.int64]:
+    """Compute when both LiDARs scan objects: the mean (N,), ns, after the stamp of the sweep.
 
-
-def seen_after_ns(xy_lidar: Array) -> NDArray[np.int64]:
-    """When (N,) objects at (N, 2) from the LiDARs, axes of the ego, are seen: the mean of both, after the stamp of the sweep."""
-    turned = (START_AZIMUTH_RAD - np.arctan2(xy_lidar[:, 1], xy_lidar[:, 0])) % (2 * np.pi)
-    upper_ns = np.round(turned / (2 * np.pi) * PERIOD_NS).astype(np.int64)
+    Parameters
+    ----------
+    xy_lidar : (N, 2) float64, m
+        Positions of the objects from the LiDARs, axes of the ego.
+    """
+    upper_ns = np.round(compute_turn_share(xy_lidar, START_AZIMUTH_RAD) * PERIOD_NS).astype(np.int64)
     return np.asarray((upper_ns + (upper_ns + HALF_TURN_NS) % PERIOD_NS) // 2)
 
 

@@ -30,6 +30,8 @@ from log2sim.logs.arrow.tables import read_columns
 from log2sim.logs.arrow.values import Kind
 from log2sim.logs.digest import digest_of
 from log2sim.logs.images import MAX_IMAGE_PX, image_stream
+from log2sim.logs.notes import defer_notes
+from log2sim.logs.record_files import list_files, list_numbered_files
 
 POSES = "city_SE3_egovehicle.feather"
 MOUNTS, INTRINSICS = "calibration/egovehicle_SE3_sensor.feather", "calibration/intrinsics.feather"
@@ -41,7 +43,6 @@ REFERENCE_CAMERA = "ring_front_center"
 # A log below a folder of splits of a folder of data sets: argoverse2/sensor/val/LOG.
 MAX_DEPTH = 3
 MAX_FOLDERS = 20_000
-MAX_STAMP_NS = np.iinfo(np.int64).max
 
 INTRINSIC_COLUMNS: dict[str, Kind] = {
     "sensor_name": "text", "fx_px": "float", "fy_px": "float", "cx_px": "float", "cy_px": "float",
@@ -125,10 +126,6 @@ class _Folder:
         def labels() -> Labels | None:
             return read_labels(annotations, ego, upper, swept, notes) if annotations.is_file() else None
 
-        def all_notes() -> tuple[str, ...]:
-            labels()
-            return tuple(notes)
-
         return Log(
             name=f"argoverse2-{self.path.resolve().name}",
             format=READER.name,
@@ -142,7 +139,7 @@ class _Folder:
             ground_z_ego_m=ROAD_Z_EGO_M,
             reference_camera=REFERENCE_CAMERA if REFERENCE_CAMERA in cameras else None,
             digest=self._digest(),
-            notes=all_notes,
+            notes=defer_notes(notes, labels),
             details={"city": city},
         )
 
@@ -204,13 +201,8 @@ def _read_cameras(path: Path, mounts: dict[str, Array]) -> dict[str, Camera]:
 
 def stamped_files(folder: Path, suffix: str, notes: list[str]) -> tuple[NDArray[np.int64], list[Path]]:
     """Files of a folder whose names are stamps in ns, in their order; other names are noted."""
-    files = [p for p in folder.iterdir() if p.suffix.lower() == suffix] if folder.is_dir() else []
-    # Longer words are not converted: that takes time.
-    numbers = {p: int(p.stem) for p in files if p.stem.isdecimal() and len(p.stem) < 20}
-    stamped = {stamp: p for p, stamp in numbers.items() if stamp <= MAX_STAMP_NS}
-    if len(stamped) < len(files):
-        notes.append(
-            f"{folder.name}: {len(files) - len(stamped)} files left out, their names are no stamps of their own"
-        )
-    t_ns = np.array(sorted(stamped), dtype=np.int64)
-    return t_ns, [stamped[t] for t in t_ns.tolist()]
+    stamped = list_numbered_files(folder, (suffix,))
+    others = len(list_files(folder, (suffix,))) - len(stamped)
+    if others:
+        notes.append(f"{folder.name}: {others} files left out, their names are no stamps of their own")
+    return np.array(list(stamped), dtype=np.int64), list(stamped.values())

@@ -162,14 +162,6 @@ def parse_oxts(text: str, where: str) -> Array:
     return np.array(rows).reshape(-1, OXTS_FIELDS)
 
 
-def numbered_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
-    """Files of a folder by the number that is their name, in the order of the numbers."""
-    if not folder.is_dir():
-        return {}
-    files = {int(p.stem): p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.stem.isdecimal()}
-    return dict(sorted(files.items()))
-
-
 def sweep_stream(
     t_ns: NDArray[np.int64], begin_ns: NDArray[np.int64], end_ns: NDArray[np.int64], files: list[Path]
 ) -> Stream:

@@ -21,6 +21,7 @@ from log2sim.logs.digest import digest_of
 from log2sim.logs.images import first_image_size, image_stream
 from log2sim.logs.kitti import drive
 from log2sim.logs.kitti.labels import CAMERA, DriveLabels, LabelRows, labels_of_rows, parse_labels
+from log2sim.logs.record_files import list_numbered_files
 from log2sim.logs.sweeps import read_sweep, sweep_of
 
 SPLITS = ("training", "testing")
@@ -136,7 +137,7 @@ class _Split:
     @cached_property
     def sweeps(self) -> dict[int, Path]:
         """Files by number of frame."""
-        return drive.numbered_files(self.base / "velodyne", (".bin",))
+        return list_numbered_files(self.base / "velodyne", (".bin",))
 
     def log(self) -> Log:
         calibrations, texts = self._calibrations()
@@ -144,7 +145,7 @@ class _Split:
         t_ns = _stamps(self.sweeps)
         streams = {"velodyne": self._velodyne(t_ns, [calibrations[n] for n in self.sweeps], first)}
         cameras = {}
-        images = drive.numbered_files(self.base / IMAGES, (".png", ".jpg", ".jpeg"))
+        images = list_numbered_files(self.base / IMAGES, (".png", ".jpg", ".jpeg"))
         if images:
             size_px = first_image_size(list(images.values()))
             cameras[CAMERA] = first.camera(*size_px)

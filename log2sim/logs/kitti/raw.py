@@ -20,6 +20,7 @@ from log2sim.logs.images import image_stream
 from log2sim.logs.kitti import drive
 from log2sim.logs.kitti.labels import CAMERA as LABELED_CAMERA
 from log2sim.logs.kitti.labels import DriveLabels, read_labels
+from log2sim.logs.record_files import list_numbered_files
 from log2sim.logs.stamps import strictly_increasing
 
 CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt")
@@ -160,7 +161,7 @@ class _Drive:
     ) -> tuple[NDArray[np.int64], list[Path], NDArray[np.intp]]:
         """Stamps, files and numbers of the records of a stream, in order; a record that is not there is a gap."""
         folder = self.path / name
-        files = drive.numbered_files(folder / "data", suffixes)
+        files = list_numbered_files(folder / "data", suffixes)
         if not files:
             raise LogError(f"{folder}/data: no records ({', '.join(suffixes)}); a stream needs at least one")
         stamps = _stamps(folder / "timestamps.txt")

@@ -15,6 +15,7 @@ from log2sim.logs.digest import digest_of
 from log2sim.logs.images import first_image_size, image_stream
 from log2sim.logs.kitti import drive
 from log2sim.logs.kitti.labels import DriveLabels, read_labels
+from log2sim.logs.record_files import list_numbered_files
 
 PERIOD_NS = 100_000_000
 CAMERA_NUMBERS = (2, 3)
@@ -116,7 +117,7 @@ class _Sequence:
         return drive.rig_of(links[0], links[1], rect, projections)
 
     def _files(self, folder: str, suffixes: tuple[str, ...]) -> dict[int, Path]:
-        files = drive.numbered_files(self.base / folder / self.name, suffixes)
+        files = list_numbered_files(self.base / folder / self.name, suffixes)
         if not files:
             raise LogError(
                 f"{self.base / folder / self.name}: no records ({', '.join(suffixes)}); a stream needs at least one"

@@ -1,8 +1,7 @@
-"""Annotations of nuScenes as labels: each at the time at which the LiDAR saw it, interpolated between key frames."""
+"""Annotations of nuScenes as labels: each at the time at which the LiDAR scanned it, interpolated between key frames."""
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,9 +12,11 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Labels
 from log2sim.errors import LogError
 from log2sim.geometry import Array, apply, inverse, rotation_from_quaternion, wrap_angle, yaw_of
+from log2sim.logs.notes import note_left_out
 from log2sim.logs.nuscenes.scene import Channel, Scene
-from log2sim.logs.nuscenes.sweeps import TURN_NS, seen_offset_ns
+from log2sim.logs.nuscenes.sweeps import TURN_NS
 from log2sim.logs.nuscenes.tables import Record, numbers_of, quaternions_of, stamp_ns_of, text_of
+from log2sim.logs.spinning import compute_scan_offset_ns
 
 ANNOTATIONS = "sample_annotation"
 CATEGORY_OF = {
@@ -37,10 +38,14 @@ CATEGORY_OF = {
     "human.pedestrian.personal_mobility": "other",
     "human.pedestrian.stroller": "other",
 }
+NO_ROAD_USERS = {
+    "animal", "movable_object.barrier", "movable_object.debris", "movable_object.pushable_pullable",
+    "movable_object.trafficcone", "static_object.bicycle_rack",
+}  # fmt: skip
 WITH_RIDER = "cycle.with_rider"
 # Visibility in the pictures of all cameras together: 1 is up to 40 %.
 HARDLY_VISIBLE = "1"
-# An object that passes the seam of the turn would be seen twice within a few ms.
+# An object that crosses the direction in which the turns start would get two labels within a few ms.
 MIN_STEP_NS = 10_000_000
 # Key frames are 0.4 to 0.6 s apart; over more than a missing one nothing is interpolated.
 MAX_GAP_NS = 1_100_000_000
@@ -86,7 +91,7 @@ def read_labels(scene: Scene, lidar: Channel | None, offset_m: Array, notes: lis
 
     Notes
     -----
-    A box fits the points where they were measured, and the LiDAR sees different directions at different times of its
+    A box fits the points where they were measured, and the LiDAR scans different directions at different times of its
     turn. Of the one fast car with points at hand, the box ends 2 cm from points of 16 ms before the stamp, in which it
     drove 15 cm.
     Between annotations of an instance in consecutive samples boxes are added for each turn of the LiDAR: positions
@@ -100,7 +105,7 @@ def read_labels(scene: Scene, lidar: Channel | None, offset_m: Array, notes: lis
         return None
     stamps = np.array([stamp_ns_of(sample, sample_path) for sample in scene.samples], dtype=np.int64)
     rows = _rows_of(scene, annotations, samples, notes)
-    t_ns = seen_ns(scene, lidar, stamps[rows.sample], rows.center_m)
+    t_ns = scanned_ns(scene, lidar, stamps[rows.sample], rows.center_m)
     rows = rows.take(np.arange(len(rows.t_ns)), t_ns=t_ns)
     ends_ns = turn_ends(stamps if lidar is None else np.union1d(stamps, lidar.t_ns))
     rows = _joined([rows, _between(scene, lidar, rows, stamps, ends_ns)])
@@ -131,13 +136,13 @@ def turn_ends(t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.union1d(t_ns, t_ns[first] + number * step_ns)
 
 
-def seen_ns(scene: Scene, lidar: Channel | None, t_ns: NDArray[np.int64], center_m: Array) -> NDArray[np.int64]:
-    """Compute when (L,) the LiDAR saw objects at `center_m` (L, 3) in the turns that end at `t_ns` (L,)."""
+def scanned_ns(scene: Scene, lidar: Channel | None, t_ns: NDArray[np.int64], center_m: Array) -> NDArray[np.int64]:
+    """Compute when (L,) the LiDAR scanned objects at `center_m` (L, 3) in the turns that end at `t_ns` (L,)."""
     if lidar is None:
         return t_ns
     map_T_ego, known = scene.ego.at(t_ns)
     local = apply(inverse(map_T_ego @ lidar.ego_T_sensor), center_m)
-    return np.where(known, t_ns + seen_offset_ns(local), t_ns).astype(np.int64)
+    return np.where(known, t_ns + compute_scan_offset_ns(local, TURN_NS), t_ns).astype(np.int64)
 
 
 def _between(
@@ -154,7 +159,7 @@ def _between(
     begin_ns, span_ns = rows.t_ns[pair], rows.t_ns[pair + 1] - rows.t_ns[pair]
     step = rows.center_m[pair + 1] - rows.center_m[pair]
     roughly = ((end_ns - TURN_NS // 2 - begin_ns) / span_ns)[:, None]
-    t_ns = seen_ns(scene, lidar, end_ns, rows.center_m[pair] + roughly * step)
+    t_ns = scanned_ns(scene, lidar, end_ns, rows.center_m[pair] + roughly * step)
     share = (t_ns - begin_ns) / span_ns
     keep = (t_ns - begin_ns >= MIN_STEP_NS) & (begin_ns + span_ns - t_ns >= MIN_STEP_NS)
     keep[1:] &= (pair[1:] != pair[:-1]) | (np.diff(t_ns) >= MIN_STEP_NS)
@@ -192,10 +197,7 @@ def _rows_of(scene: Scene, annotations: list[Record], samples: dict[str, int], n
         yaw_of(rotation_from_quaternion(quaternions_of(annotations, path))),
         np.array([_is_visible(a) for a in annotations], dtype=bool),
     )
-    left_out = Counter(kind for kind, word in zip(kinds, category) if not word)
-    if left_out:
-        named = ", ".join(f"{kind} ({count})" for kind, count in sorted(left_out.items()))
-        notes.append(f"labels left out because they are no road users or of an unknown kind: {named}")
+    note_left_out((kind for kind, word in zip(kinds, category) if not word), NO_ROAD_USERS, notes)
     flat = ~(size > 0).all(axis=1)
     if flat.any():
         notes.append(f"{int(flat.sum())} labels left out because a size is not above 0")

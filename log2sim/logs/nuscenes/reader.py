@@ -20,6 +20,7 @@ from log2sim.errors import LogError
 from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, whole_kilometers
 from log2sim.logs.digest import digest_of
 from log2sim.logs.images import MAX_IMAGE_PX, first_image_size, image_stream
+from log2sim.logs.notes import defer_notes
 from log2sim.logs.nuscenes.labels import read_labels
 from log2sim.logs.nuscenes.scene import Channel, Scene
 from log2sim.logs.nuscenes.sweeps import sweep_stream
@@ -125,10 +126,6 @@ class _SceneReader:
         def labels() -> Labels | None:
             return read_labels(scene, self._labeled_lidar(), offset_m, self.notes)
 
-        def all_notes() -> tuple[str, ...]:
-            labels()
-            return tuple(self.notes)
-
         return Log(
             name=f"nuscenes-{scene.record['name']}",
             format=READER.name,
@@ -141,7 +138,7 @@ class _SceneReader:
             labels=labels,
             reference_camera=REFERENCE_CAMERA if REFERENCE_CAMERA in cameras else None,
             digest=self._digest(),
-            notes=all_notes,
+            notes=defer_notes(self.notes, labels),
             details=self._details(),
         )
 
@@ -164,7 +161,7 @@ class _SceneReader:
             if len(files) < len(channel.records):
                 left_out = "; the sensor is left out" if not files else ""
                 self.notes.append(
-                    f"{name}: {len(channel.records) - len(files)} of {len(channel.records)} files are missing{left_out}"
+                    f"{name}: {len(channel.records) - len(files)} of {len(channel.records)} records are missing{left_out}"
                 )
             if not files:
                 continue

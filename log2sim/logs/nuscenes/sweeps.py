@@ -99,9 +99,3 @@ def sensor_path(offset_ns: NDArray[np.int64] | None, t_ns: int, poses: Poses) ->
         return np.zeros(3)
     start = map_T_lidar[1, :3, :3].T @ (map_T_lidar[0, :3, 3] - map_T_lidar[1, :3, 3])
     return np.asarray((offset_ns / first)[:, None] * start)
-
-
-def seen_offset_ns(xyz_lidar: Array) -> NDArray[np.int64]:
-    """When (N,) the LiDAR saw directions (N, 3) in its frame (x right, y forward), relative to the stamp, ns."""
-    turned = (np.pi - np.arctan2(xyz_lidar[:, 1], xyz_lidar[:, 0])) / (2 * np.pi)
-    return np.round((turned - 1) * TURN_NS).astype(np.int64)

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Labels
 from log2sim.errors import LogError
 from log2sim.geometry import Array, apply, inverse, wrap_angle
+from log2sim.logs.notes import note_left_out
 from log2sim.logs.pandaset.unpickle import Columns, read_pickled_table
+from log2sim.logs.spinning import compute_scan_offset_ns, select_spaced
 
 PERIOD_NS = 100_000_000
 MIN_STEP_NS = 20_000_000
@@ -69,33 +71,24 @@ def read_labels(
     Notes
     -----
     A cuboid fits the points where they were measured, and the Pandar64 sees different directions at different times; on
-    moving cars of sequence 002 `azimuth_offset_ns` is off the time of the points inside the box by 0.5 +- 0.4 ms. Of an object
+    moving cars of sequence 002 the time by `compute_scan_offset_ns` is off that of the points inside the box by 0.5 +- 0.4 ms:
+    the turn takes 0.1 s and ends at the rear, at the stamp of the sweep. Of an object
     with a cuboid for each LiDAR the Pandar64's is kept.
     """
     parts = []
-    unknown: set[str] = set()
+    left_out: list[str] = []
     for number, path in files.items():
         if number < len(t_ns):
             table = _checked(read_pickled_table(path, LogError), path)
-            parts.append(_frame(table, int(t_ns[number]), int(gt_t_ns[number]), map_T_lidar[number], unknown))
-    if unknown:
-        notes.append(f"labels left out because their kind is not known: {', '.join(sorted(unknown))}")
+            parts.append(_frame(table, int(t_ns[number]), int(gt_t_ns[number]), map_T_lidar[number], left_out))
+    note_left_out(left_out, NO_ROAD_USERS, notes)
     columns = [np.concatenate([p[k] for p in parts]) for k in range(6)] if parts else None
     if columns is None:
         raise LogError(f"{next(iter(files.values())).parent}: no cuboids of the sweeps of this log")
-    keep = _increasing(columns[0], columns[1])
+    keep = select_spaced(columns[0], columns[1], MIN_STEP_NS)
     t_ns, track_id, category, center, size, yaw = (c[keep] for c in columns)
     category = _settle_riders(track_id, category, notes)
     return Labels(t_ns, track_id, category, center, size, yaw)
-
-
-def azimuth_offset_ns(xyz_lidar: Array) -> NDArray[np.int64]:
-    """When (N,) the Pandar64 saw directions (N, 3), relative to the stamp of its sweep.
-
-    It turns clockwise once in 0.1 s and passes the rear at the stamp.
-    """
-    turned = (np.arctan2(xyz_lidar[:, 1], xyz_lidar[:, 0]) + np.pi) / (2 * np.pi)
-    return np.round(-turned * PERIOD_NS).astype(np.int64)
 
 
 def _checked(table: Columns, path: Path) -> Columns:
@@ -111,12 +104,12 @@ def _checked(table: Columns, path: Path) -> Columns:
     return table
 
 
-def _frame(c: Columns, t_ns: int, gt_t_ns: int, map_T_lidar: Array, unknown: set[str]) -> tuple[NDArray[Any], ...]:
-    """Stamps, track ids, categories, centers, sizes and yaws of one sweep's cuboids."""
+def _frame(c: Columns, t_ns: int, gt_t_ns: int, map_T_lidar: Array, left_out: list[str]) -> tuple[NDArray[Any], ...]:
+    """Stamps, track ids, categories, centers, sizes and yaws of one sweep's cuboids; `left_out` takes the kinds of others."""
     category = np.array(
         [_category(str(k), str(r)) for k, r in zip(c["label"], c["attributes.rider_status"])], dtype="<U16"
     )
-    unknown.update(str(k) for k, word in zip(c["label"], category) if not word and str(k) not in NO_ROAD_USERS)
+    left_out += [str(kind) for kind in c["label"][category == ""]]
     uuid, sibling = c["uuid"].astype(np.str_), c["cuboids.sibling_id"].astype(np.str_)
     of_gt = c["cuboids.sensor_id"] == GT_SENSOR
     # In sequence 002 one of the two names the other by a part of its uuid only.
@@ -124,7 +117,7 @@ def _frame(c: Columns, t_ns: int, gt_t_ns: int, map_T_lidar: Array, unknown: set
     # A cuboid of the PandarGT alone still belongs to the track of its twin.
     track_id = np.where(of_gt & (np.char.str_len(sibling) > 1), sibling, uuid)
     center = np.stack([c[f"position.{k}"] for k in "xyz"], axis=1).astype(np.float64)
-    stamp = np.where(of_gt, gt_t_ns, t_ns + azimuth_offset_ns(apply(inverse(map_T_lidar), center)))
+    stamp = np.where(of_gt, gt_t_ns, t_ns + compute_scan_offset_ns(apply(inverse(map_T_lidar), center), PERIOD_NS))
     # The data set's x is the width and its y the length; a yaw of 0 faces +y.
     size = np.stack([c["dimensions.y"], c["dimensions.x"], c["dimensions.z"]], axis=1).astype(np.float64)
     yaw = wrap_angle(c["yaw"] + np.pi / 2)
@@ -150,14 +143,3 @@ def _settle_riders(track_id: NDArray[np.str_], category: NDArray[np.str_], notes
     if alone:
         notes.append(f"{alone} bicycles of which no sweep says whether somebody rides them are taken as unridden")
     return settled
-
-
-def _increasing(t_ns: NDArray[np.int64], track_id: NDArray[np.str_]) -> NDArray[np.intp]:
-    """Rows to keep so that the stamps of each track increase: one that passes the rear is seen twice within a few ms."""
-    last: dict[str, int] = {}
-    keep = []
-    for row, (t, track) in enumerate(zip(t_ns.tolist(), track_id.tolist())):
-        if track not in last or t - last[track] >= MIN_STEP_NS:
-            last[track] = t
-            keep.append(row)
-    return np.array(keep, dtype=np.intp)

@@ -10,7 +10,7 @@ times of the PandarGT: they are those of its points, so its stamps are read from
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -22,10 +22,13 @@ from log2sim.errors import LogError
 from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, inverse, rotation_from_quaternion, transform
 from log2sim.logs.digest import digest_of
 from log2sim.logs.images import first_image_size, image_stream
+from log2sim.logs.notes import defer_notes
 from log2sim.logs.pandaset.labels import read_labels
 from log2sim.logs.pandaset.sweeps import LIDARS, SweepFiles
+from log2sim.logs.record_files import list_numbered_files
 from log2sim.logs.stamps import strictly_increasing
 
+TABLE = ".pkl.gz"
 ROAD_BELOW_POSE_M = 0.325
 # From the ego frame (x forward, y left, origin on the road) to the frame of the data set's poses.
 POSE_T_EGO = transform(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), [0.0, 0.0, -ROAD_BELOW_POSE_M])
@@ -82,21 +85,17 @@ class _Sequence:
         notes += problems
         track = PoseTrack(lidar_t_ns[keep], map_T_ego[keep])
         cameras, streams = self._cameras(track, notes)
-        sweeps = SweepFiles(self._files("lidar", ".gz", len(lidar_t_ns), notes), lidar_t_ns, notes)
+        sweeps = SweepFiles(self._files("lidar", TABLE, len(lidar_t_ns), notes), lidar_t_ns, notes)
         lidars = {lidar: Lidar(lidar, "ego", EGO_T_PANDAR64) for lidar in (LIDARS if sweeps.files else ())}
         streams |= {lidar: sweeps.stream(lidar) for lidar in lidars}
         if not streams:
             raise LogError(f"{self.path}: neither images nor sweeps are there; a log needs at least one record")
-        cuboids = numbered_files(self.path / "annotations" / "cuboids", ".gz")
+        cuboids = list_numbered_files(self.path / "annotations" / "cuboids", (TABLE,))
         map_T_lidar = map_T_ego @ EGO_T_PANDAR64
 
         @cache
         def labels() -> Labels | None:
             return read_labels(cuboids, lidar_t_ns, sweeps.gt_stamps, map_T_lidar, notes) if cuboids else None
-
-        def all_notes() -> tuple[str, ...]:
-            stamps_and_labels = [*(sweeps.index(lidar) for lidar in lidars), labels()]
-            return tuple(notes) if stamps_and_labels else ()
 
         return Log(
             name=f"pandaset-{self.path.resolve().name}",
@@ -110,15 +109,15 @@ class _Sequence:
             labels=labels,
             reference_camera="front_camera" if "front_camera" in cameras else None,
             digest=digest_of([(self.path / "lidar" / "poses.json").read_text()], self._records()),
-            notes=all_notes,
+            notes=defer_notes(notes, *(partial(sweeps.index, lidar) for lidar in lidars), labels),
         )
 
     def _records(self) -> list[Path]:
-        return sorted(self.path.glob("*/*.pkl.gz")) + sorted(self.path.glob("*/*/*.*"))
+        return sorted(self.path.glob(f"*/*{TABLE}")) + sorted(self.path.glob("*/*/*.*"))
 
     def _files(self, folder: str, suffix: str, count: int, notes: list[str]) -> dict[int, Path]:
         """Find the records of a sensor by their number and note missing ones: they are gaps."""
-        files = {k: p for k, p in numbered_files(self.path / folder, suffix).items() if k < count}
+        files = {k: p for k, p in list_numbered_files(self.path / folder, (suffix,)).items() if k < count}
         missing = sorted(set(range(count)) - set(files))
         if missing:
             notes.append(f"{folder}: {len(missing)} of {count} records are missing, first number {missing[0]:02d}")
@@ -190,14 +189,6 @@ def georeference(geodetic: Array, xyz_map: Array) -> tuple[MapFrame, str]:
     )
     origin = [float(v[0]) for v in geodetic_from_map(first, shift[None], "meta/gps.json")]
     return MapFrame(origin[0], origin[1], origin[2], transverse_mercator(origin[0], origin[1])), ""
-
-
-def numbered_files(folder: Path, suffix: str) -> dict[int, Path]:
-    """Files of a folder by the number at the beginning of their name ("07.pkl.gz"), in the order of the numbers."""
-    if not folder.is_dir():
-        return {}
-    names = ((p.name.split(".")[0], p) for p in folder.iterdir() if p.suffix.lower() == suffix)
-    return dict(sorted((int(word), p) for word, p in names if word.isdecimal()))
 
 
 def _poses(folder: Path) -> tuple[NDArray[np.int64], Array]:

@@ -6,8 +6,8 @@ as in the data set; LiDARs get "LIDAR_" before their names, for both have a FRON
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import cache, partial
+from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from log2sim.datatypes import EgoVehicle, ImageLabels, Labels, Lidar, Log, MapFr
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import Array, Camera, PoseTrack, RollingShutter, transform, whole_kilometers
 from log2sim.logs.images import decode_image
+from log2sim.logs.notes import defer_notes
 from log2sim.logs.stamps import strictly_increasing
 from log2sim.logs.sweeps import sweep_of
 from log2sim.logs.waymo.labels import LabelsOnRequest, image_labels_of, labels_of
@@ -90,7 +91,7 @@ class _Assembly:
             image_labels=self._image_labels(cameras, image_ns),
             reference_camera=next(iter(cameras), None),
             digest=digest,
-            notes=partial(self._all_notes, labels),
+            notes=defer_notes(self.notes, labels),
             details=self.segment.details,
         )
 
@@ -188,11 +189,6 @@ class _Assembly:
         # A frame's own pose comes first and stays: its points are made with it.
         t_ns, first = np.unique(np.array(stamps, dtype=np.int64), return_index=True)
         return PoseTrack(t_ns, np.stack(poses)[first])
-
-    def _all_notes(self, labels: Callable[[], Labels | None]) -> tuple[str, ...]:
-        """Return the notes with those on labels, which are made when the labels are read."""
-        labels()
-        return tuple(self.notes)
 
     def _labels(self) -> Labels | None:
         if self.segment.boxes is None:

@@ -64,7 +64,7 @@ def read_poses(path: Path) -> tuple[list[int], list[Array], list[str]]:
     if not usable:
         raise LogError(f"{path}: none of its {len(found)} rows is a rigid pose with a stamp in microseconds")
     lost = len(found) - len(usable)
-    notes = [f"{lost} of {len(found)} frames without a rigid pose kept out"] if lost else []
+    notes = [f"{lost} of {len(found)} frames without a rigid pose left out"] if lost else []
     return [t for t, _ in usable], [pose for _, pose in usable], notes
 
 

@@ -1,4 +1,4 @@
-"""Labels of a segment: 3D boxes in the map, each at the time at which the TOP LiDAR saw it, and boxes in the images."""
+"""Labels of a segment: 3D boxes in the map, each at the time at which the TOP LiDAR scanned it, and boxes in the images."""
 
 from __future__ import annotations
 
@@ -11,13 +11,16 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import ImageLabels, Labels
 from log2sim.geometry import Array, apply, rotation_from_rpy, yaw_of
+from log2sim.logs.notes import note_left_out
+from log2sim.logs.spinning import select_spaced
 from log2sim.logs.waymo.range_images import turn_of
 from log2sim.logs.waymo.segment import TYPES, BoxTable, LaserCalibration
 from log2sim.logs.waymo.timing import FrameTimes
 
-# Vehicles are cars, trucks, buses and motorcycles; signs are no road users.
+# Vehicles are cars, trucks, buses and motorcycles.
 CATEGORY_OF = {"vehicle": "car", "pedestrian": "pedestrian", "cyclist": "cyclist"}
-# An object that crosses the line behind the vehicle is seen at the end of one turn and at the start of the next.
+NO_ROAD_USERS = {"sign"}
+# Of labels of one object; see `select_spaced`.
 MIN_STEP_NS = 20_000_000
 MAX_COORDINATE_M = 1e4
 
@@ -41,15 +44,16 @@ def labels_of(
 
     Notes
     -----
-    A box fits the points where they were measured, and the TOP LiDAR sees different directions at different times: so does the
-    box. The data set states no times of boxes; where it derives boxes from them (`camera_synced_box`) it calls them boxes at the
+    A box fits the points where they were measured, and the TOP LiDAR scans different directions at different times: the box
+    has the time of its direction. The data set states no times of boxes; where it derives boxes from them (`camera_synced_box`) it calls them boxes at the
     start of the frame. On its sample the camera's label of a cyclist at 8.5 m/s is 13 px from the box at this time, 24 px
     from the box at the start; its box is 37 px wide.
     """
     table, kind = _road_users(table, notes)
     turn = None if top is None else turn_of(table.center, top)
     t_ns = times.pose_ns[table.frame] if turn is None else times.at_turn(table.frame, turn)
-    keep = _rising(t_ns, table.track_id)
+    order = np.argsort(t_ns, kind="stable")
+    keep = order[select_spaced(t_ns[order], table.track_id[order], MIN_STEP_NS)]
     table, kind, t_ns = table.take(keep), kind[keep], t_ns[keep]
     pose = map_T_vehicle[table.frame]
     turned = pose[:, :3, :3] @ rotation_from_rpy(0.0, 0.0, table.heading_rad)
@@ -73,9 +77,7 @@ def _road_users(table: BoxTable, notes: list[str]) -> tuple[BoxTable, NDArray[np
     road_user = np.isin(kind, list(CATEGORY_OF))
     if (road_user & ~usable).any():
         notes.append(f"{np.sum(road_user & ~usable)} labels without a position or size left out")
-    if (~road_user).any():
-        left_out = ", ".join(f"{np.sum(kind == word)} '{word}'" for word in np.unique(kind[~road_user]))
-        notes.append(f"labels left out as no road users: {left_out}")
+    note_left_out(kind[~road_user].tolist(), NO_ROAD_USERS, notes)
     rows = np.flatnonzero(usable & road_user)
     return table.take(rows), kind[rows]
 
@@ -138,15 +140,3 @@ class LabelsOnRequest(Mapping[str, ImageLabels]):
 
 def _categories(kind: NDArray[np.str_]) -> NDArray[np.str_]:
     return np.array([CATEGORY_OF[str(word)] for word in kind], dtype="<U16")
-
-
-def _rising(t_ns: NDArray[np.int64], track_id: NDArray[np.str_]) -> NDArray[np.intp]:
-    """Rows in the order of their stamps, of each track at least `MIN_STEP_NS` apart."""
-    last: dict[str, int] = {}
-    keep = []
-    order = np.argsort(t_ns, kind="stable")
-    for row, t, track in zip(order.tolist(), t_ns[order].tolist(), track_id[order].tolist()):
-        if track not in last or t - last[track] >= MIN_STEP_NS:
-            last[track] = t
-            keep.append(row)
-    return np.array(keep, dtype=np.intp)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array, apply, inverse, rotation_from_rpy
+from log2sim.logs.spinning import compute_turn_share
 from log2sim.logs.waymo.messages import range_image_parts
 from log2sim.logs.waymo.segment import LaserCalibration, RangeImages
 from log2sim.logs.waymo.wire import BYTES, WireError, fields_of, varints
@@ -146,9 +147,8 @@ def column_azimuths(laser: LaserCalibration, width: int) -> Array:
 
 
 def turn_of(xyz_vehicle: Array, laser: LaserCalibration) -> Array:
-    """Share (N,) of the turn, in [0, 1), at which a LiDAR looks at points (N, 3), m, of the vehicle's frame."""
-    x, y = (xyz_vehicle[:, k] - laser.vehicle_T_lidar[k, 3] for k in (0, 1))
-    return np.asarray(np.mod((np.pi - np.arctan2(y, x)) / (2 * np.pi), 1.0))
+    """Share (N,) of the turn, 0 to 1, after which a LiDAR scans points (N, 3), m, of the vehicle's frame."""
+    return compute_turn_share(xyz_vehicle - laser.vehicle_T_lidar[:3, 3])
 
 
 def _compensated(xyz: Array, pixel_poses: NDArray[np.float32], vehicle_T_lidar: Array, world_T_vehicle: Array) -> Array:

@@ -82,7 +82,7 @@ class _Frames:
 
     record: list[int] = field(default_factory=list)
     index: list[FrameIndex] = field(default_factory=list)
-    kept_out: list[str] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
     context: bytes = b""
     name: str = ""
     calibration: Calibration = field(default_factory=lambda: ({}, {}, {}))
@@ -95,8 +95,8 @@ class _SegmentFile:
     def log(self) -> Log:
         self.frames = frames = self._read_frames()
         notes = [*self.file.notes]
-        if frames.kept_out:
-            notes.append(f"{len(frames.kept_out)} of {len(self.file.spans)} records kept out; {frames.kept_out[0]}")
+        if frames.left_out:
+            notes.append(f"{len(frames.left_out)} of {len(self.file.spans)} records left out; {frames.left_out[0]}")
         if not frames.index:
             raise LogError(f"{self.path}: no usable frame; {'; '.join(notes) or 'the file is empty'}")
         index, (cameras, lasers, stats) = frames.index, frames.calibration
@@ -134,11 +134,11 @@ class _SegmentFile:
                         out.context, out.name = take_index(window, index.context), name
                         out.calibration = read_calibration(out.context)
             except (WireError, OSError) as error:
-                out.kept_out.append(f"record {k}: not a readable frame: {error}")
+                out.left_out.append(f"record {k}: not a readable frame: {error}")
                 continue
             problem = _problem(index, name, out.name)
             if problem:
-                out.kept_out.append(f"record {k}: {problem}")
+                out.left_out.append(f"record {k}: {problem}")
                 continue
             out.record.append(k)
             out.index.append(index)

@@ -43,7 +43,7 @@ class RecordFile:
     spans : list of (int, int)
         Offset and size of the data of each record.
     notes : list of str
-        What was kept out.
+        What was left out.
     """
 
     def __init__(self, path: Path) -> None:
@@ -118,11 +118,11 @@ class RecordFile:
                 if end != total and (end > total or _length_of(read_at(file, end, HEADER_BYTES)) is None):
                     if not spans:
                         raise LogError(f"{where}: the CRC of its length is wrong; expected a TFRecord file")
-                    self.notes.append(f"{where}: the CRC of its length is wrong: it and what follows are kept out")
+                    self.notes.append(f"{where}: the CRC of its length is wrong: it and what follows are left out")
                     break
-                self.notes.append(f"{where}: the CRC of its length is wrong; kept out")
+                self.notes.append(f"{where}: the CRC of its length is wrong; left out")
             elif size is None or offset + HEADER_BYTES + size + FOOTER_BYTES > total:
-                self.notes.append(f"{where} is truncated: the file ends {total - offset} bytes behind it; kept out")
+                self.notes.append(f"{where} is truncated: the file ends {total - offset} bytes behind it; left out")
                 break
             elif size > MAX_RECORD_BYTES:
                 raise LogError(f"{where}: {size} bytes, more than the {MAX_RECORD_BYTES} that it may have")
