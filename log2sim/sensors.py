@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -39,7 +39,7 @@ class Sensors:
 
     def restrict(self, log: Log) -> Log:
         """Return the log without the LiDARs that are out of range; its streams stay."""
-        return replace(log, lidars={name: log.lidars[name] for name in self.lidars})
+        return log.changed(lidars={name: log.lidars[name] for name in self.lidars})
 
 
 def choose_detector(log: Log, config: Config) -> Config:

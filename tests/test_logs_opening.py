@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from worlds import tiny_log
 
+from log2sim.datatypes import Log
 from log2sim.errors import LogError, RecordError
 from log2sim.logs.native.writer import write_log
 from log2sim.logs.opening import open_log
@@ -94,3 +95,16 @@ def test_a_recorded_log_opens_without_its_sweeps(real_data: Path, path: str) -> 
         open_log(real_data / path)
     assert names
     assert not [name for name in names if name.endswith(SWEEP_SUFFIXES)]
+
+
+def test_a_changed_log_leaves_what_is_deferred_unread() -> None:
+    def unread() -> Any:
+        raise AssertionError("was read")
+
+    log = Log("a", "log2sim", {}, {}, {}, labels=unread, notes=unread)
+    changed = log.changed(name="b", ground_z_ego_m=0.5)
+    assert (changed.name, changed.ground_z_ego_m, changed.format, log.name) == ("b", 0.5, "log2sim", "a")
+    with pytest.raises(AssertionError, match="was read"):
+        _ = changed.labels
+    with pytest.raises(TypeError, match="no field nam"):
+        log.changed(nam="b")

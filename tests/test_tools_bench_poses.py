@@ -74,7 +74,7 @@ def test_the_table_of_a_log(
     assert figures["surfaces"]["lidar"]["apart_m"] < figures["surfaces"]["given"]["apart_m"]
     assert len(figures["parked"]) == 4
     printed = capsys.readouterr().out
-    assert "auto takes lidar: upright surfaces differ of sweeps 0.7 s apart" in printed
+    assert "auto takes lidar: upright surfaces differ in sweeps 0.7 s apart" in printed
     assert "4 of them were labeled once in the map of the given poses" in printed  # synthetic labels are exact
 
 

@@ -7,7 +7,8 @@ M boxes, L labels, T ticks, F records of a stream.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, fields
 from typing import Any, Generic, Literal, Self, TypeVar, overload
 
 import numpy as np
@@ -209,6 +210,15 @@ class Log:
     digest: str = ""
     notes: Deferred[tuple[str, ...]] = Deferred(())
     details: Mapping[str, Any] = field(default_factory=dict)
+
+    def changed(self, **changes: Any) -> Log:
+        """Return the log with other values of some fields; unlike `dataclasses.replace`, what is deferred stays deferred."""
+        unknown = set(changes) - {f.name for f in fields(self)}
+        if unknown:
+            raise TypeError(f"a log has no field {', '.join(sorted(unknown))}")
+        log = copy(self)
+        log.__dict__.update(changes)
+        return log
 
     def ego_centers(self, map_T_ego: Array) -> Array:
         """Compute the centers (N, 3), m, map frame, of the ego's box at ego poses (N, 4, 4)."""

@@ -64,8 +64,8 @@ def compare_with_given(log: Log, found: Odometry, track: PoseTrack) -> Verdict:
         and _worse_share(_column(both["given"], name), _column(both["lidar"], name)) >= MIN_WORSE_SHARE
         for name, value in excess.items()
     )
-    better = "worse by more" if worse else "worse by no more"
-    return Verdict(not worse, f"{words}: the given ones are {better} than {MIN_EXCESS_M} m", excess, scatter)
+    more = "more" if worse else "no more"
+    return Verdict(not worse, f"{words}; the given poses are off by {more} than {MIN_EXCESS_M} m", excess, scatter)
 
 
 def unsure_share(found: Odometry) -> float:
@@ -101,8 +101,8 @@ def _rms(values: Array) -> float | None:
 def _words(scatter: dict[str, Figures], apart_s: float) -> str:
     """Describe both scatters in words."""
     parts = []
-    for name, label in (("apart", f"of sweeps {apart_s:.1f} s apart"), ("neighbors", "of successive sweeps")):
+    for name, pairs in (("apart", f"in sweeps {apart_s:.1f} s apart"), ("neighbors", "in successive sweeps")):
         given, lidar = scatter["given"][name], scatter["lidar"][name]
         if given is not None and lidar is not None:
-            parts.append(f"{label} by {given:.3f} m with the given poses, by {lidar:.3f} m with odometry")
+            parts.append(f"{pairs} {given:.3f} m with the given poses and {lidar:.3f} m with odometry")
     return f"upright surfaces differ {', '.join(parts)}" if parts else "no upright surface to compare"

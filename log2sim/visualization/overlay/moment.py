@@ -182,7 +182,7 @@ def _standing(log: Log) -> Log:
     """Give a log without poses an ego that stands in the origin of the map."""
     ends = [int(t) for stream in log.streams.values() for t in (stream.t_ns[0], stream.t_ns[-1])]
     stamps = np.array([min(ends), max(ends) + 1], dtype=np.int64)
-    return replace(log, ego=PoseTrack(stamps, np.repeat(np.eye(4)[None], 2, axis=0), max_gap_s=np.inf))
+    return log.changed(ego=PoseTrack(stamps, np.repeat(np.eye(4)[None], 2, axis=0), max_gap_s=np.inf))
 
 
 def _find_tick(schedule: Schedule, at_s: float | None) -> int:
