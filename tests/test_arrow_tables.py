@@ -13,7 +13,7 @@ import pytest
 
 from log2sim.errors import LogError, MissingExtra, RecordError
 from log2sim.logs.arrow import parquet_rows
-from log2sim.logs.arrow.ipc import claimed_size
+from log2sim.logs.arrow.ipc import declared_size
 from log2sim.logs.arrow.parquet_rows import ParquetRows
 from log2sim.logs.arrow.tables import TableLimits, read_columns
 
@@ -150,7 +150,7 @@ def test_the_claim_of_an_arrow_file_is_what_it_unpacks_to(tmp_path: Path) -> Non
     """Sizes by pyarrow's own account of an uncompressed copy; buffers are padded to 8 or 64 bytes."""
     for options in ({"compression": "lz4"}, {"compression": "uncompressed"}, {"compression": "zstd", "chunksize": 30}):
         path = write(tmp_path / "a.feather", table(100), **options)
-        rows, size = claimed_size(path.read_bytes())
+        rows, size = declared_size(path.read_bytes())
         assert rows == 100
         assert size == pytest.approx(table(100).nbytes, rel=0.35)
 

@@ -159,7 +159,7 @@ def test_frames_with_other_cameras_are_told(tmp_path: Path) -> None:
         ("P2:", "P9:", "no entry 'P2'"),
         ("R0_rect: 1.0", "R0_rect: 3.0", "not a rotation matrix"),
         ("Tr_velo_to_cam:", "Tr:", "no entry 'Tr_velo_to_cam'"),
-        ("P2: 700.0", "P2: -700.0", "'P2': .* looks at nothing"),
+        ("P2: 700.0", "P2: -700.0", "'P2': .* is singular or mirrors the image"),
     ],
 )
 def test_a_bad_calibration_is_named(tmp_path: Path, old: str, new: str, message: str) -> None:

@@ -89,7 +89,7 @@ def test_a_column_of_attributes_may_be_absent(tmp_path: Path) -> None:
     labels = read_labels(files, t_ns, t_ns, np.eye(4)[None].repeat(3, 0), notes)
     assert labels.track_id.tolist() == ["ridden", "pushed", "parked"] * 3
     assert labels.category.tolist() == ["cyclist", "bicycle", "bicycle"] * 3
-    assert notes == ["1 bicycles of which no sweep says whether somebody rides them are taken as unridden"]
+    assert notes == ["1 bicycle taken as unridden: no sweep states whether somebody rides them"]
 
 
 def test_a_needed_column_of_the_cuboids_is_named(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Where labels could not have told, a reconstructed agent is neither right nor false, and nowhere else."""
+"""Where labels may be incomplete, a reconstructed agent is neither right nor false, and nowhere else."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from log2sim.geometry.camera import Camera, project
 from log2sim.geometry.transforms import Array
 
 # Poses during the readout; between them image coordinates are interpolated. A camera that turns at 1 rad/s with 2000 px focal
-# length and 0.1 s of readout moves its image by 12 px between two of them, of which interpolation leaves less than 0.1 px.
+# length and 0.1 s of readout moves its image by 12 px between two of them, which interpolation follows to less than 0.1 px.
 KNOTS = 17
 ITERATIONS = 3
 
@@ -55,7 +55,7 @@ def project_moving(
 
     Notes
     -----
-    The line in which a point is seen depends on the pose at the time of that line: a fixed point, found by iteration from the
+    The line in which a point appears depends on the pose at the time of that line: a fixed point, found by iteration from the
     pose of the middle. It converges while the image of a point moves by less than the readout does.
     """
     shutter = camera.rolling_shutter

@@ -28,6 +28,24 @@ def whole_kilometers(points: Array) -> Array:
     return np.where(np.abs(points).max(axis=0) > FLOAT32_MILLIMETER_M, offset, 0.0)
 
 
+def shift_poses(map_T_x: Array, offset_m: Array) -> Array:
+    """Take an offset (3,), m, off the positions of transforms (..., 4, 4)."""
+    shifted = map_T_x.copy()
+    shifted[..., :3, 3] -= offset_m
+    return shifted
+
+
+def nearest_rotation(matrix: Array) -> Array:
+    """Compute the rotation (3, 3) that is nearest to a matrix (3, 3) of positive determinant.
+
+    Notes
+    -----
+    Orthogonal polar factor (Higham, "Computing the polar decomposition - with applications", SIAM J. Sci. Stat. Comput. 1986).
+    """
+    u, _, vt = np.linalg.svd(matrix)
+    return np.asarray(u @ vt)
+
+
 def wrap_angle(angle_rad: ArrayLike) -> Array:
     """Wrap angles to [-pi, pi).
 

@@ -133,9 +133,9 @@ def _cut_labels(labels: Labels | None, cameras: list[str], span: _Span | None) -
     """Keep the labels of each track in the span and one beyond on either side; none where no labeled camera is left."""
     if labels is None or (labels.cameras is not None and not set(labels.cameras) & set(cameras)):
         return None
-    seen = None if labels.cameras is None else tuple(name for name in labels.cameras if name in cameras)
+    labeled_cameras = None if labels.cameras is None else tuple(name for name in labels.cameras if name in cameras)
     if span is None:
-        return replace(labels, cameras=seen)
+        return replace(labels, cameras=labeled_cameras)
     keep = np.zeros(len(labels.t_ns), dtype=bool)
     for track in np.unique(labels.track_id):
         keep |= _with_neighbors(labels.t_ns, np.flatnonzero(labels.track_id == track), span)
@@ -148,7 +148,9 @@ def _cut_labels(labels: Labels | None, cameras: list[str], span: _Span | None) -
         for name, column in vars(labels).items()
         if name not in optional
     }
-    return Labels(**{**columns, "cameras": seen, "labeled_ns": labeled, "never_labeled": labels.never_labeled})
+    return Labels(
+        **{**columns, "cameras": labeled_cameras, "labeled_ns": labeled, "never_labeled": labels.never_labeled}
+    )
 
 
 def _with_neighbors(t_ns: NDArray[np.int64], rows: NDArray[np.intp], span: _Span) -> NDArray[np.bool_]:

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import NS_PER_S
+from log2sim.logs.stamps import MAX_TIME_S
 
 MAX_HEADER_BYTES = 16 * 1024
-# Unix times beyond this do not fit into int64 nanoseconds.
-MAX_TIME_S = 9e9
 TIME_FIELDS = ("t_offset_ns", "offset", "t", "timestamp")
 
 

@@ -44,7 +44,7 @@ class Reader(Protocol):
       motion of the ego is compensated downstream where there are times; with `compensated_ns` all points are in the sensor's frame
       as it was at that stamp, as data sets that compensate give them. Frame "map" is compensated too. Rows are finite, in m.
     - **Images** are (H, W, 3) uint8 BGR of the size of their calibration, never rotated. The stamp of an image is the middle of the
-      exposure of its middle line where the log tells it. `Camera.distortion_model` is "none" for rectified images;
+      exposure of its middle line where the log states it. `Camera.distortion_model` is "none" for rectified images;
       `Camera.rolling_shutter` says how lines are read. `Stream.encoded` gives the file of an image as the log holds it.
     - **Labels** are in the map frame with sizes as length, width, height, centers of boxes, categories of
       `log2sim.datatypes.CATEGORIES` and the stamp at which each object was measured, not that of the nearest frame.

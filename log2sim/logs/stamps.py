@@ -5,6 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+# Unix times beyond this do not fit into int64 nanoseconds.
+MAX_TIME_S = 9_000_000_000
+
 
 def strictly_increasing(t_ns: NDArray[np.int64], what: str) -> tuple[NDArray[np.intp], list[str]]:
     """Select and sort rows so that their stamps strictly increase.

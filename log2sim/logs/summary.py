@@ -86,7 +86,7 @@ def _mounting(mount: str, mount_T_sensor: NDArray[np.float64]) -> dict[str, Any]
 def _ego(log: Log) -> dict[str, Any] | None:
     if log.ego is None:
         return None
-    # Poses may be nanoseconds apart: steps of a tenth of a second tell the path and its speed.
+    # Poses may be nanoseconds apart: path and speed are measured over steps of a tenth of a second.
     first, last = int(log.ego.t_ns[0]), int(log.ego.t_ns[-1])
     chosen = np.unique(np.searchsorted(log.ego.t_ns, np.append(np.arange(first, last, MIN_SPEED_STEP_NS), last)))
     position, t_ns = log.ego.map_T_ego[chosen, :3, 3], log.ego.t_ns[chosen]

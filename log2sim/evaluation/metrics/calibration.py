@@ -27,7 +27,7 @@ def reliability(confidence: Array, right: Mask) -> dict[str, Any]:
     -----
     Expected calibration error (Naeini, Cooper, Hauskrecht, AAAI 2015; Guo et al., ICML 2017): the mean over all of the
     difference between the mean confidence and the share of right ones in their bin. What lies outside 0 to 1 is in the
-    outermost bins. A few in a bin leave an error by chance alone, sqrt(p (1 - p) / count).
+    outermost bins. Bins of few have an error by chance alone: sqrt(p (1 - p) / count) for a share p.
     """
     of_bin = np.clip((confidence * BINS).astype(np.int64), 0, BINS - 1)
     count = np.bincount(of_bin, minlength=BINS)
@@ -59,7 +59,7 @@ def normalized_errors(error_m: Array, sigma_m: Array) -> dict[str, Any]:
     Notes
     -----
     Normalized estimation error squared (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and
-    Navigation", 2001, section 5.4.2). A few gross errors dominate the mean, the other two tell of the rest. The noise of
+    Navigation", 2001, section 5.4.2). A few gross errors dominate the mean, the other two describe the rest. The noise of
     the labels is part of the errors. Errors end at the gate of the matching.
     """
     known = sigma_m > 0

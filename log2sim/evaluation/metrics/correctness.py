@@ -24,12 +24,12 @@ MAX_WRONG_SHARE = 0.2
 Nevatia, CVPR 2006; Li, Huang, Nevatia, CVPR 2009)."""
 
 MIN_TRUSTED_CONFIDENCE = 0.5
-"""Below, an agent is more likely wrong than right by its own account."""
+"""Agents below it are doubted: by their confidence they are more likely wrong than right."""
 
 
 @dataclass(frozen=True, eq=False)
 class JudgedAgents:
-    """B reconstructed agents with verdicts at T ticks, and what the scenario says of itself.
+    """B reconstructed agents with verdicts at T ticks, with their confidence, doubts and sigma from the scenario.
 
     Attributes
     ----------
@@ -183,12 +183,12 @@ def _confusion(j: JudgedAgents, true_category: NDArray[np.str_]) -> dict[str, An
     ours = np.array([place[str(c)] for c in j.states.category], dtype=np.int64)
     judged = j.verdicts.judged
     row, _ = np.nonzero(judged)
-    seen = np.zeros((len(ours), len(names)), dtype=np.int64)
-    np.add.at(seen, (row, true_place[j.verdicts.taken_for[judged]]), 1)
+    counts = np.zeros((len(ours), len(names)), dtype=np.int64)
+    np.add.at(counts, (row, true_place[j.verdicts.taken_for[judged]]), 1)
     rows = np.flatnonzero(judged.any(axis=1))
     ticks, agents = (np.zeros((len(CATEGORIES), len(names)), dtype=np.int64) for _ in range(2))
-    np.add.at(ticks, ours, seen)
-    np.add.at(agents, (ours[rows], seen[rows].argmax(axis=1)), 1)
+    np.add.at(ticks, ours, counts)
+    np.add.at(agents, (ours[rows], counts[rows].argmax(axis=1)), 1)
     return {"ticks": _matrix(ticks, names), "agents": _matrix(agents, names)}
 
 

@@ -19,7 +19,7 @@ from log2sim.evaluation.metrics.verdicts import (
 )
 
 IGNORED_RULE = (
-    "an unmatched reconstructed agent is neither right nor false at the ticks at which the labels could not have told: "
+    "an unmatched reconstructed agent is neither right nor false at the ticks at which the labels may be incomplete there: "
     f"every labeled camera that shows it (a frame within {MAX_FRAME_LAG_S:g} s) has at least {MIN_REGION_SHARE:g} of its "
     "outline inside the image in regions left without labels, or no labeled camera shows any of it and only what these "
     "cameras see was labeled, or its category was never labeled"
@@ -50,7 +50,7 @@ def counting_rules(truth: Scenario, min_s: float) -> dict[str, Any]:
         "rule": "a truth agent counts at the ticks at which it is visible, within range and selected, "
         "when these make up at least min_s; a reconstructed agent is false at the ticks at which no labeled object, "
         "visible or not, counted or not, matches it, but for the ignored ones",
-        "ignored": IGNORED_RULE if truth.ignore_regions is not None else "none; the truth claims to be complete",
+        "ignored": IGNORED_RULE if truth.ignore_regions is not None else "none; the truth states that it is complete",
         "visible": truth.provenance.get("visible", "as the truth file states; all where it states nothing"),
     }
 
@@ -59,11 +59,11 @@ def correctness_rules(max_wrong_share: float, min_confidence: float) -> dict[str
     """Describe what is wrong with an agent, and when a scenario doubts one; see `verdicts.judge`."""
     return {
         "judged": "ticks of a reconstructed agent at which it matches a labeled object, or matches none and the labels "
-        "could have told; shares are of these ticks, ranges those of the reconstructed agent",
+        "are complete there; shares are of these ticks, ranges those of the reconstructed agent",
         "invented": "no labeled object of its kind, matched or not, within the gate of the matching",
         "duplicate": "such an object is within the gate, but another agent matches it",
         "in_ego": "its footprint overlaps the ego's, and that of the labeled object that it matches does not; judged also "
-        "where the labels could not have told",
+        "where the labels may be incomplete",
         "wrong_speed": f"matched, and the speed along the true heading is off by more than {MAX_SPEED_ERROR_MPS:g} m/s",
         "wrong_motion": f"matched, and stands (below {MAX_STANDING_MPS:g} m/s) while the truth moves (from "
         f"{MIN_MOVING_MPS:g} m/s), moves while it stands, or both move (from {MAX_STANDING_MPS:g} m/s) more than 90 "

@@ -20,7 +20,7 @@ MAX_STANDING_MPS = 0.5
 """Slower is standing: three standard deviations of such a speed, and no more than a body sways."""
 
 MIN_MOVING_MPS = 1.0
-"""From here on an object surely moves, a slow walk already. Between both limits nothing is said of standing or moving."""
+"""From here on an object surely moves, a slow walk already. Speeds between both limits count as neither."""
 
 MAX_SIZE_ERROR_SHARE = 0.25
 MIN_SIZE_ERROR_M = 0.3
@@ -39,9 +39,9 @@ class Verdicts:
     Attributes
     ----------
     judged : (B, T) bool
-        Where the labels can tell; no other mask is true elsewhere.
+        Where the labels are complete or the agent matches one; no other mask is true elsewhere.
     undecided : (B, T) bool
-        Selected ticks at which they cannot.
+        The other selected ticks.
     matched : (B, T) int64
         Index of the matched truth agent at judged ticks, -1 for none.
     taken_for : (B, T) int64
@@ -71,7 +71,7 @@ def judge(c: Comparison, ego: StateTable | None) -> Verdicts:
 
     Notes
     -----
-    Agents are associated one to one with labeled objects of their kind (`GROUPS`), seen or hidden, as for recall and
+    Agents are associated one to one with labeled objects of their kind (`GROUPS`), visible or hidden, as for recall and
     precision (`clear_mot.associate`): within 2 m, less than half a car's length, or a quarter of the true length where
     that is more.
 
@@ -87,8 +87,8 @@ def judge(c: Comparison, ego: StateTable | None) -> Verdicts:
     - `wrong_class`: the labeled object there has another category. Not among `MEASURES`: within a kind, logs draw the
       borders differently (pickups, vans), and an agent at an object of another kind is `invented` already.
 
-    An agent that matches nothing has no state errors. The labels cannot tell in ignore regions (`label_coverage`) unless
-    the ego is there, and not where the only labeled object within the gate is interpolated over a gap of its labels.
+    An agent that matches nothing has no state errors. Ticks are undecided in ignore regions (`label_coverage`) unless
+    the ego is there, and where the only labeled object within the gate is interpolated over a gap of its labels.
     """
     truth, other = c.truth, c.other
     matched = _partners(c)
@@ -183,7 +183,7 @@ def _nearest(c: Comparison, matched: Index) -> Index:
 
 
 def _category(truth: StateTable, index: Index) -> np.ndarray[tuple[int, ...], np.dtype[np.str_]]:
-    """Look up the category of truth agents; that of the first stands in for -1."""
+    """Look up the category of truth agents; entries of -1 get that of the first one, and must be masked."""
     return truth.category[np.maximum(index, 0)] if len(truth.category) else np.full(index.shape, "", dtype="<U16")
 
 

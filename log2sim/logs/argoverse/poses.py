@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.errors import LogError
-from log2sim.geometry import Array, PoseTrack, rotation_from_quaternion, transform
+from log2sim.geometry import Array, PoseTrack, rotation_from_quaternion, shift_poses, transform
 from log2sim.logs.arrow.tables import read_columns
 from log2sim.logs.arrow.values import Kind
+from log2sim.logs.quaternions import find_not_unit
 from log2sim.logs.stamps import strictly_increasing
 
 QUATERNION = ("qw", "qx", "qy", "qz")
 TRANSLATION = ("tx_m", "ty_m", "tz_m")
 TRANSFORM: Mapping[str, Kind] = dict.fromkeys((*QUATERNION, *TRANSLATION), "float")
-MAX_NORM_ERROR = 1e-3
-KM_M = 1000.0
+OFFSET_STEP_M = 1000.0
 
 
 def read_ego_track(path: Path, notes: list[str]) -> tuple[PoseTrack, tuple[float, float, float]]:
@@ -38,9 +38,8 @@ def read_ego_track(path: Path, notes: list[str]) -> tuple[PoseTrack, tuple[float
         raise LogError(f"{path}: no poses; expected at least one")
     keep, problems = strictly_increasing(columns["timestamp_ns"], path.name)
     notes += problems
-    east, north = (float(v) for v in np.floor(city_T_ego[keep[0], :2, 3] / KM_M) * KM_M)
-    map_T_ego = city_T_ego[keep].copy()
-    map_T_ego[:, :3, 3] -= [east, north, 0.0]
+    east, north = (float(v) for v in np.floor(city_T_ego[keep[0], :2, 3] / OFFSET_STEP_M) * OFFSET_STEP_M)
+    map_T_ego = shift_poses(city_T_ego[keep], np.array([east, north, 0.0]))
     return PoseTrack(columns["timestamp_ns"][keep], map_T_ego), (east, north, 0.0)
 
 
@@ -57,16 +56,15 @@ def transforms_of(columns: Mapping[str, NDArray[Any]], path: Path) -> Array:
     Raises
     ------
     LogError
-        When one is not finite or its quaternion not of length 1; names file and row.
+        When one is not finite or its quaternion no unit quaternion; names file and row.
     """
     q = np.stack([columns[k].astype(np.float64) for k in QUATERNION], axis=1)
     position = np.stack([columns[k].astype(np.float64) for k in TRANSLATION], axis=1)
-    norm = np.linalg.norm(q, axis=1)
-    bad = np.flatnonzero(~(np.abs(norm - 1) < MAX_NORM_ERROR) | ~np.isfinite(position).all(axis=1))
+    bad = np.union1d(find_not_unit(q), np.flatnonzero(~np.isfinite(position).all(axis=1)))
     if len(bad):
         k = int(bad[0])
         raise LogError(
             f"{path}, row {k}: quaternion {q[k].tolist()}, translation {position[k].tolist()}, expected finite numbers "
-            "and a quaternion of length 1"
+            "and a unit quaternion"
         )
     return transform(rotation_from_quaternion(q), position)

@@ -111,7 +111,7 @@ class _Folder:
             raise LogError(f"{self.path / 'sensors'}: neither sweeps nor images; expected lidar/STAMP.feather")
         city = find_city(self.path)
         map_frame = map_frame_of(city, offset_m, notes)
-        notes.append("stamps do not count from 1970: only their differences mean anything")
+        notes.append("stamps count from an unknown moment: only their differences are known")
         annotations = self.path / ANNOTATIONS
         notes.append(
             "objects were labeled only within 5 m of the drivable area"

@@ -16,8 +16,8 @@ from log2sim.logs.arrow.tables import TableLimits, read_columns
 from log2sim.logs.arrow.values import Kind
 from log2sim.logs.sweeps import MAX_SWEEP_BYTES, MAX_SWEEP_POINTS, sweep_of
 
-# First laser number of each LiDAR. On the sample log the elevations of a laser's points, seen from the LiDAR that this table
-# says, scatter by 0.003 to 0.005 degrees; seen from the other one by 0.1.
+# First laser number of each LiDAR. On the sample log the elevations of a laser's points, computed from the position
+# of this LiDAR, scatter by 0.003 to 0.005 degrees; from that of the other one by 0.1.
 LIDARS = {"up_lidar": 0, "down_lidar": 32}
 LASERS = 32
 COLUMNS: dict[str, Kind] = {"x": "float", "y": "float", "z": "float", "laser_number": "int", "offset_ns": "int"}

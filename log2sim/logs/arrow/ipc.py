@@ -1,4 +1,4 @@
-"""What an Arrow IPC file claims to hold, read from its flatbuffers before pyarrow decompresses anything.
+"""Sizes that an Arrow IPC file declares, read from its flatbuffers before pyarrow decompresses anything.
 
 Layouts: Apache Arrow, format/File.fbs and format/Message.fbs; FlatBuffers internals for tables and vectors.
 """
@@ -22,7 +22,7 @@ BATCH_LENGTH, BATCH_BUFFERS, BATCH_COMPRESSION = 0, 2, 3
 DICTIONARY_BATCH, RECORD_BATCH = 2, 3
 
 
-def claimed_size(data: bytes) -> tuple[int, int]:
+def declared_size(data: bytes) -> tuple[int, int]:
     """Return the rows and the unpacked bytes of all record batches of an Arrow file.
 
     Raises
@@ -31,7 +31,7 @@ def claimed_size(data: bytes) -> tuple[int, int]:
         When it is truncated or its structure is damaged.
     """
     if len(data) < 24 or data[-6:] != ARROW_MAGIC:
-        raise ValueError("the Arrow file is truncated: it does not end as it began")
+        raise ValueError("the Arrow file is truncated: it does not end with ARROW1")
     try:
         (length,) = struct.unpack_from("<i", data, len(data) - 10)
         start = len(data) - 10 - length
@@ -66,13 +66,11 @@ def _unpacked_bytes(data: bytes, body: int, place: int, packed: bool) -> int:
         raise ValueError("a buffer of the Arrow file is damaged")
     if not packed or length < 8:
         return int(length)
-    # Compressed buffers begin with their unpacked size; -1 says that this one is not compressed.
+    # Compressed buffers begin with their unpacked size; -1 marks one that is not compressed.
     (unpacked,) = struct.unpack_from("<q", data, body + offset)
-    return int(length if unpacked == -1 else unpacked) if unpacked >= -1 else _damaged()
-
-
-def _damaged() -> int:
-    raise ValueError("a buffer of the Arrow file has a negative size")
+    if unpacked < -1:
+        raise ValueError("a buffer of the Arrow file has a negative size")
+    return int(length if unpacked == -1 else unpacked)
 
 
 def _batch(data: bytes, offset: int) -> int:

@@ -11,20 +11,20 @@ from typing import Any
 import numpy as np
 
 from log2sim.errors import LogError, RecordError
-from log2sim.logs.arrow.tables import LIMITS, TableLimits, check_rows, checked_schema, import_pyarrow, told_errors
+from log2sim.logs.arrow.tables import LIMITS, TableLimits, check_rows, checked_schema, import_pyarrow, translate_errors
 from log2sim.logs.arrow.values import Kind, values_of
 
-# Rows that were read a moment ago or on the way to others are kept up to this size.
+# Decoded rows are kept up to this size; see `ParquetRows`.
 MAX_KEPT_BYTES = 256 * 1024**2
 ROWS_AT_A_TIME = 8
-# Compressed pages are read from the file by so many bytes, instead of a whole column of a row group.
+# Compressed pages are read from the file in parts of this size, not a whole column of a row group at once.
 READ_BYTES = 1024**2
 
 Row = dict[str, Any]
 
 
 class ParquetRows:
-    """Rows of a parquet file, read when they are asked for; several threads may ask.
+    """Rows of a parquet file, read on request, also from several threads.
 
     Parameters
     ----------
@@ -37,9 +37,9 @@ class ParquetRows:
 
     Notes
     -----
-    Parquet has no way to a single row but through the pages of its row group before it. Rows are therefore read on from
-    the last one asked for, and those that were passed are kept for a while: asking in the order of the file costs one pass,
-    going far back starts the row group again. Many writers put a whole file into one row group.
+    To read a row of a parquet file, the rows before it in its row group have to be decoded. Reading therefore continues after
+    the last row that was read, and decoded rows are kept up to `MAX_KEPT_BYTES`: reading in the order of the file decodes it
+    once, reading an earlier row that is not kept starts its row group again. Many writers use one row group for the whole file.
     """
 
     def __init__(
@@ -62,8 +62,8 @@ class ParquetRows:
         self._kept_bytes = 0
 
     def __len__(self) -> int:
-        """Return the number of rows; raise `LogError` when the file is missing, damaged or not what was wanted."""
-        with self._lock, told_errors(self._path, LogError):
+        """Return the number of rows; raise `LogError` when the file is missing, damaged or lacks a wanted column."""
+        with self._lock, translate_errors(self._path, LogError):
             self._open()
             return int(self._starts[-1])
 
@@ -73,9 +73,9 @@ class ParquetRows:
         Raises
         ------
         RecordError
-            When the file is damaged there or is not what was wanted; names file, row and column.
+            When the file is damaged there or lacks a wanted column; names file, row and column.
         """
-        with self._lock, told_errors(f"{self._path}, row {index}", RecordError):
+        with self._lock, translate_errors(f"{self._path}, row {index}", RecordError):
             self._open()
             if not 0 <= index < self._starts[-1]:
                 raise ValueError(f"no such row; there are {self._starts[-1]}")

@@ -1,7 +1,7 @@
 """Columns of feather (Arrow IPC) and parquet files as NumPy arrays; needs the extra "parquet" (pyarrow).
 
 `read_columns` reads chosen columns of a whole file, `log2sim.logs.arrow.parquet_rows.ParquetRows` single rows of a large parquet
-file. What a feather file claims (rows, sizes once decompressed) is checked against `TableLimits` before anything is allocated;
+file. What a feather file declares (rows, decompressed sizes) is checked against `TableLimits` before anything is allocated;
 parquet files are unpacked piece by piece up to the limits. What pyarrow returns is validated before it is used: pyarrow itself
 trusts the offsets of text and lists that it reads.
 """
@@ -17,13 +17,13 @@ from typing import Any
 from numpy.typing import NDArray
 
 from log2sim.errors import LogError, MissingExtra
-from log2sim.logs.arrow.ipc import ARROW_MAGIC, claimed_size
+from log2sim.logs.arrow.ipc import ARROW_MAGIC, declared_size
 from log2sim.logs.arrow.values import Kind, values_of
 
 PARQUET_MAGIC = b"PAR1"
-# Before this version a file could make pyarrow unpickle (CVE-2023-47248); it is also the least that the extra asks for.
+# Before this version a file could make pyarrow unpickle (CVE-2023-47248); the extra "parquet" requires it too.
 MIN_PYARROW_VERSION = 17
-# Of a parquet file; so much is unpacked before the limit of bytes is checked again.
+# Rows of a parquet file that are unpacked before the limit of bytes is checked again.
 ROWS_AT_A_TIME = 16_384
 
 
@@ -56,7 +56,7 @@ def read_columns(
     error: type[LogError] = LogError,
     limits: TableLimits = LIMITS,
 ) -> dict[str, NDArray[Any]]:
-    """Read columns of a feather or parquet file; which of the two it is says its content, not its name.
+    """Read columns of a feather or parquet file; its content decides which of the two it is, not its name.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def read_columns(
     MissingExtra
         When pyarrow is not installed.
     """
-    with told_errors(path, error):
+    with translate_errors(path, error):
         table = _read_table(path, wanted, optional, limits)
         return {name: _values(table.column(name), name, wanted[name]) for name in wanted if name in table.column_names}
 
@@ -102,7 +102,7 @@ def import_pyarrow() -> Any:
 
 
 @contextmanager
-def told_errors(path: Path | str, error: type[LogError]) -> Iterator[None]:
+def translate_errors(path: Path | str, error: type[LogError]) -> Iterator[None]:
     """Turn whatever reading `path` raises into `error` that begins with it, in one line."""
     pyarrow = import_pyarrow()
     try:
@@ -112,8 +112,8 @@ def told_errors(path: Path | str, error: type[LogError]) -> Iterator[None]:
     except FileNotFoundError:
         raise error(f"{path}: no such file") from None
     except (pyarrow.ArrowException, OSError, ValueError, TypeError, KeyError, IndexError, MemoryError) as problem:
-        said = str(problem).strip().splitlines()
-        raise error(f"{path}: {said[0] if said else type(problem).__name__}") from None
+        lines = str(problem).strip().splitlines()
+        raise error(f"{path}: {lines[0] if lines else type(problem).__name__}") from None
 
 
 def checked_schema(schema: Any, wanted: Mapping[str, Kind], optional: Collection[str] = ()) -> list[str]:
@@ -155,7 +155,7 @@ def _read_table(path: Path, wanted: Mapping[str, Kind], optional: Collection[str
 
 
 def _read_parquet(path: Path, wanted: Mapping[str, Kind], optional: Collection[str], limits: TableLimits) -> Any:
-    """Read columns piece by piece, up to the limit: what the metadata say about sizes is not checked by pyarrow."""
+    """Read columns piece by piece, up to the limit: pyarrow does not check the sizes that the metadata declare."""
     pyarrow = import_pyarrow()
     from pyarrow.parquet import ParquetFile
 
@@ -171,7 +171,7 @@ def _read_parquet(path: Path, wanted: Mapping[str, Kind], optional: Collection[s
 
 
 def check_rows(rows: int, limits: TableLimits) -> None:
-    """Raise `ValueError` when a table claims more rows than it may have, or less than none."""
+    """Raise `ValueError` when a table declares more rows than it may have, or less than none."""
     if not 0 <= rows <= limits.rows:
         raise ValueError(f"{rows} rows, more than the {limits.rows} that a table may have")
 
@@ -189,7 +189,7 @@ def _read_feather(path: Path, wanted: Mapping[str, Kind], optional: Collection[s
     if size > limits.file_bytes:
         raise ValueError(f"{size} bytes, more than the {limits.file_bytes} that the file may have")
     data = path.read_bytes()
-    rows, unpacked = claimed_size(data)
+    rows, unpacked = declared_size(data)
     check_rows(rows, limits)
     _check_size(unpacked, limits)
     with pyarrow.ipc.open_file(pyarrow.BufferReader(data)) as whole:

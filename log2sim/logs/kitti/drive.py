@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import EgoVehicle, Lidar, MapFrame, Stream, Sweep
 from log2sim.errors import LogError
-from log2sim.geometry import Array, Camera, inverse, rotation_from_rpy, transform
+from log2sim.geometry import Array, Camera, inverse, nearest_rotation, rotation_from_rpy, transform
 from log2sim.logs.sweeps import read_sweep, sweep_of
 
 EARTH_RADIUS_M = 6378137.0
@@ -110,8 +110,7 @@ def checked_rotation(rotation: Array, where: str) -> Array:
             f"{where}: not a rotation matrix: R R^T is off the identity by {off:.2g} (at most {ROTATION_TOLERANCE:g} "
             f"is allowed), determinant {determinant:.3g} (expected +1); check the calibration"
         )
-    u, _, vt = np.linalg.svd(rotation)
-    return np.asarray(u @ vt)
+    return nearest_rotation(rotation)
 
 
 def checked_projection(P: Array, where: str) -> Array:

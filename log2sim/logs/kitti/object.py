@@ -33,7 +33,7 @@ SINGLE_FRAMES = (
 EGO_R_RECT = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """The ego has the axes of the rectified camera 0, in which labels stand upright."""
 LIDAR_HEIGHT_M = 1.73
-"""Of KITTI's car (Geiger et al., IJRR 2013, fig. 1), for frames whose calibration does not tell."""
+"""Of KITTI's car (Geiger et al., IJRR 2013, fig. 1), for frames whose calibration does not state it."""
 
 
 class KittiObjectReader:
@@ -97,7 +97,7 @@ class _Calibration:
         P = drive.calibration_entry(c, path, (3, 4), "P2")
         if not np.linalg.det(P[:, :3]) > 0:
             raise LogError(
-                f"{path}, entry 'P2': {P.tolist()} looks at nothing; expected intrinsics, or these and a rotation"
+                f"{path}, entry 'P2': {P.tolist()} is singular or mirrors the image; expected intrinsics, or these and a rotation"
             )
         velo_T_imu = rigid("Tr_imu_to_velo") if "Tr_imu_to_velo" in c else np.eye(4)
         knows_ground = not np.array_equal(velo_T_imu, np.eye(4))

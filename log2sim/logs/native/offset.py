@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from log2sim.datatypes import Labels, Lidar
-from log2sim.geometry import Array, Camera, PoseTrack
+from log2sim.geometry import Array, Camera, PoseTrack, shift_poses
 
 OFFSET_STEP_M = 1000.0
 
@@ -32,21 +32,14 @@ def _mount_T(sensor: Camera | Lidar) -> Array:
     return sensor.mount_T_cam if isinstance(sensor, Camera) else sensor.mount_T_lidar
 
 
-def shifted_poses(map_T_x: Array, offset: Array) -> Array:
-    """Shift transforms (..., 4, 4) into the map."""
-    out = map_T_x.copy()
-    out[..., :3, 3] -= offset
-    return out
-
-
 def shifted_camera(camera: Camera, offset: Array) -> Camera:
     """Shift a camera that is fixed in the map."""
-    return camera if camera.mount == "ego" else replace(camera, mount_T_cam=shifted_poses(camera.mount_T_cam, offset))
+    return camera if camera.mount == "ego" else replace(camera, mount_T_cam=shift_poses(camera.mount_T_cam, offset))
 
 
 def shifted_lidar(lidar: Lidar, offset: Array) -> Lidar:
     """Shift a LiDAR that is fixed in the map."""
-    return lidar if lidar.mount == "ego" else Lidar(lidar.name, lidar.mount, shifted_poses(lidar.mount_T_lidar, offset))
+    return lidar if lidar.mount == "ego" else Lidar(lidar.name, lidar.mount, shift_poses(lidar.mount_T_lidar, offset))
 
 
 def shifted_labels(labels: Labels, offset: Array) -> Labels:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, Sweep
 from log2sim.documents import check, inside, read_json
 from log2sim.errors import LogError
-from log2sim.geometry import Array, Camera, PoseTrack, RollingShutter, rotation_from_quaternion, transform
+from log2sim.geometry import Array, Camera, PoseTrack, RollingShutter, rotation_from_quaternion, shift_poses, transform
 from log2sim.logs.images import image_stream
 from log2sim.logs.native.csv_tables import CsvTable, read_csv_table
 from log2sim.logs.native.labels import (
@@ -27,7 +27,8 @@ from log2sim.logs.native.labels import (
     boxes_3d,
     regions_2d,
 )
-from log2sim.logs.native.offset import offset_of, shifted_camera, shifted_labels, shifted_lidar, shifted_poses
+from log2sim.logs.native.offset import offset_of, shifted_camera, shifted_labels, shifted_lidar
+from log2sim.logs.quaternions import QUATERNION_TOLERANCE, find_not_unit
 from log2sim.logs.stamps import strictly_increasing
 from log2sim.logs.sweeps import read_sweep
 
@@ -39,7 +40,6 @@ POSE_COLUMNS = {"t_ns": "int", **dict.fromkeys(("x_m", "y_m", "z_m", "qw", "qx",
 GNSS_FIELDS = ("latitude_deg", "longitude_deg", "altitude_m", "roll_rad", "pitch_rad", "yaw_rad")
 GNSS_COLUMNS = {"t_ns": "int", **dict.fromkeys(GNSS_FIELDS, "float")}
 
-QUATERNION_TOLERANCE = 1e-3
 DISTORTION_LENGTHS: Mapping[str, tuple[int, ...]] = {"none": (0,), "brown": (4, 5, 8), "fisheye": (4,)}
 
 
@@ -113,7 +113,7 @@ class _Folder:
             cameras=cameras,
             lidars=lidars,
             streams={e["name"]: self._stream(k, e, offset) for k, e in enumerate(m["sensors"])},
-            ego=None if track is None else PoseTrack(track.t_ns, shifted_poses(track.map_T_ego, offset)),
+            ego=None if track is None else PoseTrack(track.t_ns, shift_poses(track.map_T_ego, offset)),
             ego_vehicle=EgoVehicle(
                 (length, width, height), float(ego.get("rear_axle_offset_m", default.rear_axle_offset_m))
             ),
@@ -165,10 +165,10 @@ class _Folder:
 
     def _rotations(self, table: CsvTable) -> Array:
         q = table.stack("qw", "qx", "qy", "qz")
-        norm = np.linalg.norm(q, axis=1)
-        bad = np.flatnonzero(np.abs(norm - 1) > QUATERNION_TOLERANCE)
+        bad = find_not_unit(q)
         if len(bad):
-            raise LogError(f"{table.where(bad[0], 'qw,qx,qy,qz')}: norm {norm[bad[0]]:.6g}, expected a unit quaternion")
+            norm = float(np.linalg.norm(q[bad[0]]))
+            raise LogError(f"{table.where(bad[0], 'qw,qx,qy,qz')}: norm {norm:.6g}, expected a unit quaternion")
         return rotation_from_quaternion(q)
 
     def _not_empty(self, table: CsvTable) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream
 from log2sim.documents import read_json
 from log2sim.errors import LogError
-from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, whole_kilometers
+from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, shift_poses, whole_kilometers
 from log2sim.logs.digest import digest_of
 from log2sim.logs.images import MAX_IMAGE_PX, first_image_size, image_stream
 from log2sim.logs.notes import defer_notes
@@ -39,7 +39,7 @@ MAP_ORIGIN_DEG = {
     "singapore-queenstown": (1.2782562240223188, 103.76741409301758),
 }
 EARTH_RADIUS_M = 6378137.0
-# Heights of a drive on real ground vary more.
+# A smaller range of heights means that the log has none: a drive on real ground has more.
 MAX_FLAT_M = 0.001
 
 
@@ -80,7 +80,7 @@ def _is_version(path: Path) -> bool:
 
 
 def _scenes(path: Path) -> dict[str, tuple[Tables, str]]:
-    """Tables and name of the scenes by sequence; a broken list of scenes is one, so that opening it tells why."""
+    """Tables and name of the scenes by sequence; a list of scenes that cannot be read counts as one, so that opening it raises why."""
     versions = _versions(path)
     scenes = {}
     for folder in versions:
@@ -115,8 +115,7 @@ class _SceneReader:
         """Read the tables and return the log."""
         scene, ego = self.scene, self.scene.ego
         offset_m = whole_kilometers(ego.map_T_ego[:, :3, 3])
-        map_T_ego = ego.map_T_ego.copy()
-        map_T_ego[:, :3, 3] -= offset_m
+        map_T_ego = shift_poses(ego.map_T_ego, offset_m)
         track = PoseTrack(ego.t_ns, map_T_ego)
         cameras, lidars, streams = self._sensors(track)
         self._note_flat(map_T_ego)
@@ -175,7 +174,7 @@ class _SceneReader:
         if not streams:
             raise LogError(
                 f"{self.root}: none of the {missing} images and sweeps of scene '{self.scene.record['name']}' "
-                "is there; unpack its samples and sweeps beside the tables"
+                "is there; unpack samples/ and sweeps/ next to the folder of the tables"
             )
         if unused:
             self.notes.append(f"not read, as log2sim makes no use of radar: {', '.join(unused)}")

@@ -154,7 +154,7 @@ class Scene:
 
     @cached_property
     def location(self) -> str:
-        """Name of the city and its quarter; "" when log.json does not tell."""
+        """Name of the city and its quarter; "" when log.json does not state it."""
         logs = self.tables.all_of("log")
         return str(logs.get(str(self.record.get("log_token")), {}).get("location", ""))
 

@@ -14,6 +14,8 @@ import numpy as np
 from log2sim.documents import read_json
 from log2sim.errors import LogError
 from log2sim.geometry import Array
+from log2sim.logs.quaternions import find_not_unit
+from log2sim.logs.stamps import MAX_TIME_S
 
 Record = dict[str, Any]
 
@@ -22,8 +24,6 @@ CHUNK_BYTES = 4 * 1024 * 1024
 MAX_RECORD_BYTES = 64 * 1024
 # Braces inside of strings are tried as the start of a record before the one that is.
 MAX_BRACES = 64
-# Unix times beyond this do not fit into int64 nanoseconds.
-MAX_TIME_US = 9 * 10**15
 
 SCENES, DATA = "scene", "sample_data"
 
@@ -155,7 +155,7 @@ def text_of(record: Record, key: str, path: Path) -> str:
 def stamp_ns_of(record: Record, path: Path) -> int:
     """Return the stamp of a record in ns; `LogError` when it is no whole number of microseconds."""
     value = record.get("timestamp")
-    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= MAX_TIME_US:
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= MAX_TIME_S * 10**6:
         raise LogError(f"{_place(record, path)}: 'timestamp' is {_shown(value)}, expected whole microseconds")
     return value * 1000
 
@@ -179,7 +179,7 @@ def numbers_of(records: list[Record], key: str, shape: tuple[int, ...], path: Pa
 def quaternions_of(records: list[Record], path: Path) -> Array:
     """Return the rotations of records, unit quaternions (R, 4) scalar-first; `LogError` for one that is not."""
     q = numbers_of(records, "rotation", (4,), path)
-    bad = np.flatnonzero(np.abs(np.linalg.norm(np.clip(q, -2, 2), axis=1) - 1) > 1e-3)
+    bad = find_not_unit(q)
     if len(bad):
         raise LogError(
             f"{_place(records[bad[0]], path)}: 'rotation' is {q[bad[0]].tolist()}, expected a unit quaternion"

@@ -1,4 +1,4 @@
-"""PandaSet's cuboids as labels: sizes and yaws turned to our axes, each at the time at which the LiDAR saw it."""
+"""PandaSet's cuboids as labels: sizes and yaws turned to our axes, each at the time at which the LiDAR scanned it."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ NO_ROAD_USERS = {
 COLUMNS = (
     "uuid", "label", "yaw", "position.x", "position.y", "position.z", "dimensions.x", "dimensions.y", "dimensions.z",
 )  # fmt: skip
-# Columns that a file lacks where no object of its sweep has the attribute, and what stands for it then.
+# Columns that a file lacks where no object of its sweep has the attribute, and the values that they get then.
 OPTIONAL: dict[str, str | int] = {"attributes.rider_status": "", "cuboids.sibling_id": "-", "cuboids.sensor_id": -1}
 RIDER = {"With Rider": "cyclist", "Without Rider": "bicycle"}
 GT_SENSOR = 1
-# Stands for a bicycle of which one sweep does not say whether somebody rides it.
+# A bicycle in a sweep that does not state whether somebody rides it, until its other sweeps decide.
 UNKNOWN_RIDER = "bicycle?"
 
 
@@ -70,7 +70,7 @@ def read_labels(
 
     Notes
     -----
-    A cuboid fits the points where they were measured, and the Pandar64 sees different directions at different times; on
+    A cuboid fits the points where they were measured, and the Pandar64 scans different directions at different times; on
     moving cars of sequence 002 the time by `compute_scan_offset_ns` is off that of the points inside the box by 0.5 +- 0.4 ms:
     the turn takes 0.1 s and ends at the rear, at the stamp of the sweep. Of an object
     with a cuboid for each LiDAR the Pandar64's is kept.
@@ -141,5 +141,7 @@ def _settle_riders(track_id: NDArray[np.str_], category: NDArray[np.str_], notes
         settled[rows & (category == UNKNOWN_RIDER)] = words[np.argmax(counts)] if len(words) else "bicycle"
         alone += not len(words)
     if alone:
-        notes.append(f"{alone} bicycles of which no sweep says whether somebody rides them are taken as unridden")
+        notes.append(
+            f"{alone} bicycle{'s' * (alone != 1)} taken as unridden: no sweep states whether somebody rides them"
+        )
     return settled

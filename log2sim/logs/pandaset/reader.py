@@ -19,12 +19,22 @@ from numpy.typing import NDArray
 from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream
 from log2sim.documents import read_json
 from log2sim.errors import LogError
-from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, inverse, rotation_from_quaternion, transform
+from log2sim.geometry import (
+    NS_PER_S,
+    Array,
+    Camera,
+    PoseTrack,
+    inverse,
+    nearest_rotation,
+    rotation_from_quaternion,
+    transform,
+)
 from log2sim.logs.digest import digest_of
 from log2sim.logs.images import first_image_size, image_stream
 from log2sim.logs.notes import defer_notes
 from log2sim.logs.pandaset.labels import read_labels
 from log2sim.logs.pandaset.sweeps import LIDARS, SweepFiles
+from log2sim.logs.quaternions import find_not_unit
 from log2sim.logs.record_files import list_numbered_files
 from log2sim.logs.stamps import strictly_increasing
 
@@ -34,7 +44,7 @@ ROAD_BELOW_POSE_M = 0.325
 POSE_T_EGO = transform(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), [0.0, 0.0, -ROAD_BELOW_POSE_M])
 # Fit of azimuth over time (x, y) and of the vertical field of view, -25 to +15 degrees (z), of the Pandar64's points.
 EGO_T_PANDAR64 = transform(np.eye(3), [0.75, 0.0, 1.8 + ROAD_BELOW_POSE_M])
-# The mount of the PandarGT is not documented; its points are in the map already, so the mount only says from which side it looks.
+# The mount of the PandarGT is not documented; its points are in the map already, so the mount only sets where its rays start.
 # A Chrysler Pacifica, by its data sheet.
 EGO_VEHICLE = EgoVehicle(size_m=(5.18, 2.02, 1.78), rear_axle_offset_m=1.45)
 
@@ -204,9 +214,10 @@ def _poses(folder: Path) -> tuple[NDArray[np.int64], Array]:
         raise LogError(
             f"{folder}/poses.json: expected records of position x, y, z and heading w, x, y, z: {problem}"
         ) from None
-    bad = np.flatnonzero(
-        ~(np.abs(np.linalg.norm(q, axis=1) - 1) < 1e-3) | ~np.isfinite(position).all(1) | ~np.isfinite(t_s)
-    )
+    not_finite = np.flatnonzero(~np.isfinite(position).all(axis=1) | ~np.isfinite(t_s))
+    if len(not_finite):
+        raise LogError(f"{folder}: record {not_finite[0]}: its position or stamp is not finite, expected numbers")
+    bad = find_not_unit(q)
     if len(bad):
         raise LogError(
             f"{folder}/poses.json: record {bad[0]}: heading {q[bad[0]].tolist()}, expected a unit quaternion"
@@ -238,8 +249,8 @@ def _mount(track: PoseTrack, t_ns: NDArray[np.int64], map_T_cam: Array, folder: 
         raise LogError(f"{folder}/timestamps.json: no stamp lies within the ego poses of lidar/timestamps.json")
     ego_T_cam = inverse(map_T_ego[known]) @ map_T_cam[known]
     translation = np.median(ego_T_cam[:, :3, 3], axis=0)
-    u, _, vt = np.linalg.svd(np.median(ego_T_cam[:, :3, :3], axis=0))
+    rotation = nearest_rotation(np.median(ego_T_cam[:, :3, :3], axis=0))
     spread_m = float(np.median(np.linalg.norm(ego_T_cam[:, :3, 3] - translation, axis=1)))
     if spread_m > MAX_MOUNT_SPREAD_M:
         notes.append(f"{folder.name}: its poses and the ego's do not fit together, typically by {spread_m:.2f} m")
-    return transform(u @ vt, translation)
+    return transform(rotation, translation)

@@ -16,7 +16,7 @@ from log2sim.datatypes import Stream, Sweep
 from log2sim.errors import RecordError
 from log2sim.geometry import NS_PER_S
 from log2sim.logs.pandaset.unpickle import Columns, read_pickled_table
-from log2sim.logs.stamps import strictly_increasing
+from log2sim.logs.stamps import MAX_TIME_S, strictly_increasing
 from log2sim.logs.sweeps import sweep_of
 
 # Value of the column "d" by LiDAR.
@@ -24,8 +24,6 @@ LIDARS: Mapping[str, int] = {"pandar64": 0, "pandargt": 1}
 COLUMNS = ("x", "y", "z", "t", "d")
 # Tables that are kept from the reading of the stamps until their sweeps are read, so that they are decompressed once.
 MAX_KEPT_BYTES = 256 * 1024**2
-# Unix times beyond this do not fit into int64 nanoseconds.
-MAX_TIME_S = 9e9
 READING_THREADS = 4
 
 

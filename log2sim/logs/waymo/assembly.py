@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import EgoVehicle, ImageLabels, Labels, Lidar, Log, MapFrame, Stream, Sweep
 from log2sim.errors import LogError, RecordError
-from log2sim.geometry import Array, Camera, PoseTrack, RollingShutter, transform, whole_kilometers
+from log2sim.geometry import Camera, PoseTrack, RollingShutter, shift_poses, transform, whole_kilometers
 from log2sim.logs.images import decode_image
 from log2sim.logs.notes import defer_notes
 from log2sim.logs.stamps import strictly_increasing
@@ -32,7 +32,7 @@ from log2sim.logs.waymo.segment import (
     LaserCalibration,
     Segment,
 )
-from log2sim.logs.waymo.timing import FrameTimes, believed
+from log2sim.logs.waymo.timing import FrameTimes, plausible_stamp
 from log2sim.logs.waymo.wire import WireError
 
 # From OpenCV's axes to x forward, y left, z up.
@@ -44,7 +44,7 @@ DIRECTIONS = {1: "down", 2: "right", 3: "up", 4: "left"}
 PACIFICA = EgoVehicle(size_m=(5.18, 2.02, 1.78), rear_axle_offset_m=1.45)
 LASER_FRONT, LASER_REAR = 2, 5
 MAX_BUMPER_MISMATCH_M = 0.3
-# Where Frame.pose and the pose of the FRONT image, taken to be of one time, differ more, that is said.
+# Frame.pose and the pose of the FRONT image are taken to be of one time; a larger distance between them is noted.
 MAX_POSE_MISMATCH_M = 0.05
 
 Stamps = NDArray[np.int64]
@@ -69,7 +69,7 @@ class _Assembly:
         self.times = FrameTimes.of(self.frames, self.notes)
         world_T_vehicle = np.stack([frame.world_T_vehicle for frame in self.frames])
         self.offset_m = whole_kilometers(world_T_vehicle[:, :3, 3])
-        self.map_T_vehicle = _moved(world_T_vehicle, self.offset_m)
+        self.map_T_vehicle = shift_poses(world_T_vehicle, self.offset_m)
 
     def log(self, format: str, digest: str) -> Log:
         cameras, streams, image_ns = self._cameras()
@@ -119,7 +119,7 @@ class _Assembly:
 
     def _image_ns(self, k: int, number: int) -> int:
         frame = self.frames[k]
-        stamp = believed(frame.images[number].middle_ns, frame.stamp_ns)
+        stamp = plausible_stamp(frame.images[number].middle_ns(), frame.stamp_ns)
         return int(self.times.pose_ns[k]) if stamp is None else stamp
 
     def _image_stream(self, camera: Camera, number: int, rows: NDArray[np.intp], t_ns: Stamps) -> Stream:
@@ -161,7 +161,7 @@ class _Assembly:
             except WireError as error:
                 where = self.segment.where(int(self.order[row]))
                 raise RecordError(f"{where}, {name} (stamp {stamp_ns}): {error}") from None
-            # Nothing tells how the short-range LiDARs turn.
+            # How the short-range LiDARs scan is not documented.
             timed = self.times.at_turn(np.broadcast_to(row, len(turn)), turn) - stamp_ns if number == TOP else None
             raw = number == TOP and self.segment.pixel_poses_are_missing
             return sweep_of(xyz_m, stamp_ns, timed, "lidar", None if raw else stamp_ns)
@@ -174,10 +174,10 @@ class _Assembly:
         off_m = [0.0]
         for frame, own_ns, own in zip(self.frames, self.times.pose_ns, self.map_T_vehicle):
             for image in frame.images.values():
-                stamp = believed(image.pose_ns, frame.stamp_ns)
+                stamp = plausible_stamp(image.pose_ns(), frame.stamp_ns)
                 if stamp is None or image.world_T_vehicle is None:
                     continue
-                pose = _moved(image.world_T_vehicle, self.offset_m)
+                pose = shift_poses(image.world_T_vehicle, self.offset_m)
                 if stamp == own_ns:
                     off_m.append(float(np.linalg.norm(pose[:3, 3] - own[:3, 3])))
                 stamps.append(stamp)
@@ -218,7 +218,7 @@ class _Assembly:
         return moved.take(np.flatnonzero(frame >= 0))
 
     def _note_limits(self, lidars: dict[str, Lidar]) -> None:
-        """Say what the format does not tell."""
+        """Note what the format lacks."""
         notes = self.notes
         if f"LIDAR_{LASERS[TOP]}" in lidars:
             notes.append("no times of points: those of the TOP LiDAR are estimated from the column of the range image")
@@ -229,7 +229,9 @@ class _Assembly:
         if set(lidars) - {f"LIDAR_{LASERS[TOP]}"}:
             notes.append("no times of points of the short-range LiDARs")
         if self.segment.boxes is not None:
-            notes.append("labels of vehicles do not tell cars from trucks, buses and motorcycles: all are read as cars")
+            notes.append(
+                "labels do not distinguish cars from trucks, buses and motorcycles: all vehicles are read as cars"
+            )
         if self.segment.image_boxes is not None:
             projected = (
                 "3D labels projected into them" if self.segment.image_boxes_are_projected else "boxes drawn in them"
@@ -264,7 +266,7 @@ def camera_of(name: str, calibration: CameraCalibration, frames: list[FrameRow],
 
 
 def ego_vehicle_of(lasers: Mapping[int, LaserCalibration]) -> EgoVehicle:
-    """Return the Pacifica, or a vehicle of the length that the LiDARs at the bumpers tell where that is another."""
+    """Return the Pacifica, or a vehicle with the distance of the LiDARs at its bumpers as length where that differs."""
     if LASER_FRONT not in lasers or LASER_REAR not in lasers:
         return PACIFICA
     front_m, rear_m = (float(lasers[k].vehicle_T_lidar[0, 3]) for k in (LASER_FRONT, LASER_REAR))
@@ -272,12 +274,6 @@ def ego_vehicle_of(lasers: Mapping[int, LaserCalibration]) -> EgoVehicle:
     if abs(front_m - rear_m - length_m) < MAX_BUMPER_MISMATCH_M or not 2.0 < front_m - rear_m < 15.0:
         return PACIFICA
     return EgoVehicle((front_m - rear_m, *PACIFICA.size_m[1:]), (front_m + rear_m) / 2)
-
-
-def _moved(world_T_vehicle: Array, offset_m: Array) -> Array:
-    out = world_T_vehicle.copy()
-    out[..., :3, 3] -= offset_m
-    return out
 
 
 def _no_labels(camera: str) -> ImageLabels:

@@ -16,7 +16,18 @@ from log2sim.errors import LogError
 from log2sim.geometry import Array
 from log2sim.logs.arrow.tables import read_columns
 from log2sim.logs.arrow.values import Kind
-from log2sim.logs.waymo.segment import CAMERAS, LASERS, BoxTable, CameraCalibration, ImageTimes, LaserCalibration, rigid
+from log2sim.logs.stamps import MAX_TIME_S
+from log2sim.logs.waymo.segment import (
+    CAMERAS,
+    LASERS,
+    MAX_BEAMS,
+    MAX_SIDE_PX,
+    BoxTable,
+    CameraCalibration,
+    ImageTimes,
+    LaserCalibration,
+    rigid,
+)
 
 Columns = dict[str, NDArray[Any]]
 
@@ -37,8 +48,6 @@ INTRINSICS = tuple(f"{CAMERA_PREFIX}.intrinsic.{k}" for k in ("f_u", "f_v", "c_u
 LASER_PREFIX = "[LiDARCalibrationComponent]"
 LIDAR_RETURNS = ("[LiDARComponent].range_image_return1", "[LiDARComponent].range_image_return2")
 PIXEL_POSES = "[LiDARPoseComponent].range_image_return1"
-MAX_STAMP_US = 9_000_000_000_000_000
-MAX_SIDE_PX, MAX_BEAMS = 100_000, 4096
 # Component and prefix of its columns.
 LIDAR_BOXES = ("lidar_box", "[LiDARBoxComponent]")
 PROJECTED_BOXES = ("projected_lidar_box", "[ProjectedLiDARBoxComponent]")
@@ -60,7 +69,7 @@ def read_poses(path: Path) -> tuple[list[int], list[Array], list[str]]:
     """
     columns = read_columns(path, {STAMP: "int", POSE: "floats"})
     found = [(int(t), matrix(cell)) for t, cell in zip(columns[STAMP], columns[POSE])]
-    usable = [(t, pose) for t, pose in found if pose is not None and 0 < t < MAX_STAMP_US]
+    usable = [(t, pose) for t, pose in found if pose is not None and 0 < t < MAX_TIME_S * 10**6]
     if not usable:
         raise LogError(f"{path}: none of its {len(found)} rows is a rigid pose with a stamp in microseconds")
     lost = len(found) - len(usable)

@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 
 from log2sim.geometry import Array
-from log2sim.logs.waymo.segment import CameraCalibration, ImageTimes, LaserCalibration, rigid
+from log2sim.logs.waymo.segment import MAX_BEAMS, MAX_SIDE_PX, CameraCalibration, ImageTimes, LaserCalibration, rigid
 from log2sim.logs.waymo.tfrecord import RecordWindow
 from log2sim.logs.waymo.wire import BYTES, VARINT, Field, WireError, doubles, doubles_by_number, fields, fields_of, text
 
 # Calibration, poses and labels; a larger field of these is none of the data set's.
 MAX_INDEX_BYTES = 16 * 1024 * 1024
-MAX_BEAMS = 4096
-MAX_SIDE_PX = 100_000
 
 Span = tuple[int, int]
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from log2sim.datatypes import Log
 from log2sim.errors import LogError, RecordError
 from log2sim.logs.digest import digest_of
+from log2sim.logs.stamps import MAX_TIME_S
 from log2sim.logs.waymo.assembly import log_of
 from log2sim.logs.waymo.messages import (
     FrameIndex,
@@ -39,7 +40,6 @@ from log2sim.logs.waymo.tfrecord import RecordFile, starts_like_tfrecord
 from log2sim.logs.waymo.wire import WireError
 
 SUFFIX = ".tfrecord"
-MAX_STAMP_US = 9_000_000_000_000_000
 
 # Frame, id, type and numbers of a box.
 LabelRow = tuple[int, str, int, list[float]]
@@ -205,7 +205,7 @@ def _row(index: FrameIndex) -> FrameRow:
 
 def _problem(index: FrameIndex, name: str, expected: str) -> str:
     """Why a frame cannot be used; empty when it can."""
-    if index.stamp_us is None or not 0 < index.stamp_us < MAX_STAMP_US:
+    if index.stamp_us is None or not 0 < index.stamp_us < MAX_TIME_S * 10**6:
         return f"timestamp_micros is {index.stamp_us}, expected microseconds since 1970"
     if index.pose is None:
         return "no rigid pose"

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import NS_PER_S, Array
+from log2sim.geometry import NS_PER_S, Array, nearest_rotation
+from log2sim.logs.stamps import MAX_TIME_S
 
 # Enumerations of dataset.proto and label.proto, by their numbers.
 CAMERAS = {
@@ -23,8 +24,8 @@ TYPES = {1: "vehicle", 2: "pedestrian", 3: "sign", 4: "cyclist"}
 TOP = 1
 FRONT_CAMERA = 1
 
-# Unix times beyond this do not fit into int64 nanoseconds.
-MAX_TIME_S = 9e9
+# Larger ones are damaged.
+MAX_SIDE_PX, MAX_BEAMS = 100_000, 4096
 ROTATION_TOLERANCE = 1e-3
 
 
@@ -87,7 +88,7 @@ class ImageTimes:
     readout_done_s: float
 
     def middle_ns(self) -> int | None:
-        """Return the middle of the exposure of the middle line; None where the data set does not tell it.
+        """Return the middle of the exposure of the middle line; None where the data set does not state it.
 
         Notes
         -----
@@ -249,6 +250,5 @@ def rigid(numbers: Array) -> Array | None:
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
         return None
     # Version 2 may hold them in single precision.
-    u, _, vt = np.linalg.svd(rotation)
-    out[:3, :3], out[3] = u @ vt, (0.0, 0.0, 0.0, 1.0)
+    out[:3, :3], out[3] = nearest_rotation(rotation), (0.0, 0.0, 0.0, 1.0)
     return out

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +14,7 @@ Stamps = NDArray[np.int64]
 # The TOP LiDAR turns ten times a second.
 NOMINAL_PERIOD_NS = 100_000_000
 MIN_PERIOD_NS, MAX_PERIOD_NS = 80_000_000, 120_000_000
-# Times of a frame that are farther from its stamp are not believed.
+# Times that are farther from the stamp of their frame are damaged.
 MAX_LAG_NS = 1_000_000_000
 
 
@@ -50,7 +49,7 @@ class FrameTimes:
         unknown = 0
         for k, frame in enumerate(frames):
             front = frame.images.get(FRONT_CAMERA)
-            stamp = believed(front.pose_ns if front is not None else None, frame.stamp_ns)
+            stamp = plausible_stamp(None if front is None else front.pose_ns(), frame.stamp_ns)
             pose[k] = pose[k] if stamp is None else stamp
             unknown += stamp is None
         if unknown:
@@ -65,7 +64,6 @@ class FrameTimes:
         return self.start_ns[frame] + np.round(turn * self.period_ns[frame]).astype(np.int64)
 
 
-def believed(stamp_of: Callable[[], int | None] | None, near_ns: int) -> int | None:
-    """Return a stamp if it is known and within `MAX_LAG_NS` of that of its frame."""
-    stamp = None if stamp_of is None else stamp_of()
-    return stamp if stamp is not None and abs(stamp - near_ns) <= MAX_LAG_NS else None
+def plausible_stamp(stamp: int | None, frame_ns: int) -> int | None:
+    """Return a stamp, ns, if it is known and within `MAX_LAG_NS` of that of its frame; else None."""
+    return stamp if stamp is not None and abs(stamp - frame_ns) <= MAX_LAG_NS else None

@@ -265,10 +265,10 @@ def _wireframes(log: Log, camera: Camera, t_ns: int) -> tuple[tuple[Array, str],
     view = view_of(log, camera.name, t_ns)
     if view is None:
         return ()
-    seen = project_boxes_in_view(view, boxes.center_m, boxes.size_m, boxes.yaw_rad)
+    projected = project_boxes_in_view(view, boxes.center_m, boxes.size_m, boxes.yaw_rad)
     out = []
-    for i in np.flatnonzero(seen.valid):
-        middle_px = seen.box_px[i].reshape(2, 2).mean(axis=0)[None]
+    for i in np.flatnonzero(projected.valid):
+        middle_px = projected.box_px[i].reshape(2, 2).mean(axis=0)[None]
         cam_T_map = cam_T_map_at(line_time_s(camera, middle_px))[0]
         corners = box_corners(boxes.center_m[i], boxes.size_m[i], boxes.yaw_rad[i])[0]
         out.append((box_lines(camera, apply(cam_T_map, corners)), str(boxes.category[i])))

@@ -28,7 +28,7 @@ COLORS = {"vehicle": "#FFFFFF", "two_wheeler": "#FF4FD8", "pedestrian": "#00E5FF
 IMAGE_BOX_COLOR = "#FFE000"
 DEPTHS = "turbo_r"
 MIN_DEPTH_M, MAX_DEPTH_M = 2.0, 100.0
-# Wider tiles do not show more; the width of a tile follows from the number of columns.
+# Images are sampled down to this width: a tile is not printed wider.
 MAX_TILE_PX = 1100
 MAX_POINTS = 60_000
 TILE_IN, HEAD_IN, FOOT_IN, CAPTION_IN, SIDE_IN = 5.2, 0.4, 0.5, 0.36, 0.85
@@ -132,7 +132,7 @@ def _draw_above(ax: Axes, moment: Moment, aspect: float) -> tuple[str, str]:
         local = sweep.xyz - [*origin[:2], ground_z]
         local = local[:: max(1, len(local) // (2 * MAX_POINTS))]
         size = float(np.clip(2e4 / max(len(local), 1), 0.35, 3.0))
-        # The ground in the middle of the colors, so that it stands out from the paper.
+        # The ground has the middle of the color map, which contrasts with the dark background.
         ax.scatter(
             local[:, 0], local[:, 1], c=local[:, 2], s=size, linewidths=0, cmap="viridis", zorder=2,
             vmin=-MAX_HEIGHT_M, vmax=MAX_HEIGHT_M,
