@@ -389,7 +389,7 @@ def test_an_error_of_ours_inside_says_so(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_interrupting_leaves_nothing(tmp_path: Path) -> None:
     scene = tmp_path / "scene.toml"
-    scene.write_text(tiny_toml(agents=[PARKED], duration_s=2.0))
+    scene.write_text(tiny_toml(agents=[PARKED], duration_s=20.0))
     (tmp_path / "work").mkdir()
     process = subprocess.Popen(
         [sys.executable, "-m", "log2sim", "synth", str(scene), "--out", str(tmp_path / "work/log"), "--quiet"],
