@@ -22,6 +22,7 @@ import pytest
 import typer
 
 from log2sim.cli import entry
+from log2sim.logs.ros.settings import read_settings
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -169,3 +170,11 @@ def test_every_line_of_the_readme_runs_for_a_new_user(fresh_checkout: Path, fres
     missing = sorted(name for name in promised if not (fresh_checkout / name).exists())
     assert promised, "the README writes no files"
     assert not missing
+
+
+def test_the_settings_of_ros_topics_are_valid(tmp_path: Path) -> None:
+    (example,) = re.findall(r"```toml\n(.*?)```", README, re.DOTALL)
+    (tmp_path / "topics.toml").write_text(example, encoding="utf-8")
+    settings, _ = read_settings([tmp_path / "topics.toml"])
+    assert settings.ego.base_frame == "base_link"
+    assert settings.lidars["top"].time_unit == "ns"
