@@ -201,7 +201,7 @@ def test_recorded_poses_are_read(recorded_poses: Path) -> None:
 def test_recorded_poses_alone_are_no_log(recorded_poses: Path, tmp_path: Path) -> None:
     (tmp_path / "vehicle_pose").mkdir()
     shutil.copy(recorded_poses, tmp_path / "vehicle_pose" / "segment.parquet")
-    with pytest.raises(LogError, match="segment: 199 frames with neither images nor range images"):
+    with pytest.raises(LogError, match="199 frames with neither images nor range images"):
         open_log(tmp_path)
 
 

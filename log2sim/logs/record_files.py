@@ -1,4 +1,4 @@
-"""Files of records that are named by a number: that of a frame or a stamp."""
+"""Files and folders of a log, by their names."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MAX_DIGITS = 19
 
 
 def list_numbered_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
-    """Return the files of a folder by the number that is their name, in the order of the numbers; others are left out.
+    """Return the files of a folder by the number that is their name (of a frame, or a stamp), in the order of the numbers; others are left out.
 
     Parameters
     ----------
@@ -28,6 +28,14 @@ def list_numbered_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Pa
         if word.isdecimal() and len(word) <= MAX_DIGITS and int(word) <= MAX_NUMBER:
             found[int(word)] = path
     return dict(sorted(found.items()))
+
+
+def list_folders(path: Path) -> list[Path]:
+    """Return the folders in a folder, sorted; none where it cannot be read or is none."""
+    try:
+        return sorted(p for p in path.iterdir() if p.is_dir())
+    except OSError:
+        return []
 
 
 def list_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:

@@ -11,9 +11,9 @@ the stamp of an image is the middle of its exposure. Shutters are global, and im
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, Stream
 from log2sim.errors import LogError
-from log2sim.geometry import Array, Camera
+from log2sim.geometry import Array, Camera, PoseTrack
 from log2sim.logs.argoverse.cities import find_city, map_frame_of
 from log2sim.logs.argoverse.labels import read_labels
 from log2sim.logs.argoverse.poses import read_ego_track, read_mounts
@@ -112,20 +112,9 @@ class _Folder:
         city = find_city(self.path)
         map_frame = map_frame_of(city, offset_m, notes)
         notes.append("stamps count from an unknown moment: only their differences are known")
-        annotations = self.path / ANNOTATIONS
-        notes.append(
-            "objects were labeled only within 5 m of the drivable area"
-            if annotations.is_file()
-            else f"no labels: {ANNOTATIONS} is missing, as in test splits"
-        )
-        upper = mounts.get("up_lidar", np.eye(4))[:2, 3]
-
-        swept = streams["up_lidar"].t_ns if "up_lidar" in streams else np.zeros(0, dtype=np.int64)
-
-        @cache
-        def labels() -> Labels | None:
-            return read_labels(annotations, ego, upper, swept, notes) if annotations.is_file() else None
-
+        upper_lidar_xy = mounts.get("up_lidar", np.eye(4))[:2, 3]
+        swept_ns = streams["up_lidar"].t_ns if "up_lidar" in streams else np.zeros(0, dtype=np.int64)
+        labels = self._labels(ego, upper_lidar_xy, swept_ns, notes)
         return Log(
             name=f"argoverse2-{self.path.resolve().name}",
             format=READER.name,
@@ -142,6 +131,17 @@ class _Folder:
             notes=defer_notes(notes, labels),
             details={"city": city},
         )
+
+    def _labels(
+        self, ego: PoseTrack, upper_lidar_xy: Array, swept_ns: NDArray[np.int64], notes: list[str]
+    ) -> Callable[[], Labels | None]:
+        """Return a function that reads the labels once."""
+        path = self.path / ANNOTATIONS
+        if not path.is_file():
+            notes.append(f"no labels: {ANNOTATIONS} is missing, as in test splits")
+            return lambda: None
+        notes.append("objects were labeled only within 5 m of the drivable area")
+        return cache(partial(read_labels, path, ego, upper_lidar_xy, swept_ns, notes))
 
     def _digest(self) -> str:
         index = [self.path / name for name in (POSES, MOUNTS, INTRINSICS) if (self.path / name).is_file()]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Log, Stream
 from log2sim.errors import LogError
-from log2sim.geometry import PoseTrack, transform
+from log2sim.geometry import Camera, PoseTrack, transform
 from log2sim.logs.digest import digest_of
 from log2sim.logs.images import first_image_size, image_stream
 from log2sim.logs.kitti import drive
@@ -57,14 +57,7 @@ class _Sequence:
 
     def log(self) -> Log:
         rig = self._rig()
-        streams: dict[str, Stream] = {}
-        cameras = {}
-        for number in rig.projections:
-            files = self._files(f"image_{number:02d}", (".png", ".jpg", ".jpeg"))
-            size_px = first_image_size(list(files.values()))
-            camera = rig.camera(number, *size_px)
-            cameras[camera.name] = camera
-            streams[camera.name] = image_stream(camera.name, _nominal_stamps(files), list(files.values()), size_px)
+        cameras, streams = self._cameras(rig)
         if (self.base / "velodyne" / self.name).is_dir():
             sweeps = self._files("velodyne", (".bin",))
             t_ns = _nominal_stamps(sweeps)
@@ -115,6 +108,16 @@ class _Sequence:
             m = drive.calibration_entry(c, path, (3, 4), *keys)
             links.append(transform(drive.checked_rotation(m[:, :3], f"{path}, entry '{keys[0]}'"), m[:, 3]))
         return drive.rig_of(links[0], links[1], rect, projections)
+
+    def _cameras(self, rig: drive.Rig) -> tuple[dict[str, Camera], dict[str, Stream]]:
+        cameras, streams = {}, {}
+        for number in rig.projections:
+            files = self._files(f"image_{number:02d}", (".png", ".jpg", ".jpeg"))
+            size_px = first_image_size(list(files.values()))
+            camera = rig.camera(number, *size_px)
+            cameras[camera.name] = camera
+            streams[camera.name] = image_stream(camera.name, _nominal_stamps(files), list(files.values()), size_px)
+        return cameras, streams
 
     def _files(self, folder: str, suffixes: tuple[str, ...]) -> dict[int, Path]:
         files = list_numbered_files(self.base / folder / self.name, suffixes)

@@ -25,6 +25,7 @@ from log2sim.logs.nuscenes.labels import read_labels
 from log2sim.logs.nuscenes.scene import Channel, Scene
 from log2sim.logs.nuscenes.sweeps import sweep_stream
 from log2sim.logs.nuscenes.tables import DATA, SCENES, Record, Tables, numbers_of, text_of
+from log2sim.logs.record_files import list_folders
 
 REFERENCE_CAMERA = "CAM_FRONT"
 LABELED_LIDAR = "LIDAR_TOP"
@@ -72,7 +73,7 @@ READER = NuScenesReader()
 
 def _versions(path: Path) -> list[Path]:
     """Folders of tables at a path."""
-    return [path] if _is_version(path) else sorted(p for p in path.iterdir() if _is_version(p))
+    return [path] if _is_version(path) else [p for p in list_folders(path) if _is_version(p)]
 
 
 def _is_version(path: Path) -> bool:

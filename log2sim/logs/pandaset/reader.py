@@ -35,7 +35,7 @@ from log2sim.logs.notes import defer_notes
 from log2sim.logs.pandaset.labels import read_labels
 from log2sim.logs.pandaset.sweeps import LIDARS, SweepFiles
 from log2sim.logs.quaternions import find_not_unit
-from log2sim.logs.record_files import list_numbered_files
+from log2sim.logs.record_files import list_folders, list_numbered_files
 from log2sim.logs.stamps import strictly_increasing
 
 TABLE = ".pkl.gz"
@@ -69,7 +69,7 @@ class PandaSetReader:
         """Return the names of the sequences, sorted."""
         if _is_sequence(path):
             return [path.resolve().name]
-        return sorted(p.name for p in path.iterdir() if _is_sequence(p))
+        return [p.name for p in list_folders(path) if _is_sequence(p)]
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a sequence; no sweep and no cuboid is read."""

@@ -60,8 +60,6 @@ class _Assembly:
 
     def __init__(self, segment: Segment) -> None:
         self.segment, self.notes = segment, list(segment.notes)
-        if not segment.frames:
-            raise LogError(f"{segment.name}: no usable frame; {'; '.join(self.notes) or 'expected at least one'}")
         stamps = np.array([frame.stamp_ns for frame in segment.frames], dtype=np.int64)
         self.order, problems = strictly_increasing(stamps, "frames")
         self.notes += problems
@@ -75,7 +73,9 @@ class _Assembly:
         cameras, streams, image_ns = self._cameras()
         lidars, sweeps = self._lidars()
         if not cameras and not lidars:
-            raise LogError(f"{self.segment.name}: {len(self.frames)} frames with neither images nor range images")
+            raise LogError(
+                f"{self.segment.path}: {len(self.frames)} frames with neither images nor range images that have a calibration"
+            )
         self._note_limits(lidars)
         labels = cache(self._labels)
         return Log(

@@ -73,9 +73,11 @@ class _SegmentFolder:
     def log(self) -> Log:
         boxes = self._path_of(components.LIDAR_BOXES[0])
         projected, drawn = (self._path_of(c[0]) for c in (components.PROJECTED_BOXES, components.CAMERA_BOXES))
+        # Boxes projected from 3D labels go before boxes drawn in the images.
         kind, in_images = (components.PROJECTED_BOXES if projected else components.CAMERA_BOXES), projected or drawn
         segment = Segment(
             name=self.name,
+            path=self.root,
             cameras=components.read_camera_calibration(self._file("camera_calibration")) if self.images.rows else {},
             lasers=components.read_laser_calibration(self._file("lidar_calibration")) if self.sweeps.rows else {},
             frames=self._frames(),

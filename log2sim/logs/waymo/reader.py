@@ -107,6 +107,7 @@ class _SegmentFile:
             notes.append(f"{zones} of {len(index)} frames have zones in which objects are not labeled")
         segment = Segment(
             name=frames.name,
+            path=self.path,
             cameras=cameras,
             lasers=lasers,
             frames=[_row(f) for f in index],

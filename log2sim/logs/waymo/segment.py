@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -203,10 +204,12 @@ class Segment:
     Attributes
     ----------
     name : str
+    path : Path
+        Its file or folder, for errors.
     cameras : mapping of number to CameraCalibration
     lasers : mapping of number to LaserCalibration
     frames : list of FrameRow
-        Not yet in order.
+        At least one; not yet in order.
     image : callable
         Returns the JPEG of a frame by index and camera by number; raises `RecordError`.
     ranges : callable
@@ -227,6 +230,7 @@ class Segment:
     """
 
     name: str
+    path: Path
     cameras: Mapping[int, CameraCalibration]
     lasers: Mapping[int, LaserCalibration]
     frames: list[FrameRow]
