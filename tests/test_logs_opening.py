@@ -15,8 +15,11 @@ from worlds import tiny_log
 
 from log2sim.datatypes import Log
 from log2sim.errors import LogError, RecordError
+from log2sim.geometry import NS_PER_S, PoseTrack
 from log2sim.logs.native.writer import write_log
 from log2sim.logs.opening import open_log
+from log2sim.logs.stamps import strictly_increasing
+from log2sim.logs.summary import summarize
 
 SWEEP_SUFFIXES = (".bin", ".npz", ".npy", ".pcd", ".gz")
 _listeners: list[list[str]] = []
@@ -95,6 +98,27 @@ def test_a_recorded_log_opens_without_its_sweeps(real_data: Path, path: str) -> 
         open_log(real_data / path)
     assert names
     assert not [name for name in names if name.endswith(SWEEP_SUFFIXES)]
+
+
+def test_stamps_far_from_all_others_are_left_out() -> None:
+    stamps = np.array([3, 1, 0, 2, 2, 9], dtype=np.int64) * 10**8 + 1_700_000_000 * NS_PER_S
+    stamps[[2, 5]] = 0, np.iinfo(np.int64).max
+    rows, notes = strictly_increasing(stamps, "a")
+    assert rows.tolist() == [1, 3, 0]
+    assert notes[0] == "a: 2 of 6 records have stamps more than 1000000 s off the others, first 0; left out"
+    assert len(notes) == 3
+    assert strictly_increasing(stamps[:0], "a")[0].tolist() == []
+
+
+def test_a_pose_of_another_time_does_not_hinder_a_summary() -> None:
+    log, _ = tiny_log()
+    assert log.ego is not None
+    usual = summarize(log)["ego"]
+    ego = PoseTrack(np.append(0, log.ego.t_ns), np.concatenate([log.ego.map_T_ego[:1], log.ego.map_T_ego]))
+    found = summarize(log.changed(ego=ego))["ego"]
+    assert found["records"] == usual["records"] + 1
+    assert found["distance_m"] == pytest.approx(usual["distance_m"], abs=0.02)
+    assert found["top_speed_mps"] == pytest.approx(usual["top_speed_mps"], rel=0.05)
 
 
 def test_a_changed_log_leaves_what_is_deferred_unread() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import bz2
 import re
 import shutil
+import sqlite3
 import struct
 import sys
 from collections.abc import Callable, Iterator
@@ -26,6 +27,7 @@ from log2sim.cli import app
 from log2sim.datatypes import Log, Stream
 from log2sim.errors import ConfigError, LogError, MissingExtra, RecordError
 from log2sim.geometry import NS_PER_S, RollingShutter, transform
+from log2sim.logs.ros import bag
 from log2sim.logs.ros import messages as ros_messages
 from log2sim.logs.ros.bag import open_container
 from log2sim.logs.ros.chunked import ChunkedFile, decompress
@@ -451,6 +453,45 @@ def test_header_stamps_that_are_zero_or_of_another_clock_are_noted(tmp_path: Pat
     settings = '[lidars.top]\ntopic = "/top/points"\nstamps = "recorded"\n'
     told = open_log(with_settings(path, settings))
     np.testing.assert_array_equal(told.streams["top"].t_ns, world_log().streams["top"].t_ns + ros.OTHER_DELAY_NS)
+
+
+def test_one_wrong_stamp_costs_its_record_only(tmp_path: Path) -> None:
+    def at_zero(m: Message) -> Message:
+        if m[2] == "/top/points" and m[0] == second:
+            m[4].header.stamp.sec = 0
+        return m
+
+    second = int(world_log().streams["top"].t_ns[1])
+    log = open_log(bag_of(tmp_path, Style(), at_zero))
+    assert second not in log.streams["top"].t_ns
+    assert len(log.streams["top"].t_ns) == len(world_log().streams["top"].t_ns) - 1
+    # Poses cover the log all the same.
+    assert log.ego is not None
+    assert any("/top/points: 1 of 10 records have stamps more than" in note for note in log.notes)
+
+
+def test_values_of_other_types_in_a_database_cost_their_messages_only(tmp_path: Path) -> None:
+    path = bag_of(tmp_path, Style("db3"))
+    whole = open_log(path)
+    with sqlite3.connect(file_of(path)) as database:
+        last = "SELECT max(id) FROM messages WHERE topic_id = (SELECT id FROM topics WHERE name = '/top/points')"
+        database.execute(f"UPDATE messages SET timestamp = 'noon' WHERE id = ({last})")
+    database.close()
+    log = open_log(path)
+    assert log.streams["top"].t_ns.tolist() == whole.streams["top"].t_ns[:-1].tolist()
+    assert any("1 of 132 messages have no whole number as topic or stamp" in note for note in log.notes), log.notes
+
+
+def test_no_more_than_a_limit_is_kept_of_what_is_read_at_opening(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = bag_of(tmp_path, Style())
+    monkeypatch.setattr(bag, "MAX_COLLECTED_BYTES", 5000)
+    log = open_log(path)
+    assert any("have more than 5000 bytes; the rest is not read" in note for note in log.notes)
+    monkeypatch.setattr(bag, "MAX_INDEX_BYTES", 40)
+    damaged = open_log(path)
+    assert any("/tf_static: 1 of 1 messages are damaged" in note for note in damaged.notes)
 
 
 def test_of_two_clocks_that_of_the_recorder_is_right() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -336,6 +337,12 @@ def test_a_tree_that_is_none_is_refused_by_the_names_of_its_frames() -> None:
         tree.mount("a", "x")
     tree.add([tf("a", "d", (np.nan, 0, 0)), tf("a", "d", (0, 0, 0), q=(0.0, 0.0, 0.0, 0.0))])
     assert tree.refused == 2
+    tree.add([tf("a", "e", (1e300, 0, 0)), tf("a", "e", (0, 0, -2e9))])
+    assert tree.refused == 4
+    assert "e" not in tree.frames
+    tree.add(tf(f"f{k + 1}", f"f{k}", (0, 0, 0)) for k in range(2000))
+    with pytest.raises(LogError, match="frame 'f0' has more than 100 frames above it"):
+        tree.rigid_root("f0")
     tree.add_static([StaticTransform(parent="a", child="c", translation_m=(1.0, 2.0, 3.0))])
     np.testing.assert_array_equal(tree.mount("a", "c")[:3, 3], [1, 2, 3])
 
@@ -349,6 +356,9 @@ def test_the_road_is_measured_below_the_sensor() -> None:
     sweep = sweep_from(message, STAMP_NS, PERIOD_NS, PLAIN, "cloud")
     mount = transform(np.eye(3), [1.0, 0.0, 0.5])
     assert measure_ground_m(sweep, mount) == pytest.approx(-1.23, abs=0.01)
+    # Points without a return that a driver puts far below are no road.
+    far = replace(sweep, xyz_m=np.vstack([sweep.xyz_m, [[10.0, 0.0, -1e9]] * 3]).astype(np.float32))
+    assert measure_ground_m(far, mount) == pytest.approx(-1.23, abs=0.01)
     few = sweep_from(LAYOUTS["packed"], STAMP_NS, PERIOD_NS, PLAIN, "cloud")
     with pytest.raises(RecordError, match="too few to find the road"):
         measure_ground_m(few, mount)

@@ -15,7 +15,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from log_encoders import waymo
 from log_encoders.world import labels_at, world_log
+from typer.testing import CliRunner
 
+from log2sim.cli import app
 from log2sim.config import Config
 from log2sim.datatypes import Log, Stream
 from log2sim.errors import ConfigError, LogError, RecordError
@@ -267,6 +269,13 @@ def test_a_truncated_file_keeps_all_whole_frames(path: Path, log: Log, tmp_path:
     np.testing.assert_array_equal(cut.streams["LIDAR_TOP"].t_ns, log.streams["LIDAR_TOP"].t_ns[:-1])
     assert any("record 9" in note and "truncated" in note for note in cut.notes)
     np.testing.assert_array_equal(cut.streams["LIDAR_TOP"].read(8).xyz_m, log.streams["LIDAR_TOP"].read(8).xyz_m)
+
+
+def test_validate_tells_what_was_kept_out(path: Path, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.tfrecord"
+    cut.write_bytes(path.read_bytes()[:-100])
+    told = CliRunner().invoke(app, ["validate", str(cut)]).output
+    assert re.search(r"note: .*cut\.tfrecord: record 9 at offset \d+ is truncated", told), told
 
 
 def test_a_damaged_frame_loses_its_own_records_only(path: Path, tmp_path: Path) -> None:

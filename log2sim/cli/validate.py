@@ -23,16 +23,21 @@ def validate(
 ) -> None:
     """Validate a file, or every record of a log.
 
-    Exits with 3 and lists the problems, if there are any. Gaps between records are no problem; they are noted.
+    Exits with 3 and lists the problems, if there are any. Gaps between records are no problem; they are
+    noted, and so is what a format lacks or its reader left out.
     """
     from log2sim.errors import LogError
     from log2sim.logs.opening import is_log_file, open_log
 
     if path.is_dir() or is_log_file(path):
+        from log2sim.logs.native.reader import READER
         from log2sim.logs.validation import list_gaps, validate_log
 
         opened = open_log(path, format=format, sequence=sequence)
         problems = validate_log(opened)
+        # Those of native logs are among the problems.
+        for note in () if opened.format == READER.name else opened.notes:
+            say(f"note: {note}")
         for gap in list_gaps(opened):
             say(f"note: {gap}")
         if problems:

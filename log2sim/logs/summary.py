@@ -81,8 +81,8 @@ def _ego(log: Log) -> dict[str, Any] | None:
     if log.ego is None:
         return None
     # Poses may be nanoseconds apart: path and speed are measured over steps of a tenth of a second.
-    first, last = int(log.ego.t_ns[0]), int(log.ego.t_ns[-1])
-    chosen = np.unique(np.searchsorted(log.ego.t_ns, np.append(np.arange(first, last, MIN_SPEED_STEP_NS), last)))
+    step = (log.ego.t_ns - log.ego.t_ns[0]) // MIN_SPEED_STEP_NS
+    chosen = np.union1d(np.unique(step, return_index=True)[1], len(step) - 1)
     position, t_ns = log.ego.map_T_ego[chosen, :3, 3], log.ego.t_ns[chosen]
     steps = np.linalg.norm(np.diff(position[:, :2], axis=0), axis=1)
     seconds = np.diff(t_ns) / NS_PER_S

@@ -13,13 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.errors import LogError, RecordError
-from log2sim.logs.ros.containers import MAX_MESSAGE_BYTES, Channel, Container, one_line, printable
+from log2sim.logs.ros.containers import Channel, Container, one_line, printable
 from log2sim.logs.ros.recordings import Recording, recorded_files
 from log2sim.logs.sweeps import PARSER_ERRORS
 
 ENCODINGS = ("ros1", "cdr")
 STAMP = slice(4, 12)
 """Bytes of header.stamp in a message: after the sequence number in ROS 1, after the encapsulation in CDR."""
+MAX_INDEX_BYTES = 16 * 1024 * 1024
+"""Of one transform, pose or calibration message; a longer one is damaged."""
+MAX_COLLECTED_BYTES = 1024 * 1024 * 1024
+"""Of all messages that are read at opening; an hour of /tf takes some ten megabytes."""
 NAME_BYTES = 272
 """Of a message that hold its stamp and its frame_id."""
 
@@ -102,12 +106,12 @@ class Bag:
         Parameters
         ----------
         wanted : mapping of str to int or None
-            Topics with the number of bytes; None for whole messages.
+            Topics with the number of bytes; None for whole messages of up to `MAX_INDEX_BYTES`.
 
         Returns
         -------
         dict of str to list of bytes or None
-            By topic, in the order of recording; None for a damaged message.
+            By topic, in the order of recording; None for a damaged message, and for those beyond `MAX_COLLECTED_BYTES`.
         """
         topics = [self.topics[name] for name in wanted]
         found: dict[str, list[bytes | None]] = {t.name: [None] * len(t) for t in topics}
@@ -116,10 +120,17 @@ class Bag:
         number = np.concatenate([np.full(len(t), k) for k, t in enumerate(topics)])
         row = np.concatenate([np.arange(len(t)) for t in topics])
         order = np.lexsort((np.concatenate([t.entry for t in topics]), np.concatenate([t.file for t in topics])))
-        limits = [MAX_MESSAGE_BYTES if wanted[t.name] is None else wanted[t.name] for t in topics]
+        limits = [MAX_INDEX_BYTES if wanted[t.name] is None else wanted[t.name] for t in topics]
+        size = 0
         for k, i in zip(number[order].tolist(), row[order].tolist()):
+            if size > MAX_COLLECTED_BYTES:
+                self.notes.append(
+                    f"transforms, poses and calibrations have more than {MAX_COLLECTED_BYTES} bytes; the rest is not read"
+                )
+                break
             with suppress(RecordError):
-                found[topics[k].name][i] = self.read(topics[k], i, limits[k])
+                data = found[topics[k].name][i] = self.read(topics[k], i, limits[k])
+                size += len(data)
         return found
 
     def frame_id(self, topic: Topic) -> str:
@@ -138,8 +149,9 @@ class Bag:
                 name = "/" + "/".join(part for part in channel.topic.split("/") if part)
                 parts.setdefault((name, channel.msgtype, channel.encoding), []).append((f, c))
         topics: dict[str, Topic] = {}
+        rows = [_rows_by_channel(file) for file in self.files]
         for (name, msgtype, encoding), places in sorted(parts.items()):
-            topic = self._topic((name, msgtype, encoding), places)
+            topic = self._topic((name, msgtype, encoding), places, rows)
             other = topics.get(name)
             if other is not None:
                 kept, left = (topic, other) if len(topic) > len(other) else (other, topic)
@@ -148,11 +160,13 @@ class Bag:
             topics[name] = topic
         return topics
 
-    def _topic(self, key: tuple[str, str, str], places: Sequence[tuple[int, int]]) -> Topic:
+    def _topic(
+        self, key: tuple[str, str, str], places: Sequence[tuple[int, int]], by_channel: list[list[NDArray[np.intp]]]
+    ) -> Topic:
         file, entry, recorded = [], [], []
         for f in dict.fromkeys(f for f, _ in places):
             entries = self.files[f].entries
-            rows = np.flatnonzero(np.isin(entries.channel, [c for g, c in places if g == f]))
+            rows = np.sort(np.concatenate([by_channel[f][c] for g, c in places if g == f]))
             file.append(np.full(len(rows), f))
             entry.append(rows)
             recorded.append(entries.t_ns[rows])
@@ -183,6 +197,13 @@ def open_container(path: Path, compression: str = "") -> Container:
     if head == sqlite.MAGIC:
         return sqlite.SqliteBag(path, compression)
     raise LogError(f"{path}: neither a ROS 1 bag nor MCAP nor an SQLite database by its first bytes")
+
+
+def _rows_by_channel(file: Container) -> list[NDArray[np.intp]]:
+    """Numbers of the messages of each channel of a file, in one pass: a file may have many channels."""
+    channel = file.entries.channel
+    order = np.argsort(channel, kind="stable")
+    return np.split(order, np.searchsorted(channel[order], np.arange(1, max(len(file.channels), 1))))
 
 
 def stamp_of(head: bytes, encoding: str) -> int:

@@ -21,7 +21,7 @@ CAMERA_R_EGO = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 # The road is looked for in the first sweep around the vehicle, well below the sensor: a car's LiDAR is at least so high.
 ROAD_RADIUS_M = (3.0, 20.0)
-MIN_SENSOR_HEIGHT_M = 0.5
+MIN_SENSOR_HEIGHT_M, MAX_SENSOR_HEIGHT_M = 0.5, 100.0
 ROAD_BIN_M = 0.05
 MIN_ROAD_POINTS = 200
 
@@ -129,7 +129,8 @@ def measure_ground_m(sweep: Sweep, ego_T_lidar: Array) -> float:
     points = apply(ego_T_lidar, sweep.xyz_m)
     radius = np.hypot(points[:, 0] - ego_T_lidar[0, 3], points[:, 1] - ego_T_lidar[1, 3])
     around = (radius > ROAD_RADIUS_M[0]) & (radius < ROAD_RADIUS_M[1])
-    z = points[around & (points[:, 2] < ego_T_lidar[2, 3] - MIN_SENSOR_HEIGHT_M), 2]
+    height = ego_T_lidar[2, 3] - points[:, 2]
+    z = points[around & (height > MIN_SENSOR_HEIGHT_M) & (height < MAX_SENSOR_HEIGHT_M), 2]
     if len(z) < MIN_ROAD_POINTS:
         raise RecordError(f"{len(z)} points around and below the sensor, too few to find the road")
     counts = np.bincount(np.floor((z - z.min()) / ROAD_BIN_M).astype(np.int64))

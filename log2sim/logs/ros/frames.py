@@ -18,6 +18,10 @@ from log2sim.logs.ros.settings import StaticTransform
 # Transforms that are sent again and again with the same values are static, as those of ROS 1 on /tf.
 SAME_TRANSFORM = 1e-9
 MAX_QUATERNION_ERROR = 0.05
+# Farther than any place on Earth is from the origin of a map.
+MAX_POSITION_M = 1e9
+# From a sensor to the root of the tree; usual are fewer than ten.
+MAX_DEPTH = 100
 # Position, and the quaternion scalar-first.
 Numbers = tuple[float, float, float, float, float, float, float]
 
@@ -146,6 +150,8 @@ class FrameTree:
             if frame in seen:
                 raise LogError(f"the frames of /tf form a cycle: {' -> '.join([*seen, frame])}")
             seen.append(frame)
+            if len(path) > MAX_DEPTH:
+                raise LogError(f"frame '{seen[0]}' has more than {MAX_DEPTH} frames above it in /tf")
         return path
 
     def _edge(self, child: str, parent: str) -> Edge:
@@ -178,6 +184,7 @@ def pose_of(translation: Any, rotation: Any) -> Array | None:
 
 
 def is_pose(translation: Any, rotation: Any) -> bool:
-    """Whether the values are finite and the quaternion has a norm near 1."""
+    """Whether the position is finite and not farther than 1e9 m along an axis, and the quaternion has a norm near 1."""
     norm = math.hypot(rotation.w, rotation.x, rotation.y, rotation.z)
-    return math.isfinite(translation.x + translation.y + translation.z) and abs(norm - 1) < MAX_QUATERNION_ERROR
+    near = all(abs(value) <= MAX_POSITION_M for value in (translation.x, translation.y, translation.z))
+    return near and abs(norm - 1) < MAX_QUATERNION_ERROR

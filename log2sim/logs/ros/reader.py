@@ -57,8 +57,8 @@ class _Opening:
     def __init__(self, name: str, bag: Bag, settings: TopicSettings, file: Path | None) -> None:
         self.name, self.bag, self.settings, self.file = name, bag, settings, file
         self.roles: Roles = assign_roles(bag, settings, file)
-        self.notes = [*bag.notes, *self.roles.notes]
         self.messages = bag.collect(self._wanted())
+        self.notes = [*bag.notes, *self.roles.notes]
         self.tree = FrameTree()
         for topic in self.roles.topics.get("tf", ()):
             self._add_transforms(bag.topics[topic])

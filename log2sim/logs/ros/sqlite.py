@@ -51,7 +51,7 @@ class SqliteBag:
         weakref.finalize(self, self._database.close)
         try:
             self._read_index(compression)
-        except (sqlite3.Error, UnicodeDecodeError, TypeError, KeyError) as problem:
+        except (sqlite3.Error, TypeError, ValueError, KeyError, OverflowError) as problem:
             raise LogError(f"{path}: not a readable rosbag2 database: {one_line(problem)}") from None
 
     def message(self, k: int, limit_bytes: int | None = None) -> bytes:
@@ -110,13 +110,21 @@ class SqliteBag:
 
     def _rows(self) -> Iterator[tuple[int, int, int]]:
         """Yield id, topic and recorder's stamp of the messages, up to where the database is damaged."""
-        count = 0
+        count = odd = 0
         try:
             # The data come last in a row, so their pages are not read.
             for row in self._database.execute("SELECT id, topic_id, timestamp FROM messages ORDER BY id"):
                 count += 1
                 if count > MAX_MESSAGES:
                     raise LogError(f"{self.path}: more than the {MAX_MESSAGES} messages that a file may have")
-                yield row
+                # SQLite stores values of any type in any column.
+                if type(row[1]) is int and type(row[2]) is int:
+                    yield row
+                else:
+                    odd += 1
         except sqlite3.Error as problem:
             self.notes.append(f"{self.path.name}: damaged after {count} messages: {one_line(problem)}")
+        if odd:
+            self.notes.append(
+                f"{self.path.name}: {odd} of {count} messages have no whole number as topic or stamp; left out"
+            )
