@@ -21,11 +21,11 @@ from log2sim.logs.waymo.segment import (
     CAMERAS,
     LASERS,
     MAX_BEAMS,
-    MAX_SIDE_PX,
     BoxTable,
     CameraCalibration,
     ImageTimes,
     LaserCalibration,
+    are_usable,
     rigid,
 )
 
@@ -89,8 +89,7 @@ def read_camera_calibration(path: Path) -> dict[int, CameraCalibration]:
         intrinsic = np.array([columns[name][row] for name in INTRINSICS], dtype=np.float64)
         pose = matrix(columns[extrinsic][row])
         width, height, direction = (int(columns[name][row]) for name in whole)
-        usable = np.isfinite(intrinsic).all() and min(intrinsic[:2]) > 0
-        if pose is None or not usable or not 0 < min(width, height) <= max(width, height) <= MAX_SIDE_PX:
+        if pose is None or not are_usable(intrinsic, width, height):
             raise LogError(
                 f"{path}, row {row}: expected finite intrinsics, a rigid extrinsic, width and height of camera {number}"
             )

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from log2sim.geometry import Array
-from log2sim.logs.waymo.segment import MAX_BEAMS, MAX_SIDE_PX, CameraCalibration, ImageTimes, LaserCalibration, rigid
+from log2sim.logs.waymo.segment import MAX_BEAMS, CameraCalibration, ImageTimes, LaserCalibration, are_usable, rigid
 from log2sim.logs.waymo.tfrecord import RecordWindow
 from log2sim.logs.waymo.wire import BYTES, VARINT, Field, WireError, doubles, doubles_by_number, fields, fields_of, text
 
@@ -148,8 +148,7 @@ def _camera(data: bytes) -> tuple[int, CameraCalibration]:
     extrinsic = _submessage(data, found, 3)
     pose = None if extrinsic is None else _transform(extrinsic)
     width, height = _whole(found, 4), _whole(found, 5)
-    usable = intrinsic.shape == (9,) and np.isfinite(intrinsic).all() and min(intrinsic[:2]) > 0
-    if pose is None or not usable or not 0 < min(width, height) <= max(width, height) <= MAX_SIDE_PX:
+    if pose is None or not are_usable(intrinsic, width, height):
         raise WireError(
             f"calibration of camera {number}: expected 9 finite intrinsics, a rigid extrinsic, width and height"
         )

@@ -25,7 +25,7 @@ TYPES = {1: "vehicle", 2: "pedestrian", 3: "sign", 4: "cyclist"}
 TOP = 1
 FRONT_CAMERA = 1
 
-# Larger ones are damaged.
+# Of calibrations; larger ones are damaged.
 MAX_SIDE_PX, MAX_BEAMS = 100_000, 4096
 ROTATION_TOLERANCE = 1e-3
 
@@ -243,6 +243,12 @@ class Segment:
     pixel_poses_are_missing: bool = False
     details: Mapping[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+
+
+def are_usable(intrinsic: Array, width_px: int, height_px: int) -> bool:
+    """Return whether these are the 9 intrinsics, finite and with focal lengths above 0, and the size of a camera."""
+    usable = intrinsic.shape == (9,) and bool(np.isfinite(intrinsic).all()) and min(intrinsic[:2]) > 0
+    return usable and 0 < min(width_px, height_px) <= max(width_px, height_px) <= MAX_SIDE_PX
 
 
 def rigid(numbers: Array) -> Array | None:
