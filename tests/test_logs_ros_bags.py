@@ -178,8 +178,8 @@ def test_a_chunk_that_unpacks_to_more_than_it_says_is_damaged(container: str, tm
     file = open_container(path)
     assert isinstance(file, ChunkedFile)
     file.message(0, 12)
-    assert file._begun is not None
-    assert len(file._begun.data) <= says + 1
+    assert file._partial is not None
+    assert len(file._partial.data) <= says + 1
     with pytest.raises(ValueError, match=f"unpacks to more than {says} bytes"):
         file.message(0)
 

@@ -213,7 +213,7 @@ def test_a_compressed_image_is_what_its_first_bytes_say() -> None:
     jpeg, png = (cv2.imencode(kind, RGB)[1].ravel() for kind in (".jpg", ".png"))
     for data in (jpeg, png):
         assert encoded_from(SimpleNamespace(format="anything", data=data), "image") == data.tobytes()
-    with pytest.raises(RecordError, match=r"neither a JPEG nor a PNG image .its format says 'h264'"):
+    with pytest.raises(RecordError, match=r"neither a JPEG nor a PNG image .its format states 'h264'"):
         encoded_from(SimpleNamespace(format="h264", data=np.arange(40, dtype=np.uint8)), "image")
 
 

@@ -36,14 +36,15 @@ def shift_poses(map_T_x: Array, offset_m: Array) -> Array:
 
 
 def nearest_rotation(matrix: Array) -> Array:
-    """Compute the rotation (3, 3) that is nearest to a matrix (3, 3) of positive determinant.
+    """Compute the rotation (3, 3) that is nearest to a matrix (3, 3), by the Frobenius norm.
 
     Notes
     -----
-    Orthogonal polar factor (Higham, "Computing the polar decomposition - with applications", SIAM J. Sci. Stat. Comput. 1986).
+    Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991, lemma.
     """
     u, _, vt = np.linalg.svd(matrix)
-    return np.asarray(u @ vt)
+    handedness = np.sign(np.linalg.det(u @ vt))
+    return np.asarray((u * [1.0, 1.0, handedness]) @ vt)
 
 
 def wrap_angle(angle_rad: ArrayLike) -> Array:

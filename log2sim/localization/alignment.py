@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from log2sim.geometry import Array, PoseTrack, rotation_from_rpy, transform
+from log2sim.geometry import Array, PoseTrack, nearest_rotation, rotation_from_rpy, transform
 
 # The ground is searched this near to the ego, and this far above and below where it is expected.
 GROUND_REACH_M, GROUND_MARGIN_M = 15.0, 0.6
 MIN_GROUND_POINTS = 200
 GROUND_ROUNDS, GROUND_TOLERANCE_M = 10, 0.05
-# No road is steeper against the car on it; a larger tilt is no ground.
+# Roads are not tilted more against the car on them.
 MAX_TILT_RAD = np.deg2rad(15.0)
 
 
@@ -27,8 +27,7 @@ def fit_to_given(estimated: PoseTrack, given: PoseTrack) -> Array | None:
     if not known.any():
         return None
     target, source = map_T_ego[known], estimated.map_T_ego[known]
-    u, _, vt = np.linalg.svd(np.einsum("nij,nkj->ik", target[:, :3, :3], source[:, :3, :3]))
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    rotation = nearest_rotation(np.einsum("nij,nkj->ik", target[:, :3, :3], source[:, :3, :3]))
     shift = target[:, :3, 3].mean(axis=0) - rotation @ source[:, :3, 3].mean(axis=0)
     return transform(rotation, shift)
 
@@ -46,11 +45,11 @@ def level_on_ground(xyz_m: Array, ground_z_m: float) -> Array | None:
     Returns
     -------
     level_T_ego : (4, 4) float64, or None
-        None where no ground is seen. The origin keeps its place above the ground, and the x axis its direction.
+        None where there are too few points on a ground. The origin keeps its place above the ground, and the x axis its direction.
 
     Notes
     -----
-    A slope that is the same all around is taken for level: a LiDAR alone does not know the vertical.
+    A slope that is the same all around is taken for level: a LiDAR alone does not measure the vertical.
     """
     away = np.hypot(xyz_m[:, 0], xyz_m[:, 1])
     points = xyz_m[(away < GROUND_REACH_M) & (np.abs(xyz_m[:, 2] - ground_z_m) < GROUND_MARGIN_M)]

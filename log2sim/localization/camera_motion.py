@@ -2,7 +2,7 @@
 
 Points are followed from image to image and give the rotation (essential matrix, Nister, PAMI 2004). The path in meters comes
 from the road before the camera, seen from above: where it lies in the image follows from the mount of the camera. From above
-the texture of the road moves as a rigid picture, whereas in the image it grows, which makes its points seem slower.
+the texture of the road moves as a rigid picture, whereas in the image it grows, which biases tracked points towards slower motion.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Log
 from log2sim.errors import LogError, RecordError
-from log2sim.geometry import NS_PER_S, Array, Camera, rotation_from_rpy, transform, undistort, yaw_of
+from log2sim.geometry import NS_PER_S, Array, Camera, nearest_rotation, rotation_from_rpy, transform, undistort, yaw_of
 from log2sim.localization.road_view import (
     GUESS_STEP_M,
     MIN_CORNER,
@@ -36,7 +36,6 @@ TOLERANCE_PX = 0.7
 STANDING_PX = 0.25
 ROTATION_ROUNDS, MIN_ROTATION_SHARE = 8, 0.5
 MAX_SPEED_MPS = 50.0
-MAX_PREDICTED_S = 1.0
 # Yaw rates of vehicles are below 1 rad/s; a steeper turn of two images is a wrong essential matrix.
 MAX_YAW_RATE_RADPS = 1.5
 
@@ -268,15 +267,14 @@ class _Follower:
 def _pure_rotation(from_xy: Array, to_xy: Array, tolerance: float) -> Array | None:
     """Fit `second_R_first` (3, 3) to normalized image points (N, 2) without translation; None where it does not explain most.
 
-    While the ego hardly moves the essential matrix is left to chance. By iteratively reweighted least squares.
+    The essential matrix of an ego that hardly moves is undetermined. By iteratively reweighted least squares.
     """
     first, second = (np.column_stack([xy, np.ones(len(xy))]) for xy in (from_xy, to_xy))
     first, second = (rays / np.linalg.norm(rays, axis=1)[:, None] for rays in (first, second))
     weight, off = np.ones(len(first)), np.zeros(len(first))
     rotation = np.eye(3)
     for _ in range(ROTATION_ROUNDS):
-        u, _, vt = np.linalg.svd((second * weight[:, None]).T @ first)
-        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        rotation = nearest_rotation((second * weight[:, None]).T @ first)
         off = np.linalg.norm(second - first @ rotation.T, axis=1)
         weight = 1 / (1 + (off / tolerance) ** 2) ** 2
     return rotation if np.mean(off < tolerance) > MIN_ROTATION_SHARE else None

@@ -155,13 +155,8 @@ def _by_lidar(request: _Request) -> tuple[Log, PoseChoice]:
         return log, PoseChoice(asked, "given", f"nothing to compare them with: {problem}")
     track, frame = _in_map(log, PoseTrack(found.t_ns, found.odom_T_ego, _max_gap_s(found.t_ns)), lidar)
     estimate = {**_figures(found), **_difference(track, log.ego), "frame": frame}
-    if may_keep and log.ego is not None:
-        verdict = compare_with_given(log, found, track)
-        choice = request.answer(
-            "given" if verdict.keep else "lidar", verdict.reason, excess_m=verdict.excess_m, scatter_m=verdict.scatter_m,
-            estimate=estimate, notes=_doubts(log, found),
-        )  # fmt: skip
-        return (log if verdict.keep else replace_poses(log, track)), choice
+    if may_keep:
+        return _better_of(request, found, track, estimate)
     unsure = unsure_share(found)
     if log.ego is None and unsure > MAX_UNSURE_SHARE_ALONE:
         raise LogError(
@@ -170,6 +165,19 @@ def _by_lidar(request: _Request) -> tuple[Log, PoseChoice]:
         )
     reason = "as asked" if asked == "lidar" else "the log has no poses"
     return replace_poses(log, track), request.answer("lidar", reason, estimate=estimate, notes=_doubts(log, found))
+
+
+def _better_of(
+    request: _Request, found: Odometry, track: PoseTrack, estimate: dict[str, Any]
+) -> tuple[Log, PoseChoice]:
+    """Keep the poses of the log unless those of odometry, `track`, are better."""
+    log = request.log
+    verdict = compare_with_given(log, found, track)
+    choice = request.answer(
+        "given" if verdict.keep else "lidar", verdict.reason, excess_m=verdict.excess_m, scatter_m=verdict.scatter_m,
+        estimate=estimate, notes=_doubts(log, found),
+    )  # fmt: skip
+    return (log if verdict.keep else replace_poses(log, track)), choice
 
 
 def _of_one_sweep(request: _Request, lidar: str, t_ns: NDArray[np.int64]) -> tuple[Log, PoseChoice]:
@@ -211,7 +219,7 @@ def _in_map(log: Log, estimated: PoseTrack, lidar: str | None = None) -> tuple[P
 
 
 def _level(log: Log, lidar: str, t_ns: int) -> Array | None:
-    """Return the pose (4, 4) of the ego that puts the ground of the sweep at a stamp level; None where none is seen."""
+    """Return the pose (4, 4) of the ego that puts the ground of the sweep at a stamp level; None without enough points on it."""
     sweep = read_ego_sweep(log, lidar, int(nearest_index(log.streams[lidar].t_ns, t_ns)[0]))
     return None if sweep is None else level_on_ground(sweep.xyz_m, log.ground_z_ego_m)
 
@@ -271,6 +279,6 @@ def _doubts(log: Log, found: Odometry) -> tuple[str, ...]:
     if found.predicted.any():
         notes.append(f"LiDAR odometry: {int(found.predicted.sum())} of {len(found.t_ns)} poses are predicted")
     if found.problems:
-        told = ", ".join(f"{reason} ({count})" for reason, count in found.problems.items())
-        notes.append(f"LiDAR odometry: sweeps that gave no pose: {told}")
+        reasons = ", ".join(f"{reason} ({count})" for reason, count in found.problems.items())
+        notes.append(f"LiDAR odometry: sweeps that gave no pose: {reasons}")
     return tuple(notes)

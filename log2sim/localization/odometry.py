@@ -1,4 +1,4 @@
-"""LiDAR odometry: poses of the ego from the sweeps of one LiDAR, registered one after the other with a map of what they saw."""
+"""LiDAR odometry: poses of the ego from the sweeps of one LiDAR, registered one after the other with a map of the earlier ones."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Odometry:
     weakest : (P, 3) float64
         Direction of the weakest constraint, odometry frame.
     degenerate : (P,) bool
-        Whether a direction of the motion is left to chance.
+        Whether the sweep does not constrain some direction of the motion.
     predicted : (P,) bool
         Whether the sweep did not fit to the others and the pose is predicted by constant velocity.
     sweeps : int
@@ -191,7 +191,7 @@ class _Run:
         self.map.insert(target, np.eye(4))
         for shift in shifts.tolist():
             fit = self.map.fit(source, transform(np.eye(3), np.array([shift, 0.0, 0.0])))
-            if best is None or _worth(fit) > _worth(best):
+            if best is None or _rate(fit) > _rate(best):
                 best = fit
         if best is None or best.overlap < MIN_OVERLAP:
             return None
@@ -256,13 +256,13 @@ class _Run:
         return self.map.fit(surfaces, fit.pose), surfaces
 
 
-def _worth(fit: Fit) -> float:
+def _rate(fit: Fit) -> float:
     """Rate a fit among those from several guesses: many points, near to their surfaces."""
     return fit.overlap / (1.0 + fit.residual)
 
 
 def _is_possible(expected: Array, found: Array, dt_s: float) -> bool:
-    """Tell whether a vehicle can make the motion found instead of the one expected."""
+    """Return whether a vehicle can make the motion found instead of the one expected."""
     off_m = float(np.linalg.norm(found[:3, 3] - expected[:3, 3]))
     return off_m <= MAX_JUMP_M + 0.5 * MAX_ACCELERATION_MPS2 * dt_s * max(dt_s, 0.1)
 

@@ -1,4 +1,4 @@
-"""Registration of a sweep with a map of Gaussians, and what it is worth.
+"""Registration of a sweep with a map of Gaussians, and how well it is constrained.
 
 Voxelized GICP (Koide et al., ICRA 2021) as the library small_gicp implements it.
 """
@@ -86,7 +86,7 @@ def is_installed() -> bool:
 
 
 class SurfaceMap:
-    """Surfaces that were seen so far, as one Gaussian in each voxel."""
+    """Surfaces of the sweeps so far, as one Gaussian in each voxel."""
 
     def __init__(self) -> None:
         self._library = load_small_gicp()
@@ -100,7 +100,7 @@ class SurfaceMap:
         return surfaces if surfaces.size() >= MIN_POINTS else None
 
     def insert(self, surfaces: Any, pose: Array) -> None:
-        """Add surfaces of the ego's frame at a pose (4, 4); those that were not seen for 100 sweeps are forgotten."""
+        """Add surfaces of the ego's frame at a pose (4, 4); those without points for 100 sweeps are removed."""
         self._voxels.insert(surfaces, pose)
 
     def fit(self, surfaces: Any, guess: Array) -> Fit:
@@ -119,7 +119,7 @@ class SurfaceMap:
         )
 
     def holds(self, surfaces: Any, fit: Fit) -> bool:
-        """Tell whether a fit holds every direction of motion, by fitting again from a start shifted along the weakest one."""
+        """Return whether a fit holds every direction of motion, by fitting again from a start shifted along the weakest one."""
         if not MIN_CONSTRAINT <= fit.constraint < DOUBTFUL_CONSTRAINT:
             return fit.constraint >= DOUBTFUL_CONSTRAINT
         shift = np.zeros((4, 4))

@@ -29,7 +29,7 @@ class Replacement:
     new: PoseTrack
 
     def new_T_old(self, t_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
-        """Compute where the map of the old poses lies in that of the new ones, seen by the ego at stamps (N,).
+        """Compute where the map of the old poses lies in that of the new ones, for what the ego measured at stamps (N,).
 
         Returns
         -------

@@ -17,10 +17,10 @@ MAX_RETURN_PX = 0.7
 # a height of 1.5 m, and the rectangle has so many of its own pixels a meter.
 MIN_ROAD_M, MAX_ROAD_M, ROAD_SIDE_M, ROAD_PX_PER_M = 3.0, 16.0, 6.0, 20.0
 ROAD_POINTS, ROAD_WINDOW_PX, ROAD_SPACING_PX = 400, 15, 4
-# Few levels, since what is not seen of the rectangle stands still in all of them; motions are found within half a meter of a
+# Few levels: parts of the rectangle outside the image are constant and bias the coarse ones to no motion; motions are found within half a meter of a
 # guess, and guesses are this far apart where the last motion does not help.
 ROAD_LEVELS, GUESS_STEP_M = 2, 0.8
-MIN_SEEN_SHARE = 0.2
+MIN_SHOWN_SHARE = 0.2
 
 
 class RoadView:
@@ -30,7 +30,7 @@ class RoadView:
     ----------
     map_uv : (H, W, 2) float32
         Pixels of the image to look at, for each pixel of the view.
-    seen : (H, W) uint8
+    shown : (H, W) uint8
         1 where the image shows the road, away from its border.
     """
 
@@ -48,7 +48,7 @@ class RoadView:
         uv = np.where(valid[:, None], (uv + 0.5) * scale - 0.5, -1.0).astype(np.float32)
         self.map_uv = uv.reshape(rows, columns, 2)
         margin = np.ones((ROAD_WINDOW_PX, ROAD_WINDOW_PX), dtype=np.uint8)
-        self.seen = _eroded(valid.reshape(rows, columns).astype(np.uint8), margin)
+        self.shown = _eroded(valid.reshape(rows, columns).astype(np.uint8), margin)
 
     def in_ego(self, px: Array) -> Array:
         """Convert pixels (N, 2), column and row, to positions (N, 2), m, ego frame."""
@@ -64,15 +64,15 @@ class RoadView:
         """Follow the texture of the road from one view to the next: positions (N, 2), m, in the ego's frame at both."""
         import cv2
 
-        if self.seen.mean() < MIN_SEEN_SHARE:
+        if self.shown.mean() < MIN_SHOWN_SHARE:
             return np.zeros((0, 2)), np.zeros((0, 2))
-        start = cv2.goodFeaturesToTrack(first, ROAD_POINTS, MIN_CORNER, ROAD_SPACING_PX, mask=self.seen)
+        start = cv2.goodFeaturesToTrack(first, ROAD_POINTS, MIN_CORNER, ROAD_SPACING_PX, mask=self.shown)
         rows, columns = -self.axes @ guess_m * ROAD_PX_PER_M
         begin, end = follow_points(
             first, second, start, FollowSettings(ROAD_WINDOW_PX, ROAD_LEVELS, (float(columns), float(rows)))
         )
-        inside = np.clip(np.round(end).astype(int), 0, np.array(self.seen.shape)[::-1] - 1)
-        good = self.seen[inside[:, 1], inside[:, 0]] > 0
+        inside = np.clip(np.round(end).astype(int), 0, np.array(self.shown.shape)[::-1] - 1)
+        good = self.shown[inside[:, 1], inside[:, 0]] > 0
         return self.in_ego(begin[good]), self.in_ego(end[good])
 
 
@@ -109,12 +109,12 @@ def follow_points(first: Any, second: Any, start: Any, settings: FollowSettings)
         return np.zeros((0, 2)), np.zeros((0, 2))
     shift, levels = np.array(settings.guess_px, dtype=np.float32), settings.levels
     window, flags = (settings.window_px, settings.window_px), cv2.OPTFLOW_USE_INITIAL_FLOW
-    ahead, seen, _ = cv2.calcOpticalFlowPyrLK(
+    ahead, found, _ = cv2.calcOpticalFlowPyrLK(
         first, second, start, start + shift, winSize=window, maxLevel=levels, flags=flags
     )
-    back, seen_back, _ = cv2.calcOpticalFlowPyrLK(
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(
         second, first, ahead, np.asarray(ahead) - shift, winSize=window, maxLevel=levels, flags=flags
     )
     returned = np.linalg.norm((np.asarray(back) - start)[:, 0], axis=1) < MAX_RETURN_PX
-    good = (np.asarray(seen)[:, 0] == 1) & (np.asarray(seen_back)[:, 0] == 1) & returned
+    good = (np.asarray(found)[:, 0] == 1) & (np.asarray(found_back)[:, 0] == 1) & returned
     return np.asarray(start[good, 0], dtype=np.float64), np.asarray(np.asarray(ahead)[good, 0], dtype=np.float64)

@@ -62,6 +62,8 @@ class Bag:
 
     Attributes
     ----------
+    place : Path
+        File or folder of the recording, for errors.
     topics : dict of str to Topic
         Sorted by name.
     notes : list of str
@@ -70,7 +72,7 @@ class Bag:
     """
 
     def __init__(self, recording: Recording) -> None:
-        self.notes: list[str] = []
+        self.place, self.notes = recording.place, list[str]()
         paths, compression = recorded_files(recording, self.notes)
         self.files: list[Container] = []
         for path in paths:
@@ -220,5 +222,5 @@ def frame_of(head: bytes, encoding: str) -> str:
 
 
 def _order(head: bytes, encoding: str) -> str:
-    """Byte order: little in ROS 1, told by the second byte in CDR."""
+    """Byte order: little-endian in ROS 1, in CDR by the second byte."""
     return "<" if encoding == "ros1" or head[1] & 1 else ">"

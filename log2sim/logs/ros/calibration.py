@@ -15,7 +15,7 @@ ROTATION_TOLERANCE = 1e-3
 
 
 class CalibrationProblem(ValueError):
-    """A CameraInfo that gives no camera; its text says why."""
+    """A CameraInfo that gives no camera; the text is the reason."""
 
 
 def camera_from_intrinsics(name: str, given: Intrinsics, mount: Mount, mount_T_cam: Array) -> Camera:

@@ -46,7 +46,7 @@ class ChunkedFile:
         self._cache: OrderedDict[int, bytes] = OrderedDict()
         self._intact: set[int] = set()
         self._damaged: dict[int, str] = {}
-        self._begun: _BegunChunk | None = None
+        self._partial: _PartialChunk | None = None
 
     def at(self, position: int, count: int) -> bytes:
         """Read `count` bytes; `ValueError` where the file ends before."""
@@ -83,21 +83,21 @@ class ChunkedFile:
     def _unpacked_up_to(self, number: int, end: int) -> bytearray:
         """First bytes of a compressed chunk, at least `end` of them; what is stored behind them is not read."""
         chunk = self.chunks[number]
-        begun = self._begun
-        if begun is None or begun.number != number:
-            begun = self._begun = _BegunChunk(number, decompressor_of(chunk.compression))
-        while len(begun.data) < end:
-            left = chunk.stored_bytes - begun.read_bytes
+        partial = self._partial
+        if partial is None or partial.number != number:
+            partial = self._partial = _PartialChunk(number, decompressor_of(chunk.compression))
+        while len(partial.data) < end:
+            left = chunk.stored_bytes - partial.read_bytes
             if number in self._damaged or not left:
-                raise ValueError(self._damaged.get(number, f"unpacks to {len(begun.data)} bytes only"))
-            part = self.at(chunk.position + begun.read_bytes, min(left, READ_BYTES))
-            begun.read_bytes += len(part)
+                raise ValueError(self._damaged.get(number, f"unpacks to {len(partial.data)} bytes only"))
+            part = self.at(chunk.position + partial.read_bytes, min(left, READ_BYTES))
+            partial.read_bytes += len(part)
             try:
-                # More than the chunk says that it holds is not unpacked.
-                begun.data += unpack_part(begun.decompressor, part, chunk.size_bytes + 1 - len(begun.data))
+                # No more is unpacked than the size that the chunk declares.
+                partial.data += unpack_part(partial.decompressor, part, chunk.size_bytes + 1 - len(partial.data))
             except ValueError as problem:
                 self._damaged[number] = str(problem)
-        return begun.data
+        return partial.data
 
     def unpacked(self, chunk: int) -> bytes:
         """Bytes of a chunk, decompressed and checked; a damaged one is not tried again."""
@@ -134,7 +134,7 @@ class ChunkedFile:
 
 
 @dataclass
-class _BegunChunk:
+class _PartialChunk:
     """A chunk that is unpacked from its beginning on: its number, and how much of it was read and unpacked."""
 
     number: int

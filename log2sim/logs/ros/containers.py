@@ -73,8 +73,8 @@ class Container(Protocol):
     def message(self, k: int, limit_bytes: int | None = None) -> bytes:
         """Read message `k`, or its first `limit_bytes`; raise one of `sweeps.PARSER_ERRORS` where it is damaged.
 
-        With a limit, messages are best asked for in their order: chunks are then unpacked as far as needed only, and their
-        checksums are not checked.
+        With a limit, chunks are unpacked only as far as needed, and their checksums are not checked; reading messages in
+        their order is then fastest.
         """
 
 

@@ -82,12 +82,12 @@ def choose_base(
     return None, "the sensors stand still"
 
 
-def ego_frame(base: str | None, settings: EgoSettings, tree: FrameTree, camera_frames: Collection[str]) -> EgoFrame:
-    """Place the ego in the vehicle's frame as the settings tell, or by what the frame's name says."""
+def place_ego(base: str | None, settings: EgoSettings, tree: FrameTree, camera_frames: Collection[str]) -> EgoFrame:
+    """Place the ego in the vehicle's frame by the settings, else by the name of the frame."""
     notes = []
     rotation = rotation_from_quaternion(settings.rotation_wxyz)
-    told = settings.model_fields_set
-    if base is not None and base in camera_frames and "rotation_wxyz" not in told:
+    given = settings.model_fields_set
+    if base is not None and base in camera_frames and "rotation_wxyz" not in given:
         rotation = CAMERA_R_EGO
     base_T_ego = transform(rotation, settings.origin_m)
     default = EgoVehicle()
@@ -97,22 +97,22 @@ def ego_frame(base: str | None, settings: EgoSettings, tree: FrameTree, camera_f
     )
     if base is None:
         return EgoFrame(None, np.eye(4), settings.ground_z_m or 0.0, vehicle, ())
-    if "origin_m" not in told:
+    if "origin_m" not in given:
         notes.append(f"the frame '{base}' is taken to be at the middle of the rear axle (ego.origin_m in the settings)")
     if settings.size_m is None:
         notes.append("the size of the ego is not known; that of a usual car is taken (ego.size_m)")
     ground_m = settings.ground_z_m
     if ground_m is None:
-        ground_m = _known_ground_m(base, base_T_ego, tree, told, notes)
+        ground_m = _known_ground_m(base, base_T_ego, tree, given, notes)
     return EgoFrame(base, base_T_ego, ground_m, vehicle, tuple(notes))
 
 
-def _known_ground_m(base: str, base_T_ego: Array, tree: FrameTree, told: set[str], notes: list[str]) -> float | None:
+def _known_ground_m(base: str, base_T_ego: Array, tree: FrameTree, given: set[str], notes: list[str]) -> float | None:
     footprint = tree.mount(base, GROUND_FRAME) if GROUND_FRAME in tree.frames and base != GROUND_FRAME else None
     if footprint is not None:
         return float((inverse(base_T_ego) @ footprint)[2, 3])
-    if base in BASE_FRAMES or "origin_m" in told:
-        where = "ego.origin_m" if "origin_m" in told else f"'{base}'"
+    if base in BASE_FRAMES or "origin_m" in given:
+        where = "ego.origin_m" if "origin_m" in given else f"'{base}'"
         notes.append(f"{where} is taken to be at the height of the road (ego.ground_z_m)")
         return 0.0
     return None

@@ -61,7 +61,7 @@ def image_from(message: Any, where: str, size_px: tuple[int, int]) -> NDArray[np
 
 
 def image_from_compressed(message: Any, where: str, size_px: tuple[int, int]) -> NDArray[np.uint8]:
-    """Decode a CompressedImage; its first bytes tell what it is, the text of its format does not."""
+    """Decode a CompressedImage; its first bytes decide what it is, as drivers write any text as its format."""
     return decode_image(encoded_from(message, where), where, size_px)
 
 
@@ -71,5 +71,5 @@ def encoded_from(message: Any, where: str) -> bytes:
     try:
         image_size(data, where)
     except RecordError as error:
-        raise RecordError(f"{error} (its format says '{printable(message.format)}')") from None
+        raise RecordError(f"{error} (its format states '{printable(message.format)}')") from None
     return data

@@ -8,7 +8,7 @@ goes before dead reckoning, and what was filtered goes before raw fixes.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import MapFrame
 from log2sim.errors import RecordError
-from log2sim.geometry import NS_PER_S, Array, PoseTrack, transform, whole_kilometers, wrap_angle, yaw_of
+from log2sim.geometry import NS_PER_S, Array, PoseTrack, shift_poses, transform, whole_kilometers, wrap_angle, yaw_of
 from log2sim.logs.ros.bag import Bag
 from log2sim.logs.ros.containers import printable
 from log2sim.logs.ros.frames import FrameTree, pose_of
@@ -28,14 +28,14 @@ MAP_FRAMES = ("map", "world", "earth", "utm")
 MIN_POSES = 2
 # A topic of single goals or starting points is no trajectory.
 MIN_COVERED_SHARE = 0.5
-# Where the vehicle moves, its course tells whether the heading of the IMU counts from the east.
+# The course of a moving vehicle shows whether the heading of the IMU counts from the east.
 MIN_COURSE_STEP_M = 1.0
 MAX_COURSE_ERROR_DEG = 30.0
 MAX_LATITUDE_DEG, MAX_LONGITUDE_DEG = 90.0, 360.0
 
 
 class NoPoses(ValueError):
-    """A source that gives no poses; its text says why."""
+    """A source that gives no poses; the text is the reason."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +94,7 @@ class PoseSources:
                 self._check_coverage(poses.t_ns)
                 found = _near_origin(poses)
                 reason = f"{len(poses.t_ns)} poses, the first source of the order that has some"
-                reason = reason if self.settings.source == "auto" else f"{len(poses.t_ns)} poses, as the settings tell"
+                reason = reason if self.settings.source == "auto" else f"{len(poses.t_ns)} poses, by the settings"
                 considered.append({"source": source, "topic": topic, "used": True, "reason": reason})
             except NoPoses as problem:
                 considered.append({"source": source, "topic": topic, "used": False, "reason": str(problem)})
@@ -222,7 +222,7 @@ class PoseSources:
         """Topic, stamps (N,) and rotations (N, 3, 3) of the vehicle's frame in east, north, up, by the best IMU."""
         topics = [self.settings.imu] if self.settings.imu else list(self.topics.get("imu", ()))
         parent = fix.rpartition("/")[0]
-        # The one beside the fixes comes first, then the one with the most messages.
+        # The one in the namespace of the fixes comes first, then the one with the most messages.
         reasons = []
         for name in sorted(topics, key=lambda n: (n.rpartition("/")[0] != parent, -len(self.bag.topics[n]))):
             messages, stamps = self._decoded(name)
@@ -259,12 +259,8 @@ def _near_origin(poses: FoundPoses) -> FoundPoses:
     offset = whole_kilometers(poses.map_T_base[:, :3, 3])
     if not offset.any():
         return poses
-    moved = poses.map_T_base.copy()
-    moved[:, :3, 3] -= offset
-    frame = poses.map
     x, y, z = offset.tolist()
-    placed = MapFrame(frame.latitude_deg, frame.longitude_deg, frame.altitude_m, frame.projection, (x, y, z))
-    return FoundPoses(poses.t_ns, moved, placed, poses.source, poses.topic, poses.notes)
+    return replace(poses, map_T_base=shift_poses(poses.map_T_base, offset), map=replace(poses.map, offset_m=(x, y, z)))
 
 
 def _roll_pitch_yaw(map_T_base: Array) -> Array:

@@ -69,21 +69,23 @@ class _Opening:
     def log(self) -> Log:
         sensors = list(self._sensors().values())
         if not sensors:
-            raise LogError(f"{self.name}: no images with CameraInfo and no point clouds in it; {self._list_topics()}")
+            raise LogError(
+                f"{self.bag.place}: no images with CameraInfo and no point clouds in it; {self._list_topics()}"
+            )
         base, why = ego.choose_base(
             self.tree, [s.frame for s in sensors], self._pose_frames(), FIXED_FRAMES, self.settings.ego.base_frame
         )
-        frame = ego.ego_frame(base, self.settings.ego, self.tree, {c.frame for c in self.roles.cameras.values()})
+        frame = ego.place_ego(base, self.settings.ego, self.tree, {c.frame for c in self.roles.cameras.values()})
         stamped = self._stamps()
         span_ns = min(int(s.t_ns[0]) for s in stamped.values()), max(int(s.t_ns[-1]) for s in stamped.values())
         found, considered = self._poses(base, span_ns)
-        mounts = self._mounts(frame, found)
+        mounts = self._mounts(frame)
         cameras = self._cameras(mounts)
         lidars = {n: Lidar(n, *mounts[n]) for n in self.roles.lidars if n in mounts}
         streams = {n: camera_stream(self.bag, self.roles.cameras[n], stamped[n], c) for n, c in cameras.items()}
         streams |= {n: lidar_stream(self.bag, n, self.roles.lidars[n], stamped[n]) for n in lidars}
         if not streams:
-            raise LogError(f"{self.name}: none of its sensors can be used: {'; '.join(self.notes)}")
+            raise LogError(f"{self.bag.place}: none of its sensors can be used: {'; '.join(self.notes)}")
         track = None if found is None else PoseTrack(found.t_ns, found.map_T_base @ frame.base_T_ego)
         self._note_poses(found, considered, base)
         ground_m = self._ground_m(frame, lidars, streams)
@@ -168,7 +170,7 @@ class _Opening:
             instead = f"; others: {', '.join(others)}" if others else ""
             self.notes.append(f"poses of '{base}' are from {found.source} {found.topic}{instead}")
         elif self.settings.poses.source == "none":
-            self.notes.append("poses of the recording are not used, as the settings tell")
+            self.notes.append('poses of the recording are not used: the settings state source = "none"')
         elif base is not None:
             reasons = "; ".join(f"{c['topic']}: {c['reason']}" for c in considered)
             self.notes.append(f"no poses of '{base}' in the recording{': ' * bool(reasons)}{reasons}")
@@ -189,7 +191,7 @@ class _Opening:
         note_other_clocks(delays, self.notes)
         return stamped
 
-    def _mounts(self, frame: ego.EgoFrame, found: FoundPoses | None) -> dict[str, tuple[Mount, Array]]:
+    def _mounts(self, frame: ego.EgoFrame) -> dict[str, tuple[Mount, Array]]:
         """Pose of each sensor that has one, on the ego or, without a vehicle, in the map."""
         mounts: dict[str, tuple[Mount, Array]] = {}
         for name, sensor in self._sensors().items():
@@ -266,9 +268,10 @@ class _Opening:
             except RecordError as problem:
                 self.notes.append(f"{name}: {problem}")
                 continue
+            side = "below" if ground_m <= 0 else "above"
             self.notes.append(
-                f"the road is at z = {ground_m:.2f} m of the ego in the frame '{frame.base}', measured in the first sweep of "
-                f"{name} (ego.ground_z_m)"
+                f"the road is {abs(ground_m):.2f} m {side} the origin of the ego in the frame '{frame.base}', measured in the "
+                f"first sweep of {name} (ego.ground_z_m)"
             )
             return ground_m
         self.notes.append(f"the height of the road in '{frame.base}' is not known; taken as 0 (ego.ground_z_m)")

@@ -88,8 +88,8 @@ def _bags(folder: Path) -> list[Path]:
 
 
 def _file_recording(path: Path, root: Path) -> Recording:
-    beside = path.with_name(f"{path.stem}.{SETTINGS}")
-    return Recording(path.stem, path, (path,), (beside, path.parent / SETTINGS, root / SETTINGS))
+    next_to = path.with_name(f"{path.stem}.{SETTINGS}")
+    return Recording(path.stem, path, (path,), (next_to, path.parent / SETTINGS, root / SETTINGS))
 
 
 def _folder_recording(folder: Path, root: Path) -> Recording:

@@ -1,4 +1,4 @@
-"""Which topic is which: by message types and names, or as the settings tell."""
+"""Which topic is which: by message types and names, or by the settings."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def _check_named(bag: Bag, settings: TopicSettings, file: Path | None) -> None:
 def _assign_cameras(bag: Bag, topics: list[Topic], settings: TopicSettings, roles: Roles) -> None:
     infos = roles.topics.get("camera info", [])
     for name in infos:
-        roles.reasons[name] = ("unused", "no images beside it")
+        roles.reasons[name] = ("unused", "no images belong to it")
     chosen = dict(settings.cameras)
     if not chosen:
         best = _one_per_camera(topics, roles)
@@ -143,9 +143,9 @@ def _assign_cameras(bag: Bag, topics: list[Topic], settings: TopicSettings, role
         roles.cameras[name] = camera.model_copy(
             update={"info": info, "rectified": rectified, "frame": camera.frame or bag.frame_id(topic)}
         )
-        told = "as the settings tell" if camera.topic in {c.topic for c in settings.cameras.values()} else "by its type"
+        origin = "by the settings" if camera.topic in {c.topic for c in settings.cameras.values()} else "by its type"
         calibration = f"calibrated by {info}" if info else "without CameraInfo"
-        roles.reasons[camera.topic] = (f"camera {name}", f"{told}, {calibration}")
+        roles.reasons[camera.topic] = (f"camera {name}", f"{origin}, {calibration}")
         if info:
             roles.reasons[info] = (f"calibration of {name}", "named so" if camera.info else "same namespace or frame")
 
@@ -161,8 +161,8 @@ def _assign_lidars(bag: Bag, topics: list[Topic], settings: TopicSettings, roles
     for name, lidar in chosen.items():
         frame = lidar.frame or bag.frame_id(bag.topics[lidar.topic])
         roles.lidars[name] = lidar.model_copy(update={"frame": frame})
-        told = "as the settings tell" if name in settings.lidars else "by its type"
-        roles.reasons[lidar.topic] = (f"lidar {name}", f"{told}, in the frame '{frame}'")
+        origin = "by the settings" if name in settings.lidars else "by its type"
+        roles.reasons[lidar.topic] = (f"lidar {name}", f"{origin}, in the frame '{frame}'")
 
 
 def _drop_unlisted(topics: Iterable[Topic], listed: set[str], kind: str, roles: Roles) -> None:
@@ -198,7 +198,7 @@ def _one_per_frame(bag: Bag, topics: list[Topic], roles: Roles) -> list[Topic]:
 
 
 def _not_derived(topics: list[Topic], words: re.Pattern[str], why: str, roles: Roles) -> list[Topic]:
-    """Leave out topics whose names tell that they are computed from others; none where all names do."""
+    """Leave out topics whose names show that they are computed from others; none where all names do."""
     kept = [topic for topic in topics if not words.search(topic.name.lower())]
     for topic in topics if kept else ():
         if topic not in kept:
@@ -223,7 +223,7 @@ def _image_rank(topic: Topic) -> tuple[Any, ...]:
 
 
 def _find_info(bag: Bag, topic: Topic, infos: list[str]) -> str:
-    """Find the CameraInfo of images: beside them, below them, or the only one of their frame."""
+    """Find the CameraInfo of images: next to them, below them, or the only one of their frame."""
     base = _image_base(topic.name)
     parent = base.rpartition("/")[0]
     for name in (f"{parent}/camera_info", f"{base}/camera_info", f"{base}_info", f"{parent}/info"):
@@ -240,7 +240,7 @@ def _image_base(name: str) -> str:
 
 
 def _short_names(topics: list[str]) -> list[str]:
-    """Names of sensors: as many of the last parts of their topics as tell them apart, without words such as "points"."""
+    """Names of sensors: as many of the last parts of their topics as distinguish them, without words such as "points"."""
     parts = []
     for topic in topics:
         words = [re.sub(r"[^A-Za-z0-9_-]", "_", word) for word in topic.split("/") if word]

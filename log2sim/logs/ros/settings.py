@@ -1,4 +1,4 @@
-"""What a recording does not say: a TOML file beside it (topics.toml) with topics, frames, poses and the ego."""
+"""Settings that a recording lacks: a TOML file next to it (topics.toml) with topics, frames, poses and the ego."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
 from log2sim.config import Section
 from log2sim.errors import ConfigError
+from log2sim.logs.quaternions import QUATERNION_TOLERANCE
 from log2sim.model_errors import first_problem
 
 MAX_SETTINGS_BYTES = 1024 * 1024
 MAX_OFFSET_S = 10.0
-QUATERNION_TOLERANCE = 1e-3
 DISTORTION_LENGTHS = {"none": (0,), "brown": (4, 5, 8), "fisheye": (4,)}
 NAME = r"^[A-Za-z0-9_-]+$"
 
@@ -53,7 +53,7 @@ class Intrinsics(Section):
         return self
 
 
-class ReadLines(Section):
+class LineReadout(Section):
     """Rolling shutter of a camera, as `log2sim.geometry.RollingShutter` has it."""
 
     direction: Literal["down", "up", "right", "left"]
@@ -63,7 +63,7 @@ class ReadLines(Section):
 class CameraTopic(Section):
     """A camera.
 
-    `rectified` tells whether the images are free of distortion, so that P of the CameraInfo is theirs; without it the name
+    `rectified` states whether the images are free of distortion, so that P of the CameraInfo is theirs; without it the name
     of the topic decides. `info` and `frame` default to what names and headers say. `offset_s` is added to the stamps, so that
     they are of the middle of the exposure and of the LiDAR's clock.
     """
@@ -74,7 +74,7 @@ class CameraTopic(Section):
     rectified: bool | None = None
     stamps: Literal["header", "recorded"] = "header"
     offset_s: float = Field(default=0.0, ge=-MAX_OFFSET_S, le=MAX_OFFSET_S)
-    rolling_shutter: ReadLines | None = None
+    rolling_shutter: LineReadout | None = None
     intrinsics: Intrinsics | None = None
 
 
@@ -82,7 +82,7 @@ class LidarTopic(Section):
     """A LiDAR.
 
     `time_field` is the field of the points' times ("none": there is none), `time_unit` its unit; both are recognized by
-    default. `stamp` tells whether the header's stamp is the start or the end of the sweep; by default times that are not
+    default. `stamp` states whether the header's stamp is the start or the end of the sweep; by default times that are not
     negative count from it, and negative ones before it. `compensated`: a node has moved all points to that stamp. `offset_s` is
     added to all stamps.
     """
