@@ -269,3 +269,11 @@ def test_rows_of_a_damaged_file_are_lost_one_by_one(tmp_path: Path) -> None:
         len(ParquetRows(path, {"y": "float"}))
     with pytest.raises(LogError, match="more than the 10 that"):
         len(ParquetRows(path, {"x": "float"}, limits=TableLimits(rows=10)))
+
+
+def test_a_text_that_is_too_long_for_a_name_is_refused(tmp_path: Path) -> None:
+    import pyarrow
+
+    path = write(tmp_path / "a.feather", pyarrow.table({"name": ["short", None, "x" * 5000]}))
+    with pytest.raises(LogError, match="column 'name': holds a text of 5000 characters, more than the 4096"):
+        read_columns(path, {"name": "text"})

@@ -257,6 +257,14 @@ def test_the_table_log_json_is_no_log_of_ours(root: Path) -> None:
     assert not native.matches(root / "v1.0-mini")
 
 
+def test_a_key_that_is_there_twice_counts_once(spoilable: Path) -> None:
+    path = spoilable / "v1.0-mini/sample_annotation.json"
+    sample = json.loads(path.read_text())[0]["sample_token"]
+    whole = len(open_log(spoilable).labels.t_ns)
+    path.write_text(path.read_text().replace("[", f'[{{"sample_token": "{sample}", "sample_token": []}}, ', 1))
+    assert len(open_log(spoilable).labels.t_ns) == whole
+
+
 def test_scenes_of_several_versions_are_told_apart(root: Path, spoilable: Path) -> None:
     assert open_log(root / "v1.0-mini").name == open_log(root).name == "nuscenes-world"
     other = spoilable / "v1.0-test"
@@ -326,6 +334,7 @@ def break_first(root: Path, table: str) -> None:
         ("sensor", lambda r, t: edit(r, t, list.clear), "sensor.json: no record with token '"),
         ("category", lambda r, t: edit(r, t, list.clear), "category.json: no record with token '"),
         ("sample", lambda r, t: edit(r, t, list.clear), "sample.json: no sample of scene 'world'"),
+        ("sample_annotation", spoil_first("instance_token", "x" * 2000), "expected a text in one line of at most 1024"),
         ("sample_data", spoil_first("timestamp", 1.5), "'timestamp' is 1.5, expected whole microseconds"),
         ("sample_data", spoil_first("timestamp", 10**18), "expected whole microseconds"),
         ("sample_data", spoil_first("filename", "../../etc/passwd"), "leaves the log folder"),

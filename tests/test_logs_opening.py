@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -132,3 +133,20 @@ def test_a_changed_log_leaves_what_is_deferred_unread() -> None:
         _ = changed.labels
     with pytest.raises(TypeError, match="no field nam"):
         log.changed(nam="b")
+
+
+def test_a_folder_of_several_formats_says_which_else_it_holds(tmp_path: Path) -> None:
+    log, _ = tiny_log()
+    write_log(log, tmp_path / "logs/a")
+    pandaset(tmp_path / "logs/007")
+    opened = open_log(tmp_path / "logs")
+    other = {"log2sim": "pandaset", "pandaset": "log2sim"}[opened.format]
+    assert f"holds logs of other formats, too: {other}; --format chooses one" in opened.notes[0]
+    assert open_log(tmp_path / "logs", format=other).format == other
+
+
+@pytest.mark.parametrize("part", ["lidar", "lidar/00.pkl.gz", "camera/front_camera/00.jpg"])
+def test_who_gives_a_part_of_a_log_is_told_its_folder(part: str, tmp_path: Path) -> None:
+    root = pandaset(tmp_path / "007")
+    with pytest.raises(LogError, match=re.escape(f"{root}, which it is in, holds logs of the format 'pandaset'")):
+        open_log(root / part)

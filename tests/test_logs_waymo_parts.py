@@ -38,7 +38,7 @@ from log2sim.logs.waymo.range_images import (
 )
 from log2sim.logs.waymo.segment import LaserCalibration, RangeImages
 from log2sim.logs.waymo.tfrecord import RecordFile, starts_like_tfrecord
-from log2sim.logs.waymo.wire import BYTES, WireError, doubles, doubles_by_number, fields_of, varints
+from log2sim.logs.waymo.wire import BYTES, WireError, doubles, doubles_by_number, fields_of, text, varints
 
 LASER = LaserCalibration(np.eye(4), np.array([-0.3, -0.1, 0.0, 0.05]), (0.0, 0.0))
 
@@ -337,3 +337,11 @@ def test_a_recorded_cloud_survives_a_range_image(recorded_cloud: np.ndarray) -> 
     off = np.linalg.norm(decoded - own[source], axis=1) / reach[source]
     assert len(decoded) > 50_000
     assert off.max() <= np.hypot(np.pi / columns, (high - low) / (rows - 1) / 2) * 1.001
+
+
+def test_a_long_name_is_refused_and_its_characters_are_printable() -> None:
+    data = message(4, b"x" * 1025)
+    with pytest.raises(WireError, match="a text of 1025 bytes, expected at most 1024"):
+        text(data, next(fields_of(data)))
+    data = message(4, b"a\x1b[31m\nb")
+    assert text(data, next(fields_of(data))) == "a?[31m?b"

@@ -12,6 +12,8 @@ from log2sim.logs.reader import Reader
 __all__ = ["Reader", "find_reader", "open_log"]
 
 MAX_LISTED = 20
+# From a picture to the folder of its log.
+MAX_LEVELS_ABOVE = 4
 
 
 def open_log(path: Path | str, *, format: str = "auto", sequence: str | None = None) -> Log:
@@ -40,7 +42,12 @@ def open_log(path: Path | str, *, format: str = "auto", sequence: str | None = N
     reader: Reader = registry.load("log", name)
     if not _may_read(reader, root):
         raise LogError(f"{root}: is a file, which format '{name}' cannot be; expected {reader.looks_for}")
-    return reader.open(root, _select_sequence(root, name, reader.sequences(root), sequence))
+    log = reader.open(root, _select_sequence(root, name, reader.sequences(root), sequence))
+    others = _other_formats(root, name) if format == "auto" else []
+    if not others:
+        return log
+    told = f"{root} holds logs of other formats, too: {', '.join(others)}; --format chooses one"
+    return log.changed(notes=lambda: (told, *log.notes))  # notes may wait for labels
 
 
 def find_reader(root: Path) -> str:
@@ -52,10 +59,26 @@ def find_reader(root: Path) -> str:
     if root.is_file():
         suffixes = ", ".join(f"*{suffix}" for reader in readers.values() for suffix in reader.suffixes)
         raise LogError(
-            f"{root}: is a file of no known log format; give the folder of a log{', or a file ' * bool(suffixes)}{suffixes}"
+            f"{root}: is a file of no known log format; give the folder of a log{', or a file ' * bool(suffixes)}{suffixes}{_log_above(root)}"
         )
     known = "; ".join(f"{name} ({reader.looks_for})" for name, reader in readers.items())
-    raise LogError(f"{root}: no known log format; a log is one of: {known}. Force one with --format")
+    raise LogError(f"{root}: no known log format{_log_above(root)}; a log is one of: {known}. Force one with --format")
+
+
+def _other_formats(root: Path, name: str) -> list[str]:
+    """Names of further formats of which a folder holds logs, as a folder of downloads may."""
+    if root.is_file():
+        return []
+    return [other for other in registry.names("log") if other != name and registry.load("log", other).matches(root)]
+
+
+def _log_above(path: Path) -> str:
+    """Say which folder above a path is a log, for who gave a part of one; "" when none is."""
+    for folder in list(path.absolute().parents)[:-1][:MAX_LEVELS_ABOVE]:
+        for name in registry.names("log"):
+            if registry.load("log", name).matches(folder):
+                return f"; {folder}, which it is in, holds logs of the format '{name}'"
+    return ""
 
 
 def is_log_file(path: Path) -> bool:

@@ -7,6 +7,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+# Names, ids and categories; arrays of text make room for the longest in every row.
+MAX_TEXT_CHARACTERS = 4096
+
 Kind = Literal["float", "int", "bool", "text", "bytes", "floats", "ints"]
 
 
@@ -65,7 +68,11 @@ def _text(column: Any) -> NDArray[Any]:
         return _objects([None if n is None else str(n) for n in column.to_pylist()])
     if not (types.is_string(column.type) or types.is_large_string(column.type)):
         raise ValueError(f"is {column.type}, expected text")
-    return _objects(column.to_pylist())
+    cells = column.to_pylist()
+    longest = max((len(cell) for cell in cells if cell is not None), default=0)
+    if longest > MAX_TEXT_CHARACTERS:
+        raise ValueError(f"holds a text of {longest} characters, more than the {MAX_TEXT_CHARACTERS} that one may have")
+    return _objects(cells)
 
 
 def _lists(column: Any, kind: Literal["float", "int"]) -> NDArray[Any]:

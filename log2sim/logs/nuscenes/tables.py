@@ -22,6 +22,8 @@ Record = dict[str, Any]
 CHUNK_BYTES = 4 * 1024 * 1024
 # Records of v1.0 have 200 to 700 bytes.
 MAX_RECORD_BYTES = 64 * 1024
+# Tokens have 32 characters, names of files some hundred; arrays of text make room for the longest in every row.
+MAX_TEXT_CHARACTERS = 1024
 # Braces inside of strings are tried as the start of a record before the one that is.
 MAX_BRACES = 64
 
@@ -96,7 +98,8 @@ def scan_records(path: Path, key: str, values: Collection[str], chunk_bytes: int
                 break
             if match[1] in plain or b"\\" in match[1]:
                 record = _record_around(data, match.start(), f"{path}, byte {offset + match.start()}")
-                if record.get(key) in wanted:
+                found_value = record.get(key)  # of a key that is there twice the last value counts
+                if isinstance(found_value, str) and found_value in wanted:
                     yield record
 
 
@@ -147,8 +150,11 @@ def _record_around(data: bytes, at: int, where: str) -> Record:
 def text_of(record: Record, key: str, path: Path) -> str:
     """Return a text of a record; `LogError` when it has none or one that cannot be printed in a line."""
     value = record.get(key)
-    if not isinstance(value, str) or not value.isprintable():
-        raise LogError(f"{_place(record, path)}: '{key}' is {_shown(value)}, expected a text in one line")
+    if not isinstance(value, str) or not value.isprintable() or len(value) > MAX_TEXT_CHARACTERS:
+        raise LogError(
+            f"{_place(record, path)}: '{key}' is {_shown(value)}, expected a text in one line of at most "
+            f"{MAX_TEXT_CHARACTERS} characters"
+        )
     return value
 
 

@@ -110,7 +110,8 @@ def segment_name(window: RecordWindow, span: Span) -> str:
     """Return the name of the segment from the span of a Context."""
     for f in fields(window, *span):
         if f.number == 1 and f.kind == BYTES:
-            return take_index(window, (f.begin, f.end)).decode("utf-8", errors="replace")
+            value = take_index(window, (f.begin, f.end))
+            return text(value, f._replace(begin=0, end=len(value)))
     return ""
 
 

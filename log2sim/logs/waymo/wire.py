@@ -19,6 +19,8 @@ MAX_VARINT_BYTES = 10
 # A frame with a map has some thousand fields.
 MAX_FIELDS = 200_000
 MAX_PLAIN_DOUBLES = 64
+# Of names and ids, which have some twenty; tables make room for the longest of a column in every row.
+MAX_TEXT_BYTES = 1024
 
 
 class WireError(ValueError):
@@ -155,8 +157,14 @@ def varints(data: bytes) -> list[int]:
 
 
 def text(data: bytes, field: Field) -> str:
-    """Return the value of a string field."""
-    return data[field.begin : field.end].decode("utf-8", errors="replace")
+    """Return the value of a string field as printable characters; `WireError` when it is too long for a name."""
+    if field.end - field.begin > MAX_TEXT_BYTES:
+        raise WireError(
+            f"field {field.number} is a text of {field.end - field.begin} bytes, expected at most {MAX_TEXT_BYTES}"
+        )
+    return "".join(
+        c if c.isprintable() else "?" for c in data[field.begin : field.end].decode("utf-8", errors="replace")
+    )
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:
