@@ -24,13 +24,14 @@ from typer.testing import CliRunner
 
 from log2sim import open_log
 from log2sim.cli import app
-from log2sim.datatypes import Log, Stream
+from log2sim.datatypes import Log, Stream, Sweep
 from log2sim.errors import ConfigError, LogError, MissingExtra, RecordError
 from log2sim.geometry import NS_PER_S, RollingShutter, transform
-from log2sim.logs.ros import bag
+from log2sim.logs.ros import bag, ego
 from log2sim.logs.ros import messages as ros_messages
 from log2sim.logs.ros.bag import open_container
 from log2sim.logs.ros.chunked import ChunkedFile, decompress
+from log2sim.logs.ros.ego import measure_ground_m
 from log2sim.logs.ros.messages import decode_bytes, definition_fields
 from log2sim.logs.ros.recordings import find_recordings
 from log2sim.logs.ros.stamping import note_other_clocks
@@ -392,15 +393,21 @@ def test_a_sensor_without_a_transform_is_left_out_and_says_how_to_give_it(tmp_pa
     np.testing.assert_allclose(again.lidars["top"].mount_T_lidar, world_log().lidars["top"].mount_T_lidar, atol=1e-12)
 
 
-def test_a_bag_of_one_lidar_alone_has_its_frame_and_the_road_below_it(tmp_path: Path) -> None:
+def test_a_bag_of_one_lidar_alone_has_its_frame_and_the_road_below_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measured: list[Sweep] = []
+    monkeypatch.setattr(ego, "measure_ground_m", lambda s, T: (measured.append(s), measure_ground_m(s, T))[1])
     path = bag_of(tmp_path, Style("bag"), lambda m: m if m[2] == "/top/points" else None)
     log = open_log(path)
+    assert not measured  # opening reads no sweep
     assert log.ego is None
     np.testing.assert_array_equal(log.lidars["top"].mount_T_lidar, np.eye(4))
     height = world_log().lidars["top"].mount_T_lidar[2, 3]
     assert log.ground_z_ego_m == pytest.approx(-height, abs=0.05)
     assert any(note.startswith("no poses of 'top' in the recording") for note in log.notes)
     assert any("measured in the first sweep" in note for note in log.notes)
+    assert len(measured) == 1
 
 
 def test_sensors_that_stand_still_are_mounted_in_the_map(tmp_path: Path) -> None:

@@ -183,7 +183,7 @@ class Log:
     ignored_regions : mapping of str to ImageRegions
         By camera: where `labels` are incomplete.
     ground_z_ego_m : float, m
-        Height of the road in the ego frame; 0 when the ego's origin lies on the ground.
+        Height of the road in the ego frame; 0 when the ego's origin lies on the ground. May be given as a function.
     reference_camera : str or None
         The camera whose stamps make the ticks.
     digest : str
@@ -205,7 +205,7 @@ class Log:
     labels: Deferred[Labels | None] = Deferred(None)
     image_labels: Mapping[str, ImageLabels] = field(default_factory=dict)
     ignored_regions: Mapping[str, ImageRegions] = field(default_factory=dict)
-    ground_z_ego_m: float = 0.0
+    ground_z_ego_m: Deferred[float] = Deferred(0.0)
     reference_camera: str | None = None
     digest: str = ""
     notes: Deferred[tuple[str, ...]] = Deferred(())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -88,8 +89,13 @@ class _Opening:
             raise LogError(f"{self.bag.place}: none of its sensors can be used: {'; '.join(self.notes)}")
         track = None if found is None else PoseTrack(found.t_ns, found.map_T_base @ frame.base_T_ego)
         self._note_poses(found, considered, base)
-        ground_m = self._ground_m(frame, lidars, streams)
         self.notes += frame.notes
+
+        @cache
+        def measured() -> tuple[float, tuple[str, ...]]:
+            return _measure_road(frame, lidars, streams)
+
+        known_m = frame.ground_z_m
         return Log(
             name=self.name,
             format=READER.name,
@@ -99,10 +105,10 @@ class _Opening:
             ego=track,
             ego_vehicle=frame.vehicle,
             map=MapFrame() if found is None else found.map,
-            ground_z_ego_m=ground_m,
+            ground_z_ego_m=(lambda: measured()[0]) if known_m is None else known_m,
             reference_camera=self._reference_camera(cameras, streams),
             digest=self.bag.digest,
-            notes=tuple(self.notes),
+            notes=(lambda: (*self.notes, *measured()[1])) if known_m is None else tuple(self.notes),
             details=self._details(base, why, considered),
         )
 
@@ -259,24 +265,6 @@ class _Opening:
             raise calibration.CalibrationProblem(f"no message of {chosen.info} can be read")
         return info
 
-    def _ground_m(self, frame: ego.EgoFrame, lidars: dict[str, Lidar], streams: dict[str, Stream]) -> float:
-        if frame.ground_z_m is not None:
-            return frame.ground_z_m
-        for name, lidar in lidars.items():
-            try:
-                ground_m = ego.measure_ground_m(streams[name].read(0), lidar.mount_T_lidar)
-            except RecordError as problem:
-                self.notes.append(f"{name}: {problem}")
-                continue
-            side = "below" if ground_m <= 0 else "above"
-            self.notes.append(
-                f"the road is {abs(ground_m):.2f} m {side} the origin of the ego in the frame '{frame.base}', measured in the "
-                f"first sweep of {name} (ego.ground_z_m)"
-            )
-            return ground_m
-        self.notes.append(f"the height of the road in '{frame.base}' is not known; taken as 0 (ego.ground_z_m)")
-        return 0.0
-
     def _reference_camera(self, cameras: dict[str, Camera], streams: dict[str, Stream]) -> str | None:
         wanted = self.settings.reference_camera
         if wanted is None:
@@ -291,3 +279,24 @@ class _Opening:
         topics = [f"{t.name} ({t.msgtype}, {len(t)})" for t in self.bag.topics.values()]
         more = f" and {len(topics) - MAX_LISTED} more" if len(topics) > MAX_LISTED else ""
         return f"its topics are {', '.join(topics[:MAX_LISTED])}{more}" if topics else "it has no topics"
+
+
+def _measure_road(
+    frame: ego.EgoFrame, lidars: dict[str, Lidar], streams: dict[str, Stream]
+) -> tuple[float, tuple[str, ...]]:
+    """Measure the height of the road in the ego frame in a sweep, with remarks; 0 where no LiDAR shows it."""
+    notes = []
+    for name, lidar in lidars.items():
+        try:
+            ground_m = ego.measure_ground_m(streams[name].read(0), lidar.mount_T_lidar)
+        except RecordError as problem:
+            notes.append(f"{name}: {problem}")
+            continue
+        side = "below" if ground_m <= 0 else "above"
+        notes.append(
+            f"the road is {abs(ground_m):.2f} m {side} the origin of the ego in the frame '{frame.base}', measured in the "
+            f"first sweep of {name} (ego.ground_z_m)"
+        )
+        return ground_m, tuple(notes)
+    notes.append(f"the height of the road in '{frame.base}' is not known; taken as 0 (ego.ground_z_m)")
+    return 0.0, tuple(notes)
