@@ -271,6 +271,7 @@ def drop(name: str) -> Callable[[dict[str, Any]], None]:
     [
         (POSES, set_cell("qw", 3, 9.0), "row 3: quaternion"),
         (POSES, set_cell("tx_m", 2, float("nan")), "row 2: quaternion"),
+        (POSES, set_cell("tx_m", 2, 1e300), "row 2: quaternion"),
         (POSES, drop("tz_m"), "no column 'tz_m'"),
         (POSES, set_cell("timestamp_ns", 0, None), "column 'timestamp_ns': is int64 with 1 missing values"),
         (POSES, lambda c: c.update({k: [] for k in c}), "expected"),

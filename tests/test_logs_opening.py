@@ -150,3 +150,14 @@ def test_who_gives_a_part_of_a_log_is_told_its_folder(part: str, tmp_path: Path)
     root = pandaset(tmp_path / "007")
     with pytest.raises(LogError, match=re.escape(f"{root}, which it is in, holds logs of the format 'pandaset'")):
         open_log(root / part)
+
+
+@pytest.mark.parametrize(("file", "value"), [("timestamps", 1e300), ("poses", {"x": 1e300, "y": 0.0, "z": 0.0})])
+def test_numbers_that_no_place_or_time_has_are_refused(file: str, value: Any, tmp_path: Path) -> None:
+    root = pandaset(tmp_path / "007")
+    path = root / f"lidar/{file}.json"
+    rows = json.loads(path.read_text())
+    rows[1] = value if file == "timestamps" else rows[1] | {"position": value}
+    path.write_text(json.dumps(rows))
+    with pytest.raises(LogError, match="record 1: position .* expected finite numbers up to"):
+        open_log(root)

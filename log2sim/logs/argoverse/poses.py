@@ -20,6 +20,8 @@ QUATERNION = ("qw", "qx", "qy", "qz")
 TRANSLATION = ("tx_m", "ty_m", "tz_m")
 TRANSFORM: Mapping[str, Kind] = dict.fromkeys((*QUATERNION, *TRANSLATION), "float")
 OFFSET_STEP_M = 1000.0
+# Farther than any place on Earth is from the origin of a map.
+MAX_POSITION_M = 1e9
 
 
 def read_ego_track(path: Path, notes: list[str]) -> tuple[PoseTrack, tuple[float, float, float]]:
@@ -56,15 +58,15 @@ def transforms_of(columns: Mapping[str, NDArray[Any]], path: Path) -> Array:
     Raises
     ------
     LogError
-        When one is not finite or its quaternion no unit quaternion; names file and row.
+        When one is not finite or absurdly far away, or its quaternion no unit quaternion; names file and row.
     """
     q = np.stack([columns[k].astype(np.float64) for k in QUATERNION], axis=1)
     position = np.stack([columns[k].astype(np.float64) for k in TRANSLATION], axis=1)
-    bad = np.union1d(find_not_unit(q), np.flatnonzero(~np.isfinite(position).all(axis=1)))
+    bad = np.union1d(find_not_unit(q), np.flatnonzero(~(np.abs(position) <= MAX_POSITION_M).all(axis=1)))
     if len(bad):
         k = int(bad[0])
         raise LogError(
             f"{path}, row {k}: quaternion {q[k].tolist()}, translation {position[k].tolist()}, expected finite numbers "
-            "and a unit quaternion"
+            f"up to {MAX_POSITION_M:g} and a unit quaternion"
         )
     return transform(rotation_from_quaternion(q), position)

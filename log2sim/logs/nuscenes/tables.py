@@ -24,6 +24,8 @@ CHUNK_BYTES = 4 * 1024 * 1024
 MAX_RECORD_BYTES = 64 * 1024
 # Tokens have 32 characters, names of files some hundred; arrays of text make room for the longest in every row.
 MAX_TEXT_CHARACTERS = 1024
+# Meters, pixels and parts of quaternions are all smaller; squares of much larger numbers are not finite.
+MAX_NUMBER = 1e9
 # Braces inside of strings are tried as the start of a record before the one that is.
 MAX_BRACES = 64
 
@@ -175,9 +177,11 @@ def numbers_of(records: list[Record], key: str, shape: tuple[int, ...], path: Pa
             row = np.asarray(value, dtype=np.float64)
         except (TypeError, ValueError, OverflowError):
             row = np.zeros(0)
-        if row.shape != shape or not np.isfinite(row).all():
+        if row.shape != shape or not (np.abs(row) <= MAX_NUMBER).all():
             expected = " x ".join(str(n) for n in shape)
-            raise LogError(f"{_place(record, path)}: '{key}' is {_shown(value)}, expected {expected} finite numbers")
+            raise LogError(
+                f"{_place(record, path)}: '{key}' is {_shown(value)}, expected {expected} finite numbers up to {MAX_NUMBER:g}"
+            )
         rows[k] = row
     return rows
 

@@ -36,7 +36,7 @@ from log2sim.logs.pandaset.labels import read_labels
 from log2sim.logs.pandaset.sweeps import LIDARS, SweepFiles
 from log2sim.logs.quaternions import find_not_unit
 from log2sim.logs.record_files import list_folders, list_numbered_files
-from log2sim.logs.stamps import strictly_increasing
+from log2sim.logs.stamps import MAX_TIME_S, strictly_increasing
 
 TABLE = ".pkl.gz"
 ROAD_BELOW_POSE_M = 0.325
@@ -50,6 +50,8 @@ EGO_VEHICLE = EgoVehicle(size_m=(5.18, 2.02, 1.78), rear_axle_offset_m=1.45)
 
 # Camera poses that scatter more about the mount do not fit the ego poses.
 MAX_MOUNT_SPREAD_M = 0.05
+# Farther than any place on Earth is from the origin of a map.
+MAX_POSITION_M = 1e9
 MIN_GNSS_TRACK_M = 20.0
 MAX_GNSS_ANGLE_RAD = np.radians(1.0)
 
@@ -214,9 +216,12 @@ def _poses(folder: Path) -> tuple[NDArray[np.int64], Array]:
         raise LogError(
             f"{folder}/poses.json: expected records of position x, y, z and heading w, x, y, z: {problem}"
         ) from None
-    not_finite = np.flatnonzero(~np.isfinite(position).all(axis=1) | ~np.isfinite(t_s))
-    if len(not_finite):
-        raise LogError(f"{folder}: record {not_finite[0]}: its position or stamp is not finite, expected numbers")
+    wrong = np.flatnonzero(~(np.abs(position) <= MAX_POSITION_M).all(axis=1) | ~(np.abs(t_s) < MAX_TIME_S))
+    if len(wrong):
+        raise LogError(
+            f"{folder}: record {wrong[0]}: position {position[wrong[0]].tolist()}, stamp {t_s[wrong[0]]}, expected finite "
+            f"numbers up to {MAX_POSITION_M:g} m and {MAX_TIME_S} s"
+        )
     bad = find_not_unit(q)
     if len(bad):
         raise LogError(
