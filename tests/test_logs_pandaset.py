@@ -131,13 +131,13 @@ def test_the_map_is_tied_to_earth_only_where_gnss_shows_its_north() -> None:
     from pyproj import Proj
 
     geodetic, xyz = track(0.0, 80.0)
-    frame, reason = georeference(geodetic, xyz)
+    frame, reason = georeference(geodetic, xyz, "gps")
     assert reason == ""
     x, y = Proj(frame.projection)(geodetic[:, 1], geodetic[:, 0])
     np.testing.assert_allclose(np.stack([x, y], 1), xyz[:, :2], atol=0.01)
     assert frame.altitude_m == pytest.approx(4.0, abs=1e-3)
     for turn, length, words in ((0.1, 80.0, "differ by"), (0.0, 5.0, "moves less than")):
-        frame, reason = georeference(*track(turn, length))
+        frame, reason = georeference(*track(turn, length), "gps")
         assert words in reason
         assert frame.projection is None
 

@@ -297,7 +297,7 @@ def tf(parent: str, child: str, xyz: Any, t_s: float = 0.0, q: Any = (1.0, 0.0, 
 
 def test_frames_are_connected_over_their_common_ancestor() -> None:
     half = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
-    tree = FrameTree()
+    tree = FrameTree("recording")
     tree.add(
         [
             tf("base_link", "rack", (1, 0, 2), q=half),
@@ -312,7 +312,7 @@ def test_frames_are_connected_over_their_common_ancestor() -> None:
 
 
 def test_a_frame_that_moves_has_no_mount_but_a_track() -> None:
-    tree = FrameTree()
+    tree = FrameTree("recording")
     tree.add(tf("odom", "base_link", (k, 0, 0), k / 10) for k in range(11))
     tree.add(
         [tf("map", "odom", (0, 5, 0), 0.2), tf("map", "odom", (0, 7, 0), 0.4), tf("base_link", "lidar", (0, 0, 2))]
@@ -329,9 +329,9 @@ def test_a_frame_that_moves_has_no_mount_but_a_track() -> None:
 
 
 def test_a_tree_that_is_none_is_refused_by_the_names_of_its_frames() -> None:
-    tree = FrameTree()
+    tree = FrameTree("recording")
     tree.add([tf("a", "c", (0, 0, 0)), tf("b", "c", (0, 0, 0)), tf("x", "y", (0, 0, 0)), tf("y", "x", (0, 0, 0))])
-    with pytest.raises(LogError, match="frame 'c' has two parents in /tf, 'a' and 'b'"):
+    with pytest.raises(LogError, match="recording: frame 'c' has two parents in /tf, 'a' and 'b'"):
         tree.mount("a", "c")
     with pytest.raises(LogError, match="cycle: x -> y -> x"):
         tree.mount("a", "x")

@@ -9,7 +9,17 @@ from __future__ import annotations
 
 from log2sim.geometry.box_projection import ProjectedBoxes, box_lines, outline, project_boxes
 from log2sim.geometry.boxes import box_corners, box_corners_bev, box_iou, points_in_box
-from log2sim.geometry.camera import MIN_DEPTH_M, Camera, Mount, RollingShutter, distort, fold_radius, project, undistort
+from log2sim.geometry.camera import (
+    DISTORTION_LENGTHS,
+    MIN_DEPTH_M,
+    Camera,
+    Mount,
+    RollingShutter,
+    distort,
+    fold_radius,
+    project,
+    undistort,
+)
 from log2sim.geometry.homography import apply_homography, ground_homography, homography_jacobian
 from log2sim.geometry.overlap import (
     bev_iou,
@@ -41,6 +51,7 @@ from log2sim.geometry.transforms import (
 )
 
 __all__ = [
+    "DISTORTION_LENGTHS",
     "MIN_DEPTH_M",
     "NS_PER_S",
     "Array",

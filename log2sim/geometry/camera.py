@@ -5,6 +5,7 @@ The lens models are those of OpenCV: "brown" is Brown-Conrady with k1, k2, p1, p
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
@@ -17,6 +18,9 @@ from log2sim.geometry.transforms import Array
 
 MIN_DEPTH_M = 0.1
 """Points nearer to the image plane, or behind it, are not projected."""
+
+DISTORTION_LENGTHS: Mapping[str, tuple[int, ...]] = {"none": (0,), "brown": (4, 5, 8), "fisheye": (4,)}
+"""How many values the distortion of a lens model may have."""
 
 # Undistortion: entries of the table of initial values, iterations of Newton's method.
 _TABLE_SIZE = 1024

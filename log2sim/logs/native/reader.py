@@ -14,7 +14,16 @@ from numpy.typing import NDArray
 from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, Sweep
 from log2sim.documents import check, inside, read_json
 from log2sim.errors import LogError
-from log2sim.geometry import Array, Camera, PoseTrack, RollingShutter, rotation_from_quaternion, shift_poses, transform
+from log2sim.geometry import (
+    DISTORTION_LENGTHS,
+    Array,
+    Camera,
+    PoseTrack,
+    RollingShutter,
+    rotation_from_quaternion,
+    shift_poses,
+    transform,
+)
 from log2sim.logs.images import image_stream
 from log2sim.logs.native.csv_tables import CsvTable, read_csv_table
 from log2sim.logs.native.labels import (
@@ -39,8 +48,6 @@ COMPENSATED = {"compensated_ns": "int"}
 POSE_COLUMNS = {"t_ns": "int", **dict.fromkeys(("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"), "float")}
 GNSS_FIELDS = ("latitude_deg", "longitude_deg", "altitude_m", "roll_rad", "pitch_rad", "yaw_rad")
 GNSS_COLUMNS = {"t_ns": "int", **dict.fromkeys(GNSS_FIELDS, "float")}
-
-DISTORTION_LENGTHS: Mapping[str, tuple[int, ...]] = {"none": (0,), "brown": (4, 5, 8), "fisheye": (4,)}
 
 
 class NativeReader:

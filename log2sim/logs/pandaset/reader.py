@@ -172,14 +172,14 @@ class _Sequence:
         if not len(geodetic) or not np.isfinite(geodetic).all() or np.abs(geodetic[:, 0]).max() >= 90:
             notes.append("meta/gps.json holds no usable fixes: the position of the map is unknown")
             return MapFrame()
-        frame, reason = georeference(geodetic, map_T_pose[: len(geodetic), :3, 3])
+        frame, reason = georeference(geodetic, map_T_pose[: len(geodetic), :3, 3], str(path))
         if reason:
             notes.append(f"{reason}: the map is only local and its north is not known")
         return frame
 
 
-def georeference(geodetic: Array, xyz_map: Array) -> tuple[MapFrame, str]:
-    """Map frame of GNSS fixes (N, 3) in deg and m at positions (N, 3) in the map, and why it has no projection if so.
+def georeference(geodetic: Array, xyz_map: Array, where: str) -> tuple[MapFrame, str]:
+    """Map frame of GNSS fixes (N, 3) in deg and m at positions (N, 3) in the map, and why it has no projection if so; `where` names the fixes in errors.
 
     The map's axes count as east and north only if the track reaches 20 m and the best rotation is below 1 degree.
     """
@@ -191,7 +191,7 @@ def georeference(geodetic: Array, xyz_map: Array) -> tuple[MapFrame, str]:
     if np.linalg.norm(np.ptp(xyz_map[:, :2], axis=0)) < MIN_GNSS_TRACK_M:
         return local, f"the ego moves less than {MIN_GNSS_TRACK_M:g} m"
     first = MapFrame(latitude, longitude, altitude, transverse_mercator(latitude, longitude))
-    east_north = poses_from_geodetic(first, geodetic[:n], np.zeros((n, 3)), where="meta/gps.json")[:, :2, 3]
+    east_north = poses_from_geodetic(first, geodetic[:n], np.zeros((n, 3)), where=where)[:, :2, 3]
     a, b = xyz_map[:n, :2] - xyz_map[:n, :2].mean(0), east_north - east_north.mean(0)
     turn = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
     if abs(turn) > MAX_GNSS_ANGLE_RAD:
@@ -199,7 +199,7 @@ def georeference(geodetic: Array, xyz_map: Array) -> tuple[MapFrame, str]:
     shift = np.append(
         east_north.mean(0) - xyz_map[:n, :2].mean(0), np.mean(geodetic[:n, 2] - altitude - xyz_map[:n, 2])
     )
-    origin = [float(v[0]) for v in geodetic_from_map(first, shift[None], "meta/gps.json")]
+    origin = [float(v[0]) for v in geodetic_from_map(first, shift[None], where)]
     return MapFrame(origin[0], origin[1], origin[2], transverse_mercator(origin[0], origin[1])), ""
 
 

@@ -41,9 +41,16 @@ class Edge:
 
 
 class FrameTree:
-    """Frames by name; each has at most one parent, which is checked where a frame is used."""
+    """Frames by name; each has at most one parent, which is checked where a frame is used.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    where : str
+        Names the recording in errors.
+    """
+
+    def __init__(self, where: str) -> None:
+        self._where = where
         self._rows: dict[str, dict[str, list[tuple[int, Numbers]]]] = {}
         self._edges: dict[str, dict[str, Edge]] = {}
         self.refused = 0
@@ -138,20 +145,22 @@ class FrameTree:
 
     def _path_up(self, frame: str) -> list[tuple[str, Edge]]:
         path: list[tuple[str, Edge]] = []
-        seen = [frame]
+        passed = [frame]
         while frame in self._rows:
             parents = self._rows[frame]
             if len(parents) > 1:
                 names = "' and '".join(sorted(parents)[:2])
-                raise LogError(f"frame '{frame}' has two parents in /tf, '{names}'; a frame may have one")
+                raise LogError(
+                    f"{self._where}: frame '{frame}' has two parents in /tf, '{names}'; a frame may have one"
+                )
             edge = self._edge(frame, next(iter(parents)))
             path.append((frame, edge))
             frame = edge.parent
-            if frame in seen:
-                raise LogError(f"the frames of /tf form a cycle: {' -> '.join([*seen, frame])}")
-            seen.append(frame)
+            if frame in passed:
+                raise LogError(f"{self._where}: the frames of /tf form a cycle: {' -> '.join([*passed, frame])}")
+            passed.append(frame)
             if len(path) > MAX_DEPTH:
-                raise LogError(f"frame '{seen[0]}' has more than {MAX_DEPTH} frames above it in /tf")
+                raise LogError(f"{self._where}: frame '{passed[0]}' has more than {MAX_DEPTH} frames above it in /tf")
         return path
 
     def _edge(self, child: str, parent: str) -> Edge:

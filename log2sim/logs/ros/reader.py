@@ -60,7 +60,7 @@ class _Opening:
         self.roles: Roles = assign_roles(bag, settings, file)
         self.messages = bag.collect(self._wanted())
         self.notes = [*bag.notes, *self.roles.notes]
-        self.tree = FrameTree()
+        self.tree = FrameTree(str(bag.place))
         for topic in self.roles.topics.get("tf", ()):
             self._add_transforms(bag.topics[topic])
         if self.tree.refused:

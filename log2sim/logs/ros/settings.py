@@ -11,12 +11,12 @@ from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
 from log2sim.config import Section
 from log2sim.errors import ConfigError
+from log2sim.geometry import DISTORTION_LENGTHS
 from log2sim.logs.quaternions import QUATERNION_TOLERANCE
 from log2sim.model_errors import first_problem
 
 MAX_SETTINGS_BYTES = 1024 * 1024
 MAX_OFFSET_S = 10.0
-DISTORTION_LENGTHS = {"none": (0,), "brown": (4, 5, 8), "fisheye": (4,)}
 NAME = r"^[A-Za-z0-9_-]+$"
 
 
