@@ -159,5 +159,5 @@ def test_numbers_that_no_place_or_time_has_are_refused(file: str, value: Any, tm
     rows = json.loads(path.read_text())
     rows[1] = value if file == "timestamps" else rows[1] | {"position": value}
     path.write_text(json.dumps(rows))
-    with pytest.raises(LogError, match="record 1: position .* expected finite numbers up to"):
+    with pytest.raises(LogError, match=r"record 1: position .* expected finite numbers up to"):
         open_log(root)
