@@ -34,7 +34,7 @@ class Labels:
     occlusion : (L,) int64 or None
         0 fully visible, 1 partly occluded, 2 largely occluded, 3 unknown, as the log states it.
     labeled_ns : (F,) int64 or None
-        Increasing stamps of all that was labeled, also where nothing was there; None where the log does not tell.
+        Increasing stamps of all that was labeled, also where nothing was there; None where the log does not state it.
     never_labeled : tuple of str
         Categories that got no 3D boxes by the log's rules, such as bicycles without riders in KITTI.
     """

@@ -46,8 +46,8 @@ def open_log(path: Path | str, *, format: str = "auto", sequence: str | None = N
     others = _other_formats(root, name) if format == "auto" else []
     if not others:
         return log
-    told = f"{root} holds logs of other formats, too: {', '.join(others)}; --format chooses one"
-    return log.changed(notes=lambda: (told, *log.notes))  # notes may wait for labels
+    note = f"{root} holds logs of other formats, too: {', '.join(others)}; --format chooses one"
+    return log.changed(notes=lambda: (note, *log.notes))  # notes may wait for labels
 
 
 def find_reader(root: Path) -> str:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from log2sim.datatypes import EgoVehicle, Sweep
+from log2sim.datatypes import EgoVehicle, Lidar, Stream, Sweep
 from log2sim.errors import RecordError
 from log2sim.geometry import Array, apply, inverse, rotation_from_quaternion, transform
 from log2sim.logs.ros.frames import FrameTree
@@ -136,3 +136,24 @@ def measure_ground_m(sweep: Sweep, ego_T_lidar: Array) -> float:
     counts = np.bincount(np.floor((z - z.min()) / ROAD_BIN_M).astype(np.int64))
     mode_m = z.min() + (counts.argmax() + 0.5) * ROAD_BIN_M
     return float(np.median(z[np.abs(z - mode_m) < 2 * ROAD_BIN_M]))
+
+
+def measure_road(
+    frame: EgoFrame, lidars: Mapping[str, Lidar], streams: Mapping[str, Stream]
+) -> tuple[float, tuple[str, ...]]:
+    """Measure the height of the road in the ego frame in a sweep, with remarks; 0 where no LiDAR shows it."""
+    notes = []
+    for name, lidar in lidars.items():
+        try:
+            ground_m = measure_ground_m(streams[name].read(0), lidar.mount_T_lidar)
+        except RecordError as problem:
+            notes.append(f"{name}: {problem}")
+            continue
+        side = "below" if ground_m <= 0 else "above"
+        notes.append(
+            f"the road is {abs(ground_m):.2f} m {side} the origin of the ego in the frame '{frame.base}', measured in the "
+            f"first sweep of {name} (ego.ground_z_m)"
+        )
+        return ground_m, tuple(notes)
+    notes.append(f"the height of the road in '{frame.base}' is not known; taken as 0 (ego.ground_z_m)")
+    return 0.0, tuple(notes)

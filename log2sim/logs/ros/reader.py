@@ -83,17 +83,13 @@ class _Opening:
         mounts = self._mounts(frame)
         cameras = self._cameras(mounts)
         lidars = {n: Lidar(n, *mounts[n]) for n in self.roles.lidars if n in mounts}
-        streams = {n: camera_stream(self.bag, self.roles.cameras[n], stamped[n], c) for n, c in cameras.items()}
-        streams |= {n: lidar_stream(self.bag, n, self.roles.lidars[n], stamped[n]) for n in lidars}
-        if not streams:
-            raise LogError(f"{self.bag.place}: none of its sensors can be used: {'; '.join(self.notes)}")
-        track = None if found is None else PoseTrack(found.t_ns, found.map_T_base @ frame.base_T_ego)
+        streams = self._streams(cameras, lidars, stamped)
         self._note_poses(found, considered, base)
         self.notes += frame.notes
 
         @cache
         def measured() -> tuple[float, tuple[str, ...]]:
-            return _measure_road(frame, lidars, streams)
+            return ego.measure_road(frame, lidars, streams)
 
         known_m = frame.ground_z_m
         return Log(
@@ -102,7 +98,7 @@ class _Opening:
             cameras=cameras,
             lidars=lidars,
             streams=streams,
-            ego=track,
+            ego=None if found is None else PoseTrack(found.t_ns, found.map_T_base @ frame.base_T_ego),
             ego_vehicle=frame.vehicle,
             map=MapFrame() if found is None else found.map,
             ground_z_ego_m=(lambda: measured()[0]) if known_m is None else known_m,
@@ -111,6 +107,15 @@ class _Opening:
             notes=(lambda: (*self.notes, *measured()[1])) if known_m is None else tuple(self.notes),
             details=self._details(base, why, considered),
         )
+
+    def _streams(
+        self, cameras: dict[str, Camera], lidars: dict[str, Lidar], stamped: dict[str, Stamped]
+    ) -> dict[str, Stream]:
+        streams = {n: camera_stream(self.bag, self.roles.cameras[n], stamped[n], c) for n, c in cameras.items()}
+        streams |= {n: lidar_stream(self.bag, n, self.roles.lidars[n], stamped[n]) for n in lidars}
+        if not streams:
+            raise LogError(f"{self.bag.place}: none of its sensors can be used: {'; '.join(self.notes)}")
+        return streams
 
     def _details(self, base: str | None, why: str, considered: list[dict[str, Any]]) -> dict[str, Any]:
         return {
@@ -279,24 +284,3 @@ class _Opening:
         topics = [f"{t.name} ({t.msgtype}, {len(t)})" for t in self.bag.topics.values()]
         more = f" and {len(topics) - MAX_LISTED} more" if len(topics) > MAX_LISTED else ""
         return f"its topics are {', '.join(topics[:MAX_LISTED])}{more}" if topics else "it has no topics"
-
-
-def _measure_road(
-    frame: ego.EgoFrame, lidars: dict[str, Lidar], streams: dict[str, Stream]
-) -> tuple[float, tuple[str, ...]]:
-    """Measure the height of the road in the ego frame in a sweep, with remarks; 0 where no LiDAR shows it."""
-    notes = []
-    for name, lidar in lidars.items():
-        try:
-            ground_m = ego.measure_ground_m(streams[name].read(0), lidar.mount_T_lidar)
-        except RecordError as problem:
-            notes.append(f"{name}: {problem}")
-            continue
-        side = "below" if ground_m <= 0 else "above"
-        notes.append(
-            f"the road is {abs(ground_m):.2f} m {side} the origin of the ego in the frame '{frame.base}', measured in the "
-            f"first sweep of {name} (ego.ground_z_m)"
-        )
-        return ground_m, tuple(notes)
-    notes.append(f"the height of the road in '{frame.base}' is not known; taken as 0 (ego.ground_z_m)")
-    return 0.0, tuple(notes)
