@@ -26,7 +26,7 @@ def test_a_turn_starts_and_ends_behind_the_lidar() -> None:
 
 
 def test_of_two_rows_of_a_track_that_are_too_near_the_first_is_kept() -> None:
-    t_ns = np.array([0, 5, 15, 20, 26])
+    t_ns = np.array([0, 5, 15, 16, 26])
     assert select_spaced(t_ns, np.array(["a", "b", "b", "b", "a"]), 11).tolist() == [0, 1, 3, 4]
 
 
