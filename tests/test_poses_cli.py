@@ -41,7 +41,7 @@ def by_lidar(noisy: Path) -> Path:
         noisy.parent / "report.json",
     )  # fmt: skip
     assert ran.code == 0, ran.err
-    assert "poses: lidar (as asked)\n" in ran.out
+    assert "poses: lidar (as requested)\n" in ran.out
     return out
 
 

@@ -105,7 +105,7 @@ def reconstruct(
 
 def pose_notes(poses: dict[str, Any]) -> list[str]:
     """Say which poses were used and why, and what is doubtful about them; nothing of the log's own where no others were asked for."""
-    if poses["source"] == poses["asked"] == "given" or poses["source"] == "none":
+    if poses["source"] == poses["requested"] == "given" or poses["source"] == "none":
         return []
     return [f"poses: {poses['source']} ({poses['reason']})", *(f"note: {note}" for note in poses["notes"])]
 

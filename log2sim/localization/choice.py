@@ -80,26 +80,26 @@ class _Request:
     """What to localize, how, and from which part."""
 
     log: Log
-    asked: str
+    requested: str
     during_ns: tuple[int, int] | None
     progress: Progress
 
     def answer(self, source: str, reason: str, **found: Any) -> PoseChoice:
         """Return the choice of a source."""
-        return PoseChoice(self.asked, source, reason, during_ns=self.during_ns, **found)
+        return PoseChoice(self.requested, source, reason, during_ns=self.during_ns, **found)
 
 
 def _localize(request: _Request) -> tuple[Log, PoseChoice]:
-    log, asked = request.log, request.asked
+    log, requested = request.log, request.requested
     mounts = _mounts(log)
     if log.ego is None and "ego" not in mounts:
-        return log, PoseChoice(asked, "none", "all sensors are fixed in the map")
-    if log.ego is not None and asked == "given":
+        return log, PoseChoice(requested, "none", "all sensors are fixed in the map")
+    if log.ego is not None and requested == "given":
         return log, GIVEN
     if log.ego is None and "map" in mounts:
         reason = "the log has no poses that relate the ego's sensors to those fixed in the map"
-        return log, PoseChoice(asked, "none", reason)
-    if asked == "camera" or (log.ego is None and asked != "lidar" and not lidars_on_ego(log)):
+        return log, PoseChoice(requested, "none", reason)
+    if requested == "camera" or (log.ego is None and requested != "lidar" and not lidars_on_ego(log)):
         return _by_camera(request)
     return _by_lidar(request)
 
@@ -121,23 +121,23 @@ def _by_camera(request: _Request) -> tuple[Log, PoseChoice]:
     notes = ["camera motion is planar, and some percent of its path may be wrong"]
     if found.predicted.any():
         notes.append(f"camera motion: {int(found.predicted.sum())} of {len(found.t_ns)} poses are predicted")
-    reason = "as asked" if request.asked == "camera" else "the log has no poses and no LiDAR on the ego"
+    reason = "as requested" if request.requested == "camera" else "the log has no poses and no LiDAR on the ego"
     return replace_poses(log, track), request.answer("camera", reason, estimate=estimate, notes=tuple(notes))
 
 
 def _by_lidar(request: _Request) -> tuple[Log, PoseChoice]:
     """Estimate poses by LiDAR odometry; where the log has poses and may keep them, decide which are better."""
-    log, asked = request.log, request.asked
-    may_keep = log.ego is not None and asked == "auto"
+    log, requested = request.log, request.requested
+    may_keep = log.ego is not None and requested == "auto"
     if may_keep and not is_installed():
         reason = "not compared with LiDAR odometry, whose extra 'odometry' is not installed"
-        return log, PoseChoice(asked, "given", reason)
+        return log, PoseChoice(requested, "given", reason)
     lidar = densest_lidar(log)
     if lidar is None:
         if may_keep:
-            return log, PoseChoice(asked, "given", "the log has no LiDAR on the ego to compare them with")
+            return log, PoseChoice(requested, "given", "the log has no LiDAR on the ego to compare them with")
         raise ConfigError(
-            f"--poses {asked}: {log.name} has no LiDAR on the ego that can be read; choose given or camera"
+            f"--poses {requested}: {log.name} has no LiDAR on the ego that can be read; choose given or camera"
         )
     stamps = log.streams[lidar].t_ns
     if log.ego is None and len(stamps) == 1:
@@ -152,7 +152,7 @@ def _by_lidar(request: _Request) -> tuple[Log, PoseChoice]:
     except LogError as problem:
         if not may_keep:
             raise
-        return log, PoseChoice(asked, "given", f"nothing to compare them with: {problem}")
+        return log, PoseChoice(requested, "given", f"nothing to compare them with: {problem}")
     track, frame = _in_map(log, PoseTrack(found.t_ns, found.odom_T_ego, _max_gap_s(found.t_ns)), lidar)
     estimate = {**_figures(found), **_difference(track, log.ego), "frame": frame}
     if may_keep:
@@ -163,7 +163,7 @@ def _by_lidar(request: _Request) -> tuple[Log, PoseChoice]:
             f"{log.name}: the log has no ego poses, and LiDAR odometry cannot tell how the ego moves: {unsure:.0%} of the "
             "sweeps show too little that holds it, as in a tunnel or on an empty road; give poses"
         )
-    reason = "as asked" if asked == "lidar" else "the log has no poses"
+    reason = "as requested" if requested == "lidar" else "the log has no poses"
     return replace_poses(log, track), request.answer("lidar", reason, estimate=estimate, notes=_doubts(log, found))
 
 

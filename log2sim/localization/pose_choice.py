@@ -16,7 +16,7 @@ class PoseChoice:
 
     Attributes
     ----------
-    asked : str
+    requested : str
         As the settings say.
     source : {"given", "lidar", "camera", "none"}
         "none": no sensor is on an ego whose pose would have to be known.
@@ -35,7 +35,7 @@ class PoseChoice:
         First and last stamp of what poses were estimated from; None for the whole log.
     """
 
-    asked: str
+    requested: str
     source: str
     reason: str
     excess_m: Mapping[str, float | None] = field(default_factory=dict)
@@ -52,7 +52,7 @@ class PoseChoice:
     def to_dict(self) -> dict[str, Any]:
         """Return the entry `poses` of `schemas/report-1.json`."""
         return {
-            "asked": self.asked,
+            "requested": self.requested,
             "source": self.source,
             "reason": self.reason,
             "scatter_m": {name: dict(values) for name, values in self.scatter_m.items()},

@@ -49,9 +49,12 @@ def no_ego() -> Outcome:
     return Outcome(ok and result.scenario.ego is None, found)
 
 
-@case("log: no ego pose, sensors on the ego", "refused: an empty street does not show how the ego moves")
+@case("log: no ego pose, sensors on the ego", "refused: an empty street does not show it; or names the missing extra")
 def lost_ego() -> Outcome:
-    return refused_log(replace(small_log(), ego=None, labels=None), "cannot tell how the ego moves")
+    try:
+        return refused_log(replace(small_log(), ego=None, labels=None), "cannot tell how the ego moves")
+    except MissingExtra as missing:
+        return Outcome(missing.extra == "odometry", f"refused: {missing}")
 
 
 @case("log: one frame", "a scenario of one moment")
