@@ -14,6 +14,7 @@ from extremes.small_log import LABELS, folder_of, known_and_finite, refused, ref
 from extremes.table import Outcome, case
 from log2sim import open_log, reconstruct
 from log2sim.datatypes import Log
+from log2sim.errors import MissingExtra
 
 
 @case("log: one camera", "all agents, no fusion")
