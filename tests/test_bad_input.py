@@ -395,6 +395,8 @@ def test_interrupting_leaves_nothing(tmp_path: Path) -> None:
         [sys.executable, "-m", "log2sim", "synth", str(scene), "--out", str(tmp_path / "work/log"), "--quiet"],
         stderr=subprocess.PIPE,
         text=True,
+        # A suite that runs in the background of a shell would hand down that SIGINT is ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 30
     while not any((tmp_path / "work").rglob("*.jpg")) and time.monotonic() < deadline:  # it is in the middle of writing
