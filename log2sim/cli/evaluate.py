@@ -83,16 +83,16 @@ def evaluate(
     say(table, quiet=quiet)
 
 
-def _stated(made_with: Any, asked: str | None) -> dict[str, Any]:
-    """Return the provenance of poses: as stated by what is evaluated, or as asked for."""
+def _stated(made_with: Any, requested: str | None) -> dict[str, Any]:
+    """Return the provenance of poses: as stated by what is evaluated, or as requested."""
     from log2sim.config import PosesConfig
     from log2sim.errors import ConfigError
 
-    if asked is None or asked == "auto":
+    if requested is None or requested == "auto":
         return {} if made_with is None else {"poses": made_with}
-    if asked not in PosesConfig.choices("source"):
-        raise ConfigError(f"--poses {asked}: expected {', '.join(PosesConfig.choices('source'))}")
-    return {"poses": {**(made_with if isinstance(made_with, dict) else {}), "source": asked}}
+    if requested not in PosesConfig.choices("source"):
+        raise ConfigError(f"--poses {requested}: expected {', '.join(PosesConfig.choices('source'))}")
+    return {"poses": {**(made_with if isinstance(made_with, dict) else {}), "source": requested}}
 
 
 def _other_map(scenario: Scenario, truth: Path) -> str | None:

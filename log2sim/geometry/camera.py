@@ -64,7 +64,7 @@ class Camera:
     distortion : tuple of float
         In OpenCV's order: k1, k2, p1, p2[, k3[, k4, k5, k6]] for "brown", k1..k4 for "fisheye".
     rolling_shutter : RollingShutter or None
-        None for a global shutter, or where the log does not tell.
+        None for a global shutter, or where the log does not state it.
     """
 
     name: str

@@ -13,15 +13,13 @@ from log2sim.errors import LogError
 from log2sim.geometry import Array, PoseTrack, rotation_from_quaternion, shift_poses, transform
 from log2sim.logs.arrow.tables import read_columns
 from log2sim.logs.arrow.values import Kind
-from log2sim.logs.quaternions import find_not_unit
+from log2sim.logs.pose_checks import MAX_POSITION_M, find_not_unit
 from log2sim.logs.stamps import strictly_increasing
 
 QUATERNION = ("qw", "qx", "qy", "qz")
 TRANSLATION = ("tx_m", "ty_m", "tz_m")
 TRANSFORM: Mapping[str, Kind] = dict.fromkeys((*QUATERNION, *TRANSLATION), "float")
 OFFSET_STEP_M = 1000.0
-# Farther than any place on Earth is from the origin of a map.
-MAX_POSITION_M = 1e9
 
 
 def read_ego_track(path: Path, notes: list[str]) -> tuple[PoseTrack, tuple[float, float, float]]:

@@ -37,7 +37,7 @@ from log2sim.logs.native.labels import (
     regions_2d,
 )
 from log2sim.logs.native.offset import offset_of, shifted_camera, shifted_labels, shifted_lidar
-from log2sim.logs.quaternions import QUATERNION_TOLERANCE, find_not_unit
+from log2sim.logs.pose_checks import QUATERNION_TOLERANCE, find_not_unit
 from log2sim.logs.stamps import strictly_increasing
 from log2sim.logs.sweeps import read_sweep
 

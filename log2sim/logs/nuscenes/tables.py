@@ -14,7 +14,7 @@ import numpy as np
 from log2sim.documents import read_json
 from log2sim.errors import LogError
 from log2sim.geometry import Array
-from log2sim.logs.quaternions import find_not_unit
+from log2sim.logs.pose_checks import find_not_unit
 from log2sim.logs.stamps import MAX_TIME_S
 
 Record = dict[str, Any]

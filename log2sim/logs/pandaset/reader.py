@@ -34,7 +34,7 @@ from log2sim.logs.images import first_image_size, image_stream
 from log2sim.logs.notes import defer_notes
 from log2sim.logs.pandaset.labels import read_labels
 from log2sim.logs.pandaset.sweeps import LIDARS, SweepFiles
-from log2sim.logs.quaternions import find_not_unit
+from log2sim.logs.pose_checks import MAX_POSITION_M, find_not_unit
 from log2sim.logs.record_files import list_folders, list_numbered_files
 from log2sim.logs.stamps import MAX_TIME_S, strictly_increasing
 
@@ -50,8 +50,6 @@ EGO_VEHICLE = EgoVehicle(size_m=(5.18, 2.02, 1.78), rear_axle_offset_m=1.45)
 
 # Camera poses that scatter more about the mount do not fit the ego poses.
 MAX_MOUNT_SPREAD_M = 0.05
-# Farther than any place on Earth is from the origin of a map.
-MAX_POSITION_M = 1e9
 MIN_GNSS_TRACK_M = 20.0
 MAX_GNSS_ANGLE_RAD = np.radians(1.0)
 

@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 
 from log2sim.errors import LogError
 from log2sim.geometry import Array, PoseTrack, inverse, rotation_from_quaternion, transform
+from log2sim.logs.pose_checks import MAX_POSITION_M
 from log2sim.logs.ros.containers import printable
 from log2sim.logs.ros.settings import StaticTransform
 
 # Transforms that are sent again and again with the same values are static, as those of ROS 1 on /tf.
 SAME_TRANSFORM = 1e-9
 MAX_QUATERNION_ERROR = 0.05
-# Farther than any place on Earth is from the origin of a map.
-MAX_POSITION_M = 1e9
 # From a sensor to the root of the tree; usual are fewer than ten.
 MAX_DEPTH = 100
 # Position, and the quaternion scalar-first.

@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Field, ValidationError, model_validator
 from log2sim.config import Section
 from log2sim.errors import ConfigError
 from log2sim.geometry import DISTORTION_LENGTHS
-from log2sim.logs.quaternions import QUATERNION_TOLERANCE
+from log2sim.logs.pose_checks import QUATERNION_TOLERANCE
 from log2sim.model_errors import first_problem
 
 MAX_SETTINGS_BYTES = 1024 * 1024

@@ -173,10 +173,10 @@ def project_boxes_in_view(view: View, center_m: Array, size_m: Array, yaw_rad: A
 
     Where the camera moves while its lines are read, each box takes the pose at the time of the line that shows its middle.
     """
-    seen = project_boxes(center_m, size_m, yaw_rad, view.camera, inverse(view.map_T_cam))
-    if view.cam_T_map_at is None or not seen.valid.any():
-        return seen
-    box, valid, range_m = seen.box_px.copy(), seen.valid.copy(), seen.range_m.copy()
+    projected = project_boxes(center_m, size_m, yaw_rad, view.camera, inverse(view.map_T_cam))
+    if view.cam_T_map_at is None or not projected.valid.any():
+        return projected
+    box, valid, range_m = projected.box_px.copy(), projected.valid.copy(), projected.range_m.copy()
     rows = np.flatnonzero(valid)
     middle_px = (box[rows, :2] + box[rows, 2:]) / 2
     for i, cam_T_map in zip(rows, view.cam_T_map_at(line_time_s(view.camera, middle_px))):

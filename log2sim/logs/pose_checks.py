@@ -1,4 +1,4 @@
-"""Check of the quaternions that a log states."""
+"""Limits that poses of a log have to keep."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from log2sim.geometry import Array
 
 # Quaternions are stored with three decimals or more.
 QUATERNION_TOLERANCE = 1e-3
+
+# Farther than any place on Earth is from the origin of a map.
+MAX_POSITION_M = 1e9
 
 
 def find_not_unit(q: Array) -> NDArray[np.intp]:
