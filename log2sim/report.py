@@ -86,7 +86,7 @@ def _measurement_counts(measurements: Sequence[Measurements]) -> dict[str, Any]:
 def _agent_counts(scenario: Scenario) -> dict[str, Any]:
     agents = scenario.others
     categories = sorted({a.category for a in agents})
-    flagged = {a.id: list(a.quality["flags"]) for a in scenario.agents if a.quality.get("flags")}
+    doubtful = {a.id: [doubt.to_dict() for doubt in a.doubts] for a in scenario.agents if a.is_doubtful}
     residuals = [
         a.quality["smoothing_residual_rms_m"] for a in agents if a.quality.get("smoothing_residual_rms_m") is not None
     ]
@@ -95,5 +95,5 @@ def _agent_counts(scenario: Scenario) -> dict[str, Any]:
         "static": sum(a.static for a in agents),
         "by_category": {c: sum(a.category == c for a in agents) for c in categories},
         "smoothing_residual_median_m": rounded(float(np.median(residuals)), 4) if residuals else None,
-        "infeasible": flagged,
+        "doubtful": doubtful,
     }

@@ -153,7 +153,7 @@ def moving(name: str, xy: Array, tick_s: float = 0.1) -> Agent:
     speed = np.full(n, 3.0)
     columns = {"z_m": np.zeros(n), "yaw_rad": np.zeros(n), "speed_mps": speed, "sigma_xy_m": np.full(n, 0.1)}
     w = Waypoints(t_s=np.arange(n) * tick_s, x_m=xy[:, 0], y_m=xy[:, 1], observed=np.ones(n, dtype=bool), **columns)
-    return Agent(name, "car", (4.0, 1.8, 1.5), w, quality={"detections": n, "flags": []})
+    return Agent(name, "car", (4.0, 1.8, 1.5), w, quality={"detections": n})
 
 
 def world(*offsets: tuple[float, float]) -> Scenario:

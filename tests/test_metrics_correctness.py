@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from metric_scenes import T_S, agent, moved, scenario, shifted, world
 
-from log2sim.datatypes import CATEGORIES, Agent, Scenario
+from log2sim.datatypes import CATEGORIES, Agent, Doubt, Scenario
 from log2sim.documents import check
 from log2sim.errors import ScenarioError
 from log2sim.evaluation.metrics.align import reconstructed_states, truth_states
@@ -203,10 +203,10 @@ def test_an_agent_is_wrong_when_more_than_a_fifth_of_its_ticks_are(ticks, agents
 def test_doubt_is_a_flag_or_a_confidence_below_one_half():
     ours = [
         agent("right", 0.0, confidence=0.9),
-        agent("flagged", 20.0, confidence=0.9, quality={"flags": ["curvature"]}),
+        agent("flagged", 20.0, confidence=0.9, doubts=(Doubt("curvature", "turns on the spot"),)),
         agent("unsure", 40.0, confidence=0.49),
         agent("sure", 60.0, confidence=0.5),
-        agent("both", 80.0, confidence=0.1, quality={"flags": ["jump"]}),
+        agent("both", 80.0, confidence=0.1, doubts=(Doubt("jump", "jumps"),)),
     ]
     truth = [agent("a", 0.0), agent("b", 20.0)]
     found = judged(ours, truth)
@@ -215,6 +215,13 @@ def test_doubt_is_a_flag_or_a_confidence_below_one_half():
     assert {r["id"]: r["doubts"] for r in found["judged_agents"]} == {
         "right": [], "flagged": ["curvature"], "unsure": ["confidence"], "sure": [], "both": ["confidence", "jump"],
     }  # fmt: skip
+
+
+def test_a_doubt_counts_while_it_holds():
+    half = np.where(np.arange(TICKS) < 10, 50.0, 0.0)
+    hidden = Doubt("hidden", "hidden at first", None, float(T_S[9]))
+    found = judged([agent("x", 0.0, half, doubts=(hidden,))], [agent("a", 0.0)])
+    assert (found["doubted"]["wrong_ticks"], found["doubted"]["right_ticks"]) == (1.0, 0.0)
 
 
 def test_confidence_is_compared_with_right_ticks_and_right_agents():
@@ -303,7 +310,7 @@ def broken():
     rest = [a for a in world().agents if a.id not in ("a", "b")]
     return scenario(
         *rest, agent("car-18", 10 + 5 * T_S, 3.0, speed=-5.0, yaw=np.pi, **car), agent("car-9", 15.0, -4.0, yaw=-2.0),
-        agent("car-10", 15.0, -4.5, confidence=0.3), agent("ghost", 90.0, quality={"flags": ["jump"]}),
+        agent("car-10", 15.0, -4.5, confidence=0.3), agent("ghost", 90.0, doubts=(Doubt("jump", "jumps"),)),
     )  # fmt: skip
 
 

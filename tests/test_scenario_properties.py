@@ -10,7 +10,7 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis.extra.numpy import arrays
 
-from log2sim.datatypes import CATEGORIES, Agent, IgnoreRegions, LabelView, MapFrame, Scenario, Waypoints
+from log2sim.datatypes import CATEGORIES, Agent, Doubt, IgnoreRegions, LabelView, MapFrame, Scenario, Waypoints
 from log2sim.geometry import Array, Camera, quaternion_from_rotation, rotation_from_rpy
 
 FINITE = st.floats(-1e8, 1e8, allow_subnormal=True)
@@ -24,6 +24,12 @@ def times(count: int) -> st.SearchStrategy[Array]:
     return st.builds(lambda start, step: np.maximum.accumulate(start + np.cumsum(step)), st.floats(-1e3, 3e4), steps)
 
 
+def doubts() -> st.SearchStrategy[Doubt]:
+    """Doubts, some of which hold all the time."""
+    time = st.none() | st.floats(-1e6, 1e6)
+    return st.builds(Doubt, NAMES, st.text(st.characters(exclude_categories=["Cs"]), max_size=12), time, time)
+
+
 @st.composite
 def agents(draw: st.DrawFn, agent_id: str) -> Agent:
     count = draw(st.integers(1, 6))
@@ -32,13 +38,13 @@ def agents(draw: st.DrawFn, agent_id: str) -> Agent:
     t_s = draw(times(count).filter(lambda t: bool(np.all(np.diff(t) > 0))))
     waypoints = Waypoints(
         t_s, draw(column), draw(column), draw(column), draw(column), draw(column), draw(flags),
-        np.abs(draw(column)), draw(st.none() | flags),
+        np.abs(draw(column)), draw(st.none() | column), draw(st.none() | column), draw(st.none() | flags),
     )  # fmt: skip
     size = draw(st.tuples(*[st.floats(1e-3, 50.0)] * 3))
     color = draw(st.none() | st.just({"rgb": [1, 2, 3], "name": "blue"}))
     return Agent(
         agent_id, draw(st.sampled_from(CATEGORIES)), size, waypoints, draw(st.booleans()), draw(st.floats(-5.0, 5.0)),
-        color, draw(FRACTION), {"note": draw(NAMES)},
+        color, draw(FRACTION), {"note": draw(NAMES)}, tuple(draw(st.lists(doubts(), max_size=2))),
     )  # fmt: skip
 
 
@@ -76,9 +82,10 @@ def scenarios(draw: st.DrawFn) -> Scenario:
 
 def bits(scenario: Scenario) -> list[object]:
     """All numbers of the trajectories, and of the ignore regions, as bytes."""
-    columns = (*Waypoints.FLOATS, "observed", "visible")
+    columns = (*Waypoints.FLOATS, *Waypoints.OPTIONAL_FLOATS, "observed", "visible")
     out: list[object] = []
     for a in scenario.agents:
+        out += a.doubts
         out += [None if (v := getattr(a.waypoints, k)) is None else v.tobytes() for k in columns]
     for view in scenario.ignore_regions.views if scenario.ignore_regions else ():
         names = ("t_s", "translation_m", "rotation_wxyz", "region_frame", "region_px")

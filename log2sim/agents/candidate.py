@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from log2sim.agents.confirmation import agent_confidence, is_confirmed
 from log2sim.agents.size import TrackGeometry
-from log2sim.datatypes import GROUP_OF, Agent, Track, Waypoints
+from log2sim.datatypes import GROUP_OF, Agent, Doubt, Track, Waypoints
 from log2sim.geometry import NS_PER_S, Array
 
 # Distance from the rear axle to the box center as a share of the length: BMW 320i of CommonRoad's vehicle models, rounded.
@@ -48,15 +48,27 @@ class AgentCandidate:
         Sum of the scores of its detections.
     confirmed : bool
         Whether the confidence of the track suffices.
+    track : Track
+        Whose measurements, one at each of its ticks, the agent is made of.
+    geometry : TrackGeometry
+        Size of the track, and positions at its measurements.
     """
 
     agent: Agent
     evidence: float
     confirmed: bool
+    track: Track
+    geometry: TrackGeometry
 
 
 def candidate_of(
-    track: Track, geometry: TrackGeometry, waypoints: Waypoints, quality: dict[str, Any], *, static: bool
+    track: Track,
+    geometry: TrackGeometry,
+    waypoints: Waypoints,
+    quality: dict[str, Any],
+    *,
+    static: bool,
+    doubts: Sequence[Doubt] = (),
 ) -> AgentCandidate:
     """Make a candidate of a track, its geometry and its waypoints; `quality` is added to that of the track."""
     m = track.measurements
@@ -69,9 +81,10 @@ def candidate_of(
         static=static,
         rear_axle_offset_m=round(REAR_AXLE_SHARE.get(GROUP_OF[track.category], 0.0) * length, 3),
         confidence=float(np.clip(agent_confidence(track), 0.0, 1.0)),
+        doubts=tuple(doubts),
         quality=_quality_of(track) | quality,
     )
-    return AgentCandidate(agent, float(m.score.sum()), is_confirmed(track, typical=geometry.is_likely))
+    return AgentCandidate(agent, float(m.score.sum()), is_confirmed(track, typical=geometry.is_likely), track, geometry)
 
 
 def confirm(candidates: Sequence[AgentCandidate]) -> list[AgentCandidate]:

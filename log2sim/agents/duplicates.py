@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from log2sim.agents.candidate import AgentCandidate
-from log2sim.datatypes import GROUP_OF, Agent, Waypoints
+from log2sim.datatypes import GROUP_OF, Agent
 from log2sim.geometry import Array, box_corners_bev, overlap_of_smaller
 
 # Two agents whose overlap exceeds this share of the smaller box for most of the time are duplicates. Pedestrians are compared
@@ -56,8 +56,7 @@ def _outside(agent: Agent, ego: Agent) -> Agent:
     if apart.all() or not apart.any():
         return agent
     first, last = int(np.argmax(apart)), len(apart) - int(np.argmax(apart[::-1]))
-    columns = {k: v[first:last] for k, v in vars(w).items() if v is not None}
-    return replace(agent, waypoints=Waypoints(**columns))
+    return replace(agent, waypoints=w.take(slice(first, last)))
 
 
 def _are_duplicates(a: Agent, b: Agent) -> bool:

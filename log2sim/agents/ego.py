@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from log2sim.agents.candidate import Timeline
+from log2sim.agents.smooth.feasibility import limit_doubts
 from log2sim.agents.smooth.smoother import signed_speed, smooth_track
 from log2sim.datatypes import STANDSTILL_DRIFT_M, STANDSTILL_MPS, Agent, Log, Waypoints
 from log2sim.geometry import Array, yaw_of
@@ -42,7 +43,7 @@ def ego_agent(log: Log, timeline: Timeline, source: str = "ego poses of the log"
     moved = float(np.hypot(np.ptp(center[:, 0]), np.ptp(center[:, 1])))
     return Agent(
         "ego", "car", vehicle.size_m, waypoints, static=moved < STANDSTILL_DRIFT_M, rear_axle_offset_m=vehicle.rear_axle_offset_m,
-        quality={"source": source, "flags": list(path.flags)},
+        doubts=limit_doubts(path.flags), quality={"source": source},
     )  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from log2sim.agents.candidate import REAR_AXLE_SHARE, AgentCandidate, Timeline, 
 from log2sim.agents.confirmation import SAME_MOMENT_S
 from log2sim.agents.lidar_tracking import BoxState, LidarMatch, track_with_lidar
 from log2sim.agents.size import TrackGeometry, moving_geometry
+from log2sim.agents.smooth.feasibility import limit_doubts
 from log2sim.agents.smooth.fixed_interval import MotionModel
 from log2sim.agents.smooth.smoother import SmoothedTrack, signed_speed, smooth_track
 from log2sim.datatypes import GROUP_OF, STANDSTILL_MPS, TYPICAL_SIZE_M, Obstacles, Track, Waypoints
@@ -91,10 +92,12 @@ def moving_candidate(
         "lidar_only": len(matches),
         "observed_share": round(float(observed.mean()), 3),
         "smoothing_residual_rms_m": round(float(np.sqrt(np.nanmean(residual**2))), 4) if len(residual) else None,
-        "flags": list(path.flags),
     }
+    doubts = limit_doubts(path.flags)
     z = np.interp(at, t, _running_median(geometry.z_m))
-    return candidate_of(track, geometry, _waypoints(path, _headings(path, group), z, observed), quality, static=False)
+    return candidate_of(
+        track, geometry, _waypoints(path, _headings(path, group), z, observed), quality, static=False, doubts=doubts
+    )
 
 
 def _one_at_a_moment(track: Track) -> Track:

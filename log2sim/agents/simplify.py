@@ -38,8 +38,7 @@ def simplify_waypoints(waypoints: Waypoints) -> Waypoints:
     kept = waypoints_to_keep(waypoints)
     if len(kept) == len(waypoints):
         return waypoints
-    names = (*Waypoints.FLOATS, "observed")
-    return Waypoints(**{k: getattr(waypoints, k)[kept] for k in names})
+    return waypoints.take(kept)
 
 
 def waypoints_to_keep(w: Waypoints) -> NDArray[np.intp]:

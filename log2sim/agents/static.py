@@ -52,5 +52,5 @@ def static_candidate(
         sigma_xy_m=np.full(n, sigma),
     )
     share = len(observed) / (observed[-1] - observed[0] + 1)
-    quality = {"lidar_only": len(matches), "observed_share": round(float(share), 3), "flags": []}
+    quality = {"lidar_only": len(matches), "observed_share": round(float(share), 3)}
     return candidate_of(track, geometry, waypoints, quality, static=True)

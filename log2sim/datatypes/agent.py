@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from log2sim.datatypes.categories import CATEGORIES
+from log2sim.datatypes.doubts import MIN_TRUSTED_CONFIDENCE, Doubt
 from log2sim.datatypes.trajectory import Trajectory
 from log2sim.datatypes.waypoints import Waypoints
 from log2sim.errors import ScenarioError
@@ -63,6 +64,8 @@ class Agent:
         In [0, 1].
     quality : mapping
         Figures of the reconstruction, such as the number of detections.
+    doubts : tuple of Doubt
+        What speaks against it.
     """
 
     id: str
@@ -74,11 +77,17 @@ class Agent:
     color: Mapping[str, Any] | None = None
     confidence: float = 1.0
     quality: Mapping[str, Any] = field(default_factory=dict)
+    doubts: tuple[Doubt, ...] = ()
 
     @property
     def is_permanent(self) -> bool:
         """Whether it is a static agent with a single waypoint, which is present during the whole scenario."""
         return self.static and len(self.waypoints) == 1
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether it has a doubt or a confidence below `MIN_TRUSTED_CONFIDENCE`."""
+        return bool(self.doubts) or self.confidence < MIN_TRUSTED_CONFIDENCE
 
     @cached_property
     def trajectory(self) -> Trajectory:
@@ -109,10 +118,10 @@ class Agent:
 def agent_to_dict(agent: Agent) -> dict[str, Any]:
     """Return the entry of an agent in a document of `schemas/scenario-1.json`."""
     w = agent.waypoints
-    columns: dict[str, list[Any]] = {k: np.asarray(getattr(w, k), dtype=np.float64).tolist() for k in Waypoints.FLOATS}
-    columns["observed"] = [bool(v) for v in w.observed]
-    if w.visible is not None:
-        columns["visible"] = [bool(v) for v in w.visible]
+    columns = {
+        k: v.astype(bool).tolist() if k in ("observed", "visible") else v.astype(np.float64).tolist()
+        for k, v in w.columns().items()
+    }
     length, width, height = (float(v) for v in agent.size_m)
     return {
         "id": agent.id,
@@ -122,6 +131,7 @@ def agent_to_dict(agent: Agent) -> dict[str, Any]:
         "static": bool(agent.static),
         "rear_axle_offset_m": float(agent.rear_axle_offset_m),
         "confidence": float(agent.confidence),
+        "doubts": [doubt.to_dict() for doubt in agent.doubts],
         "quality": dict(agent.quality),
         "waypoints": columns,
     }
@@ -143,12 +153,8 @@ def agent_from_dict(entry: Mapping[str, Any]) -> Agent:
     for key, values in columns.items():
         if len(values) != count:
             raise ScenarioError(f"{where}: waypoints.{key} has {len(values)} values, t_s has {count}")
-    arrays = {k: np.array(columns[k], dtype=np.float64) for k in Waypoints.FLOATS}
-    visible = columns.get("visible")
     waypoints = Waypoints(
-        **arrays,
-        observed=np.array(columns["observed"], dtype=bool),
-        visible=None if visible is None else np.array(visible, dtype=bool),
+        **{k: np.array(v, dtype=bool if k in ("observed", "visible") else np.float64) for k, v in columns.items()}
     )
     problem = waypoints.problem()
     if problem is not None:
@@ -163,5 +169,14 @@ def agent_from_dict(entry: Mapping[str, Any]) -> Agent:
         rear_axle_offset_m=float(entry["rear_axle_offset_m"]),
         color=entry["color"],
         confidence=float(entry["confidence"]),
+        doubts=_doubts_of(entry),
         quality=entry["quality"],
     )
+
+
+def _doubts_of(entry: Mapping[str, Any]) -> tuple[Doubt, ...]:
+    """Read the doubts of an agent; before there were any, `quality` named the limits that its motion breaks."""
+    if "doubts" in entry:
+        return tuple(Doubt.from_dict(doubt) for doubt in entry["doubts"])
+    flags = entry["quality"].get("flags")
+    return tuple(Doubt(str(flag), f"breaks the limit of {flag}") for flag in flags) if isinstance(flags, list) else ()

@@ -20,16 +20,17 @@ def shifted_in_time(agent: Agent, seconds: float) -> Waypoints:
     """
     moved = replace(agent.waypoints, t_s=agent.waypoints.t_s + seconds)
     first = int(np.searchsorted(moved.t_s, 0.0))
-    kept = _rows(moved, np.arange(first, len(moved)))
+    kept = moved.take(np.arange(first, len(moved)))
     if first == 0 or first == len(moved) or moved.t_s[first] == 0.0:
         return kept
     at_start = agent.at(-seconds)
     start = {k: getattr(at_start, k) for k in ("x_m", "y_m", "z_m", "yaw_rad", "speed_mps")}
     start["t_s"] = np.zeros(1)
-    start["sigma_xy_m"] = np.interp([0.0], moved.t_s, moved.sigma_xy_m)
-    columns = {k: np.concatenate([start[k], getattr(kept, k)]) for k in Waypoints.FLOATS}
-    seen = moved.observed[first - 1 : first] & moved.observed[first : first + 1]
-    return Waypoints(**columns, observed=np.concatenate([seen, kept.observed]))
+    for k in moved.columns():
+        if k.startswith("sigma"):
+            start[k] = np.interp([0.0], moved.t_s, getattr(moved, k))
+    start["observed"] = moved.observed[first - 1 : first] & moved.observed[first : first + 1]
+    return Waypoints(**{k: np.concatenate([v, getattr(kept, k)]) for k, v in start.items()})
 
 
 def sped_up(w: Waypoints, factor: float) -> Waypoints:
@@ -69,7 +70,3 @@ def chords(w: Waypoints) -> tuple[Array, Array]:
     yaw = np.unwrap(w.yaw_rad)
     turn, mean = np.diff(yaw), (yaw[1:] + yaw[:-1]) / 2
     return np.diff(w.x_m) * np.cos(mean) + np.diff(w.y_m) * np.sin(mean), turn
-
-
-def _rows(w: Waypoints, rows: NDArray[np.intp]) -> Waypoints:
-    return Waypoints(**{k: getattr(w, k)[rows] for k in (*Waypoints.FLOATS, "observed")})

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
+from log2sim.datatypes import Doubt
 from log2sim.geometry import Array
 
 # Beyond these a vehicle's motion is infeasible for Waymax (Gulino et al., 2023).
@@ -34,3 +37,8 @@ def broken_limits(t_s: Array, acceleration_mps2: Array, yaw_rad: Array, curvatur
         "jerk": (jerk, MAX_JERK_MPS3),
     }
     return tuple(name for name, (values, limit) in worst.items() if values.max(initial=0.0) > limit)
+
+
+def limit_doubts(names: Iterable[str]) -> tuple[Doubt, ...]:
+    """Make doubts of the limits that a motion breaks, by their names from `broken_limits`."""
+    return tuple(Doubt(name, f"no vehicle has its {name.replace('_', ' ')}") for name in names)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import CATEGORIES, GROUPS, Agent
+from log2sim.datatypes import CATEGORIES, GROUPS, MIN_TRUSTED_CONFIDENCE, Agent
 from log2sim.evaluation.metrics.align import StateTable
 from log2sim.evaluation.metrics.calibration import normalized_errors, reliability
 from log2sim.evaluation.metrics.comparison import Comparison
@@ -22,9 +22,6 @@ RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0), (50.0, np.inf))
 MAX_WRONG_SHARE = 0.2
 """An agent is wrong when more of its ticks are. Trackers are scored alike: "mostly tracked" is 80 % of a life (Wu and
 Nevatia, CVPR 2006; Li, Huang, Nevatia, CVPR 2009)."""
-
-MIN_TRUSTED_CONFIDENCE = 0.5
-"""Agents below it are doubted: by their confidence they are more likely wrong than right."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +36,8 @@ class JudgedAgents:
     confidence : (B,) float64
     reasons : tuple of tuple of str
         Why the scenario doubts each agent; empty where it does not.
+    doubted : (B, T) bool
+        When it does.
     sigma_m : (B, T) float64, m
         Standard deviation of the position for each axis.
     """
@@ -48,12 +47,8 @@ class JudgedAgents:
     wrong: Mask
     confidence: Array
     reasons: tuple[tuple[str, ...], ...]
+    doubted: Mask
     sigma_m: Array
-
-    @property
-    def doubted(self) -> Mask:
-        """Mark (B,) the agents that the scenario doubts."""
-        return np.array([bool(r) for r in self.reasons], dtype=bool)
 
 
 def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: StateTable | None) -> dict[str, Any]:
@@ -81,6 +76,7 @@ def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: Sta
         wrong=verdicts.wrong,
         confidence=np.array([a.confidence for a in agents], dtype=np.float64),
         reasons=tuple(doubts(a) for a in agents),
+        doubted=np.array([doubted_at(a, ticks_s) for a in agents], dtype=bool).reshape(len(agents), len(ticks_s)),
         sigma_m=np.stack(sigma) if sigma else np.zeros((0, len(ticks_s))),
     )
     everything = np.ones_like(verdicts.judged)
@@ -96,9 +92,15 @@ def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: Sta
 
 
 def doubts(agent: Agent) -> tuple[str, ...]:
-    """Name the reasons for which a scenario doubts an agent: its flags, and a confidence below one half."""
+    """Name the reasons for which a scenario doubts an agent: its doubts, and a confidence below one half."""
     low = ("confidence",) if agent.confidence < MIN_TRUSTED_CONFIDENCE else ()
-    return (*low, *(str(flag) for flag in agent.quality.get("flags") or ()))
+    return (*low, *dict.fromkeys(doubt.flag for doubt in agent.doubts))
+
+
+def doubted_at(agent: Agent, t_s: Array) -> Mask:
+    """Return whether a scenario doubts an agent at times (T,)."""
+    low = np.full(len(t_s), agent.confidence < MIN_TRUSTED_CONFIDENCE)
+    return np.asarray(np.any([low, *(doubt.holds(t_s) for doubt in agent.doubts)], axis=0))
 
 
 def _present(j: JudgedAgents, column: NDArray[np.str_], names: Iterable[str]) -> list[str]:
@@ -130,8 +132,7 @@ def _figures(j: JudgedAgents, selected: Mask) -> dict[str, Any]:
     """Count the selected judged ticks and their agents, and the wrong and doubted ones among them."""
     v, ticks = j.verdicts, j.verdicts.judged & selected
     wrong_agents, right_agents = _wrong_agents(ticks, j.wrong), ticks.any(axis=1) & ~_wrong_agents(ticks, j.wrong)
-    doubted = j.doubted
-    at_doubted = _rows(doubted, ticks)
+    doubted: Mask = np.asarray((j.doubted & ticks).any(axis=1))
     matched = ticks & (v.matched >= 0)
     return {
         "agents": int(ticks.any(axis=1).sum()),
@@ -141,8 +142,8 @@ def _figures(j: JudgedAgents, selected: Mask) -> dict[str, Any]:
         **{name: _share(ticks, mask) for name, mask in v.measures.items()},
         "wrong": _share(ticks, j.wrong),
         "doubted": {
-            "wrong_ticks": _mean(at_doubted[ticks & j.wrong]),
-            "right_ticks": _mean(at_doubted[ticks & ~j.wrong]),
+            "wrong_ticks": _mean(j.doubted[ticks & j.wrong]),
+            "right_ticks": _mean(j.doubted[ticks & ~j.wrong]),
             "wrong_agents": _mean(doubted[wrong_agents]),
             "right_agents": _mean(doubted[right_agents]),
         },

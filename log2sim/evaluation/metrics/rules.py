@@ -75,7 +75,7 @@ def correctness_rules(max_wrong_share: float, min_confidence: float) -> dict[str
         "wrong_class": "the matched object, or the nearest within the gate, has another category; no reason to be wrong",
         "wrong": f"at a tick, any of {', '.join(MEASURES)}; of agents, and likewise for each measure, more than "
         f"{max_wrong_share:.0%} of the ticks",
-        "doubted": f"the scenario gives the agent a flag or a confidence below {min_confidence:g}",
+        "doubted": f"the scenario doubts the agent at the tick, or gives it a confidence below {min_confidence:g}; of agents, at any tick",
         "sigma": "nees: mean of squared position errors of matched ticks over two times the squared sigma, 1 expected; "
         "median, 0.69 expected; within_95: share inside of the 95 % circle, 0.95 expected",
     }

@@ -1,0 +1,50 @@
+"""Doubts: what speaks against an agent as it was reconstructed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import Array
+
+MIN_TRUSTED_CONFIDENCE = 0.5
+"""Agents below it are doubtful: by their confidence they are more likely wrong than right."""
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """One reason to doubt an agent.
+
+    Attributes
+    ----------
+    flag : str
+        Short name of the reason, one of those in README, such as "passes_through".
+    reason : str
+        In words for people, such as "passes through car-22 at 1.2 s".
+    start_s, end_s : float or None, s
+        When it holds; None for the whole life of the agent.
+    """
+
+    flag: str
+    reason: str
+    start_s: float | None = None
+    end_s: float | None = None
+
+    def holds(self, t_s: Array) -> NDArray[np.bool_]:
+        """Return whether it holds at times (T,)."""
+        start = -np.inf if self.start_s is None else self.start_s
+        end = np.inf if self.end_s is None else self.end_s
+        return np.asarray((t_s >= start) & (t_s <= end))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the entry in a document of `schemas/scenario-1.json`."""
+        return {"flag": self.flag, "reason": self.reason, "start_s": self.start_s, "end_s": self.end_s}
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any]) -> Doubt:
+        """Read an entry that keeps the schema."""
+        return cls(entry["flag"], entry["reason"], entry.get("start_s"), entry.get("end_s"))
