@@ -12,6 +12,7 @@ from log2sim.agents.candidate import Timeline, confirm
 from log2sim.agents.duplicates import suppress_duplicates, trim_ego_overlap
 from log2sim.agents.ego import ego_agent, ego_path
 from log2sim.agents.estimate import estimate_agents
+from log2sim.agents.heading.decide import decide_headings
 from log2sim.agents.scenario_of import camera_entries, provenance_of, scenario_of
 from log2sim.agents.simplify import simplify
 from log2sim.config import Config
@@ -209,8 +210,8 @@ def second_pass(run: Run, observations: Observations) -> Result:
             min_life_s=config.track.min_life_s,
         )
     with run.clock.stage("smooth"):
-        path = ego_path(log, run.schedule)
-        candidates = estimate_agents(tracks, observations.obstacles, timeline, path, smooth=config.smooth.enabled)
+        candidates = estimate_agents(tracks, observations.obstacles, timeline, smooth=config.smooth.enabled)
+        candidates = decide_headings(candidates, ego_path(log, run.schedule))
         ego = ego_agent(log, timeline, run.poses.origin)
         agents = trim_ego_overlap(suppress_duplicates(confirm(candidates), ego), ego)
         # Without an ego the agents' waypoints alone tell the ticks, so all of them stay.

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from worlds import Solid, scan, standing
 
-from log2sim.agents.box_votes import heading_log_odds, independent, mean_box_axis, typical_box_size, weighted_median
+from log2sim.agents.box_votes import independent, mean_box_axis, typical_box_size, weighted_median
 from log2sim.agents.confirmation import agent_confidence, image_confidence, is_confirmed, sweep_confidence
+from log2sim.agents.heading.box_headings import heading_log_odds
 from log2sim.agents.size import moving_geometry, static_geometry
 from log2sim.datatypes import Boxes3D, EgoVehicle, Log, Measurements, Track
 from log2sim.geometry import NS_PER_S, PoseTrack, rotation_from_rpy, transform, wrap_angle

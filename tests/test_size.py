@@ -9,7 +9,7 @@ import pytest
 from worlds import measured_row, rows_at, scan, standing
 
 from log2sim.agents.size import moving_geometry, static_geometry
-from log2sim.agents.standing import is_static, parked_heading
+from log2sim.agents.standing import is_static
 from log2sim.datatypes import TYPICAL_SIZE_M, Measurements, Track
 from log2sim.geometry import rotation_from_rpy
 from log2sim.perception.box_fitting import rotate
@@ -227,34 +227,3 @@ def test_moving_without_points_keeps_the_measured_places():
     np.testing.assert_array_equal(shape.xy_m, track.measurements.center_m[:, :2])
     np.testing.assert_array_equal(shape.covariance, track.measurements.covariance)
     np.testing.assert_allclose(shape.size_m, TYPICAL_SIZE_M["car"])
-
-
-# Headings of what stands
-
-
-def path(x0, y0, heading, count=20, step_m=1.0):
-    k = np.arange(count)[:, None] * step_m
-    return np.hstack([[x0, y0] + k * [np.cos(heading), np.sin(heading)], np.full((count, 1), heading)])
-
-
-@pytest.mark.parametrize("yaw", [0.05, np.pi - 0.05])
-@pytest.mark.parametrize(("left_m", "with_it"), [(-3.0, True), (-0.5, True), (4.0, False)])
-@pytest.mark.parametrize("turn", [0.0, 1.0, -2.5])
-def test_traffic_keeps_right_whatever_way_the_box_was_fitted(yaw, left_m, with_it, turn):
-    """Right of a path eastward points east, clearly left of it points west."""
-    flow = path(0.0, 0.0, 0.0)
-    flow = np.column_stack([rotate(flow[:, :2], turn), flow[:, 2] + turn])
-    xy = rotate(np.array([10.0, left_m]), turn)
-    found = parked_heading(yaw + turn, xy, flow)
-    assert np.cos(found - turn) * (1 if with_it else -1) > 0.9
-    assert apart(found, yaw + turn) < 1e-9
-
-
-def test_without_traffic_nearby_a_heading_stays_as_it_is():
-    for flow in (np.zeros((0, 3)), path(500.0, 0.0, 0.0), path(0.0, 0.0, np.pi / 2)):
-        assert parked_heading(3.0, np.array([10.0, -2.0]), flow) == pytest.approx(3.0)
-
-
-def test_the_nearer_path_has_more_say():
-    flow = np.vstack([path(0.0, 3.0, 0.0), path(20.0, -12.0, np.pi)])
-    assert np.cos(parked_heading(0.0, np.array([10.0, 0.5]), flow)) > 0.9

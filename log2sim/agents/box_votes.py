@@ -1,4 +1,4 @@
-"""What the boxes of a 3D detector say about a whole track: size, axis, center, and which end is the front."""
+"""What the boxes of a 3D detector say about a whole track: size, axis and center."""
 
 from __future__ import annotations
 
@@ -10,10 +10,6 @@ from log2sim.perception.box_completion import box_sigma
 
 # Errors of one detector about one object are alike at neighboring ticks: correlation between any two of them.
 TICK_CORRELATION = 0.5
-# A probability nearer to 1 is not believed: networks are surer than right.
-MAX_HEADING_SCORE = 0.99
-# A box turned farther than this from the axis of the object says nothing about its front.
-MIN_AXIS_COS = 0.7
 
 
 def independent(count: int) -> float:
@@ -47,23 +43,6 @@ def mean_box_axis(m: BoxEvidence) -> float | None:
         return None
     weight, doubled = box_sigma(m.points[rows]) ** -2, 2 * m.box_yaw_rad[rows]
     return float(np.arctan2(weight @ np.sin(doubled), weight @ np.cos(doubled))) / 2
-
-
-def heading_log_odds(m: BoxEvidence, yaw_rad: float) -> float:
-    """Return the log-odds that the object of a track points along a yaw rather than backward; 0 without boxes.
-
-    Notes
-    -----
-    The sum of the log-odds of all ticks, scaled down to that of as many independent ones (`independent`).
-    """
-    rows = np.flatnonzero(np.isfinite(m.box_yaw_rad))
-    along = np.cos(m.box_yaw_rad[rows] - yaw_rad)
-    rows, along = rows[np.abs(along) >= MIN_AXIS_COS], along[np.abs(along) >= MIN_AXIS_COS]
-    if len(rows) == 0:
-        return 0.0
-    p = np.clip(m.heading_score[rows], 0.5, MAX_HEADING_SCORE)
-    votes = np.sign(along) * np.log(p / (1 - p))
-    return float(votes.mean()) * independent(len(rows))
 
 
 def weighted_median(values: Array, weight: Array) -> float:

@@ -9,9 +9,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.agents.box_votes import heading_log_odds
 from log2sim.agents.candidate import REAR_AXLE_SHARE, AgentCandidate, Timeline, candidate_of
 from log2sim.agents.confirmation import SAME_MOMENT_S
+from log2sim.agents.heading.box_headings import heading_log_odds
 from log2sim.agents.lidar_tracking import BoxState, LidarMatch, track_with_lidar
 from log2sim.agents.size import TrackGeometry, moving_geometry
 from log2sim.agents.smooth.feasibility import limit_doubts

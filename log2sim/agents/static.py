@@ -6,33 +6,20 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from log2sim.agents.box_votes import heading_log_odds
 from log2sim.agents.candidate import AgentCandidate, Timeline, candidate_of
 from log2sim.agents.lidar_tracking import BoxState, track_with_lidar
 from log2sim.agents.size import static_geometry
-from log2sim.agents.standing import Side, parked_heading
-from log2sim.datatypes import GROUP_OF, Obstacles, Track, Waypoints
-from log2sim.geometry import Array
+from log2sim.datatypes import Obstacles, Track, Waypoints
 
 
-def static_candidate(
-    track: Track, obstacles: Sequence[Obstacles | None], timeline: Timeline, traffic_flow: Array, side: Side
-) -> AgentCandidate:
+def static_candidate(track: Track, obstacles: Sequence[Obstacles | None], timeline: Timeline) -> AgentCandidate:
     """Make an agent with one pose, at the ticks of its track and wherever LiDAR points match its box.
 
-    Parameters
-    ----------
-    traffic_flow : (K, 3) float64
-        x, y and heading of moving traffic, see `parked_heading`.
-    side : Side
-        Of the road that traffic keeps to.
+    Its yaw is known up to half a turn.
     """
     geometry = static_geometry(track)
     xy, z = geometry.xy_m[0], float(np.median(geometry.z_m))
     yaw = 0.0 if geometry.yaw_rad is None else float(np.nan_to_num(geometry.yaw_rad))
-    follows_traffic = GROUP_OF[track.category] in ("vehicle", "two_wheeler")
-    flow = traffic_flow if follows_traffic else np.zeros((0, 3))
-    yaw = parked_heading(yaw, xy, flow, side=side, log_odds=heading_log_odds(track.measurements, yaw))
     start_ns = int(timeline.t_ns[track.tick[0]])
     box = BoxState(start_ns, xy, np.zeros(2), yaw, geometry.size_m, z - geometry.size_m[2] / 2)
     others = np.setdiff1d(np.arange(len(timeline.t_ns)), track.tick).tolist()

@@ -1,0 +1,1 @@
+"""Which end of a vehicle is its front."""
