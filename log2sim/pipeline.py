@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.agents.candidate import Timeline, confirm
-from log2sim.agents.duplicates import suppress_duplicates, trim_ego_overlap
+from log2sim.agents.candidate import Timeline
 from log2sim.agents.ego import ego_agent, ego_path
 from log2sim.agents.estimate import estimate_agents
 from log2sim.agents.heading.decide import decide_headings
+from log2sim.agents.plausibility.judge import judge
 from log2sim.agents.scenario_of import camera_entries, provenance_of, scenario_of
 from log2sim.agents.simplify import simplify
 from log2sim.config import Config
@@ -213,7 +213,9 @@ def second_pass(run: Run, observations: Observations) -> Result:
         candidates = estimate_agents(tracks, observations.obstacles, timeline, smooth=config.smooth.enabled)
         candidates = decide_headings(candidates, ego_path(log, run.schedule))
         ego = ego_agent(log, timeline, run.poses.origin)
-        agents = trim_ego_overlap(suppress_duplicates(confirm(candidates), ego), ego)
+    with run.clock.stage("judge"):
+        judged = judge(candidates, ego)
+        agents = [candidate.agent for candidate in judged]
         # Without an ego the agents' waypoints alone tell the ticks, so all of them stay.
         agents = simplify(agents) if ego is not None else agents
     if ego is None and not agents:

@@ -9,6 +9,7 @@ import pytest
 
 from log2sim.agents.candidate import AgentCandidate
 from log2sim.agents.duplicates import suppress_duplicates, trim_ego_overlap
+from log2sim.agents.naming import name_agents
 from log2sim.datatypes import Agent, Waypoints
 
 
@@ -22,14 +23,22 @@ def agent(x_m, y_m=0.0, yaw=0.0, category="car", size=(4.4, 1.8, 1.5), t=(0.0, 4
     return Agent("", category, size, waypoints)
 
 
+def candidate(built, evidence=1.0):
+    """A confirmed candidate; duplicates are judged without its track."""
+    return AgentCandidate(built, evidence, True, None, None)
+
+
+def kept(*built, ego=None):
+    named = name_agents(suppress_duplicates([candidate(a, e) for a, e in built], ego))
+    return [c.agent for c in named]
+
+
 def names(*built, ego=None):
-    return [a.id for a in suppress_duplicates([AgentCandidate(a, e, True) for a, e in built], ego)]
+    return [a.id for a in kept(*built, ego=ego)]
 
 
 def test_of_two_in_one_place_the_one_with_more_evidence_stays():
-    left = suppress_duplicates(
-        [AgentCandidate(agent(10.0), 3.0, True), AgentCandidate(agent(10.8, size=(5.0, 1.9, 1.6)), 9.0, True)]
-    )
+    left = kept((agent(10.0), 3.0), (agent(10.8, size=(5.0, 1.9, 1.6)), 9.0))
     assert [a.size_m[0] for a in left] == [5.0]
     assert left[0].id == "car-1"
 
@@ -37,16 +46,14 @@ def test_of_two_in_one_place_the_one_with_more_evidence_stays():
 def test_neighbors_bumper_to_bumper_both_stay_and_are_numbered_by_their_start():
     assert names((agent(15.0), 9.0), (agent(10.3), 3.0)) == ["car-1", "car-2"]
     later = replace(agent(30.0).waypoints, t_s=np.linspace(1.0, 4.0, 5))
-    ordered = suppress_duplicates(
-        [AgentCandidate(replace(agent(30.0), waypoints=later), 9.0, True), AgentCandidate(agent(50.0), 1.0, True)]
-    )
+    ordered = kept((replace(agent(30.0), waypoints=later), 9.0), (agent(50.0), 1.0))
     assert [a.waypoints.x_m[0] for a in ordered] == [50.0, 30.0]
 
 
-@pytest.mark.parametrize(("y_m", "kept"), [(0.3, 0), (3.5, 1)])
-def test_what_shares_the_place_of_the_ego_is_dropped(y_m, kept):
+@pytest.mark.parametrize(("y_m", "count"), [(0.3, 0), (3.5, 1)])
+def test_what_shares_the_place_of_the_ego_is_dropped(y_m, count):
     ego = agent(0.0, speed=8.0)
-    assert len(names((agent(1.0, y_m, yaw=0.8, speed=8.0), 9.0), ego=ego)) == kept
+    assert len(names((agent(1.0, y_m, yaw=0.8, speed=8.0), 9.0), ego=ego)) == count
 
 
 def test_those_who_were_there_at_different_times_share_a_place():
@@ -59,11 +66,11 @@ def test_ways_that_cross_are_no_doubles():
     assert len(names((crossing, 5.0), (across, 4.0))) == 2
 
 
-@pytest.mark.parametrize(("apart_m", "kept"), [(0.2, 1), (0.5, 2)])
-def test_people_are_doubles_only_where_they_stand_in_each_other(apart_m, kept):
+@pytest.mark.parametrize(("apart_m", "count"), [(0.2, 1), (0.5, 2)])
+def test_people_are_doubles_only_where_they_stand_in_each_other(apart_m, count):
     body = (0.7, 0.6, 1.75)
     pair = [(agent(x, category="pedestrian", size=body), 1.0) for x in (5.0, 5.0 + apart_m)]
-    assert len(names(*pair)) == kept
+    assert len(names(*pair)) == count
 
 
 def test_a_person_on_the_back_seat_is_not_another_agent_beside_the_car():
@@ -76,23 +83,27 @@ def passing(y_m):
     return agent(-10.0, y_m, speed=2.5)
 
 
+def cut_at(ego, *built):
+    return [c.agent for c in trim_ego_overlap([candidate(a) for a in built], ego)]
+
+
 def test_a_way_that_ends_in_the_ego_is_cut_where_it_enters():
     ego = agent(0.0)
-    (cut,) = trim_ego_overlap([passing(0.3)], ego)
+    (cut,) = cut_at(ego, passing(0.3))
     # Both are 4.4 m long: they meet when the centers are that far apart, at 2.24 s; waypoints stand every second.
     assert cut.waypoints.t_s.tolist() == [0.0, 1.0, 2.0]
     assert cut.waypoints.x_m.tolist() == [-10.0, -7.5, -5.0]
     backward = replace(passing(0.3), waypoints=replace(passing(0.3).waypoints, x_m=passing(0.3).waypoints.x_m[::-1]))
-    assert trim_ego_overlap([backward], ego)[0].waypoints.t_s.tolist() == [2.0, 3.0, 4.0]
+    assert cut_at(ego, backward)[0].waypoints.t_s.tolist() == [2.0, 3.0, 4.0]
 
 
 @pytest.mark.parametrize("y_m", [1.85, -2.5])
 def test_who_passes_beside_the_ego_keeps_the_whole_way(y_m):
-    (kept,) = trim_ego_overlap([passing(y_m)], agent(0.0))
-    assert kept.waypoints.t_s.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    (whole,) = cut_at(agent(0.0), passing(y_m))
+    assert whole.waypoints.t_s.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
 
 
 def test_without_an_ego_and_for_what_stands_nothing_is_cut():
-    assert trim_ego_overlap([passing(0.0)], None)[0].waypoints.t_s[-1] == 4.0
+    assert cut_at(None, passing(0.0))[0].waypoints.t_s[-1] == 4.0
     parked = replace(agent(3.0), static=True)
-    assert trim_ego_overlap([parked], agent(0.0))[0] is parked
+    assert cut_at(agent(0.0), parked)[0] is parked

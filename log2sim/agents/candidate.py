@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +39,7 @@ class Timeline:
 
 @dataclass(frozen=True, eq=False)
 class AgentCandidate:
-    """An agent made of one track, before duplicates are removed.
+    """An agent made of one track, with what it is made of.
 
     Attributes
     ----------
@@ -59,6 +59,10 @@ class AgentCandidate:
     confirmed: bool
     track: Track
     geometry: TrackGeometry
+
+    def doubted(self, doubts: Sequence[Doubt]) -> Self:
+        """Return the candidate with more doubts of its agent."""
+        return replace(self, agent=replace(self.agent, doubts=(*self.agent.doubts, *doubts))) if doubts else self
 
 
 def candidate_of(

@@ -20,31 +20,22 @@ SAMPLES = 12
 TOUCHING = 0.05
 
 
-def suppress_duplicates(built: Sequence[AgentCandidate], ego: Agent | None = None) -> list[Agent]:
-    """Keep, of the agents that overlap, the one with the most evidence, and none that overlaps the ego.
-
-    The kept ones are sorted by their first time and named by category.
-    """
+def suppress_duplicates(built: Sequence[AgentCandidate], ego: Agent | None = None) -> list[AgentCandidate]:
+    """Keep, of the candidates that overlap, the one with the most evidence, and none that overlaps the ego."""
     taken = [ego] if ego is not None else []
-    kept: list[Agent] = []
+    kept: list[AgentCandidate] = []
     for candidate in sorted(built, key=lambda b: -b.evidence):
-        if not any(_are_duplicates(candidate.agent, other) for other in (*taken, *kept)):
-            kept.append(candidate.agent)
-    agents = sorted(kept, key=lambda a: (float(a.waypoints.t_s[0]), float(a.waypoints.x_m[0])))
-    count: dict[str, int] = {}
-    named = []
-    for agent in agents:
-        count[agent.category] = count.get(agent.category, 0) + 1
-        named.append(replace(agent, id=f"{agent.category}-{count[agent.category]}"))
-    return named
+        if not any(_are_duplicates(candidate.agent, other) for other in (*taken, *(k.agent for k in kept))):
+            kept.append(candidate)
+    return kept
 
 
-def trim_ego_overlap(agents: Sequence[Agent], ego: Agent | None) -> list[Agent]:
+def trim_ego_overlap(built: Sequence[AgentCandidate], ego: Agent | None) -> list[AgentCandidate]:
     """Trim the beginnings and ends of trajectories that overlap the box of the ego; static agents stay as they are.
 
     There the sensors of the ego see too little of an agent to locate it.
     """
-    return list(agents) if ego is None else [_outside(a, ego) for a in agents]
+    return list(built) if ego is None else [replace(c, agent=_outside(c.agent, ego)) for c in built]
 
 
 def _outside(agent: Agent, ego: Agent) -> Agent:

@@ -21,6 +21,9 @@ from log2sim.cli.options import (
     say,
 )
 
+# Doubtful agents that the terminal names; the report has all.
+MAX_NAMED_DOUBTS = 5
+
 
 def reconstruct(
     log: LogPath,
@@ -96,11 +99,29 @@ def reconstruct(
     for note in unused_records(result.report):
         say(f"note: {note}", quiet=quiet)
     counts = result.report["agents"]
+    for line in doubt_lines(counts):
+        say(line, quiet=quiet)
     say(
         f"{out}: {counts['total']} agents ({counts['static']} static) over {result.scenario.duration_s:.1f} s, "
         f"{result.report['ticks_per_second']:.1f} ticks/s",
         quiet=quiet,
     )
+
+
+def doubt_lines(counts: dict[str, Any]) -> list[str]:
+    """Say how many agents are doubtful and why the first ones are, from the part `agents` of a report; no line without any."""
+    doubtful = {name: doubts for name, doubts in counts["doubtful"].items() if name != "ego"}
+    named = [f"{name} ({_why(doubts)})" for name, doubts in list(doubtful.items())[:MAX_NAMED_DOUBTS]]
+    more = [f"and {len(doubtful) - len(named)} more"] if len(doubtful) > len(named) else []
+    verb = "is" if len(doubtful) == 1 else "are"
+    lines = (
+        [f"{len(doubtful)} of {counts['total']} agents {verb} doubtful: {', '.join([*named, *more])}"] if named else []
+    )
+    return [f"the ego is doubtful: {_why(counts['doubtful']['ego'])}", *lines] if "ego" in counts["doubtful"] else lines
+
+
+def _why(doubts: list[dict[str, Any]]) -> str:
+    return ", ".join(doubt["reason"] for doubt in doubts) if doubts else "low confidence"
 
 
 def pose_notes(poses: dict[str, Any]) -> list[str]:
