@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, counted, say
+from log2sim.cli.options import DropDoubtful, Overwrite, Quiet, ScenarioPath, counted, say
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Scenario
@@ -29,30 +29,38 @@ def edit(
     ] = None,
     remove: Annotated[Changes, typer.Option(metavar="A,B", help="Remove agents.")] = None,
     only: Annotated[Changes, typer.Option(metavar="A,B", help="Keep only these agents; the ego is 'ego'.")] = None,
+    drop_doubtful: DropDoubtful = False,
     strict: Annotated[bool, typer.Option("--strict", help="Exit 6 when a check fails.")] = False,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
     """Edit the agents of a scenario: their presence, timing, speed and lateral position.
 
-    All options but --out may be given several times. They are applied in this order: only, remove, speed, lateral, shift.
+    Options with values but --out may be given several times. They are applied in this order: only, remove, drop-doubtful,
+    speed, lateral, shift.
     """
-    from log2sim.datatypes import Scenario
+    from log2sim.datatypes import Scenario, list_doubtful
     from log2sim.documents import check_targets
     from log2sim.edit.apply import edit as run
+    from log2sim.edit.edits import DropDoubtful as Drop
 
     check_targets(out, overwrite=overwrite)
     loaded = Scenario.load(scenario)
     # A shift comes last: it may cut off waypoints before the start that other edits need.
     edits = [
         *_choices(loaded, only, remove),
+        *([Drop()] if drop_doubtful else []),
         *_motions({"speed": speed, "lateral": lateral, "shift": shift}),
     ]
     result = run(loaded, edits)
-    result.scenario.save(out)
+    edited = result.scenario
+    edited.save(out)
+    if drop_doubtful:
+        kept = {a.id for a in edited.agents}
+        gone = [a for a in loaded.doubtful if a.id not in kept]
+        say(f"left out as doubtful: {list_doubtful(gone) or 'none'}", quiet=quiet)
     for warning in result.warnings:
         say(f"warning: {warning}", quiet=quiet)
-    edited = result.scenario
     say(
         f"{out}: {counted(len(edits), 'edit')}, {counted(len(edited.agents), 'agent')} over {edited.duration_s:.1f} s, "
         f"{counted(len(result.warnings), 'warning')}",

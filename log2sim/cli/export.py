@@ -29,24 +29,30 @@ def export(
     ego: Annotated[
         str | None, typer.Option(metavar="AGENT", help="Agent to take as the ego, where the scenario has none.")
     ] = None,
+    doubtful: Annotated[
+        str, typer.Option(metavar="keep|drop", help="What to do with agents that the scenario itself doubts.")
+    ] = "keep",
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
     """Write a scenario in the format of a simulator or viewer."""
     from log2sim.datatypes import Scenario
-    from log2sim.export.checks import export_notes
-    from log2sim.export.exporters import Options, with_ego
+    from log2sim.export.checks import doubtful_note, export_notes
+    from log2sim.export.exporters import Options, with_doubtful, with_ego
     from log2sim.export.exporters import export as run
     from log2sim.logs.opening import open_log
 
     loaded = Scenario.load(scenario)
     if ego is not None:
         loaded = with_ego(loaded, ego)
+    chosen = with_doubtful(loaded, doubtful)
     opened = open_log(log) if log is not None else None
-    files = run(loaded, to, out, Options(revision, map, mode, opened), overwrite=overwrite)
+    files = run(chosen, to, out, Options(revision, map, mode, opened), overwrite=overwrite)
     for file in files:
         say(f"{file}: written", quiet=quiet)
-    notes = export_notes(loaded)
+    notes = export_notes(chosen)
+    if loaded.doubtful:
+        say(f"note: {doubtful_note(loaded, chosen)}", quiet=quiet)
     for note in notes[:MAX_NOTES]:
         say(f"note: {note}", quiet=quiet)
     if len(notes) > MAX_NOTES:

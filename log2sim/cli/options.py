@@ -14,6 +14,9 @@ from log2sim.registry import BUILT_IN
 LogPath = Annotated[Path, typer.Argument(metavar="LOG", help="Folder or file of a log.")]
 ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A scenario.json.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")]
+DropDoubtful = Annotated[
+    bool, typer.Option("--drop-doubtful", help="Leave out agents that the scenario itself doubts; the ego stays.")
+]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
 Format = Annotated[str, typer.Option(help=f"Log format: auto, {', '.join(BUILT_IN['log'])}.")]
 Sequence = Annotated[str | None, typer.Option(help="Sequence to open, when the folder has several.")]

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, say
+from log2sim.cli.options import DropDoubtful, Overwrite, Quiet, ScenarioPath, say
+
+if TYPE_CHECKING:
+    from log2sim.datatypes import Scenario
 
 
 def replay(
@@ -26,6 +29,10 @@ def replay(
         typer.Option(help="Behavior of the other agents: log (as recorded) or reactive (brake to avoid collisions)."),
     ] = "log",
     react: Annotated[str | None, typer.Option(metavar="ID,ID", help="Make only these agents reactive.")] = None,
+    confidence: Annotated[
+        float | None, typer.Option(metavar="MIN", help="Leave out agents with a lower confidence; the ego stays.")
+    ] = None,
+    drop_doubtful: DropDoubtful = False,
     simulator: Annotated[str, typer.Option(help="own, or carla: agents move in a CARLA server.")] = "own",
     host: Annotated[str | None, typer.Option(help="carla: address of the server, default 127.0.0.1.")] = None,
     port: Annotated[int | None, typer.Option(help="carla: port of the server, default 2000.", min=1, max=65535)] = None,
@@ -44,6 +51,8 @@ def replay(
     quiet: Quiet = False,
 ) -> None:
     """Simulate a scenario."""
+    from dataclasses import replace as changed
+
     from log2sim.cli.edit import ids_of
     from log2sim.cli.progress import progress
     from log2sim.datatypes import Scenario
@@ -63,13 +72,15 @@ def replay(
     limits = parse_limits(limit or ())
     loaded = Scenario.load(scenario)
     chosen = agents if react is None else list(ids_of(loaded, [react]))
+    kept, left_out = _trusted(loaded, confidence, drop_doubtful=drop_doubtful)
     policy = load_policy(ego) if ego is not None else None
     moved_by = external_simulator(simulator, host, port, map)
     with progress(quiet=quiet) as report_progress:
         result = run(
-            loaded, mode=mode, model=model, dt_s=dt, ego=policy, agents=chosen, host=moved_by,
+            kept, mode=mode, model=model, dt_s=dt, ego=policy, agents=chosen, host=moved_by,
             progress=lambda done, total: report_progress("replay", done, total),
         )  # fmt: skip
+    result = changed(result, left_out=left_out)
     if out is not None:
         result.save(out)
     say(summarize(result), quiet=quiet)
@@ -77,3 +88,16 @@ def replay(
         require_strict(result, limits)
     for broken in check_limits(result, limits):
         say(f"limit exceeded: {broken}", quiet=quiet)
+
+
+def _trusted(scenario: Scenario, confidence: float | None, *, drop_doubtful: bool) -> tuple[Scenario, dict[str, str]]:
+    """Return the scenario without the agents that are not wanted, and these with why."""
+    from log2sim.datatypes import say_confidence, why_doubtful
+
+    kept = scenario if confidence is None else scenario.trusted(confidence)
+    there = {a.id for a in kept.agents}
+    left_out = {a.id: say_confidence(a) for a in scenario.agents if a.id not in there}
+    if drop_doubtful:
+        left_out |= {a.id: why_doubtful(a) for a in kept.doubtful if a is not kept.ego}
+        kept = kept.without_doubtful()
+    return kept, left_out

@@ -5,6 +5,7 @@ from __future__ import annotations
 from log2sim.datatypes.agent import Agent
 from log2sim.datatypes.boxes3d import Boxes3D
 from log2sim.datatypes.categories import CATEGORIES, CATEGORY, GROUP_OF, GROUPS, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M
+from log2sim.datatypes.doubtful import list_doubtful, say_confidence, why_doubtful
 from log2sim.datatypes.doubts import MIN_TRUSTED_CONFIDENCE, Doubt
 from log2sim.datatypes.ignore_regions import IgnoreRegions, LabelView
 from log2sim.datatypes.labels import ImageLabels, ImageRegions, Labels
@@ -62,4 +63,7 @@ __all__ = [
     "Track",
     "Trajectory",
     "Waypoints",
+    "list_doubtful",
+    "say_confidence",
+    "why_doubtful",
 ]

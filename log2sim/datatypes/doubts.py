@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,11 @@ class Doubt:
         start = -np.inf if self.start_s is None else self.start_s
         end = np.inf if self.end_s is None else self.end_s
         return np.asarray((t_s >= start) & (t_s <= end))
+
+    def retimed(self, change: Callable[[float], float]) -> Doubt:
+        """Return the doubt of a trajectory whose times are put elsewhere by `change`, s to s."""
+        start_s, end_s = (None if t_s is None else change(t_s) for t_s in (self.start_s, self.end_s))
+        return replace(self, start_s=start_s, end_s=end_s)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry in a document of `schemas/scenario-1.json`."""

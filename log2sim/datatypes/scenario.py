@@ -15,7 +15,7 @@ from log2sim.datatypes.agent import Agent, agent_from_dict, agent_to_dict
 from log2sim.datatypes.ignore_regions import IgnoreRegions
 from log2sim.datatypes.log import MapFrame
 from log2sim.documents import check, read_json, write_json
-from log2sim.errors import ScenarioError
+from log2sim.errors import ConfigError, ScenarioError
 from log2sim.geometry import NS_PER_S, Array
 
 VERSION = 1
@@ -65,6 +65,27 @@ class Scenario:
     def others(self) -> tuple[Agent, ...]:
         """Return all agents except the ego."""
         return tuple(a for a in self.agents if a.id != EGO)
+
+    @property
+    def doubtful(self) -> tuple[Agent, ...]:
+        """Return the agents that are doubtful, see `Agent.is_doubtful`."""
+        return tuple(a for a in self.agents if a.is_doubtful)
+
+    def without_doubtful(self) -> Scenario:
+        """Return a copy without the doubtful agents; the ego stays."""
+        return replace(self, agents=tuple(a for a in self.agents if a.id == EGO or not a.is_doubtful))
+
+    def trusted(self, min_confidence: float) -> Scenario:
+        """Return a copy with the agents whose confidence is at least `min_confidence`, in [0, 1]; the ego stays.
+
+        Raises
+        ------
+        ConfigError
+            When `min_confidence` is no number from 0 to 1.
+        """
+        if not 0 <= min_confidence <= 1:
+            raise ConfigError(f"confidence: {min_confidence:g}, expected a number from 0 to 1")
+        return replace(self, agents=tuple(a for a in self.agents if a.id == EGO or a.confidence >= min_confidence))
 
     @property
     def digest(self) -> str:
@@ -118,7 +139,8 @@ class Scenario:
         for agent in self.agents:
             w = agent.waypoints
             w = replace(w, t_s=w.t_s + later_s, x_m=w.x_m + dx, y_m=w.y_m + dy, z_m=w.z_m + dz)
-            moved.append(replace(agent, waypoints=w))
+            doubts = tuple(doubt.retimed(lambda t_s: t_s + later_s) for doubt in agent.doubts)
+            moved.append(replace(agent, waypoints=w, doubts=doubts))
         return replace(self, t0_ns=other.t0_ns, map=other.map, agents=tuple(moved))
 
     def save(self, path: Path | str) -> None:

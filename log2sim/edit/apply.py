@@ -39,7 +39,7 @@ def edit(scenario: Scenario, edits: Sequence[Edit]) -> Edited:
     Parameters
     ----------
     scenario : Scenario
-    edits : sequence of Only, Remove, Speed, Lateral, Shift
+    edits : sequence of Only, Remove, DropDoubtful, Speed, Lateral, Shift
         Each kind of motion at most once for an agent.
 
     Returns

@@ -9,8 +9,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from log2sim.datatypes import Agent, Waypoints
-from log2sim.edit.motion import chords, parallel_fails, shifted_in_time, shifted_left, sped_up
+from log2sim.datatypes import EGO, Agent, Doubt, Waypoints
+from log2sim.edit.motion import (
+    chords,
+    doubts_shifted,
+    doubts_sped_up,
+    parallel_fails,
+    shifted_in_time,
+    shifted_left,
+    sped_up,
+)
 from log2sim.errors import ConfigError
 
 Agents = Mapping[str, Agent]
@@ -81,13 +89,34 @@ class Remove(_AgentEdit):
 
 
 @dataclass(frozen=True)
+class DropDoubtful(Edit):
+    """Remove the agents that the scenario itself doubts, see `Agent.is_doubtful`; the ego stays."""
+
+    kind: ClassVar[str] = "drop_doubtful"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """No ids: which agents it removes is decided by their doubts and confidence."""
+        return ()
+
+    def applied(self, agents: Agents) -> Agents:
+        """Return the agents that are not doubtful, and the ego."""
+        return {k: a for k, a in agents.items() if k == EGO or not a.is_doubtful}
+
+
+@dataclass(frozen=True)
 class _WaypointEdit(_AgentEdit):
     """A change to the waypoints of one agent; `visible` is dropped, since it is unknown at the new positions."""
 
     def applied(self, agents: Agents) -> Agents:
         """Replace the waypoints of the agent."""
         agent = agents[self.agent]
-        return {**agents, self.agent: replace(agent, waypoints=replace(self.moved(agent), visible=None))}
+        waypoints = replace(self.moved(agent), visible=None)
+        return {**agents, self.agent: replace(agent, waypoints=waypoints, doubts=self.doubts(agent))}
+
+    def doubts(self, agent: Agent) -> tuple[Doubt, ...]:
+        """Return the doubts of the agent after the edit: the same ones, unless it moves in time."""
+        return agent.doubts
 
     def moved(self, agent: Agent) -> Waypoints:
         """Return the waypoints of the agent after the edit."""
@@ -110,6 +139,10 @@ class Speed(_WaypointEdit):
         if agent.static:
             raise ConfigError(f"speed: agent '{agent.id}' is static and has no speed to change; leave it out")
         return sped_up(agent.waypoints, self.factor)
+
+    def doubts(self, agent: Agent) -> tuple[Doubt, ...]:
+        """Return the doubts at scaled times."""
+        return doubts_sped_up(agent, self.factor)
 
 
 @dataclass(frozen=True)
@@ -159,6 +192,10 @@ class Shift(_WaypointEdit):
                 f"{-self.seconds:g} s earlier; choose less, or remove the agent"
             )
         return w
+
+    def doubts(self, agent: Agent) -> tuple[Doubt, ...]:
+        """Return the doubts at shifted times."""
+        return doubts_shifted(agent, self.seconds)
 
 
 def _require(edit: _WaypointEdit, value: float, low: float, high: float, unit: str) -> None:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, Waypoints
+from log2sim.datatypes import Agent, Doubt, Waypoints
 from log2sim.geometry import Array
 
 MIN_PATH_MPS = 0.5  # slower waypoints do not define the curvature of a path
+OLD_TIME = "before it was moved in time"
+_NAMES_A_TIME = re.compile(r"\d s\b")
 
 
 def shifted_in_time(agent: Agent, seconds: float) -> Waypoints:
@@ -31,6 +35,30 @@ def shifted_in_time(agent: Agent, seconds: float) -> Waypoints:
             start[k] = np.interp([0.0], moved.t_s, getattr(moved, k))
     start["observed"] = moved.observed[first - 1 : first] & moved.observed[first : first + 1]
     return Waypoints(**{k: np.concatenate([v, getattr(kept, k)]) for k, v in start.items()})
+
+
+def doubts_shifted(agent: Agent, seconds: float) -> tuple[Doubt, ...]:
+    """Return the doubts of an agent that comes `seconds` later; none that held only before the scenario's start t = 0."""
+    moved = _retimed(agent.doubts, lambda t_s: t_s + seconds)
+    cut = (replace(d, start_s=None if d.start_s is None else max(d.start_s, 0.0)) for d in moved)
+    return tuple(d for d in cut if d.end_s is None or d.end_s >= 0.0)
+
+
+def doubts_sped_up(agent: Agent, factor: float) -> tuple[Doubt, ...]:
+    """Return the doubts of an agent that passes its waypoints `factor` times as fast from the first one on."""
+    begin_s = float(agent.waypoints.t_s[0])
+    return _retimed(agent.doubts, lambda t_s: begin_s + (t_s - begin_s) / factor)
+
+
+def _retimed(doubts: Sequence[Doubt], change: Callable[[float], float]) -> tuple[Doubt, ...]:
+    """Move the spans of doubts; a reason that names a time, which stays that of the source, says so."""
+    moved = (doubt.retimed(change) for doubt in doubts)
+    return tuple(
+        replace(d, reason=f"{d.reason}, {OLD_TIME}")
+        if _NAMES_A_TIME.search(d.reason) and OLD_TIME not in d.reason
+        else d
+        for d in moved
+    )
 
 
 def sped_up(w: Waypoints, factor: float) -> Waypoints:

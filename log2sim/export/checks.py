@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, Scenario
+from log2sim.datatypes import Agent, Scenario, list_doubtful
 from log2sim.errors import ScenarioError
 from log2sim.geometry import Array, bev_iou, box_corners_bev
 
@@ -50,6 +50,16 @@ def export_notes(scenario: Scenario) -> list[str]:
             " as in the scenario; a simulator with physics pushes them apart"
         )
     return found
+
+
+def doubtful_note(source: Scenario, exported: Scenario) -> str:
+    """Say how many agents of a scenario are doubtful, which, and whether the export has them."""
+    left_out = {a.id for a in source.agents} - {a.id for a in exported.agents}
+    gone = [a for a in source.doubtful if a.id in left_out]
+    there = [a for a in source.doubtful if a.id not in left_out]
+    counts = f"{len(gone)} of {len(source.agents)} agents left out as doubtful: {list_doubtful(gone)}" if gone else ""
+    kept = f"{len(there)} of {len(source.agents)} agents are doubtful: {list_doubtful(there)}" if there else ""
+    return "; ".join(part for part in (counts, kept) if part)
 
 
 def require_start_as_in_log(agents: Sequence[Agent], placed: Array) -> None:

@@ -59,17 +59,25 @@ class CommonRoad:
         for number, lane in enumerate(roads, start=1):
             root.append(_lanelet(lane, number))
         first = len(roads) + 1
-        table = [("commonroad_id", "agent", "category", "role"), (first, ego.id, ego.category, "planning problem")]
+        table = [
+            ("commonroad_id", "agent", "category", "role", "confidence", "doubts"),
+            (first, ego.id, ego.category, "planning problem", *_trust(ego)),
+        ]
         obstacles = []
         for number, agent in enumerate(scenario.others, start=first + 1):
             obstacle = _obstacle(agent, number, t_s)
             obstacles += [obstacle] if obstacle is not None else []
             role = obstacle.tag if obstacle is not None else "left out: not alive at any step"
-            table.append((number, agent.id, agent.category, role))
+            table.append((number, agent.id, agent.category, role, *_trust(agent)))
         root.extend(sorted(obstacles, key=lambda o: o.tag != "staticObstacle"))  # the schema wants these first
         root.append(_planning_problem(ego, first, step_times(t_s[0], ego.waypoints.t_s[-1], STEP_S)))
         xml_text.write(root, folder / f"{name}.xml")
         write_table(folder / "agents.csv", table)
+
+
+def _trust(agent: Agent) -> tuple[float, str]:
+    """Return the confidence of an agent and the reasons to doubt it."""
+    return agent.confidence, ", ".join(doubt.reason for doubt in agent.doubts)
 
 
 def _ego_and_clock(scenario: Scenario) -> tuple[Agent, Array]:

@@ -8,11 +8,23 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from log2sim.datatypes import Scenario
+from log2sim.datatypes import Agent, Scenario
 from log2sim.export.exporters import Options
 
-COLUMNS = ("t_s", "x_m", "y_m", "z_m", "yaw_rad", "speed_mps", "observed", "sigma_xy_m")
-HEADER = ("id", "category", *COLUMNS, "length_m", "width_m", "height_m", "static", "rear_axle_offset_m", "confidence")
+COLUMNS = (
+    "t_s",
+    "x_m",
+    "y_m",
+    "z_m",
+    "yaw_rad",
+    "speed_mps",
+    "observed",
+    "sigma_xy_m",
+    "sigma_yaw_rad",
+    "sigma_speed_mps",
+)
+ABOUT = ("length_m", "width_m", "height_m", "static", "rear_axle_offset_m", "confidence", "doubts")
+HEADER = ("id", "category", *COLUMNS, *ABOUT)
 
 # Texts that spreadsheets execute as a formula: they begin so and are no number.
 FORMULA = re.compile(r"\s*[=+\-@](?!\d+(\.\d+)?$)")
@@ -27,7 +39,10 @@ def write_table(file: Path, rows: Iterable[Sequence[Any]]) -> None:
 
 
 class Csv:
-    """`agents.csv`, ordered by agent and time; numbers in full precision."""
+    """`agents.csv`, ordered by agent and time; numbers in full precision.
+
+    Standard deviations that are unknown are empty. `doubts` holds the flags of the doubts that hold at the time.
+    """
 
     options: tuple[str, ...] = ()
     loses = (
@@ -42,10 +57,19 @@ class Csv:
 def _rows(scenario: Scenario) -> Iterator[Sequence[Any]]:
     yield HEADER
     for agent in scenario.agents:
+        w = agent.waypoints
         about = (*agent.size_m, int(agent.static), agent.rear_axle_offset_m, agent.confidence)
-        columns = [getattr(agent.waypoints, name).tolist() for name in COLUMNS]
-        columns[COLUMNS.index("observed")] = agent.waypoints.observed.astype(int).tolist()
-        yield from ((agent.id, agent.category, *row, *about) for row in zip(*columns))
+        known = {**w.columns(), "observed": w.observed.astype(int)}
+        columns = [known[name].tolist() if name in known else [""] * len(w) for name in COLUMNS]
+        for row, doubts in zip(zip(*columns), _doubts(agent)):
+            yield agent.id, agent.category, *row, *about, doubts
+
+
+def _doubts(agent: Agent) -> list[str]:
+    """List the flags of the doubts at each waypoint, separated by blanks."""
+    holds = [doubt.holds(agent.waypoints.t_s) for doubt in agent.doubts]
+    flags = [doubt.flag for doubt in agent.doubts]
+    return [" ".join(flag for flag, held in zip(flags, holds) if held[k]) for k in range(len(agent.waypoints))]
 
 
 EXPORTER = Csv()

@@ -127,6 +127,19 @@ def with_ego(scenario: Scenario, agent: str) -> Scenario:
     return replace(scenario, agents=agents)
 
 
+def with_doubtful(scenario: Scenario, choice: str) -> Scenario:
+    """Return a scenario with or without its doubtful agents: "keep" or "drop".
+
+    Raises
+    ------
+    ConfigError
+        For another choice.
+    """
+    if choice not in ("keep", "drop"):
+        raise ConfigError(f"--doubtful: '{choice}', expected keep or drop")
+    return scenario if choice == "keep" else scenario.without_doubtful()
+
+
 def _move_into(temporary: Path, folder: Path, *, overwrite: bool) -> tuple[Path, ...]:
     """Move all files of a folder into another, after checking that all may be written."""
     names = sorted(p.relative_to(temporary) for p in temporary.rglob("*") if p.is_file())

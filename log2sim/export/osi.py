@@ -28,7 +28,7 @@ class Osi:
     """`<time>_gt_<OSI>_<protobuf>_<frames>_<name>.osi`: one `GroundTruth` every 0.1 s, stamped with the time of the log.
 
     Parked vehicles are moving objects too, as in the standard. `source_reference` holds the id and category of each
-    agent.
+    agent, and what speaks against it.
     """
 
     options: tuple[str, ...] = ()
@@ -100,7 +100,9 @@ def _place(osi: Any, agent: Agent, move: SampledMotion, k: int) -> dict[str, Any
 
 
 def _identity(osi: Any, number: int, agent: Agent) -> dict[str, Any]:
-    reference = osi.ExternalReference(type=SOURCE, identifier=[agent.id, agent.category])
+    reference = osi.ExternalReference(
+        type=SOURCE, identifier=[agent.id, agent.category, *(d.reason for d in agent.doubts)]
+    )
     identity: dict[str, Any] = {"id": osi.Identifier(value=number), "source_reference": [reference]}
     if agent.color is not None:
         red, green, blue = (float(v) / 255 for v in agent.color["rgb"])

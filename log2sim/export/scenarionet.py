@@ -130,6 +130,7 @@ def _track(agent: Agent, move: SampledMotion, origin: Array) -> Value:
             "static": agent.static,
             "color": dict(agent.color) if agent.color is not None else None,
             "confidence": agent.confidence,
+            "doubts": [doubt.to_dict() for doubt in agent.doubts],
             "rear_axle_offset_m": agent.rear_axle_offset_m,
         },
     }

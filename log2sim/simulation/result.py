@@ -120,6 +120,8 @@ class Replay:
     agents : tuple of AgentReplay
     metrics : mapping
         As in `schemas/replay-1.json`.
+    left_out : mapping
+        Agents of the scenario's file that were left out before it was replayed: id and why.
     """
 
     scenario: str
@@ -130,6 +132,7 @@ class Replay:
     store_dt_s: float
     agents: tuple[AgentReplay, ...]
     metrics: Mapping[str, Any] = field(default_factory=dict)
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
     def agent(self, id: str) -> AgentReplay:
         """Return the agent with an id; `KeyError` when there is none."""
@@ -165,6 +168,7 @@ class Replay:
             "store_dt_s": self.store_dt_s,
             "agents": [_agent_to_dict(a) for a in self.agents],
             "metrics": dict(self.metrics),
+            "left_out": dict(self.left_out),
         }
 
     @classmethod
@@ -175,7 +179,8 @@ class Replay:
             raise ScenarioError(f"replay_version is {version!r}, expected {VERSION}; is this a replay file of log2sim?")
         check(document, "replay-1", ScenarioError)
         plain = ("scenario", "scenario_digest", "mode", "model", "dt_s", "store_dt_s", "metrics")
-        return cls(agents=tuple(_agent_from_dict(a) for a in document["agents"]), **{k: document[k] for k in plain})
+        agents = tuple(_agent_from_dict(a) for a in document["agents"])
+        return cls(agents=agents, left_out=document.get("left_out", {}), **{k: document[k] for k in plain})
 
 
 def to_scenario(replay: Replay, scenario: Scenario) -> Scenario:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from xml.etree.ElementTree import Element
@@ -108,6 +109,11 @@ def _add_properties(parent: Element, agent: Agent) -> None:
         PREFIX + "sigma_xy_m": " ".join(number(v, 4) for v in w.sigma_xy_m),
         PREFIX + "observed": "".join("1" if v else "0" for v in w.observed),
     }
+    for key in w.OPTIONAL_FLOATS:
+        if (column := getattr(w, key)) is not None:
+            values[PREFIX + key] = " ".join(number(v, 4) for v in column)
+    if agent.doubts:
+        values[PREFIX + "doubts"] = escaped(json.dumps([doubt.to_dict() for doubt in agent.doubts]))
     properties = element("Properties", parent)
     for name, value in values.items():
         element("Property", properties, name=name, value=value)

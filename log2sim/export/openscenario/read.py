@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from log2sim.datatypes import VERSION, MapFrame, Scenario
+from log2sim.datatypes import VERSION, MapFrame, Scenario, Waypoints
 from log2sim.errors import ConfigError, LogError, ScenarioError
 from log2sim.export.openscenario.entities import PREFIX, VEHICLE_DEFAULTS
 from log2sim.export.openscenario.trajectories import (
@@ -27,6 +27,7 @@ from log2sim.geometry import Array, wrap_angle
 CATEGORY_OF = {kind.category: category for category, kind in reversed(list(VEHICLE_DEFAULTS.items()))} | {
     "van": "car", "semitrailer": "truck", "trailer": "other", "tram": "other", "train": "other",
 }  # fmt: skip
+SIGMAS = ("sigma_xy_m", *Waypoints.OPTIONAL_FLOATS)
 EGO_NAMES = ("ego", "hero")
 
 
@@ -157,6 +158,7 @@ def _agent(
         "static": properties.get(PREFIX + "static", str(not np.ptp(vertices[:, 1:], axis=0).any()).lower()) == "true",
         "rear_axle_offset_m": offset_m,
         "confidence": require_number(properties.get(PREFIX + "confidence", "1"), f"{where}: property confidence"),
+        "doubts": _doubts(properties, where),
         "quality": {},
         "waypoints": _waypoints(vertices, properties, placement, (offset_m, height_m), where),
     }  # fmt: skip
@@ -170,6 +172,19 @@ def _category(body: Element) -> str:
     if body.tag == "Vehicle":
         return CATEGORY_OF.get(body.get("vehicleCategory", ""), "other")
     return "pedestrian" if body.tag == "Pedestrian" and body.get("pedestrianCategory") != "animal" else "other"
+
+
+def _doubts(properties: Mapping[str, str], where: str) -> list[Any]:
+    text = properties.get(PREFIX + "doubts")
+    if text is None:
+        return []
+    try:
+        doubts = json.loads(unescaped(text))
+    except (ValueError, RecursionError):
+        doubts = None
+    if not isinstance(doubts, list):
+        raise ScenarioError(f"{where}: property doubts is {text[:60]!r}, expected the list that an export writes")
+    return doubts
 
 
 def _color(properties: Mapping[str, str], where: str) -> Mapping[str, Any] | None:
@@ -196,14 +211,15 @@ def _waypoints(
     if speeds is not None and len(speeds) == 1:
         vertices = vertices[:1]
     exported = speeds is not None and len(speeds) == len(vertices)
-    sigma = _column(properties, "sigma_xy_m", where) if exported else None
+    sigmas = {key: _column(properties, key, where) if exported else None for key in SIGMAS}
     observed = properties.get(PREFIX + "observed", "") if exported else ""
     t, x, y, z, heading = vertices.T
     ahead_m, above_m = center_m
     centers = np.column_stack([x + ahead_m * np.cos(heading), y + ahead_m * np.sin(heading), z + above_m, heading])
     columns = dict(zip(("x_m", "y_m", "z_m", "yaw_rad"), placement.back(centers).T))
     columns |= {"t_s": t, "speed_mps": speeds if exported else speeds_of(vertices)}
-    columns["sigma_xy_m"] = sigma if sigma is not None and len(sigma) == len(t) else np.zeros(len(t))
+    columns["sigma_xy_m"] = np.zeros(len(t))
+    columns |= {key: sigma for key, sigma in sigmas.items() if sigma is not None and len(sigma) == len(t)}
     columns["yaw_rad"] = wrap_angle(columns["yaw_rad"])
     return {
         **{key: values.tolist() for key, values in columns.items()},

@@ -30,7 +30,7 @@ from foxglove_schemas_protobuf.TextPrimitive_pb2 import TextPrimitive
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from log2sim.datatypes import Agent
+from log2sim.datatypes import Agent, why_doubtful
 from log2sim.export.viewers.playback import (
     AgentSteps,
     CameraFrame,
@@ -109,6 +109,8 @@ def _box(t_ns: int, agent: Agent, position: Array, yaw_rad: float) -> SceneEntit
     length, width, height = map(float, agent.size_m)
     above = position + np.array([0.0, 0.0, height / 2 + LABEL_ABOVE_M])
     about = {"category": agent.category, "static": str(agent.static).lower(), "confidence": f"{agent.confidence:g}"}
+    if agent.is_doubtful:
+        about["doubtful"] = why_doubtful(agent)
     name = TextPrimitive(
         pose=_pose(above, 0.0),
         billboard=True,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from log2sim.datatypes import Scenario
+from log2sim.datatypes import Scenario, why_doubtful
 from log2sim.errors import MissingExtra, ScenarioError
 from log2sim.export.exporters import Options
 from log2sim.export.placement import near_origin
@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 class Mcap:
     """`<name>.mcap`: `/agents`, `/paths`, `/tf`, and with a log `/camera/<name>/...` and `/lidar/<name>`.
 
-    Times are those of the log, to the nanosecond. The metadata record "log2sim" holds the offset of the positions.
+    Times are those of the log, to the nanosecond. The metadata record "log2sim" holds the offset of the positions and
+    why agents are doubtful.
     """
 
     options: tuple[str, ...] = ("log",)
@@ -62,6 +63,7 @@ def _about(scenario: Scenario, origin_m: tuple[float, float, float]) -> Iterator
     """Describe the map frame of the file, as text."""
     yield "scenario", scenario.name
     yield "position_offset_m", json.dumps(origin_m)
+    yield "doubtful", json.dumps({a.id: why_doubtful(a) for a in scenario.doubtful})
     yield from ((f"map.{key}", json.dumps(value)) for key, value in asdict(scenario.map).items())
 
 

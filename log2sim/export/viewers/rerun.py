@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, Log, Scenario
+from log2sim.datatypes import Agent, Log, Scenario, why_doubtful
 from log2sim.errors import MissingExtra
 from log2sim.export.exporters import Options
 from log2sim.export.placement import near_origin
@@ -38,7 +38,7 @@ Part = tuple[tuple[str, ...], NDArray[np.int64] | None, Any]
 class Rerun:
     """`<name>.rrd`: `/agents`, `/paths`, `/speed`, and with a log `/cameras` and `/lidar`, all over the log's own time.
 
-    What was taken off positions stands in `/about`. The same scenario gives the same data and not the same bytes: Rerun
+    What was taken off positions and why agents are doubtful stands in `/about`. The same scenario gives the same data and not the same bytes: Rerun
     draws ids of its own for whatever it stores.
     """
 
@@ -85,8 +85,9 @@ def _parts(scenario: Scenario, log: Log | None) -> Iterator[Part]:
     placement = near_origin(scenario)
     origin = np.array(placement.origin_m)
     about = {"scenario": scenario.name, "position_offset_m": placement.origin_m, "map": asdict(scenario.map)}
+    doubtful = {a.id: why_doubtful(a) for a in scenario.doubtful}
     yield (), None, rerun.ViewCoordinates.columns(xyz=[rerun.ViewCoordinates.RIGHT_HAND_Z_UP])
-    yield ("about",), None, rerun.TextDocument.columns(text=[json.dumps(about, indent=1)])
+    yield ("about",), None, rerun.TextDocument.columns(text=[json.dumps({**about, "doubtful": doubtful}, indent=1)])
     steps = agent_steps(scenario)
     for agent, move in steps.moves:
         yield from _agent(agent, move, steps, origin)

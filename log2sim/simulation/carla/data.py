@@ -54,6 +54,7 @@ def _agent(agent: Agent, turn: int, span_s: tuple[float, float]) -> dict[str, An
         "size_m": [round(v, 3) for v in agent.size_m],
         "color": None if agent.color is None else list(agent.color["rgb"]),
         "static": agent.static,
+        "doubts": [doubt.to_dict() for doubt in agent.doubts],
         "assets": [
             {"blueprint": a.blueprint, "size_m": a.size_m, "error_m": a.error_m}
             for a in nearest_assets(agent, turn=turn)

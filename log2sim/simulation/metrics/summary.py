@@ -32,6 +32,7 @@ def summarize(replay: Replay) -> str:
     lines += [f"  {_collision_line(e)}" for e in events[:MAX_LISTED]]
     if len(events) > MAX_LISTED:
         lines.append(f"  and {len(events) - MAX_LISTED} more")
+    lines += _left_out_lines(replay)
     return "\n".join(lines)
 
 
@@ -57,6 +58,15 @@ def _model_lines(replay: Replay) -> list[str]:
     if len(chosen) > MAX_LISTED:
         found.append(f"  and {len(chosen) - MAX_LISTED} more")
     return ["models: " + ", ".join(f"{count} {model}" for model, count in counts.most_common()), *found]
+
+
+def _left_out_lines(replay: Replay) -> list[str]:
+    """Say which agents of the scenario were left out, and why."""
+    if not replay.left_out:
+        return []
+    count, named = len(replay.left_out), [f"{k} ({why})" for k, why in replay.left_out.items()]
+    more = f" and {count - MAX_LISTED} more" if count > MAX_LISTED else ""
+    return [f"{count} of {count + len(replay.agents)} agents left out: {', '.join(named[:MAX_LISTED])}{more}"]
 
 
 def _collision_line(event: Mapping[str, Any]) -> str:
