@@ -16,7 +16,7 @@ def agent(id, x, y=0.0, yaw=0.0, speed=0.0, t_s=T_S, category="car", size_m=CAR,
     n = len(t_s)
     fill = [np.broadcast_to(np.asarray(v, dtype=float), n).copy() for v in (x, y, 0.0, yaw, speed)]
     seen = None if visible is None else np.broadcast_to(visible, n).copy()
-    points = Waypoints(t_s, *fill, np.ones(n, dtype=bool), np.zeros(n), seen)
+    points = Waypoints(t_s, *fill, np.ones(n, dtype=bool), np.zeros(n), visible=seen)
     return Agent(id, category, size_m, points, **kwargs)
 
 

@@ -72,3 +72,19 @@ def test_errors_drawn_from_their_sigma_have_a_nees_of_one(factor):
 def test_a_sigma_of_zero_is_counted_apart():
     found = normalized_errors(np.array([[3.0, 4.0], [1.0, 0.0]]), np.array([5.0, 0.0]))
     assert (found["count"], found["without_sigma"], found["nees"]) == (1, 1, 0.5)
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_errors_along_one_axis_have_a_nees_of_one_too(factor):
+    rng = np.random.default_rng(2)
+    sigma = rng.uniform(0.01, 0.2, size=50_000)
+    found = normalized_errors(factor * (sigma * rng.normal(size=50_000))[:, None], sigma)
+    assert found["nees"] == pytest.approx(factor**2, rel=0.03)
+    # The square of the median of |x| for a standard normal x, and P(|x| < 1.96 / factor).
+    assert found["median"] == pytest.approx(0.6745**2 * factor**2, rel=0.04)
+    assert found["within_95"] == pytest.approx({0.5: 0.99991, 2.0: 0.6729}[factor], abs=0.01)
+
+
+def test_errors_that_do_not_count_and_sigmas_that_are_unknown_are_in_no_figure():
+    found = normalized_errors(np.array([[np.nan], [1.0], [1.0]]), np.array([1.0, np.nan, 2.0]))
+    assert (found["count"], found["without_sigma"], found["nees"]) == (1, 1, 0.25)

@@ -258,6 +258,27 @@ def test_sigma_is_compared_with_the_errors_by_range():
     assert judged([ours[0], thinned], truth)["sigma"]["nees"] == pytest.approx(expected, rel=1e-4)
 
 
+def test_sigmas_of_yaw_and_speed_are_compared_with_their_errors():
+    truth = [agent("ego", 0.0), agent("a", 10.0), agent("b", 40.0)]
+    found = judged([agent("ego", 0.0), agent("x", 10.0), agent("y", 40.0)], truth)
+    assert (found["sigma_yaw"]["count"], found["sigma_yaw"]["nees"], found["sigma_speed"]["nees"]) == (0, None, None)
+
+    def off(a, yaw_rad, speed_mps):
+        w = a.waypoints
+        columns = {"sigma_yaw_rad": np.full(TICKS, 0.05), "sigma_speed_mps": np.full(TICKS, 0.25)}
+        turned = replace(w, yaw_rad=w.yaw_rad + yaw_rad, speed_mps=w.speed_mps + speed_mps, **columns)
+        return replace(a, waypoints=turned)
+
+    # Turned round, a heading has no error that sigma_yaw should tell.
+    found = judged(
+        [agent("ego", 0.0), off(agent("x", 10.0), 0.1, 0.5), off(agent("y", 40.0), np.pi - 0.05, 0.0)], truth
+    )
+    assert found["by_range"]["0-15"]["sigma_yaw"]["nees"] == pytest.approx(4.0)
+    assert found["by_range"]["0-15"]["sigma_speed"]["nees"] == pytest.approx(4.0)
+    assert found["by_range"]["30-50"]["sigma_yaw"]["nees"] == pytest.approx(1.0)
+    assert found["sigma_speed"]["nees"] == pytest.approx(2.0)
+
+
 def test_ranges_are_those_of_the_reconstructed_agent_and_end_where_the_next_begins():
     ego = agent("ego", 0.0)
     xs = (5.0, 15.0, 29.9, 30.0, 50.0, 90.0)

@@ -29,11 +29,20 @@ REAR_AXLE_OFFSET_M = 1.4
 MAX_CACHED = 4
 
 
-def log_of(scene: TrafficScene, environment: Environment, name: str, duration_s: float, seed: int) -> Log:
+def log_of(
+    scene: TrafficScene,
+    environment: Environment,
+    name: str,
+    duration_s: float,
+    seed: int,
+    *,
+    camera_rate_hz: float = CAMERA_RATE_HZ,
+    image_labels: bool = True,
+) -> Log:
     """Make a log whose records are rendered and cast when read; every record depends on the seed and its index alone.
 
     The map is the scene's level frame: its origin is on the ground below the LiDAR at the begin. Points of sweeps are in the map.
-    Labels are given at the camera's stamps, for all road users around.
+    Labels are given at the camera's stamps, for all road users around; those in images take most of the time.
     """
     run = run_of(scene, duration_s)
     rig = rig_of(scene)
@@ -45,8 +54,7 @@ def log_of(scene: TrafficScene, environment: Environment, name: str, duration_s:
     # A sweep's middle lies within the log, and so do its first and last point.
     period = 1.0 / scene.lidar.rate_hz
     t_sweep = np.arange(period / 2, duration_s - period / 2 + 1e-9, period)
-    t_image = np.arange(0.5 / CAMERA_RATE_HZ, duration_s + 1e-9, 1.0 / CAMERA_RATE_HZ)
-    labels, image_labels = film.labels(t_image)
+    t_image = np.arange(0.5 / camera_rate_hz, duration_s + 1e-9, 1.0 / camera_rate_hz)
     return Log(
         name=name,
         format="synthetic",
@@ -58,8 +66,8 @@ def log_of(scene: TrafficScene, environment: Environment, name: str, duration_s:
         },
         ego=_poses(run, mount_T_lidar, duration_s) if mount == "ego" else None,
         ego_vehicle=EgoVehicle(CAR_SIZE_M, REAR_AXLE_OFFSET_M),
-        labels=labels,
-        image_labels={CAMERA: image_labels},
+        labels=film.labels(t_image),
+        image_labels={CAMERA: film.image_labels(t_image)} if image_labels else {},
         reference_camera=CAMERA,
         notes=(f"synthetic traffic, seed {seed}",),
     )
@@ -116,20 +124,15 @@ class _Film:
         _, map_T_cam, instant, _ = self._instant(t_s)
         return render(self._camera, map_T_cam, instant, np.random.default_rng([self._seed, 2, index]))
 
-    def labels(self, t_s: Array) -> tuple[Labels, ImageLabels]:
-        """Boxes of all road users in space, and of those in the picture in the picture, at times (F,)."""
+    def labels(self, t_s: Array) -> Labels:
+        """Boxes of all road users in space at times (F,)."""
         rows: list[tuple[int, int, str, Array, tuple[float, float, float], float]] = []
-        flat: list[tuple[int, Array, str]] = []
         for t, stamp in zip(t_s, _stamps(t_s)):
-            scene, map_T_cam, instant, seen = self._instant(float(t))
-            for k, item in enumerate(scene.objects):
+            for k, item in enumerate(self._run.at(float(t)).objects):
                 if item.category:
                     center = item.position_m + np.array([0.0, 0.0, item.size_m[2] / 2])
                     rows.append((int(stamp), k, item.category, center, item.size_m, item.yaw_rad))
-            for k, part in zip(seen, segment(self._camera, map_T_cam, instant)):
-                if part is not None and scene.objects[k].category and _is_clear(part):
-                    flat.append((int(stamp), part.box_px, scene.objects[k].category))
-        labels = Labels(
+        return Labels(
             t_ns=np.array([r[0] for r in rows], np.int64),
             track_id=np.array([f"user_{r[1]}" for r in rows], dtype="<U16"),
             category=np.array([r[2] for r in rows], dtype="<U16"),
@@ -137,9 +140,18 @@ class _Film:
             size_m=np.array([r[4] for r in rows]).reshape(-1, 3),
             yaw_rad=np.array([r[5] for r in rows]),
         )
+
+    def image_labels(self, t_s: Array) -> ImageLabels:
+        """Boxes of the road users that the picture shows, at times (F,)."""
+        flat: list[tuple[int, Array, str]] = []
+        for t, stamp in zip(t_s, _stamps(t_s)):
+            scene, map_T_cam, instant, seen = self._instant(float(t))
+            for k, part in zip(seen, segment(self._camera, map_T_cam, instant)):
+                if part is not None and scene.objects[k].category and _is_clear(part):
+                    flat.append((int(stamp), part.box_px, scene.objects[k].category))
         boxes = np.array([f[1] for f in flat]).reshape(-1, 4)
         categories = np.array([f[2] for f in flat], dtype="<U16")
-        return labels, ImageLabels(np.array([f[0] for f in flat], np.int64), boxes, categories)
+        return ImageLabels(np.array([f[0] for f in flat], np.int64), boxes, categories)
 
 
 def _is_clear(part: Visibility) -> bool:

@@ -10,8 +10,8 @@ from log2sim.evaluation.metrics.pairs import Mask
 from log2sim.geometry import Array
 
 BINS = 10
-CHI2_95 = 5.991
-"""95 % quantile of the chi-square distribution with two degrees of freedom, -2 ln 0.05."""
+CHI2_95 = {1: 3.841, 2: 5.991}
+"""95 % quantiles of the chi-square distribution by degrees of freedom: 1.96^2, and -2 ln 0.05."""
 
 
 def reliability(confidence: Array, right: Mask) -> dict[str, Any]:
@@ -46,28 +46,31 @@ def reliability(confidence: Array, right: Mask) -> dict[str, Any]:
     return {"count": len(right), "expected_calibration_error": error, "bins": bins}
 
 
-def normalized_errors(error_m: Array, sigma_m: Array) -> dict[str, Any]:
-    """Compare position errors (N, 2) with their standard deviations (N,) for each axis.
+def normalized_errors(error: Array, sigma: Array) -> dict[str, Any]:
+    """Compare errors (N, D) with their standard deviations (N,), which hold for each of the D = 1 or 2 axes.
+
+    Rows with an error of NaN are left out.
 
     Returns
     -------
     dict
-        "count"; "without_sigma", those with a sigma of 0, left out of all else; "nees", the mean of e^T P^-1 e / 2 with
-        P = sigma^2 I, 1 where sigmas are right, above where they are too small; "median", ln 2 = 0.69 where errors are
-        Gaussian too; "within_95", the share inside of the 95 % circle.
+        "count"; "without_sigma", those with a sigma of 0 or NaN, left out of all else; "nees", the mean of e^T P^-1 e / D
+        with P = sigma^2 I, 1 where sigmas are right, above where they are too small; "median", 0.69 = ln 2 for D = 2 and
+        0.45 for D = 1 where errors are Gaussian too; "within_95", the share inside of the 95 % circle or interval.
 
     Notes
     -----
     Normalized estimation error squared (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and
     Navigation", 2001, section 5.4.2). A few gross errors dominate the mean, the other two describe the rest. The noise of
-    the labels is part of the errors. Errors end at the gate of the matching.
+    the labels is part of the errors. Errors of positions end at the gate of the matching.
     """
-    known = sigma_m > 0
-    squared = (error_m[known] ** 2).sum(axis=1) / sigma_m[known] ** 2
+    there = np.isfinite(error).all(axis=1)
+    known, axes = there & (sigma > 0), error.shape[1]
+    squared = (error[known] ** 2).sum(axis=1) / sigma[known] ** 2
     return {
         "count": int(known.sum()),
-        "without_sigma": int((~known).sum()),
-        "nees": float(squared.mean() / 2) if known.any() else None,
-        "median": float(np.median(squared) / 2) if known.any() else None,
-        "within_95": float((squared <= CHI2_95).mean()) if known.any() else None,
+        "without_sigma": int((there & ~known).sum()),
+        "nees": float(squared.mean() / axes) if known.any() else None,
+        "median": float(np.median(squared) / axes) if known.any() else None,
+        "within_95": float((squared <= CHI2_95[axes]).mean()) if known.any() else None,
     }

@@ -40,6 +40,10 @@ class JudgedAgents:
         When it does.
     sigma_m : (B, T) float64, m
         Standard deviation of the position for each axis.
+    sigma_rad : (B, T) float64
+        Of the heading; NaN where the scenario states none, as in the next one.
+    sigma_mps : (B, T) float64, m/s
+        Of the speed.
     """
 
     states: StateTable
@@ -49,6 +53,8 @@ class JudgedAgents:
     reasons: tuple[tuple[str, ...], ...]
     doubted: Mask
     sigma_m: Array
+    sigma_rad: Array
+    sigma_mps: Array
 
 
 def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: StateTable | None) -> dict[str, Any]:
@@ -69,7 +75,6 @@ def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: Sta
         The part `correctness` of a document of `schemas/metrics-1.json`.
     """
     verdicts, ranged = judge(c, ego), ego is not None
-    sigma = [np.interp(ticks_s, a.waypoints.t_s, a.waypoints.sigma_xy_m) for a in agents]
     judged = JudgedAgents(
         states=c.other,
         verdicts=verdicts,
@@ -77,7 +82,9 @@ def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: Sta
         confidence=np.array([a.confidence for a in agents], dtype=np.float64),
         reasons=tuple(doubts(a) for a in agents),
         doubted=np.array([doubted_at(a, ticks_s) for a in agents], dtype=bool).reshape(len(agents), len(ticks_s)),
-        sigma_m=np.stack(sigma) if sigma else np.zeros((0, len(ticks_s))),
+        sigma_m=_sigma_at(agents, ticks_s, "sigma_xy_m"),
+        sigma_rad=_sigma_at(agents, ticks_s, "sigma_yaw_rad"),
+        sigma_mps=_sigma_at(agents, ticks_s, "sigma_speed_mps"),
     )
     everything = np.ones_like(verdicts.judged)
     kinds, categories = _present(judged, c.other.group, GROUPS), _present(judged, c.other.category, CATEGORIES)
@@ -101,6 +108,16 @@ def doubted_at(agent: Agent, t_s: Array) -> Mask:
     """Return whether a scenario doubts an agent at times (T,)."""
     low = np.full(len(t_s), agent.confidence < MIN_TRUSTED_CONFIDENCE)
     return np.asarray(np.any([low, *(doubt.holds(t_s) for doubt in agent.doubts)], axis=0))
+
+
+def _sigma_at(agents: Sequence[Agent], t_s: Array, column: str) -> Array:
+    """Interpolate (B, T) a column of standard deviations at times (T,); NaN for agents without it."""
+    out = np.full((len(agents), len(t_s)), np.nan)
+    for k, agent in enumerate(agents):
+        sigma = getattr(agent.waypoints, column)
+        if sigma is not None:
+            out[k] = np.interp(t_s, agent.waypoints.t_s, sigma)
+    return out
 
 
 def _present(j: JudgedAgents, column: NDArray[np.str_], names: Iterable[str]) -> list[str]:
@@ -148,6 +165,8 @@ def _figures(j: JudgedAgents, selected: Mask) -> dict[str, Any]:
             "right_agents": _mean(doubted[right_agents]),
         },
         "sigma": normalized_errors(v.error_m[matched], j.sigma_m[matched]),
+        "sigma_yaw": normalized_errors(v.error_rad[matched][:, None], j.sigma_rad[matched]),
+        "sigma_speed": normalized_errors(v.error_mps[matched][:, None], j.sigma_mps[matched]),
     }
 
 

@@ -18,6 +18,7 @@ COLUMNS = (
     ("wrong", "wrong"),
     ("wrong_class", "class"),
 )
+NEES = {"sigma": "NEES: position", "sigma_yaw": "yaw", "sigma_speed": "speed"}
 MAX_WORST = 6
 """Agents that are named; the document has all."""
 
@@ -26,7 +27,7 @@ def correctness_lines(found: Mapping[str, Any]) -> list[str]:
     """Format the part `correctness` of a result of `evaluate`; no line where nothing was judged."""
     if not found["ticks"]:
         return []
-    title = "wrong of the reconstructed agents' ticks (agents), doubted of these ticks, and errors over sigma (NEES, 1 is right):"
+    title = "wrong of the reconstructed agents' ticks (agents), doubted of these ticks, and squared errors over sigma (NEES, 1 is right):"
     confused = _confused_line(found["confusion"])
     return [
         "",
@@ -45,13 +46,14 @@ def _table(found: Mapping[str, Any]) -> list[str]:
     lines += list(found["by_kind"].items()) if len(found["by_kind"]) > 1 else []
     lines += [(f"{name} m", figures) for name, figures in (found["by_range"] or {}).items()]
     titles = [title for _, title in COLUMNS]
-    cells = [["", "agents", "ticks", *titles, "doubted: wrong", "right", "NEES"]]
+    cells = [["", "agents", "ticks", *titles, "doubted: wrong", "right", *NEES.values()]]
     for name, figures in lines:
         if figures["ticks"]:
             shares = [f"{figures[key]['share']:.3f} ({figures[key]['agents']})" for key, _ in COLUMNS]
             doubted = [_number(figures["doubted"][key], 3) for key in ("wrong_ticks", "right_ticks")]
             counts = [str(figures["agents"]), str(figures["ticks"])]
-            cells.append([name, *counts, *shares, *doubted, _number(figures["sigma"]["nees"], 1)])
+            nees = [_number(figures[key]["nees"], 1) for key in NEES]
+            cells.append([name, *counts, *shares, *doubted, *nees])
     widths = [max(len(row[k]) for row in cells) for k in range(len(cells[0]))]
     rows = [[row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:]))] for row in cells]
     return ["  ".join(row).rstrip() for row in rows]

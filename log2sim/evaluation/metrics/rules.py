@@ -78,4 +78,6 @@ def correctness_rules(max_wrong_share: float, min_confidence: float) -> dict[str
         "doubted": f"the scenario doubts the agent at the tick, or gives it a confidence below {min_confidence:g}; of agents, at any tick",
         "sigma": "nees: mean of squared position errors of matched ticks over two times the squared sigma, 1 expected; "
         "median, 0.69 expected; within_95: share inside of the 95 % circle, 0.95 expected",
+        "sigma_yaw": "likewise of yaw, up to half turns; median, 0.45 expected",
+        "sigma_speed": "likewise of speed; median, 0.45 expected",
     }

@@ -51,6 +51,10 @@ class Verdicts:
         By the names in `REPORTED`.
     error_m : (B, T, 2) float64, m
         Position error of matched agents; NaN elsewhere.
+    error_rad : (B, T) float64
+        Error of their heading up to half turns; NaN elsewhere and where heading does not count.
+    error_mps : (B, T) float64, m/s
+        Error of their speed; NaN elsewhere.
     """
 
     judged: Mask
@@ -59,6 +63,8 @@ class Verdicts:
     taken_for: Index
     measures: Mapping[str, Mask]
     error_m: Array
+    error_rad: Array
+    error_mps: Array
 
     @property
     def wrong(self) -> Mask:
@@ -105,10 +111,17 @@ def judge(c: Comparison, ego: StateTable | None) -> Verdicts:
     measures |= {k: _at(errors, wrong, judged.shape) for k, wrong in _state_verdicts(truth, other, errors).items()}
     taken_for = np.where(judged, _nearest(c, matched), -1)
     measures["wrong_class"] = (taken_for >= 0) & (_category(truth, taken_for) != other.category[:, None])
-    error_m = np.full((*judged.shape, 2), np.nan)
     gap = other.xy_m[errors.other, errors.tick] - truth.xy_m[errors.truth, errors.tick]
-    error_m[errors.other, errors.tick] = gap
-    return Verdicts(judged, c.selected & ~judged, np.where(known, matched, -1), taken_for, measures, error_m)
+    return Verdicts(
+        judged,
+        c.selected & ~judged,
+        np.where(known, matched, -1),
+        taken_for,
+        measures,
+        error_m=_spread(errors, gap, judged.shape),
+        error_rad=_spread(errors, np.minimum(errors.yaw_rad, np.pi - errors.yaw_rad), judged.shape),
+        error_mps=_spread(errors, errors.speed_mps, judged.shape),
+    )
 
 
 def _state_verdicts(truth: StateTable, other: StateTable, errors: StateErrors) -> dict[str, Mask]:
@@ -185,6 +198,13 @@ def _nearest(c: Comparison, matched: Index) -> Index:
 def _category(truth: StateTable, index: Index) -> np.ndarray[tuple[int, ...], np.dtype[np.str_]]:
     """Look up the category of truth agents; entries of -1 get that of the first one, and must be masked."""
     return truth.category[np.maximum(index, 0)] if len(truth.category) else np.full(index.shape, "", dtype="<U16")
+
+
+def _spread(errors: StateErrors, values: Array, shape: tuple[int, ...]) -> Array:
+    """Return (B, T, ...) the values (K, ...) of matched agent-ticks; NaN elsewhere."""
+    out = np.full((*shape, *values.shape[1:]), np.nan)
+    out[errors.other, errors.tick] = values
+    return out
 
 
 def _at(errors: StateErrors, wrong: Mask, shape: tuple[int, ...]) -> Mask:
