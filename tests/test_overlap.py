@@ -78,6 +78,13 @@ def test_a_person_on_the_back_seat_is_not_another_agent_beside_the_car():
     assert names((agent(10.0), 9.0), (person, 2.0)) == ["car-1"]
 
 
+@pytest.mark.parametrize(("y_m", "count"), [(0.0, 1), (0.85, 1), (1.0, 2)])
+def test_a_person_whose_center_is_outside_a_car_is_beside_it(y_m, count):
+    # The car's side is at 0.9 m, as far as sizes of cars are known.
+    person = agent(10.5, y_m, category="pedestrian", size=(0.7, 0.7, 1.75))
+    assert len(names((agent(10.0), 9.0), (person, 2.0))) == count
+
+
 def passing(y_m):
     """A car that comes from behind the standing ego, 10 m in 4 s."""
     return agent(-10.0, y_m, speed=2.5)

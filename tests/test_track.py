@@ -342,6 +342,32 @@ def test_the_category_is_that_of_most_of_the_score() -> None:
     )
 
 
+def test_a_group_wins_before_a_category_does_and_images_tell_two_wheelers_apart() -> None:
+    def voted(*rows: tuple[str, float, str]) -> str:
+        parts = [
+            replace(seen(np.zeros((1, 2)), START_NS, category=c, score=s), camera=np.array([camera]))
+            for c, s, camera in rows
+        ]
+        return decide_category(Measurements.join(parts))
+
+    rider = (("cyclist", 0.4, "front"), ("motorcycle", 0.4, "front"), ("pedestrian", 0.7, "front"))
+    assert voted(*rider) == "cyclist"
+    assert voted(*rider, ("pedestrian", 0.2, "front")) == "pedestrian"
+    sweeps = (("cyclist", 0.9, ""), ("cyclist", 0.9, ""))
+    assert voted(*sweeps) == "cyclist"
+    assert voted(*sweeps, ("motorcycle", 0.3, "front")) == "motorcycle"
+    assert voted(("car", 0.9, ""), ("car", 0.9, ""), ("truck", 0.3, "front")) == "car"
+
+
+@pytest.mark.parametrize(("speed_mps", "category"), [(0.0, "bicycle"), (1.5, "cyclist")])
+def test_a_bicycle_that_moves_has_a_rider(speed_mps: float, category: str) -> None:
+    t_ns = stamps(30)
+    rng = np.random.default_rng(2)
+    xy = np.column_stack([speed_mps * (t_ns - t_ns[0]) / NS_PER_S, np.zeros(len(t_ns))]) + rng.normal(0, 0.3, (30, 2))
+    xy[4] += 9.0
+    assert decide_category(seen(xy, t_ns, category="bicycle")) == category
+
+
 def test_tracks_come_in_the_order_of_their_start() -> None:
     ways = {"late": line(0, 0, 5, 0), "right": line(50, 9, 5, 0), "left": line(-50, -9, 5, 0)}
     tracks = track(*record(ways, 30, hidden={"late": (0, 10)}), **OPTIONS)

@@ -14,6 +14,8 @@ from log2sim.geometry import Array, box_corners_bev, overlap_of_smaller
 # Two agents whose overlap exceeds this share of the smaller box for most of the time are duplicates. Pedestrians are compared
 # by distance, since the boxes of two people who stand close together overlap.
 SHARED_AREA = 0.25
+# A person whose center is outside a vehicle's box is beside it, so that less than half of the person is inside.
+SHARED_AREA_OF_PERSON = 0.5
 SAME_PERSON_M = 0.35
 SAMPLES = 12
 # An overlap below this share of the smaller box is contact only.
@@ -56,10 +58,12 @@ def _are_duplicates(a: Agent, b: Agent) -> bool:
     if last < first or not _extents_meet(a, b):
         return False
     t = np.linspace(first, last, SAMPLES)
-    if {GROUP_OF[a.category], GROUP_OF[b.category]} == {"pedestrian"}:
+    groups = {GROUP_OF[a.category], GROUP_OF[b.category]}
+    if groups == {"pedestrian"}:
         p, q = a.at(t), b.at(t)
         return bool(np.median(np.hypot(p.x_m - q.x_m, p.y_m - q.y_m)) < SAME_PERSON_M)
-    return bool(np.median(shared_areas(a, b, t)) > SHARED_AREA)
+    least = SHARED_AREA_OF_PERSON if groups == {"pedestrian", "vehicle"} else SHARED_AREA
+    return bool(np.median(shared_areas(a, b, t)) > least)
 
 
 def _extents_meet(a: Agent, b: Agent) -> bool:

@@ -190,7 +190,12 @@ def _estimate_size(
             known_variance = (BOX_SIZE_SIGMA_SHARE * known[axis]) ** 2
             share = WHOLE_SIDE_SIGMA_M**2 / (WHOLE_SIDE_SIGMA_M**2 + known_variance)
             size[axis] += share * (known[axis] - size[axis])
-    likely = bool(((raw >= smallest) & (raw <= largest)).all())
+    least = CATEGORY[category].min_seen_m
+    if least is None:
+        large_enough = bool((raw >= smallest).all())
+    else:
+        large_enough = raw.max(where=whole.any(axis=0), initial=0.0) >= least or not whole.any()
+    likely = bool(large_enough and (raw <= largest).all())
     return np.clip(size, smallest, largest), likely
 
 

@@ -22,6 +22,9 @@ class Category:
         A smaller object was hardly observed whole, a larger one is several objects.
     max_length_per_height : float
         Longest side as a share of the height; infinite where the category has no such limit.
+    min_seen_m : float, optional
+        What points show of the longer horizontal side at least, where that is less than `min_size_m`: bodies are round, and
+        sparse rays miss their ends.
     """
 
     group: str
@@ -29,6 +32,7 @@ class Category:
     min_size_m: Size
     max_size_m: Size
     max_length_per_height: float = float("inf")
+    min_seen_m: float | None = None
 
 
 # Typical sizes lie between the mean labels of KITTI and nuScenes, which are the anchors of PointPillars (Lang et al., CVPR
@@ -43,16 +47,19 @@ class Category:
 # - cyclist, bicycle: DIN 79008 and the like; tandems and cargo bicycles have up to 2.6 m.
 # - pedestrian: body depth and shoulder breadth of adults (DIN 33402-2) and the stride of a tall one; children from 1 m;
 #   a stride and swinging arms make a person at most 0.8 times as long as tall (step lengths: Winter, "Biomechanics and Motor
-#   Control of Human Movement").
+#   Control of Human Movement"). A body seen from the side shows its depth, from 0.2 m; posts are thinner. A bicycle seen from
+#   behind shows the shoulders or the handlebar, from 0.4 m, less the gap between rays at either end.
 # - other: trailers, 12 m by the same directive; carts and animals.
 CATEGORY: Mapping[str, Category] = {
     "car": Category("vehicle", (4.4, 1.85, 1.6), (2.7, 1.35, 1.2), (6.0, 2.3, 2.8)),
     "truck": Category("vehicle", (7.0, 2.4, 2.9), (4.5, 1.7, 2.0), (22.4, 3.0, 4.3)),
     "bus": Category("vehicle", (11.5, 2.7, 3.2), (5.5, 1.9, 2.3), (18.75, 3.0, 4.4)),
-    "motorcycle": Category("two_wheeler", (2.1, 0.8, 1.5), (1.3, 0.5, 0.9), (2.8, 1.3, 2.2)),
-    "cyclist": Category("two_wheeler", (1.75, 0.65, 1.75), (1.1, 0.4, 1.1), (2.6, 1.1, 2.3)),
-    "bicycle": Category("two_wheeler", (1.75, 0.6, 1.1), (1.1, 0.4, 0.7), (2.6, 1.1, 1.5)),
-    "pedestrian": Category("pedestrian", (0.7, 0.7, 1.75), (0.4, 0.4, 1.0), (1.4, 1.2, 2.3), max_length_per_height=0.8),
+    "motorcycle": Category("two_wheeler", (2.1, 0.8, 1.5), (1.3, 0.5, 0.9), (2.8, 1.3, 2.2), min_seen_m=0.25),
+    "cyclist": Category("two_wheeler", (1.75, 0.65, 1.75), (1.1, 0.4, 1.1), (2.6, 1.1, 2.3), min_seen_m=0.25),
+    "bicycle": Category("two_wheeler", (1.75, 0.6, 1.1), (1.1, 0.4, 0.7), (2.6, 1.1, 1.5), min_seen_m=0.25),
+    "pedestrian": Category(
+        "pedestrian", (0.7, 0.7, 1.75), (0.4, 0.4, 1.0), (1.4, 1.2, 2.3), max_length_per_height=0.8, min_seen_m=0.2
+    ),
     "other": Category("other", (3.0, 1.8, 1.8), (0.5, 0.4, 0.4), (12.0, 3.0, 4.0)),
 }
 
