@@ -11,7 +11,7 @@ from export_paths import agent, bend, line, scenario
 
 from log2sim.datatypes import Agent, Scenario
 from log2sim.errors import ScenarioError
-from log2sim.export.checks import export_notes, overlaps_at_entry, require_exportable, require_start_as_in_log
+from log2sim.export.checks import export_notes, overlaps_at_entry, require_exportable, require_start_as_in_scenario
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
 
@@ -129,9 +129,9 @@ def test_the_sample_has_nothing_to_remark() -> None:
 def test_a_start_that_puts_agents_into_one_another_is_refused_unless_the_log_did() -> None:
     agents = [agent(line()), agent(line(start=(0.0, 5.0)), "beside")]
     apart = np.array([[0.0, 0.0, 0.8, 0.0], [0.0, 5.0, 0.8, 0.0]])
-    require_start_as_in_log(agents, apart)
+    require_start_as_in_scenario(agents, apart)
     together = apart * [1, 0.1, 1, 1]
     with pytest.raises(ScenarioError, match="agents 'ego' and 'beside' would overlap at the start"):
-        require_start_as_in_log(agents, together)
-    require_start_as_in_log(agents, together * [[1, 1, 1, 1], [np.nan, 1, 1, 1]])
-    require_start_as_in_log([agent(line()), agent(line(start=(0.0, 0.5)), "beside")], together)
+        require_start_as_in_scenario(agents, together)
+    require_start_as_in_scenario(agents, together * [[1, 1, 1, 1], [np.nan, 1, 1, 1]])
+    require_start_as_in_scenario([agent(line()), agent(line(start=(0.0, 0.5)), "beside")], together)

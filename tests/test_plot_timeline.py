@@ -153,17 +153,17 @@ def test_the_map_keeps_its_size_above_the_strips() -> None:
 
 def test_collisions_that_the_log_has_not_are_marked_between_the_boxes() -> None:
     scenario, result = reckless()
-    (event,) = [e for e in result.metrics["collisions"] if not e["in_log"]]
+    (event,) = [e for e in result.metrics["collisions"] if e["belongs_to"] == "replay"]
     times, places = new_collisions(result)
     assert times.tolist() == [event["t_s"]]
     ego = result.agent("ego")
     middle = (np.interp(event["t_s"], ego.t_s, ego.x_m) + 120.0) / 2
     assert places[0, 0] == pytest.approx(middle)
-    assert "collision, not in the log" in [
+    assert "collision of the replay" in [
         t.get_text() for t in layout_of(scenario, result).figure.legends[0].get_texts()
     ]
     assert len(new_collisions(replay(scenario))[0]) == 0
-    in_log = dataclasses.replace(result, metrics={**result.metrics, "collisions": [{**event, "in_log": True}]})
+    in_log = dataclasses.replace(result, metrics={**result.metrics, "collisions": [{**event, "belongs_to": "scenario"}]})
     assert len(new_collisions(in_log)[0]) == 0
 
 

@@ -219,9 +219,9 @@ def test_the_command_lists_collisions_and_broken_limits_and_leaves_with_6_when_s
     document["agents"][2]["waypoints"]["x_m"] = [40.0]
     write_json(tmp_path / "s.json", document)
     said = run("replay", tmp_path / "s.json")
-    assert "1 collision, 0 that the log does not have" in said.out
+    assert "1 collision, 0 of the replay and 1 of the scenario itself ·" in said.out
     assert "ego and wall collide at" in said.out
-    assert "as in the log" in said.out
+    assert ", in the scenario itself" in said.out
 
 
 @pytest.mark.parametrize("dt_s", [0.005, 0.02, 0.1])

@@ -228,8 +228,8 @@ def test_a_new_collision_is_zero_and_one_of_the_log_is_left_out_of_the_least():
     c = (lambda t: 100 + 0 * t, lambda t: 20 - 5 * t, -np.pi / 2)
     boxes, ids = boxes_of(a, b, c), ["ego", "b", "c"]
     event = {"agents": ["ego", "b"], "t_s": 2.8, "until_s": 3.2, "relative_speed_mps": 20.0, "from_start": False}
-    for in_log, contact, value in ((False, "new", 0.0), (True, "log", None)):
-        near = conflicts(boxes, np.ones(3, bool), T_S, ids, [{**event, "in_log": in_log}])
+    for whose, contact, value in (("replay", "new", 0.0), ("reconstruction", "scenario", None)):
+        near = conflicts(boxes, np.ones(3, bool), T_S, ids, [{**event, "belongs_to": whose}])
         entry = next(e for e in near if e["agents"] == ["ego", "b"])
         assert (entry["contact"], entry["ego"]) == (contact, True)
         smallest = most_critical([entry], "min_ttc")

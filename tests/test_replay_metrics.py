@@ -10,7 +10,7 @@ from log2sim.datatypes import Trajectory
 from log2sim.errors import CheckFailed
 from log2sim.geometry import rectangles_overlap
 from log2sim.simulation.metrics.box_tracks import BoxTracks
-from log2sim.simulation.metrics.collisions import LOG_MARGIN_M, LOG_WINDOW_S, collisions, contacts
+from log2sim.simulation.metrics.collisions import SCENARIO_MARGIN_M, SCENARIO_WINDOW_S, collisions, contacts
 from log2sim.simulation.metrics.limits import check_strict, require_strict
 from log2sim.simulation.metrics.summary import summarize
 from log2sim.simulation.metrics.tracking_error import tracking_errors
@@ -162,7 +162,7 @@ def one_contact(log_x, log_y=0.0):
 
 
 def test_a_collision_is_new_unless_the_log_has_it_near_in_time_and_place():
-    inside, outside = LOG_WINDOW_S - 0.1, LOG_WINDOW_S + 0.1
+    inside, outside = SCENARIO_WINDOW_S - 0.1, SCENARIO_WINDOW_S + 0.1
 
     def at(moment, gap=-1.0):
         return lambda t: np.where(np.abs(t - moment) < 0.01, 4.0 + gap, 10.0)
@@ -171,10 +171,10 @@ def test_a_collision_is_new_unless_the_log_has_it_near_in_time_and_place():
     assert one_contact(at(2.0 - inside))["in_log"]
     assert not one_contact(at(2.0 + outside))["in_log"]
     assert not one_contact(at(2.0 - outside))["in_log"]
-    assert one_contact(at(2.0, LOG_MARGIN_M * 0.9))["in_log"]
-    assert not one_contact(at(2.0, LOG_MARGIN_M * 1.1))["in_log"]
-    assert LOG_MARGIN_M <= 0.1  # more would hide what a replay does wrong
-    assert LOG_WINDOW_S <= 0.5
+    assert one_contact(at(2.0, SCENARIO_MARGIN_M * 0.9))["in_log"]
+    assert not one_contact(at(2.0, SCENARIO_MARGIN_M * 1.1))["in_log"]
+    assert SCENARIO_MARGIN_M <= 0.1  # more would hide what a replay does wrong
+    assert SCENARIO_WINDOW_S <= 0.5
 
 
 def test_contacts_of_a_pair_that_are_near_in_time_are_one_collision():

@@ -67,6 +67,13 @@ class Scenario:
         return tuple(a for a in self.agents if a.id != EGO)
 
     @property
+    def is_reconstruction(self) -> bool:
+        """Whether it is what a reconstruction says of a log, and neither edited nor replayed since."""
+        history = self.provenance.get("history")
+        made = isinstance(history, list) and "reconstruct" in history
+        return made and not {"edits", "replay"} & self.provenance.keys()
+
+    @property
     def doubtful(self) -> tuple[Agent, ...]:
         """Return the agents that are doubtful, see `Agent.is_doubtful`."""
         return tuple(a for a in self.agents if a.is_doubtful)

@@ -16,7 +16,7 @@ from log2sim.geometry import Array, bev_iou, box_corners_bev
 MAX_EXTENT_M = 65_536.0
 # Steps shorter than STEP_M have no direction; the direction of agents that move less than MOVED_M is not checked.
 STEP_M, MOVED_M = 0.05, 2.0
-# Boxes of a log may touch; a smaller overlap is within their errors.
+# Boxes of a scenario may touch; a smaller overlap is within their errors.
 TOUCHING_IOU = 0.02
 # Names are escaped in XML; a projection must stay as it is.
 _NO_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -62,7 +62,7 @@ def doubtful_note(source: Scenario, exported: Scenario) -> str:
     return "; ".join(part for part in (counts, kept) if part)
 
 
-def require_start_as_in_log(agents: Sequence[Agent], placed: Array) -> None:
+def require_start_as_in_scenario(agents: Sequence[Agent], placed: Array) -> None:
     """Raise when agents overlap at the start of an export, states (A, 4), that do not in the scenario.
 
     `placed` holds x, y, z of the box center and yaw, NaN for agents that appear later.

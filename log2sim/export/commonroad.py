@@ -113,7 +113,7 @@ def _point(parent: Element, xyz: Array) -> None:
 
 
 def _root(scenario: Scenario, name: str) -> Element:
-    """Return the document with its header, dated by the recording so that the same scenario gives the same bytes."""
+    """Return the document with its header, dated by the start of the scenario so that the same scenario gives the same bytes."""
     root = element("commonRoad", None, commonRoadVersion=VERSION, benchmarkID=name, timeStepSize=_decimal(STEP_S))
     root.set("date", datetime.fromtimestamp(scenario.t0_ns // NS_PER_S, UTC).date().isoformat())
     root.attrib |= {"author": "log2sim", "affiliation": "", "source": xml_text.escaped(scenario.name)}
@@ -188,7 +188,7 @@ def _state(tag: str, move: SampledMotion, k: int, step: int) -> Element:
 
 
 def _planning_problem(ego: Agent, number: int, t_s: Array) -> Element:
-    """Return the task of the ego: from its first to its last pose, in about the recorded time."""
+    """Return the task of the ego: from its first to its last pose, in about the time that it takes."""
     move, last, spare = sample_motion(ego, t_s), len(t_s) - 1, round(GOAL_S / STEP_S)
     problem = element("planningProblem", id=str(number))
     initial = _state("initialState", move, 0, 0)

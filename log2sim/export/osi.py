@@ -25,7 +25,7 @@ VEHICLE_TYPE = {
 
 
 class Osi:
-    """`<time>_gt_<OSI>_<protobuf>_<frames>_<name>.osi`: one `GroundTruth` every 0.1 s, stamped with the time of the log.
+    """`<time>_gt_<OSI>_<protobuf>_<frames>_<name>.osi`: one `GroundTruth` every 0.1 s, stamped with absolute time.
 
     Parked vehicles are moving objects too, as in the standard. `source_reference` holds the id and category of each
     agent, and what speaks against it.

@@ -12,6 +12,7 @@ from log2sim.datatypes import Agent, Scenario, Trajectory
 from log2sim.geometry import Array
 from log2sim.simulation.groups import AgentGroup
 from log2sim.simulation.metrics.all_metrics import LOG_FOLLOWERS, replay_metrics
+from log2sim.simulation.metrics.collisions import RECONSTRUCTION, SCENARIO
 from log2sim.simulation.metrics.tracking_error import TrackingErrors, agent_errors
 from log2sim.simulation.reactive.path_table import log_times_of_distance, log_times_of_positions
 from log2sim.simulation.recording import RecordedTracks
@@ -65,7 +66,14 @@ def replay_result(
         dt_s=clock.dt_s,
         store_dt_s=round(clock.dt_s * clock.store_every, 9),
         agents=tuple(agents),
-        metrics=replay_metrics(agents, stored, trajectories, errors, clock),
+        metrics=replay_metrics(
+            agents,
+            stored,
+            trajectories,
+            errors,
+            clock,
+            source_kind=RECONSTRUCTION if scenario.is_reconstruction else SCENARIO,
+        ),
     )
 
 

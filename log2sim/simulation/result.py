@@ -180,7 +180,22 @@ class Replay:
         check(document, "replay-1", ScenarioError)
         plain = ("scenario", "scenario_digest", "mode", "model", "dt_s", "store_dt_s", "metrics")
         agents = tuple(_agent_from_dict(a) for a in document["agents"])
-        return cls(agents=agents, left_out=document.get("left_out", {}), **{k: document[k] for k in plain})
+        known = {**{k: document[k] for k in plain}, "metrics": _with_owners(document["metrics"])}
+        return cls(agents=agents, left_out=document.get("left_out", {}), **known)
+
+
+def _with_owners(metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """State whose each collision is where an older file only says whether the scenario has it, as `in_log`."""
+
+    def owned(events: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        return [{"belongs_to": "scenario" if e["in_log"] else "replay", **e} for e in events]
+
+    by_agent = {k: {**m, "collisions": owned(m["collisions"])} for k, m in metrics["by_agent"].items()}
+    conflicts = [
+        {**c, "contact": "scenario" if c["contact"] == "log" else c["contact"]} for c in metrics.get("conflicts", ())
+    ]
+    found = {"conflicts": conflicts} if "conflicts" in metrics else {}
+    return {**metrics, **found, "collisions": owned(metrics["collisions"]), "by_agent": by_agent}
 
 
 def to_scenario(replay: Replay, scenario: Scenario) -> Scenario:

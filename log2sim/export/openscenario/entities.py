@@ -18,7 +18,7 @@ PREFIX = "log2sim."
 
 @dataclass(frozen=True)
 class VehicleDefaults:
-    """Values that OpenSCENARIO requires and logs do not contain; the limits are only wide enough for the log.
+    """Values that OpenSCENARIO requires and scenarios do not contain; the limits are only wide enough for the scenario.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ VEHICLE_DEFAULTS: Mapping[str, VehicleDefaults] = {
     "other": VehicleDefaults("van", 0.65, 0.6, 70.0, 10.0),
 }
 PEDESTRIAN_MASS_KG = 75.0
-# Wheelbase as a share of the length where the log has no rear axle, and track as a share of the width.
+# Wheelbase as a share of the length where the scenario has no rear axle, and track as a share of the width.
 WHEELBASE_SHARE, TRACK_SHARE = 0.6, 0.85
 
 

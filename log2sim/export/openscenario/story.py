@@ -86,7 +86,7 @@ class AgentStory:
 
     @property
     def start(self) -> Array:
-        """The first pose as a vertex (5,), or the pose at 0 s if the log began before."""
+        """The first pose as a vertex (5,), or the pose at 0 s if its waypoints begin before."""
         t_s = max(self.first_s, 0.0)
         return np.array([np.interp(t_s, self.vertices[:, 0], column) for column in self.vertices.T])
 
@@ -129,7 +129,7 @@ def add_storyboard(parent: Element, stories: list[AgentStory], duration_s: float
     for story in stories:
         if not story.enters or not revision.spawns:
             _add_start(actions, story)
-    act = element("Act", element("Story", storyboard, name="log"), name="replay")
+    act = element("Act", element("Story", storyboard, name="scenario"), name="replay")
     for story in stories:
         _add_group(act, story, revision)
     _add_trigger(act, "StartTrigger", "at the start", 0.0, revision)

@@ -11,7 +11,7 @@ import numpy as np
 
 from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError
-from log2sim.export.checks import require_start_as_in_log
+from log2sim.export.checks import require_start_as_in_scenario
 from log2sim.export.exporters import Options
 from log2sim.export.openscenario.entities import add_entity
 from log2sim.export.openscenario.story import Revision, add_storyboard, agent_stories, start_poses
@@ -51,7 +51,7 @@ def document(scenario: Scenario, road: str, placement: ExportPlacement, revision
     names = unique_names(a.id for a in scenario.agents)
     duration_s = max(scenario.duration_s, *(float(a.waypoints.t_s[-1]) for a in scenario.agents))
     stories = agent_stories(scenario.agents, names, duration_s, placement)
-    require_start_as_in_log(scenario.agents, _boxes(scenario, start_poses(stories, revision)))
+    require_start_as_in_scenario(scenario.agents, _boxes(scenario, start_poses(stories, revision)))
     root = element("OpenSCENARIO")
     element(
         "FileHeader", root,
@@ -92,7 +92,7 @@ def _add_parameters(root: Element, scenario: Scenario, placement: ExportPlacemen
 
 
 def _date(t0_ns: int) -> str:
-    """When the log began: the file's date too, so that the same scenario gives the same file."""
+    """When the scenario begins: the file's date too, so that the same scenario gives the same file."""
     try:
         moment = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=t0_ns // 1_000_000_000)
     except OverflowError:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Trajectory
 from log2sim.simulation.metrics.box_tracks import BoxTracks
-from log2sim.simulation.metrics.collisions import collisions
+from log2sim.simulation.metrics.collisions import REPLAY, SCENARIO, collisions
 from log2sim.simulation.metrics.comfort import comfort
 from log2sim.simulation.metrics.conflicts import conflicts, most_critical
 from log2sim.simulation.metrics.tracking_error import TrackingErrors, agent_metrics, scenario_metrics
@@ -29,6 +29,8 @@ def replay_metrics(
     trajectories: Mapping[str, Trajectory],
     errors: Mapping[str, TrackingErrors],
     clock: StepClock,
+    *,
+    source_kind: str = SCENARIO,
 ) -> dict[str, Any]:
     """Compute the metrics of `schemas/replay-1.json`, by agent and overall.
 
@@ -37,15 +39,17 @@ def replay_metrics(
     agents : sequence of AgentReplay
     stored : sequence of (S,) int
         The steps of each agent's rows; of a static agent all stored steps at which it is present.
-    paths, errors : by id
-        Courses of the agents that move in the log, and how far they are from them.
+    trajectories, errors : by id
+        Trajectories of the agents that move in the scenario, and how far they are from them.
+    source_kind : {"reconstruction", "scenario"}
+        Whose the collisions are that the boxes of the scenario have themselves.
     """
     ids = [a.id for a in agents]
-    replayed, logged = (_box_tracks(agents, stored, source, clock) for source in ({}, trajectories))
+    replayed, source = (_box_tracks(agents, stored, paths, clock) for paths in ({}, trajectories))
     moves = np.array([a.driver != "static" for a in agents], dtype=bool)
     rows = np.arange(len(replayed.x_m), dtype=np.float64)
     t_s = clock.begin_s + rows * (clock.store_every * clock.dt_s)
-    events = collisions(replayed, logged, moves, t_s, ids)
+    events = collisions(replayed, source, moves, t_s, ids, source_kind=source_kind)
     near = conflicts(replayed, moves, t_s, ids, events)
     events_of, near_of = _by_agent(events), _by_agent(near)
     by_agent = {
@@ -64,7 +68,7 @@ def replay_metrics(
     return {
         **scenario_metrics(by_agent, on_time, on_way),
         "collisions": events,
-        "new_collisions": sum(not e["in_log"] for e in events),
+        "new_collisions": sum(e["belongs_to"] == REPLAY for e in events),
         "min_ttc": most_critical(near, "min_ttc"),
         "min_pet": most_critical(near, "pet"),
         "conflicts": near,

@@ -21,8 +21,11 @@ BATCH = 100_000
 """Pairs evaluated together, which bounds memory."""
 
 SAME_CONTACT_S = 0.5  # contacts of a pair that are closer in time form one collision
-LOG_WINDOW_S = 0.5  # the log has a collision too when its boxes overlap within this time of it,
-LOG_MARGIN_M = 0.1  # or pass with a smaller gap than this, which is below the errors of boxes
+SCENARIO_WINDOW_S = 0.5  # the scenario has a collision itself when its boxes overlap within this time of it,
+SCENARIO_MARGIN_M = 0.1  # or pass with a smaller gap than this, which is below the errors of boxes
+
+REPLAY, RECONSTRUCTION, SCENARIO = "replay", "reconstruction", "scenario"
+"""Whose a collision is: new in the replay; or of the scenario, whose own boxes overlap, by its kind."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,35 +121,43 @@ def _overlapping_hulls(
 
 
 def collisions(
-    replayed: BoxTracks, logged: BoxTracks, moves: NDArray[np.bool_], t_s: Array, ids: Sequence[str]
+    replayed: BoxTracks,
+    source: BoxTracks,
+    moves: NDArray[np.bool_],
+    t_s: Array,
+    ids: Sequence[str],
+    *,
+    source_kind: str = SCENARIO,
 ) -> list[dict[str, Any]]:
-    """List collisions in order of time: pair, first and last contact, relative speed, and whether the log has it too.
+    """List collisions in order of time: pair, first and last contact, relative speed, and whose they are.
 
-    `t_s` (S,) are the evenly spaced times of the rows; in between contacts are known to about 0.01 ms.
+    Those that the boxes of the scenario, `source`, have themselves belong to `source_kind`, all others to the replay. `t_s`
+    (S,) are the evenly spaced times of the rows; in between contacts are known to about 0.01 ms.
     """
     touching = contacts(replayed, moves)
     if not len(touching.a):
         return []
     involved = np.isin(np.arange(len(ids)), np.concatenate([touching.a, touching.b]))
-    grown = replace(logged, size_m=logged.size_m + np.array([LOG_MARGIN_M, LOG_MARGIN_M, 0.0]))
+    grown = replace(source, size_m=source.size_m + np.array([SCENARIO_MARGIN_M, SCENARIO_MARGIN_M, 0.0]))
     known = contacts(grown, moves, involved)
     velocity = np.stack(replayed.velocities(spacing_s(t_s)))
     rows = np.arange(len(t_s), dtype=np.float64)
-    logged_contacts = _by_pair(known)
+    own_contacts = _by_pair(known)
     events: list[dict[str, Any]] = []
     for (a, b), contact in _by_pair(touching).items():
-        in_log = np.interp(logged_contacts.get((a, b), np.zeros((2, 0))), rows, t_s)
+        own_s = np.interp(own_contacts.get((a, b), np.zeros((2, 0))), rows, t_s)
         together = max(replayed.first_row[a], replayed.first_row[b])
         for begin_row, end_row in _merged_contacts(contact, SAME_CONTACT_S / spacing_s(t_s)):
             begin, end = np.interp([begin_row, end_row], rows, t_s)
-            shared = (in_log[0] <= end + LOG_WINDOW_S) & (in_log[1] >= begin - LOG_WINDOW_S)
+            own = (own_s[0] <= end + SCENARIO_WINDOW_S) & (own_s[1] >= begin - SCENARIO_WINDOW_S)
             events.append(
                 {
                     "agents": [ids[a], ids[b]],
                     "t_s": round(float(begin), 6),
                     "until_s": round(float(end), 6),
                     "relative_speed_mps": round(_relative_speed(velocity, begin_row, a, b), 3),
-                    "in_log": bool(shared.any()),
+                    "belongs_to": source_kind if own.any() else REPLAY,
+                    "in_log": bool(own.any()),
                     "from_start": bool(begin_row == together),
                 }
             )

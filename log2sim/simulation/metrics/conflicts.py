@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import EGO
 from log2sim.geometry import Array
 from log2sim.simulation.metrics.box_tracks import BoxTracks, spacing_s
+from log2sim.simulation.metrics.collisions import REPLAY
 from log2sim.simulation.metrics.post_encroachment_time import post_encroachment_times
 from log2sim.simulation.metrics.time_to_collision import times_to_collision
 
@@ -22,8 +23,8 @@ def conflicts(
 ) -> list[dict[str, Any]]:
     """Return one record for every pair with a time to collision or a post-encroachment time, the most critical first.
 
-    Both times of a pair with a collision that the log does not have are 0 when it begins; `contact` is "none", "new" or
-    "log".
+    Both times of a pair with a collision that the scenario does not have are 0 when it begins; `contact` is "none", "new"
+    or "scenario".
     """
     step_s = spacing_s(t_s)
     rows = np.arange(len(t_s), dtype=np.float64)
@@ -45,20 +46,20 @@ def conflicts(
     index = {k: n for n, k in enumerate(ids)}
     for event in collisions:
         entry = record(*(index[k] for k in event["agents"]))
-        if not event["in_log"] and entry["contact"] != "new":
+        if event["belongs_to"] == REPLAY and entry["contact"] != "new":
             t = event["t_s"]
             entry.update(contact="new", min_ttc_s=0.0, min_ttc_t_s=t, pet_s=0.0, pet_t_s=t, pet_first=None)
-        elif event["in_log"] and entry["contact"] == "none":
-            entry["contact"] = "log"
+        elif event["belongs_to"] != REPLAY and entry["contact"] == "none":
+            entry["contact"] = "scenario"
     return sorted(by_pair.values(), key=lambda e: (_urgency_s(e), e["agents"]))
 
 
 def most_critical(found: Iterable[Event], key: str) -> dict[str, Any] | None:
     """Return `agents`, `t_s` and value `s` of the record with the least `key` ("min_ttc" or "pet"); None without any.
 
-    Pairs that touch in the log too are left out: the errors of logged boxes are larger than the gap between them.
+    Pairs that touch in the scenario itself are left out: the errors of its boxes are larger than the gap between them.
     """
-    known = [e for e in found if e[f"{key}_s"] is not None and e["contact"] != "log"]
+    known = [e for e in found if e[f"{key}_s"] is not None and e["contact"] != "scenario"]
     if not known:
         return None
     first = min(known, key=lambda e: (e[f"{key}_s"], e["agents"]))

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 
 from log2sim.errors import CheckFailed, ConfigError
 from log2sim.registry import nearest
+from log2sim.simulation.metrics.collisions import REPLAY
 from log2sim.simulation.metrics.comfort import LIMITS as COMFORT
 from log2sim.simulation.metrics.tracking_error import OFF_PATH_M
 from log2sim.simulation.result import Replay
@@ -60,15 +61,15 @@ def check_limits(replay: Replay, limits: Mapping[str, float]) -> list[str]:
 
 
 def check_strict(replay: Replay, limits: Mapping[str, float] | None = None) -> list[str]:
-    """Return what breaks a limit of `--strict`: collisions that the log does not have, large errors, infeasible logs.
+    """Return what breaks a limit of `--strict`: collisions of the replay, large errors, infeasible scenarios.
 
-    Comfort, time to collision and post-encroachment time count only when named in `limits`: what the drivers of the log did
-    is no failure of a replay.
+    Comfort, time to collision and post-encroachment time count only when named in `limits`: what the drivers did in
+    the scenario is no failure of a replay.
     """
     broken = [
-        f"{' and '.join(e['agents'])} collide at {e['t_s']:.2f} s ({e['relative_speed_mps']:.1f} m/s); the log has no such collision"
+        f"{' and '.join(e['agents'])} collide at {e['t_s']:.2f} s ({e['relative_speed_mps']:.1f} m/s); the scenario has no such collision"
         for e in replay.metrics["collisions"]
-        if not e["in_log"]
+        if e["belongs_to"] == REPLAY
     ]
     for agent in replay.agents:
         if agent.driver in ("policy", "reactive"):

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from log2sim.simulation.metrics.all_metrics import LOG_FOLLOWERS
+from log2sim.simulation.metrics.collisions import REPLAY
 from log2sim.simulation.metrics.conflicts import most_critical
 from log2sim.simulation.result import Replay
 
@@ -14,7 +15,7 @@ MAX_LISTED = 5
 
 
 def summarize(replay: Replay) -> str:
-    """Summarize errors, conflicts and models in a line each, and list the first collisions, those not in the log first.
+    """Summarize errors, conflicts and models in a line each, and list the first collisions, those of the replay first.
 
     Where a policy drives the ego, the times are those of the ego. An error that no agent has is shown as a dash.
     """
@@ -24,11 +25,10 @@ def summarize(replay: Replay) -> str:
     whose = " of the ego" if driven else ""
     lines = [
         _error_line(replay),
-        f"{_counted(len(m['collisions']), 'collision')}, {m['new_collisions']} that the log does not have · "
-        f"least time to collision{whose} {_critical_time(near, 'min_ttc')} · post-encroachment time {_critical_time(near, 'pet')}",
+        f"{_collision_counts(m['collisions'])} · least time to collision{whose} {_critical_time(near, 'min_ttc')} · post-encroachment time {_critical_time(near, 'pet')}",
     ]
     lines += _model_lines(replay)
-    events = sorted(m["collisions"], key=lambda e: (e["in_log"], e["t_s"]))
+    events = sorted(m["collisions"], key=lambda e: (e["belongs_to"] != REPLAY, e["t_s"]))
     lines += [f"  {_collision_line(e)}" for e in events[:MAX_LISTED]]
     if len(events) > MAX_LISTED:
         lines.append(f"  and {len(events) - MAX_LISTED} more")
@@ -36,8 +36,15 @@ def summarize(replay: Replay) -> str:
     return "\n".join(lines)
 
 
+def _collision_counts(events: Sequence[Mapping[str, Any]]) -> str:
+    """Count collisions by whose they are: "3 collisions, 1 of the replay and 2 of the reconstruction itself"."""
+    total, whose = _counted(len(events), "collision"), Counter(e["belongs_to"] for e in events)
+    parts = [f"{whose[REPLAY]} of the replay", *(f"{n} of the {k} itself" for k, n in whose.items() if k != REPLAY)]
+    return f"{total}, {' and '.join(parts)}" if events else total
+
+
 def _error_line(replay: Replay) -> str:
-    """Cross-track errors of agents on the logged path, and the other errors of those that also keep its times."""
+    """Cross-track errors of agents on the path of the scenario, and the other errors of those that also keep its times."""
     m, drivers = replay.metrics, {a.driver for a in replay.agents}
     on_time = bool(drivers & {*LOG_FOLLOWERS})
     across, along, speed = "-", "-", "-"
@@ -70,7 +77,7 @@ def _left_out_lines(replay: Replay) -> list[str]:
 
 
 def _collision_line(event: Mapping[str, Any]) -> str:
-    known = ", as in the log" if event["in_log"] else ""
+    known = "" if event["belongs_to"] == REPLAY else f", in the {event['belongs_to']} itself"
     return f"{' and '.join(event['agents'])} collide at {event['t_s']:.2f} s ({event['relative_speed_mps']:.1f} m/s){known}"
 
 

@@ -19,6 +19,7 @@ from log2sim.errors import ConfigError
 from log2sim.geometry import Array
 from log2sim.visualization.plot import drawing, shapes
 from log2sim.visualization.plot.collisions import new_collisions
+from log2sim.visualization.plot.doubts import STRIPE_PT, box_stripes, is_doubted_at
 from log2sim.visualization.plot.layout import SIDE_IN, TOP_IN, WIDTH_IN, FigureLayout
 from log2sim.visualization.plot.roles import AgentRoles, centers_xy
 from log2sim.visualization.plot.scene import draw_base
@@ -131,17 +132,18 @@ class AnimatedArtists:
         self.tails = LineCollection([], linewidths=2.0, capstyle="round", **hidden)
         self.boxes = PolyCollection([], edgecolors=PAPER, linewidths=0.7, **hidden)
         self.noses = PolyCollection([], facecolors=to_rgba(PAPER, 0.85), linewidths=0, **hidden)
+        self.hatches = LineCollection([], colors=PAPER, linewidths=STRIPE_PT, **hidden)
         self.truths = PolyCollection(
             [], facecolors="none", edgecolors=INK, linewidths=0.8, linestyles=[(0, (3, 2))], **hidden
         )
         self.driven = PolyCollection([], facecolors="none", linewidths=1.2, linestyles=[(0, (1, 1.2))], **hidden)
-        self.collections = [self.tails, self.boxes, self.noses, self.truths, self.driven]
+        self.collections = [self.tails, self.boxes, self.hatches, self.noses, self.truths, self.driven]
         for collection in self.collections:
             layout.ax.add_collection(collection, autolim=False)
         text: dict[str, Any] = {"family": FONT, "fontweight": "bold", "parse_math": False, "animated": True}
         self.labels = [
             layout.ax.text(
-                0, 0, "ego" if r.is_ego else r.label, color=r.color, fontsize=6.5, path_effects=halo(), clip_on=True,
+                0, 0, ("ego" if r.is_ego else r.label) + "?" * r.agent.is_doubtful, color=r.color, fontsize=6.5, path_effects=halo(), clip_on=True,
                 ha="center", va="center", **text,
             )
             for r in roles.movers
@@ -160,6 +162,8 @@ class AnimatedArtists:
         self.boxes.set_verts(corners)
         self.boxes.set_facecolor(colors)
         self.noses.set_verts(list(shapes.heading_triangles(np.array(corners))) if corners else [])
+        doubted = [(r.agent, pose) for r, pose in present if is_doubted_at(r.agent, t_s)]
+        self.hatches.set_segments([s for a, p in doubted for s in box_stripes(a, p[:2], p[2], self.layout.view)])
         self.tails.set_segments([_tail(r.agent, t_s) for r, _ in present])
         self.tails.set_color([to_rgba(r.color, TAIL_ALPHA) for r, _ in present])
         self._show_overlays(t_s)

@@ -1,4 +1,4 @@
-"""Collisions of a replay that do not occur in its log."""
+"""Collisions of a replay that its scenario does not have."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from log2sim.geometry import Array
+from log2sim.simulation.metrics.collisions import REPLAY
 
 
 def new_collisions(replay: Any) -> tuple[Array, Array]:
-    """Find the collisions of a replay that do not occur in the log.
+    """Find the collisions of a replay that its scenario does not have.
 
     Returns
     -------
@@ -21,7 +22,7 @@ def new_collisions(replay: Any) -> tuple[Array, Array]:
     """
     if replay is None:
         return np.zeros(0), np.zeros((0, 2))
-    events = [e for e in replay.metrics.get("collisions", ()) if not e["in_log"]]
+    events = [e for e in replay.metrics.get("collisions", ()) if e["belongs_to"] == REPLAY]
     agents = {a.id: a for a in replay.agents}
     places = [
         np.mean(

@@ -173,7 +173,7 @@ def draw_replay(ax: Axes, replay: Any, roles: AgentRoles) -> None:
 
 
 def draw_collisions(ax: Axes, xy_m: Array, **style: Any) -> Line2D:
-    """Mark collisions that do not occur in the log."""
+    """Mark collisions that belong to the replay."""
     return ax.plot(*xy_m.T, ls="none", zorder=LABEL - 0.1, **COLLISION_MARK, **style)[0]
 
 
@@ -183,9 +183,14 @@ def draw_labels(ax: Axes, roles: AgentRoles, view: Viewport, times_step_s: float
     for role in roles.movers:
         anchor = centers_xy(role.agent)[-1]
         if role.leading and view.contains(anchor[None])[0]:
-            text = "ego" if role.is_ego else role.label
+            text = ("ego" if role.is_ego else role.label) + "?" * role.agent.is_doubtful
             box_half = np.ptp(shapes.footprints(role.agent, anchor, role.agent.waypoints.yaw_rad[-1])[0], axis=0) / 2
             _write(ax, text, anchor, box_half, taken, view, color=role.color, fontsize=7.0, fontweight="bold")
+    for agent in roles.stationary:
+        anchor = centers_xy(agent)[len(agent.waypoints) // 2]
+        if agent.is_doubtful and view.contains(anchor[None])[0]:
+            half = np.full(2, agent.size_m[1] / 2)
+            _write(ax, f"{agent.id}?", anchor, half, taken, view, color=MUTED, fontsize=6.0, fontweight="normal")
     if roles.movers and roles.movers[0].is_ego:
         ego = roles.movers[0].agent
         t, xy = shapes.time_marks(ego, times_step_s)

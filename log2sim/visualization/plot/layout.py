@@ -126,7 +126,7 @@ def legend_rows(
     if replay:
         rows.append((_line(MUTED, lw=1.9, ls=(0, (0.1, 1.6)), dash_capstyle="round"), "replay"))
     if collisions:
-        rows.append((Line2D([], [], ls="none", **{**COLLISION_MARK, "ms": 6.0}), "collision, not in the log"))
+        rows.append((Line2D([], [], ls="none", **{**COLLISION_MARK, "ms": 6.0}), "collision of the replay"))
     if outside:
         rows.append((_line("none"), f"{outside} outside this view"))
     return rows

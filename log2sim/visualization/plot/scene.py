@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from log2sim.datatypes import Scenario
-from log2sim.visualization.plot import drawing
+from log2sim.visualization.plot import doubts, drawing
 from log2sim.visualization.plot.collisions import new_collisions
 from log2sim.visualization.plot.layout import (
     FigureLayout,
@@ -49,12 +49,15 @@ def draw_base(
     overlays = {"truth": truth is not None, "replay": replay is not None}
     collisions = len(new_collisions(replay)[0])
     rows = legend_rows(roles, None if moving else step_s, collisions=collisions, outside=outside, **overlays)
+    rows += doubts.doubt_rows(roles)
     timeline = timeline_of(replay, scenario, roles)
-    layout = make_layout(chosen, len(rows), projected=projected, foot_in=charts_height_in(timeline))
+    lines = sum(1 + text.count("\n") for _, text in rows)
+    layout = make_layout(chosen, lines, projected=projected, foot_in=charts_height_in(timeline))
     if background is not None:
         drawing.draw_background(layout.ax, background)
     layout.ax.set(xlim=(layout.view.x0, layout.view.x1), ylim=(layout.view.y0, layout.view.y1))
     drawing.draw_stationary(layout.ax, roles.stationary, layout.view)
+    doubts.hatch_stationary(layout.ax, roles, layout.view, drawing.STATIONARY + 0.1)
     draw_legend(layout, rows)
     draw_scale_and_north(layout, projected=projected)
     write_title(layout, title or scenario.name or "scenario", _subtitle(scenario, roles))
@@ -68,6 +71,8 @@ def _subtitle(scenario: Scenario, roles: AgentRoles) -> str:
     moving = sum(is_moving(r.agent) for r in roles.movers if not r.is_ego)
     agents = len(scenario.others)
     parts = [f"{scenario.duration_s:.1f} s", f"{agents} agent{'' if agents == 1 else 's'}, {moving} moving"]
+    if scenario.doubtful:
+        parts.append(f"{len(scenario.doubtful)} doubtful")
     if scenario.ego is None:
         parts.append("no ego")
     if scenario.map.latitude_deg is not None and scenario.map.longitude_deg is not None:

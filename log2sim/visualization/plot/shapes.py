@@ -31,6 +31,21 @@ def heading_triangles(corners: Array, depth: float = 0.42) -> Array:
     )
 
 
+def stripes(corners: Array, spacing_m: float) -> Array:
+    """Compute parallel lines (K, 2, 2) across a footprint (4, 2), at 45 degrees to its sides and at least two of them."""
+    front_left, rear_left, rear_right, _ = corners
+    along, across = front_left - rear_left, rear_right - rear_left
+    length, width = float(np.hypot(*along)), float(np.hypot(*across))
+    reach = length + width
+    count = max(int(reach / (spacing_m * np.sqrt(2))), 2)
+    offset = (np.arange(count) + 0.5) / count * reach - width  # where the line meets the side, from the rear
+    first = np.stack([np.maximum(offset, 0.0), np.maximum(-offset, 0.0)], axis=1)
+    last = np.stack([np.minimum(length, offset + width), np.minimum(width, length - offset)], axis=1)
+    ends = np.stack([first, last], axis=1)
+    lines: Array = rear_left + ends[..., :1] * (along / length) + ends[..., 1:] * (across / width)
+    return lines
+
+
 def contiguous_runs(keep: NDArray[np.bool_]) -> Iterator[slice]:
     """Yield slices over points of a track, one for each run of kept segments `keep` (T - 1,)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], keep.astype(np.int8), [0]])))

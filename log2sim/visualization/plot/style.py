@@ -22,7 +22,7 @@ PARKED_FACE, PARKED_EDGE = "#D5DAE1", "#A9B2BE"
 PAPER = "#FFFFFF"
 ALARM = "#C8102E"
 COLLISION_MARK: dict[str, Any] = {"marker": "X", "ms": 8.5, "mfc": ALARM, "mec": PAPER, "mew": 0.9}
-"""Mark of collisions that do not occur in the log."""
+"""Mark of collisions that belong to the replay."""
 
 PALETTE = (
     "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#882255", "#999933", "#332288", "#44AA99",

@@ -14,6 +14,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from log2sim.datatypes import Scenario
 from log2sim.geometry import Array
+from log2sim.simulation.metrics.collisions import REPLAY
 from log2sim.visualization.plot.layout import (
     CHART_GAP_IN,
     CHART_IN,
@@ -77,7 +78,7 @@ class AgentTimeline:
     driver : str
     charts : tuple of Chart
     collisions_s : tuple of float, s
-        Start of its collisions that do not occur in the log.
+        Start of its collisions that belong to the replay.
     """
 
     role: AgentRole
@@ -87,7 +88,7 @@ class AgentTimeline:
 
 
 def timeline_of(replay: Any, scenario: Scenario, roles: AgentRoles) -> AgentTimeline | None:
-    """Choose the ego, else the driven agent farthest from its path; None when the log drives all agents."""
+    """Choose the ego, else the driven agent farthest from its path; None when all agents are where the scenario has them."""
     if replay is None:
         return None
     role_of = {r.agent.id: r for r in roles.movers}
@@ -98,7 +99,7 @@ def timeline_of(replay: Any, scenario: Scenario, roles: AgentRoles) -> AgentTime
         driven, key=lambda a: float(np.max(np.abs(a.cross_track_m)))
     )
     role = role_of[agent.id]
-    events = [e for e in replay.metrics.get("collisions", ()) if agent.id in e["agents"] and not e["in_log"]]
+    events = [e for e in replay.metrics.get("collisions", ()) if agent.id in e["agents"] and e["belongs_to"] == REPLAY]
     return AgentTimeline(role, agent.driver, _strips(agent, role), tuple(e["t_s"] for e in events))
 
 
@@ -107,7 +108,7 @@ def _strips(agent: Any, role: AgentRole) -> tuple[Chart, ...]:
     out = [
         Chart(
             "speed", "km/h", 4.0,
-            (Curve("log", w.t_s, w.speed_mps * KMH, "ribbon"), Curve("replay", t, agent.speed_mps * KMH)),
+            (Curve("scenario", w.t_s, w.speed_mps * KMH, "ribbon"), Curve("replay", t, agent.speed_mps * KMH)),
         )
     ]  # fmt: skip
     if agent.commands is not None:

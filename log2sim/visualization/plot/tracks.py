@@ -10,7 +10,7 @@ import matplotlib
 from log2sim.datatypes import Scenario
 from log2sim.documents import refuse_existing, replaced
 from log2sim.errors import ConfigError
-from log2sim.visualization.plot import drawing
+from log2sim.visualization.plot import doubts, drawing
 from log2sim.visualization.plot.collisions import new_collisions
 from log2sim.visualization.plot.layout import (
     FigureLayout,
@@ -94,6 +94,7 @@ def still(
     drawing.draw_tracks(layout.ax, roles, layout.view, step_s, alpha=0.45 if overlaid else 1.0)
     ghosts = None if overlaid or drawing.view_is_crowded(roles) else step_s
     drawing.draw_ends(layout.ax, roles, layout.view, ghosts_step_s=ghosts)
+    doubts.hatch_movers(layout.ax, roles, layout.view, drawing.TRACK + 0.5, drawing.BOX + 0.6)
     if truth is not None:
         drawing.draw_truth(layout.ax, truth)
     if replay is not None:

@@ -1,0 +1,136 @@
+"""Doubtful agents in pictures: hatched boxes, striped tracks, reasons in the legend."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from export_worlds import straight, world
+from matplotlib.collections import LineCollection
+
+from log2sim.datatypes import Agent, Doubt, Scenario
+from log2sim.geometry import Array, box_corners_bev
+from log2sim.visualization.plot import doubts, shapes
+from log2sim.visualization.plot.animation import AnimatedArtists, FrameTiming
+from log2sim.visualization.plot.layout import FigureLayout
+from log2sim.visualization.plot.roles import assign_roles
+from log2sim.visualization.plot.scene import draw_base
+from log2sim.visualization.plot.tracks import plot_tracks, still
+from log2sim.visualization.plot.viewport import Viewport
+
+VIEW = Viewport(-20.0, 20.0, -20.0, 20.0, 0.1)
+
+
+def doubted(agent: Agent, *spans: tuple[float | None, float | None]) -> Agent:
+    return replace(agent, doubts=tuple(Doubt("reversing", "reverses at 7.4 m/s", *span) for span in spans))
+
+
+def scene() -> Scenario:
+    """Movers doubtful from 1 to 2 s, at the end, and for low confidence; a standing one; and one without a doubt."""
+    names = ("middle", "end", "unsure", "sure")
+    middle, end, unsure, sure = (straight(name, start=(0.0, 6.0 * k)) for k, name in enumerate(names, start=1))
+    parked = replace(straight("parked", start=(20.0, -8.0), speed=0.0), static=True)
+    agents = doubted(middle, (1.0, 2.0)), doubted(end, (2.5, None)), replace(unsure, confidence=0.2), sure
+    return world(straight("ego"), *agents, doubted(parked, (None, None)))
+
+
+def drawn(scenario: Scenario) -> FigureLayout:
+    return still(scenario, assign_roles(scenario))
+
+
+def striped(layout: FigureLayout) -> list[Array]:
+    """The middles of all groups of stripes."""
+    groups = [c.get_segments() for c in layout.ax.collections if isinstance(c, LineCollection)]
+    return [np.mean(g, axis=(0, 1)) for g in groups if len(g) > 1 and all(len(s) == 2 for s in g)]
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7, -2.9])
+@pytest.mark.parametrize("spacing_m", [0.2, 0.5, 40.0])
+def test_stripes_cross_the_box_at_45_degrees(yaw: float, spacing_m: float) -> None:
+    corners = box_corners_bev([[3.0, -2.0]], 4.4, 1.8, yaw)[0]
+    lines = shapes.stripes(corners, spacing_m)
+    c, s = np.cos(yaw), np.sin(yaw)
+    local = (lines - [3.0, -2.0]) @ np.array([[c, -s], [s, c]])
+    assert len(lines) >= 2
+    assert np.abs(local).max(axis=(0, 1)) == pytest.approx([2.2, 0.9], abs=0.51 * spacing_m if spacing_m < 1 else 2)
+    assert (np.abs(local) <= np.array([2.2, 0.9]) + 1e-9).all()
+    on_edge = np.isclose(np.abs(local), [2.2, 0.9]).any(axis=-1)
+    assert on_edge.all()  # from side to side
+    step = local[:, 1] - local[:, 0]
+    np.testing.assert_allclose(np.abs(step[:, 0]), np.abs(step[:, 1]), atol=1e-9)
+
+
+def test_a_track_is_striped_where_it_is_doubtful() -> None:
+    agent = doubted(straight("car"), (1.0, 2.0))
+    (part,) = doubts.doubtful_parts(agent)
+    np.testing.assert_allclose(part[[0, -1], 0], [5.0, 10.0])
+    (whole,) = doubts.doubtful_parts(replace(straight("car"), confidence=0.49))
+    np.testing.assert_allclose(whole[[0, -1], 0], [0.0, 15.0])
+    assert list(doubts.doubtful_parts(doubted(straight("car"), (7.0, 8.0)))) == []
+    (moment,) = doubts.doubtful_parts(doubted(straight("car"), (1.0, 1.0)))
+    assert moment[-1, 0] - moment[0, 0] == pytest.approx(5.0 * doubts.MIN_SHOWN_S)  # a moment could not be seen
+
+
+def test_an_agent_is_doubted_while_a_doubt_holds() -> None:
+    agent = doubted(straight("car"), (1.0, 2.0))
+    assert [doubts.is_doubted_at(agent, t) for t in (0.9, 1.0, 2.0, 2.1)] == [False, True, True, False]
+    assert not doubts.is_doubted_at(straight("car"), 1.0)
+    assert doubts.is_doubted_at(replace(straight("car"), confidence=0.49), 1e9)
+
+
+def test_boxes_are_hatched_where_they_are_doubtful() -> None:
+    places = striped(drawn(scene()))
+    for hatched in ([15.0, 12.0], [15.0, 18.0], [20.0, -8.0]):  # the ends of "end" and "unsure", and what is parked
+        assert min(np.hypot(*(place - hatched)) for place in places) < 0.05
+    assert len(places) == 3
+    clean = scene()
+    assert (
+        striped(drawn(replace(clean, agents=tuple(replace(a, doubts=(), confidence=1.0) for a in clean.agents)))) == []
+    )
+
+
+def test_legend_labels_and_title_name_them() -> None:
+    layout = drawn(scene())
+    rows = [t.get_text().replace("\n", " ") for t in layout.figure.legends[0].get_texts()]
+    assert "middle is doubtful: reverses at 7.4 m/s" in rows
+    assert "unsure is doubtful: confidence 0.20" in rows
+    assert not [row for row in rows if row.startswith("sure is")]
+    labels = {t.get_text() for t in layout.ax.texts}
+    assert {"1?", "2?", "3?", "4", "parked?"} <= labels
+    assert any("4 doubtful" in t.get_text() for t in layout.figure.texts)
+
+
+def test_many_and_long_reasons_leave_the_legend_beside_the_map() -> None:
+    long = "slides " * 60
+    agents = [
+        replace(straight(f"car-{k}", start=(0.0, 3.0 * k)), doubts=(Doubt("sideways", long),)) for k in range(1, 30)
+    ]
+    layout = drawn(world(straight("ego"), *agents))
+    rows = [t.get_text() for t in layout.figure.legends[0].get_texts()]
+    assert f"and {len(agents) - doubts.MAX_NAMED} more doubtful" in rows
+    assert all(len(line) <= doubts.LINE_LETTERS for row in rows for line in row.split("\n") if "doubtful" in row)
+    layout.canvas.draw()
+    assert layout.figure.legends[0].get_window_extent().y0 >= 0
+
+
+def test_an_animation_hatches_only_while_the_doubt_holds() -> None:
+    scenario = world(straight("ego"), doubted(straight("car", start=(0.0, 6.0)), (1.0, 2.0)))
+    roles = assign_roles(scenario)
+    layout, _, _ = draw_base(scenario, roles, moving=True)
+    layout.canvas.draw()
+    artists = AnimatedArtists(layout, roles, None, None, FrameTiming(2, 1.0), None)
+    counts = []
+    for t in (0.5, 1.5, 2.5):
+        artists.show(t)
+        counts.append(len(artists.hatches.get_segments()))
+    assert counts[0] == counts[2] == 0
+    assert counts[1] >= 2
+
+
+@pytest.mark.parametrize("suffix", [".svg", ".png"])
+def test_the_same_doubts_give_the_same_bytes(suffix: str, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        plot_tracks(scene(), tmp_path / f"{name}{suffix}", dpi=50)
+    assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
