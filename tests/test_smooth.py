@@ -13,9 +13,9 @@ import pytest
 from scipy.integrate import quad_vec
 from scipy.linalg import expm
 
-from log2sim.agents.smooth.feasibility import broken_limits
+from log2sim.agents.smooth.feasibility import broken_limits, limit_doubts
 from log2sim.agents.smooth.fixed_interval import MotionModel, smooth_interval
-from log2sim.agents.smooth.heading import yaw_of_motion
+from log2sim.agents.smooth.heading import yaw_of_motion, yaw_sigma
 from log2sim.agents.smooth.motion_prior import (
     ACCELERATION_PRIOR_MPS2,
     KNOT_STEP_S,
@@ -350,12 +350,14 @@ def test_what_cannot_be_smoothed_is_refused(
 
 def test_impossible_motion_is_flagged() -> None:
     t = DT * np.arange(60)
-    assert smooth_track(t, turn(t), sigma_m=0.1).flags == ()
+    assert smooth_track(t, turn(t), sigma_m=0.1).broken == ()
     spin = 2.0 * np.column_stack([np.sin(2.0 * t), 1 - np.cos(2.0 * t)])  # 4 m/s on a circle of 2 m
-    assert "curvature" in smooth_track(t, spin, sigma_m=0.01, motion=MotionModel(1e4)).flags
-    assert smooth_track(t, spin, sigma_m=0.01, motion=MotionModel(1e4, holonomic=True)).flags == ()
+    broken = smooth_track(t, spin, sigma_m=0.01, motion=MotionModel(100.0)).broken
+    assert [limit.start_s < 0.5 < limit.end_s for limit in broken if limit.name == "curvature"] == [True]
+    assert smooth_track(t, spin, sigma_m=0.01, motion=MotionModel(1e4, holonomic=True)).broken == ()
     rocket = np.column_stack([10.0 * t**2, 0 * t])
-    assert "acceleration" in smooth_track(t, rocket, sigma_m=0.01, motion=MotionModel(1e4)).flags
+    broken = smooth_track(t, rocket, sigma_m=0.01, motion=MotionModel(100.0)).broken
+    assert "acceleration" in [limit.name for limit in broken]
 
 
 def test_knots_stand_no_nearer_than_their_step() -> None:
@@ -564,14 +566,54 @@ def test_the_selected_inverse_has_the_blocks_of_the_whole_one(count: int) -> Non
     np.testing.assert_allclose(back[1], off)
 
 
-def test_limits_that_a_motion_breaks_are_named() -> None:
+def test_limits_that_a_motion_breaks_are_named_with_their_spans() -> None:
     t, zero = DT * np.arange(10), np.zeros(10)
     calm = np.zeros((10, 2))
     assert broken_limits(t, calm, zero, zero) == ()
-    assert broken_limits(t, calm + np.array([11.0, 0.0]), zero, zero) == ("acceleration",)
-    assert broken_limits(t, calm + np.array([0.0, 9.0]), zero, zero) == ("lateral_acceleration",)
-    assert broken_limits(t, calm, zero, zero + 0.4) == ("curvature",)
-    assert broken_limits(t, np.where(t > 0.45, 6.0, 0.0)[:, None] * np.array([1.0, 0.0]), zero, zero) == ("jerk",)
+    (hard,) = broken_limits(t, calm + np.array([11.0, 0.0]), zero, zero)
+    assert (hard.name, hard.worst, hard.start_s, hard.end_s) == ("acceleration", 11.0, t[0], t[-1])
+    (slide,) = broken_limits(t, calm + np.array([0.0, 9.0]), zero, zero)
+    assert slide.name == "lateral_acceleration"
+    (spin,) = broken_limits(t, calm, zero, np.where(t == t[3], 0.4, 0.0))
+    assert (spin.name, spin.worst_s, spin.start_s, spin.end_s) == ("curvature", t[3], t[3], t[3])
+    (jolt,) = broken_limits(t, np.where(t > t[4], 6.0, 0.0)[:, None] * np.array([1.0, 0.0]), zero, zero)
+    assert (jolt.name, jolt.start_s, jolt.end_s) == ("jerk", t[4], t[5])
+    (doubt,) = limit_doubts([spin])
+    assert (doubt.flag, doubt.reason) == ("curvature", f"turns on a circle of 2.5 m at {t[3]:.1f} s")
+    assert doubt.holds(t).tolist() == (t == t[3]).tolist()
+
+
+def test_a_limit_that_noise_may_have_broken_is_not() -> None:
+    t, zero = DT * np.arange(10), np.zeros(10)
+    above = np.full((10, 2), [11.0, 0.0])
+    assert broken_limits(t, above, zero, zero, {"acceleration": zero + 0.5}) == ()
+    assert broken_limits(t, above, zero, zero, {"acceleration": zero + 0.2}) != ()
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.2])
+def test_sigmas_of_yaw_and_speed_are_honest(sigma: float) -> None:
+    t = DT * np.arange(60)
+    truth_yaw, off_yaw, off_speed = np.arctan2(*np.gradient(turn(t), t, axis=0).T[::-1]), [], []
+    truth_speed = np.hypot(*np.gradient(turn(t), t, axis=0).T)
+    for seed in range(12):
+        noisy = turn(t) + np.random.default_rng(seed).normal(0, sigma, (60, 2))
+        path = smooth_track(t, noisy, sigma_m=sigma)
+        off_yaw.append(wrap_angle(path.yaw_rad - truth_yaw)[2:-2] / path.sigma_yaw_rad[2:-2])
+        off_speed.append((np.hypot(*path.velocity_mps.T) - truth_speed)[2:-2] / path.sigma_speed_mps[2:-2])
+    assert 0.5 < np.mean(np.square(off_yaw)) < 2.0
+    assert 0.5 < np.mean(np.square(off_speed)) < 2.0
+
+
+def test_the_sigma_of_a_held_heading_grows_with_the_way_only() -> None:
+    velocity = np.column_stack([np.r_[np.full(5, 5.0), np.full(5, 0.5), np.zeros(10)], np.zeros(20)])
+    xy = np.column_stack([np.cumsum(velocity[:, 0]) * DT, np.zeros(20)])
+    known = np.arange(20) < 5
+    sigma = yaw_sigma(xy, velocity, np.tile(0.01 * np.eye(2), (20, 1, 1)), known)
+    np.testing.assert_allclose(sigma[:5], 0.02)
+    assert np.all(np.diff(sigma[5:10]) > 0)
+    np.testing.assert_allclose(sigma[11:], sigma[11])
+    unknown = yaw_sigma(xy, velocity, np.tile(0.01 * np.eye(2), (20, 1, 1)), ~known & known, hint_sigma_rad=0.3)
+    assert unknown.tolist() == [0.3] * 20
 
 
 @pytest.mark.slow

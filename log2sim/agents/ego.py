@@ -43,7 +43,7 @@ def ego_agent(log: Log, timeline: Timeline, source: str = "ego poses of the log"
     moved = float(np.hypot(np.ptp(center[:, 0]), np.ptp(center[:, 1])))
     return Agent(
         "ego", "car", vehicle.size_m, waypoints, static=moved < STANDSTILL_DRIFT_M, rear_axle_offset_m=vehicle.rear_axle_offset_m,
-        doubts=limit_doubts(path.flags), quality={"source": source},
+        doubts=limit_doubts(path.broken), quality={"source": source},
     )  # fmt: skip
 
 

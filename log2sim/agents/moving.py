@@ -13,13 +13,16 @@ from log2sim.agents.candidate import REAR_AXLE_SHARE, AgentCandidate, Timeline, 
 from log2sim.agents.confirmation import SAME_MOMENT_S
 from log2sim.agents.heading.box_headings import heading_log_odds
 from log2sim.agents.lidar_tracking import BoxState, LidarMatch, track_with_lidar
+from log2sim.agents.motion_doubts import motion_doubts
 from log2sim.agents.size import TrackGeometry, moving_geometry
 from log2sim.agents.smooth.feasibility import limit_doubts
 from log2sim.agents.smooth.fixed_interval import MotionModel
+from log2sim.agents.smooth.heading import UNKNOWN_YAW_RAD
 from log2sim.agents.smooth.smoother import SmoothedTrack, signed_speed, smooth_track
 from log2sim.datatypes import GROUP_OF, STANDSTILL_MPS, TYPICAL_SIZE_M, Obstacles, Track, Waypoints
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
 from log2sim.perception.box_fitting import align_to
+from log2sim.tracking.motion import CENTER_SIGMA_M
 
 # Spectral density of the jerk, m2/s5, of groups for which it is not estimated.
 JERK_DENSITY = {"pedestrian": 2.0}
@@ -34,6 +37,8 @@ MIN_COURSE_DISTANCE_M = 0.3
 # Log-odds that an object moves forward: of slow ones, one in five reverses, at 3 m/s one in a thousand. A displacement shorter
 # than this may be noise.
 FORWARD_LOG_ODDS, FORWARD_LOG_ODDS_PER_MPS, CERTAIN_COURSE_M = 1.4, 2.0, 1.0
+# Standard deviation of the yaw of a single measurement.
+BOX_YAW_SIGMA_RAD = 0.2
 # Heights of the ground under a track are smoothed by a median over this many measurements on either side.
 HEIGHT_MEDIAN_HALF = 4
 
@@ -72,7 +77,8 @@ def moving_candidate(
     m, group = track.measurements, GROUP_OF[track.category]
     t = timeline.seconds(m.t_ns)
     noise = FITTED_CENTER_SIGMA_M[group] ** 2 * np.eye(2)
-    motion = MotionModel(JERK_DENSITY.get(group), holonomic=group == "pedestrian", heading_rad=_first_heading(track))
+    heading, heading_sigma = _first_heading(track)
+    motion = MotionModel(JERK_DENSITY.get(group), group == "pedestrian", heading, heading_sigma)
     xy, covariance = m.center_m[:, :2], m.covariance
     for _ in range(PRELIMINARY_SMOOTHINGS):
         rough = smooth_track(t, xy, covariance=covariance + noise, at_s=t, motion=motion)
@@ -93,11 +99,10 @@ def moving_candidate(
         "observed_share": round(float(observed.mean()), 3),
         "smoothing_residual_rms_m": round(float(np.sqrt(np.nanmean(residual**2))), 4) if len(residual) else None,
     }
-    doubts = limit_doubts(path.flags)
     z = np.interp(at, t, _running_median(geometry.z_m))
-    return candidate_of(
-        track, geometry, _waypoints(path, _headings(path, group), z, observed), quality, static=False, doubts=doubts
-    )
+    waypoints = _waypoints(path, _headings(path, group), z, observed)
+    doubts = limit_doubts(path.broken) + motion_doubts(track.category, waypoints)
+    return candidate_of(track, geometry, waypoints, quality, static=False, doubts=doubts)
 
 
 def _one_at_a_moment(track: Track) -> Track:
@@ -118,8 +123,10 @@ def _headings(path: SmoothedTrack, group: str) -> Array:
     return wrap_angle(path.yaw_rad - np.arcsin(np.clip(offset * path.curvature_1pm, -0.5, 0.5)))
 
 
-def _first_heading(track: Track) -> float | None:
+def _first_heading(track: Track) -> tuple[float | None, float]:
     """Return the course from the first to the last quarter of a track, or the yaw of its first box if that is short.
+
+    With its standard deviation, which half a turn is no part of.
 
     Where the boxes of a 3D detector say that a slow object moves backward, it is the opposite of the course.
     """
@@ -131,12 +138,13 @@ def _first_heading(track: Track) -> float | None:
         speed_mps = moved_m / max(float(m.t_ns[-1] - m.t_ns[0]) / NS_PER_S, 1e-3)
         forward = FORWARD_LOG_ODDS + FORWARD_LOG_ODDS_PER_MPS * speed_mps
         forward = forward * min(moved_m / CERTAIN_COURSE_M, 1.0) + heading_log_odds(m, course)
-        return course if forward >= 0 else float(wrap_angle(course + np.pi))
+        sigma = float(np.arctan2(CENTER_SIGMA_M[GROUP_OF[track.category]], moved_m))
+        return (course if forward >= 0 else float(wrap_angle(course + np.pi))), sigma
     yaws = m.yaw_rad[np.isfinite(m.yaw_rad)]
     if len(yaws) == 0:
-        return None
+        return None, UNKNOWN_YAW_RAD
     yaw = align_to(float(yaws[0]), 0.0, np.pi)
-    return yaw if heading_log_odds(m, yaw) >= 0 else float(wrap_angle(yaw + np.pi))
+    return (yaw if heading_log_odds(m, yaw) >= 0 else float(wrap_angle(yaw + np.pi))), BOX_YAW_SIGMA_RAD
 
 
 def _lidar_matches(
@@ -187,6 +195,8 @@ def _waypoints(path: SmoothedTrack, yaw: Array, z_m: Array, observed: NDArray[np
         speed_mps=np.where(np.abs(speed) < STANDSTILL_MPS, 0.0, speed),
         observed=observed,
         sigma_xy_m=np.sqrt(np.trace(path.covariance, axis1=1, axis2=2) / 2),
+        sigma_yaw_rad=path.sigma_yaw_rad,
+        sigma_speed_mps=path.sigma_speed_mps,
     )
 
 

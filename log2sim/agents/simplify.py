@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Agent, Waypoints
 from log2sim.geometry import Array
 
-# Largest deviation of an omitted waypoint from the line between its neighbors: x, y, z, yaw, speed, sigma of the position.
+# Largest deviation of an omitted waypoint from the line between its neighbors: x, y, z, yaw, speed.
 TOLERANCE_M, TOLERANCE_RAD, TOLERANCE_MPS = 0.01, 0.002, 0.02
-TOLERANCES = np.array([TOLERANCE_M] * 3 + [TOLERANCE_RAD, TOLERANCE_MPS, TOLERANCE_M])
+# Of a standard deviation, as a share: an error of a tenth changes no decision. With the tolerance of what it belongs to.
+SIGMA_SHARE = 0.1
 MAX_INTERVAL_S = 1.0
 
 
@@ -48,14 +49,14 @@ def waypoints_to_keep(w: Waypoints) -> NDArray[np.intp]:
     -----
     Greedy: from each kept waypoint the farthest next one is searched with steps that double, then halve.
     """
-    columns = np.column_stack([w.x_m, w.y_m, w.z_m, np.unwrap(w.yaw_rad), w.speed_mps, w.sigma_xy_m])
+    columns, tolerances = _toleranced(w)
     kept, last = [0], len(w) - 1
     while kept[-1] < last:
         start = kept[-1]
         step, reach = 1, 1
         while step and start + reach < last:
             end = min(start + reach + step, last)
-            if _is_linear(w.t_s, columns, w.observed, start, end):
+            if _is_linear(w.t_s, columns, tolerances, start, end):
                 reach, step = end - start, 2 * step
             else:
                 step //= 2
@@ -63,10 +64,22 @@ def waypoints_to_keep(w: Waypoints) -> NDArray[np.intp]:
     return np.array(kept, dtype=np.intp)
 
 
-def _is_linear(t: Array, columns: Array, observed: NDArray[np.bool_], start: int, end: int) -> bool:
-    """Decide whether the rows between two lie on the line between these and share their `observed`."""
-    if t[end] - t[start] > MAX_INTERVAL_S or observed[start : end + 1].min() != observed[start : end + 1].max():
+def _toleranced(w: Waypoints) -> tuple[Array, Array]:
+    """Return the columns (T, K) of waypoints and the tolerances (T, K) of each value."""
+    exact = np.full(len(w), 0.0)
+    columns = [(w.x_m, exact + TOLERANCE_M), (w.y_m, exact + TOLERANCE_M), (w.z_m, exact + TOLERANCE_M)]
+    columns += [(np.unwrap(w.yaw_rad), exact + TOLERANCE_RAD), (w.speed_mps, exact + TOLERANCE_MPS)]
+    sigmas = (w.sigma_xy_m, TOLERANCE_M), (w.sigma_yaw_rad, TOLERANCE_RAD), (w.sigma_speed_mps, TOLERANCE_MPS)
+    columns += [(s, tolerance + SIGMA_SHARE * s) for s, tolerance in sigmas if s is not None]
+    columns.append((w.observed.astype(np.float64), exact))
+    values, tolerances = zip(*columns)
+    return np.column_stack(values), np.column_stack(tolerances)
+
+
+def _is_linear(t: Array, columns: Array, tolerances: Array, start: int, end: int) -> bool:
+    """Decide whether the rows between two lie on the line between these, `observed` included."""
+    if t[end] - t[start] > MAX_INTERVAL_S or columns[start, -1] != columns[end, -1]:
         return False
     share = (t[start + 1 : end] - t[start]) / (t[end] - t[start])
     line = columns[start] + share[:, None] * (columns[end] - columns[start])
-    return bool((np.abs(columns[start + 1 : end] - line) <= TOLERANCES).all())
+    return bool((np.abs(columns[start + 1 : end] - line) <= tolerances[start + 1 : end]).all())

@@ -6,10 +6,54 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from log2sim.agents.box_votes import independent
 from log2sim.agents.candidate import AgentCandidate, Timeline, candidate_of
 from log2sim.agents.lidar_tracking import BoxState, track_with_lidar
-from log2sim.agents.size import static_geometry
-from log2sim.datatypes import Obstacles, Track, Waypoints
+from log2sim.agents.size import TrackGeometry, static_geometry
+from log2sim.agents.standing import robust_line
+from log2sim.datatypes import GROUP_OF, BoxEvidence, Measurements, Obstacles, Track, Waypoints
+from log2sim.geometry import NS_PER_S, Array, wrap_angle
+from log2sim.perception.box_fitting import rotate
+from log2sim.tracking.motion import CENTER_SIGMA_M
+
+# Of a yaw, up to half a turn: of which nothing is known (uniform), of the box of one tick, of any.
+UNKNOWN_YAW_RAD, BOX_YAW_SIGMA_RAD, MIN_YAW_SIGMA_RAD = np.pi / np.sqrt(12.0), 0.1, 0.005
+# Nothing that was seen to stand goes faster, however short it was seen.
+MAX_SPEED_SIGMA_MPS = 2.0
+
+
+def standing_speed_sigma(m: Measurements, sigma_m: float) -> float:
+    """Return the standard deviation in m/s of the speed of a track that stands: that of a line through its centers.
+
+    `sigma_m` is what changing views add to the noise of a center.
+    """
+    variance: Array = np.linalg.eigvalsh(m.covariance)[:, -1].astype(np.float64) + sigma_m**2
+    t = (m.t_ns - m.t_ns[0]) / NS_PER_S
+    return min(robust_line(t, m.center_m[:, :2], variance)[2], MAX_SPEED_SIGMA_MPS)
+
+
+def yaw_sigma(m: BoxEvidence, geometry: TrackGeometry) -> float:
+    """Return the standard deviation in rad of the yaw of a track that stands; half a turn is no part of it.
+
+    Notes
+    -----
+    By the boxes of a 3D detector it is their scatter about the yaw, whose errors repeat from tick to tick; by points alone
+    the distance of half of them from the sides of the box, seen over the length of the longest side.
+    """
+    if geometry.yaw_rad is None or not np.isfinite(geometry.yaw_rad):
+        return UNKNOWN_YAW_RAD
+    rows = np.flatnonzero(np.isfinite(m.box_yaw_rad))
+    if len(rows):
+        off = wrap_angle(2 * (m.box_yaw_rad[rows] - geometry.yaw_rad)) / 2
+        scatter = max(float(np.sqrt(np.mean(off**2))), BOX_YAW_SIGMA_RAD / np.sqrt(len(rows)))
+        return float(np.clip(scatter / np.sqrt(independent(len(rows))), MIN_YAW_SIGMA_RAD, UNKNOWN_YAW_RAD))
+    points = [cluster[:, :2] for cluster in m.cluster if len(cluster)]
+    if not points:
+        return UNKNOWN_YAW_RAD
+    xy = rotate(np.concatenate(points) - geometry.xy_m[0], -geometry.yaw_rad)
+    low, high = np.quantile(xy, 0.02, axis=0), np.quantile(xy, 0.98, axis=0)
+    off_m = float(np.median(np.minimum(np.abs(xy - low), np.abs(xy - high)).min(axis=1)))
+    return float(np.clip(np.arctan2(off_m, float((high - low).max())), MIN_YAW_SIGMA_RAD, UNKNOWN_YAW_RAD))
 
 
 def static_candidate(track: Track, obstacles: Sequence[Obstacles | None], timeline: Timeline) -> AgentCandidate:
@@ -37,6 +81,8 @@ def static_candidate(track: Track, obstacles: Sequence[Obstacles | None], timeli
         speed_mps=np.zeros(n),
         observed=np.ones(n, dtype=bool),
         sigma_xy_m=np.full(n, sigma),
+        sigma_yaw_rad=np.full(n, yaw_sigma(track.measurements, geometry)),
+        sigma_speed_mps=np.full(n, standing_speed_sigma(track.measurements, CENTER_SIGMA_M[GROUP_OF[track.category]])),
     )
     share = len(observed) / (observed[-1] - observed[0] + 1)
     quality = {"lidar_only": len(matches), "observed_share": round(float(share), 3)}

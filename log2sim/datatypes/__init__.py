@@ -4,7 +4,16 @@ from __future__ import annotations
 
 from log2sim.datatypes.agent import Agent
 from log2sim.datatypes.boxes3d import Boxes3D
-from log2sim.datatypes.categories import CATEGORIES, CATEGORY, GROUP_OF, GROUPS, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M
+from log2sim.datatypes.categories import (
+    CATEGORIES,
+    CATEGORY,
+    GROUP_OF,
+    GROUPS,
+    MAX_SIZE_M,
+    MAX_SPEED_MPS,
+    MIN_SIZE_M,
+    TYPICAL_SIZE_M,
+)
 from log2sim.datatypes.doubtful import list_doubtful, say_confidence, why_doubtful
 from log2sim.datatypes.doubts import MIN_TRUSTED_CONFIDENCE, Doubt
 from log2sim.datatypes.ignore_regions import IgnoreRegions, LabelView
@@ -33,6 +42,7 @@ __all__ = [
     "GROUPS",
     "GROUP_OF",
     "MAX_SIZE_M",
+    "MAX_SPEED_MPS",
     "MIN_SIZE_M",
     "MIN_TRUSTED_CONFIDENCE",
     "STANDSTILL_DRIFT_M",

@@ -20,6 +20,8 @@ class Category:
         Of an object that was not observed from end to end.
     min_size_m, max_size_m : Size
         A smaller object was hardly observed whole, a larger one is several objects.
+    max_speed_mps : float
+        What is faster is hardly one.
     max_length_per_height : float
         Longest side as a share of the height; infinite where the category has no such limit.
     min_seen_m : float, optional
@@ -31,6 +33,7 @@ class Category:
     typical_size_m: Size
     min_size_m: Size
     max_size_m: Size
+    max_speed_mps: float
     max_length_per_height: float = float("inf")
     min_seen_m: float | None = None
 
@@ -50,17 +53,20 @@ class Category:
 #   Control of Human Movement"). A body seen from the side shows its depth, from 0.2 m; posts are thinner. A bicycle seen from
 #   behind shows the shoulders or the handlebar, from 0.4 m, less the gap between rays at either end.
 # - other: trailers, 12 m by the same directive; carts and animals.
+# Speeds: cars 250 km/h, to which most makers limit them; trucks and buses 140 km/h, Texas' limit of 85 mph; motorcycles 300
+# km/h, to which makers limit them; cyclists 72 km/h, about a track sprinter's best; a bicycle without a rider is pushed; people
+# sprint at 6 to 8 m/s, trained ones faster (Weyand et al., J. Appl. Physiol. 89, 2000); trailers as trucks.
 CATEGORY: Mapping[str, Category] = {
-    "car": Category("vehicle", (4.4, 1.85, 1.6), (2.7, 1.35, 1.2), (6.0, 2.3, 2.8)),
-    "truck": Category("vehicle", (7.0, 2.4, 2.9), (4.5, 1.7, 2.0), (22.4, 3.0, 4.3)),
-    "bus": Category("vehicle", (11.5, 2.7, 3.2), (5.5, 1.9, 2.3), (18.75, 3.0, 4.4)),
-    "motorcycle": Category("two_wheeler", (2.1, 0.8, 1.5), (1.3, 0.5, 0.9), (2.8, 1.3, 2.2), min_seen_m=0.25),
-    "cyclist": Category("two_wheeler", (1.75, 0.65, 1.75), (1.1, 0.4, 1.1), (2.6, 1.1, 2.3), min_seen_m=0.25),
-    "bicycle": Category("two_wheeler", (1.75, 0.6, 1.1), (1.1, 0.4, 0.7), (2.6, 1.1, 1.5), min_seen_m=0.25),
+    "car": Category("vehicle", (4.4, 1.85, 1.6), (2.7, 1.35, 1.2), (6.0, 2.3, 2.8), 70.0),
+    "truck": Category("vehicle", (7.0, 2.4, 2.9), (4.5, 1.7, 2.0), (22.4, 3.0, 4.3), 39.0),
+    "bus": Category("vehicle", (11.5, 2.7, 3.2), (5.5, 1.9, 2.3), (18.75, 3.0, 4.4), 39.0),
+    "motorcycle": Category("two_wheeler", (2.1, 0.8, 1.5), (1.3, 0.5, 0.9), (2.8, 1.3, 2.2), 83.0, min_seen_m=0.25),
+    "cyclist": Category("two_wheeler", (1.75, 0.65, 1.75), (1.1, 0.4, 1.1), (2.6, 1.1, 2.3), 20.0, min_seen_m=0.25),
+    "bicycle": Category("two_wheeler", (1.75, 0.6, 1.1), (1.1, 0.4, 0.7), (2.6, 1.1, 1.5), 3.0, min_seen_m=0.25),
     "pedestrian": Category(
-        "pedestrian", (0.7, 0.7, 1.75), (0.4, 0.4, 1.0), (1.4, 1.2, 2.3), max_length_per_height=0.8, min_seen_m=0.2
+        "pedestrian", (0.7, 0.7, 1.75), (0.4, 0.4, 1.0), (1.4, 1.2, 2.3), 8.0, max_length_per_height=0.8, min_seen_m=0.2
     ),
-    "other": Category("other", (3.0, 1.8, 1.8), (0.5, 0.4, 0.4), (12.0, 3.0, 4.0)),
+    "other": Category("other", (3.0, 1.8, 1.8), (0.5, 0.4, 0.4), (12.0, 3.0, 4.0), 39.0),
 }
 
 CATEGORIES = tuple(CATEGORY)
@@ -75,4 +81,5 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
 
 TYPICAL_SIZE_M: Mapping[str, Size] = {name: category.typical_size_m for name, category in CATEGORY.items()}
 MIN_SIZE_M: Mapping[str, Size] = {name: category.min_size_m for name, category in CATEGORY.items()}
+MAX_SPEED_MPS: Mapping[str, float] = {name: category.max_speed_mps for name, category in CATEGORY.items()}
 MAX_SIZE_M: Mapping[str, Size] = {name: category.max_size_m for name, category in CATEGORY.items()}

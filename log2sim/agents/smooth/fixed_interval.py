@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from log2sim.agents.smooth.heading import course_is_known, unwrap, yaw_of_motion
+from log2sim.agents.smooth.heading import UNKNOWN_YAW_RAD, course_is_known, unwrap, yaw_of_motion, yaw_sigma
 from log2sim.agents.smooth.jerk_density import STRONG_PRIOR, WEAK_PRIOR, DensityEstimator, min_density
 from log2sim.agents.smooth.likelihood import (
     MeasurementModel,
@@ -54,11 +54,14 @@ class MotionModel:
         Whether it may move in any direction, as pedestrians do.
     heading_rad : float, optional
         Heading where the motion does not give one.
+    heading_sigma_rad : float
+        Its standard deviation.
     """
 
     jerk_density: float | None = None
     holonomic: bool = False
     heading_rad: float | None = None
+    heading_sigma_rad: float = UNKNOWN_YAW_RAD
 
     @property
     def density_by_direction(self) -> bool:
@@ -75,7 +78,7 @@ class Smoothed:
     state : (T, 3, 2) float64
         Position in m, velocity in m/s, acceleration in m/s2.
     covariance : (T, 6, 6) float64
-    yaw_rad : (T,) float64
+    yaw_rad, sigma_yaw_rad : (T,) float64
     residual_m : (n,) float64
         Distance of each observation from the trajectory.
     weight : (n,) float64
@@ -87,6 +90,7 @@ class Smoothed:
     state: Array
     covariance: Array
     yaw_rad: Array
+    sigma_yaw_rad: Array
     residual_m: Array
     weight: Array
     jerk_density: tuple[float, float]
@@ -171,7 +175,8 @@ def smooth_interval(observed: NoisyPositions, asked_s: Array, motion: MotionMode
         state[:, 1], covariance[:, 2:4, 2:4], holonomic=motion.holonomic, correlated=observed.correlated
     )
     yaw = yaw_of_motion(state[:, 0], state[:, 1], hint_rad=motion.heading_rad, holonomic=motion.holonomic, known=known)
-    return Smoothed(state, covariance, yaw, residual, problem.weight, problem.density)
+    sigma = yaw_sigma(state[:, 0], state[:, 1], covariance[:, 2:4, 2:4], known, hint_sigma_rad=motion.heading_sigma_rad)
+    return Smoothed(state, covariance, yaw, sigma, residual, problem.weight, problem.density)
 
 
 def _weights(observed: NoisyPositions, squared: Array) -> Array:

@@ -18,6 +18,10 @@ MIN_COURSE_MPS = {False: 0.5, True: 0.3}
 MIN_PROGRESS_MPS = 0.2
 # Without a known course, the displacement from end to end tells one if it is longer.
 MIN_DISPLACEMENT_M = 1.0
+# Standard deviation of the curvature of a way on which no course is known: a turn at a crossing has a radius of some 15 m.
+WAY_CURVATURE_1PM = 0.06
+# Of a heading of which nothing is known: uniform over half a turn.
+UNKNOWN_YAW_RAD = np.pi / np.sqrt(12.0)
 
 
 def course_is_known(
@@ -65,11 +69,59 @@ def yaw_of_motion(
         overall = float(np.arctan2(displacement[1], displacement[0])) if far else 0.0
         return np.full(len(xy_m), overall if hint_rad is None else hint_rad)
     course = np.arctan2(velocity_mps[:, 1], velocity_mps[:, 0])
-    advancing = speed > MIN_PROGRESS_MPS
-    step = np.hypot(*np.diff(xy_m, axis=0).T) * (advancing[1:] | advancing[:-1])
-    distance = np.concatenate([[0.0], np.cumsum(step)])
+    distance = _distance_covered(xy_m, speed)
     angles = unwrap(course[moving] if holonomic else _heading_of_course(course[moving], hint_rad))
     return wrap_angle(np.interp(distance, distance[moving], angles))
+
+
+def yaw_sigma(
+    xy_m: Array,
+    velocity_mps: Array,
+    covariance: Array,
+    known: NDArray[np.bool_],
+    *,
+    hint_sigma_rad: float = UNKNOWN_YAW_RAD,
+) -> Array:
+    """Return the standard deviation (T,) in rad of `yaw_of_motion`, given where the course is `known` (T,).
+
+    There it is that of the direction of the velocity; elsewhere it grows with the distance from the nearest known course.
+
+    Parameters
+    ----------
+    xy_m : (T, 2) float64, m
+    velocity_mps : (T, 2) float64, m/s
+    covariance : (T, 2, 2) float64, m2/s2
+        Of the velocity.
+    known : (T,) bool
+    hint_sigma_rad : float
+        Of the heading that is taken without any known course.
+    """
+    rows = np.flatnonzero(known)
+    if len(rows) == 0:
+        return np.full(len(xy_m), min(hint_sigma_rad, UNKNOWN_YAW_RAD))
+    speed = np.hypot(*velocity_mps.T)
+    across = np.stack([-velocity_mps[:, 1], velocity_mps[:, 0]], axis=-1)[rows] / speed[rows, None]
+    variance = np.einsum("ka,kab,kb->k", across, covariance[rows], across) / speed[rows] ** 2
+    distance = _distance_covered(xy_m, speed)
+    after = np.clip(np.searchsorted(rows, np.arange(len(xy_m))), 0, len(rows) - 1)
+    nearest = [
+        variance[k] + (WAY_CURVATURE_1PM * (distance - distance[rows[k]])) ** 2
+        for k in (after, np.maximum(after - 1, 0))
+    ]
+    return np.asarray(np.minimum(np.sqrt(np.minimum(*nearest)), UNKNOWN_YAW_RAD))
+
+
+def speed_sigma(yaw_rad: Array, covariance: Array) -> Array:
+    """Return the standard deviation (T,) in m/s of the speed along headings (T,), from covariances (T, 2, 2) of the velocity."""
+    along = np.stack([np.cos(yaw_rad), np.sin(yaw_rad)], axis=-1)
+    return np.asarray(np.sqrt(np.einsum("ta,tab,tb->t", along, covariance, along)))
+
+
+def _distance_covered(xy_m: Array, speed_mps: Array) -> Array:
+    """Distance (T,) in m along a trajectory, less what is noise of a standing object."""
+    advancing = speed_mps > MIN_PROGRESS_MPS
+    step = np.hypot(*np.diff(xy_m, axis=0).T) * (advancing[1:] | advancing[:-1])
+    return np.concatenate([[0.0], np.cumsum(step)])
 
 
 def unwrap(angles: Array) -> Array:

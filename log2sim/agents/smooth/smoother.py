@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from log2sim.agents.smooth.feasibility import broken_limits
-from log2sim.agents.smooth.fixed_interval import MotionModel, smooth_interval
+from log2sim.agents.smooth.feasibility import BrokenLimit, broken_limits
+from log2sim.agents.smooth.fixed_interval import MotionModel, Smoothed, smooth_interval
+from log2sim.agents.smooth.heading import speed_sigma
 from log2sim.agents.smooth.motion_prior import NoisyPositions
 from log2sim.geometry import Array, wrap_angle
 
@@ -43,8 +44,10 @@ class SmoothedTrack:
     residual_m : (n,) float64, m
         Distance of each observation from the trajectory; NaN where it was not used.
     inlier : (n,) bool
-    flags : tuple of str
-        Names of the limits that the motion breaks.
+    sigma_yaw_rad, sigma_speed_mps : (T,) float64
+        One standard deviation of heading and speed.
+    broken : tuple of BrokenLimit
+        Limits that the motion breaks.
     """
 
     t_s: Array
@@ -56,7 +59,9 @@ class SmoothedTrack:
     covariance: Array
     residual_m: Array
     inlier: NDArray[np.bool_]
-    flags: tuple[str, ...]
+    sigma_yaw_rad: Array
+    sigma_speed_mps: Array
+    broken: tuple[BrokenLimit, ...]
 
 
 def smooth_track(
@@ -118,7 +123,9 @@ def smooth_track(
         covariance=_inflated_in_gaps(path.covariance[:, :2, :2], asked, t[inlier], path.jerk_density),
         residual_m=residual,
         inlier=inlier,
-        flags=broken_limits(asked, acceleration, path.yaw_rad, curvature) if not motion.holonomic else (),
+        sigma_yaw_rad=path.sigma_yaw_rad,
+        sigma_speed_mps=speed_sigma(path.yaw_rad, path.covariance[:, 2:4, 2:4]),
+        broken=_broken_limits(asked, path, curvature) if not motion.holonomic else (),
     )
 
 
@@ -138,6 +145,14 @@ def _curvature(velocity: Array, acceleration: Array) -> Array:
     cross = velocity[:, 0] * acceleration[:, 1] - velocity[:, 1] * acceleration[:, 0]
     curvature: Array = np.divide(cross, speed**3, out=np.zeros_like(speed), where=speed > MIN_CURVATURE_SPEED_MPS)
     return curvature
+
+
+def _broken_limits(t_s: Array, path: Smoothed, curvature: Array) -> tuple[BrokenLimit, ...]:
+    speed = np.hypot(*path.state[:, 1].T)
+    sigma = np.sqrt(np.trace(path.covariance[:, 4:, 4:], axis1=1, axis2=2) / 2)
+    of_curvature = np.divide(sigma, speed**2, out=np.zeros_like(speed), where=speed > MIN_CURVATURE_SPEED_MPS)
+    sigmas = {"acceleration": sigma, "lateral_acceleration": sigma, "curvature": of_curvature}
+    return broken_limits(t_s, path.state[:, 2], path.yaw_rad, curvature, sigmas)
 
 
 def _covariances(t: Array, xy: Array, sigma_m: ArrayLike | None, covariance: Array | None, use: NDArray[Any]) -> Array:

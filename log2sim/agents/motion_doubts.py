@@ -1,0 +1,70 @@
+"""Doubts about the motion of an agent: faster than its kind, or backward as nobody drives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import GROUP_OF, MAX_SPEED_MPS, Doubt, Waypoints
+from log2sim.geometry import Array
+
+# Of slow vehicles one in five reverses, at 3 m/s one in a thousand (`FORWARD_LOG_ODDS` of moving agents); out of a driveway or
+# to a better parking space it is some car lengths.
+MAX_REVERSING_MPS, MAX_REVERSING_M = 3.0, 20.0
+# A speed counts as beyond a limit where it is by as many of its own standard deviations.
+SIGNIFICANT_SIGMAS = 2.0
+
+
+def motion_doubts(category: str, w: Waypoints) -> tuple[Doubt, ...]:
+    """Doubt what moves faster than its category does, or reverses fast or far.
+
+    Parameters
+    ----------
+    category : str
+    w : Waypoints
+        One at every tick.
+    """
+    margin = 0.0 if w.sigma_speed_mps is None else SIGNIFICANT_SIGMAS * w.sigma_speed_mps
+    fast = np.abs(w.speed_mps) - margin > MAX_SPEED_MPS[category]
+    doubts = _doubts(w, fast, "speed", lambda k: f"moves at {_most(w.speed_mps[k]):.0f} m/s {_when(w, k)}")
+    if GROUP_OF[category] in ("vehicle", "two_wheeler"):
+        doubts += _doubts(w, _reverses(w, -w.speed_mps - margin), "reversing", lambda k: _words_of_reversing(w, k))
+    return doubts
+
+
+def _reverses(w: Waypoints, backward_mps: Array) -> NDArray[np.bool_]:
+    """Return where (T,) an agent reverses too fast, or farther than anybody does."""
+    backward = w.speed_mps < 0
+    wrong = np.zeros(len(w), dtype=bool)
+    for rows in spans_of(backward):
+        covered = float(np.hypot(np.diff(w.x_m[rows]), np.diff(w.y_m[rows])).sum())
+        wrong[rows] = bool((backward_mps[rows] > MAX_REVERSING_MPS).any()) or covered > MAX_REVERSING_M
+    return wrong
+
+
+def _doubts(
+    w: Waypoints, holds: NDArray[np.bool_], flag: str, words: Callable[[NDArray[np.intp]], str]
+) -> tuple[Doubt, ...]:
+    """Make a doubt of each span in which something holds (T,)."""
+    return tuple(Doubt(flag, words(k), float(w.t_s[k[0]]), float(w.t_s[k[-1]])) for k in spans_of(holds))
+
+
+def spans_of(mask: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
+    """Return the rows of each run of True in a mask (T,)."""
+    rows = np.flatnonzero(mask)
+    return np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []
+
+
+def _words_of_reversing(w: Waypoints, k: NDArray[np.intp]) -> str:
+    return f"reverses at up to {_most(w.speed_mps[k]):.1f} m/s {_when(w, k)}"
+
+
+def _most(speed_mps: Array) -> float:
+    return float(np.abs(speed_mps).max())
+
+
+def _when(w: Waypoints, k: NDArray[np.intp]) -> str:
+    first, last = f"{w.t_s[k[0]]:.1f}", f"{w.t_s[k[-1]]:.1f}"
+    return f"at {first} s" if first == last else f"from {first} to {last} s"
