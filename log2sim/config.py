@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from log2sim.errors import ConfigError
+from log2sim.input_files import read_text
 from log2sim.model_errors import first_problem
 
 CONFIG_LIMIT_BYTES = 1024 * 1024
@@ -310,13 +311,10 @@ def _comment(schema: Mapping[str, Any]) -> str:
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise ConfigError(f"{path}: no such config file")
-    if path.stat().st_size > CONFIG_LIMIT_BYTES:
-        raise ConfigError(f"{path}: larger than {CONFIG_LIMIT_BYTES} bytes, which no config file needs")
+    text = read_text(path, CONFIG_LIMIT_BYTES, ConfigError, missing="no such config file")
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as problem:
+        return tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as problem:
         raise ConfigError(f"{path}: not valid TOML: {problem}") from None
 
 

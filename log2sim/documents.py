@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from log2sim.errors import ConfigError, Log2SimError, LogError
+from log2sim.input_files import read_file
 
 JSON_LIMIT_BYTES = 512 * 1024 * 1024
 _SURROGATE_ESCAPE = re.compile(r"\\u[dD][89a-fA-F]")
@@ -96,12 +97,9 @@ def read_json(path: Path | str, error: type[LogError] = LogError) -> Any:
     path = Path(path)
     if path.is_dir():
         raise error(f"{path}: is a folder; expected a JSON file, such as the scenario.json that `reconstruct` writes")
-    if not path.is_file():
-        raise error(f"{path}: no such file")
-    if path.stat().st_size > JSON_LIMIT_BYTES:
-        raise error(f"{path}: {path.stat().st_size} bytes, more than the {JSON_LIMIT_BYTES} that a JSON file may have")
+    data = read_file(path, JSON_LIMIT_BYTES, error)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = data.decode("utf-8")
         value = json.loads(text, parse_constant=_refuse, parse_float=_finite)
         if _SURROGATE_ESCAPE.search(text):  # JSON can escape an unpaired surrogate, which UTF-8 cannot encode
             json.dumps(value, ensure_ascii=False).encode()

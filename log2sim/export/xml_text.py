@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 import string
 from collections.abc import Iterable
@@ -13,6 +14,7 @@ from defusedxml.common import DefusedXmlException
 from defusedxml.ElementTree import iterparse
 
 from log2sim.errors import LogError, ScenarioError
+from log2sim.input_files import read_file
 
 SIZE_LIMIT_BYTES = 256 * 1024 * 1024
 DEPTH_LIMIT = 100
@@ -74,13 +76,10 @@ def read(path: Path) -> ElementTree.Element:
     ScenarioError
         When the file is missing, too large, nested too deeply or no XML, or declares a document type.
     """
-    if not path.is_file():
-        raise ScenarioError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}; expected an XML file")
-    if path.stat().st_size > SIZE_LIMIT_BYTES:
-        raise ScenarioError(f"{path}: {path.stat().st_size} bytes, more than the {SIZE_LIMIT_BYTES} that are read")
+    data = read_file(path, SIZE_LIMIT_BYTES, ScenarioError, missing="no such file; expected an XML file")
     depth, root = 0, None
     try:
-        for event, node in iterparse(path, events=("start", "end"), forbid_dtd=True):
+        for event, node in iterparse(io.BytesIO(data), events=("start", "end"), forbid_dtd=True):
             depth += 1 if event == "start" else -1
             root = node if root is None else root
             if depth > DEPTH_LIMIT:

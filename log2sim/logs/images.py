@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Stream
 from log2sim.errors import LogError, RecordError
+from log2sim.input_files import read_file
 
 MAX_IMAGE_PX = 100_000_000
 MAX_IMAGE_BYTES = 256 * 1024 * 1024
@@ -84,14 +85,9 @@ def first_image_size(files: list[Path]) -> tuple[int, int]:
 
 
 def read_bytes(path: Path, t_ns: int, limit_bytes: int) -> bytes:
-    """Read the file of one record; `RecordError` when it is missing or larger than `limit_bytes`."""
-    try:
-        size = path.stat().st_size
-        if size > limit_bytes:
-            raise RecordError(f"{path} (stamp {t_ns}): {size} bytes, more than the {limit_bytes} that it may have")
-        return path.read_bytes()
-    except OSError as error:
-        raise RecordError(f"{path} (stamp {t_ns}): cannot be read: {error.strerror}") from None
+    """Read the file of one record; `RecordError` when it is missing, no regular file or larger than `limit_bytes`."""
+    missing = "cannot be read: No such file or directory"
+    return read_file(path, limit_bytes, RecordError, where=f"{path} (stamp {t_ns})", missing=missing)
 
 
 def _jpeg_size(data: bytes, where: str) -> tuple[int, int]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from log2sim import registry
 from log2sim.datatypes import Log
 from log2sim.errors import ConfigError, LogError
+from log2sim.logs.guarding import guard_log, translate_parser_errors
 from log2sim.logs.reader import Reader
 
 __all__ = ["Reader", "find_reader", "open_log"]
@@ -42,7 +43,9 @@ def open_log(path: Path | str, *, format: str = "auto", sequence: str | None = N
     reader: Reader = registry.load("log", name)
     if not _may_read(reader, root):
         raise LogError(f"{root}: is a file, which format '{name}' cannot be; expected {reader.looks_for}")
-    log = reader.open(root, _select_sequence(root, name, reader.sequences(root), sequence))
+    chosen = _select_sequence(root, name, reader.sequences(root), sequence)
+    with translate_parser_errors(f"{root}: cannot be read as format '{name}'", LogError):
+        log = guard_log(reader.open(root, chosen), str(root))
     others = _other_formats(root, name) if format == "auto" else []
     if not others:
         return log

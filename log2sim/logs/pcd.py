@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import NS_PER_S
-from log2sim.logs.stamps import MAX_TIME_S
+from log2sim.logs.stamps import MAX_TIME_S, checked_offset_ns
 
 MAX_HEADER_BYTES = 16 * 1024
+# Each takes some 80 bytes while it is parsed.
+MAX_ASCII_VALUES = 20_000_000
 TIME_FIELDS = ("t_offset_ns", "offset", "t", "timestamp")
 
 
@@ -84,6 +86,9 @@ def _layout(header: dict[str, list[str]]) -> np.dtype[Any]:
     for axis in ("x", "y", "z"):
         if axis not in names:
             raise ValueError(f"PCD header: no field '{axis}'")
+    for name, _, shape in spec:
+        if shape and name in ("x", "y", "z", *TIME_FIELDS):
+            raise ValueError(f"PCD header: field '{name}' has COUNT {shape[0]}, expected 1")
     return np.dtype(spec)
 
 
@@ -97,6 +102,10 @@ def _points(header: dict[str, list[str]], limit_points: int) -> int:
 
 def _parse_ascii(body: bytes, layout: np.dtype[Any], count: int) -> NDArray[Any]:
     widths = [int(np.prod(layout[name].shape, dtype=int)) for name in layout.names or ()]
+    if count * sum(widths) > MAX_ASCII_VALUES:
+        raise ValueError(
+            f"{count * sum(widths)} values as text, more than the {MAX_ASCII_VALUES} that are read; convert it to binary"
+        )
     words = body.split(maxsplit=count * sum(widths))[: count * sum(widths)]
     if len(words) != count * sum(widths):
         raise ValueError(f"truncated: {len(words)} of {count * sum(widths)} values")
@@ -110,9 +119,9 @@ def _parse_ascii(body: bytes, layout: np.dtype[Any], count: int) -> NDArray[Any]
 
 def _offset_ns(values: NDArray[Any], t_ns: int, *, absolute: bool) -> NDArray[np.int64]:
     if values.dtype.kind in "iu":
-        return values.astype(np.int64) - (t_ns if absolute else 0)
+        return checked_offset_ns(values, t_ns if absolute else 0)
     seconds = values.astype(np.float64)
     seconds = np.where(np.isfinite(seconds), seconds, 0.0)
     if np.abs(seconds).max(initial=0.0) > MAX_TIME_S:
         raise ValueError(f"a point has the time {np.abs(seconds).max():g} s, expected at most {MAX_TIME_S:g}")
-    return np.round((seconds - (t_ns / NS_PER_S if absolute else 0.0)) * NS_PER_S).astype(np.int64)
+    return checked_offset_ns(np.round((seconds - (t_ns / NS_PER_S if absolute else 0.0)) * NS_PER_S))

@@ -12,6 +12,39 @@ MAX_TIME_S = 9_000_000_000
 # The longest scenario that its schema allows; the frames of KITTI's objects, put 100 s apart, last three quarters of it.
 MAX_DISTANCE_NS = 10**15
 
+# Sweeps last a tenth of a second; a time farther from the stamp of its sweep is damage, or of another clock.
+MAX_POINT_OFFSET_NS = NS_PER_S
+
+
+def checked_offset_ns(t_ns: NDArray[np.number], stamp_ns: int = 0) -> NDArray[np.int64]:
+    """Compute the times of points relative to the stamp of their sweep.
+
+    Parameters
+    ----------
+    t_ns : (N,) whole or floating-point numbers
+        Finite.
+    stamp_ns : int
+        What they count from; 0 for times that are relative to the stamp already.
+
+    Returns
+    -------
+    (N,) int64
+
+    Raises
+    ------
+    ValueError
+        For any beyond `MAX_POINT_OFFSET_NS`.
+    """
+    # As integers of Python, which do not overflow.
+    ends = [int(t) - stamp_ns for t in (t_ns.min(), t_ns.max())] if len(t_ns) else []
+    for end in ends:
+        if abs(end) > MAX_POINT_OFFSET_NS:
+            raise ValueError(
+                f"the time of a point is {end / NS_PER_S:.6g} s off the stamp of its sweep, expected at most "
+                f"{MAX_POINT_OFFSET_NS / NS_PER_S:g} s"
+            )
+    return t_ns.astype(np.int64) - stamp_ns
+
 
 def strictly_increasing(t_ns: NDArray[np.int64], what: str) -> tuple[NDArray[np.intp], list[str]]:
     """Select and sort rows so that their stamps strictly increase.

@@ -18,13 +18,18 @@ from log2sim.datatypes import Sweep
 from log2sim.errors import RecordError
 from log2sim.logs.images import read_bytes
 from log2sim.logs.pcd import parse_pcd
+from log2sim.logs.stamps import checked_offset_ns
 
 MAX_SWEEP_POINTS = 20_000_000
 MAX_SWEEP_BYTES = 1024 * 1024 * 1024
 
+# Headers of points have some hundred bytes; NumPy would read what they declare, up to 4 GiB.
+MAX_NPY_HEADER_BYTES = 10_000
+# More columns than x, y, z and what sensors measure with them.
+MAX_COLUMNS = 64
 # What NumPy and zipfile raise for damaged files.
 PARSER_ERRORS = (
-    ValueError, TypeError, KeyError, IndexError, OverflowError, EOFError, OSError, MemoryError, RuntimeError, SyntaxError,
+    ValueError, TypeError, KeyError, IndexError, OverflowError, EOFError, OSError, RuntimeError, SyntaxError,
     struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error, lzma.LZMAError,
 )  # fmt: skip
 
@@ -43,9 +48,9 @@ def read_sweep(path: Path, t_ns: int, frame: Literal["lidar", "map"] = "lidar") 
     data = read_bytes(path, t_ns, MAX_SWEEP_BYTES)
     try:
         xyz, offset_ns = _parse(path.suffix.lower(), data, t_ns)
+        return sweep_of(xyz, t_ns, offset_ns, frame)
     except PARSER_ERRORS as error:
         raise RecordError(f"{path} (stamp {t_ns}): not a readable sweep: {error}") from None
-    return sweep_of(xyz, t_ns, offset_ns, frame)
 
 
 def sweep_of(
@@ -55,12 +60,18 @@ def sweep_of(
     frame: Literal["lidar", "map"],
     compensated_ns: int | None = None,
 ) -> Sweep:
-    """Build a `Sweep` of the finite rows of points (N, 3) with stamps `t_ns` + `offset_ns` (N,)."""
+    """Build a `Sweep` of the finite rows of points (N, 3) with stamps `t_ns` + `offset_ns` (N,).
+
+    Raises
+    ------
+    ValueError
+        For times of points farther from the stamp than `checked_offset_ns` allows.
+    """
     finite = np.isfinite(xyz_m).all(axis=1)
     if not finite.all():
         xyz_m = xyz_m[finite]
         offset_ns = None if offset_ns is None else offset_ns[finite]
-    point_ns = None if offset_ns is None else t_ns + offset_ns.astype(np.int64)
+    point_ns = None if offset_ns is None else t_ns + checked_offset_ns(offset_ns)
     return Sweep(t_ns, xyz_m, frame, point_ns, compensated_ns)
 
 
@@ -94,7 +105,7 @@ def _parse_npz(data: bytes) -> tuple[NDArray[Any], Offset]:
             offset = _read_npy(member, "t_offset_ns")
     if offset.dtype.kind not in "iu" or offset.shape != (len(xyz),):
         raise ValueError(f"t_offset_ns is {offset.dtype} {offset.shape}, expected whole numbers ({len(xyz)},)")
-    return xyz, offset.astype(np.int64)
+    return xyz, checked_offset_ns(offset)
 
 
 def _points(array: NDArray[Any]) -> NDArray[Any]:
@@ -106,12 +117,19 @@ def _points(array: NDArray[Any]) -> NDArray[Any]:
 def _read_npy(stream: IO[bytes], what: str) -> NDArray[Any]:
     """Read one .npy array whose header was checked before its data are allocated; never unpickles."""
     version = np.lib.format.read_magic(stream)
+    length = stream.read(2 if version == (1, 0) else 4)
+    if int.from_bytes(length, "little") > MAX_NPY_HEADER_BYTES:
+        raise ValueError(f"{what} has a header of more than {MAX_NPY_HEADER_BYTES} bytes")
+    header = io.BytesIO(length + stream.read(int.from_bytes(length, "little")))
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, fortran, dtype = read_header(stream)
-    if dtype.hasobject or dtype.itemsize == 0 or len(shape) not in (1, 2) or (len(shape) == 2 and shape[1] > 64):
-        raise ValueError(f"{what} is {dtype} {shape}, expected numbers, (N, 3) or (N,)")
+    shape, fortran, dtype = read_header(header)
+    columns = shape[1] if len(shape) == 2 else 1
+    if dtype.kind not in "fiu" or len(shape) not in (1, 2) or not 0 <= columns <= MAX_COLUMNS:
+        raise ValueError(f"{what} is {str(dtype)[:40]} {shape}, expected numbers, (N, 3) or (N,)")
     _check_count(shape[0])
-    size = int(np.prod(shape)) * dtype.itemsize
+    size = shape[0] * columns * dtype.itemsize
+    if size > MAX_SWEEP_BYTES:
+        raise ValueError(f"{what} has {size} bytes, more than the {MAX_SWEEP_BYTES} that it may have")
     data = stream.read(size)
     if len(data) != size:
         raise ValueError(f"{what} is truncated: {len(data)} of {size} bytes")

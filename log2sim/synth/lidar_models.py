@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
+from log2sim.input_files import read_text
 from log2sim.model_errors import first_problem
 from log2sim.registry import nearest
 
@@ -137,13 +138,12 @@ def lidar_model(name_or_path: str) -> LidarModel:
         raise ConfigError(
             f"no LiDAR '{name_or_path}'{nearest(name_or_path, known)}; known: {', '.join(known)}, or a .toml file"
         )
-    if not path.is_file() or path.stat().st_size > MAX_FILE_BYTES:
-        raise ConfigError(f"{path}: no file of at most {MAX_FILE_BYTES} bytes")
+    text = read_text(path, MAX_FILE_BYTES, ConfigError)
     try:
-        model = LidarModel.model_validate({"name": path.stem, **tomllib.loads(path.read_text(encoding="utf-8"))})
+        model = LidarModel.model_validate({"name": path.stem, **tomllib.loads(text)})
     except ValidationError as problem:
         raise ConfigError(f"{path}: {first_problem(problem, LidarModel)}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as problem:
+    except (tomllib.TOMLDecodeError, RecursionError) as problem:
         raise ConfigError(f"{path}: not valid TOML: {problem}") from None
     if model.azimuth_deg[0] >= model.azimuth_deg[1]:
         raise ConfigError(f"{path}: azimuth_deg {list(model.azimuth_deg)}: expected the right end before the left end")

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, Strict, Validation
 
 from log2sim.datatypes import TYPICAL_SIZE_M
 from log2sim.errors import ConfigError
+from log2sim.input_files import read_text
 from log2sim.model_errors import first_problem
 
 MAX_SCENE_BYTES = 4 * 1024 * 1024
@@ -242,13 +243,10 @@ def load_scene(path: Path | str) -> Scene:
         When the file is missing, is no TOML, or holds an unknown key or an impossible value; names the file and the key.
     """
     path = Path(path)
-    if not path.is_file():
-        raise ConfigError(f"{path}: no such file")
-    if path.stat().st_size > MAX_SCENE_BYTES:
-        raise ConfigError(f"{path}: {path.stat().st_size} bytes, more than the {MAX_SCENE_BYTES} of a scene file")
+    text = read_text(path, MAX_SCENE_BYTES, ConfigError)
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as problem:
+        table = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as problem:
         raise ConfigError(f"{path}: not valid TOML: {problem}") from None
     try:
         return scene_from_table(table)

@@ -22,11 +22,12 @@ from numpy.typing import NDArray
 from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, Stream
 from log2sim.errors import LogError
 from log2sim.geometry import Array, Camera, PoseTrack
+from log2sim.input_files import read_file
 from log2sim.logs.argoverse.cities import find_city, map_frame_of
 from log2sim.logs.argoverse.labels import read_labels
 from log2sim.logs.argoverse.poses import read_ego_track, read_mounts
 from log2sim.logs.argoverse.sweeps import LIDARS, sweep_stream
-from log2sim.logs.arrow.tables import read_columns
+from log2sim.logs.arrow.tables import LIMITS, read_columns
 from log2sim.logs.arrow.values import Kind
 from log2sim.logs.digest import digest_of
 from log2sim.logs.images import MAX_IMAGE_PX, image_stream
@@ -146,7 +147,7 @@ class _Folder:
     def _digest(self) -> str:
         index = [self.path / name for name in (POSES, MOUNTS, INTRINSICS) if (self.path / name).is_file()]
         records = sorted(self.path.glob("*.feather")) + sorted((self.path / "sensors").rglob("*.*"))
-        return digest_of([p.read_bytes().hex() for p in index], records)
+        return digest_of([read_file(p, LIMITS.file_bytes, LogError).hex() for p in index], records)
 
     def _lidars(self, mounts: dict[str, Array], notes: list[str]) -> tuple[dict[str, Lidar], dict[str, Stream]]:
         t_ns, files = stamped_files(self.path / "sensors" / "lidar", ".feather", notes)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from log2sim.errors import LogError, RecordError
+from log2sim.input_files import open_regular
 from log2sim.logs.arrow.tables import LIMITS, TableLimits, check_rows, checked_schema, import_pyarrow, translate_errors
 from log2sim.logs.arrow.values import Kind, values_of
 
@@ -95,6 +96,7 @@ class ParquetRows:
         import_pyarrow()
         from pyarrow.parquet import ParquetFile
 
+        open_regular(self._path).close()  # pyarrow would wait for a pipe
         file = ParquetFile(self._path, buffer_size=READ_BYTES)
         self._names = checked_schema(file.schema_arrow, self._wanted, self._optional)
         groups = [file.metadata.row_group(g).num_rows for g in range(file.metadata.num_row_groups)]

@@ -17,6 +17,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from log2sim.errors import LogError, MissingExtra
+from log2sim.input_files import open_regular, read_bytes
 from log2sim.logs.arrow.ipc import ARROW_MAGIC, declared_size
 from log2sim.logs.arrow.values import Kind, values_of
 
@@ -111,8 +112,8 @@ def translate_errors(path: Path | str, error: type[LogError]) -> Iterator[None]:
         raise
     except FileNotFoundError:
         raise error(f"{path}: no such file") from None
-    except (pyarrow.ArrowException, OSError, ValueError, TypeError, KeyError, IndexError, MemoryError) as problem:
-        lines = str(problem).strip().splitlines()
+    except (pyarrow.ArrowException, OSError, ValueError, TypeError, KeyError, IndexError, OverflowError) as problem:
+        lines = str(getattr(problem, "strerror", None) or problem).strip().splitlines()
         raise error(f"{path}: {lines[0] if lines else type(problem).__name__}") from None
 
 
@@ -142,7 +143,7 @@ def checked_schema(schema: Any, wanted: Mapping[str, Kind], optional: Collection
 
 def _read_table(path: Path, wanted: Mapping[str, Kind], optional: Collection[str], limits: TableLimits) -> Any:
     """Read the wanted columns as a pyarrow table whose offsets were validated."""
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         magic = file.read(len(ARROW_MAGIC))
     if magic.startswith(PARQUET_MAGIC):
         table = _read_parquet(path, wanted, optional, limits)
@@ -185,10 +186,7 @@ def _check_size(unpacked_bytes: int, limits: TableLimits) -> None:
 
 def _read_feather(path: Path, wanted: Mapping[str, Kind], optional: Collection[str], limits: TableLimits) -> Any:
     pyarrow = import_pyarrow()
-    size = path.stat().st_size
-    if size > limits.file_bytes:
-        raise ValueError(f"{size} bytes, more than the {limits.file_bytes} that the file may have")
-    data = path.read_bytes()
+    data = read_bytes(path, limits.file_bytes)
     rows, unpacked = declared_size(data)
     check_rows(rows, limits)
     _check_size(unpacked, limits)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import EgoVehicle, Lidar, MapFrame, Stream, Sweep
 from log2sim.errors import LogError
 from log2sim.geometry import Array, Camera, inverse, nearest_rotation, rotation_from_rpy, transform
+from log2sim.input_files import read_file
 from log2sim.logs.sweeps import read_sweep, sweep_of
 
 EARTH_RADIUS_M = 6378137.0
@@ -70,11 +71,8 @@ def rig_of(velo_T_imu: Array, cam_T_velo: Array, rect_R_cam: Array, projections:
 
 def read_text(path: Path) -> str:
     """Read a small text file; raise a `LogError` that names it where that fails."""
-    if not path.is_file():
-        raise LogError(f"{path}: no such file; KITTI stores it with the drive's data")
-    if path.stat().st_size > MAX_TEXT_BYTES:
-        raise LogError(f"{path}: {path.stat().st_size} bytes, more than the {MAX_TEXT_BYTES} that it may have")
-    return path.read_text(encoding="utf-8", errors="replace")
+    data = read_file(path, MAX_TEXT_BYTES, LogError, missing="no such file; KITTI stores it with the drive's data")
+    return data.decode("utf-8", errors="replace")
 
 
 def read_calibration(path: Path) -> dict[str, Array]:

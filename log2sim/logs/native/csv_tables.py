@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.errors import LogError
+from log2sim.input_files import read_file
 from log2sim.registry import nearest
 
 MAX_TABLE_BYTES = 256 * 1024 * 1024
@@ -80,11 +81,7 @@ def read_csv_table(path: Path, columns: Mapping[str, str], optional: Mapping[str
         Naming file, line and field.
     """
     kinds = {**columns, **(optional or {})}
-    if not path.is_file():
-        raise LogError(f"{path}: no such file")
-    if path.stat().st_size > MAX_TABLE_BYTES:
-        raise LogError(f"{path}: {path.stat().st_size} bytes, more than the {MAX_TABLE_BYTES} that a table may have")
-    data = path.read_bytes()
+    data = read_file(path, MAX_TABLE_BYTES, LogError)
     try:
         reader = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
         rows = [(reader.line_num, row) for row in reader if row]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, Sweep
-from log2sim.documents import check, inside, read_json
+from log2sim.documents import JSON_LIMIT_BYTES, check, inside, read_json
 from log2sim.errors import LogError
 from log2sim.geometry import (
     DISTORTION_LENGTHS,
@@ -24,6 +24,7 @@ from log2sim.geometry import (
     shift_poses,
     transform,
 )
+from log2sim.input_files import open_regular, read_file
 from log2sim.logs.images import image_stream
 from log2sim.logs.native.csv_tables import CsvTable, read_csv_table
 from log2sim.logs.native.labels import (
@@ -79,7 +80,7 @@ READER = NativeReader()
 def _is_manifest(path: Path) -> bool:
     """Return whether a log.json may be ours: the table of that name of nuScenes is a list."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             return not file.read(64).lstrip().startswith(b"[")
     except OSError:
         return False
@@ -97,7 +98,7 @@ class _Folder:
             check(self.manifest, "log-1", LogError)
         except LogError as error:
             raise LogError(f"{self.file}: {error}") from None
-        self.hash = hashlib.sha256(self.file.read_bytes())
+        self.hash = hashlib.sha256(read_file(self.file, JSON_LIMIT_BYTES, LogError))
 
     def log(self) -> Log:
         m = self.manifest

@@ -14,6 +14,7 @@ import numpy as np
 from log2sim.documents import read_json
 from log2sim.errors import LogError
 from log2sim.geometry import Array
+from log2sim.input_files import open_regular
 from log2sim.logs.pose_checks import find_not_unit
 from log2sim.logs.stamps import MAX_TIME_S
 
@@ -111,7 +112,7 @@ def _windows(path: Path, chunk_bytes: int) -> Iterator[tuple[bytes, int, int, in
     Around the new range every record that touches it is complete.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             data, begin, offset = b"", 0, 0
             while True:
                 chunk = file.read(chunk_bytes)

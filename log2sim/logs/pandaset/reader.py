@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream
-from log2sim.documents import read_json
+from log2sim.documents import JSON_LIMIT_BYTES, read_json
 from log2sim.errors import LogError
 from log2sim.geometry import (
     NS_PER_S,
@@ -29,6 +29,7 @@ from log2sim.geometry import (
     rotation_from_quaternion,
     transform,
 )
+from log2sim.input_files import read_text
 from log2sim.logs.digest import digest_of
 from log2sim.logs.images import first_image_size, image_stream
 from log2sim.logs.notes import defer_notes
@@ -118,7 +119,9 @@ class _Sequence:
             map=self._map_frame(map_T_pose, notes),
             labels=labels,
             reference_camera="front_camera" if "front_camera" in cameras else None,
-            digest=digest_of([(self.path / "lidar" / "poses.json").read_text()], self._records()),
+            digest=digest_of(
+                [read_text(self.path / "lidar" / "poses.json", JSON_LIMIT_BYTES, LogError)], self._records()
+            ),
             notes=defer_notes(notes, *(partial(sweeps.index, lidar) for lidar in lidars), labels),
         )
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.errors import LogError, RecordError
+from log2sim.input_files import read_file
 from log2sim.logs.pandaset.arrow_text import decode_text
 
 MAX_TABLE_BYTES = 512 * 1024 * 1024
@@ -36,19 +37,14 @@ def read_pickled_table(path: Path, error: type[LogError] = RecordError, limit_by
     RecordError or `error`
         When the file is missing, larger than `limit_bytes` once unpacked, no table, or names a class that tables do not need.
     """
-    try:
-        if path.stat().st_size > limit_bytes:
-            raise error(f"{path}: {path.stat().st_size} bytes, more than the {limit_bytes} that a table may have")
-        packed = path.read_bytes()
-    except OSError as problem:
-        raise error(f"{path}: cannot be read: {problem.strerror}") from None
+    packed = read_file(path, limit_bytes, error, missing="cannot be read: No such file or directory")
     try:
         data = _gunzip(packed, limit_bytes) if packed[:2] == b"\x1f\x8b" else packed
         table = _TableUnpickler(io.BytesIO(data)).load()
         return _columns(table)
     except (
         pickle.UnpicklingError, zlib.error, struct.error, EOFError, ValueError, TypeError, KeyError, IndexError,
-        AttributeError, AssertionError, OverflowError, MemoryError, RecursionError,
+        AttributeError, AssertionError, OverflowError, RecursionError,
     ) as problem:  # fmt: skip
         raise error(f"{path}: not a pickled table: {problem or type(problem).__name__}") from None
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.errors import LogError, RecordError
+from log2sim.input_files import open_regular
 from log2sim.logs.ros.containers import Channel, Container, one_line, printable
 from log2sim.logs.ros.recordings import Recording, recorded_files
 from log2sim.logs.sweeps import PARSER_ERRORS
@@ -188,7 +189,7 @@ def open_container(path: Path, compression: str = "") -> Container:
     """Open one file of a recording by its magic bytes; `LogError` for anything else."""
     from log2sim.logs.ros import mcap, rosbag1, sqlite
 
-    with path.open("rb") as stream:
+    with open_regular(path) as stream:
         head = stream.read(16)
     if not head:
         raise LogError(f"{path}: is empty; expected a ROS bag or an MCAP file")

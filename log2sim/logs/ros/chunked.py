@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from log2sim.errors import MissingExtra
+from log2sim.input_files import open_regular
 from log2sim.logs.ros.containers import checked_size
 
 MAX_CHUNK_BYTES = 512 * 1024 * 1024
@@ -39,9 +40,9 @@ class ChunkedFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.chunks: list[Chunk] = []
-        self.size = path.stat().st_size
-        self._handle = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
-        weakref.finalize(self, os.close, self._handle)
+        self._file = open_regular(path, buffering=0)
+        weakref.finalize(self, self._file.close)
+        self.size = os.fstat(self._file.fileno()).st_size
         self._lock = threading.RLock()
         self._cache: OrderedDict[int, bytes] = OrderedDict()
         self._intact: set[int] = set()
@@ -53,9 +54,9 @@ class ChunkedFile:
         if count < 0 or position < 0 or position + count > self.size:
             raise ValueError(f"{count} bytes at byte {position} of a file of {self.size}; it is truncated or damaged")
         with self._lock:
-            os.lseek(self._handle, position, os.SEEK_SET)
+            self._file.seek(position)
             parts, missing = [], count
-            while missing and (part := os.read(self._handle, missing)):
+            while missing and (part := self._file.read(missing)):
                 parts.append(part)
                 missing -= len(part)
         if missing:

@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from log2sim.errors import LogError, MissingExtra
+from log2sim.input_files import read_text
 from log2sim.logs.ros.containers import one_line
 
 SUFFIXES = (".bag", ".db3", ".mcap")
@@ -139,10 +140,9 @@ def _read_metadata(path: Path) -> dict[str, Any]:
         from ruamel.yaml.error import YAMLError
     except ImportError:
         raise MissingExtra("reading rosbag2 folders", "ros") from None
-    if path.stat().st_size > MAX_METADATA_BYTES:
-        raise LogError(f"{path}: {path.stat().st_size} bytes, more than the {MAX_METADATA_BYTES} that it may have")
+    text = read_text(path, MAX_METADATA_BYTES, LogError)
     try:
-        document = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
+        document = YAML(typ="safe", pure=True).load(text)["rosbag2_bagfile_information"]
         if not isinstance(document, dict):
             raise TypeError("no table")
     except (YAMLError, ValueError, TypeError, KeyError, RecursionError) as problem:

@@ -12,6 +12,7 @@ from pydantic import BeforeValidator, Field, ValidationError, model_validator
 from log2sim.config import Section
 from log2sim.errors import ConfigError
 from log2sim.geometry import DISTORTION_LENGTHS
+from log2sim.input_files import read_text
 from log2sim.logs.pose_checks import QUATERNION_TOLERANCE
 from log2sim.model_errors import first_problem
 
@@ -169,11 +170,10 @@ def read_settings(places: Iterable[Path]) -> tuple[TopicSettings, Path | None]:
     path = next((p for p in places if p.is_file()), None)
     if path is None:
         return TopicSettings(), None
-    if path.stat().st_size > MAX_SETTINGS_BYTES:
-        raise ConfigError(f"{path}: larger than the {MAX_SETTINGS_BYTES} bytes that it may have")
+    text = read_text(path, MAX_SETTINGS_BYTES, ConfigError)
     try:
-        return TopicSettings.model_validate(tomllib.loads(path.read_text(encoding="utf-8"))), path
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as problem:
+        return TopicSettings.model_validate(tomllib.loads(text)), path
+    except (tomllib.TOMLDecodeError, RecursionError) as problem:
         raise ConfigError(f"{path}: not valid TOML: {problem}") from None
     except ValidationError as problem:
         raise ConfigError(f"{path}: {first_problem(problem, TopicSettings)}") from None

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import struct
 from collections import OrderedDict
-from io import SEEK_END, FileIO
+from io import SEEK_END
 from pathlib import Path
 from threading import Lock
+from typing import BinaryIO
 
 from log2sim.errors import LogError, RecordError
+from log2sim.input_files import open_regular
 from log2sim.logs.waymo.crc32c import masked_crc32c
 
 HEADER_BYTES, FOOTER_BYTES = 12, 4
@@ -28,7 +30,7 @@ BLOCK_BYTES = 512
 def starts_like_tfrecord(path: Path) -> bool:
     """Return whether the file's first length has its CRC; False for what cannot be read."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             return _length_of(file.read(HEADER_BYTES)) is not None
     except OSError:
         return False
@@ -83,7 +85,7 @@ class RecordFile:
     def _read_checked(self, k: int, what: str) -> bytes:
         begin, size = self.spans[k]
         try:
-            with self.path.open("rb") as file:
+            with open_regular(self.path) as file:
                 file.seek(begin)
                 data, footer = file.read(size), file.read(FOOTER_BYTES)
         except OSError as error:
@@ -101,12 +103,12 @@ class RecordFile:
     def _walk(self) -> list[tuple[int, int]]:
         """Find offset and size of the data of all whole records by their lengths."""
         try:
-            with self.path.open("rb", buffering=0) as file:
+            with open_regular(self.path, buffering=0) as file:
                 return self._spans(file, file.seek(0, SEEK_END))
         except OSError as error:
             raise LogError(f"{self.path}: cannot be read: {error.strerror}") from None
 
-    def _spans(self, file: FileIO, total: int) -> list[tuple[int, int]]:
+    def _spans(self, file: BinaryIO, total: int) -> list[tuple[int, int]]:
         spans: list[tuple[int, int]] = []
         offset = number = 0
         while offset < total:
@@ -139,7 +141,7 @@ class RecordWindow:
     """Parts of one record, read in blocks from its file; offsets count from the start of its data."""
 
     def __init__(self, path: Path, begin: int, size: int) -> None:
-        self._file, self._begin, self.size = path.open("rb", buffering=0), begin, size
+        self._file, self._begin, self.size = open_regular(path, buffering=0), begin, size
         self._block, self._block_begin = b"", 0
 
     def __enter__(self) -> RecordWindow:
@@ -165,7 +167,7 @@ class RecordWindow:
         return read_at(self._file, self._begin + begin, end - begin)
 
 
-def read_at(file: FileIO, begin: int, count: int) -> bytes:
+def read_at(file: BinaryIO, begin: int, count: int) -> bytes:
     """Read up to `count` bytes at an offset, fewer at the end of the file."""
     file.seek(begin)
     return file.read(count) or b""
