@@ -30,6 +30,7 @@ from log2sim.datatypes.log import (
 )
 from log2sim.datatypes.measurements import BoxEvidence, Detections, Measurements
 from log2sim.datatypes.obstacles import Obstacles
+from log2sim.datatypes.rays import Rays
 from log2sim.datatypes.scenario import EGO, VERSION, Scenario
 from log2sim.datatypes.tracks import Track
 from log2sim.datatypes.trajectory import STANDSTILL_DRIFT_M, STANDSTILL_MPS, Trajectory
@@ -67,6 +68,7 @@ __all__ = [
     "MapFrame",
     "Measurements",
     "Obstacles",
+    "Rays",
     "Scenario",
     "Stream",
     "Sweep",

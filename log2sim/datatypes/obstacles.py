@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes.rays import Rays
 from log2sim.geometry import Array
 
 
@@ -25,7 +26,9 @@ class Obstacles:
     t_s : (N,) float32
         Times relative to `stamp_ns`.
     sensor : (3,) float32
-        Position of the sensor relative to `origin`.
+        Position of the sensor relative to `origin`, mean over several.
+    free : Rays, optional
+        A sample of all rays, those that end on the ground too: where they passed is nothing.
     """
 
     stamp_ns: int
@@ -33,6 +36,7 @@ class Obstacles:
     xyz: NDArray[np.float32]
     t_s: NDArray[np.float32]
     sensor: NDArray[np.float32]
+    free: Rays | None = None
 
     @cached_property
     def rays(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:

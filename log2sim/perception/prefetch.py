@@ -14,6 +14,7 @@ from log2sim.datatypes import Boxes3D, Log, Obstacles, Sweep
 from log2sim.perception.detect3d.detectors import LidarDetector
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.lidar.cloud import Cloud, assemble_cloud, cloud_origin, compensation_of
+from log2sim.perception.lidar.rays import sample_rays
 from log2sim.perception.sync import Schedule
 from log2sim.plan import Plan, Stage
 
@@ -144,11 +145,13 @@ def _boxes_in(detector: LidarDetector, making: Future[Cloud | None], earlier: li
 
 
 def obstacles_of(cloud: Cloud) -> Obstacles:
-    """Take the points above the ground, one a voxel, so that a long log fits in memory."""
+    """Take the points above the ground, one a voxel, and a sample of the rays, so that a long log fits in memory."""
     index, xyz = cloud.obstacles, cloud.obstacle_columns.T
     near = np.flatnonzero(np.hypot(xyz[:, 0], xyz[:, 1]) < OBSTACLE_REACH_M)
     index = index[near[_voxel_sample(xyz[near], OBSTACLE_VOXEL_M)]]
-    return Obstacles(cloud.stamp_ns, cloud.origin, cloud.xyz[index], cloud.t_s[index], cloud.sensor)
+    return Obstacles(
+        cloud.stamp_ns, cloud.origin, cloud.xyz[index], cloud.t_s[index], cloud.sensor, sample_rays(cloud)
+    )
 
 
 def _voxel_sample(xyz: NDArray[np.float32], voxel_m: float) -> NDArray[np.intp]:

@@ -28,6 +28,25 @@ GROUND_SAMPLE = 2000
 
 
 @dataclass(frozen=True, eq=False)
+class CloudSensor:
+    """One of the LiDARs whose points are in a cloud.
+
+    Attributes
+    ----------
+    points : int
+        Number of its points, which follow those of the previous sensor.
+    position : (3,) float64
+        At the stamp of the cloud, relative to the cloud's origin, m.
+    velocity_mps : (3,) float64
+        Mean over its points.
+    """
+
+    points: int
+    position: Array
+    velocity_mps: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Cloud:
     """Points of one moment in the map frame.
 
@@ -46,6 +65,8 @@ class Cloud:
         True for points on the ground.
     height : (N,) float32
         m above the ground.
+    sensors : tuple of CloudSensor
+        Empty where the points are all of one sensor at `sensor`.
     """
 
     stamp_ns: int
@@ -55,6 +76,7 @@ class Cloud:
     sensor: NDArray[np.float32]
     ground: NDArray[np.bool_]
     height: NDArray[np.float32]
+    sensors: tuple[CloudSensor, ...] = ()
 
     @cached_property
     def obstacles(self) -> NDArray[np.intp]:
@@ -194,7 +216,7 @@ def assemble_cloud(
     Cloud or None
         None when no sweep has a known pose and points.
     """
-    parts, stamp = [], 0
+    parts, sensors, stamp = [], [], 0
     for name, sweep in sweeps.items():
         mapped = sweep_to_map(log, name, sweep, compensate=compensate)
         if mapped is None or len(mapped[0]) == 0:
@@ -203,8 +225,10 @@ def assemble_cloud(
         sensor, known = log.map_T_sensor(name, sweep.stamp_ns)
         local = (mapped[0] - origin).astype(np.float32)
         near = (np.abs(local[:, 0]) <= max_range_m) & (np.abs(local[:, 1]) <= max_range_m)
-        shift_s = np.float32((sweep.stamp_ns - stamp) / NS_PER_S)
-        parts.append((local[near], mapped[1][near] + shift_s, sensor[0, :3, 3] - origin if known[0] else np.zeros(3)))
+        t_s = mapped[1] + np.float32((sweep.stamp_ns - stamp) / NS_PER_S)
+        position = sensor[0, :3, 3] - origin if known[0] else np.zeros(3)
+        parts.append((local[near], t_s[near], position))
+        sensors.append(CloudSensor(int(near.sum()), *_follow_sensor(log, name, stamp, t_s, origin)))
     if not parts:
         return None
     xyz, t_s = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
@@ -212,7 +236,25 @@ def assemble_cloud(
     height = xyz[:, 2] - surface.at(xyz[:, :2])
     # A distant LiDAR without points in range must not shift the viewpoint.
     sensor = np.mean([p[2] for p in parts if len(p[0])] or [p[2] for p in parts], axis=0).astype(np.float32)
-    return Cloud(stamp, np.asarray(origin, float), xyz, t_s, sensor, np.abs(height) <= ON_GROUND_M, height)
+    ground = np.abs(height) <= ON_GROUND_M
+    return Cloud(stamp, np.asarray(origin, float), xyz, t_s, sensor, ground, height, tuple(sensors))
+
+
+def _follow_sensor(
+    log: Log, name: str, stamp_ns: int, t_s: NDArray[np.float32], origin: Array
+) -> tuple[Array, Array]:
+    """Follow a LiDAR through times (N,) relative to a stamp: position (3,) at the stamp relative to `origin`, velocity (3,).
+
+    The line goes through its places at the first and the last time; without known poses it stands at the origin.
+    """
+    first_s, last_s = float(t_s.min()), float(t_s.max())
+    t_ns = stamp_ns + np.round(np.array([first_s, last_s]) * NS_PER_S).astype(np.int64)
+    map_T_lidar, known = log.map_T_sensor(name, t_ns)
+    if not known.all():
+        return np.zeros(3), np.zeros(3)
+    first, last = map_T_lidar[:, :3, 3] - origin
+    velocity = (last - first) / (last_s - first_s) if last_s > first_s else np.zeros(3)
+    return first - first_s * velocity, velocity
 
 
 def compensation_of(log: Log, lidar: str, sweep: Sweep) -> str:

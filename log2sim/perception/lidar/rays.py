@@ -1,0 +1,56 @@
+"""A sample of a cloud's rays for tests of free space, ground included."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Rays
+from log2sim.perception.lidar.azimuth_index import STEP_RAD, STEPS_PER_TURN
+from log2sim.perception.lidar.cloud import MAX_OBSTACLE_HEIGHT_M, Cloud, CloudSensor
+
+# One ray is kept of each cell of directions. At 50 m cells are 0.4 m wide: the side of a car has twenty.
+CELL_RAD = np.deg2rad(0.5)
+CELL_STEPS = round(CELL_RAD / STEP_RAD)
+COLUMNS = STEPS_PER_TURN // CELL_STEPS + 1
+# Cells from straight down to straight up, more than there are.
+CELLS_PER_COLUMN = 1024
+MAX_REACH_M = 70.0
+RANK_BITS = 25  # more than the points of any sweep
+
+
+def sample_rays(cloud: Cloud) -> Rays:
+    """Take a ray of every cell of directions and every sensor of those that end within reach and below what hangs over the road.
+
+    Notes
+    -----
+    Cells of directions, unlike voxels, keep the same share of the rays that hit something near and of those that pass it.
+    Directions are those from the middle of the sensors, which does for a sample.
+    """
+    index = cloud.azimuth_index
+    rows = np.flatnonzero((index.range_m < MAX_REACH_M) & (cloud.height[index.rank] < MAX_OBSTACLE_HEIGHT_M))
+    point = index.rank[rows]
+    sensor = _sensor_of(cloud, point)
+    # The slope of a ray differs from its angle where it is steep: near the sensor, where rays are many.
+    slope = np.clip(index.slope[rows] / np.float32(CELL_RAD), -CELLS_PER_COLUMN // 2, CELLS_PER_COLUMN // 2 - 1)
+    column = sensor * COLUMNS + index.azimuth[rows] // CELL_STEPS
+    cell = column * CELLS_PER_COLUMN + np.floor(slope).astype(np.int64) + CELLS_PER_COLUMN // 2
+    # Cell and rank in one number: numbers are sorted several times as fast as their places are.
+    ordered = np.sort((cell << RANK_BITS) + point)
+    kept = ordered[np.flatnonzero(np.diff(ordered >> RANK_BITS, prepend=-1))] & ((1 << RANK_BITS) - 1)
+    sensors = cloud.sensors or (CloudSensor(len(cloud.xyz), cloud.sensor, np.zeros(3)),)
+    return Rays(
+        cloud.xyz[kept],
+        cloud.t_s[kept],
+        _sensor_of(cloud, kept).astype(np.uint8),
+        np.array([s.position for s in sensors], dtype=np.float32),
+        np.array([s.velocity_mps for s in sensors], dtype=np.float32),
+    )
+
+
+def _sensor_of(cloud: Cloud, point: NDArray[np.intp]) -> NDArray[np.int64]:
+    """Return the number (n,) of the sensor that measured each point."""
+    if len(cloud.sensors) < 2:
+        return np.zeros(len(point), dtype=np.int64)
+    last = np.cumsum([sensor.points for sensor in cloud.sensors])
+    return np.searchsorted(last, point, side="right").astype(np.int64)
