@@ -214,7 +214,7 @@ def second_pass(run: Run, observations: Observations) -> Result:
         candidates = decide_headings(candidates, ego_path(log, run.schedule))
         ego = ego_agent(log, timeline, run.poses.origin)
     with run.clock.stage("judge"):
-        judged = judge(candidates, ego)
+        judged = judge(candidates, ego, observations.obstacles, timeline)
         agents = [candidate.agent for candidate in judged]
         # Without an ego the agents' waypoints alone tell the ticks, so all of them stay.
         agents = simplify(agents) if ego is not None else agents

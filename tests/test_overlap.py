@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from log2sim.agents.candidate import AgentCandidate
-from log2sim.agents.duplicates import suppress_duplicates, trim_ego_overlap
+from log2sim.agents.duplicates import suppress_duplicates
 from log2sim.agents.naming import name_agents
 from log2sim.datatypes import Agent, Waypoints
 
@@ -83,34 +83,3 @@ def test_a_person_whose_center_is_outside_a_car_is_beside_it(y_m, count):
     # The car's side is at 0.9 m, as far as sizes of cars are known.
     person = agent(10.5, y_m, category="pedestrian", size=(0.7, 0.7, 1.75))
     assert len(names((agent(10.0), 9.0), (person, 2.0))) == count
-
-
-def passing(y_m):
-    """A car that comes from behind the standing ego, 10 m in 4 s."""
-    return agent(-10.0, y_m, speed=2.5)
-
-
-def cut_at(ego, *built):
-    return [c.agent for c in trim_ego_overlap([candidate(a) for a in built], ego)]
-
-
-def test_a_way_that_ends_in_the_ego_is_cut_where_it_enters():
-    ego = agent(0.0)
-    (cut,) = cut_at(ego, passing(0.3))
-    # Both are 4.4 m long: they meet when the centers are that far apart, at 2.24 s; waypoints stand every second.
-    assert cut.waypoints.t_s.tolist() == [0.0, 1.0, 2.0]
-    assert cut.waypoints.x_m.tolist() == [-10.0, -7.5, -5.0]
-    backward = replace(passing(0.3), waypoints=replace(passing(0.3).waypoints, x_m=passing(0.3).waypoints.x_m[::-1]))
-    assert cut_at(ego, backward)[0].waypoints.t_s.tolist() == [2.0, 3.0, 4.0]
-
-
-@pytest.mark.parametrize("y_m", [1.85, -2.5])
-def test_who_passes_beside_the_ego_keeps_the_whole_way(y_m):
-    (whole,) = cut_at(agent(0.0), passing(y_m))
-    assert whole.waypoints.t_s.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
-
-
-def test_without_an_ego_and_for_what_stands_nothing_is_cut():
-    assert cut_at(None, passing(0.0))[0].waypoints.t_s[-1] == 4.0
-    parked = replace(agent(3.0), static=True)
-    assert cut_at(agent(0.0), parked)[0] is parked

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from log2sim.agents.confirmation import agent_confidence, is_confirmed
 from log2sim.agents.size import TrackGeometry
+from log2sim.agents.support import Support
 from log2sim.datatypes import GROUP_OF, Agent, Doubt, Track, Waypoints
 from log2sim.geometry import NS_PER_S, Array
 
@@ -45,13 +46,15 @@ class AgentCandidate:
     ----------
     agent : Agent
     evidence : float
-        Sum of the scores of its detections.
+        Sum of the scores of its detections; in nats, with all other evidence, once it is weighed.
     confirmed : bool
         Whether the confidence of the track suffices.
     track : Track
         Whose measurements, one at each of its ticks, the agent is made of.
     geometry : TrackGeometry
         Size of the track, and positions at its measurements.
+    support : Support, optional
+        What the points of the LiDAR say about it, once it is weighed.
     """
 
     agent: Agent
@@ -59,6 +62,7 @@ class AgentCandidate:
     confirmed: bool
     track: Track
     geometry: TrackGeometry
+    support: Support | None = None
 
     def doubted(self, doubts: Sequence[Doubt]) -> Self:
         """Return the candidate with more doubts of its agent."""

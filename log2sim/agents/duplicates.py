@@ -1,9 +1,8 @@
-"""Duplicate agents are removed, and trajectories are trimmed where they overlap the ego."""
+"""Duplicate agents are removed: those in one place most of the time."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -18,8 +17,6 @@ SHARED_AREA = 0.25
 SHARED_AREA_OF_PERSON = 0.5
 SAME_PERSON_M = 0.35
 SAMPLES = 12
-# An overlap below this share of the smaller box is contact only.
-TOUCHING = 0.05
 
 
 def suppress_duplicates(built: Sequence[AgentCandidate], ego: Agent | None = None) -> list[AgentCandidate]:
@@ -30,26 +27,6 @@ def suppress_duplicates(built: Sequence[AgentCandidate], ego: Agent | None = Non
         if not any(_are_duplicates(candidate.agent, other) for other in (*taken, *(k.agent for k in kept))):
             kept.append(candidate)
     return kept
-
-
-def trim_ego_overlap(built: Sequence[AgentCandidate], ego: Agent | None) -> list[AgentCandidate]:
-    """Trim the beginnings and ends of trajectories that overlap the box of the ego; static agents stay as they are.
-
-    There the sensors of the ego see too little of an agent to locate it.
-    """
-    return list(built) if ego is None else [replace(c, agent=_outside(c.agent, ego)) for c in built]
-
-
-def _outside(agent: Agent, ego: Agent) -> Agent:
-    """Return the agent from its first to its last waypoint that does not overlap the ego."""
-    if agent.static or not _extents_meet(agent, ego):
-        return agent
-    w = agent.waypoints
-    apart = shared_areas(agent, ego, w.t_s) <= TOUCHING
-    if apart.all() or not apart.any():
-        return agent
-    first, last = int(np.argmax(apart)), len(apart) - int(np.argmax(apart[::-1]))
-    return replace(agent, waypoints=w.take(slice(first, last)))
 
 
 def _are_duplicates(a: Agent, b: Agent) -> bool:
@@ -63,7 +40,7 @@ def _are_duplicates(a: Agent, b: Agent) -> bool:
         p, q = a.at(t), b.at(t)
         return bool(np.median(np.hypot(p.x_m - q.x_m, p.y_m - q.y_m)) < SAME_PERSON_M)
     least = SHARED_AREA_OF_PERSON if groups == {"pedestrian", "vehicle"} else SHARED_AREA
-    return bool(np.median(shared_areas(a, b, t)) > least)
+    return bool(np.median(_shared_areas(a, b, t)) > least)
 
 
 def _extents_meet(a: Agent, b: Agent) -> bool:
@@ -75,7 +52,7 @@ def _extents_meet(a: Agent, b: Agent) -> bool:
     )
 
 
-def shared_areas(a: Agent, b: Agent, t_s: Array) -> Array:
+def _shared_areas(a: Agent, b: Agent, t_s: Array) -> Array:
     """Return the overlap (T,) of two agents' boxes at times (T,) as a share of the smaller box; 0 where one is absent."""
     p, q = a.at(t_s), b.at(t_s)
     reach = (np.hypot(*a.size_m[:2]) + np.hypot(*b.size_m[:2])) / 2

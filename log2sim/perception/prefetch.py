@@ -149,9 +149,7 @@ def obstacles_of(cloud: Cloud) -> Obstacles:
     index, xyz = cloud.obstacles, cloud.obstacle_columns.T
     near = np.flatnonzero(np.hypot(xyz[:, 0], xyz[:, 1]) < OBSTACLE_REACH_M)
     index = index[near[_voxel_sample(xyz[near], OBSTACLE_VOXEL_M)]]
-    return Obstacles(
-        cloud.stamp_ns, cloud.origin, cloud.xyz[index], cloud.t_s[index], cloud.sensor, sample_rays(cloud)
-    )
+    return Obstacles(cloud.stamp_ns, cloud.origin, cloud.xyz[index], cloud.t_s[index], cloud.sensor, sample_rays(cloud))
 
 
 def _voxel_sample(xyz: NDArray[np.float32], voxel_m: float) -> NDArray[np.intp]:

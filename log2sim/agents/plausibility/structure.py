@@ -1,4 +1,4 @@
-"""Walls and fences: the points of an agent that are a part of something much longer are no evidence for it."""
+"""Walls and fences: points of an agent that are part of something much longer are no evidence for it."""
 
 from __future__ import annotations
 
@@ -9,25 +9,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.candidate import Timeline
-from log2sim.datatypes import CATEGORY, Agent, Obstacles
+from log2sim.agents.plausibility.box_table import BoxTable
+from log2sim.agents.plausibility.free_space import MAX_LAG_S
+from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, Agent, Obstacles
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception.box_fitting import rotate
 
 # Points up to this far outside a box may be its own: error of a box.
 MARGIN_M = 0.3
-# Thickness to either side of what counts as one surface; walls are flatter, the sides of cars recede by more at their ends.
+# Thickness to either side of what counts as one surface. Walls are flatter; what else the points of a vehicle show, its
+# second side, its roof and its windows, recedes by more.
 SURFACE_M = 0.2
-# Surfaces are followed along cells of this length over gaps of at most this many of them. Between the sides of parked
-# vehicles there is a gap of their distance and of two rounded corners.
+MIN_SURFACE_SHARE = 0.85
+# Surfaces are followed along cells of this length over at most so many empty ones: 0.5 m is less than the distance of parked
+# vehicles with their two rounded corners.
 CELL_M, MAX_EMPTY_CELLS = 0.25, 2
-# A surface is followed so far from the middle of a box.
-REACH_M = 15.0
-# Share of the points in a box that are on its surface.
-MIN_SURFACE_SHARE = 0.6
-MIN_POINTS, MIN_CELLS = 12, 4
-# A surface that is longer than the longest of the category by this is none of its sides.
+# A surface that is longer than the longest vehicle of its category by this is no side of one.
 EXCESS_M = 0.5
+MIN_POINTS, MIN_CELLS = 12, 4
+# Points below may be curbs.
 BOTTOM_M = 0.3
+# The points in each cell of a surface that are nearest to the sensor, without the strays.
+FRONT_QUANTILE = 0.8
+SEARCHED_TICKS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,64 +43,92 @@ class Surface:
     share : float
         Of the points in the box that are on it.
     length_m : float
-        Without a gap, within and beyond the box.
-    beyond_m : (2,) float64
-        Of it beyond either end of the box.
+        Of the surface, without a gap, in the box and beyond.
     """
 
     share: float
     length_m: float
-    beyond_m: Array
 
 
-def surface_of(agent: Agent, cloud: Obstacles, t_s: float) -> Surface | None:
-    """Follow the surface that the points of an agent at a time are on; None with few points."""
-    state = agent.at(t_s, margin_s=0.1)
-    if not state.valid[0]:
+def structure_shares(agents: Sequence[Agent], clouds: Sequence[Obstacles | None], timeline: Timeline) -> Array:
+    """Return, for A agents, the share of the searched ticks at which the points of a vehicle are part of a longer surface.
+
+    A few ticks, evenly spread over the life of an agent, are searched: what stands shows the same at all of them.
+    """
+    shares = np.zeros(len(agents))
+    ticks = np.array([k for k, cloud in enumerate(clouds) if cloud is not None], dtype=np.intp)
+    rows = [i for i, agent in enumerate(agents) if GROUP_OF[agent.category] == "vehicle"]
+    if len(ticks) == 0 or not rows:
+        return shares
+    stamps = np.array([cloud.stamp_ns for cloud in clouds if cloud is not None], dtype=np.int64)
+    boxes = BoxTable.of([agents[i] for i in rows], (stamps - timeline.t0_ns) / NS_PER_S, margin_s=MAX_LAG_S)
+    for row, i in enumerate(rows):
+        alive = np.flatnonzero(boxes.present[row])
+        searched = alive[np.unique(np.linspace(0, len(alive) - 1, min(len(alive), SEARCHED_TICKS)).astype(np.intp))]
+        longest_m = MAX_SIZE_M[agents[i].category][0] + EXCESS_M
+        found = [_surface_at(boxes, row, int(k), clouds[ticks[k]], longest_m) for k in searched]
+        longer = [s.share >= MIN_SURFACE_SHARE and s.length_m > longest_m for s in found if s is not None]
+        shares[i] = sum(longer) / max(len(searched), 1)
+    return shares
+
+
+def _surface_at(boxes: BoxTable, row: int, column: int, cloud: Obstacles | None, reach_m: float) -> Surface | None:
+    """Follow the surface of one agent in one cloud up to `reach_m` from its center."""
+    if cloud is None:
         return None
-    xy = np.array([state.x_m[0], state.y_m[0]])
-    bottom = state.z_m[0] - agent.size_m[2] / 2
-    x, y = (xy - cloud.origin[:2]).astype(np.float32)
-    reach = REACH_M
-    near = np.flatnonzero(np.abs(cloud.xyz[:, 0] - x) <= reach)
-    near = near[np.abs(cloud.xyz[near, 1] - y) <= reach]
-    z = cloud.xyz[near, 2] + (cloud.origin[2] - bottom)
-    near = near[z > BOTTOM_M]
-    yaw = float(state.yaw_rad[0])
-    local = rotate((cloud.xyz[near, :2] - np.array([x, y])).astype(np.float64), -yaw)
-    sensor = rotate(cloud.sensor[:2].astype(np.float64) + cloud.origin[:2] - xy, -yaw)
-    half = np.array(agent.size_m[:2]) / 2
-    inside = (np.abs(local) <= half + MARGIN_M).all(axis=1)
+    center, size, yaw = boxes.center_m[row, column] - cloud.origin, boxes.size_m[row], float(boxes.yaw_rad[row, column])
+    near = np.flatnonzero(np.abs(cloud.xyz[:, 0] - np.float32(center[0])) <= reach_m)
+    near = near[np.abs(cloud.xyz[near, 1] - np.float32(center[1])) <= reach_m]
+    near = near[cloud.xyz[near, 2] > center[2] - size[2] / 2 + BOTTOM_M]
+    local = rotate(cloud.xyz[near, :2].astype(np.float64) - center[:2], -yaw)
+    sensor = rotate(cloud.sensor[:2].astype(np.float64) - center[:2], -yaw)
+    return find_surface(local, size[:2], sensor)
+
+
+def find_surface(local: Array, size_m: Array, sensor: Array) -> Surface | None:
+    """Find the surface that most points in a box are on, along its length or its width.
+
+    Parameters
+    ----------
+    local : (N, 2) float64, m
+        Points in and around the box, in its axes, relative to its center.
+    size_m : (2,) float64
+        Length and width.
+    sensor : (2,) float64, m
+        Likewise.
+
+    Returns
+    -------
+    Surface or None
+        None with too few points in the box.
+    """
+    inside: NDArray[np.bool_] = np.all(np.abs(local) <= size_m / 2 + MARGIN_M, axis=1)
     if inside.sum() < MIN_POINTS:
         return None
-    found = [_along(local, inside, half, sensor, axis) for axis in (0, 1)]
-    found = [f for f in found if f is not None]
-    return max(found, key=lambda f: f.share) if found else None
+    found = [
+        _along(local[:, axis], local[:, 1 - axis] * (1 if sensor[1 - axis] >= 0 else -1), inside) for axis in (0, 1)
+    ]
+    return max((s for s in found if s is not None), key=lambda s: s.share, default=None)
 
 
-def _along(local: Array, inside: NDArray[np.bool_], half: Array, sensor: Array, axis: int) -> Surface | None:
-    side = 1.0 if sensor[1 - axis] >= 0 else -1.0
-    u, v = local[:, axis], local[:, 1 - axis] * side
+def _along(u: Array, v: Array, inside: NDArray[np.bool_]) -> Surface | None:
+    """Follow the surface of the points `inside` along u; v grows toward the sensor."""
     cell = np.floor(u / CELL_M).astype(np.int64)
-    cells = np.unique(cell[inside])
+    order = np.flatnonzero(inside)[np.lexsort((v[inside], cell[inside]))]
+    cells, first, count = np.unique(cell[order], return_index=True, return_counts=True)
     if len(cells) < MIN_CELLS:
         return None
-    front = np.array([np.quantile(v[inside & (cell == k)], 0.8) for k in cells])
+    front = v[order[first + (FRONT_QUANTILE * (count - 1)).astype(np.intp)]]
     at = (cells + 0.5) * CELL_M
     i, j = np.triu_indices(len(at), 1)
-    slope = float(np.median((front[j] - front[i]) / (at[j] - at[i])))
-    offset = float(np.median(front - slope * at))
-    on = np.abs(v - slope * u - offset) <= SURFACE_M
+    slope = np.median((front[j] - front[i]) / (at[j] - at[i]))  # Theil (1950)
+    on = np.abs(v - slope * u - np.median(front - slope * at)) <= SURFACE_M
     own = np.sort(cell[on & inside])
     if len(own) < MIN_POINTS:
         return None
-    share = float(on[inside].mean())
     occupied = np.unique(cell[on])
-    start = int(np.searchsorted(occupied, own[len(own) // 2]))
-    gaps = np.diff(occupied) > MAX_EMPTY_CELLS + 1
-    before, after = np.flatnonzero(gaps[:start]), np.flatnonzero(gaps[start:])
-    low = occupied[before[-1] + 1] if len(before) else occupied[0]
-    high = occupied[start + after[0]] if len(after) else occupied[-1]
-    ends = np.array([low, high + 1]) * CELL_M
-    beyond = np.maximum(np.array([-half[axis] - ends[0], ends[1] - half[axis]]), 0.0)
-    return Surface(share, float(ends[1] - ends[0]), beyond)
+    gap = np.flatnonzero(np.diff(occupied) > MAX_EMPTY_CELLS + 1)
+    middle = int(np.searchsorted(occupied, own[len(own) // 2]))
+    start = int(gap[gap < middle].max(initial=-1)) + 1
+    end = int(gap[gap >= middle].min(initial=len(occupied) - 1))
+    return Surface(float(on[inside].mean()), float((occupied[end] - occupied[start] + 1) * CELL_M))

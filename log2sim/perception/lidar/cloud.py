@@ -240,9 +240,7 @@ def assemble_cloud(
     return Cloud(stamp, np.asarray(origin, float), xyz, t_s, sensor, ground, height, tuple(sensors))
 
 
-def _follow_sensor(
-    log: Log, name: str, stamp_ns: int, t_s: NDArray[np.float32], origin: Array
-) -> tuple[Array, Array]:
+def _follow_sensor(log: Log, name: str, stamp_ns: int, t_s: NDArray[np.float32], origin: Array) -> tuple[Array, Array]:
     """Follow a LiDAR through times (N,) relative to a stamp: position (3,) at the stamp relative to `origin`, velocity (3,).
 
     The line goes through its places at the first and the last time; without known poses it stands at the origin.

@@ -38,7 +38,7 @@ def sample_rays(cloud: Cloud) -> Rays:
     # Cell and rank in one number: numbers are sorted several times as fast as their places are.
     ordered = np.sort((cell << RANK_BITS) + point)
     kept = ordered[np.flatnonzero(np.diff(ordered >> RANK_BITS, prepend=-1))] & ((1 << RANK_BITS) - 1)
-    sensors = cloud.sensors or (CloudSensor(len(cloud.xyz), cloud.sensor, np.zeros(3)),)
+    sensors = cloud.sensors or (CloudSensor(len(cloud.xyz), cloud.sensor.astype(np.float64), np.zeros(3)),)
     return Rays(
         cloud.xyz[kept],
         cloud.t_s[kept],

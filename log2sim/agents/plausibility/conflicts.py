@@ -1,0 +1,172 @@
+"""Conflicts: agents that are in one place at one time. The less likely one is trimmed, or doubted where that does not help."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.agents.candidate import AgentCandidate
+from log2sim.agents.plausibility.box_table import BoxTable
+from log2sim.datatypes import Agent, Doubt, Waypoints
+from log2sim.geometry import Array, rectangle_overlap
+
+# Boxes that share less than this of the smaller one only touch: their errors.
+TOUCHING = 0.05
+# Boxes that share more are not in one place by their errors alone: 0.3 m of the width of a car that stands beside another.
+IN_ONE_PLACE = 0.15
+# People stand close to each other and to vehicles: less than half of one is in the other's box.
+PERSON_IN_ONE_PLACE = 0.5
+# What is left of a life without its conflicts is kept alone if it is at least this share.
+MIN_KEPT_SHARE = 0.5
+# Fewer ticks are no trajectory.
+MIN_KEPT_TICKS = 2
+# Stamps of ticks and waypoints are the same up to rounding.
+SAME_S = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Conflict:
+    """Two agents in one place.
+
+    Attributes
+    ----------
+    first, second : int
+        Indices of the agents.
+    tick : (n,) intp
+        When.
+    share : (n,) float64
+        Of the smaller box that they share.
+    """
+
+    first: int
+    second: int
+    tick: NDArray[np.intp]
+    share: Array
+
+
+def find_conflicts(boxes: BoxTable, touching: float = TOUCHING) -> list[Conflict]:
+    """Find the pairs of A agents whose boxes share more than `touching` of the smaller one, with the ticks at which they do."""
+    first, second = np.triu_indices(len(boxes.present), 1)
+    radius = np.hypot(boxes.size_m[:, 0], boxes.size_m[:, 1]) / 2
+    low, high = (f(boxes.center_m[..., :2], axis=1) for f in (np.nanmin, np.nanmax))
+    reach = (radius[first] + radius[second])[:, None]
+    meet = ((low[first] - high[second] <= reach) & (low[second] - high[first] <= reach)).all(axis=1)
+    first, second = first[meet], second[meet]
+    apart = np.hypot(*np.moveaxis(boxes.center_m[first, :, :2] - boxes.center_m[second, :, :2], -1, 0))
+    pair, tick = np.nonzero(apart < (radius[first] + radius[second])[:, None])
+    rectangles = [
+        np.column_stack([boxes.center_m[row, tick, :2], boxes.size_m[row, :2], boxes.yaw_rad[row, tick]])
+        for row in (first[pair], second[pair])
+    ]
+    smaller = np.minimum(*(r[:, 2] * r[:, 3] for r in rectangles))
+    share = rectangle_overlap(*rectangles) / smaller
+    over = share > touching
+    pair, tick, share = pair[over], tick[over], share[over]
+    return [
+        Conflict(int(first[p]), int(second[p]), tick[pair == p], share[pair == p]) for p in np.unique(pair).tolist()
+    ]
+
+
+def resolve_conflicts(candidates: Sequence[AgentCandidate], ego: Agent | None, t_s: Array) -> list[AgentCandidate]:
+    """Trim the less likely one of two candidates that are in one place, and drop those that are in the ego all the time.
+
+    Parameters
+    ----------
+    candidates : sequence of AgentCandidate
+        Their `evidence` says which is more likely.
+    ego : Agent, optional
+        It is where it is.
+    t_s : (T,) float64
+        Ticks.
+
+    Notes
+    -----
+    A life is cut to its longest part without a conflict if that is at least `MIN_KEPT_SHARE` of it; otherwise it stays, to be
+    doubted. Nothing of it stays in the ego, at whose place nothing else can be.
+    """
+    agents = [c.agent for c in candidates]
+    evidence = [c.evidence for c in candidates]
+    if ego is not None:
+        agents, evidence = [*agents, ego], [*evidence, np.inf]
+    boxes = BoxTable.of(agents, t_s)
+    alive = boxes.present.copy()
+    for conflict in sorted(find_conflicts(boxes), key=lambda c: -max(evidence[c.first], evidence[c.second])):
+        of_ego = ego is not None and conflict.second == len(candidates)
+        stronger, weaker = conflict.first, conflict.second
+        if evidence[weaker] > evidence[stronger]:
+            stronger, weaker = weaker, stronger
+        limit = TOUCHING if of_ego else _in_one_place(agents[stronger], agents[weaker])
+        over = conflict.tick[conflict.share > limit]
+        over = over[alive[stronger, over]]
+        left = alive[weaker].copy()
+        left[over] = False
+        left = _longest_run(left)
+        if of_ego or left.sum() >= MIN_KEPT_SHARE * alive[weaker].sum():
+            alive[weaker] = left
+    kept = [k for k in range(len(candidates)) if alive[k].sum() >= MIN_KEPT_TICKS or not boxes.present[k].any()]
+    return [_cut(candidates[k], t_s, boxes.present[k], alive[k]) for k in kept]
+
+
+def _in_one_place(a: Agent, b: Agent) -> float:
+    """Return the share of the smaller box from which on two agents are in one place."""
+    return PERSON_IN_ONE_PLACE if "pedestrian" in (a.category, b.category) else IN_ONE_PLACE
+
+
+def _longest_run(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Keep only the longest run of a mask (T,), the first of several; gaps of absence end it."""
+    edges = np.flatnonzero(np.diff(np.r_[False, mask, False]))
+    out = np.zeros_like(mask)
+    if len(edges):
+        k = int(np.argmax(edges[1::2] - edges[::2]))
+        out[edges[2 * k] : edges[2 * k + 1]] = True
+    return out
+
+
+def _cut(candidate: AgentCandidate, t_s: Array, present: NDArray[np.bool_], alive: NDArray[np.bool_]) -> AgentCandidate:
+    """Return a candidate at the ticks (T,) at which it is alive, out of those at which it is present."""
+    if (alive == present).all():
+        return candidate
+    first_s, last_s = t_s[alive][[0, -1]]
+    agent, w = candidate.agent, candidate.agent.waypoints
+    return replace(candidate, agent=replace(agent, waypoints=_during(agent, w, float(first_s), float(last_s))))
+
+
+def _during(agent: Agent, w: Waypoints, first_s: float, last_s: float) -> Waypoints:
+    """Take the waypoints from a first to a last time; those of a static agent stand at its ends."""
+    if agent.static:
+        ends = w.take(np.array([0, len(w) - 1])[: 1 + (last_s > first_s)])
+        return replace(ends, t_s=np.array([first_s, last_s])[: len(ends)])
+    return w.take((w.t_s >= first_s - SAME_S) & (w.t_s <= last_s + SAME_S))
+
+
+def conflict_doubts(candidates: Sequence[AgentCandidate], ego: Agent | None, t_s: Array) -> list[list[Doubt]]:
+    """Doubt the less likely one of two named candidates that are in one place, and who touches the ego, while they do so.
+
+    Returns a list for each candidate.
+    """
+    agents = [c.agent for c in candidates] + ([ego] if ego is not None else [])
+    doubts: list[list[Doubt]] = [[] for _ in agents]
+    for conflict in find_conflicts(BoxTable.of(agents, t_s), touching=0.0):
+        a, b = conflict.first, conflict.second
+        if b == len(candidates):
+            doubts[a].append(_doubt(conflict, t_s, "in_ego", "touches the ego", agents[a]))
+        elif conflict.share.max() > _in_one_place(agents[a], agents[b]):
+            weaker, other = (a, b) if candidates[a].evidence <= candidates[b].evidence else (b, a)
+            words = "stands in" if agents[a].static and agents[b].static else "passes through"
+            doubts[weaker].append(
+                _doubt(conflict, t_s, "passes_through", f"{words} {agents[other].id}", agents[weaker])
+            )
+    return doubts[: len(candidates)]
+
+
+def _doubt(conflict: Conflict, t_s: Array, flag: str, words: str, agent: Agent) -> Doubt:
+    """Make a doubt that holds during a conflict, of the whole life where it always holds."""
+    worst_s, first_s, last_s = (
+        float(t_s[k]) for k in (conflict.tick[conflict.share.argmax()], conflict.tick[0], conflict.tick[-1])
+    )
+    if first_s <= agent.waypoints.t_s[0] + SAME_S and last_s >= agent.waypoints.t_s[-1] - SAME_S:
+        return Doubt(flag, words)
+    return Doubt(flag, f"{words} at {worst_s:.1f} s", first_s, last_s)

@@ -1,0 +1,38 @@
+"""What the points of the LiDAR say about an agent."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Support:
+    """Rays toward the solid part of an agent over its life, and the surfaces that its points are on.
+
+    Attributes
+    ----------
+    inside, through, before : int
+        Rays that end at the agent, that go on behind it, and that end before it.
+    decided_ticks : int
+        Ticks with enough rays inside or through to decide.
+    empty_ticks : int
+        Those of them at which most rays go through.
+    in_structure : float
+        Share of the searched ticks at which its points are part of something longer than itself.
+    hidden : bool
+        Whether the LiDAR looks toward it and no ray ever reaches any part of it.
+    """
+
+    inside: int = 0
+    through: int = 0
+    before: int = 0
+    decided_ticks: int = 0
+    empty_ticks: int = 0
+    in_structure: float = 0.0
+    hidden: bool = False
+
+    @property
+    def through_share(self) -> float | None:
+        """Share of the rays that met its place and went through; None without any."""
+        met = self.inside + self.through
+        return self.through / met if met else None

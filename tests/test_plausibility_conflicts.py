@@ -1,0 +1,133 @@
+"""Agents in one place at one time: the less likely one is cut to what is possible, or doubted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_overlap import agent, candidate
+
+from log2sim.agents.naming import name_agents
+from log2sim.agents.plausibility.box_table import BoxTable
+from log2sim.agents.plausibility.conflicts import conflict_doubts, find_conflicts, resolve_conflicts
+
+T = np.linspace(0.0, 4.0, 5)
+
+
+def passing(y_m):
+    """A car that comes from behind, 10 m in 4 s."""
+    return agent(-10.0, y_m, speed=2.5)
+
+
+def backward(built):
+    return replace(built, waypoints=replace(built.waypoints, x_m=built.waypoints.x_m[::-1]))
+
+
+def judged(*built, ego=None):
+    """What is left of agents with their evidence, with doubts."""
+    named = name_agents(resolve_conflicts([candidate(a, e) for a, e in built], ego, T))
+    return list(zip([c.agent for c in named], conflict_doubts(named, ego, T)))
+
+
+def test_overlaps_have_the_shares_of_exact_rectangles() -> None:
+    # 4.4 m long: 2.2 m apart they share half; crossed at right angles a square of 1.8 m.
+    (half, crossed) = find_conflicts(
+        BoxTable.of([agent(0.0), agent(2.2), agent(-50.0), agent(0.0, -50.0), agent(-50.0, yaw=np.pi / 2)], T)
+    )
+    assert (half.first, half.second, half.tick.tolist()) == (0, 1, [0, 1, 2, 3, 4])
+    assert half.share == pytest.approx(0.5)
+    assert (crossed.first, crossed.second) == (2, 4)
+    assert crossed.share == pytest.approx(1.8 / 4.4)
+
+
+def test_agents_of_other_times_or_places_have_no_conflict() -> None:
+    assert find_conflicts(BoxTable.of([agent(0.0, t=(0.0, 1.9)), agent(0.0, t=(2.0, 4.0)), agent(4.5)], T)) == []
+
+
+def test_a_way_that_ends_in_the_ego_is_cut_where_it_enters() -> None:
+    ego = agent(0.0)
+    # Both are 4.4 m long: they meet when the centers are that far apart, at 2.24 s; waypoints stand every second.
+    ((cut, doubts),) = judged((passing(0.3), 9.0), ego=ego)
+    assert cut.waypoints.t_s.tolist() == [0.0, 1.0, 2.0]
+    assert cut.waypoints.x_m.tolist() == [-10.0, -7.5, -5.0]
+    assert doubts == []
+    ((late, _),) = judged((backward(passing(0.3)), 9.0), ego=ego)
+    assert late.waypoints.t_s.tolist() == [2.0, 3.0, 4.0]
+
+
+def test_nobody_drives_through_the_ego() -> None:
+    through = agent(-10.0, 0.2, speed=9.0)
+    ((cut, _),) = judged((through, 1e6), ego=agent(0.0))
+    boxes = BoxTable.of([cut, agent(0.0)], T)
+    assert find_conflicts(boxes) == []
+    assert cut.waypoints.t_s.tolist() == [2.0, 3.0, 4.0]
+
+
+def test_what_is_in_the_ego_all_the_time_is_dropped() -> None:
+    assert judged((agent(1.0, 0.5, yaw=0.7), 50.0), ego=agent(0.0)) == []
+
+
+@pytest.mark.parametrize("y_m", [1.85, -2.5])
+def test_who_passes_beside_the_ego_keeps_the_whole_way(y_m) -> None:
+    ((kept, doubts),) = judged((passing(y_m), 1.0), ego=agent(0.0))
+    assert kept.waypoints.t_s.tolist() == T.tolist()
+    assert doubts == []
+
+
+def test_who_touches_the_ego_is_doubted_only_then() -> None:
+    # 1.8 m wide: they share 2 cm of it, 1.1 % of the box, where they are beside each other.
+    beside = agent(-10.0, 1.78, speed=2.5)
+    ((kept, (doubt,)),) = judged((beside, 1.0), ego=agent(0.0))
+    assert len(kept.waypoints) == 5
+    assert (doubt.flag, doubt.reason, doubt.start_s, doubt.end_s) == ("in_ego", "touches the ego at 4.0 s", 3.0, 4.0)
+
+
+def test_a_static_agent_is_gone_when_the_ego_stands_in_its_place() -> None:
+    parked = replace(agent(3.0), static=True)
+    arriving = agent(-8.0, speed=2.5)
+    ((cut, _),) = judged((parked, 9.0), ego=arriving)
+    # The ego reaches 3 m from its center, 1.4 m of contact, between 2 and 3 s.
+    assert cut.waypoints.t_s.tolist() == [0.0, 2.0]
+    assert cut.waypoints.x_m.tolist() == [3.0, 3.0]
+
+
+def test_without_an_ego_nothing_is_cut() -> None:
+    ((kept, doubts),) = judged((passing(0.0), 1.0))
+    assert len(kept.waypoints) == 5
+    assert doubts == []
+
+
+def test_of_two_that_meet_at_an_end_the_less_likely_one_ends_before() -> None:
+    standing = agent(0.0)
+    for evidence, ends in (((9.0, 1.0), 2.0), ((1.0, 9.0), 4.0)):
+        found = {a.waypoints.speed_mps[0]: a for a, _ in judged((standing, evidence[0]), (passing(0.3), evidence[1]))}
+        assert found[2.5].waypoints.t_s[-1] == ends
+
+
+def test_who_drives_through_the_middle_of_another_is_doubted_by_name_and_time() -> None:
+    standing = agent(0.0)
+    through = agent(-6.0, speed=3.0)
+    found = {a.waypoints.speed_mps[0]: (a, d) for a, d in judged((standing, 9.0), (through, 1.0))}
+    assert found[0.0][1] == []
+    kept, (doubt,) = found[3.0]
+    assert len(kept.waypoints) == 5
+    assert (doubt.flag, doubt.reason, doubt.start_s, doubt.end_s) == (
+        "passes_through",
+        "passes through car-2 at 2.0 s",
+        1.0,
+        3.0,
+    )
+
+
+def test_two_that_stand_in_each_other_have_one_doubt_of_the_whole_life() -> None:
+    pair = replace(agent(0.0), static=True), replace(agent(3.5), static=True)
+    found = judged((pair[0], 9.0), (pair[1], 1.0))
+    ((doubt,),) = [d for _, d in found if d]
+    assert (doubt.reason, doubt.start_s) == ("stands in car-1", None)
+
+
+def test_people_beside_each_other_and_beside_a_car_are_not_in_one_place() -> None:
+    body = (0.7, 0.7, 1.75)
+    people = [agent(x, 0.95, category="pedestrian", size=body) for x in (0.0, 0.45)]
+    assert all(doubts == [] for _, doubts in judged((agent(0.0), 9.0), *((p, 1.0) for p in people)))

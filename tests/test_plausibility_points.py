@@ -1,0 +1,179 @@
+"""What the points of the LiDAR say about agents: rays that end in them, pass through or stop before, and long surfaces."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_overlap import agent, candidate
+
+from log2sim.agents.candidate import Timeline
+from log2sim.agents.plausibility.free_space import Ending, classify_rays, count_rays
+from log2sim.agents.plausibility.points import contradict, is_refuted
+from log2sim.agents.plausibility.structure import find_surface, structure_shares
+from log2sim.agents.support import Support
+from log2sim.datatypes import Obstacles, Rays
+from log2sim.geometry import NS_PER_S
+
+SENSOR = np.array([0.0, 0.0, 1.9])
+CAR = (4.4, 1.8, 1.5)
+ORIGIN = np.array([4e5, 5e6, 30.0])
+TIMELINE = Timeline(np.arange(5) * NS_PER_S, 0)
+
+
+def classify(start, end, yaw=0.0, size=CAR):
+    """The ending of one ray about a box whose center is the origin."""
+    start, end = np.array([start], dtype=float), np.array([end], dtype=float)
+    return Ending(classify_rays(start, end - start, np.array([yaw]), np.array([size]))[0])
+
+
+@pytest.mark.parametrize(
+    ("end_x_m", "ending"),
+    # The near side is at -2.2 m, the solid part starts 0.3 m behind it; the far side is at 2.2 m.
+    [(-5.0, Ending.BEFORE), (-2.2, Ending.INSIDE), (0.0, Ending.INSIDE), (2.2, Ending.INSIDE), (8.0, Ending.THROUGH)],
+)
+def test_a_ray_ends_before_in_or_behind_a_box(end_x_m, ending) -> None:
+    assert classify((-20.0, 0.0, -0.2), (end_x_m, 0.0, -0.2)) is ending
+
+
+def test_rays_over_under_beside_and_through_windows_do_not_count() -> None:
+    # The solid part is from 25 to 55 % of 1.5 m, so from -0.375 to 0.075 m about the center.
+    for z in (-0.45, 0.15, 0.7):
+        assert classify((-20.0, 0.0, z), (8.0, 0.0, z)) is Ending.ELSEWHERE
+    assert classify((-20.0, 0.8, -0.2), (8.0, 0.8, -0.2)) is Ending.ELSEWHERE
+    assert classify((20.0, 0.0, -0.2), (30.0, 0.0, -0.2)) is Ending.ELSEWHERE
+
+
+def test_endings_turn_and_shift_with_the_box() -> None:
+    rng = np.random.default_rng(2)
+    start, to = rng.uniform(-12, 12, (4000, 3)) * [1, 1, 0.1], rng.uniform(-20, 20, (4000, 3)) * [1, 1, 0.02]
+    size, yaw = np.tile(CAR, (4000, 1)), rng.uniform(-3, 3, 4000)
+    at_zero = classify_rays(start, to, np.zeros(4000), size)
+    c, s = np.cos(yaw), np.sin(yaw)
+    turned = [np.column_stack([c * v[:, 0] - s * v[:, 1], s * v[:, 0] + c * v[:, 1], v[:, 2]]) for v in (start, to)]
+    assert np.array_equal(classify_rays(*turned, yaw, size), at_zero)
+    assert {Ending.INSIDE, Ending.THROUGH, Ending.BEFORE, Ending.ELSEWHERE} == set(at_zero)
+
+
+def fan(wall_x_m, *, things=(), t_s=0.0):
+    """Rays every 0.5 degrees from `SENSOR` to upright rectangles at x with y from and to, else a wall, else the flat ground."""
+    azimuth, slope = (np.deg2rad(a).ravel() for a in np.meshgrid(np.arange(-60, 60.1, 0.5), np.arange(-15, 2.1, 0.5)))
+    slope = np.tan(slope)
+    reach = np.full(len(azimuth), wall_x_m) / np.cos(azimuth)
+    reach = np.where(slope < 0, np.minimum(reach, SENSOR[2] / np.maximum(-slope, 1e-9)), reach)
+    for x, y0, y1, top in things:
+        at = x / np.cos(azimuth)
+        y, z = at * np.sin(azimuth), SENSOR[2] + slope * at
+        reach = np.where((y > y0) & (y < y1) & (z > 0) & (z < top) & (at < reach), at, reach)
+    end = np.column_stack([reach * np.cos(azimuth), reach * np.sin(azimuth), SENSOR[2] + slope * reach])
+    n = len(end)
+    rays = Rays(
+        end.astype(np.float32), np.full(n, t_s, np.float32), np.zeros(n, np.uint8),
+        SENSOR[None].astype(np.float32), np.zeros((1, 3), np.float32),
+    )  # fmt: skip
+    return Obstacles(0, ORIGIN, end[:0].astype(np.float32), rays.t_s[:0], SENSOR.astype(np.float32), rays)
+
+
+def over_map(built):
+    w = built.waypoints
+    return replace(built, waypoints=replace(w, x_m=w.x_m + ORIGIN[0], y_m=w.y_m + ORIGIN[1], z_m=w.z_m * 0 + 30.75))
+
+
+def clouds(cloud):
+    return [replace(cloud, stamp_ns=int(t)) for t in TIMELINE.t_ns]
+
+
+def counted(built, cloud):
+    counts = count_rays([over_map(built)], clouds(cloud), TIMELINE)
+    return [int(v.sum()) // 5 for v in (counts.inside, counts.through, counts.before)]
+
+
+def test_rays_that_go_on_to_ground_and_wall_behind_say_that_a_place_is_empty() -> None:
+    inside, through, before = counted(agent(12.0), fan(40.0))
+    assert (inside, before) == (0, 0)
+    # They descend by 5.5 to 7 degrees from 1.9 m to 0.4 and 0.8 m, over 5 degrees of azimuth: 3 times 10 rays.
+    assert through >= 20
+
+
+def test_rays_that_end_at_the_back_of_a_car_support_it() -> None:
+    inside, through, before = counted(agent(12.0), fan(40.0, things=[(9.8, -0.9, 0.9, 1.5)]))
+    assert inside >= 20
+    assert (through, before) == (0, 0)
+
+
+def test_rays_that_end_at_a_van_in_front_say_nothing() -> None:
+    inside, through, before = counted(agent(20.0), fan(40.0, things=[(9.8, -3.0, 3.0, 2.5)]))
+    assert (inside, through) == (0, 0)
+    assert before > 10
+
+
+def test_a_box_behind_the_sensor_is_seen_across_the_seam_of_the_azimuths() -> None:
+    ahead = fan(40.0)
+    turned = replace(ahead, free=replace(ahead.free, end=ahead.free.end * np.array([-1, -1, 1], np.float32)))
+    assert counted(agent(-12.0), turned) == pytest.approx(counted(agent(12.0), ahead), rel=0.2)
+
+
+def test_moving_agents_are_where_they_are_at_the_time_of_a_ray() -> None:
+    # At 20 m/s the car is 2 m farther 0.1 s after the stamp of the cloud.
+    drives = over_map(replace(agent(10.0), waypoints=agent(10.0, speed=20.0).waypoints))
+    late = fan(60.0, things=[(9.8, -0.9, 0.9, 1.5)], t_s=0.1)
+    counts = count_rays([drives], [late, None, None, None, None], TIMELINE)
+    assert counts.inside[0, 0] >= 5
+    assert counts.through[0, 0] == 0
+
+
+@pytest.mark.parametrize(
+    ("category", "share", "doubted"), [("car", 0.2, 0), ("car", 0.45, 1), ("cyclist", 0.45, 0), ("cyclist", 0.9, 1)]
+)
+def test_doubt_begins_where_no_true_agent_is(category, share, doubted) -> None:
+    support = Support(inside=round(1000 * (1 - share)), through=round(1000 * share), decided_ticks=9)
+    judged = replace(candidate(agent(5.0, category=category)), support=support)
+    assert len(contradict(judged)) == doubted
+    assert not is_refuted(judged)
+
+
+def test_an_agent_whose_place_is_empty_most_of_its_life_is_refuted() -> None:
+    support = Support(inside=10, through=90, decided_ticks=9, empty_ticks=8)
+    assert is_refuted(replace(candidate(agent(5.0)), support=support))
+    assert not is_refuted(replace(candidate(agent(5.0)), support=replace(support, empty_ticks=2)))
+
+
+def face(length_m, y_m=-0.9, x_m=0.0, step_m=0.1):
+    """Points along a surface of a length about x, three high."""
+    x = np.arange(-length_m / 2, length_m / 2, step_m) + x_m
+    return np.column_stack([np.tile(x, 3), np.full(3 * len(x), y_m)])
+
+
+BELOW = np.array([0.0, -10.0])
+
+
+def test_the_side_of_a_car_is_as_long_as_the_car_and_that_of_a_wall_longer() -> None:
+    size = np.array(CAR[:2])
+    assert find_surface(face(4.4), size, BELOW).length_m == pytest.approx(4.4, abs=0.3)
+    assert find_surface(face(12.0), size, BELOW).length_m == pytest.approx(12.0, abs=0.3)
+    # At 8 degrees to the box.
+    c, s = np.cos(0.14), np.sin(0.14)
+    turned = (face(12.0, y_m=0.0) @ np.array([[c, s], [-s, c]])) + [0, -0.7]
+    assert find_surface(turned, size, BELOW).length_m == pytest.approx(12.0 * c, abs=0.5)
+
+
+def test_a_row_of_parked_cars_is_no_wall() -> None:
+    row = np.concatenate([face(4.4, x_m=x) for x in (-5.2, 0.0, 5.2)])
+    assert find_surface(row, np.array(CAR[:2]), BELOW).length_m < 5.0
+
+
+def test_two_sides_of_a_car_are_not_one_surface() -> None:
+    side, back = face(4.4), face(1.8)[:, ::-1] + [-1.3, 0.0]
+    corner = np.concatenate([side, back, back])
+    assert find_surface(corner, np.array(CAR[:2]), BELOW).share < 0.75
+
+
+@pytest.mark.parametrize(("length_m", "share"), [(4.4, 0.0), (5.9, 0.0), (12.0, 1.0)])
+def test_a_car_on_the_face_of_a_wall_is_in_a_structure(length_m, share) -> None:
+    xy = face(length_m, x_m=10.0, y_m=5.0 - 0.9)
+    xyz = np.column_stack([xy, np.repeat([0.4, 0.8, 1.2], len(xy) // 3)]).astype(np.float32)
+    cloud = Obstacles(0, ORIGIN, xyz, np.zeros(len(xyz), np.float32), SENSOR.astype(np.float32))
+    built = [over_map(agent(10.0, 5.0)), over_map(agent(10.0, 5.0, category="pedestrian"))]
+    assert structure_shares(built, clouds(cloud), TIMELINE).tolist() == [share, 0.0]
+    assert is_refuted(replace(candidate(built[0]), support=Support(in_structure=share))) is bool(share)
