@@ -18,7 +18,7 @@ import pytest
 from browser import CHROMIUM, DRIVER, Browser, browsing
 from command_line import names, run
 
-from log2sim.datatypes import Agent, Scenario, Waypoints
+from log2sim.datatypes import Agent, Doubt, Scenario, Waypoints
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array, box_corners_bev, wrap_angle
 from log2sim.simulation.runner import replay
@@ -85,7 +85,7 @@ def test_the_document_holds_every_layer() -> None:
     scenario = Scenario.load(TRUTH)
     replayed = replay(scenario, dt_s=0.1)
     document = page_document(scenario, truth=scenario, replay=replayed)
-    assert {k: len(v) for k, v in document["layers"].items()} == {"log": 12, "truth": 12, "replay": 12}
+    assert {k: len(v) for k, v in document["layers"].items()} == {"scenario": 12, "truth": 12, "replay": 12}
     assert document["end_s"] == scenario.duration_s
     entry = next(e for e in document["layers"]["replay"] if e["id"] == "car_turning")
     summed = np.cumsum(np.cumsum(entry["x_m"])) / SCALES["x_m"]
@@ -94,7 +94,7 @@ def test_the_document_holds_every_layer() -> None:
 
 def test_agents_have_the_colors_of_the_pictures() -> None:
     scenario = Scenario.load(TRUTH)
-    entries = {e["id"]: e for e in page_document(scenario)["layers"]["log"]}
+    entries = {e["id"]: e for e in page_document(scenario)["layers"]["scenario"]}
     roles = assign_roles(scenario)
     assert list(entries) == [r.agent.id for r in roles.movers] + [a.id for a in roles.stationary]
     for role in roles.movers[1:]:
@@ -131,7 +131,7 @@ def test_the_page_asks_for_nothing_from_outside() -> None:
 
 def test_names_in_a_scenario_cannot_become_part_of_the_page() -> None:
     document = {**page_document(made(agent(EVIL, np.arange(5.0), 0.0), name=EVIL)), "scales": SCALES}
-    parts, usual = (Parts(html_of(d)) for d in (document, {**document, "name": "x", "layers": {"log": []}}))
+    parts, usual = (Parts(html_of(d)) for d in (document, {**document, "name": "x", "layers": {"scenario": []}}))
     assert [tag for tag, _ in parts.tags] == [tag for tag, _ in usual.tags]
     data = next(text for tag, text in parts.texts if tag == "script")
     assert json.loads(data) == document
@@ -295,10 +295,104 @@ def test_what_nobody_observed_is_pale(browser: Browser, tmp_path: Path) -> None:
     opened(browser, page, "#t=0.5&agent=ego")
     behind = np.array([-1.2, 0.6]) * browser.run("return log2sim.pixelsPerMeter")
     assert pixel(browser, place_of(browser, "ego") + behind) == rgb(style.INK)
-    assert text_of(browser, "agent-now").endswith("yes")
+    assert "Observedyes" in text_of(browser, "agent-now")
     browser.run("log2sim.time = 1.5")
     assert min(pixel(browser, place_of(browser, "ego") + behind)) > 150
-    assert text_of(browser, "agent-now").endswith("no, interpolated")
+    assert "Observedno, interpolated" in text_of(browser, "agent-now")
+
+
+def doubtful_scene() -> Scenario:
+    """A car that is doubtful from 1 to 2 s, a parked one all the time, one of low confidence and one without a doubt."""
+    car, unsure, sure = (
+        agent(name, np.linspace(0, 8, 5), y) for name, y in (("car", 6.0), ("unsure", 12.0), ("sure", 18.0))
+    )
+    waypoints = replace(
+        car.waypoints,
+        sigma_xy_m=np.linspace(0.1, 0.5, 5),
+        sigma_yaw_rad=np.full(5, 0.1),
+        sigma_speed_mps=np.full(5, 0.3),
+    )
+    quality = {"points_median": 40.4, "detections": 20, "without_lidar": 2, "lidar_only": 1}
+    through = Doubt("passes_through", "passes through parked at 1.2 s", 1.0, 2.0)
+    car = replace(car, waypoints=waypoints, quality=quality, doubts=(through,), confidence=0.93)
+    parked = replace(
+        agent("parked", np.full(2, 20.0), 0.0, static=True), doubts=(Doubt("empty", "rays pass through it"),)
+    )
+    return made(agent("ego", np.linspace(0, 20, 5), 0.0), car, replace(unsure, confidence=0.3), sure, parked)
+
+
+def striped(browser: Browser, id: str) -> list[tuple[int, ...]]:
+    """Colors along the middle line of an agent that heads east, behind its heading mark."""
+    scale = browser.run("return log2sim.pixelsPerMeter")
+    script = """const [x, y, width, done] = arguments;
+        requestAnimationFrame(() => requestAnimationFrame(() => {
+            const pen = new OffscreenCanvas(width, 1).getContext("2d", {willReadFrequently: true});
+            pen.drawImage(document.getElementById("map"), -Math.round(x), -Math.round(y));
+            done([...pen.getImageData(0, 0, width, 1).data]);
+        }));"""
+    x, y = place_of(browser, id)
+    row = browser.run_async(script, x - 1.8 * scale, y, int(1.6 * scale))
+    return sorted({tuple(row[k : k + 3]) for k in range(0, len(row), 4)}, key=sum)
+
+
+def test_doubtful_agents_are_hatched_while_the_doubt_holds(browser: Browser, tmp_path: Path) -> None:
+    write_page(doubtful_scene(), tmp_path / "page.html")
+    opened(browser, tmp_path / "page.html", "#t=0.5")
+    plain = {id: len(striped(browser, id)) for id in ("car", "sure", "unsure", "parked")}
+    assert plain["car"] == plain["sure"] == 1
+    assert min(plain["unsure"], plain["parked"]) > 1  # all the time
+    browser.run("log2sim.time = 1.5")
+    assert len(striped(browser, "car")) > 1
+    assert min(striped(browser, "car")[-1]) > 200  # stripes of the color of the paper
+    assert len(striped(browser, "sure")) == 1
+    browser.run("log2sim.time = 2.5")
+    assert len(striped(browser, "car")) == 1
+
+
+def test_stripes_are_dark_on_a_dark_page(browser: Browser, tmp_path: Path) -> None:
+    write_page(doubtful_scene(), tmp_path / "page.html")
+    opened(browser, tmp_path / "page.html", "#t=1.5", dark=True)
+    assert max(striped(browser, "car")[0]) < 80
+
+
+def test_the_panel_says_how_far_an_agent_can_be_trusted(browser: Browser, tmp_path: Path) -> None:
+    write_page(doubtful_scene(), tmp_path / "page.html")
+    opened(browser, tmp_path / "page.html", "#t=0.5&agent=car")
+    pixel(browser, np.zeros(2))
+    said = text_of(browser, "agent-now")
+    for part in (
+        "Sigma0.15 m · 5.7° · 0.30 m/s", "Confidence0.93", "LiDAR40 points in a sweep",
+        "Source20 detections, 2 of them placed by camera, 1 more by LiDAR alone",
+    ):  # fmt: skip
+        assert part in said
+    assert text_of(browser, "agent-doubts") == "passes through parked at 1.2 s (1.0 to 2.0 s)"
+    holds = "return document.getElementById('agent-doubts').classList.contains('holds')"
+    assert not browser.run(holds)
+    browser.run("log2sim.time = 1.5")
+    pixel(browser, np.zeros(2))
+    assert browser.run(holds)
+    browser.run("log2sim.choose('unsure')")
+    assert text_of(browser, "agent-doubts") == "confidence 0.30"
+    browser.run("log2sim.choose('sure')")
+    assert text_of(browser, "agent-doubts") == ""
+    shown = "return [...document.querySelectorAll('#agent-now dt')].filter((d) => !d.hidden).map((d) => d.textContent)"
+    assert browser.run(shown) == ["Heading", "Position", "Observed", "Confidence"]  # nobody knows the rest
+
+
+def test_doubtful_agents_are_listed_and_visited(browser: Browser, tmp_path: Path) -> None:
+    write_page(doubtful_scene(), tmp_path / "page.html")
+    opened(browser, tmp_path / "page.html")
+    assert text_of(browser, "doubtful-count") == "3 doubtful agents"
+    assert "3 doubtful" in text_of(browser, "summary")
+    rows = browser.run("return [...document.querySelectorAll('#doubtful-agents button')].map((b) => b.textContent)")
+    assert rows == [
+        "car: passes through parked at 1.2 s", "unsure: confidence 0.30", "parked: rays pass through it",
+    ]  # fmt: skip
+    browser.run("document.querySelector('#doubtful-agents button').click()")
+    assert (time_of(browser), browser.run("return log2sim.chosen")) == (1.0, "car")
+    (tmp_path / "clean").mkdir()
+    opened(browser, page_with(tmp_path / "clean", agent("car", np.arange(5.0), 0.0)))
+    assert browser.run("return document.getElementById('doubtful').hidden")
 
 
 def test_a_click_on_an_agent_shows_its_panel(browser: Browser, sample: Path) -> None:
@@ -364,8 +458,8 @@ def test_the_keyboard_does_everything(browser: Browser, sample: Path) -> None:
     assert browser.run("return log2sim.pixelsPerMeter") == pytest.approx(scale)
     browser.press(">", ">", "<")
     assert text_of(browser, "rate") == "2×"
-    browser.press("t", "r", "d", "w", "l")
-    assert [pressed(browser, f"layer-{k}") for k in ("truth", "replay", "log", "trails", "names")] == [False] * 5
+    browser.press("t", "r", "s", "w", "l")
+    assert [pressed(browser, f"layer-{k}") for k in ("truth", "replay", "scenario", "trails", "names")] == [False] * 5
     browser.press("t")
     assert pressed(browser, "layer-truth")
     browser.press("n")
@@ -451,16 +545,16 @@ def test_layers_come_and_go(browser: Browser, sample: Path) -> None:
     behind = np.array([-1.5, 0.0]) * browser.run("return log2sim.pixelsPerMeter")
     place = place_of(browser, "ego") + behind
     assert pixel(browser, place) == rgb(style.INK)
-    browser.press("d", "t", "r")
+    browser.press("s", "t", "r")
     assert pixel(browser, place) == (251, 252, 253)
-    browser.press("d")
+    browser.press("s")
     assert pixel(browser, place) == rgb(style.INK)
 
 
 def test_a_layer_that_is_not_there_has_no_button(browser: Browser, tmp_path: Path) -> None:
     opened(browser, page_with(tmp_path, agent("car", np.arange(5.0), 0.0)))
     assert browser.run("return [...document.querySelectorAll('#layers button')].map((b) => b.textContent)") == [
-        "Log", "Trails", "Names",
+        "Scenario", "Trails", "Names",
     ]  # fmt: skip
     browser.press("t", "r", "f")
     assert not pressed(browser, "follow")  # there is nobody to follow
@@ -471,13 +565,13 @@ def test_collisions_of_the_replay_are_marked_and_visited(browser: Browser, tmp_p
     replayed = replay(scenario, mode="exact", dt_s=0.1)
     (event,) = replayed.metrics["collisions"]  # both at 10 m after 2 s, bumpers 0.4 s before
     assert (event["t_s"], event["until_s"]) == pytest.approx((1.6, 2.4), abs=0.06)
-    later = {**event, "t_s": 3.0, "until_s": 3.1, "agents": ["car"], "in_log": False}
+    later = {**event, "t_s": 3.0, "until_s": 3.1, "agents": ["car"], "belongs_to": "replay"}
     metrics = {**replayed.metrics, "collisions": [event, later]}
     write_page(scenario, tmp_path / "page.html", replay=replace(replayed, metrics=metrics))
     opened(browser, tmp_path / "page.html")
     marks = browser.run("return [...document.querySelectorAll('#events button')].map((b) => [b.className, b.title])")
     assert marks == [
-        ["known", f"ego and car collide at {event['t_s']:.2f} s, in the log too"], ["new", "car collide at 3.00 s"],
+        ["known", f"ego and car collide at {event['t_s']:.2f} s, in the scenario itself"], ["new", "car collide at 3.00 s"],
     ]  # fmt: skip
     browser.press("e")
     assert time_of(browser) == pytest.approx(event["t_s"], abs=1e-4)
@@ -500,18 +594,19 @@ def test_a_truth_that_starts_earlier_stands_at_the_same_moments() -> None:
     truth = Scenario.load(TRUTH)
     later = replace(truth, t0_ns=truth.t0_ns + 50_000_000)
     document = page_document(later, truth=truth)
-    log, known = (next(e for e in document["layers"][k] if e["id"] == "ego") for k in ("log", "truth"))
-    first = [e["t_s"][0] / SCALES["t_s"] for e in (log, known)]
+    own, known = (next(e for e in document["layers"][k] if e["id"] == "ego") for k in ("scenario", "truth"))
+    first = [e["t_s"][0] / SCALES["t_s"] for e in (own, known)]
     assert first[1] - first[0] == pytest.approx(-0.05)
     assert document["begin_s"] == 0.0
 
 
 def test_plots_show_how_far_truth_and_replay_are(browser: Browser, tmp_path: Path) -> None:
     ways = {
-        name: agent("ego", np.linspace(0, 20, 5), y) for name, y in (("log", 0.0), ("truth", 0.25), ("replay", -1.5))
+        name: agent("ego", np.linspace(0, 20, 5), y)
+        for name, y in (("scenario", 0.0), ("truth", 0.25), ("replay", -1.5))
     }
     layers = {"truth": made(ways["truth"]), "replay": replay(made(ways["replay"]), mode="exact", dt_s=0.1)}
-    write_page(made(ways["log"]), tmp_path / "page.html", **layers)
+    write_page(made(ways["scenario"]), tmp_path / "page.html", **layers)
     opened(browser, tmp_path / "page.html", "#t=1.7&agent=ego")
     pixel(browser, np.zeros(2))
     shown = "return [...document.querySelectorAll('figure')].map((f) => f.hidden ? null : f.querySelector('output').textContent)"

@@ -20,20 +20,29 @@ const distanceOf = (a, b) => Math.hypot(a.px - b.px, a.py - b.py);
 
 const fixed = (value, digits) => value.toFixed(digits).replace("-", "−");
 
+const seconds = (t, otherwise) => (t ?? otherwise).toFixed(1);
+
+// Set the text of a row of the panel, or hide the row where there is none.
+const fill = (value, text) => {
+  value.textContent = text;
+  value.hidden = value.previousElementSibling.hidden = text === "";
+};
+
 class Details {
   // seek: called with a time when a plot is clicked.
   constructor(data, seek) {
     this.data = data;
     this.track = this.truth = this.replay = null;
-    this.ego = data.layers.log.find((track) => track.ego) ?? null;
+    this.ego = data.layers.scenario.find((track) => track.ego) ?? null;
     const others = ["truth", "replay"].filter((layer) => data.layers[layer]).join(" and ");
     const charts = [["Speed (m/s)", 1], ["Distance to ego (m)", 1], [`From ${others} (m)`, 0.1]];
     [this.speed, this.distance, this.error] = charts.map(([title, minSpan]) => new Chart(byId("charts"), title, minSpan, data, seek));
-    [this.heading, this.position, this.observed] = ["Heading", "Position", "Observed"].map((name) => {
+    const rows = ["Heading", "Position", "Sigma", "Observed", "Confidence", "LiDAR", "Source"].map((name) => {
       const value = element("dd");
       byId("agent-now").append(element("dt", {}, name), value);
       return value;
     });
+    [this.heading, this.position, this.sigma, this.observed, this.confidence, this.points, this.source] = rows;
   }
 
   choose(track) {
@@ -53,6 +62,7 @@ class Details {
     const size = `${track.length.toFixed(1)} × ${track.width.toFixed(1)} m`;
     const span = track.permanent ? "the whole scenario" : `${track.first.toFixed(1)} to ${track.last.toFixed(1)} s`;
     byId("agent-kind").textContent = `${track.category} · ${size} · ${span}`;
+    this.showTrust(track);
     const color = track.stationary ? theme.parked_edge : track.line;
     const own = { color, dashes: SOLID, width: 1.8 };
     const others = [[this.replay, { color, dashes: DOTTED, width: 1.6 }], [this.truth, { color: theme.truth, dashes: TRUTH_DASHES, width: 1.1 }]]
@@ -63,7 +73,19 @@ class Details {
     this.error.show(others.map(([other, style]) => ({ ...distances(track, other, this.data), ...style })));
   }
 
-  // The values at time t; all agents of the log have that state already.
+  // What does not change over time; rows of which nothing is known are hidden.
+  showTrust(track) {
+    fill(this.confidence, track.confidence === null ? "" : track.confidence.toFixed(2));
+    fill(this.points, track.points === null ? "" : `${track.points.toFixed(0)} points in a sweep (median)`);
+    fill(this.source, track.source ?? "");
+    fill(this.sigma, track.sigmas.some((values) => values !== null) ? "–" : "");
+    byId("agent-doubts").replaceChildren(...track.doubts.map(([reason, start, end]) => {
+      const span = start === null && end === null ? "" : ` (${seconds(start, this.data.begin)} to ${seconds(end, this.data.end)} s)`;
+      return element("li", {}, `${reason}${span}`);
+    }));
+  }
+
+  // The values at time t; all agents of the scenario have that state already.
   tick(t) {
     const track = this.track;
     if (!track) return;
@@ -74,6 +96,13 @@ class Details {
     const degrees = (((track.pyaw * 180) / Math.PI + 180) % 360 + 360) % 360 - 180;
     this.heading.textContent = present ? `${fixed(degrees, 0)}° from east, counter-clockwise` : absent;
     this.position.textContent = present ? `${fixed(track.px, 2)} m east, ${fixed(track.py, 2)} m north` : absent;
+    const units = [[1, 2, "m"], [180 / Math.PI, 1, "°"], [1, 2, "m/s"]];
+    const sigmas = units.map(([scale, digits, unit], which) => {
+      const value = track.sigma(which);
+      return value === null ? "" : `${(value * scale).toFixed(digits)}${unit === "°" ? "" : " "}${unit}`;
+    });
+    this.sigma.textContent = present ? sigmas.filter(Boolean).join(" · ") : absent;
+    byId("agent-doubts").classList.toggle("holds", present && track.doubted);
     this.observed.textContent = !present ? absent : track.interpolated ? "no, interpolated" : "yes";
   }
 

@@ -8,19 +8,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from log2sim.datatypes import GROUP_OF, Agent, Scenario, Trajectory
+from log2sim.datatypes import GROUP_OF, Agent, Doubt, Scenario, Trajectory, Waypoints, why_doubtful
 from log2sim.errors import ConfigError
+from log2sim.visualization.plot.doubts import shown_spans
 from log2sim.visualization.plot.roles import AgentRole, assign_roles, is_moving
 
-# Columns are stored as whole numbers of 0.1 ms, mm, 0.1 mrad and mm/s.
-SCALES = {"t_s": 1e4, "x_m": 1e3, "y_m": 1e3, "yaw_rad": 1e4, "speed_mps": 1e3, "vx_mps": 1e3, "vy_mps": 1e3}
+# Columns are stored as whole numbers of 0.1 ms, mm, 0.1 mrad and mm/s; standard deviations of cm, mrad and cm/s.
+SCALES = {
+    "t_s": 1e4, "x_m": 1e3, "y_m": 1e3, "yaw_rad": 1e4, "speed_mps": 1e3, "vx_mps": 1e3, "vy_mps": 1e3,
+    "sigma_xy_m": 1e2, "sigma_yaw_rad": 1e3, "sigma_speed_mps": 1e2,
+}  # fmt: skip
 WAYPOINT_COLUMNS = ("t_s", "x_m", "y_m", "speed_mps")
+SIGMAS = ("sigma_xy_m", *Waypoints.OPTIONAL_FLOATS)
 MAX_ROWS = 3_000_000
 """Waypoints of all layers together; a page with this many has about 50 MB."""
 
 
 def page_document(scenario: Scenario, truth: Scenario | None = None, replay: Any = None) -> dict[str, Any]:
-    """Assemble the document of a page: name, span of time and one layer each for the log, the truth and the replay.
+    """Assemble the document of a page: name, span of time and a layer each for scenario, truth and replay.
 
     Raises
     ------
@@ -29,7 +34,7 @@ def page_document(scenario: Scenario, truth: Scenario | None = None, replay: Any
     ScenarioError
         When the truth's map has another projection.
     """
-    layers = {"log": list(_log(scenario))}
+    layers = {"scenario": list(_scenario(scenario))}
     if truth is not None:
         layers["truth"] = [
             _entry(a, a.waypoints, stationary=not is_moving(a), static=a.static)
@@ -47,7 +52,7 @@ def page_document(scenario: Scenario, truth: Scenario | None = None, replay: Any
             f"{rows} waypoints are more than the {MAX_ROWS} that a page can hold; take fewer agents, "
             f"such as with `log2sim edit --only`"
         )
-    spans = [_span(e) for name in ("log", "replay") for e in layers.get(name, ())]
+    spans = [_span(e) for name in ("scenario", "replay") for e in layers.get(name, ())]
     return {
         "name": scenario.name,
         "begin_s": min([0.0, *(first for first, _ in spans)]),
@@ -60,21 +65,54 @@ def page_document(scenario: Scenario, truth: Scenario | None = None, replay: Any
 
 def _events(replay: Any) -> list[dict[str, Any]]:
     """List the collisions of a replay in order of time."""
-    keys = ("t_s", "until_s", "agents", "in_log")
+    keys = ("t_s", "until_s", "agents", "belongs_to")
     return [{k: event[k] for k in keys} for event in replay.metrics.get("collisions", ())]
 
 
-def _log(scenario: Scenario) -> Iterator[dict[str, Any]]:
+def _scenario(scenario: Scenario) -> Iterator[dict[str, Any]]:
     """Yield the scenario's agents in the order of the pictures' legend: movers with their colors, then stationary ones."""
     roles = assign_roles(scenario)
     for role in roles.movers:
-        yield {**_entry(role.agent, role.agent.waypoints, stationary=False, static=False), **_colors(role)}
+        entry = _entry(role.agent, role.agent.waypoints, stationary=False, static=False)
+        yield {**entry, **_colors(role), **_trust(role.agent)}
     for agent in roles.stationary:
-        yield _entry(agent, agent.waypoints, stationary=True, static=agent.static)
+        yield {**_entry(agent, agent.waypoints, stationary=True, static=agent.static), **_trust(agent)}
 
 
 def _colors(role: AgentRole) -> dict[str, Any]:
     return {"ego": True} if role.is_ego else {"color": role.color, "leading": role.leading}
+
+
+def _trust(agent: Agent) -> dict[str, Any]:
+    """Return what is known of how far an agent can be trusted; what nobody knows is left out."""
+    w, points, source = agent.waypoints, agent.quality.get("points_median"), _source(agent)
+    columns = {key: getattr(w, key) for key in SIGMAS}
+    known = {key: c for key, c in columns.items() if c is not None and np.any(c > 0)}
+    low = () if agent.doubts or not agent.is_doubtful else (Doubt("confidence", why_doubtful(agent)),)
+    return {
+        "confidence": round(agent.confidence, 4),
+        "doubts": [[doubt.reason, doubt.start_s, doubt.end_s] for doubt in (*agent.doubts, *low)],
+        "doubted": [[t if np.isfinite(t) else None for t in span] for span in shown_spans(agent)],
+        **({"points": round(float(points), 1)} if isinstance(points, int | float) else {}),
+        **({"source": source} if source else {}),
+        **{key: second_differences(column, SCALES[key]) for key, column in known.items()},
+    }
+
+
+def _source(agent: Agent) -> str:
+    """Say from what an agent was reconstructed, as far as its `quality` tells."""
+    quality = agent.quality
+    if isinstance(stated := quality.get("source"), str):
+        return stated
+    detections, cameras, sweeps = (quality.get(key) for key in ("detections", "without_lidar", "lidar_only"))
+    if not isinstance(detections, int):
+        return ""
+    parts = [f"{detections} detection{'s' * (detections != 1)}"]
+    if isinstance(cameras, int) and cameras:
+        parts.append(f"{cameras} of them placed by camera")
+    if isinstance(sweeps, int) and sweeps:
+        parts.append(f"{sweeps} more by LiDAR alone")
+    return ", ".join(parts)
 
 
 def _entry(agent: Any, columns: Any, *, stationary: bool, static: bool) -> dict[str, Any]:
@@ -98,7 +136,7 @@ def _entry(agent: Any, columns: Any, *, stationary: bool, static: bool) -> dict[
 
 
 def _tangents(trajectory: Trajectory) -> dict[str, list[int]]:
-    """Return the velocities of the spline at the waypoints and the indices of steps over which the log jumps."""
+    """Return the velocities of the spline at the waypoints and the indices of steps over which it jumps."""
     return {
         "vx_mps": second_differences(trajectory.velocity_x_mps, SCALES["vx_mps"]),
         "vy_mps": second_differences(trajectory.velocity_y_mps, SCALES["vy_mps"]),

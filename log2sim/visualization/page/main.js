@@ -1,6 +1,6 @@
 // Actions of the user, and the start.
 
-const LAYER_NAMES = { log: "Log", truth: "Truth", replay: "Replay", trails: "Trails", names: "Names" };
+const LAYER_NAMES = { scenario: "Scenario", truth: "Truth", replay: "Replay", trails: "Trails", names: "Names" };
 let fitted = false;
 
 const choose = (track) => {
@@ -33,7 +33,7 @@ const agentAt = (sx, sy, margin) => {
   const x = view.mx(sx), y = view.my(sy), reach = margin / view.scale;
   let best = null, closest = Infinity;
   for (const track of tracks) {
-    if (!state.shown.log || !track.present || !track.contains(x, y, reach)) continue;
+    if (!state.shown.scenario || !track.present || !track.contains(x, y, reach)) continue;
     const distance = Math.hypot(track.px - x, track.py - y);
     if (distance < closest) [best, closest] = [track, distance];
   }
@@ -100,7 +100,7 @@ const listen = () => {
     ["0", "show all", ["0"], fit],
     ["f", "follow the chosen agent, else the ego", ["f"], buttons.follow],
     ["n p", "next or previous agent", ["n"], () => neighbor(1)],
-    ["d t r", "log, truth or replay on or off", ["d"], () => toggle("log")],
+    ["s t r", "scenario, truth or replay on or off", ["s"], () => toggle("scenario")],
     ["w l", "trails or names on or off", ["w"], () => toggle("trails")],
     ["e", "next collision of the replay", ["e"], nextEvent],
     ["a /", "list of agents, search in it", ["a"], buttons["list-toggle"]],
@@ -121,6 +121,7 @@ const listen = () => {
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
     applyTheme(data.layers);
     list.show();
+    listDoubtful();
     details.show();
     drawPresence();
     requestDraw();
@@ -143,11 +144,30 @@ const neighbor = (step) => {
   if (count) chooseVisible(tracks[here < 0 ? (step > 0 ? 0 : count - 1) : (here + step + count) % count]);
 };
 
+// The doubtful agents with their reasons; a click chooses one when the doubt begins.
+const listDoubtful = () => {
+  byId("doubtful").hidden = doubtful.length === 0;
+  byId("doubtful-count").textContent = `${doubtful.length} doubtful agent${doubtful.length === 1 ? "" : "s"}`;
+  byId("doubtful-agents").replaceChildren(...doubtful.map((track) => {
+    const button = element("button", { type: "button" }), item = element("li");
+    const why = track.doubts.map(([reason]) => reason).join(", ");
+    button.append(mark(track), element("span", { class: "why" }, `${track.id}: ${why}`));
+    button.addEventListener("click", () => {
+      const starts = track.doubts.map(([, start]) => start).filter((start) => start !== null);
+      if (starts.length) seek(Math.min(...starts));
+      chooseVisible(track);
+    });
+    item.append(button);
+    return item;
+  }));
+};
+
 const list = new List(tracks, { choose: chooseVisible, hover }), details = new Details(data, seek);
 
 const start = () => {
   const moving = tracks.filter((track) => !track.stationary && !track.ego).length, agents = tracks.length - (ego ? 1 : 0);
   const parts = [`${(data.end - data.begin).toFixed(1)} s`, `${agents} agent${agents === 1 ? "" : "s"}, ${moving} moving`];
+  if (doubtful.length) parts.push(`${doubtful.length} doubtful`);
   if (!ego) parts.push("no ego");
   if (data.origin) parts.push(`origin ${data.origin}`);
   byId("whole").textContent = `/ ${data.end.toFixed(1)} s`;
@@ -162,6 +182,7 @@ const start = () => {
     byId("layers").append(button);
   }
   markEvents();
+  listDoubtful();
   setRate(0);
   showPlay();
   listen();

@@ -1,7 +1,7 @@
 // Draws the state at a time onto the canvas, without allocating memory except for the text of the scale bar.
 
 const SOLID = [], DASHED = [5, 4], TRUTH_DASHES = [4, 3], DOTTED = [1.5, 2.5];
-const TRAIL_S = 3, SMALL_PX = 6, SLIM_PX = 4, MAX_LABELS = 64;
+const TRAIL_S = 3, SMALL_PX = 6, SLIM_PX = 4, STRIPES_PX = 4, MAX_LABELS = 64;
 
 class Painter {
   constructor(canvas, view) {
@@ -21,7 +21,7 @@ class Painter {
     this.view.resize(width, height);
   }
 
-  // shown: which layers and extras; chosen, hovered: tracks of the log or null.
+  // shown: which layers and extras; chosen, hovered: tracks of the scenario or null.
   paint({ layers, events }, t, shown, chosen, hovered) {
     const ctx = this.ctx;
     ctx.setLineDash(SOLID);
@@ -29,15 +29,15 @@ class Painter {
     ctx.fillStyle = theme.ground;
     ctx.fillRect(0, 0, this.view.width + 1, this.view.height + 1);  // the last pixel may be half one
     this.grid();
-    for (const track of layers.log) track.moveTo(t);
-    if (shown.log) this.log(layers.log, t, shown, chosen);
+    for (const track of layers.scenario) track.moveTo(t);
+    if (shown.scenario) this.scene(layers.scenario, t, shown, chosen);
     if (shown.truth && layers.truth) this.outlines(layers.truth, t, TRUTH_DASHES, 1.1);
     if (shown.replay && layers.replay) this.outlines(layers.replay, t, DOTTED, 1.6);
     ctx.setLineDash(SOLID);
     if (shown.replay) this.contacts(events, t);
-    if (shown.log && chosen && chosen.present) this.ring(chosen, theme.accent, 2);
-    if (shown.log && hovered && hovered !== chosen && hovered.present) this.ring(hovered, theme.muted, 1.2);
-    if (shown.log) this.names(layers.log, shown, chosen, hovered);
+    if (shown.scenario && chosen && chosen.present) this.ring(chosen, theme.accent, 2);
+    if (shown.scenario && hovered && hovered !== chosen && hovered.present) this.ring(hovered, theme.muted, 1.2);
+    if (shown.scenario) this.names(layers.scenario, shown, chosen, hovered);
     this.scaleBar();
   }
 
@@ -59,7 +59,7 @@ class Painter {
     ctx.stroke();
   }
 
-  log(tracks, t, shown, chosen) {
+  scene(tracks, t, shown, chosen) {
     if (chosen && !chosen.stationary) this.path(chosen, chosen.first, chosen.last, chosen.pale, 2.5);
     if (shown.trails) {
       for (let i = tracks.length - 1; i >= 0; i--) {
@@ -128,9 +128,14 @@ class Painter {
     ctx.fillStyle = track.interpolated ? track.pale : track.fill;
     ctx.fill();
     const slim = track.width * this.view.scale < SLIM_PX;
-    if (slim && !track.interpolated) return;  // an outline and a heading mark would cover it
-    ctx.lineWidth = track.interpolated ? 1.2 : 0.8;
-    ctx.strokeStyle = track.interpolated ? track.line : track.edge;
+    const outlined = track.interpolated || track.doubted;
+    if (slim && !outlined) return;  // an outline and a heading mark would cover it
+    if (track.doubted) {
+      this.stripes(track.interpolated ? track.outline : track.stripes);
+      this.trace();
+    }
+    ctx.lineWidth = outlined ? 1.2 : 0.8;
+    ctx.strokeStyle = track.doubted ? track.outline : track.interpolated ? track.line : track.edge;
     ctx.setLineDash(track.interpolated ? DASHED : SOLID);
     ctx.stroke();
     ctx.setLineDash(SOLID);
@@ -145,6 +150,24 @@ class Painter {
     ctx.closePath();
     ctx.fillStyle = track.interpolated ? track.line : track.headingMark;
     ctx.fill();
+  }
+
+  // Stripes across the box in `corner`, at 45 degrees to its sides as in the pictures; they move with it.
+  stripes(color) {
+    const { ctx, corner: c } = this, ax = c[0] - c[2], ay = c[1] - c[3], bx = c[4] - c[2], by = c[5] - c[3];
+    const length = Math.hypot(ax, ay), width = Math.hypot(bx, by), reach = length + width;
+    const count = Math.max(Math.floor(reach / (STRIPES_PX * Math.SQRT2)), 2);
+    ctx.beginPath();
+    for (let k = 0; k < count; k++) {
+      const offset = ((k + 0.5) / count) * reach - width;
+      const a = Math.max(offset, 0) / length, b = Math.max(-offset, 0) / width;
+      const along = Math.min(length, offset + width) / length, across = Math.min(width, length - offset) / width;
+      ctx.moveTo(c[2] + a * ax + b * bx, c[3] + a * ay + b * by);
+      ctx.lineTo(c[2] + along * ax + across * bx, c[3] + along * ay + across * by);
+    }
+    ctx.strokeStyle = color;
+    ctx.lineWidth = 1.2;
+    ctx.stroke();
   }
 
   // The marker of the category, as in the legends of the pictures: square, diamond, circle, triangle.
@@ -164,7 +187,7 @@ class Painter {
     ctx.fillStyle = track.interpolated ? track.pale : track.fill;
     ctx.fill();
     ctx.lineWidth = 0.8;
-    ctx.strokeStyle = track.interpolated ? track.line : track.edge;
+    ctx.strokeStyle = track.doubted ? theme.alert : track.interpolated ? track.line : track.edge;
     ctx.stroke();
   }
 
@@ -189,7 +212,7 @@ class Painter {
       const event = events[k];
       if (t < event.t_s - 0.05 || t > event.until_s + 0.3) continue;
       for (let i = 0; i < event.tracks.length; i++) {
-        if (event.tracks[i].present) this.ring(event.tracks[i], event.in_log ? theme.muted : theme.alert, 2);
+        if (event.tracks[i].present) this.ring(event.tracks[i], event.belongs_to === "replay" ? theme.alert : theme.muted, 2);
       }
     }
   }

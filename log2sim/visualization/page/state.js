@@ -1,11 +1,13 @@
 // Data, display state and animation frames, which are only drawn while something moves.
 
 const data = load(byId("data").textContent);
-const tracks = data.layers.log, ego = tracks.find((track) => track.ego) ?? null;
+const tracks = data.layers.scenario, ego = tracks.find((track) => track.ego) ?? null;
 for (const track of tracks) track.label = track.id.length > 24 ? `${track.id.slice(0, 23)}…` : track.id;
+const doubtful = tracks.filter((track) => track.doubts.length > 0);
+for (const track of doubtful) track.label += "?";
 const state = {
   t: data.begin, rate: 1, playing: false, follow: false, chosen: null, hovered: null,
-  shown: { log: true, truth: true, replay: true, trails: true, names: true },
+  shown: { scenario: true, truth: true, replay: true, trails: true, names: true },
 };
 applyTheme(data.layers);
 const view = new View(), painter = new Painter(byId("map"), view);

@@ -35,7 +35,7 @@ const applyTheme = (layers) => {
   theme.headingMark = css(channels(theme.paper), 0.85);
   theme.truth = css(ink, 0.9);
   const colors = new Map();
-  for (const track of layers.log) {
+  for (const track of layers.scenario) {
     const rgb = track.ego ? ink : track.base ? readable(channels(track.base), ground) : channels(theme.parked_face);
     const strength = track.leading || track.stationary ? 1 : 0.6;
     track.line = css(rgb, 1);
@@ -44,6 +44,8 @@ const applyTheme = (layers) => {
     track.trail = css(rgb, 0.65 * strength);
     track.edge = track.stationary ? theme.parked_edge : theme.paper;
     track.headingMark = track.stationary ? theme.parked_edge : theme.headingMark;
+    track.stripes = track.stationary ? theme.muted : theme.paper;
+    track.outline = track.stationary ? theme.muted : track.line;
     colors.set(track.id, track.stationary ? theme.parked_edge : track.line);
   }
   for (const track of layers.replay ?? []) track.line = colors.get(track.id) ?? theme.ink;

@@ -54,12 +54,13 @@ const drawPresence = () => {
   }
 };
 
-// A mark below the slider for each collision of the replay, red unless it is in the log.
+// A mark below the slider for each collision of the replay, red unless the scenario has it itself.
 const markEvents = () => {
   const whole = Math.max(data.end - data.begin, 1e-3), inset = 8;  // half the slider's knob, where its ends are
   byId("events").append(...data.events.slice(0, MAX_MARKS).map((event) => {
-    const what = `${event.agents.join(" and ")} collide at ${event.t_s.toFixed(2)} s${event.in_log ? ", in the log too" : ""}`;
-    const button = element("button", { type: "button", title: what, "aria-label": what, class: event.in_log ? "known" : "new" });
+    const fresh = event.belongs_to === "replay", whose = fresh ? "" : `, in the ${event.belongs_to} itself`;
+    const what = `${event.agents.join(" and ")} collide at ${event.t_s.toFixed(2)} s${whose}`;
+    const button = element("button", { type: "button", title: what, "aria-label": what, class: fresh ? "new" : "known" });
     button.style.left = `calc(${inset}px + (100% - ${2 * inset}px) * ${(event.t_s - data.begin) / whole})`;
     button.addEventListener("click", () => showEvent(event));
     return button;

@@ -11,7 +11,7 @@ const sums = (differences, scale) => {
   return out;
 };
 
-// Value between waypoints k and k + 1 by their slopes, straight on over a jump of the log, linear without slopes.
+// Value between waypoints k and k + 1 by their slopes, straight on over a jump, linear without slopes.
 const between = (values, slopes, k, share, span, jump) => {
   const rise = values[k + 1] - values[k];
   if (slopes === null) return values[k] + share * rise;
@@ -36,10 +36,18 @@ class Track {
     this.filled = new Uint8Array(Math.max(this.t.length - 1, 0));
     const edges = entry.filled ?? [];
     for (let k = 0; k < edges.length; k += 2) this.filled.fill(1, edges[k], edges[k + 1]);
+    this.confidence = entry.confidence ?? null;
+    this.points = entry.points ?? null;
+    this.source = entry.source ?? null;
+    this.sigmas = ["sigma_xy_m", "sigma_yaw_rad", "sigma_speed_mps"].map((key) => (entry[key] ? sums(entry[key], scales[key]) : null));
+    this.doubts = entry.doubts ?? [];  // reason, start and end in s or null
+    this.doubtSpans = (entry.doubted ?? []).map(([start, end]) => [start ?? -Infinity, end ?? Infinity]);
+    this.doubted = false;
     this.first = this.t[0];
     this.last = this.t[this.t.length - 1];
     this.present = this.interpolated = false;
     this.k = 0;
+    this.share = 0;  // of the way from waypoint k to the next
     this.px = this.py = this.pyaw = this.pv = 0;
     this.fill = this.edge = this.pale = this.line = "";  // set by the theme
   }
@@ -63,12 +71,16 @@ class Track {
     const slack = 1e-4;
     this.present = this.permanent || (t >= this.first - slack && t <= this.last + slack);
     if (!this.present) return;
+    this.doubted = false;
+    for (let i = 0; i < this.doubtSpans.length; i++) this.doubted ||= t >= this.doubtSpans[i][0] && t <= this.doubtSpans[i][1];
     const k = this.find(t), n = this.t.length;
+    this.share = 0;
     if (k + 1 === n || t <= this.t[k]) {
       this.set(this.x[k], this.y[k], this.yaw[k], this.v[k], n > 1 && this.filled[Math.min(k, n - 2)] === 1);
       return;
     }
     const span = this.t[k + 1] - this.t[k], share = (t - this.t[k]) / span, jump = this.jumps[k] === 1;
+    this.share = share;
     this.set(
       between(this.x, this.vx, k, share, span, jump),
       between(this.y, this.vy, k, share, span, jump),
@@ -84,6 +96,12 @@ class Track {
     this.pyaw = yaw;
     this.pv = v;
     this.interpolated = interpolated;
+  }
+
+  // The present standard deviation of position (0), yaw (1) or speed (2); null where it is not known.
+  sigma(which) {
+    const values = this.sigmas[which], k = this.k;
+    return values === null ? null : values[k] + (this.share > 0 ? this.share * (values[k + 1] - values[k]) : 0);
   }
 
   // Whether a position in the map is inside the box or within a margin of it.

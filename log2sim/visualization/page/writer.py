@@ -48,7 +48,7 @@ def write_page(
     truth : Scenario or None
         Shown as a layer, aligned to the scenario's time and map.
     replay : Replay or None
-        Shown as a layer, and beside the log in the plots of an agent.
+        Shown as a layer, and beside the scenario in the plots of an agent.
 
     Raises
     ------
