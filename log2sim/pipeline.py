@@ -211,7 +211,7 @@ def second_pass(run: Run, observations: Observations) -> Result:
         )
     with run.clock.stage("smooth"):
         candidates = estimate_agents(tracks, observations.obstacles, timeline, smooth=config.smooth.enabled)
-        candidates = decide_headings(candidates, ego_path(log, run.schedule))
+        candidates = decide_headings(candidates, ego_path(log, run.schedule), timeline)
         ego = ego_agent(log, timeline, run.poses.origin)
     with run.clock.stage("judge"):
         judged = judge(candidates, ego, observations.obstacles, timeline)

@@ -1,4 +1,4 @@
-"""Which side traffic keeps to, and which way vehicles parked on either side of it point."""
+"""Which side traffic keeps to, and which way the street goes on either side of a path."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from log2sim.agents.heading.traffic import Side, parked_heading, side_of_traffic
+from log2sim.agents.heading.traffic import MEETING_LOG_ODDS, USUALLY_RIGHT, side_log_odds, street_axis, street_log_odds
 from log2sim.perception.box_fitting import rotate
 
 ANGLES = st.floats(-np.pi, np.pi)
@@ -31,54 +31,69 @@ def mirrored(flow: np.ndarray) -> np.ndarray:
     return flow * [1.0, -1.0, -1.0]
 
 
+USUAL = np.log(USUALLY_RIGHT / (1 - USUALLY_RIGHT))
+
+
 @given(turn=ANGLES, apart_m=st.floats(2.5, 12.0), x=st.floats(-1e5, 1e5), late=st.floats(0.0, 30.0))
 @settings(max_examples=40, deadline=None)
 def test_oncoming_traffic_on_the_left_keeps_right_in_every_map_and_left_in_the_mirror(turn, apart_m, x, late):
     road = [path(0.0, 0.0, 0.0), path(60.0 + late, apart_m, np.pi)]
-    assert side_of_traffic([moved(p, turn, (x, -x)) for p in road]) == Side.RIGHT
-    assert side_of_traffic([moved(mirrored(p), turn, (x, -x)) for p in road]) == Side.LEFT
+    assert side_log_odds([moved(p, turn, (x, -x)) for p in road]) == pytest.approx(USUAL + MEETING_LOG_ODDS)
+    assert side_log_odds([moved(mirrored(p), turn, (x, -x)) for p in road]) == pytest.approx(USUAL - MEETING_LOG_ODDS)
 
 
-def test_traffic_that_never_meets_is_taken_to_keep_right():
+def test_traffic_that_never_meets_says_nothing_about_its_side():
     one_way, crossing, far = path(0.0, 0.0, 0.0), path(30.0, -30.0, np.pi / 2), path(60.0, 200.0, np.pi)
     for paths in ([], [one_way], [one_way, path(5.0, -3.5, 0.0)], [one_way, crossing], [one_way, far]):
-        assert side_of_traffic(paths) == Side.RIGHT
+        assert side_log_odds(paths) == pytest.approx(USUAL)
 
 
 def test_most_of_those_that_meet_decide():
     wrong_way = path(60.0, 3.0, np.pi)
-    assert (
-        side_of_traffic([path(0.0, 0.0, 0.0), path(60.0, -4.0, np.pi), path(75.0, -4.0, np.pi), wrong_way]) == Side.LEFT
-    )
+    met = [path(0.0, 0.0, 0.0), path(60.0, -4.0, np.pi), path(75.0, -4.0, np.pi), wrong_way]
+    assert side_log_odds(met) < -1
 
 
-@given(turn=ANGLES, left_m=st.sampled_from([-9.0, -4.0, 0.5, 4.0, 9.0]), flipped=st.booleans())
+@given(turn=ANGLES, left_m=st.sampled_from([-9.0, -4.0, 0.5, 3.0, 9.0]), flipped=st.booleans())
 @settings(max_examples=40, deadline=None)
-def test_a_parked_heading_is_mirrored_with_its_world(turn, left_m, flipped):
-    flow, xy, yaw = path(0.0, 0.0, 0.0), np.array([20.0, left_m]), np.pi * flipped
-    right = parked_heading(yaw + turn, rotate(xy, turn), moved(flow, turn), side=Side.RIGHT)
-    left = parked_heading(turn - yaw, rotate(xy * [1, -1], turn), moved(mirrored(flow), turn), side=Side.LEFT)
-    assert np.cos(right - turn) == pytest.approx(np.cos(left - turn), abs=1e-6)
-    assert np.cos(right - turn) == pytest.approx(1.0 if left_m < 2 else -1.0, abs=1e-6)
+def test_the_direction_of_a_street_is_mirrored_with_its_world(turn, left_m, flipped):
+    flow, pose = path(0.0, 0.0, 0.0), np.array([[20.0, left_m, np.pi * flipped]])
+    right = street_log_odds(moved(pose, turn)[0], [moved(flow, turn)], keeps_right=True)
+    left = street_log_odds(moved(mirrored(pose), turn)[0], [moved(mirrored(flow), turn)], keeps_right=False)
+    assert right == pytest.approx(left, abs=1e-6)
+    assert (right > 0) == ((left_m < 2) != flipped)
+    # What points the other way has the opposite log-odds.
+    assert street_log_odds(
+        moved(pose + np.array([0, 0, np.pi]), turn)[0], [moved(flow, turn)], keeps_right=True
+    ) == pytest.approx(-right, abs=1e-6)
 
 
-@pytest.mark.parametrize("yaw", [0.05, np.pi - 0.05])
-@pytest.mark.parametrize(("left_m", "with_it"), [(-3.0, True), (-0.5, True), (4.0, False)])
-@pytest.mark.parametrize("turn", [0.0, 1.0, -2.5])
-def test_traffic_keeps_right_whatever_way_the_box_was_fitted(yaw, left_m, with_it, turn):
-    """Right of a path eastward points east, clearly left of it points west."""
-    flow = moved(path(0.0, 0.0, 0.0, 20.0), turn)
-    xy = rotate(np.array([10.0, left_m]), turn)
-    found = parked_heading(yaw + turn, xy, flow)
-    assert np.cos(found - turn) * (1 if with_it else -1) > 0.9
-    assert abs(np.sin(found - yaw - turn)) < 1e-9
+def test_in_the_lane_of_another_one_surely_goes_its_way_and_at_its_curb_most_likely():
+    def along(left_m):
+        return street_log_odds(np.array([30.0, left_m, 0.0]), [path(0.0, 0.0, 0.0)], keeps_right=True)
+
+    assert along(0.3) > along(-3.0) > 2 > 0 > along(3.0) > along(8.0)
 
 
-def test_without_traffic_nearby_a_heading_stays_as_it_is():
-    for flow in (np.zeros((0, 3)), path(500.0, 0.0, 0.0), path(0.0, 0.0, np.pi / 2, 20.0)):
-        assert parked_heading(3.0, np.array([10.0, -2.0]), flow) == pytest.approx(3.0)
+def test_another_street_says_nothing():
+    ego = [path(0.0, 0.0, 0.0)]
+    beside = abs(street_log_odds(np.array([30.0, -3.0, 0.0]), ego, keeps_right=True))
+    for pose in ([30.0, -25.0, 0.0], [30.0, -3.0, 0.6], [30.0, -3.0, np.pi / 2], [190.0, -3.0, 0.0]):
+        assert abs(street_log_odds(np.array(pose), ego, keeps_right=True)) < 0.1 * beside
+    assert street_log_odds(np.array([0.0, 0.0, 0.0]), [np.zeros((0, 3))], keeps_right=True) == 0.0
 
 
-def test_the_nearer_path_has_more_say():
-    flow = np.vstack([path(0.0, 3.0, 0.0, 20.0), path(20.0, -12.0, np.pi, 20.0)])
-    assert np.cos(parked_heading(0.0, np.array([10.0, 0.5]), flow)) > 0.9
+def test_a_street_goes_on_a_little_past_the_end_of_a_path_and_the_nearest_path_counts_most():
+    ego, oncoming = path(0.0, 0.0, 0.0), path(60.0, 7.0, np.pi)
+    beside, ahead = (street_log_odds(np.array([x, -3.0, 0.0]), [ego], keeps_right=True) for x in (30.0, 75.0))
+    assert 0.3 < ahead < beside
+    # Left of the oncoming lane, which is between it and the ego.
+    assert street_log_odds(np.array([30.0, 10.0, 0.0]), [ego, oncoming], keeps_right=True) < -2
+
+
+def test_the_axis_of_the_street_is_that_of_its_traffic():
+    yaw, belongs = street_axis(np.array([30.0, -3.0]), [path(0.0, 0.0, 0.0), path(30.0, 40.0, 1.0)])
+    assert yaw == pytest.approx(0.0)
+    assert belongs > 0.9
+    assert street_axis(np.array([30.0, 300.0]), [path(0.0, 0.0, 0.0)])[1] < 1e-6
+    assert street_axis(np.array([30.0, 300.0]), [])[1] == 0.0

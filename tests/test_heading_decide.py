@@ -1,0 +1,137 @@
+"""Which end is the front: small worlds of a street with traffic on either side, a car park, a side street, a lone car."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from worlds import rows_at
+
+from log2sim.agents.candidate import Timeline, candidate_of
+from log2sim.agents.heading.decide import decide_headings
+from log2sim.agents.size import TrackGeometry
+from log2sim.datatypes import Track, Waypoints
+
+T_NS = np.arange(20) * 100_000_000
+TIMELINE = Timeline(T_NS, 0)
+CAR_M = np.array([4.4, 1.8, 1.5])
+
+
+def candidate(x, y, yaw, speed=0.0, *, front=None, score=0.9, axis=True, category="car"):
+    """An agent at x, y that starts there with a speed along its yaw; a 3D detector's boxes point along `front`."""
+    t = T_NS / 1e9
+    xy = np.array([x, y]) + np.outer(speed * t, [np.cos(yaw), np.sin(yaw)])
+    m = rows_at(xy, category, t_ns=T_NS)
+    if front is not None:
+        m = replace(m, box_yaw_rad=np.full(20, front), heading_score=np.full(20, score))
+    w = Waypoints(
+        t_s=t, x_m=xy[:, 0], y_m=xy[:, 1], z_m=np.zeros(20), yaw_rad=np.full(20, yaw), speed_mps=np.full(20, speed),
+        observed=np.ones(20, dtype=bool), sigma_xy_m=np.full(20, 0.1), sigma_yaw_rad=np.full(20, 0.02),
+    )  # fmt: skip
+    geometry = TrackGeometry(CAR_M, xy, m.covariance, np.zeros(20), yaw if axis else None)
+    return candidate_of(Track(category, np.arange(20), m), geometry, w, {}, static=speed == 0)
+
+
+def ego(heading=0.0, speed=8.0):
+    along = np.outer(speed * np.arange(20) / 10, [np.cos(heading), np.sin(heading)])
+    return np.column_stack([along, np.full(20, heading)])
+
+
+def decided(*candidates, path=None):
+    """Headings in degrees and agents after the decision."""
+    agents = [c.agent for c in decide_headings(candidates, ego() if path is None else path, TIMELINE)]
+    return [round(float(np.rad2deg(a.waypoints.yaw_rad[0]))) % 360 for a in agents], agents
+
+
+def ambiguous(agent):
+    return [d.flag for d in agent.doubts] == ["heading_ambiguous"]
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("yaw", [0.0, np.pi])
+def test_parked_cars_point_with_the_traffic_of_their_side(side, yaw):
+    """Oncoming traffic passes on the left where traffic keeps right (side 1), on the right in the mirror."""
+    oncoming = candidate(40.0, 3.5 * side, np.pi, 9.0)
+    parked = [candidate(8.0 * k, y * side, yaw) for k in range(3) for y in (-3.0, 6.5)]
+    headings, agents = decided(oncoming, *parked)
+    assert headings == [180, *[0, 180] * 3]
+    assert min(a.quality["heading_confidence"] for a in agents) > 0.7
+    assert not any(a.doubts for a in agents)
+
+
+def test_a_queue_on_the_own_lane_points_ahead():
+    headings, agents = decided(*[candidate(15.0 + 7 * k, 0.2, np.pi) for k in range(3)])
+    assert headings == [0, 0, 0]
+    assert min(a.quality["heading_confidence"] for a in agents) > 0.8
+
+
+def test_cars_on_a_side_street_and_in_a_yard_do_not_follow_the_traffic():
+    for x, y, yaw in ((10.0, -9.0, np.pi / 2), (10.0, -25.0, np.pi), (10.0, -8.0, 0.8)):
+        _, (agent,) = decided(candidate(x, y, yaw))
+        assert agent.quality["heading_confidence"] < 0.6
+        assert ambiguous(agent)
+
+
+def test_a_car_park_is_decided_by_each_car_alone_with_a_weak_say_of_its_neighbors():
+    known = [
+        candidate(2.7 * k - 8, -20.0, np.pi / 2, front=np.pi / 2 * (-1 if k == 2 else 1), score=0.97) for k in range(6)
+    ]
+    headings, _ = decided(*known, candidate(2.7 * 6 - 8, -20.0, np.pi / 2))
+    assert headings == [90, 90, 270, 90, 90, 90, 90]
+
+
+def test_boxes_that_are_sure_outweigh_the_side_of_the_road_and_unsure_ones_do_not():
+    sure, unsure = (decided(candidate(8.0, -3.0, 0.0, front=np.pi, score=s))[0] for s in (0.99, 0.6))
+    assert (sure, unsure) == ([180], [0])
+
+
+def test_what_drives_fast_drives_forward_and_a_slow_maneuver_may_reverse():
+    backward = candidate(30.0, 40.0, 0.0, -8.0)
+    headings, (agent,) = decided(backward)
+    assert headings == [180]
+    np.testing.assert_allclose(agent.waypoints.speed_mps, 8.0)
+    assert agent.quality["heading_confidence"] > 0.99
+    assert decided(candidate(30.0, 40.0, 0.0, -0.8, front=0.0, score=0.99))[0] == [0]
+
+
+def test_a_lone_car_is_doubted_and_says_so_in_its_quality():
+    (heading,), (agent,) = decided(candidate(30.0, 40.0, 1.0), path=np.zeros((0, 3)))
+    assert heading == 57
+    assert agent.quality["heading_confidence"] == 0.5
+    assert ambiguous(agent)
+
+
+def test_a_car_without_an_axis_is_laid_along_its_street_and_only_there():
+    (beside, away), agents = decided(candidate(8.0, -3.0, 1.3, axis=False), candidate(8.0, -30.0, 1.3, axis=False))
+    assert (beside, away) == (0, 74)
+    assert agents[0].waypoints.sigma_yaw_rad[0] > 0.1
+
+
+def test_people_and_things_keep_their_yaw_and_nothing_is_lost():
+    person = candidate(8.0, -3.0, np.pi, category="pedestrian")
+    assert decided(person)[0] == [180]
+    assert "heading_confidence" not in decided(person)[1][0].quality
+    assert decided() == ([], [])
+
+
+def test_headings_do_not_depend_on_the_map_or_on_the_order():
+    turn = 2.2
+
+    def go(c):
+        w = c.agent.waypoints
+        x, y = (np.cos(turn) * w.x_m - np.sin(turn) * w.y_m, np.sin(turn) * w.x_m + np.cos(turn) * w.y_m)
+        return replace(
+            c, agent=replace(c.agent, waypoints=replace(w, x_m=x + 900, y_m=y - 400, yaw_rad=w.yaw_rad + turn))
+        )
+
+    world = [candidate(40.0, 3.5, np.pi, 9.0), *[candidate(8.0 * k, -3.0, np.pi * (k % 2)) for k in range(3)]]
+    path = ego() @ np.array([[np.cos(turn), np.sin(turn), 0], [-np.sin(turn), np.cos(turn), 0], [0, 0, 1]]) + [
+        900,
+        -400,
+        turn,
+    ]
+    here, there = decided(*world)[1], decided(*[go(c) for c in world][::-1], path=path)[1][::-1]
+    for a, b in zip(here, there):
+        assert np.cos(b.waypoints.yaw_rad[0] - a.waypoints.yaw_rad[0] - turn) == pytest.approx(1.0)
+        assert b.quality["heading_confidence"] == pytest.approx(a.quality["heading_confidence"], abs=2e-3)
