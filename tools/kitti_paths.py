@@ -93,8 +93,8 @@ class _Grid:
         self.start, self.length, self.t_ns = start, length, t_ns
         group = np.array([GROUP_OF[t.category] for t in tracks])
         self.noise = np.array([ACCELERATION_MPS2[g] for g in group.tolist()])
-        yaw = np.array([t.measurements.yaw_rad[0] for t in tracks])
-        self.first_velocity = first_velocity(yaw, group, whole_boxes=whole_boxes)
+        axis = np.array([t.measurements.yaw_rad[0] if whole_boxes else np.nan for t in tracks])
+        self.first_velocity = first_velocity(axis, group)
         m = Measurements.join([t.measurements for t in tracks])
         at = np.flatnonzero(row >= 0)
         self.seen = row >= 0

@@ -1,4 +1,4 @@
-"""Forward tracking: measurements of every tick assigned to constant-velocity tracks in the map frame."""
+"""Forward tracking: measurements of every tick assigned to tracks that stand or move at constant velocity, in the map frame."""
 
 from __future__ import annotations
 
@@ -19,6 +19,18 @@ NOT_ALLOWED = 1e6
 OTHER_GROUP_COST = 6.0
 RELATED = (("pedestrian", "two_wheeler"), ("two_wheeler", "pedestrian"))
 TENTATIVE_HITS = 3
+# An object is detected at so many of its ticks; measurements that belong to no track yet, of new objects or of none, come
+# with this density a tick: some three in a circle of 50 m. A measurement stays without a track
+# where that is likelier than that the track was measured there.
+DETECTION_PROBABILITY, NEW_PER_M2 = 0.8, 4e-4
+_LOG_NEW = 2 * np.log(2 * np.pi * NEW_PER_M2 * (1 - DETECTION_PROBABILITY) / DETECTION_PROBABILITY)
+# What was measured once may stand or move, one as likely as the other. What stands starts within this time on average, as
+# at a traffic light.
+STANDING_PRIOR, START_TIME_S = 0.5, 30.0
+# Standard deviation of what a standing object seems to move within 1 s.
+STANDING_DRIFT_M = 0.1
+# Below this probability the place where it stands is forgotten.
+MIN_STANDING_PROBABILITY = 1e-3
 # A track ends after so many ticks without a measurement; a confirmed one lives on for as long as its velocity predicts it.
 MAX_MISSES = 3
 CONFIRMED_AGE_S = 1.2
@@ -32,6 +44,7 @@ _GROUP_COST = np.array([
 ])  # fmt: skip
 
 Index = NDArray[np.intp]
+_Costs = tuple[Array, Array, NDArray[np.bool_]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +97,10 @@ class ForwardTracker:
         Time of the last measurement.
     hits : (A,) int64
         Number of measurements.
+    standing : (A,) float64
+        Probability that the object stands; 0 once it surely moves.
+    place_m : (A, 2) float64
+        Where it stands if it does, with covariances `place_covariance` (A, 2, 2).
     birth_score : float
         Lowest score that can start a track.
     whole_boxes : bool
@@ -99,6 +116,7 @@ class ForwardTracker:
         self.number = np.zeros(0, dtype=np.intp)
         self.mean, self.covariance = np.zeros((0, 4)), np.zeros((0, 4, 4))
         self.seen_ns, self.hits = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+        self.standing, self.place_m, self.place_covariance = np.zeros(0), np.zeros((0, 2)), np.zeros((0, 2, 2))
         self._group = np.zeros(0, dtype=np.intp)
         self._born = 0
         self._now_ns: int | None = None
@@ -116,8 +134,11 @@ class ForwardTracker:
             return rows, np.zeros(0, dtype=np.intp)
         columns = _Columns(found, rows, now_ns, whole_boxes=self.whole_boxes)
         strong = found.score[rows] >= self.birth_score
-        tracks, taken = self._choose(columns, strong)
-        self._update(tracks, columns, taken, now_ns)
+        costs = self._costs(columns)
+        tracks, taken = self._choose(columns, strong, costs)
+        self._update(tracks, columns, taken, costs)
+        self.seen_ns[tracks] = now_ns
+        self.hits[tracks] += 1
         numbers = self.number[tracks]
         fresh = strong.copy()
         fresh[taken] = False
@@ -142,24 +163,34 @@ class ForwardTracker:
             self._ended.append((self.number[~alive], self.mean[~alive]))
             self.number, self.mean, self.covariance = self.number[alive], self.mean[alive], self.covariance[alive]
             self.seen_ns, self.hits, self._group = self.seen_ns[alive], self.hits[alive], self._group[alive]
+            self.standing, self.place_m = self.standing[alive], self.place_m[alive]
+            self.place_covariance = self.place_covariance[alive]
         if self._now_ns is not None and len(self.number):
             dt_s = (now_ns - self._now_ns) / NS_PER_S
             self.mean, self.covariance = predict(self.mean, self.covariance, dt_s, _ACCELERATION[self._group])
+            self.place_covariance = self.place_covariance + STANDING_DRIFT_M**2 * abs(dt_s) * np.eye(2)
+            self.standing = self.standing * np.exp(-abs(dt_s) / START_TIME_S)
         self._now_ns = now_ns
 
-    def _choose(self, columns: _Columns, strong: NDArray[np.bool_]) -> tuple[Index, Index]:
-        """Return tracks and measurements of the cheapest assignment inside the gate, strong measurements first.
+    def _choose(self, columns: _Columns, strong: NDArray[np.bool_], costs: _Costs) -> tuple[Index, Index]:
+        """Return tracks and measurements of the likeliest assignment inside the gate, strong measurements first.
 
-        The cost is the negative log-likelihood.
+        Notes
+        -----
+        The cost of a pair is minus twice the logarithm of the ratio of two likelihoods: that the track was measured
+        there, and that it was not detected and the measurement is another object's or nobody's (Blackman, "Multiple
+        hypothesis tracking for multiple target tracking", IEEE AES Magazine 19, 2004). A pair that is less likely than
+        no pair is none, so that a missed object does not shift the tracks of a whole row of parked cars.
         """
         from scipy.optimize import linear_sum_assignment
 
         none = np.zeros(0, dtype=np.intp)
         if len(self.number) == 0:
             return none, none
-        squared, log_determinant = innovation(self.mean, self.covariance, columns.xy, columns.r, columns.age_s)
-        cost = squared + log_determinant + _GROUP_COST[self._group[:, None], columns.group]
-        cost[(squared > CHI2_2DOF_999) | (cost >= NOT_ALLOWED / 2)] = NOT_ALLOWED
+        moving, standing, inside = costs
+        cost = _joined(moving, standing, self.standing[:, None])
+        cost = cost + _LOG_NEW + _GROUP_COST[self._group[:, None], columns.group]
+        cost[~inside | (cost > 0)] = 0.0
         chosen = []
         for stage in (strong, ~strong):
             rows = np.flatnonzero(stage)
@@ -167,26 +198,42 @@ class ForwardTracker:
                 continue
             a, m = linear_sum_assignment(cost[:, rows])
             m = rows[m]
-            good = cost[a, m] < NOT_ALLOWED / 2
+            good = cost[a, m] < 0
             chosen.append((a[good], m[good]))
-            cost[a[good]] = NOT_ALLOWED
+            cost[a[good]] = 0.0
         tracks, taken = (np.concatenate(c) for c in zip(*chosen))
         return tracks, taken
 
-    def _update(self, tracks: Index, columns: _Columns, taken: Index, now_ns: int) -> None:
+    def _costs(self, columns: _Columns) -> _Costs:
+        """Return minus twice the log-likelihoods (A, M) if tracks move, if they stand, and which are inside a gate."""
+        squared, log_determinant = innovation(self.mean, self.covariance, columns.xy, columns.r, columns.age_s)
+        at_rest = np.pad(self.place_m, ((0, 0), (0, 2))), np.pad(self.place_covariance, ((0, 0), (0, 2), (0, 2)))
+        squared_at_rest, log_determinant_at_rest = innovation(*at_rest, columns.xy, columns.r, np.zeros(len(columns.xy)))
+        inside = (squared <= CHI2_2DOF_999) | (self.standing[:, None] > 0) & (squared_at_rest <= CHI2_2DOF_999)
+        return squared + log_determinant, squared_at_rest + log_determinant_at_rest, inside
+
+    def _update(self, tracks: Index, columns: _Columns, taken: Index, costs: _Costs) -> None:
         if len(tracks) == 0:
             return
+        moving, standing, prior = costs[0][tracks, taken], costs[1][tracks, taken], self.standing[tracks]
+        posterior = prior * np.exp((_joined(moving, standing, prior) - standing) / 2)
+        self.standing[tracks] = np.where(posterior < MIN_STANDING_PROBABILITY, 0.0, posterior)
+        gain = self.place_covariance[tracks] @ np.linalg.inv(self.place_covariance[tracks] + columns.r[taken])
+        offset = columns.xy[taken] - self.place_m[tracks]
+        self.place_m[tracks] += (gain @ offset[:, :, None])[..., 0]
+        self.place_covariance[tracks] -= gain @ self.place_covariance[tracks]
         self.mean[tracks], self.covariance[tracks] = update(
             self.mean[tracks], self.covariance[tracks], columns.xy[taken], columns.r[taken], columns.age_s[taken]
         )
-        self.seen_ns[tracks] = now_ns
-        self.hits[tracks] += 1
 
     def _start(self, columns: _Columns, born: Index, now_ns: int) -> None:
         count, group = len(born), columns.group[born]
         mean, covariance = np.zeros((count, 4)), np.zeros((count, 4, 4))
         mean[:, :2], covariance[:, :2, :2] = columns.xy[born], columns.r[born]
-        covariance[:, 2:, 2:] = first_velocity(columns.yaw_rad[born], columns.name[born], whole_boxes=self.whole_boxes)
+        covariance[:, 2:, 2:] = first_velocity(columns.axis_rad[born], columns.name[born])
+        self.standing = np.concatenate([self.standing, np.full(count, STANDING_PRIOR)])
+        self.place_m = np.concatenate([self.place_m, columns.xy[born]])
+        self.place_covariance = np.concatenate([self.place_covariance, columns.r[born]])
         self.number = np.concatenate([self.number, np.arange(self._born, self._born + count)])
         self.mean, self.covariance = np.concatenate([self.mean, mean]), np.concatenate([self.covariance, covariance])
         self.seen_ns = np.concatenate([self.seen_ns, np.full(count, now_ns, dtype=np.int64)])
@@ -200,8 +247,14 @@ class _Columns:
 
     def __init__(self, found: Measurements, rows: Index, now_ns: int, *, whole_boxes: bool) -> None:
         self.xy = found.center_m[rows, :2]
-        self.yaw_rad = found.yaw_rad[rows]
+        self.axis_rad = (found.yaw_rad if whole_boxes else found.box_yaw_rad)[rows]
         self.group = np.array([_INDEX[c] for c in found.category[rows].tolist()])
         self.name = _NAME_ARRAY[self.group]
         self.r = measurement_noise(found.covariance[rows], self.name, whole_boxes=whole_boxes)
         self.age_s = (found.t_ns[rows] - now_ns) / NS_PER_S
+
+
+def _joined(moving: Array, standing: Array, probability: Array) -> Array:
+    """Return minus twice the log-likelihood of objects that stand with a probability, from those of both motions."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(-2 * np.logaddexp(np.log(1 - probability) - moving / 2, np.log(probability) - standing / 2))

@@ -74,12 +74,15 @@ def measurement_noise(covariance: Array, groups: NDArray[Any], *, whole_boxes: b
     return covariance + (extra**2)[:, None, None] * np.eye(2)
 
 
-def first_velocity(yaw_rad: Array, groups: NDArray[Any], *, whole_boxes: bool = False) -> Array:
-    """Return the initial covariance (M, 2, 2) of velocities; for whole boxes it is larger along the axis than across."""
+def first_velocity(axis_rad: Array, groups: NDArray[Any]) -> Array:
+    """Return the initial covariance (M, 2, 2) of velocities; along an axis, where one is known, it is larger than across.
+
+    `axis_rad` (M,) is the direction of the length, up to half turns, NaN where unknown.
+    """
     along = np.array([FIRST_SPEED_MPS[g] for g in groups.tolist()])
-    if not whole_boxes:
-        return (along**2)[:, None, None] * np.eye(2)
-    across = along * np.array([ACROSS_SHARE[g] for g in groups.tolist()])
-    axis = np.stack([np.cos(yaw_rad), np.sin(yaw_rad)], axis=-1)
+    known = np.isfinite(axis_rad)
+    across = along * np.where(known, np.array([ACROSS_SHARE[g] for g in groups.tolist()]), 1.0)
+    angle = np.where(known, axis_rad, 0.0)
+    axis = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     excess = (along**2 - across**2)[:, None, None] * axis[:, :, None] * axis[:, None, :]
     return np.asarray((across**2)[:, None, None] * np.eye(2) + excess)

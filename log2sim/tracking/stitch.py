@@ -132,10 +132,10 @@ def _filtered(
     t_ns = np.concatenate([m.t_ns[o] for m, o in zip(parts, orders)])
     r = np.concatenate([m.covariance[o] for m, o in zip(parts, orders)])
     r = measurement_noise(r, np.repeat(group, count), whole_boxes=whole_boxes)
-    yaw = np.array([m.yaw_rad[o[0]] for m, o in zip(parts, orders)])
+    axis = np.array([(m.yaw_rad if whole_boxes else m.box_yaw_rad)[o[0]] for m, o in zip(parts, orders)])
     mean, covariance = np.zeros((len(parts), 4)), np.zeros((len(parts), 4, 4))
     mean[:, :2], covariance[:, :2, :2] = xy[start], r[start]
-    covariance[:, 2:, 2:] = first_velocity(yaw, group, whole_boxes=whole_boxes)
+    covariance[:, 2:, 2:] = first_velocity(axis, group)
     noise = np.array([ACCELERATION_MPS2[g] for g in group.tolist()])
     for k in range(1, int(count.max())):
         on = np.flatnonzero(count > k)
