@@ -163,7 +163,9 @@ def test_collisions_that_the_log_has_not_are_marked_between_the_boxes() -> None:
         t.get_text() for t in layout_of(scenario, result).figure.legends[0].get_texts()
     ]
     assert len(new_collisions(replay(scenario))[0]) == 0
-    in_log = dataclasses.replace(result, metrics={**result.metrics, "collisions": [{**event, "belongs_to": "scenario"}]})
+    in_log = dataclasses.replace(
+        result, metrics={**result.metrics, "collisions": [{**event, "belongs_to": "scenario"}]}
+    )
     assert len(new_collisions(in_log)[0]) == 0
 
 

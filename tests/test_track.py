@@ -156,6 +156,53 @@ def test_tracks_that_cross_keep_their_identities(apart_m: float, seed: int) -> N
     assert [len(t) for t in tracks] == [60, 60]
 
 
+def street(seed: int, period_s: float, detected: float = 0.85) -> tuple[list[Measurements], np.ndarray]:
+    """A row of parked cars on either side of a street, traffic both ways and people, with missed and false detections.
+
+    Only what is within 40 m of a vehicle that drives along is seen.
+    """
+    rng = np.random.default_rng(seed)
+    ways: dict[str, tuple[str, Way]] = {}
+    for side in (-4.6, 4.6):
+        for k, x in enumerate(-60.0 + np.cumsum(rng.uniform(5.2, 11.0, 17))):
+            ways[f"parked {side} {k}"] = ("car", line(x, side, 0, 0))
+    for k in range(4):
+        ways[f"oncoming {k}"] = ("car", line(rng.uniform(0, 150), 1.9, -rng.uniform(7, 14), 0))
+        ways[f"walker {k}"] = ("pedestrian", line(rng.uniform(-40, 40), 7 * (-1) ** k, rng.choice([-1.3, 1.3]), 0))
+    ways["ahead"] = ("car", line(-40, -1.9, 8.5, 0))
+    t_ns, found = stamps(int(12 / period_s), period_s), []
+    for k in range(len(t_ns)):
+        ego = np.array([-50 + 8.0 * k * period_s, -1.9])
+        places = {n: np.array(way(k * period_s)) for n, (_, way) in ways.items() if rng.random() < detected}
+        places = {n: xy for n, xy in places.items() if np.hypot(*(xy - ego)) < 40}
+        places |= {f"false {j}": ego + rng.uniform(-30, 30, 2) * (1, 0.3) for j in range(rng.poisson(0.5))}
+        xy = np.array(list(places.values())).reshape(-1, 2)
+        kinds = [ways[n][0] if n in ways else "car" for n in places]
+        found.append(seen(xy + rng.normal(0, 0.15, xy.shape), t_ns[k], list(places), kinds, sigma_m=0.15))
+    return found, t_ns
+
+
+@pytest.mark.parametrize(("period_s", "share"), [(0.5, 0.95), (0.2, 0.99), (0.1, 0.995), (0.05, 0.995)])
+def test_tracks_in_a_street_of_parked_cars_hold_one_object_at_any_rate(period_s: float, share: float) -> None:
+    own = total = 0
+    for seed in range(3):
+        for t in track(*street(seed, period_s), **OPTIONS):
+            own += int(np.unique(t.measurements.camera, return_counts=True)[1].max())
+            total += len(t)
+    assert own / total > share
+
+
+def test_a_missed_car_does_not_shift_the_row_behind_it() -> None:
+    t_ns = stamps(5, 0.5)
+    row = {f"car {k}": (6.5 * k, 4.6) for k in range(6)}
+    found = []
+    for k in range(5):
+        here = [n for j, n in enumerate(row) if k != 2 or j != 0]  # the first is missed once,
+        here = here if k >= 2 else here[:-1]  # when another one comes into view at the end
+        found.append(seen(np.array([row[n] for n in here]), t_ns[k], here))
+    assert sorted(names_of(track(found, t_ns, **OPTIONS))) == [[n] for n in row]
+
+
 def test_pedestrians_that_meet_walk_on() -> None:
     ways = {"east": line(-4, 0.3, 1.4, 0), "west": line(4, -0.3, -1.4, 0)}
     tracks = track(*record(ways, 60, noise_m=0.05, category="pedestrian"), **OPTIONS)
