@@ -197,8 +197,8 @@ def test_a_missed_car_does_not_shift_the_row_behind_it() -> None:
     row = {f"car {k}": (6.5 * k, 4.6) for k in range(6)}
     found = []
     for k in range(5):
-        here = [n for j, n in enumerate(row) if k != 2 or j != 0]  # the first is missed once,
-        here = here if k >= 2 else here[:-1]  # when another one comes into view at the end
+        here = [n for j, n in enumerate(row) if k != 1 or j != 0]  # the first is missed once,
+        here = here if k >= 1 else here[:-1]  # when another one comes into view at the end
         found.append(seen(np.array([row[n] for n in here]), t_ns[k], here))
     assert sorted(names_of(track(found, t_ns, **OPTIONS))) == [[n] for n in row]
 
