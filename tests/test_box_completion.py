@@ -23,6 +23,8 @@ from log2sim.perception.box_completion import (
 from log2sim.perception.box_fitting import extents, rotate
 
 QUARTER = np.pi / 2
+# Of the corners of a car of 1.8 m.
+ROUNDING_M = CORNER_ROUNDING_SHARE * 1.8
 
 
 def apart(yaw, truth, period=QUARTER):
@@ -46,10 +48,10 @@ UNSEEN, RIGHT, LEFT, BOTH = (False, False), (True, False), (False, True), (True,
         ([10.0, 10.0], UNSEEN, [-1.2, 0.1], "ahead and to the left: the box reaches back from the far ends"),
         ([0.5, -10.0], UNSEEN, [0.5, 0.9], "beside the middle of the length, no end seen: centered"),
         ([0.5, -10.0], BOTH, [0.5, 0.9], "beside the middle of the length, both ends seen: centered"),
-        ([0.5, -10.0], RIGHT, [1 + 0.08 * 1.8 - 2.2, 0.9], "from the right side of a car, its front is on the right"),
-        ([0.5, -10.0], LEFT, [-0.08 * 1.8 + 2.2, 0.9], "and its rear on the left"),
-        ([0.5, 10.0], LEFT, [1 + 0.08 * 1.8 - 2.2, 0.1], "from its left side, its front is on the left"),
-        ([10.0, 0.5], LEFT, [-1.2, -0.08 * 1.8 + 0.9], "from ahead, its right side is on the left"),
+        ([0.5, -10.0], RIGHT, [1 + ROUNDING_M - 2.2, 0.9], "from the right side of a car, its front is on the right"),
+        ([0.5, -10.0], LEFT, [-ROUNDING_M + 2.2, 0.9], "and its rear on the left"),
+        ([0.5, 10.0], LEFT, [1 + ROUNDING_M - 2.2, 0.1], "from its left side, its front is on the left"),
+        ([10.0, 0.5], LEFT, [-1.2, -ROUNDING_M + 0.9], "from ahead, its right side is on the left"),
         ([0.5, 0.5], BOTH, [0.5, 0.5], "inside what was seen: nothing says where the rest is"),
     ],
 )

@@ -118,14 +118,21 @@ def scene_of(kind: str, pose: str, second: bool, *, exact: bool = False) -> Scen
     return scene_from_table(table_of(f"{kind}-{pose}{'-second' if second else ''}", place.ego, agents, exact=exact))
 
 
-def table_of(name: str, ego: dict[str, Any], agents: Sequence[dict[str, Any]], *, exact: bool = False) -> dict[str, Any]:
+def table_of(
+    name: str, ego: dict[str, Any], agents: Sequence[dict[str, Any]], *, exact: bool = False
+) -> dict[str, Any]:
     """Make the table of a scene with six cameras and one LiDAR around the ego."""
     cameras = [
         {"name": f"camera_{yaw}", "position_m": [1.4, 0.0, 1.6], "yaw_deg": float(yaw), "fov_deg": 70.0,
          "size_px": [480, 300], "offset_s": 0.05}
         for yaw in (0, 60, 120, 180, 240, 300)
     ]  # fmt: skip
-    lidar: dict[str, Any] = {"name": "top", "position_m": [1.2, 0.0, 2.0], "channels": 40, "elevation_deg": [-25.0, 15.0]}
+    lidar: dict[str, Any] = {
+        "name": "top",
+        "position_m": [1.2, 0.0, 2.0],
+        "channels": 40,
+        "elevation_deg": [-25.0, 15.0],
+    }
     if exact:
         lidar |= {"noise_m": 0.0, "dropout": 0.0, "resolution_m": 0.0}
     sigma = 0.0 if exact else 0.02
@@ -226,7 +233,10 @@ def log_of(scene: Scene, *, seed: int) -> tuple[Log, Scenario]:
         visible=None,
     )
     spec = scene.lidar[0]
-    sweeps = {int(t): cast(spec, moving, int(t), np.random.default_rng([seed, int(t) % 2**31])) for t in sweep_stamps(spec, scene)}
+    sweeps = {
+        int(t): cast(spec, moving, int(t), np.random.default_rng([seed, int(t) % 2**31]))
+        for t in sweep_stamps(spec, scene)
+    }
     ends = np.array(sorted(sweeps), dtype=np.int64)
     stream = Stream(spec.name, ends, lambda i: sweeps[int(ends[i])])
     return replace(log, labels=labels, streams={**log.streams, spec.name: stream}), truth
@@ -292,7 +302,19 @@ def row(f: Figures) -> list[str]:
     return [f.kind, f.pose, f.vehicle, *("-" if v is None else f"{v:.2f}" for v in values), str(f.extra)]
 
 
-HEAD = ("kind", "pose", "vehicle", "recall", "position m", "yaw deg", "length m", "width m", "speed m/s", "backwards", "extra")
+HEAD = (
+    "kind",
+    "pose",
+    "vehicle",
+    "recall",
+    "position m",
+    "yaw deg",
+    "length m",
+    "width m",
+    "speed m/s",
+    "backwards",
+    "extra",
+)
 
 
 def totals(rows: Sequence[Figures]) -> str:

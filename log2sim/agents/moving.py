@@ -83,7 +83,7 @@ def moving_candidate(
     for _ in range(PRELIMINARY_SMOOTHINGS):
         rough = smooth_track(t, xy, covariance=covariance + noise, at_s=t, motion=motion)
         headings = _headings(rough, group)
-        geometry = moving_geometry(track, headings)
+        geometry = moving_geometry(track, headings, rough.velocity_mps)
         xy, covariance = geometry.xy_m, geometry.covariance
     matches = _lidar_matches(track, rough, headings, geometry, obstacles, timeline)
     positions = _all_positions(track, geometry, matches, timeline)

@@ -65,8 +65,8 @@ class BoxEvidence:
         Height in m that the image box spans at the object's depth; NaN without points.
     points : (M,) int64
         Number of LiDAR points on the object.
-    cluster : M arrays (n, 3) float64
-        These points, subsampled, m.
+    cluster : M arrays (n, 4) or (n, 3) float64
+        These points, subsampled: x, y, z in m, and where it is known the time after `t_ns` in s at which each was measured.
     sensor_m : (M, 3) float64
         Viewpoint.
     yaw_rad : (M,) float64

@@ -20,8 +20,14 @@ SENSOR_SIGMA_M = 0.08
 SIZE_SIGMA_SHARE = 0.05
 # Kinds of observed ends, see `real_ends`.
 SIDE_END, FACING_END = 1, 2
-# Corners are rounded: the outermost point seen from the side is inside the box by about this share of the width.
-CORNER_ROUNDING_SHARE = 0.08
+# Corners are rounded: the outermost point seen from the side is inside the box by about this share of the width; trucks and
+# buses, which are wider than any car is without its mirrors, are boxes.
+CORNER_ROUNDING_SHARE, BOX_CORNER_ROUNDING_SHARE, MIN_BOX_WIDTH_M = 0.05, 0.02, 2.1
+# Azimuths nearer to each other are of one column of a LiDAR, or of several lines; those of successive firings are 0.1 to 0.4
+# degrees apart.
+MIN_AZIMUTH_STEP_RAD = np.deg2rad(0.04)
+# Points nearer than this to the plane of a side that is not seen do not tell how far rays on it are apart.
+MIN_SIDE_DISTANCE_M = 0.3
 # Standard deviation of a center that a 3D detector estimates, per axis: with many points, and the number of points with which
 # its variance is twice that.
 BOX_SIGMA_M, BOX_SIGMA_POINTS = 0.2, 20.0
@@ -33,7 +39,9 @@ AXIS_AMBIGUITY_SHARE = 0.25
 UNIFORM_SIGMA = 12.0**-0.5
 
 
-def real_ends(low: Array, high: Array, sensor: Array, ends_visible: NDArray[np.bool_]) -> NDArray[np.int64]:
+def real_ends(
+    low: Array, high: Array, sensor: Array, ends_visible: NDArray[np.bool_], *, min_sine: float = MIN_VIEW_SINE
+) -> NDArray[np.int64]:
     """Decide which ends of the observed extents are ends of the box.
 
     Parameters
@@ -44,6 +52,9 @@ def real_ends(low: Array, high: Array, sensor: Array, ends_visible: NDArray[np.b
         Viewpoint, in the same axes.
     ends_visible : (..., 2) bool
         Whether the right and the left end of the points, as seen from the sensor, are ends of the object.
+    min_sine : float
+        Of the angle at which a side is seen: below it only the near end is taken for one; lower where the distances
+        between rays are taken into account (`end_gaps`).
 
     Returns
     -------
@@ -63,7 +74,7 @@ def real_ends(low: Array, high: Array, sensor: Array, ends_visible: NDArray[np.b
     right, left = np.asarray(ends_visible)[..., 0], np.asarray(ends_visible)[..., 1]
     for axis in range(2):
         other = 1 - axis
-        is_side = (above[..., other] | below[..., other]) & (offset[..., other] >= MIN_VIEW_SINE * distance)
+        is_side = (above[..., other] | below[..., other]) & (offset[..., other] >= min_sine * distance)
         # The lower end of the length is on the left when the sensor is on the lower side of the box, that of the width when
         # the sensor is beyond the upper end of the length.
         low_is_left = below[..., other] if axis == 0 else above[..., other]
@@ -73,8 +84,45 @@ def real_ends(low: Array, high: Array, sensor: Array, ends_visible: NDArray[np.b
     return real
 
 
+def end_gaps(xy: Array, low: Array, high: Array, real: NDArray[np.int64]) -> Array:
+    """Measure how far the rays of a LiDAR are apart at the ends (2, 2) of the extents of points (n, 2), m.
+
+    An end seen from the side is up to one such distance beyond the outermost point. One that faces the sensor is hit.
+
+    Parameters
+    ----------
+    xy : (n, 2) float64, m
+        Relative to the sensor, along the length and the width.
+    low, high : (2,) float64, m
+        Ends of the extents.
+    real : (2, 2) int
+        From `real_ends`.
+
+    Notes
+    -----
+    Rays that are a small angle apart meet a side at distance d from the sensor's foot point on it, which is c away, at
+    points angle x (c^2 + d^2) / c apart.
+    """
+    middle = xy.mean(axis=0)
+    turned = rotate(xy, -float(np.arctan2(middle[1], middle[0])))
+    steps = np.diff(np.sort(np.arctan2(turned[:, 1], turned[:, 0])))
+    steps = steps[steps > MIN_AZIMUTH_STEP_RAD]
+    if len(steps) == 0:
+        return np.zeros((2, 2))
+    side_m = np.maximum(np.where(np.abs(low) < np.abs(high), np.abs(low), np.abs(high))[::-1], MIN_SIDE_DISTANCE_M)
+    end_m = np.stack([low, high], axis=-1)
+    gap = float(np.median(steps)) * (side_m[:, None] ** 2 + end_m**2) / side_m[:, None]
+    return np.asarray(np.where(real == FACING_END, 0.0, gap))
+
+
 def complete_box(
-    low: Array, high: Array, size_m: Array, real: NDArray[np.int64], known: NDArray[np.bool_] | bool = False
+    low: Array,
+    high: Array,
+    size_m: Array,
+    real: NDArray[np.int64],
+    known: NDArray[np.bool_] | bool = False,
+    *,
+    gap_m: Array | float = 0.0,
 ) -> tuple[Array, Array]:
     """Place a box of known size over its observed extents.
 
@@ -88,6 +136,8 @@ def complete_box(
         Kinds of the ends, see `real_ends`.
     known : (...) bool
         Whether a 3D detector tells the size, so that what is added to the points beyond a real end is no guess.
+    gap_m : (..., 2, 2) float64, m
+        From `end_gaps`.
 
     Returns
     -------
@@ -97,23 +147,38 @@ def complete_box(
 
     Notes
     -----
-    The box is aligned with its better real end; between two equally good ends, or without any, it is centered on the
-    points.
+    The box is aligned with its better real end; between two equally good ones it is centered, nearer to the one where rays
+    are closer together, and without any it is centered on the points.
     """
-    low, high = corner_correction(low, high, real, size_m[..., 1])
+    best = (real > 0) & (real == real.max(axis=-1, keepdims=True))
+    weight = np.where(best, 1.0 / (SENSOR_SIGMA_M**2 + (UNIFORM_SIGMA * np.asarray(gap_m)) ** 2), 0.0)
+    low, high = corner_correction(low, high, real, size_m[..., 1], gap_m=gap_m)
     slack = size_m - (high - low)
-    better = np.sign(real[..., 1] - real[..., 0])
+    total = weight.sum(axis=-1)
+    better = (weight[..., 1] - weight[..., 0]) / np.where(total > 0, total, 1.0)
     one_end = np.where(np.asarray(known)[..., None], 0.0, UNIFORM_SIGMA)
     doubt = np.where(real.any(axis=-1), one_end, 1.0) * np.maximum(slack, 0.0)
     # Objects of one category differ in size, so the position of an unobserved end is never exact.
-    spread = np.where(real.all(axis=-1), 0.0, SIZE_SIGMA_SHARE * size_m)
+    # A box that is laid against one end is off by half of what its size is.
+    spread = np.where(real.all(axis=-1), np.abs(better) / 2 * (slack > 0), 1.0) * SIZE_SIGMA_SHARE * size_m
     return (low + high) / 2 - better * slack / 2, np.sqrt(SENSOR_SIGMA_M**2 + doubt**2 + spread**2)
 
 
-def corner_correction(low: Array, high: Array, real: NDArray[np.int64], width_m: Array | float) -> tuple[Array, Array]:
-    """Move ends (..., 2) observed from the side outward to the corner of the box, which is too round to be hit there."""
-    outward = np.where(real == SIDE_END, CORNER_ROUNDING_SHARE * np.asarray(width_m)[..., None, None], 0.0)
+def corner_correction(
+    low: Array, high: Array, real: NDArray[np.int64], width_m: Array | float, *, gap_m: Array | float = 0.0
+) -> tuple[Array, Array]:
+    """Move ends (..., 2) observed from the side outward to the corner of the box.
+
+    The corner is too round to be hit, and on average it is half the distance `gap_m` between two rays beyond the last one.
+    """
+    outward = np.where(real == SIDE_END, _rounding(width_m) + np.asarray(gap_m) / 2, 0.0)
     return np.asarray(low - outward[..., 0]), np.asarray(high + outward[..., 1])
+
+
+def _rounding(width_m: Array | float) -> Array:
+    """Return how far inside the corner of a box of a width (...) its outermost point is: (..., 1, 1), m."""
+    width = np.asarray(width_m)[..., None, None]
+    return np.asarray(np.where(width < MIN_BOX_WIDTH_M, CORNER_ROUNDING_SHARE, BOX_CORNER_ROUNDING_SHARE) * width)
 
 
 def oriented_covariance(sigma_m: Array, yaw_rad: Array | float) -> Array:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes import MAX_SIZE_M, MIN_SIZE_M
 from log2sim.geometry import Array, wrap_angle
 
 SEARCH_STEP_RAD = np.deg2rad(2.0)
@@ -19,6 +21,12 @@ MIN_YAW_POINTS, MAX_CORRECTION_POINTS = 30, 128
 CORRECTIONS_RAD = np.arange(-7, 8) * SEARCH_STEP_RAD
 # A side longer than this multiple of the typical width is not a front or rear.
 MAX_WIDTH_FACTOR = 1.2
+# Smallest and largest size of a category are so many standard deviations of the logarithm apart.
+LIMIT_SIGMAS = 4.0
+# Smallest extent and probability of which a logarithm is taken.
+MIN_EXTENT_M, MIN_PROBABILITY = 0.05, 1e-6
+# Stray points are outside an object by less than this.
+MAX_TRIM_M = 0.1
 # Quantile of the points' heights that is taken for the top, robust to stray points.
 TOP_QUANTILE = 0.98
 
@@ -44,9 +52,9 @@ def fit_extents(points: Array, typical: Array, known_yaw_rad: float | None = Non
     """
     if known_yaw_rad is not None:
         yaw_rad = corrected_yaw(points, known_yaw_rad)
-        return yaw_rad, *extents(points, yaw_rad)
+        return yaw_rad, *extents(points, yaw_rad, max_trim_m=MAX_TRIM_M)
     yaw_rad, _ = fit_yaw(points)
-    low, high = extents(points, yaw_rad)
+    low, high = extents(points, yaw_rad, max_trim_m=MAX_TRIM_M)
     if axes_swapped(high - low, -(low + high) / 2, typical):
         yaw_rad += np.pi / 2
         low, high = np.array([low[1], -high[0]]), np.array([high[1], -low[0]])
@@ -128,6 +136,20 @@ def subsample(points: NDArray[Any], max_count: int) -> NDArray[Any]:
     return points[np.linspace(0, len(points) - 1, max_count).round().astype(np.int64)]
 
 
+def sample_surface(range_m: Array, max_count: int) -> NDArray[np.intp]:
+    """Return the indices of at most `max_count` points at distances (N,) from a sensor, evenly spread over their surface.
+
+    Notes
+    -----
+    A ray stands for a surface that grows with the square of the distance. Of every so-manieth point hardly one would be on
+    the far end of a long vehicle beside the sensor.
+    """
+    if len(range_m) <= max_count:
+        return np.arange(len(range_m))
+    area = np.cumsum(range_m.astype(np.float64) ** 2)
+    return np.unique(np.searchsorted(area, (np.arange(max_count) + 0.5) / max_count * area[-1]))
+
+
 def extents(xy_m: Array, yaw_rad: float, trim: float = 0.01, max_trim_m: float = np.inf) -> tuple[Array, Array]:
     """Measure the lower and upper ends (2,), (2,) of points (N, 2) along the length and width axes of a yaw.
 
@@ -186,6 +208,33 @@ def axes_swapped(extents_m: Array, sensor: Array, typical: Array) -> bool:
         return bool(extents_m[1] > extents_m[0])
     along, across = np.median(np.abs(np.atleast_2d(sensor)), axis=0)
     return bool(across > along)
+
+
+def swapped_log_odds(extents_m: Array, whole: NDArray[np.bool_], sigma_m: Array, category: str) -> float:
+    """Return the log-odds that the second of two axes is the length of an object, by the sizes of its category.
+
+    Parameters
+    ----------
+    extents_m : (2,) float64
+        Of what was seen along both axes.
+    whole : (2,) bool
+        Whether that is the whole side; else the side may be longer.
+    sigma_m : (2,) float64
+        Standard deviation of the extents.
+
+    Notes
+    -----
+    The logarithm of a side is normal, with the limits of the category two standard deviations off its middle.
+    """
+    low, high = (np.log(np.array(t[category][:2])) for t in (MIN_SIZE_M, MAX_SIZE_M))
+    extents_m = np.maximum(extents_m, MIN_EXTENT_M)
+    sigma = np.hypot((high - low) / LIMIT_SIGMAS, (sigma_m / extents_m)[:, None])
+    # Rows are the observed axes, columns length and width.
+    z = (np.log(extents_m)[:, None] - (low + high) / 2) / sigma
+    density = -(z**2) / 2 - np.log(sigma)
+    longer = np.log([[max(math.erfc(v / math.sqrt(2)) / 2, MIN_PROBABILITY) for v in row] for row in z.tolist()])
+    score = np.where(whole[:, None], density, longer)
+    return float(score[0, 1] + score[1, 0] - score[0, 0] - score[1, 1])
 
 
 def align_to(yaw_rad: float, toward_rad: float, period_rad: float) -> float:

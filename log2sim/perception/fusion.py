@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Measurements
+from log2sim.geometry import NS_PER_S
 from log2sim.perception.box_completion import place_boxes, provisional_sizes
 from log2sim.perception.box_fitting import fit_extents, rotate, top_of
 
@@ -117,10 +118,10 @@ def _join(rows: Measurements, leader: int, members: NDArray[np.intp]) -> Measure
     merged = [leader, *others]
     boxed = rows.take([next((m for m in merged if np.isfinite(rows.box_yaw_rad[m])), leader)])
     row = replace(row, **{column: getattr(boxed, column) for column in BOX_COLUMNS})
-    cluster = np.concatenate([rows.cluster[m] for m in merged])
-    xyz, box_yaw = cluster - row.sensor_m[0], float(row.box_yaw_rad[0])
+    cluster = _timed_from(rows, merged, int(row.t_ns[0]))
+    xy, box_yaw = cluster[:, :2] - row.sensor_m[0, :2], float(row.box_yaw_rad[0])
     typical = np.array(TYPICAL_SIZE_M[str(row.category[0])])
-    yaw, low, high = fit_extents(xyz[:, :2], typical, None if np.isnan(box_yaw) else box_yaw)
+    yaw, low, high = fit_extents(xy, typical, None if np.isnan(box_yaw) else box_yaw)
     return place_boxes(replace(
         row, cluster=(cluster,), yaw_rad=np.array([yaw]), low_m=low[None], high_m=high[None],
         top_m=np.array([top_of(cluster[:, 2])]),
@@ -128,6 +129,15 @@ def _join(rows: Measurements, leader: int, members: NDArray[np.intp]) -> Measure
         ends_visible=np.asarray(rows.ends_visible[merged].any(axis=0, keepdims=True)),
         truncated=np.array([rows.truncated[merged].all()]), points=rows.points[merged].max(keepdims=True),
     ))  # fmt: skip
+
+
+def _timed_from(rows: Measurements, members: Sequence[int], t_ns: int) -> NDArray[np.float64]:
+    """Return the points (n, 4) of several rows, with their times after a common stamp."""
+    parts = [
+        np.column_stack([c, np.zeros(len(c))]) if c.shape[1] == 3 else c for c in (rows.cluster[m] for m in members)
+    ]
+    late_s = [[0.0, 0.0, 0.0, (int(rows.t_ns[m]) - t_ns) / NS_PER_S] for m in members]
+    return np.concatenate([part + late for part, late in zip(parts, late_s)])
 
 
 def _is_driver(rows: Measurements) -> NDArray[np.bool_]:

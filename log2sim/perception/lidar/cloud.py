@@ -60,7 +60,7 @@ class Cloud:
     t_s : (N,) float32
         Time of every point relative to `stamp_ns`.
     sensor : (3,) float32
-        Position of the sensor, mean over several, relative to `origin`.
+        Position of the sensor in the middle of the sweep, mean over several, relative to `origin`.
     ground : (N,) bool
         True for points on the ground.
     height : (N,) float32
@@ -222,7 +222,9 @@ def assemble_cloud(
         if mapped is None or len(mapped[0]) == 0:
             continue
         stamp = stamp or sweep.stamp_ns
-        sensor, known = log.map_T_sensor(name, sweep.stamp_ns)
+        # Halfway through the sweep: a sensor at 30 m/s is 3 m away from there at its begin or end.
+        middle_ns = round(float(mapped[1].mean(dtype=np.float64)) * NS_PER_S)
+        sensor, known = log.map_T_sensor(name, sweep.stamp_ns + middle_ns)
         local = (mapped[0] - origin).astype(np.float32)
         near = (np.abs(local[:, 0]) <= max_range_m) & (np.abs(local[:, 1]) <= max_range_m)
         t_s = mapped[1] + np.float32((sweep.stamp_ns - stamp) / NS_PER_S)

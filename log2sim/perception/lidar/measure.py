@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import TYPICAL_SIZE_M, Detections, Measurements
 from log2sim.geometry import NS_PER_S, Array, Camera
 from log2sim.perception.box_completion import place_boxes
-from log2sim.perception.box_fitting import fit_extents, subsample, top_of, upper_median
+from log2sim.perception.box_fitting import fit_extents, sample_surface, top_of, upper_median
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.clusters import (
     MARGIN,
@@ -90,9 +90,12 @@ def write_evidence(columns: dict[str, Any], k: int, members: NDArray[np.intp], c
     columns["bottom_m"][k] = upper_median(xyz[:, 2] - cloud.height[members]) + cloud.origin[2]
     columns["top_m"][k] = top_of(xyz[:, 2]) + cloud.origin[2]
     columns["points"][k] = len(members)
-    columns["t_ns"][k] = cloud.stamp_ns + round(float(cloud.t_s[members].mean()) * NS_PER_S)
+    t_s = cloud.t_s[members].astype(np.float64)
+    mean_ns = round(float(t_s.mean()) * NS_PER_S)
+    columns["t_ns"][k] = cloud.stamp_ns + mean_ns
     columns["sensor_m"][k] = cloud.sensor + cloud.origin
-    columns["cluster"][k] = subsample(xyz, MAX_KEPT_POINTS) + cloud.origin
+    timed = np.column_stack([xyz + cloud.origin, t_s - mean_ns / NS_PER_S])
+    columns["cluster"][k] = timed[sample_surface(np.linalg.norm(xyz - cloud.sensor, axis=1), MAX_KEPT_POINTS)]
 
 
 def _measure_as_paper(rows: Measurements, view: View, cloud: Cloud) -> Measurements:
