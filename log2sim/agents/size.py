@@ -116,8 +116,9 @@ class _Ends:
         """Return the ends along axes that are turned by a quarter turn."""
         low = np.stack([self.low[:, 1], -self.high[:, 0]], axis=1)
         high = np.stack([self.high[:, 1], -self.low[:, 0]], axis=1)
-        real, gap = (np.stack([e[:, 1], e[:, 0, ::-1]], axis=1) for e in (self.real, self.gap_m))
-        return _Ends(low, high, real, gap)
+        real = np.stack([self.real[:, 1], self.real[:, 0, ::-1]], axis=1)
+        gap_m = np.stack([self.gap_m[:, 1], self.gap_m[:, 0, ::-1]], axis=1)
+        return _Ends(low, high, real, gap_m)
 
 
 def _static_ends(track: Track, xy: Array, origin: Array) -> tuple[float, _Ends]:
@@ -183,9 +184,8 @@ def moving_geometry(track: Track, yaw_rad: Array, velocity_mps: Array | None = N
     if len(rows) == 0:
         return _geometry_without_points(track)
     yaw, sensor = yaw_rad[rows], m.sensor_m[rows, :2]
-    ends = _join_ends(
-        [_ends_of(m, k, float(yaw_rad[k]), None if velocity_mps is None else velocity_mps[k]) for k in rows]
-    )
+    moved = np.zeros((len(m), 2)) if velocity_mps is None else velocity_mps
+    ends = _join_ends([_ends_of(m, k, float(yaw_rad[k]), moved[k]) for k in rows.tolist()])
     size, is_likely = _estimate_size(ends, track.category, typical_box_size(m))
     has_box = np.isfinite(m.box_yaw_rad[rows])
     center, sigma = box_completion.complete_box(ends.low, ends.high, size, ends.real, has_box, gap_m=ends.gap_m)
@@ -204,10 +204,10 @@ def moving_geometry(track: Track, yaw_rad: Array, velocity_mps: Array | None = N
     return TrackGeometry(np.append(size, height), xy, covariance, z, None, is_likely)
 
 
-def _ends_of(m: Measurements, k: int, yaw_rad: float, velocity_mps: Array | None) -> _Ends:
+def _ends_of(m: Measurements, k: int, yaw_rad: float, velocity_mps: Array) -> _Ends:
     """Find the ends of the points of measurement `k`, relative to its viewpoint, for an object that points along a yaw."""
     xy = m.cluster[k][:, :2] - m.sensor_m[k, :2]
-    if velocity_mps is not None and m.cluster[k].shape[1] > 3:
+    if m.cluster[k].shape[1] > 3:
         xy = xy - m.cluster[k][:, 3:] * velocity_mps
     low, high = box_fitting.extents(xy, yaw_rad, max_trim_m=box_fitting.MAX_TRIM_M)
     real = box_completion.real_ends(low, high, np.zeros(2), m.ends_visible[k], min_sine=MIN_SIDE_SINE)
@@ -265,9 +265,10 @@ def _estimate_size(ends: _Ends, category: str, known: Array | None) -> tuple[Arr
         observed = weighted_median(sides, 1.0 / error)
         prior = (share * expected)[axis] ** 2
         size[axis] = observed + error_of_all / (error_of_all + prior) * (expected[axis] - observed)
-    return np.clip(np.maximum(size, least), smallest, largest), _is_likely_size(
-        seen, whole, np.maximum(expected, least), category
-    )
+    # What lies between two rays is no evidence.
+    between = np.where(ends.real == box_completion.SIDE_END, ends.gap_m / 2, 0.0).sum(axis=2)
+    is_likely = _is_likely_size(seen - between, whole, np.maximum(expected, least), category)
+    return np.clip(np.maximum(size, least), smallest, largest), is_likely
 
 
 def _is_likely_size(seen: Array, whole: NDArray[np.bool_], else_m: Array, category: str) -> bool:
