@@ -47,6 +47,11 @@ def mean_box_axis(m: BoxEvidence) -> float | None:
 
 def weighted_median(values: Array, weight: Array) -> float:
     """Return the smallest of the values (N,), N > 0, that half of the weight (N,) does not exceed."""
+    return weighted_quantile(values, weight, 0.5)
+
+
+def weighted_quantile(values: Array, weight: Array, share: float) -> float:
+    """Return the smallest of the values (N,), N > 0, that hold a share of the weight (N,) together with all smaller ones."""
     order = np.argsort(values, kind="stable")
     reached = np.cumsum(weight[order])
-    return float(values[order[np.searchsorted(reached, reached[-1] / 2)]])
+    return float(values[order[np.searchsorted(reached, reached[-1] * share)]])

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.agents.box_votes import independent, mean_box_axis, mean_box_center, typical_box_size, weighted_median
+from log2sim.agents.box_votes import independent, mean_box_axis, mean_box_center, typical_box_size, weighted_quantile
 from log2sim.datatypes import CATEGORY, GROUP_OF, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M, Measurements, Track
 from log2sim.geometry import Array
 from log2sim.perception import box_completion, box_fitting
@@ -21,6 +21,8 @@ from log2sim.perception.lidar.clusters import MIN_CLUSTER_POINTS
 # Quantile of the lengths of fully observed sides that is taken for the size: stray points lengthen some, sparse points
 # shorten most.
 SIZE_QUANTILE = 0.85
+# The same where the gaps between rays are taken into account: what is left is that parts were too dark or too low to be hit.
+WHOLE_SIDE_QUANTILE = 0.7
 # Points of a static object are persistent if so many of the ticks have points in their cell.
 VOXEL_M = 0.15
 MIN_PERSISTENT_SHARE = 0.15
@@ -30,10 +32,10 @@ MIN_STATIC_POINTS = 5
 # Standard deviations of a side observed from end to end (stray points lengthen it, gaps between rays shorten it), and of the
 # sizes that a 3D detector estimates, as a share.
 WHOLE_SIDE_SIGMA_M, BOX_SIZE_SIGMA_SHARE = 0.15, 0.07
-# A side of a person or a two-wheeler that is shorter than this share of the typical one lacks limbs or a wheel.
-MIN_WHOLE_SIDE_FACTOR = 0.75
+# A side that is shorter than the typical one by more standard deviations of its logarithm lacks a hood, a limb or a wheel.
+MAX_SHORT_SIGMAS = 1.5
 # A side seen at a smaller angle than this (sine) shows its near end only: its far end rests on few rays.
-MIN_SIDE_SINE = 0.15
+MIN_SIDE_SINE = 0.35
 # Directive 96/53/EC, Annex I: 2.55 m, refrigerated vehicles 2.6 m; the United States allow 102 inches. What is beyond are mirrors.
 MAX_ROAD_WIDTH_M = 2.6
 # A length axis is told by the lengths of the sides if the odds are e to one.
@@ -249,20 +251,20 @@ def _estimate_size(ends: _Ends, category: str, known: Array | None) -> tuple[Arr
     typical, smallest, limit = (np.array(t[category][:2]) for t in (TYPICAL_SIZE_M, MIN_SIZE_M, MAX_SIZE_M))
     is_vehicle = GROUP_OF[category] == "vehicle"
     largest = np.minimum(limit, [np.inf, MAX_ROAD_WIDTH_M]) if is_vehicle else limit
-    enough = smallest if is_vehicle else MIN_WHOLE_SIDE_FACTOR * typical
     expected = np.minimum(typical if known is None else known[:2], largest)
-    share = np.log(largest / smallest) / box_fitting.LIMIT_SIGMAS if known is None else BOX_SIZE_SIGMA_SHARE
+    spread = np.log(limit / smallest) / box_fitting.LIMIT_SIGMAS
+    enough, share = np.exp(-MAX_SHORT_SIGMAS * spread) * typical, spread if known is None else BOX_SIZE_SIGMA_SHARE
     low, high = box_completion.corner_correction(ends.low, ends.high, ends.real, expected[1], gap_m=ends.gap_m)
     seen, whole = high - low, np.all(ends.real, axis=2)
     variance = WHOLE_SIDE_SIGMA_M**2 + (box_completion.UNIFORM_SIGMA * ends.gap_m).sum(axis=2) ** 2
     least = np.quantile(ends.high - ends.low, SIZE_QUANTILE, axis=0)
     # What is shorter than a part that was seen at other times was not seen from end to end.
-    used = whole & (seen + 2 * np.sqrt(variance) >= np.maximum(least, enough))
+    used = whole & (seen + 2 * np.sqrt(variance) >= least) & (seen >= enough)
     size = expected.copy()
     for axis in np.flatnonzero(used.any(axis=0)):
         sides, error = seen[used[:, axis], axis], variance[used[:, axis], axis]
         error_of_all = error.min() / independent(len(sides))
-        observed = weighted_median(sides, 1.0 / error)
+        observed = weighted_quantile(sides, 1.0 / error, WHOLE_SIDE_QUANTILE)
         prior = (share * expected)[axis] ** 2
         size[axis] = observed + error_of_all / (error_of_all + prior) * (expected[axis] - observed)
     # What lies between two rays is no evidence.
