@@ -66,7 +66,7 @@ def read_bytes(path: Path | str, limit_bytes: int) -> bytes:
     """
     with open_regular(path, buffering=0) as file:
         size = os.fstat(file.fileno()).st_size
-        parts, count = [], 0
+        parts, count = list[bytes](), 0
         while count <= limit_bytes and size <= limit_bytes:
             part = file.read(min(size - count if size > count else CHUNK_BYTES, limit_bytes + 1 - count))
             if not part:

@@ -10,8 +10,11 @@ import pytest
 from export_paths import agent, bend, line, scenario
 
 from log2sim.datatypes import Agent, Scenario
-from log2sim.errors import ScenarioError
+from log2sim.errors import MissingExtra, ScenarioError
+from log2sim.export import checks
 from log2sim.export.checks import export_notes, overlaps_at_entry, require_exportable, require_start_as_in_scenario
+from log2sim.export.exporters import export
+from log2sim.export.sampling import step_times
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
 
@@ -76,7 +79,7 @@ def test_what_logs_hold_is_no_error(fine: Agent) -> None:
 
 def test_agents_in_one_another_when_the_later_one_appears_are_remarked() -> None:
     ego, late = agent(line()), agent(np.full((5, 2), [10.0, 0.5]), "late", yaw_rad=0.3, first_s=1.0)
-    assert overlaps_at_entry([ego, late])[0][:2] == (0, 1)
+    assert next(overlaps_at_entry([ego, late]))[:2] == (0, 1)
     (note,) = export_notes(scenario(late, ego))
     assert note.startswith("agents 'ego' and 'late' overlap by ")
     assert " at 1 s, " in note
@@ -113,7 +116,7 @@ def test_overlaps_at_entry_agree_with_looking_at_every_pair() -> None:
         if (inside[i] & inside[j]).sum() > 0.02 * (inside[i] | inside[j]).sum()
     ]
     expected = {frozenset(pair) for pair in pairs}
-    found = overlaps_at_entry(agents)
+    found = list(overlaps_at_entry(agents))
     assert {frozenset(pair[:2]) for pair in found} == expected
     assert len(found) == len(expected)
     assert len(expected) > 5
@@ -135,3 +138,74 @@ def test_a_start_that_puts_agents_into_one_another_is_refused_unless_the_log_did
         require_start_as_in_scenario(agents, together)
     require_start_as_in_scenario(agents, together * [[1, 1, 1, 1], [np.nan, 1, 1, 1]])
     require_start_as_in_scenario([agent(line()), agent(line(start=(0.0, 0.5)), "beside")], together)
+
+
+def stacked(count: int, later_s: float = 0.0) -> list[Agent]:
+    """Agents in one place, each of which appears a little later than the one before."""
+    base = agent(line())
+    first = replace(base.waypoints, t_s=base.waypoints.t_s[:2], **{k: v[:2] for k, v in vars(base.waypoints).items() if v is not None and k != "t_s"})  # fmt: skip
+    return [replace(base, id=f"a{k}", waypoints=replace(first, t_s=first.t_s + later_s * k)) for k in range(count)]
+
+
+@pytest.mark.parametrize("later_s", [0.0, 1e-5], ids=["at once", "one after the other"])
+def test_many_agents_in_one_place_are_listed_up_to_a_limit(later_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """4.5 million pairs overlap; the areas of one batch of them are computed."""
+    compared = []
+
+    def counted(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        compared.append(len(a))
+        return np.ones(len(a))
+
+    monkeypatch.setattr(checks, "bev_iou", counted)
+    notes = export_notes(scenario(*stacked(3000, later_s)))
+    assert len(notes) == 101
+    assert notes[-1] == "more than 100 pairs of agents overlap when one of them appears; only the first are listed"
+    assert sum(compared) < 10_000
+
+
+def test_what_an_export_leaves_in_place_is_not_compared_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    agents = stacked(3000)
+    placed = np.array(
+        [[a.waypoints.x_m[0], a.waypoints.y_m[0], a.waypoints.z_m[0], a.waypoints.yaw_rad[0]] for a in agents]
+    )
+    monkeypatch.setattr(checks, "bev_iou", lambda *_: pytest.fail("nothing was moved"))
+    require_start_as_in_scenario(agents, placed + 1e-5)
+    monkeypatch.undo()
+    apart = [*agents[:50], replace(agent(line(start=(500.0, 0.0))), id="far")]
+    there = np.vstack([placed[:50], [500.0, 0.0, 0.8, 0.0]])
+    require_start_as_in_scenario(apart, there)
+    there[-1] = placed[0]
+    with pytest.raises(ScenarioError, match="agents 'a0' and 'far' would overlap at the start"):
+        require_start_as_in_scenario(apart, there)
+
+
+def test_one_waypoint_far_in_the_future_is_refused_before_samples_are_made(tmp_path: Path) -> None:
+    import tracemalloc
+
+    ego, late = agent(line()), agent(line(start=(0.0, 8.0)), "late")
+    t_s = late.waypoints.t_s.copy()
+    t_s[-1] = 1e6
+    long = scenario(ego, replace(late, waypoints=replace(late.waypoints, t_s=t_s)), duration_s=1e6)
+    for name in ("carla", "scenarionet", "commonroad", "osi"):
+        tracemalloc.start()
+        try:
+            export(long, name, tmp_path / name)
+        except (ScenarioError, MissingExtra) as problem:
+            assert_one_line_about_length(problem)
+        else:
+            assert name == "scenarionet", "only that one ends with the ego"
+        assert tracemalloc.get_traced_memory()[1] < 50_000_000
+        tracemalloc.stop()
+
+
+def assert_one_line_about_length(problem: Exception) -> None:
+    assert "\n" not in str(problem)
+    assert isinstance(problem, MissingExtra) or "cut the scenario into parts" in str(problem)
+
+
+def test_the_samples_of_all_agents_together_are_limited() -> None:
+    assert len(step_times(0.0, 9000.0, 0.1, agents=100)) == 90_001
+    with pytest.raises(
+        ScenarioError, match=r"^2000 agents over 9000 s: their samples take 16\.1 GiB, at most 1\.5 GiB"
+    ):
+        step_times(0.0, 9000.0, 0.1, agents=2000)

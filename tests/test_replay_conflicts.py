@@ -11,6 +11,7 @@ from replay_scenes import line
 from test_replay_contacts import SPACING_S, T_S, boxes_of
 
 from log2sim.geometry import rectangles_overlap
+from log2sim.simulation.metrics import post_encroachment_time
 from log2sim.simulation.metrics.box_tracks import BoxTracks
 from log2sim.simulation.metrics.conflicts import conflicts, most_critical
 from log2sim.simulation.metrics.post_encroachment_time import CROSSING_RAD, post_encroachment_times
@@ -249,3 +250,15 @@ def test_on_a_slope_the_time_to_collision_is_that_on_the_flat_and_under_a_bridge
 
     assert least(lambda a: grade * a.waypoints.x_m) == least(lambda a: 0 * a.waypoints.x_m) is not None
     assert least(lambda a: 0 * a.waypoints.x_m + 6 * (a.id == "slow")) is None
+
+
+def test_agents_that_stand_in_one_place_are_not_compared_for_post_encroachment(monkeypatch):
+    """4.5 million pairs with every difference of headings: none of them leaves or arrives."""
+    count, rows = 3000, 81
+    still = np.zeros((rows, count))
+    yaw = np.broadcast_to(np.linspace(-3, 3, count), (rows, count))
+    boxes = BoxTracks(still, still, still, yaw, still, np.tile([4.0, 2.0, 1.5], (count, 1)))
+    compared = []
+    monkeypatch.setattr(post_encroachment_time._SweptRectangles, "met", lambda self, pairs: compared.append(len(pairs.a)) or pairs)  # fmt: skip
+    assert len(post_encroachment_time.post_encroachment_times(boxes, 0.05).first) == 0
+    assert sum(compared) == 0

@@ -7,7 +7,9 @@ import pytest
 from replay_maneuvers import agent_from, scenario_of
 from scipy.optimize import brentq
 
+from log2sim.errors import ScenarioError
 from log2sim.geometry import rectangles_overlap, wrap_angle
+from log2sim.simulation.metrics import collisions as collisions_module
 from log2sim.simulation.metrics.box_tracks import BoxTracks
 from log2sim.simulation.metrics.collisions import collisions, contacts
 from log2sim.simulation.metrics.continuous_collision import MAX_STEPS, RelativeMotion, first_contact
@@ -182,3 +184,35 @@ def test_a_collision_does_not_depend_on_the_step(mode):
         (event,) = replay(scenario_of(a, b), mode=mode, dt_s=dt_s).metrics["collisions"]
         assert event["t_s"] == pytest.approx((131.0 - 4.4) / 60, abs=2e-4)
         assert event["relative_speed_mps"] == pytest.approx(60.0, abs=0.01)
+
+
+def test_batches_of_pairs_find_the_same_contacts(monkeypatch):
+    rng = np.random.default_rng(4)
+    tracks = [
+        (lambda t, x=x, v=v: x + v * t, lambda t, y=y, w=w: y + w * t, float(yaw))
+        for x, y, v, w, yaw in rng.uniform([0, 0, -9, -9, -3], [60, 60, 9, 9, 3], (40, 5))
+    ]
+    boxes, moves = boxes_of(*tracks), np.ones(40, bool)
+    whole = contacts(boxes, moves)
+    assert len(whole.a) > 50
+    monkeypatch.setattr(collisions_module, "MAX_PAIRS", 7)
+    monkeypatch.setattr(collisions_module, "BATCH", 11)
+    parts = contacts(boxes, moves)
+    for name in ("a", "b", "first_row", "last_row"):
+        one, two = (getattr(c, name)[np.lexsort((c.first_row, c.b, c.a))] for c in (whole, parts))
+        np.testing.assert_allclose(one, two)
+
+
+def test_agents_on_top_of_each_other_are_refused_before_all_pairs_are_kept(monkeypatch):
+    import tracemalloc
+
+    monkeypatch.setattr(collisions_module, "MAX_CONTACTS", 200_000)
+    count = 1500
+    still = np.zeros((len(T_S), count))
+    boxes = BoxTracks(still, still, still, still, still, np.tile([4.0, 2.0, 1.5], (count, 1)))
+    tracemalloc.start()
+    with pytest.raises(ScenarioError, match="1500 agents touch in more than 200000 pairs and steps: they lie on top"):
+        contacts(boxes, np.ones(count, bool))
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak_bytes < 800_000_000

@@ -16,7 +16,10 @@ DERIVATIVE_S = (
     0.05  # half the span of difference quotients: half a step of most logs, so adjacent waypoints decide them
 )
 ROUNDING_S = 1e-6
-MAX_STEPS = 100_000  # 2.8 hours at 10 Hz; bounds the memory of a table of all agents
+MAX_STEPS = 100_000  # 2.8 hours at 10 Hz
+# Memory of a table of all agents: at 2.8 hours 160 of them.
+MAX_SAMPLED_BYTES = 1536 * 1024 * 1024
+BYTES_PER_STATE = 96
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,13 +99,13 @@ def sample_steps(agent: Agent, t_s: Array, step_s: float, at_least: int = 1) -> 
     return sample_motion(agent, t_s, margin_s=max(at_least * step_s / 2, after + ROUNDING_S))
 
 
-def step_times(start_s: float, stop_s: float, step_s: float) -> Array:
-    """Return times (T,) from `start_s` in equal steps up to `stop_s`, at least one.
+def step_times(start_s: float, stop_s: float, step_s: float, agents: int = 1) -> Array:
+    """Return times (T,) from `start_s` in equal steps up to `stop_s`, at least one, at which a number of agents are sampled.
 
     Raises
     ------
     ScenarioError
-        For more than `MAX_STEPS`, before anything is allocated for them.
+        For more than `MAX_STEPS`, or states of all agents of more than `MAX_SAMPLED_BYTES`, before anything is allocated.
     """
     steps = (stop_s - start_s) / step_s + 1e-6
     if steps > MAX_STEPS:
@@ -110,7 +113,17 @@ def step_times(start_s: float, stop_s: float, step_s: float) -> Array:
             f"waypoints span {stop_s - start_s:g} s, at most {MAX_STEPS * step_s:g} s can be exported in steps of "
             f"{step_s:g} s; cut the scenario into parts"
         )
+    require_sampled_bytes(agents * steps * BYTES_PER_STATE, f"{agents} agents over {stop_s - start_s:g} s")
     return start_s + step_s * np.arange(int(steps) + 1, dtype=np.float64)
+
+
+def require_sampled_bytes(sampled_bytes: float, what: str) -> None:
+    """Raise `ScenarioError` when samples would take more than `MAX_SAMPLED_BYTES`; `what` says of what they are."""
+    if sampled_bytes > MAX_SAMPLED_BYTES:
+        raise ScenarioError(
+            f"{what}: their samples take {sampled_bytes / 2**30:.3g} GiB, at most {MAX_SAMPLED_BYTES / 2**30:g} GiB can be exported; "
+            "cut the scenario into parts"
+        )
 
 
 def file_name(text: str) -> str:

@@ -64,7 +64,7 @@ def describe(scenario: Scenario) -> Value:
         raise ScenarioError(
             f"scenario '{scenario.name}' has no agent 'ego', which MetaDrive follows; choose one with --ego AGENT"
         )
-    t_s = step_times(ego.waypoints.t_s[0], ego.waypoints.t_s[-1], STEP_S)
+    t_s = step_times(ego.waypoints.t_s[0], ego.waypoints.t_s[-1], STEP_S, len(scenario.agents))
     origin = np.array(near_origin(scenario).origin_m)
     moves = {agent.id: sample_steps(agent, t_s, STEP_S) for agent in scenario.agents}
     tracks = {a.id: _track(a, moves[a.id], origin) for a in scenario.agents if moves[a.id].valid.any()}

@@ -100,7 +100,7 @@ def rgb_of(agent: Agent) -> tuple[int, int, int]:
 def agent_steps(scenario: Scenario) -> AgentSteps:
     """Sample every agent every `STEP_S`, from the first waypoint of any agent to the last."""
     ends = [(a.waypoints.t_s[0], a.waypoints.t_s[-1]) for a in scenario.agents]
-    t_s = step_times(min(first for first, _ in ends), max(last for _, last in ends), STEP_S)
+    t_s = step_times(min(first for first, _ in ends), max(last for _, last in ends), STEP_S, len(ends))
     t_ns = scenario.t0_ns + np.round(t_s * NS_PER_S).astype(np.int64)
     return AgentSteps(t_ns, tuple((agent, sample_steps(agent, t_s, STEP_S)) for agent in scenario.agents))
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from log2sim.datatypes import Agent, Trajectory
+from log2sim.errors import ScenarioError
 from log2sim.geometry import Array
 from log2sim.simulation.carla.assets import nearest_assets
 from log2sim.simulation.follower import GAINS
@@ -19,6 +20,10 @@ from log2sim.simulation.vehicles.parameters import PEDAL_LAG_S, STEER_LAG_S, WHE
 
 SAMPLE_S = 0.05
 """Spacing of the samples; linear interpolation errs by at most a h^2 / 8 = 3 mm at 10 m/s2."""
+
+MAX_SAMPLED_BYTES = 1536 * 1024 * 1024
+BYTES_PER_SAMPLE = 480
+"""Of the numbers of a sample in the lists that are written, as objects of Python; 1.5 GiB hold 46 hours of one agent."""
 
 DISCONTINUITY_S = 1e-6  # spacing of the two samples at a discontinuity of the log
 
@@ -29,7 +34,14 @@ def controller_data() -> dict[str, float]:
 
 
 def carla_agents(agents: Sequence[Agent]) -> list[dict[str, Any]]:
-    """Describe agents as `player` reads them. Their positions should be near the origin: CARLA computes in float32."""
+    """Describe agents as `player` reads them. Their positions should be near the origin: CARLA computes in float32.
+
+    Raises
+    ------
+    ScenarioError
+        When their samples would take more than `MAX_SAMPLED_BYTES`, before anything is allocated for them.
+    """
+    _require_few_samples(agents)
     begin_s = min(float(a.waypoints.t_s[0]) for a in agents)
     end_s = max(float(a.waypoints.t_s[-1]) for a in agents)
     counts: Counter[str] = Counter()
@@ -38,6 +50,17 @@ def carla_agents(agents: Sequence[Agent]) -> list[dict[str, Any]]:
         described.append(_agent(agent, counts[agent.category], (begin_s, end_s)))
         counts[agent.category] += 1
     return described
+
+
+def _require_few_samples(agents: Sequence[Agent]) -> None:
+    lasts_s = [0.0 if a.static else float(a.waypoints.t_s[-1] - a.waypoints.t_s[0]) for a in agents]
+    size_bytes = sum(lasts_s) / SAMPLE_S * BYTES_PER_SAMPLE
+    if size_bytes > MAX_SAMPLED_BYTES:
+        k = int(np.argmax(lasts_s))
+        raise ScenarioError(
+            f"agents last {sum(lasts_s):g} s together, '{agents[k].id}' {lasts_s[k]:g} s: their samples every {SAMPLE_S:g} s take "
+            f"{size_bytes / 2**30:.3g} GiB, at most {MAX_SAMPLED_BYTES / 2**30:g} GiB can be written; cut the scenario into parts"
+        )
 
 
 def _agent(agent: Agent, turn: int, span_s: tuple[float, float]) -> dict[str, Any]:

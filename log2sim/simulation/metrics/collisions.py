@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.errors import ScenarioError
 from log2sim.geometry import Array, wrap_angle
 from log2sim.simulation.metrics.box_tracks import BoxTracks, RowIndex, spacing_s
 from log2sim.simulation.metrics.continuous_collision import RelativeMotion, first_contact
@@ -19,6 +21,12 @@ CHUNK = 20
 
 BATCH = 100_000
 """Pairs evaluated together, which bounds memory."""
+
+MAX_PAIRS = 50_000
+"""Pairs of agents whose motion over `CHUNK` rows is compared at once: a million rows."""
+
+MAX_CONTACTS = 5_000_000
+"""Contacts that are kept, some 200 MB: a thousand pairs that overlap for four minutes. More are no traffic."""
 
 SAME_CONTACT_S = 0.5  # contacts of a pair that are closer in time form one collision
 SCENARIO_WINDOW_S = 0.5  # the scenario has a collision itself when its boxes overlap within this time of it,
@@ -53,14 +61,37 @@ def contacts(boxes: BoxTracks, moves: NDArray[np.bool_], only: NDArray[np.bool_]
     Broad phase: axis-aligned hulls of the circles about the boxes over `CHUNK` rows, sorted. Narrow phase: `first_contact`,
     forward for the first overlap and backward for the last. Where an agent does not move continuously, the boxes are compared
     at the row alone. Cost: A log A and the pairs in reach, a chunk.
+
+    Raises
+    ------
+    ScenarioError
+        For more than `MAX_CONTACTS`, of agents that lie on top of each other.
     """
-    k, a, b = np.concatenate([np.zeros((3, 0), dtype=np.intp), *_candidates(boxes, moves, only)], axis=1)
-    first_row, last_row = np.zeros(len(k)), np.zeros(len(k))
-    for begin in range(0, len(k), BATCH):
-        part = slice(begin, begin + BATCH)
-        first_row[part], last_row[part] = _contact_rows(boxes, k[part], a[part], b[part])
-    hit = ~np.isnan(first_row)
-    return Contacts(a[hit], b[hit], first_row[hit], last_row[hit])
+    found, count = [Contacts(*np.zeros((2, 0), dtype=np.intp), *np.zeros((2, 0)))], 0
+    for k, a, b in _in_batches(_candidates(boxes, moves, only)):
+        first_row, last_row = _contact_rows(boxes, k, a, b)
+        hit = ~np.isnan(first_row)
+        found.append(Contacts(a[hit], b[hit], first_row[hit], last_row[hit]))
+        count += len(found[-1].a)
+        if count > MAX_CONTACTS:
+            raise ScenarioError(
+                f"{len(boxes.size_m)} agents touch in more than {MAX_CONTACTS} pairs and steps: they lie on top of each other; "
+                "remove those that are no traffic"
+            )
+    return Contacts(*(np.concatenate([getattr(f, c) for f in found]) for c in ("a", "b", "first_row", "last_row")))
+
+
+def _in_batches(candidates: Iterator[tuple[RowIndex, RowIndex, RowIndex]]) -> Iterator[NDArray[np.intp]]:
+    """Yield candidates (3, N) joined and cut to at most `BATCH`."""
+    waiting, count = list[NDArray[np.intp]](), 0
+    for part in chain(candidates, [None]):
+        if part is not None:
+            waiting.append(np.stack(part))
+            count += waiting[-1].shape[1]
+        if count and (part is None or count >= BATCH):
+            joined = np.concatenate(waiting, axis=1)
+            yield from (joined[:, begin : begin + BATCH] for begin in range(0, count, BATCH))
+            waiting, count = [], 0
 
 
 def _candidates(
@@ -69,12 +100,12 @@ def _candidates(
     """Yield rows and pairs (3, N) that may touch before the next row."""
     for begin in range(0, len(boxes.x_m), CHUNK):
         rows = slice(begin, begin + CHUNK + 1)
-        i, j = _overlapping_hulls(boxes.x_m[rows], boxes.y_m[rows], boxes.radius_m, moves, only)
         present = boxes.present[begin : begin + CHUNK]
-        row, pair = np.nonzero(present[:, i] & present[:, j])
-        k, a, b = row + begin, i[pair], j[pair]
-        near = _relative_motion(boxes, k, a, b).may_touch()
-        yield k[near], a[near], b[near]
+        for i, j in _overlapping_hulls(boxes.x_m[rows], boxes.y_m[rows], boxes.radius_m, moves, only):
+            row, pair = np.nonzero(present[:, i] & present[:, j])
+            k, a, b = row + begin, i[pair], j[pair]
+            near = _relative_motion(boxes, k, a, b).may_touch()
+            yield k[near], a[near], b[near]
 
 
 def _contact_rows(boxes: BoxTracks, k: RowIndex, a: RowIndex, b: RowIndex) -> tuple[Array, Array]:
@@ -102,8 +133,8 @@ def _relative_motion(boxes: BoxTracks, k: RowIndex, a: RowIndex, b: RowIndex) ->
 
 def _overlapping_hulls(
     x: Array, y: Array, radius: Array, moves: NDArray[np.bool_], only: NDArray[np.bool_] | None
-) -> tuple[RowIndex, RowIndex]:
-    """Return pairs (P,), (P,) whose hulls over the rows overlap, at least one of them moving."""
+) -> Iterator[tuple[RowIndex, RowIndex]]:
+    """Yield pairs (P,), (P,), some `MAX_PAIRS` at a time, whose hulls over the rows overlap, at least one of them moving."""
     there = ~np.isnan(x).all(axis=0)
     present = np.flatnonzero(there if only is None else there & only)
     low = np.stack([np.nanmin(c[:, present], axis=0) - radius[present] for c in (x, y)])
@@ -113,11 +144,14 @@ def _overlapping_hulls(
     # Sorted by their lower end, the boxes that may meet box k in x are those up to the last one beginning before its end.
     reach = np.searchsorted(low[0], high[0], side="right")
     count = np.maximum(reach - np.arange(len(present)) - 1, 0)
-    a = np.repeat(np.arange(len(present)), count)
-    b = a + 1 + np.arange(len(a)) - np.repeat(np.cumsum(count) - count, count)
-    meet = (low[1, a] <= high[1, b]) & (low[1, b] <= high[1, a]) & (moves[present[a]] | moves[present[b]])
-    pair = np.sort(np.stack([present[a[meet]], present[b[meet]]]), axis=0)
-    return pair[0], pair[1]
+    until = np.cumsum(count)
+    last = np.searchsorted(until, np.arange(MAX_PAIRS, until[-1] if len(until) else 0, MAX_PAIRS)) + 1
+    for k in np.split(np.arange(len(present)), np.unique(last)):
+        a = np.repeat(k, count[k])
+        b = a + 1 + np.arange(len(a)) - np.repeat(np.cumsum(count[k]) - count[k], count[k])
+        meet = (low[1, a] <= high[1, b]) & (low[1, b] <= high[1, a]) & (moves[present[a]] | moves[present[b]])
+        pair = np.sort(np.stack([present[a[meet]], present[b[meet]]]), axis=0)
+        yield pair[0], pair[1]
 
 
 def collisions(

@@ -24,6 +24,9 @@ COARSE, FINER, LEVELS = 64, 4, 3
 BATCH = 2000
 """Pairs whose times are refined together, which bounds memory."""
 
+BLOCK_PAIRS = 20_000
+"""Pairs of blocks that are divided together: each becomes up to 256 pairs of parts before its rows."""
+
 PARTS, ZOOMS = 4, 4
 """A row is divided into so many parts so many times: 50 ms to 0.2 ms."""
 
@@ -85,7 +88,7 @@ def post_encroachment_times(boxes: BoxTracks, spacing_s: float) -> PostEncroachm
     lag = HORIZON_S / spacing_s
     hulls = [_SweptRectangles(boxes, COARSE // FINER**level) for level in range(LEVELS)]
     found: list[_Pairs] = []
-    for pairs in _overlapping_blocks(hulls[0], lag):
+    for pairs in _overlapping_blocks(hulls[0], _agents_that_move(boxes), lag):
         for hull in hulls[1:]:
             pairs = hull.met(pairs.divided())
         found.append(_shortest(_crossings(boxes, pairs.divided(), lag)))
@@ -146,12 +149,18 @@ def _extent(values: Array, half: Array) -> tuple[Array, Array]:
     return np.fmin.reduce(values - half, axis=1), np.fmax.reduce(values + half, axis=1)
 
 
-def _overlapping_blocks(hulls: _SweptRectangles, lag: float) -> Iterator[_Pairs]:
-    """Yield the overlapping pairs of two blocks of rows at a time."""
+def _agents_that_move(boxes: BoxTracks) -> NDArray[np.bool_]:
+    """Mark (A,) the agents that change place or heading: who stays neither leaves nor arrives."""
+    columns = (boxes.x_m, boxes.y_m, boxes.yaw_rad)
+    return np.any([np.fmax.reduce(c, axis=0) > np.fmin.reduce(c, axis=0) for c in columns], axis=0)
+
+
+def _overlapping_blocks(hulls: _SweptRectangles, moves: NDArray[np.bool_], lag: float) -> Iterator[_Pairs]:
+    """Yield the overlapping pairs of agents that move (A,), of two blocks of rows and up to `BLOCK_PAIRS` at a time."""
     from scipy.spatial import cKDTree
 
     count = len(hulls.x_m)
-    there = [np.flatnonzero(~np.isnan(x)) for x in hulls.x_m]
+    there = [np.flatnonzero(~np.isnan(x) & moves) for x in hulls.x_m]
     trees = [cKDTree(np.stack([x[k], y[k]], axis=1)) for x, y, k in zip(hulls.x_m, hulls.y_m, there)]
     reach = [np.max(radius[k], initial=0.0) for radius, k in zip(hulls.radius_m, there)]
     for i in range(count):
@@ -160,7 +169,8 @@ def _overlapping_blocks(hulls: _SweptRectangles, lag: float) -> Iterator[_Pairs]
             a, b = there[i][found["i"]], there[j][found["j"]]
             near = (a != b) & (found["v"] < hulls.radius_m[i, a] + hulls.radius_m[j, b])
             a, b = a[near], b[near]
-            yield hulls.met(_Pairs(a, b, np.full(len(a), i), np.full(len(a), j)))
+            met = hulls.met(_Pairs(a, b, np.full(len(a), i), np.full(len(a), j)))
+            yield from (met.take(slice(k, k + BLOCK_PAIRS)) for k in range(0, len(met.a), BLOCK_PAIRS))
 
 
 def _crossings(boxes: BoxTracks, pairs: _Pairs, lag: float) -> _Pairs:
