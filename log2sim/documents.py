@@ -18,6 +18,8 @@ from log2sim.errors import ConfigError, Log2SimError, LogError
 from log2sim.input_files import read_file
 
 JSON_LIMIT_BYTES = 512 * 1024 * 1024
+# Of a whole number; the largest float64 has 309.
+MAX_DIGITS = 308
 _SURROGATE_ESCAPE = re.compile(r"\\u[dD][89a-fA-F]")
 
 
@@ -100,7 +102,7 @@ def read_json(path: Path | str, error: type[LogError] = LogError) -> Any:
     data = read_file(path, JSON_LIMIT_BYTES, error)
     try:
         text = data.decode("utf-8")
-        value = json.loads(text, parse_constant=_refuse, parse_float=_finite)
+        value = json.loads(text, parse_constant=_refuse, parse_float=_finite, parse_int=_whole)
         if _SURROGATE_ESCAPE.search(text):  # JSON can escape an unpaired surrogate, which UTF-8 cannot encode
             json.dumps(value, ensure_ascii=False).encode()
         return value
@@ -132,6 +134,11 @@ def _finite(word: str) -> float:
     return value if math.isfinite(value) else _refuse(word)
 
 
+def _whole(word: str) -> int | float:
+    """Parse a whole number; one that no float64 can hold overflows wherever it meets NumPy."""
+    return int(word) if len(word) <= MAX_DIGITS else _refuse(word)
+
+
 def _location_of_not_finite(text: str) -> str:
     """Return where the first number of a JSON text is that is not finite."""
     try:
@@ -142,8 +149,8 @@ def _location_of_not_finite(text: str) -> str:
 
 def _path_of_not_finite(value: Any) -> str | None:
     """Return the path of the first number that is not finite, as "a.b[3]"; None when there is none."""
-    if isinstance(value, float):
-        return None if math.isfinite(value) else ""
+    if isinstance(value, (float, int)):
+        return None if abs(value) < 10**MAX_DIGITS else ""  # False for NaN
     if not isinstance(value, (dict, list)):
         return None
     for key, item in value.items() if isinstance(value, dict) else enumerate(value):

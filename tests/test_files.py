@@ -192,9 +192,21 @@ def test_too_large_a_file_is_not_even_opened(tmp_path: Path, monkeypatch: pytest
         (b"[NaN", r"a number is NaN"),
         (b"[NaN, " + b"[" * 100_000, r"a number is NaN"),
         (b"[" * 100_000, r"not valid JSON"),
-        (b"1" * 5000, r"not valid JSON"),
+        (b"1" * 5000, r"a number is 1+, expected a finite number"),
+        (b'{"a": [' + b"1" * 400 + b"]}", r"a\[0\] is 1+, expected a finite number"),
     ],
-    ids=["syntax", "encoding", "overflow", "infinity", "nan", "nan and cut", "nan and deep", "deep", "many digits"],
+    ids=[
+        "syntax",
+        "encoding",
+        "overflow",
+        "infinity",
+        "nan",
+        "nan and cut",
+        "nan and deep",
+        "deep",
+        "many digits",
+        "no float64",
+    ],
 )
 def test_what_is_wrong_with_a_json_file_is_named(tmp_path: Path, content: bytes, message: str) -> None:
     path = tmp_path / "a.json"

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+import shutil
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from log_encoders.pandaset import encode
+from log_encoders.world import world_log
 
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import apply, inverse, points_in_box, project, rotation_from_rpy, wrap_angle
@@ -309,3 +313,56 @@ def test_opening_reads_neither_sweeps_nor_cuboids(sequence: Path, tmp_path: Path
     assert log.streams["front_camera"].read(0).shape == (1080, 1920, 3)
     with pytest.raises(LogError, match=r"\d\d\.pkl\.gz: not a pickled table"):
         _ = log.labels
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return encode(world_log(), tmp_path_factory.mktemp("world"))
+
+
+def changed(world: Path, tmp_path: Path, name: str, change: Callable[[Any], None]) -> Path:
+    """The world with one JSON file changed."""
+    path = tmp_path / "changed"
+    shutil.copytree(world, path)
+    document = json.loads((path / name).read_text())
+    change(document)
+    (path / name).write_text(json.dumps(document))
+    return path
+
+
+DIGITS_40, DIGITS_400 = int("9" * 40), int("9" * 400)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "words"),
+    [
+        ("lidar/timestamps.json", lambda d: d.__setitem__(2, d[2] * 1000), r"lidar/timestamps\.json: record 2: '\d+\.?\d*', expected a stamp in seconds"),
+        ("lidar/timestamps.json", lambda d: d.__setitem__(2, DIGITS_40), r"lidar/timestamps\.json: record 2: '9+', expected a stamp"),
+        ("lidar/timestamps.json", lambda d: d.__setitem__(2, DIGITS_400), r"lidar/timestamps\.json: \[2\] is 9+, expected a finite number"),
+        ("lidar/timestamps.json", lambda d: d.__setitem__(2, "noon"), r"lidar/timestamps\.json: record 2: 'noon', expected a stamp"),
+        ("lidar/timestamps.json", lambda d: d.__setitem__(2, None), r"lidar/timestamps\.json: record 2: 'None', expected a stamp"),
+        ("lidar/timestamps.json", lambda d: d.__setitem__(2, [1.0]), r"lidar/timestamps\.json: record 2: .*expected a stamp"),
+        ("lidar/poses.json", lambda d: d[1]["position"].update(x=DIGITS_40), r"lidar/poses\.json: record 1: position \[1e\+40"),
+        ("lidar/poses.json", lambda d: d[1]["position"].update(x=DIGITS_400), r"lidar/poses\.json: \[1\]\.position\.x is 9+, expected a finite"),
+        ("lidar/poses.json", lambda d: d[1]["heading"].update(w=DIGITS_40), r"lidar/poses\.json: record 1: heading"),
+        ("camera/front_camera/intrinsics.json", lambda d: d.update(fx=DIGITS_400), r"intrinsics\.json: fx is 9+, expected a finite number"),
+        ("meta/gps.json", lambda d: d[0].update(lat=DIGITS_400), r"gps\.json: \[0\]\.lat is 9+"),
+    ],
+)  # fmt: skip
+def test_impossible_numbers_are_refused_by_the_file_that_holds_them(
+    world: Path, tmp_path: Path, name: str, change: Callable[[Any], None], words: str
+) -> None:
+    with pytest.raises(LogError, match=words):
+        _ = open_log(changed(world, tmp_path, name, change)).labels
+
+
+def test_a_sweep_whose_stamp_is_far_off_is_left_out_with_its_labels(world: Path, tmp_path: Path) -> None:
+    sound = open_log(world)
+    log = open_log(changed(world, tmp_path, "lidar/timestamps.json", lambda d: d.__setitem__(2, 2.0)))
+    assert len(log.streams["pandar64"].t_ns) == len(sound.streams["pandar64"].t_ns) - 1
+    assert sound.labels is not None
+    assert log.labels is not None
+    lasts_ns = np.ptp(log.streams["pandar64"].t_ns)
+    assert np.abs(log.labels.t_ns - log.streams["pandar64"].t_ns[0]).max() < 2 * lasts_ns
+    assert 0 < len(log.labels.t_ns) < len(sound.labels.t_ns)
+    assert any("lidar/timestamps.json: 1 of" in note and "left out" in note for note in log.notes)

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,12 +97,15 @@ class _Sequence:
         notes += problems
         track = PoseTrack(lidar_t_ns[keep], map_T_ego[keep])
         cameras, streams = self._cameras(track, notes)
-        sweeps = SweepFiles(self._files("lidar", TABLE, len(lidar_t_ns), notes), lidar_t_ns, notes)
+        kept = set(keep.tolist())  # records whose stamp is far off have no place among the others
+        files = self._files("lidar", TABLE, len(lidar_t_ns), notes)
+        sweeps = SweepFiles({k: file for k, file in files.items() if k in kept}, lidar_t_ns, notes)
         lidars = {lidar: Lidar(lidar, "ego", EGO_T_PANDAR64) for lidar in (LIDARS if sweeps.files else ())}
         streams |= {lidar: sweeps.stream(lidar) for lidar in lidars}
         if not streams:
             raise LogError(f"{self.path}: neither images nor sweeps are there; a log needs at least one record")
         cuboids = list_numbered_files(self.path / "annotations" / "cuboids", (TABLE,))
+        cuboids = {k: file for k, file in cuboids.items() if k in kept or k >= len(lidar_t_ns)}
         map_T_lidar = map_T_ego @ EGO_T_PANDAR64
 
         @cache
@@ -210,25 +214,32 @@ def _poses(folder: Path) -> tuple[NDArray[np.int64], Array]:
     if not isinstance(stamps, list) or not isinstance(poses, list) or len(stamps) != len(poses) or not stamps:
         raise LogError(f"{folder}: timestamps.json and poses.json must be lists of the same length, and not empty")
     try:
-        t_s = np.array(stamps, dtype=np.float64)
         q = np.array([[p["heading"][k] for k in "wxyz"] for p in poses], dtype=np.float64)
         position = np.array([[p["position"][k] for k in "xyz"] for p in poses], dtype=np.float64)
     except (TypeError, KeyError, ValueError) as problem:
         raise LogError(
             f"{folder}/poses.json: expected records of position x, y, z and heading w, x, y, z: {problem}"
         ) from None
-    wrong = np.flatnonzero(~(np.abs(position) <= MAX_POSITION_M).all(axis=1) | ~(np.abs(t_s) < MAX_TIME_S))
+    wrong = np.flatnonzero(~(np.abs(position) <= MAX_POSITION_M).all(axis=1))
     if len(wrong):
         raise LogError(
-            f"{folder}: record {wrong[0]}: position {position[wrong[0]].tolist()}, stamp {t_s[wrong[0]]}, expected finite "
-            f"numbers up to {MAX_POSITION_M:g} m and {MAX_TIME_S} s"
+            f"{folder}/poses.json: record {wrong[0]}: position {position[wrong[0]].tolist()}, expected finite numbers up to "
+            f"{MAX_POSITION_M:g} m"
         )
     bad = find_not_unit(q)
     if len(bad):
         raise LogError(
             f"{folder}/poses.json: record {bad[0]}: heading {q[bad[0]].tolist()}, expected a unit quaternion"
         )
-    return np.round(t_s * NS_PER_S).astype(np.int64), transform(rotation_from_quaternion(q), position)
+    return _stamps_ns(stamps, folder / "timestamps.json"), transform(rotation_from_quaternion(q), position)
+
+
+def _stamps_ns(stamps: list[Any], path: Path) -> NDArray[np.int64]:
+    """Return stamps (N,) int64 ns of what a file states, in s."""
+    for k, stamp in enumerate(stamps):
+        if not isinstance(stamp, (int, float)) or isinstance(stamp, bool) or not abs(stamp) < MAX_TIME_S:
+            raise LogError(f"{path}: record {k}: {str(stamp)[:40]!a}, expected a stamp in seconds below {MAX_TIME_S:g}")
+    return np.round(np.array(stamps, dtype=np.float64) * NS_PER_S).astype(np.int64)
 
 
 def _intrinsics(folder: Path) -> Array:

@@ -25,8 +25,8 @@ BATCH = 100_000
 MAX_PAIRS = 50_000
 """Pairs of agents whose motion over `CHUNK` rows is compared at once: a million rows."""
 
-MAX_CONTACTS = 5_000_000
-"""Contacts that are kept, some 200 MB: a thousand pairs that overlap for four minutes. More are no traffic."""
+MAX_CONTACTS = 2_000_000
+"""Contacts that are kept, some 80 MB: a thousand pairs that overlap for 100 s. More are no traffic."""
 
 SAME_CONTACT_S = 0.5  # contacts of a pair that are closer in time form one collision
 SCENARIO_WINDOW_S = 0.5  # the scenario has a collision itself when its boxes overlap within this time of it,
