@@ -9,14 +9,19 @@ from log2sim.geometry import Array
 
 # Log-odds that an object moves forward: of slow ones, one in five reverses, at 3 m/s one in a thousand.
 FORWARD_LOG_ODDS, FORWARD_LOG_ODDS_PER_MPS, MAX_FORWARD_LOG_ODDS = 1.4, 2.0, 9.0
-# A way shorter than this, or than so many standard deviations of its ends, may be noise.
-CERTAIN_COURSE_M, CERTAIN_SIGMAS = 1.0, 4.0
+# A way shorter than so many standard deviations of its ends may be noise.
+CERTAIN_SIGMAS = 4.0
 
 
-def course_log_odds(w: Waypoints) -> float:
-    """Return the log-odds that the front of a vehicle is where its yaw points, by the ways that it drives either way."""
+def course_log_odds(w: Waypoints, length_m: float) -> float:
+    """Return the log-odds that the front of a vehicle is where its yaw points, by the ways that it drives either way.
+
+    Notes
+    -----
+    The center of one that stands seems to move by up to its length while ever more of it shows.
+    """
     step_s = np.gradient(w.t_s) if len(w.t_s) > 1 else np.zeros(1)
-    certain_m = max(CERTAIN_COURSE_M, CERTAIN_SIGMAS * float(np.median(w.sigma_xy_m)))
+    certain_m = max(length_m, CERTAIN_SIGMAS * float(np.median(w.sigma_xy_m)))
     return _one_way(np.maximum(w.speed_mps, 0.0), step_s, certain_m) - _one_way(
         np.maximum(-w.speed_mps, 0.0), step_s, certain_m
     )

@@ -75,7 +75,7 @@ def _own_log_odds(candidate: AgentCandidate, timeline: Timeline) -> float:
     if GROUP_OF[agent.category] == "vehicle":
         outline = outline_log_odds(candidate.track, w, t_s, agent.size_m)
         odds = POINTS_SHARE * (odds + outline) if odds and outline else odds + outline
-    return odds if agent.static else odds + course_log_odds(w)
+    return odds if agent.static else odds + course_log_odds(w, agent.size_m[0])
 
 
 def _path_of(candidate: AgentCandidate, log_odds: float) -> Array:
