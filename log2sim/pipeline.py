@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from log2sim.agents.candidate import Timeline
+from log2sim.agents.confidence.rating import rate_agents
 from log2sim.agents.ego import ego_agent, ego_path
 from log2sim.agents.estimate import estimate_agents
 from log2sim.agents.heading.decide import decide_headings
@@ -214,7 +215,7 @@ def second_pass(run: Run, observations: Observations) -> Result:
         candidates = decide_headings(candidates, ego_path(log, run.schedule), timeline)
         ego = ego_agent(log, timeline, run.poses.origin)
     with run.clock.stage("judge"):
-        judged = judge(candidates, ego, observations.obstacles, timeline)
+        judged = rate_agents(judge(candidates, ego, observations.obstacles, timeline), timeline)
         agents = [candidate.agent for candidate in judged]
         # Without an ego the agents' waypoints alone tell the ticks, so all of them stay.
         agents = simplify(agents) if ego is not None else agents

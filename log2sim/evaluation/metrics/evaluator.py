@@ -9,7 +9,13 @@ import numpy as np
 
 from log2sim.datatypes import CATEGORIES, GROUPS, Scenario
 from log2sim.errors import ConfigError, ScenarioError
-from log2sim.evaluation.metrics.align import ego_states, evaluation_ticks_s, reconstructed_states, truth_states
+from log2sim.evaluation.metrics.align import (
+    StateTable,
+    ego_states,
+    evaluation_ticks_s,
+    reconstructed_states,
+    truth_states,
+)
 from log2sim.evaluation.metrics.clear_mot import mota
 from log2sim.evaluation.metrics.comparison import (
     MIN_COUNTED_S,
@@ -68,34 +74,23 @@ def evaluate(
     CLEAR MOT (Bernardin and Stiefelhagen, 2008) and HOTA (Luiten et al., 2021) with matches by the distance of box centers.
     Recall and precision count agent-ticks; position, speed and size errors are over matched agent-ticks.
     """
-    selected = _selected(categories)
-    ticks_s = evaluation_ticks_s(scenario, truth)
-    if len(ticks_s) == 0 and scenario.agents and truth.agents:
-        raise ScenarioError(_no_common_time(scenario, truth))
+    compared, ticks_s, ego = compare_scenarios(scenario, truth, Selection(max_range_m, _selected(categories)))
+    true, ours, tick_s = compared.truth, compared.other, _tick_s(ticks_s)
     truth_ticks_s = ticks_s + (scenario.t0_ns - truth.t0_ns) / NS_PER_S
-    shift_m = truth.shift_to(scenario)
-    ego = ego_states(scenario, truth, ticks_s, truth_ticks_s, shift_m)
-    ego_xy = None if ego is None else ego.xy_m[0]
-    _check_range(max_range_m, ego_xy)
-    true = truth_states(truth.others, truth_ticks_s, shift_m, ego_xy)
-    ours = reconstructed_states(scenario.others, ticks_s, ego_xy)
-    tick_s = float(np.median(np.diff(ticks_s))) if len(ticks_s) > 1 else 0.0
-    compared = compare(true, ours, tick_s, Selection(max_range_m, selected))
-    compared = without_ignored(compared, truth.ignore_regions, truth_ticks_s, shift_m)
     everywhere = np.ones_like(compared.counted), np.ones_like(compared.false)
     result = {
         "metrics_version": VERSION,
         "scenario": scenario.name,
         "truth": truth.name,
         "max_range_m": max_range_m,
-        "categories": None if categories is None else sorted(selected),
+        "categories": None if categories is None else sorted(_selected(categories)),
         "ticks": len(ticks_s),
         "tick_s": tick_s,
         **_figures(compared, *everywhere),
-        "by_range": None if ego_xy is None else _by_range(compared),
+        "by_range": None if ego is None else _by_range(compared),
         "by_category": _by_category(compared),
         "correctness": correctness(compared, scenario.others, ticks_s, ego),
-        "ego": _ego_figures(scenario, truth, ticks_s, truth_ticks_s, shift_m),
+        "ego": _ego_figures(scenario, truth, ticks_s, truth_ticks_s, truth.shift_to(scenario)),
         "matching": matching_rules(),
         "counting": counting_rules(truth, MIN_COUNTED_S),
         "agents": agent_rows(true, ours, compared.match, compared.counted, compared.switched),
@@ -103,6 +98,43 @@ def evaluate(
         "ignored_agents": ignored_rows(ours, compared.ignored),
     }
     return dict(rounded_tree(result))
+
+
+def compare_scenarios(
+    scenario: Scenario, truth: Scenario, selection: Selection
+) -> tuple[Comparison, Array, StateTable | None]:
+    """Match the agents of a scenario with those of its truth, without the egos.
+
+    Returns
+    -------
+    compared : Comparison
+    ticks_s : (T,) float64, s
+        Of the scenario.
+    ego : StateTable or None
+        One row.
+
+    Raises
+    ------
+    ConfigError, ScenarioError
+        As `evaluate`.
+    """
+    ticks_s = evaluation_ticks_s(scenario, truth)
+    if len(ticks_s) == 0 and scenario.agents and truth.agents:
+        raise ScenarioError(_no_common_time(scenario, truth))
+    truth_ticks_s = ticks_s + (scenario.t0_ns - truth.t0_ns) / NS_PER_S
+    shift_m = truth.shift_to(scenario)
+    ego = ego_states(scenario, truth, ticks_s, truth_ticks_s, shift_m)
+    ego_xy = None if ego is None else ego.xy_m[0]
+    _check_range(selection.max_range_m, ego_xy)
+    true = truth_states(truth.others, truth_ticks_s, shift_m, ego_xy)
+    ours = reconstructed_states(scenario.others, ticks_s, ego_xy)
+    compared = compare(true, ours, _tick_s(ticks_s), selection)
+    return without_ignored(compared, truth.ignore_regions, truth_ticks_s, shift_m), ticks_s, ego
+
+
+def _tick_s(ticks_s: Array) -> float:
+    """Return the median interval of ticks (T,), s; 0 for fewer than two."""
+    return float(np.median(np.diff(ticks_s))) if len(ticks_s) > 1 else 0.0
 
 
 def _figures(c: Comparison, truth_selected: Mask, other_selected: Mask) -> dict[str, Any]:

@@ -1,0 +1,42 @@
+"""The probability that an agent is right, by the evidence for it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+
+import numpy as np
+
+from log2sim.agents.candidate import AgentCandidate, Timeline
+from log2sim.agents.confidence.evidence import Evidence, evidence_of, has_boxes
+from log2sim.agents.confidence.systematic import with_systematic_errors
+from log2sim.agents.confidence.weights import BIAS, WEIGHTS
+
+# Nothing is certain: of the evidence one part is that none of the reasons to be wrong is unknown.
+MIN_CONFIDENCE, MAX_CONFIDENCE = 0.01, 0.99
+
+
+def rate_agents(candidates: Sequence[AgentCandidate], timeline: Timeline) -> list[AgentCandidate]:
+    """Give judged candidates the probability that they are right as confidence, and systematic errors in their sigmas."""
+    searched = any(has_boxes(candidate) for candidate in candidates)
+    return [_rated(candidate, timeline, searched=searched) for candidate in candidates]
+
+
+def probability_of(evidence: Evidence, weights: Mapping[str, float] = WEIGHTS, bias: float = BIAS) -> float:
+    """Return the probability that an agent with this evidence is right.
+
+    Notes
+    -----
+    Right is what `evaluate` finds right: at no more than a fifth of its ticks invented, a duplicate, in the ego, or with a
+    wrong speed, motion, direction or size. Logistic regression; each weight has the sign of its reason
+    (`evidence.SIGNS`).
+    """
+    log_odds = bias + sum(weights[name] * value for name, value in asdict(evidence).items())
+    return float(np.clip(1 / (1 + np.exp(-log_odds)), MIN_CONFIDENCE, MAX_CONFIDENCE))
+
+
+def _rated(candidate: AgentCandidate, timeline: Timeline, *, searched: bool) -> AgentCandidate:
+    evidence = evidence_of(candidate, timeline, searched=searched)
+    confidence = probability_of(evidence)
+    waypoints = with_systematic_errors(candidate, evidence, confidence, timeline)
+    return replace(candidate, agent=replace(candidate.agent, confidence=confidence, waypoints=waypoints))

@@ -1,0 +1,130 @@
+"""The rating of agents: signs of evidence, invariance, and errors that more ticks do not average away."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, fields, replace
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_size import T0_NS, measured, moved
+
+from log2sim.agents.candidate import AgentCandidate, Timeline
+from log2sim.agents.confidence.evidence import SIGNS, Evidence, evidence_of
+from log2sim.agents.confidence.rating import MAX_CONFIDENCE, MIN_CONFIDENCE, probability_of, rate_agents
+from log2sim.agents.confidence.systematic import position_terms, speed_terms, yaw_terms
+from log2sim.agents.confidence.weights import POSITION_VARIANCE, SPEED_VARIANCE, WEIGHTS, YAW_VARIANCE
+from log2sim.agents.moving import moving_candidate
+from log2sim.agents.static import static_candidate
+from log2sim.datatypes import Doubt, Track
+
+TIMELINE = Timeline(T0_NS + np.arange(60) * 100_000_000, T0_NS)
+DARK = [None] * len(TIMELINE.t_ns)
+NAMES = [f.name for f in fields(Evidence)]
+
+
+@cache
+def parked(count: int = 8) -> AgentCandidate:
+    return candidate_of(measured([(12.0, 6.0, 0.3)] * count))
+
+
+@cache
+def driving(count: int = 12) -> AgentCandidate:
+    return candidate_of(measured([(8.0 + 0.6 * k, 5.0, 0.0) for k in range(count)]), static=False)
+
+
+def candidate_of(track: Track, *, static: bool = True) -> AgentCandidate:
+    return static_candidate(track, DARK, TIMELINE) if static else moving_candidate(track, DARK, TIMELINE, smooth=True)
+
+
+def rated(candidate: AgentCandidate) -> AgentCandidate:
+    return rate_agents([candidate], TIMELINE)[0]
+
+
+def test_every_weight_has_the_sign_of_its_reason():
+    assert set(WEIGHTS) == set(NAMES) == set(SIGNS)
+    assert [name for name, sign in SIGNS.items() if sign * WEIGHTS[name] < 0] == []
+    assert min(*POSITION_VARIANCE.values(), *YAW_VARIANCE.values(), *SPEED_VARIANCE.values()) >= 0
+
+
+@settings(deadline=None)
+@given(st.lists(st.floats(-3, 3), min_size=len(NAMES), max_size=len(NAMES)), st.sampled_from(NAMES), st.floats(0, 3))
+def test_more_of_a_good_reason_never_lowers_a_confidence(values, name, more):
+    weak = Evidence(**dict(zip(NAMES, values)))
+    strong = replace(weak, **{name: getattr(weak, name) + (SIGNS[name] or np.sign(WEIGHTS[name])) * more})
+    assert MIN_CONFIDENCE <= probability_of(weak) <= probability_of(strong) <= MAX_CONFIDENCE
+
+
+@pytest.mark.parametrize("make", [parked, driving])
+def test_ratings_are_those_of_a_map_that_is_shifted_and_turned(make):
+    candidate = make()
+    static = candidate.agent.static
+    other = candidate_of(moved(candidate.track, np.array([300.0, -80.0, 4.0]), 2.1), static=static)
+    a, b = rated(candidate).agent, rated(other).agent
+    assert a.confidence == pytest.approx(b.confidence, abs=0.01)
+    np.testing.assert_allclose(a.waypoints.sigma_xy_m, b.waypoints.sigma_xy_m, rtol=0.02)
+    np.testing.assert_allclose(a.waypoints.sigma_yaw_rad, b.waypoints.sigma_yaw_rad, rtol=0.05)
+
+
+def test_doubts_scattered_positions_and_a_hidden_length_lower_a_confidence():
+    candidate = parked()
+    before = rated(candidate).agent.confidence
+    assert rated(candidate.doubted([Doubt("empty", "rays pass through")])).agent.confidence < before
+    m = candidate.track.measurements
+    wild = m.center_m + np.random.default_rng(0).normal(0, 2.0, m.center_m.shape) * [1, 1, 0]
+    scattered = replace(candidate, track=replace(candidate.track, measurements=replace(m, center_m=wild)))
+    assert rated(scattered).agent.confidence < before
+    high = m.low_m + (m.high_m - m.low_m) * [0.3, 1.0]
+    part = replace(candidate, track=replace(candidate.track, measurements=replace(m, high_m=high)))
+    assert (
+        evidence_of(part, TIMELINE, searched=False).hidden
+        > evidence_of(candidate, TIMELINE, searched=False).hidden + 0.4
+    )
+    assert rated(part).agent.confidence < before
+    assert rated(part).agent.waypoints.sigma_xy_m[0] > 1.1 * rated(candidate).agent.waypoints.sigma_xy_m[0]
+
+
+def test_more_ticks_do_not_average_systematic_errors_away():
+    few, many = driving(6), driving(30)
+    given_share = np.median(many.agent.waypoints.sigma_xy_m) / np.median(few.agent.waypoints.sigma_xy_m)
+    share = np.median(rated(many).agent.waypoints.sigma_xy_m) / np.median(rated(few).agent.waypoints.sigma_xy_m)
+    assert share > given_share
+    assert np.median(rated(many).agent.waypoints.sigma_xy_m) > 0.05
+
+
+def test_evidence_is_bounded_where_there_is_nothing_but_boxes_of_images():
+    candidate = parked(3)
+    m = candidate.track.measurements
+    bare = replace(
+        m, points=np.zeros(3, dtype=np.int64), low_m=np.full((3, 2), np.nan), high_m=np.full((3, 2), np.nan),
+        source=np.full(3, "topdown", dtype="<U16"), camera=np.full(3, "front"), yaw_rad=np.full(3, np.nan),
+    )  # fmt: skip
+    found = evidence_of(replace(candidate, track=replace(candidate.track, measurements=bare)), TIMELINE, searched=False)
+    assert np.isfinite(list(asdict(found).values())).all()
+    assert (found.hidden, found.blind, found.points) == (1.0, 1.0, 0.0)
+
+
+def test_columns_that_are_unknown_stay_unknown():
+    candidate = parked()
+    w = replace(candidate.agent.waypoints, sigma_yaw_rad=None, sigma_speed_mps=None)
+    w = rated(replace(candidate, agent=replace(candidate.agent, waypoints=w))).agent.waypoints
+    assert w.sigma_yaw_rad is None
+    assert w.sigma_speed_mps is None
+
+
+def test_every_term_of_a_variance_has_a_weight_and_none_is_negative():
+    candidate = driving()
+    evidence, w, size = (
+        evidence_of(candidate, TIMELINE, searched=False),
+        candidate.agent.waypoints,
+        candidate.agent.size_m,
+    )
+    for terms, weights in (
+        (position_terms(w, size, np.array([0.5, 1.0]), evidence, 0.7), POSITION_VARIANCE),
+        (yaw_terms(w, size, evidence, 0.7), YAW_VARIANCE),
+        (speed_terms(w, evidence, 0.7), SPEED_VARIANCE),
+    ):
+        assert set(terms) == set(weights)
+        assert all(values.shape == w.t_s.shape and values.min() >= 0 for values in terms.values())
