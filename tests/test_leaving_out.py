@@ -17,6 +17,7 @@ import log2sim.pipeline
 import log2sim.plan
 import log2sim.sensors
 from log2sim import Config, Scenario, reconstruct, replay
+from log2sim.agents.hypotheses import Part
 from log2sim.agents.simplify import simplify_waypoints
 from log2sim.datatypes import Detections, Frame, Lidar, Log, Measurements, Stream, Sweep, Waypoints
 from log2sim.documents import check
@@ -420,7 +421,7 @@ def test_a_parked_car_needs_no_smoothing(tiny: Log, monkeypatch: pytest.MonkeyPa
     assert not step["kept"]
     assert step["reason"].startswith("1 of 3 agents")
     (parked,) = [a for a in without.scenario.others if a.static]
-    monkeypatch.setattr(log2sim.agents.estimate, "is_static", lambda track: False)
+    monkeypatch.setattr(log2sim.agents.estimate, "explain_track", lambda track: [Part(track, static=False)])
     full = run(tiny)
     assert entry(full, "smoothing of parked agents")["kept"]
     smoothed = min(full.scenario.others, key=lambda a: np.hypot(a.waypoints.x_m[0] - 14.0, a.waypoints.y_m[0] + 4.0))

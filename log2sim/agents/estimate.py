@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from log2sim.agents.candidate import AgentCandidate, Timeline
+from log2sim.agents.hypotheses import explain_track
 from log2sim.agents.moving import moving_candidate
-from log2sim.agents.standing import is_static
 from log2sim.agents.static import static_candidate
 from log2sim.datatypes import Obstacles, Track
 
@@ -18,7 +18,7 @@ def estimate_agents(
     *,
     smooth: bool,
 ) -> list[AgentCandidate]:
-    """Make a candidate of every track, moving ones first.
+    """Make a candidate of every object that the tracks show, moving ones first.
 
     Parameters
     ----------
@@ -26,6 +26,6 @@ def estimate_agents(
     smooth : bool
         Whether trajectories are smoothed.
     """
-    static = [is_static(track) for track in tracks]
-    candidates = [moving_candidate(t, obstacles, timeline, smooth=smooth) for t, s in zip(tracks, static) if not s]
-    return candidates + [static_candidate(t, obstacles, timeline) for t, s in zip(tracks, static) if s]
+    parts = [part for track in tracks for part in explain_track(track)]
+    candidates = [moving_candidate(p.track, obstacles, timeline, smooth=smooth) for p in parts if not p.static]
+    return candidates + [static_candidate(p, obstacles, timeline) for p in parts if p.static]

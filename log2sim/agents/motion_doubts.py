@@ -1,4 +1,4 @@
-"""Doubts about the motion of an agent: faster than its kind, or backward as nobody drives."""
+"""Doubts about the motion of an agent: faster than its kind, backward as nobody drives, or beside what was measured."""
 
 from __future__ import annotations
 
@@ -15,6 +15,9 @@ from log2sim.geometry import Array
 MAX_REVERSING_MPS, MAX_REVERSING_M = 3.0, 20.0
 # A speed counts as beyond a limit where it is by as many of its own standard deviations.
 SIGNIFICANT_SIGMAS = 2.0
+# A measurement is beside the trajectory beyond the 99.9 % quantile of chi-square with two degrees of freedom; one may be an
+# outlier.
+CHI2_2DOF_999, MIN_BESIDE = 13.8, 2
 
 
 def motion_doubts(category: str, w: Waypoints) -> tuple[Doubt, ...]:
@@ -28,10 +31,31 @@ def motion_doubts(category: str, w: Waypoints) -> tuple[Doubt, ...]:
     """
     margin = 0.0 if w.sigma_speed_mps is None else SIGNIFICANT_SIGMAS * w.sigma_speed_mps
     fast = np.abs(w.speed_mps) - margin > MAX_SPEED_MPS[category]
-    doubts = _doubts(w, fast, "speed", lambda k: f"moves at {_most(w.speed_mps[k]):.0f} m/s {_when(w, k)}")
+    doubts = _doubts(w, fast, "speed", lambda k: f"moves at {_most(w.speed_mps[k]):.0f} m/s {_when(w.t_s, k)}")
     if GROUP_OF[category] in ("vehicle", "two_wheeler"):
         doubts += _doubts(w, _reverses(w, -w.speed_mps - margin), "reversing", lambda k: _words_of_reversing(w, k))
     return doubts
+
+
+def jump_doubts(t_s: Array, residual_m: Array, sigma_m: Array) -> tuple[Doubt, ...]:
+    """Doubt a smoothed trajectory where several measurements in a row are far beside it.
+
+    Parameters
+    ----------
+    t_s : (n,) float64, s
+        Times of the measurements.
+    residual_m : (n,) float64, m
+        Distances from the trajectory; NaN where not used.
+    sigma_m : (n,) float64, m
+        Standard deviations of the measurements, changing views included.
+    """
+    beside = np.nan_to_num(residual_m) > np.sqrt(CHI2_2DOF_999) * sigma_m
+    doubts = []
+    for rows in spans_of(beside):
+        if len(rows) >= MIN_BESIDE:
+            reason = f"measured up to {residual_m[rows].max():.1f} m beside its way {_when(t_s, rows)}"
+            doubts.append(Doubt("jump", reason, float(t_s[rows[0]]), float(t_s[rows[-1]])))
+    return tuple(doubts)
 
 
 def _reverses(w: Waypoints, backward_mps: Array) -> NDArray[np.bool_]:
@@ -58,13 +82,13 @@ def spans_of(mask: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
 
 
 def _words_of_reversing(w: Waypoints, k: NDArray[np.intp]) -> str:
-    return f"reverses at up to {_most(w.speed_mps[k]):.1f} m/s {_when(w, k)}"
+    return f"reverses at up to {_most(w.speed_mps[k]):.1f} m/s {_when(w.t_s, k)}"
 
 
 def _most(speed_mps: Array) -> float:
     return float(np.abs(speed_mps).max())
 
 
-def _when(w: Waypoints, k: NDArray[np.intp]) -> str:
-    first, last = f"{w.t_s[k[0]]:.1f}", f"{w.t_s[k[-1]]:.1f}"
+def _when(t_s: Array, k: NDArray[np.intp]) -> str:
+    first, last = f"{t_s[k[0]]:.1f}", f"{t_s[k[-1]]:.1f}"
     return f"at {first} s" if first == last else f"from {first} to {last} s"

@@ -13,7 +13,7 @@ from log2sim.agents.candidate import REAR_AXLE_SHARE, AgentCandidate, Timeline, 
 from log2sim.agents.confirmation import SAME_MOMENT_S
 from log2sim.agents.heading.box_headings import heading_log_odds
 from log2sim.agents.lidar_tracking import BoxState, LidarMatch, track_with_lidar
-from log2sim.agents.motion_doubts import motion_doubts
+from log2sim.agents.motion_doubts import jump_doubts, motion_doubts
 from log2sim.agents.size import TrackGeometry, moving_geometry
 from log2sim.agents.smooth.feasibility import limit_doubts
 from log2sim.agents.smooth.fixed_interval import MotionModel
@@ -101,7 +101,9 @@ def moving_candidate(
     }
     z = np.interp(at, t, _running_median(geometry.z_m))
     waypoints = _waypoints(path, _headings(path, group), z, observed)
+    sigma_m = np.sqrt(np.trace(positions.covariance, axis1=1, axis2=2) / 2 + CENTER_SIGMA_M[group] ** 2)
     doubts = limit_doubts(path.broken) + motion_doubts(track.category, waypoints)
+    doubts += jump_doubts(positions.t_s, path.residual_m, sigma_m)
     return candidate_of(track, geometry, waypoints, quality, static=False, doubts=doubts)
 
 

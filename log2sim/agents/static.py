@@ -3,23 +3,50 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from log2sim.agents.box_votes import independent
 from log2sim.agents.candidate import AgentCandidate, Timeline, candidate_of
+from log2sim.agents.hypotheses import Part, main_place
 from log2sim.agents.lidar_tracking import BoxState, track_with_lidar
 from log2sim.agents.size import TrackGeometry, static_geometry
+from log2sim.agents.smooth.heading import UNKNOWN_YAW_RAD
 from log2sim.agents.standing import robust_line
-from log2sim.datatypes import GROUP_OF, BoxEvidence, Measurements, Obstacles, Track, Waypoints
+from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, BoxEvidence, Measurements, Obstacles, Waypoints
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
 from log2sim.perception.box_fitting import rotate
 from log2sim.tracking.motion import CENTER_SIGMA_M
 
-# Of a yaw, up to half a turn: of which nothing is known (uniform), of the box of one tick, of any.
-UNKNOWN_YAW_RAD, BOX_YAW_SIGMA_RAD, MIN_YAW_SIGMA_RAD = np.pi / np.sqrt(12.0), 0.1, 0.005
+# Standard deviations of a yaw, up to half a turn: of the box of one tick, and of any.
+BOX_YAW_SIGMA_RAD, MIN_YAW_SIGMA_RAD = 0.1, 0.005
 # Nothing that was seen to stand goes faster, however short it was seen.
 MAX_SPEED_SIGMA_MPS = 2.0
+
+
+def _geometry_of(part: Part) -> TrackGeometry:
+    """Estimate the geometry of a track that stands by the measurements that agree on its place.
+
+    If all make it too large for one object, some show a part of a neighbor.
+    """
+    geometry = static_geometry(part.at_place or part.track)
+    if part.at_place is None and _is_too_large(geometry, part.track.category):
+        main = main_place(part.track)
+        smaller = None if main is None else static_geometry(main)
+        if smaller is not None and not _is_too_large(smaller, part.track.category):
+            geometry = smaller
+    n = len(part.track)
+    return replace(
+        geometry,
+        xy_m=np.tile(geometry.xy_m[0], (n, 1)),
+        covariance=np.tile(np.median(geometry.covariance, axis=0), (n, 1, 1)),
+        z_m=np.full(n, np.median(geometry.z_m)),
+    )
+
+
+def _is_too_large(geometry: TrackGeometry, category: str) -> bool:
+    return bool(np.any(geometry.size_m[:2] >= MAX_SIZE_M[category][:2]))
 
 
 def standing_speed_sigma(m: Measurements, sigma_m: float) -> float:
@@ -46,22 +73,24 @@ def yaw_sigma(m: BoxEvidence, geometry: TrackGeometry) -> float:
     if len(rows):
         off = wrap_angle(2 * (m.box_yaw_rad[rows] - geometry.yaw_rad)) / 2
         scatter = max(float(np.sqrt(np.mean(off**2))), BOX_YAW_SIGMA_RAD / np.sqrt(len(rows)))
-        return float(np.clip(scatter / np.sqrt(independent(len(rows))), MIN_YAW_SIGMA_RAD, UNKNOWN_YAW_RAD))
+        sigma = scatter / np.sqrt(independent(len(rows)))
+        return float(min(max(sigma, MIN_YAW_SIGMA_RAD), UNKNOWN_YAW_RAD))
     points = [cluster[:, :2] for cluster in m.cluster if len(cluster)]
     if not points:
         return UNKNOWN_YAW_RAD
     xy = rotate(np.concatenate(points) - geometry.xy_m[0], -geometry.yaw_rad)
     low, high = np.quantile(xy, 0.02, axis=0), np.quantile(xy, 0.98, axis=0)
     off_m = float(np.median(np.minimum(np.abs(xy - low), np.abs(xy - high)).min(axis=1)))
-    return float(np.clip(np.arctan2(off_m, float((high - low).max())), MIN_YAW_SIGMA_RAD, UNKNOWN_YAW_RAD))
+    sigma = np.arctan2(off_m, float((high - low).max()))
+    return float(min(max(sigma, MIN_YAW_SIGMA_RAD), UNKNOWN_YAW_RAD))
 
 
-def static_candidate(track: Track, obstacles: Sequence[Obstacles | None], timeline: Timeline) -> AgentCandidate:
+def static_candidate(part: Part, obstacles: Sequence[Obstacles | None], timeline: Timeline) -> AgentCandidate:
     """Make an agent with one pose, at the ticks of its track and wherever LiDAR points match its box.
 
     Its yaw is known up to half a turn.
     """
-    geometry = static_geometry(track)
+    track, geometry = part.track, _geometry_of(part)
     xy, z = geometry.xy_m[0], float(np.median(geometry.z_m))
     yaw = 0.0 if geometry.yaw_rad is None else float(np.nan_to_num(geometry.yaw_rad))
     start_ns = int(timeline.t_ns[track.tick[0]])

@@ -21,7 +21,7 @@ MIN_DISPLACEMENT_M = 1.0
 # Standard deviation of the curvature of a way on which no course is known: a turn at a crossing has a radius of some 15 m.
 WAY_CURVATURE_1PM = 0.06
 # Of a heading of which nothing is known: uniform over half a turn.
-UNKNOWN_YAW_RAD = np.pi / np.sqrt(12.0)
+UNKNOWN_YAW_RAD = float(np.pi / np.sqrt(12.0))
 
 
 def course_is_known(

@@ -1,0 +1,164 @@
+"""What a track shows: seeded tracks of objects that stand and move, seen in turn, at rates from 2 to 20 Hz."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from log2sim.agents.hypotheses import explain_track, main_place
+from log2sim.agents.motion_evidence import (
+    PLACE_SIGMA_M,
+    REPEATED_SHARE,
+    STANDING,
+    VIEW_S,
+    MotionPriorSigmas,
+    Positions,
+    evidence_of,
+)
+from log2sim.datatypes import Detections, Measurements, Track
+
+RATES_HZ = [2.0, 5.0, 20.0]
+
+
+def track_of(t_s: np.ndarray, xy: np.ndarray, category: str = "car", sigma_m: float = 0.2) -> Track:
+    """A track without LiDAR points: centers and their covariances alone."""
+    n = len(t_s)
+    found = Detections(np.zeros((n, 4)), np.full(n, 0.8), np.full(n, category))
+    m = replace(
+        Measurements.unplaced(found, t_ns=0, camera="front", sensor_m=np.zeros(3)),
+        t_ns=np.round(t_s * 1e9).astype(np.int64),
+        center_m=np.column_stack([xy, np.zeros(n)]),
+        covariance=np.tile(sigma_m**2 * np.eye(2), (n, 1, 1)),
+        source=np.full(n, "lidar"),
+        yaw_rad=np.zeros(n),
+    )
+    return Track(category, np.arange(n), m)
+
+
+def view_noise(t_s: np.ndarray, seed: int, sigma_m: float = 0.2) -> np.ndarray:
+    """Errors that repeat while the view stays the same, and small ones that do not."""
+    rng = np.random.default_rng(seed)
+    out = np.zeros((len(t_s), 2))
+    for k in range(len(t_s)):
+        stays = np.exp(-(t_s[k] - t_s[k - 1]) / 0.5) if k else 0.0
+        out[k] = stays * out[k - 1] + rng.normal(0, sigma_m * np.sqrt(1 - stays**2), 2)
+    return out + rng.normal(0, 0.03, out.shape)
+
+
+def times(rate_hz: float, duration_s: float = 6.0) -> np.ndarray:
+    return np.arange(0, duration_s, 1 / rate_hz)
+
+
+def along(x_m: np.ndarray) -> np.ndarray:
+    return np.column_stack([x_m, np.zeros(len(x_m))])
+
+
+@pytest.mark.parametrize("rate_hz", RATES_HZ)
+@pytest.mark.parametrize("seed", range(3))
+def test_two_parked_cars_seen_in_turn_are_two_that_stand(rate_hz, seed):
+    t = times(rate_hz)
+    second = t > 3.0
+    parts = explain_track(track_of(t, along(np.where(second, 5.5, 0.0)) + view_noise(t, seed)))
+    assert [part.static for part in parts] == [True, True]
+    places = sorted(float(np.median(part.track.measurements.center_m[:, 0])) for part in parts)
+    assert places == pytest.approx([0.0, 5.5], abs=0.6)
+    assert sorted(len(part.track) for part in parts) == sorted([int(second.sum()), int((~second).sum())])
+
+
+@pytest.mark.parametrize("rate_hz", RATES_HZ)
+@pytest.mark.parametrize("seed", range(3))
+def test_a_motion_is_one_moving_object(rate_hz, seed):
+    t = times(rate_hz)
+    braking = np.where(t < 4.0, 8.0 * t - t**2, 16.0)
+    ways = {"braking": braking, "starting": 0.75 * t**2, "slow": 1.5 * t, "motorway": 30.0 * t}
+    for name, way in ways.items():
+        (part,) = explain_track(track_of(t, along(way) + view_noise(t, seed)))
+        assert not part.static, name
+        assert len(part.track) == len(t), name
+
+
+@pytest.mark.parametrize("rate_hz", RATES_HZ)
+def test_people_who_walk_are_not_people_who_stand_in_turn(rate_hz):
+    t = times(rate_hz, 4.0)
+    (part,) = explain_track(track_of(t, along(1.3 * t) + view_noise(t, 0, 0.1), "pedestrian", 0.1))
+    assert not part.static
+
+
+@pytest.mark.parametrize("rate_hz", RATES_HZ)
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_at_rest_is_rest(rate_hz, seed):
+    t = times(rate_hz)
+    (part,) = explain_track(track_of(t, view_noise(t, seed)))
+    assert part.static
+    assert len(part.track) == len(t)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_jump_to_another_moving_car_splits_the_track(seed):
+    t = times(10.0, 5.0)
+    second = t > 2.45
+    way = along(np.where(second, 8.0 * t - 25.0, 8.0 * t)) + np.outer(second, [0.0, 3.5])
+    parts = explain_track(track_of(t, way + view_noise(t, seed)))
+    assert [part.static for part in parts] == [False, False]
+    assert [len(part.track) for part in parts] == pytest.approx([25, 25], abs=2)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_outliers_split_no_track(seed):
+    t = times(10.0)
+    way = along(6.0 * t) + view_noise(t, seed)
+    way[[7, 23, 41]] += [[3.0, 2.0], [-4.0, 1.0], [2.0, -5.0]]
+    (part,) = explain_track(track_of(t, way))
+    assert (part.static, len(part.track)) == (False, 60)
+
+
+def test_what_is_shown_in_between_is_no_object_of_its_own():
+    t = times(10.0, 4.0)
+    other = np.isin(np.arange(40), [8, 9, 17, 18, 25, 30, 31])
+    (part,) = explain_track(track_of(t, along(np.where(other, 5.0, 0.0)) + view_noise(t, 1)))
+    assert part.static
+    assert part.at_place is not None
+    assert len(part.track) == 40
+    assert np.abs(part.at_place.measurements.center_m[:, 0]).max() < 2.0
+    main = main_place(part.track)
+    assert main is not None
+    assert 20 <= len(main) <= 33
+
+
+@pytest.mark.parametrize("turn", [0.7, np.pi / 2, 3.0])
+def test_neither_map_nor_clock_matters(turn):
+    t = times(10.0)
+    way = along(np.where(t > 3.0, 5.5, 0.0)) + view_noise(t, 2)
+    c, s = np.cos(turn), np.sin(turn)
+    moved = track_of(t + 1e3, way @ np.array([[c, s], [-s, c]]) + [4e5, 5e6])
+    moved = replace(moved, measurements=replace(moved.measurements, yaw_rad=np.full(len(t), turn)))
+    expected = [part.track.tick.tolist() for part in explain_track(track_of(t, way))]
+    assert [part.track.tick.tolist() for part in explain_track(moved)] == expected
+
+
+def test_the_evidence_is_the_likelihood_of_the_gaussian_process():
+    t = np.array([0.0, 0.3, 0.5, 1.2, 2.0])
+    variance = np.array([0.1, 0.2, 0.1, 0.3, 0.1])
+    rng = np.random.default_rng(3)
+    xy = np.column_stack([5.0 * t, 1.0 - t]) + rng.normal(0, 0.1, (5, 2))
+    motion = MotionPriorSigmas(8.0, 2.5)
+    # A path of velocity steps, each Gaussian, with positions summed: the Wiener process in the limit.
+    steps = np.linspace(-1, 1, 4001)
+    dt = steps[1] - steps[0]
+    response = np.where(np.sign(steps) == np.sign(t - 1.0)[:, None], np.abs(t - 1.0)[:, None] - np.abs(steps), 0.0)
+    response = np.maximum(response, 0.0)
+    noise = np.sqrt(np.outer(variance, variance))
+    noise = noise * (REPEATED_SHARE * np.exp(-np.abs(t[:, None] - t) / VIEW_S) + (1 - REPEATED_SHARE) * np.eye(5))
+    for prior, covariance in (
+        (STANDING, noise + PLACE_SIGMA_M**2),
+        (motion, noise + PLACE_SIGMA_M**2 + 64.0 * np.outer(t - 1, t - 1) + 6.25 * response @ response.T * dt),
+    ):
+        middle = np.median(xy, axis=0) if prior is STANDING else xy[3]
+        expected = sum(multivariate_normal(np.zeros(5), covariance).logpdf(xy[:, k] - middle[k]) for k in range(2))
+        found = evidence_of(Positions(t, xy, variance), prior)
+        if found.inlier.all():
+            assert found.log == pytest.approx(expected, abs=0.05)
+        assert prior is STANDING or found.inlier.all()
