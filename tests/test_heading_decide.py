@@ -11,7 +11,7 @@ from worlds import rows_at
 from log2sim.agents.candidate import Timeline, candidate_of
 from log2sim.agents.heading.decide import decide_headings
 from log2sim.agents.size import TrackGeometry
-from log2sim.datatypes import Track, Waypoints
+from log2sim.datatypes import Doubt, Track, Waypoints
 
 T_NS = np.arange(20) * 100_000_000
 TIMELINE = Timeline(T_NS, 0)
@@ -93,6 +93,30 @@ def test_what_drives_fast_drives_forward_and_a_slow_maneuver_may_reverse():
     np.testing.assert_allclose(agent.waypoints.speed_mps, 8.0)
     assert agent.quality["heading_confidence"] > 0.99
     assert decided(candidate(30.0, 40.0, 0.0, -0.8, front=0.0, score=0.99))[0] == [0]
+
+
+def cut(c, rows):
+    """The candidate at some of its waypoints."""
+    return replace(c, agent=replace(c.agent, waypoints=c.agent.waypoints.take(rows)))
+
+
+@pytest.mark.parametrize("yaw", [0.0, np.pi])
+def test_what_drives_off_or_stops_had_its_front_where_it_has_it_then(yaw):
+    moving = candidate(30.0, 40.0, 0.0, 6.0)
+    before, after = candidate(34.0, 40.0, yaw), candidate(30.0 + 5.4 + 1.0, 40.0, yaw)
+    standing, driving = cut(before, slice(0, 5)), cut(moving, slice(8, 20))
+    headings, agents = decided(standing, driving)
+    assert headings == [0, 0]
+    assert agents[0].quality["heading_confidence"] > 0.95
+    assert decided(cut(after, slice(15, 20)), cut(moving, slice(0, 10)))[0] == [0, 0]
+    # Another place, another vehicle.
+    assert decided(cut(candidate(34.0, 44.0, yaw), slice(0, 5)), driving)[1][0].quality["heading_confidence"] < 0.6
+
+
+def test_the_doubts_of_a_car_that_is_turned_round_are_those_of_its_new_motion():
+    backward = candidate(30.0, 40.0, 0.0, -8.0)
+    doubted = backward.doubted([Doubt("reversing", "reverses"), Doubt("jump", "jumps")])
+    assert [d.flag for d in decided(doubted)[1][0].doubts] == ["jump"]
 
 
 def test_a_lone_car_is_doubted_and_says_so_in_its_quality():

@@ -9,10 +9,12 @@ import numpy as np
 
 from log2sim.agents.candidate import AgentCandidate, Timeline
 from log2sim.agents.heading.box_headings import heading_log_odds
+from log2sim.agents.heading.continuation import continued_log_odds
 from log2sim.agents.heading.course import course_log_odds
 from log2sim.agents.heading.outline import outline_log_odds
 from log2sim.agents.heading.rows import find_rows, headings_of
 from log2sim.agents.heading.traffic import PARALLEL_SIGMA_RAD, side_log_odds, street_axis, street_log_odds
+from log2sim.agents.motion_doubts import motion_doubts
 from log2sim.agents.static import UNKNOWN_YAW_RAD
 from log2sim.datatypes import GROUP_OF, Doubt, Waypoints
 from log2sim.geometry import Array, wrap_angle
@@ -50,7 +52,8 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
     if not of:
         return list(candidates)
     road_users = [candidates[k] for k in of]
-    own = np.array([_own_log_odds(c, timeline) for c in road_users])
+    alone = np.array([_own_log_odds(c, timeline) for c in road_users])
+    own = continued_log_odds([c.agent.waypoints for c in road_users], alone)
     paths = [_path_of(c, odds) for c, odds in zip(road_users, own.tolist())]
     road_users = [_along_street(c, [ego_path, *paths]) for c in road_users]
     poses = np.array([_middle_pose(c.agent.waypoints) for c in road_users])
@@ -112,7 +115,8 @@ def _decided(candidate: AgentCandidate, along: float) -> AgentCandidate:
     if along < 0.5:
         w = agent.waypoints
         w = replace(w, yaw_rad=wrap_angle(w.yaw_rad + np.pi), speed_mps=-w.speed_mps)
-        agent = replace(agent, waypoints=w)
+        kept = [doubt for doubt in agent.doubts if doubt.flag not in ("speed", "reversing")]
+        agent = replace(agent, waypoints=w, doubts=(*kept, *motion_doubts(agent.category, w)))
     agent = replace(agent, quality={**agent.quality, "heading_confidence": round(confidence, 3)})
     doubts = (
         [Doubt("heading_ambiguous", "front and back may be swapped")] if confidence < MIN_HEADING_CONFIDENCE else []
