@@ -1,4 +1,4 @@
-"""JSON documents: atomic writing, strict reading, validation against `schemas/`; paths that stay inside a log."""
+"""JSON documents: atomic writing, strict reading, validation against `schemas/`."""
 
 from __future__ import annotations
 
@@ -159,25 +159,6 @@ def _path_of_not_finite(value: Any) -> str | None:
             step = f"[{key}]" if isinstance(key, int) else f"{key}"
             return step + ("." if place and not place.startswith("[") else "") + place
     return None
-
-
-def inside(root: Path, relative: str, what: str) -> Path:
-    """Resolve a path that a log names.
-
-    Raises
-    ------
-    LogError
-        For a path outside the log's folder, also through a symbolic link.
-    """
-    try:
-        resolved = (root / relative).resolve()
-    except (OSError, RuntimeError, ValueError) as problem:  # a loop of symbolic links, a zero byte
-        raise LogError(
-            f"{what}: path {relative[:100]!r} cannot be followed: {problem}; give the path of a file"
-        ) from None
-    if Path(relative).is_absolute() or not resolved.is_relative_to(root.resolve()):
-        raise LogError(f"{what}: path '{relative}' leaves the log folder; use a path relative to it, without '..'")
-    return resolved
 
 
 def rounded(value: float, digits: int) -> float | None:

@@ -27,13 +27,14 @@ from log2sim.cli import (
 )
 from log2sim.cli.options import fail, say
 from log2sim.errors import Log2SimError
+from log2sim.links import OPTION, following_links
 from log2sim.version import __version__
 
 INTERRUPTED = 130
 
 app = typer.Typer(
     name="log2sim",
-    help="Reconstruct driving logs as scenarios that a simulator can run. Add --debug for tracebacks.",
+    help="Reconstruct driving logs as scenarios that a simulator can run. Add --debug for tracebacks, --follow-links for logs with links that leave their folders.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -44,7 +45,7 @@ app = typer.Typer(
 
 @app.callback(invoke_without_command=True)
 def root(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
-    """Reconstruct driving logs as scenarios that a simulator can run. Add --debug for tracebacks."""
+    """Reconstruct driving logs as scenarios that a simulator can run. Add --debug for tracebacks, --follow-links for logs with links that leave their folders."""
     if version:
         say(__version__)
         raise typer.Exit
@@ -60,10 +61,11 @@ app.command(name="import")(import_.import_)
 
 def main() -> None:
     """Run the command line; every `Log2SimError` becomes one message and its exit code."""
-    arguments = [a for a in sys.argv[1:] if a != "--debug"]
-    debug = len(arguments) != len(sys.argv) - 1
+    arguments = [a for a in sys.argv[1:] if a not in ("--debug", OPTION)]
+    debug = "--debug" in sys.argv
     try:
-        code = app(args=arguments, prog_name="log2sim", standalone_mode=False)
+        with following_links(OPTION in sys.argv):
+            code = app(args=arguments, prog_name="log2sim", standalone_mode=False)
     except Log2SimError as error:
         if debug:
             raise

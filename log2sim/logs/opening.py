@@ -7,6 +7,7 @@ from pathlib import Path
 from log2sim import registry
 from log2sim.datatypes import Log
 from log2sim.errors import ConfigError, LogError
+from log2sim.links import following_links
 from log2sim.logs.guarding import guard_log, translate_parser_errors
 from log2sim.logs.reader import Reader
 
@@ -17,7 +18,9 @@ MAX_LISTED = 20
 MAX_LEVELS_ABOVE = 4
 
 
-def open_log(path: Path | str, *, format: str = "auto", sequence: str | None = None) -> Log:
+def open_log(
+    path: Path | str, *, format: str = "auto", sequence: str | None = None, follow_links: bool | None = None
+) -> Log:
     """Open a log; only its index, calibration and poses are read, images and sweeps on request.
 
     Parameters
@@ -28,6 +31,8 @@ def open_log(path: Path | str, *, format: str = "auto", sequence: str | None = N
         Name of a reader (`log2sim.registry.names("log")` lists them), or "auto" to find it.
     sequence : str, optional
         Which sequence of a root; needed only when it holds several.
+    follow_links : bool, optional
+        Whether symbolic links may lead out of the log's folders. By default as in `log2sim.links.following_links`, else not.
 
     Raises
     ------
@@ -44,7 +49,7 @@ def open_log(path: Path | str, *, format: str = "auto", sequence: str | None = N
     if not _may_read(reader, root):
         raise LogError(f"{root}: is a file, which format '{name}' cannot be; expected {reader.looks_for}")
     chosen = _select_sequence(root, name, reader.sequences(root), sequence)
-    with translate_parser_errors(f"{root}: cannot be read as format '{name}'", LogError):
+    with following_links(follow_links), translate_parser_errors(f"{root}: cannot be read as format '{name}'", LogError):
         log = guard_log(reader.open(root, chosen), str(root))
     others = _other_formats(root, name) if format == "auto" else []
     if not others:

@@ -23,6 +23,7 @@ from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, Stream
 from log2sim.errors import LogError
 from log2sim.geometry import Array, Camera, PoseTrack
 from log2sim.input_files import read_file
+from log2sim.links import require_links_inside
 from log2sim.logs.argoverse.cities import find_city, map_frame_of
 from log2sim.logs.argoverse.labels import read_labels
 from log2sim.logs.argoverse.poses import read_ego_track, read_mounts
@@ -70,7 +71,9 @@ class ArgoverseReader:
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a log; no image, no sweep and no annotation is read."""
-        return _Folder(path if _is_log(path) else path / sequence).log()
+        folder = path if _is_log(path) else path / sequence
+        require_links_inside(folder, path)
+        return _Folder(folder).log()
 
 
 READER = ArgoverseReader()

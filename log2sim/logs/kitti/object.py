@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Labels, Log, Stream, Sweep
 from log2sim.errors import LogError
 from log2sim.geometry import Array, Camera, PoseTrack, apply, inverse, transform
+from log2sim.links import require_links_inside
 from log2sim.logs.digest import digest_of
 from log2sim.logs.images import first_image_size, image_stream
 from log2sim.logs.kitti import drive
@@ -53,7 +54,9 @@ class KittiObjectReader:
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a split."""
-        return _Split(self._splits(path)[sequence]).log()
+        split = self._splits(path)[sequence]
+        require_links_inside(split, path)
+        return _Split(split).log()
 
     def _splits(self, path: Path) -> dict[str, Path]:
         path = path.resolve()

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Log, MapFrame, Stream
 from log2sim.errors import LogError
 from log2sim.geometry import Array, Camera, PoseTrack, transform
+from log2sim.links import require_links_inside
 from log2sim.logs.digest import digest_of
 from log2sim.logs.images import image_stream
 from log2sim.logs.kitti import drive
@@ -49,7 +50,9 @@ class KittiRawReader:
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a sequence."""
-        return _Drive(self._drives(path)[sequence]).log()
+        drive = self._drives(path)[sequence]
+        require_links_inside(drive, drive.parent, path, files=[drive.parent / name for name in CALIBRATION])
+        return _Drive(drive).log()
 
     def _drives(self, path: Path) -> dict[str, Path]:
         # A drive given as "." has its name only once it is resolved.

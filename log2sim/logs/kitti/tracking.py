@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Log, Stream
 from log2sim.errors import LogError
 from log2sim.geometry import Camera, PoseTrack, transform
+from log2sim.links import require_links_inside
 from log2sim.logs.digest import digest_of
 from log2sim.logs.images import first_image_size, image_stream
 from log2sim.logs.kitti import drive
@@ -40,6 +41,7 @@ class KittiTrackingReader:
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a sequence."""
+        require_links_inside(_base(path), path)
         return _Sequence(_base(path), sequence).log()
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, Sweep
-from log2sim.documents import JSON_LIMIT_BYTES, check, inside, read_json
+from log2sim.documents import JSON_LIMIT_BYTES, check, read_json
 from log2sim.errors import LogError
 from log2sim.geometry import (
     DISTORTION_LENGTHS,
@@ -25,6 +25,7 @@ from log2sim.geometry import (
     transform,
 )
 from log2sim.input_files import open_regular, read_file
+from log2sim.links import inside
 from log2sim.logs.images import image_stream
 from log2sim.logs.native.csv_tables import CsvTable, read_csv_table
 from log2sim.logs.native.labels import (

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.documents import inside
 from log2sim.errors import LogError
 from log2sim.geometry import Array, PoseTrack, rotation_from_quaternion, transform
+from log2sim.links import inside
 from log2sim.logs.nuscenes.tables import (
     DATA,
     SCENES,

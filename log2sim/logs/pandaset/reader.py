@@ -31,6 +31,7 @@ from log2sim.geometry import (
     transform,
 )
 from log2sim.input_files import read_text
+from log2sim.links import require_links_inside
 from log2sim.logs.digest import digest_of
 from log2sim.logs.images import first_image_size, image_stream
 from log2sim.logs.notes import defer_notes
@@ -75,7 +76,9 @@ class PandaSetReader:
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a sequence; no sweep and no cuboid is read."""
-        return _Sequence(path if _is_sequence(path) else path / sequence).log()
+        folder = path if _is_sequence(path) else path / sequence
+        require_links_inside(folder, path)
+        return _Sequence(folder).log()
 
 
 READER = PandaSetReader()

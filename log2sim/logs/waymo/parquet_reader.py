@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Log
 from log2sim.errors import RecordError
+from log2sim.links import require_links_inside
 from log2sim.logs.arrow.parquet_rows import Row
 from log2sim.logs.arrow.tables import read_columns
 from log2sim.logs.arrow.values import Kind
@@ -51,6 +52,7 @@ class WaymoParquetReader:
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a segment; no picture, range image or label is read."""
+        require_links_inside(path)
         return _SegmentFolder(path, sequence).log()
 
 
