@@ -38,7 +38,7 @@ def test_who_crosses_on_a_bridge_is_not_hit():
     over = line("over", 40, -40, 10, 8, np.pi / 2)
     for z_m, hit in ((6.0, False), (0.0, True)):
         bridge = replace(over, waypoints=replace(over.waypoints, z_m=over.waypoints.z_m + z_m))
-        env = made(scenario_of(line("ego", 0, speed=10, duration_s=8), bridge), agents="log")
+        env = made(scenario_of(line("ego", 0, speed=10, duration_s=8), bridge), agents="scenario")
         env.reset()
         ended = cut = False
         while not (ended or cut):

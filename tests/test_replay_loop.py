@@ -19,7 +19,7 @@ from log2sim.datatypes import Trajectory
 from log2sim.errors import ConfigError
 from log2sim.simulation.policy import Controls
 from log2sim.simulation.policy_loading import load_policy
-from log2sim.simulation.reactive.path_table import log_times_of_positions
+from log2sim.simulation.reactive.path_table import scenario_times_of_positions
 from log2sim.simulation.rollout import rollout
 from log2sim.simulation.runner import open_world, replay
 
@@ -210,7 +210,7 @@ def test_where_a_way_crosses_over_itself_the_height_is_that_of_the_own_level():
     loop = agent_from(t, x, y, yaw, np.full(len(t), 5.0), id="ego", offset_m=0.01)
     path = Trajectory.through(changed(loop, waypoints=changed(loop.waypoints, z_m=0.5 * t)).waypoints, 0.01)
     late = np.arange(0, 24, 0.05)
-    found = log_times_of_positions(path, *path.at(late)[:2])
+    found = scenario_times_of_positions(path, *path.at(late)[:2])
     np.testing.assert_allclose(found, late, atol=0.25)  # a meter of way
 
 
@@ -304,7 +304,7 @@ def test_the_command_line_lets_agents_react(tmp_path):
     assert drivers("--react", "f") == ["policy", "reactive", "pid"]
     assert run("validate", tmp_path / "r.json").code == 0
     for options, said in (
-        (("--agents", "smart"), "expected log or reactive"),
+        (("--agents", "smart"), "expected scenario or reactive"),
         (("--react", "h"), "there is none of that id"),
         (("--react", "f", "--agents", "reactive"), "--react"),
     ):

@@ -15,7 +15,7 @@ from log2sim.errors import ConfigError
 from log2sim.simulation.policy import Controls
 from log2sim.simulation.policy_loading import load_policy
 from log2sim.simulation.reactive.idm import idm_parameters, leader_demand, rate_response
-from log2sim.simulation.reactive.path_table import PathTable, log_times_of_distance
+from log2sim.simulation.reactive.path_table import PathTable, scenario_times_of_distance
 from log2sim.simulation.reactive.swept_corridor import _nearest_edge
 from log2sim.simulation.rollout import rollout
 from log2sim.simulation.runner import open_world
@@ -277,7 +277,7 @@ def test_only_those_named_react():
 @pytest.mark.parametrize(
     ("agents", "said"),
     [
-        ("react", "expected log or reactive"),
+        ("react", "expected scenario or reactive"),
         (["g"], "there is none of that id"),
         (["p"], "cannot react"),
         (["ego"], "cannot react"),
@@ -367,7 +367,7 @@ def test_feet_on_a_curved_way_are_those_of_a_search_over_all_its_points():
 def test_the_time_of_the_log_at_a_place_is_found_from_the_way_gone():
     path = Trajectory.through(line("a", 0, speed=10, duration_s=10).waypoints, 0.0)
     t = np.linspace(0, 10, 201)
-    np.testing.assert_allclose(log_times_of_distance(path, t, 6 * t, 0 * t), 0.6 * t, atol=1e-6)
+    np.testing.assert_allclose(scenario_times_of_distance(path, t, 6 * t, 0 * t), 0.6 * t, atol=1e-6)
 
 
 def test_controls_of_a_policy_hold_only_for_the_ego():

@@ -26,8 +26,10 @@ def replay(
     ] = None,
     agents: Annotated[
         str,
-        typer.Option(help="Behavior of the other agents: log (as recorded) or reactive (brake to avoid collisions)."),
-    ] = "log",
+        typer.Option(
+            help="Behavior of the other agents: scenario (as it says) or reactive (brake to avoid collisions)."
+        ),
+    ] = "scenario",
     react: Annotated[str | None, typer.Option(metavar="ID,ID", help="Make only these agents reactive.")] = None,
     confidence: Annotated[
         float | None, typer.Option(metavar="MIN", help="Leave out agents with a lower confidence; the ego stays.")
@@ -67,7 +69,7 @@ def replay(
     check_targets(out, overwrite=overwrite)
     if out is not None and out.resolve() == scenario.resolve():
         raise ConfigError(f"{out}: is the scenario itself, which a replay must not replace; choose another name")
-    if react is not None and agents != "log":
+    if react is not None and agents == "reactive":
         raise ConfigError("--react selects the reactive agents and --agents reactive selects all: give one of the two")
     limits = parse_limits(limit or ())
     loaded = Scenario.load(scenario)

@@ -1,4 +1,4 @@
-"""Simulate scenarios: vehicles follow their logged trajectories, and the user's policy may drive the ego."""
+"""Simulate scenarios: vehicles follow their trajectories, and the user's policy may drive the ego."""
 
 from __future__ import annotations
 

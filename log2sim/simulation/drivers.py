@@ -52,7 +52,7 @@ def assign_drivers(
 
 
 def reactive_ids(agents: Sequence[Agent], wanted: str | Collection[str], *, drives_ego: bool) -> frozenset[str]:
-    """Return the ids of the agents that react: all that can for "reactive", none for "log", or those named.
+    """Return the ids of the agents that react: all that can for "reactive", none for "scenario", or those named.
 
     Raises
     ------
@@ -61,8 +61,8 @@ def reactive_ids(agents: Sequence[Agent], wanted: str | Collection[str], *, driv
     """
     able = [a.id for a in agents if not a.static and len(a.waypoints) > 1 and not (drives_ego and a.id == EGO)]
     if isinstance(wanted, str):
-        if wanted not in ("log", "reactive"):
-            raise ConfigError(f"agents '{wanted}': expected log or reactive")
+        if wanted not in ("scenario", "log", "reactive"):  # log: the name of scenario in older programs
+            raise ConfigError(f"agents '{wanted}': expected scenario or reactive")
         return frozenset(i for i in able if i != EGO) if wanted == "reactive" else frozenset()
     for name in wanted:
         if name in able:

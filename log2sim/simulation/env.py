@@ -51,7 +51,7 @@ class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
         Simulation step.
     hold_s : float
         How long each action holds, a multiple of `dt_s`.
-    agents : {"reactive", "log"} or collection of str
+    agents : {"reactive", "scenario"} or collection of str
         Behavior of the other agents; see `log2sim.simulation.runner.replay`.
     sight_m : float
         Range within which others are observed.
@@ -66,17 +66,18 @@ class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
 
     Observation, a dictionary of float32 boxes; values are clipped to their bounds:
 
-    - `ego` (5,): speed in m/s, acceleration in m/s2, steering angle in rad, offset from the recorded path in m (left
-      positive), heading against it in rad.
-    - `path` (10, 3): the recorded path 5, 10, ... 50 m ahead: forward, left in m of the ego's box center and the log's speed.
+    - `ego` (5,): speed in m/s, acceleration in m/s2, steering angle in rad, offset from the path of the scenario in m
+      (left positive), heading against it in rad.
+    - `path` (10, 3): the path of the scenario 5, 10, ... 50 m ahead: forward, left in m of the ego's box center and the
+      scenario's speed.
     - `others` (max_others, 7): nearest first: forward, left in m, velocity forward, left in m/s (of the other, on the ego's
       axes), heading against the ego's in rad, length, width in m. Rows without an agent are 0.
     - `others_mask` (max_others,) int8: 1 where a row has an agent.
 
-    Reward of a step: progress along the recorded path in m, less 0.2 per second and meter of offset from it, less 100 for
-    a collision; `info["reward"]` holds the terms. The episode terminates with a collision or at the end of the recorded path,
-    and is truncated when the recorded time is over, or when the ego is more than 15 m off the path. The environment is
-    deterministic; the seed has no effect.
+    Reward of a step: progress along the path of the scenario in m, less 0.2 per second and meter of offset from it,
+    less 100 for a collision; `info["reward"]` holds the terms. The episode terminates with a collision or at the end of
+    the path of the scenario, and is truncated when the scenario's time is over, or when the ego is more than 15 m off
+    the path. The environment is deterministic; the seed has no effect.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from log2sim.geometry import Array, wrap_angle
 
 KNOT_S = 0.1
-MAX_KNOTS = 60_000  # 100 minutes; a longer trajectory is followed as logged
+MAX_KNOTS = 60_000  # 100 minutes; a longer trajectory is followed as it is
 
-POSITION_M = 0.1  # standard deviations of the logged states, at every knot
+POSITION_M = 0.1  # standard deviations of the scenario's states, at every knot
 YAW_RAD = 0.1
 SPEED_MPS = 0.5
 JERK_MPS3 = 20.0  # standard deviations of a driver's inputs
@@ -134,7 +134,7 @@ def fit_trajectory(
 def unfitted_trajectory(
     t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps: Array, limits: FeasibilityLimits
 ) -> FeasibleTrajectory:
-    """Return the logged trajectory at times (K,), K >= 1: for a single time, or a lifetime that is too long to be fitted."""
+    """Return the given trajectory at times (K,), K >= 1: for a single time, or a lifetime that is too long to be fitted."""
     return FeasibleTrajectory(t_s, *_initial_states(t_s, x_m, y_m, yaw_rad, speed_mps, limits).T)
 
 
@@ -145,7 +145,7 @@ def _consistent_heading(yaw: Array) -> Array:
 
 
 def _initial_states(t_s: Array, x: Array, y: Array, yaw: Array, speed: Array, limits: FeasibilityLimits) -> Array:
-    """Return logged rear axles with acceleration and curvature clipped to their limits, (K, 6)."""
+    """Return the given rear axles with acceleration and curvature clipped to their limits, (K, 6)."""
     guess = np.zeros((len(t_s), STATES))
     guess[:, 0], guess[:, 1] = x - limits.offset_m * np.cos(yaw), y - limits.offset_m * np.sin(yaw)
     guess[:, 2], guess[:, 3] = yaw, speed
@@ -195,7 +195,7 @@ class _LeastSquares:
         return [*self._knots(state), *self._ways(state)]
 
     def _knots(self, state: Array) -> list[ResidualTerm]:
-        """Return the residuals of the logged states and of the limits."""
+        """Return the residuals of the scenario's states and of the limits."""
         x, y, yaw, speed, accel, curvature = state.T
         log_x, log_y, log_yaw, log_speed = self.logged.T
         limits, o, scale = self.limits, self.limits.offset_m, math.sqrt(self.h_s / KNOT_S)

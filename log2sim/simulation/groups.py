@@ -1,4 +1,4 @@
-"""Groups of agents that are driven alike: log replay, vehicles, pedestrians, and the vehicle of the user's policy.
+"""Groups of agents that are driven alike: placed ones, vehicles, pedestrians, and the vehicle of the user's policy.
 
 A group owns the state of its agents; the simulator that steps it is stateless. All columns are (A,) over the agents of
 the group that live in the present window of time; `live` holds their indices in the group.
@@ -60,7 +60,7 @@ class AgentGroup(ABC):
     """Agents driven alike; `first`, `last` (A,) are the steps between which each agent lives."""
 
     driver = "exact"
-    follows_log_time = True  # its agents are where the log has them at the same time, after a discontinuity too
+    follows_scenario_time = True  # its agents are where the scenario has them, after a discontinuity too
 
     def __init__(
         self, agents: Sequence[Agent], references: Sequence[Reference], first: NDArray[np.intp], last: NDArray[np.intp]
@@ -85,7 +85,7 @@ class AgentGroup(ABC):
                 _copy_rows(self._table[:, :, slot], self.references[i], self._row0)
 
     def log_times(self, t_s: float) -> Array:
-        """Return the times of the log (A,) whose places the living agents follow at a time."""
+        """Return the times of the scenario (A,) whose places the living agents follow at a time."""
         return np.full(len(self.live), t_s)
 
     def look_up(self, t_s: float) -> None:
@@ -126,7 +126,7 @@ class AgentGroup(ABC):
 
 
 class LogReplayGroup(AgentGroup):
-    """Agents that are exactly where the log has them."""
+    """Agents that are exactly where the scenario has them."""
 
     def place(self, index: NDArray[np.intp], t_s: float) -> None:
         """Do nothing: the agents are always on their references."""
@@ -136,7 +136,7 @@ class LogReplayGroup(AgentGroup):
         pass
 
     def snapshot(self) -> Snapshot:
-        """Return the states of the log."""
+        """Return the states of the scenario."""
         x, y, yaw, speed = self.row[:4]
         unknown = np.full(len(self.live), np.nan)
         x, y = x + self.origin_x_m[self.live], y + self.origin_y_m[self.live]
@@ -213,7 +213,7 @@ class PolicyVehicle(VehicleGroup):
     """The vehicle that the user's policy drives, by the controls set before each step."""
 
     driver = "policy"
-    follows_log_time = False
+    follows_scenario_time = False
     controls = Controls(0.0, 0.0)
 
     def _step(self, dt_s: float) -> None:

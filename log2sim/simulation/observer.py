@@ -54,7 +54,7 @@ class PolicyObserver:
         return Observation(t_s, dt_s, ego, self._others(ego, step, t_s), self._route(t_s), ahead)
 
     def _state(self) -> EgoState:
-        """Build the ego's state, at the height of its recorded path at `progress_m`."""
+        """Build the ego's state, at the height of its path in the scenario at `progress_m`."""
         agent, s, p = self.ego.agents[0], self.ego.snapshot(), self.ego.living
         log_t_s = self._path_table.times(ONE, np.array([self.progress_m]))
         return EgoState(
@@ -113,7 +113,7 @@ class PolicyObserver:
 
 
 def _identities(agents: Sequence[Agent], trajectories: Sequence[Trajectory]) -> NDArray[Any]:
-    """Return id, category, size and logged trajectory of agents as records (A,)."""
+    """Return id, category, size and trajectory in the scenario of agents as records (A,)."""
     rows = [(a.id, a.category, *a.size_m, trajectory) for a, trajectory in zip(agents, trajectories)]
     sizes = [(k, np.float64) for k in ("length_m", "width_m", "height_m")]
     return np.array(rows, dtype=[("id", object), ("category", object), *sizes, ("trajectory", object)])

@@ -112,7 +112,7 @@ class Others:
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """States of the recorded ego during the next 10 s, as columns (T,) every 0.1 s until the end of the log.
+    """States of the scenario's ego during the next 10 s, as columns (T,) every 0.1 s until the end of the scenario.
 
     Attributes
     ----------
@@ -128,9 +128,9 @@ class Route:
 
 @dataclass(frozen=True, eq=False)
 class PathAhead:
-    """The recorded ego's path ahead of the ego, whenever it was there, as columns (P,): 100 m, one row a meter.
+    """The path of the scenario's ego ahead of the ego, whenever it was there, as columns (P,): 100 m, one row a meter.
 
-    Beyond the end of the log the path goes straight on at the last speed.
+    Beyond the end of the scenario the path goes straight on at the last speed.
 
     Attributes
     ----------
@@ -142,9 +142,9 @@ class PathAhead:
     yaw_rad : (P,) float64
         Direction of travel.
     speed_mps : (P,) float64
-        Speed of the log at this place.
+        Speed of the scenario at this place.
     t_s : (P,) float64
-        When the log was there; NaN beyond its end.
+        When the scenario was there; NaN beyond its end.
     """
 
     progress_m: float

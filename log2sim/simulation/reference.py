@@ -29,7 +29,7 @@ GRID_S = 0.02
 """Spacing of the tables; linear interpolation errs by at most a h^2 / 8 = 0.5 mm at 10 m/s2."""
 
 SMOOTHING_S = 0.12
-"""Standard deviation of the Gaussian over the velocity of points: one waypoint of a 10 Hz log."""
+"""Standard deviation of the Gaussian over the velocity of points: one waypoint at 10 Hz."""
 
 REFERENCE_HOLD_MPS = 0.08
 """The brake holds while the reference is slower: below `STANDSTILL_MPS`, so that a start is not delayed."""
@@ -48,7 +48,7 @@ class Reference:
     Attributes
     ----------
     trajectory : Trajectory
-        The logged box centers.
+        The box centers in the scenario.
     first_row : int
     columns : (K, C) float64
         `VEHICLE_COLUMNS`, `POINT_COLUMNS`, or x, y, yaw, speed.
@@ -57,7 +57,7 @@ class Reference:
     offset_m : float
         From the reference point forward to the box center.
     flags : tuple of str
-        What in the log cannot be driven.
+        What in the scenario cannot be driven.
     slips : bool
         Whether the reference holds slip angles, so that it does not move along its yaw.
     """
@@ -106,9 +106,9 @@ def vehicle_reference(
 
 
 def feasible_trajectory_of(trajectory: Trajectory, limits: FeasibilityLimits) -> tuple[FeasibleTrajectory, Array]:
-    """Return the feasible trajectory of the rear axle, and its distance in m (K,) from the logged box centers.
+    """Return the feasible trajectory of the rear axle, and its distance in m (K,) from the box centers in the scenario.
 
-    Pieces between discontinuities of the log are fitted one by one.
+    Pieces between discontinuities of the scenario are fitted one by one.
     """
     edges = np.concatenate([[0], np.flatnonzero(trajectory.discontinuous) + 1, [len(trajectory.t_s)]])
     pieces, departures = [], []
@@ -168,7 +168,7 @@ def point_reference(trajectory: Trajectory) -> Reference:
 
 
 def log_reference(trajectory: Trajectory) -> Reference:
-    """Build the table of an agent that is placed on the log: x, y, yaw, logged speed."""
+    """Build the table of an agent that is placed on its trajectory in the scenario: x, y, yaw, speed."""
     first, t = _grid_times(trajectory)
 
     def exact(at_s: Array) -> Array:
@@ -219,13 +219,13 @@ def _gears(speed: Array) -> tuple[Array, Array]:
 
 
 def _discontinuity_flags(trajectory: Trajectory) -> tuple[str, ...]:
-    return tuple(f"the log is discontinuous at {at:.2f} s" for at in trajectory.discontinuity_times())
+    return tuple(f"the scenario is discontinuous at {at:.2f} s" for at in trajectory.discontinuity_times())
 
 
 def _flags(
     trajectory: Trajectory, course: FeasibleTrajectory, departure_m: Array, max_curvature_1pm: float
 ) -> tuple[str, ...]:
-    """Describe what cannot be driven: discontinuities, large distance from the log, acceleration or curvature beyond limits."""
+    """Describe what cannot be driven: discontinuities, large distances, acceleration or curvature beyond limits."""
     flags = list(_discontinuity_flags(trajectory))
     for name, values, limit, unit in (
         ("acceleration", course.accel_mps2, MAX_ACCEL_MPS2, "m/s2"),

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Agent, Scenario, Trajectory
 from log2sim.geometry import Array
 from log2sim.simulation.groups import AgentGroup
-from log2sim.simulation.metrics.all_metrics import LOG_FOLLOWERS, replay_metrics
+from log2sim.simulation.metrics.all_metrics import SCENARIO_FOLLOWERS, replay_metrics
 from log2sim.simulation.metrics.collisions import RECONSTRUCTION, SCENARIO
 from log2sim.simulation.metrics.tracking_error import TrackingErrors, agent_errors
-from log2sim.simulation.reactive.path_table import log_times_of_distance, log_times_of_positions
+from log2sim.simulation.reactive.path_table import scenario_times_of_distance, scenario_times_of_positions
 from log2sim.simulation.recording import RecordedTracks
 from log2sim.simulation.result import AgentReplay, Commands, Replay
 from log2sim.simulation.step_clock import StepClock
@@ -53,7 +53,7 @@ def replay_result(
                 agent.id, ModelChoice("point", "") if driver in point_drivers else ModelChoice("none", "")
             )
             moved = _moving_agent(agent, driver, choice, trajectory, flags, t_s, states)
-            errors[agent.id] = agent_errors(trajectory, moved, follows=driver in LOG_FOLLOWERS)
+            errors[agent.id] = agent_errors(trajectory, moved, follows=driver in SCENARIO_FOLLOWERS)
             replayed = _with_errors(moved, errors[agent.id])
         agents.append(replayed)
         stored.append(steps)
@@ -91,9 +91,9 @@ def _moving_agent(
         x, y, _, yaw, speed = trajectory.at(t_s)  # the reference tables are only good to half a millimeter
     log_t_s = t_s
     if driver == "reactive":
-        log_t_s = log_times_of_distance(trajectory, t_s, x, y)
+        log_t_s = scenario_times_of_distance(trajectory, t_s, x, y)
     elif driver == "policy":
-        log_t_s = log_times_of_positions(trajectory, x, y)
+        log_t_s = scenario_times_of_positions(trajectory, x, y)
     if np.isnan(accel).any():
         accel = np.gradient(speed, t_s) if len(t_s) > 1 else np.zeros(len(t_s))
     z = trajectory.heights(log_t_s)  # the height of the road at this place
@@ -109,7 +109,7 @@ def _moving_agent(
 
 
 def _with_errors(agent: AgentReplay, errors: TrackingErrors) -> AgentReplay:
-    """Add the tracking errors, unless the agent is placed on the log itself."""
+    """Add the tracking errors, unless the agent is placed on its trajectory."""
     if agent.driver == "exact":
         return agent
     across, along = (np.round(c, COMMAND_DIGITS) for c in (errors.across_m, errors.along_m))

@@ -51,7 +51,7 @@ class AgentReplay:
     size_m : (3,) tuple of float, m
         Length, width, height.
     driver : str
-        "static" (one pose, two rows), "exact" (placed on the log), "pid", "reactive" or "policy".
+        "static" (one pose, two rows), "exact" (placed on its trajectory), "pid", "reactive" or "policy".
     model : str
         "none", "point", "kinematic", "dynamic", "single-track" or the name of an external simulator.
     t_s : (S,) float64, s
@@ -65,13 +65,13 @@ class AgentReplay:
     accel_mps2 : (S,) float64, m/s2
         Along the heading.
     flags : tuple of str
-        What in the log cannot be driven.
+        What in the scenario cannot be driven.
     model_reason : str
         Why this model was chosen.
     commands : Commands or None
         None without a vehicle model.
     cross_track_m, along_track_m : (S,) float64 or None, m
-        Distance from the log, left and ahead positive; None for static agents.
+        Distance from the scenario, left and ahead positive; None for static agents.
     """
 
     id: str

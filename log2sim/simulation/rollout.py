@@ -179,7 +179,7 @@ def _placements(group: AgentGroup, clock: StepClock) -> dict[int, NDArray[np.int
         if group.last[i] < group.first[i]:
             continue
         placed[int(group.first[i])].append(i)
-        if group.follows_log_time:
+        if group.follows_scenario_time:
             # The table blends both sides of a discontinuity over one row, so the agent is placed again after that row.
             jumps_s = reference.trajectory.discontinuity_times()
             for step in clock.first_step(np.concatenate([jumps_s, jumps_s + GRID_S])):

@@ -30,12 +30,12 @@ def replay(
     model: str = "auto",
     dt_s: float = 0.01,
     ego: Policy | None = None,
-    agents: str | Collection[str] = "log",
+    agents: str | Collection[str] = "scenario",
     sight_m: float = SIGHT_M,
     host: ExternalSimulator | None = None,
     progress: Progress | None = None,
 ) -> Replay:
-    """Replay a scenario and compare it with the log.
+    """Replay a scenario and compare the replay with it.
 
     Parameters
     ----------
@@ -49,11 +49,12 @@ def replay(
         Simulation step in s, from 0.0005 to 1; controls are renewed at least every 0.1 s. States are stored about every
         0.05 s, or every step.
     ego : callable, optional
-        `policy(observation) -> Controls` that drives the ego, from its first logged state to the end of its lifetime.
-        If it has `reset(scenario)`, that is called first.
-    agents : {"log", "reactive"} or collection of str
-        "log": the other agents follow the log. "reactive": they keep to their logged paths and brake for agents that the log
-        does not have there. A collection: only the agents with these ids react (the ego too, if it is among them).
+        `policy(observation) -> Controls` that drives the ego, from its first state in the scenario to the end of its
+        lifetime. If it has `reset(scenario)`, that is called first.
+    agents : {"scenario", "reactive"} or collection of str
+        "scenario": the other agents follow their trajectories. "reactive": they keep to their paths and brake for
+        agents that the scenario does not have there. A collection: only the agents with these ids react (the ego too,
+        if it is among them).
     sight_m : float
         Range within which the ego's policy observes other agents, center to center.
     host : Host, optional
@@ -71,9 +72,9 @@ def replay(
 
     Notes
     -----
-    Static agents and those observed only once have no controller. Tracking errors are averaged over the agents that follow
-    the log; those of an ego with a policy are in `metrics["by_agent"]`. Cost: one step moves all agents that live within the
-    present 10 s at once.
+    Static agents and those observed only once have no controller. Tracking errors are averaged over the agents that
+    follow the scenario; those of an ego with a policy are in `metrics["by_agent"]`. Cost: one step moves all agents
+    that live within the present 10 s at once.
     """
     if host is not None:
         model = "kinematic"  # its references hold no slip angles of a model, so they suit every simulator
@@ -111,7 +112,7 @@ def open_world(
     model: str = "auto",
     dt_s: float = 0.01,
     drives_ego: bool = True,
-    agents: str | Collection[str] = "log",
+    agents: str | Collection[str] = "scenario",
     sight_m: float = SIGHT_M,
 ) -> World:
     """Prepare a scenario for stepwise simulation; with `drives_ego` the caller sets the ego's controls. See `replay`.

@@ -2,8 +2,8 @@
 
 The sizes are those that a CARLA 0.9.16 server reports for spawned actors (length, width, height, rounded to
 centimeters), as published in tools/carla/snapshots/blueprints_0.9.16.json of the Scenic project. CARLA's boxes include
-mirrors, riders and sometimes more: the bus is 3.9 m wide. Police cars, taxis and ambulances are left out, since a log's
-category car does not tell them apart.
+mirrors, riders and sometimes more: the bus is 3.9 m wide. Police cars, taxis and ambulances are left out, since a
+scenario's category car does not tell them apart.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ MAX_SAMPLED_BYTES = 1536 * 1024 * 1024
 BYTES_PER_SAMPLE = 480
 """Of the numbers of a sample in the lists that are written, as objects of Python; 1.5 GiB hold 46 hours of one agent."""
 
-DISCONTINUITY_S = 1e-6  # spacing of the two samples at a discontinuity of the log
+DISCONTINUITY_S = 1e-6  # spacing of the two samples at a discontinuity of the scenario
 
 
 def controller_data() -> dict[str, float]:
@@ -96,7 +96,7 @@ def _agent(agent: Agent, turn: int, span_s: tuple[float, float]) -> dict[str, An
 def _trajectories(
     agent: Agent, trajectory: Trajectory, *, drives: bool
 ) -> tuple[dict[str, list[float]], dict[str, list[float]] | None]:
-    """Return columns of the logged trajectory and, for a vehicle that drives, of the feasible one; both of the box center."""
+    """Return columns of the trajectory and, for a vehicle that drives, of the feasible one; both of the box center."""
     t_s = _times(agent, trajectory)
     x, y, yaw, _ = trajectory.relative(t_s)
     z = trajectory.heights(t_s) - agent.size_m[2] / 2

@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Replay a driving log in CARLA: `python replay_carla.py [--mode exact|pid] [--opendrive | --map TOWN]`.
+"""Replay a scenario in CARLA: `python replay_carla.py [--mode exact|pid] [--opendrive | --map TOWN]`.
 
 Needs a running CARLA 0.9.x server and its Python client (`pip install carla`), nothing else. The data file holds the
 trajectories in CARLA's frame: x forward, y to the RIGHT, z up, meters, yaw in degrees clockwise seen from above.
 
-exact  every agent is placed on the log at every tick; physics off, so nothing drifts. CARLA then reports no velocity
-       of vehicles; with --physics it does, and the pose is still set at every tick.
-pid    vehicles follow the log by throttle, brake and steering; walkers walk, all others are placed.
+exact  every agent is placed on its trajectory at every tick; physics off, so nothing drifts. CARLA then reports
+       no velocity of vehicles; with --physics it does, and the pose is still set at every tick.
+pid    vehicles follow their trajectories by throttle, brake and steering; walkers walk, all others are placed.
 """
 
 from __future__ import annotations
@@ -324,7 +324,7 @@ class ScenarioPlayer:
         self._map = session.world.get_map() if ground == "map" else None
 
     def commands(self, t_s: float) -> list[Any]:
-        """Return the commands for the tick that ends at a time of the log; agents appear and disappear."""
+        """Return the commands for the tick that ends at a time of the scenario; agents appear and disappear."""
         commands: list[Any] = []
         for agent in self.agents:
             if agent["begin_s"] - MARGIN_S <= t_s <= agent["end_s"] + MARGIN_S:
@@ -335,7 +335,7 @@ class ScenarioPlayer:
         return commands
 
     def _place(self, agent: dict[str, Any], t_s: float) -> Iterator[Any]:
-        """Yield the commands that put an agent on the log, with its velocity.
+        """Yield the commands that put an agent on its trajectory, with its velocity.
 
         Walkers, and vehicles with physics, move during the tick, so they start where their velocity leads to the place.
         """
@@ -360,9 +360,9 @@ class ScenarioPlayer:
                 actor.show_steering(curvature)
 
     def _drive(self, agent: dict[str, Any], t_s: float) -> Iterator[Any]:
-        """Yield the commands that let an agent drive or walk along the log.
+        """Yield the commands that let an agent drive or walk along its trajectory.
 
-        Where it appears, and at a discontinuity of the log, it is placed first.
+        Where it appears, and at a discontinuity of its trajectory, it is placed first.
         """
         name, now_s = agent["id"], t_s - self.session.dt_s
         actor, trajectory = self.session.actors.get(name), self.feasible.get(name, self.logged[name])
@@ -421,7 +421,7 @@ class ScenarioPlayer:
         return self.carla.command.ApplyWalkerControl(actor.handle.id, control)
 
     def _velocity(self, agent: dict[str, Any], t_s: float) -> tuple[float, float]:
-        """Return the logged velocity of the tick that ends at a time; at the start and after a discontinuity, of the next one."""
+        """Return the velocity of the tick that ends at a time; at the start and after a discontinuity, of the next one."""
         dt_s, trajectory = self.session.dt_s, self.logged[agent["id"]]
         begin_s = t_s - dt_s
         if begin_s < agent["begin_s"] - MARGIN_S or self._jumps(agent, begin_s):
@@ -432,13 +432,13 @@ class ScenarioPlayer:
         return (next_x - x) / dt_s, (next_y - y) / dt_s
 
     def _jumps(self, agent: dict[str, Any], t_s: float) -> bool:
-        """Whether the log has a discontinuity within the tick that begins at a time."""
+        """Whether its trajectory has a discontinuity within the tick that begins at a time."""
         return any(
             t_s + MARGIN_S < jump_s <= t_s + self.session.dt_s + MARGIN_S for jump_s in agent["discontinuities_s"]
         )
 
     def grounded(self, agent: dict[str, Any], place: BoxPose, *, falls: bool = False) -> BoxPose:
-        """Return the place at the height of the nearest road; without a road near, as logged, or an error if it `falls` then."""
+        """Return the place at the height of the nearest road; without a road near, as it is, or an error if it `falls` then."""
         if self._map is None:
             return place
         x, y, z, yaw = place
@@ -449,8 +449,8 @@ class ScenarioPlayer:
                 return x, y, at.z, yaw
         if falls:
             raise ReplayError(
-                f"agent '{agent['id']}': no road within {ROAD_WITHIN_M:g} m of its place at {x:.1f}, {y:.1f}; give the map that "
-                "the log was driven on (--map, --opendrive), or --ground log"
+                f"agent '{agent['id']}': no road within {ROAD_WITHIN_M:g} m of its place at {x:.1f}, {y:.1f}; give the map "
+                "of its place (--map, --opendrive), or --ground log"
             )
         return place
 
@@ -459,8 +459,8 @@ class ScenarioPlayer:
         below_m = self.grounded(agent, place)[2] - z
         if below_m > FALLEN_M:
             raise ReplayError(
-                f"agent '{agent['id']}' fell {below_m:.0f} m: there is no road below it; give the map that the log was driven "
-                "on (--map, --opendrive), or --mode exact",
+                f"agent '{agent['id']}' fell {below_m:.0f} m: there is no road below it; give the map of its "
+                "place (--map, --opendrive), or --mode exact",
                 4,
             )
 
@@ -554,11 +554,11 @@ def size_table(data: dict[str, Any]) -> str:
 
 
 def drift_table(drift_m: dict[str, list[float]]) -> str:
-    """List the distance of driven agents from the log."""
+    """List the distance of driven agents from the scenario."""
     lines = []
     for name, values in drift_m.items():
         rms = math.sqrt(sum(v * v for v in values) / len(values))
-        lines.append(f"{name}: {rms:.2f} m rms, {max(values):.2f} m at most from the log")
+        lines.append(f"{name}: {rms:.2f} m rms, {max(values):.2f} m at most from the scenario")
     return "\n".join(lines)
 
 
@@ -599,7 +599,7 @@ def arguments(words: Sequence[str] | None) -> argparse.Namespace:
         help="make a world of this road network first (default: the one exported)",
     )
     parser.add_argument(
-        "--mode", choices=("exact", "pid"), help="as logged, or driven along the log (default: as exported)"
+        "--mode", choices=("exact", "pid"), help="as in the scenario, or driven along it (default: as exported)"
     )
     parser.add_argument("--host", default="127.0.0.1")
     parser.add_argument("--port", type=int, default=2000)
@@ -611,7 +611,7 @@ def arguments(words: Sequence[str] | None) -> argparse.Namespace:
         "--physics", action="store_true", help="with exact: leave physics on, so that velocities are seen"
     )
     parser.add_argument(
-        "--ground", choices=("log", "map"), help="heights from the log (exact) or the nearest road (pid)"
+        "--ground", choices=("log", "map"), help="heights from the scenario (log; exact) or the nearest road (map; pid)"
     )
     parser.add_argument("--follow", default="ego", metavar="ID", help="agent that the spectator follows, or 'none'")
     parser.add_argument("--pace", type=float, default=1.0, help="1 is real time, 0 as fast as the server can")

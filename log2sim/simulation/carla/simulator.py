@@ -95,7 +95,7 @@ class CarlaSimulator:
         self.clock = clock
         all_agents = [a for g in groups for a in g.agents] + list(statics)
         log_groups = [g for g in groups if isinstance(g, LogReplayGroup)]
-        replayed = [a for g in log_groups if g.follows_log_time for a in g.agents] + list(statics)
+        replayed = [a for g in log_groups if g.follows_scenario_time for a in g.agents] + list(statics)
         self.offset_m = _offset_m(all_agents)
         data = {d["id"]: d for d in carla_agents([_shifted(a, self.offset_m) for a in all_agents])}
         self._data, self._trajectories = data, {k: player.SampledTrajectory(d["exact"]) for k, d in data.items()}
@@ -110,7 +110,7 @@ class CarlaSimulator:
             self._player = player.ScenarioPlayer(self.session, shown, "exact", physics=False, ground=ground)
         self._vehicle_groups = [(g, _PendingControls()) for g in groups if isinstance(g, VehicleGroup)]
         self._pedestrian_groups = [(g, _PendingControls()) for g in groups if isinstance(g, PedestrianGroup)]
-        self._delayed = [g for g in log_groups if not g.follows_log_time]
+        self._delayed = [g for g in log_groups if not g.follows_scenario_time]
         for group, pending in self._vehicle_groups:
             group.simulator = pending
         for points, pending in self._pedestrian_groups:
@@ -192,7 +192,7 @@ class CarlaSimulator:
                 yield self._player.walk(actor, (goal_x - x) / dt_s, (goal_y - y) / dt_s, yaw)
 
     def _show(self, group: LogReplayGroup, step: int) -> Iterator[Any]:
-        """Yield the commands that put delayed agents on their logged path."""
+        """Yield the commands that put delayed agents on their path."""
         now, dt_s = group.snapshot(), self.clock.dt_s
         for slot in self._present(group, step):
             name, yaw, speed = group.agents[group.live[slot]].id, -float(now.yaw_rad[slot]), float(now.speed_mps[slot])
@@ -235,7 +235,7 @@ class CarlaSimulator:
         group.state = PointState(x, y, (x - state.x_m) / dt_s, (y - state.y_m) / dt_s)
 
     def _height(self, group: AgentGroup, slot: int, step: int) -> float:
-        """Return the logged height of an agent's lowest face at its present place."""
+        """Return the scenario's height of an agent's lowest face at its present place."""
         trajectory = self._trajectories[group.agents[group.live[slot]].id]
         return trajectory.place(float(group.log_times(self.clock.time(step))[slot]))[2]
 

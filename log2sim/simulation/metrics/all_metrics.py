@@ -19,8 +19,8 @@ from log2sim.simulation.result import AgentReplay
 from log2sim.simulation.step_clock import StepClock
 from log2sim.simulation.vehicles.parameters import WHEELED
 
-LOG_FOLLOWERS = ("pid", "exact")
-"""Drivers that follow the log in place and time."""
+SCENARIO_FOLLOWERS = ("pid", "exact")
+"""Drivers that follow the scenario in place and time."""
 
 
 def replay_metrics(
@@ -86,7 +86,7 @@ def _by_agent(records: Iterable[Mapping[str, Any]]) -> dict[str, list[Any]]:
 
 
 def _comfort(agent: AgentReplay, trajectory: Trajectory) -> dict[str, float | bool] | None:
-    """Return the comfort of a vehicle; None for pedestrians, and where the log has a discontinuity."""
+    """Return the comfort of a vehicle; None for pedestrians, and where the scenario has a discontinuity."""
     if agent.category not in WHEELED or len(trajectory.discontinuity_times()):
         return None
     return comfort(agent.t_s, agent.x_m, agent.y_m, agent.yaw_rad)
@@ -98,7 +98,7 @@ def _box_tracks(
     trajectories: Mapping[str, Trajectory],
     clock: StepClock,
 ) -> BoxTracks:
-    """Return boxes at all stored steps, of the replay or, for agents with a trajectory given, of the log."""
+    """Return boxes at all stored steps, of the replay or, for agents with a trajectory given, of the scenario."""
     shape = ((clock.steps - 1) // clock.store_every + 1, len(agents))
     columns = np.full((5, *shape), np.nan)
     for k, (agent, steps) in enumerate(zip(agents, stored)):

@@ -11,7 +11,7 @@ from log2sim.geometry import Array
 
 ACCEL_WINDOW_S = 0.75
 JERK_WINDOW_S = 1.5
-"""Lengths of the fits. Shorter ones show the steps of the controller and the noise of the log."""
+"""Lengths of the fits. Shorter ones show the steps of the controller and the noise of the scenario."""
 
 MIN_ROWS = 5
 """Fewest rows of a window: a cubic with one degree of freedom left. With sparse rows the windows are longer."""

@@ -77,10 +77,10 @@ def post_encroachment_times(boxes: BoxTracks, spacing_s: float) -> PostEncroachm
     Notes
     -----
     Allen, Shin and Cooper (1978): the time from the moment when the first road user has left the area that both cover
-    until the second one reaches it. Here it is the least time between two moments at which the boxes of the first and of
-    the second cover a place in common. Where two paths cross that is the same, and it is also defined in bends and where
-    paths merge (FHWA-HRT-08-051, 2008, likewise takes it at positions). It counts if the log shows the first leave and the
-    second arrive, and if their headings differ there by at least `CROSSING_RAD`.
+    until the second one reaches it. Here it is the least time between two moments at which the boxes of the first and
+    of the second cover a place in common. Where two paths cross that is the same, and it is also defined in bends and
+    where paths merge (FHWA-HRT-08-051, 2008, likewise takes it at positions). It counts if the scenario shows the first
+    leave and the second arrive, and if their headings differ there by at least `CROSSING_RAD`.
 
     Method: oriented rectangles around the areas that boxes sweep during 64 rows are compared, then 16 and 4 rows where these
     overlap, then the boxes; the time is refined within a row. Cost: A log A for every 64 rows, then the overlapping pairs.

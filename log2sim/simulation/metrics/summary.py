@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from log2sim.simulation.metrics.all_metrics import LOG_FOLLOWERS
+from log2sim.simulation.metrics.all_metrics import SCENARIO_FOLLOWERS
 from log2sim.simulation.metrics.collisions import REPLAY
 from log2sim.simulation.metrics.conflicts import most_critical
 from log2sim.simulation.result import Replay
@@ -46,7 +46,7 @@ def _collision_counts(events: Sequence[Mapping[str, Any]]) -> str:
 def _error_line(replay: Replay) -> str:
     """Cross-track errors of agents on the path of the scenario, and the other errors of those that also keep its times."""
     m, drivers = replay.metrics, {a.driver for a in replay.agents}
-    on_time = bool(drivers & {*LOG_FOLLOWERS})
+    on_time = bool(drivers & {*SCENARIO_FOLLOWERS})
     across, along, speed = "-", "-", "-"
     if on_time or "reactive" in drivers:
         across = f"{m['cross_track_rms_m']:.3f} m rms, {m['cross_track_max_m']:.3f} m max"

@@ -1,4 +1,4 @@
-"""Tracking errors: the distance of a replay from the log."""
+"""Tracking errors: the distance of a replay from the scenario."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ OFF_PATH_M = 0.5
 
 @dataclass(frozen=True, eq=False)
 class TrackingErrors:
-    """Distance of an agent from the log at its rows (S,); left, ahead, faster and counter-clockwise are positive.
+    """Distance of an agent from the scenario at its rows (S,); left, ahead, faster and counter-clockwise are positive.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class TrackingErrors:
 
 
 def agent_errors(trajectory: Trajectory, agent: AgentReplay, *, follows: bool) -> TrackingErrors:
-    """Compute the errors of an agent; one that does not follow the log in time may be far along its path and still on it."""
+    """Compute the errors of an agent; one that is not on time may be far along its path and still on it."""
     near_s = agent.t_s if follows else _nearest_times(trajectory, agent.x_m, agent.y_m)
     across, along = tracking_errors(trajectory, agent.t_s, agent.x_m, agent.y_m, near_s)
     log = trajectory.at(agent.t_s)
@@ -45,12 +45,12 @@ def agent_errors(trajectory: Trajectory, agent: AgentReplay, *, follows: bool) -
 def tracking_errors(
     trajectory: Trajectory, t_s: Array, x_m: Array, y_m: Array, near_s: Array | None = None
 ) -> tuple[Array, Array]:
-    """Return the errors across and along the logged path, (S,) each in m, left and ahead positive.
+    """Return the errors across and along the path of the scenario, (S,) each in m, left and ahead positive.
 
-    Along: from the logged box center at the same time, in the direction of its heading. Across: distance from the
-    nearest point of the path of logged box centers within `SEARCH_S` of the same time, or of the times `near_s` (S,),
-    so a delay in a curve is no error across. Where the nearest point is an end of that path, or the log stands, the
-    component along its direction counts as along.
+    Along: from the scenario's box center at the same time, in the direction of its heading. Across: distance from the
+    nearest point of the path of the scenario's box centers within `SEARCH_S` of the same time, or of the times `near_s`
+    (S,), so a delay in a curve is no error across. Where the nearest point is an end of that path, or the scenario
+    stands, the component along its direction counts as along.
     """
     log_x, log_y, _, log_yaw, _ = trajectory.at(t_s)
     along = (x_m - log_x) * np.cos(log_yaw) + (y_m - log_y) * np.sin(log_yaw)
@@ -99,7 +99,7 @@ def scenario_metrics(
     by_agent : by id
         The errors of each agent.
     on_time, on_way : by id
-        The samples of agents that follow the log in time, and of all that keep to its path.
+        The samples of agents that follow the scenario in time, and of all that keep to its path.
     """
     out: dict[str, Any] = {}
     for key, samples in (
@@ -119,7 +119,7 @@ def _mean(values: Mapping[str, float], samples: Mapping[str, int]) -> float:
 
 
 def _nearest_times(trajectory: Trajectory, x_m: Array, y_m: Array) -> Array:
-    """Return the times (S,) at which the log is nearest to places."""
+    """Return the times (S,) at which the scenario is nearest to places."""
     from scipy.spatial import cKDTree
 
     t = np.arange(trajectory.t_s[0], trajectory.t_s[-1] + SEARCH_STEP_S / 2, SEARCH_STEP_S)

@@ -1,1 +1,1 @@
-"""Reactive agents: they keep to their logged paths and brake for agents that the log does not have there."""
+"""Reactive agents: they keep to their paths and brake for agents that the scenario does not have there."""

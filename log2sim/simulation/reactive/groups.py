@@ -16,10 +16,10 @@ RATE_OF_SPEED = {"speed": "accel_ahead", "velocity_x": "accel_x", "velocity_y": 
 
 
 class ReactiveGroup(AgentGroup):
-    """A group whose agents follow the log at the time and rate that `traffic` decides."""
+    """A group whose agents follow the scenario at the time and rate that `traffic` decides."""
 
     driver = "reactive"
-    follows_log_time = False
+    follows_scenario_time = False
     columns: tuple[str, ...] = ("x", "y", "yaw", "speed")
 
     def join(self, traffic: Traffic, clock: StepClock) -> None:
@@ -32,7 +32,7 @@ class ReactiveGroup(AgentGroup):
         self._begin = np.cumsum(self._rows) - self._rows
         self._flat = np.concatenate([r.columns for r in self.references])
         jumps = [(k, t) for k, r in enumerate(self.references) for t in r.trajectory.discontinuity_times()]
-        # As in the log, an agent is placed again after the row that blends both sides of a discontinuity.
+        # As in the scenario, an agent is placed again after the row that blends both sides of a discontinuity.
         self._discontinuities = np.array([(k, t + wait) for k, t in jumps for wait in (0.0, GRID_S)]).reshape(-1, 2)
         self._tau = np.full(len(self.agents), -np.inf)
 
@@ -43,14 +43,14 @@ class ReactiveGroup(AgentGroup):
         super().open_window(begin, end, begin_s, end_s)
 
     def log_times(self, t_s: float) -> Array:
-        """Return the log times of the living agents: the present time less their delay."""
+        """Return the scenario times of the living agents: the present time less their delay."""
         return t_s - self.traffic.delay_s[self.index[self.live]]
 
     def look_up(self, t_s: float) -> None:
-        """Set `row` (C, A) to the references at the agents' log times."""
+        """Set `row` (C, A) to the references at the agents' times in the scenario."""
         self.now_s = t_s
         live, delay = self.live, self.traffic.delay_s[self.index]
-        # A delayed agent lives on until it has reached the end of its log.
+        # A delayed agent lives on until it has reached the end of its trajectory.
         self.last = np.minimum(self.clock.last_step(self._end_s + delay), self.clock.steps - 1)
         tau = t_s - delay
         last = self._rows[live] - 1
@@ -100,4 +100,4 @@ class ReactivePedestrianGroup(ReactiveGroup, PedestrianGroup):
 
 
 class ReactiveLogReplayGroup(ReactiveGroup, LogReplayGroup):
-    """Agents that react and are placed exactly on their logged path."""
+    """Agents that react and are placed exactly on their path."""

@@ -1,4 +1,4 @@
-"""The intelligent driver model (IDM), for agents that pass their log at a rate."""
+"""The intelligent driver model (IDM), for agents that pass their trajectory at a rate."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from log2sim.simulation.vehicles.vehicle import Columns
 
 EXPONENT = 4.0
 MIN_GAP_M = 0.1  # shorter gaps, and overlaps, count as this one
-MIN_PACE_MPS = 0.5  # where the log is slower, the rate responds as at this speed; it would have no bound at standstill
+MIN_PACE_MPS = 0.5  # where it is slower, the rate responds as at this speed; it would have no bound at standstill
 HOLD_MPS = 0.2  # a slower agent with a leader is held at standstill,
 HOLD_DEMAND = (
     0.5  # until the leader's demand falls below this share of the free acceleration: 1.4 times the minimum gap
@@ -72,13 +72,13 @@ def leader_demand(driver: IdmParameters, gap_m: Array, pace_mps: Array, leader_m
 def rate_response(
     driver: IdmParameters, rate: Array, taken: Array, pace_mps: Array, log_accel_mps2: Array
 ) -> tuple[Array, Array]:
-    """Return the rate and its slope in 1/s, (A,) each, of agents whose log goes at `pace_mps` here, with demand `taken`.
+    """Return the rate and its slope in 1/s, (A,) each, of trajectories at `pace_mps` here, with demand `taken`.
 
     Notes
     -----
-    The log's speed at a place is the model's desired speed, so the rate is its v / v0, and the model's acceleration is added
-    to the log's. Braking that the log does anyway counts as a response to the leader. Without demand a rate of 1 stays 1: the
-    agent follows the log.
+    The scenario's speed at a place is the model's desired speed, so the rate is its v / v0, and the model's
+    acceleration is added to the scenario's. Braking that the scenario does anyway counts as a response to the leader.
+    Without demand a rate of 1 stays 1: the agent follows the scenario.
     """
     logged = rate**2 * log_accel_mps2
     excess = np.maximum(driver.accel_mps2 * taken - np.maximum(-logged, 0.0), 0.0)

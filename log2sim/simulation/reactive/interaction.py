@@ -1,4 +1,4 @@
-"""Demands of other agents on reactive agents at one time, beyond the demands in the log at the same place."""
+"""Demands of other agents on reactive agents at one time, beyond the demands in the scenario at the same place."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from log2sim.simulation.reactive.swept_corridor import HORIZON_S, PredictedBoxes
 MIN_LOOKAHEAD_M = 10.0  # also at standstill
 
 MARGINS_NOW = SafetyMargins(side_m=0.2, crossing_m=1.0, crossing_s=0.5, behind_m=0.0)
-MARGINS_IN_LOG = SafetyMargins(side_m=0.5, crossing_m=2.5, crossing_s=0.8, behind_m=1.0)
+MARGINS_IN_SCENARIO = SafetyMargins(side_m=0.5, crossing_m=2.5, crossing_s=0.8, behind_m=1.0)
 GAP_M, SPEED_MPS = 0.5, 0.5
-"""Tolerances, besides the difference of the margins, within which an interaction counts as that of the log."""
+"""Tolerances, besides the difference of the margins, within which an interaction counts as that of the scenario."""
 
 MIN_DEMAND = 1e-3  # share of the free acceleration below which a demand is ignored
 PATH_HULL_MARGIN_M = 1.0  # how far paths may leave the hull of a few of their points
@@ -45,9 +45,9 @@ class TrafficState:
     driven : int
         The agent that a policy drives, -1 without.
     t_s : (A,) float64
-        Time on the log of each agent.
+        Time on the scenario of each agent.
     rate : (A,) float64
-        Rate at which each agent passes its log.
+        Rate at which each agent passes its trajectory.
     pose : Pose
         Where the agents are, (A,).
     prediction : Prediction
@@ -82,7 +82,7 @@ class TrafficState:
         # Four boxes about the path ahead exclude most agents within the circle, above all those in other lanes.
         x, y = (np.ascontiguousarray(c[:, ::4].T) for c in self.prediction[:2])
         swept = self._hull(i, x[:, j], y[:, j])
-        room = radius[j] + self.size_m[i, 1] / 2 + MARGINS_IN_LOG.side_m + PATH_HULL_MARGIN_M
+        room = radius[j] + self.size_m[i, 1] / 2 + MARGINS_IN_SCENARIO.side_m + PATH_HULL_MARGIN_M
         own = np.flatnonzero(self.reacts)
         ahead = np.linspace(0.0, 1.0, 13)[:, None] * self.reach_m(own)
         x, y, *_ = self.paths.along(own[None], self.pose.distance_m[own] + ahead)
@@ -114,9 +114,9 @@ class TrafficState:
 
 
 def excess_demand(m: TrafficState, i: Index, j: Index, trusted: NDArray[np.bool_]) -> Array:
-    """Return the share of the free acceleration of agents i (P,) that agents j (P,) take beyond the log.
+    """Return the share of the free acceleration of agents i (P,) that agents j (P,) take beyond the scenario.
 
-    Where the log is not `trusted` (P,), the whole demand counts.
+    Where the scenario is not `trusted` (P,), the whole demand counts.
     """
     driver, logged_pace = m.idm.take(i), np.abs(m.pose.speed_mps[i])
     pace = m.rate[i] * logged_pace
@@ -125,7 +125,7 @@ def excess_demand(m: TrafficState, i: Index, j: Index, trusted: NDArray[np.bool_
     means = np.where(m.rate[i][:, None] < 1, np.minimum(logged, starting), logged)
     x, y, yaw, speed = (c[j] for c in m.prediction)
     found = leaders(m.paths, _corridor(m, i, pace, means), _boxes(m, j, (x, y, yaw, speed)), MARGINS_NOW)
-    # Where two reactive agents meet, the one that was first in the log goes first; an obstacle already in the path is
+    # Where two reactive agents meet, the one that was first in the scenario goes first; an obstacle already in the path is
     # waited for.
     first = m.reacts[i] & m.reacts[j] & (found.ahead_s > 0)
     first &= found.own_t_s < m.t_s[j] + m.rate[j] * found.ahead_s
@@ -134,16 +134,17 @@ def excess_demand(m: TrafficState, i: Index, j: Index, trusted: NDArray[np.bool_
     t_s = m.t_s[i]
     k = np.flatnonzero((taken > MIN_DEMAND) & trusted & (m.paths.begin_s[j] <= t_s) & (t_s <= m.paths.end_s[j]))
     if len(k):
-        taken[k] -= _demand_in_log(m, i[k], j[k], gap[k], _corridor(m, i[k], logged_pace[k], logged[k]))
+        taken[k] -= _demand_in_scenario(m, i[k], j[k], gap[k], _corridor(m, i[k], logged_pace[k], logged[k]))
     return np.maximum(taken, 0.0)
 
 
-def _demand_in_log(m: TrafficState, i: Index, j: Index, gap_m: Array, corridor: SweptCorridor) -> Array:
-    """Return the demand of agents j (P,) in the log when agents i (P,) were at this place, as far as the log applies now.
+def _demand_in_scenario(m: TrafficState, i: Index, j: Index, gap_m: Array, corridor: SweptCorridor) -> Array:
+    """Return the demand of agents j (P,) in the scenario when agents i (P,) were here, as far as it applies now.
 
-    The nearer the other agent is than it was in the log, the less of the log's demand counts; at half the gap none.
+    The nearer the other agent is than it was in the scenario, the less of the scenario's demand counts; at half the gap
+    none.
     """
-    found = leaders(m.paths, corridor, _boxes(m, j, _predict_in_log(m, j, m.t_s[i])), MARGINS_IN_LOG)
+    found = leaders(m.paths, corridor, _boxes(m, j, _predict_in_scenario(m, j, m.t_s[i])), MARGINS_IN_SCENARIO)
     gap = found.gap_m - GAP_M
     taken = leader_demand(m.idm.take(i), gap, corridor.pace_mps, found.speed_mps - SPEED_MPS)
     known = np.isfinite(gap)
@@ -171,8 +172,8 @@ def predict_all(paths: PathTable, pose: Pose, t_s: Array, rate: Array, driven: i
     return _select(np.arange(len(t_s)) == driven, predict_policy_vehicle(paths, driven, x, y, yaw, speed), prediction)
 
 
-def _predict_in_log(m: TrafficState, j: Index, t_s: Array) -> Prediction:
-    """Predict agents (P,) from the log at times (P,), by the same rules."""
+def _predict_in_scenario(m: TrafficState, j: Index, t_s: Array) -> Prediction:
+    """Predict agents (P,) from the scenario at times (P,), by the same rules."""
     prediction = predict_by_log(m.paths, j, t_s, np.ones(len(j)))
     if not np.any(j == m.driven):
         return prediction

@@ -15,7 +15,7 @@ from log2sim.geometry import Array
 TIME_STEP_S = 0.1  # linear interpolation errs by a h^2 / 8, a centimeter at 10 m/s2
 SPACING_M = 1.0
 EXTENSION_M = 120.0
-"""Straight extension of a path beyond the end of the log: as far as a driver looks ahead."""
+"""Straight extension of a path beyond the end of the scenario: as far as a driver looks ahead."""
 
 SEARCH_BACK_M, SEARCH_AHEAD_M = 5.0, 20.0
 """Range about its last place in which an agent is searched on its path: so it stays on its branch where paths cross."""
@@ -58,7 +58,7 @@ class PathProjection:
     distance_m : float64 array
         Distance along the path up to there.
     t_s : float64 array
-        Time of the log there; NaN beyond its end.
+        Time of the scenario there; NaN beyond its end.
     """
 
     ahead_m: Array
@@ -84,7 +84,7 @@ class PathTable:
         self._marks = np.concatenate(marks) if marks else np.zeros((0, 5))
 
     def at(self, agent: NDArray[np.intp], t_s: Array) -> Pose:
-        """Return where agents are at times of the log, broadcast together: held before their lifetime, straight on after it."""
+        """Return where agents are at times, broadcast together: held before their lifetime, straight on after it."""
         begin, end, rows = self.begin_s[agent], self.end_s[agent], self._rows[agent]
         step = np.where(rows > 1, (end - begin) / np.maximum(rows - 1, 1), 1.0)
         place = np.clip((t_s - begin) / step, 0.0, rows - 1)
@@ -96,7 +96,7 @@ class PathTable:
         return Pose(x + beyond * np.cos(yaw), y + beyond * np.sin(yaw), z, yaw, speed, distance + np.abs(beyond))
 
     def along(self, agent: NDArray[np.intp], distance_m: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """Return x, y, direction of travel as cos, sin, and the log's time at distances, broadcast together."""
+        """Return x, y, direction of travel as cos, sin, and the scenario's time at distances, broadcast together."""
         place = np.clip(distance_m / SPACING_M, 0.0, self.marks[agent] - 1)
         k = np.minimum(place.astype(np.intp), self.marks[agent] - 2)
         low, high = self._marks[self._mark0[agent] + k], self._marks[self._mark0[agent] + k + 1]
@@ -134,21 +134,21 @@ class PathTable:
         return max(float(foot.distance_m[0, 0] + foot.ahead_m[0, 0]), 0.0)
 
     def times(self, agent: NDArray[np.intp], distance_m: Array) -> Array:
-        """Return when the log was at distances along paths, broadcast together; its end for places beyond."""
+        """Return when the scenario was at distances along paths, broadcast together; its end for places beyond."""
         t_s = self.along(agent, distance_m)[4]
         return np.where(np.isnan(t_s), self.end_s[agent], t_s)
 
 
-def log_times_of_positions(trajectory: Trajectory, x_m: Array, y_m: Array) -> Array:
-    """Return when the log was nearest to the successive positions (S,) of an agent that drives freely."""
+def scenario_times_of_positions(trajectory: Trajectory, x_m: Array, y_m: Array) -> Array:
+    """Return when the scenario was nearest to the successive positions (S,) of an agent that drives freely."""
     table, gone_m = PathTable([trajectory]), np.zeros(len(x_m))
     for k, (x, y) in enumerate(zip(x_m.tolist(), y_m.tolist())):
         gone_m[k] = table.progress_near(0, gone_m[k - 1] if k else 0.0, x, y)
     return table.times(np.zeros(1, dtype=np.intp), gone_m)
 
 
-def log_times_of_distance(trajectory: Trajectory, t_s: Array, x_m: Array, y_m: Array) -> Array:
-    """Return when the log had traveled the distance that an agent on its path has, (S,).
+def scenario_times_of_distance(trajectory: Trajectory, t_s: Array, x_m: Array, y_m: Array) -> Array:
+    """Return when the scenario had traveled the distance that an agent on its path has, (S,).
 
     An agent that keeps to its path but not to its times takes its height and its errors from there.
     """

@@ -1,4 +1,4 @@
-"""Predicted positions of agents within the horizon: along their logged paths, or straight ahead."""
+"""Predicted positions of agents within the horizon: along their paths in the scenario, or straight ahead."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from log2sim.simulation.reactive.path_table import PathTable
 from log2sim.simulation.reactive.swept_corridor import HORIZON_S
 
 ON_PATH_M, ON_PATH_COS = 1.5, 0.9
-"""A driven agent this near to its logged path, and pointing along it, is expected to stay on it."""
+"""A driven agent this near to its path in the scenario, and pointing along it, is expected to stay on it."""
 
 Prediction = tuple[Array, Array, Array, Array]
 """x, y relative to the origin of the path table, yaw and speed, all (P, H) at the times of the horizon."""
 
 
 def predict_by_log(paths: PathTable, agent: NDArray[np.intp], t_s: Array, rate: Array) -> Prediction:
-    """Predict agents (P,) that follow their logs from times (P,) at rates (P,)."""
+    """Predict agents (P,) that follow their trajectories from times (P,) at rates (P,)."""
     pose = paths.at(agent[:, None], t_s[:, None] + rate[:, None] * HORIZON_S)
     return pose.x_m, pose.y_m, pose.yaw_rad, pose.speed_mps * rate[:, None]
 
@@ -34,7 +34,7 @@ def predict_along_path(
 def predict_policy_vehicle(
     paths: PathTable, agent: int, x_m: float, y_m: float, yaw_rad: float, speed_mps: float
 ) -> Prediction:
-    """Predict an agent that a policy drives: along its logged path while it is on it, else straight ahead; (1, H)."""
+    """Predict an agent that a policy drives: along its own path while it is on it, else straight ahead; (1, H)."""
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
     whole_m = float(paths.marks[agent])
     foot = paths.foot(np.array([agent]), np.zeros(1), whole_m, np.array([[x_m]]), np.array([[y_m]]))

@@ -88,7 +88,7 @@ class Leaders(NamedTuple):
     ahead_s : (P,) float64
         When it is in the corridor; 0 if it is now.
     own_t_s : (P,) float64
-        The log's time of the agent at that place.
+        The scenario's time of the agent at that place.
     """
 
     gap_m: Array

@@ -1,8 +1,8 @@
-"""Decisions of reactive agents: follow the log along their own path, but brake for what the log does not have there.
+"""Decisions of reactive agents: follow their own path in time, but brake for what the scenario does not have there.
 
-Each reactive agent has its own time on the log: it passes the log at `rate` (1 as logged, 0 standing), and so falls
-behind by `delay_s`. It never leaves its path, keeps the log's stops, returns to the log's speed of the place, and never
-catches up.
+Each reactive agent has its own time in the scenario: it passes its trajectory at `rate` (1 as there, 0 standing), and
+so falls behind by `delay_s`. It never leaves its path, keeps the scenario's stops, returns to the scenario's speed of
+the place, and never catches up.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from log2sim.geometry import Array
 from log2sim.simulation.groups import Snapshot
 from log2sim.simulation.reactive.idm import idm_parameters, rate_response
 from log2sim.simulation.reactive.interaction import MIN_DEMAND, TrafficState, excess_demand, predict_all
-from log2sim.simulation.reactive.log_overlaps import deep_overlaps
+from log2sim.simulation.reactive.scenario_overlaps import deep_overlaps
 from log2sim.simulation.reactive.path_table import PathTable, Pose
 
 DECISION_STEP_S = 0.1
@@ -42,11 +42,11 @@ class Traffic:
 
     Notes
     -----
-    A pair of agents is evaluated only while it differs from the log: one is driven by a policy, or their delays differ,
-    or they overlap in the log itself. The demand of a leader is compared with its demand in the log when the agent was
-    at this place, and only the excess counts; so a log that drives closer than the model would is reproduced. Where the
-    paths of two reactive agents cross, the one that was there first in the log goes first. Cost: R A comparisons a
-    decision, then some 500 distances for each pair in reach.
+    A pair of agents is evaluated only while it differs from the scenario: one is driven by a policy, or their delays
+    differ, or they overlap in the scenario itself. The demand of a leader is compared with its demand in the scenario
+    when the agent was at this place, and only the excess counts; so a scenario that drives closer than the model would
+    is reproduced. Where the paths of two reactive agents cross, the one that was there first in the scenario goes
+    first. Cost: R A comparisons a decision, then some 500 distances for each pair in reach.
     """
 
     def __init__(
@@ -68,13 +68,13 @@ class Traffic:
         self.restart()
 
     def restart(self) -> None:
-        """Reset all agents to the time of the log."""
+        """Reset all agents to the time of the scenario."""
         count, self._decided_s = len(self.reacts), -np.inf
         self.delay_s, self.rate, self.rate_slope = np.zeros(count), np.ones(count), np.zeros(count)
         self._taken, self._driven_m = np.zeros(count), 0.0
 
     def decide(self, t_s: float, dt_s: float, ego: Snapshot | None) -> None:
-        """Choose the rates of the reactive agents, and advance their log times by `dt_s`.
+        """Choose the rates of the reactive agents, and advance their times in the scenario by `dt_s`.
 
         `ego` is the state of the driven agent, None if there is none.
         """
@@ -106,7 +106,7 @@ class Traffic:
         taken = np.maximum(taken, np.where(kept > MIN_DEMAND, kept, 0.0))
         self._taken = taken
         rate, slope = rate_response(self.idm.take(own), self.rate[own], taken[own], pace, log_accel)
-        stands = pace < STANDSTILL_MPS  # the log's time goes on: waiting then counts as the log's own stop
+        stands = pace < STANDSTILL_MPS  # the scenario's time goes on: waiting then counts as the scenario's own stop
         self.rate[own], self.rate_slope[own] = np.where(stands, 1.0, rate), np.where(stands, 0.0, slope)
 
     def _with_ego(self, pose: Pose, ego: Snapshot | None) -> Pose:
@@ -117,7 +117,7 @@ class Traffic:
         x, y, yaw, speed = pose.x_m.copy(), pose.y_m.copy(), pose.yaw_rad.copy(), pose.speed_mps.copy()
         x[k], y[k] = ego.x_m[0] - self.paths.origin_m[0], ego.y_m[0] - self.paths.origin_m[1]
         yaw[k], speed[k] = ego.yaw_rad[0], ego.speed_mps[0]
-        # Its height is that of the log at this place; by time, nobody would brake for it on a slope if it fell behind.
+        # Its height is that of the scenario at this place; by time, nobody would brake for it on a slope if it fell behind.
         self._driven_m = self.paths.progress_near(k, self._driven_m, float(ego.x_m[0]), float(ego.y_m[0]))
         z = pose.z_m.copy()
         driven = np.array([k])
@@ -125,7 +125,7 @@ class Traffic:
         return pose._replace(x_m=x, y_m=y, z_m=z, yaw_rad=yaw, speed_mps=speed)
 
     def _pairs(self, t_s: float, tau: Array, own: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return pairs of a reactive agent (P,) and a present agent (P,) whose relation differs from the log."""
+        """Return pairs of a reactive agent (P,) and a present agent (P,) whose relation differs from the scenario."""
         differs = (np.abs(self.delay_s[own][:, None] - self.delay_s) > SAME_DELAY_S) & ~self._static
         if self._driven >= 0:
             differs[:, self._driven] = True

@@ -20,7 +20,7 @@ MODELS = ("auto", "kinematic", "dynamic", "single-track")
 TWO_WHEELERS = ("motorcycle", "cyclist", "bicycle")
 
 SLIP_TOLERANCE_RAD = 0.02
-"""Slip angle of the rear tires up to which the kinematic model is adequate: 1.1 degrees, the error of headings in a log.
+"""Slip angle of the rear tires up to which the kinematic model is adequate: 1.1 degrees, the error of headings in a scenario.
 
 A car reaches it at 3.3 m/s2 of lateral acceleration, a third of its tires' limit. Polack et al. ("The kinematic bicycle
 model: a consistent model for planning feasible trajectories for autonomous vehicles?", 2017) use it up to half the limit.
@@ -46,7 +46,7 @@ class ModelChoice(NamedTuple):
 def choose_model(
     agent: Agent, reference: Reference, parameters: VehicleParameters, wanted: str, *, free: bool
 ) -> ModelChoice:
-    """Choose the model of a vehicle (`parameters` of shape (1,)) by the user's wish; `free` vehicles leave their log."""
+    """Choose the model of a vehicle (`parameters` of shape (1,)) by the user's wish; `free` ones leave their trajectory."""
     if wanted != "auto":
         return ModelChoice(wanted, "asked for")
     if agent.category in TWO_WHEELERS:

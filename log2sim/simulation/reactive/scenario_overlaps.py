@@ -1,4 +1,4 @@
-"""Pairs of agents that overlap in the log itself, so that the log cannot be a reference for keeping clear."""
+"""Pairs of agents that overlap in the scenario itself, so that the scenario cannot be a reference for keeping clear."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CHUNK = 200
 
 
 def deep_overlaps(paths: PathTable, size_m: Array, static: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the pairs (A, A) whose logged boxes come to overlap by more than `DEEP_OVERLAP_M`, not from the start.
+    """Return the pairs (A, A) whose boxes come to overlap by more than `DEEP_OVERLAP_M`, not from the start.
 
     Pairs that overlap from the start are one object detected twice, or a load and its carrier: no reason to brake.
     """
