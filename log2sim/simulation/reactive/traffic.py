@@ -17,8 +17,8 @@ from log2sim.geometry import Array
 from log2sim.simulation.groups import Snapshot
 from log2sim.simulation.reactive.idm import idm_parameters, rate_response
 from log2sim.simulation.reactive.interaction import MIN_DEMAND, TrafficState, excess_demand, predict_all
-from log2sim.simulation.reactive.scenario_overlaps import deep_overlaps
 from log2sim.simulation.reactive.path_table import PathTable, Pose
+from log2sim.simulation.reactive.scenario_overlaps import deep_overlaps
 
 DECISION_STEP_S = 0.1
 CHUNK = 4096  # pairs evaluated together
