@@ -14,6 +14,7 @@ from log2sim.agents.ego import ego_agent, ego_path
 from log2sim.agents.estimate import estimate_agents
 from log2sim.agents.heading.decide import decide_headings
 from log2sim.agents.plausibility.judge import judge
+from log2sim.agents.plausibility.recording import Recording
 from log2sim.agents.scenario_of import camera_entries, provenance_of, scenario_of
 from log2sim.agents.simplify import simplify
 from log2sim.config import Config
@@ -215,7 +216,8 @@ def second_pass(run: Run, observations: Observations) -> Result:
         candidates = decide_headings(candidates, ego_path(log, run.schedule), timeline)
         ego = ego_agent(log, timeline, run.poses.origin)
     with run.clock.stage("judge"):
-        judged = rate_agents(judge(candidates, ego, observations.obstacles, timeline), timeline)
+        recording = Recording(log, run.schedule, observations.obstacles, timeline)
+        judged = rate_agents(judge(candidates, ego, recording), timeline)
         agents = [candidate.agent for candidate in judged]
         # Without an ego the agents' waypoints alone tell the ticks, so all of them stay.
         agents = simplify(agents) if ego is not None else agents

@@ -9,8 +9,9 @@ import pytest
 from test_overlap import agent, candidate
 
 from log2sim.agents.candidate import Timeline
+from log2sim.agents.plausibility.dimensions import doubt_size
 from log2sim.agents.plausibility.free_space import Ending, classify_rays, count_rays
-from log2sim.agents.plausibility.points import contradict, is_refuted
+from log2sim.agents.plausibility.points import contradict, detection_rate, is_refuted, missing_nats
 from log2sim.agents.plausibility.structure import find_surface, structure_shares
 from log2sim.agents.support import Support
 from log2sim.datatypes import Obstacles, Rays
@@ -129,14 +130,14 @@ def test_moving_agents_are_where_they_are_at_the_time_of_a_ray() -> None:
 def test_doubt_begins_where_no_true_agent_is(category, share, doubted) -> None:
     support = Support(inside=round(1000 * (1 - share)), through=round(1000 * share), decided_ticks=9)
     judged = replace(candidate(agent(5.0, category=category)), support=support)
-    assert len(contradict(judged)) == doubted
-    assert not is_refuted(judged)
+    assert len(contradict(judged, 0.9)) == doubted
+    assert not is_refuted(judged, 0.9)
 
 
 def test_an_agent_whose_place_is_empty_most_of_its_life_is_refuted() -> None:
     support = Support(inside=10, through=90, decided_ticks=9, empty_ticks=8)
-    assert is_refuted(replace(candidate(agent(5.0)), support=support))
-    assert not is_refuted(replace(candidate(agent(5.0)), support=replace(support, empty_ticks=2)))
+    assert is_refuted(replace(candidate(agent(5.0)), support=support), 0.9)
+    assert not is_refuted(replace(candidate(agent(5.0)), support=replace(support, empty_ticks=2)), 0.9)
 
 
 def face(length_m, y_m=-0.9, x_m=0.0, step_m=0.1):
@@ -175,5 +176,55 @@ def test_a_car_on_the_face_of_a_wall_is_in_a_structure(length_m, share) -> None:
     xyz = np.column_stack([xy, np.repeat([0.4, 0.8, 1.2], len(xy) // 3)]).astype(np.float32)
     cloud = Obstacles(0, ORIGIN, xyz, np.zeros(len(xyz), np.float32), SENSOR.astype(np.float32))
     built = [over_map(agent(10.0, 5.0)), over_map(agent(10.0, 5.0, category="pedestrian"))]
-    assert structure_shares(built, clouds(cloud), TIMELINE).tolist() == [share, 0.0]
-    assert is_refuted(replace(candidate(built[0]), support=Support(in_structure=share))) is bool(share)
+    in_structure, beside = structure_shares(built, clouds(cloud), TIMELINE)
+    assert in_structure.tolist() == beside.tolist() == [share, 0.0]
+    assert is_refuted(replace(candidate(built[0]), support=Support(in_structure=share)), 0.9) is bool(share)
+
+
+def with_support(**figures):
+    return replace(candidate(agent(5.0)), support=Support(**figures))
+
+
+@pytest.mark.parametrize(("detected", "doubted"), [(40, 0), (20, 0), (12, 1), (5, 1)])
+def test_an_agent_that_is_seldom_detected_where_images_show_it_well_is_doubted(detected, doubted):
+    judged = with_support(shown_ticks=40, detected_ticks=detected)
+    assert [d.flag for d in contradict(judged, 0.9)] == ["hardly_observed"] * doubted
+    assert not is_refuted(judged, 0.9)
+
+
+def test_the_evidence_of_missing_detections_is_a_ratio_of_likelihoods():
+    # 10 of 40 at a rate of 0.9 against 0.05; forty ticks that err alike count as 40 / (1 + 39 / 2) independent ones.
+    mean = 0.25 * np.log(0.05 / 0.9) + 0.75 * np.log(0.95 / 0.1)
+    assert missing_nats(Support(shown_ticks=40, detected_ticks=10), 0.9) == pytest.approx(mean * 40 / 20.5)
+    # A detector that finds half of all misses more, so that missing says less.
+    assert missing_nats(Support(shown_ticks=40, detected_ticks=10), 0.5) < 0
+    assert missing_nats(Support(shown_ticks=3, detected_ticks=0), 0.9) == 0
+    assert missing_nats(Support(shown_ticks=40, detected_ticks=0), 0.0) == 0
+
+
+def test_missing_detections_and_a_surface_that_goes_on_refute_together():
+    seldom = {"shown_ticks": 40, "detected_ticks": 9}
+    assert not is_refuted(with_support(**seldom), 0.9)
+    assert not is_refuted(with_support(beside_structure=1.0), 0.9)
+    assert is_refuted(with_support(**seldom, beside_structure=1.0), 0.9)
+
+
+def test_what_no_ray_reaches_is_refuted_and_what_has_no_point_doubted():
+    assert is_refuted(with_support(hidden=True), 0.9)
+    (doubt,) = contradict(with_support(pointless=True), 0.9)
+    assert doubt.flag == "hardly_observed"
+
+
+def test_the_usual_rate_is_that_of_all_candidates():
+    supports = [Support(shown_ticks=30, detected_ticks=30), Support(shown_ticks=10, detected_ticks=2), Support()]
+    assert detection_rate([replace(candidate(agent(5.0)), support=s) for s in supports]) == 0.8
+    assert detection_rate([]) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("category", "size", "doubted"),
+    [("car", (4.5, 1.9, 1.6), 0), ("car", (6.0, 2.3, 2.8), 1), ("truck", (7.0, 2.7, 3.0), 0), ("truck", (7.0, 2.8, 3.0), 1),
+     ("other", (12.0, 3.0, 4.0), 0)],
+)  # fmt: skip
+def test_no_vehicle_is_wider_than_the_road_allows_or_longer_than_its_kind(category, size, doubted):
+    assert [d.flag for d in doubt_size(agent(5.0, category=category, size=size))] == ["unlikely_size"] * doubted

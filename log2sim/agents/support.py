@@ -18,9 +18,17 @@ class Support:
     empty_ticks : int
         Those of them at which most rays go through.
     in_structure : float
-        Share of the searched ticks at which its points are part of something longer than itself.
+        Share of the searched ticks at which nearly all of its points are part of something longer than any of its kind.
+    beside_structure : float
+        Likewise, of most of its points.
     hidden : bool
         Whether the LiDAR looks toward it and no ray ever reaches any part of it.
+    pointless : bool
+        Whether the LiDAR looks toward it and none of its detections has a point.
+    shown_ticks : int
+        Ticks at which it is not hidden and a searched camera shows it well.
+    detected_ticks : int
+        Those of them at which it was detected, in an image or a sweep.
     """
 
     inside: int = 0
@@ -29,7 +37,11 @@ class Support:
     decided_ticks: int = 0
     empty_ticks: int = 0
     in_structure: float = 0.0
+    beside_structure: float = 0.0
     hidden: bool = False
+    pointless: bool = False
+    shown_ticks: int = 0
+    detected_ticks: int = 0
 
     @property
     def through_share(self) -> float | None:

@@ -33,16 +33,19 @@ class BoxTable:
 
     @classmethod
     def of(cls, agents: Sequence[Agent], t_s: Array, *, margin_s: float = 1e-6) -> BoxTable:
-        """Evaluate agents at times (T,); up to `margin_s` before and after its life an agent is where it starts and ends."""
+        """Evaluate agents at times (T,); up to `margin_s` before and after its life an agent moves on as it starts and ends."""
         at = [agent.at(t_s, margin_s=margin_s) for agent in agents]
         x, y, z, yaw, speed = (
             np.array([getattr(s, key) for s in at]).reshape(len(at), len(t_s))
             for key in ("x_m", "y_m", "z_m", "yaw_rad", "speed_mps")
         )
+        velocity = np.stack([speed * np.cos(yaw), speed * np.sin(yaw)], axis=-1)
+        life = np.array([[a.waypoints.t_s[0], a.waypoints.t_s[-1]] for a in agents]).reshape(len(at), 2, 1)
+        outside_s = t_s - np.clip(t_s, life[:, 0], life[:, 1])
         return cls(
             present=np.array([s.valid for s in at], dtype=bool).reshape(len(at), len(t_s)),
-            center_m=np.stack([x, y, z], axis=-1),
-            velocity_mps=np.stack([speed * np.cos(yaw), speed * np.sin(yaw)], axis=-1),
+            center_m=np.stack([x, y, z], axis=-1) + np.insert(velocity, 2, 0.0, axis=2) * outside_s[..., None],
+            velocity_mps=velocity,
             yaw_rad=yaw,
             size_m=np.array([agent.size_m for agent in agents], dtype=np.float64).reshape(len(at), 3),
         )

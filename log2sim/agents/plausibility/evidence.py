@@ -8,9 +8,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.agents.candidate import AgentCandidate, Timeline
+from log2sim.agents.candidate import AgentCandidate
+from log2sim.agents.plausibility.box_table import BoxTable
 from log2sim.agents.plausibility.free_space import SOLID, WHOLE, RayCounts, count_rays
+from log2sim.agents.plausibility.recording import Recording
 from log2sim.agents.plausibility.structure import structure_shares
+from log2sim.agents.plausibility.views import shown_in_images
 from log2sim.agents.support import Support
 from log2sim.datatypes import Obstacles
 from log2sim.geometry import Array
@@ -26,37 +29,45 @@ EMPTY_SHARE = 0.5
 RAY_NATS = 2.0
 # Nats of a tick of a motion that no road user has.
 MOTION_NATS = 1.0
-# Rays toward a hidden place before it is said to be hidden.
-MIN_HIDDEN_RAYS = 30
+# Rays toward a place before it is said that the LiDAR looks there.
+MIN_LOOKING_RAYS = 30
 # Farther apart, a camera sees what is hidden from a LiDAR.
 SAME_VIEW_M = 3.0
 
 
-def weigh(
-    candidates: Sequence[AgentCandidate], clouds: Sequence[Obstacles | None], timeline: Timeline
-) -> list[AgentCandidate]:
-    """Return the candidates with what the LiDAR says about them, and with all evidence for them.
+def weigh(candidates: Sequence[AgentCandidate], recording: Recording) -> list[AgentCandidate]:
+    """Return the candidates with what the LiDAR and the cameras say about them, and with all evidence for them.
 
     Notes
     -----
     Evidence is a sum over ticks of nats for the agent against nothing: of each detection by its score, of the rays by the
     share that goes through, and less for a motion that breaks the limits of road users.
     """
-    agents = [c.agent for c in candidates]
-    rays = count_rays(agents, clouds, timeline, SOLID)
-    structure = structure_shares(agents, clouds, timeline)
-    hidden = _hidden(candidates, clouds, timeline)
-    return [
-        replace(
-            candidate,
-            support=_support(rays, k, float(structure[k]), bool(hidden[k])),
-            evidence=_nats(candidate, rays.inside[k], rays.through[k]),
+    agents, clouds, timeline = [c.agent for c in candidates], recording.clouds, recording.timeline
+    if not agents:
+        return []
+    solid, whole = (count_rays(agents, clouds, timeline, part) for part in (SOLID, WHOLE))
+    in_structure, beside = structure_shares(agents, clouds, timeline)
+    met = whole.inside + whole.through
+    shown = shown_in_images(BoxTable.of(agents, recording.t_s), recording) & (met >= whole.before) & (met >= MIN_RAYS)
+    weighed = []
+    for k, candidate in enumerate(candidates):
+        looked = whole.before[k].sum() + met[k].sum() >= MIN_LOOKING_RAYS
+        pointless = bool(looked and not (candidate.track.measurements.points > 0).any())
+        support = replace(
+            _support(solid, k),
+            in_structure=float(in_structure[k]),
+            beside_structure=float(beside[k]),
+            pointless=pointless,
+            hidden=bool(pointless and met[k].sum() == 0) and _same_view(candidate, clouds),
+            shown_ticks=int(shown[k].sum()),
+            detected_ticks=int(shown[k, candidate.track.tick].sum()),
         )
-        for k, candidate in enumerate(candidates)
-    ]
+        weighed.append(replace(candidate, support=support, evidence=_nats(candidate, solid.inside[k], solid.through[k])))
+    return weighed
 
 
-def _support(rays: RayCounts, k: int, in_structure: float, hidden: bool) -> Support:
+def _support(rays: RayCounts, k: int) -> Support:
     """Sum the rays of one agent over its ticks; those at which it is mostly hidden say nothing."""
     met = rays.inside[k] + rays.through[k]
     seen = met >= rays.before[k]
@@ -67,24 +78,7 @@ def _support(rays: RayCounts, k: int, in_structure: float, hidden: bool) -> Supp
         before=int(rays.before[k].sum()),
         decided_ticks=int(decided.sum()),
         empty_ticks=int((decided & (rays.through[k] > EMPTY_SHARE * met)).sum()),
-        in_structure=in_structure,
-        hidden=hidden,
     )
-
-
-def _hidden(
-    candidates: Sequence[AgentCandidate], clouds: Sequence[Obstacles | None], timeline: Timeline
-) -> NDArray[np.bool_]:
-    """Mark (A,) the candidates without LiDAR points toward which no ray ever gets, though cameras see from the same place."""
-    hidden = np.zeros(len(candidates), dtype=bool)
-    cloud = next((c for c in clouds if c is not None), None)
-    rows = [k for k, c in enumerate(candidates) if not (c.track.measurements.points > 0).any()]
-    if cloud is None or not rows:
-        return hidden
-    rays = count_rays([candidates[k].agent for k in rows], clouds, timeline, WHOLE)
-    met, before = (rays.inside + rays.through).sum(axis=1), rays.before.sum(axis=1)
-    hidden[rows] = (met == 0) & (before >= MIN_HIDDEN_RAYS) & [_same_view(candidates[k], clouds) for k in rows]
-    return hidden
 
 
 def _same_view(candidate: AgentCandidate, clouds: Sequence[Obstacles | None]) -> bool:

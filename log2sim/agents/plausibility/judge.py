@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from log2sim.agents.candidate import AgentCandidate, Timeline, confirm
+from log2sim.agents.candidate import AgentCandidate, confirm
 from log2sim.agents.duplicates import suppress_duplicates
 from log2sim.agents.naming import name_agents
 from log2sim.agents.plausibility.conflicts import conflict_doubts, resolve_conflicts
 from log2sim.agents.plausibility.dimensions import doubt_size
 from log2sim.agents.plausibility.evidence import weigh
-from log2sim.agents.plausibility.points import contradict, is_refuted
-from log2sim.datatypes import Agent, Obstacles
+from log2sim.agents.plausibility.points import contradict, detection_rate, is_refuted
+from log2sim.agents.plausibility.recording import Recording
+from log2sim.datatypes import Agent
 
 
-def judge(
-    candidates: Sequence[AgentCandidate],
-    ego: Agent | None,
-    clouds: Sequence[Obstacles | None],
-    timeline: Timeline,
-) -> list[AgentCandidate]:
+def judge(candidates: Sequence[AgentCandidate], ego: Agent | None, recording: Recording) -> list[AgentCandidate]:
     """Keep the candidates that are confirmed and can be true together, each named and with what speaks against it.
 
     Parameters
@@ -28,13 +24,14 @@ def judge(
         Of all tracks.
     ego : Agent, optional
         Where the ego is, nobody else is.
-    clouds : T clouds, None at ticks without LiDAR
-    timeline : Timeline
+    recording : Recording
     """
-    t_s = timeline.seconds(timeline.t_ns)
-    weighed = [c for c in weigh(confirm(candidates), clouds, timeline) if not is_refuted(c)]
-    apart = resolve_conflicts(suppress_duplicates(weighed, ego), ego, t_s)
+    t_s = recording.t_s
+    weighed = weigh(confirm(candidates), recording)
+    usual_rate = detection_rate(weighed)
+    apart = suppress_duplicates([c for c in weighed if not is_refuted(c, usual_rate)], ego)
+    apart = resolve_conflicts(apart, ego, t_s)
     # A doubt may name another agent.
     named = name_agents(apart)
     conflicts = conflict_doubts(named, ego, t_s)
-    return [c.doubted([*contradict(c), *doubt_size(c.agent), *found]) for c, found in zip(named, conflicts)]
+    return [c.doubted([*contradict(c, usual_rate), *doubt_size(c.agent), *found]) for c, found in zip(named, conflicts)]

@@ -1,7 +1,12 @@
-"""What the points of the LiDAR say against a candidate."""
+"""What the sensors say against a candidate: what refutes it, and what makes it doubtful."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
+
+from log2sim.agents.box_votes import independent
 from log2sim.agents.candidate import AgentCandidate
 from log2sim.agents.support import Support
 from log2sim.datatypes import GROUP_OF, Doubt
@@ -16,30 +21,78 @@ EMPTY_LIFE_SHARE = 0.5
 MIN_EMPTY_TICKS = 3
 # Points at most of the searched ticks.
 MOSTLY = 0.5
+# Share of the images that show a place in which a detector is wrong about it.
+FALSE_RATE = 0.05
+MAX_USUAL_RATE = 0.9
+# Fewer ticks tell no rate.
+MIN_SHOWN_TICKS = 8
+# Nats against a vehicle by a surface that goes on beyond it: one in ten labeled ones stands that close to something.
+BESIDE_STRUCTURE_NATS = 2.3
+# Odds of 20 to 1 against a candidate.
+REFUTED_NATS = 3.0
 
 
-def is_refuted(candidate: AgentCandidate) -> bool:
-    """Return whether the points of the LiDAR show that a candidate is not there, or show something else in its place."""
-    support = candidate.support
-    return support is not None and (
-        support.hidden or support.in_structure > MOSTLY or (_is_empty(candidate, support) and _mostly_empty(support))
-    )
+def detection_rate(candidates: Sequence[AgentCandidate]) -> float:
+    """Return the share of the ticks at which a searched image shows a candidate well and it is detected, over all of them."""
+    supports = [c.support for c in candidates if c.support is not None]
+    shown = sum(s.shown_ticks for s in supports)
+    return sum(s.detected_ticks for s in supports) / shown if shown else 0.0
 
 
-def contradict(candidate: AgentCandidate) -> list[Doubt]:
-    """Doubt a candidate through whose place rays pass."""
-    support = candidate.support
-    if support is None or not _is_empty(candidate, support):
+def is_refuted(candidate: AgentCandidate, usual_rate: float) -> bool:
+    """Return whether the sensors show that a candidate is not there, or show something else in its place.
+
+    Parameters
+    ----------
+    usual_rate : float
+        Of `detection_rate`.
+    """
+    s = candidate.support
+    if s is None:
+        return False
+    if s.hidden or s.in_structure > MOSTLY or (_is_empty(candidate, s) and _is_mostly_empty(s)):
+        return True
+    beside = BESIDE_STRUCTURE_NATS if s.beside_structure > MOSTLY else 0.0
+    return missing_nats(s, usual_rate) + beside > REFUTED_NATS
+
+
+def contradict(candidate: AgentCandidate, usual_rate: float) -> list[Doubt]:
+    """Doubt a candidate through which rays pass, that has no points, or that is seldom detected where it is well seen."""
+    s, doubts = candidate.support, []
+    if s is None:
         return []
-    share = support.through_share
-    return [Doubt("empty", f"{share:.0%} of the LiDAR's rays pass through its place")]
+    if _is_empty(candidate, s):
+        doubts.append(Doubt("empty", f"{s.through_share:.0%} of the LiDAR's rays pass through its place"))
+    if s.pointless:
+        doubts.append(Doubt("hardly_observed", "the LiDAR looks toward it and has no point of it"))
+    if missing_nats(s, usual_rate) > 0:
+        doubts.append(
+            Doubt("hardly_observed", f"is detected at {s.detected_ticks} of {s.shown_ticks} ticks that show it well")
+        )
+    return doubts
 
 
-def _is_empty(candidate: AgentCandidate, support: Support) -> bool:
+def missing_nats(s: Support, usual_rate: float) -> float:
+    """Return the evidence against an agent, in nats, by the share of the ticks that show it well at which it is detected.
+
+    Notes
+    -----
+    The logarithm of the ratio of two Bernoulli likelihoods: an object is detected at the usual rate, nothing at `FALSE_RATE`.
+    Successive images err alike, which is why they count as few independent ones.
+    """
+    usual = min(usual_rate, MAX_USUAL_RATE)
+    if s.shown_ticks < MIN_SHOWN_TICKS or usual <= FALSE_RATE:
+        return 0.0
+    rate = s.detected_ticks / s.shown_ticks
+    mean = rate * np.log(FALSE_RATE / usual) + (1 - rate) * np.log((1 - FALSE_RATE) / (1 - usual))
+    return float(mean) * independent(s.shown_ticks)
+
+
+def _is_empty(candidate: AgentCandidate, s: Support) -> bool:
     limit = MAX_THROUGH_SHARE.get(GROUP_OF[candidate.agent.category], MAX_THROUGH_SHARE_WITH_GAPS)
-    share = support.through_share
-    return share is not None and support.inside + support.through >= MIN_RAYS and share > limit
+    share = s.through_share
+    return share is not None and s.inside + s.through >= MIN_RAYS and share > limit
 
 
-def _mostly_empty(support: Support) -> bool:
-    return support.empty_ticks >= MIN_EMPTY_TICKS and support.empty_ticks > EMPTY_LIFE_SHARE * support.decided_ticks
+def _is_mostly_empty(s: Support) -> bool:
+    return s.empty_ticks >= MIN_EMPTY_TICKS and s.empty_ticks > EMPTY_LIFE_SHARE * s.decided_ticks

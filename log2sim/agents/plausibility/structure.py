@@ -20,7 +20,7 @@ MARGIN_M = 0.3
 # Thickness to either side of what counts as one surface. Walls are flatter; what else the points of a vehicle show, its
 # second side, its roof and its windows, recedes by more.
 SURFACE_M = 0.2
-MIN_SURFACE_SHARE = 0.85
+MIN_SURFACE_SHARE, MIN_MOST_SHARE = 0.85, 0.5
 # Surfaces are followed along cells of this length over at most so many empty ones: 0.5 m is less than the distance of parked
 # vehicles with their two rounded corners.
 CELL_M, MAX_EMPTY_CELLS = 0.25, 2
@@ -50,16 +50,18 @@ class Surface:
     length_m: float
 
 
-def structure_shares(agents: Sequence[Agent], clouds: Sequence[Obstacles | None], timeline: Timeline) -> Array:
-    """Return, for A agents, the share of the searched ticks at which the points of a vehicle are part of a longer surface.
+def structure_shares(
+    agents: Sequence[Agent], clouds: Sequence[Obstacles | None], timeline: Timeline
+) -> tuple[Array, Array]:
+    """Return shares (A,), (A,) of the searched ticks at which nearly all and most points of a vehicle are on a longer surface.
 
     A few ticks, evenly spread over the life of an agent, are searched: what stands shows the same at all of them.
     """
-    shares = np.zeros(len(agents))
+    shares = np.zeros((2, len(agents)))
     ticks = np.array([k for k, cloud in enumerate(clouds) if cloud is not None], dtype=np.intp)
     rows = [i for i, agent in enumerate(agents) if GROUP_OF[agent.category] == "vehicle"]
     if len(ticks) == 0 or not rows:
-        return shares
+        return shares[0], shares[1]
     stamps = np.array([cloud.stamp_ns for cloud in clouds if cloud is not None], dtype=np.int64)
     boxes = BoxTable.of([agents[i] for i in rows], (stamps - timeline.t0_ns) / NS_PER_S, margin_s=MAX_LAG_S)
     for row, i in enumerate(rows):
@@ -67,9 +69,10 @@ def structure_shares(agents: Sequence[Agent], clouds: Sequence[Obstacles | None]
         searched = alive[np.unique(np.linspace(0, len(alive) - 1, min(len(alive), SEARCHED_TICKS)).astype(np.intp))]
         longest_m = MAX_SIZE_M[agents[i].category][0] + EXCESS_M
         found = [_surface_at(boxes, row, int(k), clouds[ticks[k]], longest_m) for k in searched]
-        longer = [s.share >= MIN_SURFACE_SHARE and s.length_m > longest_m for s in found if s is not None]
-        shares[i] = sum(longer) / max(len(searched), 1)
-    return shares
+        longer = [s.share for s in found if s is not None and s.length_m > longest_m]
+        for k, least in enumerate((MIN_SURFACE_SHARE, MIN_MOST_SHARE)):
+            shares[k, i] = sum(share >= least for share in longer) / max(len(searched), 1)
+    return shares[0], shares[1]
 
 
 def _surface_at(boxes: BoxTable, row: int, column: int, cloud: Obstacles | None, reach_m: float) -> Surface | None:
