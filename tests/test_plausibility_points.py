@@ -9,13 +9,17 @@ import pytest
 from test_overlap import agent, candidate
 
 from log2sim.agents.candidate import Timeline
+from log2sim.agents.plausibility.box_table import BoxTable
 from log2sim.agents.plausibility.dimensions import doubt_size
 from log2sim.agents.plausibility.free_space import Ending, classify_rays, count_rays
 from log2sim.agents.plausibility.points import contradict, detection_rate, is_refuted, missing_nats
+from log2sim.agents.plausibility.recording import Recording
 from log2sim.agents.plausibility.structure import find_surface, structure_shares
+from log2sim.agents.plausibility.views import shown_in_images
 from log2sim.agents.support import Support
-from log2sim.datatypes import Obstacles, Rays
-from log2sim.geometry import NS_PER_S
+from log2sim.datatypes import Log, Obstacles, Rays, Stream
+from log2sim.geometry import NS_PER_S, Camera, transform
+from log2sim.perception.sync import Schedule
 
 SENSOR = np.array([0.0, 0.0, 1.9])
 CAR = (4.4, 1.8, 1.5)
@@ -128,16 +132,17 @@ def test_moving_agents_are_where_they_are_at_the_time_of_a_ray() -> None:
     ("category", "share", "doubted"), [("car", 0.2, 0), ("car", 0.45, 1), ("cyclist", 0.45, 0), ("cyclist", 0.9, 1)]
 )
 def test_doubt_begins_where_no_true_agent_is(category, share, doubted) -> None:
-    support = Support(inside=round(1000 * (1 - share)), through=round(1000 * share), decided_ticks=9)
+    support = Support(inside=round(1000 * (1 - share)), through=round(1000 * share), seen_ticks=9)
     judged = replace(candidate(agent(5.0, category=category)), support=support)
     assert len(contradict(judged, 0.9)) == doubted
-    assert not is_refuted(judged, 0.9)
 
 
-def test_an_agent_whose_place_is_empty_most_of_its_life_is_refuted() -> None:
-    support = Support(inside=10, through=90, decided_ticks=9, empty_ticks=8)
+def test_an_agent_through_whose_place_nearly_all_rays_pass_is_refuted() -> None:
+    support = Support(inside=10, through=90, seen_ticks=9)
     assert is_refuted(replace(candidate(agent(5.0)), support=support), 0.9)
-    assert not is_refuted(replace(candidate(agent(5.0)), support=replace(support, empty_ticks=2)), 0.9)
+    # The rays of two ticks, or few ones, may be chance; a box that is too large has something in it.
+    for other in ({"seen_ticks": 2}, {"inside": 1, "through": 9}, {"inside": 40}):
+        assert not is_refuted(replace(candidate(agent(5.0)), support=replace(support, **other)), 0.9)
 
 
 def face(length_m, y_m=-0.9, x_m=0.0, step_m=0.1):
@@ -189,7 +194,8 @@ def with_support(**figures):
 def test_an_agent_that_is_seldom_detected_where_images_show_it_well_is_doubted(detected, doubted):
     judged = with_support(shown_ticks=40, detected_ticks=detected)
     assert [d.flag for d in contradict(judged, 0.9)] == ["hardly_observed"] * doubted
-    assert not is_refuted(judged, 0.9)
+    # The odds of 5 are 31 to 1, those of 12 are 4 to 1.
+    assert is_refuted(judged, 0.9) is (detected == 5)
 
 
 def test_the_evidence_of_missing_detections_is_a_ratio_of_likelihoods():
@@ -228,3 +234,33 @@ def test_the_usual_rate_is_that_of_all_candidates():
 )  # fmt: skip
 def test_no_vehicle_is_wider_than_the_road_allows_or_longer_than_its_kind(category, size, doubted):
     assert [d.flag for d in doubt_size(agent(5.0, category=category, size=size))] == ["unlikely_size"] * doubted
+
+
+AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+"""Axes of a camera that looks along x."""
+
+
+@pytest.mark.parametrize(
+    ("x_m", "y_m", "shown"),
+    # f is 500 px: 1.5 m are 32 px at 23.4 m, and half of 1000 px less the border end 0.9 m aside for each meter ahead.
+    [
+        (10.0, 0.0, True),
+        (23.0, 0.0, True),
+        (24.0, 0.0, False),
+        (10.0, 8.9, True),
+        (10.0, 9.1, False),
+        (-10.0, 0.0, False),
+    ],
+)
+def test_an_image_shows_what_is_large_and_inside_of_its_borders(x_m, y_m, shown):
+    for camera_x_m, seen in ((0.0, shown), (-3.5, False)):
+        pose = transform(AHEAD, ORIGIN + np.array([camera_x_m, 0, 1.9]))
+        camera = Camera(
+            "front", 1000, 600, np.array([[500.0, 0, 500], [0, 500, 300], [0, 0, 1]]), mount="map", mount_T_cam=pose
+        )
+        log = Log("one", "none", {"front": camera}, {}, {"front": Stream("front", TIMELINE.t_ns, lambda _: None)})
+        frames = np.array([0, 1, 2, 3, -1])
+        schedule = Schedule("front", TIMELINE.t_ns, {"front": frames}, {}, {})
+        recording = Recording(log, schedule, clouds(fan(40.0)), TIMELINE)
+        boxes = BoxTable.of([over_map(agent(x_m, y_m))], recording.t_s)
+        assert shown_in_images(boxes, recording)[0].tolist() == [seen] * 4 + [False]

@@ -12,11 +12,9 @@ class Support:
     Attributes
     ----------
     inside, through, before : int
-        Rays that end at the agent, that go on behind it, and that end before it.
-    decided_ticks : int
-        Ticks with enough rays inside or through to decide.
-    empty_ticks : int
-        Those of them at which most rays go through.
+        Rays that end at the agent, that go on behind it, and that end before it; the first two at `seen_ticks`.
+    seen_ticks : int
+        Ticks at which most rays toward it do not end before it.
     in_structure : float
         Share of the searched ticks at which nearly all of its points are part of something longer than any of its kind.
     beside_structure : float
@@ -34,8 +32,7 @@ class Support:
     inside: int = 0
     through: int = 0
     before: int = 0
-    decided_ticks: int = 0
-    empty_ticks: int = 0
+    seen_ticks: int = 0
     in_structure: float = 0.0
     beside_structure: float = 0.0
     hidden: bool = False

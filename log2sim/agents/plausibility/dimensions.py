@@ -20,7 +20,9 @@ def doubt_size(agent: Agent) -> list[Doubt]:
     if GROUP_OF[agent.category] != "vehicle":
         return []
     if width_m > MAX_VEHICLE_WIDTH_M + WHOLE_SIDE_SIGMA_M:
-        return [Doubt("unlikely_size", f"is {width_m:.1f} m wide, road vehicles have at most {MAX_VEHICLE_WIDTH_M:.1f} m")]
+        return [
+            Doubt("unlikely_size", f"is {width_m:.1f} m wide, road vehicles have at most {MAX_VEHICLE_WIDTH_M:.1f} m")
+        ]
     longest_m = MAX_SIZE_M[agent.category][0]
     if length_m >= longest_m - SAME_M:
         return [Doubt("unlikely_size", f"is longer than the {longest_m:.1f} m of the longest {agent.category}")]

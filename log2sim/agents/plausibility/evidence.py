@@ -20,11 +20,8 @@ from log2sim.geometry import Array
 
 # A detection is never surer than this: 3 nats.
 MAX_SCORE = 0.95
-# A tick has at least so many rays that met the place of the agent, and no more that ended before it: with fewer only the
-# border of what hides it shows.
+# Fewer rays at a tick say nothing.
 MIN_RAYS = 8
-# At a tick most rays go through: nothing is there.
-EMPTY_SHARE = 0.5
 # Nats of the rays of a tick: all of them end in what is there; more are not believed, since rays of one tick err alike.
 RAY_NATS = 2.0
 # Nats of a tick of a motion that no road user has.
@@ -63,21 +60,21 @@ def weigh(candidates: Sequence[AgentCandidate], recording: Recording) -> list[Ag
             shown_ticks=int(shown[k].sum()),
             detected_ticks=int(shown[k, candidate.track.tick].sum()),
         )
-        weighed.append(replace(candidate, support=support, evidence=_nats(candidate, solid.inside[k], solid.through[k])))
+        weighed.append(
+            replace(candidate, support=support, evidence=_nats(candidate, solid.inside[k], solid.through[k]))
+        )
     return weighed
 
 
 def _support(rays: RayCounts, k: int) -> Support:
-    """Sum the rays of one agent over its ticks; those at which it is mostly hidden say nothing."""
+    """Sum the rays of one agent over its ticks, without those at which only the border of what hides it shows."""
     met = rays.inside[k] + rays.through[k]
-    seen = met >= rays.before[k]
-    decided = seen & (met >= MIN_RAYS)
+    seen = (met > 0) & (met >= rays.before[k])
     return Support(
         inside=int(rays.inside[k, seen].sum()),
         through=int(rays.through[k, seen].sum()),
         before=int(rays.before[k].sum()),
-        decided_ticks=int(decided.sum()),
-        empty_ticks=int((decided & (rays.through[k] > EMPTY_SHARE * met)).sum()),
+        seen_ticks=int(seen.sum()),
     )
 
 

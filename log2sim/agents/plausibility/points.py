@@ -15,10 +15,9 @@ from log2sim.datatypes import GROUP_OF, Doubt
 # 0.2 for vehicles; people and bicycles have gaps, below 0.6.
 MAX_THROUGH_SHARE = {"vehicle": 0.35}
 MAX_THROUGH_SHARE_WITH_GAPS = 0.8
-MIN_RAYS = 20
-# A place is empty when most rays go through at most ticks at which that can be told.
-EMPTY_LIFE_SHARE = 0.5
-MIN_EMPTY_TICKS = 3
+# From here on nothing is there; below, something may be that is smaller than the box or beside it.
+EMPTY_SHARE = 0.8
+MIN_RAYS, MIN_EMPTY_TICKS = 20, 3
 # Points at most of the searched ticks.
 MOSTLY = 0.5
 # Share of the images that show a place in which a detector is wrong about it.
@@ -50,7 +49,7 @@ def is_refuted(candidate: AgentCandidate, usual_rate: float) -> bool:
     s = candidate.support
     if s is None:
         return False
-    if s.hidden or s.in_structure > MOSTLY or (_is_empty(candidate, s) and _is_mostly_empty(s)):
+    if s.hidden or s.in_structure > MOSTLY or _through_more_than(EMPTY_SHARE, s):
         return True
     beside = BESIDE_STRUCTURE_NATS if s.beside_structure > MOSTLY else 0.0
     return missing_nats(s, usual_rate) + beside > REFUTED_NATS
@@ -61,7 +60,7 @@ def contradict(candidate: AgentCandidate, usual_rate: float) -> list[Doubt]:
     s, doubts = candidate.support, []
     if s is None:
         return []
-    if _is_empty(candidate, s):
+    if _through_more_than(MAX_THROUGH_SHARE.get(GROUP_OF[candidate.agent.category], MAX_THROUGH_SHARE_WITH_GAPS), s):
         doubts.append(Doubt("empty", f"{s.through_share:.0%} of the LiDAR's rays pass through its place"))
     if s.pointless:
         doubts.append(Doubt("hardly_observed", "the LiDAR looks toward it and has no point of it"))
@@ -88,11 +87,7 @@ def missing_nats(s: Support, usual_rate: float) -> float:
     return float(mean) * independent(s.shown_ticks)
 
 
-def _is_empty(candidate: AgentCandidate, s: Support) -> bool:
-    limit = MAX_THROUGH_SHARE.get(GROUP_OF[candidate.agent.category], MAX_THROUGH_SHARE_WITH_GAPS)
-    share = s.through_share
-    return share is not None and s.inside + s.through >= MIN_RAYS and share > limit
-
-
-def _is_mostly_empty(s: Support) -> bool:
-    return s.empty_ticks >= MIN_EMPTY_TICKS and s.empty_ticks > EMPTY_LIFE_SHARE * s.decided_ticks
+def _through_more_than(limit: float, s: Support) -> bool:
+    """Return whether rays of several ticks, in sum enough to tell, pass through the place of an agent by more than a share."""
+    share, enough = s.through_share, s.inside + s.through >= MIN_RAYS and s.seen_ticks >= MIN_EMPTY_TICKS
+    return enough and share is not None and share > limit

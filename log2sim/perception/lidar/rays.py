@@ -28,12 +28,11 @@ def sample_rays(cloud: Cloud) -> Rays:
     Directions are those from the middle of the sensors, which does for a sample.
     """
     index = cloud.azimuth_index
-    rows = np.flatnonzero((index.range_m < MAX_REACH_M) & (cloud.height[index.rank] < MAX_OBSTACLE_HEIGHT_M))
-    point = index.rank[rows]
-    sensor = _sensor_of(cloud, point)
+    point = np.flatnonzero((index.range_m[index.rank] < MAX_REACH_M) & (cloud.height < MAX_OBSTACLE_HEIGHT_M))
+    row = index.rank[point]
     # The slope of a ray differs from its angle where it is steep: near the sensor, where rays are many.
-    slope = np.clip(index.slope[rows] / np.float32(CELL_RAD), -CELLS_PER_COLUMN // 2, CELLS_PER_COLUMN // 2 - 1)
-    column = sensor * COLUMNS + index.azimuth[rows] // CELL_STEPS
+    slope = np.clip(index.slope[row] / np.float32(CELL_RAD), -CELLS_PER_COLUMN // 2, CELLS_PER_COLUMN // 2 - 1)
+    column = _sensor_of(cloud, point) * COLUMNS + index.azimuth[row] // CELL_STEPS
     cell = column * CELLS_PER_COLUMN + np.floor(slope).astype(np.int64) + CELLS_PER_COLUMN // 2
     # Cell and rank in one number: numbers are sorted several times as fast as their places are.
     ordered = np.sort((cell << RANK_BITS) + point)
