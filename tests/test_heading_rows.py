@@ -38,6 +38,15 @@ def test_other_lines_other_axes_and_what_moves_are_rows_of_their_own():
     assert sorted(len(row.members) for row in rows_of(CURB, lengths_m=[4.5, 4.5, 12.0, 4.5])) == [4]
 
 
+def test_rows_of_a_car_park_that_face_each_other_are_two_and_a_queue_beside_a_curb_is_no_car_park():
+    opposite = [(5.0 + x, y, np.pi) for x, y, _ in LOT]
+    assert [(row.members.tolist(), row.alike) for row in rows_of(LOT + opposite)] == [
+        ([0, 1, 2, 3, 4], ALIKE_ACROSS), ([5, 6, 7, 8, 9], ALIKE_ACROSS),
+    ]  # fmt: skip
+    queue = [(7.0 * k, 3.2, 0.0) for k in range(3)]
+    assert [row.alike for row in rows_of(CURB + queue)] == [ALIKE_ALONG] * 2
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_probabilities_are_those_of_all_cases_enumerated(seed):
     rng = np.random.default_rng(seed)

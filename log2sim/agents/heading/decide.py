@@ -15,7 +15,7 @@ from log2sim.agents.heading.outline import outline_log_odds
 from log2sim.agents.heading.rows import find_rows, headings_of
 from log2sim.agents.heading.traffic import PARALLEL_SIGMA_RAD, side_log_odds, street_axis, street_log_odds
 from log2sim.agents.motion_doubts import motion_doubts
-from log2sim.agents.static import UNKNOWN_YAW_RAD
+from log2sim.agents.smooth.heading import UNKNOWN_YAW_RAD
 from log2sim.datatypes import GROUP_OF, Doubt, Waypoints
 from log2sim.geometry import Array, wrap_angle
 

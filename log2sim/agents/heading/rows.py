@@ -13,10 +13,10 @@ from log2sim.perception.box_fitting import rotate
 from log2sim.perception.late_fusion import probability
 
 # Neighbors of one row: axes are parallel within three standard deviations of a parked car's yaw; bumper to bumper with room for one
-# more car at most and in one line, or side by side in places 2.3 to 3.5 m wide.
+# more car at most and in one line, or side by side in places 2.3 to 3 m wide; lanes are wider.
 MAX_TURNED_RAD = 0.2
 MAX_GAP_M, MAX_OUT_OF_LINE_M = 7.0, 1.3
-MAX_BESIDE_M, MAX_AHEAD_M = 4.2, 3.0
+MAX_BESIDE_M, MAX_AHEAD_M = 3.0, 3.0
 # Share of a row that points alike. Along a street the law of most countries asks for it. In places across, 76 % of drivers pull
 # forward into them (AAA, 2015).
 ALIKE_ALONG, ALIKE_ACROSS = 0.93, 0.76
@@ -78,22 +78,25 @@ def find_rows(poses: Array, lengths_m: Array, stands: NDArray[np.int64]) -> list
     stands : (S,) int64
         Which of them stand.
     """
-    label, along = np.arange(len(poses)), np.ones(len(poses), dtype=bool)
+    in_line, beside = np.zeros((2, len(poses), len(poses)), dtype=bool)
     for i in stands:
         to = rotate(poses[:, :2] - poses[i, :2], -poses[i, 2])
         parallel = np.abs(np.sin(poses[:, 2] - poses[i, 2])) < np.sin(MAX_TURNED_RAD)
+        parallel[np.setdiff1d(np.arange(len(poses)), stands)] = False
         gap = np.abs(to[:, 0]) - (lengths_m + lengths_m[i]) / 2
-        in_line = parallel & (gap < MAX_GAP_M) & (np.abs(to[:, 1]) < MAX_OUT_OF_LINE_M)
-        beside = parallel & (np.abs(to[:, 0]) < MAX_AHEAD_M) & (np.abs(to[:, 1]) < MAX_BESIDE_M) & ~in_line
-        for j in stands[(in_line | beside)[stands]]:
-            label[label == label[j]] = label[i]
-        along[i] = not beside[stands].any()
-    return [_row(np.flatnonzero(label == k), poses, along) for k in np.unique(label)]
+        in_line[i] = parallel & (gap < MAX_GAP_M) & (np.abs(to[:, 1]) < MAX_OUT_OF_LINE_M)
+        beside[i] = parallel & (np.abs(to[:, 0]) < MAX_AHEAD_M) & (np.abs(to[:, 1]) < MAX_BESIDE_M) & ~in_line[i]
+    lot: NDArray[np.bool_] = np.any(beside | beside.T, axis=1)
+    # On a car park the next one in line is of the row opposite, nose to nose.
+    linked, label = beside | (in_line & ~lot & ~lot[:, None]), np.arange(len(poses))
+    for i, j in zip(*np.nonzero(linked)):
+        label[label == label[j]] = label[i]
+    return [_row(np.flatnonzero(label == k), poses, lot) for k in np.unique(label)]
 
 
-def _row(members: NDArray[np.int64], poses: Array, along: NDArray[np.bool_]) -> Row:
+def _row(members: NDArray[np.int64], poses: Array, lot: NDArray[np.bool_]) -> Row:
     toward = np.where(np.cos(poses[members, 2] - poses[members[0], 2]) > 0, 1.0, -1.0)
-    return Row(members, toward, ALIKE_ALONG if along[members].mean() > 0.5 else ALIKE_ACROSS)
+    return Row(members, toward, ALIKE_ACROSS if lot[members].any() else ALIKE_ALONG)
 
 
 def headings_of(rows: Sequence[Row], own: Array, street: Array, right: float) -> Array:
