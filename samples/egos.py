@@ -18,7 +18,7 @@ from log2sim.simulation.policy import Controls, EgoState, Observation, Others, P
 class BrakeLate:
     """Drives the recorded way, yet does not slow down with the log: it brakes hard, and only when it must.
 
-    It is in a hurry: `hurry` times the highest speed that the log has on the next 30 m. What stands or moves on its way is
+    It is in a hurry: `hurry` times the highest speed that the scenario has on the next 30 m. What stands or moves on its way is
     ignored until `late_mps2` would be needed to stop short of it, or to get as slow as it is.
     """
 

@@ -64,6 +64,7 @@ def test_why_an_agent_is_doubtful_is_said_in_words() -> None:
     assert why_doubtful(phantom) == "passes through parked at 1.2 s, 2.8 m wide"
     assert why_doubtful(low) == "confidence 0.49"  # not 0.50, which would be no reason
     assert list_doubtful([low] * 7).endswith("unsure (confidence 0.49) and 2 more")
+    assert list_doubtful([low, phantom]).startswith("phantom (passes through parked at 1.2 s, 2.8 m wide), unsure")
 
 
 def test_beside_another_scenario_doubts_have_its_time() -> None:

@@ -24,7 +24,11 @@ def say_confidence(agent: Agent) -> str:
 
 
 def list_doubtful(agents: Sequence[Agent]) -> str:
-    """List agents on one line, each with why it is doubtful, else with its confidence; the first `MAX_LISTED` of many."""
-    named = [f"{agent.id} ({why_doubtful(agent) or say_confidence(agent)})" for agent in agents[:MAX_LISTED]]
+    """List agents on one line, each with why it is doubtful, else with its confidence; `MAX_LISTED` of many.
+
+    Those with a doubt come first, since low confidence alone says less.
+    """
+    first = sorted(agents, key=lambda agent: not agent.doubts)[:MAX_LISTED]
+    named = [f"{agent.id} ({why_doubtful(agent) or say_confidence(agent)})" for agent in first]
     rest = len(agents) - MAX_LISTED
     return ", ".join(named) + (f" and {rest} more" if rest > 0 else "")

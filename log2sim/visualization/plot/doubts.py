@@ -89,6 +89,7 @@ def doubt_rows(roles: AgentRoles) -> list[tuple[Any, str]]:
     """List handles and texts of the legend: a line for each of the first doubtful agents, with the reason."""
     doubtful = [(r.agent, r.color) for r in roles.movers if r.agent.is_doubtful]
     doubtful += [(a, PARKED_FACE) for a in roles.stationary if a.is_doubtful]
+    doubtful.sort(key=lambda entry: not entry[0].doubts)  # low confidence alone says less
     rows: list[tuple[Any, str]] = []
     for agent, color in doubtful[:MAX_NAMED]:
         patch = Patch(fc=color, ec=MUTED if color == PARKED_FACE else PAPER, hatch="//////", lw=0.6)
