@@ -16,10 +16,10 @@ from log2sim.simulation.policy import Controls, EgoState, Observation, Others, P
 
 
 class BrakeLate:
-    """Drives the recorded way, yet does not slow down with the log: it brakes hard, and only when it must.
+    """Drives the way of the scenario, yet does not slow down with it: it brakes hard, and only when it must.
 
-    It is in a hurry: `hurry` times the highest speed that the scenario has on the next 30 m. What stands or moves on its way is
-    ignored until `late_mps2` would be needed to stop short of it, or to get as slow as it is.
+    It is in a hurry: `hurry` times the highest speed that the scenario has on the next 30 m. What stands or moves on
+    its way is ignored until `late_mps2` would be needed to stop short of it, or to get as slow as it is.
     """
 
     def __init__(self, late_mps2: float = 5.0, room_m: float = 1.5, hurry: float = 1.5) -> None:
@@ -46,7 +46,7 @@ class BrakeLate:
 
 
 class ChangeLane:
-    """Drives at the recorded speed (walking on where the log stopped) and changes to a lane that is free beside it, as soon as there is one.
+    """Drives at the speed of the scenario (walking on where it stopped) and changes to a lane that is free beside it, as soon as there is one.
 
     The move to the side is the course of least jerk over `over_s` seconds at the speed at which it begins.
     """

@@ -111,7 +111,7 @@ def overlaps_at_entry(agents: Sequence[Agent]) -> Iterator[tuple[int, int, float
     for t_s in np.split(times, range(size, len(times), size)):
         alive = np.flatnonzero((first_s <= t_s[-1]) & (last_s >= t_s[0] - ROUNDING_S))
         states = np.full((4, len(t_s), len(agents)), np.nan)
-        states[:, :, alive] = _states([agents[k] for k in alive], t_s)
+        states[:, :, alive] = _states([agents[k] for k in alive.tolist()], t_s)
         for k, t in enumerate(t_s):
             boxes = _Boxes.of(agents, states[:, k])
             present = alive[~np.isnan(states[0, k, alive])]

@@ -152,7 +152,8 @@ def _extent(values: Array, half: Array) -> tuple[Array, Array]:
 def _agents_that_move(boxes: BoxTracks) -> NDArray[np.bool_]:
     """Mark (A,) the agents that change place or heading: who stays neither leaves nor arrives."""
     columns = (boxes.x_m, boxes.y_m, boxes.yaw_rad)
-    return np.any([np.fmax.reduce(c, axis=0) > np.fmin.reduce(c, axis=0) for c in columns], axis=0)
+    changes = np.stack([np.fmax.reduce(c, axis=0) > np.fmin.reduce(c, axis=0) for c in columns])
+    return np.asarray(changes.any(axis=0))
 
 
 def _overlapping_blocks(hulls: _SweptRectangles, moves: NDArray[np.bool_], lag: float) -> Iterator[_Pairs]:
