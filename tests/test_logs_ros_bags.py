@@ -27,13 +27,15 @@ from log2sim.cli import app
 from log2sim.datatypes import Log, Stream, Sweep
 from log2sim.errors import ConfigError, LogError, MissingExtra, RecordError
 from log2sim.geometry import NS_PER_S, RollingShutter, transform
-from log2sim.logs.ros import bag, ego
+from log2sim.logs.ros import bag, chunked, ego
 from log2sim.logs.ros import messages as ros_messages
-from log2sim.logs.ros.bag import open_container
-from log2sim.logs.ros.chunked import ChunkedFile, decompress
+from log2sim.logs.ros.bag import Topic, open_container
+from log2sim.logs.ros.chunked import Chunk, ChunkedFile, decompress
 from log2sim.logs.ros.ego import measure_ground_m
 from log2sim.logs.ros.messages import decode_bytes, definition_fields
 from log2sim.logs.ros.recordings import find_recordings
+from log2sim.logs.ros.roles import assign_roles
+from log2sim.logs.ros.settings import TopicSettings
 from log2sim.logs.ros.stamping import note_other_clocks
 
 CONTAINERS = ("bag", "db3", "mcap")
@@ -672,3 +674,32 @@ def test_mcap_files_of_its_own_writer_are_read(ros1: bool, options: str, tmp_pat
     np.testing.assert_array_equal(log.streams["top"].read(5).xyz_m, world_log().streams["top"].read(5).xyz_m)
     np.testing.assert_array_equal(log.streams["front"].read(5), world_log().streams["front"].read(5))
     assert not any("damaged" in note or "missing" in note for note in log.notes)
+
+
+def test_a_chunk_that_says_to_unpack_to_what_no_sensor_measures_is_not_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A few bytes for 250 MB, thirty of which kept the reader busy for more than a minute."""
+    sound = bz2.compress(bytes(8 << 20))
+    bomb = bz2.compress(bytes(1000))
+    (tmp_path / "a.bag").write_bytes(sound + bomb)
+    file = ChunkedFile(tmp_path / "a.bag")
+    file.chunks = [Chunk(0, len(sound), 8 << 20, "bz2"), Chunk(len(sound), len(bomb), 250_000_000, "bz2")]
+    assert len(file.unpacked(0)) == 8 << 20
+    monkeypatch.setattr(chunked, "unpack_part", lambda *_: pytest.fail("it is unpacked"))
+    for read in (lambda: file.unpacked(1), lambda: file.within(1, 0, 100, ahead=True), lambda: file.within(1, 0, 100)):
+        with pytest.raises(ValueError, match="says to unpack to 250000000, more than 256 times as many"):
+            read()
+
+
+def test_thousands_of_sensor_topics_are_refused_unless_the_settings_choose() -> None:
+    none = np.zeros(3, dtype=np.int64)
+    topics = {
+        name: Topic(name, "sensor_msgs/msg/PointCloud2", "cdr", "", none, none, none)
+        for name in (f"/lidar_{k}/points" for k in range(1001))
+    }
+    bag = SimpleNamespace(place=Path("a.mcap"), topics=topics, frame_id=lambda topic: topic.name)
+    with pytest.raises(LogError, match=r"^a\.mcap: 1001 topics of the kind 'lidar', more than the 1000"):
+        assign_roles(bag, TopicSettings(), None)
+    chosen = TopicSettings.model_validate({"lidars": {"top": {"topic": "/lidar_7/points"}}})
+    assert list(assign_roles(bag, chosen, None).lidars) == ["top"]

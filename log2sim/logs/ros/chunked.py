@@ -19,6 +19,9 @@ from log2sim.input_files import open_regular
 from log2sim.logs.ros.containers import checked_size
 
 MAX_CHUNK_BYTES = 512 * 1024 * 1024
+MAX_RATIO, FREE_BYTES = 256, 16 * 1024 * 1024
+"""A chunk that unpacks to more than `FREE_BYTES`, and to so many times its stored size, holds nothing that was measured: sensor data
+pack to a half to a twentieth. Without this a few kilobytes would keep the reader busy for minutes."""
 READ_BYTES = 16 * 1024
 CACHED_BYTES = 64 * 1024 * 1024
 """Of decompressed chunks; the last one is kept whatever its size."""
@@ -84,6 +87,7 @@ class ChunkedFile:
     def _unpacked_up_to(self, number: int, end: int) -> bytearray:
         """First bytes of a compressed chunk, at least `end` of them; what is stored behind them is not read."""
         chunk = self.chunks[number]
+        self._require_sizes(chunk)
         partial = self._partial
         if partial is None or partial.number != number:
             partial = self._partial = _PartialChunk(number, decompressor_of(chunk.compression))
@@ -121,12 +125,20 @@ class ChunkedFile:
         return data
 
     def _unpack(self, chunk: Chunk) -> bytes:
-        if max(chunk.size_bytes, chunk.stored_bytes) > MAX_CHUNK_BYTES:
-            raise ValueError(f"a chunk of {chunk.size_bytes} bytes, more than the {MAX_CHUNK_BYTES} that it may have")
+        self._require_sizes(chunk)
         data = decompress(self.at(chunk.position, chunk.stored_bytes), chunk.compression, chunk.size_bytes)
         if chunk.crc and zlib.crc32(data) != chunk.crc:
             raise ValueError(f"the CRC of the chunk at byte {chunk.position} is wrong")
         return data
+
+    def _require_sizes(self, chunk: Chunk) -> None:
+        """Raise `ValueError` for a chunk whose sizes no recorder writes."""
+        if max(chunk.size_bytes, chunk.stored_bytes) > MAX_CHUNK_BYTES:
+            raise ValueError(f"a chunk of {chunk.size_bytes} bytes, more than the {MAX_CHUNK_BYTES} that it may have")
+        if chunk.size_bytes > max(FREE_BYTES, MAX_RATIO * chunk.stored_bytes):
+            raise ValueError(
+                f"a chunk of {chunk.stored_bytes} bytes that says to unpack to {chunk.size_bytes}, more than {MAX_RATIO} times as many"
+            )
 
     def check(self, chunk: int) -> None:
         """Check the CRC of a chunk that has one, once; `ValueError` where it is wrong."""

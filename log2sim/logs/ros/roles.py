@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from log2sim import registry
-from log2sim.errors import ConfigError
+from log2sim.errors import ConfigError, LogError
 from log2sim.logs.ros import livox
 from log2sim.logs.ros.bag import Bag, Topic
 from log2sim.logs.ros.ego import BASE_FRAMES
@@ -35,6 +35,10 @@ _DERIVED_CLOUD = re.compile(
 )
 _TRANSPORT = re.compile(r"/(compressed|raw|image_transport)$")
 _LAST_WORDS = re.compile(r"^(points?|point_?clouds?|clouds?|scan|image)(_?(raw|2|ex|rect|color|mono|packets))*$")
+
+
+MAX_SENSOR_TOPICS = 1000
+"""Of one kind among which the sensors are found by names, a comparison for every two; cars have some dozen sensors."""
 
 
 @dataclass
@@ -76,6 +80,8 @@ def assign_roles(bag: Bag, settings: TopicSettings, file: Path | None) -> Roles:
     ------
     ConfigError
         When the settings name a topic that the recording does not have, or that is of another type.
+    LogError
+        For more than `MAX_SENSOR_TOPICS` that no settings choose from.
     """
     roles = Roles()
     usable: dict[str, list[Topic]] = {}
@@ -93,6 +99,12 @@ def assign_roles(bag: Bag, settings: TopicSettings, file: Path | None) -> Roles:
         usable.setdefault(kind, []).append(topic)
     roles.topics = {kind: [t.name for t in topics] for kind, topics in usable.items()}
     _check_named(bag, settings, file)
+    for kind, listed in (("camera", settings.cameras), ("lidar", settings.lidars)):
+        if len(usable.get(kind, ())) > MAX_SENSOR_TOPICS and not listed:
+            raise LogError(
+                f"{bag.place}: {len(usable[kind])} topics of the kind '{kind}', more than the {MAX_SENSOR_TOPICS} of which log2sim "
+                "chooses; list those to use in the settings"
+            )
     _assign_cameras(bag, usable.get("camera", []), settings, roles)
     _assign_lidars(bag, usable.get("lidar", []), settings, roles)
     return roles
