@@ -6,7 +6,6 @@ import json
 import math
 import os
 import re
-import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -16,6 +15,7 @@ from typing import Any
 
 from log2sim.errors import ConfigError, Log2SimError, LogError
 from log2sim.input_files import read_file
+from log2sim.outputs import expect_new, put, temporary_beside
 
 JSON_LIMIT_BYTES = 512 * 1024 * 1024
 # Of a whole number; the largest float64 has 309.
@@ -26,6 +26,8 @@ _SURROGATE_ESCAPE = re.compile(r"\\u[dD][89a-fA-F]")
 @contextmanager
 def replaced(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path beside `path`, renamed to it when the block succeeds and removed when it fails.
+
+    Within `log2sim.outputs.together` it is renamed at the end of that.
 
     Raises
     ------
@@ -39,14 +41,15 @@ def replaced(path: Path | str) -> Iterator[Path]:
         target.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"{target.parent}: cannot be created as a folder: {error.strerror}") from error
-    temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
+    temporary, waits = temporary_beside(target), False
     try:
         yield temporary
-        os.replace(temporary, target)
+        waits = put(temporary, target)
     except OSError as error:
         raise ConfigError(f"{target}: cannot be written: {error.strerror or error}") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        if not waits:
+            temporary.unlink(missing_ok=True)
 
 
 def refuse_existing(path: Path | str, *, overwrite: bool) -> None:
@@ -56,10 +59,12 @@ def refuse_existing(path: Path | str, *, overwrite: bool) -> None:
 
 
 def refuse_below_file(path: Path | str) -> None:
-    """Raise `ConfigError` when what should be a folder above `path` is a file."""
+    """Raise `ConfigError` when what should be a folder above `path` is a file, or may not be written in."""
     above = next((p for p in Path(path).parents if p.exists()), None)
     if above is not None and not above.is_dir():
         raise ConfigError(f"{path}: cannot be written, since {above} is a file and not a folder; choose another place")
+    if above is not None and not os.access(above, os.W_OK | os.X_OK):
+        raise ConfigError(f"{path}: cannot be written: you may not write in the folder {above}; choose another place")
 
 
 def check_targets(*paths: Path | str | None, overwrite: bool) -> None:
@@ -68,7 +73,8 @@ def check_targets(*paths: Path | str | None, overwrite: bool) -> None:
     Raises
     ------
     ConfigError
-        For a file that exists and may not be replaced, a folder, a parent that is a file, or one name for two files.
+        For a file that exists and may not be replaced, a folder, a parent that is a file or may not be written in, or one name for two
+        files.
     """
     targets = [Path(p) for p in paths if p is not None]
     for k, target in enumerate(targets):
@@ -80,6 +86,8 @@ def check_targets(*paths: Path | str | None, overwrite: bool) -> None:
             raise ConfigError(
                 f"{target}: two files would be written under this one name; choose another for one of them"
             )
+    if not overwrite:
+        expect_new(targets)
 
 
 def write_json(path: Path | str, value: Any) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -26,8 +26,10 @@ from log2sim.cli import (
     view,
 )
 from log2sim.cli.options import fail, say
+from log2sim.cli.process import SIGNAL_CODE, Ended, ending_by_signals, tolerating_lost_output
 from log2sim.errors import Log2SimError
 from log2sim.links import OPTION, following_links
+from log2sim.outputs import refusing_to_replace
 from log2sim.version import __version__
 
 INTERRUPTED = 130
@@ -61,6 +63,11 @@ app.command(name="import")(import_.import_)
 
 def main() -> None:
     """Run the command line; every `Log2SimError` becomes one message and its exit code."""
+    with tolerating_lost_output(), ending_by_signals() as ended, refusing_to_replace():
+        _run(ended)
+
+
+def _run(ended: Ended) -> NoReturn:
     arguments = [a for a in sys.argv[1:] if a not in ("--debug", OPTION)]
     debug = "--debug" in sys.argv
     try:
@@ -87,5 +94,6 @@ def main() -> None:
             sys.exit(2)
         fail(f"{format_message()} (see log2sim --help)", getattr(error, "exit_code", 2))
     if code == INTERRUPTED:  # typer returns it for Ctrl-C within a command
-        fail("interrupted; no incomplete file was left", INTERRUPTED)
+        word, code = ("terminated", SIGNAL_CODE + ended.signal) if ended.signal else ("interrupted", INTERRUPTED)
+        fail(f"{word}; no incomplete file was left", code)
     sys.exit(code if isinstance(code, int) else 0)

@@ -20,6 +20,7 @@ from log2sim.geometry import Array, Camera, quaternion_from_rotation
 from log2sim.logs.images import image_size
 from log2sim.logs.native.reader import COMPENSATED, INDEX_COLUMNS, MANIFEST
 from log2sim.logs.native.table_writer import write_ego, write_labels, write_table
+from log2sim.outputs import temporary_beside
 
 POINT_RESOLUTION_M = 1e-3
 # float32 resolves 1 mm up to about 8 km.
@@ -72,8 +73,7 @@ def write_log(
     """
     target = Path(path)
     refuse_target(target, overwrite=overwrite)
-    suffix = secrets.token_hex(4)
-    temporary, replaced = (target.with_name(f".{target.name}.{suffix}{end}") for end in ("", ".old"))
+    temporary, replaced = temporary_beside(target), target.with_name(f".{target.name}.{secrets.token_hex(4)}.old")
     try:
         temporary.mkdir(parents=True)
         _Writer(log, temporary, _Encoding(jpeg_quality, ego, sweep), progress, problems).write()
