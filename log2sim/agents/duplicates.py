@@ -8,7 +8,7 @@ import numpy as np
 
 from log2sim.agents.candidate import AgentCandidate
 from log2sim.datatypes import GROUP_OF, Agent
-from log2sim.geometry import Array, box_corners_bev, overlap_of_smaller
+from log2sim.geometry import Array, rectangle_overlap
 
 # Two agents whose overlap exceeds this share of the smaller box for most of the time are duplicates. Pedestrians are compared
 # by distance, since the boxes of two people who stand close together overlap.
@@ -54,13 +54,9 @@ def _extents_meet(a: Agent, b: Agent) -> bool:
 
 def _shared_areas(a: Agent, b: Agent, t_s: Array) -> Array:
     """Return the overlap (T,) of two agents' boxes at times (T,) as a share of the smaller box; 0 where one is absent."""
-    p, q = a.at(t_s), b.at(t_s)
-    reach = (np.hypot(*a.size_m[:2]) + np.hypot(*b.size_m[:2])) / 2
-    near = p.valid & q.valid & (np.hypot(p.x_m - q.x_m, p.y_m - q.y_m) < reach)
-    corners_a, corners_b = (
-        box_corners_bev(np.stack([s.x_m, s.y_m], axis=1)[near], x.size_m[0], x.size_m[1], s.yaw_rad[near])
-        for s, x in ((p, a), (q, b))
-    )
-    shares = np.zeros(len(near))
-    shares[near] = overlap_of_smaller(corners_a, corners_b)
-    return shares
+    rectangles = []
+    for agent in (a, b):
+        s = agent.at(t_s)
+        length, width = (np.full(len(t_s), v) for v in agent.size_m[:2])
+        rectangles.append(np.column_stack([s.x_m, s.y_m, length, width, s.yaw_rad]))
+    return rectangle_overlap(*rectangles) / min(a.size_m[0] * a.size_m[1], b.size_m[0] * b.size_m[1])

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from log2sim.agents.candidate import AgentCandidate
 from log2sim.agents.plausibility.box_table import BoxTable
-from log2sim.agents.plausibility.free_space import SOLID, WHOLE, RayCounts, count_rays
+from log2sim.agents.plausibility.free_space import RayCounts, count_rays
 from log2sim.agents.plausibility.recording import Recording
 from log2sim.agents.plausibility.structure import structure_shares
 from log2sim.agents.plausibility.views import shown_in_images
 from log2sim.agents.support import Support
-from log2sim.datatypes import Obstacles
+from log2sim.datatypes import Measurements, Obstacles
 from log2sim.geometry import Array
 
 # A detection is never surer than this: 3 nats.
@@ -28,6 +28,8 @@ RAY_NATS = 2.0
 MOTION_NATS = 1.0
 # Rays toward a place before it is said that the LiDAR looks there.
 MIN_LOOKING_RAYS = 30
+# Fewer image boxes with points may each be wrong.
+MIN_HEIGHTS = 3
 # Farther apart, a camera sees what is hidden from a LiDAR.
 SAME_VIEW_M = 3.0
 
@@ -43,7 +45,7 @@ def weigh(candidates: Sequence[AgentCandidate], recording: Recording) -> list[Ag
     agents, clouds, timeline = [c.agent for c in candidates], recording.clouds, recording.timeline
     if not agents:
         return []
-    solid, whole = (count_rays(agents, clouds, timeline, part) for part in (SOLID, WHOLE))
+    solid, whole = count_rays(agents, clouds, timeline)
     in_structure, beside = structure_shares(agents, clouds, timeline)
     met = whole.inside + whole.through
     shown = shown_in_images(BoxTable.of(agents, recording.t_s), recording) & (met >= whole.before) & (met >= MIN_RAYS)
@@ -59,6 +61,7 @@ def weigh(candidates: Sequence[AgentCandidate], recording: Recording) -> list[Ag
             hidden=bool(pointless and met[k].sum() == 0) and _same_view(candidate, clouds),
             shown_ticks=int(shown[k].sum()),
             detected_ticks=int(shown[k, candidate.track.tick].sum()),
+            image_height_share=image_height_share(candidate.track.measurements),
         )
         weighed.append(
             replace(candidate, support=support, evidence=_nats(candidate, solid.inside[k], solid.through[k]))
@@ -76,6 +79,12 @@ def _support(rays: RayCounts, k: int) -> Support:
         before=int(rays.before[k].sum()),
         seen_ticks=int(seen.sum()),
     )
+
+
+def image_height_share(m: Measurements) -> float | None:
+    """Return the median height of the image boxes of a track at its distance over that of its points; None with few of both."""
+    rows = ~m.truncated & (m.points > 0) & (m.top_m > m.bottom_m) & np.isfinite(m.height_px_m)
+    return float(np.median(m.height_px_m[rows] / (m.top_m - m.bottom_m)[rows])) if rows.sum() >= MIN_HEIGHTS else None
 
 
 def _same_view(candidate: AgentCandidate, clouds: Sequence[Obstacles | None]) -> bool:

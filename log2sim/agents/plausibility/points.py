@@ -27,6 +27,9 @@ MAX_USUAL_RATE = 0.9
 MIN_SHOWN_TICKS = 8
 # Nats against a vehicle by a surface that goes on beyond it: one in ten labeled ones stands that close to something.
 BESIDE_STRUCTURE_NATS = 2.3
+# The height of an image box errs by 10 %, that of points by 20 %: a ratio of 0.5 is three standard deviations low. Then the
+# points are not those of what the image shows, but of something nearer that hides it.
+MIN_IMAGE_HEIGHT_SHARE = 0.5
 # Odds of 20 to 1 against a candidate.
 REFUTED_NATS = 3.0
 
@@ -49,6 +52,8 @@ def is_refuted(candidate: AgentCandidate, usual_rate: float) -> bool:
     s = candidate.support
     if s is None:
         return False
+    if s.image_height_share is not None and s.image_height_share < MIN_IMAGE_HEIGHT_SHARE:
+        return True
     if s.hidden or s.in_structure > MOSTLY or _through_more_than(EMPTY_SHARE, s):
         return True
     beside = BESIDE_STRUCTURE_NATS if s.beside_structure > MOSTLY else 0.0

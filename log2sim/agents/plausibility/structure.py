@@ -31,7 +31,7 @@ MIN_POINTS, MIN_CELLS = 12, 4
 BOTTOM_M = 0.3
 # The points in each cell of a surface that are nearest to the sensor, without the strays.
 FRONT_QUANTILE = 0.8
-SEARCHED_TICKS = 5
+SEARCHED_TICKS = 3
 
 
 @dataclass(frozen=True, eq=False)
