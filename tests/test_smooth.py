@@ -14,8 +14,9 @@ from scipy.integrate import quad_vec
 from scipy.linalg import expm
 
 from log2sim.agents.smooth.feasibility import broken_limits, limit_doubts
-from log2sim.agents.smooth.fixed_interval import MotionModel, smooth_interval
+from log2sim.agents.smooth.fixed_interval import smooth_interval
 from log2sim.agents.smooth.heading import yaw_of_motion, yaw_sigma
+from log2sim.agents.smooth.motion_model import MotionModel
 from log2sim.agents.smooth.motion_prior import (
     ACCELERATION_PRIOR_MPS2,
     KNOT_STEP_S,
@@ -614,6 +615,54 @@ def test_the_sigma_of_a_held_heading_grows_with_the_way_only() -> None:
     np.testing.assert_allclose(sigma[11:], sigma[11])
     unknown = yaw_sigma(xy, velocity, np.tile(0.01 * np.eye(2), (20, 1, 1)), ~known & known, hint_sigma_rad=0.3)
     assert unknown.tolist() == [0.3] * 20
+
+
+def braked(t: np.ndarray, rest_s: float) -> np.ndarray:
+    """Braking at 3 m/s2 to rest at a time."""
+    before = np.minimum(t - rest_s, 0.0)
+    return np.column_stack([-1.5 * before**2, 0 * t])
+
+
+@pytest.mark.parametrize("rate_hz", [2.0, 5.0, 20.0])
+@pytest.mark.parametrize("seen_after_s", [-0.6, 0.0, 0.5, 3.0])
+def test_what_brakes_to_rest_does_not_roll_back(rate_hz: float, seen_after_s: float) -> None:
+    """The errors of boxes repeat from tick to tick; the last tick is later than the last measurement."""
+    t = np.arange(0.0, 4.0 + seen_after_s, 1 / rate_hz)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        error = np.array([np.interp(t, np.arange(0, 9, 0.5), rng.normal(0, 0.08, 18)) for _ in range(2)]).T
+        noisy = braked(t, 4.0) + error + rng.normal(0, 0.02, (len(t), 2))
+        covariance = np.tile(0.15**2 * np.eye(2), (len(t), 1, 1))
+        asked = np.append(t, t[-1] + 0.08)
+        path = smooth_track(t, noisy, covariance=covariance, at_s=asked, motion=MotionModel(heading_rad=0.0))
+        speed = signed_speed(path.velocity_mps, path.yaw_rad)
+        assert speed.min() > -0.1
+        assert np.abs(path.yaw_rad).max() < 0.3
+        assert np.hypot(*(path.xy_m - braked(asked, 4.0)).T).max() < 0.5
+
+
+def test_noise_at_rest_has_one_sign_of_speed() -> None:
+    t = DT * np.arange(60)
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        error = np.array([np.interp(t, np.arange(0, 7, 0.7), rng.normal(0, 0.1, 10)) for _ in range(2)]).T
+        covariance = np.tile(0.1**2 * np.eye(2), (60, 1, 1))
+        path = smooth_track(t, error, covariance=covariance, motion=MotionModel(heading_rad=0.4))
+        assert signed_speed(path.velocity_mps, path.yaw_rad).min() > -0.1
+
+
+def test_sigma_grows_beyond_both_ends_as_vehicles_move() -> None:
+    """A calm motion says little about what came before and after it."""
+    t = DT * np.arange(40)
+    asked = np.arange(-1.0, 5.0, DT)
+    noisy = straight(t) + np.random.default_rng(0).normal(0, 0.05, (40, 2))
+    path = smooth_track(t, noisy, sigma_m=0.05, at_s=asked, motion=MotionModel(1e-3))
+    sigma = np.sqrt(np.trace(path.covariance, axis1=1, axis2=2) / 2)
+    assert np.all(np.diff(sigma[:10]) < 0)
+    assert np.all(np.diff(sigma[-10:]) > 0)
+    # White jerk alone: its density, times the fifth power of the time over 20.
+    assert sigma[-1] ** 2 > 0.05 * (asked[-1] - t[-1]) ** 5 / 20
+    assert sigma[len(sigma) // 2] < 0.05
 
 
 @pytest.mark.slow

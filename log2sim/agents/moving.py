@@ -16,8 +16,8 @@ from log2sim.agents.lidar_tracking import BoxState, LidarMatch, track_with_lidar
 from log2sim.agents.motion_doubts import jump_doubts, motion_doubts
 from log2sim.agents.size import TrackGeometry, moving_geometry
 from log2sim.agents.smooth.feasibility import limit_doubts
-from log2sim.agents.smooth.fixed_interval import MotionModel
 from log2sim.agents.smooth.heading import UNKNOWN_YAW_RAD
+from log2sim.agents.smooth.motion_model import MotionModel
 from log2sim.agents.smooth.smoother import SmoothedTrack, signed_speed, smooth_track
 from log2sim.datatypes import GROUP_OF, STANDSTILL_MPS, TYPICAL_SIZE_M, Obstacles, Track, Waypoints
 from log2sim.geometry import NS_PER_S, Array, wrap_angle

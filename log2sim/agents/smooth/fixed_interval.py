@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from log2sim.agents.smooth.heading import UNKNOWN_YAW_RAD, course_is_known, unwrap, yaw_of_motion, yaw_sigma
+from log2sim.agents.smooth.heading import course_is_known, unwrap, yaw_of_motion, yaw_sigma
 from log2sim.agents.smooth.jerk_density import STRONG_PRIOR, WEAK_PRIOR, DensityEstimator, min_density
 from log2sim.agents.smooth.likelihood import (
     MeasurementModel,
@@ -17,12 +17,14 @@ from log2sim.agents.smooth.likelihood import (
     transition,
     zero_motion,
 )
+from log2sim.agents.smooth.motion_model import MotionModel, Smoothed
 from log2sim.agents.smooth.motion_prior import MotionPrior, NoisyPositions, nearest_index
 from log2sim.agents.smooth.quadratic import Minimum, Quadratic, minimize, weighted_sum
+from log2sim.agents.smooth.rolling_back import MAX_HOLDING_ROUNDS, backward_runs, held_at, max_misfit
 from log2sim.agents.smooth.zero_velocity import zero_velocity_sigma
 from log2sim.geometry import Array
 
-__all__ = ["MotionModel", "NoisyPositions", "Smoothed", "smooth_interval"]
+__all__ = ["smooth_interval"]
 
 # Jerk density in m2/s5 that follows every maneuver while outliers are searched.
 PERMISSIVE_JERK_DENSITY = 4.0
@@ -40,60 +42,6 @@ STANDSTILL_HZ = 10.0
 # Lateral velocity of a slow vehicle, standard deviation: constant and as a share of its speed, since the heading that it
 # holds is known to some degrees only.
 SLIP_MPS, SLIP_SHARE = 0.03, 0.15
-
-
-@dataclass(frozen=True)
-class MotionModel:
-    """What is known of how an object moves.
-
-    Attributes
-    ----------
-    jerk_density : float, optional
-        Spectral density of the jerk in m2/s5; None to estimate it.
-    holonomic : bool
-        Whether it may move in any direction, as pedestrians do.
-    heading_rad : float, optional
-        Heading where the motion does not give one.
-    heading_sigma_rad : float
-        Its standard deviation.
-    """
-
-    jerk_density: float | None = None
-    holonomic: bool = False
-    heading_rad: float | None = None
-    heading_sigma_rad: float = UNKNOWN_YAW_RAD
-
-    @property
-    def density_by_direction(self) -> bool:
-        """Whether the jerk densities along and across the path are estimated separately."""
-        return self.jerk_density is None and not self.holonomic
-
-
-@dataclass(frozen=True, eq=False)
-class Smoothed:
-    """A smoothed trajectory at the asked times and what was found out about the observations.
-
-    Attributes
-    ----------
-    state : (T, 3, 2) float64
-        Position in m, velocity in m/s, acceleration in m/s2.
-    covariance : (T, 6, 6) float64
-    yaw_rad, sigma_yaw_rad : (T,) float64
-    residual_m : (n,) float64
-        Distance of each observation from the trajectory.
-    weight : (n,) float64
-        Weight of each observation in [0, 1].
-    jerk_density : (float, float)
-        Along and across the path, m2/s5.
-    """
-
-    state: Array
-    covariance: Array
-    yaw_rad: Array
-    sigma_yaw_rad: Array
-    residual_m: Array
-    weight: Array
-    jerk_density: tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,6 +87,11 @@ class _Problem:
         least = minimize(weighted_sum(terms if constraints is None else [*terms, (1.0, constraints)]))
         return least, self.state + least.step.reshape(self.state.shape)
 
+    def misfit(self, state: Array) -> float:
+        """Weighted squared residuals of a state (K, 3, 2), in sigmas."""
+        residual = self.measurement.residual(state)
+        return float(self.weight @ np.einsum("na,nab,nb->n", residual, self.information, residual))
+
     @cached_property
     def likelihood(self) -> Quadratic:
         """Weighted squared residuals."""
@@ -169,6 +122,9 @@ def smooth_interval(observed: NoisyPositions, asked_s: Array, motion: MotionMode
     if constraints is not None:
         least, state = problem.solve(constraints)
         covariance = least.covariance()
+    if not motion.holonomic:
+        least, state = _without_rolling_back(problem, least, state, constraints, motion)
+        covariance = least.covariance()
     residual = np.hypot(*problem.measurement.residual(state).T)
     state, covariance = _at_times(prior, asked_s, state, covariance)
     known = course_is_known(
@@ -177,6 +133,24 @@ def smooth_interval(observed: NoisyPositions, asked_s: Array, motion: MotionMode
     yaw = yaw_of_motion(state[:, 0], state[:, 1], hint_rad=motion.heading_rad, holonomic=motion.holonomic, known=known)
     sigma = yaw_sigma(state[:, 0], state[:, 1], covariance[:, 2:4, 2:4], known, hint_sigma_rad=motion.heading_sigma_rad)
     return Smoothed(state, covariance, yaw, sigma, residual, problem.weight, problem.density)
+
+
+def _without_rolling_back(
+    problem: _Problem, least: Minimum, state: Array, constraints: Quadratic | None, motion: MotionModel
+) -> tuple[Minimum, Array]:
+    """Hold the vehicle where it seems to move backward and standing explains the positions as well."""
+    observed = problem.measurement.observed
+    for _ in range(MAX_HOLDING_ROUNDS):
+        before = least
+        for run in backward_runs(state, least.covariance(), motion.heading_rad, correlated=observed.correlated):
+            hold = held_at(problem.state, run)
+            both = hold if constraints is None else weighted_sum([(1.0, constraints), (1.0, hold)])
+            stands, its_state = problem.solve(both)
+            if problem.misfit(its_state) - problem.misfit(state) < max_misfit(observed):
+                constraints, least, state = both, stands, its_state
+        if least is before:
+            break
+    return least, state
 
 
 def _weights(observed: NoisyPositions, squared: Array) -> Array:

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from log2sim.agents.smooth.feasibility import BrokenLimit, broken_limits
-from log2sim.agents.smooth.fixed_interval import MotionModel, Smoothed, smooth_interval
+from log2sim.agents.smooth.fixed_interval import smooth_interval
 from log2sim.agents.smooth.heading import speed_sigma
+from log2sim.agents.smooth.motion_model import MotionModel, Smoothed
 from log2sim.agents.smooth.motion_prior import NoisyPositions
 from log2sim.geometry import Array, wrap_angle
 
@@ -170,21 +171,26 @@ def _covariances(t: Array, xy: Array, sigma_m: ArrayLike | None, covariance: Arr
 
 
 def _inflated_in_gaps(covariance: Array, at_s: Array, inlier_s: Array, density: tuple[float, float]) -> Array:
-    """Inflate covariances (T, 2, 2) in long gaps between inliers (m,).
+    """Inflate covariances (T, 2, 2) in long gaps between inliers (m,), and before the first and after the last of them.
 
     A low jerk density where the object was observed says little about gaps, so there it may have moved as vehicles do.
     """
     factor = GAP_JERK_DENSITY / max(np.sqrt(density[0] * density[1]), 1e-12)
-    gaps = np.flatnonzero(np.diff(inlier_s) > MIN_GAP_S)
-    if factor <= 1 or len(gaps) == 0:
+    if factor <= 1 or len(inlier_s) == 0:
         return covariance
     out = covariance.copy()
-    for first, last in zip(inlier_s[gaps].tolist(), inlier_s[gaps + 1].tolist(), strict=True):
+    gaps = np.flatnonzero(np.diff(inlier_s) > MIN_GAP_S)
+    spans = list(zip(inlier_s[gaps].tolist(), inlier_s[gaps + 1].tolist(), strict=True))
+    for first, last in [(-np.inf, float(inlier_s[0])), *spans, (float(inlier_s[-1]), np.inf)]:
         rows = np.flatnonzero((at_s > first) & (at_s < last))
         if len(rows) == 0:
             continue
         before, after = covariance[max(rows[0] - 1, 0)], covariance[min(rows[-1] + 1, len(covariance) - 1)]
-        share = ((at_s[rows] - first) / (last - first))[:, None, None]
+        if np.isinf(first) or np.isinf(last):
+            before = after = after if np.isinf(first) else before
+            share = np.zeros((len(rows), 1, 1))
+        else:
+            share = ((at_s[rows] - first) / (last - first))[:, None, None]
         excess = covariance[rows] - (1 - share) * before - share * after
         # Only what the gap itself adds grows with the jerk.
         grows = np.trace(excess, axis1=1, axis2=2) > 0

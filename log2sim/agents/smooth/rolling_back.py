@@ -1,0 +1,61 @@
+"""Short ways backward that are none: a smoothed velocity swings about zero where a vehicle stands and runs on where it stops."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.agents.smooth.heading import course_is_known, yaw_of_motion
+from log2sim.agents.smooth.likelihood import zero_motion
+from log2sim.agents.smooth.motion_prior import NoisyPositions
+from log2sim.agents.smooth.quadratic import Quadratic
+from log2sim.geometry import Array
+
+# A vehicle stands instead of moving backward if that explains the positions within the 99 % quantile of chi-square with two
+# degrees of freedom; the jerk of stopping is none that the motion before tells.
+CHI2_2DOF_99 = 9.2
+# Errors of boxes repeat for some half a second, in which the view hardly changes.
+VIEW_S = 0.5
+# A longer way backward is one.
+MAX_ROLL_M = 2.0
+# Standard deviation of the velocity of what is held, and rounds in which its neighbors may have to be held too.
+HELD_SIGMA_MPS, MAX_HOLDING_ROUNDS = 0.02, 4
+
+
+def backward_runs(
+    state: Array, covariance: Array, heading_rad: float | None, *, correlated: bool
+) -> list[NDArray[np.intp]]:
+    """Return the knots of each short way backward of a vehicle.
+
+    Parameters
+    ----------
+    state : (K, 3, 2) float64
+    covariance : (K, 6, 6) float64
+    heading_rad : float, optional
+        Heading where the motion does not give one.
+    correlated : bool
+        Whether errors of the positions repeat.
+    """
+    velocity = state[:, 1]
+    known = course_is_known(velocity, covariance[:, 2:4, 2:4], correlated=correlated)
+    if heading_rad is None and not known.any():
+        return []
+    yaw = yaw_of_motion(state[:, 0], velocity, hint_rad=heading_rad, known=known)
+    forward = velocity[:, 0] * np.cos(yaw) + velocity[:, 1] * np.sin(yaw)
+    rows = np.flatnonzero(forward < -2 * HELD_SIGMA_MPS)
+    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []
+    return [run for run in runs if np.hypot(*np.diff(state[run, 0], axis=0).T).sum() < MAX_ROLL_M]
+
+
+def max_misfit(observed: NoisyPositions) -> float:
+    """Return by how much the squared residuals in sigmas may grow where a vehicle is held."""
+    if not observed.correlated or len(observed.t_s) < 2:
+        return CHI2_2DOF_99
+    return CHI2_2DOF_99 * max(1.0, VIEW_S / float(np.median(np.diff(observed.t_s))))
+
+
+def held_at(state: Array, rows: NDArray[np.intp]) -> Quadratic:
+    """Pseudo-measurements of zero velocity at some knots of a state (K, 3, 2)."""
+    information = np.zeros((len(state), 2, 2))
+    information[rows] = np.eye(2) / HELD_SIGMA_MPS**2
+    return zero_motion(state, information, np.zeros_like(information))
