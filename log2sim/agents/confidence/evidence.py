@@ -10,7 +10,7 @@ from log2sim.agents.candidate import AgentCandidate, Timeline
 from log2sim.agents.confirmation import image_confidence, sweep_confidence
 from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Measurements, Waypoints
 from log2sim.geometry import Array
-from log2sim.perception.late_fusion import logit
+from log2sim.perception.late_fusion import SWEEP_RANGE_M, logit
 
 # Of the extents seen at all ticks, this quantile counts as seen at some time: stray points lengthen a few.
 SEEN_QUANTILE = 0.85
@@ -33,7 +33,7 @@ class Evidence:
     Attributes
     ----------
     image : float
-        Log-odds of its confidence by images; 0 without.
+        Log-odds of its confidence by images, where no sweep shows it; 0 elsewhere.
     sweep : float
         Log-odds of its confidence by boxes in LiDAR sweeps; 0 without.
     both : float
@@ -41,7 +41,7 @@ class Evidence:
     no_sweep : float
         1 without boxes in sweeps: nothing but an outline of points then tells size, heading and center.
     missed : float
-        1 without boxes in sweeps although others have some: a detector did not find it there.
+        1 without boxes in sweeps although others have some and it is within the range of their detector.
     few : float
         1 by the number of its measurements.
     brief : float
@@ -141,11 +141,11 @@ def evidence_of(candidate: AgentCandidate, timeline: Timeline, *, searched: bool
     range_m = np.median(np.hypot(*(m.center_m - m.sensor_m)[:, :2].T))
     w = agent.waypoints
     return Evidence(
-        image=float(logit(np.array(image_confidence(track)))) if in_image.any() or not in_sweep.any() else 0.0,
+        image=0.0 if in_sweep.any() else float(logit(np.array(image_confidence(track)))),
         sweep=float(logit(np.array(sweep_confidence(track)))) if in_sweep.any() else 0.0,
         both=float((in_image & in_sweep).mean()),
         no_sweep=float(not in_sweep.any()),
-        missed=float(searched and not in_sweep.any()),
+        missed=float(searched and not in_sweep.any() and range_m < SWEEP_RANGE_M),
         few=1.0 / len(m),
         brief=1.0 / (1.0 + float(w.t_s[-1] - w.t_s[0])),
         unobserved=1.0 - float(agent.quality.get("observed_share", 1.0)),
