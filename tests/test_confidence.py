@@ -123,7 +123,7 @@ def test_every_term_of_a_variance_has_a_weight_and_none_is_negative():
     )
     for terms, weights in (
         (position_terms(w, size, np.array([0.5, 1.0]), evidence, 0.7), POSITION_VARIANCE),
-        (yaw_terms(w, size, evidence, 0.7), YAW_VARIANCE),
+        (yaw_terms(w, 0.7), YAW_VARIANCE),
         (speed_terms(w, evidence, 0.7), SPEED_VARIANCE),
     ):
         assert set(terms) == set(weights)

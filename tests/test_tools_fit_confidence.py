@@ -38,9 +38,10 @@ def test_weights_of_variances_are_found_again_and_make_the_normalized_error_one(
     terms = rng.gamma(1.0, 1.0, (50_000, 3)) * [0.01, 1.0, 20.0]
     true = np.array([2.0, 0.05, 1e-7])
     squared = terms @ true * rng.normal(size=len(terms)) ** 2
-    found = fit_confidence.fit_variances(terms, squared)
+    found = fit_confidence.fit_variances(terms, squared, np.full(3, 1e-7))
     np.testing.assert_allclose(found[:2], true[:2], rtol=0.15)
     assert np.mean(squared / (terms @ found)) == pytest.approx(1.0, abs=0.03)
+    assert fit_confidence.fit_variances(terms, squared, np.array([3.0, 1e-7, 1e-7]))[0] >= 3.0
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 """Fit the weights by which agents are rated, and those of their systematic errors, on synthetic logs.
 
-    python tools/confidence_logs.py --logs 60 --seed 1 --out FOLDER
+    python tools/confidence_logs.py --logs 60 --seed 2 --out FOLDER
     python tools/fit_confidence.py FOLDER > log2sim/agents/confidence/weights.py
 
 Goes on from the first passes that the former made, judges the agents as `evaluate` does, and prints the module. Tables of
@@ -37,8 +37,9 @@ from log2sim.geometry import Array
 FOLDS = 5
 # Standard deviation of the weights of evidence that is scaled to a standard deviation of 1, before anything is seen.
 PRIOR_SIGMA = 0.5
-# A weight of a variance is not below this, so that its logarithm exists.
-MIN_WEIGHT, MAX_WEIGHT = 1e-7, 25.0
+# A weight of a variance is not below this, so that its logarithm exists. Of what smoothing says remains at least a quarter, half
+# of the standard deviation: it alone knows gaps, ends and turns.
+MIN_WEIGHT, MIN_GIVEN_WEIGHT, MAX_WEIGHT = 1e-7, 0.25, 25.0
 RANGES_M = ((0, 15), (15, 30), (30, 50), (50, np.inf))
 
 
@@ -157,8 +158,8 @@ def probabilities(x: Array, bias: float, weights: Array) -> Array:
     return np.clip(1 / (1 + np.exp(-(bias + x @ weights))), MIN_CONFIDENCE, MAX_CONFIDENCE)
 
 
-def fit_variances(terms: Array, squared: Array) -> Array:
-    """Find the most likely weights (F,) of the terms (A, F) of variances for squared errors (A,), Gaussian for each axis."""
+def fit_variances(terms: Array, squared: Array, least: Array) -> Array:
+    """Find the most likely weights (F,), at least so large, of terms (A, F) of variances for squared errors (A,), Gaussian."""
     from scipy.optimize import minimize
 
     scale = squared.mean() / np.maximum(terms.mean(axis=0), 1e-9) / terms.shape[1]
@@ -169,7 +170,7 @@ def fit_variances(terms: Array, squared: Array) -> Array:
         slope = ((1 - squared / variance) / variance)[:, None] * terms * w
         return float((np.log(variance) + squared / variance).mean()), slope.mean(axis=0)
 
-    low, high = np.log(MIN_WEIGHT / scale), np.log(MAX_WEIGHT / scale)
+    low, high = np.log(least / scale), np.log(MAX_WEIGHT / scale)
     start = np.clip(np.zeros(len(scale)), low, high)
     found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=list(zip(low, high)))
     return np.exp(found.x) * scale
@@ -179,7 +180,7 @@ def terms_of(kind: str, a: Rated, confidence: float) -> dict[str, float]:
     w, size = a.candidate.waypoints, a.candidate.size_m
     terms = {
         "position": lambda: position_terms(w, size, a.seen, a.evidence, confidence),
-        "yaw": lambda: yaw_terms(w, size, a.evidence, confidence),
+        "yaw": lambda: yaw_terms(w, confidence),
         "speed": lambda: speed_terms(w, a.evidence, confidence),
     }[kind]()
     return {name: float(values.mean()) for name, values in terms.items()}
@@ -223,7 +224,8 @@ def fit_all(agents: Sequence[Rated]) -> tuple[float, Array, dict[str, dict[str, 
             continue
         names = list(terms_of(kind, *rows[0]))
         terms = np.array([list(terms_of(kind, a, c).values()) for a, c in rows])
-        found = fit_variances(terms, np.array([a.errors[kind] for a, _ in rows]) + 1e-8)
+        least = np.array([MIN_GIVEN_WEIGHT if name == "given" else MIN_WEIGHT for name in names])
+        found = fit_variances(terms, np.array([a.errors[kind] for a, _ in rows]) + 1e-8, least)
         by_kind[kind] = dict(zip(names, found.tolist()))
     return bias, weights, by_kind
 

@@ -8,22 +8,20 @@ import numpy as np
 
 from log2sim.agents.candidate import AgentCandidate, Timeline
 from log2sim.agents.confirmation import image_confidence, sweep_confidence
-from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Measurements, Waypoints
+from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M
 from log2sim.geometry import Array
 from log2sim.perception.late_fusion import SWEEP_RANGE_M, logit
 
 # Of the extents seen at all ticks, this quantile counts as seen at some time: stray points lengthen a few.
 SEEN_QUANTILE = 0.85
-# Standard deviation of the lengths and widths within a category, as a share: those of cars in KITTI's labels are 0.11.
+# Standard deviation of the lengths and widths within a category, as a share: of cars it is a tenth, of trucks more.
 SIZE_SPREAD = 0.15
 MAX_SIZE_SIGMAS = 3.0
-# An object that moved by less than this is as likely one that stands and is seen from changing sides.
-CERTAIN_PATH_M = 2.0
 # Probabilities nearer to 1 are not believed.
 MAX_HEADING_CONFIDENCE = 0.99
 # Beyond these, more evidence adds nothing.
-MAX_POINTS, MAX_SCATTER, MAX_RANGE_M, MAX_DOUBTS = 1000.0, 30.0, 100.0, 2
-MIN_RANGE_M, MIN_SIGMA, MAX_SIGMA = 2.0, 0.1, 50.0
+MAX_SCATTER, MAX_RANGE_M, MAX_DOUBTS = 30.0, 100.0, 2
+MIN_RANGE_M, MIN_SIGMA_M, MAX_SIGMA_M = 2.0, 0.01, 5.0
 
 
 @dataclass(frozen=True)
@@ -36,8 +34,6 @@ class Evidence:
         Log-odds of its confidence by images, where no sweep shows it; 0 elsewhere.
     sweep : float
         Log-odds of its confidence by boxes in LiDAR sweeps; 0 without.
-    both : float
-        Share of its measurements that show it in an image and in a sweep.
     no_sweep : float
         1 without boxes in sweeps: nothing but an outline of points then tells size, heading and center.
     missed : float
@@ -46,10 +42,6 @@ class Evidence:
         1 by the number of its measurements.
     brief : float
         1 by its duration, in units of 1 s, plus 1: motion shows over time.
-    unobserved : float
-        Share of its life without an observation.
-    points : float
-        Logarithm to base 10 of the median number of its LiDAR points.
     blind : float
         Share of its measurements without LiDAR.
     range : float
@@ -58,10 +50,6 @@ class Evidence:
         Logarithm of the median squared distance of its measurements from the trajectory in standard deviations.
     sigma : float
         Logarithm of the standard deviation of its position, in units of 0.1 m.
-    speed_sigma : float
-        Logarithm of the standard deviation of its speed, in units of 0.5 m/s; 0 without.
-    yaw_sigma : float
-        Logarithm of that of its heading, in units of 0.1 rad; 0 without.
     unlikely_size : float
         1 when the observed size is none of its category.
     odd_size : float
@@ -70,10 +58,6 @@ class Evidence:
         Share of its length that was never seen at one time.
     heading : float
         Log-odds that the front is the front; 0 where nothing was decided.
-    askew : float
-        Mean sine of the angle between its axis and that of its boxes.
-    hardly_moved : float
-        Of a moving one, how little of `CERTAIN_PATH_M` it moved.
     other_category : float
         Share of its measurements of another category.
     truncated : float
@@ -86,25 +70,18 @@ class Evidence:
 
     image: float
     sweep: float
-    both: float
     no_sweep: float
     missed: float
     few: float
     brief: float
-    unobserved: float
-    points: float
     blind: float
     range: float
     scatter: float
     sigma: float
-    speed_sigma: float
-    yaw_sigma: float
     unlikely_size: float
     odd_size: float
     hidden: float
     heading: float
-    askew: float
-    hardly_moved: float
     other_category: float
     truncated: float
     doubts: float
@@ -116,10 +93,9 @@ class Evidence:
 
 # Whether an agent with more of it is rather right (1) or wrong (-1); 0 where either may be.
 SIGNS = {
-    "image": 1, "sweep": 1, "both": 1, "no_sweep": -1, "missed": -1, "few": -1, "brief": -1, "unobserved": -1, "points": 1, "blind": -1, "range": -1,
-    "scatter": -1, "sigma": -1, "speed_sigma": -1, "yaw_sigma": -1, "unlikely_size": -1, "odd_size": -1, "hidden": -1, "heading": 1, "askew": -1,
-    "hardly_moved": -1, "other_category": -1, "truncated": -1, "doubts": -1, "moving": 0, "two_wheeler": 0,
-    "pedestrian": 0, "other": 0,
+    "image": 1, "sweep": 1, "no_sweep": -1, "missed": -1, "few": -1, "brief": -1, "blind": -1, "range": -1,
+    "scatter": -1, "sigma": -1, "unlikely_size": -1, "odd_size": -1, "hidden": -1, "heading": 1, "other_category": -1,
+    "truncated": -1, "doubts": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0, "other": 0,
 }  # fmt: skip
 
 
@@ -134,7 +110,7 @@ def evidence_of(candidate: AgentCandidate, timeline: Timeline, *, searched: bool
         Whether sweeps were searched, see `has_boxes`.
     """
     track, agent, m = candidate.track, candidate.agent, candidate.track.measurements
-    in_image, in_sweep = m.camera != "", np.isfinite(m.box_yaw_rad)
+    in_sweep = np.isfinite(m.box_yaw_rad)
     group, yaw = GROUP_OF[agent.category], yaw_at_measurements(candidate, timeline)
     size = np.log(np.array(agent.size_m[:2]) / TYPICAL_SIZE_M[agent.category][:2]) / SIZE_SPREAD
     heading = float(agent.quality.get("heading_confidence", 0.5))
@@ -143,25 +119,18 @@ def evidence_of(candidate: AgentCandidate, timeline: Timeline, *, searched: bool
     return Evidence(
         image=0.0 if in_sweep.any() else float(logit(np.array(image_confidence(track)))),
         sweep=float(logit(np.array(sweep_confidence(track)))) if in_sweep.any() else 0.0,
-        both=float((in_image & in_sweep).mean()),
         no_sweep=float(not in_sweep.any()),
         missed=float(searched and not in_sweep.any() and range_m < SWEEP_RANGE_M),
         few=1.0 / len(m),
         brief=1.0 / (1.0 + float(w.t_s[-1] - w.t_s[0])),
-        unobserved=1.0 - float(agent.quality.get("observed_share", 1.0)),
-        points=float(np.log10(1 + min(np.median(m.points), MAX_POINTS))),
         blind=float((m.source != "lidar").mean()),
         range=float(np.log(np.clip(range_m, MIN_RANGE_M, MAX_RANGE_M) / 20.0)),
         scatter=_scatter(candidate, timeline),
-        sigma=_log_sigma(w.sigma_xy_m, 0.1),
-        speed_sigma=_log_sigma(w.sigma_speed_mps, 0.5),
-        yaw_sigma=_log_sigma(w.sigma_yaw_rad, 0.1),
+        sigma=float(np.log(np.clip(np.median(w.sigma_xy_m), MIN_SIGMA_M, MAX_SIGMA_M) / 0.1)),
         unlikely_size=float(not candidate.geometry.is_likely),
         odd_size=float(min(np.hypot(*size), MAX_SIZE_SIGMAS)),
         hidden=1.0 - float(seen_share(candidate, yaw)[0]),
         heading=float(logit(np.clip(heading, 1 - MAX_HEADING_CONFIDENCE, MAX_HEADING_CONFIDENCE))),
-        askew=_askew(m, yaw),
-        hardly_moved=0.0 if agent.static else max(1.0 - _path_m(w) / CERTAIN_PATH_M, 0.0),
         other_category=float((m.category != agent.category).mean()),
         truncated=float(m.truncated.mean()),
         doubts=float(min(len({d.flag for d in agent.doubts}), MAX_DOUBTS)),
@@ -206,21 +175,3 @@ def seen_share(candidate: AgentCandidate, yaw_rad: Array) -> Array:
     extent = np.where(across[:, None], extent[:, ::-1], extent)[rows]
     seen = np.quantile(extent, SEEN_QUANTILE, axis=0) / np.array(candidate.agent.size_m[:2])
     return np.asarray(np.clip(seen, 0.0, 1.0))
-
-
-def _askew(m: Measurements, yaw_rad: Array) -> float:
-    """Return the mean sine of the angles between the axes of an agent (n,) and those of its boxes; 0 without boxes."""
-    off = np.abs(np.sin(m.box_yaw_rad - yaw_rad))
-    return float(np.nanmean(off)) if np.isfinite(off).any() else 0.0
-
-
-def _log_sigma(sigma: Array | None, unit: float) -> float:
-    """Return the logarithm of the median of standard deviations (T,) in some unit, within limits; 0 without any."""
-    if sigma is None:
-        return 0.0
-    return float(np.log(np.clip(np.median(sigma) / unit, MIN_SIGMA, MAX_SIGMA)))
-
-
-def _path_m(w: Waypoints) -> float:
-    """Return the distance between the first and the last waypoint, m."""
-    return float(np.hypot(w.x_m[-1] - w.x_m[0], w.y_m[-1] - w.y_m[0]))

@@ -30,7 +30,7 @@ def with_systematic_errors(
     w, size_m = candidate.agent.waypoints, candidate.agent.size_m
     share = seen_share(candidate, yaw_at_measurements(candidate, timeline))
     position = sigma_of(position_terms(w, size_m, share, evidence, confidence), POSITION_VARIANCE)
-    yaw = None if w.sigma_yaw_rad is None else sigma_of(yaw_terms(w, size_m, evidence, confidence), YAW_VARIANCE)
+    yaw = None if w.sigma_yaw_rad is None else sigma_of(yaw_terms(w, confidence), YAW_VARIANCE)
     speed = None if w.sigma_speed_mps is None else sigma_of(speed_terms(w, evidence, confidence), SPEED_VARIANCE)
     return replace(w, sigma_xy_m=position, sigma_yaw_rad=yaw, sigma_speed_mps=speed)
 
@@ -48,8 +48,8 @@ def position_terms(
     - given: what smoothing or the fit says;
     - given_moving: errors of neighboring ticks are alike, and smoothing averages them;
     - hidden: a box is laid against one end, and the part of its length that was never seen is on either side of the points;
-    - length: an error of the length moves the center by half of it;
-    - outline: the same where no detector in sweeps tells the size, but an outline of points;
+    - outline: an error of the length moves the center by half of it; where no box of a sweep tells it, an outline of points
+      does;
     - range: the spacing of rays and errors of the pose grow with the distance;
     - wrong: what is probably wrong is probably farther off, at most half its length for the most part.
     """
@@ -60,31 +60,22 @@ def position_terms(
         "given": w.sigma_xy_m**2,
         "given_moving": evidence.moving * w.sigma_xy_m**2,
         "hidden": ((1 - seen[0]) * length) ** 2 * ones,
-        "length": length**2 * ones,
         "outline": evidence.no_sweep * length**2 * ones,
         "range": (range_m / 10.0) ** 2 * ones,
         "wrong": _doubt(confidence) * length**2 * ones,
     }
 
 
-def yaw_terms(
-    w: Waypoints, size_m: tuple[float, float, float], evidence: Evidence, confidence: float
-) -> dict[str, Array]:
+def yaw_terms(w: Waypoints, confidence: float) -> dict[str, Array]:
     """Return the reasons for errors of yaw at the waypoints (T,), rad2 but for their weights.
 
     - given: what smoothing or the fit says;
-    - ends: points of both ends of a side are off by centimeters, which turns a short side by more;
-    - outline: without boxes in sweeps the axis is that of an outline of points, which is bent;
-    - person: people turn their boxes by their stride and arms, and standing ones have no axis;
     - wrong: the axis of what is probably wrong is off by any angle.
     """
     given = np.zeros(len(w)) if w.sigma_yaw_rad is None else w.sigma_yaw_rad
     ones = np.ones(len(w))
     return {
         "given": given**2,
-        "ends": ones / size_m[0] ** 2,
-        "outline": evidence.no_sweep * ones,
-        "person": evidence.pedestrian * ones,
         "wrong": _doubt(confidence) * ones,
     }
 
