@@ -16,6 +16,7 @@ from log2sim.agents.confidence.evidence import SIGNS, Evidence, evidence_of
 from log2sim.agents.confidence.rating import MAX_CONFIDENCE, MIN_CONFIDENCE, probability_of, rate_agents
 from log2sim.agents.confidence.systematic import position_terms, speed_terms, yaw_terms
 from log2sim.agents.confidence.weights import POSITION_VARIANCE, SPEED_VARIANCE, WEIGHTS, YAW_VARIANCE
+from log2sim.agents.hypotheses import Part
 from log2sim.agents.moving import moving_candidate
 from log2sim.agents.static import static_candidate
 from log2sim.datatypes import Doubt, Track
@@ -36,7 +37,9 @@ def driving(count: int = 12) -> AgentCandidate:
 
 
 def candidate_of(track: Track, *, static: bool = True) -> AgentCandidate:
-    return static_candidate(track, DARK, TIMELINE) if static else moving_candidate(track, DARK, TIMELINE, smooth=True)
+    if static:
+        return static_candidate(Part(track, static=True), DARK, TIMELINE)
+    return moving_candidate(track, DARK, TIMELINE, smooth=True)
 
 
 def rated(candidate: AgentCandidate) -> AgentCandidate:
