@@ -106,7 +106,7 @@ def test_evidence_is_bounded_where_there_is_nothing_but_boxes_of_images():
     )  # fmt: skip
     found = evidence_of(replace(candidate, track=replace(candidate.track, measurements=bare)), TIMELINE, searched=False)
     assert np.isfinite(list(asdict(found).values())).all()
-    assert (found.hidden, found.blind, found.points) == (1.0, 1.0, 0.0)
+    assert (found.hidden, found.blind) == (1.0, 1.0)
 
 
 def test_columns_that_are_unknown_stay_unknown():
