@@ -132,6 +132,14 @@ def test_bicycle_without_a_rider_stays_one(person: tuple[float, float, float, fl
     assert sorted(join_riders(d).category.tolist()) == ["bicycle", "pedestrian"]
 
 
+@pytest.mark.parametrize(("score", "joined"), [(0.25, ["pedestrian", "bicycle"]), (0.5, ["cyclist"])])
+def test_a_weak_bicycle_inside_a_person_is_a_bag(score: float, joined: list[str]) -> None:
+    d = detections(("pedestrian", 0.8, (10, 0, 60, 100)), ("bicycle", score, (15, 20, 55, 98)))
+    assert join_riders(d, sure_score=0.4).category.tolist() == joined
+    below = detections(("pedestrian", 0.8, (10, 0, 60, 100)), ("bicycle", score, (15, 50, 55, 125)))
+    assert join_riders(below, sure_score=0.4).category.tolist() == ["cyclist"]
+
+
 def test_one_person_rides_one_of_two_bicycles() -> None:
     d = detections(
         ("bicycle", 0.8, (10, 50, 62, 100)), ("bicycle", 0.7, (30, 52, 85, 101)), ("pedestrian", 0.6, (18, 0, 48, 90))

@@ -406,13 +406,48 @@ def test_a_group_wins_before_a_category_does_and_images_tell_two_wheelers_apart(
     assert voted(("car", 0.9, ""), ("car", 0.9, ""), ("truck", 0.3, "front")) == "car"
 
 
-@pytest.mark.parametrize(("speed_mps", "category"), [(0.0, "bicycle"), (1.5, "cyclist")])
-def test_a_bicycle_that_moves_has_a_rider(speed_mps: float, category: str) -> None:
+@pytest.mark.parametrize(
+    ("speed_mps", "riders", "category"), [(0.0, 10, "bicycle"), (1.5, 10, "cyclist"), (1.5, 0, "bicycle")]
+)
+def test_a_bicycle_that_moves_and_shows_a_rider_is_ridden(speed_mps: float, riders: int, category: str) -> None:
     t_ns = stamps(30)
     rng = np.random.default_rng(2)
     xy = np.column_stack([speed_mps * (t_ns - t_ns[0]) / NS_PER_S, np.zeros(len(t_ns))]) + rng.normal(0, 0.3, (30, 2))
     xy[4] += 9.0
-    assert decide_category(seen(xy, t_ns, category="bicycle")) == category
+    rows = seen(xy, t_ns, category="bicycle")
+    shown = np.where(np.arange(30) % 3 < riders / 10, "pedestrian", "bicycle")
+    assert decide_category(replace(rows, category=shown)) == category
+
+
+@pytest.mark.parametrize("period_s", [0.1, 0.5])
+def test_a_rider_who_passes_parked_bicycles_keeps_the_track_and_they_stay(period_s: float) -> None:
+    rng, t_ns = np.random.default_rng(4), stamps(round(6.0 / period_s), period_s)
+    racks = np.column_stack([np.arange(4.0, 30.0, 3.0), np.full(9, 2.0)])
+    found = []
+    for t in t_ns:
+        rider = np.array([[4.5 * (t - START_NS) / NS_PER_S, 0.0]])
+        shown = rng.random(len(racks)) < 0.6
+        xy = np.concatenate([rider, racks[shown]]) + rng.normal(0, 0.15, (1 + shown.sum(), 2))
+        names = ["rider", *(f"rack{k}" for k in np.flatnonzero(shown))]
+        found.append(seen(xy, t, names, ["cyclist"] + ["bicycle"] * int(shown.sum())))
+    tracks = track(found, t_ns, **OPTIONS)
+    assert [t.category for t in tracks if "rider" in t.measurements.camera] == ["cyclist"]
+    rider = next(t for t in tracks if "rider" in t.measurements.camera)
+    assert (rider.measurements.camera == "rider").mean() > 0.9
+    parked = [t.measurements for t in tracks if t is not rider]
+    assert max(np.ptp(m.center_m[:, 0]) for m in parked) < 4.0
+    assert {c for t in tracks for c in [t.category] if t is not rider} == {"bicycle"}
+
+
+@pytest.mark.parametrize(("away_m", "continued"), [(0.3, True), (1.0, False)])
+def test_a_weak_detection_of_a_person_continues_a_track_only_near_its_prediction(
+    away_m: float, continued: bool
+) -> None:
+    t_ns = stamps(12)
+    found = [seen(np.array([[5.0, 0.0]]), t, category="pedestrian", score=0.8) for t in t_ns[:11]]
+    found.append(seen(np.array([[5.0, away_m]]), t_ns[11], category="pedestrian", score=0.25))
+    (only,) = track(found, t_ns, **OPTIONS)
+    assert len(only) == 11 + continued
 
 
 def test_tracks_come_in_the_order_of_their_start() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.box_votes import independent
-from log2sim.datatypes import Track
+from log2sim.datatypes import GROUP_OF, Track
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception.late_fusion import logit, probability
 
@@ -19,6 +19,8 @@ MIN_SWEEP_CONFIDENCE = 2 / 3
 # Number of the best detections whose mean score is the confidence. Independent detections would multiply; those of a video
 # are not independent, so the confidence saturates.
 CONFIDENCE_DETECTIONS = 5
+# Detections of people and two-wheelers with a lower score continue a track and say nothing for it: about half are clutter.
+WEAK_GROUPS, MIN_COUNTED_SCORE = ("pedestrian", "two_wheeler"), 0.3
 HIDDEN_S = 1.0
 SAME_MOMENT_S = 1e-3
 
@@ -47,7 +49,9 @@ def agent_confidence(track: Track) -> float:
 def image_confidence(track: Track) -> float:
     """Return the share of its ticks at which a track is detected in images, times the mean of the best scores there."""
     m = track.measurements
-    in_image = np.isnan(m.box_yaw_rad) | (m.camera != "")
+    weak = (m.score < MIN_COUNTED_SCORE) & (GROUP_OF[track.category] in WEAK_GROUPS)
+    m, weak = m.take(~(weak & np.isnan(m.box_yaw_rad))), weak[~(weak & np.isnan(m.box_yaw_rad))]
+    in_image = (np.isnan(m.box_yaw_rad) | (m.camera != "")) & ~weak
     if not in_image.any():
         return 0.0
     return detection_rate(m.t_ns) * float(in_image.mean()) * float(_strongest(m.score[in_image]).mean())

@@ -18,6 +18,7 @@ from log2sim.perception.frames import FrameDetector, RecordReader
 from log2sim.perception.homography.correspondences import Correspondences, foot_points, undistorted_pixels
 from log2sim.perception.late_fusion import join_with_images, match_boxes
 from log2sim.perception.lidar.cloud import Cloud, cloud_origin
+from log2sim.perception.lidar.few_points import measure_few_points
 from log2sim.perception.lidar.measure import measure_view, project_cloud
 from log2sim.perception.lidar.measure_boxes import measure_boxes, outside_ego
 from log2sim.perception.lidar.projection import View, view_of
@@ -154,6 +155,8 @@ class _FirstPass:
 
     def _measure_camera(self, view: View, tick: int, detections: Detections, cloud: Cloud | None) -> Measurements:
         measured = measure_view(view, detections, cloud, mode=self.mode)
+        if cloud is not None and self.mode == "robust":
+            measured = measure_few_points(measured, view, cloud)
         if not self.plan.keeps(Stage.HOMOGRAPHY):
             return measured
         ego_T_map, camera = inverse(base_pose(self.log, view.t_ns)), view.camera.name

@@ -15,6 +15,8 @@ SPEED_BASELINE_S = 0.6
 SPEED_QUANTILE = 0.75
 # A bicycle that got farther than its own length and the errors of both positions moved, and none moves without a rider.
 MIN_RIDDEN_M = 3.0
+# Share of the measurements of a ridden bicycle that show the rider, who is larger than the bicycle.
+MIN_RIDER_SHARE = 0.25
 # Measurements at either end of a track whose median position counts, so that single wrong ones do not.
 END_MEASUREMENTS = 5
 
@@ -23,12 +25,18 @@ def decide_category(m: Measurements) -> str:
     """Decide the category of a track from its measurements, which are sorted by time.
 
     It is the one with most of the score; a pedestrian faster than people run is a cyclist whose bicycle the detector
-    missed, and a bicycle that moves has a rider.
+    missed, and a bicycle that moves and sometimes shows a rider has one.
     """
     category = voted_category(m)
     if category == "pedestrian" and _speed_mps(m) > MAX_PEDESTRIAN_SPEED_MPS:
         return "cyclist"
-    return "cyclist" if category == "bicycle" and _displacement_m(m) > MIN_RIDDEN_M else category
+    if (
+        category == "bicycle"
+        and _displacement_m(m) > MIN_RIDDEN_M
+        and (m.category != category).mean() >= MIN_RIDER_SHARE
+    ):
+        return "cyclist"
+    return category
 
 
 def voted_category(m: Measurements) -> str:

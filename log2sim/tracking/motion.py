@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array
 
-# Standard deviations of the initial velocity and of the change of the velocity in 1 s, by group.
-FIRST_SPEED_MPS = {"vehicle": 8.0, "two_wheeler": 4.0, "pedestrian": 1.5, "other": 3.0}
+# Standard deviations of the initial velocity and of the change of the velocity in 1 s, by group. A bicycle without a rider
+# stands, but for those whose rider the detector missed.
+FIRST_SPEED_MPS = {"vehicle": 8.0, "two_wheeler": 4.0, "pedestrian": 1.5, "other": 3.0, "bicycle": 1.0}
 ACCELERATION_MPS2 = {"vehicle": 2.5, "two_wheeler": 1.5, "pedestrian": 1.0, "other": 1.5}
 # A vehicle moves along its axis: lateral share of the initial velocity.
-ACROSS_SHARE = {"vehicle": 0.4, "two_wheeler": 0.4, "pedestrian": 1.0, "other": 1.0}
+ACROSS_SHARE = {"vehicle": 0.4, "two_wheeler": 0.4, "pedestrian": 1.0, "other": 1.0, "bicycle": 0.4}
 # Displacement of the box center when other sides of the object become visible.
 CENTER_SIGMA_M = {"vehicle": 0.35, "two_wheeler": 0.2, "pedestrian": 0.15, "other": 0.35}
 

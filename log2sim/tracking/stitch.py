@@ -135,7 +135,8 @@ def _filtered(
     axis = np.array([(m.yaw_rad if whole_boxes else m.box_yaw_rad)[o[0]] for m, o in zip(parts, orders)])
     mean, covariance = np.zeros((len(parts), 4)), np.zeros((len(parts), 4, 4))
     mean[:, :2], covariance[:, :2, :2] = xy[start], r[start]
-    covariance[:, 2:, 2:] = first_velocity(axis, group)
+    bicycle = np.array([m.category[o[0]] == "bicycle" for m, o in zip(parts, orders)])
+    covariance[:, 2:, 2:] = first_velocity(axis, np.where(bicycle, "bicycle", group))
     noise = np.array([ACCELERATION_MPS2[g] for g in group.tolist()])
     for k in range(1, int(count.max())):
         on = np.flatnonzero(count > k)

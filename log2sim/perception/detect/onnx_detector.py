@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Detections, Frame
 from log2sim.errors import ConfigError
-from log2sim.perception.detect.classes import Classes, choose_classes
+from log2sim.perception.detect.classes import Classes, choose_classes, groups_of
 from log2sim.perception.detect.layout import Layout, Outputs, describe_outputs
 from log2sim.perception.detect.layouts import LAYOUTS, named_layout
 from log2sim.perception.detect.onnx_model import OnnxModel, load_model
@@ -21,6 +21,9 @@ from log2sim.perception.detect.tiling import Tile, merge, plan_tiles
 
 # Smaller boxes are rounding of the decoder.
 MIN_BOX_PX = 2.0
+# People and two-wheelers cover few pixels, of which a cast shadow or a turn takes a score from 0.8 to 0.2. From half of the least
+# score on about half of their boxes are right; they continue tracks that stronger ones began.
+WEAK_GROUPS, WEAK_SHARE = ("pedestrian", "two_wheeler"), 0.5
 # Side of the gray image by whose outputs a layout is recognized.
 PROBE_PX = 320
 
@@ -37,6 +40,8 @@ class OnnxDetector:
     classes : Classes
     min_score : float
         Lowest score of a box.
+    min_weak_score : float
+        The same of people and two-wheelers: weaker boxes continue their tracks, and a weak bicycle under a person tells a rider.
     max_overlap : float
         IoU above which two boxes of one group are duplicates.
     tiles : int or "auto"
@@ -49,6 +54,7 @@ class OnnxDetector:
     layout: Layout
     classes: Classes
     min_score: float
+    min_weak_score: float
     max_overlap: float
     tiles: Literal["auto"] | int
     default_min_score: float
@@ -62,18 +68,20 @@ class OnnxDetector:
         height, width = image.shape[:2]
         tiles = plan_tiles(width, height, self.tiles, self.model.spec.width_px or self.layout.preprocessing.default_px)
         found = [(tile, suppress(self._detect_tile(image, tile), self.max_overlap)) for tile in tiles]
-        return join_riders(merge(found, width, height, self.max_overlap))
+        return join_riders(merge(found, width, height, self.max_overlap), sure_score=self.min_score)
 
     def _detect_tile(self, image: NDArray[np.uint8], tile: Tile) -> Detections:
         """Detect in one tile; boxes in px of the whole image, clipped to the tile."""
         tensor, placement = self.layout.preprocessing(tile.cut(image), self.model.spec)
         outputs = self.model.run(tensor)
-        found = self.layout.decode(outputs, placement.input_px, self.classes, self.min_score)
+        found = self.layout.decode(outputs, placement.input_px, self.classes, min(self.min_score, self.min_weak_score))
         box = placement.to_image(found.box_input)
         finite = np.isfinite(box).all(axis=1) & np.isfinite(found.score)
         low, high = np.zeros(2), np.array([tile.u1 - tile.u0, tile.v1 - tile.v0], dtype=np.float64)
         box = np.clip(box, np.tile(low, 2), np.tile(high, 2))
         kept = finite & np.all(box[:, 2:] - box[:, :2] >= MIN_BOX_PX, axis=1)
+        weak = np.isin(groups_of(found.category), WEAK_GROUPS)
+        kept &= found.score >= np.where(weak, self.min_weak_score, self.min_score)
         origin = np.array([tile.u0, tile.v0, tile.u0, tile.v0], dtype=np.float64)
         score = np.clip(found.score[kept], 0.0, 1.0)
         return Detections(box[kept] + origin, score, found.category[kept].astype("<U16"))
@@ -104,7 +112,10 @@ def open_onnx(
     if input_px is not None:
         layout = with_input_size(layout, model, input_px)
     score = layout.default_min_score if min_score is None else min_score
-    return OnnxDetector(name or path.name, model, layout, classes, score, max_overlap, tiles, layout.default_min_score)
+    weak = WEAK_SHARE * score if min_score is None else score
+    return OnnxDetector(
+        name or path.name, model, layout, classes, score, weak, max_overlap, tiles, layout.default_min_score
+    )
 
 
 def recognize_layout(model: OnnxModel, chosen: Layout | None) -> tuple[Layout, Outputs]:

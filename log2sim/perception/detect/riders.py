@@ -20,8 +20,14 @@ MIN_RISE = 0.1
 RIDDEN = {"bicycle": "cyclist", "motorcycle": "motorcycle", "cyclist": "cyclist"}
 
 
-def join_riders(detections: Detections) -> Detections:
+def join_riders(detections: Detections, *, sure_score: float = 0.0) -> Detections:
     """Replace each two-wheeler and the person on it by one box around both; a bicycle without a person stays one.
+
+    Parameters
+    ----------
+    detections : Detections
+    sure_score : float
+        A two-wheeler of a lower score that lies inside the person's box is a bag or clothes, and nothing is joined.
 
     Notes
     -----
@@ -35,6 +41,9 @@ def join_riders(detections: Detections) -> Detections:
     if not len(person) or not len(wheeler):
         return detections
     fit = rider_fit(detections.box_px[person], detections.box_px[wheeler])
+    for weak in np.flatnonzero(detections.score[wheeler] < sure_score).tolist():
+        px = detections.box_px[wheeler[weak]]
+        fit[[inside_share(px[None], p)[0] > MAX_INSIDE_SHARE for p in detections.box_px[person]], weak] = 0
     box, score = detections.box_px.copy(), detections.score.copy()
     category, kept = detections.category.copy(), np.ones(len(detections), dtype=bool)
     while fit.max() > 0:
