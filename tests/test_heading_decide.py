@@ -102,15 +102,16 @@ def cut(c, rows):
 
 @pytest.mark.parametrize("yaw", [0.0, np.pi])
 def test_what_drives_off_or_stops_had_its_front_where_it_has_it_then(yaw):
-    moving = candidate(30.0, 40.0, 0.0, 6.0)
-    before, after = candidate(34.0, 40.0, yaw), candidate(30.0 + 5.4 + 1.0, 40.0, yaw)
-    standing, driving = cut(before, slice(0, 5)), cut(moving, slice(8, 20))
-    headings, agents = decided(standing, driving)
-    assert headings == [0, 0]
-    assert agents[0].quality["heading_confidence"] > 0.95
-    assert decided(cut(after, slice(15, 20)), cut(moving, slice(0, 10)))[0] == [0, 0]
+    # So slow that it shows no direction of traffic.
+    moving = candidate(30.0, 40.0, 0.0, 1.4, front=0.0, score=0.99)
+    before, after = candidate(31.0, 40.0, yaw), candidate(32.0, 40.0, yaw)
+    driving, stopping = cut(moving, slice(8, 20)), cut(moving, slice(0, 13))
+    for world in ((cut(before, slice(0, 5)), driving), (cut(after, slice(15, 20)), stopping)):
+        headings, agents = decided(*world)
+        assert headings == [0, 0]
+        assert agents[0].quality["heading_confidence"] > 0.9
     # Another place, another vehicle.
-    assert decided(cut(candidate(34.0, 44.0, yaw), slice(0, 5)), driving)[1][0].quality["heading_confidence"] < 0.6
+    assert decided(cut(candidate(31.0, 44.0, yaw), slice(0, 5)), driving)[1][0].quality["heading_confidence"] < 0.6
 
 
 def test_the_doubts_of_a_car_that_is_turned_round_are_those_of_its_new_motion():
