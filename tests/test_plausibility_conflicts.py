@@ -37,6 +37,7 @@ def test_overlaps_have_the_shares_of_exact_rectangles() -> None:
     )
     assert (half.first, half.second, half.tick.tolist()) == (0, 1, [0, 1, 2, 3, 4])
     assert half.share == pytest.approx(0.5)
+    assert half.depth_m == pytest.approx(1.8)
     assert (crossed.first, crossed.second) == (2, 4)
     assert crossed.share == pytest.approx(1.8 / 4.4)
 
@@ -131,3 +132,20 @@ def test_people_beside_each_other_and_beside_a_car_are_not_in_one_place() -> Non
     body = (0.7, 0.7, 1.75)
     people = [agent(x, 0.95, category="pedestrian", size=body) for x in (0.0, 0.45)]
     assert all(doubts == [] for _, doubts in judged((agent(0.0), 9.0), *((p, 1.0) for p in people)))
+
+
+def test_who_passes_the_ego_closely_has_no_doubt_by_rounding() -> None:
+    rng = np.random.default_rng(0)
+    for yaw in rng.uniform(-3, 3, 40):
+        c, s = np.cos(yaw), np.sin(yaw)
+        beside = agent(-1.9 * s, 1.9 * c, yaw=yaw)
+        assert [doubts for _, doubts in judged((beside, 1.0), ego=agent(0.0, yaw=yaw))] == [[]]
+
+
+@pytest.mark.parametrize(("y_m", "count"), [(0.8, 0), (0.6, 1)])
+def test_a_rider_who_passes_a_parked_car_closely_is_there_by_the_errors_of_boxes(y_m, count) -> None:
+    # Half widths of 0.9 and 0.35 m meet 1.25 m apart.
+    rider = agent(-5.0, y_m, category="cyclist", size=(1.8, 0.7, 1.8), speed=2.5)
+    found = judged((agent(0.0), 9.0), (rider, 1.0))
+    assert sum(len(doubts) for _, doubts in found) == count
+    assert all(len(a.waypoints) == 5 for a, _ in found)

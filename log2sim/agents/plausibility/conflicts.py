@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 from log2sim.agents.candidate import AgentCandidate
 from log2sim.agents.plausibility.box_table import BoxTable
 from log2sim.datatypes import Agent, Doubt, Waypoints
-from log2sim.geometry import Array, rectangle_overlap
+from log2sim.geometry import Array, rectangle_overlap, separating_axes
 
 # Boxes that share less than this of the smaller one only touch: their errors.
 TOUCHING = 0.05
-# Boxes that share more are not in one place by their errors alone: 0.3 m of the width of a car that stands beside another.
-IN_ONE_PLACE = 0.15
-# People stand close to each other and to vehicles: less than half of one is in the other's box.
-PERSON_IN_ONE_PLACE = 0.5
+# Less is rounding: 4 mm of the length of a car.
+ROUNDING = 1e-3
+# Boxes are not so deep in each other by their errors alone: two standard deviations of the distance of two positions that are
+# known to 0.2 m each.
+IN_ONE_PLACE_M = 0.5
 # What is left of a life without its conflicts is kept alone if it is at least this share.
 MIN_KEPT_SHARE = 0.5
 # Fewer ticks are no trajectory.
@@ -39,12 +40,15 @@ class Conflict:
         When.
     share : (n,) float64
         Of the smaller box that they share.
+    depth_m : (n,) float64
+        By which one of them would have to move to be apart.
     """
 
     first: int
     second: int
     tick: NDArray[np.intp]
     share: Array
+    depth_m: Array
 
 
 def find_conflicts(boxes: BoxTable, touching: float = TOUCHING) -> list[Conflict]:
@@ -64,10 +68,18 @@ def find_conflicts(boxes: BoxTable, touching: float = TOUCHING) -> list[Conflict
     smaller = np.minimum(*(r[:, 2] * r[:, 3] for r in rectangles))
     share = rectangle_overlap(*rectangles) / smaller
     over = share > touching
-    pair, tick, share = pair[over], tick[over], share[over]
+    pair, tick, share, depth = pair[over], tick[over], share[over], _depths(*(r[over] for r in rectangles))
     return [
-        Conflict(int(first[p]), int(second[p]), tick[pair == p], share[pair == p]) for p in np.unique(pair).tolist()
+        Conflict(int(first[p]), int(second[p]), *(column[pair == p] for column in (tick, share, depth)))
+        for p in np.unique(pair).tolist()
     ]
+
+
+def _depths(a: Array, b: Array) -> Array:
+    """Return by how much (n,) one of two rectangles, (n, 5) each: x, y, length, width, yaw, has to move to be apart."""
+    dx, dy = (b[:, :2] - a[:, :2]).T
+    axes = separating_axes(a[:, 4], b[:, 4], a[:, 2:4], b[:, 2:4])
+    return np.asarray(np.min([reach - np.abs(dx * nx + dy * ny) for nx, ny, reach, _ in axes], axis=0))
 
 
 def resolve_conflicts(candidates: Sequence[AgentCandidate], ego: Agent | None, t_s: Array) -> list[AgentCandidate]:
@@ -98,8 +110,7 @@ def resolve_conflicts(candidates: Sequence[AgentCandidate], ego: Agent | None, t
         stronger, weaker = conflict.first, conflict.second
         if evidence[weaker] > evidence[stronger]:
             stronger, weaker = weaker, stronger
-        limit = TOUCHING if of_ego else _in_one_place(agents[stronger], agents[weaker])
-        over = conflict.tick[conflict.share > limit]
+        over = conflict.tick[conflict.share > TOUCHING if of_ego else conflict.depth_m > IN_ONE_PLACE_M]
         over = over[alive[stronger, over]]
         left = alive[weaker].copy()
         left[over] = False
@@ -108,11 +119,6 @@ def resolve_conflicts(candidates: Sequence[AgentCandidate], ego: Agent | None, t
             alive[weaker] = left
     kept = [k for k in range(len(candidates)) if alive[k].sum() >= MIN_KEPT_TICKS or not boxes.present[k].any()]
     return [_cut(candidates[k], t_s, boxes.present[k], alive[k]) for k in kept]
-
-
-def _in_one_place(a: Agent, b: Agent) -> float:
-    """Return the share of the smaller box from which on two agents are in one place."""
-    return PERSON_IN_ONE_PLACE if "pedestrian" in (a.category, b.category) else IN_ONE_PLACE
 
 
 def _longest_run(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -149,11 +155,11 @@ def conflict_doubts(candidates: Sequence[AgentCandidate], ego: Agent | None, t_s
     """
     agents = [c.agent for c in candidates] + ([ego] if ego is not None else [])
     doubts: list[list[Doubt]] = [[] for _ in agents]
-    for conflict in find_conflicts(BoxTable.of(agents, t_s), touching=0.0):
+    for conflict in find_conflicts(BoxTable.of(agents, t_s), touching=ROUNDING):
         a, b = conflict.first, conflict.second
         if b == len(candidates):
             doubts[a].append(_doubt(conflict, t_s, "in_ego", "touches the ego", agents[a]))
-        elif conflict.share.max() > _in_one_place(agents[a], agents[b]):
+        elif conflict.depth_m.max() > IN_ONE_PLACE_M:
             weaker, other = (a, b) if candidates[a].evidence <= candidates[b].evidence else (b, a)
             words = "stands in" if agents[a].static and agents[b].static else "passes through"
             doubts[weaker].append(
