@@ -141,11 +141,10 @@ def expect_new(targets: Iterable[Path]) -> None:
 def _machine() -> str:
     """Return 8 hexadecimal digits of this machine since its last start, and of the numbers of its processes (Linux)."""
     parts = [platform.node()]
-    for read in (lambda: Path("/proc/sys/kernel/random/boot_id").read_text(), lambda: os.readlink("/proc/self/ns/pid")):
-        try:
-            parts.append(read())
-        except OSError:
-            continue
+    try:
+        parts += [Path("/proc/sys/kernel/random/boot_id").read_text(), os.readlink("/proc/self/ns/pid")]
+    except OSError:
+        parts.append("")  # of another system
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:8]
 
 

@@ -265,6 +265,58 @@ def test_a_key_that_is_there_twice_counts_once(spoilable: Path) -> None:
     assert len(open_log(spoilable).labels.t_ns) == whole
 
 
+TABLES = (
+    "attribute", "calibrated_sensor", "category", "ego_pose", "instance", "log", "sample", "sample_annotation", "sample_data",
+    "scene", "sensor", "visibility",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_a_table_without_records_is_refused_or_missed_by_name(spoilable: Path, table: str) -> None:
+    if not (spoilable / "v1.0-mini" / f"{table}.json").is_file():
+        pytest.skip("a table that is not written")
+    edit(spoilable, table, list.clear)
+    try:
+        log = open_log(spoilable, format="nuscenes")
+        labels, notes = log.labels, " ".join(log.notes)
+    except LogError as problem:
+        assert_one_line(problem)
+    else:
+        assert labels is None or table in ("attribute", "log", "visibility"), notes
+        assert labels is not None or "nothing is labeled" in notes
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_records_that_are_there_twice_count_once(root: Path, spoilable: Path, table: str) -> None:
+    if not (spoilable / "v1.0-mini" / f"{table}.json").is_file():
+        pytest.skip("a table that is not written")
+    edit(spoilable, table, lambda rows: rows.extend([dict(row) for row in rows]))
+    once, twice = open_log(root, format="nuscenes"), open_log(spoilable, format="nuscenes")
+    for name, stream in once.streams.items():
+        assert twice.streams[name].t_ns.tolist() == stream.t_ns.tolist()
+    assert once.labels is not None
+    assert twice.labels is not None
+    assert twice.labels.t_ns.tolist() == once.labels.t_ns.tolist()
+    assert twice.labels.track_id.tolist() == once.labels.track_id.tolist()
+
+
+def test_links_between_records_that_go_in_a_circle_have_no_effect(root: Path, spoilable: Path) -> None:
+    def circle(rows: list[dict[str, Any]]) -> None:
+        for row in rows:
+            row["prev"] = row["next"] = row["token"]
+
+    for table in ("sample", "sample_data", "sample_annotation"):
+        edit(spoilable, table, circle)
+    once, again = open_log(root), open_log(spoilable)
+    assert once.labels is not None
+    assert again.labels is not None
+    assert again.labels.t_ns.tolist() == once.labels.t_ns.tolist()
+
+
+def assert_one_line(problem: Exception) -> None:
+    assert "\n" not in str(problem)
+
+
 def test_scenes_of_several_versions_are_told_apart(root: Path, spoilable: Path) -> None:
     assert open_log(root / "v1.0-mini").name == open_log(root).name == "nuscenes-world"
     other = spoilable / "v1.0-test"

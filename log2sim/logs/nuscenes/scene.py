@@ -86,7 +86,12 @@ class Scene:
         samples = self.tables.matching("sample", "scene_token", [token])
         if not samples:
             raise LogError(f"{path}: no sample of scene '{self.record.get('name')}'; expected its key frames")
-        return sorted(samples, key=lambda sample: stamp_ns_of(sample, path))
+        by_token = {text_of(sample, "token", path): sample for sample in samples}
+        if len(by_token) < len(samples):
+            self.notes.append(
+                f"sample.json: {len(samples) - len(by_token)} key frames are there twice; each counts once"
+            )
+        return sorted(by_token.values(), key=lambda sample: stamp_ns_of(sample, path))
 
     @cached_property
     def data(self) -> list[Record]:

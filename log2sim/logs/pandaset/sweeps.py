@@ -106,12 +106,13 @@ class _KeptTables:
 
 
 def _gt_middle_ns(columns: Mapping[str, NDArray[Any]]) -> int | None:
+    """Return the middle of the PandarGT's times; None where they cannot be those of a sweep."""
     try:
-        t_s = columns["t"][columns["d"] == LIDARS["pandargt"]]
-        middle_s = (float(np.nanmin(t_s)) + float(np.nanmax(t_s))) / 2 if len(t_s) else np.nan
-    except (KeyError, TypeError):
+        t_s = columns["t"][columns["d"] == LIDARS["pandargt"]].astype(np.float64)
+    except (KeyError, TypeError, ValueError, IndexError):
         return None
-    return round(middle_s * NS_PER_S) if np.isfinite(middle_s) else None
+    t_s = t_s[np.abs(t_s) < MAX_TIME_S]  # False for NaN
+    return round((float(t_s.min()) + float(t_s.max())) / 2 * NS_PER_S) if len(t_s) else None
 
 
 # One file holds the sweeps of both LiDARs, which are read one after the other.
