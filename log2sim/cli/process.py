@@ -86,6 +86,8 @@ class TolerantStream:
     def _give_up(self) -> None:
         """Write nowhere from now on; Python would try again to write what waits when it ends, and fail."""
         stream, self._stream = self._stream, None
+        if stream is None:
+            return
         try:
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, stream.fileno())
@@ -98,7 +100,7 @@ class TolerantStream:
 def tolerating_lost_output() -> Iterator[None]:
     """Within the block what cannot be printed changes nothing else."""
     before = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = TolerantStream(sys.stdout), TolerantStream(sys.stderr)  # type: ignore[assignment]
+    sys.stdout, sys.stderr = TolerantStream(sys.stdout), TolerantStream(sys.stderr)
     try:
         yield
     finally:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import secrets
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import numpy as np
 
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
+from log2sim.outputs import temporary_beside
 from log2sim.synth.kitti_layout import KittiFrame, calibration_text, label_text
 from log2sim.synth.light import light_of, weather_of
 from log2sim.synth.render import render, segment
@@ -72,7 +72,7 @@ def write_traffic(
     """
     sensor_named(settings.sensor, settings.mount)
     _refuse(out, overwrite=overwrite)
-    staging = out.with_name(f".{out.name}.{secrets.token_hex(4)}")
+    staging = temporary_beside(out)
     write = _write_frame if settings.layout == "kitti" else _write_log
     try:
         staging.mkdir(parents=True)

@@ -7,13 +7,13 @@ write_synthetic(scene, "samples/crossing", seed=1)
 
 from __future__ import annotations
 
-import secrets
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from log2sim.errors import ConfigError
+from log2sim.outputs import temporary_beside
 from log2sim.synth.scene import Scene, load_scene
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def write_synthetic(
     target = Path(out)
     _refuse(target, overwrite)
     log, truth = synthesize(scene, seed=seed)
-    staging = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
+    staging = temporary_beside(target)
     poses: Literal["gnss", "poses"] = scene.ego.poses if scene.ego is not None else "poses"
     try:
         write_log(log, staging, jpeg_quality=jpeg_quality, ego=poses, progress=progress)
