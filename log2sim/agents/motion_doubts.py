@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF, MAX_SPEED_MPS, Doubt, Waypoints
-from log2sim.geometry import Array
+from log2sim.datatypes import GROUP_OF, MAX_SPEED_MPS, BoxEvidence, Doubt, Waypoints
+from log2sim.geometry import Array, wrap_angle
 
 # Of slow vehicles one in five reverses, at 3 m/s one in a thousand (`FORWARD_LOG_ODDS` of moving agents); out of a driveway or
 # to a better parking space it is some car lengths.
@@ -18,6 +18,12 @@ SIGNIFICANT_SIGMAS = 2.0
 # A measurement is beside the trajectory beyond the 99.9 % quantile of chi-square with two degrees of freedom; one may be an
 # outlier.
 CHI2_2DOF_999, MIN_BESIDE = 13.8, 2
+# One measurement in twenty is an outlier; twice as many are more than that.
+MIN_BESIDE_SHARE = 0.1
+# No road vehicle is wider, mirrors included, so a longer side is its length (Directive 96/53/EC allows 2.6 m).
+MAX_WIDTH_M = 2.7
+# Above this speed a vehicle goes along its length, but for the slip angle, up to 30 degrees where it turns at full lock.
+MIN_COURSE_MPS, MAX_SLIP_RAD, MIN_ACROSS = 1.5, np.deg2rad(45.0), 3
 
 
 def motion_doubts(category: str, w: Waypoints) -> tuple[Doubt, ...]:
@@ -51,11 +57,35 @@ def jump_doubts(t_s: Array, residual_m: Array, sigma_m: Array) -> tuple[Doubt, .
     """
     beside = np.nan_to_num(residual_m) > np.sqrt(CHI2_2DOF_999) * sigma_m
     doubts = []
-    for rows in spans_of(beside):
+    for rows in spans_of(beside) if beside.mean() >= MIN_BESIDE_SHARE else []:
         if len(rows) >= MIN_BESIDE:
             reason = f"measured up to {residual_m[rows].max():.1f} m beside its way {_when(t_s, rows)}"
             doubts.append(Doubt("jump", reason, float(t_s[rows[0]]), float(t_s[rows[-1]])))
     return tuple(doubts)
+
+
+def sideways_doubts(m: BoxEvidence, t_s: Array, heading_rad: Array, speed_mps: Array) -> tuple[Doubt, ...]:
+    """Doubt a vehicle whose length was measured to lie across its way most of the time.
+
+    Parameters
+    ----------
+    m : BoxEvidence
+        n rows.
+    t_s : (n,) float64, s
+    heading_rad : (n,) float64
+        Of the trajectory at these times.
+    speed_mps : (n,) float64, m/s
+        There.
+    """
+    has_box = np.isfinite(m.box_yaw_rad)
+    axis = np.where(has_box, m.box_yaw_rad, m.yaw_rad)
+    certain = (has_box | ((m.high_m - m.low_m)[:, 0] > MAX_WIDTH_M)) & (np.abs(speed_mps) > MIN_COURSE_MPS)
+    across = certain & (np.abs(wrap_angle(2 * (axis - heading_rad))) / 2 > MAX_SLIP_RAD)
+    rows = np.flatnonzero(across)
+    if len(rows) < MIN_ACROSS or len(rows) <= certain.sum() / 2:
+        return ()
+    reason = f"slides across its length {_when(t_s, rows)}"
+    return (Doubt("sideways", reason, float(t_s[rows[0]]), float(t_s[rows[-1]])),)
 
 
 def _reverses(w: Waypoints, backward_mps: Array) -> NDArray[np.bool_]:

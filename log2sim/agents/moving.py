@@ -13,7 +13,7 @@ from log2sim.agents.candidate import REAR_AXLE_SHARE, AgentCandidate, Timeline, 
 from log2sim.agents.confirmation import SAME_MOMENT_S
 from log2sim.agents.heading.box_headings import heading_log_odds
 from log2sim.agents.lidar_tracking import BoxState, LidarMatch, track_with_lidar
-from log2sim.agents.motion_doubts import jump_doubts, motion_doubts
+from log2sim.agents.motion_doubts import jump_doubts, motion_doubts, sideways_doubts
 from log2sim.agents.size import TrackGeometry, moving_geometry
 from log2sim.agents.smooth.feasibility import limit_doubts
 from log2sim.agents.smooth.heading import UNKNOWN_YAW_RAD
@@ -104,6 +104,9 @@ def moving_candidate(
     sigma_m = np.sqrt(np.trace(positions.covariance, axis1=1, axis2=2) / 2 + CENTER_SIGMA_M[group] ** 2)
     doubts = limit_doubts(path.broken) + motion_doubts(track.category, waypoints)
     doubts += jump_doubts(positions.t_s, path.residual_m, sigma_m)
+    if group == "vehicle":
+        near = np.clip(np.searchsorted(at, t), 0, len(at) - 1)
+        doubts += sideways_doubts(m, t, waypoints.yaw_rad[near], waypoints.speed_mps[near])
     return candidate_of(track, geometry, waypoints, quality, static=False, doubts=doubts)
 
 
