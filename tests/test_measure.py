@@ -11,6 +11,7 @@ from log2sim.datatypes import TYPICAL_SIZE_M, Detections
 from log2sim.geometry import Camera, apply, inverse, rotation_from_rpy, transform
 from log2sim.perception.box_fitting import rotate
 from log2sim.perception.lidar.cloud import Cloud
+from log2sim.perception.lidar.clusters import continued_sides
 from log2sim.perception.lidar.ground import ON_GROUND_M
 from log2sim.perception.lidar.measure import measure_view, project_cloud
 from log2sim.perception.lidar.projection import View
@@ -444,3 +445,24 @@ def test_tilted_cameras_see_what_is_before_them():
     assert seen.tolist() == [6, 7, 8, 9, 10]
     np.testing.assert_allclose(uv, np.tile([600.0, 300.0], (5, 1)), atol=1e-2)
     np.testing.assert_allclose(depth, [1, 2, 3, 4, 5], atol=1e-5)
+
+
+def flank(azimuth_step_deg, *, length_m=16.0, aside_m=2.5, start_m=2.0):
+    """Points of a long side beside the sensor, one a ray."""
+    azimuth = np.arange(
+        np.arctan2(aside_m, start_m + length_m), np.arctan2(aside_m, start_m), np.deg2rad(azimuth_step_deg)
+    )
+    return np.stack([aside_m / np.tan(azimuth), np.full(len(azimuth), aside_m)], axis=1)
+
+
+def test_a_flank_goes_on_where_rays_are_far_apart_and_ends_where_none_hits_it():
+    points = flank(0.4)
+    near, far = points[points[:, 0] <= 9.0], points[points[:, 0] > 9.0]
+    assert np.diff(np.sort(points[:, 0])).max() > 0.8
+    np.testing.assert_array_equal(continued_sides(near, far, 22.0), np.arange(len(far)))
+    # What is beyond a gap that no lost ray explains, beside the flank, or longer than the category, is something else.
+    assert len(continued_sides(near, far + np.array([3.0, 0.0]), 22.0)) == 0
+    assert len(continued_sides(near, far + np.array([0.0, 1.0]), 22.0)) == 0
+    kept = continued_sides(near, far, 10.0)
+    assert far[kept, 0].max() <= near[:, 0].min() + 10.0 + 1e-9
+    assert 0 < len(kept) < len(far)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import TYPICAL_SIZE_M, BoxEvidence, Measurements
 from log2sim.geometry import Array
-from log2sim.perception.box_fitting import MAX_WIDTH_FACTOR, rotate
+from log2sim.perception.box_fitting import MAX_WIDTH_FACTOR, azimuth_step_rad, rotate
 
 # Standard deviation of an observed end: range noise of a LiDAR and the spacing of its rays.
 SENSOR_SIGMA_M = 0.08
@@ -23,9 +23,6 @@ SIDE_END, FACING_END = 1, 2
 # Corners are rounded: the outermost point seen from the side is inside the box by about this share of the width; trucks and
 # buses, which are wider than any car is without its mirrors, are boxes.
 CORNER_ROUNDING_SHARE, BOX_CORNER_ROUNDING_SHARE, MIN_BOX_WIDTH_M = 0.05, 0.02, 2.1
-# Azimuths nearer to each other are of one column of a LiDAR, or of several lines; those of successive firings are 0.1 to 0.4
-# degrees apart.
-MIN_AZIMUTH_STEP_RAD = np.deg2rad(0.04)
 # Points nearer than this to the plane of a side that is not seen do not tell how far rays on it are apart.
 MIN_SIDE_DISTANCE_M = 0.3
 # Standard deviation of a center that a 3D detector estimates, per axis: with many points, and the number of points with which
@@ -103,15 +100,10 @@ def end_gaps(xy: Array, low: Array, high: Array, real: NDArray[np.int64]) -> Arr
     Rays that are a small angle apart meet a side at distance d from the sensor's foot point on it, which is c away, at
     points angle x (c^2 + d^2) / c apart.
     """
-    middle = xy.mean(axis=0)
-    turned = rotate(xy, -float(np.arctan2(middle[1], middle[0])))
-    steps = np.diff(np.sort(np.arctan2(turned[:, 1], turned[:, 0])))
-    steps = steps[steps > MIN_AZIMUTH_STEP_RAD]
-    if len(steps) == 0:
-        return np.zeros((2, 2))
+    step_rad = azimuth_step_rad(xy)
     side_m = np.maximum(np.where(np.abs(low) < np.abs(high), np.abs(low), np.abs(high))[::-1], MIN_SIDE_DISTANCE_M)
     end_m = np.stack([low, high], axis=-1)
-    gap = float(np.median(steps)) * (side_m[:, None] ** 2 + end_m**2) / side_m[:, None]
+    gap = step_rad * (side_m[:, None] ** 2 + end_m**2) / side_m[:, None]
     return np.asarray(np.where(real == FACING_END, 0.0, gap))
 
 

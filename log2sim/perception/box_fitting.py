@@ -23,6 +23,9 @@ CORRECTIONS_RAD = np.arange(-7, 8) * SEARCH_STEP_RAD
 MAX_WIDTH_FACTOR = 1.2
 # Smallest and largest size of a category are so many standard deviations of the logarithm apart.
 LIMIT_SIGMAS = 4.0
+# Azimuths nearer to each other are of one column of a LiDAR, or of several lines; those of successive firings are 0.1 to 0.4
+# degrees apart.
+MIN_AZIMUTH_STEP_RAD = np.deg2rad(0.04)
 # Smallest extent and probability of which a logarithm is taken.
 MIN_EXTENT_M, MIN_PROBABILITY = 0.05, 1e-6
 # Stray points are outside an object by less than this.
@@ -134,6 +137,15 @@ def subsample(points: NDArray[Any], max_count: int) -> NDArray[Any]:
     if len(points) <= max_count:
         return points
     return points[np.linspace(0, len(points) - 1, max_count).round().astype(np.int64)]
+
+
+def azimuth_step_rad(xy: Array) -> float:
+    """Return the angle between neighboring columns of points (n, 2), seen from the origin; 0 where they are one column."""
+    middle = xy.mean(axis=0)
+    turned = rotate(xy, -float(np.arctan2(middle[1], middle[0])))
+    steps = np.diff(np.sort(np.arctan2(turned[:, 1], turned[:, 0])))
+    steps = steps[steps > MIN_AZIMUTH_STEP_RAD]
+    return float(np.median(steps)) if len(steps) else 0.0
 
 
 def sample_surface(range_m: Array, max_count: int) -> NDArray[np.intp]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import TYPICAL_SIZE_M, Detections, Measurements
+from log2sim.datatypes import MAX_SIZE_M, TYPICAL_SIZE_M, Detections, Measurements
 from log2sim.geometry import NS_PER_S, Array, Camera
 from log2sim.perception.box_completion import place_boxes
 from log2sim.perception.box_fitting import fit_extents, sample_surface, top_of, upper_median
@@ -23,6 +23,7 @@ from log2sim.perception.lidar.clusters import (
     MIN_CLUSTER_POINTS,
     assign_clusters,
     candidate_clusters,
+    continued_sides,
     region_grow,
 )
 from log2sim.perception.lidar.projection import View, points_in_image_boxes, project_points
@@ -31,6 +32,8 @@ from log2sim.perception.lidar.projection import View, points_in_image_boxes, pro
 BORDER_PX = 3.0
 # Points of a cluster that are kept as evidence.
 MAX_KEPT_POINTS = 400
+# Vehicles that may be longer show flanks at such flat angles that rays are far apart on them.
+MIN_LONG_M = 10.0
 # Smallest extent in mode "paper", m.
 MIN_EXTENT_M = 0.1
 
@@ -61,22 +64,35 @@ def _measure_robustly(rows: Measurements, view: View, cloud: Cloud) -> Measureme
     index, uv = points[visible.index], np.stack([visible.u, visible.v], axis=1)
     xyz = columns_m[:, visible.index].T
     range_m = np.linalg.norm(xyz - cloud.sensor, axis=1)
-    options = []
-    for k, i in enumerate(points_in_image_boxes(visible, rows.box_px, MARGIN)):
+    options, inside = [], points_in_image_boxes(visible, rows.box_px, MARGIN)
+    for k, i in enumerate(inside):
         found = candidate_clusters(xyz[i], uv[i], range_m[i], rows.box_px[k], str(rows.category[k]))
         options.append([(i[members], score) for members, score in found])
-    columns = writable(rows)
-    for k, chosen in enumerate(assign_clusters(options, rows.box_px, len(index))):
+    columns, assigned = writable(rows), assign_clusters(options, rows.box_px, len(index))
+    taken = np.bincount(np.concatenate([*assigned, index[:0]]), minlength=len(index)) > 0
+    for k, chosen in enumerate(assigned):
         if len(chosen) < MIN_CLUSTER_POINTS:
             continue
-        members = index[chosen]
+        members, category = index[chosen], str(rows.category[k])
         if rows.truncated[k]:
-            grown = points[region_grow(columns_m[:2].T, cloud.xyz[members, :2], str(rows.category[k]))]
+            grown = points[region_grow(columns_m[:2].T, cloud.xyz[members, :2], category)]
             members = np.union1d(members, grown)
+        if MAX_SIZE_M[category][0] >= MIN_LONG_M:
+            rest = points if rows.truncated[k] else index[inside[k]]
+            rest = np.setdiff1d(rest, np.union1d(members, index[taken]))
+            members = np.union1d(members, rest[_continuation(cloud, members, rest, MAX_SIZE_M[category][0])])
         box = rows.box_px[k]
         columns["height_px_m"][k] = (box[3] - box[1]) * upper_median(visible.depth[chosen]) / view.camera.K[1, 1]
         write_evidence(columns, k, members, cloud)
     return place_boxes(Measurements(**columns | {"cluster": tuple(columns["cluster"])}))
+
+
+def _continuation(
+    cloud: Cloud, members: NDArray[np.intp], rest: NDArray[np.intp], max_length_m: float
+) -> NDArray[np.intp]:
+    """Find those of the points `rest` that continue the sides of the points `members`, see `continued_sides`."""
+    seed, others = (cloud.xyz[rows, :2].astype(np.float64) - cloud.sensor[:2] for rows in (members, rest))
+    return continued_sides(seed, others, max_length_m)
 
 
 def write_evidence(columns: dict[str, Any], k: int, members: NDArray[np.intp], cloud: Cloud) -> None:
