@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.box_votes import mean_box_axis
-from log2sim.datatypes import TYPICAL_SIZE_M, Measurements, Track
+from log2sim.datatypes import TYPICAL_SIZE_M, Track
 from log2sim.geometry import Array
 from log2sim.perception import box_completion, box_fitting
 from log2sim.perception.lidar.clusters import MIN_CLUSTER_POINTS
@@ -17,8 +18,10 @@ from log2sim.perception.lidar.clusters import MIN_CLUSTER_POINTS
 VOXEL_M = 0.15
 MIN_PERSISTENT_SHARE = 0.15
 MAX_POINTS_PER_TICK = 150
-# A side seen at a smaller angle than this (sine) shows its near end only: its far end rests on few rays.
-MIN_SIDE_SINE = 0.35
+# A side seen at a smaller angle than this (sine) shows its near end only: its far end rests on few rays, and the low hood of a
+# car on none. Trucks and buses are as high at the one end as at the other.
+MIN_SIDE_SINE, MIN_BOX_SIDE_SINE = 0.35, 0.15
+BOXES = ("truck", "bus")
 # A length axis is told by the lengths of the sides if the odds are e to one.
 CLEAR_LOG_ODDS = 1.0
 
@@ -72,8 +75,9 @@ def static_ends(track: Track, xy: Array, origin: Array) -> tuple[float, Ends]:
     yaw = box_fitting.fit_yaw(xy)[0] if axis is None else box_fitting.corrected_yaw(xy, axis)
     low, high = box_fitting.extents(xy, yaw, max_trim_m=box_fitting.MAX_TRIM_M)
     rows = np.flatnonzero([len(c) >= MIN_CLUSTER_POINTS for c in m.cluster])
+    low, high = _reached(low, high, [m.cluster[k][:, :2] - origin for k in rows], yaw)
     sensor = box_fitting.rotate(m.sensor_m[rows, :2] - origin, -yaw)
-    views = box_completion.real_ends(low, high, sensor, m.ends_visible[rows], min_sine=MIN_SIDE_SINE)
+    views = box_completion.real_ends(low, high, sensor, m.ends_visible[rows], min_sine=_min_sine(track.category))
     gaps = np.array([
         box_completion.end_gaps(
             box_fitting.rotate(m.cluster[k][:, :2] - m.sensor_m[k, :2], -yaw), low - at, high - at, real
@@ -87,6 +91,19 @@ def static_ends(track: Track, xy: Array, origin: Array) -> tuple[float, Ends]:
     if axis is None and _is_length_across(ends, box_fitting.rotate(m.sensor_m[:, :2] - origin, -yaw), track.category):
         return yaw + np.pi / 2, ends.swapped()
     return yaw, ends
+
+
+def _reached(low: Array, high: Array, views: list[Array], yaw_rad: float) -> tuple[Array, Array]:
+    """Widen ends (2,), (2,) of points that persist in their cells to where the points of enough views (n, 2) reach.
+
+    At the far end of a long side, rays are so far apart that they never meet a cell twice.
+    """
+    if not views:
+        return low, high
+    each = [box_fitting.extents(xy, yaw_rad, max_trim_m=box_fitting.MAX_TRIM_M) for xy in views]
+    lows, highs = (np.sort(np.array(e), axis=0) for e in zip(*each))
+    enough = min(max(math.ceil(MIN_PERSISTENT_SHARE * len(views)), 2), len(views))
+    return np.minimum(low, lows[enough - 1]), np.maximum(high, highs[-enough])
 
 
 def _is_length_across(ends: Ends, sensor: Array, category: str) -> bool:
@@ -103,15 +120,20 @@ def _is_length_across(ends: Ends, sensor: Array, category: str) -> bool:
     return box_fitting.axes_swapped(ends.high[0] - ends.low[0], sensor - (ends.low + ends.high) / 2, typical)
 
 
-def ends_of(m: Measurements, k: int, yaw_rad: float, velocity_mps: Array) -> Ends:
+def ends_of(track: Track, k: int, yaw_rad: float, velocity_mps: Array) -> Ends:
     """Find the ends of the points of measurement `k`, relative to its viewpoint, for an object that points along a yaw."""
+    m = track.measurements
     xy = m.cluster[k][:, :2] - m.sensor_m[k, :2]
     if m.cluster[k].shape[1] > 3:
         xy = xy - m.cluster[k][:, 3:] * velocity_mps
     low, high = box_fitting.extents(xy, yaw_rad, max_trim_m=box_fitting.MAX_TRIM_M)
-    real = box_completion.real_ends(low, high, np.zeros(2), m.ends_visible[k], min_sine=MIN_SIDE_SINE)
+    real = box_completion.real_ends(low, high, np.zeros(2), m.ends_visible[k], min_sine=_min_sine(track.category))
     gap = box_completion.end_gaps(box_fitting.rotate(xy, -yaw_rad), low, high, real)
     return Ends(low[None], high[None], real[None], gap[None])
+
+
+def _min_sine(category: str) -> float:
+    return MIN_BOX_SIDE_SINE if category in BOXES else MIN_SIDE_SINE
 
 
 def join_ends(parts: list[Ends]) -> Ends:

@@ -118,7 +118,7 @@ def moving_geometry(track: Track, yaw_rad: Array, velocity_mps: Array | None = N
         return _geometry_without_points(track)
     yaw, sensor = yaw_rad[rows], m.sensor_m[rows, :2]
     moved = np.zeros((len(m), 2)) if velocity_mps is None else velocity_mps
-    ends = join_ends([ends_of(m, k, float(yaw_rad[k]), moved[k]) for k in rows.tolist()])
+    ends = join_ends([ends_of(track, k, float(yaw_rad[k]), moved[k]) for k in rows.tolist()])
     height, z = _height(track)
     size, is_likely = _estimate_size(ends, track.category, height, typical_box_size(m))
     has_box = np.isfinite(m.box_yaw_rad[rows])

@@ -23,7 +23,7 @@ MIN_IMAGE_IOU = 0.12
 # cluster counts as extending beyond the box.
 MARGIN, MIN_DENSITY_RATIO = 0.15, 0.3
 # Points of one side lie in a layer of this depth; a nearer side shows no flank. Between points of a side a ray may be lost.
-SIDE_DEPTH_M, MIN_SIDE_DISTANCE_M, MAX_MISSED_RAYS = 0.35, 0.3, 2.0
+SIDE_DEPTH_M, MIN_SIDE_DISTANCE_M, MAX_MISSED_RAYS = 0.2, 0.3, 1.5
 # Boxes with a higher IoU are duplicates and share points. A cluster is rejected when a larger share of its points already
 # belongs to another box.
 DUPLICATE_IOU, MAX_FOREIGN_SHARE = 0.7, 0.5

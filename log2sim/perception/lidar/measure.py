@@ -34,6 +34,7 @@ BORDER_PX = 3.0
 MAX_KEPT_POINTS = 400
 # Vehicles that may be longer show flanks at such flat angles that rays are far apart on them.
 MIN_LONG_M = 10.0
+NEAR_END_QUANTILE = 0.05
 # Smallest extent in mode "paper", m.
 MIN_EXTENT_M = 0.1
 
@@ -82,7 +83,10 @@ def _measure_robustly(rows: Measurements, view: View, cloud: Cloud) -> Measureme
             rest = np.setdiff1d(rest, np.union1d(members, index[taken]))
             members = np.union1d(members, rest[_continuation(cloud, members, rest, MAX_SIZE_M[category][0])])
         box = rows.box_px[k]
-        columns["height_px_m"][k] = (box[3] - box[1]) * upper_median(visible.depth[chosen]) / view.camera.K[1, 1]
+        # The image box of a long vehicle is as high as its near end looks.
+        is_long, depth = MAX_SIZE_M[category][0] >= MIN_LONG_M, visible.depth[chosen]
+        depth_m = float(np.quantile(depth, NEAR_END_QUANTILE)) if is_long else upper_median(depth)
+        columns["height_px_m"][k] = (box[3] - box[1]) * depth_m / view.camera.K[1, 1]
         write_evidence(columns, k, members, cloud)
     return place_boxes(Measurements(**columns | {"cluster": tuple(columns["cluster"])}))
 
