@@ -75,7 +75,8 @@ def static_ends(track: Track, xy: Array, origin: Array) -> tuple[float, Ends]:
     yaw = box_fitting.fit_yaw(xy)[0] if axis is None else box_fitting.corrected_yaw(xy, axis)
     low, high = box_fitting.extents(xy, yaw, max_trim_m=box_fitting.MAX_TRIM_M)
     rows = np.flatnonzero([len(c) >= MIN_CLUSTER_POINTS for c in m.cluster])
-    low, high = _reached(low, high, [m.cluster[k][:, :2] - origin for k in rows], yaw)
+    if track.category in BOXES:
+        low, high = _reached(low, high, [m.cluster[k][:, :2] - origin for k in rows], yaw)
     sensor = box_fitting.rotate(m.sensor_m[rows, :2] - origin, -yaw)
     views = box_completion.real_ends(low, high, sensor, m.ends_visible[rows], min_sine=_min_sine(track.category))
     gaps = np.array([
@@ -96,7 +97,8 @@ def static_ends(track: Track, xy: Array, origin: Array) -> tuple[float, Ends]:
 def _reached(low: Array, high: Array, views: list[Array], yaw_rad: float) -> tuple[Array, Array]:
     """Widen ends (2,), (2,) of points that persist in their cells to where the points of enough views (n, 2) reach.
 
-    At the far end of a long side, rays are so far apart that they never meet a cell twice.
+    At the far end of a long side, rays are so far apart that they never meet a cell twice. Errors of poses widen it too,
+    which short vehicles cannot afford.
     """
     if not views:
         return low, high
