@@ -196,10 +196,17 @@ def with_support(**figures):
 
 @pytest.mark.parametrize(("detected", "doubted"), [(40, 0), (20, 0), (12, 1), (5, 1)])
 def test_an_agent_that_is_seldom_detected_where_images_show_it_well_is_doubted(detected, doubted):
-    judged = with_support(shown_ticks=40, detected_ticks=detected)
+    judged = with_support(shown_ticks=40, detected_ticks=detected, image_ticks=detected)
     assert [d.flag for d in contradict(judged, 0.9)] == ["hardly_observed"] * doubted
     # The odds of 5 are 31 to 1, those of 12 are 4 to 1.
     assert is_refuted(judged, 0.9) is (detected == 5)
+
+
+@pytest.mark.parametrize(("in_images", "doubted"), [(12, 0), (0, 1)])
+def test_what_sweeps_alone_show_where_images_show_the_place_well_is_doubted(in_images, doubted):
+    judged = with_support(shown_ticks=40, detected_ticks=40, image_ticks=in_images)
+    assert [d.flag for d in contradict(judged, 0.9)] == ["hardly_observed"] * doubted
+    assert not is_refuted(judged, 0.9)
 
 
 def test_the_evidence_of_missing_detections_is_a_ratio_of_likelihoods():

@@ -27,6 +27,8 @@ class Support:
         Ticks at which it is not hidden and a searched camera shows it well.
     detected_ticks : int
         Those of them at which it was detected, in an image or a sweep.
+    image_ticks : int
+        Those of them at which it was detected in an image.
     image_height_share : float, optional
         Height that its image boxes span at its distance over the height of its points, the median; None with few of both.
     """
@@ -41,6 +43,7 @@ class Support:
     pointless: bool = False
     shown_ticks: int = 0
     detected_ticks: int = 0
+    image_ticks: int = 0
     image_height_share: float | None = None
 
     @property

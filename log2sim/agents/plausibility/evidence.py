@@ -61,6 +61,7 @@ def weigh(candidates: Sequence[AgentCandidate], recording: Recording) -> list[Ag
             hidden=bool(pointless and met[k].sum() == 0) and _same_view(candidate, clouds),
             shown_ticks=int(shown[k].sum()),
             detected_ticks=int(shown[k, candidate.track.tick].sum()),
+            image_ticks=int(shown[k, candidate.track.tick[candidate.track.measurements.camera != ""]].sum()),
             image_height_share=image_height_share(candidate.track.measurements),
         )
         weighed.append(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -72,6 +73,14 @@ def contradict(candidate: AgentCandidate, usual_rate: float) -> list[Doubt]:
     if missing_nats(s, usual_rate) > 0:
         doubts.append(
             Doubt("hardly_observed", f"is detected at {s.detected_ticks} of {s.shown_ticks} ticks that show it well")
+        )
+    elif missing_nats(replace(s, detected_ticks=s.image_ticks), usual_rate) > REFUTED_NATS:
+        # Sweeps alone show it, and images next to them hardly ever do.
+        doubts.append(
+            Doubt(
+                "hardly_observed",
+                f"is detected in images at {s.image_ticks} of {s.shown_ticks} ticks that show it well",
+            )
         )
     return doubts
 
