@@ -149,3 +149,10 @@ def test_a_rider_who_passes_a_parked_car_closely_is_there_by_the_errors_of_boxes
     found = judged((agent(0.0), 9.0), (rider, 1.0))
     assert sum(len(doubts) for _, doubts in found) == count
     assert all(len(a.waypoints) == 5 for a, _ in found)
+
+
+def test_whoever_is_seen_at_a_single_tick_stays_as_in_logs_of_one_frame() -> None:
+    now = agent(9.0)
+    once = replace(now, waypoints=now.waypoints.take(slice(2, 3)))
+    assert [len(a.waypoints.t_s) for a, _ in judged((once, 3.0))] == [1]
+    assert judged((replace(once, waypoints=agent(0.5).waypoints.take(slice(2, 3))), 3.0), ego=agent(0.0)) == []

@@ -117,7 +117,7 @@ def resolve_conflicts(candidates: Sequence[AgentCandidate], ego: Agent | None, t
         left = _longest_run(left)
         if of_ego or left.sum() >= MIN_KEPT_SHARE * alive[weaker].sum():
             alive[weaker] = left
-    kept = [k for k in range(len(candidates)) if alive[k].sum() >= MIN_KEPT_TICKS or not boxes.present[k].any()]
+    kept = [k for k in range(len(candidates)) if alive[k].sum() >= min(MIN_KEPT_TICKS, boxes.present[k].sum())]
     return [_cut(candidates[k], t_s, boxes.present[k], alive[k]) for k in kept]
 
 
