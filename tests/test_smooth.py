@@ -641,6 +641,20 @@ def test_what_brakes_to_rest_does_not_roll_back(rate_hz: float, seen_after_s: fl
         assert np.hypot(*(path.xy_m - braked(asked, 4.0)).T).max() < 0.5
 
 
+@pytest.mark.parametrize("rate_hz", [2.0, 10.0])
+def test_a_view_that_changes_at_the_end_is_no_acceleration(rate_hz: float) -> None:
+    """In the last second more of the front comes into view, so the center seems to move forward."""
+    t = np.arange(0.0, 5.0, 1 / rate_hz)
+    off = []
+    for seed in range(6):
+        forward = 0.5 * np.clip(t - 4.0, 0.0, 1.0)
+        xy = np.column_stack([8.0 * t + forward, 0 * t]) + np.random.default_rng(seed).normal(0, 0.05, (len(t), 2))
+        covariance = np.tile(0.2**2 * np.eye(2), (len(t), 1, 1))
+        off.append(np.abs(np.hypot(*smooth_track(t, xy, covariance=covariance).velocity_mps.T) - 8.0).max())
+    # Without usual accelerations it is 0.47 and 0.64 m/s.
+    assert np.median(off) < {2.0: 0.44, 10.0: 0.625}[rate_hz]
+
+
 def test_noise_at_rest_has_one_sign_of_speed() -> None:
     t = DT * np.arange(60)
     for seed in range(6):

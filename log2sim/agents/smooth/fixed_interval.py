@@ -42,6 +42,8 @@ STANDSTILL_HZ = 10.0
 # Lateral velocity of a slow vehicle, standard deviation: constant and as a share of its speed, since the heading that it
 # holds is known to some degrees only.
 SLIP_MPS, SLIP_SHARE = 0.03, 0.15
+# Standard deviation of the acceleration in traffic, along or across, and the time for which it lasts.
+USUAL_ACCELERATION_MPS2, ACCELERATION_S = 2.0, 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +86,8 @@ class _Problem:
     def solve(self, constraints: Quadratic | None = None) -> tuple[Minimum, Array]:
         """Return the minimum and the state (K, 3, 2) there."""
         terms = [(1.0, self.likelihood), *((1.0 / d, j) for d, j in zip(self.density, self.jerk))]
+        if self.measurement.observed.correlated and len(self.prior) > 1:
+            terms.append((1.0, self.usual_acceleration))
         least = minimize(weighted_sum(terms if constraints is None else [*terms, (1.0, constraints)]))
         return least, self.state + least.step.reshape(self.state.shape)
 
@@ -91,6 +95,13 @@ class _Problem:
         """Weighted squared residuals of a state (K, 3, 2), in sigmas."""
         residual = self.measurement.residual(state)
         return float(self.weight @ np.einsum("na,nab,nb->n", residual, self.information, residual))
+
+    @cached_property
+    def usual_acceleration(self) -> Quadratic:
+        """Squared accelerations, one in `ACCELERATION_S`: errors that repeat do not pass for braking at the ends of a track."""
+        share = np.gradient(self.prior.knots_s) / ACCELERATION_S
+        information = (share / USUAL_ACCELERATION_MPS2**2)[:, None, None] * np.eye(2)
+        return zero_motion(self.state, np.zeros_like(information), information)
 
     @cached_property
     def likelihood(self) -> Quadratic:
