@@ -173,7 +173,7 @@ def test_what_no_car_can_be_is_not_typical(size):
     ],
 )
 def test_a_narrow_body_may_be_a_person_and_a_post_is_not(category, side_m, likely):
-    track = measured([(12.0, 0.0, 0.0)] * 4, (*side_m, 1.7), category)
+    track = measured([(8.0, 0.0, 0.0)] * 4, (*side_m, 1.7), category)
     assert static_geometry(track).is_likely == likely
     assert moving_geometry(track, np.zeros(4)).is_likely == likely
 

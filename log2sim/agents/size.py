@@ -171,6 +171,7 @@ def _estimate_size(ends: Ends, category: str, height_m: float, known: Array | No
     # What lies between two rays is no evidence.
     between = np.where(ends.real == box_completion.SIDE_END, ends.gap_m / 2, 0.0).sum(axis=2)
     is_likely = _is_likely_size(seen - between, whole, np.maximum(expected, least), category)
+    is_likely = is_likely and not _is_too_thin(seen, whole, category)
     return np.clip(np.maximum(size, least), smallest, largest), is_likely
 
 
@@ -189,12 +190,17 @@ def _is_likely_size(seen: Array, whole: NDArray[np.bool_], else_m: Array, catego
     raw = np.array(
         [np.quantile(seen[whole[:, a], a], SIZE_QUANTILE) if whole[:, a].any() else else_m[a] for a in range(2)]
     )
+    if CATEGORY[category].min_seen_m is not None:
+        return bool((raw <= largest).all())
+    return bool(((raw >= smallest) & (raw <= largest)).all())
+
+
+def _is_too_thin(seen: Array, whole: NDArray[np.bool_], category: str) -> bool:
+    """Return whether the longer of the sides (n, 2) that were seen, with half the gaps beside them, is less than a body's."""
     least = CATEGORY[category].min_seen_m
-    if least is None:
-        large_enough = bool((raw >= smallest).all())
-    else:
-        large_enough = raw.max(where=whole.any(axis=0), initial=0.0) >= least or not whole.any()
-    return bool(large_enough and (raw <= largest).all())
+    if least is None or not whole.any():
+        return False
+    return max(float(np.quantile(seen[whole[:, a], a], SIZE_QUANTILE)) for a in range(2) if whole[:, a].any()) < least
 
 
 def _height(track: Track) -> tuple[float, Array]:
