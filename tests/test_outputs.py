@@ -212,3 +212,44 @@ def test_output_that_nobody_can_read_changes_no_exit_code(end: str) -> None:
     command = f"{sys.executable} -m log2sim config {end}"
     ran = subprocess.run(["bash", "-c", f"set -o pipefail; {command}"], capture_output=True, text=True, check=False)
     assert (ran.returncode, ran.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    "problem", [OSError(28, "No space left on device"), KeyboardInterrupt()], ids=["full", "Ctrl-C"]
+)
+def test_scenario_report_and_picture_of_a_run_appear_together_or_not_at_all(
+    log_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, problem: BaseException
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    command = ("reconstruct", log_folder, "--detector", "labels", "--out", out / "s.json", "--quiet")
+    options = ("--report", out / "r.json", "--topdown", out / "t.png")
+    sound = outputs.put
+
+    def fails(temporary: Path, target: Path) -> bool:
+        if target.name == "s.json":
+            raise problem
+        return sound(temporary, target)
+
+    monkeypatch.setattr("log2sim.documents.put", fails)
+    ran = run(*command, *options)
+    assert ran.code == (130 if isinstance(problem, KeyboardInterrupt) else 2)
+    assert isinstance(problem, KeyboardInterrupt) or "s.json: cannot be written: No space left on device" in ran.line
+    assert names(out) == []
+    monkeypatch.undo()
+    assert run(*command, *options).code == 0
+    assert names(out) == ["r.json", "s.json", "t.png"]
+
+
+def test_a_disk_that_is_full_during_an_export_names_the_folder(
+    tiny_scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("log2sim.export.xml_text.write", full)
+    monkeypatch.setattr("log2sim.export.csv_table.csv.writer", full)
+    ran = run("export", tiny_scenario, "--to", "csv", "--out", tmp_path / "o")
+    assert ran.code == 2
+    assert "o: cannot be written: No space left on device" in ran.line
+    assert names(tmp_path) == []

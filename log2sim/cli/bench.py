@@ -53,6 +53,7 @@ def bench(
     from log2sim.evaluation.bench.scores import Scope
     from log2sim.localization.choice import localize
     from log2sim.logs.opening import open_log
+    from log2sim.outputs import together
 
     check_targets(out / "bench.json", out / "bench.png", overwrite=overwrite)
     changes: dict[str, Any] = {"cameras": cameras, "start_s": start, "stop_s": stop}
@@ -74,6 +75,7 @@ def bench(
         result = run(
             opened, chosen, truth=known, scope=scope, detectors=tuple(detector or ()), progress=report_progress
         )
-    write_json(out / "bench.json", document(result))
-    write_picture(result, out / "bench.png")
+    with together():
+        write_json(out / "bench.json", document(result))
+        write_picture(result, out / "bench.png")
     say(format_table(result), quiet=quiet)

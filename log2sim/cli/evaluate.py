@@ -55,6 +55,7 @@ def evaluate(
     from log2sim.documents import check_targets, read_json, write_json
     from log2sim.errors import ConfigError, ScenarioError
     from log2sim.evaluation.detection.boxes_file import is_boxes_document
+    from log2sim.outputs import together
 
     check_targets(out, plot, overwrite=overwrite)
     document = read_json(path, ScenarioError)
@@ -76,10 +77,11 @@ def evaluate(
         if (note := _other_map(scenario, truth)) is not None:
             say(f"note: {note}", quiet=quiet)
         result, table = _scenario_figures(scenario, load_truth(truth, scenario, sequence), range, wanted)
-    if out is not None:
-        write_json(out, result)
-    if plot is not None:
-        _plot_reliability(result, plot)
+    with together():
+        if out is not None:
+            write_json(out, result)
+        if plot is not None:
+            _plot_reliability(result, plot)
     say(table, quiet=quiet)
 
 

@@ -58,6 +58,7 @@ def reconstruct(
     from log2sim.documents import check_targets, write_json
     from log2sim.errors import ConfigError, MissingExtra
     from log2sim.logs.opening import open_log
+    from log2sim.outputs import together
     from log2sim.pipeline import reconstruct as run
     from log2sim.sensors import IMAGE_DETECTOR, choose_detector
 
@@ -85,17 +86,18 @@ def reconstruct(
         result = run(opened, chosen, progress=report_progress)
     for line in pose_notes(result.report["poses"]):
         say(line, quiet=quiet)
-    if topdown is not None:
-        from log2sim.perception.frames import RecordReader
-        from log2sim.visualization.birdseye.mosaic import write_image
-        from log2sim.visualization.birdseye.of_log import birdseye_of_log
+    with together():
+        if topdown is not None:
+            from log2sim.perception.frames import RecordReader
+            from log2sim.visualization.birdseye.mosaic import write_image
+            from log2sim.visualization.birdseye.of_log import birdseye_of_log
 
-        reader = RecordReader(result.log)
-        write_image(birdseye_of_log(result.log, result.scenario, reader), topdown, overwrite=overwrite)
-        result.report["unreadable"] = {**reader.summary(), **result.report["unreadable"]}
-    if report is not None:
-        write_json(report, result.report)
-    result.scenario.save(out)
+            reader = RecordReader(result.log)
+            write_image(birdseye_of_log(result.log, result.scenario, reader), topdown, overwrite=overwrite)
+            result.report["unreadable"] = {**reader.summary(), **result.report["unreadable"]}
+        if report is not None:
+            write_json(report, result.report)
+        result.scenario.save(out)
     for note in unused_records(result.report):
         say(f"note: {note}", quiet=quiet)
     counts = result.report["agents"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Protocol
@@ -13,6 +12,7 @@ from log2sim.datatypes import Log, Scenario
 from log2sim.documents import refuse_below_file, refuse_existing
 from log2sim.errors import ConfigError
 from log2sim.export.checks import require_exportable
+from log2sim.outputs import temporary_beside
 
 __all__ = ["Exporter", "Options", "export", "formats"]
 
@@ -99,12 +99,17 @@ def export(
         folder.parent.mkdir(parents=True, exist_ok=True)
         # In the folder itself if it exists, since it may be on another file system than its parent.
         parent = folder if folder.is_dir() else folder.parent
-        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=parent))
+        temporary = temporary_beside(parent / folder.name)
+        temporary.mkdir()
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be written: {error.strerror or error}") from error
     try:
         exporter.write(scenario, temporary, chosen)
         return _move_into(temporary, folder, overwrite=overwrite)
+    except OSError as error:
+        if error.filename is not None and not Path(error.filename).is_relative_to(temporary):
+            raise  # of a file that is read
+        raise ConfigError(f"{folder}: cannot be written: {error.strerror or error}") from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
