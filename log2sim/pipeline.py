@@ -217,8 +217,9 @@ def second_pass(run: Run, observations: Observations) -> Result:
         ego = ego_agent(log, timeline, run.poses.origin)
     with run.clock.stage("judge"):
         recording = Recording(log, run.schedule, observations.obstacles, timeline)
-        judged = rate_agents(judge(candidates, ego, recording), timeline)
-        agents = [candidate.agent for candidate in judged]
+        judged = judge(candidates, ego, recording)
+        rated = rate_agents(judged, timeline)
+        agents = [candidate.agent for candidate in rated]
         # Without an ego the agents' waypoints alone tell the ticks, so all of them stay.
         agents = simplify(agents) if ego is not None else agents
     if ego is None and not agents:

@@ -1,35 +1,57 @@
-"""What the terminal says about doubtful agents."""
+"""What the terminal says about doubtful agents, and the list of the flags that say why."""
 
 from __future__ import annotations
 
+import ast
+from dataclasses import replace
+
 import pytest
+from export_worlds import straight, world
+from test_layers import ROOT
 
-from log2sim.cli.reconstruct import MAX_NAMED_DOUBTS, doubt_lines
-from log2sim.datatypes import Doubt
+from log2sim.agents.smooth.feasibility import PHRASES
+from log2sim.cli.reconstruct import doubt_lines
+from log2sim.datatypes import FLAGS, MAX_LISTED, Agent, Doubt
 
-PASSES = Doubt("passes_through", "passes through car-22 at 1.2 s", 1.0, 1.4).to_dict()
+PASSES = Doubt("passes_through", "passes through car-22 at 1.2 s", 1.0, 1.4)
+
+
+def agent(name: str, *doubts: Doubt, confidence: float = 0.9) -> Agent:
+    return replace(straight(name), doubts=doubts, confidence=confidence)
 
 
 def test_nothing_is_said_without_a_doubt() -> None:
-    assert doubt_lines({"total": 46, "doubtful": {}}) == []
+    assert doubt_lines(world(agent("ego"), agent("car-1"))) == []
 
 
 def test_the_agents_are_counted_and_named_with_their_reasons() -> None:
-    counts = {"total": 46, "doubtful": {"car-18": [PASSES], "car-19": []}}
-    (line,) = doubt_lines(counts)
-    assert line == "2 of 46 agents are doubtful: car-18 (passes through car-22 at 1.2 s), car-19 (low confidence)"
+    (line,) = doubt_lines(world(agent("ego"), agent("car-19", confidence=0.2), agent("car-18", PASSES), agent("car-1")))
+    assert line == "2 of 3 agents are doubtful: car-18 (passes through car-22 at 1.2 s), car-19 (confidence 0.20)"
 
 
 @pytest.mark.parametrize("extra", [0, 3])
 def test_the_list_is_limited(extra: int) -> None:
-    names = [f"car-{k}" for k in range(MAX_NAMED_DOUBTS + extra)]
-    (line,) = doubt_lines({"total": 46, "doubtful": {name: [PASSES] for name in names}})
-    assert line.startswith(f"{len(names)} of 46 agents are doubtful: car-0 (")
-    assert line.count("passes through") == MAX_NAMED_DOUBTS
-    assert line.endswith(f", and {extra} more" if extra else ")")
+    (line,) = doubt_lines(world(*(agent(f"car-{k}", PASSES) for k in range(MAX_LISTED + extra))))
+    assert line.startswith(f"{MAX_LISTED + extra} of {MAX_LISTED + extra} agents are doubtful: car-0 (")
+    assert line.count("passes through") == MAX_LISTED
+    assert line.endswith(f" and {extra} more" if extra else ")")
 
 
 def test_the_ego_is_no_agent_among_others() -> None:
-    lines = doubt_lines({"total": 2, "doubtful": {"ego": [PASSES], "car-1": [PASSES]}})
+    lines = doubt_lines(world(agent("ego", PASSES), agent("car-1", PASSES)))
     assert lines[0].startswith("the ego is doubtful: ")
-    assert lines[1].startswith("1 of 2 agents is doubtful: car-1 ")
+    assert lines[1].startswith("1 of 1 agents is doubtful: car-1 ")
+
+
+def test_every_flag_that_is_given_is_listed_and_every_listed_one_is_given() -> None:
+    given = set(PHRASES)
+    for file in (ROOT / "log2sim" / "agents").rglob("*.py"):
+        for call in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if (
+                isinstance(call, ast.Call)
+                and isinstance(call.func, ast.Name)
+                and call.func.id.lower().strip("_s") == "doubt"
+            ):
+                texts = [a.value for a in call.args if isinstance(a, ast.Constant) and isinstance(a.value, str)]
+                given |= {text for text in texts if text.isidentifier()}
+    assert given == set(FLAGS)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -21,8 +21,8 @@ from log2sim.cli.options import (
     say,
 )
 
-# Doubtful agents that the terminal names; the report has all.
-MAX_NAMED_DOUBTS = 5
+if TYPE_CHECKING:
+    from log2sim.datatypes import Scenario
 
 
 def reconstruct(
@@ -100,9 +100,9 @@ def reconstruct(
         result.scenario.save(out)
     for note in unused_records(result.report):
         say(f"note: {note}", quiet=quiet)
-    counts = result.report["agents"]
-    for line in doubt_lines(counts):
+    for line in doubt_lines(result.scenario):
         say(line, quiet=quiet)
+    counts = result.report["agents"]
     say(
         f"{out}: {counts['total']} agents ({counts['static']} static) over {result.scenario.duration_s:.1f} s, "
         f"{result.report['ticks_per_second']:.1f} ticks/s",
@@ -110,20 +110,15 @@ def reconstruct(
     )
 
 
-def doubt_lines(counts: dict[str, Any]) -> list[str]:
-    """Say how many agents are doubtful and why the first ones are, from the part `agents` of a report; no line without any."""
-    doubtful = {name: doubts for name, doubts in counts["doubtful"].items() if name != "ego"}
-    named = [f"{name} ({_why(doubts)})" for name, doubts in list(doubtful.items())[:MAX_NAMED_DOUBTS]]
-    more = [f"and {len(doubtful) - len(named)} more"] if len(doubtful) > len(named) else []
-    verb = "is" if len(doubtful) == 1 else "are"
-    lines = (
-        [f"{len(doubtful)} of {counts['total']} agents {verb} doubtful: {', '.join([*named, *more])}"] if named else []
-    )
-    return [f"the ego is doubtful: {_why(counts['doubtful']['ego'])}", *lines] if "ego" in counts["doubtful"] else lines
+def doubt_lines(scenario: Scenario) -> list[str]:
+    """Say how many agents are doubtful and why the first ones are; no line without any. The report has all."""
+    from log2sim.datatypes import list_doubtful, why_doubtful
 
-
-def _why(doubts: list[dict[str, Any]]) -> str:
-    return ", ".join(doubt["reason"] for doubt in doubts) if doubts else "low confidence"
+    ego, others = scenario.ego, [agent for agent in scenario.others if agent.is_doubtful]
+    lines = [f"the ego is doubtful: {why_doubtful(ego)}"] if ego is not None and ego.is_doubtful else []
+    verb = "is" if len(others) == 1 else "are"
+    count = f"{len(others)} of {len(scenario.others)} agents {verb} doubtful"
+    return [*lines, f"{count}: {list_doubtful(others)}"] if others else lines
 
 
 def pose_notes(poses: dict[str, Any]) -> list[str]:

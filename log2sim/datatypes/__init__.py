@@ -14,8 +14,8 @@ from log2sim.datatypes.categories import (
     MIN_SIZE_M,
     TYPICAL_SIZE_M,
 )
-from log2sim.datatypes.doubtful import list_doubtful, say_confidence, why_doubtful
-from log2sim.datatypes.doubts import MIN_TRUSTED_CONFIDENCE, Doubt
+from log2sim.datatypes.doubtful import MAX_LISTED, list_doubtful, say_confidence, why_doubtful
+from log2sim.datatypes.doubts import FLAGS, MIN_TRUSTED_CONFIDENCE, Doubt
 from log2sim.datatypes.ignore_regions import IgnoreRegions, LabelView
 from log2sim.datatypes.labels import ImageLabels, ImageRegions, Labels
 from log2sim.datatypes.log import (
@@ -40,8 +40,10 @@ __all__ = [
     "CATEGORIES",
     "CATEGORY",
     "EGO",
+    "FLAGS",
     "GROUPS",
     "GROUP_OF",
+    "MAX_LISTED",
     "MAX_SIZE_M",
     "MAX_SPEED_MPS",
     "MIN_SIZE_M",

@@ -14,6 +14,24 @@ from log2sim.geometry import Array
 MIN_TRUSTED_CONFIDENCE = 0.5
 """Agents below it are doubtful: by their confidence they are more likely wrong than right."""
 
+FLAGS = {
+    "acceleration": "accelerates or brakes harder than vehicles can",
+    "lateral_acceleration": "accelerates sideways harder than tires hold",
+    "curvature": "turns on a smaller circle than vehicles can",
+    "jerk": "changes its acceleration faster than brakes can",
+    "speed": "is faster than anything of its category",
+    "reversing": "drives backward fast or far",
+    "sideways": "slides across its length",
+    "jump": "its measurements are beside its trajectory",
+    "passes_through": "is in the place of another agent",
+    "in_ego": "touches the ego",
+    "empty": "LiDAR rays pass through its place",
+    "hardly_observed": "the LiDAR or the cameras look toward it and hardly ever show it",
+    "unlikely_size": "has a size that no road vehicle has",
+    "heading_ambiguous": "front and back may be swapped",
+}
+"""The flags that a reconstruction gives, and what each means."""
+
 
 @dataclass(frozen=True)
 class Doubt:
@@ -22,7 +40,7 @@ class Doubt:
     Attributes
     ----------
     flag : str
-        Short name of the reason, one of those in README, such as "passes_through".
+        Short name of the reason; those of a reconstruction are in `FLAGS`.
     reason : str
         In words for people, such as "passes through car-22 at 1.2 s".
     start_s, end_s : float or None, s

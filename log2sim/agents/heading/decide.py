@@ -114,7 +114,7 @@ def _decided(candidate: AgentCandidate, along: float) -> AgentCandidate:
     agent, confidence = candidate.agent, max(along, 1 - along)
     if along < 0.5:
         w = agent.waypoints
-        w = replace(w, yaw_rad=wrap_angle(w.yaw_rad + np.pi), speed_mps=-w.speed_mps)
+        w = replace(w, yaw_rad=wrap_angle(w.yaw_rad + np.pi), speed_mps=0.0 - w.speed_mps)  # never -0.0
         kept = [doubt for doubt in agent.doubts if doubt.flag not in ("speed", "reversing")]
         agent = replace(agent, waypoints=w, doubts=(*kept, *motion_doubts(agent.category, w)))
     agent = replace(agent, quality={**agent.quality, "heading_confidence": round(confidence, 3)})
