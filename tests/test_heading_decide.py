@@ -58,6 +58,8 @@ def test_parked_cars_point_with_the_traffic_of_their_side(side, yaw):
     assert headings == [180, *[0, 180] * 3]
     assert min(a.quality["heading_confidence"] for a in agents) > 0.7
     assert not any(a.doubts for a in agents)
+    # Not -0.0, though some are turned round.
+    assert not any(np.signbit(a.waypoints.speed_mps).any() for a in agents[1:])
 
 
 def test_a_queue_on_the_own_lane_points_ahead():
