@@ -13,7 +13,7 @@ from test_size import T0_NS, measured, moved
 
 from log2sim.agents.candidate import AgentCandidate, Timeline
 from log2sim.agents.confidence.evidence import SIGNS, Evidence, evidence_of
-from log2sim.agents.confidence.rating import MAX_CONFIDENCE, MIN_CONFIDENCE, probability_of, rate_agents
+from log2sim.agents.confidence.rating import MAX_CONFIDENCE, MIN_CONFIDENCE, confidence_of, rate_agents
 from log2sim.agents.confidence.systematic import position_terms, speed_terms, yaw_terms
 from log2sim.agents.confidence.weights import POSITION_VARIANCE, SPEED_VARIANCE, WEIGHTS, YAW_VARIANCE
 from log2sim.agents.hypotheses import Part
@@ -57,7 +57,7 @@ def test_every_weight_has_the_sign_of_its_reason():
 def test_more_of_a_good_reason_never_lowers_a_confidence(values, name, more):
     weak = Evidence(**dict(zip(NAMES, values)))
     strong = replace(weak, **{name: getattr(weak, name) + (SIGNS[name] or np.sign(WEIGHTS[name])) * more})
-    assert MIN_CONFIDENCE <= probability_of(weak) <= probability_of(strong) <= MAX_CONFIDENCE
+    assert MIN_CONFIDENCE <= confidence_of(weak) <= confidence_of(strong) <= MAX_CONFIDENCE
 
 
 @pytest.mark.parametrize("make", [parked, driving])

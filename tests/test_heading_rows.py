@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from log2sim.agents.heading.rows import ALIKE_ACROSS, ALIKE_ALONG, find_rows, headings_of
-from log2sim.perception.late_fusion import probability
+from log2sim.log_odds import probability_of
 
 
 def rows_of(poses, lengths_m=None, stands=None):
@@ -55,12 +55,12 @@ def test_probabilities_are_those_of_all_cases_enumerated(seed):
     own, street, right = rng.normal(0, 2, n), rng.normal(0, 1.5, (2, n)), rng.normal()
     total, along = 0.0, np.zeros(n)
     for side, ways, turned in product(range(2), product([1, -1], repeat=len(rows)), product([1, -1], repeat=n)):
-        weight = probability(right if side == 0 else -right)
+        weight = probability_of(right if side == 0 else -right)
         for row, way in zip(rows, ways):
-            weight *= probability(way * np.mean(row.toward * street[side, row.members]))
+            weight *= probability_of(way * np.mean(row.toward * street[side, row.members]))
             for k, toward in zip(row.members, row.toward):
                 agrees = turned[k] * toward == way
-                weight *= (row.alike if agrees else 1 - row.alike) * probability(turned[k] * own[k])
+                weight *= (row.alike if agrees else 1 - row.alike) * probability_of(turned[k] * own[k])
         total += weight
         along += weight * (np.array(turned) == 1)
     np.testing.assert_allclose(headings_of(rows, own, street, right), along / total, atol=1e-12)

@@ -13,7 +13,7 @@ from log2sim.agents.plausibility.box_table import BoxTable
 from log2sim.agents.plausibility.dimensions import doubt_size
 from log2sim.agents.plausibility.evidence import image_height_share
 from log2sim.agents.plausibility.free_space import Ending, classify_rays, count_rays
-from log2sim.agents.plausibility.points import contradict, detection_rate, is_refuted, missing_nats
+from log2sim.agents.plausibility.points import contradict, is_refuted, missing_nats, usual_detection_rate
 from log2sim.agents.plausibility.recording import Recording
 from log2sim.agents.plausibility.structure import find_surface, structure_shares
 from log2sim.agents.plausibility.views import shown_in_images
@@ -248,8 +248,8 @@ def test_points_that_are_twice_as_high_as_the_image_box_are_not_those_of_the_obj
 
 def test_the_usual_rate_is_that_of_all_candidates():
     supports = [Support(shown_ticks=30, detected_ticks=30), Support(shown_ticks=10, detected_ticks=2), Support()]
-    assert detection_rate([replace(candidate(agent(5.0)), support=s) for s in supports]) == 0.8
-    assert detection_rate([]) == 0.0
+    assert usual_detection_rate([replace(candidate(agent(5.0)), support=s) for s in supports]) == 0.8
+    assert usual_detection_rate([]) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ import numpy as np
 
 from log2sim.agents.heading.outline import HEIGHT_CELLS, Outline, outline_of
 from log2sim.geometry import rotation_from_rpy
+from log2sim.log_odds import probability_of
 from log2sim.perception.box_fitting import rotate, subsample
 from log2sim.synth.lidar_models import LIDAR_MODELS
 from log2sim.synth.polytope_caster import cast_polytopes
@@ -128,7 +129,7 @@ def fit(rows: np.ndarray) -> np.ndarray:
     """Fit a logistic regression to rows of which all are right by Newton's method."""
     weights = np.zeros(rows.shape[1])
     for _ in range(25):
-        wrong = 1 / (1 + np.exp(rows @ weights))
+        wrong = probability_of(-rows @ weights)
         hessian = (rows * (wrong * (1 - wrong))[:, None]).T @ rows + RIDGE * np.eye(len(weights))
         weights += np.linalg.solve(hessian, rows.T @ wrong - RIDGE * weights)
     return weights
@@ -136,7 +137,7 @@ def fit(rows: np.ndarray) -> np.ndarray:
 
 def report(name: str, odds: np.ndarray) -> None:
     """Print the share that is right by the probability that the log-odds state."""
-    stated = 1 / (1 + np.exp(-np.abs(odds)))
+    stated = probability_of(np.abs(odds))
     print(f"{name}: {np.mean(odds > 0):.3f} of {len(odds)} right")
     for low, high in ((0.5, 0.7), (0.7, 0.9), (0.9, 0.97), (0.97, 1.01)):
         of = (stated >= low) & (stated < high)

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from log2sim.agents.box_votes import independent
 from log2sim.datatypes import GROUP_OF, Track
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.perception.late_fusion import logit, probability
+from log2sim.log_odds import probability_of
+from log2sim.perception.late_fusion import logit
 
 # Limits of `image_confidence`; a track whose size is unlikely for its category needs more evidence.
 MIN_TRACK_CONFIDENCE = 0.3
@@ -50,7 +51,8 @@ def image_confidence(track: Track) -> float:
     """Return the share of its ticks at which a track is detected in images, times the mean of the best scores there."""
     m = track.measurements
     weak = (m.score < MIN_COUNTED_SCORE) & (GROUP_OF[track.category] in WEAK_GROUPS)
-    m, weak = m.take(~(weak & np.isnan(m.box_yaw_rad))), weak[~(weak & np.isnan(m.box_yaw_rad))]
+    counted = ~(weak & np.isnan(m.box_yaw_rad))
+    m, weak = m.take(counted), weak[counted]
     in_image = (np.isnan(m.box_yaw_rad) | (m.camera != "")) & ~weak
     if not in_image.any():
         return 0.0
@@ -70,7 +72,7 @@ def sweep_confidence(track: Track) -> float:
     if not in_sweep.any():
         return 0.0
     log_odds = float(logit(m.score[in_sweep]).mean()) * independent(int(in_sweep.sum()))
-    return detection_rate(m.t_ns) * float(probability(np.array(log_odds)))
+    return detection_rate(m.t_ns) * float(probability_of(log_odds))
 
 
 def detection_rate(t_ns: NDArray[np.int64]) -> float:

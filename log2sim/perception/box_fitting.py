@@ -153,7 +153,7 @@ def sample_surface(range_m: Array, max_count: int) -> NDArray[np.intp]:
 
     Notes
     -----
-    A ray stands for a surface that grows with the square of the distance. Of every so-manieth point hardly one would be on
+    A ray stands for a surface that grows with the square of the distance. Of every n-th point hardly one would be on
     the far end of a long vehicle beside the sensor.
     """
     if len(range_m) <= max_count:

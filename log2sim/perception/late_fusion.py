@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, Measurements
 from log2sim.geometry import Array, box_iou
+from log2sim.log_odds import log_odds_of, probability_of
 from log2sim.perception.lidar.projection import View, project_boxes_in_view
 
 # Boxes that overlap less are different objects.
@@ -58,7 +59,7 @@ class PairWeights:
     def score(self, image: Array, sweep: Array, iou: Array, range_m: Array) -> Array:
         """Return the probability (M,) that pairs are objects."""
         log_odds = self.bias + self.image * logit(image) + self.sweep * logit(sweep) + self.iou * iou
-        return probability(log_odds + self.range_10m * range_m / 10.0)
+        return probability_of(log_odds + self.range_10m * range_m / 10.0)
 
 
 # Independent evidence: two scores of 0.5 with an IoU of 0.7 are one of 0.75, as by 1 - (1 - a) (1 - b).
@@ -171,15 +172,9 @@ def _doubted(rows: Measurements) -> Measurements:
 
 def if_missed(score: Array, recall: Array) -> Array:
     """Return the probability (M,) of objects that another detector missed: the odds of the score times 1 - recall."""
-    return np.where(recall > 0, probability(logit(score) + np.log1p(-recall)), score)
+    return np.where(recall > 0, probability_of(logit(score) + np.log1p(-recall)), score)
 
 
 def logit(p: Array) -> Array:
     """Return the log-odds (M,) of scores, limited to those that are believed."""
-    p = np.clip(p, MIN_SCORE, MAX_SCORE)
-    return np.asarray(np.log(p / (1 - p)))
-
-
-def probability(log_odds: Array) -> Array:
-    """Return the probability (M,) of log-odds."""
-    return np.asarray(1.0 / (1.0 + np.exp(-log_odds)))
+    return log_odds_of(np.clip(p, MIN_SCORE, MAX_SCORE))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -11,8 +11,9 @@ from log2sim.agents.candidate import AgentCandidate, Timeline
 from log2sim.agents.confidence.evidence import Evidence, evidence_of, has_boxes
 from log2sim.agents.confidence.systematic import with_systematic_errors
 from log2sim.agents.confidence.weights import BIAS, WEIGHTS
+from log2sim.log_odds import probability_of
 
-# Nothing is certain: of the evidence one part is that none of the reasons to be wrong is unknown.
+# Never 0 or 1: an agent may be right or wrong for a reason that no evidence shows.
 MIN_CONFIDENCE, MAX_CONFIDENCE = 0.01, 0.99
 
 
@@ -22,7 +23,7 @@ def rate_agents(candidates: Sequence[AgentCandidate], timeline: Timeline) -> lis
     return [_rated(candidate, timeline, searched=searched) for candidate in candidates]
 
 
-def probability_of(evidence: Evidence, weights: Mapping[str, float] = WEIGHTS, bias: float = BIAS) -> float:
+def confidence_of(evidence: Evidence) -> float:
     """Return the probability that an agent with this evidence is right.
 
     Notes
@@ -31,12 +32,12 @@ def probability_of(evidence: Evidence, weights: Mapping[str, float] = WEIGHTS, b
     wrong speed, motion, direction or size. Logistic regression; each weight has the sign of its reason
     (`evidence.SIGNS`).
     """
-    log_odds = bias + sum(weights[name] * value for name, value in asdict(evidence).items())
-    return float(np.clip(1 / (1 + np.exp(-log_odds)), MIN_CONFIDENCE, MAX_CONFIDENCE))
+    log_odds = BIAS + sum(WEIGHTS[name] * value for name, value in asdict(evidence).items())
+    return float(np.clip(probability_of(log_odds), MIN_CONFIDENCE, MAX_CONFIDENCE))
 
 
 def _rated(candidate: AgentCandidate, timeline: Timeline, *, searched: bool) -> AgentCandidate:
     evidence = evidence_of(candidate, timeline, searched=searched)
-    confidence = probability_of(evidence)
+    confidence = confidence_of(evidence)
     waypoints = with_systematic_errors(candidate, evidence, confidence, timeline)
     return replace(candidate, agent=replace(candidate.agent, confidence=confidence, waypoints=waypoints))

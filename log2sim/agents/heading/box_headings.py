@@ -7,6 +7,7 @@ import numpy as np
 from log2sim.agents.box_votes import independent
 from log2sim.datatypes import BoxEvidence
 from log2sim.geometry import Array
+from log2sim.log_odds import log_odds_of
 
 # A probability nearer to 1 is not believed: networks are surer than right.
 MAX_HEADING_SCORE = 0.99
@@ -27,5 +28,5 @@ def heading_log_odds(m: BoxEvidence, yaw_rad: Array | float) -> float:
     if len(rows) == 0:
         return 0.0
     p = np.clip(m.heading_score[rows], 0.5, MAX_HEADING_SCORE)
-    votes = np.sign(along) * np.log(p / (1 - p))
+    votes = np.sign(along) * log_odds_of(p)
     return float(votes.mean()) * independent(len(rows))

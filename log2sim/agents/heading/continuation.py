@@ -8,7 +8,7 @@ import numpy as np
 
 from log2sim.datatypes import Waypoints
 from log2sim.geometry import Array
-from log2sim.perception.late_fusion import probability
+from log2sim.log_odds import log_odds_of, probability_of
 
 # A vehicle whose track is lost is found again within this time, where it was; another one rarely takes its place that soon.
 MAX_PAUSE_S, MAX_APART_M, MAX_TURNED_RAD = 3.0, 2.0, 0.3
@@ -32,5 +32,5 @@ def continued_log_odds(waypoints: Sequence[Waypoints], own: Array) -> Array:
     toward = np.where(np.cos(gap[..., 3]) > 0, 1.0, -1.0) * follows
     links = toward + toward.T
     # What is known of the other counts as far as it is the same vehicle.
-    along = 0.5 + SAME_VEHICLE * (probability(own) - 0.5)
-    return np.asarray(own + links @ np.log(along / (1 - along)))
+    along = 0.5 + SAME_VEHICLE * (probability_of(own) - 0.5)
+    return np.asarray(own + links @ log_odds_of(along))

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
+from log2sim.log_odds import probability_of
 from log2sim.perception.box_fitting import rotate
-from log2sim.perception.late_fusion import probability
 
 # Neighbors of one row: axes are parallel within three standard deviations of a parked car's yaw; bumper to bumper with room for one
 # more car at most and in one line, or side by side in places 2.3 to 3 m wide; lanes are wider.
@@ -55,8 +55,8 @@ class Row:
             Probability that each member points along its yaw, given all.
         """
         # Everything below is in the direction of the first member: first column for it, second against it.
-        known = probability(np.outer(self.toward * own[self.members], [1.0, -1.0]))
-        way = probability(np.mean(self.toward * street[self.members]) * np.array([1.0, -1.0]))
+        known = probability_of(np.outer(self.toward * own[self.members], [1.0, -1.0]))
+        way = probability_of(np.mean(self.toward * street[self.members]) * np.array([1.0, -1.0]))
         # Likelihood of each member, by the direction of the row.
         each = self.alike * known + (1 - self.alike) * known[:, ::-1]
         # Directions that all members together exclude would underflow.
@@ -120,4 +120,4 @@ def headings_of(rows: Sequence[Row], own: Array, street: Array, right: float) ->
         for row in rows:
             log_likelihood, chance[side, row.members] = row.joint(own, street[side])
             total[side] += log_likelihood
-    return np.asarray(probability(total[0] - total[1]) * chance[0] + probability(total[1] - total[0]) * chance[1])
+    return np.asarray(probability_of(total[0] - total[1]) * chance[0] + probability_of(total[1] - total[0]) * chance[1])

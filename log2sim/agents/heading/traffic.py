@@ -9,6 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from log2sim.geometry import Array
+from log2sim.log_odds import log_odds_of
 
 # Vehicles that meet on one road pass each other within the road's width, and farther to the side than vehicles of one lane.
 ROAD_M, LANE_M = 20.0, 1.8
@@ -53,7 +54,7 @@ def side_log_odds(paths: Sequence[Array]) -> float:
         if meets.any():
             votes += np.sign(np.median(left[meets]))
     evidence = np.clip(MEETING_LOG_ODDS * votes, -MAX_SIDE_LOG_ODDS, MAX_SIDE_LOG_ODDS)
-    return float(np.log(USUALLY_RIGHT / (1 - USUALLY_RIGHT)) + evidence)
+    return float(log_odds_of(USUALLY_RIGHT) + evidence)
 
 
 def street_log_odds(pose: Array, paths: Sequence[Array], *, keeps_right: bool) -> float:
@@ -77,7 +78,7 @@ def street_log_odds(pose: Array, paths: Sequence[Array], *, keeps_right: bool) -
         along = _direction_at(passing.left_m if keeps_right else -passing.left_m)
         chance = 0.5 + passing.belongs * (along - 0.5)
         sign = 1.0 if np.cos(passing.heading_rad - pose[2]) > 0 else -1.0
-        odds.append(sign * float(np.log(chance / (1 - chance))))
+        odds.append(sign * float(log_odds_of(chance)))
         weights.append(passing.weight)
     total = float(np.sum(weights))
     return float(np.dot(weights, odds) / total) if total > 0 else 0.0

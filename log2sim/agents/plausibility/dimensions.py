@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from log2sim.agents.size import WHOLE_SIDE_SIGMA_M
+from log2sim.agents.size import MAX_ROAD_WIDTH_M, WHOLE_SIDE_SIGMA_M
 from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, Agent, Doubt
 
-# Directive 96/53/EC, Annex I, without mirrors; 2.6 m in North America too (23 CFR 658.15).
-MAX_VEHICLE_WIDTH_M = 2.6
 # Rounding.
 SAME_M = 0.005
 
@@ -19,10 +17,8 @@ def doubt_size(agent: Agent) -> list[Doubt]:
     length_m, width_m, _ = agent.size_m
     if GROUP_OF[agent.category] != "vehicle":
         return []
-    if width_m > MAX_VEHICLE_WIDTH_M + WHOLE_SIDE_SIGMA_M:
-        return [
-            Doubt("unlikely_size", f"is {width_m:.1f} m wide, road vehicles have at most {MAX_VEHICLE_WIDTH_M:.1f} m")
-        ]
+    if width_m > MAX_ROAD_WIDTH_M + WHOLE_SIDE_SIGMA_M:
+        return [Doubt("unlikely_size", f"is {width_m:.1f} m wide, road vehicles have at most {MAX_ROAD_WIDTH_M:.1f} m")]
     longest_m = MAX_SIZE_M[agent.category][0]
     if length_m >= longest_m - SAME_M:
         return [Doubt("unlikely_size", f"is longer than the {longest_m:.1f} m of the longest {agent.category}")]

@@ -13,7 +13,7 @@ from log2sim.agents.plausibility.box_table import BoxTable
 from log2sim.agents.plausibility.free_space import RayCounts, count_rays
 from log2sim.agents.plausibility.recording import Recording
 from log2sim.agents.plausibility.structure import structure_shares
-from log2sim.agents.plausibility.views import shown_in_images
+from log2sim.agents.plausibility.views import MAX_BASELINE_M, shown_in_images
 from log2sim.agents.support import Support
 from log2sim.datatypes import Measurements, Obstacles
 from log2sim.geometry import Array
@@ -21,7 +21,7 @@ from log2sim.geometry import Array
 # A detection is never surer than this: 3 nats.
 MAX_SCORE = 0.95
 # Fewer rays at a tick say nothing.
-MIN_RAYS = 8
+MIN_TICK_RAYS = 8
 # Nats of the rays of a tick: all of them end in what is there; more are not believed, since rays of one tick err alike.
 RAY_NATS = 2.0
 # Nats of a tick of a motion that no road user has.
@@ -30,8 +30,6 @@ MOTION_NATS = 1.0
 MIN_LOOKING_RAYS = 30
 # Fewer image boxes with points may each be wrong.
 MIN_HEIGHTS = 3
-# Farther apart, a camera sees what is hidden from a LiDAR.
-SAME_VIEW_M = 3.0
 
 
 def weigh(candidates: Sequence[AgentCandidate], recording: Recording) -> list[AgentCandidate]:
@@ -48,7 +46,9 @@ def weigh(candidates: Sequence[AgentCandidate], recording: Recording) -> list[Ag
     solid, whole = count_rays(agents, clouds, timeline)
     in_structure, beside = structure_shares(agents, clouds, timeline)
     met = whole.inside + whole.through
-    shown = shown_in_images(BoxTable.of(agents, recording.t_s), recording) & (met >= whole.before) & (met >= MIN_RAYS)
+    shown = (
+        shown_in_images(BoxTable.of(agents, recording.t_s), recording) & (met >= whole.before) & (met >= MIN_TICK_RAYS)
+    )
     weighed = []
     for k, candidate in enumerate(candidates):
         looked = whole.before[k].sum() + met[k].sum() >= MIN_LOOKING_RAYS
@@ -94,7 +94,7 @@ def _same_view(candidate: AgentCandidate, clouds: Sequence[Obstacles | None]) ->
     for tick, sensor in zip(track.tick.tolist(), track.measurements.sensor_m):
         cloud = clouds[tick]
         if cloud is not None:
-            return bool(np.linalg.norm(sensor - cloud.origin - cloud.sensor) <= SAME_VIEW_M)
+            return bool(np.linalg.norm(sensor - cloud.origin - cloud.sensor) <= MAX_BASELINE_M)
     return False
 
 
@@ -102,7 +102,7 @@ def _nats(candidate: AgentCandidate, inside: NDArray[np.int64], through: NDArray
     """Sum the evidence for one candidate, given its rays (T,)."""
     detections = -np.log1p(-MAX_SCORE * candidate.track.measurements.score).sum()
     met = inside + through
-    decided = met >= MIN_RAYS
+    decided = met >= MIN_TICK_RAYS
     rays: Array = RAY_NATS * (1 - 2 * through[decided] / met[decided])
     impossible = MOTION_NATS * len(candidate.agent.waypoints) if candidate.agent.doubts else 0.0
     return float(detections + rays.sum() - impossible)

@@ -19,8 +19,9 @@ from log2sim.agents.plausibility.box_table import BoxTable
 from log2sim.datatypes import Agent, Obstacles, Rays
 from log2sim.geometry import NS_PER_S, Array
 
-# A ray that is to hit an agent has to go through so much of it, at most this share of its width.
-MIN_THROUGH_M, MAX_THROUGH_SHARE = 0.5, 0.4
+# A ray is toward an agent where it runs through so much of its box, or through this share of its width if that is less: rays
+# that cut a corner may miss the rounded body.
+MIN_CHORD_M, MIN_CHORD_SHARE = 0.5, 0.4
 # Boxes are taken smaller on each side by their error, at most by this share of their size. A ray that ends within twice that
 # distance of the smaller box, or above or below it, ends at it.
 INSET_M, MAX_INSET_SHARE = 0.3, 0.25
@@ -34,16 +35,16 @@ MAX_LAG_S = 0.1
 Floats = NDArray[np.floating[Any]]
 
 
-class Part(NamedTuple):
+class Layer(NamedTuple):
     """A layer of a box, as shares of its height."""
 
     low: float
     high: float
 
 
-SOLID = Part(0.25, 0.55)
+SOLID = Layer(0.25, 0.55)
 """The part of a vehicle that no ray passes: above the gap below its floor and below its windows."""
-WHOLE = Part(0.1, 1.0)
+WHOLE = Layer(0.1, 1.0)
 """All of a box that is above the errors of the ground."""
 
 
@@ -114,8 +115,8 @@ def _count_at(boxes: BoxTable, tick: int, origin: Array, rays: Rays) -> NDArray[
         relative = start[ray] - center[box]
         relative[:, :2] -= velocity[box] * rays.t_s[ray, None]
         yaw, sizes = boxes.yaw_rad[agent[box], tick], size[box]
-        for k, part in enumerate((SOLID, WHOLE)):
-            endings = classify_rays(relative, to[ray], yaw, sizes, part)
+        for k, layer in enumerate((SOLID, WHOLE)):
+            endings = classify_rays(relative, to[ray], yaw, sizes, layer)
             for ending in (Ending.INSIDE, Ending.THROUGH, Ending.BEFORE):
                 counts[k, ending] += np.bincount(agent[box[endings == ending]], minlength=counts.shape[2])
     return counts
@@ -157,13 +158,13 @@ def _near_rays(
     # One of every `step` rays, not always the same laser of the LiDAR.
     ray = order[(first[box] + rank * step[box] + rank * SCATTER % step[box]) % len(order)]
     z = to_center[:, 2:] + size_m[:, 2:] * (np.array(WHOLE) - 0.5)
-    near, far = np.maximum(distance - reach, MIN_THROUGH_M)[:, None], (distance + reach)[:, None]
+    near, far = np.maximum(distance - reach, MIN_CHORD_M)[:, None], (distance + reach)[:, None]
     slopes = np.hstack([z / near, z / far])
     level = (slope[ray] >= slopes.min(axis=1)[box]) & (slope[ray] <= slopes.max(axis=1)[box])
     return box[level], ray[level]
 
 
-def classify_rays(start: Floats, to: Floats, yaw_rad: Array, size_m: Array, part: Part = SOLID) -> NDArray[np.int64]:
+def classify_rays(start: Floats, to: Floats, yaw_rad: Array, size_m: Array, layer: Layer = SOLID) -> NDArray[np.int64]:
     """Tell for each of n rays and its box where the ray ends, as `Ending`.
 
     Parameters
@@ -184,12 +185,12 @@ def classify_rays(start: Floats, to: Floats, yaw_rad: Array, size_m: Array, part
     origin = np.stack([c * start[:, 0] + s * start[:, 1], c * start[:, 1] - s * start[:, 0], start[:, 2]], axis=1)
     along = np.stack([c * to[:, 0] + s * to[:, 1], c * to[:, 1] - s * to[:, 0], to[:, 2]], axis=1)
     half = size_m[:, :2] / 2 - np.minimum(INSET_M, MAX_INSET_SHARE * size_m[:, :2])
-    low = np.column_stack([-half, (part.low - 0.5) * size_m[:, 2]])
-    high = np.column_stack([half, (part.high - 0.5) * size_m[:, 2]])
+    low = np.column_stack([-half, (layer.low - 0.5) * size_m[:, 2]])
+    high = np.column_stack([half, (layer.high - 0.5) * size_m[:, 2]])
     enter, leave = _span(origin, along, low, high)
     arrive, _ = _span(origin[:, :2], along[:, :2], -half - MARGIN_M, half + MARGIN_M)
     length = np.linalg.norm(along, axis=1)
-    meets = (leave - enter) * length >= np.minimum(MIN_THROUGH_M, MAX_THROUGH_SHARE * size_m[:, 1])
+    meets = (leave - enter) * length >= np.minimum(MIN_CHORD_M, MIN_CHORD_SHARE * size_m[:, 1])
     ending = np.where(meets & (enter > 0), int(Ending.INSIDE), int(Ending.ELSEWHERE))
     ending[(ending == Ending.INSIDE) & (arrive > 1)] = Ending.BEFORE
     ending[(ending == Ending.INSIDE) & ((1 - leave) * length > MARGIN_M)] = Ending.THROUGH

@@ -10,7 +10,7 @@ from log2sim.agents.naming import name_agents
 from log2sim.agents.plausibility.conflicts import conflict_doubts, resolve_conflicts
 from log2sim.agents.plausibility.dimensions import doubt_size
 from log2sim.agents.plausibility.evidence import weigh
-from log2sim.agents.plausibility.points import contradict, detection_rate, is_refuted
+from log2sim.agents.plausibility.points import contradict, is_refuted, usual_detection_rate
 from log2sim.agents.plausibility.recording import Recording
 from log2sim.datatypes import Agent
 
@@ -28,7 +28,7 @@ def judge(candidates: Sequence[AgentCandidate], ego: Agent | None, recording: Re
     """
     t_s = recording.t_s
     weighed = weigh(confirm(candidates), recording)
-    usual_rate = detection_rate(weighed)
+    usual_rate = usual_detection_rate(weighed)
     apart = suppress_duplicates([c for c in weighed if not is_refuted(c, usual_rate)], ego)
     apart = resolve_conflicts(apart, ego, t_s)
     # A doubt may name another agent.

@@ -35,7 +35,7 @@ MIN_IMAGE_HEIGHT_SHARE = 0.5
 REFUTED_NATS = 3.0
 
 
-def detection_rate(candidates: Sequence[AgentCandidate]) -> float:
+def usual_detection_rate(candidates: Sequence[AgentCandidate]) -> float:
     """Return the share of the ticks at which a searched image shows a candidate well and it is detected, over all of them."""
     supports = [c.support for c in candidates if c.support is not None]
     shown = sum(s.shown_ticks for s in supports)
@@ -48,7 +48,7 @@ def is_refuted(candidate: AgentCandidate, usual_rate: float) -> bool:
     Parameters
     ----------
     usual_rate : float
-        Of `detection_rate`.
+        Of `usual_detection_rate`.
     """
     s = candidate.support
     if s is None:

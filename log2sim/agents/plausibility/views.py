@@ -13,7 +13,7 @@ from log2sim.geometry import Array, Camera, apply, inverse, project
 MIN_HEIGHT_PX = 32.0
 # Share of the width of an image at either side in which an object is cut off.
 BORDER_SHARE = 0.05
-# From a camera farther from the LiDAR something else hides an object.
+# From a camera farther from the LiDAR other things hide an object than from the LiDAR.
 MAX_BASELINE_M = 3.0
 
 
