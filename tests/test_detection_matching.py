@@ -18,7 +18,7 @@ from log2sim.evaluation.detection import (
     operating_point,
     precision_recall,
 )
-from log2sim.geometry import box_corners_bev, rectangle_iou, rectangle_overlap, upright_box_iou
+from log2sim.geometry import box_corners_bev, overlap_of_smaller, rectangle_iou, rectangle_overlap, upright_box_iou
 
 CAR = [0.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0]
 IOU = Criterion("iou_3d", 0.5)
@@ -76,6 +76,7 @@ def test_rectangles_without_area_or_with_a_nan_share_nothing():
     whole = np.array([[0.0, 0, 4, 2, 0.1]])
     for bad in (flat, unknown, -whole):
         assert rectangle_iou(whole, bad).tolist() == [0.0]
+        assert overlap_of_smaller(whole, bad).tolist() == [0.0]
     assert rectangle_iou(whole, whole)[0] == pytest.approx(1.0)
     assert upright_box_iou([CAR], [CAR])[0] == pytest.approx(1.0)
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from log2sim.agents.candidate import AgentCandidate
 from log2sim.datatypes import GROUP_OF, Agent
-from log2sim.geometry import Array, rectangle_overlap
+from log2sim.geometry import Array, overlap_of_smaller
 
 # Two agents whose overlap exceeds this share of the smaller box for most of the time are duplicates. Pedestrians are compared
 # by distance, since the boxes of two people who stand close together overlap.
@@ -59,4 +59,4 @@ def _shared_areas(a: Agent, b: Agent, t_s: Array) -> Array:
         s = agent.at(t_s)
         length, width = (np.full(len(t_s), v) for v in agent.size_m[:2])
         rectangles.append(np.column_stack([s.x_m, s.y_m, length, width, s.yaw_rad]))
-    return rectangle_overlap(*rectangles) / min(a.size_m[0] * a.size_m[1], b.size_m[0] * b.size_m[1])
+    return overlap_of_smaller(*rectangles)

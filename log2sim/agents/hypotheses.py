@@ -83,7 +83,7 @@ def explain_track(track: Track) -> list[Part]:
         cut = _best_cut(positions, moving, _expected_motion(track))
         if cut is not None:
             first = rows[cut]
-            parts = [p for rows in (slice(first), slice(first, None)) for p in explain_track(_taken(track, rows))]
+            parts = [p for part in (slice(first), slice(first, None)) for p in explain_track(_taken(track, part))]
             return [p for p in parts if p.static or len(p.track) >= MIN_MOVING_ROWS]
     return [Part(track, static=False)]
 
@@ -198,9 +198,6 @@ def _best_cut(p: Positions, whole: Evidence, motion: MotionPriorSigmas) -> int |
     cuts = np.unique(
         np.linspace(MIN_ROWS, len(p) - MIN_ROWS, min(len(p) - 2 * MIN_ROWS + 1, MAX_SPLITS)).astype(np.intp)
     )
-    cuts = cuts[(cuts >= MIN_ROWS) & (cuts <= len(p) - MIN_ROWS)]
-    if len(cuts) == 0:
-        return None
     logs = [evidence_of(p.take(slice(k)), motion).log + evidence_of(p.take(slice(k, None)), motion).log for k in cuts]
     best = int(np.argmax(logs))
     return int(cuts[best]) if logs[best] + NEXT_OBJECT_LOG > whole.log + MIN_LOG_ODDS else None

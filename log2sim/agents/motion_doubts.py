@@ -7,10 +7,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.agents.spans import spans_of
 from log2sim.datatypes import GROUP_OF, MAX_SPEED_MPS, BoxEvidence, Doubt, Waypoints
 from log2sim.geometry import Array, wrap_angle
 
-# Of slow vehicles one in five reverses, at 3 m/s one in a thousand (`FORWARD_LOG_ODDS` of moving agents); out of a driveway or
+# Of slow vehicles one in five reverses, at 3 m/s one in a thousand (`heading.course.forward_log_odds`); out of a driveway or
 # to a better parking space it is some car lengths.
 MAX_REVERSING_MPS, MAX_REVERSING_M = 3.0, 20.0
 # A speed counts as beyond a limit where it is by as many of its own standard deviations.
@@ -103,12 +104,6 @@ def _doubts(
 ) -> tuple[Doubt, ...]:
     """Make a doubt of each span in which something holds (T,)."""
     return tuple(Doubt(flag, words(k), float(w.t_s[k[0]]), float(w.t_s[k[-1]])) for k in spans_of(holds))
-
-
-def spans_of(mask: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
-    """Return the rows of each run of True in a mask (T,)."""
-    rows = np.flatnonzero(mask)
-    return np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []
 
 
 def _words_of_reversing(w: Waypoints, k: NDArray[np.intp]) -> str:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from log2sim.agents.candidate import REAR_AXLE_SHARE, AgentCandidate, Timeline, candidate_of
 from log2sim.agents.confirmation import SAME_MOMENT_S
 from log2sim.agents.heading.box_headings import heading_log_odds
+from log2sim.agents.heading.course import forward_log_odds
 from log2sim.agents.lidar_tracking import BoxState, LidarMatch, track_with_lidar
 from log2sim.agents.motion_doubts import jump_doubts, motion_doubts, sideways_doubts
 from log2sim.agents.size import TrackGeometry, moving_geometry
@@ -34,9 +35,8 @@ FITTED_CENTER_SIGMA_M = {"vehicle": 0.12, "two_wheeler": 0.1, "pedestrian": 0.08
 PRELIMINARY_SMOOTHINGS = 2
 # A shorter displacement does not give a course.
 MIN_COURSE_DISTANCE_M = 0.3
-# Log-odds that an object moves forward: of slow ones, one in five reverses, at 3 m/s one in a thousand. A displacement shorter
-# than this may be noise.
-FORWARD_LOG_ODDS, FORWARD_LOG_ODDS_PER_MPS, CERTAIN_COURSE_M = 1.4, 2.0, 1.0
+# A displacement shorter than this may be noise.
+CERTAIN_COURSE_M = 1.0
 # Standard deviation of the yaw of a single measurement.
 BOX_YAW_SIGMA_RAD = 0.2
 # Heights of the ground under a track are smoothed by a median over this many measurements on either side.
@@ -131,9 +131,8 @@ def _headings(path: SmoothedTrack, group: str) -> Array:
 def _first_heading(track: Track) -> tuple[float | None, float]:
     """Return the course from the first to the last quarter of a track, or the yaw of its first box if that is short.
 
-    With its standard deviation, which half a turn is no part of.
-
-    Where the boxes of a 3D detector say that a slow object moves backward, it is the opposite of the course.
+    Where the boxes of a 3D detector say that a slow object moves backward, it is the opposite of the course. The second value
+    is its standard deviation in rad, given that front and back are not swapped.
     """
     m, count = track.measurements, max(len(track) // 4, 1)
     displacement = np.median(m.center_m[-count:, :2], axis=0) - np.median(m.center_m[:count, :2], axis=0)
@@ -141,8 +140,7 @@ def _first_heading(track: Track) -> tuple[float | None, float]:
     if moved_m >= MIN_COURSE_DISTANCE_M:
         course = float(np.arctan2(displacement[1], displacement[0]))
         speed_mps = moved_m / max(float(m.t_ns[-1] - m.t_ns[0]) / NS_PER_S, 1e-3)
-        forward = FORWARD_LOG_ODDS + FORWARD_LOG_ODDS_PER_MPS * speed_mps
-        forward = forward * min(moved_m / CERTAIN_COURSE_M, 1.0) + heading_log_odds(m, course)
+        forward = forward_log_odds(speed_mps) * min(moved_m / CERTAIN_COURSE_M, 1.0) + heading_log_odds(m, course)
         sigma = float(np.arctan2(CENTER_SIGMA_M[GROUP_OF[track.category]], moved_m))
         return (course if forward >= 0 else float(wrap_angle(course + np.pi))), sigma
     yaws = m.yaw_rad[np.isfinite(m.yaw_rad)]

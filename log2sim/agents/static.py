@@ -19,10 +19,43 @@ from log2sim.geometry import NS_PER_S, Array, wrap_angle
 from log2sim.perception.box_fitting import rotate
 from log2sim.tracking.motion import CENTER_SIGMA_M
 
-# Standard deviations of a yaw, up to half a turn: of the box of one tick, and of any.
+# Standard deviations of a yaw known up to half a turn: of the box of one tick, and the least of any.
 BOX_YAW_SIGMA_RAD, MIN_YAW_SIGMA_RAD = 0.1, 0.005
-# Nothing that was seen to stand goes faster, however short it was seen.
+# What seems to stand is not faster than this, standard deviation, however short it was seen.
 MAX_SPEED_SIGMA_MPS = 2.0
+
+
+def static_candidate(part: Part, obstacles: Sequence[Obstacles | None], timeline: Timeline) -> AgentCandidate:
+    """Make an agent with one pose, at the ticks of its track and wherever LiDAR points match its box.
+
+    Its yaw is known up to half a turn.
+    """
+    track, geometry = part.track, _geometry_of(part)
+    xy, z = geometry.xy_m[0], float(np.median(geometry.z_m))
+    yaw = 0.0 if geometry.yaw_rad is None else float(np.nan_to_num(geometry.yaw_rad))
+    start_ns = int(timeline.t_ns[track.tick[0]])
+    box = BoxState(start_ns, xy, np.zeros(2), yaw, geometry.size_m, z - geometry.size_m[2] / 2)
+    others = np.setdiff1d(np.arange(len(timeline.t_ns)), track.tick).tolist()
+    matches = track_with_lidar(obstacles, others, timeline.t_ns, box)
+    observed = np.union1d(track.tick, np.array([m.tick for m in matches], dtype=np.int64))
+    life = np.unique(observed[[0, -1]])
+    n = len(life)
+    sigma = float(np.sqrt(np.trace(np.median(geometry.covariance, axis=0)) / 2))
+    waypoints = Waypoints(
+        t_s=timeline.seconds(timeline.t_ns[life]),
+        x_m=np.full(n, xy[0]),
+        y_m=np.full(n, xy[1]),
+        z_m=np.full(n, z),
+        yaw_rad=np.full(n, yaw),
+        speed_mps=np.zeros(n),
+        observed=np.ones(n, dtype=bool),
+        sigma_xy_m=np.full(n, sigma),
+        sigma_yaw_rad=np.full(n, yaw_sigma(track.measurements, geometry)),
+        sigma_speed_mps=np.full(n, standing_speed_sigma(track.measurements, CENTER_SIGMA_M[GROUP_OF[track.category]])),
+    )
+    share = len(observed) / (observed[-1] - observed[0] + 1)
+    quality = {"lidar_only": len(matches), "observed_share": round(float(share), 3)}
+    return candidate_of(track, geometry, waypoints, quality, static=True)
 
 
 def _geometry_of(part: Part) -> TrackGeometry:
@@ -60,7 +93,7 @@ def standing_speed_sigma(m: Measurements, sigma_m: float) -> float:
 
 
 def yaw_sigma(m: BoxEvidence, geometry: TrackGeometry) -> float:
-    """Return the standard deviation in rad of the yaw of a track that stands; half a turn is no part of it.
+    """Return the standard deviation in rad of the yaw of a track that stands, given that front and back are not swapped.
 
     Notes
     -----
@@ -83,36 +116,3 @@ def yaw_sigma(m: BoxEvidence, geometry: TrackGeometry) -> float:
     off_m = float(np.median(np.minimum(np.abs(xy - low), np.abs(xy - high)).min(axis=1)))
     sigma = np.arctan2(off_m, float((high - low).max()))
     return float(min(max(sigma, MIN_YAW_SIGMA_RAD), UNKNOWN_YAW_RAD))
-
-
-def static_candidate(part: Part, obstacles: Sequence[Obstacles | None], timeline: Timeline) -> AgentCandidate:
-    """Make an agent with one pose, at the ticks of its track and wherever LiDAR points match its box.
-
-    Its yaw is known up to half a turn.
-    """
-    track, geometry = part.track, _geometry_of(part)
-    xy, z = geometry.xy_m[0], float(np.median(geometry.z_m))
-    yaw = 0.0 if geometry.yaw_rad is None else float(np.nan_to_num(geometry.yaw_rad))
-    start_ns = int(timeline.t_ns[track.tick[0]])
-    box = BoxState(start_ns, xy, np.zeros(2), yaw, geometry.size_m, z - geometry.size_m[2] / 2)
-    others = np.setdiff1d(np.arange(len(timeline.t_ns)), track.tick).tolist()
-    matches = track_with_lidar(obstacles, others, timeline.t_ns, box)
-    observed = np.union1d(track.tick, np.array([m.tick for m in matches], dtype=np.int64))
-    life = np.unique(observed[[0, -1]])
-    n = len(life)
-    sigma = float(np.sqrt(np.trace(np.median(geometry.covariance, axis=0)) / 2))
-    waypoints = Waypoints(
-        t_s=timeline.seconds(timeline.t_ns[life]),
-        x_m=np.full(n, xy[0]),
-        y_m=np.full(n, xy[1]),
-        z_m=np.full(n, z),
-        yaw_rad=np.full(n, yaw),
-        speed_mps=np.zeros(n),
-        observed=np.ones(n, dtype=bool),
-        sigma_xy_m=np.full(n, sigma),
-        sigma_yaw_rad=np.full(n, yaw_sigma(track.measurements, geometry)),
-        sigma_speed_mps=np.full(n, standing_speed_sigma(track.measurements, CENTER_SIGMA_M[GROUP_OF[track.category]])),
-    )
-    share = len(observed) / (observed[-1] - observed[0] + 1)
-    quality = {"lidar_only": len(matches), "observed_share": round(float(share), 3)}
-    return candidate_of(track, geometry, waypoints, quality, static=True)

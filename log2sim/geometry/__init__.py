@@ -24,13 +24,12 @@ from log2sim.geometry.homography import apply_homography, ground_homography, hom
 from log2sim.geometry.overlap import (
     bev_iou,
     overlap_area,
-    overlap_of_smaller,
     polygon_area,
     rectangles_overlap,
     separating_axes,
 )
 from log2sim.geometry.poses import PoseTrack
-from log2sim.geometry.rectangles import rectangle_iou, rectangle_overlap, upright_box_iou
+from log2sim.geometry.rectangles import overlap_of_smaller, rectangle_iou, rectangle_overlap, upright_box_iou
 from log2sim.geometry.rolling_shutter import line_time_s, project_moving
 from log2sim.geometry.stamps import NS_PER_S, nearest_index, period_of
 from log2sim.geometry.transforms import (

@@ -48,13 +48,6 @@ def bev_iou(a_m: ArrayLike, b_m: ArrayLike) -> Array:
     return np.asarray(np.divide(shared, union, out=np.zeros_like(shared), where=union > 0))
 
 
-def overlap_of_smaller(a_m: ArrayLike, b_m: ArrayLike) -> Array:
-    """Compute the shared area (...) as a fraction of the smaller polygon's, pairs as for `overlap_area`; 0 without area."""
-    shared = overlap_area(a_m, b_m)
-    smaller = np.asarray(np.minimum(polygon_area(a_m), polygon_area(b_m)))
-    return np.asarray(np.divide(shared, smaller, out=np.zeros_like(shared), where=smaller > 0))
-
-
 def polygon_area(corners_m: ArrayLike) -> Array:
     """Compute the area (...) of simple polygons (..., K, 2) by the shoelace formula about their first corners."""
     corners = np.asarray(corners_m, dtype=np.float64)

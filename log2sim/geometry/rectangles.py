@@ -44,6 +44,15 @@ def rectangle_iou(a: ArrayLike, b: ArrayLike) -> Array:
     return _ratio(shared, a[:, 2] * a[:, 3] + b[:, 2] * b[:, 3] - shared)
 
 
+def overlap_of_smaller(a: ArrayLike, b: ArrayLike) -> Array:
+    """Compute the shared area (N,) of oriented rectangles as a fraction of the smaller one's, pairs as for `rectangle_overlap`.
+
+    It is 0 where one has no area or a NaN.
+    """
+    a, b = (np.asarray(r, dtype=np.float64).reshape(-1, 5) for r in (a, b))
+    return _ratio(rectangle_overlap(a, b), np.minimum(a[:, 2] * a[:, 3], b[:, 2] * b[:, 3]))
+
+
 def upright_box_iou(a: ArrayLike, b: ArrayLike) -> Array:
     """Compute the IoU (N,) of upright boxes in pairs.
 

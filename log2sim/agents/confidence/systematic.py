@@ -62,7 +62,7 @@ def position_terms(
         "hidden": ((1 - seen[0]) * length) ** 2 * ones,
         "outline": evidence.no_sweep * length**2 * ones,
         "range": (range_m / 10.0) ** 2 * ones,
-        "wrong": _doubt(confidence) * length**2 * ones,
+        "wrong": _wrong_weight(confidence) * length**2 * ones,
     }
 
 
@@ -76,7 +76,7 @@ def yaw_terms(w: Waypoints, confidence: float) -> dict[str, Array]:
     ones = np.ones(len(w))
     return {
         "given": given**2,
-        "wrong": _doubt(confidence) * ones,
+        "wrong": _wrong_weight(confidence) * ones,
     }
 
 
@@ -93,11 +93,11 @@ def speed_terms(w: Waypoints, evidence: Evidence, confidence: float) -> dict[str
     return {
         "given": given**2,
         "change": evidence.moving * ones,
-        "standing": (1 - evidence.moving) * _doubt(confidence) * ones,
-        "moving": evidence.moving * _doubt(confidence) * (1.0 + np.abs(w.speed_mps)) ** 2,
+        "standing": (1 - evidence.moving) * _wrong_weight(confidence) * ones,
+        "moving": evidence.moving * _wrong_weight(confidence) * (1.0 + np.abs(w.speed_mps)) ** 2,
     }
 
 
-def _doubt(confidence: float) -> float:
-    """Return the weight of the errors of a wrong agent: of those that are more probably wrong, errors are also larger."""
+def _wrong_weight(confidence: float) -> float:
+    """Return the weight of the errors of a wrong agent: the more probably an agent is wrong, the larger its errors are, too."""
     return (1 - confidence) ** 2

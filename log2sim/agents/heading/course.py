@@ -13,6 +13,11 @@ FORWARD_LOG_ODDS, FORWARD_LOG_ODDS_PER_MPS, MAX_FORWARD_LOG_ODDS = 1.4, 2.0, 9.0
 CERTAIN_SIGMAS = 4.0
 
 
+def forward_log_odds(speed_mps: float) -> float:
+    """Return the log-odds, in nats, that something that moves at a speed, at least 0, moves forward."""
+    return FORWARD_LOG_ODDS + FORWARD_LOG_ODDS_PER_MPS * speed_mps
+
+
 def course_log_odds(w: Waypoints, length_m: float) -> float:
     """Return the log-odds that the front of a vehicle is where its yaw points, by the ways that it drives either way.
 
@@ -32,5 +37,4 @@ def _one_way(speed_mps: Array, step_s: Array, certain_m: float) -> float:
     way_m, time_s = float(speed_mps @ step_s), float(step_s[speed_mps > 0].sum())
     if time_s <= 0:
         return 0.0
-    odds = FORWARD_LOG_ODDS + FORWARD_LOG_ODDS_PER_MPS * way_m / time_s
-    return min(odds, MAX_FORWARD_LOG_ODDS) * min(way_m / certain_m, 1.0)
+    return min(forward_log_odds(way_m / time_s), MAX_FORWARD_LOG_ODDS) * min(way_m / certain_m, 1.0)

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from log2sim.agents.candidate import AgentCandidate
 from log2sim.agents.plausibility.box_table import BoxTable
+from log2sim.agents.spans import spans_of
 from log2sim.datatypes import Agent, Doubt, Waypoints
-from log2sim.geometry import Array, rectangle_overlap, separating_axes
+from log2sim.geometry import Array, overlap_of_smaller, separating_axes
 
 # Boxes that share less than this of the smaller one only touch: their errors.
 TOUCHING = 0.05
@@ -65,8 +66,7 @@ def find_conflicts(boxes: BoxTable, touching: float = TOUCHING) -> list[Conflict
         np.column_stack([boxes.center_m[row, tick, :2], boxes.size_m[row, :2], boxes.yaw_rad[row, tick]])
         for row in (first[pair], second[pair])
     ]
-    smaller = np.minimum(*(r[:, 2] * r[:, 3] for r in rectangles))
-    share = rectangle_overlap(*rectangles) / smaller
+    share = overlap_of_smaller(*rectangles)
     over = share > touching
     pair, tick, share, depth = pair[over], tick[over], share[over], _depths(*(r[over] for r in rectangles))
     return [
@@ -123,11 +123,8 @@ def resolve_conflicts(candidates: Sequence[AgentCandidate], ego: Agent | None, t
 
 def _longest_run(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Keep only the longest run of a mask (T,), the first of several; gaps of absence end it."""
-    edges = np.flatnonzero(np.diff(np.r_[False, mask, False]))
     out = np.zeros_like(mask)
-    if len(edges):
-        k = int(np.argmax(edges[1::2] - edges[::2]))
-        out[edges[2 * k] : edges[2 * k + 1]] = True
+    out[max(spans_of(mask), key=len, default=np.zeros(0, dtype=np.intp))] = True
     return out
 
 

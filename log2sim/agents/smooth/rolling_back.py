@@ -9,6 +9,7 @@ from log2sim.agents.smooth.heading import course_is_known, yaw_of_motion
 from log2sim.agents.smooth.likelihood import zero_motion
 from log2sim.agents.smooth.motion_prior import NoisyPositions
 from log2sim.agents.smooth.quadratic import Quadratic
+from log2sim.agents.spans import spans_of
 from log2sim.geometry import Array
 
 # A vehicle stands instead of moving backward if that explains the positions within the 99 % quantile of chi-square with two
@@ -42,8 +43,7 @@ def backward_runs(
         return []
     yaw = yaw_of_motion(state[:, 0], velocity, hint_rad=heading_rad, known=known)
     forward = velocity[:, 0] * np.cos(yaw) + velocity[:, 1] * np.sin(yaw)
-    rows = np.flatnonzero(forward < -2 * HELD_SIGMA_MPS)
-    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []
+    runs = spans_of(forward < -2 * HELD_SIGMA_MPS)
     return [run for run in runs if np.hypot(*np.diff(state[run, 0], axis=0).T).sum() < MAX_ROLL_M]
 
 
