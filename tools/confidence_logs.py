@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from log2sim.config import Config
-from log2sim.datatypes import Detections, Frame, Log, Scenario, Stream
+from log2sim.datatypes import GROUP_OF, Detections, Frame, Log, Scenario, Stream
 from log2sim.evaluation.metrics.truth import points_in_labels, truth_from_log
 from log2sim.geometry import Array, nearest_index
 from log2sim.perception.detect.labels import MIN_SIDE_PX
@@ -35,6 +35,8 @@ from log2sim.synth.traffic_log import log_of
 # Ticks a second, and how long a log of that rate lasts, s.
 RATES = ((10.0, 2.5), (10.0, 4.5), (5.0, 6.0), (2.0, 9.0))
 ROADSIDE_EVERY, WITHOUT_LIDAR_EVERY = 6, 5
+# Random traffic drives at up to 18 m/s; so many times as fast it is that of a motorway, on roads as straight as one.
+FAST_EVERY, FAST, MAX_FAST_CURVATURE_PM = 3, 2.0, 0.003
 # Shares of logs by what is searched.
 SEARCHED = {"images and sweeps": 0.45, "sweeps": 0.2, "images": 0.35}
 # What LiDAR sees less of, a camera does not see either; what is hidden behind nearer objects by more is not found.
@@ -200,6 +202,8 @@ def make_log(seed: int, index: int) -> tuple[Log, TrafficScene]:
     mount = "roadside" if index % ROADSIDE_EVERY == ROADSIDE_EVERY - 1 else "vehicle"
     rate_hz, duration_s = RATES[int(rng.integers(len(RATES)))]
     scene, environment = draw_traffic(TrafficSettings(mount, seed=seed, sensor="random"), index)
+    if index % FAST_EVERY == 0 and abs(scene.roads[0].curvature_per_m) < MAX_FAST_CURVATURE_PM:
+        scene = _sped_up(scene)
     name, own_seed = f"{mount}-{index}", int(rng.integers(2**31))
     log = log_of(scene, environment, name, duration_s, own_seed, camera_rate_hz=rate_hz, image_labels=False)
     camera, lidar = log.streams["camera"], log.streams["lidar"]
@@ -214,6 +218,18 @@ def make_log(seed: int, index: int) -> tuple[Log, TrafficScene]:
     log = log.changed(streams=streams)
     points, _ = points_in_labels(log, log.labels)
     return log.changed(labels=replace(log.labels, visible=points >= MIN_SEEN_POINTS)), scene
+
+
+def _sped_up(scene: TrafficScene) -> TrafficScene:
+    """Let the vehicles of a scene drive `FAST` times as fast, the sensor's too."""
+    objects = [
+        replace(o, speed_mps=FAST * o.speed_mps, turn_radps=FAST * o.turn_radps)
+        if GROUP_OF.get(o.category) == "vehicle" or o.kind == "own car"
+        else o
+        for o in scene.objects
+    ]
+    sensor = replace(scene.sensor, velocity_mps=FAST * scene.sensor.velocity_mps)
+    return replace(scene, objects=type(scene.objects)(objects), sensor=sensor)
 
 
 def cases_of(seed: int, index: int) -> list[Case]:

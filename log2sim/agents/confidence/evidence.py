@@ -155,9 +155,11 @@ def yaw_at_measurements(candidate: AgentCandidate, timeline: Timeline) -> Array:
 def _scatter(candidate: AgentCandidate, timeline: Timeline) -> float:
     """Return log(1 + median of the squared distances of measurements from the trajectory in standard deviations)."""
     m, at = candidate.track.measurements, timeline.seconds(candidate.track.measurements.t_ns)
-    w = candidate.agent.waypoints
-    off = m.center_m[:, :2] - np.stack([np.interp(at, w.t_s, w.x_m), np.interp(at, w.t_s, w.y_m)], axis=1)
-    squared = np.einsum("na,nab,nb->n", off, np.linalg.pinv(m.covariance), off)
+    w, geometry = candidate.agent.waypoints, candidate.geometry
+    # The one place of what stands is no test of it, and the measured centers of a long vehicle that moves lag behind its points.
+    centers = (m.center_m[:, :2], m.covariance) if candidate.agent.static else (geometry.xy_m, geometry.covariance)
+    off = centers[0] - np.stack([np.interp(at, w.t_s, w.x_m), np.interp(at, w.t_s, w.y_m)], axis=1)
+    squared = np.einsum("na,nab,nb->n", off, np.linalg.pinv(centers[1]), off)
     return float(np.log1p(min(np.median(squared), MAX_SCATTER)))
 
 
