@@ -14,7 +14,7 @@ from test_size import T0_NS, measured, moved
 from log2sim.agents.candidate import AgentCandidate, Timeline
 from log2sim.agents.confidence.evidence import SIGNS, Evidence, evidence_of
 from log2sim.agents.confidence.rating import MAX_CONFIDENCE, MIN_CONFIDENCE, confidence_of, rate_agents
-from log2sim.agents.confidence.systematic import position_terms, speed_terms, yaw_terms
+from log2sim.agents.confidence.systematic import position_terms, speed_terms, with_systematic_errors, yaw_terms
 from log2sim.agents.confidence.weights import POSITION_VARIANCE, SPEED_VARIANCE, WEIGHTS, YAW_VARIANCE
 from log2sim.agents.hypotheses import Part
 from log2sim.agents.moving import moving_candidate
@@ -92,9 +92,10 @@ def test_doubts_scattered_positions_and_a_hidden_length_lower_a_confidence():
 def test_more_ticks_do_not_average_systematic_errors_away():
     few, many = driving(6), driving(30)
     given_share = np.median(many.agent.waypoints.sigma_xy_m) / np.median(few.agent.waypoints.sigma_xy_m)
-    share = np.median(rated(many).agent.waypoints.sigma_xy_m) / np.median(rated(few).agent.waypoints.sigma_xy_m)
-    assert share > given_share
-    assert np.median(rated(many).agent.waypoints.sigma_xy_m) > 0.05
+    evidence = evidence_of(few, TIMELINE, searched=False)
+    sigmas = [np.median(with_systematic_errors(c, evidence, 0.8, TIMELINE).sigma_xy_m) for c in (few, many)]
+    assert sigmas[1] / sigmas[0] > given_share
+    assert sigmas[1] > 0.05
 
 
 def test_evidence_is_bounded_where_there_is_nothing_but_boxes_of_images():
