@@ -178,10 +178,10 @@ def test_which_way_a_parked_car_points_is_told_by_the_boxes(yaw_deg: float) -> N
         parked = nearest(run_with(log, None, Sweeps(log, change)), (14.0, -4.0))
         assert parked is not None
         assert abs(wrap_angle(parked.waypoints.yaw_rad[0] - np.deg2rad(yaw_deg))) < np.deg2rad(5)
-    # Traffic alone says that it points along with the ego and the other car.
+    # Without them traffic says that it points along with the ego and the other car, and the outline of its points what is true.
     without = nearest(run(log, "labels"), (14.0, -4.0))
     assert without is not None
-    assert abs(wrap_angle(without.waypoints.yaw_rad[0] - np.deg2rad(10.0))) < np.deg2rad(5)
+    assert abs(wrap_angle(without.waypoints.yaw_rad[0] - np.deg2rad(yaw_deg))) < np.deg2rad(5)
 
 
 def test_a_moving_car_points_where_it_goes_whatever_the_boxes_say(world: tuple[Log, Scenario]) -> None:
