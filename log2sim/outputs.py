@@ -1,4 +1,4 @@
-"""Output files: temporary names beside them, several that appear together, and none over what another run wrote meanwhile."""
+"""Output files: temporary names beside them, several that appear together, and none that replaces another run's."""
 
 from __future__ import annotations
 

@@ -11,7 +11,8 @@ from test_layers import ROOT
 
 from log2sim.agents.smooth.feasibility import PHRASES
 from log2sim.cli.reconstruct import doubt_lines
-from log2sim.datatypes import FLAGS, MAX_LISTED, Agent, Doubt
+from log2sim.datatypes import FLAGS, Agent, Doubt
+from log2sim.datatypes.doubtful import MAX_LISTED
 
 PASSES = Doubt("passes_through", "passes through car-22 at 1.2 s", 1.0, 1.4)
 

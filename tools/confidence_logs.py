@@ -23,6 +23,7 @@ from log2sim.config import Config
 from log2sim.datatypes import GROUP_OF, Detections, Frame, Log, Scenario, Stream
 from log2sim.evaluation.metrics.truth import points_in_labels, truth_from_log
 from log2sim.geometry import Array, nearest_index
+from log2sim.log_odds import probability_of
 from log2sim.perception.detect.labels import MIN_SIDE_PX
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.lidar.projection import project_boxes_in_view, view_of
@@ -109,7 +110,7 @@ class SimulatedDetector:
             w = h * (0.4 if category == "pedestrian" else 1.4)
             rows.append((np.array([u, v, u + w, v + h]), category, rng.normal(-0.6, 0.5)))
         limit = np.array([frame.camera.width_px - 1, frame.camera.height_px - 1] * 2)
-        rows = [(np.clip(b, 0, limit), c, 1 / (1 + np.exp(-o - self._offset))) for b, c, o in rows]
+        rows = [(np.clip(b, 0, limit), c, float(probability_of(o + self._offset))) for b, c, o in rows]
         rows = [r for r in rows if r[2] >= MIN_SCORE and (r[0][2:] - r[0][:2]).min() >= MIN_SIDE_PX]
         rows.sort(key=lambda r: -r[2])
         return Detections(

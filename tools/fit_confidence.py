@@ -33,6 +33,7 @@ from log2sim.evaluation.metrics.correctness import MAX_WRONG_SHARE
 from log2sim.evaluation.metrics.evaluator import compare_scenarios
 from log2sim.evaluation.metrics.verdicts import judge
 from log2sim.geometry import Array
+from log2sim.log_odds import probability_of
 
 FOLDS = 5
 # Standard deviation of the weights of evidence that is scaled to a standard deviation of 1, before anything is seen.
@@ -145,7 +146,7 @@ def fit_weights(x: Array, right: Array, weight: Array, signs: Sequence[int]) -> 
     def loss(w: Array) -> tuple[float, Array]:
         odds = w[0] + z @ w[1:]
         value = weight @ (np.logaddexp(0.0, odds) - right * odds) + (w[1:] ** 2).sum() / (2 * PRIOR_SIGMA**2)
-        slope = weight * (1 / (1 + np.exp(-odds)) - right)
+        slope = weight * (probability_of(odds) - right)
         return float(value), np.append(slope.sum(), z.T @ slope + w[1:] / PRIOR_SIGMA**2)
 
     limits: list[tuple[float | None, float | None]] = [(None, None)]
@@ -155,7 +156,7 @@ def fit_weights(x: Array, right: Array, weight: Array, signs: Sequence[int]) -> 
 
 
 def probabilities(x: Array, bias: float, weights: Array) -> Array:
-    return np.clip(1 / (1 + np.exp(-(bias + x @ weights))), MIN_CONFIDENCE, MAX_CONFIDENCE)
+    return np.clip(probability_of(bias + x @ weights), MIN_CONFIDENCE, MAX_CONFIDENCE)
 
 
 def fit_variances(terms: Array, squared: Array, least: Array) -> Array:

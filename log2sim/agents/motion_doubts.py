@@ -1,4 +1,4 @@
-"""Doubts about the motion of an agent: faster than its kind, backward as nobody drives, or beside what was measured."""
+"""Doubts about the motion of an agent: too fast, backward fast or far, across its length, or beside its measurements."""
 
 from __future__ import annotations
 

@@ -23,6 +23,7 @@ from log2sim.cli.options import (
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Scenario
+    from log2sim.pipeline import Result
 
 
 def reconstruct(
@@ -63,12 +64,8 @@ def reconstruct(
     from log2sim.sensors import IMAGE_DETECTOR, choose_detector
 
     check_targets(out, report, topdown, overwrite=overwrite)
-    changes: dict[str, Any] = {
-        "cameras": None if cameras is None else camera_names(cameras),
-        "start_s": start,
-        "stop_s": stop,
-        "seed": seed,
-    }
+    changes: dict[str, Any] = {"start_s": start, "stop_s": stop, "seed": seed}
+    changes["cameras"] = None if cameras is None else camera_names(cameras)
     if detector is not None:
         changes["detect"] = {"name": detector}
     if poses is not None:
@@ -88,26 +85,30 @@ def reconstruct(
         say(line, quiet=quiet)
     with together():
         if topdown is not None:
-            from log2sim.perception.frames import RecordReader
-            from log2sim.visualization.birdseye.mosaic import write_image
-            from log2sim.visualization.birdseye.of_log import birdseye_of_log
-
-            reader = RecordReader(result.log)
-            write_image(birdseye_of_log(result.log, result.scenario, reader), topdown, overwrite=overwrite)
-            result.report["unreadable"] = {**reader.summary(), **result.report["unreadable"]}
+            _write_topdown(result, topdown, overwrite=overwrite)
         if report is not None:
             write_json(report, result.report)
         result.scenario.save(out)
-    for note in unused_records(result.report):
-        say(f"note: {note}", quiet=quiet)
-    for line in doubt_lines(result.scenario):
+    notes = [f"note: {note}" for note in unused_records(result.report)]
+    for line in (*notes, *doubt_lines(result.scenario), f"{out}: {_summary(result)}"):
         say(line, quiet=quiet)
-    counts = result.report["agents"]
-    say(
-        f"{out}: {counts['total']} agents ({counts['static']} static) over {result.scenario.duration_s:.1f} s, "
-        f"{result.report['ticks_per_second']:.1f} ticks/s",
-        quiet=quiet,
-    )
+
+
+def _write_topdown(result: Result, path: Path, *, overwrite: bool) -> None:
+    """Write the bird's-eye image of a run, and note in its report which records could not be read for it."""
+    from log2sim.perception.frames import RecordReader
+    from log2sim.visualization.birdseye.mosaic import write_image
+    from log2sim.visualization.birdseye.of_log import birdseye_of_log
+
+    reader = RecordReader(result.log)
+    write_image(birdseye_of_log(result.log, result.scenario, reader), path, overwrite=overwrite)
+    result.report["unreadable"] = {**reader.summary(), **result.report["unreadable"]}
+
+
+def _summary(result: Result) -> str:
+    counts, rate = result.report["agents"], result.report["ticks_per_second"]
+    static, duration_s = counts["static"], result.scenario.duration_s
+    return f"{counts['total']} agents ({static} static) over {duration_s:.1f} s, {rate:.1f} ticks/s"
 
 
 def doubt_lines(scenario: Scenario) -> list[str]:

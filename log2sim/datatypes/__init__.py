@@ -14,7 +14,7 @@ from log2sim.datatypes.categories import (
     MIN_SIZE_M,
     TYPICAL_SIZE_M,
 )
-from log2sim.datatypes.doubtful import MAX_LISTED, list_doubtful, say_confidence, why_doubtful
+from log2sim.datatypes.doubtful import list_doubtful, say_confidence, why_doubtful
 from log2sim.datatypes.doubts import FLAGS, MIN_TRUSTED_CONFIDENCE, Doubt
 from log2sim.datatypes.ignore_regions import IgnoreRegions, LabelView
 from log2sim.datatypes.labels import ImageLabels, ImageRegions, Labels
@@ -43,7 +43,6 @@ __all__ = [
     "FLAGS",
     "GROUPS",
     "GROUP_OF",
-    "MAX_LISTED",
     "MAX_SIZE_M",
     "MAX_SPEED_MPS",
     "MIN_SIZE_M",

@@ -23,7 +23,7 @@ def judge(candidates: Sequence[AgentCandidate], ego: Agent | None, recording: Re
     candidates : sequence of AgentCandidate
         Of all tracks.
     ego : Agent, optional
-        Where the ego is, nobody else is.
+        At its place there is no other agent.
     recording : Recording
     """
     t_s = recording.t_s
