@@ -218,8 +218,7 @@ def second_pass(run: Run, observations: Observations) -> Result:
     with run.clock.stage("judge"):
         recording = Recording(log, run.schedule, observations.obstacles, timeline)
         judged = judge(candidates, ego, recording)
-        rated = rate_agents(judged, timeline)
-        agents = [candidate.agent for candidate in rated]
+        agents = [candidate.agent for candidate in rate_agents(judged, timeline)]
         # Without an ego the agents' waypoints alone tell the ticks, so all of them stay.
         agents = simplify(agents) if ego is not None else agents
     if ego is None and not agents:

@@ -81,10 +81,7 @@ def test_doubts_scattered_positions_and_a_hidden_length_lower_a_confidence():
     assert rated(scattered).agent.confidence < before
     high = m.low_m + (m.high_m - m.low_m) * [0.3, 1.0]
     part = replace(candidate, track=replace(candidate.track, measurements=replace(m, high_m=high)))
-    assert (
-        evidence_of(part, TIMELINE, searched=False).hidden
-        > evidence_of(candidate, TIMELINE, searched=False).hidden + 0.4
-    )
+    assert evidence_of(part, TIMELINE).hidden > evidence_of(candidate, TIMELINE).hidden + 0.4
     assert rated(part).agent.confidence < before
     assert rated(part).agent.waypoints.sigma_xy_m[0] > 1.1 * rated(candidate).agent.waypoints.sigma_xy_m[0]
 
@@ -92,7 +89,7 @@ def test_doubts_scattered_positions_and_a_hidden_length_lower_a_confidence():
 def test_more_ticks_do_not_average_systematic_errors_away():
     few, many = driving(6), driving(30)
     given_share = np.median(many.agent.waypoints.sigma_xy_m) / np.median(few.agent.waypoints.sigma_xy_m)
-    evidence = evidence_of(few, TIMELINE, searched=False)
+    evidence = evidence_of(few, TIMELINE)
     sigmas = [np.median(with_systematic_errors(c, evidence, 0.8, TIMELINE).sigma_xy_m) for c in (few, many)]
     assert sigmas[1] / sigmas[0] > given_share
     assert sigmas[1] > 0.05
@@ -105,7 +102,7 @@ def test_evidence_is_bounded_where_there_is_nothing_but_boxes_of_images():
         m, points=np.zeros(3, dtype=np.int64), low_m=np.full((3, 2), np.nan), high_m=np.full((3, 2), np.nan),
         source=np.full(3, "topdown", dtype="<U16"), camera=np.full(3, "front"), yaw_rad=np.full(3, np.nan),
     )  # fmt: skip
-    found = evidence_of(replace(candidate, track=replace(candidate.track, measurements=bare)), TIMELINE, searched=False)
+    found = evidence_of(replace(candidate, track=replace(candidate.track, measurements=bare)), TIMELINE)
     assert np.isfinite(list(asdict(found).values())).all()
     assert (found.hidden, found.blind) == (1.0, 1.0)
 
@@ -121,7 +118,7 @@ def test_columns_that_are_unknown_stay_unknown():
 def test_every_term_of_a_variance_has_a_weight_and_none_is_negative():
     candidate = driving()
     evidence, w, size = (
-        evidence_of(candidate, TIMELINE, searched=False),
+        evidence_of(candidate, TIMELINE),
         candidate.agent.waypoints,
         candidate.agent.size_m,
     )

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from log2sim import pipeline
 from log2sim.agents.candidate import AgentCandidate, Timeline
-from log2sim.agents.confidence.evidence import SIGNS, Evidence, evidence_of, has_boxes, seen_share, yaw_at_measurements
+from log2sim.agents.confidence.evidence import SIGNS, Evidence, evidence_of, seen_share, yaw_at_measurements
 from log2sim.agents.confidence.rating import MAX_CONFIDENCE, MIN_CONFIDENCE
 from log2sim.agents.confidence.systematic import position_terms, speed_terms, yaw_terms
 from log2sim.datatypes import CATEGORIES, Agent, Scenario
@@ -102,7 +102,7 @@ def rated_agents(
             for n, e in squared.items()
             if (matched & np.isfinite(e)).any()
         }
-        evidence = evidence_of(candidate, timeline, searched=any(has_boxes(c) for c in kept))
+        evidence = evidence_of(candidate, timeline)
         seen = seen_share(candidate, yaw_at_measurements(candidate, timeline))
         doubted = bool(agent.doubts)
         range_m = float(np.median(compared.other.range_m[k, ticks]))

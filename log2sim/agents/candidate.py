@@ -70,13 +70,7 @@ class AgentCandidate:
 
 
 def candidate_of(
-    track: Track,
-    geometry: TrackGeometry,
-    waypoints: Waypoints,
-    quality: dict[str, Any],
-    *,
-    static: bool,
-    doubts: Sequence[Doubt] = (),
+    track: Track, geometry: TrackGeometry, waypoints: Waypoints, quality: dict[str, Any], *, static: bool
 ) -> AgentCandidate:
     """Make a candidate of a track, its geometry and its waypoints; `quality` is added to that of the track."""
     m = track.measurements
@@ -89,7 +83,6 @@ def candidate_of(
         static=static,
         rear_axle_offset_m=round(REAR_AXLE_SHARE.get(GROUP_OF[track.category], 0.0) * length, 3),
         confidence=float(np.clip(agent_confidence(track), 0.0, 1.0)),
-        doubts=tuple(doubts),
         quality=_quality_of(track) | quality,
     )
     return AgentCandidate(agent, float(m.score.sum()), is_confirmed(track, typical=geometry.is_likely), track, geometry)

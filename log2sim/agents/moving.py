@@ -107,7 +107,7 @@ def moving_candidate(
     if group == "vehicle":
         near = np.clip(np.searchsorted(at, t), 0, len(at) - 1)
         doubts += sideways_doubts(m, t, waypoints.yaw_rad[near], waypoints.speed_mps[near])
-    return candidate_of(track, geometry, waypoints, quality, static=False, doubts=doubts)
+    return candidate_of(track, geometry, waypoints, quality, static=False).doubted(doubts)
 
 
 def _one_at_a_moment(track: Track) -> Track:

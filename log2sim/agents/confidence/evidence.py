@@ -10,7 +10,7 @@ from log2sim.agents.candidate import AgentCandidate, Timeline
 from log2sim.agents.confirmation import image_confidence, sweep_confidence
 from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M
 from log2sim.geometry import Array
-from log2sim.perception.late_fusion import SWEEP_RANGE_M, logit
+from log2sim.perception.late_fusion import logit
 
 # Of the extents seen at all ticks, this quantile counts as seen at some time: stray points lengthen a few.
 SEEN_QUANTILE = 0.85
@@ -36,8 +36,6 @@ class Evidence:
         Log-odds of its confidence by boxes in LiDAR sweeps; 0 without.
     no_sweep : float
         1 without boxes in sweeps: nothing but an outline of points then tells size, heading and center.
-    missed : float
-        1 without boxes in sweeps although others have some and it is within the range of their detector.
     few : float
         1 by the number of its measurements.
     brief : float
@@ -60,8 +58,6 @@ class Evidence:
         Log-odds that the front is the front; 0 where nothing was decided.
     other_category : float
         Share of its measurements of another category.
-    truncated : float
-        Share of its measurements whose image box the border cuts.
     doubts : float
         Number of its doubts.
     moving, two_wheeler, pedestrian, other : float
@@ -71,7 +67,6 @@ class Evidence:
     image: float
     sweep: float
     no_sweep: float
-    missed: float
     few: float
     brief: float
     blind: float
@@ -83,7 +78,6 @@ class Evidence:
     hidden: float
     heading: float
     other_category: float
-    truncated: float
     doubts: float
     moving: float
     two_wheeler: float
@@ -93,22 +87,14 @@ class Evidence:
 
 # Whether an agent with more of it is rather right (1) or wrong (-1); 0 where either may be.
 SIGNS = {
-    "image": 1, "sweep": 1, "no_sweep": -1, "missed": -1, "few": -1, "brief": -1, "blind": -1, "range": -1,
+    "image": 1, "sweep": 1, "no_sweep": -1, "few": -1, "brief": -1, "blind": -1, "range": -1,
     "scatter": -1, "sigma": -1, "unlikely_size": -1, "odd_size": -1, "hidden": -1, "heading": 1, "other_category": -1,
-    "truncated": -1, "doubts": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0, "other": 0,
+    "doubts": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0, "other": 0,
 }  # fmt: skip
 
 
-def evidence_of(candidate: AgentCandidate, timeline: Timeline, *, searched: bool) -> Evidence:
-    """Collect the evidence for and against a candidate.
-
-    Parameters
-    ----------
-    candidate : AgentCandidate
-    timeline : Timeline
-    searched : bool
-        Whether sweeps were searched, see `has_boxes`.
-    """
+def evidence_of(candidate: AgentCandidate, timeline: Timeline) -> Evidence:
+    """Collect the evidence for and against a candidate."""
     track, agent, m = candidate.track, candidate.agent, candidate.track.measurements
     in_sweep = np.isfinite(m.box_yaw_rad)
     group, yaw = GROUP_OF[agent.category], yaw_at_measurements(candidate, timeline)
@@ -120,7 +106,6 @@ def evidence_of(candidate: AgentCandidate, timeline: Timeline, *, searched: bool
         image=0.0 if in_sweep.any() else float(logit(np.array(image_confidence(track)))),
         sweep=float(logit(np.array(sweep_confidence(track)))) if in_sweep.any() else 0.0,
         no_sweep=float(not in_sweep.any()),
-        missed=float(searched and not in_sweep.any() and range_m < SWEEP_RANGE_M),
         few=1.0 / len(m),
         brief=1.0 / (1.0 + float(w.t_s[-1] - w.t_s[0])),
         blind=float((m.source != "lidar").mean()),
@@ -132,18 +117,12 @@ def evidence_of(candidate: AgentCandidate, timeline: Timeline, *, searched: bool
         hidden=1.0 - float(seen_share(candidate, yaw)[0]),
         heading=float(logit(np.clip(heading, 1 - MAX_HEADING_CONFIDENCE, MAX_HEADING_CONFIDENCE))),
         other_category=float((m.category != agent.category).mean()),
-        truncated=float(m.truncated.mean()),
         doubts=float(min(len({d.flag for d in agent.doubts}), MAX_DOUBTS)),
         moving=float(not agent.static),
         two_wheeler=float(group == "two_wheeler"),
         pedestrian=float(group == "pedestrian"),
         other=float(group == "other"),
     )
-
-
-def has_boxes(candidate: AgentCandidate) -> bool:
-    """Return whether a detector found it in a sweep."""
-    return bool(np.isfinite(candidate.track.measurements.box_yaw_rad).any())
 
 
 def yaw_at_measurements(candidate: AgentCandidate, timeline: Timeline) -> Array:

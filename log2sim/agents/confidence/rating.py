@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 import numpy as np
 
 from log2sim.agents.candidate import AgentCandidate, Timeline
-from log2sim.agents.confidence.evidence import Evidence, evidence_of, has_boxes
+from log2sim.agents.confidence.evidence import Evidence, evidence_of
 from log2sim.agents.confidence.systematic import with_systematic_errors
 from log2sim.agents.confidence.weights import BIAS, WEIGHTS
 from log2sim.log_odds import probability_of
@@ -19,8 +19,7 @@ MIN_CONFIDENCE, MAX_CONFIDENCE = 0.01, 0.99
 
 def rate_agents(candidates: Sequence[AgentCandidate], timeline: Timeline) -> list[AgentCandidate]:
     """Give judged candidates the probability that they are right as confidence, and systematic errors in their sigmas."""
-    searched = any(has_boxes(candidate) for candidate in candidates)
-    return [_rated(candidate, timeline, searched=searched) for candidate in candidates]
+    return [_rated(candidate, timeline) for candidate in candidates]
 
 
 def confidence_of(evidence: Evidence) -> float:
@@ -36,8 +35,8 @@ def confidence_of(evidence: Evidence) -> float:
     return float(np.clip(probability_of(log_odds), MIN_CONFIDENCE, MAX_CONFIDENCE))
 
 
-def _rated(candidate: AgentCandidate, timeline: Timeline, *, searched: bool) -> AgentCandidate:
-    evidence = evidence_of(candidate, timeline, searched=searched)
+def _rated(candidate: AgentCandidate, timeline: Timeline) -> AgentCandidate:
+    evidence = evidence_of(candidate, timeline)
     confidence = confidence_of(evidence)
     waypoints = with_systematic_errors(candidate, evidence, confidence, timeline)
     return replace(candidate, agent=replace(candidate.agent, confidence=confidence, waypoints=waypoints))

@@ -54,33 +54,33 @@ def measure_few_points(rows: Measurements, view: View, cloud: Cloud) -> Measurem
     free = ~_owned(cloud.xyz[cloud.obstacles[visible.index], :2] + cloud.origin[:2], rows)
     columns: dict[str, Any] = {k: v.copy() if isinstance(v, np.ndarray) else v for k, v in vars(rows).items()}
     for k in wanted.tolist():
-        chosen = body_points(visible, rows.box_px, k, free, str(rows.category[k]), float(view.camera.K[1, 1]))
+        chosen = _body_points(visible, rows, k, free, float(view.camera.K[1, 1]))
         if len(chosen):
             _write(columns, k, view, cloud, cloud.obstacles[visible.index[chosen]], visible.depth[chosen])
     return Measurements(**columns)
 
 
-def body_points(
-    visible: ProjectedPoints, boxes_px: Array, k: int, free: NDArray[np.bool_], category: str, focal_px: float
+def _body_points(
+    visible: ProjectedPoints, rows: Measurements, k: int, free: NDArray[np.bool_], focal_px: float
 ) -> NDArray[np.intp]:
-    """Choose the points of the body in box `k` of (M, 4) among the points (n,) of an image; none where nothing fits.
+    """Choose the points of the body in the box of row `k` among the n points of an image; none where nothing fits.
 
     Parameters
     ----------
     visible : ProjectedPoints
-    boxes_px : (M, 4) float64
+    rows : Measurements
+        Of the frame.
     k : int
     free : (n,) bool
         Points that are no other object's.
-    category : str
-        Tells the height.
     focal_px : float
         Vertical.
     """
+    boxes_px, tall_m = rows.box_px, TYPICAL_SIZE_M[str(rows.category[k])][2]
     u0, v0, u1, v1 = boxes_px[k].tolist()
     width, height = u1 - u0, v1 - v0
     u, v, depth = visible.u, visible.v, visible.depth
-    off = (height * depth / focal_px / TYPICAL_SIZE_M[category][2] - 1) / HEIGHT_SIGMA_SHARE
+    off = (height * depth / focal_px / tall_m - 1) / HEIGHT_SIGMA_SHARE
     person = free & (np.abs(off) <= MAX_HEIGHT_SIGMAS)
     inner = np.abs(u - (u0 + u1) / 2) <= (0.5 - SIDE_SHARE) * width
     inside = np.flatnonzero(person & inner & (v >= v0) & (v <= v1))
