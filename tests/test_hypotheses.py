@@ -16,7 +16,7 @@ from log2sim.agents.motion_evidence import (
     VIEW_S,
     MotionPriorSigmas,
     Positions,
-    evidence_of,
+    marginal_likelihood,
 )
 from log2sim.datatypes import Detections, Measurements, Track
 
@@ -158,7 +158,7 @@ def test_the_evidence_is_the_likelihood_of_the_gaussian_process():
     ):
         middle = np.median(xy, axis=0) if prior is STANDING else xy[3]
         expected = sum(multivariate_normal(np.zeros(5), covariance).logpdf(xy[:, k] - middle[k]) for k in range(2))
-        found = evidence_of(Positions(t, xy, variance), prior)
+        found = marginal_likelihood(Positions(t, xy, variance), prior)
         if found.inlier.all():
             assert found.log == pytest.approx(expected, abs=0.05)
         assert prior is STANDING or found.inlier.all()

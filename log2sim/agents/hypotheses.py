@@ -14,14 +14,15 @@ from log2sim.agents.motion_evidence import (
     OUTLIER_LOG,
     REPEATED_SHARE,
     STANDING,
-    Evidence,
+    MarginalLikelihood,
     MotionPriorSigmas,
     Positions,
-    evidence_of,
+    marginal_likelihood,
 )
 from log2sim.agents.standing import is_static
 from log2sim.datatypes import GROUP_OF, MIN_SIZE_M, Track
 from log2sim.geometry import NS_PER_S, Array
+from log2sim.tracking.gates import CHI2_2DOF_99
 from log2sim.tracking.motion import ACCELERATION_MPS2, CENTER_SIGMA_M, FIRST_SPEED_MPS
 
 # More measurements of a track are not looked at one by one.
@@ -30,7 +31,7 @@ MAX_ROWS = 80
 MIN_ROWS, MIN_MOVING_ROWS = 3, 5
 # Two positions are at one place within the 99 % quantile of chi-square with two degrees of freedom, in standard deviations of
 # the errors that do not repeat.
-PLACE_GATE = 9.2 * 2 * (1 - REPEATED_SHARE)
+PLACE_GATE = CHI2_2DOF_99 * 2 * (1 - REPEATED_SHARE)
 # A track changes its object once in fifty tracks, and between two that it has shown already with one measurement in ten.
 NEXT_OBJECT_LOG, CHANGE_LOG = float(np.log(0.02)), float(np.log(0.1))
 # One object stays what it is unless several are e^3 = 20 times as likely.
@@ -70,7 +71,7 @@ def explain_track(track: Track) -> list[Part]:
     if len(track) <= MIN_ROWS:
         return [Part(track, static=False)]
     positions, rows = _positions(track)
-    moving = evidence_of(positions, _expected_motion(track))
+    moving = marginal_likelihood(positions, _expected_motion(track))
     standing = _standing_parts(track, positions)
     if standing is not None and standing[1]:
         log, parts = standing
@@ -132,7 +133,7 @@ def _standing_parts(track: Track, few: Positions) -> tuple[float, list[Part]] | 
     seen = label[label >= 0]
     log = OUTLIER_LOG * int((label < 0).sum()) + NEXT_OBJECT_LOG * (count - 1)
     log += CHANGE_LOG * int((np.diff(seen) != 0).sum())
-    log += sum(evidence_of(few.take(label == k), STANDING).log for k in range(count) if (label == k).any())
+    log += sum(marginal_likelihood(few.take(label == k), STANDING).log for k in range(count) if (label == k).any())
     return log, _parts_of(track, _labels(_positions_of(track, np.arange(len(track))), places, objects))
 
 
@@ -191,13 +192,16 @@ def _labels(p: Positions, places: Array, objects: NDArray[np.intp]) -> NDArray[n
     return np.where(squared[np.arange(len(p)), nearest] < PLACE_GATE, objects[nearest], -1)
 
 
-def _best_cut(p: Positions, whole: Evidence, motion: MotionPriorSigmas) -> int | None:
+def _best_cut(p: Positions, whole: MarginalLikelihood, motion: MotionPriorSigmas) -> int | None:
     """Return the first row of the second of two objects, if two are likelier than one."""
     if len(p) < 2 * MIN_ROWS:
         return None
     cuts = np.unique(
         np.linspace(MIN_ROWS, len(p) - MIN_ROWS, min(len(p) - 2 * MIN_ROWS + 1, MAX_SPLITS)).astype(np.intp)
     )
-    logs = [evidence_of(p.take(slice(k)), motion).log + evidence_of(p.take(slice(k, None)), motion).log for k in cuts]
+    logs = [
+        marginal_likelihood(p.take(slice(k)), motion).log + marginal_likelihood(p.take(slice(k, None)), motion).log
+        for k in cuts
+    ]
     best = int(np.argmax(logs))
     return int(cuts[best]) if logs[best] + NEXT_OBJECT_LOG > whole.log + MIN_LOG_ODDS else None

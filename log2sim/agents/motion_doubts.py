@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from log2sim.agents.spans import spans_of
 from log2sim.datatypes import GROUP_OF, MAX_SPEED_MPS, BoxEvidence, Doubt, Waypoints
 from log2sim.geometry import Array, wrap_angle
+from log2sim.tracking.gates import CHI2_2DOF_999
 
 # Of slow vehicles one in five reverses, at 3 m/s one in a thousand (`heading.course.forward_log_odds`); out of a driveway or
 # to a better parking space it is some car lengths.
@@ -18,7 +19,7 @@ MAX_REVERSING_MPS, MAX_REVERSING_M = 3.0, 20.0
 SIGNIFICANT_SIGMAS = 2.0
 # A measurement is beside the trajectory beyond the 99.9 % quantile of chi-square with two degrees of freedom; one may be an
 # outlier.
-CHI2_2DOF_999, MIN_BESIDE = 13.8, 2
+MIN_BESIDE = 2
 # One measurement in twenty is an outlier; twice as many are more than that.
 MIN_BESIDE_SHARE = 0.1
 # No road vehicle is wider, mirrors included, so a longer side is its length (Directive 96/53/EC allows 2.6 m).

@@ -72,8 +72,8 @@ STANDING = MotionPriorSigmas()
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
-    """Evidence of a hypothesis about positions.
+class MarginalLikelihood:
+    """How well a hypothesis explains positions.
 
     Attributes
     ----------
@@ -86,20 +86,20 @@ class Evidence:
     inlier: NDArray[np.bool_]
 
 
-def evidence_of(positions: Positions, motion: MotionPriorSigmas) -> Evidence:
-    """Compute the evidence of one object that moves as expected, or stands.
+def marginal_likelihood(positions: Positions, motion: MotionPriorSigmas) -> MarginalLikelihood:
+    """Compute the marginal likelihood of one object that moves as expected, or stands.
 
     Notes
     -----
     The velocity is a Wiener process about the middle of the track. O(n^3).
     """
     inlier = np.ones(len(positions), dtype=bool)
-    best = Evidence(-np.inf, inlier)
+    best = MarginalLikelihood(-np.inf, inlier)
     for _ in range(MAX_ROUNDS):
         log, each = _likelihoods(positions.take(inlier), motion)
         log += OUTLIER_LOG * int((~inlier).sum())
         if log > best.log:
-            best = Evidence(log, inlier)
+            best = MarginalLikelihood(log, inlier)
         padded = np.pad(each, NEIGHBORS, constant_values=np.inf)
         lowest = np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBORS + 1).min(axis=1)
         worst = np.flatnonzero((each < OUTLIER_LOG) & (each == lowest))

@@ -12,6 +12,7 @@ from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Measurements
 from log2sim.geometry import NS_PER_S
 from log2sim.perception.box_completion import place_boxes, provisional_sizes
 from log2sim.perception.box_fitting import fit_extents, rotate, top_of
+from log2sim.tracking.gates import CHI2_2DOF_99
 
 # Clusters are one object when this share of the points of either is inside the extents of the other.
 MIN_SHARED_POINTS = 0.4
@@ -22,8 +23,6 @@ MIN_DRIVER_SHARE = 0.8
 TRUNCATED_SCORE_FACTOR = 0.7
 # What a detector in LiDAR sweeps adds to a row.
 BOX_COLUMNS = ("box_center_m", "box_size_m", "box_yaw_rad", "heading_score")
-# Squared Mahalanobis distance of two independent positions, 2 degrees of freedom, 99 %.
-CHI2_2DOF_99 = 9.21
 
 
 def fuse(measurements: Sequence[Measurements], *, across: bool = True) -> list[Measurements]:

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, GROUPS, Measurements
 from log2sim.geometry import NS_PER_S, Array, period_of
+from log2sim.tracking.gates import CHI2_2DOF_999
 from log2sim.tracking.motion import ACCELERATION_MPS2, first_velocity, innovation, measurement_noise, predict, update
 
-# Gate: 99.9 % quantile of the squared Mahalanobis distance with 2 degrees of freedom.
-CHI2_2DOF_999 = 13.8
 NOT_ALLOWED = 1e6
 # A rider is taken for a pedestrian now and then and the other way round; it costs as much as 2.4 sigma.
 OTHER_GROUP_COST = 6.0

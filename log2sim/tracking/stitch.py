@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from log2sim.datatypes import GROUP_OF, Measurements, Track
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.tracking.category import voted_category
+from log2sim.tracking.gates import CHI2_4DOF_999
 from log2sim.tracking.motion import ACCELERATION_MPS2, first_velocity, measurement_noise, predict, update
 
-# Gate: 99.9 % quantile of the squared Mahalanobis distance with 4 degrees of freedom.
-CHI2_4DOF_999 = 18.5
 FORBIDDEN = 1e6
 # Largest standard deviation of the position difference; above it agreement is no evidence.
 MAX_POSITION_SIGMA_M = 2.0

@@ -5,18 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.agents.motion_evidence import VIEW_S
 from log2sim.agents.smooth.heading import course_is_known, yaw_of_motion
 from log2sim.agents.smooth.likelihood import zero_motion
 from log2sim.agents.smooth.motion_prior import NoisyPositions
 from log2sim.agents.smooth.quadratic import Quadratic
 from log2sim.agents.spans import spans_of
 from log2sim.geometry import Array
+from log2sim.tracking.gates import CHI2_2DOF_99
 
-# A vehicle stands instead of moving backward if that explains the positions within the 99 % quantile of chi-square with two
-# degrees of freedom; the jerk of stopping is none that the motion before tells.
-CHI2_2DOF_99 = 9.2
-# Errors of boxes repeat for some half a second, in which the view hardly changes.
-VIEW_S = 0.5
 # A longer way backward is one.
 MAX_ROLL_M = 2.0
 # Standard deviation of the velocity of what is held, and rounds in which its neighbors may have to be held too.
@@ -48,7 +45,11 @@ def backward_runs(
 
 
 def max_misfit(observed: NoisyPositions) -> float:
-    """Return by how much the squared residuals in sigmas may grow where a vehicle is held."""
+    """Return by how much the squared residuals in sigmas may grow where a vehicle is held.
+
+    A vehicle stands instead of moving backward if that explains the positions within the 99 % quantile. Errors that repeat for
+    `VIEW_S` count once.
+    """
     if not observed.correlated or len(observed.t_s) < 2:
         return CHI2_2DOF_99
     return CHI2_2DOF_99 * max(1.0, VIEW_S / float(np.median(np.diff(observed.t_s))))
