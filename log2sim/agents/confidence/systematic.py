@@ -51,7 +51,7 @@ def position_terms(
     - outline: an error of the length moves the center by half of it; where no box of a sweep tells it, an outline of points
       does;
     - range: the spacing of rays and errors of the pose grow with the distance;
-    - wrong: what is probably wrong is probably farther off, at most half its length for the most part.
+    - wrong: what is probably wrong is probably farther off, mostly by up to half its length.
     """
     ones = np.ones(len(w))
     length = size_m[0]

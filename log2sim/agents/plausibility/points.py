@@ -18,10 +18,12 @@ MAX_THROUGH_SHARE = {"vehicle": 0.35}
 MAX_THROUGH_SHARE_WITH_GAPS = 0.8
 # From here on nothing is there; below, something may be that is smaller than the box or beside it.
 EMPTY_SHARE = 0.8
+# Fewer rays, or those of fewer ticks, may all have gone through a window or past a corner.
 MIN_RAYS, MIN_EMPTY_TICKS = 20, 3
-# Points at most of the searched ticks.
+# A surface counts that is there at more than this share of the searched ticks.
 MOSTLY = 0.5
-# Share of the images that show a place in which a detector is wrong about it.
+# Share of the images of a place without an object in which a detector finds one, and the highest rate at which it is taken
+# to find one that is there: no detector finds all.
 FALSE_RATE = 0.05
 MAX_USUAL_RATE = 0.9
 # Fewer ticks tell no rate.

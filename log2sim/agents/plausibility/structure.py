@@ -20,17 +20,20 @@ MARGIN_M = 0.3
 # Thickness to either side of what counts as one surface. Walls are flatter; what else the points of a vehicle show, its
 # second side, its roof and its windows, recedes by more.
 SURFACE_M = 0.2
+# Shares of the points in a box that are nearly all, and most, of them.
 MIN_SURFACE_SHARE, MIN_MOST_SHARE = 0.85, 0.5
 # Surfaces are followed along cells of this length over at most so many empty ones: 0.5 m is less than the distance of parked
 # vehicles with their two rounded corners.
 CELL_M, MAX_EMPTY_CELLS = 0.25, 2
 # A surface that is longer than the longest vehicle of its category by this is no side of one.
 EXCESS_M = 0.5
+# Fewer points, or points in fewer cells (1 m of a side), show no surface.
 MIN_POINTS, MIN_CELLS = 12, 4
 # Points below may be curbs.
 BOTTOM_M = 0.3
 # The points in each cell of a surface that are nearest to the sensor, without the strays.
 FRONT_QUANTILE = 0.8
+# Ticks that are searched for each agent, evenly spread over its life: what stands looks much the same at all of them.
 SEARCHED_TICKS = 3
 
 
