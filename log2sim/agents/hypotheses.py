@@ -20,6 +20,7 @@ from log2sim.agents.motion_evidence import (
     marginal_likelihood,
 )
 from log2sim.agents.standing import is_static
+from log2sim.agents.starting import starts_or_stops
 from log2sim.datatypes import GROUP_OF, MIN_SIZE_M, Track
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.tracking.gates import CHI2_2DOF_99
@@ -67,7 +68,7 @@ def explain_track(track: Track) -> list[Part]:
     objects of which the second is seen after the first.
     """
     if is_static(track):
-        return [Part(track, static=True)]
+        return [Part(track, static=not starts_or_stops(track))]
     if len(track) <= MIN_ROWS:
         return [Part(track, static=False)]
     positions, rows = _positions(track)
@@ -79,7 +80,7 @@ def explain_track(track: Track) -> list[Part]:
         at_places = [part.at_place or part.track for part in parts]
         margin = -MIN_LOG_ODDS if all(is_static(shown) for shown in at_places) else MIN_LOG_ODDS
         if log > moving.log + margin:
-            return parts
+            return [Part(p.track, static=False) if starts_or_stops(p.track) else p for p in parts]
     if not moving.inlier.all():
         cut = _best_cut(positions, moving, _expected_motion(track))
         if cut is not None:

@@ -115,7 +115,7 @@ def _likelihoods(p: Positions, motion: MotionPriorSigmas) -> tuple[float, Array]
     s = p.t_s - (p.t_s[0] + p.t_s[-1]) / 2
     middle = np.median(p.xy_m, axis=0) if motion.speed_mps == 0 else p.xy_m[np.argmin(np.abs(s))]
     z = p.xy_m - middle
-    k = _noise(p) + PLACE_SIGMA_M**2 + motion.speed_mps**2 * np.outer(s, s)
+    k = noise_of(p) + PLACE_SIGMA_M**2 + motion.speed_mps**2 * np.outer(s, s)
     if motion.acceleration_mps2:
         near = np.minimum(np.abs(s)[:, None], np.abs(s)[None, :]) * (np.sign(s)[:, None] == np.sign(s)[None, :])
         far = np.maximum(np.abs(s)[:, None], np.abs(s)[None, :])
@@ -127,8 +127,8 @@ def _likelihoods(p: Positions, motion: MotionPriorSigmas) -> tuple[float, Array]
     return log, each
 
 
-def _noise(p: Positions) -> Array:
-    """Covariance (n, n) of the errors: a part that repeats, and one that does not."""
+def noise_of(p: Positions) -> Array:
+    """Return the covariance (n, n), m2, of the errors: a part that repeats while the view stays the same, and one that does not."""
     sigma = np.sqrt(p.variance)
     repeated = np.exp(-np.abs(p.t_s[:, None] - p.t_s[None, :]) / VIEW_S)
     return np.outer(sigma, sigma) * (REPEATED_SHARE * repeated + (1 - REPEATED_SHARE) * np.eye(len(p)))
