@@ -36,7 +36,8 @@ def least_squares(t: Track, t_ns: np.ndarray, *, whole_boxes: bool) -> tuple[np.
         at = 4 * (tick - ticks[0])
         information[at : at + 2, at : at + 2] += np.linalg.inv(r[k])
         rhs[at : at + 2] += np.linalg.solve(r[k], t.measurements.center_m[k, :2])
-    speed = first_velocity(t.measurements.yaw_rad[:1], group, whole_boxes=whole_boxes)[0]
+    axis = t.measurements.yaw_rad[:1] if whole_boxes else np.array([np.nan])
+    speed = first_velocity(axis, group)[0]
     information[2:4, 2:4] += np.linalg.inv(speed)
     for k in range(n - 1):
         dt = (t_ns[ticks[k + 1]] - t_ns[ticks[k]]) / NS_PER_S
@@ -88,12 +89,13 @@ def test_paths_go_on_beyond_both_ends_as_far_as_there_are_ticks() -> None:
 def test_whole_boxes_start_along_their_axis() -> None:
     yaw = np.array([0.0, 0.7, np.pi / 2])
     axis, side = np.stack([np.cos(yaw), np.sin(yaw)], 1), np.stack([-np.sin(yaw), np.cos(yaw)], 1)
-    whole = first_velocity(yaw, np.array(["vehicle"] * 3), whole_boxes=True)
+    whole = first_velocity(yaw, np.array(["vehicle"] * 3))
     along, across = (np.einsum("ni,nij,nj->n", d, whole, d) for d in (axis, side))
     np.testing.assert_allclose(along, FIRST_SPEED_MPS["vehicle"] ** 2)
     assert (across < 0.3 * along).all()
     np.testing.assert_allclose(np.einsum("ni,nij,nj->n", axis, whole, side), 0, atol=1e-9)
-    np.testing.assert_allclose(first_velocity(yaw, np.array(["vehicle"] * 3)), np.tile(64 * np.eye(2), (3, 1, 1)))
+    unknown = first_velocity(np.full(3, np.nan), np.array(["vehicle"] * 3))
+    np.testing.assert_allclose(unknown, np.tile(64 * np.eye(2), (3, 1, 1)))
 
 
 def test_parked_side_by_side_whole_boxes_do_not_change_places() -> None:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from replay_maneuvers import OFFSET_M, agent_from, driven, ramp, scenario_of
 
-from log2sim.datatypes import Waypoints
 from log2sim.errors import ScenarioError
 from log2sim.geometry import wrap_angle
 from log2sim.simulation.feasible_trajectory import LOCK_SHARE
@@ -192,10 +191,7 @@ def test_a_log_that_accelerates_harder_than_the_car_is_followed_at_full_throttle
 
 
 def without(agent, gone):
-    w = agent.waypoints
-    return changed(
-        agent, waypoints=Waypoints(*(getattr(w, k)[~gone] for k in Waypoints.__dataclass_fields__ if k != "visible"))
-    )
+    return changed(agent, waypoints=agent.waypoints.take(~gone))
 
 
 @pytest.mark.parametrize("dt_s", LONG_STEPS_S)
@@ -222,8 +218,7 @@ def test_waypoints_a_microsecond_apart_change_nothing(dt_s):
     twice = np.concatenate([w.t_s, w.t_s[20:23] + 1e-6])
     order = np.argsort(twice, kind="stable")
     k = np.concatenate([np.arange(len(w)), [20, 21, 22]])[order]
-    columns = {name: getattr(w, name)[k] for name in Waypoints.__dataclass_fields__ if name != "visible"}
-    doubled = changed(plain, waypoints=Waypoints(**{**columns, "t_s": twice[order]}))
+    doubled = changed(plain, waypoints=changed(w.take(k), t_s=twice[order]))
     one, other = followed(plain, dt_s=dt_s), followed(doubled, dt_s=dt_s)
     np.testing.assert_allclose(other.x_m, one.x_m, atol=0.01)
     np.testing.assert_allclose(other.y_m, one.y_m, atol=0.01)
