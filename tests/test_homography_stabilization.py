@@ -107,10 +107,10 @@ def outcome(log: Log, monkeypatch: pytest.MonkeyPatch) -> Outcome:
     u, width = 1800 - 2100 * truth[:, 1] / near_side, 2100 * 1.85 / near_side
     rows_u, rows_width = rows.box_px[:, [0, 2]].mean(axis=1), rows.box_px[:, 2] - rows.box_px[:, 0]
     own = (np.abs(rows_u[:, None] - u) < 60) & (np.abs(rows_width[:, None] / width - 1) < 0.15)
-    agents = np.array([np.column_stack([a.waypoints.x_m, a.waypoints.y_m]).mean(axis=0) for a in scenario.others])
+    placed_m = [rows.center_m[own[:, k], :2] for k in range(len(UNSEEN))]
     return Outcome(
-        np.array([rows.center_m[own[:, k], 0].std() for k in range(len(UNSEEN))]),
-        np.hypot(*(truth[:, None] - agents).transpose(2, 0, 1)).min(axis=1),
+        np.array([xy[:, 0].std() for xy in placed_m]),
+        np.array([np.hypot(*(xy.mean(axis=0) - center)) for xy, center in zip(placed_m, truth)]),
         dict(scenario.cameras[0]["homography"]),
     )
 

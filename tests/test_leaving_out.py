@@ -54,12 +54,15 @@ def entry(result: Result, stage: str) -> dict[str, Any]:
 
 
 def farthest_m(a: Scenario, b: Scenario) -> float:
-    """Largest distance of the waypoints of two scenarios with the same agents."""
+    """Largest distance of the trajectories of two scenarios with the same agents, which may keep other waypoints."""
     assert [x.id for x in a.agents] == [x.id for x in b.agents]
-    return max(
-        float(np.hypot(x.waypoints.x_m - y.waypoints.x_m, x.waypoints.y_m - y.waypoints.y_m).max())
-        for x, y in zip(a.agents, b.agents)
-    )
+    farthest = []
+    for x, y in zip(a.agents, b.agents):
+        np.testing.assert_allclose(x.waypoints.t_s[[0, -1]], y.waypoints.t_s[[0, -1]])
+        t_s = np.linspace(*x.waypoints.t_s[[0, -1]], 50)
+        p, q = x.at(t_s), y.at(t_s)
+        farthest.append(float(np.hypot(p.x_m - q.x_m, p.y_m - q.y_m).max()))
+    return max(farthest)
 
 
 def plan_of(log: Log, config: Config = LABELS, t_ns: np.ndarray | None = None) -> Plan:
