@@ -85,6 +85,14 @@ class PosesConfig(Section):
     )
 
 
+class CalibrationConfig(Section):
+    """Checks of clocks and mounts against the motion of the ego."""
+
+    check: bool = _setting(True, "Whether offsets of clocks and rotations of mounts are estimated from the log.")
+    fix_time: bool = _setting(False, "Whether stamps of sensors are corrected by the estimated offsets.")
+    fix_mounts: bool = _setting(False, "Whether mounts of sensors are corrected by the estimated rotations.")
+
+
 AUTO = "auto"
 
 
@@ -198,6 +206,7 @@ class Config(Section):
     start_s: float | None = _setting(None, "First time that is used, from the start of the log.", unit="s")
     stop_s: float | None = _setting(None, "Last time that is used, from the start of the log.", unit="s")
     poses: PosesConfig = PosesConfig()
+    calibration: CalibrationConfig = CalibrationConfig()
     sync: SyncConfig = SyncConfig()
     detect: DetectConfig = DetectConfig()
     lidar: LidarConfig = LidarConfig()

@@ -17,8 +17,9 @@ from log2sim.agents.plausibility.judge import judge
 from log2sim.agents.plausibility.recording import Recording
 from log2sim.agents.scenario_of import camera_entries, provenance_of, scenario_of
 from log2sim.agents.simplify import simplify
+from log2sim.calibration.check import check_calibration
 from log2sim.config import Config
-from log2sim.datatypes import Log, Scenario
+from log2sim.datatypes import Fault, Log, Scenario
 from log2sim.errors import NothingToReconstruct
 from log2sim.localization.choice import localize
 from log2sim.localization.pose_choice import GIVEN, PoseChoice
@@ -95,6 +96,8 @@ class Run:
         Called as `report_progress(stage, done, total)`.
     poses : PoseChoice
         Where the poses of `log` come from.
+    faults : tuple of Fault
+        Of poses, clocks and mounts.
     """
 
     log: Log
@@ -105,6 +108,7 @@ class Run:
     clock: StageClock
     report_progress: Progress
     poses: PoseChoice = GIVEN
+    faults: tuple[Fault, ...] = ()
 
 
 def reconstruct(log: Log, config: Config | None = None, *, progress: Progress | None = None) -> Result:
@@ -131,17 +135,20 @@ def reconstruct(log: Log, config: Config | None = None, *, progress: Progress | 
 
 
 def start(log: Log, config: Config, *, progress: Progress | None = None) -> Run:
-    """Choose the poses and the sensors, synchronize these, and plan the run."""
+    """Choose the poses and the sensors, check their calibration, synchronize them, and plan the run."""
     clock, report_progress = StageClock(), progress or (lambda *_: None)
     with clock.stage("poses"):
         log, poses = localize(log, config, progress=report_progress)
     config = choose_detector(log, config)
     sensors = select_sensors(log, config)
+    with clock.stage("calibration"):
+        log, faults = check_calibration(log, config, sensors, progress=report_progress)
     detectors = detectors_of(log, config)
     with clock.stage("sync"):
         schedule = schedule_of(log, config, sensors)
     plan = make_plan(log, config, sensors, schedule.t_ns)
-    return Run(sensors.restrict(log), config, plan, schedule, detectors, clock, report_progress, poses)
+    faults = (*poses.faults, *faults)
+    return Run(sensors.restrict(log), config, plan, schedule, detectors, clock, report_progress, poses, faults)
 
 
 def detectors_of(log: Log, config: Config) -> Detectors:
@@ -225,13 +232,17 @@ def second_pass(run: Run, observations: Observations) -> Result:
         raise NothingToReconstruct(f"{log.name}: no ego poses, and no object was detected in {len(t_ns)} ticks")
     outputs = RunOutputs(observations, measurements, homographies, tuple(agents), run.clock)
     outcomes = stage_outcomes(plan, outputs)
+    faults = [fault.to_dict(int(t_ns[0])) for fault in (*run.faults, *observations.faults)]
     scenario = scenario_of(
         log,
         t_ns,
         [ego, *agents] if ego is not None else agents,
         cameras=camera_entries(log, plan.cameras, homographies),
         plan=[outcome.to_dict() for outcome in outcomes],
-        provenance=provenance_of(log, config, run.detectors.name, run.poses.to_provenance()),
+        provenance={
+            **provenance_of(log, config, run.detectors.name, run.poses.to_provenance()),
+            **({"faults": faults} if faults else {}),
+        },
     )
     report = report_of(log, config, run.schedule, outputs, outcomes, scenario)
-    return Result(scenario, {**report, "poses": run.poses.to_dict()}, log)
+    return Result(scenario, {**report, "poses": run.poses.to_dict(), "faults": faults}, log)

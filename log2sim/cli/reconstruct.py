@@ -43,6 +43,12 @@ def reconstruct(
     start: Annotated[float | None, typer.Option(help="First time to use, in s from the start of the log.")] = None,
     stop: Annotated[float | None, typer.Option(help="Last time to use, in s from the start of the log.")] = None,
     poses: Poses = None,
+    fix_time: Annotated[
+        bool, typer.Option("--fix-time", help="Correct stamps of sensors by the offsets that the log shows.")
+    ] = False,
+    fix_calibration: Annotated[
+        bool, typer.Option("--fix-calibration", help="Correct mounts of sensors by the rotations that the log shows.")
+    ] = False,
     config: ConfigFile = None,
     settings: Settings = None,
     seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
@@ -70,6 +76,8 @@ def reconstruct(
         changes["detect"] = {"name": detector}
     if poses is not None:
         changes["poses"] = {"source": poses}
+    fixes = {"fix_time": fix_time, "fix_mounts": fix_calibration}
+    changes["calibration"] = {name: True for name, chosen in fixes.items() if chosen}
     chosen = Config.load(config, settings or (), **changes)
     opened = open_log(log, format=format, sequence=sequence)
     if topdown is not None and not opened.cameras:
@@ -81,7 +89,7 @@ def reconstruct(
         say(f"note: no image is searched: {MissingExtra(IMAGE_DETECTOR, 'coco')}", quiet=quiet)
     with progress(quiet=quiet) as report_progress:
         result = run(opened, chosen, progress=report_progress)
-    for line in pose_notes(result.report["poses"]):
+    for line in (*pose_notes(result.report["poses"]), *fault_lines(result.report["faults"])):
         say(line, quiet=quiet)
     with together():
         if topdown is not None:
@@ -127,6 +135,11 @@ def pose_notes(poses: dict[str, Any]) -> list[str]:
     if poses["source"] == poses["requested"] == "given" or poses["source"] == "none":
         return []
     return [f"poses: {poses['source']} ({poses['reason']})", *(f"note: {note}" for note in poses["notes"])]
+
+
+def fault_lines(faults: list[dict[str, Any]]) -> list[str]:
+    """Say what is wrong with the sensors and poses of a log, a line for each fault."""
+    return [f"note: {fault['sensor']}: {fault['message']}" for fault in faults]
 
 
 def unused_records(report: dict[str, Any]) -> list[str]:

@@ -16,6 +16,7 @@ from log2sim.datatypes.categories import (
 )
 from log2sim.datatypes.doubtful import list_doubtful, say_confidence, why_doubtful
 from log2sim.datatypes.doubts import FLAGS, MIN_TRUSTED_CONFIDENCE, Doubt
+from log2sim.datatypes.faults import FAULT_KINDS, Fault
 from log2sim.datatypes.ignore_regions import IgnoreRegions, LabelView
 from log2sim.datatypes.labels import ImageLabels, ImageRegions, Labels
 from log2sim.datatypes.log import (
@@ -40,6 +41,7 @@ __all__ = [
     "CATEGORIES",
     "CATEGORY",
     "EGO",
+    "FAULT_KINDS",
     "FLAGS",
     "GROUPS",
     "GROUP_OF",
@@ -58,6 +60,7 @@ __all__ = [
     "Detections",
     "Doubt",
     "EgoVehicle",
+    "Fault",
     "Frame",
     "IgnoreRegions",
     "ImageLabels",

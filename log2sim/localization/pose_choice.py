@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from log2sim.datatypes import Fault
+
 ORIGINS = {"given": "ego poses of the log", "lidar": "LiDAR odometry", "camera": "camera motion"}
 """What a scenario says about the ego by the source of its poses."""
 
@@ -33,6 +35,8 @@ class PoseChoice:
         What is doubtful about estimated poses.
     during_ns : (int, int), optional
         First and last stamp of what poses were estimated from; None for the whole log.
+    faults : tuple of Fault
+        Faults of given poses.
     """
 
     requested: str
@@ -43,6 +47,7 @@ class PoseChoice:
     estimate: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     during_ns: tuple[int, int] | None = None
+    faults: tuple[Fault, ...] = ()
 
     @property
     def origin(self) -> str:

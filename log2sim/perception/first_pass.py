@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Boxes3D, Detections, Log, Measurements, Obstacles
+from log2sim.datatypes import Boxes3D, Detections, Fault, Log, Measurements, Obstacles
 from log2sim.geometry import Array, inverse
 from log2sim.perception.detect.detectors import Detector
 from log2sim.perception.detect3d.detectors import LidarDetector
@@ -50,6 +50,8 @@ class Observations:
     frames_detected : int
     frames_skipped : mapping of str to int
         By camera.
+    faults : tuple of Fault
+        Of the records.
     """
 
     measurements: list[Measurements] = field(default_factory=list)
@@ -61,6 +63,7 @@ class Observations:
     sweeps: Counter[str] = field(default_factory=Counter)
     frames_detected: int = 0
     frames_skipped: Mapping[str, int] = field(default_factory=dict)
+    faults: tuple[Fault, ...] = ()
 
 
 def observe(

@@ -1,0 +1,1 @@
+"""Offsets of clocks and rotations of mounts, estimated from a log, and their correction."""
