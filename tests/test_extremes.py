@@ -14,7 +14,9 @@ import stability
 from extremes import CASES, Case, Outcome, outcome_of
 
 
-@pytest.mark.parametrize("case", CASES, ids=[c.name for c in CASES])
+@pytest.mark.parametrize(
+    "case", [pytest.param(c, id=c.name, marks=[pytest.mark.slow] if c.slow else []) for c in CASES]
+)
 def test_extreme(case: Case) -> None:
     outcome = outcome_of(case)
     assert outcome.ok, f"{outcome.found}, error {outcome.error} {outcome.unit}; required: {case.required}"

@@ -26,11 +26,12 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Case:
-    """A named extreme, what is required of it, and how to run it."""
+    """A named extreme, what is required of it, how to run it, and whether that takes more than a few seconds."""
 
     name: str
     required: str
     run: Callable[[], Outcome]
+    slow: bool = False
 
 
 CASES: list[Case] = []
@@ -44,11 +45,11 @@ def outcome_of(case: Case) -> Outcome:
         return Outcome(False, f"raised {type(error).__name__}: {error}")
 
 
-def case(name: str, required: str) -> Callable[[Callable[[], Outcome]], Callable[[], Outcome]]:
+def case(name: str, required: str, *, slow: bool = False) -> Callable[[Callable[[], Outcome]], Callable[[], Outcome]]:
     """Put a function into the table."""
 
     def add(run: Callable[[], Outcome]) -> Callable[[], Outcome]:
-        CASES.append(Case(name, required, run))
+        CASES.append(Case(name, required, run, slow))
         return run
 
     return add
