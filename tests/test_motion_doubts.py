@@ -58,7 +58,7 @@ def test_measurements_beside_the_way_are_doubted_unless_they_are_few():
     residual[20:25] = [1.5, 2.5, np.nan, 3.0, 1.5]
     first, second, third = jump_doubts(t, residual, sigma)
     assert (first.flag, first.start_s, first.end_s) == ("jump", 0.5, 0.6)
-    assert second.reason == "measured up to 2.5 m beside its way from 2.0 to 2.1 s"
+    assert second.reason == "measured up to 2.5 m off its path from 2.0 to 2.1 s"
     assert (third.start_s, third.end_s) == (2.3, 2.4)
 
 

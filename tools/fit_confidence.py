@@ -313,8 +313,8 @@ def report(agents: Sequence[Rated]) -> None:
     say_confidence("before", np.array([a.before for a in agents]), agents)
     say_confidence("held out", p, agents)
     kinds = {
-        "sweeps": lambda a: a.evidence.no_sweep == 0,
-        "images and points": lambda a: a.evidence.no_sweep == 1 and a.evidence.blind < 0.5,
+        "sweeps": lambda a: a.evidence.sweep != 0,
+        "images and points": lambda a: a.evidence.sweep == 0 and a.evidence.blind < 0.5,
         "images": lambda a: a.evidence.blind >= 0.5,
     }
     for title, chosen in kinds.items():

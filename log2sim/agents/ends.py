@@ -1,4 +1,4 @@
-"""Ends of an object along its length and width, in one view or in several: which are real, and how well rays tell them."""
+"""Ends of an object along its length and width, in one view or in several: which are real, and how precisely rays locate them."""
 
 from __future__ import annotations
 

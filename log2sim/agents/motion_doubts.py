@@ -1,4 +1,4 @@
-"""Doubts about the motion of an agent: too fast, backward fast or far, across its length, or beside its measurements."""
+"""Doubts about the motion of an agent: too fast, backward fast or far, across its length, or far from its measurements."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from log2sim.tracking.gates import CHI2_2DOF_999
 MAX_REVERSING_MPS, MAX_REVERSING_M = 3.0, 20.0
 # A speed counts as beyond a limit where it is by as many of its own standard deviations.
 SIGNIFICANT_SIGMAS = 2.0
-# A measurement is beside the trajectory beyond the 99.9 % quantile of chi-square with two degrees of freedom; one may be an
+# A measurement is far from the trajectory beyond the 99.9 % quantile of chi-square with two degrees of freedom; one may be an
 # outlier.
 MIN_BESIDE = 2
 # One measurement in twenty is an outlier; twice as many are more than that.
@@ -46,7 +46,7 @@ def motion_doubts(category: str, w: Waypoints) -> tuple[Doubt, ...]:
 
 
 def jump_doubts(t_s: Array, residual_m: Array, sigma_m: Array) -> tuple[Doubt, ...]:
-    """Doubt a smoothed trajectory where several measurements in a row are far beside it.
+    """Doubt a smoothed trajectory where several measurements in a row are far from it.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def jump_doubts(t_s: Array, residual_m: Array, sigma_m: Array) -> tuple[Doubt, .
     doubts = []
     for rows in spans_of(beside) if beside.mean() >= MIN_BESIDE_SHARE else []:
         if len(rows) >= MIN_BESIDE:
-            reason = f"measured up to {residual_m[rows].max():.1f} m beside its way {_when(t_s, rows)}"
+            reason = f"measured up to {residual_m[rows].max():.1f} m off its path {_when(t_s, rows)}"
             doubts.append(Doubt("jump", reason, float(t_s[rows[0]]), float(t_s[rows[-1]])))
     return tuple(doubts)
 

@@ -1,4 +1,4 @@
-"""Vehicles that stand for most of their track, but start or stop within it: their observed ends tell.
+"""Vehicles that stand for most of their track, but start or stop within it, recognized by their observed ends.
 
 The center of a long vehicle wanders by meters while more or less of it is seen, and its mean velocity is small if it starts
 late. Its ends, where they are observed, do neither.

@@ -22,7 +22,7 @@ FLAGS = {
     "speed": "is faster than anything of its category",
     "reversing": "drives backward fast or far",
     "sideways": "slides across its length",
-    "jump": "its measurements are beside its trajectory",
+    "jump": "its measurements are far from its trajectory",
     "passes_through": "is in the place of another agent",
     "in_ego": "touches the ego",
     "empty": "LiDAR rays pass through its place",

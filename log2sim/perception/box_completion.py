@@ -127,7 +127,7 @@ def complete_box(
     real : (..., 2, 2) int
         Kinds of the ends, see `real_ends`.
     known : (...) bool
-        Whether a 3D detector tells the size, so that what is added to the points beyond a real end is no guess.
+        Whether a 3D detector gives the size, so that what is added to the points beyond a real end is no guess.
     gap_m : (..., 2, 2) float64, m
         From `end_gaps`.
 

@@ -44,7 +44,7 @@ def fit_extents(points: Array, typical: Array, known_yaw_rad: float | None = Non
     typical : (3,) float64, m
         Size of the category, to tell the length from the width.
     known_yaw_rad : float, optional
-        Rough yaw from elsewhere, which tells it instead.
+        Rough yaw from elsewhere, used instead.
 
     Returns
     -------

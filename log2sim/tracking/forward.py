@@ -26,7 +26,7 @@ TENTATIVE_HITS = 3
 # where that is likelier than that the track was measured there.
 DETECTION_PROBABILITY, NEW_PER_M2 = 0.8, 4e-4
 _LOG_NEW = 2 * np.log(2 * np.pi * NEW_PER_M2 * (1 - DETECTION_PROBABILITY) / DETECTION_PROBABILITY)
-# What was measured once may stand or move, one as likely as the other. What stands starts within this time on average, as
+# An object measured once is as likely to stand as to move. A standing one starts within this time on average, as
 # at a traffic light.
 STANDING_PRIOR, START_TIME_S = 0.5, 30.0
 # Standard deviation of what a standing object seems to move within 1 s.

@@ -1,4 +1,4 @@
-"""What tells right agents from wrong ones: numbers that a judged candidate has, each with a reason for its sign."""
+"""Evidence for and against an agent: numbers that a judged candidate has, each with a reason for its sign."""
 
 from __future__ import annotations
 
@@ -34,8 +34,6 @@ class Evidence:
         Log-odds of its confidence by images, where no sweep shows it; 0 elsewhere.
     sweep : float
         Log-odds of its confidence by boxes in LiDAR sweeps; 0 without.
-    no_sweep : float
-        1 without boxes in sweeps: nothing but an outline of points then tells size, heading and center.
     few : float
         1 by the number of its measurements.
     brief : float
@@ -66,7 +64,6 @@ class Evidence:
 
     image: float
     sweep: float
-    no_sweep: float
     few: float
     brief: float
     blind: float
@@ -87,7 +84,7 @@ class Evidence:
 
 # Whether an agent with more of it is rather right (1) or wrong (-1); 0 where either may be.
 SIGNS = {
-    "image": 1, "sweep": 1, "no_sweep": -1, "few": -1, "brief": -1, "blind": -1, "range": -1,
+    "image": 1, "sweep": 1, "few": -1, "brief": -1, "blind": -1, "range": -1,
     "scatter": -1, "sigma": -1, "unlikely_size": -1, "odd_size": -1, "hidden": -1, "heading": 1, "other_category": -1,
     "doubts": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0, "other": 0,
 }  # fmt: skip
@@ -105,7 +102,6 @@ def evidence_of(candidate: AgentCandidate, timeline: Timeline) -> Evidence:
     return Evidence(
         image=0.0 if in_sweep.any() else float(logit(np.array(image_confidence(track)))),
         sweep=float(logit(np.array(sweep_confidence(track)))) if in_sweep.any() else 0.0,
-        no_sweep=float(not in_sweep.any()),
         few=1.0 / len(m),
         brief=1.0 / (1.0 + float(w.t_s[-1] - w.t_s[0])),
         blind=float((m.source != "lidar").mean()),
@@ -135,7 +131,8 @@ def _scatter(candidate: AgentCandidate, timeline: Timeline) -> float:
     """Return log(1 + median of the squared distances of measurements from the trajectory in standard deviations)."""
     m, at = candidate.track.measurements, timeline.seconds(candidate.track.measurements.t_ns)
     w, geometry = candidate.agent.waypoints, candidate.geometry
-    # The one place of what stands is no test of it, and the measured centers of a long vehicle that moves lag behind its points.
+    # The place of a standing agent is fitted to its measurements, so their residuals are no test of it; and the measured
+    # centers of a long moving vehicle lag behind its points.
     centers = (m.center_m[:, :2], m.covariance) if candidate.agent.static else (geometry.xy_m, geometry.covariance)
     off = centers[0] - np.stack([np.interp(at, w.t_s, w.x_m), np.interp(at, w.t_s, w.y_m)], axis=1)
     squared = np.einsum("na,nab,nb->n", off, np.linalg.pinv(centers[1]), off)

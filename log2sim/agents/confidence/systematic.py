@@ -48,10 +48,8 @@ def position_terms(
     - given: what smoothing or the fit says;
     - given_moving: errors of neighboring ticks are alike, and smoothing averages them;
     - hidden: a box is laid against one end, and the part of its length that was never seen is on either side of the points;
-    - outline: an error of the length moves the center by half of it; where no box of a sweep tells it, an outline of points
-      does;
     - range: the spacing of rays and errors of the pose grow with the distance;
-    - wrong: what is probably wrong is probably farther off, mostly by up to half its length.
+    - wrong: an agent that is probably wrong is farther off, mostly by up to half its length.
     """
     ones = np.ones(len(w))
     length = size_m[0]
@@ -60,7 +58,6 @@ def position_terms(
         "given": w.sigma_xy_m**2,
         "given_moving": evidence.moving * w.sigma_xy_m**2,
         "hidden": ((1 - seen[0]) * length) ** 2 * ones,
-        "outline": evidence.no_sweep * length**2 * ones,
         "range": (range_m / 10.0) ** 2 * ones,
         "wrong": _wrong_weight(confidence) * length**2 * ones,
     }
@@ -70,7 +67,7 @@ def yaw_terms(w: Waypoints, confidence: float) -> dict[str, Array]:
     """Return the reasons for errors of yaw at the waypoints (T,), rad2 but for their weights.
 
     - given: what smoothing or the fit says;
-    - wrong: the axis of what is probably wrong is off by any angle.
+    - wrong: the axis of an agent that is probably wrong may be off by any angle.
     """
     given = np.zeros(len(w)) if w.sigma_yaw_rad is None else w.sigma_yaw_rad
     ones = np.ones(len(w))
@@ -84,15 +81,13 @@ def speed_terms(w: Waypoints, evidence: Evidence, confidence: float) -> dict[str
     """Return the reasons for errors of speed at the waypoints (T,), m2/s2 but for their weights.
 
     - given: what smoothing says;
-    - change: other sides come into view while an object passes, which moves its outline as if it moved;
-    - standing: what is probably wrong and stands may move;
-    - moving: what is probably wrong and moves may stand, or move at another speed.
+    - standing: a standing agent that is probably wrong may move;
+    - moving: a moving agent that is probably wrong may stand, or move at another speed.
     """
     given = np.zeros(len(w)) if w.sigma_speed_mps is None else w.sigma_speed_mps
     ones = np.ones(len(w))
     return {
         "given": given**2,
-        "change": evidence.moving * ones,
         "standing": (1 - evidence.moving) * _wrong_weight(confidence) * ones,
         "moving": evidence.moving * _wrong_weight(confidence) * (1.0 + np.abs(w.speed_mps)) ** 2,
     }

@@ -9,7 +9,6 @@ BIAS = 2.424
 WEIGHTS = {
     "image": 0.1081,
     "sweep": 0.08424,
-    "no_sweep": 0.0,
     "few": -0.8772,
     "brief": -0.6452,
     "blind": -1.067,
@@ -31,7 +30,6 @@ POSITION_VARIANCE = {
     "given": 1.599,
     "given_moving": 1.009,
     "hidden": 0.003781,
-    "outline": 1e-07,
     "range": 0.0001366,
     "wrong": 0.04673,
 }
@@ -41,7 +39,6 @@ YAW_VARIANCE = {
 }
 SPEED_VARIANCE = {
     "given": 4.335,
-    "change": 2.274e-07,
     "standing": 5.145,
     "moving": 0.3874,
 }

@@ -23,7 +23,7 @@ def course_log_odds(w: Waypoints, length_m: float) -> float:
 
     Notes
     -----
-    The center of one that stands seems to move by up to its length while ever more of it shows.
+    The center of a standing vehicle seems to move by up to its length while more and more of it comes into view.
     """
     step_s = np.gradient(w.t_s) if len(w.t_s) > 1 else np.zeros(1)
     certain_m = max(length_m, CERTAIN_SIGMAS * float(np.median(w.sigma_xy_m)))

@@ -1,4 +1,4 @@
-"""Traffic that passes a vehicle: on which side of the road it keeps, and which way those beside its path point."""
+"""Traffic that passes a vehicle: on which side of the road it drives, and which way vehicles next to its path face."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ OPPOSITE_COS = -0.7
 USUALLY_RIGHT = 0.72
 # Log-odds of each pair that meets: one in twenty meets on a car park, or at a turn, or one of both overtakes.
 MEETING_LOG_ODDS, MAX_SIDE_LOG_ODDS = 3.0, 6.0
-# Probability that what stands beside the path of another vehicle belongs to the direction of that side: in its own lane (a queue),
-# at the near curb, between it and the next lane (the lane may be of either direction), and beyond (unless the street is one-way).
+# Probability that a vehicle standing next to the path of another one faces in the direction of that side: in its own lane (a
+# queue), at the near curb, between it and the next lane (the lane may be of either direction), and beyond (unless the street is one-way).
 IN_LANE, NEAR_CURB, NEXT_LANE, BEYOND = 0.97, 0.92, 0.7, 0.85
 # A vehicle's center is in the lane of a path that is nearer than half the width left in a lane of 3.5 m plus half a car; the lane
 # beyond the next begins one and a half lanes away.
 IN_LANE_M, BEYOND_M = 1.2, 4.5
-# Standard deviation of the yaw between a street and what stands along it, and lengths over which a street is known to go on
+# Standard deviation of the yaw between a street and vehicles parked along it, and lengths over which a street is known to go on
 # ahead and to the side: streets bend, and farther to the side is another street or a yard.
 PARALLEL_SIGMA_RAD, AHEAD_M, STREET_M, ASIDE_M = 0.15, 25.0, 9.0, 3.0
 
@@ -58,7 +58,7 @@ def side_log_odds(paths: Sequence[Array]) -> float:
 
 
 def street_log_odds(pose: Array, paths: Sequence[Array], *, keeps_right: bool) -> float:
-    """Return the log-odds that the street's direction where something stands is along its yaw, by the traffic beside it.
+    """Return the log-odds that the street's direction where something stands is along its yaw, by the traffic next to it.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ MIN_POINTS, MIN_CELLS = 12, 4
 BOTTOM_M = 0.3
 # The points in each cell of a surface that are nearest to the sensor, without the strays.
 FRONT_QUANTILE = 0.8
-# Ticks that are searched for each agent, evenly spread over its life: what stands looks much the same at all of them.
+# Ticks that are searched for each agent, evenly spread over its life: standing structure looks much the same at all of them.
 SEARCHED_TICKS = 3
 
 
@@ -58,7 +58,7 @@ def structure_shares(
 ) -> tuple[Array, Array]:
     """Return shares (A,), (A,) of the searched ticks at which nearly all and most points of a vehicle are on a longer surface.
 
-    A few ticks, evenly spread over the life of an agent, are searched: what stands shows the same at all of them.
+    A few ticks, evenly spread over the life of an agent, are searched: standing structure shows the same at all of them.
     """
     shares = np.zeros((2, len(agents)))
     ticks = np.array([k for k, cloud in enumerate(clouds) if cloud is not None], dtype=np.intp)

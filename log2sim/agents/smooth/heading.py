@@ -16,7 +16,7 @@ MIN_COURSE_SIGMAS = {False: 5.0, True: 2.5}
 MIN_COURSE_MPS = {False: 0.5, True: 0.3}
 # What is covered at a lower speed is noise of a standing object.
 MIN_PROGRESS_MPS = 0.2
-# Without a known course, the displacement from end to end tells one if it is longer.
+# Without a known course, the displacement from end to end gives one if it is longer.
 MIN_DISPLACEMENT_M = 1.0
 # Standard deviation of the curvature of a way on which no course is known: a turn at a crossing has a radius of some 15 m.
 WAY_CURVATURE_1PM = 0.06
@@ -48,14 +48,15 @@ def yaw_of_motion(
 ) -> Array:
     """Heading (T,) in rad of a trajectory.
 
-    Between two moving parts the heading changes with the distance covered, so what stands does not turn.
+    Between two moving parts the heading changes with the distance covered, so a standing object does not turn.
 
     Parameters
     ----------
     xy_m : (T, 2) float64, m
     velocity_mps : (T, 2) float64, m/s
     hint_rad : float, optional
-        Heading before the first motion; it also tells driving from reversing. Without motion and hint the heading is 0.
+        Heading before the first motion; it also decides between driving forward and reversing. Without motion and hint the
+        heading is 0.
     holonomic : bool
         True for pedestrians, who turn round instead of moving backward.
     known : (T,) bool, optional

@@ -1,4 +1,4 @@
-"""Short ways backward that are none: a smoothed velocity swings about zero where a vehicle stands and runs on where it stops."""
+"""Removal of false backward motion: smoothed velocities oscillate about zero at standstill and overshoot at a stop."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ def place_obstacle(
     camera : Camera
     box_px : (4,) float64
     category : str
-        Tells the typical size.
+        Its typical size is used.
     camera_xy : (2,) float64
         Position of the camera in the frame of the ground positions, m.
 

@@ -1,4 +1,4 @@
-"""Places of people of whom a LiDAR has too few points for a cluster: the image tells the direction, the points the depth.
+"""Places of people of whom a LiDAR has too few points for a cluster: the image gives the direction, the points the depth.
 
 A sensor with 32 layers has 2 to 6 points on a person at 20 to 30 m.
 """

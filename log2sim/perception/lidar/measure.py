@@ -100,7 +100,7 @@ def _continuation(
 
 
 def write_evidence(columns: dict[str, Any], k: int, members: NDArray[np.intp], cloud: Cloud) -> None:
-    """Write what the points at `members` (n,) show into row `k`; a box of a 3D detector tells the length from the width."""
+    """Write what the points at `members` (n,) show into row `k`; a box of a 3D detector says which side is the length."""
     xyz = cloud.xyz[members].astype(np.float64)
     xy, box_yaw = xyz[:, :2] - cloud.sensor[:2], float(columns["box_yaw_rad"][k])
     typical = np.array(TYPICAL_SIZE_M[str(columns["category"][k])])
