@@ -223,7 +223,8 @@ def second_pass(run: Run, observations: Observations) -> Result:
         candidates = decide_headings(candidates, ego_path(log, run.schedule), timeline)
         ego = ego_agent(log, timeline, run.poses.origin)
     with run.clock.stage("judge"):
-        recording = Recording(log, run.schedule, observations.obstacles, timeline)
+        seen = run.schedule.without_frames(observations.unseen)
+        recording = Recording(log, seen, observations.obstacles, timeline)
         judged = judge(candidates, ego, recording)
         agents = [candidate.agent for candidate in rate_agents(judged, timeline)]
         # Without an ego the agents' waypoints alone tell the ticks, so all of them stay.

@@ -289,3 +289,47 @@ def test_mode_paper_runs_from_the_log_to_the_scenario():
     scenario = reconstruct(log, config).scenario
     assert scenario.ego is not None
     assert scenario.others
+
+
+def with_records(log, **reads):
+    """The log with other records: by stream a function of the index."""
+    streams = {name: Stream(name, log.streams[name].t_ns, read) for name, read in reads.items()}
+    return log.changed(streams={**log.streams, **streams})
+
+
+def test_a_repeated_sweep_counts_as_not_recorded_and_is_told():
+    log, _ = driving_log()
+    sweep = log.streams["top"].read
+    out, _ = run(with_records(log, top=lambda i: sweep((0, 1, 1, 3)[i])))
+    assert [cloud is None for cloud in out.obstacles] == [False, False, True, False]
+    assert set(out.measurements[2].source) == {""}  # seen by the camera alone
+    assert [(f.kind, f.sensor, f.treatment, f.start_ns) for f in out.faults] == [
+        ("repeated_sweeps", "top", "left_out", STAMPS[2])
+    ]
+
+
+def test_pictures_that_repeat_while_the_ego_drives_are_not_used_and_told():
+    log, _ = driving_log()
+    picture = np.random.default_rng(0).integers(0, 255, (60, 120, 3), dtype=np.uint8).repeat(10, 0).repeat(10, 1)
+    out, _ = run(with_records(log, front=lambda i: picture))
+    assert out.unseen == {"front": [1, 2, 3]}
+    assert [len(m) for m in out.measurements] == [2, 0, 0, 0]
+    assert [(f.kind, f.sensor, f.values["count"]) for f in out.faults] == [("frozen_images", "front", 3)]
+
+
+@pytest.mark.parametrize("finds", [True, False])
+def test_a_black_picture_says_nothing_unless_something_is_found_in_it(finds):
+    log, _ = driving_log()
+    detector = Truth(log)
+    if not finds:
+        detector.detect = lambda frame: Detections.empty()
+    out, _ = run(log, detector)
+    assert out.unseen == ({} if finds else {"front": [0, 1, 2, 3]})
+    assert [f.kind for f in out.faults] == ([] if finds else ["black_images"])
+
+
+def test_with_boxes_from_the_log_no_picture_is_looked_at():
+    log, _ = driving_log()
+    out, _ = run(log, labels=True)
+    assert out.unseen == {}
+    assert out.faults == ()

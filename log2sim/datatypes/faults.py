@@ -11,6 +11,7 @@ from log2sim.geometry import NS_PER_S
 FAULT_KINDS = {
     "frozen_images": "a camera repeats a picture while the ego or the scene moves",
     "black_images": "pictures of a camera show nothing",
+    "missing_images": "a camera gives no pictures for longer than usual",
     "repeated_sweeps": "a LiDAR repeats a sweep",
     "missing_sweeps": "a LiDAR gives no sweeps for longer than usual",
     "sparse_sweeps": "sweeps have next to no points",

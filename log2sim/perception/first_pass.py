@@ -50,6 +50,8 @@ class Observations:
     frames_detected : int
     frames_skipped : mapping of str to int
         By camera.
+    unseen : mapping of str to list of int
+        Ticks at which a camera has a frame that shows nothing of them, by camera: unreadable, repeated, or black.
     faults : tuple of Fault
         Of the records.
     """
@@ -63,6 +65,7 @@ class Observations:
     sweeps: Counter[str] = field(default_factory=Counter)
     frames_detected: int = 0
     frames_skipped: Mapping[str, int] = field(default_factory=dict)
+    unseen: dict[str, list[int]] = field(default_factory=dict)
     faults: tuple[Fault, ...] = ()
 
 
@@ -100,6 +103,9 @@ def observe(
         clouds.prefetch(0)
         for tick in range(len(schedule)):
             found = {} if frames is None else frames.detections_at(tick)
+            for camera in plan.cameras if frames is not None else ():
+                if schedule.frames[camera][tick] >= 0 and camera not in found:
+                    out.unseen.setdefault(camera, []).append(tick)
             with clock.stage("cloud"):
                 ready = [clouds.cloud(tick, row) for row in range(schedule.rows)]
             if lidar_detector is not None:
@@ -113,7 +119,7 @@ def observe(
                 out.obstacles.append(None if ready[0] is None else obstacles_of(ready[0]))
             progress(tick + 1, len(schedule))
     records.require_some()
-    out.sweeps = clouds.compensated
+    out.sweeps, out.faults = clouds.compensated, records.watch.faults(schedule)
     if frames is not None:
         out.frames_detected, out.frames_skipped = frames.detected, frames.skipped
     return out

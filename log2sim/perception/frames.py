@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Detections, Frame, Log, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.perception.detect.detectors import Detector
+from log2sim.perception.record_checks.records import RecordWatch
+from log2sim.perception.record_checks.thumbnails import Thumbnail, shrink
 from log2sim.perception.sync import Schedule
 from log2sim.plan import Plan, Stage
 from log2sim.stage_clock import StageClock
@@ -28,12 +30,15 @@ class RecordReader:
         How many records of each stream were read.
     failed : dict of str to list of str
         Messages of the records that could not be read, by stream.
+    watch : RecordWatch
+        Which of them repeat others or show nothing.
     """
 
     def __init__(self, log: Log) -> None:
         self.log = log
         self.read: dict[str, int] = {}
         self.failed: dict[str, list[str]] = {}
+        self.watch = RecordWatch(log)
         self._lock = threading.Lock()
 
     def get(self, stream: str, index: int) -> Any | None:
@@ -93,17 +98,34 @@ class FrameDetector:
         self._log, self._schedule, self._detector, self._plan = log, schedule, detector, plan
         self._reader, self._pool, self._clock = reader, pool, clock
         self._pending: dict[int, dict[str, Detections]] = {}
+        self._thumbnails: dict[tuple[str, int], Thumbnail] = {}
         self.detected = 0
         self.skipped: dict[str, int] = {}
 
     def detections_at(self, tick: int) -> dict[str, Detections]:
-        """Return the detections of a tick by camera; must be called for every tick in order."""
+        """Return the detections of a tick by camera; must be called for every tick in order.
+
+        A camera is left out where its frame cannot be read, repeats an earlier one, or shows nothing: what it does not show
+        may be there.
+        """
         last, stride = len(self._schedule) - 1, self._plan.detector_stride
         if tick not in self._pending:
             self._pending[tick] = self._detect(tick, self._plan.cameras)
         if stride > 1 and tick < last and tick % stride == 0:
             self._detect_between(tick, min(tick + stride, last))
-        return self._pending.pop(tick)
+        found = self._pending.pop(tick)
+        return {camera: boxes for camera, boxes in found.items() if self._is_live(camera, tick, boxes)}
+
+    def _is_live(self, camera: str, tick: int, found: Detections) -> bool:
+        """Return whether a frame shows what is there; nothing is said of frames that are not decoded."""
+        if not self._plan.keeps(Stage.IMAGE_DECODING):
+            return True
+        watch, thumbnail = self._reader.watch.cameras[camera], self._thumbnails.pop((camera, tick), None)
+        t_ns = int(self._log.streams[camera].t_ns[self._schedule.frames[camera][tick]])
+        state = (
+            watch.assume_unchanged(t_ns) if thumbnail is None else watch.judge(t_ns, thumbnail, found=len(found) > 0)
+        )
+        return state == "live"
 
     def _detect_between(self, start: int, end: int) -> None:
         """Detect at the tick `end` and at those before it, except in cameras that are empty at `start` and `end`."""
@@ -122,8 +144,9 @@ class FrameDetector:
         frames = self._frames(tick, cameras)
         if self._plan.keeps(Stage.IMAGE_DECODING):
             with self._clock.stage("decode"):
-                readable = dict(zip(frames, self._pool.map(_is_readable, frames.values())))
-            frames = {name: frame for name, frame in frames.items() if readable[name]}
+                thumbnails = dict(zip(frames, self._pool.map(_thumbnail_of, frames.values())))
+            frames = {name: frame for name, frame in frames.items() if thumbnails[name] is not None}
+            self._thumbnails |= {(name, tick): small for name, small in thumbnails.items() if small is not None}
         with self._clock.stage("detect"):
             self.detected += len(frames)
             return {name: self._detector.detect(frame) for name, frame in frames.items()}
@@ -154,9 +177,9 @@ class _LazyImage:
         return self._image
 
 
-def _is_readable(frame: Frame) -> bool:
+def _thumbnail_of(frame: Frame) -> Thumbnail | None:
+    """Decode a frame and return a small copy; None where it cannot be read."""
     try:
-        frame.image()
+        return shrink(frame.image())
     except RecordError:
-        return False
-    return True
+        return None

@@ -15,6 +15,7 @@ from log2sim.perception.detect3d.detectors import LidarDetector
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.lidar.cloud import Cloud, assemble_cloud, cloud_origin, compensation_of
 from log2sim.perception.lidar.rays import sample_rays
+from log2sim.perception.record_checks.sweep_sketches import sketch_sweep
 from log2sim.perception.sync import Schedule
 from log2sim.plan import Plan, Stage
 
@@ -69,6 +70,7 @@ class CloudPrefetcher:
         self._counting = threading.Lock()
         self.compensated: Counter[str] = Counter()
         self._sweeps: dict[tuple[str, int], Future[Sweep | None]] = {}
+        self._latest: dict[str, Future[Sweep | None]] = {}
         self._clouds: dict[Key, Future[Cloud | None]] = {}
         self._boxes: dict[Key, Future[Boxes3D]] = {}
         self._earlier: list[Key] = []
@@ -83,9 +85,10 @@ class CloudPrefetcher:
         self._boxes = {k: v for k, v in self._boxes.items() if k in keys}
         self._sweeps = {k: v for k, v in self._sweeps.items() if k in sweeps}
         # What waits for something else goes after it: it must never keep that from being made.
-        for sweep in sweeps:
-            if sweep not in self._sweeps:
-                self._sweeps[sweep] = self._pool.submit(self._read, *sweep)
+        for name, i in sorted(sweeps):
+            if (name, i) not in self._sweeps:
+                reading = self._pool.submit(self._read, name, i, self._latest.get(name))
+                self._sweeps[name, i] = self._latest[name] = reading
         for key in keys:
             if key not in self._clouds:
                 read = {n: self._sweeps[n, i] for n, i in zip(self._schedule.sweeps, key) if i >= 0}
@@ -113,14 +116,19 @@ class CloudPrefetcher:
                 self._boxes[key] = self._pool.submit(_boxes_in, detector, self._clouds[key], earlier)
                 self._earlier = [*self._earlier, key][max(len(self._earlier) + 2 - self._options.sweeps, 0) :]
 
-    def _read(self, name: str, index: int) -> Sweep | None:
+    def _read(self, name: str, index: int, before: Future[Sweep | None] | None) -> Sweep | None:
+        """Read a sweep; None where it cannot be read or repeats another, which is known once those before it are read."""
         sweep: Sweep | None = self._records.get(name, index)
-        if sweep is not None:
-            kind = (
-                compensation_of(self._log, name, sweep) if self._plan.keeps(Stage.MOTION_COMPENSATION) else "left out"
-            )
-            with self._counting:
-                self.compensated[kind] += 1
+        sketch = None if sweep is None else sketch_sweep(self._log, name, sweep)
+        if before is not None:
+            before.exception()
+        if sweep is None or sketch is None:
+            return None
+        if self._records.watch.lidars[name].is_repeated(int(self._log.streams[name].t_ns[index]), sketch):
+            return None
+        kind = compensation_of(self._log, name, sweep) if self._plan.keeps(Stage.MOTION_COMPENSATION) else "left out"
+        with self._counting:
+            self.compensated[kind] += 1
         return sweep
 
     def _make(self, reading: dict[str, Future[Sweep | None]]) -> Cloud | None:

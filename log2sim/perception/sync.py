@@ -7,8 +7,8 @@ tick is a sweep of the reference LiDAR.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -58,6 +58,14 @@ class Schedule:
     def reference_row(self) -> int:
         """Row of `sweeps` that belongs to the reference."""
         return list(self.frames).index(self.reference) if self.frames else 0
+
+    def without_frames(self, ticks: Mapping[str, Sequence[int]]) -> Schedule:
+        """Return the schedule without the frames of some ticks by camera, as if they had not been recorded."""
+        frames = dict(self.frames)
+        for camera, left_out in ticks.items():
+            frames[camera] = frames[camera].copy()
+            frames[camera][list(left_out)] = -1
+        return replace(self, frames=frames)
 
     def summary(self) -> dict[str, Any]:
         """Summarize residuals by stream for the report: median and largest magnitude in s, and the number of ticks without a record."""
