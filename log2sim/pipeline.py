@@ -23,6 +23,7 @@ from log2sim.datatypes import Fault, Log, Scenario
 from log2sim.errors import NothingToReconstruct
 from log2sim.localization.choice import localize
 from log2sim.localization.pose_choice import GIVEN, PoseChoice
+from log2sim.logs.time_checks import say_without_pose
 from log2sim.outcome import RunOutputs, stage_outcomes
 from log2sim.perception.detect.detectors import Detector, create_detector
 from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector
@@ -230,7 +231,9 @@ def second_pass(run: Run, observations: Observations) -> Result:
         # Without an ego the agents' waypoints alone tell the ticks, so all of them stay.
         agents = simplify(agents) if ego is not None else agents
     if ego is None and not agents:
-        raise NothingToReconstruct(f"{log.name}: no ego poses, and no object was detected in {len(t_ns)} ticks")
+        raise NothingToReconstruct(
+            f"{log.name}: {say_without_pose(log, t_ns)}, and no object was detected in {len(t_ns)} ticks"
+        )
     outputs = RunOutputs(observations, measurements, homographies, tuple(agents), run.clock)
     outcomes = stage_outcomes(plan, outputs)
     faults = [fault.to_dict(int(t_ns[0])) for fault in (*run.faults, *observations.faults)]

@@ -10,6 +10,9 @@ import numpy as np
 from log2sim.config import AUTO, Config
 from log2sim.datatypes import Log
 from log2sim.errors import ConfigError, LogError
+from log2sim.geometry import NS_PER_S
+from log2sim.logs.calibration_checks import problems_of
+from log2sim.logs.time_checks import Span, say_apart
 from log2sim.registry import nearest
 
 # Largest departure of R R^T from 1: calibration files round to five digits or more.
@@ -73,10 +76,12 @@ def select_sensors(log: Log, config: Config) -> Sensors:
     ConfigError
         For a camera that the log does not have or that the detector does not use.
     LogError
-        For a log without a sensor that the detector needs, or with a calibration that no sensor can have.
+        For a log without a sensor that the detector needs, with a calibration that no sensor can have, or with poses of the ego
+        at other times than the records.
     """
     cameras = _cameras(log, config)
     _check_calibration(log, cameras)
+    _check_pose_times(log, cameras)
     far = _lidars_out_of_range(log, config.measure.max_range_m)
     lidars = tuple(n for n in log.lidars if n not in far)
     if config.detect.in_sweeps and not lidars:
@@ -126,6 +131,22 @@ def _check_calibration(log: Log, cameras: tuple[str, ...]) -> None:
                 f"camera '{name}': its intrinsics K are {k.tolist()}; expected finite numbers, positive focal lengths and "
                 "0, 0, 1 in the last row"
             )
+    for name in (*cameras, *log.lidars):
+        for problem in problems_of(log, name):
+            if problem.is_impossible:
+                raise LogError(problem.message)
+
+
+def _check_pose_times(log: Log, cameras: tuple[str, ...]) -> None:
+    """Raise `LogError` when the ego has poses, but at other times than all records of the sensors on it."""
+    mounts = {n: log.cameras[n].mount for n in cameras} or {n: lidar.mount for n, lidar in log.lidars.items()}
+    stamps = [log.streams[name].t_ns for name in mounts if name in log.streams and len(log.streams[name].t_ns)]
+    if log.ego is None or not stamps or "map" in mounts.values():
+        return
+    records = Span.of("frames" if cameras else "sweeps", np.concatenate(stamps))
+    poses = Span.of("ego poses", log.ego.t_ns)
+    if poses.is_apart(records, round(log.ego.extrapolate_s * NS_PER_S)):
+        raise LogError(f"{log.name}: {say_apart(poses, records)}; correct the stamps, or choose --poses lidar")
 
 
 def _lidars_out_of_range(log: Log, max_range_m: float) -> set[str]:

@@ -227,8 +227,9 @@ def test_a_stamp_out_of_order_is_put_in_place_and_told(log_folder: Path, stamp: 
     line("front/index.csv", 4, f"{stamp},front/000002.jpg")(log_folder)
     ran = reconstruct(log_folder)
     assert ran.code == 0
-    (note,) = report_of(log_folder)["log"]["notes"]
+    note, *boxes = report_of(log_folder)["log"]["notes"]
     assert all(word in note for word in (*words, str(stamp)))
+    assert all("boxes in images of 'front' are at stamps of no frame" in line for line in boxes)
     assert f"note: {note}" in ran.out
     assert run("validate", log_folder).code == 3
 

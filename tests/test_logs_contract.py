@@ -18,8 +18,10 @@ from log2sim import registry
 from log2sim.datatypes import CATEGORIES, Labels, Log, Stream, Sweep
 from log2sim.errors import ConfigError, Log2SimError, LogError, RecordError
 from log2sim.geometry import NS_PER_S, Array, apply, inverse, project
+from log2sim.logs.calibration_checks import list_calibration_problems
 from log2sim.logs.images import decode_image
 from log2sim.logs.opening import open_log
+from log2sim.logs.time_checks import list_time_problems
 from log2sim.perception.lidar.cloud import deskew, has_motion, transform_rigidly
 
 # Opening may read the index, and where a size is stated nowhere else the first image; images are nearly all of a log.
@@ -188,6 +190,16 @@ def points_on(log: Log, lidar: str, i: int, track: str) -> tuple[Array, Array]:
 
 def test_every_built_in_reader_is_under_contract() -> None:
     assert set(ENCODERS) == set(registry.BUILT_IN["log"])
+
+
+def test_a_sound_log_gets_no_line_of_damage(log: Log) -> None:
+    assert list_time_problems(log) == []
+    assert list_calibration_problems(log) == []
+
+
+def test_every_sensor_says_where_its_calibration_stands(log: Log, path: Path) -> None:
+    assert set(log.calibrations) >= set(log.cameras)
+    assert all(Path(path.parts[-1]).stem in place for place in log.calibrations.values())
 
 
 def test_opening_reads_no_sweep_and_no_image(name: str, path: Path, copy: Path) -> None:

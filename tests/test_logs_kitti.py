@@ -270,10 +270,29 @@ def test_a_missing_calibration_and_a_cut_sweep(raw: Path) -> None:
         open_log(raw)
 
 
-def test_a_bad_label_line_is_named(tracking: Path) -> None:
-    with (tracking / "training" / "label_02" / "0007.txt").open("a") as file:
-        file.write("3 7 Spaceship 0 0\n")
-    with pytest.raises(LogError, match=r"0007.txt, line 4"):
+@pytest.mark.parametrize(
+    "line",
+    [
+        "3 7 Spaceship 0 0",
+        "3 7 Car 0 0 0 1 2 30 20 1.5",
+        "3 7 Car 0 0 x 1 2 30 20 1 1 1 1 1 1 1",
+        "2" * 30 + " 7 Car" + " 1" * 14,
+        "3 7 Car" + " 1" * 17,
+    ],
+)
+def test_a_damaged_label_line_is_left_out_and_counted(tracking: Path, line: str) -> None:
+    file = tracking / "training" / "label_02" / "0007.txt"
+    before = open_log(tracking)
+    file.write_text(file.read_text() + line + "\n")
+    log = open_log(tracking)
+    assert log.labels.track_id.tolist() == before.labels.track_id.tolist()
+    (note,) = set(log.notes) - set(before.notes)
+    assert note.startswith(f"1 of 4 rows of labels are damaged and left out, first: {file}, line 4: ")
+
+
+def test_a_file_without_a_line_that_is_a_label_is_refused(tracking: Path) -> None:
+    (tracking / "training" / "label_02" / "0007.txt").write_text("frame,id\n1,2\n")
+    with pytest.raises(LogError, match=r"0007.txt, line 1"):
         open_log(tracking)
 
 

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from log2sim.datatypes import CATEGORIES, EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import Camera, PoseTrack, RollingShutter, rotation_from_rpy, transform
+from log2sim.logs.calibration_checks import list_calibration_problems
 from log2sim.logs.images import read_image
 from log2sim.logs.kitti.drive import parse_oxts
 from log2sim.logs.kitti.labels import parse_labels
@@ -26,6 +27,7 @@ from log2sim.logs.native.writer import write_log
 from log2sim.logs.opening import open_log
 from log2sim.logs.pandaset.unpickle import read_pickled_table
 from log2sim.logs.sweeps import read_sweep
+from log2sim.logs.time_checks import list_time_problems
 
 quick = settings(
     max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
@@ -281,7 +283,7 @@ def labels_of(draw: st.DrawFn, t_ns: np.ndarray, far: float) -> Labels:
 def test_any_small_log_survives_writing_and_reading(tmp_path: Path, log: Log) -> None:
     write_log(log, tmp_path / "log", overwrite=True)
     back = open_log(tmp_path / "log")
-    assert back.notes == ()
+    assert back.notes == (*list_calibration_problems(back), *list_time_problems(back))
     offset = np.array(back.map.offset_m)
     for name, stream in log.streams.items():
         np.testing.assert_array_equal(back.streams[name].t_ns, stream.t_ns)

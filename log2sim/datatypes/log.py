@@ -190,6 +190,8 @@ class Log:
         SHA-256 over the log's index.
     notes : tuple of str
         Remarks of the reader for the report; may be given as a function.
+    calibrations : mapping of str to str
+        By sensor: where its calibration stands, for messages.
     details : mapping of str to Any
         What only this format has, as JSON values, for `log2sim inspect`; for example the topics of a bag.
     """
@@ -209,6 +211,7 @@ class Log:
     reference_camera: str | None = None
     digest: str = ""
     notes: Deferred[tuple[str, ...]] = Deferred(())
+    calibrations: Mapping[str, str] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)
 
     def changed(self, **changes: Any) -> Log:

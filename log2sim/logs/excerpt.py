@@ -19,6 +19,8 @@ from log2sim.registry import nearest
 RECORD_MARGIN_NS = 200_000_000
 # Stamps of labels and frames of one moment differ by rounding in some logs.
 STAMP_TOLERANCE_NS = 1_000_000
+# Labels are interpolated where they come at 1 Hz or denser; farther from a record they say nothing about it.
+MAX_LABEL_DISTANCE_NS = 1_100_000_000
 
 
 @dataclass(frozen=True)
@@ -59,12 +61,12 @@ def cut_log(log: Log, *, cameras: Sequence[str] = (), start_s: float | None = No
         return log
     chosen = {name: camera for name, camera in log.cameras.items() if not cameras or name in cameras}
     streams = {name: log.streams[name] for name in (*chosen, *log.lidars)}
-    reference = _reference(log, list(chosen))
+    reference = reference_of(log, list(chosen))
     ticks = log.streams[reference].t_ns
     span = None if start_s is None and stop_s is None else _span(ticks, reference, start_s, stop_s)
     notes: list[str] = []
+    margins = {name: 0 if name == reference else RECORD_MARGIN_NS for name in streams}
     if span is not None:
-        margins = {name: 0 if name == reference else RECORD_MARGIN_NS for name in streams}
         streams = {name: _cut_stream(stream, span, margins[name]) for name, stream in streams.items()}
         notes = [f"{name}: no record from --start to --stop" for name, s in streams.items() if not len(s.t_ns)]
         streams = {name: stream for name, stream in streams.items() if len(stream.t_ns)}
@@ -79,20 +81,22 @@ def cut_log(log: Log, *, cameras: Sequence[str] = (), start_s: float | None = No
         ego_vehicle=log.ego_vehicle,
         map=log.map,
         labels=lambda: _cut_labels(log.labels, list(kept), span),
-        image_labels={n: _cut_image_labels(labels, span) for n, labels in log.image_labels.items() if n in kept},
-        ignored_regions={n: _cut_regions(regions, span) for n, regions in log.ignored_regions.items() if n in kept},
+        image_labels={n: _cut_image_labels(b, span, margins[n]) for n, b in log.image_labels.items() if n in kept},
+        ignored_regions={n: _cut_regions(r, span, margins[n]) for n, r in log.ignored_regions.items() if n in kept},
         ground_z_ego_m=log.ground_z_ego_m,
         reference_camera=log.reference_camera if log.reference_camera in kept else None,
         digest=hashlib.sha256(f"{log.digest} {sorted(streams)} {span}".encode()).hexdigest(),
         notes=lambda: (*log.notes, *notes),
+        calibrations=log.calibrations,
         details=log.details,
     )
 
 
-def _reference(log: Log, cameras: list[str]) -> str:
-    """Choose the sensor whose records are the ticks, as reconstruction does."""
+def reference_of(log: Log, cameras: Sequence[str]) -> str:
+    """Return the sensor whose records are the ticks, as reconstruction chooses it: of some cameras, without any a LiDAR."""
     if cameras:
-        return log.reference_camera if log.reference_camera in cameras else cameras[0]
+        wanted = log.reference_camera
+        return wanted if wanted is not None and wanted in cameras else cameras[0]
     return max(log.lidars, key=lambda name: len(log.streams[name].t_ns))
 
 
@@ -154,9 +158,10 @@ def _cut_labels(labels: Labels | None, cameras: list[str], span: _Span | None) -
 
 
 def _with_neighbors(t_ns: NDArray[np.int64], rows: NDArray[np.intp], span: _Span) -> NDArray[np.bool_]:
-    """Mark (N,) those of `rows` in the span, and of the others the last before and the first after it."""
+    """Mark (N,) those of `rows` in the span, and of the others the last before and the first after it, unless far from it."""
     mark = np.zeros(len(t_ns), dtype=bool)
     mark[rows[span.contains(t_ns[rows], 0)]] = True
+    rows = rows[span.contains(t_ns[rows], MAX_LABEL_DISTANCE_NS)]
     before, after = rows[t_ns[rows] < span.first_ns], rows[t_ns[rows] > span.last_ns]
     if len(before):
         mark[before[np.argmax(t_ns[before])]] = True
@@ -165,15 +170,17 @@ def _with_neighbors(t_ns: NDArray[np.int64], rows: NDArray[np.intp], span: _Span
     return mark
 
 
-def _cut_image_labels(labels: ImageLabels, span: _Span | None) -> ImageLabels:
+def _cut_image_labels(labels: ImageLabels, span: _Span | None, margin_ns: int) -> ImageLabels:
+    """Keep the boxes of the frames that are kept."""
     if span is None:
         return labels
-    rows = span.contains(labels.t_ns, RECORD_MARGIN_NS + STAMP_TOLERANCE_NS)
+    rows = span.contains(labels.t_ns, margin_ns + STAMP_TOLERANCE_NS)
     return ImageLabels(labels.t_ns[rows], labels.box_px[rows], labels.category[rows])
 
 
-def _cut_regions(regions: ImageRegions, span: _Span | None) -> ImageRegions:
+def _cut_regions(regions: ImageRegions, span: _Span | None, margin_ns: int) -> ImageRegions:
+    """Keep the regions of the frames that are kept."""
     if span is None:
         return regions
-    rows = span.contains(regions.t_ns, RECORD_MARGIN_NS + STAMP_TOLERANCE_NS)
+    rows = span.contains(regions.t_ns, margin_ns + STAMP_TOLERANCE_NS)
     return ImageRegions(regions.t_ns[rows], regions.box_px[rows])

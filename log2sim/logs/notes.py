@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
+
+from log2sim.errors import LogError
 
 
 def count_words(words: Iterable[str]) -> str:
@@ -29,6 +31,29 @@ def note_left_out(kinds: Iterable[str], no_road_users: Collection[str], notes: l
         words = [kind for kind in kinds if (kind in no_road_users) == known]
         if words:
             notes.append(f"labels left out because {reason}: {count_words(words)}")
+
+
+def note_damaged_rows(damaged: Sequence[str], total: int, notes: list[str]) -> None:
+    """Note the rows of a text that are left out because they cannot be read.
+
+    Parameters
+    ----------
+    damaged : sequence of str
+        Where each of them is and what is wrong with it.
+    total : int
+        Of all rows.
+    notes : list of str
+        Takes a note where there are such rows.
+
+    Raises
+    ------
+    LogError
+        When no row can be read.
+    """
+    if damaged and len(damaged) == total:
+        raise LogError(damaged[0])
+    if damaged:
+        notes.append(f"{len(damaged)} of {total} rows of labels are damaged and left out, first: {damaged[0]}")
 
 
 def defer_notes(notes: list[str], *readings: Callable[[], object]) -> Callable[[], tuple[str, ...]]:

@@ -8,8 +8,10 @@ from log2sim import registry
 from log2sim.datatypes import Log
 from log2sim.errors import ConfigError, LogError
 from log2sim.links import following_links
+from log2sim.logs.calibration_checks import list_calibration_problems
 from log2sim.logs.guarding import guard_log, translate_parser_errors
 from log2sim.logs.reader import Reader
+from log2sim.logs.time_checks import list_time_problems
 
 __all__ = ["Reader", "find_reader", "open_log"]
 
@@ -52,10 +54,9 @@ def open_log(
     with following_links(follow_links), translate_parser_errors(f"{root}: cannot be read as format '{name}'", LogError):
         log = guard_log(reader.open(root, chosen), str(root))
     others = _other_formats(root, name) if format == "auto" else []
-    if not others:
-        return log
-    note = f"{root} holds logs of other formats, too: {', '.join(others)}; --format chooses one"
-    return log.changed(notes=lambda: (note, *log.notes))  # notes may wait for labels
+    notes = [f"{root} holds logs of other formats, too: {', '.join(others)}; --format chooses one"] if others else []
+    # Notes may wait for labels.
+    return log.changed(notes=lambda: (*notes, *log.notes, *list_calibration_problems(log), *list_time_problems(log)))
 
 
 def find_reader(root: Path) -> str:

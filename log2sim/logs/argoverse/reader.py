@@ -133,6 +133,7 @@ class _Folder:
             reference_camera=REFERENCE_CAMERA if REFERENCE_CAMERA in cameras else None,
             digest=self._digest(),
             notes=defer_notes(notes, labels),
+            calibrations={n: str(self.path / (INTRINSICS if n in cameras else MOUNTS)) for n in streams},
             details={"city": city},
         )
 

@@ -13,6 +13,7 @@ from log2sim.datatypes import ImageLabels, ImageRegions, Labels
 from log2sim.errors import LogError
 from log2sim.geometry import Array, PoseTrack, apply, wrap_angle
 from log2sim.logs.kitti import drive
+from log2sim.logs.notes import note_damaged_rows
 
 CATEGORY_OF = {
     "Car": "car",
@@ -30,6 +31,10 @@ NEVER_LABELED = ("bicycle",)
 """No class is for bicycles without riders (Geiger et al., "Vision meets robotics", 2013, section III)."""
 
 LABEL_FIELDS = 17
+RESULT_FIELDS = 18
+"""Of a line that ends with a score."""
+# A day and more at 10 Hz; stamps of much larger numbers do not fit into int64 ns.
+MAX_FRAME = 1_000_000
 CAMERA = "image_02"
 
 
@@ -78,9 +83,13 @@ class LabelRows:
 
 
 def read_labels(
-    path: Path, rig: drive.Rig, track: PoseTrack, stamp_of: Callable[[NDArray[np.int64]], NDArray[np.int64]]
+    path: Path,
+    rig: drive.Rig,
+    track: PoseTrack,
+    stamp_of: Callable[[NDArray[np.int64]], NDArray[np.int64]],
+    notes: list[str],
 ) -> DriveLabels:
-    """Read a label file; `stamp_of` gives the stamps (L,) of frame numbers (L,).
+    """Read a label file; `stamp_of` gives the stamps (L,) of frame numbers (L,), `notes` takes what was left out.
 
     Notes
     -----
@@ -88,7 +97,10 @@ def read_labels(
     be labeled are marked by boxes of the type DontCare.
     """
     text = drive.read_text(path)
-    return labels_of_rows(parse_labels(text, path), rig.ego_T_rect, track, stamp_of, text)
+    damaged: list[str] = []
+    rows = parse_labels(text, path, damaged)
+    note_damaged_rows(damaged, len(rows.frame) + len(damaged), notes)
+    return labels_of_rows(rows, rig.ego_T_rect, track, stamp_of, text)
 
 
 def labels_of_rows(
@@ -139,23 +151,36 @@ def labels_of_rows(
     )
 
 
-def parse_labels(text: str, path: Path) -> LabelRows:
-    """Parse the lines of a label file; a `LogError` names the one that is wrong."""
+def parse_labels(text: str, path: Path, damaged: list[str] | None = None) -> LabelRows:
+    """Parse the lines of a label file.
+
+    Parameters
+    ----------
+    text : str
+    path : Path
+        For messages.
+    damaged : list of str, optional
+        Takes a message for each line that is wrong, which is left out.
+
+    Raises
+    ------
+    LogError
+        Naming the first line that is wrong, without `damaged`.
+    """
     frames, ids, types, values = [], [], [], []
     for k, line in enumerate(text.splitlines(), start=1):
         words = line.split()
         if not words:
             continue
-        if len(words) < LABEL_FIELDS or (words[2] not in CATEGORY_OF and words[2] != NOT_LABELED):
-            known = ", ".join([*CATEGORY_OF, NOT_LABELED])
-            raise LogError(f"{path}, line {k}: expected frame, track id, type ({known}) and {LABEL_FIELDS - 3} numbers")
         try:
-            row = [float(word) for word in words[3:LABEL_FIELDS]]
-            frames.append(int(words[0]))
-        except ValueError:
-            raise LogError(f"{path}, line {k}: expected numbers after the type, found '{line[:60]}'") from None
-        if not np.isfinite(row).all():
-            raise LogError(f"{path}, line {k}: a number is not finite")
+            frame, row = _parse_words(words)
+        except ValueError as problem:
+            message = f"{path}, line {k}: {problem}"
+            if damaged is None:
+                raise LogError(message) from None
+            damaged.append(message)
+            continue
+        frames.append(frame)
         ids.append(words[1])
         types.append(words[2])
         values.append(row)
@@ -163,6 +188,22 @@ def parse_labels(text: str, path: Path) -> LabelRows:
     return LabelRows(
         np.array(frames, dtype=np.int64), np.array(ids, dtype="<U16"), np.array(types, dtype="<U16"), table
     )
+
+
+def _parse_words(words: list[str]) -> tuple[int, list[float]]:
+    """Return the number of the frame and the numbers after the type of a line; `ValueError` says what is wrong with it."""
+    if not LABEL_FIELDS <= len(words) <= RESULT_FIELDS or (words[2] not in CATEGORY_OF and words[2] != NOT_LABELED):
+        known = ", ".join([*CATEGORY_OF, NOT_LABELED])
+        raise ValueError(f"expected frame, track id, type ({known}) and {LABEL_FIELDS - 3} numbers")
+    try:
+        frame, row = int(words[0]), [float(word) for word in words[3:LABEL_FIELDS]]
+    except ValueError:
+        raise ValueError(f"expected numbers after the type, found '{' '.join(words)[:60]}'") from None
+    if not np.isfinite(row).all():
+        raise ValueError("a number is not finite")
+    if not 0 <= frame <= MAX_FRAME:
+        raise ValueError(f"frame {words[0][:20]}, expected 0 to {MAX_FRAME}")
+    return frame, row
 
 
 def boxes_in_map(map_T_rect: Array, values: Array) -> tuple[Array, Array, Array]:

@@ -22,6 +22,7 @@ from log2sim.logs.digest import digest_of
 from log2sim.logs.images import first_image_size, image_stream
 from log2sim.logs.kitti import drive
 from log2sim.logs.kitti.labels import CAMERA, DriveLabels, LabelRows, labels_of_rows, parse_labels
+from log2sim.logs.notes import note_damaged_rows
 from log2sim.logs.record_files import list_numbered_files
 from log2sim.logs.sweeps import read_sweep, sweep_of
 
@@ -154,9 +155,9 @@ class _Split:
             cameras[CAMERA] = first.camera(*size_px)
             streams[CAMERA] = image_stream(CAMERA, _stamps(images), list(images.values()), size_px)
         ego = PoseTrack(t_ns, np.repeat(np.eye(4)[None], len(t_ns), axis=0))
-        labels = self._labels(first, ego)
-        ground_z_m = 0.0 if first.knows_ground else _ground_under(labels.boxes_3d)
         notes = [SINGLE_FRAMES]
+        labels = self._labels(first, ego, notes)
+        ground_z_m = 0.0 if first.knows_ground else _ground_under(labels.boxes_3d)
         others = sum(not np.allclose(c.P, first.P, rtol=1e-2, atol=1e-3) for c in calibrations.values())
         if others:
             notes.append(f"{others} of {len(t_ns)} frames have another P2 by more than 1 %; that of the first is used")
@@ -175,6 +176,9 @@ class _Split:
             reference_camera=CAMERA if cameras else None,
             digest=digest_of([*texts, labels.text], self.sweeps.values()),
             notes=tuple(notes),
+            calibrations=dict.fromkeys(
+                streams, str(self.base / "calib" / f"{next(iter(self.sweeps.values())).stem}.txt")
+            ),
         )
 
     def _calibrations(self) -> tuple[dict[int, _Calibration], list[str]]:
@@ -200,9 +204,9 @@ class _Split:
 
         return Stream("velodyne", t_ns, read)
 
-    def _labels(self, first: _Calibration, ego: PoseTrack) -> DriveLabels:
+    def _labels(self, first: _Calibration, ego: PoseTrack, notes: list[str]) -> DriveLabels:
         """Read the labels of all frames; each object is a track of its own."""
-        parts, texts, labeled = [], [], []
+        parts, texts, labeled, damaged = [], [], [], list[str]()
         for number, file in self.sweeps.items():
             path = self.base / "label_2" / f"{file.stem}.txt"
             if path.is_file():
@@ -210,7 +214,7 @@ class _Split:
                 lines = [
                     f"{number} {number}-{k} {line}" if line.strip() else "" for k, line in enumerate(text.splitlines())
                 ]
-                parts.append(parse_labels("\n".join(lines), path))
+                parts.append(parse_labels("\n".join(lines), path, damaged))
                 texts.append(text)
                 labeled.append(number * PERIOD_NS)
         if not parts:
@@ -218,6 +222,7 @@ class _Split:
         rows = LabelRows(
             *(np.concatenate([getattr(p, k) for p in parts]) for k in ("frame", "track_id", "type", "values"))
         )
+        note_damaged_rows(damaged, len(rows.frame) + len(damaged), notes)
         found = labels_of_rows(rows, first.ego_T_rect, ego, lambda frame: frame * PERIOD_NS, "\n".join(texts))
         assert found.boxes_3d is not None
         return replace(found, boxes_3d=replace(found.boxes_3d, labeled_ns=np.array(labeled, dtype=np.int64)))

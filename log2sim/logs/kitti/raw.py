@@ -81,7 +81,7 @@ class _Drive:
         if not streams:
             raise LogError(f"{self.path}: neither images (image_00 to image_03) nor velodyne_points in it")
         track = PoseTrack(ego_t_ns, poses)
-        labels = self._labels(rig, track)
+        labels = self._labels(rig, track, notes)
         texts = [drive.read_text(self.path.parent / name) for name in CALIBRATION]
         return Log(
             name=self.path.name,
@@ -98,6 +98,7 @@ class _Drive:
             reference_camera=next((c for c in REFERENCE_CAMERAS if c in cameras), None),
             digest=digest_of([*texts, labels.text], sorted(self.path.glob("*/data/*"))),
             notes=tuple(notes),
+            calibrations={n: str(self.path.parent / CALIBRATION[0 if n in cameras else 1]) for n in streams},
         )
 
     def _rig(self) -> drive.Rig:
@@ -143,7 +144,7 @@ class _Drive:
         poses, map_frame = drive.poses_from_oxts(np.array(rows))
         return t_ns, poses, map_frame
 
-    def _labels(self, rig: drive.Rig, track: PoseTrack) -> DriveLabels:
+    def _labels(self, rig: drive.Rig, track: PoseTrack, notes: list[str]) -> DriveLabels:
         path, times = self.path / LABELS, self.path / LABELED_CAMERA / "timestamps.txt"
         if not path.is_file():
             return DriveLabels()
@@ -157,7 +158,7 @@ class _Drive:
                 )
             return stamps[frame]
 
-        return read_labels(path, rig, track, stamp_of)
+        return read_labels(path, rig, track, stamp_of, notes)
 
     def _records(
         self, name: str, suffixes: tuple[str, ...], notes: list[str]

@@ -73,7 +73,8 @@ class _Sequence:
             raise LogError(f"{oxts_file}: no records; a stream needs at least one")
         poses, map_frame = drive.poses_from_oxts(rows)
         track = PoseTrack(np.arange(len(rows), dtype=np.int64) * PERIOD_NS, poses)
-        labels = self._labels(rig, track)
+        notes = [NO_STAMPS]
+        labels = self._labels(rig, track, notes)
         records = sorted(p for folder in streams for p in (self.base / folder / self.name).iterdir())
         calibration = drive.read_text(self.base / "calib" / f"{self.name}.txt")
         return Log(
@@ -90,7 +91,8 @@ class _Sequence:
             ignored_regions=labels.ignored,
             reference_camera="image_02",
             digest=digest_of([calibration, oxts, labels.text], records),
-            notes=(NO_STAMPS,),
+            notes=tuple(notes),
+            calibrations=dict.fromkeys(streams, str(self.base / "calib" / f"{self.name}.txt")),
         )
 
     def _rig(self) -> drive.Rig:
@@ -129,9 +131,11 @@ class _Sequence:
             )
         return files
 
-    def _labels(self, rig: drive.Rig, track: PoseTrack) -> DriveLabels:
+    def _labels(self, rig: drive.Rig, track: PoseTrack, notes: list[str]) -> DriveLabels:
         path = self.base / "label_02" / f"{self.name}.txt"
-        return read_labels(path, rig, track, lambda frame: frame * PERIOD_NS) if path.is_file() else DriveLabels()
+        if not path.is_file():
+            return DriveLabels()
+        return read_labels(path, rig, track, lambda frame: frame * PERIOD_NS, notes)
 
 
 def _nominal_stamps(files: dict[int, Path]) -> NDArray[np.int64]:

@@ -66,7 +66,13 @@ class CsvTable:
         return f"{self.path}, line {self.line[row]}, field '{field}'"
 
 
-def read_csv_table(path: Path, columns: Mapping[str, str], optional: Mapping[str, str] | None = None) -> CsvTable:
+def read_csv_table(
+    path: Path,
+    columns: Mapping[str, str],
+    optional: Mapping[str, str] | None = None,
+    *,
+    damaged: list[str] | None = None,
+) -> CsvTable:
     """Read a CSV file with a header.
 
     Parameters
@@ -74,6 +80,8 @@ def read_csv_table(path: Path, columns: Mapping[str, str], optional: Mapping[str
     path : Path
     columns, optional : mapping of name to "int", "float", "bool" or "str"
         Columns that must and that may be there, in any order. An unknown one is an error.
+    damaged : list of str, optional
+        Takes a message for each row with fewer or more fields than the header, which is left out; else it is an error.
 
     Raises
     ------
@@ -91,11 +99,18 @@ def read_csv_table(path: Path, columns: Mapping[str, str], optional: Mapping[str
         raise LogError(f"{path}: is empty; expected the header {','.join(columns)}")
     header = [name.strip() for name in rows[0][1]]
     _check_header(path, header, columns, kinds)
-    line = np.array([n for n, _ in rows[1:]], dtype=np.int64)
-    for n, row in rows[1:]:
-        if len(row) != len(header):
-            raise LogError(f"{path}, line {n}: {len(row)} fields, the header has {len(header)}")
-    cells = {name: [row[k].strip() for _, row in rows[1:]] for k, name in enumerate(header)}
+    wrong = [
+        f"{path}, line {n}: {len(row)} fields, the header has {len(header)}"
+        for n, row in rows[1:]
+        if len(row) != len(header)
+    ]
+    if wrong and damaged is None:
+        raise LogError(wrong[0])
+    if damaged is not None:
+        damaged += wrong
+    whole = [(n, row) for n, row in rows[1:] if len(row) == len(header)]
+    line = np.array([n for n, _ in whole], dtype=np.int64)
+    cells = {name: [row[k].strip() for _, row in whole] for k, name in enumerate(header)}
     values = {name: _parse(path, line, name, text, kinds[name]) for name, text in cells.items()}
     return CsvTable(path, values, line, hashlib.sha256(data).hexdigest())
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, Sweep
+from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream
 from log2sim.documents import JSON_LIMIT_BYTES, check, read_json
 from log2sim.errors import LogError
 from log2sim.geometry import (
@@ -39,9 +38,10 @@ from log2sim.logs.native.labels import (
     regions_2d,
 )
 from log2sim.logs.native.offset import offset_of, shifted_camera, shifted_labels, shifted_lidar
+from log2sim.logs.native.sweep_files import SweepFiles
+from log2sim.logs.notes import note_damaged_rows
 from log2sim.logs.pose_checks import QUATERNION_TOLERANCE, find_not_unit
 from log2sim.logs.stamps import strictly_increasing
-from log2sim.logs.sweeps import read_sweep
 
 MANIFEST = "log.json"
 
@@ -134,13 +134,20 @@ class _Folder:
             reference_camera=m.get("reference_camera"),
             digest=self.hash.hexdigest(),
             notes=tuple(self.notes),
+            calibrations={e["name"]: f"{self.file}, sensors[{k}]" for k, e in enumerate(m["sensors"])},
         )
 
     def table(
-        self, relative: str, field: str, columns: Mapping[str, str], optional: Mapping[str, str] | None = None
+        self,
+        relative: str,
+        field: str,
+        columns: Mapping[str, str],
+        optional: Mapping[str, str] | None = None,
+        damaged: list[str] | None = None,
     ) -> CsvTable:
-        """Read a table that the manifest names under `field`."""
-        table = read_csv_table(inside(self.root, relative, f"{self.file}, field '{field}'"), columns, optional)
+        """Read a table that the manifest names under `field`; rows that are cut go to `damaged`, else they are an error."""
+        path = inside(self.root, relative, f"{self.file}, field '{field}'")
+        table = read_csv_table(path, columns, optional, damaged=damaged)
         self.hash.update(table.sha256.encode())
         return table
 
@@ -238,12 +245,13 @@ class _Folder:
             size_px = entry["intrinsics"]["width_px"], entry["intrinsics"]["height_px"]
             return image_stream(entry["name"], t_ns, files, size_px)
         compensated = table.columns.get("compensated_ns")
-        sweeps = _SweepFiles(files, t_ns, frame, offset, None if compensated is None else compensated[keep])
+        sweeps = SweepFiles(files, t_ns, frame, offset, None if compensated is None else compensated[keep])
         return Stream(entry["name"], t_ns, sweeps.read)
 
     def _labels(self) -> Labels | None:
         entry = self.manifest.get("labels", {})
-        if "boxes_3d" not in entry:
+        table = self._label_table("boxes_3d", BOX_3D_COLUMNS, BOX_3D_OPTIONAL)
+        if table is None:
             return None
         names = [s["name"] for s in self.manifest["sensors"] if s["kind"] == "camera"]
         for name in entry.get("cameras", ()):
@@ -251,7 +259,7 @@ class _Folder:
                 raise LogError(
                     f"{self.file}, field 'labels.cameras': no camera '{name}'; there are: {', '.join(sorted(names))}"
                 )
-        labels = boxes_3d(self.table(entry["boxes_3d"], "labels.boxes_3d", BOX_3D_COLUMNS, BOX_3D_OPTIONAL))
+        labels = boxes_3d(table)
         labeled = self._label_table("labeled", LABELED_COLUMNS)
         return replace(
             labels,
@@ -260,9 +268,16 @@ class _Folder:
             never_labeled=tuple(entry.get("never_labeled", ())),
         )
 
-    def _label_table(self, key: str, columns: Mapping[str, str]) -> CsvTable | None:
+    def _label_table(
+        self, key: str, columns: Mapping[str, str], optional: Mapping[str, str] | None = None
+    ) -> CsvTable | None:
         relative = self.manifest.get("labels", {}).get(key)
-        return None if relative is None else self.table(relative, f"labels.{key}", columns)
+        if relative is None:
+            return None
+        damaged: list[str] = []
+        table = self.table(relative, f"labels.{key}", columns, optional, damaged)
+        note_damaged_rows(damaged, len(table) + len(damaged), self.notes)
+        return table
 
 
 def _check_geodetic(table: CsvTable) -> None:
@@ -272,23 +287,3 @@ def _check_geodetic(table: CsvTable) -> None:
             raise LogError(
                 f"{table.where(bad[0], field)}: {table[field][bad[0]]:g}, expected at most {limit:g} degrees"
             )
-
-
-@dataclass(frozen=True, eq=False)
-class _SweepFiles:
-    """Sweeps of one LiDAR: files, stamps (F,), the frame of the points, the map's offset (3,), stamps of compensation (F,)."""
-
-    files: list[Path]
-    t_ns: NDArray[np.int64]
-    frame: Literal["lidar", "map"]
-    offset: Array
-    compensated_ns: NDArray[np.int64] | None
-
-    def read(self, i: int) -> Sweep:
-        """Read sweep `i`; points in the map frame are shifted by the map's offset."""
-        sweep = read_sweep(self.files[i], int(self.t_ns[i]), self.frame)
-        if self.compensated_ns is not None:
-            return replace(sweep, compensated_ns=int(self.compensated_ns[i]))
-        if self.frame == "map" and self.offset.any():
-            return replace(sweep, xyz_m=sweep.xyz_m.astype(np.float64) - self.offset)
-        return sweep

@@ -139,6 +139,7 @@ class _SceneReader:
             reference_camera=REFERENCE_CAMERA if REFERENCE_CAMERA in cameras else None,
             digest=self._digest(),
             notes=defer_notes(self.notes, labels),
+            calibrations=dict.fromkeys(streams, str(self.tables.path("calibrated_sensor"))),
             details=self._details(),
         )
 

@@ -40,6 +40,7 @@ from log2sim.logs.pandaset.sweeps import LIDARS, SweepFiles
 from log2sim.logs.pose_checks import MAX_POSITION_M, find_not_unit
 from log2sim.logs.record_files import list_folders, list_numbered_files
 from log2sim.logs.stamps import MAX_TIME_S, strictly_increasing
+from log2sim.logs.time_checks import Span, say_apart
 
 TABLE = ".pkl.gz"
 ROAD_BELOW_POSE_M = 0.325
@@ -129,6 +130,7 @@ class _Sequence:
             digest=digest_of(
                 [read_text(self.path / "lidar" / "poses.json", JSON_LIMIT_BYTES, LogError)], self._records()
             ),
+            calibrations={n: f"{self.path}/camera/{n}/intrinsics.json" for n in cameras},
             notes=defer_notes(notes, *(partial(sweeps.index, lidar) for lidar in lidars), labels),
         )
 
@@ -137,7 +139,12 @@ class _Sequence:
 
     def _files(self, folder: str, suffix: str, count: int, notes: list[str]) -> dict[int, Path]:
         """Find the records of a sensor by their number and note missing ones: they are gaps."""
-        files = {k: p for k, p in list_numbered_files(self.path / folder, (suffix,)).items() if k < count}
+        found = list_numbered_files(self.path / folder, (suffix,))
+        files = {k: p for k, p in found.items() if k < count}
+        if len(files) < len(found):
+            notes.append(
+                f"{folder}: {len(found) - len(files)} of {len(found)} records left out: there are stamps for {count}"
+            )
         missing = sorted(set(range(count)) - set(files))
         if missing:
             notes.append(f"{folder}: {len(missing)} of {count} records are missing, first number {missing[0]:02d}")
@@ -145,7 +152,12 @@ class _Sequence:
 
     def _cameras(self, track: PoseTrack, notes: list[str]) -> tuple[dict[str, Camera], dict[str, Stream]]:
         cameras, streams = {}, {}
-        for folder in sorted(p for p in (self.path / "camera").iterdir() if (p / "intrinsics.json").is_file()):
+        for folder in list_folders(self.path / "camera"):
+            if not (folder / "intrinsics.json").is_file():
+                images = len(list_numbered_files(folder, (".jpg",)))
+                if images:
+                    notes.append(f"camera/{folder.name}: {images} images left out: it has no intrinsics.json")
+                continue
             t_ns, map_T_cam = _poses(folder)
             files = self._files(f"camera/{folder.name}", ".jpg", len(t_ns), notes)
             if not files:
@@ -266,7 +278,8 @@ def _mount(track: PoseTrack, t_ns: NDArray[np.int64], map_T_cam: Array, folder: 
     """
     map_T_ego, known = track.at(t_ns)
     if not known.any():
-        raise LogError(f"{folder}/timestamps.json: no stamp lies within the ego poses of lidar/timestamps.json")
+        apart = say_apart(Span.of("ego poses", track.t_ns), Span.of("frames", t_ns))
+        raise LogError(f"{folder}/timestamps.json and lidar/timestamps.json: {apart}")
     ego_T_cam = inverse(map_T_ego[known]) @ map_T_cam[known]
     translation = np.median(ego_T_cam[:, :3, 3], axis=0)
     rotation = nearest_rotation(np.median(ego_T_cam[:, :3, :3], axis=0))

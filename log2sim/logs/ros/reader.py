@@ -105,6 +105,7 @@ class _Opening:
             reference_camera=self._reference_camera(cameras, streams),
             digest=self.bag.digest,
             notes=(lambda: (*self.notes, *measured()[1])) if known_m is None else tuple(self.notes),
+            calibrations={n: self._calibration_place(n) for n in streams},
             details=self._details(base, why, considered),
         )
 
@@ -116,6 +117,13 @@ class _Opening:
         if not streams:
             raise LogError(f"{self.bag.place}: none of its sensors can be used: {'; '.join(self.notes)}")
         return streams
+
+    def _calibration_place(self, name: str) -> str:
+        """Say where the calibration of a sensor stands."""
+        camera = self.roles.cameras.get(name)
+        if camera is None:
+            return f"{self.bag.place}, transforms"
+        return f"{self.file}" if camera.intrinsics is not None else f"{self.bag.place}, {camera.info}"
 
     def _details(self, base: str | None, why: str, considered: list[dict[str, Any]]) -> dict[str, Any]:
         return {

@@ -92,6 +92,7 @@ class _Assembly:
             reference_camera=next(iter(cameras), None),
             digest=digest,
             notes=defer_notes(self.notes, labels),
+            calibrations=dict.fromkeys(streams | sweeps, f"{self.segment.path}, its calibrations"),
             details=self.segment.details,
         )
 

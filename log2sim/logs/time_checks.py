@@ -1,0 +1,228 @@
+"""Checks of the stamps of a whole log: streams of other clocks, a reference that ends early, labels of no frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import Log
+from log2sim.geometry import NS_PER_S, nearest_index
+from log2sim.logs.excerpt import MAX_LABEL_DISTANCE_NS, STAMP_TOLERANCE_NS, reference_of
+
+# Streams of a second that has no record of another may still belong together: a log may hold one frame and one sweep.
+MAX_APART_NS = NS_PER_S
+# A run that is shorter than the log by less is worth no line: sensors start one after the other.
+MIN_MISSING_NS = NS_PER_S
+MIN_MISSING_SHARE = 0.01
+# Both ends of a stream are off alike when they differ by no more than this share of the offset.
+MAX_END_MISMATCH = 0.2
+MAX_NAMES = 3
+# The first Unix time with ten digits is of 2001; recordings that count from their start last no year.
+MIN_UNIX_S, MAX_RELATIVE_S = 1e9, 3e7
+SECONDS_OF_ZONES = 900
+MAX_ZONE_S = 14 * 3600
+# Seconds between clocks: leap seconds since 2017 (IERS Bulletin C 52 and later), epochs of GPS (1980) and NTP (1900) to Unix.
+CLOCKS_S = {
+    18: "GPS time against UTC",
+    37: "TAI against UTC",
+    19: "TAI against GPS time",
+    315_964_800: "seconds since 1980, as of GPS, against Unix time",
+    315_964_782: "seconds since 1980, as of GPS, against Unix time",
+    2_208_988_800: "seconds since 1900, as of NTP, against Unix time",
+}
+UNITS = {10**3: "units that differ by 1000, such as ms and us", 10**6: "ms against ns", 10**9: "s against ns"}
+
+
+@dataclass(frozen=True)
+class Span:
+    """First and last stamp of something.
+
+    Attributes
+    ----------
+    words : str
+        What it is, such as "ego poses".
+    first_ns, last_ns : int
+    """
+
+    words: str
+    first_ns: int
+    last_ns: int
+
+    @classmethod
+    def of(cls, words: str, t_ns: NDArray[np.int64]) -> Span:
+        """Return the span of stamps (N,), at least one of them."""
+        return cls(words, int(t_ns.min()), int(t_ns.max()))
+
+    def is_apart(self, other: Span, distance_ns: int = MAX_APART_NS) -> bool:
+        """Whether more than a distance lies between two spans."""
+        return max(self.first_ns, other.first_ns) - min(self.last_ns, other.last_ns) > distance_ns
+
+    def joined(self, other: Span) -> Span:
+        """Return the span of both, with the words of the first."""
+        return Span(self.words, min(self.first_ns, other.first_ns), max(self.last_ns, other.last_ns))
+
+
+def list_time_problems(log: Log) -> list[str]:
+    """List what is wrong with the stamps of a log, one line each.
+
+    Only stamps are read, and the labels.
+    """
+    return [*_other_clocks(log), *_reference_problem(log), *_image_label_problems(log), *_label_problems(log)]
+
+
+def say_without_pose(log: Log, t_ns: NDArray[np.int64]) -> str:
+    """Say why no pose of the ego is known at any of some ticks (T,)."""
+    if log.ego is None:
+        return "no ego poses"
+    poses, ticks = Span.of("ego poses", log.ego.t_ns), Span.of("ticks", t_ns)
+    if poses.is_apart(ticks, 0):
+        return say_apart(poses, ticks)
+    return f"no ego pose within {log.ego.max_gap_s:g} s of any tick"
+
+
+def say_apart(one: Span, other: Span) -> str:
+    """Say that two spans do not overlap, by how much, and which clocks would explain it."""
+    difference_s = (one.first_ns - other.first_ns) / NS_PER_S
+    hint = _explain(one, other)
+    reason = f": {hint}?" if hint else ""
+    return (
+        f"the {one.words} are from {_seconds(one.first_ns)} to {_seconds(one.last_ns)} s, the {other.words} from "
+        f"{_seconds(other.first_ns)} to {_seconds(other.last_ns)} s: they do not overlap (the difference is "
+        f"{abs(difference_s):.6g} s{reason})"
+    )
+
+
+def _seconds(t_ns: int) -> str:
+    """Format a stamp in s with ms, exactly."""
+    sign, t_ms = "-" * (t_ns < 0), abs(t_ns) // 10**6
+    return f"{sign}{t_ms // 1000}.{t_ms % 1000:03d}"
+
+
+def _explain(one: Span, other: Span) -> str:
+    """Name the usual mistake that would put two spans apart as they are; "" without one."""
+    early, late = sorted((one, other), key=lambda span: span.first_ns)
+    for factor, words in UNITS.items():
+        if early.first_ns > 0 and abs(late.first_ns / (early.first_ns * factor) - 1) < 1e-3:
+            return words
+    if abs(early.first_ns) < MAX_RELATIVE_S * NS_PER_S and late.first_ns > MIN_UNIX_S * NS_PER_S:
+        return "one counts from its start, the other is Unix time"
+    difference_s = (late.first_ns - early.first_ns) / NS_PER_S
+    offsets = dict(CLOCKS_S)
+    zone_s = round(difference_s / SECONDS_OF_ZONES) * SECONDS_OF_ZONES
+    if 0 < zone_s <= MAX_ZONE_S:
+        offsets[zone_s] = f"{zone_s / 3600:g} h, a time zone"
+    misfit = {seconds: _misfit_ns(early, late, seconds * NS_PER_S) for seconds in offsets}
+    best = min(misfit, key=lambda seconds: misfit[seconds])
+    length_ns = min(early.last_ns - early.first_ns, late.last_ns - late.first_ns)
+    return offsets[best] if misfit[best] <= max(length_ns, MAX_APART_NS) else ""
+
+
+def _misfit_ns(early: Span, late: Span, offset_ns: int) -> int:
+    """Distances of both ends when the later span is moved by an offset."""
+    return abs(late.first_ns - offset_ns - early.first_ns) + abs(late.last_ns - offset_ns - early.last_ns)
+
+
+def _other_clocks(log: Log) -> list[str]:
+    """Tell of streams and poses that lie apart from most of the others."""
+    groups: list[tuple[list[str], Span]] = []
+    for span in sorted(_spans(log), key=lambda span: span.first_ns):
+        if groups and not groups[-1][1].is_apart(span):
+            groups[-1] = ([*groups[-1][0], span.words], groups[-1][1].joined(span))
+        else:
+            groups.append(([span.words], span))
+    if len(groups) < 2:
+        return []
+    spans = [Span(_listed(words), span.first_ns, span.last_ns) for words, span in groups]
+    most = max(range(len(groups)), key=lambda k: len(groups[k][0]))
+    return [say_apart(span, spans[most]) for k, span in enumerate(spans) if k != most]
+
+
+def _spans(log: Log) -> list[Span]:
+    """Return the spans of the streams that have records, and of the poses of the ego."""
+    spans = [
+        Span.of(f"{'frames' if name in log.cameras else 'sweeps'} of '{name}'", stream.t_ns)
+        for name, stream in log.streams.items()
+        if len(stream.t_ns)
+    ]
+    return spans if log.ego is None else [*spans, Span.of("ego poses", log.ego.t_ns)]
+
+
+def _listed(words: Sequence[str]) -> str:
+    more = len(words) - MAX_NAMES
+    return ", ".join(words[:MAX_NAMES]) + (f" and {more} other streams" if more > 0 else "")
+
+
+def _reference_problem(log: Log) -> list[str]:
+    """Tell when the sensor whose records are the ticks begins late or ends early, since a run lasts as long as it does."""
+    streams = {name: s.t_ns for name, s in log.streams.items() if len(s.t_ns)}
+    reference = reference_of(log, [name for name in log.cameras if name in streams]) if streams else ""
+    if reference not in streams or len(streams) < 2:
+        return []
+    others = [Span.of(name, t_ns) for name, t_ns in streams.items() if name != reference]
+    own = Span.of(reference, streams[reference])
+    begin_ns = max(own.first_ns - min(span.first_ns for span in others), 0)
+    end_ns = max(max(span.last_ns for span in others) - own.last_ns, 0)
+    whole_ns = own.last_ns - own.first_ns + begin_ns + end_ns
+    least_ns = max(MIN_MISSING_NS, MIN_MISSING_SHARE * whole_ns)
+    late = sum(own.first_ns - span.first_ns >= least_ns for span in others) * 2 >= len(others) and begin_ns >= least_ns
+    early = sum(span.last_ns - own.last_ns >= least_ns for span in others) * 2 >= len(others) and end_ns >= least_ns
+    if not late and not early:
+        return []
+    parts = [f"begins {begin_ns / NS_PER_S:.1f} s after"] * late + [f"ends {end_ns / NS_PER_S:.1f} s before"] * early
+    kind = "camera" if reference in log.cameras else "LiDAR"
+    return [
+        f"the reference {kind} '{reference}' {' and '.join(parts)} other sensors{_shifted(own, others)}: a run of its ticks lasts "
+        f"{(own.last_ns - own.first_ns) / NS_PER_S:.1f} s of the {whole_ns / NS_PER_S:.1f} s of the log"
+    ]
+
+
+def _shifted(own: Span, others: Sequence[Span]) -> str:
+    """Say that a stream is off the others by the same time at both ends, as by another clock; "" where it is not."""
+    first_ns = own.first_ns - int(np.median([span.first_ns for span in others]))
+    last_ns = own.last_ns - int(np.median([span.last_ns for span in others]))
+    alike = abs(first_ns - last_ns) <= MAX_END_MISMATCH * min(abs(first_ns), abs(last_ns))
+    if not alike or min(abs(first_ns), abs(last_ns)) < MIN_MISSING_NS:
+        return ""
+    return f" (both its ends are {abs(first_ns) / NS_PER_S:.1f} s {'late' if first_ns > 0 else 'early'}, as by another clock)"
+
+
+def _image_label_problems(log: Log) -> list[str]:
+    """Tell of boxes in images, and regions without labels, of which no frame has the stamp."""
+    problems = []
+    for what, by_camera in (("boxes", log.image_labels), ("ignored regions", log.ignored_regions)):
+        for name, rows in by_camera.items():
+            stream = log.streams.get(name)
+            if stream is None or not len(rows.t_ns) or not len(stream.t_ns):
+                continue
+            frames = stream.t_ns
+            off_ns = np.abs((frames[nearest_index(frames, rows.t_ns)] - rows.t_ns).astype(np.float64))
+            lost = off_ns > STAMP_TOLERANCE_NS
+            if not lost.any():
+                continue
+            line = f"{int(lost.sum())} of {len(lost)} {what} in images of '{name}' are at stamps of no frame, first {rows.t_ns[lost].min()}"
+            spans = Span.of(f"{what}", rows.t_ns), Span.of("frames", frames)
+            apart = f": {say_apart(*spans)}" if spans[0].is_apart(spans[1]) else ""
+            nearest = "" if apart or not lost.all() else f"; the nearest is {off_ns.min() / 1e6:.3g} ms off"
+            problems.append(f"{line}{nearest}{apart}")
+    return problems
+
+
+def _label_problems(log: Log) -> list[str]:
+    """Tell of 3D labels far from all records and poses; where records are missing, as in a partial download, poses still tell."""
+    records = [stream.t_ns for stream in log.streams.values() if len(stream.t_ns)]
+    if log.labels is None or not len(log.labels.t_ns) or not records:
+        return []
+    t_ns = log.labels.t_ns
+    known = np.unique(np.concatenate([*records, *([] if log.ego is None else [log.ego.t_ns])]))
+    far = np.abs((known[nearest_index(known, t_ns)] - t_ns).astype(np.float64)) > MAX_LABEL_DISTANCE_NS
+    if not far.any():
+        return []
+    line = (
+        f"{int(far.sum())} of {len(far)} labeled boxes are more than {MAX_LABEL_DISTANCE_NS / NS_PER_S:g} s off all frames, sweeps and "
+        f"poses, first at stamp {t_ns[far].min()}"
+    )
+    spans = Span.of("labels", t_ns), Span.of("records", np.concatenate(records))
+    return [f"{line}: {say_apart(*spans)}" if spans[0].is_apart(spans[1]) else line]
