@@ -19,7 +19,9 @@ FAULT_KINDS = {
     "frozen_poses": "the ego's pose stays while the ego moves",
     "sparse_poses": "poses are farther apart than usual and are interpolated by the ego's motion",
     "time_offset": "the stamps of a sensor are off against the poses",
+    "unknown_offset": "stamps were to be corrected, but the ego's motion does not show their offset",
     "lidar_rotation": "the mount of a LiDAR is rotated against its calibration",
+    "unknown_rotation": "a mount was to be corrected, but the ego's motion does not show its rotation",
     "camera_rotation": "the mount of a camera is rotated against its calibration",
     "swapped_cameras": "cameras have each other's calibration",
 }

@@ -1,0 +1,108 @@
+"""Time offset and mount of a LiDAR, fitted to the motions between its sweeps and to the poses of the ego.
+
+The poses at the stamps and the mount predict the motion from one sweep to another. Where the stamps are late or the mount is
+turned, the prediction departs from what surfaces show, and departs otherwise where the ego goes straight, turns or speeds up:
+hand-eye calibration (Park, Martin, IEEE TRA 1994) with a time offset. On a straight way at constant speed an offset shifts all
+sweeps alike and does not show; turned mounts do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from log2sim.calibration.pose_noise import MAX_NOISE_SHARE, USUAL_NOISE, Linearized, PoseNoise, Solution
+from log2sim.calibration.sweep_pairs import SweepPairs
+from log2sim.calibration.twists import adjoint_of, cross_matrix, exp_of, log_of, velocities_at
+from log2sim.geometry import NS_PER_S, Array, inverse, transform
+
+OFFSET, ROLL, PITCH, YAW = range(4)
+VALUES = 7
+# Of stamps, s, of rotation, rad, and translation, m, of a mount: what a mistake that nobody sees can be. A mount is measured to
+# centimeters, so its translation is no result; it takes up what it would explain.
+PRIOR_SIGMA = np.array([0.3, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05])
+# An offset that the motion does not show is taken for none.
+UNSEEN_OFFSET_SIGMA_S = 0.005
+FIRST_TIME_S = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Time offset and mount of a LiDAR.
+
+    Attributes
+    ----------
+    values : (7,) float64
+        What stamps lack, s; rotation vector of the mount in the ego's frame about the sensor, rad, and translation, m, that the
+        mount lacks.
+    covariance : (7, 7) float64
+    shows_offset : bool
+        Whether the ego's motion shows a time offset; without, that is 0 here.
+    """
+
+    values: Array
+    covariance: Array
+    shows_offset: bool
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (7,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def mount_change(values: Array, sensor_m: Array) -> Array:
+    """Compute how points move in the ego's frame (4, 4) by rotation about the sensor and translation of its mount."""
+    turn = exp_of(np.concatenate([np.zeros(3), values[1:4]]))[:3, :3]
+    return transform(turn, sensor_m - turn @ sensor_m + values[4:])
+
+
+def fit_clock_and_mount(seen: SweepPairs) -> Estimate:
+    """Fit the time offset and the mount to motions between sweeps.
+
+    Notes
+    -----
+    Gauss-Newton; sizes of the errors of the poses are estimated after the first step, and the results for several time
+    constants of these are weighed by their likelihood.
+    """
+    for prior_sigma_s in (PRIOR_SIGMA[OFFSET], UNSEEN_OFFSET_SIGMA_S):
+        prior = PRIOR_SIGMA.copy()
+        prior[OFFSET] = prior_sigma_s
+        values = PoseNoise(_linearize(seen, np.zeros(VALUES), prior)).solve(USUAL_NOISE, FIRST_TIME_S).step
+        problem = PoseNoise(_linearize(seen, values, prior))
+        solved = [(weight, problem.solve(noise, tau)) for weight, noise, tau in problem.estimate()]
+        shows_offset = prior_sigma_s == PRIOR_SIGMA[OFFSET]
+        if not shows_offset or sum(w * s.noise_share for w, s in solved) < MAX_NOISE_SHARE:
+            break
+    step, covariance = _mean(solved)
+    return Estimate(values + step, covariance, shows_offset)
+
+
+def _mean(solved: list[tuple[float, Solution]]) -> tuple[Array, Array]:
+    """Return mean (V,) and covariance (V, V) of a mixture."""
+    step = np.sum([w * s.step for w, s in solved], axis=0)
+    covariance = sum(w * (s.covariance + np.outer(s.step - step, s.step - step)) for w, s in solved)
+    return step, np.asarray(covariance)
+
+
+def _linearize(seen: SweepPairs, values: Array, prior_sigma: Array) -> Linearized:
+    """Compare predicted motions with those found, at given values (7,)."""
+    t_ns = seen.t_ns + round(values[OFFSET] * NS_PER_S)
+    change = mount_change(values, seen.sensor_m)
+    moved = seen.track.at(t_ns)[0] @ change
+    velocity, _ = velocities_at(seen.track, t_ns)
+    back, mount = adjoint_of(inverse(change)), np.eye(6)[:, [3, 4, 5, 0, 1, 2]]
+    mount[:3, :3] = -cross_matrix(seen.sensor_m).T
+    size, count = 6 * len(seen.pairs), len(t_ns)
+    residual, by_values, by_poses = np.zeros(size), np.zeros((size, VALUES)), np.zeros((size, 6 * count))
+    for p, pair in enumerate(seen.pairs):
+        rows, i, j = slice(6 * p, 6 * p + 6), pair.first, pair.second
+        predicted = inverse(moved[i]) @ moved[j]
+        residual[rows] = log_of(inverse(predicted) @ pair.found.first_T_second)
+        second_T_first = adjoint_of(inverse(predicted))
+        by_values[rows, OFFSET] = back @ velocity[j] - second_T_first @ back @ velocity[i]
+        by_values[rows, 1:] = mount - second_T_first @ mount
+        by_poses[rows, 6 * j : 6 * j + 6], by_poses[rows, 6 * i : 6 * i + 6] = back, -second_T_first @ back
+    information = [np.asarray(np.linalg.inv(pair.found.covariance), np.float64) for pair in seen.pairs]
+    prior = prior_sigma**-2.0
+    return Linearized(seen.t_ns, residual, by_values, by_poses, information, prior, -values * prior)
