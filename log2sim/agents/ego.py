@@ -11,8 +11,8 @@ from log2sim.datatypes import STANDSTILL_DRIFT_M, STANDSTILL_MPS, Agent, Log, Wa
 from log2sim.geometry import Array, yaw_of
 from log2sim.perception.sync import Schedule
 
-# Standard deviation of ego positions from GNSS/INS with RTK or LiDAR odometry.
-EGO_SIGMA_M = 0.02
+# Standard deviations of ego positions and yaws from GNSS/INS with RTK or LiDAR odometry.
+EGO_SIGMA_M, EGO_SIGMA_RAD = 0.02, 0.002
 
 
 def ego_agent(log: Log, timeline: Timeline, source: str = "ego poses of the log") -> Agent | None:
@@ -28,7 +28,11 @@ def ego_agent(log: Log, timeline: Timeline, source: str = "ego poses of the log"
     vehicle = log.ego_vehicle
     center = log.ego_centers(map_T_ego[valid])
     t, yaw = timeline.seconds(timeline.t_ns[valid]), yaw_of(map_T_ego[valid])
-    path = smooth_track(t, center[:, :2], sigma_m=EGO_SIGMA_M)
+    sigma_m = log.ego.sigmas_at(timeline.t_ns[valid], (EGO_SIGMA_M, EGO_SIGMA_RAD))[:, 0]
+    path = smooth_track(t, center[:, :2], sigma_m=sigma_m)
+    # Poses that bridge a gap are off together, so that smoothing does not make them better.
+    base_m = EGO_SIGMA_M if log.ego.sigma_m is None else float(log.ego.sigma_m.min())
+    bridging_m2 = np.maximum(sigma_m**2 - base_m**2, 0.0)
     speed = signed_speed(path.velocity_mps, yaw)
     waypoints = Waypoints(
         t_s=t,
@@ -38,7 +42,7 @@ def ego_agent(log: Log, timeline: Timeline, source: str = "ego poses of the log"
         yaw_rad=yaw,
         speed_mps=np.where(np.abs(speed) < STANDSTILL_MPS, 0.0, speed),
         observed=np.ones(len(t), dtype=bool),
-        sigma_xy_m=np.sqrt(np.trace(path.covariance, axis1=1, axis2=2) / 2),
+        sigma_xy_m=np.sqrt(np.trace(path.covariance, axis1=1, axis2=2) / 2 + bridging_m2),
     )
     moved = float(np.hypot(np.ptp(center[:, 0]), np.ptp(center[:, 1])))
     return Agent(

@@ -34,12 +34,16 @@ class PoseTrack:
         Poses are not interpolated between stamps farther apart than this.
     extrapolate_s : float, s
         Poses are extrapolated up to this far outside the track.
+    sigma_m, sigma_yaw_rad : (P,) float64, optional
+        Standard deviations of the position along each axis, m, and of the yaw, rad; None where they are not known.
     """
 
     t_ns: NDArray[np.int64]
     map_T_ego: Array
     max_gap_s: float = 1.0
     extrapolate_s: float = 0.2
+    sigma_m: Array | None = None
+    sigma_yaw_rad: Array | None = None
 
     def __post_init__(self) -> None:
         """Check that stamps increase and that there is one pose for each."""
@@ -47,6 +51,8 @@ class PoseTrack:
             raise ValueError("a pose track needs one pose per stamp and at least one of them")
         if np.any(np.diff(self.t_ns) <= 0):
             raise ValueError("stamps of a pose track must be strictly increasing")
+        if any(s is not None and len(s) != len(self.t_ns) for s in (self.sigma_m, self.sigma_yaw_rad)):
+            raise ValueError("a pose track with standard deviations needs one per stamp")
 
     @cached_property
     def _quaternions(self) -> Array:
@@ -77,6 +83,23 @@ class PoseTrack:
         margin = round(self.extrapolate_s * NS_PER_S)
         inside = (t >= self.t_ns[0] - margin) & (t <= self.t_ns[-1] + margin)
         return poses, inside & ((span <= self.max_gap_s * NS_PER_S) | np.isin(t, self.t_ns))
+
+    def sigmas_at(self, t_ns: ArrayLike, usual: tuple[float, float]) -> Array:
+        """Interpolate the standard deviations (N, 2) of position, m, and yaw, rad, at stamps (N,) int64 ns.
+
+        Parameters
+        ----------
+        t_ns : int or (N,) int64
+        usual : (float, float)
+            What they are where the track does not know them.
+        """
+        t_s = (np.atleast_1d(np.asarray(t_ns, dtype=np.int64)) - self.t_ns[0]) / NS_PER_S
+        known_s = (self.t_ns - self.t_ns[0]) / NS_PER_S
+        columns = zip(usual, (self.sigma_m, self.sigma_yaw_rad), strict=True)
+        return np.stack(
+            [np.full(len(t_s), value) if sigma is None else np.interp(t_s, known_s, sigma) for value, sigma in columns],
+            axis=1,
+        )
 
     def _neighbors(self, t_ns: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Rows (N,) before and after stamps; outside the track its end and a row some time away, never two at nearly one time."""

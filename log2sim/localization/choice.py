@@ -15,10 +15,13 @@ from log2sim.documents import rounded
 from log2sim.errors import ConfigError, LogError
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse, nearest_index, period_of
 from log2sim.localization.alignment import fit_to_given, level_on_ground
-from log2sim.localization.camera_motion import CameraPath, follow_camera, motion_camera
+from log2sim.localization.camera_motion import follow_camera, motion_camera
 from log2sim.localization.ego_sweeps import densest_lidar, lidars_on_ego, read_ego_sweep
+from log2sim.localization.estimate_figures import camera_figures, odometry_figures
+from log2sim.localization.given_poses import check_poses
 from log2sim.localization.odometry import Odometry, run_odometry
 from log2sim.localization.pose_choice import GIVEN, ORIGINS, PoseChoice
+from log2sim.localization.pose_faults import list_faults
 from log2sim.localization.registration import is_installed
 from log2sim.localization.replaced import replace_poses
 from log2sim.localization.verdict import compare_with_given, unsure_share
@@ -90,6 +93,23 @@ class _Request:
 
 
 def _localize(request: _Request) -> tuple[Log, PoseChoice]:
+    """Check the poses of the log, then choose between them and others."""
+    if request.log.ego is None:
+        return _choose(request)
+    given = request.log.ego
+    checked = check_poses(given)
+    if checked.track is given:
+        return _choose(request)
+    if any(stretch.kind != "gap" for stretch in checked.stretches):
+        # What was measured in gaps moves with the poses around them.
+        mended = replace_poses(request.log.changed(ego=replace(given, max_gap_s=np.inf)), checked.track)
+    else:
+        mended = request.log.changed(ego=checked.track)
+    log, choice = _choose(replace(request, log=mended))
+    return log, replace(choice, faults=list_faults(request.log, checked.stretches, request.during_ns))
+
+
+def _choose(request: _Request) -> tuple[Log, PoseChoice]:
     log, requested = request.log, request.requested
     mounts = _mounts(log)
     if log.ego is None and "ego" not in mounts:
@@ -117,7 +137,7 @@ def _by_camera(request: _Request) -> tuple[Log, PoseChoice]:
         progress=lambda done, total: request.progress("camera motion", done, total),
     )  # fmt: skip
     track, frame = _in_map(log, PoseTrack(found.t_ns, found.start_T_ego, _max_gap_s(found.t_ns)))
-    estimate = {**_camera_figures(found), **_difference(track, log.ego), "frame": frame}
+    estimate = {**camera_figures(found), **_difference(track, log.ego), "frame": frame}
     notes = ["camera motion is planar, and some percent of its path may be wrong"]
     if found.predicted.any():
         notes.append(f"camera motion: {int(found.predicted.sum())} of {len(found.t_ns)} poses are predicted")
@@ -154,7 +174,7 @@ def _by_lidar(request: _Request) -> tuple[Log, PoseChoice]:
             raise
         return log, PoseChoice(requested, "given", f"nothing to compare them with: {problem}")
     track, frame = _in_map(log, PoseTrack(found.t_ns, found.odom_T_ego, _max_gap_s(found.t_ns)), lidar)
-    estimate = {**_figures(found), **_difference(track, log.ego), "frame": frame}
+    estimate = {**odometry_figures(found), **_difference(track, log.ego), "frame": frame}
     if may_keep:
         return _better_of(request, found, track, estimate)
     unsure = unsure_share(found)
@@ -222,41 +242,6 @@ def _level(log: Log, lidar: str, t_ns: int) -> Array | None:
     """Return the pose (4, 4) of the ego that puts the ground of the sweep at a stamp level; None without enough points on it."""
     sweep = read_ego_sweep(log, lidar, int(nearest_index(log.streams[lidar].t_ns, t_ns)[0]))
     return None if sweep is None else level_on_ground(sweep.xyz_m, log.ground_z_ego_m)
-
-
-def _figures(found: Odometry) -> dict[str, Any]:
-    """Collect the figures of an odometry for the report."""
-    return {
-        "lidar": found.lidar,
-        "sweeps": found.sweeps,
-        "poses": len(found.t_ns),
-        "predicted": int(found.predicted.sum()),
-        "degenerate": int(found.degenerate.sum()),
-        "problems": found.problems,
-        "path_m": rounded(found.path_m, 3),
-        "overlap_median": _median(found.overlap),
-        "residual_median": _median(found.residual),
-        "constraint_median": _median(found.constraint),
-    }
-
-
-def _camera_figures(found: CameraPath) -> dict[str, Any]:
-    """Collect the figures of camera motion for the report."""
-    steps = np.diff(found.start_T_ego[:, :3, 3], axis=0)
-    return {
-        "camera": found.camera,
-        "frames": found.frames,
-        "poses": len(found.t_ns),
-        "predicted": int(found.predicted.sum()),
-        "path_m": rounded(float(np.linalg.norm(steps, axis=1).sum()), 3),
-        "points_on_road_median": found.on_road,
-    }
-
-
-def _median(values: Array) -> float | None:
-    """Return the median of what is known, rounded."""
-    known = values[np.isfinite(values)]
-    return rounded(float(np.median(known)), 4) if len(known) else None
 
 
 def _difference(track: PoseTrack, given: PoseTrack | None) -> dict[str, Any]:

@@ -1,0 +1,255 @@
+"""Poses of a log checked against what a vehicle can do: jumps, poses that freeze, and gaps, repaired as far as the motion around tells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import (
+    NS_PER_S,
+    Array,
+    PoseTrack,
+    rotation_from_rpy,
+    yaw_of,
+)
+from log2sim.localization.path_fit import POSITION_PRIOR, YAW_PRIOR
+from log2sim.localization.path_repair import Limits, RepairedPath, bridge, repair_path, runs_of
+
+# Vehicles on roads brake, speed up and turn with up to 10 m/s2; the rest is how their bodies pitch and bounce. They change their
+# yaw rate by less than 3 rad/s2 at the limit of their tires.
+MAX_ACCELERATION_MPS2, MAX_YAW_ACCELERATION_RADPS2 = 12.0, 5.0
+# Smaller faults are left as they are: they are no larger than the errors of GNSS without corrections, of a compass, and of the
+# fits that would repair them.
+MIN_STEP_M, MIN_STEP_RAD = 0.25, np.deg2rad(2.0)
+# Standard deviations of poses of GNSS/INS with RTK or LiDAR odometry.
+USUAL_SIGMA_M, USUAL_SIGMA_RAD = 0.02, 0.002
+POSITION = Limits(MAX_ACCELERATION_MPS2, POSITION_PRIOR, MIN_STEP_M, USUAL_SIGMA_M)
+YAW = Limits(MAX_YAW_ACCELERATION_RADPS2, YAW_PRIOR, MIN_STEP_RAD, USUAL_SIGMA_RAD)
+# Poses are not used where their standard deviation is beyond these, by which what is 20 m away is off by less than a meter.
+MAX_SIGMA_M, MAX_SIGMA_RAD = 0.5, 0.035
+# Over longer gaps a line between two poses is off by more than 2 cm at 3 m/s2, so that poses are added by the motion around.
+MAX_LINEAR_S, ADDED_STEP_S = 0.25, 0.05
+# No gap as long is bridged within `MAX_SIGMA_M`.
+MAX_BRIDGED_S = 8.0
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A time in which poses were repaired or are not known.
+
+    Attributes
+    ----------
+    kind : {"pose_jump", "frozen_poses", "gap"}
+    first_ns, last_ns : int
+        Stamps of the first and the last pose in question; of a gap those around it.
+    shift_m, turn_rad : float
+        By how much poses were moved at most.
+    sigma_m : float
+        Largest standard deviation of a repaired position that is used.
+    unknown_s : float, s
+        For how long no pose is known well enough.
+    poses : int
+        Number of poses in question.
+    """
+
+    kind: str
+    first_ns: int
+    last_ns: int
+    shift_m: float = 0.0
+    turn_rad: float = 0.0
+    sigma_m: float = 0.0
+    unknown_s: float = 0.0
+    poses: int = 0
+
+    @property
+    def duration_s(self) -> float:
+        """Length, s."""
+        return (self.last_ns - self.first_ns) / NS_PER_S
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedPoses:
+    """Poses after the check.
+
+    Attributes
+    ----------
+    track : PoseTrack
+        The very poses that were given where nothing is wrong with them.
+    stretches : tuple of Stretch
+        In the order of time.
+    """
+
+    track: PoseTrack
+    stretches: tuple[Stretch, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Path:
+    """The columns of poses that are checked: positions (P, 3), m, and unwrapped yaws (P,), rad, at times (P,), s."""
+
+    t_s: Array
+    xyz_m: Array
+    yaw_rad: Array
+
+
+def check_poses(track: PoseTrack) -> CheckedPoses:
+    """Check given poses and repair them where a vehicle cannot have moved so, or where they are far apart.
+
+    Notes
+    -----
+    Stretches that are off by a constant are moved back, which keeps what they measured; what cannot be right, and gaps, are
+    bridged by the most probable motion between the poses around. Of two parts of a path the one that lasts longer is taken for
+    right. Roll and pitch stay as they are. Linear in the number of poses.
+    """
+    if len(track.t_ns) < 2:
+        return CheckedPoses(track, ())
+    path = _path_of(track)
+    level = repair_path(path.t_s, path.xyz_m[:, :2], POSITION)
+    height = repair_path(path.t_s, path.xyz_m[:, 2:], POSITION, level.at_rest)
+    yaw = repair_path(path.t_s, path.yaw_rad[:, None], YAW, level.at_rest)
+    changed = level.moved | level.bridged | height.moved | height.bridged | yaw.moved | yaw.bridged
+    new = _Path(path.t_s, np.hstack([level.values, height.values]), yaw.values[:, 0])
+    repaired = _repaired_track(track, path, new, changed, (level, yaw))
+    stretches = [_stretch(track, path, new, rows, (level, yaw)) for rows in runs_of(changed)]
+    kept = ~changed | (_sigmas(level, yaw) <= [MAX_SIGMA_M, MAX_SIGMA_RAD]).all(axis=1)
+    measured = ~(level.bridged | yaw.bridged)
+    filled, gaps = _filled(repaired, kept, _Evidence(new, measured, (level.noise, yaw.noise)))
+    return CheckedPoses(filled, tuple(sorted([*stretches, *gaps], key=lambda s: s.first_ns)))
+
+
+def _path_of(track: PoseTrack) -> _Path:
+    t_s = (track.t_ns - track.t_ns[0]) / NS_PER_S
+    return _Path(t_s, track.map_T_ego[:, :3, 3], np.unwrap(yaw_of(track.map_T_ego)))
+
+
+def _sigmas(level: RepairedPath, yaw: RepairedPath) -> Array:
+    """Return the standard deviations (P, 2) of positions, m, and yaws, rad, after their repair."""
+    usual = max(level.noise, USUAL_SIGMA_M), max(yaw.noise, USUAL_SIGMA_RAD)
+    return np.stack([np.hypot(level.sigma, usual[0]), np.hypot(yaw.sigma, usual[1])], axis=1)
+
+
+def _repaired_track(
+    track: PoseTrack, old: _Path, new: _Path, changed: NDArray[np.bool_], repaired: tuple[RepairedPath, RepairedPath]
+) -> PoseTrack:
+    """Return poses with the repaired positions and yaws where they changed, and their standard deviations."""
+    level, yaw = repaired
+    if not changed.any() and max(level.noise / USUAL_SIGMA_M, yaw.noise / USUAL_SIGMA_RAD) <= 1:
+        return track
+    sigmas = _sigmas(level, yaw)
+    track = replace(track, sigma_m=sigmas[:, 0], sigma_yaw_rad=sigmas[:, 1])
+    if not changed.any():
+        return track
+    poses = track.map_T_ego.copy()
+    poses[changed] = _placed(poses[changed], new.xyz_m[changed], new.yaw_rad[changed] - old.yaw_rad[changed])
+    return replace(track, map_T_ego=poses)
+
+
+def _placed(map_T_ego: Array, xyz_m: Array, turn_rad: Array) -> Array:
+    """Return poses (N, 4, 4) at other positions (N, 3) and turned about the vertical by angles (N,)."""
+    out = map_T_ego.copy()
+    none = np.zeros(len(turn_rad))
+    out[:, :3, :3] = rotation_from_rpy(none, none, turn_rad) @ map_T_ego[:, :3, :3]
+    out[:, :3, 3] = xyz_m
+    return out
+
+
+def _stretch(
+    track: PoseTrack, old: _Path, new: _Path, rows: tuple[int, int], repaired: tuple[RepairedPath, RepairedPath]
+) -> Stretch:
+    """Describe the repair of the poses from one row up to another."""
+    level, yaw = repaired
+    k = slice(*rows)
+    sigmas = _sigmas(level, yaw)[k]
+    known = (sigmas <= [MAX_SIGMA_M, MAX_SIGMA_RAD]).all(axis=1)
+    frozen = level.at_rest[k].mean() > 0.5
+    period = float(np.median(np.diff(old.t_s)))
+    return Stretch(
+        "frozen_poses" if frozen else "pose_jump",
+        int(track.t_ns[rows[0]]),
+        int(track.t_ns[rows[1] - 1]),
+        float(np.linalg.norm(new.xyz_m[k] - old.xyz_m[k], axis=1).max()),
+        float(np.abs(new.yaw_rad[k] - old.yaw_rad[k]).max()),
+        float(sigmas[known, 0].max(initial=0.0)),
+        float(np.sum(~known)) * period,
+        rows[1] - rows[0],
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Evidence:
+    """What tells poses in gaps: a path, which of its samples are measured, and their noise in m and rad."""
+
+    path: _Path
+    measured: NDArray[np.bool_]
+    noise: tuple[float, float]
+
+
+def _filled(track: PoseTrack, kept: NDArray[np.bool_], evidence: _Evidence) -> tuple[PoseTrack, list[Stretch]]:
+    """Add poses in gaps that are longer than `MAX_LINEAR_S`, and leave out those that are not kept."""
+    rows = np.flatnonzero(kept)
+    t_ns = track.t_ns[rows]
+    gaps = np.flatnonzero(np.diff(t_ns) > MAX_LINEAR_S * NS_PER_S)
+    if not len(gaps):
+        return (track if kept.all() or not len(rows) else _joined(track, [_taken(track, rows)])), []
+    parts, stretches = [_taken(track, rows)], []
+    line = replace(track, max_gap_s=np.inf)
+    for first, last in zip(t_ns[gaps].tolist(), t_ns[gaps + 1].tolist()):
+        added = _bridged(line, evidence, (first, last)) if last - first <= MAX_BRIDGED_S * NS_PER_S else None
+        ends, worst_m = np.array([first, last]), 0.0
+        if added is not None:
+            parts.append(added)
+            ends, worst_m = np.concatenate([[first], added.t_ns, [last]]), float(added.sigma_m.max())
+        between = np.diff(ends) / NS_PER_S
+        unknown_s = float(between[between > MAX_LINEAR_S].sum())
+        stretches.append(Stretch("gap", first, last, sigma_m=worst_m, unknown_s=unknown_s))
+    filled = _joined(track, parts)
+    # What is not bridged stays a gap.
+    return replace(filled, max_gap_s=MAX_LINEAR_S) if any(s.unknown_s for s in stretches) else filled, stretches
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Stamps, poses and standard deviations of some poses of a track."""
+
+    t_ns: NDArray[np.int64]
+    map_T_ego: Array
+    sigma_m: Array
+    sigma_rad: Array
+
+
+def _taken(track: PoseTrack, rows: NDArray[np.intp]) -> _Rows:
+    sigmas = track.sigmas_at(track.t_ns[rows], (USUAL_SIGMA_M, USUAL_SIGMA_RAD))
+    return _Rows(track.t_ns[rows], track.map_T_ego[rows], sigmas[:, 0], sigmas[:, 1])
+
+
+def _joined(track: PoseTrack, parts: list[_Rows]) -> PoseTrack:
+    """Return a track of the poses of several parts, in the order of time."""
+    order = np.argsort(np.concatenate([p.t_ns for p in parts]), kind="stable")
+    t_ns, poses, sigma_m, sigma_rad = (
+        np.concatenate([getattr(p, name) for p in parts])[order]
+        for name in ("t_ns", "map_T_ego", "sigma_m", "sigma_rad")
+    )
+    return replace(track, t_ns=t_ns, map_T_ego=poses, sigma_m=sigma_m, sigma_yaw_rad=sigma_rad)
+
+
+def _bridged(line: PoseTrack, evidence: _Evidence, around_ns: tuple[int, int]) -> _Rows | None:
+    """Interpolate poses between two stamps by the motion around, as far as they are known well enough; None without any."""
+    first, last = around_ns
+    path, measured, noise = evidence.path, evidence.measured, evidence.noise
+    steps = int(np.ceil((last - first) / NS_PER_S / ADDED_STEP_S))
+    t_ns = first + (np.arange(1, steps) * (last - first)) // steps
+    t_s = (t_ns - line.t_ns[0]) / NS_PER_S
+    xyz = bridge(path.t_s, path.xyz_m, measured, t_s, noise[0], POSITION_PRIOR)
+    yaw = bridge(path.t_s, path.yaw_rad[:, None], measured, t_s, noise[1], YAW_PRIOR)
+    if xyz is None or yaw is None:
+        return None
+    sigma_m = np.hypot(xyz.sigma, max(noise[0], USUAL_SIGMA_M))
+    sigma_rad = np.hypot(yaw.sigma, max(noise[1], USUAL_SIGMA_RAD))
+    known = (sigma_m <= MAX_SIGMA_M) & (sigma_rad <= MAX_SIGMA_RAD)
+    if not known.any():
+        return None
+    straight = line.at(t_ns[known])[0]
+    turned = yaw.value[known, 0] - yaw_of(straight)
+    return _Rows(t_ns[known], _placed(straight, xyz.value[known], turned), sigma_m[known], sigma_rad[known])

@@ -1,0 +1,255 @@
+"""Parts of a path between which it jumps or stops in a way that no vehicle moves.
+
+Positions or yaws are samples of a path, in units u: m or rad. Where the second derivative is beyond what vehicles do, by more
+than noise explains, the path breaks. What lies between two breaks is a part; the parts that one vehicle can have driven, and
+that last longest together, are right.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import Array
+
+# Second derivatives are taken over these times: the first finds jumps and sudden stops, the second jumps that take a while.
+# Shorter ones would find the vibration of the vehicle and the last digits of stored poses.
+SPANS_S = (0.1, 0.3)
+# Of a normal distribution 6e-7 are beyond: one sample of the longest logs.
+MAX_SIGMAS = 5.0
+# Third differences need some rows for a median.
+MIN_ROWS_FOR_NOISE, MIN_SIGMA = 8, 1e-3
+# The rate at the end of a part is fitted to this time of it.
+END_S = 0.5
+MIN_END_S = 0.05
+# Vehicles change their acceleration by up to this in a second, which a parabola does not follow, u/s3.
+MAX_JERK = 10.0
+# A rate that is not known, u/s.
+UNKNOWN_RATE = 60.0
+# A part that covers less is at rest, u; in noisier logs as many standard deviations.
+MAX_REST = 0.05
+# Parts farther back are no longer compared: between them almost any motion is possible.
+MAX_COMPARED = 30
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Samples of a path.
+
+    Attributes
+    ----------
+    t_s : (P,) float64, s
+        Strictly increasing.
+    values : (P, D) float64, u
+    max_change : float, u/s2
+        Largest second derivative of a vehicle's path.
+    sigma : float, u
+        Standard deviation of their noise, see `noise_of`.
+    """
+
+    t_s: Array
+    values: Array
+    max_change: float
+    sigma: float
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Successive samples that a vehicle can have driven.
+
+    Attributes
+    ----------
+    rows : (n,) int
+        Rows of `Samples`.
+    right : bool
+        Whether it belongs to the parts that are taken for right.
+    at_rest : bool
+        Whether it stays in one place although the path enters or leaves it at a speed.
+    """
+
+    rows: NDArray[np.intp]
+    right: bool = True
+    at_rest: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class _End:
+    """Time, value, rate and change (D,) at an end of a part, standard deviations, and by how much the rate may be off besides."""
+
+    t_s: float
+    value: Array
+    rate: Array
+    change: Array
+    sigma: float
+    rate_sigma: float
+    rate_slack: float
+
+
+def noise_of(t_s: Array, values: Array, usual_sigma: float) -> float:
+    """Estimate the standard deviation, u, of samples (P, D) from third differences over the shortest of `SPANS_S`; the usual one for few samples.
+
+    Notes
+    -----
+    The median absolute value, 0.6745 standard deviations of a Gaussian, is insensitive to jumps (Rousseeuw and Croux, J. Am.
+    Stat. Assoc. 88, 1993). Slow errors, such as those of a GNSS that drifts, do not show; where samples are sparse the third
+    derivative of the motion itself counts as noise.
+    """
+    i = np.arange(len(t_s))
+    steps = [i]
+    for _ in range(3):
+        after = np.searchsorted(t_s, t_s[np.minimum(steps[-1], len(t_s) - 1)] + SPANS_S[0] * 0.99)
+        steps.append(np.where(steps[-1] < len(t_s), after, len(t_s)))
+    rows = np.stack(steps, axis=1)
+    rows = rows[rows[:, -1] < len(t_s)]
+    if len(rows) < MIN_ROWS_FOR_NOISE:
+        return usual_sigma
+    # Weights of the divided difference: the inverse products of each time's distances to the other three.
+    t = t_s[rows] / SPANS_S[0]
+    weights = 1.0 / (t[:, :, None] - t[:, None, :] + np.eye(4)).prod(axis=2)
+    differences = np.einsum("nj,njk->nk", weights, values[rows]) / np.linalg.norm(weights, axis=1, keepdims=True)
+    spread = np.median(np.abs(differences), axis=0) / 0.6745
+    return max(float(np.sqrt(np.mean(spread**2))), MIN_SIGMA)
+
+
+def find_parts(samples: Samples) -> list[Part]:
+    """Divide samples where the path breaks; one part holds all of them where it does not."""
+    broken = find_breaks(samples)
+    if not broken.any():
+        return [Part(np.arange(len(samples.t_s)))]
+    edges = np.flatnonzero(np.diff(np.concatenate([[True], broken, [True]]).astype(np.int8)))
+    cores = [np.arange(first, end) for first, end in zip(edges[::2].tolist(), edges[1::2].tolist())]
+    if not cores:
+        return []
+    parts = [Part(rows) for rows in _grown(samples, cores)]
+    return _choose(samples, _marked_at_rest(samples, parts))
+
+
+def find_breaks(samples: Samples) -> NDArray[np.bool_]:
+    """Mark the samples (P,) around which the second derivative is beyond a vehicle's and beyond noise."""
+    t, values = samples.t_s, samples.values
+    broken = np.zeros(len(t), dtype=bool)
+    for span in SPANS_S:
+        before = np.searchsorted(t, t - span * 0.99, side="right") - 1
+        after = np.searchsorted(t, t + span * 0.99)
+        i = np.flatnonzero((before >= 0) & (after < len(t)))
+        b, a = before[i], after[i]
+        first, second = t[i] - t[b], t[a] - t[i]
+        change = (values[a] - values[i]) / second[:, None] - (values[i] - values[b]) / first[:, None]
+        scale = 2.0 / (first + second)
+        noise = samples.sigma * np.sqrt(first**-2 + second**-2 + (1 / first + 1 / second) ** 2)
+        # A wrong pair of samples shows in the mean; what a vehicle can do in the time of both is possible.
+        broken[i] |= np.linalg.norm(change, axis=1) * scale > samples.max_change + MAX_SIGMAS * noise * scale
+    return broken
+
+
+def _grown(samples: Samples, cores: list[NDArray[np.intp]]) -> list[NDArray[np.intp]]:
+    """Add to parts the samples beside them that continue their motion."""
+    grown, taken = [], 0
+    for k, core in enumerate(cores):
+        limit = cores[k + 1][0] if k + 1 < len(cores) else len(samples.t_s)
+        start, stop = int(core[0]), int(core[-1]) + 1
+        head, tail = _end(samples, core, first=True), _end(samples, core, first=False)
+        while start > taken and _continues(samples, head, start - 1):
+            start -= 1
+        while stop < limit and _continues(samples, tail, stop):
+            stop += 1
+        grown.append(np.arange(start, stop))
+        taken = stop
+    return grown
+
+
+def _continues(samples: Samples, end: _End, row: int) -> bool:
+    """Return whether a sample is where a vehicle can be that was at an end of a part."""
+    dt = samples.t_s[row] - end.t_s
+    off = float(np.linalg.norm(samples.values[row] - end.value - end.rate * dt - end.change * dt**2 / 2))
+    sigma = np.sqrt(samples.sigma**2 + end.sigma**2 + (end.rate_sigma * dt) ** 2)
+    # Something is wrong near here, so samples that a vehicle reaches by full brakes only are not added.
+    return off <= MAX_JERK * float(abs(dt)) ** 3 / 6 + MAX_SIGMAS * float(sigma)
+
+
+def _end(samples: Samples, rows: NDArray[np.intp], *, first: bool) -> _End:
+    """Fit value and rate at an end of a part: a parabola to its last samples, a line to few of them."""
+    t, t_end = samples.t_s[rows], float(samples.t_s[rows[0 if first else -1]])
+    near = np.abs(t - t_end) <= END_S
+    if near.sum() < 3 and len(rows) >= 3:
+        near = np.zeros(len(rows), dtype=bool)
+        near[: 3 if first else None] = first
+        near[None if first else -3 :] |= not first
+    used, span = rows[near], float(np.ptp(t[near]))
+    if len(used) < 2 or span < MIN_END_S:
+        value = samples.values[rows[0 if first else -1]]
+        none = np.zeros_like(value)
+        return _End(t_end, value, none, none, samples.sigma, 0.0, UNKNOWN_RATE)
+    degree = 2 if len(used) > 2 and span >= END_S / 2 else 1
+    powers = np.vander(samples.t_s[used] - t_end, degree + 1, increasing=True)
+    solution = np.linalg.lstsq(powers, samples.values[used], rcond=None)[0]
+    spread = np.sqrt(np.diag(np.linalg.inv(powers.T @ powers))) * samples.sigma
+    slack = MAX_JERK * span**2 / 12 if degree == 2 else samples.max_change * span / 2
+    change = 2 * solution[2] if degree == 2 else np.zeros_like(solution[0])
+    return _End(t_end, solution[0], solution[1], change, float(spread[0]), float(spread[1]), slack)
+
+
+def _marked_at_rest(samples: Samples, parts: list[Part]) -> list[Part]:
+    """Mark the parts that stay in one place although no vehicle stops or starts as suddenly as the path around them."""
+    out = []
+    for k, part in enumerate(parts):
+        covered = float(np.linalg.norm(np.ptp(samples.values[part.rows], axis=0)))
+        stays = covered <= max(MAX_REST, MAX_SIGMAS * samples.sigma)
+        sudden = stays and (
+            (
+                k > 0
+                and not _same_rate(
+                    samples, _end(samples, parts[k - 1].rows, first=False), _end(samples, part.rows, first=True)
+                )
+            )
+            or (
+                k + 1 < len(parts)
+                and not _same_rate(
+                    samples, _end(samples, part.rows, first=False), _end(samples, parts[k + 1].rows, first=True)
+                )
+            )
+        )
+        out.append(Part(part.rows, part.right, sudden))
+    return out
+
+
+def _same_rate(samples: Samples, end: _End, start: _End) -> bool:
+    """Return whether a vehicle can change from the rate at an end of a part to that at the start of a later one."""
+    sigma = np.hypot(end.rate_sigma, start.rate_sigma)
+    off = float(np.linalg.norm(start.rate - end.rate))
+    slack = end.rate_slack + start.rate_slack
+    return off <= samples.max_change * (start.t_s - end.t_s) + slack + MAX_SIGMAS * float(sigma)
+
+
+def _is_possible(samples: Samples, end: _End, start: _End) -> bool:
+    """Return whether a vehicle can get from the end of a part to the start of a later one."""
+    dt = start.t_s - end.t_s
+    if not _same_rate(samples, end, start):
+        return False
+    sigma = np.sqrt(end.sigma**2 + start.sigma**2 + (end.rate_sigma**2 + start.rate_sigma**2) * dt**2 / 4)
+    off = float(np.linalg.norm(start.value - end.value - (end.rate + start.rate) / 2 * dt))
+    # Full throttle for half of the time and full brakes for the other half.
+    slack = (end.rate_slack + start.rate_slack) / 2 * dt
+    return off <= samples.max_change * dt**2 / 4 + slack + MAX_SIGMAS * float(sigma)
+
+
+def _choose(samples: Samples, parts: list[Part]) -> list[Part]:
+    """Take the parts for right that one vehicle can have driven and that last longest together."""
+    moving = [k for k, part in enumerate(parts) if not part.at_rest]
+    heads = {k: _end(samples, parts[k].rows, first=True) for k in moving}
+    tails = {k: _end(samples, parts[k].rows, first=False) for k in moving}
+    best: dict[int, tuple[float, int | None]] = {}
+    for n, k in enumerate(moving):
+        earlier = [
+            (best[j][0], j) for j in moving[max(n - MAX_COMPARED, 0) : n] if _is_possible(samples, tails[j], heads[k])
+        ]
+        total, from_part = max(earlier, default=(0.0, None), key=lambda e: e[0])
+        best[k] = (total + float(np.ptp(samples.t_s[parts[k].rows])), from_part)
+    chosen: set[int] = set()
+    k_next = max(best, key=lambda k: best[k][0], default=None)
+    while k_next is not None:
+        chosen.add(k_next)
+        k_next = best[k_next][1]
+    return [Part(part.rows, k in chosen, part.at_rest) for k, part in enumerate(parts)]
