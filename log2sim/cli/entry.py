@@ -19,6 +19,7 @@ from log2sim.cli import (
     import_,
     inspect,
     plot,
+    predict,
     reconstruct,
     replay,
     synth,
@@ -54,7 +55,7 @@ def root(version: Annotated[bool, typer.Option("--version", help="Print the vers
 
 
 for command in (
-    reconstruct.reconstruct, detect.detect, replay.replay, synth.synth, edit.edit, plot.plot, evaluate.evaluate, bench.bench,
+    reconstruct.reconstruct, detect.detect, replay.replay, predict.predict, synth.synth, edit.edit, plot.plot, evaluate.evaluate, bench.bench,
     inspect.inspect, validate.validate, convert.convert, config.config, view.view, export.export,
 ):  # fmt: skip
     app.command()(command)

@@ -66,6 +66,8 @@ def _validate_file(path: Path) -> None:
         DetectedBoxes.load(path)
     elif "report_version" in keys:
         check(document, "report-1", ScenarioError)
+    elif "prediction_version" in keys:
+        check(document, "prediction-1", ScenarioError)
     elif "bench_version" in keys:
         check(document, "bench-1", ScenarioError)
     else:

@@ -119,6 +119,19 @@ class Trajectory:
             yaw = np.where(jumps, self.yaw_rad[i], yaw)
         return x, y, yaw, speed
 
+    def velocity(self, t_s: Array) -> tuple[Array, Array]:
+        """Compute the velocity vx, vy, m/s, at times (N,): the slope of the spline, straight on up to a discontinuity."""
+        t = np.clip(t_s, self.t_s[0], self.t_s[-1])
+        if len(self.t_s) == 1:
+            return np.full(len(t), self.velocity_x_mps[0]), np.full(len(t), self.velocity_y_mps[0])
+        i = np.clip(np.searchsorted(self.t_s, t, side="right") - 1, 0, len(self.t_s) - 2)
+        span = self.t_s[i + 1] - self.t_s[i]
+        since = t - self.t_s[i]
+        vx = hermite_slope(self.x_m, self.velocity_x_mps, i, since, span)
+        vy = hermite_slope(self.y_m, self.velocity_y_mps, i, since, span)
+        jumps = self.discontinuous[i] & (t < self.t_s[i + 1])
+        return np.where(jumps, self.velocity_x_mps[i], vx), np.where(jumps, self.velocity_y_mps[i], vy)
+
     def heights(self, t_s: Array) -> Array:
         """Interpolate the height z of the box center at times (N,); the ends are held."""
         return np.interp(t_s, self.t_s, self.z_m)
@@ -147,3 +160,10 @@ def hermite(value: Array, slope: Array, i: NDArray[np.intp], t: Array, span: Arr
     return begin + f * (
         begin_rise + f * (3 * rise - 2 * begin_rise - end_rise + f * (begin_rise + end_rise - 2 * rise))
     )
+
+
+def hermite_slope(value: Array, slope: Array, i: NDArray[np.intp], t: Array, span: Array) -> Array:
+    """Evaluate the slopes (N,) of the cubics of `hermite`."""
+    f = t / span
+    begin, end, rise = slope[i], slope[i + 1], (value[i + 1] - value[i]) / span
+    return begin + f * (2 * (3 * rise - 2 * begin - end) + 3 * f * (begin + end - 2 * rise))

@@ -1,0 +1,44 @@
+"""Predict where the agents of a scenario will be within seconds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, say
+
+
+def predict(
+    scenario: ScenarioPath,
+    horizon: Annotated[float, typer.Option(metavar="S", help="Longest prediction in s, from 0.1 to 10.")] = 3.0,
+    method: Annotated[
+        str | None,
+        typer.Option(metavar="A,B", help="Only these methods: velocity, turn, smoothed, path. Default: all."),
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Figures file to write.")] = None,
+    positions: Annotated[
+        bool, typer.Option("--positions", help="With --out: write every predicted position with its sigma, too.")
+    ] = False,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Predict each agent at each tick from its past, and tell how far off that is."""
+    from log2sim.datatypes import Scenario
+    from log2sim.documents import check_targets, write_json
+    from log2sim.errors import ConfigError
+    from log2sim.prediction.document import format_figures, prediction_document
+    from log2sim.prediction.prediction import METHODS, predict_scenario
+
+    check_targets(out, overwrite=overwrite)
+    if positions and out is None:
+        raise ConfigError("--positions: there is no file to write them to; name one with --out")
+    methods = tuple(METHODS) if method is None else tuple(dict.fromkeys(m.strip() for m in method.split(",")))
+    loaded = Scenario.load(scenario)
+    document = prediction_document(loaded, predict_scenario(loaded, horizon, methods=methods), with_positions=positions)
+    if out is not None:
+        write_json(out, document)
+    say(format_figures(document), quiet=quiet)
+    if loaded.is_reconstruction:
+        say("note: the states were smoothed over the whole log and tell a little of what came next", quiet=quiet)

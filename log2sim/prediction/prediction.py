@@ -1,0 +1,238 @@
+"""Short predictions of every agent at every tick, by several methods."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.datatypes import GROUP_OF, Scenario
+from log2sim.errors import ConfigError
+from log2sim.geometry import Array
+from log2sim.prediction.motion_table import TICK_S, Complex, MotionTable, table_of
+from log2sim.prediction.paths import Paths, Seekers, follow, locate
+from log2sim.prediction.smoothing import MIN_COURSE_MPS, PROOF_S, displacement, smooth_motion, turn_rates
+from log2sim.prediction.spread import own_scale, usual_sigma
+
+METHODS: Mapping[str, str] = {
+    "velocity": "constant velocity",
+    "turn": "constant speed and turn rate",
+    "smoothed": "velocity and turn rate smoothed exponentially, with constants that fit the agent's past",
+    "path": "smoothed speed along the path of another agent or a lane, where one is known; else as smoothed",
+}
+"""Methods of prediction by name, and what each expects an agent to keep."""
+
+DEFAULT_METHOD = "path"
+"""Where no path is known it is `smoothed`, and elsewhere it errs less."""
+
+LEAD_STEP_S = 0.5
+"""Interval of predicted positions: half a second as in nuScenes' prediction task."""
+
+HORIZON_LIMITS_S = (0.1, 10.0)
+"""Within a tick there is nothing to predict; beyond 10 s no agent keeps to what it did."""
+
+
+PATH_SIGMA_M = 0.5
+"""Standard deviation of the ways of two agents on one path from each other: drivers keep to a lane within some 0.3 m each. At short
+leads an agent's own motion tells its place more exactly."""
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """Predictions of N agent-ticks by one method.
+
+    Attributes
+    ----------
+    position_m : (N, H) complex128, m
+        Predicted box centers x + iy, map frame.
+    course : (N, H) complex128
+        Unit vectors of the predicted courses; of the heading where the agent stands.
+    sigma_m : (N, H, 2) float64, m
+        Standard deviations along and across the course.
+    """
+
+    position_m: Complex
+    course: Complex
+    sigma_m: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Predictions:
+    """Predictions of all agents at all ticks at which they are present.
+
+    Attributes
+    ----------
+    table : MotionTable
+        What they start from.
+    lead_s : (H,) float64, s
+    row : (N,) int
+        Agents, as indices of `table.agents`; the ticks of one agent follow each other.
+    tick : (N,) int
+        Indices of `table.t_s`.
+    forecasts : mapping of str to Forecast
+        By the names of `METHODS`.
+    constants_s : (N, 2) float64, s
+        Time constants of velocity and turn rate that the past of the agent chose.
+    on_path : (N,) bool
+        Where `path` knows one.
+    """
+
+    table: MotionTable
+    lead_s: Array
+    row: NDArray[np.intp]
+    tick: NDArray[np.intp]
+    forecasts: Mapping[str, Forecast]
+    constants_s: Array
+    on_path: NDArray[np.bool_]
+
+    def rows_of(self, agent: str) -> NDArray[np.intp]:
+        """Return the indices (K,) of the predictions of an agent, in order of time; none for an unknown one."""
+        k = next((k for k, a in enumerate(self.table.agents) if a.id == agent), -1)
+        return np.flatnonzero(self.row == k)
+
+    def rows_at(self, t_s: float) -> NDArray[np.intp]:
+        """Return the indices (K,) of the predictions made at the last tick up to a time."""
+        ticks = self.table.t_s
+        return np.flatnonzero(self.tick == np.searchsorted(ticks, t_s + self.table.tick_s * 1e-3, side="right") - 1)
+
+
+def leads_of(horizon_s: float) -> Array:
+    """Return the leads (H,), s, up to a horizon, which is rounded to ticks: every `LEAD_STEP_S`, and the horizon itself.
+
+    Raises
+    ------
+    ConfigError
+        For a horizon outside `HORIZON_LIMITS_S`.
+    """
+    low, high = HORIZON_LIMITS_S
+    if not low <= horizon_s <= high:
+        raise ConfigError(f"horizon: {horizon_s:g} s, expected {low:g} to {high:g} s")
+    horizon_s = round(horizon_s / TICK_S) * TICK_S
+    leads = np.arange(1, math.floor(horizon_s / LEAD_STEP_S + 1e-6) + 1) * LEAD_STEP_S
+    ends = len(leads) > 0 and math.isclose(leads[-1], horizon_s, abs_tol=1e-6)
+    return np.asarray(leads if ends else np.append(leads, horizon_s))
+
+
+def predict_scenario(
+    scenario: Scenario, horizon_s: float = 3.0, *, methods: Sequence[str] = tuple(METHODS), lanes: Sequence[Array] = ()
+) -> Predictions:
+    """Predict where each agent of a scenario will be, at every tick and from its states up to then.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    horizon_s : float, s
+        Longest lead.
+    methods : sequence of str
+        Of `METHODS`.
+    lanes : sequence of (K, 2) float64, m
+        Middle lines of lanes in their direction of travel, map frame, for the method `path`; scenarios hold none.
+
+    Raises
+    ------
+    ConfigError
+        For a horizon that is not from 0.1 to 10 s, or an unknown method.
+
+    Notes
+    -----
+    Only states up to a tick are used. Those of a reconstruction were smoothed over the whole log, so that they tell a little
+    of what came next: predictions by a system that measures while it drives are worse.
+    """
+    return predict_table(table_of(scenario, TICK_S), leads_of(horizon_s), methods, lanes)
+
+
+def predict_table(
+    table: MotionTable, lead_s: Array, methods: Sequence[str] = tuple(METHODS), lanes: Sequence[Array] = ()
+) -> Predictions:
+    """Predict agents from their states at ticks, for leads (H,), s; see `predict_scenario`."""
+    for name in methods:
+        if name not in METHODS:
+            raise ConfigError(f"method: '{name}' is not known; known: {', '.join(METHODS)}")
+    present = _Present(table, *np.nonzero(table.present))
+    smooth = smooth_motion(table)
+    latest, velocity = present.of(table.velocity_mps), present.of(smooth.velocity_mps)
+    motions = {
+        "velocity": (latest, np.zeros(len(latest))),
+        "turn": (latest, present.of(turn_rates(table))),
+        "smoothed": (velocity, present.of(smooth.turn_radps)),
+    }
+    # The last lead is that by which the past is judged.
+    leads = np.append(lead_s, PROOF_S)
+    known = np.zeros(len(latest), dtype=bool)
+    forecasts = {}
+    for name in methods:
+        way = _turn_on(present, *motions[name if name in motions else "smoothed"], leads)
+        if name == "path":
+            paths = Paths.driven(table, lanes)
+            way, known = _drawn_to_paths(present, way, np.abs(velocity), paths, leads)
+        forecasts[name] = _with_sigma(present, way, lead_s)
+    return Predictions(table, lead_s, present.row, present.tick, forecasts, present.of(smooth.constants_s), known)
+
+
+class _Present(NamedTuple):
+    """Where agents are present in a table: row (N,) and tick (N,)."""
+
+    table: MotionTable
+    row: NDArray[np.intp]
+    tick: NDArray[np.intp]
+
+    def of(self, column: NDArray[Any]) -> NDArray[Any]:
+        """Take the values (N, ...) of a column (A, T, ...)."""
+        return column[self.row, self.tick]
+
+
+class _Way(NamedTuple):
+    """Predicted positions and courses (N, H)."""
+
+    position_m: Complex
+    course: Complex
+
+
+def _turn_on(present: _Present, velocity: Complex, turn: Array, lead_s: Array) -> _Way:
+    """Move on with velocities (N,) that turn at rates (N,)."""
+    speed = np.abs(velocity)
+    course = np.exp(1j * present.of(present.table.yaw_rad))
+    fast = speed > MIN_COURSE_MPS
+    course[fast] = velocity[fast] / speed[fast]
+    position = present.of(present.table.position_m)[:, None] + displacement(velocity[:, None], turn[:, None], lead_s)
+    return _Way(position, course[:, None] * np.exp(1j * turn[:, None] * lead_s))
+
+
+def _drawn_to_paths(
+    present: _Present, way: _Way, speed_mps: Array, paths: Paths, lead_s: Array
+) -> tuple[_Way, NDArray[np.bool_]]:
+    """Average a way with that along a path by their variances across; and tell where a path is known (N,)."""
+    table = present.table
+    walks = np.array([GROUP_OF[a.category] == "pedestrian" for a in table.agents], dtype=bool)
+    seekers = Seekers(
+        present.of(table.position_m),
+        np.where(speed_mps > MIN_COURSE_MPS, way.course[:, 0], np.nan),
+        table.t_s[present.tick],
+        present.row,
+        walks[present.row],
+    )
+    point, heading = follow(paths, locate(paths, seekers), speed_mps, lead_s)
+    known = np.isfinite(point)
+    free_variance = present.of(usual_sigma(table, lead_s))[..., 1] ** 2
+    share = np.where(known, free_variance / (free_variance + PATH_SIGMA_M**2), 0.0)
+    position = way.position_m + share * np.where(known, point - way.position_m, 0.0)
+    course = way.course + share * np.where(known, heading - way.course, 0.0)
+    return _Way(position, course / np.abs(course)), np.asarray(known.any(axis=1))
+
+
+def _with_sigma(present: _Present, way: _Way, lead_s: Array) -> Forecast:
+    """Add standard deviations to a way whose last lead is `PROOF_S`."""
+    table, shape = present.table, present.table.position_m.shape
+    ticks = round(PROOF_S / table.tick_s)
+    usual = usual_sigma(table, np.append(lead_s, PROOF_S))
+    later, observed = table.later(ticks)
+    error, course = np.full(shape, np.nan, dtype=complex), np.ones(shape, dtype=complex)
+    error[present.row, present.tick] = way.position_m[:, -1] - present.of(later)
+    course[present.row, present.tick] = way.course[:, -1]
+    scale = own_scale(table, np.where(observed, error, np.nan), course, usual[:, :, -1], ticks)
+    sigma = present.of(usual)[:, :-1] * present.of(scale)[:, None, None]
+    return Forecast(way.position_m[:, :-1], way.course[:, :-1], sigma)
