@@ -35,6 +35,7 @@ from log2sim.plan import Plan, Stage, make_plan
 from log2sim.report import report_of
 from log2sim.sensors import Sensors, choose_detector, select_sensors
 from log2sim.stage_clock import StageClock
+from log2sim.tracking.recorded import mark_unrecorded
 from log2sim.tracking.tracker import track
 
 Progress = Callable[[str, int, int], None]
@@ -219,6 +220,7 @@ def second_pass(run: Run, observations: Observations) -> Result:
             max_gap_s=config.track.max_gap_s,
             min_life_s=config.track.min_life_s,
         )
+        tracks = mark_unrecorded(tracks, observations.recorded(run.schedule))
     with run.clock.stage("smooth"):
         candidates = estimate_agents(tracks, observations.obstacles, timeline, smooth=config.smooth.enabled)
         candidates = decide_headings(candidates, ego_path(log, run.schedule), timeline)

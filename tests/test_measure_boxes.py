@@ -17,6 +17,7 @@ from log2sim.geometry import NS_PER_S, PoseTrack, rotation_from_rpy, transform, 
 from log2sim.perception.box_completion import BOX_SIGMA_M, box_sigma, weighted_center
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.measure_boxes import measure_boxes, outside_ego
+from log2sim.tracking.recorded import mark_unrecorded
 
 ORIGIN = np.array([500.0, -200.0, 3.0])
 SENSOR = (0.0, 0.0, 1.9)
@@ -188,3 +189,18 @@ def test_a_track_seen_at_every_third_tick_is_no_object() -> None:
     pairs = np.sort(np.r_[rows, rows[::3] + 1])
     gappy = Track("car", whole.tick[pairs], whole.measurements.take(pairs))
     assert sweep_confidence(gappy) < sweep_confidence(sparse) <= sweep_confidence(whole)
+
+
+def test_ticks_at_which_nothing_was_recorded_do_not_count_against_a_track() -> None:
+    whole = track_of(60, 0.7)
+    rows = np.r_[0:20, 29:60]  # 0.9 s without
+    missed = Track("car", whole.tick[rows], whole.measurements.take(rows))
+    recorded = np.ones(60, dtype=bool)
+    recorded[20:29] = False
+    [silent] = mark_unrecorded([missed], {"": recorded, "front": np.ones(60, dtype=bool)})
+    assert sweep_confidence(missed) < 0.9 * sweep_confidence(whole)
+    assert sweep_confidence(silent) == pytest.approx(sweep_confidence(whole), rel=0.01)
+    [seen] = mark_unrecorded([missed], {"": ~recorded | recorded})
+    assert sweep_confidence(seen) == sweep_confidence(missed)
+    [half] = mark_unrecorded([missed], {"": recorded | (np.arange(60) % 2 == 0)})
+    assert sweep_confidence(missed) < sweep_confidence(half) < sweep_confidence(silent)

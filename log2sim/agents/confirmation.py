@@ -49,14 +49,18 @@ def agent_confidence(track: Track) -> float:
 
 def image_confidence(track: Track) -> float:
     """Return the share of its ticks at which a track is detected in images, times the mean of the best scores there."""
-    m = track.measurements
+    m, tick = track.measurements, track.tick
     weak = (m.score < MIN_COUNTED_SCORE) & (GROUP_OF[track.category] in WEAK_GROUPS)
     counted = ~(weak & np.isnan(m.box_yaw_rad))
-    m, weak = m.take(counted), weak[counted]
+    m, tick, weak = m.take(counted), tick[counted], weak[counted]
     in_image = (np.isnan(m.box_yaw_rad) | (m.camera != "")) & ~weak
     if not in_image.any():
         return 0.0
-    return detection_rate(m.t_ns) * float(in_image.mean()) * float(_strongest(m.score[in_image]).mean())
+    return (
+        detection_rate(m.t_ns, tick, track.unrecorded)
+        * float(in_image.mean())
+        * float(_strongest(m.score[in_image]).mean())
+    )
 
 
 def sweep_confidence(track: Track) -> float:
@@ -72,20 +76,25 @@ def sweep_confidence(track: Track) -> float:
     if not in_sweep.any():
         return 0.0
     log_odds = float(logit(m.score[in_sweep]).mean()) * independent(int(in_sweep.sum()))
-    return detection_rate(m.t_ns) * float(probability_of(log_odds))
+    return detection_rate(m.t_ns, track.tick, track.unrecorded) * float(probability_of(log_odds))
 
 
-def detection_rate(t_ns: NDArray[np.int64]) -> float:
-    """Return the share of ticks with a detection between the first and the last of stamps (n,).
+def detection_rate(t_ns: NDArray[np.int64], tick: NDArray[np.int64], unrecorded: NDArray[np.int64]) -> float:
+    """Return the share of ticks with a detection between the first and the last of stamps (n,), which belong to ticks (n,).
 
-    A gap longer than `HIDDEN_S` counts as an occlusion: half of `HIDDEN_S` of it enters the detection rate.
+    A gap longer than `HIDDEN_S` counts as an occlusion: half of `HIDDEN_S` of it enters the detection rate. Ticks (U,) at which
+    nothing was recorded do not count.
     """
-    t = np.sort((t_ns - t_ns[0]) / NS_PER_S)
+    order = np.argsort(t_ns, kind="stable")
+    t, tick = (t_ns[order] - t_ns[0]) / NS_PER_S, tick[order]
     # Frames that share a sweep measure at the same time, which counts once.
-    t = t[np.r_[True, np.diff(t) > SAME_MOMENT_S]]
+    rows = np.r_[True, np.diff(t) > SAME_MOMENT_S]
+    t, tick = t[rows], tick[rows]
     steps = np.diff(t)
     if len(steps) == 0:
         return 1.0
+    between = np.searchsorted(unrecorded, tick[1:]) - np.searchsorted(unrecorded, tick[:-1], side="right")
+    steps = steps * (1.0 - between / np.maximum(np.diff(tick), 1))
     period = float(np.median(steps[steps <= np.median(steps)]))
     expected = 1 + float(np.where(steps > HIDDEN_S, HIDDEN_S / 2, steps).sum()) / max(period, 1e-3)
     return min(len(t) / expected, 1.0)

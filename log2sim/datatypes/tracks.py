@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +21,15 @@ class Track:
         Strictly increasing indices of ticks.
     measurements : Measurements
         n rows, one at each of these ticks.
+    unrecorded : (U,) int64
+        Increasing indices of ticks at which no sensor that measured it recorded anything: that it was not measured there says
+        nothing.
     """
 
     category: str
     tick: NDArray[np.int64]
     measurements: Measurements
+    unrecorded: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def __len__(self) -> int:
         """Return the number of measurements."""

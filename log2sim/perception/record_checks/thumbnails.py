@@ -20,8 +20,8 @@ COARSE_FACTOR = 4
 # Of sums over independent noise the variance falls with the number of cells, within a factor of 2 by chance and by the
 # blocks of 8 pixels in which JPEG codes.
 MAX_NOISE_RATIO = 2.0
-# Structure below half a gray level is rounding to 8 bits and by JPEG.
-MIN_STRUCTURE_LEVELS = 0.5
+# Standard deviation of rounding to 8 bits; a street in fog that hides everything beyond 15 m has more structure.
+MIN_STRUCTURE_LEVELS = 0.29
 # One cell of thousands is this many standard deviations off once in 10^5 pictures of noise; a lamp at night is more.
 OUTSTANDING_SIGMAS = 6.0
 MIN_OUTSTANDING_LEVELS = 4.0
