@@ -107,11 +107,23 @@ def test_a_camera_with_noise_that_stands_never_repeats_a_picture():
     assert set(found[8:]) == {"frozen"}
 
 
-@pytest.mark.parametrize("step_m", [lambda i: 5.0 * (i >= 4), lambda i: 0.02 * i], ids=["jump", "drift"])
+def scatter(i):
+    return np.random.default_rng(0).normal(0, 0.3, len(i))
+
+
+@pytest.mark.parametrize(
+    "step_m", [lambda i: 5.0 * (i >= 4), lambda i: 0.02 * i, scatter], ids=["jump", "drift", "scatter"]
+)
 def test_poses_that_jump_or_drift_do_not_make_a_standing_camera_frozen(step_m):
     log, t_ns, images = pictures()
     moved = with_motion(log, step_m(np.arange(len(t_ns))))
     assert set(states(moved, t_ns, [noisy(images[0], i) for i in range(len(t_ns))])) == {"live"}
+
+
+def test_a_standing_camera_without_noise_is_not_frozen_by_scattered_poses():
+    log, t_ns, images = pictures()
+    moved = with_motion(log, 0.2 * scatter(np.arange(len(t_ns))))
+    assert set(states(moved, t_ns, [images[0]] * len(t_ns))) == {"live"}
 
 
 def gray(level, shape=(375, 1242)):
@@ -213,6 +225,14 @@ def test_equal_sweeps_without_noise_of_a_lidar_that_stands_are_no_fault(start):
     log = lidar_log().changed(ego=PoseTrack(STAMPS, poses))
     sweeps = [scan(SOLIDS, sensor=(x, 0.0, 1.9))[0] - [x, 0.0, 1.9] for x in at]
     assert not any(repeated(log, [Sweep(int(t), xyz) for t, xyz in zip(STAMPS, sweeps)]))
+
+
+def test_equal_sweeps_without_noise_are_no_fault_where_poses_scatter():
+    at = 0.06 * np.random.default_rng(1).normal(size=COUNT)
+    poses = transform(np.eye(3), np.stack([at, np.zeros(COUNT), np.zeros(COUNT)], axis=1))
+    log = lidar_log().changed(ego=PoseTrack(STAMPS, poses))
+    sweep = scan(SOLIDS)[0] - [0.0, 0.0, 1.9]
+    assert not any(repeated(log, [Sweep(int(t), sweep) for t in STAMPS]))
 
 
 def test_flat_ground_alone_looks_the_same_from_everywhere_and_is_no_copy():

@@ -5,7 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
+
 from log2sim.datatypes import Log
+from log2sim.perception.record_checks.driving import sensor_drives
 from log2sim.perception.record_checks.expected_change import expect_change
 from log2sim.perception.record_checks.thumbnails import Thumbnail, changed_share, measure_change, shows_nothing
 
@@ -69,7 +72,7 @@ class CameraWatch:
         -----
         Identical pictures are harmless as long as the camera has not moved since the first of them enough to change them: they
         show what it sees of all that stands. Pictures that are nearly identical are copies where the poses say at every step
-        that they cannot be; poses that drift while the ego stands do not.
+        that they cannot be; poses that drift or scatter while the ego stands do not.
         """
         last = self._last
         if not found and shows_nothing(thumbnail):
@@ -109,13 +112,13 @@ class CameraWatch:
         return self._steps_without_change >= MIN_STEPS_WITHOUT_CHANGE
 
     def _expected(self, before_ns: int, after_ns: int, thumbnail: Thumbnail) -> float:
-        """Return by how many levels a picture should change between two stamps; 0 where the motion is not known."""
-        camera = self.log.cameras[self.name]
-        if camera.mount == "map" or self.log.ego is None:
+        """Return by how many levels a picture should change between two stamps; 0 where the camera does not drive."""
+        log, ego = self.log, self.log.ego
+        if ego is None or not sensor_drives(log, self.name, before_ns, after_ns):
             return 0.0
-        poses, known = self.log.map_T_sensor(self.name, [before_ns, after_ns])
+        poses, known = log.map_T_sensor(self.name, np.array([before_ns, after_ns]))
         if not known.all():
             return 0.0
-        ego, _ = self.log.ego.at(after_ns)
-        ground_z_m = float((ego[0] @ [0.0, 0.0, self.log.ground_z_ego_m, 1.0])[2])
-        return expect_change(thumbnail, camera, poses[0], poses[1], ground_z_m)
+        map_T_ego = ego.at(after_ns)[0][0]
+        ground_z_m = float((map_T_ego @ [0.0, 0.0, log.ground_z_ego_m, 1.0])[2])
+        return expect_change(thumbnail, log.cameras[self.name], poses[0], poses[1], ground_z_m)

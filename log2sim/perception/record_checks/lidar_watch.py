@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
 from log2sim.datatypes import Log
 from log2sim.geometry import inverse
+from log2sim.perception.record_checks.driving import sensor_drives
 from log2sim.perception.record_checks.sweep_sketches import CELL_M, SweepSketch, common_share
 
 # A sweep that has this share of its obstacle points in common with another is a copy of it: rounded to millimeters one has
@@ -15,14 +17,18 @@ from log2sim.perception.record_checks.sweep_sketches import CELL_M, SweepSketch,
 MIN_COPIED_SHARE = 0.6
 # Where nothing tells how much sweeps of this LiDAR usually have in common, only exact copies count.
 MIN_IDENTICAL_SHARE = 0.95
-# Motion of the LiDAR by ten cells, or by the angle that moves points at 30 m as far, moves all points of structures.
+# Motion of the LiDAR by ten cells moves all points of structures to other cells; one that moves points by less than a cell at
+# this distance is none.
 MIN_MOTION_M = 10 * CELL_M
-MIN_TURN_RAD = MIN_MOTION_M / 30.0
+FAR_M = 30.0
 # So many pairs of sweeps tell how much they usually have in common.
 MIN_PAIRS = 5
 MAX_USUAL_SHARE = 0.3
 # Fewer obstacle points do not tell copies from chance.
 MIN_OBSTACLES = 20
+
+
+Motion = Literal["stands", "drives", "unclear"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +61,7 @@ class LidarWatch:
     points: dict[int, int] = field(default_factory=dict)
     obstacles: dict[int, int] = field(default_factory=dict)
     _last: _Sweep | None = None
-    _shares: dict[bool, list[float]] = field(default_factory=lambda: {False: [], True: []})
+    _shares: dict[Motion, list[float]] = field(default_factory=lambda: {"stands": [], "drives": [], "unclear": []})
 
     def is_repeated(self, t_ns: int, sketch: SweepSketch) -> bool:
         """Return whether a sweep repeats the one before it, and remember it.
@@ -70,27 +76,29 @@ class LidarWatch:
         if last is not None and min(sketch.obstacles, last.sketch.obstacles) >= MIN_OBSTACLES:
             share = common_share(last.sketch, sketch)
             same = share >= MIN_COPIED_SHARE
-            moved, still = self._motion(last.since_ns, t_ns)
-            copy = (moved and share >= MIN_IDENTICAL_SHARE) or (same and self._usually_differ(still))
+            motion = self._motion(last.since_ns, t_ns)
+            copy = (motion == "drives" and share >= MIN_IDENTICAL_SHARE) or (same and self._usually_differ(motion))
             if not copy:
-                self._shares[still].append(share)
+                self._shares[motion].append(share)
         self._last = _Sweep(last.since_ns if same and last is not None else t_ns, sketch)
         self.repeated[t_ns] = copy
         return copy
 
-    def _usually_differ(self, still: bool) -> bool:
-        """Return whether sweeps are known to have few points in common, from one place or while the LiDAR moves."""
-        shares = self._shares[still]
-        return len(shares) >= MIN_PAIRS and float(np.median(shares)) < MAX_USUAL_SHARE
+    def _usually_differ(self, motion: Motion) -> bool:
+        """Return whether sweeps are known to have few points in common where the LiDAR moves like this."""
+        shares = self._shares[motion]
+        return motion != "unclear" and len(shares) >= MIN_PAIRS and float(np.median(shares)) < MAX_USUAL_SHARE
 
-    def _motion(self, before_ns: int, after_ns: int) -> tuple[bool, bool]:
-        """Return whether the LiDAR moved between two stamps enough to change all points, and whether it stood."""
+    def _motion(self, before_ns: int, after_ns: int) -> Motion:
+        """Return how the LiDAR moved between two stamps."""
         if self.log.lidars[self.name].mount == "map":
-            return False, True
-        poses, known = self.log.map_T_sensor(self.name, [before_ns, after_ns])
+            return "stands"
+        poses, known = self.log.map_T_sensor(self.name, np.array([before_ns, after_ns]))
         if not known.all():
-            return False, False
+            return "unclear"
         step = inverse(poses[0]) @ poses[1]
         moved_m = float(np.linalg.norm(step[:3, 3]))
         turned_rad = float(np.arccos(np.clip((np.trace(step[:3, :3]) - 1) / 2, -1.0, 1.0)))
-        return moved_m > MIN_MOTION_M or turned_rad > MIN_TURN_RAD, moved_m < CELL_M and turned_rad < MIN_TURN_RAD / 10
+        if moved_m > MIN_MOTION_M and sensor_drives(self.log, self.name, before_ns, after_ns):
+            return "drives"
+        return "stands" if max(moved_m, turned_rad * FAR_M) < CELL_M else "unclear"
