@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from log2sim.calibration.twists import exp_of
-from log2sim.geometry import Array, inverse
+from log2sim.geometry import Array, apply, inverse
 
 # Points farther away are too sparse to lie next to each other in sweeps from two places.
 MAX_REACH_M = 60.0
@@ -16,13 +16,15 @@ VOXEL_M, NEIGHBORS = 0.4, 10
 # A piece of a plane is thin (RMS over its points, range noise and all) and no line, as the points of one ring are.
 MAX_THICKNESS_M, MIN_WIDTH_M = 0.06, 0.1
 # Ground, walls across and walls along count the same, however many points each of them has.
-MAX_FACING = 500
-MAX_TRIED = 4000
+MAX_FACING, MAX_TRIED = 300, 3000
 MIN_NORMAL_Z = 0.8
 MIN_PIECES = 150
 # Matches within a meter at first, since 3 degrees are 1 m after 20 m of driving; then within what noise and edges leave.
-MATCH_WITHIN_M = (2.0, 1.0, 0.5, 0.3, 0.3, 0.3)
+MATCH_WITHIN_M = (2.0, 1.0, 0.5, 0.3, 0.3)
 MIN_SCALE_M = 0.01
+MAD_TO_SIGMA = 1.4826
+# Pieces so many standard deviations off count half.
+CAUCHY = 2.0
 MIN_OVERLAP = 0.3
 # A direction that no surface holds stays where it was guessed: information of a guess that is right to 0.5 m and 3 degrees.
 GUESS_SIGMA = np.array([0.5, 0.5, 0.5, 0.05, 0.05, 0.05])
@@ -116,30 +118,42 @@ def register(first: Surfaces, second: Surfaces, guess: Array) -> Registration | 
     -----
     Point-to-plane ICP (Chen, Medioni, IVC 1992) with the normals of the first sweep and Cauchy weights.
     """
-    points, normals = first.xyz_m, first.normals
     pose = guess
-    information, scale, matched = np.zeros((6, 6)), MIN_SCALE_M, 0
+    match: _Match | None = None
     for within_m in MATCH_WITHIN_M:
-        second_T_first = inverse(pose)
-        p = points @ second_T_first[:3, :3].T + second_T_first[:3, 3]
-        n = normals @ second_T_first[:3, :3].T
-        away, index = second.tree.query(p, distance_upper_bound=within_m)
-        found = np.flatnonzero(np.isfinite(away))
-        matched = len(found)
-        if matched < MIN_PIECES // 2:
+        match = _match(first, second, inverse(pose), within_m)
+        if match is None:
             return None
-        x, n = second.middles[index[found]], n[found]
-        residual = np.einsum("nj,nj->n", n, x - p[found])
-        scale = max(1.4826 * float(np.median(np.abs(residual))), MIN_SCALE_M)
-        weight = 1.0 / (1.0 + (residual / (2 * scale)) ** 2)
-        jacobian = np.concatenate([n, np.cross(x, n)], axis=1)
-        information = (jacobian * (weight / scale**2)[:, None]).T @ jacobian
-        gradient = (jacobian * (weight / scale**2)[:, None]).T @ residual
-        step = np.linalg.solve(information + np.diag(GUESS_SIGMA**-2.0), -gradient)
-        pose = pose @ exp_of(step)
-    if matched < MIN_OVERLAP * len(points):
+        step = np.asarray(np.linalg.solve(match.information + np.diag(GUESS_SIGMA**-2.0), -match.gradient), np.float64)
+        pose = np.asarray(pose @ exp_of(step), dtype=np.float64)
+    if match is None or match.count < MIN_OVERLAP * len(first.xyz_m):
         return None
-    return Registration(pose, _covariance(information, scale), matched / len(points))
+    return Registration(pose, _covariance(match.information, match.scale_m), match.count / len(first.xyz_m))
+
+
+@dataclass(frozen=True, eq=False)
+class _Match:
+    """Pieces of one sweep beside points of another: how many, how far apart (robust RMS), and information about a twist."""
+
+    count: int
+    scale_m: float
+    information: Array
+    gradient: Array
+
+
+def _match(first: Surfaces, second: Surfaces, second_T_first: Array, within_m: float) -> _Match | None:
+    """Match pieces of the first sweep with points of the second one; None with too few."""
+    at, normals = apply(second_T_first, first.xyz_m), first.normals @ second_T_first[:3, :3].T
+    away, index = second.tree.query(at, distance_upper_bound=within_m)
+    found = np.flatnonzero(np.isfinite(away))
+    if len(found) < MIN_PIECES // 2:
+        return None
+    (x, y, z), (u, v, w) = second.middles[index[found]].T, normals[found].T
+    residual = u * (x - at[found, 0]) + v * (y - at[found, 1]) + w * (z - at[found, 2])
+    scale = max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), MIN_SCALE_M)
+    jacobian = np.stack([u, v, w, y * w - z * v, z * u - x * w, x * v - y * u])
+    weighted = jacobian / (scale**2 + (residual / CAUCHY) ** 2)
+    return _Match(len(found), scale, weighted @ jacobian.T, weighted @ residual)
 
 
 def _covariance(information: Array, scale_m: float) -> Array:

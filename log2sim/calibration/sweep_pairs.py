@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +19,10 @@ from log2sim.localization.moving_points import move_points
 
 # More sweeps make the result no better: the errors of the poses, which last for seconds, remain.
 MAX_SWEEPS = 20
-# Of a long log, the parts in which the ego changes its motion most.
-SPACING_S, PARTS = 0.5, 2
-# Sweeps are compared with those that follow at once, after the next one, and so on: near ones show much in common, far ones
-# do not add up errors.
-STEPS = (1, 2, 4)
+# Farther apart, sweeps miss how the ego changes its motion: of a long log, those of the parts in which it changes most are taken.
+SPACING_S, MAX_SPACING_S, PARTS = 0.5, 1.0, 2
+# Sweeps are compared with the next and with one of those after it: near ones show much in common, errors of far ones do not add up.
+STEP = 4
 MAX_APART_M = 40.0
 # On a shorter way no rotation shows that matters: errors of poses of centimeters are a degree of it.
 MIN_PATH_M = 3.0
@@ -117,10 +117,11 @@ def choose_sweeps(
     spaced, velocity = spaced[known], velocity[known]
     if len(spaced) == 0 or _path_m(track, t_ns[spaced]) < MIN_PATH_M:
         return rows[:0]
-    if len(spaced) > MAX_SWEEPS:
+    if len(spaced) * SPACING_S > MAX_SWEEPS * MAX_SPACING_S:
         return np.sort(np.concatenate(_livelies(spaced, velocity)))
     usable = rows[(rows >= spaced[0]) & (rows <= spaced[-1])]
-    return usable[np.unique(np.linspace(0, len(usable) - 1, MAX_SWEEPS).round().astype(np.int64))]
+    chosen = usable[np.unique(np.linspace(0, len(usable) - 1, MAX_SWEEPS).round().astype(np.int64))]
+    return np.asarray(chosen[velocities_at(track, t_ns[chosen])[1]])
 
 
 def _spaced(t_ns: NDArray[np.int64], rows: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -128,8 +129,7 @@ def _spaced(t_ns: NDArray[np.int64], rows: NDArray[np.intp]) -> NDArray[np.intp]
     if len(rows) == 0:
         return rows
     slot = (t_ns[rows] - t_ns[rows[0]]) // round(SPACING_S * NS_PER_S)
-    first: NDArray[np.intp] = np.unique(slot, return_index=True)[1]
-    return rows[first]
+    return np.asarray(rows[np.unique(slot, return_index=True)[1]])
 
 
 def _path_m(track: PoseTrack, t_ns: NDArray[np.int64]) -> float:
@@ -166,17 +166,20 @@ def _surfaces(sweep: EgoSweep, track: PoseTrack) -> Surfaces | None:
 
 
 def _compare(surfaces: list[Surfaces], map_T_ego: Array) -> list[Pair]:
-    """Register sweeps with those `STEPS` later, from what shorter steps have shown."""
-    known: dict[tuple[int, int], Registration] = {}
-    for step in STEPS:
+    """Register sweeps with the next ones, and with those `STEP` later, from what the former have shown."""
+    near: dict[int, Registration] = {}
+    pairs = []
+    for step in (1, STEP):
         for i in range(len(surfaces) - step):
-            middle, j = i + step // 2, i + step
-            guess = inverse(map_T_ego[i]) @ map_T_ego[j]
+            guess = inverse(map_T_ego[i]) @ map_T_ego[i + step]
             if np.linalg.norm(guess[:3, 3]) > MAX_APART_M:
                 continue
-            if (i, middle) in known and (middle, j) in known:
-                guess = known[i, middle].first_T_second @ known[middle, j].first_T_second
-            found = register(surfaces[i], surfaces[j], guess)
+            between = [near.get(k) for k in range(i, i + step)]
+            if step > 1 and all(between):
+                guess = reduce(np.matmul, [found.first_T_second for found in between if found is not None])
+            found = register(surfaces[i], surfaces[i + step], guess)
             if found is not None:
-                known[i, j] = found
-    return [Pair(i, j, found) for (i, j), found in known.items()]
+                pairs.append(Pair(i, i + step, found))
+                if step == 1:
+                    near[i] = found
+    return pairs
