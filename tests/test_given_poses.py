@@ -168,6 +168,17 @@ def test_a_step_is_taken_out_of_the_shorter_part_and_said_to_be_open() -> None:
     assert "which part is right does not show" in fault.message
 
 
+def test_a_step_forward_that_stays_may_be_of_the_stamps_and_is_told_only() -> None:
+    track = drive(6, 10, sigma=0.01)
+    kept = (times(track) < 3.95) | (times(track) > 4.15)
+    skipping = PoseTrack(track.t_ns[: kept.sum()], track.map_T_ego[kept])
+    found = check_poses(skipping)
+    assert found.track is skipping
+    (fault,) = list_faults(log_of(skipping), found.stretches, None)
+    assert fault.treatment == "kept"
+    assert fault.values["shift_m"] == pytest.approx(2.0, abs=0.1)
+
+
 @pytest.mark.parametrize("start_s", [0.0, 2.0, 5.0])
 def test_a_heading_that_jumps_is_turned_back(start_s: float) -> None:
     true = drive(6, 50, turn=0.2, sigma=0.01)

@@ -98,15 +98,16 @@ def _localize(request: _Request) -> tuple[Log, PoseChoice]:
         return _choose(request)
     given = request.log.ego
     checked = check_poses(given)
+    faults = list_faults(request.log, checked.stretches, request.during_ns)
     if checked.track is given:
-        return _choose(request)
-    if any(stretch.kind != "gap" for stretch in checked.stretches):
+        mended = request.log
+    elif any(stretch.kind in ("pose_jump", "frozen_poses") for stretch in checked.stretches):
         # What was measured in gaps moves with the poses around them.
         mended = replace_poses(request.log.changed(ego=replace(given, max_gap_s=np.inf)), checked.track)
     else:
         mended = request.log.changed(ego=checked.track)
     log, choice = _choose(replace(request, log=mended))
-    return log, replace(choice, faults=list_faults(request.log, checked.stretches, request.during_ns))
+    return log, replace(choice, faults=faults) if faults else choice
 
 
 def _choose(request: _Request) -> tuple[Log, PoseChoice]:

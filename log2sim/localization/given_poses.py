@@ -20,9 +20,9 @@ from log2sim.localization.path_repair import Limits, RepairedPath, bridge, repai
 # Vehicles on roads brake, speed up and turn with up to 10 m/s2; the rest is how their bodies pitch and bounce. They change their
 # yaw rate by less than 3 rad/s2 at the limit of their tires.
 MAX_ACCELERATION_MPS2, MAX_YAW_ACCELERATION_RADPS2 = 12.0, 5.0
-# Smaller faults are left as they are: they are no larger than the errors of GNSS without corrections, of a compass, and of the
-# fits that would repair them.
-MIN_STEP_M, MIN_STEP_RAD = 0.25, np.deg2rad(2.0)
+# Smaller faults are left as they are: stamps that are off by some 10 ms at 30 m/s, GNSS without corrections, and the fits that
+# would repair them err by as much.
+MIN_STEP_M, MIN_STEP_RAD = 0.4, np.deg2rad(2.0)
 # Standard deviations of poses of GNSS/INS with RTK or LiDAR odometry.
 USUAL_SIGMA_M, USUAL_SIGMA_RAD = 0.02, 0.002
 POSITION = Limits(MAX_ACCELERATION_MPS2, POSITION_PRIOR, MIN_STEP_M, USUAL_SIGMA_M)
@@ -41,7 +41,8 @@ class Stretch:
 
     Attributes
     ----------
-    kind : {"pose_jump", "frozen_poses", "gap"}
+    kind : {"pose_jump", "frozen_poses", "gap", "skip"}
+        A skip is a step forward that stays: the position may have jumped, or stamps may miss as much time.
     first_ns, last_ns : int
         Stamps of the first and the last pose in question; of a gap those around it.
     shift_m, turn_rad : float
@@ -113,6 +114,7 @@ def check_poses(track: PoseTrack) -> CheckedPoses:
     new = _Path(path.t_s, np.hstack([level.values, height.values]), yaw.values[:, 0])
     repaired = _repaired_track(track, path, new, changed, (level, yaw))
     stretches = [_stretch(track, path, new, rows, (level, yaw)) for rows in runs_of(changed)]
+    stretches += _skips(track, path, level)
     kept = ~changed | (_sigmas(level, yaw) <= [MAX_SIGMA_M, MAX_SIGMA_RAD]).all(axis=1)
     measured = ~(level.bridged | yaw.bridged)
     filled, gaps = _filled(repaired, kept, _Evidence(new, measured, (level.noise, yaw.noise)))
@@ -184,6 +186,15 @@ class _Evidence:
     path: _Path
     measured: NDArray[np.bool_]
     noise: tuple[float, float]
+
+
+def _skips(track: PoseTrack, path: _Path, level: RepairedPath) -> list[Stretch]:
+    """List the steps forward that are worth a word."""
+    return [
+        Stretch("skip", int(track.t_ns[s.first]), int(track.t_ns[s.last]), shift_m=s.size)
+        for s in level.skips
+        if s.size >= MIN_STEP_M
+    ]
 
 
 def _filled(track: PoseTrack, kept: NDArray[np.bool_], evidence: _Evidence) -> tuple[PoseTrack, list[Stretch]]:

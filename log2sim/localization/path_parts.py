@@ -8,6 +8,7 @@ that last longest together, are right.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,8 @@ MAX_JERK = 10.0
 UNKNOWN_RATE = 60.0
 # A part that covers less is at rest, u; in noisier logs as many standard deviations.
 MAX_REST = 0.05
+# Stamps of recorded drives miss some frames, or are assumed to be regular: then the path steps forward by up to this time of driving.
+MAX_SKIP_S = 0.25
 # Parts farther back are no longer compared: between them almost any motion is possible.
 MAX_COMPARED = 30
 
@@ -224,15 +227,57 @@ def _same_rate(samples: Samples, end: _End, start: _End) -> bool:
 
 
 def _is_possible(samples: Samples, end: _End, start: _End) -> bool:
-    """Return whether a vehicle can get from the end of a part to the start of a later one."""
+    """Return whether a vehicle can get from the end of a part to the start of a later one, or would if stamps skipped some time."""
     dt = start.t_s - end.t_s
     if not _same_rate(samples, end, start):
         return False
+    off, most = _step_and_limit(samples, end, start)
+    if np.linalg.norm(off) <= most:
+        return True
+    rate = (end.rate + start.rate) / 2
+    speed = float(np.linalg.norm(rate))
+    forward = float(off @ rate) / max(speed, MIN_SIGMA)
+    across = float(np.linalg.norm(off - forward * rate / max(speed, MIN_SIGMA)))
+    known = max(end.rate_sigma, start.rate_sigma, dt) < MAX_SKIP_S and max(end.rate_slack, start.rate_slack) < speed
+    return known and 0 < forward <= MAX_SKIP_S * speed and across <= most + forward / 10
+
+
+def _step_and_limit(samples: Samples, end: _End, start: _End) -> tuple[Array, float]:
+    """Compute how far the start of a part is from where the end of an earlier one leads, and how far it may be."""
+    dt = start.t_s - end.t_s
     sigma = np.sqrt(end.sigma**2 + start.sigma**2 + (end.rate_sigma**2 + start.rate_sigma**2) * dt**2 / 4)
-    off = float(np.linalg.norm(start.value - end.value - (end.rate + start.rate) / 2 * dt))
-    # Full throttle for half of the time and full brakes for the other half.
     slack = (end.rate_slack + start.rate_slack) / 2 * dt
-    return off <= samples.max_change * dt**2 / 4 + slack + MAX_SIGMAS * float(sigma)
+    # Full throttle for half of the time and full brakes for the other half.
+    most = samples.max_change * dt**2 / 4 + slack + MAX_SIGMAS * float(sigma)
+    return start.value - end.value - (end.rate + start.rate) / 2 * dt, most
+
+
+@dataclass(frozen=True)
+class Skip:
+    """A step forward between two right parts, as if stamps missed some time.
+
+    Attributes
+    ----------
+    first, last : int
+        Rows of the last sample before the step and of the first one after it.
+    size : float, u
+    """
+
+    first: int
+    last: int
+    size: float
+
+
+def find_skips(samples: Samples, parts: list[Part]) -> list[Skip]:
+    """List the steps forward between right parts."""
+    right, out = [part for part in parts if part.right], []
+    for one, other in pairwise(right):
+        off, most = _step_and_limit(
+            samples, _end(samples, one.rows, first=False), _end(samples, other.rows, first=True)
+        )
+        if np.linalg.norm(off) > most:
+            out.append(Skip(int(one.rows[-1]), int(other.rows[0]), float(np.linalg.norm(off))))
+    return out
 
 
 def _choose(samples: Samples, parts: list[Part]) -> list[Part]:

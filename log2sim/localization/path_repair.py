@@ -10,7 +10,16 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array
 from log2sim.localization.path_fit import FittedPath, PathPrior, fit_path
-from log2sim.localization.path_parts import MAX_REST, MAX_SIGMAS, Part, Samples, find_parts, noise_of
+from log2sim.localization.path_parts import (
+    MAX_REST,
+    MAX_SIGMAS,
+    Part,
+    Samples,
+    Skip,
+    find_parts,
+    find_skips,
+    noise_of,
+)
 
 # A gap is bridged by the samples this near to its ends, and by some where they are sparse; more change nothing.
 WINDOW_S, MIN_SIDE, MAX_SIDE = 1.5, 4, 30
@@ -53,6 +62,8 @@ class RepairedPath:
     moved, bridged, at_rest : (P,) bool
         Whether a sample was moved with its part, or replaced by what the samples around suggest; whether it stayed in its
         place while the vehicle moved.
+    skips : tuple of Skip
+        Steps forward that may be of the stamps: these samples stay as they are.
     """
 
     values: Array
@@ -61,6 +72,7 @@ class RepairedPath:
     moved: NDArray[np.bool_]
     bridged: NDArray[np.bool_]
     at_rest: NDArray[np.bool_]
+    skips: tuple[Skip, ...] = ()
 
 
 def repair_path(t_s: Array, values: Array, limits: Limits, wrong: NDArray[np.bool_] | None = None) -> RepairedPath:
@@ -94,6 +106,9 @@ def repair_path(t_s: Array, values: Array, limits: Limits, wrong: NDArray[np.boo
         if float(np.linalg.norm(offset, axis=1).max()) >= limits.min_step:
             new[of_part] -= offset
             sigma[of_part], moved[of_part] = offset_sigma, True
+    skips = [Skip(int(rows[s.first]), int(rows[s.last]), s.size) for s in find_skips(samples, parts)]
+    for skip in skips:
+        known[skip.first : skip.last] |= ~at_rest[skip.first : skip.last]
     bridged = ~known
     for first, stop in runs_of(bridged):
         fitted = bridge(t_s, new, known, t_s[first:stop], noise, limits.prior)
@@ -106,7 +121,7 @@ def repair_path(t_s: Array, values: Array, limits: Limits, wrong: NDArray[np.boo
             at_rest[first:stop] = False
             continue
         new[first:stop], sigma[first:stop] = fitted.value, fitted.sigma
-    return RepairedPath(new, sigma, noise, moved, bridged, at_rest & bridged)
+    return RepairedPath(new, sigma, noise, moved, bridged, at_rest & bridged, tuple(skips))
 
 
 def runs_of(marked: NDArray[np.bool_]) -> list[tuple[int, int]]:

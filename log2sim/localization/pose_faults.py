@@ -11,8 +11,8 @@ from log2sim.datatypes import Fault, Log
 from log2sim.geometry import NS_PER_S
 from log2sim.localization.given_poses import MIN_STEP_M, MIN_STEP_RAD, Stretch
 
-# At 3 m/s2, which is brisk driving, a line between poses this far apart is off by `MIN_STEP_M`: poses of 2 Hz are usual.
-MIN_SPARSE_S = float(np.sqrt(8 * MIN_STEP_M / 3.0))
+# At 3 m/s2, which is brisk driving, a line between poses this far apart is off by 0.25 m; poses of 2 Hz are usual.
+MIN_SPARSE_S = float(np.sqrt(8 * 0.25 / 3.0))
 
 
 def list_faults(log: Log, stretches: Sequence[Stretch], during_ns: tuple[int, int] | None) -> tuple[Fault, ...]:
@@ -26,7 +26,8 @@ def list_faults(log: Log, stretches: Sequence[Stretch], during_ns: tuple[int, in
     during_ns : (int, int), optional
         First and last stamp that is used; None for all.
     """
-    assert log.ego is not None
+    if log.ego is None or not stretches:
+        return ()
     records = np.unique(np.concatenate([stream.t_ns for stream in log.streams.values()] or [log.ego.t_ns]))
     if during_ns is not None:
         records = records[(records >= during_ns[0]) & (records <= during_ns[1])]
@@ -34,7 +35,8 @@ def list_faults(log: Log, stretches: Sequence[Stretch], during_ns: tuple[int, in
         return ()
     ends_ns = int(log.ego.t_ns[0]), int(log.ego.t_ns[-1])
     told = [s for s in stretches if _concerns(s, records)]
-    wrong = [s for s in told if s.kind != "gap"]
+    skips = [_skip(s, int(records[0])) for s in told if s.kind == "skip"]
+    wrong = [s for s in told if s.kind not in ("gap", "skip")]
     # Where wrong poses are left out there is a gap, which is told with them.
     gaps = [
         s for s in told if s.kind == "gap" and not any(w.first_ns < s.last_ns and s.first_ns < w.last_ns for w in wrong)
@@ -42,7 +44,7 @@ def list_faults(log: Log, stretches: Sequence[Stretch], during_ns: tuple[int, in
     repairs = [_repair(s, int(records[0]), ends_ns) for s in wrong]
     lost = [_lost(s, int(records[0])) for s in gaps if s.unknown_s > 0]
     sparse = [s for s in gaps if not s.unknown_s and s.duration_s >= MIN_SPARSE_S]
-    found = [*repairs, *lost, *([_sparse(sparse, int(records[0]))] if sparse else [])]
+    found = [*repairs, *skips, *lost, *([_sparse(sparse, int(records[0]))] if sparse else [])]
     return tuple(sorted(found, key=lambda fault: fault.start_ns or 0))
 
 
@@ -88,6 +90,16 @@ def _repair(stretch: Stretch, start_ns: int, ends_ns: tuple[int, int]) -> Fault:
         stretch.last_ns,
         values,
     )
+
+
+def _skip(stretch: Stretch, start_ns: int) -> Fault:
+    """Describe a step forward."""
+    message = (
+        f"the position steps forward by {stretch.shift_m:.1f} m {_span(stretch, start_ns)}, farther than a vehicle moves: it "
+        "jumped, or the stamps miss some time, which does not show; used as it is"
+    )
+    values = {"shift_m": round(stretch.shift_m, 3)}
+    return Fault("pose_jump", "ego", message, "kept", stretch.first_ns, stretch.last_ns, values)
 
 
 def _lost(stretch: Stretch, start_ns: int) -> Fault:
