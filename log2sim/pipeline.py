@@ -10,7 +10,7 @@ import numpy as np
 
 from log2sim.agents.candidate import Timeline
 from log2sim.agents.confidence.rating import rate_agents
-from log2sim.agents.ego import ego_agent, ego_path
+from log2sim.agents.ego import ego_agent, ego_path, with_pose_errors
 from log2sim.agents.estimate import estimate_agents
 from log2sim.agents.heading.decide import decide_headings
 from log2sim.agents.plausibility.judge import judge
@@ -229,7 +229,7 @@ def second_pass(run: Run, observations: Observations) -> Result:
         seen = run.schedule.without_frames(observations.unseen)
         recording = Recording(log, seen, observations.obstacles, timeline)
         judged = judge(candidates, ego, recording)
-        agents = [candidate.agent for candidate in rate_agents(judged, timeline)]
+        agents = [with_pose_errors(candidate.agent, log, timeline) for candidate in rate_agents(judged, timeline)]
         # Without an ego the agents' waypoints alone tell the ticks, so all of them stay.
         agents = simplify(agents) if ego is not None else agents
     if ego is None and not agents:

@@ -9,7 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from log2sim.datatypes import FAULT_KINDS, Log, Stream
+from log2sim.agents.candidate import Timeline
+from log2sim.agents.ego import ego_agent, with_pose_errors
+from log2sim.datatypes import FAULT_KINDS, Agent, Log, Stream, Waypoints
 from log2sim.geometry import Array, PoseTrack, rotation_from_rpy, transform, wrap_angle, yaw_of
 from log2sim.localization.choice import localize_like
 from log2sim.localization.given_poses import MAX_SIGMA_M, CheckedPoses, check_poses
@@ -360,3 +362,41 @@ def test_noise_is_estimated_in_spite_of_jumps_and_irregular_stamps() -> None:
     values = np.stack([10 * t, t**2 / 2], axis=1) + rng.normal(0, 0.05, (2000, 2))
     values[900:1000] += 5.0
     assert noise_of(t, values, 0.02) == pytest.approx(0.05, rel=0.15)
+
+
+# --- what is placed by the poses
+
+
+def test_agents_are_as_uncertain_as_the_poses_that_place_them() -> None:
+    true = drive(6, 50)
+    kept = (times(true) < 2.0) | (times(true) > 4.0)
+    log = log_of(check_poses(replace(true, t_ns=true.t_ns[kept], map_T_ego=true.map_T_ego[kept])).track)
+    t = np.arange(0.0, 6.05, 0.1)
+    timeline = Timeline(np.rint(t * NS).astype(np.int64), 0)
+    flat = np.zeros(len(t))
+    seen = np.ones(len(t), dtype=bool)
+    near = Waypoints(t, 10 * t, flat + 3.0, flat, flat, flat + 10, seen, flat + 0.1, flat + 0.05)
+    far = replace(near, y_m=flat + 40.0)
+    size = (4.5, 1.8, 1.5)
+    small, large = (
+        with_pose_errors(Agent("a", "car", size, w), log, timeline).waypoints.sigma_xy_m for w in (near, far)
+    )
+    middle = len(t) // 2
+    assert small[0] == pytest.approx(0.1)
+    assert small[middle] > 0.14
+    assert large[middle] > small[middle]
+    standing = with_pose_errors(Agent("b", "car", size, near, static=True), log, timeline).waypoints
+    np.testing.assert_allclose(standing.sigma_xy_m, 0.1, atol=1e-3)
+    assert with_pose_errors(Agent("a", "car", size, near), log_of(true), timeline).waypoints is near
+
+
+def test_the_ego_is_less_sure_where_its_poses_are_bridged() -> None:
+    true = drive(6, 50)
+    t_ns = np.arange(0, 6 * NS + 1, NS // 10)
+    whole = ego_agent(log_of(true), Timeline(t_ns, 0))
+    bridged = ego_agent(log_of(check_poses(frozen(true, 2.0, 3.5)).track), Timeline(t_ns, 0))
+    assert whole is not None
+    assert bridged is not None
+    added = bridged.waypoints.sigma_xy_m - whole.waypoints.sigma_xy_m
+    assert added[27] > 0.03
+    assert abs(added[10]) < 2e-3
