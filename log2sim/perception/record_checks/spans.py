@@ -51,10 +51,6 @@ def gaps_of(t_ns: NDArray[np.int64], start_ns: int, end_ns: int) -> list[tuple[i
     """Find the gaps of a stream (F,) between two stamps that are much longer than its period: stamps where they start and end."""
     if len(t_ns) < MIN_STAMPS:
         return []
+    shortest_ns = max(MIN_GAP_PERIODS * float(np.median(np.diff(t_ns))), MIN_GAP_S * NS_PER_S)
     around = np.concatenate([[start_ns], t_ns[(t_ns > start_ns) & (t_ns < end_ns)], [end_ns]])
-    return [(int(around[k]), int(around[k + 1])) for k in np.flatnonzero(np.diff(around) > shortest_gap_ns(t_ns))]
-
-
-def shortest_gap_ns(t_ns: NDArray[np.int64]) -> float:
-    """Return how long a stream (F,), at least three records, is silent where it is interrupted."""
-    return max(MIN_GAP_PERIODS * float(np.median(np.diff(t_ns))), MIN_GAP_S * NS_PER_S)
+    return [(int(around[k]), int(around[k + 1])) for k in np.flatnonzero(np.diff(around) > shortest_ns)]
