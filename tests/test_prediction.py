@@ -28,6 +28,7 @@ from log2sim.prediction.spread import ACCELERATION_S, drift_variance
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
+import bench_prediction  # noqa: E402
 import prediction_worlds  # noqa: E402
 
 Array = np.ndarray
@@ -250,6 +251,19 @@ def test_on_random_traffic_sigmas_are_honest_and_the_past_helps() -> None:
     assert 0.92 < (nees.sum(axis=1) < 5.991).mean() <= 1.0
     mean = {m: np.abs(np.concatenate(e)).mean() for m, e in off.items()}
     assert mean["path"] < mean["smoothed"] < 0.95 * mean["velocity"]
+
+
+def test_differences_of_measured_positions_are_smoothed() -> None:
+    """Chen's scheme: velocities are differences of noisy positions, off by a meter per second and more."""
+    courses = prediction_worlds.courses(0)
+    truth = table_of(prediction_worlds.true_scenario(courses))
+    found = predict_table(bench_prediction.difference_table(truth, courses, 0), leads_of(3.0))
+    later, _ = truth.later(30)
+    known = np.isfinite(later[found.row, found.tick]) & (found.table.t_s[found.tick] > 3.0)
+    off = {
+        m: np.abs(f.position_m[:, -1] - later[found.row, found.tick])[known].mean() for m, f in found.forecasts.items()
+    }
+    assert off["smoothed"] < 0.5 * off["velocity"] < 0.5 * off["turn"]
 
 
 def test_ten_thousand_agent_ticks_take_well_under_a_second() -> None:

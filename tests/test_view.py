@@ -22,7 +22,8 @@ from log2sim.datatypes import Agent, Doubt, Scenario, Waypoints
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array, box_corners_bev, wrap_angle
 from log2sim.simulation.runner import replay
-from log2sim.visualization.page.document import SCALES, page_document, second_differences
+from log2sim.visualization.page.columns import SCALES, second_differences
+from log2sim.visualization.page.document import page_document
 from log2sim.visualization.page.writer import html_of, write_page
 from log2sim.visualization.plot import style
 from log2sim.visualization.plot.roles import assign_roles
@@ -549,6 +550,22 @@ def test_layers_come_and_go(browser: Browser, sample: Path) -> None:
     assert pixel(browser, place) == (251, 252, 253)
     browser.press("s")
     assert pixel(browser, place) == rgb(style.INK)
+
+
+def test_predictions_show_where_an_agent_is_expected(browser: Browser, tmp_path: Path) -> None:
+    world = made(agent("car", 5.0 * np.arange(5.0), 0.0))
+    write_page(world, tmp_path / "page.html", predict_s=2.0)
+    opened(browser, tmp_path / "page.html", "#t=2.1")
+    car, scale = place_of(browser, "car"), browser.run("return log2sim.pixelsPerMeter")
+    beside = car + np.array([10.0 * scale, 0.3 * scale])  # within the ellipse, off the dots
+    ground = pixel(browser, car + np.array([6.0 * scale, 3.0 * scale]))
+    assert pixel(browser, beside) != ground
+    browser.press("d")
+    assert not pressed(browser, "layer-predictions")
+    assert pixel(browser, beside) == ground
+    browser.press("d")
+    browser.run("log2sim.time = 1.9")
+    assert pixel(browser, beside - np.array([1.0 * scale, 0.0])) != ground  # it moves with the car
 
 
 def test_a_layer_that_is_not_there_has_no_button(browser: Browser, tmp_path: Path) -> None:

@@ -153,8 +153,8 @@ def smoothed_scenario(found: list[Course], seed: int) -> Scenario:
     """The scenario that a reconstruction makes of noisy positions: smoothed over the whole log."""
     agents = []
     for k, course in enumerate(found):
-        noisy = _noisy(course, k, seed)
-        path = smooth_track(times(course), noisy, sigma_m=SIGMA_M[course.category], motion=_motion(course))
+        measured = noisy(course, k, seed)
+        path = smooth_track(times(course), measured, sigma_m=SIGMA_M[course.category], motion=_motion(course))
         agents.append(_smoothed_agent(k, course, path))
     return _scenario(agents)
 
@@ -166,23 +166,19 @@ def times(course: Course) -> Array:
 
 def causal_states(course: Course, k: int, seed: int, ticks: Array) -> tuple[Array, Array]:
     """Positions and velocities (K, 2) at ticks (K,), each smoothed over what was measured up to then."""
-    noisy, t = _noisy(course, k, seed), times(course)
+    measured, t = noisy(course, k, seed), times(course)
     xy, velocity = np.full((len(ticks), 2), np.nan), np.full((len(ticks), 2), np.nan)
     for row, n in enumerate(ticks.astype(int)):
         past = slice(max(0, n - 50), n + 1)
         path = smooth_track(
-            t[past], noisy[past], sigma_m=SIGMA_M[course.category], motion=_motion(course), at_s=t[n : n + 1]
+            t[past], measured[past], sigma_m=SIGMA_M[course.category], motion=_motion(course), at_s=t[n : n + 1]
         )
         xy[row], velocity[row] = path.xy_m[0], path.velocity_mps[0]
     return xy, velocity
 
 
-def noisy_positions(course: Course, k: int, seed: int) -> Array:
+def noisy(course: Course, k: int, seed: int) -> Array:
     """Measured positions (T, 2)."""
-    return _noisy(course, k, seed)
-
-
-def _noisy(course: Course, k: int, seed: int) -> Array:
     rng = np.random.default_rng([seed, k])
     return course.xy_m + rng.normal(0, SIGMA_M[course.category], course.xy_m.shape)
 

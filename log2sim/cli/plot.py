@@ -24,6 +24,9 @@ def plot(
         Path | None,
         typer.Option(metavar="LOG", help="Log whose camera images are projected onto the ground as background."),
     ] = None,
+    predict: Annotated[
+        float | None, typer.Option(metavar="S", help="Draw where movers were expected to go for this long, in s.")
+    ] = None,
     sequence: Sequence = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -42,4 +45,4 @@ def plot(
 
         picture = birdseye_of_log(open_log(background, sequence=sequence), loaded)
     known = load_truth(truth, loaded, sequence) if truth is not None else None
-    plot_tracks(loaded, out, replay=replayed, truth=known, background=picture, overwrite=overwrite)
+    plot_tracks(loaded, out, replay=replayed, truth=known, background=picture, predict_s=predict, overwrite=overwrite)

@@ -17,6 +17,9 @@ def view(
         Path | None, typer.Option(metavar="TRUTH", help="Ground truth: a scenario file or a log with labels.")
     ] = None,
     replay: Annotated[Path | None, typer.Option(metavar="REPLAY", help="Replay to show as a layer.")] = None,
+    predict: Annotated[
+        float | None, typer.Option(metavar="S", help="Show where agents were expected to go for this long, in s.")
+    ] = None,
     sequence: Sequence = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -31,5 +34,5 @@ def view(
     loaded = Scenario.load(scenario)
     replayed = load_replay(replay, loaded, quiet=quiet) if replay is not None else None
     known = load_truth(truth, loaded, sequence) if truth is not None else None
-    write_page(loaded, out, truth=known, replay=replayed, overwrite=overwrite)
+    write_page(loaded, out, truth=known, replay=replayed, predict_s=predict, overwrite=overwrite)
     say(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {counted(len(loaded.agents), 'agent')}", quiet=quiet)

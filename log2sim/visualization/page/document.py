@@ -6,31 +6,32 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, Agent, Doubt, Scenario, Trajectory, Waypoints, why_doubtful
 from log2sim.errors import ConfigError
+from log2sim.visualization.page.columns import SCALES, second_differences
+from log2sim.visualization.page.predictions import predicted_columns
 from log2sim.visualization.plot.doubts import shown_spans
 from log2sim.visualization.plot.roles import AgentRole, assign_roles, is_moving
 
-# Columns are stored as whole numbers of 0.1 ms, mm, 0.1 mrad and mm/s; standard deviations of cm, mrad and cm/s.
-SCALES = {
-    "t_s": 1e4, "x_m": 1e3, "y_m": 1e3, "yaw_rad": 1e4, "speed_mps": 1e3, "vx_mps": 1e3, "vy_mps": 1e3,
-    "sigma_xy_m": 1e2, "sigma_yaw_rad": 1e3, "sigma_speed_mps": 1e2,
-}  # fmt: skip
 WAYPOINT_COLUMNS = ("t_s", "x_m", "y_m", "speed_mps")
 SIGMAS = ("sigma_xy_m", *Waypoints.OPTIONAL_FLOATS)
 MAX_ROWS = 3_000_000
 """Waypoints of all layers together; a page with this many has about 50 MB."""
 
 
-def page_document(scenario: Scenario, truth: Scenario | None = None, replay: Any = None) -> dict[str, Any]:
+def page_document(
+    scenario: Scenario, truth: Scenario | None = None, replay: Any = None, predict_s: float | None = None
+) -> dict[str, Any]:
     """Assemble the document of a page: name, span of time and a layer each for scenario, truth and replay.
+
+    With `predict_s`, s, movers of the scenario also hold where they were expected to go for as long.
 
     Raises
     ------
     ConfigError
-        When there are more waypoints than a browser can be expected to hold.
+        When there are more waypoints than a browser can be expected to hold, or for a horizon that predictions do not have.
     ScenarioError
         When the truth's map has another projection.
     """
@@ -45,6 +46,10 @@ def page_document(scenario: Scenario, truth: Scenario | None = None, replay: Any
         layers["replay"] = [
             _entry(a, a, stationary=static[a.id], static=static[a.id]) for a in replay.agents if len(a.t_s)
         ]
+    if predict_s is not None:
+        predicted = predicted_columns(scenario, predict_s)
+        for entry in layers["scenario"]:
+            entry |= {"predicted": predicted[entry["id"]]} if entry["id"] in predicted else {}
     entries = [e for layer in layers.values() for e in layer]
     rows = sum(len(e["t_s"]) for e in entries)
     if rows > MAX_ROWS:
@@ -142,12 +147,6 @@ def _tangents(trajectory: Trajectory) -> dict[str, list[int]]:
         "vy_mps": second_differences(trajectory.velocity_y_mps, SCALES["vy_mps"]),
         "jumps": np.flatnonzero(trajectory.discontinuous).tolist(),
     }
-
-
-def second_differences(values: ArrayLike, scale: float) -> list[int]:
-    """Compute second differences (T,) of a column in whole units of 1 / `scale`; two cumulative sums restore it exactly."""
-    whole = np.rint(np.asarray(values, dtype=np.float64) * scale).astype(np.int64)
-    return list(np.diff(whole, n=2, prepend=[0, 0]).tolist())
 
 
 def _filled(observed: NDArray[np.bool_]) -> list[int]:

@@ -1,7 +1,11 @@
 // Actions of the user, and the start.
 
-const LAYER_NAMES = { scenario: "Scenario", truth: "Truth", replay: "Replay", trails: "Trails", names: "Names" };
+const LAYER_NAMES = { scenario: "Scenario", truth: "Truth", replay: "Replay", trails: "Trails", names: "Names", predictions: "Predictions" };
 let fitted = false;
+
+// Whether there is anything to show or hide.
+const hasLayer = (layer) =>
+  layer in { truth: 0, replay: 0 } ? data.layers[layer] !== undefined : layer !== "predictions" || tracks.some((track) => track.predicted);
 
 const choose = (track) => {
   state.chosen = track;
@@ -65,7 +69,7 @@ const showList = () => {
 };
 
 const toggle = (layer) => {
-  if (!(layer in LAYER_NAMES) || (data.layers[layer] === undefined && layer in { truth: 0, replay: 0 })) return;
+  if (!(layer in LAYER_NAMES) || !hasLayer(layer)) return;
   state.shown[layer] = !state.shown[layer];
   byId(`layer-${layer}`).setAttribute("aria-pressed", state.shown[layer]);
   requestDraw();
@@ -101,7 +105,7 @@ const listen = () => {
     ["f", "follow the chosen agent, else the ego", ["f"], buttons.follow],
     ["n p", "next or previous agent", ["n"], () => neighbor(1)],
     ["s t r", "scenario, truth or replay on or off", ["s"], () => toggle("scenario")],
-    ["w l", "trails or names on or off", ["w"], () => toggle("trails")],
+    ["w l d", "trails, names or predictions on or off", ["w"], () => toggle("trails")],
     ["e", "next collision of the replay", ["e"], nextEvent],
     ["a /", "list of agents, search in it", ["a"], buttons["list-toggle"]],
     ["Esc", "choose nobody", ["Escape"], () => choose(null)],
@@ -109,7 +113,8 @@ const listen = () => {
   ], [
     [["ArrowRight"], jump(0.1)], [["End"], () => seek(data.end)], [[">", "."], () => setRate(1)],
     [["-", "_"], () => zoom(1 / 1.25)], [["p"], () => neighbor(-1)], [["t"], () => toggle("truth")],
-    [["r"], () => toggle("replay")], [["l"], () => toggle("names")], [["/"], () => byId("search").focus()],
+    [["r"], () => toggle("replay")], [["l"], () => toggle("names")], [["d"], () => toggle("predictions")],
+    [["/"], () => byId("search").focus()],
   ]);
   listenToPointers(byId("map"), {
     drag: (dx, dy) => { follow(false); view.drag(dx, dy); requestDraw(); },
@@ -176,7 +181,7 @@ const start = () => {
   Object.assign(byId("scrub"), { min: data.begin, max: data.end, value: data.begin });
   byId("follow").disabled = tracks.length === 0;
   for (const [layer, name] of Object.entries(LAYER_NAMES)) {
-    if (layer in { truth: 0, replay: 0 } && !data.layers[layer]) continue;
+    if (!hasLayer(layer)) continue;
     const button = element("button", { id: `layer-${layer}`, type: "button", "aria-pressed": true, class: layer }, name);
     button.addEventListener("click", () => toggle(layer));
     byId("layers").append(button);

@@ -31,6 +31,7 @@ class Painter {
     this.grid();
     for (const track of layers.scenario) track.moveTo(t);
     if (shown.scenario) this.scene(layers.scenario, t, shown, chosen);
+    if (shown.scenario && shown.predictions) this.predictions(layers.scenario, t);
     if (shown.truth && layers.truth) this.outlines(layers.truth, t, TRUTH_DASHES, 1.1);
     if (shown.replay && layers.replay) this.outlines(layers.replay, t, DOTTED, 1.6);
     ctx.setLineDash(SOLID);
@@ -68,6 +69,10 @@ class Painter {
       }
     }
     for (let i = tracks.length - 1; i >= 0; i--) if (tracks[i].present) this.box(tracks[i]);
+  }
+
+  predictions(tracks, t) {
+    for (let i = tracks.length - 1; i >= 0; i--) if (tracks[i].present) drawPredicted(this.ctx, this.view, tracks[i], t);
   }
 
   // A part of a track, dashed where it was not observed.

@@ -36,6 +36,7 @@ class Track {
     this.filled = new Uint8Array(Math.max(this.t.length - 1, 0));
     const edges = entry.filled ?? [];
     for (let k = 0; k < edges.length; k += 2) this.filled.fill(1, edges[k], edges[k + 1]);
+    this.predicted = entry.predicted ? new Predicted(entry.predicted, scales) : null;
     this.confidence = entry.confidence ?? null;
     this.points = entry.points ?? null;
     this.source = entry.source ?? null;

@@ -14,11 +14,13 @@ from typing import Any
 from log2sim.datatypes import Scenario
 from log2sim.documents import refuse_existing, replaced
 from log2sim.errors import ConfigError
-from log2sim.visualization.page.document import SCALES, page_document
+from log2sim.visualization.page.columns import SCALES
+from log2sim.visualization.page.document import page_document
 
 SUFFIXES = (".html", ".htm")
 SCRIPT_FILES = (
     "track.js",
+    "predicted.js",
     "theme.js",
     "map.js",
     "paint.js",
@@ -39,6 +41,7 @@ def write_page(
     *,
     truth: Scenario | None = None,
     replay: Any = None,
+    predict_s: float | None = None,
     overwrite: bool = False,
 ) -> None:
     """Write a self-contained page that plays a scenario in a browser and loads nothing over the network.
@@ -49,18 +52,20 @@ def write_page(
         Shown as a layer, aligned to the scenario's time and map.
     replay : Replay or None
         Shown as a layer, and beside the scenario in the plots of an agent.
+    predict_s : float, s, or None
+        For how long it is shown where agents were expected to go.
 
     Raises
     ------
     ConfigError
         When the name ends in something else than .html, the file exists and `overwrite` is False, it cannot be written, or
-        there are more waypoints than a page can hold.
+        there are more waypoints than a page can hold, or for a horizon that predictions do not have.
     """
     out_path = Path(out_path)
     if out_path.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"{out_path}: a page's name must end in {' or '.join(SUFFIXES)}, not in '{out_path.suffix}'")
     refuse_existing(out_path, overwrite=overwrite)
-    page = html_of({**page_document(scenario, truth, replay), "scales": SCALES})
+    page = html_of({**page_document(scenario, truth, replay, predict_s), "scales": SCALES})
     with replaced(out_path) as temporary:
         temporary.write_text(page, encoding="utf-8")
 

@@ -21,6 +21,7 @@ from log2sim.visualization.plot import drawing, shapes
 from log2sim.visualization.plot.collisions import new_collisions
 from log2sim.visualization.plot.doubts import STRIPE_PT, box_stripes, is_doubted_at
 from log2sim.visualization.plot.layout import SIDE_IN, TOP_IN, WIDTH_IN, FigureLayout
+from log2sim.visualization.plot.predicted import DOTS, PredictedWays, show_expected
 from log2sim.visualization.plot.roles import AgentRoles, centers_xy
 from log2sim.visualization.plot.scene import draw_base
 from log2sim.visualization.plot.style import ALARM, FONT, INK, PAPER, halo
@@ -79,17 +80,25 @@ def write_animation(
     replay: Any,
     truth: Scenario | None,
     background: drawing.Background | None,
+    predicted: PredictedWays | None,
     title: str | None,
 ) -> None:
     """Write a .gif or .mp4; parameters as in `tracks.plot_tracks`."""
     suffix = out_path.suffix.lower()
     layout, step_s, charts = draw_base(
-        scenario, roles, replay=replay, truth=truth, background=background, title=title, moving=True
+        scenario,
+        roles,
+        replay=replay,
+        truth=truth,
+        background=background,
+        title=title,
+        moving=True,
+        predicted=predicted,
     )
     drawing.draw_tracks(layout.ax, roles, layout.view, step_s, alpha=TRACK_ALPHA, faint=True)
     layout.figure.set_dpi(DPI[suffix])
     timing = choose_frame_timing(scenario.duration_s)
-    artists = AnimatedArtists(layout, roles, replay, truth, timing, charts)
+    artists = AnimatedArtists(layout, roles, replay, truth, timing, charts, predicted)
     frames = _frames(layout, artists, timing)
     with replaced(out_path) as temporary:
         if suffix == ".gif":
@@ -120,7 +129,9 @@ class AnimatedArtists:
         truth: Scenario | None,
         timing: FrameTiming,
         charts: TimelineCharts | None,
+        predicted: PredictedWays | None,
     ) -> None:
+        self.predicted = predicted
         self.layout, self.roles, self.truth, self.timing, self.charts = layout, roles, truth, timing, charts
         if charts is not None:
             charts.start()
@@ -137,7 +148,11 @@ class AnimatedArtists:
             [], facecolors="none", edgecolors=INK, linewidths=0.8, linestyles=[(0, (3, 2))], **hidden
         )
         self.driven = PolyCollection([], facecolors="none", linewidths=1.2, linestyles=[(0, (1, 1.2))], **hidden)
-        self.collections = [self.tails, self.boxes, self.hatches, self.noses, self.truths, self.driven]
+        self.ways = LineCollection([], **hidden, **DOTS)
+        self.ellipses = PolyCollection([], linewidths=0.7, **hidden)
+        self.collections = [
+            self.ellipses, self.tails, self.ways, self.boxes, self.hatches, self.noses, self.truths, self.driven,
+        ]  # fmt: skip
         for collection in self.collections:
             layout.ax.add_collection(collection, autolim=False)
         text: dict[str, Any] = {"family": FONT, "fontweight": "bold", "parse_math": False, "animated": True}
@@ -183,6 +198,11 @@ class AnimatedArtists:
             self.charts.show(t_s)
 
     def _show_overlays(self, t_s: float) -> None:
+        if self.predicted is not None:
+            leading = [(role, self.predicted.at(role.agent.id, t_s)) for role in self.roles.movers if role.leading]
+            expected = [(role, found) for role, found in leading if found is not None]
+            show_expected(self.ways, expected)
+            show_expected(self.ellipses, expected)
         if self.truth is not None:
             there = [(a, _pose(a, t_s)) for a in self.truth.agents]
             self.truths.set_verts([shapes.footprints(a, pose[:2], pose[2])[0] for a, pose in there if pose is not None])

@@ -17,6 +17,7 @@ from log2sim.visualization.plot.layout import (
     make_layout,
     write_title,
 )
+from log2sim.visualization.plot.predicted import PredictedWays, prediction_row
 from log2sim.visualization.plot.roles import AgentRoles, centers_xy, is_moving
 from log2sim.visualization.plot.time_series import TimelineCharts, charts_height_in, draw_charts, timeline_of
 from log2sim.visualization.plot.viewport import Viewport, choose_viewport, time_step_s
@@ -31,6 +32,7 @@ def draw_base(
     background: drawing.Background | None = None,
     title: str | None = None,
     moving: bool = False,
+    predicted: PredictedWays | None = None,
 ) -> tuple[FigureLayout, float, TimelineCharts | None]:
     """Draw what stills and animations share.
 
@@ -50,6 +52,8 @@ def draw_base(
     collisions = len(new_collisions(replay)[0])
     rows = legend_rows(roles, None if moving else step_s, collisions=collisions, outside=outside, **overlays)
     rows += doubts.doubt_rows(roles)
+    if predicted is not None and roles.movers:
+        rows.append(prediction_row(predicted.horizon_s))
     timeline = timeline_of(replay, scenario, roles)
     lines = sum(1 + text.count("\n") for _, text in rows)
     layout = make_layout(chosen, lines, projected=projected, foot_in=charts_height_in(timeline))

@@ -15,6 +15,7 @@ from log2sim.visualization.plot.collisions import new_collisions
 from log2sim.visualization.plot.layout import (
     FigureLayout,
 )
+from log2sim.visualization.plot.predicted import PredictedWays, draw_predictions
 from log2sim.visualization.plot.roles import AgentRoles, assign_roles
 from log2sim.visualization.plot.scene import draw_base
 
@@ -28,6 +29,7 @@ def plot_tracks(
     replay: Any = None,
     truth: Scenario | None = None,
     background: drawing.Background | None = None,
+    predict_s: float | None = None,
     title: str | None = None,
     overwrite: bool = False,
     dpi: int = 200,
@@ -43,13 +45,15 @@ def plot_tracks(
         Brought to the scenario's start and map.
     background : BirdsEyeView or None
         A picture of the ground in the map frame, drawn below everything.
+    predict_s : float, s, or None
+        For how long predictions of the leading movers are drawn.
     dpi : int
         Dots per inch of a .png, which is 10 inches wide.
 
     Raises
     ------
     ConfigError
-        When the name has another suffix, the file exists and `overwrite` is False, or it cannot be written.
+        When the name has another suffix, `predict_s` is no horizon of predictions, the file exists and `overwrite` is False, or it cannot be written.
     ScenarioError
         When the truth's map has another projection.
     """
@@ -62,13 +66,19 @@ def plot_tracks(
         )
     refuse_existing(out_path, overwrite=overwrite)
     roles = assign_roles(scenario)
-    truth = None if truth is None else truth.aligned_to(scenario)
+    overlays: dict[str, Any] = {
+        "replay": replay,
+        "truth": None if truth is None else truth.aligned_to(scenario),
+        "background": background,
+        "predicted": None if predict_s is None else PredictedWays(scenario, predict_s),
+        "title": title,
+    }
     if suffix in ANIMATED:
         from log2sim.visualization.plot.animation import write_animation
 
-        write_animation(scenario, roles, out_path, replay=replay, truth=truth, background=background, title=title)
+        write_animation(scenario, roles, out_path, **overlays)
         return
-    layout = still(scenario, roles, replay=replay, truth=truth, background=background, title=title)
+    layout = still(scenario, roles, **overlays)
     # The same scenario gives the same bytes: no random element names, no dates.
     metadata: dict[str, dict[str, Any]] = {
         ".svg": {"Date": None},
@@ -86,10 +96,13 @@ def still(
     replay: Any = None,
     truth: Scenario | None = None,
     background: drawing.Background | None = None,
+    predicted: PredictedWays | None = None,
     title: str | None = None,
 ) -> FigureLayout:
     """Draw a still picture."""
-    layout, step_s, _ = draw_base(scenario, roles, replay=replay, truth=truth, background=background, title=title)
+    layout, step_s, _ = draw_base(
+        scenario, roles, replay=replay, truth=truth, background=background, title=title, predicted=predicted
+    )
     overlaid = truth is not None or replay is not None
     drawing.draw_tracks(layout.ax, roles, layout.view, step_s, alpha=0.45 if overlaid else 1.0)
     ghosts = None if overlaid or drawing.view_is_crowded(roles) else step_s
@@ -100,5 +113,7 @@ def still(
     if replay is not None:
         drawing.draw_replay(layout.ax, replay, roles)
         drawing.draw_collisions(layout.ax, new_collisions(replay)[1])
+    if predicted is not None:
+        draw_predictions(layout.ax, roles, predicted)
     drawing.draw_labels(layout.ax, roles, layout.view, step_s)
     return layout
