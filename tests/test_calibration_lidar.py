@@ -161,6 +161,13 @@ def test_late_stamps_are_corrected_with_those_of_the_points(lively: Log) -> None
     assert check(log)[1] == ()
 
 
+def test_stamps_at_the_end_of_sweeps_whose_points_have_no_times_are_half_a_turn_late(lively: Log) -> None:
+    old = lively.streams[TOP]
+    untimed = Stream(TOP, old.t_ns, lambda i: replace(old.read(i), t_ns=None))
+    _, (fault,) = check(lively.changed(streams={TOP: untimed}))
+    assert fault.values["offset_s"] == pytest.approx(0.05, abs=0.01)
+
+
 def test_a_turned_mount_is_corrected_about_the_axes_that_are_certain(lively: Log) -> None:
     log, (fault,) = check(turned(lively, yaw_deg=1.0), fix_mounts=True)
     assert (fault.kind, fault.treatment) == ("lidar_rotation", "corrected")
@@ -231,6 +238,12 @@ def test_points_in_the_map_tell_nothing_about_clocks(lively: Log) -> None:
     old = lively.streams[TOP]
     in_map = Stream(TOP, old.t_ns, lambda i: replace(old.read(i), frame="map"))
     assert check(lively.changed(streams={TOP: in_map}))[1] == ()
+
+
+def test_sweeps_that_do_not_belong_to_the_poses_are_blamed_for_nothing(lively: Log) -> None:
+    assert lively.ego is not None
+    other = replace(lively.ego, map_T_ego=lively.ego.map_T_ego[::-1])
+    assert check(lively.changed(ego=other))[1] == ()
 
 
 def test_sweeps_that_cannot_be_read_are_passed_over(lively: Log) -> None:

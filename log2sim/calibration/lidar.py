@@ -28,6 +28,8 @@ MIN_OFFSET_S = 0.02
 MIN_ROTATION_RAD = np.array([0.7, 0.7, 0.2]) / 40.0
 # An estimate that is no better than this does not help who asks for a correction.
 MAX_SIGMA_S, MAX_SIGMA_RAD = 0.05, np.deg2rad(1.0)
+# Poses that err by more within seconds, or that belong to other sweeps, are no base for a calibration.
+MAX_POSE_ERROR_M = 0.5
 AXES = {ROLL: "roll", PITCH: "pitch", YAW: "yaw"}
 
 
@@ -59,9 +61,9 @@ def _check_lidar(log: Log, lidar: str, config: Config, progress: Progress) -> tu
     """Return the log with one LiDAR corrected, and its faults."""
     asked, stage = config.calibration, f"check {lidar}"
     seen = pair_sweeps(log, lidar, during_ns(log, config), lambda done, total: progress(stage, done, total))
-    if seen is None:
+    found = None if seen is None else fit_clock_and_mount(seen)
+    if seen is None or found is None or found.pose_error_m > MAX_POSE_ERROR_M:
         return log, unseen_faults(lidar, None, asked)
-    found = fit_clock_and_mount(seen)
     faults = unseen_faults(lidar, found, asked)
     offset, turned = offset_fault(lidar, found, asked), certain_rotation(found)
     if offset is not None:
@@ -86,7 +88,7 @@ def offset_fault(lidar: str, found: Estimate, asked: CalibrationConfig) -> Fault
         f"stamps are {abs(late_s) * 1e3:.0f} ms {'late' if late_s > 0 else 'early'} against the poses of the ego "
         f"(sigma {sigma_s * 1e3:.0f} ms); {'corrected' if asked.fix_time else 'not corrected, which --fix-time does'}"
     )
-    values = {"offset_s": late_s, "offset_sigma_s": sigma_s}
+    values = {"offset_s": late_s, "offset_sigma_s": sigma_s, "pose_error_m": found.pose_error_m}
     return Fault("time_offset", lidar, message, "corrected" if asked.fix_time else "kept", values=values)
 
 
@@ -99,7 +101,7 @@ def certain_rotation(found: Estimate) -> Array:
 def rotation_fault(lidar: str, found: Estimate, seen: SweepPairs, asked: CalibrationConfig) -> Fault:
     """Describe the rotation of a mount."""
     words: list[str] = []
-    values: dict[str, float] = {}
+    values = {"pose_error_m": found.pose_error_m}
     for row, name in AXES.items():
         off_deg, sigma_deg = -np.degrees(found.values[row]), np.degrees(found.sigma[row])
         if certain_rotation(found)[row - ROLL] != 0:

@@ -24,7 +24,8 @@ VALUES = 7
 PRIOR_SIGMA = np.array([0.3, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05])
 # An offset that the motion does not show is taken for none.
 UNSEEN_OFFSET_SIGMA_S = 0.005
-FIRST_TIME_S = 2.0
+# Steps until the size of the errors of the poses is estimated, from what is usual.
+FIRST_TIME_S, FIRST_STEPS = 2.0, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,11 +40,14 @@ class Estimate:
     covariance : (7, 7) float64
     shows_offset : bool
         Whether the ego's motion shows a time offset; without, that is 0 here.
+    pose_error_m : float, m
+        By how much the positions of the poses err, for seconds at a time.
     """
 
     values: Array
     covariance: Array
     shows_offset: bool
+    pose_error_m: float
 
     @property
     def sigma(self) -> Array:
@@ -62,20 +66,25 @@ def fit_clock_and_mount(seen: SweepPairs) -> Estimate:
 
     Notes
     -----
-    Gauss-Newton; sizes of the errors of the poses are estimated after the first step, and the results for several time
+    Gauss-Newton; sizes of the errors of the poses are estimated after the first steps, and the results for several time
     constants of these are weighed by their likelihood.
     """
     for prior_sigma_s in (PRIOR_SIGMA[OFFSET], UNSEEN_OFFSET_SIGMA_S):
         prior = PRIOR_SIGMA.copy()
         prior[OFFSET] = prior_sigma_s
-        values = PoseNoise(_linearize(seen, np.zeros(VALUES), prior)).solve(USUAL_NOISE, FIRST_TIME_S).step
+        values = np.zeros(VALUES)
+        for _ in range(FIRST_STEPS):
+            values = values + PoseNoise(_linearize(seen, values, prior)).solve(USUAL_NOISE, FIRST_TIME_S).step
         problem = PoseNoise(_linearize(seen, values, prior))
-        solved = [(weight, problem.solve(noise, tau)) for weight, noise, tau in problem.estimate()]
+        errors = problem.estimate()
+        solved = [(weight, problem.solve(noise, tau)) for weight, noise, tau in errors]
         shows_offset = prior_sigma_s == PRIOR_SIGMA[OFFSET]
         if not shows_offset or sum(w * s.noise_share for w, s in solved) < MAX_NOISE_SHARE:
             break
     step, covariance = _mean(solved)
-    return Estimate(values + step, covariance, shows_offset)
+    return Estimate(
+        values + step, covariance, shows_offset, float(sum(weight * noise[0] for weight, noise, _ in errors))
+    )
 
 
 def _mean(solved: list[tuple[float, Solution]]) -> tuple[Array, Array]:

@@ -24,8 +24,8 @@ SPACING_S, MAX_SPACING_S, PARTS = 0.5, 1.0, 2
 # Sweeps are compared with the next and with one of those after it: near ones show much in common, errors of far ones do not add up.
 STEP = 4
 MAX_APART_M = 40.0
-# On a shorter way no rotation shows that matters: errors of poses of centimeters are a degree of it.
-MIN_PATH_M = 3.0
+# On a shorter way nothing shows that matters: errors of poses of centimeters are degrees of it.
+MIN_PATH_M = 1.0
 # A turn moves what is seen as much as a translation by its angle times this.
 LEVER_M = 20.0
 MIN_PAIRS = 8
