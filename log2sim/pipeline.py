@@ -145,6 +145,7 @@ def start(log: Log, config: Config, *, progress: Progress | None = None) -> Run:
     sensors = select_sensors(log, config)
     with clock.stage("calibration"):
         log, faults = check_calibration(log, config, sensors, progress=report_progress)
+        sensors = sensors.without([fault.sensor for fault in faults if fault.treatment == "left_out"])
     detectors = detectors_of(log, config)
     with clock.stage("sync"):
         schedule = schedule_of(log, config, sensors)

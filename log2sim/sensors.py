@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -43,6 +44,10 @@ class Sensors:
     def restrict(self, log: Log) -> Log:
         """Return the log without the LiDARs that are out of range; its streams stay."""
         return log.changed(lidars={name: log.lidars[name] for name in self.lidars})
+
+    def without(self, cameras: Collection[str]) -> Sensors:
+        """Return the sensors but for some cameras."""
+        return replace(self, cameras=tuple(name for name in self.cameras if name not in cameras))
 
 
 def choose_detector(log: Log, config: Config) -> Config:

@@ -38,5 +38,5 @@ def check_calibration(
     if not config.calibration.check:
         return log, ()
     log, of_lidars = check_lidars(log, config, sensors, progress=progress)
-    log, of_cameras = check_cameras(log, config, sensors, progress=progress)
+    log, of_cameras = check_cameras(log, config, sensors, of_lidars=of_lidars, progress=progress)
     return log, (*of_lidars, *of_cameras)

@@ -16,7 +16,7 @@ from log2sim.datatypes.categories import (
 )
 from log2sim.datatypes.doubtful import list_doubtful, say_confidence, why_doubtful
 from log2sim.datatypes.doubts import FLAGS, MIN_TRUSTED_CONFIDENCE, Doubt
-from log2sim.datatypes.faults import FAULT_KINDS, Fault
+from log2sim.datatypes.faults import FAULT_KINDS, Fault, Treatment
 from log2sim.datatypes.ignore_regions import IgnoreRegions, LabelView
 from log2sim.datatypes.labels import ImageLabels, ImageRegions, Labels
 from log2sim.datatypes.log import (
@@ -78,6 +78,7 @@ __all__ = [
     "Sweep",
     "Track",
     "Trajectory",
+    "Treatment",
     "Waypoints",
     "list_doubtful",
     "say_confidence",

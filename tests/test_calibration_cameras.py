@@ -1,0 +1,246 @@
+"""Mounts of cameras against a LiDAR: edges of synthetic scans and pictures with exact truth, and the sample with faults put in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from log2sim import Config, open_log
+from log2sim.calibration.cameras import check_cameras
+from log2sim.calibration.corrections import turn_mount
+from log2sim.calibration.depth_edges import DepthEdges, find_depth_edges, keep_standing
+from log2sim.calibration.edge_alignment import (
+    SYSTEMATIC_RAD,
+    EdgeView,
+    YawEstimate,
+    estimate_yaw,
+    find_image_edges,
+    score_angles,
+)
+from log2sim.calibration.gray_images import read_gray
+from log2sim.datatypes import Fault, Log
+from log2sim.geometry import Array, Camera, apply, inverse, project, transform
+from log2sim.sensors import Sensors, choose_detector, select_sensors
+
+SAMPLE = Path(__file__).parents[1] / "samples/crossing"
+FORWARD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+K = np.array([[600.0, 0.0, 399.5], [0.0, 600.0, 199.5], [0.0, 0.0, 1.0]])
+CAMERA = Camera("front", 800, 400, K, "ego", transform(FORWARD, [1.5, 0.0, 1.5]))
+
+
+def yawed(camera: Camera, degrees: float) -> Camera:
+    return replace(camera, mount_T_cam=turn_mount(camera.mount_T_cam, np.radians([0.0, 0.0, degrees])))
+
+
+# Edges of scans
+
+
+def scan(panel_rad: tuple[float, float], panel_m: float, wall_m: float) -> Array:
+    """Points of eight lasers on a round wall and, between two azimuths, on a panel before it."""
+    azimuth, elevation = np.meshgrid(np.radians(np.arange(-30.0, 30.0, 0.2)), np.radians(np.arange(-7.9, 0.0)))
+    azimuth, elevation = azimuth.ravel(), elevation.ravel()
+    near = (azimuth > panel_rad[0]) & (azimuth < panel_rad[1])
+    flat = np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)], axis=1) * np.cos(elevation)[:, None]
+    return np.asarray(flat * np.where(near, panel_m, wall_m)[:, None])
+
+
+def test_edges_are_where_a_panel_before_a_wall_ends() -> None:
+    points = scan((np.radians(-2.05), np.radians(3.05)), 10.0, 20.0)
+    index, left = find_depth_edges(points[np.random.default_rng(0).permutation(len(points))])
+    points = points[np.random.default_rng(0).permutation(len(points))][index]
+    azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+    assert len(index) == 16
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 10.0)
+    np.testing.assert_allclose(azimuth[left], 3.0, atol=1e-9)
+    np.testing.assert_allclose(azimuth[~left], -2.0, atol=1e-9)
+
+
+def test_a_panel_close_to_the_wall_has_no_edges() -> None:
+    assert len(find_depth_edges(scan((-0.05, 0.05), 19.5, 20.0))[0]) == 0
+
+
+def test_edges_that_are_elsewhere_in_the_next_sweep_are_left_out() -> None:
+    xyz, left = np.array([[10.0, 0.0, 1.0], [20.0, 3.0, 1.0], [15.0, -4.0, 0.0]]), np.array([True, True, False])
+    later = xyz + np.array([[0.05, 0.0, 0.3], [0.8, 0.0, 0.0], [0.0, 0.1, 0.0]])
+    kept = keep_standing(DepthEdges(xyz, np.linalg.norm(xyz, axis=1), left), DepthEdges(later, np.ones(3), left))
+    assert kept.points_map.tolist() == xyz[[0, 2]].tolist()
+    others = DepthEdges(later, np.ones(3), ~left)
+    assert len(keep_standing(DepthEdges(xyz, np.ones(3), left), others).left) == 0
+
+
+# Alignment in a world of posts
+
+
+def world(camera: Camera, rng: np.random.Generator, *, frames: int = 10, overhang_rad: float = 0.002) -> list[EdgeView]:
+    """Pictures of the upright edges of panels, as many edges that no LiDAR sees, and points beside the ends of the panels."""
+    views = []
+    for _ in range(frames):
+        azimuth, range_m = rng.uniform(-0.5, 0.5, 12), rng.uniform(6.0, 40.0, 12)
+        left = rng.random(12) < 0.5
+        gray = np.full((camera.height_px, camera.width_px), 60, np.uint8)
+        points = []
+        for a, r, is_left in zip(azimuth, range_m, left):
+            a_end = a + (overhang_rad if is_left else -overhang_rad)
+            both = [
+                np.stack([r * np.cos(b) + 0 * up, r * np.sin(b) + 0 * up, up], 1) for b, up in ((a_end, UP), (a, UP))
+            ]
+            uv, valid = project(camera, apply(inverse(camera.mount_T_cam), both[0]))
+            cv2.polylines(gray, [np.round(uv[valid]).astype(np.int32)], False, 200, 1)
+            points.append(both[1] + rng.normal(0.0, 0.02, both[1].shape))
+        for u in rng.uniform(0, camera.width_px, 12).astype(int):
+            cv2.line(gray, (u, 100), (u, 300), 200, 1)
+        noisy = gray + rng.integers(0, 6, gray.shape, dtype=np.uint8)
+        strength = find_image_edges(noisy, sideways=False)
+        views.append(EdgeView(strength, 1.0, np.concatenate(points), np.repeat(left, len(UP))))
+    return views
+
+
+UP = np.linspace(0.5, 2.5, 6)
+
+
+def estimated(camera: Camera, views: Sequence[EdgeView]) -> YawEstimate | None:
+    return estimate_yaw([score_angles(camera, view) for view in views])
+
+
+@pytest.mark.parametrize("degrees", [-1.5, -0.3, 0.0, 1.0])
+def test_the_yaw_that_a_mount_lacks_is_found(degrees: float) -> None:
+    found = estimated(yawed(CAMERA, degrees), world(CAMERA, np.random.default_rng(3)))
+    assert found is not None
+    assert np.degrees(found.yaw_rad) == pytest.approx(-degrees, abs=0.06)
+
+
+def test_errors_are_as_large_as_the_scatter_between_parts_of_the_log() -> None:
+    errors, scatter = [], []
+    for seed in range(12):
+        found = estimated(CAMERA, world(CAMERA, np.random.default_rng(seed), frames=8))
+        assert found is not None
+        errors.append(found.yaw_rad)
+        scatter.append(np.sqrt(found.sigma_rad**2 - SYSTEMATIC_RAD**2))
+    assert 0.3 < np.std(errors) / np.sqrt(np.mean(np.square(scatter))) < 2.0
+    assert np.abs(errors).max() < SYSTEMATIC_RAD
+
+
+def test_pictures_of_another_place_give_no_yaw() -> None:
+    for seed in range(4):
+        pictures, points = (world(CAMERA, np.random.default_rng(k)) for k in (seed, 100 + seed))
+        mixed = [replace(picture, points_mount=p.points_mount, left=p.left) for picture, p in zip(pictures, points)]
+        assert estimated(CAMERA, mixed) is None
+
+
+def test_one_frame_does_not_decide() -> None:
+    views = world(CAMERA, np.random.default_rng(0))
+    dark = [replace(view, strength=np.zeros_like(view.strength)) for view in views[1:]]
+    assert estimated(CAMERA, [views[0], *dark]) is None
+    assert estimated(CAMERA, views[:1]) is None
+
+
+def test_a_camera_that_lies_on_its_side_has_its_upright_edges_along_the_rows() -> None:
+    gray = np.full((90, 120), 50, np.uint8)
+    gray[:, 60:] = 150
+    assert find_image_edges(gray, sideways=False)[45, 60] > 3
+    assert find_image_edges(gray, sideways=True)[45, 60] == 0
+    lying = find_image_edges(gray.T.copy(), sideways=True)
+    np.testing.assert_allclose(lying, find_image_edges(gray, sideways=False).T, atol=1e-4)
+
+
+# The sample
+
+
+@pytest.fixture(scope="module")
+def sample() -> Log:
+    return open_log(SAMPLE)
+
+
+def with_cameras(log: Log, *cameras: Camera) -> Log:
+    return log.changed(cameras={**log.cameras, **{camera.name: camera for camera in cameras}})
+
+
+def checked(log: Log, *, fix: bool = False, of_lidars: tuple[Fault, ...] = ()) -> tuple[Log, tuple[Fault, ...]]:
+    config = choose_detector(
+        log, Config().changed(calibration={"fix_mounts": fix}, detect={"name": "ssd-mobilenet-v2"})
+    )
+    return check_cameras(log, config, select_sensors(log, config), of_lidars=of_lidars, progress=lambda *_: None)
+
+
+def test_nothing_is_said_of_the_sample(sample: Log) -> None:
+    same, faults = checked(sample)
+    assert faults == ()
+    assert same is sample
+
+
+def test_a_turned_camera_is_told_and_corrected(sample: Log) -> None:
+    turned = with_cameras(sample, yawed(sample.cameras["front"], 1.0))
+    same, (fault,) = checked(turned)
+    assert (fault.kind, fault.sensor, fault.treatment) == ("camera_rotation", "front", "kept")
+    assert same is turned
+    assert abs(fault.values["yaw_deg"] - 1.0) < 2 * fault.values["yaw_sigma_deg"] < 0.4
+    mended, (fault,) = checked(turned, fix=True)
+    assert fault.treatment == "corrected"
+    rest = mended.cameras["front"].mount_T_cam[:3, :3].T @ sample.cameras["front"].mount_T_cam[:3, :3]
+    assert np.degrees(np.arccos((np.trace(rest) - 1) / 2)) < 0.15
+    assert mended.cameras["front_left"] is sample.cameras["front_left"]
+    assert checked(mended)[1] == ()
+
+
+def test_exchanged_mounts_are_told_by_name_and_given_back(sample: Log) -> None:
+    left, right = sample.cameras["front_left"], sample.cameras["front_right"]
+    swapped = with_cameras(
+        sample, replace(left, mount_T_cam=right.mount_T_cam), replace(right, mount_T_cam=left.mount_T_cam)
+    )
+    _, faults = checked(swapped)
+    assert [(f.kind, f.sensor, f.treatment) for f in faults] == [
+        ("swapped_cameras", "front_left", "left_out"),
+        ("swapped_cameras", "front_right", "left_out"),
+    ]
+    assert faults[0].message.startswith("sees front_right's points")
+    mended, faults = checked(swapped, fix=True)
+    assert {f.treatment for f in faults} == {"corrected"}
+    for name in ("front_left", "front_right"):
+        np.testing.assert_array_equal(mended.cameras[name].mount_T_cam, sample.cameras[name].mount_T_cam)
+
+
+def test_a_turn_of_all_cameras_is_one_of_the_lidar(sample: Log) -> None:
+    turned = with_cameras(sample, *(yawed(camera, -1.2) for camera in sample.cameras.values()))
+    _, (fault,) = checked(turned)
+    assert (fault.kind, fault.sensor) == ("lidar_rotation", "lidar_top")
+    assert abs(fault.values["yaw_deg"] - 1.2) < 0.2
+    known = Fault("lidar_rotation", "lidar_top", "", "kept")
+    assert checked(turned, of_lidars=(known,))[1] == ()
+
+
+def test_dark_pictures_say_nothing(sample: Log) -> None:
+    stream = sample.streams["front"]
+    dark = replace(stream, read=lambda i: stream.read(i) // 40, encoded=None)
+    turned = with_cameras(sample, yawed(sample.cameras["front"], 1.0))
+    dark_log = turned.changed(streams={**sample.streams, "front": dark})
+    assert checked(dark_log)[1] == ()
+    assert [fault.kind for fault in checked(dark_log, fix=True)[1]] == ["unknown_rotation"]
+
+
+def test_boxes_of_the_log_need_no_picture(sample: Log) -> None:
+    def read(i: int) -> None:
+        raise AssertionError("a picture was read")
+
+    blind = {name: replace(sample.streams[name], read=read, encoded=None) for name in sample.cameras}
+    log = sample.changed(streams={**sample.streams, **blind})
+    config = Config().changed(detect={"name": "labels"})
+    assert check_cameras(log, config, select_sensors(log, config), progress=lambda *_: None)[1] == ()
+
+
+def test_sensors_go_on_without_cameras_that_are_left_out() -> None:
+    assert Sensors(("a", "b", "c"), ("top",)).without(["b", "top"]) == Sensors(("a", "c"), ("top",))
+
+
+def test_gray_images_are_the_same_from_bytes_and_from_pictures(sample: Log) -> None:
+    stream, camera = sample.streams["front"], sample.cameras["front"]
+    by_bytes, by_picture = (read_gray(s, 3, camera) for s in (stream, replace(stream, encoded=None)))
+    assert by_bytes is not None
+    assert by_picture is not None
+    assert by_bytes.shape == by_picture.shape == (520, 896)
+    assert np.abs(by_bytes.astype(int) - by_picture).mean() < 1.5
+    assert read_gray(stream, 3, replace(camera, width_px=900)) is not None  # `read` decides about its size
