@@ -119,6 +119,14 @@ def read_text(path: Path | str, limit_bytes: int, error: type[Exception], *, mis
         raise error(f"{path}: not a text in UTF-8: {problem}") from None
 
 
+def is_present(path: Path) -> bool:
+    """Return whether there is anything of a name, for a file that a log may lack.
+
+    A folder, a pipe or a link to nothing is there: whoever reads it raises an error, instead of taking it for missing.
+    """
+    return os.path.lexists(path)
+
+
 def _require_regular(mode: int, path: Path | str) -> None:
     if not stat.S_ISREG(mode):
         kind = next((name for is_kind, name in _KINDS if is_kind(mode)), "something else")

@@ -73,14 +73,28 @@ def require_links_inside(folder: Path, *roots: Path, files: Iterable[Path] = ())
         return
     allowed = [root.resolve() for root in (folder, *roots)]
     for link in (*_links_in(folder), *files):
-        try:
-            target = link.resolve()
-        except (OSError, RuntimeError) as problem:
-            raise LogError(f"{link}: is a link that cannot be followed: {problem}; give the path of a file") from None
-        if not any(target.is_relative_to(root) for root in allowed) and _record_of(link) != _record_of(target):
-            raise LogError(
-                f"{link}: is a link that leaves the log folder, to {target}; pass {OPTION} if it belongs to it"
-            )
+        _require_inside(link, allowed)
+
+
+def require_link_inside(file: Path, *roots: Path) -> None:
+    """Refuse one file of a log that is a link out of its folders, as `require_links_inside` does.
+
+    Raises
+    ------
+    LogError
+        Naming the link and where it leads to.
+    """
+    if not _followed.get():
+        _require_inside(file, [root.resolve() for root in roots])
+
+
+def _require_inside(link: Path, allowed: Iterable[Path]) -> None:
+    try:
+        target = link.resolve()
+    except (OSError, RuntimeError) as problem:
+        raise LogError(f"{link}: is a link that cannot be followed: {problem}; give the path of a file") from None
+    if not any(target.is_relative_to(root) for root in allowed) and _record_of(link) != _record_of(target):
+        raise LogError(f"{link}: is a link that leaves the log folder, to {target}; pass {OPTION} if it belongs to it")
 
 
 def _links_in(folder: Path) -> Iterator[Path]:

@@ -15,6 +15,7 @@ from defusedxml.ElementTree import iterparse
 
 from log2sim.errors import LogError, ScenarioError
 from log2sim.input_files import read_file
+from log2sim.numerals import parse_float
 
 SIZE_LIMIT_BYTES = 256 * 1024 * 1024
 DEPTH_LIMIT = 100
@@ -107,7 +108,7 @@ def require_number(value: str | None, where: str) -> float:
         When the attribute is absent or no finite number.
     """
     try:
-        found = float(value) if value is not None else float("nan")
+        found = parse_float(value) if value is not None else float("nan")
     except ValueError:
         found = float("nan")
     if not -1e300 < found < 1e300:

@@ -10,6 +10,7 @@ import numpy as np
 
 from log2sim.datatypes import Log, Stream
 from log2sim.errors import Log2SimError, LogError, RecordError
+from log2sim.logs.pose_checks import MAX_POSITION_M
 
 T = TypeVar("T")
 MAX_REASON_CHARACTERS = 300
@@ -43,12 +44,30 @@ def guard_log(log: Log, where: str) -> Log:
         As a reader returns it.
     where : str
         Its path, for errors.
+
+    Raises
+    ------
+    LogError
+        For poses of the ego that are not finite, or farther from the origin of the map than any place on Earth.
     """
+    _require_possible_poses(log, where)
     return log.changed(
         streams={name: _guarded_stream(stream, where) for name, stream in log.streams.items()},
         labels=_guarded(lambda: log.labels, f"{where}: the labels cannot be read"),
         notes=_guarded(lambda: log.notes, f"{where}: cannot be read"),
     )
+
+
+def _require_possible_poses(log: Log, where: str) -> None:
+    if log.ego is None:
+        return
+    wrong = np.flatnonzero(~(np.abs(log.ego.map_T_ego) <= MAX_POSITION_M).all(axis=(1, 2)))
+    if len(wrong):
+        position = ", ".join(f"{v:.6g}" for v in log.ego.map_T_ego[wrong[0], :3, 3])
+        raise LogError(
+            f"{where}: the position of the ego at stamp {log.ego.t_ns[wrong[0]]} is {position}, expected finite numbers up to "
+            f"{MAX_POSITION_M:g} m; {len(wrong)} of {len(log.ego.t_ns)} poses are so"
+        )
 
 
 def _guarded_stream(stream: Stream, where: str) -> Stream:

@@ -43,7 +43,11 @@ def open_log(
     ConfigError
         When the format is unknown, or the sequence is missing, unknown or ambiguous.
     """
-    root = Path(path)
+    with following_links(follow_links):
+        return _open(Path(path), format, sequence)
+
+
+def _open(root: Path, format: str, sequence: str | None) -> Log:
     if not root.exists():
         raise LogError(f"{root}: no such folder; give the folder of a log, or its file")
     name = find_reader(root) if format == "auto" else format
@@ -51,7 +55,7 @@ def open_log(
     if not _may_read(reader, root):
         raise LogError(f"{root}: is a file, which format '{name}' cannot be; expected {reader.looks_for}")
     chosen = _select_sequence(root, name, reader.sequences(root), sequence)
-    with following_links(follow_links), translate_parser_errors(f"{root}: cannot be read as format '{name}'", LogError):
+    with translate_parser_errors(f"{root}: cannot be read as format '{name}'", LogError):
         log = guard_log(reader.open(root, chosen), str(root))
     others = _other_formats(root, name) if format == "auto" else []
     notes = [f"{root} holds logs of other formats, too: {', '.join(others)}; --format chooses one"] if others else []

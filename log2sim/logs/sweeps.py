@@ -18,6 +18,7 @@ from log2sim.datatypes import Sweep
 from log2sim.errors import RecordError
 from log2sim.logs.images import read_bytes
 from log2sim.logs.pcd import parse_pcd
+from log2sim.logs.pose_checks import MAX_POSITION_M
 from log2sim.logs.stamps import checked_offset_ns
 
 MAX_SWEEP_POINTS = 20_000_000
@@ -60,17 +61,17 @@ def sweep_of(
     frame: Literal["lidar", "map"],
     compensated_ns: int | None = None,
 ) -> Sweep:
-    """Build a `Sweep` of the finite rows of points (N, 3) with stamps `t_ns` + `offset_ns` (N,).
+    """Build a `Sweep` of the rows of points (N, 3) that are finite and can be on Earth, with stamps `t_ns` + `offset_ns` (N,).
 
     Raises
     ------
     ValueError
         For times of points farther from the stamp than `checked_offset_ns` allows.
     """
-    finite = np.isfinite(xyz_m).all(axis=1)
-    if not finite.all():
-        xyz_m = xyz_m[finite]
-        offset_ns = None if offset_ns is None else offset_ns[finite]
+    possible = (np.abs(xyz_m) <= MAX_POSITION_M).all(axis=1)  # False for NaN
+    if not possible.all():
+        xyz_m = xyz_m[possible]
+        offset_ns = None if offset_ns is None else offset_ns[possible]
     point_ns = None if offset_ns is None else t_ns + checked_offset_ns(offset_ns)
     return Sweep(t_ns, xyz_m, frame, point_ns, compensated_ns)
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, Stream
 from log2sim.errors import LogError
 from log2sim.geometry import Array, Camera, PoseTrack
-from log2sim.input_files import read_file
+from log2sim.input_files import is_present, read_file
 from log2sim.links import require_links_inside
 from log2sim.logs.argoverse.cities import find_city, map_frame_of
 from log2sim.logs.argoverse.labels import read_labels
@@ -142,7 +142,7 @@ class _Folder:
     ) -> Callable[[], Labels | None]:
         """Return a function that reads the labels once."""
         path = self.path / ANNOTATIONS
-        if not path.is_file():
+        if not is_present(path):
             notes.append(f"no labels: {ANNOTATIONS} is missing, as in test splits")
             return lambda: None
         notes.append("objects were labeled only within 5 m of the drivable area")
@@ -169,7 +169,7 @@ class _Folder:
         found = {p.name: stamped_files(p, ".jpg", notes) for p in sorted(root.iterdir())} if root.is_dir() else {}
         found = {name: (t_ns, files) for name, (t_ns, files) in found.items() if files}
         path = self.path / INTRINSICS
-        if not found or not path.is_file():
+        if not found or not is_present(path):
             notes.append(
                 f"images of {len(found)} cameras left out: {INTRINSICS} is missing"
                 if found

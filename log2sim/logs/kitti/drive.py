@@ -18,6 +18,7 @@ from log2sim.errors import LogError
 from log2sim.geometry import Array, Camera, inverse, nearest_rotation, rotation_from_rpy, transform
 from log2sim.input_files import read_file
 from log2sim.logs.sweeps import read_sweep, sweep_of
+from log2sim.numerals import parse_float
 
 EARTH_RADIUS_M = 6378137.0
 ROTATION_TOLERANCE = 1e-3
@@ -81,7 +82,7 @@ def read_calibration(path: Path) -> dict[str, Array]:
     for line in read_text(path).splitlines():
         key, _, rest = line.strip().partition(" ")
         try:
-            numbers = np.array([float(word) for word in rest.split()])
+            numbers = np.array([parse_float(word) for word in rest.split()])
         except ValueError:
             continue
         values[key.removesuffix(":")] = numbers
@@ -148,7 +149,7 @@ def parse_oxts(text: str, where: str) -> Array:
         if not line.strip():
             continue
         try:
-            row = [float(word) for word in line.split()]
+            row = [parse_float(word) for word in line.split()]
         except ValueError:
             row = []
         if len(row) < OXTS_FIELDS or not np.isfinite(row).all():

@@ -14,6 +14,7 @@ from log2sim.errors import LogError
 from log2sim.geometry import Array, PoseTrack, apply, wrap_angle
 from log2sim.logs.kitti import drive
 from log2sim.logs.notes import note_damaged_rows
+from log2sim.numerals import parse_float, parse_int
 
 CATEGORY_OF = {
     "Car": "car",
@@ -196,7 +197,7 @@ def _parse_words(words: list[str]) -> tuple[int, list[float]]:
         known = ", ".join([*CATEGORY_OF, NOT_LABELED])
         raise ValueError(f"expected frame, track id, type ({known}) and {LABEL_FIELDS - 3} numbers")
     try:
-        frame, row = int(words[0]), [float(word) for word in words[3:LABEL_FIELDS]]
+        frame, row = parse_int(words[0]), [parse_float(word) for word in words[3:LABEL_FIELDS]]
     except ValueError:
         raise ValueError(f"expected numbers after the type, found '{' '.join(words)[:60]}'") from None
     if not np.isfinite(row).all():

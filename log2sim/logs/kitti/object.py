@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Labels, Log, Stream, Sweep
 from log2sim.errors import LogError
 from log2sim.geometry import Array, Camera, PoseTrack, apply, inverse, transform
+from log2sim.input_files import is_present
 from log2sim.links import require_links_inside
 from log2sim.logs.digest import digest_of
 from log2sim.logs.images import first_image_size, image_stream
@@ -156,6 +157,9 @@ class _Split:
             streams[CAMERA] = image_stream(CAMERA, _stamps(images), list(images.values()), size_px)
         ego = PoseTrack(t_ns, np.repeat(np.eye(4)[None], len(t_ns), axis=0))
         notes = [SINGLE_FRAMES]
+        without = sorted(set(images) - set(self.sweeps))
+        if without:
+            notes.append(f"{len(without)} of {len(images)} images have no sweep, first number {without[0]:06d}")
         labels = self._labels(first, ego, notes)
         ground_z_m = 0.0 if first.knows_ground else _ground_under(labels.boxes_3d)
         others = sum(not np.allclose(c.P, first.P, rtol=1e-2, atol=1e-3) for c in calibrations.values())
@@ -209,7 +213,7 @@ class _Split:
         parts, texts, labeled, damaged = [], [], [], list[str]()
         for number, file in self.sweeps.items():
             path = self.base / "label_2" / f"{file.stem}.txt"
-            if path.is_file():
+            if is_present(path):
                 text = drive.read_text(path)
                 lines = [
                     f"{number} {number}-{k} {line}" if line.strip() else "" for k, line in enumerate(text.splitlines())

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Log, MapFrame, Stream
 from log2sim.errors import LogError
 from log2sim.geometry import Array, Camera, PoseTrack, transform
+from log2sim.input_files import is_present
 from log2sim.links import require_links_inside
 from log2sim.logs.digest import digest_of
 from log2sim.logs.images import image_stream
@@ -146,7 +147,7 @@ class _Drive:
 
     def _labels(self, rig: drive.Rig, track: PoseTrack, notes: list[str]) -> DriveLabels:
         path, times = self.path / LABELS, self.path / LABELED_CAMERA / "timestamps.txt"
-        if not path.is_file():
+        if not is_present(path):
             return DriveLabels()
         stamps = _stamps(times)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Log, Stream
 from log2sim.errors import LogError
 from log2sim.geometry import Camera, PoseTrack, transform
+from log2sim.input_files import is_present
 from log2sim.links import require_links_inside
 from log2sim.logs.digest import digest_of
 from log2sim.logs.images import first_image_size, image_stream
@@ -73,7 +75,7 @@ class _Sequence:
             raise LogError(f"{oxts_file}: no records; a stream needs at least one")
         poses, map_frame = drive.poses_from_oxts(rows)
         track = PoseTrack(np.arange(len(rows), dtype=np.int64) * PERIOD_NS, poses)
-        notes = [NO_STAMPS]
+        notes = [NO_STAMPS, *_missing_records(streams, len(rows))]
         labels = self._labels(rig, track, notes)
         records = sorted(p for folder in streams for p in (self.base / folder / self.name).iterdir())
         calibration = drive.read_text(self.base / "calib" / f"{self.name}.txt")
@@ -133,9 +135,17 @@ class _Sequence:
 
     def _labels(self, rig: drive.Rig, track: PoseTrack, notes: list[str]) -> DriveLabels:
         path = self.base / "label_02" / f"{self.name}.txt"
-        if not path.is_file():
+        if not is_present(path):
             return DriveLabels()
         return read_labels(path, rig, track, lambda frame: frame * PERIOD_NS, notes)
+
+
+def _missing_records(streams: Mapping[str, Stream], count: int) -> Iterator[str]:
+    """Say which streams lack records of the frames that the IMU counts."""
+    for name, stream in streams.items():
+        missing = np.setdiff1d(np.arange(count), stream.t_ns // PERIOD_NS)
+        if len(missing):
+            yield f"{name}: {len(missing)} of {count} records are missing, first number {missing[0]:06d}"
 
 
 def _nominal_stamps(files: dict[int, Path]) -> NDArray[np.int64]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from log2sim.errors import LogError
 from log2sim.input_files import read_file
+from log2sim.numerals import is_plain
 from log2sim.registry import nearest
 
 MAX_TABLE_BYTES = 256 * 1024 * 1024
@@ -136,6 +137,8 @@ def _parse(path: Path, line: NDArray[np.int64], name: str, text: list[str], kind
         values: NDArray[Any] = np.array([words.get(t.lower(), False) for t in text], dtype=bool)
     else:
         try:
+            if not is_plain("".join(text)):
+                raise ValueError
             values = np.array(text, dtype=np.str_).astype(_DTYPE[kind])
             good = list(_is_possible(values))
         except (ValueError, OverflowError):
@@ -148,7 +151,7 @@ def _parse(path: Path, line: NDArray[np.int64], name: str, text: list[str], kind
 
 def _parses(text: str, kind: str) -> bool:
     try:
-        return bool(_is_possible(np.array([text]).astype(_DTYPE[kind]))[0])
+        return is_plain(text) and bool(_is_possible(np.array([text]).astype(_DTYPE[kind]))[0])
     except (ValueError, OverflowError):
         return False
 

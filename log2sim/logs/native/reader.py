@@ -24,7 +24,7 @@ from log2sim.geometry import (
     transform,
 )
 from log2sim.input_files import open_regular, read_file
-from log2sim.links import inside
+from log2sim.links import inside, require_link_inside
 from log2sim.logs.images import image_stream
 from log2sim.logs.native.csv_tables import CsvTable, read_csv_table
 from log2sim.logs.native.labels import (
@@ -72,6 +72,7 @@ class NativeReader:
     def open(self, path: Path, sequence: str) -> Log:
         """Open a sequence."""
         root = path if (path / MANIFEST).is_file() else path / sequence
+        require_link_inside(root / MANIFEST, root, path)
         return _Folder(root).log()
 
 
@@ -80,6 +81,10 @@ READER = NativeReader()
 
 def _is_manifest(path: Path) -> bool:
     """Return whether a log.json may be ours: the table of that name of nuScenes is a list."""
+    try:
+        require_link_inside(path, path.parent.parent)
+    except LogError:
+        return not path.with_name("scene.json").exists()  # opening it says what is wrong
     try:
         with open_regular(path) as file:
             return not file.read(64).lstrip().startswith(b"[")

@@ -15,6 +15,7 @@ from log2sim.documents import read_json
 from log2sim.errors import LogError
 from log2sim.geometry import Array
 from log2sim.input_files import open_regular
+from log2sim.links import require_link_inside
 from log2sim.logs.pose_checks import find_not_unit
 from log2sim.logs.stamps import MAX_TIME_S
 
@@ -45,8 +46,16 @@ class Tables:
     folder: Path
 
     def path(self, table: str) -> Path:
-        """Return the file of a table."""
-        return self.folder / f"{table}.json"
+        """Return the file of a table.
+
+        Raises
+        ------
+        LogError
+            When it is a link that leaves the folders of the log.
+        """
+        path = self.folder / f"{table}.json"
+        require_link_inside(path, self.folder.parent)
+        return path
 
     def all_of(self, table: str) -> dict[str, Record]:
         """Read a small table as its records by token."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -77,11 +78,19 @@ def read_labels(
     """
     parts = []
     left_out: list[str] = []
+    twice = flat = 0
     for number, path in files.items():
         if number < len(t_ns):
             table = _checked(read_pickled_table(path, LogError), path)
+            twice += len(table["uuid"]) - len(np.unique(table["uuid"].astype(np.str_)))
+            flat += int((_sizes(table) <= 0).any(axis=1).sum())
             parts.append(_frame(table, int(t_ns[number]), int(gt_t_ns[number]), map_T_lidar[number], left_out))
+    if twice:
+        notes.append(f"{twice} cuboids left out: their sweep has another one of the same uuid")
+    if flat:
+        notes.append(f"{flat} cuboids left out: a side of them is 0 or less")
     note_left_out(left_out, NO_ROAD_USERS, notes)
+    _note_missing(files, len(t_ns), notes)
     columns = [np.concatenate([p[k] for p in parts]) for k in range(6)] if parts else None
     if columns is None:
         raise LogError(f"{next(iter(files.values())).parent}: no cuboids of the sweeps of this log")
@@ -89,6 +98,13 @@ def read_labels(
     t_ns, track_id, category, center, size, yaw = (c[keep] for c in columns)
     category = _settle_riders(track_id, category, notes)
     return Labels(t_ns, track_id, category, center, size, yaw)
+
+
+def _note_missing(files: Collection[int], count: int, notes: list[str]) -> None:
+    """Note the sweeps without a file of cuboids, where others have one."""
+    missing = sorted(set(range(count)) - set(files))
+    if missing:
+        notes.append(f"annotations/cuboids: {len(missing)} of {count} files are missing, first number {missing[0]:02d}")
 
 
 def _checked(table: Columns, path: Path) -> Columns:
@@ -118,11 +134,14 @@ def _frame(c: Columns, t_ns: int, gt_t_ns: int, map_T_lidar: Array, left_out: li
     track_id = np.where(of_gt & (np.char.str_len(sibling) > 1), sibling, uuid)
     center = np.stack([c[f"position.{k}"] for k in "xyz"], axis=1).astype(np.float64)
     stamp = np.where(of_gt, gt_t_ns, t_ns + compute_scan_offset_ns(apply(inverse(map_T_lidar), center), PERIOD_NS))
-    # The data set's x is the width and its y the length; a yaw of 0 faces +y.
-    size = np.stack([c["dimensions.y"], c["dimensions.x"], c["dimensions.z"]], axis=1).astype(np.float64)
-    yaw = wrap_angle(c["yaw"] + np.pi / 2)
+    size, yaw = _sizes(c), wrap_angle(c["yaw"] + np.pi / 2)
     keep = (category != "") & ~twin & (size > 0).all(axis=1)
     return tuple(column[keep] for column in (stamp, track_id, category, center, size, yaw))
+
+
+def _sizes(c: Columns) -> Array:
+    """Length, width and height (M, 3) of cuboids; the data set's x is the width and its y the length, a yaw of 0 faces +y."""
+    return np.stack([c["dimensions.y"], c["dimensions.x"], c["dimensions.z"]], axis=1).astype(np.float64)
 
 
 def _category(label: str, rider: str) -> str:

@@ -30,7 +30,7 @@ from log2sim.geometry import (
     rotation_from_quaternion,
     transform,
 )
-from log2sim.input_files import read_text
+from log2sim.input_files import is_present, read_text
 from log2sim.links import require_links_inside
 from log2sim.logs.digest import digest_of
 from log2sim.logs.images import first_image_size, image_stream
@@ -153,7 +153,7 @@ class _Sequence:
     def _cameras(self, track: PoseTrack, notes: list[str]) -> tuple[dict[str, Camera], dict[str, Stream]]:
         cameras, streams = {}, {}
         for folder in list_folders(self.path / "camera"):
-            if not (folder / "intrinsics.json").is_file():
+            if not is_present(folder / "intrinsics.json"):
                 images = len(list_numbered_files(folder, (".jpg",)))
                 if images:
                     notes.append(f"camera/{folder.name}: {images} images left out: it has no intrinsics.json")
@@ -182,7 +182,7 @@ class _Sequence:
     def _map_frame(self, map_T_pose: Array, notes: list[str]) -> MapFrame:
         """Georeference the map where the GNSS track is long enough to show that its axes are east and north."""
         path = self.path / "meta" / "gps.json"
-        if not path.is_file():
+        if not is_present(path):
             return MapFrame()
         fixes = read_json(path)
         try:

@@ -128,8 +128,9 @@ def _read_sweep(kept: Columns | None, path: Path, t_ns: int, number: int) -> Swe
         rows = columns["d"] == number
         xyz = np.stack([columns[k][rows] for k in ("x", "y", "z")], axis=1)
         t_s = columns["t"][rows]
-        if xyz.dtype.kind != "f" or t_s.dtype.kind != "f":
-            raise RecordError(f"{where}: columns x, y, z, t are {xyz.dtype} and {t_s.dtype}, expected numbers")
+        if xyz.dtype.kind != "f" or t_s.dtype.kind != "f" or columns["d"].dtype.kind not in "iuf":
+            kinds = f"{xyz.dtype}, {t_s.dtype} and {columns['d'].dtype}"
+            raise RecordError(f"{where}: columns x, y, z, then t and d are {kinds}, expected numbers")
     except KeyError as missing:
         raise RecordError(f"{where}: no column {missing}; expected x, y, z, i, t, d") from None
     timed = np.isfinite(t_s) & (np.abs(t_s) < MAX_TIME_S)

@@ -9,6 +9,7 @@ from typing import Any
 
 from log2sim.errors import LogError, MissingExtra
 from log2sim.input_files import read_text
+from log2sim.links import require_link_inside
 from log2sim.logs.ros.containers import one_line
 
 SUFFIXES = (".bag", ".db3", ".mcap")
@@ -65,10 +66,14 @@ def find_recordings(path: Path) -> dict[str, Recording]:
 
 def recorded_files(recording: Recording, notes: list[str]) -> tuple[list[Path], str]:
     """Return the files of a recording that are there, in order, and the compression of its messages."""
+    if recording.place.is_dir():
+        for file in recording.files:
+            require_link_inside(file, recording.place)
     metadata = recording.place / METADATA
     if not recording.place.is_dir() or not metadata.is_file():
         _note_missing_parts(recording, notes)
         return list(recording.files), ""
+    require_link_inside(metadata, recording.place)
     document = _read_metadata(metadata)
     mode, method = (str(document.get(key) or "").lower() for key in ("compression_mode", "compression_format"))
     if mode == "file":

@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Field, ValidationError, model_validator
 from log2sim.config import Section
 from log2sim.errors import ConfigError
 from log2sim.geometry import DISTORTION_LENGTHS
-from log2sim.input_files import read_text
+from log2sim.input_files import is_present, read_text
 from log2sim.logs.pose_checks import QUATERNION_TOLERANCE
 from log2sim.model_errors import first_problem
 
@@ -167,7 +167,7 @@ def read_settings(places: Iterable[Path]) -> tuple[TopicSettings, Path | None]:
     ConfigError
         For a file that is no TOML, an unknown key or a value out of its range; names file and key.
     """
-    path = next((p for p in places if p.is_file()), None)
+    path = next((p for p in places if is_present(p)), None)
     if path is None:
         return TopicSettings(), None
     text = read_text(path, MAX_SETTINGS_BYTES, ConfigError)

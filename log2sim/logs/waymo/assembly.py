@@ -223,6 +223,11 @@ class _Assembly:
         notes = self.notes
         if f"LIDAR_{LASERS[TOP]}" in lidars:
             notes.append("no times of points: those of the TOP LiDAR are estimated from the column of the range image")
+            if not len(self.segment.lasers[TOP].inclinations_rad):  # only the short-range LiDARs have even beams
+                notes.append(
+                    "the calibration lacks the inclinations of the TOP LiDAR's beams: they are taken to be even between "
+                    "the lowest and the highest"
+                )
             if self.segment.pixel_poses_are_missing:
                 notes.append(
                     "the poses of the pixels are missing: points of the TOP LiDAR are as measured, not compensated"

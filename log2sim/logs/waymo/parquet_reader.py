@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Log
 from log2sim.errors import RecordError
+from log2sim.input_files import is_present
 from log2sim.links import require_links_inside
 from log2sim.logs.arrow.parquet_rows import Row
 from log2sim.logs.arrow.tables import read_columns
@@ -116,7 +117,7 @@ class _SegmentFolder:
     def _path_of(self, component: str) -> Path | None:
         """Path of a component; None where it was not downloaded."""
         path = self._file(component)
-        return path if path.is_file() else None
+        return path if is_present(path) else None
 
     def _rows(self, component: str, index: Any, names: dict[int, str], records: RecordColumns) -> SensorRows:
         rows = SensorRows(self._file(component), index, names, self.frame_of, records)

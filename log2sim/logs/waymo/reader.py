@@ -13,6 +13,7 @@ from pathlib import Path
 
 from log2sim.datatypes import Log
 from log2sim.errors import LogError, RecordError
+from log2sim.links import require_link_inside
 from log2sim.logs.digest import digest_of
 from log2sim.logs.stamps import MAX_TIME_S
 from log2sim.logs.waymo.assembly import log_of
@@ -55,7 +56,7 @@ class WaymoReader:
 
     def matches(self, path: Path) -> bool:
         """Return whether the file is a TFRecord file, or the folder holds some."""
-        return any(starts_like_tfrecord(file) for file in _files(path))
+        return any(_may_be_segment(file, path) for file in _files(path))
 
     def sequences(self, path: Path) -> list[str]:
         """Return the names of the files without their suffix, sorted."""
@@ -63,7 +64,10 @@ class WaymoReader:
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a segment; no picture, range image or label is read."""
-        return _SegmentFile(path if path.is_file() else path / f"{sequence}{SUFFIX}").log()
+        if path.is_file():
+            return _SegmentFile(path).log()
+        require_link_inside(path / f"{sequence}{SUFFIX}", path)
+        return _SegmentFile(path / f"{sequence}{SUFFIX}").log()
 
 
 READER = WaymoReader()
@@ -74,6 +78,15 @@ def _files(path: Path) -> list[Path]:
         return [path] if path.is_file() else sorted(file for file in path.glob(f"*{SUFFIX}") if file.is_file())
     except OSError:
         return []
+
+
+def _may_be_segment(file: Path, root: Path) -> bool:
+    """Whether a file is a TFRecord file; also where it is a link that must not be read, of which opening it tells."""
+    try:
+        require_link_inside(file, root if root.is_dir() else file)
+    except LogError:
+        return True
+    return starts_like_tfrecord(file)
 
 
 @dataclass(eq=False)

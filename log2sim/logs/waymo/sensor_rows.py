@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from log2sim.input_files import is_present
 from log2sim.logs.arrow.parquet_rows import ParquetRows, Row
 from log2sim.logs.arrow.tables import read_columns
 from log2sim.logs.arrow.values import Kind
@@ -68,7 +69,7 @@ class SensorRows:
     def __post_init__(self) -> None:
         """Read the index."""
         self._files: dict[int, ParquetRows] = {}
-        if not self.path.is_file():
+        if not is_present(self.path):
             return
         self.columns = read_columns(self.path, self.index)
         sensor_column = CAMERA if CAMERA in self.index else next(name for name in self.index if name != STAMP)

@@ -226,7 +226,7 @@ def assemble_cloud(
         middle_ns = round(float(mapped[1].mean(dtype=np.float64)) * NS_PER_S)
         sensor, known = log.map_T_sensor(name, sweep.stamp_ns + middle_ns)
         local = (mapped[0] - origin).astype(np.float32)
-        near = (np.abs(local[:, 0]) <= max_range_m) & (np.abs(local[:, 1]) <= max_range_m)
+        near = (np.abs(local) <= max_range_m).all(axis=1)
         t_s = mapped[1] + np.float32((sweep.stamp_ns - stamp) / NS_PER_S)
         position = sensor[0, :3, 3] - origin if known[0] else np.zeros(3)
         parts.append((local[near], t_s[near], position))

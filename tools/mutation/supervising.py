@@ -1,0 +1,233 @@
+"""Workers that are forked from a warm process, one after the other, and what each input came to."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pickle
+import pkgutil
+import select
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import log2sim
+from mutation.bases import KINDS, LOGS, SCENARIO, XOSC, write_base
+from mutation.containers import CONTAINERS
+from mutation.damage import Damage, Mutation, Place, damage
+from mutation.json_trees import TREES
+from mutation.messages import MESSAGES
+from mutation.raw_bytes import RAW
+from mutation.record_files import FILES
+from mutation.running import Outcome, Ran, Watched, commands_for, measured, prepare_process, run_commands, variant_of
+from mutation.stored_tables import STORED
+from mutation.text_lines import LINES
+from mutation.verdict import judge
+from mutation.watch import Canaries, Watch
+from mutation.xml_files import XML
+
+ALL: tuple[Mutation, ...] = (*RAW, *LINES, *TREES, *FILES, *CONTAINERS, *STORED, *MESSAGES, *XML)
+# Three of twenty inputs are scenarios, one an OpenSCENARIO file, the rest logs in turn.
+CYCLE = tuple([*LOGS, SCENARIO, *LOGS, SCENARIO, *LOGS, SCENARIO, SCENARIO, XOSC, XOSC])
+INPUTS_PER_WORKER = 1000
+TIME_LIMIT_S = 40.0
+Runner = Callable[[str, Path, Path, int, Watched], Ran]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One input: how it was damaged and what came of it."""
+
+    seed: int
+    index: int
+    kind: str
+    damage: str
+    visible: bool
+    verdict: str
+    reason: str
+    seconds: float = 0.0
+    peak_bytes: int = 0
+
+    @property
+    def replay(self) -> str:
+        return f"{self.seed}:{self.index}"
+
+
+class Harness:
+    """The sound inputs of the kinds that are asked for, and a place for one damaged input at a time."""
+
+    def __init__(self, folder: Path, kinds: Sequence[str] = KINDS, mutations: Sequence[Mutation] = ALL) -> None:
+        self.folder, self.mutations = folder, mutations
+        self.canaries = Canaries(folder / "outside")
+        self.bases = {kind: write_base(kind, folder / "sound" / kind.replace(" ", "-")) for kind in kinds}
+        self._sound: dict[str, Outcome] = {}
+
+    def run_one(self, seed: int, index: int, watch: Watch, runner: Runner) -> Row:
+        """Damage, run and judge one input in this process."""
+        kind = kind_of(index)
+        path, place, name, done = self.make(seed, index)
+        before = {p.name for p in self.canaries.folder.iterdir() if p.name not in Canaries.NAMES}
+        out = self.folder / "case" / "out"
+        variant = variant_of(index)
+        sound = self._sound_outcome(kind, variant)
+        before |= {"secret.txt"} if "entities" in name else set()
+        os.chdir(self.folder / "case")
+        watch.allow(read=[path.parent if path.is_file() else path, *done.allowed], write=[out])
+        ran = runner(kind, path, out, variant, watch.watching)
+        ran.outside += [*watch.found, *self.canaries.check(before)]
+        verdict, reason = judge(ran, sound, visible=done.visible)
+        return Row(
+            seed, index, kind, f"{name}: {done.what}", done.visible, verdict, reason, ran.seconds, ran.peak_bytes
+        )
+
+    def make(self, seed: int, index: int) -> tuple[Path, Place, str, Damage]:
+        """Lay out a damaged input; the same seed and index give the same one."""
+        kind = kind_of(index)
+        case, sound = self.folder / "case", self.bases[kind]
+        _remove(case)
+        self.canaries.reset()
+        top = self.folder / "sound" / kind.replace(" ", "-")
+        shutil.copytree(top, case / "input")
+        path = case / "input" / sound.relative_to(top)
+        place = Place(path, sound, self.canaries.folder)
+        name, done = damage(np.random.default_rng([seed, index]), place, self.mutations)
+        return path, place, name, done
+
+    def _sound_outcome(self, kind: str, variant: int) -> Outcome:
+        """What the last of the same commands leaves of the sound input."""
+        out = self.folder / "sound-out"
+        command = commands_for(kind, self.bases[kind], out, variant)[-1]
+        key = " ".join(map(str, command))
+        if key not in self._sound:
+            self._sound[key] = run_commands(kind, self.bases[kind], out, [command])[0]
+            if self._sound[key].code:
+                raise RuntimeError(f"a sound input of kind '{kind}' fails: {self._sound[key]}")
+        return self._sound[key]
+
+
+def kind_of(index: int) -> str:
+    return CYCLE[index % len(CYCLE)]
+
+
+def indices(count: int, only: Sequence[str] = (), start: int = 0) -> Iterator[int]:
+    """The first so many indices, of these kinds."""
+    found, index = 0, start
+    while found < count:
+        if not only or kind_of(index) in only:
+            yield index
+            found += 1
+        index += 1
+
+
+def run_many(
+    harness: Harness,
+    seed: int,
+    numbers: Sequence[int],
+    *,
+    runner: Runner = measured,
+    time_limit_s: float = TIME_LIMIT_S,
+) -> Iterator[Row]:
+    """Run inputs in forked workers; one that hangs or dies costs its input and a new worker."""
+    import_everything()
+    todo = list(numbers)
+    while todo:
+        batch = todo[:INPUTS_PER_WORKER]
+        done = 0
+        for row in _run_batch(harness, seed, batch, runner, time_limit_s):
+            done += 1
+            yield row
+        todo = todo[done:]
+
+
+def _run_batch(harness: Harness, seed: int, batch: Sequence[int], runner: Runner, time_limit_s: float) -> Iterator[Row]:
+    """Rows of a worker until it has done all, or has been ended."""
+    receive, send = os.pipe()
+    sys.stdout.flush()
+    worker = os.fork()
+    if worker == 0:
+        os.close(receive)
+        _work(harness, seed, batch, runner, send)
+    os.close(send)
+    try:
+        for index in batch:
+            message = _receive(receive, time_limit_s)
+            if isinstance(message, Row):
+                yield message
+                continue
+            if message == "late":
+                os.kill(worker, signal.SIGKILL)
+            status = os.waitpid(worker, 0)[1]
+            worker = 0
+            verdict, reason = (
+                ("hang", f"not ended after {time_limit_s:.0f} s")
+                if message == "late"
+                else ("crash", f"the process ended with status {status}")
+            )
+            _, _, name, done = harness.make(seed, index)
+            yield Row(seed, index, kind_of(index), f"{name}: {done.what}", done.visible, verdict, reason, time_limit_s)
+            return
+    finally:
+        os.close(receive)
+        if worker:
+            os.kill(worker, signal.SIGKILL)
+            os.waitpid(worker, 0)
+
+
+def _work(harness: Harness, seed: int, batch: Sequence[int], runner: Runner, send: int) -> None:
+    """Run a batch in a new process, which never returns."""
+    try:
+        silent = os.open(os.devnull, os.O_RDWR)
+        os.dup2(silent, 2)  # what libraries in C print
+        os.dup2(silent, 0)
+        watch = Watch()
+        for index in batch:
+            row = harness.run_one(seed, index, watch, runner)
+            data = pickle.dumps(row)
+            os.write(send, len(data).to_bytes(4, "little") + data)
+    except BaseException as error:
+        data = pickle.dumps(f"{type(error).__name__}: {error}")
+        os.write(send, len(data).to_bytes(4, "little") + data)
+        raise
+    finally:
+        os._exit(0)
+
+
+def _receive(source: int, time_limit_s: float) -> Row | str:
+    """A row; "late" after the time limit; "" when the worker died."""
+    if not select.select([source], [], [], time_limit_s)[0]:
+        return "late"
+    head = os.read(source, 4)
+    if len(head) < 4:
+        return ""
+    data, size = b"", int.from_bytes(head, "little")
+    while len(data) < size:
+        part = os.read(source, size - len(data))
+        if not part:
+            return ""
+        data += part
+    message = pickle.loads(data)
+    if isinstance(message, str):
+        raise RuntimeError(f"the harness itself failed: {message}")
+    return message
+
+
+def import_everything() -> None:
+    """Import all modules of the package, so that no worker has to."""
+    prepare_process()
+    for module in pkgutil.walk_packages(log2sim.__path__, "log2sim."):
+        if not module.name.endswith("__main__") and ".carla" not in module.name:
+            importlib.import_module(module.name)
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder that may hold folders that must not be read."""
+    for _ in range(2):
+        if folder.exists():
+            shutil.rmtree(folder, ignore_errors=True)
+            time.sleep(0)
