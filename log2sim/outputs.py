@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import glob
 import hashlib
 import os
@@ -19,9 +18,6 @@ from pathlib import Path
 from log2sim.errors import ConfigError
 
 _TEMPORARY = re.compile(r"\.(?P<machine>[0-9a-f]{8})-(?P<process>[0-9]{1,10})-[0-9a-f]{8}(?=\.|$)")
-# Ends the name of what is replaced, where both names cannot be exchanged at once.
-_REPLACED = ".replaced"
-_EXCHANGE, _AT_WORKING_FOLDER = 2, -100
 _waiting: ContextVar[list[tuple[Path, Path]] | None] = ContextVar("waiting", default=None)
 _expected_new: ContextVar[set[Path] | None] = ContextVar("expected_new", default=None)
 
@@ -36,8 +32,6 @@ def temporary_beside(target: Path) -> Path:
     for left in target.parent.glob(f".{glob.escape(target.stem)}.*"):
         found = _TEMPORARY.search(left.name, len(target.stem) + 1)
         if found and found["machine"] == _machine() and not _is_alive(int(found["process"])):
-            if left.name.endswith(_REPLACED) and not target.exists():
-                left.rename(target)  # its run died between the two names
             remove(left)
     return target.with_name(f".{target.stem}.{_machine()}-{os.getpid()}-{secrets.token_hex(4)}{target.suffix}")
 
@@ -48,45 +42,6 @@ def remove(path: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
     else:
         path.unlink(missing_ok=True)
-
-
-def put_folder(temporary: Path, target: Path) -> None:
-    """Rename a finished folder to its target and remove what was there.
-
-    Notes
-    -----
-    On Linux both names are exchanged at once. Elsewhere the old folder gets another name first; if the run dies just then, the
-    next one that writes there gives it its name back.
-
-    Raises
-    ------
-    OSError
-        When it cannot be renamed; the old folder is there again.
-    """
-    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
-        temporary.rename(target)
-        return
-    if _exchange(temporary, target):
-        remove(temporary)
-        return
-    replaced = temporary.with_name(temporary.name + _REPLACED)
-    target.rename(replaced)
-    try:
-        temporary.rename(target)
-    except BaseException:
-        replaced.rename(target)
-        raise
-    remove(replaced)
-
-
-def _exchange(one: Path, other: Path) -> bool:
-    """Exchange two names at once (renameat2 of Linux); return False where that is not possible."""
-    try:
-        rename = ctypes.CDLL(None, use_errno=True).renameat2
-    except (OSError, AttributeError, TypeError):  # another system, an old C library, Windows
-        return False
-    names = os.fsencode(one.absolute()), os.fsencode(other.absolute())
-    return bool(rename(_AT_WORKING_FOLDER, names[0], _AT_WORKING_FOLDER, names[1], _EXCHANGE) == 0)
 
 
 def put(temporary: Path, target: Path) -> bool:

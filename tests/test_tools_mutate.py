@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
-mutate = pytest.importorskip("mutate", reason="needs the packages that write the logs of all formats")
+import mutate
 from mutation import killing, verdict
 from mutation.damage import Damage, Mutation
 from mutation.messages import MESSAGES

@@ -12,15 +12,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-
-for name in ("tools", "tests"):
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / name))
 
 from mutation.bases import KINDS
 from mutation.supervising import Harness, Row, indices, kind_of, run_many
@@ -56,8 +54,6 @@ def main(arguments: list[str] | None = None) -> int:
 
 def run(folder: Path, options: argparse.Namespace) -> list[Row]:
     """Run all inputs; bad ones are printed at once."""
-    import shutil
-
     numbers = list(indices(options.count, options.only, options.start))
     harness = Harness(folder, sorted({kind_of(i) for i in numbers}, key=KINDS.index))
     rows: list[Row] = []

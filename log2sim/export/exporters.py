@@ -152,9 +152,6 @@ def _move_into(temporary: Path, folder: Path, *, overwrite: bool) -> tuple[Path,
         refuse_existing(folder / name, overwrite=overwrite)
         if (folder / name).is_dir():
             raise ConfigError(f"{folder / name}: is a folder, where a file would be written; choose another folder")
-    if not folder.exists():
-        temporary.rename(folder)
-        return tuple(folder / name for name in names)
     for name in names:
         try:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)

@@ -13,7 +13,7 @@ import numpy as np
 
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
-from log2sim.outputs import put_folder, temporary_beside
+from log2sim.outputs import temporary_beside
 from log2sim.synth.kitti_layout import KittiFrame, calibration_text, label_text
 from log2sim.synth.light import light_of, weather_of
 from log2sim.synth.render import render, segment
@@ -86,7 +86,9 @@ def write_traffic(
         if settings.layout == "kitti":
             _write_splits(staging, settings)
         (staging / MANIFEST).write_text(json.dumps(_manifest(settings, scenes), indent=1) + "\n", encoding="utf-8")
-        put_folder(staging, out)
+        if out.exists():
+            shutil.rmtree(out)
+        staging.rename(out)
     except OSError as error:
         raise ConfigError(f"{out}: cannot be written: {error.strerror or error}") from error
     finally:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from log2sim.errors import ConfigError
-from log2sim.outputs import put_folder, temporary_beside
+from log2sim.outputs import temporary_beside
 from log2sim.synth.scene import Scene, load_scene
 
 if TYPE_CHECKING:
@@ -67,7 +67,9 @@ def write_synthetic(
     try:
         write_log(log, staging, jpeg_quality=jpeg_quality, ego=poses, progress=progress)
         truth.save(staging / TRUTH_FILE)
-        put_folder(staging, target)
+        if target.exists():
+            shutil.rmtree(target)
+        staging.rename(target)
     except OSError as error:
         raise ConfigError(f"{target}: cannot be written: {error.strerror or error}") from error
     finally:

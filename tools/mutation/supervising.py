@@ -33,8 +33,8 @@ from mutation.watch import Canaries, Watch
 from mutation.xml_files import XML
 
 ALL: tuple[Mutation, ...] = (*RAW, *LINES, *TREES, *FILES, *CONTAINERS, *STORED, *MESSAGES, *XML)
-# Three of twenty inputs are scenarios, one an OpenSCENARIO file, the rest logs in turn.
-CYCLE = tuple([*LOGS, SCENARIO, *LOGS, SCENARIO, *LOGS, SCENARIO, SCENARIO, XOSC, XOSC])
+# Of 48 inputs four are scenarios and two OpenSCENARIO files, the rest logs in turn.
+CYCLE = (*LOGS, SCENARIO, *LOGS, SCENARIO, *LOGS, SCENARIO, SCENARIO, XOSC, XOSC)
 INPUTS_PER_WORKER = 1000
 TIME_LIMIT_S = 40.0
 Runner = Callable[[str, Path, Path, int, Watched], Ran]
@@ -71,7 +71,7 @@ class Harness:
     def run_one(self, seed: int, index: int, watch: Watch, runner: Runner) -> Row:
         """Damage, run and judge one input in this process."""
         kind = kind_of(index)
-        path, place, name, done = self.make(seed, index)
+        path, _, name, done = self.make(seed, index)
         before = {p.name for p in self.canaries.folder.iterdir() if p.name not in Canaries.NAMES}
         out = self.folder / "case" / "out"
         variant = variant_of(index)

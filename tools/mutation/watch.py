@@ -80,8 +80,7 @@ class Watch:
         # What the hook does itself has events, too.
         if (
             not self.on
-            or event not in WATCHED
-            and not event.startswith((*PROCESSES, *SOCKETS))
+            or (event not in WATCHED and not event.startswith((*PROCESSES, *SOCKETS)))
             or getattr(self._busy, "now", False)
         ):
             return

@@ -1,0 +1,224 @@
+"""Files of logs that are missing, twice, no files at all, or state what cannot be: each is told or refused."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from log_encoders import kitti, kitti_object, native, nuscenes, pandaset, ros, waymo, waymo_parquet
+from log_encoders.world import make_world
+
+from log2sim.datatypes import Log, Sweep
+from log2sim.errors import LogError, RecordError
+from log2sim.export.xml_text import require_number
+from log2sim.geometry import PoseTrack
+from log2sim.logs.guarding import guard_log
+from log2sim.logs.native.csv_tables import read_csv_table
+from log2sim.logs.opening import open_log
+from log2sim.logs.sweeps import sweep_of
+from log2sim.numerals import parse_float, parse_int
+from log2sim.perception.lidar.cloud import assemble_cloud
+
+Encode = Callable[[Log, Path], Path]
+
+
+@cache
+def short_world() -> Log:
+    return make_world(duration_s=0.35)
+
+
+@pytest.fixture
+def encoded(tmp_path: Path) -> Callable[[Encode], Path]:
+    return lambda encode: encode(short_world(), tmp_path / "log")
+
+
+def encode_db3(log: Log, folder: Path) -> Path:
+    return ros.encode_as(log, folder, ros.Style(container="db3"))
+
+
+def encode_nuscenes(log: Log, folder: Path) -> Path:
+    return nuscenes.encode_world(replace(log), folder)
+
+
+@pytest.mark.parametrize(
+    ("encode", "name"),
+    [
+        (encode_db3, "metadata.yaml"),
+        (encode_db3, "*.db3"),
+        (encode_nuscenes, "v1.0-mini/log.json"),
+        (encode_nuscenes, "v1.0-mini/scene.json"),
+        (encode_nuscenes, "v1.0-mini/ego_pose.json"),
+        (waymo.encode, "*.tfrecord"),
+        (native.encode, "log.json"),
+    ],
+    ids=["metadata", "database", "small table", "scenes", "large table", "tfrecord", "manifest"],
+)
+def test_a_file_that_links_out_of_the_log_is_refused(
+    encoded: Callable[[Encode], Path], tmp_path: Path, encode: Encode, name: str
+) -> None:
+    log = encoded(encode)
+    root = log.parent if log.is_file() else log
+    file = next(root.glob(name))
+    target = tmp_path / f"secret{file.suffix}"
+    shutil.move(file, target)
+    file.symlink_to(target)
+    with pytest.raises(LogError, match=r"is a link that leaves the log folder, to .*; pass --follow-links"):
+        open_log(root)
+    assert open_log(root, follow_links=True).streams
+
+
+def test_pipes_in_the_place_of_labels_are_no_missing_labels(encoded: Callable[[Encode], Path]) -> None:
+    log = encoded(kitti_object.encode)
+    label = log / "training" / "label_2" / "000002.txt"
+    label.unlink()
+    os.mkfifo(label)
+    with pytest.raises(LogError, match=r"000002\.txt: cannot be read: is a named pipe"):
+        open_log(log)
+    label.unlink()
+    assert open_log(log).labels is not None  # test splits have no labels
+
+
+@pytest.mark.parametrize(
+    ("encode", "missing", "words"),
+    [
+        (kitti.encode_tracking, "*/velodyne/*/000001.bin", "velodyne: 1 of 4 records are missing, first number 000001"),
+        (kitti.encode_tracking, "*/image_02/*/000003.png", "image_02: 1 of 4 records are missing, first number 000003"),
+        (kitti_object.encode, "*/velodyne/000002.bin", "1 of 4 images have no sweep, first number 000002"),
+        (
+            pandaset.encode,
+            "annotations/cuboids/01.pkl.gz",
+            "annotations/cuboids: 1 of 3 files are missing, first number 01",
+        ),
+    ],
+)
+def test_records_that_are_not_there_are_told(
+    encoded: Callable[[Encode], Path], encode: Encode, missing: str, words: str
+) -> None:
+    log = encoded(encode)
+    assert not any("missing" in note or "no sweep" in note for note in open_log(log).notes)
+    next(log.glob(missing)).unlink()
+    assert words in open_log(log).notes
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            lambda table: np.repeat(np.arange(len(table)), 2),
+            "3 cuboids left out: their sweep has another one of the same uuid",
+        ),
+        ("dimensions.z", "1 cuboids left out: a side of them is 0 or less"),
+    ],
+)
+def test_cuboids_that_stand_twice_or_are_flat_are_told(
+    encoded: Callable[[Encode], Path], change: Callable[[object], np.ndarray] | str, words: str
+) -> None:
+    pandas = pytest.importorskip("pandas")
+    log = encoded(pandaset.encode)
+    assert words not in open_log(log).notes
+    path = log / "annotations" / "cuboids" / "00.pkl.gz"
+    table = pandas.read_pickle(path)
+    if isinstance(change, str):
+        table.loc[0, change] = -1.0
+    else:
+        table = table.iloc[change(table)]
+    table.to_pickle(path)
+    assert words in open_log(log).notes
+
+
+def test_a_sweep_whose_sensors_are_words_is_a_record_error(encoded: Callable[[Encode], Path]) -> None:
+    pandas = pytest.importorskip("pandas")
+    log = encoded(pandaset.encode)
+    path = log / "lidar" / "00.pkl.gz"
+    table = pandas.read_pickle(path)
+    table["d"] = table["d"].astype(object)
+    table.loc[0, "d"] = "x"
+    table.to_pickle(path)
+    with pytest.raises(RecordError, match="then t and d are float64, float64 and object, expected numbers"):
+        open_log(log).streams["pandar64"].read(0)
+
+
+def test_a_scanner_without_the_angles_of_its_beams_is_told(encoded: Callable[[Encode], Path]) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    log = encoded(waymo_parquet.encode)
+    path = next((log / "lidar_calibration").iterdir())
+    words = "the calibration lacks the inclinations of the TOP LiDAR's beams"
+    assert not any(words in note for note in open_log(log).notes)
+    table = parquet.read_table(path)
+    parquet.write_table(table.drop_columns([n for n in table.column_names if n.endswith("inclination.values")]), path)
+    assert any(words in note for note in open_log(log).notes)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1e300])
+def test_an_ego_nowhere_on_earth_is_refused(value: float) -> None:
+    log = short_world()
+    assert log.ego is not None
+    poses = log.ego.map_T_ego.copy()
+    poses[3, 1, 3] = value
+    with pytest.raises(
+        LogError, match=rf"^here: the position of the ego at stamp {log.ego.t_ns[3]} is .* 1 of \d+ poses"
+    ):
+        guard_log(log.changed(ego=PoseTrack(log.ego.t_ns, poses)), "here")
+
+
+@pytest.mark.filterwarnings("error")
+def test_points_nowhere_on_earth_are_dropped() -> None:
+    xyz = np.array([[1.0, 2.0, 3.0], [1e300, 0.0, 0.0], [0.0, np.nan, 0.0], [0.0, 0.0, -2e9], [4.0, 5.0, 6.0]])
+    sweep = sweep_of(xyz, 0, np.arange(5), "lidar")
+    np.testing.assert_array_equal(sweep.xyz_m, xyz[[0, 4]])
+    assert sweep.t_ns is not None
+    np.testing.assert_array_equal(sweep.t_ns, [0, 4])
+
+
+@pytest.mark.filterwarnings("error")
+def test_points_high_above_the_range_are_left_out_of_a_cloud() -> None:
+    log = short_world()
+    stamp = int(log.streams["top"].t_ns[1])
+    sound = log.streams["top"].read(1).xyz_m.astype(np.float64)
+    high = np.concatenate([sound, [[5.0, 0.0, 8e8], [5.0, 1.0, -8e8]]])
+    clouds = [
+        assemble_cloud(
+            log,
+            {"top": Sweep(stamp, xyz, "lidar", None)},
+            origin=np.array([30.0, -20.0, 0.0]),
+            ground_z=0.0,
+            max_range_m=60.0,
+        )
+        for xyz in (sound, high)
+    ]
+    assert clouds[0] is not None
+    assert clouds[1] is not None
+    np.testing.assert_array_equal(clouds[1].xyz, clouds[0].xyz)
+    np.testing.assert_array_equal(clouds[1].height, clouds[0].height)
+
+
+@pytest.mark.parametrize("text", ["1_000", "\u0663", "1\u0660", "\uff11", "0x10", "", "1,5"])
+def test_only_ascii_digits_make_a_number(tmp_path: Path, text: str) -> None:
+    for parse in (parse_float, parse_int):
+        with pytest.raises(ValueError):
+            parse(text)
+    with pytest.raises(LogError):
+        require_number(text, "here")
+    table = tmp_path / "t.csv"
+    for kind in ("int", "float"):
+        table.write_text(f't_ns\n1\n"{text}"\n', encoding="utf-8")
+        with pytest.raises(LogError, match="line 3, field 't_ns'"):
+            read_csv_table(table, {"t_ns": kind})
+
+
+@given(st.integers(-(10**40), 10**40))
+def test_whole_numbers_are_parsed(value: int) -> None:
+    assert parse_int(str(value)) == value
+
+
+@given(st.floats(allow_nan=False))
+def test_numbers_are_parsed(value: float) -> None:
+    assert parse_float(repr(value)) == value
