@@ -31,6 +31,12 @@ def replay(
         ),
     ] = "scenario",
     react: Annotated[str | None, typer.Option(metavar="ID,ID", help="Make only these agents reactive.")] = None,
+    foresight: Annotated[
+        str,
+        typer.Option(
+            help="What reactive agents expect of others: path (where the scenario has them go) or motion (as they moved so far)."
+        ),
+    ] = "path",
     confidence: Annotated[
         float | None, typer.Option(metavar="MIN", help="Leave out agents with a lower confidence; the ego stays.")
     ] = None,
@@ -71,6 +77,8 @@ def replay(
         raise ConfigError(f"{out}: is the scenario itself, which a replay must not replace; choose another name")
     if react is not None and agents == "reactive":
         raise ConfigError("--react selects the reactive agents and --agents reactive selects all: give one of the two")
+    if foresight != "path" and react is None and agents != "reactive":
+        raise ConfigError("--foresight: nobody reacts; add --agents reactive or --react")
     limits = parse_limits(limit or ())
     loaded = Scenario.load(scenario)
     chosen = agents if react is None else list(ids_of(loaded, [react]))
@@ -79,7 +87,7 @@ def replay(
     moved_by = external_simulator(simulator, host, port, map)
     with progress(quiet=quiet) as report_progress:
         result = run(
-            kept, mode=mode, model=model, dt_s=dt, ego=policy, agents=chosen, host=moved_by,
+            kept, mode=mode, model=model, dt_s=dt, ego=policy, agents=chosen, foresight=foresight, host=moved_by,
             progress=lambda done, total: report_progress("replay", done, total),
         )  # fmt: skip
     result = changed(result, left_out=left_out)

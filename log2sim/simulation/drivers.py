@@ -129,7 +129,9 @@ def _vehicle_groups(
     return groups
 
 
-def reactive_traffic(agents: Sequence[Agent], groups: Sequence[AgentGroup], clock: StepClock) -> Traffic | None:
+def reactive_traffic(
+    agents: Sequence[Agent], groups: Sequence[AgentGroup], clock: StepClock, foresight: str
+) -> Traffic | None:
     """Build the traffic model of the reactive groups and connect them with it; None when no agent reacts."""
     reacting = [g for g in groups if isinstance(g, ReactiveGroup)]
     if not reacting:
@@ -137,7 +139,8 @@ def reactive_traffic(agents: Sequence[Agent], groups: Sequence[AgentGroup], cloc
     trajectories = {a.id: r.trajectory for g in groups for a, r in zip(g.agents, g.references)}
     driven = next((g.agents[0].id for g in groups if isinstance(g, PolicyVehicle)), None)
     reactive = {a.id for g in reacting for a in g.agents}
-    traffic = Traffic(agents, [trajectories.get(a.id) or _static_trajectory(a) for a in agents], reactive, driven)
+    followed = [trajectories.get(a.id) or _static_trajectory(a) for a in agents]
+    traffic = Traffic(agents, followed, reactive, driven, foresight)
     for group in reacting:
         group.join(traffic, clock)
     return traffic

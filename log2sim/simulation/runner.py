@@ -9,6 +9,7 @@ from log2sim.errors import ConfigError, ScenarioError
 from log2sim.registry import nearest
 from log2sim.simulation.drivers import agent_groups, assign_drivers, reactive_ids, reactive_traffic
 from log2sim.simulation.policy import SIGHT_M, Policy, reset_policy
+from log2sim.simulation.reactive.foresight import FORESIGHTS
 from log2sim.simulation.recording import RecordedTracks
 from log2sim.simulation.replay_result import replay_result
 from log2sim.simulation.result import Replay
@@ -31,6 +32,7 @@ def replay(
     dt_s: float = 0.01,
     ego: Policy | None = None,
     agents: str | Collection[str] = "scenario",
+    foresight: str = "path",
     sight_m: float = SIGHT_M,
     host: ExternalSimulator | None = None,
     progress: Progress | None = None,
@@ -55,6 +57,9 @@ def replay(
         "scenario": the other agents follow their trajectories. "reactive": they keep to their paths and brake for
         agents that the scenario does not have there. A collection: only the agents with these ids react (the ego too,
         if it is among them).
+    foresight : {"path", "motion"}
+        What reactive agents expect of others: that they go where the scenario has them go, or that they go on as they
+        have moved so far, see `log2sim.prediction`.
     sight_m : float
         Range within which the ego's policy observes other agents, center to center.
     host : Host, optional
@@ -79,8 +84,9 @@ def replay(
     if host is not None:
         model = "kinematic"  # its references hold no slip angles of a model, so they suit every simulator
     world = open_world(
-        scenario, mode=mode, model=model, dt_s=dt_s, drives_ego=ego is not None, agents=agents, sight_m=sight_m
-    )
+        scenario, mode=mode, model=model, dt_s=dt_s, drives_ego=ego is not None, agents=agents, foresight=foresight,
+        sight_m=sight_m,
+    )  # fmt: skip
     if ego is not None:
         reset_policy(ego, scenario)
     if host is None:
@@ -113,6 +119,7 @@ def open_world(
     dt_s: float = 0.01,
     drives_ego: bool = True,
     agents: str | Collection[str] = "scenario",
+    foresight: str = "path",
     sight_m: float = SIGHT_M,
 ) -> World:
     """Prepare a scenario for stepwise simulation; with `drives_ego` the caller sets the ego's controls. See `replay`.
@@ -130,6 +137,8 @@ def open_world(
         raise ConfigError(f"mode '{mode}': expected one of {', '.join(MODES)}")
     if not DT_RANGE_S[0] <= dt_s <= DT_RANGE_S[1]:
         raise ConfigError(f"dt: {dt_s} s, expected {DT_RANGE_S[0]} to {DT_RANGE_S[1]} s")
+    if foresight not in FORESIGHTS:
+        raise ConfigError(f"foresight '{foresight}': expected one of {', '.join(FORESIGHTS)}")
     if not sight_m >= 0:
         raise ConfigError(f"sight: {sight_m} m, expected 0 or more")
     if model not in MODELS:
@@ -144,7 +153,8 @@ def open_world(
     reactive = reactive_ids(scenario.agents, agents, drives_ego=drives_ego)
     assigned = assign_drivers(scenario.agents, mode, drives_ego=drives_ego, reactive=reactive)
     groups, choices = agent_groups(assigned, clock, mode, model)
-    return World(groups, clock, assigned["static"], reactive_traffic(scenario.agents, groups, clock), choices, sight_m)
+    traffic = reactive_traffic(scenario.agents, groups, clock, foresight)
+    return World(groups, clock, assigned["static"], traffic, choices, sight_m)
 
 
 def _clock(agents: Sequence[Agent], dt_s: float) -> StepClock:

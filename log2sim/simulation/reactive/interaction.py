@@ -8,14 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
+from log2sim.simulation.reactive.foresight import Foresight
 from log2sim.simulation.reactive.idm import IdmParameters, leader_demand
 from log2sim.simulation.reactive.path_table import EXTENSION_M, PathTable, Pose
-from log2sim.simulation.reactive.prediction import (
-    Prediction,
-    predict_along_path,
-    predict_by_log,
-    predict_policy_vehicle,
-)
+from log2sim.simulation.reactive.prediction import Prediction
 from log2sim.simulation.reactive.swept_corridor import HORIZON_S, PredictedBoxes, SafetyMargins, SweptCorridor, leaders
 
 MIN_LOOKAHEAD_M = 10.0  # also at standstill
@@ -52,6 +48,8 @@ class TrafficState:
         Where the agents are, (A,).
     prediction : Prediction
         Where they are expected to go, (A, H).
+    foresight : Foresight
+        What expects it.
     """
 
     paths: PathTable
@@ -63,6 +61,7 @@ class TrafficState:
     rate: Array
     pose: Pose
     prediction: Prediction
+    foresight: Foresight
 
     def reach_m(self, i: Index) -> Array:
         """Return the look-ahead distance of agents (P,): a comfortable stop and a reserve."""
@@ -163,24 +162,23 @@ def _boxes(m: TrafficState, j: Index, prediction: Prediction) -> PredictedBoxes:
     return PredictedBoxes(*prediction, m.size_m[j, 0], m.size_m[j, 1])
 
 
-def predict_all(paths: PathTable, pose: Pose, t_s: Array, rate: Array, driven: int) -> Prediction:
-    """Predict all agents (A,) from where they are; the driven agent as if it kept to its path."""
-    prediction = predict_by_log(paths, np.arange(len(t_s)), t_s, rate)
-    if driven < 0:
-        return prediction
-    x, y, yaw, speed = (float(c[driven]) for c in (pose.x_m, pose.y_m, pose.yaw_rad, pose.speed_mps))
-    return _select(np.arange(len(t_s)) == driven, predict_policy_vehicle(paths, driven, x, y, yaw, speed), prediction)
+def predict_all(foresight: Foresight, t_s: float, pose: Pose, own_s: Array, rate: Array, driven: int) -> Prediction:
+    """Predict all agents (A,) at a time, each of which is at its own time of the scenario `own_s` (A,)."""
+    everyone = np.arange(len(own_s))
+    prediction = foresight.expect(everyone, own_s, rate)
+    return (
+        prediction
+        if driven < 0
+        else _select(everyone == driven, foresight.expect_driven(driven, t_s, pose), prediction)
+    )
 
 
 def _predict_in_scenario(m: TrafficState, j: Index, t_s: Array) -> Prediction:
     """Predict agents (P,) from the scenario at times (P,), by the same rules."""
-    prediction = predict_by_log(m.paths, j, t_s, np.ones(len(j)))
+    prediction = m.foresight.expect(j, t_s, np.ones(len(j)))
     if not np.any(j == m.driven):
         return prediction
-    pose = m.paths.at(j, t_s)
-    return _select(
-        j == m.driven, predict_along_path(m.paths, m.driven, pose.distance_m, np.abs(pose.speed_mps)), prediction
-    )
+    return _select(j == m.driven, m.foresight.expect_driven_in_scenario(m.driven, t_s), prediction)
 
 
 def _select(mask: NDArray[np.bool_], one: Prediction, other: Prediction) -> Prediction:

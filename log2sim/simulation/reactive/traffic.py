@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import STANDSTILL_MPS, Agent, Trajectory
 from log2sim.geometry import Array
 from log2sim.simulation.groups import Snapshot
+from log2sim.simulation.reactive.foresight import Foresight, MotionForesight, PathForesight
 from log2sim.simulation.reactive.idm import idm_parameters, rate_response
 from log2sim.simulation.reactive.interaction import MIN_DEMAND, TrafficState, excess_demand, predict_all
 from log2sim.simulation.reactive.path_table import PathTable, Pose
@@ -39,6 +40,8 @@ class Traffic:
         Ids of the reactive agents.
     driven : str, optional
         Id of the agent whose states are given with each decision, since a policy drives it.
+    foresight : str
+        One of `FORESIGHTS`: what the reactive agents expect of others.
 
     Notes
     -----
@@ -55,9 +58,12 @@ class Traffic:
         trajectories: Sequence[Trajectory],
         reactive: Collection[str],
         driven: str | None,
+        foresight: str = "path",
     ) -> None:
         self.index = {a.id: k for k, a in enumerate(agents)}
         self.paths = PathTable(trajectories)
+        self._foresight: Foresight
+        self._foresight = MotionForesight(self.paths, agents) if foresight == "motion" else PathForesight(self.paths)
         self.reacts = np.array([a.id in reactive for a in agents], dtype=bool)
         self.idm = idm_parameters(agents)
         self._static = np.array([a.static for a in agents], dtype=bool)
@@ -93,9 +99,18 @@ class Traffic:
         pace = np.abs(pose.speed_mps[own])
         log_accel = (np.abs(self.paths.at(own, tau[own] + DECISION_STEP_S).speed_mps) - pace) / DECISION_STEP_S
         pose = self._with_ego(pose, ego)
-        prediction = predict_all(self.paths, pose, tau, self.rate, self._driven)
+        prediction = predict_all(self._foresight, t_s, pose, tau, self.rate, self._driven)
         moment = TrafficState(
-            self.paths, self.idm, self._size, self.reacts, self._driven, tau, self.rate, pose, prediction
+            self.paths,
+            self.idm,
+            self._size,
+            self.reacts,
+            self._driven,
+            tau,
+            self.rate,
+            pose,
+            prediction,
+            self._foresight,
         )
         taken = np.zeros(len(tau))
         pairs = moment.meeting(*self._pairs(t_s, tau, own))

@@ -1,0 +1,98 @@
+"""What reactive agents expect of others: their ways in the scenario, or their motion so far."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import run as run_command
+from replay_maneuvers import agent_from, scenario_of
+from replay_scenes import Speed, departure, gap, line
+from test_prediction import circle
+
+from log2sim.datatypes import Scenario
+from log2sim.errors import ConfigError
+from log2sim.simulation.reactive.foresight import MotionForesight
+from log2sim.simulation.reactive.path_table import PathTable
+from log2sim.simulation.reactive.swept_corridor import HORIZON_S
+from log2sim.simulation.runner import replay as run
+
+SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
+
+
+def replay(scene: Scenario, **options):
+    return run(scene, **{"model": "kinematic", "agents": "reactive", "dt_s": 0.1, **options})
+
+
+def turns_off(id: str) -> object:
+    """A car that comes from the south at 8 m/s and turns right on 8 m before the street at y = 0."""
+    t = np.arange(0, 12.05, 0.1)
+    way = 8.0 * t - 50.0  # the bend begins at y = -18
+    turned = np.clip(way / 8.0, 0.0, np.pi / 2)
+    beyond = np.maximum(way - np.pi / 2 * 8.0, 0.0)
+    x = 8.0 * (1 - np.cos(turned)) + beyond
+    y = -18.0 + np.where(way < 0, way, 8.0 * np.sin(turned))
+    return agent_from(t, x, y, np.pi / 2 - turned, np.full(len(t), 8.0), id=id, offset_m=0.0)
+
+
+def first_brake_s(result, id: str) -> float:
+    """When an agent first decelerates by more than 0.5 m/s2; inf when it never does."""
+    agent = result.agent(id)
+    slower = np.flatnonzero(np.diff(agent.speed_mps) / np.diff(agent.t_s) < -0.5)
+    return float(agent.t_s[slower[0]]) if len(slower) else float("inf")
+
+
+def test_who_does_not_turn_off_as_in_the_scenario_is_braked_for_earlier_by_those_who_see_its_motion() -> None:
+    """The ego goes on into the street; by its way in the scenario it turns off before, until it has left that."""
+    scene = scenario_of(turns_off("ego"), line("f", -85.0, speed=10.0, duration_s=12.0))
+    results = {f: replay(scene, ego=Speed(lambda t: 8.0), foresight=f) for f in ("path", "motion")}
+    at = {f: first_brake_s(result, "f") for f, result in results.items()}
+    assert at["motion"] < at["path"] - 0.1
+    assert at["motion"] > 4.0  # the ego is within 3 s of the street from then on
+
+
+@pytest.mark.parametrize("foresight", ["path", "motion"])
+def test_where_nobody_interferes_the_scenario_is_kept(foresight: str) -> None:
+    scene = scenario_of(line("a", 0.0, speed=12.0), line("f", -20.0, speed=12.0), circle(30.0, 8.0, 20.0, id="c"))
+    kept, free = (replay(scene, agents=a, foresight=foresight) for a in ("reactive", "scenario"))
+    for agent in "afc":
+        assert departure(kept, free, agent) < 1e-6
+
+
+@pytest.mark.parametrize("foresight", ["path", "motion"])
+def test_an_ego_that_stops_is_not_run_into(foresight: str) -> None:
+    scene = scenario_of(line("ego", 40.0, duration_s=20.0), line("f", 0.0, duration_s=20.0))
+    result = replay(scene, ego=Speed(lambda t: 25.0 if t < 5.0 else 0.0), foresight=foresight)
+    assert gap(result, "f").min() > 0.5
+    assert result.agent("f").speed_mps[-1] < 0.2
+
+
+def test_motion_is_extrapolated_from_the_past_alone() -> None:
+    agents = [circle(20.0, 6.0), line("b", 0.0, speed=9.0)]
+    foresight = MotionForesight(PathTable([a.trajectory for a in agents]), agents)
+    x, y, yaw, speed = foresight.expect(np.array([0, 1]), np.array([5.05, 5.05]), np.array([1.0, 0.5]))
+    angle = 6.0 / 20.0 * (5.05 + HORIZON_S)
+    assert x[0] == pytest.approx(20.0 * np.cos(angle) - 20.0, abs=0.05)  # relative to the first waypoint
+    assert y[0] == pytest.approx(20.0 * np.sin(angle), abs=0.05)
+    assert np.diff(x[1]) == pytest.approx(0.5 * 9.0 * 0.25)
+    assert np.diff(yaw[0]) == pytest.approx(6.0 / 20.0 * 0.25, rel=0.02)
+    assert speed[:, 0] == pytest.approx([6.0, 4.5], rel=1e-3)
+
+
+def test_a_world_that_starts_again_expects_the_same() -> None:
+    scene = scenario_of(turns_off("ego"), line("f", -85.0, speed=10.0, duration_s=12.0))
+    agents = list(scene.agents)
+    paths = PathTable([a.trajectory for a in agents])
+    fresh, used = MotionForesight(paths, agents), MotionForesight(paths, agents)
+    for t in (3.0, 7.0, 7.1):
+        used.expect_driven(0, t, paths.at(np.arange(2), np.full(2, t)))
+    again, first = (f.expect_driven(0, 0.0, paths.at(np.arange(2), np.zeros(2))) for f in (used, fresh))
+    assert np.array(again) == pytest.approx(np.array(first))
+
+
+def test_an_unknown_foresight_and_one_that_nobody_has_are_refused() -> None:
+    with pytest.raises(ConfigError, match="foresight 'crystal': expected one of path, motion"):
+        replay(Scenario.load(SAMPLE), foresight="crystal")
+    assert "nobody reacts" in run_command("replay", SAMPLE, "--foresight", "motion").line
+    assert run_command("replay", SAMPLE, "--agents", "reactive", "--foresight", "motion", "--dt", 0.1).code == 0
