@@ -194,6 +194,18 @@ def test_a_heading_by_which_the_ego_drives_askew_is_named(lively: Log) -> None:
     assert "heading" not in fault.message
 
 
+def test_a_mount_at_another_place_is_found_where_the_ego_turns(lively: Log) -> None:
+    true = lively.lidars[TOP]
+    moved = true.mount_T_lidar.copy()
+    moved[:2, 3] += [0.8, -1.0]
+    log, (fault,) = check(lively.changed(lidars={TOP: replace(true, mount_T_lidar=moved)}), fix_mounts=True)
+    assert (fault.kind, fault.treatment) == ("lidar_translation", "corrected")
+    assert "m too far forward" in fault.message
+    assert "m too far right" in fault.message
+    assert [fault.values[n] for n in ("x_m", "y_m")] == pytest.approx([0.8, -1.0], abs=0.15)
+    assert log.lidars[TOP].mount_T_lidar == pytest.approx(true.mount_T_lidar, abs=0.15)
+
+
 def test_each_lidar_is_checked_for_itself(lively: Log) -> None:
     second = replace(lively.lidars[TOP], name="second")
     streams = {TOP: lively.streams[TOP], "second": replace(late(lively, 0.1).streams[TOP], name="second")}

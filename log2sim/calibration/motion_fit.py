@@ -8,7 +8,7 @@ sweeps alike and does not show; turned mounts do.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,11 +17,14 @@ from log2sim.calibration.sweep_pairs import SweepPairs
 from log2sim.calibration.twists import adjoint_of, cross_matrix, exp_of, log_of, velocities_at
 from log2sim.geometry import NS_PER_S, Array, inverse, transform
 
-OFFSET, ROLL, PITCH, YAW = range(4)
+OFFSET, ROLL, PITCH, YAW, X, Y, Z = range(7)
 VALUES = 7
-# Of stamps, s, of rotation, rad, and translation, m, of a mount: what a mistake that nobody sees can be. A mount is measured to
-# centimeters, so its translation is no result; it takes up what it would explain.
-PRIOR_SIGMA = np.array([0.3, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05])
+# Of stamps, s, of rotation, rad, and translation, m, of a mount: what a mistake that nobody sees can be.
+PRIOR_SIGMA = np.array([0.3, 0.05, 0.05, 0.05, 0.3, 0.3, 0.3])
+# A result by chance is farther off once in 2,000 times.
+MIN_SIGMAS = 3.5
+# Mounts are measured to centimeters.
+MEASURED_SIGMA_M = 0.05
 # An offset that the motion does not show is taken for none.
 UNSEEN_OFFSET_SIGMA_S = 0.005
 # Steps until the size of the errors of the poses is estimated, from what is usual.
@@ -64,27 +67,38 @@ def mount_change(values: Array, sensor_m: Array) -> Array:
 def fit_clock_and_mount(seen: SweepPairs) -> Estimate:
     """Fit the time offset and the mount to motions between sweeps.
 
+    A translation that is not certain is taken for as small as mounts are measured, and an offset that the ego's motion does not
+    show for none, so that neither blurs the rest.
+    """
+    prior = PRIOR_SIGMA.copy()
+    found = _fit(seen, prior)
+    if (np.abs(found.values[X:]) < MIN_SIGMAS * found.sigma[X:]).all():
+        prior[X:] = MEASURED_SIGMA_M
+        found = _fit(seen, prior)
+    if not found.shows_offset:
+        prior[OFFSET] = UNSEEN_OFFSET_SIGMA_S
+        found = replace(_fit(seen, prior), shows_offset=False)
+    return found
+
+
+def _fit(seen: SweepPairs, prior_sigma: Array) -> Estimate:
+    """Fit with standard deviations (7,) of what is expected.
+
     Notes
     -----
     Gauss-Newton; sizes of the errors of the poses are estimated after the first steps, and the results for several time
     constants of these are weighed by their likelihood.
     """
-    for prior_sigma_s in (PRIOR_SIGMA[OFFSET], UNSEEN_OFFSET_SIGMA_S):
-        prior = PRIOR_SIGMA.copy()
-        prior[OFFSET] = prior_sigma_s
-        values = np.zeros(VALUES)
-        for _ in range(FIRST_STEPS):
-            values = values + PoseNoise(_linearize(seen, values, prior)).solve(USUAL_NOISE, FIRST_TIME_S).step
-        problem = PoseNoise(_linearize(seen, values, prior))
-        errors = problem.estimate()
-        solved = [(weight, problem.solve(noise, tau)) for weight, noise, tau in errors]
-        shows_offset = prior_sigma_s == PRIOR_SIGMA[OFFSET]
-        if not shows_offset or sum(w * s.noise_share for w, s in solved) < MAX_NOISE_SHARE:
-            break
+    values = np.zeros(VALUES)
+    for _ in range(FIRST_STEPS):
+        values = values + PoseNoise(_linearize(seen, values, prior_sigma)).solve(USUAL_NOISE, FIRST_TIME_S).step
+    problem = PoseNoise(_linearize(seen, values, prior_sigma))
+    errors = problem.estimate()
+    solved = [(weight, problem.solve(noise, tau)) for weight, noise, tau in errors]
     step, covariance = _mean(solved)
-    return Estimate(
-        values + step, covariance, shows_offset, float(sum(weight * noise[0] for weight, noise, _ in errors))
-    )
+    shows_offset = sum(weight * s.noise_share for weight, s in solved) < MAX_NOISE_SHARE
+    pose_error_m = float(sum(weight * noise[0] for weight, noise, _ in errors))
+    return Estimate(values + step, covariance, shows_offset, pose_error_m)
 
 
 def _mean(solved: list[tuple[float, Solution]]) -> tuple[Array, Array]:

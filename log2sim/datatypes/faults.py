@@ -21,6 +21,7 @@ FAULT_KINDS = {
     "time_offset": "the stamps of a sensor are off against the poses",
     "unknown_offset": "stamps were to be corrected, but the ego's motion does not show their offset",
     "lidar_rotation": "the mount of a LiDAR is rotated against its calibration",
+    "lidar_translation": "the mount of a LiDAR, or the ego's origin, is elsewhere than in the calibration",
     "unknown_rotation": "a mount was to be corrected, but the ego's motion does not show its rotation",
     "camera_rotation": "the mount of a camera is rotated against its calibration",
     "swapped_cameras": "cameras have each other's calibration",
