@@ -15,6 +15,8 @@ from typing import Any
 
 from log2sim.errors import ConfigError, Log2SimError, LogError
 from log2sim.input_files import read_file
+from log2sim.json_keys import RepeatedKeysError, parse_unique
+from log2sim.output_claims import claim
 from log2sim.outputs import expect_new, put, temporary_beside
 
 JSON_LIMIT_BYTES = 512 * 1024 * 1024
@@ -86,8 +88,24 @@ def check_targets(*paths: Path | str | None, overwrite: bool) -> None:
             raise ConfigError(
                 f"{target}: two files would be written under this one name; choose another for one of them"
             )
+    for target in targets:
+        claim(target, overwrite=overwrite)
     if not overwrite:
         expect_new(targets)
+
+
+def check_folder(folder: Path, *, overwrite: bool) -> None:
+    """Refuse an output folder that cannot be written, or that another run is writing, before any work is done for it.
+
+    Raises
+    ------
+    ConfigError
+        For a file, a parent that is a file or may not be written in, or a folder that another run is about to write.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError(f"{folder}: is a file; give the name of a folder")
+    refuse_below_file(folder / "any file" if folder.exists() else folder)
+    claim(folder, overwrite=overwrite)
 
 
 def write_json(path: Path | str, value: Any) -> None:
@@ -102,7 +120,8 @@ def read_json(path: Path | str, error: type[LogError] = LogError) -> Any:
     Raises
     ------
     error
-        For a file that is missing, too large, not valid JSON, or has a number that is not finite; with its position.
+        For a file that is missing, too large, not valid JSON, or has a number that is not finite; with its position. For keys that
+        stand twice in one object, too: which of the two values is meant, no program can tell.
     """
     path = Path(path)
     if path.is_dir():
@@ -110,7 +129,7 @@ def read_json(path: Path | str, error: type[LogError] = LogError) -> Any:
     data = read_file(path, JSON_LIMIT_BYTES, error)
     try:
         text = data.decode("utf-8")
-        value = json.loads(text, parse_constant=_refuse, parse_float=_finite, parse_int=_whole)
+        value = parse_unique(text, parse_constant=_refuse, parse_float=_finite, parse_int=_whole)
         if _SURROGATE_ESCAPE.search(text):  # JSON can escape an unpaired surrogate, which UTF-8 cannot encode
             json.dumps(value, ensure_ascii=False).encode()
         return value
@@ -118,6 +137,8 @@ def read_json(path: Path | str, error: type[LogError] = LogError) -> Any:
         raise error(
             f"{path}: {_location_of_not_finite(text)} is {problem}, expected a finite number; write one, or null where the schema allows it"
         ) from None
+    except RepeatedKeysError as problem:
+        raise error(f"{path}: {problem}") from None
     except json.JSONDecodeError as problem:
         raise error(f"{path}: not valid JSON at line {problem.lineno}, column {problem.colno}: {problem.msg}") from None
     except UnicodeEncodeError as problem:

@@ -1,4 +1,4 @@
-"""Output files: temporary names beside them, several that appear together, and none that replaces another run's."""
+"""Output files and folders: complete or absent, several that appear together, and none that replaces another run's."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import platform
 import re
 import secrets
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
@@ -65,11 +65,14 @@ def put(temporary: Path, target: Path) -> bool:
     try:
         _rename_to_new(temporary, target)
     except FileExistsError:
-        raise ConfigError(
-            f"{target}: another run has written it meanwhile; choose another name or pass --overwrite"
-        ) from None
+        raise written_meanwhile(target) from None
     expected_new.discard(target.resolve())
     return False
+
+
+def written_meanwhile(target: Path) -> ConfigError:
+    """Return the error for a target that another run wrote while this one worked."""
+    return ConfigError(f"{target}: another run has written it meanwhile; choose another name or pass --overwrite")
 
 
 def _rename_to_new(temporary: Path, target: Path) -> None:
@@ -105,11 +108,23 @@ def together() -> Iterator[None]:
         raise
     finally:
         _waiting.reset(token)
+    place_all(files)
+
+
+def place_all(files: Sequence[tuple[Path, Path]]) -> None:
+    """Rename finished files to their targets, all of them or none.
+
+    Raises
+    ------
+    ConfigError
+        When one of them cannot be renamed; those that are new are removed again.
+    """
     placed: list[Path] = []
     try:
         for temporary, target in files:
             is_new = not target.exists()
             try:
+                target.parent.mkdir(parents=True, exist_ok=True)
                 put(temporary, target)
             except OSError as error:
                 raise ConfigError(f"{target}: cannot be written: {error.strerror or error}") from error

@@ -169,3 +169,19 @@ def test_rounded_numbers_for_json() -> None:
     assert rounded(1.23456, 2) == 1.23
     assert rounded(float("nan"), 2) is None
     assert rounded(float("-inf"), 2) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"a": 1, "b": {"a": 2}, "a": 3}', "a key stands twice in one object, first 'a'"),
+        ('[{"x": [1], "x": [1]}, {"y": 1, "y": 2, "y": 3}]', "3 keys stand twice in one object, first 'x'"),
+        ('{"\\u0061": 1, "a": 2}', "first 'a'"),
+    ],
+)
+def test_keys_that_stand_twice_are_told_with_their_number(tmp_path: Path, text: str, message: str) -> None:
+    """Which of the two is meant, no program can tell."""
+    path = tmp_path / "a.json"
+    path.write_text(text)
+    with pytest.raises(ScenarioError, match=message):
+        read_json(path, ScenarioError)

@@ -366,3 +366,27 @@ def test_a_sweep_whose_stamp_is_far_off_is_left_out_with_its_labels(world: Path,
     assert np.abs(log.labels.t_ns - log.streams["pandar64"].t_ns[0]).max() < 2 * lasts_ns
     assert 0 < len(log.labels.t_ns) < len(sound.labels.t_ns)
     assert any("lidar/timestamps.json: 1 of" in note and "left out" in note for note in log.notes)
+
+
+def test_images_that_cannot_be_used_are_counted(world: Path, tmp_path: Path) -> None:
+    """Without intrinsics, or without a stamp."""
+    shutil.copytree(world, tmp_path / "log")
+    camera = tmp_path / "log" / "camera" / "front_camera"
+    count = len(list(camera.glob("*.jpg")))
+    shutil.copytree(camera, camera.parent / "back_camera")
+    (camera.parent / "back_camera" / "intrinsics.json").unlink()
+    shutil.copy(camera / "00.jpg", camera / "77.jpg")
+    log = open_log(tmp_path / "log")
+    assert set(log.cameras) == {"front_camera"}
+    assert f"camera/back_camera: {count} images left out: it has no intrinsics.json" in log.notes
+    assert f"camera/front_camera: 1 of {count + 1} records left out: there are stamps for {count}" in log.notes
+
+
+@pytest.mark.parametrize("seconds", [18.0, -3600.0])
+def test_images_of_another_clock_are_told_with_it(world: Path, tmp_path: Path, seconds: float) -> None:
+    shutil.copytree(world, tmp_path / "log")
+    path = tmp_path / "log" / "camera" / "front_camera" / "timestamps.json"
+    path.write_text(json.dumps([stamp + seconds for stamp in json.loads(path.read_text())]))
+    words = "GPS time against UTC" if seconds > 0 else "1 h, a time zone"
+    with pytest.raises(LogError, match=rf"front_camera/timestamps.json .*they do not overlap .*{words}"):
+        open_log(tmp_path / "log")

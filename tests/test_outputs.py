@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextvars
 import io
 import os
 import signal
@@ -13,11 +14,15 @@ from pathlib import Path
 
 import pytest
 from command_line import names, run
+from worlds import tiny_toml
 
 from log2sim import outputs
 from log2sim.cli.process import Ended, TolerantStream, ending_by_signals
 from log2sim.documents import check_targets, refuse_below_file, replaced, write_json
 from log2sim.errors import ConfigError
+from log2sim.export import exporters
+from log2sim.output_claims import claim, holding_claims
+from log2sim.output_folders import replaced_folder
 from log2sim.outputs import refusing_to_replace, temporary_beside, together
 
 DIES = """
@@ -241,7 +246,7 @@ def test_scenario_report_and_picture_of_a_run_appear_together_or_not_at_all(
     assert names(out) == ["r.json", "s.json", "t.png"]
 
 
-def test_a_disk_that_is_full_during_an_export_names_the_folder(
+def test_a_disk_that_is_full_during_an_export_names_the_file(
     tiny_scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object, **__: object) -> None:
@@ -251,5 +256,175 @@ def test_a_disk_that_is_full_during_an_export_names_the_folder(
     monkeypatch.setattr("log2sim.export.csv_table.csv.writer", full)
     ran = run("export", tiny_scenario, "--to", "csv", "--out", tmp_path / "o")
     assert ran.code == 2
-    assert "o: cannot be written: No space left on device" in ran.line
+    assert "o/agents.csv: cannot be written: No space left on device" in ran.line
     assert names(tmp_path) == []
+
+
+COMMANDS: dict[str, tuple[str, ...]] = {
+    "reconstruct": ("reconstruct", "no.log", "--out", "{out}/s.json"),
+    "report": ("reconstruct", "no.log", "--out", "{free}/s.json", "--report", "{out}/r.json"),
+    "topdown": ("reconstruct", "no.log", "--out", "{free}/s.json", "--topdown", "{out}/t.png"),
+    "detect": ("detect", "no.log", "--out", "{out}/b.json"),
+    "bench": ("bench", "no.log", "--out", "{out}"),
+    "convert": ("convert", "no.log", "--out", "{out}/log"),
+    "inspect": ("inspect", "no.log", "--overlay", "{out}/o.png"),
+    "synth": ("synth", "{scene}", "--out", "{out}/log"),
+    "traffic": ("synth", "--traffic", "vehicle", "--out", "{out}/data"),
+    "export": ("export", "no.json", "--to", "csv", "--out", "{out}/csv"),
+    "edit": ("edit", "no.json", "--out", "{out}/e.json"),
+    "replay": ("replay", "no.json", "--out", "{out}/r.json"),
+    "plot": ("plot", "no.json", "--out", "{out}/p.png"),
+    "view": ("view", "no.json", "--out", "{out}/v.html"),
+    "evaluate": ("evaluate", "no.json", "--truth", "no.json", "--out", "{out}/m.json"),
+    "import": ("import", "no.xosc", "--out", "{out}/i.json"),
+}
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="no folder that nobody can write in")
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_refuses_a_folder_that_cannot_be_written_before_its_work(command: str, tmp_path: Path) -> None:
+    """Its input is not even there, which it does not come to see."""
+    scene = tmp_path / "scene.toml"
+    scene.write_text(tiny_toml())
+    free = tmp_path / "free" / "deep"
+    ran = run(*(a.format(out="/proc/self/new", free=free, scene=scene) for a in COMMANDS[command]))
+    assert ran.code == 2
+    assert "/proc/self/new" in ran.line
+    assert "cannot be written: " in ran.line
+    assert names(tmp_path) == ["scene.toml"]
+
+
+HOLDS = """
+import sys, time
+from pathlib import Path
+from log2sim.documents import {check}
+from log2sim.output_claims import holding_claims
+with holding_claims():
+    {check}(Path(sys.argv[1]), overwrite=False)
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no such locks there")
+@pytest.mark.parametrize("command", ["edit", "convert", "export", "synth", "traffic"])
+def test_of_two_runs_the_second_is_refused_before_its_work(command: str, tmp_path: Path) -> None:
+    scene = tmp_path / "scene.toml"
+    scene.write_text(tiny_toml())
+    out = tmp_path / "new"
+    arguments = [a.format(out=out, scene=scene, free=tmp_path) for a in COMMANDS[command]]
+    target = arguments[arguments.index("--out") + 1]
+    code = HOLDS.format(check="check_targets" if command == "edit" else "check_folder")
+    with subprocess.Popen([sys.executable, "-c", code, target], stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "held\n"
+        ran = run(*arguments)
+        assert ran.code == 2
+        assert f"{target}: another run is about to write it" in ran.line
+        other.kill()
+    if not command.startswith(("synth", "traffic")):  # a killed run holds no claim: now the missing input is told
+        assert "no.log" in run(*arguments).line or "no.json" in run(*arguments).line
+        assert names(out) == []
+
+
+def test_a_claim_is_taken_once_and_leaves_no_folder(tmp_path: Path) -> None:
+    target = tmp_path / "a" / "b" / "c.json"
+    with holding_claims():
+        claim(target, overwrite=False)
+        claim(target, overwrite=False)
+        assert names(target.parent) == [".c.json.lock"]
+    assert names(tmp_path) == []
+    with holding_claims():
+        claim(target, overwrite=False)
+        target.write_text("x")
+    assert names(target.parent) == ["c.json"]
+    claim(target, overwrite=False)  # a library has no claims
+    assert names(target.parent) == ["c.json"]
+
+
+def test_with_overwrite_another_run_does_not_matter(tmp_path: Path) -> None:
+    contexts = [contextvars.copy_context() for _ in range(3)]
+    holders = [holding_claims() for _ in contexts]
+    for context, holder in zip(contexts, holders):
+        context.run(holder.__enter__)
+    contexts[0].run(claim, tmp_path / "a", overwrite=False)
+    contexts[1].run(claim, tmp_path / "a", overwrite=True)
+    with pytest.raises(ConfigError, match="another run is about to write it"):
+        contexts[2].run(claim, tmp_path / "a", overwrite=False)
+    for context, holder in zip(contexts, holders):
+        context.run(holder.__exit__, None, None, None)
+    assert names(tmp_path) == []
+
+
+def test_a_full_disk_names_the_file_of_a_folder(tmp_path: Path) -> None:
+    target = tmp_path / "log"
+    with pytest.raises(ConfigError) as caught, replaced_folder(target, overwrite=False) as folder:  # noqa: PT012
+        (folder / "front").mkdir()
+        (folder / "front" / "0.jpg").write_text("x")
+        raise OSError(28, "No space left on device")
+    assert str(caught.value) == f"{target}/front/0.jpg: cannot be written: No space left on device"
+    with pytest.raises(ConfigError) as caught, replaced_folder(target, overwrite=False) as folder:  # noqa: PT012
+        (folder / "front").mkdir()
+        (folder / "front").write_text("x")
+    assert str(caught.value) == f"{target}/front: cannot be written: Is a directory"
+    with pytest.raises(ConfigError) as caught, replaced_folder(target, overwrite=False) as folder:
+        raise ConfigError(f"{folder}/truth.json: cannot be written: No space left on device")
+    assert str(caught.value) == f"{target}/truth.json: cannot be written: No space left on device"
+    assert names(tmp_path) == []
+
+
+def test_a_folder_that_another_run_wrote_meanwhile_is_kept(tmp_path: Path) -> None:
+    target = tmp_path / "log"
+
+    def write(folder: Path) -> None:
+        (folder / "own").write_text("x")
+        target.mkdir()
+        (target / "of another").write_text("x")
+
+    with (
+        pytest.raises(ConfigError, match="another run has written"),
+        replaced_folder(target, overwrite=False) as folder,
+    ):
+        write(folder)
+    assert names(target) == ["of another"]
+    assert names(tmp_path) == ["log"]
+    with replaced_folder(target, overwrite=True) as folder:
+        (folder / "own").write_text("x")
+    assert names(target) == ["own"]
+    assert names(tmp_path) == ["log"]
+
+
+def test_a_folder_that_cannot_be_placed_leaves_the_earlier_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    target = tmp_path / "log"
+    target.mkdir()
+    (target / "a").write_text("x")
+    sound = Path.rename
+
+    def fails(self: Path, new: Path) -> Path:
+        if new == target and ".old" not in self.name:
+            raise OSError(28, "No space left on device", str(self))
+        return sound(self, new)
+
+    monkeypatch.setattr(Path, "rename", fails)
+    with pytest.raises(ConfigError, match="log: cannot be written: No space"), replaced_folder(target, overwrite=True):
+        pass
+    assert names(target) == ["a"]
+    assert names(tmp_path) == ["log"]
+
+
+def test_files_of_an_export_replace_none_of_another_run(
+    tiny_scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "o"
+    sound = exporters.place_all
+
+    def late(files: list[tuple[Path, Path]]) -> None:
+        out.mkdir()
+        files[-1][1].write_text("of another")
+        sound(files)
+
+    monkeypatch.setattr(exporters, "place_all", late)
+    ran = run("export", tiny_scenario, "--to", "csv", "--out", out)
+    assert ran.code == 2
+    assert "another run has written it meanwhile" in ran.line
+    assert [p.read_text() for p in out.iterdir()] == ["of another"]

@@ -34,14 +34,14 @@ def convert(
 ) -> None:
     """Write any log, or a part of it, as a log folder of log2sim; images are copied as they are."""
     from log2sim.cli.progress import progress
-    from log2sim.documents import refuse_below_file
+    from log2sim.documents import check_folder
     from log2sim.logs.excerpt import cut_log
     from log2sim.logs.native.writer import refuse_target, write_log
     from log2sim.logs.opening import open_log
 
     names = camera_names(cameras)
-    refuse_below_file(out)
     refuse_target(out, overwrite=overwrite)
+    check_folder(out, overwrite=overwrite)
     if out.resolve() in (log.resolve(), *log.resolve().parents):
         raise ConfigError(f"{out}: holds the log that is converted; choose another folder")
     part = cut_log(open_log(log, format=format, sequence=sequence), cameras=names, start_s=start, stop_s=stop)

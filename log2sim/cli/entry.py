@@ -30,6 +30,7 @@ from log2sim.cli.options import fail, say
 from log2sim.cli.process import SIGNAL_CODE, Ended, ending_by_signals, tolerating_lost_output
 from log2sim.errors import Log2SimError
 from log2sim.links import OPTION, following_links
+from log2sim.output_claims import holding_claims
 from log2sim.outputs import refusing_to_replace
 from log2sim.version import __version__
 
@@ -64,7 +65,7 @@ app.command(name="import")(import_.import_)
 
 def main() -> None:
     """Run the command line; every `Log2SimError` becomes one message and its exit code."""
-    with tolerating_lost_output(), ending_by_signals() as ended, refusing_to_replace():
+    with tolerating_lost_output(), ending_by_signals() as ended, refusing_to_replace(), holding_claims():
         _run(ended)
 
 

@@ -37,11 +37,13 @@ def export(
 ) -> None:
     """Write a scenario in the format of a simulator or viewer."""
     from log2sim.datatypes import Scenario
+    from log2sim.documents import check_folder
     from log2sim.export.checks import doubtful_note, export_notes
     from log2sim.export.exporters import Options, with_doubtful, with_ego
     from log2sim.export.exporters import export as run
     from log2sim.logs.opening import open_log
 
+    check_folder(out, overwrite=overwrite)
     loaded = Scenario.load(scenario)
     if ego is not None:
         loaded = with_ego(loaded, ego)

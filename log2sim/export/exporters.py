@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Protocol
 
 from log2sim import registry
 from log2sim.datatypes import Log, Scenario
-from log2sim.documents import refuse_below_file, refuse_existing
+from log2sim.documents import check_folder, refuse_existing
 from log2sim.errors import ConfigError
 from log2sim.export.checks import require_exportable
-from log2sim.outputs import temporary_beside
+from log2sim.output_folders import unfinished_folder
+from log2sim.outputs import expect_new, place_all, temporary_beside
 
 __all__ = ["Exporter", "Options", "export", "formats"]
 
@@ -92,26 +92,12 @@ def export(
             raise ConfigError(f"--{field.name}: format '{to}' has no such option; it has {known}")
     require_exportable(scenario)
     folder = Path(out)
-    if folder.exists() and not folder.is_dir():
-        raise ConfigError(f"{folder}: is a file; give the name of a folder")
-    refuse_below_file(folder)
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        # In the folder itself if it exists, since it may be on another file system than its parent.
-        parent = folder if folder.is_dir() else folder.parent
-        temporary = temporary_beside(parent / folder.name)
-        temporary.mkdir()
-    except OSError as error:
-        raise ConfigError(f"{folder}: cannot be written: {error.strerror or error}") from error
-    try:
+    check_folder(folder, overwrite=overwrite)
+    # In the folder itself if it exists, since it may be on another file system than its parent.
+    parent = folder if folder.is_dir() else folder.parent
+    with unfinished_folder(temporary_beside(parent / folder.name), folder) as temporary:
         exporter.write(scenario, temporary, chosen)
         return _move_into(temporary, folder, overwrite=overwrite)
-    except OSError as error:
-        if error.filename is not None and not Path(error.filename).is_relative_to(temporary):
-            raise  # of a file that is read
-        raise ConfigError(f"{folder}: cannot be written: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def with_ego(scenario: Scenario, agent: str) -> Scenario:
@@ -152,10 +138,8 @@ def _move_into(temporary: Path, folder: Path, *, overwrite: bool) -> tuple[Path,
         refuse_existing(folder / name, overwrite=overwrite)
         if (folder / name).is_dir():
             raise ConfigError(f"{folder / name}: is a folder, where a file would be written; choose another folder")
-    for name in names:
-        try:
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (temporary / name).replace(folder / name)
-        except OSError as error:
-            raise ConfigError(f"{folder / name}: cannot be written: {error.strerror or error}") from error
-    return tuple(folder / name for name in names)
+    targets = tuple(folder / name for name in names)
+    if not overwrite:
+        expect_new(targets)
+    place_all([(temporary / name, folder / name) for name in names])
+    return targets

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +10,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from log2sim.documents import check_folder
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
-from log2sim.outputs import temporary_beside
+from log2sim.output_folders import replaced_folder
 from log2sim.synth.kitti_layout import KittiFrame, calibration_text, label_text
 from log2sim.synth.light import light_of, weather_of
 from log2sim.synth.render import render, segment
@@ -72,27 +72,19 @@ def write_traffic(
     """
     sensor_named(settings.sensor, settings.mount)
     _refuse(out, overwrite=overwrite)
-    staging = temporary_beside(out)
+    check_folder(out, overwrite=overwrite)
     write = _write_frame if settings.layout == "kitti" else _write_log
-    try:
-        staging.mkdir(parents=True)
+    with replaced_folder(out, overwrite=overwrite) as folder:
         scenes = []
         for index in range(settings.scenes):
             scene, environment = draw_traffic(settings, index)
-            write(settings, scene, environment, staging, index)
+            write(settings, scene, environment, folder, index)
             scenes.append(_description(scene, environment, index))
             if progress is not None:
                 progress(index + 1, settings.scenes)
         if settings.layout == "kitti":
-            _write_splits(staging, settings)
-        (staging / MANIFEST).write_text(json.dumps(_manifest(settings, scenes), indent=1) + "\n", encoding="utf-8")
-        if out.exists():
-            shutil.rmtree(out)
-        staging.rename(out)
-    except OSError as error:
-        raise ConfigError(f"{out}: cannot be written: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
+            _write_splits(folder, settings)
+        (folder / MANIFEST).write_text(json.dumps(_manifest(settings, scenes), indent=1) + "\n", encoding="utf-8")
 
 
 def draw_traffic(settings: TrafficSettings, index: int) -> tuple[TrafficScene, Environment]:

@@ -7,13 +7,13 @@ write_synthetic(scene, "samples/crossing", seed=1)
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from log2sim.documents import check_folder
 from log2sim.errors import ConfigError
-from log2sim.outputs import temporary_beside
+from log2sim.output_folders import replaced_folder
 from log2sim.synth.scene import Scene, load_scene
 
 if TYPE_CHECKING:
@@ -61,19 +61,12 @@ def write_synthetic(
 
     target = Path(out)
     _refuse(target, overwrite)
+    check_folder(target, overwrite=overwrite)
     log, truth = synthesize(scene, seed=seed)
-    staging = temporary_beside(target)
     poses: Literal["gnss", "poses"] = scene.ego.poses if scene.ego is not None else "poses"
-    try:
-        write_log(log, staging, jpeg_quality=jpeg_quality, ego=poses, progress=progress)
-        truth.save(staging / TRUTH_FILE)
-        if target.exists():
-            shutil.rmtree(target)
-        staging.rename(target)
-    except OSError as error:
-        raise ConfigError(f"{target}: cannot be written: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
+    with replaced_folder(target, overwrite=overwrite) as folder:
+        write_log(log, folder, jpeg_quality=jpeg_quality, ego=poses, progress=progress)
+        truth.save(folder / TRUTH_FILE)
 
 
 def _refuse(target: Path, overwrite: bool) -> None:

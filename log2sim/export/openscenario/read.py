@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -23,6 +22,7 @@ from log2sim.export.openscenario.trajectories import (
 from log2sim.export.placement import ExportPlacement
 from log2sim.export.xml_text import read, require_number, unescaped
 from log2sim.geometry import Array, wrap_angle
+from log2sim.json_keys import parse_unique
 
 CATEGORY_OF = {kind.category: category for category, kind in reversed(list(VEHICLE_DEFAULTS.items()))} | {
     "van": "car", "semitrailer": "truck", "trailer": "other", "tram": "other", "train": "other",
@@ -109,7 +109,7 @@ def _map(text: str | None) -> MapFrame:
     if text is None:
         return MapFrame()
     try:
-        entries = json.loads(unescaped(text))
+        entries = parse_unique(unescaped(text))
         frame = MapFrame(**{**entries, "offset_m": tuple(float(v) for v in entries["offset_m"])})
     except (ValueError, TypeError, KeyError, RecursionError):
         raise ScenarioError(f"parameter log2sim_map is {text[:60]!r}, expected the map that an export writes") from None
@@ -179,7 +179,7 @@ def _doubts(properties: Mapping[str, str], where: str) -> list[Any]:
     if text is None:
         return []
     try:
-        doubts = json.loads(unescaped(text))
+        doubts = parse_unique(unescaped(text))
     except (ValueError, RecursionError):
         doubts = None
     if not isinstance(doubts, list):

@@ -77,7 +77,13 @@ def read_text(path: Path) -> str:
 
 
 def read_calibration(path: Path) -> dict[str, Array]:
-    """Numbers by key of a KITTI calibration file; lines that hold no numbers are left out."""
+    """Numbers by key of a KITTI calibration file; lines that hold no numbers are left out.
+
+    Raises
+    ------
+    LogError
+        For a key that stands twice.
+    """
     values = {}
     for line in read_text(path).splitlines():
         key, _, rest = line.strip().partition(" ")
@@ -85,6 +91,10 @@ def read_calibration(path: Path) -> dict[str, Array]:
             numbers = np.array([parse_float(word) for word in rest.split()])
         except ValueError:
             continue
+        if key.removesuffix(":") in values:
+            raise LogError(
+                f"{path}: entry '{key.removesuffix(':')[:40]}' stands twice; remove the one of the two that is wrong"
+            )
         values[key.removesuffix(":")] = numbers
     return values
 

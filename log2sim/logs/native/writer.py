@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import secrets
-import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -20,7 +18,7 @@ from log2sim.geometry import Array, Camera, quaternion_from_rotation
 from log2sim.logs.images import image_size
 from log2sim.logs.native.reader import COMPENSATED, INDEX_COLUMNS, MANIFEST
 from log2sim.logs.native.table_writer import write_ego, write_labels, write_table
-from log2sim.outputs import temporary_beside
+from log2sim.output_folders import replaced_folder
 
 POINT_RESOLUTION_M = 1e-3
 # float32 resolves 1 mm up to about 8 km.
@@ -73,20 +71,8 @@ def write_log(
     """
     target = Path(path)
     refuse_target(target, overwrite=overwrite)
-    temporary, replaced = temporary_beside(target), target.with_name(f".{target.name}.{secrets.token_hex(4)}.old")
-    try:
-        temporary.mkdir(parents=True)
+    with replaced_folder(target, overwrite=overwrite) as temporary:
         _Writer(log, temporary, _Encoding(jpeg_quality, ego, sweep), progress, problems).write()
-        if target.exists():
-            target.rename(replaced)
-        temporary.rename(target)
-    except OSError as error:
-        raise ConfigError(f"{target}: cannot be written: {error.strerror or error}") from error
-    finally:
-        if replaced.exists() and not target.exists():
-            replaced.rename(target)
-        for folder in (temporary, replaced):
-            shutil.rmtree(folder, ignore_errors=True)
 
 
 def refuse_target(target: Path, *, overwrite: bool) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from log2sim.documents import read_json
 from log2sim.errors import LogError
 from log2sim.geometry import Array
 from log2sim.input_files import open_regular
+from log2sim.json_keys import RepeatedKeysError, require_unique, unique_decoder
 from log2sim.links import require_link_inside
 from log2sim.logs.pose_checks import find_not_unit
 from log2sim.logs.stamps import MAX_TIME_S
@@ -110,7 +110,7 @@ def scan_records(path: Path, key: str, values: Collection[str], chunk_bytes: int
                 break
             if match[1] in plain or b"\\" in match[1]:
                 record = _record_around(data, match.start(), f"{path}, byte {offset + match.start()}")
-                found_value = record.get(key)  # of a key that is there twice the last value counts
+                found_value = record.get(key)
                 if isinstance(found_value, str) and found_value in wanted:
                     yield record
 
@@ -151,12 +151,21 @@ def _record_around(data: bytes, at: int, where: str) -> Record:
             break
         text = data[start:last].decode("utf-8", errors="replace")
         try:
-            record, length = json.JSONDecoder().raw_decode(text)
+            repeated: list[str] = []
+            record, length = unique_decoder(repeated).raw_decode(text)
         except (ValueError, RecursionError):
             continue
         if len(text[:length].encode()) > at - start:
-            return dict(record)
+            return _checked(dict(record), repeated, where)
     raise LogError(f"{where}: not valid JSON; expected a flat record of at most {MAX_RECORD_BYTES} bytes")
+
+
+def _checked(record: Record, repeated: list[str], where: str) -> Record:
+    try:
+        require_unique(repeated)
+    except RepeatedKeysError as problem:
+        raise LogError(f"{where}: {problem}") from None
+    return record
 
 
 def text_of(record: Record, key: str, path: Path) -> str:
