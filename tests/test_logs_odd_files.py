@@ -20,7 +20,9 @@ from log2sim.datatypes import Log, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.export.xml_text import require_number
 from log2sim.geometry import PoseTrack
+from log2sim.logs.calibration_checks import problems_of
 from log2sim.logs.guarding import guard_log
+from log2sim.logs.label_checks import without_impossible_labels
 from log2sim.logs.native.csv_tables import read_csv_table
 from log2sim.logs.opening import open_log
 from log2sim.logs.sweeps import sweep_of
@@ -222,3 +224,33 @@ def test_whole_numbers_are_parsed(value: int) -> None:
 @given(st.floats(allow_nan=False))
 def test_numbers_are_parsed(value: float) -> None:
     assert parse_float(repr(value)) == value
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "row_is_kept"),
+    [("size_m", 1e308, False), ("size_m", -1.0, False), ("center_m", 2e9, False), ("size_m", 900.0, True)],
+)
+def test_labels_of_no_object_are_left_out_and_told(column: str, value: float, row_is_kept: bool) -> None:
+    log = short_world()
+    assert log.labels is not None
+    assert without_impossible_labels(log).notes == log.notes
+    assert without_impossible_labels(log).labels is log.labels
+    changed = getattr(log.labels, column).copy()
+    changed[2, 0] = value
+    labels = replace(log.labels, **{column: changed})
+    checked = without_impossible_labels(log.changed(labels=labels))
+    words = "1 label left out: no object is so large or so far away, or it has no size"
+    assert (words in checked.notes) == (not row_is_kept)
+    assert checked.labels is not None
+    assert len(checked.labels.t_ns) == len(labels.t_ns) - (not row_is_kept)
+    assert checked.labels.track_id.tolist() == np.delete(labels.track_id, [] if row_is_kept else [2]).tolist()
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [1e308, np.nan, np.inf, -1e7])
+def test_lenses_that_bend_without_limit_are_impossible(value: float) -> None:
+    log = short_world()
+    camera = replace(log.cameras["front"], distortion_model="brown", distortion=(0.1, value, 0.0, 0.0))
+    problems = list(problems_of(log.changed(cameras={"front": camera}), "front"))
+    assert [p.is_impossible for p in problems] == [True]
+    assert "its distortion has the coefficient" in problems[0].message

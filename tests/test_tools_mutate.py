@@ -70,13 +70,13 @@ def test_a_reader_that_dies_is_a_crash(harness: Harness) -> None:
     ("reader", "words"),
     [
         (lambda path, out: (path.parents[2] / "new").write_text("x"), "open writes"),
-        (lambda path, out: (path.parents[3] / "outside" / "canary").read_bytes(), "open reads"),
+        (lambda path, out: (path.parents[4] / "outside" / "canary").read_bytes(), "open reads"),
         (lambda path, out: Path("/etc/passwd").read_bytes(), "open reads /etc/passwd"),
         (lambda path, out: os.remove(path), "os.remove writes"),
         (lambda path, out: subprocess.run(["true"], check=False), "subprocess.Popen"),
         (lambda path, out: os.system("true"), "os.system"),
         (lambda path, out: socket.socket().close(), "socket"),
-        (lambda path, out: np.load(path.parents[3] / "outside" / "canary"), "open reads"),
+        (lambda path, out: np.load(path.parents[4] / "outside" / "canary"), "open reads"),
     ],
     ids=["write", "read", "system file", "remove", "process", "shell", "socket", "through a library"],
 )
@@ -95,10 +95,10 @@ def test_what_a_reader_does_outside_is_found(harness: Harness, reader: Reader, w
 def test_what_a_library_in_c_reads_or_writes_outside_is_found(harness: Harness) -> None:
     import cv2
 
-    row = row_of(harness, lambda path, out: cv2.imread(str(path.parents[3] / "outside" / "canary")))
+    row = row_of(harness, lambda path, out: cv2.imread(str(path.parents[4] / "outside" / "canary")))
     if harness.canaries.shows_reading:
         assert "read outside: canary" in row.reason
-    row = row_of(harness, lambda p, o: cv2.imwrite(str(p.parents[3] / "outside" / "x.png"), np.zeros((2, 2), np.uint8)))
+    row = row_of(harness, lambda p, o: cv2.imwrite(str(p.parents[4] / "outside" / "x.png"), np.zeros((2, 2), np.uint8)))
     assert "made outside: x.png" in row.reason
 
 

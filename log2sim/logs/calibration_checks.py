@@ -21,6 +21,8 @@ MAX_RAY_DEGREES = 80.0
 MAX_MOUNT_DISTANCE_M = 100.0
 # Corners of wide lenses lie outside of the circle that the lens draws, where nothing keeps a fitted polynomial from folding.
 MAX_FOLD_DEGREES = 70.0
+# Fits of rational models reach thousands; the roots of much larger ones are not finite.
+MAX_DISTORTION = 1e6
 MAX_FOLDED_SHARE, MAX_USABLE_FOLDED_SHARE = 0.01, 0.5
 GRID = 32
 
@@ -87,7 +89,13 @@ def _principal_point(camera: Camera, where: str) -> Iterator[CalibrationProblem]
 
 
 def _distortion(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
-    if camera.rectified or not np.arctan(fold_radius(camera)) < np.radians(MAX_FOLD_DEGREES):
+    wrong = [value for value in camera.distortion if not abs(value) <= MAX_DISTORTION]
+    if wrong:
+        yield CalibrationProblem(
+            f"{where}: its distortion has the coefficient {wrong[0]:.6g}, expected numbers up to {MAX_DISTORTION:g}",
+            True,
+        )
+    if wrong or camera.rectified or not np.arctan(fold_radius(camera)) < np.radians(MAX_FOLD_DEGREES):
         return
     u, v = ((np.arange(GRID) + 0.5) * size / GRID for size in (camera.width_px, camera.height_px))
     pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)

@@ -10,6 +10,7 @@ from log2sim.errors import ConfigError, LogError
 from log2sim.links import following_links
 from log2sim.logs.calibration_checks import list_calibration_problems
 from log2sim.logs.guarding import guard_log, translate_parser_errors
+from log2sim.logs.label_checks import without_impossible_labels
 from log2sim.logs.reader import Reader
 from log2sim.logs.time_checks import list_time_problems
 
@@ -56,7 +57,7 @@ def _open(root: Path, format: str, sequence: str | None) -> Log:
         raise LogError(f"{root}: is a file, which format '{name}' cannot be; expected {reader.looks_for}")
     chosen = _select_sequence(root, name, reader.sequences(root), sequence)
     with translate_parser_errors(f"{root}: cannot be read as format '{name}'", LogError):
-        log = guard_log(reader.open(root, chosen), str(root))
+        log = without_impossible_labels(guard_log(reader.open(root, chosen), str(root)))
     others = _other_formats(root, name) if format == "auto" else []
     notes = [f"{root} holds logs of other formats, too: {', '.join(others)}; --format chooses one"] if others else []
     # Notes may wait for labels.

@@ -18,6 +18,8 @@ IMPOSSIBLE: tuple[Any, ...] = (
     -(10**40), f"{RAW}{'9' * 5000}@@", None, "", "x", [], {}, [[1.0]], "1.5",
 )  # fmt: skip
 OTHER_TYPES: tuple[Any, ...] = (None, 1, -1.5, 10**40, [], {}, True, [None])
+# Parts of a scenario in which any value may stand.
+FREE_FORM = (".quality", ".provenance", ".homography")
 DEPTHS = (100, 3000, 200_000)
 
 
@@ -66,13 +68,17 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
+def _is_free(path: str) -> bool:
+    return any(part in path for part in FREE_FORM)
+
+
 def replace_number_by_impossible(rng: np.random.Generator, root: Any) -> tuple[str, bool] | None:
     found = _walk(rng, root, _is_number)
     if found is None:
         return None
     holder, key, path = found
     old, holder[key] = holder[key], pick(rng, IMPOSSIBLE)
-    return f"{path}: {old} is {str(holder[key])[:50]}", True
+    return f"{path}: {old} is {str(holder[key])[:50]}", not _is_free(path)
 
 
 def change_value(rng: np.random.Generator, root: Any) -> tuple[str, bool] | None:
@@ -105,7 +111,7 @@ def replace_by_other_type(rng: np.random.Generator, root: Any) -> tuple[str, boo
         return None
     holder, key, path = found
     old, holder[key] = holder[key], pick(rng, OTHER_TYPES)
-    return f"{path}: {type(old).__name__} is {str(holder[key])[:50]}", True
+    return f"{path}: {type(old).__name__} is {str(holder[key])[:50]}", not _is_free(path)
 
 
 def remove_key(rng: np.random.Generator, root: Any) -> tuple[str, bool] | None:

@@ -55,7 +55,7 @@ def change_message(rng: np.random.Generator, file: Path, place: Place) -> Damage
     if not messages:
         return None
     target = file if file == place.input else file.parent
-    anew = place.outside.parent / "case" / "anew"
+    anew = place.outside.parent / "anew"
     shutil.rmtree(anew, ignore_errors=True)  # of a try that failed
     try:
         written = ros.write(iter(messages), anew, "world", STYLES[file.suffix])

@@ -73,11 +73,11 @@ class Harness:
         kind = kind_of(index)
         path, _, name, done = self.make(seed, index)
         before = {p.name for p in self.canaries.folder.iterdir() if p.name not in Canaries.NAMES}
-        out = self.folder / "case" / "out"
+        out = self.case(index) / "out"
         variant = variant_of(index)
         sound = self._sound_outcome(kind, variant)
         before |= {"secret.txt"} if "entities" in name else set()
-        os.chdir(self.folder / "case")
+        os.chdir(self.case(index))
         watch.allow(read=[path.parent if path.is_file() else path, *done.allowed], write=[out])
         ran = runner(kind, path, out, variant, watch.watching)
         ran.outside += [*watch.found, *self.canaries.check(before)]
@@ -86,11 +86,16 @@ class Harness:
             seed, index, kind, f"{name}: {done.what}", done.visible, verdict, reason, ran.seconds, ran.peak_bytes
         )
 
+    def case(self, index: int) -> Path:
+        """The folder of a damaged input and of what is made of it."""
+        return self.folder / "case" / str(index)
+
     def make(self, seed: int, index: int) -> tuple[Path, Place, str, Damage]:
         """Lay out a damaged input; the same seed and index give the same one."""
         kind = kind_of(index)
-        case, sound = self.folder / "case", self.bases[kind]
-        _remove(case)
+        # A folder of its own for each, as readers may remember files by their path.
+        case, sound = self.case(index), self.bases[kind]
+        _remove(case.parent)
         self.canaries.reset()
         top = self.folder / "sound" / kind.replace(" ", "-")
         shutil.copytree(top, case / "input")
