@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from worlds import camera_ahead, scan, standing, tiny_log
 
+from log2sim.config import Config
 from log2sim.datatypes import Lidar, Log, Stream, Sweep
 from log2sim.geometry import PoseTrack, transform
 from log2sim.perception.record_checks.camera_watch import CameraWatch
@@ -19,6 +20,7 @@ from log2sim.perception.record_checks.spans import gaps_of, spans_of
 from log2sim.perception.record_checks.sweep_sketches import common_share, sketch_sweep
 from log2sim.perception.record_checks.thumbnails import measure_change, shows_nothing, shrink
 from log2sim.perception.sync import synchronize
+from log2sim.pipeline import reconstruct
 
 STEP_NS = 100_000_000
 COUNT = 10
@@ -133,7 +135,7 @@ def gray(level, shape=(375, 1242)):
 @pytest.mark.parametrize(
     "image",
     [
-        gray(0), gray(255), gray((90, 20, 160)), noisy(gray(3), 1, 3.0), noisy(gray(128), 2, 15.0),
+        gray(0), gray(255), gray((90, 20, 160)), noisy(gray(3), 1, 3.0), noisy(gray(128), 2, 45.0),
         compressed(noisy(gray(20), 3, 8.0), 50), gray(0, (1080, 1920)),
         noisy(gray(0) + np.linspace(20, 90, 1242).astype(np.uint8)[None, :, None], 4),
     ],
@@ -146,7 +148,7 @@ def test_pictures_of_nothing_show_nothing(image):
 def test_scenes_at_night_and_in_fog_show_something():
     _, _, images = pictures()
     night = np.zeros((375, 1242, 3), dtype=np.uint8)
-    cv2.circle(night, (700, 180), 4, (200, 220, 255), -1)
+    cv2.circle(night, (700, 180), 2, (200, 220, 255), -1)  # one lamp far away
     assert not shows_nothing(shrink(noisy(night, 1, 3.0)))
     assert not shows_nothing(shrink(noisy((images[0] * 0.1).astype(np.uint8), 2, 2.0)))
     assert not shows_nothing(shrink(noisy((200 + (images[0] * 0.15)).astype(np.uint8), 3, 2.0)))
@@ -307,3 +309,36 @@ def test_sweeps_with_next_to_no_points_are_told_with_counts(count):
     assert fault.values["count"] == 2
     assert fault.values["most_points"] == count
     assert "2 from 0.40 to 0.50 s" in fault.message
+
+
+def gap_errors(seed):
+    """Errors (N, 2) m and sigmas (N,) m of the agents at the ticks without sweeps, and the faults that were told."""
+    log, truth = tiny_log(seed=seed, duration_s=3.0)
+    start_ns = int(log.streams["front"].t_ns[0])
+    old = log.streams["top"]
+    kept = np.flatnonzero(np.abs(old.t_ns - start_ns - 1_500_000_000) > 500_000_000)
+    log = log.changed(streams={**log.streams, "top": Stream("top", old.t_ns[kept], lambda i: old.read(int(kept[i])))})
+    result = reconstruct(log, Config.load(settings=["detect.name=labels"]))
+    errors, sigmas = [], []
+    for agent in result.scenario.others:
+        w = agent.waypoints
+        t = np.arange(1.1, 2.0, 0.1)
+        t = t[(t >= w.t_s[0]) & (t <= w.t_s[-1])]
+        xy = np.stack([np.interp(t, w.t_s, v) for v in (w.x_m, w.y_m)], axis=1)
+        true = [
+            np.stack([np.interp(t, o.waypoints.t_s, v) for v in (o.waypoints.x_m, o.waypoints.y_m)], axis=1)
+            for o in truth.others
+        ]
+        if len(t):
+            errors.append(min((xy - at for at in true), key=lambda e: np.hypot(*e.T).mean()))
+            sigmas.append(np.interp(t, w.t_s, w.sigma_xy_m))
+    return np.concatenate(errors), np.concatenate(sigmas), result.report["faults"]
+
+
+@pytest.mark.slow
+def test_positions_are_as_uncertain_as_their_errors_while_no_sweeps_come():
+    several = [gap_errors(seed) for seed in range(2)]
+    assert all([fault["kind"] for fault in faults] == ["missing_sweeps"] for *_, faults in several)
+    error, sigma = (np.concatenate([found[k] for found in several]) for k in range(2))
+    assert np.mean((error**2).sum(axis=1) / (2 * sigma**2)) < 2.0
+    assert sigma.max() < 1.0

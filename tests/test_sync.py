@@ -289,3 +289,13 @@ def test_all_points_of_one_moment_and_no_points_at_all_are_fine():
     none, seconds = sweep_to_map(log, "top", swept(log, np.zeros((0, 3)), np.zeros(0)), compensate=True)
     assert none.shape == (0, 3)
     assert seconds.shape == (0,)
+
+
+def test_frames_that_show_nothing_are_taken_as_not_recorded():
+    t = stamps(0, 100, 5)
+    schedule = synchronize(log_of({"a": t, "b": t}), ("a", "b"))
+    without = schedule.without_frames({"b": [1, 3]})
+    assert without.frames["a"].tolist() == [0, 1, 2, 3, 4]
+    assert without.frames["b"].tolist() == [0, -1, 2, -1, 4]
+    assert schedule.frames["b"].tolist() == [0, 1, 2, 3, 4]
+    np.testing.assert_array_equal(without.t_ns, t)
