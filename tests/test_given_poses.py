@@ -16,7 +16,7 @@ from log2sim.geometry import Array, PoseTrack, rotation_from_rpy, transform, wra
 from log2sim.localization.choice import localize_like
 from log2sim.localization.given_poses import MAX_SIGMA_M, CheckedPoses, check_poses
 from log2sim.localization.path_fit import POSITION_PRIOR, YAW_PRIOR, fit_path
-from log2sim.localization.path_parts import noise_of
+from log2sim.localization.path_noise import noise_of
 from log2sim.localization.pose_faults import list_faults
 
 NS = 1_000_000_000
@@ -93,7 +93,6 @@ HEALTHY = {
     "hard stop": drive(6, 50, speed=14.0, brake=9.5),
     "hard stop at 10 Hz": drive(6, 10, speed=14.0, brake=9.5),
     "turns": drive(10, 20, turn=0.7, sigma=0.01),
-    "noisy GNSS": drive(20, 10, sigma=0.5),
     "1000 Hz": drive(3, 1000, sigma=0.01),
     "standing": drive(5, 50, speed=0.0),
     "standing with noise": drive(5, 50, speed=0.0, sigma=0.02),
@@ -109,7 +108,39 @@ def test_healthy_poses_are_not_touched(name: str) -> None:
     track = HEALTHY[name]
     found = check_poses(track)
     assert not found.stretches
-    assert found.track.map_T_ego is track.map_T_ego
+    assert found.track is track
+
+
+@pytest.mark.parametrize("hz", [10, 50, 400])
+@pytest.mark.parametrize("sigma", [0.1, 0.5])
+def test_noisy_poses_are_smoothed_and_tell_how_good_they_are(sigma: float, hz: int) -> None:
+    true, noisy = drive(10, hz, turn=0.2), drive(10, hz, turn=0.2, sigma=sigma)
+    found = check_poses(noisy)
+    assert not found.stretches
+    inner = (times(true) > 0.5) & (times(true) < 9.5)
+    before, after = (t.map_T_ego[inner, :2, 3] - true.map_T_ego[inner, :2, 3] for t in (noisy, found.track))
+    assert np.std(after) < 0.65 * np.std(before)
+    assert found.track.sigma_m is not None
+    assert 0.2 < np.std(after) / np.median(found.track.sigma_m) < 1.6
+
+
+def test_errors_that_last_are_not_smoothed() -> None:
+    true, rng = drive(20, 50), np.random.default_rng(0)
+    poses, keep = true.map_T_ego.copy(), np.exp(-0.02 / 2.0)
+    error = rng.normal(0, 0.3, 3)
+    for pose in poses:
+        error = keep * error + np.sqrt(1 - keep**2) * rng.normal(0, 0.3, 3)
+        pose[:3, 3] += error
+    track = replace(true, map_T_ego=poses)
+    assert check_poses(track).track is track
+
+
+def test_stamps_that_are_off_are_not_taken_for_noise() -> None:
+    true = drive(10, 10, speed=20.0)
+    poses = true.map_T_ego.copy()
+    poses[:, 0, 3] += np.random.default_rng(0).normal(0, 0.1, len(poses))
+    found = check_poses(replace(true, map_T_ego=poses))
+    assert found.track.map_T_ego is poses
 
 
 def test_rounded_poses_are_healthy() -> None:

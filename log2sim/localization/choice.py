@@ -101,7 +101,7 @@ def _localize(request: _Request) -> tuple[Log, PoseChoice]:
     faults = list_faults(request.log, checked.stretches, request.during_ns)
     if checked.track is given:
         mended = request.log
-    elif any(stretch.kind in ("pose_jump", "frozen_poses") for stretch in checked.stretches):
+    elif checked.moved:
         # What was measured in gaps moves with the poses around them.
         mended = replace_poses(request.log.changed(ego=replace(given, max_gap_s=np.inf)), checked.track)
     else:

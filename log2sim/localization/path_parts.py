@@ -14,14 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
+from log2sim.localization.path_noise import MIN_SIGMA, SPANS_S
 
-# Second derivatives are taken over these times: the first finds jumps and sudden stops, the second jumps that take a while.
-# Shorter ones would find the vibration of the vehicle and the last digits of stored poses.
-SPANS_S = (0.1, 0.3)
 # Of a normal distribution 6e-7 are beyond: one sample of the longest logs.
 MAX_SIGMAS = 5.0
-# Third differences need some rows for a median.
-MIN_ROWS_FOR_NOISE, MIN_SIGMA = 8, 1e-3
 # The rate at the end of a part is fitted to this time of it.
 END_S = 0.5
 MIN_END_S = 0.05
@@ -88,32 +84,6 @@ class _End:
     sigma: float
     rate_sigma: float
     rate_slack: float
-
-
-def noise_of(t_s: Array, values: Array, usual_sigma: float) -> float:
-    """Estimate the standard deviation, u, of samples (P, D) from third differences over the shortest of `SPANS_S`; the usual one for few samples.
-
-    Notes
-    -----
-    The median absolute value, 0.6745 standard deviations of a Gaussian, is insensitive to jumps (Rousseeuw and Croux, J. Am.
-    Stat. Assoc. 88, 1993). Slow errors, such as those of a GNSS that drifts, do not show; where samples are sparse the third
-    derivative of the motion itself counts as noise.
-    """
-    i = np.arange(len(t_s))
-    steps = [i]
-    for _ in range(3):
-        after = np.searchsorted(t_s, t_s[np.minimum(steps[-1], len(t_s) - 1)] + SPANS_S[0] * 0.99)
-        steps.append(np.where(steps[-1] < len(t_s), after, len(t_s)))
-    rows = np.stack(steps, axis=1)
-    rows = rows[rows[:, -1] < len(t_s)]
-    if len(rows) < MIN_ROWS_FOR_NOISE:
-        return usual_sigma
-    # Weights of the divided difference: the inverse products of each time's distances to the other three.
-    t = t_s[rows] / SPANS_S[0]
-    weights = 1.0 / (t[:, :, None] - t[:, None, :] + np.eye(4)).prod(axis=2)
-    differences = np.einsum("nj,njk->nk", weights, values[rows]) / np.linalg.norm(weights, axis=1, keepdims=True)
-    spread = np.median(np.abs(differences), axis=0) / 0.6745
-    return max(float(np.sqrt(np.mean(spread**2))), MIN_SIGMA)
 
 
 def find_parts(samples: Samples) -> list[Part]:

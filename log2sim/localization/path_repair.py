@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array
 from log2sim.localization.path_fit import FittedPath, PathPrior, fit_path
+from log2sim.localization.path_noise import noise_of
 from log2sim.localization.path_parts import (
     MAX_REST,
     MAX_SIGMAS,
@@ -18,7 +19,6 @@ from log2sim.localization.path_parts import (
     Skip,
     find_parts,
     find_skips,
-    noise_of,
 )
 
 # A gap is bridged by the samples this near to its ends, and by some where they are sparse; more change nothing.
