@@ -50,10 +50,15 @@ def states(log, t_ns, images):
 
 
 def with_motion(log, step_m):
-    """The log with an ego that has moved by so many meters (T,) forward at the stamps of the front camera."""
+    """The log with an ego that has moved by so many meters (T,) forward at the stamps of the front camera, and stood before."""
     t_ns = log.streams["front"].t_ns
-    xyz = np.stack([np.asarray(step_m, dtype=float), 0 * t_ns, 0 * t_ns], axis=1)
-    return log.changed(ego=PoseTrack(t_ns, transform(np.eye(3), xyz)))
+    return log.changed(ego=path(t_ns, step_m))
+
+
+def path(t_ns, x_m):
+    """Poses along x at stamps, and at the place of the first a second before."""
+    x, t = np.r_[x_m[0], x_m].astype(float), np.r_[t_ns[0] - 1_000_000_000, t_ns]
+    return PoseTrack(t, transform(np.eye(3), np.stack([x, 0 * x, 0 * x], axis=1)))
 
 
 def test_pictures_of_a_moving_camera_are_live():
@@ -122,6 +127,12 @@ def test_poses_that_jump_or_drift_do_not_make_a_standing_camera_frozen(step_m):
     assert set(states(moved, t_ns, [noisy(images[0], i) for i in range(len(t_ns))])) == {"live"}
 
 
+def test_a_camera_without_noise_that_creeps_to_a_stop_is_not_frozen():
+    log, t_ns, images = pictures()
+    places = np.minimum(np.arange(len(t_ns)), 6)
+    assert set(states(with_motion(log, 0.05 * places), t_ns, [images[i] for i in places])) == {"live"}
+
+
 def test_a_standing_camera_without_noise_is_not_frozen_by_scattered_poses():
     log, t_ns, images = pictures()
     moved = with_motion(log, 0.2 * scatter(np.arange(len(t_ns))))
@@ -166,14 +177,15 @@ SOLIDS = [standing(12.0 + 6 * k, (-1) ** k * 6.0, 20.0 * k) for k in range(6)]
 
 def lidar_log(step_m=0.5, frame="lidar"):
     """A log whose LiDAR drives along a street by so much a sweep."""
-    poses = transform(np.eye(3), np.stack([step_m * np.arange(COUNT), np.zeros(COUNT), np.zeros(COUNT)], axis=1))
     lidar = Lidar("top", "ego", transform(np.eye(3), np.array([0.0, 0.0, 1.9])))
 
     def read(i):
         world, _ = scan(SOLIDS, sensor=(step_m * i, 0.0, 1.9), noise_m=0.02, seed=i)
         return Sweep(int(STAMPS[i]), world - [step_m * i, 0.0, 1.9] if frame == "lidar" else world, frame)
 
-    return Log("log", "test", {}, {"top": lidar}, {"top": Stream("top", STAMPS, read)}, PoseTrack(STAMPS, poses))
+    return Log(
+        "log", "test", {}, {"top": lidar}, {"top": Stream("top", STAMPS, read)}, path(STAMPS, step_m * np.arange(COUNT))
+    )
 
 
 def repeated(log, sweeps):
@@ -223,16 +235,14 @@ def test_copies_are_told_of_a_lidar_that_stands_and_has_noise():
 def test_equal_sweeps_without_noise_of_a_lidar_that_stands_are_no_fault(start):
     """It may have driven before: then its sweeps differed."""
     at = np.minimum(np.arange(COUNT), 5) * start
-    poses = transform(np.eye(3), np.stack([at, np.zeros(COUNT), np.zeros(COUNT)], axis=1))
-    log = lidar_log().changed(ego=PoseTrack(STAMPS, poses))
+    log = lidar_log().changed(ego=path(STAMPS, at))
     sweeps = [scan(SOLIDS, sensor=(x, 0.0, 1.9))[0] - [x, 0.0, 1.9] for x in at]
     assert not any(repeated(log, [Sweep(int(t), xyz) for t, xyz in zip(STAMPS, sweeps)]))
 
 
 def test_equal_sweeps_without_noise_are_no_fault_where_poses_scatter():
     at = 0.06 * np.random.default_rng(1).normal(size=COUNT)
-    poses = transform(np.eye(3), np.stack([at, np.zeros(COUNT), np.zeros(COUNT)], axis=1))
-    log = lidar_log().changed(ego=PoseTrack(STAMPS, poses))
+    log = lidar_log().changed(ego=path(STAMPS, at))
     sweep = scan(SOLIDS)[0] - [0.0, 0.0, 1.9]
     assert not any(repeated(log, [Sweep(int(t), sweep) for t in STAMPS]))
 

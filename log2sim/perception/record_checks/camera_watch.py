@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 
 from log2sim.datatypes import Log
-from log2sim.perception.record_checks.driving import sensor_drives
 from log2sim.perception.record_checks.expected_change import expect_change
+from log2sim.perception.record_checks.motion import motion_of
 from log2sim.perception.record_checks.thumbnails import Thumbnail, changed_share, measure_change, shows_nothing
 
 PictureState = Literal["live", "black", "frozen"]
@@ -101,23 +101,23 @@ class CameraWatch:
             return False  # no motion changes it by five times as much
         if self._frozen and change < MAX_COPY_LEVELS:
             return True
-        expected = self._expected(last.since_ns if share == 0 else last.t_ns, t_ns, last.thumbnail)
+        before_ns = last.since_ns if share == 0 else last.t_ns
+        motion = motion_of(self.log, self.name, before_ns, t_ns)
+        expected = self._expected(before_ns, t_ns, last.thumbnail) if motion == "drives" else 0.0
         noisy = len(self._still_shares) >= MIN_STILL_PAIRS and min(self._still_shares) > MIN_NOISY_SHARE
-        if share == 0 and (expected >= MAX_COPY_LEVELS or noisy):
+        if share == 0 and (expected >= MAX_COPY_LEVELS or (motion == "stands" and noisy)):
             return True
-        if expected < MAX_COPY_LEVELS:
+        if motion == "stands":
             self._still_shares.append(share)
         without_change = expected >= MIN_EXPECTED_LEVELS and change < MAX_CHANGED_SHARE * expected
         self._steps_without_change = self._steps_without_change + 1 if without_change else 0
         return self._steps_without_change >= MIN_STEPS_WITHOUT_CHANGE
 
     def _expected(self, before_ns: int, after_ns: int, thumbnail: Thumbnail) -> float:
-        """Return by how many levels a picture should change between two stamps; 0 where the camera does not drive."""
+        """Return by how many levels a picture should change between two stamps; 0 where the poses are not known."""
         log, ego = self.log, self.log.ego
-        if ego is None or not sensor_drives(log, self.name, before_ns, after_ns):
-            return 0.0
         poses, known = log.map_T_sensor(self.name, np.array([before_ns, after_ns]))
-        if not known.all():
+        if ego is None or not known.all():
             return 0.0
         map_T_ego = ego.at(after_ns)[0][0]
         ground_z_m = float((map_T_ego @ [0.0, 0.0, log.ground_z_ego_m, 1.0])[2])

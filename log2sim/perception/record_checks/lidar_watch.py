@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 
 from log2sim.datatypes import Log
-from log2sim.geometry import inverse
-from log2sim.perception.record_checks.driving import sensor_drives
+from log2sim.perception.record_checks.motion import Motion, motion_of
 from log2sim.perception.record_checks.sweep_sketches import CELL_M, SweepSketch, common_share
 
 # A sweep that has this share of its obstacle points in common with another is a copy of it: rounded to millimeters one has
@@ -17,18 +15,13 @@ from log2sim.perception.record_checks.sweep_sketches import CELL_M, SweepSketch,
 MIN_COPIED_SHARE = 0.6
 # Where nothing tells how much sweeps of this LiDAR usually have in common, only exact copies count.
 MIN_IDENTICAL_SHARE = 0.95
-# Motion of the LiDAR by ten cells moves all points of structures to other cells; one that moves points by less than a cell at
-# this distance is none.
+# Motion of the LiDAR by ten cells moves all points of structures to other cells.
 MIN_MOTION_M = 10 * CELL_M
-FAR_M = 30.0
 # So many pairs of sweeps tell how much they usually have in common.
 MIN_PAIRS = 5
 MAX_USUAL_SHARE = 0.3
 # Fewer obstacle points do not tell copies from chance.
 MIN_OBSTACLES = 20
-
-
-Motion = Literal["stands", "drives", "unclear"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,15 +83,9 @@ class LidarWatch:
         return motion != "unclear" and len(shares) >= MIN_PAIRS and float(np.median(shares)) < MAX_USUAL_SHARE
 
     def _motion(self, before_ns: int, after_ns: int) -> Motion:
-        """Return how the LiDAR moved between two stamps."""
-        if self.log.lidars[self.name].mount == "map":
-            return "stands"
-        poses, known = self.log.map_T_sensor(self.name, np.array([before_ns, after_ns]))
-        if not known.all():
-            return "unclear"
-        step = inverse(poses[0]) @ poses[1]
-        moved_m = float(np.linalg.norm(step[:3, 3]))
-        turned_rad = float(np.arccos(np.clip((np.trace(step[:3, :3]) - 1) / 2, -1.0, 1.0)))
-        if moved_m > MIN_MOTION_M and sensor_drives(self.log, self.name, before_ns, after_ns):
-            return "drives"
-        return "stands" if max(moved_m, turned_rad * FAR_M) < CELL_M else "unclear"
+        """Return how the LiDAR moved between two stamps; it drives where all points of structures are in other cells."""
+        motion = motion_of(self.log, self.name, before_ns, after_ns)
+        if motion != "drives":
+            return motion
+        poses, _ = self.log.map_T_sensor(self.name, np.array([before_ns, after_ns]))
+        return "drives" if np.linalg.norm(poses[1, :3, 3] - poses[0, :3, 3]) > MIN_MOTION_M else "unclear"
