@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from log2sim.calibration.corrections import turn_mount
-from log2sim.calibration.edge_alignment import EdgeView, YawEstimate, estimate_yaw, score_angles
+from log2sim.calibration.edge_alignment import REACH_RAD, EdgeView, YawEstimate, estimate_yaw, score_angles
 from log2sim.calibration.edge_views import EdgeViews, choose_moments, is_near
 from log2sim.config import Config
 from log2sim.datatypes import Fault, Log, Treatment
-from log2sim.geometry import Array, Camera
+from log2sim.geometry import Array, Camera, inverse, rotation_from_rpy, transform
 from log2sim.localization.choice import during_ns
 from log2sim.localization.ego_sweeps import densest_lidar
 from log2sim.plan import LABELS
@@ -21,12 +21,14 @@ from log2sim.sensors import Sensors
 # At 30 m this is 0.3 m, half the width of a pedestrian: LiDAR points leave the image boxes of their objects.
 MIN_TOLD_RAD = 0.01
 MIN_SIGMAS = 4.0
-# With a mount that is another camera's, what is left is the yaw of that mount.
+# What may be left of the yaw with the mount of another camera.
 MAX_LEFT_RAD = np.deg2rad(1.5)
+# A camera that is turned far is looked at again from there, so that the whole range of angles lies around it.
+MAX_ROUNDS = 3
 FIX = "--fix-calibration"
-SWAPPED: Mapping[Treatment, str] = {
-    "corrected": "it gets that mount",
-    "left_out": f"it is not used; {FIX} gives it that mount",
+DONE: Mapping[Treatment, str] = {
+    "corrected": "corrected",
+    "left_out": f"the camera is not used, unless {FIX} corrects it",
     "kept": f"not corrected, which {FIX} does",
 }
 NOT_SEEN = "the mount is not corrected: the edges that {} sees do not show whether it is turned"
@@ -54,6 +56,28 @@ class _Check:
     yaws: Mapping[str, YawEstimate | None]
 
 
+@dataclass(frozen=True, eq=False)
+class _Mistake:
+    """A mount that fits the images of a camera where its own does not.
+
+    Attributes
+    ----------
+    kind : str
+        Of the fault.
+    words : str
+        What is wrong, with a place for the LiDAR.
+    mount_T_cam : (4, 4) float64
+        What fits.
+    other : str
+        The camera whose mount it is; "" for none.
+    """
+
+    kind: str
+    words: str
+    mount_T_cam: Array
+    other: str = ""
+
+
 def check_cameras(
     log: Log, config: Config, sensors: Sensors, *, of_lidars: tuple[Fault, ...] = (), progress: Progress
 ) -> tuple[Log, tuple[Fault, ...]]:
@@ -79,22 +103,23 @@ def check_cameras(
     """
     if config.detect.in_images in ("", LABELS):
         return log, ()
-    check = _look(log, config, sensors, progress)
-    if check is None or any(fault.sensor == check.lidar and _is_wrong(fault) for fault in of_lidars):
+    lidar = densest_lidar(sensors.restrict(log))
+    if lidar is None or any(fault.sensor == lidar and _is_wrong(fault) for fault in of_lidars):
         return log, ()
+    check = _look(log, lidar, config, sensors, progress)
     fix = config.calibration.fix_mounts
-    swapped = _find_swapped(check)
-    mounts = {name: log.cameras[other].mount_T_cam for name, other in swapped.items()}
-    treatment = _treat_swapped(swapped, config, sensors)
-    faults = [_fault_of_swap(check, name, other, treatment) for name, other in swapped.items()]
+    mistakes = _find_mistakes(check)
+    mounts = {name: mistake.mount_T_cam for name, mistake in mistakes.items()}
+    treatment = _treat_mistakes(mounts, config, sensors)
+    faults = [_fault_of_mistake(name, lidar, mistake, treatment) for name, mistake in mistakes.items()]
     off = {name: yaw for name, yaw in check.yaws.items() if yaw is not None and is_off(yaw)}
     if turns_together(check.yaws):
-        faults.append(_fault_of_lidar(check.lidar, off, fix=fix))
+        faults.append(_fault_of_lidar(lidar, off, fix=fix))
     else:
         faults += [_fault_of_yaw(name, check, yaw, fix=fix) for name, yaw in off.items()]
-    mounts |= {name: _turned(log.cameras[name].mount_T_cam, yaw) for name, yaw in off.items()}
-    unknown = [name for name, yaw in check.yaws.items() if fix and yaw is None and name not in swapped]
-    faults += [Fault("unknown_rotation", name, NOT_SEEN.format(check.lidar), "kept") for name in unknown]
+    mounts |= {name: _turned(log.cameras[name].mount_T_cam, yaw.yaw_rad) for name, yaw in off.items()}
+    unknown = [name for name, yaw in check.yaws.items() if fix and yaw is None and name not in mistakes]
+    faults += [Fault("unknown_rotation", name, NOT_SEEN.format(lidar), "kept") for name in unknown]
     return (with_mounts(log, mounts) if fix and mounts else log), tuple(faults)
 
 
@@ -103,12 +128,12 @@ def _is_wrong(fault: Fault) -> bool:
     return fault.treatment == "kept" and fault.kind in ("time_offset", "lidar_rotation")
 
 
-def _treat_swapped(swapped: Mapping[str, str], config: Config, sensors: Sensors) -> Treatment:
-    """Decide what is done about cameras with the mounts of others; they are left out where the run can go on without them."""
+def _treat_mistakes(names: Collection[str], config: Config, sensors: Sensors) -> Treatment:
+    """Decide what is done about cameras with wrong mounts; they are left out where the run can go on without them."""
     if config.calibration.fix_mounts:
         return "corrected"
-    remain = set(sensors.cameras) - set(swapped)
-    return "left_out" if remain and config.sync.reference not in swapped else "kept"
+    remain = set(sensors.cameras) - set(names)
+    return "left_out" if remain and config.sync.reference not in names else "kept"
 
 
 def is_off(yaw: YawEstimate) -> bool:
@@ -132,12 +157,11 @@ def with_mounts(log: Log, mounts: Mapping[str, Array]) -> Log:
     return log.changed(cameras={**log.cameras, **moved})
 
 
-def _look(log: Log, config: Config, sensors: Sensors, progress: Progress) -> _Check | None:
-    """Look at frames and sweeps over the log; None without cameras beside a LiDAR."""
-    lidar = densest_lidar(sensors.restrict(log))
-    names = [] if lidar is None else [name for name in sensors.cameras if is_near(log, name, lidar)]
-    if lidar is None or not names:
-        return None
+def _look(log: Log, lidar: str, config: Config, sensors: Sensors, progress: Progress) -> _Check:
+    """Look at frames of the cameras beside a LiDAR and at its sweeps, over the log."""
+    names = [name for name in sensors.cameras if is_near(log, name, lidar)]
+    if not names:
+        return _Check(log, lidar, {}, {})
     reference = log.reference_camera if log.reference_camera in names else names[0]
     moments = choose_moments(log, lidar, reference, during_ns(log, config))
     seen = EdgeViews(log, moments, lambda done, total: progress("check cameras", done, total))
@@ -146,40 +170,80 @@ def _look(log: Log, config: Config, sensors: Sensors, progress: Progress) -> _Ch
 
 
 def _yaw_of(camera: Camera, views: list[EdgeView]) -> YawEstimate | None:
-    return estimate_yaw([score_angles(camera, view) for view in views])
+    """Estimate the yaw that the mount of a camera lacks."""
+    turned_rad = 0.0
+    for _ in range(MAX_ROUNDS):
+        turned = replace(camera, mount_T_cam=_turned(camera.mount_T_cam, turned_rad))
+        found = estimate_yaw([score_angles(turned, view) for view in views])
+        if found is None:
+            return None
+        turned_rad += found.yaw_rad
+        if abs(found.yaw_rad) < REACH_RAD / 2:
+            return replace(found, yaw_rad=turned_rad)
+    return None
 
 
-def _find_swapped(check: _Check) -> dict[str, str]:
-    """Find the cameras whose own mount does not fit while that of another camera does: that camera by their names."""
-    swapped = {}
+def _find_mistakes(check: _Check) -> dict[str, _Mistake]:
+    """Find the cameras of which the own mount does not fit while another one does: the one with the clearest edges."""
+    mistakes = {}
     for name, yaw in check.yaws.items():
-        if yaw is not None:
-            continue
-        camera = check.log.cameras[name]
-        for other in check.yaws:
-            if other == name or check.yaws[other] is not None:
-                continue
-            found = _yaw_of(replace(camera, mount_T_cam=check.log.cameras[other].mount_T_cam), check.views[name])
-            if found is not None and abs(found.yaw_rad) < MAX_LEFT_RAD:
-                swapped[name] = other
-    return swapped
+        camera, best = check.log.cameras[name], 0.0
+        for mistake in _list_mistakes(check, name) if yaw is None else ():
+            found = _yaw_of(replace(camera, mount_T_cam=mistake.mount_T_cam), check.views[name])
+            if found is not None and abs(found.yaw_rad) < MAX_LEFT_RAD and found.gain > best:
+                mistakes[name], best = mistake, found.gain
+    return mistakes | _list_exchanged(check, mistakes)
 
 
-def _fault_of_swap(check: _Check, name: str, other: str, treatment: Treatment) -> Fault:
-    message = (
-        f"sees {other}'s points: edges of {check.lidar} fit its images with the mount of {other} and not with its own; "
-        f"{SWAPPED[treatment]}"
-    )
-    return Fault("swapped_cameras", name, message, treatment)
+def _list_exchanged(check: _Check, mistakes: Mapping[str, _Mistake]) -> dict[str, _Mistake]:
+    """List the cameras whose mount is another one's, though their own images do not show it: they get what that one had."""
+    return {
+        mistake.other: _Mistake(
+            "swapped_cameras",
+            f"its mount is that of {name}, whose images fit edges of {{}} with it and not with the mount of {name}",
+            check.log.cameras[name].mount_T_cam,
+            name,
+        )
+        for name, mistake in mistakes.items()
+        if mistake.other and mistake.other not in mistakes
+    }
+
+
+def _list_mistakes(check: _Check, name: str) -> list[_Mistake]:
+    """List the mounts that a camera may have instead of its own: those of others that do not fit them either, and likely slips."""
+    cameras, own = check.log.cameras, check.log.cameras[name].mount_T_cam
+    others = [other for other, yaw in check.yaws.items() if other != name and yaw is None]
+    fits = "edges of {} fit its images with"
+    listed = [
+        _Mistake(
+            "swapped_cameras",
+            f"sees {other}'s points: {fits} the mount of {other} and not with its own",
+            cameras[other].mount_T_cam,
+            other,
+        )
+        for other in others
+    ]
+    inverted = f"its mount in the calibration is inverted: {fits} the inverse and not as it is"
+    listed.append(_Mistake("wrong_mount", inverted, inverse(own)))
+    for degrees in (90, 180, 270):
+        about_axis = transform(rotation_from_rpy(0.0, 0.0, np.deg2rad(degrees)), np.zeros(3))
+        words = f"its images are turned by {degrees} degrees: {fits} its mount turned about the optical axis and not as it is"
+        listed.append(_Mistake("wrong_mount", words, own @ about_axis))
+    return listed
+
+
+def _fault_of_mistake(name: str, lidar: str, mistake: _Mistake, treatment: Treatment) -> Fault:
+    return Fault(mistake.kind, name, f"{mistake.words.format(lidar)}; {DONE[treatment]}", treatment)
 
 
 def _fault_of_yaw(name: str, check: _Check, yaw: YawEstimate, *, fix: bool) -> Fault:
+    treatment: Treatment = "corrected" if fix else "kept"
     alone = sum(other is not None for other in check.yaws.values()) == 1
     message = (
         f"its mount in the calibration is turned by {_words(yaw)} against edges that {check.lidar} sees too"
-        f"{f', or the mount of {check.lidar} is' if alone else ''}; {_done(fix)}"
+        f"{f', or the mount of {check.lidar} is' if alone else ''}; {DONE[treatment]}"
     )
-    return Fault("camera_rotation", name, message, "corrected" if fix else "kept", values=_values(yaw))
+    return Fault("camera_rotation", name, message, treatment, values=_values(yaw))
 
 
 def _fault_of_lidar(lidar: str, yaws: Mapping[str, YawEstimate], *, fix: bool) -> Fault:
@@ -199,12 +263,8 @@ def _fault_of_lidar(lidar: str, yaws: Mapping[str, YawEstimate], *, fix: bool) -
     return Fault("lidar_rotation", lidar, message, "corrected" if fix else "kept", values=_values(mean))
 
 
-def _turned(mount_T_cam: Array, yaw: YawEstimate) -> Array:
-    return turn_mount(mount_T_cam, np.array([0.0, 0.0, yaw.yaw_rad]))
-
-
-def _done(fix: bool) -> str:
-    return "corrected" if fix else f"not corrected, which {FIX} does"
+def _turned(mount_T_cam: Array, yaw_rad: float) -> Array:
+    return turn_mount(mount_T_cam, np.array([0.0, 0.0, yaw_rad]))
 
 
 def _words(yaw: YawEstimate) -> str:

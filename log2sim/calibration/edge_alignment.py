@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,20 +48,30 @@ class EdgeView:
 
     Attributes
     ----------
-    strength : (H, W) float32
-        Of the upright edges of the image, 0 where there is none.
+    gray : (H, W) uint8
+        The image.
     scale : float
-        Pixels of `strength` per pixel of the camera.
+        Pixels of `gray` per pixel of the camera.
     points_mount : (N, 3) float64, m
         Depth edges in the frame that the camera is fixed in, at the time of the image.
     left : (N,) bool
         See `DepthEdges`.
     """
 
-    strength: NDArray[np.float32]
+    gray: NDArray[np.uint8]
     scale: float
     points_mount: Array
     left: NDArray[np.bool_]
+
+    @cached_property
+    def upright(self) -> NDArray[np.float32]:
+        """Strength (H, W) of edges along the columns."""
+        return find_image_edges(self.gray, sideways=False)
+
+    @cached_property
+    def level(self) -> NDArray[np.float32]:
+        """Strength (H, W) of edges along the rows, which are upright for a camera that lies on its side."""
+        return find_image_edges(self.gray, sideways=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,9 +141,10 @@ def score_angles(camera: Camera, view: EdgeView) -> FrameScores:
     moved = np.stack(np.broadcast_arrays(c * x + s * y, c * y - s * x, z), axis=-1).reshape(-1, 3)
     uv, inside = project(camera, moved @ camera.mount_T_cam[:3, :3])
     px = np.nan_to_num((uv + 0.5) * view.scale - 0.5, nan=0.0)
-    px = np.clip(np.round(px), 0, np.array(view.strength.shape[::-1]) - 1).astype(np.int64)
+    image = view.level if is_sideways(camera.mount_T_cam) else view.upright
+    px = np.clip(np.round(px), 0, np.array(image.shape[::-1]) - 1).astype(np.int64)
     # Relative to its surroundings an edge has strength 1 by chance, so edges that leave the image neither gain nor lose.
-    strength = np.where(inside, view.strength[px[:, 1], px[:, 0]] - 1.0, 0.0).reshape(len(angles), -1)
+    strength = np.where(inside, image[px[:, 1], px[:, 0]] - 1.0, 0.0).reshape(len(angles), -1)
     shown = inside.reshape(len(angles), -1)[len(angles) // 2]
     scores = np.stack([strength[:, left].sum(axis=1), strength[:, ~left].sum(axis=1)])
     line = 2 * np.floor(np.arctan2(y, x) / LINE_RAD) + left

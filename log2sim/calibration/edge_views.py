@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.calibration.depth_edges import DepthEdges, keep_standing, read_depth_edges
-from log2sim.calibration.edge_alignment import EdgeView, find_image_edges, is_sideways
+from log2sim.calibration.edge_alignment import EdgeView
 from log2sim.calibration.gray_images import read_gray
 from log2sim.datatypes import Log
 from log2sim.geometry import NS_PER_S, Array, Camera, apply, inverse, line_time_s, nearest_index, project
@@ -81,9 +81,9 @@ class EdgeViews:
             if edges is None or abs(int(stamps[frame]) - int(t_ns)) > MAX_APART_NS:
                 continue
             points = points_in_mount(log, log.cameras[name], int(stamps[frame]), edges.points_map)
-            image = None if points is None else _upright_edges(log, name, int(frame))
-            if points is not None and image is not None:
-                views.append(EdgeView(image[0], image[1], points, edges.left))
+            gray = None if points is None else read_gray(log.streams[name], int(frame), log.cameras[name])
+            if points is not None and gray is not None:
+                views.append(EdgeView(gray, gray.shape[1] / log.cameras[name].width_px, points, edges.left))
         return views
 
 
@@ -121,12 +121,3 @@ def _standing_edges(log: Log, lidar: str, row: int) -> DepthEdges | None:
     next_row = row + 1 if row + 1 < len(log.streams[lidar].t_ns) else row - 1
     others = None if edges is None or next_row < 0 else read_depth_edges(log, lidar, next_row)
     return None if edges is None or others is None else keep_standing(edges, others)
-
-
-def _upright_edges(log: Log, name: str, frame: int) -> tuple[NDArray[np.float32], float] | None:
-    """Read a frame and find its upright edges, with the scale of their image; None where it cannot be read."""
-    camera = log.cameras[name]
-    gray = read_gray(log.streams[name], frame, camera)
-    if gray is None:
-        return None
-    return find_image_edges(gray, sideways=is_sideways(camera.mount_T_cam)), gray.shape[1] / camera.width_px

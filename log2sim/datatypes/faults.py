@@ -25,6 +25,7 @@ FAULT_KINDS = {
     "unknown_rotation": "a mount was to be corrected, but the ego's motion does not show its rotation",
     "camera_rotation": "the mount of a camera is rotated against its calibration",
     "swapped_cameras": "cameras have each other's calibration",
+    "wrong_mount": "the mount of a camera is inverted, or its images are turned",
 }
 """The kinds of faults that a run looks for, and what each means."""
 
