@@ -192,7 +192,6 @@ def test_noisy_positions_choose_longer_averages() -> None:
 
 def test_an_average_over_a_steady_circle_does_not_lag(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(smoothing, "CONSTANTS_S", ((0.6, 0.6),))
-    monkeypatch.setattr(smoothing, "USUAL", 0)
     table = table_of(scene(circle(20.0, 6.0)))
     velocity = smoothing.smooth_motion(table).velocity_mps[0, 60:100]
     assert velocity == pytest.approx(table.velocity_mps[0, 60:100], abs=0.02)
@@ -326,6 +325,14 @@ def test_nothing_to_predict_is_no_error() -> None:
         document = prediction_document(world, found, with_positions=True)
         check(document, "prediction-1", ScenarioError)
         assert format_figures(document).startswith("nothing to compare")
+
+
+@pytest.mark.parametrize("duration_s", [0.1, 0.2, 0.5])
+def test_a_way_too_short_for_a_path_is_none(duration_s: float) -> None:
+    brief = line("a", 0.0, speed=1.0, duration_s=duration_s)
+    found = predict_scenario(scene(brief, line("b", -3.0, speed=1.0), duration_s=duration_s))
+    assert not found.on_path.any()
+    assert errors(found, "b", "path", 3.0).max() < 1e-6
 
 
 def test_a_prediction_is_found_by_time_and_agent() -> None:

@@ -208,7 +208,8 @@ def _resampled(point_m: Complex, known_s: Array) -> tuple[Complex, Array, Array]
     way, point_m, known_s = way[moved], point_m[moved], known_s[moved]
     at = np.arange(0.0, way[-1], SPACING_M)
     known_s = known_s[np.minimum(np.searchsorted(way, at), len(way) - 1)]
-    known_s[:1] = known_s[1:2]  # its direction is that of the step to the second point
+    if len(known_s) > 1:
+        known_s[0] = known_s[1]  # its direction is that of the step to the second point
     return np.interp(at, way, point_m), at, known_s
 
 

@@ -21,7 +21,7 @@ from log2sim.prediction.spread import own_scale, usual_sigma
 METHODS: Mapping[str, str] = {
     "velocity": "constant velocity",
     "turn": "constant speed and turn rate",
-    "smoothed": "velocity and turn rate smoothed exponentially, with constants that fit the agent's past",
+    "smoothed": "velocity and turn rate smoothed exponentially, constants weighed by the agent's past",
     "path": "smoothed speed along the path of another agent or a lane, where one is known; else as smoothed",
 }
 """Methods of prediction by name, and what each expects an agent to keep."""

@@ -1,4 +1,4 @@
-"""Exponential smoothing of velocity and turn rate, with constants that explain the agent's own past best."""
+"""Exponential smoothing of velocity and turn rate, with constants weighed by how well they explain the agent's own past."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ CONSTANTS_S = tuple(itertools.product((0.0, 0.3, 0.6, 1.2), (0.0, 0.3, 0.6, 1.2,
 """Time constants to choose from, of velocity and of turn rate: 0 takes the latest value, and infinity none, so that the agent
 goes straight on."""
 
-USUAL = CONSTANTS_S.index((0.0, 0.3))
-"""Taken until the past says otherwise: smoothed states need little more smoothing."""
+LATEST_ADVANTAGE = 3.0
+"""Log-odds, before anything is known, of taking the latest velocity as it is: states of scenarios are smoothed already."""
 
 PROOF_S = 1.0
 """Constants are judged by predictions over this time, of which the outcome is known already."""
@@ -26,10 +26,6 @@ USUAL_ERROR_M = 0.3
 
 USUAL_ERRORS = 2.0
 """How many errors of the past `USUAL_ERROR_M` counts as."""
-
-MIN_ADVANTAGE = 0.5
-"""By how much the log-likelihood of other constants must be greater than that of the usual ones: one parameter is worth half a
-nat by chance."""
 
 MIN_COURSE_MPS = 0.5
 """Of slower agents the velocity does not tell the course: smoothed speeds err by 0.15 m/s, which is 17 degrees here."""
@@ -50,7 +46,7 @@ class SmoothedMotion:
     velocity_mps : (A, T) complex128, m/s
     turn_radps : (A, T) float64, rad/s
     constants_s : (A, T, 2) float64, s
-        Time constants of velocity and turn rate that explain the past up to each tick best.
+        The likeliest time constants of velocity and turn rate, by the past up to each tick.
     """
 
     velocity_mps: Complex
@@ -88,24 +84,25 @@ def smooth_motion(table: MotionTable) -> SmoothedMotion:
     Exponential smoothing, v_n = s x_n + (1 - s) v_(n-1) (Brown, "Statistical Forecasting for Inventory Control", 1959), with
     s = 1 - exp(-tick / constant). The earlier velocity is turned by the smoothed turn rate before it is averaged, so that
     a steady circle is followed without lag. For each pair of `CONSTANTS_S` the positions `PROOF_S` ahead are predicted;
-    the likelihood of the errors known so far, normal with unknown variance, decides. Errors of overlapping times count
-    as one for each `PROOF_S`. Cost: linear in agents, ticks and constants.
+    the likelihood of the errors known so far, normal with unknown variance, weighs the pairs, and their values are
+    averaged: while little is known, that errs less than the likeliest alone. Errors of overlapping times count as one for
+    each `PROOF_S`. Cost: linear in agents, ticks and constants.
     """
-    chooser = _Chooser(len(table.agents), round(PROOF_S / table.tick_s), table.tick_s)
+    judge = _Judge(len(table.agents), round(PROOF_S / table.tick_s), table.tick_s)
     fresh, rates = table.begins, turn_rates(table)
     share_v, share_w = (_shares(np.array(c), table.tick_s) for c in zip(*CONSTANTS_S))
     velocity = np.zeros((len(table.agents), len(CONSTANTS_S)), dtype=complex)
     turn = np.zeros(velocity.shape)
     out = SmoothedMotion(np.empty_like(table.velocity_mps), np.empty(rates.shape), np.empty((*rates.shape, 2)))
-    rows, constants = np.arange(len(table.agents)), np.array(CONSTANTS_S)
+    constants = np.array(CONSTANTS_S)
     for n in range(len(table.t_s)):
         new, latest = fresh[:, n, None], table.velocity_mps[:, n, None]
         turn = np.where(new, 0.0, turn + share_w * (rates[:, n, None] - turn))
         velocity = velocity * np.exp(1j * table.tick_s * turn)
         velocity = np.where(new, latest, velocity + share_v * (latest - velocity))
-        best = chooser.choose(n, table.position_m[:, n, None], fresh[:, n], velocity, turn)
-        out.velocity_mps[:, n], out.turn_radps[:, n] = velocity[rows, best], turn[rows, best]
-        out.constants_s[:, n] = constants[best]
+        weight = judge.weigh(n, table.position_m[:, n, None], fresh[:, n], velocity, turn)
+        out.velocity_mps[:, n], out.turn_radps[:, n] = (weight * velocity).sum(axis=1), (weight * turn).sum(axis=1)
+        out.constants_s[:, n] = constants[weight.argmax(axis=1)]
     return out
 
 
@@ -115,20 +112,19 @@ def _shares(constants_s: Array, tick_s: float) -> Array:
     return np.asarray(-np.expm1(-rate))
 
 
-class _Chooser:
-    """Chooses constants by predictions whose outcome is known."""
+class _Judge:
+    """Weighs constants by predictions whose outcome is known."""
 
     def __init__(self, agents: int, ticks: int, tick_s: float) -> None:
         shape = (agents, len(CONSTANTS_S))
         self._ticks, self._weight = ticks, 1.0 / ticks
         self._lead_s = ticks * tick_s
         self._pending = np.full((ticks, *shape), np.nan, dtype=complex)
+        self._before = LATEST_ADVANTAGE * np.array([velocity_s == 0 for velocity_s, _ in CONSTANTS_S])
         self._squares, self._errors = np.zeros(shape), np.zeros((agents, 1))
 
-    def choose(
-        self, n: int, position: Complex, fresh: NDArray[np.bool_], velocity: Complex, turn: Array
-    ) -> NDArray[np.intp]:
-        """Return the best constants (A,) at tick `n`, where positions are (A, 1), velocities and turn rates (A, K)."""
+    def weigh(self, n: int, position: Complex, fresh: NDArray[np.bool_], velocity: Complex, turn: Array) -> Array:
+        """Return the weights (A, K) of constants at tick `n`, where positions are (A, 1), velocities and turn rates (A, K)."""
         slot = n % self._ticks
         self._pending[:, fresh] = np.nan
         self._squares[fresh] = self._errors[fresh] = 0.0
@@ -140,5 +136,6 @@ class _Chooser:
         self._pending[slot] = position + displacement(velocity, turn, self._lead_s)
         usual = USUAL_ERRORS * USUAL_ERROR_M**2
         likelihood = -(USUAL_ERRORS + self._errors) * np.log(usual + self._squares)
-        likelihood[:, USUAL] += MIN_ADVANTAGE
-        return np.asarray(likelihood.argmax(axis=1))
+        likelihood += self._before
+        weight = np.exp(likelihood - likelihood.max(axis=1, keepdims=True))
+        return np.asarray(weight / weight.sum(axis=1, keepdims=True))

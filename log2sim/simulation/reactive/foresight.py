@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Agent
 from log2sim.geometry import Array, wrap_angle
 from log2sim.prediction.motion_table import TICK_S, tabulate
-from log2sim.prediction.smoothing import CONSTANTS_S, USUAL, displacement, smooth_motion
+from log2sim.prediction.smoothing import displacement, smooth_motion
 from log2sim.simulation.reactive.path_table import PathTable, Pose
 from log2sim.simulation.reactive.prediction import (
     Prediction,
@@ -24,6 +24,9 @@ from log2sim.simulation.reactive.swept_corridor import HORIZON_S
 FORESIGHTS = ("path", "motion")
 """`path`: others go where the scenario has them go. `motion`: they go on as they have moved so far, as who sees them for the
 first time expects."""
+
+DRIVEN_TURN_S = 0.3
+"""Time constant of the turn rate of a vehicle that a policy drives: short, since simulated headings have no noise."""
 
 Index = NDArray[np.intp]
 
@@ -95,7 +98,7 @@ class MotionForesight:
         else:
             step_s = t_s - self._seen[0]
             rate = float(wrap_angle(yaw - self._seen[1])) / step_s
-            self._driven_radps += (rate - self._driven_radps) * -np.expm1(-step_s / CONSTANTS_S[USUAL][1])
+            self._driven_radps += (rate - self._driven_radps) * -np.expm1(-step_s / DRIVEN_TURN_S)
         self._seen = t_s, yaw
         return _go_on(one, one.speed_mps * np.exp(1j * one.yaw_rad), np.array([self._driven_radps]))
 
