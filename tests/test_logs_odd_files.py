@@ -254,3 +254,31 @@ def test_lenses_that_bend_without_limit_are_impossible(value: float) -> None:
     problems = list(problems_of(log.changed(cameras={"front": camera}), "front"))
     assert [p.is_impossible for p in problems] == [True]
     assert "its distortion has the coefficient" in problems[0].message
+
+
+@pytest.mark.parametrize("width_px", [0, 10_000_000])
+def test_a_first_image_of_an_impossible_size_does_not_size_the_camera(
+    encoded: Callable[[Encode], Path], width_px: int
+) -> None:
+    log = encoded(kitti.encode_tracking)
+    size_px = open_log(log).cameras["image_02"].width_px
+    first = next(log.glob("*/image_02/*/000000.png"))
+    data = bytearray(first.read_bytes())
+    data[16:20] = width_px.to_bytes(4, "big")
+    first.write_bytes(data)
+    opened = open_log(log)
+    assert opened.cameras["image_02"].width_px == size_px
+    with pytest.raises(RecordError, match=rf"{width_px}x300 px, expected 1 to \d+ px"):
+        opened.streams["image_02"].read(0)
+    assert opened.streams["image_02"].read(1).shape == (300, size_px, 3)
+
+
+@pytest.mark.parametrize("field", [3, 5, 10, 13, 16])
+def test_label_lines_with_numbers_beyond_all_are_left_out(encoded: Callable[[Encode], Path], field: int) -> None:
+    log = encoded(kitti.encode_tracking)
+    path = next(log.glob("*/label_02/*.txt"))
+    lines = path.read_text().splitlines()
+    words = lines[1].split()
+    words[field] = "-1e308"
+    path.write_text("\n".join([lines[0], " ".join(words), *lines[2:]]) + "\n")
+    assert any("line 2" in note and "not finite, or larger than" in note for note in open_log(log).notes)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import gzip
 import io
 import pickle
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from damaged_bytes import damaged, quick, result_or_refusal
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -29,9 +29,6 @@ from log2sim.logs.pandaset.unpickle import read_pickled_table
 from log2sim.logs.sweeps import read_sweep
 from log2sim.logs.time_checks import list_time_problems
 
-quick = settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
-)
 COLUMNS = {"t_ns": "int", "x_m": "float", "name": "str", "flag": "bool"}
 
 
@@ -58,27 +55,6 @@ SWEEPS = {
     ".npz": npz(xyz_m=POINTS, t_offset_ns=np.arange(4)),
     ".pcd": PCD,
 }
-
-
-@st.composite
-def damaged(draw: st.DrawFn, sound: bytes) -> bytes:
-    """A sound file with some bytes replaced, removed or inserted, or something else altogether."""
-    data = bytearray(sound)
-    for _ in range(draw(st.integers(0, 4))):
-        begin = draw(st.integers(0, len(data)))
-        end = min(len(data), begin + draw(st.integers(0, 8)))
-        data[begin:end] = draw(st.binary(max_size=8))
-    return draw(st.sampled_from([bytes(data), bytes(data), bytes(data[: len(data) // 2])]) | st.binary(max_size=200))
-
-
-def result_or_refusal(parse: Callable[[], Any], error: type[Exception], where: str) -> Any:
-    """What a parser returns; None for an error that says where, while any other error passes on."""
-    try:
-        return parse()
-    except error as problem:
-        if where not in str(problem):
-            raise AssertionError(f"'{problem}' does not say {where}") from problem
-        return None
 
 
 @pytest.mark.parametrize("suffix", SWEEPS)

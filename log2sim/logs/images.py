@@ -39,16 +39,17 @@ def decode_image(data: bytes, where: str, size_px: tuple[int, int]) -> NDArray[n
     """
     jpeg = data[:2] == b"\xff\xd8"
     width, height = image_size(data, where)
-    if width * height > MAX_IMAGE_PX:
-        raise RecordError(f"{where}: {width}x{height} px, more than the {MAX_IMAGE_PX} px that an image may have")
     if (width, height) != size_px:
         raise RecordError(f"{where}: {width}x{height} px, the calibration is for {size_px[0]}x{size_px[1]}")
     return _decode_jpeg(data, where) if jpeg else _decode_png(data, where)
 
 
 def image_size(data: bytes, where: str) -> tuple[int, int]:
-    """Return width and height in px of a JPEG or PNG file from its header; `RecordError` for anything else."""
-    return _jpeg_size(data, where) if data[:2] == b"\xff\xd8" else _png_size(data, where)
+    """Return width and height in px of a JPEG or PNG file from its header; `RecordError` for anything else, also for an impossible size."""
+    width, height = _jpeg_size(data, where) if data[:2] == b"\xff\xd8" else _png_size(data, where)
+    if not 0 < width * height <= MAX_IMAGE_PX:
+        raise RecordError(f"{where}: {width}x{height} px, expected 1 to {MAX_IMAGE_PX} px")
+    return width, height
 
 
 def image_stream(name: str, t_ns: NDArray[np.int64], files: list[Path], size_px: tuple[int, int]) -> Stream:

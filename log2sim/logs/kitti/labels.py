@@ -14,6 +14,7 @@ from log2sim.errors import LogError
 from log2sim.geometry import Array, PoseTrack, apply, wrap_angle
 from log2sim.logs.kitti import drive
 from log2sim.logs.notes import note_damaged_rows
+from log2sim.logs.pose_checks import MAX_POSITION_M
 from log2sim.numerals import parse_float, parse_int
 
 CATEGORY_OF = {
@@ -200,8 +201,8 @@ def _parse_words(words: list[str]) -> tuple[int, list[float]]:
         frame, row = parse_int(words[0]), [parse_float(word) for word in words[3:LABEL_FIELDS]]
     except ValueError:
         raise ValueError(f"expected numbers after the type, found '{' '.join(words)[:60]}'") from None
-    if not np.isfinite(row).all():
-        raise ValueError("a number is not finite")
+    if not (np.abs(row) <= MAX_POSITION_M).all():  # False for NaN
+        raise ValueError(f"a number is not finite, or larger than {MAX_POSITION_M:g}")
     if not 0 <= frame <= MAX_FRAME:
         raise ValueError(f"frame {words[0][:20]}, expected 0 to {MAX_FRAME}")
     return frame, row

@@ -14,6 +14,7 @@ from log2sim.errors import LogError
 from log2sim.geometry import Array, apply, inverse, wrap_angle
 from log2sim.logs.notes import note_left_out
 from log2sim.logs.pandaset.unpickle import Columns, read_pickled_table
+from log2sim.logs.pose_checks import MAX_POSITION_M
 from log2sim.logs.spinning import compute_scan_offset_ns, select_spaced
 
 PERIOD_NS = 100_000_000
@@ -115,8 +116,8 @@ def _checked(table: Columns, path: Path) -> Columns:
     table = {name: np.full(count, value) for name, value in OPTIONAL.items()} | table
     numbers = [n for n in COLUMNS if n.startswith(("yaw", "position", "dimensions"))]
     for name in numbers:
-        if table[name].dtype.kind not in "fiu" or not np.isfinite(table[name]).all():
-            raise LogError(f"{path}, column '{name}': expected finite numbers")
+        if table[name].dtype.kind not in "fiu" or not (np.abs(table[name]) <= MAX_POSITION_M).all():
+            raise LogError(f"{path}, column '{name}': expected finite numbers up to {MAX_POSITION_M:g}")
     return table
 
 

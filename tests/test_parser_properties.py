@@ -1,0 +1,283 @@
+"""Every parser on damaged files and any text: what it raises is our error that says where, and nothing else passes."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import shutil
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from damaged_bytes import damaged, quick, result_or_refusal
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from log_encoders import argoverse, kitti, nuscenes, pandaset, ros, waymo, waymo_parquet
+from log_encoders.world import make_world
+from worlds import tiny_toml
+
+from log2sim.config import Config
+from log2sim.datatypes import Log, Scenario
+from log2sim.documents import read_json
+from log2sim.errors import ConfigError, Log2SimError, LogError, ScenarioError
+from log2sim.evaluation.detection.boxes_file import DetectedBoxes
+from log2sim.export.exporters import Options, export
+from log2sim.export.openscenario.read import load
+from log2sim.export.roads.opendrive import require_roads
+from log2sim.export.xml_text import read
+from log2sim.logs.arrow.tables import read_columns
+from log2sim.logs.kitti.drive import calibration_entry, read_calibration
+from log2sim.logs.nuscenes.tables import scan_records
+from log2sim.logs.opening import open_log
+from log2sim.logs.ros.messages import definition_fields
+from log2sim.logs.ros.settings import read_settings
+from log2sim.logs.waymo.wire import WireError, fields_of
+from log2sim.simulation.metrics.limits import parse_limits
+from log2sim.simulation.result import Replay
+from log2sim.simulation.runner import replay
+from log2sim.synth.scene import load_scene
+
+few = settings(quick, max_examples=25)
+fewer = settings(quick, max_examples=8)
+WORDS = st.sampled_from(
+    [
+        "=",
+        ".",
+        "detect",
+        "name",
+        "track",
+        "[",
+        "]",
+        '"',
+        "1e999",
+        "nan",
+        "9" * 30,
+        "\n",
+        "\0",
+        ",",
+        "P2:",
+        "true",
+        "\u0663",
+    ]
+)
+ANY_TEXT = st.text(max_size=60) | st.lists(WORDS, max_size=12).map("".join)
+
+
+@cache
+def short_world() -> Log:
+    return make_world(duration_s=0.25)
+
+
+@pytest.fixture(scope="module")
+def sound(tiny_scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """A sound file of each kind of document."""
+    folder = tmp_path_factory.mktemp("sound")
+    scenario = Scenario.load(tiny_scenario)
+    export(scenario, "openscenario", folder / "x", Options())
+    replay(scenario, mode="exact", dt_s=0.1).save(folder / "replay.json")
+    return {
+        "scenario": tiny_scenario.read_bytes(),
+        "replay": (folder / "replay.json").read_bytes(),
+        "xosc": next((folder / "x").glob("*.xosc")).read_bytes(),
+        "xodr": next((folder / "x").glob("*.xodr")).read_bytes(),
+        "settings": Config().to_toml().encode(),
+        "scene": tiny_toml().encode(),
+        "topics": b'reference_camera = "a"\n[cameras.a]\nimages = "/a/image"\n[poses]\nsource = "tf"\n',
+        "json": json.dumps({"a": [1.5, None, {"b": "\u00e9"}]}).encode(),
+    }
+
+
+DOCUMENTS: dict[str, tuple[Callable[[Path], Any], type[Exception]]] = {
+    "scenario": (Scenario.load, ScenarioError),
+    "replay": (Replay.load, ScenarioError),
+    "xosc": (load, ScenarioError),
+    "xodr": (lambda path: require_roads(read(path), str(path)), LogError),
+    "settings": (Config.load, ConfigError),
+    "scene": (load_scene, ConfigError),
+    "topics": (lambda path: read_settings([path]), ConfigError),
+    "json": (lambda path: read_json(path), LogError),
+}
+
+
+@pytest.mark.parametrize("kind", DOCUMENTS)
+@few
+@given(data=st.data())
+def test_a_damaged_document_is_an_error_or_a_value(
+    tmp_path: Path, sound: dict[str, bytes], kind: str, data: st.DataObject
+) -> None:
+    parse, error = DOCUMENTS[kind]
+    path = tmp_path / "file"
+    path.write_bytes(data.draw(damaged(sound[kind])))
+    result_or_refusal(lambda: parse(path), error, str(path))
+
+
+@pytest.mark.parametrize("kind", DOCUMENTS)
+@few
+@given(text=ANY_TEXT)
+def test_any_text_is_an_error_or_a_document(tmp_path: Path, kind: str, text: str) -> None:
+    parse, error = DOCUMENTS[kind]
+    path = tmp_path / "file"
+    path.write_bytes(text.encode("utf-8", "surrogatepass"))
+    result_or_refusal(lambda: parse(path), error, str(path))
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers(-(10**40), 10**40) | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=4), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@pytest.mark.parametrize("parse", [Scenario.from_dict, Replay.from_dict, DetectedBoxes.from_dict])
+@few
+@given(data=st.data())
+def test_any_value_in_a_document_is_an_error_or_a_value(
+    sound: dict[str, bytes], parse: Callable[[Any], Any], data: st.DataObject
+) -> None:
+    boxes = {"format": "log2sim-boxes", "boxes_version": 1, "frames": []}
+    document = {
+        Scenario.from_dict: json.loads(sound["scenario"]),
+        Replay.from_dict: json.loads(sound["replay"]),
+        DetectedBoxes.from_dict: boxes,
+    }[parse]
+    holder, key = {"": document}, ""
+    while isinstance(holder[key], (dict, list)) and holder[key] and data.draw(st.integers(0, 3)):
+        holder = holder[key]
+        key = data.draw(st.sampled_from(sorted(holder) if isinstance(holder, dict) else range(len(holder))))
+    holder[key] = data.draw(json_values)
+    with contextlib.suppress(Log2SimError):
+        parse(document)
+
+
+@few
+@given(text=ANY_TEXT)
+def test_any_setting_is_an_error_or_a_setting(text: str) -> None:
+    result_or_refusal(lambda: Config.load(None, [text]), ConfigError, "--set")
+    result_or_refusal(lambda: Config.load(None, [f"track.max_gap_s={text}"]), ConfigError, "--set")
+
+
+@few
+@given(text=ANY_TEXT)
+def test_any_limit_is_an_error_or_a_limit(text: str) -> None:
+    limits = result_or_refusal(lambda: parse_limits([f"min_ttc_s={text}"]), ConfigError, "limit")
+    assert limits is None or np.isfinite(list(limits.values())).all()
+
+
+@few
+@given(text=ANY_TEXT | st.lists(st.floats().map(repr), max_size=14).map(lambda words: "P2: " + " ".join(words)))
+def test_any_text_is_an_error_or_a_calibration_of_kitti(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "calib.txt"
+    path.write_text(text.encode("utf-8", "replace").decode(), encoding="utf-8")
+    found = result_or_refusal(
+        lambda: calibration_entry(read_calibration(path), path, (3, 4), "P2"), LogError, str(path)
+    )
+    assert found is None or (found.shape == (3, 4) and np.isfinite(found).all())
+
+
+RECORDS = json.dumps([{"token": "a", "x": 1}, {"token": "b", "x": [1, 2]}], indent=0).encode()
+
+
+@few
+@given(data=damaged(RECORDS))
+def test_a_damaged_table_of_nuscenes_is_an_error_or_records(tmp_path: Path, data: bytes) -> None:
+    path = tmp_path / "table.json"
+    path.write_bytes(data)
+    found = result_or_refusal(lambda: list(scan_records(path, "token", {"a", "b"})), LogError, str(path))
+    assert found is None or all(record["token"] in ("a", "b") for record in found)
+
+
+@cache
+def table_bytes(suffix: str) -> bytes:
+    pyarrow = pytest.importorskip("pyarrow")
+    stream = io.BytesIO()
+    table = pyarrow.table(
+        {"t": [1, 2, 3], "x": [0.5, 1.5, None], "name": ["a", "b", "c"], "v": [[1.0], [2.0, 3.0], []]}
+    )
+    if suffix == ".feather":
+        from pyarrow import feather
+
+        feather.write_feather(table, stream, compression="lz4")
+    else:
+        from pyarrow import parquet
+
+        parquet.write_table(table, stream)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("suffix", [".feather", ".parquet"])
+@few
+@given(data=st.data())
+def test_a_damaged_column_file_is_an_error_or_columns(tmp_path: Path, suffix: str, data: st.DataObject) -> None:
+    path = tmp_path / f"table{suffix}"
+    path.write_bytes(data.draw(damaged(table_bytes(suffix))))
+    kinds = {"t": "int", "x": "float", "name": "text", "v": "floats"}
+    columns = result_or_refusal(lambda: read_columns(path, kinds), LogError, str(path))
+    assert columns is None or len({len(column) for column in columns.values()}) == 1
+
+
+@few
+@given(data=st.binary(max_size=60))
+def test_any_bytes_are_fields_of_a_message_or_a_wire_error(data: bytes) -> None:
+    with contextlib.suppress(WireError):
+        assert all(field.number >= 0 for field in fields_of(data))
+
+
+@few
+@given(text=ANY_TEXT)
+def test_any_definition_has_names_of_fields(text: str) -> None:
+    assert all(isinstance(name, str) for name in definition_fields(text))
+
+
+def _bag(container: str) -> Callable[[Log, Path], Path]:
+    return lambda log, folder: ros.encode_as(log, folder, ros.Style(container=container))
+
+
+CONTAINERS: dict[str, tuple[Callable[[Log, Path], Path], str]] = {
+    "bag": (_bag("bag"), "*.bag"),
+    "db3": (_bag("db3"), "*/*"),
+    "mcap": (_bag("mcap"), "*.mcap"),
+    "waymo v1": (waymo.encode, "*.tfrecord"),
+    "waymo v2": (waymo_parquet.encode, "*/*.parquet"),
+    "argoverse 2": (argoverse.encode, "*/*.feather"),
+    "nuscenes": (nuscenes.encode_world, "*/*.json"),
+    "pandaset": (pandaset.encode, "*/*/*.json"),
+    "kitti raw": (kitti.encode_raw, "**/*.txt"),
+    "kitti tracking": (kitti.encode_tracking, "**/*.txt"),
+}
+
+
+@pytest.fixture(scope="module", params=CONTAINERS)
+def container(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, str]:
+    """What is opened, the folder that it is in, and which of its files are damaged."""
+    encode, pattern = CONTAINERS[request.param]
+    folder = tmp_path_factory.mktemp("container")
+    return encode(short_world(), folder), folder, pattern
+
+
+def read_all(path: Path) -> None:
+    """Open a log and read all that a run may read; records may be refused one by one."""
+    log = open_log(path)
+    assert log.streams
+    for stream in log.streams.values():
+        for i in range(len(stream.t_ns)):
+            with contextlib.suppress(Log2SimError):
+                stream.read(i)
+    assert log.notes is not None
+
+
+@fewer
+@given(data=st.data())
+def test_a_log_with_a_damaged_file_is_an_error_or_a_log(
+    container: tuple[Path, Path, str], tmp_path: Path, data: st.DataObject
+) -> None:
+    path, folder, pattern = container
+    copy = tmp_path / "copy"
+    shutil.rmtree(copy, ignore_errors=True)
+    shutil.copytree(folder, copy)
+    file = data.draw(st.sampled_from(sorted(copy.glob(pattern))))
+    file.write_bytes(data.draw(damaged(file.read_bytes())))
+    result_or_refusal(lambda: read_all(copy / path.relative_to(folder)), Log2SimError, str(tmp_path))
