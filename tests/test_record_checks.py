@@ -165,6 +165,15 @@ def test_scenes_at_night_and_in_fog_show_something():
     assert not shows_nothing(shrink(noisy((200 + (images[0] * 0.15)).astype(np.uint8), 3, 2.0)))
 
 
+@pytest.mark.parametrize("shape", [(1, 1), (2, 3), (3, 500), (500, 3), (13, 17), (300, 4000)])
+def test_pictures_of_any_shape_are_judged(shape):
+    watch = CameraWatch(pictures()[0], "front")
+    rng = np.random.default_rng(0)
+    for i in range(3):
+        assert watch.judge(i, shrink(rng.integers(0, 255, (*shape, 3), dtype=np.uint8))) in ("live", "black")
+        assert shows_nothing(shrink(gray(7, shape)))
+
+
 def test_change_is_zero_of_equal_pictures_only():
     _, _, images = pictures()
     small = shrink(images[0])

@@ -1,4 +1,4 @@
-"""Which sweeps of a LiDAR repeat an earlier one, and which have next to no points."""
+"""Which sweeps of a LiDAR repeat an earlier one, and how many points they have."""
 
 from __future__ import annotations
 
@@ -44,15 +44,14 @@ class LidarWatch:
         Of the LiDAR.
     repeated : dict of int to bool
         Whether a sweep repeats an earlier one, by stamp, ns.
-    points, obstacles : dict of int to int
-        Number of points, and of those that are above the ground, by stamp.
+    points : dict of int to int
+        Number of points, by stamp.
     """
 
     log: Log
     name: str
     repeated: dict[int, bool] = field(default_factory=dict)
     points: dict[int, int] = field(default_factory=dict)
-    obstacles: dict[int, int] = field(default_factory=dict)
     _last: _Sweep | None = None
     _shares: dict[Motion, list[float]] = field(default_factory=lambda: {"stands": [], "drives": [], "unclear": []})
 
@@ -64,7 +63,7 @@ class LidarWatch:
         A LiDAR that stands in a synthetic world without noise gives the same points again and again, and rightly so. Hence a
         sweep is a copy where the LiDAR moved meanwhile, or where its sweeps are known to differ even from one place.
         """
-        self.points[t_ns], self.obstacles[t_ns] = sketch.points, sketch.obstacles
+        self.points[t_ns] = sketch.points
         last, same, copy = self._last, False, False
         if last is not None and min(sketch.obstacles, last.sketch.obstacles) >= MIN_OBSTACLES:
             share = common_share(last.sketch, sketch)

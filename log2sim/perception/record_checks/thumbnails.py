@@ -86,7 +86,9 @@ def shows_nothing(thumbnail: Thumbnail) -> bool:
 
 def _averaged(thumbnail: Thumbnail) -> Thumbnail:
     height, width = (n - n % COARSE_FACTOR for n in thumbnail.shape)
-    blocks = thumbnail[:height, :width].reshape(height // COARSE_FACTOR, COARSE_FACTOR, -1, COARSE_FACTOR)
+    blocks = thumbnail[:height, :width].reshape(
+        height // COARSE_FACTOR, COARSE_FACTOR, width // COARSE_FACTOR, COARSE_FACTOR
+    )
     return np.asarray(blocks.mean(axis=(1, 3)))
 
 
