@@ -115,7 +115,7 @@ def _linearize(seen: SweepPairs, values: Array, prior_sigma: Array) -> Linearize
     moved = seen.track.at(t_ns)[0] @ change
     velocity, _ = velocities_at(seen.track, t_ns)
     back, mount = adjoint_of(inverse(change)), np.eye(6)[:, [3, 4, 5, 0, 1, 2]]
-    mount[:3, :3] = -cross_matrix(seen.sensor_m).T
+    mount[:3, :3] = cross_matrix(seen.sensor_m)
     size, count = 6 * len(seen.pairs), len(t_ns)
     residual, by_values, by_poses = np.zeros(size), np.zeros((size, VALUES)), np.zeros((size, 6 * count))
     for p, pair in enumerate(seen.pairs):
