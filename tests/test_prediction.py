@@ -171,9 +171,21 @@ def test_a_lane_is_a_path_that_is_known_beforehand() -> None:
     assert errors(found, "a", "path", 3.0).mean() < 0.3 * errors(free, "a", "path", 3.0).mean()
 
 
-def test_cars_follow_no_pedestrians() -> None:
-    found = predict_scenario(scene(corner("a", 0.0, category="pedestrian"), corner("b", 4.0)))
-    assert not found.on_path.any()
+@pytest.mark.parametrize(
+    ("ahead", "behind", "follows"),
+    [
+        ("pedestrian", "car", False),
+        ("cyclist", "car", False),
+        ("truck", "car", True),
+        ("car", "cyclist", True),
+        ("motorcycle", "cyclist", True),
+        ("car", "pedestrian", False),
+        ("pedestrian", "pedestrian", True),
+    ],
+)
+def test_agents_follow_their_own_kind_and_riders_vehicles_too(ahead: str, behind: str, follows: bool) -> None:
+    found = predict_scenario(scene(corner("a", 0.0, category=ahead), corner("b", 4.0, category=behind)))
+    assert found.on_path.any() == follows
 
 
 def test_noisy_positions_choose_longer_averages() -> None:

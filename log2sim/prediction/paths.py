@@ -32,7 +32,13 @@ NEIGHBORS = 24
 MAX_BEYOND_M = 2.0
 """How far a path is continued straight on."""
 
-_PEDESTRIANS = "pedestrian"
+VEHICLES, RIDERS, WALKERS = range(3)
+"""Kinds of paths: agents follow their own kind, and riders vehicles too; where riders or people turn off, no vehicle may."""
+
+
+def kind_of(category: str) -> int:
+    """Return whether a category goes as `VEHICLES`, `RIDERS` or `WALKERS` do."""
+    return {"two_wheeler": RIDERS, "pedestrian": WALKERS}.get(GROUP_OF[category], VEHICLES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +57,8 @@ class Paths:
         When an agent was there; minus infinity on lanes, which are known beforehand.
     agent : (N,) int
         Row of the agent that was there; -1 on lanes.
-    walked : (N,) bool
-        Whether a pedestrian was there.
+    kind : (N,) int
+        Who was there, see `kind_of`; `VEHICLES` on lanes.
     """
 
     point_m: Complex
@@ -61,18 +67,20 @@ class Paths:
     path: NDArray[np.intp]
     known_s: Array
     agent: NDArray[np.intp]
-    walked: NDArray[np.bool_]
+    kind: NDArray[np.intp]
 
     @classmethod
     def driven(cls, table: MotionTable, lanes: Sequence[Array] = ()) -> Self:
         """Collect where agents went, and lanes (K, 2), m, map frame, in their direction of travel."""
-        parts = [(*_resampled(line[:, 0] + 1j * line[:, 1], np.full(len(line), -np.inf)), -1, False) for line in lanes]
+        parts = [
+            (*_resampled(line[:, 0] + 1j * line[:, 1], np.full(len(line), -np.inf)), -1, VEHICLES) for line in lanes
+        ]
         for k, agent in enumerate(table.agents):
             there = np.flatnonzero(table.present[k] & (np.abs(table.velocity_mps[k]) > MIN_COURSE_MPS))
             for run in np.split(there, np.flatnonzero(np.diff(table.piece[k, there])) + 1):
                 if len(run) > 1:
                     part = _resampled(table.position_m[k, run], table.t_s[run])
-                    parts.append((*part, k, GROUP_OF[agent.category] == _PEDESTRIANS))
+                    parts.append((*part, k, kind_of(agent.category)))
         parts = [part for part in parts if len(part[0]) > 1]
         counts = [len(part[0]) for part in parts]
         starts = np.cumsum([0.0, *(part[1][-1] + SPACING_M for part in parts)])
@@ -83,7 +91,7 @@ class Paths:
             np.repeat(np.arange(len(parts)), counts),
             np.concatenate([np.zeros(0), *(part[2] for part in parts)]),
             np.repeat(np.array([part[3] for part in parts], dtype=np.intp), counts),
-            np.repeat(np.array([part[4] for part in parts], dtype=bool), counts),
+            np.repeat(np.array([part[4] for part in parts], dtype=np.intp), counts),
         )
 
     def ends_at(self, row: NDArray[np.intp], t_s: Array) -> Array:
@@ -128,15 +136,15 @@ class Seekers:
     t_s : (Q,) float64, s
     agent : (Q,) int
         Rows of the agents.
-    walks : (Q,) bool
-        Whether it is a pedestrian.
+    kind : (Q,) int
+        Of the agents, see `kind_of`.
     """
 
     position_m: Complex
     direction: Complex
     t_s: Array
     agent: NDArray[np.intp]
-    walks: NDArray[np.bool_]
+    kind: NDArray[np.intp]
 
 
 def locate(paths: Paths, seekers: Seekers) -> Places:
@@ -156,7 +164,9 @@ def locate(paths: Paths, seekers: Seekers) -> Places:
     row = np.minimum(near, len(paths.point_m) - 1)
     offset = (position - paths.point_m[row]) * paths.direction[row].conj()
     usable = (near < len(paths.point_m)) & (paths.known_s[row] <= seekers.t_s[asked, None])
-    usable &= (paths.agent[row] != seekers.agent[asked, None]) & (paths.walked[row] == seekers.walks[asked, None])
+    usable &= paths.agent[row] != seekers.agent[asked, None]
+    kind = seekers.kind[asked, None]
+    usable &= (paths.kind[row] == kind) | (paths.kind[row] == VEHICLES) & (kind == RIDERS)
     usable &= (np.abs(offset.imag) < MAX_ASIDE_M) & (np.abs(offset.real) <= SPACING_M)
     usable &= (direction * paths.direction[row].conj()).real > MIN_COS
     pick = np.arange(len(asked)), usable.argmax(axis=1)

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF, Scenario
+from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
 from log2sim.prediction.motion_table import TICK_S, Complex, MotionTable, table_of
-from log2sim.prediction.paths import Paths, Seekers, follow, locate
+from log2sim.prediction.paths import Paths, Seekers, follow, kind_of, locate
 from log2sim.prediction.smoothing import MIN_COURSE_MPS, PROOF_S, displacement, smooth_motion, turn_rates
 from log2sim.prediction.spread import own_scale, usual_sigma
 
@@ -207,13 +207,13 @@ def _drawn_to_paths(
 ) -> tuple[_Way, NDArray[np.bool_]]:
     """Average a way with that along a path by their variances across; and tell where a path is known (N,)."""
     table = present.table
-    walks = np.array([GROUP_OF[a.category] == "pedestrian" for a in table.agents], dtype=bool)
+    kinds = np.array([kind_of(a.category) for a in table.agents], dtype=np.intp)
     seekers = Seekers(
         present.of(table.position_m),
         np.where(speed_mps > MIN_COURSE_MPS, way.course[:, 0], np.nan),
         table.t_s[present.tick],
         present.row,
-        walks[present.row],
+        kinds[present.row],
     )
     point, heading = follow(paths, locate(paths, seekers), speed_mps, lead_s)
     known = np.isfinite(point)
