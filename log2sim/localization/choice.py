@@ -19,6 +19,7 @@ from log2sim.localization.camera_motion import follow_camera, motion_camera
 from log2sim.localization.ego_sweeps import densest_lidar, lidars_on_ego, read_ego_sweep
 from log2sim.localization.estimate_figures import camera_figures, odometry_figures
 from log2sim.localization.given_poses import check_poses
+from log2sim.localization.lidar_bridge import bridge_by_lidar
 from log2sim.localization.odometry import Odometry, run_odometry
 from log2sim.localization.pose_choice import GIVEN, ORIGINS, PoseChoice
 from log2sim.localization.pose_faults import list_faults
@@ -97,7 +98,9 @@ def _localize(request: _Request) -> tuple[Log, PoseChoice]:
     if request.log.ego is None:
         return _choose(request)
     given = request.log.ego
-    checked = check_poses(given)
+    checked = bridge_by_lidar(
+        request.log, check_poses(given), lambda done, total: request.progress("odometry", done, total)
+    )
     faults = list_faults(request.log, checked.stretches, request.during_ns)
     if checked.track is given:
         mended = request.log

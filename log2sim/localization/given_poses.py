@@ -59,6 +59,8 @@ class Stretch:
         For how long no pose is known well enough.
     poses : int
         Number of poses in question.
+    by : str
+        What bridges it.
     """
 
     kind: str
@@ -69,6 +71,7 @@ class Stretch:
     sigma_m: float = 0.0
     unknown_s: float = 0.0
     poses: int = 0
+    by: str = "the motion around"
 
     @property
     def duration_s(self) -> float:

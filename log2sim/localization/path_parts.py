@@ -29,6 +29,8 @@ UNKNOWN_RATE = 60.0
 MAX_REST = 0.05
 # Stamps of recorded drives miss some frames, or are assumed to be regular: then the path steps forward by up to this time of driving.
 MAX_SKIP_S = 0.25
+# Vehicles that drive off or stop change their speed by less than this share of what they can.
+USUAL_CHANGE_SHARE = 1 / 3
 # Parts farther back are no longer compared: between them almost any motion is possible.
 MAX_COMPARED = 30
 
@@ -166,34 +168,22 @@ def _end(samples: Samples, rows: NDArray[np.intp], *, first: bool) -> _End:
 
 def _marked_at_rest(samples: Samples, parts: list[Part]) -> list[Part]:
     """Mark the parts that stay in one place although no vehicle stops or starts as suddenly as the path around them."""
-    out = []
-    for k, part in enumerate(parts):
-        covered = float(np.linalg.norm(np.ptp(samples.values[part.rows], axis=0)))
-        stays = covered <= max(MAX_REST, MAX_SIGMAS * samples.sigma)
-        sudden = stays and (
-            (
-                k > 0
-                and not _same_rate(
-                    samples, _end(samples, parts[k - 1].rows, first=False), _end(samples, part.rows, first=True)
-                )
-            )
-            or (
-                k + 1 < len(parts)
-                and not _same_rate(
-                    samples, _end(samples, part.rows, first=False), _end(samples, parts[k + 1].rows, first=True)
-                )
-            )
-        )
-        out.append(Part(part.rows, part.right, sudden))
-    return out
+    heads = [_end(samples, part.rows, first=True) for part in parts]
+    tails = [_end(samples, part.rows, first=False) for part in parts]
+    sudden = [not _same_rate(samples, tail, head, USUAL_CHANGE_SHARE) for tail, head in zip(tails, heads[1:])]
+    most = max(MAX_REST, MAX_SIGMAS * samples.sigma)
+    stays = [float(np.linalg.norm(np.ptp(samples.values[part.rows], axis=0))) <= most for part in parts]
+    return [
+        Part(part.rows, part.right, stays[k] and any(sudden[max(k - 1, 0) : k + 1])) for k, part in enumerate(parts)
+    ]
 
 
-def _same_rate(samples: Samples, end: _End, start: _End) -> bool:
-    """Return whether a vehicle can change from the rate at an end of a part to that at the start of a later one."""
+def _same_rate(samples: Samples, end: _End, start: _End, share: float = 1.0) -> bool:
+    """Return whether a vehicle changes from the rate at an end of a part to that at the start of a later one by a share of what it can."""
     sigma = np.hypot(end.rate_sigma, start.rate_sigma)
     off = float(np.linalg.norm(start.rate - end.rate))
     slack = end.rate_slack + start.rate_slack
-    return off <= samples.max_change * (start.t_s - end.t_s) + slack + MAX_SIGMAS * float(sigma)
+    return off <= share * samples.max_change * (start.t_s - end.t_s) + slack + MAX_SIGMAS * float(sigma)
 
 
 def _is_possible(samples: Samples, end: _End, start: _End) -> bool:

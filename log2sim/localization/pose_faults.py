@@ -64,7 +64,7 @@ def _repair(stretch: Stretch, start_ns: int, ends_ns: tuple[int, int]) -> Fault:
     """Describe a jump, or poses that froze."""
     if stretch.kind == "frozen_poses":
         what = f"the pose stays {_span(stretch, start_ns)} while the ego moves on by up to {stretch.shift_m:.1f} m"
-        done = "the motion around bridges it"
+        done = f"{stretch.by} bridges it"
     else:
         by = [f"{stretch.shift_m:.1f} m"] if stretch.shift_m >= MIN_STEP_M else []
         by += [f"{np.rad2deg(stretch.turn_rad):.1f} degrees"] if stretch.turn_rad >= MIN_STEP_RAD else []
@@ -114,11 +114,12 @@ def _lost(stretch: Stretch, start_ns: int) -> Fault:
 
 def _sparse(gaps: Sequence[Stretch], start_ns: int) -> Fault:
     """Describe gaps that are bridged."""
+    by = "the ego's motion" if gaps[0].by == Stretch.by else gaps[0].by
     longest, sigma_m = max(s.duration_s for s in gaps), max(s.sigma_m for s in gaps)
     whole = Stretch("gap", gaps[0].first_ns, gaps[-1].last_ns)
     number = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
     message = (
-        f"poses are up to {longest:.2f} s apart {_span(whole, start_ns)} ({number}): the ego's motion interpolates them, "
+        f"poses are up to {longest:.2f} s apart {_span(whole, start_ns)} ({number}): {by} interpolates them, "
         f"to {sigma_m:.2f} m (1 sigma)"
     )
     values = {"longest_s": round(longest, 3), "gaps": float(len(gaps)), "sigma_m": round(sigma_m, 3)}
