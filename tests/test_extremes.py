@@ -15,7 +15,12 @@ from extremes import CASES, Case, Outcome, outcome_of
 
 
 @pytest.mark.parametrize(
-    "case", [pytest.param(c, id=c.name, marks=[pytest.mark.slow] if c.slow else []) for c in CASES]
+    "case",
+    [
+        pytest.param(c, id=c.name, marks=[pytest.mark.slow] if c.run_by == "slow tests" else [])
+        for c in CASES
+        if c.run_by != "tool"
+    ],
 )
 def test_extreme(case: Case) -> None:
     outcome = outcome_of(case)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from extremes.table import Outcome, case
+from extremes.table import Outcome, RunBy, case
 from log2sim import Config, Scenario, evaluate, open_log, reconstruct
 from log2sim.datatypes import CATEGORIES, Log, Stream, Sweep
 from log2sim.evaluation.metrics.comparison import Selection
@@ -237,5 +237,15 @@ FAULTS: dict[str, tuple[Change, Required]] = {
 }  # fmt: skip
 """What is done to the sample, and what is required of its reconstruction."""
 
+SLOW_TESTS = {
+    "front camera frozen from 2 s",
+    "one LiDAR sweep repeated for 1 s",
+    "LiDAR stamps + 100 ms, --fix-time",
+    "left and right extrinsics swapped",
+    "GNSS frozen for 1 s",
+}
+"""One of each kind of fault; a run takes 20 s."""
+
 for _name, (_change, _required) in FAULTS.items():
-    case(f"sensor: {_name}", str(_required), slow=True)(lambda c=_change, r=_required: run(c, r))
+    _by: RunBy = "slow tests" if _name in SLOW_TESTS else "tool"
+    case(f"sensor: {_name}", str(_required), run_by=_by)(lambda c=_change, r=_required: run(c, r))

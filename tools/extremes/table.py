@@ -1,4 +1,4 @@
-"""The table of extremes: named cases with the outcome that each must have. Tests and `stability.py` run the same ones.
+"""The table of extremes: named cases with the outcome that each must have. `stability.py` runs all of them, tests those that are theirs.
 
 A case says what it found and whether that is what is required; it never raises for a wrong outcome.
 """
@@ -7,9 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
+RunBy = Literal["tests", "slow tests", "tool"]
 FAR_M = np.array([691_000.0, 5_334_000.0])
 
 
@@ -26,12 +28,12 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Case:
-    """A named extreme, what is required of it, how to run it, and whether that takes more than a few seconds."""
+    """A named extreme, what is required of it, how to run it, and by what: of the cases that take long, tests run some."""
 
     name: str
     required: str
     run: Callable[[], Outcome]
-    slow: bool = False
+    run_by: RunBy = "tests"
 
 
 CASES: list[Case] = []
@@ -45,11 +47,13 @@ def outcome_of(case: Case) -> Outcome:
         return Outcome(False, f"raised {type(error).__name__}: {error}")
 
 
-def case(name: str, required: str, *, slow: bool = False) -> Callable[[Callable[[], Outcome]], Callable[[], Outcome]]:
+def case(
+    name: str, required: str, *, run_by: RunBy = "tests"
+) -> Callable[[Callable[[], Outcome]], Callable[[], Outcome]]:
     """Put a function into the table."""
 
     def add(run: Callable[[], Outcome]) -> Callable[[], Outcome]:
-        CASES.append(Case(name, required, run, slow))
+        CASES.append(Case(name, required, run, run_by))
         return run
 
     return add
