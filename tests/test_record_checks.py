@@ -127,6 +127,14 @@ def test_poses_that_jump_or_drift_do_not_make_a_standing_camera_frozen(step_m):
     assert set(states(moved, t_ns, [noisy(images[0], i) for i in range(len(t_ns))])) == {"live"}
 
 
+def test_a_camera_known_to_have_noise_never_repeats_a_picture_while_it_starts():
+    log, t_ns, images = pictures()
+    log = with_motion(log, 0.06 * np.maximum(np.arange(len(t_ns)) - 6, 0))
+    found = states(log, t_ns, [noisy(images[0], min(i, 7)) for i in range(len(t_ns))])
+    assert set(found[:8]) == {"live"}
+    assert set(found[8:]) == {"frozen"}
+
+
 def test_a_camera_without_noise_that_creeps_to_a_stop_is_not_frozen():
     log, t_ns, images = pictures()
     places = np.minimum(np.arange(len(t_ns)), 6)
@@ -233,8 +241,9 @@ def test_sweeps_with_noise_are_no_copies(step_m):
     assert not any(repeated(log, [log.streams["top"].read(i) for i in range(COUNT)]))
 
 
-def test_copies_are_told_of_a_lidar_that_stands_and_has_noise():
-    log = lidar_log(0.0)
+@pytest.mark.parametrize("step_m", [0.0, 0.06])
+def test_copies_are_told_of_a_lidar_that_stands_or_starts_and_has_noise(step_m):
+    log = lidar_log(0.0).changed(ego=path(STAMPS, step_m * np.maximum(np.arange(COUNT) - 6, 0)))
     read = log.streams["top"].read
     found = repeated(log, [read(min(i, 7)) for i in range(COUNT)])
     assert found == [i > 7 for i in range(COUNT)]

@@ -105,7 +105,7 @@ class CameraWatch:
         motion = motion_of(self.log, self.name, before_ns, t_ns)
         expected = self._expected(before_ns, t_ns, last.thumbnail) if motion == "drives" else 0.0
         noisy = len(self._still_shares) >= MIN_STILL_PAIRS and min(self._still_shares) > MIN_NOISY_SHARE
-        if share == 0 and (expected >= MAX_COPY_LEVELS or (motion == "stands" and noisy)):
+        if share == 0 and (expected >= MAX_COPY_LEVELS or noisy):
             return True
         if motion == "stands":
             self._still_shares.append(share)

@@ -77,9 +77,10 @@ class LidarWatch:
         return copy
 
     def _usually_differ(self, motion: Motion) -> bool:
-        """Return whether sweeps are known to have few points in common where the LiDAR moves like this."""
-        shares = self._shares[motion]
-        return motion != "unclear" and len(shares) >= MIN_PAIRS and float(np.median(shares)) < MAX_USUAL_SHARE
+        """Return whether sweeps are known to have few points in common: even from one place, or while the LiDAR drives as now."""
+        kinds: tuple[Motion, ...] = ("stands", "drives") if motion == "drives" else ("stands",)
+        known = [self._shares[kind] for kind in kinds if len(self._shares[kind]) >= MIN_PAIRS]
+        return any(float(np.median(shares)) < MAX_USUAL_SHARE for shares in known)
 
     def _motion(self, before_ns: int, after_ns: int) -> Motion:
         """Return how the LiDAR moved between two stamps; it drives where all points of structures are in other cells."""

@@ -12,10 +12,10 @@ from log2sim.geometry import NS_PER_S
 Motion = Literal["drives", "stands", "unclear"]
 
 # Positions of a standing ego scatter, drift by centimeters a second, and its yaw by GNSS alone is any; only net motion over
-# a second tells that it drives. What stops at 1 m/s2 has been as near to where it stands only for the last 0.2 s.
+# a second tells that it drives. What brakes to a stop has been this near to its place for a second only after it stands.
 WINDOW_S = 1.0
 MIN_DRIVEN_M = 1.0
-MAX_STANDING_M = 0.02
+MAX_STANDING_M = 0.05
 
 
 def motion_of(log: Log, name: str, since_ns: int, t_ns: int) -> Motion:

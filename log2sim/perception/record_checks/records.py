@@ -49,7 +49,7 @@ def _camera_faults(watch: CameraWatch, t0_ns: int) -> Iterator[Fault]:
     stamps = np.array(sorted(watch.states), dtype=np.int64)
     states = np.array([watch.states[t] for t in stamps.tolist()])
     for span in spans_of(stamps, states == "frozen"):
-        message = f"pictures repeat an earlier one while the camera moves: {_when(span, t0_ns)}; they are not used"
+        message = f"pictures repeat an earlier one: {_when(span, t0_ns)}; they are not used"
         yield Fault("frozen_images", watch.name, message, "left_out", span.start_ns, span.end_ns, _counts(span))
     for span in spans_of(stamps, states == "black"):
         message = f"pictures show nothing (black, covered, of one color): {_when(span, t0_ns)}; they are not used"
