@@ -208,3 +208,20 @@ def test_single_precision_points_keep_a_hundredth_of_a_pixel() -> None:
         single, _ = project(camera, points.astype(np.float32))
         double, valid = project(camera, points)
         assert np.abs(single - double)[valid].max() < 0.01, model
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("model", ["brown", "fisheye"])
+@pytest.mark.parametrize("last", [0.0, 1e-320, -1e-320, 1e-12, 1e-3, 1e6, 1e300, np.inf, np.nan])
+def test_the_fold_of_any_coefficient_is_found(model: str, last: float) -> None:
+    """A tiny last coefficient changes nothing; one that is not finite leaves no usable ray."""
+    padding = (0.0,) * (2 if model == "fisheye" else 3)
+    radius = fold_radius(make_camera(model, (-0.2, *padding, last)))
+    angle = np.sqrt(1 / 0.6)
+    alone = np.tan(angle) if model == "fisheye" else angle
+    if not np.isfinite(last):
+        assert radius == 0
+    elif abs(last) < 1e-9:
+        assert radius == pytest.approx(alone)
+    else:
+        assert radius > alone

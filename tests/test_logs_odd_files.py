@@ -282,3 +282,14 @@ def test_label_lines_with_numbers_beyond_all_are_left_out(encoded: Callable[[Enc
     words[field] = "-1e308"
     path.write_text("\n".join([lines[0], " ".join(words), *lines[2:]]) + "\n")
     assert any("line 2" in note and "not finite, or larger than" in note for note in open_log(log).notes)
+
+
+def test_a_word_in_an_entry_that_may_be_missing_is_refused(encoded: Callable[[Encode], Path]) -> None:
+    log = encoded(kitti_object.encode)
+    path = log / "training" / "calib" / "000000.txt"
+    sound = path.read_text()
+    path.write_text(sound.replace("Tr_imu_to_velo: ", "Tr_imu_to_velo: x"))
+    with pytest.raises(LogError, match="entry 'Tr_imu_to_velo': 0 numbers, expected 12 finite ones"):
+        open_log(log)
+    path.write_text(f"calib_time: 09-Jan-2012\n{sound}")
+    assert open_log(log).streams

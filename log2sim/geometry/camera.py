@@ -133,6 +133,8 @@ def fold_radius(camera: Camera) -> float:
 
 @lru_cache(maxsize=256)
 def _fold_radius(model: str, distortion: tuple[float, ...]) -> float:
+    if not np.isfinite(distortion).all():
+        return 0.0
     if model == "fisheye":
         k1, k2, k3, k4 = _padded(distortion, 4)
         angle_squared = _first_positive_root(Polynomial([1, 3 * k1, 5 * k2, 7 * k3, 9 * k4]))
@@ -144,9 +146,18 @@ def _fold_radius(model: str, distortion: tuple[float, ...]) -> float:
 
 
 def _first_positive_root(polynomial: Polynomial) -> float:
-    roots = np.asarray(polynomial.trim().roots(), dtype=complex)
-    real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]
-    return float(real.min()) if len(real) else float("inf")
+    """Find the smallest positive root of a polynomial that is 1 at 0; infinite without one, 0 where coefficients are not finite.
+
+    Notes
+    -----
+    Its inverse is a root of the polynomial of the reversed coefficients, whose leading one is 1: however small the last ones are,
+    nothing is divided by them.
+    """
+    if not np.isfinite(polynomial.coef).all():
+        return 0.0
+    inverses = np.asarray(Polynomial(polynomial.coef[::-1]).roots(), dtype=complex)
+    real = inverses.real[(np.abs(inverses.imag) <= 1e-9 * np.abs(inverses)) & (inverses.real > 0)]
+    return float(1 / real.max()) if len(real) else float("inf")
 
 
 def distort(camera: Camera, xy: Array) -> Array:

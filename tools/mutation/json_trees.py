@@ -20,6 +20,8 @@ IMPOSSIBLE: tuple[Any, ...] = (
 OTHER_TYPES: tuple[Any, ...] = (None, 1, -1.5, 10**40, [], {}, True, [None])
 # Parts of a scenario in which any value may stand.
 FREE_FORM = (".quality", ".provenance", ".homography")
+# And what may be null there.
+NULLABLE = (".map.", ".color")
 DEPTHS = (100, 3000, 200_000)
 
 
@@ -68,8 +70,9 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _is_free(path: str) -> bool:
-    return any(part in path for part in FREE_FORM)
+def _is_valid(path: str, value: Any) -> bool:
+    """Whether the format allows the value there."""
+    return any(part in path for part in FREE_FORM) or (value is None and any(part in path for part in NULLABLE))
 
 
 def replace_number_by_impossible(rng: np.random.Generator, root: Any) -> tuple[str, bool] | None:
@@ -78,7 +81,7 @@ def replace_number_by_impossible(rng: np.random.Generator, root: Any) -> tuple[s
         return None
     holder, key, path = found
     old, holder[key] = holder[key], pick(rng, IMPOSSIBLE)
-    return f"{path}: {old} is {str(holder[key])[:50]}", not _is_free(path)
+    return f"{path}: {old} is {str(holder[key])[:50]}", not _is_valid(path, holder[key])
 
 
 def change_value(rng: np.random.Generator, root: Any) -> tuple[str, bool] | None:
@@ -111,7 +114,7 @@ def replace_by_other_type(rng: np.random.Generator, root: Any) -> tuple[str, boo
         return None
     holder, key, path = found
     old, holder[key] = holder[key], pick(rng, OTHER_TYPES)
-    return f"{path}: {type(old).__name__} is {str(holder[key])[:50]}", not _is_free(path)
+    return f"{path}: {type(old).__name__} is {str(holder[key])[:50]}", not _is_valid(path, holder[key])
 
 
 def remove_key(rng: np.random.Generator, root: Any) -> tuple[str, bool] | None:

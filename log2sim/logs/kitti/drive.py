@@ -77,7 +77,7 @@ def read_text(path: Path) -> str:
 
 
 def read_calibration(path: Path) -> dict[str, Array]:
-    """Numbers by key of a KITTI calibration file; lines that hold no numbers are left out.
+    """Numbers by key of a KITTI calibration file; none for lines that hold words.
 
     Raises
     ------
@@ -90,7 +90,7 @@ def read_calibration(path: Path) -> dict[str, Array]:
         try:
             numbers = np.array([parse_float(word) for word in rest.split()])
         except ValueError:
-            continue
+            numbers = np.zeros(0)  # words are in no entry that is used
         if key.removesuffix(":") in values:
             raise LogError(
                 f"{path}: entry '{key.removesuffix(':')[:40]}' stands twice; remove the one of the two that is wrong"
