@@ -116,16 +116,21 @@ def _linearize(seen: SweepPairs, values: Array, prior_sigma: Array) -> Linearize
     velocity, _ = velocities_at(seen.track, t_ns)
     back, mount = adjoint_of(inverse(change)), np.eye(6)[:, [3, 4, 5, 0, 1, 2]]
     mount[:3, :3] = cross_matrix(seen.sensor_m)
-    size, count = 6 * len(seen.pairs), len(t_ns)
-    residual, by_values, by_poses = np.zeros(size), np.zeros((size, VALUES)), np.zeros((size, 6 * count))
-    for p, pair in enumerate(seen.pairs):
-        rows, i, j = slice(6 * p, 6 * p + 6), pair.first, pair.second
-        predicted = inverse(moved[i]) @ moved[j]
-        residual[rows] = log_of(inverse(predicted) @ pair.found.first_T_second)
-        second_T_first = adjoint_of(inverse(predicted))
-        by_values[rows, OFFSET] = back @ velocity[j] - second_T_first @ back @ velocity[i]
-        by_values[rows, 1:] = mount - second_T_first @ mount
-        by_poses[rows, 6 * j : 6 * j + 6], by_poses[rows, 6 * i : 6 * i + 6] = back, -second_T_first @ back
-    information = [np.asarray(np.linalg.inv(pair.found.covariance), np.float64) for pair in seen.pairs]
-    prior = prior_sigma**-2.0
-    return Linearized(seen.t_ns, residual, by_values, by_poses, information, prior, -values * prior)
+    first, second = np.array([(pair.first, pair.second) for pair in seen.pairs]).T
+    predicted = inverse(moved[first]) @ moved[second]
+    second_T_first = adjoint_of(inverse(predicted))
+    found = np.array([pair.found.first_T_second for pair in seen.pairs])
+    of_ego = velocity @ back.T
+    by_offset = of_ego[second] - np.einsum("pij,pj->pi", second_T_first, of_ego[first])
+    by_poses = np.zeros((len(seen.pairs), len(t_ns), 6, 6))
+    row = np.arange(len(seen.pairs))
+    by_poses[row, second], by_poses[row, first] = back, -second_T_first @ back
+    return Linearized(
+        seen.t_ns,
+        log_of(inverse(predicted) @ found).ravel(),
+        np.concatenate([by_offset[:, :, None], mount - second_T_first @ mount], axis=2).reshape(-1, VALUES),
+        by_poses.transpose(0, 2, 1, 3).reshape(6 * len(seen.pairs), -1),
+        [np.asarray(np.linalg.inv(pair.found.covariance), np.float64) for pair in seen.pairs],
+        prior_sigma**-2.0,
+        -values * prior_sigma**-2.0,
+    )

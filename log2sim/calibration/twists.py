@@ -32,24 +32,28 @@ def exp_of(twist: Array) -> Array:
 
 
 def log_of(motion: Array) -> Array:
-    """Compute the twist (6,) of a transform (4, 4)."""
-    q = quaternion_from_rotation(motion[:3, :3])
-    sine = float(np.linalg.norm(q[1:]))
-    factor = 2.0 if sine < 1e-12 else 2 * np.arctan2(sine, q[0]) / sine
-    return np.concatenate([motion[:3, 3], factor * q[1:]])
+    """Compute the twists (..., 6) of transforms (..., 4, 4)."""
+    q = quaternion_from_rotation(motion[..., :3, :3])
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    turned = sine > 1e-12
+    factor = np.where(turned, 2 * np.arctan2(sine, q[..., :1]) / np.where(turned, sine, 1.0), 2.0)
+    return np.concatenate([motion[..., :3, 3], factor * q[..., 1:]], axis=-1)
 
 
 def cross_matrix(v: Array) -> Array:
-    """Return the matrix (3, 3) by which a vector (3,) is crossed with others."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    """Return the matrices (..., 3, 3) by which vectors (..., 3) are crossed with others."""
+    out = np.zeros((*v.shape, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        out[..., j, i], out[..., i, j] = v[..., k], -v[..., k]
+    return out
 
 
 def adjoint_of(dst_T_src: Array) -> Array:
-    """Compute the matrix (6, 6) that takes a twist in the frame `src` to the one in `dst`."""
-    rotation = dst_T_src[:3, :3]
-    out = np.zeros((6, 6))
-    out[:3, :3] = out[3:, 3:] = rotation
-    out[:3, 3:] = cross_matrix(dst_T_src[:3, 3]) @ rotation
+    """Compute the matrices (..., 6, 6) that take twists in the frame `src` to those in `dst`, for transforms (..., 4, 4)."""
+    rotation = dst_T_src[..., :3, :3]
+    out = np.zeros((*dst_T_src.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = rotation
+    out[..., :3, 3:] = cross_matrix(dst_T_src[..., :3, 3]) @ rotation
     return out
 
 
@@ -66,6 +70,6 @@ def velocities_at(track: PoseTrack, t_ns: NDArray[np.int64]) -> tuple[Array, NDA
     (before, known), (at, is_known), (after, will_be_known) = (
         track.at(t_ns + shift) for shift in (-MOTION_SPAN_NS, 0, MOTION_SPAN_NS)
     )
-    rows = [log_of(inverse(m) @ a) - log_of(inverse(m) @ b) for b, m, a in zip(before, at, after)]
-    velocity = np.reshape(rows, (-1, 6)) / (2 * MOTION_SPAN_NS / NS_PER_S)
+    ego_T_map = inverse(at)
+    velocity = (log_of(ego_T_map @ after) - log_of(ego_T_map @ before)) / (2 * MOTION_SPAN_NS / NS_PER_S)
     return velocity, known & is_known & will_be_known
