@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 import pytest
 
-from log2sim import Config, open_log
+from log2sim import Config, open_log, pipeline
 from log2sim.calibration.cameras import check_cameras
 from log2sim.calibration.corrections import turn_mount
 from log2sim.calibration.depth_edges import DepthEdges, find_depth_edges, keep_standing
@@ -22,10 +23,23 @@ from log2sim.calibration.edge_alignment import (
     find_image_edges,
     score_angles,
 )
+from log2sim.calibration.edge_views import points_in_mount
 from log2sim.calibration.gray_images import read_gray
+from log2sim.calibration.image_flow import FlowPair, find_exchanged, flow_agreement
 from log2sim.datatypes import Fault, Log
-from log2sim.geometry import Array, Camera, apply, inverse, project, rotation_from_rpy, transform
-from log2sim.sensors import Sensors, choose_detector, select_sensors
+from log2sim.geometry import (
+    Array,
+    Camera,
+    PoseTrack,
+    RollingShutter,
+    apply,
+    inverse,
+    project,
+    project_moving,
+    rotation_from_rpy,
+    transform,
+)
+from log2sim.sensors import choose_detector, select_sensors
 
 SAMPLE = Path(__file__).parents[1] / "samples/crossing"
 FORWARD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -147,6 +161,59 @@ def test_a_camera_that_lies_on_its_side_has_its_upright_edges_along_the_rows() -
     np.testing.assert_allclose(lying, find_image_edges(gray, sideways=False).T, atol=1e-4)
 
 
+# Motion in images
+
+
+def flow_pairs(camera: Camera, rng: np.random.Generator) -> list[FlowPair]:
+    """Exact motion of standing points around the road for an ego that goes ahead and turns, some of them on a car that overtakes."""
+    pairs = []
+    for _ in range(4):
+        points = rng.uniform([-30.0, -30.0, -1.0], [30.0, 30.0, 6.0], (2000, 3))
+        second_T_first = inverse(transform(rotation_from_rpy(0.0, 0.0, rng.uniform(-0.05, 0.05)), [1.0, 0.02, 0.0]))
+        after = apply(second_T_first, points)
+        after[:300, 0] += 3.0
+        both = [apply(inverse(camera.mount_T_cam), xyz) for xyz in (points, after)]
+        shown = project(camera, both[0])[1] & project(camera, both[1])[1]
+        rays = [xyz[shown] / np.linalg.norm(xyz[shown], axis=1)[:, None] for xyz in both]
+        pairs.append(FlowPair(rays[0], rays[1], second_T_first))
+    return pairs
+
+
+def test_points_move_as_the_own_mount_says_and_exchanged_mounts_show() -> None:
+    rng = np.random.default_rng(5)
+    rig = {
+        name: replace(yawed(CAMERA, degrees), name=name)
+        for name, degrees in (("front", 0), ("left", 70), ("right", -70))
+    }
+    pairs = {name: flow_pairs(camera, rng) for name, camera in rig.items()}
+    for name, camera in rig.items():
+        assert (flow_agreement(camera, pairs[name]) or 0.0) > 0.99
+        assert (flow_agreement(yawed(camera, 3.0), pairs[name]) or 0.0) > 0.9
+    assert find_exchanged(rig, pairs) == {}
+    swapped = {"front": rig["front"], "left": rig["right"], "right": rig["left"]}
+    assert find_exchanged(swapped, pairs) == {"left": "right", "right": "left"}
+    overtaken = {**pairs, "left": pairs["right"]}
+    assert find_exchanged(rig, overtaken) == {}
+    assert flow_agreement(rig["left"], pairs["left"][:2]) is None
+
+
+def test_exchanged_mounts_are_told_without_a_lidar(sample: Log) -> None:
+    blind = sample.changed(lidars={})
+    assert checked(blind) == (blind, ())
+    left, right = sample.cameras["front_left"], sample.cameras["front_right"]
+    swapped = with_cameras(
+        blind, replace(left, mount_T_cam=right.mount_T_cam), replace(right, mount_T_cam=left.mount_T_cam)
+    )
+    _, faults = checked(swapped)
+    assert [(f.kind, f.sensor, f.treatment) for f in faults] == [
+        ("swapped_cameras", "front_left", "kept"),
+        ("swapped_cameras", "front_right", "kept"),
+    ]
+    assert sample.ego is not None
+    standing = replace(sample.ego, map_T_ego=np.repeat(sample.ego.map_T_ego[:1], len(sample.ego.t_ns), axis=0))
+    assert checked(swapped.changed(ego=standing))[1] == ()
+
+
 # The sample
 
 
@@ -262,8 +329,39 @@ def test_boxes_of_the_log_need_no_picture(sample: Log) -> None:
     assert check_cameras(log, config, select_sensors(log, config), progress=lambda *_: None)[1] == ()
 
 
-def test_sensors_go_on_without_cameras_that_are_left_out() -> None:
-    assert Sensors(("a", "b", "c"), ("top",)).without(["b", "top"]) == Sensors(("a", "c"), ("top",))
+def test_a_run_goes_on_without_cameras_that_are_left_out(sample: Log, monkeypatch: pytest.MonkeyPatch) -> None:
+    left_out = Fault("swapped_cameras", "front", "", "left_out")
+    kept = Fault("swapped_cameras", "front_left", "", "kept")
+    monkeypatch.setattr(pipeline, "check_calibration", lambda log, *_, **__: (log, (left_out, kept)))
+    run = pipeline.start(sample, Config().changed(detect={"name": "labels"}))
+    assert run.plan.cameras == ("front_left", "front_right")
+    assert run.schedule.reference == "front_left"
+    assert run.faults[-2:] == (left_out, kept)
+
+
+@pytest.mark.parametrize("direction", ["down", "left"])
+def test_points_are_where_they_are_when_their_line_is_exposed(direction: Literal["down", "left"]) -> None:
+    t_ns, speed_mps = np.arange(0, 2_000_000_000, 10_000_000), 20.0
+    poses = transform(np.eye(3), np.stack([speed_mps * t_ns / 1e9, 0 * t_ns, 0 * t_ns], axis=1))
+    none: dict[str, Any] = {}
+    ego = PoseTrack(t_ns, poses)
+    log = Log("drive", "test", none, none, none, ego=ego)
+    camera = replace(CAMERA, rolling_shutter=RollingShutter(direction, 0.04))
+    points = np.random.default_rng(0).uniform([35.0, -5.0, 0.0], [60.0, 5.0, 5.0], (50, 3))
+    found = points_in_mount(log, camera, 1_000_000_000, points)
+    assert found is not None
+    uv, _, valid = project_moving(
+        camera,
+        points,
+        lambda s: inverse(ego.at(1_000_000_000 + np.round(s * 1e9).astype(int))[0] @ camera.mount_T_cam),
+    )
+    assert valid.sum() > 20
+    np.testing.assert_allclose(
+        project(camera, apply(inverse(camera.mount_T_cam), found))[0][valid], uv[valid], atol=0.1
+    )
+    still = points_in_mount(log, replace(camera, rolling_shutter=None), 1_000_000_000, points)
+    assert still is not None
+    assert np.abs(found - still)[:, 0].max() > 0.1
 
 
 def test_gray_images_are_the_same_from_bytes_and_from_pictures(sample: Log) -> None:

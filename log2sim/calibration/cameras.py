@@ -1,18 +1,18 @@
-"""Mounts of cameras, checked against a LiDAR beside them."""
+"""Mounts of cameras, checked against a LiDAR beside them and the motion of the ego."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 
-from log2sim.calibration.corrections import turn_mount
-from log2sim.calibration.edge_alignment import REACH_RAD, EdgeView, YawEstimate, estimate_yaw, score_angles
+from log2sim.calibration.edge_alignment import YawEstimate
 from log2sim.calibration.edge_views import EdgeViews, choose_moments, is_near
+from log2sim.calibration.mount_mistakes import Mistake, MountCheck, estimate_mount_yaw, find_mistakes, turn_by
 from log2sim.config import Config
 from log2sim.datatypes import Fault, Log, Treatment
-from log2sim.geometry import Array, Camera, inverse, rotation_from_rpy, transform
+from log2sim.geometry import Array
 from log2sim.localization.choice import during_ns
 from log2sim.localization.ego_sweeps import densest_lidar
 from log2sim.plan import LABELS
@@ -21,10 +21,6 @@ from log2sim.sensors import Sensors
 # At 30 m this is 0.3 m, half the width of a pedestrian: LiDAR points leave the image boxes of their objects.
 MIN_TOLD_RAD = 0.01
 MIN_SIGMAS = 4.0
-# What may be left of the yaw with the mount of another camera.
-MAX_LEFT_RAD = np.deg2rad(1.5)
-# A camera that is turned far is looked at again from there, so that the whole range of angles lies around it.
-MAX_ROUNDS = 3
 FIX = "--fix-calibration"
 DONE: Mapping[Treatment, str] = {
     "corrected": "corrected",
@@ -34,48 +30,6 @@ DONE: Mapping[Treatment, str] = {
 NOT_SEEN = "the mount is not corrected: the edges that {} sees do not show whether it is turned"
 
 Progress = Callable[[str, int, int], None]
-
-
-@dataclass(frozen=True, eq=False)
-class _Check:
-    """What the mounts of a log are checked with, and what came of it.
-
-    Attributes
-    ----------
-    log : Log
-    lidar : str
-    views : mapping of str to list of EdgeView
-        By camera.
-    yaws : mapping of str to YawEstimate or None
-        By camera, with its own mount.
-    """
-
-    log: Log
-    lidar: str
-    views: Mapping[str, list[EdgeView]]
-    yaws: Mapping[str, YawEstimate | None]
-
-
-@dataclass(frozen=True, eq=False)
-class _Mistake:
-    """A mount that fits the images of a camera where its own does not.
-
-    Attributes
-    ----------
-    kind : str
-        Of the fault.
-    words : str
-        What is wrong, with a place for the LiDAR.
-    mount_T_cam : (4, 4) float64
-        What fits.
-    other : str
-        The camera whose mount it is; "" for none.
-    """
-
-    kind: str
-    words: str
-    mount_T_cam: Array
-    other: str = ""
 
 
 def check_cameras(
@@ -98,27 +52,27 @@ def check_cameras(
 
     Notes
     -----
-    Nothing is said of a camera with which no LiDAR is mounted, that shows no edges, or of which several angles fit alike;
-    and no image is read where boxes come from the log. Where all cameras are turned alike, it is the LiDAR that is turned.
+    No yaw is estimated of a camera with which no LiDAR is mounted, that shows no edges, or of which several angles fit
+    alike; and no image is read where boxes come from the log. Where all cameras are turned alike, it is the LiDAR that is.
     """
     if config.detect.in_images in ("", LABELS):
         return log, ()
-    lidar = densest_lidar(sensors.restrict(log))
-    if lidar is None or any(fault.sensor == lidar and _is_wrong(fault) for fault in of_lidars):
-        return log, ()
+    lidar = densest_lidar(sensors.restrict(log)) or ""
+    if any(fault.sensor == lidar and _is_wrong(fault) for fault in of_lidars):
+        lidar = ""
     check = _look(log, lidar, config, sensors, progress)
     fix = config.calibration.fix_mounts
-    mistakes = _find_mistakes(check)
+    mistakes = find_mistakes(check, during_ns(log, config))
     mounts = {name: mistake.mount_T_cam for name, mistake in mistakes.items()}
-    treatment = _treat_mistakes(mounts, config, sensors)
-    faults = [_fault_of_mistake(name, lidar, mistake, treatment) for name, mistake in mistakes.items()]
+    treatments = _treat_mistakes(mistakes, config, sensors)
+    faults = [_fault_of_mistake(name, lidar, mistake, treatments[name]) for name, mistake in mistakes.items()]
     off = {name: yaw for name, yaw in check.yaws.items() if yaw is not None and is_off(yaw)}
     if turns_together(check.yaws):
         faults.append(_fault_of_lidar(lidar, off, fix=fix))
     else:
         faults += [_fault_of_yaw(name, check, yaw, fix=fix) for name, yaw in off.items()]
-    mounts |= {name: _turned(log.cameras[name].mount_T_cam, yaw.yaw_rad) for name, yaw in off.items()}
-    unknown = [name for name, yaw in check.yaws.items() if fix and yaw is None and name not in mistakes]
+    mounts |= {name: turn_by(log.cameras[name].mount_T_cam, yaw.yaw_rad) for name, yaw in off.items()}
+    unknown = [name for name, yaw in check.yaws.items() if fix and lidar and yaw is None and name not in mistakes]
     faults += [Fault("unknown_rotation", name, NOT_SEEN.format(lidar), "kept") for name in unknown]
     return (with_mounts(log, mounts) if fix and mounts else log), tuple(faults)
 
@@ -128,12 +82,13 @@ def _is_wrong(fault: Fault) -> bool:
     return fault.treatment == "kept" and fault.kind in ("time_offset", "lidar_rotation")
 
 
-def _treat_mistakes(names: Collection[str], config: Config, sensors: Sensors) -> Treatment:
+def _treat_mistakes(mistakes: Mapping[str, Mistake], config: Config, sensors: Sensors) -> dict[str, Treatment]:
     """Decide what is done about cameras with wrong mounts; they are left out where the run can go on without them."""
+    certain = {name for name, mistake in mistakes.items() if mistake.certain}
+    dispensable = bool(set(sensors.cameras) - certain) and config.sync.reference not in certain
     if config.calibration.fix_mounts:
-        return "corrected"
-    remain = set(sensors.cameras) - set(names)
-    return "left_out" if remain and config.sync.reference not in names else "kept"
+        return dict.fromkeys(mistakes, "corrected")
+    return {name: "left_out" if dispensable and name in certain else "kept" for name in mistakes}
 
 
 def is_off(yaw: YawEstimate) -> bool:
@@ -157,86 +112,26 @@ def with_mounts(log: Log, mounts: Mapping[str, Array]) -> Log:
     return log.changed(cameras={**log.cameras, **moved})
 
 
-def _look(log: Log, lidar: str, config: Config, sensors: Sensors, progress: Progress) -> _Check:
+def _look(log: Log, lidar: str, config: Config, sensors: Sensors, progress: Progress) -> MountCheck:
     """Look at frames of the cameras beside a LiDAR and at its sweeps, over the log."""
-    names = [name for name in sensors.cameras if is_near(log, name, lidar)]
+    unknown = dict.fromkeys(sensors.cameras)
+    names = [name for name in sensors.cameras if lidar and is_near(log, name, lidar)]
     if not names:
-        return _Check(log, lidar, {}, {})
+        return MountCheck(log, lidar, {}, unknown)
     reference = log.reference_camera if log.reference_camera in names else names[0]
     moments = choose_moments(log, lidar, reference, during_ns(log, config))
     seen = EdgeViews(log, moments, lambda done, total: progress("check cameras", done, total))
     views = {name: seen.of_camera(name) for name in names}
-    return _Check(log, lidar, views, {name: _yaw_of(log.cameras[name], views[name]) for name in names})
+    return MountCheck(
+        log, lidar, views, unknown | {name: estimate_mount_yaw(log.cameras[name], views[name]) for name in names}
+    )
 
 
-def _yaw_of(camera: Camera, views: list[EdgeView]) -> YawEstimate | None:
-    """Estimate the yaw that the mount of a camera lacks."""
-    turned_rad = 0.0
-    for _ in range(MAX_ROUNDS):
-        turned = replace(camera, mount_T_cam=_turned(camera.mount_T_cam, turned_rad))
-        found = estimate_yaw([score_angles(turned, view) for view in views])
-        if found is None:
-            return None
-        turned_rad += found.yaw_rad
-        if abs(found.yaw_rad) < REACH_RAD / 2:
-            return replace(found, yaw_rad=turned_rad)
-    return None
-
-
-def _find_mistakes(check: _Check) -> dict[str, _Mistake]:
-    """Find the cameras of which the own mount does not fit while another one does: the one with the clearest edges."""
-    mistakes = {}
-    for name, yaw in check.yaws.items():
-        camera, best = check.log.cameras[name], 0.0
-        for mistake in _list_mistakes(check, name) if yaw is None else ():
-            found = _yaw_of(replace(camera, mount_T_cam=mistake.mount_T_cam), check.views[name])
-            if found is not None and abs(found.yaw_rad) < MAX_LEFT_RAD and found.gain > best:
-                mistakes[name], best = mistake, found.gain
-    return mistakes | _list_exchanged(check, mistakes)
-
-
-def _list_exchanged(check: _Check, mistakes: Mapping[str, _Mistake]) -> dict[str, _Mistake]:
-    """List the cameras whose mount is another one's, though their own images do not show it: they get what that one had."""
-    return {
-        mistake.other: _Mistake(
-            "swapped_cameras",
-            f"its mount is that of {name}, whose images fit edges of {{}} with it and not with the mount of {name}",
-            check.log.cameras[name].mount_T_cam,
-            name,
-        )
-        for name, mistake in mistakes.items()
-        if mistake.other and mistake.other not in mistakes
-    }
-
-
-def _list_mistakes(check: _Check, name: str) -> list[_Mistake]:
-    """List the mounts that a camera may have instead of its own: those of others that do not fit them either, and likely slips."""
-    cameras, own = check.log.cameras, check.log.cameras[name].mount_T_cam
-    others = [other for other, yaw in check.yaws.items() if other != name and yaw is None]
-    fits = "edges of {} fit its images with"
-    listed = [
-        _Mistake(
-            "swapped_cameras",
-            f"sees {other}'s points: {fits} the mount of {other} and not with its own",
-            cameras[other].mount_T_cam,
-            other,
-        )
-        for other in others
-    ]
-    inverted = f"its mount in the calibration is inverted: {fits} the inverse and not as it is"
-    listed.append(_Mistake("wrong_mount", inverted, inverse(own)))
-    for degrees in (90, 180, 270):
-        about_axis = transform(rotation_from_rpy(0.0, 0.0, np.deg2rad(degrees)), np.zeros(3))
-        words = f"its images are turned by {degrees} degrees: {fits} its mount turned about the optical axis and not as it is"
-        listed.append(_Mistake("wrong_mount", words, own @ about_axis))
-    return listed
-
-
-def _fault_of_mistake(name: str, lidar: str, mistake: _Mistake, treatment: Treatment) -> Fault:
+def _fault_of_mistake(name: str, lidar: str, mistake: Mistake, treatment: Treatment) -> Fault:
     return Fault(mistake.kind, name, f"{mistake.words.format(lidar)}; {DONE[treatment]}", treatment)
 
 
-def _fault_of_yaw(name: str, check: _Check, yaw: YawEstimate, *, fix: bool) -> Fault:
+def _fault_of_yaw(name: str, check: MountCheck, yaw: YawEstimate, *, fix: bool) -> Fault:
     treatment: Treatment = "corrected" if fix else "kept"
     alone = sum(other is not None for other in check.yaws.values()) == 1
     message = (
@@ -261,10 +156,6 @@ def _fault_of_lidar(lidar: str, yaws: Mapping[str, YawEstimate], *, fix: bool) -
         f"alike; {done}"
     )
     return Fault("lidar_rotation", lidar, message, "corrected" if fix else "kept", values=_values(mean))
-
-
-def _turned(mount_T_cam: Array, yaw_rad: float) -> Array:
-    return turn_mount(mount_T_cam, np.array([0.0, 0.0, yaw_rad]))
 
 
 def _words(yaw: YawEstimate) -> str:
