@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
+import os
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,6 +12,9 @@ from pathlib import Path
 
 from log2sim.errors import ConfigError
 from log2sim.outputs import remove, temporary_beside, written_meanwhile
+
+# Of the system call: paths count from the working folder; both names stay, exchanged (linux/fcntl.h, linux/fs.h).
+_WORKING_FOLDER, _EXCHANGE = -100, 2
 
 
 @contextmanager
@@ -26,9 +31,16 @@ def replaced_folder(target: Path, *, overwrite: bool) -> Iterator[Path]:
     ------
     ConfigError
         When it cannot be written, naming the file in it, or when another run wrote the target meanwhile.
+
+    Notes
+    -----
+    On Linux the new folder and the one that it replaces exchange their names at once, so that a run that is killed leaves either. On
+    other systems there is a moment at which the target has no name; what was there is beside it then, as `.NAME.XXXXXXXX.old`.
     """
     with unfinished_folder(temporary_beside(target), target) as temporary:
         yield temporary
+        if overwrite and target.exists() and exchange_names(temporary, target):
+            return  # what was there is under the temporary name now, and is removed with it
         # Under another name than what a later run removes: it is the only copy until the new folder is in its place.
         earlier = target.with_name(f".{target.name}.{secrets.token_hex(4)}.old")
         if overwrite and target.exists():
@@ -44,6 +56,16 @@ def replaced_folder(target: Path, *, overwrite: bool) -> Iterator[Path]:
                 raise written_meanwhile(target) from None
             raise
         remove(earlier)
+
+
+def exchange_names(one: Path, other: Path) -> bool:
+    """Exchange the names of two files or folders at once, by renameat2 of Linux; return False where that is not possible."""
+    try:
+        rename = ctypes.CDLL(None, use_errno=True).renameat2
+    except (OSError, AttributeError, TypeError):  # another system, an old C library, Windows
+        return False
+    names = os.fsencode(one.absolute()), os.fsencode(other.absolute())
+    return bool(rename(_WORKING_FOLDER, names[0], _WORKING_FOLDER, names[1], _EXCHANGE) == 0)
 
 
 @contextmanager

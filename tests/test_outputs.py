@@ -16,7 +16,7 @@ import pytest
 from command_line import names, run
 from worlds import tiny_toml
 
-from log2sim import outputs
+from log2sim import output_folders, outputs
 from log2sim.cli.process import Ended, TolerantStream, ending_by_signals
 from log2sim.documents import check_targets, refuse_below_file, replaced, write_json
 from log2sim.errors import ConfigError
@@ -406,20 +406,49 @@ def test_a_folder_that_cannot_be_placed_leaves_the_earlier_one(tmp_path: Path, m
         return sound(self, new)
 
     monkeypatch.setattr(Path, "rename", fails)
+    monkeypatch.setattr(output_folders, "exchange_names", lambda one, other: False)  # as on other systems
     with pytest.raises(ConfigError, match="log: cannot be written: No space"), replaced_folder(target, overwrite=True):
         pass
     assert names(target) == ["a"]
     assert names(tmp_path) == ["log"]
 
 
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="names are exchanged at once on Linux")
+def test_a_folder_that_is_replaced_is_there_at_every_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    target = tmp_path / "log"
+    target.mkdir()
+    (target / "old").write_text("x")
+    monkeypatch.setattr(Path, "rename", lambda self, new: pytest.fail(f"{self} is renamed"))
+    seen = []
+    sound = output_folders.exchange_names
+
+    def watched(one: Path, other: Path) -> bool:
+        seen.append((names(one), names(other)))
+        done = sound(one, other)
+        seen.append((names(one), names(other)))
+        return done
+
+    monkeypatch.setattr(output_folders, "exchange_names", watched)
+    with replaced_folder(target, overwrite=True) as folder:
+        (folder / "new").write_text("x")
+    assert seen == [(["new"], ["old"]), (["old"], ["new"])]
+    assert names(target) == ["new"]
+    assert names(tmp_path) == ["log"]
+
+
+def test_names_are_exchanged_or_nothing_happens(tmp_path: Path) -> None:
+    assert not output_folders.exchange_names(tmp_path / "none", tmp_path / "nothing")
+    assert names(tmp_path) == []
+
+
 def test_files_of_an_export_replace_none_of_another_run(
     tiny_scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "o"
+    out.mkdir()
     sound = exporters.place_all
 
     def late(files: list[tuple[Path, Path]]) -> None:
-        out.mkdir()
         files[-1][1].write_text("of another")
         sound(files)
 
@@ -428,3 +457,22 @@ def test_files_of_an_export_replace_none_of_another_run(
     assert ran.code == 2
     assert "another run has written it meanwhile" in ran.line
     assert [p.read_text() for p in out.iterdir()] == ["of another"]
+
+
+def test_a_new_folder_of_an_export_replaces_none_of_another_run(
+    tiny_scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "o"
+    sound = Path.rename
+
+    def late(self: Path, new: Path) -> Path:
+        out.mkdir()
+        (out / "agents.csv").write_text("of another")
+        return sound(self, new)
+
+    monkeypatch.setattr(Path, "rename", late)
+    ran = run("export", tiny_scenario, "--to", "csv", "--out", out)
+    assert ran.code == 2
+    assert "another run has written it meanwhile" in ran.line
+    assert [p.read_text() for p in out.iterdir()] == ["of another"]
+    assert names(tmp_path) == ["o"]

@@ -227,6 +227,32 @@ def test_the_table_counts_each_input_once() -> None:
     assert len(lines) == 5
 
 
+def test_what_a_kill_may_leave(tmp_path: Path) -> None:
+    whole = {"a.json": 1000, "b.png": 500}
+
+    def left(files: dict[str, int], before: tuple[str, ...] = ()) -> str:
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+        (tmp_path / "out").mkdir()
+        for name in before:
+            (tmp_path / "out" / name).write_bytes(bytes(whole[name]))
+        inodes = killing.names_and_inodes(tmp_path / "out")
+        for name, size in files.items():
+            (tmp_path / "new").write_bytes(bytes(size))
+            (tmp_path / "new").rename(tmp_path / "out" / name)
+        return killing._what_is_left(tmp_path / "out", inodes, whole)[0]
+
+    both = tuple(whole)
+    assert left({}) == "nothing"
+    assert left({".a.json.0-1-2": 30}) == "nothing"
+    assert left(whole) == "whole"
+    assert left({"a.json": 1000}) == "torn"
+    assert left({"a.json": 400, "b.png": 500}) == "torn"
+    assert left({}, both) == "old"
+    assert left(whole, both) == "whole"
+    assert left({"a.json": 1000}, both) == "torn"
+    assert left({"a.json": 0, "b.png": 0}, both) == "torn"
+
+
 @pytest.mark.slow
 def test_nothing_crashes_hangs_or_is_swallowed(tmp_path: Path) -> None:
     harness = Harness(tmp_path.resolve())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Protocol
@@ -12,7 +13,7 @@ from log2sim.documents import check_folder, refuse_existing
 from log2sim.errors import ConfigError
 from log2sim.export.checks import require_exportable
 from log2sim.output_folders import unfinished_folder
-from log2sim.outputs import expect_new, place_all, temporary_beside
+from log2sim.outputs import expect_new, place_all, temporary_beside, written_meanwhile
 
 __all__ = ["Exporter", "Options", "export", "formats"]
 
@@ -139,6 +140,14 @@ def _move_into(temporary: Path, folder: Path, *, overwrite: bool) -> tuple[Path,
         if (folder / name).is_dir():
             raise ConfigError(f"{folder / name}: is a folder, where a file would be written; choose another folder")
     targets = tuple(folder / name for name in names)
+    if not folder.exists():
+        try:
+            temporary.rename(folder)  # all files at once
+        except OSError as error:
+            if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
+                raise written_meanwhile(folder) from None
+            raise
+        return targets
     if not overwrite:
         expect_new(targets)
     place_all([(temporary / name, folder / name) for name in names])
