@@ -21,6 +21,7 @@ from log2sim.perception.record_checks.sweep_sketches import common_share, sketch
 from log2sim.perception.record_checks.thumbnails import measure_change, shows_nothing, shrink
 from log2sim.perception.sync import synchronize
 from log2sim.pipeline import reconstruct
+from log2sim.visualization.birdseye.of_log import birdseye_of_log
 
 STEP_NS = 100_000_000
 COUNT = 10
@@ -370,3 +371,14 @@ def test_positions_are_as_uncertain_as_their_errors_while_no_sweeps_come():
     error, sigma = (np.concatenate([found[k] for found in several]) for k in range(2))
     assert np.mean((error**2).sum(axis=1) / (2 * sigma**2)) < 2.0
     assert sigma.max() < 1.0
+
+
+def test_black_pictures_are_not_mapped():
+    log, truth = tiny_log(observe=False)
+    read = log.streams["front"].read
+    half = Stream("front", log.streams["front"].t_ns, lambda i: read(i) * np.uint8(i < 5))
+    whole, part = (
+        birdseye_of_log(changed, truth) for changed in (log, log.changed(streams={**log.streams, "front": half}))
+    )
+    assert 0 < part.coverage.sum() < whole.coverage.sum()
+    assert part.image_bgr[part.coverage].min() > 20

@@ -13,6 +13,7 @@ from log2sim.errors import LogError
 from log2sim.geometry import NS_PER_S, nearest_index
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.lidar.cloud import cloud_origin
+from log2sim.perception.record_checks.thumbnails import shrink
 from log2sim.visualization.birdseye.ground_view import GroundView
 from log2sim.visualization.birdseye.mosaic import BirdsEyeView, Mosaic
 
@@ -54,7 +55,8 @@ def birdseye_of_log(log: Log, scenario: Scenario, reader: RecordReader | None = 
             if not known[0]:
                 continue
             image = reader.get(name, i)
-            if image is not None:
+            # What a black picture or a copy of an earlier one shows is not there.
+            if image is not None and reader.watch.cameras[name].judge(int(stream.t_ns[i]), shrink(image)) == "live":
                 views.append(GroundView.from_pose(image, log.cameras[name], map_T_cam[0], ground_z))
         mosaic.add(views)
     reader.require_some()
