@@ -14,7 +14,7 @@ import pytest
 from log2sim import Config, open_log, pipeline
 from log2sim.calibration.cameras import check_cameras
 from log2sim.calibration.corrections import turn_mount
-from log2sim.calibration.depth_edges import DepthEdges, find_depth_edges, keep_standing
+from log2sim.calibration.depth_edges import DepthEdges, find_depth_edges, keep_standing, read_depth_edges
 from log2sim.calibration.edge_alignment import (
     SYSTEMATIC_RAD,
     EdgeView,
@@ -23,7 +23,7 @@ from log2sim.calibration.edge_alignment import (
     find_image_edges,
     score_angles,
 )
-from log2sim.calibration.edge_views import points_in_mount
+from log2sim.calibration.edge_views import EdgeViews, choose_moments, points_in_mount
 from log2sim.calibration.gray_images import read_gray
 from log2sim.calibration.image_flow import FlowPair, find_exchanged, flow_agreement
 from log2sim.datatypes import Fault, Log
@@ -90,12 +90,14 @@ def test_edges_that_are_elsewhere_in_the_next_sweep_are_left_out() -> None:
 # Alignment in a world of posts
 
 
-def world(camera: Camera, rng: np.random.Generator, *, frames: int = 10, overhang_rad: float = 0.002) -> list[EdgeView]:
+def world(
+    camera: Camera, rng: np.random.Generator, *, frames: int = 10, overhang_rad: float = 0.002, left_share: float = 0.5
+) -> list[EdgeView]:
     """Pictures of the upright edges of panels, as many edges that no LiDAR sees, and points beside the ends of the panels."""
     views = []
     for _ in range(frames):
         azimuth, range_m = rng.uniform(-0.5, 0.5, 12), rng.uniform(6.0, 40.0, 12)
-        left = rng.random(12) < 0.5
+        left = rng.random(12) < left_share
         gray = np.full((camera.height_px, camera.width_px), 60, np.uint8)
         points = []
         for a, r, is_left in zip(azimuth, range_m, left):
@@ -127,6 +129,13 @@ def test_the_yaw_that_a_mount_lacks_is_found(degrees: float) -> None:
     assert np.degrees(found.yaw_rad) == pytest.approx(-degrees, abs=0.06)
 
 
+def test_surfaces_that_go_on_beyond_their_last_point_turn_no_camera() -> None:
+    views = world(CAMERA, np.random.default_rng(4), frames=14, overhang_rad=0.0044, left_share=0.75)
+    found = estimated(CAMERA, views)
+    assert found is not None
+    assert abs(np.degrees(found.yaw_rad)) < 0.08
+
+
 def test_errors_are_as_large_as_the_scatter_between_parts_of_the_log() -> None:
     errors, scatter = [], []
     for seed in range(8):
@@ -145,11 +154,15 @@ def test_pictures_of_another_place_give_no_yaw() -> None:
         assert estimated(CAMERA, mixed) is None
 
 
-def test_one_frame_does_not_decide() -> None:
+def test_few_frames_do_not_decide() -> None:
     views = world(CAMERA, np.random.default_rng(0))
     dark = [replace(view, gray=np.zeros_like(view.gray)) for view in views[1:]]
     assert estimated(CAMERA, [views[0], *dark]) is None
     assert estimated(CAMERA, views[:1]) is None
+    shown = {0, 4, 8}
+    dark = [replace(view, gray=np.zeros_like(view.gray)) for view in views]
+    assert estimated(CAMERA, [views[k] if k in shown else dark[k] for k in range(10)]) is None
+    assert estimated(CAMERA, [views[k] if k in shown | {2, 6} else dark[k] for k in range(10)]) is not None
 
 
 def test_a_camera_that_lies_on_its_side_has_its_upright_edges_along_the_rows() -> None:
@@ -194,6 +207,9 @@ def test_points_move_as_the_own_mount_says_and_exchanged_mounts_show() -> None:
     assert find_exchanged(swapped, pairs) == {"left": "right", "right": "left"}
     overtaken = {**pairs, "left": pairs["right"]}
     assert find_exchanged(rig, overtaken) == {}
+    behind = flow_pairs(yawed(CAMERA, 180.0), rng)
+    assert (flow_agreement(rig["right"], behind) or 0.0) < 0.3
+    assert find_exchanged(rig, {**overtaken, "right": behind}) == {}
     assert flow_agreement(rig["left"], pairs["left"][:2]) is None
 
 
@@ -231,6 +247,16 @@ def checked(log: Log, *, fix: bool = False, of_lidars: tuple[Fault, ...] = ()) -
         log, Config().changed(calibration={"fix_mounts": fix}, detect={"name": "ssd-mobilenet-v2"})
     )
     return check_cameras(log, config, select_sensors(log, config), of_lidars=of_lidars, progress=lambda *_: None)
+
+
+def test_only_edges_that_stand_are_looked_at(sample: Log) -> None:
+    moments = choose_moments(sample, "lidar_top", "front", None)
+    views = EdgeViews(sample, moments, lambda *_: None).of_camera("front")
+    for view, row in zip(views, moments.sweeps.tolist(), strict=True):
+        all_edges, later = (read_depth_edges(sample, "lidar_top", k) for k in (row, row + 1))
+        assert all_edges is not None
+        assert later is not None
+        assert len(view.left) == len(keep_standing(all_edges, later).left) < len(all_edges.left)
 
 
 def test_nothing_is_said_of_the_sample(sample: Log) -> None:
