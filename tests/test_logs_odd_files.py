@@ -293,3 +293,18 @@ def test_a_word_in_an_entry_that_may_be_missing_is_refused(encoded: Callable[[En
         open_log(log)
     path.write_text(f"calib_time: 09-Jan-2012\n{sound}")
     assert open_log(log).streams
+
+
+def test_images_without_times_of_their_exposure_are_told(encoded: Callable[[Encode], Path]) -> None:
+    pyarrow = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    log = encoded(waymo_parquet.encode)
+    assert not any("times of their exposure" in note for note in open_log(log).notes)
+    path = next((log / "camera_image").iterdir())
+    table = parquet.read_table(path)
+    name = next(n for n in table.column_names if n.endswith("camera_trigger_time"))
+    values = table[name].to_pylist()
+    table = table.set_column(table.column_names.index(name), name, pyarrow.array([values[0], np.nan, *values[2:]]))
+    parquet.write_table(table, path)
+    words = f"FRONT: 1 of {len(values)} images without the times of their exposure: those of their poses are taken"
+    assert words in open_log(log).notes

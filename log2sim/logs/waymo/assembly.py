@@ -109,6 +109,11 @@ class _Assembly:
                     self.notes.append(f"{name}: no images of this camera")
                 continue
             camera = camera_of(name, calibration, [self.frames[k] for k in rows], number)
+            untimed = sum(not self.frames[k].images[number].is_timed for k in rows)
+            if untimed:
+                self.notes.append(
+                    f"{name}: {untimed} of {len(rows)} images without the times of their exposure: those of their poses are taken"
+                )
             t_ns = np.array([self._image_ns(k, number) for k in rows], dtype=np.int64)
             keep, problems = strictly_increasing(t_ns, name)
             self.notes += problems

@@ -88,6 +88,11 @@ class ImageTimes:
     trigger_s: float
     readout_done_s: float
 
+    @property
+    def is_timed(self) -> bool:
+        """Whether the begin and the end of the exposure are stated."""
+        return 0 < self.trigger_s <= self.readout_done_s < MAX_TIME_S
+
     def middle_ns(self) -> int | None:
         """Return the middle of the exposure of the middle line; None where the data set does not state it.
 
@@ -96,7 +101,7 @@ class ImageTimes:
         The first line is exposed from the trigger on, the last one until its readout at the end (comments of CameraImage in
         dataset.proto): half a shutter after the trigger and half a shutter before the end lie the middles of both.
         """
-        if not 0 < self.trigger_s <= self.readout_done_s < MAX_TIME_S:
+        if not self.is_timed:
             return self.pose_ns()
         return round((self.trigger_s + (self.readout_done_s - self.trigger_s) / 2) * NS_PER_S)
 
