@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import (
-    NS_PER_S,
-    Array,
-    PoseTrack,
-    rotation_from_rpy,
-    yaw_of,
-)
+from log2sim.geometry import NS_PER_S, Array, PoseTrack, rotation_from_rpy, yaw_of
 from log2sim.localization.path_fit import POSITION_PRIOR, YAW_PRIOR, PathPrior
 from log2sim.localization.path_noise import independent_noise
+from log2sim.localization.path_parts import Skip
 from log2sim.localization.path_repair import MAX_DENSE_S, Limits, RepairedPath, bridge, repair_path, runs_of
 from log2sim.localization.path_smoothing import smooth_path
 
@@ -28,8 +24,9 @@ MAX_ACCELERATION_MPS2, MAX_YAW_ACCELERATION_RADPS2 = 12.0, 5.0
 MIN_STEP_M, MIN_STEP_RAD = 0.4, np.deg2rad(2.0)
 # Standard deviations of poses of GNSS/INS with RTK or LiDAR odometry.
 USUAL_SIGMA_M, USUAL_SIGMA_RAD = 0.02, 0.002
-POSITION = Limits(MAX_ACCELERATION_MPS2, POSITION_PRIOR, MIN_STEP_M, USUAL_SIGMA_M)
-YAW = Limits(MAX_YAW_ACCELERATION_RADPS2, YAW_PRIOR, MIN_STEP_RAD, USUAL_SIGMA_RAD)
+MIN_LASTING_STEP_M, MIN_LASTING_STEP_RAD = 2.0, np.deg2rad(5.0)
+POSITION = Limits(MAX_ACCELERATION_MPS2, POSITION_PRIOR, MIN_STEP_M, MIN_LASTING_STEP_M, USUAL_SIGMA_M)
+YAW = Limits(MAX_YAW_ACCELERATION_RADPS2, YAW_PRIOR, MIN_STEP_RAD, MIN_LASTING_STEP_RAD, USUAL_SIGMA_RAD)
 # Poses with more noise across the path are smoothed. With the noise of the sample and of recorded drives it changes nothing, of
 # which a part is of their stamps; with 0.05 m it halves the errors of agents.
 MIN_SMOOTHED_M = 0.04
@@ -48,7 +45,7 @@ class Stretch:
     Attributes
     ----------
     kind : {"pose_jump", "frozen_poses", "gap", "skip"}
-        A skip is a step forward that stays: the position may have jumped, or stamps may miss as much time.
+        A skip is a step that stays: the position may have jumped, or stamps may miss some time.
     first_ns, last_ns : int
         Stamps of the first and the last pose in question; of a gap those around it.
     shift_m, turn_rad : float
@@ -125,7 +122,7 @@ def check_poses(track: PoseTrack) -> CheckedPoses:
     changed = level.moved | level.bridged | height.moved | height.bridged | yaw.moved | yaw.bridged
     new = _Path(path.t_s, np.hstack([level.values, height.values]), yaw.values[:, 0])
     stretches = [_stretch(track, path, new, rows, (level, yaw)) for rows in runs_of(changed)]
-    stretches += _skips(track, path, level)
+    stretches += _skips(track, (*level.skips, *height.skips))
     kept = ~changed | (_sigmas(level, yaw) <= [MAX_SIGMA_M, MAX_SIGMA_RAD]).all(axis=1)
     measured = ~(level.bridged | height.bridged | yaw.bridged)
     if _is_noisy(path.t_s[measured], new.xyz_m[measured, :2]) and not level.skips:
@@ -219,11 +216,11 @@ class _Evidence:
     noise: tuple[float, float]
 
 
-def _skips(track: PoseTrack, path: _Path, level: RepairedPath) -> list[Stretch]:
-    """List the steps forward that are worth a word."""
+def _skips(track: PoseTrack, skips: Sequence[Skip]) -> list[Stretch]:
+    """List the steps that stay and are worth a word."""
     return [
         Stretch("skip", int(track.t_ns[s.first]), int(track.t_ns[s.last]), shift_m=s.size)
-        for s in level.skips
+        for s in skips
         if s.size >= MIN_STEP_M
     ]
 

@@ -92,31 +92,32 @@ def fit_path(
     base = samples[0]
     shifted = np.zeros(len(t)) if after is None else after.astype(np.float64)
     noise = max(sigma, MIN_SIGMA) ** 2
-    covariance = _covariance(t, t, prior) + STEP_PRIOR**2 * np.outer(shifted, shifted) + noise * np.eye(len(t))
-    factor = np.linalg.cholesky(covariance)
-    whitened = np.linalg.solve(factor, samples - base)
-    cross = np.linalg.solve(factor, _covariance(t, asked, prior))
-    of_step = np.linalg.solve(factor, STEP_PRIOR**2 * shifted)
-    variance = _variance(asked, prior) - np.sum(cross**2, axis=0)
-    step_variance = STEP_PRIOR**2 * float(shifted.any()) - float(of_step @ of_step)
+    # Value, rate and change at the start and the step are estimated apart from the rest, which keeps the digits of both.
+    terms, asked_terms = np.column_stack([_powers(t), shifted]), np.column_stack([_powers(asked), np.zeros(len(asked))])
+    scale = np.array([prior.place, prior.rate, prior.change, STEP_PRIOR])
+    factor = np.linalg.cholesky(prior.density * _wandering(t, t) + noise * np.eye(len(t)))
+    design = np.linalg.solve(factor, terms * scale)
+    measured = np.linalg.solve(factor, samples - base)
+    cross = np.linalg.solve(factor, prior.density * _wandering(t, asked))
+    covariance = np.linalg.inv(design.T @ design + np.eye(len(scale)))
+    found = covariance @ design.T @ measured
+    reach = asked_terms * scale - cross.T @ design
+    variance = prior.density * asked**5 / 20 - np.sum(cross**2, axis=0) + np.sum((reach @ covariance) * reach, axis=1)
     return FittedPath(
-        base + cross.T @ whitened,
+        base + reach @ found + cross.T @ measured,
         np.sqrt(np.maximum(variance, 0.0)),
-        of_step @ whitened,
-        float(np.sqrt(max(step_variance, 0.0))),
+        STEP_PRIOR * found[3],
+        STEP_PRIOR * float(np.sqrt(covariance[3, 3])) if shifted.any() else 0.0,
     )
 
 
-def _covariance(first_s: Array, second_s: Array, prior: PathPrior) -> Array:
-    """Compute the covariances (n, m) of the path before it is measured between times (n,) and (m,) after its start."""
+def _powers(t_s: Array) -> Array:
+    """Return what value, rate and change at the start contribute at times (n,) after it: (n, 3)."""
+    return np.stack([np.ones(len(t_s)), t_s, t_s**2 / 2], axis=1)
+
+
+def _wandering(first_s: Array, second_s: Array) -> Array:
+    """Compute the covariances (n, m) of white noise that is integrated three times, of unit density, at times (n,) and (m,)."""
     a, b = first_s[:, None], second_s[None, :]
     early, apart = np.minimum(a, b), np.abs(a - b)
-    wandering = early**5 / 20 + apart * early**4 / 8 + apart**2 * early**3 / 12
-    line = prior.place**2 + prior.rate**2 * a * b + prior.change**2 * (a * b) ** 2 / 4
-    return np.asarray(line + prior.density * wandering)
-
-
-def _variance(t_s: Array, prior: PathPrior) -> Array:
-    """Compute the diagonal (n,) of `_covariance`."""
-    line = prior.place**2 + (prior.rate * t_s) ** 2 + (prior.change * t_s**2) ** 2 / 4
-    return np.asarray(line + prior.density * t_s**5 / 20)
+    return np.asarray(early**5 / 20 + apart * early**4 / 8 + apart**2 * early**3 / 12)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.localization.path_noise import MIN_SIGMA, SPANS_S
+from log2sim.localization.path_noise import SPANS_S
 
 # Of a normal distribution 6e-7 are beyond: one sample of the longest logs.
 MAX_SIGMAS = 5.0
@@ -31,6 +31,8 @@ MAX_REST = 0.05
 MAX_SKIP_S = 0.25
 # Vehicles that drive off or stop change their speed by less than this share of what they can.
 USUAL_CHANGE_SHARE = 1 / 3
+# Successive samples that repeat one, at least.
+MIN_SAME = 3
 # Parts farther back are no longer compared: between them almost any motion is possible.
 MAX_COMPARED = 30
 
@@ -97,7 +99,9 @@ def find_parts(samples: Samples) -> list[Part]:
     cores = [np.arange(first, end) for first, end in zip(edges[::2].tolist(), edges[1::2].tolist())]
     if not cores:
         return []
-    parts = [Part(rows) for rows in _grown(samples, cores)]
+    grown = _grown(samples, cores)
+    rows = [r for part in grown[:-1] for r in _without_rest(samples, part)] + grown[-1:]
+    parts = [Part(r) for r in rows]
     return _choose(samples, _marked_at_rest(samples, parts))
 
 
@@ -166,6 +170,18 @@ def _end(samples: Samples, rows: NDArray[np.intp], *, first: bool) -> _End:
     return _End(t_end, solution[0], solution[1], change, float(spread[0]), float(spread[1]), slack)
 
 
+def _without_rest(samples: Samples, rows: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """Divide a part that ends in one place, at which the path goes on with a break, unless the vehicle stopped there by itself."""
+    same = (samples.values[rows] == samples.values[rows[-1]]).all(axis=1)
+    moving = len(rows) - int(np.argmin(same[::-1])) if not same.all() else 0
+    if len(rows) - moving < MIN_SAME or moving < MIN_SAME:
+        return [rows]
+    end = _end(samples, rows[:moving], first=False)
+    place = samples.values[rows[-1]]
+    rest = _End(float(samples.t_s[rows[moving]]), place, np.zeros_like(place), np.zeros_like(place), 0.0, 0.0, 0.0)
+    return [rows] if _same_rate(samples, end, rest, USUAL_CHANGE_SHARE) else [rows[:moving], rows[moving:]]
+
+
 def _marked_at_rest(samples: Samples, parts: list[Part]) -> list[Part]:
     """Mark the parts that stay in one place although no vehicle stops or starts as suddenly as the path around them."""
     heads = [_end(samples, part.rows, first=True) for part in parts]
@@ -173,9 +189,12 @@ def _marked_at_rest(samples: Samples, parts: list[Part]) -> list[Part]:
     sudden = [not _same_rate(samples, tail, head, USUAL_CHANGE_SHARE) for tail, head in zip(tails, heads[1:])]
     most = max(MAX_REST, MAX_SIGMAS * samples.sigma)
     stays = [float(np.linalg.norm(np.ptp(samples.values[part.rows], axis=0))) <= most for part in parts]
-    return [
-        Part(part.rows, part.right, stays[k] and any(sudden[max(k - 1, 0) : k + 1])) for k, part in enumerate(parts)
-    ]
+    at_rest = [stays[k] and any(sudden[max(k - 1, 0) : k + 1]) for k in range(len(parts))]
+    for k, other in [*pairwise(range(len(parts))), *((k + 1, k) for k in reversed(range(len(parts) - 1)))]:
+        # Parts in the place of one that is at rest are at rest as well.
+        apart = samples.values[parts[k].rows[-1]] - samples.values[parts[other].rows[0]]
+        at_rest[other] |= at_rest[k] and stays[other] and float(np.linalg.norm(apart)) <= most
+    return [Part(part.rows, part.right, rests) for part, rests in zip(parts, at_rest)]
 
 
 def _same_rate(samples: Samples, end: _End, start: _End, share: float = 1.0) -> bool:
@@ -187,19 +206,22 @@ def _same_rate(samples: Samples, end: _End, start: _End, share: float = 1.0) -> 
 
 
 def _is_possible(samples: Samples, end: _End, start: _End) -> bool:
-    """Return whether a vehicle can get from the end of a part to the start of a later one, or would if stamps skipped some time."""
-    dt = start.t_s - end.t_s
-    if not _same_rate(samples, end, start):
-        return False
+    """Return whether a vehicle can get from the end of a part to the start of a later one."""
     off, most = _step_and_limit(samples, end, start)
-    if np.linalg.norm(off) <= most:
-        return True
+    return _same_rate(samples, end, start) and float(np.linalg.norm(off)) <= most
+
+
+def is_skip(samples: Samples, first: Part, second: Part) -> bool:
+    """Return whether the path steps forward between two parts as it would if stamps missed some time."""
+    end, start = _end(samples, first.rows, first=False), _end(samples, second.rows, first=True)
+    off, most = _step_and_limit(samples, end, start)
     rate = (end.rate + start.rate) / 2
     speed = float(np.linalg.norm(rate))
-    forward = float(off @ rate) / max(speed, MIN_SIGMA)
-    across = float(np.linalg.norm(off - forward * rate / max(speed, MIN_SIGMA)))
-    known = max(end.rate_sigma, start.rate_sigma, dt) < MAX_SKIP_S and max(end.rate_slack, start.rate_slack) < speed
-    return known and 0 < forward <= MAX_SKIP_S * speed and across <= most + forward / 10
+    if not _same_rate(samples, end, start) or max(end.rate_slack, start.rate_slack) >= speed:
+        return False
+    forward = float(off @ rate) / speed
+    across = float(np.linalg.norm(off - forward * rate / speed))
+    return 0 < forward <= MAX_SKIP_S * speed and across <= most + forward / 10
 
 
 def _step_and_limit(samples: Samples, end: _End, start: _End) -> tuple[Array, float]:
@@ -214,7 +236,7 @@ def _step_and_limit(samples: Samples, end: _End, start: _End) -> tuple[Array, fl
 
 @dataclass(frozen=True)
 class Skip:
-    """A step forward between two right parts, as if stamps missed some time.
+    """A step between two parts that are used as they are.
 
     Attributes
     ----------
@@ -229,7 +251,7 @@ class Skip:
 
 
 def find_skips(samples: Samples, parts: list[Part]) -> list[Skip]:
-    """List the steps forward between right parts."""
+    """List the steps between right parts."""
     right, out = [part for part in parts if part.right], []
     for one, other in pairwise(right):
         off, most = _step_and_limit(
@@ -247,9 +269,8 @@ def _choose(samples: Samples, parts: list[Part]) -> list[Part]:
     tails = {k: _end(samples, parts[k].rows, first=False) for k in moving}
     best: dict[int, tuple[float, int | None]] = {}
     for n, k in enumerate(moving):
-        earlier = [
-            (best[j][0], j) for j in moving[max(n - MAX_COMPARED, 0) : n] if _is_possible(samples, tails[j], heads[k])
-        ]
+        before = moving[max(n - MAX_COMPARED, 0) : n]
+        earlier = [(best[j][0], j) for j in before if _is_possible(samples, tails[j], heads[k])]
         total, from_part = max(earlier, default=(0.0, None), key=lambda e: e[0])
         best[k] = (total + float(np.ptp(samples.t_s[parts[k].rows])), from_part)
     chosen: set[int] = set()

@@ -19,12 +19,15 @@ from log2sim.localization.path_parts import (
     Skip,
     find_parts,
     find_skips,
+    is_skip,
 )
 
 # A gap is bridged by the samples this near to its ends, and by some where they are sparse; more change nothing.
 WINDOW_S, MIN_SIDE, MAX_SIDE = 1.5, 4, 30
 # Third differences of sparse samples hold the motion itself, so they do not tell the noise.
 MAX_DENSE_S = 0.25
+# Of samples farther apart a step that stays is told only: that a vehicle stopped or jumped before may not show in them.
+MAX_LASTING_S = 0.15
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,8 @@ class Limits:
     prior : PathPrior
     min_step : float, u
         Repairs that move samples by less are not made.
+    min_lasting_step : float, u
+        The same for a step that stays: a smaller one may be an end of a short jump whose other end is hidden in noise.
     usual_sigma : float, u
         Standard deviation of samples whose noise does not show because they are few or sparse.
     """
@@ -45,6 +50,7 @@ class Limits:
     max_change: float
     prior: PathPrior
     min_step: float
+    min_lasting_step: float
     usual_sigma: float
 
 
@@ -63,7 +69,7 @@ class RepairedPath:
         Whether a sample was moved with its part, or replaced by what the samples around suggest; whether it stayed in its
         place while the vehicle moved.
     skips : tuple of Skip
-        Steps forward that may be of the stamps: these samples stay as they are.
+        Steps that stay, and that may be of the stamps or one end of a jump: these samples are as they were.
     """
 
     values: Array
@@ -97,16 +103,20 @@ def repair_path(t_s: Array, values: Array, limits: Limits, wrong: NDArray[np.boo
     noise = scatter if dense else min(scatter, limits.usual_sigma)
     parts = find_parts(samples)
     moved, at_rest, known = none.copy(), none.copy(), none.copy()
-    for part, offset, offset_sigma in _offsets(samples, parts, noise, limits):
+    offsets = _offsets(samples, parts, noise, limits)
+    for part, offset, offset_sigma in offsets:
         of_part = rows[part.rows]
         if part.at_rest:
             at_rest[of_part] = True
             continue
-        known[of_part] = True
+        known[of_part] = offset_sigma < limits.min_step
+        if not known[of_part].all():
+            continue
         if float(np.linalg.norm(offset, axis=1).max()) >= limits.min_step:
             new[of_part] -= offset
             sigma[of_part], moved[of_part] = offset_sigma, True
-    skips = [Skip(int(rows[s.first]), int(rows[s.last]), s.size) for s in find_skips(samples, parts)]
+    used = sorted((part for part, _, _ in offsets), key=lambda part: int(part.rows[0]))
+    skips = [Skip(int(rows[s.first]), int(rows[s.last]), s.size) for s in find_skips(samples, used)]
     for skip in skips:
         known[skip.first : skip.last] |= ~at_rest[skip.first : skip.last]
     bridged = ~known
@@ -160,6 +170,7 @@ def _side(t_s: Array, rows: NDArray[np.intp], edge_s: float, *, last: bool) -> N
 def _offsets(samples: Samples, parts: list[Part], noise: float, limits: Limits) -> list[tuple[Part, Array, float]]:
     """Estimate how far the samples of each part are off those of the right parts: offsets (n, D) and their standard deviation."""
     moving = [part for part in parts if not part.at_rest]
+    sparse = float(np.median(np.diff(samples.t_s, prepend=-1.0))) > MAX_LASTING_S
     none = np.zeros((1, samples.values.shape[1]))
     steps = [_step(samples, first, second, noise, limits) for first, second in pairwise(moving)]
     out: list[tuple[Part, Array, float]] = [(part, none, 0.0) for part in parts if part.at_rest or part.right]
@@ -170,7 +181,14 @@ def _offsets(samples: Samples, parts: list[Part], noise: float, limits: Limits) 
         left, end = max((r for r in right if r < k), default=None), min((r for r in right if r > k), default=None)
         from_left = None if left is None else _sum_of(steps[left:k])
         from_right = None if end is None else _sum_of(steps[k:end])
-        out.append((part, *_blended(samples.t_s[part.rows], from_left, from_right)))
+        offset, sigma = _blended(samples.t_s[part.rows], from_left, from_right)
+        lasts = from_left is None or from_right is None
+        between = moving[left or 0 : k + 1] if end is None else moving[k : end + 1]
+        skips = lasts and all(is_skip(samples, one, other) for one, other in pairwise(between))
+        if skips or (lasts and (sparse or float(np.linalg.norm(offset)) < limits.min_lasting_step)):
+            out.append((Part(part.rows), none, 0.0))
+        else:
+            out.append((part, offset, sigma))
     return out
 
 

@@ -95,7 +95,7 @@ def _repair(stretch: Stretch, start_ns: int, ends_ns: tuple[int, int]) -> Fault:
 def _skip(stretch: Stretch, start_ns: int) -> Fault:
     """Describe a step forward."""
     message = (
-        f"the position steps forward by {stretch.shift_m:.1f} m {_span(stretch, start_ns)}, farther than a vehicle moves: it "
+        f"the position steps by {stretch.shift_m:.1f} m {_span(stretch, start_ns)}, farther than a vehicle moves: it "
         "jumped, or the stamps miss some time, which does not show; used as it is"
     )
     values = {"shift_m": round(stretch.shift_m, 3)}
