@@ -15,7 +15,7 @@ from rosbags.highlevel import AnyReader
 
 from log2sim import Config, open_log, reconstruct
 from log2sim.datatypes import Log, Stream, Sweep
-from log2sim.geometry import inverse, rotation_from_rpy, transform
+from log2sim.geometry import NS_PER_S, PoseTrack, inverse, rotation_from_rpy, transform
 from log2sim.logs.geodesy import transverse_mercator
 from log2sim.logs.kitti.drive import EGO_T_IMU as EGO_T_KITTI_IMU
 from log2sim.logs.ros.bag import Bag
@@ -186,3 +186,12 @@ def plain_scenario(log: Log, config: Config) -> dict[str, Any]:
     document = reconstruct(replace(log, name="log", digest=""), config).scenario.to_dict()
     document.pop("provenance")
     return document
+
+
+@pytest.mark.parametrize("poses", ["odometry", "tf", "gnss"])
+def test_poses_of_another_clock_are_told_with_it(poses: str, tmp_path: Path) -> None:
+    world = world_log()
+    later = PoseTrack(world.ego.t_ns + 18 * NS_PER_S, world.ego.map_T_ego)
+    log = open_log(ros.encode_as(world.changed(ego=later), tmp_path, Style(poses=poses)))
+    assert log.ego is None
+    assert any("no poses of" in n and "they do not overlap" in n and "GPS time against UTC?" in n for n in log.notes)

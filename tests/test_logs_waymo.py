@@ -23,9 +23,10 @@ from log2sim.datatypes import Log, Stream
 from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.geometry import Camera, apply, box_iou, inverse, points_in_box, project, project_boxes, wrap_angle
 from log2sim.logs.opening import open_log
-from log2sim.logs.waymo import tfrecord
+from log2sim.logs.waymo import reader, tfrecord
 from log2sim.logs.waymo.assembly import PACIFICA, camera_of, ego_vehicle_of
 from log2sim.logs.waymo.segment import CameraCalibration, LaserCalibration
+from log2sim.logs.waymo.wire import WireError
 from log2sim.pipeline import reconstruct
 
 START_BYTES = 12
@@ -174,6 +175,26 @@ def test_labels_drawn_in_images_serve_where_none_are_projected(segment: waymo.Se
     np.testing.assert_array_equal(log.image_labels["FRONT"].box_px, [[90, 20, 110, 80]])
     assert log.image_labels["FRONT"].category.tolist() == ["pedestrian"]
     assert "labels of images are the boxes drawn in them" in log.notes
+
+
+@pytest.mark.parametrize(
+    ("read", "told"),
+    [
+        ("read_box", "1 labels are damaged or of no frame"),
+        ("read_camera_labels", "1 boxes in images of 'FRONT' are damaged"),
+    ],
+)
+def test_damaged_labels_are_counted(path: Path, monkeypatch: pytest.MonkeyPatch, read: str, told: str) -> None:
+    sound, calls = getattr(reader, read), []
+
+    def broken(*arguments: object) -> object:
+        calls.append(arguments)
+        if len(calls) == 1:
+            raise WireError("cut")
+        return sound(*arguments)
+
+    monkeypatch.setattr(reader, read, broken)
+    assert sum(note.startswith(told) for note in open_log(path).notes) == 1
 
 
 def test_zones_without_labels_are_counted(segment: waymo.Segment, tmp_path: Path) -> None:

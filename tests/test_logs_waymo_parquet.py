@@ -221,3 +221,18 @@ def test_a_file_with_one_sensor_after_the_other_is_read_as_well(tmp_path: Path) 
         for i in (2, 0, 1):
             a, b = stream.read(i), other.streams[name].read(i)
             np.testing.assert_array_equal(*((a, b) if name == "FRONT" else (a.xyz_m, b.xyz_m)))
+
+
+def test_labels_of_no_frame_are_counted(root: Path) -> None:
+    from pyarrow import parquet
+
+    for name, told in (
+        ("lidar_box", "labels are damaged or of no frame"),
+        ("projected_lidar_box", "boxes in images of 'FRONT' are"),
+    ):
+        before = set(open_log(root).notes)
+        stamps = parquet.read_table(component(root, name)).column("key.frame_timestamp_micros").to_pylist()
+        rewrite(component(root, name), timestamp_micros=[stamps[0] + 1, stamps[1] + 1, *stamps[2:]])
+        (note,) = (n for n in open_log(root).notes if told in n)
+        assert note.startswith("2 ")
+        assert note not in before

@@ -8,7 +8,7 @@ goes before dead reckoning, and what was filtered goes before raw fixes.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,18 +16,16 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import MapFrame
 from log2sim.errors import RecordError
-from log2sim.geometry import NS_PER_S, Array, PoseTrack, shift_poses, transform, whole_kilometers, wrap_angle, yaw_of
+from log2sim.geometry import Array, PoseTrack, shift_poses, transform, whole_kilometers, wrap_angle, yaw_of
 from log2sim.logs.ros.bag import Bag
 from log2sim.logs.ros.containers import printable
 from log2sim.logs.ros.frames import FrameTree, pose_of
 from log2sim.logs.ros.messages import decode_bytes
 from log2sim.logs.ros.settings import MapSettings, PoseSettings
+from log2sim.logs.ros.stamping import MIN_POSES, say_uncovered
 from log2sim.logs.stamps import strictly_increasing
 
 MAP_FRAMES = ("map", "world", "earth", "utm")
-MIN_POSES = 2
-# A topic of single goals or starting points is no trajectory.
-MIN_COVERED_SHARE = 0.5
 # The course of a moving vehicle shows whether the heading of the IMU counts from the east.
 MIN_COURSE_STEP_M = 1.0
 MAX_COURSE_ERROR_DEG = 30.0
@@ -68,6 +66,8 @@ class PoseSources:
     map : MapSettings
     span_ns : (int, int)
         First and last stamp of the sensors.
+    damaged : dict of str to int
+        Messages by topic that could not be read, of the topics that were tried.
     """
 
     bag: Bag
@@ -78,6 +78,7 @@ class PoseSources:
     settings: PoseSettings
     map: MapSettings
     span_ns: tuple[int, int]
+    damaged: dict[str, int] = field(default_factory=dict)
 
     def find(self) -> tuple[FoundPoses | None, list[dict[str, Any]]]:
         """Find the poses of the first source that has some, and what was considered, as JSON."""
@@ -91,21 +92,22 @@ class PoseSources:
                 continue
             try:
                 poses = read(topic)
-                self._check_coverage(poses.t_ns)
-                found = _near_origin(poses)
+                if problem := say_uncovered(poses.t_ns, *self.span_ns):
+                    raise NoPoses(problem)
+                found = _near_origin(self._with_damage(poses))
                 reason = f"{len(poses.t_ns)} poses, the first source of the order that has some"
                 reason = reason if self.settings.source == "auto" else f"{len(poses.t_ns)} poses, by the settings"
                 considered.append({"source": source, "topic": topic, "used": True, "reason": reason})
-            except NoPoses as problem:
-                considered.append({"source": source, "topic": topic, "used": False, "reason": str(problem)})
+            except NoPoses as reason_against:
+                considered.append({"source": source, "topic": topic, "used": False, "reason": str(reason_against)})
         return found, considered
 
-    def _check_coverage(self, t_ns: NDArray[np.int64]) -> None:
-        begin, end = self.span_ns
-        covered_ns = max(0, min(end, int(t_ns[-1])) - max(begin, int(t_ns[0]))) if len(t_ns) else 0
-        if len(t_ns) < MIN_POSES or covered_ns < MIN_COVERED_SHARE * (end - begin):
-            seconds = f"{covered_ns / NS_PER_S:.1f} of {(end - begin) / NS_PER_S:.1f} s"
-            raise NoPoses(f"it gives {len(t_ns)} poses in {seconds} of the sensors")
+    def _with_damage(self, poses: FoundPoses) -> FoundPoses:
+        damaged = self.damaged.get(poses.topic, 0)
+        if not damaged:
+            return poses
+        note = f"{poses.topic}: {damaged} of {len(self.messages[poses.topic])} messages are damaged and left out"
+        return replace(poses, notes=(*poses.notes, note))
 
     def _candidates(self) -> list[tuple[str, str, Callable[[str], FoundPoses]]]:
         wanted = self.settings
@@ -134,7 +136,7 @@ class PoseSources:
         return [c for c in ordered if wanted.topic in ("", c[1]) or c[0] == "tf"]
 
     def _decoded(self, name: str) -> tuple[list[Any], NDArray[np.int64]]:
-        """Messages of a topic that can be read, and their stamps (N,)."""
+        """Messages of a topic that can be read, and their stamps (N,); how many cannot is kept in `damaged`."""
         topic, messages = self.bag.topics[name], []
         for i, raw in enumerate(self.messages[name]):
             if raw is None:
@@ -143,6 +145,7 @@ class PoseSources:
                 messages.append(decode_bytes(topic, raw, self.bag.where(topic, i)))
             except RecordError:
                 continue
+        self.damaged[name] = len(self.messages[name]) - len(messages)
         stamps = [int(m.header.stamp.sec) * 1_000_000_000 + int(m.header.stamp.nanosec) for m in messages]
         return messages, np.array(stamps, dtype=np.int64)
 

@@ -12,9 +12,13 @@ from numpy.typing import NDArray
 from log2sim.geometry import NS_PER_S
 from log2sim.logs.ros.bag import STAMP, Topic, stamp_of
 from log2sim.logs.stamps import strictly_increasing
+from log2sim.logs.time_checks import Span, say_apart
 
 # Delays between sensor and recorder are seconds at most; a larger one is another clock.
 MAX_CLOCK_DIFFERENCE_S = 10.0
+MIN_POSES = 2
+# A topic of single goals or starting points is no trajectory.
+MIN_COVERED_SHARE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +68,18 @@ def stamp_messages(topic: Topic, heads: Sequence[bytes | None], notes: list[str]
     row, problems = strictly_increasing(t_ns, topic.name)
     notes += problems
     return Stamped(t_ns[row], row, delay_s)
+
+
+def say_uncovered(t_ns: NDArray[np.int64], begin_ns: int, end_ns: int) -> str:
+    """Say why poses at stamps (P,) ns do not cover the time of the sensors; "" where they do."""
+    covered_ns = max(0, min(end_ns, int(t_ns[-1])) - max(begin_ns, int(t_ns[0]))) if len(t_ns) else 0
+    if len(t_ns) >= MIN_POSES and covered_ns >= MIN_COVERED_SHARE * (end_ns - begin_ns):
+        return ""
+    poses, sensors = Span.of("poses", t_ns) if len(t_ns) else None, Span("frames and sweeps", begin_ns, end_ns)
+    if poses is not None and poses.is_apart(sensors):
+        return say_apart(poses, sensors)
+    seconds = f"{covered_ns / NS_PER_S:.1f} of {(end_ns - begin_ns) / NS_PER_S:.1f} s"
+    return f"it gives {len(t_ns)} poses in {seconds} of the sensors"
 
 
 def note_other_clocks(delays_s: Mapping[str, float | None], notes: list[str]) -> None:

@@ -7,7 +7,8 @@ as in the data set; LiDARs get "LIDAR_" before their names, for both have a FRON
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache
+from dataclasses import replace
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -77,7 +78,7 @@ class _Assembly:
                 f"{self.segment.path}: {len(self.frames)} frames with neither images nor range images that have a calibration"
             )
         self._note_limits(lidars)
-        labels = cache(self._labels)
+        labels, image_labels = cache(self._labels), self._image_labels(cameras, image_ns)
         return Log(
             name=f"waymo-{self.segment.name}",
             format=format,
@@ -88,10 +89,10 @@ class _Assembly:
             ego_vehicle=ego_vehicle_of(self.segment.lasers),
             map=MapFrame(offset_m=(float(self.offset_m[0]), float(self.offset_m[1]), float(self.offset_m[2]))),
             labels=None if self.segment.boxes is None else labels,
-            image_labels=self._image_labels(cameras, image_ns),
+            image_labels=image_labels,
             reference_camera=next(iter(cameras), None),
             digest=digest,
-            notes=defer_notes(self.notes, labels),
+            notes=defer_notes(self.notes, labels, *(partial(image_labels.get, name) for name in image_labels)),
             calibrations=dict.fromkeys(streams | sweeps, f"{self.segment.path}, its calibrations"),
             details=self.segment.details,
         )
@@ -211,6 +212,9 @@ class _Assembly:
         def read(name: str) -> ImageLabels:
             number, camera = number_of[name], cameras[name]
             table = self._in_order(boxes(number))
+            lost = table.lost + int((image_ns[number][table.frame] < 0).sum())
+            if lost:
+                self.notes.append(f"{lost} boxes in images of '{name}' are damaged or of no frame, and left out")
             return image_labels_of(table, image_ns[number], (camera.width_px, camera.height_px))
 
         return LabelsOnRequest(tuple(cameras), read)
@@ -220,8 +224,8 @@ class _Assembly:
         place = np.full(len(self.segment.frames), -1, dtype=np.int64)
         place[self.order] = np.arange(len(self.order))
         frame = place[table.frame]
-        moved = BoxTable(frame, table.track_id, table.kind, table.center, table.size, table.heading_rad)
-        return moved.take(np.flatnonzero(frame >= 0))
+        rows = np.flatnonzero(frame >= 0)
+        return replace(table, frame=frame, lost=table.lost + len(frame) - len(rows)).take(rows)
 
     def _note_limits(self, lidars: dict[str, Lidar]) -> None:
         """Note what the format lacks."""

@@ -155,7 +155,15 @@ def _table(columns: Columns, track: str, kind: str, numbers: list[str], frame_of
     dimensions = len(numbers) // 2
     heading = box[:, -1] if len(numbers) % 2 else np.zeros(len(box))
     track_id = np.array([str(word) for word in columns[track]], dtype=np.str_)
-    table = BoxTable(frame, track_id, columns[kind], box[:, :dimensions], box[:, dimensions : 2 * dimensions], heading)
+    table = BoxTable(
+        frame,
+        track_id,
+        columns[kind],
+        box[:, :dimensions],
+        box[:, dimensions : 2 * dimensions],
+        heading,
+        len(box) - len(known),
+    )
     return table.take(known)
 
 

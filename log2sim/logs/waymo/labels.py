@@ -49,6 +49,8 @@ def labels_of(
     start of the frame. On its sample the camera's label of a cyclist at 8.5 m/s is 13 px from the box at this time, 24 px
     from the box at the start; its box is 37 px wide.
     """
+    if table.lost:
+        notes.append(f"{table.lost} labels are damaged or of no frame, and left out")
     table, kind = _road_users(table, notes)
     turn = None if top is None else turn_of(table.center, top)
     t_ns = times.pose_ns[table.frame] if turn is None else times.at_turn(table.frame, turn)

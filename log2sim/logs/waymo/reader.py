@@ -7,7 +7,6 @@ images and labels are skipped. The format is that of dataset.proto and label.pro
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -178,35 +177,52 @@ class _SegmentFile:
             raise RecordError(f"{self._where(frame)}, LiDAR {laser}: {error}") from None
 
     def _boxes(self) -> BoxTable:
-        rows: list[LabelRow] = []
+        rows, lost = list[LabelRow](), 0
         for frame, data in self._messages(lambda index: index.labels):
-            with suppress(WireError):
+            try:
+                if data is None:
+                    raise WireError("too large")
                 box = read_box(data, 3)
-                rows += [] if box is None else [(frame, *box)]
-        return BoxTable.of(rows, 3)
+            except WireError:
+                lost += 1
+                continue
+            rows += [] if box is None else [(frame, *box)]
+        return BoxTable.of(rows, 3, lost)
 
     def _image_boxes(self, camera: int) -> BoxTable:
         if self.boxes_by_camera is None:
-            self.boxes_by_camera = self._boxes_of_cameras()
-        return BoxTable.of(self.boxes_by_camera.get(camera, []), 2)
+            self.boxes_by_camera, self.lost_boxes = self._boxes_of_cameras()
+        # To which camera a message belonged that cannot be read is not known: all of them are told of the first one.
+        lost, self.lost_boxes = self.lost_boxes, 0
+        return BoxTable.of(self.boxes_by_camera.get(camera, []), 2, lost)
 
-    def _boxes_of_cameras(self) -> dict[int, list[LabelRow]]:
-        """Read the labels of all images, by camera."""
+    def _boxes_of_cameras(self) -> tuple[dict[int, list[LabelRow]], int]:
+        """Read the labels of all images, by camera, and count the messages that cannot be read."""
         out: dict[int, list[LabelRow]] = {}
+        lost = 0
         spans = (lambda index: index.projected_labels) if self.projected else (lambda index: index.camera_labels)
         for frame, data in self._messages(spans):
-            with suppress(WireError):
+            try:
+                if data is None:
+                    raise WireError("too large")
                 number, boxes = read_camera_labels(data)
-                out.setdefault(number, []).extend((frame, *box) for box in boxes)
-        return out
+            except WireError:
+                lost += 1
+                continue
+            out.setdefault(number, []).extend((frame, *box) for box in boxes)
+        return out, lost
 
-    def _messages(self, spans: Callable[[FrameIndex], list[Span]]) -> Iterator[tuple[int, bytes]]:
-        """Yield frame and bytes of messages of all frames; those that are too large are left out."""
+    def _messages(self, spans: Callable[[FrameIndex], list[Span]]) -> Iterator[tuple[int, bytes | None]]:
+        """Yield frame and bytes of messages of all frames; None for those that are too large."""
         for k, (record, index) in enumerate(zip(self.frames.record, self.frames.index)):
             with self.file.window(record) as window:
                 for span in spans(index):
-                    with suppress(WireError):
-                        yield k, take_index(window, span)
+                    try:
+                        data = take_index(window, span)
+                    except WireError:
+                        yield k, None
+                        continue
+                    yield k, data
 
 
 def _row(index: FrameIndex) -> FrameRow:

@@ -168,6 +168,8 @@ class BoxTable:
     size : (B, 3) or (B, 2) float64
         Length, width, height in m, or length (along u) and width (along v) in px.
     heading_rad : (B,) float64
+    lost : int
+        Further boxes, which cannot be read or are of no frame.
     """
 
     frame: NDArray[np.int64]
@@ -176,9 +178,10 @@ class BoxTable:
     center: Array
     size: Array
     heading_rad: Array
+    lost: int = 0
 
     @classmethod
-    def of(cls, rows: list[tuple[int, str, int, Any]], dimensions: int) -> BoxTable:
+    def of(cls, rows: list[tuple[int, str, int, Any]], dimensions: int, lost: int) -> BoxTable:
         """Build the table of rows of frame, id, type and box, (2 dimensions + 1,) numbers: center, size, heading."""
         box = np.array([row[3] for row in rows], dtype=np.float64).reshape(-1, 2 * dimensions + 1)
         return cls(
@@ -188,6 +191,7 @@ class BoxTable:
             box[:, :dimensions],
             box[:, dimensions : 2 * dimensions],
             box[:, -1],
+            lost,
         )
 
     def take(self, rows: NDArray[Any]) -> BoxTable:
@@ -199,6 +203,7 @@ class BoxTable:
             self.center[rows],
             self.size[rows],
             self.heading_rad[rows],
+            self.lost,
         )
 
 
