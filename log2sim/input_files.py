@@ -111,6 +111,29 @@ def read_file(
         raise error(f"{where or path}: cannot be read: {problem}") from None
 
 
+def require_readable(path: Path | str, limit_bytes: int, error: type[Exception], what: str) -> None:
+    """Check a file that another library is going to open by its name.
+
+    Parameters
+    ----------
+    path : Path or str
+    limit_bytes : int
+    error : type
+        Of the exception that is raised for a file that is missing, empty, too large or no regular file.
+    what : str
+        What it should be, for the message.
+    """
+    try:
+        with open_regular(path, buffering=0) as file:
+            size = os.fstat(file.fileno()).st_size
+    except FileNotFoundError:
+        raise error(f"{path}: no such file; give the path of {what}") from None
+    except OSError as problem:
+        raise error(f"{path}: cannot be read: {problem.strerror}; give the path of {what}") from None
+    if not 0 < size <= limit_bytes:
+        raise error(f"{path}: {size} bytes; expected {what} of 1 to {limit_bytes} bytes")
+
+
 def read_text(path: Path | str, limit_bytes: int, error: type[Exception], *, missing: str = "no such file") -> str:
     """Read a text file in UTF-8, with or without a byte order mark, as `read_file` does."""
     try:

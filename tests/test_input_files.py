@@ -8,6 +8,7 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -29,6 +30,10 @@ from log2sim.logs.ros.bag import open_container
 from log2sim.logs.ros.chunked import ChunkedFile
 from log2sim.logs.sweeps import read_sweep
 from log2sim.logs.waymo.tfrecord import RecordFile, starts_like_tfrecord
+from log2sim.perception.detect import ssd_mobilenet
+from log2sim.perception.detect.onnx_model import load_model
+from log2sim.perception.detect3d.network import load_network
+from log2sim.simulation.carla import player
 from log2sim.synth.lidar_models import lidar_model
 from log2sim.synth.scene import load_scene
 
@@ -176,3 +181,38 @@ def test_regular_files_are_read_from_several_threads(tmp_path: Path) -> None:
     for thread in threads:
         thread.join()
     assert found == [b"abc" * 1000] * 4
+
+
+@pytest.mark.parametrize("load", [load_model, load_network])
+def test_a_model_that_is_no_regular_file_is_refused_at_once(tmp_path: Path, load: Callable[[Path], object]) -> None:
+    os.mkfifo(tmp_path / "pipe.onnx")
+    (tmp_path / "empty.onnx").write_bytes(b"")
+    for name, words in (
+        ("pipe.onnx", "cannot be read: is a named pipe, expected a regular file"),
+        ("empty.onnx", "0 bytes; expected"),
+        ("no.onnx", "no such file"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            load(tmp_path / name)
+    with pytest.raises(ConfigError, match="is a device"):
+        load(Path("/dev/zero"))
+
+
+def test_weights_that_are_no_regular_file_are_refused_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "models").mkdir()
+    os.mkfifo(tmp_path / "models" / "frozen_inference_graph.pb")
+    monkeypatch.setattr(
+        "importlib.util.find_spec", lambda name: SimpleNamespace(submodule_search_locations=[str(tmp_path)])
+    )
+    with pytest.raises(ConfigError, match="is a named pipe"):
+        ssd_mobilenet.graph_bytes()
+
+
+def test_the_player_of_carla_reads_regular_files_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(player.ReplayError, match="is no regular file"):
+        player.load_data(tmp_path / "pipe")
+    monkeypatch.setattr(player, "MAX_TEXT_BYTES", 10)
+    (tmp_path / "long").write_text("[1, 2, 3, 4]")
+    with pytest.raises(player.ReplayError, match="has more than 10 bytes"):
+        player.load_data(tmp_path / "long")

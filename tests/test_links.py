@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from command_line import run
-from log_encoders import argoverse, kitti, kitti_object, native, pandaset, waymo_parquet
+from log_encoders import argoverse, kitti, kitti_object, native, pandaset, ros, waymo_parquet
 from log_encoders.world import world_log
 
 from log2sim.datatypes import Log
@@ -144,6 +144,7 @@ FORMATS: dict[str, tuple[Callable[[Log, Path], Path], str]] = {
     "pandaset": (pandaset.encode, "lidar/poses.json"),
     "argoverse2": (argoverse.encode, "sensors/lidar/*.feather"),
     "waymo-parquet": (waymo_parquet.encode, "vehicle_pose/*.parquet"),
+    "ros": (lambda log, folder: ros.encode_as(log, folder, ros.Style("bag")).parent, "*.bag"),
 }
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from log2sim.datatypes import Lidar, Log, MapFrame, Stream
 from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.geometry import NS_PER_S, Array, Camera, Mount, PoseTrack, RollingShutter, inverse
+from log2sim.links import require_link_inside
 from log2sim.logs.ros import calibration, ego
 from log2sim.logs.ros.bag import NAME_BYTES, Bag, Topic
 from log2sim.logs.ros.containers import printable
@@ -45,6 +46,9 @@ class RosReader:
     def open(self, path: Path, sequence: str) -> Log:
         """Open a recording: its index, the stamps of its messages, its transforms and poses."""
         recording = find_recordings(path)[sequence]
+        if path.is_dir():
+            for bag in recording.files:
+                require_link_inside(bag, path)
         settings, file = read_settings(recording.settings)
         return _Opening(sequence, Bag(recording), settings, file).log()
 

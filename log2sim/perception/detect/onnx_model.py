@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.errors import ConfigError
+from log2sim.input_files import require_readable
 from log2sim.perception.detect.preprocessing import InputSpec
 
 MAX_FILE_BYTES = 2 * 1024**3
@@ -83,11 +84,7 @@ def load_model(path: Path, *, threads: int | None = None) -> OnnxModel:
 
 def check_file(path: Path) -> None:
     """Raise `ConfigError` for a file that cannot be a model, before it is read."""
-    if not path.is_file():
-        raise ConfigError(f"{path}: no such file; give the path of an ONNX model")
-    size = path.stat().st_size
-    if size == 0 or size > MAX_FILE_BYTES:
-        raise ConfigError(f"{path}: {size} bytes; expected an ONNX model of 1 to {MAX_FILE_BYTES} bytes")
+    require_readable(path, MAX_FILE_BYTES, ConfigError, "an ONNX model")
 
 
 def input_spec(inputs: list[Any], path: Path) -> InputSpec:

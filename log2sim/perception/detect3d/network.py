@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from log2sim.datatypes import GROUPS
 from log2sim.errors import ConfigError
+from log2sim.input_files import require_readable
 from log2sim.model_errors import first_problem
 from log2sim.perception.detect3d.grid import CHANNELS, MIN_SIZE_CELLS
 
@@ -200,11 +201,7 @@ def load_network(path: Path) -> Network:
     """
     import onnxruntime
 
-    if not path.is_file():
-        raise ConfigError(f"{path}: no such file; give the path of an ONNX network for clouds")
-    size = path.stat().st_size
-    if not 0 < size <= MAX_FILE_BYTES:
-        raise ConfigError(f"{path}: {size} bytes; expected an ONNX network of 1 to {MAX_FILE_BYTES} bytes")
+    require_readable(path, MAX_FILE_BYTES, ConfigError, "an ONNX network for clouds")
     options = onnxruntime.SessionOptions()
     # Networks this small gain nothing from a second thread, which the stages beside need.
     options.intra_op_num_threads = options.inter_op_num_threads = 1

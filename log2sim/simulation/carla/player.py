@@ -15,6 +15,7 @@ import argparse
 import bisect
 import json
 import math
+import stat
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -35,6 +36,7 @@ KMH_PER_MPS = 3.6
 SHOWN_DEG = 0.2
 SUBSTEP_S, SUBSTEPS = 0.01, 10  # of CARLA's physics within a tick
 SIZE_DIFFERS_M = 0.1
+MAX_TEXT_BYTES = 512 * 1024 * 1024  # as of a scenario
 
 
 class ReplayError(Exception):
@@ -523,7 +525,7 @@ def open_world(carla: ModuleType, client: Any, town: str | None, opendrive: Path
         if opendrive is not None:
             # No walls beside the road: agents also move off it.
             parameters = carla.OpendriveGenerationParameters(2.0, 500.0, 0.0, 1.0, True, True)
-            return client.generate_opendrive_world(opendrive.read_text(encoding="utf-8"), parameters)
+            return client.generate_opendrive_world(read_text(opendrive), parameters)
     except RuntimeError as error:
         raise ReplayError(f"CARLA could not load {town or opendrive}: {error}", 4) from None
     except (OSError, UnicodeDecodeError) as error:
@@ -531,10 +533,21 @@ def open_world(carla: ModuleType, client: Any, town: str | None, opendrive: Path
     return client.get_world()
 
 
+def read_text(path: Path) -> str:
+    """Read a text; `OSError` for what is no regular file, since a pipe or a device may never end, and for more than the limit."""
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError("is no regular file")
+    with path.open("rb") as file:
+        data = file.read(MAX_TEXT_BYTES + 1)
+    if len(data) > MAX_TEXT_BYTES:
+        raise OSError(f"has more than {MAX_TEXT_BYTES} bytes")
+    return data.decode("utf-8")
+
+
 def load_data(path: Path) -> dict[str, Any]:
     """Read the data file and check its format."""
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(read_text(path))
     except (OSError, ValueError) as error:
         raise ReplayError(f"{path}: cannot be read: {error}", 3) from None
     if not isinstance(data, dict) or data.get("format") != "log2sim-carla" or data.get("version") != VERSION:
