@@ -13,8 +13,9 @@ from log2sim.agents.candidate import Timeline
 from log2sim.agents.ego import ego_agent, with_pose_errors
 from log2sim.datatypes import FAULT_KINDS, Agent, Log, Stream, Waypoints
 from log2sim.geometry import Array, PoseTrack, rotation_from_rpy, transform, wrap_angle, yaw_of
+from log2sim.localization.checked_poses import CheckedPoses
 from log2sim.localization.choice import localize_like
-from log2sim.localization.given_poses import MAX_SIGMA_M, CheckedPoses, check_poses
+from log2sim.localization.given_poses import MAX_SIGMA_M, check_poses
 from log2sim.localization.path_fit import POSITION_PRIOR, YAW_PRIOR, fit_path
 from log2sim.localization.path_noise import noise_of
 from log2sim.localization.pose_faults import list_faults
@@ -285,6 +286,29 @@ def test_sigmas_of_bridges_cover_their_errors(speed: float, turn: float, hz: int
     sigma = found.track.sigmas_at(true.t_ns[known], (0.02, 0.002))[:, 0]
     assert kinds(found) == ["frozen_poses"]
     assert np.all(off < 5 * sigma)
+
+
+@pytest.mark.parametrize(("step", "bound_m"), [(5, 0.1), (25, 0.1), (50, 0.3)])
+def test_poses_of_a_slower_source_that_repeat_are_not_used(step: int, bound_m: float) -> None:
+    true = drive(10, 50, turn=0.2)
+    rows = np.arange(len(true.t_ns)) // step * step
+    track = replace(true, map_T_ego=true.map_T_ego[rows])
+    found = check_poses(track)
+    assert errors(found, true)[0] < bound_m
+    told = [f for f in list_faults(log_of(track), found.stretches, None) if f.kind == "frozen_poses"]
+    assert len(told) == 1
+    assert "repeat the one before" in told[0].message
+
+
+@pytest.mark.parametrize("sigma", [0.001, 0.01])
+def test_poses_that_stay_but_for_noise_are_frozen(sigma: float) -> None:
+    true = drive(6, 50, speed=12.0, turn=0.2, sigma=0.01)
+    track = frozen(true, 2.0, 3.0)
+    during = (times(true) >= 2.0) & (times(true) < 3.0)
+    track.map_T_ego[during, :3, 3] += np.random.default_rng(0).normal(0, sigma, (during.sum(), 3))
+    found = check_poses(track)
+    assert kinds(found) == ["frozen_poses"]
+    assert errors(found, true)[0] < 0.25
 
 
 @settings(max_examples=60, deadline=None)

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, rotation_from_rpy, yaw_of
-from log2sim.localization.path_fit import POSITION_PRIOR, YAW_PRIOR, PathPrior
+from log2sim.localization.checked_poses import CheckedPoses, Stretch
+from log2sim.localization.path_fit import POSITION_PRIOR, YAW_PRIOR
 from log2sim.localization.path_noise import independent_noise
 from log2sim.localization.path_parts import Skip
 from log2sim.localization.path_repair import MAX_DENSE_S, Limits, RepairedPath, bridge, repair_path, runs_of
 from log2sim.localization.path_smoothing import smooth_path
+from log2sim.localization.pose_copies import leave_out_copies
 
 # Vehicles on roads brake, speed up and turn with up to 10 m/s2; the rest is how their bodies pitch and bounce. They change their
 # yaw rate by less than 3 rad/s2 at the limit of their tires.
@@ -27,8 +28,7 @@ USUAL_SIGMA_M, USUAL_SIGMA_RAD = 0.02, 0.002
 MIN_LASTING_STEP_M, MIN_LASTING_STEP_RAD = 2.0, np.deg2rad(5.0)
 POSITION = Limits(MAX_ACCELERATION_MPS2, POSITION_PRIOR, MIN_STEP_M, MIN_LASTING_STEP_M, USUAL_SIGMA_M)
 YAW = Limits(MAX_YAW_ACCELERATION_RADPS2, YAW_PRIOR, MIN_STEP_RAD, MIN_LASTING_STEP_RAD, USUAL_SIGMA_RAD)
-# Poses with more noise across the path are smoothed. With the noise of the sample and of recorded drives it changes nothing, of
-# which a part is of their stamps; with 0.05 m it halves the errors of agents.
+# Poses with more noise across the path are smoothed; less changes agents by no more than GNSS/INS errs.
 MIN_SMOOTHED_M = 0.04
 # Poses are not used where their standard deviation is beyond these, by which what is 20 m away is off by less than a meter.
 MAX_SIGMA_M, MAX_SIGMA_RAD = 0.5, 0.035
@@ -36,63 +36,6 @@ MAX_SIGMA_M, MAX_SIGMA_RAD = 0.5, 0.035
 MAX_LINEAR_S, ADDED_STEP_S = 0.25, 0.05
 # No gap as long is bridged within `MAX_SIGMA_M`.
 MAX_BRIDGED_S = 8.0
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """A time in which poses were repaired or are not known.
-
-    Attributes
-    ----------
-    kind : {"pose_jump", "frozen_poses", "gap", "skip"}
-        A skip is a step that stays: the position may have jumped, or stamps may miss some time.
-    first_ns, last_ns : int
-        Stamps of the first and the last pose in question; of a gap those around it.
-    shift_m, turn_rad : float
-        By how much poses were moved at most.
-    sigma_m : float
-        Largest standard deviation of a repaired position that is used.
-    unknown_s : float, s
-        For how long no pose is known well enough.
-    poses : int
-        Number of poses in question.
-    by : str
-        What bridges it.
-    """
-
-    kind: str
-    first_ns: int
-    last_ns: int
-    shift_m: float = 0.0
-    turn_rad: float = 0.0
-    sigma_m: float = 0.0
-    unknown_s: float = 0.0
-    poses: int = 0
-    by: str = "the motion around"
-
-    @property
-    def duration_s(self) -> float:
-        """Length, s."""
-        return (self.last_ns - self.first_ns) / NS_PER_S
-
-
-@dataclass(frozen=True, eq=False)
-class CheckedPoses:
-    """Poses after the check.
-
-    Attributes
-    ----------
-    track : PoseTrack
-        The very poses that were given where nothing is wrong with them.
-    stretches : tuple of Stretch
-        In the order of time.
-    moved : bool
-        Whether given poses are not where they were, so that what was measured moves with them.
-    """
-
-    track: PoseTrack
-    stretches: tuple[Stretch, ...]
-    moved: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,39 +58,41 @@ def check_poses(track: PoseTrack) -> CheckedPoses:
     """
     if len(track.t_ns) < 2:
         return CheckedPoses(track, ())
-    path = _path_of(track)
+    copies = leave_out_copies(track)
+    track, path = copies.track, _path_of(copies.track)
     level = repair_path(path.t_s, path.xyz_m[:, :2], POSITION)
     height = repair_path(path.t_s, path.xyz_m[:, 2:], POSITION, level.at_rest)
     yaw = repair_path(path.t_s, path.yaw_rad[:, None], YAW, level.at_rest)
     changed = level.moved | level.bridged | height.moved | height.bridged | yaw.moved | yaw.bridged
     new = _Path(path.t_s, np.hstack([level.values, height.values]), yaw.values[:, 0])
     stretches = [_stretch(track, path, new, rows, (level, yaw)) for rows in runs_of(changed)]
+    if copies.count:
+        stretches.append(Stretch("copies", copies.first_ns, copies.last_ns, copies.worst_m, poses=copies.count))
     stretches += _skips(track, (*level.skips, *height.skips))
     kept = ~changed | (_sigmas(level, yaw) <= [MAX_SIGMA_M, MAX_SIGMA_RAD]).all(axis=1)
     measured = ~(level.bridged | height.bridged | yaw.bridged)
     if _is_noisy(path.t_s[measured], new.xyz_m[measured, :2]) and not level.skips:
-        level, height, yaw = (
-            replace(r, **_smoothed(path.t_s, r, measured, prior))
-            for r, prior in ((level, POSITION_PRIOR), (height, POSITION_PRIOR), (yaw, YAW_PRIOR))
-        )
+        level, height, yaw = (_smoothed(path.t_s, r, measured) for r in (level, height, yaw))
         new = _Path(path.t_s, np.hstack([level.values, height.values]), yaw.values[:, 0])
         changed = np.ones_like(changed)
     repaired = _repaired_track(track, path, new, changed, (level, yaw))
     filled, gaps = _filled(repaired, kept, _Evidence(new, measured, (level.noise, yaw.noise)))
-    return CheckedPoses(filled, tuple(sorted([*stretches, *gaps], key=lambda s: s.first_ns)), bool(changed.any()))
+    return CheckedPoses(
+        filled, tuple(sorted([*stretches, *gaps], key=lambda s: s.first_ns)), bool(changed.any() or copies.count)
+    )
 
 
 def _is_noisy(t_s: Array, xy_m: Array) -> bool:
-    """Return whether smoothing makes positions (P, 2) better: those of sparse poses hardly, whose noise does not show either."""
+    """Return whether smoothing makes positions (P, 2) better; the noise of sparse ones does not show."""
     dense = len(t_s) > 1 and float(np.median(np.diff(t_s))) < MAX_DENSE_S
     return dense and independent_noise(t_s, xy_m) > MIN_SMOOTHED_M
 
 
-def _smoothed(t_s: Array, path: RepairedPath, measured: NDArray[np.bool_], prior: PathPrior) -> dict[str, Any]:
-    """Return the values of a path without their noise, and what is left of it."""
-    values, sigma = smooth_path(t_s, path.values, measured, path.noise, prior)
-    left = float(np.median(sigma[measured]))
-    return {"values": values, "sigma": np.where(measured, np.hypot(path.sigma, sigma), path.sigma), "noise": left}
+def _smoothed(t_s: Array, path: RepairedPath, measured: NDArray[np.bool_]) -> RepairedPath:
+    """Return a path without its noise."""
+    values, sigma = smooth_path(t_s, path.values, measured, path.noise, path.limits.prior)
+    sigma = np.where(measured, np.hypot(path.sigma, sigma), path.sigma)
+    return replace(path, values=values, sigma=sigma, noise=float(np.median(sigma[measured])))
 
 
 def _path_of(track: PoseTrack) -> _Path:
@@ -158,7 +103,7 @@ def _path_of(track: PoseTrack) -> _Path:
 def _sigmas(level: RepairedPath, yaw: RepairedPath) -> Array:
     """Return the standard deviations (P, 2) of positions, m, and yaws, rad, after their repair.
 
-    Errors that last do not show in the noise of poses, and do not average out: they are not counted.
+    Errors that last do not show in the noise of poses: they are not counted.
     """
     return np.stack([np.hypot(level.sigma, USUAL_SIGMA_M), np.hypot(yaw.sigma, USUAL_SIGMA_RAD)], axis=1)
 

@@ -20,8 +20,9 @@ from log2sim.geometry import (
     transform,
 )
 from log2sim.localization.alignment import fit_to_given
+from log2sim.localization.checked_poses import CheckedPoses, Stretch
 from log2sim.localization.ego_sweeps import densest_lidar
-from log2sim.localization.given_poses import MAX_SIGMA_M, USUAL_SIGMA_M, USUAL_SIGMA_RAD, CheckedPoses, Stretch
+from log2sim.localization.given_poses import MAX_SIGMA_M, USUAL_SIGMA_M, USUAL_SIGMA_RAD
 from log2sim.localization.odometry import Odometry, run_odometry
 from log2sim.localization.registration import is_installed
 from log2sim.localization.verdict import MAX_UNSURE_SHARE, unsure_share

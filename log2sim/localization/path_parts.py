@@ -25,8 +25,8 @@ MIN_END_S = 0.05
 MAX_JERK = 10.0
 # A rate that is not known, u/s.
 UNKNOWN_RATE = 60.0
-# A part that covers less is at rest, u; in noisier logs as many standard deviations.
-MAX_REST = 0.05
+# A part that covers less is at rest, u; in noisier logs as many standard deviations, which some hundred samples cover.
+MAX_REST, MAX_REST_SIGMAS = 0.05, 10.0
 # Stamps of recorded drives miss some frames, or are assumed to be regular: then the path steps forward by up to this time of driving.
 MAX_SKIP_S = 0.25
 # Vehicles that drive off or stop change their speed by less than this share of what they can.
@@ -187,7 +187,7 @@ def _marked_at_rest(samples: Samples, parts: list[Part]) -> list[Part]:
     heads = [_end(samples, part.rows, first=True) for part in parts]
     tails = [_end(samples, part.rows, first=False) for part in parts]
     sudden = [not _same_rate(samples, tail, head, USUAL_CHANGE_SHARE) for tail, head in zip(tails, heads[1:])]
-    most = max(MAX_REST, MAX_SIGMAS * samples.sigma)
+    most = max(MAX_REST, MAX_REST_SIGMAS * samples.sigma)
     stays = [float(np.linalg.norm(np.ptp(samples.values[part.rows], axis=0))) <= most for part in parts]
     at_rest = [stays[k] and any(sudden[max(k - 1, 0) : k + 1]) for k in range(len(parts))]
     for k, other in [*pairwise(range(len(parts))), *((k + 1, k) for k in reversed(range(len(parts) - 1)))]:

@@ -60,6 +60,7 @@ class RepairedPath:
 
     Attributes
     ----------
+    limits : Limits
     values : (P, D) float64, u
     sigma : (P,) float64, u
         Standard deviation of what the repair adds, 0 where a sample is as it was.
@@ -72,6 +73,7 @@ class RepairedPath:
         Steps that stay, and that may be of the stamps or one end of a jump: these samples are as they were.
     """
 
+    limits: Limits
     values: Array
     sigma: Array
     noise: float
@@ -96,7 +98,7 @@ def repair_path(t_s: Array, values: Array, limits: Limits, wrong: NDArray[np.boo
     new, sigma = values.copy(), np.zeros(len(t_s))
     none = np.zeros(len(t_s), dtype=bool)
     if not len(rows):
-        return RepairedPath(new, sigma, 0.0, none, none.copy(), none.copy())
+        return RepairedPath(limits, new, sigma, 0.0, none, none.copy(), none.copy())
     scatter = noise_of(t_s[rows], values[rows], limits.usual_sigma)
     samples = Samples(t_s[rows], values[rows], limits.max_change, scatter)
     dense = len(rows) > 1 and float(np.median(np.diff(samples.t_s))) < MAX_DENSE_S
@@ -131,7 +133,7 @@ def repair_path(t_s: Array, values: Array, limits: Limits, wrong: NDArray[np.boo
             at_rest[first:stop] = False
             continue
         new[first:stop], sigma[first:stop] = fitted.value, fitted.sigma
-    return RepairedPath(new, sigma, noise, moved, bridged, at_rest & bridged, tuple(skips))
+    return RepairedPath(limits, new, sigma, noise, moved, bridged, at_rest & bridged, tuple(skips))
 
 
 def runs_of(marked: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Fault, Log
 from log2sim.geometry import NS_PER_S
-from log2sim.localization.given_poses import MIN_STEP_M, MIN_STEP_RAD, Stretch
+from log2sim.localization.checked_poses import Stretch
+from log2sim.localization.given_poses import MIN_STEP_M, MIN_STEP_RAD
 
 # At 3 m/s2, which is brisk driving, a line between poses this far apart is off by 0.25 m; poses of 2 Hz are usual.
 MIN_SPARSE_S = float(np.sqrt(8 * 0.25 / 3.0))
@@ -36,7 +37,8 @@ def list_faults(log: Log, stretches: Sequence[Stretch], during_ns: tuple[int, in
     ends_ns = int(log.ego.t_ns[0]), int(log.ego.t_ns[-1])
     told = [s for s in stretches if _concerns(s, records)]
     skips = [_skip(s, int(records[0])) for s in told if s.kind == "skip"]
-    wrong = [s for s in told if s.kind not in ("gap", "skip")]
+    copies = [_copies(s, int(records[0])) for s in told if s.kind == "copies"]
+    wrong = [s for s in told if s.kind not in ("gap", "skip", "copies")]
     # Where wrong poses are left out there is a gap, which is told with them.
     gaps = [
         s for s in told if s.kind == "gap" and not any(w.first_ns < s.last_ns and s.first_ns < w.last_ns for w in wrong)
@@ -44,7 +46,7 @@ def list_faults(log: Log, stretches: Sequence[Stretch], during_ns: tuple[int, in
     repairs = [_repair(s, int(records[0]), ends_ns) for s in wrong]
     lost = [_lost(s, int(records[0])) for s in gaps if s.unknown_s > 0]
     sparse = [s for s in gaps if not s.unknown_s and s.duration_s >= MIN_SPARSE_S]
-    found = [*repairs, *skips, *lost, *([_sparse(sparse, int(records[0]))] if sparse else [])]
+    found = [*copies, *repairs, *skips, *lost, *([_sparse(sparse, int(records[0]))] if sparse else [])]
     return tuple(sorted(found, key=lambda fault: fault.start_ns or 0))
 
 
@@ -90,6 +92,16 @@ def _repair(stretch: Stretch, start_ns: int, ends_ns: tuple[int, int]) -> Fault:
         stretch.last_ns,
         values,
     )
+
+
+def _copies(stretch: Stretch, start_ns: int) -> Fault:
+    """Describe poses that repeat others."""
+    message = (
+        f"{stretch.poses} poses {_span(stretch, start_ns)} repeat the one before while the ego moves on by up to "
+        f"{stretch.shift_m:.1f} m, as those of a slower source do: they are not used"
+    )
+    values = {"shift_m": round(stretch.shift_m, 3), "poses": float(stretch.poses)}
+    return Fault("frozen_poses", "ego", message, "left_out", stretch.first_ns, stretch.last_ns, values)
 
 
 def _skip(stretch: Stretch, start_ns: int) -> Fault:
