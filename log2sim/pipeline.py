@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +19,7 @@ from log2sim.agents.scenario_of import camera_entries, provenance_of, scenario_o
 from log2sim.agents.simplify import simplify
 from log2sim.calibration.check import check_calibration
 from log2sim.config import Config
-from log2sim.datatypes import Fault, Log, Scenario
+from log2sim.datatypes import Agent, Fault, Log, Scenario, Track
 from log2sim.errors import NothingToReconstruct
 from log2sim.localization.choice import localize
 from log2sim.localization.pose_choice import GIVEN, PoseChoice
@@ -206,7 +206,6 @@ def first_pass(run: Run) -> Observations:
 def second_pass(run: Run, observations: Observations) -> Result:
     """Go on from the observations, which stay as they are, to the scenario and the report."""
     log, config, plan, t_ns = run.log, run.config, run.plan, run.schedule.t_ns
-    timeline = Timeline(t_ns, int(t_ns[0]))
     with run.clock.stage("topdown"):
         rng = np.random.default_rng(config.seed)
         homographies = fit_homographies(log, observations, plan, estimation_options(config.topdown), rng=rng)
@@ -222,8 +221,20 @@ def second_pass(run: Run, observations: Observations) -> Result:
             min_life_s=config.track.min_life_s,
         )
         tracks = mark_unrecorded(tracks, observations.recorded(run.schedule))
+    ego, agents = agents_of(run, tracks, observations)
+    if ego is None and not agents:
+        raise NothingToReconstruct(
+            f"{log.name}: {say_without_pose(log, t_ns)}, and no object was detected in {len(t_ns)} ticks"
+        )
+    return result_of(run, ego, RunOutputs(observations, measurements, homographies, tuple(agents), run.clock))
+
+
+def agents_of(run: Run, tracks: Sequence[Track], observations: Observations) -> tuple[Agent | None, list[Agent]]:
+    """Make agents of tracks, judged and rated together; the ego, if its poses are known, stands apart."""
+    log, t_ns = run.log, run.schedule.t_ns
+    timeline = Timeline(t_ns, int(t_ns[0]))
     with run.clock.stage("smooth"):
-        candidates = estimate_agents(tracks, observations.obstacles, timeline, smooth=config.smooth.enabled)
+        candidates = estimate_agents(tracks, observations.obstacles, timeline, smooth=run.config.smooth.enabled)
         candidates = decide_headings(candidates, ego_path(log, run.schedule), timeline)
         ego = ego_agent(log, timeline, run.poses.origin)
     with run.clock.stage("judge"):
@@ -231,20 +242,20 @@ def second_pass(run: Run, observations: Observations) -> Result:
         recording = Recording(log, seen, observations.obstacles, timeline)
         judged = judge(candidates, ego, recording)
         agents = [with_pose_errors(candidate.agent, log, timeline) for candidate in rate_agents(judged, timeline)]
-        # Without an ego the agents' waypoints alone tell the ticks, so all of them stay.
-        agents = simplify(agents) if ego is not None else agents
-    if ego is None and not agents:
-        raise NothingToReconstruct(
-            f"{log.name}: {say_without_pose(log, t_ns)}, and no object was detected in {len(t_ns)} ticks"
-        )
-    outputs = RunOutputs(observations, measurements, homographies, tuple(agents), run.clock)
-    outcomes = stage_outcomes(plan, outputs)
-    faults = [fault.to_dict(int(t_ns[0])) for fault in (*run.faults, *observations.faults)]
+        # Without an ego the agents' waypoints alone hold the ticks, so all of them stay.
+        return ego, simplify(agents) if ego is not None else agents
+
+
+def result_of(run: Run, ego: Agent | None, outputs: RunOutputs) -> Result:
+    """Assemble the scenario and the report of a run."""
+    log, config, t_ns = run.log, run.config, run.schedule.t_ns
+    outcomes = stage_outcomes(run.plan, outputs)
+    faults = [fault.to_dict(int(t_ns[0])) for fault in (*run.faults, *outputs.observations.faults)]
     scenario = scenario_of(
         log,
         t_ns,
-        [ego, *agents] if ego is not None else agents,
-        cameras=camera_entries(log, plan.cameras, homographies),
+        [ego, *outputs.agents] if ego is not None else outputs.agents,
+        cameras=camera_entries(log, run.plan.cameras, outputs.homographies),
         plan=[outcome.to_dict() for outcome in outcomes],
         provenance={
             **provenance_of(log, config, run.detectors.name, run.poses.to_provenance()),
