@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import glob
 import os
 import secrets
 from collections.abc import Iterator
@@ -41,7 +42,7 @@ def replaced_folder(target: Path, *, overwrite: bool) -> Iterator[Path]:
         yield temporary
         if overwrite and target.exists() and exchange_names(temporary, target):
             return  # what was there is under the temporary name now, and is removed with it
-        # Under another name than what a later run removes: it is the only copy until the new folder is in its place.
+        # Under another name than what the next run removes at its start: it is the only copy until a new folder is in its place.
         earlier = target.with_name(f".{target.name}.{secrets.token_hex(4)}.old")
         if overwrite and target.exists():
             target.rename(earlier)
@@ -55,7 +56,8 @@ def replaced_folder(target: Path, *, overwrite: bool) -> Iterator[Path]:
             elif isinstance(error, OSError) and error.errno in (errno.ENOTEMPTY, errno.EEXIST):
                 raise written_meanwhile(target) from None
             raise
-        remove(earlier)
+        for replaced in _earlier_copies(target):  # of runs that died before this line, too
+            remove(replaced)
 
 
 def exchange_names(one: Path, other: Path) -> bool:
@@ -92,6 +94,11 @@ def unfinished_folder(temporary: Path, target: Path) -> Iterator[Path]:
         raise ConfigError(f"{target / inside}: cannot be written: {error.strerror or error}") from error
     finally:
         remove(temporary)
+
+
+def _earlier_copies(target: Path) -> list[Path]:
+    """Return what was at a target and made room for a new folder."""
+    return list(target.parent.glob(f".{glob.escape(target.name)}.{'[0-9a-f]' * 8}.old"))
 
 
 def _latest_in(folder: Path) -> Path:

@@ -219,6 +219,26 @@ def test_output_that_nobody_can_read_changes_no_exit_code(end: str) -> None:
     assert (ran.returncode, ran.stderr) == (0, "")
 
 
+PRINTS = """
+import os, sys
+from log2sim.cli.process import tolerating_lost_output
+with tolerating_lost_output():
+    with open(sys.argv[1], "w") as file:
+        os.write(1, b"of a library")
+        os.write(2, b"of a library")
+        file.write("result")
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no such shell there")
+@pytest.mark.parametrize("end", [">&-", "2>&-", "<&- >&- 2>&-"])
+def test_what_libraries_print_never_gets_into_an_output(tmp_path: Path, end: str) -> None:
+    """A file takes the lowest free number, which would be that of the closed stream."""
+    command = ["bash", "-c", f'"$0" -c "$1" "$2" {end}', sys.executable, PRINTS, str(tmp_path / "out")]
+    subprocess.run(command, check=True, capture_output=True)
+    assert (tmp_path / "out").read_text() == "result"
+
+
 @pytest.mark.parametrize(
     "problem", [OSError(28, "No space left on device"), KeyboardInterrupt()], ids=["full", "Ctrl-C"]
 )
@@ -439,6 +459,17 @@ def test_a_folder_that_is_replaced_is_there_at_every_moment(tmp_path: Path, monk
 def test_names_are_exchanged_or_nothing_happens(tmp_path: Path) -> None:
     assert not output_folders.exchange_names(tmp_path / "none", tmp_path / "nothing")
     assert names(tmp_path) == []
+
+
+def test_what_a_run_put_aside_and_died_is_kept_until_a_new_folder_is_there(tmp_path: Path) -> None:
+    target, aside = tmp_path / "log", tmp_path / ".log.0123abcd.old"
+    (aside / "deep").mkdir(parents=True)
+    with pytest.raises(ConfigError, match="broken"), replaced_folder(target, overwrite=True):
+        raise ConfigError("broken")
+    assert names(tmp_path) == [aside.name]
+    with replaced_folder(target, overwrite=True) as folder:
+        (folder / "new").write_text("x")
+    assert names(tmp_path) == ["log"]
 
 
 def test_files_of_an_export_replace_none_of_another_run(

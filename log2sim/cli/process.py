@@ -96,9 +96,19 @@ class TolerantStream:
             return
 
 
+def fill_closed_descriptors() -> None:
+    """Let the standard streams that are closed lead nowhere: a file opened next would get the number, and what libraries print."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest number that is free
+
+
 @contextmanager
 def tolerating_lost_output() -> Iterator[None]:
     """Within the block what cannot be printed changes nothing else."""
+    fill_closed_descriptors()
     before = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = TolerantStream(sys.stdout), TolerantStream(sys.stderr)
     try:

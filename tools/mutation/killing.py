@@ -137,7 +137,7 @@ def _kill(arguments: list[object], out: Path, before: set[str], rng: np.random.G
     begun = None if waits_for_writing else start
     while os.waitpid(process, os.WNOHANG)[0] == 0:
         now = time.monotonic()
-        if begun is None and any(p.name not in before for p in out.iterdir()):
+        if begun is None and any(p.name not in before and p.suffix != ".lock" for p in out.iterdir()):
             begun = now
         if begun is not None and now - begun >= moment_s:
             os.kill(process, signal.SIGKILL)
