@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -265,6 +266,7 @@ def test_a_first_image_of_an_impossible_size_does_not_size_the_camera(
     first = next(log.glob("*/image_02/*/000000.png"))
     data = bytearray(first.read_bytes())
     data[16:20] = width_px.to_bytes(4, "big")
+    data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
     first.write_bytes(data)
     opened = open_log(log)
     assert opened.cameras["image_02"].width_px == size_px
@@ -308,3 +310,27 @@ def test_images_without_times_of_their_exposure_are_told(encoded: Callable[[Enco
     parquet.write_table(table, path)
     words = f"FRONT: 1 of {len(values)} images without the times of their exposure: those of their poses are taken"
     assert words in open_log(log).notes
+
+
+def test_a_png_whose_header_is_damaged_does_not_size_the_camera(encoded: Callable[[Encode], Path]) -> None:
+    log = encoded(kitti.encode_tracking)
+    size_px = open_log(log).cameras["image_02"].width_px
+    first = next(log.glob("*/image_02/*/000000.png"))
+    data = bytearray(first.read_bytes())
+    data[18] ^= 1
+    first.write_bytes(data)
+    opened = open_log(log)
+    assert opened.cameras["image_02"].width_px == size_px
+    with pytest.raises(RecordError, match="the check sum of the PNG header is wrong"):
+        opened.streams["image_02"].read(0)
+
+
+@pytest.mark.parametrize(
+    "line", ["2011-09-26", "2011-09-26 13", "2011-09-26 13:02", "2011-09-26 13:02:2", "13:02:25.9"]
+)
+def test_a_stamp_that_is_cut_is_no_stamp(encoded: Callable[[Encode], Path], line: str) -> None:
+    log = encoded(kitti.encode_raw)
+    path = next(log.glob("*/*/image_02/timestamps.txt"))
+    path.write_text("\n".join([line, *path.read_text().splitlines()[1:]]) + "\n")
+    with pytest.raises(LogError, match=r"timestamps\.txt, line 1: .*, expected YYYY-MM-DD HH:MM:SS"):
+        open_log(log)

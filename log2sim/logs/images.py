@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -114,6 +115,8 @@ def _decode_jpeg(data: bytes, where: str) -> NDArray[np.uint8]:
 def _png_size(data: bytes, where: str) -> tuple[int, int]:
     if data[:8] != b"\x89PNG\r\n\x1a\n" or len(data) < 24:
         raise RecordError(f"{where}: neither a JPEG nor a PNG image")
+    if zlib.crc32(data[12:29]) != int.from_bytes(data[29:33], "big"):
+        raise RecordError(f"{where}: the check sum of the PNG header is wrong")
     return struct.unpack(">II", data[16:24])
 
 

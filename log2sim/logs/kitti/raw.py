@@ -6,6 +6,7 @@ frame by frame (sequence 0000 is drive 2011_09_26_0005).
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +31,7 @@ REFERENCE_CAMERAS = ("image_02", "image_00", "image_03", "image_01")
 PATTERN = "*_drive_*_sync"
 LABELS = "label_02.txt"
 _NOT_A_TIME = np.iinfo(np.int64).min
+_TIME = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2} [0-9]{2}:[0-9]{2}:[0-9]{2}(\.[0-9]{1,9})?")
 
 
 class KittiRawReader:
@@ -196,6 +198,8 @@ def _stamps(path: Path) -> NDArray[np.int64]:
     stamps = np.zeros(len(lines), dtype=np.int64)
     for k, line in enumerate(lines):
         try:
+            if _TIME.fullmatch(line.strip()) is None:
+                raise ValueError  # a date alone, of a line that was cut, would be a time
             stamps[k] = np.array([line.strip().replace(" ", "T")], dtype="datetime64[ns]").astype(np.int64)[0]
         except ValueError:
             stamps[k] = _NOT_A_TIME
