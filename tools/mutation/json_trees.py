@@ -114,7 +114,9 @@ def replace_by_other_type(rng: np.random.Generator, root: Any) -> tuple[str, boo
         return None
     holder, key, path = found
     old, holder[key] = holder[key], pick(rng, OTHER_TYPES)
-    return f"{path}: {type(old).__name__} is {str(holder[key])[:50]}", not _is_valid(path, holder[key])
+    # An empty object or list instead of another is of the same type, and may have been so.
+    visible = type(old) is not type(holder[key]) and not _is_valid(path, holder[key])
+    return f"{path}: {type(old).__name__} is {str(holder[key])[:50]}", visible
 
 
 def remove_key(rng: np.random.Generator, root: Any) -> tuple[str, bool] | None:
