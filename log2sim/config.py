@@ -83,6 +83,9 @@ class PosesConfig(Section):
         "motion of a camera above the ground; auto: lidar where the log has no poses or the LiDAR shows that they are worse, "
         "camera where it has neither, else given.",
     )
+    check: bool = _setting(
+        True, "Whether the log's own poses are checked for jumps, standstills of the data and gaps, and repaired."
+    )
 
 
 class CalibrationConfig(Section):

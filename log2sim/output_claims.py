@@ -23,7 +23,8 @@ def holding_claims() -> Iterator[None]:
         yield
     finally:
         _claims.reset(token)
-        for lock in held.values():
+        # The first one made the folders for the others.
+        for lock in reversed(held.values()):
             lock.release()
 
 

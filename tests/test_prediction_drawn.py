@@ -17,7 +17,7 @@ from log2sim.visualization.page import predictions as page_predictions
 from log2sim.visualization.page.columns import SCALES
 from log2sim.visualization.page.document import page_document
 from log2sim.visualization.page.predictions import EVERY_TICKS, predicted_columns
-from log2sim.visualization.plot.predicted import PredictedWays, draw_predictions
+from log2sim.visualization.plot.predicted import PredictedPaths, draw_predictions
 from log2sim.visualization.plot.roles import assign_roles
 from log2sim.visualization.plot.tracks import still
 
@@ -27,7 +27,7 @@ def drawn(world, horizon_s: float) -> tuple[list[np.ndarray], list[np.ndarray]]:
     roles = assign_roles(world)
     ax = still(world, roles).ax
     before = set(ax.collections)
-    draw_predictions(ax, roles, PredictedWays(world, horizon_s))
+    draw_predictions(ax, roles, PredictedPaths(world, horizon_s))
     added = [c for c in ax.collections if c not in before]
     (lines,) = (c for c in added if isinstance(c, LineCollection))
     (rims,) = (c for c in added if isinstance(c, PolyCollection))
@@ -47,7 +47,7 @@ def test_a_still_picture_shows_every_way_from_the_track_to_its_ellipse() -> None
 
 def test_who_stands_or_is_absent_has_no_way() -> None:
     stops = line("a", 0.0, speed=0.0, duration_s=9.0)
-    ways = PredictedWays(scene(stops, line("b", 0.0, 9.0, duration_s=2.0)), 3.0)
+    ways = PredictedPaths(scene(stops, line("b", 0.0, 9.0, duration_s=2.0)), 3.0)
     assert ways.at("a", 5.0) is None
     assert ways.at("b", 1.0) is not None
     assert ways.at("b", 3.0) is None
@@ -56,7 +56,7 @@ def test_who_stands_or_is_absent_has_no_way() -> None:
 
 def test_the_legend_tells_what_is_drawn(tmp_path: Path) -> None:
     world = scene(corner("ego", 3.0), corner("a", 0.0))
-    legend = still(world, assign_roles(world), predicted=PredictedWays(world, 2.5)).figure.legends[0]
+    legend = still(world, assign_roles(world), predicted=PredictedPaths(world, 2.5)).figure.legends[0]
     assert "predicted for 2.5 s, 1 sigma" in [text.get_text() for text in legend.get_texts()]
     world.save(tmp_path / "scenario.json")
     sizes = {}

@@ -42,7 +42,7 @@ def localize(log: Log, config: Config, *, progress: Progress | None = None) -> t
     ----------
     log : Log
     config : Config
-        `poses.source`, and `start_s` and `stop_s`, outside of which nothing is estimated.
+        `poses.source`, `poses.check`, and `start_s` and `stop_s`, outside of which nothing is estimated.
     progress : callable, optional
         Called as `progress(stage, done, total)`.
 
@@ -55,7 +55,11 @@ def localize(log: Log, config: Config, *, progress: Progress | None = None) -> t
     MissingExtra
         For LiDAR odometry without its library.
     """
-    return _localize(_Request(log, config.poses.source, during_ns(log, config), progress or (lambda *_: None)))
+    return _localize(
+        _Request(
+            log, config.poses.source, during_ns(log, config), progress or (lambda *_: None), check=config.poses.check
+        )
+    )
 
 
 def localize_like(log: Log, provenance: Mapping[str, Any], *, progress: Progress | None = None) -> Log:
@@ -76,17 +80,19 @@ def localize_like(log: Log, provenance: Mapping[str, Any], *, progress: Progress
     window = None
     if isinstance(during, Sequence) and len(during) == 2 and all(type(t) is int for t in during):
         window = (int(during[0]), int(during[1]))
-    return _localize(_Request(log, source, window, progress or (lambda *_: None)))[0]
+    check = entry.get("check") is not False
+    return _localize(_Request(log, source, window, progress or (lambda *_: None), check=check))[0]
 
 
 @dataclass(frozen=True, eq=False)
 class _Request:
-    """What to localize, how, and from which part."""
+    """What to localize, how, from which part, and whether poses of the log are checked first."""
 
     log: Log
     requested: str
     during_ns: tuple[int, int] | None
     progress: Progress
+    check: bool = True
 
     def answer(self, source: str, reason: str, **found: Any) -> PoseChoice:
         """Return the choice of a source."""
@@ -95,8 +101,9 @@ class _Request:
 
 def _localize(request: _Request) -> tuple[Log, PoseChoice]:
     """Check the poses of the log, then choose between them and others."""
-    if request.log.ego is None:
-        return _choose(request)
+    if request.log.ego is None or not request.check:
+        log, choice = _choose(request)
+        return log, replace(choice, checked=request.check)
     given = request.log.ego
     checked = bridge_by_lidar(
         request.log, check_poses(given), lambda done, total: request.progress("odometry", done, total)

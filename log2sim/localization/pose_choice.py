@@ -37,6 +37,8 @@ class PoseChoice:
         First and last stamp of what poses were estimated from; None for the whole log.
     faults : tuple of Fault
         Faults of given poses.
+    checked : bool
+        Whether given poses were checked, and repaired where that was needed.
     """
 
     requested: str
@@ -48,6 +50,7 @@ class PoseChoice:
     notes: tuple[str, ...] = ()
     during_ns: tuple[int, int] | None = None
     faults: tuple[Fault, ...] = ()
+    checked: bool = True
 
     @property
     def origin(self) -> str:
@@ -69,7 +72,7 @@ class PoseChoice:
     def to_provenance(self) -> dict[str, Any]:
         """Return what `localize_like` needs to find the same poses again."""
         during = {} if self.during_ns is None else {"during_ns": list(self.during_ns)}
-        return {"source": self.source, **during}
+        return {"source": self.source, **during, **({} if self.checked else {"check": False})}
 
 
 GIVEN = PoseChoice("given", "given", "the log's own poses")

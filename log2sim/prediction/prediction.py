@@ -37,7 +37,7 @@ HORIZON_LIMITS_S = (0.1, 10.0)
 
 
 PATH_SIGMA_M = 0.5
-"""Standard deviation of the ways of two agents on one path from each other: drivers keep to a lane within some 0.3 m each. At short
+"""Standard deviation of the lateral distance of two agents on one path: drivers keep to a lane within some 0.3 m each. At short
 leads an agent's own motion tells its place more exactly."""
 
 

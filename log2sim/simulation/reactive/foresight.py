@@ -1,4 +1,4 @@
-"""What reactive agents expect of others: that they keep to their ways in the scenario, or to their motion so far."""
+"""What reactive agents expect of others: that they keep to their paths in the scenario, or to their motion so far."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ MAX_PREDICTIONS = 1_000_000
 
 
 def predicted_columns(scenario: Scenario, horizon_s: float) -> dict[str, dict[str, Any]]:
-    """Predict agents while they move: by agent, ways relative to where it was, and the ellipse at their ends.
+    """Predict agents while they move: by agent, paths relative to where it was, and the ellipse at their ends.
 
     Raises
     ------

@@ -21,7 +21,7 @@ from log2sim.visualization.plot import drawing, shapes
 from log2sim.visualization.plot.collisions import new_collisions
 from log2sim.visualization.plot.doubts import STRIPE_PT, box_stripes, is_doubted_at
 from log2sim.visualization.plot.layout import SIDE_IN, TOP_IN, WIDTH_IN, FigureLayout
-from log2sim.visualization.plot.predicted import DOTS, PredictedWays, show_expected
+from log2sim.visualization.plot.predicted import DOTS, PredictedPaths, show_expected
 from log2sim.visualization.plot.roles import AgentRoles, centers_xy
 from log2sim.visualization.plot.scene import draw_base
 from log2sim.visualization.plot.style import ALARM, FONT, INK, PAPER, halo
@@ -80,7 +80,7 @@ def write_animation(
     replay: Any,
     truth: Scenario | None,
     background: drawing.Background | None,
-    predicted: PredictedWays | None,
+    predicted: PredictedPaths | None,
     title: str | None,
 ) -> None:
     """Write a .gif or .mp4; parameters as in `tracks.plot_tracks`."""
@@ -129,7 +129,7 @@ class AnimatedArtists:
         truth: Scenario | None,
         timing: FrameTiming,
         charts: TimelineCharts | None,
-        predicted: PredictedWays | None,
+        predicted: PredictedPaths | None = None,
     ) -> None:
         self.predicted = predicted
         self.layout, self.roles, self.truth, self.timing, self.charts = layout, roles, truth, timing, charts
@@ -148,10 +148,10 @@ class AnimatedArtists:
             [], facecolors="none", edgecolors=INK, linewidths=0.8, linestyles=[(0, (3, 2))], **hidden
         )
         self.driven = PolyCollection([], facecolors="none", linewidths=1.2, linestyles=[(0, (1, 1.2))], **hidden)
-        self.ways = LineCollection([], **hidden, **DOTS)
+        self.predicted_paths = LineCollection([], **hidden, **DOTS)
         self.ellipses = PolyCollection([], linewidths=0.7, **hidden)
         self.collections = [
-            self.ellipses, self.tails, self.ways, self.boxes, self.hatches, self.noses, self.truths, self.driven,
+            self.ellipses, self.tails, self.predicted_paths, self.boxes, self.hatches, self.noses, self.truths, self.driven,
         ]  # fmt: skip
         for collection in self.collections:
             layout.ax.add_collection(collection, autolim=False)
@@ -201,7 +201,7 @@ class AnimatedArtists:
         if self.predicted is not None:
             leading = [(role, self.predicted.at(role.agent.id, t_s)) for role in self.roles.movers if role.leading]
             expected = [(role, found) for role, found in leading if found is not None]
-            show_expected(self.ways, expected)
+            show_expected(self.predicted_paths, expected)
             show_expected(self.ellipses, expected)
         if self.truth is not None:
             there = [(a, _pose(a, t_s)) for a in self.truth.agents]

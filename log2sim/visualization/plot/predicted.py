@@ -27,17 +27,17 @@ class Expected(NamedTuple):
 
     Attributes
     ----------
-    way_m : (H + 1, 2) float64, m
+    path_m : (H + 1, 2) float64, m
         From where the agent is to where it is expected to be.
     ellipse_m : (V, 2) float64, m
         One standard deviation about the end.
     """
 
-    way_m: Array
+    path_m: Array
     ellipse_m: Array
 
 
-class PredictedWays:
+class PredictedPaths:
     """Predictions of the agents of a scenario, to be drawn at times."""
 
     def __init__(self, scenario: Scenario, horizon_s: float) -> None:
@@ -53,15 +53,15 @@ class PredictedWays:
         if k < 0 or t_s - table.t_s[ticks[k]] > table.tick_s or self._stands(rows[k]):
             return None
         forecast, row = found.forecasts[DEFAULT_METHOD], rows[k]
-        way = np.append(table.position_m[found.row[row], ticks[k]], forecast.position_m[row])
+        path = np.append(table.position_m[found.row[row], ticks[k]], forecast.position_m[row])
         along, across = forecast.sigma_m[row, -1]
-        rim = way[-1] + forecast.course[row, -1] * (along * _CIRCLE.real + 1j * across * _CIRCLE.imag)
-        return Expected(*(np.column_stack([z.real, z.imag]) for z in (way, rim)))
+        rim = path[-1] + forecast.course[row, -1] * (along * _CIRCLE.real + 1j * across * _CIRCLE.imag)
+        return Expected(*(np.column_stack([z.real, z.imag]) for z in (path, rim)))
 
     def times_of(self, agent: str) -> Array:
         """Choose the times (K,), s, at which a still picture shows what was expected of an agent.
 
-        Every `horizon_s`, so that the ways follow each other, and at its last tick, where nothing else tells how it goes on.
+        Every `horizon_s`, so that they follow each other, and at its last tick, after which nothing else is drawn.
         """
         found, rows = self._found, self._rows[agent]
         t = found.table.t_s[found.tick[rows]]
@@ -77,14 +77,14 @@ class PredictedWays:
         return bool(abs(found.table.velocity_mps[found.row[row], found.tick[row]]) < STANDSTILL_MPS)
 
 
-def draw_predictions(ax: Axes, roles: AgentRoles, ways: PredictedWays) -> None:
+def draw_predictions(ax: Axes, roles: AgentRoles, paths: PredictedPaths) -> None:
     """Draw what was expected of the leading movers at several times, as dotted lines with an ellipse at the end."""
     shown = [
         (role, expected)
         for role in roles.movers
         if role.leading
-        for t in ways.times_of(role.agent.id)
-        if (expected := ways.at(role.agent.id, float(t))) is not None
+        for t in paths.times_of(role.agent.id)
+        if (expected := paths.at(role.agent.id, float(t))) is not None
     ]
     for artist in (
         LineCollection([], zorder=MARK + 0.2, **DOTS),
@@ -95,10 +95,10 @@ def draw_predictions(ax: Axes, roles: AgentRoles, ways: PredictedWays) -> None:
 
 
 def show_expected(artist: LineCollection | PolyCollection, shown: list[tuple[AgentRole, Expected]]) -> None:
-    """Set the ways of a line collection or the ellipses of a polygon collection, in the colors of the agents."""
+    """Set the paths of a line collection or the ellipses of a polygon collection, in the colors of the agents."""
     colors = [role.color for role, _ in shown]
     if isinstance(artist, LineCollection):
-        artist.set_segments([expected.way_m for _, expected in shown])
+        artist.set_segments([expected.path_m for _, expected in shown])
         artist.set_color([to_rgba(color) for color in colors])
         return
     artist.set_verts([expected.ellipse_m for _, expected in shown])

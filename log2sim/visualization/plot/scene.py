@@ -17,7 +17,7 @@ from log2sim.visualization.plot.layout import (
     make_layout,
     write_title,
 )
-from log2sim.visualization.plot.predicted import PredictedWays, prediction_row
+from log2sim.visualization.plot.predicted import PredictedPaths, prediction_row
 from log2sim.visualization.plot.roles import AgentRoles, centers_xy, is_moving
 from log2sim.visualization.plot.time_series import TimelineCharts, charts_height_in, draw_charts, timeline_of
 from log2sim.visualization.plot.viewport import Viewport, choose_viewport, time_step_s
@@ -32,7 +32,7 @@ def draw_base(
     background: drawing.Background | None = None,
     title: str | None = None,
     moving: bool = False,
-    predicted: PredictedWays | None = None,
+    predicted: PredictedPaths | None = None,
 ) -> tuple[FigureLayout, float, TimelineCharts | None]:
     """Draw what stills and animations share.
 

@@ -15,7 +15,7 @@ from log2sim.visualization.plot.collisions import new_collisions
 from log2sim.visualization.plot.layout import (
     FigureLayout,
 )
-from log2sim.visualization.plot.predicted import PredictedWays, draw_predictions
+from log2sim.visualization.plot.predicted import PredictedPaths, draw_predictions
 from log2sim.visualization.plot.roles import AgentRoles, assign_roles
 from log2sim.visualization.plot.scene import draw_base
 
@@ -70,7 +70,7 @@ def plot_tracks(
         "replay": replay,
         "truth": None if truth is None else truth.aligned_to(scenario),
         "background": background,
-        "predicted": None if predict_s is None else PredictedWays(scenario, predict_s),
+        "predicted": None if predict_s is None else PredictedPaths(scenario, predict_s),
         "title": title,
     }
     if suffix in ANIMATED:
@@ -96,7 +96,7 @@ def still(
     replay: Any = None,
     truth: Scenario | None = None,
     background: drawing.Background | None = None,
-    predicted: PredictedWays | None = None,
+    predicted: PredictedPaths | None = None,
     title: str | None = None,
 ) -> FigureLayout:
     """Draw a still picture."""
