@@ -334,3 +334,15 @@ def test_a_stamp_that_is_cut_is_no_stamp(encoded: Callable[[Encode], Path], line
     path.write_text("\n".join([line, *path.read_text().splitlines()[1:]]) + "\n")
     with pytest.raises(LogError, match=r"timestamps\.txt, line 1: .*, expected YYYY-MM-DD HH:MM:SS"):
         open_log(log)
+
+
+@pytest.mark.parametrize("field", [2, 3, 5, 29])
+def test_a_record_of_the_imu_with_a_number_beyond_all_is_refused(encoded: Callable[[Encode], Path], field: int) -> None:
+    log = encoded(kitti.encode_tracking)
+    path = next(log.glob("*/oxts/*.txt"))
+    lines = path.read_text().splitlines()
+    words = lines[2].split()
+    words[field] = "-9223372036854775808"
+    path.write_text("\n".join([*lines[:2], " ".join(words), *lines[3:]]) + "\n")
+    with pytest.raises(LogError, match="line 3: expected 30 finite numbers"):
+        open_log(log)

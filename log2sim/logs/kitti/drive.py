@@ -17,6 +17,7 @@ from log2sim.datatypes import EgoVehicle, Lidar, MapFrame, Stream, Sweep
 from log2sim.errors import LogError
 from log2sim.geometry import Array, Camera, inverse, nearest_rotation, rotation_from_rpy, transform
 from log2sim.input_files import read_file
+from log2sim.logs.pose_checks import MAX_POSITION_M
 from log2sim.logs.sweeps import read_sweep, sweep_of
 from log2sim.numerals import parse_float
 
@@ -162,7 +163,7 @@ def parse_oxts(text: str, where: str) -> Array:
             row = [parse_float(word) for word in line.split()]
         except ValueError:
             row = []
-        if len(row) < OXTS_FIELDS or not np.isfinite(row).all():
+        if len(row) < OXTS_FIELDS or not (np.abs(row) <= MAX_POSITION_M).all():
             raise LogError(f"{where}, line {k}: expected {OXTS_FIELDS} finite numbers (lat lon alt roll pitch yaw ...)")
         if abs(row[0]) >= 90:
             raise LogError(f"{where}, line {k}: latitude {row[0]:g}, expected less than 90 degrees")
