@@ -152,7 +152,7 @@ def _spans(log: Log) -> list[Span]:
 
 def _listed(words: Sequence[str]) -> str:
     more = len(words) - MAX_NAMES
-    return ", ".join(words[:MAX_NAMES]) + (f" and {more} other streams" if more > 0 else "")
+    return ", ".join(words[:MAX_NAMES]) + (f" and {more} other stream{'s' * (more > 1)}" if more > 0 else "")
 
 
 def _reference_problem(log: Log) -> list[str]:
