@@ -336,7 +336,7 @@ def test_files_that_are_no_network(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     with pytest.raises(ConfigError, match="not a network that ONNX Runtime can load"):
         network.load_network(path)
     monkeypatch.setattr(network, "MAX_FILE_BYTES", 5)
-    with pytest.raises(ConfigError, match="13 bytes; expected an ONNX network of 1 to 5 bytes"):
+    with pytest.raises(ConfigError, match="13 bytes; expected an ONNX network for clouds of 1 to 5 bytes"):
         network.load_network(path)
 
 

@@ -134,7 +134,7 @@ def _code_folders() -> list[str]:
     names = ("stdlib", "platstdlib", "purelib", "platlib")
     return [
         sys.prefix, sys.base_prefix, *site.getsitepackages(), *(sysconfig.get_path(n) for n in names), str(ROOT / "log2sim"),
-        str(ROOT / "schemas"),
+        str(ROOT / "schemas"), str(ROOT / "log2sim.egg-info"),
     ]  # fmt: skip
 
 
