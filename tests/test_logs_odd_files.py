@@ -346,3 +346,24 @@ def test_a_record_of_the_imu_with_a_number_beyond_all_is_refused(encoded: Callab
     path.write_text("\n".join([*lines[:2], " ".join(words), *lines[3:]]) + "\n")
     with pytest.raises(LogError, match="line 3: expected 30 finite numbers"):
         open_log(log)
+
+
+@pytest.mark.parametrize("rest", ["Tr_im", "Tr_imu_to_velo:"])
+def test_a_calibration_that_ends_within_a_key_is_refused(encoded: Callable[[Encode], Path], rest: str) -> None:
+    log = encoded(kitti_object.encode)
+    path = log / "training" / "calib" / "000000.txt"
+    sound = path.read_text()
+    path.write_text(sound.partition("Tr_imu_to_velo")[0] + rest)
+    with pytest.raises(LogError, match=r"nothing stands after 'Tr_im.*'; expected numbers"):
+        open_log(log)
+    path.write_text(f"\n{sound}\n\n")
+    assert open_log(log).streams
+
+
+def test_sweeps_that_end_before_they_face_forward_are_told(encoded: Callable[[Encode], Path]) -> None:
+    log = encoded(kitti.encode_raw)
+    assert open_log(log).notes == ()
+    path = next(log.glob("*/*/velodyne_points/timestamps_end.txt"))
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([lines[0], *lines]) + "\n")
+    assert any("3 of 4 sweeps face forward at a stamp before their start or after" in n for n in open_log(log).notes)

@@ -83,11 +83,13 @@ def read_calibration(path: Path) -> dict[str, Array]:
     Raises
     ------
     LogError
-        For a key that stands twice.
+        For a key that stands twice, and for one that nothing follows, as where a file is cut.
     """
-    values = {}
-    for line in read_text(path).splitlines():
-        key, _, rest = line.strip().partition(" ")
+    values: dict[str, Array] = {}
+    for line in filter(None, map(str.strip, read_text(path).splitlines())):
+        key, _, rest = line.partition(" ")
+        if not rest:
+            raise LogError(f"{path}: nothing stands after '{key[:40]}'; expected numbers")
         try:
             numbers = np.array([parse_float(word) for word in rest.split()])
         except ValueError:

@@ -134,6 +134,12 @@ class _Drive:
         for name, stamps in (("start", begin), ("end", end)):
             if len(stamps) <= numbers.max():
                 raise LogError(f"{folder}/timestamps_{name}.txt: {len(stamps)} lines, record {numbers.max()} has none")
+        wrong = np.flatnonzero((begin[numbers] > t_ns) | (end[numbers] < t_ns))
+        if len(wrong):
+            notes.append(
+                f"{folder.name}: {len(wrong)} of {len(numbers)} sweeps face forward at a stamp before their start or after their end, "
+                f"first number {numbers[wrong[0]]:010d}; check timestamps_start.txt and timestamps_end.txt"
+            )
         return drive.sweep_stream(t_ns, begin[numbers], end[numbers], files)
 
     def _poses(self, notes: list[str]) -> tuple[NDArray[np.int64], Array, MapFrame]:
