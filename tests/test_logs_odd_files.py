@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import zlib
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -17,8 +19,10 @@ from hypothesis import strategies as st
 from log_encoders import kitti, kitti_object, native, nuscenes, pandaset, ros, waymo, waymo_parquet
 from log_encoders.world import make_world
 
-from log2sim.datatypes import Log, Sweep
-from log2sim.errors import LogError, RecordError
+from log2sim.datatypes import Log, Scenario, Sweep
+from log2sim.errors import LogError, RecordError, ScenarioError
+from log2sim.export.exporters import Options, export
+from log2sim.export.openscenario.read import load
 from log2sim.export.xml_text import require_number
 from log2sim.geometry import PoseTrack
 from log2sim.logs.calibration_checks import problems_of
@@ -367,3 +371,24 @@ def test_sweeps_that_end_before_they_face_forward_are_told(encoded: Callable[[En
     lines = path.read_text().splitlines()
     path.write_text("\n".join([lines[0], *lines]) + "\n")
     assert any("3 of 4 sweeps face forward at a stamp before their start or after" in n for n in open_log(log).notes)
+
+
+@pytest.mark.parametrize("number", [0, 3])
+def test_one_image_of_another_size_does_not_size_the_camera(encoded: Callable[[Encode], Path], number: int) -> None:
+    log = encoded(kitti.encode_tracking)
+    file = next(log.glob(f"*/image_02/*/{number:06d}.png"))
+    cv2.imwrite(str(file), np.zeros((75, 240, 3), np.uint8))
+    opened = open_log(log)
+    assert (opened.cameras["image_02"].width_px, opened.cameras["image_02"].height_px) == (480, 300)
+    with pytest.raises(RecordError, match="240x75 px, the calibration is for 480x300"):
+        opened.streams["image_02"].read(number)
+
+
+@pytest.mark.parametrize("text", ["NaN", "11\u0661", "1 0", "102"])
+def test_marks_of_an_openscenario_file_are_0_and_1(tiny_scenario: Path, tmp_path: Path, text: str) -> None:
+    export(Scenario.load(tiny_scenario), "openscenario", tmp_path / "x", Options())
+    file = next((tmp_path / "x").glob("*.xosc"))
+    sound = file.read_text(encoding="utf-8")
+    file.write_text(re.sub(r'(log2sim\.observed" value=")[01]+', rf"\g<1>{text}", sound, count=1), encoding="utf-8")
+    with pytest.raises(ScenarioError, match=r"property log2sim\.observed is .*, expected 0 and 1 alone"):
+        load(file)

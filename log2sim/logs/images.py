@@ -77,13 +77,21 @@ def image_stream(name: str, t_ns: NDArray[np.int64], files: list[Path], size_px:
 
 
 def first_image_size(files: list[Path]) -> tuple[int, int]:
-    """Width and height in px of the first readable image file, from its header."""
-    for file in files:
+    """Width and height in px of image files, from the headers of the first and the last readable one.
+
+    Where these differ, one of them is damaged, and the next that has either size decides.
+    """
+    found = list[tuple[int, int]]()
+    for file in (files[0], *files[:0:-1]):
         try:
-            return image_size(read_bytes(file, 0, MAX_IMAGE_BYTES), str(file))
+            found.append(image_size(read_bytes(file, 0, MAX_IMAGE_BYTES), str(file)))
         except RecordError:
             continue
-    raise LogError(f"{files[0].parent}: none of its {len(files)} images can be read")
+        if found.count(found[-1]) > 1:
+            return found[-1]
+    if not found:
+        raise LogError(f"{files[0].parent}: none of its {len(files)} images can be read")
+    return found[0]
 
 
 def read_bytes(path: Path, t_ns: int, limit_bytes: int) -> bytes:

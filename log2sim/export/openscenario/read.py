@@ -213,6 +213,8 @@ def _waypoints(
     exported = speeds is not None and len(speeds) == len(vertices)
     sigmas = {key: _column(properties, key, where) if exported else None for key in SIGMAS}
     observed = properties.get(PREFIX + "observed", "") if exported else ""
+    if observed.strip("01"):
+        raise ScenarioError(f"{where}: property {PREFIX}observed is {observed[:40]!r}, expected 0 and 1 alone")
     t, x, y, z, heading = vertices.T
     ahead_m, above_m = center_m
     centers = np.column_stack([x + ahead_m * np.cos(heading), y + ahead_m * np.sin(heading), z + above_m, heading])
