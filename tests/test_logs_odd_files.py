@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -392,3 +393,13 @@ def test_marks_of_an_openscenario_file_are_0_and_1(tiny_scenario: Path, tmp_path
     file.write_text(re.sub(r'(log2sim\.observed" value=")[01]+', rf"\g<1>{text}", sound, count=1), encoding="utf-8")
     with pytest.raises(ScenarioError, match=r"property log2sim\.observed is .*, expected 0 and 1 alone"):
         load(file)
+
+
+def test_key_frames_that_are_missing_are_told(encoded: Callable[[Encode], Path]) -> None:
+    log = encoded(encode_nuscenes)
+    assert not any("key frames" in note for note in open_log(log).notes)
+    path = log / "v1.0-mini" / "sample.json"
+    samples = json.loads(path.read_text())
+    path.write_text(json.dumps([samples[0], *samples[2:]]))
+    words = f"sample.json: 1 of the {len(samples)} key frames of the scene are missing"
+    assert words in open_log(log).notes

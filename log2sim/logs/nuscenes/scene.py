@@ -91,6 +91,11 @@ class Scene:
             self.notes.append(
                 f"sample.json: {len(samples) - len(by_token)} key frames are there twice; each counts once"
             )
+        stated = self.record.get("nbr_samples")
+        if isinstance(stated, int) and len(by_token) < stated:
+            self.notes.append(
+                f"sample.json: {stated - len(by_token)} of the {stated} key frames of the scene are missing"
+            )
         return sorted(by_token.values(), key=lambda sample: stamp_ns_of(sample, path))
 
     @cached_property
