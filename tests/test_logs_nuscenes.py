@@ -108,6 +108,15 @@ def test_keys_that_stand_twice_in_a_wanted_record_are_told(tmp_path: Path) -> No
         list(tables.scan_records(path, "token", ["b"]))
 
 
+def test_a_table_that_goes_on_with_zeros_is_refused_at_the_first_of_them(tmp_path: Path) -> None:
+    path = tmp_path / "sample.json"
+    path.write_text('[{"token": "a"}]')
+    with path.open("r+b") as file:
+        file.truncate(64 * 1024**3)  # takes no place on the disk, and minutes to read
+    with pytest.raises(LogError, match="byte 16: not valid JSON: a zero byte"):
+        list(tables.scan_records(path, "token", ["b"]))
+
+
 def test_points_are_where_and_when_the_world_has_them(root: Path) -> None:
     """The file order gives the times; rays without a return are not points."""
     log, world = open_log(root), hdl32_world()

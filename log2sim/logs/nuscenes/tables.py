@@ -127,6 +127,9 @@ def _windows(path: Path, chunk_bytes: int) -> Iterator[tuple[bytes, int, int, in
                 chunk = file.read(chunk_bytes)
                 if not offset and not data and chunk.lstrip()[:1] not in (b"[", b""):
                     raise LogError(f"{path}: begins with {chunk.lstrip()[:1]!a}, expected a JSON list of records")
+                if b"\0" in chunk:  # a file that was cut and grown by a copy that failed: it may go on for gigabytes
+                    place = offset + len(data) + chunk.index(b"\0")
+                    raise LogError(f"{path}, byte {place}: not valid JSON: a zero byte; is the file damaged?")
                 if not chunk and data.rstrip()[-1:] != b"]":
                     raise LogError(f"{path}: not valid JSON: it does not end with ']'; is the file truncated?")
                 data += chunk
