@@ -151,7 +151,7 @@ def test_a_split_without_labels_or_pictures_and_two_splits(tmp_path: Path) -> No
 def test_frames_with_other_cameras_are_told(tmp_path: Path) -> None:
     write_frame(tmp_path / "training", 0, [])
     write_frame(tmp_path / "training", 1, [], tilt=np.eye(3))
-    assert "1 of 2 frames have another P2" in open_log(tmp_path).notes[1]
+    assert any(note.startswith("1 of 2 frames have another P2") for note in open_log(tmp_path).notes)
 
 
 @pytest.mark.parametrize(

@@ -403,3 +403,23 @@ def test_key_frames_that_are_missing_are_told(encoded: Callable[[Encode], Path])
     path.write_text(json.dumps([samples[0], *samples[2:]]))
     words = f"sample.json: 1 of the {len(samples)} key frames of the scene are missing"
     assert words in open_log(log).notes
+
+
+@pytest.mark.parametrize("text", ["-9223372036854775808", "1e7"])
+def test_headings_of_an_openscenario_file_are_radians(tiny_scenario: Path, tmp_path: Path, text: str) -> None:
+    export(Scenario.load(tiny_scenario), "openscenario", tmp_path / "x", Options())
+    file = next((tmp_path / "x").glob("*.xosc"))
+    sound = file.read_text(encoding="utf-8")
+    file.write_text(re.sub(r' h="[^"]+"', f' h="{text}"', sound), encoding="utf-8")
+    with pytest.raises(ScenarioError, match=r"WorldPosition h is .*, expected radians"):
+        load(file)
+
+
+def test_calibrations_without_an_imu_are_told(encoded: Callable[[Encode], Path]) -> None:
+    log = encoded(kitti_object.encode)
+    assert not any("Tr_imu_to_velo" in note for note in open_log(log).notes)
+    path = log / "training" / "calib" / "000001.txt"
+    path.write_text("".join(line for line in path.read_text().splitlines(keepends=True) if "imu" not in line))
+    count = len(list(path.parent.iterdir()))
+    words = f"1 of {count} calibrations have no entry 'Tr_imu_to_velo', first 000001.txt"
+    assert any(note.startswith(words) for note in open_log(log).notes)

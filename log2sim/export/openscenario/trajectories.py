@@ -11,6 +11,8 @@ from log2sim.export.xml_text import require_number
 from log2sim.geometry import Array
 
 VERTEX_LIMIT = 10_000_000
+# Headings may count whole turns; of larger ones not even the direction is left.
+MAX_HEADING_RAD = 1e6
 
 
 def vertices_by_entity(root: Element) -> dict[str, Array]:
@@ -72,8 +74,11 @@ def _pose(node: Element, where: str) -> list[float]:
     x, y, z = (
         require_number(world.get(key, "0" if key == "z" else None), f"{where}: WorldPosition {key}") for key in "xyz"
     )
-    heading = world.get("h")
-    return [x, y, z, float("nan") if heading is None else require_number(heading, f"{where}: WorldPosition h")]
+    text = world.get("h")
+    heading = float("nan") if text is None else require_number(text, f"{where}: WorldPosition h")
+    if abs(heading) > MAX_HEADING_RAD:
+        raise ScenarioError(f"{where}: WorldPosition h is {heading:g}, expected radians")
+    return [x, y, z, heading]
 
 
 def initial_positions(root: Element) -> dict[str, Element]:

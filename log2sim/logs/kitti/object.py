@@ -82,12 +82,15 @@ class _Calibration:
         From the rectified camera 0 to the image; may hold a rotation.
     knows_ground : bool
         Whether the height of the LiDAR is known from that of the IMU.
+    names_imu : bool
+        Whether the file has an entry for the IMU.
     """
 
     ego_T_rect: Array
     rect_T_velo: Array
     P: Array
     knows_ground: bool
+    names_imu: bool
 
     @classmethod
     def read(cls, path: Path) -> _Calibration:
@@ -112,7 +115,7 @@ class _Calibration:
         rect_T_velo = transform(rect_R_cam, np.zeros(3)) @ rigid("Tr_velo_to_cam")
         velo_ego = (drive.EGO_T_IMU @ inverse(velo_T_imu))[:3, 3]
         ego_T_rect = transform(EGO_R_RECT, velo_ego - EGO_R_RECT @ rect_T_velo[:3, 3])
-        return cls(ego_T_rect, rect_T_velo, P, knows_ground)
+        return cls(ego_T_rect, rect_T_velo, P, knows_ground, "Tr_imu_to_velo" in c)
 
     def camera(self, width_px: int, height_px: int) -> Camera:
         """Make the camera."""
@@ -160,6 +163,12 @@ class _Split:
         without = sorted(set(images) - set(self.sweeps))
         if without:
             notes.append(f"{len(without)} of {len(images)} images have no sweep, first number {without[0]:06d}")
+        nameless = [number for number, c in calibrations.items() if not c.names_imu]
+        if nameless:
+            notes.append(
+                f"{len(nameless)} of {len(t_ns)} calibrations have no entry 'Tr_imu_to_velo', first {nameless[0]:06d}.txt: "
+                "the ego is put below the LiDAR there"
+            )
         labels = self._labels(first, ego, notes)
         ground_z_m = 0.0 if first.knows_ground else _ground_under(labels.boxes_3d)
         others = sum(not np.allclose(c.P, first.P, rtol=1e-2, atol=1e-3) for c in calibrations.values())
