@@ -10,10 +10,24 @@ import json
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BeforeValidator, ConfigDict, ValidationError
 
+from log2sim.config_sections import (
+    CalibrationConfig,
+    CooperationConfig,
+    DetectConfig,
+    LidarConfig,
+    MeasureConfig,
+    PosesConfig,
+    Section,
+    SmoothConfig,
+    SyncConfig,
+    TopdownConfig,
+    TrackConfig,
+    setting,
+)
 from log2sim.errors import ConfigError
 from log2sim.input_files import read_text
 from log2sim.model_errors import first_problem
@@ -27,17 +41,6 @@ KINDS = {
     "array": "names separated by commas",
 }
 """Types of JSON Schema in plain words."""
-LIDAR_PREFIX = "lidar:"
-"""Names of detectors in LiDAR sweeps begin with it."""
-
-
-def _setting(
-    default: Any, description: str, *, unit: str = "", ge: float | None = None, le: float | None = None
-) -> Any:
-    """Declare a setting: its default, meaning, unit, and limits `ge` and `le`, which belong to the range."""
-    return Field(
-        default=default, description=description, json_schema_extra={"unit": unit} if unit else None, ge=ge, le=le
-    )
 
 
 def _names(value: Any) -> Any:
@@ -49,151 +52,6 @@ def _names(value: Any) -> Any:
     return tuple(name for name in names if name != "")
 
 
-class Section(BaseModel):
-    """Base of all settings: immutable, no unknown key, no conversion of types, no NaN and no infinity."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
-    @classmethod
-    def choices(cls, key: str) -> tuple[str, ...]:
-        """Return the values that a setting may have, the default first; none for a setting that is free."""
-        annotation = cls.model_fields[key].annotation
-        return get_args(annotation) if get_origin(annotation) is Literal else ()
-
-
-class SyncConfig(Section):
-    """Synchronization of the sensors."""
-
-    reference: str = _setting(
-        "",
-        "Camera whose frames set the ticks, without cameras the LiDAR whose sweeps do; empty: the log's own choice, of "
-        "LiDARs the one with the most sweeps.",
-    )
-    max_residual_s: float = _setting(
-        0.1, "Largest time between a tick and a record that is used for it.", unit="s", ge=1e-6, le=10.0
-    )
-
-
-class PosesConfig(Section):
-    """Poses of the ego."""
-
-    source: Literal["given", "lidar", "camera", "auto"] = _setting(
-        "given",
-        "given: the log's own, and for a log without any what auto takes; lidar: odometry of the LiDAR on the ego; camera: "
-        "motion of a camera above the ground; auto: lidar where the log has no poses or the LiDAR shows that they are worse, "
-        "camera where it has neither, else given.",
-    )
-    check: bool = _setting(
-        True, "Whether the log's own poses are checked for jumps, standstills of the data and gaps, and repaired."
-    )
-
-
-class CalibrationConfig(Section):
-    """Checks of clocks and mounts against the motion of the ego."""
-
-    check: bool = _setting(True, "Whether offsets of clocks and rotations of mounts are estimated from the log.")
-    fix_time: bool = _setting(False, "Whether stamps of sensors are corrected by the estimated offsets.")
-    fix_mounts: bool = _setting(False, "Whether mounts of sensors are corrected by the estimated rotations.")
-
-
-AUTO = "auto"
-
-
-class DetectConfig(Section):
-    """Detection in images."""
-
-    name: str = _setting(
-        AUTO,
-        "Detector in images: ssd-mobilenet-v2, a path to an ONNX model, or labels (boxes of the log); in LiDAR sweeps: "
-        "lidar:vehicle, lidar:roadside, lidar:FILE.onnx or lidar:labels; both, joined by +; auto: ssd-mobilenet-v2 where "
-        "there are cameras, joined with lidar:vehicle, or lidar:roadside where no LiDAR is on a vehicle.",
-    )
-    min_score: float = _setting(
-        0.0, "Lowest score of a detection that can continue a track; 0: the detector's own.", ge=0.0, le=1.0
-    )
-    tiles: int = _setting(
-        0, "Overlapping tiles that are searched besides the whole image; 0: chosen from the image size.", ge=0, le=64
-    )
-    layout: str = _setting("", "Output layout of an ONNX model; empty: recognized from its outputs.")
-    input_px: int = _setting(
-        0, "Side of the input of an ONNX model that takes any size; 0: usual for its layout.", unit="px", ge=0, le=8192
-    )
-
-    @property
-    def in_images(self) -> str:
-        """Name of the detector in images, "" where LiDAR sweeps alone are searched."""
-        return self._names()[0]
-
-    @property
-    def in_sweeps(self) -> str:
-        """Name of the detector in LiDAR sweeps with its prefix "lidar:", "" where images alone are searched."""
-        return self._names()[1]
-
-    def _names(self) -> tuple[str, str]:
-        if self.name.startswith(LIDAR_PREFIX):
-            return "", self.name
-        images, plus, sweeps = self.name.rpartition("+" + LIDAR_PREFIX)
-        return (images, LIDAR_PREFIX + sweeps) if plus else (self.name, "")
-
-
-class LidarConfig(Section):
-    """Detection in clouds."""
-
-    decode: Literal["centers", "votes"] = _setting(
-        "centers",
-        "centers: a box for every peak of the network's map of centers; votes: a box for every cluster of cells by where "
-        "they vote their object's center to be (Zou et al. 2021).",
-    )
-    sweeps: int = _setting(1, "Successive clouds that the network sees as one.", ge=1, le=10)
-    range_m: float = _setting(
-        0.0,
-        "Largest distance from the LiDAR, along x and along y of the map, at which objects are detected; 0: the network's "
-        "own.",
-        unit="m",
-        ge=0.0,
-        le=250.0,
-    )
-    min_score: float = _setting(0.0, "Lowest score of a box; 0: the network's own for each group.", ge=0.0, le=1.0)
-
-
-class MeasureConfig(Section):
-    """Measurement of detected objects by LiDAR."""
-
-    mode: Literal["robust", "paper"] = _setting(
-        "robust",
-        "robust: the object's cluster with an oriented box; paper: depth of the point nearest to the center of the "
-        "detection and extents of all its points.",
-    )
-    max_range_m: float = _setting(
-        80.0, "Largest distance from the ego at which objects are measured.", unit="m", ge=1.0, le=1000.0
-    )
-
-
-class TopdownConfig(Section):
-    """Homography from each image to the ground."""
-
-    method: Literal["time-aware", "calibrated", "min-frame", "per-frame", "per-frame-skimage", "straw-man", "off"] = (
-        _setting("time-aware", "How the homography is estimated; off: not at all.")
-    )
-    hypotheses: int = _setting(
-        0, "Samples that RANSAC draws, per camera or per frame; 0: as many as the data need.", ge=0, le=100_000
-    )
-
-
-class TrackConfig(Section):
-    """Tracking over time."""
-
-    birth_score: float = _setting(0.4, "Lowest score of a detection that can start a track.", ge=0.0, le=1.0)
-    max_gap_s: float = _setting(3.0, "Longest occlusion that a track bridges.", unit="s", ge=0.0, le=60.0)
-    min_life_s: float = _setting(0.3, "Shortest track that is kept.", unit="s", ge=0.0, le=60.0)
-
-
-class SmoothConfig(Section):
-    """Smoothing of trajectories."""
-
-    enabled: bool = _setting(True, "Whether trajectories are smoothed; false keeps measured positions, for comparison.")
-
-
 class Config(Section):
     """All settings of a reconstruction."""
 
@@ -202,12 +60,12 @@ class Config(Section):
         json_schema_extra={"$schema": "https://json-schema.org/draft/2020-12/schema"},
     )
 
-    seed: int = _setting(0, "Seed of all random numbers.", ge=0, le=2**32 - 1)
-    cameras: Annotated[tuple[str, ...], BeforeValidator(_names)] = _setting(
+    seed: int = setting(0, "Seed of all random numbers.", ge=0, le=2**32 - 1)
+    cameras: Annotated[tuple[str, ...], BeforeValidator(_names)] = setting(
         (), "Cameras that are used; empty: all of the log."
     )
-    start_s: float | None = _setting(None, "First time that is used, from the start of the log.", unit="s")
-    stop_s: float | None = _setting(None, "Last time that is used, from the start of the log.", unit="s")
+    start_s: float | None = setting(None, "First time that is used, from the start of the log.", unit="s")
+    stop_s: float | None = setting(None, "Last time that is used, from the start of the log.", unit="s")
     poses: PosesConfig = PosesConfig()
     calibration: CalibrationConfig = CalibrationConfig()
     sync: SyncConfig = SyncConfig()
@@ -215,6 +73,7 @@ class Config(Section):
     lidar: LidarConfig = LidarConfig()
     measure: MeasureConfig = MeasureConfig()
     topdown: TopdownConfig = TopdownConfig()
+    cooperation: CooperationConfig = CooperationConfig()
     track: TrackConfig = TrackConfig()
     smooth: SmoothConfig = SmoothConfig()
 
@@ -239,14 +98,14 @@ class Config(Section):
         config = cls()
         if path is not None:
             config = _merged(config, _read_toml(Path(path)), str(path))
-        for setting in settings:
-            key, equals, text = setting.partition("=")
+        for entry in settings:
+            key, equals, text = entry.partition("=")
             if not equals:
-                raise ConfigError(f"--set {setting}: expected section.key=value")
+                raise ConfigError(f"--set {entry}: expected section.key=value")
             nested: Any = _parse_value(text)
             for part in reversed(key.strip().split(".")):
                 nested = {part: nested}
-            config = _merged(config, nested, f"--set {setting}")
+            config = _merged(config, nested, f"--set {entry}")
         return _merged(config, {k: v for k, v in overrides.items() if v is not None}, "options")
 
     def changed(self, **changes: Any) -> Config:

@@ -13,12 +13,14 @@ from log2sim.agents.confidence.rating import rate_agents
 from log2sim.agents.ego import ego_agent, ego_path, with_pose_errors
 from log2sim.agents.estimate import estimate_agents
 from log2sim.agents.heading.decide import decide_headings
+from log2sim.agents.observers import with_observers
 from log2sim.agents.plausibility.judge import judge
 from log2sim.agents.plausibility.recording import Recording
 from log2sim.agents.scenario_of import camera_entries, provenance_of, scenario_of
 from log2sim.agents.simplify import simplify
 from log2sim.calibration.check import check_calibration
 from log2sim.config import Config
+from log2sim.cooperation.registration import register_road
 from log2sim.datatypes import Agent, Fault, Log, Scenario, Track
 from log2sim.errors import NothingToReconstruct
 from log2sim.localization.choice import localize
@@ -100,6 +102,8 @@ class Run:
         Where the poses of `log` come from.
     faults : tuple of Fault
         Of poses, clocks and mounts.
+    registration : sequence of dict
+        How the road's sensors were registered, one entry for each roadside unit.
     """
 
     log: Log
@@ -111,6 +115,7 @@ class Run:
     report_progress: Progress
     poses: PoseChoice = GIVEN
     faults: tuple[Fault, ...] = ()
+    registration: Sequence[dict[str, Any]] = ()
 
 
 def reconstruct(log: Log, config: Config | None = None, *, progress: Progress | None = None) -> Result:
@@ -146,12 +151,17 @@ def start(log: Log, config: Config, *, progress: Progress | None = None) -> Run:
     with clock.stage("calibration"):
         log, faults = check_calibration(log, config, sensors, progress=report_progress)
         sensors = sensors.without([fault.sensor for fault in faults if fault.treatment == "left_out"])
+    with clock.stage("registration"):
+        road = register_road(log, config, sensors, progress=report_progress)
+        log, sensors = road.log, sensors.without([f.sensor for f in road.faults if f.treatment == "left_out"])
     detectors = detectors_of(log, config)
     with clock.stage("sync"):
         schedule = schedule_of(log, config, sensors)
     plan = make_plan(log, config, sensors, schedule.t_ns)
-    faults = (*poses.faults, *faults)
-    return Run(sensors.restrict(log), config, plan, schedule, detectors, clock, report_progress, poses, faults)
+    faults = (*poses.faults, *faults, *road.faults)
+    return Run(
+        sensors.restrict(log), config, plan, schedule, detectors, clock, report_progress, poses, faults, road.figures
+    )
 
 
 def detectors_of(log: Log, config: Config) -> Detectors:
@@ -241,7 +251,8 @@ def agents_of(run: Run, tracks: Sequence[Track], observations: Observations) -> 
         seen = run.schedule.without_frames(observations.unseen)
         recording = Recording(log, seen, observations.obstacles, timeline)
         judged = judge(candidates, ego, recording)
-        agents = [with_pose_errors(candidate.agent, log, timeline) for candidate in rate_agents(judged, timeline)]
+        rated = rate_agents(judged, timeline)
+        agents = [with_observers(c, with_pose_errors(c.agent, log, timeline), timeline) for c in rated]
         # Without an ego the agents' waypoints alone hold the ticks, so all of them stay.
         return ego, simplify(agents) if ego is not None else agents
 
@@ -263,4 +274,5 @@ def result_of(run: Run, ego: Agent | None, outputs: RunOutputs) -> Result:
         },
     )
     report = report_of(log, config, run.schedule, outputs, outcomes, scenario)
-    return Result(scenario, {**report, "poses": run.poses.to_dict(), "faults": faults}, log)
+    added = {"poses": run.poses.to_dict(), "faults": faults, "registration": list(run.registration)}
+    return Result(scenario, {**report, **added}, log)

@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from log2sim.config import AUTO, Config
-from log2sim.datatypes import Log
+from log2sim.config import Config
+from log2sim.config_sections import AUTO
+from log2sim.datatypes import VEHICLE, Lidar, Log, end_of
 from log2sim.errors import ConfigError, LogError
-from log2sim.geometry import NS_PER_S
+from log2sim.geometry import NS_PER_S, Camera
 from log2sim.logs.calibration_checks import problems_of
 from log2sim.logs.time_checks import Span, say_apart
 from log2sim.registry import nearest
@@ -45,9 +46,10 @@ class Sensors:
         """Return the log without the LiDARs that are out of range; its streams stay."""
         return log.changed(lidars={name: log.lidars[name] for name in self.lidars})
 
-    def without(self, cameras: Collection[str]) -> Sensors:
-        """Return the sensors but for some cameras."""
-        return replace(self, cameras=tuple(name for name in self.cameras if name not in cameras))
+    def without(self, names: Collection[str]) -> Sensors:
+        """Return the sensors but for some cameras and LiDARs."""
+        cameras, lidars = (tuple(n for n in kept if n not in names) for kept in (self.cameras, self.lidars))
+        return replace(self, cameras=cameras, lidars=lidars)
 
 
 def choose_detector(log: Log, config: Config) -> Config:
@@ -59,13 +61,19 @@ def choose_detector(log: Log, config: Config) -> Config:
     if config.detect.name != AUTO:
         return config
     far = _lidars_out_of_range(log, config.measure.max_range_m)
-    near = [lidar for name, lidar in log.lidars.items() if name not in far]
+    near = [lidar for name, lidar in log.lidars.items() if name not in far and is_used(lidar, config)]
+    cameras = [camera for camera in log.cameras.values() if is_used(camera, config)]
     names = []
-    if not near or (log.cameras and (config.cameras or image_detector_installed())):
+    if not near or (cameras and (config.cameras or image_detector_installed())):
         names.append(IMAGE_DETECTOR)
     if near:
         names.append("lidar:roadside" if all(lidar.mount == "map" for lidar in near) else "lidar:vehicle")
     return config.changed(detect={"name": "+".join(names)})
+
+
+def is_used(sensor: Camera | Lidar, config: Config) -> bool:
+    """Return whether the settings use the end that a sensor belongs to."""
+    return config.cooperation.ends in ("both", end_of(sensor))
 
 
 def image_detector_installed() -> bool:
@@ -84,15 +92,25 @@ def select_sensors(log: Log, config: Config) -> Sensors:
         For a log without a sensor that the detector needs, with a calibration that no sensor can have, or with poses of the ego
         at other times than the records.
     """
+    _check_ends(log, config)
     cameras = _cameras(log, config)
     _check_calibration(log, cameras)
     _check_pose_times(log, cameras)
-    far = _lidars_out_of_range(log, config.measure.max_range_m)
-    lidars = tuple(n for n in log.lidars if n not in far)
+    used = tuple(name for name, lidar in log.lidars.items() if is_used(lidar, config))
+    far = _lidars_out_of_range(log, config.measure.max_range_m) & set(used)
+    lidars = tuple(name for name in used if name not in far)
     if config.detect.in_sweeps and not lidars:
         found = f"no LiDAR within range ({', '.join(sorted(far))} are too far)" if far else "no LiDAR"
         raise LogError(f"{log.name}: the log has {found}; detector '{config.detect.in_sweeps}' needs one")
     return Sensors(cameras, lidars, tuple(sorted(far)))
+
+
+def _check_ends(log: Log, config: Config) -> None:
+    """Raise `ConfigError` when the settings choose an end without sensors."""
+    sensors: list[Camera | Lidar] = [*log.cameras.values(), *log.lidars.values()]
+    if config.cooperation.ends != "both" and not any(is_used(sensor, config) for sensor in sensors):
+        place = "on a vehicle" if config.cooperation.ends == VEHICLE else "at the road"
+        raise ConfigError(f"--ends {config.cooperation.ends}: {log.name}: no sensor is {place}; choose both")
 
 
 def _cameras(log: Log, config: Config) -> tuple[str, ...]:
@@ -115,7 +133,9 @@ def _cameras(log: Log, config: Config) -> tuple[str, ...]:
         if name not in log.cameras:
             known = list(log.cameras)
             raise ConfigError(f"--cameras: no camera '{name}'{nearest(name, known)}; the log has {', '.join(known)}")
-    return config.cameras or tuple(log.cameras)
+        if not is_used(log.cameras[name], config):
+            raise ConfigError(f"--cameras: '{name}' is not at the end that --ends {config.cooperation.ends} uses")
+    return tuple(name for name in config.cameras or log.cameras if is_used(log.cameras[name], config))
 
 
 def _check_calibration(log: Log, cameras: tuple[str, ...]) -> None:

@@ -12,7 +12,8 @@ import pytest
 from command_line import names, run
 from worlds import tiny_log
 
-from log2sim.config import Config, Section, TopdownConfig
+from log2sim.config import Config
+from log2sim.config_sections import Section, TopdownConfig
 from log2sim.datatypes import Agent, Detections, Frame, Log, Measurements, Scenario, Waypoints
 from log2sim.documents import check
 from log2sim.errors import ConfigError, LogError

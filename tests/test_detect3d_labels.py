@@ -9,7 +9,8 @@ import pytest
 from test_detect_labels import CAR, SECOND, log_with
 
 from log2sim import registry
-from log2sim.config import Config, LidarConfig
+from log2sim.config import Config
+from log2sim.config_sections import LidarConfig
 from log2sim.datatypes import Boxes3D, Log
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array, box_corners_bev, points_in_box

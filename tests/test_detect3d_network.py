@@ -14,7 +14,7 @@ import pytest
 from lidar_networks import INFO, empty_maps, encode, info, write_network
 from numpy.typing import ArrayLike, NDArray
 
-from log2sim.config import LidarConfig
+from log2sim.config_sections import LidarConfig
 from log2sim.datatypes import Log
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array

@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 
 from lidar_training.clouds import draw_example
 
-from log2sim.config import LidarConfig
+from log2sim.config_sections import LidarConfig
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.matching import Criterion, match
 from log2sim.geometry import wrap_angle

@@ -23,7 +23,7 @@ from lidar_training.samples import CATEGORIES, Sample, write_shard
 from lidar_training.zou2021_export import export_zou2021
 from lidar_training.zou2021_targets import IGNORED, CellTargets, cell_targets
 
-from log2sim.config import LidarConfig
+from log2sim.config_sections import LidarConfig
 from log2sim.datatypes import Boxes3D
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.logs.opening import open_log

@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from bench_table import markdown, replace_section
 
-from log2sim.config import LidarConfig
+from log2sim.config_sections import LidarConfig
 from log2sim.logs.opening import open_log
 from log2sim.perception.detect3d.grid import grid_window, rasterize
 from log2sim.perception.detect3d.level_points import level_points, sensor_xy

@@ -11,7 +11,7 @@ import numpy as np
 from kitti_boxes import Boxes
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Measurements
+from log2sim.datatypes import VEHICLE, Measurements, seen_from
 from log2sim.errors import LogError
 from log2sim.geometry import Array, apply, box_corners, inverse, rotation_from_quaternion, transform
 from log2sim.logs.kitti import drive
@@ -117,6 +117,7 @@ def to_measurements(boxes: Boxes, view: View) -> list[Measurements]:
         box_size_m=np.full((n, 3), np.nan),
         box_yaw_rad=np.full(n, np.nan),
         heading_score=np.full(n, np.nan),
+        seen_by=seen_from(VEHICLE, n),
     )
     cuts = np.searchsorted(boxes.frame, np.arange(len(view.map_T_cam) + 1))
     return [everything.take(slice(a, b)) for a, b in pairwise(cuts)]

@@ -32,7 +32,7 @@ from lidar_training.report import report
 from lidar_training.samples import Sample, Shard, augmented, draw_sample, grid_of, window_of, write_shard
 from lidar_training.targets import targets_of
 
-from log2sim.config import LidarConfig
+from log2sim.config_sections import LidarConfig
 from log2sim.perception.detect3d.network import load_network
 from log2sim.perception.detect3d.network_detector import open_network
 

@@ -32,7 +32,7 @@ from lidar_training.two_stream_boxes import (
 )
 from lidar_training.two_stream_inputs import inputs_of
 
-from log2sim.config import LidarConfig
+from log2sim.config_sections import LidarConfig
 from log2sim.logs.opening import open_log
 from log2sim.perception.detect3d.network_detector import WEIGHTS, open_network
 

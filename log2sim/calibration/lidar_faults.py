@@ -9,7 +9,7 @@ import numpy as np
 from log2sim.calibration.motion_fit import MIN_SIGMAS, OFFSET, PITCH, ROLL, YAW, Estimate, X, Y, Z
 from log2sim.calibration.sweep_pairs import SweepPairs
 from log2sim.calibration.twists import velocities_at
-from log2sim.config import CalibrationConfig
+from log2sim.config_sections import CalibrationConfig
 from log2sim.datatypes import Fault, Treatment
 
 # What is certain is told if it matters: 0.2 m, which is how well agents are placed, at 10 m/s and to the side at 40 m; up or down, 0.7 m at 40 m, half

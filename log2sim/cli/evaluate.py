@@ -87,7 +87,7 @@ def evaluate(
 
 def _stated(made_with: Any, requested: str | None) -> dict[str, Any]:
     """Return the provenance of poses: as stated by what is evaluated, or as requested."""
-    from log2sim.config import PosesConfig
+    from log2sim.config_sections import PosesConfig
     from log2sim.errors import ConfigError
 
     if requested is None or requested == "auto":

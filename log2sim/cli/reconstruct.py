@@ -49,6 +49,19 @@ def reconstruct(
     fix_calibration: Annotated[
         bool, typer.Option("--fix-calibration", help="Correct mounts of sensors by the rotations that the log shows.")
     ] = False,
+    ends: Annotated[
+        str | None,
+        typer.Option(
+            metavar="both|vehicle|road", help="Use only the sensors on the vehicle, or only those at the road."
+        ),
+    ] = None,
+    fusion: Annotated[
+        str | None,
+        typer.Option(
+            metavar="points|boxes|tracks",
+            help="What of the vehicle's and the road's LiDARs is joined, see log2sim config.",
+        ),
+    ] = None,
     config: ConfigFile = None,
     settings: Settings = None,
     seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
@@ -76,6 +89,7 @@ def reconstruct(
         changes["detect"] = {"name": detector}
     if poses is not None:
         changes["poses"] = {"source": poses}
+    changes["cooperation"] = {k: v for k, v in (("ends", ends), ("fusion", fusion)) if v is not None}
     fixes = {"fix_time": fix_time, "fix_mounts": fix_calibration}
     changes["calibration"] = {name: True for name, chosen in fixes.items() if chosen}
     chosen = Config.load(config, settings or (), **changes)

@@ -16,6 +16,7 @@ from log2sim.datatypes.categories import (
 )
 from log2sim.datatypes.doubtful import list_doubtful, say_confidence, why_doubtful
 from log2sim.datatypes.doubts import FLAGS, MIN_TRUSTED_CONFIDENCE, Doubt
+from log2sim.datatypes.ends import ENDS, ROAD, VEHICLE, Span, end_of, retime_spans, seen_from
 from log2sim.datatypes.faults import FAULT_KINDS, Fault, Treatment
 from log2sim.datatypes.ignore_regions import IgnoreRegions, LabelView
 from log2sim.datatypes.labels import ImageLabels, ImageRegions, Labels
@@ -41,6 +42,7 @@ __all__ = [
     "CATEGORIES",
     "CATEGORY",
     "EGO",
+    "ENDS",
     "FAULT_KINDS",
     "FLAGS",
     "GROUPS",
@@ -49,9 +51,11 @@ __all__ = [
     "MAX_SPEED_MPS",
     "MIN_SIZE_M",
     "MIN_TRUSTED_CONFIDENCE",
+    "ROAD",
     "STANDSTILL_DRIFT_M",
     "STANDSTILL_MPS",
     "TYPICAL_SIZE_M",
+    "VEHICLE",
     "VERSION",
     "Agent",
     "BoxEvidence",
@@ -74,13 +78,17 @@ __all__ = [
     "Obstacles",
     "Rays",
     "Scenario",
+    "Span",
     "Stream",
     "Sweep",
     "Track",
     "Trajectory",
     "Treatment",
     "Waypoints",
+    "end_of",
     "list_doubtful",
+    "retime_spans",
     "say_confidence",
+    "seen_from",
     "why_doubtful",
 ]

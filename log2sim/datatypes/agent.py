@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from log2sim.datatypes.categories import CATEGORIES
 from log2sim.datatypes.doubts import MIN_TRUSTED_CONFIDENCE, Doubt
+from log2sim.datatypes.ends import Span
 from log2sim.datatypes.trajectory import Trajectory
 from log2sim.datatypes.waypoints import Waypoints
 from log2sim.errors import ScenarioError
@@ -66,6 +67,8 @@ class Agent:
         Figures of the reconstruction, such as the number of detections.
     doubts : tuple of Doubt
         What speaks against it.
+    observed_by : mapping of str to tuple of Span
+        Times of the scenario, s, between which each of the `ENDS` measured it; empty for logs of one end.
     """
 
     id: str
@@ -78,6 +81,7 @@ class Agent:
     confidence: float = 1.0
     quality: Mapping[str, Any] = field(default_factory=dict)
     doubts: tuple[Doubt, ...] = ()
+    observed_by: Mapping[str, tuple[Span, ...]] = field(default_factory=dict)
 
     @property
     def is_permanent(self) -> bool:
@@ -123,6 +127,7 @@ def agent_to_dict(agent: Agent) -> dict[str, Any]:
         for k, v in w.columns().items()
     }
     length, width, height = (float(v) for v in agent.size_m)
+    observed_by = {end: [list(span) for span in spans] for end, spans in agent.observed_by.items()}
     return {
         "id": agent.id,
         "category": agent.category,
@@ -133,6 +138,7 @@ def agent_to_dict(agent: Agent) -> dict[str, Any]:
         "confidence": float(agent.confidence),
         "doubts": [doubt.to_dict() for doubt in agent.doubts],
         "quality": dict(agent.quality),
+        **({"observed_by": observed_by} if observed_by else {}),
         "waypoints": columns,
     }
 
@@ -171,6 +177,10 @@ def agent_from_dict(entry: Mapping[str, Any]) -> Agent:
         confidence=float(entry["confidence"]),
         doubts=_doubts_of(entry),
         quality=entry["quality"],
+        observed_by={
+            end: tuple((float(first), float(last)) for first, last in spans)
+            for end, spans in entry.get("observed_by", {}).items()
+        },
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes.boxes3d import Boxes3D
+from log2sim.datatypes.ends import seen_from
 from log2sim.geometry import Array
 
 
@@ -85,6 +86,8 @@ class BoxEvidence:
         Its heading.
     heading_score : (M,) float64
         Probability in [0.5, 1] that its front and back are not swapped.
+    seen_by : (M, 2) bool
+        Which of the `ENDS` measured it.
     """
 
     t_ns: NDArray[np.int64]
@@ -107,6 +110,7 @@ class BoxEvidence:
     box_size_m: Array
     box_yaw_rad: Array
     heading_score: Array
+    seen_by: NDArray[np.bool_]
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -165,8 +169,10 @@ class Measurements(BoxEvidence):
         )
 
     @classmethod
-    def unplaced(cls, detections: Detections, *, t_ns: int, camera: str, sensor_m: Array) -> Measurements:
-        """Return a row a detection (M,) of a camera frame, without LiDAR points and without a position."""
+    def unplaced(
+        cls, detections: Detections, *, t_ns: int, camera: str, sensor_m: Array, end: str = ""
+    ) -> Measurements:
+        """Return a row a detection (M,) of a frame of a camera at an end, without LiDAR points and without a position."""
         m = len(detections)
         return cls(
             t_ns=np.full(m, t_ns, dtype=np.int64),
@@ -189,6 +195,7 @@ class Measurements(BoxEvidence):
             box_size_m=np.full((m, 3), np.nan),
             box_yaw_rad=np.full(m, np.nan),
             heading_score=np.full(m, np.nan),
+            seen_by=seen_from(end, m),
             center_m=np.full((m, 3), np.nan),
             covariance=np.full((m, 2, 2), np.nan),
             source=np.full(m, "", dtype="<U16"),

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from log2sim.datatypes import EGO, Agent, Doubt, Waypoints
+from log2sim.datatypes import EGO, Agent, Doubt, Span, Waypoints, retime_spans
 from log2sim.edit.motion import (
     chords,
     doubts_shifted,
@@ -112,11 +112,16 @@ class _WaypointEdit(_AgentEdit):
         """Replace the waypoints of the agent."""
         agent = agents[self.agent]
         waypoints = replace(self.moved(agent), visible=None)
-        return {**agents, self.agent: replace(agent, waypoints=waypoints, doubts=self.doubts(agent))}
+        moved = replace(agent, waypoints=waypoints, doubts=self.doubts(agent), observed_by=self.observed_by(agent))
+        return {**agents, self.agent: moved}
 
     def doubts(self, agent: Agent) -> tuple[Doubt, ...]:
         """Return the doubts of the agent after the edit: the same ones, unless it moves in time."""
         return agent.doubts
+
+    def observed_by(self, agent: Agent) -> Mapping[str, tuple[Span, ...]]:
+        """Return when each end measured the agent after the edit: at the same times, unless it moves in time."""
+        return agent.observed_by
 
     def moved(self, agent: Agent) -> Waypoints:
         """Return the waypoints of the agent after the edit."""
@@ -143,6 +148,11 @@ class Speed(_WaypointEdit):
     def doubts(self, agent: Agent) -> tuple[Doubt, ...]:
         """Return the doubts at scaled times."""
         return doubts_sped_up(agent, self.factor)
+
+    def observed_by(self, agent: Agent) -> Mapping[str, tuple[Span, ...]]:
+        """Return the spans at scaled times."""
+        begin_s = float(agent.waypoints.t_s[0])
+        return retime_spans(agent.observed_by, lambda t_s: begin_s + (t_s - begin_s) / self.factor)
 
 
 @dataclass(frozen=True)
@@ -196,6 +206,10 @@ class Shift(_WaypointEdit):
     def doubts(self, agent: Agent) -> tuple[Doubt, ...]:
         """Return the doubts at shifted times."""
         return doubts_shifted(agent, self.seconds)
+
+    def observed_by(self, agent: Agent) -> Mapping[str, tuple[Span, ...]]:
+        """Return the spans at shifted times, cut at the scenario's start."""
+        return retime_spans(agent.observed_by, lambda t_s: t_s + self.seconds, begin_s=0.0)
 
 
 def _require(edit: _WaypointEdit, value: float, low: float, high: float, unit: str) -> None:

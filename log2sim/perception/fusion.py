@@ -112,6 +112,7 @@ def _join(rows: Measurements, leader: int, members: NDArray[np.intp]) -> Measure
     row = rows.take([leader])
     with_points = _has_points(rows)
     others = [m for m in members if m != leader and rows.camera[m] != rows.camera[leader] and with_points[m]]
+    row = replace(row, seen_by=np.asarray(rows.seen_by[members].any(axis=0, keepdims=True)))
     if not others or not with_points[leader]:
         return row
     merged = [leader, *others]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.config import TopdownConfig
+from log2sim.config_sections import TopdownConfig
 from log2sim.datatypes import TYPICAL_SIZE_M, Log, Measurements, Obstacles
 from log2sim.geometry import Array, Camera, ground_homography, inverse, wrap_angle
 from log2sim.perception.first_pass import Observations, base_pose

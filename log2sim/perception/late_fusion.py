@@ -143,6 +143,7 @@ def _with_partners(boxes: Measurements, frames: Sequence[ImageMatches], weights:
             # Texts of fixed width would be cut.
             columns[name] = columns[name].astype(np.promote_types(columns[name].dtype, column.dtype))
             columns[name][mine[taken]] = column
+        columns["seen_by"][mine] |= frame.rows.seen_by[theirs]
         columns["score"][mine] = weights.score(
             frame.rows.score[theirs], boxes.score[mine], frame.iou[mine], range_m[mine]
         )

@@ -13,7 +13,7 @@ import torch
 from lidar_training.clouds import Example
 from lidar_training.network import IN_CHANNELS, BevNetwork
 from lidar_training.targets import GROUPS
-from log2sim.config import LidarConfig
+from log2sim.config_sections import LidarConfig
 from log2sim.datatypes import GROUP_OF
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.matching import Criterion, match

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar_training.samples import CATEGORIES, KEPT_RANGE_M, Sample
-from log2sim.config import LidarConfig
+from log2sim.config_sections import LidarConfig
 from log2sim.datatypes import Log
 from log2sim.errors import LogError
 from log2sim.evaluation.detection.boxes import SceneBoxes

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from log2sim.config import AUTO, Config, Section
+from log2sim.config import Config
+from log2sim.config_sections import AUTO, Section
 from log2sim.datatypes import Log
 from log2sim.errors import ConfigError
 from log2sim.perception.detect.onnx_detector import OnnxDetector

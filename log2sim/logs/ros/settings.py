@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
-from log2sim.config import Section
+from log2sim.config_sections import Section
 from log2sim.errors import ConfigError
 from log2sim.geometry import DISTORTION_LENGTHS
 from log2sim.input_files import is_present, read_text

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 from log2sim import registry
-from log2sim.config import LidarConfig
+from log2sim.config_sections import LidarConfig
 from log2sim.datatypes import Boxes3D, Log
 from log2sim.errors import ConfigError
 from log2sim.perception.lidar.cloud import Cloud

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from log2sim import registry
-from log2sim.config import LidarConfig
+from log2sim.config_sections import LidarConfig
 from log2sim.datatypes import CATEGORIES, Boxes3D, Log
 from log2sim.errors import ConfigError
 from log2sim.perception.detect.label_motion import LabelBoxes, interpolate_boxes, window_ns

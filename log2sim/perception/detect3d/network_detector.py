@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.config import LidarConfig
+from log2sim.config_sections import LidarConfig
 from log2sim.datatypes import Boxes3D, Log
 from log2sim.errors import ConfigError
 from log2sim.geometry import NS_PER_S, Array

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Log, Sweep
+from log2sim.datatypes import ENDS, VEHICLE, Log, Sweep, end_of
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception.lidar.azimuth_index import AzimuthIndex
 from log2sim.perception.lidar.ground import ON_GROUND_M, estimate_ground
@@ -25,6 +25,8 @@ AT_REST_PROBES = 5
 MIN_OBSTACLE_HEIGHT_M, MAX_OBSTACLE_HEIGHT_M = 0.2, 4.2
 GROUND_REACH_M = 45.0
 GROUND_SAMPLE = 2000
+# Fewer points in a box may be of the road or of a neighbor.
+MIN_END_POINTS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,11 +41,14 @@ class CloudSensor:
         At the stamp of the cloud, relative to the cloud's origin, m.
     velocity_mps : (3,) float64
         Mean over its points.
+    end : str
+        One of `ENDS`.
     """
 
     points: int
     position: Array
     velocity_mps: Array
+    end: str = VEHICLE
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +110,14 @@ class Cloud:
         """Indices of about `GROUND_SAMPLE` ground points within `GROUND_REACH_M` of the origin, evenly spaced in their order."""
         index = np.flatnonzero(self.ground & (np.hypot(self.xyz[:, 0], self.xyz[:, 1]) < GROUND_REACH_M))
         return index[:: max(len(index) // GROUND_SAMPLE, 1)]
+
+    def ends_of(self, index: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Return (2,), in the order of `ENDS`, whose sensors measured points (n,): those with `MIN_END_POINTS` or half of them."""
+        if not self.sensors or not len(index):
+            return np.zeros(len(ENDS), dtype=bool)
+        sensor = np.searchsorted(np.cumsum([s.points for s in self.sensors]), index, side="right")
+        end = np.array([ENDS.index(s.end) for s in self.sensors], dtype=np.int64)[sensor]
+        return np.asarray(np.bincount(end, minlength=len(ENDS)) >= max(min(MIN_END_POINTS, len(index) / 2), 1))
 
     def prepare(self, *, ground: bool = True) -> None:
         """Fill the cached columns in the calling thread; `ground` includes the sample of ground points."""
@@ -230,7 +243,8 @@ def assemble_cloud(
         t_s = mapped[1] + np.float32((sweep.stamp_ns - stamp) / NS_PER_S)
         position = sensor[0, :3, 3] - origin if known[0] else np.zeros(3)
         parts.append((local[near], t_s[near], position))
-        sensors.append(CloudSensor(int(near.sum()), *_follow_sensor(log, name, stamp, t_s, origin)))
+        place = _follow_sensor(log, name, stamp, t_s, origin)
+        sensors.append(CloudSensor(int(near.sum()), *place, end_of(log.lidars[name])))
     if not parts:
         return None
     xyz, t_s = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])

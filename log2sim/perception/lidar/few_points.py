@@ -148,5 +148,6 @@ def _write(
     columns["covariance"][k] = oriented_covariance(np.array([DEPTH_SIGMA_M, max(across_m, DEPTH_SIGMA_M)]), yaw)
     columns["bottom_m"][k], columns["top_m"][k], columns["height_px_m"][k] = bottom_m, bottom_m + tall_m, tall_m
     columns["points"][k], columns["source"][k] = len(members), "lidar"
+    columns["seen_by"][k] |= cloud.ends_of(members)
     columns["t_ns"][k] = cloud.stamp_ns + round(float(cloud.t_s[members].mean()) * NS_PER_S)
     columns["sensor_m"][k] = cloud.sensor + cloud.origin

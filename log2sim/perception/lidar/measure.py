@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import MAX_SIZE_M, TYPICAL_SIZE_M, Detections, Measurements
+from log2sim.datatypes import MAX_SIZE_M, TYPICAL_SIZE_M, Detections, Measurements, end_of
 from log2sim.geometry import NS_PER_S, Array, Camera
 from log2sim.perception.box_completion import place_boxes
 from log2sim.perception.box_fitting import fit_extents, sample_surface, top_of, upper_median
@@ -41,7 +41,13 @@ MIN_EXTENT_M = 0.1
 
 def measure_view(view: View, detections: Detections, cloud: Cloud | None, *, mode: str = "robust") -> Measurements:
     """Measure every detection (M,) of one camera frame; rows without LiDAR points have no position."""
-    rows = Measurements.unplaced(detections, t_ns=view.t_ns, camera=view.camera.name, sensor_m=view.map_T_cam[:3, 3])
+    rows = Measurements.unplaced(
+        detections,
+        t_ns=view.t_ns,
+        camera=view.camera.name,
+        sensor_m=view.map_T_cam[:3, 3],
+        end=end_of(view.camera),
+    )
     rows = replace(rows, truncated=_cut_by_border(view.camera, detections.box_px))
     if cloud is None or not len(detections):
         return rows
@@ -110,6 +116,7 @@ def write_evidence(columns: dict[str, Any], k: int, members: NDArray[np.intp], c
     columns["bottom_m"][k] = upper_median(xyz[:, 2] - cloud.height[members]) + cloud.origin[2]
     columns["top_m"][k] = top_of(xyz[:, 2]) + cloud.origin[2]
     columns["points"][k] = len(members)
+    columns["seen_by"][k] |= cloud.ends_of(members)
     t_s = cloud.t_s[members].astype(np.float64)
     mean_ns = round(float(t_s.mean()) * NS_PER_S)
     columns["t_ns"][k] = cloud.stamp_ns + mean_ns
@@ -135,6 +142,7 @@ def _measure_as_paper(rows: Measurements, view: View, cloud: Cloud) -> Measureme
         columns["bottom_m"][k], columns["top_m"][k] = center[2] - half[2], center[2] + half[2]
         columns["center_m"][k], columns["covariance"][k], columns["source"][k] = center, np.eye(2), "lidar"
         columns["points"][k], columns["t_ns"][k] = len(inside), cloud.stamp_ns
+        columns["seen_by"][k] |= cloud.ends_of(visible.index[inside])
     return Measurements(**columns | {"cluster": tuple(columns["cluster"])})
 
 

@@ -29,6 +29,7 @@ def measure_boxes(boxes: Boxes3D, cloud: Cloud) -> Measurements:
     for end, sign in (("bottom_m", -0.5), ("top_m", 0.5)):
         columns[end][:] = boxes.center_m[:, 2] + sign * boxes.size_m[:, 2]
     for k, members in enumerate(_members(boxes, cloud)):
+        columns["seen_by"][k] = cloud.ends_of(members)
         if len(members) >= MIN_CLUSTER_POINTS:
             write_evidence(columns, k, members, cloud)
     return place_boxes(Measurements(**columns | {"cluster": tuple(columns["cluster"])}))
