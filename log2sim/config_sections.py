@@ -162,7 +162,7 @@ class CooperationConfig(Section):
     )
     road_detector: str = setting(
         "auto",
-        "Detector in the road's clouds where the ends are searched apart, named as in detect.name; auto: the network that "
+        "Detector in the road's clouds where the ends are searched separately, named as in detect.name; auto: the network that "
         "fits the mounting.",
     )
 

@@ -121,7 +121,7 @@ def read_json(path: Path | str, error: type[LogError] = LogError) -> Any:
     ------
     error
         For a file that is missing, too large, not valid JSON, or has a number that is not finite; with its position. For keys that
-        stand twice in one object, too: which of the two values is meant, no program can tell.
+        occur twice in one object, too: which of the two values is meant, no program can tell.
     """
     path = Path(path)
     if path.is_dir():

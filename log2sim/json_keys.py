@@ -1,4 +1,4 @@
-"""JSON texts in which no key stands twice."""
+"""JSON texts in which no key occurs twice."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any
 
 
 class RepeatedKeysError(ValueError):
-    """Keys of a JSON text that stand twice in one object; the text says how many, and the first of them."""
+    """Keys of a JSON text that occur twice in one object; the text says how many, and the first of them."""
 
 
 def parse_unique(text: str, **hooks: Any) -> Any:
-    """Parse a JSON text in which no key stands twice in one object.
+    """Parse a JSON text in which no key occurs twice in one object.
 
     Parameters
     ----------
@@ -34,12 +34,12 @@ def parse_unique(text: str, **hooks: Any) -> Any:
 
 
 def unique_decoder(repeated: list[str]) -> json.JSONDecoder:
-    """Return a decoder of JSON that adds the keys to `repeated` that stand twice in one object."""
+    """Return a decoder of JSON that adds the keys to `repeated` that occur twice in one object."""
     return json.JSONDecoder(object_pairs_hook=partial(_unique, repeated))
 
 
 def require_unique(repeated: list[str]) -> None:
-    """Raise `RepeatedKeysError` where there are keys that stand twice."""
+    """Raise `RepeatedKeysError` where there are keys that occur twice."""
     if repeated:
         count = f"{len(repeated)} keys stand" if len(repeated) > 1 else "a key stands"
         raise RepeatedKeysError(

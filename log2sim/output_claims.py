@@ -44,7 +44,7 @@ def claim(target: Path, *, overwrite: bool) -> None:
 
     Notes
     -----
-    A locked file beside the target tells others. The system unlocks it when the process ends in any way, so that no claim of a
+    A locked file next to the target shows it to others. The system unlocks it when the process ends in any way, so that no claim of a
     dead run stays. Folders that are missing above the target are made, and removed again where nothing came into them.
     """
     claims, path = _claims.get(), target.absolute()

@@ -240,7 +240,7 @@ def second_pass(run: Run, observations: Observations) -> Result:
 
 
 def agents_of(run: Run, tracks: Sequence[Track], observations: Observations) -> tuple[Agent | None, list[Agent]]:
-    """Make agents of tracks, judged and rated together; the ego, if its poses are known, stands apart."""
+    """Make agents of tracks, judged and rated together; the ego, if its poses are known, is returned separately."""
     log, t_ns = run.log, run.schedule.t_ns
     timeline = Timeline(t_ns, int(t_ns[0]))
     with run.clock.stage("smooth"):

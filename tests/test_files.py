@@ -174,8 +174,8 @@ def test_rounded_numbers_for_json() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('{"a": 1, "b": {"a": 2}, "a": 3}', "a key stands twice in one object, first 'a'"),
-        ('[{"x": [1], "x": [1]}, {"y": 1, "y": 2, "y": 3}]', "3 keys stand twice in one object, first 'x'"),
+        ('{"a": 1, "b": {"a": 2}, "a": 3}', "a key occurs twice in one object, first 'a'"),
+        ('[{"x": [1], "x": [1]}, {"y": 1, "y": 2, "y": 3}]', "3 keys occur twice in one object, first 'x'"),
         ('{"\\u0061": 1, "a": 2}', "first 'a'"),
     ],
 )

@@ -246,7 +246,7 @@ def test_a_rotation_that_is_not_orthonormal_is_refused_with_its_error(raw: Path)
         ("calib_cam_to_cam.txt", "P_rect_02: 7", "P_rect_02: 0", "positive focal"),
         ("calib_cam_to_cam.txt", "P_rect_02", "P_rect_09", "no entry 'P_rect_02'"),
         ("calib_imu_to_velo.txt", "T: -8", "T: nan -8", "expected 3 finite"),
-        ("calib_imu_to_velo.txt", "T: -8", "T: 1 2 3\nT: -8", "entry 'T' stands twice"),
+        ("calib_imu_to_velo.txt", "T: -8", "T: 1 2 3\nT: -8", "entry 'T' occurs twice"),
         ("2011_09_26_drive_0001_sync/oxts/data/0000000002.txt", "4.9", "x", "0000000002.txt, line 1"),
         ("2011_09_26_drive_0001_sync/image_02/timestamps.txt", "2011-09-26", "yesterday", "timestamps.txt, line 1"),
         ("2011_09_26_drive_0001_sync/oxts/timestamps.txt", stamp(4), "", "record 3 has none"),

@@ -104,7 +104,7 @@ def test_keys_that_stand_twice_in_a_wanted_record_are_told(tmp_path: Path) -> No
     path = tmp_path / "sample_data.json"
     path.write_text('[{"token": "a", "x": 1}, {"token": "b", "x": 1, "x": 2}]')
     assert list(tables.scan_records(path, "token", ["a"])) == [{"token": "a", "x": 1}]
-    with pytest.raises(LogError, match=r"sample_data.json, byte \d+: a key stands twice in one object, first 'x'"):
+    with pytest.raises(LogError, match=r"sample_data.json, byte \d+: a key occurs twice in one object, first 'x'"):
         list(tables.scan_records(path, "token", ["b"]))
 
 
@@ -279,7 +279,7 @@ def test_a_key_that_stands_twice_in_an_annotation_is_told(spoilable: Path) -> No
     sample = json.loads(path.read_text())[0]["sample_token"]
     path.write_text(path.read_text().replace("[", f'[{{"sample_token": "{sample}", "sample_token": []}}, ', 1))
     with pytest.raises(
-        LogError, match=r"sample_annotation.json, byte 2: a key stands twice in one object, first 'sample_token'"
+        LogError, match=r"sample_annotation.json, byte 2: a key occurs twice in one object, first 'sample_token'"
     ):
         _ = open_log(spoilable).labels
 

@@ -359,7 +359,7 @@ def test_a_calibration_that_ends_within_a_key_is_refused(encoded: Callable[[Enco
     path = log / "training" / "calib" / "000000.txt"
     sound = path.read_text()
     path.write_text(sound.partition("Tr_imu_to_velo")[0] + rest)
-    with pytest.raises(LogError, match=r"nothing stands after 'Tr_im.*'; expected numbers"):
+    with pytest.raises(LogError, match=r"nothing follows 'Tr_im.*'; expected numbers"):
         open_log(log)
     path.write_text(f"\n{sound}\n\n")
     assert open_log(log).streams

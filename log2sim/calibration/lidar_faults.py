@@ -1,4 +1,4 @@
-"""What is told about the clock and the mount of a LiDAR: what is beyond doubt and large enough to matter."""
+"""What is reported about the clock and the mount of a LiDAR: what is beyond doubt and large enough to matter."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from log2sim.calibration.twists import velocities_at
 from log2sim.config_sections import CalibrationConfig
 from log2sim.datatypes import Fault, Treatment
 
-# What is certain is told if it matters: 0.2 m, which is how well agents are placed, at 10 m/s and to the side at 40 m; up or down, 0.7 m at 40 m, half
+# What is certain is reported if it matters: 0.2 m, which is how well agents are placed, at 10 m/s and to the side at 40 m; up or down, 0.7 m at 40 m, half
 # of a car. Data sets are calibrated to less. Of heights only what moves the ground out of reach.
 MIN_OFFSET_S = 0.02
 MIN_ROTATION_RAD = {ROLL: 0.7 / 40.0, PITCH: 0.7 / 40.0, YAW: 0.2 / 40.0}
@@ -62,29 +62,29 @@ class Findings:
 
     def faults(self) -> list[Fault]:
         """Describe what is wrong, and what cannot be corrected although it was asked for."""
-        told = unseen_faults(self.lidar, self.found, self.asked)
+        faults = unseen_faults(self.lidar, self.found, self.asked)
         if self.offset_s:
-            told.append(_offset_fault(self))
+            faults.append(_offset_fault(self))
         if any(self.turn_rad):
-            told.append(_rotation_fault(self))
+            faults.append(_rotation_fault(self))
         if any(self.shift_m):
-            told.append(_translation_fault(self))
-        return told
+            faults.append(_translation_fault(self))
+        return faults
 
 
 def unseen_faults(lidar: str, found: Estimate | None, asked: CalibrationConfig) -> list[Fault]:
     """Say what cannot be corrected although the settings ask for it; without an estimate, that is all of it."""
-    told = []
+    faults = []
     if asked.fix_time and (found is None or not found.shows_offset or found.sigma[OFFSET] > MAX_SIGMA_S):
         message = (
             "stamps are not corrected: the ego's motion does not show whether they are off, which takes that it speeds up, "
             "brakes or turns"
         )
-        told.append(Fault("unknown_offset", lidar, message, "kept"))
+        faults.append(Fault("unknown_offset", lidar, message, "kept"))
     if asked.fix_mounts and (found is None or found.sigma[YAW] > MAX_SIGMA_RAD):
         message = "the mount is not corrected: the ego's motion does not show whether it is turned"
-        told.append(Fault("unknown_rotation", lidar, message, "kept"))
-    return told
+        faults.append(Fault("unknown_rotation", lidar, message, "kept"))
+    return faults
 
 
 def _offset_fault(of: Findings) -> Fault:
@@ -100,7 +100,7 @@ def _offset_fault(of: Findings) -> Fault:
 
 def _rotation_fault(of: Findings) -> Fault:
     off_deg, sigma_deg = -np.degrees(of.found.values), np.degrees(of.found.sigma)
-    told = [
+    figures = [
         f"{name} {off_deg[row]:+.2f} degrees (sigma {sigma_deg[row]:.2f})"
         for (row, name), turn in zip(ANGLES.items(), of.turn_rad)
         if turn
@@ -108,7 +108,7 @@ def _rotation_fault(of: Findings) -> Fault:
     course_rad = course_in_ego(of.seen)
     words, treatment = _treated(of.asked.fix_mounts, "--fix-calibration")
     message = (
-        f"its mount in the calibration is turned by {', '.join(told)} against the motion of the ego"
+        f"its mount in the calibration is turned by {', '.join(figures)} against the motion of the ego"
         f"{_heading_words(of.turn_rad[2], course_rad)}; {words}"
     )
     values = {f"{name}_deg": float(off_deg[row]) for row, name in ANGLES.items()}
@@ -118,13 +118,15 @@ def _rotation_fault(of: Findings) -> Fault:
 
 
 def _translation_fault(of: Findings) -> Fault:
-    told = [
+    figures = [
         f"{abs(shift):.2f} m too far {way[shift > 0]} (sigma {of.found.sigma[row]:.2f})"
         for (row, way), shift in zip(TOO_FAR.items(), of.shift_m)
         if shift
     ]
     words, treatment = _treated(of.asked.fix_mounts, "--fix-calibration")
-    message = f"its mount in the calibration, or the ego's origin, is {', '.join(told)} by how the ego turns; {words}"
+    message = (
+        f"its mount in the calibration, or the ego's origin, is {', '.join(figures)} by how the ego turns; {words}"
+    )
     values = {f"{name}_m": -float(of.found.values[row]) for row, name in zip((X, Y, Z), "xyz")}
     values |= {f"{name}_sigma_m": float(of.found.sigma[row]) for row, name in zip((X, Y, Z), "xyz")}
     return Fault("lidar_translation", of.lidar, message, treatment, values=values)

@@ -1,4 +1,4 @@
-"""Errors of the ego's poses: how large they are, how long they last, and what can be told about a sensor in spite of them.
+"""Errors of the ego's poses: how large they are, how long they last, and what can be known of a sensor in spite of them.
 
 Each coordinate errs as a first-order Gauss-Markov process, as poses of GNSS and IMU do. Sizes and the time constant are
 estimated by restricted maximum likelihood (Patterson, Thompson, Biometrika 1971), so that standard deviations hold.
@@ -107,9 +107,9 @@ class PoseNoise:
         information, right = both[:-1, :-1] + self._prior, both[:-1, -1] + self._pull
         own = 1 / np.linalg.inv(information)[0, 0] - self._prior[0, 0]
         false = self._information_of_noise(noise, tau)
-        told = information.copy()
-        told[0, 0] -= min(false, MAX_NOISE_SHARE * own)
-        covariance = np.linalg.inv(told)
+        reduced = information.copy()
+        reduced[0, 0] -= min(false, MAX_NOISE_SHARE * own)
+        covariance = np.linalg.inv(reduced)
         share = false / own if own > 0 else 1.0
         return Solution(covariance @ right, covariance @ information @ covariance, share)
 

@@ -118,7 +118,7 @@ def choose_sweeps(
     if len(spaced) == 0 or _path_m(track, t_ns[spaced]) < MIN_PATH_M:
         return rows[:0]
     if len(spaced) * SPACING_S > MAX_SWEEPS * MAX_SPACING_S:
-        return np.sort(np.concatenate(_livelies(spaced, velocity)))
+        return np.sort(np.concatenate(_fastest_changes(spaced, velocity)))
     usable = rows[(rows >= spaced[0]) & (rows <= spaced[-1])]
     chosen = usable[np.unique(np.linspace(0, len(usable) - 1, MAX_SWEEPS).round().astype(np.int64))]
     return np.asarray(chosen[velocities_at(track, t_ns[chosen])[1]])
@@ -138,7 +138,7 @@ def _path_m(track: PoseTrack, t_ns: NDArray[np.int64]) -> float:
     return float(np.linalg.norm(np.ptp(places, axis=0)))
 
 
-def _livelies(rows: NDArray[np.intp], velocity: Array) -> list[NDArray[np.intp]]:
+def _fastest_changes(rows: NDArray[np.intp], velocity: Array) -> list[NDArray[np.intp]]:
     """Choose `PARTS` runs of rows in which the velocity varies most, one after the other."""
     size = MAX_SWEEPS // PARTS
     scaled = velocity * np.array([1.0, 1.0, 1.0, LEVER_M, LEVER_M, LEVER_M])

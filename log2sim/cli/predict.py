@@ -24,7 +24,7 @@ def predict(
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Predict each agent at each tick from its past, and tell how far off that is."""
+    """Predict each agent at each tick from its past, and estimate how far off that is."""
     from log2sim.datatypes import Scenario
     from log2sim.documents import check_targets, write_json
     from log2sim.errors import ConfigError
@@ -41,4 +41,4 @@ def predict(
         write_json(out, document)
     say(format_figures(document), quiet=quiet)
     if loaded.is_reconstruction:
-        say("note: the states were smoothed over the whole log and tell a little of what came next", quiet=quiet)
+        say("note: the states were smoothed over the whole log and depend a little on what came next", quiet=quiet)

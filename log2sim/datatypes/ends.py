@@ -24,7 +24,7 @@ def end_of(sensor: Camera | Lidar) -> str:
 
 
 def seen_from(end: str, count: int) -> NDArray[np.bool_]:
-    """Return (count, 2) for rows that one end alone saw; an empty name stands for none."""
+    """Return (count, 2) for rows that one end alone saw; no end for an empty name."""
     return np.tile([end == name for name in ENDS], (count, 1))
 
 

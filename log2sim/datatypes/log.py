@@ -191,7 +191,7 @@ class Log:
     notes : tuple of str
         Remarks of the reader for the report; may be given as a function.
     calibrations : mapping of str to str
-        By sensor: where its calibration stands, for messages.
+        By sensor: where its calibration is, for messages.
     details : mapping of str to Any
         What only this format has, as JSON values, for `log2sim inspect`; for example the topics of a bag.
     """

@@ -85,8 +85,8 @@ def _bridge(
     rows &= (track.t_ns < stretch.first_ns) | (track.t_ns > stretch.last_ns)
     joined = _joined(track, np.flatnonzero(rows), placed)
     assert placed.sigma_m is not None
-    told = replace(stretch, unknown_s=0.0, sigma_m=float(placed.sigma_m.max()), by="LiDAR odometry")
-    return joined, told
+    bridged = replace(stretch, unknown_s=0.0, sigma_m=float(placed.sigma_m.max()), by="LiDAR odometry")
+    return joined, bridged
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ from log2sim.localization.path_parts import (
 WINDOW_S, MIN_SIDE, MAX_SIDE = 1.5, 4, 30
 # Third differences of sparse samples hold the motion itself, so they do not tell the noise.
 MAX_DENSE_S = 0.25
-# Of samples farther apart a step that stays is told only: that a vehicle stopped or jumped before may not show in them.
+# Of samples farther apart a step that stays is only reported: that a vehicle stopped or jumped before may not show in them.
 MAX_LASTING_S = 0.15
 
 

@@ -35,13 +35,15 @@ def list_faults(log: Log, stretches: Sequence[Stretch], during_ns: tuple[int, in
     if not len(records):
         return ()
     ends_ns = int(log.ego.t_ns[0]), int(log.ego.t_ns[-1])
-    told = [s for s in stretches if _concerns(s, records)]
-    skips = [_skip(s, int(records[0])) for s in told if s.kind == "skip"]
-    copies = [_copies(s, int(records[0])) for s in told if s.kind == "copies"]
-    wrong = [s for s in told if s.kind not in ("gap", "skip", "copies")]
-    # Where wrong poses are left out there is a gap, which is told with them.
+    relevant = [s for s in stretches if _concerns(s, records)]
+    skips = [_skip(s, int(records[0])) for s in relevant if s.kind == "skip"]
+    copies = [_copies(s, int(records[0])) for s in relevant if s.kind == "copies"]
+    wrong = [s for s in relevant if s.kind not in ("gap", "skip", "copies")]
+    # Where wrong poses are left out there is a gap, which is reported with them.
     gaps = [
-        s for s in told if s.kind == "gap" and not any(w.first_ns < s.last_ns and s.first_ns < w.last_ns for w in wrong)
+        s
+        for s in relevant
+        if s.kind == "gap" and not any(w.first_ns < s.last_ns and s.first_ns < w.last_ns for w in wrong)
     ]
     repairs = [_repair(s, int(records[0]), ends_ns) for s in wrong]
     lost = [_lost(s, int(records[0])) for s in gaps if s.unknown_s > 0]

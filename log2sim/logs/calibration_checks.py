@@ -34,7 +34,7 @@ class CalibrationProblem:
     Attributes
     ----------
     message : str
-        Names the sensor, where its calibration stands, the field and its value.
+        Names the sensor, where its calibration is, the field and its value.
     is_impossible : bool
         Whether nothing that is measured with it can be right; else it is only doubtful.
     """

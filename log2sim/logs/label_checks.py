@@ -1,4 +1,4 @@
-"""Labels that no object can have: they are left out and told."""
+"""Labels that no object can have: they are left out and reported."""
 
 from __future__ import annotations
 

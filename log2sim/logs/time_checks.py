@@ -126,7 +126,7 @@ def _misfit_ns(early: Span, late: Span, offset_ns: int) -> int:
 
 
 def _other_clocks(log: Log) -> list[str]:
-    """Tell of streams and poses that lie apart from most of the others."""
+    """Report streams and poses whose times are far from those of most others."""
     groups: list[tuple[list[str], Span]] = []
     for span in sorted(_spans(log), key=lambda span: span.first_ns):
         if groups and not groups[-1][1].is_apart(span):
@@ -156,7 +156,7 @@ def _listed(words: Sequence[str]) -> str:
 
 
 def _reference_problem(log: Log) -> list[str]:
-    """Tell when the sensor whose records are the ticks begins late or ends early, since a run lasts as long as it does."""
+    """Report when the sensor whose records are the ticks begins late or ends early, since a run lasts as long as it does."""
     streams = {name: s.t_ns for name, s in log.streams.items() if len(s.t_ns)}
     reference = reference_of(log, [name for name in log.cameras if name in streams]) if streams else ""
     if reference not in streams or len(streams) < 2:
@@ -190,7 +190,7 @@ def _shifted(own: Span, others: Sequence[Span]) -> str:
 
 
 def _image_label_problems(log: Log) -> list[str]:
-    """Tell of boxes in images, and regions without labels, of which no frame has the stamp."""
+    """Report boxes in images, and regions without labels, whose stamp no frame has."""
     problems = []
     for what, by_camera in (("boxes", log.image_labels), ("ignored regions", log.ignored_regions)):
         for name, rows in by_camera.items():
@@ -211,7 +211,7 @@ def _image_label_problems(log: Log) -> list[str]:
 
 
 def _label_problems(log: Log) -> list[str]:
-    """Tell of 3D labels far from all records and poses; where records are missing, as in a partial download, poses still tell."""
+    """Report 3D labels far from all records and poses; where records are missing, as in a partial download, poses suffice."""
     records = [stream.t_ns for stream in log.streams.values() if len(stream.t_ns)]
     if log.labels is None or not len(log.labels.t_ns) or not records:
         return []

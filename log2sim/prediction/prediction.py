@@ -139,7 +139,7 @@ def predict_scenario(
 
     Notes
     -----
-    Only states up to a tick are used. Those of a reconstruction were smoothed over the whole log, so that they tell a little
+    Only states up to a tick are used. Those of a reconstruction were smoothed over the whole log, so that they depend a little
     of what came next: predictions by a system that measures while it drives are worse.
     """
     return predict_table(table_of(scenario, TICK_S), leads_of(horizon_s), methods, lanes)

@@ -14,7 +14,7 @@ from log2sim.prediction.motion_table import Complex, MotionTable
 
 
 class Restlessness(NamedTuple):
-    """What agents do that their past does not tell.
+    """What agents do that does not follow from their past.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ def _lasting(state: NDArray[np.bool_], table: MotionTable) -> NDArray[np.intp]:
 def own_scale(table: MotionTable, error_m: Complex, course: Complex, sigma_m: Array, ticks: int) -> Array:
     """Compute by how much each agent's motion was more regular than usual so far: factors (A, T) on its standard deviations.
 
-    Times at which it stood do not count, nor does their factor differ from 1: they tell nothing of how it drives.
+    Times at which it stood do not count, nor does their factor differ from 1: they say nothing about how it drives.
 
     Parameters
     ----------

@@ -210,8 +210,8 @@ def _gears(speed: Array) -> tuple[Array, Array]:
     gear, stands = np.ones(len(speed)), np.ones(len(speed))
     begin = 0
     for run in runs:
-        way_m, peak_mps = np.abs(speed[run]).sum() * GRID_S, np.abs(speed[run]).max()
-        if direction[run[0]] != 0 and (way_m >= MIN_RUN_M or peak_mps >= MIN_RUN_MPS):
+        distance_m, peak_mps = np.abs(speed[run]).sum() * GRID_S, np.abs(speed[run]).max()
+        if direction[run[0]] != 0 and (distance_m >= MIN_RUN_M or peak_mps >= MIN_RUN_MPS):
             gear[begin:] = direction[run[0]]
             stands[run] = 0.0
             begin = run[-1] + 1

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Track
 
 SWEEPS = ""
-"""Stands for the LiDARs among the cameras, as in the column `camera` of measurements."""
+"""Represents the LiDARs among the cameras, as in the column `camera` of measurements."""
 
 
 def mark_unrecorded(tracks: Sequence[Track], recorded: Mapping[str, NDArray[np.bool_]]) -> list[Track]:

@@ -215,7 +215,7 @@ def change_table_pickle(rng: np.random.Generator, file: Path, place: Place) -> D
     elif kind == 8:
         data, words, visible = (
             pickle.dumps(pandas.concat([table, table])),
-            "each row stands twice",
+            "each row occurs twice",
             "cuboids" in str(file),
         )
     else:

@@ -139,7 +139,7 @@ def repeat_key(rng: np.random.Generator, root: Any) -> tuple[str, bool] | None:
     name = pick(rng, list(holder[key]))
     old = holder[key][name]
     holder[key][f'{RAW}"{name}"@@'] = old * 2 + 1 if _is_number(old) else old
-    return f"{path}.{name} stands twice", _is_number(old)
+    return f"{path}.{name} occurs twice", _is_number(old)
 
 
 def remove_item(rng: np.random.Generator, root: Any) -> tuple[str, bool] | None:
@@ -147,7 +147,7 @@ def remove_item(rng: np.random.Generator, root: Any) -> tuple[str, bool] | None:
 
 
 def repeat_item(rng: np.random.Generator, root: Any) -> tuple[str, bool] | None:
-    return _change_list(rng, root, lambda values, k: values.insert(k, values[k]), "stands twice")
+    return _change_list(rng, root, lambda values, k: values.insert(k, values[k]), "occurs twice")
 
 
 def empty_list(rng: np.random.Generator, root: Any) -> tuple[str, bool] | None:

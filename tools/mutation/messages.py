@@ -47,7 +47,7 @@ def change_message(rng: np.random.Generator, file: Path, place: Place) -> Damage
         words, visible = f"{topic}: {len(gone)} messages are gone", False
     elif kind == 6:
         messages.insert(at, messages[at])
-        words, visible = f"{topic}: a message stands twice", False
+        words, visible = f"{topic}: a message occurs twice", False
     else:
         stamp = int(pick(rng, (0, 2**62, 1)))
         messages[at] = (stamp, stamp, *messages[at][2:])

@@ -64,7 +64,7 @@ def change_rows(rng: np.random.Generator, file: Path, place: Place) -> Damage | 
     at = int(rng.integers(table.num_rows))
     kinds = {
         "removed": pyarrow.concat_tables([table.slice(0, at), table.slice(at + 1)]),
-        "stands twice": pyarrow.concat_tables([table.slice(0, at + 1), table.slice(at)]),
+        "occurs twice": pyarrow.concat_tables([table.slice(0, at + 1), table.slice(at)]),
         "and all others are removed": table.slice(0, 0),
         "and all others are in reverse order": table.take(pyarrow.array(range(table.num_rows - 1, -1, -1))),
     }
@@ -147,7 +147,7 @@ def change_records(rng: np.random.Generator, file: Path, place: Place) -> Damage
         words, visible = f"record {at} is gone", False
     elif kind == 5:
         records.insert(at, records[at])
-        words, visible = f"record {at} stands twice", True
+        words, visible = f"record {at} occurs twice", True
     else:
         records.reverse()
         words, visible = "records in reverse order", False

@@ -53,21 +53,25 @@ def change_number(rng: np.random.Generator, file: Path, place: Place) -> Damage 
 
 
 def remove_line(rng: np.random.Generator, file: Path, place: Place) -> Damage | None:
-    lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
+    lines, at = draw_line(rng, file)
     if not lines:
         return None
-    at = int(rng.integers(len(lines)))
     file.write_text("".join(lines[:at] + lines[at + 1 :]), encoding="utf-8")
     # A header, or the line that pairs with a file; any other row may never have been there.
     visible = (file.suffix == ".csv" and at == 0) or file.name.startswith("timestamps") or "calib" in str(file)
     return Damage(f"line {at + 1} of {len(lines)} removed", visible)
 
 
-def cut_line(rng: np.random.Generator, file: Path, place: Place) -> Damage | None:
+def draw_line(rng: np.random.Generator, file: Path) -> tuple[list[str], int]:
+    """Lines of a file with their ends, and the index of one of them, 0 for an empty file."""
     lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
+    return lines, int(rng.integers(len(lines))) if lines else 0
+
+
+def cut_line(rng: np.random.Generator, file: Path, place: Place) -> Damage | None:
+    lines, at = draw_line(rng, file)
     if not lines:
         return None
-    at = int(rng.integers(len(lines)))
     separator = "," if file.suffix == ".csv" else " "
     fields = lines[at].rstrip("\n").split(separator)
     if len(fields) < 2:
@@ -79,13 +83,12 @@ def cut_line(rng: np.random.Generator, file: Path, place: Place) -> Damage | Non
 
 
 def repeat_line(rng: np.random.Generator, file: Path, place: Place) -> Damage | None:
-    lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
+    lines, at = draw_line(rng, file)
     if not lines:
         return None
-    at = int(rng.integers(len(lines)))
     file.write_text("".join(lines[: at + 1] + lines[at:]), encoding="utf-8")
     # Two boxes in one place may be two objects for layouts without tracks.
-    return Damage(f"line {at + 1} stands twice", file.name.startswith(TELLING_ORDER))
+    return Damage(f"line {at + 1} occurs twice", file.name.startswith(TELLING_ORDER))
 
 
 def swap_lines(rng: np.random.Generator, file: Path, place: Place) -> Damage | None:
@@ -99,10 +102,9 @@ def swap_lines(rng: np.random.Generator, file: Path, place: Place) -> Damage | N
 
 
 def add_field(rng: np.random.Generator, file: Path, place: Place) -> Damage | None:
-    lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
+    lines, at = draw_line(rng, file)
     if not lines:
         return None
-    at = int(rng.integers(len(lines)))
     lines[at] = lines[at].rstrip("\n") + ("," if file.suffix == ".csv" else " ") + "1.5\n"
     file.write_text("".join(lines), encoding="utf-8")
     return Damage(f"line {at + 1} has a field more", file.suffix == ".csv")

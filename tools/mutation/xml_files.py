@@ -50,7 +50,7 @@ def repeat_attribute(rng: np.random.Generator, file: Path, place: Place) -> Dama
     found = list(_ATTRIBUTE.finditer(text))
     match = found[rng.integers(len(found))]
     file.write_text(f"{text[: match.end()]} {match[0]}{text[match.end() :]}", encoding="utf-8")
-    return Damage(f"{match[1]} stands twice", True)
+    return Damage(f"{match[1]} occurs twice", True)
 
 
 def change_elements(rng: np.random.Generator, file: Path, place: Place) -> Damage | None:
@@ -62,7 +62,7 @@ def change_elements(rng: np.random.Generator, file: Path, place: Place) -> Damag
     kind = int(rng.integers(3))
     other = ("", match[0] * 2, match[0].replace(f"<{match[1]}", "<Unknown"))[kind]
     file.write_text(text[: match.start()] + other + text[match.end() :], encoding="utf-8")
-    return Damage(f"<{match[1]}> {('removed', 'stands twice', 'is called Unknown')[kind]}", False)
+    return Damage(f"<{match[1]}> {('removed', 'occurs twice', 'is called Unknown')[kind]}", False)
 
 
 def add_entities(rng: np.random.Generator, file: Path, place: Place) -> Damage | None:

@@ -34,7 +34,7 @@ def course_log_odds(w: Waypoints, length_m: float) -> float:
 
 def _one_way(speed_mps: Array, step_s: Array, certain_m: float) -> float:
     """Return the log-odds for the direction in which something drives at speeds (T,), 0 at other times."""
-    way_m, time_s = float(speed_mps @ step_s), float(step_s[speed_mps > 0].sum())
+    distance_m, time_s = float(speed_mps @ step_s), float(step_s[speed_mps > 0].sum())
     if time_s <= 0:
         return 0.0
-    return min(forward_log_odds(way_m / time_s), MAX_FORWARD_LOG_ODDS) * min(way_m / certain_m, 1.0)
+    return min(forward_log_odds(distance_m / time_s), MAX_FORWARD_LOG_ODDS) * min(distance_m / certain_m, 1.0)

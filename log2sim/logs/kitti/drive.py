@@ -83,20 +83,20 @@ def read_calibration(path: Path) -> dict[str, Array]:
     Raises
     ------
     LogError
-        For a key that stands twice, and for one that nothing follows, as where a file is cut.
+        For a key that occurs twice, and for one that nothing follows, as where a file is cut.
     """
     values: dict[str, Array] = {}
     for line in filter(None, map(str.strip, read_text(path).splitlines())):
         key, _, rest = line.partition(" ")
         if not rest:
-            raise LogError(f"{path}: nothing stands after '{key[:40]}'; expected numbers")
+            raise LogError(f"{path}: nothing follows '{key[:40]}'; expected numbers")
         try:
             numbers = np.array([parse_float(word) for word in rest.split()])
         except ValueError:
             numbers = np.zeros(0)  # words are in no entry that is used
         if key.removesuffix(":") in values:
             raise LogError(
-                f"{path}: entry '{key.removesuffix(':')[:40]}' stands twice; remove the one of the two that is wrong"
+                f"{path}: entry '{key.removesuffix(':')[:40]}' occurs twice; remove the one of the two that is wrong"
             )
         values[key.removesuffix(":")] = numbers
     return values

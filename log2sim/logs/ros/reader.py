@@ -123,7 +123,7 @@ class _Opening:
         return streams
 
     def _calibration_place(self, name: str) -> str:
-        """Say where the calibration of a sensor stands."""
+        """Say where the calibration of a sensor is."""
         camera = self.roles.cameras.get(name)
         if camera is None:
             return f"{self.bag.place}, transforms"

@@ -80,7 +80,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _may_be_segment(file: Path, root: Path) -> bool:
-    """Whether a file is a TFRecord file; also where it is a link that must not be read, of which opening it tells."""
+    """Whether a file is a TFRecord file; also where it is a link that must not be read, which opening it reports."""
     try:
         require_link_inside(file, root if root.is_dir() else file)
     except LogError:
@@ -192,7 +192,7 @@ class _SegmentFile:
     def _image_boxes(self, camera: int) -> BoxTable:
         if self.boxes_by_camera is None:
             self.boxes_by_camera, self.lost_boxes = self._boxes_of_cameras()
-        # To which camera a message belonged that cannot be read is not known: all of them are told of the first one.
+        # To which camera a message belonged that cannot be read is not known: all of them report the first one.
         lost, self.lost_boxes = self.lost_boxes, 0
         return BoxTable.of(self.boxes_by_camera.get(camera, []), 2, lost)
 

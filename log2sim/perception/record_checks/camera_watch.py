@@ -14,8 +14,8 @@ from log2sim.perception.record_checks.thumbnails import Thumbnail, changed_share
 
 PictureState = Literal["live", "black", "frozen"]
 
-# A copy that was compressed again differs by less than a gray level; motion that should change a picture by five is told
-# apart from that.
+# A copy that was compressed again differs by less than a gray level; motion that should change a picture by five
+# differs clearly from that.
 MIN_EXPECTED_LEVELS = 5.0
 MAX_CHANGED_SHARE = 0.2
 MAX_COPY_LEVELS = MAX_CHANGED_SHARE * MIN_EXPECTED_LEVELS

@@ -68,7 +68,7 @@ def _lidar_faults(watch: LidarWatch, t0_ns: int) -> Iterator[Fault]:
 
 
 def _sparse_sweeps(name: str, t_ns: NDArray[np.int64], points: NDArray[np.int64], t0_ns: int) -> Iterator[Fault]:
-    """Tell the sweeps (F,) with next to no points, judged by what this LiDAR usually gives."""
+    """Mark the sweeps (F,) with next to no points, judged by what this LiDAR usually gives."""
     usual = float(np.quantile(points, USUAL_QUANTILE))
     if usual < MIN_USUAL_POINTS:
         message = f"sweeps have next to no points, at most {points.max()}"

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import NS_PER_S
 
-# Faults of one sensor nearer to each other than this are told as one, and more than so many all together.
+# Faults of one sensor nearer to each other than this are reported as one, and more than so many all together.
 JOINED_S = 1.0
 MAX_SPANS = 3
 # Busy recorders drop a record now and then. Longer than this, and than so many periods, a stream is interrupted.
