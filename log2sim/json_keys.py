@@ -41,7 +41,7 @@ def unique_decoder(repeated: list[str]) -> json.JSONDecoder:
 def require_unique(repeated: list[str]) -> None:
     """Raise `RepeatedKeysError` where there are keys that occur twice."""
     if repeated:
-        count = f"{len(repeated)} keys stand" if len(repeated) > 1 else "a key stands"
+        count = f"{len(repeated)} keys occur" if len(repeated) > 1 else "a key occurs"
         raise RepeatedKeysError(
             f"{count} twice in one object, first {repeated[0][:40]!a}; remove the one of the two that is wrong"
         )
