@@ -388,6 +388,7 @@ def test_an_error_of_ours_inside_says_so(monkeypatch: pytest.MonkeyPatch) -> Non
     )
 
 
+@pytest.mark.slow
 def test_interrupting_leaves_nothing(tmp_path: Path) -> None:
     scene = tmp_path / "scene.toml"
     scene.write_text(tiny_toml(agents=[PARKED], duration_s=20.0))

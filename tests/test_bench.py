@@ -497,6 +497,7 @@ def no_labels(log_folder: Path) -> Path:
     return log_folder
 
 
+@pytest.mark.slow
 def test_without_truth_only_steadiness_is_told_and_said_so(no_labels: Path, tmp_path: Path) -> None:
     ran = run("bench", no_labels, "--out", tmp_path / "b", "--detector", "labels", "--stop", "0.5")
     assert ran.code == 0, ran.err
@@ -512,6 +513,7 @@ def test_without_truth_only_steadiness_is_told_and_said_so(no_labels: Path, tmp_
     assert "recall" not in panels["whole run"]["points"][0]["figures"]
 
 
+@pytest.mark.slow
 def test_the_command_writes_two_files_and_replaces_only_when_asked(tiny_folder: Path, tmp_path: Path) -> None:
     import cv2
 
@@ -532,6 +534,7 @@ def test_the_command_writes_two_files_and_replaces_only_when_asked(tiny_folder: 
     assert json.loads((tmp_path / "b/bench.json").read_text())["ticks"] == 3
 
 
+@pytest.mark.slow
 def test_one_tick_is_enough_to_run(tiny_folder: Path, tmp_path: Path) -> None:
     ran = run("bench", tiny_folder, "--out", tmp_path / "b", "--detector", "labels", "--stop", "0")
     assert ran.code == 0, ran.err

@@ -128,6 +128,7 @@ def test_far_map_coordinates_and_another_ground_height_change_nothing(two_camera
     assert np.mean(np.abs(near.image_bgr.astype(int) - far_picture.image_bgr.astype(int)) > 8) < 0.002
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "distortion"), [("brown", (-0.25, 0.08, 0.001, -0.0005, -0.01)), ("fisheye", (-0.02, 0.003, 0.0, 0.0))]
 )
@@ -181,6 +182,7 @@ def test_a_camera_in_the_ground_plane_is_refused() -> None:
         ground_homography(make_camera(), pose(0, z=0.0))
 
 
+@pytest.mark.slow
 def test_exposures_are_leveled_where_cameras_overlap() -> None:
     camera = make_camera()
     poses = (pose(12), pose(-12))

@@ -50,6 +50,7 @@ def filmed(change=lambda image, i: image) -> Log:
     return replace(street(), ego=None, streams={"front": changed})
 
 
+@pytest.mark.slow
 def test_the_path_of_the_camera_is_that_of_the_ego_within_some_percent() -> None:
     found = follow_camera(filmed(), "front")
     true, _ = street().ego.at(found.t_ns)
@@ -79,6 +80,7 @@ def test_images_that_do_not_change_show_an_ego_that_stands() -> None:
     np.testing.assert_array_equal(found.start_T_ego, np.tile(np.eye(4), (len(found.t_ns), 1, 1)))
 
 
+@pytest.mark.slow
 def test_missing_and_blank_images_are_bridged() -> None:
     def change(image: np.ndarray, i: int) -> np.ndarray:
         if i == 4:
@@ -93,6 +95,7 @@ def test_missing_and_blank_images_are_bridged() -> None:
     assert np.linalg.norm(found.start_T_ego[-1, :2, 3] - true[-1, :2, 3]) < 1.2
 
 
+@pytest.mark.slow
 def test_a_log_of_a_camera_alone_gets_a_path_and_says_what_it_is_worth() -> None:
     log, choice = localize(filmed(), Config())
     assert choice.source == "camera"
@@ -102,6 +105,7 @@ def test_a_log_of_a_camera_alone_gets_a_path_and_says_what_it_is_worth() -> None
     np.testing.assert_allclose(log.ego.map_T_ego[0], np.eye(4), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_camera_motion_that_is_asked_for_lies_in_the_map_of_the_given_poses() -> None:
     given = replace(filmed(), ego=street().ego)
     log, choice = localize(given, Config.load(poses={"source": "camera"}))

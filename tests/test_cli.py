@@ -39,6 +39,7 @@ def read(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
+@pytest.mark.slow
 def test_the_whole_chain_from_a_scene_to_a_picture(tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_text(tiny_toml())
     log, out = tmp_path / "log", tmp_path / "out"
@@ -143,6 +144,7 @@ def test_plot_writes_what_the_suffix_says(tiny_scenario: Path, tmp_path: Path, n
     assert names(tmp_path) == [name]
 
 
+@pytest.mark.slow
 def test_plot_takes_the_cameras_as_background(tiny_scenario: Path, tiny_folder: Path, tmp_path: Path) -> None:
     assert run("plot", tiny_scenario, "--out", tmp_path / "plain.png").code == 0
     assert run("plot", tiny_scenario, "--out", tmp_path / "t.png", "--background", tiny_folder).code == 0
@@ -301,6 +303,7 @@ def test_nothing_to_reconstruct_exits_with_4(log_folder: Path, tmp_path: Path) -
     assert names(out) == []
 
 
+@pytest.mark.slow
 def test_edit_changes_a_scenario_that_then_replays_and_plots(tmp_path: Path) -> None:
     source, out = Path(__file__).resolve().parents[1] / "samples/crossing/truth.json", tmp_path / "e.json"
     ran = run(
@@ -353,6 +356,7 @@ def test_who_reacts_is_named_by_ids_even_if_they_hold_a_comma(tiny_scenario: Pat
     assert [k for k, v in drivers.items() if v == "reactive"] == ["a, b"]
 
 
+@pytest.mark.slow
 def test_a_replay_of_another_scenario_is_shown_with_a_warning(tiny_scenario: Path, tmp_path: Path) -> None:
     other = Path(__file__).resolve().parents[1] / "samples/crossing/truth.json"
     run("replay", other, "--mode", "exact", "--out", tmp_path / "r.json")

@@ -89,6 +89,7 @@ def test_the_table_holds_ticks_per_second_and_none_for_a_stage_that_took_no_time
     assert StageClock().table(ticks=10) == []
 
 
+@pytest.mark.slow
 def test_peak_memory_is_of_this_process_and_never_falls(hand):
     watch = StageClock()
     before = peak_memory_mib()

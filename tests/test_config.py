@@ -180,6 +180,7 @@ CONFIGS = st.fixed_dictionaries(
 )
 
 
+@pytest.mark.slow
 @given(CONFIGS, st.booleans())
 @settings(deadline=None)
 def test_toml_loads_back_as_the_same_settings(document: dict[str, object], comments: bool) -> None:

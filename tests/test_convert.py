@@ -72,6 +72,7 @@ def test_a_converted_log_gives_the_same_scenario(tmp_path: Path, encode: Callabl
         assert back.streams[name].encoded(2) == log.streams[name].encoded(2)
 
 
+@pytest.mark.slow
 def test_a_part_gives_what_reconstruction_makes_of_that_part(tmp_path: Path) -> None:
     path = native.encode(make_world(camera=TWO_CAMERAS), tmp_path)
     ran = run("convert", path, "--out", tmp_path / "part", "--start", "0.2", "--stop", "0.7", "--cameras", "front")

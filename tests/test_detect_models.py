@@ -68,6 +68,7 @@ def test_yolox_finds_van_cyclist_and_pedestrian(yolox_model: Path, real_data: Pa
     np.testing.assert_array_equal(detector.detect(frame).box_px, found.box_px)
 
 
+@pytest.mark.slow
 @pytest.mark.real
 @needs_weights
 def test_ssd_finds_van_cyclist_and_pedestrian(in_cache: Path, real_data: Path) -> None:
@@ -87,6 +88,7 @@ def test_ssd_gives_1917_boxes_and_nothing_on_gray(in_cache: Path) -> None:
     assert len(detector.detect(Frame(camera, 0, lambda: np.full((240, 320, 3), 128, np.uint8)))) == 0
 
 
+@pytest.mark.slow
 @needs_weights
 def test_conversion_is_kept_and_repeated_only_when_the_file_changed(
     in_cache: Path, monkeypatch: pytest.MonkeyPatch

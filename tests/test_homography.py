@@ -202,6 +202,7 @@ def degenerate_worlds() -> dict[str, World]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("case", degenerate_worlds())
 def test_what_does_not_determine_a_homography_is_refused_with_a_reason(case: str, method: str) -> None:
@@ -248,6 +249,7 @@ def test_order_of_rows_and_names_of_ticks_do_not_matter(method: str) -> None:
     np.testing.assert_array_equal(fit.ticks, 1000 - 7 * np.arange(10)[::-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_same_seed_same_bytes(method: str) -> None:
     world = make_world(6, outliers=0.3, each=12)

@@ -115,6 +115,7 @@ def outcome(log: Log, monkeypatch: pytest.MonkeyPatch) -> Outcome:
     )
 
 
+@pytest.mark.slow
 def test_a_pitching_vehicle_places_far_cars_as_well_as_one_that_does_not_pitch(monkeypatch: pytest.MonkeyPatch) -> None:
     still = outcome(pitching_log(0.0), monkeypatch)
     assert not still.homography["pitch_roll"]["per_tick"]
@@ -133,6 +134,7 @@ def test_a_pitching_vehicle_places_far_cars_as_well_as_one_that_does_not_pitch(m
         assert np.abs(stabilized.error_m - still.error_m).max() < 0.2
 
 
+@pytest.mark.slow
 def test_poses_that_do_not_tell_the_pitch_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     told, untold = (outcome(pitching_log(0.3, level_poses=level), monkeypatch) for level in (False, True))
     assert untold.homography["pitch_roll"]["per_tick"]

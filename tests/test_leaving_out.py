@@ -289,6 +289,7 @@ def test_a_camera_that_sees_nothing_is_looked_at_now_and_then(both: Log, monkeyp
     assert_same_agents(few.scenario, every.scenario, within=0.0)
 
 
+@pytest.mark.slow
 def test_whoever_comes_into_an_empty_view_is_not_missed(passing: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     few, looked = run_counting(passing, monkeypatch)
     every, all_frames = run_counting(passing, monkeypatch, stride=1)
@@ -502,6 +503,7 @@ def straight() -> tuple[Log, Scenario]:
     return tiny_log([CAR | {"waypoints": [[16.0, 2.0, 4.0], [60.0, 2.0, 4.0]]}, PARKED], duration_s=3.0, noise_m=0.0)
 
 
+@pytest.mark.slow
 def test_few_waypoints_are_as_good_as_all(straight: tuple[Log, Scenario], monkeypatch: pytest.MonkeyPatch) -> None:
     log, truth = straight
     few = run(log)

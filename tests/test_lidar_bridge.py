@@ -32,6 +32,7 @@ def silent(done: int, total: int) -> None:
     assert 0 < done <= total
 
 
+@pytest.mark.slow
 def test_odometry_goes_on_where_the_motion_before_does_not_tell_the_pose() -> None:
     log, true = frozen_log(HOUSES, BEND)
     assert log.ego is not None

@@ -301,6 +301,7 @@ def test_a_tunnel_without_poses_is_refused() -> None:
         localize(without_poses(tunnel()), Config())
 
 
+@pytest.mark.slow
 def test_a_log_without_poses_becomes_a_scenario_in_the_frame_of_the_first_sweep() -> None:
     log, _ = drive(HOUSES, BEND, observe=True)
     given = reconstruct(log, Config.load(detect={"name": "lidar:labels"}, poses=LIDAR)).scenario

@@ -51,6 +51,7 @@ def with_camera(log: Log, **changes: Any) -> Log:
     return log.changed(cameras={**log.cameras, "front": replace(log.cameras["front"], **changes)})
 
 
+@pytest.mark.slow
 def test_a_sound_log_has_no_problems() -> None:
     for log in (sound(), world_log(), tiny_log()[0]):
         assert list_time_problems(log) == []

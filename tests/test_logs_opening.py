@@ -135,6 +135,7 @@ def test_a_changed_log_leaves_what_is_deferred_unread() -> None:
         log.changed(nam="b")
 
 
+@pytest.mark.slow
 def test_a_folder_of_several_formats_says_which_else_it_holds(tmp_path: Path) -> None:
     log, _ = tiny_log()
     write_log(log, tmp_path / "logs/a")

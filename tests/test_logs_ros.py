@@ -98,6 +98,7 @@ def test_every_source_of_poses_gives_the_poses_that_were_written(poses: str, tmp
     assert [c["source"] for c in log.details["poses"] if c["used"]] == ["pose" if poses == "covariance" else poses]
 
 
+@pytest.mark.slow
 def test_the_scenario_is_that_of_the_log_in_every_container(tmp_path: Path) -> None:
     world = geodetic_world()
     style = Style(ego_T_base=transform(np.eye(3), EGO_T_IMU[:3, 3]))

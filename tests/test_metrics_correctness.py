@@ -363,6 +363,7 @@ def test_a_document_without_its_figures_breaks_the_schema():
             check(spoiled, "metrics-1", ScenarioError)
 
 
+@pytest.mark.slow
 def test_the_command_writes_them_and_draws_the_reliability(tmp_path):
     broken().save(tmp_path / "s.json")
     world().save(tmp_path / "t.json")
@@ -443,6 +444,7 @@ def shares(figures):
     yield from figures["doubted"].values()
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(scenes(), scenes())
 def test_shares_are_shares_and_parts_add_up(ours, truth):

@@ -275,6 +275,7 @@ def painted_share(center, size, regions):
     return float(inside[canvas > 0].mean())
 
 
+@pytest.mark.slow
 def test_random_worlds_against_painted_pixels():
     rng = np.random.default_rng(7)
     told = np.zeros(3, dtype=int)

@@ -248,6 +248,7 @@ def test_static_is_what_neither_reaches_nor_drifts():
     assert not is_static(t[:1], noise[:1])
 
 
+@pytest.mark.slow
 @pytest.mark.real
 def test_recorded_labels_have_the_points_that_a_full_search_finds(real_data):
     from log2sim.evaluation.metrics.truth import points_in_labels

@@ -239,6 +239,7 @@ def test_what_libraries_print_never_gets_into_an_output(tmp_path: Path, end: str
     assert (tmp_path / "out").read_text() == "result"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "problem", [OSError(28, "No space left on device"), KeyboardInterrupt()], ids=["full", "Ctrl-C"]
 )

@@ -115,6 +115,7 @@ def test_a_damaged_document_is_an_error_or_a_value(
     result_or_refusal(lambda: parse(path), error, str(path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", DOCUMENTS)
 @few
 @given(text=ANY_TEXT)

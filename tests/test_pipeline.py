@@ -213,6 +213,7 @@ def test_without_camera_there_are_no_ticks_and_it_says_so(tiny: tuple[Log, Scena
         run(replace(log, cameras={}, streams={"top": log.streams["top"]}, image_labels={}, reference_camera=None))
 
 
+@pytest.mark.slow
 def test_one_of_two_cameras_gives_what_a_log_of_that_camera_gives() -> None:
     front = {"name": "front", "position_m": [1.7, 0.0, 1.5], "size_px": [480, 300], "offset_s": 0.03}
     left = {"name": "left", "position_m": [1.7, 0.4, 1.5], "size_px": [480, 300], "yaw_deg": 50.0, "offset_s": 0.04}

@@ -166,6 +166,7 @@ def test_a_false_image_box_is_doubted_where_the_lidar_sees_something_else() -> N
     assert len(both.scenario.others) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("yaw_deg", [10.0, 190.0])
 def test_which_way_a_parked_car_points_is_told_by_the_boxes(yaw_deg: float) -> None:
     log, _ = tiny_log([CAR, PARKED | {"pose": [14.0, -4.0, yaw_deg]}], lidar=ALL_AROUND)

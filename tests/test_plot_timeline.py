@@ -77,6 +77,7 @@ def test_where_only_the_log_drives_there_are_no_charts() -> None:
         assert chart_axes(layout_of(scenario, result)) == []
 
 
+@pytest.mark.slow
 def test_the_charts_show_commands_response_and_errors() -> None:
     scenario, result = reckless()
     ego = result.agent("ego")
@@ -151,6 +152,7 @@ def test_the_map_keeps_its_size_above_the_strips() -> None:
     assert all(ax.get_window_extent().y1 < other.y0 for ax in chart_axes(with_strips))
 
 
+@pytest.mark.slow
 def test_collisions_that_the_log_has_not_are_marked_between_the_boxes() -> None:
     scenario, result = reckless()
     (event,) = [e for e in result.metrics["collisions"] if e["belongs_to"] == "replay"]
@@ -169,6 +171,7 @@ def test_collisions_that_the_log_has_not_are_marked_between_the_boxes() -> None:
     assert len(new_collisions(in_log)[0]) == 0
 
 
+@pytest.mark.slow
 def test_the_cursor_moves_and_marks_come_when_it_hits() -> None:
     scenario, result = reckless()
     roles = assign_roles(scenario)

@@ -98,6 +98,7 @@ def test_a_brake_is_not_foreseen() -> None:
     assert off[90:].max() < 1e-3
 
 
+@pytest.mark.slow
 @settings(max_examples=5, deadline=None)
 @given(turn=st.floats(-3, 3), x=st.floats(-1e5, 1e5), y=st.floats(-1e5, 1e5))
 def test_turned_and_shifted_worlds_are_predicted_alike(turn: float, x: float, y: float) -> None:

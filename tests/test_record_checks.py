@@ -373,6 +373,7 @@ def test_positions_are_as_uncertain_as_their_errors_while_no_sweeps_come():
     assert sigma.max() < 1.0
 
 
+@pytest.mark.slow
 def test_black_pictures_are_not_mapped():
     log, truth = tiny_log(observe=False)
     read = log.streams["front"].read

@@ -101,6 +101,7 @@ def test_comfort_of_a_replay_is_that_of_its_maneuver_at_every_step():
         assert replay(scenario_of(agent)).metrics["by_agent"]["a"]["comfort"] is None
 
 
+@pytest.mark.slow
 def test_an_ego_far_behind_on_its_own_course_is_not_off_its_path():
     def curve(id, side=0.0):
         t = np.arange(0, 81) * 0.1
@@ -117,6 +118,7 @@ def test_an_ego_far_behind_on_its_own_course_is_not_off_its_path():
     assert straight["off_path_share"] == pytest.approx(1 - np.sqrt(25.5**2 - 25**2) / 8 / 8, abs=0.03)
 
 
+@pytest.mark.slow
 def test_commands_lead_what_actuators_do_and_do_not_break_at_windows():
     agent = driven(lambda t: np.full_like(t, 8.0), np.zeros_like, 24.0, id="ego")
     result = replay(scenario_of(agent), ego=lambda seen: Controls(0.4, 0.02)).agents[0]

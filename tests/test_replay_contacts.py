@@ -203,6 +203,7 @@ def test_batches_of_pairs_find_the_same_contacts(monkeypatch):
         np.testing.assert_allclose(one, two)
 
 
+@pytest.mark.slow
 def test_agents_on_top_of_each_other_are_refused_before_all_pairs_are_kept(monkeypatch):
     import tracemalloc
 

@@ -34,6 +34,7 @@ def test_it_passes_gymnasiums_own_checker_without_a_warning():
     check_env(env.unwrapped)
 
 
+@pytest.mark.slow
 def test_who_crosses_on_a_bridge_is_not_hit():
     over = line("over", 40, -40, 10, 8, np.pi / 2)
     for z_m, hit in ((6.0, False), (0.0, True)):

@@ -65,6 +65,7 @@ def test_a_vehicle_that_stands_does_not_move_at_all(dt_s):
     assert np.all(r.speed_mps == 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt_s", LONG_STEPS_S)
 def test_a_stop_stays_a_stop_without_creeping_or_turning_the_wheels_back_and_forth(dt_s):
     agent = driven(lambda t: ramp(t, (0, 8), (4, 0), (30, 0)), lambda s: np.full_like(s, 0.08), 30.0)
@@ -93,6 +94,7 @@ def test_a_short_but_fast_run_backward_is_driven_backward():
     assert r.x_m.max() - r.x_m[-1] > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt_s", STEPS_S)
 def test_60_mps_straight_on(dt_s):
     t = np.arange(51) * 0.1
@@ -101,6 +103,7 @@ def test_60_mps_straight_on(dt_s):
     np.testing.assert_allclose(r.y_m, 0.0, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt_s", LONG_STEPS_S)
 @pytest.mark.parametrize("model", LIMITS_M)
 def test_60_mps_in_a_wide_curve(dt_s, model):
@@ -123,6 +126,7 @@ def test_reversing_on_a_circle(dt_s):
     assert np.abs(late).max() < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt_s", STEPS_S)
 def test_full_lock_drives_its_circle(dt_s):
     radius = 1 / (LOCK_SHARE * LOCK_1PM)
@@ -162,6 +166,7 @@ def vars_of(kind):
     return kind.__dataclass_fields__
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt_s", [0.005, 0.1])
 def test_at_full_throttle_the_controller_does_not_wind_up(dt_s):
     behind, speed, pedal = chase(40.0, 10.0, 10.0, 25.0, dt_s)

@@ -44,6 +44,7 @@ def test_maneuvers_are_followed_within_limits(name):
     assert agent.flags == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["brake to stop and go", "turn of radius 8 m", "reversing"])
 def test_the_result_changes_little_when_the_step_is_halved(name):
     runs = [followed(MANEUVERS[name](), dt_s=dt)[0] for dt in (0.01, 0.005, 0.05)]
@@ -52,6 +53,7 @@ def test_the_result_changes_little_when_the_step_is_halved(name):
         assert np.hypot(other.x_m - runs[0].x_m, other.y_m - runs[0].y_m).max() < limit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt_s", [0.0005, 0.1])
 def test_the_shortest_and_the_longest_step_follow_too(dt_s):
     agent = driven(lambda t: np.full_like(t, 8.0), lambda s: ramp(s, (5, 0), (9, 0.05)), 1.5)

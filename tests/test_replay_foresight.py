@@ -60,6 +60,7 @@ def test_where_nobody_interferes_the_scenario_is_kept(foresight: str) -> None:
         assert departure(kept, free, agent) < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("foresight", ["path", "motion"])
 def test_an_ego_that_stops_is_not_run_into(foresight: str) -> None:
     scene = scenario_of(line("ego", 40.0, duration_s=20.0), line("f", 0.0, duration_s=20.0))

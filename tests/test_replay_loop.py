@@ -42,6 +42,7 @@ class Recorder:
 # Stepping.
 
 
+@pytest.mark.slow
 def test_a_world_that_is_stepped_by_hand_gives_the_tracks_of_a_replay():
     scene = scenario_of(line("ego", 30, speed=12, duration_s=12), line("f", 0, speed=12, duration_s=12))
     driver = Speed(lambda t: 12.0 if t < 2 else 5.0)
@@ -169,6 +170,7 @@ def uphill(agent, grade=0.1):
     return changed(agent, waypoints=changed(agent.waypoints, z_m=grade * agent.waypoints.x_m))
 
 
+@pytest.mark.slow
 def test_an_ego_that_falls_behind_its_log_has_the_height_of_its_place_and_is_hit_there():
     flat = [line("ego", 0, speed=10, duration_s=8), line("behind", -40, speed=10, duration_s=8)]
     slope = replay(scenario_of(*map(uphill, flat)), ego=Recorder(Controls(-4.0, 0.0)))
@@ -193,6 +195,7 @@ def test_an_observation_tells_the_height_of_the_ego_and_of_others_also_of_late_o
     assert set(seen.others.height_m) == {seen.ego.height_m} == {1.5}
 
 
+@pytest.mark.slow
 def test_agents_brake_for_a_late_ego_on_a_slope_as_on_the_flat():
     flat = [line("ego", 60, speed=10, duration_s=12), line("late", 30, speed=10, duration_s=12)]
     on_flat, on_slope = (
@@ -349,6 +352,7 @@ def test_the_ego_that_changes_lane_moves_by_a_lane_smoothly(speed):
     assert np.abs(ego.yaw_rad[-20:]).max() < 0.005
 
 
+@pytest.mark.slow
 def test_the_ego_that_changes_lane_takes_the_free_side_or_stays():
     ego = line("ego", 0, speed=12, duration_s=10)
     left, right = line("l", 5, 3.5, 12, 10), line("r", -3, -3.5, 12, 10)

@@ -40,6 +40,7 @@ def stops_at(t_s, speed=25.0):
 # The model.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("leader_mps", [12.0, 18.0])
 def test_behind_a_constant_leader_the_gap_is_that_of_the_model_in_equilibrium(leader_mps):
     # Acceleration 0 and equal speeds: 1 - (v / v0)^4 = ((s0 + v T) / s)^2, with the values of town traffic.
@@ -78,6 +79,7 @@ def test_a_free_agent_goes_on_at_the_logs_rate_and_accelerates_to_it():
 # Interference.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distance_m", [6.0, 10.0, 20.0, 40.0])
 def test_a_follower_at_25_mps_stops_behind_an_ego_that_brakes_hard(distance_m):
     scene = scenario_of(line("ego", distance_m + LENGTH_M, duration_s=16), line("f", 0, duration_s=16))
@@ -94,6 +96,7 @@ def test_a_follower_at_25_mps_stops_behind_an_ego_that_brakes_hard(distance_m):
     assert new_collisions(log)
 
 
+@pytest.mark.slow
 def test_a_stopped_follower_drives_on_when_the_way_is_free_and_makes_up_nothing():
     scene = scenario_of(line("ego", 30, duration_s=60), line("f", 0, duration_s=60))
     go = Speed(lambda t: 25.0 if t < 3 or t > 15 else 0.0)
@@ -130,6 +133,7 @@ def test_a_pedestrian_does_not_walk_into_an_ego_that_comes_later_than_in_the_log
     assert result.agent("p").y_m[-1] > 4
 
 
+@pytest.mark.slow
 def test_of_two_whose_ways_cross_the_first_in_the_log_goes_first_and_both_get_through():
     # In the log b passes the crossing at 5 s, a at 7 s; the ego holds b up until both would be there together.
     scene = scenario_of(
@@ -159,6 +163,7 @@ def test_at_the_edge_of_a_conflict_an_agent_does_not_hunt():
     assert np.count_nonzero(np.diff((c.accel_mps2 < -0.5).astype(int)) > 0) <= 2  # brakes once, perhaps once more
 
 
+@pytest.mark.slow
 def test_two_that_wait_for_each_other_do_not_wait_for_ever():
     # Four ways into one crossing; everybody comes late by another delay.
     legs = [line(f"a{k}", *(-60 * np.array([np.cos(yaw), np.sin(yaw)]) + 2 * np.array([np.sin(yaw), -np.cos(yaw)])), 10, 40, yaw)
@@ -174,6 +179,7 @@ def test_two_that_wait_for_each_other_do_not_wait_for_ever():
         assert np.hypot(a.x_m[-1] - a.x_m[0], a.y_m[-1] - a.y_m[0]) > 120
 
 
+@pytest.mark.slow
 def test_a_logged_stop_is_kept_as_long_as_it_was():
     stop = driven(lambda t: ramp(t, (0, 10), (8, 10), (11, 0), (15, 0), (19, 8), (30, 8)), np.zeros_like, 30.0, id="s")
     scene = scenario_of(line("ego", 25, speed=10, duration_s=40), stop)
@@ -299,6 +305,7 @@ def test_far_from_the_origin_and_turned_the_reaction_is_the_same():
     np.testing.assert_allclose(np.hypot(far.x_m - far.x_m[0], far.y_m - far.y_m[0]), one.x_m, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_step_hardly_matters():
     scene = scenario_of(line("ego", 35, duration_s=14), line("f", 0, duration_s=14))
     ends = [replay(scene, ego=stops_at(2), agents="reactive", dt_s=dt).agent("f").x_m[-1] for dt in (0.01, 0.1)]

@@ -38,6 +38,7 @@ def test_exact_mode_goes_through_the_waypoints():
     assert result.metrics["followers"] == 0
 
 
+@pytest.mark.slow
 def test_the_same_scenario_gives_the_same_bytes():
     scene = scenario_of(*(changed(f(), id=name) for name, f in MANEUVERS.items()))
     one, two = (json.dumps(replay(scene, dt_s=0.05).to_dict()) for _ in range(2))

@@ -330,6 +330,7 @@ EXTREMES = {
 }
 
 
+@pytest.mark.slow
 @ALL
 def test_the_path_is_the_converged_one_at_every_step_in_every_extreme(name):
     step, one = ALL_STEPS[name]
@@ -357,6 +358,7 @@ def test_the_path_is_the_converged_one_at_every_step_in_every_extreme(name):
         assert {k: e for k, e, limit in zip(EXTREMES, error, limits) if e > limit} == {}
 
 
+@pytest.mark.slow
 @BOTH
 def test_halving_the_step_quarters_the_error(name):
     step, p = STEPS[name]

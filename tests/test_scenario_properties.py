@@ -7,6 +7,7 @@ from pathlib import Path
 
 import hypothesis.strategies as st
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis.extra.numpy import arrays
 
@@ -115,6 +116,7 @@ def test_a_saved_scenario_reads_back_bit_by_bit(tmp_path: Path, scenario: Scenar
     assert json.loads(before)["scenario_version"] == 1
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=60)
 @given(scenarios(), scenarios())
 def test_aligning_there_and_back_changes_nothing_but_rounding(one: Scenario, other: Scenario) -> None:

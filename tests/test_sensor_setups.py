@@ -55,6 +55,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Path
     return make
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EACH)
 def test_a_log_is_described_checked_and_drawn(
     made: Callable[[str], tuple[Path, Path]], name: str, tmp_path: Path
@@ -82,6 +83,7 @@ def test_the_scenario_is_that_of_the_world(made: Callable[[str], tuple[Path, Pat
         assert figures["position_rmse_m"] < 0.4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EACH)
 def test_the_scenario_is_drawn_replayed_changed_and_exported(
     made: Callable[[str], tuple[Path, Path]], name: str, tmp_path: Path

@@ -397,6 +397,7 @@ def errors(maneuvers: ModuleType, sigma: float, outliers: float, *, told: bool, 
     return np.median(rows, axis=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.1, 0.3, 0.6])
 def test_no_smoothing_spline_is_better_not_even_the_one_tuned_with_the_truth(
     maneuvers: ModuleType, sigma: float
@@ -406,6 +407,7 @@ def test_no_smoothing_spline_is_better_not_even_the_one_tuned_with_the_truth(
         assert (errors(maneuvers, sigma, 0.0, told=told) <= 1.05 * best).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.1, 0.3, 0.6])
 def test_outliers_cost_little(maneuvers: ModuleType, sigma: float) -> None:
     for told in (True, False):

@@ -150,6 +150,7 @@ def test_buildings_stop_rays() -> None:
     assert (xyz[:, 2] > 0.3).any()
 
 
+@pytest.mark.slow
 def test_an_image_shows_the_car_in_its_color() -> None:
     green = {**PARKED, "color": [20, 200, 40], "pose": [9.0, 0.0, 90.0]}
     log, _ = tiny_log([green])

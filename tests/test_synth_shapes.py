@@ -83,6 +83,7 @@ def test_rays_meet_a_sphere_where_the_formula_says() -> None:
     assert both.sum() > 50
 
 
+@pytest.mark.slow
 def test_the_rasterizer_and_the_ray_caster_see_the_same_surface() -> None:
     mesh = shape("car")
     K = np.array([[300.0, 0, 100], [0, 300.0, 60], [0, 0, 1]])

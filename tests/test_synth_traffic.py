@@ -196,6 +196,7 @@ def test_bounds_hold_all_corners(part) -> None:
     assert np.allclose(np.linalg.norm(part.normals, axis=1), 1, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_labels_are_where_the_points_are() -> None:
     """Of every road user, points lie in its box, at any speed and on any slope."""
     for seed in range(6):

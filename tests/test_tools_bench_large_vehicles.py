@@ -15,6 +15,7 @@ def _tools_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(TOOLS))
 
 
+@pytest.mark.slow
 def test_a_minibus_at_the_curb_neither_slides_nor_turns_nor_grows() -> None:
     from bench_large_vehicles import measured
 

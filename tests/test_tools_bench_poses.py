@@ -61,6 +61,7 @@ def test_scatter_is_of_labeled_vehicles_that_stand() -> None:
     assert bench_poses.standing_vehicles({"given": labels}) == {"a": {"given": pytest.approx(0.1)}}
 
 
+@pytest.mark.slow
 def test_the_table_of_a_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -152,6 +152,7 @@ def test_onnx_equals_torch_and_detects_nothing_untrained(tmp_path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_resumed_run_gives_the_weights_of_one_that_was_not_stopped(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(train_lidar, "PER_SHARD", 2)
     monkeypatch.setattr(train_lidar, "CELLS", {"roadside": 64})

@@ -97,6 +97,7 @@ def test_the_eight_channels_say_what_the_paper_names(grid: np.ndarray) -> None:
     np.testing.assert_allclose(out[3] * z.DISTANCE_UNIT_M, np.hypot(y[None, :], x[:, None]) * z.CELL_M, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_part_of_a_window_has_the_directions_and_distances_of_the_whole(grid: np.ndarray) -> None:
     whole = z.PaperGrid()(torch.from_numpy(grid[None]))
     part = torch.from_numpy(grid[None, :, 16:80, 32:96])
@@ -225,6 +226,7 @@ def test_half_of_a_batch_comes_from_the_other_source(sample: Sample) -> None:
     assert [len(s.boxes) for s in mixing.Mixture([[sample]]).draw(np.random.default_rng(0))] == [4] * 4
 
 
+@pytest.mark.slow
 def test_a_fit_that_was_cut_off_goes_on_to_the_same_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fitting, "CHECKPOINT_S", 0.0)
 

@@ -182,6 +182,7 @@ def street(seed: int, period_s: float, detected: float = 0.85) -> tuple[list[Mea
     return found, t_ns
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("period_s", "share"), [(0.5, 0.95), (0.2, 0.99), (0.1, 0.995), (0.05, 0.995)])
 def test_tracks_in_a_street_of_parked_cars_hold_one_object_at_any_rate(period_s: float, share: float) -> None:
     own = total = 0

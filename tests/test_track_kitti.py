@@ -440,6 +440,7 @@ def test_sequences_without_results_are_missed() -> None:
     assert evaluate({}, {"0": label}, "Car").mota == 0
 
 
+@pytest.mark.slow
 @pytest.mark.real
 @pytest.mark.parametrize("online", [True, False])
 def test_a_recorded_sequence_is_tracked_without_identity_switches(tmp_path: Path, online: bool) -> None:

@@ -180,6 +180,7 @@ def test_points_of_the_cloud_are_in_the_boxes_of_visible_cars(kitti: Path) -> No
     assert inside_total > 100
 
 
+@pytest.mark.slow
 def test_the_same_seed_writes_the_same_bytes_and_conditions_stand_beside_the_data(tmp_path: Path) -> None:
     settings = TrafficSettings("vehicle", 2, 9, sensor="vlp16", light="dusk")
     for name in ("a", "b"):
@@ -210,6 +211,7 @@ def test_data_is_not_replaced_unasked_and_an_unknown_sensor_is_named(tmp_path: P
     assert sorted(p.name for p in tmp_path.iterdir()) == ["mine"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mount", ["vehicle", "roadside"])
 def test_a_log_of_traffic_is_read_back_with_boxes_on_its_points(mount: str, tmp_path: Path) -> None:
     settings = TrafficSettings(
