@@ -24,6 +24,20 @@ def replay(
     ego: Annotated[
         str | None, typer.Option(metavar="MODULE|FILE.py:ATTRIBUTE", help="Policy that drives the ego.")
     ] = None,
+    warn: Annotated[
+        str | None,
+        typer.Option(
+            metavar="vehicle|road|both", help="Warn of collisions with the ego by what the sensors at these ends observe."
+        ),
+    ] = None,
+    brake: Annotated[bool, typer.Option("--brake", help="With --warn: the ego brakes when it is warned.")] = False,
+    horizon: Annotated[float, typer.Option(metavar="S", help="--warn: predict collisions for so long, in s.")] = 3.0,
+    reaction: Annotated[
+        float, typer.Option(metavar="S", help="--warn: from the warning until the brakes work, in s.")
+    ] = 1.0,
+    deceleration: Annotated[
+        float, typer.Option(metavar="MPS2", help="--warn: how hard the ego brakes, in m/s2.")
+    ] = 8.0,
     agents: Annotated[
         str,
         typer.Option(
@@ -71,6 +85,9 @@ def replay(
     from log2sim.simulation.metrics.summary import summarize
     from log2sim.simulation.policy_loading import load_policy
     from log2sim.simulation.runner import replay as run
+    from log2sim.simulation.warnings.policy import BrakeWhenWarned
+    from log2sim.simulation.warnings.settings import WarningSettings
+    from log2sim.simulation.warnings.warn import warn as find_warnings
 
     check_targets(out, overwrite=overwrite)
     if out is not None and out.resolve() == scenario.resolve():
@@ -80,17 +97,21 @@ def replay(
     if foresight != "path" and react is None and agents != "reactive":
         raise ConfigError("--foresight: nobody reacts; add --agents reactive or --react")
     limits = parse_limits(limit or ())
+    if brake and (warn is None or ego is not None):
+        raise ConfigError("--brake: brakes when the ego is warned; add --warn, and leave out --ego")
+    warning = None if warn is None else WarningSettings(warn, horizon, reaction_s=reaction, brake_mps2=deceleration)
     loaded = Scenario.load(scenario)
     chosen = agents if react is None else list(ids_of(loaded, [react]))
     kept, left_out = _trusted(loaded, confidence, drop_doubtful=drop_doubtful)
-    policy = load_policy(ego) if ego is not None else None
+    policy = load_policy(ego) if ego is not None else BrakeWhenWarned(warning) if brake else None
     moved_by = external_simulator(simulator, host, port, map)
     with progress(quiet=quiet) as report_progress:
         result = run(
             kept, mode=mode, model=model, dt_s=dt, ego=policy, agents=chosen, foresight=foresight, host=moved_by,
             progress=lambda done, total: report_progress("replay", done, total),
         )  # fmt: skip
-    result = changed(result, left_out=left_out)
+    warned = None if warning is None else find_warnings(kept, result, ends=warning.ends, settings=warning)
+    result = changed(result, left_out=left_out, warnings=warned)
     if out is not None:
         result.save(out)
     say(summarize(result), quiet=quiet)

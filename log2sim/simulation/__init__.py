@@ -9,9 +9,13 @@ from log2sim.simulation.policy_loading import load_policy
 from log2sim.simulation.result import AgentReplay, Commands, Replay, to_scenario
 from log2sim.simulation.rollout import World
 from log2sim.simulation.runner import open_world, replay
+from log2sim.simulation.warnings.policy import BrakeWhenWarned
+from log2sim.simulation.warnings.settings import WarningSettings
+from log2sim.simulation.warnings.warn import warn
 
 __all__ = [
     "AgentReplay",
+    "BrakeWhenWarned",
     "Commands",
     "Controls",
     "EgoState",
@@ -21,6 +25,7 @@ __all__ = [
     "Policy",
     "Replay",
     "Route",
+    "WarningSettings",
     "World",
     "check_limits",
     "check_strict",
@@ -31,4 +36,5 @@ __all__ = [
     "replay",
     "require_strict",
     "to_scenario",
+    "warn",
 ]

@@ -14,6 +14,7 @@ from log2sim.datatypes import Scenario, Waypoints
 from log2sim.documents import check, read_json, write_json
 from log2sim.errors import ScenarioError
 from log2sim.geometry import Array
+from log2sim.simulation.warnings.warning import Warnings
 
 VERSION = 1
 
@@ -122,6 +123,8 @@ class Replay:
         As in `schemas/replay-1.json`.
     left_out : mapping
         Agents of the scenario's file that were left out before it was replayed: id and why.
+    warnings : Warnings or None
+        Who was on a collision course with the ego, if that was asked for.
     """
 
     scenario: str
@@ -133,6 +136,7 @@ class Replay:
     agents: tuple[AgentReplay, ...]
     metrics: Mapping[str, Any] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
+    warnings: Warnings | None = None
 
     def agent(self, id: str) -> AgentReplay:
         """Return the agent with an id; `KeyError` when there is none."""
@@ -158,7 +162,7 @@ class Replay:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the document of `schemas/replay-1.json`."""
-        return {
+        document = {
             "replay_version": VERSION,
             "scenario": self.scenario,
             "scenario_digest": self.scenario_digest,
@@ -170,6 +174,7 @@ class Replay:
             "metrics": dict(self.metrics),
             "left_out": dict(self.left_out),
         }
+        return document if self.warnings is None else {**document, "warnings": self.warnings.to_dict()}
 
     @classmethod
     def from_dict(cls, document: Any) -> Self:
@@ -181,7 +186,8 @@ class Replay:
         plain = ("scenario", "scenario_digest", "mode", "model", "dt_s", "store_dt_s", "metrics")
         agents = tuple(_agent_from_dict(a) for a in document["agents"])
         known = {**{k: document[k] for k in plain}, "metrics": _with_owners(document["metrics"])}
-        return cls(agents=agents, left_out=document.get("left_out", {}), **known)
+        warned = Warnings.from_dict(document["warnings"]) if "warnings" in document else None
+        return cls(agents=agents, left_out=document.get("left_out", {}), warnings=warned, **known)
 
 
 def _with_owners(metrics: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from log2sim.simulation.metrics.all_metrics import SCENARIO_FOLLOWERS
 from log2sim.simulation.metrics.collisions import REPLAY
 from log2sim.simulation.metrics.conflicts import most_critical
 from log2sim.simulation.result import Replay
+from log2sim.simulation.warnings.sentences import describe_warnings
 
 MAX_LISTED = 5
 
@@ -33,6 +34,8 @@ def summarize(replay: Replay) -> str:
     if len(events) > MAX_LISTED:
         lines.append(f"  and {len(events) - MAX_LISTED} more")
     lines += _left_out_lines(replay)
+    if replay.warnings is not None:
+        lines.append(describe_warnings(replay.warnings))
     return "\n".join(lines)
 
 

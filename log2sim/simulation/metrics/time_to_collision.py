@@ -75,8 +75,18 @@ def time_to_touch(
 ) -> Array:
     """Return the time in s (N,) until rectangles touch, inf where they never do or overlap already.
 
-    `dx`, `dy` lead from a to b and change at `vx`, `vy`. On each separating axis the projections overlap for one
-    interval of time; the rectangles do while all four do. Exact.
+    `dx`, `dy` lead from a to b and change at `vx`, `vy`.
+    """
+    enter, leave = touching(dx, dy, vx, vy, yaw_a, yaw_b, size_a, size_b)
+    return np.where((enter >= 0) & (enter < leave), enter, np.inf)
+
+
+def touching(
+    dx: Array, dy: Array, vx: Array, vy: Array, yaw_a: Array, yaw_b: Array, size_a: Array, size_b: Array
+) -> tuple[Array, Array]:
+    """Return the times in s (N,) from and until which rectangles touch, negative ones too; enter < leave only where they do.
+
+    On each separating axis the projections overlap for one interval of time; the rectangles do while all four do. Exact.
     """
     enter, leave = np.full(len(dx), -np.inf), np.full(len(dx), np.inf)
     for nx, ny, reach, _ in separating_axes(yaw_a, yaw_b, size_a, size_b):
@@ -87,7 +97,7 @@ def time_to_touch(
         one, other = ends
         enter = np.maximum(enter, np.minimum(one, other))
         leave = np.minimum(leave, np.where(moves, np.maximum(one, other), -never))
-    return np.where((enter >= 0) & (enter < leave), enter, np.inf)
+    return enter, leave
 
 
 def _same_height(
