@@ -8,11 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, Scenario
+from log2sim.datatypes import Agent, Scenario, Span
 from log2sim.geometry import Array
 from log2sim.tracking.forward import CONFIRMED_AGE_S, TENTATIVE_HITS
-
-Span = tuple[float, float]
 
 MIN_INTERVAL_S = 0.1
 """Between observations: most LiDARs turn ten times a second. Logs with fewer ticks are observed at these."""
@@ -99,9 +97,8 @@ def observed_spans(agent: Agent, ends: Sequence[str]) -> tuple[Span, ...]:
     Agents that do not say which end observed them are observed where their waypoints are, or, in truth, where they are visible:
     in scenarios of a single end these are all.
     """
-    by_end = getattr(agent, "observed_by", None)
-    if by_end:
-        return tuple(sorted(span for end in ends for span in by_end.get(end, ())))
+    if agent.observed_by:
+        return tuple(sorted(span for end in ends for span in agent.observed_by.get(end, ())))
     if agent.is_permanent:
         return ((-np.inf, np.inf),)
     w = agent.waypoints
@@ -112,7 +109,7 @@ def observed_spans(agent: Agent, ends: Sequence[str]) -> tuple[Span, ...]:
 
 def has_ends(scenario: Scenario) -> bool:
     """Whether a scenario says which end observed its agents."""
-    return any(getattr(a, "observed_by", None) for a in scenario.agents)
+    return any(a.observed_by for a in scenario.agents)
 
 
 def observation_interval_s(scenario: Scenario) -> float:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from log2sim.datatypes import ENDS
 from log2sim.errors import ConfigError
 from log2sim.registry import nearest
 
-CHOICES = ("vehicle", "road", "both")
+CHOICES = (*ENDS, "both")
 """Whose observations count: those of the sensors of the ego, of those at the roadside, or all."""
 
 _RANGES = {
@@ -62,7 +63,7 @@ class WarningSettings:
     @property
     def used_ends(self) -> tuple[str, ...]:
         """Return the ends whose observations count."""
-        return ("vehicle", "road") if self.ends == "both" else (self.ends,)
+        return ENDS if self.ends == "both" else (self.ends,)
 
     def stopping_distance_m(self, speed_mps: float) -> float:
         """Return the way in m until a vehicle stands: reaction, then braking."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import EGO, STANDSTILL_MPS, Agent, Scenario
+from log2sim.datatypes import EGO, ENDS, STANDSTILL_MPS, Agent, Scenario
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array, box_corners_bev
 from log2sim.prediction.motion_table import TICK_S, table_of
@@ -171,7 +171,7 @@ def _with_collisions(
 def _known_by(agent: Agent, t_s: Array, interval_s: float) -> dict[str, float]:
     """Return when each end alone knows an agent first, s."""
     found: dict[str, Any] = {}
-    for end in ("vehicle", "road"):
+    for end in ENDS:
         present = np.ones((1, len(t_s)), dtype=bool)
         since = known_agents([agent], [observed_spans(agent, (end,))], t_s, interval_s, present).since_s[0]
         if np.isfinite(since):
