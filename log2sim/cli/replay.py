@@ -27,11 +27,12 @@ def replay(
     warn: Annotated[
         str | None,
         typer.Option(
-            metavar="vehicle|road|both", help="Warn of collisions with the ego by what the sensors at these ends observe."
+            metavar="vehicle|road|both",
+            help="Warn of collisions with the ego by what the sensors at these ends observe.",
         ),
     ] = None,
     brake: Annotated[bool, typer.Option("--brake", help="With --warn: the ego brakes when it is warned.")] = False,
-    horizon: Annotated[float, typer.Option(metavar="S", help="--warn: predict collisions for so long, in s.")] = 3.0,
+    horizon: Annotated[float, typer.Option(metavar="S", help="--warn: predict collisions for so long, in s.")] = 5.0,
     reaction: Annotated[
         float, typer.Option(metavar="S", help="--warn: from the warning until the brakes work, in s.")
     ] = 1.0,

@@ -45,8 +45,8 @@ def expected_contacts(ego: Ways, others: Ways, lead_s: Array) -> Contacts:
     -----
     The errors of an agent at different leads are one: who is faster than expected is so throughout. They are normal along and
     across its course, and each takes `QUANTILES` values of equal probability; the probability is the share of the pairs of
-    values with which the boxes meet. Between leads both move straight, and the time is exact. Contacts count while the ego
-    moves, and not those at its rear, where the other one's driver runs into it, nor of boxes that overlap already.
+    values with which the boxes meet. Between leads both move straight, and the time is exact. A first contact does not count where
+    the ego stands by then, or is hit from behind, which its braking would not help, nor where boxes overlap already.
     """
     probability, time = np.zeros(len(ego.size_m)), np.full(len(ego.size_m), np.inf)
     near = np.flatnonzero(_in_reach(ego, others))
@@ -88,10 +88,12 @@ def _contact_times(ego: Ways, others: Ways, lead_s: Array) -> Array:
     then = np.where(meets, enter, 0.0)
     ahead = ((flat + then * speed) * np.exp(-1j * own)).real
     length = np.broadcast_to(ego.size_m[:, :1, None], shape).ravel()
-    moves = np.broadcast_to((np.abs(np.diff(ego.position_m, axis=1)) > 1e-6)[:, None], shape).ravel()
-    meets &= (ahead > -length / 2) & moves
-    times = np.where(meets, then + np.broadcast_to(lead_s[:-1], shape).ravel(), np.inf).reshape(shape).min(axis=-1)
-    return np.where(times > 0, times, np.inf)  # boxes that overlap now have met before
+    moves = np.broadcast_to((np.abs(np.diff(ego.position_m, axis=1)) > 1e-6)[:, None], shape)
+    times = np.where(meets, then + np.broadcast_to(lead_s[:-1], shape).ravel(), np.inf).reshape(shape)
+    first = times.argmin(axis=-1)[..., None]
+    counts = (ahead > -length / 2).reshape(shape) & moves
+    time, counts = (np.take_along_axis(c, first, axis=-1)[..., 0] for c in (times, counts))
+    return np.where(counts & (time > 0), time, np.inf)
 
 
 def _errors() -> tuple[Array, Array]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, Trajectory
 from log2sim.geometry import Array, wrap_angle
+from log2sim.prediction.motion_table import Complex
 from log2sim.simulation.reactive.path_table import PathTable
 from log2sim.simulation.reactive.prediction import ON_PATH_COS, ON_PATH_M
 from log2sim.simulation.warnings.ways import Ways
@@ -71,8 +72,8 @@ class EgoWay:
         facing = np.exp(1j * ego.yaw_rad)[:, None]
         travel = facing * np.where(ego.speed_mps < 0, -1.0, 1.0)[:, None]
         on = (np.abs(left) < ON_PATH_M) & ((travel * (cos0 - 1j * sin0)).real > ON_PATH_COS)
-        direction = np.where(on, cos + 1j * sin, travel)
-        direction = direction / np.abs(direction)
+        along = np.where(on, cos + 1j * sin, travel)
+        direction: Complex = np.asarray(along / np.abs(along), dtype=np.complex128)
         position = np.where(on, origin + x + 1j * y + 1j * left * direction, here + ahead * travel)
         turned = np.where(on, np.angle(direction * (cos0 - 1j * sin0)), 0.0)
         yaw = wrap_angle(ego.yaw_rad[:, None] + turned)

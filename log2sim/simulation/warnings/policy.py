@@ -10,7 +10,7 @@ from log2sim.prediction.motion_table import TICK_S, table_of
 from log2sim.simulation.policy import Controls, EgoState, Observation, PathAhead
 from log2sim.simulation.warnings.ego_way import EgoStates
 from log2sim.simulation.warnings.settings import WarningSettings
-from log2sim.simulation.warnings.watch import Watch
+from log2sim.simulation.warnings.watch import MIN_EGO_MPS, Watch
 
 CLEAR_S = 1.0
 """The ego drives on when its way has been clear for so long."""
@@ -76,14 +76,14 @@ class BrakeWhenWarned:
         ego, t_s = seen.ego, seen.t_s
         speed, accel = ego.speed_mps, ego.accel_mps2
         if self.braking(t_s):
-            speed, accel = max(speed, float(seen.path.speed_mps[0]), STANDSTILL_MPS), 0.0
+            speed, accel = max(speed, float(seen.path.speed_mps[0]), MIN_EGO_MPS), 0.0
         one = [np.array([v]) for v in (ego.x_m, ego.y_m, ego.yaw_rad, speed, accel, seen.path.progress_m)]
         place, pace = np.full(len(self._index), np.nan, dtype=complex), np.full(len(self._index), np.nan)
         rows = np.array([self._index[i] for i in seen.others.id.tolist()], dtype=np.intp)
         place[rows] = seen.others.x_m + 1j * seen.others.y_m
         pace[rows] = np.hypot(seen.others.velocity_x_mps, seen.others.velocity_y_mps)
         found = self._watch.courses(EgoStates(*one), np.array([tick]), (place, pace))
-        if (found.probability >= self.settings.min_probability).any():
+        if found.due.any():
             self._danger_s, self._warned_s = t_s, min(self._warned_s, t_s)
         elif t_s > self._danger_s + CLEAR_S - 1e-9:
             self._warned_s = np.inf

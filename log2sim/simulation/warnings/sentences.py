@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from log2sim.simulation.warnings.warning import Warning, Warnings
+from log2sim.simulation.warnings.warning import CollisionWarning, Warnings
 
 MAX_LISTED = 5
 
@@ -12,7 +12,9 @@ _ENDS = {"vehicle": "the vehicle's sensors", "road": "the road's sensors", "both
 def describe_warnings(warnings: Warnings) -> str:
     """Say how many warnings there are, and describe the first ones."""
     warned = [w for w in warnings.events if w.warned is not None]
-    whose = _ENDS[warnings.ends] if warnings.tells_ends else "all sensors, which the scenario does not tell apart by end"
+    whose = (
+        _ENDS[warnings.ends] if warnings.tells_ends else "all sensors, which the scenario does not tell apart by end"
+    )
     count = f"{len(warned) or 'no'} warning{'s' * (len(warned) != 1)}"
     lines = [f"{count} in {warnings.driven_s:.1f} s of driving, by {whose}"]
     lines += [f"  {describe_warning(w, warnings)}" for w in warnings.events[:MAX_LISTED]]
@@ -21,7 +23,7 @@ def describe_warnings(warnings: Warnings) -> str:
     return "\n".join(lines)
 
 
-def describe_warning(warning: Warning, warnings: Warnings) -> str:
+def describe_warning(warning: CollisionWarning, warnings: Warnings) -> str:
     """Describe a warning: when, how soon and how far off the collision is, whether braking suffices, and since when it is known."""
     parts = [_warned(warning, warnings), _known(warning)]
     if warning.collision_s is not None:
@@ -29,7 +31,7 @@ def describe_warning(warning: Warning, warnings: Warnings) -> str:
     return " ".join(parts)
 
 
-def _warned(warning: Warning, warnings: Warnings) -> str:
+def _warned(warning: CollisionWarning, warnings: Warnings) -> str:
     at = warning.warned
     if at is None or warning.ttc_s is None or warning.way_m is None:
         return f"{warning.agent}: no warning."
@@ -43,8 +45,10 @@ def _warned(warning: Warning, warnings: Warnings) -> str:
     )
 
 
-def _known(warning: Warning) -> str:
-    ends = ", ".join(f"by the {end} alone at {t_s:.2f} s" for end, t_s in sorted(warning.known_by.items(), key=lambda e: e[1]))
+def _known(warning: CollisionWarning) -> str:
+    ends = ", ".join(
+        f"by the {end} alone at {t_s:.2f} s" for end, t_s in sorted(warning.known_by.items(), key=lambda e: e[1])
+    )
     if warning.known is None:
         return f"Never known by them{f'; {ends}' if ends else ''}."
     return f"Known since {warning.known.t_s:.2f} s, {warning.known.distance_m:.1f} m away{f'; {ends}' if ends else ''}."

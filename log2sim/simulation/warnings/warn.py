@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
-from typing import Any
+from dataclasses import fields, replace
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from log2sim.datatypes import EGO, ENDS, STANDSTILL_MPS, Agent, Scenario
 from log2sim.errors import ConfigError
@@ -17,7 +16,7 @@ from log2sim.simulation.result import Replay, to_scenario
 from log2sim.simulation.warnings.ego_way import EgoStates
 from log2sim.simulation.warnings.known import has_ends, known_agents, observed_spans
 from log2sim.simulation.warnings.settings import WarningSettings
-from log2sim.simulation.warnings.warning import Moment, Warning, Warnings
+from log2sim.simulation.warnings.warning import CollisionWarning, Moment, Warnings
 from log2sim.simulation.warnings.watch import Courses, Watch
 
 BRAKING_SEEN_S = 0.3
@@ -54,7 +53,7 @@ def warn(
     -----
     At every tick of 0.1 s agents are expected where `log2sim.prediction` sees them by what the ends have observed up to then, and
     the ego on its path at its speed, or braking as it does. An agent with which the ego collides by that, with at least
-    `min_probability` within `horizon_s`, is warned of. Nothing later is used but the ego's path: its route. States of a
+    `min_probability` within `horizon_s`, is warned of from when the ego has to react within `margin_s`. Nothing later is used but the ego's path: its route. States of a
     reconstruction were smoothed over the whole log, so that they tell a little of what came next.
     """
     settings = replace(settings or WarningSettings(), ends=ends)
@@ -64,18 +63,15 @@ def warn(
     table = table_of(moved)
     ticks = np.flatnonzero(table.present[[a.id for a in moved.agents].index(EGO)])
     watch = Watch(scenario, moved.others, settings, table.t_s)
-    ego = ego_states(moved.ego, watch, table.t_s[ticks])
-    events = _events(watch, watch.courses(ego, ticks), ego, ticks)
-    hit = _collisions(replay)
-    events = _with_collisions(events, hit, watch, ego, ticks)
-    sources = {a.id: a for a in scenario.agents}
+    drive = _Drive(watch, ego_states(moved.ego, watch, table.t_s[ticks]), table.t_s[ticks])
+    events = _with_collisions(_events(drive, watch.courses(drive.ego, ticks)), _collisions(replay), drive)
     if has_ends(scenario):
+        sources = {a.id: a for a in scenario.agents}
         events = [replace(e, known_by=_known_by(sources[e.agent], table.t_s, watch.interval_s)) for e in events]
-    driven_s = float((np.abs(ego.speed_mps) >= STANDSTILL_MPS).sum()) * TICK_S
-    return Warnings(
-        settings.ends, has_ends(scenario), settings.horizon_s, settings.min_probability, settings.reaction_s,
-        settings.brake_mps2, round(driven_s, 1), tuple(sorted(events, key=_time_of)),
-    )  # fmt: skip
+    driven_s = float((np.abs(drive.ego.speed_mps) >= STANDSTILL_MPS).sum()) * TICK_S
+    used = {f.name: getattr(settings, f.name) for f in fields(settings)}
+    in_order = tuple(sorted(events, key=lambda e: (e.begin_s, e.agent)))
+    return Warnings(tells_ends=has_ends(scenario), driven_s=round(driven_s, 1), events=in_order, **used)
 
 
 def ego_states(ego: Agent, watch: Watch, t_s: Array) -> EgoStates:
@@ -88,45 +84,55 @@ def ego_states(ego: Agent, watch: Watch, t_s: Array) -> EgoStates:
     return EgoStates(x, y, yaw, speed, accel, watch.ego_way.progress(x, y))
 
 
-def _events(watch: Watch, found: Courses, ego: EgoStates, ticks: NDArray[np.intp]) -> list[Warning]:
-    """Make a warning of all agents that reach the probability."""
+class _Drive(NamedTuple):
+    """The ego's states at its ticks, and what is known of others."""
+
+    watch: Watch
+    ego: EgoStates
+    t_s: Array
+
+    def moment(self, agent: int, t_s: float) -> Moment:
+        """Tell how far the ego and an agent are from each other at a time."""
+        other, size = self.watch.table.agents[agent], self.watch.ego_way.size_m
+        x, y, _, yaw, _ = other.trajectory.at(np.array([t_s]))
+        columns = (self.ego.x_m, self.ego.y_m, np.unwrap(self.ego.yaw_rad), self.ego.speed_mps)
+        own_x, own_y, own_yaw, own_speed = (float(np.interp(t_s, self.t_s, c)) for c in columns)
+        gap_m = _gap_m(
+            box_corners_bev([[own_x, own_y]], size[0], size[1], own_yaw),
+            box_corners_bev([[x[0], y[0]]], other.size_m[0], other.size_m[1], yaw[0]),
+        )
+        stopping_m = float(self.watch.settings.stopping_distance_m(np.array(own_speed)))
+        return Moment(*(round(v, _DIGITS) for v in (t_s, gap_m, abs(own_speed), stopping_m)))
+
+    def known(self, agent: int) -> Moment | None:
+        """Tell the same of when an agent is first known; None where it never is, or while there was no ego."""
+        since_s = float(self.watch.known.since_s[agent])
+        there = self.t_s[0] - TICK_S <= since_s <= self.t_s[-1] + TICK_S
+        return self.moment(agent, since_s) if there else None
+
+
+def _events(drive: _Drive, found: Courses) -> list[CollisionWarning]:
+    """Make a warning of all agents that the ego has to be warned of."""
     events = []
-    s, t_s = watch.settings, watch.table.t_s[ticks]
-    warned = found.probability >= s.min_probability
-    for agent in np.unique(found.agent[warned]).tolist():
-        rows = np.flatnonzero(warned & (found.agent == agent))
-        first = rows[np.argmin(found.row[rows])]
-        n, way = int(found.row[first]), float(found.way_m[first])
-        moment = _moment(watch, agent, ego, ticks, float(t_s[n]))
-        needed = s.needed_mps2(moment.ego_speed_mps, way)
-        who = watch.table.agents[agent]
-        events.append(
-            Warning(
-                who.id, who.category, _moment(watch, agent, ego, ticks, float(watch.known.since_s[agent])),
-                warned=moment, probability=round(float(found.probability[first]), _DIGITS),
-                ttc_s=round(float(found.ttc_s[first]), _DIGITS), way_m=round(way, _DIGITS),
-                needed_mps2=None if needed is None else round(needed, _DIGITS), braking_suffices=moment.stopping_m <= way,
-                spans_s=_spans(np.sort(t_s[found.row[rows]])),
-            )
-        )  # fmt: skip
+    for agent in np.unique(found.agent[found.due]).tolist():
+        rows = np.flatnonzero(found.due & (found.agent == agent))
+        first, who = rows[np.argmin(found.row[rows])], drive.watch.table.agents[agent]
+        moment, way_m = drive.moment(agent, float(drive.t_s[found.row[first]])), float(found.way_m[first])
+        needed = drive.watch.settings.needed_mps2(moment.ego_speed_mps, way_m)
+        event = CollisionWarning(
+            agent=who.id,
+            category=who.category,
+            known=drive.known(agent),
+            warned=moment,
+            probability=round(float(found.probability[first]), _DIGITS),
+            ttc_s=round(float(found.ttc_s[first]), _DIGITS),
+            way_m=round(way_m, _DIGITS),
+            needed_mps2=None if needed is None else round(needed, _DIGITS),
+            braking_suffices=moment.stopping_m <= way_m,
+            spans_s=_spans(np.sort(drive.t_s[found.row[rows]])),
+        )
+        events.append(event)
     return events
-
-
-def _moment(watch: Watch, agent: int, ego: EgoStates, ticks: NDArray[np.intp], t_s: float) -> Moment | None:
-    """Tell how far the ego and an agent are from each other at a time; None while either is absent, or never."""
-    own_s, other = watch.table.t_s[ticks], watch.table.agents[agent]
-    if not own_s[0] - TICK_S <= t_s <= own_s[-1] + TICK_S:
-        return None
-    x, y, _, yaw, _ = other.trajectory.at(np.array([t_s]))
-    ours = [np.interp(t_s, own_s, c) for c in (ego.x_m, ego.y_m, np.unwrap(ego.yaw_rad), ego.speed_mps)]
-    size = watch.ego_way.size_m
-    boxes = (
-        box_corners_bev([[ours[0], ours[1]]], size[0], size[1], ours[2]),
-        box_corners_bev([[x[0], y[0]]], other.size_m[0], other.size_m[1], yaw[0]),
-    )
-    speed = abs(float(ours[3]))
-    stopping = watch.settings.stopping_distance_m(speed)
-    return Moment(round(t_s, _DIGITS), round(_gap_m(*boxes), _DIGITS), round(speed, _DIGITS), round(stopping, _DIGITS))
 
 
 def _gap_m(a_m: Array, b_m: Array) -> float:
@@ -144,41 +150,34 @@ def _spans(t_s: Array) -> tuple[tuple[float, float], ...]:
 
 
 def _collisions(replay: Replay | None) -> Mapping[str, float]:
-    """Return when the ego first touches others in a replay, by id."""
-    if replay is None:
-        return {}
+    """Return when the ego first touches others in a replay, by id; boxes that overlap from the start have not collided."""
     touched: dict[str, float] = {}
-    for event in replay.metrics.get("collisions", ()):
-        if EGO in event["agents"]:
+    for event in () if replay is None else replay.metrics.get("collisions", ()):
+        if EGO in event["agents"] and not event.get("from_start", False):
             (other,) = (i for i in event["agents"] if i != EGO)
-            touched[other] = min(touched.get(other, np.inf), float(event["t_s"]))
+            touched[other] = min(touched.get(other, np.inf), round(float(event["t_s"]), _DIGITS))
     return touched
 
 
 def _with_collisions(
-    events: Iterable[Warning], hit: Mapping[str, float], watch: Watch, ego: EgoStates, ticks: NDArray[np.intp]
-) -> list[Warning]:
+    events: Iterable[CollisionWarning], hit: Mapping[str, float], drive: _Drive
+) -> list[CollisionWarning]:
     """Tell which agents the ego touches, and add those that nothing was predicted of."""
-    out = [replace(e, collision_s=round(hit[e.agent], _DIGITS)) if e.agent in hit else e for e in events]
-    ids = [a.id for a in watch.table.agents]
+    out = [replace(e, collision_s=hit.get(e.agent)) for e in events]
+    row = {a.id: k for k, a in enumerate(drive.watch.table.agents)}
     for agent in hit.keys() - {e.agent for e in out}:
-        k = ids.index(agent)
-        known = _moment(watch, k, ego, ticks, float(watch.known.since_s[k]))
-        out.append(Warning(agent, watch.table.agents[k].category, known, collision_s=round(hit[agent], _DIGITS)))
+        k = row[agent]
+        category = drive.watch.table.agents[k].category
+        out.append(CollisionWarning(agent, category, drive.known(k), collision_s=hit[agent]))
     return out
 
 
 def _known_by(agent: Agent, t_s: Array, interval_s: float) -> dict[str, float]:
     """Return when each end alone knows an agent first, s."""
-    found: dict[str, Any] = {}
+    found = {}
+    present = np.ones((1, len(t_s)), dtype=bool)
     for end in ENDS:
-        present = np.ones((1, len(t_s)), dtype=bool)
         since = known_agents([agent], [observed_spans(agent, (end,))], t_s, interval_s, present).since_s[0]
         if np.isfinite(since):
             found[end] = round(float(since), _DIGITS)
     return found
-
-
-def _time_of(warning: Warning) -> tuple[float, str]:
-    at = warning.warned.t_s if warning.warned else warning.collision_s
-    return float("inf") if at is None else at, warning.agent

@@ -28,7 +28,7 @@ class Moment:
 
 
 @dataclass(frozen=True)
-class Warning:
+class CollisionWarning:
     """What is known of an agent on a collision course with the ego.
 
     Attributes
@@ -69,6 +69,11 @@ class Warning:
     spans_s: tuple[tuple[float, float], ...] = ()
     collision_s: float | None = None
 
+    @property
+    def begin_s(self) -> float:
+        """Return when it is first warned of, or the collision."""
+        return min([a for a, _ in self.spans_s] + ([] if self.collision_s is None else [self.collision_s]))
+
     @classmethod
     def from_dict(cls, entry: Mapping[str, Any]) -> Self:
         """Build a warning from its entry in a document."""
@@ -87,33 +92,37 @@ class Warnings:
         Whose observations count: "vehicle", "road" or "both".
     tells_ends : bool
         Whether the scenario says which end observed its agents; else what it observed counts.
-    horizon_s, min_probability, reaction_s, brake_mps2 : float
+    horizon_s, min_probability, early_probability, margin_s, reaction_s, brake_mps2 : float
         As in `WarningSettings`.
     driven_s : float, s
         For how long the ego moved.
-    events : tuple of Warning
+    events : tuple of CollisionWarning
     """
 
     ends: str
     tells_ends: bool
     horizon_s: float
     min_probability: float
+    early_probability: float
+    margin_s: float
     reaction_s: float
     brake_mps2: float
     driven_s: float
-    events: tuple[Warning, ...] = ()
+    events: tuple[CollisionWarning, ...] = ()
 
-    def of(self, agent: str) -> Warning | None:
+    def of(self, agent: str) -> CollisionWarning | None:
         """Return the warning of an agent; None without."""
         return next((w for w in self.events if w.agent == agent), None)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry `warnings` of `schemas/replay-1.json`."""
         plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "events"}
-        events = [{**asdict(w), "known_by": dict(w.known_by), "spans_s": [list(s) for s in w.spans_s]} for w in self.events]
+        events = [
+            {**asdict(w), "known_by": dict(w.known_by), "spans_s": [list(s) for s in w.spans_s]} for w in self.events
+        ]
         return {**plain, "events": events}
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Self:
         """Build warnings from an entry that keeps the schema."""
-        return cls(**{**document, "events": tuple(Warning.from_dict(e) for e in document["events"])})
+        return cls(**{**document, "events": tuple(CollisionWarning.from_dict(e) for e in document["events"])})

@@ -25,6 +25,9 @@ MAX_SLOPE = 0.06
 SPARE_MPS = 5.0
 """By so much an agent may become faster within the horizon, and be compared with the ego still."""
 
+MIN_EGO_MPS = 1.0
+"""A slower ego stands within a meter whenever it has to, so that it need not be warned."""
+
 Index = NDArray[np.intp]
 
 
@@ -40,6 +43,8 @@ class Courses(NamedTuple):
         Time to the collision.
     way_m : (C,) float64, m
         Of the ego until then.
+    due : (C,) bool
+        Whether the ego has to be warned: the collision is probable enough and near enough.
     """
 
     agent: Index
@@ -47,6 +52,7 @@ class Courses(NamedTuple):
     probability: Array
     ttc_s: Array
     way_m: Array
+    due: NDArray[np.bool_]
 
 
 class Watch:
@@ -93,7 +99,7 @@ class Watch:
             what is expected in the table, as much faster as they are. NaN for those that are as in the table.
         """
         row, agent = np.nonzero(self.known.source[:, ticks].T >= 0)
-        kept = np.abs(ego.speed_mps[row]) >= STANDSTILL_MPS
+        kept = np.abs(ego.speed_mps[row]) >= MIN_EGO_MPS
         row, agent = row[kept], agent[kept]
         kept = self._may_meet(ego.take(row), agent, ticks[row])
         row, agent = row[kept], agent[kept]
@@ -104,9 +110,12 @@ class Watch:
         lead_s = self._expected.lead_s
         own = self.ego_way.at(ego.take(row), lead_s)
         found = expected_contacts(own, others, lead_s)
-        gone = np.concatenate([np.zeros((len(row), 1)), np.cumsum(np.abs(np.diff(own.position_m, axis=1)), axis=1)], axis=1)
+        gone = np.concatenate(
+            [np.zeros((len(row), 1)), np.cumsum(np.abs(np.diff(own.position_m, axis=1)), axis=1)], axis=1
+        )
         way = np.array([np.interp(t, lead_s, w) if np.isfinite(t) else np.inf for t, w in zip(found.time_s, gone)])
-        return Courses(agent, row, found.probability, found.time_s, way)
+        due = self.settings.is_due(found.probability, way, ego.speed_mps[row])
+        return Courses(agent, row, found.probability, found.time_s, way, due)
 
     def _may_meet(self, ego: EgoStates, agent: Index, tick: Index) -> NDArray[np.bool_]:
         """Whether agents (C,) are within reach of the ego, and at a height of its path."""
@@ -118,7 +127,9 @@ class Watch:
         reach = np.abs(ego.speed_mps) * self.settings.horizon_s + (speed + SPARE_MPS) * ahead_s
         near = np.flatnonzero(apart <= reach + np.hypot(*size[:2]) / 2 + self._radius_m[agent])
         path_z = self.ego_way.heights(ego.progress_m[near], apart[near])
-        z = np.array([self.table.agents[k].trajectory.heights(self.table.t_s[[n]])[0] for k, n in zip(agent[near], source[near])])
+        z = np.array(
+            [self.table.agents[k].trajectory.heights(self.table.t_s[[n]])[0] for k, n in zip(agent[near], source[near])]
+        )
         room = (self._height_m[agent[near]] + size[2]) / 2 + MAX_SLOPE * apart[near]
         meets = np.zeros(len(agent), dtype=bool)
         meets[near] = np.abs(path_z - z.reshape(-1, 1)).min(axis=1) < room if len(near) else False

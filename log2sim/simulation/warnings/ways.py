@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,8 +85,8 @@ class ExpectedAgents:
         self._mover = np.full(len(table.agents), -1, dtype=np.intp)
         self._mover[movers] = np.arange(len(movers))
         seen = _observed_table(table, known, movers)
-        self._far_s = np.arange(1, int(np.ceil((horizon_s + CONFIRMED_AGE_S) / LEAD_STEP_S)) + 1) * LEAD_STEP_S
-        found = predict_table(seen, self._far_s, (DEFAULT_METHOD,))
+        count = int(np.ceil((horizon_s + CONFIRMED_AGE_S) / LEAD_STEP_S))
+        found = predict_table(seen, np.linspace(LEAD_STEP_S, count * LEAD_STEP_S, count), (DEFAULT_METHOD,))
         self._forecast = found.forecasts[DEFAULT_METHOD]
         self._row = np.full(seen.piece.shape, -1, dtype=np.intp)
         self._row[found.row, found.tick] = np.arange(len(found.row))
@@ -146,11 +147,11 @@ def _observed_table(table: MotionTable, known: Known, rows: Index) -> MotionTabl
 
 
 def _numbered(jumps: Index, pieces: Index) -> Index:
-    """Number what both piece numbers (A, T) tell apart."""
+    """Return numbers (A, T) that differ where either piece number does."""
     return np.asarray(pieces * (int(jumps.max(initial=0)) + 1) + np.maximum(jumps, 0))
 
 
-def _at_leads(values: NDArray[np.generic], lead_s: Array) -> NDArray[np.generic]:
+def _at_leads(values: NDArray[Any], lead_s: Array) -> NDArray[Any]:
     """Interpolate values (C, K, ...) that are `LEAD_STEP_S` apart, the first at 0, at leads (C, H)."""
     place = np.minimum(lead_s / LEAD_STEP_S, values.shape[1] - 1.0)
     k = np.minimum(place.astype(np.intp), values.shape[1] - 2)

@@ -1,0 +1,82 @@
+"""How often the ego is warned in ordinary traffic, where nobody collides: warnings per minute of driving.
+
+    python tools/bench_warnings.py SCENARIO.json|SCENE.toml|LOG ... [--seeds 2] [--ends both]
+
+Logs are taken by their labels. The second opinion is that of the replay's conflict metrics, which know where everybody goes: the
+least time to collision at constant velocity of the ego and the agent, and the least post-encroachment time. A warning without
+either below the limits is counted as false.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+from log2sim.cli.truth import truth_at
+from log2sim.datatypes import EGO, Scenario
+from log2sim.simulation.runner import replay
+from log2sim.simulation.warnings.warn import warn
+
+# A driver who has to react within 1.5 s, or passes within 1 s of another, is in a conflict (Hyden 1987; Allen et al. 1978).
+CONFLICT_TTC_S, CONFLICT_PET_S = 1.5, 1.0
+
+
+def main() -> None:
+    """Print a line for each scenario and warning."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("paths", nargs="+", type=Path)
+    parser.add_argument("--seeds", type=int, default=1, help="of random scenes")
+    parser.add_argument("--ends", default="both")
+    asked = parser.parse_args()
+    driven_s, counts = 0.0, [0, 0]
+    for name, scenario in (found for path in asked.paths for found in scenarios(path, asked.seeds)):
+        if scenario.ego is None:
+            print(f"{name:40} no ego")
+            continue
+        result = replay(scenario, mode="exact", dt_s=0.05)
+        found = warn(scenario, result, ends=asked.ends)
+        warned = [w for w in found.events if w.warned is not None]
+        driven_s += found.driven_s
+        print(f"{name:40} {found.driven_s:6.1f} s driven, {len(warned)} warnings")
+        for w in warned:
+            ttc_s, pet_s = near_misses(result, w.agent)
+            true = w.collision_s is not None or ttc_s <= CONFLICT_TTC_S or pet_s <= CONFLICT_PET_S
+            counts[true] += 1
+            print(
+                f"  {w.agent:24} {w.category:10} at {w.warned.t_s:6.1f} s for "
+                f"{sum(b - a for a, b in w.spans_s) + 0.1:4.1f} s, p {w.probability:.2f}, ttc {w.ttc_s:4.2f} s, "
+                f"gap {w.warned.distance_m:5.1f} m, ego {w.warned.ego_speed_mps:4.1f} m/s; least ttc {ttc_s:5.2f} s, "
+                f"pet {pet_s:5.2f} s, {'conflict' if true else 'false'}"
+            )
+    minutes = driven_s / 60
+    print(
+        f"{driven_s:.0f} s driven: {sum(counts)} warnings, {sum(counts) / minutes:.2f} a minute; "
+        f"{counts[0]} of them false, {counts[0] / minutes:.2f} a minute"
+    )
+
+
+def scenarios(path: Path, seeds: int) -> Iterator[tuple[str, Scenario]]:
+    """Yield the scenarios that a path stands for."""
+    if path.suffix == ".json":
+        yield path.parent.name + "/" + path.name, Scenario.load(path)
+    elif path.suffix == ".toml":
+        from log2sim.synth.scene import load_scene
+        from log2sim.synth.synthesis import synthesize
+
+        for seed in range(seeds):
+            yield f"{path.stem}, seed {seed}", synthesize(load_scene(path), seed=seed, observe=False)[1]
+    else:
+        yield path.name, truth_at(path, None, None)
+
+
+def near_misses(result: object, agent: str) -> tuple[float, float]:
+    """Least time to collision and post-encroachment time of the ego and an agent, s; infinite without."""
+    for entry in result.metrics["conflicts"]:
+        if {EGO, agent} == set(entry["agents"]):
+            return tuple(float("inf") if entry[k] is None else entry[k] for k in ("min_ttc_s", "pet_s"))
+    return float("inf"), float("inf")
+
+
+if __name__ == "__main__":
+    main()
