@@ -6,8 +6,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from log2sim.config import Config
+from log2sim.cooperation.estimate import Sight, estimate_error, look_around
+from log2sim.cooperation.findings import Findings
+from log2sim.cooperation.free_space import look_through
+from log2sim.cooperation.units import Unit, correct_unit, units_of
 from log2sim.datatypes import Fault, Log
+from log2sim.geometry import Array
+from log2sim.localization.ego_sweeps import lidars_on_ego
 from log2sim.sensors import Sensors
 
 Progress = Callable[[str, int, int], None]
@@ -44,5 +52,35 @@ def register_road(log: Log, config: Config, sensors: Sensors, *, progress: Progr
         Those that the run uses.
     progress : callable
         Called as `progress(stage, done, total)`.
+
+    Notes
+    -----
+    The ego's poses and its clock are the reference. Nothing is read of a log without LiDARs at both ends.
     """
-    return RoadRegistration(log)
+    used = sensors.restrict(log)
+    at_road = [n for n, lidar in used.lidars.items() if lidar.mount == "map" and len(log.streams[n].t_ns)]
+    if not config.cooperation.register_road or log.ego is None or not at_road or not lidars_on_ego(used):
+        return RoadRegistration(log)
+    faults: list[Fault] = []
+    figures = []
+    for unit in units_of(used, at_road):
+        findings = _check_unit(used, config, unit, progress)
+        log = (
+            correct_unit(log, unit, findings.correction, float(findings.applied[-1])) if findings.applied.any() else log
+        )
+        faults += findings.faults()
+        figures.append(findings.to_dict())
+    return RoadRegistration(log, tuple(faults), figures)
+
+
+def _check_unit(log: Log, config: Config, unit: Unit, progress: Progress) -> Findings:
+    """Estimate what a unit lacks, and look whether what it sees can be there."""
+    sight = look_around(log, config, unit, lambda done, total: progress(f"register {unit.lidars[0]}", done, total))
+    found = estimate_error(sight)
+    return Findings(unit, found, (_visibility(sight, np.eye(4)), _visibility(sight, found.correction)))
+
+
+def _visibility(sight: Sight, correction: Array) -> Any:
+    if sight.view is None:
+        return None
+    return look_through(sight.view, sight.road_m @ correction[:3, :3].T + correction[:3, 3])

@@ -1,0 +1,61 @@
+"""Poses and clocks of roadside units, disturbed in worlds with exact truth, are found, told and corrected; nothing else is."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
+from registration_worlds import World, WorldSpec, disturbed, draw_world, errors_of
+
+from log2sim.config import Config
+from log2sim.cooperation.registration import RoadRegistration, register_road
+from log2sim.datatypes import Log
+from log2sim.sensors import choose_detector, select_sensors
+
+POLE = "pole0"
+
+
+@pytest.fixture(scope="module")
+def street() -> World:
+    """A street with buildings, moving traffic, and a LiDAR of 16 lines on a pole."""
+    return draw_world(WorldSpec(kind="street", seed=0, azimuth_step_deg=0.8, duration_s=3.0))
+
+
+def register(log: Log, **asked: object) -> RoadRegistration:
+    config = choose_detector(log, Config().changed(cooperation=asked) if asked else Config())
+    return register_road(log, config, select_sensors(log, config), progress=lambda *_: None)
+
+
+def test_a_pole_that_is_moved_turned_and_late_is_put_right(street: World) -> None:
+    bad = disturbed(street.log, POLE, 0.5, 2.0, 0.2, np.random.default_rng(0))
+    found = register(bad)
+    away_m, turned_deg, late_s = errors_of(found.log, street.log, POLE)
+    assert away_m < 0.1
+    assert turned_deg < 0.3
+    assert abs(late_s) < 0.02
+    assert [fault.kind for fault in found.faults] == ["road_pose", "road_clock"]
+    assert found.figures[0]["treatment"] == "corrected"
+
+
+def test_a_healthy_log_comes_out_as_it_is(street: World) -> None:
+    found = register(street.log)
+    assert found.log is street.log
+    assert found.faults == ()
+    assert found.figures[0]["verified"]
+
+
+def test_a_pose_that_contradicts_what_the_vehicle_sees_is_left_out(street: World) -> None:
+    found = register(disturbed(street.log, POLE, 12.0, 40.0, 0.0, np.random.default_rng(0)))
+    assert [(fault.kind, fault.sensor, fault.treatment) for fault in found.faults] == [
+        ("wrong_road_pose", POLE, "left_out")
+    ]
+
+
+def test_nothing_is_read_of_a_log_with_one_end(street: World) -> None:
+    vehicle_alone = street.log.changed(lidars={"vehicle": street.log.lidars["vehicle"]}, streams={})
+    assert register(vehicle_alone).log is vehicle_alone
+    assert register(street.log, register_road=False).figures == []
