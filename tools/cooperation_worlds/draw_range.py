@@ -1,0 +1,120 @@
+"""Test A: a car comes around a curve; the ego's LiDAR ends at 20 m, the one at the curve at 40 m.
+
+Frame: the ego drives along x toward a curve that begins at x = 0; right-hand traffic.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cooperation_worlds.builder import MAX_TRIES, ROAD_RANGE_M, Builder
+from cooperation_worlds.line_of_sight import visible_share
+from cooperation_worlds.world import ROAD_LIDAR, Array, World
+
+MAX_DURATION_S, STEP_S = 5.0, 0.1
+FROM_M, TO_M = 46.0, 13.0  # distances between ego and target that a variant covers, from 46 m or more to 13 m or less
+
+
+def draw_range(seed: int) -> World:
+    """Draw a variant that keeps what the test promises."""
+    for attempt in range(MAX_TRIES):
+        world = _drawn(seed, np.random.default_rng([seed, 1, attempt]))
+        if world is not None and keeps_promise(world):
+            return world
+    raise RuntimeError(f"range, seed {seed}: no variant within {MAX_TRIES} tries keeps the distances")
+
+
+def distances_m(world: World, t_s: Array) -> Array:
+    """Distances (T,) between the centers of the ego and the target."""
+    moving = world.moving
+    target = next(a for a in moving.actors if a.spec.id == world.target)
+    assert moving.ego_body is not None
+    return np.linalg.norm((target.at(t_s).center_m - moving.ego_body.at(t_s).center_m)[:, :2], axis=1)
+
+
+def keeps_promise(world: World) -> bool:
+    """Return whether the pole sees the target wherever it is 15 to 40 m from the ego."""
+    t_s = np.arange(0, world.scene.duration_s + 1e-9, STEP_S)
+    away = distances_m(world, t_s)
+    between = (away > 15) & (away < 40)
+    share = visible_share(world, ROAD_LIDAR, t_s[between])
+    return bool(away[0] >= FROM_M and away[-1] <= TO_M and between.sum() >= 10 and (share > 0.3).all())
+
+
+def _drawn(seed: int, rng: np.random.Generator) -> World | None:
+    out = Builder("range", seed, rng)
+    lane, radius = float(rng.uniform(3.0, 3.6)), float(rng.uniform(18, 70))
+    turn = float(rng.choice([-1, 1])) * min(float(rng.uniform(0.5, 1.6)), 60 / radius)
+    line = _line(radius, turn)
+    out.roads = [{"line": line[::5].tolist(), "width_m": round(2 * lane, 2)}]
+    ego_mps, target_mps = float(rng.uniform(3.0, 7.0)), float(rng.uniform(3.0, 7.0))
+    out.drive_ego(_lane(line, -lane / 2, ego_mps, _at(line, float(rng.uniform(-32, -8)))))
+    out.ego["rounding_m"] = 8.0
+    coming = _lane(line, lane / 2, target_mps, 0)[::-1]
+    shape = out.draw_shape("car")
+    # The distance along the road shrinks at both speeds; a chord is shorter than its arc.
+    start = _first_beyond(coming, np.array(out.ego["waypoints"])[0, :2], FROM_M + float(rng.uniform(1.0, 4.0)))
+    if start is None:
+        return None
+    out.add("target", shape, "car", waypoints=coming[start:], rounding_m=8.0)
+    duration = min(MAX_DURATION_S, round((FROM_M + 6 - TO_M + 5) / (ego_mps + target_mps) + 0.4, 1))
+    s_pole = _at(line, float(rng.uniform(-4, 14)))
+    side = float(rng.choice([-1, 1]))
+    pole = _beside(line, s_pole, side * (lane + float(rng.uniform(0.6, 3.0))))
+    _others(out, line, lane)
+    out.scatter(line[30:130], lane + 3.4)
+    out.add_sensors(pole.tolist(), line[min(s_pole + 12, len(line) - 1)].tolist())
+    return out.world(duration, "target")
+
+
+def _line(radius: float, turn: float) -> Array:
+    """Center line at every meter: 70 m straight, an arc that turns by an angle, and straight on."""
+    arc = max(int(radius * abs(turn)), 1)
+    bend = np.concatenate([np.zeros(70), np.full(arc, turn / arc), np.zeros(max(130 - arc, 30))])
+    yaw = np.concatenate([[0.0], np.cumsum(bend)[:-1]])
+    steps = np.column_stack([np.cos(yaw), np.sin(yaw)])
+    begin = np.array([-70.0, 0.0])
+    return begin + np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])
+
+
+def _at(line: Array, s: float) -> int:
+    return int(np.clip(round(70 + s), 0, len(line) - 2))
+
+
+def _beside(line: Array, index: int, offset: float) -> Array:
+    d = line[index + 1] - line[index]
+    return np.asarray(line[index] + offset * np.array([-d[1], d[0]]))
+
+
+def _lane(line: Array, offset: float, speed: float, start: int) -> Array:
+    """Waypoints (W, 3) every 4 m along a line with an offset to its left."""
+    xy = np.array([_beside(line, k, offset) for k in range(start, len(line) - 1, 4)])
+    return np.column_stack([xy, np.full(len(xy), speed)])
+
+
+def _first_beyond(coming: Array, ego: Array, away_m: float) -> int | None:
+    """Return the waypoint of who comes that is the last beyond a distance from the ego."""
+    distance = np.linalg.norm(coming[:, :2] - ego, axis=1)
+    beyond = np.flatnonzero(distance >= away_m)
+    index = int(beyond[-1]) if len(beyond) else None
+    return index if index is not None and distance[index] < ROAD_RANGE_M + 15 and index + 3 < len(coming) else None
+
+
+def _others(out: Builder, line: Array, lane: float) -> None:
+    """Park cars beside the straight part, let people walk there, and put a house on a side."""
+    rng = out.rng
+    for k in range(int(rng.integers(0, 4))):
+        car = out.draw_shape("car")
+        side = float(rng.choice([-1, 1]))
+        at = _beside(line, _at(line, float(rng.uniform(-30, -2))) + k, side * (lane + 0.2 + car[0][1] / 2))
+        if all(np.linalg.norm(at - a["pose"][:2]) > 7 for a in out.agents if "pose" in a):
+            out.add(f"parked_{k}", car, "car", pose=[*at.tolist(), 0.0])
+    for k in range(int(rng.integers(0, 3))):
+        side, first = float(rng.choice([-1, 1])), _at(line, float(rng.uniform(-25, 10)))
+        xy = np.array([_beside(line, first + j, side * (lane + 2.6)) for j in (0, 12)])
+        rows = np.column_stack([xy, [1.3, 1.3]]).tolist()
+        out.add(f"walker_{k}", out.draw_shape("pedestrian"), "pedestrian", waypoints=rows)
+    if rng.random() < 0.6:
+        side = float(rng.choice([-1, 1]))
+        size = [float(rng.uniform(10, 30)), 8.0, float(rng.uniform(5, 12))]
+        out.houses.append({"center": [-25.0, side * (lane + 10)], "size_m": size})

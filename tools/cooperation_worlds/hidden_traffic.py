@@ -1,0 +1,261 @@
+"""Random traffic around a vehicle with a LiDAR and a pole with another: what hides from one is often seen by the other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cooperation_worlds.builder import ROAD_LINES
+from cooperation_worlds.world import ROAD_LIDAR, VEHICLE_LIDAR, Array, Parts
+from log2sim.datatypes import GROUP_OF, Boxes3D, EgoVehicle, Lidar, Log, Stream, Sweep
+from log2sim.evaluation.detection.boxes import SceneBoxes
+from log2sim.evaluation.detection.matching import Criterion
+from log2sim.evaluation.detection.precision import average_precision
+from log2sim.geometry import NS_PER_S, PoseTrack, inverse, rotation_from_rpy, transform
+from log2sim.synth.lidar_models import LIDAR_MODELS, LidarModel
+from log2sim.synth.polytope_caster import Returns, cast_polytopes
+from log2sim.synth.polytope_hits import SensorState, Solid
+from log2sim.synth.returns import Weather
+from log2sim.synth.traffic import TrafficScene
+from log2sim.synth.traffic_log import REAR_AXLE_OFFSET_M, REAR_AXLE_TO_LIDAR_M, START_NS
+from log2sim.synth.traffic_motion import TrafficRun, run_of
+from log2sim.synth.traffic_random import draw_scene
+from log2sim.synth.traffic_vehicles import car
+
+VEHICLE_MODELS = ("hdl64e", "pandar64", "os1-64", "vlp32c")
+SWEEPS, PERIOD_S = 3, 0.1
+POLE_HEIGHTS_M = (3.0, 6.0)
+REACH_M = 50.0  # of the ego, within which road users count
+MIN_POINTS = 5  # of both ends together, as labels of both clouds need
+IOU = 0.5
+# Of the counted vehicles, of which there are some, the share that hides from the vehicle.
+MIN_HIDDEN_SHARE, MIN_COUNTED, MAX_TRIES = 0.2, 5, 200
+KINDS = ("vehicle", "car", "pedestrian", "two_wheeler")
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenTraffic:
+    """A random scene with sensors at both ends.
+
+    Attributes
+    ----------
+    seed : int
+    run : TrafficRun
+    pole : LidarModel
+    place : SensorState
+        Of the pole's LiDAR.
+    ego_parts, ego_size : shape of the ego, as the pole sees it.
+    late_s : float
+        Of the pole's sweeps after those of the vehicle.
+    """
+
+    seed: int
+    run: TrafficRun
+    pole: LidarModel
+    place: SensorState
+    ego_parts: Parts
+    ego_size: tuple[float, float, float]
+    late_s: float
+
+    def vehicle_returns(self, t_s: float, index: int) -> Returns:
+        """Cast the vehicle's sweep whose middle is at a time."""
+        return self.run.at(t_s).cast(np.random.default_rng([self.seed, 4, index]))
+
+    def road_returns(self, t_s: float, index: int) -> Returns:
+        """Cast the pole's sweep; the ego is the last of the objects."""
+        scene, rng = self.run.at(t_s), np.random.default_rng([self.seed, 7, index])
+        solids = [_solid(o.parts, o.position_m, o.yaw_rad, o.speed_mps) for o in scene.objects if o.kind != "own car"]
+        ahead = scene.sensor.rotation[:2, 0] / np.hypot(*scene.sensor.rotation[:2, 0])
+        middle = scene.sensor.position_m[:2] + (REAR_AXLE_OFFSET_M - REAR_AXLE_TO_LIDAR_M) * ahead
+        floor = np.append(middle, scene.surface.elevation(middle))
+        yaw = float(np.arctan2(ahead[1], ahead[0]))
+        solids.append(_solid(self.ego_parts, floor, yaw, float(np.hypot(*scene.sensor.velocity_mps))))
+        return cast_polytopes(self.pole, self.place, solids, scene.surface, rng, scene.returns)
+
+
+def _solid(parts: Parts, position: Array, yaw: float, speed: float) -> Solid:
+    return Solid(parts, position, yaw, speed * np.array([np.cos(yaw), np.sin(yaw)]))
+
+
+def draw_hidden_traffic(seed: int) -> HiddenTraffic:
+    """Draw a scene in which many vehicles hide from the LiDAR of the one that records, and a pole that may see them."""
+    for attempt in range(MAX_TRIES):
+        traffic = _drawn(seed, attempt)
+        truth, hidden = truth_at(_first_sweeps(traffic), START_NS + round(PERIOD_S * NS_PER_S), "vehicle")
+        counted = ~truth.ignored
+        if (hidden & counted).sum() >= MIN_HIDDEN_SHARE * max(counted.sum(), MIN_COUNTED):
+            return traffic
+    raise RuntimeError(f"hidden traffic, seed {seed}: none of {MAX_TRIES} scenes hides enough vehicles")
+
+
+def _drawn(seed: int, attempt: int) -> HiddenTraffic:
+    """Draw a scene and a pole beside its road, 10 to 35 m from the vehicle."""
+    rng = np.random.default_rng([seed, 11, attempt])
+    model = LIDAR_MODELS[str(rng.choice(VEHICLE_MODELS))]
+    scene = draw_scene("vehicle", np.random.default_rng([seed, 12, attempt]), lidar=model, weather=Weather())
+    road, height = scene.roads[0], float(rng.uniform(*POLE_HEIGHTS_M))
+    along, side = float(rng.choice([-1, 1], p=[0.3, 0.7])) * float(rng.uniform(10, 35)), float(rng.choice([-1, 1]))
+    # The line passes the vehicle; ahead of it is where its LiDAR looks.
+    if np.cos(road.yaw_rad - np.arctan2(scene.sensor.rotation[1, 0], scene.sensor.rotation[0, 0])) < 0:
+        along = -along
+    xy, direction = road.at(along, side * (road.half_width_m + float(rng.uniform(0.5, 3.0))))
+    lean = np.deg2rad(rng.normal(0, 0.5, 2))
+    rotation = rotation_from_rpy(lean[0], lean[1], direction + float(rng.uniform(-np.pi, np.pi)))
+    ground = scene.surface.elevation(np.append(xy, 0.0))
+    lines = int(rng.choice(ROAD_LINES))
+    pole = LidarModel(
+        name="pole",
+        elevation_deg=tuple(np.linspace(-35.0 if height > 4 else -25.0, 5.0, lines).tolist()),
+        azimuth_step_deg=0.2,
+        range_m=100.0,
+    )
+    size, parts = car(rng)
+    while size[2] > scene.sensor.position_m[2] - 0.1 or size[0] > 5.2:
+        size, parts = car(rng)
+    place = SensorState(rotation, np.array([*xy, ground + height]), np.zeros(2))
+    run = run_of(scene, SWEEPS * PERIOD_S + 0.2)
+    return HiddenTraffic(seed, run, pole, place, parts, size, float(rng.uniform(0, 0.05)))
+
+
+@dataclass(frozen=True, eq=False)
+class SeenTraffic:
+    """A log of hidden traffic, and the returns of its sweeps.
+
+    Attributes
+    ----------
+    traffic : HiddenTraffic
+    log : Log
+    returns : mapping of LiDAR to a list of Returns
+    """
+
+    traffic: HiddenTraffic
+    log: Log
+    returns: dict[str, list[Returns]]
+
+
+def seen(traffic: HiddenTraffic) -> SeenTraffic:
+    """Cast all sweeps and make the log."""
+    middles = PERIOD_S * (np.arange(SWEEPS) + 0.5)
+    returns = {
+        VEHICLE_LIDAR: [traffic.vehicle_returns(float(t), i) for i, t in enumerate(middles)],
+        ROAD_LIDAR: [traffic.road_returns(float(t), i) for i, t in enumerate(middles + traffic.late_s)],
+    }
+    scene = traffic.run.scene
+    ego_T_lidar = transform(np.eye(3), np.array([REAR_AXLE_TO_LIDAR_M, 0.0, float(scene.sensor.position_m[2])]))
+    map_T_pole = transform(traffic.place.rotation, traffic.place.position_m)
+    stamps = {VEHICLE_LIDAR: _stamps(middles), ROAD_LIDAR: _stamps(middles + traffic.late_s)}
+    streams = {}
+    for name, all_returns in returns.items():
+        sweeps = []
+        for middle, r in zip(stamps[name], all_returns):
+            xyz, frame = (r.xyz_m, "map") if name == VEHICLE_LIDAR else (_local(r.xyz_m, map_T_pole), "lidar")
+            t_ns = middle + np.rint(r.t_s.astype(np.float64) * NS_PER_S).astype(np.int64)
+            sweeps.append(Sweep(int(middle + PERIOD_S / 2 * NS_PER_S), xyz, frame, t_ns))  # type: ignore[arg-type]
+        streams[name] = Stream(name, np.array([s.stamp_ns for s in sweeps]), sweeps.__getitem__)
+    t_s = np.arange(-0.1, SWEEPS * PERIOD_S + 0.2, 0.02)
+    poses = np.array([_map_T_lidar(traffic.run.at(float(t))) @ inverse(ego_T_lidar) for t in t_s])
+    log = Log(
+        name=f"hidden_traffic_{traffic.seed}",
+        format="synthetic",
+        cameras={},
+        lidars={
+            VEHICLE_LIDAR: Lidar(VEHICLE_LIDAR, "ego", ego_T_lidar),
+            ROAD_LIDAR: Lidar(ROAD_LIDAR, "map", map_T_pole),
+        },
+        streams=streams,
+        ego=PoseTrack(_stamps(t_s), poses),
+        ego_vehicle=EgoVehicle(traffic.ego_size, REAR_AXLE_OFFSET_M),
+    )
+    return SeenTraffic(traffic, log, returns)
+
+
+def _first_sweeps(traffic: HiddenTraffic) -> SeenTraffic:
+    """Cast the first sweep of each end alone, without a log."""
+    vehicle, road = traffic.vehicle_returns(PERIOD_S / 2, 0), traffic.road_returns(PERIOD_S / 2, 0)
+    nothing = Log("", "", {}, {}, {}, None)
+    return SeenTraffic(traffic, nothing, {VEHICLE_LIDAR: [vehicle], ROAD_LIDAR: [road]})
+
+
+def _stamps(t_s: Array) -> NDArray[np.int64]:
+    return np.asarray(START_NS + np.rint(t_s * NS_PER_S).astype(np.int64))
+
+
+def _map_T_lidar(scene: TrafficScene) -> Array:
+    return transform(scene.sensor.rotation, scene.sensor.position_m)
+
+
+def _local(xyz: NDArray[np.float32], map_T_lidar: Array) -> NDArray[np.float32]:
+    return ((xyz - map_T_lidar[:3, 3]) @ map_T_lidar[:3, :3]).astype(np.float32)
+
+
+def points_of(view: SeenTraffic, name: str, index: int) -> NDArray[np.int64]:
+    """Number of points (M,) of a sweep on each object of the scene."""
+    objects = view.traffic.run.scene.objects
+    keep = [k for k, o in enumerate(objects) if name == VEHICLE_LIDAR or o.kind != "own car"]
+    hit = view.returns[name][index].hit
+    count = np.bincount(hit[(hit >= 0) & (hit < len(keep))], minlength=len(keep))
+    out = np.zeros(len(objects), np.int64)
+    out[keep] = count[: len(keep)]
+    return out
+
+
+def truth_at(view: SeenTraffic, stamp_ns: int, kind: str) -> tuple[SceneBoxes, NDArray[np.bool_]]:
+    """True boxes of a kind at the middle of a sweep that ends at a stamp, and which of them hide from the vehicle."""
+    middle_s = (stamp_ns - START_NS) / NS_PER_S - PERIOD_S / 2
+    index = int(np.clip(np.floor(middle_s / PERIOD_S), 0, SWEEPS - 1))
+    scene = view.traffic.run.at(middle_s)
+    vehicle, road = (points_of(view, name, index) for name in (VEHICLE_LIDAR, ROAD_LIDAR))
+    rows = [k for k, o in enumerate(scene.objects) if _is(o.category, kind)]
+    boxes = np.array(
+        [_box(scene.objects[k].position_m, scene.objects[k].size_m, scene.objects[k].yaw_rad) for k in rows]
+    )
+    boxes = boxes.reshape(-1, 7)
+    ego = _ego_xy(scene)
+    away = np.hypot(*(boxes[:, :2] - ego).T)
+    few = (vehicle + road)[rows] < MIN_POINTS
+    return SceneBoxes.of(boxes, range_m=away, ignored=few | (away > REACH_M)), vehicle[rows] < MIN_POINTS
+
+
+def found_at(view: SeenTraffic, stamp_ns: int, found: Boxes3D, kind: str) -> SceneBoxes:
+    """Found boxes of a kind, each moved with the object that it is nearest to from its own time to the middle of the sweep."""
+    middle_s = (stamp_ns - START_NS) / NS_PER_S - PERIOD_S / 2
+    now = view.traffic.run.at(middle_s)
+    users = [k for k, o in enumerate(now.objects) if o.category]
+    boxes = np.column_stack([found.center_m, found.size_m, found.yaw_rad])
+    for row, t_ns in enumerate(found.t_ns):
+        then = _at(view.traffic.run, (int(t_ns) - START_NS) / NS_PER_S)
+        if users:
+            k = min(users, key=lambda k: float(np.hypot(*(then.objects[k].position_m - boxes[row, :3])[:2])))
+            boxes[row, :3] += now.objects[k].position_m - then.objects[k].position_m
+    ego = _ego_xy(now)
+    away = np.hypot(*(boxes[:, :2] - ego).T)
+    # The pole sees the ego, which is no other road user; far ones do not count.
+    kept = np.array([_is(c, kind) for c in found.category], bool) & (away < REACH_M) & (away > 1.5)
+    return SceneBoxes.of(boxes[kept], found.category[kept], found.score[kept], range_m=away[kept])
+
+
+def average_precisions(views: list[tuple[SceneBoxes, SceneBoxes]]) -> float | None:
+    """AP BEV .5 (R40) of pairs of found and true boxes of one way and kind."""
+    found, truth = (SceneBoxes.join([v[side] for v in views]) for side in (0, 1))
+    return average_precision(found, truth, Criterion("iou_bev", IOU))
+
+
+@cache
+def _at(run: TrafficRun, t_s: float) -> TrafficScene:
+    return run.at(t_s)
+
+
+def _is(category: str, kind: str) -> bool:
+    return bool(category) and (category == kind or GROUP_OF.get(category) == kind)
+
+
+def _box(position: Array, size: tuple[float, float, float], yaw: float) -> Array:
+    return np.array([*position[:2], position[2] + size[2] / 2, *size, yaw])
+
+
+def _ego_xy(scene: TrafficScene) -> Array:
+    ahead = scene.sensor.rotation[:2, 0] / np.hypot(*scene.sensor.rotation[:2, 0])
+    return np.asarray(scene.sensor.position_m[:2] + (REAR_AXLE_OFFSET_M - REAR_AXLE_TO_LIDAR_M) * ahead)

@@ -1,0 +1,76 @@
+"""What each end makes of a log alone, and both together at each level of fusion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cooperation_worlds.world import Array
+from log2sim.config import Config
+from log2sim.datatypes import GROUP_OF, Agent, Boxes3D, Log, Scenario
+from log2sim.errors import NothingToReconstruct
+from log2sim.evaluation.detection.detect_log import detect_log
+from log2sim.pipeline import reconstruct
+
+ALONE = ("vehicle", "road")
+LEVELS = ("points", "boxes", "tracks")
+WAYS = (*ALONE, *LEVELS)
+DETECTOR = {"vehicle": "lidar:vehicle", "road": "lidar:roadside"}
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What one way of perceiving made of a log.
+
+    Attributes
+    ----------
+    scenario : Scenario or None
+        None where nothing was found.
+    report : dict
+    """
+
+    scenario: Scenario | None
+    report: dict[str, Any]
+
+
+def settings(way: str, *, register: bool, **more: Any) -> Config:
+    """Settings of a way: an end alone, or a level of fusion."""
+    ends, fusion = (way, "points") if way in ALONE else ("both", way)
+    cooperation = {"ends": ends, "fusion": fusion, "register_road": register}
+    return Config.load(None, (), cooperation=cooperation, **more)
+
+
+def perceive(log: Log, way: str, *, register: bool = True) -> Found:
+    """Reconstruct the scenario of a log in one way."""
+    try:
+        result = reconstruct(log, settings(way, register=register))
+    except NothingToReconstruct:
+        return Found(None, {})
+    return Found(result.scenario, result.report)
+
+
+def detect(log: Log, way: str, *, register: bool = True, min_score: float = 0.05) -> tuple[Array, tuple[Boxes3D, ...]]:
+    """Detect boxes in the sweeps of a log in one way: middles of the sweeps in s, and the boxes of each.
+
+    The networks' scores are calibrated probabilities; those below `min_score` are left out.
+    """
+    detector = DETECTOR.get(way, "lidar:vehicle")
+    config = settings(way, register=register, detect={"name": detector}, lidar={"min_score": min_score})
+    found = detect_log(log, config).found
+    return found.t_ns, found.boxes
+
+
+def agents_near(scenario: Scenario | None, category: str) -> list[Agent]:
+    """Agents of the group of a category, without the ego."""
+    agents = () if scenario is None else scenario.agents
+    return [a for a in agents if a.id != "ego" and GROUP_OF[a.category] == GROUP_OF[category]]
+
+
+def at(agent: Agent, t_s: Array) -> tuple[Array, np.ndarray]:
+    """x, y, yaw (T, 3) of an agent at times, and which of them it was there, by interpolation between its waypoints."""
+    w = agent.waypoints
+    there = (t_s >= w.t_s[0] - 0.06) & (t_s <= w.t_s[-1] + 0.06)
+    yaw = np.interp(t_s, w.t_s, np.unwrap(w.yaw_rad))
+    return np.column_stack([np.interp(t_s, w.t_s, w.x_m), np.interp(t_s, w.t_s, w.y_m), yaw]), there
