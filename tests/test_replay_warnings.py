@@ -228,7 +228,7 @@ def test_the_file_holds_the_warnings(tmp_path: Path) -> None:
     assert ran.code == 0
     out = ran.out
     assert "1 warning in 14.1 s of driving, by the sensors of vehicle and road" in out
-    assert "by the road alone at 3.20 s, by the vehicle alone at 6.20 s" in out
+    assert "(to the road alone from 3.20 s; to the vehicle alone from 6.20 s)" in out
     loaded = Replay.load(files[1])
     assert loaded.warnings == warn(scene, loaded)
     assert "warnings" not in json.loads((SAMPLE.parent / "truth.json").read_text(encoding="utf-8"))

@@ -11,44 +11,62 @@ _ENDS = {"vehicle": "the vehicle's sensors", "road": "the road's sensors", "both
 
 def describe_warnings(warnings: Warnings) -> str:
     """Say how many warnings there are, and describe the first ones."""
-    warned = [w for w in warnings.events if w.warned is not None]
     whose = (
         _ENDS[warnings.ends] if warnings.tells_ends else "all sensors, which the scenario does not tell apart by end"
     )
-    count = f"{len(warned) or 'no'} warning{'s' * (len(warned) != 1)}"
-    lines = [f"{count} in {warnings.driven_s:.1f} s of driving, by {whose}"]
+    lines = [f"{count_warnings(warnings)} in {warnings.driven_s:.1f} s of driving, by {whose}"]
     lines += [f"  {describe_warning(w, warnings)}" for w in warnings.events[:MAX_LISTED]]
     if len(warnings.events) > MAX_LISTED:
         lines.append(f"  and {len(warnings.events) - MAX_LISTED} more")
     return "\n".join(lines)
 
 
+def count_warnings(warnings: Warnings) -> str:
+    """Say how many warnings there are, and how many collisions nothing was predicted of."""
+    warned = sum(w.warned is not None for w in warnings.events)
+    missed = len(warnings.events) - warned
+    text = f"{warned or 'no'} warning{'s' * (warned != 1)}"
+    return text if not missed else f"{text} and {missed} collision{'s' * (missed != 1)} without"
+
+
 def describe_warning(warning: CollisionWarning, warnings: Warnings) -> str:
     """Describe a warning: when, how soon and how far off the collision is, whether braking suffices, and since when it is known."""
-    parts = [_warned(warning, warnings), _known(warning)]
-    if warning.collision_s is not None:
+    parts = [describe_briefly(warning) + ".", _braking(warning, warnings), _known(warning)]
+    if warning.warned is not None and warning.collision_s is not None:
         parts.append(f"They collide at {warning.collision_s:.2f} s.")
-    return " ".join(parts)
+    return " ".join(part for part in parts if part)
 
 
-def _warned(warning: CollisionWarning, warnings: Warnings) -> str:
+def describe_briefly(warning: CollisionWarning) -> str:
+    """Say who is warned of, when, and how soon and how far off the collision is."""
     at = warning.warned
-    if at is None or warning.ttc_s is None or warning.way_m is None:
-        return f"{warning.agent}: no warning."
-    needs = "" if warning.needed_mps2 is None else f", for which {warning.needed_mps2:.1f} m/s2 would be needed"
-    verdict = f"braking suffices{needs}" if warning.braking_suffices else f"braking does not suffice{needs}"
+    if at is None or warning.ttc_s is None:
+        return f"{warning.agent}: no warning before the collision at {warning.begin_s:.2f} s"
     return (
         f"{warning.agent}: warning at {at.t_s:.2f} s, collision in {warning.ttc_s:.2f} s with probability "
-        f"{warning.probability:.2f}, {at.distance_m:.1f} m apart. At {at.ego_speed_mps * 3.6:.0f} km/h the ego gets there in "
-        f"{warning.way_m:.1f} m and stands after {at.stopping_m:.1f} m ({warnings.reaction_s:g} s, then "
-        f"{warnings.brake_mps2:g} m/s2): {verdict}."
+        f"{warning.probability:.2f}, {at.distance_m:.1f} m apart"
+    )
+
+
+def _braking(warning: CollisionWarning, warnings: Warnings) -> str:
+    at = warning.warned
+    if at is None or warning.way_m is None:
+        return ""
+    verdict = "braking suffices" if warning.braking_suffices else "braking comes too late"
+    needed = "" if warning.needed_mps2 is None else f", {warning.needed_mps2:.1f} m/s2 would be needed"
+    return (
+        f"The ego drives {at.ego_speed_mps * 3.6:.0f} km/h, {warning.way_m:.1f} m from the collision, and stands after "
+        f"{at.stopping_m:.1f} m ({warnings.reaction_s:g} s to react, then {warnings.brake_mps2:g} m/s2): {verdict}{needed}."
     )
 
 
 def _known(warning: CollisionWarning) -> str:
-    ends = ", ".join(
-        f"by the {end} alone at {t_s:.2f} s" for end, t_s in sorted(warning.known_by.items(), key=lambda e: e[1])
+    """Say since when the agent is known, and to which end alone."""
+    in_order = sorted(warning.known_by.items(), key=lambda e: e[1])
+    ends = "; ".join(f"to the {end} alone from {t_s:.2f} s" for end, t_s in in_order)
+    since = (
+        "Never known"
+        if warning.known is None
+        else f"Known since {warning.known.t_s:.2f} s, {warning.known.distance_m:.1f} m away"
     )
-    if warning.known is None:
-        return f"Never known by them{f'; {ends}' if ends else ''}."
-    return f"Known since {warning.known.t_s:.2f} s, {warning.known.distance_m:.1f} m away{f'; {ends}' if ends else ''}."
+    return f"{since} ({ends})." if ends else f"{since}."

@@ -65,6 +65,7 @@ def page_document(
         "origin": _origin(scenario),
         "layers": layers,
         "events": [] if replay is None else _events(replay),
+        "warnings": _warnings(replay),
     }
 
 
@@ -72,6 +73,26 @@ def _events(replay: Any) -> list[dict[str, Any]]:
     """List the collisions of a replay in order of time."""
     keys = ("t_s", "until_s", "agents", "belongs_to")
     return [{k: event[k] for k in keys} for event in replay.metrics.get("collisions", ())]
+
+
+def _warnings(replay: Any) -> dict[str, Any]:
+    """Describe the warnings of a replay, and say when they hold."""
+    from log2sim.simulation.warnings.sentences import count_warnings, describe_briefly, describe_warning
+
+    warnings = None if replay is None else replay.warnings
+    if warnings is None:
+        return {"title": "", "events": []}
+    events = [
+        {
+            "agent": w.agent,
+            "t_s": w.begin_s,
+            "spans": [list(span) for span in w.spans_s],
+            "brief": describe_briefly(w),
+            "text": describe_warning(w, warnings),
+        }
+        for w in warnings.events
+    ]
+    return {"title": count_warnings(warnings), "events": events}
 
 
 def _scenario(scenario: Scenario) -> Iterator[dict[str, Any]]:
@@ -98,6 +119,11 @@ def _trust(agent: Agent) -> dict[str, Any]:
         "confidence": round(agent.confidence, 4),
         "doubts": [[doubt.reason, doubt.start_s, doubt.end_s] for doubt in (*agent.doubts, *low)],
         "doubted": [[t if np.isfinite(t) else None for t in span] for span in shown_spans(agent)],
+        **(
+            {"observed_by": {end: spans for end, spans in agent.observed_by.items() if spans}}
+            if agent.observed_by
+            else {}
+        ),
         **({"points": round(float(points), 1)} if isinstance(points, int | float) else {}),
         **({"source": source} if source else {}),
         **{key: second_differences(column, SCALES[key]) for key, column in known.items()},

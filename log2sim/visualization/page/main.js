@@ -1,11 +1,14 @@
 // Actions of the user, and the start.
 
-const LAYER_NAMES = { scenario: "Scenario", truth: "Truth", replay: "Replay", trails: "Trails", names: "Names", predictions: "Predictions" };
+const LAYER_NAMES = { scenario: "Scenario", truth: "Truth", replay: "Replay", trails: "Trails", names: "Names", predictions: "Predictions", ends: "Ends" };
 let fitted = false;
 
 // Whether there is anything to show or hide.
-const hasLayer = (layer) =>
-  layer in { truth: 0, replay: 0 } ? data.layers[layer] !== undefined : layer !== "predictions" || tracks.some((track) => track.predicted);
+const hasLayer = (layer) => {
+  if (layer === "predictions") return tracks.some((track) => track.predicted);
+  if (layer === "ends") return tracks.some((track) => track.observedBy !== null);
+  return !(layer in { truth: 0, replay: 0 }) || data.layers[layer] !== undefined;
+};
 
 const choose = (track) => {
   state.chosen = track;
@@ -105,8 +108,8 @@ const listen = () => {
     ["f", "follow the chosen agent, else the ego", ["f"], buttons.follow],
     ["n p", "next or previous agent", ["n"], () => neighbor(1)],
     ["s t r", "scenario, truth or replay on or off", ["s"], () => toggle("scenario")],
-    ["w l d", "trails, names or predictions on or off", ["w"], () => toggle("trails")],
-    ["e", "next collision of the replay", ["e"], nextEvent],
+    ["w l d o", "trails, names, predictions or ends on or off", ["w"], () => toggle("trails")],
+    ["e", "next warning or collision of the replay", ["e"], nextEvent],
     ["a /", "list of agents, search in it", ["a"], buttons["list-toggle"]],
     ["Esc", "choose nobody", ["Escape"], () => choose(null)],
     ["?", "this list", ["?"], buttons["help-toggle"]],
@@ -114,6 +117,7 @@ const listen = () => {
     [["ArrowRight"], jump(0.1)], [["End"], () => seek(data.end)], [[">", "."], () => setRate(1)],
     [["-", "_"], () => zoom(1 / 1.25)], [["p"], () => neighbor(-1)], [["t"], () => toggle("truth")],
     [["r"], () => toggle("replay")], [["l"], () => toggle("names")], [["d"], () => toggle("predictions")],
+    [["o"], () => toggle("ends")],
     [["/"], () => byId("search").focus()],
   ]);
   listenToPointers(byId("map"), {
@@ -127,6 +131,7 @@ const listen = () => {
     applyTheme(data.layers);
     list.show();
     listDoubtful();
+    listWarnings(data.warnings, data.warned, showEvent);
     details.show();
     drawPresence();
     requestDraw();
@@ -172,6 +177,7 @@ const list = new List(tracks, { choose: chooseVisible, hover }), details = new D
 const start = () => {
   const moving = tracks.filter((track) => !track.stationary && !track.ego).length, agents = tracks.length - (ego ? 1 : 0);
   const parts = [`${(data.end - data.begin).toFixed(1)} s`, `${agents} agent${agents === 1 ? "" : "s"}, ${moving} moving`];
+  if (data.warnings.length) parts.push(data.warned);
   if (doubtful.length) parts.push(`${doubtful.length} doubtful`);
   if (!ego) parts.push("no ego");
   if (data.origin) parts.push(`origin ${data.origin}`);
@@ -187,6 +193,7 @@ const start = () => {
     byId("layers").append(button);
   }
   markEvents();
+  listWarnings(data.warnings, data.warned, showEvent);
   listDoubtful();
   setRate(0);
   showPlay();

@@ -22,7 +22,7 @@ class Painter {
   }
 
   // shown: which layers and extras; chosen, hovered: tracks of the scenario or null.
-  paint({ layers, events }, t, shown, chosen, hovered) {
+  paint({ layers, events, warnings }, t, shown, chosen, hovered) {
     const ctx = this.ctx;
     ctx.setLineDash(SOLID);
     ctx.lineJoin = "round";
@@ -35,6 +35,8 @@ class Painter {
     if (shown.truth && layers.truth) this.outlines(layers.truth, t, TRUTH_DASHES, 1.1);
     if (shown.replay && layers.replay) this.outlines(layers.replay, t, DOTTED, 1.6);
     ctx.setLineDash(SOLID);
+    if (shown.scenario && shown.ends) drawEnds(this, layers.scenario, t);
+    if (shown.replay) drawWarnings(this, warnings, t);
     if (shown.replay) this.contacts(events, t);
     if (shown.scenario && chosen && chosen.present) this.ring(chosen, theme.accent, 2);
     if (shown.scenario && hovered && hovered !== chosen && hovered.present) this.ring(hovered, theme.muted, 1.2);

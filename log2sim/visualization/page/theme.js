@@ -24,7 +24,7 @@ const css = ([r, g, b], alpha) => `rgba(${r},${g},${b},${alpha})`;
 
 const applyTheme = (layers) => {
   const style = getComputedStyle(document.documentElement);
-  for (const name of ["paper", "ground", "ink", "muted", "grid", "frame", "parked-face", "parked-edge", "accent", "alert"]) {
+  for (const name of ["paper", "ground", "ink", "muted", "grid", "frame", "parked-face", "parked-edge", "accent", "alert", "warn", "vehicle", "road"]) {
     theme[name.replace("-", "_")] = style.getPropertyValue(`--${name}`).trim();
   }
   theme.font = style.getPropertyValue("--font").trim();

@@ -36,15 +36,20 @@ const setRate = (step) => {
   byId("rate").textContent = `${state.rate}×`;
 };
 
-// When the chosen agent is present, above the slider; pale where it was not observed.
+// When the chosen agent is present, above the slider; pale where it was not observed. Below that, when each end observes it.
 const drawPresence = () => {
-  const canvas = byId("presence"), ctx = scaledContext(canvas), track = state.chosen;
+  const canvas = byId("presence");
+  canvas.classList.toggle("ends", Boolean(state.chosen?.observedBy));
+  const ctx = scaledContext(canvas), track = state.chosen;
   if (!track || !canvas.clientWidth) return;
   const sx = (t) => ((t - data.begin) / Math.max(data.end - data.begin, 1e-3)) * canvas.clientWidth;
-  const bar = (from, to, color) => {
+  const bar = (from, to, color, top = 0, height = 3) => {
     ctx.fillStyle = color;
-    ctx.fillRect(sx(from), 0, Math.max(sx(to) - sx(from), 2), canvas.clientHeight);
+    ctx.fillRect(sx(from), top, Math.max(sx(to) - sx(from), 2), height);
   };
+  ENDS.forEach((end, k) => {
+    for (const [from, to] of track.observedBy?.[end] ?? []) bar(from, to, theme[end], 4 + 3 * k, 2);
+  });
   if (track.permanent) bar(data.begin, data.end, theme.parked_edge);
   else if (track.t.length === 1) bar(track.first, track.first, track.line);
   for (let k = 0, from = 0; k + 1 < track.t.length; k++) {
@@ -54,14 +59,29 @@ const drawPresence = () => {
   }
 };
 
-// A mark below the slider for each collision of the replay, red unless the scenario has it itself.
+// Warnings and collisions in order of time.
+const marked = [...data.warnings, ...data.events].sort((a, b) => a.t_s - b.t_s);
+
+const describe = (event) => {
+  if (event.brief) return event.brief;
+  const whose = event.belongs_to === "replay" ? "" : `, in the ${event.belongs_to} itself`;
+  return `${event.agents.join(" and ")} collide at ${event.t_s.toFixed(2)} s${whose}`;
+};
+
+// Marks below the slider: for collisions of the replay, red unless the scenario has them itself, and for warnings while they last.
 const markEvents = () => {
   const whole = Math.max(data.end - data.begin, 1e-3), inset = 8;  // half the slider's knob, where its ends are
-  byId("events").append(...data.events.slice(0, MAX_MARKS).map((event) => {
-    const fresh = event.belongs_to === "replay", whose = fresh ? "" : `, in the ${event.belongs_to} itself`;
-    const what = `${event.agents.join(" and ")} collide at ${event.t_s.toFixed(2)} s${whose}`;
-    const button = element("button", { type: "button", title: what, "aria-label": what, class: fresh ? "new" : "known" });
-    button.style.left = `calc(${inset}px + (100% - ${2 * inset}px) * ${(event.t_s - data.begin) / whole})`;
+  const at = (t) => `calc(${inset}px + (100% - ${2 * inset}px) * ${(t - data.begin) / whole})`;
+  for (const [from, to] of data.warnings.flatMap((warning) => warning.spans)) {
+    const span = element("div");
+    span.style.left = at(from);
+    span.style.width = `calc((100% - ${2 * inset}px) * ${(to - from) / whole})`;
+    byId("events").append(span);
+  }
+  byId("events").append(...marked.slice(0, MAX_MARKS).map((event) => {
+    const kind = event.brief ? "warned" : event.belongs_to === "replay" ? "new" : "known", what = describe(event);
+    const button = element("button", { type: "button", title: what, "aria-label": what, class: kind });
+    button.style.left = at(event.t_s);
     button.addEventListener("click", () => showEvent(event));
     return button;
   }));
@@ -74,7 +94,7 @@ const showEvent = (event) => {
 };
 
 const nextEvent = () => {
-  const next = data.events.find((event) => event.t_s > state.t + 1e-6) ?? data.events[0];
+  const next = marked.find((event) => event.t_s > state.t + 1e-6) ?? marked[0];
   if (next) showEvent(next);
 };
 

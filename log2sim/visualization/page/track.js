@@ -41,6 +41,7 @@ class Track {
     this.points = entry.points ?? null;
     this.source = entry.source ?? null;
     this.sigmas = ["sigma_xy_m", "sigma_yaw_rad", "sigma_speed_mps"].map((key) => (entry[key] ? sums(entry[key], scales[key]) : null));
+    this.observedBy = entry.observed_by ?? null;  // end: spans in s; null where the scenario does not tell
     this.doubts = entry.doubts ?? [];  // reason, start and end in s or null
     this.doubtSpans = (entry.doubted ?? []).map(([start, end]) => [start ?? -Infinity, end ?? Infinity]);
     this.doubted = false;
@@ -142,5 +143,11 @@ const load = (text) => {
   const events = document_.events.map((event) => ({
     ...event, tracks: (layers.replay ?? []).filter((track) => event.agents.includes(track.id)),
   }));
-  return { name: document_.name, origin: document_.origin, begin: document_.begin_s, end: document_.end_s, layers, events };
+  const named = (name, id) => (layers[name] ?? []).find((track) => track.id === id) ?? null;
+  const warnings = document_.warnings.events.map((warning) => ({
+    ...warning, agents: [warning.agent], ego: layers.replay?.find((track) => track.id === "ego"),
+    track: named("replay", warning.agent), shown: named("scenario", warning.agent),
+  }));
+  const { name, origin, begin_s: begin, end_s: end } = document_;
+  return { name, origin, begin, end, layers, events, warnings, warned: document_.warnings.title };
 };

@@ -22,6 +22,8 @@ SCRIPT_FILES = (
     "track.js",
     "predicted.js",
     "theme.js",
+    "ends.js",
+    "warnings.js",
     "map.js",
     "paint.js",
     "chart.js",
