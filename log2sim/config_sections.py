@@ -160,6 +160,11 @@ class CooperationConfig(Section):
     register_road: bool = setting(
         True, "Whether poses and clocks of the road's sensors are checked and corrected against what the vehicle sees."
     )
+    matching: Literal["covariance", "overlap"] = setting(
+        "covariance",
+        "How boxes of the ends are joined; covariance: matched by overlap or by distance in relation to its error, each side "
+        "merged by its variance; overlap: matched by overlap and class, centers averaged (Chen).",
+    )
     road_detector: str = setting(
         "auto",
         "Detector in the road's clouds where the ends are searched separately, named as in detect.name; auto: the network that "

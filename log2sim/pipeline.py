@@ -21,24 +21,25 @@ from log2sim.agents.simplify import simplify
 from log2sim.calibration.check import check_calibration
 from log2sim.config import Config
 from log2sim.cooperation.registration import register_road
-from log2sim.datatypes import Agent, Fault, Log, Scenario, Track
+from log2sim.datatypes import ENDS, Agent, Fault, Log, Measurements, Scenario, Track
 from log2sim.errors import NothingToReconstruct
 from log2sim.localization.choice import localize
 from log2sim.localization.pose_choice import GIVEN, PoseChoice
 from log2sim.logs.time_checks import say_without_pose
 from log2sim.outcome import RunOutputs, stage_outcomes
+from log2sim.perception.cooperative.detector import create_for_ends
 from log2sim.perception.detect.detectors import Detector, create_detector
-from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector
+from log2sim.perception.detect3d.detectors import LidarDetector
 from log2sim.perception.first_pass import Observations, observe
 from log2sim.perception.fusion import fuse
 from log2sim.perception.homography_stage import estimation_options, fit_homographies, place_by_homography
 from log2sim.perception.sync import Schedule, synchronize
-from log2sim.plan import Plan, Stage, make_plan
+from log2sim.plan import FusionLevel, Plan, Stage, make_plan
 from log2sim.report import report_of
 from log2sim.sensors import Sensors, choose_detector, select_sensors
 from log2sim.stage_clock import StageClock
+from log2sim.tracking.merging import track_ends
 from log2sim.tracking.recorded import mark_unrecorded
-from log2sim.tracking.tracker import track
 
 Progress = Callable[[str, int, int], None]
 
@@ -154,7 +155,7 @@ def start(log: Log, config: Config, *, progress: Progress | None = None) -> Run:
     with clock.stage("registration"):
         road = register_road(log, config, sensors, progress=report_progress)
         log, sensors = road.log, sensors.without([f.sensor for f in road.faults if f.treatment == "left_out"])
-    detectors = detectors_of(log, config)
+    detectors = detectors_of(sensors.restrict(log), config)
     with clock.stage("sync"):
         schedule = schedule_of(log, config, sensors)
     plan = make_plan(log, config, sensors, schedule.t_ns)
@@ -166,10 +167,9 @@ def start(log: Log, config: Config, *, progress: Progress | None = None) -> Run:
 
 def detectors_of(log: Log, config: Config) -> Detectors:
     """Create the detectors that the settings name."""
-    sweeps = config.detect.in_sweeps
     return Detectors(
         detector_of(log, config) if config.detect.in_images else None,
-        create_lidar_detector(sweeps, log, config.lidar) if sweeps else None,
+        create_for_ends(log, config) if config.detect.in_sweeps else None,
     )
 
 
@@ -221,10 +221,12 @@ def second_pass(run: Run, observations: Observations) -> Result:
         homographies = fit_homographies(log, observations, plan, estimation_options(config.topdown), rng=rng)
         placed = place_by_homography(log, observations, homographies)
     with run.clock.stage("fuse"):
-        measurements = fuse(placed, across=plan.keeps(Stage.FUSION) or plan.keeps(Stage.FUSION_WITH_LIDAR))
+        across = plan.keeps(Stage.FUSION) or plan.keeps(Stage.FUSION_WITH_LIDAR)
+        ends = [fuse(of_end, across=across) for of_end in apart(placed, plan)]
+        measurements = [Measurements.join(rows) for rows in zip(*ends)]
     with run.clock.stage("track"):
-        tracks = track(
-            measurements,
+        tracks = track_ends(
+            ends,
             t_ns,
             birth_score=config.track.birth_score,
             max_gap_s=config.track.max_gap_s,
@@ -237,6 +239,13 @@ def second_pass(run: Run, observations: Observations) -> Result:
             f"{log.name}: {say_without_pose(log, t_ns)}, and no object was detected in {len(t_ns)} ticks"
         )
     return result_of(run, ego, RunOutputs(observations, measurements, homographies, tuple(agents), run.clock))
+
+
+def apart(measurements: Sequence[Measurements], plan: Plan) -> list[Sequence[Measurements]]:
+    """Return the measurements by tick of what is tracked apart: each end where tracks are joined, else everything."""
+    if plan.fusion is not FusionLevel.TRACKS:
+        return [measurements]
+    return [[rows.take(rows.seen_by[:, k]) for rows in measurements] for k in range(len(ENDS))]
 
 
 def agents_of(run: Run, tracks: Sequence[Track], observations: Observations) -> tuple[Agent | None, list[Agent]]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.config import Config
-from log2sim.datatypes import Log
+from log2sim.datatypes import ENDS, Log, end_of
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.sensors import MAX_LIDAR_RANGE_M, Sensors
 from log2sim.tracking.tracker import min_hits
@@ -34,6 +34,7 @@ class Stage(StrEnum):
     HOMOGRAPHY = "homography"
     FUSION = "fusion of cameras"
     FUSION_WITH_LIDAR = "fusion of cameras and LiDAR"
+    FUSION_OF_ENDS = "fusion of vehicle and road"
     TRACKING = "tracking"
     SMOOTHING = "smoothing"
     SMOOTHING_OF_PARKED_AGENTS = "smoothing of parked agents"
@@ -46,6 +47,14 @@ class HomographyScope(Enum):
     NONE = "none"
     CAMERAS_IN_NEED = "cameras with detections that no LiDAR point places"
     ALL_CAMERAS = "all cameras"
+
+
+class FusionLevel(StrEnum):
+    """What of the vehicle's and the road's LiDARs is joined; the values are those of `cooperation.fusion`."""
+
+    POINTS = "points"
+    BOXES = "boxes"
+    TRACKS = "tracks"
 
 
 @dataclass(frozen=True)
@@ -83,12 +92,15 @@ class Plan:
         Which cameras get a homography.
     detector_stride : int
         Ticks from one detection in all cameras to the next, see `log2sim.perception.frames`.
+    fusion : FusionLevel, optional
+        What of the two ends is joined; None where not both have LiDARs.
     """
 
     cameras: tuple[str, ...]
     decisions: tuple[Decision, ...]
     homography: HomographyScope = HomographyScope.CAMERAS_IN_NEED
     detector_stride: int = 1
+    fusion: FusionLevel | None = None
 
     def decision(self, stage: Stage) -> Decision:
         """Return the decision about a stage."""
@@ -108,7 +120,7 @@ def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64
     decodes = _image_decoding(config)
     stride = min_hits(t_ns, config.track.min_life_s) if decodes.kept else 1
     scope, homography = _homography(log, config)
-    smooth = config.smooth.enabled
+    smooth, ends = config.smooth.enabled, fusion_level(sensors.only(log), config)
     decisions = (
         _lidar_use(log, sensors),
         _motion_compensation(log, sensors, t_ns),
@@ -118,12 +130,13 @@ def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64
         homography,
         _fusion(sensors.cameras),
         *_fusion_with_lidar(config),
+        *([Decision(Stage.FUSION_OF_ENDS, ends.level is not None, ends.reason)] if ends.reason else []),
         Decision(Stage.TRACKING, True, "identities over time are the result"),
         Decision(Stage.SMOOTHING, smooth, "measured positions are noisy" if smooth else "smooth.enabled=false"),
         Decision(Stage.SMOOTHING_OF_PARKED_AGENTS, False, "a parked agent has one pose"),
         Decision(Stage.WAYPOINT_AT_EVERY_TICK, False, "waypoints that interpolation gives back are left out"),
     )
-    return Plan(sensors.cameras, decisions, scope, max(stride, 1))
+    return Plan(sensors.cameras, decisions, scope, max(stride, 1), ends.level)
 
 
 def _lidar_use(log: Log, sensors: Sensors) -> Decision:
@@ -218,3 +231,36 @@ def _fusion(cameras: tuple[str, ...]) -> Decision:
     if len(cameras) > 1:
         return Decision(Stage.FUSION, True, f"{len(cameras)} cameras")
     return Decision(Stage.FUSION, False, "one camera; only duplicates of its detector are dropped")
+
+
+@dataclass(frozen=True)
+class FusionChoice:
+    """At what level the ends of a log are joined.
+
+    Attributes
+    ----------
+    level : FusionLevel, optional
+        None where not both ends have LiDARs that are searched or measured.
+    reason : str
+        "" for a log with one end.
+    """
+
+    level: FusionLevel | None
+    reason: str
+
+
+def fusion_level(log: Log, config: Config) -> FusionChoice:
+    """Decide at what level the ends of a log, with the sensors that are used, are joined."""
+    ends = {end_of(lidar) for lidar in log.lidars.values()} | {end_of(camera) for camera in log.cameras.values()}
+    if ends < set(ENDS):
+        return FusionChoice(None, "")
+    with_lidar, asked = {end_of(lidar) for lidar in log.lidars.values()}, FusionLevel(config.cooperation.fusion)
+    if with_lidar < set(ENDS):
+        missing = [end for end in ENDS if end not in with_lidar]
+        return FusionChoice(
+            None, f"no LiDAR of {' and '.join(missing)}: what their cameras measure is joined as of any"
+        )
+    if not config.detect.in_sweeps and asked is not FusionLevel.POINTS:
+        reason = f"points: images alone are searched, so that there are no {asked} of LiDARs to join"
+        return FusionChoice(FusionLevel.POINTS, reason)
+    return FusionChoice(asked, f"{asked}: cooperation.fusion")

@@ -46,6 +46,10 @@ class Sensors:
         """Return the log without the LiDARs that are out of range; its streams stay."""
         return log.changed(lidars={name: log.lidars[name] for name in self.lidars})
 
+    def only(self, log: Log) -> Log:
+        """Return the log with these sensors alone; its streams stay."""
+        return self.restrict(log).changed(cameras={name: log.cameras[name] for name in self.cameras})
+
     def without(self, names: Collection[str]) -> Sensors:
         """Return the sensors but for some cameras and LiDARs."""
         cameras, lidars = (tuple(n for n in kept if n not in names) for kept in (self.cameras, self.lidars))

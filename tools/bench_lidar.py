@@ -23,7 +23,7 @@ from bench_table import markdown, replace_section
 from log2sim.config_sections import LidarConfig
 from log2sim.logs.opening import open_log
 from log2sim.perception.detect3d.grid import grid_window, rasterize
-from log2sim.perception.detect3d.level_points import level_points, sensor_xy
+from log2sim.perception.detect3d.level_points import level_points, viewpoints_xy
 from log2sim.perception.detect3d.network_detector import WEIGHTS, NetworkDetector, open_shipped
 from log2sim.perception.first_pass import cloud_origin
 from log2sim.perception.lidar.cloud import Cloud, assemble_cloud
@@ -82,7 +82,9 @@ def row(name: str, clouds: list[tuple[Cloud, float]], detector: NetworkDetector)
     info, columns = detector.network.info, []
     for cloud, leveling in clouds:
         xyz, _ = level_points(cloud, detector.range_m)
-        low, shape = grid_window(xyz[:, :2], cell_m=info.cell_m, range_m=detector.range_m, center=sensor_xy(cloud))
+        low, shape = grid_window(
+            xyz[:, :2], cell_m=info.cell_m, range_m=detector.range_m, center=viewpoints_xy(cloud)[0]
+        )
         grid = rasterize(xyz, cell_m=info.cell_m, low=low, shape=shape)
         raster = fastest_ms(
             lambda xyz=xyz, low=low, shape=shape: rasterize(xyz, cell_m=info.cell_m, low=low, shape=shape)

@@ -33,6 +33,8 @@ class Boxes3D:
         Calibrated probability in [0, 1] that the box is right.
     points : (M,) int64
         Number of points in the box.
+    seen_by : (M, 2) bool, optional
+        Which of the `ENDS` found it; None where their clouds were searched as one.
     """
 
     t_ns: NDArray[np.int64]
@@ -43,6 +45,7 @@ class Boxes3D:
     category: NDArray[np.str_]
     score: Array
     points: NDArray[np.int64]
+    seen_by: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         """Return the number of boxes."""
@@ -50,7 +53,8 @@ class Boxes3D:
 
     def take(self, index: Any) -> Self:
         """Take the boxes at `index`, integers or a mask."""
-        return type(self)(**{k: v[index] for k, v in vars(self).items()})
+        columns: dict[str, Any] = {k: None if v is None else v[index] for k, v in vars(self).items()}
+        return type(self)(**columns)
 
     @classmethod
     def empty(cls) -> Self:
@@ -63,7 +67,11 @@ class Boxes3D:
 
     @classmethod
     def join(cls, parts: Sequence[Boxes3D]) -> Boxes3D:
-        """Concatenate several sets; an empty sequence gives no boxes."""
+        """Concatenate several sets; an empty sequence gives no boxes. Who found them is known if it is of all."""
         if not parts:
             return cls.empty()
-        return cls(**{k: np.concatenate([getattr(p, k) for p in parts]) for k in vars(parts[0])})
+        columns: dict[str, Any] = {}
+        for name in vars(parts[0]):
+            values = [getattr(p, name) for p in parts]
+            columns[name] = None if any(v is None for v in values) else np.concatenate(values)
+        return cls(**columns)

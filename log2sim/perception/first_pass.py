@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Boxes3D, Detections, Fault, Log, Measurements, Obstacles
+from log2sim.datatypes import ENDS, Boxes3D, Detections, Fault, Log, Measurements, Obstacles, end_of
 from log2sim.geometry import Array, inverse
 from log2sim.perception.detect.detectors import Detector
 from log2sim.perception.detect3d.detectors import LidarDetector
@@ -22,9 +22,10 @@ from log2sim.perception.lidar.few_points import measure_few_points
 from log2sim.perception.lidar.measure import measure_view, project_cloud
 from log2sim.perception.lidar.measure_boxes import measure_boxes, outside_ego
 from log2sim.perception.lidar.projection import View, view_of
+from log2sim.perception.lidar.viewpoints import join_parts
 from log2sim.perception.prefetch import CloudOptions, CloudPrefetcher, obstacles_of
 from log2sim.perception.sync import Schedule
-from log2sim.plan import Plan, Stage
+from log2sim.plan import FusionLevel, Plan, Stage
 from log2sim.stage_clock import StageClock
 
 MAX_GROUND_POINTS_PER_FRAME = 40
@@ -147,9 +148,10 @@ class _FirstPass:
     ) -> None:
         """Measure the detections of a tick, each camera's in its cloud and boxes in that of the reference."""
         views = {name: view for name in found if (view := self._view(name, tick)) is not None}
+        own = clouds if boxes is None else [_of_end(c, self._end(n)) for n, c in zip(self.schedule.frames, clouds)]
         measured = {
             camera: self._measure_camera(views[camera], tick, found[camera], cloud)
-            for camera, cloud in zip(self.schedule.frames, clouds)
+            for camera, cloud in zip(self.schedule.frames, own)
             if camera in views
         }
         for camera in found:
@@ -157,11 +159,33 @@ class _FirstPass:
         reference = clouds[self.schedule.reference_row]
         if boxes is None or reference is None:
             joined = Measurements.join(list(measured.values()))
+        elif self.plan.fusion is FusionLevel.TRACKS and boxes.seen_by is not None:
+            joined = Measurements.join([
+                self._join_sensors(
+                    boxes.take(seen),
+                    _of_end(reference, end),
+                    {camera: rows for camera, rows in measured.items() if self._end(camera) == end},
+                    views,
+                )
+                for end, seen in zip(ENDS, boxes.seen_by.T)
+            ])  # fmt: skip
         else:
-            in_sweep = measure_boxes(outside_ego(self.log, boxes), reference)
-            frames = [match_boxes(in_sweep, rows, views[camera]) for camera, rows in measured.items()]
-            joined = join_with_images(in_sweep, frames)
+            joined = self._join_sensors(boxes, reference, measured, views)
         self.out.measurements.append(joined.take(self._in_range(tick, joined)))
+
+    def _end(self, camera: str) -> str:
+        return end_of(self.log.cameras[camera])
+
+    def _join_sensors(
+        self, boxes: Boxes3D, cloud: Cloud | None, measured: dict[str, Measurements], views: dict[str, View]
+    ) -> Measurements:
+        """Measure boxes found in a cloud and join them with the measured detections of cameras."""
+        if cloud is None:
+            return Measurements.join(list(measured.values()))
+        in_sweep = measure_boxes(outside_ego(self.log, boxes), cloud)
+        return join_with_images(
+            in_sweep, [match_boxes(in_sweep, rows, views[camera]) for camera, rows in measured.items()]
+        )
 
     def _view(self, camera: str, tick: int) -> View | None:
         """Return a camera's frame of a tick; None where its pose is not known."""
@@ -185,6 +209,13 @@ class _FirstPass:
         origin, _ = cloud_origin(self.log, int(self.schedule.t_ns[tick]))
         with np.errstate(invalid="ignore"):
             return np.asarray(~(np.hypot(*(rows.center_m[:, :2] - origin[:2]).T) > self.max_range_m))
+
+
+def _of_end(cloud: Cloud | None, end: str) -> Cloud | None:
+    """Return the parts of a cloud that an end sees; the whole cloud where it has no parts or the end sees none of them."""
+    if cloud is None or not cloud.parts:
+        return cloud
+    return join_parts([part for part in cloud.parts if part.end == end]) or cloud
 
 
 def base_pose(log: Log, t_ns: int) -> Array:

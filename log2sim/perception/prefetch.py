@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Boxes3D, Log, Obstacles, Sweep
 from log2sim.perception.detect3d.detectors import LidarDetector
 from log2sim.perception.frames import RecordReader
-from log2sim.perception.lidar.cloud import Cloud, assemble_cloud, cloud_origin, compensation_of
+from log2sim.perception.lidar.cloud import Cloud, cloud_origin, compensation_of
 from log2sim.perception.lidar.rays import sample_rays
+from log2sim.perception.lidar.viewpoints import assemble_views
 from log2sim.perception.record_checks.sweep_sketches import sketch_sweep
 from log2sim.perception.sync import Schedule
 from log2sim.plan import Plan, Stage
@@ -136,7 +137,7 @@ class CloudPrefetcher:
         if not sweeps:
             return None
         origin, ground_z = cloud_origin(self._log, next(iter(sweeps.values())).stamp_ns)
-        cloud = assemble_cloud(
+        cloud = assemble_views(
             self._log, sweeps, origin=origin, ground_z=ground_z, max_range_m=self._options.max_range_m,
             compensate=self._plan.keeps(Stage.MOTION_COMPENSATION),
         )  # fmt: skip

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Boxes3D
 from log2sim.perception.detect3d.grid import grid_window, rasterize
 from log2sim.perception.detect3d.level_boxes import MapCells, categories_of, category_logits, headings
-from log2sim.perception.detect3d.level_points import level_points, sensor_xy
+from log2sim.perception.detect3d.level_points import level_points, viewpoints_xy
 from log2sim.perception.detect3d.network import Network
 from log2sim.perception.detect3d.votes import bandwidths_m, cluster, foreground
 from log2sim.perception.lidar.cloud import Cloud
@@ -50,7 +50,7 @@ class ClusterBoxDetector:
         xyz, index = level_points(cloud, self.range_m)
         if not len(xyz):
             return Boxes3D.empty()
-        low, shape = grid_window(xyz, cell_m=info.cell_m, range_m=self.range_m, center=sensor_xy(cloud))
+        low, shape = grid_window(xyz, cell_m=info.cell_m, range_m=self.range_m, center=viewpoints_xy(cloud)[0])
         grid = rasterize(xyz, cell_m=info.cell_m, low=low, shape=shape)
         maps = self.network.run(grid)
         flat, probability = foreground(maps, grid, info)

@@ -18,7 +18,7 @@ from log2sim.datatypes import GROUP_OF
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.matching import Criterion, match
 from log2sim.perception.detect3d.grid import grid_window, rasterize
-from log2sim.perception.detect3d.level_points import level_points, sensor_xy
+from log2sim.perception.detect3d.level_points import level_points, viewpoints_xy
 from log2sim.perception.detect3d.network import METADATA_KEY, load_network
 from log2sim.perception.detect3d.network_detector import NetworkDetector, open_network
 
@@ -163,7 +163,7 @@ def quantize(path: Path, out: Path, examples: list[Example]) -> None:
                 return None
             xyz, _ = level_points(example.cloud, info.range_m)
             low, shape = grid_window(
-                xyz[:, :2], cell_m=info.cell_m, range_m=info.range_m, center=sensor_xy(example.cloud)
+                xyz[:, :2], cell_m=info.cell_m, range_m=info.range_m, center=viewpoints_xy(example.cloud)[0]
             )
             return {"grid": rasterize(xyz, cell_m=info.cell_m, low=low, shape=shape)[None]}
 

@@ -21,13 +21,13 @@ PLANE_POINTS = 64
 
 
 def level_points(cloud: Cloud, range_m: float) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-    """Take the points in range of a cloud's sensor, relative to the cloud's origin.
+    """Take the points in range of a cloud's sensors, relative to the cloud's origin.
 
     Parameters
     ----------
     cloud : Cloud
     range_m : float
-        Largest distance from the sensor along x and along y, m.
+        Largest distance from a sensor along x and along y, m.
 
     Returns
     -------
@@ -36,11 +36,11 @@ def level_points(cloud: Cloud, range_m: float) -> tuple[NDArray[np.float32], NDA
     index : (n,) int
         Of the points in the cloud.
     """
-    return _cropped(cloud, sensor_xy(cloud), range_m)
+    return _cropped(cloud, viewpoints_xy(cloud), range_m)
 
 
 def stack_points(cloud: Cloud, earlier: Sequence[Cloud], range_m: float) -> NDArray[np.float32]:
-    """Merge the points of earlier clouds that are in range of a cloud's sensor: (n, 3) as from `level_points`.
+    """Merge the points of earlier clouds that are in range of a cloud's sensors: (n, 3) as from `level_points`.
 
     Notes
     -----
@@ -49,30 +49,27 @@ def stack_points(cloud: Cloud, earlier: Sequence[Cloud], range_m: float) -> NDAr
     parts = [np.zeros((0, 3), np.float32)]
     for old in earlier:
         shift = (old.origin - cloud.origin)[:2]
-        xyz = _cropped(old, sensor_xy(cloud) - shift, range_m)[0]
+        xyz = _cropped(old, viewpoints_xy(cloud) - shift, range_m)[0]
         xyz[:, :2] += shift.astype(np.float32)
         parts.append(xyz)
     return np.concatenate(parts)
 
 
-def sensor_xy(cloud: Cloud) -> Array:
-    """Return the place (2,) of the sensor relative to the origin, m; the origin where it is not known."""
-    xy = np.asarray(cloud.sensor[:2], dtype=np.float64)
-    return xy if np.isfinite(xy).all() else np.zeros(2)
+def viewpoints_xy(cloud: Cloud) -> Array:
+    """Return the places (V, 2) of the sensors relative to the origin, m, one a viewpoint; the origin where it is not known."""
+    xy = np.array([view.sensor[:2] for view in cloud.views], dtype=np.float64)
+    return np.where(np.isfinite(xy).all(axis=1, keepdims=True), xy, 0.0)
 
 
-def _cropped(cloud: Cloud, center: Array, range_m: float) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+def _cropped(cloud: Cloud, centers: Array, range_m: float) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+    """Take the points within range of any of the centers (V, 2)."""
     x, y, height = cloud.xyz[:, 0], cloud.xyz[:, 1], cloud.height
-    low, high = (center - range_m).astype(np.float32), (center + range_m).astype(np.float32)
-    # False for NaN.
-    index = np.flatnonzero(
-        (x >= low[0])
-        & (x < high[0])
-        & (y >= low[1])
-        & (y < high[1])
-        & (height > MIN_HEIGHT_M)
-        & (height < MAX_HEIGHT_M)
-    )
+    near = np.zeros(len(x), dtype=bool)
+    for center in centers:
+        low, high = (center - range_m).astype(np.float32), (center + range_m).astype(np.float32)
+        # False for NaN.
+        near |= (x >= low[0]) & (x < high[0]) & (y >= low[1]) & (y < high[1])
+    index = np.flatnonzero(near & (height > MIN_HEIGHT_M) & (height < MAX_HEIGHT_M))
     if len(index) > MAX_POINTS:
         index = index[:: -(-len(index) // MAX_POINTS)]
     xyz = np.empty((len(index), 3), np.float32)

@@ -18,7 +18,7 @@ from log2sim.perception.detect3d.box_points import PointsOfBoxes, bounding_reach
 from log2sim.perception.detect3d.centers import decode_centers
 from log2sim.perception.detect3d.grid import grid_window, rasterize
 from log2sim.perception.detect3d.level_boxes import LevelBoxes, sigmoid
-from log2sim.perception.detect3d.level_points import ground_under, level_points, sensor_xy, stack_points
+from log2sim.perception.detect3d.level_points import ground_under, level_points, stack_points, viewpoints_xy
 from log2sim.perception.detect3d.network import Network, load_network
 from log2sim.perception.detect3d.suppression import suppress
 from log2sim.perception.detect3d.votes import MIN_SCORE, decode_votes
@@ -99,24 +99,36 @@ class NetworkDetector:
         -----
         The calibration of a network is fitted to the terms of these.
         """
-        info, sensor = self.network.info, sensor_xy(cloud)
+        info, sensors = self.network.info, viewpoints_xy(cloud)
         xyz, index = level_points(cloud, self.range_m)
         stacked = np.concatenate([xyz, stack_points(cloud, earlier, self.range_m)]) if earlier else xyz
-        low, shape = grid_window(stacked[:, :2], cell_m=info.cell_m, range_m=self.range_m, center=sensor)
+        center, reach_m = self._square_around(sensors)
+        low, shape = grid_window(stacked[:, :2], cell_m=info.cell_m, range_m=reach_m, center=center)
         grid = rasterize(stacked, cell_m=info.cell_m, low=low, shape=shape)
         maps = self.network.run(grid)
         if self.decode == "votes":
             boxes = decode_votes(maps, grid, info, low)
         else:
             boxes = decode_centers(maps, info, low)
-            boxes = boxes if weak else boxes.take(self._may_suffice(boxes, grid, low, sensor))
-            first = boxes.score(info, boxes.terms(np.zeros(len(boxes)), ranges_m(boxes, sensor)))
+            boxes = boxes if weak else boxes.take(self._may_suffice(boxes, grid, low, sensors))
+            first = boxes.score(info, boxes.terms(np.zeros(len(boxes)), ranges_m(boxes, sensors)))
             boxes = boxes.take(suppress(boxes.rectangles, first, boxes.group, across=False))
         inside = points_of_boxes(xyz, boxes.center_m, boxes.size_m, boxes.yaw_rad, xyz[:, 2] > ON_GROUND_M)
-        return Candidates(boxes, inside, index, boxes.terms(inside.count, ranges_m(boxes, sensor)))
+        return Candidates(boxes, inside, index, boxes.terms(inside.count, ranges_m(boxes, sensors)))
+
+    def _square_around(self, sensors: Array) -> tuple[Array, float]:
+        """Return center (2,) and half of the side, m, of the square that holds what is in range of sensors at (V, 2).
+
+        It is as large as the network's grid at most.
+        """
+        low, high = sensors.min(axis=0), sensors.max(axis=0)
+        if len(sensors) == 1:
+            return sensors[0], self.range_m
+        reach_m = self.range_m + float((high - low).max()) / 2
+        return (low + high) / 2, min(reach_m, self.network.info.max_range_m)
 
     def _may_suffice(
-        self, boxes: LevelBoxes, grid: NDArray[np.float32], low: Array, sensor: Array
+        self, boxes: LevelBoxes, grid: NDArray[np.float32], low: Array, sensors: Array
     ) -> NDArray[np.bool_]:
         """Mark boxes (M,) that reach the least score with as many points as they may hold, or with none.
 
@@ -125,7 +137,7 @@ class NetworkDetector:
         info, reach = self.network.info, bounding_reach(boxes.size_m, boxes.yaw_rad)
         counts = np.rint(np.expm1(3 * grid[3]))
         most = most_points(counts, low, info.cell_m, boxes.center_m[:, :2], reach)
-        range_m = ranges_m(boxes, sensor)
+        range_m = ranges_m(boxes, sensors)
         best = np.maximum(*(boxes.score(info, boxes.terms(points, range_m)) for points in (most, 0 * most)))
         return np.asarray(best >= self._least(boxes))
 
@@ -139,9 +151,10 @@ class NetworkDetector:
         return np.array([info.min_score[group] for group in info.groups])[found.group]
 
 
-def ranges_m(boxes: LevelBoxes, sensor: Array) -> Array:
-    """Compute the distances (M,), m, of centers from the sensor at (2,) in the plane."""
-    return np.asarray(np.hypot(*(boxes.center_m[:, :2] - sensor).T))
+def ranges_m(boxes: LevelBoxes, sensors: Array) -> Array:
+    """Compute the distances (M,), m, of centers from the nearest of the sensors at (V, 2) in the plane."""
+    away = boxes.center_m[:, None, :2] - sensors
+    return np.asarray(np.hypot(away[..., 0], away[..., 1]).min(axis=1))
 
 
 def open_network(path: Path, settings: LidarConfig, *, name: str) -> NetworkDetector:

@@ -65,13 +65,15 @@ class Cloud:
     t_s : (N,) float32
         Time of every point relative to `stamp_ns`.
     sensor : (3,) float32
-        Position of the sensor in the middle of the sweep, mean over several, relative to `origin`.
+        Position of the sensor in the middle of the sweep, mean over several, relative to `origin`; with parts of the first.
     ground : (N,) bool
         True for points on the ground.
     height : (N,) float32
         m above the ground.
     sensors : tuple of CloudSensor
         Empty where the points are all of one sensor at `sensor`.
+    parts : tuple of Cloud
+        The same points by viewpoint, in their order; empty where all are seen from one.
     """
 
     stamp_ns: int
@@ -82,6 +84,17 @@ class Cloud:
     ground: NDArray[np.bool_]
     height: NDArray[np.float32]
     sensors: tuple[CloudSensor, ...] = ()
+    parts: tuple[Cloud, ...] = ()
+
+    @property
+    def views(self) -> tuple[Cloud, ...]:
+        """The cloud of each viewpoint: the parts, or the cloud itself."""
+        return self.parts or (self,)
+
+    @property
+    def end(self) -> str:
+        """The end, one of `ENDS`, of the first sensor."""
+        return self.sensors[0].end if self.sensors else VEHICLE
 
     @cached_property
     def obstacles(self) -> NDArray[np.intp]:
@@ -121,7 +134,18 @@ class Cloud:
 
     def prepare(self, *, ground: bool = True) -> None:
         """Fill the cached columns in the calling thread; `ground` includes the sample of ground points."""
-        _ = self.obstacle_columns, self.azimuth_index, self.ground_sample if ground else None
+        _ = self.obstacle_columns, self.ground_sample if ground else None
+        for view in self.views:
+            _ = view.azimuth_index
+
+    def split(self, index: NDArray[np.intp]) -> list[tuple[Cloud, NDArray[np.intp]]]:
+        """Divide points (n,) by viewpoint: each with the rows in its own cloud, those with most points first."""
+        if not self.parts:
+            return [(self, index)]
+        first = np.cumsum([0, *(len(part.xyz) for part in self.parts)])
+        of = np.searchsorted(first, index, side="right") - 1
+        found = [(part, index[of == k] - first[k]) for k, part in enumerate(self.parts)]
+        return sorted((view for view in found if len(view[1])), key=lambda view: -len(view[1]))
 
 
 def sweep_to_map(log: Log, lidar: str, sweep: Sweep, *, compensate: bool) -> tuple[Array, NDArray[np.float32]] | None:

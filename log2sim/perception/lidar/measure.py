@@ -106,7 +106,20 @@ def _continuation(
 
 
 def write_evidence(columns: dict[str, Any], k: int, members: NDArray[np.intp], cloud: Cloud) -> None:
-    """Write what the points at `members` (n,) show into row `k`; a box of a 3D detector says which side is the length."""
+    """Write what the points at `members` (n,) show into row `k`; a box of a 3D detector says which side is the length.
+
+    Points of several viewpoints are measured from the one that has most of them.
+    """
+    view, own = cloud.split(members)[0]
+    if len(own) < min(MIN_CLUSTER_POINTS, len(members)):
+        return
+    _write_view(columns, k, own, view)
+    columns["points"][k] = len(members)
+    columns["seen_by"][k] |= cloud.ends_of(members)
+
+
+def _write_view(columns: dict[str, Any], k: int, members: NDArray[np.intp], cloud: Cloud) -> None:
+    """Write what the points at `members` (n,) of one viewpoint show into row `k`."""
     xyz = cloud.xyz[members].astype(np.float64)
     xy, box_yaw = xyz[:, :2] - cloud.sensor[:2], float(columns["box_yaw_rad"][k])
     typical = np.array(TYPICAL_SIZE_M[str(columns["category"][k])])
@@ -115,8 +128,6 @@ def write_evidence(columns: dict[str, Any], k: int, members: NDArray[np.intp], c
     columns["ends_visible"][k] = cloud.azimuth_index.ends_visible(members)
     columns["bottom_m"][k] = upper_median(xyz[:, 2] - cloud.height[members]) + cloud.origin[2]
     columns["top_m"][k] = top_of(xyz[:, 2]) + cloud.origin[2]
-    columns["points"][k] = len(members)
-    columns["seen_by"][k] |= cloud.ends_of(members)
     t_s = cloud.t_s[members].astype(np.float64)
     mean_ns = round(float(t_s.mean()) * NS_PER_S)
     columns["t_ns"][k] = cloud.stamp_ns + mean_ns

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Rays
+from log2sim.geometry import NS_PER_S
 from log2sim.perception.lidar.azimuth_index import STEP_RAD, STEPS_PER_TURN
 from log2sim.perception.lidar.cloud import MAX_OBSTACLE_HEIGHT_M, Cloud, CloudSensor
 
@@ -25,8 +28,10 @@ def sample_rays(cloud: Cloud) -> Rays:
     Notes
     -----
     Cells of directions, unlike voxels, keep the same share of the rays that hit something near and of those that pass it.
-    Directions are those from the middle of the sensors, which does for a sample.
+    Directions are those from the middle of the sensors of a viewpoint, which does for a sample.
     """
+    if cloud.parts:
+        return _join([sample_rays(part) for part in cloud.parts], cloud)
     index = cloud.azimuth_index
     point = np.flatnonzero((index.range_m[index.rank] < MAX_REACH_M) & (cloud.height < MAX_OBSTACLE_HEIGHT_M))
     row = index.rank[point]
@@ -44,6 +49,19 @@ def sample_rays(cloud: Cloud) -> Rays:
         _sensor_of(cloud, kept).astype(np.uint8),
         np.array([s.position for s in sensors], dtype=np.float32),
         np.array([s.velocity_mps for s in sensors], dtype=np.float32),
+    )
+
+
+def _join(parts: Sequence[Rays], cloud: Cloud) -> Rays:
+    """Join the rays of the parts of a cloud; their sensors are numbered on."""
+    before = np.cumsum([0, *(len(part.position) for part in parts)])
+    late_s = [(part.stamp_ns - cloud.stamp_ns) / NS_PER_S for part in cloud.parts]
+    return Rays(
+        np.concatenate([part.end for part in parts]),
+        np.concatenate([part.t_s + np.float32(late) for part, late in zip(parts, late_s)]),
+        np.concatenate([part.sensor + np.uint8(first) for part, first in zip(parts, before)]),
+        np.concatenate([part.position - np.float32(late) * part.velocity_mps for part, late in zip(parts, late_s)]),
+        np.concatenate([part.velocity_mps for part in parts]),
     )
 
 

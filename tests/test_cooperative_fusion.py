@@ -1,0 +1,332 @@
+"""Fusion of the vehicle's and the road's LiDARs: boxes side by side, clouds by viewpoint, tracks at common ticks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from worlds import rows_at, tiny_log, tiny_table
+
+from log2sim.config import Config
+from log2sim.datatypes import Boxes3D, Track
+from log2sim.geometry import rectangle_iou, wrap_angle
+from log2sim.perception.cooperative.box_errors import BoxErrors, estimate_errors
+from log2sim.perception.cooperative.detector import EndsDetector, create_for_ends, detector_by_mounting
+from log2sim.perception.cooperative.matching import SeenBoxes, match_by_covariance, match_by_overlap
+from log2sim.perception.cooperative.merging import METHODS, fuse_boxes, merge_by_covariance
+from log2sim.perception.lidar.cloud import assemble_cloud
+from log2sim.perception.lidar.viewpoints import assemble_views, group_by_viewpoint
+from log2sim.pipeline import reconstruct
+from log2sim.plan import FusionLevel, fusion_level
+from log2sim.tracking.merging import merge_tracks, track_ends, velocities
+
+POST = {
+    "name": "post",
+    "mount": "map",
+    "position_m": [32.0, 7.0, 3.5],
+    "yaw_deg": -150.0,
+    "channels": 24,
+    "elevation_deg": [-22.0, 3.0],
+    "azimuth_step_deg": 0.5,
+    "range_m": 60.0,
+}
+CAR = (0.0, 0.0, 0.8, 4.5, 1.8, 1.6, 0.0)
+
+
+def boxes_at(*rows, category="car", score=0.6, points=50, t_ns=0):
+    """Boxes with x, y, z, length, width, height, yaw."""
+    rows = np.array(rows, dtype=np.float64).reshape(-1, 7)
+    n = len(rows)
+    return Boxes3D(
+        np.full(n, t_ns, np.int64), rows[:, :3], rows[:, 3:6], rows[:, 6], np.full(n, 0.9), np.full(n, category, "<U16"),
+        np.full(n, score), np.full(n, points, np.int64),
+    )  # fmt: skip
+
+
+def seen(boxes, side_m=0.1, yaw_rad=0.05):
+    n = len(boxes)
+    return SeenBoxes(boxes, BoxErrors(np.broadcast_to(side_m, (n, 2, 2)).astype(float), np.full(n, yaw_rad)))
+
+
+def test_each_side_comes_from_whoever_sees_it() -> None:
+    # The one end knows the rear of a car 4.5 m long and takes it for 4.0 m, the other knows the front and takes it for 5.2 m.
+    rear = seen(boxes_at((-0.25, 0, 0.8, 4.0, 1.8, 1.6, 0)), [[[0.05, 0.5], [0.1, 0.1]]])
+    front = seen(boxes_at((-0.35, 0, 0.8, 5.2, 1.8, 1.6, 0)), [[[0.5, 0.05], [0.1, 0.1]]])
+    merged = merge_by_covariance(rear, front)
+    assert merged.boxes.size_m[0, 0] == pytest.approx(4.5, abs=0.05)
+    assert merged.boxes.center_m[0, :2] == pytest.approx([0, 0], abs=0.03)
+    assert (merged.errors.side_m <= 0.12).all()
+    assert merged.boxes.score[0] == pytest.approx(1 - 0.4**2)
+    assert merged.boxes.points[0] == 100
+
+
+def test_sides_known_alike_are_averaged() -> None:
+    a, b = seen(boxes_at(CAR)), seen(boxes_at((0.04, 0.02, 0.8, 4.6, 1.9, 1.6, 0.02)))
+    merged = merge_by_covariance(a, b)
+    # The road's share is less, as its pose may be off.
+    assert 0 < merged.boxes.center_m[0, 0] < 0.02
+    assert merged.boxes.size_m[0, :2] == pytest.approx([4.55, 1.85], abs=0.01)
+    assert merged.boxes.yaw_rad[0] == pytest.approx(0.01)
+
+
+def test_a_box_turned_round_is_the_same_box() -> None:
+    a = seen(boxes_at(CAR), [[[0.05, 0.3], [0.1, 0.2]]])
+    turned = seen(boxes_at((*CAR[:6], np.pi)), [[[0.3, 0.05], [0.2, 0.1]]])
+    merged, same = merge_by_covariance(a, turned), merge_by_covariance(a, a)
+    assert merged.boxes.center_m == pytest.approx(same.boxes.center_m)
+    assert merged.boxes.size_m == pytest.approx(same.boxes.size_m)
+    assert merged.errors.side_m == pytest.approx(same.errors.side_m)
+    # Who is equally sure of opposite headings knows none.
+    assert merged.boxes.heading_score[0] == pytest.approx(0.5)
+
+
+def test_what_moves_between_the_times_of_both_ends_is_put_at_one() -> None:
+    # At 15 m/s, with sweeps 0.1 s apart.
+    a = seen(boxes_at(CAR, t_ns=0, points=100))
+    b = seen(boxes_at((1.5, *CAR[1:]), t_ns=100_000_000, points=100))
+    merged = merge_by_covariance(a, b).boxes
+    assert merged.center_m[0, 0] == pytest.approx(15 * merged.t_ns[0] / 1e9, abs=0.05)
+    assert merged.size_m[0, 0] == pytest.approx(4.5, abs=0.05)
+    assert match_by_covariance(a, b)[0].tolist() == [0]
+    # Boxes of one time are as far apart by mistake; none is between them.
+    still = seen(boxes_at((1.5, *CAR[1:]), t_ns=0, points=100))
+    assert abs(merge_by_covariance(a, still).boxes.size_m[0, 0] - 4.5) < 0.2
+
+
+def test_boxes_that_contradict_each_other_are_not_mixed() -> None:
+    a, across = seen(boxes_at(CAR), 0.05), seen(boxes_at((*CAR[:6], np.pi / 2)), 0.2)
+    assert merge_by_covariance(a, across).boxes.size_m[0].tolist() == [4.5, 1.8, 1.6]
+    assert merge_by_covariance(a, across).boxes.yaw_rad[0] == 0.0
+    bus = seen(boxes_at((3.0, 0, 1.5, 11.0, 2.5, 3.0, 0)), 0.1)
+    assert merge_by_covariance(a, bus).boxes.size_m[0, 0] in (4.5, 11.0)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.floats(-np.pi, np.pi), st.floats(-50, 50), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.floats(-0.1, 0.1),
+    st.floats(0.03, 0.5),
+)  # fmt: skip
+def test_merging_turns_and_moves_with_the_world(turn, shift, dx, dy, dyaw, sigma) -> None:
+    def in_world(x, y, yaw):
+        c, s = np.cos(turn), np.sin(turn)
+        return (c * x - s * y + shift, s * x + c * y - shift, 0.8, 4.5, 1.8, 1.6, yaw + turn)
+
+    a, b = seen(boxes_at(in_world(0, 0, 0)), 0.1), seen(boxes_at(in_world(dx, dy, dyaw)), sigma)
+    plain = merge_by_covariance(seen(boxes_at(CAR), 0.1), seen(boxes_at((dx, dy, *CAR[2:6], dyaw)), sigma)).boxes
+    merged = merge_by_covariance(a, b).boxes
+    x, y = plain.center_m[0, :2]
+    assert merged.center_m[0, :2] == pytest.approx(in_world(x, y, 0)[:2], abs=1e-6)
+    assert merged.size_m == pytest.approx(plain.size_m, abs=1e-6)
+    assert wrap_angle(merged.yaw_rad - plain.yaw_rad - turn) == pytest.approx(0, abs=1e-9)
+
+
+def test_small_objects_match_though_they_hardly_overlap() -> None:
+    one, other = (seen(boxes_at((x, 0, 0.9, 0.6, 0.6, 1.8, 0), category="pedestrian"), 0.15) for x in (0.0, 0.45))
+    assert [v.tolist() for v in match_by_covariance(one, other)] == [[0], [0]]
+    assert [v.tolist() for v in match_by_overlap(one, other)] == [[], []]
+    far = seen(boxes_at((1.2, 0, 0.9, 0.6, 0.6, 1.8, 0), category="pedestrian"), 0.5)
+    assert [v.tolist() for v in match_by_covariance(one, far)] == [[], []]
+
+
+def test_neighbors_are_matched_with_their_own() -> None:
+    parked = boxes_at(*((0.0, 2.4 * k, 0.8, 4.5, 1.8, 1.6, 0) for k in range(4)))
+    moved = replace(parked, center_m=parked.center_m + np.array([0.2, 0.3, 0]))
+    i, j = match_by_covariance(seen(parked), seen(moved.take([2, 0, 3])))
+    assert dict(zip(i.tolist(), j.tolist())) == {2: 0, 0: 1, 3: 2}
+
+
+def test_other_kinds_of_objects_do_not_match() -> None:
+    walker = boxes_at((0, 0, 0.9, 0.6, 0.6, 1.8, 0), category="pedestrian")
+    for match in (match_by_covariance, match_by_overlap):
+        assert not len(match(seen(boxes_at(CAR)), seen(walker))[0])
+    truck = boxes_at(CAR, category="truck")
+    assert len(match_by_covariance(seen(boxes_at(CAR)), seen(truck))[0]) == 1
+    assert not len(match_by_overlap(seen(boxes_at(CAR)), seen(truck))[0])
+
+
+@pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
+def test_what_one_end_alone_sees_stays(method) -> None:
+    a = seen(boxes_at(CAR, (20, 0, 0.8, 4.5, 1.8, 1.6, 0.3)))
+    b = seen(boxes_at((0.1, 0, 0.8, 4.5, 1.8, 1.6, 0), (0, 30, 0.8, 4.5, 1.8, 1.6, 0.3)))
+    fused = fuse_boxes(a, b, method).boxes
+    assert len(fused) == 3
+    alone = fused.take(fused.points == 50)
+    assert sorted(map(tuple, alone.center_m[:, :2].tolist())) == [(0, 30), (20, 0)]
+    nothing = seen(Boxes3D.empty())
+    assert fuse_boxes(a, nothing, method) is a
+    assert fuse_boxes(nothing, b, method) is b
+
+
+def test_near_sides_are_better_known_than_far_ones() -> None:
+    errors = estimate_errors(boxes_at(CAR), np.array([-10.0, 4.0, 2.0]))
+    (rear, front), (right, left) = errors.side_m[0]
+    assert rear < front
+    assert left < right
+    assert errors.yaw_rad[0] < 0.2
+    few = estimate_errors(boxes_at(CAR, points=5), np.array([-10.0, 4.0, 2.0]))
+    assert (few.side_m > errors.side_m).all()
+
+
+def test_pose_noise_of_the_road_costs_little() -> None:
+    # Rear from the one, front from the other, and the road 0.3 m off: neither end is much worse than alone.
+    rear = seen(boxes_at((-0.25, 0, 0.8, 4.0, 1.8, 1.6, 0)), [[[0.05, 0.4], [0.05, 0.15]]])
+    for angle in np.linspace(0, 2 * np.pi, 9):
+        off = 0.3 * np.array([np.cos(angle), np.sin(angle)])
+        front = seen(boxes_at((0.2 + off[0], off[1], 0.8, 4.1, 1.8, 1.6, 0)), [[[0.4, 0.05], [0.15, 0.05]]])
+        ious = [rectangle_iou([CAR[:2] + CAR[3:5] + CAR[6:]], s.rectangles)[0] for s in (rear, front)]
+        fused = rectangle_iou([CAR[:2] + CAR[3:5] + CAR[6:]], merge_by_covariance(rear, front).rectangles)[0]
+        assert fused >= np.mean(ious)
+
+
+@pytest.fixture(scope="module")
+def both_ends():
+    return tiny_log(lidar=[tiny_table()["lidar"][0], POST])[0]
+
+
+def sweeps_at(log, index=3):
+    return {name: log.streams[name].read(index) for name in log.lidars}
+
+
+def test_clouds_of_both_ends_keep_their_viewpoints(both_ends) -> None:
+    sweeps = sweeps_at(both_ends)
+    cloud = assemble_views(both_ends, sweeps, origin=np.zeros(3), ground_z=0.0, max_range_m=80.0)
+    assert [view.end for view in cloud.views] == ["vehicle", "road"]
+    assert len(cloud.xyz) == sum(len(view.xyz) for view in cloud.views)
+    assert cloud.views[1].sensor == pytest.approx([32, 7, 3.5], abs=1e-3)
+    assert cloud.sensor == pytest.approx(cloud.views[0].sensor)
+    # Times are absolute, whatever the stamps of the sweeps.
+    stamps = np.concatenate([view.stamp_ns + (view.t_s * 1e9).astype(np.int64) for view in cloud.views])
+    assert cloud.stamp_ns + (cloud.t_s * 1e9).astype(np.int64) == pytest.approx(stamps, abs=2000)
+    index = np.array([0, len(cloud.views[0].xyz), len(cloud.xyz) - 1])
+    split = cloud.split(index)
+    assert [(view.end, rows.tolist()) for view, rows in split] == [
+        ("road", [0, len(cloud.views[1].xyz) - 1]), ("vehicle", [0]),
+    ]  # fmt: skip
+
+
+def test_a_cloud_of_one_end_is_made_as_before() -> None:
+    log, _ = tiny_log()
+    options = {"origin": np.zeros(3), "ground_z": 0.0, "max_range_m": 80.0}
+    one, other = assemble_views(log, sweeps_at(log), **options), assemble_cloud(log, sweeps_at(log), **options)
+    for name in ("xyz", "t_s", "sensor", "ground", "height"):
+        assert np.array_equal(getattr(one, name), getattr(other, name))
+    assert one.parts == ()
+
+
+def test_lidars_of_the_road_are_grouped_by_their_places(both_ends) -> None:
+    lidars = dict(both_ends.lidars)
+    post = lidars["post"]
+    for name, x in (("beside", 33.0), ("far", 90.0)):
+        pose = post.mount_T_lidar.copy()
+        pose[0, 3] = x
+        lidars[name] = replace(post, name=name, mount_T_lidar=pose)
+    log = both_ends.changed(lidars=lidars)
+    assert group_by_viewpoint(log, list(lidars)) == [["top"], ["post", "beside"], ["far"]]
+    road = log.changed(lidars={k: v for k, v in lidars.items() if k != "top"})
+    assert group_by_viewpoint(road, list(road.lidars)) == [["post", "beside", "far"]]
+
+
+@pytest.mark.parametrize("level", ["points", "boxes", "tracks"])
+def test_every_level_finds_every_object_once(both_ends, level) -> None:
+    chosen = Config.load(
+        settings=["detect.name=lidar:labels", f"cooperation.fusion={level}", "cooperation.register_road=false"]
+    )
+    result = reconstruct(both_ends, chosen)
+    agents = [a for a in result.scenario.agents if a.id != "ego"]
+    assert sorted(a.category for a in agents) == ["car", "car", "pedestrian"]
+    assert all(set(a.observed_by) == {"vehicle", "road"} for a in agents)
+    (entry,) = [e for e in result.scenario.plan if e["stage"] == "fusion of vehicle and road"]
+    assert entry["kept"]
+    assert entry["reason"].startswith(level)
+
+
+def test_levels_fall_back_where_an_end_has_no_lidar(both_ends) -> None:
+    config = Config.load(settings=["detect.name=lidar:vehicle", "cooperation.fusion=boxes"])
+    assert fusion_level(both_ends, config).level is FusionLevel.BOXES
+    images = config.changed(detect={"name": "labels"})
+    choice = fusion_level(both_ends, images)
+    assert choice.level is FusionLevel.POINTS
+    assert "images alone" in choice.reason
+    alone = both_ends.changed(lidars={"post": both_ends.lidars["post"]})
+    choice = fusion_level(alone, config)
+    assert choice.level is None
+    assert "no LiDAR of vehicle" in choice.reason
+    vehicle = both_ends.changed(lidars={"top": both_ends.lidars["top"]})
+    assert fusion_level(vehicle, config).reason == ""
+
+
+def test_the_road_has_a_detector_that_fits_its_mounting(both_ends) -> None:
+    assert detector_by_mounting(both_ends, "lidar:vehicle") == "lidar:vehicle"
+    assert detector_by_mounting(both_ends, "lidar:mine.onnx") == "lidar:mine.onnx"
+    tilted = tiny_log(lidar=[tiny_table()["lidar"][0], {**POST, "pitch_deg": -31.0}])[0]
+    assert detector_by_mounting(tilted, "lidar:vehicle") == "lidar:roadside"
+    config = Config.load(settings=["detect.name=lidar:vehicle", "cooperation.fusion=boxes"])
+    detector = create_for_ends(tilted, config)
+    assert isinstance(detector, EndsDetector)
+    assert detector.name == "lidar:vehicle|lidar:roadside"
+    points = config.changed(cooperation={"fusion": "points"})
+    assert create_for_ends(tilted, points).name == "lidar:vehicle"
+
+
+def track_of(ticks, xy, *, late_s=0.0, end=0, category="car"):
+    """A track measured at ticks of 0.1 s, some time late."""
+    ticks = np.array(ticks)
+    rows = rows_at(xy, category=category, sigma_m=0.2, source="lidar", camera="")
+    seen_by = np.zeros((len(ticks), 2), bool)
+    seen_by[:, end] = True
+    return Track(category, ticks, replace(rows, t_ns=(ticks * 1e8 + late_s * 1e9).astype(np.int64), seen_by=seen_by))
+
+
+def line(ticks, speed, y=0.0, late_s=0.0):
+    return [[speed * (0.1 * k + late_s), y] for k in ticks]
+
+
+def test_tracks_are_compared_where_their_velocities_carry_them() -> None:
+    # 1.5 m apart at each tick, as the road measures 0.1 s later: one car, not two.
+    ticks = range(10)
+    a = track_of(ticks, line(ticks, 15.0))
+    b = track_of(ticks, line(ticks, 15.0, late_s=0.1), late_s=0.1, end=1)
+    (merged,) = merge_tracks([a], [b])
+    assert merged.tick.tolist() == list(ticks)
+    assert merged.measurements.seen_by.all()
+    t_s = merged.measurements.t_ns / 1e9
+    assert merged.measurements.center_m[:, 0] == pytest.approx(15 * t_s, abs=0.05)
+    # The next car follows 1.5 m behind in the same lane only if it is one that nobody could drive.
+    beside = track_of(ticks, line(ticks, 15.0, y=3.0), end=1)
+    assert len(merge_tracks([a], [beside])) == 2
+    oncoming = track_of(ticks, [[13.5 - x, 0.4] for x, _ in line(ticks, 15.0)], end=1)
+    assert len(merge_tracks([a], [oncoming])) == 2
+
+
+def test_the_road_joins_two_tracks_of_a_hidden_object() -> None:
+    first, last, whole = range(8), range(30, 40), range(40)
+    a = [track_of(first, line(first, 5.0)), track_of(last, line(last, 5.0))]
+    b = [track_of(whole, line(whole, 5.0, y=0.1), end=1)]
+    (merged,) = merge_tracks(a, b)
+    assert merged.tick.tolist() == list(whole)
+    assert merged.measurements.seen_by[:, 0].sum() == 18
+    # Two objects that the vehicle sees at the same ticks are never one.
+    twin = track_of(first, line(first, 5.0, y=0.3))
+    assert len(merge_tracks([a[0], twin], b)) == 2
+
+
+def test_velocities_are_those_of_the_measurements() -> None:
+    ticks = range(12)
+    assert velocities(track_of(ticks, line(ticks, 7.0))) == pytest.approx(np.tile([7.0, 0.0], (12, 1)))
+    assert velocities(track_of([3], [[1.0, 2.0]])).tolist() == [[0, 0]]
+
+
+def test_both_ends_share_the_life_of_a_short_track() -> None:
+    ticks = np.arange(12)
+    empty = rows_at(np.zeros((0, 2)))
+
+    def by_tick(track):
+        return [track.measurements.take(track.tick == k) if k in track.tick else empty for k in ticks]
+
+    a, b = track_of([2, 3, 4], line([2, 3, 4], 5.0)), track_of([5, 6, 7], line([5, 6, 7], 5.0), end=1)
+    options = {"birth_score": 0.4, "max_gap_s": 1.0, "min_life_s": 0.5}
+    (found,) = track_ends([by_tick(a), by_tick(b)], (ticks * 1e8).astype(np.int64), **options)
+    assert found.tick.tolist() == [2, 3, 4, 5, 6, 7]
