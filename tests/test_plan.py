@@ -49,7 +49,7 @@ def test_every_stage_is_decided_once_with_a_reason() -> None:
     decisions = plan_of(config=Config.load(settings=["detect.name=labels+lidar:labels"])).decisions
     # About the fusion of vehicle and road only logs with both say something.
     assert [d.stage for d in decisions] == [stage for stage in Stage if stage is not Stage.FUSION_OF_ENDS]
-    in_sweeps = [Stage.DETECTION_IN_SWEEPS, Stage.FUSION_WITH_LIDAR]
+    in_sweeps = [Stage.DETECTION_IN_SWEEPS, Stage.FUSION_WITH_LIDAR, Stage.FUSION_OF_ENDS]
     assert [d.stage for d in plan_of().decisions] == [s for s in Stage if s not in in_sweeps]
     assert not plan_of().keeps(Stage.DETECTION_IN_SWEEPS)
     assert all(len(d.reason) > 5 for d in decisions)
