@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,13 +28,17 @@ from cooperation_worlds.draw_blind_area import draw_blind_area
 from cooperation_worlds.draw_overlap import draw_overlap
 from cooperation_worlds.draw_range import draw_range
 from cooperation_worlds.perturb import RoadError, disturb, draw_error
-from cooperation_worlds.runs import WAYS, Found, detect, perceive
-from cooperation_worlds.world import World, log_of
+from cooperation_worlds.plots import plot_world
+from cooperation_worlds.rows import Rows
+from cooperation_worlds.runs import ALONE, WAYS, Found, detect, perceive, prepared
+from cooperation_worlds.world import World, at_rate, log_of
 
 from log2sim.datatypes import Log
 
 DRAW = {"range": draw_range, "blind_area": draw_blind_area, "overlap": draw_overlap}
 TESTS = (*DRAW, "ap", "registration")
+PLOTTED = 10
+PLOT_AT_S = {"range": (0.5, 2.5), "blind_area": (1.0, 4.2), "overlap": (1.0,)}
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,10 @@ class Choices:
         Whether the clock of the road's end is off, too.
     register : bool
         Whether the road's end is registered.
+    rate_hz : float
+        Of both LiDARs.
+    rows : Rows
+        What is measured already.
     plots : Path or None
     """
 
@@ -58,7 +66,13 @@ class Choices:
     noise: float
     delayed: bool
     register: bool
+    rate_hz: float
+    rows: Rows
     plots: Path | None
+
+    def key(self, test: str, seed: int, way: str) -> tuple[Any, ...]:
+        """Name a row."""
+        return (test, seed, way, self.noise, self.delayed, self.register, self.rate_hz)
 
     def disturbed(self, log: Log, seed: int) -> tuple[Log, RoadError]:
         """Put an error on the road's end."""
@@ -76,105 +90,111 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--noise", type=float, default=0.0, metavar="SHARE", help="Of 0.5 m, 2 degrees and 0.3 s.")
     parser.add_argument("--no-delay", action="store_true", help="Noise in the pose alone.")
     parser.add_argument("--no-register", action="store_true", help="Take the road's pose and clock as they are.")
+    parser.add_argument("--rate", type=float, default=10.0, metavar="HZ", help="Of both LiDARs; the scenes stay.")
     parser.add_argument("--plot", type=Path, metavar="DIR", help="Draw the first ten variants of each test from above.")
-    parser.add_argument("--json", type=Path, metavar="FILE")
-    chosen = parser.parse_args(arguments)
-    choices = Choices(
-        tuple(chosen.ways.split(",")), chosen.noise, not chosen.no_delay, not chosen.no_register, chosen.plot
+    parser.add_argument("--json", type=Path, metavar="FILE", help="Write the figures.")
+    parser.add_argument(
+        "--rows", type=Path, metavar="FILE", help="Keep rows here, and go on from those that are there."
     )
-    if choices.plots is not None:
-        choices.plots.mkdir(parents=True, exist_ok=True)
+    a = parser.parse_args(arguments)
+    choices = Choices(
+        tuple(a.ways.split(",")), a.noise, not a.no_delay, not a.no_register, a.rate, Rows(a.rows), a.plot
+    )
+    if a.plot is not None:
+        a.plot.mkdir(parents=True, exist_ok=True)
     out = {}
-    for test in chosen.test or TESTS:
-        seeds = range(chosen.seed, chosen.seed + chosen.variants)
-        out[test] = RUN[test](choices, seeds)
+    for test in a.test or TESTS:
+        out[test] = RUN[test](choices, range(a.seed, a.seed + a.variants))
         print("\n" + tables.TABLE[test](out[test]) + "\n", flush=True)
-    if chosen.json is not None:
-        chosen.json.write_text(json.dumps(out, indent=1) + "\n")
+    if a.json is not None:
+        a.json.write_text(json.dumps(out, indent=1) + "\n")
 
 
-def perceived(test: str, choices: Choices, seeds: Sequence[int]) -> Any:
-    """Yield each world with what every way finds in it."""
+def measured(
+    test: str, choices: Choices, seeds: Sequence[int], measure: Callable[[World, Log, str, Found], Any]
+) -> Iterator[tuple[World, dict[str, Any]]]:
+    """Yield each world with a row for every way, in the order of the seeds."""
     for count, seed in enumerate(seeds, start=1):
-        world = DRAW[test](seed)
-        log, _ = log_of(world)
-        log, error = choices.disturbed(log, seed)
-        found = {way: perceive(log, way, register=choices.register) for way in choices.ways}
-        _draw(world, log, found, choices, count)
-        print(f"\r{test}: {count}/{len(seeds)}", end="", file=sys.stderr, flush=True)
-        yield world, log, error, found
+        world = at_rate(DRAW[test](seed), choices.rate_hz)
+        missing = [way for way in choices.ways if choices.key(test, seed, way) not in choices.rows]
+        if missing:
+            log, _ = choices.disturbed(log_of(world)[0], seed)
+            both = prepared(log, register=choices.register) if set(missing) - set(ALONE) else log
+            found = {}
+            for way in missing:
+                used = log if way in ALONE else both
+                found[way] = perceive(used, way)
+                choices.rows[choices.key(test, seed, way)] = measure(world, used, way, found[way])
+            if choices.plots is not None and count <= PLOTTED:
+                plot_world(world, log, found, choices.plots / f"{test}_{seed}.png", PLOT_AT_S[test])
+        say(test, count, len(seeds))
+        yield world, {way: choices.rows[choices.key(test, seed, way)] for way in choices.ways}
 
 
-def _draw(world: World, log: Log, found: dict[str, Found], choices: Choices, count: int) -> None:
-    if choices.plots is not None and count <= 10:
-        from cooperation_worlds.plots import plot_world
-
-        times = {"range": (0.5, 2.5), "blind_area": (1.0, 4.2), "overlap": (1.0,)}[world.test]
-        plot_world(world, log, found, choices.plots / f"{world.test}_{world.seed}.png", times)
+def say(test: str, done: int, total: int) -> None:
+    """Show how far a test is."""
+    print(f"\r{test}: {done}/{total}", end="" if done < total else "\n", file=sys.stderr, flush=True)
 
 
 def run_range(choices: Choices, seeds: Sequence[int]) -> dict[str, Any]:
     """Test A."""
-    rows: dict[str, list[Any]] = {way: [] for way in choices.ways}
-    for world, _, _, found in perceived("range", choices, seeds):
-        for way, result in found.items():
-            rows[way].append(range_measures.perceived(world, result))
-    return {way: range_measures.figures(of_way) for way, of_way in rows.items()}
+    rows = [
+        r for _, r in measured("range", choices, seeds, lambda w, _, __, f: range_measures.perceived(w, f).tolist())
+    ]
+    return {way: range_measures.figures([np.array(r[way]) for r in rows]) for way in choices.ways}
 
 
 def run_blind_area(choices: Choices, seeds: Sequence[int]) -> dict[str, Any]:
     """Test B."""
-    rows = [blind_area_measures.row(world, found) for world, _, _, found in perceived("blind_area", choices, seeds)]
-    seen = [
-        {"seed": s, **{w: {"before": r[w]["before_contact_s"], "hit": r[w]["collides"]} for w in r}}
-        for s, r in zip(seeds, rows)
-    ]
-    return {"ways": blind_area_measures.figures(rows), "stopping_m": blind_area_measures.STOPPING_M, "variants": seen}
+    results = list(measured("blind_area", choices, seeds, lambda w, _, __, f: blind_area_measures.row(w, f)))
+    rows = {way: [r[way] for _, r in results] for way in choices.ways}
+    return blind_area_measures.figures([world for world, _ in results], rows)
 
 
 def run_overlap(choices: Choices, seeds: Sequence[int]) -> dict[str, Any]:
     """Test C, box by box and as a scenario."""
-    scenarios, boxes = [], []
-    for world, log, _, found in perceived("overlap", choices, seeds):
-        scenarios.append({way: overlap_measures.of_scenario(world, result) for way, result in found.items()})
-        sweeps = {way: detect(log, way, register=choices.register) for way in choices.ways if way != "tracks"}
-        boxes.append({way: overlap_measures.of_boxes(world, *s) for way, s in sweeps.items()})
-    return {"scenario": overlap_measures.figures(scenarios), "boxes": overlap_measures.figures(boxes)}
+
+    def measure(world: World, log: Log, way: str, found: Found) -> dict[str, Any]:
+        row = {"scenario": overlap_measures.of_scenario(world, found).tolist()}
+        # Tracks join after detection: their boxes are those of each end.
+        return (
+            row if way == "tracks" else {**row, "boxes": overlap_measures.of_boxes(world, *detect(log, way)).tolist()}
+        )
+
+    rows = [r for _, r in measured("overlap", choices, seeds, measure)]
+    return {
+        of: overlap_measures.figures([{way: r[way][of] for way in choices.ways if of in r[way]} for r in rows])
+        for of in ("boxes", "scenario")
+    }
 
 
 def run_ap(choices: Choices, seeds: Sequence[int]) -> dict[str, Any]:
-    """AP in random traffic, of all road users that both ends together have points of."""
+    """AP in random traffic, of all road users that both ends together have points of; too short to register."""
     ways = [way for way in choices.ways if way != "tracks"]
-    pairs: dict[tuple[str, str], list[Any]] = {(way, kind): [] for way in ways for kind in hidden_traffic.KINDS}
-    counted, hidden = 0, 0
     for count, seed in enumerate(seeds, start=1):
-        view = hidden_traffic.seen(hidden_traffic.draw_hidden_traffic(seed))
-        log, _ = choices.disturbed(view.log, seed)
-        for way in ways:
-            for stamp, boxes in zip(*detect(log, way, register=choices.register, min_score=0.02)):
-                for kind in hidden_traffic.KINDS:
-                    truth, unseen = hidden_traffic.truth_at(view, int(stamp), kind)
-                    pairs[way, kind].append((hidden_traffic.found_at(view, int(stamp), boxes, kind), truth))
-                    if way == "vehicle" and kind == "vehicle":
-                        counted += int((~truth.ignored).sum())
-                        hidden += int((unseen & ~truth.ignored).sum())
-        print(f"\rap: {count}/{len(seeds)}", end="", file=sys.stderr, flush=True)
-    ap = {
-        kind: {way: hidden_traffic.average_precisions(pairs[way, kind]) for way in ways}
-        for kind in hidden_traffic.KINDS
-    }
-    return {"ap": ap, "vehicles": counted, "hidden_from_vehicle": hidden / max(counted, 1)}
+        missing = [way for way in ways if choices.key("ap", seed, way) not in choices.rows]
+        if missing:
+            view = hidden_traffic.seen(hidden_traffic.draw_hidden_traffic(seed))
+            log, _ = choices.disturbed(view.log, seed)
+            for way in missing:
+                found = detect(log, way, min_score=hidden_traffic.MIN_SCORE)
+                choices.rows[choices.key("ap", seed, way)] = hidden_traffic.row(view, *found)
+        say("ap", count, len(seeds))
+    rows = {way: [choices.rows[choices.key("ap", seed, way)] for seed in seeds] for way in ways}
+    return hidden_traffic.figures(rows)
 
 
 def run_registration(choices: Choices, seeds: Sequence[int]) -> dict[str, Any]:
-    """Errors of the pole's pose and clock before and after registration, in worlds of all three tests."""
-    rows = []
+    """Errors of the pole's pose and clock before and after registration, in worlds of all three tests by turns."""
     for count, seed in enumerate(seeds, start=1):
-        world = list(DRAW.values())[count % len(DRAW)](seed)
-        log, _ = log_of(world)
-        error = draw_error(seed, choices.noise or 1.0, delayed=choices.delayed)
-        rows.append({"test": world.test, "seed": seed, **registration_measures.row(log, error)})
-        print(f"\rregistration: {count}/{len(seeds)}", end="", file=sys.stderr, flush=True)
+        key = choices.key("registration", seed, "")
+        if key not in choices.rows:
+            world = at_rate(list(DRAW.values())[seed % len(DRAW)](seed), choices.rate_hz)
+            error = draw_error(seed, choices.noise or 1.0, delayed=choices.delayed)
+            row = registration_measures.row(log_of(world)[0], error)
+            choices.rows[key] = {"test": world.test, "seed": seed, **row}
+        say("registration", count, len(seeds))
+    rows = [choices.rows[choices.key("registration", seed, "")] for seed in seeds]
     return {"rows": rows, **registration_measures.figures(rows)}
 
 
@@ -187,5 +207,4 @@ RUN: dict[str, Callable[[Choices, Sequence[int]], dict[str, Any]]] = {
 }
 
 if __name__ == "__main__":
-    np.seterr(all="raise", under="ignore")
     main()

@@ -20,8 +20,8 @@ from log2sim.synth.traffic_shapes import ROAD_USERS
 VEHICLE_HEIGHT_M, VEHICLE_RANGE_M = 2.0, 20.0
 ROAD_HEIGHT_M, ROAD_RANGE_M = 3.0, 40.0
 # Lines and steps of sensors on the market; at crossings denser ones are mounted than on cars (DAIR-V2X: 300 lines and 40).
-VEHICLE_LINES, ROAD_LINES = (32, 40, 64), (40, 64, 80, 128)
-STEPS_DEG = (0.2, 0.25, 0.3)
+VEHICLE_LINES, ROAD_LINES = (32, 40, 64), (40, 64, 80)
+STEPS_DEG = (0.25, 0.3, 0.4)
 LIDAR_AHEAD_M = 1.2  # of the rear axle
 MAX_TRIES = 400
 

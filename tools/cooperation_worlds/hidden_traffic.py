@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +14,7 @@ from cooperation_worlds.builder import ROAD_LINES
 from cooperation_worlds.world import ROAD_LIDAR, VEHICLE_LIDAR, Array, Parts
 from log2sim.datatypes import GROUP_OF, Boxes3D, EgoVehicle, Lidar, Log, Stream, Sweep
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.matching import Criterion
+from log2sim.evaluation.detection.matching import Criterion, match
 from log2sim.evaluation.detection.precision import average_precision
 from log2sim.geometry import NS_PER_S, PoseTrack, inverse, rotation_from_rpy, transform
 from log2sim.synth.lidar_models import LIDAR_MODELS, LidarModel
@@ -30,7 +32,7 @@ SWEEPS, PERIOD_S = 3, 0.1
 POLE_HEIGHTS_M = (3.0, 6.0)
 REACH_M = 50.0  # of the ego, within which road users count
 MIN_POINTS = 5  # of both ends together, as labels of both clouds need
-IOU = 0.5
+IOU, MIN_SCORE, REPORTED_SCORE = 0.5, 0.02, 0.5
 # Of the counted vehicles, of which there are some, the share that hides from the vehicle.
 MIN_HIDDEN_SHARE, MIN_COUNTED, MAX_TRIES = 0.2, 5, 200
 KINDS = ("vehicle", "car", "pedestrian", "two_wheeler")
@@ -109,7 +111,7 @@ def _drawn(seed: int, attempt: int) -> HiddenTraffic:
     pole = LidarModel(
         name="pole",
         elevation_deg=tuple(np.linspace(-35.0 if height > 4 else -25.0, 5.0, lines).tolist()),
-        azimuth_step_deg=0.2,
+        azimuth_step_deg=0.3,
         range_m=100.0,
     )
     size, parts = car(rng)
@@ -237,10 +239,46 @@ def found_at(view: SeenTraffic, stamp_ns: int, found: Boxes3D, kind: str) -> Sce
     return SceneBoxes.of(boxes[kept], found.category[kept], found.score[kept], range_m=away[kept])
 
 
-def average_precisions(views: list[tuple[SceneBoxes, SceneBoxes]]) -> float | None:
-    """AP BEV .5 (R40) of pairs of found and true boxes of one way and kind."""
-    found, truth = (SceneBoxes.join([v[side] for v in views]) for side in (0, 1))
-    return average_precision(found, truth, Criterion("iou_bev", IOU))
+def row(view: SeenTraffic, t_ns: NDArray[np.int64], boxes: Sequence[Boxes3D]) -> dict[str, Any]:
+    """Boxes of each sweep by kind: found ones with their scores, true ones with whether they count and hide from the vehicle."""
+    out: dict[str, Any] = {kind: [] for kind in KINDS}
+    for stamp, of_sweep in zip(t_ns.tolist(), boxes, strict=True):
+        for kind in KINDS:
+            truth, hidden = truth_at(view, stamp, kind)
+            found = found_at(view, stamp, of_sweep, kind)
+            out[kind].append(
+                {
+                    "found": found.box.round(4).tolist(),
+                    "score": found.score.round(4).tolist(),
+                    "truth": truth.box.round(4).tolist(),
+                    "ignored": truth.ignored.tolist(),
+                    "hidden": hidden.tolist(),
+                }
+            )
+    return out
+
+
+def figures(rows: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
+    """AP BEV .5 (R40) by kind and way, and recall at a score of 0.5 of what hides from the vehicle and of what does not."""
+    ap: dict[str, dict[str, float | None]] = {kind: {} for kind in KINDS}
+    recall: dict[str, dict[str, float]] = {"seen": {}, "hidden": {}}
+    criterion = Criterion("iou_bev", IOU)
+    for way, of_way in rows.items():
+        for kind in KINDS:
+            sweeps = [sweep for of_scene in of_way for sweep in of_scene[kind]]
+            found = SceneBoxes.join([SceneBoxes.of(np.reshape(s["found"], (-1, 7)), score=s["score"]) for s in sweeps])
+            truth = SceneBoxes.join(
+                [SceneBoxes.of(np.reshape(s["truth"], (-1, 7)), ignored=s["ignored"]) for s in sweeps]
+            )
+            ap[kind][way] = average_precision(found, truth, criterion)
+            if kind == "vehicle":
+                hidden = np.concatenate([np.array(s["hidden"], bool) for s in sweeps])
+                right = match(found.take(found.score >= REPORTED_SCORE), truth, criterion).truth
+                got = np.isin(np.arange(len(truth)), right[right >= 0])
+                recall["seen"][way] = float(got[~truth.ignored & ~hidden].mean())
+                recall["hidden"][way] = float(got[~truth.ignored & hidden].mean())
+                count, share = int((~truth.ignored).sum()), float(hidden[~truth.ignored].mean())
+    return {"ap": ap, "recall": recall, "vehicles": count, "hidden_from_vehicle": share}
 
 
 @cache

@@ -74,16 +74,17 @@ def shares(found: Array, truth: Array) -> Array:
     return np.column_stack([shared / area[1], shared / (area[0] + area[1] - shared)])
 
 
-def figures(rows: Sequence[dict[str, Array]]) -> dict[str, Any]:
+def figures(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Means over variants by way, and the gain over the end alone that is better in each variant."""
-    means = {way: np.array([r[way].mean(0) for r in rows]) for way in rows[0]}
+    table = [{way: np.reshape(of_way, (-1, 2)) for way, of_way in r.items()} for r in rows]
+    means = {way: np.array([r[way].mean(0) for r in table]) for way in table[0]}
     better = np.max([means[way][:, 1] for way in ALONE], axis=0)
     best_on_average = max(float(means[way][:, 1].mean()) for way in ALONE)
     return {
         way: {
             "overlap": float(m[:, 0].mean()),
             "iou": float(m[:, 1].mean()),
-            "found": float(np.mean([(r[way][:, 1] > 0).mean() for r in rows])),
+            "found": float(np.mean([(r[way][:, 1] > 0).mean() for r in table])),
             "over_better_end": float(m[:, 1].mean()) - best_on_average,
             "over_better_by_variant": float((m[:, 1] - better).mean()),
             "worse_variants": int((m[:, 1] < better - WORSE_BY).sum()),

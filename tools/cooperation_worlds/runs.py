@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cooperation_worlds.world import Array
 from log2sim.config import Config
 from log2sim.datatypes import GROUP_OF, Agent, Boxes3D, Log, Scenario
 from log2sim.errors import NothingToReconstruct
 from log2sim.evaluation.detection.detect_log import detect_log
-from log2sim.pipeline import reconstruct
+from log2sim.pipeline import reconstruct, start
 
 ALONE = ("vehicle", "road")
 LEVELS = ("points", "boxes", "tracks")
@@ -42,22 +43,27 @@ def settings(way: str, *, register: bool, **more: Any) -> Config:
     return Config.load(None, (), cooperation=cooperation, **more)
 
 
-def perceive(log: Log, way: str, *, register: bool = True) -> Found:
+def prepared(log: Log, *, register: bool) -> Log:
+    """Return a log as a run with both ends uses it: with the road's end registered, so that it is registered once for all levels."""
+    return start(log, settings("points", register=True)).log if register else log
+
+
+def perceive(log: Log, way: str) -> Found:
     """Reconstruct the scenario of a log in one way."""
     try:
-        result = reconstruct(log, settings(way, register=register))
+        result = reconstruct(log, settings(way, register=False))
     except NothingToReconstruct:
         return Found(None, {})
     return Found(result.scenario, result.report)
 
 
-def detect(log: Log, way: str, *, register: bool = True, min_score: float = 0.05) -> tuple[Array, tuple[Boxes3D, ...]]:
-    """Detect boxes in the sweeps of a log in one way: middles of the sweeps in s, and the boxes of each.
+def detect(log: Log, way: str, *, min_score: float = 0.05) -> tuple[NDArray[np.int64], tuple[Boxes3D, ...]]:
+    """Detect boxes in the sweeps of a log in one way: stamps of the sweeps, and the boxes of each.
 
     The networks' scores are calibrated probabilities; those below `min_score` are left out.
     """
     detector = DETECTOR.get(way, "lidar:vehicle")
-    config = settings(way, register=register, detect={"name": detector}, lidar={"min_score": min_score})
+    config = settings(way, register=False, detect={"name": detector}, lidar={"min_score": min_score})
     found = detect_log(log, config).found
     return found.t_ns, found.boxes
 

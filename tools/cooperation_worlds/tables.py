@@ -28,14 +28,16 @@ def range_table(figures: dict[str, Any]) -> str:
 def blind_area_table(figures: dict[str, Any]) -> str:
     """Test B."""
     head = [
-        "", "known before contact s", "distance m", "least m", "20 m or more", "gained s", "2 s or more", "collisions", "never known",
+        "", "known before contact s", "distance m", "least m", "20 m or more", "gained s", "2 s or more", "never known",
+        "collisions, braking when known", "warned before contact s", "never warned", "collisions, braking when warned",
     ]  # fmt: skip
     rows = [
         [
             NAMES[w], _n(f["before_contact_s"]), f"{f['distance_m']:.1f}", f"{f['distance_least_m']:.1f}", _n(f["from_20_m"]),
-            _n(f["gained_s"]), _n(f["gained_2_s"]), str(f["collisions"]), str(f["never"]),
+            _n(f["gained_s"]), _n(f["gained_2_s"]), str(f["never"]), str(f["collisions"]), _n(f["warned_before_s"]),
+            str(f["never_warned"]), str(f["collisions_warned"]),
         ]
-        for w, f in figures["ways"].items()
+        for w, f in figures.items()
     ]  # fmt: skip
     return _table(head, rows)
 
@@ -60,6 +62,7 @@ def ap_table(figures: dict[str, Any]) -> str:
     rows = [
         [kind, *("-" if ap[w] is None else f"{100 * ap[w]:.1f}" for w in ways)] for kind, ap in figures["ap"].items()
     ]
+    rows += [[f"recall, vehicles {what}", *(_n(of[w]) for w in ways)] for what, of in figures["recall"].items()]
     share = f"{figures['vehicles']} vehicles, {100 * figures['hidden_from_vehicle']:.0f} % hidden from the vehicle"
     return _table(["AP BEV .5", *(NAMES[w] for w in ways)], rows) + "\n\n" + share
 

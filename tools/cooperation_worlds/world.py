@@ -65,6 +65,12 @@ class World:
         return MovingScene.of(self.scene)
 
 
+def at_rate(world: World, rate_hz: float) -> World:
+    """Let both LiDARs turn at another rate; nothing else changes."""
+    lidars = tuple(spec.model_copy(update={"rate_hz": rate_hz}) for spec in world.scene.lidar)
+    return replace(world, scene=world.scene.model_copy(update={"lidar": lidars}))
+
+
 def log_of(world: World) -> tuple[Log, Scenario]:
     """Make the log of a world, whose sweeps are cast once when they are read, and its exact truth."""
     log, truth = synthesize(world.scene, seed=world.seed, observe=False)
