@@ -18,7 +18,8 @@ from log2sim.pipeline import reconstruct, start
 ALONE = ("vehicle", "road")
 LEVELS = ("points", "boxes", "tracks")
 WAYS = (*ALONE, *LEVELS)
-DETECTOR = {"vehicle": "lidar:vehicle", "road": "lidar:roadside"}
+# Both LiDARs stand level, so both are searched by the network for such ones, as the ends are where their boxes are joined.
+DETECTOR = "lidar:vehicle"
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +41,7 @@ def settings(way: str, *, register: bool, **more: Any) -> Config:
     """Settings of a way: an end alone, or a level of fusion."""
     ends, fusion = (way, "points") if way in ALONE else ("both", way)
     cooperation = {"ends": ends, "fusion": fusion, "register_road": register}
-    return Config.load(None, (), cooperation=cooperation, **more)
+    return Config.load(None, (), cooperation=cooperation, detect={"name": DETECTOR}, **more)
 
 
 def prepared(log: Log, *, register: bool) -> Log:
@@ -62,8 +63,7 @@ def detect(log: Log, way: str, *, min_score: float = 0.05) -> tuple[NDArray[np.i
 
     The networks' scores are calibrated probabilities; those below `min_score` are left out.
     """
-    detector = DETECTOR.get(way, "lidar:vehicle")
-    config = settings(way, register=False, detect={"name": detector}, lidar={"min_score": min_score})
+    config = settings(way, register=False, lidar={"min_score": min_score})
     found = detect_log(log, config).found
     return found.t_ns, found.boxes
 
