@@ -229,6 +229,17 @@ def test_an_occlusion_is_stitched_and_not_beyond_what_is_allowed() -> None:
     assert len(track(found, t_ns, **{**OPTIONS, "max_gap_s": 2.15})) == 2
 
 
+def test_a_rider_taken_for_a_pedestrian_before_an_occlusion_stays_one_track() -> None:
+    found, t_ns = record({"a": line(0, 0, 3.6, 0)}, 40, hidden={"a": (15, 27)}, category="pedestrian")
+    after = [replace(m, category=np.full(len(m), "cyclist")) if k >= 27 else m for k, m in enumerate(found)]
+    (rider,) = track(after, t_ns, **OPTIONS)
+    assert rider.category == "cyclist" and len(rider) == 28
+    # Somebody who walks before it and a rider after it are two.
+    slow, _ = record({"a": line(0, 0, 1.2, 0)}, 40, hidden={"a": (15, 27)}, category="pedestrian")
+    two = [replace(m, category=np.full(len(m), "cyclist")) if k >= 27 else m for k, m in enumerate(slow)]
+    assert len(track(two, t_ns, **OPTIONS)) == 2
+
+
 def test_a_chain_of_occlusions_is_one_track() -> None:
     found, t_ns = record({"a": line(0, 0, 8, 0)}, 100, noise_m=0.05)
     found = [Measurements.empty() if 20 <= k < 32 or 50 <= k < 62 or 75 <= k < 87 else m for k, m in enumerate(found)]

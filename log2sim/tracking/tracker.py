@@ -44,7 +44,9 @@ def track(
     tracks = []
     for t in tracklets:
         rows = everything.take(first_row[t.ticks] + t.rows)
-        tracks.append(Track(voted_category(rows), t.ticks, rows))
+        # A rider taken for a pedestrian is as fast before an occlusion as after it.
+        category = voted_category(rows) if whole_boxes else decide_category(rows)
+        tracks.append(Track(category, t.ticks, rows))
     joined = stitch(tracks, t_ns, max_gap_s=max_gap_s, whole_boxes=whole_boxes)
     required = min_hits(t_ns, min_life_s)
     kept = [t for t in joined if len(t) >= required]
