@@ -233,7 +233,7 @@ def test_a_rider_taken_for_a_pedestrian_before_an_occlusion_stays_one_track() ->
     found, t_ns = record({"a": line(0, 0, 3.6, 0)}, 40, hidden={"a": (15, 27)}, category="pedestrian")
     after = [replace(m, category=np.full(len(m), "cyclist")) if k >= 27 else m for k, m in enumerate(found)]
     (rider,) = track(after, t_ns, **OPTIONS)
-    assert rider.category == "cyclist" and len(rider) == 28
+    assert (rider.category, len(rider)) == ("cyclist", 28)
     # Somebody who walks before it and a rider after it are two.
     slow, _ = record({"a": line(0, 0, 1.2, 0)}, 40, hidden={"a": (15, 27)}, category="pedestrian")
     two = [replace(m, category=np.full(len(m), "cyclist")) if k >= 27 else m for k, m in enumerate(slow)]
