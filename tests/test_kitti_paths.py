@@ -75,8 +75,8 @@ def test_smoothed_paths_solve_the_whole_least_squares_problem(whole_boxes: bool)
 def test_paths_go_on_beyond_both_ends_as_far_as_there_are_ticks() -> None:
     t_ns = stamps(12)
     inner, outer = a_track([4, 5, 6], t_ns, 1), a_track([1, 2, 11], t_ns, 2)
-    short, long = smooth_paths([inner, outer], t_ns), smooth_paths([inner, outer], t_ns, before=3, after=2)
-    assert long.tick[long.track == 0].tolist() == list(range(1, 9))
+    short, long = smooth_paths([inner, outer], t_ns), smooth_paths([inner, outer], t_ns, beyond=np.array([3, 2]))
+    assert long.tick[long.track == 0].tolist() == list(range(1, 10))
     assert long.tick[long.track == 1].tolist() == list(range(12))
     first = short.mean[0]
     expected = [*(first[:2] - first[2:] * 0.3), *first[2:]]

@@ -13,11 +13,15 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
 
 import evaluate_kitti  # noqa: E402
+import fit_kitti  # noqa: E402
 import track_kitti  # noqa: E402
 from conftest import SHARED  # noqa: E402
 from evaluate_kitti import evaluate, recall_thresholds  # noqa: E402
 from kitti_boxes import Boxes, overlap_3d, read_detections, read_tracks, write_tracks  # noqa: E402
+from kitti_choice import labeled_probability  # noqa: E402
+from kitti_joining import join_tracks  # noqa: E402
 from kitti_map import EGO_R_CAM, View, from_map, hidden_share, read_view, to_measurements  # noqa: E402
+from kitti_rows import Rows  # noqa: E402
 
 from log2sim.errors import LogError  # noqa: E402
 from log2sim.geometry import bev_iou, box_corners_bev, rotation_from_rpy, transform  # noqa: E402
@@ -281,19 +285,67 @@ def test_offline_fills_short_gaps_of_what_is_believed_and_no_others() -> None:
     # Between its ends the path is that of the motion.
     np.testing.assert_allclose(first.bottom_m[:, 2], 20 + 0.3 * np.arange(40), atol=0.05)
     online = track_kitti.track_boxes(good, standing_view(40), online=True)
-    assert online.frame.tolist() == [*range(11), *range(14, 40)]  # one frame ahead, no more
+    assert set(online.frame.tolist()) >= {*range(10), *range(14, 40)}
 
 
-def test_what_comes_from_far_away_was_there_before() -> None:
+def person(frame: object, x: object, score: object) -> Boxes:
+    xz = np.column_stack([x, np.full(len(np.atleast_1d(frame)), 15.0)])
+    return boxes(frame, xz, category="Pedestrian", size=PERSON, score=score)
+
+
+def test_gaps_of_people_are_filled_up_to_a_second_if_they_are_believed() -> None:
+    def told(gap: int, score: float) -> set[int]:
+        frame = np.array([k for k in range(60) if not 20 <= k < 20 + gap])
+        out = track_kitti.track_boxes(person(frame, np.full(60 - gap, 3.0), score), standing_view(60), online=False)
+        return set(out.frame.tolist())
+
+    assert told(10, 4.0) == set(range(60))
+    assert told(11, 4.0) == set(range(60)) - set(range(20, 31))
+    assert told(5, -0.5) == set(range(60)) - set(range(20, 25))
+
+
+def test_what_walks_is_believed_before_what_stands_unless_nothing_is_known_to_stand() -> None:
+    frame = np.arange(30)
+    both = Boxes.join([person(frame, 0.2 * frame - 3, 2.0), person(frame, np.full(30, 6.0), 2.0)])
+    view = standing_view(30)
+    out = track_kitti.track_boxes(both, view, online=False)
+    walks, stands = (out.score[side] for side in (out.bottom_m[:, 0] < 4, out.bottom_m[:, 0] > 5))
+    assert len(walks) == len(stands) == 30
+    assert walks.min() == pytest.approx(stands.max() + 1)
+    blind = track_kitti.track_boxes(both, replace(view, motion_known=False), online=False)
+    assert len(np.unique(blind.score)) == 1
+
+
+def test_a_track_that_is_missed_often_is_believed_less() -> None:
+    frame = np.arange(30)
+    often = frame[frame % 3 == 0]
+    both = Boxes.join([person(frame, np.full(30, -6.0), 2.0), person(often, np.full(len(often), 6.0), 2.0)])
+    out = track_kitti.track_boxes(both, standing_view(30), online=False)
+    assert out.score[out.bottom_m[:, 0] < 0].min() > out.score[out.bottom_m[:, 0] > 0].max() + 1
+
+
+def test_boxes_too_small_to_be_errors_are_carried_on_and_others_end() -> None:
     def seen_from(z: float) -> list[int]:
-        frame = np.arange(10, 30)
-        out = track_kitti.track_boxes(
-            boxes(frame, np.column_stack([0 * frame, z - 0.2 * frame])), standing_view(40), online=False
-        )
+        frame = np.arange(25, 45)
+        b = boxes(frame, np.column_stack([0 * frame, z - 0.2 * frame]), score=4.0)
+        out = track_kitti.track_boxes(b, standing_view(80), online=False)
         return out.frame.tolist()
 
-    assert seen_from(64.0) == list(range(6, 34))
-    assert seen_from(50.0) == list(range(10, 30))
+    # A car of 1.5 m is 25 px high at 43 m.
+    assert seen_from(75.0) == list(range(5, 65))
+    assert set(seen_from(30.0)) >= set(range(25, 45))
+    assert not set(seen_from(30.0)) & {*range(15), *range(55, 80)}
+
+
+def test_where_another_track_is_seen_none_is_predicted() -> None:
+    # Two parked cars; a third track is a fragment of the second, seen elsewhere in time.
+    first = boxes(np.arange(20, 40), np.tile([0.0, 60.0], (20, 1)), score=6.0)
+    moving = boxes(np.arange(10, 20), np.column_stack([np.full(10, 0.3), 60 + 3.0 * np.arange(-10, 0)]), score=6.0)
+    out = track_kitti.track_boxes(Boxes.join([first, moving]), standing_view(60), online=False)
+    for f in range(60):
+        here = out.take(out.frame == f)
+        i, j = np.triu_indices(len(here), 1)
+        assert (overlap_3d(here.take(i), here.take(j)) < 0.1).all(), f
 
 
 def test_a_rider_is_no_pedestrian_beside() -> None:
@@ -311,9 +363,12 @@ def test_a_rider_is_no_pedestrian_beside() -> None:
 def test_what_stands_behind_others_is_left_out_unless_it_is_sure() -> None:
     frame = np.arange(20)
     front = boxes(frame, np.tile([0.0, 10.0], (20, 1)))
-    behind = boxes(frame, np.tile([0.0, 20.0], (20, 1)), score=np.where(frame < 10, 0.0, 3.0))
-    out = track_kitti.track_boxes(Boxes.join([front, behind]), standing_view(20), online=True)
-    assert out.take(out.bottom_m[:, 2] > 15).frame.tolist() == list(range(10, 20))
+    behind = boxes(
+        frame, np.tile([0.0, 20.0], (20, 1)), score=np.where(frame < 10, 0.0, 3.0), category="Pedestrian", size=PERSON
+    )
+    for online in (False, True):
+        out = track_kitti.track_boxes(Boxes.join([front, behind]), standing_view(20), online=online)
+        assert out.take(out.bottom_m[:, 2] > 15).frame.tolist() == list(range(10, 20))
 
 
 # ---- scores
@@ -443,7 +498,7 @@ def test_sequences_without_results_are_missed() -> None:
 @pytest.mark.slow
 @pytest.mark.real
 @pytest.mark.parametrize("online", [True, False])
-def test_a_recorded_sequence_is_tracked_without_identity_switches(tmp_path: Path, online: bool) -> None:
+def test_a_recorded_sequence_is_tracked_ahead_of_the_baseline(tmp_path: Path, online: bool) -> None:
     if not KITTI.is_dir():
         pytest.skip(
             "the KITTI tracking labels and detections are not beside this checkout (../shared/data/kitti_tracking)"
@@ -463,11 +518,51 @@ def test_a_recorded_sequence_is_tracked_without_identity_switches(tmp_path: Path
     assert track_kitti.main([*arguments, "--out", str(tmp_path / "out"), *(["--online"] if online else [])]) == 0
     result = {"0004": read_tracks(tmp_path / "out" / "0004.txt")}
     score = evaluate(result, {"0004": read_tracks(KITTI / "label_02" / "0004.txt")}, "Car")
-    assert score.id_switches == 0
+    assert score.id_switches <= 1
     # AB3DMOT with its repository settings has 90.4 and 83.7 here.
-    assert score.samota > 90.4
-    assert score.mota > 85.0
+    assert score.samota > 94.0
+    assert score.mota > (90.0 if online else 93.0)
     report = tmp_path / "score.json"
     folders = ["--results", str(tmp_path / "out"), "--labels", str(KITTI / "label_02")]
     assert evaluate_kitti.main([*folders, "--categories", "Car", "--out", str(report)]) == 0
     assert report.is_file()
+
+
+def test_weights_are_found_from_labels_and_boxes_on_labels_are_told(tmp_path: Path) -> None:
+    # Objects of which those with a high score are labeled.
+    rng = np.random.default_rng(11)
+    frame, number = np.divmod(np.arange(40 * 12), 12)
+    xz = np.column_stack([-22 + 4.0 * number, 15 + 2.0 * number]) + rng.normal(0, 0.05, (480, 2))
+    score = np.where(number % 2 == 0, 4.0, 0.5) + rng.normal(0, 0.7, 480)
+    found = boxes(frame, xz, score=score).take(rng.random(480) > 0.1)
+    label = boxes(frame, xz, track=number).take(number % 2 == 0)
+    described = track_kitti.describe_sequence(found, standing_view(40), online=False)
+    weights = [fit_kitti.fit([described], [label], seen=seen) for seen in (True, False)]
+    for w, seen in zip(weights, (True, False)):
+        p = labeled_probability(described.features, w)
+        on_label = fit_kitti.labeled(described.boxes, label, "Car")
+        rows = described.seen == seen
+        assert np.nanmean(p[rows & (on_label == 1)]) > 0.85
+        assert np.nanmean(p[rows & (on_label == 0)]) < 0.15
+
+
+def test_logistic_regression_finds_the_weights_that_made_the_data() -> None:
+    rng = np.random.default_rng(2)
+    x = np.column_stack([np.ones(40_000), rng.normal(size=(40_000, 2))])
+    y = rng.random(40_000) < 1 / (1 + np.exp(-x @ np.array([-1.0, 2.0, 0.5])))
+    np.testing.assert_allclose(fit_kitti.logistic_regression(x, y.astype(float)), [-1.0, 2.0, 0.5], atol=0.08)
+
+
+def test_tracks_are_one_where_one_is_predicted_on_the_other_and_both_are_never_seen_at_once() -> None:
+    frame = np.array([0, 1, 2, 3, 2, 3, 4, 0, 1, 2])
+    track = np.array([0, 0, 0, 0, 1, 1, 1, 2, 2, 2])
+    source = np.array([0, 1, 2, -1, -1, 3, 4, 5, 6, -1])
+    xz = np.array([[0, 20], [0, 20], [0, 20], [0, 20], [0, 20], [0, 20], [0, 20], [0.5, 20], [0.5, 20], [0.5, 20.0]])
+    b = boxes(frame, xz, track=track)
+    rows = Rows(frame, track, source, np.maximum(source, 0), xz, b.category)
+    distance = np.array([0, 0, 0, 1, 1, 0, 0, 0, 0, 1])
+    joined, kept = join_tracks(rows, b, distance)
+    # The third is seen together with the first, so it is another object.
+    assert joined.track.tolist() == [0] * 7 + [2] * 3
+    assert joined.frame[kept].tolist() == [0, 1, 2, 3, 4, 0, 1, 2]
+    assert source[kept].tolist() == [0, 1, 2, 3, 4, 5, 6, -1]

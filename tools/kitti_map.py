@@ -31,10 +31,14 @@ NEARER_M = 1.0
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Where the camera was: `map_T_cam` (T, 4, 4) of the rectified camera 0 at every frame and `P` (3, 4) to the image."""
+    """Where the camera was: `map_T_cam` (T, 4, 4) of the rectified camera 0 at every frame and `P` (3, 4) to the image.
+
+    Where the ego motion is unknown (`motion_known` False) the axes of the car stand for the map, and nothing in it stands.
+    """
 
     map_T_cam: Array
     P: Array
+    motion_known: bool = True
 
 
 def read_view(calib: Path, ego_motion: Path | None, frames: int) -> View:
@@ -46,7 +50,7 @@ def read_view(calib: Path, ego_motion: Path | None, frames: int) -> View:
     c = drive.read_calibration(calib)
     P = drive.calibration_entry(c, calib, (3, 4), "P2")
     if ego_motion is None:
-        return View(np.repeat(transform(EGO_R_CAM, np.zeros(3))[None], frames, axis=0), P)
+        return View(np.repeat(transform(EGO_R_CAM, np.zeros(3))[None], frames, axis=0), P, motion_known=False)
     rows = _poses(ego_motion)
     if len(rows) < frames:
         raise LogError(f"{ego_motion}: {len(rows)} poses, expected one for each of {frames} frames of the detections")
@@ -157,23 +161,28 @@ def project(bottom_m: Array, size_hwl_m: Array, yaw_rad: Array, P: Array) -> Arr
     return np.where(inside[:, None], np.concatenate([cut_low, cut_high], axis=1), np.nan)
 
 
-def hidden_share(boxes: Boxes, frames: int) -> Array:
-    """Share (N,) of every image box that lies behind boxes of its frame that are nearer to the camera; rows by frame."""
+def hidden_share(boxes: Boxes, frames: int, hides: NDArray[np.bool_] | None = None) -> Array:
+    """Share (N,) of every image box that lies behind boxes of its frame that are nearer to the camera; rows by frame.
+
+    With `hides` (N,) only those rows hide others.
+    """
     depth = np.linalg.norm(boxes.bottom_m, axis=1)
+    hides = np.ones(len(boxes), dtype=bool) if hides is None else hides
     steps = (np.arange(GRID) + 0.5) / GRID
     low, high = boxes.box_px[:, :2], boxes.box_px[:, 2:]
     grid = low[:, None] + (high - low)[:, None] * steps[:, None]
     out = np.zeros(len(boxes))
     cuts = np.searchsorted(boxes.frame, np.arange(frames + 1))
     for a, b in pairwise(cuts):
-        if b - a < 2:
+        front = a + np.flatnonzero(hides[a:b])
+        if b - a < 2 or len(front) == 0:
             continue
-        nearer = depth[None, a:b] < depth[a:b, None] - NEARER_M
-        touching = np.all((low[None, a:b] < high[a:b, None]) & (high[None, a:b] > low[a:b, None]), axis=2) & nearer
+        nearer = depth[None, front] < depth[a:b, None] - NEARER_M
+        touching = np.all((low[None, front] < high[a:b, None]) & (high[None, front] > low[a:b, None]), axis=2) & nearer
         i, j = np.nonzero(touching)
         if len(i) == 0:
             continue
-        covered = (grid[a + i] > low[a + j, None]) & (grid[a + i] < high[a + j, None])
+        covered = (grid[a + i] > low[front[j], None]) & (grid[a + i] < high[front[j], None])
         cells = covered[:, :, None, 0] & covered[:, None, :, 1]
         hidden = np.zeros((b - a, GRID, GRID), dtype=bool)
         np.logical_or.at(hidden, i, cells)

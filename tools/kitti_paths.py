@@ -36,11 +36,15 @@ class Paths:
 
 
 def smooth_paths(
-    tracks: Sequence[Track], t_ns: NDArray[np.int64], *, whole_boxes: bool = False, before: int = 0, after: int = 0
+    tracks: Sequence[Track],
+    t_ns: NDArray[np.int64],
+    *,
+    whole_boxes: bool = False,
+    beyond: NDArray[np.int64] | None = None,
 ) -> Paths:
     """Estimate the states of all tracks at all ticks from their first to their last measurement.
 
-    They are extended by `before` ticks into the past and `after` ticks into the future, as far as there are ticks.
+    Each is carried on at both ends by `beyond` (A,) ticks, as far as there are ticks.
 
     Notes
     -----
@@ -60,10 +64,11 @@ def smooth_paths(
         row[start[k] + t.tick - first[k]] = np.arange(len(t))
     grid = _Grid(tracks, start, length, np.asarray(t_ns, dtype=np.int64)[tick], row, whole_boxes=whole_boxes)
     paths = Paths(track, tick, row, *grid.smooth())
-    ends = [start + length - 1 + 0 * k for k in range(after)], [start + 0 * k for k in range(before)]
-    steps = [np.full(len(tracks), k + 1) for k in range(after)], [np.full(len(tracks), -k - 1) for k in range(before)]
-    origin, step = np.concatenate([*ends[0], *ends[1], start[:0]]), np.concatenate([*steps[0], *steps[1], start[:0]])
-    return _extended(paths, origin, step, grid.noise, t_ns) if len(origin) else paths
+    if beyond is None or not beyond.any():
+        return paths
+    step = np.arange(beyond.sum()) - np.repeat(np.cumsum(beyond) - beyond, beyond) + 1
+    origin = np.concatenate([np.repeat(start + length - 1, beyond), np.repeat(start, beyond)])
+    return _extended(paths, origin, np.concatenate([step, -step]), grid.noise, t_ns)
 
 
 def _extended(

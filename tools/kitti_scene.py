@@ -45,7 +45,7 @@ def make_scene(results: Mapping[str, Boxes], labels: Mapping[str, Boxes], catego
     truths, founds, areas, begin = [], [], [], 0
     for k, name in enumerate(sorted(labels)):
         label = _shifted(labels[name], begin, k)
-        truths.append(label.take(np.isin(label.category, [category, NEIGHBORS.get(category, category)])))
+        truths.append(label.take(np.isin(label.category, with_neighbors(category))))
         areas.append(label.take(label.category == "DontCare"))
         end = int(label.frame.max(initial=begin - 1)) + 1
         if name in results:
@@ -55,18 +55,32 @@ def make_scene(results: Mapping[str, Boxes], labels: Mapping[str, Boxes], catego
     truth, area = Boxes.join(truths), Boxes.join(areas)
     found = Boxes.join(founds) if founds else truth.take(slice(0, 0))
     truth, found = _in_order(truth), _in_order(found)
-    ignorable = (truth.occlusion > MAX_OCCLUSION) | (truth.truncation > MAX_TRUNCATION) | (truth.category != category)
-    small = np.abs(found.box_px[:, 3] - found.box_px[:, 1]) <= MIN_HEIGHT_PX
+    ignorable = is_ignorable(truth, category)
     count = np.bincount(found.track_id)
     mean = np.bincount(found.track_id, weights=found.score) / np.maximum(count, 1)
-    row, col = _same_frame(truth, found, reach_m=True)
+    row, col = same_frame(truth, found, reach_m=True)
     overlap = overlap_3d(truth.take(row), found.take(col))
     touching = overlap > 0
     row, col, overlap = row[touching], col[touching], overlap[touching]
     return Scene(
-        truth, found, ignorable, small | _in_areas(found, area), mean[found.track_id] if len(found) else np.zeros(0),
+        truth, found, ignorable, is_small(found) | in_areas(found, area), mean[found.track_id] if len(found) else np.zeros(0),
         row, col, overlap, overlap >= iou,
     )  # fmt: skip
+
+
+def with_neighbors(category: str) -> list[str]:
+    """The category and the one that looks like it, whose labels are no errors."""
+    return [category, NEIGHBORS.get(category, category)]
+
+
+def is_ignorable(truth: Boxes, category: str) -> Mask:
+    """Which labels (A,) need not be found: too much of them is hidden or cut off, or they are of the neighboring category."""
+    return (truth.occlusion > MAX_OCCLUSION) | (truth.truncation > MAX_TRUNCATION) | (truth.category != category)
+
+
+def is_small(found: Boxes) -> Mask:
+    """Which boxes (B,) are too low in the image to be errors."""
+    return np.asarray(np.abs(found.box_px[:, 3] - found.box_px[:, 1]) <= MIN_HEIGHT_PX)
 
 
 def _shifted(boxes: Boxes, begin: int, sequence: int) -> Boxes:
@@ -80,8 +94,8 @@ def _in_order(boxes: Boxes) -> Boxes:
     return Boxes(**{**vars(boxes), "track_id": index.astype(np.int64)})
 
 
-def _same_frame(a: Boxes, b: Boxes, *, reach_m: bool) -> tuple[Index, Index]:
-    """All pairs of rows of the same frame, by frame; with `reach_m` only those whose boxes can touch."""
+def same_frame(a: Boxes, b: Boxes, *, reach_m: bool) -> tuple[Index, Index]:
+    """All pairs of rows of the same frame, by row of `a`; `b` is sorted by frame; with `reach_m` only those whose boxes can touch."""
     first, last = np.searchsorted(b.frame, a.frame, "left"), np.searchsorted(b.frame, a.frame, "right")
     count = last - first
     row = np.repeat(np.arange(len(a)), count)
@@ -94,10 +108,10 @@ def _same_frame(a: Boxes, b: Boxes, *, reach_m: bool) -> tuple[Index, Index]:
     return row, col
 
 
-def _in_areas(found: Boxes, area: Boxes) -> Mask:
+def in_areas(found: Boxes, area: Boxes) -> Mask:
     """Which found boxes lie by more than half in an area without labels, in the image."""
     area = area.take(np.argsort(area.frame, kind="stable"))
-    row, col = _same_frame(found, area, reach_m=False)
+    row, col = same_frame(found, area, reach_m=False)
     a, b = found.box_px[row], area.box_px[col]
     common = np.clip(np.minimum(a[:, 2:], b[:, 2:]) - np.maximum(a[:, :2], b[:, :2]), 0, None).prod(1)
     own = (a[:, 2:] - a[:, :2]).prod(1)

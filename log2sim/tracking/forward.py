@@ -213,9 +213,8 @@ class ForwardTracker:
     def _costs(self, columns: _Columns) -> _Costs:
         """Return minus twice the log-likelihoods (A, M) if tracks move, if they stand, and which are inside a gate."""
         squared, log_determinant = innovation(self.mean, self.covariance, columns.xy, columns.r, columns.age_s)
-        at_rest = np.pad(self.place_m, ((0, 0), (0, 2))), np.pad(self.place_covariance, ((0, 0), (0, 2), (0, 2)))
         squared_at_rest, log_determinant_at_rest = innovation(
-            *at_rest, columns.xy, columns.r, np.zeros(len(columns.xy))
+            self.place_m, self.place_covariance, columns.xy, columns.r, np.zeros(len(columns.xy))
         )
         inside = (squared <= CHI2_2DOF_999) | (self.standing[:, None] > 0) & (squared_at_rest <= CHI2_2DOF_999)
         return squared + log_determinant, squared_at_rest + log_determinant_at_rest, inside

@@ -41,7 +41,8 @@ def predict(mean: Array, covariance: Array, dt_s: Array | float, acceleration: A
 def innovation(mean: Array, covariance: Array, xy: Array, r: Array, age_s: Array) -> tuple[Array, Array]:
     """Return squared Mahalanobis distances and log-determinants, both (A, M), of measurements (M, 2) against states (A, 4).
 
-    `age_s` (M,) is when each was measured relative to the states: a sweep sees an object before or after the tick.
+    `age_s` (M,) is when each was measured relative to the states: a sweep sees an object before or after the tick. Where all are
+    0 the states may be places alone, (A, 2) with (A, 2, 2).
     """
     p = covariance[:, None]
     dx, dy = xy[:, 0] - mean[:, :1], xy[:, 1] - mean[:, 1:2]
