@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 Caster = Callable[[str, int], raycast.LabeledSweep]
 
 TRUTH_STEP_S = 0.05
-MAX_CACHED_SWEEPS = 64
+# Sweeps that were cast for the visibility of agents and are read next: memory for some hundred of 64 lines.
+MAX_CACHED_BYTES, BYTES_PER_RAY = 400_000_000, 28
 GNSS_CORRELATION_S = 2.0  # time constant of the errors of GNSS and IMU
 
 
@@ -144,8 +145,9 @@ def _backdrop(scene: Scene, seed: int) -> Any:
 def _caster(moving: MovingScene, seed: int) -> Caster:
     """Return a function that casts sweep `i` of the LiDAR of a name; the last sweeps are cached."""
     specs = {spec.name: (index, spec) for index, spec in enumerate(moving.scene.lidar)}
+    rays = max((len(raycast.ray_pattern(spec)[0]) for _, spec in specs.values()), default=1)
 
-    @lru_cache(maxsize=MAX_CACHED_SWEEPS)
+    @lru_cache(maxsize=max(1, MAX_CACHED_BYTES // (BYTES_PER_RAY * rays)))
     def cast(name: str, i: int) -> raycast.LabeledSweep:
         index, spec = specs[name]
         stamp = int(raycast.sweep_stamps(spec, moving.scene)[i])

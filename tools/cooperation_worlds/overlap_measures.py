@@ -75,19 +75,30 @@ def shares(found: Array, truth: Array) -> Array:
 
 
 def figures(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Means over variants by way, and the gain over the end alone that is better in each variant."""
+    """Means over variants by way, where the target is found, and the gain over the end alone that is better.
+
+    `over_better_end` is over the end that is better on average, `over_better_by_variant` over the one that is better in each
+    variant, which nobody knows beforehand; so is `worse_variants`.
+    """
     table = [{way: np.reshape(of_way, (-1, 2)) for way, of_way in r.items()} for r in rows]
-    means = {way: np.array([r[way].mean(0) for r in table]) for way in table[0]}
-    better = np.max([means[way][:, 1] for way in ALONE], axis=0)
-    best_on_average = max(float(means[way][:, 1].mean()) for way in ALONE)
+    means = {way: np.array([_mean(r[way]) for r in table]) for way in table[0]}
+    ends = np.array([means[way][:, 1] for way in ALONE if way in means])
+    better, best_on_average = np.nanmax(ends, axis=0), np.nanmean(ends, axis=1).max()
     return {
         way: {
-            "overlap": float(m[:, 0].mean()),
-            "iou": float(m[:, 1].mean()),
             "found": float(np.mean([(r[way][:, 1] > 0).mean() for r in table])),
-            "over_better_end": float(m[:, 1].mean()) - best_on_average,
-            "over_better_by_variant": float((m[:, 1] - better).mean()),
-            "worse_variants": int((m[:, 1] < better - WORSE_BY).sum()),
+            "overlap": float(np.nanmean(m[:, 0])),
+            "iou": float(np.nanmean(m[:, 1])),
+            "over_better_end": float(np.nanmean(m[:, 1]) - best_on_average),
+            "over_better_by_variant": float(np.nanmean(m[:, 1] - better)),
+            "worse_variants": int(np.sum(m[:, 1] < better - WORSE_BY)),
+            "never_found": int(np.isnan(m[:, 1]).sum()),
         }
         for way, m in means.items()
     }
+
+
+def _mean(shares: Array) -> Array:
+    """Return the mean overlap and IoU (2,) of the times at which the target is found; NaN without any."""
+    found = shares[shares[:, 1] > 0]
+    return found.mean(0) if len(found) else np.full(2, np.nan)

@@ -17,8 +17,9 @@ AROUND_30_M = (27.5, 32.5)
 
 
 def perceived(world: World, found: Found) -> Array:
-    """Rows (T, 2) of times during which the log was recorded: distance of the target, and whether it was perceived."""
-    t_s = np.arange(STEP_S, world.scene.duration_s - STEP_S, STEP_S)
+    """Rows (T, 2) of times from the first tick to the last one: distance of the target, and whether it was perceived."""
+    period_s = 1 / world.scene.lidar[0].rate_hz
+    t_s = np.arange(period_s, world.scene.duration_s - period_s, STEP_S)
     target = next(a for a in world.moving.actors if a.spec.id == world.target)
     xy, seen = target.at(t_s).center_m[:, :2], np.zeros(len(t_s), bool)
     for agent in agents_near(found.scenario, target.spec.category):

@@ -44,10 +44,19 @@ def blind_area_table(figures: dict[str, Any]) -> str:
 
 def overlap_table(figures: dict[str, Any]) -> str:
     """Test C."""
-    head = ["", "of", "overlap", "IoU", "over the better end", "over the better end of each variant", "worse variants"]
+    head = [
+        "",
+        "of",
+        "found",
+        "overlap",
+        "IoU",
+        "over the better end",
+        "over the better of each variant",
+        "worse variants",
+    ]
     rows = [
         [
-            NAMES[w], of, f"{f['overlap']:.3f}", f"{f['iou']:.3f}", f"{f['over_better_end']:+.3f}",
+            NAMES[w], of, _n(f["found"]), f"{f['overlap']:.3f}", f"{f['iou']:.3f}", f"{f['over_better_end']:+.3f}",
             f"{f['over_better_by_variant']:+.3f}", str(f["worse_variants"]),
         ]
         for of in ("boxes", "scenario")
