@@ -19,14 +19,25 @@ MIN_BOXES = 3
 # Within so much time of a box the velocity of its track is taken from.
 VELOCITY_SPAN_S = 0.5
 MAX_GAP_S = 0.7
+# Boxes of one object are of different sweeps; what is farther away than any limit is not linked.
+MIN_STEP_S, UNLIKELY_M = 0.01, 1e6
 # Kinds of road users that detectors tell apart.
 GROUPS = {"car": 0, "truck": 0, "bus": 0, "pedestrian": 1, "cyclist": 2, "motorcycle": 2, "bicycle": 2}
-# Standard deviations of a box's center: of one detection, and of all those of one object seen from one place.
-BOX_SIGMA_M, BOX_BIAS_M = 0.2, 0.15
+# How far centers of boxes by both ends are apart, measured in synthetic streets and roads with exact poses: the standard
+# deviation of one, and what all of one object have in common, as each end sees another side of it. Along and across the motion
+# of a vehicle, of others that move, and of what stands, which says little.
+SPREAD_M = {
+    "vehicle": ((0.17, 0.09), (0.2, 0.1)),
+    "small": ((0.07, 0.07), (0.12, 0.08)),
+    "standing": ((0.1, 0.1), (0.3, 0.3)),
+}
 # Two tracks of one object have velocities as like as boxes over a second tell.
 MAX_VELOCITY_APART_MPS = 4.0
-CAUCHY = 2.0
+# Boxes so many standard deviations apart count a quarter (Geman, McClure 1987), as they may be of different objects.
+TOO_FAR = 2.5
 MOVING_MPS = 1.0
+# By an error of a unit's pose, and of boxes.
+MAX_APART_M = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,53 +61,49 @@ class ObjectTrack:
 
     def at(self, t_s: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Interpolate places (N, 3) and velocities (N, 2) at times (N,), and say where they are known (N,)."""
-        place = np.stack([np.interp(t_s, self.t_s, column) for column in self.xyz_m.T], axis=1)
-        velocity = np.stack([np.interp(t_s, self.t_s, column) for column in self.velocity_mps.T], axis=1)
         after = np.searchsorted(self.t_s, t_s, side="left").clip(1, len(self.t_s) - 1)
-        gap = self.t_s[after] - self.t_s[after - 1]
+        begin, gap = self.t_s[after - 1], self.t_s[after] - self.t_s[after - 1]
+        share = ((t_s - begin) / gap)[:, None]
+        place, velocity = (c[after - 1] + share * (c[after] - c[after - 1]) for c in (self.xyz_m, self.velocity_mps))
         return place, velocity, (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1]) & (gap <= MAX_GAP_S)
 
 
 def link_boxes(boxes: Sequence[Boxes3D], site_m: Array, start_ns: int) -> list[ObjectTrack]:
     """Link boxes of successive moments to tracks."""
-    open_tracks: list[list[Array]] = []
+    growing: list[list[Array]] = []
     done: list[list[Array]] = []
     for found in boxes:
         rows = _rows_of(found, site_m, start_ns)
-        costs = np.array([[_cost(track, row) for row in rows] for track in open_tracks]).reshape(
-            len(open_tracks), len(rows)
-        )
-        first, second = linear_sum_assignment(np.where(np.isfinite(costs), costs, 1e6))
-        taken = [(a, b) for a, b in zip(first.tolist(), second.tolist()) if np.isfinite(costs[a, b])]
-        for a, b in taken:
-            open_tracks[a].append(rows[b])
-        used = {b for _, b in taken}
-        open_tracks += [[row] for b, row in enumerate(rows) if b not in used]
-        now_s = max((row[0] for row in rows), default=-np.inf)
-        done += [track for track in open_tracks if track[-1][0] < now_s - MAX_GAP_S]
-        open_tracks = [track for track in open_tracks if track[-1][0] >= now_s - MAX_GAP_S]
-    return [track_of(np.array(track)) for track in (*done, *open_tracks) if len(track) >= MIN_BOXES]
+        if len(rows) == 0:
+            continue
+        costs = np.array([_costs(track, rows) for track in growing]).reshape(len(growing), len(rows))
+        pairs = zip(*linear_sum_assignment(np.where(np.isfinite(costs), costs, UNLIKELY_M)))
+        taken = {int(b): int(a) for a, b in pairs if np.isfinite(costs[a, b])}
+        for b, a in taken.items():
+            growing[a].append(rows[b])
+        growing += [[row] for b, row in enumerate(rows) if b not in taken]
+        over_s = rows[:, 0].max() - MAX_GAP_S
+        done += [track for track in growing if track[-1][0] < over_s]
+        growing = [track for track in growing if track[-1][0] >= over_s]
+    return [track_of(np.array(track)) for track in (*done, *growing) if len(track) >= MIN_BOXES]
 
 
-def _rows_of(boxes: Boxes3D, site_m: Array, start_ns: int) -> list[Array]:
-    t_s = (boxes.t_ns - start_ns) / NS_PER_S
+def _rows_of(boxes: Boxes3D, site_m: Array, start_ns: int) -> Array:
+    """Return rows (M, 5) of time, place and group."""
     group = [GROUPS.get(str(category), -1) for category in boxes.category]
-    return list(np.column_stack([t_s, boxes.center_m - site_m, group]))
+    return np.column_stack([(boxes.t_ns - start_ns) / NS_PER_S, boxes.center_m - site_m, group])
 
 
-def _cost(track: list[Array], row: Array) -> float:
-    """How far a box is from where a track leads, m; infinite where they cannot be one object."""
+def _costs(track: list[Array], rows: Array) -> Array:
+    """Compute how far boxes (M,) are from where a track leads, m; infinite where they cannot be one object."""
     last = track[-1]
-    ahead_s = float(row[0] - last[0])
-    if row[4] != last[4] or ahead_s <= 0.01:
-        return float("inf")
-    if len(track) == 1:
-        away = float(np.hypot(*(row[1:3] - last[1:3])))
-        return away if away < MAX_SPEED_MPS * ahead_s + MAX_JUMP_M else float("inf")
-    before = track[-2]
-    velocity = (last[1:3] - before[1:3]) / (last[0] - before[0])
-    away = float(np.hypot(*(row[1:3] - last[1:3] - velocity * ahead_s)))
-    return away if away < MAX_JUMP_M else float("inf")
+    ahead_s = rows[:, 0] - last[0]
+    expected, limit = last[1:3], MAX_SPEED_MPS * ahead_s + MAX_JUMP_M
+    if len(track) > 1:
+        velocity = (last[1:3] - track[-2][1:3]) / (last[0] - track[-2][0])
+        expected, limit = last[1:3] + velocity * ahead_s[:, None], np.full(len(rows), MAX_JUMP_M)
+    away = np.hypot(*(rows[:, 1:3] - expected).T)
+    return np.where((rows[:, 4] == last[4]) & (ahead_s > MIN_STEP_S) & (away < limit), away, np.inf)
 
 
 def track_of(rows: Array) -> ObjectTrack:
@@ -112,16 +119,29 @@ def track_of(rows: Array) -> ObjectTrack:
 
 @dataclass(frozen=True, eq=False)
 class CommonObjects:
-    """Tracks of both ends.
+    """Tracks of the vehicle, with the vehicle itself, and for each those of the road that may show the same road user.
 
     Attributes
     ----------
-    vehicle, road : tuple of ObjectTrack
-        The former with the vehicle itself, if its poses are known.
+    pairs : tuple of (ObjectTrack, tuple of ObjectTrack)
     """
 
-    vehicle: tuple[ObjectTrack, ...]
-    road: tuple[ObjectTrack, ...]
+    pairs: tuple[tuple[ObjectTrack, tuple[ObjectTrack, ...]], ...]
+
+    @classmethod
+    def of(cls, vehicle: Sequence[ObjectTrack], road: Sequence[ObjectTrack]) -> CommonObjects:
+        """Pair tracks of one group that come near each other, at whatever time."""
+        near = [(seen, tuple(other for other in road if _may_be_one(seen, other))) for seen in vehicle]
+        return cls(tuple((seen, others) for seen, others in near if others))
+
+
+def _may_be_one(first: ObjectTrack, second: ObjectTrack) -> bool:
+    if first.group != second.group:
+        return False
+    (low, high), (other_low, other_high) = (
+        (track.xyz_m[:, :2].min(axis=0), track.xyz_m[:, :2].max(axis=0)) for track in (first, second)
+    )
+    return bool((low < other_high + MAX_APART_M).all() and (other_low < high + MAX_APART_M).all())
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,25 +172,38 @@ def match_objects(objects: CommonObjects, correction: Array, delay_s: float, wit
     """Match places of road users with those nearest to them, given a correction (4, 4) and a delay of the road's stamps."""
     information, gradient = np.zeros((7, 7)), np.zeros(7)
     away, moving, gain = [], 0, 0.0
-    for seen in objects.vehicle:
-        best = _best_match(seen, objects.road, correction, delay_s, within_m)
+    for seen, others in objects.pairs:
+        best = _best_match(seen, others, correction, delay_s, within_m)
         if best is None:
             continue
         place, velocity, off = best
-        away2 = (off**2).sum(axis=1)
-        away.append(np.sqrt(away2))
-        moving += bool(np.hypot(*velocity.mean(axis=0)) > MOVING_MPS)
-        gain += float(np.maximum(1 - away2 / within_m**2, 0).sum())
-        share = 1.0 / (1.0 + away2 / (CAUCHY * BOX_SIGMA_M) ** 2)
-        weight = share / (BOX_SIGMA_M**2 + share.sum() * BOX_BIAS_M**2)
-        jacobian = _jacobian(place, velocity)
-        information += np.einsum("naj,n,nak->jk", jacobian, weight, jacobian)
-        gradient += np.einsum("naj,n,na->j", jacobian, weight, off)
+        away.append(np.hypot(*off.T))
+        moves, turn, sigma, bias = _spread_of(seen, velocity)
+        moving += moves
+        gain += float((1 - away[-1] ** 2 / within_m**2).sum())
+        turned, jacobian = off @ turn.T, turn @ _jacobian(place, velocity)
+        # Boxes that jump say less than their number, all together too.
+        sigma, bias = np.maximum(sigma, turned.std(axis=0)), np.maximum(bias, turned.std(axis=0))
+        share = (1.0 + (turned**2 / (sigma**2 + bias**2)).sum(axis=1) / TOO_FAR**2) ** -2.0
+        weight = share[:, None] / (sigma**2 + share.sum() * bias**2)
+        information += np.einsum("naj,na,nak->jk", jacobian, weight, jacobian)
+        gradient += np.einsum("naj,na,na->j", jacobian, weight, turned)
     if not away:
         return None
     # Of a distance in the plane, the median is 1.18 times the standard deviation along an axis.
     rms_m = float(np.median(np.concatenate(away))) / 1.18 * np.sqrt(2.0)
-    return Matched(Evidence(information, gradient), len(away), moving, gain, rms_m)
+    return Matched(Evidence(information, gradient), len(away), moving, gain, float(rms_m))
+
+
+def _spread_of(seen: ObjectTrack, velocity: Array) -> tuple[bool, Array, Array, Array]:
+    """Return whether an object moves, the axes (2, 2) along and across its motion, and the sigmas and biases (2,) along them."""
+    forward = velocity.mean(axis=0)
+    speed = float(np.hypot(*forward))
+    moves = speed > MOVING_MPS
+    kind = "standing" if not moves else "vehicle" if seen.group == GROUPS["car"] else "small"
+    sigma, bias = np.array(SPREAD_M[kind])
+    x, y = forward / speed if moves else (1.0, 0.0)
+    return moves, np.array([[x, y], [-y, x]]), sigma, bias
 
 
 def _jacobian(place: Array, velocity: Array) -> Array:
@@ -189,8 +222,6 @@ def _best_match(
     """Find the track of the road that a vehicle's track is nearest to: its places, velocities, and offsets from the latter's."""
     best, best_gain = None, 0.0
     for other in road:
-        if other.group != seen.group:
-            continue
         place, velocity, known = other.at(seen.t_s + delay_s)
         known &= np.hypot(*(velocity - seen.velocity_mps).T) < MAX_VELOCITY_APART_MPS
         if not known.any():

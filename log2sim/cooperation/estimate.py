@@ -23,7 +23,7 @@ from log2sim.localization.ego_sweeps import lidars_on_ego
 SURFACE_WITHIN_M = (2.0, 1.5, 1.0, 0.7, 0.5, 0.4, 0.3, 0.3, 0.3)
 OBJECT_WITHIN_M = (2.5, 2.0, 1.5, 1.2, 1.0, 1.0, 1.0, 1.0, 1.0)
 # Delays that are tried; stamps of a sweep's begin instead of its end are early by a period.
-TRIED_DELAYS_S = np.arange(-0.2, 0.551, 0.05)
+TRIED_DELAYS_S = np.arange(-0.2, 0.51, 0.1)
 JUDGED_WITHIN_M = 0.5
 # Of the lowest points around a pole, those of the ground.
 GROUND_RADIUS_M, GROUND_SHARE = 20.0, 0.1
@@ -89,7 +89,7 @@ def look_around(log: Log, config: Config, unit: Unit, report: Callable[[int, int
 def _objects_around(log: Log, config: Config, unit: Unit, road_m: Array) -> CommonObjects:
     moments = choose_moments(log, unit.site_m, during_ns(log, config))
     if log.ego is None or len(moments) == 0:
-        return CommonObjects((), ())
+        return CommonObjects(())
     of_vehicle, of_road = detectors_of(log, config)
     pose, _ = log.ego.at(moments)
     floor = pose[:, :3, 3] + pose[:, :3, 2] * log.ground_z_ego_m
@@ -100,7 +100,7 @@ def _objects_around(log: Log, config: Config, unit: Unit, road_m: Array) -> Comm
     own = np.column_stack([(moments - start) / NS_PER_S, log.ego_centers(pose) - unit.site_m, np.zeros(len(moments))])
     seen = link_boxes(detect_boxes(log, lidars_on_ego(log), of_vehicle, moments, floor), unit.site_m, start)
     road = link_boxes(detect_boxes(log, unit.lidars, of_road, moments, at_pole), unit.site_m, start)
-    return CommonObjects((track_of(own), *seen), tuple(road))
+    return CommonObjects.of((track_of(own), *seen), road)
 
 
 def estimate_error(sight: Sight) -> Estimate:
@@ -111,8 +111,9 @@ def estimate_error(sight: Sight) -> Estimate:
     Structure first, with limits that become tighter; then the delay with which most common objects fall onto each other; then
     all together by Gauss and Newton's method.
     """
-    by_structure, covariance = _refine(sight, np.zeros(7), with_objects=False)
-    values, covariance = _refine(sight, _start(sight, by_structure), with_objects=True)
+    by_structure, _ = _refine(sight, np.zeros(7), with_objects=False)
+    tried = [_refine(sight, start, with_objects=True) for start in _starts(sight, by_structure)]
+    values, covariance = max(tried, key=lambda found: _gain(sight, found[0], OBJECT_WITHIN_M[-1]))
     return Estimate(
         values,
         covariance,
@@ -121,16 +122,18 @@ def estimate_error(sight: Sight) -> Estimate:
     )
 
 
-def _start(sight: Sight, by_structure: Array) -> Array:
-    """Choose the delay, and the pose by structure or that of the calibration, by which objects fit best."""
-    best, best_gain = by_structure, 0.0
-    for pose in (by_structure, np.zeros(7)):
-        for delay_s in TRIED_DELAYS_S[np.argsort(np.abs(TRIED_DELAYS_S), kind="stable")]:
-            tried = np.append(pose[:DELAY], delay_s)
-            found = _objects(sight, tried, OBJECT_WITHIN_M[0])
-            if found is not None and found.gain > best_gain:
-                best, best_gain = tried, found.gain
-    return best
+def _starts(sight: Sight, by_structure: Array) -> list[Array]:
+    """Choose delays, and the pose by structure or that of the calibration, by which objects fit best: within a wide and a narrow limit."""
+    nearest_first = TRIED_DELAYS_S[np.argsort(np.abs(TRIED_DELAYS_S), kind="stable")]
+    tried = [np.append(pose[:DELAY], delay_s) for pose in (by_structure, np.zeros(7)) for delay_s in nearest_first]
+    limits = (OBJECT_WITHIN_M[0], OBJECT_WITHIN_M[-1])
+    chosen = {int(np.argmax([_gain(sight, values, within_m) for values in tried])) for within_m in limits}
+    return [tried[k] for k in sorted(chosen)]
+
+
+def _gain(sight: Sight, values: Array, within_m: float) -> float:
+    found = _objects(sight, values, within_m)
+    return 0.0 if found is None else found.gain
 
 
 def _refine(sight: Sight, start: Array, *, with_objects: bool) -> tuple[Array, Array]:

@@ -72,19 +72,22 @@ def match_structure(surfaces: Surfaces, road_m: Array, correction: Array, within
     Point-to-plane ICP (Chen, Medioni, IVC 1992) with Cauchy weights; posts hold points in two directions.
     """
     at = road_m @ correction[:3, :3].T + correction[:3, 3]
-    away, index = surfaces.tree.query(at, distance_upper_bound=within_m)
+    away, index = surfaces.tree.query(at, distance_upper_bound=np.hypot(within_m, surfaces.reach_m.max()))
     found = np.flatnonzero(np.isfinite(away))
+    off = at[found] - surfaces.xyz_m[index[found]]
+    first = np.einsum("kj,kj->k", surfaces.normals[index[found], 0], off)
+    along_m = np.sqrt(np.maximum(away[found] ** 2 - first**2, 0.0))
+    near = (np.abs(first) < within_m) & (along_m < np.maximum(surfaces.reach_m[index[found]], within_m))
+    found, off, first = found[near], off[near], first[near]
     if len(found) < FEW_PIECES:
         return None
     at, piece = at[found], index[found]
     post = surfaces.post[piece]
     normals = np.concatenate([surfaces.normals[piece, 0], surfaces.normals[piece[post], 1]])
-    off = at - surfaces.xyz_m[piece]
     at, off = np.concatenate([at, at[post]]), np.concatenate([off, off[post]])
     residual = np.einsum("kj,kj->k", normals, off)
     jacobian = np.hstack([normals, np.cross(at, normals)])
     share, weight = _weights(normals, residual, np.concatenate([post, post[post]]))
-    first = residual[: len(found)]
     return MatchedStructure(
         _damped(jacobian, residual, share, weight),
         len(found),

@@ -23,7 +23,12 @@ MAX_VEHICLE_SWEEPS, MAX_ROAD_SWEEPS = 16, 10
 MAX_SWEEP_POINTS = 20_000
 # Sweeps of a moving vehicle from places nearer to each other than this show the same.
 MIN_APART_M = 0.5
-VOXEL_M, NEIGHBORS, NEIGHBORHOOD_M = 0.25, 12, 0.9
+NEIGHBORS = 12
+# Voxels and largest neighborhoods: fine ones where there are many points, coarse ones between the rings of a vehicle that stands.
+VOXEL_M = 0.25
+SCALES_M = ((VOXEL_M, 0.9), (0.7, 3.0), (2.0, 7.0))
+# What an error of 0.5 m and 2 degrees moves at the end of the reach.
+MAX_ERROR_M = 2.5
 # A piece of a plane is thin (RMS over its points, range noise and all) and no line, as the points of one ring are.
 MAX_THICKNESS_M, MIN_WIDTH_M = 0.06, 0.1
 MIN_UPRIGHT_Z, MAX_POST_WIDTH_M, MIN_POST_LENGTH_M = 0.95, 0.12, 0.25
@@ -41,12 +46,15 @@ class Surfaces:
     xyz_m : (P, 3) float64, m
     normals : (P, 2, 3) float64
         Directions in which each piece holds a point: one of a plane, turned to where it was seen from, and NaN; two of a post.
+    reach_m : (P,) float64, m
+        How far along itself each piece goes.
     tree : cKDTree
         Of `xyz_m`.
     """
 
     xyz_m: Array
     normals: Array
+    reach_m: Array
     tree: cKDTree
 
     @property
@@ -78,7 +86,9 @@ def view_from_vehicle(log: Log, site_m: Array, during_ns: tuple[int, int] | None
     """Collect points of the vehicle's LiDARs around a site (3,), m, by the poses of the ego; None where it never comes near."""
     if log.ego is None:
         return None
-    points, sensors, rows = [], [], []
+    points: list[Array] = []
+    sensors: list[Array] = []
+    rows: list[NDArray[np.int64]] = []
     lidars = lidars_on_ego(log)
     for name in lidars:
         for i in _near_sweeps(log, name, site_m, during_ns, MAX_VEHICLE_SWEEPS // len(lidars) or 1):
@@ -176,20 +186,35 @@ def thin(xyz_m: Array, voxel_m: float) -> Array:
 
 
 def surfaces_of(view: VehicleView, near_m: Array) -> Surfaces | None:
-    """Find pieces of planes and posts in what the vehicle saw, within an error of the pose of points (N, 3) of the road."""
-    if len(near_m) == 0:
-        return None
-    both = thin(np.hstack([view.xyz_m, view.sensor_m[view.sweep]]), VOXEL_M)
-    close = cKDTree(near_m).query(both[:, :3], distance_upper_bound=2.5)[0]
-    both = both[np.isfinite(close)]
-    if len(both) < NEIGHBORS:
-        return None
-    xyz, sensor = both[:, :3], both[:, 3:]
-    away, index = cKDTree(xyz).query(xyz, k=NEIGHBORS)
-    near = away[:, -1] < NEIGHBORHOOD_M
-    xyz, sensor, around = xyz[near], sensor[near], xyz[index[near]]
-    if len(xyz) == 0:
-        return None
+    """Find pieces of planes and posts in what the vehicle saw, within an error of the pose of points (N, 3) of the road.
+
+    Where points are too sparse for fine pieces, as between the rings of a LiDAR on a vehicle that stands, coarser ones fill in.
+    """
+    points = thin(np.hstack([view.xyz_m, view.sensor_m[view.sweep]]), VOXEL_M)
+    near = (
+        cKDTree(near_m).query(points[:, :3], distance_upper_bound=MAX_ERROR_M)[0]
+        if len(near_m)
+        else np.full(len(points), np.inf)
+    )
+    points = points[np.isfinite(near)]
+    middles, normals, reach = np.zeros((0, 3)), np.zeros((0, 2, 3)), np.zeros(0)
+    for voxel_m, radius_m in SCALES_M:
+        found, facing = _pieces(thin(points, voxel_m), radius_m)
+        if len(middles) and len(found):
+            alone = ~np.isfinite(cKDTree(middles).query(found, distance_upper_bound=voxel_m)[0])
+            found, facing = found[alone], facing[alone]
+        middles, normals = np.concatenate([middles, found]), np.concatenate([normals, facing])
+        reach = np.concatenate([reach, np.full(len(found), voxel_m)])
+    return Surfaces(middles, normals, reach, cKDTree(middles)) if len(middles) else None
+
+
+def _pieces(points: Array, radius_m: float) -> tuple[Array, Array]:
+    """Find pieces of planes and posts among points with the places of their sensors (N, 6): middles (P, 3), normals (P, 2, 3)."""
+    if len(points) < NEIGHBORS:
+        return np.zeros((0, 3)), np.zeros((0, 2, 3))
+    away, index = cKDTree(points[:, :3]).query(points[:, :3], k=NEIGHBORS)
+    near = away[:, -1] < radius_m
+    sensor, around = points[near, 3:], points[index[near], :3]
     middle = around.mean(axis=1)
     off = around - middle[:, None]
     spread, axes = np.linalg.eigh(off.transpose(0, 2, 1) @ off / NEIGHBORS)
@@ -202,6 +227,4 @@ def surfaces_of(view: VehicleView, near_m: Array) -> Surfaces | None:
     normals[plane, 1] = np.nan
     # The pole, at the origin, cannot see a plane from behind.
     seen = post | (plane & (np.einsum("nj,nj->n", normals[:, 0], -middle) > 0))
-    if not seen.any():
-        return None
-    return Surfaces(middle[seen], normals[seen], cKDTree(middle[seen]))
+    return middle[seen], normals[seen]

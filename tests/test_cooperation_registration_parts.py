@@ -1,0 +1,248 @@
+"""Parts of the registration of roadside units: objects, structure, free space, units, and what is told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from log2sim.calibration.twists import exp_of
+from log2sim.cooperation.common_objects import CommonObjects, ObjectTrack, link_boxes, track_of
+from log2sim.cooperation.estimate import Estimate, Sight, estimate_error
+from log2sim.cooperation.findings import Findings
+from log2sim.cooperation.free_space import Visibility, look_through
+from log2sim.cooperation.structure import Surfaces, VehicleView, surfaces_of, view_from_road
+from log2sim.cooperation.units import Unit, correct_unit, units_of
+from log2sim.datatypes import Boxes3D, Lidar, Log, Stream, Sweep
+from log2sim.geometry import Array, Camera, apply, inverse, transform
+
+UNIT = Unit(("pole",), (), np.zeros(3))
+ERROR = np.array([0.3, -0.35, 0.2, 0.01, -0.02, 0.025])
+
+
+# --- common objects
+
+
+def drive(start: tuple[float, float], velocity: tuple[float, float], t_s: Array, group: int = 0) -> ObjectTrack:
+    place = np.array(start) + t_s[:, None] * np.array(velocity)
+    return track_of(np.column_stack([t_s, place, np.full(len(t_s), -3.0), np.full(len(t_s), group)]))
+
+
+def seen_by_road(track: ObjectTrack, error: Array, delay_s: float) -> ObjectTrack:
+    """The track as a road end with an error of its pose and late stamps gives it."""
+    wrong = inverse(exp_of(error))
+    velocity = track.velocity_mps @ wrong[:2, :2].T
+    return ObjectTrack(track.t_s + delay_s, apply(wrong, track.xyz_m), velocity, track.group)
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.1, 0.3])
+def test_traffic_alone_shows_the_pose_in_the_plane_and_the_delay(delay_s: float) -> None:
+    t_s = np.arange(0.0, 4.0, 0.2)
+    cars = [
+        drive((-20, 3), (10, 0), t_s),
+        drive((25, -3), (-12, 0), t_s),
+        drive((8, -15), (0, 5), t_s),
+        drive((-5, 8), (1.2, -0.4), t_s, 1),
+    ]
+    error = ERROR * np.array([1, 1, 0, 0, 0, 1])
+    objects = CommonObjects.of(cars, [seen_by_road(car, error, delay_s) for car in cars])
+    found = estimate_error(Sight(None, np.zeros((0, 3)), None, objects))
+    assert found.values[6] == pytest.approx(delay_s, abs=0.01)
+    assert found.values[[0, 1]] == pytest.approx(error[:2], abs=0.04)
+    assert np.degrees(found.values[5] - error[5]) == pytest.approx(0.0, abs=0.1)
+
+
+def test_objects_that_stand_say_nothing_about_the_delay() -> None:
+    t_s = np.arange(0.0, 4.0, 0.2)
+    cars = [drive((x, y), (0, 0), t_s) for x, y in ((-10, 3), (12, -4), (5, 9))]
+    found = estimate_error(Sight(None, np.zeros((0, 3)), None, CommonObjects.of(cars, cars)))
+    assert np.sqrt(found.covariance[6, 6]) == pytest.approx(0.3, rel=0.01)
+    assert not Findings(UNIT, found, (None, None)).late
+
+
+def test_a_track_follows_the_nearest_box_of_its_kind() -> None:
+    t_ns = (np.arange(8) * 2e8).astype(np.int64)
+    boxes = []
+    for t in t_ns:
+        x = 8.0 * t / 1e9
+        center = np.array([[x, 0.0, 0.0], [30 - x, 4.0, 0.0], [x, 1.0, 0.0]])
+        flat, kind = np.ones(3), np.array(["car", "car", "pedestrian"])
+        boxes.append(Boxes3D(np.full(3, t), center, np.ones((3, 3)), flat, flat, kind, flat, np.ones(3, np.int64)))
+    tracks = sorted(link_boxes(boxes, np.zeros(3), 0), key=lambda track: track.xyz_m[0, 1])
+    assert [len(track.t_s) for track in tracks] == [8, 8, 8]
+    assert [round(float(track.velocity_mps[3, 0])) for track in tracks] == [8, 8, -8]
+
+
+# --- structure
+
+
+def walls(step_m: float) -> tuple[Array, Array]:
+    """Points on the ground and two walls around a pole 4 m high at the origin, and a sensor that sees them."""
+    span = np.arange(-15, 15, step_m)
+    x, y = (a.ravel() for a in np.meshgrid(span, span))
+    ground = np.stack([x, y, np.full_like(x, -4.0)], axis=1)
+    u, v = (a.ravel() for a in np.meshgrid(span, np.arange(-4, 2, step_m)))
+    across, along = np.stack([np.full_like(u, 16.0), u, v], axis=1), np.stack([u, np.full_like(u, 17.0), v], axis=1)
+    return np.concatenate([ground, across, along]), np.array([[0.0, -2.0, -2.0]])
+
+
+def view_of(points: Array, sensors: Array) -> VehicleView:
+    return VehicleView(points, sensors, np.zeros(len(points), np.int64))
+
+
+def test_walls_and_ground_show_the_whole_pose() -> None:
+    rng = np.random.default_rng(0)
+    points, sensors = walls(0.3)
+    surfaces = surfaces_of(view_of(points + rng.normal(0, 0.01, points.shape), sensors), points)
+    road = apply(inverse(exp_of(ERROR)), walls(0.7)[0] + 0.13)
+    road = road + rng.normal(0, 0.01, road.shape)
+    found = estimate_error(Sight(None, road - 0.0, surfaces, CommonObjects(())))
+    assert np.linalg.norm(found.values[3:6] - ERROR[3:]) < np.radians(0.1)
+    # All points of the road were moved by 0.13 m along each axis, too.
+    assert found.values[:3] == pytest.approx(ERROR[:3] - 0.13, abs=0.03)
+    findings = Findings(UNIT, found, (None, None))
+    assert findings.moved
+    assert findings.verified
+
+
+def test_the_ground_alone_shows_height_and_tilt_and_no_more() -> None:
+    points, sensors = walls(0.3)
+    ground = points[points[:, 2] == -4.0]
+    surfaces = surfaces_of(view_of(ground, sensors), ground)
+    found = estimate_error(Sight(None, apply(inverse(exp_of(ERROR)), ground[::5]), surfaces, CommonObjects(())))
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert found.values[[2, 3, 4]] == pytest.approx(ERROR[[2, 3, 4]], abs=0.03)
+    assert (sigma[:2] > 0.4).all()
+    assert np.abs(found.values[[0, 1, 5]]).max() < 0.05
+    assert not Findings(UNIT, found, (None, None)).verified
+
+
+def test_a_wall_is_not_matched_from_behind() -> None:
+    points, sensors = walls(0.3)
+    surfaces = surfaces_of(view_of(points, sensors + np.array([30.0, 0.0, 0.0])), points)
+    assert surfaces is not None
+    # The wall across stands between the sensor and the pole now: it shows the pole its back.
+    assert not (np.abs(surfaces.xyz_m[:, 0] - 16.0) < 0.1).any()
+
+
+def test_a_post_holds_both_directions() -> None:
+    z = np.arange(-4, 2, 0.05)
+    angle = np.linspace(0, np.pi, 5)
+    post = np.concatenate(
+        [np.stack([5 + 0.05 * np.cos(a) + 0 * z, 3 + 0.05 * np.sin(a) + 0 * z, z], axis=1) for a in angle]
+    )
+    surfaces = surfaces_of(view_of(post, np.array([[0.0, 0.0, -2.0]])), post)
+    assert surfaces is not None
+    assert surfaces.post.any()
+    assert np.abs(surfaces.normals[surfaces.post][..., 2]).max() < 0.1
+
+
+# --- free space
+
+
+def test_what_the_vehicle_saw_through_contradicts_a_pose() -> None:
+    points, sensors = walls(0.25)
+    upright = points[points[:, 2] > -3.0]
+    healthy = look_through(view_of(points, sensors), points)
+    assert healthy.contradicting < 0.05
+    assert healthy.seen > 0.8 * len(upright)
+    nearer = apply(transform(np.eye(3), np.array([-8.0, -8.0, 0.0])), points)
+    assert look_through(view_of(points, sensors), nearer).contradicting > 0.8
+
+
+# --- units
+
+
+def sweep_log(frame: str = "lidar") -> Log:
+    lidars = {
+        name: Lidar(name, "map", transform(np.eye(3), np.array([x, 0.0, 4.0])))
+        for name, x in (("pole", 0.0), ("beside", 1.0), ("far", 40.0))
+    }
+    camera = Camera(
+        "eye", 640, 480, np.eye(3), mount="map", mount_T_cam=transform(np.eye(3), np.array([0.5, 0.0, 4.0]))
+    )
+    t_ns = np.array([10**9, 2 * 10**9])
+    xyz = np.random.default_rng(0).uniform(-5, 5, (50, 3))
+
+    def read(i: int) -> Sweep:
+        return Sweep(int(t_ns[i]), xyz, frame, np.full(50, t_ns[i]))  # type: ignore[arg-type]
+
+    streams = {name: Stream(name, t_ns, read) for name in lidars} | {"eye": Stream("eye", t_ns, lambda i: i)}
+    return Log("log", "test", {"eye": camera}, lidars, streams)
+
+
+def test_sensors_of_one_pole_are_one_unit() -> None:
+    log = sweep_log()
+    units = units_of(log, list(log.lidars))
+    assert [(set(unit.lidars), unit.cameras) for unit in units] == [({"pole", "beside"}, ("eye",)), ({"far"}, ())]
+
+
+@pytest.mark.parametrize("frame", ["lidar", "map"])
+def test_a_unit_is_corrected_with_its_cameras_and_its_clock(frame: str) -> None:
+    log = sweep_log(frame)
+    unit = units_of(log, list(log.lidars))[0]
+    right = correct_unit(log, unit, exp_of(ERROR), 0.25)
+    at = unit.site_m
+    expected = apply(exp_of(ERROR), log.lidars["pole"].mount_T_lidar[None, :3, 3] - at)[0] + at
+    assert right.lidars["pole"].mount_T_lidar[:3, 3] == pytest.approx(expected)
+    assert right.lidars["far"] is log.lidars["far"]
+    apart = inverse(log.lidars["pole"].mount_T_lidar) @ log.cameras["eye"].mount_T_cam
+    assert inverse(right.lidars["pole"].mount_T_lidar) @ right.cameras["eye"].mount_T_cam == pytest.approx(apart)
+    assert right.streams["eye"].t_ns.tolist() == (log.streams["eye"].t_ns - 250_000_000).tolist()
+    assert right.streams["eye"].read(1) == 1
+    before, after = log.streams["pole"].read(0), right.streams["pole"].read(0)
+    assert after.t_ns.tolist() == (before.t_ns - 250_000_000).tolist()
+    moved = apply(exp_of(ERROR), before.xyz_m - at) + at
+    assert after.xyz_m == pytest.approx(before.xyz_m if frame == "lidar" else moved)
+
+
+def test_what_passes_is_not_what_stands() -> None:
+    rng = np.random.default_rng(0)
+    wall = np.stack([np.full(400, 10.0), rng.uniform(-5, 5, 400), rng.uniform(-3, 1, 400)], axis=1)
+    t_ns = (np.arange(20) * 1e8).astype(np.int64)
+
+    def read(i: int) -> Sweep:
+        car = np.array([5.0, -8.0 + 0.8 * i, -2.0]) + rng.uniform(-0.2, 0.2, (50, 3))
+        return Sweep(int(t_ns[i]), np.concatenate([wall, car]))
+
+    log = Log("log", "test", {}, {"pole": Lidar("pole", "map", np.eye(4))}, {"pole": Stream("pole", t_ns, read)})
+    seen = view_from_road(log, ["pole"], np.zeros(3))
+    assert (np.abs(seen[:, 0] - 10.0) < 0.01).all()
+
+
+# --- what is told
+
+
+def estimate(values: Array, sigma: Array) -> Estimate:
+    return Estimate(values, np.diag(sigma**2), (None, None), (None, None))
+
+
+FINE = np.array([0.02, 0.02, 0.03, 0.003, 0.003, 0.001, 0.01])
+
+
+def test_a_contradiction_is_told_and_corrects_nothing() -> None:
+    findings = Findings(UNIT, estimate(np.zeros(7), FINE), (Visibility(20, 80), Visibility(20, 80)))
+    assert [fault.treatment for fault in findings.faults()] == ["left_out"]
+    assert not findings.applied.any()
+    assert Findings(UNIT, findings.found, (Visibility(5, 8), Visibility(5, 8))).faults() == []
+
+
+def test_what_chance_explains_or_does_not_matter_is_not_told() -> None:
+    small = np.array([0.05, 0.05, 0.0, 0.0, 0.0, 0.002, 0.01])
+    loose = replace(estimate(np.array([0.3, 0.2, 0, 0, 0, 0.01, 0.1]), 8 * FINE))
+    for found in (estimate(small, FINE), loose):
+        findings = Findings(UNIT, found, (None, None))
+        assert findings.faults() == []
+        assert not findings.applied.any()
+
+
+def test_a_pose_that_nothing_ties_to_the_map_is_said_to_be_unverified() -> None:
+    findings = Findings(UNIT, estimate(np.zeros(7), 20 * FINE), (None, None))
+    assert [(fault.kind, fault.treatment) for fault in findings.faults()] == [("unknown_road_pose", "kept")]
+
+
+def test_pieces_without_neighbors_are_no_surface() -> None:
+    assert surfaces_of(view_of(np.eye(3), np.zeros((1, 3))), np.eye(3)) is None
+    assert Surfaces(np.eye(3), np.full((3, 2, 3), np.nan), np.ones(3), cKDTree(np.eye(3))).post.sum() == 0
