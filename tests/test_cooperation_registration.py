@@ -22,7 +22,7 @@ POLE = "pole0"
 @pytest.fixture(scope="module")
 def street() -> World:
     """A street with buildings, moving traffic, and a LiDAR of 16 lines on a pole."""
-    return draw_world(WorldSpec(kind="street", seed=0, azimuth_step_deg=0.8, duration_s=3.0))
+    return draw_world(WorldSpec(kind="street", seed=0, azimuth_step_deg=1.2, duration_s=2.0))
 
 
 def register(log: Log, **asked: object) -> RoadRegistration:

@@ -48,7 +48,7 @@ def test_traffic_alone_shows_the_pose_in_the_plane_and_the_delay(delay_s: float)
     ]
     error = ERROR * np.array([1, 1, 0, 0, 0, 1])
     objects = CommonObjects.of(cars, [seen_by_road(car, error, delay_s) for car in cars])
-    found = estimate_error(Sight(None, np.zeros((0, 3)), None, objects))
+    found = estimate_error(Sight(None, np.zeros((0, 3)), None, None, objects))
     assert found.values[6] == pytest.approx(delay_s, abs=0.01)
     assert found.values[[0, 1]] == pytest.approx(error[:2], abs=0.04)
     assert np.degrees(found.values[5] - error[5]) == pytest.approx(0.0, abs=0.1)
@@ -57,7 +57,7 @@ def test_traffic_alone_shows_the_pose_in_the_plane_and_the_delay(delay_s: float)
 def test_objects_that_stand_say_nothing_about_the_delay() -> None:
     t_s = np.arange(0.0, 4.0, 0.2)
     cars = [drive((x, y), (0, 0), t_s) for x, y in ((-10, 3), (12, -4), (5, 9))]
-    found = estimate_error(Sight(None, np.zeros((0, 3)), None, CommonObjects.of(cars, cars)))
+    found = estimate_error(Sight(None, np.zeros((0, 3)), None, None, CommonObjects.of(cars, cars)))
     assert np.sqrt(found.covariance[6, 6]) == pytest.approx(0.3, rel=0.01)
     assert not Findings(UNIT, found, (None, None)).late
 
@@ -98,7 +98,7 @@ def test_walls_and_ground_show_the_whole_pose() -> None:
     surfaces = surfaces_of(view_of(points + rng.normal(0, 0.01, points.shape), sensors), points)
     road = apply(inverse(exp_of(ERROR)), walls(0.7)[0] + 0.13)
     road = road + rng.normal(0, 0.01, road.shape)
-    found = estimate_error(Sight(None, road - 0.0, surfaces, CommonObjects(())))
+    found = estimate_error(Sight(None, road - 0.0, surfaces, None, CommonObjects(())))
     assert np.linalg.norm(found.values[3:6] - ERROR[3:]) < np.radians(0.1)
     # All points of the road were moved by 0.13 m along each axis, too.
     assert found.values[:3] == pytest.approx(ERROR[:3] - 0.13, abs=0.03)
@@ -111,7 +111,7 @@ def test_the_ground_alone_shows_height_and_tilt_and_no_more() -> None:
     points, sensors = walls(0.3)
     ground = points[points[:, 2] == -4.0]
     surfaces = surfaces_of(view_of(ground, sensors), ground)
-    found = estimate_error(Sight(None, apply(inverse(exp_of(ERROR)), ground[::5]), surfaces, CommonObjects(())))
+    found = estimate_error(Sight(None, apply(inverse(exp_of(ERROR)), ground[::5]), surfaces, None, CommonObjects(())))
     sigma = np.sqrt(np.diag(found.covariance))
     assert found.values[[2, 3, 4]] == pytest.approx(ERROR[[2, 3, 4]], abs=0.03)
     assert (sigma[:2] > 0.4).all()

@@ -19,7 +19,7 @@ from log2sim.datatypes import Log
 from log2sim.sensors import choose_detector, select_sensors
 
 TARGET_M, TARGET_DEG, TARGET_S = 0.1, 0.3, 0.02
-RATES_HZ = (10.0, 2.0, 20.0, 5.0)
+RATES_HZ = (10.0, 5.0, 2.0, 20.0)
 
 
 @dataclass(frozen=True)

@@ -54,8 +54,8 @@ class WorldSpec:
     poles: int = 1
     vehicle_rate_hz: float = 10.0
     road_rate_hz: float = 10.0
-    duration_s: float = 5.0
-    azimuth_step_deg: float = 0.4
+    duration_s: float = 4.5
+    azimuth_step_deg: float = 0.5
 
 
 @dataclass(frozen=True, eq=False)

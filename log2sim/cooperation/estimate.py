@@ -11,6 +11,7 @@ from log2sim.calibration.twists import exp_of, log_of
 from log2sim.config import Config
 from log2sim.cooperation.common_objects import CommonObjects, Matched, link_boxes, match_objects, track_of
 from log2sim.cooperation.detections import choose_moments, detect_boxes, detectors_of
+from log2sim.cooperation.ground_match import CommonGround, common_ground, ground_below, match_ground
 from log2sim.cooperation.pose_fit import DELAY, PRIOR_SIGMA, MatchedStructure, match_structure, solve
 from log2sim.cooperation.structure import Surfaces, VehicleView, surfaces_of, view_from_road, view_from_vehicle
 from log2sim.cooperation.units import Unit
@@ -25,9 +26,6 @@ OBJECT_WITHIN_M = (2.5, 2.0, 1.5, 1.2, 1.0, 1.0, 1.0, 1.0, 1.0)
 # Delays that are tried; stamps of a sweep's begin instead of its end are early by a period.
 TRIED_DELAYS_S = np.arange(-0.2, 0.51, 0.1)
 JUDGED_WITHIN_M = 0.5
-# Of the lowest points around a pole, those of the ground.
-GROUND_RADIUS_M, GROUND_SHARE = 20.0, 0.1
-GROUND_BELOW_M = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +39,14 @@ class Sight:
     road_m : (N, 3) float64, m
         What stands still by the unit's LiDARs.
     surfaces : Surfaces or None
+    ground : CommonGround or None
     objects : CommonObjects
     """
 
     view: VehicleView | None
     road_m: Array
     surfaces: Surfaces | None
+    ground: CommonGround | None
     objects: CommonObjects
 
 
@@ -83,7 +83,8 @@ def look_around(log: Log, config: Config, unit: Unit, report: Callable[[int, int
     report(1, 3)
     surfaces = None if view is None else surfaces_of(view, road)
     report(2, 3)
-    return Sight(view, road, surfaces, _objects_around(log, config, unit, road))
+    ground = None if view is None else common_ground(view, road)
+    return Sight(view, road, surfaces, ground, _objects_around(log, config, unit, road))
 
 
 def _objects_around(log: Log, config: Config, unit: Unit, road_m: Array) -> CommonObjects:
@@ -93,9 +94,7 @@ def _objects_around(log: Log, config: Config, unit: Unit, road_m: Array) -> Comm
     of_vehicle, of_road = detectors_of(log, config)
     pose, _ = log.ego.at(moments)
     floor = pose[:, :3, 3] + pose[:, :3, 2] * log.ground_z_ego_m
-    near = road_m[np.hypot(road_m[:, 0], road_m[:, 1]) < GROUND_RADIUS_M, 2]
-    below = float(np.quantile(near, GROUND_SHARE)) if len(near) else -GROUND_BELOW_M
-    at_pole = np.repeat((unit.site_m + np.array([0.0, 0.0, below]))[None], len(moments), axis=0)
+    at_pole = np.repeat((unit.site_m + np.array([0.0, 0.0, ground_below(road_m)]))[None], len(moments), axis=0)
     start = int(moments[0])
     own = np.column_stack([(moments - start) / NS_PER_S, log.ego_centers(pose) - unit.site_m, np.zeros(len(moments))])
     seen = link_boxes(detect_boxes(log, lidars_on_ego(log), of_vehicle, moments, floor), unit.site_m, start)
@@ -143,6 +142,8 @@ def _refine(sight: Sight, start: Array, *, with_objects: bool) -> tuple[Array, A
         structure = _structure(sight, values, near_surface)
         objects = _objects(sight, values, near_object) if with_objects else None
         parts = [part.evidence for part in (structure, objects) if part is not None]
+        ground = None if sight.ground is None else match_ground(sight.ground, exp_of(values[:DELAY]), near_surface)
+        parts += [] if ground is None else [ground]
         step, covariance = solve(parts, values)
         pose = exp_of(step[:DELAY]) @ exp_of(values[:DELAY])
         values = np.append(log_of(pose), values[DELAY] + step[DELAY])
