@@ -11,13 +11,17 @@ from hypothesis import strategies as st
 from worlds import rows_at, tiny_log, tiny_table
 
 from log2sim.config import Config
-from log2sim.datatypes import Boxes3D, Track
-from log2sim.geometry import rectangle_iou, wrap_angle
+from log2sim.datatypes import Boxes3D, Measurements, Track
+from log2sim.errors import LogError
+from log2sim.evaluation.bench.benchmark import bench
+from log2sim.evaluation.bench.document import document
+from log2sim.geometry import rectangle_iou, rotation_from_rpy, transform, wrap_angle
 from log2sim.perception.cooperative.box_errors import BoxErrors, estimate_errors
 from log2sim.perception.cooperative.detector import EndsDetector, create_for_ends, detector_by_mounting
 from log2sim.perception.cooperative.matching import SeenBoxes, match_by_covariance, match_by_overlap
 from log2sim.perception.cooperative.merging import METHODS, fuse_boxes, merge_by_covariance
 from log2sim.perception.lidar.cloud import assemble_cloud
+from log2sim.perception.lidar.measure_boxes import measure_boxes
 from log2sim.perception.lidar.viewpoints import assemble_views, group_by_viewpoint
 from log2sim.pipeline import reconstruct
 from log2sim.plan import FusionLevel, fusion_level
@@ -238,6 +242,10 @@ def test_every_level_finds_every_object_once(both_ends, level) -> None:
     agents = [a for a in result.scenario.agents if a.id != "ego"]
     assert sorted(a.category for a in agents) == ["car", "car", "pedestrian"]
     assert all(set(a.observed_by) == {"vehicle", "road"} for a in agents)
+    # Neither end sees both ends of the parked car 4.2 m long: alone they take it for 4.0 m and 3.8 m.
+    parked = min(agents, key=lambda a: abs(a.waypoints.y_m[0] + 4))
+    assert parked.size_m[0] == pytest.approx(4.2, abs=0.08)
+    assert (parked.waypoints.x_m[0], parked.waypoints.y_m[0]) == pytest.approx((14, -4), abs=0.06)
     (entry,) = [e for e in result.scenario.plan if e["stage"] == "fusion of vehicle and road"]
     assert entry["kept"]
     assert entry["reason"].startswith(level)
@@ -261,7 +269,9 @@ def test_levels_fall_back_where_an_end_has_no_lidar(both_ends) -> None:
 def test_the_road_has_a_detector_that_fits_its_mounting(both_ends) -> None:
     assert detector_by_mounting(both_ends, "lidar:vehicle") == "lidar:vehicle"
     assert detector_by_mounting(both_ends, "lidar:mine.onnx") == "lidar:mine.onnx"
-    tilted = tiny_log(lidar=[tiny_table()["lidar"][0], {**POST, "pitch_deg": -31.0}])[0]
+    post = both_ends.lidars["post"]
+    down = post.mount_T_lidar @ transform(rotation_from_rpy(0.0, np.deg2rad(31.0), 0.0), np.zeros(3))
+    tilted = both_ends.changed(lidars={**both_ends.lidars, "post": replace(post, mount_T_lidar=down)})
     assert detector_by_mounting(tilted, "lidar:vehicle") == "lidar:roadside"
     config = Config.load(settings=["detect.name=lidar:vehicle", "cooperation.fusion=boxes"])
     detector = create_for_ends(tilted, config)
@@ -330,3 +340,37 @@ def test_both_ends_share_the_life_of_a_short_track() -> None:
     options = {"birth_score": 0.4, "max_gap_s": 1.0, "min_life_s": 0.5}
     (found,) = track_ends([by_tick(a), by_tick(b)], (ticks * 1e8).astype(np.int64), **options)
     assert found.tick.tolist() == [2, 3, 4, 5, 6, 7]
+
+
+def test_a_row_keeps_the_view_of_the_other_end(both_ends) -> None:
+    cloud = assemble_views(both_ends, sweeps_at(both_ends), origin=np.zeros(3), ground_z=0.0, max_range_m=80.0)
+    rows = measure_boxes(boxes_at((14.0, -4.0, 0.75, 4.2, 1.8, 1.5, np.deg2rad(10))), cloud)
+    (other,) = rows.others
+    assert rows.seen_by.tolist() == [[True, True]]
+    places = [view.sensor + view.origin for view in cloud.views]
+    seen_from = sorted(([*rows.sensor_m, other.sensor_m]), key=lambda p: p[0])
+    assert np.array(seen_from) == pytest.approx(np.array(places), abs=1e-4)
+    local = np.concatenate([rows.cluster[0], other.cluster])[:, :2] - [14.0, -4.0]
+    assert np.abs(local).max() < 2.5
+    kept = rows.take([0, 0])
+    assert [v is other for v in kept.others] == [True, True]
+    joined = Measurements.join([rows_at([[0, 0]]), rows])
+    assert joined.others == (None, other)
+    assert rows_at([[0, 0]]).take([0]).others == ()
+
+
+@pytest.mark.slow
+def test_bench_compares_the_ends_and_their_levels(both_ends) -> None:
+    log = both_ends.changed(cameras={}, reference_camera=None)
+    truth = tiny_log(lidar=[tiny_table()["lidar"][0], POST])[1]
+    chosen = Config.load(detect={"name": "lidar:labels"}, cooperation={"fusion": "boxes", "register_road": False})
+    result = bench(log, chosen, truth=truth)
+    (panel,) = result.panels
+    names = [point.setting for point in panel.points]
+    assert names[0] == "both, boxes"
+    assert sorted(names) == ["both, boxes", "both, points", "both, tracks", "road alone", "vehicle alone"]
+    error = {point.setting: point.error for point in panel.points}
+    assert error["both, boxes"] < error["vehicle alone"] <= error["road alone"]
+    assert document(result)["panels"][0]["stage"] == "ends"
+    with pytest.raises(LogError, match="compares methods for images"):
+        bench(log.changed(lidars={"top": log.lidars["top"]}), chosen)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.box_votes import mean_box_axis
-from log2sim.datatypes import TYPICAL_SIZE_M, Track
+from log2sim.datatypes import TYPICAL_SIZE_M, OtherView, Track
 from log2sim.geometry import Array
 from log2sim.perception import box_completion, box_fitting
 from log2sim.perception.lidar.clusters import MIN_CLUSTER_POINTS
@@ -76,14 +76,14 @@ def static_ends(track: Track, xy: Array, origin: Array) -> tuple[float, Ends]:
     low, high = box_fitting.extents(xy, yaw, max_trim_m=box_fitting.MAX_TRIM_M)
     rows = np.flatnonzero([len(c) >= MIN_CLUSTER_POINTS for c in m.cluster])
     if track.category in BOXES:
-        low, high = _reached(low, high, [m.cluster[k][:, :2] - origin for k in rows], yaw)
-    sensor = box_fitting.rotate(m.sensor_m[rows, :2] - origin, -yaw)
-    views = box_completion.real_ends(low, high, sensor, m.ends_visible[rows], min_sine=_min_sine(track.category))
+        low, high = _reached(low, high, [m.points_of(k)[:, :2] - origin for k in rows.tolist()], yaw)
+    seen = [view for _, view in m.views_of(rows)]
+    sensor = box_fitting.rotate(np.array([v.sensor_m[:2] for v in seen]).reshape(-1, 2) - origin, -yaw)
+    visible = np.array([v.ends_visible for v in seen], dtype=bool).reshape(-1, 2)
+    views = box_completion.real_ends(low, high, sensor, visible, min_sine=_min_sine(track.category))
     gaps = np.array([
-        box_completion.end_gaps(
-            box_fitting.rotate(m.cluster[k][:, :2] - m.sensor_m[k, :2], -yaw), low - at, high - at, real
-        )
-        for k, at, real in zip(rows, sensor, views)
+        box_completion.end_gaps(box_fitting.rotate(v.cluster[:, :2] - v.sensor_m[:2], -yaw), low - at, high - at, real)
+        for v, at, real in zip(seen, sensor, views)
     ])  # fmt: skip
     # An end that is real from one viewpoint is real, and known as well as from the best one.
     real = views.max(axis=0)
@@ -123,15 +123,41 @@ def _is_length_across(ends: Ends, sensor: Array, category: str) -> bool:
 
 
 def ends_of(track: Track, k: int, yaw_rad: float, velocity_mps: Array) -> Ends:
-    """Find the ends of the points of measurement `k`, relative to its viewpoint, for an object that points along a yaw."""
-    m = track.measurements
-    xy = m.cluster[k][:, :2] - m.sensor_m[k, :2]
-    if m.cluster[k].shape[1] > 3:
-        xy = xy - m.cluster[k][:, 3:] * velocity_mps
+    """Find the ends of the points of measurement `k`, relative to its viewpoint, for an object that points along a yaw.
+
+    Of an end that is seen from two viewpoints counts the better view.
+    """
+    views = [view for _, view in track.measurements.views_of(np.array([k]))]
+    out = _ends_in_view(views[0], yaw_rad, velocity_mps, track.category)
+    for view in views[1:]:
+        ends = _ends_in_view(view, yaw_rad, velocity_mps, track.category)
+        apart = box_fitting.rotate((view.sensor_m - views[0].sensor_m)[:2], -yaw_rad)
+        out = _better_ends(out, replace(ends, low=ends.low + apart, high=ends.high + apart))
+    return out
+
+
+def _ends_in_view(view: OtherView, yaw_rad: float, velocity_mps: Array, category: str) -> Ends:
+    """Find the ends of the points of one viewpoint, relative to it."""
+    xy = view.cluster[:, :2] - view.sensor_m[:2]
+    if view.cluster.shape[1] > 3:
+        xy = xy - view.cluster[:, 3:] * velocity_mps
     low, high = box_fitting.extents(xy, yaw_rad, max_trim_m=box_fitting.MAX_TRIM_M)
-    real = box_completion.real_ends(low, high, np.zeros(2), m.ends_visible[k], min_sine=_min_sine(track.category))
+    real = box_completion.real_ends(low, high, np.zeros(2), view.ends_visible, min_sine=_min_sine(category))
     gap = box_completion.end_gaps(box_fitting.rotate(xy, -yaw_rad), low, high, real)
     return Ends(low[None], high[None], real[None], gap[None])
+
+
+def _better_ends(one: Ends, other: Ends) -> Ends:
+    """Take each end from the view that knows it better; of two that do not, the outer one."""
+    outer = np.stack([other.low < one.low, other.high > one.high], axis=-1)
+    takes = (other.real > one.real) | ((other.real == one.real) & (other.gap_m < one.gap_m))
+    takes = np.where((one.real == 0) & (other.real == 0), outer, takes)
+    return Ends(
+        np.where(takes[..., 0], other.low, one.low),
+        np.where(takes[..., 1], other.high, one.high),
+        np.where(takes, other.real, one.real),
+        np.where(takes, other.gap_m, one.gap_m),
+    )
 
 
 def _min_sine(category: str) -> float:

@@ -147,7 +147,7 @@ def match_box(cloud: Obstacles, tick: int, box: BoxState) -> LidarMatch | None:
     low, high = np.quantile(local[inside], 0.01, axis=0), np.quantile(local[inside], 0.99, axis=0)
     if np.any(high - low > size[:2] + 0.6):
         return None
-    sensor = rotate(cloud.sensor[:2].astype(np.float64) + cloud.origin[:2] - box.xy_m, -yaw_rad)
+    sensor = rotate(cloud.sensor_of(near[inside])[:2].astype(np.float64) + cloud.origin[:2] - box.xy_m, -yaw_rad)
     center, sigma = complete_box(low, high, size[:2], real_ends(low, high, sensor, np.zeros(2, dtype=bool)))
     hidden = size[:2] - (high - low)
     if np.hypot(*center) > MAX_SHIFT_M or np.any(hidden > MAX_HIDDEN_SHARE * np.maximum(size[:2], 1.0)):

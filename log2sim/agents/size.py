@@ -68,7 +68,7 @@ def static_geometry(track: Track) -> TrackGeometry:
     """Estimate one pose and size of a static track from all its points together."""
     m = track.measurements
     origin = np.append(np.median(m.center_m[:, :2], axis=0), 0.0)
-    cloud = persistent_points([c[:, :3] - origin for c in m.cluster])
+    cloud = persistent_points([m.points_of(k) - origin for k in range(len(m))])
     if len(cloud) < MIN_STATIC_POINTS:
         return _geometry_without_points(track)
     yaw, ends = static_ends(track, cloud[:, :2], origin[:2])

@@ -46,7 +46,6 @@ def bench(
     from log2sim.cli.progress import progress
     from log2sim.config import Config
     from log2sim.documents import check_targets, write_json
-    from log2sim.errors import ConfigError
     from log2sim.evaluation.bench.benchmark import bench as run
     from log2sim.evaluation.bench.document import document, format_table
     from log2sim.evaluation.bench.figure import write_picture
@@ -61,10 +60,6 @@ def bench(
         changes["detect"] = {"name": detector[0]}
     chosen = Config.load(config, settings or (), **changes)
     opened = open_log(log, format=format, sequence=sequence)
-    if not opened.cameras:
-        raise ConfigError(
-            f"{opened.name}: the log has no camera, and bench compares methods for images; use detect and evaluate"
-        )
     opened, choice = localize(opened, chosen)
     labeled = opened.labels is not None or (log / "truth.json").is_file()
     made = {"poses": choice.to_provenance()}

@@ -30,7 +30,7 @@ from log2sim.datatypes.log import (
     Stream,
     Sweep,
 )
-from log2sim.datatypes.measurements import BoxEvidence, Detections, Measurements
+from log2sim.datatypes.measurements import TUPLES, BoxEvidence, Detections, Measurements, OtherView
 from log2sim.datatypes.obstacles import Obstacles
 from log2sim.datatypes.rays import Rays
 from log2sim.datatypes.scenario import EGO, VERSION, Scenario
@@ -54,6 +54,7 @@ __all__ = [
     "ROAD",
     "STANDSTILL_DRIFT_M",
     "STANDSTILL_MPS",
+    "TUPLES",
     "TYPICAL_SIZE_M",
     "VEHICLE",
     "VERSION",
@@ -76,6 +77,7 @@ __all__ = [
     "MapFrame",
     "Measurements",
     "Obstacles",
+    "OtherView",
     "Rays",
     "Scenario",
     "Span",

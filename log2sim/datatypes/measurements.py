@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from log2sim.datatypes.boxes3d import Boxes3D
 from log2sim.datatypes.ends import seen_from
 from log2sim.geometry import Array
+
+TUPLES = ("cluster", "others")
+"""Columns of measurements that are no arrays."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +46,25 @@ class Detections:
     def take(self, index: Any) -> Detections:
         """Take the rows at `index`, integers or a mask."""
         return Detections(self.box_px[index], self.score[index], self.category[index])
+
+
+@dataclass(frozen=True, eq=False)
+class OtherView:
+    """What a second LiDAR, far from the first, shows of an object at the same tick.
+
+    Attributes
+    ----------
+    sensor_m : (3,) float64
+        Viewpoint, m, map frame.
+    ends_visible : (2,) bool
+        Whether the right and the left end of the points, as seen from there, are ends of the object.
+    cluster : (n, 4) float64
+        These points, subsampled: x, y, z in m, and the time after `t_ns` of the row in s.
+    """
+
+    sensor_m: Array
+    ends_visible: NDArray[np.bool_]
+    cluster: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +110,8 @@ class BoxEvidence:
         Probability in [0.5, 1] that its front and back are not swapped.
     seen_by : (M, 2) bool
         Which of the `ENDS` measured it.
+    others : M OtherView or None
+        What a second viewpoint shows, None for rows without; empty where no row has one.
     """
 
     t_ns: NDArray[np.int64]
@@ -111,16 +135,29 @@ class BoxEvidence:
     box_yaw_rad: Array
     heading_score: Array
     seen_by: NDArray[np.bool_]
+    others: tuple[OtherView | None, ...] = field(default=(), kw_only=True)
 
     def __len__(self) -> int:
         """Return the number of rows."""
         return len(self.t_ns)
 
+    def views_of(self, rows: NDArray[np.signedinteger[Any]]) -> list[tuple[int, OtherView]]:
+        """List the viewpoints of rows (n,), first their own in their order, then the others: the row, and what is seen from there."""
+        own = [(int(k), OtherView(self.sensor_m[k], self.ends_visible[k], self.cluster[k])) for k in rows]
+        return own + [(int(k), view) for k in rows if self.others and (view := self.others[k]) is not None]
+
+    def points_of(self, k: int) -> NDArray[np.float64]:
+        """Return the places (n, 3) of the points of a row from all viewpoints."""
+        view = self.others[k] if self.others else None
+        own = self.cluster[k][:, :3]
+        return own if view is None else np.concatenate([own, view.cluster[:, :3]])
+
     def take(self, index: Any) -> Self:
         """Take the rows at `index`, integers or a mask."""
         rows = np.arange(len(self))[index]
-        columns = {k: v[rows] for k, v in vars(self).items() if k != "cluster"}
-        return type(self)(**columns, cluster=tuple(self.cluster[i] for i in rows))
+        columns = {k: v[rows] for k, v in vars(self).items() if k not in TUPLES}
+        others = tuple(self.others[i] for i in rows) if self.others else ()
+        return type(self)(**columns, cluster=tuple(self.cluster[i] for i in rows), others=others)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,8 +184,9 @@ class Measurements(BoxEvidence):
         """Concatenate several sets; an empty sequence gives an empty set."""
         if not parts:
             return cls.empty()
-        columns = {k: np.concatenate([getattr(p, k) for p in parts]) for k in vars(parts[0]) if k != "cluster"}
-        return cls(**columns, cluster=tuple(c for p in parts for c in p.cluster))
+        columns = {k: np.concatenate([getattr(p, k) for p in parts]) for k in vars(parts[0]) if k not in TUPLES}
+        others = tuple(v for p in parts for v in p.others or (None,) * len(p)) if any(p.others for p in parts) else ()
+        return cls(**columns, cluster=tuple(c for p in parts for c in p.cluster), others=others)
 
     @classmethod
     def empty(cls) -> Measurements:

@@ -26,9 +26,13 @@ class Obstacles:
     t_s : (N,) float32
         Times relative to `stamp_ns`.
     sensor : (3,) float32
-        Position of the sensor relative to `origin`, mean over several.
+        Position of the sensor relative to `origin`, mean over several; of viewpoints far from each other the first.
     free : Rays, optional
         A sample of all rays, those that end on the ground too: where they passed is nothing.
+    viewpoints : (V, 3) float32, optional
+        Positions of LiDARs far from each other relative to `origin`; None where all points are seen from `sensor`.
+    seen_from : (N,) uint8, optional
+        The viewpoint of each point.
     """
 
     stamp_ns: int
@@ -37,6 +41,14 @@ class Obstacles:
     t_s: NDArray[np.float32]
     sensor: NDArray[np.float32]
     free: Rays | None = None
+    viewpoints: NDArray[np.float32] | None = None
+    seen_from: NDArray[np.uint8] | None = None
+
+    def sensor_of(self, index: NDArray[np.intp]) -> NDArray[np.float32]:
+        """Return the position (3,) of the sensor that sees most of the points at `index`."""
+        if self.viewpoints is None or self.seen_from is None or not len(index):
+            return self.sensor
+        return np.asarray(self.viewpoints[np.bincount(self.seen_from[index]).argmax()])
 
     @cached_property
     def rays(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF, Measurements
+from log2sim.datatypes import GROUP_OF, TUPLES, Measurements
 from log2sim.geometry import Array, box_iou
 from log2sim.log_odds import log_odds_of, probability_of
 from log2sim.perception.lidar.projection import View, project_boxes_in_view
@@ -128,7 +128,7 @@ def join_with_images(
 
 def _with_partners(boxes: Measurements, frames: Sequence[ImageMatches], weights: PairWeights) -> Measurements:
     """Return the boxes of a sweep (M,) with what their partners add."""
-    columns = {k: v.copy() for k, v in vars(boxes).items() if k != "cluster"}
+    columns = {k: v.copy() for k, v in vars(boxes).items() if k not in TUPLES}
     range_m = np.hypot(*(boxes.center_m - boxes.sensor_m)[:, :2].T)
     best = np.zeros(len(boxes))
     for frame in frames:
@@ -151,7 +151,7 @@ def _with_partners(boxes: Measurements, frames: Sequence[ImageMatches], weights:
     lonely = best == 0
     recall = IMAGE_RECALL * np.clip((height_px - NO_IMAGE_RECALL_PX) / (IMAGE_RECALL_PX - NO_IMAGE_RECALL_PX), 0, 1)
     columns["score"][lonely] = if_missed(boxes.score, recall)[lonely]
-    return Measurements(**columns, cluster=boxes.cluster)
+    return Measurements(**columns, cluster=boxes.cluster, others=boxes.others)
 
 
 def _take_alone(frame: ImageMatches) -> Measurements:

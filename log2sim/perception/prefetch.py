@@ -158,7 +158,12 @@ def obstacles_of(cloud: Cloud) -> Obstacles:
     index, xyz = cloud.obstacles, cloud.obstacle_columns.T
     near = np.flatnonzero(np.hypot(xyz[:, 0], xyz[:, 1]) < OBSTACLE_REACH_M)
     index = index[near[_voxel_sample(xyz[near], OBSTACLE_VOXEL_M)]]
-    return Obstacles(cloud.stamp_ns, cloud.origin, cloud.xyz[index], cloud.t_s[index], cloud.sensor, sample_rays(cloud))
+    kept = cloud.stamp_ns, cloud.origin, cloud.xyz[index], cloud.t_s[index], cloud.sensor, sample_rays(cloud)
+    if not cloud.parts:
+        return Obstacles(*kept)
+    first = np.cumsum([len(part.xyz) for part in cloud.parts])
+    seen_from = np.searchsorted(first, index, side="right").astype(np.uint8)
+    return Obstacles(*kept, np.array([part.sensor for part in cloud.parts]), seen_from)
 
 
 def _voxel_sample(xyz: NDArray[np.float32], voxel_m: float) -> NDArray[np.intp]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF, Measurements, Track
+from log2sim.datatypes import GROUP_OF, Measurements, OtherView, Track
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.tracking.category import decide_category
 from log2sim.tracking.gates import CHI2_2DOF_99
@@ -161,14 +161,17 @@ def _merge(tracks: Sequence[Track], velocity: Sequence[Array]) -> Track:
     for name in ("center_m", "covariance", "score", "points", "seen_by"):
         columns[name] = getattr(out, name).copy()
         columns[name][pair] = getattr(merged, name)
-    out = replace(out, **columns)
+    others = list(out.others or (None,) * len(out))
+    for k, view in zip(pair.tolist(), merged.others):
+        others[k] = view
+    out = replace(out, **columns, others=tuple(others))
     return Track(tracks[0].category, tick[first], out)
 
 
 def merge_rows(a: Measurements, b: Measurements, velocity_b: Array) -> Measurements:
     """Merge measurements (P,) of two ends row by row, moved to the times of the first: centers by inverse covariance.
 
-    Scores are independent evidence. What else was seen is that of the first.
+    Scores are independent evidence. What else was seen is that of the first, beside which the view of the second is kept.
     """
     late_s = ((a.t_ns - b.t_ns) / NS_PER_S)[:, None]
     moved = b.center_m[:, :2] + late_s * velocity_b
@@ -182,4 +185,13 @@ def merge_rows(a: Measurements, b: Measurements, velocity_b: Array) -> Measureme
         score=1 - (1 - a.score) * (1 - b.score),
         points=a.points + b.points,
         seen_by=a.seen_by | b.seen_by,
+        others=tuple(_other_view(b, k, -float(late_s[k, 0])) for k in range(len(b))),
     )
+
+
+def _other_view(m: Measurements, k: int, late_s: float) -> OtherView | None:
+    """Return what measurement `k` shows, as the second view of one that is so much earlier; None without points."""
+    if not len(m.cluster[k]):
+        return None
+    t_s = m.cluster[k][:, 3:4] if m.cluster[k].shape[1] > 3 else np.zeros((len(m.cluster[k]), 1))
+    return OtherView(m.sensor_m[k], m.ends_visible[k], np.column_stack([m.cluster[k][:, :3], t_s + late_s]))

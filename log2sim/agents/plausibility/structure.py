@@ -87,7 +87,7 @@ def _surface_at(boxes: BoxTable, row: int, column: int, cloud: Obstacles | None,
     near = near[np.abs(cloud.xyz[near, 1] - np.float32(center[1])) <= reach_m]
     near = near[cloud.xyz[near, 2] > center[2] - size[2] / 2 + BOTTOM_M]
     local = rotate(cloud.xyz[near, :2].astype(np.float64) - center[:2], -yaw)
-    sensor = rotate(cloud.sensor[:2].astype(np.float64) - center[:2], -yaw)
+    sensor = rotate(cloud.sensor_of(near)[:2].astype(np.float64) - center[:2], -yaw)
     return find_surface(local, size[:2], sensor)
 
 

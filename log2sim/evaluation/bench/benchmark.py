@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 from log2sim.config import Config
 from log2sim.datatypes import Log, Scenario
-from log2sim.evaluation.bench.panels import Panel, make_panels
-from log2sim.evaluation.bench.runs import BenchContext, Progress, make_context
+from log2sim.evaluation.bench.ends import ends_points, ends_settings
+from log2sim.evaluation.bench.panels import Panel, make_ends_panel, make_panels
+from log2sim.evaluation.bench.runs import BenchContext, Progress, make_context, make_context_of_ends
 from log2sim.evaluation.bench.scores import EVERYTHING, Scope
 from log2sim.evaluation.bench.settings import make_grid
 
@@ -44,6 +45,8 @@ def bench(
 ) -> Benchmark:
     """Run a log with the present settings and with every alternative of one stage at a time.
 
+    Of a log with LiDARs on the vehicle and at the road, the ends alone and all levels of their fusion are compared, too.
+
     Parameters
     ----------
     log : Log
@@ -62,13 +65,23 @@ def bench(
     Raises
     ------
     LogError, ConfigError, MissingExtra
-        For a log that cannot be read, invalid settings, or a detector whose package is missing.
+        For a log that cannot be read or has neither a camera nor LiDARs at both ends, invalid settings, or a detector whose
+        package is missing.
     """
     report = progress or (lambda what, done, total: None)
-    grid = make_grid(log, config or Config(), detectors)
-    context = make_context(log, grid, truth, report, scope)
-    panels = make_panels(context, report)
-    return Benchmark(context, tuple(panels), tuple(_notes(context, panels)))
+    config = config or Config()
+    ends = ends_settings(log, config)
+    if log.cameras:
+        grid = make_grid(log, config, detectors)
+        context = make_context(log, grid, truth, report, scope)
+        panels = make_panels(context, report)
+        notes = _notes(context, panels)
+    else:
+        context = make_context_of_ends(log, ends, truth, scope)
+        panels, notes = [], ["the log has no camera: only vehicle, road, and both are compared"]
+    if ends:
+        panels.append(make_ends_panel(ends_points(log, ends, truth, scope, report), truth))
+    return Benchmark(context, tuple(panels), tuple(notes))
 
 
 def _notes(context: BenchContext, panels: list[Panel]) -> list[str]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from log2sim.datatypes import Scenario
+from log2sim.evaluation.bench.ends import STAGE as ENDS_STAGE
 from log2sim.evaluation.bench.pareto import Point, Recommendation, front_mask, recommend
 from log2sim.evaluation.bench.runs import BenchContext, BenchRun, Progress, homography_points, run_all
 from log2sim.evaluation.bench.scores import Score
@@ -60,6 +62,10 @@ ERRORS = {
         ("error_m", "position error, missed and false objects counted", "m"),
         ("jitter_m", "jitter of waypoints", "m"),
     ),
+    ENDS_STAGE: (
+        ("error_m", "vehicle, road, and both by LiDAR: position error, missed and false objects counted", "m"),
+        ("jitter_m", "vehicle, road, and both by LiDAR: jitter of waypoints", "m"),
+    ),
 }
 
 
@@ -77,6 +83,11 @@ def make_panels(context: BenchContext, report: Progress) -> list[Panel]:
         "whole run": [_whole_point(context, r) for r in runs],
     }
     return [_panel(stage, own, whole_ms, known) for stage, own in points.items() if own]
+
+
+def make_ends_panel(points: Sequence[Point], truth: Scenario | None) -> Panel:
+    """Make the panel of vehicle, road, and both; the present setting comes first."""
+    return _panel(ENDS_STAGE, points, points[0].ms_per_tick, truth is not None)
 
 
 def _panel(stage: str, points: Sequence[Point], whole_ms: float, known: bool) -> Panel:

@@ -66,7 +66,7 @@ class Grid:
 
     @property
     def present(self) -> Setting:
-        """Return the present setting of the detector."""
+        """Return the present setting of the detector in images."""
         return self.detect[0]
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import MAX_SIZE_M, TYPICAL_SIZE_M, Detections, Measurements, end_of
+from log2sim.datatypes import MAX_SIZE_M, TYPICAL_SIZE_M, Detections, Measurements, OtherView, end_of
 from log2sim.geometry import NS_PER_S, Array, Camera
 from log2sim.perception.box_completion import place_boxes
 from log2sim.perception.box_fitting import fit_extents, sample_surface, top_of, upper_median
@@ -61,7 +61,14 @@ def _cut_by_border(camera: Camera, box_px: Array) -> NDArray[np.bool_]:
 
 def writable(rows: Measurements) -> dict[str, Any]:
     """Copy the columns of rows, so that they can be written."""
-    return {k: list(v) if isinstance(v, tuple) else v.copy() for k, v in vars(rows).items()}
+    columns = {k: list(v) if isinstance(v, tuple) else v.copy() for k, v in vars(rows).items()}
+    return columns | {"others": columns["others"] or [None] * len(rows)}
+
+
+def with_tuples(columns: dict[str, Any]) -> dict[str, Any]:
+    """Return columns from `writable` as rows have them."""
+    others = columns["others"] if any(v is not None for v in columns["others"]) else ()
+    return columns | {"cluster": tuple(columns["cluster"]), "others": tuple(others)}
 
 
 def _measure_robustly(rows: Measurements, view: View, cloud: Cloud) -> Measurements:
@@ -94,7 +101,7 @@ def _measure_robustly(rows: Measurements, view: View, cloud: Cloud) -> Measureme
         depth_m = float(np.quantile(depth, NEAR_END_QUANTILE)) if is_long else upper_median(depth)
         columns["height_px_m"][k] = (box[3] - box[1]) * depth_m / view.camera.K[1, 1]
         write_evidence(columns, k, members, cloud)
-    return place_boxes(Measurements(**columns | {"cluster": tuple(columns["cluster"])}))
+    return place_boxes(Measurements(**with_tuples(columns)))
 
 
 def _continuation(
@@ -108,14 +115,29 @@ def _continuation(
 def write_evidence(columns: dict[str, Any], k: int, members: NDArray[np.intp], cloud: Cloud) -> None:
     """Write what the points at `members` (n,) show into row `k`; a box of a 3D detector says which side is the length.
 
-    Points of several viewpoints are measured from the one that has most of them.
+    Points of several viewpoints are measured from the one that has most of them; a second one is kept beside it.
     """
-    view, own = cloud.split(members)[0]
+    views = cloud.split(members)
+    view, own = views[0]
     if len(own) < min(MIN_CLUSTER_POINTS, len(members)):
         return
     _write_view(columns, k, own, view)
     columns["points"][k] = len(members)
     columns["seen_by"][k] |= cloud.ends_of(members)
+    if len(views) > 1 and len(views[1][1]) >= MIN_CLUSTER_POINTS:
+        columns["others"][k] = _other_view(*views[1], int(columns["t_ns"][k]))
+
+
+def _other_view(cloud: Cloud, members: NDArray[np.intp], t_ns: int) -> OtherView:
+    """Describe what the points at `members` (n,) of a second viewpoint show of an object that is measured at a time."""
+    xyz = cloud.xyz[members].astype(np.float64)
+    late_s = cloud.t_s[members].astype(np.float64) + (cloud.stamp_ns - t_ns) / NS_PER_S
+    kept = sample_surface(np.linalg.norm(xyz - cloud.sensor, axis=1), MAX_KEPT_POINTS)
+    return OtherView(
+        cloud.sensor + cloud.origin,
+        cloud.azimuth_index.ends_visible(members),
+        np.column_stack([xyz + cloud.origin, late_s])[kept],
+    )
 
 
 def _write_view(columns: dict[str, Any], k: int, members: NDArray[np.intp], cloud: Cloud) -> None:
@@ -154,7 +176,7 @@ def _measure_as_paper(rows: Measurements, view: View, cloud: Cloud) -> Measureme
         columns["center_m"][k], columns["covariance"][k], columns["source"][k] = center, np.eye(2), "lidar"
         columns["points"][k], columns["t_ns"][k] = len(inside), cloud.stamp_ns
         columns["seen_by"][k] |= cloud.ends_of(visible.index[inside])
-    return Measurements(**columns | {"cluster": tuple(columns["cluster"])})
+    return Measurements(**with_tuples(columns))
 
 
 def project_cloud(view: View, cloud: Cloud, index: NDArray[np.intp]) -> tuple[NDArray[np.intp], Array, Array]:

@@ -15,7 +15,7 @@ from log2sim.perception.box_fitting import rotate
 from log2sim.perception.detect3d.box_points import points_of_boxes
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.clusters import MIN_CLUSTER_POINTS
-from log2sim.perception.lidar.measure import writable, write_evidence
+from log2sim.perception.lidar.measure import with_tuples, writable, write_evidence
 
 # A box is wrong by less than this at each side; neighbors are farther away.
 BOX_MARGIN_M = 0.2
@@ -41,7 +41,7 @@ def measure_boxes(boxes: Boxes3D, cloud: Cloud) -> Measurements:
             columns["seen_by"][k] |= boxes.seen_by[k]
         if len(members) >= MIN_CLUSTER_POINTS:
             write_evidence(columns, k, members, cloud)
-    return place_boxes(Measurements(**columns | {"cluster": tuple(columns["cluster"])}))
+    return place_boxes(Measurements(**with_tuples(columns)))
 
 
 def outside_ego(log: Log, boxes: Boxes3D) -> Boxes3D:

@@ -1,0 +1,78 @@
+"""Vehicle alone, road alone, and both joined at each level, as whole runs on one log."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from log2sim.config import Config
+from log2sim.datatypes import ENDS, ROAD, Log, Scenario, end_of
+from log2sim.errors import NothingToReconstruct
+from log2sim.evaluation.bench.pareto import Point
+from log2sim.evaluation.bench.scores import Scope, Score, score_scenario
+from log2sim.evaluation.bench.settings import Setting
+from log2sim.geometry import period_of
+from log2sim.perception.cooperative.detector import detector_by_mounting
+from log2sim.pipeline import first_pass, second_pass, start
+from log2sim.plan import FusionLevel
+
+STAGE = "ends"
+DETECTOR = "lidar:vehicle"
+"""Searches sweeps where the settings name no detector for them."""
+
+
+def has_both_ends(log: Log) -> bool:
+    """Return whether a log has LiDARs of the vehicle and of the road."""
+    return {end_of(lidar) for lidar in log.lidars.values()} >= set(ENDS)
+
+
+def ends_settings(log: Log, config: Config) -> tuple[Setting, ...]:
+    """List the levels of fusion and the ends alone, the present one first; none for a log without LiDARs at both ends.
+
+    LiDAR sweeps alone are searched, so that what is compared is what the LiDARs of the ends tell.
+    """
+    if not has_both_ends(log):
+        return ()
+    name = config.detect.in_sweeps or DETECTOR
+    present = config.cooperation.ends if config.cooperation.ends != "both" else config.cooperation.fusion
+    ways: dict[str, dict[str, Any]] = {f"{end} alone": {"ends": end} for end in ENDS}
+    ways |= {f"both, {level}": {"ends": "both", "fusion": str(level)} for level in FusionLevel}
+    out = []
+    for title, change in ways.items():
+        detector = detector_by_mounting(log, name) if change["ends"] == ROAD else name
+        changed = config.changed(cameras=[], detect={"name": detector}, cooperation=change)
+        chosen = change.get("fusion", change["ends"])
+        out.append(Setting(STAGE, title, changed, chosen == present))
+    return tuple(sorted(out, key=lambda setting: not setting.present))
+
+
+def ends_points(
+    log: Log,
+    settings: Sequence[Setting],
+    truth: Scenario | None,
+    scope: Scope,
+    report: Callable[[str, int, int], None],
+) -> list[Point]:
+    """Run every setting once and score its scenario.
+
+    The time is that of everything after synchronization: poses, calibration and registration are the same for all.
+    """
+    out = []
+    for k, setting in enumerate(settings):
+        run = start(log, setting.config)
+        begin = time.perf_counter()
+        try:
+            result = second_pass(run, first_pass(run))
+            score = score_scenario(result.scenario, truth, period_of(run.schedule.t_ns), scope)
+        except NothingToReconstruct:
+            score = Score({"agents": 0})
+        ms = (time.perf_counter() - begin) * 1e3 / len(run.schedule)
+        stages = {stage: s * 1e3 / len(run.schedule) for stage, s in run.clock.seconds.items()}
+        error = "error_m" if truth is not None else "jitter_m"
+        figures = {**score.figures, "stages_ms_per_tick": stages}
+        out.append(
+            Point(setting.name, setting.present, ms, score.figures.get(error), figures, score.by_object.get(error, {}))
+        )
+        report("ends", k + 1, len(settings))
+    return out
