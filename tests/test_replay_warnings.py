@@ -106,6 +106,18 @@ def test_nobody_is_warned_of_whom_the_chosen_end_does_not_know() -> None:
     assert "no warning" in describe_warnings(warn(scene, result, ends="vehicle"))
 
 
+def test_with_one_end_nothing_is_said_of_which_end_knows_it() -> None:
+    scene = scenario_of(town_ego(), seen(crossing_walker(8.0), vehicle=(3.0, 14.0)))
+    found = warn(scene, ends="both")
+    assert found.tells_ends
+    assert found.events[0].known_by == {}
+    assert (found.known_agents, warn(scene, ends="road").known_agents) == (1, 0)
+    assert "they know 0 of 1 other agents" in describe_warnings(warn(scene, ends="road"))
+    untold = warn(scenario_of(town_ego(), crossing_walker(8.0)), ends="road")
+    assert not untold.tells_ends
+    assert [e.agent for e in untold.events] == ["p"]
+
+
 def test_what_was_seen_once_is_not_known() -> None:
     assert warn(scenario_of(town_ego(), seen(crossing_walker(8.0), vehicle=(6.0, 6.1)))).events == ()
 
@@ -227,7 +239,7 @@ def test_the_file_holds_the_warnings(tmp_path: Path) -> None:
     ran = run_command("replay", files[0], "--warn", "both", "--dt", "0.05", "--out", files[1])
     assert ran.code == 0
     out = ran.out
-    assert "1 warning in 14.1 s of driving, by the sensors of vehicle and road" in out
+    assert "1 warning in 14.1 s of driving, by the sensors of vehicle and road: they know 1 of 1 other agents" in out
     assert "(to the road alone from 3.20 s; to the vehicle alone from 6.20 s)" in out
     loaded = Replay.load(files[1])
     assert loaded.warnings == warn(scene, loaded)

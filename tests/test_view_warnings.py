@@ -33,7 +33,7 @@ def test_the_document_tells_of_warnings_and_of_ends() -> None:
     world = scene()
     document = page_document(world, replay=warned(world))
     entries = {e["id"]: e for e in document["layers"]["scenario"]}
-    assert entries["p"]["observed_by"] == {"vehicle": ((5.0, 8.0),), "road": ((1.0, 8.0),)}
+    assert entries["p"]["observed_by"] == {"vehicle": [[5.0, 8.0]], "road": [[1.0, 8.0]]}
     assert "observed_by" not in entries["ego"]
     assert document["warnings"]["title"] == "1 warning"
     (event,) = document["warnings"]["events"]
@@ -42,8 +42,8 @@ def test_the_document_tells_of_warnings_and_of_ends() -> None:
     assert event["brief"].startswith("p: warning at ")
 
 
-def test_without_warnings_and_ends_a_page_tells_of_neither() -> None:
-    world = scenario_of(town_ego(8.0), crossing_walker(6.0, 8.0))
+def test_without_warnings_and_with_one_end_a_page_tells_of_neither() -> None:
+    world = scenario_of(town_ego(8.0), seen(crossing_walker(6.0, 8.0), vehicle=(0.0, 8.0)))
     document = page_document(world, replay=replay(world, mode="exact", dt_s=0.1))
     assert document["warnings"] == {"title": "", "events": []}
     assert not [e for e in document["layers"]["scenario"] if "observed_by" in e]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, Scenario, Span
+from log2sim.datatypes import ENDS, Agent, Scenario, Span
 from log2sim.geometry import Array
 from log2sim.tracking.forward import CONFIRMED_AGE_S, TENTATIVE_HITS
 
@@ -107,9 +107,9 @@ def observed_spans(agent: Agent, ends: Sequence[str]) -> tuple[Span, ...]:
     return tuple((float(w.t_s[a]), float(w.t_s[b - 1])) for a, b in zip(edges[::2], edges[1::2]))
 
 
-def has_ends(scenario: Scenario) -> bool:
-    """Whether a scenario says which end observed its agents."""
-    return any(a.observed_by for a in scenario.agents)
+def ends_of(scenario: Scenario) -> tuple[str, ...]:
+    """Return the ends whose sensors observed any agent; none where the scenario does not tell."""
+    return tuple(end for end in ENDS if any(a.observed_by.get(end) for a in scenario.agents))
 
 
 def observation_interval_s(scenario: Scenario) -> float:

@@ -14,7 +14,9 @@ def describe_warnings(warnings: Warnings) -> str:
     whose = (
         _ENDS[warnings.ends] if warnings.tells_ends else "all sensors, which the scenario does not tell apart by end"
     )
-    lines = [f"{count_warnings(warnings)} in {warnings.driven_s:.1f} s of driving, by {whose}"]
+    lines = [
+        f"{count_warnings(warnings)} in {warnings.driven_s:.1f} s of driving, by {whose}: they know {warnings.known_agents} of {warnings.agents} other agents"
+    ]
     lines += [f"  {describe_warning(w, warnings)}" for w in warnings.events[:MAX_LISTED]]
     if len(warnings.events) > MAX_LISTED:
         lines.append(f"  and {len(warnings.events) - MAX_LISTED} more")

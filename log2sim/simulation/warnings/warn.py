@@ -14,7 +14,7 @@ from log2sim.geometry import Array, box_corners_bev
 from log2sim.prediction.motion_table import TICK_S, table_of
 from log2sim.simulation.result import Replay, to_scenario
 from log2sim.simulation.warnings.ego_way import EgoStates
-from log2sim.simulation.warnings.known import has_ends, known_agents, observed_spans
+from log2sim.simulation.warnings.known import ends_of, known_agents, observed_spans
 from log2sim.simulation.warnings.settings import WarningSettings
 from log2sim.simulation.warnings.warning import CollisionWarning, Moment, Warnings
 from log2sim.simulation.warnings.watch import Courses, Watch
@@ -65,13 +65,20 @@ def warn(
     watch = Watch(scenario, moved.others, settings, table.t_s)
     drive = _Drive(watch, ego_states(moved.ego, watch, table.t_s[ticks]), table.t_s[ticks])
     events = _with_collisions(_events(drive, watch.courses(drive.ego, ticks)), _collisions(replay), drive)
-    if has_ends(scenario):
+    if len(ends_of(scenario)) > 1:
         sources = {a.id: a for a in scenario.agents}
         events = [replace(e, known_by=_known_by(sources[e.agent], table.t_s, watch.interval_s)) for e in events]
     driven_s = float((np.abs(drive.ego.speed_mps) >= STANDSTILL_MPS).sum()) * TICK_S
     used = {f.name: getattr(settings, f.name) for f in fields(settings)}
     in_order = tuple(sorted(events, key=lambda e: (e.begin_s, e.agent)))
-    return Warnings(tells_ends=has_ends(scenario), driven_s=round(driven_s, 1), events=in_order, **used)
+    return Warnings(
+        tells_ends=bool(ends_of(scenario)),
+        agents=len(watch.table.agents),
+        known_agents=int(np.isfinite(watch.known.since_s).sum()),
+        driven_s=round(driven_s, 1),
+        events=in_order,
+        **used,
+    )
 
 
 def ego_states(ego: Agent, watch: Watch, t_s: Array) -> EgoStates:

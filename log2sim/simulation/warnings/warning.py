@@ -37,7 +37,7 @@ class CollisionWarning:
     known : Moment or None
         When it is first known; None where it never is.
     known_by : mapping of str to float
-        When each end alone knows it first, s; only where a scenario tells its ends apart.
+        When each end alone knows it first, s; only where both have observed somebody.
     warned : Moment or None
         When it is first warned of; None for a collision that was not predicted.
     probability : float
@@ -94,6 +94,8 @@ class Warnings:
         Whether the scenario says which end observed its agents; else what it observed counts.
     horizon_s, min_probability, early_probability, margin_s, reaction_s, brake_mps2 : float
         As in `WarningSettings`.
+    agents, known_agents : int
+        Other agents, and how many of them the ends get to know.
     driven_s : float, s
         For how long the ego moved.
     events : tuple of CollisionWarning
@@ -107,6 +109,8 @@ class Warnings:
     margin_s: float
     reaction_s: float
     brake_mps2: float
+    agents: int
+    known_agents: int
     driven_s: float
     events: tuple[CollisionWarning, ...] = ()
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, Agent, Doubt, Scenario, Trajectory, Waypoints, why_doubtful
 from log2sim.errors import ConfigError
+from log2sim.simulation.warnings.known import ends_of
 from log2sim.visualization.page.columns import SCALES, second_differences
 from log2sim.visualization.page.predictions import predicted_columns
 from log2sim.visualization.plot.doubts import shown_spans
@@ -97,12 +98,19 @@ def _warnings(replay: Any) -> dict[str, Any]:
 
 def _scenario(scenario: Scenario) -> Iterator[dict[str, Any]]:
     """Yield the scenario's agents in the order of the pictures' legend: movers with their colors, then stationary ones."""
-    roles = assign_roles(scenario)
+    roles, tell_ends = assign_roles(scenario), len(ends_of(scenario)) > 1
     for role in roles.movers:
         entry = _entry(role.agent, role.agent.waypoints, stationary=False, static=False)
-        yield {**entry, **_colors(role), **_trust(role.agent)}
+        yield {**entry, **_colors(role), **_trust(role.agent), **(_observers(role.agent) if tell_ends else {})}
     for agent in roles.stationary:
-        yield {**_entry(agent, agent.waypoints, stationary=True, static=agent.static), **_trust(agent)}
+        entry = _entry(agent, agent.waypoints, stationary=True, static=agent.static)
+        yield {**entry, **_trust(agent), **(_observers(agent) if tell_ends else {})}
+
+
+def _observers(agent: Agent) -> dict[str, Any]:
+    """Return the spans, s, in which each end observed an agent; nothing for one that does not tell, such as the ego."""
+    spans = {end: [[round(t, 3) for t in span] for span in found] for end, found in agent.observed_by.items() if found}
+    return {"observed_by": spans} if spans else {}
 
 
 def _colors(role: AgentRole) -> dict[str, Any]:
@@ -119,11 +127,6 @@ def _trust(agent: Agent) -> dict[str, Any]:
         "confidence": round(agent.confidence, 4),
         "doubts": [[doubt.reason, doubt.start_s, doubt.end_s] for doubt in (*agent.doubts, *low)],
         "doubted": [[t if np.isfinite(t) else None for t in span] for span in shown_spans(agent)],
-        **(
-            {"observed_by": {end: spans for end, spans in agent.observed_by.items() if spans}}
-            if agent.observed_by
-            else {}
-        ),
         **({"points": round(float(points), 1)} if isinstance(points, int | float) else {}),
         **({"source": source} if source else {}),
         **{key: second_differences(column, SCALES[key]) for key, column in known.items()},
