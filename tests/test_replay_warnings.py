@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import run as run_command
-from replay_maneuvers import agent_from, driven, scenario_of
+from replay_maneuvers import MANEUVERS, agent_from, driven, scenario_of
 from replay_scenes import LENGTH_M, line, parked, walker
 
 from log2sim.datatypes import Agent, Scenario
@@ -230,6 +230,26 @@ def test_the_ego_drives_on_as_in_the_scenario_when_its_way_is_clear() -> None:
     assert ego.speed_mps[-1] == pytest.approx(TOWN_MPS, abs=0.5)
     quiet = replay(scenario_of(town_ego(5.0)), ego=BrakeWhenWarned(), dt_s=0.1).agent("ego")
     assert np.abs(quiet.x_m - TOWN_MPS * quiet.t_s).max() < 0.05
+
+
+def test_an_ego_in_reverse_is_warned_of_what_is_behind_it_and_stands_before() -> None:
+    t = np.arange(0.0, 8.05, 0.1)
+    ego = agent_from(t, -3.0 * t, 0 * t, 0 * t, np.full(len(t), -3.0), id="ego")
+    scene = scenario_of(ego, parked("k", -16.0, 0.0), line("before", 8.0, speed=0.0, duration_s=8.0))
+    (event,) = warn(scene).events
+    assert event.agent == "k"
+    assert event.ttc_s == pytest.approx((16.0 - LENGTH_M) / 3.0 - event.warned.t_s, abs=0.01)
+    braked = replay(scene, ego=BrakeWhenWarned(), dt_s=0.1, model="kinematic")
+    assert braked.metrics["collisions"] == []
+    assert braked.agent("ego").speed_mps[-1] == 0.0
+
+
+def test_the_ego_that_is_not_warned_drives_as_in_the_scenario() -> None:
+    for name in ("turn of radius 8 m", "reversing", "brake to stop and go"):
+        ego = replace(MANEUVERS[name](), id="ego")
+        own = replay(scenario_of(ego), ego=BrakeWhenWarned(), dt_s=0.1, model="kinematic").agent("ego")
+        x, y = ego.trajectory.at(own.t_s)[:2]
+        assert np.hypot(own.x_m - x, own.y_m - y).max() < 0.25
 
 
 def test_the_file_holds_the_warnings(tmp_path: Path) -> None:

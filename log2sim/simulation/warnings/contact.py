@@ -21,6 +21,9 @@ CHUNK = 256
 REACH_SIGMA = 2.0
 """Beyond the outermost quantile, which is 1.6 standard deviations off, so that nothing is missed by looking no farther."""
 
+MIN_TRAVEL_M = 1e-6
+"""An ego that moves by less between leads stands."""
+
 
 class Contacts(NamedTuple):
     """Expected contacts of C pairs of ways.
@@ -86,12 +89,13 @@ def _contact_times(ego: Ways, others: Ways, lead_s: Array) -> Array:
     enter = np.maximum(enter, 0.0)
     meets = (enter < leave) & (enter <= np.broadcast_to(span, shape).ravel())
     then = np.where(meets, enter, 0.0)
-    ahead = ((flat + then * speed) * np.exp(-1j * own)).real
-    length = np.broadcast_to(ego.size_m[:, :1, None], shape).ravel()
-    moves = np.broadcast_to((np.abs(np.diff(ego.position_m, axis=1)) > 1e-6)[:, None], shape)
+    travel = np.diff(ego.position_m, axis=1)
+    forward = np.where((travel * np.exp(-1j * _middle(ego.yaw_rad))).real < 0, -1.0, 1.0)
+    moves = np.broadcast_to((np.abs(travel) > MIN_TRAVEL_M)[:, None], shape)
+    ahead = ((flat + then * speed) * np.exp(-1j * own)).real.reshape(shape) * forward[:, None]
     times = np.where(meets, then + np.broadcast_to(lead_s[:-1], shape).ravel(), np.inf).reshape(shape)
     first = times.argmin(axis=-1)[..., None]
-    counts = (ahead > -length / 2).reshape(shape) & moves
+    counts = (ahead > -ego.size_m[:, :1, None] / 2) & moves
     time, counts = (np.take_along_axis(c, first, axis=-1)[..., 0] for c in (times, counts))
     return np.where(counts & (time > 0), time, np.inf)
 
