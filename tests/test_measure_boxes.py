@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 from worlds import Solid, scan, standing
 
-from log2sim.agents.box_votes import independent, mean_box_axis, typical_box_size, weighted_median
+from log2sim.agents.box_votes import (
+    TICK_CORRELATION,
+    independent,
+    independent_along,
+    mean_box_axis,
+    typical_box_size,
+    weighted_median,
+)
 from log2sim.agents.confirmation import agent_confidence, image_confidence, is_confirmed, sweep_confidence
 from log2sim.agents.heading.box_headings import heading_log_odds
 from log2sim.agents.size import moving_geometry, static_geometry
@@ -174,6 +181,30 @@ def test_a_long_false_track_with_a_few_high_scores_is_not_confirmed() -> None:
     assert is_confirmed(true, typical=True)
     assert agent_confidence(true) == pytest.approx(sweep_confidence(true))
     assert image_confidence(true) == 0.0
+
+
+def test_ticks_in_one_place_are_alike_and_far_ones_are_independent() -> None:
+    here, far = np.zeros((30, 2)), np.column_stack([np.arange(30) * 1e3, np.zeros(30)])
+    assert independent_along(here, 0.7) == pytest.approx(independent(30))
+    assert independent_along(far, 0.7) == pytest.approx(30)
+    # Two ticks, one length from each other: 4 / (2 + 2 c / e).
+    pair = np.array([[0.0, 0.0], [0.0, 2.0]])
+    assert independent_along(pair, 2.0) == pytest.approx(4 / (2 + 2 * TICK_CORRELATION / np.e))
+
+
+def test_who_walks_on_needs_less_sure_boxes_than_what_stays() -> None:
+    rng = np.random.default_rng(5)
+
+    def person(speed_mps: float, score: float) -> Track:
+        track = track_of(46, score)
+        center = track.measurements.center_m + rng.normal(0, 0.05, (46, 3))
+        center[:, 0] += 0.1 * speed_mps * np.arange(46)
+        measured = replace(track.measurements, center_m=center, category=np.full(46, "pedestrian"))
+        return Track("pedestrian", track.tick, measured)
+
+    assert is_confirmed(person(1.5, 0.58), typical=True)
+    assert not is_confirmed(person(0.0, 0.58), typical=True)
+    assert not is_confirmed(person(1.5, 0.45), typical=True)
 
 
 def test_what_the_image_confirms_needs_no_sweep() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.agents.box_votes import independent
-from log2sim.datatypes import GROUP_OF, Track
+from log2sim.agents.box_votes import independent, independent_along
+from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Track
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.log_odds import probability_of
 from log2sim.perception.late_fusion import logit
@@ -23,6 +23,8 @@ CONFIDENCE_DETECTIONS = 5
 # Detections of people and two-wheelers with a lower score continue a track and say nothing for it: about half are clutter.
 WEAK_GROUPS, MIN_COUNTED_SCORE = ("pedestrian", "two_wheeler"), 0.3
 HIDDEN_S = 1.0
+# Over so many ticks, half a second of usual logs, errors of positions average to less than the length of a person.
+SMOOTHED_TICKS = 5
 SAME_MOMENT_S = 1e-3
 
 
@@ -36,7 +38,9 @@ def is_confirmed(track: Track, *, typical: bool) -> bool:
         Whether the size is likely for the category; an unlikely size needs a higher confidence.
     """
     least = MIN_TRACK_CONFIDENCE if typical else MIN_TRACK_CONFIDENCE_UNLIKELY_SIZE
-    return image_confidence(track) >= least or sweep_confidence(track) >= MIN_SWEEP_CONFIDENCE
+    if image_confidence(track) >= least:
+        return True
+    return max(sweep_confidence(track), moving_confidence(track)) >= MIN_SWEEP_CONFIDENCE
 
 
 def agent_confidence(track: Track) -> float:
@@ -76,6 +80,24 @@ def sweep_confidence(track: Track) -> float:
     if not in_sweep.any():
         return 0.0
     log_odds = float(logit(m.score[in_sweep]).mean()) * independent(int(in_sweep.sum()))
+    return detection_rate(m.t_ns, track.tick, track.unrecorded) * float(probability_of(log_odds))
+
+
+def moving_confidence(track: Track) -> float:
+    """Return the probability that a track is an object, from its boxes in LiDAR sweeps and how far it moves; 0 without boxes.
+
+    Notes
+    -----
+    Ticks count as `independent_along` has it. Errors of the positions are no motion: the places are means over `SMOOTHED_TICKS`.
+    """
+    m = track.measurements
+    in_sweep = np.flatnonzero(np.isfinite(m.box_yaw_rad) & np.isfinite(m.center_m[:, 0]))
+    if len(in_sweep) < SMOOTHED_TICKS:
+        return 0.0
+    window = np.full(SMOOTHED_TICKS, 1.0 / SMOOTHED_TICKS)
+    places = np.stack([np.convolve(m.center_m[in_sweep, axis], window, mode="valid") for axis in range(2)], axis=1)
+    looks = independent_along(places, TYPICAL_SIZE_M[track.category][0])
+    log_odds = float(logit(m.score[in_sweep]).mean()) * looks
     return detection_rate(m.t_ns, track.tick, track.unrecorded) * float(probability_of(log_odds))
 
 
