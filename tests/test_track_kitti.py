@@ -21,6 +21,7 @@ from kitti_boxes import Boxes, overlap_3d, read_detections, read_tracks, write_t
 from kitti_choice import labeled_probability  # noqa: E402
 from kitti_joining import join_tracks  # noqa: E402
 from kitti_map import EGO_R_CAM, View, from_map, hidden_share, read_view, to_measurements  # noqa: E402
+from kitti_people import find_pairs  # noqa: E402
 from kitti_rows import Rows  # noqa: E402
 
 from log2sim.errors import LogError  # noqa: E402
@@ -293,15 +294,15 @@ def person(frame: object, x: object, score: object) -> Boxes:
     return boxes(frame, xz, category="Pedestrian", size=PERSON, score=score)
 
 
-def test_gaps_of_people_are_filled_up_to_a_second_if_they_are_believed() -> None:
+def test_gaps_of_people_are_filled_up_to_a_second_and_a_half_if_they_are_believed() -> None:
     def told(gap: int, score: float) -> set[int]:
         frame = np.array([k for k in range(60) if not 20 <= k < 20 + gap])
         out = track_kitti.track_boxes(person(frame, np.full(60 - gap, 3.0), score), standing_view(60), online=False)
         return set(out.frame.tolist())
 
-    assert told(10, 4.0) == set(range(60))
-    assert told(11, 4.0) == set(range(60)) - set(range(20, 31))
-    assert told(5, -0.5) == set(range(60)) - set(range(20, 25))
+    assert told(15, 4.0) == set(range(60))
+    assert told(16, 4.0) == set(range(60)) - set(range(20, 36))
+    assert told(5, -1.2) == set(range(60)) - set(range(20, 25))
 
 
 def test_what_walks_is_believed_before_what_stands_unless_nothing_is_known_to_stand() -> None:
@@ -350,7 +351,7 @@ def test_where_another_track_is_seen_none_is_predicted() -> None:
 
 def test_a_rider_is_no_pedestrian_beside() -> None:
     frame = np.arange(30)
-    way = np.column_stack([0.2 * frame - 3, np.full(30, 15.0)])
+    way = np.column_stack([0.4 * frame - 3, np.full(30, 15.0)])
     rider = boxes(frame, way, category="Cyclist", score=5.0, size=(1.7, 0.6, 1.8))
     ghost = boxes(frame, way + 0.1, category="Pedestrian", score=np.where(frame % 9 == 0, 6.0, 2.0), size=PERSON)
     for online in (True, False):
@@ -360,15 +361,50 @@ def test_a_rider_is_no_pedestrian_beside() -> None:
         assert len(out) == 30
 
 
-def test_what_stands_behind_others_is_left_out_unless_it_is_sure() -> None:
-    frame = np.arange(20)
-    front = boxes(frame, np.tile([0.0, 10.0], (20, 1)))
-    behind = boxes(
-        frame, np.tile([0.0, 20.0], (20, 1)), score=np.where(frame < 10, 0.0, 3.0), category="Pedestrian", size=PERSON
-    )
-    for online in (False, True):
-        out = track_kitti.track_boxes(Boxes.join([front, behind]), standing_view(20), online=online)
-        assert out.take(out.bottom_m[:, 2] > 15).frame.tolist() == list(range(10, 20))
+@pytest.mark.parametrize("online", [True, False])
+def test_who_walks_is_a_pedestrian_though_the_rider_has_the_higher_score(online: bool) -> None:
+    frame = np.arange(60)
+
+    def both(speed_mps: float) -> Boxes:
+        way = np.column_stack([0.1 * speed_mps * frame - 3, np.full(60, 15.0)])
+        rider = boxes(frame, way, category="Cyclist", score=4.0, size=(1.7, 0.6, 1.8))
+        return Boxes.join([rider, boxes(frame, way + 0.1, category="Pedestrian", score=2.5, size=PERSON)])
+
+    for speed, category, length in ((1.2, "Pedestrian", 0.6), (4.0, "Cyclist", 1.8)):
+        out = track_kitti.track_boxes(both(speed), standing_view(60), online=online)
+        late = out.take(out.frame > 20)
+        assert len(np.unique(out.track_id)) == 1
+        assert set(late.category) == {category}
+        assert set(late.size_hwl_m[:, 2]) == {length}  # the box of the category, not that of the other detection
+
+
+def test_the_nearest_of_both_kinds_are_pairs_and_each_is_in_one() -> None:
+    people = boxes([0, 0, 1], [(0, 15), (0.5, 15), (0, 15)], category="Pedestrian", score=[1.0, 2.0, 3.0])
+    riders = boxes([0, 1], [(0.4, 15), (3, 15)], category="Cyclist", score=[2.5, 2.5])
+    pairs = find_pairs(Boxes.join([people, riders]))
+    assert len(pairs.boxes) == 5
+    assert pairs.count == 4
+    tracked = pairs.tracked
+    assert sorted(zip(tracked.frame.tolist(), tracked.category.tolist(), tracked.score.tolist())) == [
+        (0, "Pedestrian", 1.0),
+        (0, "Pedestrian", 2.0),
+        (1, "Cyclist", 2.5),
+        (1, "Pedestrian", 3.0),
+    ]
+    other = pairs.other[tracked.score == 2.0]
+    assert pairs.boxes.score[other].tolist() == [2.5]
+    # Alone they count as one against a missed other one.
+    np.testing.assert_allclose(pairs.rider[tracked.score == 3.0], -1 - 3.0 - 1.0)
+    np.testing.assert_allclose(pairs.rider[(tracked.score == 2.5)], 2.5 + 1 - 1.0)
+
+
+def test_cars_that_others_hide_are_told_where_their_track_is_sure() -> None:
+    frame = np.arange(30)
+    front = boxes(frame, np.tile([0.0, 10.0], (30, 1)))
+    for score, told in ((0.5, 0), (8.0, 30)):
+        behind = boxes(frame, np.tile([0.0, 20.0], (30, 1)), score=score)
+        out = track_kitti.track_boxes(Boxes.join([front, behind]), standing_view(30), online=True)
+        assert (out.bottom_m[:, 2] > 15).sum() == told
 
 
 # ---- scores

@@ -33,9 +33,8 @@ WEAK_TRACK = 0.5
 # Boxes so small that the benchmark does not count them as errors are carried on for so many frames.
 SMALL_FRAMES = 20
 # There are too few labeled people to learn from. Tracks of at least this confidence are filled where they are missed for at
-# most so many frames, online for one; detections that others hide by more than this count where the detector is this sure.
-FILLED_CONFIDENCE, FILLED_FRAMES, FILLED_FRAMES_ONLINE = 3.0, 10, 1
-PERSON_HIDDEN, SURE_SCORE = 0.2, 2.0
+# most so many frames, online for two.
+FILLED_CONFIDENCE, FILLED_FRAMES, FILLED_FRAMES_ONLINE = 2.0, 15, 2
 
 
 def choose(described: Described, *, online: bool) -> Boxes:
@@ -65,15 +64,15 @@ def _cars(d: Described, *, online: bool) -> tuple[Mask, Array]:
 
 
 def _people(d: Described, *, online: bool) -> tuple[Mask, Array]:
-    unsure = (d.features["hidden"] > PERSON_HIDDEN) & (d.features["score"] < SURE_SCORE)
     few = d.distance <= FILLED_FRAMES_ONLINE if online else (d.gap > 0) & (d.gap <= FILLED_FRAMES)
     filled = ~d.doubled & (d.confidence >= FILLED_CONFIDENCE) & few
-    keep = np.where(d.seen, ~unsure, filled)
+    keep = d.seen | filled
     if not online:
         return keep, d.confidence
-    # The evaluation takes the mean over the track, and a score now tells more than the mean of those up to now.
+    # The evaluation takes the mean over the track: what is seen now counts beside all that was seen.
     before, _ = neighbors(d.seen, d.boxes.track_id)
-    return keep, (d.features["score"] + np.log(np.clip(d.hits, 1, FULL_HITS)))[before]
+    now = d.features["score"] + np.log(np.clip(d.hits, 1, FULL_HITS))
+    return keep, (now[before] + d.confidence) / 2
 
 
 def labeled_probability(features: Mapping[str, Array], weights: Mapping[str, float]) -> Array:

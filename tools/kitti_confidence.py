@@ -9,7 +9,7 @@ import numpy as np
 from kitti_boxes import Boxes, overlap_3d
 from kitti_joining import join_tracks
 from kitti_map import View, from_map, hidden_share
-from kitti_rows import SCALE, Index, Mask, Rows, exact_sums, first_of_run, neighbors, sum_so_far
+from kitti_rows import SCALE, Index, Mask, Rows, end_rows, exact_sums, first_of_run, last_of_run, neighbors, sum_so_far
 from kitti_scene import same_frame
 
 from log2sim.datatypes import Measurements
@@ -70,8 +70,7 @@ class Described:
 
 
 def describe(rows: Rows, boxes: Boxes, measurements: Measurements, view: View, *, online: bool) -> Described:
-    """Boxes of the camera and features of all rows that it can see; online they depend on no later frame."""
-    rows = rows.take(np.lexsort([rows.frame, rows.track]))
+    """Boxes of the camera and features of all rows that it can see, given by track and frame; online no later frame is used."""
     out = _in_camera(rows, boxes, measurements, view)
     inside = np.isfinite(out.box_px).all(axis=1)
     out, rows = out.take(inside), rows.take(inside)
@@ -132,23 +131,15 @@ def _evidence(track: Index, seen: Mask, score: Array, within: Mask, *, online: b
     counted = np.where(within, np.where(seen, score, MISSED_SCORE), 0.0)
     sums = [sum_so_far(v, begin) for v in (counted, within, seen)]
     if not online:
-        last = _last_of_run(begin)
+        last = last_of_run(begin)
         sums = [s[last] for s in sums]
     total, frames, hits = sums
     return np.asarray(total / np.maximum(frames, 1) + np.log(np.clip(hits, 1, FULL_HITS)))
 
 
-def _last_of_run(begin: Index) -> Index:
-    return np.r_[np.unique(begin)[1:], len(begin)][np.cumsum(begin == np.arange(len(begin))) - 1] - 1
-
-
 def _moved_m(rows: Rows, measurements: Measurements, *, online: bool) -> Array:
     """Distance (N,) in the map from the first detection of a track to its last one, online to the last one so far."""
-    seen = rows.source >= 0
-    before, after = neighbors(seen, rows.track)
-    begin = first_of_run(rows.track)
-    first = after[begin]
-    last = before if online else before[_last_of_run(begin)]
+    first, last = end_rows(rows, online=online)
     xy = measurements.center_m[:, :2]
     return np.asarray(np.hypot(*(xy[rows.source[last]] - xy[rows.source[first]]).T))
 

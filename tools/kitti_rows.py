@@ -16,8 +16,6 @@ from log2sim.geometry import NS_PER_S, Array
 from log2sim.tracking.forward import ForwardTracker
 from log2sim.tracking.tracker import track
 
-# A detector that finds a rider on a bicycle often finds a pedestrian there as well.
-MAY_BE_ONE = ("Pedestrian", "Cyclist")
 # Gaps up to this are bridged offline.
 MAX_GAP_S = 2.0
 # Offline, tracks of at least so many detections with this mean score (a logit) are carried on by so many frames at both ends.
@@ -79,24 +77,18 @@ def rows_online(boxes: Boxes, measurements: Sequence[Measurements]) -> Rows:
     frames, number, source, model, predicted = (np.concatenate(c) for c in zip(*parts))
     xy = Measurements.join(measurements).center_m[model, :2]
     xy[source < 0] = predicted
-    return Rows(frames, number, source, model, xy, _category_so_far(number, source, model, boxes))
-
-
-def _category_so_far(number: Index, source: Index, model: Index, boxes: Boxes) -> NDArray[np.str_]:
-    """Category (N,) with more of the score of a track up to each of its rows, which come in order of time."""
-    order = np.argsort(number, kind="stable")
-    probability = (source[order] >= 0) / (1 + np.exp(-boxes.score[model[order]]))
-    vote = np.where(boxes.category[model[order]] == MAY_BE_ONE[1], probability, -probability)
-    lead = np.empty(len(number))
-    lead[order] = sum_so_far(vote, first_of_run(number[order]))
-    category = boxes.category[model]
-    return np.where(np.isin(category, MAY_BE_ONE), np.where(lead > 0, *MAY_BE_ONE[::-1]), category)
+    return Rows(frames, number, source, model, xy, boxes.category[model])
 
 
 def first_of_run(number: Index) -> Index:
     """Index (N,) of the first row of the run of equal numbers that each row is in."""
     fresh = np.r_[True, np.diff(number) != 0][: len(number)]
     return np.flatnonzero(fresh)[np.cumsum(fresh) - 1] if len(number) else np.zeros(0, dtype=np.int64)
+
+
+def last_of_run(begin: Index) -> Index:
+    """Index (N,) of the last row of each run, from that of its first row, `begin` (N,)."""
+    return np.r_[np.unique(begin)[1:], len(begin)][np.cumsum(begin == np.arange(len(begin))) - 1] - 1
 
 
 def sum_so_far(values: NDArray[np.generic], begin: Index) -> Array:
@@ -145,3 +137,10 @@ def neighbors(seen: Mask, track: Index) -> tuple[Index, Index]:
     no_after = after == len(seen)
     no_after |= track[np.where(no_after, 0, after)] != track
     return np.where(no_before, after, before), np.where(no_after, before, after)
+
+
+def end_rows(rows: Rows, *, online: bool) -> tuple[Index, Index]:
+    """Rows (N,) of the first and the last detection of the track of each row, online of the last one so far."""
+    before, after = neighbors(rows.source >= 0, rows.track)
+    begin = first_of_run(rows.track)
+    return after[begin], before if online else before[last_of_run(begin)]

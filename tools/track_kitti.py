@@ -21,13 +21,11 @@ from kitti_boxes import Boxes, read_detections, write_tracks
 from kitti_choice import choose
 from kitti_confidence import Described, describe
 from kitti_map import View, read_view, to_measurements
-from kitti_rows import MAY_BE_ONE, rows_offline, rows_online
+from kitti_people import decide_people, find_pairs
+from kitti_rows import rows_offline, rows_online
 
 from log2sim.datatypes import Measurements
 from log2sim.errors import Log2SimError, LogError
-
-# A detector that finds a rider on a bicycle often finds a pedestrian there as well.
-SAME_OBJECT_M = 0.6
 
 
 def track_boxes(boxes: Boxes, view: View, *, online: bool) -> Boxes:
@@ -37,26 +35,13 @@ def track_boxes(boxes: Boxes, view: View, *, online: bool) -> Boxes:
 
 def describe_sequence(boxes: Boxes, view: View, *, online: bool) -> Described:
     """All boxes of tracks, detected and predicted ones, before it is chosen which are told."""
-    boxes = one_category_each(boxes.take(np.argsort(boxes.frame, kind="stable")))
-    measurements = to_measurements(boxes, view)
-    rows = (rows_online if online else rows_offline)(boxes, measurements)
-    return describe(rows, boxes, Measurements.join(measurements), view, online=online)
-
-
-def one_category_each(boxes: Boxes) -> Boxes:
-    """Boxes, sorted by frame, without those of a pedestrian where a rider is found with a higher score, and the other way round."""
-    first, second = (np.flatnonzero(boxes.category == c) for c in MAY_BE_ONE)
-    if len(first) == 0 or len(second) == 0:
-        return boxes
-    begin, end = (np.searchsorted(boxes.frame[second], boxes.frame[first], side) for side in ("left", "right"))
-    count = end - begin
-    a = np.repeat(first, count)
-    b = second[np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(begin, count)]
-    one = np.hypot(*(boxes.bottom_m[a] - boxes.bottom_m[b])[:, [0, 2]].T) < SAME_OBJECT_M
-    a, b = a[one], b[one]
-    keep = np.ones(len(boxes), dtype=bool)
-    keep[np.where(boxes.score[a] < boxes.score[b], a, b)] = False
-    return boxes.take(keep)
+    pairs = find_pairs(boxes)
+    measurements = to_measurements(pairs.tracked, view)
+    rows = (rows_online if online else rows_offline)(pairs.tracked, measurements)
+    others = to_measurements(pairs.boxes.take(slice(pairs.count, None)), view)
+    everything = Measurements.join([*measurements, *others])
+    rows = decide_people(rows, pairs, everything.center_m if view.motion_known else None, online=online)
+    return describe(rows, pairs.boxes, everything, view, online=online)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
