@@ -47,9 +47,10 @@ def expected_contacts(ego: Ways, others: Ways, lead_s: Array) -> Contacts:
     Notes
     -----
     The errors of an agent at different leads are one: who is faster than expected is so throughout. They are normal along and
-    across its course, and each takes `QUANTILES` values of equal probability; the probability is the share of the pairs of
-    values with which the boxes meet. Between leads both move straight, and the time is exact. A first contact does not count where
-    the ego stands by then, or is hit from behind, which its braking would not help, nor where boxes overlap already.
+    across its course, with those of the ego added, and each takes `QUANTILES` values of equal probability; the probability is
+    the share of the pairs of values with which the boxes meet. Between leads both move straight, and the time is exact. A
+    first contact does not count where the ego stands by then, or is hit from behind, which its braking would not help, nor
+    where boxes overlap already.
     """
     probability, time = np.zeros(len(ego.size_m)), np.full(len(ego.size_m), np.inf)
     near = np.flatnonzero(_in_reach(ego, others))
@@ -70,14 +71,16 @@ def _in_reach(ego: Ways, others: Ways) -> NDArray[np.bool_]:
     """Whether two ways come so near that their boxes may meet with any of the errors."""
     radius = (np.hypot(*ego.size_m.T) + np.hypot(*others.size_m.T)) / 2
     step = np.abs(np.diff(others.position_m - ego.position_m, axis=1)).max(axis=1, initial=0.0)
-    room = radius + step + REACH_SIGMA * np.hypot(others.sigma_m[..., 0], others.sigma_m[..., 1]).max(axis=1)
+    sigma = np.hypot(others.sigma_m, ego.sigma_m)
+    room = radius + step + REACH_SIGMA * np.hypot(sigma[..., 0], sigma[..., 1]).max(axis=1)
     return np.asarray(np.abs(others.position_m - ego.position_m).min(axis=1) <= room)
 
 
 def _contact_times(ego: Ways, others: Ways, lead_s: Array) -> Array:
     """Return for pairs (C,) and all errors (K,) the times (C, K) of the first contact, infinite without."""
     along, across = _errors()
-    off = others.sigma_m[:, None, :, 0] * along[:, None] + 1j * others.sigma_m[:, None, :, 1] * across[:, None]
+    sigma = np.hypot(others.sigma_m, ego.sigma_m)[:, None]
+    off = sigma[..., 0] * along[:, None] + 1j * sigma[..., 1] * across[:, None]
     apart = (others.position_m - ego.position_m)[:, None] + off * others.course[:, None]
     span = np.diff(lead_s)
     start, rate = apart[..., :-1], np.diff(apart, axis=-1) / span

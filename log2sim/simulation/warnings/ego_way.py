@@ -14,6 +14,10 @@ from log2sim.simulation.reactive.path_table import PathTable
 from log2sim.simulation.reactive.prediction import ON_PATH_COS, ON_PATH_M
 from log2sim.simulation.warnings.ways import Ways
 
+KEEPING_SIGMA_M, KEEPING_S = 0.3, 1.0
+"""Drivers keep to a lane within some 0.3 m, which they may be off after about a second: what nearly touches may just as well
+not."""
+
 
 class EgoStates(NamedTuple):
     """States of the ego (C,).
@@ -77,8 +81,9 @@ class EgoWay:
         position = np.where(on, origin + x + 1j * y + 1j * left * direction, here + ahead * travel)
         turned = np.where(on, np.angle(direction * (cos0 - 1j * sin0)), 0.0)
         yaw = wrap_angle(ego.yaw_rad[:, None] + turned)
-        still = np.zeros((*position.shape, 2))
-        return Ways(position, yaw, direction, still, np.broadcast_to(np.array(self.size_m[:2]), (len(position), 2)))
+        off = KEEPING_SIGMA_M * np.minimum(lead_s / KEEPING_S, 1.0)
+        sigma = np.broadcast_to(off[:, None], (*position.shape, 2))
+        return Ways(position, yaw, direction, sigma, np.broadcast_to(np.array(self.size_m[:2]), (len(position), 2)))
 
     def heights(self, progress_m: Array, reach_m: Array) -> Array:
         """Return the heights (C, 7), m, of the ego's center on the next `reach_m` (C,) of its path."""
