@@ -16,6 +16,10 @@ from log2sim.simulation.runner import replay
 from log2sim.simulation.warnings.warn import warn
 from log2sim.visualization.page.document import page_document
 from log2sim.visualization.page.writer import write_page
+from log2sim.visualization.plot.observers import lines_of
+from log2sim.visualization.plot.roles import assign_roles
+from log2sim.visualization.plot.tracks import still
+from log2sim.visualization.plot.warned import warned_places
 
 WARN_LIGHT = (179, 92, 0)
 
@@ -47,6 +51,39 @@ def test_without_warnings_and_with_one_end_a_page_tells_of_neither() -> None:
     document = page_document(world, replay=replay(world, mode="exact", dt_s=0.1))
     assert document["warnings"] == {"title": "", "events": []}
     assert not [e for e in document["layers"]["scenario"] if "observed_by" in e]
+
+
+def test_a_picture_shows_beside_the_tracks_what_one_end_alone_observed() -> None:
+    world = scene()
+    walker = world.agents[1]
+    (road,) = lines_of(walker, "road", 0.5)
+    assert lines_of(walker, "vehicle") == []
+    states = walker.at([1.0, 4.9])
+    assert road[0] == pytest.approx([states.x_m[0] + 0.5, states.y_m[0]])
+    assert road[-1] == pytest.approx([states.x_m[1] + 0.5, states.y_m[1]], abs=0.15)
+    assert lines_of(world.agents[0], "road") == []
+
+
+@pytest.mark.parametrize("ends", [1, 2])
+def test_the_legend_explains_ends_and_warnings_where_there_are_some(ends: int) -> None:
+    spans = {"vehicle": (5.0, 8.0), "road": (1.0, 8.0)} if ends == 2 else {"vehicle": (0.0, 8.0)}
+    world = scenario_of(town_ego(8.0), seen(crossing_walker(6.0, 8.0), **spans))
+    for result in (None, warned(world)):
+        layout = still(world, assign_roles(world), replay=result)
+        told = {text.get_text() for text in layout.figure.legends[0].get_texts()}
+        assert ("observed by the road alone" in told) == (ends == 2)
+        assert ("warning: when, and how far apart" in told) == (result is not None)
+
+
+def test_a_warning_is_drawn_from_the_ego_to_the_agent() -> None:
+    world = scene()
+    result = warned(world)
+    (place,) = warned_places(result)
+    t_s = result.warnings.events[0].begin_s
+    for point, agent in zip(place.ends_m, world.agents):
+        states = agent.at(t_s)
+        assert point == pytest.approx([states.x_m[0], states.y_m[0]], abs=1e-3)
+    assert warned_places(replace(result, warnings=None)) == []
 
 
 @pytest.fixture(scope="module")

@@ -17,10 +17,12 @@ from log2sim.visualization.plot.layout import (
     make_layout,
     write_title,
 )
+from log2sim.visualization.plot.observers import observer_rows, tells_ends
 from log2sim.visualization.plot.predicted import PredictedPaths, prediction_row
 from log2sim.visualization.plot.roles import AgentRoles, centers_xy, is_moving
 from log2sim.visualization.plot.time_series import TimelineCharts, charts_height_in, draw_charts, timeline_of
 from log2sim.visualization.plot.viewport import Viewport, choose_viewport, time_step_s
+from log2sim.visualization.plot.warned import warned_places, warning_row
 
 
 def draw_base(
@@ -54,6 +56,10 @@ def draw_base(
     rows += doubts.doubt_rows(roles)
     if predicted is not None and roles.movers:
         rows.append(prediction_row(predicted.horizon_s))
+    if tells_ends(scenario) and not moving:
+        rows += observer_rows()
+    if warned_places(replay) and not moving:
+        rows.append(warning_row())
     timeline = timeline_of(replay, scenario, roles)
     lines = sum(1 + text.count("\n") for _, text in rows)
     layout = make_layout(chosen, lines, projected=projected, foot_in=charts_height_in(timeline))

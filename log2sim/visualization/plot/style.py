@@ -24,6 +24,10 @@ ALARM = "#C8102E"
 COLLISION_MARK: dict[str, Any] = {"marker": "X", "ms": 8.5, "mfc": ALARM, "mec": PAPER, "mew": 0.9}
 """Mark of collisions that belong to the replay."""
 
+WARNING = "#B35C00"
+END_COLOR = {"vehicle": "#1F6FB2", "road": "#8E3B9E"}
+"""Of what one end of a cooperative log alone observed; as on the page."""
+
 PALETTE = (
     "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#882255", "#999933", "#332288", "#44AA99",
     "#AA4499", "#117733", "#CC6677", "#6699CC", "#A6761D", "#661100", "#5E9B2F", "#8C6BB1", "#2F6F7E", "#B8860B",

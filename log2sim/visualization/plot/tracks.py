@@ -15,9 +15,11 @@ from log2sim.visualization.plot.collisions import new_collisions
 from log2sim.visualization.plot.layout import (
     FigureLayout,
 )
+from log2sim.visualization.plot.observers import draw_observers, tells_ends
 from log2sim.visualization.plot.predicted import PredictedPaths, draw_predictions
 from log2sim.visualization.plot.roles import AgentRoles, assign_roles
 from log2sim.visualization.plot.scene import draw_base
+from log2sim.visualization.plot.warned import draw_warnings, warned_places
 
 STILL, ANIMATED = (".png", ".svg", ".pdf"), (".gif", ".mp4")
 
@@ -113,6 +115,9 @@ def still(
     if replay is not None:
         drawing.draw_replay(layout.ax, replay, roles)
         drawing.draw_collisions(layout.ax, new_collisions(replay)[1])
+    if tells_ends(scenario):
+        draw_observers(layout.ax, roles, layout.view)
+    draw_warnings(layout.ax, warned_places(replay))
     if predicted is not None:
         draw_predictions(layout.ax, roles, predicted)
     drawing.draw_labels(layout.ax, roles, layout.view, step_s)
