@@ -9,6 +9,7 @@ import numpy as np
 
 from cooperation_worlds.builder import MAX_TRIES, Builder
 from cooperation_worlds.line_of_sight import visible_share
+from cooperation_worlds.spacing import agents_touch
 from cooperation_worlds.world import ROAD_LIDAR, VEHICLE_LIDAR, World
 from log2sim.synth.polytopes import Shape
 
@@ -18,6 +19,7 @@ CONTACT_S, AFTER_S = 5.0, 0.1
 FIRST_SIGHT_S = (0.5, 1.45)
 # The pole sees half of the person from here on, s before the contact.
 ROAD_SIGHT_S = 4.0
+GAP_M, NEAR_CONTACT_S = 0.05, 0.3  # between all others at least, and until the ego meets the walker
 HIDING_HEIGHT_M = 2.2  # the LiDAR on the roof looks over what is lower
 
 
@@ -34,6 +36,8 @@ def keeps_promise(world: World) -> bool:
     """Return whether the vehicle's LiDAR sees the person late and the road's early."""
     before = np.arange(0.0, ROAD_SIGHT_S + 0.01, 0.1)
     t_s = world.contact_s - before
+    if agents_touch(world, t_s[before > NEAR_CONTACT_S], GAP_M):
+        return False
     alone = visible_share(world, VEHICLE_LIDAR, t_s) > 0.1
     first = before[alone].max(initial=0.0)
     if not FIRST_SIGHT_S[0] <= first <= FIRST_SIGHT_S[1]:

@@ -10,9 +10,11 @@ import numpy as np
 from cooperation_worlds.builder import MAX_TRIES, Builder
 from cooperation_worlds.draw_range import distances_m
 from cooperation_worlds.line_of_sight import visible_share
+from cooperation_worlds.spacing import agents_touch, things_touch
 from cooperation_worlds.world import ROAD_LIDAR, VEHICLE_LIDAR, World
 
 DURATION_S, STEP_S = 2.0, 0.1
+GAP_M = 1.0
 NEAR_M, FAR_M = 6.0, 17.5  # of the target's center from the ego's, whose LiDAR ends at 20 m
 MIN_VIEW_ANGLE_RAD = np.deg2rad(50)  # between the views of both ends, at the target
 
@@ -30,6 +32,8 @@ def keeps_promise(world: World) -> bool:
     """Return whether both ends see the target all the time, from sides that differ."""
     t_s = np.arange(0, world.scene.duration_s + 1e-9, STEP_S)
     away = distances_m(world, t_s)
+    if agents_touch(world, t_s, GAP_M) or things_touch(world, t_s, GAP_M):
+        return False
     if away.min() < NEAR_M or away.max() > FAR_M or _view_angle(world, t_s).min() < MIN_VIEW_ANGLE_RAD:
         return False
     return all((visible_share(world, lidar, t_s) > 0.35).all() for lidar in (VEHICLE_LIDAR, ROAD_LIDAR))
@@ -73,5 +77,7 @@ def _drawn(seed: int, rng: np.random.Generator) -> World:
     if rng.random() < 0.5:
         out.houses.append({"center": [0.0, float(rng.choice([-1, 1])) * 34.0], "size_m": [60.0, 8.0, 9.0]})
     out.scatter([[-30.0, 0.0], [30.0, 0.0]], 7.0)
+    # Nothing stands where the target goes.
+    out.things = [thing for thing in out.things if np.linalg.norm(thing[1] - xy) > shape[0][0] / 2 + 8]
     out.add_sensors(pole.tolist(), xy.tolist())
     return out.world(DURATION_S, "target")

@@ -9,9 +9,11 @@ import numpy as np
 
 from cooperation_worlds.builder import MAX_TRIES, ROAD_RANGE_M, Builder
 from cooperation_worlds.line_of_sight import visible_share
+from cooperation_worlds.spacing import agents_touch
 from cooperation_worlds.world import ROAD_LIDAR, Array, World
 
 MAX_DURATION_S, STEP_S = 5.0, 0.1
+GAP_M = 0.05  # between all at least
 FROM_M, TO_M = 46.0, 13.0  # distances between ego and target that a variant covers, from 46 m or more to 13 m or less
 
 
@@ -36,6 +38,8 @@ def keeps_promise(world: World) -> bool:
     """Return whether the pole sees the target wherever it is 15 to 40 m from the ego."""
     t_s = np.arange(0, world.scene.duration_s + 1e-9, STEP_S)
     away = distances_m(world, t_s)
+    if agents_touch(world, t_s, GAP_M):
+        return False
     between = (away > 15) & (away < 40)
     share = visible_share(world, ROAD_LIDAR, t_s[between])
     return bool(away[0] >= FROM_M and away[-1] <= TO_M and between.sum() >= 10 and (share > 0.3).all())
