@@ -73,7 +73,7 @@ def ap_table(figures: dict[str, Any]) -> str:
     ]
     rows += [[f"recall, vehicles {what}", *(_n(of[w]) for w in ways)] for what, of in figures["recall"].items()]
     share = f"{figures['vehicles']} vehicles, {100 * figures['hidden_from_vehicle']:.0f} % hidden from the vehicle"
-    return _table(["AP BEV .5", *(NAMES[w] for w in ways)], rows) + "\n\n" + share
+    return _table(["AP BEV .5; people, two-wheelers .25", *(NAMES[w] for w in ways)], rows) + "\n\n" + share
 
 
 def registration_table(figures: dict[str, Any]) -> str:
