@@ -11,7 +11,7 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ from cooperation_worlds.perturb import RoadError, disturb, draw_error
 from cooperation_worlds.plots import plot_world
 from cooperation_worlds.rows import Rows
 from cooperation_worlds.runs import ALONE, WAYS, Found, detect, perceive, prepared
-from cooperation_worlds.world import World, at_rate, log_of
+from cooperation_worlds.world import World, log_of
 
 from log2sim.datatypes import Log
 
@@ -55,8 +55,8 @@ class Choices:
         Whether the clock of the road's end is off, too.
     register : bool
         Whether the road's end is registered.
-    rate_hz : float
-        Of both LiDARs.
+    every : int
+        One in so many sweeps is used.
     rows : Rows
         What is measured already.
     plots : Path or None
@@ -66,13 +66,13 @@ class Choices:
     noise: float
     delayed: bool
     register: bool
-    rate_hz: float
+    every: int
     rows: Rows
     plots: Path | None
 
     def key(self, test: str, seed: int, way: str) -> tuple[Any, ...]:
         """Name a row."""
-        return (test, seed, way, self.noise, self.delayed, self.register, self.rate_hz)
+        return (test, seed, way, self.noise, self.delayed, self.register, self.every)
 
     def disturbed(self, log: Log, seed: int) -> tuple[Log, RoadError]:
         """Put an error on the road's end."""
@@ -90,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--noise", type=float, default=0.0, metavar="SHARE", help="Of 0.5 m, 2 degrees and 0.3 s.")
     parser.add_argument("--no-delay", action="store_true", help="Noise in the pose alone.")
     parser.add_argument("--no-register", action="store_true", help="Take the road's pose and clock as they are.")
-    parser.add_argument("--rate", type=float, default=10.0, metavar="HZ", help="Of both LiDARs; the scenes stay.")
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="Use one in N sweeps, which saves time.")
     parser.add_argument("--plot", type=Path, metavar="DIR", help="Draw the first ten variants of each test from above.")
     parser.add_argument("--json", type=Path, metavar="FILE", help="Write the figures.")
     parser.add_argument(
@@ -98,7 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     a = parser.parse_args(arguments)
     choices = Choices(
-        tuple(a.ways.split(",")), a.noise, not a.no_delay, not a.no_register, a.rate, Rows(a.rows), a.plot
+        tuple(a.ways.split(",")), a.noise, not a.no_delay, not a.no_register, a.every, Rows(a.rows), a.plot
     )
     if a.plot is not None:
         a.plot.mkdir(parents=True, exist_ok=True)
@@ -115,7 +115,7 @@ def measured(
 ) -> Iterator[tuple[World, dict[str, Any]]]:
     """Yield each world with a row for every way, in the order of the seeds."""
     for count, seed in enumerate(seeds, start=1):
-        world = at_rate(DRAW[test](seed), choices.rate_hz)
+        world = replace(DRAW[test](seed), every=choices.every)
         missing = [way for way in choices.ways if choices.key(test, seed, way) not in choices.rows]
         if missing:
             log, _ = choices.disturbed(log_of(world)[0], seed)
@@ -123,7 +123,7 @@ def measured(
             found = {}
             for way in missing:
                 used = log if way in ALONE else both
-                found[way] = perceive(used, way)
+                found[way] = perceive(used, way, world.scene.start_ns)
                 choices.rows[choices.key(test, seed, way)] = measure(world, used, way, found[way])
             if choices.plots is not None and count <= PLOTTED:
                 plot_world(world, log, found, choices.plots / f"{test}_{seed}.png", PLOT_AT_S[test])
@@ -189,7 +189,7 @@ def run_registration(choices: Choices, seeds: Sequence[int]) -> dict[str, Any]:
     for count, seed in enumerate(seeds, start=1):
         key = choices.key("registration", seed, "")
         if key not in choices.rows:
-            world = at_rate(list(DRAW.values())[seed % len(DRAW)](seed), choices.rate_hz)
+            world = replace(list(DRAW.values())[seed % len(DRAW)](seed), every=choices.every)
             error = draw_error(seed, choices.noise or 1.0, delayed=choices.delayed)
             row = registration_measures.row(log_of(world)[0], error)
             choices.rows[key] = {"test": world.test, "seed": seed, **row}

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from cooperation_worlds.draw_blind_area import SPEED_MPS
-from cooperation_worlds.runs import Found, agents_near, at
+from cooperation_worlds.runs import Found, agents_near
 from cooperation_worlds.world import World
 from log2sim.geometry import rectangles_overlap
 from log2sim.simulation.warnings.warn import warn
@@ -26,18 +26,19 @@ MOMENTS = ("known_s", "warned_s")
 def row(world: World, found: Found) -> dict[str, float | None]:
     """When the person is first known and first warned of, s; None where it never is before the contact."""
     known, warned = np.inf, np.inf
-    period_s = 1 / world.scene.lidar[0].rate_hz
     t_s = np.arange(0.0, world.contact_s + 1e-9, STEP_S)
     target = next(a for a in world.moving.actors if a.spec.id == world.target)
     xy = target.at(t_s).center_m[:, :2]
     warnings = None if found.scenario is None or found.scenario.ego is None else warn(found.scenario)
     for agent in agents_near(found.scenario, target.spec.category):
-        state, there = at(agent, t_s)
+        state, there = found.at(agent, t_s)
         near = there & (np.linalg.norm(state[:, :2] - xy, axis=1) < MATCH_M)
         if near.any():
-            known = min(known, float(t_s[near][0]) + SWEEPS_BEFORE_KNOWN * period_s)
+            known = min(known, float(t_s[near][0]) + SWEEPS_BEFORE_KNOWN * world.period_s)
             event = warnings.of(agent.id) if warnings is not None else None
-            warned = min(warned, event.warned.t_s if event is not None and event.warned is not None else np.inf)
+            warned = min(
+                warned, event.warned.t_s + found.begin_s if event is not None and event.warned is not None else np.inf
+            )
     return {name: t if t < world.contact_s else None for name, t in (("known_s", known), ("warned_s", warned))}
 
 

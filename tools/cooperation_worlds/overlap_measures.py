@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cooperation_worlds.runs import ALONE, Found, agents_near, at
+from cooperation_worlds.runs import ALONE, Found, agents_near
 from cooperation_worlds.world import Array, World
 from log2sim.datatypes import GROUP_OF, Boxes3D
 from log2sim.geometry import NS_PER_S, rectangle_overlap
@@ -34,7 +34,7 @@ def of_scenario(world: World, found: Found) -> Array:
     category = next(a for a in world.moving.actors if a.spec.id == world.target).spec.category
     best = np.zeros((len(t_s), 2))
     for agent in agents_near(found.scenario, category):
-        state, there = at(agent, t_s)
+        state, there = found.at(agent, t_s)
         near = there & (np.linalg.norm(state[:, :2] - truth[:, :2], axis=1) < MATCH_M)
         size = np.tile(np.array(agent.size_m[:2]), (len(t_s), 1))
         shared = shares(np.column_stack([state[:, :2], size, state[:, 2]]), truth)

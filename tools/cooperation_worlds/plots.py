@@ -55,11 +55,9 @@ def _cloud(log: Log, lidar: str, start_ns: int, t_s: float) -> Array:
 
 
 def _draw_found(axis: object, result: Found, color: str, t_s: float) -> None:
-    from cooperation_worlds.runs import at
-
     agents = () if result.scenario is None else result.scenario.agents
     for agent in agents:
-        state, there = at(agent, np.array([t_s]))
+        state, there = result.at(agent, np.array([t_s]))
         if agent.id != "ego" and there[0]:
             size = np.array(agent.size_m)[:2, None]
             corners = box_corners_bev(state[:, :2], *size, state[:, 2])[0]

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cooperation_worlds.draw_range import distances_m
-from cooperation_worlds.runs import Found, agents_near, at
+from cooperation_worlds.runs import Found, agents_near
 from cooperation_worlds.world import Array, World
 
 STEP_S, MATCH_M = 0.2, 2.0
@@ -18,12 +18,11 @@ AROUND_30_M = (27.5, 32.5)
 
 def perceived(world: World, found: Found) -> Array:
     """Rows (T, 2) of times from the first tick to the last one: distance of the target, and whether it was perceived."""
-    period_s = 1 / world.scene.lidar[0].rate_hz
-    t_s = np.arange(period_s, world.scene.duration_s - period_s, STEP_S)
+    t_s = np.arange(world.period_s, world.scene.duration_s - world.period_s, STEP_S)
     target = next(a for a in world.moving.actors if a.spec.id == world.target)
     xy, seen = target.at(t_s).center_m[:, :2], np.zeros(len(t_s), bool)
     for agent in agents_near(found.scenario, target.spec.category):
-        state, there = at(agent, t_s)
+        state, there = found.at(agent, t_s)
         seen |= there & (np.linalg.norm(state[:, :2] - xy, axis=1) < MATCH_M)
     return np.column_stack([distances_m(world, t_s), seen])
 

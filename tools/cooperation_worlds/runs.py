@@ -13,6 +13,7 @@ from log2sim.config import Config
 from log2sim.datatypes import GROUP_OF, Agent, Boxes3D, Log, Scenario
 from log2sim.errors import NothingToReconstruct
 from log2sim.evaluation.detection.detect_log import detect_log
+from log2sim.geometry import NS_PER_S
 from log2sim.pipeline import reconstruct, start
 
 ALONE = ("vehicle", "road")
@@ -20,6 +21,7 @@ LEVELS = ("points", "boxes", "tracks")
 WAYS = (*ALONE, *LEVELS)
 # Both LiDARs stand level, so both are searched by the network for such ones, as the ends are where their boxes are joined.
 DETECTOR = "lidar:vehicle"
+ROUNDED_S = 0.06  # a tick is there until its neighbors are
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,11 +32,19 @@ class Found:
     ----------
     scenario : Scenario or None
         None where nothing was found.
-    report : dict
+    begin_s : float
+        When it begins, after the begin of the log's scene: at the middle of its first sweep.
     """
 
     scenario: Scenario | None
-    report: dict[str, Any]
+    begin_s: float = 0.0
+
+    def at(self, agent: Agent, t_s: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """x, y, yaw (T, 3) of an agent at times of the scene, and at which of them it was there; between waypoints straight."""
+        w, t = agent.waypoints, np.asarray(t_s) - self.begin_s
+        there = (t >= w.t_s[0] - ROUNDED_S) & (t <= w.t_s[-1] + ROUNDED_S)
+        yaw = np.interp(t, w.t_s, np.unwrap(w.yaw_rad))
+        return np.column_stack([np.interp(t, w.t_s, w.x_m), np.interp(t, w.t_s, w.y_m), yaw]), there
 
 
 def settings(way: str, *, register: bool, **more: Any) -> Config:
@@ -49,13 +59,13 @@ def prepared(log: Log, *, register: bool) -> Log:
     return start(log, settings("points", register=True)).log if register else log
 
 
-def perceive(log: Log, way: str) -> Found:
-    """Reconstruct the scenario of a log in one way."""
+def perceive(log: Log, way: str, start_ns: int) -> Found:
+    """Reconstruct the scenario of a log in one way; `start_ns` is when its scene begins."""
     try:
-        result = reconstruct(log, settings(way, register=False))
+        scenario = reconstruct(log, settings(way, register=False)).scenario
     except NothingToReconstruct:
-        return Found(None, {})
-    return Found(result.scenario, result.report)
+        return Found(None)
+    return Found(scenario, (scenario.t0_ns - start_ns) / NS_PER_S)
 
 
 def detect(log: Log, way: str, *, min_score: float = 0.05) -> tuple[NDArray[np.int64], tuple[Boxes3D, ...]]:
@@ -72,11 +82,3 @@ def agents_near(scenario: Scenario | None, category: str) -> list[Agent]:
     """Agents of the group of a category, without the ego."""
     agents = () if scenario is None else scenario.agents
     return [a for a in agents if a.id != "ego" and GROUP_OF[a.category] == GROUP_OF[category]]
-
-
-def at(agent: Agent, t_s: Array) -> tuple[Array, np.ndarray]:
-    """x, y, yaw (T, 3) of an agent at times, and which of them it was there, by interpolation between its waypoints."""
-    w = agent.waypoints
-    there = (t_s >= w.t_s[0] - 0.06) & (t_s <= w.t_s[-1] + 0.06)
-    yaw = np.interp(t_s, w.t_s, np.unwrap(w.yaw_rad))
-    return np.column_stack([np.interp(t_s, w.t_s, w.x_m), np.interp(t_s, w.t_s, w.y_m), yaw]), there

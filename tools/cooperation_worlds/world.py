@@ -49,6 +49,8 @@ class World:
         When the front of the ego reaches the target, if nobody brakes; NaN where it does not.
     things : tuple of Solid
         Trees, posts, bins and other things beside the road, which are no road users.
+    every : int
+        One in so many sweeps is recorded; the LiDARs turn as fast as they do.
     """
 
     test: str
@@ -58,6 +60,12 @@ class World:
     target: str
     contact_s: float = float("nan")
     things: tuple[Solid, ...] = ()
+    every: int = 1
+
+    @property
+    def period_s(self) -> float:
+        """Time between the sweeps of the vehicle's LiDAR."""
+        return self.every / self.scene.lidar[0].rate_hz
 
     @property
     def moving(self) -> MovingScene:
@@ -65,18 +73,12 @@ class World:
         return MovingScene.of(self.scene)
 
 
-def at_rate(world: World, rate_hz: float) -> World:
-    """Let both LiDARs turn at another rate; nothing else changes."""
-    lidars = tuple(spec.model_copy(update={"rate_hz": rate_hz}) for spec in world.scene.lidar)
-    return replace(world, scene=world.scene.model_copy(update={"lidar": lidars}))
-
-
 def log_of(world: World) -> tuple[Log, Scenario]:
     """Make the log of a world, whose sweeps are cast once when they are read, and its exact truth."""
     log, truth = synthesize(world.scene, seed=world.seed, observe=False)
     moving, streams = world.moving, {}
     for index, spec in enumerate(world.scene.lidar):
-        stamps = sweep_stamps(spec, world.scene)
+        stamps = sweep_stamps(spec, world.scene)[:: world.every]
         streams[spec.name] = Stream(spec.name, stamps, _reader(world, moving, spec, index, stamps))
     return log.changed(streams=streams), truth
 
