@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -30,6 +31,7 @@ from cooperation_worlds.overlap_measures import shares  # noqa: E402
 from cooperation_worlds.perturb import RoadError, disturb  # noqa: E402
 from cooperation_worlds.range_measures import figures as range_figures  # noqa: E402
 from cooperation_worlds.rows import Rows  # noqa: E402
+from cooperation_worlds.runs import Found  # noqa: E402
 from cooperation_worlds.world import ROAD_LIDAR, VEHICLE_LIDAR, World, cast, log_of  # noqa: E402
 
 DRAW = {"range": draw_range, "blind_area": draw_blind_area, "overlap": draw_overlap}
@@ -142,6 +144,18 @@ def test_an_error_of_the_pole_moves_its_points_and_stamps_alone() -> None:
         wrong.streams[ROAD_LIDAR].read(2).t_ns, log.streams[ROAD_LIDAR].read(2).t_ns + 200_000_000
     )
     assert wrong.lidars[VEHICLE_LIDAR] is log.lidars[VEHICLE_LIDAR]
+
+
+def test_agents_of_a_scenario_are_where_they_were_at_times_of_the_scene() -> None:
+    """A scenario begins with the middle of its first sweep, not with its scene."""
+    world = replace(draw_overlap(2), every=2)
+    log, truth = log_of(world)
+    assert np.diff(log.streams[VEHICLE_LIDAR].t_ns).tolist() == [200_000_000] * 9
+    later = truth.agents[1].waypoints
+    agent = replace(truth.agents[1], waypoints=replace(later, t_s=later.t_s - 0.05))
+    state, there = Found(truth, begin_s=0.05).at(agent, np.array([1.0, 9.0]))
+    assert there.tolist() == [True, False]
+    np.testing.assert_allclose(state[0, :2], world.moving.actors[0].at([1.0]).center_m[0, :2], atol=1e-6)
 
 
 def test_overlap_and_iou_of_a_box_that_is_twice_as_long() -> None:
