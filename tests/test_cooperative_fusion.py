@@ -11,18 +11,23 @@ from hypothesis import strategies as st
 from worlds import rows_at, tiny_log, tiny_table
 
 from log2sim.config import Config
+from log2sim.config_sections import LidarConfig
 from log2sim.datatypes import Boxes3D, Measurements, Track
 from log2sim.errors import LogError
 from log2sim.evaluation.bench.benchmark import bench
 from log2sim.evaluation.bench.document import document
 from log2sim.geometry import rectangle_iou, rotation_from_rpy, transform, wrap_angle
+from log2sim.perception.cooperative.alignment import align_parts, moving_boxes
 from log2sim.perception.cooperative.box_errors import BoxErrors, estimate_errors
 from log2sim.perception.cooperative.detector import EndsDetector, create_for_ends, detector_by_mounting
 from log2sim.perception.cooperative.matching import SeenBoxes, match_by_covariance, match_by_overlap
 from log2sim.perception.cooperative.merging import METHODS, fuse_boxes, merge_by_covariance
-from log2sim.perception.lidar.cloud import assemble_cloud
-from log2sim.perception.lidar.measure_boxes import measure_boxes
-from log2sim.perception.lidar.viewpoints import assemble_views, group_by_viewpoint
+from log2sim.perception.detect3d.level_points import level_points, viewpoints_xy
+from log2sim.perception.detect3d.network_detector import open_shipped
+from log2sim.perception.lidar.cloud import Cloud, CloudSensor, assemble_cloud
+from log2sim.perception.lidar.measure_boxes import follow_box, measure_boxes
+from log2sim.perception.lidar.viewpoints import assemble_views, group_by_viewpoint, join_parts
+from log2sim.perception.prefetch import obstacles_of
 from log2sim.pipeline import reconstruct
 from log2sim.plan import FusionLevel, fusion_level
 from log2sim.tracking.merging import merge_tracks, track_ends, velocities
@@ -374,3 +379,106 @@ def test_bench_compares_the_ends_and_their_levels(both_ends) -> None:
     assert document(result)["panels"][0]["stage"] == "ends"
     with pytest.raises(LogError, match="compares methods for images"):
         bench(log.changed(lidars={"top": log.lidars["top"]}), chosen)
+
+
+def outline_points(x, y, length=4.5, width=1.8, step=0.1):
+    """Points on all sides of a car, 0.3 to 1.3 m above the ground."""
+    along, across = np.arange(-length / 2, length / 2 + 1e-9, step), np.arange(-width / 2, width / 2 + 1e-9, step)
+    sides = [np.column_stack([along, np.full(len(along), s * width / 2)]) for s in (-1, 1)]
+    sides += [np.column_stack([np.full(len(across), s * length / 2), across]) for s in (-1, 1)]
+    flat = np.concatenate(sides) + np.array([x, y])
+    return np.concatenate([np.column_stack([flat, np.full(len(flat), z)]) for z in (0.3, 0.8, 1.3)])
+
+
+def view_of(xyz, sensor, *, end="vehicle", stamp_ns=0):
+    n = len(xyz)
+    return Cloud(
+        stamp_ns, np.zeros(3), xyz.astype(np.float32), np.zeros(n, np.float32), np.array(sensor, np.float32),
+        np.zeros(n, bool), xyz[:, 2].astype(np.float32), (CloudSensor(n, np.array(sensor, float), np.zeros(3), end),),
+    )  # fmt: skip
+
+
+def test_boxes_are_sought_where_the_other_end_sees_them_later() -> None:
+    box = boxes_at((0, 0, 0.75, 4.5, 1.8, 1.5, 0))
+    # At 15 m/s, 0.05 s later.
+    later = view_of(outline_points(0.75, 0.0), [20, 5, 3], end="road", stamp_ns=50_000_000)
+    moved = follow_box(box, later)
+    assert moved.center_m[0, :2] == pytest.approx([0.75, 0.0], abs=0.15)
+    same_time = view_of(outline_points(0.75, 0.0), [20, 5, 3], end="road")
+    assert np.array_equal(follow_box(box, same_time).center_m, box.center_m)
+    nothing = view_of(outline_points(30.0, 0.0), [20, 5, 3], end="road", stamp_ns=50_000_000)
+    assert np.array_equal(follow_box(box, nothing).center_m, box.center_m)
+    cloud = join_parts([view_of(outline_points(0.0, 0.0), [-15, -5, 2]), later])
+    rows = measure_boxes(box, cloud)
+    assert rows.points[0] == len(cloud.xyz)
+
+
+def test_what_a_viewpoint_sees_is_judged_from_there() -> None:
+    parts = [view_of(outline_points(-5, 0), [-15, -5, 2]), view_of(outline_points(5, 0), [20, 5, 3], end="road")]
+    cloud = join_parts(parts)
+    obstacles = obstacles_of(cloud)
+    for x, sensor in ((-5, [-15, -5, 2]), (5, [20, 5, 3])):
+        near = np.flatnonzero(np.abs(obstacles.xyz[:, 0] - x) < 3)
+        assert obstacles.sensor_of(near).tolist() == sensor
+    assert obstacles_of(parts[0]).sensor_of(np.arange(3)).tolist() == [-15, -5, 2]
+    starts = {tuple(p) for p in obstacles.free.start.tolist()}
+    assert starts == {(-15, -5, 2), (20, 5, 3)}
+
+
+def test_the_grid_reaches_around_every_viewpoint() -> None:
+    places = ([0, 0, 2], [70, 10, 4])
+    cloud = join_parts([view_of(outline_points(p[0] + dx, p[1]), p) for p in places for dx in (-30, 30)])
+    xyz, index = level_points(cloud, 40.0)
+    assert len(index) == len(cloud.xyz)
+    detector = open_shipped("vehicle", LidarConfig())
+    center, reach_m = detector._square_around(viewpoints_xy(cloud))
+    assert (np.abs(xyz[:, :2] - center) <= reach_m).all()
+    one = detector._square_around(viewpoints_xy(cloud.parts[0]))
+    assert (one[0].tolist(), one[1]) == ([0, 0], 40.0)
+    # Nothing that is out of range of all of them.
+    far = join_parts([view_of(outline_points(45, 0), [0, 0, 2]), view_of(outline_points(70, 10), [70, 70, 4])])
+    assert len(level_points(far, 40.0)[1]) == 0
+
+
+def test_points_of_a_moving_car_are_put_to_one_time() -> None:
+    # 15 m/s; the vehicle sees its rear, the road its front 0.05 s later. Beside it stands another.
+    outline = outline_points(0.0, 0.0)
+    rear, front = outline[outline[:, 0] < 0], outline[outline[:, 0] > 0.5] + [0.75, 0, 0]
+    parked = outline_points(0.0, 5.0)
+    parts = [
+        view_of(np.concatenate([rear, parked]), [-15, -5, 2]),
+        view_of(np.concatenate([front, parked]), [20, 5, 3], end="road", stamp_ns=50_000_000),
+    ]
+    cloud = join_parts(parts)
+    stands = (0.0, 5.0, 0.75, 4.5, 1.8, 1.5, 0)
+    before = [
+        boxes_at((-3.0, 0.1, 0.75, 4.5, 1.8, 1.5, 0.02), stands, t_ns=-200_000_000),
+        boxes_at((-1.5, 0.0, 0.75, 4.5, 1.8, 1.5, 0.0), stands, t_ns=-100_000_000),
+    ]
+    aligned = align_parts(cloud, before)
+    own = np.abs(aligned.xyz[:, 1]) < 1.5
+    assert np.ptp(cloud.xyz[own, 0]) == pytest.approx(5.25, abs=0.01)
+    assert np.ptp(aligned.xyz[own, 0]) == pytest.approx(4.5, abs=0.01)
+    assert np.ptp(aligned.t_s[own]) == 0
+    assert np.array_equal(aligned.xyz[~own], cloud.xyz[~own])
+    assert np.array_equal(aligned.t_s[~own], cloud.t_s[~own])
+    for few in ([], before[:1], [before[0], Boxes3D.empty()]):
+        assert align_parts(cloud, few) is cloud
+    assert align_parts(parts[0], before) is parts[0]
+
+
+def test_only_what_drives_along_its_axis_is_moved() -> None:
+    at = (0.0, 0.0, 0.75, 4.5, 1.8, 1.5, 0.0)
+    earlier = boxes_at(at, t_ns=0)
+
+    def speed_of(x, y, **columns):
+        _, speed = moving_boxes(replace(earlier, **columns), boxes_at((x, y, *at[2:]), t_ns=100_000_000))
+        return speed.tolist()
+
+    assert speed_of(1.5, 0.1) == pytest.approx([15.0])
+    assert speed_of(-1.5, 0.1) == pytest.approx([-15.0])
+    assert speed_of(0.3, 0.0) == []
+    assert speed_of(0.6, 0.8) == []
+    assert speed_of(8.0, 0.0) == []
+    assert speed_of(1.5, 0.0, score=np.array([0.1])) == []
+    assert speed_of(1.5, 0.0, category=np.array(["truck"])) == []

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Boxes3D, Log, Obstacles, Sweep
+from log2sim.perception.cooperative.alignment import align_parts
 from log2sim.perception.detect3d.detectors import LidarDetector
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.lidar.cloud import Cloud, cloud_origin, compensation_of
@@ -18,7 +19,7 @@ from log2sim.perception.lidar.rays import sample_rays
 from log2sim.perception.lidar.viewpoints import assemble_views
 from log2sim.perception.record_checks.sweep_sketches import sketch_sweep
 from log2sim.perception.sync import Schedule
-from log2sim.plan import Plan, Stage
+from log2sim.plan import FusionLevel, Plan, Stage
 
 OBSTACLE_REACH_M = 70.0
 OBSTACLE_VOXEL_M = 0.12
@@ -75,6 +76,8 @@ class CloudPrefetcher:
         self._clouds: dict[Key, Future[Cloud | None]] = {}
         self._boxes: dict[Key, Future[Boxes3D]] = {}
         self._earlier: list[Key] = []
+        # Boxes of the two clouds before, by whose motion the points of both ends are put to one time.
+        self._before: list[Future[Boxes3D]] = []
 
     def prefetch(self, tick: int) -> None:
         """Start making what a tick and the ones after it need, and forget what only earlier ticks needed."""
@@ -114,7 +117,9 @@ class CloudPrefetcher:
         for key in keys:
             if key not in self._boxes:
                 earlier = [self._clouds[k] for k in self._earlier]
-                self._boxes[key] = self._pool.submit(_boxes_in, detector, self._clouds[key], earlier)
+                self._boxes[key] = self._pool.submit(_boxes_in, detector, self._clouds[key], earlier, self._before)
+                if self._plan.fusion is FusionLevel.POINTS:
+                    self._before = [*self._before, self._boxes[key]][-2:]
                 self._earlier = [*self._earlier, key][max(len(self._earlier) + 2 - self._options.sweeps, 0) :]
 
     def _read(self, name: str, index: int, before: Future[Sweep | None] | None) -> Sweep | None:
@@ -146,10 +151,16 @@ class CloudPrefetcher:
         return cloud
 
 
-def _boxes_in(detector: LidarDetector, making: Future[Cloud | None], earlier: list[Future[Cloud | None]]) -> Boxes3D:
+def _boxes_in(
+    detector: LidarDetector,
+    making: Future[Cloud | None],
+    earlier: list[Future[Cloud | None]],
+    found: list[Future[Boxes3D]],
+) -> Boxes3D:
     cloud = making.result()
     if cloud is None:
         return Boxes3D.empty()
+    cloud = align_parts(cloud, [boxes.result() for boxes in found])
     return detector.detect(cloud, [before for future in earlier if (before := future.result()) is not None])
 
 

@@ -94,7 +94,8 @@ def merge_by_covariance(a: SeenBoxes, b: SeenBoxes) -> SeenBoxes:
     """
     axes, apart_rad = _join_axes(a, b)
     first, second = (_in_axes(seen, axes, a.boxes.center_m[:, :2]) for seen in (a, b))
-    t_ns = _mean_time(a.boxes, b.boxes)
+    # The time of those points that say most, which later stages measure again.
+    t_ns = np.where(b.boxes.points > a.boxes.points, b.boxes.t_ns, a.boxes.t_ns)
     late_s = np.stack([(t - t_ns) / NS_PER_S for t in (a.boxes.t_ns, a.boxes.t_ns, b.boxes.t_ns, b.boxes.t_ns)], axis=1)
     speed = first_speeds(a.boxes)[:, None]
     moves = np.concatenate([speed, np.where(is_walking(a.boxes)[:, None], speed, 0.0)], axis=1)
