@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from worlds import rows_at, tiny_log, tiny_table
 
+from log2sim.agents.ends import Ends, _better_ends
 from log2sim.config import Config
 from log2sim.config_sections import LidarConfig
 from log2sim.datatypes import Boxes3D, Measurements, Track
@@ -100,6 +101,9 @@ def test_what_moves_between_the_times_of_both_ends_is_put_at_one() -> None:
     assert merged.center_m[0, 0] == pytest.approx(15 * merged.t_ns[0] / 1e9, abs=0.05)
     assert merged.size_m[0, 0] == pytest.approx(4.5, abs=0.05)
     assert match_by_covariance(a, b)[0].tolist() == [0]
+    # Its size is known to both, wherever it is.
+    longer = seen(boxes_at((1.5, 0, 0.8, 4.7, 1.8, 1.6, 0), t_ns=100_000_000, points=100))
+    assert merge_by_covariance(a, longer).boxes.size_m[0, 0] == pytest.approx(4.6, abs=0.02)
     # Boxes of one time are as far apart by mistake; none is between them.
     still = seen(boxes_at((1.5, *CAR[1:]), t_ns=0, points=100))
     assert abs(merge_by_covariance(a, still).boxes.size_m[0, 0] - 4.5) < 0.2
@@ -136,7 +140,7 @@ def test_small_objects_match_though_they_hardly_overlap() -> None:
     one, other = (seen(boxes_at((x, 0, 0.9, 0.6, 0.6, 1.8, 0), category="pedestrian"), 0.15) for x in (0.0, 0.45))
     assert [v.tolist() for v in match_by_covariance(one, other)] == [[0], [0]]
     assert [v.tolist() for v in match_by_overlap(one, other)] == [[], []]
-    far = seen(boxes_at((1.2, 0, 0.9, 0.6, 0.6, 1.8, 0), category="pedestrian"), 0.5)
+    far = seen(boxes_at((1.0, 0, 0.9, 0.6, 0.6, 1.8, 0), category="pedestrian"), 0.5)
     assert [v.tolist() for v in match_by_covariance(one, far)] == [[], []]
 
 
@@ -209,6 +213,10 @@ def test_clouds_of_both_ends_keep_their_viewpoints(both_ends) -> None:
     # Times are absolute, whatever the stamps of the sweeps.
     stamps = np.concatenate([view.stamp_ns + (view.t_s * 1e9).astype(np.int64) for view in cloud.views])
     assert cloud.stamp_ns + (cloud.t_s * 1e9).astype(np.int64) == pytest.approx(stamps, abs=2000)
+    # Positions of sensors are those at the stamp of the whole.
+    sensor = CloudSensor(1, np.array([20.0, 5, 3]), np.array([10.0, 0, 0]), "road")
+    later = replace(cloud.views[1], stamp_ns=cloud.stamp_ns + 50_000_000, sensors=(sensor,))
+    assert join_parts([cloud.views[0], later]).sensors[-1].position.tolist() == [19.5, 5, 3]
     index = np.array([0, len(cloud.views[0].xyz), len(cloud.xyz) - 1])
     split = cloud.split(index)
     assert [(view.end, rows.tolist()) for view, rows in split] == [
@@ -482,3 +490,20 @@ def test_only_what_drives_along_its_axis_is_moved() -> None:
     assert speed_of(8.0, 0.0) == []
     assert speed_of(1.5, 0.0, score=np.array([0.1])) == []
     assert speed_of(1.5, 0.0, category=np.array(["truck"])) == []
+
+
+def test_an_end_is_taken_from_the_view_that_knows_it_better() -> None:
+    def ends(low, high, real_low, real_high, gap_m=0.1):
+        real = np.array([[[real_low, real_high]] * 2])
+        return Ends(np.full((1, 2), float(low)), np.full((1, 2), float(high)), real, np.full((1, 2, 2), gap_m))
+
+    facing, beside = ends(-2.0, 1.0, 2, 0), ends(-1.7, 2.3, 1, 1)
+    for better in (_better_ends(facing, beside), _better_ends(beside, facing)):
+        assert (better.low[0, 0], better.high[0, 0]) == (-2.0, 2.3)
+        assert better.real[0, 0].tolist() == [2, 1]
+    # Of ends that nobody knows, what reaches farther.
+    unknown = _better_ends(ends(-2.0, 1.0, 0, 0), ends(-1.0, 1.5, 0, 0))
+    assert (unknown.low[0, 0], unknown.high[0, 0]) == (-2.0, 1.5)
+    # Of two that are known alike, the one where rays are closer together.
+    close = _better_ends(ends(-2.0, 1.0, 1, 1), ends(-2.1, 1.1, 1, 1, gap_m=0.02))
+    assert (close.low[0, 0], close.high[0, 0]) == (-2.1, 1.1)
