@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
-from registration_worlds import World, WorldSpec, disturbed, draw_world, errors_of
+from registration_worlds import World, WorldSpec, disturbed, draw_world, errors_of, misplaced
 
 from log2sim.config import Config
 from log2sim.cooperation.registration import RoadRegistration, register_road
@@ -21,8 +21,8 @@ POLE = "pole0"
 
 @pytest.fixture(scope="module")
 def street() -> World:
-    """A street with buildings, moving traffic, and a LiDAR of 16 lines on a pole."""
-    return draw_world(WorldSpec(kind="street", seed=0, azimuth_step_deg=1.2, duration_s=2.0))
+    """A street with buildings, moving traffic, and a LiDAR of 32 lines on a pole."""
+    return draw_world(WorldSpec(kind="street", seed=5, road_lidar="level32", azimuth_step_deg=1.2, duration_s=2.0))
 
 
 def register(log: Log, **asked: object) -> RoadRegistration:
@@ -49,7 +49,7 @@ def test_a_healthy_log_comes_out_as_it_is(street: World) -> None:
 
 
 def test_a_pose_that_contradicts_what_the_vehicle_sees_is_left_out(street: World) -> None:
-    found = register(disturbed(street.log, POLE, 12.0, 40.0, 0.0, np.random.default_rng(0)))
+    found = register(misplaced(street.log, POLE, 8.0, 90.0))
     assert [(fault.kind, fault.sensor, fault.treatment) for fault in found.faults] == [
         ("wrong_road_pose", POLE, "left_out")
     ]

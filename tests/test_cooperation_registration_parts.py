@@ -13,7 +13,8 @@ from log2sim.cooperation.common_objects import CommonObjects, ObjectTrack, link_
 from log2sim.cooperation.estimate import Estimate, Sight, estimate_error
 from log2sim.cooperation.findings import Findings
 from log2sim.cooperation.free_space import Visibility, look_through
-from log2sim.cooperation.structure import Surfaces, VehicleView, surfaces_of, view_from_road
+from log2sim.cooperation.ground_match import upright_points
+from log2sim.cooperation.structure import RoadView, Surfaces, VehicleView, surfaces_of, view_from_road
 from log2sim.cooperation.units import Unit, correct_unit, units_of
 from log2sim.datatypes import Boxes3D, Lidar, Log, Stream, Sweep
 from log2sim.geometry import Array, Camera, apply, inverse, transform
@@ -22,12 +23,18 @@ UNIT = Unit(("pole",), (), np.zeros(3))
 ERROR = np.array([0.3, -0.35, 0.2, 0.01, -0.02, 0.025])
 
 
+def still(points: Array) -> RoadView:
+    return RoadView(points, np.ones(len(points)))
+
+
 # --- common objects
 
 
 def drive(start: tuple[float, float], velocity: tuple[float, float], t_s: Array, group: int = 0) -> ObjectTrack:
     place = np.array(start) + t_s[:, None] * np.array(velocity)
-    return track_of(np.column_stack([t_s, place, np.full(len(t_s), -3.0), np.full(len(t_s), group)]))
+    return track_of(
+        np.column_stack([t_s, place, np.full(len(t_s), -3.0), np.full(len(t_s), group), np.full(len(t_s), 200)])
+    )
 
 
 def seen_by_road(track: ObjectTrack, error: Array, delay_s: float) -> ObjectTrack:
@@ -48,7 +55,7 @@ def test_traffic_alone_shows_the_pose_in_the_plane_and_the_delay(delay_s: float)
     ]
     error = ERROR * np.array([1, 1, 0, 0, 0, 1])
     objects = CommonObjects.of(cars, [seen_by_road(car, error, delay_s) for car in cars])
-    found = estimate_error(Sight(None, np.zeros((0, 3)), None, None, objects))
+    found = estimate_error(Sight(None, still(np.zeros((0, 3))), None, None, objects))
     assert found.values[6] == pytest.approx(delay_s, abs=0.01)
     assert found.values[[0, 1]] == pytest.approx(error[:2], abs=0.04)
     assert np.degrees(found.values[5] - error[5]) == pytest.approx(0.0, abs=0.1)
@@ -57,7 +64,7 @@ def test_traffic_alone_shows_the_pose_in_the_plane_and_the_delay(delay_s: float)
 def test_objects_that_stand_say_nothing_about_the_delay() -> None:
     t_s = np.arange(0.0, 4.0, 0.2)
     cars = [drive((x, y), (0, 0), t_s) for x, y in ((-10, 3), (12, -4), (5, 9))]
-    found = estimate_error(Sight(None, np.zeros((0, 3)), None, None, CommonObjects.of(cars, cars)))
+    found = estimate_error(Sight(None, still(np.zeros((0, 3))), None, None, CommonObjects.of(cars, cars)))
     assert np.sqrt(found.covariance[6, 6]) == pytest.approx(0.3, rel=0.01)
     assert not Findings(UNIT, found, (None, None)).late
 
@@ -98,7 +105,7 @@ def test_walls_and_ground_show_the_whole_pose() -> None:
     surfaces = surfaces_of(view_of(points + rng.normal(0, 0.01, points.shape), sensors), points)
     road = apply(inverse(exp_of(ERROR)), walls(0.7)[0] + 0.13)
     road = road + rng.normal(0, 0.01, road.shape)
-    found = estimate_error(Sight(None, road - 0.0, surfaces, None, CommonObjects(())))
+    found = estimate_error(Sight(None, still(road), surfaces, None, CommonObjects(())))
     assert np.linalg.norm(found.values[3:6] - ERROR[3:]) < np.radians(0.1)
     # All points of the road were moved by 0.13 m along each axis, too.
     assert found.values[:3] == pytest.approx(ERROR[:3] - 0.13, abs=0.03)
@@ -111,7 +118,9 @@ def test_the_ground_alone_shows_height_and_tilt_and_no_more() -> None:
     points, sensors = walls(0.3)
     ground = points[points[:, 2] == -4.0]
     surfaces = surfaces_of(view_of(ground, sensors), ground)
-    found = estimate_error(Sight(None, apply(inverse(exp_of(ERROR)), ground[::5]), surfaces, None, CommonObjects(())))
+    found = estimate_error(
+        Sight(None, still(apply(inverse(exp_of(ERROR)), ground[::5])), surfaces, None, CommonObjects(()))
+    )
     sigma = np.sqrt(np.diag(found.covariance))
     assert found.values[[2, 3, 4]] == pytest.approx(ERROR[[2, 3, 4]], abs=0.03)
     assert (sigma[:2] > 0.4).all()
@@ -145,10 +154,10 @@ def test_a_post_holds_both_directions() -> None:
 def test_what_the_vehicle_saw_through_contradicts_a_pose() -> None:
     points, sensors = walls(0.25)
     upright = points[points[:, 2] > -3.0]
-    healthy = look_through(view_of(points, sensors), points)
+    healthy = look_through(view_of(points, sensors), upright_points(points))
     assert healthy.contradicting < 0.05
     assert healthy.seen > 0.8 * len(upright)
-    nearer = apply(transform(np.eye(3), np.array([-8.0, -8.0, 0.0])), points)
+    nearer = apply(transform(np.eye(3), np.array([-8.0, -8.0, 0.0])), upright_points(points))
     assert look_through(view_of(points, sensors), nearer).contradicting > 0.8
 
 
@@ -208,7 +217,7 @@ def test_what_passes_is_not_what_stands() -> None:
         return Sweep(int(t_ns[i]), np.concatenate([wall, car]))
 
     log = Log("log", "test", {}, {"pole": Lidar("pole", "map", np.eye(4))}, {"pole": Stream("pole", t_ns, read)})
-    seen = view_from_road(log, ["pole"], np.zeros(3))
+    seen = view_from_road(log, ["pole"], np.zeros(3)).xyz_m
     assert (np.abs(seen[:, 0] - 10.0) < 0.01).all()
 
 

@@ -34,6 +34,7 @@ class Outcome:
     verified: bool
     moving: int
     took_s: float
+    seen_through: float
 
 
 def register(log: Log) -> tuple[RoadRegistration, float]:
@@ -58,6 +59,7 @@ def measure(world: World, noise: tuple[float, float], delay_s: float) -> list[Ou
             Outcome(
                 f"{world.spec.kind} {world.spec.road_lidar}", noise, delay_s, errors_of(found.log, world.log, pole),
                 kinds, figures["verified"], 0 if objects is None else objects["moving"], took_s / len(world.poles),
+                figures["seen_through"]["before"] or 0.0,
             )
         )  # fmt: skip
     return outcomes

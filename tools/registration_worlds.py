@@ -28,6 +28,7 @@ VEHICLE = "vehicle"
 POSE_RATE_HZ = 20.0
 # What stays in a world with next to no structure.
 TRAFFIC_SPEED_MPS = 1.0
+ALONG, STANDING_SHARE = 0.9, 0.1
 
 
 @dataclass(frozen=True)
@@ -73,9 +74,7 @@ def draw_world(spec: WorldSpec) -> World:
     lidar = LIDAR_MODELS["hdl32e"].model_copy(
         update={"azimuth_step_deg": spec.azimuth_step_deg, "rate_hz": spec.vehicle_rate_hz}
     )
-    scene = draw_scene("vehicle", rng, lidar=lidar)
-    if np.hypot(*scene.sensor.velocity_mps) > 20.0:
-        scene = replace(scene, sensor=replace(scene.sensor, velocity_mps=scene.sensor.velocity_mps / 2))
+    scene = _draw_drive(lidar, rng)
     if spec.kind == "open":
         kept = tuple(
             o for o in scene.objects if (o.category and o.speed_mps > TRAFFIC_SPEED_MPS) or o.kind == "own car"
@@ -101,6 +100,19 @@ def draw_world(spec: WorldSpec) -> World:
         ego=_poses(run, ego_T_lidar, spec.duration_s), ego_vehicle=EgoVehicle(size, REAR_AXLE_OFFSET_M),
     )  # fmt: skip
     return World(log, spec, names)
+
+
+def _draw_drive(lidar: LidarModel, rng: np.random.Generator) -> TrafficScene:
+    """Draw a scene whose vehicle follows the road at up to 16 m/s; one in ten stands."""
+    while True:
+        scene = draw_scene("vehicle", rng, lidar=lidar)
+        forward = scene.sensor.rotation[:2, 0] / np.linalg.norm(scene.sensor.rotation[:2, 0])
+        road = scene.roads[0].yaw_rad
+        if abs(forward @ [np.cos(road), np.sin(road)]) < ALONG:
+            continue
+        speed = 0.0 if rng.random() < STANDING_SHARE else rng.uniform(3.0, 16.0)
+        own = [replace(o, speed_mps=speed) if o.kind == "own car" else o for o in scene.objects]
+        return replace(scene, objects=tuple(own), sensor=replace(scene.sensor, velocity_mps=speed * forward))
 
 
 def _car(rng: np.random.Generator) -> tuple[tuple[float, float, float], tuple]:
@@ -205,6 +217,14 @@ def _poses(run: TrafficRun, ego_T_lidar: Array, duration_s: float) -> PoseTrack:
     sensors = [run.at(float(t)).sensor for t in t_s]
     poses = np.array([transform(s.rotation, s.position_m) @ inverse(ego_T_lidar) for s in sensors])
     return PoseTrack(_stamps(t_s), poses)
+
+
+def misplaced(log: Log, pole: str, shift_m: float, turn_deg: float) -> Log:
+    """Put a LiDAR of the roadside elsewhere on the ground and turn it about the vertical, as by a wrong entry in a table."""
+    mount = log.lidars[pole].mount_T_lidar
+    turn = transform(rotation_from_rpy(0.0, 0.0, np.radians(turn_deg)), np.zeros(3)) @ mount
+    turn[:3, 3] = mount[:3, 3] + [shift_m, 0.0, 0.0]
+    return log.changed(lidars={**log.lidars, pole: replace(log.lidars[pole], mount_T_lidar=turn)})
 
 
 def disturbed(log: Log, pole: str, shift_m: float, turn_deg: float, delay_s: float, rng: np.random.Generator) -> Log:

@@ -31,6 +31,8 @@ SPREAD_M = {
     "small": ((0.07, 0.07), (0.12, 0.08)),
     "standing": ((0.1, 0.1), (0.3, 0.3)),
 }
+# Of boxes with so many points; those with fewer err more.
+USUAL_POINTS, MAX_FACTOR = 100.0, 3.0
 # Two tracks of one object have velocities as like as boxes over a second tell.
 MAX_VELOCITY_APART_MPS = 4.0
 # Boxes so many standard deviations apart count a quarter (Geman, McClure 1987), as they may be of different objects.
@@ -52,12 +54,15 @@ class ObjectTrack:
         In the frame of the site.
     velocity_mps : (K, 2) float64
     group : int
+    points : float
+        Median number of points in its boxes.
     """
 
     t_s: Array
     xyz_m: Array
     velocity_mps: Array
     group: int
+    points: float = np.inf
 
     def at(self, t_s: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Interpolate places (N, 3) and velocities (N, 2) at times (N,), and say where they are known (N,)."""
@@ -89,9 +94,9 @@ def link_boxes(boxes: Sequence[Boxes3D], site_m: Array, start_ns: int) -> list[O
 
 
 def _rows_of(boxes: Boxes3D, site_m: Array, start_ns: int) -> Array:
-    """Return rows (M, 5) of time, place and group."""
+    """Return rows (M, 6) of time, place, group, and number of points."""
     group = [GROUPS.get(str(category), -1) for category in boxes.category]
-    return np.column_stack([(boxes.t_ns - start_ns) / NS_PER_S, boxes.center_m - site_m, group])
+    return np.column_stack([(boxes.t_ns - start_ns) / NS_PER_S, boxes.center_m - site_m, group, boxes.points])
 
 
 def _costs(track: list[Array], rows: Array) -> Array:
@@ -107,14 +112,14 @@ def _costs(track: list[Array], rows: Array) -> Array:
 
 
 def track_of(rows: Array) -> ObjectTrack:
-    """Make a track of rows (K, 5): time, place, group."""
+    """Make a track of rows (K, 6): time, place, group, number of points."""
     t_s, xyz = rows[:, 0], rows[:, 1:4]
     near = np.abs(t_s[:, None] - t_s) <= VELOCITY_SPAN_S
     count = near.sum(axis=1)
     mean_s = near @ t_s / count
     off_s = np.where(near, t_s - mean_s[:, None], 0.0)
     velocity = (off_s @ xyz[:, :2]) / np.maximum((off_s**2).sum(axis=1), 1e-6)[:, None]
-    return ObjectTrack(t_s, xyz, velocity, int(np.median(rows[:, 4])))
+    return ObjectTrack(t_s, xyz, velocity, int(rows[0, 4]), float(np.median(rows[:, 5])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,9 +181,9 @@ def match_objects(objects: CommonObjects, correction: Array, delay_s: float, wit
         best = _best_match(seen, others, correction, delay_s, within_m)
         if best is None:
             continue
-        place, velocity, off = best
+        place, velocity, off, points = best
         away.append(np.hypot(*off.T))
-        moves, turn, sigma, bias = _spread_of(seen, velocity)
+        moves, turn, sigma, bias = _spread_of(seen, velocity, min(points, seen.points))
         moving += moves
         gain += float((1 - away[-1] ** 2 / within_m**2).sum())
         turned, jacobian = off @ turn.T, turn @ _jacobian(place, velocity)
@@ -195,13 +200,13 @@ def match_objects(objects: CommonObjects, correction: Array, delay_s: float, wit
     return Matched(Evidence(information, gradient), len(away), moving, gain, float(rms_m))
 
 
-def _spread_of(seen: ObjectTrack, velocity: Array) -> tuple[bool, Array, Array, Array]:
+def _spread_of(seen: ObjectTrack, velocity: Array, points: float) -> tuple[bool, Array, Array, Array]:
     """Return whether an object moves, the axes (2, 2) along and across its motion, and the sigmas and biases (2,) along them."""
     forward = velocity.mean(axis=0)
     speed = float(np.hypot(*forward))
     moves = speed > MOVING_MPS
     kind = "standing" if not moves else "vehicle" if seen.group == GROUPS["car"] else "small"
-    sigma, bias = np.array(SPREAD_M[kind])
+    sigma, bias = np.array(SPREAD_M[kind]) * np.clip(np.sqrt(USUAL_POINTS / points), 1.0, MAX_FACTOR)
     x, y = forward / speed if moves else (1.0, 0.0)
     return moves, np.array([[x, y], [-y, x]]), sigma, bias
 
@@ -218,8 +223,8 @@ def _jacobian(place: Array, velocity: Array) -> Array:
 
 def _best_match(
     seen: ObjectTrack, road: Sequence[ObjectTrack], correction: Array, delay_s: float, within_m: float
-) -> tuple[Array, Array, Array] | None:
-    """Find the track of the road that a vehicle's track is nearest to: its places, velocities, and offsets from the latter's."""
+) -> tuple[Array, Array, Array, float] | None:
+    """Find the track of the road that a vehicle's track is nearest to: places, velocities, offsets from the latter's, and points."""
     best, best_gain = None, 0.0
     for other in road:
         place, velocity, known = other.at(seen.t_s + delay_s)
@@ -231,5 +236,5 @@ def _best_match(
         known &= np.hypot(*off.T) < within_m
         gain = float((1 - (off[known] ** 2).sum(axis=1) / within_m**2).sum())
         if gain > best_gain and known.sum() >= min(MIN_BOXES, len(known)):
-            best, best_gain = (place[known], velocity[known], off[known]), gain
+            best, best_gain = (place[known], velocity[known], off[known], other.points), gain
     return best

@@ -13,7 +13,14 @@ from log2sim.cooperation.common_objects import CommonObjects, Matched, link_boxe
 from log2sim.cooperation.detections import choose_moments, detect_boxes, detectors_of
 from log2sim.cooperation.ground_match import CommonGround, common_ground, ground_below, match_ground
 from log2sim.cooperation.pose_fit import DELAY, PRIOR_SIGMA, MatchedStructure, match_structure, solve
-from log2sim.cooperation.structure import Surfaces, VehicleView, surfaces_of, view_from_road, view_from_vehicle
+from log2sim.cooperation.structure import (
+    RoadView,
+    Surfaces,
+    VehicleView,
+    surfaces_of,
+    view_from_road,
+    view_from_vehicle,
+)
 from log2sim.cooperation.units import Unit
 from log2sim.datatypes import Log
 from log2sim.geometry import NS_PER_S, Array
@@ -36,7 +43,7 @@ class Sight:
     ----------
     view : VehicleView or None
         Of the vehicle; None where it never comes near.
-    road_m : (N, 3) float64, m
+    road : RoadView
         What stands still by the unit's LiDARs.
     surfaces : Surfaces or None
     ground : CommonGround or None
@@ -44,7 +51,7 @@ class Sight:
     """
 
     view: VehicleView | None
-    road_m: Array
+    road: RoadView
     surfaces: Surfaces | None
     ground: CommonGround | None
     objects: CommonObjects
@@ -81,10 +88,10 @@ def look_around(log: Log, config: Config, unit: Unit, report: Callable[[int, int
     view = view_from_vehicle(log, unit.site_m, during)
     road = view_from_road(log, unit.lidars, unit.site_m, during)
     report(1, 3)
-    surfaces = None if view is None else surfaces_of(view, road)
+    surfaces = None if view is None else surfaces_of(view, road.xyz_m)
     report(2, 3)
-    ground = None if view is None else common_ground(view, road)
-    return Sight(view, road, surfaces, ground, _objects_around(log, config, unit, road))
+    ground = None if view is None else common_ground(view, road.xyz_m)
+    return Sight(view, road, surfaces, ground, _objects_around(log, config, unit, road.xyz_m))
 
 
 def _objects_around(log: Log, config: Config, unit: Unit, road_m: Array) -> CommonObjects:
@@ -96,7 +103,9 @@ def _objects_around(log: Log, config: Config, unit: Unit, road_m: Array) -> Comm
     floor = pose[:, :3, 3] + pose[:, :3, 2] * log.ground_z_ego_m
     at_pole = np.repeat((unit.site_m + np.array([0.0, 0.0, ground_below(road_m)]))[None], len(moments), axis=0)
     start = int(moments[0])
-    own = np.column_stack([(moments - start) / NS_PER_S, log.ego_centers(pose) - unit.site_m, np.zeros(len(moments))])
+    places = log.ego_centers(pose) - unit.site_m
+    known = np.ones((len(moments), 1))
+    own = np.hstack([(moments - start)[:, None] / NS_PER_S, places, 0 * known, np.inf * known])
     seen = link_boxes(detect_boxes(log, lidars_on_ego(log), of_vehicle, moments, floor), unit.site_m, start)
     road = link_boxes(detect_boxes(log, unit.lidars, of_road, moments, at_pole), unit.site_m, start)
     return CommonObjects.of((track_of(own), *seen), road)
@@ -153,7 +162,7 @@ def _refine(sight: Sight, start: Array, *, with_objects: bool) -> tuple[Array, A
 def _structure(sight: Sight, values: Array, within_m: float) -> MatchedStructure | None:
     if sight.surfaces is None:
         return None
-    return match_structure(sight.surfaces, sight.road_m, exp_of(values[:DELAY]), within_m)
+    return match_structure(sight.surfaces, sight.road.xyz_m, exp_of(values[:DELAY]), within_m)
 
 
 def _objects(sight: Sight, values: Array, within_m: float) -> Matched | None:

@@ -19,6 +19,8 @@ VOXEL_M = 0.5
 # For slopes of the surface.
 STEP_M = 0.5
 CAUCHY = 2.0
+# Of upright things: above curbs and the errors of a surface on slopes.
+MIN_HEIGHT_M = 0.7
 # Of the lowest points around a pole, those of the ground.
 GROUND_RADIUS_M, GROUND_SHARE = 20.0, 0.1
 # Of a pole that sees no ground.
@@ -48,6 +50,14 @@ def ground_below(road_m: Array) -> float:
     """Estimate the height of the ground at a pole, m, in the frame of the site, from the unit's points (N, 3)."""
     near = road_m[np.hypot(road_m[:, 0], road_m[:, 1]) < GROUND_RADIUS_M, 2]
     return float(np.quantile(near, GROUND_SHARE)) if len(near) else -USUAL_BELOW_M
+
+
+def upright_points(road_m: Array) -> Array:
+    """Choose the points (n, 3) of a unit, m, that are above the ground as it sees it itself."""
+    if len(road_m) == 0:
+        return road_m
+    surface = estimate_ground(road_m, np.zeros(2), ground_below(road_m))
+    return road_m[road_m[:, 2] - surface.at(road_m[:, :2]) > MIN_HEIGHT_M]
 
 
 def common_ground(view: VehicleView, road_m: Array) -> CommonGround | None:

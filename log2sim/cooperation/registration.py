@@ -11,7 +11,8 @@ import numpy as np
 from log2sim.config import Config
 from log2sim.cooperation.estimate import Sight, estimate_error, look_around
 from log2sim.cooperation.findings import Findings
-from log2sim.cooperation.free_space import look_through
+from log2sim.cooperation.free_space import Visibility, look_through
+from log2sim.cooperation.ground_match import upright_points
 from log2sim.cooperation.units import Unit, correct_unit, units_of
 from log2sim.datatypes import Fault, Log
 from log2sim.geometry import Array
@@ -76,11 +77,12 @@ def register_road(log: Log, config: Config, sensors: Sensors, *, progress: Progr
 def _check_unit(log: Log, config: Config, unit: Unit, progress: Progress) -> Findings:
     """Estimate what a unit lacks, and look whether what it sees can be there."""
     sight = look_around(log, config, unit, lambda done, total: progress(f"register {unit.lidars[0]}", done, total))
-    found = estimate_error(sight)
-    return Findings(unit, found, (_visibility(sight, np.eye(4)), _visibility(sight, found.correction)))
+    found, upright = estimate_error(sight), upright_points(sight.road.steady_m)
+    visibility = (_visibility(sight, upright, np.eye(4)), _visibility(sight, upright, found.correction))
+    return Findings(unit, found, visibility)
 
 
-def _visibility(sight: Sight, correction: Array) -> Any:
+def _visibility(sight: Sight, upright_m: Array, correction: Array) -> Visibility | None:
     if sight.view is None:
         return None
-    return look_through(sight.view, sight.road_m @ correction[:3, :3].T + correction[:3, 3])
+    return look_through(sight.view, upright_m @ correction[:3, :3].T + correction[:3, 3])

@@ -33,7 +33,7 @@ MAX_ERROR_M = 2.5
 MAX_THICKNESS_M, MIN_WIDTH_M = 0.06, 0.1
 MIN_UPRIGHT_Z, MAX_POST_WIDTH_M, MIN_POST_LENGTH_M = 0.95, 0.12, 0.25
 # What stands still is in a place in a third of the sweeps or more; what passes is not, unless it waits.
-STATIC_VOXEL_M, MIN_STATIC_SHARE = 0.4, 0.35
+STATIC_VOXEL_M, MIN_STATIC_SHARE, STEADY_SHARE = 0.4, 0.35, 0.8
 MAX_ROAD_POINTS = 6000
 
 
@@ -125,34 +125,61 @@ def _near_sweeps(
     return np.asarray(rows[np.unique(np.searchsorted(gone, places).clip(0, len(rows) - 1))])
 
 
-def view_from_road(log: Log, lidars: Sequence[str], site_m: Array, during_ns: tuple[int, int] | None = None) -> Array:
-    """Collect the points (N, 3), m, of what stands still around a site by the LiDARs of a pole, one a voxel."""
-    return np.concatenate([_static_points(log, name, site_m, during_ns) for name in lidars])
+@dataclass(frozen=True, eq=False)
+class RoadView:
+    """What stands still around a site by the LiDARs of a pole.
+
+    Attributes
+    ----------
+    xyz_m : (N, 3) float64, m
+        Points in the frame of the site, one a voxel.
+    share : (N,) float64
+        Of the sweeps that have a point in the same place.
+    """
+
+    xyz_m: Array
+    share: Array
+
+    @property
+    def steady_m(self) -> Array:
+        """The points (n, 3) that are there nearly all the time: what waits for a while is not among them."""
+        return self.xyz_m[self.share > STEADY_SHARE]
+
+
+def view_from_road(
+    log: Log, lidars: Sequence[str], site_m: Array, during_ns: tuple[int, int] | None = None
+) -> RoadView:
+    """Collect the points of what stands still around a site (3,), m, by the LiDARs of a pole."""
+    parts = [_static_points(log, name, site_m, during_ns) for name in lidars]
+    points = np.concatenate(parts) if parts else np.zeros((0, 4))
+    points = points[:: max(-(-len(points) // MAX_ROAD_POINTS), 1)]
+    return RoadView(points[:, :3], points[:, 3])
 
 
 def _static_points(log: Log, lidar: str, site_m: Array, during_ns: tuple[int, int] | None) -> Array:
+    """Return points with the share of sweeps that have one in the same place, (N, 4)."""
     t_ns = log.streams[lidar].t_ns
     rows = np.arange(len(t_ns))
     if during_ns is not None:
         rows = rows[(t_ns >= during_ns[0]) & (t_ns <= during_ns[1])]
-    if len(rows) == 0:
-        return np.zeros((0, 3))
-    chosen = rows[np.unique(np.linspace(0, len(rows) - 1, MAX_ROAD_SWEEPS).round().astype(np.int64))]
+    chosen = (
+        rows[np.unique(np.linspace(0, len(rows) - 1, MAX_ROAD_SWEEPS).round().astype(np.int64))] if len(rows) else rows
+    )
     parts = []
     for i in chosen.tolist():
         mapped = _read(log, lidar, i)
         if mapped is not None:
             xyz = mapped[0] - site_m
             parts.append(xyz[np.linalg.norm(xyz, axis=1) < MAX_REACH_M])
-    if not parts:
-        return np.zeros((0, 3))
+    if not parts or not sum(map(len, parts)):
+        return np.zeros((0, 4))
     xyz = np.concatenate(parts)
     sweep = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     place = _voxels(xyz, STATIC_VOXEL_M)
     seen = np.unique(place * len(parts) + sweep) // len(parts)
-    static = np.bincount(seen, minlength=int(place.max()) + 1) >= MIN_STATIC_SHARE * len(parts)
-    kept = thin(xyz[static[place]], VOXEL_M)
-    return kept[:: -(-len(kept) // MAX_ROAD_POINTS)] if len(kept) else kept
+    share = (np.bincount(seen, minlength=int(place.max()) + 1) / len(parts))[place]
+    static = share >= MIN_STATIC_SHARE
+    return thin(np.hstack([xyz[static], share[static, None]]), VOXEL_M)
 
 
 def _read(log: Log, lidar: str, index: int) -> tuple[Array, Array] | None:
