@@ -15,8 +15,7 @@ from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector
 from log2sim.perception.lidar.cloud import assemble_cloud
 
-# More moments make the result no better: errors of boxes that last for the whole track remain.
-MAX_MOMENTS, SPACING_S = 30, 0.2
+SPACING_S = 0.2
 # Farther from a pole, boxes have too few points.
 MAX_AWAY_M = 70.0
 REACH_M = 60.0
@@ -24,8 +23,8 @@ MIN_SCORE = 0.4
 NO_DETECTIONS = "lidar:labels"
 
 
-def choose_moments(log: Log, site_m: Array, during_ns: tuple[int, int] | None) -> NDArray[np.int64]:
-    """Choose stamps (K,) at which the vehicle is near a site (3,), evenly spaced around the nearest."""
+def choose_moments(log: Log, site_m: Array, during_ns: tuple[int, int] | None, count: int) -> NDArray[np.int64]:
+    """Choose `count` stamps (K,) or fewer at which the vehicle is near a site (3,), evenly spaced around the nearest."""
     if log.ego is None:
         return np.zeros(0, dtype=np.int64)
     first, last = int(log.ego.t_ns[0]), int(log.ego.t_ns[-1])
@@ -35,10 +34,10 @@ def choose_moments(log: Log, site_m: Array, during_ns: tuple[int, int] | None) -
     pose, known = log.ego.at(t_ns)
     away = np.hypot(*(pose[:, :2, 3] - site_m[:2]).T)
     usable = np.flatnonzero(known & (away < MAX_AWAY_M))
-    if len(usable) > MAX_MOMENTS:
+    if len(usable) > count:
         nearest = int(np.argmin(away[usable]))
-        begin = int(np.clip(nearest - MAX_MOMENTS // 2, 0, len(usable) - MAX_MOMENTS))
-        usable = usable[begin : begin + MAX_MOMENTS]
+        begin = int(np.clip(nearest - count // 2, 0, len(usable) - count))
+        usable = usable[begin : begin + count]
     return np.asarray(t_ns[usable])
 
 

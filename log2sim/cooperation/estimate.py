@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from log2sim.calibration.twists import exp_of, log_of
 from log2sim.config import Config
@@ -33,6 +34,8 @@ OBJECT_WITHIN_M = (2.5, 2.0, 1.5, 1.2, 1.0, 1.0, 1.0, 1.0, 1.0)
 # Delays that are tried; stamps of a sweep's begin instead of its end are early by a period.
 TRIED_DELAYS_S = np.arange(-0.2, 0.51, 0.1)
 JUDGED_WITHIN_M = 0.5
+# Where structure holds the pose in the plane, objects tell the delay alone, for which fewer moments do.
+HELD_M, FEW_MOMENTS, MANY_MOMENTS = 0.1, 15, 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,11 +94,14 @@ def look_around(log: Log, config: Config, unit: Unit, report: Callable[[int, int
     surfaces = None if view is None else surfaces_of(view, road.xyz_m)
     report(2, 3)
     ground = None if view is None else common_ground(view, road.xyz_m)
-    return Sight(view, road, surfaces, ground, _objects_around(log, config, unit, road.xyz_m))
+    sight = Sight(view, road, surfaces, ground, CommonObjects(()))
+    covariance = _refine(sight, np.zeros(7), with_objects=False)[1]
+    held = np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]) < HELD_M
+    moments = choose_moments(log, unit.site_m, during, FEW_MOMENTS if held else MANY_MOMENTS)
+    return replace(sight, objects=_objects_around(log, config, unit, road.xyz_m, moments))
 
 
-def _objects_around(log: Log, config: Config, unit: Unit, road_m: Array) -> CommonObjects:
-    moments = choose_moments(log, unit.site_m, during_ns(log, config))
+def _objects_around(log: Log, config: Config, unit: Unit, road_m: Array, moments: NDArray[np.int64]) -> CommonObjects:
     if log.ego is None or len(moments) == 0:
         return CommonObjects(())
     of_vehicle, of_road = detectors_of(log, config)
