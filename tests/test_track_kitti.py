@@ -375,7 +375,8 @@ def test_who_walks_is_a_pedestrian_though_the_rider_has_the_higher_score(online:
         late = out.take(out.frame > 20)
         assert len(np.unique(out.track_id)) == 1
         assert set(late.category) == {category}
-        assert set(late.size_hwl_m[:, 2]) == {length}  # the box of the category, not that of the other detection
+        # The box of the category, not that of the other detection.
+        np.testing.assert_allclose(late.size_hwl_m[:, 2], length, atol=1e-6)
 
 
 def test_the_nearest_of_both_kinds_are_pairs_and_each_is_in_one() -> None:
@@ -405,6 +406,26 @@ def test_cars_that_others_hide_are_told_where_their_track_is_sure() -> None:
         behind = boxes(frame, np.tile([0.0, 20.0], (30, 1)), score=score)
         out = track_kitti.track_boxes(Boxes.join([front, behind]), standing_view(30), online=True)
         assert (out.bottom_m[:, 2] > 15).sum() == told
+
+
+@pytest.mark.parametrize("online", [True, False])
+def test_an_object_has_one_size_and_a_heading_that_turns_slowly(online: bool) -> None:
+    rng = np.random.default_rng(4)
+    frame = np.arange(200)
+    way = np.column_stack([np.zeros(200), 15 + 0.1 * frame])
+    # Every other box is turned around, which is the same box.
+    b = boxes(frame, way, yaw=-1.57 + rng.normal(0, 0.1, 200) + np.pi * (frame % 2))
+    b = replace(b, size_hwl_m=b.size_hwl_m + rng.normal(0, 0.1, (200, 3)))
+    out = track_kitti.track_boxes(b, standing_view(200), online=online)
+    out = out.take((out.frame >= 100) & (out.frame < 200))
+    np.testing.assert_allclose(out.size_hwl_m, np.tile(CAR, (100, 1)), atol=0.05)
+    assert np.ptp(out.size_hwl_m, axis=0).max() == (0 if not online else pytest.approx(0, abs=0.02))
+    off = np.abs(np.mod(out.yaw_rad + 1.57 + np.pi / 2, np.pi) - np.pi / 2)
+    given = np.abs(np.mod(b.yaw_rad[100:] + 1.57 + np.pi / 2, np.pi) - np.pi / 2)
+    assert np.sqrt((off**2).mean()) < (0.65 if online else 0.5) * np.sqrt((given**2).mean())
+    np.testing.assert_array_equal(np.cos(out.yaw_rad + 1.57) > 0, frame[100:] % 2 == 0)
+    # The ground is where it was, whatever the height.
+    np.testing.assert_allclose(out.bottom_m[:, 1], 1.7, atol=1e-6)
 
 
 # ---- scores

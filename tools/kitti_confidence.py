@@ -11,6 +11,7 @@ from kitti_joining import join_tracks
 from kitti_map import View, from_map, hidden_share
 from kitti_rows import SCALE, Index, Mask, Rows, end_rows, exact_sums, first_of_run, last_of_run, neighbors, sum_so_far
 from kitti_scene import same_frame
+from kitti_shapes import smooth_shapes
 
 from log2sim.datatypes import Measurements
 from log2sim.geometry import Array
@@ -71,7 +72,7 @@ class Described:
 
 def describe(rows: Rows, boxes: Boxes, measurements: Measurements, view: View, *, online: bool) -> Described:
     """Boxes of the camera and features of all rows that it can see, given by track and frame; online no later frame is used."""
-    out = _in_camera(rows, boxes, measurements, view)
+    out = _in_camera(rows, boxes, measurements, view, online=online)
     inside = np.isfinite(out.box_px).all(axis=1)
     out, rows = out.take(inside), rows.take(inside)
     if not online:
@@ -112,11 +113,10 @@ def _distances(rows: Rows, *, online: bool) -> tuple[Index, Index, Index]:
     return distance, np.where(outside, since, 0), np.where(seen | outside, 0, since + until - 1)
 
 
-def _in_camera(rows: Rows, boxes: Boxes, measurements: Measurements, view: View) -> Boxes:
+def _in_camera(rows: Rows, boxes: Boxes, measurements: Measurements, view: View, *, online: bool) -> Boxes:
     columns = {**vars(boxes.take(rows.model)), "frame": rows.frame, "track_id": rows.track, "category": rows.category}
-    center = np.column_stack([rows.xy_m, measurements.center_m[rows.model, 2]])
-    size = boxes.size_hwl_m[rows.model, ::-1]
-    in_camera = from_map(center, size, measurements.yaw_rad[rows.model], rows.frame, view)
+    center, size, yaw = smooth_shapes(rows, boxes, measurements, online=online)
+    in_camera = from_map(center, size, yaw, rows.frame, view)
     # In the image the detector knows better than a box around a box.
     in_camera["box_px"] = np.where((rows.source < 0)[:, None], in_camera["box_px"], boxes.box_px[rows.model])
     return Boxes(**(columns | in_camera))

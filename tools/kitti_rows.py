@@ -23,8 +23,8 @@ EXTENDED_HITS, EXTENDED_SCORE, EXTENDED_FRAMES = 3, 2.0, 20
 # Online, tracks of at least so many detections are carried on while they are not seen.
 COAST_HITS = 3
 
-# Unit of exact sums; scores have four decimals.
-SCALE = 1e6
+# Sums are exact in units of one in so many.
+SCALE = 1e9
 
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
