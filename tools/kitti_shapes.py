@@ -18,14 +18,19 @@ def smooth_shapes(rows: Rows, boxes: Boxes, measurements: Measurements, *, onlin
 
     Means over the detections with the category of the track, each by how likely it is one; online over those up to a row.
     """
-    seen = rows.source >= 0
-    alike = seen & (boxes.category[rows.source] == rows.category)
-    weight = np.where(alike, 1 / (1 + np.exp(-boxes.score[rows.source])), 0.0)
-    size = _mean_of_track(boxes.size_hwl_m[rows.model, ::-1], weight, first_of_run(rows.track), online=online)
+    chance = np.where(rows.source >= 0, 1 / (1 + np.exp(-boxes.score[rows.source])), 0.0)
+    begin = first_of_run(rows.track)
+    size = boxes.size_hwl_m[rows.model, ::-1].copy()
+    for category in np.unique(rows.category):
+        # Online a track may have had another category before.
+        weight = np.where(boxes.category[rows.source] == category, chance, 0.0)
+        of = rows.category == category
+        size[of] = _mean_of_track(boxes.size_hwl_m[rows.model, ::-1], weight, begin, online=online)[of]
     bottom = measurements.center_m[rows.model, 2] - boxes.size_hwl_m[rows.model, 0] / 2
     yaw = measurements.yaw_rad[rows.model]
     # Twice the angle: a box is the same from the front and from behind.
     columns = np.column_stack([bottom, np.cos(2 * yaw), np.sin(2 * yaw)])
+    weight = np.where(boxes.category[rows.source] == rows.category, chance, 0.0)
     bottom, cos, sin = _mean_nearby(columns, weight, rows, online=online).T
     turn = np.arctan2(sin, cos) / 2 - yaw
     yaw = yaw + np.mod(turn + np.pi / 2, np.pi) - np.pi / 2
