@@ -22,7 +22,7 @@ from log2sim.datatypes import Log
 from log2sim.export.exporters import export
 from log2sim.perception.detect3d.detectors import create_lidar_detector
 from log2sim.perception.first_pass import cloud_origin
-from log2sim.perception.lidar.cloud import assemble_cloud
+from log2sim.perception.lidar.viewpoints import assemble_cloud
 from log2sim.simulation import runner, simulators
 
 TEXT = (ROOT / "log2sim" / "README.md").read_text(encoding="utf-8")

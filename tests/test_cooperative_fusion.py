@@ -25,9 +25,9 @@ from log2sim.perception.cooperative.matching import SeenBoxes, match_by_covarian
 from log2sim.perception.cooperative.merging import METHODS, fuse_boxes, merge_by_covariance
 from log2sim.perception.detect3d.level_points import level_points, viewpoints_xy
 from log2sim.perception.detect3d.network_detector import open_shipped
-from log2sim.perception.lidar.cloud import Cloud, CloudSensor, assemble_cloud
+from log2sim.perception.lidar.cloud import Cloud, CloudSensor
 from log2sim.perception.lidar.measure_boxes import follow_box, measure_boxes
-from log2sim.perception.lidar.viewpoints import assemble_views, group_by_viewpoint, join_parts
+from log2sim.perception.lidar.viewpoints import assemble_cloud, assemble_views, group_by_viewpoint, join_parts
 from log2sim.perception.prefetch import obstacles_of
 from log2sim.pipeline import reconstruct
 from log2sim.plan import FusionLevel, fusion_level

@@ -30,7 +30,8 @@ from log2sim.perception.first_pass import Observations
 from log2sim.perception.fusion import fuse_tick
 from log2sim.perception.homography.estimate import EstimationOptions
 from log2sim.perception.homography_stage import fit_homographies
-from log2sim.perception.lidar.cloud import assemble_cloud, is_at_rest, sweep_to_map
+from log2sim.perception.lidar.cloud import is_at_rest, sweep_to_map
+from log2sim.perception.lidar.viewpoints import assemble_cloud
 from log2sim.pipeline import Result, first_pass, second_pass, start
 from log2sim.plan import Decision, HomographyScope, Plan, Stage, make_plan
 from log2sim.sensors import select_sensors

@@ -33,7 +33,7 @@ from log2sim.logs.native.csv_tables import read_csv_table
 from log2sim.logs.opening import open_log
 from log2sim.logs.sweeps import sweep_of
 from log2sim.numerals import parse_float, parse_int
-from log2sim.perception.lidar.cloud import assemble_cloud
+from log2sim.perception.lidar.viewpoints import assemble_cloud
 
 Encode = Callable[[Log, Path], Path]
 

@@ -26,7 +26,8 @@ from log2sim.perception.detect3d.grid import grid_window, rasterize
 from log2sim.perception.detect3d.level_points import level_points, viewpoints_xy
 from log2sim.perception.detect3d.network_detector import WEIGHTS, NetworkDetector, open_shipped
 from log2sim.perception.first_pass import cloud_origin
-from log2sim.perception.lidar.cloud import Cloud, assemble_cloud
+from log2sim.perception.lidar.cloud import Cloud
+from log2sim.perception.lidar.viewpoints import assemble_cloud
 from log2sim.synth.lidar_models import LIDAR_MODELS
 from log2sim.synth.traffic import Mount, labeled_cloud
 from log2sim.synth.traffic_random import draw_scene

@@ -13,7 +13,7 @@ from log2sim.datatypes import Boxes3D, Log, Sweep
 from log2sim.errors import RecordError
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector
-from log2sim.perception.lidar.cloud import assemble_cloud
+from log2sim.perception.lidar.viewpoints import assemble_cloud
 
 SPACING_S = 0.2
 # Farther from a pole, boxes have too few points.

@@ -15,7 +15,8 @@ from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.geometry import Array, Camera, apply, inverse, nearest_index, project
 from log2sim.perception.detect3d.detectors import create_lidar_detector
 from log2sim.perception.detect3d.grid import MAX_HEIGHT_M, MIN_HEIGHT_M
-from log2sim.perception.lidar.cloud import Cloud, assemble_cloud, cloud_origin
+from log2sim.perception.lidar.cloud import Cloud, cloud_origin
+from log2sim.perception.lidar.viewpoints import assemble_cloud
 
 MAX_RANGE_M = 60.0
 # The ground under a box is the mean of that under so many points nearest to it.

@@ -63,7 +63,8 @@ def _title(figure: Figure, result: Benchmark) -> None:
     context = result.context
     height = figure.get_figheight()
     against = f"truth: {context.truth.name}" if context.truth is not None else "no truth"
-    counts = [(len(context.schedule), "tick"), (len(context.plan.cameras), "camera")]
+    cameras, lidars = len(context.plan.cameras), len(context.log.lidars)
+    counts = [(len(context.schedule), "tick"), (cameras, "camera") if cameras else (lidars, "LiDAR")]
     parts = [f"{n} {what}{'s' * (n != 1)}" for n, what in counts]
     if context.truth is not None and context.scope.max_range_m is not None:
         parts.append(f"within {context.scope.max_range_m:g} m")

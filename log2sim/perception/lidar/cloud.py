@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import ENDS, VEHICLE, Log, Sweep, end_of
+from log2sim.datatypes import ENDS, VEHICLE, Log, Sweep
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception.lidar.azimuth_index import AzimuthIndex
-from log2sim.perception.lidar.ground import ON_GROUND_M, estimate_ground
 
 # Rotation is constant within a bin, which errs by 2.5 cm at 1 rad/s and 50 m; translation is interpolated for every point.
 POSE_BIN_NS = 500_000
@@ -225,74 +223,6 @@ def deskew(log: Log, lidar: str, sweep: Sweep, t_ns: NDArray[np.int64]) -> Array
     position = map_T_lidar[:, :3, 3]
     fraction = (place - k)[:, None]
     return np.asarray(out + position[k] * (1 - fraction) + position[k + 1] * fraction)
-
-
-def assemble_cloud(
-    log: Log,
-    sweeps: Mapping[str, Sweep],
-    *,
-    origin: Array,
-    ground_z: float,
-    max_range_m: float,
-    compensate: bool = True,
-) -> Cloud | None:
-    """Merge the simultaneous sweeps of all LiDARs into one cloud in the map frame and estimate its ground.
-
-    Parameters
-    ----------
-    sweeps : mapping of LiDAR name to Sweep
-    origin : (3,) float64, m, map frame
-        Position of the ego, or of the sensors; points farther than `max_range_m` along an axis are left out.
-    ground_z : float
-        Expected height of the ground at the origin, m, map frame.
-    compensate : bool
-        See `sweep_to_map`.
-
-    Returns
-    -------
-    Cloud or None
-        None when no sweep has a known pose and points.
-    """
-    parts, sensors, stamp = [], [], 0
-    for name, sweep in sweeps.items():
-        mapped = sweep_to_map(log, name, sweep, compensate=compensate)
-        if mapped is None or len(mapped[0]) == 0:
-            continue
-        stamp = stamp or sweep.stamp_ns
-        # Halfway through the sweep: a sensor at 30 m/s is 3 m away from there at its begin or end.
-        middle_ns = round(float(mapped[1].mean(dtype=np.float64)) * NS_PER_S)
-        sensor, known = log.map_T_sensor(name, sweep.stamp_ns + middle_ns)
-        local = (mapped[0] - origin).astype(np.float32)
-        near = (np.abs(local) <= max_range_m).all(axis=1)
-        t_s = mapped[1] + np.float32((sweep.stamp_ns - stamp) / NS_PER_S)
-        position = sensor[0, :3, 3] - origin if known[0] else np.zeros(3)
-        parts.append((local[near], t_s[near], position))
-        place = _follow_sensor(log, name, stamp, t_s, origin)
-        sensors.append(CloudSensor(int(near.sum()), *place, end_of(log.lidars[name])))
-    if not parts:
-        return None
-    xyz, t_s = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
-    surface = estimate_ground(xyz, np.zeros(2), ground_z - float(origin[2]))
-    height = xyz[:, 2] - surface.at(xyz[:, :2])
-    # A distant LiDAR without points in range must not shift the viewpoint.
-    sensor = np.mean([p[2] for p in parts if len(p[0])] or [p[2] for p in parts], axis=0).astype(np.float32)
-    ground = np.abs(height) <= ON_GROUND_M
-    return Cloud(stamp, np.asarray(origin, float), xyz, t_s, sensor, ground, height, tuple(sensors))
-
-
-def _follow_sensor(log: Log, name: str, stamp_ns: int, t_s: NDArray[np.float32], origin: Array) -> tuple[Array, Array]:
-    """Follow a LiDAR through times (N,) relative to a stamp: position (3,) at the stamp relative to `origin`, velocity (3,).
-
-    The line goes through its places at the first and the last time; without known poses it stands at the origin.
-    """
-    first_s, last_s = float(t_s.min()), float(t_s.max())
-    t_ns = stamp_ns + np.round(np.array([first_s, last_s]) * NS_PER_S).astype(np.int64)
-    map_T_lidar, known = log.map_T_sensor(name, t_ns)
-    if not known.all():
-        return np.zeros(3), np.zeros(3)
-    first, last = map_T_lidar[:, :3, 3] - origin
-    velocity = (last - first) / (last_s - first_s) if last_s > first_s else np.zeros(3)
-    return first - first_s * velocity, velocity
 
 
 def compensation_of(log: Log, lidar: str, sweep: Sweep) -> str:
