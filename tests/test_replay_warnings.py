@@ -14,12 +14,15 @@ from replay_scenes import LENGTH_M, line, parked, walker
 
 from log2sim.datatypes import Agent, Scenario
 from log2sim.errors import ConfigError
+from log2sim.prediction.motion_table import table_of
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
+from log2sim.simulation.warnings.ego_way import EgoStates, EgoWay
 from log2sim.simulation.warnings.policy import BrakeWhenWarned
 from log2sim.simulation.warnings.sentences import describe_warnings
 from log2sim.simulation.warnings.settings import WarningSettings
 from log2sim.simulation.warnings.warn import warn
+from log2sim.simulation.warnings.watch import Watch
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
 TOWN_MPS = 30 / 3.6
@@ -136,6 +139,64 @@ def test_who_was_lost_is_expected_to_go_on_for_a_while_and_then_forgotten() -> N
     assert warn(scenario_of(town_ego(), stays)).events[0].agent == "k"
 
 
+def test_who_is_lost_is_expected_from_where_it_was_seen_last() -> None:
+    """The oncoming car is lost 3 s before it meets the ego, and warned of after that: the time to the collision stays exact."""
+    oncoming = seen(line("a", 120.0 + LENGTH_M, speed=10.0, yaw=np.pi, duration_s=8.0), road=(0.0, 3.0))
+    (event,) = warn(scenario_of(line("ego", 0.0, speed=10.0, duration_s=8.0), oncoming), settings=CERTAIN).events
+    assert 3.2 < event.warned.t_s < 4.2
+    assert event.ttc_s == pytest.approx(6.0 - event.warned.t_s, abs=5e-3)
+
+
+def test_what_an_agent_does_while_nobody_looks_is_not_known() -> None:
+    steady = crossing_walker(8.0)
+    w = steady.waypoints
+    unseen = (w.t_s > 3.05) & (w.t_s < 3.95)
+    strays = replace(steady, waypoints=replace(w, x_m=w.x_m - 2.0 * unseen, y_m=w.y_m + 1.5 * unseen))
+    spans = {"vehicle": ((0.0, 3.0), (4.0, 14.0))}
+    found = [warn(scenario_of(town_ego(), replace(a, observed_by=spans))) for a in (steady, strays)]
+    assert found[0].events
+    assert found[0] == found[1]
+
+
+def test_an_ego_that_brakes_for_it_already_is_not_warned() -> None:
+    t = np.arange(0.0, 10.05, 0.1)
+    speed = np.clip(10.0 - 2.0 * (t - 2.0), 0.0, 10.0)
+    way = np.where(t < 2.0, 10.0 * t, 20.0 + np.minimum(t - 2.0, 5.0) * (10.0 - np.minimum(t - 2.0, 5.0)))
+    ego = agent_from(t, way, 0 * t, 0 * t, speed, id="ego")
+    stands = parked("k", 45.0 + LENGTH_M + 2.0, 0.0)
+    assert warn(scenario_of(ego, stands)).events == ()
+    assert warn(scenario_of(line("ego", 0.0, speed=10.0, duration_s=5.0), stands)).events
+
+
+def test_the_ego_is_expected_along_its_path_as_far_aside_as_it_is_and_off_it_straight_on() -> None:
+    bend = driven(lambda t: np.full_like(t, 8.0), lambda s: np.where(s > 20, 1 / 15, 0.0), 8.0, id="ego")
+    way, lead_s = EgoWay(bend), np.array([0.0, 1.0, 3.0])
+    at_s = np.array([1.0])
+    x, y, _, yaw, speed = bend.trajectory.at(at_s)
+    states = EgoStates(x, y + 0.8, yaw, speed, np.zeros(1), way.progress(x, y))
+    ahead = bend.trajectory.at(at_s + lead_s)
+    wanted = ahead.x_m + 1j * ahead.y_m + 0.8j * np.exp(1j * ahead.yaw_rad)
+    assert np.abs(way.at(states, lead_s).position_m[0] - wanted).max() < 0.3
+    off = way.at(states._replace(y_m=y + 5.0), lead_s).position_m[0]
+    assert np.abs(off - (x + 1j * (y + 5.0) + 8.0 * lead_s)).max() < 1e-6
+    slows = way.at(states._replace(accel_mps2=np.array([-4.0])), lead_s).position_m[0]
+    assert abs(slows[2] - slows[0]) == pytest.approx(8.0, abs=0.01)  # v^2 / 2a
+
+
+def test_who_is_elsewhere_than_in_the_scenario_is_expected_from_there() -> None:
+    scene = scenario_of(line("ego", 0.0, speed=10.0, duration_s=8.0), line("a", 40.0, 12.0, speed=2.0, duration_s=8.0))
+    watch = Watch(scene, scene.others, CERTAIN, table_of(scene).t_s)
+    ego = EgoStates(*(np.array([v]) for v in (20.0, 0.0, 0.0, 10.0, 0.0, 20.0)))
+    tick = np.array([20])
+    assert not watch.courses(ego, tick).due.any()
+    beside = np.array([44.0 + 0.0j]), np.array([2.0])
+    found = watch.courses(ego, tick, beside)
+    assert found.due.all()
+    assert found.ttc_s[0] == pytest.approx((24.0 - LENGTH_M) / 8.0, abs=1e-3)
+    slower = watch.courses(ego, tick, (beside[0], np.array([1.0])))
+    assert slower.ttc_s[0] == pytest.approx((24.0 - LENGTH_M) / 9.0, abs=1e-3)
+
+
 def test_nothing_later_than_the_moment_is_used() -> None:
     """Cut short at a warning, the scenario gives the same warning; velocities of waypoints rest on the next one, which is kept."""
     t = np.arange(0.0, 10.05, 0.1)
@@ -228,6 +289,7 @@ def test_the_ego_drives_on_as_in_the_scenario_when_its_way_is_clear() -> None:
     ego = replay(scene, ego=BrakeWhenWarned(), dt_s=0.1, model="kinematic").agent("ego")
     assert ego.speed_mps.min() < 0.05
     assert ego.speed_mps[-1] == pytest.approx(TOWN_MPS, abs=0.5)
+    assert ego.speed_mps.max() < TOWN_MPS + 1.5  # it does not hurry after what it lost
     quiet = replay(scenario_of(town_ego(5.0)), ego=BrakeWhenWarned(), dt_s=0.1).agent("ego")
     assert np.abs(quiet.x_m - TOWN_MPS * quiet.t_s).max() < 0.05
 

@@ -16,12 +16,12 @@ const observers = (track, t) => {
   return `${now} (${first.join(", ")})`;
 };
 
-// Rings around agents that one end alone observes, in its color.
+// Rings around agents that one end alone observes, in its color; thin ones around what stands.
 const drawEnds = (painter, tracks, t) => {
   for (let i = 0; i < tracks.length; i++) {
     const track = tracks[i];
     if (!track.present || track.observedBy === null) continue;
     const vehicle = observes(track, "vehicle", t);
-    if (vehicle !== observes(track, "road", t)) painter.ring(track, vehicle ? theme.vehicle : theme.road, 1.6);
+    if (vehicle !== observes(track, "road", t)) painter.ring(track, vehicle ? theme.vehicle : theme.road, track.stationary ? 0.7 : 1.6);
   }
 };
