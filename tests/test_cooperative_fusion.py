@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +25,7 @@ from log2sim.perception.cooperative.box_errors import BoxErrors, estimate_errors
 from log2sim.perception.cooperative.detector import EndsDetector, create_for_ends, detector_by_mounting
 from log2sim.perception.cooperative.matching import SeenBoxes, match_by_covariance, match_by_overlap
 from log2sim.perception.cooperative.merging import METHODS, fuse_boxes, merge_by_covariance
+from log2sim.perception.cooperative.offset import take_off_offset
 from log2sim.perception.detect3d.level_points import level_points, viewpoints_xy
 from log2sim.perception.detect3d.network_detector import open_shipped
 from log2sim.perception.lidar.cloud import Cloud, CloudSensor
@@ -507,3 +510,57 @@ def test_an_end_is_taken_from_the_view_that_knows_it_better() -> None:
     # Of two that are known alike, the one where rays are closer together.
     close = _better_ends(ends(-2.0, 1.0, 1, 1), ends(-2.1, 1.1, 1, 1, gap_m=0.02))
     assert (close.low[0, 0], close.high[0, 0]) == (-2.1, 1.1)
+
+
+def street(count=8):
+    """Vehicles in both directions along two streets, as x, y, z, length, width, height, yaw."""
+    along = [(8.0 * k - 20, 3.0 * (-1) ** k, 0.8, 4.5, 1.8, 1.6, np.pi * (k % 2)) for k in range(count)]
+    return along + [(25.0, 8.0 * k - 20, 0.8, 4.5, 1.8, 1.6, np.pi / 2) for k in range(count)]
+
+
+def turned(boxes, pivot, shift, turn_rad):
+    """Boxes as a sensor reports them whose pose is off."""
+    c, s = np.cos(turn_rad), np.sin(turn_rad)
+    center = boxes.center_m.copy()
+    center[:, :2] = (center[:, :2] - pivot[:2]) @ np.array([[c, s], [-s, c]]) + pivot[:2] + shift
+    return replace(boxes, center_m=center, yaw_rad=boxes.yaw_rad + turn_rad)
+
+
+def test_what_many_pairs_agree_on_is_taken_off() -> None:
+    true, pivot = boxes_at(*street()), np.array([10.0, 5.0, 4.0])
+    off = turned(true, pivot, [0.25, -0.15], np.deg2rad(1.0))
+    # One pair is of two objects.
+    off.center_m[3] += [1.0, 1.0, 0.0]
+    a, b = seen(true), replace(seen(off), sensor_m=pivot)
+    moved = take_off_offset(a, b, b).boxes
+    good = np.arange(len(true)) != 3
+    before, after = (np.abs(x.center_m - true.center_m)[good].max() for x in (off, moved))
+    assert after < 0.2 * before
+    assert moved.yaw_rad == pytest.approx(true.yaw_rad, abs=np.deg2rad(0.25))
+    # A single pair moves them by a part, and nothing without a pair or a place of the sensor.
+    one = take_off_offset(a.take([0]), b.take([0]), b).boxes
+    assert np.hypot(*(one.center_m - off.center_m)[0, :2]) < 0.7 * np.hypot(*(off.center_m - true.center_m)[0, :2])
+    assert take_off_offset(a.take([]), b.take([]), b) is b
+    assert take_off_offset(a, seen(off), seen(off)).boxes is off
+
+
+def test_boxes_that_the_road_alone_sees_are_moved_with_the_others() -> None:
+    true, pivot = boxes_at(*street()), np.array([10.0, 5.0, 4.0])
+    off = turned(true, pivot, [0.3, 0.1], np.deg2rad(-1.0))
+    a, b = seen(true.take(np.arange(15))), replace(seen(off), sensor_m=pivot)
+    fused = fuse_boxes(a, b, METHODS["covariance"]).boxes
+    assert len(fused) == len(true)
+    alone = fused.center_m[np.argmin(np.hypot(*(fused.center_m - true.center_m[15])[:, :2].T))]
+    assert np.hypot(*(alone - true.center_m[15])[:2]) < 0.3 * np.hypot(*(off.center_m - true.center_m)[15, :2])
+    as_they_are = fuse_boxes(a, b, METHODS["overlap"]).boxes.center_m
+    assert np.hypot(*(as_they_are - off.center_m[15])[:, :2].T).min() == 0.0
+
+
+def test_the_scale_of_errors_is_found_by_their_likelihood() -> None:
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
+    from fit_box_errors import fit_sigma
+
+    rng = np.random.default_rng(0)
+    terms = np.column_stack([np.ones(4000), rng.uniform(0, 5, 4000)])
+    error = rng.standard_t(4, 4000) * np.exp(terms @ [-1.0, -0.3])
+    assert fit_sigma(terms, error) == pytest.approx([-1.0, -0.3], abs=0.06)

@@ -16,6 +16,7 @@ from log2sim.evaluation.detection.sweep_clouds import clouds, stamps_of
 from log2sim.localization.pose_choice import PoseChoice
 from log2sim.perception.frames import RecordReader
 from log2sim.pipeline import start
+from log2sim.plan import FusionLevel
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +47,8 @@ def detect_log(log: Log, config: Config, *, progress: Callable[[int, int], None]
     ----------
     log : Log
     config : Config
-        `detect.name` is a LiDAR detector, such as "lidar:vehicle"; its settings are in the section `lidar`.
+        `detect.name` is a LiDAR detector, such as "lidar:vehicle"; its settings are in the section `lidar`. Where vehicle and
+        road are joined as tracks, their boxes are joined as boxes.
     progress : callable, optional
         Called with (sweeps done, all sweeps).
 
@@ -62,6 +64,9 @@ def detect_log(log: Log, config: Config, *, progress: Callable[[int, int], None]
             f"detector '{config.detect.name}': 3D boxes are detected in LiDAR sweeps alone; expected a name that begins with "
             "'lidar:', such as lidar:vehicle"
         )
+    if FusionLevel(config.cooperation.fusion) is FusionLevel.TRACKS:
+        # Before they are tracked, what both ends find would be there twice.
+        config = config.changed(cooperation={"fusion": "boxes"})
     run = start(log, config)
     records, detector = RecordReader(run.log), run.detectors.sweeps
     of_sweeps, stamps, boxes = stamps_of(run), [], []

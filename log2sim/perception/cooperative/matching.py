@@ -33,10 +33,13 @@ class SeenBoxes:
     ----------
     boxes : M Boxes3D
     errors : BoxErrors
+    sensor_m : (3,) float64, optional
+        Where they are all seen from, m, map frame.
     """
 
     boxes: Boxes3D
     errors: BoxErrors
+    sensor_m: Array | None = None
 
     def __len__(self) -> int:
         """Return the number of boxes."""
@@ -45,12 +48,12 @@ class SeenBoxes:
     @classmethod
     def of(cls, boxes: Boxes3D, sensor_m: Array) -> Self:
         """Estimate the errors of boxes (M,) that were seen from a sensor at (3,), m, map frame."""
-        return cls(boxes, estimate_errors(boxes, sensor_m))
+        return cls(boxes, estimate_errors(boxes, sensor_m), sensor_m)
 
     def take(self, index: NDArray[Any]) -> SeenBoxes:
         """Take the boxes at `index`, integers or a mask."""
         errors = BoxErrors(self.errors.side_m[index], self.errors.yaw_rad[index])
-        return SeenBoxes(self.boxes.take(index), errors)
+        return SeenBoxes(self.boxes.take(index), errors, self.sensor_m)
 
     @property
     def rectangles(self) -> Array:
@@ -78,7 +81,7 @@ def match_by_covariance(a: SeenBoxes, b: SeenBoxes) -> Pairs:
     """
     group_a, group_b = (np.array([GROUP_OF[str(c)] for c in seen.boxes.category], dtype="<U16") for seen in (a, b))
     away = a.boxes.center_m[:, None, :2] - b.boxes.center_m[:, :2]
-    c = _center_covariance(a)[:, None] + _center_covariance(b) + POSE_SIGMA_M**2 * np.eye(2) + _motion_covariance(a, b)
+    c = center_covariance(a)[:, None] + center_covariance(b) + POSE_SIGMA_M**2 * np.eye(2) + motion_covariance(a, b)
     squared = np.einsum("abi,abi->ab", away, np.linalg.solve(c, away[..., None])[..., 0])
     reach = (a.boxes.size_m[:, None, 0] + b.boxes.size_m[:, 0]) / 2
     near = (squared <= CHI2_2DOF_99) & (np.hypot(away[..., 0], away[..., 1]) <= reach)
@@ -92,11 +95,12 @@ def _iou_of_all(a: SeenBoxes, b: SeenBoxes) -> Array:
     return rectangle_iou(one, other).reshape(len(a), len(b))
 
 
-def _center_covariance(seen: SeenBoxes) -> Array:
+def center_covariance(seen: SeenBoxes) -> Array:
+    """Return the covariances (M, 2, 2) of the centers of boxes, m2, map frame."""
     return oriented_covariance(seen.errors.center_m, seen.boxes.yaw_rad)
 
 
-def _motion_covariance(a: SeenBoxes, b: SeenBoxes) -> Array:
+def motion_covariance(a: SeenBoxes, b: SeenBoxes) -> Array:
     """Return the covariance (M, N, 2, 2) of what objects move between the times of their boxes: road users move along their axis."""
     apart_s = (a.boxes.t_ns[:, None] - b.boxes.t_ns) / NS_PER_S
     speed = first_speeds(a.boxes)[:, None] * np.abs(apart_s)

@@ -28,6 +28,7 @@ from log2sim.perception.cooperative.matching import (
     match_by_covariance,
     match_by_overlap,
 )
+from log2sim.perception.cooperative.offset import take_off_offset
 from log2sim.perception.detect3d.suppression import Rectangles, suppress
 
 # Lower and upper side of the one box, then of the other.
@@ -41,6 +42,9 @@ MIN_SIZE_M = 0.2
 # Boxes whose four sides and axes differ by more contradict each other: quantile of the chi-square distribution at 99.9 % with
 # two degrees of freedom for each of the two axes, and one for the yaw.
 CHI2_5DOF_999 = 20.5
+
+# What was too far off to match at first does once others have shown the offset.
+OFFSET_ROUNDS = 2
 
 Merge = Callable[[SeenBoxes, SeenBoxes], SeenBoxes]
 
@@ -56,7 +60,8 @@ class Method:
     merge : callable
         Of two sets of P boxes that belong together row by row, the joined ones.
     refines : bool
-        Whether boxes are first laid against the points of their end.
+        Whether boxes are first laid against the points of their end, and those of the road moved by what pairs show of its
+        pose.
     """
 
     match: Callable[[SeenBoxes, SeenBoxes], Pairs]
@@ -72,6 +77,10 @@ def fuse_boxes(a: SeenBoxes, b: SeenBoxes, method: Method) -> SeenBoxes:
     if not len(a) or not len(b):
         return a if len(a) else b
     i, j = method.match(a, b)
+    if method.refines:
+        for _ in range(OFFSET_ROUNDS):
+            b = take_off_offset(a.take(i), b.take(j), b)
+            i, j = method.match(a, b)
     rest_a, rest_b = (np.setdiff1d(np.arange(len(seen)), taken) for seen, taken in ((a, i), (b, j)))
     parts = [method.merge(a.take(i), b.take(j)), a.take(rest_a), b.take(rest_b)]
     out = join([part for part in parts if len(part)])
