@@ -10,14 +10,14 @@ from scipy.spatial import cKDTree
 
 from log2sim.calibration.twists import exp_of
 from log2sim.cooperation.common_objects import CommonObjects, ObjectTrack, link_boxes, track_of
-from log2sim.cooperation.estimate import Estimate, Sight, estimate_error
+from log2sim.cooperation.estimate import Estimate, Sight, add_pose_errors, estimate_error
 from log2sim.cooperation.findings import Findings
 from log2sim.cooperation.free_space import Visibility, look_through
 from log2sim.cooperation.ground_match import upright_points
 from log2sim.cooperation.structure import RoadView, Surfaces, VehicleView, surfaces_of, view_from_road
 from log2sim.cooperation.units import Unit, correct_unit, units_of
 from log2sim.datatypes import Boxes3D, Lidar, Log, Stream, Sweep
-from log2sim.geometry import Array, Camera, apply, inverse, transform
+from log2sim.geometry import Array, Camera, PoseTrack, apply, inverse, transform
 
 UNIT = Unit(("pole",), (), np.zeros(3))
 ERROR = np.array([0.3, -0.35, 0.2, 0.01, -0.02, 0.025])
@@ -96,7 +96,7 @@ def walls(step_m: float) -> tuple[Array, Array]:
 
 
 def view_of(points: Array, sensors: Array) -> VehicleView:
-    return VehicleView(points, sensors, np.zeros(len(points), np.int64))
+    return VehicleView(points, sensors, np.zeros(1, np.int64), np.zeros(len(points), np.int64))
 
 
 def test_walls_and_ground_show_the_whole_pose() -> None:
@@ -125,7 +125,29 @@ def test_the_ground_alone_shows_height_and_tilt_and_no_more() -> None:
     assert found.values[[2, 3, 4]] == pytest.approx(ERROR[[2, 3, 4]], abs=0.03)
     assert (sigma[:2] > 0.4).all()
     assert np.abs(found.values[[0, 1, 5]]).max() < 0.05
-    assert not Findings(UNIT, found, (None, None)).verified
+    findings = Findings(UNIT, found, (None, None))
+    assert not findings.verified
+    assert findings.applied[[2, 3, 4]] == pytest.approx(ERROR[[2, 3, 4]], abs=0.03)
+    assert not findings.applied[[0, 1, 5, 6]].any()
+    assert [fault.kind for fault in findings.faults()] == ["road_pose", "unknown_road_pose"]
+
+
+def test_errors_of_the_poses_of_the_ego_add_to_the_sigma() -> None:
+    points, sensors = walls(0.4)
+    sweep = np.arange(len(points)) % 3
+    drifting = points + np.array([[-0.15, 0.0, 0.0], [0.0, 0.0, 0.0], [0.15, 0.0, 0.0]])[sweep]
+    track = PoseTrack(np.arange(3), np.repeat(np.eye(4)[None], 3, axis=0), sigma_m=np.full(3, 0.2))
+    sigmas = []
+    for seen, known in ((points, None), (drifting, None), (points, track)):
+        view = VehicleView(seen, np.repeat(sensors, 3, axis=0), np.arange(3), sweep)
+        sight = Sight(view, still(points[::7]), surfaces_of(view, points), None, CommonObjects(()))
+        found = estimate_error(sight)
+        without = PoseTrack(np.arange(3), track.map_T_ego)
+        added = add_pose_errors(sight, found, known or without).covariance - found.covariance
+        sigmas.append(np.sqrt(added[0, 0]))
+    assert sigmas[0] < 0.01
+    assert 0.03 < sigmas[1] < 0.1
+    assert sigmas[2] == pytest.approx(0.2, abs=0.01)
 
 
 def test_a_wall_is_not_matched_from_behind() -> None:

@@ -24,7 +24,7 @@ from log2sim.cooperation.structure import (
 )
 from log2sim.cooperation.units import Unit
 from log2sim.datatypes import Log
-from log2sim.geometry import NS_PER_S, Array
+from log2sim.geometry import NS_PER_S, Array, PoseTrack
 from log2sim.localization.choice import during_ns
 from log2sim.localization.ego_sweeps import lidars_on_ego
 
@@ -34,6 +34,8 @@ OBJECT_WITHIN_M = (2.5, 2.0, 1.5, 1.2, 1.0, 1.0, 1.0, 1.0, 1.0)
 # Delays that are tried; stamps of a sweep's begin instead of its end are early by a period.
 TRIED_DELAYS_S = np.arange(-0.2, 0.51, 0.1)
 JUDGED_WITHIN_M = 0.5
+# Of the vehicle's way, to see how far its poses err.
+PARTS = 3
 # Where structure holds the pose in the plane, objects tell the delay alone, for which fewer moments do.
 HELD_M, FEW_MOMENTS, MANY_MOMENTS = 0.1, 15, 30
 
@@ -134,6 +136,36 @@ def estimate_error(sight: Sight) -> Estimate:
         (_structure(sight, np.zeros(7), JUDGED_WITHIN_M), _structure(sight, values, JUDGED_WITHIN_M)),
         (_objects(sight, np.zeros(7), OBJECT_WITHIN_M[0]), _objects(sight, values, OBJECT_WITHIN_M[0])),
     )
+
+
+def add_pose_errors(sight: Sight, found: Estimate, track: PoseTrack) -> Estimate:
+    """Return the estimate with the errors of the ego's poses in its covariance: those that the track states, and those seen.
+
+    Notes
+    -----
+    The ego's poses err for seconds. What parts of its way say about the unit's pose differs by that, and the mean of them all
+    errs by the square root of their number less. Of each kind, translation and rotation, one variance is taken for all axes.
+    """
+    if sight.view is None:
+        return found
+    values = [
+        _refine(_sight_of_part(sight, part), np.zeros(7), with_objects=False)[0]
+        for part in sight.view.parts(PARTS)
+        if len(part.xyz_m)
+    ]
+    variance = np.zeros(7)
+    if len(values) == PARTS:
+        for rows in (slice(0, 3), slice(3, DELAY)):
+            variance[rows] = np.array(values)[:, rows].var(axis=0, ddof=1).mean() / PARTS
+    sigma_m, sigma_rad = track.sigmas_at(sight.view.t_ns, (0.0, 0.0)).mean(axis=0)
+    variance[:3] += sigma_m**2
+    variance[5] += sigma_rad**2
+    return replace(found, covariance=found.covariance + np.diag(variance))
+
+
+def _sight_of_part(sight: Sight, part: VehicleView) -> Sight:
+    road = sight.road.xyz_m
+    return replace(sight, view=part, surfaces=surfaces_of(part, road), ground=common_ground(part, road))
 
 
 def _starts(sight: Sight, by_structure: Array) -> list[Array]:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from log2sim.config import Config
-from log2sim.cooperation.estimate import Sight, estimate_error, look_around
+from log2sim.cooperation.estimate import Estimate, Sight, add_pose_errors, estimate_error, look_around
 from log2sim.cooperation.findings import Findings
 from log2sim.cooperation.free_space import Visibility, look_through
 from log2sim.cooperation.ground_match import upright_points
+from log2sim.cooperation.pose_fit import DELAY
 from log2sim.cooperation.units import Unit, correct_unit, units_of
 from log2sim.datatypes import Fault, Log
 from log2sim.geometry import Array
@@ -20,6 +21,9 @@ from log2sim.localization.ego_sweeps import lidars_on_ego
 from log2sim.sensors import Sensors
 
 Progress = Callable[[str, int, int], None]
+
+# GNSS with an IMU errs by less; a larger error is the unit's.
+MAX_POSE_ERROR_M, MAX_POSE_ERROR_RAD = 0.4, np.radians(1.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +83,16 @@ def _check_unit(log: Log, config: Config, unit: Unit, progress: Progress) -> Fin
     sight = look_around(log, config, unit, lambda done, total: progress(f"register {unit.lidars[0]}", done, total))
     found, upright = estimate_error(sight), upright_points(sight.road.steady_m)
     visibility = (_visibility(sight, upright, np.eye(4)), _visibility(sight, upright, found.correction))
-    return Findings(unit, found, visibility)
+    findings = Findings(unit, found, visibility)
+    if log.ego is None or not findings.moved or not _may_be_of_ego(found):
+        return findings
+    return replace(findings, found=add_pose_errors(sight, found, log.ego))
+
+
+def _may_be_of_ego(found: Estimate) -> bool:
+    """Whether errors of the ego's poses can be as large as what a unit's pose is off by."""
+    shift_m, turn_rad = np.linalg.norm(found.values[:3]), np.linalg.norm(found.values[3:DELAY])
+    return bool(shift_m < MAX_POSE_ERROR_M and turn_rad < MAX_POSE_ERROR_RAD)
 
 
 def _visibility(sight: Sight, upright_m: Array, correction: Array) -> Visibility | None:

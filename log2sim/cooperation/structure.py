@@ -73,13 +73,22 @@ class VehicleView:
         Points in the frame of the site, those of several sweeps.
     sensor_m : (S, 3) float64, m
         Where the LiDAR was in the middle of each sweep.
+    t_ns : (S,) int64
+        Stamps of the sweeps.
     sweep : (N,) int64
         Row of `sensor_m` for each point.
     """
 
     xyz_m: Array
     sensor_m: Array
+    t_ns: NDArray[np.int64]
     sweep: NDArray[np.int64]
+
+    def parts(self, count: int) -> list[VehicleView]:
+        """Split into runs of successive sweeps; fewer than `count` where there are fewer sweeps."""
+        runs = np.array_split(np.argsort(self.t_ns, kind="stable"), min(count, len(self.t_ns)))
+        kept = [np.isin(self.sweep, run) for run in runs]
+        return [VehicleView(self.xyz_m[rows], self.sensor_m, self.t_ns, self.sweep[rows]) for rows in kept]
 
 
 def view_from_vehicle(log: Log, site_m: Array, during_ns: tuple[int, int] | None) -> VehicleView | None:
@@ -89,6 +98,7 @@ def view_from_vehicle(log: Log, site_m: Array, during_ns: tuple[int, int] | None
     points: list[Array] = []
     sensors: list[Array] = []
     rows: list[NDArray[np.int64]] = []
+    stamps: list[int] = []
     lidars = lidars_on_ego(log)
     for name in lidars:
         for i in _near_sweeps(log, name, site_m, during_ns, MAX_VEHICLE_SWEEPS // len(lidars) or 1):
@@ -100,9 +110,10 @@ def view_from_vehicle(log: Log, site_m: Array, during_ns: tuple[int, int] | None
             rows.append(np.full(int(near.sum()), len(sensors), dtype=np.int64))
             points.append(xyz[near])
             sensors.append(sensor)
+            stamps.append(int(log.streams[name].t_ns[i]))
     if not points:
         return None
-    return VehicleView(np.concatenate(points), np.array(sensors), np.concatenate(rows))
+    return VehicleView(np.concatenate(points), np.array(sensors), np.array(stamps), np.concatenate(rows))
 
 
 def _near_sweeps(
