@@ -1,8 +1,8 @@
 """How often the ego is warned in ordinary traffic, where nobody collides: warnings per minute of driving.
 
-    python tools/bench_warnings.py SCENARIO.json|SCENE.toml|LOG ... [--seeds 2] [--ends both]
+    python tools/bench_warnings.py SCENARIO.json|SCENE.toml|LOG|KITTI_TRACKING ... [--seeds 2] [--ends both]
 
-Logs are taken by their labels. The second opinion is that of the replay's conflict metrics, which know where everybody goes: the
+Logs are taken by their labels, and so are the sequences of the KITTI tracking benchmark with `ego_motion`. The second opinion is that of the replay's conflict metrics, which know where everybody goes: the
 least time to collision at constant velocity of the ego and the agent, and the least post-encroachment time. A warning without
 either below the limits is counted as false.
 """
@@ -13,13 +13,17 @@ import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
-from log2sim.cli.truth import truth_at
+from labeled_drives import kitti_tracking, labeled_log
+
 from log2sim.datatypes import EGO, Scenario
 from log2sim.simulation.runner import replay
 from log2sim.simulation.warnings.warn import warn
 
 # A driver who has to react within 1.5 s, or passes within 1 s of another, is in a conflict (Hyden 1987; Allen et al. 1978).
 CONFLICT_TTC_S, CONFLICT_PET_S = 1.5, 1.0
+
+# Warnings by the time to collision alone, as the simplest systems give them.
+PLAIN_TTC_S = 2.5
 
 
 def main() -> None:
@@ -29,7 +33,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1, help="of random scenes")
     parser.add_argument("--ends", default="both")
     asked = parser.parse_args()
-    driven_s, counts = 0.0, [0, 0]
+    driven_s, counts, plain = 0.0, [0, 0], 0
     for name, scenario in (found for path in asked.paths for found in scenarios(path, asked.seeds)):
         if scenario.ego is None:
             print(f"{name:40} no ego")
@@ -38,6 +42,9 @@ def main() -> None:
         found = warn(scenario, result, ends=asked.ends)
         warned = [w for w in found.events if w.warned is not None]
         driven_s += found.driven_s
+        plain += sum(
+            e["ego"] and (e["min_ttc_s"] or PLAIN_TTC_S + 1) <= PLAIN_TTC_S for e in result.metrics["conflicts"]
+        )
         print(f"{name:40} {found.driven_s:6.1f} s driven, {len(warned)} warnings")
         for w in warned:
             ttc_s, pet_s = near_misses(result, w.agent)
@@ -50,6 +57,7 @@ def main() -> None:
                 f"pet {pet_s:5.2f} s, {'conflict' if true else 'false'}"
             )
     minutes = driven_s / 60
+    print(f"agents within {PLAIN_TTC_S:g} s of the ego at constant velocity: {plain}, {plain / minutes:.2f} a minute")
     print(
         f"{driven_s:.0f} s driven: {sum(counts)} warnings, {sum(counts) / minutes:.2f} a minute; "
         f"{counts[0]} of them false, {counts[0] / minutes:.2f} a minute"
@@ -66,8 +74,10 @@ def scenarios(path: Path, seeds: int) -> Iterator[tuple[str, Scenario]]:
 
         for seed in range(seeds):
             yield f"{path.stem}, seed {seed}", synthesize(load_scene(path), seed=seed, observe=False)[1]
+    elif (path / "label_02").is_dir() and (path / "ego_motion").is_dir():
+        yield from kitti_tracking(path)
     else:
-        yield path.name, truth_at(path, None, None)
+        yield path.name, labeled_log(path)
 
 
 def near_misses(result: object, agent: str) -> tuple[float, float]:
