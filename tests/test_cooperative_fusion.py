@@ -19,6 +19,7 @@ from log2sim.datatypes import Boxes3D, Measurements, Track
 from log2sim.errors import LogError
 from log2sim.evaluation.bench.benchmark import bench
 from log2sim.evaluation.bench.document import document
+from log2sim.evaluation.detection.detect_log import without_ego
 from log2sim.geometry import rectangle_iou, rotation_from_rpy, transform, wrap_angle
 from log2sim.perception.cooperative.alignment import align_parts, moving_boxes
 from log2sim.perception.cooperative.box_errors import BoxErrors, estimate_errors
@@ -564,3 +565,12 @@ def test_the_scale_of_errors_is_found_by_their_likelihood() -> None:
     terms = np.column_stack([np.ones(4000), rng.uniform(0, 5, 4000)])
     error = rng.standard_t(4, 4000) * np.exp(terms @ [-1.0, -0.3])
     assert fit_sigma(terms, error) == pytest.approx([-1.0, -0.3], abs=0.06)
+
+
+def test_the_ego_that_the_road_sees_is_no_detection(both_ends) -> None:
+    t_ns = int(both_ends.streams["post"].t_ns[2])
+    center = both_ends.ego_centers(both_ends.ego.at(t_ns)[0])[0]
+    found = boxes_at((*center, 4.5, 1.8, 1.5, 0.0), (*(center + np.array([9, 3, 0])), 4.5, 1.8, 1.5, 0.0), t_ns=t_ns)
+    assert without_ego(both_ends, found).center_m.tolist() == found.center_m[1:].tolist()
+    vehicle = both_ends.changed(lidars={"top": both_ends.lidars["top"]})
+    assert without_ego(vehicle, found) is found

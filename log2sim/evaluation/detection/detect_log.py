@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from log2sim.config import Config
-from log2sim.datatypes import Log
+from log2sim.datatypes import ROAD, Boxes3D, Log, end_of
 from log2sim.errors import ConfigError, LogError
 from log2sim.evaluation.detection.boxes_file import DetectedBoxes
 from log2sim.evaluation.detection.sweep_clouds import clouds, stamps_of
 from log2sim.localization.pose_choice import PoseChoice
 from log2sim.perception.frames import RecordReader
+from log2sim.perception.lidar.measure_boxes import outside_ego
 from log2sim.pipeline import start
 from log2sim.plan import FusionLevel
 
@@ -73,7 +74,7 @@ def detect_log(log: Log, config: Config, *, progress: Callable[[int, int], None]
     for searched in clouds(run, records, detector):
         if searched.cloud is not None:
             stamps.append(of_sweeps[searched.tick])
-            boxes.append(searched.boxes)
+            boxes.append(without_ego(run.log, searched.boxes))
         if progress is not None:
             progress(searched.tick + 1, len(run.schedule))
     records.require_some()
@@ -83,3 +84,8 @@ def detect_log(log: Log, config: Config, *, progress: Callable[[int, int], None]
         log.name, run.detectors.name, np.array(stamps, dtype=np.int64), tuple(boxes), run.poses.to_provenance()
     )
     return LogDetections(found, len(run.schedule) - len(stamps), records.summary(), run.poses)
+
+
+def without_ego(log: Log, boxes: Boxes3D) -> Boxes3D:
+    """Leave out the boxes on the ego where the road's LiDARs see it: it is no other road user, and no label is on it."""
+    return outside_ego(log, boxes) if any(end_of(lidar) == ROAD for lidar in log.lidars.values()) else boxes
