@@ -249,6 +249,18 @@ def test_ordinary_traffic_gives_no_warning() -> None:
     assert warn(scene).events == ()
 
 
+def lifted(agent: Agent, z_m: np.ndarray | float) -> Agent:
+    w = agent.waypoints
+    return replace(agent, waypoints=replace(w, z_m=np.broadcast_to(z_m, len(w)).astype(float)))
+
+
+def test_who_crosses_on_a_bridge_is_no_danger_and_who_stands_up_the_slope_is() -> None:
+    below = line("ego", 0.0, speed=15.0, duration_s=8.0)
+    assert warn(scenario_of(below, lifted(parked("k", 80.0, 0.0, np.pi / 2), 6.0))).events == ()
+    uphill = lifted(below, 0.1 * below.waypoints.x_m)
+    assert warn(scenario_of(uphill, lifted(parked("k", 80.0, 0.0), 8.0))).events
+
+
 def test_oncoming_traffic_in_a_bend_gives_no_warning() -> None:
     def circle(radius_m: float, speed: float, begin: float, id: str) -> Agent:
         t = np.arange(0, 10.05, 0.1)
@@ -321,7 +333,7 @@ def test_the_file_holds_the_warnings(tmp_path: Path) -> None:
     ran = run_command("replay", files[0], "--warn", "both", "--dt", "0.05", "--out", files[1])
     assert ran.code == 0
     out = ran.out
-    assert "1 warning in 14.1 s of driving, by the sensors of vehicle and road: they know 1 of 1 other agents" in out
+    assert "1 warning in 14.0 s of driving, by the sensors of vehicle and road: they know 1 of 1 other agents" in out
     assert "(to the road alone from 3.20 s; to the vehicle alone from 6.20 s)" in out
     loaded = Replay.load(files[1])
     assert loaded.warnings == warn(scene, loaded)

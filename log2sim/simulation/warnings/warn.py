@@ -68,7 +68,7 @@ def warn(
     if len(ends_of(scenario)) > 1:
         sources = {a.id: a for a in scenario.agents}
         events = [replace(e, known_by=_known_by(sources[e.agent], table.t_s, watch.interval_s)) for e in events]
-    driven_s = float((np.abs(drive.ego.speed_mps) >= STANDSTILL_MPS).sum()) * TICK_S
+    driven_s = float((np.abs(drive.ego.speed_mps[:-1]) >= STANDSTILL_MPS).sum()) * TICK_S
     used = {f.name: getattr(settings, f.name) for f in fields(settings)}
     in_order = tuple(sorted(events, key=lambda e: (e.begin_s, e.agent)))
     return Warnings(
