@@ -68,9 +68,10 @@ Pairs = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 def match_by_overlap(a: SeenBoxes, b: SeenBoxes) -> Pairs:
     """Match boxes of one class by their IoU in the ground plane, the pairs with the greatest sum."""
-    iou = _iou_of_all(a, b)
-    allowed = (iou >= MIN_CLASS_IOU) & (a.boxes.category[:, None] == b.boxes.category)
-    return _assign(1 - iou, allowed)
+    i, j = _touching(a, b)
+    iou = rectangle_iou(a.take(i).rectangles, b.take(j).rectangles)
+    allowed = (iou >= MIN_CLASS_IOU) & (a.boxes.category[i] == b.boxes.category[j])
+    return _assign((len(a), len(b)), (i[allowed], j[allowed]), 1 - iou[allowed])
 
 
 def match_by_covariance(a: SeenBoxes, b: SeenBoxes) -> Pairs:
@@ -79,20 +80,28 @@ def match_by_covariance(a: SeenBoxes, b: SeenBoxes) -> Pairs:
     Boxes that hardly overlap are matched if they are as near as their errors, those of the poses, and the motion between
     their times allow; never those whose centers are farther apart than they are long.
     """
-    group_a, group_b = (np.array([GROUP_OF[str(c)] for c in seen.boxes.category], dtype="<U16") for seen in (a, b))
+    i, j = _touching(a, b)
+    one, other = a.take(i), b.take(j)
+    away = one.boxes.center_m[:, :2] - other.boxes.center_m[:, :2]
+    c = center_covariance(one) + center_covariance(other) + POSE_SIGMA_M**2 * np.eye(2) + motion_covariance(one, other)
+    squared = np.einsum("pi,pi->p", away, np.linalg.solve(c, away[..., None])[..., 0])
+    reach = (one.boxes.size_m[:, 0] + other.boxes.size_m[:, 0]) / 2
+    near = (squared <= CHI2_2DOF_99) & (np.hypot(away[:, 0], away[:, 1]) <= reach)
+    overlap = rectangle_iou(one.rectangles, other.rectangles) >= MIN_GROUP_IOU
+    allowed = (near | overlap) & (_groups(one.boxes) == _groups(other.boxes))
+    return _assign((len(a), len(b)), (i[allowed], j[allowed]), np.minimum(squared, CHI2_2DOF_99)[allowed])
+
+
+def _touching(a: SeenBoxes, b: SeenBoxes) -> Pairs:
+    """Find the pairs of boxes that may overlap: circles around them do."""
     away = a.boxes.center_m[:, None, :2] - b.boxes.center_m[:, :2]
-    c = center_covariance(a)[:, None] + center_covariance(b) + POSE_SIGMA_M**2 * np.eye(2) + motion_covariance(a, b)
-    squared = np.einsum("abi,abi->ab", away, np.linalg.solve(c, away[..., None])[..., 0])
-    reach = (a.boxes.size_m[:, None, 0] + b.boxes.size_m[:, 0]) / 2
-    near = (squared <= CHI2_2DOF_99) & (np.hypot(away[..., 0], away[..., 1]) <= reach)
-    allowed = (near | (_iou_of_all(a, b) >= MIN_GROUP_IOU)) & (group_a[:, None] == group_b)
-    return _assign(np.minimum(squared, CHI2_2DOF_99), allowed)
+    radius_a, radius_b = (np.hypot(*seen.boxes.size_m[:, :2].T) / 2 for seen in (a, b))
+    i, j = np.nonzero(np.hypot(away[..., 0], away[..., 1]) <= radius_a[:, None] + radius_b)
+    return i, j
 
 
-def _iou_of_all(a: SeenBoxes, b: SeenBoxes) -> Array:
-    """Compute the IoU (M, N) in the ground plane of every box of the one with every box of the other end."""
-    one, other = np.repeat(a.rectangles, len(b), axis=0), np.tile(b.rectangles, (len(a), 1))
-    return rectangle_iou(one, other).reshape(len(a), len(b))
+def _groups(boxes: Boxes3D) -> NDArray[np.str_]:
+    return np.array([GROUP_OF[str(c)] for c in boxes.category], dtype="<U16")
 
 
 def center_covariance(seen: SeenBoxes) -> Array:
@@ -101,12 +110,13 @@ def center_covariance(seen: SeenBoxes) -> Array:
 
 
 def motion_covariance(a: SeenBoxes, b: SeenBoxes) -> Array:
-    """Return the covariance (M, N, 2, 2) of what objects move between the times of their boxes: road users move along their axis."""
-    apart_s = (a.boxes.t_ns[:, None] - b.boxes.t_ns) / NS_PER_S
-    speed = first_speeds(a.boxes)[:, None] * np.abs(apart_s)
-    across = np.where(is_walking(a.boxes)[:, None], speed, 0.0)
-    yaw = np.broadcast_to(a.boxes.yaw_rad[:, None], speed.shape)
-    return oriented_covariance(np.stack([speed, across], axis=-1), yaw)
+    """Return the covariances (P, 2, 2) of what objects move between the times of boxes a and b, row by row the same objects.
+
+    Road users move along their axis, but for those who walk.
+    """
+    moved_m = first_speeds(a.boxes) * np.abs(a.boxes.t_ns - b.boxes.t_ns) / NS_PER_S
+    across_m = np.where(is_walking(a.boxes), moved_m, 0.0)
+    return oriented_covariance(np.stack([moved_m, across_m], axis=-1), a.boxes.yaw_rad)
 
 
 def first_speeds(boxes: Boxes3D) -> Array:
@@ -119,10 +129,12 @@ def is_walking(boxes: Boxes3D) -> NDArray[np.bool_]:
     return np.array([GROUP_OF[str(c)] in ("pedestrian", "other") for c in boxes.category], dtype=bool)
 
 
-def _assign(cost: Array, allowed: NDArray[np.bool_]) -> Pairs:
-    """Choose the allowed pairs with the least sum of costs (M, N)."""
+def _assign(shape: tuple[int, int], pairs: Pairs, cost: Array) -> Pairs:
+    """Choose of allowed pairs of M and N boxes those with the least sum of costs (P,)."""
     from scipy.optimize import linear_sum_assignment
 
-    i, j = linear_sum_assignment(np.where(allowed, cost, NOT_ALLOWED))
-    kept = allowed[i, j]
+    every = np.full(shape, NOT_ALLOWED)
+    every[pairs] = cost
+    i, j = linear_sum_assignment(every)
+    kept = every[i, j] < NOT_ALLOWED
     return i[kept], j[kept]

@@ -52,9 +52,7 @@ def _estimate(a: SeenBoxes, b: SeenBoxes, pivot: Array) -> tuple[Array, float]:
     """Estimate shift (2,), m, and turn, rad, of the road's boxes b."""
     away = b.boxes.center_m[:, :2] - pivot
     difference = a.boxes.center_m[:, :2] - b.boxes.center_m[:, :2]
-    each = np.arange(len(a))
-    covariance = center_covariance(a) + center_covariance(b) + motion_covariance(a, b)[each, each]
-    precision = np.linalg.inv(covariance)
+    precision = np.linalg.inv(center_covariance(a) + center_covariance(b) + motion_covariance(a, b))
     design = np.zeros((len(a), 2, 3))
     design[:, 0, 0] = design[:, 1, 1] = 1.0
     design[:, 0, 2], design[:, 1, 2] = -away[:, 1], away[:, 0]
