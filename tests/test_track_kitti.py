@@ -19,6 +19,7 @@ from conftest import SHARED  # noqa: E402
 from evaluate_kitti import evaluate, recall_thresholds  # noqa: E402
 from kitti_boxes import Boxes, overlap_3d, read_detections, read_tracks, write_tracks  # noqa: E402
 from kitti_choice import labeled_probability  # noqa: E402
+from kitti_crowd import walking_crowd  # noqa: E402
 from kitti_joining import join_tracks  # noqa: E402
 from kitti_map import EGO_R_CAM, View, from_map, hidden_share, read_view, to_measurements  # noqa: E402
 from kitti_people import find_pairs  # noqa: E402
@@ -543,6 +544,18 @@ def test_what_the_benchmark_ignores_is_no_error() -> None:
     assert (got.false_positives, got.false_negatives, got.mota) == (0, 0, 100)
     taller = replace(small, box_px=small.box_px + np.array([0, 0, 0, 0.5]))
     assert evaluate({"0": Boxes.join([*found, taller])}, {"0": truth}, "Car").false_positives == 8
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_people_in_a_crowd_are_tracked_through_what_hides_them(seed: int) -> None:
+    view = standing_view(70)
+    label, found = walking_crowd(view, count=14, rng=np.random.default_rng(seed))
+    for online, samota, mota in ((False, 94.0, 94.0), (True, 90.0, 85.0)):
+        out = track_kitti.track_boxes(found, view, online=online)
+        score = evaluate({"0": out}, {"0": label}, "Pedestrian")
+        assert score.id_switches <= 2
+        assert score.samota > samota
+        assert score.mota > mota
 
 
 def test_sequences_without_results_are_missed() -> None:
