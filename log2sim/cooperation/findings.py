@@ -19,8 +19,9 @@ from log2sim.geometry import Array
 # What is certain is corrected if it matters: as much as agents are misplaced anyway, near the unit and 20 to 40 m away; stamps
 # by as much at city speeds.
 MIN_SHIFT_M, MIN_TURN_RAD, MIN_DELAY_S = 0.1, np.radians(0.3), 0.02
-# Chance explains as much in one of 10^4 checks of six normal variables (chi-square) and of one.
-MAX_CHANCE_CHI2, MIN_SIGMAS = 27.9, 4.0
+# Chance explains as much in one of 100 checks of six normal variables, or of the three in the plane (chi-square), and in one of
+# 10^4 of one. The sigmas of poses are bounds by what points have in common: with right poses, estimates are within a third.
+MAX_CHANCE_CHI2, MAX_CHANCE_PLANE_CHI2, MIN_SIGMAS = 16.8, 11.3, 4.0
 # Nothing is verified that could be off by more than objects are apart.
 MAX_SIGMA_M, MAX_SIGMA_RAD = 0.25, np.radians(1.0)
 # Of upright points that the vehicle looked at, the share that it saw through: in synthetic streets up to 3 % with a right pose,
@@ -29,7 +30,7 @@ MAX_CONTRADICTING, MAX_LEFT, MIN_LOOKED_AT = 0.2, 0.1, 50
 # Of matched points, where both ends show one place; in synthetic streets 66 to 96 % of them lie on surfaces, of wrong ones 20 to 36 %.
 MIN_ON_SURFACE = 0.5
 POSE = slice(0, DELAY)
-HEIGHT_AND_TILT = [2, 3, 4]
+HEIGHT_AND_TILT, PLANE = [2, 3, 4], [0, 1, 5]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,10 +54,15 @@ class Findings:
         """Standard deviations (7,) of the estimate."""
         return np.asarray(np.sqrt(np.diag(self.found.covariance)))
 
-    @property
+    @cached_property
     def _told_rows(self) -> list[int]:
         """The rows of the pose that both ends tell: all, or height, roll and pitch where the ground alone ties them."""
-        return list(range(DELAY)) if self.verified else HEIGHT_AND_TILT
+        return list(range(DELAY)) if self.verified or self._chi2(PLANE) > MAX_CHANCE_PLANE_CHI2 else HEIGHT_AND_TILT
+
+    def _chi2(self, rows: list[int]) -> float:
+        """How far some values are from 0, squared, in units of their covariance."""
+        values = self.found.values[rows]
+        return float(values @ np.linalg.solve(self.found.covariance[np.ix_(rows, rows)], values))
 
     def _likeliest(self, rows: list[int]) -> tuple[Array, Array]:
         """Return values (7,) of some rows and their covariance, if the others are right and so 0."""
@@ -69,10 +75,12 @@ class Findings:
     @cached_property
     def moved(self) -> bool:
         """Whether the pose is off for certain, by enough to matter, and both ends fit better with another."""
-        rows = self._told_rows
-        values, covariance = (self.found.values, self.found.covariance) if self.verified else self._likeliest(rows)
-        told, among = values[rows], covariance[np.ix_(rows, rows)] if self.verified else covariance
-        chi2 = float(told @ np.linalg.solve(among, told))
+        rows, values = self._told_rows, self.found.values
+        if len(rows) == DELAY:
+            chi2 = self._chi2(rows)
+        else:
+            values, covariance = self._likeliest(rows)
+            chi2 = float(values[rows] @ np.linalg.solve(covariance, values[rows]))
         large = np.linalg.norm(values[:3]) > MIN_SHIFT_M or np.linalg.norm(values[3:DELAY]) > MIN_TURN_RAD
         better = self._fits and self._fits_better and self._is_free(1, MAX_LEFT)
         return bool(large and chi2 > MAX_CHANCE_CHI2 and better)
@@ -147,7 +155,7 @@ class Findings:
         return (
             f"its pose is {shift:.2f} m and {turn:.1f} degrees off the ego's map (sigma {max(self.sigma[:2]):.2f} m, "
             f"{np.degrees(self.sigma[5]):.2f} degrees of yaw), by {self._sources()}; "
-            f"{'corrected' if self.verified else 'its height and tilt are corrected'}{self._company()}"
+            f"{'corrected' if len(self._told_rows) == DELAY else 'its height and tilt are corrected'}{self._company()}"
         )
 
     def _lateness(self) -> str:
