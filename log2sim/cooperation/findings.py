@@ -20,8 +20,8 @@ from log2sim.geometry import Array
 # by as much at city speeds.
 MIN_SHIFT_M, MIN_TURN_RAD, MIN_DELAY_S = 0.1, np.radians(0.3), 0.02
 # Chance explains as much in one of 100 checks of six normal variables, or of the three in the plane (chi-square), and in one of
-# 10^4 of one. The sigmas of poses are bounds by what points have in common: with right poses, estimates are within a third.
-MAX_CHANCE_CHI2, MAX_CHANCE_PLANE_CHI2, MIN_SIGMAS = 16.8, 11.3, 4.0
+# 300 of one. The sigmas of poses are bounds by what points have in common: on streets with houses, estimates are within a third.
+MAX_CHANCE_CHI2, MAX_CHANCE_PLANE_CHI2, MIN_SIGMAS = 16.8, 11.3, 3.0
 # Nothing is verified that could be off by more than objects are apart.
 MAX_SIGMA_M, MAX_SIGMA_RAD = 0.25, np.radians(1.0)
 # Of upright points that the vehicle looked at, the share that it saw through: in synthetic streets up to 3 % with a right pose,
