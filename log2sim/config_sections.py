@@ -74,7 +74,7 @@ class DetectConfig(Section):
         AUTO,
         "Detector in images: ssd-mobilenet-v2, a path to an ONNX model, or labels (boxes of the log); in LiDAR sweeps: "
         "lidar:vehicle, lidar:roadside, lidar:FILE.onnx or lidar:labels; both, joined by +; auto: ssd-mobilenet-v2 where "
-        "there are cameras, joined with lidar:vehicle, or lidar:roadside where no LiDAR is on a vehicle.",
+        "there are cameras, joined with lidar:vehicle, or lidar:roadside where all LiDARs are at the road and tilted.",
     )
     min_score: float = setting(
         0.0, "Lowest score of a detection that can continue a track; 0: the detector's own.", ge=0.0, le=1.0

@@ -17,11 +17,9 @@ from log2sim.perception.cooperative.refinement import refine_boxes
 from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.plan import FusionLevel, fusion_level
+from log2sim.sensors import ROADSIDE_NETWORK, VEHICLE_NETWORK, network_for
 
 AUTO = "auto"
-SHIPPED = ("lidar:vehicle", "lidar:roadside")
-# The network for roadsides is trained on LiDARs that look down by 31 degrees, that for vehicles on level ones.
-MIN_TILT_RAD = np.deg2rad(15.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,8 +91,6 @@ def create_for_ends(log: Log, config: Config) -> LidarDetector:
 
 def detector_by_mounting(log: Log, name: str) -> str:
     """Return the shipped detector that fits how the road's LiDARs look down; a detector of the user's own is for both ends."""
-    if name not in SHIPPED:
+    if name not in (VEHICLE_NETWORK, ROADSIDE_NETWORK):
         return name
-    road = [lidar.mount_T_lidar for lidar in log.lidars.values() if end_of(lidar) == ROAD]
-    tilt = [np.arccos(np.clip(mount_T_lidar[2, 2], -1.0, 1.0)) for mount_T_lidar in road]
-    return SHIPPED[int(bool(tilt) and min(tilt) >= MIN_TILT_RAD)]
+    return network_for(lidar for lidar in log.lidars.values() if end_of(lidar) == ROAD)
