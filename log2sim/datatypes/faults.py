@@ -28,7 +28,7 @@ FAULT_KINDS = {
     "wrong_mount": "the mount of a camera is inverted, or its images are turned",
     "road_pose": "the pose of a roadside unit is off against the ego's map",
     "road_clock": "the stamps of a roadside unit are off against the ego's clock",
-    "unknown_road_pose": "the vehicle sees too little of what a roadside unit sees to tell whether its pose is right",
+    "unknown_road_pose": "the vehicle sees too little of what a roadside unit sees to say whether its pose is right",
     "wrong_road_pose": "the vehicle saw through what a roadside unit sees, and no pose near its own makes both fit",
 }
 """The kinds of faults that a run looks for, and what each means."""

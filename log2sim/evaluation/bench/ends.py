@@ -30,7 +30,7 @@ def has_both_ends(log: Log) -> bool:
 def ends_settings(log: Log, config: Config) -> tuple[Setting, ...]:
     """List the levels of fusion and the ends alone, the present one first; none for a log without LiDARs at both ends.
 
-    LiDAR sweeps alone are searched, so that what is compared is what the LiDARs of the ends tell.
+    LiDAR sweeps alone are searched, so that the LiDARs of the ends are what is compared.
     """
     if not has_both_ends(log):
         return ()

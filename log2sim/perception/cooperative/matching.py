@@ -125,7 +125,7 @@ def first_speeds(boxes: Boxes3D) -> Array:
 
 
 def is_walking(boxes: Boxes3D) -> NDArray[np.bool_]:
-    """Mark the boxes (M,) of objects that move in any direction, and whose axes tell little."""
+    """Mark the boxes (M,) of objects that move in any direction, and whose axes say little."""
     return np.array([GROUP_OF[str(c)] in ("pedestrian", "other") for c in boxes.category], dtype=bool)
 
 

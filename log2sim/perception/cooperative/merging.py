@@ -194,7 +194,7 @@ def _with_both(boxes: Boxes3D, a: Boxes3D, b: Boxes3D) -> Boxes3D:
 def _join_axes(a: SeenBoxes, b: SeenBoxes) -> tuple[SeenBoxes, Array]:
     """Return boxes (P,) with the mean axis and heading of both, and the angles (P,) between their axes.
 
-    The axes of pedestrians tell little: the surer one is taken, and none is said to be off.
+    The axes of pedestrians say little: the surer one is taken, and none is said to be off.
     """
     better, walking = _take_better(a, b), is_walking(a.boxes)
     apart = wrap_angle(2 * (b.boxes.yaw_rad - a.boxes.yaw_rad)) / 2

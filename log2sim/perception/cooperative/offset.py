@@ -33,7 +33,7 @@ def take_off_offset(a: SeenBoxes, b: SeenBoxes, b_all: SeenBoxes) -> SeenBoxes:
 
     Notes
     -----
-    A shift and a turn about the sensor by weighted least squares. Their prior is what registration leaves: a single pair tells
+    A shift and a turn about the sensor by weighted least squares. Their prior is what registration leaves: a single pair says
     little, and many move the boxes where they agree to. Cauchy's weights make single wrong pairs harmless (Holland & Welsch,
     "Robust regression using iteratively reweighted least-squares", 1977).
     """

@@ -13,7 +13,7 @@ from log2sim.simulation.metrics.time_to_collision import touching
 from log2sim.simulation.warnings.ways import Ways
 
 QUANTILES = 9
-"""Of the errors along and across, so that a probability is told to a hundredth; odd, so that one of them is no error."""
+"""Of the errors along and across, so that a probability is exact to a hundredth; odd, so that one of them is no error."""
 
 CHUNK = 256
 """Pairs of ways that are compared at once."""

@@ -108,7 +108,7 @@ def observed_spans(agent: Agent, ends: Sequence[str]) -> tuple[Span, ...]:
 
 
 def ends_of(scenario: Scenario) -> tuple[str, ...]:
-    """Return the ends whose sensors observed any agent; none where the scenario does not tell."""
+    """Return the ends whose sensors observed any agent; none where the scenario does not say."""
     return tuple(end for end in ENDS if any(a.observed_by.get(end) for a in scenario.agents))
 
 

@@ -39,8 +39,8 @@ class LateDriver:
         """Return what follows the scenario."""
         if self._braked and abs(self._row(seen)[3, 0]) > STANDSTILL_MPS:
             self._delay_s = max(self._delay_s, seen.t_s - self._place_s(seen) - CATCH_UP_S)
-        told = self._follow(seen)
-        return replace(told, accel_mps2=min(told.accel_mps2, MAX_THROTTLE_MPS2)) if self._braked else told
+        commands = self._follow(seen)
+        return replace(commands, accel_mps2=min(commands.accel_mps2, MAX_THROTTLE_MPS2)) if self._braked else commands
 
     def brake(self, seen: Observation, brake_mps2: float) -> Controls:
         """Return what stops the ego on its path; it goes on from there."""
@@ -50,8 +50,8 @@ class LateDriver:
 
     def _follow(self, seen: Observation) -> Controls:
         p = replace(self._parameters, understeer_s2pm2=np.array([seen.ego.understeer_s2pm2]))
-        told, self._memory = follow_vehicles(self._row(seen), self._state(seen.ego), self._memory, p, seen.dt_s)
-        return Controls(float(told.pedal_mps2[0]), float(told.steer_rad[0]), bool(told.reverse[0]))
+        commands, self._memory = follow_vehicles(self._row(seen), self._state(seen.ego), self._memory, p, seen.dt_s)
+        return Controls(float(commands.pedal_mps2[0]), float(commands.steer_rad[0]), bool(commands.reverse[0]))
 
     def _row(self, seen: Observation) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
         """Return the reference (C, 1) of the present."""

@@ -12,7 +12,7 @@ _ENDS = {"vehicle": "the vehicle's sensors", "road": "the road's sensors", "both
 def describe_warnings(warnings: Warnings) -> str:
     """Say how many warnings there are, and describe the first ones."""
     whose = (
-        _ENDS[warnings.ends] if warnings.tells_ends else "all sensors, which the scenario does not tell apart by end"
+        _ENDS[warnings.ends] if warnings.tells_ends else "all sensors, which the scenario does not distinguish by end"
     )
     lines = [
         f"{count_warnings(warnings)} in {warnings.driven_s:.1f} s of driving, by {whose}: they know {warnings.known_agents} of {warnings.agents} other agents"

@@ -20,7 +20,7 @@ from log2sim.simulation.warnings.warning import CollisionWarning, Moment, Warnin
 from log2sim.simulation.warnings.watch import Courses, Watch
 
 BRAKING_SEEN_S = 0.3
-"""The ego's deceleration is that of its speed over this time: three ticks tell it to 0.5 m/s2 where a speed is good to 0.1 m/s."""
+"""The ego's deceleration is that of its speed over this time: three ticks give it to 0.5 m/s2 where a speed is good to 0.1 m/s."""
 
 SAME_WARNING_S = 1.0
 """A warning that ends for less time goes on."""
@@ -36,7 +36,7 @@ def warn(
     Parameters
     ----------
     scenario : Scenario
-        Tells which end observed an agent when.
+        With the spans in which each end observed an agent.
     replay : Replay, optional
         Where agents are, instead of in the scenario.
     ends : {"both", "vehicle", "road"}
@@ -54,7 +54,7 @@ def warn(
     At every tick of 0.1 s agents are expected where `log2sim.prediction` sees them by what the ends have observed up to then, and
     the ego on its path at its speed, or braking as it does. An agent with which the ego collides by that, with at least
     `min_probability` within `horizon_s`, is warned of from when the ego has to react within `margin_s`. Nothing later is used but the ego's path: its route. States of a
-    reconstruction were smoothed over the whole log, so that they tell a little of what came next.
+    reconstruction were smoothed over the whole log, so that they depend a little on what came next.
     """
     settings = replace(settings or WarningSettings(), ends=ends)
     moved = to_scenario(replay, scenario) if replay is not None else scenario
@@ -99,7 +99,7 @@ class _Drive(NamedTuple):
     t_s: Array
 
     def moment(self, agent: int, t_s: float) -> Moment:
-        """Tell how far the ego and an agent are from each other at a time."""
+        """Compute how far the ego and an agent are from each other at a time."""
         other, size = self.watch.table.agents[agent], self.watch.ego_way.size_m
         x, y, _, yaw, _ = other.trajectory.at(np.array([t_s]))
         columns = (self.ego.x_m, self.ego.y_m, np.unwrap(self.ego.yaw_rad), self.ego.speed_mps)
@@ -112,7 +112,7 @@ class _Drive(NamedTuple):
         return Moment(*(round(v, _DIGITS) for v in (t_s, gap_m, abs(own_speed), stopping_m)))
 
     def known(self, agent: int) -> Moment | None:
-        """Tell the same of when an agent is first known; None where it never is, or while there was no ego."""
+        """Compute the same for when an agent is first known; None where it never is, or while there was no ego."""
         since_s = float(self.watch.known.since_s[agent])
         there = self.t_s[0] - TICK_S <= since_s <= self.t_s[-1] + TICK_S
         return self.moment(agent, since_s) if there else None
@@ -169,7 +169,7 @@ def _collisions(replay: Replay | None) -> Mapping[str, float]:
 def _with_collisions(
     events: Iterable[CollisionWarning], hit: Mapping[str, float], drive: _Drive
 ) -> list[CollisionWarning]:
-    """Tell which agents the ego touches, and add those that nothing was predicted of."""
+    """Find which agents the ego touches, and add those that nothing was predicted of."""
     out = [replace(e, collision_s=hit.get(e.agent)) for e in events]
     row = {a.id: k for k, a in enumerate(drive.watch.table.agents)}
     for agent in hit.keys() - {e.agent for e in out}:

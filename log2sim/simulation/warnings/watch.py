@@ -20,7 +20,7 @@ from log2sim.simulation.warnings.settings import WarningSettings
 from log2sim.simulation.warnings.ways import ExpectedAgents
 
 MAX_SLOPE = 0.06
-"""Of a road beyond what the ego's path tells of its height: more is rare outside of mountains."""
+"""Of a road beyond the heights of the ego's path: more is rare outside of mountains."""
 
 SPARE_MPS = 5.0
 """By so much an agent may become faster within the horizon, and be compared with the ego still."""
@@ -61,7 +61,7 @@ class Watch:
     Parameters
     ----------
     scenario : Scenario
-        With an ego; tells what was observed when.
+        With an ego, and what was observed when.
     agents : sequence of Agent
         The other agents, where they are: as in the scenario, or in a replay of it.
     settings : WarningSettings
@@ -138,8 +138,8 @@ class Watch:
     def _moved(self, way: Complex, agent: Index, tick: Index, seen: tuple[Complex, Array]) -> Complex:
         """Let ways (C, H) begin where agents are seen to be, as much faster as they are."""
         place, speed = seen[0][agent], seen[1][agent]
-        told = np.isfinite(place) & self.known.observed[agent, tick]
+        measured = np.isfinite(place) & self.known.observed[agent, tick]
         usual = np.abs(self.table.velocity_mps[agent, tick])
-        faster = np.divide(speed, usual, out=np.ones(len(agent)), where=told & (usual > STANDSTILL_MPS))
+        faster = np.divide(speed, usual, out=np.ones(len(agent)), where=measured & (usual > STANDSTILL_MPS))
         moved = place[:, None] + np.minimum(faster, 2.0)[:, None] * (way - way[:, :1])
-        return np.where(told[:, None], moved, way)
+        return np.where(measured[:, None], moved, way)

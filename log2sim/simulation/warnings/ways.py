@@ -18,7 +18,7 @@ LEAD_STEP_S = 0.25
 """Between expected places; motion between them is straight, which is 3 cm off where a car turns with 4 m/s2 across."""
 
 LEARNED_OBSERVATIONS = 11
-"""A tracker's speed rests on about a second of observations; older ones tell nothing of the present."""
+"""A tracker's speed rests on about a second of observations; older ones say nothing about the present."""
 
 Index = NDArray[np.intp]
 

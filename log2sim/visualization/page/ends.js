@@ -8,7 +8,7 @@ const observes = (track, end, t) => {
   return false;
 };
 
-// Who observes it now, and since when each end does first; empty where the scenario does not tell.
+// Who observes it now, and since when each end does first; empty where the scenario does not say.
 const observers = (track, t) => {
   if (track.observedBy === null) return "";
   const now = ENDS.filter((end) => observes(track, end, t)).join(" and ") || "nobody";

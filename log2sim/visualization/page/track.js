@@ -41,7 +41,7 @@ class Track {
     this.points = entry.points ?? null;
     this.source = entry.source ?? null;
     this.sigmas = ["sigma_xy_m", "sigma_yaw_rad", "sigma_speed_mps"].map((key) => (entry[key] ? sums(entry[key], scales[key]) : null));
-    this.observedBy = entry.observed_by ?? null;  // end: spans in s; null where the scenario does not tell
+    this.observedBy = entry.observed_by ?? null;  // end: spans in s; null where the scenario does not say
     this.doubts = entry.doubts ?? [];  // reason, start and end in s or null
     this.doubtSpans = (entry.doubted ?? []).map(([start, end]) => [start ?? -Infinity, end ?? Infinity]);
     this.doubted = false;

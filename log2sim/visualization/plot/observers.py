@@ -23,7 +23,7 @@ WIDTH_PT, BESIDE_PT = 1.3, 3.4
 
 
 def tells_ends(scenario: Scenario) -> bool:
-    """Whether both ends of a cooperative log observed somebody, so that there is something to tell apart."""
+    """Whether both ends of a cooperative log observed somebody, so that there is something to distinguish."""
     return len(ends_of(scenario)) > 1
 
 
