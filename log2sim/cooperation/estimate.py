@@ -35,7 +35,7 @@ OBJECT_WITHIN_M = (2.5, 2.0, 1.5, 1.2, 1.0, 1.0, 1.0, 1.0, 1.0)
 TRIED_DELAYS_S = np.arange(-0.2, 0.51, 0.1)
 JUDGED_WITHIN_M = 0.5
 # Of the vehicle's way, to see how far its poses err.
-PARTS = 3
+PARTS, HELD_SHARE = 3, 0.3
 # Where structure holds the pose in the plane, objects tell the delay alone, for which fewer moments do.
 HELD_M, FEW_MOMENTS, MANY_MOMENTS = 0.1, 15, 30
 
@@ -148,15 +148,16 @@ def add_pose_errors(sight: Sight, found: Estimate, track: PoseTrack) -> Estimate
     """
     if sight.view is None:
         return found
-    values = [
-        _refine(_sight_of_part(sight, part), np.zeros(7), with_objects=False)[0]
-        for part in sight.view.parts(PARTS)
-        if len(part.xyz_m)
-    ]
+    parts = [_sight_of_part(sight, part) for part in sight.view.parts(PARTS) if len(part.xyz_m)]
+    fits = [_refine(part, np.zeros(7), with_objects=False) for part in parts]
     variance = np.zeros(7)
-    if len(values) == PARTS:
-        for rows in (slice(0, 3), slice(3, DELAY)):
-            variance[rows] = np.array(values)[:, rows].var(axis=0, ddof=1).mean() / PARTS
+    if len(fits) == PARTS:
+        values = np.array([value for value, _ in fits])
+        # What structure does not hold scatters by the noise of surfaces alone.
+        held = np.max([np.diag(covariance) for _, covariance in fits], axis=0) < (HELD_SHARE * PRIOR_SIGMA) ** 2
+        for rows in (np.arange(3), np.arange(3, DELAY)):
+            if held[rows].any():
+                variance[rows] = values[:, rows[held[rows]]].var(axis=0, ddof=1).mean() / PARTS
     sigma_m, sigma_rad = track.sigmas_at(sight.view.t_ns, (0.0, 0.0)).mean(axis=0)
     variance[:3] += sigma_m**2
     variance[5] += sigma_rad**2

@@ -57,7 +57,14 @@ class Findings:
     @cached_property
     def _told_rows(self) -> list[int]:
         """The rows of the pose that both ends tell: all, or height, roll and pitch where the ground alone ties them."""
-        return list(range(DELAY)) if self.verified or self._chi2(PLANE) > MAX_CHANCE_PLANE_CHI2 else HEIGHT_AND_TILT
+        certain = self._chi2(PLANE) > MAX_CHANCE_PLANE_CHI2 and self._objects_agree
+        return list(range(DELAY)) if self.verified or certain else HEIGHT_AND_TILT
+
+    @property
+    def _objects_agree(self) -> bool:
+        """Whether several common objects fit better with the correction: one alone may be matched by mistake."""
+        before, after = self.found.objects
+        return after is not None and after.pairs > 1 and after.gain > (0.0 if before is None else before.gain)
 
     def _chi2(self, rows: list[int]) -> float:
         """How far some values are from 0, squared, in units of their covariance."""
