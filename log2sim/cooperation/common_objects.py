@@ -21,7 +21,7 @@ VELOCITY_SPAN_S = 0.5
 MAX_GAP_S = 0.7
 # Boxes of one object are of different sweeps; what is farther away than any limit is not linked.
 MIN_STEP_S, UNLIKELY_M = 0.01, 1e6
-# Kinds of road users that detectors tell apart.
+# Kinds of road users that detectors distinguish.
 GROUPS = {"car": 0, "truck": 0, "bus": 0, "pedestrian": 1, "cyclist": 2, "motorcycle": 2, "bicycle": 2}
 # How far centers of boxes by both ends are apart, measured in synthetic streets and roads with exact poses: the standard
 # deviation of one, and what all of one object have in common, as each end sees another side of it. Along and across the motion
@@ -33,7 +33,7 @@ SPREAD_M = {
 }
 # Of boxes with so many points; those with fewer err more.
 USUAL_POINTS, MAX_FACTOR = 100.0, 3.0
-# Two tracks of one object have velocities as like as boxes over a second tell.
+# Two tracks of one object have velocities as similar as boxes over a second show.
 MAX_VELOCITY_APART_MPS = 4.0
 # Boxes so many standard deviations apart count a quarter (Geman, McClure 1987), as they may be of different objects.
 TOO_FAR = 2.5

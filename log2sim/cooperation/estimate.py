@@ -36,7 +36,7 @@ TRIED_DELAYS_S = np.arange(-0.2, 0.51, 0.1)
 JUDGED_WITHIN_M = 0.5
 # Of the vehicle's way, to see how far its poses err.
 PARTS, HELD_SHARE = 3, 0.3
-# Where structure holds the pose in the plane, objects tell the delay alone, for which fewer moments do.
+# Where structure holds the pose in the plane, objects are needed for the delay alone, for which fewer moments do.
 HELD_M, FEW_MOMENTS, MANY_MOMENTS = 0.1, 15, 30
 
 

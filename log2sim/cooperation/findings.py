@@ -1,4 +1,4 @@
-"""What is told and corrected of a roadside unit: what is beyond doubt, large enough to matter, and makes both ends fit better."""
+"""What is reported and corrected of a roadside unit: what is beyond doubt, large enough to matter, and makes both ends fit better."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ class Findings:
         return np.asarray(np.sqrt(np.diag(self.found.covariance)))
 
     @cached_property
-    def _told_rows(self) -> list[int]:
-        """The rows of the pose that both ends tell: all, or height, roll and pitch where the ground alone ties them."""
+    def _looked_rows(self) -> list[int]:
+        """The rows of the pose that both ends show: all, or height, roll and pitch where the ground alone ties them."""
         certain = self._chi2(PLANE) > MAX_CHANCE_PLANE_CHI2 and self._objects_agree
         return list(range(DELAY)) if self.verified or certain else HEIGHT_AND_TILT
 
@@ -82,7 +82,7 @@ class Findings:
     @cached_property
     def moved(self) -> bool:
         """Whether the pose is off for certain, by enough to matter, and both ends fit better with another."""
-        rows, values = self._told_rows, self.found.values
+        rows, values = self._looked_rows, self.found.values
         if len(rows) == DELAY:
             chi2 = self._chi2(rows)
         else:
@@ -126,15 +126,15 @@ class Findings:
 
     def _is_free(self, row: int, limit: float) -> bool:
         """Whether the vehicle saw through few of the unit's points without (0) or with (1) the correction."""
-        told = self.visibility[row]
-        if told is None or told.seen + told.seen_through < MIN_LOOKED_AT:
+        looked = self.visibility[row]
+        if looked is None or looked.seen + looked.seen_through < MIN_LOOKED_AT:
             return True
-        return told.contradicting <= limit
+        return looked.contradicting <= limit
 
     @cached_property
     def applied(self) -> Array:
         """What is corrected (7,): all, or what is likeliest of a part where the rest is taken to be right."""
-        rows = [*(self._told_rows if self.moved else []), *([DELAY] if self.late else [])]
+        rows = [*(self._looked_rows if self.moved else []), *([DELAY] if self.late else [])]
         if self.contradicted or not rows:
             return np.zeros(7)
         return self.found.values if len(rows) == len(self.found.values) else self._likeliest(rows)[0]
@@ -148,21 +148,21 @@ class Findings:
         """Describe what is wrong, and what cannot be said."""
         if self.contradicted:
             return [Fault("wrong_road_pose", name, self._contradiction(), "left_out") for name in self.unit.sensors]
-        told, lidar, values = [], self.unit.lidars[0], self._values()
+        faults, lidar, values = [], self.unit.lidars[0], self._values()
         if self.moved:
-            told.append(Fault("road_pose", lidar, self._displacement(), "corrected", values=values))
+            faults.append(Fault("road_pose", lidar, self._displacement(), "corrected", values=values))
         if self.late:
-            told.append(Fault("road_clock", lidar, self._lateness(), "corrected", values=values))
+            faults.append(Fault("road_clock", lidar, self._lateness(), "corrected", values=values))
         if not self.verified:
-            told.append(Fault("unknown_road_pose", lidar, self._uncertainty(), "kept", values=values))
-        return told
+            faults.append(Fault("unknown_road_pose", lidar, self._uncertainty(), "kept", values=values))
+        return faults
 
     def _displacement(self) -> str:
         shift, turn = np.linalg.norm(self.applied[:3]), np.degrees(np.linalg.norm(self.applied[3:DELAY]))
         return (
             f"its pose is {shift:.2f} m and {turn:.1f} degrees off the ego's map (sigma {max(self.sigma[:2]):.2f} m, "
             f"{np.degrees(self.sigma[5]):.2f} degrees of yaw), by {self._sources()}; "
-            f"{'corrected' if len(self._told_rows) == DELAY else 'its height and tilt are corrected'}{self._company()}"
+            f"{'corrected' if len(self._looked_rows) == DELAY else 'its height and tilt are corrected'}{self._company()}"
         )
 
     def _lateness(self) -> str:
@@ -179,8 +179,8 @@ class Findings:
         )
 
     def _contradiction(self) -> str:
-        told = self.visibility[0]
-        share = 0.0 if told is None else told.contradicting
+        looked = self.visibility[0]
+        share = 0.0 if looked is None else looked.contradicting
         return (
             f"its pose cannot be trusted: the vehicle saw through {share:.0%} of the upright surfaces that it sees, and no "
             "pose within 0.5 m and 2 degrees makes both fit; left out"

@@ -37,8 +37,8 @@ class Visibility:
     @property
     def contradicting(self) -> float:
         """Share of points that the vehicle saw through."""
-        told = self.seen + self.seen_through
-        return self.seen_through / told if told else 0.0
+        looked_at = self.seen + self.seen_through
+        return self.seen_through / looked_at if looked_at else 0.0
 
 
 def look_through(view: VehicleView, upright_m: Array) -> Visibility:

@@ -1,4 +1,4 @@
-"""Ground as both ends see it: heights between the rings of the vehicle's LiDAR tell how high and how tilted a unit stands."""
+"""Ground as both ends see it: heights between the rings of the vehicle's LiDAR show how high and how tilted a unit is."""
 
 from __future__ import annotations
 
