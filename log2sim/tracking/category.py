@@ -19,6 +19,8 @@ MIN_RIDDEN_M = 3.0
 MIN_RIDER_SHARE = 0.25
 # Measurements at either end of a track whose median position counts, so that single wrong ones do not.
 END_MEASUREMENTS = 5
+# Errors of the positions at both ends of a shorter track may make up that speed.
+MIN_FAST_S = 1.0
 
 
 def decide_category(m: Measurements) -> str:
@@ -37,6 +39,18 @@ def decide_category(m: Measurements) -> str:
     ):
         return "cyclist"
     return category
+
+
+def gets_on_fast(m: Measurements) -> bool:
+    """Return whether a track gets on faster than people run, from one end to the other, which takes `MIN_FAST_S` or more.
+
+    Errors of single positions make a pedestrian fast for a moment, but do not carry it away.
+    """
+    if (m.t_ns[-1] - m.t_ns[0]) / NS_PER_S < MIN_FAST_S:
+        return False
+    count = min(END_MEASUREMENTS, len(m) // 2)
+    between_s = float(np.median(m.t_ns[-count:]) - np.median(m.t_ns[:count])) / NS_PER_S
+    return _displacement_m(m) > MAX_PEDESTRIAN_SPEED_MPS * between_s
 
 
 def voted_category(m: Measurements) -> str:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Measurements, Track
 from log2sim.geometry import period_of
-from log2sim.tracking.category import decide_category, voted_category
+from log2sim.tracking.category import decide_category, gets_on_fast, voted_category
 from log2sim.tracking.forward import track_forward
 from log2sim.tracking.stitch import stitch
 
@@ -44,9 +44,10 @@ def track(
     tracks = []
     for t in tracklets:
         rows = everything.take(first_row[t.ticks] + t.rows)
-        # A rider taken for a pedestrian is as fast before an occlusion as after it.
-        category = voted_category(rows) if whole_boxes else decide_category(rows)
-        tracks.append(Track(category, t.ticks, rows))
+        category = voted_category(rows)
+        # A rider who was taken for a pedestrian before an occlusion may be seen to ride after it.
+        rides = category == "pedestrian" and not whole_boxes and gets_on_fast(rows)
+        tracks.append(Track("cyclist" if rides else category, t.ticks, rows))
     joined = stitch(tracks, t_ns, max_gap_s=max_gap_s, whole_boxes=whole_boxes)
     required = min_hits(t_ns, min_life_s)
     kept = [t for t in joined if len(t) >= required]
