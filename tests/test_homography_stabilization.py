@@ -19,7 +19,7 @@ from log2sim.perception.homography.estimate import EstimationOptions
 from log2sim.perception.homography.fit import HomographyFit, PitchRoll
 from log2sim.perception.homography.stabilization import two_folds
 from log2sim.pipeline import reconstruct
-from log2sim.tracking.tracker import track
+from log2sim.tracking.merging import track_ends
 
 T0_NS = 1_700_000_000_000_000_000
 TICKS = 40
@@ -92,12 +92,12 @@ class Outcome:
 def outcome(log: Log, monkeypatch: pytest.MonkeyPatch) -> Outcome:
     placed: list[Measurements] = []
 
-    def spy(measurements: list[Measurements], *rest: Any, **options: Any) -> Any:
-        placed.extend(measurements)
-        return track(measurements, *rest, **options)
+    def spy(ends: list[list[Measurements]], *rest: Any, **options: Any) -> Any:
+        placed.extend(measurements for of_end in ends for measurements in of_end)
+        return track_ends(ends, *rest, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(log2sim.pipeline, "track", spy)
+        patch.setattr(log2sim.pipeline, "track_ends", spy)
         scenario = reconstruct(log, Config.load(detect={"name": "labels"})).scenario
     rows = Measurements.join(placed)
     rows = rows.take(rows.source == "topdown")
