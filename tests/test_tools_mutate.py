@@ -60,6 +60,12 @@ def test_a_reader_that_never_ends_is_a_hang(harness: Harness) -> None:
     assert row_of(harness, lambda path, out: time.sleep(60), 0.5).verdict == "hang"
 
 
+def test_what_a_late_run_left_does_not_stop_the_next(harness: Harness) -> None:
+    (harness.folder / "sound-out" / "old").mkdir(parents=True, exist_ok=True)
+    row = row_of(harness, lambda path, out: os.kill(os.getpid(), signal.SIGKILL))
+    assert row.verdict == "crash"
+
+
 def test_a_reader_that_dies_is_a_crash(harness: Harness) -> None:
     row = row_of(harness, lambda path, out: os.kill(os.getpid(), signal.SIGKILL))
     assert row.verdict == "crash"

@@ -110,6 +110,8 @@ class Harness:
         command = commands_for(kind, self.bases[kind], out, variant)[-1]
         key = " ".join(map(str, command))
         if key not in self._sound:
+            # A run that was late and stopped leaves its folder.
+            _remove(out)
             self._sound[key] = run_commands(kind, self.bases[kind], out, [command])[0]
             if self._sound[key].code:
                 raise RuntimeError(f"a sound input of kind '{kind}' fails: {self._sound[key]}")
