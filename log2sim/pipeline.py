@@ -222,7 +222,7 @@ def second_pass(run: Run, observations: Observations) -> Result:
         placed = place_by_homography(log, observations, homographies)
     with run.clock.stage("fuse"):
         across = plan.keeps(Stage.FUSION) or plan.keeps(Stage.FUSION_WITH_LIDAR)
-        ends = [fuse(of_end, across=across) for of_end in apart(placed, plan)]
+        ends = [fuse(of_end, across=across) for of_end in split_by_end(placed, plan)]
         measurements = [Measurements.join(rows) for rows in zip(*ends)]
     with run.clock.stage("track"):
         tracks = track_ends(
@@ -241,8 +241,8 @@ def second_pass(run: Run, observations: Observations) -> Result:
     return result_of(run, ego, RunOutputs(observations, measurements, homographies, tuple(agents), run.clock))
 
 
-def apart(measurements: Sequence[Measurements], plan: Plan) -> list[Sequence[Measurements]]:
-    """Return the measurements by tick of what is tracked apart: each end where tracks are joined, else everything."""
+def split_by_end(measurements: Sequence[Measurements], plan: Plan) -> list[Sequence[Measurements]]:
+    """Return the measurements by tick of what is tracked together: each end where tracks are joined, else everything."""
     if plan.fusion is not FusionLevel.TRACKS:
         return [measurements]
     return [[rows.take(rows.seen_by[:, k]) for rows in measurements] for k in range(len(ENDS))]

@@ -17,7 +17,7 @@ from log2sim.errors import ConfigError
 from log2sim.prediction.motion_table import table_of
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
-from log2sim.simulation.warnings.ego_way import EgoStates, EgoWay
+from log2sim.simulation.warnings.ego_path import EgoPath, EgoStates
 from log2sim.simulation.warnings.policy import BrakeWhenWarned
 from log2sim.simulation.warnings.sentences import describe_warnings
 from log2sim.simulation.warnings.settings import WarningSettings
@@ -170,7 +170,7 @@ def test_an_ego_that_brakes_for_it_already_is_not_warned() -> None:
 
 def test_the_ego_is_expected_along_its_path_as_far_aside_as_it_is_and_off_it_straight_on() -> None:
     bend = driven(lambda t: np.full_like(t, 8.0), lambda s: np.where(s > 20, 1 / 15, 0.0), 8.0, id="ego")
-    way, lead_s = EgoWay(bend), np.array([0.0, 1.0, 3.0])
+    way, lead_s = EgoPath(bend), np.array([0.0, 1.0, 3.0])
     at_s = np.array([1.0])
     x, y, _, yaw, speed = bend.trajectory.at(at_s)
     states = EgoStates(x, y + 0.8, yaw, speed, np.zeros(1), way.progress(x, y))

@@ -68,7 +68,7 @@ class Agent:
     doubts : tuple of Doubt
         What speaks against it.
     observed_by : mapping of str to tuple of Span
-        Times of the scenario, s, between which each of the `ENDS` measured it; empty for logs of one end.
+        Times of the scenario, s, between which each of the `ENDS` measured it; empty for truth and the ego.
     """
 
     id: str

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 from log2sim.config import Config
 from log2sim.datatypes import Log, Scenario
-from log2sim.evaluation.bench.ends import ends_points, ends_settings
+from log2sim.evaluation.bench.ends import ends_points, ends_settings, make_context_of_ends
 from log2sim.evaluation.bench.panels import Panel, make_ends_panel, make_panels
-from log2sim.evaluation.bench.runs import BenchContext, Progress, make_context, make_context_of_ends
+from log2sim.evaluation.bench.runs import BenchContext, Progress, make_context
 from log2sim.evaluation.bench.scores import EVERYTHING, Scope
 from log2sim.evaluation.bench.settings import make_grid
 

@@ -8,14 +8,16 @@ from typing import Any
 
 from log2sim.config import Config
 from log2sim.datatypes import ENDS, ROAD, Log, Scenario, end_of
-from log2sim.errors import NothingToReconstruct
+from log2sim.errors import LogError, NothingToReconstruct
 from log2sim.evaluation.bench.pareto import Point
-from log2sim.evaluation.bench.scores import Scope, Score, score_scenario
-from log2sim.evaluation.bench.settings import Setting
+from log2sim.evaluation.bench.runs import BenchContext
+from log2sim.evaluation.bench.scores import Scope, Score, check_scope, score_scenario
+from log2sim.evaluation.bench.settings import Grid, Setting
 from log2sim.geometry import period_of
 from log2sim.perception.cooperative.detector import detector_by_mounting
-from log2sim.pipeline import first_pass, second_pass, start
-from log2sim.plan import FusionLevel
+from log2sim.pipeline import first_pass, schedule_of, second_pass, start
+from log2sim.plan import FusionLevel, make_plan
+from log2sim.sensors import select_sensors
 
 STAGE = "ends"
 DETECTOR = "lidar:vehicle"
@@ -25,6 +27,27 @@ DETECTOR = "lidar:vehicle"
 def has_both_ends(log: Log) -> bool:
     """Return whether a log has LiDARs of the vehicle and of the road."""
     return {end_of(lidar) for lidar in log.lidars.values()} >= set(ENDS)
+
+
+def make_context_of_ends(log: Log, ends: Sequence[Setting], truth: Scenario | None, scope: Scope) -> BenchContext:
+    """Synchronize a log without cameras, of which the ends alone are compared.
+
+    Raises
+    ------
+    LogError
+        For a log without LiDARs at both ends.
+    """
+    if not ends:
+        raise LogError(
+            f"{log.name}: the log has no camera, and bench compares methods for images; use detect and evaluate"
+        )
+    check_scope(truth, scope)
+    config = ends[0].config
+    sensors = select_sensors(log, config)
+    schedule = schedule_of(log, config, sensors)
+    plan = make_plan(log, config, sensors, schedule.t_ns)
+    grid = Grid(detect=tuple(ends[:1]), measure=(), homography=(), hypotheses=(), smooth=())
+    return BenchContext(sensors.restrict(log), plan, schedule, truth, scope, grid, {}, {})
 
 
 def ends_settings(log: Log, config: Config) -> tuple[Setting, ...]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from log2sim.datatypes import Log, Scenario
-from log2sim.errors import LogError, NothingToReconstruct
+from log2sim.errors import NothingToReconstruct
 from log2sim.evaluation.bench.localization import (
     Holdout,
     lidar_positions,
@@ -127,27 +127,6 @@ def make_context(
     # Detections are looked up, so that no image is decoded and no frame skipped.
     plan = replace(plan.variant(Decision(Stage.IMAGE_DECODING, False, "detections are shared")), detector_stride=1)
     return BenchContext(log, plan, schedule, truth, scope, grid, found, {**clock.seconds, "decode": decoding_s})
-
-
-def make_context_of_ends(log: Log, ends: Sequence[Setting], truth: Scenario | None, scope: Scope) -> BenchContext:
-    """Synchronize a log without cameras, of which the ends alone are compared.
-
-    Raises
-    ------
-    LogError
-        For a log without LiDARs at both ends.
-    """
-    if not ends:
-        raise LogError(
-            f"{log.name}: the log has no camera, and bench compares methods for images; use detect and evaluate"
-        )
-    check_scope(truth, scope)
-    config = ends[0].config
-    sensors = select_sensors(log, config)
-    schedule = schedule_of(log, config, sensors)
-    plan = make_plan(log, config, sensors, schedule.t_ns)
-    grid = Grid(detect=tuple(ends[:1]), measure=(), homography=(), hypotheses=(), smooth=())
-    return BenchContext(sensors.restrict(log), plan, schedule, truth, scope, grid, {}, {})
 
 
 def first_pass(

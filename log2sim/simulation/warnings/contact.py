@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array
 from log2sim.simulation.metrics.time_to_collision import touching
-from log2sim.simulation.warnings.ways import Ways
+from log2sim.simulation.warnings.expected_paths import ExpectedPaths
 
 QUANTILES = 9
 """Of the errors along and across, so that a probability is exact to a hundredth; odd, so that one of them is no error."""
@@ -41,7 +41,7 @@ class Contacts(NamedTuple):
     time_s: Array
 
 
-def expected_contacts(ego: Ways, others: Ways, lead_s: Array) -> Contacts:
+def expected_contacts(ego: ExpectedPaths, others: ExpectedPaths, lead_s: Array) -> Contacts:
     """Compare C ways of the ego with one of another agent each, at leads (H,).
 
     Notes
@@ -67,7 +67,7 @@ def expected_contacts(ego: Ways, others: Ways, lead_s: Array) -> Contacts:
     return Contacts(probability, time)
 
 
-def _in_reach(ego: Ways, others: Ways) -> NDArray[np.bool_]:
+def _in_reach(ego: ExpectedPaths, others: ExpectedPaths) -> NDArray[np.bool_]:
     """Whether two ways come so near that their boxes may meet with any of the errors."""
     radius = (np.hypot(*ego.size_m.T) + np.hypot(*others.size_m.T)) / 2
     step = np.abs(np.diff(others.position_m - ego.position_m, axis=1)).max(axis=1, initial=0.0)
@@ -76,7 +76,7 @@ def _in_reach(ego: Ways, others: Ways) -> NDArray[np.bool_]:
     return np.asarray(np.abs(others.position_m - ego.position_m).min(axis=1) <= room)
 
 
-def _contact_times(ego: Ways, others: Ways, lead_s: Array) -> Array:
+def _contact_times(ego: ExpectedPaths, others: ExpectedPaths, lead_s: Array) -> Array:
     """Return for pairs (C,) and all errors (K,) the times (C, K) of the first contact, infinite without."""
     along, across = _errors()
     sigma = np.hypot(others.sigma_m, ego.sigma_m)[:, None]

@@ -9,7 +9,7 @@ import numpy as np
 from log2sim.datatypes import Scenario
 from log2sim.prediction.motion_table import TICK_S, table_of
 from log2sim.simulation.policy import Controls, Observation
-from log2sim.simulation.warnings.ego_way import EgoStates
+from log2sim.simulation.warnings.ego_path import EgoStates
 from log2sim.simulation.warnings.late_driver import LateDriver
 from log2sim.simulation.warnings.settings import WarningSettings
 from log2sim.simulation.warnings.watch import MIN_EGO_MPS, Watch

@@ -13,7 +13,7 @@ from log2sim.errors import ConfigError
 from log2sim.geometry import Array, box_corners_bev
 from log2sim.prediction.motion_table import TICK_S, table_of
 from log2sim.simulation.result import Replay, to_scenario
-from log2sim.simulation.warnings.ego_way import EgoStates
+from log2sim.simulation.warnings.ego_path import EgoStates
 from log2sim.simulation.warnings.known import ends_of, known_agents, observed_spans
 from log2sim.simulation.warnings.settings import WarningSettings
 from log2sim.simulation.warnings.warning import CollisionWarning, Moment, Warnings
@@ -88,7 +88,7 @@ def ego_states(ego: Agent, watch: Watch, t_s: Array) -> EgoStates:
     before = np.abs(ego.trajectory.at(np.maximum(t_s - BRAKING_SEEN_S, t_s[:1])).speed_mps)
     past_s = np.minimum(t_s - t_s[0], BRAKING_SEEN_S)
     accel = np.divide(pace - before, past_s, out=np.zeros(len(t_s)), where=past_s > TICK_S / 2)
-    return EgoStates(x, y, yaw, speed, accel, watch.ego_way.progress(x, y))
+    return EgoStates(x, y, yaw, speed, accel, watch.ego_path.progress(x, y))
 
 
 class _Drive(NamedTuple):
@@ -100,7 +100,7 @@ class _Drive(NamedTuple):
 
     def moment(self, agent: int, t_s: float) -> Moment:
         """Compute how far the ego and an agent are from each other at a time."""
-        other, size = self.watch.table.agents[agent], self.watch.ego_way.size_m
+        other, size = self.watch.table.agents[agent], self.watch.ego_path.size_m
         x, y, _, yaw, _ = other.trajectory.at(np.array([t_s]))
         columns = (self.ego.x_m, self.ego.y_m, np.unwrap(self.ego.yaw_rad), self.ego.speed_mps)
         own_x, own_y, own_yaw, own_speed = (float(np.interp(t_s, self.t_s, c)) for c in columns)

@@ -14,10 +14,10 @@ from log2sim.errors import ConfigError
 from log2sim.geometry import Array
 from log2sim.prediction.motion_table import TICK_S, Complex, tabulate
 from log2sim.simulation.warnings.contact import expected_contacts
-from log2sim.simulation.warnings.ego_way import EgoStates, EgoWay
+from log2sim.simulation.warnings.ego_path import EgoPath, EgoStates
+from log2sim.simulation.warnings.expected_paths import ExpectedAgents
 from log2sim.simulation.warnings.known import known_agents, observation_interval_s, observed_spans
 from log2sim.simulation.warnings.settings import WarningSettings
-from log2sim.simulation.warnings.ways import ExpectedAgents
 
 MAX_SLOPE = 0.06
 """Of a road beyond the heights of the ego's path: more is rare outside of mountains."""
@@ -82,7 +82,7 @@ class Watch:
         spans = [observed_spans(source[a.id], settings.used_ends) for a in agents]
         self.table = tabulate(agents, t_s, TICK_S)
         self.known = known_agents(agents, spans, t_s, self.interval_s, self.table.present)
-        self.ego_way = EgoWay(scenario.ego)
+        self.ego_path = EgoPath(scenario.ego)
         self._expected = ExpectedAgents(self.table, self.known, self.interval_s, settings.horizon_s)
         self._height_m = np.array([a.size_m[2] for a in agents])
         self._radius_m = np.array([np.hypot(*a.size_m[:2]) / 2 for a in agents])
@@ -108,7 +108,7 @@ class Watch:
         if seen is not None:
             others = replace(others, position_m=self._moved(others.position_m, agent, tick, seen))
         lead_s = self._expected.lead_s
-        own = self.ego_way.at(ego.take(row), lead_s)
+        own = self.ego_path.at(ego.take(row), lead_s)
         found = expected_contacts(own, others, lead_s)
         gone = np.concatenate(
             [np.zeros((len(row), 1)), np.cumsum(np.abs(np.diff(own.position_m, axis=1)), axis=1)], axis=1
@@ -123,10 +123,10 @@ class Watch:
         place, speed = self.table.position_m[agent, source], np.abs(self.table.velocity_mps[agent, source])
         apart = np.abs(place - (ego.x_m + 1j * ego.y_m))
         ahead_s = self.settings.horizon_s + (tick - source) * TICK_S
-        size = self.ego_way.size_m
+        size = self.ego_path.size_m
         reach = np.abs(ego.speed_mps) * self.settings.horizon_s + (speed + SPARE_MPS) * ahead_s
         near = np.flatnonzero(apart <= reach + np.hypot(*size[:2]) / 2 + self._radius_m[agent])
-        path_z = self.ego_way.heights(ego.progress_m[near], apart[near])
+        path_z = self.ego_path.heights(ego.progress_m[near], apart[near])
         z = np.array(
             [self.table.agents[k].trajectory.heights(self.table.t_s[[n]])[0] for k, n in zip(agent[near], source[near])]
         )

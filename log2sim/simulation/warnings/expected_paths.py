@@ -24,7 +24,7 @@ Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
-class Ways:
+class ExpectedPaths:
     """Expected motion of C boxes at the leads (H,).
 
     Attributes
@@ -46,9 +46,11 @@ class Ways:
     sigma_m: Array
     size_m: Array
 
-    def take(self, index: NDArray[np.generic]) -> Ways:
+    def take(self, index: NDArray[np.generic]) -> ExpectedPaths:
         """Return some of the boxes."""
-        return Ways(*(c[index] for c in (self.position_m, self.yaw_rad, self.course, self.sigma_m, self.size_m)))
+        return ExpectedPaths(
+            *(c[index] for c in (self.position_m, self.yaw_rad, self.course, self.sigma_m, self.size_m))
+        )
 
 
 def lead_times(horizon_s: float) -> Array:
@@ -91,7 +93,7 @@ class ExpectedAgents:
         self._row = np.full(seen.piece.shape, -1, dtype=np.intp)
         self._row[found.row, found.tick] = np.arange(len(found.row))
 
-    def at(self, agent: Index, tick: Index) -> Ways:
+    def at(self, agent: Index, tick: Index) -> ExpectedPaths:
         """Return where agents (C,), known at ticks (C,), are expected at the leads from then on."""
         ways = self._standing(agent, tick)
         moving = np.flatnonzero(~self._static[agent])
@@ -101,12 +103,12 @@ class ExpectedAgents:
             ways.course[moving], ways.sigma_m[moving] = course, sigma
         return ways
 
-    def _standing(self, agent: Index, tick: Index) -> Ways:
+    def _standing(self, agent: Index, tick: Index) -> ExpectedPaths:
         t, source = self.table, self.known.source[agent, tick]
         wide = (len(agent), len(self.lead_s))
         position = np.where(self._static[agent], t.position_m[agent, source], 0.0)
         sigma = np.where(self._static[agent], t.sigma_m[agent, source], 0.0)
-        return Ways(
+        return ExpectedPaths(
             np.repeat(position[:, None], wide[1], axis=1),
             np.repeat(t.yaw_rad[agent, source][:, None], wide[1], axis=1),
             np.ones(wide, dtype=complex),

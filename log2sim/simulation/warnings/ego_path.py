@@ -12,7 +12,7 @@ from log2sim.geometry import Array, wrap_angle
 from log2sim.prediction.motion_table import Complex
 from log2sim.simulation.reactive.path_table import PathTable
 from log2sim.simulation.reactive.prediction import ON_PATH_COS, ON_PATH_M
-from log2sim.simulation.warnings.ways import Ways
+from log2sim.simulation.warnings.expected_paths import ExpectedPaths
 
 KEEPING_SIGMA_M, KEEPING_S = 0.3, 1.0
 """Drivers keep to a lane within some 0.3 m, which they may be off after about a second: what nearly touches may just as well
@@ -46,7 +46,7 @@ class EgoStates(NamedTuple):
         return EgoStates(*(column[index] for column in self))
 
 
-class EgoWay:
+class EgoPath:
     """Expected motion of the ego along the path that it has in the scenario: its route, which it knows."""
 
     def __init__(self, ego: Agent) -> None:
@@ -61,7 +61,7 @@ class EgoWay:
             out[k] = gone = self._paths.progress_near(0, gone, x, y)
         return out
 
-    def at(self, ego: EgoStates, lead_s: Array) -> Ways:
+    def at(self, ego: EgoStates, lead_s: Array) -> ExpectedPaths:
         """Return where the ego is expected at leads (H,): on its path, as far aside as it is; off it, straight on.
 
         It keeps its speed, or goes on braking as it does until it stands.
@@ -83,7 +83,9 @@ class EgoWay:
         yaw = wrap_angle(ego.yaw_rad[:, None] + turned)
         off = KEEPING_SIGMA_M * np.minimum(lead_s / KEEPING_S, 1.0)
         sigma = np.broadcast_to(off[:, None], (*position.shape, 2))
-        return Ways(position, yaw, direction, sigma, np.broadcast_to(np.array(self.size_m[:2]), (len(position), 2)))
+        return ExpectedPaths(
+            position, yaw, direction, sigma, np.broadcast_to(np.array(self.size_m[:2]), (len(position), 2))
+        )
 
     def heights(self, progress_m: Array, reach_m: Array) -> Array:
         """Return the heights (C, 7), m, of the ego's center on the next `reach_m` (C,) of its path."""
