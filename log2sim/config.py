@@ -15,10 +15,12 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, ConfigDict, ValidationError
 
 from log2sim.config_sections import (
+    AppearanceConfig,
     CalibrationConfig,
     CooperationConfig,
     DetectConfig,
     LidarConfig,
+    MapConfig,
     MeasureConfig,
     PosesConfig,
     Section,
@@ -76,6 +78,8 @@ class Config(Section):
     cooperation: CooperationConfig = CooperationConfig()
     track: TrackConfig = TrackConfig()
     smooth: SmoothConfig = SmoothConfig()
+    map: MapConfig = MapConfig()
+    appearance: AppearanceConfig = AppearanceConfig()
 
     @classmethod
     def load(cls, path: Path | str | None = None, settings: Iterable[str] = (), **overrides: Any) -> Config:

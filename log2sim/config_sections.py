@@ -146,6 +146,11 @@ class TopdownConfig(Section):
     hypotheses: int = setting(
         0, "Samples that RANSAC draws, per camera or per frame; 0: as many as the data need.", ge=0, le=100_000
     )
+    rig: Literal["apart", "together"] = setting(
+        "apart",
+        "apart: the homography of each camera alone; together: those of all cameras at once, by time-aware RANSAC over the "
+        "whole rig.",
+    )
 
 
 class CooperationConfig(Section):
@@ -184,3 +189,18 @@ class SmoothConfig(Section):
     """Smoothing of trajectories."""
 
     enabled: bool = setting(True, "Whether trajectories are smoothed; false keeps measured positions, for comparison.")
+
+
+class MapConfig(Section):
+    """Map of the ground, and what is read from it."""
+
+    lanes: bool = setting(True, "Whether markings, borders of roads and lanes are looked for.")
+    cell_m: float = setting(0.05, "Edge of a cell of the map.", unit="m", ge=0.02, le=1.0)
+
+
+class AppearanceConfig(Section):
+    """What pictures show of agents and traffic lights."""
+
+    colors: bool = setting(True, "Whether colors of vehicles are estimated.")
+    clothing: bool = setting(False, "Whether pedestrians and riders get the color of their clothing.")
+    signals: bool = setting(True, "Whether traffic lights and their states are looked for.")

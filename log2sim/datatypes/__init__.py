@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from log2sim.datatypes.agent import Agent
+from log2sim.datatypes.agent import COLOR_NAMES, Agent
 from log2sim.datatypes.boxes3d import Boxes3D
 from log2sim.datatypes.categories import (
     CATEGORIES,
@@ -30,28 +30,45 @@ from log2sim.datatypes.log import (
     Stream,
     Sweep,
 )
+from log2sim.datatypes.map_features import (
+    BORDER_KINDS,
+    LANE_LINE_KINDS,
+    LANE_ORIGINS,
+    MARKING_KINDS,
+    MapFeatures,
+    MapLane,
+    Marking,
+    RoadBorder,
+)
 from log2sim.datatypes.measurements import TUPLES, BoxEvidence, Detections, Measurements, OtherView
 from log2sim.datatypes.obstacles import Obstacles
 from log2sim.datatypes.rays import Rays
 from log2sim.datatypes.scenario import EGO, VERSION, Scenario
+from log2sim.datatypes.signals import SIGNAL_STATES, Signal
 from log2sim.datatypes.tracks import Track
 from log2sim.datatypes.trajectory import STANDSTILL_DRIFT_M, STANDSTILL_MPS, Trajectory
 from log2sim.datatypes.waypoints import Waypoints
 
 __all__ = [
+    "BORDER_KINDS",
     "CATEGORIES",
     "CATEGORY",
+    "COLOR_NAMES",
     "EGO",
     "ENDS",
     "FAULT_KINDS",
     "FLAGS",
     "GROUPS",
     "GROUP_OF",
+    "LANE_LINE_KINDS",
+    "LANE_ORIGINS",
+    "MARKING_KINDS",
     "MAX_SIZE_M",
     "MAX_SPEED_MPS",
     "MIN_SIZE_M",
     "MIN_TRUSTED_CONFIDENCE",
     "ROAD",
+    "SIGNAL_STATES",
     "STANDSTILL_DRIFT_M",
     "STANDSTILL_MPS",
     "TUPLES",
@@ -74,12 +91,17 @@ __all__ = [
     "Labels",
     "Lidar",
     "Log",
+    "MapFeatures",
     "MapFrame",
+    "MapLane",
+    "Marking",
     "Measurements",
     "Obstacles",
     "OtherView",
     "Rays",
+    "RoadBorder",
     "Scenario",
+    "Signal",
     "Span",
     "Stream",
     "Sweep",

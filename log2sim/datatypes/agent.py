@@ -19,6 +19,9 @@ from log2sim.datatypes.waypoints import Waypoints
 from log2sim.errors import ScenarioError
 from log2sim.geometry import Array
 
+COLOR_NAMES = ("black", "white", "gray", "silver", "red", "blue", "green", "yellow", "brown", "orange")
+"""Names that reconstructed colors of vehicles have."""
+
 
 @dataclass(frozen=True, eq=False)
 class AgentStates:
@@ -60,7 +63,8 @@ class Agent:
     rear_axle_offset_m : float, m
         From the rear axle forward to the center of the box.
     color : mapping or None
-        {"rgb": [r, g, b], "name": ...}.
+        {"rgb": [r, g, b], "name": ...}; of a reconstruction the name is one of `COLOR_NAMES`, and "confidence" the probability
+        that it is right.
     confidence : float
         In [0, 1].
     quality : mapping

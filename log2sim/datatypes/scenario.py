@@ -14,6 +14,8 @@ import numpy as np
 from log2sim.datatypes.agent import Agent, agent_from_dict, agent_to_dict
 from log2sim.datatypes.ignore_regions import IgnoreRegions
 from log2sim.datatypes.log import MapFrame
+from log2sim.datatypes.map_features import MapFeatures
+from log2sim.datatypes.signals import Signal
 from log2sim.documents import check, read_json, write_json
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.geometry import NS_PER_S, Array
@@ -44,6 +46,9 @@ class Scenario:
         Log, settings and versions that the scenario came from.
     ignore_regions : IgnoreRegions or None
         Only in truth: where objects were left without labels; None when the labels are complete.
+    map_features : MapFeatures or None
+        Markings, borders and lanes; None where they were not looked for.
+    signals : tuple of Signal
     """
 
     name: str
@@ -55,6 +60,8 @@ class Scenario:
     plan: tuple[Mapping[str, Any], ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
     ignore_regions: IgnoreRegions | None = None
+    map_features: MapFeatures | None = None
+    signals: tuple[Signal, ...] = ()
 
     @property
     def ego(self) -> Agent | None:
@@ -148,7 +155,11 @@ class Scenario:
             w = replace(w, t_s=w.t_s + later_s, x_m=w.x_m + dx, y_m=w.y_m + dy, z_m=w.z_m + dz)
             doubts = tuple(doubt.retimed(lambda t_s: t_s + later_s) for doubt in agent.doubts)
             moved.append(replace(agent, waypoints=w, doubts=doubts))
-        return replace(self, t0_ns=other.t0_ns, map=other.map, agents=tuple(moved))
+        shift = np.array([dx, dy, dz])
+        features = None if self.map_features is None else self.map_features.moved(lambda points_m: points_m + shift)
+        signals = tuple(replace(s, position_m=s.position_m + shift, t_s=s.t_s + later_s) for s in self.signals)
+        placed = replace(self, map_features=features, signals=signals)
+        return replace(placed, t0_ns=other.t0_ns, map=other.map, agents=tuple(moved))
 
     def save(self, path: Path | str) -> None:
         """Write the scenario atomically; `load` returns exactly the same numbers.
@@ -165,7 +176,7 @@ class Scenario:
     def to_dict(self) -> dict[str, Any]:
         """Return the document of `schemas/scenario-1.json`."""
         m = self.map
-        document = {
+        document: dict[str, Any] = {
             "scenario_version": VERSION,
             "name": self.name,
             "t0_ns": int(self.t0_ns),
@@ -182,7 +193,13 @@ class Scenario:
             "plan": [dict(p) for p in self.plan],
             "provenance": dict(self.provenance),
         }
-        return document if self.ignore_regions is None else {**document, "unlabeled": self.ignore_regions.to_dict()}
+        if self.ignore_regions is not None:
+            document["unlabeled"] = self.ignore_regions.to_dict()
+        if self.map_features is not None:
+            document["map_features"] = self.map_features.to_dict()
+        if self.signals:
+            document["signals"] = [signal.to_dict() for signal in self.signals]
+        return document
 
     @classmethod
     def from_dict(cls, document: Any) -> Scenario:
@@ -210,10 +227,13 @@ class Scenario:
             plan=tuple(document["plan"]),
             provenance=document["provenance"],
             ignore_regions=IgnoreRegions.from_dict(document["unlabeled"]) if "unlabeled" in document else None,
+            map_features=MapFeatures.from_dict(document["map_features"]) if "map_features" in document else None,
+            signals=tuple(Signal.from_dict(entry) for entry in document.get("signals", ())),
         )
-        seen: set[str] = set()
-        for agent in scenario.agents:
-            if agent.id in seen:
-                raise ScenarioError(f"agent '{agent.id}': the id occurs twice; ids must be unique")
-            seen.add(agent.id)
+        for what, items in (("agent", scenario.agents), ("signal", scenario.signals)):
+            seen: set[str] = set()
+            for item in items:
+                if item.id in seen:
+                    raise ScenarioError(f"{what} '{item.id}': the id occurs twice; ids must be unique")
+                seen.add(item.id)
         return scenario

@@ -1,0 +1,1 @@
+"""Markings, borders of roads, and lanes."""

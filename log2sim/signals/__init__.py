@@ -1,0 +1,1 @@
+"""Traffic lights and their states."""
