@@ -36,7 +36,8 @@ def log_of(reads: list[tuple[str, int]], *, black: int = -1, broken: int = -1) -
         reads.append((name, i))
         if i == broken:
             raise RecordError("broken")
-        image = np.random.default_rng([i, len(name)]).integers(0, 255, (SIZE[1], SIZE[0], 3)).astype(np.uint8)
+        blocks = np.random.default_rng([i, len(name)]).integers(0, 255, (6, 8, 3)).astype(np.uint8)
+        image = blocks.repeat(8, axis=0).repeat(8, axis=1)
         image[0, 0] = i
         return np.zeros_like(image) if i == black else image
 
