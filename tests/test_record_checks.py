@@ -13,6 +13,7 @@ from worlds import camera_ahead, scan, standing, tiny_log
 from log2sim.config import Config
 from log2sim.datatypes import Lidar, Log, Stream, Sweep
 from log2sim.geometry import PoseTrack, transform
+from log2sim.mapping.topdown import birdseye_of_log
 from log2sim.perception.record_checks.camera_watch import CameraWatch
 from log2sim.perception.record_checks.lidar_watch import LidarWatch
 from log2sim.perception.record_checks.records import RecordWatch
@@ -21,7 +22,6 @@ from log2sim.perception.record_checks.sweep_sketches import common_share, sketch
 from log2sim.perception.record_checks.thumbnails import measure_change, shows_nothing, shrink
 from log2sim.perception.sync import synchronize
 from log2sim.pipeline import reconstruct
-from log2sim.visualization.birdseye.of_log import birdseye_of_log
 
 STEP_NS = 100_000_000
 COUNT = 10

@@ -41,7 +41,7 @@ def plot(
     picture = None
     if background is not None:
         from log2sim.logs.opening import open_log
-        from log2sim.visualization.birdseye.of_log import birdseye_of_log
+        from log2sim.mapping.topdown import birdseye_of_log
 
         picture = birdseye_of_log(open_log(background, sequence=sequence), loaded)
     known = load_truth(truth, loaded, sequence) if truth is not None else None

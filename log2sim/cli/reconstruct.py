@@ -118,9 +118,9 @@ def reconstruct(
 
 def _write_topdown(result: Result, path: Path, *, overwrite: bool) -> None:
     """Write the bird's-eye image of a run, and note in its report which records could not be read for it."""
+    from log2sim.mapping.mosaic import write_image
+    from log2sim.mapping.topdown import birdseye_of_log
     from log2sim.perception.frames import RecordReader
-    from log2sim.visualization.birdseye.mosaic import write_image
-    from log2sim.visualization.birdseye.of_log import birdseye_of_log
 
     reader = RecordReader(result.log)
     write_image(birdseye_of_log(result.log, result.scenario, reader), path, overwrite=overwrite)

@@ -90,6 +90,8 @@ class Sweep:
     compensated_ns : int or None
         For the frame "lidar": the stamp of the sensor's pose to which all points are compensated already; None where each
         point is in the sensor's frame at its own time.
+    intensity : (N,) float32 or None
+        How strong each return is, on the scale of its LiDAR; NaN where the log does not tell. None where the log has none.
     """
 
     stamp_ns: int
@@ -97,6 +99,7 @@ class Sweep:
     frame: Literal["lidar", "map"] = "lidar"
     t_ns: NDArray[np.int64] | None = None
     compensated_ns: int | None = None
+    intensity: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,10 +14,13 @@ MAX_HEADER_BYTES = 16 * 1024
 # Each takes some 80 bytes while it is parsed.
 MAX_ASCII_VALUES = 20_000_000
 TIME_FIELDS = ("t_offset_ns", "offset", "t", "timestamp")
+INTENSITY_FIELDS = ("intensity", "reflectivity", "reflectance")
 
 
-def parse_pcd(data: bytes, t_ns: int, limit_points: int) -> tuple[NDArray[Any], NDArray[np.int64] | None]:
-    """Parse points (N, 3) and their times (N,) int64 ns relative to the stamp, None without a time field.
+def parse_pcd(
+    data: bytes, t_ns: int, limit_points: int
+) -> tuple[NDArray[Any], NDArray[np.int64] | None, NDArray[Any] | None]:
+    """Parse points (N, 3), their times (N,) int64 ns relative to the stamp and their intensities (N,); None without such a field.
 
     A time field is `t_offset_ns`, `offset` or `t` (relative to the stamp) or `timestamp` (absolute); whole numbers are
     nanoseconds, floating-point numbers seconds.
@@ -43,7 +46,15 @@ def parse_pcd(data: bytes, t_ns: int, limit_points: int) -> tuple[NDArray[Any], 
         )
     xyz = np.stack([rows[k] for k in ("x", "y", "z")], axis=1)
     field = next((f for f in TIME_FIELDS if f in (layout.names or ())), None)
-    return xyz, None if field is None else _offset_ns(rows[field], t_ns, absolute=field == "timestamp")
+    offset_ns = None if field is None else _offset_ns(rows[field], t_ns, absolute=field == "timestamp")
+    strength = find_intensity_field(layout)
+    return xyz, offset_ns, None if strength is None else rows[strength]
+
+
+def find_intensity_field(layout: np.dtype[Any]) -> str | None:
+    """Find the field of the points' intensities, one number each; None where there is none."""
+    named = {name.lower(): name for name in layout.names or () if layout[name].shape == ()}
+    return next((named[name] for name in INTENSITY_FIELDS if name in named), None)
 
 
 def _read_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:

@@ -36,6 +36,8 @@ PARSER_ERRORS = (
 
 # Times of points relative to the stamp of their sweep, ns; None when the file has none.
 Offset = NDArray[np.int64] | None
+# How strong returns are; None when the file does not tell.
+Intensity = NDArray[Any] | None
 
 
 def read_sweep(path: Path, t_ns: int, frame: Literal["lidar", "map"] = "lidar") -> Sweep:
@@ -48,8 +50,8 @@ def read_sweep(path: Path, t_ns: int, frame: Literal["lidar", "map"] = "lidar") 
     """
     data = read_bytes(path, t_ns, MAX_SWEEP_BYTES)
     try:
-        xyz, offset_ns = _parse(path.suffix.lower(), data, t_ns)
-        return sweep_of(xyz, t_ns, offset_ns, frame)
+        xyz, offset_ns, intensity = _parse(path.suffix.lower(), data, t_ns)
+        return sweep_of(xyz, t_ns, offset_ns, frame, intensity=intensity)
     except PARSER_ERRORS as error:
         raise RecordError(f"{path} (stamp {t_ns}): not a readable sweep: {error}") from None
 
@@ -60,8 +62,11 @@ def sweep_of(
     offset_ns: Offset,
     frame: Literal["lidar", "map"],
     compensated_ns: int | None = None,
+    intensity: Intensity = None,
 ) -> Sweep:
     """Build a `Sweep` of the rows of points (N, 3) that are finite and can be on Earth, with stamps `t_ns` + `offset_ns` (N,).
+
+    Intensities (N,) of any type of numbers become float32; those that cannot be, NaN.
 
     Raises
     ------
@@ -72,18 +77,27 @@ def sweep_of(
     if not possible.all():
         xyz_m = xyz_m[possible]
         offset_ns = None if offset_ns is None else offset_ns[possible]
+        intensity = None if intensity is None else intensity[possible]
     point_ns = None if offset_ns is None else t_ns + checked_offset_ns(offset_ns)
-    return Sweep(t_ns, xyz_m, frame, point_ns, compensated_ns)
+    return Sweep(t_ns, xyz_m, frame, point_ns, compensated_ns, None if intensity is None else _strengths(intensity))
 
 
-def _parse(suffix: str, data: bytes, t_ns: int) -> tuple[NDArray[Any], Offset]:
+def _strengths(values: NDArray[Any]) -> NDArray[np.float32]:
+    """Return intensities (N,) as float32, NaN where they are negative or not finite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        strengths = values.astype(np.float32)
+        return np.where(np.isfinite(strengths) & (strengths >= 0), strengths, np.float32(np.nan))
+
+
+def _parse(suffix: str, data: bytes, t_ns: int) -> tuple[NDArray[Any], Offset, Intensity]:
     if suffix == ".bin":
         if len(data) % 16:
             raise ValueError(f"{len(data)} bytes, expected four float32 (x, y, z, intensity) a point")
         _check_count(len(data) // 16)
-        return np.frombuffer(data, "<f4").reshape(-1, 4)[:, :3], None
+        rows = np.frombuffer(data, "<f4").reshape(-1, 4)
+        return rows[:, :3], None, rows[:, 3] if rows[:, 3].any() else None
     if suffix == ".npy":
-        return _points(_read_npy(io.BytesIO(data), "the array")), None
+        return _points(_read_npy(io.BytesIO(data), "the array")), None, None
     if suffix == ".npz":
         return _parse_npz(data)
     if suffix == ".pcd":
@@ -91,7 +105,7 @@ def _parse(suffix: str, data: bytes, t_ns: int) -> tuple[NDArray[Any], Offset]:
     raise ValueError(f"unknown suffix '{suffix}', expected .npz, .npy, .bin or .pcd")
 
 
-def _parse_npz(data: bytes) -> tuple[NDArray[Any], Offset]:
+def _parse_npz(data: bytes) -> tuple[NDArray[Any], Offset, Intensity]:
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         names = archive.namelist()
         if "xyz_m.npy" not in names:
@@ -100,13 +114,17 @@ def _parse_npz(data: bytes) -> tuple[NDArray[Any], Offset]:
             )
         with archive.open("xyz_m.npy") as member:
             xyz = _points(_read_npy(member, "xyz_m"))
-        if "t_offset_ns.npy" not in names:
-            return xyz, None
-        with archive.open("t_offset_ns.npy") as member:
-            offset = _read_npy(member, "t_offset_ns")
-    if offset.dtype.kind not in "iu" or offset.shape != (len(xyz),):
+        columns = {}
+        for name in ("t_offset_ns", "intensity"):
+            if f"{name}.npy" in names:
+                with archive.open(f"{name}.npy") as member:
+                    columns[name] = _read_npy(member, name)
+    offset, intensity = columns.get("t_offset_ns"), columns.get("intensity")
+    if offset is not None and (offset.dtype.kind not in "iu" or offset.shape != (len(xyz),)):
         raise ValueError(f"t_offset_ns is {offset.dtype} {offset.shape}, expected whole numbers ({len(xyz)},)")
-    return xyz, checked_offset_ns(offset)
+    if intensity is not None and intensity.shape != (len(xyz),):
+        raise ValueError(f"intensity has the shape {intensity.shape}, expected ({len(xyz)},)")
+    return xyz, None if offset is None else checked_offset_ns(offset), intensity
 
 
 def _points(array: NDArray[Any]) -> NDArray[Any]:

@@ -20,7 +20,15 @@ from log2sim.logs.sweeps import MAX_SWEEP_BYTES, MAX_SWEEP_POINTS, sweep_of
 # of this LiDAR, scatter by 0.003 to 0.005 degrees; from that of the other one by 0.1.
 LIDARS = {"up_lidar": 0, "down_lidar": 32}
 LASERS = 32
-COLUMNS: dict[str, Kind] = {"x": "float", "y": "float", "z": "float", "laser_number": "int", "offset_ns": "int"}
+COLUMNS: dict[str, Kind] = {
+    "x": "float",
+    "y": "float",
+    "z": "float",
+    "laser_number": "int",
+    "offset_ns": "int",
+    "intensity": "float",
+}
+OPTIONAL = ("intensity",)
 LIMITS = TableLimits(rows=MAX_SWEEP_POINTS, file_bytes=MAX_SWEEP_BYTES, unpacked_bytes=MAX_SWEEP_BYTES)
 # A sweep lasts 0.1 s, those of both LiDARs together 0.106 s in the sample log.
 MAX_OFFSET_NS = 1_000_000_000
@@ -43,11 +51,14 @@ def sweep_stream(lidar: str, t_ns: NDArray[np.int64], files: list[Path], ego_T_l
     def read(i: int) -> Sweep:
         stamp = int(t_ns[i])
         columns = _read_points(files[i])
+        strength = columns.get("intensity")
         rows = columns["laser_number"] // LASERS == LIDARS[lidar] // LASERS
         # Points are moved in double precision: they were stored in half precision, to which nothing should be added.
         xyz_ego = np.stack([columns[k][rows] for k in "xyz"], axis=1).astype(np.float64)
         xyz = apply(lidar_T_ego, xyz_ego).astype(np.float32)
-        return sweep_of(xyz, stamp, columns["offset_ns"][rows], "lidar", compensated_ns=stamp)
+        return sweep_of(
+            xyz, stamp, columns["offset_ns"][rows], "lidar", stamp, None if strength is None else strength[rows]
+        )
 
     return Stream(lidar, t_ns, read)
 
@@ -55,7 +66,7 @@ def sweep_stream(lidar: str, t_ns: NDArray[np.int64], files: list[Path], ego_T_l
 # The streams of both LiDARs read each file, one after the other.
 @lru_cache(maxsize=4)
 def _read_points(path: Path) -> dict[str, NDArray[Any]]:
-    columns = read_columns(path, COLUMNS, error=RecordError, limits=LIMITS)
+    columns = read_columns(path, COLUMNS, optional=OPTIONAL, error=RecordError, limits=LIMITS)
     laser, offset_ns = columns["laser_number"], columns["offset_ns"]
     if len(laser) and not (laser.min() >= 0 and laser.max() < LASERS * len(LIDARS)):
         raise RecordError(f"{path}, column 'laser_number': {laser.min()} to {laser.max()}, expected 0 to 63")

@@ -181,7 +181,7 @@ def sweep_stream(
     def read(i: int) -> Sweep:
         sweep = read_sweep(files[i], int(t_ns[i]))
         offset = spin_offset_ns(sweep.xyz_m, int(begin_ns[i] - t_ns[i]), int(end_ns[i] - t_ns[i]))
-        return sweep_of(sweep.xyz_m, sweep.stamp_ns, offset, "lidar")
+        return sweep_of(sweep.xyz_m, sweep.stamp_ns, offset, "lidar", intensity=sweep.intensity)
 
     return Stream("velodyne", t_ns, read)
 

@@ -213,7 +213,7 @@ class _Split:
         def read(i: int) -> Sweep:
             sweep = read_sweep(files[i], int(t_ns[i]))
             points = apply(first.ego_T_rect @ calibrations[i].rect_T_velo, sweep.xyz_m.astype(np.float64))
-            return sweep_of(points, sweep.stamp_ns, None, "map")
+            return sweep_of(points, sweep.stamp_ns, None, "map", intensity=sweep.intensity)
 
         return Stream("velodyne", t_ns, read)
 

@@ -250,9 +250,21 @@ def _write_sweep(sweep: Sweep, folder: Path, i: int, kind: str, offset: Array) -
             offset_ns = sweep.t_ns - sweep.stamp_ns
             small = len(offset_ns) == 0 or np.abs(offset_ns).max() < 2**31
             columns["t_offset_ns"] = offset_ns.astype(np.int32 if small else np.int64)
+        if sweep.intensity is not None:
+            columns["intensity"] = _packed(sweep.intensity)
         np.savez_compressed(folder / name, **columns)  # type: ignore[arg-type]
     elif kind == "npy":
         np.save(folder / name, xyz)
     else:
-        (folder / name).write_bytes(np.pad(xyz.astype("<f4"), ((0, 0), (0, 1))).tobytes())
+        strength = np.zeros(len(xyz), np.float32) if sweep.intensity is None else np.nan_to_num(sweep.intensity)
+        (folder / name).write_bytes(np.column_stack([xyz, strength]).astype("<f4").tobytes())
     return f"{folder.name}/{name}"
+
+
+def _packed(intensity: NDArray[np.float32]) -> NDArray[Any]:
+    """Return intensities as bytes where they are whole numbers up to 255, as most LiDARs have them."""
+    if len(intensity) and np.isfinite(intensity).all():
+        whole = intensity.round()
+        if np.array_equal(whole, intensity) and whole.max() <= 255:
+            return whole.astype(np.uint8)
+    return intensity

@@ -76,7 +76,8 @@ def read_sweep(path: Path, t_ns: int, poses: Poses) -> Sweep:
     away = xyz - sensor_path(offset_ns, t_ns, poses)
     with np.errstate(over="ignore", invalid="ignore"):
         returned = np.linalg.norm(away, axis=1) >= MIN_RANGE_M
-    return sweep_of(xyz[returned], t_ns, None if offset_ns is None else offset_ns[returned], "lidar", t_ns)
+    offset_ns = None if offset_ns is None else offset_ns[returned]
+    return sweep_of(xyz[returned], t_ns, offset_ns, "lidar", t_ns, rows[returned, 3])
 
 
 def firing_offset_ns(ring: NDArray[np.float32]) -> NDArray[np.int64] | None:

@@ -21,7 +21,7 @@ from log2sim.logs.sweeps import sweep_of
 
 # Value of the column "d" by LiDAR.
 LIDARS: Mapping[str, int] = {"pandar64": 0, "pandargt": 1}
-COLUMNS = ("x", "y", "z", "t", "d")
+COLUMNS = ("x", "y", "z", "t", "d", "i")
 # Tables that are kept from the reading of the stamps until their sweeps are read, so that they are decompressed once.
 MAX_KEPT_BYTES = 256 * 1024**2
 READING_THREADS = 4
@@ -128,6 +128,7 @@ def _read_sweep(kept: Columns | None, path: Path, t_ns: int, number: int) -> Swe
         rows = columns["d"] == number
         xyz = np.stack([columns[k][rows] for k in ("x", "y", "z")], axis=1)
         t_s = columns["t"][rows]
+        strength = columns["i"][rows] if "i" in columns and columns["i"].dtype.kind in "iuf" else None
         if xyz.dtype.kind != "f" or t_s.dtype.kind != "f" or columns["d"].dtype.kind not in "iuf":
             kinds = f"{xyz.dtype}, {t_s.dtype} and {columns['d'].dtype}"
             raise RecordError(f"{where}: columns x, y, z, then t and d are {kinds}, expected numbers")
@@ -135,4 +136,4 @@ def _read_sweep(kept: Columns | None, path: Path, t_ns: int, number: int) -> Swe
         raise RecordError(f"{where}: no column {missing}; expected x, y, z, i, t, d") from None
     timed = np.isfinite(t_s) & (np.abs(t_s) < MAX_TIME_S)
     xyz, offset_ns = xyz[timed], np.round(t_s[timed] * NS_PER_S).astype(np.int64) - t_ns
-    return sweep_of(xyz, t_ns, offset_ns, "map")
+    return sweep_of(xyz, t_ns, offset_ns, "map", intensity=None if strength is None else strength[timed])

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Sweep
 from log2sim.errors import RecordError
+from log2sim.logs.pcd import find_intensity_field
 from log2sim.logs.ros.containers import printable
 from log2sim.logs.ros.settings import LidarTopic
 from log2sim.logs.sweeps import MAX_SWEEP_POINTS, sweep_of
@@ -69,7 +70,15 @@ def sweep_from(message: Any, t_ns: int, period_ns: float, settings: LidarTopic, 
     xyz = xyz[kept]
     name = find_time_field(list(points.dtype.names or ()), settings.time_field)
     offset = None if name is None else offsets_ns(points[name][kept], t_ns, period_ns, settings)
-    return sweep_of(xyz, t_ns, offset, "lidar", t_ns if settings.compensated else None)
+    strength = find_intensity_field(points.dtype)
+    return sweep_of(
+        xyz,
+        t_ns,
+        offset,
+        "lidar",
+        t_ns if settings.compensated else None,
+        None if strength is None else points[strength][kept],
+    )
 
 
 def point_table(message: Any, where: str) -> NDArray[Any]:

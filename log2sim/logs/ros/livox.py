@@ -17,7 +17,7 @@ from log2sim.logs.sweeps import MAX_SWEEP_POINTS, sweep_of
 TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
 FIELDS = ["header", "timebase", "point_num", "lidar_id", "rsvd", "points"]
 # CustomPoint: time in ns after the stamp, position in m; then reflectivity, tag and line.
-POINT_FORMATS = ("u4", "f4", "f4", "f4")
+POINT_FORMATS = ("u4", "f4", "f4", "f4", "u1")
 POINT_BYTES = 19
 ENCAPSULATION_BYTES = 4
 
@@ -46,7 +46,7 @@ def sweep_from_livox(raw: bytes, encoding: str, t_ns: int, settings: LidarTopic,
     # CDR does not pad the last point.
     data = raw[begin : begin + count * step].ljust(count * step, b"\0")
     formats = [order + kind for kind in POINT_FORMATS]
-    dtype = np.dtype({"names": list("txyz"), "formats": formats, "offsets": [0, 4, 8, 12], "itemsize": step})
+    dtype = np.dtype({"names": list("txyzr"), "formats": formats, "offsets": [0, 4, 8, 12, 16], "itemsize": step})
     points: NDArray[Any] = np.frombuffer(data, dtype)
     xyz = np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float32)
     kept = xyz.any(axis=1)
@@ -59,4 +59,5 @@ def sweep_from_livox(raw: bytes, encoding: str, t_ns: int, settings: LidarTopic,
         None if settings.time_field == "none" else offset,
         "lidar",
         t_ns if settings.compensated else None,
+        points["r"][kept],
     )

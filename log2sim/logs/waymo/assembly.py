@@ -22,7 +22,7 @@ from log2sim.logs.notes import defer_notes
 from log2sim.logs.stamps import strictly_increasing
 from log2sim.logs.sweeps import sweep_of
 from log2sim.logs.waymo.labels import LabelsOnRequest, image_labels_of, labels_of
-from log2sim.logs.waymo.range_images import points_of
+from log2sim.logs.waymo.range_images import intensities_of, points_of
 from log2sim.logs.waymo.segment import (
     CAMERAS,
     LASERS,
@@ -171,7 +171,7 @@ class _Assembly:
             # How the short-range LiDARs scan is not documented.
             timed = self.times.at_turn(np.broadcast_to(row, len(turn)), turn) - stamp_ns if number == TOP else None
             raw = number == TOP and self.segment.pixel_poses_are_missing
-            return sweep_of(xyz_m, stamp_ns, timed, "lidar", None if raw else stamp_ns)
+            return sweep_of(xyz_m, stamp_ns, timed, "lidar", None if raw else stamp_ns, intensities_of(images))
 
         return Stream(name, stamps, read)
 

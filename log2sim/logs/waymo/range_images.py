@@ -110,7 +110,7 @@ def points_of(
     inclination, azimuth = row_inclinations(laser, height), column_azimuths(laser, width)
     parts, turns = [], []
     for image in images.returns:
-        row, column = np.nonzero((image[..., 0] > 0) & np.isfinite(image[..., 0]))
+        row, column = _pixels_with_return(image)
         reach = image[row, column, 0].astype(np.float64)
         level = np.cos(inclination[row]) * reach
         xyz = np.stack(
@@ -121,6 +121,18 @@ def points_of(
         parts.append(xyz.astype(np.float32))
         turns.append((column + 0.5) / width)
     return np.concatenate(parts), np.concatenate(turns)
+
+
+def intensities_of(images: RangeImages) -> NDArray[np.float32] | None:
+    """Return the intensities (N,) of the points of `points_of`, in their order; None where the images hold ranges only."""
+    if min(image.shape[2] for image in images.returns) < 2:
+        return None
+    return np.concatenate([image[(*_pixels_with_return(image), 1)] for image in images.returns])
+
+
+def _pixels_with_return(image: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    row, column = np.nonzero((image[..., 0] > 0) & np.isfinite(image[..., 0]))
+    return row, column
 
 
 def row_inclinations(laser: LaserCalibration, height: int) -> Array:

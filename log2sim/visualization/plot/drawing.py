@@ -34,7 +34,7 @@ BACKGROUND, STATIONARY, TRUTH, TRACK, MARK, REPLAY, BOX, LABEL = range(1, 9)
 
 
 class Background(Protocol):
-    """Bird's-eye view of the ground, such as `visualization.birdseye.mosaic.BirdsEyeView`."""
+    """Bird's-eye view of the ground, such as `mapping.ground_map.GroundMap`."""
 
     @property
     def image_bgr(self) -> NDArray[np.uint8]:

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from log2sim.documents import refuse_existing, replaced
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
-from log2sim.visualization.birdseye.ground_view import (
+from log2sim.mapping.ground_map import raster_of
+from log2sim.mapping.ground_view import (
     GroundView,
     Image,
     project_cells,
@@ -28,9 +29,6 @@ from log2sim.visualization.birdseye.ground_view import (
 )
 
 __all__ = ["BirdsEyeView", "GroundView", "Mosaic", "render_birdseye", "write_image"]
-
-# At 28 bytes a cell while it is accumulated this is 1 GB.
-MAX_CELLS = 36_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,9 +100,7 @@ class Mosaic:
         coarsest_m: float = 0.6,
         frame: str = "map",
     ) -> None:
-        rows, columns = _raster_shape(extent_m, resolution_m)
-        x0, y1 = extent_m[0], extent_m[3]
-        self.extent_m = (x0, x0 + columns * resolution_m, y1 - rows * resolution_m, y1)
+        (rows, columns), self.extent_m = raster_of(extent_m, resolution_m)
         self.resolution_m = resolution_m
         self.coarsest_m = coarsest_m
         self.frame = frame
@@ -208,19 +204,6 @@ class _Layer:
     weight: NDArray[np.float32]
     opacity: NDArray[np.float32]
     weighted: bool = False
-
-
-def _raster_shape(extent_m: tuple[float, float, float, float], resolution_m: float) -> tuple[int, int]:
-    x0, x1, y0, y1 = extent_m
-    if not (np.all(np.isfinite(extent_m)) and x1 > x0 and y1 > y0 and resolution_m > 0):
-        raise ConfigError(f"bird's-eye view: extent {extent_m} at {resolution_m} m a cell has no area")
-    rows, columns = round(np.ceil((y1 - y0) / resolution_m - 1e-6)), round(np.ceil((x1 - x0) / resolution_m - 1e-6))
-    if rows * columns > MAX_CELLS or max(rows, columns) >= 32767:
-        raise ConfigError(
-            f"bird's-eye view: {columns} x {rows} cells, more than the {MAX_CELLS} allowed (32766 an edge); "
-            f"choose a resolution coarser than {resolution_m:g} m or a smaller extent"
-        )
-    return rows, columns
 
 
 def _log_ratio(a: _Layer, b: _Layer, step: int = 4, fewest: int = 100) -> Array | None:

@@ -11,11 +11,11 @@ import numpy as np
 from log2sim.datatypes import Log, Scenario
 from log2sim.errors import LogError
 from log2sim.geometry import NS_PER_S, nearest_index
+from log2sim.mapping.ground_view import GroundView
+from log2sim.mapping.mosaic import BirdsEyeView, Mosaic
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.lidar.cloud import cloud_origin
 from log2sim.perception.record_checks.thumbnails import shrink
-from log2sim.visualization.birdseye.ground_view import GroundView
-from log2sim.visualization.birdseye.mosaic import BirdsEyeView, Mosaic
 
 # Ticks that are mapped, evenly over the scenario.
 TICKS = 15

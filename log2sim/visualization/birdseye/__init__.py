@@ -1,1 +1,0 @@
-"""Bird's-eye view: cameras mapped onto one raster of the ground by inverse perspective mapping."""
