@@ -22,7 +22,8 @@ from log2sim.synth.lamps import (
 from log2sim.synth.light import NIGHT, NOON, light_of
 from log2sim.synth.raycast import AIR, BUILDING, GROUND, USUAL_REFLECTANCE, cast_sweep
 from log2sim.synth.returns import BACKSCATTER_SHARE, MIN_SIGNAL, REFERENCE_RANGE_M
-from log2sim.synth.scene import Environment, Road
+from log2sim.synth.scene import Environment
+from log2sim.synth.scene_places import Road
 
 
 def image(seed: int = 0, index: int = 4, **environment: Any) -> np.ndarray:

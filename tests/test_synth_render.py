@@ -11,10 +11,11 @@ from log2sim.geometry import Camera, apply, inverse, rotation_from_rpy, transfor
 from log2sim.synth.backdrop import Backdrop
 from log2sim.synth.bodies import Body
 from log2sim.synth.ground import ASPHALT, GROUND_M_PER_PX, MARKING, MAX_TILES, MEADOW, TILE_PX, Ground
+from log2sim.synth.markings import GroundPlan
 from log2sim.synth.raster import NEAR_M, rasterize
 from log2sim.synth.raycast import first_hit
 from log2sim.synth.render import SceneInstant, render
-from log2sim.synth.scene import Road
+from log2sim.synth.scene_places import Road
 from log2sim.synth.shapes import block
 
 FORWARD = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0.0]])
@@ -52,7 +53,7 @@ def test_a_road_of_three_kilometers_looks_the_same_wherever_the_ego_is() -> None
 
 
 def test_painted_ground_is_bounded_in_memory() -> None:
-    ground = Ground([Road(line=((0.0, 0.0), (3000.0, 0.0)))], (), 0)
+    ground = Ground(GroundPlan([Road(line=((0.0, 0.0), (3000.0, 0.0)))]), 0)
     for i in range(MAX_TILES + 50):
         ground.tile(0, i, 0)
     assert len(ground._tiles) == MAX_TILES
@@ -62,7 +63,7 @@ def test_painted_ground_is_bounded_in_memory() -> None:
 def test_markings_lie_where_the_road_says_at_every_level(level: int) -> None:
     step = GROUND_M_PER_PX * 2**level
     road = Road(line=((-500.0, 2.0), (500.0, 2.0)), width_m=7.0, marking="solid", sidewalk_m=0.0)
-    image = Ground([road], (), 0).tile(level, 0, 0).astype(float).mean(2)
+    image = Ground(GroundPlan([road]), 0).tile(level, 0, 0).astype(float).mean(2)
     y = (np.arange(TILE_PX) + 0.5) * step
     rows = image.mean(1)
     dark = np.flatnonzero(rows < (np.mean(ASPHALT) + np.mean(MEADOW)) / 2)

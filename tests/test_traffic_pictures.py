@@ -17,6 +17,7 @@ from log2sim.logs.opening import open_log
 from log2sim.synth.bodies import Body, samples_of
 from log2sim.synth.ground import Ground
 from log2sim.synth.light import NOON
+from log2sim.synth.markings import GroundPlan
 from log2sim.synth.polytope_mesh import meshes_of
 from log2sim.synth.polytopes import Material
 from log2sim.synth.raster import nearest_of
@@ -315,7 +316,7 @@ def test_our_own_reader_of_the_layout_finds_the_boxes_on_the_points(kitti: Path)
 
 def test_a_row_of_a_picture_may_see_near_and_far_ground() -> None:
     """On a slope the rays of one row meet the ground from a meter to two kilometers away, more than fits at one resolution."""
-    ground = Ground([], (), 0)
+    ground = Ground(GroundPlan(), 0)
     x = np.linspace(1, 2000, 400, dtype=np.float32)[None].repeat(3, axis=0)
     colors = sampled_ground(ground, 0, x, np.zeros_like(x), np.ones(x.shape, bool))
     assert colors.shape == (3, 400, 3)

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from log2sim.geometry import Array, box_corners_bev
 from log2sim.synth.grain import grain
 from log2sim.synth.ground import Ground
+from log2sim.synth.markings import GroundPlan
 from log2sim.synth.polytope_caster import Terrain
-from log2sim.synth.scene import Building, Scene
+from log2sim.synth.scene import Scene
+from log2sim.synth.scene_places import Building
 
 FACADE_M_PER_PX = 0.04
 FACADE_LEVELS = 6
@@ -61,7 +63,7 @@ class Backdrop:
 
     def __init__(self, scene: Scene, seed: int) -> None:
         self.terrain: Terrain | None = None  # level
-        self.ground = Ground(scene.road, scene.zebra, seed)
+        self.ground = Ground(GroundPlan.of(scene), seed)
         self.buildings = tuple(_walls(building, (seed, 5, k)) for k, building in enumerate(scene.building))
 
 

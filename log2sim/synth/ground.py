@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -18,7 +17,14 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array
 from log2sim.synth.grain import grain
-from log2sim.synth.scene import Road, Zebra
+from log2sim.synth.markings import GroundPlan, Stroke, arrow_outline, crosswalk_stripes, old_lines, road_lines
+from log2sim.synth.scene_places import PaintColor
+from log2sim.synth.wear import paint_left
+
+Mask = NDArray[np.uint8]
+Share = NDArray[np.uint8] | NDArray[np.float32]
+Color = tuple[int, int, int]
+_Paint = tuple[PaintColor, float, float]
 
 GROUND_M_PER_PX = 0.04
 TILE_PX = 256
@@ -31,13 +37,13 @@ MARKING, ASPHALT, PAVING, CURB, MEADOW = (
     (172, 176, 178),
     (128, 142, 138),
 )
+# Yellow as traffic yellow (RAL 1023) in sRGB, BGR.
+PAINT: dict[str, Color] = {"white": MARKING, "yellow": (38, 176, 236)}
+OLD_STRENGTH, OLD_WORN = 0.4, 0.35  # of removed lines: what grinding leaves is dimmer and in pieces
 CURB_M = 0.12
 SLAB_PX, JOINT_SHADE = 25, 0.86  # paving slabs of 1 m with joints of one fine pixel
 MAX_CIRCLE_PX = 2e4  # from a tile to the center of a circle that is drawn
 SUBPIXELS = 2  # masks are drawn so much finer than tiles
-
-Mask = NDArray[np.uint8]
-Color = tuple[int, int, int]
 
 
 class Ground:
@@ -45,27 +51,21 @@ class Ground:
 
     Parameters
     ----------
-    roads, zebras
+    plan
         What is painted on a meadow.
     seed
-        Of grain and stains.
+        Of grain, stains and wear.
     """
 
-    def __init__(self, roads: Sequence[Road], zebras: Sequence[Zebra], seed: int) -> None:
+    def __init__(self, plan: GroundPlan, seed: int) -> None:
         self._seed = seed
-        lines = [np.array(r.line) for r in roads]
-        asphalt = [Stroke(line, r.width_m) for line, r in zip(lines, roads)]
-        crosswalks = [Stroke(np.array(z.line), z.width_m) for z in zebras]
+        roads = plan.roads
+        asphalt = [Stroke(np.array(r.line), r.width_m) for r in roads]
         curbs = [2 * CURB_M if r.sidewalk_m > 0 else 0.0 for r in roads]
         self._sidewalks = _Strokes([Stroke(s.line, s.width_m + 2 * r.sidewalk_m) for s, r in zip(asphalt, roads)])
         self._curbs = _Strokes([Stroke(s.line, s.width_m + more) for s, more in zip(asphalt, curbs)])
         self._asphalt = _Strokes(asphalt)
-        self._marks = [_Strokes(_markings(line, r)) for line, r in zip(lines, roads)]
-        self._crossing = [
-            _Strokes([s.wider(4.0) for s in asphalt if s is not own] + [c.wider(1.6) for c in crosswalks])
-            for own in asphalt
-        ]
-        self._stripes = _Strokes([Stroke(dash, c.width_m) for c in crosswalks for dash in _dashes(c.line, 0.5, 0.5)])
+        self._layers = _layers(plan)
         self._tiles: OrderedDict[tuple[int, int, int], Mask] = OrderedDict()
 
     def tile(self, level: int, i: int, j: int) -> Mask:
@@ -81,8 +81,7 @@ class Ground:
         return image
 
     def _paint(self, level: int, i: int, j: int) -> Mask:
-        step = GROUND_M_PER_PX * 2**level
-        canvas = _Canvas(np.array([i, j]) * TILE_PX * step, step)
+        canvas = _canvas_of(level, i, j)
         planes = np.empty((3, TILE_PX, TILE_PX), np.float32)
         planes[:] = np.reshape(MEADOW, (3, 1, 1))
         sidewalk = canvas.drawn(self._sidewalks)
@@ -92,41 +91,106 @@ class Ground:
         asphalt = canvas.drawn(self._asphalt)
         _blend(planes, ASPHALT, asphalt)
         if asphalt is not None:
-            _blend(planes, MARKING, self._white(canvas))
+            for layer in self._layers:
+                _blend(planes, PAINT[layer.color], self._covered(layer, canvas, (level, i, j)))
         planes *= grain(self._seed, level, (j * TILE_PX, i * TILE_PX), (TILE_PX, TILE_PX))
         np.clip(planes, 0, 255, out=planes)
         return np.asarray(cv2.merge(list(planes.astype(np.uint8))), np.uint8)
 
-    def _white(self, canvas: _Canvas) -> Mask | None:
-        """Draw markings, which end where another road or a crosswalk begins, and the stripes of crosswalks."""
-        white = canvas.drawn(self._stripes)
-        for marks, crossing in zip(self._marks, self._crossing):
+    def paint(self, level: int, i: int, j: int) -> NDArray[np.float32]:
+        """Return how much of each pixel of a tile (TILE_PX, TILE_PX) is painted, from 0 to 1."""
+        where = (level, i, j)
+        canvas = _canvas_of(*where)
+        out = np.zeros((TILE_PX, TILE_PX), np.float32)
+        for layer in self._layers:
+            covered = self._covered(layer, canvas, where)
+            if covered is not None:
+                np.maximum(out, covered * np.float32(1 / 255), out=out)
+        return out
+
+    def _covered(self, layer: _Layer, canvas: _Canvas, where: tuple[int, int, int]) -> Share | None:
+        """Share of each pixel (TILE_PX, TILE_PX) from 0 to 255 that has paint of a layer; None where nothing has."""
+        drawn = layer.drawn(canvas)
+        if drawn is None or (layer.worn <= 0 and layer.strength >= 1):
+            return drawn
+        level, i, j = where
+        left = paint_left(self._seed, level, (j * TILE_PX, i * TILE_PX), (TILE_PX, TILE_PX), layer.worn)
+        return np.asarray(drawn * (left * np.float32(layer.strength)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Layer:
+    """Paint of one color that is worn alike.
+
+    Attributes
+    ----------
+    color : str
+    worn : float
+        Share that is missing.
+    strength : float
+        From 0 for what cannot be seen to 1 for fresh paint.
+    free : _Strokes
+        What nothing interrupts.
+    along : tuple of (_Strokes, _Strokes)
+        Lines along roads, and what interrupts them.
+    outlines : tuple of (P, 2) float64, m
+    """
+
+    color: PaintColor
+    worn: float
+    strength: float
+    free: _Strokes
+    along: tuple[tuple[_Strokes, _Strokes], ...]
+    outlines: tuple[Array, ...]
+
+    def drawn(self, canvas: _Canvas) -> Mask | None:
+        """Share of each pixel (TILE_PX, TILE_PX) from 0 to 255 that was once painted; None where nothing was."""
+        paint = canvas.drawn(self.free)
+        for outline in self.outlines:
+            paint = _most(paint, canvas.filled(outline))
+        for marks, crossing in self.along:
             drawn = canvas.drawn(marks)
             if drawn is None:
                 continue
             gap = canvas.drawn(crossing)
-            if gap is not None:
-                drawn = np.asarray(cv2.subtract(drawn, gap), np.uint8)
-            white = drawn if white is None else np.maximum(white, drawn)
-        return white
+            paint = _most(paint, drawn if gap is None else np.asarray(cv2.subtract(drawn, gap), np.uint8))
+        return paint
 
 
-@dataclass(frozen=True, eq=False)
-class Stroke:
-    """A line with a width.
+def _most(a: Mask | None, b: Mask | None) -> Mask | None:
+    return b if a is None else a if b is None else np.maximum(a, b)
 
-    Attributes
-    ----------
-    line : (P, 2) float64, m
-    width_m : float
-    """
 
-    line: Array
-    width_m: float
+def _layers(plan: GroundPlan) -> tuple[_Layer, ...]:
+    """Sort what is painted by its color and wear; removed lines lie below all others."""
+    free: dict[_Paint, list[Stroke]] = {}
+    outlines: dict[_Paint, list[Array]] = {}
+    along: dict[_Paint, list[tuple[_Strokes, _Strokes]]] = {}
+    for zebra in plan.zebras:
+        free.setdefault(("white", zebra.worn, 1.0), []).extend(crosswalk_stripes(zebra))
+    for stop in plan.stop_lines:
+        free.setdefault((stop.color, stop.worn, 1.0), []).append(Stroke(np.array(stop.line), stop.width_m))
+    for arrow in plan.arrows:
+        outlines.setdefault(("white", arrow.worn, 1.0), []).append(arrow_outline(arrow))
+    for k, road in enumerate(plan.roads):
+        strokes: dict[_Paint, list[Stroke]] = {}
+        if road.old_m:
+            strokes["white", OLD_WORN, OLD_STRENGTH] = old_lines(road)
+        for line in road_lines(road, keeps_right=plan.keeps_right):
+            strokes.setdefault((line.color, road.worn, 1.0), []).extend(line.strokes)
+        gaps = _Strokes(plan.interruptions(k))
+        for paint, some in strokes.items():
+            along.setdefault(paint, []).append((_Strokes(some), gaps))
+    kinds = sorted({*free, *outlines, *along}, key=lambda paint: (paint[2], *paint))
+    return tuple(
+        _Layer(*kind, _Strokes(free.get(kind, ())), tuple(along.get(kind, ())), tuple(outlines.get(kind, ())))
+        for kind in kinds
+    )
 
-    def wider(self, by_m: float) -> Stroke:
-        """Add to the width."""
-        return Stroke(self.line, self.width_m + by_m)
+
+def _canvas_of(level: int, i: int, j: int) -> _Canvas:
+    step = GROUND_M_PER_PX * 2**level
+    return _Canvas(np.array([i, j]) * TILE_PX * step, step)
 
 
 class _Strokes:
@@ -169,6 +233,15 @@ class _Canvas:
         share = np.asarray(cv2.resize(mask, (TILE_PX, TILE_PX), interpolation=cv2.INTER_AREA), np.uint8)
         return share if cv2.countNonZero(share) else None
 
+    def filled(self, outline: Array) -> Mask | None:
+        """Share of each pixel (TILE_PX, TILE_PX) from 0 to 255 within an outline (P, 2); None where it does not reach."""
+        if np.any(outline.max(0) < self._low) or np.any(outline.min(0) > self._high):
+            return None
+        mask = np.zeros((TILE_PX * SUBPIXELS,) * 2, np.uint8)
+        corners = np.rint(((outline - self._low) / self._step - 0.5) * 16).astype(np.int32)
+        cv2.fillPoly(mask, [corners], 255, cv2.LINE_8, 4)
+        return np.asarray(cv2.resize(mask, (TILE_PX, TILE_PX), interpolation=cv2.INTER_AREA), np.uint8)
+
     def _draw(self, mask: Mask, begin: Array, end: Array, width_m: float, *, joined: bool) -> None:
         """Draw a piece with square ends; one that is thinner than a pixel is fainter instead."""
         shade = round(255 * min(1.0, width_m / self._step))
@@ -186,7 +259,7 @@ class _Canvas:
 
 
 def _blend(
-    planes: NDArray[np.float32], color: Color, share: Mask | None, shade: NDArray[np.float32] | None = None
+    planes: NDArray[np.float32], color: Color, share: Share | None, shade: NDArray[np.float32] | None = None
 ) -> None:
     """Paint a color over an image (3, H, W) where a mask (H, W) covers it, in part where the mask does."""
     if share is None:
@@ -197,32 +270,6 @@ def _blend(
         part *= shade
     for plane, value in zip(planes, color):
         plane += part * np.float32(value)
-
-
-def _markings(line: Array, road: Road) -> list[Stroke]:
-    """List the line in the middle and those along both sides."""
-    pieces: list[Array] = []
-    if road.marking != "none":
-        for k in range(1, road.lanes):
-            border = _parallel(line, (k / road.lanes - 0.5) * road.width_m) if 2 * k != road.lanes else line
-            pieces += _dashes(border, 3.0, 3.0) if road.marking == "dashed" else [border]
-    sides = [Stroke(_parallel(line, side * (road.width_m / 2 - 0.2)), 0.1) for side in (-1, 1)]
-    return [Stroke(piece, 0.14) for piece in pieces] + sides
-
-
-def _dashes(line: Array, on_m: float, off_m: float) -> list[Array]:
-    out = []
-    for a, b in pairwise(line):
-        length = float(np.linalg.norm(b - a))
-        if length > 0:
-            begins = np.arange(off_m / 2, length, on_m + off_m) / length
-            out += [np.array([a + (b - a) * f, a + (b - a) * min(f + on_m / length, 1.0)]) for f in begins]
-    return out
-
-
-def _parallel(line: Array, left_m: float) -> Array:
-    d = np.gradient(line, axis=0)
-    return np.asarray(line + left_m * np.stack([-d[:, 1], d[:, 0]], 1) / np.linalg.norm(d, axis=1, keepdims=True))
 
 
 def _joints(level: int, i: int, j: int) -> NDArray[np.float32]:

@@ -12,7 +12,7 @@ import numpy as np
 from log2sim.geometry import Array, apply, inverse
 from log2sim.synth.light import Color, Light
 from log2sim.synth.render_camera import RenderCamera
-from log2sim.synth.scene import Road
+from log2sim.synth.scene_places import Road
 from log2sim.synth.scenery import FAR_M, Image
 
 HEADLIGHT_COLOR: Color = (0.95, 0.95, 0.90)  # LED, 5000 K

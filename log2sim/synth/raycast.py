@@ -12,7 +12,8 @@ from log2sim.geometry import NS_PER_S, Array, inverse, rotation_from_rpy, transf
 from log2sim.synth.actors import Actor, MovingScene
 from log2sim.synth.light import weather_of
 from log2sim.synth.returns import ReturnModel, Weather, backscattered, detected, reflected
-from log2sim.synth.scene import Building, LidarSpec, Scene
+from log2sim.synth.scene import LidarSpec, Scene
+from log2sim.synth.scene_places import Building
 from log2sim.synth.shapes import cross_products
 
 GROUND, BUILDING, EGO, AIR = -1, -2, -3, -4

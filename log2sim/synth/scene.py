@@ -10,42 +10,16 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, Strict, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from log2sim.datatypes import TYPICAL_SIZE_M
 from log2sim.errors import ConfigError
 from log2sim.input_files import read_text
 from log2sim.model_errors import first_problem
+from log2sim.synth.scene_keys import Angle, Color, Name, Number, Pixels, Size, Table, Vec2, Vec3, Whole, key
+from log2sim.synth.scene_places import Arrow, Building, Road, Shadow, StopLine, Zebra
 
 MAX_SCENE_BYTES = 4 * 1024 * 1024
-MAX_COORDINATE_M = 1e7
-
-Number = Annotated[float, Strict()]
-Whole = Annotated[int, Strict()]
-Coordinate = Annotated[float, Strict(), Field(ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M)]
-Extent = Annotated[float, Strict(), Field(ge=0.1, le=500)]
-Angle = Annotated[float, Strict(), Field(ge=-90, le=90)]
-Channel = Annotated[int, Strict(), Field(ge=0, le=255)]
-Pixels = Annotated[int, Strict(), Field(ge=16, le=8192)]
-Name = Annotated[str, Field(pattern=r"^[\w-]+$")]
-
-Vec2 = tuple[Coordinate, Coordinate]
-Vec3 = tuple[Coordinate, Coordinate, Coordinate]
-Size = tuple[Extent, Extent, Extent]
-Color = tuple[Channel, Channel, Channel]
-Line = Annotated[tuple[Vec2, ...], Field(min_length=2)]
-
-
-def key(description: str, default: Any = ..., unit: str | None = None, **limits: Any) -> Any:
-    """Declare a key of a scene file: what it means, its default, its unit and its limits (`ge`, `le`, `max_length` ...)."""
-    extra: dict[str, JsonValue] = {} if unit is None else {"unit": unit}
-    return Field(default, description=description, json_schema_extra=extra, **limits)
-
-
-class Table(BaseModel):
-    """Base of all tables of a scene file: immutable, unknown keys are errors."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class Origin(Table):
@@ -54,32 +28,6 @@ class Origin(Table):
     latitude_deg: Number = key("Latitude of the origin, WGS 84.", 52.52, "deg", ge=-80, le=84)
     longitude_deg: Number = key("Longitude of the origin, WGS 84.", 13.405, "deg", ge=-180, le=180)
     altitude_m: Number = key("Altitude of the ground.", 34.0, "m", ge=-500, le=9000)
-
-
-class Road(Table):
-    """A road along a polyline, with a center marking and sidewalks."""
-
-    line: Line = key("Center line, points [x, y].", unit="m")
-    width_m: Number = key("Width of the carriageway.", 7.0, "m", ge=1, le=60)
-    lanes: Whole = key("Number of lanes of equal width.", 2, ge=1, le=12)
-    marking: Literal["dashed", "solid", "none"] = key("Marking between lanes.", "dashed")
-    sidewalk_m: Number = key("Width of the sidewalk on each side.", 2.5, "m", ge=0, le=20)
-
-
-class Zebra(Table):
-    """A crosswalk."""
-
-    line: Line = key("Its center line from one side of the road to the other, points [x, y].", unit="m")
-    width_m: Number = key("Extent along the road.", 3.0, "m", ge=1, le=20)
-
-
-class Building(Table):
-    """A box with a facade."""
-
-    center: Vec2 = key("Center [x, y].", unit="m")
-    size_m: Size = key("Length, width, height.", unit="m")
-    yaw_deg: Number = key("Direction of its length.", 0.0, "deg")
-    color: Color = key("Color of the facade, RGB 0 to 255.", (190, 180, 165))
 
 
 class Environment(Table):
@@ -212,8 +160,12 @@ class Scene(Table):
         "Stamp of the log's begin, Unix time.", 1_700_000_000_000_000_000, "ns", ge=0, le=9_000_000_000_000_000_000
     )
     origin: Origin = key("Position on Earth.", Origin())
+    traffic: Literal["right", "left"] = key("Side of the road on which vehicles drive.", "right")
     road: tuple[Road, ...] = key("Roads.", ())
     zebra: tuple[Zebra, ...] = key("Crosswalks.", ())
+    stop_line: tuple[StopLine, ...] = key("Stop lines.", ())
+    arrow: tuple[Arrow, ...] = key("Arrows on the road.", ())
+    shadow: tuple[Shadow, ...] = key("Shadows on the ground, where the sun shines.", ())
     building: tuple[Building, ...] = key("Buildings.", ())
     agent: tuple[AgentSpec, ...] = key("Road users besides the ego.", ())
     camera: tuple[CameraSpec, ...] = key("Cameras.", ())

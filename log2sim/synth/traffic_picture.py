@@ -13,11 +13,12 @@ from log2sim.synth.bodies import Body
 from log2sim.synth.ground import Ground
 from log2sim.synth.lamps import Lamp, headlights
 from log2sim.synth.light import Light
+from log2sim.synth.markings import GroundPlan
 from log2sim.synth.polytope_caster import Terrain
 from log2sim.synth.polytope_mesh import meshes_of
 from log2sim.synth.polytopes import Material
 from log2sim.synth.render import SceneInstant
-from log2sim.synth.scene import Road as PaintedRoad
+from log2sim.synth.scene_places import Road as PaintedRoad
 from log2sim.synth.shapes import Mesh
 from log2sim.synth.traffic import Road, TrafficObject, TrafficScene
 from log2sim.synth.traffic_colors import VEHICLES, Look, look_of
@@ -58,7 +59,7 @@ class TrafficPainter:
 
     def __init__(self, scene: TrafficScene, seed: int) -> None:
         painted = [painted_road(road, scene.surface.kerb_m > 0) for road in scene.roads]
-        self.backdrop = TrafficBackdrop(Ground(painted, (), GRAIN_SEED), scene.surface)
+        self.backdrop = TrafficBackdrop(Ground(GroundPlan(painted), GRAIN_SEED), scene.surface)
         self._seed = seed
         self._looks: dict[int, Look] = {}
         self._meshes: dict[int, Mesh] = {}

@@ -21,7 +21,8 @@ from log2sim.synth.polytope_hits import SensorState, Solid
 from log2sim.synth.polytopes import Material, Polytope, box
 from log2sim.synth.raycast import mount_T_lidar, sweep_stamps
 from log2sim.synth.returns import ReturnModel
-from log2sim.synth.scene import Building, LidarSpec, Scene
+from log2sim.synth.scene import LidarSpec, Scene
+from log2sim.synth.scene_places import Building
 from log2sim.synth.synthesis import synthesize
 from log2sim.synth.traffic import Surface
 
