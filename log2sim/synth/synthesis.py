@@ -24,6 +24,7 @@ from log2sim.synth.labels import (
     visibility_by_camera,
     visible_at,
 )
+from log2sim.synth.map_truth import map_features_of
 from log2sim.synth.scene import LidarSpec, Scene
 
 if TYPE_CHECKING:
@@ -54,6 +55,7 @@ def synthesize(scene: Scene, *, seed: int = 0, observe: bool = True) -> tuple[Lo
     truth : Scenario
         Every agent and the ego ("ego") each 0.05 s; x, y, z of box centers. `visible` is true where one LiDAR sweep has
         20 points or more on the agent and one camera shows a third or more of its silhouette, at least half of its box.
+        Its map features are all that is painted, where roads end, and their lanes.
     """
     moving = MovingScene.of(scene)
     cameras = {spec.name: camera_of(spec) for spec in scene.camera}
@@ -208,7 +210,15 @@ def _truth(moving: MovingScene, t_s: Array, visible: NDArray[np.bool_] | None, s
         f"+proj=tmerc +lat_0={origin.latitude_deg!r} +lon_0={origin.longitude_deg!r} +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m",
     )
     provenance = {"source": "synthetic", "seed": seed, "scene_digest": _digest(scene, seed)}
-    return Scenario(scene.name, scene.start_ns, float(t_s[-1]), tuple(agents), frame, provenance=provenance)
+    return Scenario(
+        scene.name,
+        scene.start_ns,
+        float(t_s[-1]),
+        tuple(agents),
+        frame,
+        provenance=provenance,
+        map_features=map_features_of(scene),
+    )
 
 
 def _ego_agent(ego: Actor, t_s: Array) -> Agent:
