@@ -37,12 +37,12 @@ class Details {
     const others = ["truth", "replay"].filter((layer) => data.layers[layer]).join(" and ");
     const charts = [["Speed (m/s)", 1], ["Distance to ego (m)", 1], [`From ${others} (m)`, 0.1]];
     [this.speed, this.distance, this.error] = charts.map(([title, minSpan]) => new Chart(byId("charts"), title, minSpan, data, seek));
-    const rows = ["Heading", "Position", "Sigma", "Observed", "Observed by", "Confidence", "LiDAR", "Source"].map((name) => {
+    const rows = ["Heading", "Position", "Sigma", "Observed", "Observed by", "Confidence", "Color", "LiDAR", "Source"].map((name) => {
       const value = element("dd");
       byId("agent-now").append(element("dt", {}, name), value);
       return value;
     });
-    [this.heading, this.position, this.sigma, this.observed, this.observers, this.confidence, this.points, this.source] = rows;
+    [this.heading, this.position, this.sigma, this.observed, this.observers, this.confidence, this.paint, this.points, this.source] = rows;
   }
 
   choose(track) {
@@ -78,6 +78,8 @@ class Details {
     fill(this.confidence, track.confidence === null ? "" : track.confidence.toFixed(2));
     fill(this.points, track.points === null ? "" : `${track.points.toFixed(0)} points in a sweep (median)`);
     fill(this.source, track.source ?? "");
+    fill(this.paint, track.paintName);
+    this.paint.style.setProperty("--paint", track.paint ?? "none");
     fill(this.observers, observers(track, 0));
     const warning = this.data.warnings.find((other) => other.agent === track.id);
     byId("agent-warning").hidden = warning === undefined;

@@ -12,6 +12,7 @@ from log2sim.datatypes import GROUP_OF, Agent, Doubt, Scenario, Trajectory, Wayp
 from log2sim.errors import ConfigError
 from log2sim.simulation.warnings.known import ends_of
 from log2sim.visualization.page.columns import SCALES, second_differences
+from log2sim.visualization.page.features import feature_columns
 from log2sim.visualization.page.predictions import predicted_columns
 from log2sim.visualization.plot.doubts import shown_spans
 from log2sim.visualization.plot.roles import AgentRole, assign_roles, is_moving
@@ -65,6 +66,7 @@ def page_document(
         "end_s": max([scenario.duration_s, *(last for _, last in spans)]),
         "origin": _origin(scenario),
         "layers": layers,
+        "features": feature_columns(scenario),
         "events": [] if replay is None else _events(replay),
         "warnings": _warnings(replay),
     }
@@ -101,10 +103,16 @@ def _scenario(scenario: Scenario) -> Iterator[dict[str, Any]]:
     roles, tell_ends = assign_roles(scenario), len(ends_of(scenario)) > 1
     for role in roles.movers:
         entry = _entry(role.agent, role.agent.waypoints, stationary=False, static=False)
-        yield {**entry, **_colors(role), **_trust(role.agent), **(_observers(role.agent) if tell_ends else {})}
+        yield {
+            **entry,
+            **_paint(role.agent),
+            **_colors(role),
+            **_trust(role.agent),
+            **(_observers(role.agent) if tell_ends else {}),
+        }
     for agent in roles.stationary:
         entry = _entry(agent, agent.waypoints, stationary=True, static=agent.static)
-        yield {**entry, **_trust(agent), **(_observers(agent) if tell_ends else {})}
+        yield {**entry, **_paint(agent), **_trust(agent), **(_observers(agent) if tell_ends else {})}
 
 
 def _observers(agent: Agent) -> dict[str, Any]:
@@ -115,6 +123,15 @@ def _observers(agent: Agent) -> dict[str, Any]:
 
 def _colors(role: AgentRole) -> dict[str, Any]:
     return {"ego": True} if role.is_ego else {"color": role.color, "leading": role.leading}
+
+
+def _paint(agent: Agent) -> dict[str, Any]:
+    """Return the color that an agent itself has, and its name with how sure that is; nothing where it is not known."""
+    if agent.color is None:
+        return {}
+    confidence = agent.color.get("confidence")
+    sure = "" if confidence is None else f" ({confidence:.2f})"
+    return {"paint": {"rgb": list(agent.color["rgb"]), "text": f"{agent.color['name']}{sure}"}}
 
 
 def _trust(agent: Agent) -> dict[str, Any]:

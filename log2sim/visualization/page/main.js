@@ -1,11 +1,12 @@
 // Actions of the user, and the start.
 
-const LAYER_NAMES = { scenario: "Scenario", truth: "Truth", replay: "Replay", trails: "Trails", names: "Names", predictions: "Predictions", ends: "Ends" };
+const LAYER_NAMES = { scenario: "Scenario", truth: "Truth", replay: "Replay", trails: "Trails", names: "Names", predictions: "Predictions", ends: "Ends", lanes: "Lanes" };
 let fitted = false;
 
 // Whether there is anything to show or hide.
 const hasLayer = (layer) => {
   if (layer === "predictions") return tracks.some((track) => track.predicted);
+  if (layer === "lanes") return data.features.some || data.features.signals.length > 0;
   if (layer === "ends") return tracks.some((track) => track.observedBy !== null);
   return !(layer in { truth: 0, replay: 0 }) || data.layers[layer] !== undefined;
 };
@@ -108,7 +109,7 @@ const listen = () => {
     ["f", "follow the chosen agent, else the ego", ["f"], buttons.follow],
     ["n p", "next or previous agent", ["n"], () => neighbor(1)],
     ["s t r", "scenario, truth or replay on or off", ["s"], () => toggle("scenario")],
-    ["w l d o", "trails, names, predictions or ends on or off", ["w"], () => toggle("trails")],
+    ["w l d o m", "trails, names, predictions, ends or lanes on or off", ["w"], () => toggle("trails")],
     ["e", "next warning or collision of the replay", ["e"], nextEvent],
     ["a /", "list of agents, search in it", ["a"], buttons["list-toggle"]],
     ["Esc", "choose nobody", ["Escape"], () => choose(null)],
@@ -117,7 +118,7 @@ const listen = () => {
     [["ArrowRight"], jump(0.1)], [["End"], () => seek(data.end)], [[">", "."], () => setRate(1)],
     [["-", "_"], () => zoom(1 / 1.25)], [["p"], () => neighbor(-1)], [["t"], () => toggle("truth")],
     [["r"], () => toggle("replay")], [["l"], () => toggle("names")], [["d"], () => toggle("predictions")],
-    [["o"], () => toggle("ends")],
+    [["o"], () => toggle("ends")], [["m"], () => toggle("lanes")],
     [["/"], () => byId("search").focus()],
   ]);
   listenToPointers(byId("map"), {
@@ -178,6 +179,7 @@ const start = () => {
   const moving = tracks.filter((track) => !track.stationary && !track.ego).length, agents = tracks.length - (ego ? 1 : 0);
   const parts = [`${(data.end - data.begin).toFixed(1)} s`, `${agents} agent${agents === 1 ? "" : "s"}, ${moving} moving`];
   if (data.warnings.length) parts.push(data.warned);
+  if (data.features.lanes.length) parts.push(`${data.features.lanes.length} lane${data.features.lanes.length === 1 ? "" : "s"}`);
   if (doubtful.length) parts.push(`${doubtful.length} doubtful`);
   if (!ego) parts.push("no ego");
   if (data.origin) parts.push(`origin ${data.origin}`);

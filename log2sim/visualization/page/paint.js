@@ -22,12 +22,13 @@ class Painter {
   }
 
   // shown: which layers and extras; chosen, hovered: tracks of the scenario or null.
-  paint({ layers, events, warnings }, t, shown, chosen, hovered) {
+  paint({ layers, events, warnings, features }, t, shown, chosen, hovered) {
     const ctx = this.ctx;
     ctx.setLineDash(SOLID);
     ctx.lineJoin = "round";
     ctx.fillStyle = theme.ground;
     ctx.fillRect(0, 0, this.view.width + 1, this.view.height + 1);  // the last pixel may be half one
+    if (shown.lanes) drawFeatures(this, features);
     this.grid();
     for (const track of layers.scenario) track.moveTo(t);
     if (shown.scenario) this.scene(layers.scenario, t, shown, chosen);
@@ -40,6 +41,7 @@ class Painter {
     if (shown.replay) this.contacts(events, t);
     if (shown.scenario && chosen && chosen.present) this.ring(chosen, theme.accent, 2);
     if (shown.scenario && hovered && hovered !== chosen && hovered.present) this.ring(hovered, theme.muted, 1.2);
+    if (shown.lanes) drawSignals(this, features.signals, t);
     if (shown.scenario) this.names(layers.scenario, shown, chosen, hovered);
     this.scaleBar();
   }
@@ -157,6 +159,10 @@ class Painter {
     ctx.closePath();
     ctx.fillStyle = track.interpolated ? track.line : track.headingMark;
     ctx.fill();
+    if (!track.paint || track.interpolated) return;
+    ctx.lineWidth = 0.8;
+    ctx.strokeStyle = track.stationary ? theme.parked_edge : theme.headingMark;
+    ctx.stroke();
   }
 
   // Stripes across the box in `corner`, at 45 degrees to its sides as in the pictures; they move with it.

@@ -24,8 +24,10 @@ const css = ([r, g, b], alpha) => `rgba(${r},${g},${b},${alpha})`;
 
 const applyTheme = (layers) => {
   const style = getComputedStyle(document.documentElement);
-  for (const name of ["paper", "ground", "ink", "muted", "grid", "frame", "parked-face", "parked-edge", "accent", "alert", "warn", "vehicle", "road"]) {
-    theme[name.replace("-", "_")] = style.getPropertyValue(`--${name}`).trim();
+  for (const name of ["paper", "ground", "ink", "muted", "grid", "frame", "parked-face", "parked-edge", "accent", "alert", "warn", "vehicle", "road",
+    "lane", "lane-arrow", "marking", "yellow-marking", "border",
+    "signal-red", "signal-red-yellow", "signal-yellow", "signal-green", "signal-off", "signal-unknown"]) {
+    theme[name.replaceAll("-", "_")] = style.getPropertyValue(`--${name}`).trim();
   }
   theme.font = style.getPropertyValue("--font").trim();
   theme.names = `600 11px ${theme.font}`;
@@ -43,7 +45,7 @@ const applyTheme = (layers) => {
     track.pale = css(rgb, 0.22);
     track.trail = css(rgb, 0.65 * strength);
     track.edge = track.stationary ? theme.parked_edge : theme.paper;
-    track.headingMark = track.stationary ? theme.parked_edge : theme.headingMark;
+    track.headingMark = track.paint ?? (track.stationary ? theme.parked_edge : theme.headingMark);
     track.stripes = track.stationary ? theme.muted : theme.paper;
     track.outline = track.stationary ? theme.muted : track.line;
     colors.set(track.id, track.stationary ? theme.parked_edge : track.line);

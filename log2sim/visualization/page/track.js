@@ -40,6 +40,8 @@ class Track {
     this.confidence = entry.confidence ?? null;
     this.points = entry.points ?? null;
     this.source = entry.source ?? null;
+    this.paint = entry.paint ? `rgb(${entry.paint.rgb})` : null;  // its own color, where it is known
+    this.paintName = entry.paint?.text ?? "";
     this.sigmas = ["sigma_xy_m", "sigma_yaw_rad", "sigma_speed_mps"].map((key) => (entry[key] ? sums(entry[key], scales[key]) : null));
     this.observedBy = entry.observed_by ?? null;  // end: spans in s; null where the scenario does not say
     this.doubts = entry.doubts ?? [];  // reason, start and end in s or null
@@ -149,5 +151,5 @@ const load = (text) => {
     track: named("replay", warning.agent), shown: named("scenario", warning.agent),
   }));
   const { name, origin, begin_s: begin, end_s: end } = document_;
-  return { name, origin, begin, end, layers, events, warnings, warned: document_.warnings.title };
+  return { name, origin, begin, end, layers, events, warnings, warned: document_.warnings.title, features: loadFeatures(document_) };
 };

@@ -20,6 +20,7 @@ from log2sim.visualization.page.document import page_document
 SUFFIXES = (".html", ".htm")
 SCRIPT_FILES = (
     "track.js",
+    "features.js",
     "predicted.js",
     "theme.js",
     "ends.js",

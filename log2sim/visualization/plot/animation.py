@@ -22,6 +22,7 @@ from log2sim.visualization.plot.collisions import new_collisions
 from log2sim.visualization.plot.doubts import STRIPE_PT, box_stripes, is_doubted_at
 from log2sim.visualization.plot.layout import SIDE_IN, TOP_IN, WIDTH_IN, FigureLayout
 from log2sim.visualization.plot.predicted import DOTS, PredictedPaths, show_expected
+from log2sim.visualization.plot.road_features import SignalLights
 from log2sim.visualization.plot.roles import AgentRoles, centers_xy
 from log2sim.visualization.plot.scene import draw_base
 from log2sim.visualization.plot.style import ALARM, FONT, INK, PAPER, halo
@@ -99,6 +100,7 @@ def write_animation(
     layout.figure.set_dpi(DPI[suffix])
     timing = choose_frame_timing(scenario.duration_s)
     artists = AnimatedArtists(layout, roles, replay, truth, timing, charts, predicted)
+    artists.signals = SignalLights(layout.ax, scenario.signals)
     frames = _frames(layout, artists, timing)
     with replaced(out_path) as temporary:
         if suffix == ".gif":
@@ -131,7 +133,7 @@ class AnimatedArtists:
         charts: TimelineCharts | None,
         predicted: PredictedPaths | None = None,
     ) -> None:
-        self.predicted = predicted
+        self.predicted, self.signals = predicted, SignalLights(layout.ax, ())
         self.layout, self.roles, self.truth, self.timing, self.charts = layout, roles, truth, timing, charts
         if charts is not None:
             charts.start()
@@ -142,7 +144,7 @@ class AnimatedArtists:
         hidden: dict[str, Any] = {"animated": True, "zorder": drawing.BOX}
         self.tails = LineCollection([], linewidths=2.0, capstyle="round", **hidden)
         self.boxes = PolyCollection([], edgecolors=PAPER, linewidths=0.7, **hidden)
-        self.noses = PolyCollection([], facecolors=to_rgba(PAPER, 0.85), linewidths=0, **hidden)
+        self.noses = PolyCollection([], linewidths=0, **hidden)
         self.hatches = LineCollection([], colors=PAPER, linewidths=STRIPE_PT, **hidden)
         self.truths = PolyCollection(
             [], facecolors="none", edgecolors=INK, linewidths=0.8, linestyles=[(0, (3, 2))], **hidden
@@ -176,6 +178,7 @@ class AnimatedArtists:
         corners = [shapes.footprints(r.agent, pose[:2], pose[2])[0] for r, pose in present]
         self.boxes.set_verts(corners)
         self.boxes.set_facecolor(colors)
+        self.noses.set_facecolor([drawing.paint_of(r.agent, to_rgba(PAPER, 0.85)) for r, _ in present])
         self.noses.set_verts(list(shapes.heading_triangles(np.array(corners))) if corners else [])
         doubted = [(r.agent, pose) for r, pose in present if is_doubted_at(r.agent, t_s)]
         self.hatches.set_segments([s for a, p in doubted for s in box_stripes(a, p[:2], p[2], self.layout.view)])
@@ -184,6 +187,7 @@ class AnimatedArtists:
         self._show_overlays(t_s)
         for collection in self.collections:
             self.layout.ax.draw_artist(collection)
+        self.signals.show(t_s)
         for label, (role, pose) in zip(self.labels, posed):
             if role.leading and pose is not None:
                 top = shapes.footprints(role.agent, pose[:2], pose[2])[0, :, 1].max()

@@ -74,7 +74,11 @@ def draw_stationary(ax: Axes, agents: Sequence[Agent], view: Viewport) -> None:
     ax.add_collection(PolyCollection(list(corners), **style), autolim=False)
     ax.add_collection(
         PolyCollection(
-            list(shapes.heading_triangles(corners)), facecolors=PARKED_EDGE, linewidths=0, zorder=STATIONARY
+            list(shapes.heading_triangles(corners)),
+            facecolors=[paint_of(a, PARKED_EDGE) for a in agents],
+            edgecolors=PARKED_EDGE,
+            linewidths=0.3,
+            zorder=STATIONARY,
         ),
         autolim=False,
     )
@@ -132,10 +136,17 @@ def draw_ends(ax: Axes, roles: AgentRoles, view: Viewport, *, ghosts_step_s: flo
         first, last = (shapes.footprints(agent, xy[k], w.yaw_rad[k]) for k in (0, -1))
         _polygons(ax, first, facecolors=to_rgba(PAPER, 0.75), edgecolors=to_rgba(role.color, 0.9 * alpha), z=z - 0.6)
         _polygons(ax, last, facecolors=to_rgba(role.color, 0.92 * alpha), edgecolors=PAPER, z=z)
-        _polygons(ax, shapes.heading_triangles(last), facecolors=to_rgba(PAPER, 0.85), edgecolors="none", z=z)
+        paint = paint_of(agent, to_rgba(PAPER, 0.85))
+        rim = "none" if agent.color is None else to_rgba(PAPER, 0.85)
+        _polygons(ax, shapes.heading_triangles(last), facecolors=paint, edgecolors=rim, z=z)
         if max(agent.size_m[:2]) < 9 * view.m_per_pt:
             face = to_rgba(role.color, alpha)
             ax.plot(*xy[-1], MARKERS[role.group], ms=4.2, mfc=face, mec=PAPER, mew=0.7, zorder=z + 0.01)
+
+
+def paint_of(agent: Agent, otherwise: Any) -> Any:
+    """Return the color that an agent itself has, which its heading mark is drawn in; `otherwise` where it is not known."""
+    return otherwise if agent.color is None else tuple(v / 255 for v in agent.color["rgb"])
 
 
 def draw_truth(ax: Axes, truth: Scenario) -> None:

@@ -121,6 +121,10 @@ def legend_rows(
         rows.append((_line("none", marker="o", ms=3.2, mfc=PAPER, mec=MUTED, mew=0.9), f"every {mark_step_s:g} s"))
     if mark_step_s is not None and any(not r.agent.waypoints.observed.all() for r in roles.movers):
         rows.append((_line(MUTED, lw=1.3, ls=(0, (2.2, 1.8))), "not observed, interpolated"))
+    if any(a.color is not None for a in (*(r.agent for r in roles.movers), *roles.stationary)):
+        rows.append(
+            (_line("none", marker="^", ms=4.6, mfc="#C0392B", mec=MUTED, mew=0.4), "heading, in the vehicle's color")
+        )
     if truth:
         rows.append((_line(INK, lw=0.8, ls=(0, (3, 2))), "truth"))
     if replay:

@@ -19,6 +19,7 @@ from log2sim.visualization.plot.layout import (
 )
 from log2sim.visualization.plot.observers import observer_rows, tells_ends
 from log2sim.visualization.plot.predicted import PredictedPaths, prediction_row
+from log2sim.visualization.plot.road_features import draw_road, draw_signals, road_rows
 from log2sim.visualization.plot.roles import AgentRoles, centers_xy, is_moving
 from log2sim.visualization.plot.time_series import TimelineCharts, charts_height_in, draw_charts, timeline_of
 from log2sim.visualization.plot.viewport import Viewport, choose_viewport, time_step_s
@@ -60,11 +61,15 @@ def draw_base(
         rows += observer_rows()
     if warned_places(replay) and not moving:
         rows.append(warning_row())
+    rows += road_rows(scenario)
     timeline = timeline_of(replay, scenario, roles)
     lines = sum(1 + text.count("\n") for _, text in rows)
     layout = make_layout(chosen, lines, projected=projected, foot_in=charts_height_in(timeline))
     if background is not None:
         drawing.draw_background(layout.ax, background)
+    draw_road(layout.ax, scenario, layout.view, over_picture=background is not None)
+    if not moving:
+        draw_signals(layout.ax, scenario.signals, scenario.duration_s)
     layout.ax.set(xlim=(layout.view.x0, layout.view.x1), ylim=(layout.view.y0, layout.view.y1))
     drawing.draw_stationary(layout.ax, roles.stationary, layout.view)
     doubts.hatch_stationary(layout.ax, roles, layout.view, drawing.STATIONARY + 0.1)

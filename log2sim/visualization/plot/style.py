@@ -28,6 +28,15 @@ WARNING = "#B35C00"
 END_COLOR = {"vehicle": "#1F6FB2", "road": "#8E3B9E"}
 """Of what one end of a cooperative log alone observed; as on the page."""
 
+LANE_FACE, LANE_ARROW = "#EBEEF2", "#C9D0D9"
+MARKING_COLOR = {"white": "#55606E", "yellow": "#C58A00"}
+"""Paint on the ground; white paint is dark, since the pictures are white."""
+
+BORDER_COLOR = "#9A7B5B"
+SIGNAL_COLOR = {
+    "red": "#D11F1F", "red_yellow": "#E2711D", "yellow": "#E0A800", "green": "#1D9A4B", "off": "#3A434F", "unknown": "#9AA3AE",
+}  # fmt: skip
+
 PALETTE = (
     "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#882255", "#999933", "#332288", "#44AA99",
     "#AA4499", "#117733", "#CC6677", "#6699CC", "#A6761D", "#661100", "#5E9B2F", "#8C6BB1", "#2F6F7E", "#B8860B",
