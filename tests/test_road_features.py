@@ -50,7 +50,7 @@ def world() -> Scenario:
         MapLane("west", line(1.75, reverse=True), np.full(51, 3.0), left="middle", opposite="east", inferred_from="paths"),
     )  # fmt: skip
     features = MapFeatures(markings, (RoadBorder("curb", "curb", line(-5.0)),), lanes)
-    signal = Signal("light", np.array([10.0, -4.0, 5.0]), 0.0, np.array([0.0, 2.5]), np.array(["red", "green"]))
+    signal = Signal("light", np.array([11.3, -4.3, 5.0]), 0.0, np.array([0.0, 2.5]), np.array(["red", "green"]))
     return Scenario("made", 0, 4.0, (car,), map_features=features, signals=(signal,))
 
 
@@ -161,11 +161,11 @@ def test_the_page_shows_and_hides_them(browser: Browser, tmp_path: Path) -> None
         return tuple(round(255 * c) for c in to_rgb(color))
 
     assert pixel(9.0, -0.9) == rgb("#ECEFF3")
-    assert pixel(10.0, -4.0) == rgb(style.SIGNAL_COLOR["red"])
+    assert pixel(11.3, -4.3) == rgb(style.SIGNAL_COLOR["red"])
     browser.run("log2sim.time = 3")
-    assert pixel(10.0, -4.0) == rgb(style.SIGNAL_COLOR["green"])
+    assert pixel(11.3, -4.3) == rgb(style.SIGNAL_COLOR["green"])
     browser.run("document.getElementById('layer-lanes').click()")
-    assert pixel(9.0, -0.9) == pixel(10.0, -4.0) == (251, 252, 253)
+    assert pixel(9.0, -0.9) == pixel(11.3, -4.3) == (251, 252, 253)
     browser.run("log2sim.choose('car')")
     shown = browser.run("return [...document.querySelectorAll('#agent-now dd')].map((row) => row.textContent)")
     assert "red (0.90)" in shown
