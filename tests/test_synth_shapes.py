@@ -9,9 +9,9 @@ from log2sim.geometry import Array
 from log2sim.synth import people, vehicles
 from log2sim.synth.paint import paint
 from log2sim.synth.raster import rasterize
-from log2sim.synth.raycast import first_hit
 from log2sim.synth.shapes import Mesh, block, ellipsoid
 from log2sim.synth.surfaces import Appearance
+from log2sim.synth.triangles import first_hit
 
 SIZES = {"car": (4.4, 1.8, 1.5), "truck": (7.2, 2.4, 3.0), "bus": (11.0, 2.5, 3.1), "cyclist": (1.76, 0.6, 1.76)}
 

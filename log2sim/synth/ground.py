@@ -8,7 +8,7 @@ x = i * its length, its first row at y = j * its length: columns go east, rows g
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -24,6 +24,7 @@ from log2sim.synth.wear import paint_left
 Mask = NDArray[np.uint8]
 Share = NDArray[np.uint8] | NDArray[np.float32]
 Color = tuple[int, int, int]
+Surface = Mapping[str, float]  # values by meadow, sidewalk, curb, asphalt and paint
 _Paint = tuple[PaintColor, float, float]
 
 GROUND_M_PER_PX = 0.04
@@ -97,16 +98,16 @@ class Ground:
         np.clip(planes, 0, 255, out=planes)
         return np.asarray(cv2.merge(list(planes.astype(np.uint8))), np.uint8)
 
-    def paint(self, level: int, i: int, j: int) -> NDArray[np.float32]:
-        """Return how much of each pixel of a tile (TILE_PX, TILE_PX) is painted, from 0 to 1."""
+    def shade(self, level: int, i: int, j: int, values: Surface) -> NDArray[np.float32]:
+        """Return a tile (TILE_PX, TILE_PX) of a value that each surface has, fresh paint among them, without grain."""
         where = (level, i, j)
         canvas = _canvas_of(*where)
-        out = np.zeros((TILE_PX, TILE_PX), np.float32)
+        plane = np.full((1, TILE_PX, TILE_PX), values["meadow"], np.float32)
+        for name, strokes in (("sidewalk", self._sidewalks), ("curb", self._curbs), ("asphalt", self._asphalt)):
+            _blend(plane, (values[name],), canvas.drawn(strokes))
         for layer in self._layers:
-            covered = self._covered(layer, canvas, where)
-            if covered is not None:
-                np.maximum(out, covered * np.float32(1 / 255), out=out)
-        return out
+            _blend(plane, (values["paint"],), self._covered(layer, canvas, where))
+        return np.asarray(plane[0])
 
     def _covered(self, layer: _Layer, canvas: _Canvas, where: tuple[int, int, int]) -> Share | None:
         """Share of each pixel (TILE_PX, TILE_PX) from 0 to 255 that has paint of a layer; None where nothing has."""
@@ -259,9 +260,9 @@ class _Canvas:
 
 
 def _blend(
-    planes: NDArray[np.float32], color: Color, share: Share | None, shade: NDArray[np.float32] | None = None
+    planes: NDArray[np.float32], color: Sequence[float], share: Share | None, shade: NDArray[np.float32] | None = None
 ) -> None:
-    """Paint a color over an image (3, H, W) where a mask (H, W) covers it, in part where the mask does."""
+    """Paint a color (C,) over an image (C, H, W) where a mask (H, W) covers it, in part where the mask does."""
     if share is None:
         return
     part = share * np.float32(1 / 255)

@@ -9,19 +9,18 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Sweep
 from log2sim.geometry import NS_PER_S, Array, inverse, rotation_from_rpy, transform
-from log2sim.synth.actors import Actor, MovingScene
+from log2sim.synth.actors import EGO_COLOR, Actor, MovingScene
 from log2sim.synth.light import weather_of
+from log2sim.synth.reflectance import AIR_REFLECTANCE, GroundReflectance, body_reflectance, intensity_of, spot_m
 from log2sim.synth.returns import ReturnModel, Weather, backscattered, detected, reflected
 from log2sim.synth.scene import LidarSpec, Scene
 from log2sim.synth.scene_places import Building
-from log2sim.synth.shapes import cross_products
+from log2sim.synth.triangles import first_hit
 
 GROUND, BUILDING, EGO, AIR = -1, -2, -3, -4
-MAX_PAIRS_PER_BATCH = 400_000
-MIN_TRIANGLES_PER_GROUP, MAX_GROUPS = 16, 32  # measured on the meshes of road users
-SPHERE_MARGIN_M = 1e-5
 MESH_MARGIN_M = 1e-6  # rounding of a mesh that fills its box
 MIN_RANGE_M = 0.5
+BUILDING_REFLECTANCE = 0.35  # of plaster and brick at 905 nm
 USUAL_REFLECTANCE = np.float32(0.3)  # of what a mesh stands for, where weather decides what comes back
 MIN_GRAZING_SINE = 0.02  # of the angle to the ground below which no return comes back
 
@@ -74,8 +73,17 @@ def ray_pattern(spec: LidarSpec) -> tuple[Array, Array]:
     return directions, np.repeat(ago, len(elevation))
 
 
-def cast_sweep(spec: LidarSpec, moving: MovingScene, stamp_ns: int, rng: np.random.Generator) -> LabeledSweep:
-    """Cast the rays of one sweep; its stamp is its end, and every point is in the lidar frame at its own time."""
+def cast_sweep(
+    spec: LidarSpec,
+    moving: MovingScene,
+    stamp_ns: int,
+    rng: np.random.Generator,
+    ground: GroundReflectance | None = None,
+) -> LabeledSweep:
+    """Cast the rays of one sweep; its stamp is its end, and every point is in the lidar frame at its own time.
+
+    Returns have intensities where the reflectance of the ground is given.
+    """
     scene = moving.scene
     directions, ago_s = ray_pattern(spec)
     t_ns = stamp_ns - np.rint(ago_s * NS_PER_S).astype(np.int64)
@@ -104,8 +112,43 @@ def cast_sweep(spec: LidarSpec, moving: MovingScene, stamp_ns: int, rng: np.rand
     xyz = directions[keep] * (distance + noise)[keep, None]
     if spec.resolution_m > 0:
         xyz = np.rint(xyz / spec.resolution_m) * spec.resolution_m
+    met = _Returns(origin[keep], ray[keep], distance[keep], hit[keep])
+    intensity = None if ground is None else _intensity(met, scene, ground, rng)
     # Column after column in memory, which packs a quarter smaller.
-    return LabeledSweep(Sweep(stamp_ns, np.asfortranarray(xyz, dtype=np.float32), "lidar", t_ns[keep]), hit[keep])
+    points = np.asfortranarray(xyz, dtype=np.float32)
+    return LabeledSweep(Sweep(stamp_ns, points, "lidar", t_ns[keep], intensity=intensity), hit[keep])
+
+
+@dataclass(frozen=True, eq=False)
+class _Returns:
+    """Rays that came back, map frame.
+
+    Attributes
+    ----------
+    origin, ray : (N, 3) float64
+    distance_m : (N,) float64, m
+    hit : (N,) int64
+        As in `LabeledSweep`.
+    """
+
+    origin: Array
+    ray: Array
+    distance_m: Array
+    hit: NDArray[np.int64]
+
+
+def _intensity(met: _Returns, scene: Scene, ground: GroundReflectance, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Intensities (N,) of returns; what is no ground is taken to face the sensor."""
+    solid = [body_reflectance(agent.color) for agent in scene.agent]
+    # The last four are those of `GROUND`, `BUILDING`, `EGO` and `AIR`, counted from the end.
+    by_hit = [*solid, AIR_REFLECTANCE, body_reflectance(EGO_COLOR), BUILDING_REFLECTANCE, 0.0]
+    reflectance = np.array(by_hit, np.float32)[met.hit]
+    incidence = np.ones(len(met.hit), np.float32)
+    on = met.hit == GROUND
+    down, range_m = -met.ray[on, 2], met.distance_m[on]
+    xy = met.origin[on, :2] + met.ray[on, :2] * range_m[:, None]
+    reflectance[on], incidence[on] = ground.at(xy, spot_m(range_m, down)), down
+    return intensity_of(reflectance, incidence, rng)
 
 
 def _through_air(distance: Array, hit: NDArray[np.int64], weather: Weather, rng: np.random.Generator) -> None:
@@ -166,103 +209,3 @@ def _actor_distance(
     d = np.einsum("nij,nj->ni", agent_T_map[:, :3, :3], ray[rows])
     meets = np.isfinite(slab_distance(np.array(actor.spec.box_m) + 2 * MESH_MARGIN_M, o, d, from_inside=True))
     return rows[meets], first_hit(o[meets], d[meets], mesh.vertices_m[mesh.faces])
-
-
-def first_hit(origin: Array, ray: Array, triangles: Array) -> Array:
-    """Distance (N,) along rays (N, 3) to the nearest of triangles (F, 3 vertices, 3), inf where there is none.
-
-    Notes
-    -----
-    Moeller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection (1997); both sides of a triangle count. Triangles that
-    lie together share a sphere around them, and only rays that meet the sphere are tested against them, in batches of
-    bounded size.
-    """
-    out = np.full(len(ray), np.inf)
-    if len(ray) == 0 or len(triangles) == 0:
-        return out
-    groups = _groups_of(triangles)
-    ordered = triangles[np.concatenate(groups)]
-    ends = np.cumsum([len(rows) for rows in groups])
-    planes, (centers, radii) = _Planes.of(ordered), _spheres_around(ordered, ends)
-    moment, along_origin = cross_products(origin, ray), np.einsum("ni,ni->n", origin, ray)
-    square_origin = np.einsum("ni,ni->n", origin, origin)
-    for center, radius, rows, end in zip(centers, radii, groups, ends.tolist()):
-        along = ray @ center - along_origin
-        square = square_origin - 2 * (origin @ center) + center @ center
-        near = np.flatnonzero((square - along**2 <= radius**2) & (along >= -radius))
-        own = planes.part(end - len(rows), end)
-        step = max(1, MAX_PAIRS_PER_BATCH // len(rows))
-        for k in range(0, len(near), step):
-            some = near[k : k + step]
-            out[some] = np.minimum(out[some], own.nearest_hit(origin[some], ray[some], moment[some]))
-    return out
-
-
-def _groups_of(triangles: Array) -> list[NDArray[np.intp]]:
-    """Divide triangles (F, 3, 3) at medians into groups that lie together: the indices of each."""
-    middle, groups = triangles.mean(1), [np.arange(len(triangles))]
-    while len(groups[0]) > MIN_TRIANGLES_PER_GROUP and len(groups) < MAX_GROUPS:
-        halves = []
-        for rows in groups:
-            axis = int(np.ptp(middle[rows], axis=0).argmax())
-            order = rows[np.argsort(middle[rows, axis], kind="stable")]
-            halves += [order[: len(order) // 2], order[len(order) // 2 :]]
-        groups = halves
-    return groups
-
-
-def _spheres_around(triangles: Array, ends: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Centers (G, 3) and radii (G,) of spheres around groups of triangles (F, 3, 3) that end at `ends` (G,)."""
-    starts = np.concatenate([[0], ends[:-1]])
-    low, high = np.minimum.reduceat(triangles.min(1), starts), np.maximum.reduceat(triangles.max(1), starts)
-    # Larger by more than the rounding of the distances between rays and centers.
-    return (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2 + SPHERE_MARGIN_M
-
-
-@dataclass(frozen=True, eq=False)
-class _Planes:
-    """Triangles as what products with rays need.
-
-    Attributes
-    ----------
-    normal : (F, 3) float64
-        Product of the edges, not of unit length.
-    offset : (F,) float64
-        Of the planes along their normals.
-    edges : (2, F, 3) float64
-        Second and first edge, for both coordinates within a triangle.
-    moments : (2, F, 3) float64
-        Products of these edges with the first vertex.
-    """
-
-    normal: Array
-    offset: Array
-    edges: Array
-    moments: Array
-
-    @classmethod
-    def of(cls, triangles: Array) -> _Planes:
-        """Compute the planes of triangles (F, 3, 3)."""
-        a = triangles[:, 0]
-        e1, e2 = triangles[:, 1] - a, triangles[:, 2] - a
-        normal = cross_products(e1, e2)
-        edges = np.stack([e2, e1])
-        return cls(normal, np.einsum("fi,fi->f", a, normal), edges, cross_products(a[None], edges))
-
-    def part(self, start: int, end: int) -> _Planes:
-        """Take some of them."""
-        rows = slice(start, end)
-        return _Planes(self.normal[rows], self.offset[rows], self.edges[:, rows], self.moments[:, rows])
-
-    def nearest_hit(self, o: Array, d: Array, moment: Array) -> Array:
-        """Distance (N,) along rays to the nearest triangle, each tested against each; inf without one."""
-        determinant = -(d @ self.normal.T)
-        # (o - a) . (d x e) from the moments o x d of the rays and a x e of the edges.
-        u = moment @ self.edges[0].T + d @ self.moments[0].T
-        v = -(moment @ self.edges[1].T + d @ self.moments[1].T)
-        t = o @ self.normal.T - self.offset
-        solid = np.abs(determinant) > 1e-12
-        scale = np.divide(1.0, determinant, out=np.zeros_like(determinant), where=solid)
-        u, v, t = u * scale, v * scale, t * scale
-        inside = solid & (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (t > 0)
-        return np.asarray(np.where(inside, t, np.inf).min(1, initial=np.inf))

@@ -29,12 +29,13 @@ from log2sim.synth.scene import LidarSpec, Scene
 
 if TYPE_CHECKING:
     from log2sim.synth.lamps import Lamp
+    from log2sim.synth.reflectance import GroundReflectance
 
 Caster = Callable[[str, int], raycast.LabeledSweep]
 
 TRUTH_STEP_S = 0.05
 # Sweeps that were cast for the visibility of agents and are read next: memory for some hundred of 64 lines.
-MAX_CACHED_BYTES, BYTES_PER_RAY = 400_000_000, 28
+MAX_CACHED_BYTES, BYTES_PER_RAY = 400_000_000, 32
 GNSS_CORRELATION_S = 2.0  # time constant of the errors of GNSS and IMU
 
 
@@ -144,6 +145,16 @@ def _backdrop(scene: Scene, seed: int) -> Any:
     return Backdrop(scene, seed)
 
 
+@lru_cache(maxsize=2)
+def _ground_reflectance(scene: Scene, seed: int) -> GroundReflectance:
+    from log2sim.synth.ground import Ground
+    from log2sim.synth.light import light_of
+    from log2sim.synth.markings import GroundPlan
+    from log2sim.synth.reflectance import GroundReflectance
+
+    return GroundReflectance(Ground(GroundPlan.of(scene), seed), light_of(scene.environment).wetness)
+
+
 def _caster(moving: MovingScene, seed: int) -> Caster:
     """Return a function that casts sweep `i` of the LiDAR of a name; the last sweeps are cached."""
     specs = {spec.name: (index, spec) for index, spec in enumerate(moving.scene.lidar)}
@@ -153,7 +164,8 @@ def _caster(moving: MovingScene, seed: int) -> Caster:
     def cast(name: str, i: int) -> raycast.LabeledSweep:
         index, spec = specs[name]
         stamp = int(raycast.sweep_stamps(spec, moving.scene)[i])
-        return raycast.cast_sweep(spec, moving, stamp, np.random.default_rng([seed, 4, index, i]))
+        rng = np.random.default_rng([seed, 4, index, i])
+        return raycast.cast_sweep(spec, moving, stamp, rng, _ground_reflectance(moving.scene, seed))
 
     return cast
 
