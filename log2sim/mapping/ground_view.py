@@ -15,6 +15,7 @@ from log2sim.geometry import Array, Camera, distort, fold_radius, ground_homogra
 PYRAMID_LEVELS = 4
 # Opacity rises from the image border inwards over this share of the width, which feathers seams.
 FEATHER_SHARE = 0.04
+SAMPLES_A_ROW = 1024
 
 Image = NDArray[np.uint8]
 
@@ -133,16 +134,38 @@ def visible_window(
 
 
 def sample_colors(
-    image: Image, uv: tuple[NDArray[np.float32], NDArray[np.float32]], scale: NDArray[np.float32]
+    image: Image,
+    uv: tuple[NDArray[np.float32], NDArray[np.float32]],
+    scale: NDArray[np.float32],
+    wanted: NDArray[np.bool_] | None = None,
 ) -> Image:
-    """Sample colors at pixels, from higher levels of an image pyramid where a cell holds several pixels."""
+    """Sample colors at pixels, from higher levels of an image pyramid where a cell holds several pixels.
+
+    Parameters
+    ----------
+    image : (H, W, 3) uint8
+    uv : pair of (R, C) float32
+    scale : (R, C) float32
+        Pixels along a cell's edge.
+    wanted : (R, C) bool, optional
+        The others stay black.
+    """
     level = np.clip(np.rint(np.log2(np.maximum(scale, 1e-6))), 0, PYRAMID_LEVELS).astype(np.int8)
+    if wanted is not None:
+        level[~wanted] = -1
     out = np.zeros((*level.shape, 3), dtype=np.uint8)
-    for k in range(PYRAMID_LEVELS + 1):
+    for k in range(int(level.max(initial=0)) + 1):
         chosen = level == k
         if chosen.any():
-            factor = np.float32(0.5**k)
-            seen = cv2.remap(image, uv[0] * factor, uv[1] * factor, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            out[chosen] = seen[chosen]
-        image = np.asarray(cv2.pyrDown(image), dtype=np.uint8)
+            out[chosen] = _sample(image, uv[0][chosen] * np.float32(0.5**k), uv[1][chosen] * np.float32(0.5**k))
+        if k < PYRAMID_LEVELS:
+            image = np.asarray(cv2.pyrDown(image), dtype=np.uint8)
     return out
+
+
+def _sample(image: Image, u: NDArray[np.float32], v: NDArray[np.float32]) -> Image:
+    """Interpolate colors (N, 3) at pixels (N,); they are put into rows, since OpenCV takes no longer ones."""
+    rows = -(-len(u) // SAMPLES_A_ROW)
+    at = [np.resize(a, (rows, SAMPLES_A_ROW)) for a in (u, v)]
+    seen = cv2.remap(image, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(seen, dtype=np.uint8).reshape(-1, 3)[: len(u)]

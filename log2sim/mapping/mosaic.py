@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from log2sim.documents import refuse_existing, replaced
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
-from log2sim.mapping.ground_map import raster_of
 from log2sim.mapping.ground_view import (
     GroundView,
     Image,
@@ -27,6 +26,7 @@ from log2sim.mapping.ground_view import (
     signed_inverse,
     visible_window,
 )
+from log2sim.mapping.raster import Raster
 
 __all__ = ["BirdsEyeView", "GroundView", "Mosaic", "render_birdseye", "write_image"]
 
@@ -100,7 +100,8 @@ class Mosaic:
         coarsest_m: float = 0.6,
         frame: str = "map",
     ) -> None:
-        (rows, columns), self.extent_m = raster_of(extent_m, resolution_m)
+        raster = Raster.covering(extent_m, resolution_m)
+        (rows, columns), self.extent_m = raster.shape, raster.extent_m
         self.resolution_m = resolution_m
         self.coarsest_m = coarsest_m
         self.frame = frame

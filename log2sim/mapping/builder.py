@@ -1,0 +1,235 @@
+"""A map of the ground of a whole log: sweeps give its height and intensity, pictures warped onto that height its color."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.config_sections import MapConfig
+from log2sim.datatypes import Log, Scenario
+from log2sim.geometry import NS_PER_S, Array
+from log2sim.mapping.color_raster import ColorRaster, sample_mask
+from log2sim.mapping.ground_map import GroundMap
+from log2sim.mapping.ground_points import GroundPoints, PointCollector
+from log2sim.mapping.ground_view import Image
+from log2sim.mapping.picture_warp import View, find_hidden, warp_onto
+from log2sim.mapping.raster import Raster, coarsened_cell_m
+from log2sim.mapping.records import (
+    MAX_PICTURES,
+    MAX_SWEEPS,
+    PICTURE_STEP_M,
+    SWEEP_STEP_M,
+    choose_records,
+    extent_of,
+    path_of,
+    roadside_places,
+)
+from log2sim.mapping.reflectivity import map_intensity
+from log2sim.mapping.road_users import MASK_SHRINK, RoadUsers, draw_footprints, draw_outlines
+from log2sim.mapping.surface import Surface, estimate_surface, upsample
+from log2sim.perception.frames import RecordReader
+from log2sim.perception.picture_pass import look_again
+
+# Cells of heights along the edge of a cell of colors: curbs are 10 cm wide, and ten points lie on such a cell in a usual log.
+HEIGHT_CELL_M = 0.1
+# Half the width of a car: where the middle of the ego went, there is road this far to both sides.
+ROAD_HALF_WIDTH_M = 1.0
+# A sweep shows what hid the ground in a picture if both were taken within this time.
+MAX_APART_S = 0.15
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Ground:
+    """What sweeps show: the points on the ground, its surface, that on which pictures are laid, and by stamp what hides it."""
+
+    points: GroundPoints
+    surface: Surface
+    laid: Surface
+    hiding: Mapping[int, Array]
+
+
+class GroundMapBuilder:
+    """Make a map of the ground; it takes its pictures as a `PictureConsumer` and reads its sweeps itself.
+
+    Parameters
+    ----------
+    log : Log
+    scenario : Scenario
+        Its agents hide the ground: moving ones where they are at the time of a record, standing ones always.
+    settings : MapConfig
+    reader : RecordReader, optional
+        Reads the sweeps and counts those that cannot be read.
+    progress : callable, optional
+        Called as `progress(done, total)` while sweeps are read.
+
+    Attributes
+    ----------
+    notes : list of str
+        What could not be mapped, and why.
+
+    Raises
+    ------
+    LogError
+        When no pose is known.
+    """
+
+    def __init__(
+        self,
+        log: Log,
+        scenario: Scenario,
+        settings: MapConfig,
+        reader: RecordReader | None = None,
+        progress: Progress | None = None,
+    ) -> None:
+        self._log, self._scenario = log, scenario
+        self._reader, self._progress = reader or RecordReader(log), progress or (lambda done, total: None)
+        self._path = path_of(log, scenario)
+        roadside = roadside_places(log, scenario)
+        extent = extent_of(self._path, roadside)
+        cell_m = coarsened_cell_m(extent, settings.cell_m)
+        self.notes: list[str] = []
+        if cell_m > settings.cell_m:
+            size = f"{extent[1] - extent[0]:.0f} x {extent[3] - extent[2]:.0f} m"
+            self.notes.append(f"the log covers {size}: cells of {cell_m:g} m instead of {settings.cell_m:g} m")
+        self.raster = Raster.covering(extent, cell_m)
+        places = self._path if len(self._path) else roadside
+        self._anchors, self._z0_m = places, float(np.median(places[:, 2]))
+        self._sweeps = choose_records(log, scenario, list(log.lidars), SWEEP_STEP_M, MAX_SWEEPS)
+        self._frames = choose_records(log, scenario, self._cameras(), PICTURE_STEP_M, MAX_PICTURES)
+        stamps = [log.streams[name].t_ns[i] for name, i in (*self._sweeps.items(), *self._frames.items())]
+        self._users = RoadUsers(log, scenario, np.concatenate([*stamps, np.zeros(0, np.int64)]))
+        self._colors = ColorRaster(self.raster) if any(len(i) for i in self._frames.values()) else None
+
+    def frames(self) -> Mapping[str, NDArray[np.int64]]:
+        """Return the indices of the frames that the map is made of, by camera."""
+        return self._frames
+
+    def add(self, camera: str, index: int, image_bgr: Image) -> None:
+        """Add a picture (H, W, 3)."""
+        t_ns = int(self._log.streams[camera].t_ns[index])
+        map_T_cam, known = self._log.map_T_sensor(camera, t_ns)
+        if self._colors is None or not known[0]:
+            return
+        view = View(self._log, self._log.cameras[camera], t_ns, map_T_cam[0])
+        warp = warp_onto(view, self._ground.laid, self._z0_m, self.raster)
+        if warp is None:
+            return
+        users = draw_outlines(self._users.at(t_ns), view.camera, view.map_T_cam)
+        opacity = np.where(sample_mask(users, warp, MASK_SHRINK), 0, warp.opacity)
+        hiding = self._hiding_at(t_ns)
+        if hiding is not None:
+            opacity[find_hidden(view, warp, hiding)] = 0
+        if view.camera.mount == "ego":
+            ego = draw_footprints([self._users.ego_at(t_ns)], self.raster)[warp.rows, warp.columns]
+            opacity[ego > 0] = 0
+        self._colors.add(camera, image_bgr, warp, opacity.astype(np.float32))
+
+    def build(self) -> GroundMap:
+        """Return the map of all that was added."""
+        shape = self.raster.shape
+        if self._colors is None:
+            self.notes.append("no color: there is no picture with a known pose")
+            color, alpha = np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.uint8)
+        else:
+            color, alpha = self._colors.image()
+        standing = draw_footprints([self._users.standing()], self.raster) > 0
+        alpha[standing], color[standing] = 0, 0
+        height, intensity = self._measured()
+        for layer in (height, intensity):
+            layer[standing] = np.nan
+        return GroundMap(
+            color, alpha, height, intensity, self.raster.resolution_m, self.raster.extent_m, tuple(self.notes)
+        )
+
+    def _cameras(self) -> list[str]:
+        """Cameras that the scenario was made with; all of the log where it names none."""
+        used = [str(c["name"]) for c in self._scenario.cameras if c.get("used") and c["name"] in self._log.cameras]
+        return used or list(self._log.cameras)
+
+    @cached_property
+    def _ground(self) -> _Ground:
+        """Read the sweeps, when the first picture comes."""
+        factor = max(round(HEIGHT_CELL_M / self.raster.resolution_m), 1)
+        coarse = self.raster.coarser(factor)
+        chosen = [(name, int(i)) for name, indices in self._sweeps.items() for i in indices]
+        chosen.sort(key=lambda key: int(self._log.streams[key[0]].t_ns[key[1]]))
+        collector = PointCollector(self._log, coarse, len(chosen), self._z0_m)
+        for done, (name, i) in enumerate(chosen):
+            sweep = self._reader.get(name, i)
+            t_ns = int(self._log.streams[name].t_ns[i])
+            if sweep is not None and not self._reader.watch.lidars[name].repeated.get(t_ns, False):
+                hidden = draw_footprints([self._users.at(t_ns), self._users.ego_at(t_ns)], coarse)
+                collector.add(name, sweep, hidden)
+            self._progress(done + 1, len(chosen))
+        points = collector.points()
+        if not len(points.z):
+            self.notes.append(
+                "no height and no intensity: there is no sweep with ground; pictures are laid on flat ground"
+            )
+        elif not np.isfinite(points.intensity).any():
+            self.notes.append("no intensity: the sweeps of this log have none")
+        surface = estimate_surface(points, coarse, self._anchors, self._z0_m)
+        return _Ground(points, surface, surface.smoothed(), collector.hiding)
+
+    def _hiding_at(self, t_ns: int) -> Array | None:
+        """Return points (H, 3), m, map frame, of what stood above the ground at a time; None where no sweep is near."""
+        stamps = np.array(sorted(self._ground.hiding), dtype=np.int64)
+        near = stamps[np.abs(stamps - t_ns) <= MAX_APART_S * NS_PER_S]
+        return np.concatenate([self._ground.hiding[t] for t in near.tolist()]) if len(near) else None
+
+    def _measured(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Height, m, and intensity on the cells of the map (R, C), NaN where no sweep tells."""
+        ground, shape = self._ground, self.raster.shape
+        factor = round(ground.surface.raster.resolution_m / self.raster.resolution_m)
+        height = upsample(ground.surface.z_m, factor, shape) + np.float32(self._z0_m)
+        known = np.repeat(np.repeat(ground.surface.known, factor, axis=0), factor, axis=1)[: shape[0], : shape[1]]
+        height[~known] = np.nan
+        intensity = map_intensity(ground.points, ground.surface, self.raster, self._road(ground.surface.raster))
+        return height, intensity
+
+    def _road(self, raster: Raster) -> NDArray[np.bool_]:
+        """Mask (R, C) of the cells that the ego drove over."""
+        mask = np.zeros(raster.shape, dtype=np.uint8)
+        if len(self._path):
+            rows, columns = raster.cells_of(self._path[:, :2])
+            line = np.rint(np.stack([columns, rows], axis=1)).astype(np.int32)
+            cv2.polylines(mask, [line], False, 1, max(round(2 * ROAD_HALF_WIDTH_M / raster.resolution_m), 1))
+        return mask > 0
+
+
+def map_ground(
+    log: Log,
+    scenario: Scenario,
+    settings: MapConfig,
+    reader: RecordReader | None = None,
+    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+) -> GroundMap:
+    """Map the ground of a log.
+
+    Parameters
+    ----------
+    log : Log
+    scenario : Scenario
+        Its agents are left out of the map; its span of time is what is mapped.
+    settings : MapConfig
+    reader : RecordReader, optional
+        Counts the records that cannot be read.
+    progress : callable, optional
+        Called as `progress(stage, done, total)`.
+
+    Raises
+    ------
+    LogError
+        When no pose is known, or no record that is wanted can be read.
+    """
+    reader = reader or RecordReader(log)
+    builder = GroundMapBuilder(log, scenario, settings, reader, partial(progress, "map: sweeps"))
+    look_again(log, reader, [builder], partial(progress, "map: pictures"))
+    reader.require_some()
+    return builder.build()
