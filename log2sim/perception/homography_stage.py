@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,9 +14,11 @@ from log2sim.geometry import Array, Camera, ground_homography, inverse, wrap_ang
 from log2sim.perception.first_pass import Observations, base_pose
 from log2sim.perception.homography.camera_fit import fit_camera
 from log2sim.perception.homography.correspondences import Correspondences
-from log2sim.perception.homography.estimate import EstimationOptions
+from log2sim.perception.homography.estimate import STREAM_METHODS, EstimationOptions
 from log2sim.perception.homography.fit import HomographyFit, refused_fit
 from log2sim.perception.homography.placement import place_obstacle
+from log2sim.perception.homography.rig import Rig
+from log2sim.perception.homography.rig_fit import RigFit, fit_rig
 from log2sim.plan import HomographyScope, Plan
 
 # A box that ends nearer than this to the lower image border is cut by it and has no foot in the image.
@@ -31,6 +33,8 @@ MIN_RAYS, MAX_STOPPED_SHARE = 5, 0.25
 # Factor on the score of an obstacle where the LiDAR has rays but no points on it: it may continue a track and hardly
 # start one.
 UNCONFIRMED_SCORE = 0.5
+# Cameras of one pole are nearer to each other than an arm of its mast is long, horizontally.
+MAX_POLE_M = 5.0
 # Rays count as toward the obstacle between these shares of its height, clear of the ground and of its upper edge.
 RAY_HEIGHT_SHARES = (0.2, 0.8)
 
@@ -47,17 +51,28 @@ class CameraHomography:
         What it was fitted to, "calibration and flat ground" where a fit was refused, "none" where there is none.
     refusal : str
         Why the fit to the log was refused, "" otherwise.
+    rig : RigFit or None
+        What it was fitted together with; None for a camera that was fitted apart.
     """
 
     camera: Camera
     fit: HomographyFit
     source: str
     refusal: str = ""
+    rig: RigFit | None = None
+
+    def road_at_tick(self, tick: int) -> Array | None:
+        """Return the homography (3, 3) from the image to the ground for the road itself; None where there is none.
+
+        Fitted apart, it is that of the feet of obstacles.
+        """
+        return self.fit.at_tick(tick) if self.rig is None else self.rig.road_at_tick(self.camera.name, tick)
 
 
 def estimation_options(config: TopdownConfig) -> EstimationOptions:
     """Make the options of the estimator from the settings."""
-    return EstimationOptions(config.method, hypotheses=config.hypotheses or None)
+    together = config.rig == "together"
+    return EstimationOptions(config.method, hypotheses=config.hypotheses or None, together=together)
 
 
 def fit_homographies(
@@ -71,7 +86,67 @@ def fit_homographies(
     if plan.homography is HomographyScope.NONE:
         return {}
     wanted = set(plan.cameras) if plan.homography is HomographyScope.ALL_CAMERAS else _cameras_in_need(log, observed)
-    return {c: _fit_one(log, observed, c, options, rng) for c in plan.cameras if c in wanted}
+    together, why_apart = _fit_together(log, observed, plan, options, rng) if wanted else ({}, {})
+    apart = {c: _fit_one(log, observed, c, options, rng) for c in plan.cameras if c in wanted and c not in together}
+    apart = {c: replace(g, source=_source(g.source, why_apart.get(c, ""))) for c, g in apart.items()}
+    return {c: together[c] if c in together else apart[c] for c in plan.cameras if c in wanted}
+
+
+def _source(source: str, why_apart: str) -> str:
+    return f"{source} (apart: {why_apart})" if why_apart else source
+
+
+def _fit_together(
+    log: Log, observed: Observations, plan: Plan, options: EstimationOptions, rng: np.random.Generator
+) -> tuple[dict[str, CameraHomography], dict[str, str]]:
+    """Fit the cameras of each rig together; returns their homographies, and why the others are fitted apart, by camera."""
+    if not options.together or options.method not in STREAM_METHODS:
+        return {}, {}
+    found, why_apart = {}, {}
+    rigs, left_out = list_rigs(log, plan.cameras)
+    why_apart.update(left_out)
+    for names in rigs:
+        rig = Rig.of({c: log.cameras[c] for c in names}, log.ground_z_ego_m)
+        feet, ground = ({c: Correspondences.join(o.get(c, [])) for c in names} for o in (observed.feet, observed.ground))
+        fitted = fit_rig(rig, feet, ground, rng=rng)
+        for c in names:
+            fit = fitted.fits.get(c)
+            if fit is not None and fit.ok:
+                found[c] = CameraHomography(log.cameras[c], fit, f"obstacles and ground of {len(names)} cameras", "", fitted)
+            else:
+                why_apart[c] = fitted.reason if fit is None else fit.reason
+    return found, why_apart
+
+
+def list_rigs(log: Log, cameras: Sequence[str]) -> tuple[list[list[str]], dict[str, str]]:
+    """List the cameras that see one ground: those of the ego, and those of each place at the road.
+
+    Returns
+    -------
+    rigs : list of list of str
+    left_out : dict of str to str
+        Why a camera belongs to none.
+    """
+    left_out: dict[str, str] = {}
+    rigs: list[list[str]] = []
+    for name in cameras:
+        camera = log.cameras[name]
+        if calibrated_homography(log, camera) is None:
+            left_out[name] = "its mount does not say how high above the ground it is"
+        elif (camera.mount == "ego") == (log.ego is None):
+            left_out[name] = "it does not move with the ground positions"
+        else:
+            own = [rig for rig in rigs if _in_one_place(log.cameras[rig[0]], camera)]
+            if not own:
+                rigs.append([])
+            (own or rigs[-1:])[0].append(name)
+    left_out |= {rig[0]: "no other camera is in its place" for rig in rigs if len(rig) == 1}
+    return [rig for rig in rigs if len(rig) > 1], left_out
+
+
+def _in_one_place(a: Camera, b: Camera) -> bool:
+    """Return whether two cameras are on one vehicle or on one pole."""
+    return a.mount == "ego" or float(np.hypot(*(a.mount_T_cam - b.mount_T_cam)[:2, 3])) < MAX_POLE_M
 
 
 def _cameras_in_need(log: Log, observed: Observations) -> set[str]:

@@ -44,6 +44,8 @@ class EstimationOptions:
         Fit pitch and roll of each tick on top of the stream's homography, with "time-aware" and "calibrated".
     hypotheses : int or None
         Samples of four to draw, for the stream or for each frame; None for as many as the data need.
+    together : bool
+        Whether the cameras of a rig are fitted together, see `rig_fit`.
     sigma_px, sigma_m : float
         Assumed standard deviations of pixels and of ground positions; they are estimated anew from the inliers, within a
         factor of 4.
@@ -53,6 +55,7 @@ class EstimationOptions:
     K: Array | None = None
     pitch_roll: bool = False
     hypotheses: int | None = None
+    together: bool = False
     sigma_px: float = 1.5
     sigma_m: float = 0.1
 
