@@ -107,12 +107,16 @@ def _fit_together(
     why_apart.update(left_out)
     for names in rigs:
         rig = Rig.of({c: log.cameras[c] for c in names}, log.ground_z_ego_m)
-        feet, ground = ({c: Correspondences.join(o.get(c, [])) for c in names} for o in (observed.feet, observed.ground))
+        feet, ground = (
+            {c: Correspondences.join(o.get(c, [])) for c in names} for o in (observed.feet, observed.ground)
+        )
         fitted = fit_rig(rig, feet, ground, rng=rng)
         for c in names:
             fit = fitted.fits.get(c)
             if fit is not None and fit.ok:
-                found[c] = CameraHomography(log.cameras[c], fit, f"obstacles and ground of {len(names)} cameras", "", fitted)
+                found[c] = CameraHomography(
+                    log.cameras[c], fit, f"obstacles and ground of {len(names)} cameras", "", fitted
+                )
             else:
                 why_apart[c] = fitted.reason if fit is None else fit.reason
     return found, why_apart

@@ -99,8 +99,8 @@ def _step(
     of_camera = np.array([LIFT_SIGMA_M, *[MOUNT_SIGMA_RAD] * 3]) ** -2.0
     prior = np.concatenate([[BELOW_SIGMA_PX**-2.0], np.tile(of_camera, count)])
     value = np.array([state.below_px, *(v for n in rig.cameras for v in (state.lift_m[n], *state.feet[n]))])
-    covariance = np.linalg.inv(normal + np.diag(prior))
-    return -covariance @ (right + prior * value), covariance
+    covariance: Array = np.linalg.inv(normal + np.diag(prior))
+    return np.asarray(-covariance @ (right + prior * value)), covariance
 
 
 def _noise_factor(squared: Array, gate: float) -> float:
@@ -126,9 +126,7 @@ def _with_consensus(rig: Rig, rows: RigRows, state: RigState, planes: Array | No
         usable = np.abs(np.linalg.det(slope)) > 1e-9
         asked = -np.linalg.solve(slope[usable], linear.error[some][usable][:, :, None])[:, :, 0]
         candidates = np.concatenate([np.zeros((1, 2)), asked])
-        moved = linear.error[own] + np.einsum(
-            "nij,kj->kni", linear.slope[own][:, :, 2:4], candidates
-        )
+        moved = linear.error[own] + np.einsum("nij,kj->kni", linear.slope[own][:, :, 2:4], candidates)
         loss = np.minimum((moved**2).sum(axis=2), CHI2_2DOF_99).sum(axis=1)
         best = candidates[int(np.argmin(loss + (candidates**2).sum(axis=1) / MOUNT_SIGMA_RAD**2))]
         feet[name] = feet[name] + np.append(best, 0.0)

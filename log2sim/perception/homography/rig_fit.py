@@ -25,7 +25,7 @@ from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.fit import HomographyFit, PitchRoll, refused_fit
 from log2sim.perception.homography.rig import Rig, RigState, foot_homography, foot_sigma_m, road_homography
 from log2sim.perception.homography.rig_feet import FeetFit, fit_feet
-from log2sim.perception.homography.rig_plane import CHI2_1DOF_99, HeightRows, find_plane, tilt_of_ticks
+from log2sim.perception.homography.rig_plane import HeightRows, find_plane, tilt_of_ticks
 from log2sim.perception.homography.rig_rows import RigRows, heights_of
 from log2sim.perception.homography.stabilization import MIN_SIGNIFICANCE_SIGMA, HeldOutErrors
 from log2sim.perception.homography.validation import MIN_INLIER_SHARE, MIN_INLIERS
