@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.color_names import name_of
 from log2sim.datatypes import Agent, EgoVehicle, Lidar, Log, MapFrame, Scenario, Stream, Waypoints
 from log2sim.errors import ConfigError
 from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, rotation_from_rpy, transform, wrap_angle
@@ -211,7 +212,7 @@ def _truth(moving: MovingScene, t_s: Array, visible: NDArray[np.bool_] | None, s
                 waypoints=_waypoints(t_s, actor.at(t_s), None if visible is None else visible[:, index]),
                 static=actor.path is None,
                 rear_axle_offset_m=actor.spec.rear_axle_offset_m,
-                color={"rgb": rgb, "name": color_name(actor.spec.color)},
+                color={"rgb": rgb, "name": name_of(actor.spec.color)},
             )
         )
     origin = scene.origin
@@ -252,31 +253,6 @@ def _waypoints(t_s: Array, states: ActorStates, visible: NDArray[np.bool_] | Non
         sigma_xy_m=np.zeros(n),
         visible=visible,
     )
-
-
-# Names of hues by their upper end in degrees.
-_HUES = (
-    (20, "red"),
-    (45, "orange"),
-    (70, "yellow"),
-    (165, "green"),
-    (200, "cyan"),
-    (260, "blue"),
-    (330, "purple"),
-    (360, "red"),
-)
-
-
-def color_name(rgb: tuple[int, int, int]) -> str:
-    """Name an sRGB color as people do."""
-    import colorsys
-
-    hue, saturation, value = colorsys.rgb_to_hsv(*(c / 255 for c in rgb))
-    if value < 0.2:
-        return "black"
-    if saturation < 0.18:
-        return "white" if value > 0.85 else "silver" if value > 0.6 else "gray"
-    return next(name for end, name in _HUES if hue * 360 <= end)
 
 
 def _digest(scene: Scene, seed: int) -> str:
