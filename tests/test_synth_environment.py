@@ -10,6 +10,7 @@ from worlds import CAR, PARKED, tiny_log, tiny_scene
 
 from log2sim.geometry import transform
 from log2sim.synth.actors import MovingScene
+from log2sim.synth.backdrop import Backdrop
 from log2sim.synth.lamps import (
     BEAM_HALF_WIDTH,
     HEADLIGHT_REACH_M,
@@ -134,3 +135,55 @@ def test_rain_takes_less_than_fog_and_clear_weather_nothing() -> None:
     _, fog = sweep(weather="fog", visibility_m=50.0)
     assert (fog >= GROUND).sum() < (rain >= GROUND).sum()
     assert len(rain) > 0.9 * len(hit)
+
+
+def test_a_shadow_has_a_sharp_edge_that_lies_where_its_outline_does() -> None:
+    outline = [[8.0, -6.0], [8.0, 6.0], [14.0, 6.0], [14.0, -6.0]]
+    plain = {"road": [{"line": [[-10.0, 0.0], [60.0, 0.0]], "width_m": 14.0, "marking": "none"}]}
+    pictures = []
+    for changes in ({}, {"shadow": [{"outline": outline}]}):
+        log, _ = tiny_log([], observe=False, **plain, **changes)
+        pictures.append(log.streams["front"].read(0).astype(float).mean(2))
+    ratio = pictures[1] / pictures[0]
+    camera = log.cameras["front"]
+    pose = log.map_T_sensor("front", log.streams["front"].t_ns[:1])[0][0]
+
+    def at(x: float, y: float) -> float:
+        p = np.linalg.inv(pose) @ [x, y, 0.0, 1.0]
+        u, v = np.rint(camera.K[:2, :2].diagonal() * p[:2] / p[2] + camera.K[:2, 2]).astype(int)
+        return float(ratio[v - 1 : v + 2, u - 1 : u + 2].mean())
+
+    # Light falls to what the sky gives; a picture has its 2.2nd root, and haze is added.
+    dark = (1 - NOON.sun_share()) ** (1 / 2.2)
+    assert at(9.0, 0.0) == pytest.approx(dark, abs=0.05)
+    assert at(12.0, 2.0) == pytest.approx(dark, abs=0.05)
+    assert at(6.5, 0.0) == pytest.approx(1.0, abs=0.03)
+    assert at(7.75, 0.0) > 0.97 > at(8.25, 0.0) + 0.1
+
+
+def test_buildings_throw_shadows_away_from_the_sun_where_they_are_asked_to() -> None:
+    building = {"center": [20.0, -15.0], "size_m": [10.0, 10.0, 12.0]}
+    without, thrown = (
+        Backdrop(tiny_scene([], building=[{**building, "shadow": on}]), 0).shadows for on in (False, True)
+    )
+    assert without == ()
+    reach = np.array([20.0, -15.0]) - np.array(NOON.sun[:2]) / NOON.sun[2] * 12.0
+    low, high = thrown[0].min(0), thrown[0].max(0)
+    assert np.allclose(low, [15.0, -20.0])
+    assert np.allclose(high, reach + 5.0, atol=1e-4)
+
+
+def test_wet_ground_glares_below_headlights_that_come_and_only_where_it_is_asked_to() -> None:
+    oncoming = {"id": "car", "category": "car", "waypoints": [[25.0, 2.0, 3.0], [0.0, 2.0, 3.0]]}
+    pictures = []
+    for wet in ({}, {"wetness": 1.0}, {"wetness": 1.0, "glare": True}):
+        log, _ = tiny_log([oncoming], observe=False, environment={"light": "night", **wet})
+        pictures.append(log.streams["front"].read(0).astype(float).mean(2))
+    dry, wet, glaring = pictures
+    assert wet[200:].mean() < dry[200:].mean()  # a wet road is darker
+    added = glaring - wet
+    rows, columns = np.nonzero(added > 60)
+    assert len(rows) > 50
+    assert rows.min() > 150  # below the horizon
+    assert np.ptp(rows) > 1.5 * np.ptp(columns)  # a streak toward the camera
+    assert added.min() > -30

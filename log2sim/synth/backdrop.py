@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from log2sim.geometry import Array, box_corners_bev
 from log2sim.synth.grain import grain
 from log2sim.synth.ground import Ground
+from log2sim.synth.light import light_of
 from log2sim.synth.markings import GroundPlan
 from log2sim.synth.polytope_caster import Terrain
 from log2sim.synth.scene import Scene
@@ -65,6 +66,21 @@ class Backdrop:
         self.terrain: Terrain | None = None  # level
         self.ground = Ground(GroundPlan.of(scene), seed)
         self.buildings = tuple(_walls(building, (seed, 5, k)) for k, building in enumerate(scene.building))
+        sun = light_of(scene.environment).sun
+        thrown = [_shadow(building, sun) for building in scene.building if building.shadow]
+        self.shadows: tuple[Array, ...] = (*(_hull(np.array(s.outline)) for s in scene.shadow), *thrown)
+
+
+def _shadow(building: Building, sun: tuple[float, float, float]) -> Array:
+    """Outline (P, 2) of the shadow of a building."""
+    length, width, height = building.size_m
+    corners = box_corners_bev(np.array(building.center), length, width, np.deg2rad(building.yaw_deg))[0]
+    top = corners - np.divide(sun[:2], sun[2]) * height
+    return _hull(np.concatenate([corners, top]))
+
+
+def _hull(points: Array) -> Array:
+    return np.asarray(cv2.convexHull(points.astype(np.float32))[:, 0], np.float64)
 
 
 def _walls(building: Building, seed: tuple[int, ...]) -> tuple[Wall, ...]:

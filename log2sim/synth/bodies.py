@@ -173,9 +173,20 @@ def shade(view: RenderCamera, body: Body, lit: Lighting, fragments: Fragments) -
 
 
 def draw_shadows(
-    view: RenderCamera, bodies: Sequence[Body], lit: Lighting, color: Image, ground: NDArray[np.bool_]
+    view: RenderCamera,
+    bodies: Sequence[Body],
+    lit: Lighting,
+    color: Image,
+    ground: NDArray[np.bool_],
+    standing: Sequence[Array] = (),
 ) -> None:
-    """Darken the ground (H, W) in the shadow of bodies and, right below them, further."""
+    """Darken the ground (H, W) in the shadow of bodies and, right below them, further.
+
+    Parameters
+    ----------
+    standing
+        Convex outlines (P, 2), m, of further shadows on level ground.
+    """
     sun = np.zeros(ground.shape, np.uint8)
     sky = np.zeros(ground.shape, np.uint8)
     slope = np.divide(lit.light.sun[:2], lit.light.sun[2])
@@ -196,6 +207,10 @@ def draw_shadows(
             polygon = view.polygon(np.column_stack([hull, np.full(len(hull), floor)]).astype(float))
             if len(polygon):
                 cv2.fillConvexPoly(mask, polygon, 255, cv2.LINE_AA, 4)
+    for outline in standing:
+        polygon = view.polygon(np.column_stack([outline, np.zeros(len(outline))]))
+        if len(polygon):
+            cv2.fillConvexPoly(sun, polygon, 255, cv2.LINE_AA, 4)
     rows = np.flatnonzero(sun.any(1) | sky.any(1))
     if len(rows) == 0:
         return

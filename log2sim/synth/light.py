@@ -40,6 +40,8 @@ class Light:
         Of the camera, relative to daylight.
     exposure : float
         Relative to that of a night, at which lamps light the road well.
+    glare : bool
+        Whether wet ground mirrors the sun and lamps.
     """
 
     sun: Color
@@ -53,6 +55,7 @@ class Light:
     rain_mm_h: float = 0.0
     noise: float = 1.0
     exposure: float = 0.01
+    glare: bool = False
 
     def on_ground(self) -> NDArray[np.float32]:
         """Light (3,) that level ground under the open sky gives back relative to its dry color."""
@@ -117,7 +120,12 @@ def light_of(environment: Environment) -> Light:
 
     Rain takes light besides what clear air takes, fog so much more that the air does not count.
     """
-    light = LIGHTS[environment.light]
+    light = _in_weather(LIGHTS[environment.light], environment)
+    wetness = light.wetness if environment.wetness is None else environment.wetness
+    return replace(light, wetness=wetness, glare=environment.glare)
+
+
+def _in_weather(light: Light, environment: Environment) -> Light:
     if environment.weather == "clear":
         return light
     fog = environment.weather == "fog"

@@ -23,6 +23,7 @@ from log2sim.synth.raster import Fragments, ZBuffer, nearest_of
 from log2sim.synth.render_camera import RenderCamera
 from log2sim.synth.scenery import FAR_M, GAMMA, Image, draw_ground, draw_sky
 from log2sim.synth.terrain_view import draw_terrain
+from log2sim.synth.wet import mirror_lights
 
 LENS_BLUR_PX = 0.45
 GRAIN = 0.8  # standard deviation of the sensor's noise, of 255
@@ -68,6 +69,11 @@ class Scenery(Protocol):
         """Sides of each building."""
         ...
 
+    @property
+    def shadows(self) -> tuple[Array, ...]:
+        """Convex outlines (P, 2), m, of the shadows of what does not move."""
+        ...
+
 
 @dataclass(frozen=True, eq=False)
 class SceneInstant:
@@ -98,10 +104,12 @@ def render(camera: Camera, map_T_cam: Array, instant: SceneInstant, rng: np.rand
     else:
         draw_terrain(view, instant.backdrop.ground, instant.backdrop.terrain, light, color, depth)
     ground = depth.copy()
-    draw_shadows(view, instant.bodies, lit, color, ground < FAR_M)
+    draw_shadows(view, instant.bodies, lit, color, ground < FAR_M, instant.backdrop.shadows)
     draw_buildings(view, instant.backdrop.buildings, light, color, depth)
     light_scenery(view, lit.lamps, light, color, depth)
-    mirror_sky(view, light, color, (ground < FAR_M) & (depth == ground))
+    open_ground = (ground < FAR_M) & (depth == ground)
+    mirror_sky(view, light, color, open_ground)
+    mirror_lights(view, lit, color, depth, open_ground)
     color = light.hazy(color, depth)
     draw_bodies(view, instant.bodies, lit, color, depth)
     glare(view, lit.lamps, light, color, depth)

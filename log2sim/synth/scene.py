@@ -37,6 +37,8 @@ class Environment(Table):
     weather: Literal["clear", "rain", "fog"] = key("What is in the air.", "clear")
     visibility_m: Number = key("Meteorological visibility in fog.", 120.0, "m", ge=10, le=1000)
     rain_mm_h: Number = key("Rate of rain.", 15.0, "mm/h", ge=0.1, le=200)
+    wetness: Number | None = key("Wetness of the road; by default as the weather makes it.", None, "1", ge=0, le=1)
+    glare: Annotated[bool, Field(strict=True)] = key("Whether a wet road mirrors the sun and lamps.", False)
 
 
 class Ego(Table):

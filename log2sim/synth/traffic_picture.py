@@ -38,13 +38,14 @@ class TrafficBackdrop:
     ----------
     ground : Ground
     terrain : Terrain
-    buildings : tuple
+    buildings, shadows : tuple
         None; houses are bodies.
     """
 
     ground: Ground
     terrain: Terrain | None
     buildings: tuple[tuple[Wall, ...], ...] = ()
+    shadows: tuple[Array, ...] = ()
 
 
 class TrafficPainter:
