@@ -1,0 +1,204 @@
+"""Ridges of a map: where it is brighter than to both sides, as paint on a road is.
+
+A shadow's edge, a curb or the seam of two asphalts is a step: brighter than one side only. The lesser of the two contrasts
+is taken, therefore (symmetric local threshold: Veit, Tarel, Nicolle, Charbonnier, "Evaluation of road marking feature
+extraction", ITSC 2008), of means along 1 m in several directions, so that grain averages out and lines do not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from log2sim.geometry import Array
+from log2sim.lanes.layers import CoarseTile, Layer, coarse_factor, iterate_tiles
+from log2sim.mapping.ground_map import GroundMap
+
+DIRECTIONS = 12  # 15 deg apart: at worst a line of 0.12 m leaves the middle of the mean at its ends
+ALONG_M = 1.0
+# Lines of 0.1 to 0.15 m, wide ones of 0.25 to 0.3 m, stop lines and bars of crosswalks of 0.4 to 0.6 m.
+WIDTHS_M = (0.1, 0.3, 0.5)
+FLANK_M = 0.2  # bars of crosswalks are as little as 0.3 m apart
+GAP_M = 0.1  # between paint and flank: its blurred edge
+MARGIN_M = 2.0
+# Paint that is worn until one sees it no more is 1.1 times as bright as the road (values of pixels, with their gamma).
+MIN_CONTRAST = 0.1
+MIN_SIGMAS = 4.0  # of the same filter's response to the texture around
+BLOCK_M = 6.0  # texture is measured within
+MIN_SEEN = 0.7  # share of the cells under the filter
+MAX_POINTS = 400_000  # bound of memory: 40 km of lines
+HIGH_PASS_M = 1.5
+# Contrasts of ordinary paint to asphalt, as logarithms: pixel values 1.6 times as large (their gamma has reflectances 3 times
+# as large), LiDAR intensity 3 times.
+EXPECTED_COLOR, EXPECTED_INTENSITY = 0.5, 1.1
+
+
+@dataclass(frozen=True, eq=False)
+class RidgePoints:
+    """Points in the middle of ridges, one for each coarse cell along them.
+
+    Attributes
+    ----------
+    xy_map : (N, 2) float64, m
+    direction : (N,) float64
+        rad in [0, pi), map frame.
+    strength : (N,) float64
+        Response in sigmas of the texture.
+    """
+
+    xy_map: Array
+    direction: Array
+    strength: Array
+
+
+def find_ridges(ground: GroundMap) -> RidgePoints:
+    """Find points on ridges of color, LiDAR intensity, or both together."""
+    cell = ground.resolution_m * coarse_factor(ground)
+    margin = round(MARGIN_M / cell)
+    found = [_ridges_of(tile, cell) for tile in iterate_tiles(ground, margin)]
+    points = np.concatenate([np.zeros((0, 4)), *found])
+    if len(points) > MAX_POINTS:
+        points = points[np.argsort(-points[:, 3], kind="stable")[:MAX_POINTS]]
+    xy = np.stack(
+        [ground.extent_m[0] + (points[:, 0] + 0.5) * cell, ground.extent_m[3] - (points[:, 1] + 0.5) * cell], 1
+    )
+    return RidgePoints(xy, points[:, 2], points[:, 3])
+
+
+def _ridges_of(tile: CoarseTile, cell_m: float) -> Array:
+    """List column, row, direction and strength (N, 4) of ridge points of a tile, in cells of the coarse map."""
+    flat = _join(tile, cell_m)
+    response, direction, noise = _respond(flat, cell_m)
+    found = _crests(response / noise, direction, tile)
+    found[:, 0] += tile.origin[1]
+    found[:, 1] += tile.origin[0]
+    return found
+
+
+def _join(tile: CoarseTile, cell_m: float) -> Layer:
+    """Add both sensors' contrasts to the surroundings, each by what it tells of paint, in units of the camera's.
+
+    The best filter for known contrasts in independent noise weighs by contrast over variance.
+    """
+    color = _high_pass(tile.paint, tile.seen, cell_m)
+    if not np.any(tile.hit):
+        return color
+    # Means over what was hit within 3 x 3 cells: rings of LiDAR leave gaps.
+    hit = cv2.blur(tile.hit, (3, 3))
+    filled = np.divide(cv2.blur(tile.intensity * tile.hit, (3, 3)), hit, out=np.zeros_like(hit), where=hit > 1e-3)
+    intensity = _high_pass(filled, (hit > 1e-3).astype(np.float32), cell_m)
+    if not np.any(tile.seen):
+        return intensity
+    c, i = _spread(color, tile.seen), _spread(intensity, tile.hit)
+    ratio = (EXPECTED_INTENSITY / i**2) / (EXPECTED_COLOR / c**2)
+    share = 1 / (1 + ratio)
+    both = np.float32(share) * color + np.float32(1 - share) * intensity
+    return np.asarray(np.where(hit <= 1e-3, color, np.where(tile.seen > 0, both, intensity)), np.float32)
+
+
+def _spread(flat: Layer, valid: Layer) -> float:
+    """Sigma of cells by their median, at least that of rounded values."""
+    values = np.abs(flat[valid > 0])[::7]
+    return max(float(np.median(values)) / 0.6745, 0.03) if len(values) else 0.03
+
+
+def _high_pass(values: Layer, valid: Layer, cell_m: float) -> Layer:
+    """Subtract the mean around, so that what was not seen (0 now) looks like its surroundings."""
+    size = (2 * round(HIGH_PASS_M / cell_m) + 1,) * 2
+    share = cv2.blur(valid, size)
+    mean = np.divide(cv2.blur(values * valid, size), share, out=np.zeros_like(values), where=share > 1e-6)
+    return np.asarray(np.where(valid > 0, values - mean, 0), np.float32)
+
+
+def _respond(flat: Layer, cell_m: float) -> tuple[Layer, NDArray[np.uint8], Layer]:
+    """Find the strongest response of each cell (R, C), the number of its direction, and the sigma on texture."""
+    best = np.zeros(flat.shape, np.float32)
+    direction = np.zeros(flat.shape, np.uint8)
+    noise = np.ones_like(flat)
+    for k in range(DIRECTIONS):
+        there, back, size = _turn(flat.shape, np.pi * k / DIRECTIONS)
+        response, plain = _across(_warp(flat, there, size), cell_m)
+        if k == 0:
+            noise = _block_sigma(_warp(plain, back, (flat.shape[1], flat.shape[0])), cell_m)
+        response = _warp(response, back, (flat.shape[1], flat.shape[0]))
+        better = np.asarray(cv2.compare(response, best, cv2.CMP_GT), np.uint8)
+        cv2.max(response, best, dst=best)
+        direction[better > 0] = k
+    return best, direction, noise
+
+
+def _warp(image: Layer, matrix: Array, size: tuple[int, int]) -> Layer:
+    return np.asarray(cv2.warpAffine(image, matrix, size, flags=cv2.INTER_LINEAR), np.float32)
+
+
+def _across(turned: Layer, cell_m: float) -> tuple[Layer, Layer]:
+    """Respond to ridges along the rows: the lesser contrast of the best width, and the mean contrast of the least one."""
+    along = _blur(turned, max(1, round(ALONG_M / cell_m)), 1)
+    best, plain = np.zeros_like(along), np.zeros_like(along)
+    flank = _blur(along, 1, max(1, round(FLANK_M / cell_m)))
+    for k, width_m in enumerate(WIDTHS_M):
+        middle = max(1, round(width_m / cell_m)) | 1
+        # From the middle of the paint to that of the flank, whose own middle lies half a cell off if it is even.
+        reach = round((width_m / 2 + GAP_M / 2 + FLANK_M / 2) / cell_m + 0.25)
+        above, inner, below = flank[: -2 * reach], _blur(along, 1, middle)[reach:-reach], flank[2 * reach :]
+        np.maximum(best[reach:-reach], inner - np.maximum(above, below), out=best[reach:-reach])
+        if k == 0:
+            plain[reach:-reach] = inner - (above + below) / 2
+    return best, plain
+
+
+def _blur(image: Layer, columns: int, rows: int) -> Layer:
+    return np.asarray(cv2.blur(image, (columns, rows)), np.float32)
+
+
+def _turn(shape: tuple[int, ...], angle: float) -> tuple[Array, Array, tuple[int, int]]:
+    """Affine maps (2, 3) to an image whose rows run along an angle and back, and its size (columns, rows)."""
+    rows, columns = shape
+    c, s = abs(np.cos(angle)), abs(np.sin(angle))
+    size = (int(np.ceil(columns * c + rows * s)), int(np.ceil(columns * s + rows * c)))
+    # Counter-clockwise in the map is clockwise in rows that count downwards.
+    middle = (columns / 2 - 0.5, rows / 2 - 0.5)
+    there = np.asarray(cv2.getRotationMatrix2D(middle, -float(np.degrees(angle)), 1.0), np.float64)
+    there[:, 2] += (np.array(size) - (columns, rows)) / 2
+    return there, np.asarray(cv2.invertAffineTransform(there), np.float64), size
+
+
+def _block_sigma(plain: Layer, cell_m: float) -> Layer:
+    """Estimate the sigma (R, C) of the response to texture, by medians of blocks, as lines are few in each."""
+    block = max(8, round(BLOCK_M / cell_m / 2))
+    rows, columns = plain.shape
+    values = np.abs(plain[::2, ::2])
+    grid = np.full((-(-values.shape[0] // block), -(-values.shape[1] // block)), np.nan, np.float32)
+    for i, j in np.ndindex(grid.shape):
+        part = values[i * block : (i + 1) * block, j * block : (j + 1) * block]
+        part = part[part > 0]  # exactly 0 where nothing was seen
+        if part.size > 20:
+            grid[i, j] = np.median(part) / 0.6745
+    # A perfectly even ground has no texture: what then counts is the least contrast.
+    least = np.float32(MIN_CONTRAST / MIN_SIGMAS)
+    grid = np.maximum(np.where(np.isfinite(grid), grid, least), least)
+    return np.asarray(cv2.resize(cv2.blur(grid, (3, 3)), (columns, rows), interpolation=cv2.INTER_LINEAR), np.float32)
+
+
+def _crests(strength: Layer, direction: NDArray[np.uint8], tile: CoarseTile) -> Array:
+    """Keep cells that respond most across their direction: column, row, direction, strength (N, 4)."""
+    known = np.zeros(strength.shape, bool)
+    known[tile.core] = (tile.seen[tile.core] > MIN_SEEN) | (cv2.blur(tile.hit, (5, 5))[tile.core] > 0)
+    rows, columns = np.nonzero((strength > MIN_SIGMAS) & known)
+    angle = direction[rows, columns].astype(np.float64) * (np.pi / DIRECTIONS)
+    dx, dy = -np.sin(angle), -np.cos(angle)  # to the left of the direction; rows count downwards
+    here = strength[rows, columns].astype(np.float64)
+    sides = [
+        map_coordinates(strength, [rows + k * dy, columns + k * dx], order=1, mode="nearest").astype(np.float64)
+        for k in (-2, -1, 1, 2)
+    ]
+    crest = here >= np.max(sides, axis=0)
+    lower, upper = sides[1][crest], sides[2][crest]
+    bend = 2 * here[crest] - lower - upper
+    shift = np.divide(upper - lower, 2 * bend, out=np.zeros_like(bend), where=bend > 0).clip(-0.5, 0.5)
+    x, y = columns[crest] + shift * dx[crest], rows[crest] + shift * dy[crest]
+    return np.stack([x, y, angle[crest], here[crest]], 1)

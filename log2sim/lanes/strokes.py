@@ -1,0 +1,220 @@
+"""Paint along a curve: where there is some and where there is none, and whether that is a pattern of dashes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry import Array
+from log2sim.lanes.curves import Curve
+from log2sim.lanes.layers import sample
+from log2sim.mapping.ground_map import GroundMap
+
+STEP_M = 0.1
+SMOOTH_M = 0.5
+FLANKS_M = (0.08, 0.14, 0.2, 0.26)  # from the edge of the paint
+ON_SHARE = 0.4  # of the contrast that a line usually has where it is painted
+# Dashes and gaps are 1 m and more (MUTCD dotted lines: 2 ft dashes, 4 ft gaps; RMS: 1.5 m); flakes of worn paint are less.
+MIN_DASH_M, MIN_GAP_M = 0.5, 0.6
+MAX_DASH_M = 13.0  # Japan: 8 m; Germany: 6 m; ramps: 12 m
+LONG_M = 4.0
+# Periods of dashed lines: 2 m (MUTCD dotted lines: 6 ft) to 24 m.
+PERIODS_M, PHASE_M, MIN_BARE_M = (1.6, 26.0), 0.25, 0.8
+MIN_ON, MAX_OFF = 0.35, 0.12  # shares with paint within dashes and between them
+MIN_GAIN = 8.0  # nats, as a hundred periods at as many phases are tried
+SOLID_DASHES = 2.5  # a stroke so many times as long as the dashes beside it is a solid part
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """Paint along a curve, every `STEP_M`.
+
+    Attributes
+    ----------
+    s : (P,) float64, m
+    on : (P,) bool
+        Whether there is paint.
+    seen : (P,) bool
+        Whether a sensor saw the ground.
+    """
+
+    s: Array
+    on: NDArray[np.bool_]
+    seen: NDArray[np.bool_]
+
+    def strokes(self) -> Array:
+        """Begin and end (K, 2) of the parts with paint, m, without flakes and small gaps."""
+        runs = _runs(self.on)
+        merged: list[list[float]] = []
+        for begin, end in self.s[runs] + np.array([-STEP_M / 2, STEP_M / 2]) if len(runs) else ():
+            hidden = merged and not self._seen_between(merged[-1][1], begin)
+            if merged and (begin - merged[-1][1] < MIN_GAP_M or hidden):
+                merged[-1][1] = end
+            else:
+                merged.append([begin, end])
+        return np.array([m for m in merged if m[1] - m[0] >= MIN_DASH_M]).reshape(-1, 2)
+
+    def _seen_between(self, begin: float, end: float) -> bool:
+        between = self.seen[(self.s > begin) & (self.s < end)]
+        return not len(between) or float(np.mean(between)) > 0.5
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A part of a curve that is one marking.
+
+    Attributes
+    ----------
+    begin_m, end_m : float
+    kind : str
+        "solid" or "dashed".
+    painted_m : float
+        Length with paint.
+    dashes : int
+        Number of dashes, 1 for a solid line.
+    """
+
+    begin_m: float
+    end_m: float
+    kind: str
+    painted_m: float
+    dashes: int
+
+
+def trace(ground: GroundMap, curve: Curve, width_m: float) -> Trace:
+    """Look along a curve for paint of a width."""
+    length = float(curve.s[-1])
+    s = np.arange(STEP_M / 2, max(length, STEP_M), STEP_M)
+    xy = curve.at(s)
+    normal = Curve(xy).normal if len(xy) > 1 else np.zeros_like(xy)
+    inside = np.array([-width_m / 4, 0.0, width_m / 4])
+    sides = width_m / 2 + np.array(FLANKS_M)
+    across = np.concatenate([inside, -sides, sides])
+    seen = sample(ground, xy[:, :1] + normal[:, :1] * across[None, :], xy[:, 1:] + normal[:, 1:] * across[None, :])
+    by_color, by_lidar = (_ridge(a) for a in (seen.paint, seen.intensity))
+    soft = _normalized(by_color)
+    soft = np.where(np.isfinite(soft), soft, _normalized(by_lidar))
+    return Trace(s, np.nan_to_num(soft) > ON_SHARE, np.isfinite(soft))
+
+
+def _ridge(values: NDArray[np.float32]) -> Array:
+    """Contrast (P,) to the brighter side of samples (P, 3 inside + left + right)."""
+    each = len(FLANKS_M)
+    known = np.isfinite(values).astype(np.float32)
+    filled = np.nan_to_num(values)
+
+    def mean(part: slice) -> Array:
+        total, count = filled[:, part].sum(1, dtype=np.float64), known[:, part].sum(1)
+        # LiDAR hits few cells: those of 0.5 m along are taken together.
+        total, count = (cv2.blur(a.reshape(-1, 1), (1, 5)).ravel() for a in (total, count.astype(np.float64)))
+        return np.divide(total, count, out=np.full(len(total), np.nan), where=count > 0)
+
+    left, right = mean(slice(3, 3 + each)), mean(slice(3 + each, None))
+    return np.asarray(mean(slice(0, 3)) - np.fmax(left, right))
+
+
+def _normalized(contrast: Array) -> Array:
+    """Smooth contrasts (P,) and divide by what paint has; NaN where nothing is known."""
+    known = np.isfinite(contrast)
+    if np.count_nonzero(known) < 3:
+        return np.full(len(contrast), np.nan)
+    size = (1, 2 * round(SMOOTH_M / STEP_M / 2) + 1)
+    total, count = (
+        cv2.blur(a.reshape(-1, 1), size).ravel() for a in (np.nan_to_num(contrast), known.astype(np.float64))
+    )
+    soft = np.divide(total, count, out=np.zeros(len(total)), where=count > 0)
+    # Dashes of a quarter of the period (MUTCD: 10 ft of 40 ft): the upper eighth is the middle of their paint.
+    level = float(np.quantile(soft[known], 0.875))
+    return np.asarray(np.where(known, soft / (level if level > 0 else np.inf), np.nan), np.float64)
+
+
+def _runs(on: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """First and last index (K, 2) of each run."""
+    change = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(np.int8)))
+    return np.stack([change[::2], change[1::2] - 1], 1)
+
+
+def stretches_of(strokes: Array) -> list[Stretch]:
+    """Part strokes (K, 2) along a curve into solid and dashed stretches."""
+    out: list[Stretch] = []
+    solid: list[Array] = []
+    for part in _alike_parts(strokes):
+        if part[0, 1] - part[0, 0] <= MAX_DASH_M and is_dashed(part):
+            out += _solid_parts(solid)
+            solid = []
+            out.append(
+                Stretch(float(part[0, 0]), float(part[-1, 1]), "dashed", float(np.ptp(part, 1).sum()), len(part))
+            )
+        else:
+            solid += list(part)
+    return out + _solid_parts(solid)
+
+
+def _alike_parts(strokes: Array) -> list[Array]:
+    """Part strokes (K, 2) where much longer ones begin or end, as dashed lines become solid before a junction."""
+    length = strokes[:, 1] - strokes[:, 0]
+    short = length[length <= MAX_DASH_M]
+    dash = float(np.median(short)) if len(short) else 0.0
+    long = (length > SOLID_DASHES * dash) & (length > LONG_M) if len(short) > 1 else length > MAX_DASH_M
+    return np.split(strokes, np.flatnonzero(np.diff(long)) + 1) if len(strokes) else []
+
+
+def is_dashed(strokes: Array) -> bool:
+    """Whether strokes (K, 2) are dashes at one distance, some of them worn in part or altogether.
+
+    Notes
+    -----
+    The strokes are laid over each other by every possible period. Of a dashed line, the phases with paint are together,
+    and the others are bare: of the best period by likelihood that is to be so beyond chance.
+    """
+    if len(strokes) == 2:
+        length, gap = strokes[:, 1] - strokes[:, 0], strokes[1, 0] - strokes[0, 1]
+        return bool(length.max() < 1.4 * length.min() + 0.3 and gap >= MIN_BARE_M and length.max() <= MAX_DASH_M)
+    if len(strokes) < 2:
+        return False
+    s = np.arange(strokes[0, 0], strokes[-1, 1], STEP_M)
+    on = (np.searchsorted(strokes[:, 0], s, side="right") - np.searchsorted(strokes[:, 1], s, side="right")) > 0
+    best, gain = None, MIN_GAIN
+    for period in np.arange(*PERIODS_M, PHASE_M / 2):
+        if 1.5 * period > s[-1] - s[0]:
+            break
+        found = _fold(s, on, float(period))
+        if found is not None and found[0] > gain * 1.02:
+            gain, best = found[0], found
+    return best is not None and best[1] >= MIN_ON and best[2] <= MAX_OFF
+
+
+def _fold(s: Array, on: NDArray[np.bool_], period: float) -> tuple[float, float, float] | None:
+    """Gain in log-likelihood by dashes of a period, and the shares with paint within dashes and between them."""
+    bins = max(round(period / PHASE_M), 4)
+    phase = np.minimum((s % period / period * bins).astype(int), bins - 1)
+    count, painted = np.bincount(phase, minlength=bins), np.bincount(phase, on, minlength=bins)
+    rate = painted / np.maximum(count, 1)
+    inside = rate > 0.5 * rate.max()
+    if inside.all() or np.count_nonzero(inside != np.roll(inside, 1)) != 2 or period * (~inside).mean() < MIN_BARE_M:
+        return None
+    n1, k1 = count[inside].sum(), painted[inside].sum()
+    n0, k0 = count[~inside].sum(), painted[~inside].sum()
+    # Neighbors are not independent: flakes are as long as the smoothing.
+    gain = (_entropy(k1, n1) + _entropy(k0, n0) - _entropy(k1 + k0, n1 + n0)) * STEP_M / SMOOTH_M
+    return float(gain), float(k1 / n1), float(k0 / n0)
+
+
+def _entropy(k: float, n: float) -> float:
+    return float(sum(a * np.log(a / n) for a in (k, n - k) if a > 0))
+
+
+def _solid_parts(strokes: list[Array]) -> list[Stretch]:
+    """Join strokes to solid lines with worn places; where more is bare than painted, the line ends."""
+    out: list[list[float]] = []
+    for begin, end in strokes:
+        bare = begin - out[-1][1] if out else np.inf
+        if out and bare <= max(2.0, 0.5 * min(out[-1][2], 12.0)):
+            out[-1][1] = end
+            out[-1][2] += end - begin
+        else:
+            out.append([begin, end, end - begin])
+    return [Stretch(float(b), float(e), "solid", float(painted), 1) for b, e, painted in out]

@@ -1,0 +1,243 @@
+"""Markings are found in maps of the ground on which they are painted, and nowhere else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from painted_ground import ASPHALT, CONCRETE, GRASS, WHITE, YELLOW, Painter, dashes_of, line_of, outline_of
+from scipy.spatial import cKDTree
+
+from log2sim.geometry import Array
+from log2sim.lanes.curves import fit_curve, thin
+from log2sim.lanes.markings import find_markings
+from log2sim.lanes.strokes import is_dashed, stretches_of
+
+GRAVEL = (120, 125, 130)
+EXTENT = (0.0, 50.0, -10.0, 14.0)
+
+
+def bend(x: Array) -> Array:
+    return 0.002 * x**2
+
+
+def road(painter: Painter, **options) -> list[Array]:
+    """Paint two solid lines with two dashed ones between them; return their middles."""
+    truth = []
+    for offset, solid in ((-5.25, True), (-1.75, False), (1.75, False), (5.25, True)):
+        line = line_of(lambda x, o=offset: bend(x) + o, *painter.extent_m[:2])
+        painter.lines([line] if solid else dashes_of(line, 3.0, 6.0, 1.5), **({"width_m": 0.12} | options))
+        truth.append(line)
+    return truth
+
+
+def dense(xy: Array) -> Array:
+    s = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
+    return np.stack([np.interp(np.arange(0, s[-1], 0.1), s, xy[:, k]) for k in range(2)], 1)
+
+
+def compare(markings, truth: list[Array]) -> tuple[float, float, float]:
+    """Precision and recall of lane lines at 0.3 m, and the median error."""
+    found = np.concatenate([dense(m.points_m[:, :2]) for m in markings if m.is_lane_line])
+    true = np.concatenate([dense(line) for line in truth])
+    error, miss = cKDTree(true).query(found)[0], cKDTree(found).query(true)[0]
+    return float(np.mean(error < 0.3)), float(np.mean(miss < 0.3)), float(np.median(error))
+
+
+def shadows(painter: Painter) -> None:
+    rng = np.random.default_rng(5)
+    bands = []
+    for _ in range(6):
+        angle, middle = rng.uniform(0, np.pi), rng.uniform((0, -10), (50, 14))
+        reach = np.array([np.cos(angle), np.sin(angle)]) * rng.uniform(5, 20)
+        bands.append(outline_of(np.array([middle - reach, middle + reach]), rng.uniform(0.5, 8)))
+    shade = cv2.GaussianBlur(painter.cover(bands), (0, 0), 1.5)[..., None]
+    painter.color *= 1 - shade * 0.55 * np.array([0.92, 1, 1.03], np.float32)
+
+
+def sun_through_a_fence(painter: Painter) -> None:
+    bars = [outline_of(np.array([[10 + 0.55 * k, -8], [14 + 0.55 * k, 8]]), 0.3) for k in range(30)]
+    painter.color *= 1 - cv2.GaussianBlur(painter.cover(bars), (0, 0), 1.0)[..., None] * 0.5
+
+
+def wet_glare(painter: Painter) -> None:
+    x, y = painter.xy
+    for k in range(4):
+        middle = 15 + 10 * k
+        across, along = (y - 2 + k * 1.5 - 0.05 * (x - middle)) / 0.35, (x - middle) / 8
+        painter.color += (90 * np.exp(-(across**2) - along**2))[..., None]
+
+
+def night(painter: Painter) -> None:
+    x, y = painter.xy
+    light = 0.06 + 0.5 * np.exp(-(((x - 10) / 14) ** 2) - (y / 7) ** 2)
+    painter.color *= (light + 0.25 * np.exp(-(((x - 42) / 6) ** 2) - ((y + 6) / 6) ** 2))[..., None]
+
+
+def facade(painter: Painter) -> None:
+    painter.color[:] = (110, 130, 160)
+    for x in range(2, 30, 3):
+        for y in range(-9, 9, 3):
+            frame = np.array([[x, y], [x + 1.6, y], [x + 1.6, y + 1.9], [x, y + 1.9]])
+            painter.lay(painter.cover([frame]), (225, 225, 225))
+            inner = np.array([[0.12, 0.12], [-0.12, 0.12], [-0.12, -0.12], [0.12, -0.12]])
+            painter.lay(painter.cover([frame + inner]), (60, 50, 45))
+
+
+def paving(painter: Painter) -> None:
+    painter.color[:] = (150, 155, 158)
+    x, y = painter.xy
+    painter.color *= np.where((x % 1 < 0.04) | (y % 1 < 0.04), 0.86, 1)[..., None]
+
+
+@pytest.mark.parametrize("lidar", [True, False])
+@pytest.mark.parametrize(
+    "change", [None, shadows, sun_through_a_fence, wet_glare, night], ids=lambda c: c.__name__ if c else "day"
+)
+def test_lane_lines_are_found_where_they_are(change, lidar: bool) -> None:
+    painter = Painter(EXTENT)
+    truth = road(painter)
+    if change:
+        change(painter)
+    markings, _, _ = find_markings(painter.ground(lidar=lidar))
+    precision, recall, error = compare(markings, truth)
+    assert precision >= 0.95
+    assert recall >= 0.85
+    assert error <= 0.02
+    if change is None:
+        assert sorted(m.kind for m in markings) == ["dashed", "dashed", "solid", "solid"]
+        assert {m.color for m in markings} == {"white"}
+        assert {m.sources for m in markings} == {("camera", "lidar") if lidar else ("camera",)}
+        assert all(abs(m.width_m - 0.12) < 0.06 for m in markings)
+
+
+def test_worn_lines_are_found_in_part_and_none_is_invented() -> None:
+    painter = Painter(EXTENT)
+    truth = road(painter, worn=0.4)
+    precision, recall, error = compare(find_markings(painter.ground())[0], truth)
+    assert precision >= 0.95
+    assert recall >= 0.75
+    assert error <= 0.02
+
+
+def test_yellow_paint_on_bright_concrete_is_yellow() -> None:
+    painter = Painter(EXTENT, base=CONCRETE)
+    painter.lines([line_of(bend, 0, 50)], color=YELLOW)
+    (marking,) = find_markings(painter.ground(lidar=False))[0]
+    assert (marking.kind, marking.color) == ("solid", "yellow")
+
+
+def test_what_is_left_of_removed_lines_is_no_marking() -> None:
+    painter = Painter(EXTENT)
+    old = [line_of(lambda x, o=offset: bend(x) + o, 0, 50) for offset in (-4.35, -0.85, 2.65)]
+    painter.lines(old, color=(112, 112, 111))
+    painter.paint *= 0.1
+    truth = road(painter)
+    assert compare(find_markings(painter.ground(lidar=False))[0], truth)[0] >= 0.95
+
+
+@pytest.mark.parametrize("lidar", [True, False])
+@pytest.mark.parametrize("change", [shadows, sun_through_a_fence, wet_glare, paving], ids=lambda c: c.__name__)
+def test_nothing_is_found_where_nothing_is_painted(change, lidar: bool) -> None:
+    painter = Painter(EXTENT)
+    change(painter)
+    markings, _, notes = find_markings(painter.ground(lidar=lidar))
+    assert markings == ()
+    assert any("no markings seen" in note for note in notes)
+
+
+@pytest.mark.parametrize(("base", "grain"), [(ASPHALT, 0.05), (GRAVEL, 0.25), (GRASS, 0.3)])
+def test_textures_are_no_paint(base, grain: float) -> None:
+    assert find_markings(Painter(EXTENT, base=base).ground(grain=grain, lidar=False))[0] == ()
+
+
+def test_a_facade_is_no_road() -> None:
+    painter = Painter(EXTENT)
+    facade(painter)
+    assert find_markings(painter.ground())[0] == ()
+
+
+def test_a_map_of_nothing_says_so() -> None:
+    ground = Painter((0.0, 5.0, 0.0, 5.0)).ground(lidar=False)
+    markings, borders, notes = find_markings(replace(ground, alpha=ground.alpha * 0))
+    assert (markings, borders) == ((), ())
+    assert notes == ("no markings seen: no sensor saw the ground",)
+
+
+def test_crosswalk_stop_line_and_arrow_are_told_from_lane_lines() -> None:
+    painter = Painter(EXTENT)
+    painter.lines([line_of(lambda x: 3.5 + 0 * x, 0, 30), line_of(lambda x: 0 * x, 0, 30)])
+    painter.lines([np.array([[31.0, 0.2], [31.0, 3.3]])], 0.5)
+    painter.lines([np.array([[34.0, y], [38.0, y]]) for y in np.arange(-7, 8)], 0.5)
+    arrow = np.array([[10, -5.1], [13, -5.1], [13, -5.4], [14, -5.0], [13, -4.6], [13, -4.9], [10, -4.9]])
+    painter.lay(painter.cover([arrow]), WHITE, reflects=1.0)
+    markings = {m.kind: m for m in find_markings(painter.ground())[0]}
+    assert set(markings) == {"solid", "stop_line", "crosswalk", "other"}
+    stop, crosswalk, other = markings["stop_line"], markings["crosswalk"], markings["other"]
+    assert np.allclose(stop.points_m[:, 0], 31, atol=0.1)
+    assert abs(np.ptp(stop.points_m[:, 1]) - 3.1) < 0.5
+    area = cv2.contourArea(crosswalk.points_m[:, :2].astype(np.float32))
+    assert abs(crosswalk.width_m - 4) < 0.5
+    assert abs(area - 4 * 14.5) < 6
+    assert abs(cv2.contourArea(other.points_m[:, :2].astype(np.float32)) - 1.0) < 0.25
+
+
+def test_markings_turn_with_the_map() -> None:
+    painter = Painter((0.0, 30.0, -15.0, 15.0))
+    painter.lines([line_of(lambda x: 0.3 * x - 2, 0, 30)])
+    ground = painter.ground()
+    turned = replace(
+        ground,
+        **{
+            k: np.ascontiguousarray(np.rot90(getattr(ground, k)))
+            for k in ("color_bgr", "alpha", "height_m", "intensity")
+        },
+        extent_m=(-15.0, 15.0, 0.0, 30.0),
+    )
+    (before,), (after,) = find_markings(ground)[0], find_markings(turned)[0]
+    quarter = before.points_m[:, :2] @ np.array([[0.0, 1.0], [-1.0, 0.0]])
+    assert cKDTree(dense(after.points_m[:, :2])).query(dense(quarter))[0].max() < 0.08
+
+
+def test_height_of_the_ground_is_kept() -> None:
+    painter = Painter((0.0, 30.0, -5.0, 5.0))
+    painter.height += 7.0 + 0.05 * painter.xy[0].astype(np.float32)
+    painter.lines([line_of(lambda x: 0 * x, 0, 30)])
+    (marking,) = find_markings(painter.ground())[0]
+    assert np.allclose(marking.points_m[:, 2], 7 + 0.05 * marking.points_m[:, 0], atol=0.02)
+
+
+def test_a_curve_follows_a_clothoid_through_noisy_points() -> None:
+    rng = np.random.default_rng(0)
+    s = np.arange(0, 80, 0.5)
+    heading = s**2 / (2 * 60.0**2)
+    clothoid = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], 1) * 0.5, axis=0)
+    curve = fit_curve(clothoid + rng.normal(0, 0.03, clothoid.shape))
+    assert cKDTree(dense(clothoid)).query(curve.xy)[0].max() < 0.08
+    line = thin(curve.xy)
+    assert len(line) < len(curve.xy)
+    assert cKDTree(dense(line)).query(dense(curve.xy))[0].max() < 0.06
+
+
+@pytest.mark.parametrize(("on_m", "off_m"), [(3.0, 3.0), (3.0, 9.0), (6.0, 12.0), (1.0, 1.0)])
+def test_dashes_are_regular_even_when_some_are_gone(on_m: float, off_m: float) -> None:
+    begin = np.arange(12) * (on_m + off_m)
+    strokes = np.stack([begin, begin + on_m], 1)
+    assert is_dashed(strokes)
+    assert is_dashed(strokes[[0, 1, 2, 4, 5, 7, 8, 9, 10, 11]])
+    assert [s.kind for s in stretches_of(strokes)] == ["dashed"]
+
+
+def test_worn_solid_lines_are_not_dashed() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        edges = np.sort(rng.uniform(0, 60, 16)).reshape(-1, 2)
+        edges = edges[np.ptp(edges, 1) > 0.5]
+        assert not is_dashed(edges) or len(edges) < 4
+
+
+def test_a_solid_part_ends_a_dashed_line() -> None:
+    strokes = np.array([[0, 3], [6, 9], [12, 15], [18, 21], [24, 44]], float)
+    assert [s.kind for s in stretches_of(strokes)] == ["dashed", "solid"]
