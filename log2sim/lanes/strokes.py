@@ -118,7 +118,7 @@ def _ridge(values: NDArray[np.float32]) -> Array:
 
 def _normalized(contrast: Array) -> Array:
     """Smooth contrasts (P,) and divide by what paint has; NaN where nothing is known."""
-    known = np.isfinite(contrast)
+    known: NDArray[np.bool_] = np.isfinite(contrast)
     if np.count_nonzero(known) < 3:
         return np.full(len(contrast), np.nan)
     size = (1, 2 * round(SMOOTH_M / STEP_M / 2) + 1)
@@ -128,7 +128,9 @@ def _normalized(contrast: Array) -> Array:
     soft = np.divide(total, count, out=np.zeros(len(total)), where=count > 0)
     # Dashes of a quarter of the period (MUTCD: 10 ft of 40 ft): the upper eighth is the middle of their paint.
     level = float(np.quantile(soft[known], 0.875))
-    return np.asarray(np.where(known, soft / (level if level > 0 else np.inf), np.nan), np.float64)
+    soft = soft / level if level > 0 else np.zeros(len(soft))
+    soft[~known] = np.nan
+    return np.asarray(soft, np.float64)
 
 
 def _runs(on: NDArray[np.bool_]) -> NDArray[np.int64]:
