@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +28,7 @@ from log2sim.synth.labels import (
 )
 from log2sim.synth.map_truth import map_features_of
 from log2sim.synth.scene import LidarSpec, Scene
+from log2sim.synth.seen_ground import seen_ground
 
 if TYPE_CHECKING:
     from log2sim.synth.lamps import Lamp
@@ -76,6 +78,8 @@ def synthesize(scene: Scene, *, seed: int = 0, observe: bool = True) -> tuple[Lo
         t_ns = scene.start_ns + np.rint(t_s * NS_PER_S).astype(np.int64)
         visible = visible_at(t_ns, frames, sweeps, len(moving.actors))
     truth = _truth(moving, t_s, visible, seed)
+    if observe:
+        truth = replace(truth, provenance={**truth.provenance, "seen_ground": seen_ground(moving, cameras, cast)})
     log = Log(
         name=scene.name,
         format="synthetic",

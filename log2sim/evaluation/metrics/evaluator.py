@@ -9,6 +9,8 @@ import numpy as np
 
 from log2sim.datatypes import CATEGORIES, GROUPS, Scenario
 from log2sim.errors import ConfigError, ScenarioError
+from log2sim.evaluation.colors import color_figures
+from log2sim.evaluation.lanes.figures import map_figures
 from log2sim.evaluation.metrics.align import (
     StateTable,
     ego_states,
@@ -31,6 +33,7 @@ from log2sim.evaluation.metrics.pairs import Mask
 from log2sim.evaluation.metrics.per_agent import agent_rows, false_rows, ignored_rows, rounded_tree
 from log2sim.evaluation.metrics.rules import counting_rules, matching_rules
 from log2sim.evaluation.metrics.state_errors import median, root_mean_square, state_errors, summarize
+from log2sim.evaluation.signals import signal_figures
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.registry import nearest
 
@@ -91,6 +94,9 @@ def evaluate(
         "by_category": _by_category(compared),
         "correctness": correctness(compared, scenario.others, ticks_s, ego),
         "ego": _ego_figures(scenario, truth, ticks_s, truth_ticks_s, truth.shift_to(scenario)),
+        "map_features": map_figures(scenario, truth),
+        "colors": color_figures(compared, scenario.others, truth.others),
+        "signals": signal_figures(scenario, truth),
         "matching": matching_rules(),
         "counting": counting_rules(truth, MIN_COUNTED_S),
         "agents": agent_rows(true, ours, compared.match, compared.counted, compared.switched),

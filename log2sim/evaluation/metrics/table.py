@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from log2sim.evaluation.lanes.figures import map_lines
 from log2sim.evaluation.metrics.correctness_table import correctness_lines
 
 COLUMNS = (
@@ -24,7 +25,8 @@ COLUMNS = (
 def format_table(result: Mapping[str, Any]) -> str:
     """Format a result of `evaluate`: a line for all, for each range and category, and for the ego; '-' for None.
 
-    A second table says what is wrong with the agents, and the worst are named.
+    A second table says what is wrong with the agents, and the worst are named; lines below it tell of map features, colors of
+    vehicles and traffic lights.
     """
     lines = [("all", result)]
     lines += [(f"{name} m", figures) for name, figures in (result["by_range"] or {}).items()]
@@ -38,7 +40,8 @@ def format_table(result: Mapping[str, Any]) -> str:
         cells.append(["ego", "", *(_cell(ego[key], digits) if key in ego else "" for key, _, digits in COLUMNS)])
     widths = [max(len(row[k]) for row in cells) for k in range(len(cells[0]))]
     rows = [[row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:]))] for row in cells]
-    return "\n".join(["  ".join(row).rstrip() for row in rows] + correctness_lines(result["correctness"]))
+    below = [*correctness_lines(result["correctness"]), *map_lines(result)]
+    return "\n".join(["  ".join(row).rstrip() for row in rows] + below)
 
 
 def _cell(value: float | None, digits: int) -> str:

@@ -1,0 +1,1 @@
+"""Compares markings, borders, lanes, colors and traffic lights with the truth."""
