@@ -150,17 +150,18 @@ def test_a_shift_of_the_origin_is_stored(tmp_path: Path) -> None:
         back - a["tracks"]["ego"]["state"]["position"], [[5_407_123.25, -690_333.5, 0]] * 31, atol=1e-6
     )
     assert np.abs(b["tracks"]["ego"]["state"]["position"]).max() < 1000
-    polyline = b["map_features"]["lane_0"]["polyline"] + b["metadata"]["position_offset_m"]
+    polyline = b["map_features"]["lane-1"]["polyline"] + b["metadata"]["position_offset_m"]
     first = far.agents[0].waypoints
     assert np.hypot(polyline[:, 0] - first.x_m[0], polyline[:, 1] - first.y_m[0]).min() < 0.5
 
 
 def test_every_vehicle_drives_on_a_lane(tmp_path: Path) -> None:
-    """MetaDrive's map needs lanes; one is inferred along the ego's way, and more where others leave those."""
+    """MetaDrive's map needs lanes: the ego's and its follower's, one across it, and those of the junction."""
     follower, crossing = straight("follower", start=(-9.0, 0.2)), straight("crossing", start=(8.0, -6.0), yaw=np.pi / 2)
     scenario = world(straight("ego"), follower, crossing, straight("walker", "pedestrian", start=(0.0, 30.0)))
     features = described(scenario, tmp_path)["map_features"].values()
-    assert [f["inferred_from"] for f in features] == ["ego", "crossing"]
+    assert {f["inferred_from"] for f in features} == {"paths"}
+    assert {f["junction"] for f in features} == {None, "junction-1"}
     middles = np.concatenate([f["polyline"] for f in features])
     assert all(np.linalg.norm(np.diff(f["polyline"], axis=0), axis=1).max() < 1.001 for f in features)
     for agent in scenario.agents[:3]:

@@ -1,4 +1,4 @@
-"""Export to CommonRoad: lanelets under the paths, agents as obstacles, and the ego's task as planning problem.
+"""Export to CommonRoad: lanes as lanelets, agents as obstacles, and the ego's task as planning problem.
 
 Written without CommonRoad's own library: each year's release has other modules, all releases pin a protobuf version
 that conflicts with other packages, and its writer truncates decimals and dates files by the day of writing.
@@ -7,18 +7,20 @@ that conflicts with other packages, and its writer truncates decimals and dates 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from log2sim.datatypes import Agent, MapFrame, Scenario
+from log2sim.datatypes import Agent, MapFrame, MapLane, Scenario
 from log2sim.errors import ScenarioError
 from log2sim.export import xml_text
 from log2sim.export.csv_table import write_table
 from log2sim.export.exporters import Options
-from log2sim.export.roads.lanes import Lane, lanes
+from log2sim.export.roads.lanes import edges_of, lanes
+from log2sim.export.roads.marks import MarkFinder
 from log2sim.export.sampling import SampledMotion, sample_motion, sample_steps, step_times
 from log2sim.export.xml_text import element
 from log2sim.geometry import NS_PER_S, Array
@@ -37,6 +39,7 @@ TYPE_OF_CATEGORY = {
     "car": "car", "truck": "truck", "bus": "bus", "motorcycle": "motorcycle", "cyclist": "bicycle",
     "bicycle": "bicycle", "pedestrian": "pedestrian", "other": "unknown",
 }  # fmt: skip
+LINE_MARKING = {"solid": "solid", "broken": "dashed", "curb": "curb", "none": "no_marking"}
 # Static obstacles have types of their own, without pedestrians: those are dynamic obstacles that do not move.
 STATIC_TYPE = dict.fromkeys(("car", "truck", "bus", "motorcycle", "bicycle"), "parkedVehicle") | {"other": "unknown"}
 
@@ -56,8 +59,8 @@ class CommonRoad:
         name = f"ZAM_{_camel_case(scenario.name)}-1_1_T-1"
         root = _root(scenario, name)
         roads = lanes(scenario)
-        for number, lane in enumerate(roads, start=1):
-            root.append(_lanelet(lane, number))
+        number_of = {lane.id: number for number, lane in enumerate(roads, start=1)}
+        root.extend(_lanelet(lane, number_of, MarkFinder.of(scenario)) for lane in roads)
         first = len(roads) + 1
         table = [
             ("commonroad_id", "agent", "category", "role", "confidence", "doubts"),
@@ -135,13 +138,23 @@ def _location(frame: MapFrame) -> Element:
     return location
 
 
-def _lanelet(lane: Lane, number: int) -> Element:
-    lanelet = element("lanelet", id=str(number))
-    for tag, bound in zip(("leftBound", "rightBound"), lane.bounds_m):
+def _lanelet(lane: MapLane, number_of: Mapping[str, int], marks: MarkFinder) -> Element:
+    """Return a lane with its edges and the lanes before, behind and beside it."""
+    lanelet = element("lanelet", id=str(number_of[lane.id]))
+    for tag, bound, mark in zip(
+        ("leftBound", "rightBound"), edges_of(lane), (marks.left_of(lane), marks.right_of(lane))
+    ):
         parent = element(tag, lanelet)
         for point in bound:
             _point(parent, point)
-    return _texts(lanelet, laneletType="unknown")
+        _texts(parent, lineMarking=LINE_MARKING[mark.kind])
+    for tag, names in (("predecessor", lane.predecessors), ("successor", lane.successors)):
+        for name in names:
+            element(tag, lanelet, ref=str(number_of[name]))
+    for tag, beside in (("adjacentLeft", lane.left_lane), ("adjacentRight", lane.right_lane)):
+        if beside is not None:
+            element(tag, lanelet, ref=str(number_of[beside]), drivingDir="same")
+    return _texts(lanelet, laneletType="unknown" if lane.junction is None else "intersection")
 
 
 def _obstacle(agent: Agent, number: int, t_s: Array) -> Element | None:

@@ -18,8 +18,8 @@ from log2sim.datatypes import GROUP_OF, VERSION, Agent, Scenario
 from log2sim.errors import ScenarioError
 from log2sim.export.exporters import Options
 from log2sim.export.placement import near_origin
-from log2sim.export.roads.lanes import lanes
 from log2sim.export.sampling import SampledMotion, file_name, sample_steps, step_times
+from log2sim.export.scenarionet_map import map_features
 from log2sim.geometry import NS_PER_S, Array
 
 STEP_S = 0.1  # MetaDrive assumes this step
@@ -69,10 +69,7 @@ def describe(scenario: Scenario) -> Value:
     moves = {agent.id: sample_steps(agent, t_s, STEP_S) for agent in scenario.agents}
     tracks = {a.id: _track(a, moves[a.id], origin) for a in scenario.agents if moves[a.id].valid.any()}
     left_out = {a.id: "not alive at any step of the ego" for a in scenario.agents if a.id not in tracks}
-    features = {
-        f"lane_{k}": {"type": "LANE_SURFACE_STREET", "polyline": lane.points_m - origin, "inferred_from": lane.agent}
-        for k, lane in enumerate(lanes(scenario))
-    }
+    features = map_features(scenario, origin)
     metadata = {
         **_metadata(scenario, t_s),
         "sdc_id": ego.id,
@@ -151,7 +148,9 @@ def _object_summary(name: str, track: Value) -> Value:
 
 
 def _number_summary(objects: Value, features: Value) -> Value:
-    heights = np.concatenate([feature["polyline"][:, 2] for feature in features.values()])
+    heights = np.concatenate(
+        [feature["polyline" if "polyline" in feature else "polygon"][:, 2] for feature in features.values()]
+    )
     moving = [o["type"] for o in objects.values() if o["moving_distance"] > MOVED_M]
     kinds = [o["type"] for o in objects.values()]
     return {

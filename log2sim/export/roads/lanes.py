@@ -1,54 +1,58 @@
-"""Lanes as polylines, for formats that need a road under the vehicles: the driven lane of each inferred road."""
+"""The lanes under a scenario, for formats that need a road under the vehicles."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from log2sim.datatypes import Scenario
-from log2sim.export.roads.infer import InferredRoad, infer_roads
+from log2sim.datatypes import Agent, MapFeatures, MapLane, Scenario
 from log2sim.geometry import Array
+from log2sim.lanes.lane_graph import add_missing_lanes, infer_lanes
+from log2sim.lanes.polyline import Polyline
 
-SPACING_M = 1.0
+STANDING_M = 20.0
+"""Length of the lane under an agent that stands, where nobody moves: its whole vehicle is on it."""
+
+STANDING_WIDTH_M = 3.5
+"""Of that lane, as of lanes along paths."""
 
 
-@dataclass(frozen=True, eq=False)
-class Lane:
-    """A lane in its driving direction.
+def lanes(scenario: Scenario) -> tuple[MapLane, ...]:
+    """Return the lanes of a scenario: those of its map features, else inferred ones, and more where paths leave them.
 
-    Attributes
-    ----------
-    agent : str
-        Id of the agent whose path it follows.
-    points_m : (N, 3) float64
-        Center line on the ground, N >= 2.
-    heading_rad : (N,) float64
-    width_m : float
+    Where no vehicle moves, there is a straight one under the agent that moves farthest.
     """
-
-    agent: str
-    points_m: Array
-    heading_rad: Array
-    width_m: float
-
-    @property
-    def bounds_m(self) -> tuple[Array, Array]:
-        """The left and the right edge, (N, 3) each."""
-        left = np.stack([-np.sin(self.heading_rad), np.cos(self.heading_rad), np.zeros(len(self.heading_rad))], axis=-1)
-        return self.points_m + left * self.width_m / 2, self.points_m - left * self.width_m / 2
+    features = scenario.map_features or MapFeatures()
+    if features.lanes:
+        return add_missing_lanes(features.lanes, scenario)
+    found, _ = infer_lanes(features.markings, features.borders, scenario)
+    return found or (_lane_of_standing_agent(_first_agent(scenario)),)
 
 
-def lanes(scenario: Scenario) -> list[Lane]:
-    """Return a lane along the ego's path, and one for each other inferred road; the ego's first."""
-    return [_lane(road) for road in infer_roads(scenario)]
+def _first_agent(scenario: Scenario) -> Agent:
+    vehicles = [a for a in scenario.agents if a.category != "pedestrian"] or list(scenario.agents)
+    return scenario.ego or max(
+        vehicles, key=lambda a: float(np.hypot(np.ptp(a.waypoints.x_m), np.ptp(a.waypoints.y_m)))
+    )
 
 
-def _lane(road: InferredRoad) -> Lane:
-    stations = np.linspace(0.0, road.line.length_m, max(int(np.ceil(road.line.length_m / SPACING_M)), 1) + 1)
-    points = road.line.at(stations)
-    row = np.maximum(np.searchsorted(road.elevation[:, 0], stations, side="right") - 1, 0)
-    start, a, b, c, d = road.elevation[row].T
-    along = stations - start
-    height = a + along * (b + along * (c + along * d))
-    return Lane(road.name, np.column_stack([points[:, :2], height]), points[:, 2], road.lane_m)
+def _lane_of_standing_agent(agent: Agent) -> MapLane:
+    w = agent.waypoints
+    x, y, yaw = (float(np.mean(v)) for v in (w.x_m, w.y_m, np.unwrap(w.yaw_rad)))
+    ground = float(np.mean(w.z_m)) - agent.size_m[2] / 2
+    ahead = np.array([-STANDING_M / 2, STANDING_M / 2])
+    points = np.column_stack([x + ahead * np.cos(yaw), y + ahead * np.sin(yaw), [ground, ground]])
+    return MapLane(
+        "lane-1",
+        points,
+        np.full(2, max(STANDING_WIDTH_M, agent.size_m[1] + 0.8)),
+        inferred_from="paths",
+        confidence=0.0,
+    )
+
+
+def edges_of(lane: MapLane) -> tuple[Array, Array]:
+    """Return the left and the right edge (N, 3) of a lane, point by point."""
+    heading = Polyline(lane.points_m).heading_rad
+    left = np.column_stack([-np.sin(heading), np.cos(heading), np.zeros(len(heading))])
+    half = lane.width_m[:, None] / 2
+    return lane.points_m + left * half, lane.points_m - left * half

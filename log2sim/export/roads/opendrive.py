@@ -12,7 +12,9 @@ from log2sim.datatypes import MapFrame, Scenario
 from log2sim.errors import ConfigError
 from log2sim.export.placement import ExportPlacement, near_origin, on_map
 from log2sim.export.roads.checks import require_roads
-from log2sim.export.roads.infer import InferredRoad, infer_roads
+from log2sim.export.roads.lanes import lanes
+from log2sim.export.roads.marks import MarkFinder, RoadMark
+from log2sim.export.roads.network import Network, Road, build_network
 from log2sim.export.xml_text import element, escaped, number, read, require_number, write
 
 FILE_NAME = "road.xodr"
@@ -80,8 +82,9 @@ def _require_near(root: Element, scenario: Scenario, placement: ExportPlacement,
 def document(scenario: Scenario, placement: ExportPlacement) -> Element:
     """Return the OpenDRIVE document of a scenario's roads, with the same origin as the agents."""
     x0, y0, _ = placement.origin_m
-    roads = infer_roads(scenario)
-    ends = np.concatenate([r.line.at(np.linspace(0.0, r.line.length_m, 50))[:, :2] for r in roads]) - [x0, y0]
+    network = build_network(lanes(scenario))
+    spread = [r.line.at(np.linspace(0.0, r.line.length_m, 50))[:, :2] for r in network.roads]
+    ends = np.concatenate(spread) - [x0, y0]
     (west, south), (east, north) = ends.min(axis=0), ends.max(axis=0)
     root = element("OpenDRIVE")
     header = element(
@@ -89,8 +92,11 @@ def document(scenario: Scenario, placement: ExportPlacement) -> Element:
         north=number(north), south=number(south), east=number(east), west=number(west),
     )  # fmt: skip
     _add_place(header, scenario.map, placement)
-    for k, road in enumerate(roads):
-        _add_road(root, road, k + 1, placement)
+    marks = MarkFinder.of(scenario)
+    for road in network.roads:
+        _add_road(root, road, placement, marks)
+    for junction, name in network.junctions.items():
+        _add_junction(root, junction, name, network)
     return root
 
 
@@ -103,11 +109,17 @@ def _add_place(header: Element, frame: MapFrame, placement: ExportPlacement) -> 
         element("offset", header, x=number(x), y=number(y), z=number(z), hdg="0")
 
 
-def _add_road(root: Element, road: InferredRoad, road_id: int, placement: ExportPlacement) -> None:
+def _add_road(root: Element, road: Road, placement: ExportPlacement, marks: MarkFinder) -> None:
     x0, y0, z0 = placement.origin_m
     parent = element(
-        "road", root, name=escaped(road.name), length=number(road.line.length_m, LENGTH_DIGITS), id=str(road_id), junction="-1", rule="RHT"
+        "road", root, name=escaped(" ".join(lane.id for lane in road.lanes)), length=number(road.line.length_m, LENGTH_DIGITS),
+        id=str(road.number), junction=str(road.junction or -1), rule="RHT",
     )  # fmt: skip
+    links = element("link", parent)
+    for tag, link, point in (("predecessor", road.before, "end"), ("successor", road.after, "start")):
+        if link is not None:
+            there = {"contactPoint": point} if link.kind == "road" else {}
+            element(tag, links, elementType=link.kind, elementId=str(link.number), **there)
     plan = element("planView", parent)
     for piece in road.line.pieces:
         geometry = element(
@@ -122,32 +134,43 @@ def _add_road(root: Element, road: InferredRoad, road_id: int, placement: Export
     for s, a, *rest in road.elevation:
         _add_cubic(profile, "elevation", "s", s, [a - z0, *rest])
     element("lateralProfile", parent)
-    _add_lanes(parent, road)
+    _add_lanes(parent, road, marks)
 
 
-def _add_lanes(parent: Element, road: InferredRoad) -> None:
-    """Add lane -1 centered on the reference line, and one lane on either side of it where the road has them."""
-    lanes = element("lanes", parent)
-    _add_cubic(lanes, "laneOffset", "s", 0.0, [road.lane_m / 2, 0.0, 0.0, 0.0])
-    section = element("laneSection", lanes, s="0")
-    if road.left_m > 0:
-        _add_lane(element("left", section), 1, road.left_m, "solid")
+def _add_lanes(parent: Element, road: Road, marks: MarkFinder) -> None:
+    """Add lanes -1, -2, ... to the right of the left edge of the first."""
+    parts = element("lanes", parent)
+    for s, *rest in road.offset:
+        _add_cubic(parts, "laneOffset", "s", s, rest)
+    section = element("laneSection", parts, s="0")
     middle = element("lane", element("center", section), id="0", type="none", level="false")
-    _add_mark(middle, "broken" if road.left_m > 0 else "solid")
+    _add_mark(middle, marks.left_of(road.lanes[0]))
     right = element("right", section)
-    _add_lane(right, -1, road.lane_m, "broken" if road.right_m > 0 else "solid")
-    if road.right_m > 0:
-        _add_lane(right, -2, road.right_m, "solid")
+    for row, (lane, widths) in enumerate(zip(road.lanes, road.widths)):
+        node = element("lane", right, id=str(-1 - row), type="driving", level="false")
+        links = element("link", node)
+        for tag, link in (("predecessor", road.before), ("successor", road.after)):
+            if link is not None and -1 - row in link.lanes:
+                element(tag, links, id=str(link.lanes[-1 - row]))
+        for s, *rest in widths:
+            _add_cubic(node, "width", "sOffset", s, rest)
+        _add_mark(node, marks.right_of(lane))
 
 
-def _add_lane(parent: Element, lane_id: int, width_m: float, mark: str) -> None:
-    lane = element("lane", parent, id=str(lane_id), type="driving", level="false")
-    _add_cubic(lane, "width", "sOffset", 0.0, [width_m, 0.0, 0.0, 0.0])
-    _add_mark(lane, mark)
+def _add_mark(lane: Element, mark: RoadMark) -> None:
+    element(
+        "roadMark", lane, sOffset="0", type=mark.kind, weight="standard", color=mark.color, width=number(mark.width_m, 3)
+    )  # fmt: skip
 
 
-def _add_mark(lane: Element, kind: str) -> None:
-    element("roadMark", lane, sOffset="0", type=kind, weight="standard", color="white", width="0.12")
+def _add_junction(root: Element, junction: int, name: str, network: Network) -> None:
+    parent = element("junction", root, name=escaped(name), id=str(junction), type="default")
+    for k, connection in enumerate(c for c in network.connections if c.junction == junction):
+        node = element(
+            "connection", parent, id=str(k), incomingRoad=str(connection.incoming),
+            connectingRoad=str(connection.connecting), contactPoint="start",
+        )  # fmt: skip
+        element("laneLink", node, **{"from": str(connection.lane), "to": "-1"})
 
 
 def _add_cubic(parent: Element, tag: str, station: str, s: float, coefficients: list[float]) -> None:

@@ -21,6 +21,9 @@ MAX_POINTS = 20_000
 # RMS distances of the points from the spline that are tried, from the smoothest curve to interpolation.
 SIGMAS_M = (*(SPLINE_M / 2 * 0.7**k for k in range(8)), 0.0)
 MAX_PARAMETER_SPEED = 1.2
+# Lines are bent over so much of them to begin and end where others do; straight ones that differ by less stay as they are.
+PIN_M = 8.0
+EXACT_M, EXACT_RAD = 1e-6, 1e-6
 # An arc with a smaller sagitta is written as a line.
 MAX_LINE_SAGITTA_M = 1e-6
 
@@ -118,8 +121,14 @@ def straight(x_m: float, y_m: float, heading_rad: float, length_m: float) -> Ref
     return joined_pieces([(*start, heading_rad, length_m, 0.0)])
 
 
-def fit(xy_m: Array) -> tuple[ReferenceLine, Array]:
+def fit(xy_m: Array, start: Array | None = None, end: Array | None = None) -> tuple[ReferenceLine, Array]:
     """Fit lines and arcs to points (N, 2), at least two, in order along the path.
+
+    Parameters
+    ----------
+    xy_m : (N, 2) float64, m
+    start, end : (3,) float64 or None
+        x, y, heading with which the line begins and ends exactly, next to the first and last point.
 
     Returns
     -------
@@ -134,6 +143,8 @@ def fit(xy_m: Array) -> tuple[ReferenceLine, Array]:
     Cost: a banded least-squares problem per spline, and O(N log N) for the arcs.
     """
     samples, sample_of_point = _spline(xy_m)
+    if start is not None or end is not None:
+        samples, sample_of_point = _pinned(samples, sample_of_point, start, end)
     ends = _longest_biarcs(samples)
     steps, stations = [], np.zeros(len(samples))
     s = 0.0
@@ -145,6 +156,40 @@ def fit(xy_m: Array) -> tuple[ReferenceLine, Array]:
         stations[i : j + 1] = s + travelled / travelled[-1] * length
         s += length
     return joined_pieces(steps), np.interp(sample_of_point, np.arange(len(samples)), stations)
+
+
+def _pinned(samples: Array, rows: Array, start: Array | None, end: Array | None) -> tuple[Array, Array]:
+    """Bend samples (M, 3) over up to `PIN_M` so that they begin and end as told; `rows` (N,) are those of points in them."""
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(samples[:, :2], axis=0).T))])
+    if len(samples) == 2:  # of a straight line only the ends are there
+        if all(pose is None or _is_at(samples[k], pose) for k, pose in ((0, start), (-1, end))):
+            return samples, rows
+        share = np.linspace(0.0, 1.0, max(int(np.ceil(way[-1] / SAMPLE_M)), 2) + 1)
+        samples = samples[0] + share[:, None] * (samples[1] - samples[0])
+        rows, way = rows * (len(share) - 1), share * way[-1]
+    moved = samples.copy()
+    reach = min(PIN_M, way[-1])
+    for k, pose, since, sign in ((0, start, way, 1.0), (-1, end, way[-1] - way, -1.0)):
+        if pose is None:
+            continue
+        u = np.clip(since / reach, 0.0, 1.0)
+        turn = float(np.angle(np.exp(1j * (pose[2] - samples[k, 2]))))
+        fade, swing = (1 - u) ** 2 * (1 + 2 * u), u * (1 - u) ** 2 * reach
+        left = np.array([-np.sin(samples[k, 2]), np.cos(samples[k, 2])])
+        moved[:, :2] += fade[:, None] * (pose[:2] - samples[k, :2]) + sign * turn * swing[:, None] * left
+    steps = np.gradient(moved[:, :2], way, axis=0) - np.gradient(samples[:, :2], way, axis=0)
+    heading = samples[:, 2]
+    moved[:, 2] = heading + steps[:, 1] * np.cos(heading) - steps[:, 0] * np.sin(heading)
+    for k, pose in ((0, start), (-1, end)):
+        if pose is not None:
+            moved[k, :2] = pose[:2]
+            moved[k, 2] = samples[k, 2] + np.angle(np.exp(1j * (pose[2] - samples[k, 2])))
+    return moved, rows
+
+
+def _is_at(sample: Array, pose: Array) -> bool:
+    turn = np.angle(np.exp(1j * (pose[2] - sample[2])))
+    return bool(np.hypot(*(pose[:2] - sample[:2])) < EXACT_M and abs(turn) < EXACT_RAD)
 
 
 def _spline(xy_m: Array) -> tuple[Array, Array]:

@@ -1,0 +1,208 @@
+"""Infers lanes: from markings where there are some, from the paths of vehicles elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import count
+
+import numpy as np
+
+from log2sim.datatypes import MapLane, Marking, RoadBorder, Scenario
+from log2sim.lanes.junction_areas import join_conflicts
+from log2sim.lanes.beside import find_beside
+from log2sim.lanes.conflicts import find_conflicts, find_transitions, is_lane_change
+from log2sim.lanes.connections import Connection, connect, continuations
+from log2sim.lanes.coverage import find_uncovered
+from log2sim.lanes.driven_paths import DrivenPath, collect_paths
+from log2sim.lanes.extension import continued
+from log2sim.lanes.lane_changes import without_lane_changes
+from log2sim.lanes.matching import Match
+from log2sim.lanes.polyline import Polyline
+from log2sim.lanes.routes import JOIN_M, Route, match_path, merge_paths
+from log2sim.lanes.sections import Strip, cut_sections, lay_out
+from log2sim.lanes.thinning import thin
+
+PATH_PROBABILITY = 0.6
+"""That there is a lane where one vehicle surely drove: others overtake, turn into yards or pass obstacles."""
+
+MAX_CONFIDENCE = 0.95
+"""Paths alone never prove a lane."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Graph:
+    """Sections and connections, and what they came from."""
+
+    routes: Sequence[Route]
+    strips: Sequence[Strip]
+    connections: Sequence[Connection]
+    drivers: Sequence[Sequence[str]]
+    crossing: frozenset[int]
+
+
+def infer_lanes(
+    markings: Sequence[Marking], borders: Sequence[RoadBorder], scenario: Scenario
+) -> tuple[tuple[MapLane, ...], tuple[str, ...]]:
+    """Infer the lanes of a scenario, linked to each other, and notes on what is missing.
+
+    Lanes lie between markings and borders that run side by side, in the direction of the traffic on them; where there are none
+    they follow the paths of vehicles, those of two-wheelers only where nobody else drove. The paths of several vehicles
+    in one lane make one lane; it branches where they part, merges where they meet, and where they cross is a junction. Every
+    path lies within the width of some lane.
+
+    Notes
+    -----
+    Routes are merged from paths (`merge_paths`), cut where they conflict (`find_conflicts`) into sections that lie side by side
+    (`lay_out`), and the ways of the vehicles from one section to the next become connections (`connect`).
+    """
+    driven = collect_paths(scenario)
+    if not driven:
+        return (), ("no lanes from paths: no vehicle moves",)
+    paths = without_lane_changes(driven)
+    graph = _graph(merge_paths(paths), paths)
+    lanes = _as_lanes(graph, {path.agent: path.confidence for path in driven})
+    return _with_opposites([*lanes, *_free_lanes(lanes, driven)]), ()
+
+
+def _graph(routes: Sequence[Route], paths: Sequence[DrivenPath]) -> _Graph:
+    seen = [match_path(routes, path) for path in paths]
+    whole = [continued(routes, path, match) for path, match in zip(paths, seen)]
+    matches = [match_path(routes, path) for path in whole]
+    beside = find_beside([route.line for route in routes])
+    areas = join_conflicts(routes, find_conflicts(routes, whole, matches), beside)
+    sections = cut_sections(routes, areas, beside, _passed_ends(routes, whole, matches))
+    strips = lay_out(routes, sections, beside)
+    drivers: list[list[str]] = [[] for _ in strips]
+    for path, match in zip(paths, seen):
+        for k, strip in enumerate(strips):
+            rows = [slice(run.first, run.last + 1) for run in match.runs if run.route == strip.section.route]
+            s = np.concatenate([match.s_m[r] for r in rows]) if rows else np.zeros(0)
+            if np.any((s > strip.section.first_m) & (s < strip.section.last_m)) and path.agent not in drivers[k]:
+                drivers[k].append(path.agent)
+    return _Graph(routes, strips, connect(routes, strips, whole, matches), drivers, areas.crossing)
+
+
+def _passed_ends(
+    routes: Sequence[Route], paths: Sequence[DrivenPath], matches: Sequence[Match]
+) -> set[tuple[int, bool]]:
+    """Return the routes whose start (True) or end (False) some path passes, coming from or going to another."""
+    passed = set()
+    for path, match in zip(paths, matches):
+        for one, two in find_transitions(match):
+            if is_lane_change(routes, path, one, two):
+                continue
+            if match.s_m[two.first] < JOIN_M:
+                passed.add((two.route, True))
+            if routes[one.route].line.length_m - match.s_m[one.last] < JOIN_M:
+                passed.add((one.route, False))
+    return passed
+
+
+def _as_lanes(graph: _Graph, confidence_of: dict[str, float]) -> list[MapLane]:
+    """Return sections and connections as lanes with their links."""
+    first = len(graph.strips)
+    links = [(c.origin, first + k) for k, c in enumerate(graph.connections)]
+    links += [(first + k, c.target) for k, c in enumerate(graph.connections)]
+    links += continuations(graph.strips)
+    names = [f"lane-{k + 1}" for k in range(first + len(graph.connections))]
+    after: list[list[str]] = [[] for _ in names]
+    before: list[list[str]] = [[] for _ in names]
+    for a, b in links:
+        after[a].append(names[b])
+        before[b].append(names[a])
+    junction_of = _junctions(graph)
+    lanes = []
+    for k, strip in enumerate(graph.strips):
+        route = graph.routes[strip.section.route]
+        origin = "both" if route.marked and graph.drivers[k] else "markings" if route.marked else "paths"
+        lanes.append(
+            MapLane(
+                names[k],
+                strip.line.points_m,
+                strip.width_m,
+                route.left,
+                route.right,
+                tuple(before[k]),
+                tuple(after[k]),
+                None if strip.left is None else names[strip.left],
+                None if strip.right is None else names[strip.right],
+                inferred_from=origin,
+                confidence=_confidence(graph.drivers[k], confidence_of),
+            )
+        )
+    for k, way in enumerate(graph.connections, start=first):
+        lanes.append(
+            MapLane(
+                names[k],
+                way.line.points_m,
+                way.width_m,
+                predecessors=tuple(before[k]),
+                successors=tuple(after[k]),
+                junction=junction_of.get(way.area),
+                inferred_from="paths",
+                confidence=_confidence(way.agents, confidence_of),
+            )
+        )
+    return [thin(lane) for lane in _meeting(lanes, links)]
+
+
+def _junctions(graph: _Graph) -> dict[int, str]:
+    """Name the areas in which lanes cross, branch or merge."""
+    busy = set()
+    for area in {c.area for c in graph.connections}:
+        ways = [c for c in graph.connections if c.area == area]
+        branches = len({c.origin for c in ways}) < len(ways) or len({c.target for c in ways}) < len(ways)
+        if branches or (area in graph.crossing and len(ways) > 0):
+            busy.add(area)
+    order = list(dict.fromkeys(c.area for c in graph.connections if c.area in busy))
+    return {area: f"junction-{k + 1}" for k, area in enumerate(order)}
+
+
+def _confidence(agents: Sequence[str], confidence_of: dict[str, float]) -> float:
+    missing = float(np.prod([1 - PATH_PROBABILITY * confidence_of.get(agent, 0.0) for agent in agents]))
+    return round(min(1 - missing, MAX_CONFIDENCE), 3)
+
+
+def _meeting(lanes: Sequence[MapLane], links: Sequence[tuple[int, int]]) -> list[MapLane]:
+    """Let linked lanes meet in exactly the same point."""
+    points = [lane.points_m.copy() for lane in lanes]
+    for a, b in links:
+        points[b][0] = points[a][-1]
+    return [replace(lane, points_m=p) for lane, p in zip(lanes, points)]
+
+
+def add_missing_lanes(lanes: Sequence[MapLane], scenario: Scenario) -> tuple[MapLane, ...]:
+    """Return lanes and, where paths of a scenario's vehicles leave them, more without links."""
+    return (*lanes, *_free_lanes(lanes, collect_paths(scenario)))
+
+
+def _free_lanes(lanes: Sequence[MapLane], paths: Sequence[DrivenPath]) -> list[MapLane]:
+    """Return lanes without links over what is left of paths outside the lanes."""
+    found: list[MapLane] = []
+    taken = {lane.id for lane in lanes}
+    for path in paths:
+        for points, width in find_uncovered([*lanes, *found], path):
+            line = Polyline.through(points)
+            name = next(n for k in count(len(lanes) + len(found) + 1) if (n := f"lane-{k}") not in taken)
+            taken.add(name)
+            confidence = round(min(PATH_PROBABILITY * path.confidence, MAX_CONFIDENCE), 3)
+            full = np.full(len(line.points_m), width)
+            found.append(thin(MapLane(name, line.points_m, full, inferred_from="paths", confidence=confidence)))
+    return found
+
+
+def _with_opposites(lanes: Sequence[MapLane]) -> tuple[MapLane, ...]:
+    """Name for each lane the one beside it that leads the other way, along at least half of it."""
+    flat = [k for k, lane in enumerate(lanes) if lane.junction is None]
+    lines = [Polyline.through(lanes[k].points_m) for k in flat]
+    best: dict[int, tuple[float, int]] = {}
+    for pair in find_beside(lines):
+        length = float(pair.s_m[-1] - pair.s_m[0])
+        if not pair.same_way and length >= lines[pair.route].length_m / 2:
+            best[pair.route] = max(best.get(pair.route, (0.0, -1)), (length, pair.other))
+    found = list(lanes)
+    for k, (_, other) in best.items():
+        if best.get(other, (0.0, -1))[1] == k:
+            found[flat[k]] = replace(found[flat[k]], opposite=lanes[flat[other]].id)
+    return tuple(found)
