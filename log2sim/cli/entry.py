@@ -18,6 +18,7 @@ from log2sim.cli import (
     export,
     import_,
     inspect,
+    map,
     plot,
     predict,
     reconstruct,
@@ -61,6 +62,7 @@ for command in (
 ):  # fmt: skip
     app.command()(command)
 app.command(name="import")(import_.import_)
+app.command(name="map")(map.map_)
 
 
 def main() -> None:

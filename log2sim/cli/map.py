@@ -1,0 +1,96 @@
+"""Make a map of the ground of a log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from log2sim.cli.options import Format, LogPath, Overwrite, Quiet, Sequence, say
+
+if TYPE_CHECKING:
+    from log2sim.datatypes import Log, Scenario
+
+
+def map_(
+    log: LogPath,
+    out: Annotated[
+        Path,
+        typer.Option("--out", metavar="FILE", help="Map to write: .tif (GeoTIFF), .png or .jpg (with a world file)."),
+    ],
+    scenario: Annotated[
+        Path | None,
+        typer.Option(metavar="SCENARIO", help="Scenario of the log; its agents are left out of the map."),
+    ] = None,
+    layer: Annotated[str, typer.Option(help="What is written: color, intensity (of the LiDAR), height.")] = "color",
+    cell: Annotated[float, typer.Option(metavar="M", help="Edge of a cell, in m.")] = 0.05,
+    format: Format = "auto",
+    sequence: Sequence = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Make a map of the ground of a log: its color, its height, or how strongly it reflects the LiDAR."""
+    from typing import cast
+
+    from log2sim.cli.progress import progress
+    from log2sim.config import Config
+    from log2sim.documents import check_targets
+    from log2sim.errors import ConfigError
+    from log2sim.logs.opening import open_log
+    from log2sim.mapping.builder import map_ground
+    from log2sim.mapping.files import HEIGHT_STEP_M, LAYERS, Layer, check_name, lowest_m, world_file_of, write_map
+    from log2sim.mapping.geokeys import geokeys_of
+    from log2sim.outputs import together
+    from log2sim.perception.frames import RecordReader
+
+    check_name(out)
+    check_targets(out, world_file_of(out), overwrite=overwrite)
+    if layer not in LAYERS:
+        raise ConfigError(f"--layer: '{layer}' is none of {', '.join(LAYERS)}")
+    chosen, settings = cast(Layer, layer), Config.load(map={"cell_m": cell}).map
+    opened = open_log(log, format=format, sequence=sequence)
+    opened, loaded, note = _agents_of(opened, log, scenario)
+    for line in (*opened.notes, *((note,) if note else ())):
+        say(f"note: {line}", quiet=quiet)
+    reader = RecordReader(opened)
+    with progress(quiet=quiet) as report_progress:
+        ground = map_ground(opened, loaded, settings, reader, report_progress)
+    with together():
+        write_map(ground, out, chosen, opened.map, overwrite=overwrite)
+    notes = [
+        *ground.notes,
+        *(f"{name}: {u['count']} records could not be read" for name, u in reader.summary().items()),
+    ]
+    problem = geokeys_of(opened.map).problem
+    notes += [f"no place on Earth: {problem}"] if problem else []
+    if chosen == "height" and out.suffix.lower() == ".png":
+        notes.append(
+            f"heights in {out.name}: value 1 is {lowest_m(ground):.2f} m, {HEIGHT_STEP_M:g} m a step, 0 is unknown"
+        )
+    for line in notes:
+        say(f"note: {line}", quiet=quiet)
+    rows, columns = ground.alpha.shape
+    d = ground.resolution_m
+    say(f"{out}: {columns * d:.0f} x {rows * d:.0f} m in cells of {d:g} m", quiet=quiet)
+
+
+def _agents_of(log: Log, path: Path, scenario: Path | None) -> tuple[Log, Scenario, str | None]:
+    """Return the log as the scenario places it, the agents to leave out, and what is to be said of them."""
+    from log2sim.datatypes import Scenario
+    from log2sim.localization.choice import localize_like
+
+    if scenario is not None:
+        loaded = Scenario.load(scenario)
+        return localize_like(log, loaded.provenance), loaded, None
+    if log.labels is not None:
+        from log2sim.evaluation.metrics.truth import truth_from_log
+
+        return log, truth_from_log(log), "without --scenario only agents with labels are left out of the map"
+    from log2sim.geometry import NS_PER_S
+
+    stamps = [stream.t_ns for stream in log.streams.values() if len(stream.t_ns)]
+    first = min((int(t[0]) for t in stamps), default=0)
+    last = max((int(t[-1]) for t in stamps), default=0)
+    whole = Scenario(log.name, first, (last - first) / NS_PER_S, (), log.map)
+    return log, whole, "no agent is left out of the map: the log has no labels; pass --scenario to leave out its agents"
