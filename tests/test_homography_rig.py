@@ -143,7 +143,9 @@ def test_predicted_errors_are_those_over_many_worlds() -> None:
     errors, sigmas = [], []
     for seed in range(12):
         world, rng = make_world(noise_px=4.0, seed=seed, ticks=10, each=8), np.random.default_rng(seed)
-        world.feet = {n: replace(c, xy_ego=c.xy_ego + rng.normal(0, 0.2, c.xy_ego.shape)) for n, c in world.feet.items()}
+        world.feet = {
+            n: replace(c, xy_ego=c.xy_ego + rng.normal(0, 0.2, c.xy_ego.shape)) for n, c in world.feet.items()
+        }
         fit = world.fit()
         for name, camera in world.cameras.items():
             axis = camera.mount_T_cam[:2, 2] / np.hypot(*camera.mount_T_cam[:2, 2])

@@ -13,7 +13,7 @@ import tifffile
 
 from log2sim.datatypes import MapFrame
 from log2sim.errors import ConfigError, LogError
-from log2sim.mapping.files import lowest_m, read_png_map, write_map
+from log2sim.mapping.files import lowest_m, read_png_map, world_file_of, write_map, write_world_file
 from log2sim.mapping.geokeys import geokeys_of
 from log2sim.mapping.ground_map import GroundMap
 
@@ -115,6 +115,9 @@ def test_a_png_and_its_world_file_are_read_back_to_the_same_place(tmp_path: Path
     frame = MapFrame(projection=PROJECTIONS["kitti"], offset_m=(1000.0, 2000.0, 0.0))
     ground = small_map()
     write_map(ground, tmp_path / "m.png", "color", frame)
+    world = world_file_of(tmp_path / "m.png")
+    assert world is not None
+    write_world_file(ground, world, frame)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["m.pgw", "m.png"]
     d, _, _, down, x, y = (float(line) for line in (tmp_path / "m.pgw").read_text().split())
     assert (d, down) == (0.5, -0.5)
@@ -136,10 +139,10 @@ def test_a_png_of_heights_has_steps_of_a_centimeter(tmp_path: Path) -> None:
 def test_names_of_other_formats_and_existing_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"\.tif"):
         write_map(small_map(), tmp_path / "m.bmp")
-    (tmp_path / "m.pgw").write_text("mine")
+    (tmp_path / "m.png").write_text("mine")
     with pytest.raises(ConfigError, match="--overwrite"):
         write_map(small_map(), tmp_path / "m.png")
-    assert [p.name for p in tmp_path.iterdir()] == ["m.pgw"]
+    assert (tmp_path / "m.png").read_text() == "mine"
     write_map(small_map(), tmp_path / "m.png", overwrite=True)
 
 
@@ -149,7 +152,6 @@ def test_names_of_other_formats_and_existing_files_are_refused(tmp_path: Path) -
 )  # fmt: skip
 def test_a_map_without_a_usable_world_file_is_refused(world: str | None, reason: str, tmp_path: Path) -> None:
     write_map(small_map(), tmp_path / "m.png")
-    (tmp_path / "m.pgw").unlink()
     if world is not None:
         (tmp_path / "m.pgw").write_text(world)
     with pytest.raises(LogError, match=reason):

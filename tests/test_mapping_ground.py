@@ -43,6 +43,7 @@ def test_cells_and_positions_are_inverse(ground: GroundMap) -> None:
     np.testing.assert_allclose(ground.xy_of(rows, columns), [[1.234, -2.345]], atol=1e-9)
     x0, _, _, y1 = ground.extent_m
     np.testing.assert_allclose(ground.xy_of(0, 0), [x0 + 0.025, y1 - 0.025])
+    np.testing.assert_allclose(np.array(ground.extent_m) / 0.05, np.rint(np.array(ground.extent_m) / 0.05), atol=1e-6)
 
 
 def test_heights_are_those_of_the_road_and_of_the_curb(ground: GroundMap) -> None:
@@ -118,6 +119,16 @@ def test_a_log_of_lidars_alone_has_no_color() -> None:
     assert not ground.alpha.any()
     assert np.isfinite(ground.height_m).any()
     assert any("no color" in note for note in ground.notes)
+
+
+def test_a_map_ends_where_nothing_more_is_known(ground: GroundMap) -> None:
+    known = ground.known
+    assert all(known[edge].any() for edge in (0, -1, np.s_[:, 0], np.s_[:, -1]))
+    nothing = GroundMap(
+        np.zeros((3, 4, 3), np.uint8), np.zeros((3, 4), np.uint8), np.full((3, 4), np.nan, np.float32),
+        np.full((3, 4), np.nan, np.float32), 0.5, (0.0, 2.0, 0.0, 1.5),
+    )  # fmt: skip
+    assert nothing.around(nothing.known).extent_m == (0.0, 0.5, 1.0, 1.5)
 
 
 def test_a_log_without_poses_is_refused_with_the_reason() -> None:

@@ -11,9 +11,10 @@ import pytest
 from worlds import camera_ahead, scan, standing, tiny_log
 
 from log2sim.config import Config
+from log2sim.config_sections import MapConfig
 from log2sim.datatypes import Lidar, Log, Stream, Sweep
 from log2sim.geometry import PoseTrack, transform
-from log2sim.mapping.topdown import birdseye_of_log
+from log2sim.mapping.builder import map_ground
 from log2sim.perception.record_checks.camera_watch import CameraWatch
 from log2sim.perception.record_checks.lidar_watch import LidarWatch
 from log2sim.perception.record_checks.records import RecordWatch
@@ -379,7 +380,8 @@ def test_black_pictures_are_not_mapped():
     read = log.streams["front"].read
     half = Stream("front", log.streams["front"].t_ns, lambda i: read(i) * np.uint8(i < 5))
     whole, part = (
-        birdseye_of_log(changed, truth) for changed in (log, log.changed(streams={**log.streams, "front": half}))
+        map_ground(changed, truth, MapConfig())
+        for changed in (log, log.changed(streams={**log.streams, "front": half}))
     )
     assert 0 < part.coverage.sum() < whole.coverage.sum()
     assert part.image_bgr[part.coverage].min() > 20

@@ -13,6 +13,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from browser import CHROMIUM, DRIVER, Browser, browsing
@@ -21,6 +22,7 @@ from command_line import names, run
 from log2sim.datatypes import Agent, Doubt, Scenario, Waypoints
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array, box_corners_bev, wrap_angle
+from log2sim.mapping.ground_map import GroundMap
 from log2sim.simulation.runner import replay
 from log2sim.visualization.page.columns import SCALES, second_differences
 from log2sim.visualization.page.document import page_document
@@ -716,3 +718,22 @@ def test_pages_with_next_to_nothing_open(browser: Browser, tmp_path: Path, agent
     assert time_of(browser) == 4.0
     there = [a.id for a in agents if browser.run("return log2sim.placeOf(arguments[0])", a.id)]
     assert there == [a.id for a in agents if a.static]  # what stands has one pose for good
+
+
+def test_a_map_of_the_ground_is_embedded_where_it_lies_and_stays_small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("log2sim.visualization.page.background.MAX_BYTES", 20_000)
+    alpha = np.zeros((400, 420), np.uint8)
+    alpha[10:390, 20:410] = 255
+    color = np.random.default_rng(2).integers(0, 256, (400, 420, 3)).astype(np.uint8)
+    nothing = np.full(alpha.shape, np.nan, np.float32)
+    ground = GroundMap(color, alpha, nothing, nothing, 0.5, (10.0, 220.0, 0.0, 200.0))
+    entry = page_document(made(agent("a", np.arange(5.0), 0.0)), background=ground)["background"]
+    assert entry["extent_m"] == [20.0, 215.0, 5.0, 195.0]
+    kind, _, data = entry["source"].partition(",")
+    assert kind == "data:image/webp;base64"
+    assert len(data) <= 20_000 * 4 / 3 + 4
+    shown = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert shown.shape[1] < 390
+    assert shown.shape[1] / shown.shape[0] == pytest.approx(390 / 380, rel=0.02)
+    blank = GroundMap(color[:5, :5], alpha[:5, :5], nothing[:5, :5], nothing[:5, :5], 0.5, (0.0, 2.5, 0.0, 2.5))
+    assert page_document(made(agent("a", np.arange(5.0), 0.0)), background=blank)["background"] is None

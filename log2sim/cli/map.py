@@ -39,25 +39,42 @@ def map_(
     from log2sim.errors import ConfigError
     from log2sim.logs.opening import open_log
     from log2sim.mapping.builder import map_ground
-    from log2sim.mapping.files import HEIGHT_STEP_M, LAYERS, Layer, check_name, lowest_m, world_file_of, write_map
+    from log2sim.mapping.files import (
+        HEIGHT_STEP_M,
+        LAYERS,
+        Layer,
+        check_name,
+        lowest_m,
+        world_file_of,
+        write_map,
+        write_world_file,
+    )
     from log2sim.mapping.geokeys import geokeys_of
     from log2sim.outputs import together
     from log2sim.perception.frames import RecordReader
 
     check_name(out)
-    check_targets(out, world_file_of(out), overwrite=overwrite)
+    world = world_file_of(out)
+    check_targets(out, world, overwrite=overwrite)
     if layer not in LAYERS:
         raise ConfigError(f"--layer: '{layer}' is none of {', '.join(LAYERS)}")
     chosen, settings = cast(Layer, layer), Config.load(map={"cell_m": cell}).map
     opened = open_log(log, format=format, sequence=sequence)
-    opened, loaded, note = _agents_of(opened, log, scenario)
+    if chosen == "color" and not opened.cameras:
+        raise ConfigError(f"{opened.name}: the log has no camera; take --layer intensity or --layer height")
+    if chosen != "color" and not opened.lidars:
+        raise ConfigError(f"{opened.name}: the log has no LiDAR; take --layer color")
+    opened, loaded, note = _agents_of(opened, scenario)
     for line in (*opened.notes, *((note,) if note else ())):
         say(f"note: {line}", quiet=quiet)
     reader = RecordReader(opened)
     with progress(quiet=quiet) as report_progress:
-        ground = map_ground(opened, loaded, settings, reader, report_progress)
+        whole = map_ground(opened, loaded, settings, reader, report_progress)
+    ground = whole.around(known_cells(whole, chosen))
     with together():
         write_map(ground, out, chosen, opened.map, overwrite=overwrite)
+        if world is not None:
+            write_world_file(ground, world, opened.map, overwrite=overwrite)
     notes = [
         *ground.notes,
         *(f"{name}: {u['count']} records could not be read" for name, u in reader.summary().items()),
@@ -75,7 +92,7 @@ def map_(
     say(f"{out}: {columns * d:.0f} x {rows * d:.0f} m in cells of {d:g} m", quiet=quiet)
 
 
-def _agents_of(log: Log, path: Path, scenario: Path | None) -> tuple[Log, Scenario, str | None]:
+def _agents_of(log: Log, scenario: Path | None) -> tuple[Log, Scenario, str | None]:
     """Return the log as the scenario places it, the agents to leave out, and what is to be said of them."""
     from log2sim.datatypes import Scenario
     from log2sim.localization.choice import localize_like

@@ -22,7 +22,9 @@ def plot(
     ] = None,
     background: Annotated[
         Path | None,
-        typer.Option(metavar="LOG", help="Log whose camera images are projected onto the ground as background."),
+        typer.Option(
+            metavar="LOG|MAP.png", help="Log whose map of the ground is the background, or a map of log2sim map."
+        ),
     ] = None,
     predict: Annotated[
         float | None, typer.Option(metavar="S", help="Draw where movers were expected to go for this long, in s.")
@@ -40,9 +42,8 @@ def plot(
     replayed = load_replay(replay, loaded) if replay is not None else None
     picture = None
     if background is not None:
-        from log2sim.logs.opening import open_log
-        from log2sim.mapping.topdown import birdseye_of_log
+        from log2sim.cli.background import load_background
 
-        picture = birdseye_of_log(open_log(background, sequence=sequence), loaded)
+        picture = load_background(background, loaded, sequence)
     known = load_truth(truth, loaded, sequence) if truth is not None else None
     plot_tracks(loaded, out, replay=replayed, truth=known, background=picture, predict_s=predict, overwrite=overwrite)

@@ -118,12 +118,15 @@ def reconstruct(
 
 def _write_topdown(result: Result, path: Path, *, overwrite: bool) -> None:
     """Write the bird's-eye image of a run, and note in its report which records could not be read for it."""
-    from log2sim.mapping.mosaic import write_image
-    from log2sim.mapping.topdown import birdseye_of_log
+    from log2sim.cli.background import CELL_M
+    from log2sim.config_sections import MapConfig
+    from log2sim.mapping.builder import map_ground
+    from log2sim.mapping.files import write_map
     from log2sim.perception.frames import RecordReader
 
     reader = RecordReader(result.log)
-    write_image(birdseye_of_log(result.log, result.scenario, reader), path, overwrite=overwrite)
+    ground = map_ground(result.log, result.scenario, MapConfig(cell_m=CELL_M), reader)
+    write_map(ground.around(ground.coverage), path, overwrite=overwrite)
     result.report["unreadable"] = {**reader.summary(), **result.report["unreadable"]}
 
 

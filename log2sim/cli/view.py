@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -20,6 +20,12 @@ def view(
     predict: Annotated[
         float | None, typer.Option(metavar="S", help="Show where agents were expected to go for this long, in s.")
     ] = None,
+    background: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="LOG|MAP.png", help="Log whose map of the ground is shown below, or a map of log2sim map."
+        ),
+    ] = None,
     sequence: Sequence = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -34,5 +40,13 @@ def view(
     loaded = Scenario.load(scenario)
     replayed = load_replay(replay, loaded, quiet=quiet) if replay is not None else None
     known = load_truth(truth, loaded, sequence) if truth is not None else None
-    write_page(loaded, out, truth=known, replay=replayed, predict_s=predict, overwrite=overwrite)
+    picture = None
+    if background is not None:
+        from log2sim.cli.background import load_background
+        from log2sim.cli.progress import progress
+
+        with progress(quiet=quiet) as report_progress:
+            picture = load_background(background, loaded, sequence, report_progress)
+    layers: dict[str, Any] = {"truth": known, "replay": replayed, "background": picture}
+    write_page(loaded, out, **layers, predict_s=predict, overwrite=overwrite)
     say(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {counted(len(loaded.agents), 'agent')}", quiet=quiet)

@@ -131,7 +131,7 @@ class GroundMapBuilder:
         self._colors.add(camera, image_bgr, warp, opacity.astype(np.float32))
 
     def build(self) -> GroundMap:
-        """Return the map of all that was added."""
+        """Return the map of all that was added, as far as anything is known."""
         shape = self.raster.shape
         if self._colors is None:
             self.notes.append("no color: there is no picture with a known pose")
@@ -143,9 +143,10 @@ class GroundMapBuilder:
         height, intensity = self._measured()
         for layer in (height, intensity):
             layer[standing] = np.nan
-        return GroundMap(
+        whole = GroundMap(
             color, alpha, height, intensity, self.raster.resolution_m, self.raster.extent_m, tuple(self.notes)
         )
+        return whole.around(whole.known)
 
     def _cameras(self) -> list[str]:
         """Cameras that the scenario was made with; all of the log where it names none."""

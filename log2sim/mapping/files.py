@@ -57,11 +57,11 @@ def write_map(
     ----------
     ground : GroundMap
     path : Path
-        Ends in one of `SUFFIXES`. Beside a PNG or JPEG a world file is written.
+        Ends in one of `SUFFIXES`.
     layer : {"color", "intensity", "height"}
         In a PNG heights are steps of `HEIGHT_STEP_M` from one below the lowest, 0 where unknown; in a GeoTIFF they are m.
     frame : MapFrame, optional
-        Where the map lies on Earth.
+        Where the map lies on Earth; only a GeoTIFF holds it, see `write_world_file` for others.
 
     Raises
     ------
@@ -69,11 +69,7 @@ def write_map(
         For another suffix, a file that exists and may not be replaced or cannot be written.
     """
     check_name(path)
-    frame = frame or MapFrame()
-    world = world_file_of(path)
-    for target in (path, world):
-        if target is not None:
-            refuse_existing(target, overwrite=overwrite)
+    refuse_existing(path, overwrite=overwrite)
     encode: dict[str, Callable[[], bytes]] = {
         ".png": lambda: _encode(".png", _png_values(ground, layer)),
         ".jpg": lambda: _encode(".jpg", on_white(ground, layer)),
@@ -81,12 +77,23 @@ def write_map(
     suffix = {".jpeg": ".jpg", ".tiff": ".tif"}.get(path.suffix.lower(), path.suffix.lower())
     with replaced(path) as temporary:
         if suffix == ".tif":
-            _write_geotiff(ground, temporary, layer, frame)
+            _write_geotiff(ground, temporary, layer, frame or MapFrame())
         else:
             temporary.write_bytes(encode[suffix]())
-    if world is not None:
-        with replaced(world) as temporary:
-            temporary.write_text(world_text(ground, frame), encoding="ascii")
+
+
+def write_world_file(ground: GroundMap, path: Path, frame: MapFrame, *, overwrite: bool = False) -> None:
+    """Write the world file beside a PNG or JPEG of a map."""
+    refuse_existing(path, overwrite=overwrite)
+    with replaced(path) as temporary:
+        temporary.write_text(world_text(ground, frame), encoding="ascii")
+
+
+def known_cells(ground: GroundMap, layer: Layer) -> NDArray[np.bool_]:
+    """Return the mask (R, C) of the cells of which a layer says something."""
+    if layer == "color":
+        return ground.coverage
+    return np.isfinite(ground.intensity if layer == "intensity" else ground.height_m)
 
 
 def on_white(ground: GroundMap, layer: Layer) -> NDArray[np.uint8]:
@@ -158,7 +165,7 @@ def _spread(height_m: NDArray[np.float32]) -> NDArray[np.float32]:
 def _png_values(ground: GroundMap, layer: Layer) -> NDArray[Any]:
     if layer == "color":
         return np.dstack([ground.color_bgr, ground.alpha])
-    known = np.isfinite(ground.intensity if layer == "intensity" else ground.height_m)
+    known = known_cells(ground, layer)
     if layer == "intensity":
         gray = np.rint(255 * np.nan_to_num(ground.intensity)).astype(np.uint8)
         return np.dstack([gray, gray, gray, np.where(known, 255, 0).astype(np.uint8)])

@@ -57,6 +57,31 @@ class GroundMap:
         """Mask (R, C) of the cells that a camera saw."""
         return self.alpha > 0
 
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Mask (R, C) of the cells of which anything is known."""
+        return self.coverage | np.isfinite(self.height_m) | np.isfinite(self.intensity)
+
+    def around(self, cells: NDArray[np.bool_]) -> GroundMap:
+        """Return the part of the map around all cells of a mask (R, C); one cell where there are none."""
+        spans = []
+        for axis in (1, 0):
+            found = np.flatnonzero(cells.any(axis=axis))
+            spans.append(slice(int(found[0]), int(found[-1]) + 1) if len(found) else slice(0, 1))
+        (rows, columns), d = spans, self.resolution_m
+        x0, _, _, y1 = self.extent_m
+        extent = (x0 + columns.start * d, x0 + columns.stop * d, y1 - rows.stop * d, y1 - rows.start * d)
+        part = (rows, columns)
+        return GroundMap(
+            self.color_bgr[part].copy(),
+            self.alpha[part].copy(),
+            self.height_m[part].copy(),
+            self.intensity[part].copy(),
+            d,
+            extent,
+            self.notes,
+        )
+
     def cells_of(self, xy: ArrayLike) -> tuple[Array, Array]:
         """Return rows and columns (N,), fractional, of positions (N, 2), m; whole numbers are centers of cells."""
         return self.raster.cells_of(xy)

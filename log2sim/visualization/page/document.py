@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 from log2sim.datatypes import GROUP_OF, Agent, Doubt, Scenario, Trajectory, Waypoints, why_doubtful
 from log2sim.errors import ConfigError
 from log2sim.simulation.warnings.known import ends_of
+from log2sim.visualization.page.background import embed
 from log2sim.visualization.page.columns import SCALES, second_differences
 from log2sim.visualization.page.features import feature_columns
 from log2sim.visualization.page.predictions import predicted_columns
 from log2sim.visualization.plot.doubts import shown_spans
+from log2sim.visualization.plot.drawing import Background
 from log2sim.visualization.plot.roles import AgentRole, assign_roles, is_moving
 
 WAYPOINT_COLUMNS = ("t_s", "x_m", "y_m", "speed_mps")
@@ -24,11 +26,16 @@ MAX_ROWS = 3_000_000
 
 
 def page_document(
-    scenario: Scenario, truth: Scenario | None = None, replay: Any = None, predict_s: float | None = None
+    scenario: Scenario,
+    truth: Scenario | None = None,
+    replay: Any = None,
+    predict_s: float | None = None,
+    background: Background | None = None,
 ) -> dict[str, Any]:
     """Assemble the document of a page: name, span of time and a layer each for scenario, truth and replay.
 
     With `predict_s`, s, movers of the scenario also hold where they were expected to go for as long.
+    `background` is a map of the ground to show below everything.
 
     Raises
     ------
@@ -67,6 +74,7 @@ def page_document(
         "origin": _origin(scenario),
         "layers": layers,
         "features": feature_columns(scenario),
+        "background": None if background is None else embed(background),
         "events": [] if replay is None else _events(replay),
         "warnings": _warnings(replay),
     }

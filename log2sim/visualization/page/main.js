@@ -1,12 +1,13 @@
 // Actions of the user, and the start.
 
-const LAYER_NAMES = { scenario: "Scenario", truth: "Truth", replay: "Replay", trails: "Trails", names: "Names", predictions: "Predictions", ends: "Ends", lanes: "Lanes" };
+const LAYER_NAMES = { scenario: "Scenario", truth: "Truth", replay: "Replay", trails: "Trails", names: "Names", predictions: "Predictions", ends: "Ends", lanes: "Lanes", ground: "Ground" };
 let fitted = false;
 
 // Whether there is anything to show or hide.
 const hasLayer = (layer) => {
   if (layer === "predictions") return tracks.some((track) => track.predicted);
   if (layer === "lanes") return data.features.some || data.features.signals.length > 0;
+  if (layer === "ground") return data.background !== null;
   if (layer === "ends") return tracks.some((track) => track.observedBy !== null);
   return !(layer in { truth: 0, replay: 0 }) || data.layers[layer] !== undefined;
 };
@@ -109,7 +110,7 @@ const listen = () => {
     ["f", "follow the chosen agent, else the ego", ["f"], buttons.follow],
     ["n p", "next or previous agent", ["n"], () => neighbor(1)],
     ["s t r", "scenario, truth or replay on or off", ["s"], () => toggle("scenario")],
-    ["w l d o m", "trails, names, predictions, ends or lanes on or off", ["w"], () => toggle("trails")],
+    ["w l d o m g", "trails, names, predictions, ends, lanes or ground on or off", ["w"], () => toggle("trails")],
     ["e", "next warning or collision of the replay", ["e"], nextEvent],
     ["a /", "list of agents, search in it", ["a"], buttons["list-toggle"]],
     ["Esc", "choose nobody", ["Escape"], () => choose(null)],
@@ -118,7 +119,7 @@ const listen = () => {
     [["ArrowRight"], jump(0.1)], [["End"], () => seek(data.end)], [[">", "."], () => setRate(1)],
     [["-", "_"], () => zoom(1 / 1.25)], [["p"], () => neighbor(-1)], [["t"], () => toggle("truth")],
     [["r"], () => toggle("replay")], [["l"], () => toggle("names")], [["d"], () => toggle("predictions")],
-    [["o"], () => toggle("ends")], [["m"], () => toggle("lanes")],
+    [["o"], () => toggle("ends")], [["m"], () => toggle("lanes")], [["g"], () => toggle("ground")],
     [["/"], () => byId("search").focus()],
   ]);
   listenToPointers(byId("map"), {

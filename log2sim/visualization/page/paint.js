@@ -22,12 +22,13 @@ class Painter {
   }
 
   // shown: which layers and extras; chosen, hovered: tracks of the scenario or null.
-  paint({ layers, events, warnings, features }, t, shown, chosen, hovered) {
+  paint({ layers, events, warnings, features, background }, t, shown, chosen, hovered) {
     const ctx = this.ctx;
     ctx.setLineDash(SOLID);
     ctx.lineJoin = "round";
     ctx.fillStyle = theme.ground;
     ctx.fillRect(0, 0, this.view.width + 1, this.view.height + 1);  // the last pixel may be half one
+    if (shown.ground && background) drawBackground(this, background);
     if (shown.lanes) drawFeatures(this, features);
     this.grid();
     for (const track of layers.scenario) track.moveTo(t);

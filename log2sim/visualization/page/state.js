@@ -7,7 +7,7 @@ const doubtful = tracks.filter((track) => track.doubts.length > 0);
 for (const track of doubtful) track.label += "?";
 const state = {
   t: data.begin, rate: 1, playing: false, follow: false, chosen: null, hovered: null,
-  shown: { scenario: true, truth: true, replay: true, trails: true, names: true, predictions: true, ends: true, lanes: true },
+  shown: { scenario: true, truth: true, replay: true, trails: true, names: true, predictions: true, ends: true, lanes: true, ground: true },
 };
 applyTheme(data.layers);
 const view = new View(), painter = new Painter(byId("map"), view);

@@ -151,5 +151,8 @@ const load = (text) => {
     track: named("replay", warning.agent), shown: named("scenario", warning.agent),
   }));
   const { name, origin, begin_s: begin, end_s: end } = document_;
-  return { name, origin, begin, end, layers, events, warnings, warned: document_.warnings.title, features: loadFeatures(document_) };
+  return {
+    name, origin, begin, end, layers, events, warnings, warned: document_.warnings.title, features: loadFeatures(document_),
+    background: loadBackground(document_.background),
+  };
 };

@@ -16,11 +16,13 @@ from log2sim.documents import refuse_existing, replaced
 from log2sim.errors import ConfigError
 from log2sim.visualization.page.columns import SCALES
 from log2sim.visualization.page.document import page_document
+from log2sim.visualization.plot.drawing import Background
 
 SUFFIXES = (".html", ".htm")
 SCRIPT_FILES = (
     "track.js",
     "features.js",
+    "background.js",
     "predicted.js",
     "theme.js",
     "ends.js",
@@ -45,6 +47,7 @@ def write_page(
     truth: Scenario | None = None,
     replay: Any = None,
     predict_s: float | None = None,
+    background: Background | None = None,
     overwrite: bool = False,
 ) -> None:
     """Write a self-contained page that plays a scenario in a browser and loads nothing over the network.
@@ -57,6 +60,8 @@ def write_page(
         Shown as a layer, and beside the scenario in the plots of an agent.
     predict_s : float, s, or None
         For how long it is shown where agents were expected to go.
+    background : Background or None
+        Map of the ground to show below everything; the page holds a copy of at most some megabytes.
 
     Raises
     ------
@@ -68,7 +73,7 @@ def write_page(
     if out_path.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"{out_path}: a page's name must end in {' or '.join(SUFFIXES)}, not in '{out_path.suffix}'")
     refuse_existing(out_path, overwrite=overwrite)
-    page = html_of({**page_document(scenario, truth, replay, predict_s), "scales": SCALES})
+    page = html_of({**page_document(scenario, truth, replay, predict_s, background), "scales": SCALES})
     with replaced(out_path) as temporary:
         temporary.write_text(page, encoding="utf-8")
 
