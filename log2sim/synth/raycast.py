@@ -15,6 +15,7 @@ from log2sim.synth.reflectance import AIR_REFLECTANCE, GroundReflectance, body_r
 from log2sim.synth.returns import ReturnModel, Weather, backscattered, detected, reflected
 from log2sim.synth.scene import LidarSpec, Scene
 from log2sim.synth.scene_places import Building
+from log2sim.synth.traffic_lights import triangles_of
 from log2sim.synth.triangles import first_hit
 
 GROUND, BUILDING, EGO, AIR = -1, -2, -3, -4
@@ -99,6 +100,10 @@ def cast_sweep(
         nearer = _box_distance(building, origin, ray)
         closer = nearer < distance
         distance[closer], hit[closer] = nearer[closer], BUILDING
+    for triangles in triangles_of(scene):
+        rows, nearer = _standing_distance(triangles, origin, ray)
+        closer = nearer < distance[rows]
+        distance[rows[closer]], hit[rows[closer]] = nearer[closer], BUILDING
     t_s = (moments - scene.start_ns) / NS_PER_S
     for index, actor in enumerate(moving.seen_from(spec.mount)):
         rows, nearer = _actor_distance(actor, t_s, column, origin, ray)
@@ -189,6 +194,18 @@ def slab_distance(size_m: Array, origin: Array, ray: Array, *, from_inside: bool
     leave = np.where(parallel, np.inf, np.maximum(a, b)).min(1)
     ahead = leave > 0 if from_inside else enter > 0
     return np.where((enter <= leave) & ahead & ~outside.any(1), enter, np.inf)
+
+
+def _standing_distance(triangles: Array, origin: Array, ray: Array) -> tuple[NDArray[np.int64], Array]:
+    """Rays that pass near triangles (F, 3, 3) in the map, and their distances to them."""
+    corners = triangles.reshape(-1, 3)
+    middle = (corners.min(0) + corners.max(0)) / 2
+    to = middle - origin
+    along = np.einsum("ni,ni->n", to, ray)
+    off = np.einsum("ni,ni->n", to, to) - along**2
+    radius = float(np.linalg.norm(corners - middle, axis=1).max())
+    rows = np.flatnonzero((off < radius**2) & (along > -radius))
+    return rows, first_hit(origin[rows], ray[rows], triangles)
 
 
 def _actor_distance(

@@ -17,7 +17,7 @@ from log2sim.errors import ConfigError
 from log2sim.input_files import read_text
 from log2sim.model_errors import first_problem
 from log2sim.synth.scene_keys import Angle, Color, Name, Number, Pixels, Size, Table, Vec2, Vec3, Whole, key
-from log2sim.synth.scene_places import Arrow, Building, Road, Shadow, StopLine, Zebra
+from log2sim.synth.scene_places import Arrow, Building, Road, Shadow, StopLine, TrafficLight, Zebra
 
 MAX_SCENE_BYTES = 4 * 1024 * 1024
 
@@ -169,6 +169,7 @@ class Scene(Table):
     arrow: tuple[Arrow, ...] = key("Arrows on the road.", ())
     shadow: tuple[Shadow, ...] = key("Shadows on the ground, where the sun shines.", ())
     building: tuple[Building, ...] = key("Buildings.", ())
+    traffic_light: tuple[TrafficLight, ...] = key("Traffic lights.", ())
     agent: tuple[AgentSpec, ...] = key("Road users besides the ego.", ())
     camera: tuple[CameraSpec, ...] = key("Cameras.", ())
     lidar: tuple[LidarSpec, ...] = key("LiDARs.", ())
@@ -178,7 +179,8 @@ class Scene(Table):
     @model_validator(mode="after")
     def _unique_names_and_mounts(self) -> Self:
         sensors = [c.name for c in self.camera] + [d.name for d in self.lidar]
-        for kind, names in (("agent", [a.id for a in self.agent]), ("sensor", sensors)):
+        lights = [light.id for light in self.traffic_light]
+        for kind, names in (("agent", [a.id for a in self.agent]), ("sensor", sensors), ("traffic light", lights)):
             for name in names:
                 if names.count(name) > 1:
                     raise ValueError(f"{kind} '{name}' occurs twice; names must be unique")

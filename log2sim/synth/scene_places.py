@@ -6,9 +6,10 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from log2sim.synth.scene_keys import Color, Coordinate, Line, Number, Size, Table, Vec2, Whole, key
+from log2sim.synth.scene_keys import Color, Coordinate, Line, Name, Number, Size, Table, Vec2, Vec3, Whole, key
 
 PaintColor = Literal["white", "yellow"]
+LampState = Literal["red", "red_yellow", "yellow", "green", "off"]
 Share = Annotated[Number, Field(ge=0, le=1)]
 Length = Annotated[Number, Field(ge=0.1, le=100)]
 
@@ -90,6 +91,19 @@ class Building(Table):
     yaw_deg: Number = key("Direction of its length.", 0.0, "deg")
     color: Color = key("Color of the facade, RGB 0 to 255.", (190, 180, 165))
     shadow: Annotated[bool, Field(strict=True)] = key("Whether it throws a shadow on the ground.", False)
+
+
+class TrafficLight(Table):
+    """A signal head of a traffic light with a red, a yellow and a green lamp."""
+
+    id: Name = key("Unique name of letters, digits, '_' and '-'.")
+    position: Vec3 = key("Middle of its housing [x, y, z].", unit="m")
+    yaw_deg: Number = key("Direction that its lamps face.", 0.0, "deg")
+    program: Annotated[tuple[tuple[LampState, Length], ...], Field(min_length=1)] = key(
+        "Rows [state, seconds], again and again.", unit="1, s"
+    )
+    start_s: Annotated[Number, Field(ge=-1000, le=0)] = key("Time at which the program begins.", 0.0, "s")
+    pole: Annotated[bool, Field(strict=True)] = key("Whether a pole behind it carries it.", True)
 
 
 class Shadow(Table):

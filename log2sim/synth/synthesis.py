@@ -106,10 +106,12 @@ def _image_streams(moving: MovingScene, cameras: dict[str, Camera], seed: int) -
     def read(camera: Camera, index: int, t_ns: NDArray[np.int64], i: int) -> NDArray[np.uint8]:
         from log2sim.synth.bodies import Body
         from log2sim.synth.render import SceneInstant, render
+        from log2sim.synth.traffic_lights import bodies_at
 
         map_T_cam = moving.map_T_mount(camera.mount, t_ns[i : i + 1])[0] @ camera.mount_T_cam
         rng = np.random.default_rng([seed, 2, index, i])
         bodies = [Body.of(actor, moving.seconds(t_ns[i])) for actor in moving.seen_from(camera.mount)]
+        bodies += bodies_at(scene, moving.seconds(t_ns[i]))
         lamps = lamps_on(moving, map_T_cam, int(t_ns[i])) if light.lamps > 0 else ()
         instant = SceneInstant(_backdrop(scene, seed), bodies, light, lamps)
         return render(camera, map_T_cam, instant, rng)
@@ -204,6 +206,8 @@ def _measured_poses(ego: EgoMotion, scene: Scene, rng: np.random.Generator) -> P
 
 
 def _truth(moving: MovingScene, t_s: Array, visible: NDArray[np.bool_] | None, seed: int) -> Scenario:
+    from log2sim.synth.traffic_lights import signals_of
+
     scene = moving.scene
     agents = [] if moving.ego_body is None else [_ego_agent(moving.ego_body, t_s)]
     for index, actor in enumerate(moving.actors):
@@ -235,6 +239,7 @@ def _truth(moving: MovingScene, t_s: Array, visible: NDArray[np.bool_] | None, s
         frame,
         provenance=provenance,
         map_features=map_features_of(scene),
+        signals=signals_of(scene),
     )
 
 
