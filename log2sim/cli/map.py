@@ -44,6 +44,7 @@ def map_(
         LAYERS,
         Layer,
         check_name,
+        known_cells,
         lowest_m,
         world_file_of,
         write_map,
