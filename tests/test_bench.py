@@ -335,6 +335,20 @@ def test_the_settings_are_those_that_exist(tiny: tuple[Log, Scenario]) -> None:
     assert [s.name for s in grid.detect] == ["labels"]
 
 
+@pytest.mark.parametrize("present", ["apart", "together"])
+def test_several_cameras_are_fitted_together_and_apart(tiny: tuple[Log, Scenario], present: str) -> None:
+    front = tiny[0].cameras["front"]
+    log = tiny[0].changed(cameras={"front": front, "left": replace(front, name="left")})
+    grid = make_grid(log, Config.load(detect={"name": "labels"}, topdown={"rig": present}))
+    rigs = {s.name: s.config.topdown.rig for s in grid.homography}
+    other = {"apart": "together", "together": "apart"}[present]
+    assert rigs["time-aware"] == present
+    assert rigs[f"cameras {other}"] == other
+    assert {rig for name, rig in rigs.items() if name not in ("time-aware", f"cameras {other}")} == {"apart"}
+    alone = make_grid(tiny[0], LABELS)
+    assert not any("cameras" in s.name for s in alone.homography)
+
+
 def test_a_method_that_is_off_is_compared_all_the_same(tiny: tuple[Log, Scenario]) -> None:
     grid = make_grid(tiny[0], Config.load(detect={"name": "labels"}, topdown={"method": "off"}))
     assert grid.homography[0].config.topdown.method == TopdownConfig().method

@@ -21,6 +21,7 @@ from log2sim.evaluation.bench.localization import (
 )
 from log2sim.evaluation.bench.pareto import Point
 from log2sim.evaluation.bench.scores import EVERYTHING, Scope, Score, check_scope, score_scenario
+from log2sim.evaluation.bench.seams import SeamBench
 from log2sim.evaluation.bench.settings import Grid, Setting
 from log2sim.evaluation.bench.shared_detections import RecordedDetections, detect_once
 from log2sim.geometry import period_of
@@ -255,9 +256,12 @@ def homography_points(context: BenchContext, observations: Observations, report:
             spent[setting.name].append(time.perf_counter() - begin)
             report("homographies", repeat * len(spent) + k + 1, REPEATS * len(spent))
     out = []
+    seams = SeamBench.of(context.log, context.schedule, observations)
     for setting in settings:
         score = score_homographies(context.log, holdout, fits[setting.name])
         figures = score.figures | fit_figures(fits[setting.name])
+        if setting in context.grid.homography:
+            figures |= seams.figures(fits[setting.name])
         ms = context.ms_per_tick(min(spent[setting.name]))
         out.append(Point(setting.name, setting.present, ms, figures["error_m"], figures, score.by_object["error_m"]))
     return out

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -92,10 +92,24 @@ def make_grid(log: Log, config: Config, detectors: Sequence[str] = ()) -> Grid:
     return Grid(
         detect=tuple(_detector_settings(log, config, detectors)),
         measure=_choices("measure", config, "measure", "mode"),
-        homography=_choices("homography", config, "topdown", "method"),
+        homography=(*_methods_apart(config), *_rig_settings(log, config)),
         hypotheses=tuple(_hypotheses(config)),
         smooth=tuple(_smooth_settings(config)),
     )
+
+
+def _methods_apart(config: Config) -> list[Setting]:
+    """List the methods, the present one as it is and the others for each camera alone."""
+    present, *others = _choices("homography", config, "topdown", "method")
+    return [present, *(replace(s, config=with_changes(s.config, "topdown", rig="apart")) for s in others)]
+
+
+def _rig_settings(log: Log, config: Config) -> list[Setting]:
+    """List the other way to fit several cameras: all together, or each apart."""
+    if len(config.cameras or log.cameras) < 2:
+        return []
+    other = choices(config.topdown, "rig")[1]
+    return [Setting("homography", f"cameras {other}", with_changes(config, "topdown", rig=other), False)]
 
 
 def _hypotheses(config: Config) -> list[Setting]:

@@ -99,7 +99,7 @@ def _step(
     of_camera = np.array([LIFT_SIGMA_M, *[MOUNT_SIGMA_RAD] * 3]) ** -2.0
     prior = np.concatenate([[BELOW_SIGMA_PX**-2.0], np.tile(of_camera, count)])
     value = np.array([state.below_px, *(v for n in rig.cameras for v in (state.lift_m[n], *state.feet[n]))])
-    covariance: Array = np.linalg.inv(normal + np.diag(prior))
+    covariance = np.asarray(np.linalg.inv(normal + np.diag(prior)), dtype=np.float64)
     return np.asarray(-covariance @ (right + prior * value)), covariance
 
 
