@@ -10,7 +10,7 @@ from log2sim.agents.simplify import TOLERANCE_M
 from log2sim.datatypes import Agent, Measurements
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography_stage import CameraHomography
-from log2sim.plan import Decision, HomographyScope, Plan, Stage
+from log2sim.plan import DESCRIBING, Decision, HomographyScope, Plan, Stage
 from log2sim.stage_clock import StageClock
 
 
@@ -65,7 +65,7 @@ class Outcome:
 
 
 def stage_outcomes(plan: Plan, outputs: RunOutputs) -> tuple[Outcome, ...]:
-    """Join the decisions of a plan with what the stages did, in the plan's order."""
+    """Join the decisions of a plan with what the stages did, in the plan's order, but for those that describe the scenario."""
     found: Mapping[Stage, Callable[[Decision], Outcome]] = {
         Stage.MOTION_COMPENSATION: lambda d: _compensation(d, outputs.observations),
         Stage.DETECTION_IN_EVERY_FRAME: lambda d: _detection(d, outputs),
@@ -73,7 +73,7 @@ def stage_outcomes(plan: Plan, outputs: RunOutputs) -> tuple[Outcome, ...]:
         Stage.SMOOTHING_OF_PARKED_AGENTS: lambda d: _parked(outputs.agents),
         Stage.WAYPOINT_AT_EVERY_TICK: lambda d: _waypoints(outputs.agents),
     }
-    return tuple(found.get(d.stage, Outcome)(d) for d in plan.decisions)
+    return tuple(found.get(d.stage, Outcome)(d) for d in plan.decisions if d.stage not in DESCRIBING)
 
 
 def _compensation(planned: Decision, observations: Observations) -> Outcome:

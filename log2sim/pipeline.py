@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from log2sim.calibration.check import check_calibration
 from log2sim.config import Config
 from log2sim.cooperation.registration import register_road
 from log2sim.datatypes import ENDS, Agent, Fault, Log, Measurements, Scenario, Track
+from log2sim.describe import Recorded, describe
 from log2sim.errors import NothingToReconstruct
 from log2sim.localization.choice import localize
 from log2sim.localization.pose_choice import GIVEN, PoseChoice
@@ -35,7 +36,7 @@ from log2sim.perception.fusion import fuse
 from log2sim.perception.homography_stage import estimation_options, fit_homographies, place_by_homography
 from log2sim.perception.sync import Schedule, synchronize
 from log2sim.plan import FusionLevel, Plan, Stage, make_plan
-from log2sim.report import report_of
+from log2sim.report import extended_report, report_of
 from log2sim.sensors import Sensors, choose_detector, select_sensors
 from log2sim.stage_clock import StageClock
 from log2sim.tracking.merging import track_ends
@@ -139,7 +140,8 @@ def reconstruct(log: Log, config: Config | None = None, *, progress: Progress | 
         When neither an ego nor any agent was found.
     """
     run = start(log, config or Config(), progress=progress)
-    return second_pass(run, first_pass(run))
+    observations = first_pass(run)
+    return look_around(run, observations, second_pass(run, observations))
 
 
 def start(log: Log, config: Config, *, progress: Progress | None = None) -> Run:
@@ -285,3 +287,13 @@ def result_of(run: Run, ego: Agent | None, outputs: RunOutputs) -> Result:
     report = report_of(log, config, run.schedule, outputs, outcomes, scenario)
     added = {"poses": run.poses.to_dict(), "faults": faults, "registration": list(run.registration)}
     return Result(scenario, {**report, **added}, log)
+
+
+def look_around(run: Run, observations: Observations, result: Result) -> Result:
+    """Describe the scenario of a run: lanes, colors of vehicles, traffic lights."""
+    used = run.log.changed(cameras={name: run.log.cameras[name] for name in run.plan.cameras})
+    recorded = Recorded(used, run.config, run.plan, observations, run.clock, run.report_progress)
+    description = describe(result.scenario, recorded)
+    plan = [*result.scenario.plan, *(outcome.to_dict() for outcome in description.outcomes)]
+    scenario = replace(description.scenario, plan=tuple(plan))
+    return replace(result, scenario=scenario, report=extended_report(result.report, description, run.clock))

@@ -39,6 +39,12 @@ class Stage(StrEnum):
     SMOOTHING = "smoothing"
     SMOOTHING_OF_PARKED_AGENTS = "smoothing of parked agents"
     WAYPOINT_AT_EVERY_TICK = "waypoint at every tick"
+    LANES = "markings and lanes"
+    COLORS = "colors of vehicles"
+
+
+DESCRIBING = (Stage.LANES, Stage.COLORS)
+"""Stages that describe a scenario once its agents are known, see `log2sim.describe`."""
 
 
 class HomographyScope(Enum):
@@ -135,6 +141,8 @@ def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64
         Decision(Stage.SMOOTHING, smooth, "measured positions are noisy" if smooth else "smooth.enabled=false"),
         Decision(Stage.SMOOTHING_OF_PARKED_AGENTS, False, "a parked agent has one pose"),
         Decision(Stage.WAYPOINT_AT_EVERY_TICK, False, "waypoints that interpolation gives back are left out"),
+        _lanes(log, config, sensors),
+        _colors(config, sensors),
     )
     return Plan(sensors.cameras, decisions, scope, max(stride, 1), ends.level)
 
@@ -231,6 +239,24 @@ def _fusion(cameras: tuple[str, ...]) -> Decision:
     if len(cameras) > 1:
         return Decision(Stage.FUSION, True, f"{len(cameras)} cameras")
     return Decision(Stage.FUSION, False, "one camera; only duplicates of its detector are dropped")
+
+
+def _lanes(log: Log, config: Config, sensors: Sensors) -> Decision:
+    stage, lidars = Stage.LANES, [name for name in sensors.lidars if name in log.lidars]
+    if not config.map.lanes:
+        return Decision(stage, False, "map.lanes=false")
+    if not (sensors.cameras or lidars):
+        return Decision(stage, False, "no sensor is used that shows the ground")
+    seen = " and ".join([*(["pictures"] if sensors.cameras else []), *(["sweeps"] if lidars else [])])
+    return Decision(stage, True, f"{seen} show the ground")
+
+
+def _colors(config: Config, sensors: Sensors) -> Decision:
+    if not config.appearance.colors:
+        return Decision(Stage.COLORS, False, "appearance.colors=false")
+    if not sensors.cameras:
+        return Decision(Stage.COLORS, False, NO_CAMERA)
+    return Decision(Stage.COLORS, True, "pictures show the vehicles")
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,13 @@ import numpy as np
 
 from log2sim.config import Config
 from log2sim.datatypes import Log, Measurements, Scenario
+from log2sim.describe import Description
 from log2sim.documents import rounded
 from log2sim.geometry import NS_PER_S
 from log2sim.outcome import Outcome, RunOutputs
 from log2sim.perception.homography_stage import CameraHomography
 from log2sim.perception.sync import Schedule
+from log2sim.stage_clock import StageClock
 from log2sim.version import __version__
 
 DETECTOR_STAGES = ("detect",)
@@ -29,18 +31,14 @@ def report_of(
 ) -> dict[str, Any]:
     """Assemble the report of a finished run."""
     clock, observations = outputs.clock, outputs.observations
-    ticks, total = len(schedule), clock.total()
-    detecting = sum(clock.seconds.get(s, 0.0) for s in DETECTOR_STAGES)
+    ticks = len(schedule)
     return {
         "report_version": 1,
         "log": {"name": log.name, "format": log.format, "digest": log.digest, "notes": list(log.notes)},
         "log2sim_version": __version__,
         "ticks": ticks,
         "duration_s": (int(schedule.t_ns[-1]) - int(schedule.t_ns[0])) / NS_PER_S,
-        "seconds": round(total, 4),
-        "ticks_per_second": round(ticks / total, 3),
-        "ticks_per_second_without_detector": round(ticks / max(total - detecting, 1e-9), 3),
-        "stages": clock.table(ticks),
+        **_times(clock, ticks),
         "plan": [outcome.to_report() for outcome in outcomes],
         "sync": {"reference": schedule.reference, "streams": schedule.summary()},
         "without_pose": _without_pose(log, schedule),
@@ -49,6 +47,28 @@ def report_of(
         "homography": {name: _homography_entry(g, config.topdown.method) for name, g in outputs.homographies.items()},
         "measurements": _measurement_counts(outputs.measurements),
         "agents": _agent_counts(scenario),
+    }
+
+
+def extended_report(report: dict[str, Any], description: Description, clock: StageClock) -> dict[str, Any]:
+    """Return the report of a run whose scenario was described since, with the times of all stages."""
+    return {
+        **report,
+        **_times(clock, report["ticks"]),
+        "plan": [*report["plan"], *(outcome.to_report() for outcome in description.outcomes)],
+        "unreadable": {**description.reader.summary(), **report["unreadable"]},
+        **description.figures,
+    }
+
+
+def _times(clock: StageClock, ticks: int) -> dict[str, Any]:
+    """Return the seconds of a run so far, its rates, and the table of its stages."""
+    total, detecting = clock.total(), sum(clock.seconds.get(stage, 0.0) for stage in DETECTOR_STAGES)
+    return {
+        "seconds": round(total, 4),
+        "ticks_per_second": round(ticks / total, 3),
+        "ticks_per_second_without_detector": round(ticks / max(total - detecting, 1e-9), 3),
+        "stages": clock.table(ticks),
     }
 
 

@@ -111,7 +111,7 @@ def reconstruct(
         if report is not None:
             write_json(report, result.report)
         result.scenario.save(out)
-    notes = [f"note: {note}" for note in unused_records(result.report)]
+    notes = [f"note: {note}" for note in (*unused_records(result.report), *feature_notes(result.scenario))]
     for line in (*notes, *doubt_lines(result.scenario), f"{out}: {_summary(result)}"):
         say(line, quiet=quiet)
 
@@ -133,7 +133,21 @@ def _write_topdown(result: Result, path: Path, *, overwrite: bool) -> None:
 def _summary(result: Result) -> str:
     counts, rate = result.report["agents"], result.report["ticks_per_second"]
     static, duration_s = counts["static"], result.scenario.duration_s
-    return f"{counts['total']} agents ({static} static) over {duration_s:.1f} s, {rate:.1f} ticks/s"
+    agents = f"{counts['total']} agents ({static} static) over {duration_s:.1f} s"
+    return ", ".join([agents, *described(result.scenario), f"{rate:.1f} ticks/s"])
+
+
+def described(scenario: Scenario) -> list[str]:
+    """Count what was found beside the agents; nothing of what was not found or not looked for."""
+    features = scenario.map_features
+    counts = [] if features is None else [(len(features.lanes), "lane"), (len(features.markings), "marking")]
+    counts.append((len(scenario.signals), "traffic light"))
+    return [f"{count} {name}{'s' * (count != 1)}" for count, name in counts if count]
+
+
+def feature_notes(scenario: Scenario) -> tuple[str, ...]:
+    """Return what of the road is not there, and why."""
+    return () if scenario.map_features is None else scenario.map_features.notes
 
 
 def doubt_lines(scenario: Scenario) -> list[str]:
