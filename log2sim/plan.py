@@ -188,7 +188,7 @@ def _image_decoding(config: Config) -> Decision:
         return Decision(Stage.IMAGE_DECODING, False, NO_CAMERA)
     if config.detect.in_images != LABELS:
         return Decision(Stage.IMAGE_DECODING, True, "the detector needs images")
-    return Decision(Stage.IMAGE_DECODING, False, "boxes come from the log; no image is needed")
+    return Decision(Stage.IMAGE_DECODING, False, "boxes come from the log; detection needs no image")
 
 
 def _detection_in_every_frame(config: Config, decodes: bool, stride: int) -> Decision:

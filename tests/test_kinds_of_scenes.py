@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from plain_settings import AGENTS_ALONE
 from worlds import tiny_log
 
 from log2sim.config import Config
@@ -15,7 +16,7 @@ from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.pipeline import reconstruct
 
 pytestmark = pytest.mark.slow
-LABELS = Config.load(None, ["detect.name=labels"])
+LABELS = Config.load(None, ["detect.name=labels"], **AGENTS_ALONE)
 AROUND = {"azimuth_deg": [-130.0, 130.0], "channels": 20, "elevation_deg": [-18.0, 3.0]}
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from plain_settings import AGENTS_ALONE
 from test_pipeline import assert_same_agents
 from worlds import CAR, PARKED, scan, standing, tiny_log
 
@@ -37,7 +38,7 @@ from log2sim.plan import Decision, HomographyScope, Plan, Stage, make_plan
 from log2sim.sensors import select_sensors
 from log2sim.stage_clock import StageClock
 
-LABELS = Config.load(detect={"name": "labels"})
+LABELS = Config.load(detect={"name": "labels"}, **AGENTS_ALONE)
 FRONT = {"name": "front", "position_m": [1.7, 0.0, 1.5], "size_px": [480, 300], "offset_s": 0.03}
 BACK = {"name": "back", "position_m": [-0.5, 0.0, 1.5], "size_px": [480, 300], "yaw_deg": 180.0, "offset_s": 0.03}
 STANDING = {"waypoints": [[0.0, 0.0, 0.01], [0.1, 0.0, 0.01]], "poses": "poses"}
@@ -234,6 +235,30 @@ def test_boxes_of_the_log_need_no_image(tiny: Log) -> None:
     assert_same_agents(without.scenario, full.scenario, within=0.0)
     assert without.report["unreadable"] == {}
     assert not entry(full, "image decoding")["kept"]
+
+
+def test_lanes_and_colors_are_left_out_when_asked(tiny: Log) -> None:
+    without = run(tiny)
+    assert without.scenario.map_features is None
+    assert all(agent.color is None for agent in without.scenario.agents)
+    stages = {"markings and lanes": "map.lanes=false", "colors of vehicles": "appearance.colors=false"}
+    assert all(
+        entry(without, stage) == entry(without, stage) | {"kept": False, "reason": why} for stage, why in stages.items()
+    )
+    full = run(tiny, Config.load(detect={"name": "labels"}))
+    assert full.scenario.map_features is not None
+    assert all(entry(full, stage)["kept"] for stage in stages)
+    assert_same_agents(without.scenario, full.scenario, within=0.0)
+
+
+def test_sweeps_alone_have_no_colors(tiny: Log) -> None:
+    result = run(tiny, Config.load(detect={"name": "lidar:labels"}))
+    step = entry(result, "colors of vehicles")
+    assert not step["kept"]
+    assert "no camera is used" in step["reason"]
+    assert entry(result, "markings and lanes")["kept"]
+    assert result.scenario.map_features is not None
+    assert all(marking.sources == ("lidar",) for marking in result.scenario.map_features.markings)
 
 
 class Counting:

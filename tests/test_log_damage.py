@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from command_line import run
 from log_encoders.world import world_log
+from plain_settings import AGENTS_ALONE
 from worlds import tiny_log
 
 from log2sim.config import Config
@@ -26,7 +27,7 @@ from log2sim.logs.opening import open_log
 from log2sim.logs.time_checks import Span, list_time_problems, say_apart
 from log2sim.sensors import select_sensors
 
-LABELS = Config.load(detect={"name": "labels"})
+LABELS = Config.load(detect={"name": "labels"}, **AGENTS_ALONE)
 
 
 @cache

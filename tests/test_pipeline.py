@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from plain_settings import AGENTS_ALONE
 from worlds import PARKED, tiny_log
 
 from log2sim import Config, Scenario, open_log, reconstruct, replay
@@ -25,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 from extremes.small_log import rows_changed
 
 UTM_M = (691_000.0, 5_334_000.0, 0.0)
-LABELS = Config.load(detect={"name": "labels"})
+LABELS = Config.load(detect={"name": "labels"}, **AGENTS_ALONE)
 
 
 def run(log: Log, **changes: Any) -> Result:

@@ -1,0 +1,7 @@
+"""Settings of runs that are about agents alone: no map of the ground, no colors, no traffic lights, which takes less time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+AGENTS_ALONE: dict[str, Any] = {"map": {"lanes": False}, "appearance": {"colors": False, "signals": False}}
