@@ -68,9 +68,12 @@ def fit_curve(points: Array, sigma_m: float = POINT_SIGMA_M) -> Curve:
     place = s / s[-1] * (knots - 1)
     spacing = s[-1] / (knots - 1)
     weight = np.full(len(points), 1 / sigma_m**2)
-    xy = np.zeros((knots, 2))
+    # What few points leave open is straight: the curve is fitted as its distance from the chord.
+    chord = points[0] + np.linspace(0, 1, knots)[:, None] * (points[-1] - points[0])
+    offset = points - (points[0] + (place / (knots - 1))[:, None] * (points[-1] - points[0]))
+    xy = chord
     for _ in range(ROUNDS):
-        xy = _solve(points, place, weight, knots, spacing)
+        xy = chord + _solve(offset, place, weight, knots, spacing)
         low = np.minimum(place.astype(int), knots - 2)
         part = (place - low)[:, None]
         distance = np.linalg.norm(points - (xy[low] * (1 - part) + xy[low + 1] * part), axis=1)
