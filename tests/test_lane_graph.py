@@ -75,7 +75,7 @@ def moved(world: Scenario, turn_rad: float, shift: tuple[float, float]) -> Scena
     return replace(world, agents=tuple(put(a) for a in world.agents))
 
 
-def require_consistent(lanes: Sequence[MapLane]) -> None:
+def require_consistent(lanes: Sequence[MapLane], features: MapFeatures = MapFeatures()) -> None:  # noqa: B008
     """Links lead back and lanes meet; those side by side know each other."""
     by_id = {lane.id: lane for lane in lanes}
     assert len(by_id) == len(lanes)
@@ -91,7 +91,7 @@ def require_consistent(lanes: Sequence[MapLane]) -> None:
         assert lane.left_lane is None or by_id[lane.left_lane].right_lane == lane.id
         assert lane.right_lane is None or by_id[lane.right_lane].left_lane == lane.id
         assert lane.opposite is None or by_id[lane.opposite].opposite == lane.id
-    MapFeatures.from_dict(MapFeatures(lanes=tuple(lanes)).to_dict())
+    MapFeatures.from_dict(replace(features, lanes=tuple(lanes)).to_dict())
 
 
 @pytest.mark.parametrize("name", WORLDS)
@@ -160,7 +160,10 @@ def test_the_order_of_agents_does_not_matter(order: list[int]) -> None:
 def test_where_nobody_moves_there_is_no_lane() -> None:
     still = agent(np.zeros((5, 2)), yaw_rad=0.3)
     walker = agent(line(20.0, 21), "walker", category="pedestrian")
-    assert infer_lanes((), (), scenario(still, walker)) == ((), ("no lanes from paths: no vehicle moves",))
+    assert infer_lanes((), (), scenario(still, walker)) == (
+        (),
+        ("no lanes between markings: none were found", "no lanes from paths: no vehicle moves"),
+    )
 
 
 def test_a_cyclist_beside_cars_makes_no_lane_and_alone_makes_one() -> None:

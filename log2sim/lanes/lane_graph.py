@@ -9,18 +9,21 @@ from itertools import count
 import numpy as np
 
 from log2sim.datatypes import MapLane, Marking, RoadBorder, Scenario
-from log2sim.lanes.junction_areas import join_conflicts
 from log2sim.lanes.beside import find_beside
 from log2sim.lanes.conflicts import find_conflicts, find_transitions, is_lane_change
 from log2sim.lanes.connections import Connection, connect, continuations
 from log2sim.lanes.coverage import find_uncovered
+from log2sim.lanes.directions import direct_strips
 from log2sim.lanes.driven_paths import DrivenPath, collect_paths
 from log2sim.lanes.extension import continued
+from log2sim.lanes.junction_areas import join_conflicts
 from log2sim.lanes.lane_changes import without_lane_changes
+from log2sim.lanes.lane_lines import name_lines
 from log2sim.lanes.matching import Match
 from log2sim.lanes.polyline import Polyline
 from log2sim.lanes.routes import JOIN_M, Route, match_path, merge_paths
 from log2sim.lanes.sections import Strip, cut_sections, lay_out
+from log2sim.lanes.strips import find_strips
 from log2sim.lanes.thinning import thin
 
 PATH_PROBABILITY = 0.6
@@ -57,12 +60,44 @@ def infer_lanes(
     (`lay_out`), and the ways of the vehicles from one section to the next become connections (`connect`).
     """
     driven = collect_paths(scenario)
+    marked = _marked_routes(markings, borders, driven)
+    notes = []
+    if not marked:
+        notes.append(
+            "no lanes between markings: "
+            + ("no two lines run side by side" if markings or borders else "none were found")
+        )
     if not driven:
-        return (), ("no lanes from paths: no vehicle moves",)
+        notes.append("no lanes from paths: no vehicle moves")
+    if not driven and not marked:
+        return (), tuple(notes)
     paths = without_lane_changes(driven)
-    graph = _graph(merge_paths(paths), paths)
+    graph = _graph(merge_paths(paths, marked), paths)
     lanes = _as_lanes(graph, {path.agent: path.confidence for path in driven})
-    return _with_opposites([*lanes, *_free_lanes(lanes, driven)]), ()
+    lanes = [*lanes, *_free_lanes(lanes, driven)]
+    return _with_opposites(name_lines(lanes, markings, borders)), tuple(notes)
+
+
+def _marked_routes(
+    markings: Sequence[Marking], borders: Sequence[RoadBorder], paths: Sequence[DrivenPath]
+) -> list[Route]:
+    """Return routes along the strips between lines, in the direction of traffic."""
+    sides: dict[str, Marking | RoadBorder] = {marking.id: marking for marking in markings}
+    sides |= {border.id: border for border in borders}
+    strips = direct_strips(find_strips(markings, borders), paths, sides)
+    return [
+        Route(
+            strip.line,
+            strip.width_m,
+            strip.width_s_m,
+            (True, True),
+            (0.0, strip.line.length_m),
+            strip.left,
+            strip.right,
+            strip.confidence * strip.directed,
+        )
+        for strip in strips
+    ]
 
 
 def _graph(routes: Sequence[Route], paths: Sequence[DrivenPath]) -> _Graph:
@@ -115,20 +150,24 @@ def _as_lanes(graph: _Graph, confidence_of: dict[str, float]) -> list[MapLane]:
     lanes = []
     for k, strip in enumerate(graph.strips):
         route = graph.routes[strip.section.route]
-        origin = "both" if route.marked and graph.drivers[k] else "markings" if route.marked else "paths"
+        marked = _is_marked(route, strip)
+        by_paths = _confidence(graph.drivers[k], confidence_of)
+        origin = ("both" if graph.drivers[k] else "markings") if marked else "paths"
+        both = 1 - (1 - by_paths) * (1 - route.confidence) if marked else by_paths
+        left, right = (None if other is None else names[other] for other in (strip.left, strip.right))
         lanes.append(
             MapLane(
                 names[k],
                 strip.line.points_m,
                 strip.width_m,
-                route.left,
-                route.right,
+                route.left if marked else None,
+                route.right if marked else None,
                 tuple(before[k]),
                 tuple(after[k]),
-                None if strip.left is None else names[strip.left],
-                None if strip.right is None else names[strip.right],
+                left,
+                right,
                 inferred_from=origin,
-                confidence=_confidence(graph.drivers[k], confidence_of),
+                confidence=round(both, 3),
             )
         )
     for k, way in enumerate(graph.connections, start=first):
@@ -145,6 +184,14 @@ def _as_lanes(graph: _Graph, confidence_of: dict[str, float]) -> list[MapLane]:
             )
         )
     return [thin(lane) for lane in _meeting(lanes, links)]
+
+
+def _is_marked(route: Route, strip: Strip) -> bool:
+    """Whether markings make the route along at least half of a section."""
+    if route.marked_m is None:
+        return False
+    first, last = strip.section.first_m, strip.section.last_m
+    return min(last, route.marked_m[1]) - max(first, route.marked_m[0]) >= (last - first) / 2
 
 
 def _junctions(graph: _Graph) -> dict[int, str]:

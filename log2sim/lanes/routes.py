@@ -9,7 +9,7 @@ import numpy as np
 
 from log2sim.geometry import Array
 from log2sim.lanes.driven_paths import DrivenPath
-from log2sim.lanes.matching import ENTER_M, MAX_TURN_RAD, STAY_M, Match, match
+from log2sim.lanes.matching import ENTER_M, MAX_TURN_RAD, SHORT_M, STAY_M, Match, match
 from log2sim.lanes.polyline import Polyline
 
 LANE_M = 3.5
@@ -55,19 +55,22 @@ class Route:
     width_s_m : (K,) float64
     free : (2,) tuple of bool
         Whether start and end are where a vehicle was first or last seen, so that others may lengthen it.
-    marked : bool
-        Whether markings make it; else its middle is that of the paths.
+    marked_m : (2,) tuple of float or None
+        Stations between which markings make it; elsewhere its middle is that of the paths.
     left, right : str or None
-        Ids of the markings or borders beside it.
+        Ids of the markings or borders beside it, there.
+    confidence : float
+        That it is a lane in this direction, by its markings.
     """
 
     line: Polyline
     width_m: Array
     width_s_m: Array
     free: tuple[bool, bool] = (True, True)
-    marked: bool = False
+    marked_m: tuple[float, float] | None = None
     left: str | None = None
     right: str | None = None
+    confidence: float = 0.0
 
     def width_at(self, s_m: Array) -> Array:
         """Return the width (N,) at stations (N,)."""
@@ -86,7 +89,9 @@ def merge_paths(paths: Sequence[DrivenPath], marked: Sequence[Route] = ()) -> li
     for path in paths:
         _add(routes, path)
     matches = [match_path(routes, path) for path in paths]
-    return [route if route.marked else _center(route, k, paths, matches) for k, route in enumerate(routes)]
+    return [
+        route if route.marked_m is not None else _center(route, k, paths, matches) for k, route in enumerate(routes)
+    ]
 
 
 def match_path(routes: Sequence[Route], path: DrivenPath) -> Match:
@@ -102,9 +107,7 @@ def _add(routes: list[Route], path: DrivenPath) -> None:
     for _ in range(len(s)):
         found = match_path(routes, path)
         runs = found.runs
-        off = [
-            k for k, run in enumerate(runs) if run.route < 0 and run.first not in tried and s[run.last] - s[run.first] >= 2 * JOIN_M / 5
-        ]  # fmt: skip
+        off = [k for k in range(len(runs)) if runs[k].first not in tried and _is_new(routes, found, k, s)]
         if not off:
             return
         k = off[0]
@@ -125,12 +128,26 @@ def _add(routes: list[Route], path: DrivenPath) -> None:
             routes.append(Route(line, np.array([width]), np.zeros(1), free))
 
 
+def _is_new(routes: Sequence[Route], found: Match, k: int, s: Array) -> bool:
+    """Whether run k of a path is off all routes for long, or beyond the end of one."""
+    run = found.runs[k]
+    if run.route >= 0:
+        return False
+    before = found.runs[k - 1].route if k > 0 else -1
+    after = found.runs[k + 1].route if k + 1 < len(found.runs) else -1
+    if before >= 0 and run.last == len(s) - 1 and _is_at_end(routes[before], found.s_m[run.first - 1]):
+        return True
+    if after >= 0 and run.first == 0 and _is_at_start(routes[after], found.s_m[run.last + 1]):
+        return True
+    return bool(s[run.last] - s[run.first] >= SHORT_M)
+
+
 def _is_at_end(route: Route, s_m: float) -> bool:
-    return route.free[1] and not route.marked and route.line.length_m - s_m < JOIN_M
+    return route.free[1] and route.line.length_m - s_m < JOIN_M
 
 
 def _is_at_start(route: Route, s_m: float) -> bool:
-    return route.free[0] and not route.marked and s_m < JOIN_M
+    return route.free[0] and s_m < JOIN_M
 
 
 def _first_return(line: Polyline, first: int, last: int) -> int | None:
@@ -165,9 +182,9 @@ def _preceded(route: Route, path: DrivenPath, rows: tuple[int, int], aside_m: fl
     moved = path.line.offset(s, -aside_m * (1 - _ease((s[-1] - s) / BLEND_M)))
     points = np.concatenate([moved, route.line.points_m[1:]])
     grown = Polyline.through(_forward(points[::-1])[::-1])
-    return replace(
-        route, line=grown, width_s_m=route.width_s_m + grown.length_m - route.line.length_m, free=(free, route.free[1])
-    )
+    later = grown.length_m - route.line.length_m
+    marked = None if route.marked_m is None else (route.marked_m[0] + later, route.marked_m[1] + later)
+    return replace(route, line=grown, width_s_m=route.width_s_m + later, marked_m=marked, free=(free, route.free[1]))
 
 
 def _forward(points: Array) -> Array:

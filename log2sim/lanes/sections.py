@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from log2sim.geometry import Array
-from log2sim.lanes.junction_areas import MIN_SECTION_M, Areas
 from log2sim.lanes.beside import Beside
+from log2sim.lanes.junction_areas import MIN_SECTION_M, Areas
 from log2sim.lanes.polyline import Polyline
 from log2sim.lanes.routes import Route
 
@@ -116,6 +116,9 @@ def _find_cuts(routes: Sequence[Route], areas: Areas, beside: Sequence[Beside]) 
         cuts[route].append(s)
         return True
 
+    for k, route in enumerate(routes):
+        for s in route.marked_m or ():
+            add(k, s)
     same = [pair for pair in beside if pair.same_way]
     for pair in same:
         for k in (0, -1):
