@@ -128,7 +128,7 @@ def _group(linked: NDArray[np.bool_]) -> NDArray[np.int32]:
 def _crosswalk(pieces: Pieces, bars: list[_Bar]) -> PaintedArea:
     corners = np.concatenate([_corners(bar) for bar in bars])
     own = pieces.take(np.concatenate([bar.members for bar in bars]))
-    odds = log_odds_of_line(own, sum(bar.length_m for bar in bars), dashes=len(bars))
+    odds = log_odds_of_line(own, sum(bar.length_m for bar in bars), dashes=len(bars), alone=False)
     return PaintedArea("crosswalk", _hull(corners), float(np.median([bar.length_m for bar in bars])), own, odds)
 
 

@@ -11,7 +11,7 @@ from log2sim.lanes.profiles import Pieces
 PRIOR = -3.0
 PER_METER = 0.8  # of paint in line, which texture seldom continues
 MAX_BY_LENGTH = 5.5
-DASHES = 1.5  # dashes of one length at one distance
+DASHES = 2.0  # three or more dashes of one length at one distance
 # Sun between two shadows and wet glare are ridges to a camera, too: more than that it alone does not say.
 MAX_BY_CAMERA = 3.5
 UNEVEN = -2.5  # a step beside which a little stands out
@@ -23,31 +23,34 @@ WIDTH_VARIES = -2.0
 WIDTH_UNUSUAL = -4.0
 # Contrast of logarithms of LiDAR intensity of paint and of other ridges: mean, sigma.
 PAINT_REFLECTS, OTHER_REFLECTS = (0.8, 0.3), (0.0, 0.12)
+# Dashes along lanes are up to 0.3 m wide (VwV-StVO: broad lines of 0.25 m and 0.3 m).
+MAX_DASH_WIDTH_M, WIDE_DASHES = 0.4, -2.0
 MAX_BY_LIDAR = 6.0
 MIN_REFLECTING = 2  # pieces
 MIN_WIDTH_M, MAX_WIDTH_M = 0.06, 0.7
 
 
-def log_odds_of_line(pieces: Pieces, painted_m: float, *, dashes: int) -> float:
-    """Log-odds that pieces in a line are a marking."""
+def log_odds_of_line(pieces: Pieces, painted_m: float, *, dashes: int, alone: bool = True) -> float:
+    """Log-odds that pieces in a line are a marking; `alone` unless others like it are beside it, as bars of crosswalks."""
     odds = PRIOR + min(PER_METER * painted_m, MAX_BY_LENGTH)
-    odds += DASHES * min(max(dashes - 2, 0), 2) / 2 + (DASHES / 2 if dashes >= 2 else 0)
+    odds += DASHES * min(max(dashes - 2, 0), 2) / 2
     by_camera = _median_known(pieces.color)
     if np.isfinite(by_camera):
-        odds += _by_shape(pieces)
+        odds += _by_shape(pieces, alone=alone)
     odds += _by_width(pieces)
+    if alone and dashes > 1 and np.median(pieces.width_m) > MAX_DASH_WIDTH_M:
+        odds += WIDE_DASHES
     odds = min(odds, MAX_BY_CAMERA)
     return odds + by_lidar(pieces)
 
 
-def _by_shape(pieces: Pieces) -> float:
+def _by_shape(pieces: Pieces, *, alone: bool) -> float:
     contrast = np.maximum(pieces.color, 1e-3)
     odds = 0.0
     uneven = _median_known(pieces.uneven / contrast)
     odds += UNEVEN * float(np.clip((uneven - 0.5) / 0.5, 0, 1))
     bright = pieces.outshines[np.isfinite(pieces.outshines)]
-    # Beside wide paint there is more of it, as bright: bars of crosswalks, double lines.
-    if len(bright) and np.median(pieces.width_m) < 0.3:
+    if len(bright) and alone:
         share = float(np.mean(bright > MIN_OUTSHINING * contrast[np.isfinite(pieces.outshines)]))
         odds += NOT_BRIGHTEST * float(np.clip((0.5 - share) / 0.4, 0, 1))
     width, edge = float(np.median(pieces.width_m)), _median_known(pieces.edge_m)

@@ -17,7 +17,7 @@ COARSE_M = 0.1
 # Added to pixel values before the logarithm: what noise and rounding of a dark picture amount to.
 DARK_LEVEL = 4.0
 # Yellow paint on concrete is hardly brighter than it but much more yellow; half the weight, as blue is noisier.
-YELLOW_WEIGHT = 0.5
+YELLOW_WEIGHT = 1.0
 # Returns of asphalt are as weak as 1 % to 10 %: keeps the logarithm of the weakest from ruling.
 DARK_INTENSITY = 0.02
 TILE_CELLS = 1024

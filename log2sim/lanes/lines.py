@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from log2sim.geometry import Array
@@ -14,7 +13,7 @@ from log2sim.lanes.curves import Curve, fit_curve
 from log2sim.lanes.evidence import log_odds_of_line
 from log2sim.lanes.layers import Mask
 from log2sim.lanes.profiles import Pieces
-from log2sim.lanes.strokes import Stretch, stretches_of, trace
+from log2sim.lanes.strokes import Stretch, Trace, stretches_of, trace
 from log2sim.mapping.ground_map import GroundMap
 
 MIN_LINE_M = 1.0
@@ -23,6 +22,7 @@ MIN_YELLOW = 0.2
 REPEAT_M = 0.18  # double lines are 0.2 m apart and more, from middle to middle
 # Lanes are 2 m wide at least; of lines that run beside each other there are two. More are sun through a fence, or a wall.
 BESIDE_M, MAX_BESIDE, CROWDED = (0.45, 1.7), 1, -5.0
+BESIDE_PER_M = 4  # pairs of points 0.5 m apart, two for each: beside it along half of it or more
 MAX_CROSSINGS, MAX_CROSSINGS_PER_M = 3, 0.2  # a grid of more lines is a wall or paving
 # Paint of the same time is about as bright; a much weaker line beside another is what is left of removed paint.
 REMNANT_SHARE, REMNANT = 0.4, -4.0
@@ -103,12 +103,15 @@ def find_lines(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> list[P
         own = pieces.take(chain.members)
         curve = fit_curve(corners)
         width = float(np.median(own.width_m))
-        strokes = trace(ground, curve, width).strokes()
-        out += [line for line in (_line_of(curve, own, stretch) for stretch in stretches_of(strokes)) if line]
+        traced = trace(ground, curve, width)
+        for stretch in stretches_of(traced.strokes()):
+            line = _line_of(curve, own, stretch, traced)
+            if line is not None:
+                out.append(line)
     return _in_context(without_repeats(out))
 
 
-def _line_of(curve: Curve, pieces: Pieces, stretch: Stretch) -> PaintedLine | None:
+def _line_of(curve: Curve, pieces: Pieces, stretch: Stretch, traced: Trace) -> PaintedLine | None:
     s = curve.s
     nearest = s[cKDTree(curve.xy).query(pieces.xy)[1]]
     member = (nearest > stretch.begin_m - 1.0) & (nearest < stretch.end_m + 1.0)
@@ -118,8 +121,9 @@ def _line_of(curve: Curve, pieces: Pieces, stretch: Stretch) -> PaintedLine | No
     inner = s[(s > stretch.begin_m + 0.1) & (s < end - 0.1)]
     xy = curve.at(np.concatenate([[stretch.begin_m], inner, [end]]))
     own = pieces.take(member)
-    odds = log_odds_of_line(own, stretch.painted_m, dashes=stretch.dashes)
-    return PaintedLine(xy, stretch.kind, float(np.median(own.width_m)), own, stretch.painted_m, stretch.dashes, odds)
+    painted_m = traced.painted_m(stretch.begin_m, end)
+    odds = log_odds_of_line(own, painted_m, dashes=stretch.dashes)
+    return PaintedLine(xy, stretch.kind, float(np.median(own.width_m)), own, painted_m, stretch.dashes, odds)
 
 
 def without_repeats(lines: list[PaintedLine]) -> list[PaintedLine]:
@@ -160,29 +164,29 @@ def _in_context(lines: list[PaintedLine]) -> list[PaintedLine]:
     np.add.at(shared[0], (owner[a[parallel]], owner[b[parallel]]), 1)
     np.add.at(shared[1], (owner[a[crossing]], owner[b[crossing]]), 1)
     contrast = np.array([float(np.median(np.nan_to_num(line.pieces.color))) for line in lines])
-    crowded = np.array([np.count_nonzero(_beside(shared[0, k], line)) > MAX_BESIDE for k, line in enumerate(lines)])
-    return [
-        replace(line, log_odds=line.log_odds + _by_neighbors(line, k, shared, crowded, contrast))
-        for k, line in enumerate(lines)
-    ]
+    alike = _alike(lines, contrast)
+    beside = np.stack([shared[0, k] > BESIDE_PER_M * line.length_m for k, line in enumerate(lines)])
+    crowded = np.count_nonzero(beside & alike, axis=1) > MAX_BESIDE
+    out = []
+    for k, line in enumerate(lines):
+        odds = CROWDED if crowded[k] else 0.0
+        # Combs do not tell against what they cross, unless that is a comb, too.
+        crossings = np.count_nonzero((shared[1, k] > 0) & alike[k] & (~crowded | np.any(beside[k])))
+        if crossings > MAX_CROSSINGS and crossings > MAX_CROSSINGS_PER_M * line.length_m:
+            odds += CROWDED
+        brighter = beside[k] & np.array([other.log_odds > line.log_odds - 1 for other in lines])
+        if np.any(brighter) and contrast[k] < REMNANT_SHARE * float(contrast[brighter].max()):
+            odds += REMNANT
+        out.append(replace(line, log_odds=line.log_odds + odds))
+    return out
 
 
-def _by_neighbors(line: PaintedLine, own: int, shared: NDArray[np.int32], crowded: Mask, contrast: Array) -> float:
-    """Log-odds of a line by how many of its points are beside, or at, each other line (2, L, L)."""
-    odds = CROWDED if crowded[own] else 0.0
-    beside = _beside(shared[0, own], line)
-    # Combs do not tell against what they cross, unless that is a comb, too.
-    crossings = np.count_nonzero((shared[1, own] > 0) & (~crowded | np.any(beside)))
-    if crossings > MAX_CROSSINGS and crossings > MAX_CROSSINGS_PER_M * line.length_m:
-        odds += CROWDED
-    if np.any(beside) and contrast[own] < REMNANT_SHARE * float(contrast[beside].max()):
-        odds += REMNANT
-    return odds
-
-
-def _beside(shared: NDArray[np.int32], line: PaintedLine) -> Mask:
-    """Mask (L,) of the lines beside a line along most of it; its points are 0.5 m apart, and each has some in reach."""
-    return np.asarray(shared > 4 * line.length_m)
+def _alike(lines: list[PaintedLine], contrast: Array) -> Mask:
+    """Mask (L, L) of lines (second) that look like another (first) and are as likely: what combs and grids are made of."""
+    width, odds = np.array([line.width_m for line in lines]), np.array([line.log_odds for line in lines])
+    same = np.maximum(width[:, None], width) <= 2 * np.minimum(width[:, None], width)
+    same &= np.maximum(contrast[:, None], contrast) <= 2 * np.minimum(contrast[:, None], contrast)
+    return np.asarray(same & (odds > odds[:, None] - 2))
 
 
 def _headings(points: Array) -> Array:

@@ -16,7 +16,7 @@ from log2sim.lanes.ridges import find_ridges
 from log2sim.mapping.ground_map import GroundMap
 
 MIN_CONFIDENCE = 0.5  # what is rather not there than there is left out
-MIN_SOLID_M = 2.0  # shorter plain strokes tell no lane
+MIN_LINE_M = 2.0  # shorter plain strokes tell no lane
 
 
 def find_markings(ground: GroundMap) -> tuple[tuple[Marking, ...], tuple[RoadBorder, ...], tuple[str, ...]]:
@@ -42,22 +42,27 @@ def find_markings(ground: GroundMap) -> tuple[tuple[Marking, ...], tuple[RoadBor
     bars are crosswalks, and wide strokes across lanes are stop lines (`areas`). Each is rated by both sensors
     (`evidence`). The cost grows with the area that was seen.
     """
-    areas, stops, lines = _find_paint(ground)
-    found = [_marking_of_area(ground, area) for area in areas]
-    found += [_marking_of_line(ground, line, "stop_line") for line in stops]
-    found += [_marking_of_line(ground, line, line.kind) for line in lines]
-    markings = sorted((m for m in found if m.confidence >= MIN_CONFIDENCE), key=lambda m: -m.confidence)
-    named = tuple(_named(marking, f"marking-{k + 1}") for k, marking in enumerate(markings))
-    return named, (), _notes(ground, named)
+    markings = list_markings(ground, min_confidence=MIN_CONFIDENCE, min_line_m=MIN_LINE_M)
+    return markings, (), _notes(ground, markings)
 
 
-def _find_paint(ground: GroundMap) -> tuple[list[PaintedArea], list[PaintedLine], list[PaintedLine]]:
+def list_markings(
+    ground: GroundMap, *, min_confidence: float, min_line_m: float, symbols: bool = True
+) -> tuple[Marking, ...]:
+    """List markings, sure ones first, from a confidence and, for plain strokes, a length on; `symbols` tells arrows apart."""
     pieces = find_pieces(ground, find_ridges(ground))
     areas, chains = find_crosswalks(ground, pieces, touching_chains(pieces))
     lines = find_lines(ground, pieces, dashed_chains(pieces, chains))
     stops, lines = part_stop_lines(lines)
-    symbols, lines = part_symbols(ground, lines)
-    return areas + symbols, stops, [line for line in lines if line.kind == "dashed" or line.length_m >= MIN_SOLID_M]
+    if symbols:
+        small, lines = part_symbols(ground, lines)
+        areas += small
+    found = [_marking_of_area(ground, area) for area in areas]
+    found += [_marking_of_line(ground, line, "stop_line") for line in stops]
+    long = [line for line in lines if line.kind == "dashed" or line.length_m >= min_line_m]
+    found += [_marking_of_line(ground, line, line.kind) for line in long]
+    markings = sorted((m for m in found if m.confidence >= min_confidence), key=lambda m: -m.confidence)
+    return tuple(_named(marking, f"marking-{k + 1}") for k, marking in enumerate(markings))
 
 
 def _marking_of_line(ground: GroundMap, line: PaintedLine, kind: str) -> Marking:

@@ -15,6 +15,7 @@ from log2sim.lanes.layers import Layer, Samples, sample
 from log2sim.mapping.ground_map import GroundMap
 
 PROFILE_M, PROFILE_STEP_M, ALONG_SAMPLES = 1.5, 0.05, 11
+MIN_SEEN = 0.6  # share of a profile's middle; of what is hidden beside a line, the other side tells
 MAX_SHIFT_M = 0.25  # from the ridge to the middle of the paint
 FLANK_M = (0.08, 0.7)  # from the middle: where the road beside the paint is looked for
 
@@ -85,7 +86,7 @@ def measure_pieces(ground: GroundMap, lines: Array) -> Pieces:
     seen = sample(ground, x.reshape(flat), y.reshape(flat))
     samples = Samples(*(a.reshape(x.shape) for a in (seen.bright, seen.yellow, seen.intensity)))
     color, reflected = (_quiet(np.nanmean, a) for a in (samples.paint, samples.intensity))
-    by_camera = np.isfinite(color).mean(1) > 0.8
+    by_camera = np.isfinite(color[:, np.abs(across) <= 2 * MAX_SHIFT_M]).mean(1) > MIN_SEEN
     # Of values, not of their logarithms, in which edges that are blurred lie farther out.
     left, right, edge = _edges(np.exp(np.where(by_camera[:, None], color, reflected)), across)
     shift, width = (left + right) / 2, right - left
@@ -133,11 +134,17 @@ def _edges(profile: Array, across: Array) -> tuple[Array, Array, Array]:
     top = soft[index, peak]
     # Lines wider than the blur have a flat top: its mean is nearer to the paint than its largest value.
     edges, falls = [], []
-    for side in (-1, 1):
-        beside = (side * (across - across[peak][:, None]) > FLANK_M[0]) & (
-            side * (across - across[peak][:, None]) < FLANK_M[1]
+    distance = across - across[peak][:, None]
+    roads = [
+        _quiet(
+            np.nanquantile,
+            np.where((side * distance > FLANK_M[0]) & (side * distance < FLANK_M[1]), profile, np.nan),
+            q=0.25,
         )
-        road = _quiet(np.nanquantile, np.where(beside, profile, np.nan), q=0.25)
+        for side in (-1, 1)
+    ]
+    for side, road, other in zip((-1, 1), roads, roads[::-1]):
+        road = np.where(np.isfinite(road), road, other)
         high, half, low = (_crossing(filled, peak, road + q * (top - road), side, across) for q in (0.75, 0.5, 0.25))
         edges.append(half)
         falls.append(side * (low - high))

@@ -27,8 +27,12 @@ GAP_M = 0.1  # between paint and flank: its blurred edge
 MARGIN_M = 2.0
 # Paint that is worn until one sees it no more is 1.1 times as bright as the road (values of pixels, with their gamma).
 MIN_CONTRAST = 0.1
+# What is so bright is looked at however rough its surroundings are: vehicles and curbs stand beside lines.
+CLEAR_CONTRAST = 0.25
 MIN_SIGMAS = 4.0  # of the same filter's response to the texture around
-BLOCK_M = 6.0  # texture is measured within
+BLOCK_M = 4.0  # texture is measured within
+# Of a normal distribution that share is within so many sigmas; what stands on part of a block does not count.
+TEXTURE_QUANTILE, TEXTURE_SIGMAS = 0.35, 0.454
 MIN_SEEN = 0.7  # share of the cells under the filter
 MAX_POINTS = 400_000  # bound of memory: 40 km of lines
 HIGH_PASS_M = 1.5
@@ -168,7 +172,7 @@ def _turn(shape: tuple[int, ...], angle: float) -> tuple[Array, Array, tuple[int
 
 
 def _block_sigma(plain: Layer, cell_m: float) -> Layer:
-    """Estimate the sigma (R, C) of the response to texture, by medians of blocks, as lines are few in each."""
+    """Estimate the sigma (R, C) of the response to texture by what is usual in blocks, as lines are few in each."""
     block = max(8, round(BLOCK_M / cell_m / 2))
     rows, columns = plain.shape
     values = np.abs(plain[::2, ::2])
@@ -177,11 +181,11 @@ def _block_sigma(plain: Layer, cell_m: float) -> Layer:
         part = values[i * block : (i + 1) * block, j * block : (j + 1) * block]
         part = part[part > 0]  # exactly 0 where nothing was seen
         if part.size > 20:
-            grid[i, j] = np.median(part) / 0.6745
+            grid[i, j] = np.quantile(part, TEXTURE_QUANTILE) / TEXTURE_SIGMAS
     # A perfectly even ground has no texture: what then counts is the least contrast.
     least = np.float32(MIN_CONTRAST / MIN_SIGMAS)
-    grid = np.maximum(np.where(np.isfinite(grid), grid, least), least)
-    return np.asarray(cv2.resize(cv2.blur(grid, (3, 3)), (columns, rows), interpolation=cv2.INTER_LINEAR), np.float32)
+    grid = np.clip(np.where(np.isfinite(grid), grid, least), least, CLEAR_CONTRAST / MIN_SIGMAS)
+    return np.asarray(cv2.resize(grid, (columns, rows), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 def _crests(strength: Layer, direction: NDArray[np.uint8], tile: CoarseTile) -> Array:

@@ -57,6 +57,10 @@ class Trace:
                 merged.append([begin, end])
         return np.array([m for m in merged if m[1] - m[0] >= MIN_DASH_M]).reshape(-1, 2)
 
+    def painted_m(self, begin_m: float, end_m: float) -> float:
+        """Measure the length with paint between two places."""
+        return STEP_M * int(np.count_nonzero(self.on & (self.s >= begin_m) & (self.s <= end_m)))
+
     def _seen_between(self, begin: float, end: float) -> bool:
         between = self.seen[(self.s > begin) & (self.s < end)]
         return not len(between) or float(np.mean(between)) > 0.5
@@ -71,8 +75,6 @@ class Stretch:
     begin_m, end_m : float
     kind : str
         "solid" or "dashed".
-    painted_m : float
-        Length with paint.
     dashes : int
         Number of dashes, 1 for a solid line.
     """
@@ -80,7 +82,6 @@ class Stretch:
     begin_m: float
     end_m: float
     kind: str
-    painted_m: float
     dashes: int
 
 
@@ -110,7 +111,7 @@ def _ridge(values: NDArray[np.float32]) -> Array:
         total, count = filled[:, part].sum(1, dtype=np.float64), known[:, part].sum(1)
         # LiDAR hits few cells: those of 0.5 m along are taken together.
         total, count = (cv2.blur(a.reshape(-1, 1), (1, 5)).ravel() for a in (total, count.astype(np.float64)))
-        return np.divide(total, count, out=np.full(len(total), np.nan), where=count > 0)
+        return np.asarray(np.divide(total, count, out=np.full(len(total), np.nan), where=count > 0), np.float64)
 
     left, right = mean(slice(3, 3 + each)), mean(slice(3 + each, None))
     return np.asarray(mean(slice(0, 3)) - np.fmax(left, right))
@@ -147,9 +148,7 @@ def stretches_of(strokes: Array) -> list[Stretch]:
         if part[0, 1] - part[0, 0] <= MAX_DASH_M and is_dashed(part):
             out += _solid_parts(solid)
             solid = []
-            out.append(
-                Stretch(float(part[0, 0]), float(part[-1, 1]), "dashed", float(np.ptp(part, 1).sum()), len(part))
-            )
+            out.append(Stretch(float(part[0, 0]), float(part[-1, 1]), "dashed", len(part)))
         else:
             solid += list(part)
     return out + _solid_parts(solid)
@@ -180,13 +179,22 @@ def is_dashed(strokes: Array) -> bool:
     s = np.arange(strokes[0, 0], strokes[-1, 1], STEP_M)
     on = (np.searchsorted(strokes[:, 0], s, side="right") - np.searchsorted(strokes[:, 1], s, side="right")) > 0
     best, gain = None, MIN_GAIN
-    for period in np.arange(*PERIODS_M, PHASE_M / 2):
-        if 1.5 * period > s[-1] - s[0]:
-            break
+    for period in _periods(strokes):
         found = _fold(s, on, float(period))
-        if found is not None and found[0] > gain * 1.02:
+        if found is not None and found[0] > gain:
             gain, best = found[0], found
     return best is not None and best[1] >= MIN_ON and best[2] <= MAX_OFF
+
+
+def _periods(strokes: Array) -> Array:
+    """List periods that strokes (K, 2) may have: distances of neighbors, adjusted to their distance from first to last."""
+    middle = strokes.mean(axis=1)
+    steps = np.concatenate([np.diff(edge[::every]) / every for edge in (middle, *strokes.T) for every in (1, 2)])
+    steps = np.unique(np.round(steps[(steps >= PERIODS_M[0]) & (steps <= PERIODS_M[1])] / PHASE_M) * PHASE_M)
+    length = np.concatenate([middle[-1:] - middle[:1], strokes[-1] - strokes[0]])
+    adjusted = (length[:, None] / np.maximum(np.rint(length[:, None] / steps), 1)).ravel()
+    periods = np.unique(np.round(np.concatenate([steps, adjusted]), 2))
+    return np.asarray(periods[1.5 * periods <= strokes[-1, 1] - strokes[0, 0]])
 
 
 def _fold(s: Array, on: NDArray[np.bool_], period: float) -> tuple[float, float, float] | None:
@@ -196,7 +204,11 @@ def _fold(s: Array, on: NDArray[np.bool_], period: float) -> tuple[float, float,
     count, painted = np.bincount(phase, minlength=bins), np.bincount(phase, on, minlength=bins)
     rate = painted / np.maximum(count, 1)
     inside = rate > 0.5 * rate.max()
-    if inside.all() or np.count_nonzero(inside != np.roll(inside, 1)) != 2 or period * (~inside).mean() < MIN_BARE_M:
+    if (
+        inside.all()
+        or np.count_nonzero(inside[1:] != inside[:-1]) + int(inside[0] != inside[-1]) != 2
+        or period * (~inside).mean() < MIN_BARE_M
+    ):
         return None
     n1, k1 = count[inside].sum(), painted[inside].sum()
     n0, k0 = count[~inside].sum(), painted[~inside].sum()
@@ -211,7 +223,7 @@ def _entropy(k: float, n: float) -> float:
 
 def _solid_parts(strokes: list[Array]) -> list[Stretch]:
     """Join strokes to solid lines with worn places; where more is bare than painted, the line ends."""
-    out: list[list[float]] = []
+    out: list[list[float]] = []  # begin, end, length with paint
     for begin, end in strokes:
         bare = begin - out[-1][1] if out else np.inf
         if out and bare <= max(2.0, 0.5 * min(out[-1][2], 12.0)):
@@ -219,4 +231,4 @@ def _solid_parts(strokes: list[Array]) -> list[Stretch]:
             out[-1][2] += end - begin
         else:
             out.append([begin, end, end - begin])
-    return [Stretch(float(b), float(e), "solid", float(painted), 1) for b, e, painted in out]
+    return [Stretch(float(b), float(e), "solid", 1) for b, e, _ in out]
