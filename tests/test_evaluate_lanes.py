@@ -61,7 +61,7 @@ def test_the_truth_is_perfect_against_itself(truth: Scenario) -> None:
     assert result["colors"]["accuracy"] == 1
     assert result["signals"] is None
     table = format_table(result)
-    assert "lane lines: precision 1.00, recall 1.00" in table
+    assert "lane lines: precision 1.00, recall 1.00 (1.00 within 20 m), off by 0.00 m" in table
     assert "1 of 1 stop lines, 1 of 1 crosswalks" in table
 
 

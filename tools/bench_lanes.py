@@ -33,7 +33,7 @@ from log2sim.synth.write import write_synthetic
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"
 HEADER = [
-    "scene", "condition", "precision", "recall", "off by, median", "95 %", "kind right", "false per 100 m", "stop lines",
+    "scene", "condition", "precision", "recall", "within 20 m", "off by, median", "95 %", "kind right", "false per 100 m", "stop lines",
     "crosswalks", "lanes precision", "recall", "center off by", "paths inside",
 ]  # fmt: skip
 COLORS = ["light", "vehicles", "with color", "name right", "CIEDE2000", "confused"]
@@ -152,7 +152,7 @@ def lane_rows(results: Sequence[dict[str, Any]]) -> list[list[str]]:
     out = []
     for name in dict.fromkeys(r["case"] for r in results):
         rows = [r for r in results if r["case"] == name]
-        lines = [mean_of(rows, "lane_lines", key) for key in ("precision", "recall")]
+        lines = [mean_of(rows, "lane_lines", key) for key in ("precision", "recall", "recall_20_m")]
         away = [mean_of(rows, "lane_lines", key) for key in ("lateral_median_m", "lateral_p95_m")]
         lanes = [mean_of(rows, "lanes", key) for key in ("precision", "recall")]
         out.append([

@@ -13,7 +13,7 @@ from log2sim.datatypes import Scenario
 from log2sim.errors import ScenarioError
 from log2sim.geometry import Array
 
-WITHIN_M = 40.0  # of the ego's path
+WITHIN_M, CLOSE_M = 40.0, 20.0  # of the ego's path
 STEP_M = 0.1  # between points at which lines are compared
 MAX_SAMPLES = 2_000_000
 MAX_CELLS = 10_000_000
@@ -28,6 +28,8 @@ class Area:
     ----------
     near : polygon or None
         Surroundings of the ego's path; None without an ego, where all counts.
+    close : polygon or None
+        Its nearer part.
     seen : polygon or None
         Ground that a sensor saw; None where the truth does not tell.
     path_m : float
@@ -35,6 +37,7 @@ class Area:
     """
 
     near: BaseGeometry | None
+    close: BaseGeometry | None
     seen: BaseGeometry | None
     path_m: float
 
@@ -50,12 +53,12 @@ class Area:
         ego = truth.ego or scenario.ego
         seen = seen_ground(truth, shift_m)
         if ego is None:
-            return cls(None, seen, 0.0)
+            return cls(None, None, seen, 0.0)
         w = ego.waypoints
         path = shapely.LineString(np.column_stack([w.x_m, w.y_m])) if len(w) > 1 else shapely.Point(w.x_m[0], w.y_m[0])
-        near = path.simplify(PATH_TOLERANCE_M).buffer(WITHIN_M)
-        shapely.prepare(near)
-        return cls(near, seen, float(path.length))
+        near, close = (path.simplify(PATH_TOLERANCE_M).buffer(reach) for reach in (WITHIN_M, CLOSE_M))
+        shapely.prepare([near, close])
+        return cls(near, close, seen, float(path.length))
 
     def counts(self, xy_m: Array) -> NDArray[np.bool_]:
         """Whether what is found at points (N, 2) counts: near the path."""
@@ -64,6 +67,10 @@ class Area:
     def expects(self, xy_m: Array) -> NDArray[np.bool_]:
         """Whether what is true at points (N, 2) should be found: near the path, where a sensor saw the ground."""
         return _within(self.near, xy_m) & _within(self.seen, xy_m)
+
+    def is_close(self, xy_m: Array) -> NDArray[np.bool_]:
+        """Whether points (N, 2) lie in the nearer part."""
+        return _within(self.close, xy_m)
 
 
 def _within(area: BaseGeometry | None, xy_m: Array) -> NDArray[np.bool_]:

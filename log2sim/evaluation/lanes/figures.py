@@ -86,8 +86,8 @@ def _count(counts: Mapping[str, int]) -> str:
 
 def _line_text(figures: Mapping[str, Any]) -> str:
     return (
-        f"precision {_figure(figures['precision'])}, recall {_figure(figures['recall'])}, off by "
-        f"{_meters(figures['lateral_median_m'])} (median) {_meters(figures['lateral_p95_m'])} (p95), "
+        f"precision {_figure(figures['precision'])}, recall {_figure(figures['recall'])} "
+        f"({_figure(figures['recall_20_m'])} within 20 m), off by {_meters(figures['lateral_median_m'])} (median) {_meters(figures['lateral_p95_m'])} (p95), "
         f"{_figure(figures['false_m_per_100_m'], 1)} m false per 100 m"
     )
 

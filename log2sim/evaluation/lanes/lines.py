@@ -74,7 +74,7 @@ def line_figures(found: Sequence[Line], true: Sequence[Line], area: Area) -> dic
     -------
     dict
         `precision` is the share of found length within `MATCH_M` of a true line, `recall` the share of true length within
-        that of a found one, where a sensor saw the ground. The lateral errors are distances of found points to the nearest
+        that of a found one, where a sensor saw the ground; `recall_20_m` the same within 20 m of the path. The lateral errors are distances of found points to the nearest
         true line within `LATERAL_REACH_M`. None where there is nothing to compute a figure from.
     """
     ours = Samples.of(found)
@@ -86,12 +86,14 @@ def line_figures(found: Sequence[Line], true: Sequence[Line], area: Area) -> dic
     right = away <= MATCH_M
     found_m, true_m = float(ours.length_m.sum()), float(theirs.length_m.sum())
     false_m = float(ours.length_m[~right].sum())
+    close = area.is_close(theirs.xy_m)
     beside = away <= LATERAL_REACH_M
     return {
         "true_m": true_m,
         "found_m": found_m,
         "precision": share(ours.length_m, right),
         "recall": share(theirs.length_m, missed_by <= MATCH_M),
+        "recall_20_m": share(theirs.length_m[close], missed_by[close] <= MATCH_M),
         "lateral_median_m": weighted_quantile(away[beside], ours.length_m[beside], 0.5),
         "lateral_p95_m": weighted_quantile(away[beside], ours.length_m[beside], 0.95),
         "false_m_per_100_m": None if area.path_m < 1 else 100 * false_m / area.path_m,
