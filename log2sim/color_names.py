@@ -16,7 +16,7 @@ from log2sim.geometry import Array
 
 # Lightness L* up to which an achromatic color is black, gray, silver; above that it is white. Kelly and Judd (1976), ISCC-NBS:
 # black up to Munsell value 2.5 (L* 25), white from value 8.5 (L* 85); silver paint is a light gray, from value 6 (L* 61).
-BLACK_L, GRAY_L, SILVER_L = 22.0, 60.0, 84.0
+BLACK_L, GRAY_L, SILVER_L = 25.0, 60.0, 84.0
 # Chroma C*ab from which a color is not called achromatic: ISCC-NBS calls colors of Munsell chroma below 1.5 to 2 grayish, one
 # step of which is about 5 to 6 units. Surfaces under the open sky look bluish, so blue starts later.
 GRAY_CHROMA, BLUISH_GRAY_CHROMA = 10.0, 12.5
@@ -102,12 +102,12 @@ def name_probabilities(lab: Array, sigma: Array) -> Array:
     samples = np.empty_like(errors)
     samples[:, 0] = np.clip(lab[0] + errors[:, 0], 0, 100)
     samples[:, 1:] = lab[1:] + errors[:, 1:2] * along + errors[:, 2:] * [-along[1], along[0]]
-    votes = np.bincount(name_indices(samples), minlength=len(COLOR_NAMES)) * _odds()
+    votes = np.bincount(name_indices(samples), minlength=len(COLOR_NAMES)) * odds_of_names()
     return np.asarray(votes / votes.sum())
 
 
-def _odds() -> Array:
-    """Return how much more frequent each name (K,) is among vehicles than its part of the colors."""
+def odds_of_names() -> Array:
+    """Return how much more frequent each of `COLOR_NAMES` (K,) is among vehicles than its part of the colors."""
     return np.array([ACHROMATIC_ODDS if name in ACHROMATIC else 1.0 for name in COLOR_NAMES])
 
 

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from log2sim.appearance.colors import ColorSampler
+from log2sim.appearance.lab import lab_of_linear, linear_of_lab
 from log2sim.appearance.light import CAMERA_WHITE, estimate_light, linear_values, mirrored_share, reflectances, veil_of
-from log2sim.appearance.paint import find_paint, lab_of_linear
+from log2sim.appearance.paint import find_paint
 from log2sim.appearance.surface import hit_vehicle
 from log2sim.appearance.verdict import geometric_median
 from log2sim.appearance.views import choose_views
@@ -107,8 +108,7 @@ def test_a_hue_prevails_over_gray_things_and_shading() -> None:
     red = linear((170, 30, 30)) * rng.uniform(0.2, 1.0, (450, 1))
     gray = np.repeat(rng.uniform(0.0, 1.0, (550, 1)), 3, axis=1)
     paint = find_paint(lab_of_linear(np.concatenate([red, gray])), np.ones(1000))
-    assert paint.share == pytest.approx(0.45, abs=0.03)
-    hue = np.arctan2(*paint.lab[[2, 1]])
+    hue = np.arctan2(*paint.mean[[2, 1]])
     assert hue == pytest.approx(np.arctan2(*to_lab((170, 30, 30))[0, [2, 1]]), abs=0.1)
 
 
@@ -116,12 +116,13 @@ def test_the_most_frequent_lightness_is_that_of_a_gray_paint() -> None:
     rng = np.random.default_rng(1)
     body, glass = np.full((600, 1), 0.7) * rng.uniform(0.95, 1.05, (600, 1)), rng.uniform(0.0, 0.3, (400, 1))
     paint = find_paint(lab_of_linear(np.repeat(np.concatenate([body, glass]), 3, axis=1)), np.ones(1000))
-    assert paint.lab[0] == pytest.approx(lab_of_linear(np.full((1, 3), 0.7))[0, 0], abs=1.5)
+    assert paint.mean[0] == pytest.approx(lab_of_linear(np.full((1, 3), 0.7))[0, 0], abs=1.5)
 
 
 def test_lab_of_linear_light_is_that_of_its_srgb() -> None:
     rgb = np.random.default_rng(2).integers(0, 256, (100, 3)).astype(np.uint8)
     np.testing.assert_allclose(lab_of_linear(linear_values(rgb)), to_lab(rgb), atol=0.02)
+    np.testing.assert_allclose(linear_of_lab(lab_of_linear(linear_values(rgb))), linear_values(rgb), atol=1e-6)
 
 
 def test_light_without_surroundings_is_that_of_a_usual_camera() -> None:

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.appearance.lab import lab_of_linear
 from log2sim.appearance.light import estimate_light, linear_values, reflectances, veil_of
-from log2sim.appearance.paint import find_paint, lab_of_linear
-from log2sim.appearance.surface import SHAPES, hit_block, hit_vehicle
+from log2sim.appearance.paint import find_paint
+from log2sim.appearance.surface import SHAPES, Surface, hit_block, hit_vehicle
 from log2sim.appearance.verdict import Look, decide_color
 from log2sim.appearance.views import Boxes, boxes_at, choose_views, frames_of
 from log2sim.datatypes import Log, Scenario
@@ -113,14 +114,12 @@ class _Scene:
         rows = np.flatnonzero(weight)
         if len(rows) < MIN_PAINT_PIXELS:
             return None
-        pixels = self._pixels(uv[rows])
+        height_px = float(found.box_px[0, 3] - found.box_px[0, 1])
+        surface = Surface(self._pixels(uv[rows]), weight[rows], hits.facing[rows], height_px)
         light = estimate_light(linear_values(self.below), linear_values(self.above), self._road(row, map_T_cam))
-        met = clear & np.isfinite(hits.distance)
-        veil = veil_of(self._pixels(uv[met]), light)
-        paint = find_paint(lab_of_linear(reflectances(pixels, light, hits.facing[rows], veil)), weight[rows])
-        return Look.of(
-            paint, light, pixels, weight[rows], hits.facing[rows], float(found.box_px[0, 3] - found.box_px[0, 1])
-        )
+        veil = veil_of(self._pixels(uv[clear & np.isfinite(hits.distance)]), light)
+        paint = find_paint(lab_of_linear(reflectances(surface.pixels, light, surface.facing, veil)), surface.weight)
+        return Look.of(paint, light, surface)
 
     def _pose(self, uv: Array) -> Array:
         """Return the pose of the camera when the line of a pixel (1, 2) was exposed."""

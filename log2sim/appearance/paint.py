@@ -16,11 +16,6 @@ import numpy as np
 
 from log2sim.geometry import Array
 
-# Linear sRGB to CIE XYZ relative to D65 white (IEC 61966-2-1).
-XYZ_OF_RGB = np.array(
-    [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
-)
-WHITE_XYZ = XYZ_OF_RGB.sum(axis=1)
 # Chroma as it would be at this lightness; darker pixels than the least are too noisy to be scaled up from.
 REFERENCE_L, MIN_L, MAX_L = 55.0, 14.0, 115.0
 # A pixel has a hue from this chroma at the reference; sky on a gray surface gives about half of it.
@@ -31,29 +26,30 @@ WHITEST_L = 94.0  # the whitest paints reflect 0.85
 # Of the pixels of one hue those in bright, direct light mirror least of other things and are not clipped.
 CHROMA_QUANTILE, LIGHTNESS_QUANTILE = 0.6, 0.6
 LIGHTNESS_BANDWIDTH = 7.0
+# Glass, tires, grilles and shade are dark on vehicles of every color, a third of what one sees; only where more is, it is the paint.
+DARK_L, MIN_DARK_SHARE = 20.0, 0.45
+DARKER_QUANTILE, LIGHT_L = 0.2, 60.0
 
 
 @dataclass(frozen=True, eq=False)
 class Paint:
-    """Color of a surface.
+    """Colors that a surface may have.
 
     Attributes
     ----------
-    lab : (3,) float64
-        CIELAB.
-    share : float
-        Of the weight of the pixels that have this color.
+    lab : (C, 3) float64
+        CIELAB, the most probable first.
+    probability : (C,) float64
+        They sum to 1.
     """
 
     lab: Array
-    share: float
+    probability: Array
 
-
-def lab_of_linear(rgb: Array) -> Array:
-    """Return CIELAB (N, 3) of linear RGB (N, 3), 1 for white; what is brighter has an L* above 100."""
-    xyz = np.maximum(rgb @ XYZ_OF_RGB.T / WHITE_XYZ, 0.0)
-    f = np.where(xyz > 216 / 24389, np.cbrt(xyz), xyz * 24389 / 3132 + 4 / 29)
-    return np.stack([116 * f[:, 1] - 16, 500 * (f[:, 0] - f[:, 1]), 200 * (f[:, 1] - f[:, 2])], axis=1)
+    @property
+    def mean(self) -> Array:
+        """Return the mean (3,) of the colors."""
+        return np.asarray(self.probability @ self.lab)
 
 
 def find_paint(lab: Array, weight: Array) -> Paint:
@@ -62,10 +58,10 @@ def find_paint(lab: Array, weight: Array) -> Paint:
     Where it would reflect more light than the whitest paints, the light is brighter than was thought, and the color is scaled.
     """
     paint = _most_frequent(lab, weight)
-    return Paint(paint.lab * min(1.0, WHITEST_L / max(paint.lab[0], 1.0)), paint.share)
+    return Paint((paint * min(1.0, WHITEST_L / max(paint[0], 1.0)))[None], np.ones(1))
 
 
-def _most_frequent(lab: Array, weight: Array) -> Paint:
+def _most_frequent(lab: Array, weight: Array) -> Array:
     weight = weight / weight.sum()
     L, chroma = np.clip(lab[:, 0], 0, MAX_L), np.hypot(lab[:, 1], lab[:, 2])
     relative = chroma * REFERENCE_L / np.maximum(L, MIN_L)
@@ -78,14 +74,20 @@ def _most_frequent(lab: Array, weight: Array) -> Paint:
     if windows[best] >= MIN_HUE_SHARE:
         center = (best + 0.5) * 360 / HUE_BINS
         rows = colored & (np.abs((hue - center + 180) % 360 - 180) <= HUE_REACH_DEG + 180 / HUE_BINS)
-        return Paint(_colored_paint(lab[rows], relative[rows], weight[rows]), float(windows[best]))
+        return _colored_paint(lab[rows], relative[rows], weight[rows])
     rows = ~colored
     if not weight[rows].sum() > 0:
         rows = np.ones(len(lab), bool)
+    light = rows & (L >= DARK_L)
+    if weight[light].sum() > (1 - MIN_DARK_SHARE) * weight[rows].sum():
+        rows = light
     level = _mode(L[rows], weight[rows])
     near = rows & (np.abs(L - level) <= LIGHTNESS_BANDWIDTH)
     tone = [weighted_quantile(lab[near, k], weight[near], 0.5) for k in (1, 2)]
-    return Paint(np.array([level, *tone]), float(weight[near].sum()))
+    # The lower halves of doors mirror the dark road, which matters where the paint is dark itself.
+    darker = weighted_quantile(L[rows], weight[rows], DARKER_QUANTILE)
+    share = np.clip((level - DARK_L) / (LIGHT_L - DARK_L), 0.0, 1.0)
+    return np.array([share * level + (1 - share) * min(darker, level), *tone])
 
 
 def _colored_paint(lab: Array, relative: Array, weight: Array) -> Array:

@@ -90,6 +90,28 @@ class Hits:
     facing: Array
 
 
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Pixels of a vehicle's surface.
+
+    Attributes
+    ----------
+    pixels : (N, 3) float64
+        Linear RGB.
+    weight : (N,) float64
+        How much each says about the paint.
+    facing : (N,) float64
+        Cosines of the angles at which it is seen.
+    height_px : float
+        Of the whole vehicle in the picture.
+    """
+
+    pixels: Array
+    weight: Array
+    facing: Array
+    height_px: float
+
+
 def hit_vehicle(category: str, size_m: Array, origin: Array, rays: Array) -> Hits:
     """Intersect rays with a vehicle.
 
