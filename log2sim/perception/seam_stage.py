@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -13,6 +13,7 @@ from log2sim.datatypes import Log, Obstacles
 from log2sim.geometry import Array, apply, inverse
 from log2sim.perception.first_pass import Observations, base_pose
 from log2sim.perception.frames import RecordReader
+from log2sim.perception.homography.rig import rotation_of
 from log2sim.perception.homography.rig_seams import fit_mounts, with_mounts
 from log2sim.perception.homography.seams import LENGTH_M, Seam, SeamPlace, find_seams, measure_seam, pixels_of
 from log2sim.perception.homography_stage import CameraHomography
@@ -29,7 +30,7 @@ NEAR_M, NEAR_S, MIN_GROUND_POINTS = 3.0, 2.0, 3
 # More LiDAR points that hide or cover a patch are an object on it.
 MAX_HIDING_POINTS = 4
 # Rounds of measuring and turning: the offset varies over a patch by its share of the distance, so each leaves a fifth of it.
-ALIGNING_ROUNDS = 2
+ALIGNING_ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +94,8 @@ class SeamPictures:
         """Compare neighboring cameras by the homographies of the road."""
         seams, places, covered = [], 0, 0
         for tick in sorted({tick for _, tick in self.images}):
-            roads = self._roads_at(homographies, tick)
+            seen = {name: g for name, g in homographies.items() if (name, tick) in self.images}
+            roads = roads_at(self.log, self.schedule, seen, tick)
             if len(roads) < 2:
                 continue
             cameras = {name: self.log.cameras[name] for name in roads}
@@ -121,18 +123,6 @@ class SeamPictures:
         """Position (2,) of a camera in that frame."""
         pose = self.log.map_T_sensor(camera, self._stamp(camera, tick))[0][0]
         return np.asarray((inverse(self._base(tick)) @ pose)[:2, 3])
-
-    def _roads_at(self, homographies: Mapping[str, CameraHomography], tick: int) -> dict[str, Array]:
-        """Homographies of the road for the cameras with a picture at a tick, in the ground frame of the tick."""
-        out = {}
-        for name, ground in homographies.items():
-            h = ground.road_at_tick(tick) if (name, tick) in self.images else None
-            if h is not None:
-                # The ego moves between the stamps of two cameras.
-                moved = inverse(self._base(tick)) @ base_pose(self.log, self._stamp(name, tick))
-                level = np.array([[*moved[0, :2], moved[0, 3]], [*moved[1, :2], moved[1, 3]], [0.0, 0.0, 1.0]])
-                out[name] = level @ h
-        return out
 
     def _shows_ground(self, place: SeamPlace, tick: int, roads: Mapping[str, Array]) -> bool:
         """Return whether LiDAR ground lies at a place, and nothing stands on it or before it."""
@@ -184,6 +174,31 @@ class SeamPictures:
         return False
 
 
+def roads_at(log: Log, schedule: Schedule, homographies: Mapping[str, CameraHomography], tick: int) -> dict[str, Array]:
+    """Compute the homographies (3, 3) of the road of cameras with a frame at a tick, in the ground frame at its stamp."""
+    out, base = {}, base_pose(log, int(schedule.t_ns[tick]))
+    for name, ground in homographies.items():
+        index = int(schedule.frames[name][tick])
+        h = ground.road_at_tick(tick) if index >= 0 else None
+        if h is not None:
+            # The ego moves between the stamps of two cameras.
+            moved = inverse(base) @ base_pose(log, int(log.streams[name].t_ns[index]))
+            level = np.array([[*moved[0, :2], moved[0, 3]], [*moved[1, :2], moved[1, 3]], [0.0, 0.0, 1.0]])
+            out[name] = level @ h
+    return out
+
+
+def turn_mounts(log: Log, homographies: Mapping[str, CameraHomography]) -> Log:
+    """Return the log with the mounts of its cameras turned as their homographies ask for."""
+    cameras = dict(log.cameras)
+    for name, ground in homographies.items():
+        if ground.rig is not None and ground.rig.state is not None:
+            turn = np.eye(4)
+            turn[:3, :3] = rotation_of(ground.rig.state.mount[name]).T
+            cameras[name] = replace(cameras[name], mount_T_cam=cameras[name].mount_T_cam @ turn)
+    return log.changed(cameras=cameras)
+
+
 def ticks_of(schedule: Schedule, count: int = TICKS, *, held_out: bool = False) -> list[int]:
     """Choose ticks evenly over a log; `held_out` ones lie between the others."""
     steps = np.arange(count) + (0.75 if held_out else 0.25)
@@ -205,5 +220,5 @@ def align_seams(
             turned = with_mounts(rig, mounts)
             for name, ground in out.items():
                 if ground.rig is rig:
-                    out[name] = CameraHomography(ground.camera, ground.fit, ground.source, ground.refusal, turned)
+                    out[name] = replace(ground, rig=turned)
     return out, survey

@@ -96,8 +96,9 @@ def rotation_of(vector: Array) -> Array:
     v = np.asarray(vector, dtype=np.float64)
     angle = np.linalg.norm(v, axis=-1)[..., None, None]
     x, y, z = v[..., 0], v[..., 1], v[..., 2]
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*v.shape[:-1], 3, 3)
+    cross = np.zeros((*v.shape[:-1], 3, 3))
+    cross[..., 2, 1], cross[..., 0, 2], cross[..., 1, 0] = x, y, z
+    cross -= np.swapaxes(cross, -1, -2)
     return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * cross + np.sinc(angle / 2 / np.pi) ** 2 / 2 * cross @ cross)
 
 

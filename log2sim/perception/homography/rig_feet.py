@@ -20,6 +20,7 @@ BELOW_SIGMA_PX, LIFT_SIGMA_M = 4.0, 0.1
 MOUNT_SIGMA_RAD = np.deg2rad(0.5)
 # Gates on the squared error while it is fitted, then until nothing changes.
 GATES = (16 * CHI2_2DOF_99, 6 * CHI2_2DOF_99, 2 * CHI2_2DOF_99, CHI2_2DOF_99, CHI2_2DOF_99, CHI2_2DOF_99)
+LAST_GATES = 4
 # Of the shifts that single feet of a camera ask for so many are tried.
 MAX_CANDIDATES = 48
 # The assumed noise counts as a prior worth this many feet; an estimate departs from it by this factor at most.
@@ -57,18 +58,22 @@ class FeetFit:
         return np.asarray(self.errors.squared < CHI2_2DOF_99 * self.noise**2)
 
 
-def fit_feet(rig: Rig, rows: RigRows, state: RigState, planes: Array | None = None) -> FeetFit:
+def fit_feet(
+    rig: Rig, rows: RigRows, state: RigState, planes: Array | None = None, *, is_start: bool = True
+) -> FeetFit:
     """Fit the two parameters of feet and the rotation of each camera that they ask for, over all cameras and ticks.
 
     Notes
     -----
     Gauss-Newton on whitened errors with a bounded loss, from the shift that most feet of a camera agree with. Normal priors
-    keep what is not observed at the calibration, such as a camera without feet.
+    keep what is not observed at the calibration, such as a camera without feet. With `is_start` False the state is that of an
+    earlier fit to the same rows, from which fewer steps lead on.
     """
-    state = _with_consensus(rig, rows, state, planes)
+    if is_start:
+        state = _with_consensus(rig, rows, state, planes)
     names, scale = list(rig.cameras), 1.0
     covariance = np.zeros((SHARED + OF_CAMERA * len(names),) * 2)
-    for gate in GATES:
+    for gate in GATES if is_start else GATES[-LAST_GATES:]:
         linear = linearize_feet(rig, rows, state, planes)
         step, covariance = _step(rig, rows, linear, state, gate * scale**2, scale)
         of_camera = step[SHARED:].reshape(-1, OF_CAMERA)

@@ -95,7 +95,8 @@ def fit_rig(
     ticks, planes, decision = np.zeros(0, dtype=np.int64), np.zeros((0, 3)), None
     if len(ground_rows) and len(foot_rows) >= MIN_TESTED_FEET:
         ticks, planes = _planes_of_ticks(_heights(rig, ground_rows), plane)
-        moving = fit_feet(rig, foot_rows, fit.state, _of_rows(ticks, planes, plane, foot_rows.tick))
+        own = _of_rows(ticks, planes, plane, foot_rows.tick)
+        moving = fit_feet(rig, foot_rows, fit.state, own, is_start=False)
         decision = _decide(foot_rows, fit, moving, planes - plane)
         if decision.per_tick:
             fit = moving

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array
 from log2sim.perception.homography.correspondences import Correspondences
-from log2sim.perception.homography.rig import Rig, RigState, cam_of_ground, rotation_of
+from log2sim.perception.homography.rig import Rig, RigState, rotation_of
 
 # Parameters of feet: one that all cameras share, then of each camera the height of feet above the road, m, and its rotation.
 SHARED, OF_CAMERA = 1, 4
@@ -114,9 +114,11 @@ class FootErrors:
 def linearize_feet(rig: Rig, rows: RigRows, state: RigState, planes: Array | None = None) -> FootErrors:
     """Linearize the errors of feet; `planes` (N, 3) replaces the plane of the state, as each tick has its own."""
     members = list(rig.cameras.values())
-    turns = [rotation_of(state.feet[name]) @ rotation_of(state.mount[name]) for name in rig.cameras]
-    flat = np.array([cam_of_ground(m, np.zeros(3), turn) for turn, m in zip(turns, members)])[rows.camera]
-    up = np.array([turn @ m.cam_T_rig[:3, 2] for turn, m in zip(turns, members)])[rows.camera]
+    turns = rotation_of(np.array([state.feet[n] for n in rig.cameras]))
+    turns = turns @ rotation_of(np.array([state.mount[n] for n in rig.cameras]))
+    poses = turns @ np.array([m.cam_T_rig[:3] for m in members])
+    flat = np.concatenate([poses[:, :, :2], poses[:, :, 3:]], axis=2)[rows.camera]
+    up = poses[rows.camera, :, 2]
     lift = np.array([state.lift_m[name] for name in rig.cameras])[rows.camera]
     plane = (state.plane if planes is None else planes) + np.column_stack([0 * lift, 0 * lift, lift])
     matrices = flat + up[:, :, None] * plane[:, None, :]
