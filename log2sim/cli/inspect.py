@@ -1,18 +1,18 @@
-"""Describe the content of a log, or draw one of its moments."""
+"""Describe the content of a log or a scenario, or draw one moment of a log."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from log2sim.cli.options import Cameras, Format, LogPath, Overwrite, Sequence, camera_names, say
+from log2sim.cli.options import Cameras, Format, Overwrite, Sequence, camera_names, say
 from log2sim.errors import ConfigError
 
 
 def inspect(
-    log: LogPath,
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="Folder or file of a log, or a scenario.json.")],
     format: Format = "auto",
     sequence: Sequence = None,
     overlay: Annotated[
@@ -28,7 +28,7 @@ def inspect(
     cameras: Cameras = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Describe the content of a log as JSON, or draw one of its ticks."""
+    """Describe the content of a log, or of a scenario.json, as JSON, or draw one tick of a log."""
     import json
 
     from log2sim.documents import check_targets
@@ -37,6 +37,11 @@ def inspect(
 
     if overlay is None and (at is not None or cameras is not None):
         raise ConfigError("--at and --cameras choose what --overlay FILE.png draws; name the picture too")
+    if log.suffix.lower() == ".json":
+        if overlay is not None:
+            raise ConfigError(f"{log}: is a scenario, which --overlay does not draw; log2sim plot does")
+        say(json.dumps(_summary_of_scenario(log), indent=2))
+        return
     names = camera_names(cameras)
     check_targets(overlay, overwrite=overwrite)
     opened = open_log(log, format=format, sequence=sequence)
@@ -48,3 +53,10 @@ def inspect(
 
     write_overlay(read_moment(opened, names, at), overlay, overwrite=overwrite)
     say(f"{overlay}: written")
+
+
+def _summary_of_scenario(path: Path) -> dict[str, Any]:
+    from log2sim.datatypes import Scenario
+    from log2sim.lanes.scenario_summary import summarize_scenario
+
+    return summarize_scenario(Scenario.load(path))

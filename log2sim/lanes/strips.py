@@ -34,6 +34,10 @@ MAX_ASIDE_M, MAX_WIDENING_M = 0.5, 0.8
 """How far the second piece may lie aside of where the first leads, and how much wider it may be: less than any next lane."""
 
 
+RoadLine = Marking | RoadBorder
+"""What may be the edge of a lane."""
+
+
 @dataclass(frozen=True, eq=False)
 class LaneStrip:
     """A strip between two lines; its direction is that of one of them.
@@ -67,9 +71,16 @@ class LaneStrip:
         return replace(self, line=line, width_m=self.width_m[::-1], width_s_m=s, left=self.right, right=self.left)
 
 
+def list_road_lines(markings: Sequence[Marking], borders: Sequence[RoadBorder]) -> list[RoadLine]:
+    """Return the lane lines and borders."""
+    items: list[RoadLine] = [marking for marking in markings if marking.is_lane_line]
+    items.extend(borders)
+    return [item for item in items if len(item.points_m) > 1 and np.ptp(item.points_m[:, :2], axis=0).max() > 0]
+
+
 def find_strips(markings: Sequence[Marking], borders: Sequence[RoadBorder]) -> list[LaneStrip]:
     """Return the strips between lane lines and borders, from one end of the lines to the other."""
-    items = [item for item in (*(m for m in markings if m.is_lane_line), *borders) if len(item.points_m) > 1]
+    items = list_road_lines(markings, borders)
     lines = [Polyline.through(item.points_m) for item in items]
     sides = [_Sides.of(line, k, lines) for k, line in enumerate(lines)]
     found = []
@@ -134,9 +145,7 @@ def _mutual(
     return [run for run in runs if len(run) > 1 and own.s_m[run[-1]] - own.s_m[run[0]] >= STEP_M]
 
 
-def _strip(
-    sides: _Sides, rows: NDArray[np.intp], line: Polyline, items: tuple[Marking | RoadBorder, Marking | RoadBorder]
-) -> LaneStrip:
+def _strip(sides: _Sides, rows: NDArray[np.intp], line: Polyline, items: tuple[RoadLine, RoadLine]) -> LaneStrip:
     s, width = sides.s_m[rows], sides.left_m[rows]
     middle = Polyline.through(line.offset(s, width / 2))
     at = (s - s[0]) / (s[-1] - s[0]) * middle.length_m
