@@ -16,7 +16,7 @@ from log2sim.synth.write import write_synthetic
 SAMPLES = Path(__file__).resolve().parent.parent / "samples"
 SEED = 1
 JPEG_QUALITY = 58
-LIMIT_BYTES = 8_000_000
+LIMIT_BYTES = 8_500_000
 
 
 def main() -> int:
