@@ -14,7 +14,7 @@ from log2sim.synth.scene import Scene
 from log2sim.synth.scene_places import Arrow, PaintColor, Road, StopLine, Zebra
 
 DASH_M = (3.0, 3.0)  # length and gap, as in towns (RMS-1, 1993: 3 m and 6 m; many narrower ones)
-LINE_M, SIDE_LINE_M, SIDE_INSET_M = 0.14, 0.1, 0.2
+LINE_M = 0.14
 DOUBLE_GAP_M = 0.12  # between the two lines of a double one (RMS-1: as wide as a line)
 STRIPE_M = (0.5, 0.5)  # of crosswalks
 ROAD_MARGIN_M, ZEBRA_MARGIN_M = 4.0, 1.6  # by which what interrupts markings is wider than roads and crosswalks
@@ -120,9 +120,9 @@ def road_lines(road: Road, keeps_right: bool = True) -> list[RoadLine]:
         elif kind == "solid" or kind == "dashed":
             out.append(_line(road, middle, kind, (offset, LINE_M, k), color))
     if road.side_marking != "none":
-        side = road.width_m / 2 - SIDE_INSET_M
+        side = road.width_m / 2 - road.side_inset_m
         for offset, k in ((-side, 0), (side, road.lanes)):
-            out.append(_line(road, middle, road.side_marking, (offset, SIDE_LINE_M, k), road.color))
+            out.append(_line(road, middle, road.side_marking, (offset, road.side_line_m, k), road.color))
     return out
 
 

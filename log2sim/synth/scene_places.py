@@ -30,6 +30,8 @@ class Road(Table):
         "Marking between the two directions; by default as between lanes.", None
     )
     side_marking: Literal["dashed", "solid", "none"] = key("Markings along both sides.", "solid")
+    side_line_m: Number = key("Width of the markings along both sides.", 0.1, "m", ge=0.05, le=0.5)
+    side_inset_m: Number = key("From the middle of these markings to the end of the road.", 0.2, "m", ge=0.1, le=10)
     color: PaintColor = key("Color of the markings.", "white")
     center_color: PaintColor | None = key("Color of the marking between the two directions.", None)
     dash_m: tuple[Length, Length] | None = key(
