@@ -15,6 +15,7 @@ from log2sim.appearance.colors import ColorSampler
 from log2sim.config import Config
 from log2sim.datatypes import Agent, Log, MapFeatures, Scenario
 from log2sim.errors import LogError
+from log2sim.lanes.lane_graph import infer_lanes
 from log2sim.lanes.markings import find_markings
 from log2sim.mapping.builder import GroundMapBuilder
 from log2sim.outcome import Outcome
@@ -96,11 +97,13 @@ def describe(scenario: Scenario, recorded: Recorded) -> Description:
 
 def read_map(ground: GroundMapBuilder | None, scenario: Scenario, notes: Sequence[str]) -> MapFeatures:
     """Find markings and borders in the map of the ground, if there is one, and lanes between them and where agents drove."""
-    if ground is None:
-        return MapFeatures(notes=tuple(notes))
-    seen = ground.build()
-    markings, borders, marking_notes = find_markings(seen)
-    return MapFeatures(markings, borders, (), (*notes, *seen.notes, *marking_notes))
+    found = MapFeatures(notes=tuple(notes))
+    if ground is not None:
+        seen = ground.build()
+        markings, borders, marking_notes = find_markings(seen)
+        found = MapFeatures(markings, borders, notes=(*notes, *seen.notes, *marking_notes))
+    lanes, lane_notes = infer_lanes(found.markings, found.borders, scenario)
+    return replace(found, lanes=lanes, notes=(*found.notes, *lane_notes))
 
 
 def with_colors(agents: tuple[Agent, ...], sampler: ColorSampler) -> tuple[Agent, ...]:
