@@ -34,6 +34,9 @@ class CoarseTile:
     ----------
     paint : (R, C) float32
         Logarithm of brightness, plus that of yellowness.
+    peak, dip : (R, C) float32
+        The same of the brightest and the darkest cell of the map in each: lines, and gaps between a line and a curb, that are
+        as narrow as a coarse cell seldom fill one.
     seen : (R, C) float32
         Share of each cell that a camera saw.
     intensity : (R, C) float32
@@ -47,6 +50,8 @@ class CoarseTile:
     """
 
     paint: Layer
+    peak: Layer
+    dip: Layer
     seen: Layer
     intensity: Layer
     hit: Layer
@@ -89,9 +94,11 @@ def iterate_tiles(ground: GroundMap, margin_cells: int) -> Iterator[CoarseTile]:
             core = (slice(r - r0, min(r + TILE_CELLS, rows) - r0), slice(c - c0, min(c + TILE_CELLS, columns) - c0))
             alpha, hit = ground.alpha[fine] > 0, np.isfinite(ground.intensity[fine])
             if alpha.any() or hit.any():
-                paint, seen = _coarse(log_paint(ground.color_bgr[fine]), alpha, factor)
+                values = log_paint(ground.color_bgr[fine])
+                paint, seen = _coarse(values, alpha, factor)
+                peak, dip = _extremes(values, alpha, factor)
                 intensity, share = _coarse(log_intensity(ground.intensity[fine]), hit, factor)
-                yield CoarseTile(paint, seen, intensity, (share > 0).astype(np.float32), core, (r0, c0))
+                yield CoarseTile(paint, peak, dip, seen, intensity, (share > 0).astype(np.float32), core, (r0, c0))
 
 
 def _coarse(values: Layer, valid: Mask, factor: int) -> tuple[Layer, Layer]:
@@ -100,6 +107,15 @@ def _coarse(values: Layer, valid: Mask, factor: int) -> tuple[Layer, Layer]:
     share = np.asarray(cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA), np.float32)
     total = cv2.resize(np.where(valid, values, 0).astype(np.float32), size, interpolation=cv2.INTER_AREA)
     return np.divide(total, share, out=np.zeros_like(share), where=share > 0), share
+
+
+def _extremes(values: Layer, valid: Mask, factor: int) -> tuple[Layer, Layer]:
+    """Take the largest and the least valid value in squares of cells, 0 where there is none."""
+    corners = [(slice(i, None, factor), slice(j, None, factor)) for i in range(factor) for j in range(factor)]
+    high = np.max([np.where(valid[c], values[c], -np.inf) for c in corners], axis=0)
+    low = np.min([np.where(valid[c], values[c], np.inf) for c in corners], axis=0)
+    known = np.isfinite(high)
+    return np.where(known, high, 0).astype(np.float32), np.where(known, low, 0).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,8 +24,8 @@ REPEAT_M = 0.18  # double lines are 0.2 m apart and more, from middle to middle
 BESIDE_M, MAX_BESIDE, CROWDED = (0.45, 1.7), 1, -5.0
 BESIDE_PER_M = 4  # pairs of points 0.5 m apart, two for each: beside it along half of it or more
 MAX_CROSSINGS, MAX_CROSSINGS_PER_M = 3, 0.2  # a grid of more lines is a wall or paving
-# Paint of the same time is about as bright; a much weaker line beside another is what is left of removed paint.
-REMNANT_SHARE, REMNANT = 0.4, -4.0
+# Paint of the same time is about as bright; a weaker line so near another is what is left of removed paint.
+REMNANT_SHARE, REMNANT = 0.65, -6.0
 MIN_REFLECTED = 0.1  # logarithm: a tenth more than the road
 PARALLEL_RAD = np.deg2rad(15)
 

@@ -16,8 +16,10 @@ from log2sim.mapping.ground_map import GroundMap
 
 PROFILE_M, PROFILE_STEP_M, ALONG_SAMPLES = 1.5, 0.05, 11
 MIN_SEEN = 0.6  # share of a profile's middle; of what is hidden beside a line, the other side tells
-MAX_SHIFT_M = 0.25  # from the ridge to the middle of the paint
-FLANK_M = (0.08, 0.7)  # from the middle: where the road beside the paint is looked for
+MAX_SHIFT_M = 0.12  # from the ridge, which is as fine as a coarse cell, to the middle of the paint
+FLANK_M = (0.08, 0.4)  # from the middle: where the road beside the paint is looked for
+# From the edge: between a line and a curb there are often 0.1 m of road, and paint may be blurred so far.
+SIDES_M = ((0.03, 0.13), (0.1, 0.3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +40,7 @@ class Pieces:
     uneven : (N,) float64
         Difference of both sides.
     outshines : (N,) float64
-        Logarithm by which it is brighter than the brightest quarter of the ground within 1.5 m.
+        Logarithm by which it is brighter than the brightest quarter of the ground within 1.5 m, on the darker side.
     yellow : (N,) float64
         Contrast of yellowness.
     reflected, reflected_sigma : (N,) float64
@@ -86,19 +88,25 @@ def measure_pieces(ground: GroundMap, lines: Array) -> Pieces:
     seen = sample(ground, x.reshape(flat), y.reshape(flat))
     samples = Samples(*(a.reshape(x.shape) for a in (seen.bright, seen.yellow, seen.intensity)))
     color, reflected = (_quiet(np.nanmean, a) for a in (samples.paint, samples.intensity))
-    by_camera = np.isfinite(color[:, np.abs(across) <= 2 * MAX_SHIFT_M]).mean(1) > MIN_SEEN
+    by_camera = np.isfinite(color[:, np.abs(across) <= 0.5]).mean(1) > MIN_SEEN
     # Of values, not of their logarithms, in which edges that are blurred lie farther out.
     left, right, edge = _edges(np.exp(np.where(by_camera[:, None], color, reflected)), across)
     shift, width = (left + right) / 2, right - left
     inside = np.abs(across - shift[:, None]) <= np.maximum(width / 2 - 0.02, 0.03)[:, None]
     sides = [_side(across, shift, width, side) for side in (-1, 1)]
-    contrast, sigma, uneven = _contrast(samples.paint, inside, sides)
-    yellow = _contrast(samples.yellow, inside, sides)[0]
-    intensity, intensity_sigma, _ = _contrast(samples.intensity, inside, sides)
+    contrast, sigma, uneven = _contrast(samples.paint, inside, sides, one_side=True)
+    yellow = _contrast(samples.yellow, inside, sides, one_side=True)[0]
+    intensity, intensity_sigma, _ = _contrast(samples.intensity, inside, sides, one_side=False)
     xy = lines[:, :2] + shift[:, None] * np.stack([-s, c], 1)
-    outer = np.where(np.abs(across - shift[:, None]) > width[:, None] / 2 + 0.1, color, np.nan)
     bright = np.where(inside, color, np.nan)
-    outshines = _quiet(np.nanmean, bright) - _quiet(np.nanquantile, outer, q=0.75)
+    around = [
+        _quiet(
+            np.nanquantile, np.where(side * (across - shift[:, None]) > width[:, None] / 2 + 0.1, color, np.nan), q=0.75
+        )
+        for side in (-1, 1)
+    ]
+    # Beside a road there are brighter grounds; the road itself is on one side at least.
+    outshines = _quiet(np.nanmean, bright) - np.fmin(*around)
     return Pieces(
         xy,
         lines[:, 2],
@@ -135,14 +143,7 @@ def _edges(profile: Array, across: Array) -> tuple[Array, Array, Array]:
     # Lines wider than the blur have a flat top: its mean is nearer to the paint than its largest value.
     edges, falls = [], []
     distance = across - across[peak][:, None]
-    roads = [
-        _quiet(
-            np.nanquantile,
-            np.where((side * distance > FLANK_M[0]) & (side * distance < FLANK_M[1]), profile, np.nan),
-            q=0.25,
-        )
-        for side in (-1, 1)
-    ]
+    roads = [_darkest(soft, (side * distance > FLANK_M[0]) & (side * distance < FLANK_M[1])) for side in (-1, 1)]
     for side, road, other in zip((-1, 1), roads, roads[::-1]):
         road = np.where(np.isfinite(road), road, other)
         high, half, low = (_crossing(filled, peak, road + q * (top - road), side, across) for q in (0.75, 0.5, 0.25))
@@ -151,11 +152,18 @@ def _edges(profile: Array, across: Array) -> tuple[Array, Array, Array]:
     return edges[0], edges[1], np.fmax(falls[0], falls[1])
 
 
+def _darkest(soft: Array, where: NDArray[np.bool_]) -> Array:
+    """Least value (N,) of profiles (N, P) somewhere; NaN where nothing is known there."""
+    least = np.where(where & np.isfinite(soft), soft, np.inf).min(axis=1)
+    return np.where(np.isfinite(least), least, np.nan)
+
+
 def _without_gaps(profile: Array) -> tuple[Array, Array]:
     """Fill gaps of profiles (N, P), where LiDAR hit no cell, from their neighbors; also blur them, without gaps."""
     known = np.isfinite(profile).astype(np.float64)
     total, count = cv2.blur(np.nan_to_num(profile), (3, 1)), cv2.blur(known, (3, 1))
     soft = np.divide(total, count, out=np.zeros_like(total), where=count > 0)
+    soft[count == 0] = np.nan
     return np.where(known > 0, profile, soft), np.asarray(soft)
 
 
@@ -177,20 +185,22 @@ def _crossing(profile: Array, peak: NDArray[Any], half: Array, side: int, across
     return at
 
 
-def _side(across: Array, shift: Array, width: Array, side: int) -> NDArray[np.bool_]:
-    """Mask (N, P) of the road beside the paint, 0.05 to 0.3 m from its edge."""
+def _side(across: Array, shift: Array, width: Array, side: int) -> list[NDArray[np.bool_]]:
+    """Masks (N, P) of the road beside the paint, near and farther, on one side."""
     distance = side * (across - shift[:, None]) - width[:, None] / 2
-    return np.asarray((distance > 0.05) & (distance < 0.3))
+    return [np.asarray((distance > low) & (distance < high)) for low, high in SIDES_M]
 
 
-def _contrast(values: Layer, inside: NDArray[np.bool_], sides: list[NDArray[np.bool_]]) -> tuple[Array, Array, Array]:
+def _contrast(
+    values: Layer, inside: NDArray[np.bool_], sides: list[list[NDArray[np.bool_]]], *, one_side: bool
+) -> tuple[Array, Array, Array]:
     """Contrast (N,) of samples (N, along, across) to the brighter side, its standard error, and the sides' difference."""
     middle = _masked_mean(values, inside)
-    beside = [_masked_mean(values, side) for side in sides]
+    beside = [_darker([_masked_mean(values, part) for part in side]) for side in sides]
     left, right = (_quiet(np.nanmean, b) for b in beside)
     ridge = middle - np.maximum(*beside)
     count = np.isfinite(ridge).sum(1)
-    mean = _quiet(np.nanmean, middle) - np.fmax(left, right)
+    mean = _quiet(np.nanmean, middle) - (np.fmax if one_side else np.maximum)(left, right)
     sigma = _quiet(np.nanstd, ridge) / np.sqrt(np.maximum(count - 1, 1))
     enough = count >= 3
     return (
@@ -198,6 +208,12 @@ def _contrast(values: Layer, inside: NDArray[np.bool_], sides: list[NDArray[np.b
         np.where(enough, sigma, np.nan),
         np.where(enough, np.abs(left - right), np.nan),
     )
+
+
+def _darker(parts: list[Array]) -> Array:
+    """Choose, for each profile, that of two parts (N, along) whose mean is darker."""
+    means = [_quiet(np.nanmean, part) for part in parts]
+    return np.where((means[0] < means[1])[:, None] | ~np.isfinite(means[1])[:, None], parts[0], parts[1])
 
 
 def _masked_mean(values: Layer, mask: NDArray[Any]) -> Array:

@@ -33,7 +33,8 @@ MIN_SIGMAS = 4.0  # of the same filter's response to the texture around
 BLOCK_M = 4.0  # texture is measured within
 # Of a normal distribution that share is within so many sigmas; what stands on part of a block does not count.
 TEXTURE_QUANTILE, TEXTURE_SIGMAS = 0.35, 0.454
-MIN_SEEN = 0.7  # share of the cells under the filter
+MIN_SEEN = 0.7  # share of a cell
+MIN_HIT = 0.5  # of the cells around by LiDAR, where no camera saw the ground: single rings are lines themselves
 MAX_POINTS = 400_000  # bound of memory: 40 km of lines
 HIGH_PASS_M = 1.5
 # Contrasts of ordinary paint to asphalt, as logarithms: pixel values 1.6 times as large (their gamma has reflectances 3 times
@@ -75,33 +76,40 @@ def find_ridges(ground: GroundMap) -> RidgePoints:
 
 def _ridges_of(tile: CoarseTile, cell_m: float) -> Array:
     """List column, row, direction and strength (N, 4) of ridge points of a tile, in cells of the coarse map."""
-    flat = _join(tile, cell_m)
-    response, direction, noise = _respond(flat, cell_m)
+    layers = _join(tile, cell_m)
+    response, direction, noise = _respond(layers, cell_m)
+    # What is so bright is looked at however rough its surroundings are; intensities of grass are as bright.
+    noise = np.where(tile.seen > MIN_SEEN, np.minimum(noise, CLEAR_CONTRAST / MIN_SIGMAS), noise)
     found = _crests(response / noise, direction, tile)
     found[:, 0] += tile.origin[1]
     found[:, 1] += tile.origin[0]
     return found
 
 
-def _join(tile: CoarseTile, cell_m: float) -> Layer:
+def _join(tile: CoarseTile, cell_m: float) -> tuple[Layer, Layer, Layer]:
     """Add both sensors' contrasts to the surroundings, each by what it tells of paint, in units of the camera's.
 
-    The best filter for known contrasts in independent noise weighs by contrast over variance.
+    The best filter for known contrasts in independent noise weighs by contrast over variance. The others are those of
+    the brightest and the darkest cells.
     """
-    color = _high_pass(tile.paint, tile.seen, cell_m)
+    color, peak, dip = (_high_pass(values, tile.seen, cell_m) for values in (tile.paint, tile.peak, tile.dip))
     if not np.any(tile.hit):
-        return color
+        return color, peak, dip
     # Means over what was hit within 3 x 3 cells: rings of LiDAR leave gaps.
     hit = cv2.blur(tile.hit, (3, 3))
     filled = np.divide(cv2.blur(tile.intensity * tile.hit, (3, 3)), hit, out=np.zeros_like(hit), where=hit > 1e-3)
     intensity = _high_pass(filled, (hit > 1e-3).astype(np.float32), cell_m)
     if not np.any(tile.seen):
-        return intensity
+        return intensity, intensity, intensity
     c, i = _spread(color, tile.seen), _spread(intensity, tile.hit)
     ratio = (EXPECTED_INTENSITY / i**2) / (EXPECTED_COLOR / c**2)
     share = 1 / (1 + ratio)
-    both = np.float32(share) * color + np.float32(1 - share) * intensity
-    return np.asarray(np.where(hit <= 1e-3, color, np.where(tile.seen > 0, both, intensity)), np.float32)
+
+    def joined(by_color: Layer) -> Layer:
+        both = np.float32(share) * by_color + np.float32(1 - share) * intensity
+        return np.asarray(np.where(hit <= 1e-3, by_color, np.where(tile.seen > 0, both, intensity)), np.float32)
+
+    return joined(color), joined(peak), joined(dip)
 
 
 def _spread(flat: Layer, valid: Layer) -> float:
@@ -118,14 +126,15 @@ def _high_pass(values: Layer, valid: Layer, cell_m: float) -> Layer:
     return np.asarray(np.where(valid > 0, values - mean, 0), np.float32)
 
 
-def _respond(flat: Layer, cell_m: float) -> tuple[Layer, NDArray[np.uint8], Layer]:
+def _respond(layers: tuple[Layer, Layer, Layer], cell_m: float) -> tuple[Layer, NDArray[np.uint8], Layer]:
     """Find the strongest response of each cell (R, C), the number of its direction, and the sigma on texture."""
+    flat = layers[0]
     best = np.zeros(flat.shape, np.float32)
     direction = np.zeros(flat.shape, np.uint8)
     noise = np.ones_like(flat)
     for k in range(DIRECTIONS):
         there, back, size = _turn(flat.shape, np.pi * k / DIRECTIONS)
-        response, plain = _across(_warp(flat, there, size), cell_m)
+        response, plain = _across(*(_warp(layer, there, size) for layer in layers), cell_m)
         if k == 0:
             noise = _block_sigma(_warp(plain, back, (flat.shape[1], flat.shape[0])), cell_m)
         response = _warp(response, back, (flat.shape[1], flat.shape[0]))
@@ -139,20 +148,31 @@ def _warp(image: Layer, matrix: Array, size: tuple[int, int]) -> Layer:
     return np.asarray(cv2.warpAffine(image, matrix, size, flags=cv2.INTER_LINEAR), np.float32)
 
 
-def _across(turned: Layer, cell_m: float) -> tuple[Layer, Layer]:
+def _across(turned: Layer, peak: Layer, dip: Layer, cell_m: float) -> tuple[Layer, Layer]:
     """Respond to ridges along the rows: the lesser contrast of the best width, and the mean contrast of the least one."""
-    along = _blur(turned, max(1, round(ALONG_M / cell_m)), 1)
+    along, brightest, darkest = (_blur(layer, max(1, round(ALONG_M / cell_m)), 1) for layer in (turned, peak, dip))
     best, plain = np.zeros_like(along), np.zeros_like(along)
     flank = _blur(along, 1, max(1, round(FLANK_M / cell_m)))
     for k, width_m in enumerate(WIDTHS_M):
         middle = max(1, round(width_m / cell_m)) | 1
         # From the middle of the paint to that of the flank, whose own middle lies half a cell off if it is even.
         reach = round((width_m / 2 + GAP_M / 2 + FLANK_M / 2) / cell_m + 0.25)
-        above, inner, below = flank[: -2 * reach], _blur(along, 1, middle)[reach:-reach], flank[2 * reach :]
+        inner = (brightest if middle == 1 else _blur(along, 1, middle))[reach:-reach]
+        above, below = flank[: -2 * reach], flank[2 * reach :]
         np.maximum(best[reach:-reach], inner - np.maximum(above, below), out=best[reach:-reach])
         if k == 0:
+            np.maximum(best, _narrow(brightest, darkest), out=best)
             plain[reach:-reach] = inner - (above + below) / 2
     return best, plain
+
+
+def _narrow(brightest: Layer, darkest: Layer) -> Layer:
+    """Respond to a line of a cell's width with dark gaps of a cell's width beside it, as between a line and a curb."""
+    # The darker of the first and the second cell beside it, as gaps may straddle both.
+    gap = np.minimum(darkest[1:], darkest[:-1])
+    out = np.zeros_like(brightest)
+    out[2:-2] = brightest[2:-2] - np.maximum(gap[3:], gap[:-3])
+    return out
 
 
 def _blur(image: Layer, columns: int, rows: int) -> Layer:
@@ -184,14 +204,14 @@ def _block_sigma(plain: Layer, cell_m: float) -> Layer:
             grid[i, j] = np.quantile(part, TEXTURE_QUANTILE) / TEXTURE_SIGMAS
     # A perfectly even ground has no texture: what then counts is the least contrast.
     least = np.float32(MIN_CONTRAST / MIN_SIGMAS)
-    grid = np.clip(np.where(np.isfinite(grid), grid, least), least, CLEAR_CONTRAST / MIN_SIGMAS)
+    grid = np.maximum(np.where(np.isfinite(grid), grid, least), least)
     return np.asarray(cv2.resize(grid, (columns, rows), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 def _crests(strength: Layer, direction: NDArray[np.uint8], tile: CoarseTile) -> Array:
     """Keep cells that respond most across their direction: column, row, direction, strength (N, 4)."""
     known = np.zeros(strength.shape, bool)
-    known[tile.core] = (tile.seen[tile.core] > MIN_SEEN) | (cv2.blur(tile.hit, (5, 5))[tile.core] > 0)
+    known[tile.core] = (tile.seen[tile.core] > MIN_SEEN) | (cv2.blur(tile.hit, (7, 7))[tile.core] > MIN_HIT)
     rows, columns = np.nonzero((strength > MIN_SIGMAS) & known)
     angle = direction[rows, columns].astype(np.float64) * (np.pi / DIRECTIONS)
     dx, dy = -np.sin(angle), -np.cos(angle)  # to the left of the direction; rows count downwards
