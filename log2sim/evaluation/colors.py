@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from log2sim.datatypes import COLOR_NAMES, GROUP_OF, Agent
-from log2sim.evaluation.metrics.comparison import Comparison
 
 
-def color_figures(compared: Comparison, ours: tuple[Agent, ...], theirs: tuple[Agent, ...]) -> dict[str, Any] | None:
-    """Compare the colors of vehicles that were found with the colors of the agents that they match most.
+def color_figures(true: Sequence[Agent], found: Mapping[str, Agent]) -> dict[str, Any] | None:
+    """Compare the colors of vehicles that were found with the true ones.
+
+    Parameters
+    ----------
+    true : sequence of Agent
+    found : mapping
+        The agent that each true one is matched with most often, by the true one's id.
 
     Returns
     -------
@@ -21,19 +27,13 @@ def color_figures(compared: Comparison, ours: tuple[Agent, ...], theirs: tuple[A
         `ciede2000_median` the difference of the RGB values (Sharma et al., 2005; about 2 is just noticeable). None where the
         truth has no colors.
     """
-    colored = [a for a in theirs if a.color is not None and GROUP_OF.get(a.category) == "vehicle"]
+    colored = [a for a in true if a.color is not None and GROUP_OF.get(a.category) == "vehicle"]
     if not colored:
         return None
-    agents = {a.id: a for a in ours}
     confused: Counter[str] = Counter()
-    distance, named, right, with_color, found = [], 0, 0, 0, 0
-    for true in colored:
-        row = compared.truth.ids.index(true.id)
-        hits = compared.match[row][compared.counted[row] & (compared.match[row] >= 0)]
-        if len(hits) == 0:
-            continue
-        found += 1
-        color, true_color = agents[compared.other.ids[int(np.bincount(hits).argmax())]].color, true.color
+    distance, named, right, with_color = [], 0, 0, 0
+    matched = [(agent.color, found[agent.id].color) for agent in colored if agent.id in found]
+    for true_color, color in matched:
         if color is None or true_color is None:
             continue
         with_color += 1
@@ -44,7 +44,7 @@ def color_figures(compared: Comparison, ours: tuple[Agent, ...], theirs: tuple[A
             if color["name"] != true_color["name"]:
                 confused[f"{true_color['name']} as {color['name']}"] += 1
     return {
-        "vehicles": found,
+        "vehicles": len(matched),
         "with_color": with_color,
         "named": named,
         "right": right,

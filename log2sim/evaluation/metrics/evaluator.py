@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.datatypes import CATEGORIES, GROUPS, Scenario
+from log2sim.datatypes import CATEGORIES, GROUPS, Agent, Scenario
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.evaluation.colors import color_figures
 from log2sim.evaluation.lanes.figures import map_figures
@@ -95,7 +95,7 @@ def evaluate(
         "correctness": correctness(compared, scenario.others, ticks_s, ego),
         "ego": _ego_figures(scenario, truth, ticks_s, truth_ticks_s, truth.shift_to(scenario)),
         "map_features": map_figures(scenario, truth),
-        "colors": color_figures(compared, scenario.others, truth.others),
+        "colors": color_figures(truth.others, _matched(compared, scenario)),
         "signals": signal_figures(scenario, truth),
         "matching": matching_rules(),
         "counting": counting_rules(truth, MIN_COUNTED_S),
@@ -136,6 +136,17 @@ def compare_scenarios(
     ours = reconstructed_states(scenario.others, ticks_s, ego_xy)
     compared = compare(true, ours, _tick_s(ticks_s), selection)
     return without_ignored(compared, truth.ignore_regions, truth_ticks_s, shift_m), ticks_s, ego
+
+
+def _matched(c: Comparison, scenario: Scenario) -> dict[str, Agent]:
+    """Return the agent that each truth agent is matched with most often, by its id."""
+    agents = {agent.id: agent for agent in scenario.others}
+    out = {}
+    for row, name in enumerate(c.truth.ids):
+        hits = c.match[row][c.counted[row] & (c.match[row] >= 0)]
+        if len(hits):
+            out[name] = agents[c.other.ids[int(np.bincount(hits).argmax())]]
+    return out
 
 
 def _tick_s(ticks_s: Array) -> float:
