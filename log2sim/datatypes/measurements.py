@@ -28,11 +28,14 @@ class Detections:
     score : (M,) float64
         In [0, 1].
     category : (M,) str
+    traffic_lights : (K, 5) float64
+        Boxes u0, v0, u1, v1 and scores of traffic lights in the frame, which are no road users.
     """
 
     box_px: Array
     score: Array
     category: NDArray[np.str_]
+    traffic_lights: Array = field(default_factory=lambda: np.zeros((0, 5)))
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -44,7 +47,7 @@ class Detections:
         return cls(np.zeros((0, 4)), np.zeros(0), np.zeros(0, dtype="<U16"))
 
     def take(self, index: Any) -> Detections:
-        """Take the rows at `index`, integers or a mask."""
+        """Take the rows at `index`, integers or a mask; of traffic lights none."""
         return Detections(self.box_px[index], self.score[index], self.category[index])
 
 

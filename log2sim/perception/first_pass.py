@@ -23,6 +23,7 @@ from log2sim.perception.lidar.measure import measure_view, project_cloud
 from log2sim.perception.lidar.measure_boxes import measure_boxes, outside_ego
 from log2sim.perception.lidar.projection import View, view_of
 from log2sim.perception.lidar.viewpoints import join_parts
+from log2sim.perception.light_boxes import LightBox, with_range
 from log2sim.perception.prefetch import CloudOptions, CloudPrefetcher, obstacles_of
 from log2sim.perception.sync import Schedule
 from log2sim.plan import FusionLevel, Plan, Stage
@@ -55,6 +56,8 @@ class Observations:
         Ticks at which a camera has a frame that shows nothing of them, by camera: unreadable, repeated, or black.
     faults : tuple of Fault
         Of the records.
+    lights : list of LightBox
+        Traffic lights in frames, which are no agents.
     """
 
     measurements: list[Measurements] = field(default_factory=list)
@@ -68,6 +71,7 @@ class Observations:
     frames_skipped: Mapping[str, int] = field(default_factory=dict)
     unseen: dict[str, list[int]] = field(default_factory=dict)
     faults: tuple[Fault, ...] = ()
+    lights: list[LightBox] = field(default_factory=list)
 
     def recorded(self, schedule: Schedule) -> dict[str, NDArray[np.bool_]]:
         """Return (T,) for each camera, and for "" any LiDAR, whether it recorded at each tick something that shows what is there."""
@@ -109,6 +113,7 @@ def observe(
         frames = None if detector is None else FrameDetector(log, schedule, detector, plan, records, pool, clock)
         clouds.prefetch(0)
         for tick in range(len(schedule)):
+            known_lights = 0 if frames is None else len(frames.lights)
             found = {} if frames is None else frames.detections_at(tick)
             for camera in plan.cameras if frames is not None else ():
                 if schedule.frames[camera][tick] >= 0 and camera not in found:
@@ -122,13 +127,15 @@ def observe(
             clouds.prefetch(tick + 1)
             with clock.stage("measure"):
                 first.measure(tick, found, ready, boxes if lidar_detector is not None else None)
+                if frames is not None:
+                    frames.lights[known_lights:] = first.range_lights(tick, frames.lights[known_lights:], ready)
             with clock.stage("cloud"):
                 out.obstacles.append(None if ready[0] is None else obstacles_of(ready[0]))
             progress(tick + 1, len(schedule))
     records.require_some()
     out.sweeps, out.faults = clouds.compensated, records.watch.faults(schedule)
     if frames is not None:
-        out.frames_detected, out.frames_skipped = frames.detected, frames.skipped
+        out.frames_detected, out.frames_skipped, out.lights = frames.detected, frames.skipped, frames.lights
     return out
 
 
@@ -172,6 +179,15 @@ class _FirstPass:
         else:
             joined = self._join_sensors(boxes, reference, measured, views)
         self.out.measurements.append(joined.take(self._in_range(tick, joined)))
+
+    def range_lights(self, tick: int, lights: list[LightBox], clouds: Sequence[Cloud | None]) -> list[LightBox]:
+        """Return the traffic lights of a tick with distances where LiDAR points are on them."""
+        by_camera = dict(zip(self.schedule.frames, clouds))
+        out = []
+        for light in lights:
+            view, cloud = self._view(light.camera, tick), by_camera[light.camera]
+            out.append(light if view is None or cloud is None else with_range(light, view, cloud))
+        return out
 
     def _end(self, camera: str) -> str:
         return end_of(self.log.cameras[camera])

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Detections, Frame, Log, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.perception.detect.detectors import Detector
+from log2sim.perception.light_boxes import MAX_CROPS, LightBox, crop_lights
 from log2sim.perception.record_checks.records import RecordWatch
 from log2sim.perception.record_checks.thumbnails import Thumbnail, shrink
 from log2sim.perception.sync import Schedule
@@ -89,6 +90,8 @@ class FrameDetector:
         Number of frames in which the detector ran.
     skipped : dict of str to int
         Number of frames skipped, by camera.
+    lights : list of LightBox
+        Traffic lights in the frames, in the order of the ticks.
     """
 
     def __init__(
@@ -99,6 +102,8 @@ class FrameDetector:
         self._reader, self._pool, self._clock = reader, pool, clock
         self._pending: dict[int, dict[str, Detections]] = {}
         self._thumbnails: dict[tuple[str, int], Thumbnail] = {}
+        self._lights: dict[tuple[str, int], list[LightBox]] = {}
+        self.lights: list[LightBox] = []
         self.detected = 0
         self.skipped: dict[str, int] = {}
 
@@ -114,7 +119,12 @@ class FrameDetector:
         if stride > 1 and tick < last and tick % stride == 0:
             self._detect_between(tick, min(tick + stride, last))
         found = self._pending.pop(tick)
-        return {camera: boxes for camera, boxes in found.items() if self._is_live(camera, tick, boxes)}
+        live = {camera: boxes for camera, boxes in found.items() if self._is_live(camera, tick, boxes)}
+        for camera in found:
+            lights = self._lights.pop((camera, tick), [])
+            if camera in live and len(self.lights) < MAX_CROPS:
+                self.lights += lights
+        return live
 
     def _is_live(self, camera: str, tick: int, found: Detections) -> bool:
         """Return whether a frame shows what is there; nothing is said of frames that are not decoded."""
@@ -149,7 +159,12 @@ class FrameDetector:
             self._thumbnails |= {(name, tick): small for name, small in thumbnails.items() if small is not None}
         with self._clock.stage("detect"):
             self.detected += len(frames)
-            return {name: self._detector.detect(frame) for name, frame in frames.items()}
+            found = {name: self._detector.detect(frame) for name, frame in frames.items()}
+            for name, boxes in found.items():
+                if len(boxes.traffic_lights):
+                    frame = frames[name]
+                    self._lights[name, tick] = crop_lights(name, frame.t_ns, frame.image(), boxes.traffic_lights)
+            return found
 
     def _frames(self, tick: int, cameras: Iterable[str]) -> dict[str, Frame]:
         frames = {}

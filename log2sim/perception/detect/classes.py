@@ -1,4 +1,4 @@
-"""Mapping from the classes of a model to categories of road users; other classes are dropped."""
+"""Mapping from the classes of a model to categories of road users and to traffic lights; other classes are dropped."""
 
 from __future__ import annotations
 
@@ -20,7 +20,11 @@ CATEGORY_OF_NAME: Mapping[str, str] = {
     "motorcycle": "motorcycle", "motorbike": "motorcycle", "motorcyclist": "motorcycle", "motor": "motorcycle",
     "bicycle": "bicycle", "bike": "bicycle", "cyclist": "cyclist", "bicyclist": "cyclist", "rider": "cyclist",
     "person": "pedestrian", "pedestrian": "pedestrian", "people": "pedestrian",
+    "traffic light": "traffic_light", "traffic_light": "traffic_light", "traffic signal": "traffic_light",
 }  # fmt: skip
+
+TRAFFIC_LIGHT = "traffic_light"
+"""No road user, but what traffic goes by: a group of its own."""
 
 NAMES_LIMIT_CHARS = 1_000_000
 
@@ -47,7 +51,7 @@ class Classes:
         category : (M,) str
         """
         rows, scores, categories = [], [], []
-        for members in GROUPS.values():
+        for members in (*GROUPS.values(), (TRAFFIC_LIGHT,)):
             columns = [i for i, name in self.category_of.items() if name in members and i < class_scores.shape[1]]
             if not columns:
                 continue
@@ -68,8 +72,8 @@ class Classes:
         return np.array([self.category_of.get(i, "") for i in np.asarray(class_id, float).tolist()], dtype="<U16")
 
 
-COCO_80 = Classes({0: "pedestrian", 1: "bicycle", 2: "car", 3: "motorcycle", 5: "bus", 7: "truck"})
-COCO_91 = Classes({1: "pedestrian", 2: "bicycle", 3: "car", 4: "motorcycle", 6: "bus", 8: "truck"})
+COCO_80 = Classes({0: "pedestrian", 1: "bicycle", 2: "car", 3: "motorcycle", 5: "bus", 7: "truck", 9: TRAFFIC_LIGHT})
+COCO_91 = Classes({1: "pedestrian", 2: "bicycle", 3: "car", 4: "motorcycle", 6: "bus", 8: "truck", 10: TRAFFIC_LIGHT})
 COCO_90 = Classes({i - 1: category for i, category in COCO_91.category_of.items()})
 BY_COUNT: Mapping[int, Classes] = {80: COCO_80, 90: COCO_90, 91: COCO_91}
 
@@ -109,7 +113,7 @@ def classes_from_names(names: str, where: str) -> Classes:
     except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError) as error:
         raise ConfigError(f"{where}: metadata 'names' is no list or dict of class names: {error}") from None
     known = {i: CATEGORY_OF_NAME[name] for i, name in by_index.items() if name in CATEGORY_OF_NAME}
-    if not known:
+    if not set(known.values()) - {TRAFFIC_LIGHT}:
         listed = ", ".join(list(by_index.values())[:8])
         names_known = ", ".join(CATEGORY_OF_NAME)
         raise ConfigError(f"{where}: none of its classes is a road user ({listed}); known: {names_known}")
@@ -118,4 +122,4 @@ def classes_from_names(names: str, where: str) -> Classes:
 
 def groups_of(category: NDArray[np.str_]) -> NDArray[np.str_]:
     """Return the groups (M,) of categories (M,)."""
-    return np.array([GROUP_OF[name] for name in category.tolist()], dtype="<U16")
+    return np.array([GROUP_OF.get(name, name) for name in category.tolist()], dtype="<U16")

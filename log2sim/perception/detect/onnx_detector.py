@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Detections, Frame
 from log2sim.errors import ConfigError
-from log2sim.perception.detect.classes import Classes, choose_classes, groups_of
+from log2sim.perception.detect.classes import TRAFFIC_LIGHT, Classes, choose_classes, groups_of
 from log2sim.perception.detect.layout import Layout, Outputs, describe_outputs
 from log2sim.perception.detect.layouts import LAYOUTS, named_layout
 from log2sim.perception.detect.onnx_model import OnnxModel, load_model
@@ -23,7 +23,8 @@ from log2sim.perception.detect.tiling import Tile, merge, plan_tiles
 MIN_BOX_PX = 2.0
 # People and two-wheelers cover few pixels, of which a cast shadow or a turn takes a score from 0.8 to 0.2. From half of the least
 # score on about half of their boxes are right; they continue tracks that stronger ones began.
-WEAK_GROUPS, WEAK_SHARE = ("pedestrian", "two_wheeler"), 0.5
+# Traffic lights are small, too; they stand still, so that several weak boxes confirm each other.
+WEAK_GROUPS, WEAK_SHARE = ("pedestrian", "two_wheeler", TRAFFIC_LIGHT), 0.5
 # Side of the gray image by whose outputs a layout is recognized.
 PROBE_PX = 320
 
@@ -41,7 +42,7 @@ class OnnxDetector:
     min_score : float
         Lowest score of a box.
     min_weak_score : float
-        The same of people and two-wheelers: weaker boxes continue their tracks, and a weak bicycle under a person tells a rider.
+        The same of people, two-wheelers and traffic lights: weaker boxes continue their tracks, and a weak bicycle under a person tells a rider.
     max_overlap : float
         IoU above which two boxes of one group are duplicates.
     tiles : int or "auto"
@@ -64,11 +65,14 @@ class OnnxDetector:
         return self.detect_image(frame.image())
 
     def detect_image(self, image: NDArray[np.uint8]) -> Detections:
-        """Detect road users in one image (H, W, 3) uint8 BGR."""
+        """Detect road users and traffic lights in one image (H, W, 3) uint8 BGR."""
         height, width = image.shape[:2]
         tiles = plan_tiles(width, height, self.tiles, self.model.spec.width_px or self.layout.preprocessing.default_px)
         found = [(tile, suppress(self._detect_tile(image, tile), self.max_overlap)) for tile in tiles]
-        return join_riders(merge(found, width, height, self.max_overlap), sure_score=self.min_score)
+        merged = merge(found, width, height, self.max_overlap)
+        light = merged.category == TRAFFIC_LIGHT
+        users = join_riders(merged.take(~light), sure_score=self.min_score)
+        return replace(users, traffic_lights=np.column_stack([merged.box_px[light], merged.score[light]]))
 
     def _detect_tile(self, image: NDArray[np.uint8], tile: Tile) -> Detections:
         """Detect in one tile; boxes in px of the whole image, clipped to the tile."""
