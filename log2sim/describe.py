@@ -23,6 +23,7 @@ from log2sim.perception.first_pass import Observations
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.picture_pass import PictureConsumer, look_again
 from log2sim.plan import Decision, Plan, Stage
+from log2sim.signals.traffic_lights import find_signals
 from log2sim.stage_clock import StageClock
 
 
@@ -90,9 +91,12 @@ def describe(scenario: Scenario, recorded: Recorded) -> Description:
         features = read_map(ground, scenario, notes) if plan.keeps(Stage.LANES) else None
     with recorded.clock.stage("colors"):
         agents = scenario.agents if colors is None else with_colors(scenario.agents, colors)
-    described = replace(scenario, map_features=features, agents=agents)
-    figures = {"map_features": count_features(features), "colors": count_colors(agents), "signals": 0}
-    return Description(described, outcomes_of(plan, described), figures, reader)
+    with recorded.clock.stage("signals"):
+        lights = recorded.observations.lights
+        signals, seen = find_signals(log, scenario, lights) if plan.keeps(Stage.SIGNALS) else ((), "")
+    described = replace(scenario, map_features=features, agents=agents, signals=signals)
+    figures = {"map_features": count_features(features), "colors": count_colors(agents), "signals": len(signals)}
+    return Description(described, outcomes_of(plan, described, seen), figures, reader)
 
 
 def read_map(ground: GroundMapBuilder | None, scenario: Scenario, notes: Sequence[str]) -> MapFeatures:
@@ -112,12 +116,13 @@ def with_colors(agents: tuple[Agent, ...], sampler: ColorSampler) -> tuple[Agent
     return tuple(replace(agent, color=found.get(agent.id, agent.color)) for agent in agents)
 
 
-def outcomes_of(plan: Plan, scenario: Scenario) -> tuple[Outcome, ...]:
+def outcomes_of(plan: Plan, scenario: Scenario, seen_lights: str) -> tuple[Outcome, ...]:
     """Say what came of the stages of the description."""
     features, colored = scenario.map_features, sum(agent.color is not None for agent in scenario.others)
     said = {
         Stage.LANES: "" if features is None else f"{len(features.markings)} markings, {len(features.lanes)} lanes",
         Stage.COLORS: f"colors of {colored} of {len(scenario.others)} agents",
+        Stage.SIGNALS: seen_lights,
     }
     decisions = [plan.decision(stage) for stage in said]
     return tuple(Outcome(Decision(d.stage, d.kept, said[d.stage] if d.kept else d.reason)) for d in decisions)

@@ -41,9 +41,10 @@ class Stage(StrEnum):
     WAYPOINT_AT_EVERY_TICK = "waypoint at every tick"
     LANES = "markings and lanes"
     COLORS = "colors of vehicles"
+    SIGNALS = "traffic lights"
 
 
-DESCRIBING = (Stage.LANES, Stage.COLORS)
+DESCRIBING = (Stage.LANES, Stage.COLORS, Stage.SIGNALS)
 """Stages that describe a scenario once its agents are known, see `log2sim.describe`."""
 
 
@@ -143,6 +144,7 @@ def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64
         Decision(Stage.WAYPOINT_AT_EVERY_TICK, False, "waypoints that interpolation gives back are left out"),
         _lanes(log, config, sensors),
         _colors(config, sensors),
+        _signals(config, sensors),
     )
     return Plan(sensors.cameras, decisions, scope, max(stride, 1), ends.level)
 
@@ -257,6 +259,16 @@ def _colors(config: Config, sensors: Sensors) -> Decision:
     if not sensors.cameras:
         return Decision(Stage.COLORS, False, NO_CAMERA)
     return Decision(Stage.COLORS, True, "pictures show the vehicles")
+
+
+def _signals(config: Config, sensors: Sensors) -> Decision:
+    if not config.appearance.signals:
+        return Decision(Stage.SIGNALS, False, "appearance.signals=false")
+    if not sensors.cameras or not config.detect.in_images:
+        return Decision(Stage.SIGNALS, False, NO_CAMERA)
+    if config.detect.in_images == "labels":
+        return Decision(Stage.SIGNALS, False, "labels of road users take the place of a detector")
+    return Decision(Stage.SIGNALS, True, "detectors with the classes of COCO know them")
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ PLACES, PLACE_SIGMA = (0.2, 0.5, 0.8), 0.25
 UPRIGHT = 1.3  # height by width; other housings lie, or are round, and the place says nothing
 # Probabilities of the colors that a lamp of each color shows: red and yellow lamps are alike where they are clipped.
 SEEN_AS = np.array([[0.84, 0.14, 0.02], [0.2, 0.76, 0.04], [0.01, 0.05, 0.94]])
+SEEN_SHARE, MIN_APART = 0.15, 0.15  # of what shines; of the housing's length
 # One picture is wrong for reasons that the next ones share: what it says counts for no more than this, in nats.
 MAX_EVIDENCE = 3.0
 OFF_WHERE_LIT, LIT_WHERE_DARK = 0.03, 0.15
@@ -45,10 +46,11 @@ def lamp_evidence(crop_bgr: NDArray[np.uint8]) -> Array:
 def _log_of(lamps: list[int], shares: Array, places: Array, upright: bool) -> float:
     """Return the log-likelihood of colors (3,), as shares of what shines, at places (3,), while lamps are lit."""
     log = float(shares @ np.log(SEEN_AS[lamps].mean(axis=0)))
-    if len(lamps) == 2 and upright:
-        # Both shine: neither may be missing.
-        log += np.log(0.5) if min(shares[0], shares[1]) > 0.15 else np.log(0.1)
-    seen = shares > 0.15
+    if len(lamps) == 2:
+        # Both shine, one below the other.
+        apart = not upright or places[1] - places[0] > MIN_APART
+        log += 0.0 if min(shares[0], shares[1]) > SEEN_SHARE and apart else np.log(LIT_WHERE_DARK)
+    seen = shares > SEEN_SHARE
     if upright:
         for color in np.flatnonzero(seen):
             off = min(abs(places[color] - PLACES[lamp]) for lamp in lamps) / PLACE_SIGMA

@@ -25,32 +25,29 @@ MIN_LIT_SHARE = 0.4
 SURE_BOXES = 6.0
 
 
-def find_signals(log: Log, scenario: Scenario, boxes: Sequence[LightBox]) -> tuple[tuple[Signal, ...], tuple[str, ...]]:
-    """Find the traffic lights among boxes of frames; says in notes which boxes were left out.
+def find_signals(log: Log, scenario: Scenario, boxes: Sequence[LightBox]) -> tuple[tuple[Signal, ...], str]:
+    """Find the traffic lights among boxes of frames.
 
     Returns
     -------
     signals : tuple of Signal
         Ordered by when they are first seen.
-    notes : tuple of str
+    seen : str
+        How many there are, and how many places of boxes were left out, in words.
     """
     if not boxes:
-        return (), ("no traffic lights seen",)
-    housings = place_lights(log, boxes)
-    signals, left_out = [], 0
-    for housing in sorted(housings, key=lambda h: min(b.t_ns for b in h.boxes)):
-        if _is_plausible(log, housing):
-            signals.append(_signal(f"signal_{len(signals) + 1}", housing, scenario))
-        else:
-            left_out += 1
-    notes = (
-        [f"{left_out} places of boxes of traffic lights left out: seen too rarely, or not where signals are"]
-        if left_out
-        else []
-    )
-    if not signals:
-        notes.insert(0, "no traffic lights seen often enough")
-    return tuple(signals), tuple(notes)
+        return (), "no traffic light seen"
+    signals: list[Signal] = []
+    housings = sorted(place_lights(log, boxes), key=lambda housing: min(box.t_ns for box in housing.boxes))
+    for housing in housings:
+        signal = _signal(f"signal_{len(signals) + 1}", housing, scenario) if _is_plausible(log, housing) else None
+        signals += [] if signal is None else [signal]
+    text = f"{len(signals)} traffic light{'' if len(signals) == 1 else 's'}"
+    if left_out := len(housings) - len(signals):
+        text += (
+            f"; {left_out} places left out: seen too rarely, placed too roughly, not where signals hang, or no lamp lit"
+        )
+    return tuple(signals), text
 
 
 def _is_plausible(log: Log, housing: Housing) -> bool:
@@ -59,7 +56,7 @@ def _is_plausible(log: Log, housing: Housing) -> bool:
         return False
     height = housing.position[2] - ground_height(log, housing)
     margin = HEIGHT_MARGIN_M + float(np.sqrt(housing.covariance[2, 2]))
-    return HEIGHT_M[0] - margin <= height <= HEIGHT_M[1] + margin
+    return bool(HEIGHT_M[0] - margin <= height <= HEIGHT_M[1] + margin)
 
 
 def ground_height(log: Log, housing: Housing) -> float:
