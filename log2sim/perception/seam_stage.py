@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Log, Obstacles
-from log2sim.geometry import Array, apply, inverse
+from log2sim.datatypes import Log
+from log2sim.geometry import Array, inverse
 from log2sim.perception.first_pass import Observations, base_pose
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.homography.rig import rotation_of
 from log2sim.perception.homography.rig_seams import fit_mounts, with_mounts
-from log2sim.perception.homography.seams import LENGTH_M, Seam, SeamPlace, find_seams, measure_seam, pixels_of
+from log2sim.perception.homography.seams import Seam, SeamView, find_seams, measure_seam, misalignment_m
 from log2sim.perception.homography_stage import CameraHomography
 from log2sim.perception.record_checks.thumbnails import shrink
+from log2sim.perception.seam_cover import Standing, ground_points, standing_at
 from log2sim.perception.sync import Schedule
 
 # Distances from the rig at which cameras are compared; the middle one is the distance at which misalignment is reported.
@@ -25,10 +27,6 @@ DISTANCES_M = (9.0, 15.0)
 REPORT_M = 15.0
 # Ticks of which pictures are read to align mounts, and others to measure what is left.
 TICKS = 6
-# Ground within this distance of a patch, and so much time before and after, shows that it lies on the ground.
-NEAR_M, NEAR_S, MIN_GROUND_POINTS = 3.0, 2.0, 3
-# More LiDAR points that hide or cover a patch are an object on it.
-MAX_HIDING_POINTS = 4
 # Rounds of measuring and turning: the offset varies over a patch by its share of the distance, so each leaves a fifth of it.
 ALIGNING_ROUNDS = 3
 
@@ -51,7 +49,7 @@ class SeamSurvey:
     covered: int = 0
 
     @property
-    def misalignment_m(self) -> float | None:
+    def median_m(self) -> float | None:
         """Median length of the offsets, m; None where no patch could be registered."""
         return float(np.median([s.distance_m for s in self.seams])) if self.seams else None
 
@@ -99,79 +97,35 @@ class SeamPictures:
             if len(roads) < 2:
                 continue
             cameras = {name: self.log.cameras[name] for name in roads}
-            places_xy = np.array([self._place(name, tick) for name in roads])
             images = {name: self.images[name, tick] for name in roads}
-            for distance in distances_m:
-                for place in find_seams(cameras, roads, places_xy.mean(axis=0), distance):
-                    places += 1
-                    if not self._shows_ground(place, tick, roads):
-                        covered += 1
-                        continue
-                    seam = measure_seam(place, tick, images, cameras, roads)
-                    if seam is not None:
-                        seams.append(seam)
+            middle = np.mean([self._standing[tick].cameras[name][:2] for name in roads], axis=0)
+            for place in (p for d in distances_m for p in find_seams(cameras, roads, middle, d)):
+                places += 1
+                rig = homographies[place.first].rig
+                z = None if rig is None else rig.road_z_m(np.array(place.center_m), tick)
+                hidden = self._standing[tick].hidden(place, cameras, roads, z)
+                if hidden is None:
+                    covered += 1
+                    continue
+                seam = measure_seam(SeamView(place, tick, hidden), images, cameras, roads)
+                if seam is not None:
+                    seams.append(seam)
         return SeamSurvey(tuple(seams), places, covered)
 
-    def _stamp(self, camera: str, tick: int) -> int:
-        return int(self.log.streams[camera].t_ns[self.schedule.frames[camera][tick]])
+    @cached_property
+    def _standing(self) -> dict[int, Standing]:
+        """What stands on the ground at each tick."""
+        points = ground_points(self.log, self.schedule, self.observed)
+        return {
+            tick: standing_at(self.log, self.schedule, self.observed, points, tick)
+            for tick in sorted({tick for _, tick in self.images})
+        }
 
-    def _base(self, tick: int) -> Array:
-        """Pose (4, 4) of the ground frame that all pictures of a tick are compared in."""
-        return base_pose(self.log, int(self.schedule.t_ns[tick]))
-
-    def _place(self, camera: str, tick: int) -> Array:
-        """Position (2,) of a camera in that frame."""
-        pose = self.log.map_T_sensor(camera, self._stamp(camera, tick))[0][0]
-        return np.asarray((inverse(self._base(tick)) @ pose)[:2, 3])
-
-    def _shows_ground(self, place: SeamPlace, tick: int, roads: Mapping[str, Array]) -> bool:
-        """Return whether LiDAR ground lies at a place, and nothing stands on it or before it."""
-        xy = place.cells()
-        for name in (place.first, place.second):
-            uv, inside = pixels_of(self.log.cameras[name], roads[name], xy)
-            if inside.any() and self._overlaps_box(name, tick, uv[inside]):
-                return False
-        obstacles = self.observed.obstacles[tick] if tick < len(self.observed.obstacles) else None
-        if obstacles is None:
-            return True
-        return self._has_ground(place, tick) and not self._is_hidden(place, tick, obstacles)
-
-    def _overlaps_box(self, camera: str, tick: int, uv: Array) -> bool:
-        m = self.observed.measurements[tick]
-        low, high = uv.min(axis=0), uv.max(axis=0)
-        box = m.box_px[m.camera == camera]
-        return bool(((box[:, :2] < high) & (box[:, 2:] > low)).all(axis=1).any())
-
-    def _has_ground(self, place: SeamPlace, tick: int) -> bool:
-        near_ns, count = int(NEAR_S * 1e9), 0
-        base_T_map = inverse(self._base(tick))
-        for name in (place.first, place.second):
-            for rows in self.observed.ground.get(name, []):
-                if (
-                    len(rows) == 0
-                    or abs(int(self.schedule.t_ns[rows.tick[0]]) - int(self.schedule.t_ns[tick])) > near_ns
-                ):
-                    continue
-                there = base_T_map @ base_pose(self.log, self._stamp(name, int(rows.tick[0])))
-                xy = rows.xy_ego @ there[:2, :2].T + there[:2, 3]
-                count += int((np.hypot(*(xy - place.center_m).T) < NEAR_M).sum())
-        return count >= MIN_GROUND_POINTS
-
-    def _is_hidden(self, place: SeamPlace, tick: int, obstacles: Obstacles) -> bool:
-        """Return whether LiDAR points above the ground lie in the picture where the place is, seen from a camera."""
-        points = apply(inverse(self._base(tick)), obstacles.xyz.astype(np.float64) + obstacles.origin)
-        points[:, 2] -= self.log.ground_z_ego_m
-        for name in (place.first, place.second):
-            pose = inverse(self._base(tick)) @ self.log.map_T_sensor(name, self._stamp(name, tick))[0][0]
-            height = pose[2, 3] - self.log.ground_z_ego_m
-            lower = points[(points[:, 2] < 0.95 * height)]
-            # A point stands on the ground below it, and hides that on the line from the camera through it.
-            hidden = pose[:2, 3] + (lower[:, :2] - pose[:2, 3]) * (height / (height - lower[:, 2]))[:, None]
-            for xy in (lower[:, :2], hidden):
-                local = (xy - place.center_m) @ place.axes.T
-                if ((np.abs(local) < [LENGTH_M / 2, place.width_m / 2]).all(axis=1)).sum() > MAX_HIDING_POINTS:
-                    return True
-        return False
+    def misalignments_m(self, seams: Sequence[Seam], homographies: Mapping[str, CameraHomography]) -> Array:
+        """Compute how far apart (N,) other homographies put what the cameras show at seams; NaN where a camera has none."""
+        roads = {t: roads_at(self.log, self.schedule, homographies, t) for t in {seam.tick for seam in seams}}
+        known = [{s.place.first, s.place.second} <= set(roads[s.tick]) for s in seams]
+        return np.array([misalignment_m(s, roads[s.tick]) if k else np.nan for s, k in zip(seams, known)])
 
 
 def roads_at(log: Log, schedule: Schedule, homographies: Mapping[str, CameraHomography], tick: int) -> dict[str, Array]:

@@ -256,7 +256,9 @@ def homography_points(context: BenchContext, observations: Observations, report:
             spent[setting.name].append(time.perf_counter() - begin)
             report("homographies", repeat * len(spent) + k + 1, REPEATS * len(spent))
     out = []
-    seams = SeamBench.of(context.log, context.schedule, observations)
+    # Those fitted together register the pictures best, whatever the settings are.
+    together = [found for found in fits.values() if any(g.rig is not None for g in found.values())]
+    seams = SeamBench.of(context.log, context.schedule, observations, together[0] if together else {})
     for setting in settings:
         score = score_homographies(context.log, holdout, fits[setting.name])
         figures = score.figures | fit_figures(fits[setting.name])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -126,12 +126,15 @@ class Seam:
     offset_m : (2,) float64
         From the picture of the first camera to that of the second, ground frame, m.
     covariance : (2, 2) float64
+    pixels : (2, 2) float64
+        Undistorted pixels of the two cameras that show one point of the ground, that at the middle of the place.
     """
 
     place: SeamPlace
     tick: int
     offset_m: Array
     covariance: Array
+    pixels: Array
 
     @property
     def distance_m(self) -> float:
@@ -139,18 +142,52 @@ class Seam:
         return float(np.hypot(*self.offset_m))
 
 
+@dataclass(frozen=True, eq=False)
+class SeamView:
+    """A place at a tick, and what of it is hidden from either camera.
+
+    Attributes
+    ----------
+    place : SeamPlace
+    tick : int
+    hidden : mapping of str to (R, C) bool
+        Cells that do not show the ground, by camera.
+    """
+
+    place: SeamPlace
+    tick: int
+    hidden: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
+
+
 def measure_seam(
-    place: SeamPlace, tick: int, images: Mapping[str, NDArray[np.uint8]], cameras: Mapping[str, Camera],
+    view: SeamView, images: Mapping[str, NDArray[np.uint8]], cameras: Mapping[str, Camera],
     homographies: Mapping[str, Array],
 ) -> Seam | None:  # fmt: skip
     """Register what two cameras show of a place; None where that is not possible."""
-    xy = place.cells()
-    patches = [draw_patch(images[n], cameras[n], homographies[n], xy) for n in (place.first, place.second)]
+    place, tick = view.place, view.tick
+    xy, patches = place.cells(), []
+    for name in (place.first, place.second):
+        patch = draw_patch(images[name], cameras[name], homographies[name], xy)
+        patches.append(np.where(view.hidden[name], np.nan, patch).astype(np.float32) if view.hidden else patch)
     found: Offset | None = register_patches(patches[0], patches[1], CELL_M)
     if found is None:
         return None
     axes = place.axes
-    return Seam(place, tick, found.offset_m @ axes, axes.T @ found.covariance @ axes)
+    offset = found.offset_m @ axes
+    shown = np.array([place.center_m, place.center_m + offset])
+    image_H_ground = np.linalg.inv([homographies[place.first], homographies[place.second]])
+    q = np.einsum("kij,kj->ki", image_H_ground, np.column_stack([shown, np.ones(2)]))
+    return Seam(place, tick, offset, axes.T @ found.covariance @ axes, q[:, :2] / q[:, 2:])
+
+
+def misalignment_m(seam: Seam, homographies: Mapping[str, Array]) -> float:
+    """Compute how far apart other homographies put what both cameras show, m; infinite where it is above a horizon."""
+    h = np.array([homographies[seam.place.first], homographies[seam.place.second]])
+    q = np.einsum("kij,kj->ki", h, np.column_stack([seam.pixels, np.ones(2)]))
+    if not (q[:, 2] > 0).all():
+        return float("inf")
+    xy = q[:, :2] / q[:, 2:]
+    return float(np.hypot(*(xy[1] - xy[0])))
 
 
 def summarize_seams(seams: Sequence[Seam]) -> dict[str, float]:
