@@ -27,7 +27,7 @@ REVISIONS = ("1.0", "1.1", "1.2")
 QC_CONFIG = """<Config><Param name="InputFile" value="{file}"/><CheckerBundle application="{bundle}">
 <Param name="resultFile" value="result.xqar"/></CheckerBundle></Config>
 """
-# Checks that ask for something a file without junctions lacks; those of OpenSCENARIO have rules for 1.2 only.
+# A check of OpenDRIVE 1.8, which is skipped for 1.7; those of OpenSCENARIO have rules for 1.2 only.
 NOT_APPLICABLE = {"check_asam_xodr_junctions_connection_one_link_to_incoming"}
 
 
@@ -99,24 +99,30 @@ def test_asam_s_checkers_would_find_something(folders: dict[str, Path], tmp_path
         assert judged(kind, tmp_path / name, tmp_path)[0]
 
 
-def test_carla_s_lanes_have_the_ego_within_1_cm_of_their_middle(
-    world: Scenario, folders: dict[str, Path], tmp_path: Path
-) -> None:
-    ego = world.ego
-    assert ego is not None
-    t = np.linspace(ego.waypoints.t_s[0], ego.waypoints.t_s[-1], 2000)
-    state = ego.at(t)
-    points = np.column_stack([state.x_m, state.y_m, state.z_m - ego.size_m[2] / 2])
-    (tmp_path / "points.json").write_text(json.dumps(points.tolist()))
-    found = json.loads(peer("carla")(ROOT / "tests/peers/carla_lanes.py", folders["1.2"] / "road.xodr", tmp_path / "points.json"))  # fmt: skip
-    assert found["aside_m"] <= 0.01
-    assert found["above_m"] <= 0.05
-    assert found["lanes"] == [[1, -1]]
+def test_carla_s_lanes_hold_every_vehicle(world: Scenario, folders: dict[str, Path], tmp_path: Path) -> None:
+    """Within half a lane's width, and the ego's path within the heights of its lane; CARLA knows the lanes that follow."""
+    offset = ElementTree.parse(folders["1.2"] / "road.xodr").find("header/offset")
+    shift = np.zeros(3) if offset is None else np.array([float(offset.attrib[k]) for k in "xyz"]) - world.map.offset_m
+    for a in world.agents:
+        if a.static or a.category not in ("car", "truck", "bus"):
+            continue
+        t = np.linspace(a.waypoints.t_s[0], a.waypoints.t_s[-1], 200)
+        state = a.at(t)
+        points = np.column_stack([state.x_m, state.y_m, state.z_m - a.size_m[2] / 2]) - shift
+        (tmp_path / "points.json").write_text(json.dumps(points.tolist()))
+        found = json.loads(peer("carla")(ROOT / "tests/peers/carla_lanes.py", folders["1.2"] / "road.xodr", tmp_path / "points.json"))  # fmt: skip
+        if np.hypot(*(points[-1] - points[0])[:2]) > 2.0:
+            assert found["over_edge_m"] <= 0.1, a.id
+        if a.id == "ego":
+            assert found["above_m"] <= 0.1
 
 
 def test_netconvert_reads_the_road_without_a_warning(folders: dict[str, Path], tmp_path: Path) -> None:
+    """But for turns that are sharper than 9 m in radius, which vehicles drove."""
     command = [
         tool("sumo", "netconvert"),
+        "--geometry.min-radius",
+        "3",
         "--opendrive-files",
         folders["1.2"] / "road.xodr",
         "-o",
@@ -124,9 +130,11 @@ def test_netconvert_reads_the_road_without_a_warning(folders: dict[str, Path], t
     ]
     ran = subprocess.run(command, capture_output=True, text=True)
     assert (ran.returncode, ran.stdout.strip(), ran.stderr) == (0, "Success.", "")
-    lanes = ElementTree.parse(tmp_path / "net.xml").getroot().findall("edge/lane")
-    assert len(lanes) >= 3
-    assert all(float(lane.attrib["length"]) > 4 for lane in lanes)
+    net = ElementTree.parse(tmp_path / "net.xml").getroot()
+    assert len(net.findall("edge/lane")) >= 3
+    ends = {c.attrib["to"] for c in net.iterfind("connection")}
+    junctions = ElementTree.parse(folders["1.2"] / "road.xodr").getroot().findall("junction")
+    assert len(ends) >= len(junctions)
 
 
 @pytest.mark.parametrize("revision", REVISIONS)

@@ -7,20 +7,21 @@ that conflicts with other packages, and its writer truncates decimals and dates 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from log2sim.datatypes import Agent, MapFrame, MapLane, Scenario
+from log2sim.datatypes import Agent, MapFrame, MapLane, Scenario, Signal
 from log2sim.errors import ScenarioError
 from log2sim.export import xml_text
 from log2sim.export.csv_table import write_table
 from log2sim.export.exporters import Options
 from log2sim.export.roads.lanes import edges_of, lanes
 from log2sim.export.roads.marks import MarkFinder
+from log2sim.export.roads.signal_lanes import signal_lanes
 from log2sim.export.sampling import SampledMotion, sample_motion, sample_steps, step_times
 from log2sim.export.xml_text import element
 from log2sim.geometry import NS_PER_S, Array
@@ -39,6 +40,14 @@ TYPE_OF_CATEGORY = {
     "car": "car", "truck": "truck", "bus": "bus", "motorcycle": "motorcycle", "cyclist": "bicycle",
     "bicycle": "bicycle", "pedestrian": "pedestrian", "other": "unknown",
 }  # fmt: skip
+LIGHT = {
+    "red": "red",
+    "red_yellow": "redYellow",
+    "yellow": "yellow",
+    "green": "green",
+    "off": "inactive",
+    "unknown": "inactive",
+}
 LINE_MARKING = {"solid": "solid", "broken": "dashed", "curb": "curb", "none": "no_marking"}
 # Static obstacles have types of their own, without pedestrians: those are dynamic obstacles that do not move.
 STATIC_TYPE = dict.fromkeys(("car", "truck", "bus", "motorcycle", "bicycle"), "parkedVehicle") | {"other": "unknown"}
@@ -50,7 +59,7 @@ class CommonRoad:
     options: tuple[str, ...] = ()
     loses = (
         "colors, uncertainty and observed flags, times between steps of 0.1 s and before the ego's first, the ego's way "
-        "between start and goal, when parked vehicles were first and last seen, cameras, plan; text ids (in agents.csv)"
+        "between start and goal, confidences of lanes, crosswalks, states of traffic lights beyond the log, when parked vehicles were first and last seen, cameras, plan; text ids (in agents.csv)"
     )
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
@@ -60,8 +69,12 @@ class CommonRoad:
         root = _root(scenario, name)
         roads = lanes(scenario)
         number_of = {lane.id: number for number, lane in enumerate(roads, start=1)}
-        root.extend(_lanelet(lane, number_of, MarkFinder.of(scenario)) for lane in roads)
-        first = len(roads) + 1
+        lights = [{lane.id for lane in signal_lanes(signal, roads)} for signal in scenario.signals]
+        for lane in roads:
+            own = [len(roads) + k for k, names in enumerate(lights, start=1) if lane.id in names]
+            root.append(_lanelet(lane, number_of, MarkFinder.of(scenario), own))
+        root.extend(_traffic_light(signal, len(roads) + k, t_s) for k, signal in enumerate(scenario.signals, start=1))
+        first = len(roads) + len(scenario.signals) + 1
         table = [
             ("commonroad_id", "agent", "category", "role", "confidence", "doubts"),
             (first, ego.id, ego.category, "planning problem", *_trust(ego)),
@@ -138,8 +151,8 @@ def _location(frame: MapFrame) -> Element:
     return location
 
 
-def _lanelet(lane: MapLane, number_of: Mapping[str, int], marks: MarkFinder) -> Element:
-    """Return a lane with its edges and the lanes before, behind and beside it."""
+def _lanelet(lane: MapLane, number_of: Mapping[str, int], marks: MarkFinder, lights: Sequence[int]) -> Element:
+    """Return a lane with its edges, the lanes before, behind and beside it, and the traffic lights for it."""
     lanelet = element("lanelet", id=str(number_of[lane.id]))
     for tag, bound, mark in zip(
         ("leftBound", "rightBound"), edges_of(lane), (marks.left_of(lane), marks.right_of(lane))
@@ -154,7 +167,22 @@ def _lanelet(lane: MapLane, number_of: Mapping[str, int], marks: MarkFinder) -> 
     for tag, beside in (("adjacentLeft", lane.left_lane), ("adjacentRight", lane.right_lane)):
         if beside is not None:
             element(tag, lanelet, ref=str(number_of[beside]), drivingDir="same")
-    return _texts(lanelet, laneletType="unknown" if lane.junction is None else "intersection")
+    _texts(lanelet, laneletType="unknown" if lane.junction is None else "intersection")
+    for light in lights:
+        element("trafficLightRef", lanelet, ref=str(light))
+    return lanelet
+
+
+def _traffic_light(signal: Signal, number: int, t_s: Array) -> Element:
+    """Return a traffic light whose cycle is what was seen of it from the first step to the last."""
+    states = [LIGHT[str(state)] for state in signal.at(t_s)]
+    node = element("trafficLight", id=str(number))
+    cycle = element("cycle", node)
+    starts = [k for k, state in enumerate(states) if k == 0 or state != states[k - 1]]
+    for first, last in zip(starts, [*starts[1:], len(states)], strict=True):
+        _texts(element("cycleElement", cycle), duration=str(last - first), color=states[first])
+    _point(element("position", node), signal.position_m)
+    return _texts(node, direction="all", active="true")
 
 
 def _obstacle(agent: Agent, number: int, t_s: Array) -> Element | None:

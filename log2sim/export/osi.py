@@ -11,6 +11,7 @@ import numpy as np
 from log2sim.datatypes import Agent, MapFrame, Scenario
 from log2sim.errors import MissingExtra
 from log2sim.export.exporters import Options
+from log2sim.export.osi_map import static_map, traffic_lights
 from log2sim.export.sampling import SampledMotion, file_name
 from log2sim.export.viewers.playback import agent_steps
 from log2sim.geometry import NS_PER_S
@@ -32,7 +33,10 @@ class Osi:
     """
 
     options: tuple[str, ...] = ()
-    loses = "uncertainty and observed flags, whether vehicles are parked, times between steps of 0.1 s, cameras, plan"
+    loses = (
+        "uncertainty and observed flags, whether vehicles are parked, times between steps of 0.1 s, confidences of lanes and"
+        " markings, cameras, plan"
+    )
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
         """Write the trace."""
@@ -42,11 +46,18 @@ class Osi:
             raise MissingExtra("export to OSI", "osi") from None
         steps = agent_steps(scenario)
         head = _head(betterosi, scenario)
+        ground = static_map(betterosi, scenario, first=len(scenario.agents) + 1)
         with betterosi.Writer(folder / _trace_name(betterosi, scenario, len(steps.t_ns))) as writer:
             for k, stamp_ns in enumerate(steps.t_ns.tolist()):
                 alive = [(n, a, m) for n, (a, m) in enumerate(steps.moves, start=1) if m.valid[k]]
                 truth = betterosi.GroundTruth(
                     **head,
+                    lane=ground.lanes,
+                    lane_boundary=ground.boundaries,
+                    road_marking=ground.markings,
+                    traffic_light=traffic_lights(
+                        betterosi, scenario, ground.next_id, (stamp_ns - scenario.t0_ns) / NS_PER_S
+                    ),
                     timestamp=betterosi.Timestamp(seconds=stamp_ns // NS_PER_S, nanos=stamp_ns % NS_PER_S),
                     moving_object=[_moving(betterosi, n, a, m, k) for n, a, m in alive if not _stationary(a)],
                     stationary_object=[_still(betterosi, n, a, m, k) for n, a, m in alive if _stationary(a)],

@@ -19,7 +19,7 @@ from log2sim.errors import ScenarioError
 from log2sim.export.exporters import Options
 from log2sim.export.placement import near_origin
 from log2sim.export.sampling import SampledMotion, file_name, sample_steps, step_times
-from log2sim.export.scenarionet_map import map_features
+from log2sim.export.scenarionet_map import dynamic_map_states, map_features
 from log2sim.geometry import NS_PER_S, Array
 
 STEP_S = 0.1  # MetaDrive assumes this step
@@ -38,8 +38,8 @@ class ScenarioNet:
 
     options: tuple[str, ...] = ()
     loses = (
-        "times between steps of 0.1 s and outside the ego's life, uncertainty and observed flags, cameras, plan; MetaDrive "
-        "itself takes over no height, and shows no agents of category other and cyclists and pedestrians in sizes of its own"
+        "times between steps of 0.1 s and outside the ego's life, uncertainty and observed flags, stop lines and other markings "
+        "that are no lines, colors of lines where unknown, cameras, plan; MetaDrive itself takes over no height, and shows no agents of category other and cyclists and pedestrians in sizes of its own"
     )
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
@@ -70,6 +70,7 @@ def describe(scenario: Scenario) -> Value:
     tracks = {a.id: _track(a, moves[a.id], origin) for a in scenario.agents if moves[a.id].valid.any()}
     left_out = {a.id: "not alive at any step of the ego" for a in scenario.agents if a.id not in tracks}
     features = map_features(scenario, origin)
+    lights = dynamic_map_states(scenario, t_s, origin)
     metadata = {
         **_metadata(scenario, t_s),
         "sdc_id": ego.id,
@@ -77,13 +78,13 @@ def describe(scenario: Scenario) -> Value:
         "left_out": left_out,
         "object_summary": {k: _object_summary(k, track) for k, track in tracks.items()},
     }
-    metadata["number_summary"] = _number_summary(metadata["object_summary"], features)
+    metadata["number_summary"] = _number_summary(metadata["object_summary"], features, lights)
     return {
         "id": scenario.name,
         "version": f"{DATASET}_{VERSION}",
         "length": len(t_s),
         "tracks": tracks,
-        "dynamic_map_states": {},
+        "dynamic_map_states": lights,
         "map_features": features,
         "metadata": metadata,
     }
@@ -147,21 +148,22 @@ def _object_summary(name: str, track: Value) -> Value:
     }
 
 
-def _number_summary(objects: Value, features: Value) -> Value:
+def _number_summary(objects: Value, features: Value, lights: Value) -> Value:
     heights = np.concatenate(
         [feature["polyline" if "polyline" in feature else "polygon"][:, 2] for feature in features.values()]
     )
     moving = [o["type"] for o in objects.values() if o["moving_distance"] > MOVED_M]
     kinds = [o["type"] for o in objects.values()]
+    states = Counter(state for light in lights.values() for state in light["state"]["object_state"])
     return {
         "num_objects": len(objects),
         "object_types": sorted(set(kinds)),
         "num_objects_each_type": dict(Counter(kinds)),
         "num_moving_objects": len(moving),
         "num_moving_objects_each_type": dict(Counter(moving)),
-        "num_traffic_lights": 0,
-        "num_traffic_light_types": [],
-        "num_traffic_light_each_step": {},
+        "num_traffic_lights": len(lights),
+        "num_traffic_light_types": sorted(states),
+        "num_traffic_light_each_step": dict(states),
         "num_map_features": len(features),
         "map_height_diff": float(np.ptp(heights)),
     }

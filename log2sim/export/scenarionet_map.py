@@ -8,6 +8,7 @@ import numpy as np
 
 from log2sim.datatypes import MapFeatures, MapLane, Marking, Scenario
 from log2sim.export.roads.lanes import lanes
+from log2sim.export.roads.signal_lanes import signal_lanes
 from log2sim.geometry import Array
 from log2sim.lanes.polyline import Polyline
 
@@ -58,3 +59,33 @@ def _marking(marking: Marking, origin_m: Array) -> dict[str, Any] | None:
     if marking.is_lane_line:
         return {"type": LINE_TYPE[marking.kind, marking.color or "white"], "polyline": points}
     return None
+
+
+LIGHT_STATE = {
+    "red": "LANE_STATE_STOP", "red_yellow": "LANE_STATE_CAUTION", "yellow": "LANE_STATE_CAUTION", "green": "LANE_STATE_GO",
+    "off": "LANE_STATE_UNKNOWN", "unknown": "LANE_STATE_UNKNOWN",
+}  # fmt: skip
+"""States of traffic lights, as Waymo names them."""
+
+
+def dynamic_map_states(scenario: Scenario, t_s: Array, origin_m: Array) -> dict[str, Any]:
+    """Return the traffic lights of a scenario by the lanes that they are for, with their states at times (T,).
+
+    A light is for the lanes into a junction that lead towards its face and end nearest to it; MetaDrive has one a lane.
+    """
+    found: dict[str, Any] = {}
+    names = lanes(scenario)
+    for signal in scenario.signals:
+        for lane in signal_lanes(signal, names):
+            state = {"object_state": [LIGHT_STATE[str(s)] for s in signal.at(t_s)]}
+            meta = {
+                "track_length": len(t_s),
+                "type": "TRAFFIC_LIGHT",
+                "object_id": lane.id,
+                "dataset": "log2sim",
+                "signal": signal.id,
+            }
+            found[lane.id] = {
+                "type": "TRAFFIC_LIGHT", "state": state, "lane": lane.id, "stop_point": lane.points_m[-1] - origin_m, "metadata": meta,
+            }  # fmt: skip
+    return found

@@ -9,7 +9,7 @@ import numpy as np
 
 from log2sim.datatypes import EGO, GROUP_OF, Agent, Scenario
 from log2sim.geometry import Array
-from log2sim.lanes.polyline import Polyline
+from log2sim.lanes.polyline import SPACING_M, Polyline
 
 REVERSAL_M = 0.1
 """A vehicle that moves back by less is settling; more begins a new path."""
@@ -25,6 +25,12 @@ STEP_M = 0.5
 
 MAX_STEPS = 200
 """Points between two waypoints, which bounds what a jump in a trajectory costs."""
+
+SMOOTH_M = 1.0
+"""Standard deviation of the smoothing of observed paths along them: a curve of 6 m becomes 8 cm tighter, and no car turns in less."""
+
+LEVEL_M = 8.0
+"""Standard deviation of the smoothing of heights of observed agents: roads curve over tens of meters."""
 
 VEHICLES_FIRST = ("car", "truck", "bus")
 """Categories whose paths make lanes; two-wheelers make some only where those have none."""
@@ -70,11 +76,26 @@ def _paths_of(agent: Agent) -> list[DrivenPath]:
         return []
     rank = 0 if agent.id == EGO else 1 if agent.category in VEHICLES_FIRST else 2
     lines = [Polyline.through(points) for points in directed_paths(agent)]
+    lines = lines if rank == 0 else [_smoothed(line) for line in lines]
     return [
         DrivenPath(agent.id, line, agent.size_m[1], rank, agent.confidence)
         for line in lines
         if line.length_m >= MIN_PATH_M
     ]
+
+
+def _smoothed(line: Polyline) -> Polyline:
+    """Smooth a path, which is that of a box observed from afar; its ends stay."""
+    from scipy.ndimage import gaussian_filter1d
+
+    points = line.points_m.copy()
+    for columns, sigma_m in ((slice(0, 2), SMOOTH_M), (slice(2, 3), LEVEL_M)):
+        pad = min(int(4 * sigma_m / SPACING_M), len(points) - 1)
+        if pad:
+            before, after = 2 * points[:1] - points[pad:0:-1], 2 * points[-1:] - points[-2 : -pad - 2 : -1]
+            padded = np.concatenate([before, points, after])[:, columns]
+            points[:, columns] = gaussian_filter1d(padded, sigma_m / SPACING_M, axis=0, mode="nearest")[pad:-pad]
+    return Polyline.through(points)
 
 
 def directed_paths(agent: Agent) -> list[Array]:
@@ -84,15 +105,23 @@ def directed_paths(agent: Agent) -> list[Array]:
     for rows in np.split(np.arange(len(points)), np.flatnonzero(jump) + 1):
         progress = _progress(points[rows], yaw[rows])
         for first, last, sign in _monotone_stretches(progress):
-            ahead = sign * progress[first : last + 1]
-            new = np.maximum.accumulate(ahead)
-            kept = [0]
-            for k in range(1, len(ahead)):
-                if new[k] == ahead[k] and ahead[k] >= ahead[kept[-1]] + MIN_STEP_M:
-                    kept.append(k)
+            stretch = rows[first : last + 1][::sign]
+            kept = _forward_rows(points[stretch], yaw[stretch])
             if len(kept) > 1:
-                found.append(points[rows[first : last + 1][kept]][::sign])
+                found.append(points[stretch[kept]])
     return found
+
+
+def _forward_rows(points: Array, yaw: Array) -> list[int]:
+    """Return the rows of points (N, 3) that lie ahead of the ones before, by more than aside: no wheel rolls sideways."""
+    kept = [0]
+    for k in range(1, len(points)):
+        dx, dy = (points[k] - points[kept[-1]])[:2]
+        c, s = np.cos(yaw[k]), np.sin(yaw[k])
+        ahead, aside = dx * c + dy * s, dy * c - dx * s
+        if ahead >= MIN_STEP_M and ahead >= abs(aside):
+            kept.append(k)
+    return kept
 
 
 def _dense(agent: Agent) -> tuple[Array, Array, Array]:

@@ -9,6 +9,7 @@ from itertools import count
 import numpy as np
 
 from log2sim.datatypes import MapLane, Marking, RoadBorder, Scenario
+from log2sim.geometry import Array
 from log2sim.lanes.beside import find_beside
 from log2sim.lanes.conflicts import find_conflicts, find_transitions, is_lane_change
 from log2sim.lanes.connections import Connection, connect, continuations
@@ -28,6 +29,9 @@ from log2sim.lanes.thinning import thin
 
 PATH_PROBABILITY = 0.6
 """That there is a lane where one vehicle surely drove: others overtake, turn into yards or pass obstacles."""
+
+MIN_AHEAD_M = 0.05
+"""A point nearer than this to where a lane begins, or behind it, is left out."""
 
 MAX_CONFIDENCE = 0.95
 """Paths alone never prove a lane."""
@@ -213,10 +217,20 @@ def _confidence(agents: Sequence[str], confidence_of: dict[str, float]) -> float
 
 def _meeting(lanes: Sequence[MapLane], links: Sequence[tuple[int, int]]) -> list[MapLane]:
     """Let linked lanes meet in exactly the same point."""
-    points = [lane.points_m.copy() for lane in lanes]
+    found = list(lanes)
     for a, b in links:
-        points[b][0] = points[a][-1]
-    return [replace(lane, points_m=p) for lane, p in zip(lanes, points)]
+        points, lane = found[b].points_m.copy(), found[b]
+        points[0] = found[a].points_m[-1]
+        ahead = (points[1:, :2] - points[0, :2]) @ _direction(lane)
+        kept = np.concatenate([[0], 1 + np.flatnonzero(np.maximum.accumulate(ahead > MIN_AHEAD_M))])
+        if len(kept) > 1:
+            found[b] = replace(lane, points_m=points[kept], width_m=lane.width_m[kept])
+    return found
+
+
+def _direction(lane: MapLane) -> Array:
+    heading = Polyline(lane.points_m).heading_rad[0]
+    return np.array([np.cos(heading), np.sin(heading)])
 
 
 def add_missing_lanes(lanes: Sequence[MapLane], scenario: Scenario) -> tuple[MapLane, ...]:

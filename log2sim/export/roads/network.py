@@ -341,6 +341,6 @@ def _merged_cubics(rows: Array) -> Array:
         s, a, b, c, d = kept[-1]
         h = row[0] - s
         goes_on = [a + h * (b + h * (c + h * d)), b + h * (2 * c + 3 * h * d), c + 3 * h * d, d]
-        if np.abs(row[1:] - goes_on).max() > 1e-9:
+        if np.abs(row[1:] - goes_on).max() > 2e-6:
             kept.append(row)
     return np.array(kept)

@@ -15,6 +15,7 @@ from log2sim.export.roads.checks import require_roads
 from log2sim.export.roads.lanes import lanes
 from log2sim.export.roads.marks import MarkFinder, RoadMark
 from log2sim.export.roads.network import Network, Road, build_network
+from log2sim.export.roads.road_objects import RoadObjects, add_objects, add_signals
 from log2sim.export.xml_text import element, escaped, number, read, require_number, write
 
 FILE_NAME = "road.xodr"
@@ -92,9 +93,11 @@ def document(scenario: Scenario, placement: ExportPlacement) -> Element:
         north=number(north), south=number(south), east=number(east), west=number(west),
     )  # fmt: skip
     _add_place(header, scenario.map, placement)
-    marks = MarkFinder.of(scenario)
+    marks, objects = MarkFinder.of(scenario), RoadObjects.of(scenario, network.roads)
     for road in network.roads:
-        _add_road(root, road, placement, marks)
+        node = _add_road(root, road, placement, marks)
+        add_objects(node, road, objects)
+        add_signals(node, road, objects, placement)
     for junction, name in network.junctions.items():
         _add_junction(root, junction, name, network)
     return root
@@ -109,7 +112,7 @@ def _add_place(header: Element, frame: MapFrame, placement: ExportPlacement) -> 
         element("offset", header, x=number(x), y=number(y), z=number(z), hdg="0")
 
 
-def _add_road(root: Element, road: Road, placement: ExportPlacement, marks: MarkFinder) -> None:
+def _add_road(root: Element, road: Road, placement: ExportPlacement, marks: MarkFinder) -> Element:
     x0, y0, z0 = placement.origin_m
     parent = element(
         "road", root, name=escaped(" ".join(lane.id for lane in road.lanes)), length=number(road.line.length_m, LENGTH_DIGITS),
@@ -135,6 +138,7 @@ def _add_road(root: Element, road: Road, placement: ExportPlacement, marks: Mark
         _add_cubic(profile, "elevation", "s", s, [a - z0, *rest])
     element("lateralProfile", parent)
     _add_lanes(parent, road, marks)
+    return parent
 
 
 def _add_lanes(parent: Element, road: Road, marks: MarkFinder) -> None:
