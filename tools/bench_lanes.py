@@ -78,6 +78,7 @@ CASES = (
     Case("scenes/worn.toml", "overcast", note="worn, old lines"),
     Case("scenes/night_wet.toml", "night", note="wet, glare"),
     Case("scenes/bare.toml", note="no markings"),
+    Case("scenes/signals.toml", note="traffic lights"),
 )
 
 
