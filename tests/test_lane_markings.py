@@ -242,3 +242,36 @@ def test_worn_solid_lines_are_not_dashed() -> None:
 def test_a_solid_part_ends_a_dashed_line() -> None:
     strokes = np.array([[0, 3], [6, 9], [12, 15], [18, 21], [24, 44]], float)
     assert [s.kind for s in stretches_of(strokes)] == ["dashed", "solid"]
+
+
+def test_arrows_one_behind_the_other_are_no_dashes() -> None:
+    painter = Painter(EXTENT)
+    painter.lines([line_of(lambda x: 3.5 + 0 * x, 0, 50)])
+    arrow = np.array([[0, -0.1], [3, -0.1], [3, -0.5], [4.5, 0], [3, 0.5], [3, 0.1], [0, 0.1]])
+    painter.lay(painter.cover([arrow + np.array([x, 0]) for x in (10, 22)]), WHITE, reflects=1.0)
+    markings = find_markings(painter.ground())[0]
+    assert sorted(m.kind for m in markings) == ["other", "other", "solid"]
+
+
+@pytest.mark.parametrize("curb_m", [0.0, 0.12])
+def test_borders_are_where_the_road_ends(curb_m: float) -> None:
+    painter = Painter(EXTENT, base=GRASS)
+    carriageway = painter.cover([outline_of(line_of(bend, -1, 51), 8.0)])
+    painter.lay(carriageway, ASPHALT)
+    painter.height += curb_m * (carriageway < 0.5)
+    painter.paint -= 0.2 * (carriageway < 0.5)
+    painter.lines([line_of(bend, 0, 50)])
+    _, borders, notes = find_markings(painter.ground())
+    truth = [line_of(lambda x, s=side: bend(x) + s * 4 * np.sqrt(1 + (0.004 * x) ** 2), 0, 50) for side in (-1, 1)]
+    assert {b.kind for b in borders} == {"curb" if curb_m else "edge"}
+    found = np.concatenate([dense(border.points_m[:, :2]) for border in borders])
+    assert cKDTree(np.concatenate([dense(line) for line in truth])).query(found)[0].max() < 0.4
+    assert np.mean(cKDTree(found).query(np.concatenate([dense(line) for line in truth]))[0] < 0.4) > 0.8
+    assert not any("no borders" in note for note in notes)
+
+
+def test_shadows_are_no_borders() -> None:
+    painter = Painter(EXTENT)
+    painter.lines([line_of(bend, 0, 50)])
+    shadows(painter)
+    assert find_markings(painter.ground())[1] == ()

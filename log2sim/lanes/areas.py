@@ -31,7 +31,8 @@ LANE_LINE_WITHIN_M, MIN_STOP_ANGLE_RAD = 10.0, np.deg2rad(60)
 MAX_LANE_LINE_WIDTH_M = 0.35
 ALONE = -1.0  # log-odds of a stop line beside which no lane line is seen
 # Arrows are 1.5 to 7.5 m long, letters less (MUTCD 3B.20; RMS 1).
-SYMBOL_GAP_M, MAX_SYMBOL_M, MIN_SYMBOL_M2, MAX_SYMBOL_M2 = 0.8, 9.0, 0.15, 12.0
+MAX_SYMBOL_M, MIN_SYMBOL_M2, MAX_SYMBOL_M2 = 9.0, 0.15, 12.0
+MAX_SYMBOLS, SYMBOL_STEP_M, SAME_SYMBOL_M = 3, 20.0, 0.3  # in a row, from one to the next, and parts of one
 MAX_ACROSS_M = 2.5  # within a lane
 ROAD_AROUND_M = 4.0  # whose mean is nearly that of the road
 OUTLINE_ERROR_M, HULL_ERROR_M = 0.03, 0.15
@@ -181,25 +182,30 @@ def _angle_to_lanes(line: PaintedLine, lanes: list[PaintedLine]) -> float | None
 
 def part_symbols(ground: GroundMap, lines: list[PaintedLine]) -> tuple[list[PaintedArea], list[PaintedLine]]:
     """Part arrows, letters and other small paint from lane lines: symbols with their outlines, others."""
-    short = [line for line in lines if line.dashes == 1 and line.length_m <= MAX_SYMBOL_M]
     outlines: list[NDArray[np.float32]] = []
     areas, used = [], set()
-    for line in short:
-        outline = _outline_around(ground, line)
-        if outline is None:
+    for line in lines:
+        if line.dashes > MAX_SYMBOLS or line.length_m > MAX_SYMBOL_M + SYMBOL_STEP_M * (line.dashes - 1):
+            continue
+        # Arrows one behind the other look like dashes: their pieces are looked at one by one.
+        found = [_outline_around(ground, line, xy) for xy in (line.pieces.xy if line.dashes > 1 else [line.xy])]
+        shapes = [outline for outline in found if outline is not None]
+        if len(shapes) <= len(found) / 2:
             continue
         used.add(id(line))
-        if any(cv2.pointPolygonTest(o, line.xy.mean(axis=0).astype(np.float32).tolist(), False) >= 0 for o in outlines):
-            continue
-        outlines.append(outline.astype(np.float32))
-        extent = np.array(cv2.minAreaRect(outline.astype(np.float32))[1])
-        areas.append(PaintedArea("other", outline, float(extent.min()), line.pieces, line.log_odds))
+        for outline in shapes:
+            middle = tuple(outline.mean(axis=0).tolist())
+            if not any(cv2.pointPolygonTest(other, middle, True) > -SAME_SYMBOL_M for other in outlines):
+                outlines.append(outline.astype(np.float32))
+                extent = np.array(cv2.minAreaRect(outlines[-1])[1])
+                areas.append(PaintedArea("other", outline, float(extent.min()), line.pieces, line.log_odds))
     return areas, [line for line in lines if id(line) not in used]
 
 
-def _outline_around(ground: GroundMap, line: PaintedLine) -> Array | None:
-    """Outline (P, 2) of the paint that a short line is part of; None where it is a plain stroke, or too large."""
-    low, high = line.xy.min(axis=0) - MAX_SYMBOL_M / 2, line.xy.max(axis=0) + MAX_SYMBOL_M / 2
+def _outline_around(ground: GroundMap, line: PaintedLine, xy: Array) -> Array | None:
+    """Outline (P, 2) of the paint at points (N, 2) of a line; None where it is a plain stroke, or too large."""
+    xy = xy.reshape(-1, 2)
+    low, high = xy.min(axis=0) - MAX_SYMBOL_M / 2, xy.max(axis=0) + MAX_SYMBOL_M / 2
     res, (x0, _, _, y1) = ground.resolution_m, ground.extent_m
     rows = slice(max(int((y1 - high[1]) / res), 0), max(int((y1 - low[1]) / res), 0))
     columns = slice(max(int((low[0] - x0) / res), 0), max(int((high[0] - x0) / res), 0))
@@ -213,8 +219,8 @@ def _outline_around(ground: GroundMap, line: PaintedLine) -> Array | None:
     road = np.divide(cv2.blur(paint * seen, size), share, out=np.full_like(share, np.inf), where=share > 0.1)
     mask = ((paint > road + 0.4 * float(np.median(contrast))) & (seen > 0)).astype(np.uint8)
     labels = cv2.connectedComponents(mask)[1]
-    u = np.clip(((line.xy[:, 0] - x0) / res).astype(int) - columns.start, 0, mask.shape[1] - 1)
-    v = np.clip(((y1 - line.xy[:, 1]) / res).astype(int) - rows.start, 0, mask.shape[0] - 1)
+    u = np.clip(((xy[:, 0] - x0) / res).astype(int) - columns.start, 0, mask.shape[1] - 1)
+    v = np.clip(((y1 - xy[:, 1]) / res).astype(int) - rows.start, 0, mask.shape[0] - 1)
     under = labels[v, u]
     under = under[under > 0]
     if not len(under):
@@ -229,5 +235,7 @@ def _outline_around(ground: GroundMap, line: PaintedLine) -> Array | None:
     if extent.min() < 0.3 and area > 0.7 * extent.prod():  # a plain stroke
         return None
     simple = cv2.approxPolyDP(contour, OUTLINE_ERROR_M / res, True).reshape(-1, 2).astype(np.float64)
-    xy = np.stack([x0 + (simple[:, 0] + columns.start + 0.5) * res, y1 - (simple[:, 1] + rows.start + 0.5) * res], 1)
-    return xy if len(xy) >= 3 else None
+    outline = np.stack(
+        [x0 + (simple[:, 0] + columns.start + 0.5) * res, y1 - (simple[:, 1] + rows.start + 0.5) * res], 1
+    )
+    return outline if len(outline) >= 3 else None

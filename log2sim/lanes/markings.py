@@ -6,6 +6,7 @@ import numpy as np
 
 from log2sim.datatypes import Marking, RoadBorder
 from log2sim.lanes.areas import PaintedArea, find_crosswalks, part_stop_lines, part_symbols
+from log2sim.lanes.borders import find_borders
 from log2sim.lanes.chains import dashed_chains, touching_chains
 from log2sim.lanes.curves import thin
 from log2sim.lanes.evidence import probability
@@ -43,7 +44,11 @@ def find_markings(ground: GroundMap) -> tuple[tuple[Marking, ...], tuple[RoadBor
     (`evidence`). The cost grows with the area that was seen.
     """
     markings = list_markings(ground, min_confidence=MIN_CONFIDENCE, min_line_m=MIN_LINE_M)
-    return markings, (), _notes(ground, markings)
+    notes = _notes(ground, markings)
+    if not np.any(ground.alpha) and not np.isfinite(ground.intensity).any():
+        return (), (), notes
+    borders, more = find_borders(ground, markings)
+    return markings, borders, (*notes, *more)
 
 
 def list_markings(

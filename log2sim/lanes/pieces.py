@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from log2sim.geometry import Array
-from log2sim.lanes.profiles import Pieces, measure_pieces
+from log2sim.lanes.profiles import Pieces, measure_pieces, no_pieces
 from log2sim.lanes.ridges import RidgePoints
 from log2sim.mapping.ground_map import GroundMap
 
@@ -27,17 +27,13 @@ PROFILES_AT_ONCE = 4000  # bound of memory
 
 def find_pieces(ground: GroundMap, points: RidgePoints) -> Pieces:
     """Fit straight pieces to ridge points and measure the profile across each."""
-    lines = _fit_lines(points)
+    lines = fit_lines(points)
     if not len(lines):
-        return _no_pieces()
+        return no_pieces(0)
     parts = [measure_pieces(ground, lines[k : k + PROFILES_AT_ONCE]) for k in range(0, len(lines), PROFILES_AT_ONCE)]
     pieces = Pieces(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Pieces)))
     pieces = pieces.take(np.isfinite(pieces.width_m) & (pieces.width_m > 0))
     return pieces.take(~_aslant(pieces))
-
-
-def _no_pieces() -> Pieces:
-    return Pieces(np.zeros((0, 2)), *(np.zeros(0) for _ in fields(Pieces)[1:]))
 
 
 def _aslant(pieces: Pieces) -> NDArray[np.bool_]:
@@ -62,8 +58,12 @@ def _aslant(pieces: Pieces) -> NDArray[np.bool_]:
     return out
 
 
-def _fit_lines(points: RidgePoints) -> Array:
-    """Fit lines to ridge points, the strongest first, each point to one: x, y, direction, length (N, 4)."""
+def fit_lines(points: RidgePoints, cell_m: float = CELL_M) -> Array:
+    """Fit lines to ridge points, the strongest first, each point to one: x, y, direction, length (N, 4).
+
+    Points are `cell_m` apart along a line; all lengths are in proportion to that.
+    """
+    scale = cell_m / CELL_M
     if not len(points.xy_map):
         return np.zeros((0, 4))
     tree = cKDTree(points.xy_map)
@@ -72,25 +72,26 @@ def _fit_lines(points: RidgePoints) -> Array:
     for seed in np.argsort(-points.strength, kind="stable"):
         if not free[seed]:
             continue
-        near = np.array(tree.query_ball_point(points.xy_map[seed], HALF_PIECE_M))
+        near = np.array(tree.query_ball_point(points.xy_map[seed], HALF_PIECE_M * scale))
         near = near[free[near]]
         free[seed] = False
         if len(near) < MIN_POINTS:
             continue
-        line = _fit_line(points, int(seed), near)
+        line = _fit_line(points, int(seed), near, scale)
         if line is not None:
             lines.append(line[0])
             free[line[1]] = False
     return np.array(lines).reshape(-1, 4)
 
 
-def _fit_line(points: RidgePoints, seed: int, near: NDArray[Any]) -> tuple[Array, NDArray[Any]] | None:
+def _fit_line(points: RidgePoints, seed: int, near: NDArray[Any], scale: float) -> tuple[Array, NDArray[Any]] | None:
     """Fit a line through a seed to points near it; also the indices of those that it explains."""
     xy = points.xy_map[near] - points.xy_map[seed]
     turn = np.abs((points.direction[near] - points.direction[seed] + np.pi / 2) % np.pi - np.pi / 2)
     angle, center = float(points.direction[seed]), np.zeros(2)
     chosen = turn < MAX_TURN_RAD
-    for width in (2 * ACROSS_M, ACROSS_M):
+    across_m, cell_m = ACROSS_M * scale, CELL_M * scale
+    for width in (2 * across_m, across_m):
         along, across = _turned(xy - center, angle)
         member = chosen & (np.abs(across) < width)
         if np.count_nonzero(member) < MIN_POINTS:
@@ -99,16 +100,16 @@ def _fit_line(points: RidgePoints, seed: int, near: NDArray[Any]) -> tuple[Array
         moments = np.cov((xy[member] - center).T)
         angle = float(0.5 * np.arctan2(2 * moments[0, 1], moments[0, 0] - moments[1, 1]))
     along, across = _turned(xy - center, angle)
-    member = chosen & (np.abs(across) < ACROSS_M)
+    member = chosen & (np.abs(across) < across_m)
     if np.count_nonzero(member) < MIN_POINTS:
         return None
     begin, end = along[member].min(), along[member].max()
-    length = end - begin + CELL_M
-    covered = len(np.unique(np.floor((along[member] - begin) / CELL_M + 0.5))) * CELL_M
-    if length < MIN_PIECE_M or covered < MIN_COVERED * length:
+    length = end - begin + cell_m
+    covered = len(np.unique(np.floor((along[member] - begin) / cell_m + 0.5))) * cell_m
+    if length < MIN_PIECE_M * scale or covered < MIN_COVERED * length:
         return None
     middle = points.xy_map[seed] + center + (begin + end) / 2 * np.array([np.cos(angle), np.sin(angle)])
-    explained = near[(np.abs(across) < 2 * ACROSS_M) & (along > begin - CELL_M) & (along < end + CELL_M)]
+    explained = near[(np.abs(across) < 2 * across_m) & (along > begin - cell_m) & (along < end + cell_m)]
     return np.array([*middle, angle % np.pi, length]), explained
 
 

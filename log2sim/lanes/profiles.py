@@ -74,6 +74,12 @@ class Pieces:
         return np.stack([self.xy - half, self.xy + half], 1)
 
 
+def no_pieces(count: int, **known: Array) -> Pieces:
+    """Make pieces of which only some attributes are known; the others are 1, so that all are alike."""
+    plain = {f.name: np.ones((count, 2) if f.name == "xy" else count) for f in fields(Pieces)}
+    return Pieces(**(plain | known))
+
+
 def measure_pieces(ground: GroundMap, lines: Array) -> Pieces:
     """Measure the profiles across lines (N, 4): x, y, direction, length."""
     steps = round(PROFILE_M / PROFILE_STEP_M)

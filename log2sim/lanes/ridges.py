@@ -133,18 +133,20 @@ def _respond(layers: tuple[Layer, Layer, Layer], cell_m: float) -> tuple[Layer, 
     direction = np.zeros(flat.shape, np.uint8)
     noise = np.ones_like(flat)
     for k in range(DIRECTIONS):
-        there, back, size = _turn(flat.shape, np.pi * k / DIRECTIONS)
-        response, plain = _across(*(_warp(layer, there, size) for layer in layers), cell_m)
+        there, back, size = turn_image(flat.shape, np.pi * k / DIRECTIONS)
+        turned, peak, dip = (warp(layer, there, size) for layer in layers)
+        response, plain = _across(turned, peak, dip, cell_m)
         if k == 0:
-            noise = _block_sigma(_warp(plain, back, (flat.shape[1], flat.shape[0])), cell_m)
-        response = _warp(response, back, (flat.shape[1], flat.shape[0]))
+            noise = _block_sigma(warp(plain, back, (flat.shape[1], flat.shape[0])), cell_m)
+        response = warp(response, back, (flat.shape[1], flat.shape[0]))
         better = np.asarray(cv2.compare(response, best, cv2.CMP_GT), np.uint8)
         cv2.max(response, best, dst=best)
         direction[better > 0] = k
     return best, direction, noise
 
 
-def _warp(image: Layer, matrix: Array, size: tuple[int, int]) -> Layer:
+def warp(image: Layer, matrix: Array, size: tuple[int, int]) -> Layer:
+    """Warp an image by an affine map (2, 3) to a size (columns, rows), 0 outside."""
     return np.asarray(cv2.warpAffine(image, matrix, size, flags=cv2.INTER_LINEAR), np.float32)
 
 
@@ -179,8 +181,8 @@ def _blur(image: Layer, columns: int, rows: int) -> Layer:
     return np.asarray(cv2.blur(image, (columns, rows)), np.float32)
 
 
-def _turn(shape: tuple[int, ...], angle: float) -> tuple[Array, Array, tuple[int, int]]:
-    """Affine maps (2, 3) to an image whose rows run along an angle and back, and its size (columns, rows)."""
+def turn_image(shape: tuple[int, ...], angle: float) -> tuple[Array, Array, tuple[int, int]]:
+    """Return affine maps (2, 3) to an image whose rows run along an angle and back, and its size (columns, rows)."""
     rows, columns = shape
     c, s = abs(np.cos(angle)), abs(np.sin(angle))
     size = (int(np.ceil(columns * c + rows * s)), int(np.ceil(columns * s + rows * c)))
