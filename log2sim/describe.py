@@ -18,6 +18,7 @@ from log2sim.errors import LogError
 from log2sim.lanes.lane_graph import infer_lanes
 from log2sim.lanes.markings import find_markings
 from log2sim.mapping.builder import GroundMapBuilder
+from log2sim.mapping.pose_refinement import refine_poses
 from log2sim.outcome import Outcome
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.frames import RecordReader
@@ -79,7 +80,7 @@ def describe(scenario: Scenario, recorded: Recorded) -> Description:
     ground = colors = None
     if plan.keeps(Stage.LANES):
         try:
-            ground = GroundMapBuilder(log, scenario, recorded.config.map, reader)
+            ground = GroundMapBuilder(refine_poses(log, scenario, reader), scenario, recorded.config.map, reader)
         except LogError as problem:
             notes.append(f"no map of the ground: {problem}")
     if plan.keeps(Stage.COLORS):

@@ -18,6 +18,7 @@ from log2sim.mapping.ground_map import GroundMap
 from log2sim.mapping.ground_points import GroundPoints, PointCollector
 from log2sim.mapping.ground_view import Image
 from log2sim.mapping.picture_warp import View, find_hidden, warp_onto
+from log2sim.mapping.pose_refinement import refine_poses
 from log2sim.mapping.raster import Raster, coarsened_cell_m
 from log2sim.mapping.records import (
     MAX_PICTURES,
@@ -60,6 +61,7 @@ class GroundMapBuilder:
     Parameters
     ----------
     log : Log
+        With refined poses, see `refine_poses`.
     scenario : Scenario
         Its agents hide the ground: moving ones where they are at the time of a record, standing ones always.
     settings : MapConfig
@@ -210,6 +212,8 @@ def map_ground(
     settings: MapConfig,
     reader: RecordReader | None = None,
     progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+    *,
+    refine: bool = True,
 ) -> GroundMap:
     """Map the ground of a log.
 
@@ -223,6 +227,8 @@ def map_ground(
         Counts the records that cannot be read.
     progress : callable, optional
         Called as `progress(stage, done, total)`.
+    refine : bool
+        Whether the poses are refined first, see `refine_poses`.
 
     Raises
     ------
@@ -230,6 +236,8 @@ def map_ground(
         When no pose is known, or no record that is wanted can be read.
     """
     reader = reader or RecordReader(log)
+    if refine:
+        log = refine_poses(log, scenario, reader)
     builder = GroundMapBuilder(log, scenario, settings, reader, partial(progress, "map: sweeps"))
     look_again(log, reader, [builder], partial(progress, "map: pictures"))
     reader.require_some()

@@ -1,0 +1,124 @@
+"""Poses refined for a map: drift that a log's poses have is taken out, and nothing else is changed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from log2sim.calibration.surfaces import Registration
+from log2sim.calibration.twists import exp_of, log_of
+from log2sim.datatypes import Lidar, Log, Scenario, Stream, Sweep
+from log2sim.geometry import Array, PoseTrack, apply, inverse, rotation_from_rpy, transform
+from log2sim.mapping.pose_refinement import Keyframe, corrected, refine_poses, solve_twists
+from log2sim.perception.frames import RecordReader
+
+T_NS = np.arange(0, 41) * 100_000_000 + 10**18
+MOUNT = transform(rotation_from_rpy(0.0, 0.0, 0.3), [0.5, 0.0, 1.8])
+
+
+def true_poses() -> Array:
+    """A curve of 20 m."""
+    t = (T_NS - T_NS[0]) / 1e9
+    yaw = 0.1 * t
+    return transform(
+        rotation_from_rpy(0 * t, 0 * t, yaw), np.stack([50 * np.sin(yaw), 50 - 50 * np.cos(yaw), 0 * t], axis=1)
+    )
+
+
+def drift() -> Array:
+    """Slow errors of all six parts, up to 30 cm and half a degree."""
+    s = np.linspace(-1, 1, len(T_NS))[:, None]
+    return s * [0.15, 0.3, 0.2, 0.004, 0.006, 0.008] + np.sin(4 * s) * [0.05, 0.05, 0.05, 0.002, 0.002, 0.002]
+
+
+def drifted() -> Array:
+    return true_poses() @ np.stack([exp_of(twist) for twist in drift()])
+
+
+def street(rng: np.random.Generator, count: int) -> Array:
+    """Points on the road, on walls along and across."""
+    u, v = rng.uniform(-15, 35, count), rng.uniform(-12, 12, count)
+    up, zero = rng.uniform(0, 5, count), np.zeros(count)
+    walls = [np.column_stack([u, zero + y, up]) for y in (-12, 12)]
+    walls += [np.column_stack([zero + x, np.sign(v) * (8 + np.abs(v) / 3), up]) for x in (-10.0, 3.0, 16.0, 30.0)]
+    return np.concatenate([np.column_stack([u, v, zero]), *walls])
+
+
+def street_log(poses: Array, frame: str = "lidar") -> Log:
+    """Sweeps from the true poses in a log that states others."""
+
+    def read(i: int) -> Sweep:
+        rng = np.random.default_rng(i)
+        world = street(rng, 4000)
+        local = apply(inverse(true_poses()[i] @ MOUNT), world) + rng.normal(0, 0.01, (len(world), 3))
+        points = local if frame == "lidar" else apply(poses[i] @ MOUNT, local)
+        return Sweep(int(T_NS[i]), points, frame)  # type: ignore[arg-type]
+
+    streams = {"top": Stream("top", T_NS, read)}
+    return Log("street", "log2sim", {}, {"top": Lidar("top", "ego", MOUNT)}, streams, PoseTrack(T_NS, poses))
+
+
+def whole() -> Scenario:
+    return Scenario("street", int(T_NS[0]), 4.0, ())
+
+
+def relative_errors(poses: Array) -> Array:
+    """Errors (K, 6) of the motion from the first pose."""
+    true = inverse(true_poses()[:1]) @ true_poses()
+    return log_of(inverse(true) @ (inverse(poses[:1]) @ poses))
+
+
+@pytest.mark.parametrize("frame", ["lidar", "map"])
+def test_drift_is_taken_out(frame: str) -> None:
+    log = street_log(drifted(), frame)
+    refined = refine_poses(log, whole(), RecordReader(log))
+    assert refined.ego is not None
+    before, after = (np.abs(relative_errors(p)).max(axis=0) for p in (drifted(), refined.ego.map_T_ego))
+    assert before[:3].max() > 0.5
+    assert after[:3].max() < 0.04
+    assert np.degrees(after[3:]).max() < 0.15
+
+
+def test_what_the_sweeps_hold_moves_with_the_poses() -> None:
+    """A sweep in the map, as some logs have it, lies where its refined pose puts it."""
+    log = street_log(drifted(), "map")
+    refined = refine_poses(log, whole(), RecordReader(log))
+    assert refined.ego is not None
+    sweep = refined.streams["top"].read(30)
+    local = apply(inverse(drifted()[30]), log.streams["top"].read(30).xyz_m)
+    np.testing.assert_allclose(sweep.xyz_m, apply(refined.ego.map_T_ego[30], local), atol=1e-6)
+
+
+def test_poses_that_are_right_stay() -> None:
+    log = street_log(true_poses())
+    refined = refine_poses(log, whole(), RecordReader(log))
+    assert refined.ego is not None
+    moved = np.linalg.norm(refined.ego.map_T_ego[:, :3, 3] - true_poses()[:, :3, 3], axis=1)
+    assert moved.max() < 0.03
+
+
+def test_one_false_registration_changes_little() -> None:
+    frames = [Keyframe(int(t), p, None) for t, p in zip(T_NS[::4], drifted()[::4])]  # type: ignore[arg-type]
+    true = true_poses()[::4]
+    covariance = np.diag([0.01, 0.01, 0.01, 0.001, 0.001, 0.001]) ** 2
+    pairs = [(j - lag, j) for j in range(len(frames)) for lag in (1, 3) if j >= lag]
+    links = [(i, j, Registration(inverse(true[i]) @ true[j], covariance, 1.0)) for i, j in pairs]
+    i, j, good = links[5]
+    links[5] = (i, j, Registration(good.first_T_second @ transform(np.eye(3), [2.0, 0, 0]), covariance, 1.0))
+    fixed = np.stack([f.map_T_ego @ exp_of(twist) for f, twist in zip(frames, solve_twists(frames, links))])
+    off = log_of(inverse(inverse(true[:1]) @ true) @ (inverse(fixed[:1]) @ fixed))
+    assert np.abs(off[:, :3]).max() < 0.02
+
+
+def test_corrections_are_interpolated_and_held_at_the_ends() -> None:
+    track = PoseTrack(T_NS, np.repeat(np.eye(4)[None], len(T_NS), axis=0))
+    moved = corrected(track, T_NS[[10, 20]], np.array([[1.0, 0, 0, 0, 0, 0], [3.0, 0, 0, 0, 0, 0]]))
+    np.testing.assert_allclose(moved.map_T_ego[[0, 10, 15, 20, 40], 0, 3], [1, 1, 2, 3, 3])
+
+
+def test_logs_without_lidar_or_way_stay_as_they_are() -> None:
+    log = street_log(true_poses())
+    bare = log.changed(lidars={}, streams={})
+    assert refine_poses(bare, whole(), RecordReader(bare)) is bare
+    standing = street_log(np.repeat(true_poses()[:1], len(T_NS), axis=0))
+    assert refine_poses(standing, whole(), RecordReader(standing)) is standing
