@@ -31,6 +31,9 @@ MIN_KEYFRAMES = 3
 PRIOR_SIGMA = np.array([0.5, 0.5, 0.5, 0.02, 0.02, 0.02])
 # Registrations that are this many standard deviations off count half.
 CAUCHY = 3.0
+# Directions that a registration tells less well than this, at the distance of usual surfaces, are those that no surface holds.
+MAX_SIGMA_M, LEVER_M = 0.1, 20.0
+MAX_SLIDE_M = 0.1
 ROUNDS = 5
 # Points of a sweep that are looked at.
 MAX_POINTS = 60_000
@@ -67,6 +70,21 @@ def refine_poses(log: Log, scenario: Scenario, reader: RecordReader) -> Log:
     links = [(i, j, registration) for i, j, registration in found if registration is not None]
     twists = solve_twists(keyframes, links)
     return replace_poses(log, corrected(log.ego, np.array([k.t_ns for k in keyframes]), twists))
+
+
+def _told(covariance: Array, measured: Array) -> Array | None:
+    """Return the information (6, 6) of a registration along the directions that its surfaces hold, none along others.
+
+    Without walls nothing holds a sweep along the road, and what noise says of it must not add up over many registrations. One that
+    slid far along such a direction, with a twist `measured` (6,), is of other surfaces than it began with: None.
+    """
+    length = np.diag([1.0, 1.0, 1.0, LEVER_M, LEVER_M, LEVER_M])
+    squares, directions = np.linalg.eigh(length @ covariance @ length)
+    held = squares < MAX_SIGMA_M**2
+    if np.linalg.norm(directions[:, ~held].T @ length @ measured) > MAX_SLIDE_M:
+        return None
+    known = np.where(held, 1 / np.maximum(squares, 1e-12), 0.0)
+    return np.asarray(length @ (directions * known) @ directions.T @ length)
 
 
 def _choose(log: Log, scenario: Scenario, lidar: str) -> NDArray[np.int64]:
@@ -109,7 +127,9 @@ def solve_twists(keyframes: list[Keyframe], links: list[tuple[int, int, Registra
     for i, j, registration in links:
         j_T_i = inverse(keyframes[j].map_T_ego) @ keyframes[i].map_T_ego
         measured = log_of(j_T_i @ registration.first_T_second)
-        equations.append((6 * i, 6 * j, -adjoint_of(j_T_i), measured, np.linalg.inv(registration.covariance)))
+        information = _told(registration.covariance, measured)
+        if information is not None:
+            equations.append((6 * i, 6 * j, -adjoint_of(j_T_i), measured, information))
     for _ in range(ROUNDS):
         normal: Array = prior.copy()
         right: Array = np.zeros(count)
