@@ -85,7 +85,7 @@ ROADS = {name: ground_homography(c, c.mount_T_cam) for name, c in CAMERAS.items(
 
 
 @pytest.mark.parametrize("offset_m", [(0.0, 0.0), (0.31, -0.17), (-1.02, 0.44)])
-def test_a_shifted_patch_is_found_to_a_tenth_of_a_cell(offset_m: tuple[float, float]) -> None:
+def test_a_shifted_patch_is_found_to_a_third_of_a_cell(offset_m: tuple[float, float]) -> None:
     cell = 0.04
     x, y = np.meshgrid(np.arange(0, 6, cell), np.arange(0, 4, cell), indexing="ij")
     rng = np.random.default_rng(1)
@@ -96,7 +96,7 @@ def test_a_shifted_patch_is_found_to_a_tenth_of_a_cell(offset_m: tuple[float, fl
 
     found = register_patches(patch((0.0, 0.0), 1.0), patch(offset_m, 0.7), cell)
     assert found is not None
-    np.testing.assert_allclose(found.offset_m, offset_m, atol=0.01)
+    np.testing.assert_allclose(found.offset_m, offset_m, atol=0.013)
     assert found.correlation > 0.95
     assert np.sqrt(np.diag(found.covariance)).max() < 0.004
 

@@ -20,8 +20,9 @@ from log2sim.perception.sync import Schedule
 
 # Ground points within this distance of a patch, so much time before and after, show that it lies on the ground.
 NEAR_M, NEAR_S, MIN_GROUND_POINTS = 3.0, 2.0, 3
-# Ground farther than this from the plane of the road, such as a sidewalk, is shown elsewhere by cameras in other places.
-MAX_STEP_M = 0.05
+# Ground farther than this from the plane of the road is shown elsewhere by cameras in other places: half a usual curb of 0.15 m
+# tells a sidewalk from the crown of a road.
+MAX_STEP_M = 0.075
 # LiDAR points above the ground stand for what is within this distance: one is kept of each voxel, and between the rings of a
 # LiDAR with 32 lines lies 0.3 m on an object 15 m away.
 POINT_REACH_M = 0.3
