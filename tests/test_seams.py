@@ -97,8 +97,8 @@ def test_a_shifted_patch_is_found_to_a_third_of_a_cell(offset_m: tuple[float, fl
     found = register_patches(patch((0.0, 0.0), 1.0), patch(offset_m, 0.7), cell)
     assert found is not None
     np.testing.assert_allclose(found.offset_m, offset_m, atol=0.013)
-    assert found.correlation > 0.95
-    assert np.sqrt(np.diag(found.covariance)).max() < 0.004
+    assert found.correlation > 0.9
+    assert np.sqrt(np.diag(found.covariance)).max() < 0.015
 
 
 def test_patches_that_do_not_tell_an_offset_are_refused() -> None:
