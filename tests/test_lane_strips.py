@@ -92,16 +92,35 @@ def test_the_side_of_traffic_is_that_of_who_comes_towards_each_other(side: float
 
 
 @pytest.mark.parametrize(
-    ("kind", "color", "same"), [("dashed", "white", True), ("solid", "white", False), ("dashed", "yellow", False)]
+    ("kind", "color", "count", "same"),
+    [
+        ("dashed", "white", 2, False),
+        ("dashed", "white", 3, True),
+        ("solid", "white", 3, False),
+        ("dashed", "yellow", 3, False),
+    ],
 )
-def test_an_empty_lane_towards_oncoming_traffic_leads_as_the_line_says(kind: str, color: str, same: bool) -> None:
-    lines = [paint("right", 0.0), paint("middle", 3.5, kind, color=color), paint("left", 7.0, turn=True)]
+def test_an_empty_lane_towards_oncoming_traffic_leads_as_the_line_says(
+    kind: str, color: str, count: int, same: bool
+) -> None:
+    """A dashed line parts the directions of a road with two lanes, and the lanes of one with more."""
+    lines = [paint("right", 0.0), paint("middle", 3.5, kind, color=color), paint("left", 7.0, "dashed", turn=True)]
+    lines += [paint("farthest", 10.5)] if count > 2 else []
     lanes = inferred(lines, [], scenario(agent(line(100.0, 101, 0.0, (0.0, 1.75)))))
-    driven, empty = sorted(lanes, key=lambda lane: lane.points_m[0, 1])
+    driven, empty = sorted(lanes, key=lambda lane: lane.points_m[0, 1])[:2]
     assert driven.confidence > 0.9 > empty.confidence
     assert (driven.inferred_from, empty.inferred_from) == ("both", "markings")
     assert (driven.left_lane == empty.id) is same
     assert (driven.opposite == empty.id) is not same
+
+
+def test_a_median_is_no_lane() -> None:
+    """Between two carriageways, behind solid lines that nobody crosses."""
+    lines = [paint("a", 0.0), paint("b", 3.5), paint("c", 6.5), paint("d", 10.0)]
+    there = agent(line(100.0, 101, 0.0, (0.0, 1.75)))
+    back = agent(line(100.0, 101, np.pi, (100.0, 8.25)), "back")
+    assert len(inferred(lines, [], scenario(there, back))) == 2
+    assert len(inferred(lines, [], scenario(there))) == 3  # who could tell
 
 
 def test_without_traffic_the_direction_is_doubtful() -> None:

@@ -131,10 +131,19 @@ def _transition(routes: Sequence[Route], path: DrivenPath, match: Match, one: Ru
     last = max(own[leave], min(a.s_m[apart], routes[one.route].line.length_m))
     enter = min(own[arrive], max(b.s_m[together], 0.0)) if b.inside[together] else own[arrive]
     out = max(own[end], own[apart] if apart >= arrive else -np.inf)
+    length = routes[one.route].line.length_m
+    room = JUMP_M if s[arrive] - s[leave] < JUMP_M else 0.0
+    if length - own[leave] < JOIN_M and own[arrive] < JOIN_M:  # one goes on as the other
+        return Conflict((Interval(one.route, length - room, length), Interval(two.route, 0.0, room)), crossing=False)
     return Conflict(
         (
-            hold(routes[one.route], one.route, min(first, own[leave] - JUMP_M), last),
-            hold(routes[two.route], two.route, enter, max(out, own[arrive] + JUMP_M)),
+            hold(
+                routes[one.route],
+                one.route,
+                min(first, own[leave] - JUMP_M),
+                length if length - own[leave] < JOIN_M else last,
+            ),
+            hold(routes[two.route], two.route, 0.0 if own[arrive] < JOIN_M else enter, max(out, own[arrive] + JUMP_M)),
         ),
         crossing=False,
     )

@@ -48,13 +48,33 @@ def direct_strips(
         news = {}
         for pair in beside:
             if known[pair.route] and not known[pair.other] and pair.other not in news:
-                news[pair.other] = _from_neighbor(found[pair.route], found[pair.other], pair, traffic, sides)
+                alone = not _has_more(beside, pair)
+                news[pair.other] = _from_neighbor(found[pair.route], found[pair.other], pair, (traffic, alone), sides)
         if not news:
             break
         turned = {k: strip.line is not found[k].line for k, strip in news.items()}
         found = [news.get(k, strip) for k, strip in enumerate(found)]
         if any(turned.values()):
             beside = find_beside([strip.line for strip in found])
+    medians = _find_medians(found, beside, sides)
+    return [strip for k, strip in enumerate(found) if k not in medians]
+
+
+def _find_medians(
+    strips: Sequence[LaneStrip], beside: Sequence[Beside], sides: Mapping[str, Marking | RoadBorder]
+) -> set[int]:
+    """Return strips that nobody drives, behind solid lines, between lanes that vehicles drive in opposite directions."""
+    ways: dict[int, set[tuple[bool, bool]]] = {}
+    for pair in beside:
+        if strips[pair.other].directed >= DRIVEN:
+            ways.setdefault(pair.route, set()).add((bool(pair.aside_m[0] > 0), pair.same_way))
+    found = set()
+    for k, strip in enumerate(strips):
+        lines = [sides.get(name) for name in (strip.left, strip.right)]
+        closed = all(isinstance(line, RoadBorder) or (line is not None and line.kind == "solid") for line in lines)
+        apart = {(True, True), (False, False)}, {(True, False), (False, True)}
+        if closed and strip.directed < DRIVEN and ways.get(k, set()) in apart:
+            found.add(k)
     return found
 
 
@@ -72,15 +92,26 @@ def _driven(strip: LaneStrip, paths: Sequence[DrivenPath]) -> LaneStrip:
     return replace(strip if along > 0 else strip.reversed(), directed=DRIVEN)
 
 
+def _has_more(beside: Sequence[Beside], pair: Beside) -> bool:
+    """Whether a road has more lanes than two strips side by side."""
+    both = {pair.route, pair.other}
+    return any(other.route in both and other.other not in both for other in beside)
+
+
 def _from_neighbor(
-    known: LaneStrip, strip: LaneStrip, pair: Beside, traffic: int, sides: Mapping[str, Marking | RoadBorder]
+    known: LaneStrip, strip: LaneStrip, pair: Beside, road: tuple[int, bool], sides: Mapping[str, Marking | RoadBorder]
 ) -> LaneStrip:
-    """Turn a strip by the one beside it: outside of it the same way, towards oncoming traffic by the line between them."""
+    """Turn a strip by the one beside it: outside of it the same way, towards oncoming traffic by the line between them.
+
+    `road` is the side of traffic, and whether there are just these two: a dashed line in the middle of a road with two lanes
+    parts its directions, one between more lanes those of one direction.
+    """
+    traffic, alone = road
     inner = pair.aside_m[0] * traffic > 0
     between = sides.get(known.left if pair.aside_m[0] > 0 else known.right)
     same, probability = True, OUTER
     if inner:
         dashed = isinstance(between, Marking) and between.kind == "dashed" and between.color != "yellow"
-        same, probability = dashed, INNER
+        same, probability = dashed and not alone, INNER
     turned = strip if pair.same_way == same else strip.reversed()
     return replace(turned, directed=probability * known.directed)

@@ -34,8 +34,8 @@ class Areas:
     crossing: frozenset[int]
 
 
-class _Union:
-    """Sets of numbers that are united step by step (Tarjan 1975)."""
+class Union:
+    """Sets of the numbers below `count` that are united step by step (Tarjan 1975)."""
 
     def __init__(self, count: int) -> None:
         self._parent = list(range(count))
@@ -55,7 +55,7 @@ class _Union:
 
 def join_conflicts(routes: Sequence[Route], conflicts: Sequence[Conflict], beside: Sequence[Beside]) -> Areas:
     """Join conflicts whose stretches overlap, on any route, and let lanes side by side enter a junction together."""
-    union = _Union(len(conflicts))
+    union = Union(len(conflicts))
     stretches: dict[int, list[Stretch]] = {}
     for k, conflict in enumerate(conflicts):
         for interval in conflict.intervals:
@@ -69,7 +69,7 @@ def join_conflicts(routes: Sequence[Route], conflicts: Sequence[Conflict], besid
     return Areas({route: [(a, b, union.root(k)) for a, b, k in items] for route, items in merged.items()}, crossing)
 
 
-def _merge(items: Iterable[Stretch], union: _Union) -> list[Stretch]:
+def _merge(items: Iterable[Stretch], union: Union) -> list[Stretch]:
     """Unite stretches that overlap or leave no section between them."""
     out: list[Stretch] = []
     for first, last, k in sorted(items):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import count
@@ -17,7 +18,7 @@ from log2sim.lanes.coverage import find_uncovered
 from log2sim.lanes.directions import direct_strips
 from log2sim.lanes.driven_paths import DrivenPath, collect_paths
 from log2sim.lanes.extension import continued
-from log2sim.lanes.junction_areas import join_conflicts
+from log2sim.lanes.junction_areas import Union, join_conflicts
 from log2sim.lanes.lane_changes import without_lane_changes
 from log2sim.lanes.lane_lines import name_lines
 from log2sim.lanes.matching import Match
@@ -199,15 +200,20 @@ def _is_marked(route: Route, strip: Strip) -> bool:
 
 
 def _junctions(graph: _Graph) -> dict[int, str]:
-    """Name the areas in which lanes cross, branch or merge."""
-    busy = set()
-    for area in {c.area for c in graph.connections}:
-        ways = [c for c in graph.connections if c.area == area]
-        branches = len({c.origin for c in ways}) < len(ways) or len({c.target for c in ways}) < len(ways)
-        if branches or (area in graph.crossing and len(ways) > 0):
-            busy.add(area)
-    order = list(dict.fromkeys(c.area for c in graph.connections if c.area in busy))
-    return {area: f"junction-{k + 1}" for k, area in enumerate(order)}
+    """Name the areas in which lanes cross, branch or merge, or in which several leave one road side by side: these are one."""
+    union = Union(1 + max((c.area for c in graph.connections), default=0))
+    known = {c.area for c in graph.connections}
+    for strip in graph.strips:
+        if strip.right is not None:
+            other = graph.strips[strip.right].section
+            for one, two in ((strip.section.start, other.start), (strip.section.end, other.end)):
+                if one in known and two in known:
+                    union.unite(one, two)
+    ways = Counter(union.root(c.area) for c in graph.connections)
+    crossing = {union.root(area) for area in graph.crossing & known}
+    order = list(dict.fromkeys(union.root(c.area) for c in graph.connections))
+    names = {area: f"junction-{k + 1}" for k, area in enumerate(a for a in order if ways[a] > 1 or a in crossing)}
+    return {area: names[union.root(area)] for area in known if union.root(area) in names}
 
 
 def _confidence(agents: Sequence[str], confidence_of: dict[str, float]) -> float:

@@ -27,6 +27,9 @@ JOIN_M = 5.0
 BLEND_M = 20.0
 """Over this length a path that lengthens a route comes to its own offset from it: 2.5 degrees at most, as a driver steers."""
 
+GAP_M = 8.0
+"""Between two routes that a vehicle drove one after the other, for the way from the middle of one to that of the next."""
+
 KEEP_M = 1.6
 """Center lines stay this close to every path on them, so that all lie within half of a lane of `LANE_M`."""
 
@@ -114,6 +117,8 @@ def _add(routes: list[Route], path: DrivenPath) -> None:
         first, last = runs[k].first, runs[k].last
         tried.add(first)
         back = _first_return(path.line, first, last)
+        if back is None and _is_bridge(routes, found, k):
+            last = int(np.searchsorted(s, s[last] - GAP_M))
         last = back if back is not None else last
         before = runs[k - 1].route if k > 0 else -1
         after = runs[k + 1].route if k + 1 < len(runs) and back is None else -1
@@ -135,11 +140,23 @@ def _is_new(routes: Sequence[Route], found: Match, k: int, s: Array) -> bool:
         return False
     before = found.runs[k - 1].route if k > 0 else -1
     after = found.runs[k + 1].route if k + 1 < len(found.runs) else -1
+    if _is_bridge(routes, found, k) and s[run.last] - s[run.first] <= GAP_M + SHORT_M:
+        return False
     if before >= 0 and run.last == len(s) - 1 and _is_at_end(routes[before], found.s_m[run.first - 1]):
         return True
     if after >= 0 and run.first == 0 and _is_at_start(routes[after], found.s_m[run.last + 1]):
         return True
     return bool(s[run.last] - s[run.first] >= SHORT_M)
+
+
+def _is_bridge(routes: Sequence[Route], found: Match, k: int) -> bool:
+    """Whether run k of a path leads from the end of a route to the start of another."""
+    if not 0 < k < len(found.runs) - 1:
+        return False
+    one, run, two = found.runs[k - 1 : k + 2]
+    if one.route < 0 or two.route < 0:
+        return False
+    return routes[one.route].line.length_m - found.s_m[run.first - 1] < JOIN_M and found.s_m[run.last + 1] < JOIN_M
 
 
 def _is_at_end(route: Route, s_m: float) -> bool:

@@ -19,6 +19,9 @@ FREE, CUT = -1, -2
 FIRST_M = 3.0
 """Of a path that begins or ends within a junction, this much is a section, from which its way through the junction leads on."""
 
+MIN_LENGTH_M = 0.5
+"""Shorter sections are what rounding leaves: a sample of a path."""
+
 TAPER_M = 10.0
 """Over this length a lane comes to the width that it has beside others: 6 cm a meter at most."""
 
@@ -98,6 +101,8 @@ def _with_ends(low: float, high: float, length: float, entered: tuple[bool, bool
 
 
 def _pieces(k: int, span: tuple[float, float], ends: tuple[int, int], cuts: Iterable[float]) -> list[Section]:
+    if span[1] - span[0] < MIN_LENGTH_M:
+        return []
     inner = [c for c in sorted(cuts) if span[0] + MIN_SECTION_M < c < span[1] - MIN_SECTION_M]
     at = [span[0], *inner, span[1]]
     kinds = [ends[0], *([CUT] * len(inner)), ends[1]]
