@@ -158,11 +158,13 @@ def test_one_wrong_picture_does_not_switch_a_signal() -> None:
 
 
 def test_without_pictures_a_state_is_unknown() -> None:
-    t_s = np.array([0.0, 0.1, 0.2, 5.0, 5.1, 5.2])
+    t_s = np.array([0.0, 0.1, 0.2, 9.0, 9.1, 9.2])
     times, states = changes_of(t_s, np.zeros(6, int))
     assert states == ["red", "unknown", "red", "unknown"]
     assert times[1] == pytest.approx(0.8)
     Signal("a", np.zeros(3), None, times, np.array(states))
+    assert changes_of(t_s / 2.5, np.zeros(6, int))[1] == ["red", "unknown"]
+    assert changes_of(t_s / 2.5, np.array([0, 0, 0, 3, 3, 3]))[1] == ["red", "unknown", "green", "unknown"]
 
 
 def test_rates_keep_probability() -> None:

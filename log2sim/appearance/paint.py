@@ -18,13 +18,13 @@ from log2sim.geometry import Array
 
 # Chroma as it would be at this lightness; darker pixels than the least are too noisy to be scaled up from.
 REFERENCE_L, MIN_L, MAX_L = 55.0, 14.0, 115.0
-# A pixel has a hue from this chroma at the reference; sky on a gray surface gives about half of it.
-MIN_CHROMA = 15.0
+# A pixel has a hue from this chroma at the reference: three sigmas of the color of the light (0.06 in the logarithm, see `light.py`).
+MIN_CHROMA = 17.5
 HUE_BINS, HUE_REACH_DEG = 72, 25.0
 MIN_HUE_SHARE = 0.38
 WHITEST_L = 94.0  # the whitest paints reflect 0.85
 # Of the pixels of one hue those in bright, direct light mirror least of other things and are not clipped.
-CHROMA_QUANTILE, LIGHTNESS_QUANTILE = 0.6, 0.6
+CHROMA_QUANTILE, LIGHTNESS_QUANTILE = 0.5, 0.6
 LIGHTNESS_BANDWIDTH = 7.0
 # Glass, tires, grilles and shade are dark on vehicles of every color, a third of what one sees; only where more is, it is the paint.
 DARK_L, MIN_DARK_SHARE = 20.0, 0.45

@@ -19,7 +19,7 @@ from log2sim.geometry import Array
 ENOUGH_PIXELS = 150.0
 MIN_SIGMA_LAB = np.array([3.0, 3.0, 2.0])
 # Errors of a pixel's value: half of a step of 8 bits and the noise of a sensor, relative to full scale after the camera's curve.
-PIXEL_NOISE = 3 / 255
+PIXEL_NOISE = 4 / 255
 # Lenses and interpolation mix a door of a small vehicle with what is around it, which differs from it by this reflectance.
 MIXED, BLUR_PX, DOOR_HEIGHT = 0.15, 1.5, 0.3
 ITERATIONS = 20

@@ -19,7 +19,7 @@ MARGIN = 0.1
 MIN_SIDE_PX = 3
 # Points of a housing lie in the middle of its box, and none behind the first ones; below this height above ground are vehicles.
 MIDDLE, HOUSING_DEPTH_M, MIN_HEIGHT_M, MIN_POINTS = 0.7, 0.6, 1.5, 2
-MAX_OVERLAP = 0.5  # of the smaller of two boxes
+MAX_OVERLAP = 0.2  # of the smaller of two boxes; more have parts of one housing
 # Of a log; 40 MB. Later ones are not kept.
 MAX_CROPS = 20_000
 

@@ -24,9 +24,14 @@ PIXEL_SIGMA, SHARE_SIGMA, ANGLE_SIGMA_RAD = 1.5, 0.12, 0.003
 GATE, MAX_SIZE_RATIO = 13.8, 2.0
 # Of a distance by LiDAR points: half of the depth of a housing, and what hangs beside it.
 RANGE_SIGMA_M = 0.4
+# Boxes often hold a part of a housing, whose middle is off by so much, or the board around it.
+PART_M = 0.2
 # Weights of old and new boxes: errors of poses last, so that many boxes from one place are not as sure as they are many.
 SAME_PLACE_SHARE = 0.25
-MERGE_M, MERGE_GATE = 1.2, 9.2
+MERGE_M, MERGE_GATE = 1.2, 11.3
+SAME_M = 0.5  # housings that hang side by side are no nearer
+# Of the frames with a box of one, how many may have one of the other, too, where both are one housing.
+MAX_SHARED = 0.15
 
 
 @dataclass(eq=False)
@@ -116,7 +121,8 @@ def _misfit(housing: Housing, sight: _Sight) -> float:
         return np.inf
     across = _across(sight.ray)
     off = across @ away / distance
-    spread = across @ housing.covariance @ across.T / distance**2 + np.eye(2) * sight.sigma_rad**2
+    off_m = (sight.sigma_rad * distance) ** 2 + PART_M**2
+    spread = (across @ housing.covariance @ across.T + np.eye(2) * off_m) / distance**2
     return float(off @ np.linalg.solve(spread, off))
 
 
@@ -166,14 +172,18 @@ def _range_of(sight: _Sight) -> float | None:
 
 
 def _merged(housings: list[Housing]) -> list[Housing]:
-    """Join housings that are one: never in the same frame, and where the same errors could put both."""
+    """Join housings that are one: hardly ever in the same frame, and where the same errors could put both."""
     kept: list[Housing] = []
     for housing in sorted(housings, key=lambda h: -len(h.boxes)):
         for other in kept:
             off = housing.position - other.position
-            close = off @ np.linalg.solve(housing.covariance + other.covariance + np.eye(3) * 0.1**2, off) < MERGE_GATE
+            close = (
+                off @ np.linalg.solve(housing.covariance + other.covariance + np.eye(3) * PART_M**2, off) < MERGE_GATE
+            )
             both = {(b.t_ns, b.camera) for b in housing.boxes} & {(b.t_ns, b.camera) for b in other.boxes}
-            if (close or np.linalg.norm(off) < MERGE_M) and not both:
+            few = len(both) <= MAX_SHARED * min(len(housing.boxes), len(other.boxes))
+            apart = float(np.linalg.norm(off))
+            if apart < SAME_M or (few and (close or apart < MERGE_M)):
                 weight = [np.linalg.inv(h.covariance) for h in (other, housing)]
                 other.covariance = np.linalg.inv(weight[0] + weight[1])
                 other.position = other.covariance @ (weight[0] @ other.position + weight[1] @ housing.position)

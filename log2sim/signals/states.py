@@ -21,6 +21,9 @@ FOLLOWS = {
 }
 # Without a picture a state is taken to last this long, half of the shortest that drivers see.
 HOLD_S = 0.6
+# A signal that shows the same before and after a gap has not changed meanwhile: away and back takes at least a shortest green (5 s)
+# or a yellow and a red.
+LEAST_CYCLE_S = 5.0
 MIN_STATE_S = 0.25  # shorter changes are of single pictures
 
 
@@ -79,7 +82,7 @@ def changes_of(t_s: Array, course: NDArray[np.intp]) -> tuple[Array, list[str]]:
     times, states = [float(t_s[0])], [STATES[course[0]]]
     for k in range(1, len(t_s)):
         state, gap = STATES[course[k]], t_s[k] - t_s[k - 1]
-        if gap > 2 * HOLD_S:
+        if gap > (LEAST_CYCLE_S if state == states[-1] else 2 * HOLD_S):
             times += [float(t_s[k - 1] + HOLD_S), float(t_s[k] - HOLD_S / 2)]
             states += ["unknown", state]
         elif state != states[-1]:
