@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
-from ground_worlds import World, empty_scenario, height_at, is_paint, parked_car, world_log
+from ground_worlds import EGO_R_CAM, World, empty_scenario, height_at, is_paint, parked_car, world_log
 
 from log2sim.config_sections import MapConfig
+from log2sim.datatypes import Agent, Log, Scenario, Stream, Sweep, Waypoints
 from log2sim.errors import LogError
-from log2sim.geometry import Array
+from log2sim.geometry import Array, Camera, apply, rotation_from_rpy, transform
 from log2sim.mapping.builder import map_ground
 from log2sim.mapping.ground_map import GroundMap
+from log2sim.mapping.road_users import RoadUsers, draw_outlines
 
 SETTINGS = MapConfig(cell_m=0.05)
 
@@ -155,3 +158,73 @@ def test_sweeps_without_intensity_leave_the_heights() -> None:
     assert np.isfinite(ground.height_m).any()
     assert not np.isfinite(ground.intensity).any()
     assert any("no intensity" in note for note in ground.notes)
+
+
+def roadside_log(passing: bool) -> Log:
+    """A camera on a pole, before which something bright passes in two of seven pictures, and no ego."""
+    mount = transform(rotation_from_rpy(0.0, 0.6, 0.0) @ EGO_R_CAM, [0.0, 0.0, 6.0])
+    camera = Camera("pole", 320, 240, np.array([[250.0, 0, 160], [0, 250.0, 120], [0, 0, 1]]), "map", mount)
+
+    def read(i: int) -> np.ndarray:
+        image = np.full((240, 320, 3), 90, np.uint8)
+        image[:, 150:170] = 180
+        if passing and i in (2, 3):
+            image[100:160] = 250
+        return image
+
+    stamps = np.arange(7) * 500_000_000 + 10**18
+    return Log("pole", "log2sim", {"pole": camera}, {}, {"pole": Stream("pole", stamps, read)})
+
+
+def test_what_passes_a_roadside_camera_is_not_mapped() -> None:
+    plain, passed = (
+        map_ground(log, Scenario("pole", 10**18, 3.0, ()), SETTINGS)
+        for log in (roadside_log(False), roadside_log(True))
+    )
+    assert (plain.alpha > 200).sum() > 10_000
+    np.testing.assert_array_equal(plain.color_bgr, passed.color_bgr)
+
+
+def moving_car(speed_mps: float = 5.0) -> Agent:
+    """A car that drives along beside the ego, ahead of it."""
+    t = np.linspace(0, 2, 5)
+    x, one = 8.0 + speed_mps * t, np.ones(5)
+    z = height_at(np.column_stack([x, -2.5 * one])) + 0.75
+    waypoints = Waypoints(t, x, -2.5 * one, z, 0 * one, speed_mps * one, one > 0, 0.1 * one)
+    return Agent("car", "car", (4.5, 1.8, 1.5), waypoints)
+
+
+def test_pictures_and_points_of_moving_agents_are_left_out() -> None:
+    """A mark on every picture and bright returns where the car is would show in the map."""
+    log, car = world_log(), moving_car()
+    scenario = empty_scenario(log, car)
+    users = RoadUsers(log, scenario, log.streams["c0"].t_ns)
+    read, sweeps, camera = log.streams["c0"].read, log.streams["l0"].read, log.cameras["c0"]
+
+    def painted(i: int) -> np.ndarray:
+        t_ns = int(log.streams["c0"].t_ns[i])
+        mask = draw_outlines(users.at(t_ns), camera, log.map_T_sensor("c0", t_ns)[0][0])
+        mask = cv2.resize(mask, (camera.width_px, camera.height_px), interpolation=cv2.INTER_NEAREST)
+        return np.where(cv2.erode(mask, np.ones((5, 5), np.uint8))[..., None] > 0, [0, 0, 255], read(i)).astype(
+            np.uint8
+        )
+
+    def bright(i: int) -> Sweep:
+        sweep = sweeps(i)
+        xyz = apply(log.map_T_sensor("l0", sweep.stamp_ns)[0][0], sweep.xyz_m.astype(float))
+        x = 8.0 + 5.0 * (sweep.stamp_ns - 10**18) / 1e9
+        under = (np.abs(xyz[:, 0] - x) < 2.3) & (np.abs(xyz[:, 1] + 2.5) < 1.0)
+        raised = sweep.xyz_m + np.where(under, 0.3, 0.0)[:, None] * np.array([0, 0, 1], np.float32)
+        return dataclasses.replace(sweep, xyz_m=raised.astype(np.float32))
+
+    streams = {"c0": Stream("c0", log.streams["c0"].t_ns, painted), "l0": Stream("l0", log.streams["l0"].t_ns, bright)}
+    spoiled = log.changed(streams=streams)
+    with_car, without = (map_ground(spoiled, s, SETTINGS, refine=False) for s in (scenario, empty_scenario(log)))
+    red = [
+        int(((g.color_bgr[..., 2] > 120) & (g.color_bgr[..., 0] < 60) & (g.alpha > 0)).sum())
+        for g in (with_car, without)
+    ]
+    assert red[0] < 0.01 * red[1]
+    error = with_car.height_m - height_at(positions(with_car))
+    lane = np.abs(positions(with_car)[..., 1] + 2.5) < 0.8
+    assert np.nanpercentile(np.abs(error[lane & near_path(positions(with_car), 10.0)]), 95) < 0.05

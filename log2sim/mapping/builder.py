@@ -32,6 +32,7 @@ from log2sim.mapping.records import (
 )
 from log2sim.mapping.reflectivity import map_intensity
 from log2sim.mapping.road_users import MASK_SHRINK, RoadUsers, draw_footprints, draw_outlines
+from log2sim.mapping.standing_pictures import StandingPictures
 from log2sim.mapping.surface import Surface, estimate_surface, upsample
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.picture_pass import look_again
@@ -106,6 +107,7 @@ class GroundMapBuilder:
         self._frames = choose_records(log, scenario, self._cameras(), PICTURE_STEP_M, MAX_PICTURES)
         stamps = [log.streams[name].t_ns[i] for name, i in (*self._sweeps.items(), *self._frames.items())]
         self._users = RoadUsers(log, scenario, np.concatenate([*stamps, np.zeros(0, np.int64)]))
+        self._standing: dict[str, tuple[View, StandingPictures]] = {}
         self._colors = ColorRaster(self.raster) if any(len(i) for i in self._frames.values()) else None
 
     def frames(self) -> Mapping[str, NDArray[np.int64]]:
@@ -119,18 +121,25 @@ class GroundMapBuilder:
         if self._colors is None or not known[0]:
             return
         view = View(self._log, self._log.cameras[camera], t_ns, map_T_cam[0])
+        users = draw_outlines(self._users.at(t_ns), view.camera, view.map_T_cam)
+        if view.camera.mount == "map":
+            self._standing.setdefault(camera, (view, StandingPictures()))[1].add(image_bgr, users)
+        else:
+            self._lay(self._colors, view, image_bgr, users)
+
+    def _lay(self, colors: ColorRaster, view: View, image: Image, users: NDArray[np.uint8]) -> None:
+        """Lay a picture on the ground but where its mask shows road users, or where something stands before the ground."""
         warp = warp_onto(view, self._ground.laid, self._z0_m, self.raster)
         if warp is None:
             return
-        users = draw_outlines(self._users.at(t_ns), view.camera, view.map_T_cam)
         opacity = np.where(sample_mask(users, warp, MASK_SHRINK), 0, warp.opacity)
-        hiding = self._hiding_at(t_ns)
+        hiding = self._hiding_at(view.t_ns) if view.camera.mount == "ego" else None
         if hiding is not None:
             opacity[find_hidden(view, warp, hiding)] = 0
         if view.camera.mount == "ego":
-            ego = draw_footprints([self._users.ego_at(t_ns)], self.raster)[warp.rows, warp.columns]
+            ego = draw_footprints([self._users.ego_at(view.t_ns)], self.raster)[warp.rows, warp.columns]
             opacity[ego > 0] = 0
-        self._colors.add(camera, image_bgr, warp, opacity.astype(np.float32))
+        colors.add(view.camera.name, image, warp, opacity.astype(np.float32))
 
     def build(self) -> GroundMap:
         """Return the map of all that was added, as far as anything is known."""
@@ -139,6 +148,9 @@ class GroundMapBuilder:
             self.notes.append("no color: there is no picture with a known pose")
             color, alpha = np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.uint8)
         else:
+            for view, pictures in self._standing.values():
+                self._lay(self._colors, view, *pictures.median())
+            self._standing.clear()
             color, alpha = self._colors.image()
         standing = draw_footprints([self._users.standing()], self.raster) > 0
         alpha[standing], color[standing] = 0, 0
