@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -186,3 +187,17 @@ def test_paths_of_several_vehicles_in_one_lane_make_one_middle() -> None:
     middle = np.median([a.waypoints.y_m[0] for a in world.agents])
     np.testing.assert_allclose(lane.points_m[:, 1], middle, atol=0.01)
     assert lane.confidence == 0.95
+
+
+@pytest.mark.real
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pandaset/002", "kitti_tracking"])
+def test_lanes_of_recorded_traffic_hold_every_path(name: str, real_data: Path) -> None:
+    from log2sim.cli.truth import truth_at
+
+    world = truth_at(real_data / name, None, None)
+    lanes = lanes_of(world)
+    require_consistent(lanes)
+    for path in collect_paths(world):
+        if path.rank < 2:
+            assert find_covered(lanes, path.line).all(), path.agent

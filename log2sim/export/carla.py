@@ -26,7 +26,10 @@ class Carla:
     """`replay_carla.py`, `scenario_carla.json` in CARLA's axes (y to the right, yaw clockwise), and `road.xodr`."""
 
     options: tuple[str, ...] = ("map", "mode")
-    loses = "sizes (CARLA's assets have their own; the data list by how much), map origin, cameras, quality, plan, provenance"
+    loses = (
+        "sizes (CARLA's assets have their own; the data list by how much), states of traffic lights, map origin, cameras, quality,"
+        " plan, provenance"
+    )
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
         """Write script, data and road."""

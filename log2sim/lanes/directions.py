@@ -22,6 +22,10 @@ DRIVEN, OUTER, INNER, UNKNOWN = 0.98, 0.9, 0.7, 0.5
 the one towards oncoming traffic may lead either way; nothing is known. Not measured, but for the order."""
 
 
+SURE = 0.65
+"""Directions of lanes that somebody drives or that lie next to such a one, not those told across two lines."""
+
+
 def find_side_of_traffic(paths: Sequence[DrivenPath]) -> int:
     """Return 1 where oncoming traffic passes to the left (right-hand traffic), -1 where to the right, 0 if none is seen."""
     votes = 0.0
@@ -63,10 +67,10 @@ def direct_strips(
 def _find_medians(
     strips: Sequence[LaneStrip], beside: Sequence[Beside], sides: Mapping[str, Marking | RoadBorder]
 ) -> set[int]:
-    """Return strips that nobody drives, behind solid lines, between lanes that vehicles drive in opposite directions."""
+    """Return strips that nobody drives, behind solid lines, between lanes that surely lead opposite ways."""
     ways: dict[int, set[tuple[bool, bool]]] = {}
     for pair in beside:
-        if strips[pair.other].directed >= DRIVEN:
+        if strips[pair.other].directed >= SURE:
             ways.setdefault(pair.route, set()).add((bool(pair.aside_m[0] > 0), pair.same_way))
     found = set()
     for k, strip in enumerate(strips):

@@ -156,7 +156,8 @@ def _is_bridge(routes: Sequence[Route], found: Match, k: int) -> bool:
     one, run, two = found.runs[k - 1 : k + 2]
     if one.route < 0 or two.route < 0:
         return False
-    return routes[one.route].line.length_m - found.s_m[run.first - 1] < JOIN_M and found.s_m[run.last + 1] < JOIN_M
+    left = routes[one.route].line.length_m - found.s_m[run.first - 1]
+    return bool(left < JOIN_M and found.s_m[run.last + 1] < JOIN_M)
 
 
 def _is_at_end(route: Route, s_m: float) -> bool:

@@ -29,8 +29,8 @@ class OpenScenario:
 
     options: tuple[str, ...] = ("revision", "map")
     loses = (
-        "cameras, quality, plan and provenance; players take a cyclist for a bicycle and what is 'other' for a van (an import"
-        " does not), and ScenarioRunner takes over no sizes"
+        "states of traffic lights, confidences of lanes and markings, cameras, quality, plan and provenance; players take a"
+        " cyclist for a bicycle and what is 'other' for a van (an import does not), and ScenarioRunner takes over no sizes"
     )
 
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
