@@ -13,6 +13,9 @@ STATES = ("red", "red_yellow", "yellow", "green", "off")
 RED_HUES, YELLOW_HUES, GREEN_HUES = (330.0, 22.0), (22.0, 75.0), (95.0, 215.0)
 # A lit lamp is brighter than its housing by at least this share of full scale, and has a color at least at its rim.
 MIN_CONTRAST, MIN_SATURATION = 0.18, 0.35
+# Lamps are in the middle of their housing: leaves and sky beside it are not looked at. Two lit lamps with their glare cover half of
+# it; signs, cones, and rear lamps of vehicles shine all over.
+SIDE_SHARE, MAX_LIT_SHARE = 0.22, 0.55
 HOUSING_QUANTILE = 0.25  # a housing covers more than half of its box; the sky around it may be brighter than its lamps
 # Share of a crop that a lamp covers: 0.1 of a box that fits; much less is a speck.
 MIN_LAMP_SHARE = 0.012
@@ -60,18 +63,21 @@ def _log_of(lamps: list[int], shares: Array, places: Array, upright: bool) -> fl
 
 def find_lamps(crop_bgr: NDArray[np.uint8]) -> tuple[Array, Array]:
     """Return how much of a crop shines red, yellow and green (3,), and the mean places (3,) from its top, NaN where nothing does."""
-    rgb = crop_bgr[..., ::-1].astype(np.float64) / 255
+    edge = int(SIDE_SHARE * crop_bgr.shape[1])
+    rgb = crop_bgr[:, edge : crop_bgr.shape[1] - edge, ::-1].astype(np.float64) / 255
     value = rgb.max(axis=2)
     chroma = value - rgb.min(axis=2)
     saturation = np.divide(chroma, value, out=np.zeros_like(value), where=value > 0)
     lit = value > np.quantile(value, HOUSING_QUANTILE) + MIN_CONTRAST
     colored = lit & (saturation > MIN_SATURATION)
+    shares, places = np.zeros(3), np.full(3, np.nan)
+    if lit.mean() > MAX_LIT_SHARE:
+        return shares, places
     hue = _hues(rgb, chroma)
     color = np.full(hue.shape, -1)
     color[_between(hue, RED_HUES)], color[_between(hue, YELLOW_HUES)], color[_between(hue, GREEN_HUES)] = 0, 1, 2
     rows = (np.arange(len(rgb)) + 0.5) / len(rgb)
     weight = np.where(colored, chroma * value, 0.0)
-    shares, places = np.zeros(3), np.full(3, np.nan)
     for k in range(3):
         part = np.where(color == k, weight, 0.0).sum(axis=1)
         shares[k] = part.sum() / rgb[..., 0].size

@@ -52,7 +52,9 @@ def most_probable_states(t_s: Array, evidence: Array) -> tuple[NDArray[np.intp],
     Viterbi (1967) for the course, forward-backward (Rabiner 1989) for the probabilities, with the transitions of a Markov process
     in continuous time.
     """
-    steps = [expm(rates() * gap) for gap in np.diff(t_s)]
+    gaps = np.round(np.diff(t_s), 3)
+    of_gap = {gap: expm(rates() * gap) for gap in set(gaps.tolist())}
+    steps = [of_gap[gap] for gap in gaps.tolist()]
     count = len(STATES)
     best, origin = np.zeros((len(t_s), count)), np.zeros((len(t_s), count), np.intp)
     best[0] = evidence[0]

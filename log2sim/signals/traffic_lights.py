@@ -15,10 +15,12 @@ from log2sim.signals.states import changes_of, most_probable_states
 
 # Fewer boxes are as likely of something else that is red or green: single false boxes do not repeat in one place.
 MIN_BOXES = 3
-# Middles of housings above the road: pedestrians' signals hang at 2.1 m and higher, those above lanes at 5 to 7 m.
-HEIGHT_M, HEIGHT_MARGIN_M = (1.8, 9.0), 1.0
+# Middles of housings above the road: pedestrians' signals begin at 2.1 m, those above lanes at 5 to 7 m.
+HEIGHT_M, HEIGHT_MARGIN_M = (1.9, 9.0), 0.2
 # Where the distance is less sure than this, no place is stated.
 MAX_SIGMA_M = 8.0
+# What is likelier wrong than right is not stated.
+MIN_CONFIDENCE = 0.5
 # Of pictures with a lit lamp.
 MIN_LIT_SHARE = 0.4
 # From so many boxes on, a light is as sure as their scores; half as sure from a third of it.
@@ -44,9 +46,7 @@ def find_signals(log: Log, scenario: Scenario, boxes: Sequence[LightBox]) -> tup
         signals += [] if signal is None else [signal]
     text = f"{len(signals)} traffic light{'' if len(signals) == 1 else 's'}"
     if left_out := len(housings) - len(signals):
-        text += (
-            f"; {left_out} places left out: seen too rarely, placed too roughly, not where signals hang, or no lamp lit"
-        )
+        text += f"; {left_out} places left out: seen too rarely, placed too roughly, not where signals hang, no lamp lit, or too unsure"
     return tuple(signals), text
 
 
@@ -69,7 +69,7 @@ def ground_height(log: Log, housing: Housing) -> float:
 
 
 def _signal(name: str, housing: Housing, scenario: Scenario) -> Signal | None:
-    """Return the signal of a housing; None where lamps are lit in too few of its pictures."""
+    """Return the signal of a housing; None where lamps are lit in too few of its pictures, or too unsure."""
     order = sorted(range(len(housing.boxes)), key=lambda k: (housing.boxes[k].t_ns, housing.boxes[k].camera))
     boxes = [housing.boxes[k] for k in order]
     t_s = np.array([(box.t_ns - scenario.t0_ns) / NS_PER_S for box in boxes])
@@ -77,13 +77,15 @@ def _signal(name: str, housing: Housing, scenario: Scenario) -> Signal | None:
     course, probability = most_probable_states(t_s, evidence)
     lit = evidence.argmax(axis=1) != STATES.index("off")
     # Dark from everywhere is more often a housing's back, or a tree, than a signal that is off.
-    if lit.mean() < MIN_LIT_SHARE:
-        return None
     times, states = changes_of(t_s, course)
+    if lit.mean() < MIN_LIT_SHARE or set(states) <= {"off", "unknown"}:
+        return None
     heading = _heading([housing.eyes[k] for k, shines in zip(order, lit) if shines], housing.position)
     score = float(np.mean([box.score for box in boxes]))
     repeated = 1 - (1 - score) ** (len(boxes) / SURE_BOXES * 2)
     confidence = repeated * float(probability.mean())
+    if confidence < MIN_CONFIDENCE:
+        return None
     return Signal(
         id=name,
         position_m=housing.position,
