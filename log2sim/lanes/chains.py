@@ -42,7 +42,7 @@ class Chain:
 
     def corners(self, pieces: Pieces) -> Array:
         """List the ends of all pieces in order, (2 K, 2), m."""
-        ends = pieces.ends()[self.members]
+        ends = pieces.ends(self.members)
         ends[self.flipped] = ends[self.flipped][:, ::-1]
         return ends.reshape(-1, 2)
 

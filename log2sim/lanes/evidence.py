@@ -14,7 +14,7 @@ MAX_BY_LENGTH = 5.5
 PER_METER_MORE, MAX_BY_MORE = 0.03, 1.5  # of longer lines
 DASHES = 1.5  # three or more dashes of one length at one distance
 # Sun between two shadows and wet glare are ridges to a camera, too: more than that it alone does not say.
-MAX_BY_CAMERA = 3.5
+MAX_BY_CAMERA = 3.0
 UNEVEN = -1.5  # a step beside which a little stands out
 NOT_BRIGHTEST, MIN_OUTSHINING = -2.5, 0.4  # no brighter than much of the ground around; share of its contrast
 # Glare fades to its sides; paint ends. Lines of 0.3 m or less look alike to a camera.

@@ -68,10 +68,11 @@ class Pieces:
         """Choose pieces by a mask or by indices."""
         return Pieces(*(getattr(self, f.name)[chosen] for f in fields(self)))
 
-    def ends(self) -> Array:
-        """Both ends (N, 2, 2), m."""
-        half = np.stack([np.cos(self.direction), np.sin(self.direction)], 1) * self.length_m[:, None] / 2
-        return np.stack([self.xy - half, self.xy + half], 1)
+    def ends(self, chosen: NDArray[np.int64]) -> Array:
+        """Return both ends (K, 2, 2), m, of some pieces (K,)."""
+        angle, xy = self.direction[chosen], self.xy[chosen]
+        half = np.stack([np.cos(angle), np.sin(angle)], 1) * self.length_m[chosen, None] / 2
+        return np.stack([xy - half, xy + half], 1)
 
 
 def no_pieces(count: int, **known: Array) -> Pieces:

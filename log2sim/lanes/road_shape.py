@@ -17,8 +17,8 @@ TOLERANCE_M, TOLERANCE_PER_M = 0.12, 0.01  # of a line's course: its own error, 
 SAME_LINE_M = 0.6  # double lines are one lane line
 MAX_SLOPE = 0.35  # of lines that run along the road where the camera is
 STEP_M = 0.5
-BEND_SIGMA_PER_M = 0.002  # curvature of roads at more than 50 km/h: radii of 250 m and more are usual
-MIN_WEIGHT = 0.5
+BEND_SIGMA_PER_M = 0.01  # half the curvature of a radius of 50 m; a line counts as one observation, however long it is
+MIN_WEIGHT = 0.8
 
 
 @dataclass(frozen=True, eq=False)
