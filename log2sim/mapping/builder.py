@@ -43,6 +43,10 @@ HEIGHT_CELL_M = 0.1
 ROAD_HALF_WIDTH_M = 1.0
 # A sweep shows what hid the ground in a picture if both were taken within this time.
 MAX_APART_S = 0.15
+# LiDARs on roofs do not see the ground nearer than this around the vehicle.
+BLIND_M = 6.0
+# Rings of a LiDAR are up to this far apart on ground that its pictures still show finely.
+MAX_AWAY_M = 2.0
 Progress = Callable[[int, int], None]
 
 
@@ -133,6 +137,7 @@ class GroundMapBuilder:
         if warp is None:
             return
         opacity = np.where(sample_mask(users, warp, MASK_SHRINK), 0, warp.opacity)
+        opacity[self._likely_ground[warp.rows, warp.columns] == 0] = 0
         hiding = self._hiding_at(view.t_ns) if view.camera.mount == "ego" else None
         if hiding is not None:
             opacity[find_hidden(view, warp, hiding)] = 0
@@ -192,6 +197,21 @@ class GroundMapBuilder:
         surface = estimate_surface(points, coarse, self._anchors, self._z0_m)
         return _Ground(points, surface, surface.smoothed(), collector.hiding)
 
+    @cached_property
+    def _likely_ground(self) -> NDArray[np.uint8]:
+        """Mask (R, C), 1 where there may be ground: everywhere without sweeps, else near what they show or the ego passed.
+
+        Behind that stand houses, which pictures would smear over the map.
+        """
+        surface = self._ground.surface
+        if not surface.known.any():
+            return np.ones(self.raster.shape, dtype=np.uint8)
+        blind = self._road(surface.raster, BLIND_M)
+        away = cv2.distanceTransform((~surface.known & ~blind).astype(np.uint8), cv2.DIST_L2, 3)
+        near = (away * surface.raster.resolution_m <= MAX_AWAY_M).astype(np.uint8)
+        factor = round(surface.raster.resolution_m / self.raster.resolution_m)
+        return np.repeat(np.repeat(near, factor, axis=0), factor, axis=1)
+
     def _hiding_at(self, t_ns: int) -> Array | None:
         """Return points (H, 3), m, map frame, of what stood above the ground at a time; None where no sweep is near."""
         stamps = np.array(sorted(self._ground.hiding), dtype=np.int64)
@@ -208,13 +228,13 @@ class GroundMapBuilder:
         intensity = map_intensity(ground.points, ground.surface, self.raster, self._road(ground.surface.raster))
         return height, intensity
 
-    def _road(self, raster: Raster) -> NDArray[np.bool_]:
-        """Mask (R, C) of the cells that the ego drove over."""
+    def _road(self, raster: Raster, half_width_m: float = ROAD_HALF_WIDTH_M) -> NDArray[np.bool_]:
+        """Mask (R, C) of the cells that the ego drove over, or past at a distance."""
         mask = np.zeros(raster.shape, dtype=np.uint8)
         if len(self._path):
             rows, columns = raster.cells_of(self._path[:, :2])
             line = np.rint(np.stack([columns, rows], axis=1)).astype(np.int32)
-            cv2.polylines(mask, [line], False, 1, max(round(2 * ROAD_HALF_WIDTH_M / raster.resolution_m), 1))
+            cv2.polylines(mask, [line], False, 1, max(round(2 * half_width_m / raster.resolution_m), 1))
         return mask > 0
 
 
