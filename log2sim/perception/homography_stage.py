@@ -19,6 +19,7 @@ from log2sim.perception.homography.fit import HomographyFit, refused_fit
 from log2sim.perception.homography.placement import place_obstacle
 from log2sim.perception.homography.rig import Rig
 from log2sim.perception.homography.rig_fit import RigFit, fit_rig
+from log2sim.perception.homography.rig_plane import SAMPLES
 from log2sim.plan import HomographyScope, Plan
 
 # A box that ends nearer than this to the lower image border is cut by it and has no foot in the image.
@@ -110,7 +111,7 @@ def _fit_together(
         feet, ground = (
             {c: Correspondences.join(o.get(c, [])) for c in names} for o in (observed.feet, observed.ground)
         )
-        fitted = fit_rig(rig, feet, ground, rng=rng)
+        fitted = fit_rig(rig, feet, ground, rng=rng, samples=options.hypotheses or SAMPLES)
         for c in names:
             fit = fitted.fits.get(c)
             if fit is not None and fit.ok:

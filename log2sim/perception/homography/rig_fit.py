@@ -25,7 +25,7 @@ from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.fit import HomographyFit, PitchRoll, refused_fit
 from log2sim.perception.homography.rig import Rig, RigState, foot_homography, foot_sigma_m, road_homography
 from log2sim.perception.homography.rig_feet import FeetFit, fit_feet
-from log2sim.perception.homography.rig_plane import HeightRows, find_plane, tilt_of_ticks
+from log2sim.perception.homography.rig_plane import SAMPLES, HeightRows, find_plane, tilt_of_ticks
 from log2sim.perception.homography.rig_rows import RigRows, heights_of
 from log2sim.perception.homography.stabilization import MIN_SIGNIFICANCE_SIGMA, HeldOutErrors
 from log2sim.perception.homography.validation import MIN_INLIER_SHARE, MIN_INLIERS
@@ -78,7 +78,12 @@ class RigFit:
 
 
 def fit_rig(
-    rig: Rig, feet: Mapping[str, Correspondences], ground: Mapping[str, Correspondences], *, rng: np.random.Generator
+    rig: Rig,
+    feet: Mapping[str, Correspondences],
+    ground: Mapping[str, Correspondences],
+    *,
+    rng: np.random.Generator,
+    samples: int = SAMPLES,
 ) -> RigFit:
     """Fit the homographies of all cameras of a rig.
 
@@ -88,11 +93,13 @@ def fit_rig(
     feet, ground : mapping of str to Correspondences
         Of obstacles and of LiDAR ground points, by camera.
     rng : numpy.random.Generator
+    samples : int
+        Planes that RANSAC draws for the whole rig.
     """
     foot_rows = RigRows.of(rig, feet, FOOT_SIGMA_PX, FOOT_SIGMA_M)
     ground_rows = RigRows.of(rig, ground, GROUND_SIGMA_PX, GROUND_SIGMA_M)
     heights = _heights(rig, RigRows.join([foot_rows, ground_rows]))
-    plane = find_plane(heights, rng) if len(heights.tick) >= MIN_ROWS else None
+    plane = find_plane(heights, rng, samples) if len(heights.tick) >= MIN_ROWS else None
     if plane is None:
         reason = f"{len(heights.tick)} correspondences of all cameras do not determine the ground"
         return RigFit(reason, rig)
