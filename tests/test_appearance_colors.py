@@ -81,6 +81,12 @@ def test_what_is_hidden_is_not_looked_at() -> None:
     both = replace(truth, agents=(*truth.agents, wall))
     assert "a" in sampled(log, truth).colors()
     assert "a" not in sampled(log, both).colors()
+    sampler = ColorSampler(log, both)
+    sampler._views = choose_views(log, truth, ["a"])  # even where a frame was chosen
+    for camera, frames in sampler._views.items():
+        for index in frames:
+            sampler.add(camera, index, log.streams[camera].read(index))
+    assert sampler.colors() == {}
 
 
 def test_no_frame_is_chosen_from_which_a_vehicle_is_tiny_or_outside() -> None:
