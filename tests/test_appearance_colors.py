@@ -77,7 +77,7 @@ def test_what_is_hidden_is_not_looked_at() -> None:
     log, truth = street()
     red = next(agent for agent in truth.others if agent.id == "a")
     w = red.waypoints
-    wall = replace(red, id="wall", category="other", waypoints=replace(w, y_m=w.y_m - 1.6), size_m=(9.0, 1.0, 4.0))
+    wall = replace(red, id="wall", category="other", waypoints=replace(w, y_m=w.y_m - 1.6), size_m=(30.0, 1.0, 4.0))
     both = replace(truth, agents=(*truth.agents, wall))
     assert "a" in sampled(log, truth).colors()
     assert "a" not in sampled(log, both).colors()
