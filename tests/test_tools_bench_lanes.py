@@ -36,7 +36,7 @@ def result(seed: int, precision: float | None, **colors: Any) -> dict[str, Any]:
     }
     case = bench_lanes.Case("scenes/worn.toml", "dusk", "rain", "worn")
     return {
-        "case": case.name, "scene": case.scene, "condition": case.condition, "seed": seed,
+        "case": case.name, "scene": case.scene, "sky": case.sky, "condition": case.condition, "seed": seed,
         "map_features": features, "colors": {**named, **colors}, "signals": None,
     }  # fmt: skip
 
@@ -52,7 +52,7 @@ def test_rows_hold_means_over_seeds_and_sums_of_counts() -> None:
 
 def test_colors_are_summed_by_light() -> None:
     rows = bench_lanes.color_rows([result(1, 0.8), result(2, 0.6, right=2, confused={}, ciede2000_median=None)])
-    assert rows == [[light, "6", "4", "3 of 4", "6.0", "red as brown (1)"] for light in ("dusk", "all")]
+    assert rows == [[sky, "6", "4", "3 of 4", "6.0", "red as brown (1)"] for sky in ("dusk, rain", "all")]
 
 
 @pytest.mark.parametrize(("rig", "cameras", "lidars"), [("all", 1, 1), ("cameras", 1, 0), ("lidar", 0, 1)])

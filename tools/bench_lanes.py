@@ -5,7 +5,7 @@
 Each scene is rendered in its conditions, reconstructed and compared with its truth as `log2sim evaluate` does: precision and
 recall of lane lines at 0.3 m within 40 m of the ego's path where a sensor saw the ground, lateral error, kinds, false length,
 stop lines and crosswalks, and how much of the true paths lies in a found lane. A second table has the colors of vehicles by
-light. `--rig` leaves out the other sensors. `--keep` stores rendered logs and scenarios, and takes the logs that are there.
+light and weather. `--rig` leaves out the other sensors. `--keep` stores rendered logs and scenarios, and takes the logs that are there.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ HEADER = [
     "scene", "condition", "precision", "recall", "within 20 m", "off by, median", "95 %", "kind right", "false per 100 m", "stop lines",
     "crosswalks", "lanes precision", "recall", "center off by", "paths inside",
 ]  # fmt: skip
-COLORS = ["light", "vehicles", "with color", "name right", "CIEDE2000", "confused"]
+COLORS = ["light and weather", "vehicles", "with color", "name right", "CIEDE2000", "confused"]
 
 
 @dataclass(frozen=True)
@@ -49,11 +49,14 @@ class Case:
     note: str = ""
 
     @property
+    def sky(self) -> str:
+        """Light and weather."""
+        return self.light if self.weather == "clear" else f"{self.light}, {self.weather}"
+
+    @property
     def condition(self) -> str:
         """What a table calls it."""
-        return ", ".join(
-            part for part in (self.light, self.weather if self.weather != "clear" else "", self.note) if part
-        )
+        return f"{self.sky}, {self.note}" if self.note else self.sky
 
     @property
     def name(self) -> str:
@@ -114,6 +117,7 @@ def measure(case: Case, seed: int, options: argparse.Namespace, keep: Path) -> d
     return {
         "case": case.name,
         "scene": case.scene,
+        "sky": case.sky,
         "condition": case.condition,
         "seed": seed,
         **{k: figures[k] for k in keys},
@@ -167,13 +171,10 @@ def lane_rows(results: Sequence[dict[str, Any]]) -> list[list[str]]:
 
 
 def color_rows(results: Sequence[dict[str, Any]]) -> list[list[str]]:
-    """One row a light, and one for all."""
+    """One row for each light and weather, and one for all."""
     out = []
-    lights = [*dict.fromkeys(r["condition"].split(", ")[0] for r in results), "all"]
-    for light in lights:
-        found = [
-            r["colors"] for r in results if light in ("all", r["condition"].split(", ")[0]) and r["colors"] is not None
-        ]
+    for sky in [*dict.fromkeys(r["sky"] for r in results), "all"]:
+        found = [r["colors"] for r in results if sky in (r["sky"], "all") and r["colors"] is not None]
         total: Counter[str] = Counter()
         confused: Counter[str] = Counter()
         for row in found:
@@ -183,7 +184,7 @@ def color_rows(results: Sequence[dict[str, Any]]) -> list[list[str]]:
         right = f"{total['right']} of {total['named']}" if total["named"] else "-"
         wrong = ", ".join(f"{name} ({n})" for name, n in confused.most_common(4))
         numbers = [str(total["vehicles"]), str(total["with_color"]), right]
-        out.append([light, *numbers, cell(float(np.mean(away)) if away else None, 1), wrong or "-"])
+        out.append([sky, *numbers, cell(float(np.mean(away)) if away else None, 1), wrong or "-"])
     return out
 
 
