@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from replay_maneuvers import agent_from, driven
 from replay_scenes import line, parked, walker
 
-from log2sim.datatypes import Agent, Scenario
+from log2sim.datatypes import Agent, MapFeatures, MapLane, Scenario
 from log2sim.documents import check
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.prediction import smoothing
@@ -170,6 +170,20 @@ def test_a_lane_is_a_path_that_is_known_beforehand() -> None:
     found = predict_scenario(scene(corner("a", 0.0)), lanes=[lane])
     free = predict_scenario(scene(corner("a", 0.0)))
     assert errors(found, "a", "path", 3.0).mean() < 0.3 * errors(free, "a", "path", 3.0).mean()
+
+
+@pytest.mark.parametrize(("origin", "known"), [("markings", True), ("both", True), ("paths", False)])
+def test_lanes_between_markings_are_known_and_those_out_of_paths_are_not(origin: str, known: bool) -> None:
+    """Lanes out of paths are where agents went later."""
+    ahead = corner("lane", 0.0).waypoints
+    points = np.column_stack([ahead.x_m, ahead.y_m, 0 * ahead.x_m])
+    lane = MapLane("lane", points, np.full(len(points), 3.5), inferred_from=origin)
+    world = scene(corner("a", 0.0))
+    found = predict_scenario(replace(world, map_features=MapFeatures(lanes=(lane,))))
+    free = predict_scenario(world)
+    share = errors(found, "a", "path", 3.0).mean() / errors(free, "a", "path", 3.0).mean()
+    assert (share < 0.3) is known
+    assert (share == 1.0) is not known
 
 
 @pytest.mark.parametrize(

@@ -118,7 +118,11 @@ def leads_of(horizon_s: float) -> Array:
 
 
 def predict_scenario(
-    scenario: Scenario, horizon_s: float = 3.0, *, methods: Sequence[str] = tuple(METHODS), lanes: Sequence[Array] = ()
+    scenario: Scenario,
+    horizon_s: float = 3.0,
+    *,
+    methods: Sequence[str] = tuple(METHODS),
+    lanes: Sequence[Array] | None = None,
 ) -> Predictions:
     """Predict where each agent of a scenario will be, at every tick and from its states up to then.
 
@@ -129,8 +133,9 @@ def predict_scenario(
         Longest lead.
     methods : sequence of str
         Of `METHODS`.
-    lanes : sequence of (K, 2) float64, m
-        Middle lines of lanes in their direction of travel, map frame, for the method `path`; scenarios hold none.
+    lanes : sequence of (K, 2) float64, m, or None
+        Middle lines of lanes in their direction of travel, map frame, for the method `path`; None for those of the scenario
+        that are between markings.
 
     Raises
     ------
@@ -142,7 +147,15 @@ def predict_scenario(
     Only states up to a tick are used. Those of a reconstruction were smoothed over the whole log, so that they depend a little
     of what came next: predictions by a system that measures while it drives are worse.
     """
-    return predict_table(table_of(scenario, TICK_S), leads_of(horizon_s), methods, lanes)
+    known = marked_lanes(scenario) if lanes is None else lanes
+    return predict_table(table_of(scenario, TICK_S), leads_of(horizon_s), methods, known)
+
+
+def marked_lanes(scenario: Scenario) -> list[Array]:
+    """Return the middle lines (K, 2) of a scenario's lanes between markings; those out of paths know where agents will go."""
+    if scenario.map_features is None:
+        return []
+    return [lane.points_m[:, :2] for lane in scenario.map_features.lanes if lane.inferred_from != "paths"]
 
 
 def predict_table(
