@@ -202,5 +202,4 @@ class AppearanceConfig(Section):
     """What pictures show of agents and traffic lights."""
 
     colors: bool = setting(True, "Whether colors of vehicles are estimated.")
-    clothing: bool = setting(False, "Whether pedestrians and riders get the color of their clothing.")
     signals: bool = setting(True, "Whether traffic lights and their states are looked for.")

@@ -18,7 +18,7 @@ from log2sim.errors import LogError
 from log2sim.lanes.lane_graph import infer_lanes
 from log2sim.lanes.markings import find_markings
 from log2sim.mapping.builder import GroundMapBuilder
-from log2sim.mapping.pose_refinement import refine_poses
+from log2sim.mapping.pose_refinement import place_as_given, refine_poses
 from log2sim.outcome import Outcome
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.frames import RecordReader
@@ -77,10 +77,11 @@ def describe(scenario: Scenario, recorded: Recorded) -> Description:
     """Add what the plan keeps of lanes, colors and traffic lights to a scenario."""
     log, plan = recorded.log, recorded.plan
     reader, notes = RecordReader(log), []
-    ground = colors = None
+    mapped, ground, colors = log, None, None
     if plan.keeps(Stage.LANES):
         try:
-            ground = GroundMapBuilder(refine_poses(log, scenario, reader), scenario, recorded.config.map, reader)
+            mapped = refine_poses(log, scenario, reader)
+            ground = GroundMapBuilder(mapped, scenario, recorded.config.map, reader)
         except LogError as problem:
             notes.append(f"no map of the ground: {problem}")
     if plan.keeps(Stage.COLORS):
@@ -89,7 +90,10 @@ def describe(scenario: Scenario, recorded: Recorded) -> Description:
     with recorded.clock.stage("pictures"):
         look_again(log, reader, consumers, lambda done, total: recorded.report_progress("pictures", done, total))
     with recorded.clock.stage("lanes"):
-        features = read_map(ground, scenario, notes) if plan.keeps(Stage.LANES) else None
+        features = None
+        if plan.keeps(Stage.LANES):
+            shown = read_map(ground, notes).moved(lambda points_m: place_as_given(points_m, mapped, log))
+            features = with_lanes(shown, scenario)
     with recorded.clock.stage("colors"):
         agents = scenario.agents if colors is None else with_colors(scenario.agents, colors)
     with recorded.clock.stage("signals"):
@@ -100,15 +104,19 @@ def describe(scenario: Scenario, recorded: Recorded) -> Description:
     return Description(described, outcomes_of(plan, described, seen), figures, reader)
 
 
-def read_map(ground: GroundMapBuilder | None, scenario: Scenario, notes: Sequence[str]) -> MapFeatures:
-    """Find markings and borders in the map of the ground, if there is one, and lanes between them and where agents drove."""
-    found = MapFeatures(notes=tuple(notes))
-    if ground is not None:
-        seen = ground.build()
-        markings, borders, marking_notes = find_markings(seen)
-        found = MapFeatures(markings, borders, notes=(*notes, *seen.notes, *marking_notes))
-    lanes, lane_notes = infer_lanes(found.markings, found.borders, scenario)
-    return replace(found, lanes=lanes, notes=(*found.notes, *lane_notes))
+def read_map(ground: GroundMapBuilder | None, notes: Sequence[str]) -> MapFeatures:
+    """Find markings and borders in the map of the ground, if there is one."""
+    if ground is None:
+        return MapFeatures(notes=tuple(notes))
+    seen = ground.build()
+    markings, borders, more = find_markings(seen)
+    return MapFeatures(markings, borders, notes=(*notes, *seen.notes, *more))
+
+
+def with_lanes(features: MapFeatures, scenario: Scenario) -> MapFeatures:
+    """Add the lanes between markings and where agents drove."""
+    lanes, notes = infer_lanes(features.markings, features.borders, scenario)
+    return replace(features, lanes=lanes, notes=(*features.notes, *notes))
 
 
 def with_colors(agents: tuple[Agent, ...], sampler: ColorSampler) -> tuple[Agent, ...]:
