@@ -9,7 +9,7 @@ from log2sim.calibration.surfaces import Registration
 from log2sim.calibration.twists import exp_of, log_of
 from log2sim.datatypes import Lidar, Log, Scenario, Stream, Sweep
 from log2sim.geometry import Array, PoseTrack, apply, inverse, rotation_from_rpy, transform
-from log2sim.mapping.pose_refinement import Keyframe, corrected, refine_poses, solve_twists
+from log2sim.mapping.pose_refinement import Keyframe, corrected, place_as_given, refine_poses, solve_twists
 from log2sim.perception.frames import RecordReader
 
 T_NS = np.arange(0, 41) * 100_000_000 + 10**18
@@ -122,3 +122,18 @@ def test_logs_without_lidar_or_way_stay_as_they_are() -> None:
     assert refine_poses(bare, whole(), RecordReader(bare)) is bare
     standing = street_log(np.repeat(true_poses()[:1], len(T_NS), axis=0))
     assert refine_poses(standing, whole(), RecordReader(standing)) is standing
+
+
+def test_a_map_of_refined_poses_is_put_back_where_the_agents_are() -> None:
+    log = street_log(drifted())
+    refined = refine_poses(log, whole(), RecordReader(log))
+    assert log.ego is not None
+    assert refined.ego is not None
+    local = np.array([[3.0, 1.5, -0.2], [-1.0, -4.0, 0.0]])
+    for k in (0, 30):
+        on_map = apply(refined.ego.map_T_ego[k], local)
+        expected = apply(log.ego.map_T_ego[k], local)
+        np.testing.assert_allclose(place_as_given(on_map, refined, log), expected, atol=0.06)
+    assert place_as_given(local, log, log) is local
+    moved = refined.ego.map_T_ego[:, :3, 3] - log.ego.map_T_ego[:, :3, 3]
+    assert np.linalg.norm(moved, axis=1).max() > 0.2
