@@ -279,3 +279,24 @@ def test_shadows_are_no_borders() -> None:
     painter.lines([line_of(bend, 0, 50)])
     shadows(painter)
     assert find_markings(painter.ground())[1] == ()
+
+
+def dashes(dash_m: float, gap_m: float, *spans: tuple[float, float]) -> np.ndarray:
+    """Strokes of a dashed line that is painted within spans alone."""
+    begin = np.arange(0.0, 200.0, dash_m + gap_m)
+    return np.array([(b, b + dash_m) for b in begin if any(low <= b and b + dash_m <= high for low, high in spans)])
+
+
+@pytest.mark.parametrize(("dash_m", "gap_m"), [(3.0, 3.0), (1.5, 4.5), (6.0, 12.0), (3.0, 9.0)])
+def test_dashed_lines_end_at_a_junction_and_not_at_their_own_gaps(dash_m: float, gap_m: float) -> None:
+    (whole,) = stretches_of(dashes(dash_m, gap_m, (0.0, 120.0)))
+    assert whole.kind == "dashed"
+    far = max(14.0, 4 * gap_m)
+    parts = stretches_of(dashes(dash_m, gap_m, (0.0, 70.0), (70.0 + far, 200.0)))
+    assert len(parts) == 2
+    assert all(part.kind == "dashed" for part in parts)
+    assert parts[0].end_m <= 70.0
+    assert parts[1].begin_m >= 70.0 + far
+    one_worn_away = np.delete(dashes(dash_m, gap_m, (0.0, 120.0)), 3, axis=0)
+    if 2 * gap_m + dash_m < 10.0 or 2 * gap_m + dash_m <= 3 * gap_m:
+        assert len(stretches_of(one_worn_away)) == 1

@@ -25,6 +25,8 @@ LONG_M = 4.0
 PERIODS_M, PHASE_M, MIN_BARE_M = (1.6, 26.0), 0.25, 0.8
 MIN_ON, MAX_OFF = 0.35, 0.12  # shares with paint within dashes and between them
 MIN_GAIN = 8.0  # nats, as a hundred periods at as many phases are tried
+# Roads that join are 5.5 m wide and lines end some meters before them; a worn dash or two leave less than that, or than three gaps.
+JUNCTION_M, LONG_GAPS, FEW_GAPS = 10.0, 3.0, 3
 SOLID_DASHES = 2.5  # a stroke so many times as long as the dashes beside it is a solid part
 
 
@@ -148,10 +150,17 @@ def stretches_of(strokes: Array) -> list[Stretch]:
         if part[0, 1] - part[0, 0] <= MAX_DASH_M and is_dashed(part):
             out += _solid_parts(solid)
             solid = []
-            out.append(Stretch(float(part[0, 0]), float(part[-1, 1]), "dashed", len(part)))
+            out += [Stretch(float(p[0, 0]), float(p[-1, 1]), "dashed", len(p)) for p in _without_long_gaps(part)]
         else:
             solid += list(part)
     return out + _solid_parts(solid)
+
+
+def _without_long_gaps(strokes: Array) -> list[Array]:
+    """Part dashes (K, 2) where several are missing in a row, as lines end before a junction and begin again behind it."""
+    gaps = strokes[1:, 0] - strokes[:-1, 1]
+    usual = float(np.median(gaps) if len(gaps) > FEW_GAPS else gaps.min(initial=np.inf))
+    return np.split(strokes, np.flatnonzero(gaps > max(JUNCTION_M, LONG_GAPS * usual)) + 1)
 
 
 def _alike_parts(strokes: Array) -> list[Array]:

@@ -92,7 +92,8 @@ class SignalLights:
 
 def road_rows(scenario: Scenario) -> list[tuple[Any, str]]:
     """Return the lines of the legend for what there is."""
-    features, rows = scenario.map_features, []
+    features = scenario.map_features
+    rows: list[tuple[Any, str]] = []
     if features is not None:
         if features.lanes:
             inferred = sum(lane.inferred_from == "paths" for lane in features.lanes)
