@@ -15,8 +15,8 @@ from log2sim.appearance.colors import ColorSampler
 from log2sim.config import Config
 from log2sim.datatypes import Agent, Log, MapFeatures, Scenario
 from log2sim.errors import LogError
-from log2sim.lanes.lane_graph import infer_lanes
-from log2sim.lanes.markings import find_markings
+from log2sim.lanes.detection.markings import find_markings
+from log2sim.lanes.graph.lane_graph import infer_lanes
 from log2sim.mapping.builder import GroundMapBuilder
 from log2sim.mapping.pose_refinement import place_as_given, refine_poses
 from log2sim.outcome import Outcome

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from log2sim.datatypes import Agent, MapFeatures, MapLane, Scenario
 from log2sim.geometry import Array
-from log2sim.lanes.coverage import find_covered
-from log2sim.lanes.driven_paths import collect_paths
-from log2sim.lanes.lane_graph import infer_lanes
-from log2sim.lanes.polyline import Polyline
+from log2sim.lanes.graph.coverage import find_covered
+from log2sim.lanes.graph.driven_paths import collect_paths
+from log2sim.lanes.graph.lane_graph import infer_lanes
+from log2sim.lanes.graph.polyline import Polyline
 
 
 def turn_left(radius_m: float = 9.0) -> Array:

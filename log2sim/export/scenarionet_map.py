@@ -10,7 +10,7 @@ from log2sim.datatypes import MapFeatures, MapLane, Marking, Scenario
 from log2sim.export.roads.lanes import lanes
 from log2sim.export.roads.signal_lanes import signal_lanes
 from log2sim.geometry import Array
-from log2sim.lanes.polyline import Polyline
+from log2sim.lanes.graph.polyline import Polyline
 
 SPACING_M = 1.0
 """Of points of lanes, as MetaDrive's own maps have them."""

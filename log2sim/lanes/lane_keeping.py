@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, MapLane
 from log2sim.geometry import Array
-from log2sim.lanes.matching import MAX_TURN_RAD
-from log2sim.lanes.polyline import Polyline
+from log2sim.lanes.graph.matching import MAX_TURN_RAD
+from log2sim.lanes.graph.polyline import Polyline
 
 STEP_S = 0.1
 """Times at which positions are taken: a vehicle drifts within its lane by centimeters in that time."""

@@ -6,7 +6,7 @@ from collections import Counter
 from typing import Any
 
 from log2sim.datatypes import MapFeatures, Scenario
-from log2sim.lanes.lane_graph import infer_lanes
+from log2sim.lanes.graph.lane_graph import infer_lanes
 from log2sim.lanes.lane_keeping import summarize_lane_keeping
 
 

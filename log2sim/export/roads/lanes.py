@@ -6,8 +6,8 @@ import numpy as np
 
 from log2sim.datatypes import Agent, MapFeatures, MapLane, Scenario
 from log2sim.geometry import Array
-from log2sim.lanes.lane_graph import add_missing_lanes, infer_lanes
-from log2sim.lanes.polyline import Polyline
+from log2sim.lanes.graph.lane_graph import add_missing_lanes, infer_lanes
+from log2sim.lanes.graph.polyline import Polyline
 
 STANDING_M = 20.0
 """Length of the lane under an agent that stands, where nobody moves: its whole vehicle is on it."""

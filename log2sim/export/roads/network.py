@@ -10,7 +10,7 @@ import numpy as np
 from log2sim.datatypes import MapLane
 from log2sim.export.roads.reference_line import ReferenceLine, fit
 from log2sim.geometry import Array
-from log2sim.lanes.polyline import Polyline
+from log2sim.lanes.graph.polyline import Polyline
 
 EXTENSION_M = 10.0
 """Roads go on straight for so long where nothing is known of what is before or after them, so that whole vehicles are on them."""

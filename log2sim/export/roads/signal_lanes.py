@@ -8,7 +8,7 @@ import numpy as np
 
 from log2sim.datatypes import MapLane, Signal
 from log2sim.geometry import wrap_angle
-from log2sim.lanes.polyline import Polyline
+from log2sim.lanes.graph.polyline import Polyline
 
 FACING_RAD = float(np.deg2rad(40.0))
 """Lamps face the traffic that they are for; posts beside the road turn them by some degrees towards it."""

@@ -9,8 +9,8 @@ import numpy as np
 
 from log2sim.datatypes import MapLane, Marking, RoadBorder
 from log2sim.geometry import wrap_angle
-from log2sim.lanes.polyline import Polyline
-from log2sim.lanes.strips import PARALLEL_RAD, list_road_lines
+from log2sim.lanes.graph.polyline import Polyline
+from log2sim.lanes.graph.strips import PARALLEL_RAD, list_road_lines
 
 NEAR_M = 0.7
 """A line this near to the edge of a lane is its edge: vehicles, and so lanes along their paths, keep half a meter off the middle."""

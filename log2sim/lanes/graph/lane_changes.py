@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from log2sim.geometry import Array
-from log2sim.lanes.beside import MAX_APART_M, MIN_APART_M, PARALLEL_RAD
-from log2sim.lanes.driven_paths import DrivenPath
-from log2sim.lanes.matching import MAX_TURN_RAD
+from log2sim.lanes.graph.beside import MAX_APART_M, MIN_APART_M, PARALLEL_RAD
+from log2sim.lanes.graph.driven_paths import DrivenPath
+from log2sim.lanes.graph.matching import MAX_TURN_RAD
 
 SAME_M = 1.3
 """Two vehicles in one lane are less apart than this: each keeps within some half meter of its middle."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from log2sim.geometry import Array
-from log2sim.lanes.layers import CoarseTile, Layer, coarse_factor, iterate_tiles
+from log2sim.lanes.detection.layers import CoarseTile, Layer, coarse_factor, iterate_tiles
 from log2sim.mapping.ground_map import GroundMap
 
 DIRECTIONS = 12  # 15 deg apart: at worst a line of 0.12 m leaves the middle of the mean at its ends

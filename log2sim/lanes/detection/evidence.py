@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from log2sim.geometry import Array
-from log2sim.lanes.profiles import Pieces
+from log2sim.lanes.detection.profiles import Pieces
 
 # Log-odds before anything but one ridge of a meter is known: on gravel, one in 20 is followed by paint.
 PRIOR = -3.0

@@ -13,14 +13,14 @@ from scipy.spatial import cKDTree
 
 from log2sim.datatypes import Marking, RoadBorder
 from log2sim.geometry import Array
-from log2sim.lanes.chains import touching_chains
-from log2sim.lanes.curves import fit_curve, thin
-from log2sim.lanes.evidence import probability
-from log2sim.lanes.heights import at_height
-from log2sim.lanes.layers import Layer, Mask, log_color, log_intensity
-from log2sim.lanes.pieces import fit_lines
-from log2sim.lanes.profiles import no_pieces
-from log2sim.lanes.ridges import RidgePoints, turn_image, warp
+from log2sim.lanes.detection.chains import touching_chains
+from log2sim.lanes.detection.curves import fit_curve, thin
+from log2sim.lanes.detection.evidence import probability
+from log2sim.lanes.detection.heights import at_height
+from log2sim.lanes.detection.layers import Layer, Mask, log_color, log_intensity
+from log2sim.lanes.detection.pieces import fit_lines
+from log2sim.lanes.detection.profiles import no_pieces
+from log2sim.lanes.detection.ridges import RidgePoints, turn_image, warp
 from log2sim.mapping.ground_map import GroundMap
 
 CELL_M = 0.2

@@ -11,13 +11,13 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from log2sim.geometry import Array
-from log2sim.lanes.chains import Chain
-from log2sim.lanes.curves import Curve
-from log2sim.lanes.evidence import log_odds_of_line
-from log2sim.lanes.layers import log_paint
-from log2sim.lanes.lines import PaintedLine
-from log2sim.lanes.profiles import Pieces
-from log2sim.lanes.strokes import trace
+from log2sim.lanes.detection.chains import Chain
+from log2sim.lanes.detection.curves import Curve
+from log2sim.lanes.detection.evidence import log_odds_of_line
+from log2sim.lanes.detection.layers import log_paint
+from log2sim.lanes.detection.lines import PaintedLine
+from log2sim.lanes.detection.profiles import Pieces
+from log2sim.lanes.detection.strokes import trace
 from log2sim.mapping.ground_map import GroundMap
 
 # Bars of crosswalks: 0.3 to 0.6 m wide, as far apart (StVO sign 293: 0.5 m; MUTCD 3C: 12 to 24 in, gaps up to 60 in).

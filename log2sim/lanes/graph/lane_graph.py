@@ -11,22 +11,22 @@ import numpy as np
 
 from log2sim.datatypes import MapLane, Marking, RoadBorder, Scenario
 from log2sim.geometry import Array
-from log2sim.lanes.beside import find_beside
-from log2sim.lanes.conflicts import find_conflicts, find_transitions, is_lane_change
-from log2sim.lanes.connections import Connection, connect, continuations
-from log2sim.lanes.coverage import find_uncovered
-from log2sim.lanes.directions import direct_strips
-from log2sim.lanes.driven_paths import DrivenPath, collect_paths
-from log2sim.lanes.extension import continued
-from log2sim.lanes.junction_areas import Union, join_conflicts
-from log2sim.lanes.lane_changes import without_lane_changes
-from log2sim.lanes.lane_lines import name_lines
-from log2sim.lanes.matching import Match
-from log2sim.lanes.polyline import Polyline
-from log2sim.lanes.routes import JOIN_M, Route, match_path, merge_paths
-from log2sim.lanes.sections import Strip, cut_sections, lay_out
-from log2sim.lanes.strips import find_strips
-from log2sim.lanes.thinning import thin
+from log2sim.lanes.graph.beside import find_beside
+from log2sim.lanes.graph.conflicts import find_conflicts, find_transitions, is_lane_change
+from log2sim.lanes.graph.connections import Connection, connect, continuations
+from log2sim.lanes.graph.coverage import find_uncovered
+from log2sim.lanes.graph.directions import direct_strips
+from log2sim.lanes.graph.driven_paths import DrivenPath, collect_paths
+from log2sim.lanes.graph.extension import continued
+from log2sim.lanes.graph.junction_areas import Union, join_conflicts
+from log2sim.lanes.graph.lane_changes import without_lane_changes
+from log2sim.lanes.graph.lane_lines import name_lines
+from log2sim.lanes.graph.matching import Match
+from log2sim.lanes.graph.polyline import Polyline
+from log2sim.lanes.graph.routes import JOIN_M, Route, match_path, merge_paths
+from log2sim.lanes.graph.sections import Strip, cut_sections, lay_out
+from log2sim.lanes.graph.strips import find_strips
+from log2sim.lanes.graph.thinning import thin
 
 PATH_PROBABILITY = 0.6
 """That there is a lane where one vehicle surely drove: others overtake, turn into yards or pass obstacles."""

@@ -9,10 +9,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.lanes.driven_paths import DrivenPath
-from log2sim.lanes.matching import JUMP_M, STAY_M, Match, Run
-from log2sim.lanes.polyline import Projection, crossings
-from log2sim.lanes.routes import JOIN_M, LANE_M, MAX_LANE_M, Route
+from log2sim.lanes.graph.driven_paths import DrivenPath
+from log2sim.lanes.graph.matching import JUMP_M, STAY_M, Match, Run
+from log2sim.lanes.graph.polyline import Projection, crossings
+from log2sim.lanes.graph.routes import JOIN_M, LANE_M, MAX_LANE_M, Route
 
 ALIGNED_RAD = float(np.deg2rad(2.0))
 """A path that is turned less against a route follows it: within its lane a vehicle turns by a degree or two."""

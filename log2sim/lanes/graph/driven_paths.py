@@ -9,7 +9,7 @@ import numpy as np
 
 from log2sim.datatypes import EGO, GROUP_OF, Agent, Scenario
 from log2sim.geometry import Array
-from log2sim.lanes.polyline import SPACING_M, Polyline
+from log2sim.lanes.graph.polyline import SPACING_M, Polyline
 
 REVERSAL_M = 0.1
 """A vehicle that moves back by less is settling; more begins a new path."""

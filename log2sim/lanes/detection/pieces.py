@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from log2sim.geometry import Array
-from log2sim.lanes.profiles import Pieces, measure_pieces, no_pieces
-from log2sim.lanes.ridges import RidgePoints
+from log2sim.lanes.detection.profiles import Pieces, measure_pieces, no_pieces
+from log2sim.lanes.detection.ridges import RidgePoints
 from log2sim.mapping.ground_map import GroundMap
 
 HALF_PIECE_M = 1.0

@@ -9,10 +9,10 @@ import numpy as np
 
 from log2sim.datatypes import Marking, RoadBorder
 from log2sim.geometry import wrap_angle
-from log2sim.lanes.beside import Beside, find_beside
-from log2sim.lanes.driven_paths import DrivenPath
-from log2sim.lanes.matching import MAX_TURN_RAD
-from log2sim.lanes.strips import LaneStrip
+from log2sim.lanes.graph.beside import Beside, find_beside
+from log2sim.lanes.graph.driven_paths import DrivenPath
+from log2sim.lanes.graph.matching import MAX_TURN_RAD
+from log2sim.lanes.graph.strips import LaneStrip
 
 ONCOMING_M = 15.0
 """Traffic that comes towards a vehicle within this distance is on the same road: two lanes each way and a strip between."""

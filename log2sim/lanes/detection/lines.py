@@ -8,12 +8,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from log2sim.geometry import Array
-from log2sim.lanes.chains import Chain
-from log2sim.lanes.curves import Curve, fit_curve
-from log2sim.lanes.evidence import log_odds_of_line
-from log2sim.lanes.layers import Mask
-from log2sim.lanes.profiles import Pieces
-from log2sim.lanes.strokes import Stretch, Trace, stretches_of, trace
+from log2sim.lanes.detection.chains import Chain
+from log2sim.lanes.detection.curves import Curve, fit_curve
+from log2sim.lanes.detection.evidence import log_odds_of_line
+from log2sim.lanes.detection.layers import Mask
+from log2sim.lanes.detection.profiles import Pieces
+from log2sim.lanes.detection.strokes import Stretch, Trace, stretches_of, trace
 from log2sim.mapping.ground_map import GroundMap
 
 MIN_LINE_M = 1.0

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from log2sim.lanes.beside import Beside
-from log2sim.lanes.conflicts import Conflict, hold
-from log2sim.lanes.routes import Route
+from log2sim.lanes.graph.beside import Beside
+from log2sim.lanes.graph.conflicts import Conflict, hold
+from log2sim.lanes.graph.routes import Route
 
 MIN_SECTION_M = 4.0
 """Between two conflicts nearer than this no vehicle can wait: they are one junction."""

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.lanes.layers import log_color
+from log2sim.lanes.detection.layers import log_color
 from log2sim.mapping.ground_map import GroundMap
 
 NEAR_M, BESIDE_M = 12.0, 3.0  # from the camera: ground that is mostly road in pictures that look along one

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.lanes.polyline import Polyline
+from log2sim.lanes.graph.polyline import Polyline
 
 ENTER_M = 1.5
 """A vehicle closer than this to a route is on it: half of the narrowest usual lane, 3.0 m (RAA 2008, urban roads)."""

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from log2sim.geometry import Array
-from log2sim.lanes.driven_paths import DrivenPath
-from log2sim.lanes.matching import ENTER_M, MAX_TURN_RAD, SHORT_M, STAY_M, Match, match
-from log2sim.lanes.polyline import Polyline
+from log2sim.lanes.graph.driven_paths import DrivenPath
+from log2sim.lanes.graph.matching import ENTER_M, MAX_TURN_RAD, SHORT_M, STAY_M, Match, match
+from log2sim.lanes.graph.polyline import Polyline
 
 LANE_M = 3.5
 """Width of a lane where none is measured: 3.5 m on rural roads (RAL 2012), 3.25 to 3.75 m elsewhere."""

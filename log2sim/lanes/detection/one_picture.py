@@ -8,10 +8,10 @@ import numpy as np
 
 from log2sim.datatypes import Marking, RoadBorder
 from log2sim.geometry import Array, Camera, apply, inverse, project
-from log2sim.lanes.markings import list_markings
-from log2sim.lanes.road_shape import LaneLine, find_shape, join_lines
-from log2sim.lanes.road_surface import keep_road
-from log2sim.lanes.vanishing import find_vanishing_point
+from log2sim.lanes.detection.markings import list_markings
+from log2sim.lanes.detection.road_shape import LaneLine, find_shape, join_lines
+from log2sim.lanes.detection.road_surface import keep_road
+from log2sim.lanes.detection.vanishing import find_vanishing_point
 from log2sim.mapping.ground_map import GroundMap
 from log2sim.mapping.ground_view import GroundView, Image
 from log2sim.mapping.mosaic import render_birdseye

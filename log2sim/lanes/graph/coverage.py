@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import MapLane
 from log2sim.geometry import Array
-from log2sim.lanes.driven_paths import MIN_PATH_M, DrivenPath
-from log2sim.lanes.matching import MAX_TURN_RAD
-from log2sim.lanes.polyline import Polyline
-from log2sim.lanes.routes import BESIDE_M, CLEARANCE_M, LANE_M, MAX_LANE_M
+from log2sim.lanes.graph.driven_paths import MIN_PATH_M, DrivenPath
+from log2sim.lanes.graph.matching import MAX_TURN_RAD
+from log2sim.lanes.graph.polyline import Polyline
+from log2sim.lanes.graph.routes import BESIDE_M, CLEARANCE_M, LANE_M, MAX_LANE_M
 
 OVERLAP_M = 10.0
 """A lane of its own overlaps the lanes that a path leaves by as much; two stretches nearer than twice of it become one."""

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from log2sim.datatypes import Marking, RoadBorder
-from log2sim.lanes.areas import PaintedArea, find_crosswalks, part_stop_lines, part_symbols
-from log2sim.lanes.borders import find_borders
-from log2sim.lanes.chains import dashed_chains, touching_chains
-from log2sim.lanes.curves import thin
-from log2sim.lanes.evidence import probability
-from log2sim.lanes.heights import at_height
-from log2sim.lanes.lines import PaintedLine, color_of, find_lines, sources_of
-from log2sim.lanes.pieces import find_pieces
-from log2sim.lanes.ridges import find_ridges
+from log2sim.lanes.detection.areas import PaintedArea, find_crosswalks, part_stop_lines, part_symbols
+from log2sim.lanes.detection.borders import find_borders
+from log2sim.lanes.detection.chains import dashed_chains, touching_chains
+from log2sim.lanes.detection.curves import thin
+from log2sim.lanes.detection.evidence import probability
+from log2sim.lanes.detection.heights import at_height
+from log2sim.lanes.detection.lines import PaintedLine, color_of, find_lines, sources_of
+from log2sim.lanes.detection.pieces import find_pieces
+from log2sim.lanes.detection.ridges import find_ridges
 from log2sim.mapping.ground_map import GroundMap
 
 MIN_CONFIDENCE = 0.5  # what is rather not there than there is left out

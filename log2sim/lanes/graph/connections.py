@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from log2sim.geometry import Array
-from log2sim.lanes.conflicts import is_lane_change
-from log2sim.lanes.driven_paths import DrivenPath
-from log2sim.lanes.matching import Match
-from log2sim.lanes.polyline import Polyline
-from log2sim.lanes.routes import Route
-from log2sim.lanes.sections import CUT, FREE, Strip
+from log2sim.lanes.graph.conflicts import is_lane_change
+from log2sim.lanes.graph.driven_paths import DrivenPath
+from log2sim.lanes.graph.matching import Match
+from log2sim.lanes.graph.polyline import Polyline
+from log2sim.lanes.graph.routes import Route
+from log2sim.lanes.graph.sections import CUT, FREE, Strip
 
 BLEND_M = 15.0
 """Over this length from its ends a connection comes from the lanes' middles to the path that was driven."""

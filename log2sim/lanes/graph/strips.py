@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Marking, RoadBorder
 from log2sim.geometry import Array, wrap_angle
-from log2sim.lanes.polyline import Polyline
+from log2sim.lanes.graph.polyline import Polyline
 
 STEP_M = 1.0
 """Stations at which the distance to the next line is taken."""

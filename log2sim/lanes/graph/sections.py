@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from log2sim.geometry import Array
-from log2sim.lanes.beside import Beside
-from log2sim.lanes.junction_areas import MIN_SECTION_M, Areas
-from log2sim.lanes.polyline import Polyline
-from log2sim.lanes.routes import Route
+from log2sim.lanes.graph.beside import Beside
+from log2sim.lanes.graph.junction_areas import MIN_SECTION_M, Areas
+from log2sim.lanes.graph.polyline import Polyline
+from log2sim.lanes.graph.routes import Route
 
 FREE, CUT = -1, -2
 """What a section ends at, if not at a junction: nothing that is known, or its own continuation beside other lanes."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from log2sim.geometry import Array
-from log2sim.lanes.profiles import Pieces
+from log2sim.lanes.detection.profiles import Pieces
 
 TOUCH_M = 1.2  # worn paint, and ridges that end before the paint does
 # The longest gaps of dashed lines are 12 m (Germany: 12 m at 6 m dashes; MUTCD: 30 ft = 9.1 m; UK: 7 m; Japan: 12 m).

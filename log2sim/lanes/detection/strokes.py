@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.lanes.curves import Curve
-from log2sim.lanes.layers import sample
+from log2sim.lanes.detection.curves import Curve
+from log2sim.lanes.detection.layers import sample
 from log2sim.mapping.ground_map import GroundMap
 
 STEP_M = 0.1

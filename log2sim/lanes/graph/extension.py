@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from log2sim.geometry import Array
-from log2sim.lanes.driven_paths import DrivenPath
-from log2sim.lanes.matching import Match, Run
-from log2sim.lanes.polyline import SPACING_M
-from log2sim.lanes.routes import Route
+from log2sim.lanes.graph.driven_paths import DrivenPath
+from log2sim.lanes.graph.matching import Match, Run
+from log2sim.lanes.graph.polyline import SPACING_M
+from log2sim.lanes.graph.routes import Route
 
 REACH_M = 30.0
 """How far: through a junction of four lanes each way."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array
-from log2sim.lanes.layers import Layer, Samples, sample
+from log2sim.lanes.detection.layers import Layer, Samples, sample
 from log2sim.mapping.ground_map import GroundMap
 
 PROFILE_M, PROFILE_STEP_M, ALONG_SAMPLES = 1.5, 0.05, 11

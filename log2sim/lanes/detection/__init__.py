@@ -1,0 +1,1 @@
+"""Markings and borders of roads, found in the map of the ground or in one picture."""

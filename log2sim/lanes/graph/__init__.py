@@ -1,0 +1,1 @@
+"""Lanes between markings and along paths, linked to each other."""
