@@ -76,24 +76,16 @@ class Description:
 def describe(scenario: Scenario, recorded: Recorded) -> Description:
     """Add what the plan keeps of lanes, colors and traffic lights to a scenario."""
     log, plan = recorded.log, recorded.plan
-    reader, notes = RecordReader(log), []
-    mapped, ground, colors = log, None, None
-    if plan.keeps(Stage.LANES):
-        try:
-            mapped = refine_poses(log, scenario, reader)
-            ground = GroundMapBuilder(mapped, scenario, recorded.config.map, reader)
-        except LogError as problem:
-            notes.append(f"no map of the ground: {problem}")
-    if plan.keeps(Stage.COLORS):
-        colors = ColorSampler(log, scenario)
-    consumers: list[PictureConsumer] = [consumer for consumer in (ground, colors) if consumer is not None]
+    reader = RecordReader(log)
+    with recorded.clock.stage("map poses"):
+        started = start_map(scenario, recorded, reader) if plan.keeps(Stage.LANES) else None
+    colors = ColorSampler(log, scenario) if plan.keeps(Stage.COLORS) else None
+    builder = None if started is None else started.builder
+    consumers: list[PictureConsumer] = [consumer for consumer in (builder, colors) if consumer is not None]
     with recorded.clock.stage("pictures"):
         look_again(log, reader, consumers, lambda done, total: recorded.report_progress("pictures", done, total))
     with recorded.clock.stage("lanes"):
-        features = None
-        if plan.keeps(Stage.LANES):
-            shown = read_map(ground, notes).moved(lambda points_m: place_as_given(points_m, mapped, log))
-            features = with_lanes(shown, scenario)
+        features = None if started is None else with_lanes(read_map(started, log), scenario)
     with recorded.clock.stage("colors"):
         agents = scenario.agents if colors is None else with_colors(scenario.agents, colors)
     with recorded.clock.stage("signals"):
@@ -101,16 +93,46 @@ def describe(scenario: Scenario, recorded: Recorded) -> Description:
         signals, seen = find_signals(log, scenario, lights) if plan.keeps(Stage.SIGNALS) else ((), "")
     described = replace(scenario, map_features=features, agents=agents, signals=signals)
     figures = {"map_features": count_features(features), "colors": count_colors(agents), "signals": len(signals)}
-    return Description(described, outcomes_of(plan, described, seen), figures, reader)
+    uncolored = () if colors is None else colors.notes()
+    return Description(described, outcomes_of(plan, described, seen, uncolored), figures, reader)
 
 
-def read_map(ground: GroundMapBuilder | None, notes: Sequence[str]) -> MapFeatures:
-    """Find markings and borders in the map of the ground, if there is one."""
-    if ground is None:
-        return MapFeatures(notes=tuple(notes))
-    seen = ground.build()
-    markings, borders, more = find_markings(seen)
-    return MapFeatures(markings, borders, notes=(*notes, *seen.notes, *more))
+@dataclass(frozen=True, eq=False)
+class StartedMap:
+    """A map of the ground that is being made.
+
+    Attributes
+    ----------
+    log : Log
+        With the poses that the map is made by.
+    builder : GroundMapBuilder or None
+        None where no map can be made.
+    notes : tuple of str
+        Why not.
+    """
+
+    log: Log
+    builder: GroundMapBuilder | None
+    notes: tuple[str, ...] = ()
+
+
+def start_map(scenario: Scenario, recorded: Recorded, reader: RecordReader) -> StartedMap:
+    """Refine the poses for a map of the ground, and choose what it is made of."""
+    log = refine_poses(recorded.log, scenario, reader)
+    try:
+        return StartedMap(log, GroundMapBuilder(log, scenario, recorded.config.map, reader))
+    except LogError as problem:
+        return StartedMap(log, None, (f"no map of the ground: {problem}",))
+
+
+def read_map(started: StartedMap, log: Log) -> MapFeatures:
+    """Find markings and borders in the map, if there is one, and put them where the poses of the log have them."""
+    if started.builder is None:
+        return MapFeatures(notes=started.notes)
+    ground = started.builder.build()
+    markings, borders, notes = find_markings(ground)
+    features = MapFeatures(markings, borders, notes=(*ground.notes, *notes))
+    return features.moved(lambda points_m: place_as_given(points_m, started.log, log))
 
 
 def with_lanes(features: MapFeatures, scenario: Scenario) -> MapFeatures:
@@ -125,12 +147,12 @@ def with_colors(agents: tuple[Agent, ...], sampler: ColorSampler) -> tuple[Agent
     return tuple(replace(agent, color=found.get(agent.id, agent.color)) for agent in agents)
 
 
-def outcomes_of(plan: Plan, scenario: Scenario, seen_lights: str) -> tuple[Outcome, ...]:
+def outcomes_of(plan: Plan, scenario: Scenario, seen_lights: str, uncolored: Sequence[str]) -> tuple[Outcome, ...]:
     """Say what came of the stages of the description."""
     features, colored = scenario.map_features, sum(agent.color is not None for agent in scenario.others)
     said = {
         Stage.LANES: "" if features is None else f"{len(features.markings)} markings, {len(features.lanes)} lanes",
-        Stage.COLORS: f"colors of {colored} of {len(scenario.others)} agents",
+        Stage.COLORS: "; ".join([f"colors of {colored} vehicles", *uncolored]),
         Stage.SIGNALS: seen_lights,
     }
     decisions = [plan.decision(stage) for stage in said]
