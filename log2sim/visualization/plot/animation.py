@@ -23,7 +23,7 @@ from log2sim.visualization.plot.doubts import STRIPE_PT, box_stripes, is_doubted
 from log2sim.visualization.plot.layout import SIDE_IN, TOP_IN, WIDTH_IN, FigureLayout
 from log2sim.visualization.plot.predicted import DOTS, PredictedPaths, show_expected
 from log2sim.visualization.plot.road_features import SignalLights
-from log2sim.visualization.plot.roles import AgentRoles, centers_xy
+from log2sim.visualization.plot.roles import AgentRoles, centers_xy, paint_of
 from log2sim.visualization.plot.scene import draw_base
 from log2sim.visualization.plot.style import ALARM, FONT, INK, PAPER, halo
 from log2sim.visualization.plot.time_series import TimelineCharts
@@ -178,7 +178,7 @@ class AnimatedArtists:
         corners = [shapes.footprints(r.agent, pose[:2], pose[2])[0] for r, pose in present]
         self.boxes.set_verts(corners)
         self.boxes.set_facecolor(colors)
-        self.noses.set_facecolor([drawing.paint_of(r.agent, to_rgba(PAPER, 0.85)) for r, _ in present])
+        self.noses.set_facecolor([paint_of(r.agent, to_rgba(PAPER, 0.85)) for r, _ in present])
         self.noses.set_verts(list(shapes.heading_triangles(np.array(corners))) if corners else [])
         doubted = [(r.agent, pose) for r, pose in present if is_doubted_at(r.agent, t_s)]
         self.hatches.set_segments([s for a, p in doubted for s in box_stripes(a, p[:2], p[2], self.layout.view)])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Agent, Scenario
 from log2sim.geometry import Array
 from log2sim.visualization.plot import shapes
-from log2sim.visualization.plot.roles import AgentRole, AgentRoles, centers_xy, is_moving
+from log2sim.visualization.plot.roles import AgentRole, AgentRoles, centers_xy, is_moving, paint_of
 from log2sim.visualization.plot.style import (
     COLLISION_MARK,
     FONT,
@@ -142,11 +142,6 @@ def draw_ends(ax: Axes, roles: AgentRoles, view: Viewport, *, ghosts_step_s: flo
         if max(agent.size_m[:2]) < 9 * view.m_per_pt:
             face = to_rgba(role.color, alpha)
             ax.plot(*xy[-1], MARKERS[role.group], ms=4.2, mfc=face, mec=PAPER, mew=0.7, zorder=z + 0.01)
-
-
-def paint_of(agent: Agent, otherwise: Any) -> Any:
-    """Return the color that an agent itself has, which its heading mark is drawn in; `otherwise` where it is not known."""
-    return otherwise if agent.color is None else tuple(v / 255 for v in agent.color["rgb"])
 
 
 def draw_truth(ax: Axes, truth: Scenario) -> None:

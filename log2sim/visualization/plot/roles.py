@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -84,3 +85,8 @@ def _closest_m(agent: Agent, ego: Agent, samples: int = 24) -> float:
     """Compute the shortest distance, m, between a few points of two trajectories."""
     a, b = (p[np.linspace(0, len(p) - 1, samples).round().astype(int)] for p in (centers_xy(agent), centers_xy(ego)))
     return float(np.min(np.hypot(*(a[:, None] - b[None]).transpose(2, 0, 1))))
+
+
+def paint_of(agent: Agent, otherwise: Any) -> Any:
+    """Return the color that an agent itself has, which its heading mark is drawn in; `otherwise` where it is not known."""
+    return otherwise if agent.color is None else tuple(v / 255 for v in agent.color["rgb"])
