@@ -146,10 +146,10 @@ class TopdownConfig(Section):
     hypotheses: int = setting(
         0, "Samples that RANSAC draws, per camera or per frame; 0: as many as the data need.", ge=0, le=100_000
     )
-    rig: Literal["together", "apart"] = setting(
-        "together",
-        "together: the homographies of all cameras at once, by time-aware RANSAC over the whole rig; apart: that of each "
-        "camera alone.",
+    rig: Literal["apart", "together"] = setting(
+        "apart",
+        "apart: the homography of each camera alone; together: those of all cameras at once, by time-aware RANSAC over the "
+        "whole rig.",
     )
 
 
