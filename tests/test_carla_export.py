@@ -582,10 +582,10 @@ def test_positions_of_the_data_are_those_of_carlas_own_map(carla: ModuleType, tm
 
 
 @pytest.mark.parametrize("name", ["truth", "turn", "hill"])
-def test_carla_reads_the_exported_road_with_the_ego_in_the_middle_of_a_lane(
+def test_carla_reads_the_exported_road_with_the_ego_in_a_lane(
     name: str, carla: ModuleType, scenario: Scenario, tmp_path: Path
 ) -> None:
-    """Lane centers within 1 cm of the ego's path, in place and in height, heading the ego's way."""
+    """The ego's path lies within the lane that is nearest, at its height, heading its way."""
     made = {"truth": scenario, "turn": of(left_turn(at=(3e5, 5e6))), "hill": of(along_the_road())}[name]
     _, data = written(made, tmp_path)
     assert_on_a_lane(carla, data, tmp_path / data["road"])
@@ -597,11 +597,13 @@ def assert_on_a_lane(carla: ModuleType, data: dict[str, Any], road_path: Path) -
     course = SampledTrajectory(ego["exact"])
     for t_s in ego["exact"]["t_s"]:
         x, y, z, yaw = course.place(t_s)
-        lane = road.get_waypoint(carla.Location(x, y, z)).transform
-        assert math.hypot(lane.location.x - x, lane.location.y - y) < 0.01
+        there = road.get_waypoint(carla.Location(x, y, z))
+        lane = there.transform
+        assert math.hypot(lane.location.x - x, lane.location.y - y) < there.lane_width / 2
         assert lane.location.z == pytest.approx(z, abs=0.05)
         turned = math.remainder(math.radians(lane.rotation.yaw) - yaw, 2 * math.pi)
-        assert abs(turned) < 0.3  # the box's center does not move along its heading in a turn
+        # The box's center does not move along its heading in a turn; where roads cross, the nearest lane may be the other road's.
+        assert abs(turned) < 0.3 or there.is_junction
 
 
 @pytest.mark.parametrize("mode", ["exact", "pid"])

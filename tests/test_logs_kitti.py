@@ -228,6 +228,15 @@ def edit(file: Path, old: str, new: str) -> None:
     file.write_text(text.replace(old, new, 1))
 
 
+def test_a_repeated_line_of_the_sweep_times_is_told(raw: Path) -> None:
+    file = raw / "2011_09_26" / "2011_09_26_drive_0001_sync" / "velodyne_points" / "timestamps_start.txt"
+    assert not [note for note in open_log(raw).notes if "still turns" in note]
+    lines = file.read_text().splitlines()
+    lines.insert(2, lines[1])
+    file.write_text("\n".join(lines))
+    assert [note for note in open_log(raw).notes if "still turns, first number 0000000002" in note]
+
+
 def test_a_rotation_that_is_not_orthonormal_is_refused_with_its_error(raw: Path) -> None:
     bent = R_CAM.copy()
     bent[0, 0] += 0.01

@@ -548,7 +548,7 @@ def test_layers_come_and_go(browser: Browser, sample: Path) -> None:
     behind = np.array([-1.5, 0.0]) * browser.run("return log2sim.pixelsPerMeter")
     place = place_of(browser, "ego") + behind
     assert pixel(browser, place) == rgb(style.INK)
-    browser.press("s", "t", "r")
+    browser.press("s", "t", "r", "m")
     assert pixel(browser, place) == (251, 252, 253)
     browser.press("s")
     assert pixel(browser, place) == rgb(style.INK)

@@ -104,7 +104,8 @@ def bad_points() -> Outcome:
                 columns = dict(data)
             for bad in (np.nan, np.inf, -np.inf):
                 columns["xyz_m"] = np.concatenate([columns["xyz_m"], np.full((50, 3), bad, columns["xyz_m"].dtype)])
-                columns["t_offset_ns"] = np.concatenate([columns["t_offset_ns"], columns["t_offset_ns"][:50]])
+                for name in set(columns) - {"xyz_m"}:
+                    columns[name] = np.concatenate([columns[name], columns[name][:50]])
             np.savez(file, **columns)
 
     return same(result_of(spoil), 1e-9)

@@ -23,6 +23,9 @@ MIN_STEP_M = 0.01
 STEP_M = 0.5
 """Greatest distance of points between waypoints."""
 
+MAX_GAP_S = 60.0
+"""Between waypoints farther apart in time nobody knows where an agent went: the trajectory is a guess that can overshoot."""
+
 MAX_STEPS = 200
 """Points between two waypoints, which bounds what a jump in a trajectory costs."""
 
@@ -128,7 +131,8 @@ def _dense(agent: Agent) -> tuple[Array, Array, Array]:
     """Ground points (N, 3) and unwrapped headings (N,) along a trajectory, and where it jumps (N - 1,)."""
     w = agent.waypoints
     steps = np.hypot(np.diff(w.x_m), np.diff(w.y_m))
-    parts = np.clip(np.ceil(steps / STEP_M), 1, MAX_STEPS).astype(int)
+    unknown = agent.trajectory.discontinuous | (np.diff(w.t_s) > MAX_GAP_S)
+    parts = np.where(unknown, 1, np.clip(np.ceil(steps / STEP_M), 1, MAX_STEPS)).astype(int)
     t = np.concatenate(
         [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(w.t_s, w.t_s[1:], parts)] + [w.t_s[-1:]]
     )
@@ -136,7 +140,7 @@ def _dense(agent: Agent) -> tuple[Array, Array, Array]:
     points = np.column_stack([state.x_m, state.y_m, state.z_m - agent.size_m[2] / 2])
     ends = np.cumsum(parts) - 1
     jump = np.zeros(len(t) - 1, dtype=bool)
-    jump[ends[agent.trajectory.discontinuous]] = True
+    jump[ends[unknown]] = True
     return points, np.unwrap(state.yaw_rad), jump
 
 

@@ -165,17 +165,27 @@ def crossings(one: Polyline, two: Polyline) -> Array:
     if np.any(low > high):
         return np.zeros((0, 2))
     (s, a), (t, b) = _chords(one), _chords(two)
-    da, db = np.diff(a, axis=0)[:, None], np.diff(b, axis=0)[None]
-    gap = b[None, :-1] - a[:-1, None]
-    det = da[..., 0] * db[..., 1] - da[..., 1] * db[..., 0]
+    i, j = _near_chords(a, b)
+    da, db, gap = np.diff(a, axis=0)[i], np.diff(b, axis=0)[j], b[j] - a[i]
+    det = da[:, 0] * db[:, 1] - da[:, 1] * db[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        f = (gap[..., 0] * db[..., 1] - gap[..., 1] * db[..., 0]) / det
-        g = (gap[..., 0] * da[..., 1] - gap[..., 1] * da[..., 0]) / det
-    sine = np.abs(det) / (np.hypot(*np.moveaxis(da, -1, 0)) * np.hypot(*np.moveaxis(db, -1, 0)))
+        f = (gap[:, 0] * db[:, 1] - gap[:, 1] * db[:, 0]) / det
+        g = (gap[:, 0] * da[:, 1] - gap[:, 1] * da[:, 0]) / det
+    sine = np.abs(det) / (np.hypot(*da.T) * np.hypot(*db.T))
     hit = (sine > MIN_SINE) & (f >= 0) & (f < 1) & (g >= 0) & (g < 1)
-    i, j = np.nonzero(hit)
-    found = np.column_stack([s[i] + f[i, j] * np.diff(s)[i], t[j] + g[i, j] * np.diff(t)[j]])
+    found = np.column_stack([s[i] + f * np.diff(s)[i], t[j] + g * np.diff(t)[j]])[hit]
     return found[found[:, 0] < found[:, 1] - CROSSING_STEP_M] if one is two else found
+
+
+def _near_chords(a: Array, b: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return pairs of chords of two lines of points that are near enough to each other to intersect, in rising order."""
+    from scipy.spatial import cKDTree
+
+    trees = [cKDTree((points[:-1] + points[1:]) / 2) for points in (a, b)]
+    reach = sum(float(np.hypot(*np.diff(points, axis=0).T).max()) for points in (a, b)) / 2
+    near = trees[0].sparse_distance_matrix(trees[1], reach * (1 + 1e-9), output_type="ndarray")
+    order = np.lexsort((near["j"], near["i"]))
+    return near["i"][order], near["j"][order]
 
 
 def _chords(line: Polyline) -> tuple[Array, Array]:

@@ -30,6 +30,8 @@ CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_ve
 REFERENCE_CAMERAS = ("image_02", "image_00", "image_03", "image_01")
 PATTERN = "*_drive_*_sync"
 LABELS = "label_02.txt"
+# A scanner begins a sweep where the one before ends; stamps of this share of a sweep are none that a clock's resolution explains.
+MAX_OVERLAP = 0.1
 _NOT_A_TIME = np.iinfo(np.int64).min
 _TIME = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2} [0-9]{2}:[0-9]{2}:[0-9]{2}(\.[0-9]{1,9})?")
 
@@ -140,7 +142,14 @@ class _Drive:
                 f"{folder.name}: {len(wrong)} of {len(numbers)} sweeps face forward at a stamp before their start or after their end, "
                 f"first number {numbers[wrong[0]]:010d}; check timestamps_start.txt and timestamps_end.txt"
             )
-        return drive.sweep_stream(t_ns, begin[numbers], end[numbers], files)
+        begin, end = begin[numbers], end[numbers]
+        early = np.flatnonzero(end[:-1] - begin[1:] > MAX_OVERLAP * (end - begin)[:-1]) + 1
+        if len(early):
+            notes.append(
+                f"{folder.name}: {len(early)} of {len(numbers)} sweeps begin while the one before still turns, first number "
+                f"{numbers[early[0]]:010d}; check timestamps_start.txt and timestamps_end.txt"
+            )
+        return drive.sweep_stream(t_ns, begin, end, files)
 
     def _poses(self, notes: list[str]) -> tuple[NDArray[np.int64], Array, MapFrame]:
         t_ns, files, _ = self._records("oxts", (".txt",), notes)
