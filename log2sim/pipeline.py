@@ -28,15 +28,13 @@ from log2sim.localization.choice import localize
 from log2sim.localization.pose_choice import GIVEN, PoseChoice
 from log2sim.logs.time_checks import say_without_pose
 from log2sim.outcome import RunOutputs, stage_outcomes
-from log2sim.perception.cooperative.detector import create_for_ends
-from log2sim.perception.detect.detectors import Detector, create_detector
-from log2sim.perception.detect3d.detectors import LidarDetector
 from log2sim.perception.first_pass import Observations, observe
 from log2sim.perception.fusion import fuse
 from log2sim.perception.homography_stage import estimation_options, fit_homographies, place_by_homography
 from log2sim.perception.sync import Schedule, synchronize
 from log2sim.plan import FusionLevel, Plan, Stage, make_plan
 from log2sim.report import extended_report, report_of
+from log2sim.run_detectors import Detectors, create_detectors
 from log2sim.sensors import Sensors, choose_detector, select_sensors
 from log2sim.stage_clock import StageClock
 from log2sim.tracking.merging import track_ends
@@ -61,27 +59,6 @@ class Result:
     scenario: Scenario
     report: dict[str, Any]
     log: Log
-
-
-@dataclass(frozen=True, eq=False)
-class Detectors:
-    """The detectors of a run.
-
-    Attributes
-    ----------
-    images : Detector, optional
-        Searches the frames of all cameras.
-    sweeps : LidarDetector, optional
-        Searches the clouds.
-    """
-
-    images: Detector | None
-    sweeps: LidarDetector | None
-
-    @property
-    def name(self) -> str:
-        """Names of both, joined by +."""
-        return "+".join(detector.name for detector in (self.images, self.sweeps) if detector is not None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,33 +134,13 @@ def start(log: Log, config: Config, *, progress: Progress | None = None) -> Run:
     with clock.stage("registration"):
         road = register_road(log, config, sensors, progress=report_progress)
         log, sensors = road.log, sensors.without([f.sensor for f in road.faults if f.treatment == "left_out"])
-    detectors = detectors_of(sensors.restrict(log), config)
+    detectors = create_detectors(sensors.restrict(log), config)
     with clock.stage("sync"):
         schedule = schedule_of(log, config, sensors)
     plan = make_plan(log, config, sensors, schedule.t_ns)
     faults = (*poses.faults, *faults, *road.faults)
     return Run(
         sensors.restrict(log), config, plan, schedule, detectors, clock, report_progress, poses, faults, road.figures
-    )
-
-
-def detectors_of(log: Log, config: Config) -> Detectors:
-    """Create the detectors that the settings name."""
-    return Detectors(
-        detector_of(log, config) if config.detect.in_images else None,
-        create_for_ends(log, config) if config.detect.in_sweeps else None,
-    )
-
-
-def detector_of(log: Log, config: Config) -> Detector:
-    """Create the detector in images that the settings name."""
-    return create_detector(
-        config.detect.in_images,
-        log,
-        min_score=config.detect.min_score or None,
-        tiles=config.detect.tiles or "auto",
-        layout=config.detect.layout or None,
-        input_px=config.detect.input_px or None,
     )
 
 

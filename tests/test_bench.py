@@ -370,7 +370,7 @@ def test_tiles_and_input_sizes_are_those_that_change_something(
         model = OnnxModel(Path("m.onnx"), InputSpec("images", side, side, False, np.dtype(np.float32)), {}, None)
         return OnnxDetector("m", model, LAYOUTS["yolox"], COCO_80, 0.4, 0.4, 0.5, "auto", 0.4)
 
-    monkeypatch.setattr("log2sim.evaluation.bench.settings.detector_of", open_size)
+    monkeypatch.setattr("log2sim.evaluation.bench.settings.create_image_detector", open_size)
     grid = make_grid(tiny[0], Config.load(detect={"name": "any.onnx"}), ["models/fixed.onnx"])
     found = {s.name: (s.config.detect.tiles, s.config.detect.input_px) for s in grid.detect}
     # The picture is 480 px wide, so "auto" is no tiles for both; 416 px is what the family takes anyway.

@@ -27,7 +27,8 @@ from log2sim.log_odds import probability_of
 from log2sim.perception.detect.labels import MIN_SIDE_PX
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.lidar.projection import project_boxes_in_view, view_of
-from log2sim.pipeline import Detectors, Run, first_pass, second_pass, start
+from log2sim.pipeline import Run, first_pass, second_pass, start
+from log2sim.run_detectors import Detectors
 from log2sim.stage_clock import StageClock
 from log2sim.synth.traffic import TrafficScene
 from log2sim.synth.traffic_data import TrafficSettings, draw_traffic

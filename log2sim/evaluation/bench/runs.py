@@ -29,8 +29,9 @@ from log2sim.perception.first_pass import Observations, observe
 from log2sim.perception.fusion import fuse
 from log2sim.perception.homography_stage import CameraHomography, estimation_options, fit_homographies
 from log2sim.perception.sync import Schedule
-from log2sim.pipeline import Detectors, Run, detector_of, schedule_of, second_pass
+from log2sim.pipeline import Run, schedule_of, second_pass
 from log2sim.plan import LABELS, Decision, HomographyScope, Plan, Stage, make_plan
+from log2sim.run_detectors import Detectors, create_image_detector
 from log2sim.sensors import select_sensors
 from log2sim.stage_clock import StageClock
 
@@ -119,7 +120,7 @@ def make_context(
     with clock.stage("sync"):
         schedule = schedule_of(log, config, sensors)
     log = sensors.restrict(log)
-    detectors = {s.name: detector_of(log, s.config) for s in grid.detect}
+    detectors = {s.name: create_image_detector(log, s.config) for s in grid.detect}
     decode = any(s.config.detect.name != LABELS for s in grid.detect)
     found, decoding_s = detect_once(
         log, schedule, detectors, decode=decode, progress=lambda done, total: report("detect", done, total)

@@ -13,7 +13,7 @@ from log2sim.datatypes import Log
 from log2sim.errors import ConfigError
 from log2sim.perception.detect.onnx_detector import OnnxDetector
 from log2sim.perception.detect.tiling import plan_tiles
-from log2sim.pipeline import detector_of
+from log2sim.run_detectors import create_image_detector
 from log2sim.sensors import IMAGE_DETECTOR
 
 TILES = (0, 1, 2, 3, 5)
@@ -174,7 +174,7 @@ def _detector_settings(log: Log, config: Config, detectors: Sequence[str]) -> li
     for name in names:
         own = config if name == config.detect.name else with_changes(config, "detect", name=name, layout="", input_px=0)
         label = f"{_short(name, names)} " if len(names) > 1 else ""
-        detector = detector_of(log, own)
+        detector = create_image_detector(log, own)
         if not isinstance(detector, OnnxDetector):
             out.append(Setting("detect", name, own, not out))
             continue
