@@ -1,4 +1,4 @@
-"""Seconds and peak memory of every stage, taken around the stages and never by them."""
+"""Seconds on the wall and of the processor, and peak memory of every stage, taken around the stages and never by them."""
 
 from __future__ import annotations
 
@@ -14,34 +14,44 @@ class StageClock:
     """Adds up the time of named stages; a stage inside another stops the outer one's clock.
 
     Not for use from several threads: what a worker does in the background is not a stage's time but its waiting is.
+
+    Attributes
+    ----------
+    seconds : dict of str to float
+        By stage, on the wall.
+    cpu_seconds : dict of str to float
+        By stage, of the processor; what workers spend meanwhile counts.
+    peak_mib : dict of str to float
+        Largest resident memory of the process up to the end of each stage, MiB.
     """
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
+        self.cpu_seconds: dict[str, float] = {}
         self.peak_mib: dict[str, float] = {}
-        self._running: list[tuple[str, float]] = []
+        self._running: list[tuple[str, float, float]] = []
         self._start = time.perf_counter()
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Count the time of the block for `name`."""
-        now = time.perf_counter()
         if self._running:
-            outer, since = self._running[-1]
-            self._add(outer, now - since)
-        self._running.append((name, now))
+            self._add()
+        self._running.append((name, time.perf_counter(), time.process_time()))
         try:
             yield
         finally:
-            _, since = self._running.pop()
-            now = time.perf_counter()
-            self._add(name, now - since)
+            self._add()
+            self._running.pop()
             self.peak_mib[name] = peak_memory_mib()
             if self._running:
-                self._running[-1] = (self._running[-1][0], now)
+                self._running[-1] = (self._running[-1][0], time.perf_counter(), time.process_time())
 
-    def _add(self, name: str, seconds: float) -> None:
-        self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+    def _add(self) -> None:
+        """Add what the innermost stage took since it was entered or went on."""
+        name, since, cpu_since = self._running[-1]
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - since
+        self.cpu_seconds[name] = self.cpu_seconds.get(name, 0.0) + time.process_time() - cpu_since
 
     def table(self, ticks: int) -> list[dict[str, Any]]:
         """Rows of the report: stage, seconds, ticks per second, peak memory of the process up to its end."""

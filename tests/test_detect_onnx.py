@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Frame, Log
+from log2sim.datatypes import Detections, Frame, Log
 from log2sim.errors import ConfigError
 from log2sim.geometry import Camera
-from log2sim.perception.detect.detectors import create_detector
+from log2sim.perception.detect.detectors import create_detector, detect_all
 
 onnx = pytest.importorskip("onnx", reason="building test models needs onnx")
 
@@ -251,6 +251,48 @@ def test_threads_get_the_same_boxes(tmp_path: Path) -> None:
         boxes = [d.box_px.tolist() for d in pool.map(lambda _: detector.detect(frame), range(16))]
     assert all(b == boxes[0] for b in boxes)
     assert len(boxes[0]) == 1
+
+
+def save_brightness_model(path: Path) -> Path:
+    """Write a model whose box and score grow with the mean brightness of what it sees, so that no two tiles give the same."""
+    helper = onnx.helper
+    nodes = [
+        helper.make_node("Constant", [], ["full"], value=onnx.numpy_helper.from_array(yolov8())),
+        helper.make_node("ReduceMean", ["images"], ["brightness"], axes=[0, 1, 2, 3], keepdims=0),
+        helper.make_node("Mul", ["full", "brightness"], ["o"]),
+    ]
+    picture = helper.make_tensor_value_info("images", 1, (1, 3, HEIGHT, WIDTH))
+    found = helper.make_tensor_value_info("o", 1, yolov8().shape)
+    graph = helper.make_graph(nodes, "brightness", [picture], [found])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8), path)
+    return path
+
+
+@pytest.mark.parametrize("tiles", [1, 4])
+def test_frames_that_are_searched_together_have_the_boxes_of_each_alone(tiles: int, tmp_path: Path) -> None:
+    detector = create_detector(str(save_brightness_model(tmp_path / "m.onnx")), LOG, tiles=tiles, min_score=0.1)
+    # Of several sizes, each brighter to the right, so that its tiles differ.
+    shades = [np.linspace(low, 255, width).astype(np.uint8) for low, width in zip((0, 90, 150), (192, 256, 200))]
+    images = [np.tile(shade[None, :, None], (128, 1, 3)) for shade in shades]
+    frames = [Frame(Camera("c", i.shape[1], 128, np.eye(3), "ego", np.eye(4)), 0, lambda i=i: i) for i in images]
+    alone = [detector.detect(frame) for frame in frames]
+    for one, together in zip(alone, detect_all(detector, frames), strict=True):
+        assert len(one)
+        np.testing.assert_array_equal(together.box_px, one.box_px)
+        np.testing.assert_array_equal(together.score, one.score)
+    assert len({float(one.score[0]) for one in alone}) == len(frames)
+
+
+def test_detectors_of_single_frames_are_asked_one_after_the_other() -> None:
+    class Single:
+        name, default_min_score = "single", 0.5
+
+        def detect(self, frame: Frame) -> Detections:
+            return Detections(np.array([[0.0, 0.0, float(frame.t_ns), 1.0]]), np.ones(1), np.array(["car"]))
+
+    camera = Camera("c", 4, 4, np.eye(3), "ego", np.eye(4))
+    found = detect_all(Single(), [Frame(camera, t_ns, lambda: IMAGE) for t_ns in (3, 1, 2)])
+    assert [float(boxes.box_px[0, 2]) for boxes in found] == [3.0, 1.0, 2.0]
 
 
 BAD_MODELS = {

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Detections, Frame, Log, Sweep
 from log2sim.errors import LogError, RecordError
-from log2sim.perception.detect.detectors import Detector
+from log2sim.perception.detect.detectors import Detector, detect_all
 from log2sim.perception.light_boxes import MAX_CROPS, LightBox, crop_lights
 from log2sim.perception.record_checks.records import RecordWatch
 from log2sim.perception.record_checks.thumbnails import Thumbnail, shrink
@@ -159,7 +159,7 @@ class FrameDetector:
             self._thumbnails |= {(name, tick): small for name, small in thumbnails.items() if small is not None}
         with self._clock.stage("detect"):
             self.detected += len(frames)
-            found = {name: self._detector.detect(frame) for name, frame in frames.items()}
+            found = dict(zip(frames, detect_all(self._detector, list(frames.values())), strict=True))
             for name, boxes in found.items():
                 if len(boxes.traffic_lights):
                     frame = frames[name]

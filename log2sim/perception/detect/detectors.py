@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 from log2sim import registry
 from log2sim.datatypes import Detections, Frame, Log
 from log2sim.errors import ConfigError
 
-__all__ = ["Detector", "create_detector"]
+__all__ = ["BatchDetector", "Detector", "create_detector", "detect_all"]
 
 MAX_OVERLAP = 0.5
 MAX_TILES = 64
@@ -31,6 +32,22 @@ class Detector(Protocol):
     def detect(self, frame: Frame) -> Detections:
         """Detect road users in one frame, best score first; deterministic, and may be called from threads."""
         ...
+
+
+@runtime_checkable
+class BatchDetector(Protocol):
+    """Detector that can search several frames at once, in less time than one after the other."""
+
+    def detect_many(self, frames: Sequence[Frame]) -> list[Detections]:
+        """Detect road users in each of several frames, as `Detector.detect` does."""
+        ...
+
+
+def detect_all(detector: Detector, frames: Sequence[Frame]) -> list[Detections]:
+    """Detect road users in several frames, at once where the detector can."""
+    if isinstance(detector, BatchDetector):
+        return detector.detect_many(frames)
+    return [detector.detect(frame) for frame in frames]
 
 
 def create_detector(

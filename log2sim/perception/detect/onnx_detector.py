@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -62,13 +64,33 @@ class OnnxDetector:
 
     def detect(self, frame: Frame) -> Detections:
         """Detect road users in one frame, best score first."""
-        return self.detect_image(frame.image())
+        return self.detect_images([frame.image()])[0]
 
-    def detect_image(self, image: NDArray[np.uint8]) -> Detections:
-        """Detect road users and traffic lights in one image (H, W, 3) uint8 BGR."""
+    def detect_many(self, frames: Sequence[Frame]) -> list[Detections]:
+        """Detect road users in each of several frames, see `detect_images`."""
+        return self.detect_images([frame.image() for frame in frames])
+
+    def detect_images(self, images: Sequence[NDArray[np.uint8]]) -> list[Detections]:
+        """Detect road users and traffic lights in each of several images (H, W, 3) uint8 BGR.
+
+        Tiles are searched side by side, each by one thread: threads that share a tile wait for each other.
+        """
+        tiles = [self._tiles_of(image) for image in images]
+        jobs = [(image, tile) for image, planned in zip(images, tiles) for tile in planned]
+        with ThreadPoolExecutor(self.model.threads) as pool:
+            found = pool.map(lambda job: suppress(self._detect_tile(*job), self.max_overlap), jobs)
+            return [
+                self._merged([(tile, next(found)) for tile in planned], image) for image, planned in zip(images, tiles)
+            ]
+
+    def _tiles_of(self, image: NDArray[np.uint8]) -> list[Tile]:
         height, width = image.shape[:2]
-        tiles = plan_tiles(width, height, self.tiles, self.model.spec.width_px or self.layout.preprocessing.default_px)
-        found = [(tile, suppress(self._detect_tile(image, tile), self.max_overlap)) for tile in tiles]
+        input_px = self.model.spec.width_px or self.layout.preprocessing.default_px
+        return plan_tiles(width, height, self.tiles, input_px)
+
+    def _merged(self, found: list[tuple[Tile, Detections]], image: NDArray[np.uint8]) -> Detections:
+        """Merge what was found in the tiles of an image, and separate the traffic lights from the road users."""
+        height, width = image.shape[:2]
         merged = merge(found, width, height, self.max_overlap)
         light = merged.category == TRAFFIC_LIGHT
         users = join_riders(merged.take(~light), sure_score=self.min_score)

@@ -36,12 +36,16 @@ class OnnxModel:
     metadata : mapping of str to str
         Custom metadata of the file, such as class names.
     session : onnxruntime.InferenceSession
+        Runs in the thread that calls it.
+    threads : int
+        That may run it side by side.
     """
 
     path: Path
     spec: InputSpec
     metadata: Mapping[str, str]
     session: Any
+    threads: int
 
     def run(self, tensor: NDArray[Any]) -> dict[str, NDArray[Any]]:
         """Run the model on one input; returns all outputs by name."""
@@ -58,7 +62,7 @@ def load_model(path: Path, *, threads: int | None = None) -> OnnxModel:
     Parameters
     ----------
     threads
-        Threads within one run, None for the number of cores that this process may use.
+        That may run it side by side, None for the number of cores that this process may use.
 
     Raises
     ------
@@ -69,17 +73,17 @@ def load_model(path: Path, *, threads: int | None = None) -> OnnxModel:
 
     check_file(path)
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads or len(os.sched_getaffinity(0))
-    options.inter_op_num_threads = 1
+    # Threads that share a run wait for each other; runs side by side do not.
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 3
-    # Idle threads that spin take the cores from the stages beside the detector.
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
         session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # as above
         raise ConfigError(f"{path}: not a model that ONNX Runtime can load: {first_line(error)}") from None
     metadata = dict(session.get_modelmeta().custom_metadata_map)
-    return OnnxModel(path, input_spec(session.get_inputs(), path), metadata, session)
+    return OnnxModel(
+        path, input_spec(session.get_inputs(), path), metadata, session, threads or len(os.sched_getaffinity(0))
+    )
 
 
 def check_file(path: Path) -> None:

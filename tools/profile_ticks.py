@@ -1,0 +1,310 @@
+"""Where the time of a run goes, beside the floor: decoding its pictures and reading its clouds once.
+
+    OPENBLAS_NUM_THREADS=1 python tools/profile_ticks.py LOG [LOG ...] [--detector NAME ...] [--ticks N] [--repeats N] [--json]
+
+Runs and floors take turns; medians of their wall and processor times are shown. The floor is measured with one thread and
+with as many as there are cores. Parts are the packages whose functions a thread is in, found by looking at all threads
+every few milliseconds and giving the processor time that each took since then to the function it is in. Linux only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from bench_table import markdown
+
+import log2sim
+from log2sim.config import Config
+from log2sim.datatypes import Log
+from log2sim.errors import Log2SimError, RecordError
+from log2sim.logs.opening import open_log
+from log2sim.perception.sync import Schedule
+from log2sim.pipeline import Run, first_pass, look_around, second_pass, start
+
+PACKAGE = str(Path(log2sim.__file__).parent) + os.sep
+TASKS = Path("/proc/self/task")
+PERIOD_S = 0.008
+DETECTORS = ("labels", "lidar:vehicle", "labels+lidar:vehicle", "ssd-mobilenet-v2+lidar:vehicle")
+DETECTING = ("perception.detect", "perception.detect3d", "libraries")
+LIBRARIES = "libraries"
+WARM_UP_TICKS = 4
+
+
+@dataclass
+class Times:
+    """Seconds on the wall and of the processor."""
+
+    wall_s: float
+    cpu_s: float
+
+
+@dataclass
+class Measured:
+    """One run: its times, and those of its stages and parts."""
+
+    times: Times
+    ticks: int
+    stages: dict[str, Times]
+    parts: Counter[str]
+    functions: Counter[str]
+
+
+class Sampler(threading.Thread):
+    """Processor time of all threads by the function of log2sim that they are in."""
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self.functions: Counter[str] = Counter()
+        self._spent: dict[int, float] = thread_seconds()
+        self._done = threading.Event()
+
+    def __enter__(self) -> Sampler:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._done.set()
+        self.join()
+
+    def run(self) -> None:
+        while not self._done.wait(PERIOD_S):
+            self._look()
+        self._look()
+
+    def _look(self) -> None:
+        frames = sys._current_frames()
+        inside = {thread.native_id: frames.get(thread.ident or 0) for thread in threading.enumerate()}
+        for task, seconds in thread_seconds().items():
+            spent = seconds - self._spent.get(task, 0.0)
+            self._spent[task] = seconds
+            if spent > 0 and task != self.native_id:
+                self.functions[function_of(inside.get(task))] += spent
+
+
+def thread_seconds() -> dict[int, float]:
+    """Processor seconds of all threads of this process, those of libraries included."""
+    out = {}
+    for task in TASKS.iterdir():
+        try:
+            out[int(task.name)] = int((task / "schedstat").read_text().split()[0]) * 1e-9
+        except OSError:  # it ended meanwhile
+            continue
+    return out
+
+
+def function_of(frame: FrameType | None) -> str:
+    """Name of the innermost function of log2sim around a frame; "libraries" for a thread that Python did not start."""
+    if frame is None:
+        return LIBRARIES
+    while frame is not None:
+        path = frame.f_code.co_filename
+        if path.startswith(PACKAGE):
+            module = path[len(PACKAGE) : -len(".py")].replace(os.sep, ".")
+            return f"{module}.{frame.f_code.co_name}"
+        frame = frame.f_back
+    return "other"
+
+
+def part_of(function: str) -> str:
+    """Package that a function belongs to: two names of perception, lanes and agents, else the first."""
+    names = function.split(".")[:-1] or [function]
+    return ".".join(names[: 2 if names[0] == "perception" else 1])
+
+
+def times_of(call: Callable[[], Any]) -> tuple[Any, Times]:
+    """What a call returns, and its times."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    out = call()
+    return out, Times(time.perf_counter() - wall, time.process_time() - cpu)
+
+
+def records_of(schedule: Schedule) -> list[tuple[str, int]]:
+    """The records that the ticks use, each once, in the order of the ticks."""
+    found: dict[tuple[str, int], None] = {}
+    for tick in range(len(schedule)):
+        for name, index in schedule.frames.items():
+            found[name, int(index[tick])] = None
+        for name, rows in schedule.sweeps.items():
+            for i in rows[:, tick].tolist():
+                found[name, i] = None
+    return [(name, i) for name, i in found if i >= 0]
+
+
+def floor_of(log: Log, records: Sequence[tuple[str, int]], threads: int) -> Times:
+    """Times to read and decode records with some threads."""
+
+    def read(record: tuple[str, int]) -> None:
+        with suppress(RecordError):
+            log.streams[record[0]].read(record[1])
+
+    def read_all() -> None:
+        if threads == 1:
+            for record in records:
+                read(record)
+            return
+        with ThreadPoolExecutor(threads) as pool:
+            for _ in pool.map(read, records):
+                pass
+
+    return times_of(read_all)[1]
+
+
+def measure(open_anew: Callable[[], Log], config: Config) -> tuple[Measured, Schedule]:
+    """Run all stages on a log that is opened anew."""
+    log, kept = open_anew(), list[Run]()
+
+    def reconstruct() -> None:
+        run = start(log, config)
+        kept.append(run)
+        observations = first_pass(run)
+        look_around(run, observations, second_pass(run, observations))
+
+    with Sampler() as sampler:
+        _, times = times_of(reconstruct)
+    run, functions = kept[0], sampler.functions
+    cpu = run.clock.cpu_seconds
+    stages = {name: Times(seconds, cpu[name]) for name, seconds in run.clock.seconds.items()}
+    parts: Counter[str] = Counter()
+    for name, seconds in functions.items():
+        parts[part_of(name)] += seconds
+    return Measured(times, len(run.schedule), stages, parts, functions), run.schedule
+
+
+def config_of(log: Log, detector: str, ticks: int, settings: Sequence[str]) -> Config:
+    """Settings of a run of the first ticks."""
+    config = Config.load(None, settings, detect={"name": detector})
+    if ticks:
+        cameras = list(log.cameras) if config.detect.in_images else []
+        preferred = log.reference_camera if log.reference_camera in cameras else None
+        most = max(log.lidars, key=lambda name: len(log.streams[name].t_ns), default="")
+        t_ns = log.streams[preferred or (cameras[0] if cameras else most)].t_ns
+        last = min(ticks, len(t_ns)) - 1
+        return config.changed(stop_s=float(t_ns[last] - t_ns[0]) * 1e-9 + 1e-4)
+    return config
+
+
+def profile(open_anew: Callable[[], Log], options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Figures of a log with each detector."""
+    log, threads = open_anew(), len(os.sched_getaffinity(0))
+    configs: dict[str, Config] = {}
+    for detector in options.detector or DETECTORS:
+        try:
+            measure(open_anew, config_of(log, detector, WARM_UP_TICKS, options.set))
+            configs[detector] = config_of(log, detector, options.ticks, options.set)
+        except Log2SimError as problem:
+            print(f"{log.name}, {detector}: left out: {problem}", file=sys.stderr)
+    runs: dict[str, list[Measured]] = {name: [] for name in configs}
+    floors: dict[tuple[str, int], list[Times]] = {}
+    for _ in range(options.repeats):
+        for name, config in configs.items():
+            measured, schedule = measure(open_anew, config)
+            runs[name].append(measured)
+            for count in sorted({1, threads}):
+                floor = floor_of(open_anew(), records_of(schedule), count)
+                floors.setdefault((name, count), []).append(floor)
+    for name, measured in runs.items():
+        yield figures(log, name, measured, {n: floors[name, n] for n in sorted({1, threads})})
+
+
+def figures(log: Log, detector: str, runs: list[Measured], floors: dict[int, list[Times]]) -> dict[str, Any]:
+    """Medians of the runs and floors of one detector; ms are a tick."""
+    ticks = runs[0].ticks
+
+    def ms(values: list[float]) -> float:
+        return round(1e3 * statistics.median(values) / ticks, 2)
+
+    parts = {k: ms([r.parts[k] for r in runs]) for k in {k for r in runs for k in r.parts}}
+    functions = {k: ms([r.functions[k] for r in runs]) for k in {k for r in runs for k in r.functions}}
+    wall, cpu = ms([r.times.wall_s for r in runs]), ms([r.times.cpu_s for r in runs])
+    floor = {n: {"wall": ms([t.wall_s for t in f]), "cpu": ms([t.cpu_s for t in f])} for n, f in floors.items()}
+    detecting = sum(parts.get(name, 0.0) for name in DETECTING)
+    return {
+        "log": log.name,
+        "detector": detector,
+        "ticks": ticks,
+        "repeats": len(runs),
+        "ticks_per_second": round(1e3 / wall, 2),
+        "wall_ms": wall,
+        "cpu_ms": cpu,
+        "detector_cpu_ms": round(detecting, 2),
+        "floor_ms": floor,
+        "cpu_over_floor": round(cpu / floor[1]["cpu"], 2),
+        "without_detector_over_floor": round((cpu - detecting) / floor[1]["cpu"], 2),
+        "stages_ms": {
+            k: {"wall": ms([r.stages[k].wall_s for r in runs]), "cpu": ms([r.stages[k].cpu_s for r in runs])}
+            for k in runs[0].stages
+        },
+        "parts_cpu_ms": dict(sorted(parts.items(), key=lambda item: -item[1])),
+        "functions_cpu_ms": dict(sorted(functions.items(), key=lambda item: -item[1])[:40]),
+    }
+
+
+def show(found: list[dict[str, Any]], functions: int) -> str:
+    """Tables of rates, stages and parts."""
+    rates, rest = [], []
+    for f in found:
+        one, most = min(f["floor_ms"]), max(f["floor_ms"])
+        rates.append([
+            f["log"], f"`{f['detector']}`", str(f["ticks"]), f"{f['ticks_per_second']:.2f}", f"{f['wall_ms']:.0f}",
+            f"{f['cpu_ms']:.0f}", f"{f['detector_cpu_ms']:.0f}", f"{f['floor_ms'][one]['cpu']:.0f}",
+            f"{f['floor_ms'][most]['wall']:.0f}", f"{f['cpu_over_floor']:.2f}",
+            f"{f['without_detector_over_floor']:.2f}",
+        ])  # fmt: skip
+        rest.append(f"\n{f['log']}, `{f['detector']}`, ms a tick\n")
+        stages = f["stages_ms"].items()
+        rest.append(markdown(["stage", "wall", "cpu"], [[k, f"{v['wall']:.1f}", f"{v['cpu']:.1f}"] for k, v in stages]))
+        for title, key, most_rows in (
+            ("part", "parts_cpu_ms", len(f["parts_cpu_ms"])),
+            ("function", "functions_cpu_ms", functions),
+        ):
+            rows = [[k, f"{v:.1f}"] for k, v in f[key].items() if v >= 0.05][:most_rows]
+            rest += ["", markdown([title, "cpu"], rows)] if rows else []
+    head = [
+        "log", "detector", "ticks", "ticks/s", "wall ms", "cpu ms", "detector cpu", "floor cpu", "floor wall, all threads",
+        "cpu / floor", "without detector / floor",
+    ]  # fmt: skip
+    return "\n".join([markdown(head, rates), *rest])
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("logs", nargs="+", type=Path, metavar="LOG")
+    parser.add_argument("--sequence", help="of the log")
+    parser.add_argument("--detector", action="append", metavar="NAME", help=f"repeat it; by default {DETECTORS}")
+    parser.add_argument("--ticks", type=int, default=0, metavar="N", help="the first ones; by default all")
+    parser.add_argument("--repeats", type=int, default=3, metavar="N")
+    parser.add_argument("--functions", type=int, default=0, metavar="N", help="lines of functions")
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="as of reconstruct")
+    parser.add_argument("--json", action="store_true", help="all figures as JSON")
+    options = parser.parse_args()
+    if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
+        print("OPENBLAS_NUM_THREADS is not 1: times will swing", file=sys.stderr)
+    found: list[dict[str, Any]] = []
+    for path in options.logs:
+
+        def open_anew(path: Path = path) -> Log:
+            return open_log(path, sequence=options.sequence)
+
+        found += profile(open_anew, options)
+    print(json.dumps(found, indent=1) if options.json else show(found, options.functions))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
