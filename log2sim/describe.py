@@ -77,14 +77,14 @@ def describe(scenario: Scenario, recorded: Recorded) -> Description:
     """Add what the plan keeps of lanes, colors and traffic lights to a scenario."""
     log, plan = recorded.log, recorded.plan
     reader = RecordReader(log)
-    with recorded.clock.stage("map poses"):
+    with recorded.clock.stage("map poses", recorded.report_progress):
         started = start_map(scenario, recorded, reader) if plan.keeps(Stage.LANES) else None
     colors = ColorSampler(log, scenario) if plan.keeps(Stage.COLORS) else None
     builder = None if started is None else started.builder
     consumers: list[PictureConsumer] = [consumer for consumer in (builder, colors) if consumer is not None]
-    with recorded.clock.stage("pictures"):
+    with recorded.clock.stage("pictures", recorded.report_progress):
         look_again(log, reader, consumers, lambda done, total: recorded.report_progress("pictures", done, total))
-    with recorded.clock.stage("lanes"):
+    with recorded.clock.stage("lanes", recorded.report_progress):
         features = None if started is None else with_lanes(read_map(started, log), scenario)
     with recorded.clock.stage("colors"):
         agents = scenario.agents if colors is None else with_colors(scenario.agents, colors)

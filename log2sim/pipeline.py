@@ -107,7 +107,7 @@ def reconstruct(log: Log, config: Config | None = None, *, progress: Progress | 
     config : Config, optional
         Settings; the defaults without.
     progress : callable, optional
-        Called as `progress(stage, done, total)`.
+        Called as `progress(stage, done, total)`; with a total of 0 when a stage of unknown length begins.
 
     Raises
     ------
@@ -134,6 +134,7 @@ def start(log: Log, config: Config, *, progress: Progress | None = None) -> Run:
     with clock.stage("registration"):
         road = register_road(log, config, sensors, progress=report_progress)
         log, sensors = road.log, sensors.without([f.sensor for f in road.faults if f.treatment == "left_out"])
+    report_progress("load", 0, 0)
     detectors = create_detectors(sensors.restrict(log), config)
     with clock.stage("sync"):
         schedule = schedule_of(log, config, sensors)
@@ -158,6 +159,7 @@ def schedule_of(log: Log, config: Config, sensors: Sensors) -> Schedule:
 
 def first_pass(run: Run) -> Observations:
     """Detect and measure, tick by tick."""
+    run.report_progress("detect and measure", 0, len(run.schedule))
     return observe(
         run.log,
         run.schedule,
@@ -183,7 +185,7 @@ def second_pass(run: Run, observations: Observations) -> Result:
         across = plan.keeps(Stage.FUSION) or plan.keeps(Stage.FUSION_WITH_LIDAR)
         ends = [fuse(of_end, across=across) for of_end in split_by_end(placed, plan)]
         measurements = [Measurements.join(rows) for rows in zip(*ends)]
-    with run.clock.stage("track"):
+    with run.clock.stage("track", run.report_progress):
         tracks = track_ends(
             ends,
             t_ns,
@@ -211,11 +213,11 @@ def agents_of(run: Run, tracks: Sequence[Track], observations: Observations) -> 
     """Make agents of tracks, judged and rated together; the ego, if its poses are known, is returned separately."""
     log, t_ns = run.log, run.schedule.t_ns
     timeline = Timeline(t_ns, int(t_ns[0]))
-    with run.clock.stage("smooth"):
+    with run.clock.stage("smooth", run.report_progress):
         candidates = estimate_agents(tracks, observations.obstacles, timeline, smooth=run.config.smooth.enabled)
         candidates = decide_headings(candidates, ego_path(log, run.schedule), timeline)
         ego = ego_agent(log, timeline, run.poses.origin)
-    with run.clock.stage("judge"):
+    with run.clock.stage("judge", run.report_progress):
         seen = run.schedule.without_frames(observations.unseen)
         recording = Recording(log, seen, observations.obstacles, timeline)
         judged = judge(candidates, ego, recording)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import difflib
 import importlib
-from importlib.metadata import entry_points
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from log2sim.errors import ConfigError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoints
 
 BUILT_IN: dict[str, dict[str, str]] = {
     "log": {
@@ -50,7 +52,14 @@ KIND_LABELS = {"log": "log format", "lidar_detector": "LiDAR detector", "export"
 
 def names(kind: str) -> list[str]:
     """List the plug-ins of a kind ("log", "detector", "lidar_detector", "export"), built-in ones first."""
-    return list(BUILT_IN[kind]) + sorted(e.name for e in entry_points(group=f"log2sim.{kind}"))
+    return list(BUILT_IN[kind]) + sorted(e.name for e in installed(kind))
+
+
+def installed(kind: str) -> EntryPoints:
+    """Return the plug-ins of a kind that other packages declare."""
+    from importlib.metadata import entry_points  # imported here: it takes as long as the rest of `log2sim --help`
+
+    return entry_points(group=f"log2sim.{kind}")
 
 
 def load(kind: str, name: str) -> Any:
@@ -64,7 +73,7 @@ def load(kind: str, name: str) -> Any:
     if name in BUILT_IN[kind]:
         module, _, attribute = BUILT_IN[kind][name].partition(":")
         return getattr(importlib.import_module(module), attribute)
-    for entry in entry_points(group=f"log2sim.{kind}"):
+    for entry in installed(kind):
         if entry.name == name:
             return entry.load()
     raise ConfigError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import resource
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -33,8 +33,10 @@ class StageClock:
         self._start = time.perf_counter()
 
     @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Count the time of the block for `name`."""
+    def stage(self, name: str, progress: Callable[[str, int, int], None] | None = None) -> Iterator[None]:
+        """Count the time of the block for `name`; `progress`, if given, is told when it begins: `progress(name, 0, 0)`."""
+        if progress is not None:
+            progress(name, 0, 0)
         if self._running:
             self._add()
         self._running.append((name, time.perf_counter(), time.process_time()))

@@ -76,7 +76,7 @@ def test_reconstruct_says_what_came_out_and_writes_nothing_unasked(tiny_folder: 
     assert ran.code == 0
     assert names(tmp_path) == ["s.json"]
     assert "s.json: 3 agents (1 static) over 0.9 s" in ran.out
-    assert "detect and measure: 10 of 10" in ran.err
+    assert "detecting and measuring: 10 of 10\ntracking\nsmoothing trajectories\n" in ran.err
     again = run("reconstruct", tiny_folder, "--out", tmp_path / "s.json", "--detector", "labels")
     assert again.code == 2
     assert "--overwrite" in again.line

@@ -227,6 +227,6 @@ def test_third_parties_add_formats_by_entry_points(
     scenario: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     theirs = EntryPoint("theirs", "log2sim.export.csv_table:EXPORTER", "log2sim.export")
-    monkeypatch.setattr(registry, "entry_points", lambda group: [theirs] if group == theirs.group else [])
+    monkeypatch.setattr(registry, "installed", lambda kind: [theirs] if f"log2sim.{kind}" == theirs.group else [])
     assert formats()[-1] == "theirs"
     assert [f.name for f in export(scenario, "theirs", tmp_path / "out")] == ["agents.csv"]

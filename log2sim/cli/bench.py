@@ -13,7 +13,7 @@ from log2sim.cli.truth import truth_at
 
 def bench(
     log: LogPath,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for bench.json and bench.png.")],
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for bench.json and bench.png.")],
     truth: Annotated[
         Path | None,
         typer.Option(

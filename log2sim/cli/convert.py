@@ -23,7 +23,7 @@ from log2sim.errors import ConfigError
 
 def convert(
     log: LogPath,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder to write.")],
     format: Format = "auto",
     sequence: Sequence = None,
     start: Annotated[float | None, typer.Option(help="First time to keep, in s from the start of the log.")] = None,

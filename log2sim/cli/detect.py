@@ -12,7 +12,7 @@ from log2sim.cli.options import ConfigFile, Format, LogPath, Overwrite, Poses, Q
 
 def detect(
     log: LogPath,
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Boxes file to write.")],
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="Boxes file to write.")],
     detector: Annotated[
         str,
         typer.Option(

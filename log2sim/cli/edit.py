@@ -19,7 +19,7 @@ Changes = list[str] | None
 
 def edit(
     scenario: ScenarioPath,
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Scenario file to write.")],
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="Scenario file to write.")],
     shift: Annotated[
         Changes, typer.Option(metavar="AGENT=SECONDS", help="Delay an agent; negative: advance it.")
     ] = None,

@@ -13,6 +13,7 @@ from log2sim.cli import (
     config,
     convert,
     detect,
+    doctor,
     edit,
     evaluate,
     export,
@@ -29,6 +30,7 @@ from log2sim.cli import (
 )
 from log2sim.cli.options import fail, say
 from log2sim.cli.process import SIGNAL_CODE, Ended, ending_by_signals, tolerating_lost_output
+from log2sim.cli.shared import DEBUG, Debug, FollowLinks, add_command
 from log2sim.errors import Log2SimError
 from log2sim.links import OPTION, following_links
 from log2sim.output_claims import holding_claims
@@ -37,32 +39,49 @@ from log2sim.version import __version__
 
 INTERRUPTED = 130
 
+EXIT_CODES = """\b
+Exit codes:
+    0  done
+    1  an error within log2sim; --debug shows where
+    2  wrong usage or setting
+    3  a log or file that cannot be read or written
+    4  nothing to reconstruct
+    5  an extra is missing; log2sim doctor lists them
+    6  a check of --strict failed
+  130  interrupted"""
+
+UNSET = {"help": False, "install_completion": False, "show_completion": False}
+"""Flags that typer adds without a default: it would load pydantic to check them, which takes as long as all of --help."""
+
 app = typer.Typer(
     name="log2sim",
-    help="Reconstruct driving logs as scenarios that a simulator can run. Add --debug for tracebacks, --follow-links for logs with links that leave their folders.",
+    epilog=EXIT_CODES,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "default_map": UNSET},
 )
 
 
 @app.callback(invoke_without_command=True)
-def root(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
-    """Reconstruct driving logs as scenarios that a simulator can run. Add --debug for tracebacks, --follow-links for logs with links that leave their folders."""
+def root(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+    debug: Debug = False,
+    follow_links: FollowLinks = False,
+) -> None:
+    """Reconstruct driving logs as scenarios that a simulator can run."""
     if version:
         say(__version__)
         raise typer.Exit
 
 
 for command in (
-    reconstruct.reconstruct, detect.detect, replay.replay, predict.predict, synth.synth, edit.edit, plot.plot, evaluate.evaluate, bench.bench,
-    inspect.inspect, validate.validate, convert.convert, config.config, view.view, export.export,
+    reconstruct.reconstruct, inspect.inspect, validate.validate, convert.convert, detect.detect, evaluate.evaluate, bench.bench,
+    plot.plot, view.view, replay.replay, predict.predict, edit.edit, export.export, synth.synth, config.config, doctor.doctor,
 ):  # fmt: skip
-    app.command()(command)
-app.command(name="import")(import_.import_)
-app.command(name="map")(map.map_)
+    add_command(app, command)
+add_command(app, import_.import_, "import")
+add_command(app, map.map_, "map")
 
 
 def main() -> None:
@@ -72,8 +91,9 @@ def main() -> None:
 
 
 def _run(ended: Ended) -> NoReturn:
-    arguments = [a for a in sys.argv[1:] if a not in ("--debug", OPTION)]
-    debug = "--debug" in sys.argv
+    # Taken off here, too: before the name of a command they mean the same.
+    arguments = [a for a in sys.argv[1:] if a not in (DEBUG, OPTION)]
+    debug = DEBUG in sys.argv
     try:
         with following_links(OPTION in sys.argv):
             code = app(args=arguments, prog_name="log2sim", standalone_mode=False)

@@ -47,7 +47,7 @@ def evaluate(
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="Reliability diagram of confidences or scores to write.")
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Metrics file to write.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", metavar="FILE", help="Metrics file to write.")] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:

@@ -16,7 +16,7 @@ FORMATS = "openscenario, carla, csv, scenarionet, commonroad, osi, mcap, rerun" 
 def export(
     scenario: ScenarioPath,
     to: Annotated[str, typer.Option("--to", metavar="FORMAT", help=f"One of {FORMATS}.")],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write into.")],
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder to write into.")],
     revision: Annotated[str | None, typer.Option(help="openscenario: version 1.0, 1.1 or 1.2.")] = None,
     map: Annotated[
         Path | None,

@@ -12,7 +12,7 @@ from log2sim.cli.options import Overwrite, Quiet, say
 
 def import_(
     file: Annotated[Path, typer.Argument(metavar="FILE.xosc", help="An OpenSCENARIO file with trajectories.")],
-    out: Annotated[Path, typer.Option("--out", metavar="SCENARIO", help="Scenario file to write.")],
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="SCENARIO", help="Scenario file to write.")],
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:

@@ -17,7 +17,9 @@ def map_(
     log: LogPath,
     out: Annotated[
         Path,
-        typer.Option("--out", metavar="FILE", help="Map to write: .tif (GeoTIFF), .png or .jpg (with a world file)."),
+        typer.Option(
+            "--out", "-o", metavar="FILE", help="Map to write: .tif (GeoTIFF), .png or .jpg (with a world file)."
+        ),
     ],
     scenario: Annotated[
         Path | None,

@@ -1,15 +1,68 @@
-"""Options that several commands share, and output for the user."""
+"""Options that several commands share, and output for the user.
+
+Every command writes with `-o/--out`, is silent with `-q/--quiet` and tells more with `-v/--verbose`. `--debug`, `--follow-links`
+and `--help` are added to all of them by `log2sim.cli.shared`.
+"""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 
 from log2sim.errors import ConfigError
 from log2sim.registry import BUILT_IN
+
+POSES = ("given", "lidar", "camera", "auto")
+
+
+def complete(*choices: str) -> Callable[[str], list[str]]:
+    """Return a function by which a shell completes one of the choices."""
+    return lambda incomplete: [choice for choice in choices if choice.startswith(incomplete)]
+
+
+def complete_plugins(*kinds: str, prefix: str = "") -> Callable[[str], list[str]]:
+    """Return a function by which a shell completes the name of a plug-in; installed ones are looked up only then."""
+
+    def completed(incomplete: str) -> list[str]:
+        from log2sim.registry import names
+
+        known = [prefix + name for kind in kinds for name in names(kind)]
+        return [name for name in known if name.startswith(incomplete)]
+
+    return completed
+
+
+def choose(flag: str, *choices: str, help: str, default: str | None = None) -> Any:
+    """Make an option that takes one of a few words: `help` lists them, and a shell completes them.
+
+    Parameters
+    ----------
+    flag : str
+        Such as "--mode".
+    choices : str
+    help : str
+    default : str, optional
+        What happens without the option, in words; needed where its default is None.
+    """
+    shown: Any = True if default is None else default
+    return typer.Option(
+        flag, metavar="|".join(choices), help=help, autocompletion=complete(*choices), show_default=shown
+    )
+
+
+def write_to(metavar: str, help: str) -> Any:
+    """Make the option -o/--out."""
+    return typer.Option("--out", "-o", metavar=metavar, help=help)
+
+
+def complete_detectors(incomplete: str) -> list[str]:
+    """Complete the name of a detector in images or in LiDAR sweeps."""
+    return [*complete_plugins("detector")(incomplete), *complete_plugins("lidar_detector", prefix="lidar:")(incomplete)]
+
 
 LogPath = Annotated[Path, typer.Argument(metavar="LOG", help="Folder or file of a log.")]
 ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A scenario.json.")]
@@ -17,24 +70,55 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that
 DropDoubtful = Annotated[
     bool, typer.Option("--drop-doubtful", help="Leave out agents that the scenario itself doubts; the ego stays.")
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
-Format = Annotated[str, typer.Option(help=f"Log format: auto, {', '.join(BUILT_IN['log'])}.")]
-Sequence = Annotated[str | None, typer.Option(help="Sequence to open, when the folder has several.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print everything, not only the first of many.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, for programs, instead of a table.")]
+Format = Annotated[
+    str,
+    typer.Option(
+        metavar="FORMAT",
+        help=f"Log format: auto, {', '.join(BUILT_IN['log'])}.",
+        autocompletion=lambda incomplete: [*complete("auto")(incomplete), *complete_plugins("log")(incomplete)],
+    ),
+]
+Sequence = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="Sequence to open, when the folder has several.", show_default="the only one"),
+]
 Settings = Annotated[
     list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change a setting; see log2sim config.")
 ]
-Cameras = Annotated[str | None, typer.Option(metavar="A,B", help="Use only these cameras.")]
+Cameras = Annotated[str | None, typer.Option(metavar="A,B", help="Use only these cameras.", show_default="all")]
 ConfigFile = Annotated[
     Path | None, typer.Option("--config", metavar="FILE.toml", help="File with settings; see log2sim config.")
 ]
-
-
+Start = Annotated[
+    float | None,
+    typer.Option(metavar="S", help="First time to use, in s from the start of the log.", show_default="the start"),
+]
+Stop = Annotated[
+    float | None,
+    typer.Option(metavar="S", help="Last time to use, in s from the start of the log.", show_default="the end"),
+]
+Range = Annotated[
+    float | None,
+    typer.Option(metavar="M", help="Compare agents up to this distance from the ego, in m.", show_default="no limit"),
+]
+Categories = Annotated[
+    str | None,
+    typer.Option(metavar="A,B", help="Compare only these categories or groups, e.g. vehicle.", show_default="all"),
+]
+Truth = Annotated[
+    Path | None, typer.Option(metavar="TRUTH", help="Ground truth: a scenario file or a log with labels.")
+]
 Poses = Annotated[
     str | None,
-    typer.Option(
-        metavar="given|lidar|camera|auto",
+    choose(
+        "--poses",
+        *POSES,
         help="Ego poses: the log's own, from LiDAR odometry (extra odometry), from the motion of a camera, or what fits to the "
-        "sensors best. Default: the log's own; what fits best for a log without any.",
+        "sensors best.",
+        default="the log's own; what fits best for a log without any",
     ),
 ]
 

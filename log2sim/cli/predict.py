@@ -17,7 +17,7 @@ def predict(
         str | None,
         typer.Option(metavar="A,B", help="Only these methods: velocity, turn, smoothed, path. Default: all."),
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Figures file to write.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", metavar="FILE", help="Figures file to write.")] = None,
     positions: Annotated[
         bool, typer.Option("--positions", help="With --out: write every predicted position with its sigma, too.")
     ] = False,

@@ -1,4 +1,4 @@
-"""Progress: bars on a terminal, a plain line every few seconds elsewhere, nothing with --quiet."""
+"""Progress: what is being done, as bars on a terminal, as plain lines elsewhere, and nothing with --quiet."""
 
 from __future__ import annotations
 
@@ -6,13 +6,49 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
 
 LINE_EVERY_S = 5.0
 
+WORDS = {
+    "open": "opening the log",
+    "odometry": "following the ego in LiDAR sweeps",
+    "camera motion": "following the ego in pictures",
+    "check cameras": "checking the mounts of cameras",
+    "load": "loading the detectors",
+    "detect and measure": "detecting and measuring",
+    "track": "tracking",
+    "smooth": "smoothing trajectories",
+    "judge": "comparing agents with the recording",
+    "map poses": "aligning the map",
+    "pictures": "mapping the ground and reading colors",
+    "lanes": "finding markings and lanes",
+    "map: sweeps": "mapping the ground: LiDAR sweeps",
+    "map: pictures": "mapping the ground: pictures",
+    "replay": "simulating",
+    "convert": "writing records",
+    "detect": "detecting",
+    "synthesize": "rendering",
+    "scenes": "rendering scenes",
+    "count points": "counting points in boxes",
+    "draw": "drawing",
+    "evaluate": "comparing with the truth",
+    "write": "writing",
+}
+"""What people read of a stage; a stage without words of its own shows its name."""
+
+WORDS_BEFORE_SENSORS = {"check ": "checking the clock and mount of ", "register ": "registering "}
+
+Report = Callable[[str, int, int], None]
+"""Called as `report(stage, done, total)`; a total of 0 says that the length of the stage is not known."""
+
 
 @contextmanager
-def progress(*, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """Yield a function `report_progress(stage, done, total)`."""
+def progress(*, quiet: bool) -> Iterator[Report]:
+    """Yield a function `report_progress(stage, done, total)`; with a total of 0 the length of the stage is not known."""
     if quiet:
         yield lambda stage, done, total: None
     elif sys.stderr.isatty():
@@ -22,30 +58,90 @@ def progress(*, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
         yield _lines()
 
 
+def say_stage(stage: str) -> str:
+    """Return the words for a stage."""
+    for start, words in WORDS_BEFORE_SENSORS.items():
+        if stage not in WORDS and stage.startswith(start):
+            return words + stage.removeprefix(start)
+    return WORDS.get(stage, stage)
+
+
+class Bars:
+    """A bar for each stage of a run; a stage ends when the next one begins.
+
+    Parameters
+    ----------
+    display : rich.progress.Progress
+    """
+
+    def __init__(self, display: Progress) -> None:
+        self._display = display
+        self._tasks: dict[str, TaskID] = {}
+        self._current: str | None = None
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Show how far a stage is."""
+        if stage != self._current:
+            self._end_current()
+            self._current = stage
+        if stage not in self._tasks:
+            self._tasks[stage] = self._display.add_task(say_stage(stage), total=total or None)
+        self._display.update(self._tasks[stage], completed=done, total=total or None)
+
+    def _end_current(self) -> None:
+        """Take the bar of a stage of unknown length away: it would go on moving."""
+        task = self._tasks.get(self._current or "")
+        if task is not None and self._display.tasks[self._display.task_ids.index(task)].total is None:
+            self._display.remove_task(task)
+            del self._tasks[self._current or ""]
+
+
 @contextmanager
-def _bars() -> Iterator[Callable[[str, int, int], None]]:
+def _bars() -> Iterator[Report]:
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        ProgressColumn,
+        Task,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+    from rich.text import Text
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
-        tasks: dict[str, object] = {}
+    class Count(ProgressColumn):
+        """How many of how many, where that is known."""
 
-        def report_progress(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=total)
-            bars.update(tasks[stage], completed=done, total=total)  # type: ignore[arg-type]
+        def render(self, task: Task) -> Text:
+            return Text("" if task.total is None else f"{task.completed:.0f} of {task.total:.0f}")
 
-        yield report_progress
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=20),
+        Count(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    # What is printed meanwhile goes where it was meant to go, not to this console.
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, redirect_stdout=False, redirect_stderr=False) as display:
+        yield Bars(display)
 
 
-def _lines() -> Callable[[str, int, int], None]:
-    last = [time.monotonic()]
+def _lines() -> Report:
+    last, current = [time.monotonic()], [""]
 
     def report_progress(stage: str, done: int, total: int) -> None:
         now = time.monotonic()
-        if done == total or now - last[0] >= LINE_EVERY_S:
+        begins, current[0] = stage != current[0], stage
+        if done == total if total else begins:
+            wanted = True
+        else:
+            wanted = now - last[0] >= LINE_EVERY_S
+        if wanted:
             last[0] = now
-            sys.stderr.write(f"{stage}: {done} of {total}\n")
+            count = f": {done} of {total}" if total else ""
+            sys.stderr.write(f"{say_stage(stage)}{count}\n")
 
     return report_progress

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 def replay(
     scenario: ScenarioPath,
-    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Replay file to write.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", metavar="FILE", help="Replay file to write.")] = None,
     mode: Annotated[
         str, typer.Option(help="pid: vehicles follow their trajectories by a controller; exact: no controller.")
     ] = "pid",

@@ -44,7 +44,7 @@ class WeatherName(StrEnum):
 
 
 def synth(
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder to write.")],
     scene: Annotated[Path | None, typer.Argument(metavar="[SCENE.toml]", help="Scene file.")] = None,
     traffic: Annotated[
         Traffic | None,
