@@ -15,8 +15,9 @@ if TYPE_CHECKING:
     from log2sim.logs.opening import open_log
     from log2sim.pipeline import reconstruct
     from log2sim.simulation.runner import replay
+    from log2sim.visualization.plot.axes import plot
 
-__all__ = ["Config", "Log2SimError", "Scenario", "__version__", "evaluate", "open_log", "reconstruct", "replay"]
+__all__ = ["Config", "Log2SimError", "Scenario", "__version__", "evaluate", "open_log", "plot", "reconstruct", "replay"]
 
 _MODULE_OF = {
     "Config": "log2sim.config",
@@ -24,6 +25,7 @@ _MODULE_OF = {
     "Scenario": "log2sim.datatypes.scenario",
     "evaluate": "log2sim.evaluation.metrics.evaluator",
     "open_log": "log2sim.logs.opening",
+    "plot": "log2sim.visualization.plot.axes",
     "reconstruct": "log2sim.pipeline",
     "replay": "log2sim.simulation.runner",
 }

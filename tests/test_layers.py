@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import inspect
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import log2sim
+from log2sim import late_functions
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
@@ -19,11 +21,11 @@ import imports  # noqa: E402
 
 # Folders and modules of the package from the ground floor up. Each may import those before it and nothing else.
 RANKED = (
-    "errors", "version", "registry", "log_odds", "numerals", "input_files", "links", "outputs", "output_folders", "output_claims", "json_keys", "documents", "model_errors", "geometry", "datatypes", "color_names", "stage_clock", "config_sections", "config", "logs",
+    "errors", "version", "registry", "late_functions", "log_odds", "numerals", "input_files", "links", "outputs", "output_folders", "output_claims", "json_keys", "documents", "model_errors", "geometry", "datatypes", "color_names", "stage_clock", "config_sections", "config", "logs",
     "synth", "tracking", "sensors", "plan", "perception", "localization", "calibration", "cooperation", "agents", "mapping", "lanes", "appearance", "signals", "outcome", "describe", "report", "run_detectors", "pipeline", "prediction", "simulation", "edit", "export",
     "visualization", "evaluation", "cli", "__init__", "__main__",
 )  # fmt: skip
-PUBLIC = ["Config", "Log2SimError", "Scenario", "__version__", "evaluate", "open_log", "reconstruct", "replay"]
+PUBLIC = ["Config", "Log2SimError", "Scenario", "__version__", "evaluate", "open_log", "plot", "reconstruct", "replay"]
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +86,7 @@ def test_the_public_names_are_listed_in_a_fresh_interpreter() -> None:
     assert sorted(ran.stdout.split()) == PUBLIC
 
 
-@pytest.mark.parametrize("name", ["open_log", "reconstruct", "replay", "evaluate"])
+@pytest.mark.parametrize("name", ["open_log", "plot", "reconstruct", "replay", "evaluate"])
 def test_the_public_functions_show_their_signatures(name: str) -> None:
     function = getattr(log2sim, name)
     assert inspect.isfunction(function)
@@ -94,3 +96,10 @@ def test_the_public_functions_show_their_signatures(name: str) -> None:
 def test_an_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="has no attribute 'recontruct'"):
         log2sim.recontruct  # noqa: B018
+
+
+@pytest.mark.parametrize("place", late_functions.FUNCTIONS.values())
+def test_late_functions_are_of_higher_rooms_and_exist(place: str) -> None:
+    module, _, name = place.partition(":")
+    assert callable(getattr(importlib.import_module(module), name))
+    assert RANKED.index(imports.room_of(module.removeprefix("log2sim."))) > RANKED.index("datatypes")

@@ -14,22 +14,14 @@ from log2sim.datatypes.categories import (
     MIN_SIZE_M,
     TYPICAL_SIZE_M,
 )
+from log2sim.datatypes.deferred import Deferred
 from log2sim.datatypes.doubtful import list_doubtful, say_confidence, why_doubtful
 from log2sim.datatypes.doubts import FLAGS, MIN_TRUSTED_CONFIDENCE, Doubt
 from log2sim.datatypes.ends import ENDS, ROAD, VEHICLE, Span, end_of, retime_spans, seen_from
 from log2sim.datatypes.faults import FAULT_KINDS, Fault, Treatment
 from log2sim.datatypes.ignore_regions import IgnoreRegions, LabelView
 from log2sim.datatypes.labels import ImageLabels, ImageRegions, Labels
-from log2sim.datatypes.log import (
-    Deferred,
-    EgoVehicle,
-    Frame,
-    Lidar,
-    Log,
-    MapFrame,
-    Stream,
-    Sweep,
-)
+from log2sim.datatypes.log import EgoVehicle, Frame, Lidar, Log, MapFrame, Stream
 from log2sim.datatypes.map_features import (
     BORDER_KINDS,
     LANE_LINE_KINDS,
@@ -45,6 +37,7 @@ from log2sim.datatypes.obstacles import Obstacles
 from log2sim.datatypes.rays import Rays
 from log2sim.datatypes.scenario import EGO, VERSION, Scenario
 from log2sim.datatypes.signals import SIGNAL_STATES, Signal
+from log2sim.datatypes.tick import Sweep, Tick
 from log2sim.datatypes.tracks import Track
 from log2sim.datatypes.trajectory import STANDSTILL_DRIFT_M, STANDSTILL_MPS, Trajectory
 from log2sim.datatypes.waypoints import Waypoints
@@ -105,6 +98,7 @@ __all__ = [
     "Span",
     "Stream",
     "Sweep",
+    "Tick",
     "Track",
     "Trajectory",
     "Treatment",

@@ -6,54 +6,19 @@ M boxes, L labels, T ticks, F records of a stream.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, fields
-from typing import Any, Generic, Literal, Self, TypeVar, overload
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim import late_functions
+from log2sim.datatypes.deferred import Deferred
 from log2sim.datatypes.labels import ImageLabels, ImageRegions, Labels
-from log2sim.geometry import Array, Camera, Mount, PoseTrack
-
-T = TypeVar("T")
-
-
-class Deferred(Generic[T]):
-    """A dataclass field that also takes a function of no arguments; it is called when the field is first read.
-
-    For parts of a log that have to be read from large files: opening a log does not wait for what is not used. Without
-    arguments the field has no default.
-    """
-
-    def __init__(self, *default: T) -> None:
-        self._default = default
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        """Remember the name of the field."""
-        self._name = name
-
-    @overload
-    def __get__(self, instance: None, owner: type) -> Self: ...
-
-    @overload
-    def __get__(self, instance: object, owner: type) -> T: ...
-
-    def __get__(self, instance: object | None, owner: type) -> Any:
-        """Return the value; of the class, the default."""
-        if instance is None:
-            if not self._default:
-                raise AttributeError(self._name)
-            return self._default[0]
-        value = instance.__dict__[self._name]
-        if callable(value):
-            value = instance.__dict__[self._name] = value()
-        return value
-
-    def __set__(self, instance: object, value: T | Callable[[], T]) -> None:
-        """Store the value or the function that makes it."""
-        instance.__dict__[self._name] = value
+from log2sim.datatypes.tick import Tick
+from log2sim.geometry import NS_PER_S, Array, Camera, Mount, PoseTrack
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,35 +36,6 @@ class Lidar:
     name: str
     mount: Mount
     mount_T_lidar: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Sweep:
-    """One LiDAR sweep.
-
-    Attributes
-    ----------
-    stamp_ns : int
-        Absolute time of the sweep.
-    xyz_m : (N, 3) float32 or float64, m
-        Finite points in `frame`.
-    frame : {"lidar", "map"}
-        "lidar": the sensor's frame; "map": already motion-compensated.
-    t_ns : (N,) int64 or None
-        Absolute stamps at which the points were measured; None when the log has none.
-    compensated_ns : int or None
-        For the frame "lidar": the stamp of the sensor's pose to which all points are compensated already; None where each
-        point is in the sensor's frame at its own time.
-    intensity : (N,) float32 or None
-        How strong each return is, on the scale of its LiDAR; NaN where the log does not tell. None where the log has none.
-    """
-
-    stamp_ns: int
-    xyz_m: NDArray[np.floating[Any]]
-    frame: Literal["lidar", "map"] = "lidar"
-    t_ns: NDArray[np.int64] | None = None
-    compensated_ns: int | None = None
-    intensity: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,6 +152,71 @@ class Log:
     notes: Deferred[tuple[str, ...]] = Deferred(())
     calibrations: Mapping[str, str] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        """Return name, format and sensors in one line, without reading what is not read yet."""
+        counts = [(len(self.cameras), "camera"), (len(self.lidars), "LiDAR")]
+        parts = [f"{count} {noun}{'s' * (count != 1)}" for count, noun in counts if count]
+        known = [t_ns for s in self.streams.values() if not callable(t_ns := vars(s)["t_ns"]) and len(t_ns)]
+        known += [self.ego.t_ns] if self.ego is not None and not known else []
+        if known:
+            parts.append(f"{(max(int(t[-1]) for t in known) - min(int(t[0]) for t in known)) / NS_PER_S:.1f} s")
+        return f"<Log {self.name!r:.80} ({self.format}): {', '.join(parts) or 'no sensors'}>"
+
+    def _repr_html_(self) -> str | None:
+        """Return what a notebook shows: the sensors, and a picture of each camera."""
+        return late_functions.html_or_none(self)
+
+    def ticks(
+        self, cameras: Sequence[str] = (), *, start_s: float | None = None, stop_s: float | None = None
+    ) -> Sequence[Tick]:
+        """Return the synchronized moments of the log; their pictures and sweeps are read when they are asked for.
+
+        Parameters
+        ----------
+        cameras : sequence of str
+            All of the log where it is empty.
+        start_s, stop_s : float, optional
+            Keeps the ticks in [start, stop] seconds after the first one.
+
+        Raises
+        ------
+        ConfigError
+            For an unknown camera, and where no tick is left.
+        LogError
+            For a log without cameras and LiDARs, or with stamps that do not increase.
+
+        Examples
+        --------
+        >>> for tick in log.ticks():
+        ...     print(tick.t_s, tick.images["front"].shape, len(tick.points))
+        """
+        ticks: Sequence[Tick] = late_functions.call("ticks_of", self, tuple(cameras), start_s=start_s, stop_s=stop_s)
+        return ticks
+
+    def show(self, when: float | Tick | None = None, *, camera: str | Sequence[str] = (), scenario: Any = None) -> Any:
+        """Draw boxes and LiDAR points on the pictures of one moment.
+
+        Parameters
+        ----------
+        when : float or Tick, optional
+            Seconds after the first tick, or a tick of `ticks`; by default a moment in the middle.
+        camera : str or sequence of str
+            One camera or several; all where it is empty.
+        scenario : Scenario, optional
+            Its agents are drawn in place of the labels of the log.
+
+        Returns
+        -------
+        log2sim.visualization.notebook.show.Picture
+            A notebook shows it; `save` writes it, `figure` is the figure.
+
+        Raises
+        ------
+        ConfigError
+            For an unknown camera, and for a time outside the log.
+        """
+        return late_functions.call("show_log", self, when, camera=camera, scenario=scenario)
 
     def changed(self, **changes: Any) -> Log:
         """Return the log with other values of some fields; unlike `dataclasses.replace`, what is deferred stays deferred."""

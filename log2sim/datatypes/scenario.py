@@ -11,11 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from log2sim import late_functions
 from log2sim.datatypes.agent import Agent, agent_from_dict, agent_to_dict
 from log2sim.datatypes.ignore_regions import IgnoreRegions
 from log2sim.datatypes.log import MapFrame
 from log2sim.datatypes.map_features import MapFeatures
 from log2sim.datatypes.signals import Signal
+from log2sim.datatypes.waypoint_table import dataframe_of, write_parquet
 from log2sim.documents import check, read_json, write_json
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.geometry import NS_PER_S, Array
@@ -62,6 +64,17 @@ class Scenario:
     ignore_regions: IgnoreRegions | None = None
     map_features: MapFeatures | None = None
     signals: tuple[Signal, ...] = ()
+
+    def __repr__(self) -> str:
+        """Return name, agents and duration in one line."""
+        count = len(self.others)
+        agents = f"{'the ego and ' * (self.ego is not None)}{count} {'other ' * (self.ego is not None)}agent{'s' * (count != 1)}"
+        notes = [f"{len(self.doubtful)} doubtful"] * bool(self.doubtful)
+        return f"<Scenario {self.name!r:.80}: {', '.join([agents, *notes, f'{self.duration_s:.1f} s'])}>"
+
+    def _repr_html_(self) -> str | None:
+        """Return what a notebook shows: the agents by category, and the tracks from above."""
+        return late_functions.html_or_none(self)
 
     @property
     def ego(self) -> Agent | None:
@@ -172,6 +185,32 @@ class Scenario:
         document = self.to_dict()
         check(document, "scenario-1", ScenarioError)
         write_json(path, document)
+
+    def to_dataframe(self) -> Any:
+        """Return a pandas DataFrame with one row for each agent and waypoint, ordered by agent and time.
+
+        Columns: `agent`, `category`, `t_s`, `x_m`, `y_m`, `z_m` (center of the box, map frame), `yaw_rad`, `speed_mps`,
+        `observed`, `sigma_xy_m`, `sigma_yaw_rad`, `sigma_speed_mps` (NaN where not known), `length_m`, `width_m`,
+        `height_m`, `static`, `confidence`, `doubts` (the flags, joined by commas). `attrs` hold name and start of the scenario.
+
+        Raises
+        ------
+        MissingExtra
+            When pandas is not installed.
+        """
+        return dataframe_of(self.agents, {"name": self.name, "t0_ns": int(self.t0_ns)})
+
+    def to_parquet(self, path: Path | str) -> None:
+        """Write the rows of `to_dataframe` as a Parquet file, atomically; its schema states unit and meaning of each column.
+
+        Raises
+        ------
+        MissingExtra
+            When pyarrow is not installed.
+        ConfigError
+            When the file cannot be written.
+        """
+        write_parquet(self.agents, {"name": self.name, "t0_ns": int(self.t0_ns)}, Path(path))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the document of `schemas/scenario-1.json`."""

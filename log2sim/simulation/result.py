@@ -10,6 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim import late_functions
 from log2sim.datatypes import Scenario, Waypoints
 from log2sim.documents import check, read_json, write_json
 from log2sim.errors import ScenarioError
@@ -137,6 +138,15 @@ class Replay:
     metrics: Mapping[str, Any] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     warnings: Warnings | None = None
+
+    def __repr__(self) -> str:
+        """Return scenario, mode, model and agents in one line."""
+        count = len(self.agents)
+        return f"<Replay of {self.scenario!r:.80}: {count} agent{'s' * (count != 1)}, mode {self.mode}, model {self.model}>"
+
+    def _repr_html_(self) -> str | None:
+        """Return what a notebook shows: models and collisions, and the paths from above."""
+        return late_functions.html_or_none(self)
 
     def agent(self, id: str) -> AgentReplay:
         """Return the agent with an id; `KeyError` when there is none."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -114,7 +114,14 @@ class Moment:
     notes: tuple[str, ...]
 
 
-def read_moment(log: Log, cameras: Sequence[str] = (), at_s: float | None = None) -> Moment:
+def read_moment(
+    log: Log,
+    cameras: Sequence[str] = (),
+    at_s: float | None = None,
+    *,
+    t_ns: int | None = None,
+    labels: Callable[[int], Labels] | None = None,
+) -> Moment:
     """Read the records of one tick.
 
     Parameters
@@ -124,6 +131,10 @@ def read_moment(log: Log, cameras: Sequence[str] = (), at_s: float | None = None
         All of the log where it is empty.
     at_s : float, optional
         Time of the tick since the first one, s; by default in the middle of those with the most records.
+    t_ns : int, optional
+        Absolute stamp; the tick nearest to it is read, whatever `at_s` says.
+    labels : callable, optional
+        Returns for the stamp of the tick the 3D boxes that are drawn in place of those of the log.
 
     Raises
     ------
@@ -140,11 +151,13 @@ def read_moment(log: Log, cameras: Sequence[str] = (), at_s: float | None = None
         notes.append("the log has no poses: drawn as if the ego stood still")
         log = _standing(log)
     schedule = synchronize(log, tuple(cameras) or tuple(log.cameras))
-    tick = _find_tick(schedule, at_s)
+    tick = _find_tick(schedule, at_s) if t_ns is None else int(np.argmin(np.abs(schedule.t_ns - t_ns)))
+    t_ns = int(schedule.t_ns[tick])
+    if labels is not None:
+        log = log.changed(labels=labels(t_ns), image_labels={})
     reader = _SweepReader(log)
     shots = tuple(_shot(log, schedule, reader, row, tick) for row in range(len(schedule.frames)))
     sweeps = reader.at(schedule, schedule.reference_row, tick)
-    t_ns = int(schedule.t_ns[tick])
     boxes = labels_at(log.labels, t_ns)
     at = float(t_ns - schedule.t_ns[0]) / NS_PER_S
     return Moment(log, t_ns, at, shots, sweeps, boxes, (*notes, *reader.problems))

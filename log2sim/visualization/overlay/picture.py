@@ -59,8 +59,8 @@ def write_overlay(moment: Moment, path: Path | str, *, overwrite: bool = False) 
         figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": None})
 
 
-def draw_moment(moment: Moment) -> Figure:
-    """Draw all cameras of a moment and, where it has sweeps or boxes, the view from above."""
+def draw_moment(moment: Moment, *, box_name: str = "3D label") -> Figure:
+    """Draw all cameras of a moment and, where it has sweeps or boxes, the view from above; the legend names the boxes."""
     count = len(moment.shots) + bool(moment.sweeps or len(moment.boxes.t_ns))
     columns = int(np.ceil(np.sqrt(count)))
     rows = -(-count // columns)
@@ -83,7 +83,7 @@ def draw_moment(moment: Moment) -> Figure:
         caption = _draw_above(ax, moment, wide_in / picture_in) if above else _draw_shot(ax, moment.shots[k], moment)
         text = "\n".join(printable(line, 110) for line in caption)
         ax.set_title(text, fontsize=6.5, color=INK, family=FONT, parse_math=False, pad=3, loc="left")
-    _draw_frame(figure, moment)
+    _draw_frame(figure, moment, box_name)
     return figure
 
 
@@ -163,7 +163,7 @@ def _reach(moment: Moment, origin: Array) -> float:
     return float(np.clip(np.percentile(everything, 97) if len(everything) else 0.0, 15.0, ABOVE_REACH_M))
 
 
-def _draw_frame(figure: Figure, moment: Moment) -> None:
+def _draw_frame(figure: Figure, moment: Moment, box_name: str) -> None:
     """Write the title, the scale of depths and the legend of boxes."""
     width, height = figure.get_size_inches()
     log = moment.log
@@ -172,7 +172,7 @@ def _draw_frame(figure: Figure, moment: Moment) -> None:
     figure.text(0.06 / width, 1 - 0.08 / height, printable(title, 160), fontsize=9, color=INK, **text)
     notes = "; ".join(moment.notes)
     figure.text(0.06 / width, 1 - 0.27 / height, printable(notes, 220), fontsize=6.5, color="#C8102E", **text)
-    _draw_legend(figure)
+    _draw_legend(figure, box_name)
     if not moment.shots:
         return
     bar = figure.add_axes(((width - 0.6) / width, 0.25, 0.12 / width, 0.5))
@@ -184,9 +184,9 @@ def _draw_frame(figure: Figure, moment: Moment) -> None:
     bar.set_title("depth, m", fontsize=6.5, color=MUTED, family=FONT)
 
 
-def _draw_legend(figure: Figure) -> None:
+def _draw_legend(figure: Figure, box_name: str) -> None:
     groups = list(dict.fromkeys(CATEGORY[c].group for c in CATEGORIES))
-    handles = [Line2D([], [], color=COLORS[g], lw=1.6, label=f"3D label: {g.replace('_', '-')}") for g in groups]
+    handles = [Line2D([], [], color=COLORS[g], lw=1.6, label=f"{box_name}: {g.replace('_', '-')}") for g in groups]
     handles.append(Line2D([], [], color=IMAGE_BOX_COLOR, lw=1.6, ls=(0, (3, 2)), label="2D label"))
     figure.legend(
         handles=handles, loc="lower left", ncols=len(handles) + 1, fontsize=6.5, frameon=True, facecolor="#10151D",

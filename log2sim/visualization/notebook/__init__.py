@@ -1,0 +1,1 @@
+"""What a notebook shows of logs, scenarios and replays."""
