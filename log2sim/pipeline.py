@@ -97,7 +97,9 @@ class Run:
     registration: Sequence[dict[str, Any]] = ()
 
 
-def reconstruct(log: Log, config: Config | None = None, *, progress: Progress | None = None) -> Result:
+def reconstruct(
+    log: Log, config: Config | None = None, *, progress: Progress | None = None, cache: bool = True
+) -> Result:
     """Reconstruct the scenario of a log.
 
     Parameters
@@ -108,6 +110,8 @@ def reconstruct(log: Log, config: Config | None = None, *, progress: Progress | 
         Settings; the defaults without.
     progress : callable, optional
         Called as `progress(stage, done, total)`; with a total of 0 when a stage of unknown length begins.
+    cache : bool
+        Whether what the detector finds in pictures is taken from the user's cache, and kept there.
 
     Raises
     ------
@@ -116,12 +120,12 @@ def reconstruct(log: Log, config: Config | None = None, *, progress: Progress | 
     NothingToReconstruct
         When neither an ego nor any agent was found.
     """
-    run = start(log, config or Config(), progress=progress)
+    run = start(log, config or Config(), progress=progress, cache=cache)
     observations = first_pass(run)
     return look_around(run, observations, second_pass(run, observations))
 
 
-def start(log: Log, config: Config, *, progress: Progress | None = None) -> Run:
+def start(log: Log, config: Config, *, progress: Progress | None = None, cache: bool = True) -> Run:
     """Choose the poses and the sensors, check their calibration, synchronize them, and plan the run."""
     clock, report_progress = StageClock(), progress or (lambda *_: None)
     with clock.stage("poses"):
@@ -135,7 +139,7 @@ def start(log: Log, config: Config, *, progress: Progress | None = None) -> Run:
         road = register_road(log, config, sensors, progress=report_progress)
         log, sensors = road.log, sensors.without([f.sensor for f in road.faults if f.treatment == "left_out"])
     report_progress("load", 0, 0)
-    detectors = create_detectors(sensors.restrict(log), config)
+    detectors = create_detectors(sensors.restrict(log), config, cache=cache)
     with clock.stage("sync"):
         schedule = schedule_of(log, config, sensors)
     plan = make_plan(log, config, sensors, schedule.t_ns)
@@ -171,6 +175,7 @@ def first_pass(run: Run) -> Observations:
         progress=lambda done, total: run.report_progress("detect and measure", done, total),
         lidar_detector=run.detectors.sweeps,
         sweeps=run.config.lidar.sweeps,
+        cache=run.detectors.cache,
     )
 
 
@@ -245,7 +250,8 @@ def result_of(run: Run, ego: Agent | None, outputs: RunOutputs) -> Result:
     )
     report = report_of(log, config, run.schedule, outputs, outcomes, scenario)
     added = {"poses": run.poses.to_dict(), "faults": faults, "registration": list(run.registration)}
-    return Result(scenario, {**report, **added}, log)
+    cached = {"detection_cache": None if run.detectors.cache is None else run.detectors.cache.figures()}
+    return Result(scenario, {**report, **added, **cached}, log)
 
 
 def look_around(run: Run, observations: Observations, result: Result) -> Result:

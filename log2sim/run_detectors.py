@@ -9,6 +9,7 @@ from log2sim.datatypes import Log
 from log2sim.perception.cooperative.detector import create_for_ends
 from log2sim.perception.detect.detectors import Detector, create_detector
 from log2sim.perception.detect3d.detectors import LidarDetector
+from log2sim.perception.detection_cache import DetectionCache, open_cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,10 +22,13 @@ class Detectors:
         Searches the frames of all cameras.
     sweeps : LidarDetector, optional
         Searches the clouds.
+    cache : DetectionCache, optional
+        What the detector in images found in earlier runs.
     """
 
     images: Detector | None
     sweeps: LidarDetector | None
+    cache: DetectionCache | None = None
 
     @property
     def name(self) -> str:
@@ -32,12 +36,17 @@ class Detectors:
         return "+".join(detector.name for detector in (self.images, self.sweeps) if detector is not None)
 
 
-def create_detectors(log: Log, config: Config) -> Detectors:
-    """Create the detectors that the settings name."""
-    return Detectors(
-        create_image_detector(log, config) if config.detect.in_images else None,
-        create_for_ends(log, config) if config.detect.in_sweeps else None,
-    )
+def create_detectors(log: Log, config: Config, *, cache: bool = True) -> Detectors:
+    """Create the detectors that the settings name.
+
+    Parameters
+    ----------
+    cache : bool
+        Whether what the detector finds in images is taken from the user's cache, and kept there.
+    """
+    images = create_image_detector(log, config) if config.detect.in_images else None
+    sweeps = create_for_ends(log, config) if config.detect.in_sweeps else None
+    return Detectors(images, sweeps, open_cache(images) if cache and images is not None else None)
 
 
 def create_image_detector(log: Log, config: Config) -> Detector:

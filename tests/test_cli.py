@@ -30,6 +30,7 @@ COMMANDS = (
     "synth",
     "inspect",
     "validate",
+    "cache",
     "config",
 )
 PNG, GIF = b"\x89PNG", b"GIF8"
@@ -277,7 +278,7 @@ def test_help_and_version() -> None:
 def test_a_missing_extra_exits_with_5_and_names_it(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("LOG2SIM_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("log2sim.perception.detect.ssd_mobilenet.PACKAGE", "no_such_package_anywhere")
     ran = run("reconstruct", tiny_folder, "--out", tmp_path / "s.json", "--quiet")
     assert ran.code == 5

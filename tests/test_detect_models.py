@@ -35,7 +35,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def in_cache(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+    monkeypatch.setenv("LOG2SIM_CACHE", str(cache))
     return cache
 
 
@@ -94,7 +94,7 @@ def test_conversion_is_kept_and_repeated_only_when_the_file_changed(
     in_cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = ssd_mobilenet.converted_model()
-    assert path.parent == in_cache / "log2sim"
+    assert path.parent == in_cache
     content, stamp = path.read_bytes(), path.stat().st_mtime_ns
     assert ssd_mobilenet.converted_model().stat().st_mtime_ns == stamp
     path.write_bytes(content[:-100])
@@ -118,7 +118,7 @@ def test_anchors_tile_the_picture_as_the_paper_says() -> None:
 
 
 def test_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("LOG2SIM_CACHE", str(tmp_path))
     monkeypatch.setattr(ssd_mobilenet, "PACKAGE", "no_such_package_anywhere")
     with pytest.raises(MissingExtra, match="needs the extra 'coco'"):
         create_detector("ssd-mobilenet-v2", LOG)
@@ -130,7 +130,7 @@ def test_other_weights_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     (package / "__init__.py").write_text("raise SystemExit('must not be imported')\n")
     (package / "models" / "frozen_inference_graph.pb").write_bytes(b"other")
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("LOG2SIM_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(ssd_mobilenet, "PACKAGE", "other_weights")
     with pytest.raises(ConfigError, match="SHA-256"):
         create_detector("ssd-mobilenet-v2", LOG)

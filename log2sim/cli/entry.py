@@ -10,6 +10,7 @@ import typer
 
 from log2sim.cli import (
     bench,
+    cache,
     config,
     convert,
     detect,
@@ -77,7 +78,7 @@ def root(
 
 for command in (
     reconstruct.reconstruct, inspect.inspect, validate.validate, convert.convert, detect.detect, evaluate.evaluate, bench.bench,
-    plot.plot, view.view, replay.replay, predict.predict, edit.edit, export.export, synth.synth, config.config, doctor.doctor,
+    plot.plot, view.view, replay.replay, predict.predict, edit.edit, export.export, synth.synth, config.config, cache.cache, doctor.doctor,
 ):  # fmt: skip
     add_command(app, command)
 add_command(app, import_.import_, "import")

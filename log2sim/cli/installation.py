@@ -272,7 +272,7 @@ def _state_of_image_detector() -> str:
 
 def find_cache() -> Path:
     """Return the folder of the cache."""
-    from log2sim.perception.detect.ssd_mobilenet import cache_folder
+    from log2sim.cache_folder import cache_folder
 
     return cache_folder()
 

@@ -123,6 +123,12 @@ Poses = Annotated[
 ]
 
 
+NoCache = Annotated[
+    bool,
+    typer.Option("--no-cache", help="Search every picture again, and keep nothing of it; see log2sim cache."),
+]
+
+
 def fail(message: str, code: int) -> NoReturn:
     """Print an error and exit with a code."""
     sys.stderr.write(f"log2sim: {message}\n")

@@ -12,12 +12,14 @@ from log2sim.cli.options import (
     ConfigFile,
     Format,
     LogPath,
+    NoCache,
     Overwrite,
     Poses,
     Quiet,
     Sequence,
     Settings,
     camera_names,
+    counted,
     say,
 )
 
@@ -69,6 +71,7 @@ def reconstruct(
     topdown: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="Bird's-eye image of all cameras to write.")
     ] = None,
+    no_cache: NoCache = False,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
@@ -102,7 +105,7 @@ def reconstruct(
     if opened.cameras and not chosen.detect.in_images and detector is None:
         say(f"note: no image is searched: {MissingExtra(IMAGE_DETECTOR, 'coco')}", quiet=quiet)
     with progress(quiet=quiet) as report_progress:
-        result = run(opened, chosen, progress=report_progress)
+        result = run(opened, chosen, progress=report_progress, cache=not no_cache)
     for line in (*pose_notes(result.report["poses"]), *fault_lines(result.report["faults"])):
         say(line, quiet=quiet)
     with together():
@@ -111,7 +114,8 @@ def reconstruct(
         if report is not None:
             write_json(report, result.report)
         result.scenario.save(out)
-    notes = [f"note: {note}" for note in (*unused_records(result.report), *feature_notes(result.scenario))]
+    told = (*unused_records(result.report), *cache_notes(result.report), *feature_notes(result.scenario))
+    notes = [f"note: {note}" for note in told]
     for line in (*notes, *doubt_lines(result.scenario), f"{out}: {_summary(result)}"):
         say(line, quiet=quiet)
 
@@ -134,7 +138,20 @@ def _summary(result: Result) -> str:
     counts, rate = result.report["agents"], result.report["ticks_per_second"]
     static, duration_s = counts["static"], result.scenario.duration_s
     agents = f"{counts['total']} agents ({static} static) over {duration_s:.1f} s"
-    return ", ".join([agents, *described(result.scenario), f"{rate:.1f} ticks/s"])
+    return ", ".join([agents, *described(result.scenario), f"{rate:.1f} ticks/s", *known_pictures(result.report)])
+
+
+def known_pictures(report: dict[str, Any]) -> list[str]:
+    """Say how many pictures were not searched, since an earlier run had done it."""
+    cache = report["detection_cache"]
+    found = 0 if cache is None else cache["found"]
+    return [f"{counted(found, 'picture')} known from earlier runs"] if found else []
+
+
+def cache_notes(report: dict[str, Any]) -> list[str]:
+    """Say why detections were not kept, where they should have been."""
+    cache = report["detection_cache"]
+    return [f"detections are not kept for later runs: {cache['problem']}"] if cache and cache["problem"] else []
 
 
 def described(scenario: Scenario) -> list[str]:

@@ -52,7 +52,8 @@ class Stream:
         Returns record `i`: (H, W, 3) uint8 BGR of a camera, a `Sweep` of a LiDAR. Raises `RecordError` for a record that
         cannot be read. Several threads may call it at once.
     encoded : callable or None
-        Returns the image of record `i` as the bytes of a JPEG or PNG file, as the log holds it; None where it holds none.
+        Returns the image of record `i` as the bytes of a JPEG or PNG file, as the log holds it, which hold all that `read`
+        returns; None where it holds none.
     """
 
     name: str
@@ -271,8 +272,11 @@ class Frame:
         Absolute stamp.
     image : callable
         Decodes the frame when called: (H, W, 3) uint8 BGR.
+    encoded : callable or None
+        Returns the file that `image` decodes, where the log holds one. Raises `RecordError` for one that cannot be read.
     """
 
     camera: Camera
     t_ns: int
     image: Callable[[], NDArray[np.uint8]]
+    encoded: Callable[[], bytes] | None = None

@@ -14,6 +14,7 @@ from log2sim.datatypes import ENDS, Boxes3D, Detections, Fault, Log, Measurement
 from log2sim.geometry import Array, inverse
 from log2sim.perception.detect.detectors import Detector
 from log2sim.perception.detect3d.detectors import LidarDetector
+from log2sim.perception.detection_cache import DetectionCache
 from log2sim.perception.frames import FrameDetector, RecordReader
 from log2sim.perception.homography.correspondences import Correspondences, foot_points, undistorted_pixels
 from log2sim.perception.late_fusion import join_with_images, match_boxes
@@ -92,6 +93,7 @@ def observe(
     progress: Callable[[int, int], None],
     lidar_detector: LidarDetector | None = None,
     sweeps: int = 1,
+    cache: DetectionCache | None = None,
 ) -> Observations:
     """Run detection and measurement over all ticks.
 
@@ -103,6 +105,8 @@ def observe(
         Searches the clouds of the reference sensor.
     sweeps : int
         Successive clouds that it sees as one.
+    cache : DetectionCache, optional
+        Of the detector in images: frames that it knows are not searched again.
     """
     out = Observations(feet={c: [] for c in plan.cameras}, ground={c: [] for c in plan.cameras})
     records = out.records = RecordReader(log)
@@ -110,7 +114,7 @@ def observe(
     first = _FirstPass(log, schedule, plan, out, mode, max_range_m)
     with ThreadPoolExecutor(BACKGROUND_THREADS) as pool:
         clouds = CloudPrefetcher(log, schedule, plan, records, pool, options)
-        frames = None if detector is None else FrameDetector(log, schedule, detector, plan, records, pool, clock)
+        frames = None if detector is None else FrameDetector(log, schedule, detector, plan, records, pool, clock, cache)
         clouds.prefetch(0)
         for tick in range(len(schedule)):
             known_lights = 0 if frames is None else len(frames.lights)
@@ -133,6 +137,8 @@ def observe(
                 out.obstacles.append(None if ready[0] is None else obstacles_of(ready[0]))
             progress(tick + 1, len(schedule))
     records.require_some()
+    if cache is not None:
+        cache.finish()
     out.sweeps, out.faults = clouds.compensated, records.watch.faults(schedule)
     if frames is not None:
         out.frames_detected, out.frames_skipped, out.lights = frames.detected, frames.skipped, frames.lights

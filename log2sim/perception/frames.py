@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,17 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Detections, Frame, Log, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.perception.detect.detectors import Detector, detect_all
+from log2sim.perception.detection_cache import DetectionCache
 from log2sim.perception.light_boxes import MAX_CROPS, LightBox, crop_lights
+from log2sim.perception.picture_findings import PictureFindings
 from log2sim.perception.record_checks.records import RecordWatch
 from log2sim.perception.record_checks.thumbnails import Thumbnail, shrink
 from log2sim.perception.sync import Schedule
 from log2sim.plan import Plan, Stage
 from log2sim.stage_clock import StageClock
+
+# Of a frame that is not decoded.
+EMPTY: Thumbnail = np.zeros((0, 0), np.float32)
 
 
 class RecordReader:
@@ -54,9 +60,13 @@ class RecordReader:
                 if str(error) not in problems:  # a record that is asked for again fails again
                     problems.append(str(error))
             return None
+        self.count(stream)
+        return record
+
+    def count(self, stream: str) -> None:
+        """Count a record of a stream as read, also one whose content is known already."""
         with self._lock:
             self.read[stream] = self.read.get(stream, 0) + 1
-        return record
 
     def require_some(self) -> None:
         """Require that every stream of which records were requested gave at least one.
@@ -87,7 +97,7 @@ class FrameDetector:
     Attributes
     ----------
     detected : int
-        Number of frames in which the detector ran.
+        Number of frames in which the detector ran, now or in an earlier run.
     skipped : dict of str to int
         Number of frames skipped, by camera.
     lights : list of LightBox
@@ -96,10 +106,10 @@ class FrameDetector:
 
     def __init__(
         self, log: Log, schedule: Schedule, detector: Detector, plan: Plan, reader: RecordReader,
-        pool: ThreadPoolExecutor, clock: StageClock,
+        pool: ThreadPoolExecutor, clock: StageClock, cache: DetectionCache | None = None,
     ) -> None:  # fmt: skip
         self._log, self._schedule, self._detector, self._plan = log, schedule, detector, plan
-        self._reader, self._pool, self._clock = reader, pool, clock
+        self._reader, self._pool, self._clock, self._cache = reader, pool, clock, cache
         self._pending: dict[int, dict[str, Detections]] = {}
         self._thumbnails: dict[tuple[str, int], Thumbnail] = {}
         self._lights: dict[tuple[str, int], list[LightBox]] = {}
@@ -150,29 +160,60 @@ class FrameDetector:
                     self.skipped[camera] = self.skipped.get(camera, 0) + 1
 
     def _detect(self, tick: int, cameras: Iterable[str]) -> dict[str, Detections]:
-        """Run the detector on a tick's frames by camera; unreadable frames are left out, all others decode in parallel."""
-        frames = self._frames(tick, cameras)
+        """Search a tick's frames by camera; unreadable frames are left out."""
+        frames, found = self._frames(tick, cameras), dict[str, PictureFindings]()
+        with self._clock.stage("detect"):
+            keys = self._recall(frames, found)
+        self._search({name: frame for name, frame in frames.items() if name not in found}, keys, found)
+        self.detected += len(found)
+        for name in frames:
+            if name in found:
+                if found[name].thumbnail.size:
+                    self._thumbnails[name, tick] = found[name].thumbnail
+                self._lights[name, tick] = list(found[name].lights)
+        return {name: found[name].detections for name in frames if name in found}
+
+    def _recall(self, frames: dict[str, Frame], found: dict[str, PictureFindings]) -> dict[str, bytes | None]:
+        """Add what the cache knows of frames to `found`; returns the keys of all frames."""
+        cache = self._cache
+        if cache is None:
+            return {}
+        keys = dict(zip(frames, self._pool.map(cache.key_of, frames.values())))
+        for name, key in keys.items():
+            findings = None if key is None else cache.get(key, frames[name])
+            if findings is not None:
+                found[name] = findings
+                self._reader.count(name)
+        cache.found += sum(name in found for name in keys)
+        return keys
+
+    def _search(
+        self, frames: dict[str, Frame], keys: dict[str, bytes | None], found: dict[str, PictureFindings]
+    ) -> None:
+        """Run the detector on frames, all of which decode in parallel, and add to `found` what it finds."""
+        thumbnails: dict[str, Thumbnail | None] = dict.fromkeys(frames, EMPTY)
         if self._plan.keeps(Stage.IMAGE_DECODING):
             with self._clock.stage("decode"):
                 thumbnails = dict(zip(frames, self._pool.map(_thumbnail_of, frames.values())))
-            frames = {name: frame for name, frame in frames.items() if thumbnails[name] is not None}
-            self._thumbnails |= {(name, tick): small for name, small in thumbnails.items() if small is not None}
         with self._clock.stage("detect"):
-            self.detected += len(frames)
-            found = dict(zip(frames, detect_all(self._detector, list(frames.values())), strict=True))
-            for name, boxes in found.items():
-                if len(boxes.traffic_lights):
-                    frame = frames[name]
-                    self._lights[name, tick] = crop_lights(name, frame.t_ns, frame.image(), boxes.traffic_lights)
-            return found
+            readable = {name: frame for name, frame in frames.items() if thumbnails[name] is not None}
+            searched = detect_all(self._detector, list(readable.values()))
+            for (name, frame), boxes in zip(readable.items(), searched, strict=True):
+                lights, thumbnail = boxes.traffic_lights, thumbnails[name]
+                cut = crop_lights(name, frame.t_ns, frame.image(), lights) if len(lights) else []
+                found[name] = PictureFindings(boxes, EMPTY if thumbnail is None else thumbnail, tuple(cut))
+                key = keys.get(name)
+                if self._cache is not None and key is not None:
+                    self._cache.put(key, found[name])
 
     def _frames(self, tick: int, cameras: Iterable[str]) -> dict[str, Frame]:
         frames = {}
         for name in cameras:
-            index = int(self._schedule.frames[name][tick])
+            index, stream = int(self._schedule.frames[name][tick]), self._log.streams[name]
             if index >= 0:
-                stamp = int(self._log.streams[name].t_ns[index])
-                frames[name] = Frame(self._log.cameras[name], stamp, _LazyImage(self._reader, name, index))
+                encoded = None if stream.encoded is None else partial(stream.encoded, index)
+                image = _LazyImage(self._reader, name, index)
+                frames[name] = Frame(self._log.cameras[name], int(stream.t_ns[index]), image, encoded)
         return frames
 
 

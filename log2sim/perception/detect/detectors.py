@@ -17,7 +17,11 @@ MAX_TILES = 64
 
 
 class Detector(Protocol):
-    """Detector of road users in one camera frame."""
+    """Detector of road users in one camera frame.
+
+    One that also has a text `cache_key`, which states all that its boxes depend on besides the picture (weights, settings,
+    versions), is not asked twice about one picture: they are kept in the user's cache.
+    """
 
     @property
     def name(self) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -61,6 +61,15 @@ class OnnxDetector:
     max_overlap: float
     tiles: Literal["auto"] | int
     default_min_score: float
+
+    @property
+    def cache_key(self) -> str | None:
+        """All that the boxes depend on besides the picture; None where the weights are not all in the model's file."""
+        import onnxruntime
+
+        digest = self.model.digest()
+        settings = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("name", "model")}
+        return None if digest is None else f"{digest} onnxruntime {onnxruntime.__version__} {settings!r}"
 
     def detect(self, frame: Frame) -> Detections:
         """Detect road users in one frame, best score first."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,11 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.errors import ConfigError
-from log2sim.input_files import require_readable
+from log2sim.input_files import read_file, require_readable
 from log2sim.perception.detect.preprocessing import InputSpec
 
 MAX_FILE_BYTES = 2 * 1024**3
 MAX_INPUT_SIDE_PX = 8192
+# How the name of another file begins in a protocol buffer: field 1, 8 bytes, "location" (onnx.proto, TensorProto.external_data).
+EXTERNAL_DATA = b"\n\x08location"
 DTYPES: Mapping[str, type] = {
     "tensor(float)": np.float32,
     "tensor(float16)": np.float16,
@@ -46,6 +49,11 @@ class OnnxModel:
     metadata: Mapping[str, str]
     session: Any
     threads: int
+
+    def digest(self) -> str | None:
+        """Return the SHA-256 of the file; None for one whose weights are in other files."""
+        content = read_file(self.path, MAX_FILE_BYTES, ConfigError)
+        return None if EXTERNAL_DATA in content else hashlib.sha256(content).hexdigest()
 
     def run(self, tensor: NDArray[Any]) -> dict[str, NDArray[Any]]:
         """Run the model on one input; returns all outputs by name."""

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-import os
 from pathlib import Path
 from typing import Any, Literal
 
+from log2sim.cache_folder import cache_folder
 from log2sim.datatypes import Log
 from log2sim.documents import replaced
 from log2sim.errors import ConfigError, MissingExtra, install_command
@@ -81,12 +81,6 @@ def graph_bytes() -> bytes:
             f"install the version that log2sim knows: {install_command(EXTRA)}"
         )
     return data
-
-
-def cache_folder() -> Path:
-    """Return the user's cache: XDG_CACHE_HOME where it is set to an absolute path, else ~/.cache."""
-    home = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(home) if Path(home).is_absolute() else Path.home() / ".cache") / "log2sim"
 
 
 def _states_digest_of(digest: Path, model: Path) -> bool:

@@ -1,0 +1,91 @@
+"""Show, limit and clear the cache of detections."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from log2sim.cli.options import AsJson, counted, say
+
+if TYPE_CHECKING:
+    from log2sim.disk_cache import DiskCache
+
+
+def cache(
+    clear: Annotated[bool, typer.Option("--clear", help="Remove all kept detections.")] = False,
+    max_mb: Annotated[
+        int | None,
+        typer.Option(
+            "--max-mb",
+            metavar="MB",
+            min=0,
+            max=2**30,
+            help="Size of the cache from now on, for all runs; what was not used for longest is dropped. At first 2048.",
+            show_default="as it is",
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show what is kept of earlier runs, so that no picture is searched twice; limit it or remove it.
+
+    The environment variable LOG2SIM_CACHE moves the folder.
+
+    Examples
+    --------
+    log2sim cache
+    log2sim cache --max-mb 8192
+    """
+    import json
+
+    from log2sim.cache_folder import detection_folder
+    from log2sim.disk_cache import DiskCache
+
+    store = DiskCache(detection_folder())
+    if max_mb is not None:
+        store.set_limit(max_mb)
+    removed = store.clear() if clear else None
+    if as_json:
+        say(json.dumps(summarize(store), indent=2))
+    elif removed is not None:
+        say(f"{store.folder}: {counted(removed, 'picture')} removed")
+    else:
+        say("\n".join(describe(summarize(store))))
+
+
+def summarize(store: DiskCache) -> dict[str, Any]:
+    """Return the folder and the size of a cache, the pictures by detector, and what the last run took from it."""
+    usage, last = store.usage(), store.last_run
+    detectors = [
+        {"name": group.rpartition(".")[0], "pictures": count, "bytes": usage.bytes[group]}
+        for group, count in sorted(usage.entries.items(), key=lambda item: (-item[1], item[0]))
+    ]
+    found, kept = last.get("found"), last.get("kept")
+    return {
+        "folder": str(store.folder),
+        "max_mb": store.max_mb,
+        "bytes": sum(usage.bytes.values()),
+        "pictures": sum(usage.entries.values()),
+        "detectors": detectors,
+        "last_run": {"found": found, "kept": kept} if isinstance(found, int) and isinstance(kept, int) else None,
+    }
+
+
+def describe(found: dict[str, Any]) -> list[str]:
+    """Describe a cache in lines for people."""
+    from log2sim.cli.tables import format_rows
+
+    rows = [
+        ("folder", found["folder"]),
+        ("size", f"{_megabytes(found)} of at most {found['max_mb']} MB"),
+        ("pictures", str(found["pictures"])),
+        *(("", f"{d['pictures']} by {d['name']}, {_megabytes(d)} MB") for d in found["detectors"]),
+    ]
+    last = found["last_run"]
+    if last is not None:
+        rows.append(("last run", f"{counted(last['found'], 'picture')} known, {last['kept']} searched and kept"))
+    return list(format_rows(rows))
+
+
+def _megabytes(entry: dict[str, Any]) -> str:
+    return f"{entry['bytes'] / 1024**2:.1f}"
