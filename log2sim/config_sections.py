@@ -87,6 +87,15 @@ class DetectConfig(Section):
         0, "Side of the input of an ONNX model that takes any size; 0: usual for its layout.", unit="px", ge=0, le=8192
     )
 
+    period_s: float = setting(
+        0.3,
+        "Time from one search of a camera's pictures to the next, where LiDAR sweeps are searched at every tick; 0: every "
+        "picture is searched.",
+        unit="s",
+        ge=0.0,
+        le=10.0,
+    )
+
     @property
     def in_images(self) -> str:
         """Name of the detector in images, "" where LiDAR sweeps alone are searched."""

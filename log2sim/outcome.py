@@ -68,7 +68,7 @@ def stage_outcomes(plan: Plan, outputs: RunOutputs) -> tuple[Outcome, ...]:
     """Join the decisions of a plan with what the stages did, in the plan's order, but for those that describe the scenario."""
     found: Mapping[Stage, Callable[[Decision], Outcome]] = {
         Stage.MOTION_COMPENSATION: lambda d: _compensation(d, outputs.observations),
-        Stage.DETECTION_IN_EVERY_FRAME: lambda d: _detection(d, outputs),
+        Stage.DETECTION_IN_EVERY_FRAME: lambda d: _detection(d, plan.picture_stride, outputs),
         Stage.HOMOGRAPHY: lambda d: _homography(d, plan.homography, outputs.homographies),
         Stage.SMOOTHING_OF_PARKED_AGENTS: lambda d: _parked(outputs.agents),
         Stage.WAYPOINT_AT_EVERY_TICK: lambda d: _waypoints(outputs.agents),
@@ -90,7 +90,7 @@ def _compensation(planned: Decision, observations: Observations) -> Outcome:
     return Outcome(planned)
 
 
-def _detection(planned: Decision, outputs: RunOutputs) -> Outcome:
+def _detection(planned: Decision, picture_stride: int, outputs: RunOutputs) -> Outcome:
     observations, seconds = outputs.observations, outputs.clock.seconds
     skipped, detected = sum(observations.frames_skipped.values()), observations.frames_detected
     if planned.kept or not detected:
@@ -99,6 +99,8 @@ def _detection(planned: Decision, outputs: RunOutputs) -> Outcome:
         return Outcome(Decision(planned.stage, True, "no camera was empty long enough to skip a frame"))
     names = ", ".join(f"{name} {n}" for name, n in sorted(observations.frames_skipped.items()))
     reason = f"{skipped} of {skipped + detected} frames are between two in which nothing was found: {names}"
+    if picture_stride > 1:
+        reason = f"{planned.reason}; {skipped} of {skipped + detected} frames were not"
     each_s = (seconds.get("decode", 0.0) + seconds.get("detect", 0.0)) / max(detected, 1)
     how = f"estimated: {1e3 * each_s:.3g} ms a frame (measured on {detected}), times {skipped}"
     return Outcome(Decision(planned.stage, False, reason), round(skipped * each_s, 4), how)

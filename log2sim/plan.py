@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from log2sim.config import Config
 from log2sim.datatypes import ENDS, Log, end_of
-from log2sim.geometry import NS_PER_S, Array
+from log2sim.geometry import NS_PER_S, Array, period_of
 from log2sim.sensors import MAX_LIDAR_RANGE_M, Sensors
 from log2sim.tracking.tracker import min_hits
 
@@ -101,6 +101,8 @@ class Plan:
         Ticks from one detection in all cameras to the next, see `log2sim.perception.frames`.
     fusion : FusionLevel, optional
         What of the two ends is joined; None where not both have LiDARs.
+    picture_stride : int
+        Ticks from one search of a camera's frames to the next, where LiDAR sweeps are searched at every tick.
     """
 
     cameras: tuple[str, ...]
@@ -108,6 +110,7 @@ class Plan:
     homography: HomographyScope = HomographyScope.CAMERAS_IN_NEED
     detector_stride: int = 1
     fusion: FusionLevel | None = None
+    picture_stride: int = 1
 
     def decision(self, stage: Stage) -> Decision:
         """Return the decision about a stage."""
@@ -125,14 +128,15 @@ class Plan:
 def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64]) -> Plan:
     """Decide what to run at the ticks (T,) of a log."""
     decodes = _image_decoding(config)
-    stride = min_hits(t_ns, config.track.min_life_s) if decodes.kept else 1
+    every = picture_stride(config, t_ns) if decodes.kept else 1
+    stride = min_hits(t_ns, config.track.min_life_s) if decodes.kept and every == 1 else 1
     scope, homography = _homography(log, config)
     smooth, ends = config.smooth.enabled, fusion_level(sensors.only(log), config)
     decisions = (
         _lidar_use(log, sensors),
         _motion_compensation(log, sensors, t_ns),
         decodes,
-        _detection_in_every_frame(config, decodes.kept, stride),
+        _detection_in_every_frame(config, decodes.kept, stride, every),
         *_detection_in_sweeps(config),
         homography,
         _fusion(sensors.cameras),
@@ -146,7 +150,14 @@ def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64
         _colors(config, sensors),
         _signals(config, sensors),
     )
-    return Plan(sensors.cameras, decisions, scope, max(stride, 1), ends.level)
+    return Plan(sensors.cameras, decisions, scope, max(stride, 1), ends.level, every)
+
+
+def picture_stride(config: Config, t_ns: NDArray[np.int64]) -> int:
+    """Return how many of the ticks (T,) lie from one search of a camera's frames to the next by `detect.period_s`, 1 or more."""
+    if not config.detect.in_sweeps or len(t_ns) < 2:
+        return 1
+    return max(round(config.detect.period_s / period_of(t_ns)), 1)
 
 
 def _lidar_use(log: Log, sensors: Sensors) -> Decision:
@@ -193,8 +204,10 @@ def _image_decoding(config: Config) -> Decision:
     return Decision(Stage.IMAGE_DECODING, False, "boxes come from the log; detection needs no image")
 
 
-def _detection_in_every_frame(config: Config, decodes: bool, stride: int) -> Decision:
+def _detection_in_every_frame(config: Config, decodes: bool, stride: int, every: int) -> Decision:
     """Decide whether frames may be skipped.
+
+    Where sweeps are searched at every tick, those of a camera are searched at every `every`th.
 
     A track needs `min_hits` measurements. An object that is visible for fewer ticks is not confirmed, so between two
     frames that many ticks apart in which the detector found nothing, the others need not be decoded.
@@ -204,6 +217,8 @@ def _detection_in_every_frame(config: Config, decodes: bool, stride: int) -> Dec
         return Decision(stage, False, NO_CAMERA)
     if not decodes:
         return Decision(stage, True, "without decoding a frame costs nothing")
+    if every > 1:
+        return Decision(stage, False, f"sweeps show the same objects: each camera is searched at every {every}th tick")
     if stride < 2:
         return Decision(stage, True, "the log has too few ticks for its tracks to skip any")
     return Decision(stage, False, f"frames between two empty ones {stride} ticks apart are skipped")

@@ -166,6 +166,25 @@ def test_each_record_is_read_once_and_images_only_if_they_are_needed():
     assert reads == {(s, i): 1 for s in ("front", "left", "top") for i in range(TICKS)}
 
 
+def test_cameras_that_are_searched_now_and_then_take_turns_and_say_nothing_in_between():
+    log, reads = driving_log(cameras=("front", "left"))
+    sensors = select_sensors(log, Config())
+    schedule = synchronize(log, sensors.cameras)
+    plan = replace(make_plan(log, Config.load(), sensors, schedule.t_ns), picture_stride=2, detector_stride=1)
+    detector = Truth(log, looks=True)
+    reads.clear()
+    out = observe(
+        log, schedule, detector, plan, mode="robust", max_range_m=80.0, clock=StageClock(), progress=lambda *_: None
+    )
+    asked = [("left" if i % 2 else "front", int(STAMPS[i])) for i in range(TICKS)]
+    assert detector.frames == asked
+    assert {name: sorted(i for n, i in reads if n == name) for name in ("front", "left")} == {"front": [0, 2], "left": [1, 3]}
+    assert [set(m.camera.tolist()) for m in out.measurements] == [{"front"}, {"left"}, {"front"}, {"left"}]
+    assert out.unseen == {"front": [1, 3], "left": [0, 2]}
+    assert (out.frames_detected, out.frames_skipped) == (TICKS, {"front": 2, "left": 2})
+    assert out.recorded(schedule)["front"].tolist() == [True, False, True, False]
+
+
 def test_what_only_one_of_two_cameras_sees_is_kept():
     log, _ = driving_log(cameras=("front", "left"))
     detector, every = Truth(log), Truth(log)

@@ -16,6 +16,7 @@ import log2sim.agents.estimate
 import log2sim.perception.lidar.cloud
 import log2sim.pipeline
 import log2sim.plan
+import log2sim.run_detectors
 import log2sim.sensors
 from log2sim import Config, Scenario, reconstruct, replay
 from log2sim.agents.hypotheses import Part
@@ -278,7 +279,7 @@ class Counting:
 
 def run_counting(log: Log, monkeypatch: pytest.MonkeyPatch, stride: int | None = None) -> tuple[Result, Counting]:
     detector = Counting(log)
-    monkeypatch.setattr(log2sim.pipeline, "create_detector", lambda *a, **k: detector)
+    monkeypatch.setattr(log2sim.run_detectors, "create_detector", lambda *a, **k: detector)
     if stride is not None:
         monkeypatch.setattr(log2sim.plan, "min_hits", lambda *a: stride)
     result = run(log, Config.load(detect={"name": "counting.onnx"}))
@@ -330,6 +331,28 @@ def test_looks_are_nearer_than_a_track_is_long(ticks: int, stride: int, tiny: Lo
     t_ns = np.arange(ticks) * 100_000_000
     assert plan_of(tiny, config, t_ns).detector_stride == stride
     assert plan_of(tiny, LABELS, t_ns).detector_stride == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "period_s", "hz", "stride"),
+    [
+        ("some.onnx+lidar:vehicle", 0.3, 10, 3),
+        ("some.onnx+lidar:vehicle", 0.3, 20, 6),
+        ("some.onnx+lidar:vehicle", 0.3, 2, 1),
+        ("some.onnx+lidar:vehicle", 0.0, 10, 1),
+        ("some.onnx", 0.3, 10, 1),
+        ("labels+lidar:vehicle", 0.3, 10, 1),
+    ],
+)
+def test_pictures_are_searched_less_often_only_where_sweeps_are_searched_and_a_network_looks(
+    name: str, period_s: float, hz: int, stride: int, tiny: Log
+) -> None:
+    config = Config.load(detect={"name": name, "period_s": period_s})
+    plan = plan_of(tiny, config, np.arange(40) * (10**9 // hz))
+    assert plan.picture_stride == stride
+    # Frames between two empty ones are left out only where all are searched otherwise.
+    assert stride == 1 or plan.detector_stride == 1
+    assert plan.decision(Stage.DETECTION_IN_EVERY_FRAME).kept is (stride == 1 and plan.detector_stride == 1)
 
 
 def test_a_look_that_could_not_be_read_found_nothing_out(both: Log, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -54,7 +54,7 @@ class Observations:
     frames_skipped : mapping of str to int
         By camera.
     unseen : mapping of str to list of int
-        Ticks at which a camera has a frame that shows nothing of them, by camera: unreadable, repeated, or black.
+        Ticks at which a camera has a frame that says nothing of them, by camera: unreadable, repeated, black, or not searched.
     faults : tuple of Fault
         Of the records.
     lights : list of LightBox

@@ -92,7 +92,9 @@ class FrameDetector:
     """Detect objects in the camera frames of every tick, tick by tick in order.
 
     With a `stride` above 1 the detector first runs at every `stride`-th tick; frames between two such ticks are skipped
-    for cameras in which both found nothing. An object visible for less than a stride, and only there, is missed.
+    for cameras in which both found nothing. An object visible for less than a stride, and only there, is missed. With a
+    `picture_stride` above 1 the frames of each camera are searched at every so many ticks, and what is found nowhere else is
+    measured as often.
 
     Attributes
     ----------
@@ -120,11 +122,13 @@ class FrameDetector:
     def detections_at(self, tick: int) -> dict[str, Detections]:
         """Return the detections of a tick by camera; must be called for every tick in order.
 
-        A camera is left out where its frame cannot be read, repeats an earlier one, or shows nothing: what it does not show
-        may be there.
+        A camera is left out where its frame cannot be read, repeats an earlier one, shows nothing, or is not searched: what it
+        does not show may be there.
         """
         last, stride = len(self._schedule) - 1, self._plan.detector_stride
-        if tick not in self._pending:
+        if self._plan.picture_stride > 1:
+            self._pending[tick] = self._detect(tick, self._cameras_due(tick))
+        elif tick not in self._pending:
             self._pending[tick] = self._detect(tick, self._plan.cameras)
         if stride > 1 and tick < last and tick % stride == 0:
             self._detect_between(tick, min(tick + stride, last))
@@ -135,6 +139,16 @@ class FrameDetector:
             if camera in live and len(self.lights) < MAX_CROPS:
                 self.lights += lights
         return live
+
+    def _cameras_due(self, tick: int) -> list[str]:
+        """Return the cameras whose frames are searched at a tick: they take turns, so that each tick takes as long."""
+        stride, due = self._plan.picture_stride, list[str]()
+        for k, camera in enumerate(self._plan.cameras):
+            if (tick + k) % stride == 0:
+                due.append(camera)
+            elif self._schedule.frames[camera][tick] >= 0:
+                self.skipped[camera] = self.skipped.get(camera, 0) + 1
+        return due
 
     def _is_live(self, camera: str, tick: int, found: Detections) -> bool:
         """Return whether a frame shows what is there; nothing is said of frames that are not decoded."""

