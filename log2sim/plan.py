@@ -207,7 +207,7 @@ def _image_decoding(config: Config) -> Decision:
 def _detection_in_every_frame(config: Config, decodes: bool, stride: int, every: int) -> Decision:
     """Decide whether frames may be skipped.
 
-    Where sweeps are searched at every tick, those of a camera are searched at every `every`th.
+    Where sweeps are searched at every tick, the frames of a camera are searched at one of `every` ticks.
 
     A track needs `min_hits` measurements. An object that is visible for fewer ticks is not confirmed, so between two
     frames that many ticks apart in which the detector found nothing, the others need not be decoded.
@@ -218,7 +218,7 @@ def _detection_in_every_frame(config: Config, decodes: bool, stride: int, every:
     if not decodes:
         return Decision(stage, True, "without decoding a frame costs nothing")
     if every > 1:
-        return Decision(stage, False, f"sweeps show the same objects: each camera is searched at every {every}th tick")
+        return Decision(stage, False, f"sweeps show the same objects: each camera is searched at one of {every} ticks")
     if stride < 2:
         return Decision(stage, True, "the log has too few ticks for its tracks to skip any")
     return Decision(stage, False, f"frames between two empty ones {stride} ticks apart are skipped")

@@ -178,7 +178,10 @@ def test_cameras_that_are_searched_now_and_then_take_turns_and_say_nothing_in_be
     )
     asked = [("left" if i % 2 else "front", int(STAMPS[i])) for i in range(TICKS)]
     assert detector.frames == asked
-    assert {name: sorted(i for n, i in reads if n == name) for name in ("front", "left")} == {"front": [0, 2], "left": [1, 3]}
+    assert {name: sorted(i for n, i in reads if n == name) for name in ("front", "left")} == {
+        "front": [0, 2],
+        "left": [1, 3],
+    }
     assert [set(m.camera.tolist()) for m in out.measurements] == [{"front"}, {"left"}, {"front"}, {"left"}]
     assert out.unseen == {"front": [1, 3], "left": [0, 2]}
     assert (out.frames_detected, out.frames_skipped) == (TICKS, {"front": 2, "left": 2})
