@@ -189,7 +189,7 @@ def second_pass(run: Run, observations: Observations) -> Result:
     with run.clock.stage("fuse"):
         across = plan.keeps(Stage.FUSION) or plan.keeps(Stage.FUSION_WITH_LIDAR)
         ends = [fuse(of_end, across=across) for of_end in split_by_end(placed, plan)]
-        measurements = [Measurements.join(rows) for rows in zip(*ends)]
+        measurements = ends[0] if len(ends) == 1 else [Measurements.join(rows) for rows in zip(*ends)]
     with run.clock.stage("track", run.report_progress):
         tracks = track_ends(
             ends,

@@ -18,7 +18,7 @@ from log2sim.agents.confidence.systematic import position_terms, speed_terms, wi
 from log2sim.agents.confidence.weights import POSITION_VARIANCE, SPEED_VARIANCE, WEIGHTS, YAW_VARIANCE
 from log2sim.agents.hypotheses import Part
 from log2sim.agents.moving import moving_candidate
-from log2sim.agents.static import static_candidate
+from log2sim.agents.static import static_candidates
 from log2sim.datatypes import Doubt, Track
 
 TIMELINE = Timeline(T0_NS + np.arange(60) * 100_000_000, T0_NS)
@@ -38,7 +38,7 @@ def driving(count: int = 12) -> AgentCandidate:
 
 def candidate_of(track: Track, *, static: bool = True) -> AgentCandidate:
     if static:
-        return static_candidate(Part(track, static=True), DARK, TIMELINE)
+        return static_candidates([Part(track, static=True)], DARK, TIMELINE)[0]
     return moving_candidate(track, DARK, TIMELINE, smooth=True)
 
 

@@ -242,7 +242,7 @@ def test_a_log_without_lidar_gives_rows_without_a_place():
     log, _ = driving_log()
     out, _ = run(replace(log, lidars={}))
     assert [m.source.tolist() for m in out.measurements] == [["", ""]] * TICKS
-    assert out.obstacles == [None] * TICKS
+    assert list(out.obstacles) == [None] * TICKS
 
 
 def roadside(log):

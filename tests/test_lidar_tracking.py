@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from worlds import Solid, scan, standing
 
-from log2sim.agents.lidar_tracking import BoxState, match_box, track_with_lidar
+from log2sim.agents.lidar_tracking import BoxState, match_box, match_standing, track_with_lidar
 from log2sim.datatypes import Obstacles
 from log2sim.geometry import rotation_from_rpy
 from log2sim.perception.box_fitting import rotate
@@ -201,3 +201,19 @@ def test_what_stands_is_waited_for_and_does_not_drift():
 def test_no_ticks_and_no_sweeps_give_no_sightings():
     assert run([], np.zeros(1, dtype=np.int64), [], (0.0, 0.0), (1.0, 0.0)) == []
     assert run([None] * 4, T0_NS + np.arange(4) * STEP_NS, range(1, 4), (0.0, 0.0), (1.0, 0.0)) == []
+
+
+def test_boxes_that_stand_are_matched_together_as_each_alone():
+    places = [(12.0, 3.0), (20.0, -6.0), (400.0, 0.0)]
+    clouds = [
+        None if k == 2 else obstacles([standing(*place) for place in places[:2]], stamp_ns=T0_NS + k * STEP_NS)
+        for k in range(6)
+    ]
+    t_ns = T0_NS + np.arange(6) * STEP_NS
+    boxes = [BoxState(T0_NS, np.array(place), np.zeros(2), 0.0, SIZE, 0.0) for place in places]
+    known = [np.array([0, 1]), np.array([4]), np.array([0])]
+    found = match_standing(clouds, boxes, known)
+    alone = [track_with_lidar(clouds, [t for t in range(6) if t not in k], t_ns, b) for b, k in zip(boxes, known)]
+    assert [[m.tick for m in matches] for matches in found] == [[3, 4, 5], [0, 1, 3, 5], []]
+    for one, other in zip(found, alone):
+        assert [(m.tick, m.t_ns, *m.xy_m) for m in one] == [(m.tick, m.t_ns, *m.xy_m) for m in other]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from log2sim.agents.candidate import AgentCandidate, Timeline
 from log2sim.agents.hypotheses import explain_track
 from log2sim.agents.moving import moving_candidate
-from log2sim.agents.static import static_candidate
+from log2sim.agents.static import static_candidates
 from log2sim.datatypes import Obstacles, Track
 
 
@@ -28,4 +28,4 @@ def estimate_agents(
     """
     parts = [part for track in tracks for part in explain_track(track)]
     candidates = [moving_candidate(p.track, obstacles, timeline, smooth=smooth) for p in parts if not p.static]
-    return candidates + [static_candidate(p, obstacles, timeline) for p in parts if p.static]
+    return candidates + static_candidates([p for p in parts if p.static], obstacles, timeline)

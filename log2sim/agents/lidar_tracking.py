@@ -12,6 +12,7 @@ from log2sim.datatypes import Obstacles
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception.box_completion import SENSOR_SIGMA_M, complete_box, oriented_covariance, real_ends
 from log2sim.perception.box_fitting import align_to, rotate
+from log2sim.perception.prefetch import OBSTACLE_REACH_M
 
 MIN_POINTS = 8
 # Points up to this far outside the predicted box count as its own; a shell of this width around them is compared with it.
@@ -102,7 +103,8 @@ def track_with_lidar(
     for tick in ticks:
         cloud = obstacles[tick]
         predicted = state.xy_m + state.velocity_mps * ((int(t_ns[tick]) - state.t_ns) / NS_PER_S)
-        match = None if cloud is None else match_box(cloud, tick, replace(state, xy_m=predicted))
+        reached = cloud is not None and float(np.hypot(*(predicted - cloud.origin[:2]))) <= reach_of(state.size_m)
+        match = match_box(cloud, tick, replace(state, xy_m=predicted)) if cloud is not None and reached else None
         if match is None:
             misses += 1
             if misses >= MAX_MISSES and not is_static:
@@ -113,6 +115,39 @@ def track_with_lidar(
         if not is_static:
             state = _corrected(state, match)
     return matches
+
+
+def match_standing(
+    obstacles: Sequence[Obstacles | None], boxes: Sequence[BoxState], known: Sequence[NDArray[np.int64]]
+) -> list[list[LidarMatch]]:
+    """Match boxes that stand at all ticks but those at which each is `known`; returns the matches of each.
+
+    Every cloud is looked at once, and only for the boxes that its points reach: a long log has many of both.
+    """
+    matches: list[list[LidarMatch]] = [[] for _ in boxes]
+    if not boxes:
+        return matches
+    place = np.array([box.xy_m for box in boxes])
+    reach = np.array([reach_of(box.size_m) for box in boxes])
+    measured = [set(ticks.tolist()) for ticks in known]
+    for tick, cloud in enumerate(obstacles):
+        if cloud is None:
+            continue
+        for k in np.flatnonzero(np.hypot(*(place - cloud.origin[:2]).T) <= reach).tolist():
+            match = None if tick in measured[k] else match_box(cloud, tick, boxes[k])
+            if match is not None:
+                matches[k].append(match)
+    return matches
+
+
+def reach_of(size_m: Array) -> float:
+    """Return how far from the origin of a cloud, m, a box may be to have points of it near."""
+    return OBSTACLE_REACH_M + _reach_around(size_m)
+
+
+def _reach_around(size_m: Array) -> float:
+    """Return how far from the center of a box, m, points are looked at."""
+    return float(np.hypot(*size_m[:2])) / 2 + MARGIN_M + SHELL_M
 
 
 def _corrected(state: BoxState, match: LidarMatch) -> BoxState:
@@ -131,10 +166,8 @@ def _corrected(state: BoxState, match: LidarMatch) -> BoxState:
 def match_box(cloud: Obstacles, tick: int, box: BoxState) -> LidarMatch | None:
     """Match a predicted box against the points of a tick; None where they do not determine its position."""
     size, yaw_rad = box.size_m, box.yaw_rad
-    reach = float(np.hypot(*size[:2])) / 2 + MARGIN_M + SHELL_M
     x, y = (box.xy_m - cloud.origin[:2]).astype(np.float32)
-    near = np.flatnonzero(np.abs(cloud.xyz[:, 0] - x) <= reach)
-    near = near[np.abs(cloud.xyz[near, 1] - y) <= reach]
+    near = cloud.near(box.xy_m, _reach_around(size))
     z = cloud.xyz[near, 2] + np.float32(cloud.origin[2] - box.bottom_m)
     near = near[(z > 0.15) & (z < size[2] + 0.4)]
     if len(near) < MIN_POINTS:

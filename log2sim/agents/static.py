@@ -10,11 +10,11 @@ import numpy as np
 from log2sim.agents.box_votes import independent
 from log2sim.agents.candidate import AgentCandidate, Timeline, candidate_of
 from log2sim.agents.hypotheses import Part, main_place
-from log2sim.agents.lidar_tracking import BoxState, track_with_lidar
+from log2sim.agents.lidar_tracking import BoxState, match_standing
 from log2sim.agents.size import TrackGeometry, static_geometry
 from log2sim.agents.smooth.heading import UNKNOWN_YAW_RAD
 from log2sim.agents.standing import robust_line
-from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, BoxEvidence, Measurements, Obstacles, Waypoints
+from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, BoxEvidence, Measurements, Obstacles, Track, Waypoints
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
 from log2sim.perception.box_fitting import rotate
 from log2sim.tracking.motion import CENTER_SIGMA_M
@@ -25,19 +25,37 @@ BOX_YAW_SIGMA_RAD, MIN_YAW_SIGMA_RAD = 0.1, 0.005
 MAX_SPEED_SIGMA_MPS = 2.0
 
 
-def static_candidate(part: Part, obstacles: Sequence[Obstacles | None], timeline: Timeline) -> AgentCandidate:
-    """Make an agent with one pose, at the ticks of its track and wherever LiDAR points match its box.
+def static_candidates(
+    parts: Sequence[Part], obstacles: Sequence[Obstacles | None], timeline: Timeline
+) -> list[AgentCandidate]:
+    """Make agents with one pose each, at the ticks of their tracks and wherever LiDAR points match their boxes.
 
-    Its yaw is known up to half a turn.
+    Their yaws are known up to half a turn.
     """
-    track, geometry = part.track, _geometry_of(part)
-    xy, z = geometry.xy_m[0], float(np.median(geometry.z_m))
-    yaw = 0.0 if geometry.yaw_rad is None else float(np.nan_to_num(geometry.yaw_rad))
+    geometries = [_geometry_of(part) for part in parts]
+    boxes = [_box_of(part.track, geometry, timeline) for part, geometry in zip(parts, geometries)]
+    matches = match_standing(obstacles, boxes, [part.track.tick for part in parts])
+    return [
+        _candidate(part.track, geometry, [m.tick for m in found], timeline)
+        for part, geometry, found in zip(parts, geometries, matches)
+    ]
+
+
+def _box_of(track: Track, geometry: TrackGeometry, timeline: Timeline) -> BoxState:
+    z = float(np.median(geometry.z_m))
     start_ns = int(timeline.t_ns[track.tick[0]])
-    box = BoxState(start_ns, xy, np.zeros(2), yaw, geometry.size_m, z - geometry.size_m[2] / 2)
-    others = np.setdiff1d(np.arange(len(timeline.t_ns)), track.tick).tolist()
-    matches = track_with_lidar(obstacles, others, timeline.t_ns, box)
-    observed = np.union1d(track.tick, np.array([m.tick for m in matches], dtype=np.int64))
+    bottom_m = z - geometry.size_m[2] / 2
+    return BoxState(start_ns, geometry.xy_m[0], np.zeros(2), _yaw_of(geometry), geometry.size_m, bottom_m)
+
+
+def _yaw_of(geometry: TrackGeometry) -> float:
+    return 0.0 if geometry.yaw_rad is None else float(np.nan_to_num(geometry.yaw_rad))
+
+
+def _candidate(track: Track, geometry: TrackGeometry, matched: Sequence[int], timeline: Timeline) -> AgentCandidate:
+    """Make an agent with one pose of a track that stands, whose box is matched at other ticks."""
+    xy, z, yaw = geometry.xy_m[0], float(np.median(geometry.z_m)), _yaw_of(geometry)
+    observed = np.union1d(track.tick, np.array(matched, dtype=np.int64))
     life = np.unique(observed[[0, -1]])
     n = len(life)
     sigma = float(np.sqrt(np.trace(np.median(geometry.covariance, axis=0)) / 2))
@@ -54,7 +72,7 @@ def static_candidate(part: Part, obstacles: Sequence[Obstacles | None], timeline
         sigma_speed_mps=np.full(n, standing_speed_sigma(track.measurements, CENTER_SIGMA_M[GROUP_OF[track.category]])),
     )
     share = len(observed) / (observed[-1] - observed[0] + 1)
-    quality = {"lidar_only": len(matches), "observed_share": round(float(share), 3)}
+    quality = {"lidar_only": len(matched), "observed_share": round(float(share), 3)}
     return candidate_of(track, geometry, waypoints, quality, static=True)
 
 

@@ -9,6 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.array_file import ArrayFile, ArrayList, join_arrays, take_arrays
 from log2sim.datatypes.boxes3d import Boxes3D
 from log2sim.datatypes.ends import seen_from
 from log2sim.geometry import Array
@@ -125,7 +126,7 @@ class BoxEvidence:
     truncated: NDArray[np.bool_]
     height_px_m: Array
     points: NDArray[np.int64]
-    cluster: tuple[NDArray[np.float64], ...]
+    cluster: Sequence[NDArray[np.float64]]
     sensor_m: Array
     yaw_rad: Array
     low_m: Array
@@ -160,7 +161,11 @@ class BoxEvidence:
         rows = np.arange(len(self))[index]
         columns = {k: v[rows] for k, v in vars(self).items() if k not in TUPLES}
         others = tuple(self.others[i] for i in rows) if self.others else ()
-        return type(self)(**columns, cluster=tuple(self.cluster[i] for i in rows), others=others)
+        return type(self)(**columns, cluster=take_arrays(self.cluster, rows.tolist()), others=others)
+
+    def stored(self, file: ArrayFile) -> Self:
+        """Return the same rows with their points in the keeping of a file."""
+        return replace(self, cluster=ArrayList(file.keep(points) for points in self.cluster))
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +194,7 @@ class Measurements(BoxEvidence):
             return cls.empty()
         columns = {k: np.concatenate([getattr(p, k) for p in parts]) for k in vars(parts[0]) if k not in TUPLES}
         others = tuple(v for p in parts for v in p.others or (None,) * len(p)) if any(p.others for p in parts) else ()
-        return cls(**columns, cluster=tuple(c for p in parts for c in p.cluster), others=others)
+        return cls(**columns, cluster=join_arrays(p.cluster for p in parts), others=others)
 
     @classmethod
     def empty(cls) -> Measurements:

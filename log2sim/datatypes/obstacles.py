@@ -8,13 +8,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.datatypes.log import Deferred
 from log2sim.datatypes.rays import Rays
 from log2sim.geometry import Array
 
 
 @dataclass(frozen=True, eq=False)
 class Obstacles:
-    """Points above the ground at one tick, one a voxel.
+    """Points above the ground at one tick, one a voxel; points and rays may be given as functions that read them.
 
     Attributes
     ----------
@@ -37,12 +38,12 @@ class Obstacles:
 
     stamp_ns: int
     origin: Array
-    xyz: NDArray[np.float32]
-    t_s: NDArray[np.float32]
-    sensor: NDArray[np.float32]
-    free: Rays | None = None
+    xyz: Deferred[NDArray[np.float32]] = Deferred()  # noqa: RUF009  # a descriptor
+    t_s: Deferred[NDArray[np.float32]] = Deferred()  # noqa: RUF009  # a descriptor
+    sensor: NDArray[np.float32]  # type: ignore[misc]  # those before it are descriptors, they have no default
+    free: Deferred[Rays | None] = Deferred(None)  # noqa: RUF009  # a descriptor
     viewpoints: NDArray[np.float32] | None = None
-    seen_from: NDArray[np.uint8] | None = None
+    seen_from: Deferred[NDArray[np.uint8] | None] = Deferred(None)  # noqa: RUF009  # a descriptor
 
     def sensor_of(self, index: NDArray[np.intp]) -> NDArray[np.float32]:
         """Return the position (3,) of the sensor that sees most of the points at `index`."""
@@ -56,3 +57,14 @@ class Obstacles:
         x, y, z = (self.xyz - self.sensor).T
         reach = np.hypot(x, y)
         return np.arctan2(y, x), reach, z / np.maximum(reach, np.float32(1e-3))
+
+    def near(self, xy: Array, reach_m: float) -> NDArray[np.intp]:
+        """Return the indices (n,), rising, of the points in the square of `reach_m` to all four sides of a place (2,), map frame."""
+        x, y = (xy - self.origin[:2]).astype(np.float32)
+        near = np.flatnonzero(np.abs(self._x - x) <= reach_m)
+        return near[np.abs(self.xyz[near, 1] - y) <= reach_m]
+
+    @cached_property
+    def _x(self) -> NDArray[np.float32]:
+        """The x of all points (N,) side by side, which many places are compared with."""
+        return np.ascontiguousarray(self.xyz[:, 0])

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.array_file import ArrayFile
 from log2sim.datatypes import ENDS, Boxes3D, Detections, Fault, Log, Measurements, Obstacles, end_of
 from log2sim.geometry import Array, inverse
 from log2sim.perception.detect.detectors import Detector
@@ -25,6 +26,7 @@ from log2sim.perception.lidar.measure_boxes import measure_boxes, outside_ego
 from log2sim.perception.lidar.projection import View, view_of
 from log2sim.perception.lidar.viewpoints import join_parts
 from log2sim.perception.light_boxes import LightBox, with_range
+from log2sim.perception.obstacle_list import ObstacleList
 from log2sim.perception.prefetch import CloudOptions, CloudPrefetcher, obstacles_of
 from log2sim.perception.sync import Schedule
 from log2sim.plan import FusionLevel, Plan, Stage
@@ -43,6 +45,8 @@ class Observations:
     measurements : T Measurements
         Of all cameras and of the sweeps, not fused; rows of a camera without LiDAR points have no position.
     obstacles : T Obstacles, None at ticks without LiDAR
+    points : ArrayFile
+        Keeps the points of all measurements and obstacles.
     feet, ground : dict of str to list of Correspondences
         Foot points of measured objects and ground points of the LiDAR, by camera.
     detections : dict of str to int
@@ -62,7 +66,8 @@ class Observations:
     """
 
     measurements: list[Measurements] = field(default_factory=list)
-    obstacles: list[Obstacles | None] = field(default_factory=list)
+    obstacles: Sequence[Obstacles | None] = field(default_factory=list)
+    points: ArrayFile = field(default_factory=ArrayFile)
     feet: dict[str, list[Correspondences]] = field(default_factory=dict)
     ground: dict[str, list[Correspondences]] = field(default_factory=dict)
     detections: dict[str, int] = field(default_factory=dict)
@@ -110,6 +115,7 @@ def observe(
     """
     out = Observations(feet={c: [] for c in plan.cameras}, ground={c: [] for c in plan.cameras})
     records = out.records = RecordReader(log)
+    obstacles = out.obstacles = ObstacleList(out.points)
     options = CloudOptions(max_range_m, lidar_detector, sweeps)
     first = _FirstPass(log, schedule, plan, out, mode, max_range_m)
     with ThreadPoolExecutor(BACKGROUND_THREADS) as pool:
@@ -134,7 +140,7 @@ def observe(
                 if frames is not None:
                     frames.lights[known_lights:] = first.range_lights(tick, frames.lights[known_lights:], ready)
             with clock.stage("cloud"):
-                out.obstacles.append(None if ready[0] is None else obstacles_of(ready[0]))
+                obstacles.append(None if ready[0] is None else obstacles_of(ready[0]))
             progress(tick + 1, len(schedule))
     records.require_some()
     if cache is not None:
@@ -184,7 +190,7 @@ class _FirstPass:
             ])  # fmt: skip
         else:
             joined = self._join_sensors(boxes, reference, measured, views)
-        self.out.measurements.append(joined.take(self._in_range(tick, joined)))
+        self.out.measurements.append(joined.take(self._in_range(tick, joined)).stored(self.out.points))
 
     def range_lights(self, tick: int, lights: list[LightBox], clouds: Sequence[Cloud | None]) -> list[LightBox]:
         """Return the traffic lights of a tick with distances where LiDAR points are on them."""

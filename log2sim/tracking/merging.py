@@ -108,6 +108,8 @@ def compare(one: Track, other: Track, velocity: Array, velocity_other: Array) ->
     groups = {GROUP_OF[one.category], GROUP_OF[other.category]}
     if len(groups) > 1 and groups not in RELATED:
         return None
+    if one.tick[0] > other.tick[-1] or other.tick[0] > one.tick[-1]:
+        return None
     _, i, j = np.intersect1d(one.tick, other.tick, assume_unique=True, return_indices=True)
     if not len(i):
         return None

@@ -23,6 +23,8 @@ MAX_STATIONARY_OFFSET_M = 1.0
 # Number of measurements from the end of a track that the filter uses; earlier ones no longer influence the state.
 END_MEASUREMENTS = 20
 
+_Costs = tuple[NDArray[np.intp], NDArray[np.intp], Array]
+
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
@@ -54,16 +56,12 @@ def stitch(
     Both ends are predicted to the middle of the gap and must agree there in position and velocity, within their
     uncertainty.
     """
-    from scipy.optimize import linear_sum_assignment
-
     current = list(tracks)
     while len(current) > 1:
-        cost = _joining_costs(_ends(current, whole_boxes=whole_boxes), max_gap_s)
-        i, j = linear_sum_assignment(cost)
-        joins = cost[i, j] < FORBIDDEN
-        if not joins.any():
+        i, j = _choose_joins(_joining_costs(_ends(current, whole_boxes=whole_boxes), max_gap_s))
+        if not len(i):
             break
-        following = dict(zip(i[joins].tolist(), j[joins].tolist()))
+        following = dict(zip(i.tolist(), j.tolist()))
         heads = sorted(set(range(len(current))) - set(following.values()))
         joined = []
         for head in heads:
@@ -75,38 +73,94 @@ def stitch(
     return current
 
 
-def _joining_costs(ends: _Ends, max_gap_s: float) -> Array:
-    """Return the cost (A, A) of continuing the first track with the second, `FORBIDDEN` where that is impossible."""
-    cost = np.full((len(ends.group), len(ends.group)), FORBIDDEN)
-    gap_s = (ends.first_ns[None, :] - ends.last_ns[:, None]) / NS_PER_S
+def _choose_joins(costs: _Costs) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the pairs of the best assignment: as many as possible, and of those the cheapest.
+
+    Tracks that no chain of possible pairs connects do not compete: each group of the others is assigned on its own, so that a
+    long log with many tracks takes no table of all pairs.
+    """
+    from scipy.optimize import linear_sum_assignment
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    first, second, cost = costs
+    if not len(first):
+        return first, second
+    count = int(max(first.max(), second.max())) + 1
+    # The end of a track and its start are different things: rows and columns.
+    graph = coo_array((np.ones(len(first)), (first, second + count)), shape=(2 * count, 2 * count))
+    group = connected_components(graph, directed=False)[1][first]
+    order = np.argsort(group, kind="stable")
+    chosen = []
+    for pairs in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
+        ends, row = np.unique(first[pairs], return_inverse=True)
+        starts, column = np.unique(second[pairs], return_inverse=True)
+        table = np.full((len(ends), len(starts)), FORBIDDEN)
+        table[row, column] = cost[pairs]
+        i, j = linear_sum_assignment(table)
+        possible = table[i, j] < FORBIDDEN
+        chosen.append((ends[i[possible]], starts[j[possible]]))
+    i, j = (np.concatenate(side) for side in zip(*chosen))
+    return i, j
+
+
+def _possible_pairs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the pairs of tracks of one group of which the second starts after the first ends: soon, or where it stood."""
+    from scipy.spatial import cKDTree
+
+    order = np.argsort(ends.first_ns, kind="stable")
+    starts = ends.first_ns[order]
+    # A margin of a microsecond for the comparison in seconds that follows.
+    after = np.searchsorted(starts, ends.last_ns, side="right")
+    until = np.searchsorted(starts, ends.last_ns + round(max_gap_s * NS_PER_S) + 1000, side="right")
+    count = np.maximum(until - after, 0)
+    a = np.repeat(np.arange(len(starts)), count)
+    b = order[np.arange(len(a)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(after, count)]
+    slow_end, slow_start = (
+        np.flatnonzero(np.hypot(*state[:, 2:].T) < MAX_STATIONARY_MPS) for state in (ends.last[0], ends.first[0])
+    )
+    if len(slow_end) and len(slow_start):
+        near = cKDTree(ends.first[0][slow_start, :2])
+        found = near.query_ball_point(ends.last[0][slow_end, :2], MAX_STATIONARY_OFFSET_M)
+        a = np.concatenate([a, np.repeat(slow_end, [len(k) for k in found])])
+        b = np.concatenate([b, slow_start[np.concatenate([*found, []]).astype(np.intp)]])
+    pairs = np.unique(a * len(starts) + b)
+    a, b = pairs // len(starts), pairs % len(starts)
+    same = (ends.group[a] == ends.group[b]) & (ends.first_ns[b] > ends.last_ns[a])
+    return a[same], b[same]
+
+
+def _joining_costs(ends: _Ends, max_gap_s: float) -> _Costs:
+    """Return the pairs (P,), (P,) of tracks of which the second may continue the first, and the cost (P,) of each."""
+    a, b = _possible_pairs(ends, max_gap_s)
+    gap_s = (ends.first_ns[b] - ends.last_ns[a]) / NS_PER_S
     ends_stationary, starts_stationary = (
         np.hypot(*state[:, 2:].T) < MAX_STATIONARY_MPS for state in (ends.last[0], ends.first[0])
     )
-    stationary = ends_stationary[:, None] & starts_stationary[None, :]
-    a, b = np.nonzero((gap_s > 0) & (stationary | (gap_s <= max_gap_s)) & (ends.group[:, None] == ends.group[None, :]))
-    gap_s, stationary = gap_s[a, b], stationary[a, b]
+    stationary = ends_stationary[a] & starts_stationary[b]
     last, first = ends.last[0][a], ends.first[0][b]
     offset_m = np.hypot(*(last - first)[:, :2].T)
     same_place = stationary & (offset_m < MAX_STATIONARY_OFFSET_M)
-    cost[a[same_place], b[same_place]] = offset_m[same_place]
+    cost = np.where(same_place, offset_m, FORBIDDEN)
     half = gap_s[:, None] / 2
     midpoint_offset_m = np.hypot(*(last[:, :2] + half * last[:, 2:] - first[:, :2] + half * first[:, 2:]).T)
     # Beyond this distance no allowed uncertainty passes the gate.
     near = np.flatnonzero(
         ~same_place & (gap_s <= max_gap_s) & (midpoint_offset_m <= np.sqrt(CHI2_4DOF_999) * MAX_POSITION_SIGMA_M)
     )
-    a, b, half = a[near], b[near], gap_s[near] / 2
-    noise = np.array([ACCELERATION_MPS2[g] for g in ends.group[a].tolist()])
-    forward = predict(ends.last[0][a], ends.last[1][a], half, noise)
-    backward = predict(ends.first[0][b], ends.first[1][b], -half, noise)
+    one, other, half_gap_s = a[near], b[near], gap_s[near] / 2
+    noise = np.array([ACCELERATION_MPS2[g] for g in ends.group[one].tolist()])
+    forward = predict(ends.last[0][one], ends.last[1][one], half_gap_s, noise)
+    backward = predict(ends.first[0][other], ends.first[1][other], -half_gap_s, noise)
     difference, covariance = forward[0] - backward[0], forward[1] + backward[1]
     squared = np.einsum("ni,ni->n", difference, np.linalg.solve(covariance, difference[..., None])[..., 0])
     position_covariance = covariance[:, :2, :2]
     certain = np.sqrt(np.linalg.eigvalsh(position_covariance)[:, -1]) <= MAX_POSITION_SIGMA_M
     good = certain & (squared <= CHI2_4DOF_999)
     # The determinant keeps an uncertain agreement from costing less than a certain one.
-    cost[a[good], b[good]] = squared[good] + np.log(np.linalg.det(position_covariance[good])) + 10.0
-    return cost
+    cost[near[good]] = squared[good] + np.log(np.linalg.det(position_covariance[good])) + 10.0
+    possible = cost < FORBIDDEN
+    return a[possible], b[possible], cost[possible]
 
 
 def _ends(tracks: Sequence[Track], *, whole_boxes: bool) -> _Ends:

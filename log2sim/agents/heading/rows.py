@@ -79,10 +79,11 @@ def find_rows(poses: Array, lengths_m: Array, stands: NDArray[np.int64]) -> list
         Which of them stand.
     """
     in_line, beside = np.zeros((2, len(poses), len(poses)), dtype=bool)
+    standing = np.zeros(len(poses), dtype=bool)
+    standing[stands] = True
     for i in stands:
         to = rotate(poses[:, :2] - poses[i, :2], -poses[i, 2])
-        parallel = np.abs(np.sin(poses[:, 2] - poses[i, 2])) < np.sin(MAX_TURNED_RAD)
-        parallel[np.setdiff1d(np.arange(len(poses)), stands)] = False
+        parallel = standing & (np.abs(np.sin(poses[:, 2] - poses[i, 2])) < np.sin(MAX_TURNED_RAD))
         gap = np.abs(to[:, 0]) - (lengths_m + lengths_m[i]) / 2
         in_line[i] = parallel & (gap < MAX_GAP_M) & (np.abs(to[:, 1]) < MAX_OUT_OF_LINE_M)
         beside[i] = parallel & (np.abs(to[:, 0]) < MAX_AHEAD_M) & (np.abs(to[:, 1]) < MAX_BESIDE_M) & ~in_line[i]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 
@@ -28,6 +27,8 @@ IN_LANE_M, BEYOND_M = 1.2, 4.5
 # Standard deviation of the yaw between a street and vehicles parked along it, and lengths over which a street is known to go on
 # ahead and to the side: streets bend, and farther to the side is another street or a yard.
 PARALLEL_SIGMA_RAD, AHEAD_M, STREET_M, ASIDE_M = 0.15, 25.0, 9.0, 3.0
+# A path that far away belongs to the street with a probability of less than 1e-5.
+FAR_M = 500.0
 
 
 def side_log_odds(paths: Sequence[Array]) -> float:
@@ -45,7 +46,10 @@ def side_log_odds(paths: Sequence[Array]) -> float:
     """
     votes = 0.0
     thinned = [p[np.linspace(0, len(p) - 1, min(len(p), PATH_SAMPLES)).astype(np.intp)] for p in paths if len(p)]
-    for one, other in combinations(thinned, 2):
+    extents = np.array([[*p[:, :2].min(axis=0), *p[:, :2].max(axis=0)] for p in thinned]).reshape(-1, 4)
+    apart = np.any(extents[:, None, :2] - extents[None, :, 2:] > ROAD_M, axis=2)
+    for i, j in zip(*np.nonzero(np.triu(~(apart | apart.T), 1))):
+        one, other = thinned[i], thinned[j]
         to = other[None, :, :2] - one[:, None, :2]
         c, s = np.cos(one[:, 2])[:, None], np.sin(one[:, 2])[:, None]
         left = c * to[..., 1] - s * to[..., 0]
@@ -118,7 +122,7 @@ def _passing_by(xy: Array, paths: Sequence[Array], yaw_rad: float | None) -> lis
     """Find how each path passes a place (2,), or something there with a yaw, which should be parallel."""
     found = []
     for path in paths:
-        if len(path) == 0:
+        if len(path) == 0 or np.abs(path[:, :2] - xy).max(axis=1).min() > FAR_M:
             continue
         to = xy - path[:, :2]
         c, s = np.cos(path[:, 2]), np.sin(path[:, 2])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.candidate import AgentCandidate
-from log2sim.agents.plausibility.box_table import BoxTable
+from log2sim.agents.plausibility.box_table import SAME_S, BoxTable
 from log2sim.agents.spans import spans_of
 from log2sim.datatypes import Agent, Doubt, Waypoints
 from log2sim.geometry import Array, overlap_of_smaller, separating_axes
@@ -25,8 +25,6 @@ IN_ONE_PLACE_M = 0.5
 MIN_KEPT_SHARE = 0.5
 # Fewer ticks are no trajectory.
 MIN_KEPT_TICKS = 2
-# Stamps of ticks and waypoints are the same up to rounding.
-SAME_S = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +73,25 @@ def find_conflicts(boxes: BoxTable, touching: float = TOUCHING) -> list[Conflict
     ]
 
 
+def find_all_conflicts(
+    agents: Sequence[Agent], t_s: Array, touching: float = TOUCHING
+) -> tuple[list[Conflict], NDArray[np.bool_]]:
+    """Find the conflicts of A agents at ticks (T,) as `find_conflicts` does, and mark (A, T) when each agent is there."""
+    present = np.zeros((len(agents), len(t_s)), dtype=bool)
+    parts: dict[tuple[int, int], list[Conflict]] = {}
+    for rows, first, boxes in BoxTable.in_turn(agents, t_s):
+        present[rows, first : first + boxes.present.shape[1]] = boxes.present
+        for found in find_conflicts(boxes, touching):
+            pair = int(rows[found.first]), int(rows[found.second])
+            parts.setdefault(pair, []).append(replace(found, tick=found.tick + first))
+    return [
+        Conflict(
+            *pair, *(np.concatenate([getattr(c, name) for c in parts[pair]]) for name in ("tick", "share", "depth_m"))
+        )
+        for pair in sorted(parts)
+    ], present
+
+
 def _depths(a: Array, b: Array) -> Array:
     """Return by how much (n,) one of two rectangles, (n, 5) each: x, y, length, width, yaw, has to move to be apart."""
     dx, dy = (b[:, :2] - a[:, :2]).T
@@ -103,9 +120,9 @@ def resolve_conflicts(candidates: Sequence[AgentCandidate], ego: Agent | None, t
     evidence = [c.evidence for c in candidates]
     if ego is not None:
         agents, evidence = [*agents, ego], [*evidence, np.inf]
-    boxes = BoxTable.of(agents, t_s)
-    alive = boxes.present.copy()
-    for conflict in sorted(find_conflicts(boxes), key=lambda c: -max(evidence[c.first], evidence[c.second])):
+    conflicts, present = find_all_conflicts(agents, t_s)
+    alive = present.copy()
+    for conflict in sorted(conflicts, key=lambda c: -max(evidence[c.first], evidence[c.second])):
         of_ego = ego is not None and conflict.second == len(candidates)
         stronger, weaker = conflict.first, conflict.second
         if evidence[weaker] > evidence[stronger]:
@@ -117,8 +134,8 @@ def resolve_conflicts(candidates: Sequence[AgentCandidate], ego: Agent | None, t
         left = _longest_run(left)
         if of_ego or left.sum() >= MIN_KEPT_SHARE * alive[weaker].sum():
             alive[weaker] = left
-    kept = [k for k in range(len(candidates)) if alive[k].sum() >= min(MIN_KEPT_TICKS, boxes.present[k].sum())]
-    return [_cut(candidates[k], t_s, boxes.present[k], alive[k]) for k in kept]
+    kept = [k for k in range(len(candidates)) if alive[k].sum() >= min(MIN_KEPT_TICKS, present[k].sum())]
+    return [_cut(candidates[k], t_s, present[k], alive[k]) for k in kept]
 
 
 def _longest_run(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -152,7 +169,7 @@ def conflict_doubts(candidates: Sequence[AgentCandidate], ego: Agent | None, t_s
     """
     agents = [c.agent for c in candidates] + ([ego] if ego is not None else [])
     doubts: list[list[Doubt]] = [[] for _ in agents]
-    for conflict in find_conflicts(BoxTable.of(agents, t_s), touching=ROUNDING):
+    for conflict in find_all_conflicts(agents, t_s, touching=ROUNDING)[0]:
         a, b = conflict.first, conflict.second
         if b == len(candidates):
             doubts[a].append(_doubt(conflict, t_s, "in_ego", "touches the ego", agents[a]))

@@ -26,6 +26,8 @@ MIN_TICK_RAYS = 8
 RAY_NATS = 2.0
 # Nats of a tick of a motion that no road user has.
 MOTION_NATS = 1.0
+# Agents times ticks that are looked at together; each takes about a hundred bytes.
+MAX_CELLS = 400_000
 # Rays toward a place before it is said that the LiDAR looks there.
 MIN_LOOKING_RAYS = 30
 # Fewer image boxes with points may each be wrong.
@@ -40,9 +42,19 @@ def weigh(candidates: Sequence[AgentCandidate], recording: Recording) -> list[Ag
     Evidence is a sum over ticks of nats for the agent against nothing: of each detection by its score, of the rays by the
     share that goes through, and less for a motion that breaks the limits of road users.
     """
+    weighed = list(candidates)
+    order = sorted(range(len(candidates)), key=lambda k: float(candidates[k].agent.waypoints.t_s[0]))
+    most = max(MAX_CELLS // max(len(recording.clouds), 1), 1)
+    for first in range(0, len(order), most):
+        rows = order[first : first + most]
+        for k, candidate in zip(rows, _weigh_together([candidates[k] for k in rows], recording)):
+            weighed[k] = candidate
+    return weighed
+
+
+def _weigh_together(candidates: Sequence[AgentCandidate], recording: Recording) -> list[AgentCandidate]:
+    """Weigh candidates of which there are not too many."""
     agents, clouds, timeline = [c.agent for c in candidates], recording.clouds, recording.timeline
-    if not agents:
-        return []
     solid, whole = count_rays(agents, clouds, timeline)
     in_structure, beside = structure_shares(agents, clouds, timeline)
     met = whole.inside + whole.through

@@ -93,8 +93,9 @@ def count_rays(
         stamps = [timeline.t_ns[k] if cloud is None else cloud.stamp_ns for k, cloud in enumerate(clouds)]
         t_s = (np.array(stamps, dtype=np.int64) - timeline.t0_ns) / NS_PER_S
         boxes = BoxTable.of(agents, t_s, margin_s=MAX_LAG_S)
-        for tick, cloud in enumerate(clouds):
-            if cloud is not None and cloud.free is not None and len(cloud.free) and boxes.present[:, tick].any():
+        for tick in np.flatnonzero(boxes.present.any(axis=0)).tolist():
+            cloud = clouds[tick]
+            if cloud is not None and cloud.free is not None and len(cloud.free):
                 counts[..., tick] = _count_at(boxes, tick, cloud.origin, cloud.free)
     return RayCounts(*counts[0]), RayCounts(*counts[1])
 

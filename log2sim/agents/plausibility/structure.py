@@ -61,11 +61,12 @@ def structure_shares(
     A few ticks, evenly spread over the life of an agent, are searched: standing structure shows the same at all of them.
     """
     shares = np.zeros((2, len(agents)))
-    ticks = np.array([k for k, cloud in enumerate(clouds) if cloud is not None], dtype=np.intp)
+    stamp_of = {k: cloud.stamp_ns for k, cloud in enumerate(clouds) if cloud is not None}
+    ticks = np.array(list(stamp_of), dtype=np.intp)
     rows = [i for i, agent in enumerate(agents) if GROUP_OF[agent.category] == "vehicle"]
     if len(ticks) == 0 or not rows:
         return shares[0], shares[1]
-    stamps = np.array([cloud.stamp_ns for cloud in clouds if cloud is not None], dtype=np.int64)
+    stamps = np.array(list(stamp_of.values()), dtype=np.int64)
     boxes = BoxTable.of([agents[i] for i in rows], (stamps - timeline.t0_ns) / NS_PER_S, margin_s=MAX_LAG_S)
     for row, i in enumerate(rows):
         alive = np.flatnonzero(boxes.present[row])
@@ -83,8 +84,7 @@ def _surface_at(boxes: BoxTable, row: int, column: int, cloud: Obstacles | None,
     if cloud is None:
         return None
     center, size, yaw = boxes.center_m[row, column] - cloud.origin, boxes.size_m[row], float(boxes.yaw_rad[row, column])
-    near = np.flatnonzero(np.abs(cloud.xyz[:, 0] - np.float32(center[0])) <= reach_m)
-    near = near[np.abs(cloud.xyz[near, 1] - np.float32(center[1])) <= reach_m]
+    near = cloud.near(boxes.center_m[row, column, :2], reach_m)
     near = near[cloud.xyz[near, 2] > center[2] - size[2] / 2 + BOTTOM_M]
     local = rotate(cloud.xyz[near, :2].astype(np.float64) - center[:2], -yaw)
     sensor = rotate(cloud.sensor_of(near)[:2].astype(np.float64) - center[:2], -yaw)

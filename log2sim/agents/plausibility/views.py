@@ -22,7 +22,7 @@ def shown_in_images(boxes: BoxTable, recording: Recording) -> NDArray[np.bool_]:
     shown = np.zeros(boxes.present.shape, dtype=bool)
     log, schedule = recording.log, recording.schedule
     for name, frames in schedule.frames.items():
-        camera, ticks = log.cameras[name], np.flatnonzero(frames >= 0)
+        camera, ticks = log.cameras[name], np.flatnonzero((frames >= 0) & boxes.present.any(axis=0))
         poses, known = log.map_T_sensor(name, log.streams[name].t_ns[frames[ticks]])
         for tick, map_T_cam in zip(ticks[known].tolist(), poses[known]):
             cloud, rows = recording.clouds[tick], np.flatnonzero(boxes.present[:, tick])

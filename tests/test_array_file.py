@@ -1,0 +1,105 @@
+"""Arrays that wait in a file: they come back as they were, and short logs need no file."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from log2sim.array_file import ArrayFile, ArrayList, StoredArray, join_arrays, take_arrays
+from log2sim.datatypes import Measurements, Obstacles, Rays
+from log2sim.perception.obstacle_list import ObstacleList
+
+ARRAYS = hnp.arrays(
+    st.sampled_from([np.float32, np.float64, np.int64, np.uint8]), hnp.array_shapes(min_dims=1, max_dims=2, min_side=0)
+)
+
+
+@given(st.lists(ARRAYS, max_size=8), st.integers(0, 300))
+def test_arrays_come_back_as_they_were(arrays: list[Any], memory_bytes: int) -> None:
+    file = ArrayFile(memory_bytes)
+    kept = ArrayList([file.keep(array) for array in arrays])
+    assert len(kept) == len(arrays)
+    for array, back in zip(arrays, kept, strict=True):
+        assert (back.dtype, back.shape) == (array.dtype, array.shape)
+        np.testing.assert_array_equal(back, array)
+    in_memory = sum(item.nbytes for item in kept.items if isinstance(item, np.ndarray))
+    assert in_memory <= memory_bytes
+    assert in_memory == sum(a.nbytes for a in arrays) or any(isinstance(item, StoredArray) for item in kept.items)
+
+
+def test_parts_of_an_array_are_kept_without_the_rest() -> None:
+    whole = np.arange(12.0).reshape(4, 3)
+    kept = ArrayFile(0).keep(whole[:, 1])
+    assert isinstance(kept, StoredArray)
+    assert kept.read().tolist() == [1.0, 4.0, 7.0, 10.0]
+
+
+def test_threads_keep_and_read_at_once() -> None:
+    file = ArrayFile(1000)
+    with ThreadPoolExecutor(4) as pool:
+        kept = ArrayList(pool.map(lambda k: file.keep(np.full(50 + k, k)), range(64)))
+        assert list(pool.map(lambda k: (len(kept[k]), set(kept[k].tolist())), range(64))) == [
+            (50 + k, {k}) for k in range(64)
+        ]
+
+
+def test_rows_are_taken_and_joined_unread() -> None:
+    file = ArrayFile(0)
+    kept = ArrayList([file.keep(np.array([k])) for k in range(5)])
+    some = take_arrays(kept, [3, 1])
+    joined = join_arrays([some, (np.array([9]),)])
+    assert all(isinstance(item, StoredArray) for item in some.items)  # type: ignore[attr-defined]
+    assert [int(a[0]) for a in joined] == [3, 1, 9]
+    assert [int(a[0]) for a in kept[1:3]] == [1, 2]
+    assert isinstance(take_arrays((np.zeros(1),), [0]), tuple)
+
+
+def test_measurements_keep_their_points_through_take_and_join() -> None:
+    rows = Measurements.empty()
+    points = [np.full((k + 1, 4), float(k)) for k in range(3)]
+    columns = {k: np.repeat(v, 3, axis=0) if isinstance(v, np.ndarray) else v for k, v in vars(rows).items()}
+    columns = {k: np.zeros((3, *v.shape[1:]), v.dtype) if isinstance(v, np.ndarray) else v for k, v in columns.items()}
+    full = Measurements(**{**columns, "cluster": tuple(points)})
+    stored = full.stored(ArrayFile(0))
+    again = Measurements.join([stored.take([2, 0]), stored.take(np.array([False, True, False]))])
+    assert [c.tolist() for c in again.cluster] == [points[k].tolist() for k in (2, 0, 1)]
+
+
+@pytest.mark.parametrize("memory_bytes", [0, 3000, 10**7])
+@pytest.mark.parametrize("with_rays", [True, False])
+def test_obstacles_come_back_as_they_were(memory_bytes: int, with_rays: bool) -> None:
+    rng = np.random.default_rng(4)
+    kept, given_ = ObstacleList(ArrayFile(memory_bytes)), []
+    for k in range(6):
+        xyz = rng.normal(size=(20 + k, 3)).astype(np.float32)
+        sensor, number = rng.normal(size=(2, 3)).astype(np.float32), (np.arange(20 + k) % 2).astype(np.uint8)
+        rays = Rays(xyz + 1, xyz[:, 0], number, sensor, sensor * 2) if with_rays else None
+        given_.append(
+            Obstacles(
+                k, np.ones(3) * k, xyz, xyz[:, 1], sensor[0], rays, sensor if k % 2 else None, number if k % 2 else None
+            )
+        )
+        kept.append(given_[-1])
+    kept.append(None)
+    assert [o is None for o in kept] == [False] * 6 + [True]
+    assert kept[-1] is None
+    for one, other in zip(given_, kept[:6], strict=True):
+        assert one.stamp_ns == other.stamp_ns
+        for name in ("origin", "xyz", "t_s", "sensor", "viewpoints", "seen_from"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+        assert (other.free is None) is (one.free is None)
+        for name in ("end", "t_s", "sensor", "position", "velocity_mps") if with_rays else ():
+            np.testing.assert_array_equal(getattr(one.free, name), getattr(other.free, name))
+
+
+def test_points_near_a_place_are_those_of_the_square() -> None:
+    xyz = np.random.default_rng(0).uniform(-10, 10, (500, 3)).astype(np.float32)
+    cloud = Obstacles(0, np.array([100.0, 50.0, 0.0]), xyz, xyz[:, 0], np.zeros(3, np.float32))
+    inside = np.all(np.abs(xyz[:, :2] - [3.0, -2.0]) <= 2.5, axis=1)
+    assert cloud.near(np.array([103.0, 48.0]), 2.5).tolist() == np.flatnonzero(inside).tolist()
