@@ -59,6 +59,12 @@ class CheckFailed(Log2SimError):
     exit_code = 6
 
 
+class LogsFailed(Log2SimError):
+    """Some logs of many could not be reconstructed; the others were."""
+
+    exit_code = 7
+
+
 def install_command(extra: str) -> str:
     """Return the pip command that adds an extra to this installation.
 

@@ -26,6 +26,11 @@ def following_links(follow: bool | None = True) -> Iterator[None]:
         _followed.reset(token)
 
 
+def follows_links() -> bool:
+    """Return whether links of logs may leave the log's folders here."""
+    return _followed.get()
+
+
 def inside(root: Path, relative: str, what: str) -> Path:
     """Resolve a path that a log names.
 

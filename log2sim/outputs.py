@@ -36,6 +36,17 @@ def temporary_beside(target: Path) -> Path:
     return target.with_name(f".{target.stem}.{_machine()}-{os.getpid()}-{secrets.token_hex(4)}{target.suffix}")
 
 
+def is_temporary(path: Path) -> bool:
+    """Return whether a file or folder has a name of `temporary_beside`."""
+    return _TEMPORARY.search(path.name) is not None
+
+
+def is_left_over(path: Path) -> bool:
+    """Return whether a file or folder has such a name of a process of this machine that is not there any more."""
+    found = _TEMPORARY.search(path.name)
+    return found is not None and found["machine"] == _machine() and not _is_alive(int(found["process"]))
+
+
 def remove(path: Path) -> None:
     """Remove a file, a link or a folder with all in it, as far as that is possible."""
     if path.is_dir() and not path.is_symlink():

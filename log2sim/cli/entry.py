@@ -9,6 +9,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from log2sim.cli import (
+    batch,
     bench,
     cache,
     config,
@@ -49,6 +50,7 @@ Exit codes:
     4  nothing to reconstruct
     5  an extra is missing; log2sim doctor lists them
     6  a check of --strict failed
+    7  some logs of a batch failed
   130  interrupted"""
 
 UNSET = {"help": False, "install_completion": False, "show_completion": False}
@@ -77,8 +79,8 @@ def root(
 
 
 for command in (
-    reconstruct.reconstruct, inspect.inspect, validate.validate, convert.convert, detect.detect, evaluate.evaluate, bench.bench,
-    plot.plot, view.view, replay.replay, predict.predict, edit.edit, export.export, synth.synth, config.config, cache.cache, doctor.doctor,
+    reconstruct.reconstruct, batch.batch, inspect.inspect, validate.validate, convert.convert, detect.detect, evaluate.evaluate,
+    bench.bench, plot.plot, view.view, replay.replay, predict.predict, edit.edit, export.export, synth.synth, config.config, cache.cache, doctor.doctor,
 ):  # fmt: skip
     add_command(app, command)
 add_command(app, import_.import_, "import")

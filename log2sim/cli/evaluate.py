@@ -16,13 +16,23 @@ if TYPE_CHECKING:
     from log2sim.datatypes import Log, Scenario
 
 PROTOCOL = "center"
+MAX_LOGS = 20
+"""Of a batch that are printed; the document has all."""
 
 
 def evaluate(
-    path: Annotated[Path, typer.Argument(metavar="FILE", help="A scenario.json, or a boxes.json of `detect`.")],
+    path: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE_OR_DIR", help="A scenario.json, a boxes.json of `detect`, or the folder of a `batch`."
+        ),
+    ],
     truth: Annotated[
         Path,
-        typer.Option(metavar="TRUTH", help="Ground truth: a log with labels or, for a scenario, a scenario file."),
+        typer.Option(
+            metavar="TRUTH",
+            help="Ground truth: a log with labels or, for a scenario, a scenario file; of a batch the folder with its logs.",
+        ),
     ],
     sequence: Sequence = None,
     poses: Poses = None,
@@ -58,9 +68,18 @@ def evaluate(
     from log2sim.outputs import together
 
     check_targets(out, plot, overwrite=overwrite)
-    document = read_json(path, ScenarioError)
     wanted = [c.strip() for c in categories.split(",")] if categories else None
     only_boxes = {"--protocol": protocol, "--score": score}
+    if path.is_dir():
+        only_files = {**only_boxes, "--sequence": sequence, "--poses": poses, "--plot": plot}
+        for name in (name for name, value in only_files.items() if value is not None):
+            raise ConfigError(f"{name}: is for single files; {path} is a folder, so leave it out")
+        result, table = _batch_figures(path, truth, range, wanted, quiet=quiet)
+        if out is not None:
+            write_json(out, result)
+        say(table, quiet=quiet)
+        return
+    document = read_json(path, ScenarioError)
     if is_boxes_document(document):
         options = {"protocol": protocol or PROTOCOL, "max_range_m": range, "classes": wanted}
         options |= {} if score is None else {"min_score": score}
@@ -150,6 +169,30 @@ def _scenario_figures(
 
     result = run(scenario, truth, max_range_m=max_range_m, categories=categories)
     return result, format_table(result)
+
+
+def _batch_figures(
+    path: Path, truth: Path, max_range_m: float | None, categories: list[str] | None, *, quiet: bool
+) -> tuple[dict[str, Any], str]:
+    """Compare all scenarios of a batch with the labels of their logs."""
+    from log2sim.batch.evaluation import Scope, evaluate_batch, format_batch_table
+    from log2sim.batch.folder import BatchFolder, is_batch
+    from log2sim.cli.progress import progress
+    from log2sim.errors import LogError
+
+    if not is_batch(path):
+        raise LogError(
+            f"{path}: is a folder, but not of a batch; give a file, or the folder that `log2sim batch` wrote"
+        )
+    with progress(quiet=quiet) as report_progress:
+        result = evaluate_batch(
+            BatchFolder.load(path),
+            truth,
+            lambda log, scenario: load_truth(log.path, scenario, log.sequence),
+            Scope(max_range_m, categories),
+            progress=lambda done, total: report_progress("logs", done, total),
+        )
+    return result, format_batch_table(result, max_rows=MAX_LOGS)
 
 
 def _log_of(path: Path, sequence: str | None, provenance: dict[str, Any]) -> Callable[[], Log]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from log2sim.errors import ConfigError
 from log2sim.input_files import read_file, require_readable
 from log2sim.perception.detect.preprocessing import InputSpec
+from log2sim.threads import usable_threads
 
 MAX_FILE_BYTES = 2 * 1024**3
 MAX_INPUT_SIDE_PX = 8192
@@ -70,7 +70,7 @@ def load_model(path: Path, *, threads: int | None = None) -> OnnxModel:
     Parameters
     ----------
     threads
-        That may run it side by side, None for the number of cores that this process may use.
+        That may run it side by side, None for as many as `log2sim.threads.usable_threads` says.
 
     Raises
     ------
@@ -89,9 +89,7 @@ def load_model(path: Path, *, threads: int | None = None) -> OnnxModel:
     except Exception as error:  # as above
         raise ConfigError(f"{path}: not a model that ONNX Runtime can load: {first_line(error)}") from None
     metadata = dict(session.get_modelmeta().custom_metadata_map)
-    return OnnxModel(
-        path, input_spec(session.get_inputs(), path), metadata, session, threads or len(os.sched_getaffinity(0))
-    )
+    return OnnxModel(path, input_spec(session.get_inputs(), path), metadata, session, threads or usable_threads())
 
 
 def check_file(path: Path) -> None:

@@ -1,0 +1,167 @@
+"""Find logs of any format below a folder."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from log2sim import registry
+from log2sim.errors import ConfigError, LogError
+from log2sim.links import follows_links
+from log2sim.logs.opening import find_reader
+from log2sim.logs.reader import Reader
+
+MAX_LEVELS = 8
+"""Below the root; data sets have up to four (split, date, drive, sensor)."""
+MAX_FOLDERS = 500_000
+"""That are looked into, so that a wrong root such as "/" ends."""
+
+
+@dataclass(frozen=True)
+class FoundLog:
+    """A log that can be opened.
+
+    Attributes
+    ----------
+    id : str
+        Path of the log below the root, with the sequence where one folder holds several; unique within a format.
+    path : Path
+        What `open_log` takes.
+    format : str
+    sequence : str
+    """
+
+    id: str
+    path: Path
+    format: str
+    sequence: str
+
+
+def find_logs(root: Path, *, format: str = "auto", leave_out: Path | None = None) -> list[FoundLog]:
+    """Find all logs at and below a folder, in the order of their ids.
+
+    Parameters
+    ----------
+    root : Path
+        A folder, or the file of one log.
+    format : str
+        Name of the only format that is looked for, or "auto".
+    leave_out : Path, optional
+        Folder that is not looked into.
+
+    Raises
+    ------
+    LogError
+        When the root is missing, or there is no log.
+    ConfigError
+        For an unknown format, or more folders than can be searched.
+
+    Notes
+    -----
+    A log is reported at the deepest folder that its reader accepts. Nothing below a folder that is a log itself is another one. Hidden
+    folders are skipped, and links are followed only where that was asked for (`log2sim.links.following_links`).
+    """
+    if not root.exists():
+        raise LogError(f"{root}: no such folder; give a folder with logs")
+    names = registry.names("log") if format == "auto" else [format]
+    readers: dict[str, Reader] = {name: registry.load("log", name) for name in names}
+    if root.is_file():
+        found = _of_file(root, format)
+    else:
+        found = _Search(root, readers, None if leave_out is None else leave_out.resolve()).below(root, MAX_LEVELS)
+    if not found:
+        kind = "of any format" if format == "auto" else f"of format '{format}'"
+        raise LogError(f"{root}: holds no log {kind}, down to {MAX_LEVELS} folders below it")
+    return sorted(found, key=lambda log: (log.id, log.format))
+
+
+def _of_file(root: Path, format: str) -> list[FoundLog]:
+    name = find_reader(root) if format == "auto" else format
+    reader: Reader = registry.load("log", name)
+    return [FoundLog(_text(sequence), root, name, sequence) for sequence in reader.sequences(root)]
+
+
+class _Search:
+    """A search below one root.
+
+    Attributes
+    ----------
+    root : Path
+    readers : mapping of str to Reader
+    leave_out : Path or None
+    """
+
+    def __init__(self, root: Path, readers: Mapping[str, Reader], leave_out: Path | None) -> None:
+        self.root, self.readers, self.leave_out = root, readers, leave_out
+        self._seen: set[Path] = set()
+
+    def below(self, folder: Path, levels: int) -> list[FoundLog]:
+        """Return the logs at and below a folder, of which `levels` more levels are searched."""
+        if len(self._seen) >= MAX_FOLDERS:
+            raise ConfigError(f"{self.root}: more than {MAX_FOLDERS} folders are below it; give the folder of the logs")
+        self._seen.add(folder.resolve())
+        held = self._held(folder)
+        itself = next((name for name, sequences in held.items() if _is_one_log(folder, sequences)), None)
+        if itself is not None:
+            return [self._log(folder, itself, held[itself][0])]
+        folders, stems = self._entries(folder)
+        deeper = [log for child in folders for log in self.below(child, levels - 1)] if levels else []
+        known = {(log.format, name) for log in deeper for name in _names_from(folder, log, stems)}
+        own = [
+            (name, s) for name, sequences in held.items() for s in sequences if (name, s) not in known and s[0] != "."
+        ]
+        return [*deeper, *(self._log(folder, name, sequence) for name, sequence in own)]
+
+    def _held(self, folder: Path) -> dict[str, list[str]]:
+        """Return the sequences at a folder by format."""
+        held = {}
+        for name, reader in self.readers.items():
+            try:
+                sequences = reader.sequences(folder) if reader.matches(folder) else []
+            except Exception as error:  # of a plug-in, which should raise none
+                raise ConfigError(
+                    f"log format '{name}': its reader fails on {folder}: {type(error).__name__}: {error}"
+                ) from error
+            if sequences:
+                held[name] = sequences
+        return held
+
+    def _entries(self, folder: Path) -> tuple[list[Path], set[str]]:
+        """Return the folders in a folder that are searched, and the names of its files up to any dot; none if it cannot be listed."""
+        try:
+            with os.scandir(folder) as entries:
+                listed = sorted((e for e in entries if not e.name.startswith(".")), key=lambda e: e.name)
+        except OSError:
+            return [], set()
+        inner = [Path(e.path) for e in listed if e.is_dir(follow_symlinks=follows_links())]
+        inner = [path for path in inner if path.resolve() not in self._seen and path.resolve() != self.leave_out]
+        parts = [e.name.split(".") for e in listed if not e.is_dir()]
+        return inner, {".".join(part[:k]) for part in parts for k in range(1, len(part) + 1)}
+
+    def _log(self, folder: Path, format: str, sequence: str) -> FoundLog:
+        parts = folder.relative_to(self.root).parts
+        name = sequence.rpartition("/")[2]
+        is_itself = bool(parts) and folder.name == name
+        return FoundLog(_text("/".join(parts if is_itself else (*parts, sequence))), folder, format, sequence)
+
+
+def _is_one_log(folder: Path, sequences: list[str]) -> bool:
+    """Return whether a folder is a log, rather than one that holds some."""
+    name = folder.resolve().name
+    return sequences == [name] and not (folder / name).is_dir()
+
+
+def _names_from(folder: Path, log: FoundLog, stems: set[str]) -> list[str]:
+    """Return under which names a reader may list a log that lies deeper, when it is asked for those of a folder above.
+
+    A file of the folder that has the name, with any suffix, is a log of its own.
+    """
+    place = log.path.relative_to(folder).as_posix()
+    return [place, f"{place}/{log.sequence}", *([] if log.sequence in stems else [log.sequence])]
+
+
+def _text(name: str) -> str:
+    """Return a name with escapes for bytes that are no UTF-8, which files of text cannot hold."""
+    return name.encode("utf-8", "backslashreplace").decode()

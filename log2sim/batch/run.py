@@ -1,0 +1,240 @@
+"""Run all logs of a batch on the workers of a cluster."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from log2sim.batch.cluster import Workers
+from log2sim.batch.discovery import find_logs
+from log2sim.batch.folder import BatchFolder, BatchSettings
+from log2sim.batch.jobs import Job, make_jobs
+from log2sim.batch.page import write_batch_page
+from log2sim.batch.rows import Row, failed_row
+from log2sim.batch.table import write_parquet
+from log2sim.config import Config
+from log2sim.errors import ConfigError, Log2SimError
+from log2sim.links import follows_links
+
+if TYPE_CHECKING:
+    from distributed import Future
+
+Progress = Callable[[int, int], None]
+
+MAX_SUBMITTED = 4000
+"""Jobs that the scheduler knows at once: enough for 1,000 workers, and little memory for any number of logs."""
+MAX_ATTEMPTS = 2
+KEY_BYTES = 8
+MAX_ROUNDS = 6
+"""Of repetitions at the end; more than two come of logs that waited behind one that killed their worker."""
+TABLE_FILE, PAGE_FILE = "table.parquet", "table.html"
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Logs to be reconstructed, and what earlier runs did of them.
+
+    Attributes
+    ----------
+    folder : BatchFolder
+    jobs : tuple of Job
+        One for each log.
+    done : mapping of str to Row
+        By the name of the log's folder.
+    """
+
+    folder: BatchFolder
+    jobs: tuple[Job, ...]
+    done: Mapping[str, Row]
+
+    @cached_property
+    def missing(self) -> list[Job]:
+        """Jobs that were not done yet, those that failed among them."""
+        return [job for job in self.jobs if job.name not in self.done]
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A job that ended.
+
+    Attributes
+    ----------
+    job : Job
+    row : Row
+    repetition : Job, optional
+        To be run at the end.
+    worker : str
+        Address of the worker that is not to run that; empty where none is to be avoided.
+    """
+
+    job: Job
+    row: Row
+    repetition: Job | None = None
+    worker: str = ""
+
+
+def plan_batch(
+    root: Path, out: Path, config: Config, *, format: str = "auto", overwrite: bool = False, cache: bool = True
+) -> Batch:
+    """Find the logs below a folder, and begin their batch in another or go on with it.
+
+    Parameters
+    ----------
+    root, out : Path
+    config : Config
+        Settings of all runs.
+    format : str
+        Format of the logs, or "auto".
+    overwrite : bool
+        Whether to start over, without the results of earlier runs.
+    cache : bool
+        Whether detections in pictures are taken from the caches of the workers, and kept there.
+
+    Raises
+    ------
+    LogError
+        Where there is no log.
+    ConfigError
+        For an output folder that holds the logs, something else, or a batch of other settings.
+    """
+    if out.resolve() in (root.resolve(), *root.resolve().parents):
+        raise ConfigError(f"{out}: holds the logs; choose another folder for the results")
+    logs = find_logs(root, format=format, leave_out=out)
+    wanted = BatchSettings.create(root, format, follows_links(), config)
+    folder = BatchFolder.start(out, wanted, overwrite=overwrite)
+    jobs = make_jobs(logs, out, folder.settings.token, cache=cache)
+    rows = {job.name: folder.read_row(job.name) for job in jobs}
+    return Batch(folder, tuple(jobs), {name: row for name, row in rows.items() if row is not None and row.is_done})
+
+
+def run_batch(
+    batch: Batch, connection: AbstractContextManager[Workers], *, progress: Progress = lambda done, total: None
+) -> list[Row]:
+    """Run the logs of a batch that are missing, and write its tables, however it ends.
+
+    Parameters
+    ----------
+    batch : Batch
+    connection : context manager of Workers
+        Entered only if there is something to do.
+    progress : callable
+        Called as `progress(done, total)`.
+
+    Returns
+    -------
+    list of Row
+        Of all logs, those of earlier runs among them.
+    """
+    rows, finished = dict(batch.done), len(batch.done)
+    try:
+        if batch.missing:
+            progress(finished, len(batch.jobs))
+            with connection as workers:
+                for ended in run_jobs(workers, batch.missing, batch.folder):
+                    rows[ended.job.name] = ended.row
+                    finished += ended.repetition is None
+                    progress(finished, len(batch.jobs))
+    finally:
+        batch.folder.remove_left_over()
+        listed = [rows[job.name] for job in batch.jobs if job.name in rows]
+        write_parquet(batch.folder.path / TABLE_FILE, listed)
+        write_batch_page(batch.folder.path / PAGE_FILE, listed, batch.folder.settings, total=len(batch.jobs))
+    return listed
+
+
+def run_jobs(workers: Workers, jobs: Iterable[Job], folder: BatchFolder) -> Iterator[Finished]:
+    """Run jobs and yield each as it ends; those that may succeed a second time are repeated at the end, on fresh workers."""
+    avoided: dict[str, str] = {}
+    for last in (*[False] * (MAX_ROUNDS - 1), True):
+        again = []
+        for ended in _run_once(workers, jobs, folder, avoided):
+            if ended.repetition is not None and last:
+                folder.write_failure(ended.row, ended.row.error)
+                yield replace(ended, repetition=None)
+                continue
+            yield ended
+            again += [] if ended.repetition is None else [ended]
+        if not again:
+            return
+        workers.refresh()
+        jobs = [ended.repetition for ended in again if ended.repetition is not None]
+        avoided = {ended.job.name: ended.worker for ended in again if ended.worker}
+
+
+def _run_once(
+    workers: Workers, jobs: Iterable[Job], folder: BatchFolder, avoided: Mapping[str, str]
+) -> Iterator[Finished]:
+    """Run jobs, each on another worker than the one that is to be avoided if there is another."""
+    from distributed import as_completed
+
+    waiting, running = iter(jobs), dict[str, Job]()
+    futures = as_completed([])
+
+    def submit(count: int) -> None:
+        for job in islice(waiting, count):
+            future = _submit(workers, job, avoided)
+            running[future.key] = job
+            futures.add(future)
+
+    submit(MAX_SUBMITTED)
+    for future in futures:
+        yield _ended(workers, future, running.pop(future.key), folder)
+        submit(1)
+
+
+def _run_on_worker(job: Job) -> tuple[dict[str, Any], bool]:
+    """Run a job; what that needs is imported by workers alone."""
+    from log2sim.batch.worker import run_job
+
+    return run_job(job)
+
+
+def _submit(workers: Workers, job: Job, avoided: Mapping[str, str]) -> Future:
+    others = workers.others_than(avoided[job.name]) if job.name in avoided else []
+    preferred = {"workers": others, "allow_other_workers": True} if others else {}
+    # A key of its own for each run: Dask returns the result that it has under a known one.
+    key = f"log2sim-{job.token}-{job.name}-{secrets.token_hex(KEY_BYTES)}"
+    return workers.client.submit(_run_on_worker, job, key=key, pure=False, **preferred)
+
+
+def _ended(workers: Workers, future: Future, job: Job, folder: BatchFolder) -> Finished:
+    """Return what came of a job, also where its worker could not say."""
+    from distributed import KilledWorker
+
+    repetition = replace(job, attempts=job.attempts + 1) if job.attempts < MAX_ATTEMPTS else None
+    if future.status == "finished":
+        document, may_repeat = future.result()
+        row = Row.model_validate(document)
+        if not may_repeat or repetition is None:
+            return Finished(job, row)
+        holders = [] if workers.are_ours else workers.client.who_has([future])[future.key]
+        return Finished(job, row, repetition, next(iter(holders), ""))
+    if future.cancelled():
+        raise ConfigError("the Dask scheduler is gone; the same command goes on where this one was")
+    error = future.exception()
+    if isinstance(error, KilledWorker):
+        return _died(job, repetition, folder)
+    row = failed_row(job, type(error).__name__, str(error))
+    if isinstance(error, Log2SimError) or repetition is None:
+        folder.write_failure(row, row.error)
+        return Finished(job, row)
+    return Finished(job, row, repetition)
+
+
+def _died(job: Job, repetition: Job | None, folder: BatchFolder) -> Finished:
+    """Return what came of a job whose worker died: after its work, before it, or by it."""
+    written = folder.read_row(job.name)
+    if written is not None and written.is_done:
+        return Finished(job, written)
+    row = failed_row(job, "WorkerDied", "the worker process died: it was killed, crashed or needed too much memory")
+    if not folder.take_unfinished(job.name):
+        return Finished(job, row, job)  # it waited behind another
+    if repetition is None:
+        folder.write_failure(row, row.error)
+    return Finished(job, row, repetition)

@@ -1,0 +1,102 @@
+"""Reconstruct all logs below a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from log2sim.cli.options import ConfigFile, Format, NoCache, Poses, Quiet, Settings, counted, say, write_to
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from log2sim.batch.rows import Row
+
+MAX_NAMED = 5
+
+
+def batch(
+    root: Annotated[Path, typer.Argument(metavar="ROOT", help="Folder with logs of any formats below it.")],
+    out: Annotated[Path, write_to("DIR", "Folder for the results; the same command goes on there.")],
+    jobs: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=1, help="Worker processes on this machine.", show_default="one for each core"),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="tcp://HOST:PORT", help="Use the workers of this Dask scheduler, which see the same folders."
+        ),
+    ] = None,
+    format: Format = "auto",
+    detector: Annotated[
+        str | None, typer.Option(metavar="NAME|MODEL.onnx|labels|lidar:NAME", help="Detector, see reconstruct.")
+    ] = None,
+    poses: Poses = None,
+    config: ConfigFile = None,
+    settings: Settings = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
+    no_cache: NoCache = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Start over: first remove the results that DIR holds.")
+    ] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Reconstruct all logs below a folder, several at once.
+
+    Each log gets a folder in DIR/logs with scenario.json and report.json, or error.txt where it failed; table.html and
+    table.parquet list them all. A log that fails by something else than its data is run once more at the end. A second call
+    runs what is missing or failed. Exits with 7 when logs failed.
+
+    Examples
+    --------
+    log2sim batch drives/ -o results/
+    log2sim batch drives/ -o results/ --scheduler tcp://10.0.0.5:8786
+    """
+    from log2sim.batch import plan_batch, run_batch
+    from log2sim.batch.cluster import local_workers, workers_of
+    from log2sim.cli.progress import progress
+    from log2sim.config import Config
+    from log2sim.errors import ConfigError, LogsFailed
+    from log2sim.threads import usable_threads
+
+    if scheduler is not None and jobs is not None:
+        raise ConfigError("--jobs: the scheduler decides how many workers there are; leave out --jobs or --scheduler")
+    changes: dict[str, Any] = {"seed": seed}
+    if detector is not None:
+        changes["detect"] = {"name": detector}
+    if poses is not None:
+        changes["poses"] = {"source": poses}
+    chosen = Config.load(config, settings or (), **changes)
+    planned = plan_batch(root, out, chosen, format=format, overwrite=overwrite, cache=not no_cache)
+    found = f"{counted(len(planned.jobs), 'log')} below {root}"
+    say(f"{found}, {len(planned.done)} of them done before" if planned.done else found, quiet=quiet)
+    workers = local_workers(jobs or usable_threads()) if scheduler is None else workers_of(scheduler)
+    with progress(quiet=quiet) as report_progress:
+        rows = run_batch(planned, workers, progress=lambda done, total: report_progress("logs", done, total))
+    for line in _failure_lines(rows):
+        say(line, quiet=quiet)
+    say(f"{out / 'table.html'}: {_summary(rows)}", quiet=quiet)
+    failed = sum(not row.is_done for row in rows)
+    if failed:
+        raise LogsFailed(f"{failed} of {counted(len(rows), 'log')} failed; {out / 'table.html'} says why")
+
+
+def _summary(rows: Sequence[Row]) -> str:
+    from log2sim.batch.table import sum_up
+
+    sums = sum_up(rows)
+    return (
+        f"{sums['done']:.0f} of {counted(len(rows), 'log')} done, {sums['agents']:.0f} agents ({sums['static']:.0f} static, "
+        f"{sums['doubtful']:.0f} doubtful) over {sums['duration_s']:.0f} s"
+    )
+
+
+def _failure_lines(rows: Sequence[Row]) -> list[str]:
+    """Say why the first logs failed."""
+    failed = [row for row in rows if not row.is_done]
+    lines = [f"failed: {row.log}: {row.error.splitlines()[0] if row.error else row.error_kind}" for row in failed]
+    more = len(lines) - MAX_NAMED
+    return [*lines[:MAX_NAMED], *([f"and {more} more"] if more > 0 else [])]
