@@ -54,6 +54,11 @@ def _names(value: Any) -> Any:
     return tuple(name for name in names if name != "")
 
 
+def _detector(value: Any) -> Any:
+    """Return the section of a detector that is given by its name alone."""
+    return {"name": value} if isinstance(value, str) else value
+
+
 class Config(Section):
     """All settings of a reconstruction."""
 
@@ -71,7 +76,7 @@ class Config(Section):
     poses: PosesConfig = PosesConfig()
     calibration: CalibrationConfig = CalibrationConfig()
     sync: SyncConfig = SyncConfig()
-    detect: DetectConfig = DetectConfig()
+    detect: Annotated[DetectConfig, BeforeValidator(_detector)] = DetectConfig()
     lidar: LidarConfig = LidarConfig()
     measure: MeasureConfig = MeasureConfig()
     topdown: TopdownConfig = TopdownConfig()
@@ -80,6 +85,29 @@ class Config(Section):
     smooth: SmoothConfig = SmoothConfig()
     map: MapConfig = MapConfig()
     appearance: AppearanceConfig = AppearanceConfig()
+
+    def __init__(self, **settings: Any) -> None:
+        """Check the settings; `ConfigError` names the one that is wrong.
+
+        A section is its model or a document of its settings; `detect="labels"` is short for `detect={"name": "labels"}`.
+        """
+        try:
+            super().__init__(**settings)
+        except ValidationError as problem:
+            raise ConfigError(first_problem(problem, Config)) from None
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> Config:
+        """Build settings from a document such as `to_dict` returns and the provenance of a scenario holds; what it lacks has its default.
+
+        Raises
+        ------
+        ConfigError
+            When it is no table, for an unknown key or a value out of its range.
+        """
+        if not isinstance(document, Mapping):
+            raise ConfigError(f"settings: {type(document).__name__}, expected a table of settings")
+        return _merged(cls(), document, "settings")
 
     @classmethod
     def load(cls, path: Path | str | None = None, settings: Iterable[str] = (), **overrides: Any) -> Config:
@@ -140,17 +168,21 @@ class Config(Section):
 
 def _merged(config: Config, changes: Mapping[str, Any], where: str) -> Config:
     """Return checked settings with the changes of a document; `where` begins the message of an error."""
+    merged = _deep_merged(config.model_dump(), changes)
+    unnamed = [key for key in merged if not isinstance(key, str)]
+    if unnamed:
+        raise ConfigError(f"{where}: {unnamed[0]!r} is no name of a setting")
     try:
-        return Config.model_validate(_deep_merged(config.model_dump(), changes))
-    except ValidationError as problem:
-        raise ConfigError(f"{where}: {first_problem(problem, Config)}") from None
+        return Config(**merged)
+    except ConfigError as problem:
+        raise ConfigError(f"{where}: {problem}") from None
 
 
 def _deep_merged(document: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     merged = dict(document)
     for key, value in changes.items():
-        new = value.model_dump() if isinstance(value, Section) else value
         old = merged.get(key)
+        new = value.model_dump() if isinstance(value, Section) else _detector(value) if key == "detect" else value
         merged[key] = _deep_merged(old, new) if isinstance(old, dict) and isinstance(new, Mapping) else new
     return merged
 

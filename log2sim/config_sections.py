@@ -9,6 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field
 LIDAR_PREFIX = "lidar:"
 """Names of detectors in LiDAR sweeps begin with it."""
 
+GIVEN_PREFIX = "given:"
+"""Names of detectors that a program handed to `reconstruct` begin with it."""
+
 
 def setting(default: Any, description: str, *, unit: str = "", ge: float | None = None, le: float | None = None) -> Any:
     """Declare a setting: its default, meaning, unit, and limits `ge` and `le`, which belong to the range."""

@@ -23,6 +23,10 @@ class ConfigError(Log2SimError):
     exit_code = 2
 
 
+class PluginError(ConfigError):
+    """A plug-in of another package that cannot be imported, lacks something, or does what no plug-in of its kind may."""
+
+
 class LogError(Log2SimError):
     """A log or an input file that is missing, unreadable, inconsistent or incomplete."""
 

@@ -30,6 +30,7 @@ from log2sim.logs.time_checks import say_without_pose
 from log2sim.outcome import RunOutputs, stage_outcomes
 from log2sim.perception.first_pass import Observations, observe
 from log2sim.perception.fusion import fuse
+from log2sim.perception.given_detectors import GivenDetector, sort_detectors
 from log2sim.perception.homography_stage import estimation_options, fit_homographies, place_by_homography
 from log2sim.perception.sync import Schedule, synchronize
 from log2sim.plan import FusionLevel, Plan, Stage, make_plan
@@ -59,6 +60,14 @@ class Result:
     scenario: Scenario
     report: dict[str, Any]
     log: Log
+
+    def __repr__(self) -> str:
+        """Return its scenario and its log in one line."""
+        return f"<Result: {self.scenario!r} of {self.log!r}>"
+
+    def _repr_html_(self) -> str | None:
+        """Return what a notebook shows of its scenario."""
+        return self.scenario._repr_html_()
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +107,12 @@ class Run:
 
 
 def reconstruct(
-    log: Log, config: Config | None = None, *, progress: Progress | None = None, cache: bool = True
+    log: Log,
+    config: Config | None = None,
+    *,
+    detector: GivenDetector | list[GivenDetector] | tuple[GivenDetector, ...] | None = None,
+    progress: Progress | None = None,
+    cache: bool = True,
 ) -> Result:
     """Reconstruct the scenario of a log.
 
@@ -108,6 +122,11 @@ def reconstruct(
         From `open_log`.
     config : Config, optional
         Settings; the defaults without.
+    detector : callable, Detector, LidarDetector, str or a list of two of them, optional
+        Takes the place of `detect.name` in the settings. A function gets a picture, (H, W, 3) uint8 BGR, and returns rows of x0,
+        y0, x1, y1 in px, score in [0, 1], category of `log2sim.datatypes.CATEGORIES`; or `Detections`. An object has the members of
+        `log2sim.perception.detect.detectors.Detector` or, for LiDAR sweeps, of `log2sim.perception.detect3d.detectors.LidarDetector`.
+        A name is one that `--detector` takes. A list joins one for pictures and one for sweeps, such as `[find_cars, "lidar:vehicle"]`.
     progress : callable, optional
         Called as `progress(stage, done, total)`; with a total of 0 when a stage of unknown length begins.
     cache : bool
@@ -117,16 +136,22 @@ def reconstruct(
     ------
     LogError, ConfigError, MissingExtra
         For logs and settings that cannot work.
+    PluginError
+        When the detector fails, or returns something else.
     NothingToReconstruct
         When neither an ego nor any agent was found.
     """
-    run = start(log, config or Config(), progress=progress, cache=cache)
+    run = start(log, config or Config(), detector=detector, progress=progress, cache=cache)
     observations = first_pass(run)
     return look_around(run, observations, second_pass(run, observations))
 
 
-def start(log: Log, config: Config, *, progress: Progress | None = None, cache: bool = True) -> Run:
+def start(
+    log: Log, config: Config, *, detector: Any = None, progress: Progress | None = None, cache: bool = True
+) -> Run:
     """Choose the poses and the sensors, check their calibration, synchronize them, and plan the run."""
+    given = sort_detectors(detector, config)
+    config = given.config
     clock, report_progress = StageClock(), progress or (lambda *_: None)
     with clock.stage("poses"):
         log, poses = localize(log, config, progress=report_progress)
@@ -139,7 +164,7 @@ def start(log: Log, config: Config, *, progress: Progress | None = None, cache: 
         road = register_road(log, config, sensors, progress=report_progress)
         log, sensors = road.log, sensors.without([f.sensor for f in road.faults if f.treatment == "left_out"])
     report_progress("load", 0, 0)
-    detectors = create_detectors(sensors.restrict(log), config, cache=cache)
+    detectors = create_detectors(sensors.restrict(log), config, given, cache=cache)
     with clock.stage("sync"):
         schedule = schedule_of(log, config, sensors)
     plan = make_plan(log, config, sensors, schedule.t_ns)

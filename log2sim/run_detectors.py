@@ -10,6 +10,7 @@ from log2sim.perception.cooperative.detector import create_for_ends
 from log2sim.perception.detect.detectors import Detector, create_detector
 from log2sim.perception.detect3d.detectors import LidarDetector
 from log2sim.perception.detection_cache import DetectionCache, open_cache
+from log2sim.perception.given_detectors import GivenDetectors
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,16 +37,16 @@ class Detectors:
         return "+".join(detector.name for detector in (self.images, self.sweeps) if detector is not None)
 
 
-def create_detectors(log: Log, config: Config, *, cache: bool = True) -> Detectors:
-    """Create the detectors that the settings name.
+def create_detectors(log: Log, config: Config, given: GivenDetectors, *, cache: bool = True) -> Detectors:
+    """Create the detectors that the settings name, but for those that were given.
 
     Parameters
     ----------
     cache : bool
         Whether what the detector finds in images is taken from the user's cache, and kept there.
     """
-    images = create_image_detector(log, config) if config.detect.in_images else None
-    sweeps = create_for_ends(log, config) if config.detect.in_sweeps else None
+    images = given.images or create_image_detector(log, config) if config.detect.in_images else None
+    sweeps = create_for_ends(log, config, given.sweeps) if config.detect.in_sweeps else None
     return Detectors(images, sweeps, open_cache(images) if cache and images is not None else None)
 
 

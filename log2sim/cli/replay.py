@@ -19,10 +19,16 @@ def replay(
     mode: Annotated[
         str, typer.Option(help="pid: vehicles follow their trajectories by a controller; exact: no controller.")
     ] = "pid",
-    model: Annotated[str, typer.Option(help="Vehicle model: auto, kinematic, dynamic or single-track.")] = "auto",
+    model: Annotated[
+        str, typer.Option(help="Vehicle model: auto, kinematic, dynamic or single-track, or a plug-in.")
+    ] = "auto",
     dt: Annotated[float, typer.Option(help="Time step in s, from 0.0005 to 1.")] = 0.01,
     ego: Annotated[
-        str | None, typer.Option(metavar="MODULE|FILE.py:ATTRIBUTE", help="Policy that drives the ego.")
+        str | None,
+        typer.Option(
+            metavar="NAME|MODULE:ATTRIBUTE|FILE.py:ATTRIBUTE",
+            help="Policy that drives the ego: a plug-in, or of a module or file.",
+        ),
     ] = None,
     warn: Annotated[
         str | None,

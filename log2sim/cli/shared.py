@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from log2sim.cli.plugin_help import CommandWithPlugins
 from log2sim.links import OPTION
 
 DEBUG = "--debug"
@@ -29,7 +30,9 @@ def add_command(app: typer.Typer, command: Callable[..., None], name: str | None
         Default: that of the function.
     """
     text, _, examples = (inspect.getdoc(command) or "").partition("\nExamples\n--------\n")
-    app.command(name=name, help=text.strip(), epilog=format_examples(examples))(with_shared_options(command))
+    app.command(name=name, cls=CommandWithPlugins, help=text.strip(), epilog=format_examples(examples))(
+        with_shared_options(command)
+    )
 
 
 def with_shared_options(command: Callable[..., None]) -> Callable[..., None]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.config import Config
-from log2sim.config_sections import AUTO
+from log2sim.config_sections import AUTO, GIVEN_PREFIX, LIDAR_PREFIX
 from log2sim.datatypes import Boxes3D, Log, Sweep
 from log2sim.errors import RecordError
 from log2sim.geometry import NS_PER_S, Array
@@ -21,6 +21,7 @@ MAX_AWAY_M = 70.0
 REACH_M = 60.0
 MIN_SCORE = 0.4
 NO_DETECTIONS = "lidar:labels"
+GIVEN = LIDAR_PREFIX + GIVEN_PREFIX
 
 
 def choose_moments(log: Log, site_m: Array, during_ns: tuple[int, int] | None, count: int) -> NDArray[np.int64]:
@@ -86,7 +87,7 @@ def detectors_of(log: Log, config: Config) -> tuple[LidarDetector, LidarDetector
     """
     vehicle, road = config.detect.in_sweeps, config.cooperation.road_detector
     names = (
-        vehicle if vehicle not in ("", NO_DETECTIONS) else "lidar:vehicle",
+        vehicle if vehicle not in ("", NO_DETECTIONS) and not vehicle.startswith(GIVEN) else "lidar:vehicle",
         road if road not in (AUTO, NO_DETECTIONS) else "lidar:roadside",
     )
     first, second = (create_lidar_detector(name, log, config.lidar) for name in names)

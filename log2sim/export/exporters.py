@@ -97,7 +97,8 @@ def export(
     # In the folder itself if it exists, since it may be on another file system than its parent.
     parent = folder if folder.is_dir() else folder.parent
     with unfinished_folder(temporary_beside(parent / folder.name), folder) as temporary:
-        exporter.write(scenario, temporary, chosen)
+        with registry.blaming("export", to):
+            exporter.write(scenario, temporary, chosen)
         return _move_into(temporary, folder, overwrite=overwrite)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from log2sim import registry
 from log2sim.datatypes import Log
-from log2sim.errors import ConfigError, LogError
+from log2sim.errors import ConfigError, LogError, PluginError
 from log2sim.links import following_links
 from log2sim.logs.calibration_checks import list_calibration_problems
 from log2sim.logs.guarding import guard_log, translate_parser_errors
@@ -55,49 +55,89 @@ def _open(root: Path, format: str, sequence: str | None) -> Log:
     reader: Reader = registry.load("log", name)
     if not _may_read(reader, root):
         raise LogError(f"{root}: is a file, which format '{name}' cannot be; expected {reader.looks_for}")
-    chosen = _select_sequence(root, name, reader.sequences(root), sequence)
+    with registry.blaming("log", name):
+        available = reader.sequences(root)
+    chosen = _select_sequence(root, name, available, sequence)
     with translate_parser_errors(f"{root}: cannot be read as format '{name}'", LogError):
-        log = without_impossible_labels(guard_log(reader.open(root, chosen), str(root)))
+        with registry.blaming("log", name):
+            opened = reader.open(root, chosen)
+        registry.require_type("log", name, opened, Log)
+        log = without_impossible_labels(guard_log(opened, str(root)))
     others = _other_formats(root, name) if format == "auto" else []
     notes = [f"{root} holds logs of other formats, too: {', '.join(others)}; --format chooses one"] if others else []
+    notes += _usable_readers()[1] if format == "auto" else []
     # Notes may wait for labels.
     return log.changed(notes=lambda: (*notes, *log.notes, *list_calibration_problems(log), *list_time_problems(log)))
 
 
 def find_reader(root: Path) -> str:
     """Name of the reader that matches a folder or file; `LogError` when none does."""
-    readers: dict[str, Reader] = {name: registry.load("log", name) for name in registry.names("log")}
+    readers, defects = _usable_readers()
     for name, reader in readers.items():
-        if _may_read(reader, root) and reader.matches(root):
+        if _matches(name, reader, root):
             return name
+    broken = "".join(f"; {defect}" for defect in defects)
     if root.is_file():
         suffixes = ", ".join(f"*{suffix}" for reader in readers.values() for suffix in reader.suffixes)
         raise LogError(
-            f"{root}: is a file of no known log format; give the folder of a log{', or a file ' * bool(suffixes)}{suffixes}{_log_above(root)}"
+            f"{root}: is a file of no known log format; give the folder of a log{', or a file ' * bool(suffixes)}{suffixes}{_log_above(root)}{broken}"
         )
     known = "; ".join(f"{name} ({reader.looks_for})" for name, reader in readers.items())
-    raise LogError(f"{root}: no known log format{_log_above(root)}; a log is one of: {known}. Force one with --format")
+    raise LogError(
+        f"{root}: no known log format{_log_above(root)}; a log is one of: {known}. Force one with --format{broken}"
+    )
+
+
+def _usable_readers() -> tuple[dict[str, Reader], list[str]]:
+    """Return all readers by name but those of other packages that cannot be used, and what is wrong with these.
+
+    A broken plug-in is told; it does not keep logs of other formats from being opened.
+    """
+    readers: dict[str, Reader] = {}
+    defects = []
+    for name in registry.names("log"):
+        try:
+            readers[name] = registry.load("log", name)
+        except PluginError as error:
+            defects.append(str(error))
+    return readers, defects
+
+
+def _matches(name: str, reader: Reader, root: Path) -> bool:
+    """Return whether a reader may read a path and matches it."""
+    with registry.blaming("log", name):
+        return bool(_may_read(reader, root) and reader.matches(root))
+
+
+def _seems_to_match(name: str, reader: Reader, root: Path) -> bool:
+    """Return the same where it is only a remark, which no broken plug-in of another package must keep from being made."""
+    try:
+        return _matches(name, reader, root)
+    except PluginError:
+        return False
 
 
 def _other_formats(root: Path, name: str) -> list[str]:
     """Names of further formats of which a folder holds logs, as a folder of downloads may."""
     if root.is_file():
         return []
-    return [other for other in registry.names("log") if other != name and registry.load("log", other).matches(root)]
+    readers = _usable_readers()[0].items()
+    return [other for other, reader in readers if other != name and _seems_to_match(other, reader, root)]
 
 
 def _log_above(path: Path) -> str:
     """Say which folder above a path is a log, for who gave a part of one; "" when none is."""
+    readers = _usable_readers()[0]
     for folder in list(path.absolute().parents)[:-1][:MAX_LEVELS_ABOVE]:
-        for name in registry.names("log"):
-            if registry.load("log", name).matches(folder):
+        for name, reader in readers.items():
+            if _seems_to_match(name, reader, folder):
                 return f"; {folder}, which it is in, holds logs of the format '{name}'"
     return ""
 
 
 def is_log_file(path: Path) -> bool:
     """Return whether a file has a suffix of a format of which a file is a log."""
-    return path.is_file() and any(_may_read(registry.load("log", name), path) for name in registry.names("log"))
+    return path.is_file() and any(_may_read(reader, path) for reader in _usable_readers()[0].values())
 
 
 def _may_read(reader: Reader, root: Path) -> bool:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim import registry
 from log2sim.datatypes import EGO, Agent, Trajectory
 from log2sim.errors import ConfigError
 from log2sim.registry import nearest
@@ -25,7 +26,7 @@ from log2sim.simulation.reference import (
     point_reference,
     vehicle_reference_of,
 )
-from log2sim.simulation.simulators import STEPS, EmbeddedSimulator
+from log2sim.simulation.simulators import EmbeddedSimulator, load_step
 from log2sim.simulation.step_clock import StepClock
 from log2sim.simulation.vehicles.model_choice import ModelChoice, choose_model, slipping_reference, understeer
 from log2sim.simulation.vehicles.parameters import STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
@@ -94,7 +95,7 @@ def agent_groups(
         if walking:
             references = [point_reference(Trajectory.through(a.waypoints)) for a in walking]
             groups.append(
-                on_foot(walking, references, *_lifespans(walking, clock), EmbeddedSimulator(STEPS["kinematic"]))
+                on_foot(walking, references, *_lifespans(walking, clock), EmbeddedSimulator(load_step("kinematic")))
             )
     for driver, tape in (
         ("exact", LogReplayGroup),
@@ -115,17 +116,17 @@ def _vehicle_groups(
     references = {a.id: vehicle_reference_of(a, clock.dt_s) for a in agents}
     for a in agents:
         choices[a.id] = choose_model(a, references[a.id], parameters_for([a]), model, free=kind is PolicyVehicle)
-    for name in STEPS:
+    chosen = {choices[a.id].model for a in agents}
+    for name in sorted(chosen, key=[*registry.BUILT_IN["vehicle_model"], *sorted(chosen)].index):
         moved = [a for a in agents if choices[a.id].model == name]
-        if moved:
-            p = parameters_for(moved, published=name == "single-track")
-            followed = [references[a.id] for a in moved]
-            if name != "kinematic":
-                p = replace(p, understeer_s2pm2=understeer(p))
-                ahead_s = STEER_LAG_S + control_step(clock.dt_s) / 2
-                ones = [p.take(slice(i, i + 1)) for i in range(len(moved))]
-                followed = [slipping_reference(r, one, name, ahead_s) for r, one in zip(followed, ones)]
-            groups.append(kind(moved, followed, *_lifespans(moved, clock), p, EmbeddedSimulator(STEPS[name])))
+        p = parameters_for(moved, published=name == "single-track")
+        followed = [references[a.id] for a in moved]
+        if name != "kinematic":
+            p = replace(p, understeer_s2pm2=understeer(p))
+            ahead_s = STEER_LAG_S + control_step(clock.dt_s) / 2
+            ones = [p.take(slice(i, i + 1)) for i in range(len(moved))]
+            followed = [slipping_reference(r, one, name, ahead_s) for r, one in zip(followed, ones)]
+        groups.append(kind(moved, followed, *_lifespans(moved, clock), p, EmbeddedSimulator(load_step(name))))
     return groups
 
 

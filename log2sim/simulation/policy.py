@@ -14,7 +14,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Scenario
-from log2sim.errors import ConfigError
+from log2sim.errors import ConfigError, PluginError
 from log2sim.geometry import Array
 
 SIGHT_M = 100.0  # default range of observed agents
@@ -190,6 +190,8 @@ def reset_policy(policy: Policy, scenario: Scenario) -> None:
         return
     try:
         reset(scenario)
+    except PluginError:  # of a plug-in, which names its package
+        raise
     except Exception as error:
         raise ConfigError(f"policy: reset raised {type(error).__name__}: {error}") from error
 
@@ -199,6 +201,8 @@ def query_policy(policy: Policy, observation: Observation) -> Controls:
     where = f"policy at {observation.t_s:g} s"
     try:
         answer = policy(observation)
+    except PluginError:
+        raise
     except Exception as error:
         # A user's policy may raise anything; the chained traceback shows its author where.
         raise ConfigError(f"{where}: raised {type(error).__name__}: {error}") from error

@@ -1,4 +1,4 @@
-"""Loads the policy that a name on the command line refers to."""
+"""Loads the policy that a name on the command line refers to, of an installed package, a module or a file."""
 
 from __future__ import annotations
 
@@ -7,17 +7,20 @@ import importlib.util
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from log2sim.errors import ConfigError
+from log2sim import registry
+from log2sim.datatypes import Scenario
+from log2sim.errors import ConfigError, PluginError
 from log2sim.registry import nearest
-from log2sim.simulation.policy import Policy
+from log2sim.simulation.policy import Controls, Observation, Policy, query_policy, reset_policy
 
 
 def load_policy(name: str) -> Policy:
-    """Load the policy "module:attribute" or "path/to/file.py:attribute"; the attribute may contain dots.
+    """Load the policy "module:attribute" or "path/to/file.py:attribute", or a plug-in by its name; the attribute may contain dots.
 
     A module is looked up in the current folder first, as `python -m` does; a file can import from its own folder. A class is
     instantiated without arguments.
@@ -28,9 +31,11 @@ def load_policy(name: str) -> Policy:
         When the name has another form, or cannot be imported, instantiated or called.
     """
     source, colon, attribute = name.rpartition(":")
-    if not (source and colon and attribute):
+    if not colon and name:
+        return _load_plugin(name)
+    if not (source and attribute):
         raise ConfigError(
-            f"policy '{name}': expected module:attribute or file.py:attribute, such as my_driver:brake_late"
+            f"policy '{name}': expected module:attribute or file.py:attribute, such as my_driver:brake_late, or the name of a plug-in"
         )
     try:
         target: Any = _import_file(Path(source)) if source.endswith(".py") else _import_module(source)
@@ -41,15 +46,64 @@ def load_policy(name: str) -> Policy:
             known = [key for key in vars(target) if not key.startswith("_")] if hasattr(target, "__dict__") else []
             raise ConfigError(f"policy '{name}': there is no '{part}' in '{source}'{nearest(part, known)}")
         target = getattr(target, part)
+    return _made(target, f"policy '{name}'", ConfigError)
+
+
+@dataclass(frozen=True, eq=False)
+class PluginPolicy:
+    """A policy of another package; its faults are told with the name of the package.
+
+    Attributes
+    ----------
+    inner : callable
+    source : str
+        How messages name it.
+    """
+
+    inner: Policy
+    source: str
+
+    def reset(self, scenario: Scenario) -> None:
+        """Prepare it for a replay, if it wants to be."""
+        with self._blamed():
+            reset_policy(self.inner, scenario)
+
+    def __call__(self, observation: Observation) -> Controls:
+        """Return its controls."""
+        with self._blamed():
+            return query_policy(self.inner, observation)
+
+    @contextmanager
+    def _blamed(self) -> Iterator[None]:
+        try:
+            yield
+        except ConfigError as error:  # whatever it raises and returns is one already
+            raise PluginError(f"{self.source}: {error}") from error
+
+
+def _load_plugin(name: str) -> Policy:
+    """Load the policy that another package declares as an entry point of the group "log2sim.policy"."""
+    try:
+        target = registry.load("policy", name)
+    except PluginError:
+        raise
+    except ConfigError as error:
+        raise ConfigError(
+            f"{error}; of a module or a file, expected module:attribute or file.py:attribute, such as my_driver:brake_late"
+        ) from None
+    source = registry.say_plugin("policy", name)
+    return PluginPolicy(_made(target, source, PluginError), source)
+
+
+def _made(target: Any, source: str, error_type: type[ConfigError]) -> Policy:
+    """Return the policy itself, which a class is made to without arguments."""
     if isinstance(target, type):
         try:
             target = target()
         except Exception as error:
-            raise ConfigError(f"policy '{name}': cannot be made: {type(error).__name__}: {error}") from error
+            raise error_type(f"{source}: cannot be made: {type(error).__name__}: {error}") from error
     if not callable(target):
-        raise ConfigError(
-            f"policy '{name}': is a {type(target).__name__}, expected a callable policy(observation) -> Controls"
-        )
+        raise error_type(f"{source}: is a {type(target).__name__}, expected a callable policy(observation) -> Controls")
     result: Policy = target
     return result
 

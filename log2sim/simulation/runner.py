@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 
 from log2sim.datatypes import EGO, Agent, Scenario
 from log2sim.errors import ConfigError, ScenarioError
-from log2sim.registry import nearest
+from log2sim.registry import is_built_in, names, nearest
 from log2sim.simulation.drivers import agent_groups, assign_drivers, reactive_ids, reactive_traffic
 from log2sim.simulation.policy import SIGHT_M, Policy, reset_policy
 from log2sim.simulation.reactive.foresight import FORESIGHTS
@@ -16,7 +16,7 @@ from log2sim.simulation.result import Replay
 from log2sim.simulation.rollout import Progress, World, rollout
 from log2sim.simulation.simulators import ExternalSimulator
 from log2sim.simulation.step_clock import StepClock
-from log2sim.simulation.vehicles.model_choice import MODELS, ModelChoice
+from log2sim.simulation.vehicles.model_choice import AUTO, ModelChoice
 from log2sim.simulation.vehicles.parameters import WHEELED
 
 MODES = ("pid", "exact")
@@ -44,7 +44,7 @@ def replay(
     scenario : Scenario
     mode : {"pid", "exact"}
         "pid": agents follow their trajectories by control through a vehicle model; "exact": they are placed on them.
-    model : {"auto", "kinematic", "dynamic", "single-track"}
+    model : {"auto", "kinematic", "dynamic", "single-track"} or the name of a plug-in
         How vehicles move: rolling without slip, on tires that slip and saturate, or by the published single-track model
         with linear tires. "auto" takes for each vehicle the simplest adequate one; `AgentReplay.model_reason` gives the reason.
     dt_s : float
@@ -141,8 +141,10 @@ def open_world(
         raise ConfigError(f"foresight '{foresight}': expected one of {', '.join(FORESIGHTS)}")
     if not sight_m >= 0:
         raise ConfigError(f"sight: {sight_m} m, expected 0 or more")
-    if model not in MODELS:
-        raise ConfigError(f"unknown vehicle model '{model}'{nearest(model, list(MODELS))}; known: {', '.join(MODELS)}")
+    if model != AUTO and not is_built_in("vehicle_model", model):
+        models = [AUTO, *names("vehicle_model")]
+        if model not in models:
+            raise ConfigError(f"unknown vehicle model '{model}'{nearest(model, models)}; known: {', '.join(models)}")
     if drives_ego and (scenario.ego is None or scenario.ego.category not in WHEELED):
         raise ConfigError(f"ego policy: scenario '{scenario.name}' has no agent '{EGO}' with wheels to drive")
     for agent in scenario.agents:

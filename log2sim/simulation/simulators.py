@@ -1,6 +1,6 @@
 """What a replay needs of a simulator, and the embedded one.
 
-A simulator moves all agents at once by stateless steps. To add a vehicle model, add a line to `STEPS`; to add a
+A simulator moves all agents at once by stateless steps. Vehicle models are plug-ins of the kind `vehicle_model`; to add a
 simulator, implement the two methods of `Simulator`, or `ExternalSimulator` for one that runs in another process, such
 as a game engine.
 """
@@ -10,16 +10,17 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
+import numpy as np
+
+from log2sim import registry
 from log2sim.datatypes import Agent
-from log2sim.simulation.vehicles.dynamic import step_dynamic
-from log2sim.simulation.vehicles.single_track import step_single_track
+from log2sim.errors import PluginError
 from log2sim.simulation.vehicles.vehicle import (
     PointControls,
     PointState,
     VehicleControls,
     VehicleParameters,
     VehicleState,
-    step_bicycle,
     step_point,
 )
 
@@ -88,4 +89,36 @@ class EmbeddedSimulator:
         return step_point(state, controls, dt_s)
 
 
-STEPS: dict[str, VehicleStep] = {"kinematic": step_bicycle, "dynamic": step_dynamic, "single-track": step_single_track}
+def load_step(model: str) -> VehicleStep:
+    """Return the step of a vehicle model by its name.
+
+    Raises
+    ------
+    ConfigError
+        When there is no such model.
+    PluginError
+        When one of another package cannot be used.
+    """
+    step: VehicleStep = registry.load("vehicle_model", model)
+    return step if registry.is_built_in("vehicle_model", model) else _checked(step, model)
+
+
+def _checked(step: VehicleStep, model: str) -> VehicleStep:
+    """Return a step of another package whose faults are told with the name of the package."""
+
+    def checked(
+        state: VehicleState, controls: VehicleControls, parameters: VehicleParameters, dt_s: float
+    ) -> VehicleState:
+        with registry.blaming("vehicle_model", model):
+            after = step(state, controls, parameters, dt_s)
+        registry.require_type("vehicle_model", model, after, VehicleState)
+        for key in ("x_m", "y_m", "yaw_rad", "speed_mps"):
+            column = np.asarray(getattr(after, key))
+            if column.shape != state.x_m.shape or not np.isfinite(column).all():
+                raise PluginError(
+                    f"{registry.say_plugin('vehicle_model', model)}: {key} is {column!s:.80}, expected {len(state.x_m)} finite "
+                    "numbers, one for each vehicle"
+                )
+        return after
+
+    return checked

@@ -71,8 +71,13 @@ def _is_same_view(one: Cloud, other: Cloud) -> bool:
     return one.end == other.end and (one.end != ROAD or float(np.linalg.norm(moved)) < 1.0)
 
 
-def create_for_ends(log: Log, config: Config) -> LidarDetector:
+def create_for_ends(log: Log, config: Config, given: LidarDetector | None = None) -> LidarDetector:
     """Make the detector in LiDAR sweeps of a log, one for each end where these are searched apart.
+
+    Parameters
+    ----------
+    given : LidarDetector, optional
+        Takes the place of the one that the settings name.
 
     Raises
     ------
@@ -80,7 +85,7 @@ def create_for_ends(log: Log, config: Config) -> LidarDetector:
         See `create_lidar_detector`.
     """
     name, level = config.detect.in_sweeps, fusion_level(log, config).level
-    vehicle = create_lidar_detector(name, log, config.lidar)
+    vehicle = given or create_lidar_detector(name, log, config.lidar)
     if level in (None, FusionLevel.POINTS):
         return vehicle
     chosen = config.cooperation.road_detector

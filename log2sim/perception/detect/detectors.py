@@ -8,7 +8,8 @@ from typing import Literal, Protocol, runtime_checkable
 
 from log2sim import registry
 from log2sim.datatypes import Detections, Frame, Log
-from log2sim.errors import ConfigError
+from log2sim.errors import ConfigError, PluginError
+from log2sim.perception.detect.checked_detector import checked
 
 __all__ = ["BatchDetector", "Detector", "create_detector", "detect_all"]
 
@@ -108,10 +109,15 @@ def create_detector(
         raise ConfigError(f"input_px {input_px}: only a detector given as the path of an ONNX file takes another size")
     try:
         create = registry.load("detector", name_or_path)
+    except PluginError:
+        raise
     except ConfigError as error:
         raise ConfigError(f"{error}, or the path of an ONNX file (ending in .onnx)") from None
-    detector: Detector = create(log, min_score=min_score, max_overlap=max_overlap, tiles=tiles)
-    return detector
+    with registry.blaming("detector", name_or_path):
+        detector: Detector = create(log, min_score=min_score, max_overlap=max_overlap, tiles=tiles)
+    if registry.is_built_in("detector", name_or_path):
+        return detector
+    return checked(detector, registry.say_plugin("detector", name_or_path))
 
 
 def check_settings(min_score: float | None, max_overlap: float, tiles: str | int) -> None:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 from log2sim import registry
 from log2sim.config_sections import LidarConfig
 from log2sim.datatypes import Boxes3D, Log
-from log2sim.errors import ConfigError
+from log2sim.errors import ConfigError, Log2SimError, PluginError
 from log2sim.perception.lidar.cloud import Cloud
+from log2sim.plugin_checks import DETECT_IN_CLOUD, find_member_defect
 
 PREFIX = "lidar:"
+MEMBERS = ("name", "detect")
 
 
 class LidarDetector(Protocol):
@@ -66,7 +69,47 @@ def create_lidar_detector(name: str, log: Log, settings: LidarConfig) -> LidarDe
         return open_network(Path(rest), settings, name=f"{PREFIX}{Path(rest).name}")
     try:
         create = registry.load("lidar_detector", rest)
+    except PluginError:
+        raise
     except ConfigError as error:
         raise ConfigError(f"{error}, or {PREFIX} and the path of an ONNX file (ending in .onnx)") from None
-    detector: LidarDetector = create(log, settings)
-    return detector
+    with registry.blaming("lidar_detector", rest):
+        detector: LidarDetector = create(log, settings)
+    if registry.is_built_in("lidar_detector", rest):
+        return detector
+    return checked(detector, registry.say_plugin("lidar_detector", rest))
+
+
+def checked(detector: LidarDetector, source: str) -> LidarDetector:
+    """Return a detector of somebody else whose faults are told in one line each that begins with `source`.
+
+    Raises
+    ------
+    PluginError
+        When it lacks a member of `LidarDetector`, or its `detect` cannot be called.
+    """
+    defect = find_member_defect(detector, MEMBERS, DETECT_IN_CLOUD)
+    if defect is not None:
+        raise PluginError(f"{source}: {defect}")
+    return _CheckedLidarDetector(detector, source)
+
+
+@dataclass(frozen=True, eq=False)
+class _CheckedLidarDetector:
+    inner: LidarDetector
+    source: str
+
+    @property
+    def name(self) -> str:
+        return self.inner.name
+
+    def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
+        try:
+            found = self.inner.detect(cloud, earlier)
+        except (Log2SimError, MemoryError):
+            raise
+        except Exception as error:
+            raise PluginError(f"{self.source}: cloud at {cloud.stamp_ns}: {registry.say_exception(error)}") from error
+        if not isinstance(found, Boxes3D):
+            raise PluginError(f"{self.source}: detect returned {type(found).__name__}, expected Boxes3D")
+        return found

@@ -16,7 +16,7 @@ from log2sim.simulation.vehicles.vehicle import GRAVITY_MPS2, VehicleParameters,
 
 YAW, SPEED, ACCEL, CURVATURE = map(VEHICLE_COLUMNS.index, ("yaw", "speed", "accel_ahead", "curvature_ahead"))
 
-MODELS = ("auto", "kinematic", "dynamic", "single-track")
+AUTO = "auto"
 TWO_WHEELERS = ("motorcycle", "cyclist", "bicycle")
 
 SLIP_TOLERANCE_RAD = 0.02
@@ -47,7 +47,7 @@ def choose_model(
     agent: Agent, reference: Reference, parameters: VehicleParameters, wanted: str, *, free: bool
 ) -> ModelChoice:
     """Choose the model of a vehicle (`parameters` of shape (1,)) by the user's wish; `free` ones leave their trajectory."""
-    if wanted != "auto":
+    if wanted != AUTO:
         return ModelChoice(wanted, "asked for")
     if agent.category in TWO_WHEELERS:
         return ModelChoice("kinematic", "leans into its curves, which slip does not describe")

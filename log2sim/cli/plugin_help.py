@@ -1,0 +1,45 @@
+"""Help of a command that ends with the plug-ins of other packages that its options take."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from typer.core import TyperCommand
+
+KINDS = {
+    "--format": {"log": ""},
+    "--detector": {"detector": "", "lidar_detector": "lidar:"},
+    "--to": {"export": ""},
+    "--ego": {"policy": ""},
+    "--model": {"vehicle_model": ""},
+}
+"""Kinds of plug-ins that an option takes, and what stands before their names."""
+
+ONLY_OF = {"--ego": "replay", "--model": "replay"}
+"""Commands of which alone an option means that; `export --ego` takes the id of an agent."""
+
+
+class CommandWithPlugins(TyperCommand):
+    """A command whose help names installed plug-ins; they are looked up only then, and none is imported."""
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        """Write the installed plug-ins by option, then the examples."""
+        options = {name for parameter in self.params for name in parameter.opts}
+        found = []
+        for option in [o for o in KINDS if o in options and ONLY_OF.get(o, self.name) == self.name]:
+            found += [(f"{option} {name}", package) for name, package in list_plugins(option)]
+        if found:
+            with formatter.section("Plug-ins that are installed"):
+                formatter.write_dl(found)
+        super().format_epilog(ctx, formatter)
+
+
+def list_plugins(option: str) -> list[tuple[str, str]]:
+    """List names and packages of the plug-ins that an option takes, without importing them."""
+    from log2sim.registry import installed, package_of
+
+    return [
+        (f"{prefix}{entry.name}", package_of(entry))
+        for kind, prefix in KINDS[option].items()
+        for entry in sorted(installed(kind), key=lambda entry: entry.name)
+    ]

@@ -1,0 +1,352 @@
+"""Plug-ins of other packages: the examples of README run as installed, and a wrong one is one line that names its package."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from plugin_packages import ROOT, SECTION, install, install_readme
+
+from log2sim import Config, Scenario, open_log, reconstruct, registry, replay
+from log2sim.datatypes import Log
+from log2sim.errors import ConfigError, LogError, PluginError
+from log2sim.export.exporters import export
+from log2sim.perception.detect3d.detectors import create_lidar_detector
+from log2sim.perception.first_pass import cloud_origin
+from log2sim.perception.lidar.cloud import Cloud
+from log2sim.perception.lidar.viewpoints import assemble_cloud
+from log2sim.simulation import load_policy
+
+PACKAGE = r"package 'broken 2\.1'"
+
+
+@pytest.fixture
+def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder on the search path, whose modules are forgotten after the test."""
+    folder = tmp_path / "site"
+    folder.mkdir()
+    known = set(sys.modules)
+    monkeypatch.syspath_prepend(str(folder))
+    yield folder
+    for name in set(sys.modules) - known:
+        if str(getattr(sys.modules[name], "__file__", "")).startswith(str(folder)):
+            del sys.modules[name]
+
+
+@pytest.fixture
+def examples(packages: Path) -> Path:
+    install_readme(packages)
+    return packages
+
+
+def broken(packages: Path, kind: str, code: str, place: str = "THING") -> None:
+    """Install the package `broken` with one plug-in of the name "mine"."""
+    install(packages, "broken", code, {f"log2sim.{kind}": {"mine": f"broken:{place}"}}, "2.1")
+
+
+def cloud_of(log: Log) -> Cloud:
+    origin, ground_z = cloud_origin(log, int(log.streams["top"].t_ns[0]))
+    sweeps = {"top": log.streams["top"].read(0)}
+    cloud = assemble_cloud(log, sweeps, origin=origin, ground_z=ground_z, max_range_m=60.0)
+    assert cloud is not None
+    return cloud
+
+
+# The examples of README
+
+
+def test_there_is_an_example_of_every_kind(examples: Path) -> None:
+    groups = set(re.findall(r"`log2sim\.(\w+)`", SECTION))
+    assert groups == set(registry.BUILT_IN)
+    for kind in groups:
+        (name,) = set(registry.names(kind)) - set(registry.BUILT_IN[kind])
+        assert registry.load(kind, name) is not None
+        assert "package 'my-plugins 1.0'" in registry.say_plugin(kind, name)
+
+
+def test_the_log_reader_opens_a_folder(examples: Path, tmp_path: Path) -> None:
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"{10**18 + k * 10**8}.png"), np.full((480, 640, 3), k, np.uint8))
+    log = open_log(tmp_path)
+    assert log.format == "frame-folder"
+    assert log.streams["road"].t_ns.tolist() == [10**18, 10**18 + 10**8, 10**18 + 2 * 10**8]
+    assert log.streams["road"].read(2).mean() == 2.0
+
+
+def test_the_detector_runs(examples: Path, tiny_folder: Path) -> None:
+    result = reconstruct(open_log(tiny_folder), Config(detect="center", stop_s=0.4, map={"lanes": False}, appearance={"colors": False}))
+    assert result.scenario.provenance["detector"] == "center"
+    assert result.report["detections"]["front"] == result.report["ticks"]
+
+
+def test_the_lidar_detector_runs(examples: Path, tiny_folder: Path) -> None:
+    log = open_log(tiny_folder)
+    cloud = cloud_of(log)
+    found = create_lidar_detector("lidar:highest", log, Config().lidar).detect(cloud)
+    assert found.center_m[0, 2] + 0.75 == pytest.approx(cloud.xyz[cloud.height.argmax(), 2] + cloud.origin[2])
+
+
+def test_the_exporter_writes(examples: Path, tiny_folder: Path, tmp_path: Path) -> None:
+    export(Scenario.load(tiny_folder / "truth.json"), "agent-list", tmp_path / "out")
+    assert (tmp_path / "out" / "agents.txt").read_text().startswith("ego car\n")
+
+
+def test_the_policy_drives(examples: Path, tiny_folder: Path) -> None:
+    scenario = Scenario.load(tiny_folder / "truth.json")
+    driven = replay(scenario, ego=load_policy("calm")).agent("ego")
+    # At 3 m/s it never brakes, so it rolls on without throttle.
+    assert driven.driver == "policy"
+    assert driven.speed_mps == pytest.approx(np.full(len(driven), 3.0), abs=0.01)
+
+
+def test_the_vehicle_model_drives(examples: Path, tiny_folder: Path) -> None:
+    scenario = Scenario.load(tiny_folder / "truth.json")
+    ours, kinematic = (replay(scenario, model=model) for model in ("halves", "kinematic"))
+    assert "halves" in {a.model for a in ours.agents}
+    assert ours.metrics["cross_track_max_m"] == pytest.approx(kinematic.metrics["cross_track_max_m"], abs=0.01)
+
+
+def test_help_lists_installed_plug_ins_and_imports_none(packages: Path) -> None:
+    code = "raise SystemExit('imported')"
+    kinds = {kind: {f"my-{kind}": "mine:THING"} for kind in registry.BUILT_IN}
+    install(packages, "mine", code, {f"log2sim.{kind}": named for kind, named in kinds.items()})
+    expected = {
+        "reconstruct": ["--format my-log", "--detector my-detector", "--detector lidar:my-lidar_detector"],
+        "export": ["--to my-export"],
+        "replay": ["--ego my-policy", "--model my-vehicle_model"],
+    }
+    script = (
+        "import sys\nfrom log2sim import cli\n"
+        "for name in sys.argv[1:]:\n"
+        "    sys.argv = ['log2sim', name, '--help']\n"
+        "    try: cli.main()\n    except SystemExit as end: assert not end.code, end.code\n"
+        "    print('END OF', name)\n"
+    )
+    path = os.pathsep.join([str(packages), str(ROOT)])
+    ran = subprocess.run(
+        [sys.executable, "-c", script, *expected],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    texts = re.split(r"END OF \w+\n", ran.stdout)
+    for text, lines in zip(texts, expected.values()):
+        section = " ".join(text.partition("Plug-ins that are installed:")[2].split())
+        assert section.startswith(" ".join(f"{line} package 'mine 1.0'" for line in lines))
+        assert section.count("mine 1.0") == len(lines)
+
+
+# Wrong plug-ins
+
+READER = """
+class Reader:
+    name, looks_for, suffixes = "mine", "nothing", ()
+    def matches(self, path): return {matches}
+    def sequences(self, path): return {sequences}
+    def open(self, path, sequence): return {log}
+THING = Reader()
+"""
+GOOD = {"matches": "True", "sequences": "['a']", "log": "None"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "code", "message"),
+    [
+        (
+            "export",
+            "import no_such_module",
+            r"raised ModuleNotFoundError: No module named 'no_such_module' \(line 1 of broken\.py\)",
+        ),
+        ("export", "1 +", r"raised SyntaxError: invalid syntax"),
+        ("export", "OTHER = 1", r"raised AttributeError: module 'broken' has no attribute 'THING'"),
+        (
+            "export",
+            "class THING: pass",
+            r"is the class THING, expected an object of it: name an instance, such as THING\(\)",
+        ),
+        ("export", "THING = 3", r"has no 'options', 'loses', 'write'; expected an object with options, loses, write"),
+        (
+            "export",
+            "class E:\n    options, loses = (), ''\n    def write(self, scenario): pass\nTHING = E()",
+            r"write\(scenario\) cannot be called as write\(scenario, folder, options\): too many positional arguments",
+        ),
+        ("detector", "THING = 3", r"is a int, expected create\(log, \*, min_score, max_overlap, tiles\)"),
+        (
+            "detector",
+            "def THING(log): pass",
+            r"THING\(log\) cannot be called as create\(.*\): got an unexpected keyword argument",
+        ),
+        (
+            "lidar_detector",
+            "def THING(log): pass",
+            r"THING\(log\) cannot be called as create\(log, settings\): too many",
+        ),
+        ("vehicle_model", "def THING(a, b): pass", r"THING\(a, b\) cannot be called as step\(state, controls, parameters, dt_s\)"),
+        (
+            "log",
+            "class R:\n    name = ''\nTHING = R()",
+            r"has no 'looks_for', 'suffixes', 'matches', 'sequences', 'open'",
+        ),
+    ],
+)
+def test_what_is_no_plug_in_is_one_line_that_names_the_package(
+    packages: Path, kind: str, code: str, message: str
+) -> None:
+    broken(packages, kind, code)
+    with pytest.raises(PluginError, match=rf"'mine' of {PACKAGE} \(broken:THING\): {message}") as raised:
+        registry.load(kind, "mine")
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        ("def THING(log, **k): return 3", r"made a int without 'name', 'default_min_score', 'detect'"),
+        ("def THING(log, **k): return {}['x']", r"raised KeyError: 'x' \(line 1 of broken\.py\)"),
+        (
+            "{D}    def detect(self): pass",
+            r"detect\(\) cannot be called as detect\(frame\): too many positional arguments",
+        ),
+        (
+            "{D}    def detect(self, frame): return []",
+            r"camera 'front' at \d+: detect returned list, expected Detections",
+        ),
+        (
+            "{D}    def detect(self, frame): return 1 / 0",
+            r"camera 'front' at \d+: raised ZeroDivisionError: division by zero",
+        ),
+    ],
+)
+def test_a_detector_that_fails_is_one_line(packages: Path, tiny_folder: Path, code: str, message: str) -> None:
+    made = "class D:\n    name, default_min_score = 'd', 0\n"
+    broken(packages, "detector", f"{code.replace('{D}', made)}\n{'def THING(log, **k): return D()' * ('{D}' in code)}")
+    with pytest.raises(PluginError, match=rf"^detector 'mine' of {PACKAGE} \(broken:THING\): {message}"):
+        reconstruct(open_log(tiny_folder), Config(detect="mine", stop_s=0.2))
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        ("None", r"detect returned NoneType, expected Boxes3D"),
+        ("cloud.nothing", r"raised AttributeError: 'Cloud' object"),
+    ],
+)
+def test_a_lidar_detector_that_fails_is_one_line(packages: Path, tiny_folder: Path, answer: str, message: str) -> None:
+    broken(
+        packages,
+        "lidar_detector",
+        f"class D:\n    name = 'd'\n    def detect(self, cloud, earlier=()): return {answer}\ndef THING(log, settings): return D()",
+    )
+    log = open_log(tiny_folder)
+    detector = create_lidar_detector("lidar:mine", log, Config().lidar)
+    with pytest.raises(PluginError, match=rf"^LiDAR detector 'mine' of {PACKAGE} .*{message}"):
+        detector.detect(cloud_of(log))
+
+
+def test_a_reader_that_fails_is_one_line(packages: Path, tmp_path: Path) -> None:
+    broken(packages, "log", READER.format(**GOOD))
+    with pytest.raises(PluginError, match=rf"log format 'mine' of {PACKAGE} .*: returned NoneType, expected Log"):
+        open_log(tmp_path, format="mine")
+
+
+@pytest.mark.parametrize("code", ["import no_such_module", READER.format(**{**GOOD, "matches": "path.nothing"})])
+def test_a_broken_reader_keeps_no_other_log_from_being_opened(
+    packages: Path, tiny_folder: Path, tmp_path: Path, code: str
+) -> None:
+    broken(packages, "log", code)
+    log = open_log(tiny_folder)
+    assert log.format == "log2sim"
+    told = [note for note in log.notes if "'broken 2.1'" in note]
+    assert len(told) == code.startswith("import")
+    with pytest.raises((LogError, PluginError), match=PACKAGE):
+        open_log(tmp_path)
+
+
+def test_an_exporter_that_fails_leaves_nothing(packages: Path, tiny_folder: Path, tmp_path: Path) -> None:
+    broken(
+        packages,
+        "export",
+        "class E:\n    options, loses = (), ''\n    def write(self, scenario, folder, options):\n        (folder / 'half').touch()\n        raise ValueError('no\\nnumbers')\nTHING = E()",
+    )
+    out = tmp_path / "out"
+    with pytest.raises(
+        PluginError, match=rf"export format 'mine' of {PACKAGE} .*: raised ValueError: no \(line 5 of broken\.py\)"
+    ):
+        export(Scenario.load(tiny_folder / "truth.json"), "mine", out)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        ("def THING(seen): return 1", r"policy at 0 s: answered int, expected log2sim\.simulation\.policy\.Controls"),
+        (
+            "class THING:\n    def __init__(self, x): pass",
+            r"cannot be made: TypeError: .*missing 1 required positional argument: 'x'",
+        ),
+        ("THING = 3", r"is a int, expected a callable policy\(observation\) -> Controls"),
+        ("def THING(seen): return seen.nothing", r"policy at 0 s: raised AttributeError"),
+    ],
+)
+def test_a_policy_that_fails_is_one_line(packages: Path, tiny_folder: Path, code: str, message: str) -> None:
+    broken(packages, "policy", code)
+    with pytest.raises(PluginError, match=rf"^policy 'mine' of {PACKAGE} \(broken:THING\): {message}"):
+        replay(Scenario.load(tiny_folder / "truth.json"), ego=load_policy("mine"))
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        ("None", r"returned NoneType, expected VehicleState"),
+        ("1 / 0", r"raised ZeroDivisionError"),
+        (
+            "replace(state, x_m=state.x_m * float('nan'))",
+            r"x_m is \[nan.*, expected \d finite numbers, one for each vehicle",
+        ),
+        ("replace(state, x_m=state.x_m[:0])", r"x_m is \[\], expected \d finite numbers"),
+    ],
+)
+def test_a_vehicle_model_that_fails_is_one_line(packages: Path, tiny_folder: Path, answer: str, message: str) -> None:
+    broken(
+        packages,
+        "vehicle_model",
+        f"from dataclasses import replace\ndef THING(state, controls, parameters, dt_s): return {answer}",
+    )
+    with pytest.raises(PluginError, match=rf"^vehicle model 'mine' of {PACKAGE} \(broken:THING\): {message}"):
+        replay(Scenario.load(tiny_folder / "truth.json"), model="mine")
+
+
+def test_one_name_of_two_packages_is_refused(packages: Path) -> None:
+    for name in ("first", "second"):
+        install(packages, name, "THING = print", {"log2sim.detector": {"mine": f"{name}:THING"}})
+    with pytest.raises(
+        PluginError, match=r"detector 'mine': is declared by package 'first 1\.0' and package 'second 1\.0'"
+    ):
+        registry.load("detector", "mine")
+
+
+def test_built_in_names_cannot_be_taken(packages: Path) -> None:
+    install(packages, "taker", "THING = print", {"log2sim.detector": {"labels": "taker:THING"}})
+    create: Any = registry.load("detector", "labels")
+    assert create.__module__ == "log2sim.perception.detect.labels"
+    assert registry.names("detector").count("labels") == 1
+
+
+def test_unknown_names_list_the_installed_ones(examples: Path, tiny_folder: Path) -> None:
+    scenario = Scenario.load(tiny_folder / "truth.json")
+    with pytest.raises(
+        ConfigError, match=r"unknown vehicle model 'halvs' \(did you mean 'halves'\?\); known: auto, kinematic"
+    ):
+        replay(scenario, model="halvs")
+    with pytest.raises(
+        ConfigError, match=r"unknown policy 'clam' \(did you mean 'calm'\?\); known: calm; of a module or a file"
+    ):
+        load_policy("clam")
