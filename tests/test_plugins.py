@@ -81,7 +81,9 @@ def test_the_log_reader_opens_a_folder(examples: Path, tmp_path: Path) -> None:
 
 
 def test_the_detector_runs(examples: Path, tiny_folder: Path) -> None:
-    result = reconstruct(open_log(tiny_folder), Config(detect="center", stop_s=0.4, map={"lanes": False}, appearance={"colors": False}))
+    result = reconstruct(
+        open_log(tiny_folder), Config(detect="center", stop_s=0.4, map={"lanes": False}, appearance={"colors": False})
+    )
     assert result.scenario.provenance["detector"] == "center"
     assert result.report["detections"]["front"] == result.report["ticks"]
 
@@ -189,7 +191,11 @@ GOOD = {"matches": "True", "sequences": "['a']", "log": "None"}
             "def THING(log): pass",
             r"THING\(log\) cannot be called as create\(log, settings\): too many",
         ),
-        ("vehicle_model", "def THING(a, b): pass", r"THING\(a, b\) cannot be called as step\(state, controls, parameters, dt_s\)"),
+        (
+            "vehicle_model",
+            "def THING(a, b): pass",
+            r"THING\(a, b\) cannot be called as step\(state, controls, parameters, dt_s\)",
+        ),
         (
             "log",
             "class R:\n    name = ''\nTHING = R()",
