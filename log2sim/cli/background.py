@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from log2sim.datatypes import Scenario
+    from log2sim.datatypes import Log, Scenario
     from log2sim.mapping.ground_map import GroundMap
 
 CELL_M = 0.06
@@ -28,11 +28,9 @@ def load_background(
     LogError
         When the file is no such map, or the log has no camera.
     """
-    from log2sim.config_sections import MapConfig
     from log2sim.errors import LogError
     from log2sim.localization.choice import localize_like
     from log2sim.logs.opening import open_log
-    from log2sim.mapping.builder import map_ground
     from log2sim.mapping.files import read_png_map
 
     if path.suffix.lower() == ".png":
@@ -40,4 +38,12 @@ def load_background(
     log = localize_like(open_log(path, sequence=sequence), scenario.provenance)
     if not log.cameras:
         raise LogError(f"{log.name}: the log has no camera, so there is no picture of the ground")
+    return map_of(log, scenario, progress)
+
+
+def map_of(log: Log, scenario: Scenario, progress: Callable[[str, int, int], None]) -> GroundMap:
+    """Return the map of the ground of an opened log, as fine as screens and paper show it."""
+    from log2sim.config_sections import MapConfig
+    from log2sim.mapping.builder import map_ground
+
     return map_ground(log, scenario, MapConfig(cell_m=CELL_M), progress=progress)

@@ -35,6 +35,8 @@ WORDS = {
     "scenes": "rendering scenes",
     "count points": "counting points in boxes",
     "draw": "drawing",
+    "page: pictures": "reading pictures",
+    "page: sweeps": "reading LiDAR points",
     "evaluate": "comparing with the truth",
     "write": "writing",
 }

@@ -3,27 +3,54 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, Sequence, counted, say
+from log2sim.cli.options import Cameras, Overwrite, Quiet, ScenarioPath, Sequence, camera_names, counted, say, write_to
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from log2sim.datatypes import Scenario
+    from log2sim.visualization.recording.recording import Recorded
+
+DEFAULT_MAX_MB = 40.0
+"""Of a page with pictures: mail and chat programs take so much, and a phone still opens it."""
 
 
 def view(
     scenario: ScenarioPath,
-    out: Annotated[Path, typer.Option("--out", metavar="FILE.html", help="Page to write.")],
+    out: Annotated[Path, write_to("FILE.html", "Page to write.")],
+    log: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="LOG", help="Log whose pictures with boxes, LiDAR points and map of the ground the page shows."
+        ),
+    ] = None,
+    max_mb: Annotated[
+        float | None,
+        typer.Option(
+            metavar="MB",
+            help="Size of a page with --log, in millions of bytes; pictures and points are chosen to fit. Default: 40.",
+        ),
+    ] = None,
+    cameras: Cameras = None,
     truth: Annotated[
         Path | None, typer.Option(metavar="TRUTH", help="Ground truth: a scenario file or a log with labels.")
     ] = None,
     replay: Annotated[Path | None, typer.Option(metavar="REPLAY", help="Replay to show as a layer.")] = None,
+    metrics: Annotated[
+        Path | None, typer.Option(metavar="METRICS", help="Metrics file of log2sim evaluate, to show beside the map.")
+    ] = None,
     predict: Annotated[
         float | None, typer.Option(metavar="S", help="Show where agents were expected to go for this long, in s.")
     ] = None,
     background: Annotated[
         Path | None,
         typer.Option(
-            metavar="LOG|MAP.png", help="Log whose map of the ground is shown below, or a map of log2sim map."
+            metavar="LOG|MAP.png",
+            help="Log whose map of the ground is shown below, or a map of log2sim map. Default: that of --log.",
         ),
     ] = None,
     sequence: Sequence = None,
@@ -31,22 +58,77 @@ def view(
     quiet: Quiet = False,
 ) -> None:
     """Write an interactive HTML page of a scenario."""
+    from log2sim.cli.progress import progress
     from log2sim.cli.truth import load_replay, load_truth
     from log2sim.datatypes import Scenario
     from log2sim.documents import check_targets
+    from log2sim.errors import ConfigError
     from log2sim.visualization.page.writer import write_page
 
     check_targets(out, overwrite=overwrite)
+    for name, value in (("--max-mb", max_mb), ("--cameras", cameras)):
+        if log is None and value is not None:
+            raise ConfigError(f"{name}: is for the pictures of a log; add --log")
+    if max_mb is not None and not 0 < max_mb <= 1000:
+        raise ConfigError(f"--max-mb {max_mb:g}: expected a number above 0 and up to 1000")
     loaded = Scenario.load(scenario)
-    replayed = load_replay(replay, loaded, quiet=quiet) if replay is not None else None
-    known = load_truth(truth, loaded, sequence) if truth is not None else None
-    picture = None
-    if background is not None:
-        from log2sim.cli.background import load_background
-        from log2sim.cli.progress import progress
+    layers: dict[str, Any] = {
+        "replay": load_replay(replay, loaded, quiet=quiet) if replay is not None else None,
+        "truth": load_truth(truth, loaded, sequence) if truth is not None else None,
+        "metrics": [] if metrics is None else [_metrics(metrics)],
+    }
+    with progress(quiet=quiet) as report_progress:
+        if log is not None:
+            report_progress("open", 0, 0)
+            max_bytes = round((DEFAULT_MAX_MB if max_mb is None else max_mb) * 1e6)
+            layers["recorded"] = _recorded(log, loaded, sequence, max_bytes, camera_names(cameras), report_progress)
+        if background is not None:
+            from log2sim.cli.background import load_background
 
-        with progress(quiet=quiet) as report_progress:
-            picture = load_background(background, loaded, sequence, report_progress)
-    layers: dict[str, Any] = {"truth": known, "replay": replayed, "background": picture}
-    write_page(loaded, out, **layers, predict_s=predict, overwrite=overwrite)
+            layers["background"] = load_background(background, loaded, sequence, report_progress)
+        elif log is not None and (opened := layers["recorded"].log).cameras and opened.ego is not None:
+            from log2sim.cli.background import map_of
+
+            layers["background"] = map_of(opened, loaded, report_progress)
+        notes = write_page(loaded, out, **layers, predict_s=predict, overwrite=overwrite)
+    for note in notes:
+        say(note, quiet=quiet)
     say(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {counted(len(loaded.agents), 'agent')}", quiet=quiet)
+
+
+def _recorded(
+    path: Path,
+    scenario: Scenario,
+    sequence: str | None,
+    max_bytes: int,
+    cameras: tuple[str, ...],
+    progress: Callable[[str, int, int], None],
+) -> Recorded:
+    """Open the log whose pictures and points are shown, with the poses that the scenario was made with."""
+    from log2sim.localization.choice import localize_like
+    from log2sim.logs.opening import open_log
+    from log2sim.visualization.recording.recording import Recorded
+
+    log = localize_like(open_log(path, sequence=sequence), scenario.provenance)
+    return Recorded(log, max_bytes, cameras, progress)
+
+
+def _metrics(path: Path) -> tuple[str, str]:
+    """Return title and table of a metrics file.
+
+    Raises
+    ------
+    ConfigError
+        When it is none.
+    """
+    from log2sim.documents import read_json
+    from log2sim.errors import ConfigError
+    from log2sim.evaluation.metrics.table import format_table
+
+    document = read_json(path, ConfigError)
+    try:
+        return f"Metrics against {document['truth']}", format_table(document)
+    except (KeyError, TypeError, AttributeError, ValueError):
+        raise ConfigError(
+            f"{path}: expected metrics of a scenario, as `log2sim evaluate SCENARIO --truth TRUTH --out FILE` writes them"
+        ) from None

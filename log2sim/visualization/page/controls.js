@@ -55,7 +55,7 @@ const listenToKeys = (keys, silent) => {
   window.addEventListener("keydown", (event) => {
     const typing = event.target instanceof HTMLInputElement && event.target.type === "search";
     if (event.ctrlKey || event.metaKey || event.altKey || (typing && event.key !== "Escape")) return;
-    if (event.key === "Enter" || byId("help").open) return;
+    if (event.key === "Enter" || document.querySelector("dialog[open]")) return;
     const run = actions.get(event.key);
     if (!run) return;
     event.preventDefault();

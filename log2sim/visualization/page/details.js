@@ -37,12 +37,12 @@ class Details {
     const others = ["truth", "replay"].filter((layer) => data.layers[layer]).join(" and ");
     const charts = [["Speed (m/s)", 1], ["Distance to ego (m)", 1], [`From ${others} (m)`, 0.1]];
     [this.speed, this.distance, this.error] = charts.map(([title, minSpan]) => new Chart(byId("charts"), title, minSpan, data, seek));
-    const rows = ["Heading", "Position", "Sigma", "Observed", "Observed by", "Confidence", "Color", "LiDAR", "Source"].map((name) => {
+    const rows = ["Confidence", "Sigma", "Heading", "Position", "Observed", "Observed by", "Color", "LiDAR", "Source"].map((name) => {
       const value = element("dd");
       byId("agent-now").append(element("dt", {}, name), value);
       return value;
     });
-    [this.heading, this.position, this.sigma, this.observed, this.observers, this.confidence, this.paint, this.points, this.source] = rows;
+    [this.confidence, this.sigma, this.heading, this.position, this.observed, this.observers, this.paint, this.points, this.source] = rows;
   }
 
   choose(track) {
@@ -85,9 +85,11 @@ class Details {
     byId("agent-warning").hidden = warning === undefined;
     byId("agent-warning").textContent = warning?.text ?? "";
     fill(this.sigma, track.sigmas.some((values) => values !== null) ? "–" : "");
-    byId("agent-doubts").replaceChildren(...track.doubts.map(([reason, start, end]) => {
+    byId("agent-doubts").replaceChildren(...track.doubts.map(([reason, start, end, flag]) => {
       const span = start === null && end === null ? "" : ` (${seconds(start, this.data.begin)} to ${seconds(end, this.data.end)} s)`;
-      return element("li", {}, `${reason}${span}`);
+      const item = element("li", {}, `${reason}${span}`);
+      item.append(" ", element("code", { title: "flag of the doubt" }, flag));
+      return item;
     }));
   }
 
@@ -100,8 +102,8 @@ class Details {
     this.distance.mark(t, present && this.ego?.present ? `${fixed(distanceOf(track, this.ego), 1)} m` : "");
     this.error.mark(t, present ? [this.truth, this.replay].map((other) => this.off(other, t)).filter(Boolean).join(" · ") : "");
     const degrees = (((track.pyaw * 180) / Math.PI + 180) % 360 + 360) % 360 - 180;
-    this.heading.textContent = present ? `${fixed(degrees, 0)}° from east, counter-clockwise` : absent;
-    this.position.textContent = present ? `${fixed(track.px, 2)} m east, ${fixed(track.py, 2)} m north` : absent;
+    this.heading.textContent = present ? `${fixed(degrees, 0)}° from ${this.data.north ? "east" : "x"}, counter-clockwise` : absent;
+    this.position.textContent = present ? this.place(track) : absent;
     const units = [[1, 2, "m"], [180 / Math.PI, 1, "°"], [1, 2, "m/s"]];
     const sigmas = units.map(([scale, digits, unit], which) => {
       const value = track.sigma(which);
@@ -111,6 +113,12 @@ class Details {
     byId("agent-doubts").classList.toggle("holds", present && track.doubted);
     if (track.observedBy !== null) this.observers.textContent = present ? observers(track, t) : absent;
     this.observed.textContent = !present ? absent : track.interpolated ? "no, interpolated" : "yes";
+  }
+
+  // Where it is, in words that the map can answer for.
+  place({ px, py }) {
+    const [x, y] = [fixed(px, 2), fixed(py, 2)];
+    return this.data.north ? `${x} m east, ${y} m north` : `x ${x} m, y ${y} m`;
   }
 
   off(other, t) {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -31,11 +31,12 @@ def page_document(
     replay: Any = None,
     predict_s: float | None = None,
     background: Background | None = None,
+    metrics: Sequence[tuple[str, str]] = (),
 ) -> dict[str, Any]:
     """Assemble the document of a page: name, span of time and a layer each for scenario, truth and replay.
 
     With `predict_s`, s, movers of the scenario also hold where they were expected to go for as long.
-    `background` is a map of the ground to show below everything.
+    `background` is a map of the ground to show below everything, `metrics` are titles and texts.
 
     Raises
     ------
@@ -72,12 +73,22 @@ def page_document(
         "begin_s": min([0.0, *(first for first, _ in spans)]),
         "end_s": max([scenario.duration_s, *(last for _, last in spans)]),
         "origin": _origin(scenario),
+        "north": scenario.map.projection is not None,
         "layers": layers,
         "features": feature_columns(scenario),
         "background": None if background is None else embed(background),
         "events": [] if replay is None else _events(replay),
         "warnings": _warnings(replay),
+        "metrics": [[title, text] for title, text in (*metrics, *_replay_metrics(replay))],
+        "recording": None,
     }
+
+
+def _replay_metrics(replay: Any) -> list[tuple[str, str]]:
+    """Return the summary of a replay with its title."""
+    from log2sim.simulation.metrics.summary import summarize
+
+    return [] if replay is None else [("Replay", summarize(replay))]
 
 
 def _events(replay: Any) -> list[dict[str, Any]]:
@@ -150,7 +161,7 @@ def _trust(agent: Agent) -> dict[str, Any]:
     low = () if agent.doubts or not agent.is_doubtful else (Doubt("confidence", why_doubtful(agent)),)
     return {
         "confidence": round(agent.confidence, 4),
-        "doubts": [[doubt.reason, doubt.start_s, doubt.end_s] for doubt in (*agent.doubts, *low)],
+        "doubts": [[doubt.reason, doubt.start_s, doubt.end_s, doubt.flag] for doubt in (*agent.doubts, *low)],
         "doubted": [[t if np.isfinite(t) else None for t in span] for span in shown_spans(agent)],
         **({"points": round(float(points), 1)} if isinstance(points, int | float) else {}),
         **({"source": source} if source else {}),

@@ -21,14 +21,17 @@ const loadFeatures = (document_) => {
   };
 };
 
-const drawFeatures = (painter, features) => {
+// Lanes are pale above a picture of the ground, which shows more.
+const drawFeatures = (painter, features, overGround) => {
   const { ctx, view } = painter, ratio = painter.canvas.width / Math.max(painter.canvas.clientWidth, 1), scale = view.scale;
   ctx.save();
   ctx.setTransform(ratio * scale, 0, 0, -ratio * scale, ratio * view.sx(0), ratio * view.sy(0));
   ctx.fillStyle = theme.lane;
+  ctx.globalAlpha = overGround ? 0.3 : 1;
   for (const path of features.lanes) ctx.fill(path);
   ctx.fillStyle = theme.lane_arrow;
   if (scale > 3) for (const path of features.arrows) ctx.fill(path);
+  ctx.globalAlpha = 1;
   ctx.strokeStyle = theme.border;
   ctx.lineWidth = 1.2 / scale;
   for (const path of features.borders) ctx.stroke(path);

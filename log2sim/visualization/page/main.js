@@ -1,6 +1,6 @@
 // Actions of the user, and the start.
 
-const LAYER_NAMES = { scenario: "Scenario", truth: "Truth", replay: "Replay", trails: "Trails", names: "Names", predictions: "Predictions", ends: "Ends", lanes: "Lanes", ground: "Ground" };
+const LAYER_NAMES = { scenario: "Scenario", truth: "Truth", replay: "Replay", trails: "Trails", names: "Names", predictions: "Predictions", ends: "Ends", lanes: "Lanes", ground: "Ground", pictures: "Pictures", points: "Points" };
 let fitted = false;
 
 // Whether there is anything to show or hide.
@@ -8,6 +8,8 @@ const hasLayer = (layer) => {
   if (layer === "predictions") return tracks.some((track) => track.predicted);
   if (layer === "lanes") return data.features.some || data.features.signals.length > 0;
   if (layer === "ground") return data.background !== null;
+  if (layer === "pictures") return pictures !== null;
+  if (layer === "points") return data.points !== null;
   if (layer === "ends") return tracks.some((track) => track.observedBy !== null);
   return !(layer in { truth: 0, replay: 0 }) || data.layers[layer] !== undefined;
 };
@@ -77,7 +79,23 @@ const toggle = (layer) => {
   if (!(layer in LAYER_NAMES) || !hasLayer(layer)) return;
   state.shown[layer] = !state.shown[layer];
   byId(`layer-${layer}`).setAttribute("aria-pressed", state.shown[layer]);
+  byId("pictures").hidden = pictures === null || !state.shown.pictures;
   requestDraw();
+};
+
+// Color LiDAR points by height or by intensity.
+const colorPoints = () => {
+  if (!data.points?.entry.intensity) return;
+  data.points.byIntensity = !data.points.byIntensity;
+  data.points.applyTheme();
+  byId("points-color").textContent = data.points.byIntensity ? "by intensity" : "by height";
+  requestDraw();
+};
+
+// On a narrow screen the layers are behind a button.
+const showLayers = () => {
+  const open = byId("layers").classList.toggle("open");
+  byId("layers-toggle").setAttribute("aria-expanded", open);
 };
 
 const resize = () => {
@@ -88,6 +106,7 @@ const resize = () => {
   }
   details.show();
   drawPresence();
+  placeEventLabels();
   draw(performance.now());
 };
 
@@ -96,6 +115,7 @@ const listen = () => {
     play: () => (state.playing ? pause() : play()), slower: () => setRate(-1), faster: () => setRate(1), fit,
     "zoom-in": () => zoom(1.5), "zoom-out": () => zoom(1 / 1.5), follow: () => follow(!state.follow),
     "help-toggle": () => byId("help").showModal(), deselect: () => choose(null), "list-toggle": showList,
+    "metrics-toggle": () => byId("metrics").showModal(), "doubts-toggle": showDoubtful, "layers-toggle": showLayers,
   };
   for (const [id, run] of Object.entries(buttons)) byId(id).addEventListener("click", run);
   byId("scrub").addEventListener("input", (event) => seek(event.target.valueAsNumber));
@@ -111,8 +131,12 @@ const listen = () => {
     ["n p", "next or previous agent", ["n"], () => neighbor(1)],
     ["s t r", "scenario, truth or replay on or off", ["s"], () => toggle("scenario")],
     ["w l d o m g", "trails, names, predictions, ends, lanes or ground on or off", ["w"], () => toggle("trails")],
+    ["i x", "pictures or LiDAR points on or off", ["i"], () => toggle("pictures")],
+    ["c", "next camera large, or all", ["c"], () => pictures?.next()],
+    ["h", "LiDAR points by height or intensity", ["h"], colorPoints],
     ["e", "next warning or collision of the replay", ["e"], nextEvent],
-    ["a /", "list of agents, search in it", ["a"], buttons["list-toggle"]],
+    ["a / u", "list of agents, search in it, doubtful ones", ["a"], buttons["list-toggle"]],
+    ["v", "metrics", ["v"], () => data.metrics.length && byId("metrics").showModal()],
     ["Esc", "choose nobody", ["Escape"], () => choose(null)],
     ["?", "this list", ["?"], buttons["help-toggle"]],
   ], [
@@ -120,7 +144,7 @@ const listen = () => {
     [["-", "_"], () => zoom(1 / 1.25)], [["p"], () => neighbor(-1)], [["t"], () => toggle("truth")],
     [["r"], () => toggle("replay")], [["l"], () => toggle("names")], [["d"], () => toggle("predictions")],
     [["o"], () => toggle("ends")], [["m"], () => toggle("lanes")], [["g"], () => toggle("ground")],
-    [["/"], () => byId("search").focus()],
+    [["x"], () => toggle("points")], [["u"], () => doubtful.length && showDoubtful()], [["/"], () => byId("search").focus()],
   ]);
   listenToPointers(byId("map"), {
     drag: (dx, dy) => { follow(false); view.drag(dx, dy); requestDraw(); },
@@ -131,9 +155,11 @@ const listen = () => {
   window.addEventListener("hashchange", readAddress);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
     applyTheme(data.layers);
+    data.points?.applyTheme();
     list.show();
     listDoubtful();
     listWarnings(data.warnings, data.warned, showEvent);
+    listCollisions(data.events, tracks, showEvent);
     details.show();
     drawPresence();
     requestDraw();
@@ -156,25 +182,8 @@ const neighbor = (step) => {
   if (count) chooseVisible(tracks[here < 0 ? (step > 0 ? 0 : count - 1) : (here + step + count) % count]);
 };
 
-// The doubtful agents with their reasons; a click chooses one when the doubt begins.
-const listDoubtful = () => {
-  byId("doubtful").hidden = doubtful.length === 0;
-  byId("doubtful-count").textContent = `${doubtful.length} doubtful agent${doubtful.length === 1 ? "" : "s"}`;
-  byId("doubtful-agents").replaceChildren(...doubtful.map((track) => {
-    const button = element("button", { type: "button" }), item = element("li");
-    const why = track.doubts.map(([reason]) => reason).join(", ");
-    button.append(mark(track), element("span", { class: "why" }, `${track.id}: ${why}`));
-    button.addEventListener("click", () => {
-      const starts = track.doubts.map(([, start]) => start).filter((start) => start !== null);
-      if (starts.length) seek(Math.min(...starts));
-      chooseVisible(track);
-    });
-    item.append(button);
-    return item;
-  }));
-};
-
 const list = new List(tracks, { choose: chooseVisible, hover }), details = new Details(data, seek);
+const pictures = data.recording?.pictures ? new Pictures(data.recording.pictures, tracks, { choose: chooseVisible, hover, ready: requestDraw }) : null;
 
 const start = () => {
   const moving = tracks.filter((track) => !track.stationary && !track.ego).length, agents = tracks.length - (ego ? 1 : 0);
@@ -195,36 +204,23 @@ const start = () => {
     button.addEventListener("click", () => toggle(layer));
     byId("layers").append(button);
   }
+  if (data.points?.entry.intensity) {
+    const color = element("button", { id: "points-color", type: "button", title: "Color of the points (h)" }, "by height");
+    color.addEventListener("click", colorPoints);
+    byId("layers").append(color);
+  }
+  for (const note of data.recording?.notes ?? []) byId("notes").append(element("p", {}, note));
+  byId("pictures").hidden = pictures === null;
+  pictures?.showAhead();
+  byId("doubts-toggle").hidden = doubtful.length === 0;
   markEvents();
   listWarnings(data.warnings, data.warned, showEvent);
   listDoubtful();
+  listCollisions(data.events, tracks, showEvent);
+  fillMetrics(data.metrics);
   setRate(0);
   showPlay();
   listen();
   resize();
   readAddress();
 };
-
-// For scripts and tests.
-window.log2sim = {
-  get time() { return state.t; },
-  set time(t) { seek(t); },
-  get agents() { return tracks.map((track) => track.id); },
-  get chosen() { return state.chosen?.id ?? null; },
-  choose: (id) => choose(tracks.find((track) => track.id === id) ?? null),
-  play, pause,
-  // Position of an agent's center on the canvas, CSS pixels; null when it is absent.
-  placeOf: (id) => {
-    const track = tracks.find((other) => other.id === id);
-    track?.moveTo(state.t);
-    return track?.present ? [view.sx(track.px), view.sy(track.py)] : null;
-  },
-  // Its heading in rad, counter-clockwise from east; null when it is absent.
-  headingOf: (id) => {
-    const track = tracks.find((other) => other.id === id);
-    track?.moveTo(state.t);
-    return track?.present ? track.pyaw : null;
-  },
-  get pixelsPerMeter() { return view.scale; },
-};
-start();

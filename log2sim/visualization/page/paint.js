@@ -1,7 +1,7 @@
-// Draws the state at a time onto the canvas, without allocating memory except for the text of the scale bar.
+// Draws the state at a time onto the canvas, without allocating memory except for texts.
 
 const SOLID = [], DASHED = [5, 4], TRUTH_DASHES = [4, 3], DOTTED = [1.5, 2.5];
-const TRAIL_S = 3, SMALL_PX = 6, SLIM_PX = 4, STRIPES_PX = 4, MAX_LABELS = 64;
+const TRAIL_S = 3, SMALL_PX = 6, SLIM_PX = 4, STRIPES_PX = 4, MAX_LABELS = 64, MIN_NAMED_STANDING_PX = 16;
 
 class Painter {
   constructor(canvas, view) {
@@ -22,15 +22,16 @@ class Painter {
   }
 
   // shown: which layers and extras; chosen, hovered: tracks of the scenario or null.
-  paint({ layers, events, warnings, features, background }, t, shown, chosen, hovered) {
+  paint({ layers, events, warnings, features, background, points, north }, t, shown, chosen, hovered) {
     const ctx = this.ctx;
     ctx.setLineDash(SOLID);
     ctx.lineJoin = "round";
     ctx.fillStyle = theme.ground;
     ctx.fillRect(0, 0, this.view.width + 1, this.view.height + 1);  // the last pixel may be half one
     if (shown.ground && background) drawBackground(this, background);
-    if (shown.lanes) drawFeatures(this, features);
+    if (shown.lanes) drawFeatures(this, features, shown.ground && background !== null);
     this.grid();
+    if (shown.points && points) points.draw(this, t);
     for (const track of layers.scenario) track.moveTo(t);
     if (shown.scenario) this.scene(layers.scenario, t, shown, chosen);
     if (shown.scenario && shown.predictions) this.predictions(layers.scenario, t);
@@ -39,12 +40,14 @@ class Painter {
     ctx.setLineDash(SOLID);
     if (shown.scenario && shown.ends) drawEnds(this, layers.scenario, t);
     if (shown.replay) drawWarnings(this, warnings, t);
-    if (shown.replay) this.contacts(events, t);
+    if (shown.replay) ringCollisions(this, events, t);
     if (shown.scenario && chosen && chosen.present) this.ring(chosen, theme.accent, 2);
     if (shown.scenario && hovered && hovered !== chosen && hovered.present) this.ring(hovered, theme.muted, 1.2);
     if (shown.lanes) drawSignals(this, features.signals, t);
+    this.labels = 0;
+    if (shown.replay) nameCollisions(this, events, t);
     if (shown.scenario) this.names(layers.scenario, shown, chosen, hovered);
-    this.scaleBar();
+    drawScaleBar(this, north);
   }
 
   grid() {
@@ -220,17 +223,6 @@ class Painter {
     }
   }
 
-  // Rings around agents that collide in the replay, shown 0.3 s longer than the contact.
-  contacts(events, t) {
-    for (let k = 0; k < events.length; k++) {
-      const event = events[k];
-      if (t < event.t_s - 0.05 || t > event.until_s + 0.3) continue;
-      for (let i = 0; i < event.tracks.length; i++) {
-        if (event.tracks[i].present) this.ring(event.tracks[i], event.belongs_to === "replay" ? theme.alert : theme.muted, 2);
-      }
-    }
-  }
-
   ring(track, color, width) {
     if (!this.corners(track, 3.5)) return;
     this.trace();
@@ -239,24 +231,35 @@ class Painter {
     this.ctx.stroke();
   }
 
-  // Names of the leading movers where there is room; always of the chosen and the hovered agent.
+  // Names where there is room, first of leading movers, then of others, of standing ones if their boxes are not tiny; always of the
+  // chosen and the hovered agent.
   names(tracks, shown, chosen, hovered) {
-    this.labels = 0;
     this.ctx.font = theme.names;
     this.ctx.textAlign = "center";
     this.ctx.textBaseline = "alphabetic";
     if (chosen) this.label(chosen, true);
     if (hovered && hovered !== chosen) this.label(hovered, true);
     if (!shown.names) return;
-    for (let i = 0; i < tracks.length; i++) {
-      if (tracks[i].leading && tracks[i] !== chosen && tracks[i] !== hovered) this.label(tracks[i], false);
+    for (let rank = 0; rank < 3; rank++) {
+      for (let i = 0; i < tracks.length; i++) {
+        const track = tracks[i];
+        if (track === chosen || track === hovered || (track.stationary ? 2 : track.leading ? 0 : 1) !== rank) continue;
+        if (!track.stationary || track.length * this.view.scale >= MIN_NAMED_STANDING_PX) this.label(track, false);
+      }
     }
   }
 
   label(track, forced) {
-    if (!track.present || !this.corners(track, 0) || this.labels === MAX_LABELS) return;
-    const { ctx, corner: c, taken } = this, half = track.halfWidth ?? (track.halfWidth = ctx.measureText(track.label).width / 2 + 2);
-    const sx = (c[0] + c[4]) / 2, bottom = Math.min(c[1], c[3], c[5], c[7]) - 4;
+    if (!track.present || !this.corners(track, 0)) return;
+    const { ctx, corner: c } = this, half = track.halfWidth ?? (track.halfWidth = ctx.measureText(track.label).width / 2 + 2);
+    const bottom = Math.min(c[1], c[3], c[5], c[7]) - 4;
+    this.write(track.label, (c[0] + c[4]) / 2, bottom, half, track.stationary ? theme.muted : track.line, forced);
+  }
+
+  // Write a text, of which half the width is known, where no other is; a forced one always.
+  write(text, sx, bottom, half, color, forced) {
+    const { ctx, taken } = this;
+    if (this.labels === MAX_LABELS) return;
     for (let k = 0; k < 4 * this.labels && !forced; k += 4) {
       if (sx - half < taken[k + 2] && sx + half > taken[k] && bottom - 12 < taken[k + 3] && bottom + 2 > taken[k + 1]) return;
     }
@@ -267,25 +270,8 @@ class Painter {
     taken[k + 3] = bottom + 2;
     ctx.lineWidth = 3;
     ctx.strokeStyle = theme.halo;
-    ctx.strokeText(track.label, sx, bottom);
-    ctx.fillStyle = track.stationary ? theme.muted : track.line;
-    ctx.fillText(track.label, sx, bottom);
-  }
-
-  scaleBar() {
-    const { ctx, view } = this, meters = niceStep(110 / view.scale), width = meters * view.scale;
-    const x = 16, y = view.height - 16;
-    ctx.fillStyle = theme.paper;
-    ctx.strokeStyle = theme.ink;
-    ctx.lineWidth = 1;
-    ctx.fillRect(x + width / 2, y - 5, width / 2, 5);
-    ctx.strokeRect(x, y - 5, width, 5);
-    ctx.fillStyle = theme.ink;
-    ctx.fillRect(x, y - 5, width / 2, 5);
-    ctx.font = theme.figures;
-    ctx.textAlign = "left";
-    ctx.fillText("0", x, y - 10);
-    ctx.textAlign = "right";
-    ctx.fillText(meters >= 1000 ? `${meters / 1000} km` : `${meters} m`, x + width, y - 10);
+    ctx.strokeText(text, sx, bottom);
+    ctx.fillStyle = color;
+    ctx.fillText(text, sx, bottom);
   }
 }

@@ -7,9 +7,10 @@ const doubtful = tracks.filter((track) => track.doubts.length > 0);
 for (const track of doubtful) track.label += "?";
 const state = {
   t: data.begin, rate: 1, playing: false, follow: false, chosen: null, hovered: null,
-  shown: { scenario: true, truth: true, replay: true, trails: true, names: true, predictions: true, ends: true, lanes: true, ground: true },
+  shown: { scenario: true, truth: true, replay: true, trails: true, names: true, predictions: true, ends: true, lanes: true, ground: true, pictures: true, points: true },
 };
 applyTheme(data.layers);
+data.points?.applyTheme();
 const view = new View(), painter = new Painter(byId("map"), view);
 let queued = false, before = 0, dimmed = 0, labelled = "";
 
@@ -41,6 +42,7 @@ const draw = (now) => {
     if (leader.present) [view.x, view.y] = [leader.px, leader.py];
   }
   painter.paint(data, state.t, state.shown, state.chosen, state.hovered);
+  if (state.shown.pictures) pictures?.paint(state.t, state.chosen, state.hovered);
   const text = state.t.toFixed(2);
   if (text !== labelled) {
     byId("time").textContent = labelled = text;

@@ -85,6 +85,12 @@ const markEvents = () => {
     button.addEventListener("click", () => showEvent(event));
     return button;
   }));
+  byId("events").append(...data.events.slice(0, MAX_MARKS).map((event) => {
+    const label = element("span", { class: event.belongs_to === "replay" ? "label new" : "label" }, event.agents.join(" × "));
+    label.style.left = at(event.t_s);
+    return label;
+  }));
+  byId("timeline").classList.toggle("labeled", data.events.length > 0);
 };
 
 const showEvent = (event) => {

@@ -1,5 +1,7 @@
 // Agents over time. Columns are decoded once; the present state is kept in fields, so that no frame allocates memory.
 
+const STANDING_IN_PICTURES = "#DDE3EA";
+
 const sums = (differences, scale) => {
   const out = new Float64Array(differences.length);
   let step = 0, value = 0;
@@ -37,6 +39,7 @@ class Track {
     const edges = entry.filled ?? [];
     for (let k = 0; k < edges.length; k += 2) this.filled.fill(1, edges[k], edges[k + 1]);
     this.predicted = entry.predicted ? new Predicted(entry.predicted, scales) : null;
+    this.inPicture = entry.color ?? STANDING_IN_PICTURES;
     this.confidence = entry.confidence ?? null;
     this.points = entry.points ?? null;
     this.source = entry.source ?? null;
@@ -44,7 +47,7 @@ class Track {
     this.paintName = entry.paint?.text ?? "";
     this.sigmas = ["sigma_xy_m", "sigma_yaw_rad", "sigma_speed_mps"].map((key) => (entry[key] ? sums(entry[key], scales[key]) : null));
     this.observedBy = entry.observed_by ?? null;  // end: spans in s; null where the scenario does not say
-    this.doubts = entry.doubts ?? [];  // reason, start and end in s or null
+    this.doubts = entry.doubts ?? [];  // reason, start and end in s or null, flag
     this.doubtSpans = (entry.doubted ?? []).map(([start, end]) => [start ?? -Infinity, end ?? Infinity]);
     this.doubted = false;
     this.first = this.t[0];
@@ -150,9 +153,10 @@ const load = (text) => {
     ...warning, agents: [warning.agent], ego: layers.replay?.find((track) => track.id === "ego"),
     track: named("replay", warning.agent), shown: named("scenario", warning.agent),
   }));
-  const { name, origin, begin_s: begin, end_s: end } = document_;
+  const { name, origin, north, metrics, recording, begin_s: begin, end_s: end } = document_;
   return {
     name, origin, begin, end, layers, events, warnings, warned: document_.warnings.title, features: loadFeatures(document_),
-    background: loadBackground(document_.background),
+    background: loadBackground(document_.background), north, metrics, recording,
+    points: recording?.points ? new Points(recording.points, () => requestDraw()) : null,
   };
 };

@@ -7,6 +7,7 @@ import hashlib
 import html
 import json
 import re
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -17,25 +18,37 @@ from log2sim.errors import ConfigError
 from log2sim.visualization.page.columns import SCALES
 from log2sim.visualization.page.document import page_document
 from log2sim.visualization.plot.drawing import Background
+from log2sim.visualization.recording.recording import Recorded, recording_document
 
 SUFFIXES = (".html", ".htm")
+MARGIN_BYTES = 10_000
+"""Of a page, for the names and keys around pictures and points."""
+
 SCRIPT_FILES = (
     "track.js",
     "features.js",
     "background.js",
     "predicted.js",
+    "decoded.js",
     "theme.js",
     "ends.js",
     "warnings.js",
     "map.js",
+    "scale.js",
+    "points.js",
     "paint.js",
     "chart.js",
     "list.js",
     "details.js",
     "controls.js",
     "state.js",
+    "outlines.js",
+    "pictures.js",
+    "collisions.js",
     "timeline.js",
+    "lists.js",
     "main.js",
+    "scripting.js",
 )
 """Parts of the script in the order of their dependencies."""
 
@@ -48,8 +61,10 @@ def write_page(
     replay: Any = None,
     predict_s: float | None = None,
     background: Background | None = None,
+    recorded: Recorded | None = None,
+    metrics: Sequence[tuple[str, str]] = (),
     overwrite: bool = False,
-) -> None:
+) -> tuple[str, ...]:
     """Write a self-contained page that plays a scenario in a browser and loads nothing over the network.
 
     Parameters
@@ -62,20 +77,46 @@ def write_page(
         For how long it is shown where agents were expected to go.
     background : Background or None
         Map of the ground to show below everything; the page holds a copy of at most some megabytes.
+    recorded : Recorded or None
+        Log whose pictures and LiDAR points are shown, and the size of the page that they have to fit into.
+    metrics : sequence of (str, str)
+        Titles and texts, such as tables of `evaluate`; those of the replay are shown too.
+
+    Returns
+    -------
+    tuple of str
+        What was taken of the log, in sentences; empty without one.
 
     Raises
     ------
     ConfigError
         When the name ends in something else than .html, the file exists and `overwrite` is False, it cannot be written, or
-        there are more waypoints than a page can hold, or for a horizon that predictions do not have.
+        there are more waypoints than a page can hold, for a horizon that predictions do not have, or when the size is too
+        small for what is to be shown.
+    LogError
+        When no record of the log can be read.
     """
     out_path = Path(out_path)
     if out_path.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"{out_path}: a page's name must end in {' or '.join(SUFFIXES)}, not in '{out_path.suffix}'")
     refuse_existing(out_path, overwrite=overwrite)
-    page = html_of({**page_document(scenario, truth, replay, predict_s, background), "scales": SCALES})
+    document = {**page_document(scenario, truth, replay, predict_s, background, metrics), "scales": SCALES}
+    if recorded is not None:
+        document["recording"] = _recording(scenario, recorded, document)
+    page = html_of(document).encode()
+    if recorded is not None and len(page) > recorded.max_bytes:
+        raise ConfigError(f"--max-mb: the page has {len(page) / 1e6:.2f} MB at least; give as much")
     with replaced(out_path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+        temporary.write_bytes(page)
+    return tuple(document["recording"]["notes"]) if recorded is not None else ()
+
+
+def _recording(scenario: Scenario, recorded: Recorded, document: dict[str, Any]) -> dict[str, Any]:
+    """Return the pictures and points that fit beside the rest of a document."""
+    rest = len(html_of(document).encode()) + MARGIN_BYTES
+    if rest >= recorded.max_bytes:
+        raise ConfigError(f"--max-mb: the page has {rest / 1e6:.2f} MB without any picture; give more than that")
+    return recording_document(scenario, recorded, recorded.max_bytes - rest)
 
 
 def html_of(document: dict[str, Any]) -> str:

@@ -1,0 +1,33 @@
+// For scripts and tests, and the start of everything.
+window.log2sim = {
+  get time() { return state.t; },
+  set time(t) { seek(t); },
+  get agents() { return tracks.map((track) => track.id); },
+  get chosen() { return state.chosen?.id ?? null; },
+  choose: (id) => choose(tracks.find((track) => track.id === id) ?? null),
+  play, pause,
+  // Position of an agent's center on the canvas, CSS pixels; null when it is absent.
+  placeOf: (id) => {
+    const track = tracks.find((other) => other.id === id);
+    track?.moveTo(state.t);
+    return track?.present ? [view.sx(track.px), view.sy(track.py)] : null;
+  },
+  // Its heading in rad, counter-clockwise from east; null when it is absent.
+  headingOf: (id) => {
+    const track = tracks.find((other) => other.id === id);
+    track?.moveTo(state.t);
+    return track?.present ? track.pyaw : null;
+  },
+  get pixelsPerMeter() { return view.scale; },
+  // For each camera the time of the picture shown, s; null while there is none.
+  get pictures() {
+    const shown = (tile) => (tile.shown < 0 || !tile.decoded.get(tile.shown) ? null : tile.t[tile.shown]);
+    return Object.fromEntries((pictures?.tiles ?? []).map((tile) => [tile.name, shown(tile)]));
+  },
+  // Time of the LiDAR points shown and how many they are; null while there are none.
+  get points() {
+    const k = data.points ? nearest(data.points.t, state.t, data.points.reach) : -1, points = k < 0 ? null : data.points.decoded.get(k);
+    return points ? [data.points.t[k], points.x.length] : null;
+  },
+};
+start();
