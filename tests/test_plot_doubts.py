@@ -13,8 +13,9 @@ from matplotlib.collections import LineCollection
 from log2sim.datatypes import Agent, Doubt, Scenario
 from log2sim.geometry import Array, box_corners_bev
 from log2sim.visualization.plot import doubts, shapes
-from log2sim.visualization.plot.animation import AnimatedArtists, FrameTiming
+from log2sim.visualization.plot.animated_artists import AnimatedArtists
 from log2sim.visualization.plot.layout import FigureLayout
+from log2sim.visualization.plot.overlays import NO_OVERLAYS
 from log2sim.visualization.plot.roles import assign_roles
 from log2sim.visualization.plot.scene import draw_base
 from log2sim.visualization.plot.tracks import plot_tracks, still
@@ -98,7 +99,9 @@ def test_legend_labels_and_title_name_them() -> None:
     assert "unsure is doubtful: confidence 0.20" in rows
     assert not [row for row in rows if row.startswith("sure is")]
     labels = {t.get_text() for t in layout.ax.texts}
-    assert {"1?", "2?", "3?", "4", "parked?"} <= labels
+    assert {"middle? · 18 km/h", "end? · 18 km/h", "unsure? · 18 km/h", "sure · 18 km/h"} <= labels
+    assert "parked? reverses at 7.4 m/s" in labels
+    assert not [row for row in rows if row.startswith("parked")]
     assert any("4 doubtful" in t.get_text() for t in layout.figure.texts)
 
 
@@ -118,9 +121,9 @@ def test_many_and_long_reasons_leave_the_legend_beside_the_map() -> None:
 def test_an_animation_hatches_only_while_the_doubt_holds() -> None:
     scenario = world(straight("ego"), doubted(straight("car", start=(0.0, 6.0)), (1.0, 2.0)))
     roles = assign_roles(scenario)
-    layout, _, _ = draw_base(scenario, roles, moving=True)
+    layout = draw_base(scenario, roles, NO_OVERLAYS, moving=True).layout
     layout.canvas.draw()
-    artists = AnimatedArtists(layout, roles, None, None, FrameTiming(2, 1.0), None)
+    artists = AnimatedArtists(layout, roles, NO_OVERLAYS)
     counts = []
     for t in (0.5, 1.5, 2.5):
         artists.show(t)

@@ -15,12 +15,13 @@ from log2sim.datatypes import Scenario
 from log2sim.simulation.policy import Controls
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
-from log2sim.visualization.plot.animation import TRACK_ALPHA, AnimatedArtists, FrameTiming
+from log2sim.visualization.plot.animated_artists import AnimatedArtists
 from log2sim.visualization.plot.collisions import new_collisions
 from log2sim.visualization.plot.layout import FigureLayout
+from log2sim.visualization.plot.overlays import Overlays
 from log2sim.visualization.plot.roles import assign_roles
 from log2sim.visualization.plot.scene import draw_base
-from log2sim.visualization.plot.style import ALARM
+from log2sim.visualization.plot.style import ALARM, TRACK_ALPHA
 from log2sim.visualization.plot.time_series import timeline_of
 from log2sim.visualization.plot.tracks import plot_tracks, still
 
@@ -44,7 +45,7 @@ def reckless() -> tuple[Scenario, Replay]:
 
 
 def layout_of(scenario: Scenario, result: Replay | None) -> FigureLayout:
-    return still(scenario, assign_roles(scenario), replay=result)
+    return still(scenario, assign_roles(scenario), Overlays(replay=result))
 
 
 def chart_axes(layout: FigureLayout) -> list:
@@ -175,9 +176,10 @@ def test_collisions_that_the_log_has_not_are_marked_between_the_boxes() -> None:
 def test_the_cursor_moves_and_marks_come_when_it_hits() -> None:
     scenario, result = reckless()
     roles = assign_roles(scenario)
-    layout, _, charts = draw_base(scenario, roles, replay=result, moving=True)
+    base = draw_base(scenario, roles, Overlays(replay=result), moving=True)
+    layout, charts = base.layout, base.charts
     assert charts is not None
-    artists = AnimatedArtists(layout, roles, result, None, FrameTiming(2, 1.0), charts)
+    artists = AnimatedArtists(layout, roles, Overlays(replay=result), charts=charts)
     layout.canvas.draw()
     (hit_s,) = new_collisions(result)[0]
     for t_s, marks in ((hit_s - 0.1, 0), (hit_s + 0.1, 1)):

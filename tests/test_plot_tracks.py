@@ -12,8 +12,9 @@ from log2sim.datatypes import TYPICAL_SIZE_M, Agent, MapFrame, Scenario, Waypoin
 from log2sim.errors import ConfigError
 from log2sim.simulation.runner import replay
 from log2sim.visualization.plot import shapes
-from log2sim.visualization.plot.animation import AnimatedArtists
+from log2sim.visualization.plot.animated_artists import AnimatedArtists
 from log2sim.visualization.plot.layout import FigureLayout
+from log2sim.visualization.plot.overlays import Overlays
 from log2sim.visualization.plot.roles import assign_roles
 from log2sim.visualization.plot.style import PALETTE, printable
 from log2sim.visualization.plot.tracks import plot_tracks, still
@@ -135,7 +136,7 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(
         show(stage, t_s)
 
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", fail_half_way)
-    monkeypatch.setattr("log2sim.visualization.plot.animation.AnimatedArtists.show", fail_later)
+    monkeypatch.setattr("log2sim.visualization.plot.animated_artists.AnimatedArtists.show", fail_later)
     with pytest.raises(RuntimeError, match="disk"):
         plot_tracks(crossing(), out, overwrite=True)
     assert out.read_bytes() == b"good"
@@ -143,7 +144,7 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(
 
 
 def draw(scenario: Scenario, **overlays: object) -> FigureLayout:
-    return still(scenario, assign_roles(scenario), **overlays)  # type: ignore[arg-type]
+    return still(scenario, assign_roles(scenario), Overlays(**overlays))  # type: ignore[arg-type]
 
 
 def texts(sheet: FigureLayout) -> list[str]:

@@ -17,6 +17,7 @@ from log2sim.visualization.page import predictions as page_predictions
 from log2sim.visualization.page.columns import SCALES
 from log2sim.visualization.page.document import page_document
 from log2sim.visualization.page.predictions import EVERY_TICKS, predicted_columns
+from log2sim.visualization.plot.overlays import Overlays
 from log2sim.visualization.plot.predicted import PredictedPaths, draw_predictions
 from log2sim.visualization.plot.roles import assign_roles
 from log2sim.visualization.plot.tracks import still
@@ -56,7 +57,7 @@ def test_who_stands_or_is_absent_has_no_way() -> None:
 
 def test_the_legend_tells_what_is_drawn(tmp_path: Path) -> None:
     world = scene(corner("ego", 3.0), corner("a", 0.0))
-    legend = still(world, assign_roles(world), predicted=PredictedPaths(world, 2.5)).figure.legends[0]
+    legend = still(world, assign_roles(world), Overlays(predicted=PredictedPaths(world, 2.5))).figure.legends[0]
     assert "predicted for 2.5 s, 1 sigma" in [text.get_text() for text in legend.get_texts()]
     world.save(tmp_path / "scenario.json")
     sizes = {}

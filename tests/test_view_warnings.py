@@ -17,6 +17,7 @@ from log2sim.simulation.warnings.warn import warn
 from log2sim.visualization.page.document import page_document
 from log2sim.visualization.page.writer import write_page
 from log2sim.visualization.plot.observers import lines_of
+from log2sim.visualization.plot.overlays import Overlays
 from log2sim.visualization.plot.roles import assign_roles
 from log2sim.visualization.plot.tracks import still
 from log2sim.visualization.plot.warned import warned_places
@@ -69,7 +70,7 @@ def test_the_legend_explains_ends_and_warnings_where_there_are_some(ends: int) -
     spans = {"vehicle": (5.0, 8.0), "road": (1.0, 8.0)} if ends == 2 else {"vehicle": (0.0, 8.0)}
     world = scenario_of(town_ego(8.0), seen(crossing_walker(6.0, 8.0), **spans))
     for result in (None, warned(world)):
-        layout = still(world, assign_roles(world), replay=result)
+        layout = still(world, assign_roles(world), Overlays(replay=result))
         told = {text.get_text() for text in layout.figure.legends[0].get_texts()}
         assert ("observed by the road alone" in told) == (ends == 2)
         assert ("warning: when, and how far apart" in told) == (result is not None)

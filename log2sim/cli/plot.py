@@ -7,14 +7,18 @@ from typing import Annotated
 
 import typer
 
-from log2sim.cli.options import Overwrite, ScenarioPath, Sequence
+from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, Sequence, say
+from log2sim.cli.progress import progress
 from log2sim.cli.truth import load_replay, load_truth
 
 
 def plot(
     scenario: ScenarioPath,
     out: Annotated[
-        Path, typer.Option("--out", metavar="FILE", help="Image (.png .svg .pdf) or animation (.gif .mp4) to write.")
+        Path,
+        typer.Option(
+            "--out", "-o", metavar="FILE", help="Picture (.png .svg .pdf) or film (.mp4 .webm .gif) to write."
+        ),
     ],
     replay: Annotated[Path | None, typer.Option(metavar="REPLAY", help="Replay to draw over the scenario.")] = None,
     truth: Annotated[
@@ -29,21 +33,48 @@ def plot(
     predict: Annotated[
         float | None, typer.Option(metavar="S", help="Draw where movers were expected to go for this long, in s.")
     ] = None,
+    start: Annotated[float | None, typer.Option(metavar="S", help="Show the scenario from here on, in s.")] = None,
+    stop: Annotated[float | None, typer.Option(metavar="S", help="Show the scenario up to here, in s.")] = None,
+    extent: Annotated[
+        str | None, typer.Option(metavar="X0,Y0,X1,Y1", help="Two corners of the part of the map to show, in m.")
+    ] = None,
+    agents: Annotated[str | None, typer.Option(metavar="ID,ID", help="Show these agents alone.")] = None,
+    size: Annotated[
+        str | None, typer.Option(metavar="WxH", help="Size in pixels, such as 1280x720; not of .svg and .pdf.")
+    ] = None,
+    fps: Annotated[
+        float | None, typer.Option(metavar="N", help="Frames of a film a second. Default: 25, of a .gif 10.")
+    ] = None,
+    speed: Annotated[
+        float | None,
+        typer.Option(metavar="X", help="Times faster than real time. Default: 1, more for films beyond a minute."),
+    ] = None,
     sequence: Sequence = None,
     overwrite: Overwrite = False,
+    quiet: Quiet = False,
 ) -> None:
-    """Draw a scenario from above."""
+    """Draw a scenario from above: a picture or a film."""
     from log2sim.datatypes import Scenario
     from log2sim.documents import check_targets
-    from log2sim.visualization.plot.tracks import plot_tracks
+    from log2sim.visualization.plot.options import PlotOptions, parse_extent, parse_ids, parse_size
+    from log2sim.visualization.plot.tracks import plot_tracks, resolve_picture
 
-    check_targets(out, overwrite=overwrite)
+    options = PlotOptions(parse_size(size), fps, speed, start, stop, parse_extent(extent), parse_ids(agents))
+    picture = resolve_picture(out)
+    options.require_fits(picture.path.suffix.lower(), picture.path.name)
+    check_targets(picture.path, overwrite=overwrite)
     loaded = Scenario.load(scenario)
     replayed = load_replay(replay, loaded) if replay is not None else None
-    picture = None
-    if background is not None:
-        from log2sim.cli.background import load_background
-
-        picture = load_background(background, loaded, sequence)
     known = load_truth(truth, loaded, sequence) if truth is not None else None
-    plot_tracks(loaded, out, replay=replayed, truth=known, background=picture, predict_s=predict, overwrite=overwrite)
+    if picture.note is not None:
+        say(f"note: {picture.note}", quiet=quiet)
+    with progress(quiet=quiet) as report_progress:
+        ground = None
+        if background is not None:
+            from log2sim.cli.background import load_background
+
+            ground = load_background(background, loaded, sequence, report_progress)
+        plot_tracks(
+            loaded, out, replay=replayed, truth=known, background=ground, predict_s=predict, options=options,
+            overwrite=overwrite, progress=report_progress,
+        )  # fmt: skip

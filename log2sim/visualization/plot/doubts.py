@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from typing import Any
 
 import numpy as np
@@ -85,18 +85,23 @@ def doubtful_parts(agent: Agent) -> Iterator[Array]:
             yield np.column_stack([at.x_m, at.y_m])
 
 
-def doubt_rows(roles: AgentRoles) -> list[tuple[Any, str]]:
-    """List handles and texts of the legend: a line for each of the first doubtful agents, with the reason."""
+def doubt_rows(roles: AgentRoles, told: Set[str] = frozenset()) -> list[tuple[Any, str]]:
+    """List handles and texts of the legend: a line for each of the first doubtful agents but the `told` ones, with the reason."""
     doubtful = [(r.agent, r.color) for r in roles.movers if r.agent.is_doubtful]
-    doubtful += [(a, PARKED_FACE) for a in roles.stationary if a.is_doubtful]
+    doubtful += [(a, PARKED_FACE) for a in roles.stationary if a.is_doubtful and a.id not in told]
     doubtful.sort(key=lambda entry: not entry[0].doubts)  # low confidence alone says less
     rows: list[tuple[Any, str]] = []
     for agent, color in doubtful[:MAX_NAMED]:
-        patch = Patch(fc=color, ec=MUTED if color == PARKED_FACE else PAPER, hatch="//////", lw=0.6)
-        rows.append((patch, _wrapped(f"{agent.id} is doubtful: {why_doubtful(agent)}")))
+        rows.append((_hatched_patch(color), _wrapped(f"{agent.id} is doubtful: {why_doubtful(agent)}")))
     if len(doubtful) > MAX_NAMED:
         rows.append((Patch(fc="none", ec="none"), f"and {len(doubtful) - MAX_NAMED} more doubtful"))
+    if not doubtful and any(a.is_doubtful for a in roles.stationary):
+        rows.append((_hatched_patch(PARKED_FACE), "doubtful"))
     return rows
+
+
+def _hatched_patch(color: str) -> Patch:
+    return Patch(fc=color, ec=MUTED if color == PARKED_FACE else PAPER, hatch="//////", lw=0.6)
 
 
 def _wrapped(text: str) -> str:

@@ -18,14 +18,11 @@ from log2sim.visualization.plot import shapes
 from log2sim.visualization.plot.roles import AgentRole, AgentRoles, centers_xy, is_moving, paint_of
 from log2sim.visualization.plot.style import (
     COLLISION_MARK,
-    FONT,
     INK,
     MARKERS,
-    MUTED,
     PAPER,
     PARKED_EDGE,
     PARKED_FACE,
-    halo,
 )
 from log2sim.visualization.plot.viewport import MAX_UNCROWDED_MOVERS, Viewport
 
@@ -181,78 +178,6 @@ def draw_replay(ax: Axes, replay: Any, roles: AgentRoles) -> None:
 def draw_collisions(ax: Axes, xy_m: Array, **style: Any) -> Line2D:
     """Mark collisions that belong to the replay."""
     return ax.plot(*xy_m.T, ls="none", zorder=LABEL - 0.1, **COLLISION_MARK, **style)[0]
-
-
-def draw_labels(ax: Axes, roles: AgentRoles, view: Viewport, times_step_s: float) -> None:
-    """Write labels at the last boxes and times along the ego's track, each at a free place or not at all."""
-    taken = _occupied(roles, view)
-    for role in roles.movers:
-        anchor = centers_xy(role.agent)[-1]
-        if role.leading and view.contains(anchor[None])[0]:
-            text = ("ego" if role.is_ego else role.label) + "?" * role.agent.is_doubtful
-            box_half = np.ptp(shapes.footprints(role.agent, anchor, role.agent.waypoints.yaw_rad[-1])[0], axis=0) / 2
-            _write(ax, text, anchor, box_half, taken, view, color=role.color, fontsize=7.0, fontweight="bold")
-    for agent in roles.stationary:
-        anchor = centers_xy(agent)[len(agent.waypoints) // 2]
-        if agent.is_doubtful and view.contains(anchor[None])[0]:
-            half = np.full(2, agent.size_m[1] / 2)
-            _write(ax, f"{agent.id}?", anchor, half, taken, view, color=MUTED, fontsize=6.0, fontweight="normal")
-    if roles.movers and roles.movers[0].is_ego:
-        ego = roles.movers[0].agent
-        t, xy = shapes.time_marks(ego, times_step_s)
-        apart = shapes.spaced_apart(xy, centers_xy(ego)[[0, -1]], max(ego.size_m[0] / 2, 24 * view.m_per_pt))
-        for when, at in zip(t[apart], xy[apart]):
-            around = np.full(2, ego.size_m[1] / 2)
-            _write(ax, f"{when:g} s", at, around, taken, view, color=MUTED, fontsize=6.0, fontweight="normal")
-
-
-def _write(
-    ax: Axes,
-    text: str,
-    anchor: Array,
-    box_half: Array,
-    taken: list[tuple[float, float, float, float]],
-    view: Viewport,
-    **style: Any,
-) -> None:
-    """Write next to a box at the first free place and reserve it in `taken`."""
-    size_pt = style["fontsize"]
-    half = np.array([0.34 * size_pt * len(text) + 1.0, 0.55 * size_pt]) * view.m_per_pt
-    place = _free_place(anchor, half, box_half, taken, view)
-    if place is None:
-        return
-    taken.append((*(place - half), *(place + half)))
-    style |= {"family": FONT, "ha": "center", "va": "center_baseline", "path_effects": halo(), "zorder": LABEL}
-    ax.text(place[0], place[1], text, parse_math=False, clip_on=True, **style)
-
-
-def _free_place(
-    anchor: Array, half: Array, box_half: Array, taken: list[tuple[float, float, float, float]], view: Viewport
-) -> Array | None:
-    """Find the center of a label of half size (2,) next to a box of half extents (2,), clear of `taken`; None without."""
-    pad = 1.5 * view.m_per_pt
-    for ring in (0.0, 6.0, 14.0):
-        for side in ((1, 1), (-1, 1), (1, -1), (-1, -1), (0, 1), (0, -1), (1, 0), (-1, 0)):
-            place = anchor + np.array(side) * (box_half + half + pad + ring * view.m_per_pt)
-            low, high = place - half, place + half
-            inside = view.contains(np.stack([low, high])).all()
-            if inside and not any(low[0] < t[2] and high[0] > t[0] and low[1] < t[3] and high[1] > t[1] for t in taken):
-                return place
-    return None
-
-
-def _occupied(roles: AgentRoles, view: Viewport) -> list[tuple[float, float, float, float]]:
-    """Collect the bounds of the last boxes and of points along the leading tracks, which labels keep clear of."""
-    out = []
-    for role in roles.movers:
-        xy, w = centers_xy(role.agent), role.agent.waypoints
-        corners = shapes.footprints(role.agent, xy[-1], w.yaw_rad[-1])[0]
-        out.append((*corners.min(axis=0), *corners.max(axis=0)))
-        if role.leading:
-            r = 1.2 * view.m_per_pt
-            steps = np.linspace(0, len(xy) - 1, min(len(xy), 40)).round().astype(int)
-            out.extend((x - r, y - r, x + r, y + r) for x, y in xy[steps])
-    return out
 
 
 def _lines(ax: Axes, roles: list[AgentRole], alpha: float, leading: bool) -> None:

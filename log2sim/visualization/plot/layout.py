@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 from matplotlib.ticker import FuncFormatter, MultipleLocator
 
-from log2sim.datatypes import STANDSTILL_MPS
+from log2sim.visualization.plot.labels import speed_text
 from log2sim.visualization.plot.roles import AgentRole, AgentRoles
 from log2sim.visualization.plot.style import (
     COLLISION_MARK,
@@ -61,18 +62,40 @@ class FigureLayout:
     view: Viewport
     foot_in: float = 0.0
 
+    @property
+    def width_in(self) -> float:
+        """Return the width of the figure, inch."""
+        return float(self.figure.get_figwidth())
 
-def make_layout(view: Viewport, legend_rows: int, *, projected: bool, foot_in: float = 0.0) -> FigureLayout:
-    """Lay out a figure whose map has the proportions of the view within limits, above `foot_in` inches for charts."""
-    map_width = WIDTH_IN - LEFT_IN - SIDE_IN - GAP_IN
-    wanted = map_width * view.height_m / view.width_m
+    def set_width_px(self, width_px: int) -> None:
+        """Choose the dots per inch that make the figure so wide, and its sides whole pixels."""
+        height_px = round(width_px * self.figure.get_figheight() / self.width_in)
+        self.figure.set_dpi(width_px / self.width_in)
+        # A hair more, since the canvas cuts off parts of pixels.
+        self.figure.set_size_inches((width_px + 0.01) / self.figure.dpi, (height_px + 0.01) / self.figure.dpi)
+
+
+def make_layout(
+    view: Viewport, legend_rows: int, *, projected: bool, foot_in: float = 0.0, aspect: float | None = None
+) -> FigureLayout:
+    """Lay out a figure whose map has the proportions of the view within limits, above `foot_in` inches for charts.
+
+    With an `aspect`, height over width, the figure has that, and is so large that all has room.
+    """
+    width, map_width = WIDTH_IN, WIDTH_IN - LEFT_IN - SIDE_IN - GAP_IN
     needed = legend_rows * ROW_IN + 1.0
-    map_height = float(np.clip(max(wanted, needed), MIN_MAP_IN, MAX_MAP_IN))
-    height = map_height + TOP_IN + BOTTOM_IN + foot_in
-    figure = Figure(figsize=(WIDTH_IN, height), facecolor=PAPER)
+    around = TOP_IN + BOTTOM_IN + foot_in
+    if aspect is None:
+        wanted = max(map_width * view.height_m / view.width_m, needed)
+        map_height = float(np.clip(wanted, MIN_MAP_IN, MAX_MAP_IN))
+    else:
+        width = max(WIDTH_IN, (max(needed, MIN_MAP_IN) + around) / aspect)
+        map_width, map_height = width - LEFT_IN - SIDE_IN - GAP_IN, width * aspect - around
+    height = map_height + around
+    figure = Figure(figsize=(width, height), facecolor=PAPER)
     canvas = FigureCanvasAgg(figure)
     bottom = foot_in + BOTTOM_IN
-    ax = figure.add_axes((LEFT_IN / WIDTH_IN, bottom / height, map_width / WIDTH_IN, map_height / height))
+    ax = figure.add_axes((LEFT_IN / width, bottom / height, map_width / width, map_height / height))
     fitted = view.fitted(map_width * 72, map_height * 72)
     ax.set(xlim=(fitted.x0, fitted.x1), ylim=(fitted.y0, fitted.y1), facecolor="#FBFCFD")
     ax.set_aspect("equal", adjustable="box")
@@ -84,7 +107,7 @@ def write_title(layout: FigureLayout, title: str, subtitle: str) -> None:
     """Write the title and a smaller line below it, flush with the map's left edge."""
     height = layout.figure.get_figheight()
     style: dict[str, Any] = {"family": FONT, "ha": "left", "va": "baseline", "parse_math": False}
-    x = LEFT_IN / WIDTH_IN
+    x = LEFT_IN / layout.width_in
     layout.figure.text(x, 1 - 0.36 / height, printable(title, 70), fontsize=13, fontweight="bold", color=INK, **style)
     layout.figure.text(x, 1 - 0.59 / height, printable(subtitle, 130), fontsize=8, color=MUTED, **style)
 
@@ -92,7 +115,7 @@ def write_title(layout: FigureLayout, title: str, subtitle: str) -> None:
 def draw_legend(layout: FigureLayout, rows: list[tuple[Any, str]]) -> None:
     """Draw the legend in the column beside the map, where it covers nothing."""
     height = layout.figure.get_figheight()
-    x = (WIDTH_IN - SIDE_IN) / WIDTH_IN
+    x = 1 - SIDE_IN / layout.width_in
     legend = layout.figure.legend(
         [handle for handle, _ in rows], [text for _, text in rows], loc="upper left", bbox_to_anchor=(x, 1 - TOP_IN / height),
         borderaxespad=0, frameon=False, prop={"family": FONT, "size": 7.0}, handlelength=2.0, labelspacing=0.56,
@@ -103,12 +126,23 @@ def draw_legend(layout: FigureLayout, rows: list[tuple[Any, str]]) -> None:
 
 
 def legend_rows(
-    roles: AgentRoles, mark_step_s: float | None, *, truth: bool, replay: bool, collisions: int, outside: int
+    roles: AgentRoles,
+    mark_step_s: float | None,
+    told: Set[str],
+    *,
+    truth: bool,
+    replay: bool,
+    collisions: int,
+    outside: int,
 ) -> list[tuple[Any, str]]:
-    """List handles and texts: leading movers, counts of the others, then the meaning of marks that occur."""
+    """List handles and texts: leading movers but the `told` ones, counts of the others, then the meaning of marks that occur."""
     rows: list[tuple[Any, str]] = []
+    listed = any(role.leading and role.agent.id not in told for role in roles.movers)
+    if roles.movers:
+        present = mark_step_s is None and not listed  # an animation whose labels tell the speed
+        rows.append((_line("none"), "km/h: speed at this time" if present else "km/h: highest speed of each"))
     for role in sorted(roles.movers, key=_reading_order):
-        if role.leading:
+        if role.leading and role.agent.id not in told:
             marker = "s" if role.is_ego else MARKERS[role.group]
             rows.append((_line(role.color, lw=2.4 if role.is_ego else 1.7, marker=marker, ms=4.6), _name(role)))
     rest = sum(not r.leading for r in roles.movers)
@@ -141,9 +175,9 @@ def draw_scale_and_north(layout: FigureLayout, *, projected: bool) -> None:
     height = layout.figure.get_figheight()
     m_per_in = layout.view.m_per_pt * 72
     length_m = nice_step(1.35 * m_per_in)
-    x, y, w = WIDTH_IN - SIDE_IN + 0.06, layout.foot_in + BOTTOM_IN + 0.08, length_m / m_per_in
+    x, y, w = layout.width_in - SIDE_IN + 0.06, layout.foot_in + BOTTOM_IN + 0.08, length_m / m_per_in
     column = layout.figure.add_axes((0, 0, 1, 1), frameon=False)
-    column.set(xlim=(0, WIDTH_IN), ylim=(0, height), xticks=[], yticks=[])
+    column.set(xlim=(0, layout.width_in), ylim=(0, height), xticks=[], yticks=[])
     column.set_zorder(-1)
     for k, face in enumerate((INK, PAPER)):
         column.add_patch(Polygon(_rectangle(x + k * w / 2, y, w / 2, 0.06), fc=face, ec=INK, lw=0.8, closed=True))
@@ -151,7 +185,7 @@ def draw_scale_and_north(layout: FigureLayout, *, projected: bool) -> None:
     column.text(x, y + 0.1, "0", ha="center", **style)
     column.text(x + w, y + 0.1, f"{length_m:g} m", ha="center", **style)
     if projected:
-        nx, ny = WIDTH_IN - 0.42, y
+        nx, ny = layout.width_in - 0.42, y
         column.add_patch(Polygon([(nx, ny + 0.4), (nx - 0.1, ny), (nx, ny + 0.09)], fc=INK, ec=INK, lw=0.8))
         column.add_patch(Polygon([(nx, ny + 0.4), (nx + 0.1, ny), (nx, ny + 0.09)], fc=PAPER, ec=INK, lw=0.8))
         column.text(nx, ny + 0.44, "N", ha="center", **{**style, "fontsize": 8.5, "fontweight": "bold"})
@@ -181,8 +215,7 @@ def _reading_order(role: AgentRole) -> tuple[bool, int, str]:
 
 
 def _name(role: AgentRole) -> str:
-    speed = float(np.max(np.abs(role.agent.waypoints.speed_mps)))
-    moving = f"{speed * 3.6:.0f} km/h" if speed >= STANDSTILL_MPS else "stationary"
+    moving = speed_text(role.agent)
     if role.is_ego:
         return f"ego · {moving}"
     if role.agent.id.startswith(role.agent.category):

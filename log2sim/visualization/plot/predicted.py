@@ -84,6 +84,7 @@ def draw_predictions(ax: Axes, roles: AgentRoles, paths: PredictedPaths) -> None
         for role in roles.movers
         if role.leading
         for t in paths.times_of(role.agent.id)
+        if role.agent.waypoints.t_s[0] <= t <= role.agent.waypoints.t_s[-1]
         if (expected := paths.at(role.agent.id, float(t))) is not None
     ]
     for artist in (

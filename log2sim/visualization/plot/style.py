@@ -21,6 +21,9 @@ FRAME = "#B9C1CB"
 PARKED_FACE, PARKED_EDGE = "#D5DAE1", "#A9B2BE"
 PAPER = "#FFFFFF"
 ALARM = "#C8102E"
+TAIL_ALPHA, TRACK_ALPHA = 0.65, 0.22
+"""Opacity of tails and of whole tracks in animations."""
+
 COLLISION_MARK: dict[str, Any] = {"marker": "X", "ms": 8.5, "mfc": ALARM, "mec": PAPER, "mew": 0.9}
 """Mark of collisions that belong to the replay."""
 

@@ -18,11 +18,11 @@ from log2sim.simulation.metrics.collisions import REPLAY
 from log2sim.visualization.plot.layout import (
     CHART_GAP_IN,
     CHART_IN,
+    GAP_IN,
     HEAD_IN,
     LEFT_IN,
     SIDE_IN,
     TIME_IN,
-    WIDTH_IN,
     FigureLayout,
 )
 from log2sim.visualization.plot.roles import AgentRole, AgentRoles
@@ -179,17 +179,19 @@ def draw_charts(
     height = layout.figure.get_figheight()
     count = len(timeline.charts)
     top = TIME_IN + count * (CHART_IN + CHART_GAP_IN)
-    width = WIDTH_IN - LEFT_IN - SIDE_IN - 0.2
+    width = layout.width_in - LEFT_IN - SIDE_IN - GAP_IN
     axes: list[Axes] = []
     for k, chart in enumerate(timeline.charts):
         bottom = top - (k + 1) * (CHART_IN + CHART_GAP_IN) + CHART_GAP_IN
-        ax = layout.figure.add_axes((LEFT_IN / WIDTH_IN, bottom / height, width / WIDTH_IN, CHART_IN / height))
+        ax = layout.figure.add_axes(
+            (LEFT_IN / layout.width_in, bottom / height, width / layout.width_in, CHART_IN / height)
+        )
         _draw_strip(ax, chart, timeline, span_s, last=k == count - 1, moving=moving)
         axes.append(ax)
     role = timeline.role
     name = role.label if role.is_ego or role.label == role.agent.id else f"{role.label} · {role.agent.id}"
     layout.figure.text(
-        LEFT_IN / WIDTH_IN, (top + HEAD_IN - 0.16) / height, f"{printable(name, 40)} in the replay, driven by {_spoken(timeline.driver)}",
+        LEFT_IN / layout.width_in, (top + HEAD_IN - 0.16) / height, f"{printable(name, 40)} in the replay, driven by {_spoken(timeline.driver)}",
         family=FONT, fontsize=8.5, fontweight="bold", color=role.color, parse_math=False, va="baseline",
     )  # fmt: skip
     return TimelineCharts(timeline, tuple(axes))
@@ -237,7 +239,7 @@ def _style(ax: Axes, *, last: bool) -> None:
 def _legend(ax: Axes, chart: Chart, handles: Sequence[Line2D], labels: Sequence[str]) -> None:
     legend = ax.legend(
         handles[::-1], labels[::-1], title=f"{chart.name} ({chart.unit})", alignment="left",
-        loc="upper left", bbox_to_anchor=(_beside(ax, 0.2), 1.06), borderaxespad=0, borderpad=0, frameon=False,
+        loc="upper left", bbox_to_anchor=(_beside(ax, GAP_IN), 1.06), borderaxespad=0, borderpad=0, frameon=False,
         prop={"family": FONT, "size": 6.5}, title_fontproperties={"family": FONT, "size": 7, "weight": "bold"},
         handlelength=2.0, labelspacing=0.35, handletextpad=0.7, labelcolor=INK,
     )  # fmt: skip
@@ -247,14 +249,14 @@ def _legend(ax: Axes, chart: Chart, handles: Sequence[Line2D], labels: Sequence[
 def _read_out(ax: Axes, text: str, **style: Any) -> Any:
     """Write a value at the right edge of the figure, level with the name of the chart."""
     return ax.text(
-        _beside(ax, SIDE_IN + 0.2 - 0.12), 1.06, text, transform=ax.transAxes, ha="right", va="top", fontsize=7.0,
+        _beside(ax, SIDE_IN + GAP_IN - 0.12), 1.06, text, transform=ax.transAxes, ha="right", va="top", fontsize=7.0,
         family=FONT, color=INK, parse_math=False, path_effects=halo(), clip_on=False, **style,
     )  # fmt: skip
 
 
 def _beside(ax: Axes, inches: float) -> float:
     """Convert inches to the right of axes into a fraction of their width."""
-    return 1.0 + inches / (ax.get_position().width * WIDTH_IN)
+    return 1.0 + inches / (ax.get_position().width * float(ax.get_figure(root=True).get_figwidth()))
 
 
 def _limits(chart: Chart) -> tuple[float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib
 
@@ -12,16 +12,17 @@ from log2sim.documents import refuse_existing, replaced
 from log2sim.errors import ConfigError
 from log2sim.visualization.plot import doubts, drawing
 from log2sim.visualization.plot.collisions import new_collisions
-from log2sim.visualization.plot.layout import (
-    FigureLayout,
-)
+from log2sim.visualization.plot.encoding import FilmFile, choose_film_file
+from log2sim.visualization.plot.labels import draw_labels
+from log2sim.visualization.plot.layout import FigureLayout
 from log2sim.visualization.plot.observers import draw_observers, tells_ends
+from log2sim.visualization.plot.options import MOVING, NO_OPTIONS, STILL, PlotOptions
+from log2sim.visualization.plot.overlays import NO_OVERLAYS, Overlays
 from log2sim.visualization.plot.predicted import PredictedPaths, draw_predictions
 from log2sim.visualization.plot.roles import AgentRoles, assign_roles
 from log2sim.visualization.plot.scene import draw_base
+from log2sim.visualization.plot.selection import choose_span, cut_replay, cut_scenario, select_shown
 from log2sim.visualization.plot.warned import draw_warnings, warned_places
-
-STILL, ANIMATED = (".png", ".svg", ".pdf"), (".gif", ".mp4")
 
 
 def plot_tracks(
@@ -33,10 +34,12 @@ def plot_tracks(
     background: drawing.Background | None = None,
     predict_s: float | None = None,
     title: str | None = None,
+    options: PlotOptions = NO_OPTIONS,
     overwrite: bool = False,
     dpi: int = 200,
-) -> None:
-    """Draw a scenario from above into a file: a still for .png, .svg and .pdf, an animation for .gif and .mp4.
+    progress: Any = lambda stage, done, total: None,
+) -> Path:
+    """Draw a scenario from above into a file: a still for .png, .svg and .pdf, an animation for .gif, .mp4 and .webm.
 
     Parameters
     ----------
@@ -49,76 +52,101 @@ def plot_tracks(
         A picture of the ground in the map frame, drawn below everything.
     predict_s : float, s, or None
         For how long predictions of the leading movers are drawn.
+    options : PlotOptions
+        Size, range of time, part of the map, agents, and the frames of a film.
     dpi : int
-        Dots per inch of a .png, which is 10 inches wide.
+        Dots per inch of a .png without a size, which is 10 inches wide then.
+    progress : callable
+        `progress(stage, done, total)` is called for every frame of an animation.
+
+    Returns
+    -------
+    Path
+        The file that was written: a .webm where an .mp4 was asked for and H.264 is not installed.
 
     Raises
     ------
     ConfigError
-        When the name has another suffix, `predict_s` is no horizon of predictions, the file exists and `overwrite` is False, or it cannot be written.
+        When the name has another suffix, an option does not fit, `predict_s` is no horizon of predictions, the file exists and
+        `overwrite` is False, or it cannot be written.
     ScenarioError
         When the truth's map has another projection.
     """
-    out_path = Path(out_path)
-    suffix = out_path.suffix.lower()
-    if suffix not in STILL + ANIMATED:
-        raise ConfigError(
-            f"{out_path}: a picture's name must end in {', '.join(STILL)} (still) or {', '.join(ANIMATED)} (moving), "
-            f"not in '{out_path.suffix}'"
-        )
-    refuse_existing(out_path, overwrite=overwrite)
+    film = resolve_picture(Path(out_path))
+    suffix = film.path.suffix.lower()
+    options.require_fits(suffix, film.path.name)
+    refuse_existing(film.path, overwrite=overwrite)
+    scenario, replay = select_shown(scenario, replay, options)
+    span = choose_span(scenario, options)
+    overlays = Overlays(
+        replay=cut_replay(replay, span, scenario),
+        truth=None if truth is None else cut_scenario(truth.aligned_to(scenario), span),
+        background=background,
+        predicted=None if predict_s is None else PredictedPaths(scenario, predict_s),
+        title=title,
+        span=span,
+        options=options,
+    )
+    scenario = cut_scenario(scenario, span)
     roles = assign_roles(scenario)
-    overlays: dict[str, Any] = {
-        "replay": replay,
-        "truth": None if truth is None else truth.aligned_to(scenario),
-        "background": background,
-        "predicted": None if predict_s is None else PredictedPaths(scenario, predict_s),
-        "title": title,
-    }
-    if suffix in ANIMATED:
+    if suffix in MOVING:
         from log2sim.visualization.plot.animation import write_animation
 
-        write_animation(scenario, roles, out_path, **overlays)
-        return
-    layout = still(scenario, roles, **overlays)
+        write_animation(scenario, roles, film, overlays, progress)
+    else:
+        _save(still(scenario, roles, overlays), film.path, "figure" if options.size_px else dpi)
+    return film.path
+
+
+def still(scenario: Scenario, roles: AgentRoles, overlays: Overlays = NO_OVERLAYS) -> FigureLayout:
+    """Draw a still picture."""
+    base = draw_base(scenario, roles, overlays)
+    layout, ax, replay = base.layout, base.layout.ax, overlays.replay
+    overlaid = overlays.truth is not None or replay is not None
+    drawing.draw_tracks(ax, roles, layout.view, base.step_s, alpha=0.45 if overlaid else 1.0)
+    ghosts = None if overlaid or drawing.view_is_crowded(roles) else base.step_s
+    drawing.draw_ends(ax, roles, layout.view, ghosts_step_s=ghosts)
+    doubts.hatch_movers(ax, roles, layout.view, drawing.TRACK + 0.5, drawing.BOX + 0.6)
+    if overlays.truth is not None:
+        drawing.draw_truth(ax, overlays.truth)
+    if replay is not None:
+        drawing.draw_replay(ax, replay, roles)
+        drawing.draw_collisions(ax, new_collisions(replay)[1])
+    if tells_ends(scenario):
+        draw_observers(ax, roles, layout.view)
+    draw_warnings(ax, warned_places(replay))
+    if overlays.predicted is not None:
+        draw_predictions(ax, roles, overlays.predicted)
+    draw_labels(ax, base.labels)
+    if overlays.options.size_px is not None:
+        layout.set_width_px(overlays.options.size_px[0])
+    return layout
+
+
+def resolve_picture(requested: Path) -> FilmFile:
+    """Tell which file is written for a name, and for an animation how.
+
+    Raises
+    ------
+    ConfigError
+        When no picture ends in its suffix.
+    """
+    suffix = requested.suffix.lower()
+    if suffix not in STILL + MOVING:
+        raise ConfigError(
+            f"{requested}: a picture's name must end in {', '.join(STILL)} (still) or {', '.join(MOVING)} (moving), "
+            f"not in '{requested.suffix}'"
+        )
+    return choose_film_file(requested) if suffix in (".mp4", ".webm") else FilmFile(requested)
+
+
+def _save(layout: FigureLayout, path: Path, dpi: float | Literal["figure"]) -> None:
+    suffix = path.suffix.lower()
     # The same scenario gives the same bytes: no random element names, no dates.
     metadata: dict[str, dict[str, Any]] = {
         ".svg": {"Date": None},
         ".pdf": {"CreationDate": None},
         ".png": {"Software": None},
     }
-    with replaced(out_path) as temporary, matplotlib.rc_context({"svg.hashsalt": "log2sim"}):
+    with replaced(path) as temporary, matplotlib.rc_context({"svg.hashsalt": "log2sim"}):
         layout.figure.savefig(temporary, format=suffix[1:], dpi=dpi, metadata=metadata[suffix])
-
-
-def still(
-    scenario: Scenario,
-    roles: AgentRoles,
-    *,
-    replay: Any = None,
-    truth: Scenario | None = None,
-    background: drawing.Background | None = None,
-    predicted: PredictedPaths | None = None,
-    title: str | None = None,
-) -> FigureLayout:
-    """Draw a still picture."""
-    layout, step_s, _ = draw_base(
-        scenario, roles, replay=replay, truth=truth, background=background, title=title, predicted=predicted
-    )
-    overlaid = truth is not None or replay is not None
-    drawing.draw_tracks(layout.ax, roles, layout.view, step_s, alpha=0.45 if overlaid else 1.0)
-    ghosts = None if overlaid or drawing.view_is_crowded(roles) else step_s
-    drawing.draw_ends(layout.ax, roles, layout.view, ghosts_step_s=ghosts)
-    doubts.hatch_movers(layout.ax, roles, layout.view, drawing.TRACK + 0.5, drawing.BOX + 0.6)
-    if truth is not None:
-        drawing.draw_truth(layout.ax, truth)
-    if replay is not None:
-        drawing.draw_replay(layout.ax, replay, roles)
-        drawing.draw_collisions(layout.ax, new_collisions(replay)[1])
-    if tells_ends(scenario):
-        draw_observers(layout.ax, roles, layout.view)
-    draw_warnings(layout.ax, warned_places(replay))
-    if predicted is not None:
-        draw_predictions(layout.ax, roles, predicted)
-    drawing.draw_labels(layout.ax, roles, layout.view, step_s)
-    return layout

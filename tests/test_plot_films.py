@@ -1,0 +1,295 @@
+"""Films: codecs, sizes, frames, the part of the scenario that they show, and that they are written frame by frame."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import weakref
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import CHROMIUM, DRIVER, browsing
+from command_line import names, run
+from export_worlds import straight, world
+from matplotlib.colors import to_rgb
+
+from log2sim.datatypes import Scenario
+from log2sim.errors import ConfigError
+from log2sim.simulation.runner import replay
+from log2sim.visualization.plot import encoding
+from log2sim.visualization.plot.animated_artists import AnimatedArtists
+from log2sim.visualization.plot.animation import choose_frame_timing
+from log2sim.visualization.plot.labels import place_labels
+from log2sim.visualization.plot.options import PlotOptions, parse_extent, parse_ids, parse_size
+from log2sim.visualization.plot.overlays import Overlays
+from log2sim.visualization.plot.roles import assign_roles
+from log2sim.visualization.plot.selection import Span, cut_replay, cut_scenario, select_shown
+from log2sim.visualization.plot.style import INK
+from log2sim.visualization.plot.tracks import plot_tracks, still
+from log2sim.visualization.plot.viewport import choose_viewport
+
+SMALL = PlotOptions(size_px=(480, 320), fps=10, stop_s=0.5)
+
+
+def scene() -> Scenario:
+    parked = dataclasses.replace(straight("parked", start=(5.0, -6.0), speed=0.0), static=True)
+    return world(straight("ego"), straight("car-1", start=(0.0, 6.0), speed=8.0), parked)
+
+
+def read_film(path: Path) -> tuple[Any, list[np.ndarray]]:
+    """The video stream of a film and its frames (H, W, 3), RGB."""
+    av = pytest.importorskip("av")
+    with av.open(str(path)) as film:
+        (stream,) = film.streams
+        found = {name: getattr(stream.codec_context, name) for name in ("name", "pix_fmt", "width", "height")}
+        found["fps"] = float(stream.average_rate)
+        return found, [frame.to_ndarray(format="rgb24") for frame in film.decode(stream)]
+
+
+def test_an_mp4_is_h264_of_the_size_and_rate_that_were_asked_for(tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    out = plot_tracks(scene(), tmp_path / "film.mp4", options=PlotOptions((480, 320), fps=20, start_s=1, stop_s=1.5))
+    found, frames = read_film(out)
+    assert found == {"name": "h264", "pix_fmt": "yuv420p", "width": 480, "height": 320, "fps": 20.0}
+    assert len(frames) == 11
+    data = out.read_bytes()
+    assert data.find(b"moov") < data.find(b"mdat")
+    ink = np.abs(frames[0].astype(int) - np.rint(255 * np.array(to_rgb(INK)))).max(axis=2) <= 12
+    assert ink.sum() > 40  # BT.709 both ways; the colors of BT.601 are off by up to 20
+
+
+@pytest.mark.parametrize("name", ["film.mp4", "film.webm", "film.gif"])
+def test_the_same_scenario_gives_the_same_film(tmp_path: Path, name: str) -> None:
+    written = [plot_tracks(scene(), tmp_path / folder / name, options=SMALL) for folder in "ab"]
+    assert written[0].read_bytes() == written[1].read_bytes()
+
+
+def test_without_pyav_an_mp4_becomes_a_webm_which_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(encoding, "_import_av", lambda: None)
+    scene().save(tmp_path / "s.json")
+    options = ("--size", "480x320", "--stop", 0.3, "--fps", 10)
+    ran = run("plot", tmp_path / "s.json", "-o", tmp_path / "film.mp4", *options)
+    assert ran.code == 0, ran.err
+    (note,) = [line for line in ran.out.splitlines() if line.startswith("note:")]
+    assert "'video'" in note
+    assert note.endswith("written as film.webm")
+    assert names(tmp_path) == ["film.webm", "s.json"]
+    again = run("plot", tmp_path / "s.json", "-o", tmp_path / "film.mp4", *options)
+    assert (again.code, "film.webm: exists already" in again.line) == (2, True)
+    first = (tmp_path / "film.webm").read_bytes()
+    assert run("plot", tmp_path / "s.json", "-o", tmp_path / "film.mp4", *options, "--overwrite").code == 0
+    assert (tmp_path / "film.webm").read_bytes() == first
+    found, frames = read_film(tmp_path / "film.webm")
+    assert (found["name"], found["width"], len(frames)) == ("vp9", 480, 4)
+
+
+def test_without_h264_vp9_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("av")
+    monkeypatch.setattr(encoding, "H264", "no-such-encoder")
+    film = encoding.choose_film_file(tmp_path / "film.mp4")
+    assert film.path.name == "film.webm"
+    assert film.note == "film.mp4 needs H.264, which this PyAV lacks; written as film.webm"
+
+
+def living(count: int, alive: list[int]) -> Iterator[np.ndarray]:
+    """Frames that differ, and how many of them there are at once."""
+    seen: list[weakref.ref[np.ndarray]] = []
+    for k in range(count):
+        frame = np.full((64, 96, 3), 255, np.uint8)
+        frame[10:20, k : k + 9] = (0, 114, 178)
+        seen.append(weakref.ref(frame))
+        yield frame
+        del frame
+        alive.append(sum(r() is not None for r in seen))
+
+
+@pytest.mark.parametrize("codec", ["libx264", "libvpx-vp9", "opencv", "gif"])
+def test_frames_are_not_kept(tmp_path: Path, codec: str) -> None:
+    alive: list[int] = []
+    frames, out = living(60, alive), tmp_path / "film"
+    if codec == "gif":
+        encoding.write_gif(frames, out, 10, ["#0072B2"])
+    elif codec == "opencv":
+        encoding.write_with_opencv(frames, out.with_suffix(".webm"), 10)
+    else:
+        pytest.importorskip("av")
+        encoding.write_with_av(frames, out, 10, codec, "mp4" if codec == "libx264" else "webm")
+    assert len(alive) == 60
+    assert max(alive) <= 3
+
+
+def test_a_gif_shows_each_frame_as_it_was(tmp_path: Path) -> None:
+    from PIL import Image
+
+    frames = list(living(12, []))
+    encoding.write_gif(itertools.chain(frames[:1], frames), tmp_path / "a.gif", 10, ["#0072B2"])
+    with Image.open(tmp_path / "a.gif") as moving:
+        assert (moving.n_frames, moving.info["duration"], moving.info["loop"]) == (13, 100, 0)
+        for k, frame in enumerate(frames[:1] + frames):
+            moving.seek(k)
+            assert np.abs(np.asarray(moving.convert("RGB")).astype(int) - frame).max() <= 6
+
+
+@pytest.mark.parametrize("name", ["film.mp4", "film.webm", "film.gif"])
+def test_ctrl_c_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    show = AnimatedArtists.show
+
+    def interrupted(artists: AnimatedArtists, t_s: float) -> None:
+        if t_s > 0.25:
+            raise KeyboardInterrupt
+        show(artists, t_s)
+
+    monkeypatch.setattr(AnimatedArtists, "show", interrupted)
+    told: list[tuple[str, int, int]] = []
+    with pytest.raises(KeyboardInterrupt):
+        plot_tracks(scene(), tmp_path / name, options=SMALL, progress=lambda *step: told.append(step))
+    assert names(tmp_path) == []
+    assert told == [("drawing frames", k, 6) for k in (1, 2, 3)]
+
+
+def test_long_films_play_faster_unless_a_speed_is_given() -> None:
+    def timing(duration_s: float, suffix: str, **options: Any) -> tuple[int, float, float]:
+        found = choose_frame_timing(Span(2.0, 2.0 + duration_s), PlotOptions(**options), suffix)
+        assert found.start_s == 2.0
+        return found.frames, round(found.speed_up, 6), found.fps
+
+    assert timing(4.0, ".mp4") == (101, 1.0, 25.0)
+    assert timing(600.0, ".mp4") == (1501, 10.0, 25.0)
+    assert timing(600.0, ".mp4", speed=1) == (15001, 1.0, 25.0)
+    assert timing(4.0, ".mp4", speed=0.5, fps=50) == (401, 0.5, 50.0)
+    assert timing(60.0, ".gif") == (301, 2.0, 10.0)
+    assert timing(3.0, ".gif", fps=30) == (100, pytest.approx(1.0, abs=0.02), pytest.approx(100 / 3))
+    assert timing(0.0, ".mp4")[0] == 1
+
+
+def test_a_range_of_time_cuts_tracks_at_its_ends() -> None:
+    scenario = scene()
+    cut = cut_scenario(scenario, Span(0.6, 1.25))
+    car = next(a for a in cut.agents if a.id == "car-1")
+    assert car.waypoints.t_s[[0, -1]].tolist() == [0.6, 1.25]
+    assert car.waypoints.x_m[[0, -1]] == pytest.approx([8 * 0.6, 8 * 1.25])
+    assert np.diff(car.waypoints.t_s).min() > 0
+    result = replay(scenario, dt_s=0.05)
+    there = cut_replay(result, Span(0.6, 1.25), scenario).agent("car-1")
+    assert 0.55 < there.t_s[0] < there.t_s[-1] < 1.3
+    assert len(there.cross_track_m) == len(there.commands.gear) == len(there.t_s)
+    assert cut_scenario(scenario, Span(0.0, scenario.duration_s)) is scenario
+    early = world(straight("ego"), straight("gone", start=(0.0, 3.0), t_s=np.array([0.0, 0.5, 1.0])))
+    assert [a.id for a in cut_scenario(early, Span(2.0, 3.0)).agents] == ["ego"]
+
+
+def test_a_picture_shows_the_agents_and_the_part_of_the_map_that_it_is_asked_for() -> None:
+    scenario = scene()
+    options = PlotOptions(extent_m=(12.0, 9.0, -3.0, -4.0), agents=("car-1",))
+    shown, result = select_shown(scenario, replay(scenario, dt_s=0.05), options)
+    assert [a.id for a in shown.agents] == [a.id for a in result.agents] == ["car-1"]
+    layout = still(shown, assign_roles(shown), Overlays(options=options))
+    x0, x1, y0, y1 = *layout.ax.get_xlim(), *layout.ax.get_ylim()
+    assert (x0 + x1, y0 + y1) == pytest.approx((9.0, 5.0))
+    assert min(x1 - x0 - 15.0, y1 - y0 - 13.0) == pytest.approx(0.0, abs=1e-9)
+    with pytest.raises(ConfigError, match=r"agents: 'car1' is no agent.*'car-1'"):
+        select_shown(scenario, None, PlotOptions(agents=("car1",)))
+
+
+@pytest.mark.parametrize("size", [(640, 360), (360, 640), (1920, 1080), (300, 300)])
+def test_a_picture_has_the_size_that_was_asked_for_and_room_for_all(tmp_path: Path, size: tuple[int, int]) -> None:
+    from PIL import Image
+
+    scenario = scene()
+    out = plot_tracks(scenario, tmp_path / "a.png", options=PlotOptions(size), replay=replay(scenario, dt_s=0.05))
+    with Image.open(out) as image:
+        assert image.size == size
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["a.png", "--fps", "5"], "fps: a.png is a still picture"),
+        (["a.svg", "--size", "640x480"], "size: a.svg has no pixels"),
+        (["a.mp4", "--size", "641x480"], "expected even sides"),
+        (["a.gif", "--size", "10x480"], "expected sides of 240 to 7680 px"),
+        (["a.gif", "--size", "large"], "such as 1280x720"),
+        (["a.gif", "--fps", "60"], "expected 1 to 50 frames a second in a .gif"),
+        (["a.gif", "--speed", "0"], "expected 0.001 to 1000 times real time"),
+        (["a.png", "--start", "2", "--stop", "1"], "start, stop: 2 to 1 s"),
+        (["a.png", "--start", "9"], "within the scenario, 0 to 3 s"),
+        (["a.png", "--extent", "1,2,3"], "X0,Y0,X1,Y1"),
+        (["a.png", "--extent", "-5,0,-5,9"], "at least 1 m apart"),
+        (["a.png", "--extent", "nan,0,5,9"], "finite numbers"),
+        (["a.png", "--agents", ","], "names nobody"),
+        (["a.png", "--agents", "ego,bus"], "'bus' is no agent"),
+    ],
+)
+def test_options_that_do_not_fit_are_told_in_one_line(tmp_path: Path, arguments: list[str], said: str) -> None:
+    scene().save(tmp_path / "s.json")
+    ran = run("plot", tmp_path / "s.json", "-o", tmp_path / arguments[0], *arguments[1:])
+    assert ran.code == 2
+    assert said in ran.line
+    assert names(tmp_path) == ["s.json"]
+
+
+def test_options_are_read() -> None:
+    assert parse_size("1280X720") == (1280, 720)
+    assert parse_extent("-20,-10.5,60,4e1") == (-20.0, -10.5, 60.0, 40.0)
+    assert parse_ids(" ego, car-1,ego") == ("ego", "car-1")
+    assert parse_size(None) is parse_extent(None) is parse_ids(None) is None
+
+
+def test_labels_say_what_the_legend_then_leaves_out() -> None:
+    scenario = scene()
+    layout = still(scenario, assign_roles(scenario))
+    labels = {t.get_text() for t in layout.ax.texts}
+    assert {"ego · 18 km/h", "car-1 · 29 km/h"} <= labels
+    rows = [t.get_text() for t in layout.figure.legends[0].get_texts()]
+    assert rows[:2] == ["km/h: highest speed of each", "1 stationary"]
+
+
+def test_a_full_label_is_nearest_to_its_own_track_and_else_the_legend_has_it() -> None:
+    lanes = [
+        dataclasses.replace(straight(f"vehicle-{k}", start=(0.0, 1.2 * k)), size_m=(4.0, 1.0, 1.5)) for k in range(12)
+    ]
+    scenario = world(straight("ego", start=(0.0, -3.0)), *lanes)
+    roles = assign_roles(scenario)
+    placed = place_labels(roles, choose_viewport(roles).fitted(490, 490), 1.0)
+    assert 2 <= len(placed.told) < 13
+    for label in placed.labels:
+        (owner,) = [a for a in scenario.agents if label.text.startswith(f"{a.id} ·")] or [None]
+        if owner is not None:
+            y = {a.id: abs(a.waypoints.y_m[0] - label.place_m[1]) for a in scenario.agents}
+            assert owner.id in placed.told
+            beyond = label.place_m[0] > 17.0 or label.place_m[0] < -2.0
+            assert y[owner.id] == min(y.values()) or beyond
+    rows = [t.get_text() for t in still(scenario, roles).figure.legends[0].get_texts()]
+    listed = [row for row in rows if "vehicle-" in row]
+    assert listed == [row for row in rows if row.endswith("18 km/h") and "ego" not in row]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None or DRIVER is None, reason="no Chromium with its driver here")
+@pytest.mark.parametrize(
+    ("name", "kind"), [("film.mp4", 'video/mp4; codecs="avc1.640028"'), ("film.webm", "video/webm; codecs=vp9")]
+)
+def test_a_film_plays_in_a_browser(tmp_path: Path, name: str, kind: str) -> None:
+    pytest.importorskip("av")
+    plot_tracks(scene(), tmp_path / name, options=PlotOptions((480, 320), fps=20, start_s=0.5, stop_s=1.5))
+    page = tmp_path / "page.html"
+    page.write_text(f"<!doctype html><title>film</title><video muted src={name}></video>", encoding="utf-8")
+    with browsing(tmp_path / "profile", flags=["--allow-file-access-from-files"]) as browser:
+        browser.open(page.as_uri())
+        if not browser.run("return document.createElement('video').canPlayType(arguments[0])", kind):
+            pytest.skip(f"this Chromium has no decoder for {kind}")
+        browser.wait("document.querySelector('video').readyState >= 2")
+        video = browser.run(
+            "const v = document.querySelector('video'); return [v.videoWidth, v.videoHeight, v.duration]"
+        )
+        assert video[:2] == [480, 320]
+        assert video[2] == pytest.approx(21 / 20, abs=0.06)
+        browser.run("document.querySelector('video').play()")
+        browser.wait("document.querySelector('video').ended")
+        pixel = """const v = document.querySelector('video'), c = document.createElement('canvas');
+            c.width = v.videoWidth; c.height = v.videoHeight; const g = c.getContext('2d'); g.drawImage(v, 0, 0);
+            return [...g.getImageData(2, 2, 1, 1).data].slice(0, 3)"""
+        assert min(browser.run(pixel)) > 245  # the paper is white
