@@ -7,23 +7,14 @@ from typing import Annotated
 
 import typer
 
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, Sequence, say
-from log2sim.cli.progress import progress
-from log2sim.cli.truth import load_replay, load_truth
+from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, Sequence, Truth, say, write_to
 
 
 def plot(
     scenario: ScenarioPath,
-    out: Annotated[
-        Path,
-        typer.Option(
-            "--out", "-o", metavar="FILE", help="Picture (.png .svg .pdf) or film (.mp4 .webm .gif) to write."
-        ),
-    ],
+    out: Annotated[Path, write_to("FILE", "Picture (.png .svg .pdf) or film (.mp4 .webm .gif) to write.")],
     replay: Annotated[Path | None, typer.Option(metavar="REPLAY", help="Replay to draw over the scenario.")] = None,
-    truth: Annotated[
-        Path | None, typer.Option(metavar="TRUTH", help="Ground truth: a scenario file or a log with labels.")
-    ] = None,
+    truth: Truth = None,
     background: Annotated[
         Path | None,
         typer.Option(
@@ -33,27 +24,55 @@ def plot(
     predict: Annotated[
         float | None, typer.Option(metavar="S", help="Draw where movers were expected to go for this long, in s.")
     ] = None,
-    start: Annotated[float | None, typer.Option(metavar="S", help="Show the scenario from here on, in s.")] = None,
-    stop: Annotated[float | None, typer.Option(metavar="S", help="Show the scenario up to here, in s.")] = None,
-    extent: Annotated[
-        str | None, typer.Option(metavar="X0,Y0,X1,Y1", help="Two corners of the part of the map to show, in m.")
+    start: Annotated[
+        float | None,
+        typer.Option(metavar="S", help="First time of the scenario to show, in s.", show_default="the start"),
     ] = None,
-    agents: Annotated[str | None, typer.Option(metavar="ID,ID", help="Show these agents alone.")] = None,
+    stop: Annotated[
+        float | None, typer.Option(metavar="S", help="Last time of the scenario to show, in s.", show_default="the end")
+    ] = None,
+    extent: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X0,Y0,X1,Y1", help="Two corners of the part of the map to show, in m.", show_default="what moves"
+        ),
+    ] = None,
+    agents: Annotated[
+        str | None, typer.Option(metavar="ID,ID", help="Show these agents alone.", show_default="all")
+    ] = None,
     size: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Size in pixels, such as 1280x720; not of .svg and .pdf.")
+        str | None,
+        typer.Option(
+            metavar="WxH", help="Size in pixels, such as 1280x720; not of .svg and .pdf.", show_default="what fits"
+        ),
     ] = None,
     fps: Annotated[
-        float | None, typer.Option(metavar="N", help="Frames of a film a second. Default: 25, of a .gif 10.")
+        float | None,
+        typer.Option(metavar="N", help="Frames of a film a second.", show_default="25, of a .gif 10"),
     ] = None,
     speed: Annotated[
         float | None,
-        typer.Option(metavar="X", help="Times faster than real time. Default: 1, more for films beyond a minute."),
+        typer.Option(
+            metavar="X",
+            help="Times faster than real time that a film plays.",
+            show_default="1, or what fits into a minute, half a minute for a .gif",
+        ),
     ] = None,
     sequence: Sequence = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Draw a scenario from above: a picture or a film."""
+    """Draw a scenario from above: a picture or a film.
+
+    An .mp4 is H.264 (extra video); without that it becomes a .webm.
+
+    Examples
+    --------
+    log2sim plot scenario.json -o tracks.png
+    log2sim plot scenario.json -o film.mp4 --size 1280x720 --start 2 --stop 8
+    """
+    from log2sim.cli.progress import progress
+    from log2sim.cli.truth import load_replay, load_truth
     from log2sim.datatypes import Scenario
     from log2sim.documents import check_targets
     from log2sim.visualization.plot.options import PlotOptions, parse_extent, parse_ids, parse_size
@@ -64,7 +83,7 @@ def plot(
     options.require_fits(picture.path.suffix.lower(), picture.path.name)
     check_targets(picture.path, overwrite=overwrite)
     loaded = Scenario.load(scenario)
-    replayed = load_replay(replay, loaded) if replay is not None else None
+    replayed = load_replay(replay, loaded, quiet=quiet) if replay is not None else None
     known = load_truth(truth, loaded, sequence) if truth is not None else None
     if picture.note is not None:
         say(f"note: {picture.note}", quiet=quiet)

@@ -93,4 +93,4 @@ def draw_frames(
         canvas.restore_region(background)
         artists.show(timing.start_s + k * timing.step_s)
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
-        progress("drawing frames", k + 1, timing.frames)
+        progress("draw", k + 1, timing.frames)

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from log2sim.datatypes import Scenario
 from log2sim.visualization.plot import doubts, drawing
 from log2sim.visualization.plot.collisions import new_collisions
+from log2sim.visualization.plot.labels import draw_labels, place_labels
 from log2sim.visualization.plot.layout import legend_rows
 from log2sim.visualization.plot.road_features import draw_road, draw_signals
 from log2sim.visualization.plot.roles import AgentRoles, assign_roles, is_moving
@@ -75,11 +76,13 @@ def plot(
     if replay is not None:
         drawing.draw_replay(ax, replay, roles)
         drawing.draw_collisions(ax, new_collisions(replay)[1])
-    drawing.draw_labels(ax, roles, view, step_s)
+    placed = place_labels(roles, view, step_s)
+    draw_labels(ax, placed.labels)
     ax.set(xlim=(view.x0, view.x1), ylim=(view.y0, view.y1))
     if new if legend is None else legend:
         overlays = {"truth": truth is not None, "replay": replay is not None}
-        _draw_legend(ax, legend_rows(roles, step_s, collisions=len(new_collisions(replay)[0]), outside=0, **overlays))
+        collisions = len(new_collisions(replay)[0])
+        _draw_legend(ax, legend_rows(roles, step_s, placed.told, collisions=collisions, outside=0, **overlays))
     return ax
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import matplotlib
 
@@ -94,7 +94,8 @@ def plot_tracks(
 
         write_animation(scenario, roles, film, overlays, progress)
     else:
-        _save(still(scenario, roles, overlays), film.path, "figure" if options.size_px else dpi)
+        layout = still(scenario, roles, overlays)
+        _save(layout, film.path, layout.figure.dpi if options.size_px else dpi)
     return film.path
 
 
@@ -140,7 +141,7 @@ def resolve_picture(requested: Path) -> FilmFile:
     return choose_film_file(requested) if suffix in (".mp4", ".webm") else FilmFile(requested)
 
 
-def _save(layout: FigureLayout, path: Path, dpi: float | Literal["figure"]) -> None:
+def _save(layout: FigureLayout, path: Path, dpi: float) -> None:
     suffix = path.suffix.lower()
     # The same scenario gives the same bytes: no random element names, no dates.
     metadata: dict[str, dict[str, Any]] = {
