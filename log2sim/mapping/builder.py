@@ -15,7 +15,7 @@ from log2sim.datatypes import Log, Scenario
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.mapping.color_raster import ColorRaster, sample_mask
 from log2sim.mapping.ground_map import GroundMap
-from log2sim.mapping.ground_points import GroundPoints, PointCollector
+from log2sim.mapping.ground_points import GroundPoints, PointCollector, PreparedSweep
 from log2sim.mapping.ground_view import Image
 from log2sim.mapping.picture_warp import View, find_hidden, warp_onto
 from log2sim.mapping.pose_refinement import refine_poses
@@ -34,6 +34,7 @@ from log2sim.mapping.reflectivity import map_intensity
 from log2sim.mapping.road_users import MASK_SHRINK, RoadUsers, draw_footprints, draw_outlines
 from log2sim.mapping.standing_pictures import StandingPictures
 from log2sim.mapping.surface import Surface, estimate_surface, upsample
+from log2sim.perception.background import work_ahead
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.picture_pass import look_again
 
@@ -147,7 +148,7 @@ class GroundMapBuilder:
         colors.add(view.camera.name, image, warp, opacity.astype(np.float32))
 
     def build(self) -> GroundMap:
-        """Return the map of all that was added, as far as anything is known."""
+        """Return the map of all that was added, as far as anything is known; once, since what it is made of is let go."""
         shape = self.raster.shape
         if self._colors is None:
             self.notes.append("no color: there is no picture with a known pose")
@@ -157,9 +158,12 @@ class GroundMapBuilder:
                 self._lay(self._colors, view, *pictures.median())
             self._standing.clear()
             color, alpha = self._colors.image()
+            self._colors = None
         standing = draw_footprints([self._users.standing()], self.raster) > 0
         alpha[standing], color[standing] = 0, 0
         height, intensity = self._measured()
+        for name in ("_ground", "_likely_ground"):
+            self.__dict__.pop(name, None)
         for layer in (height, intensity):
             layer[standing] = np.nan
         whole = GroundMap(
@@ -180,12 +184,16 @@ class GroundMapBuilder:
         chosen = [(name, int(i)) for name, indices in self._sweeps.items() for i in indices]
         chosen.sort(key=lambda key: int(self._log.streams[key[0]].t_ns[key[1]]))
         collector = PointCollector(self._log, coarse, len(chosen), self._z0_m)
-        for done, (name, i) in enumerate(chosen):
-            sweep = self._reader.get(name, i)
-            t_ns = int(self._log.streams[name].t_ns[i])
-            if sweep is not None and not self._reader.watch.lidars[name].repeated.get(t_ns, False):
-                hidden = draw_footprints([self._users.at(t_ns), self._users.ego_at(t_ns)], coarse)
-                collector.add(name, sweep, hidden)
+
+        def prepare(key: tuple[str, int]) -> PreparedSweep | None:
+            name, sweep, t_ns = key[0], self._reader.get(*key), int(self._log.streams[key[0]].t_ns[key[1]])
+            if sweep is None or self._reader.watch.lidars[name].repeated.get(t_ns, False):
+                return None
+            hidden = draw_footprints([self._users.at(t_ns), self._users.ego_at(t_ns)], coarse)
+            return collector.prepare(name, sweep, hidden)
+
+        for done, prepared in enumerate(work_ahead(prepare, chosen)):
+            collector.take(prepared)
             self._progress(done + 1, len(chosen))
         points = collector.points()
         if not len(points.z):

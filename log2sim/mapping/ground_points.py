@@ -56,6 +56,24 @@ class GroundPoints:
     lidar: NDArray[np.int8]
 
 
+@dataclass(frozen=True, eq=False)
+class PreparedSweep:
+    """What is taken of one sweep.
+
+    Attributes
+    ----------
+    stamp_ns : int
+    hiding : (H, 3) float64
+        Points above the ground, m, map frame.
+    columns : tuple of arrays
+        Those of `GroundPoints`.
+    """
+
+    stamp_ns: int
+    hiding: Array
+    columns: tuple[NDArray[np.generic], ...]
+
+
 class PointCollector:
     """Gather the points near the ground of chosen sweeps.
 
@@ -84,9 +102,20 @@ class PointCollector:
 
     def add(self, lidar: str, sweep: Sweep, hidden: NDArray[np.uint8]) -> None:
         """Take a sweep; points in cells of the raster at which `hidden` (R, C) is not 0 are left out."""
+        self.take(self.prepare(lidar, sweep, hidden))
+
+    def take(self, prepared: PreparedSweep | None) -> None:
+        """Take what `prepare` made of a sweep."""
+        if prepared is not None:
+            before = self.hiding.get(prepared.stamp_ns, np.zeros((0, 3)))
+            self.hiding[prepared.stamp_ns] = np.concatenate([before, prepared.hiding])
+            self._parts.append(prepared.columns)
+
+    def prepare(self, lidar: str, sweep: Sweep, hidden: NDArray[np.uint8]) -> PreparedSweep | None:
+        """Find the points of a sweep as for `add`, for `take`; several threads may do so at once. None where no pose is known."""
         mapped = sweep_to_map(self._log, lidar, sweep, compensate=True)
         if mapped is None or not len(mapped[0]):
-            return
+            return None
         xyz, t_s = mapped
         middle_ns = sweep.stamp_ns + round(float(t_s.mean(dtype=np.float64)) * 1e9)
         map_T_lidar, known = self._log.map_T_sensor(lidar, middle_ns)
@@ -97,7 +126,7 @@ class PointCollector:
         reach = np.hypot(local[:, 0], local[:, 1])
         above = np.flatnonzero((height > MIN_HIDING_HEIGHT_M) & (height < MAX_OBSTACLE_HEIGHT_M) & (reach < REACH_M))
         above = above[:: max(len(above) // MAX_HIDING_POINTS, 1)]
-        self.hiding[sweep.stamp_ns] = np.concatenate([self.hiding.get(sweep.stamp_ns, np.zeros((0, 3))), xyz[above]])
+        hiding = xyz[above]
         near = np.flatnonzero((np.abs(height) < NEAR_GROUND_M) & (reach < REACH_M))
         near = near[:: -(-len(near) // self._most)] if len(near) > self._most else near
         cell, inside = self._raster.index_of(xyz[near, :2])
@@ -108,14 +137,15 @@ class PointCollector:
         beam = (np.arcsin(np.clip(away[usable, 2] / range_m[usable], -1, 1)) + np.pi / 2) / ELEVATION_BIN_RAD
         near, x0, y1 = near[usable], self._raster.extent_m[0], self._raster.extent_m[3]
         unknown = np.full(len(near), np.nan, np.float32)
-        self._parts.append((
+        columns = (
             np.stack([xyz[near, 0] - x0, y1 - xyz[near, 1]], axis=1).astype(np.float32),
             (xyz[near, 2] - self._z0_m).astype(np.float32),
             range_m[usable].astype(np.float32),
             unknown if sweep.intensity is None else sweep.intensity[near],
             np.minimum(beam, ELEVATION_BINS - 1).astype(np.int16),
             np.full(len(near), self._lidars.index(lidar), np.int8),
-        ))  # fmt: skip
+        )  # fmt: skip
+        return PreparedSweep(sweep.stamp_ns, hiding, columns)
 
     def points(self) -> GroundPoints:
         """Join what was gathered."""

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from log2sim.calibration.surfaces import Registration, Surfaces, register, surfaces_of
 from log2sim.calibration.twists import adjoint_of, exp_of, log_of
-from log2sim.datatypes import Log, Scenario
+from log2sim.datatypes import Log, Scenario, Sweep
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse
 from log2sim.localization.ego_sweeps import densest_lidar
 from log2sim.localization.replaced import replace_poses
+from log2sim.perception.background import work_ahead
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.lidar.cloud import sweep_to_map
 
@@ -62,12 +63,13 @@ def refine_poses(log: Log, scenario: Scenario, reader: RecordReader) -> Log:
     if log.ego is None or lidar is None:
         return log
     chosen = _choose(log, scenario, lidar)
-    keyframes = [k for k in (_keyframe(log, reader, lidar, int(i)) for i in chosen) if k is not None]
+    made = work_ahead(lambda index: _keyframe(log, reader, lidar, index), chosen.tolist())
+    keyframes = [keyframe for keyframe in made if keyframe is not None]
     if len(keyframes) < MIN_KEYFRAMES:
         return log
     pairs = [(j - lag, j) for j in range(len(keyframes)) for lag in LAGS if j >= lag]
-    found = [(i, j, _registered(keyframes[i], keyframes[j])) for i, j in pairs]
-    links = [(i, j, registration) for i, j, registration in found if registration is not None]
+    found = work_ahead(lambda pair: _registered(keyframes[pair[0]], keyframes[pair[1]]), pairs)
+    links = [(*pair, registration) for pair, registration in zip(pairs, found) if registration is not None]
     twists = solve_twists(keyframes, links)
     return replace_poses(log, corrected(log.ego, np.array([k.t_ns for k in keyframes]), twists))
 
@@ -166,16 +168,21 @@ def _keyframe(log: Log, reader: RecordReader, lidar: str, index: int) -> Keyfram
     """Read a sweep and find its surfaces, in the ego's frame at its stamp; None where it has too few."""
     sweep = reader.get(lidar, index)
     t_ns = int(log.streams[lidar].t_ns[index])
-    mapped = None if sweep is None else sweep_to_map(log, lidar, sweep, compensate=True)
+    mapped = None if sweep is None else sweep_to_map(log, lidar, _thinned(sweep), compensate=True)
     assert log.ego is not None
     pose, known = log.ego.at(t_ns)
     if mapped is None or not known[0] or reader.watch.lidars[lidar].repeated.get(t_ns, False):
         return None
-    points = mapped[0][:: max(len(mapped[0]) // MAX_POINTS, 1)]
-    local = (points - pose[0, :3, 3]) @ pose[0, :3, :3]
+    local = (mapped[0] - pose[0, :3, 3]) @ pose[0, :3, :3]
     # The ego itself moves with every sweep.
     surfaces = surfaces_of(local[np.hypot(local[:, 0], local[:, 1]) > MIN_RANGE_M])
     return None if surfaces is None else Keyframe(t_ns, pose[0], surfaces)
+
+
+def _thinned(sweep: Sweep) -> Sweep:
+    """Return every second, third ... point of a sweep, as far as there are too many."""
+    step = max(len(sweep.xyz_m) // MAX_POINTS, 1)
+    return replace(sweep, xyz_m=sweep.xyz_m[::step], t_ns=None if sweep.t_ns is None else sweep.t_ns[::step])
 
 
 def _registered(first: Keyframe, second: Keyframe) -> Registration | None:

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Log
+from log2sim.perception.background import work_ahead
 from log2sim.perception.frames import RecordReader
 from log2sim.perception.record_checks.thumbnails import Thumbnail, shrink
-
-BACKGROUND_THREADS = 2
-# Pictures that are decoded ahead of the one in use, which bounds the memory.
-AHEAD = 6
 
 
 class PictureConsumer(Protocol):
@@ -62,22 +57,8 @@ def _decoded(
 ) -> Iterator[tuple[str, int, NDArray[np.uint8] | None, Thumbnail]]:
     """Yield camera, index, picture (None where it cannot be read) and thumbnail, decoded a few ahead in threads."""
 
-    def decode(camera: str, index: int) -> tuple[NDArray[np.uint8] | None, Thumbnail]:
-        image = reader.get(camera, index)
-        return image, np.zeros((0, 0), np.float32) if image is None else shrink(image)
+    def decode(key: tuple[str, int]) -> tuple[str, int, NDArray[np.uint8] | None, Thumbnail]:
+        image = reader.get(*key)
+        return *key, image, np.zeros((0, 0), np.float32) if image is None else shrink(image)
 
-    waiting: deque[tuple[str, int, Future[tuple[NDArray[np.uint8] | None, Thumbnail]]]] = deque()
-    with ThreadPoolExecutor(BACKGROUND_THREADS) as pool:
-        for camera, index in order:
-            waiting.append((camera, index, pool.submit(decode, camera, index)))
-            if len(waiting) > AHEAD:
-                yield _next(waiting.popleft())
-        while waiting:
-            yield _next(waiting.popleft())
-
-
-def _next(
-    item: tuple[str, int, Future[tuple[NDArray[np.uint8] | None, Thumbnail]]],
-) -> tuple[str, int, NDArray[np.uint8] | None, Thumbnail]:
-    camera, index, future = item
-    return camera, index, *future.result()
+    return work_ahead(decode, order)

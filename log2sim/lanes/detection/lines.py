@@ -128,15 +128,22 @@ def _line_of(curve: Curve, pieces: Pieces, stretch: Stretch, traced: Trace) -> P
 
 def without_repeats(lines: list[PaintedLine]) -> list[PaintedLine]:
     """Leave out lines that lie on stronger ones."""
-    kept: list[PaintedLine] = []
-    taken = np.zeros((0, 2))
-    for line in sorted(lines, key=lambda one: (-one.log_odds, -one.length_m)):
-        dense = _dense(line.xy)
-        if len(taken) and np.mean(cKDTree(taken).query(dense, distance_upper_bound=1.0)[0] < REPEAT_M) > 0.5:
-            continue
-        kept.append(line)
-        taken = np.concatenate([taken, dense])
-    return kept
+    order = sorted(lines, key=lambda one: (-one.log_odds, -one.length_m))
+    dense = [_dense(line.xy) for line in order]
+    if not dense:
+        return []
+    owner = np.repeat(np.arange(len(dense)), [len(points) for points in dense])
+    tree = cKDTree(np.concatenate(dense))
+    kept = np.zeros(len(dense), dtype=bool)
+    for k, points in enumerate(dense):
+        near = tree.query_ball_point(points, np.nextafter(REPEAT_M, 0), return_sorted=False)
+        count = np.array([len(found) for found in near])
+        # Which of the points of this line are near one of a stronger line that was kept.
+        covered = np.bincount(
+            np.repeat(np.arange(len(points)), count), kept[owner[np.concatenate(near).astype(np.intp)]]
+        )
+        kept[k] = np.mean(covered > 0) <= 0.5
+    return [line for line, keep in zip(order, kept) if keep]
 
 
 def _dense(xy: Array) -> Array:

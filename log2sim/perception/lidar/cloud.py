@@ -211,7 +211,7 @@ def deskew(log: Log, lidar: str, sweep: Sweep, t_ns: NDArray[np.int64]) -> Array
         return None
     place = (t_ns - first) / max(span, 1) * bins
     k = np.minimum(place.astype(np.int64), bins - 1)
-    order = np.argsort(k, kind="stable")
+    order = np.argsort(k.astype(np.uint16), kind="stable")  # short numbers are sorted by their digits
     edges = np.searchsorted(k[order], np.arange(bins + 1))
     out = np.empty((len(t_ns), 3))
     sorted_points = np.asarray(sweep.xyz_m, dtype=np.float64)[order]
