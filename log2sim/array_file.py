@@ -52,8 +52,8 @@ class ArrayFile:
         Of the arrays that stay in memory.
     """
 
-    def __init__(self, memory_bytes: int = MEMORY_BYTES) -> None:
-        self.memory_bytes = memory_bytes
+    def __init__(self, memory_bytes: int | None = None) -> None:
+        self.memory_bytes = MEMORY_BYTES if memory_bytes is None else memory_bytes
         self._kept = 0
         self._size = 0
         self._file: BinaryIO | None = None
