@@ -11,7 +11,7 @@ import pytest
 from log2sim.datatypes import Detections, Log, Scenario, Signal
 from log2sim.geometry import box_corners, inverse, project
 from log2sim.perception.detect.classes import COCO_80, COCO_91, TRAFFIC_LIGHT, classes_from_names
-from log2sim.perception.light_boxes import LightBox, crop_lights, with_range
+from log2sim.perception.light_boxes import LightBox, crop_lights, with_ranges
 from log2sim.signals.lamps import STATES, lamp_evidence
 from log2sim.signals.placing import place_lights
 from log2sim.signals.states import changes_of, most_probable_states, rates
@@ -206,5 +206,7 @@ def test_points_in_the_middle_of_a_box_give_its_range() -> None:
     view = view_of(log, "front", box.t_ns)
     assert view is not None
     expected = np.linalg.norm(signal.position_m - view.map_T_cam[:3, 3])
-    assert with_range(box, view, cloud).range_m == pytest.approx(expected, abs=0.05)
-    assert np.isnan(with_range(LightBox("front", box.t_ns, box.box_px + 150, 0.5, box.crop), view, cloud).range_m)
+    aside = LightBox("front", box.t_ns, box.box_px + 150, 0.5, box.crop)
+    near, none = with_ranges([box, aside], view, cloud)
+    assert near.range_m == pytest.approx(expected, abs=0.05)
+    assert np.isnan(none.range_m)

@@ -25,7 +25,7 @@ from log2sim.perception.lidar.measure import measure_view, project_cloud
 from log2sim.perception.lidar.measure_boxes import measure_boxes, outside_ego
 from log2sim.perception.lidar.projection import View, view_of
 from log2sim.perception.lidar.viewpoints import join_parts
-from log2sim.perception.light_boxes import LightBox, with_range
+from log2sim.perception.light_boxes import LightBox, with_ranges
 from log2sim.perception.obstacle_list import ObstacleList
 from log2sim.perception.prefetch import CloudOptions, CloudPrefetcher, obstacles_of
 from log2sim.perception.sync import Schedule
@@ -194,11 +194,11 @@ class _FirstPass:
 
     def range_lights(self, tick: int, lights: list[LightBox], clouds: Sequence[Cloud | None]) -> list[LightBox]:
         """Return the traffic lights of a tick with distances where LiDAR points are on them."""
-        by_camera = dict(zip(self.schedule.frames, clouds))
         out = []
-        for light in lights:
-            view, cloud = self._view(light.camera, tick), by_camera[light.camera]
-            out.append(light if view is None or cloud is None else with_range(light, view, cloud))
+        for camera, cloud in zip(self.schedule.frames, clouds):
+            of_camera = [light for light in lights if light.camera == camera]
+            view = self._view(camera, tick) if of_camera else None
+            out += of_camera if view is None or cloud is None else with_ranges(of_camera, view, cloud)
         return out
 
     def _end(self, camera: str) -> str:

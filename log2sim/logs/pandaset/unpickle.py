@@ -10,7 +10,6 @@ import io
 import pickle
 import re
 import struct
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
@@ -21,6 +20,13 @@ from numpy.typing import NDArray
 from log2sim.errors import LogError, RecordError
 from log2sim.input_files import read_file
 from log2sim.logs.pandaset.arrow_text import decode_text
+
+try:  # a third of the time, see the extra `pandaset`
+    from isal.isal_zlib import IsalError as GzipError
+    from isal.isal_zlib import decompressobj
+except ImportError:
+    from zlib import decompressobj
+    from zlib import error as GzipError
 
 MAX_TABLE_BYTES = 512 * 1024 * 1024
 # Cells that become objects of Python: a few bytes of a pickle can name the same text again and again.
@@ -43,14 +49,14 @@ def read_pickled_table(path: Path, error: type[LogError] = RecordError, limit_by
         table = _TableUnpickler(io.BytesIO(data)).load()
         return _columns(table)
     except (
-        pickle.UnpicklingError, zlib.error, struct.error, EOFError, ValueError, TypeError, KeyError, IndexError,
+        pickle.UnpicklingError, GzipError, struct.error, EOFError, ValueError, TypeError, KeyError, IndexError,
         AttributeError, AssertionError, OverflowError, RecursionError,
     ) as problem:  # fmt: skip
         raise error(f"{path}: not a pickled table: {problem or type(problem).__name__}") from None
 
 
 def _gunzip(packed: bytes, limit_bytes: int) -> bytes:
-    unpacker = zlib.decompressobj(wbits=31)
+    unpacker = decompressobj(wbits=31)
     data = unpacker.decompress(packed, limit_bytes)
     if unpacker.unconsumed_tail:
         raise ValueError(f"unpacks to more than the {limit_bytes} bytes that a table may have")

@@ -32,8 +32,8 @@ class Tile:
     v1: int
 
     def cut(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Crop the tile (h, w, 3) from an image (H, W, 3)."""
-        return np.ascontiguousarray(image[self.v0 : self.v1, self.u0 : self.u1])
+        """Crop the tile (h, w, 3) from an image (H, W, 3), without a copy."""
+        return image[self.v0 : self.v1, self.u0 : self.u1]
 
 
 def plan_tiles(width_px: int, height_px: int, tiles: Literal["auto"] | int, input_px: int | None) -> list[Tile]:

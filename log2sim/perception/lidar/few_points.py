@@ -5,6 +5,7 @@ A sensor with 32 layers has 2 to 6 points on a person at 20 to 30 m.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -51,17 +52,24 @@ def measure_few_points(rows: Measurements, view: View, cloud: Cloud) -> Measurem
     if len(wanted) == 0:
         return rows
     visible = project_points(view, cloud.origin, cloud.obstacle_columns)
-    free = ~_owned(cloud.xyz[cloud.obstacles[visible.index], :2] + cloud.origin[:2], rows)
+
+    def is_free(chosen: NDArray[np.intp]) -> NDArray[np.bool_]:
+        return ~_owned(cloud.xyz[cloud.obstacles[visible.index[chosen]], :2] + cloud.origin[:2], rows)
+
     columns: dict[str, Any] = {k: v.copy() if isinstance(v, np.ndarray) else v for k, v in vars(rows).items()}
     for k in wanted.tolist():
-        chosen = _body_points(visible, rows, k, free, float(view.camera.K[1, 1]))
+        chosen = _body_points(visible, rows, k, is_free, float(view.camera.K[1, 1]))
         if len(chosen):
             _write(columns, k, view, cloud, cloud.obstacles[visible.index[chosen]], visible.depth[chosen])
     return Measurements(**columns)
 
 
 def _body_points(
-    visible: ProjectedPoints, rows: Measurements, k: int, free: NDArray[np.bool_], focal_px: float
+    visible: ProjectedPoints,
+    rows: Measurements,
+    k: int,
+    is_free: Callable[[NDArray[np.intp]], NDArray[np.bool_]],
+    focal_px: float,
 ) -> NDArray[np.intp]:
     """Choose the points of the body in the box of row `k` among the n points of an image; none where nothing fits.
 
@@ -71,8 +79,8 @@ def _body_points(
     rows : Measurements
         Of the frame.
     k : int
-    free : (n,) bool
-        Points that are no other object's.
+    is_free : callable
+        Marks those of some of the points that are no other object's.
     focal_px : float
         Vertical.
     """
@@ -80,17 +88,27 @@ def _body_points(
     u0, v0, u1, v1 = boxes_px[k].tolist()
     width, height = u1 - u0, v1 - v0
     u, v, depth = visible.u, visible.v, visible.depth
-    off = (height * depth / focal_px / tall_m - 1) / HEIGHT_SIGMA_SHARE
-    person = free & (np.abs(off) <= MAX_HEIGHT_SIGMAS)
     inner = np.abs(u - (u0 + u1) / 2) <= (0.5 - SIDE_SHARE) * width
-    inside = np.flatnonzero(person & inner & (v >= v0) & (v <= v1))
+    inside = np.flatnonzero(inner & (v >= v0) & (v <= v1))
+    inside = inside[np.abs(_off_height(depth[inside], height, focal_px, tall_m)) <= MAX_HEIGHT_SIGMAS]
+    inside = inside[is_free(inside)] if len(inside) >= MIN_POINTS else inside
     if len(inside) < MIN_POINTS:
         return inside[:0]
     inside = inside[np.argsort(depth[inside], kind="stable")]
     bodies = np.split(inside, np.flatnonzero(np.diff(depth[inside]) > MAX_DEPTH_GAP_M) + 1)
     around = _around(visible, boxes_px, k)
     bodies = [b for b in bodies if len(b) >= MIN_POINTS and not _goes_on(visible, b, around, boxes_px[k])]
-    return max(bodies, key=lambda b: float(np.log(len(b)) - off[b].mean() ** 2 / 2), default=inside[:0])
+
+    def likelihood(body: NDArray[np.intp]) -> float:
+        off = _off_height(depth[body], height, focal_px, tall_m)
+        return float(np.log(len(body)) - off.mean() ** 2 / 2)
+
+    return max(bodies, key=likelihood, default=inside[:0])
+
+
+def _off_height(depth_m: NDArray[np.float32], height_px: float, focal_px: float, tall_m: float) -> NDArray[np.float32]:
+    """Return by how many sigma a body of some height in px would be off a person's at depths (n,)."""
+    return np.asarray((height_px * depth_m / focal_px / tall_m - 1) / HEIGHT_SIGMA_SHARE)
 
 
 def _owned(xy: Array, rows: Measurements) -> NDArray[np.bool_]:
@@ -108,12 +126,13 @@ def _around(visible: ProjectedPoints, boxes_px: Array, k: int) -> NDArray[np.int
     u0, v0, u1, v1 = boxes_px[k].tolist()
     beside, above = BESIDE_SHARE * (u1 - u0), ABOVE_SHARE * (v1 - v0)
     u, v = visible.u, visible.v
-    found = (u >= u0 - beside) & (u <= u1 + beside) & (v >= v0 - above) & (v <= v1)
-    found &= (u < u0) | (u > u1) | (v < v0)
+    near = np.flatnonzero((u >= u0 - beside) & (u <= u1 + beside) & (v >= v0 - above) & (v <= v1))
+    u, v = u[near], v[near]
+    found = (u < u0) | (u > u1) | (v < v0)
     for j, (a0, b0, a1, b1) in enumerate(boxes_px.tolist()):
         if j != k and not (a0 <= u0 and a1 >= u1):
             found &= ~((u >= a0) & (u <= a1) & (v >= b0) & (v <= b1))
-    return np.flatnonzero(found)
+    return near[found]
 
 
 def _goes_on(visible: ProjectedPoints, body: NDArray[np.intp], around: NDArray[np.intp], box_px: Array) -> bool:

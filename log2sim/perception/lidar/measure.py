@@ -75,12 +75,12 @@ def _measure_robustly(rows: Measurements, view: View, cloud: Cloud) -> Measureme
     """Assign a cluster to every row and measure its extents."""
     points, columns_m = cloud.obstacles, cloud.obstacle_columns
     visible = project_points(view, cloud.origin, columns_m)
-    index, uv = points[visible.index], np.stack([visible.u, visible.v], axis=1)
-    xyz = columns_m[:, visible.index].T
-    range_m = np.linalg.norm(xyz - cloud.sensor, axis=1)
+    index = points[visible.index]
     options, inside = [], points_in_image_boxes(visible, rows.box_px, MARGIN)
     for k, i in enumerate(inside):
-        found = candidate_clusters(xyz[i], uv[i], range_m[i], rows.box_px[k], str(rows.category[k]))
+        xyz, uv = columns_m[:, visible.index[i]].T, np.stack([visible.u[i], visible.v[i]], axis=1)
+        range_m = np.linalg.norm(xyz - cloud.sensor, axis=1)
+        found = candidate_clusters(xyz, uv, range_m, rows.box_px[k], str(rows.category[k]))
         options.append([(i[members], score) for members, score in found])
     columns, assigned = writable(rows), assign_clusters(options, rows.box_px, len(index))
     taken = np.bincount(np.concatenate([*assigned, index[:0]]), minlength=len(index)) > 0
@@ -93,7 +93,9 @@ def _measure_robustly(rows: Measurements, view: View, cloud: Cloud) -> Measureme
             members = np.union1d(members, grown)
         if MAX_SIZE_M[category][0] >= MIN_LONG_M:
             rest = points if rows.truncated[k] else index[inside[k]]
-            rest = np.setdiff1d(rest, np.union1d(members, index[taken]))
+            other = np.ones(len(cloud.xyz), dtype=bool)
+            other[members] = other[index[taken]] = False
+            rest = rest[other[rest]]
             members = np.union1d(members, rest[_continuation(cloud, members, rest, MAX_SIZE_M[category][0])])
         box = rows.box_px[k]
         # The image box of a long vehicle is as high as its near end looks.
