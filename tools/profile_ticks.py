@@ -170,7 +170,7 @@ def measure(open_anew: Callable[[], Log], config: Config) -> tuple[Measured, Sch
     log, kept = open_anew(), list[Run]()
 
     def reconstruct() -> None:
-        run = start(log, config)
+        run = start(log, config, cache=False)
         kept.append(run)
         observations = first_pass(run)
         look_around(run, observations, second_pass(run, observations))

@@ -125,6 +125,14 @@ def software_key() -> str:
     for pattern in SOURCES:
         for source in sorted(package.glob(pattern)):
             value.update(source.read_bytes())
-    # OpenCV and ONNX Runtime choose their code by the instructions that the processor has, and sums differ in the last bit.
-    parts = (np.__version__, cv2.__version__, simplejpeg.__version__, platform.machine(), cv2.getCPUFeaturesLine())
+    parts = (np.__version__, cv2.__version__, simplejpeg.__version__, platform.machine(), _instructions())
     return "\n".join((value.hexdigest(), *parts))
+
+
+def _instructions() -> str:
+    """Return the instructions that the processor has: libraries choose their code by them, and sums differ in the last bits."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:  # not on Linux
+        return platform.processor()
+    return next((line for line in lines if line.startswith(("flags", "Features"))), platform.processor())
