@@ -232,6 +232,24 @@ def test_detectors_that_do_not_say_what_they_depend_on_are_asked_again(
     assert not folder.exists()
 
 
+def test_a_function_is_asked_once_where_it_states_what_it_depends_on(tiny_folder: Path, folder: Path) -> None:
+    asked: list[int] = []
+
+    def find(image: Any) -> list[tuple[float, float, float, float, float, str]]:
+        asked.append(len(image))
+        return [(10.0, 20.0, 60.0, 80.0, 0.9, "car")]
+
+    log = open_log(tiny_folder)
+    for expected in (TICKS, 2 * TICKS):
+        first_pass(start(log, config(), detector=find))
+        assert len(asked) == expected
+    find.cache_key = "find 1"  # type: ignore[attr-defined]
+    for min_score, expected in ((0.0, 3 * TICKS), (0.0, 3 * TICKS), (0.5, 4 * TICKS)):
+        detect = {"name": "seeing", "min_score": min_score}
+        first_pass(start(log, config(detect=detect), detector=find))
+        assert len(asked) == expected
+
+
 def test_a_folder_that_cannot_be_used_costs_the_cache_alone(
     tiny_folder: Path, folder: Path, made: list[Seeing]
 ) -> None:

@@ -101,6 +101,12 @@ class FunctionDetector:
     default_min_score: float = 0.0
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
+    @property
+    def cache_key(self) -> str | None:
+        """What the function states of its kind, with the score; None where it states nothing."""
+        stated = getattr(self.function, "cache_key", None)
+        return f"{stated} {self.min_score}" if isinstance(stated, str) else None
+
     def detect(self, frame: Frame) -> Detections:
         """Call the function with a copy of the picture, one call at a time.
 
