@@ -18,10 +18,11 @@ from log2sim.errors import LogError
 from log2sim.lanes.detection.markings import find_markings
 from log2sim.lanes.graph.lane_graph import infer_lanes
 from log2sim.mapping.builder import GroundMapBuilder
-from log2sim.mapping.pose_refinement import place_as_given, refine_poses
+from log2sim.mapping.pose_refinement import MAX_KEYFRAMES, place_as_given, refine_poses
 from log2sim.outcome import Outcome
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.frames import RecordReader
+from log2sim.perception.kept_sweeps import KeepingReader
 from log2sim.perception.picture_pass import PictureConsumer, look_again
 from log2sim.plan import Decision, Plan, Stage
 from log2sim.signals.traffic_lights import find_signals
@@ -76,7 +77,7 @@ class Description:
 def describe(scenario: Scenario, recorded: Recorded) -> Description:
     """Add what the plan keeps of lanes, colors and traffic lights to a scenario."""
     log, plan = recorded.log, recorded.plan
-    reader = RecordReader(log)
+    reader = KeepingReader(log, MAX_KEYFRAMES)
     with recorded.clock.stage("map poses", recorded.report_progress):
         started = start_map(scenario, recorded, reader) if plan.keeps(Stage.LANES) else None
     colors = ColorSampler(log, scenario) if plan.keeps(Stage.COLORS) else None
@@ -85,7 +86,7 @@ def describe(scenario: Scenario, recorded: Recorded) -> Description:
     with recorded.clock.stage("pictures", recorded.report_progress):
         look_again(log, reader, consumers, lambda done, total: recorded.report_progress("pictures", done, total))
     with recorded.clock.stage("lanes", recorded.report_progress):
-        features = None if started is None else with_lanes(read_map(started, log), scenario)
+        features = None if started is None else with_lanes(read_map(started, log, reader), scenario)
     with recorded.clock.stage("colors"):
         agents = scenario.agents if colors is None else with_colors(scenario.agents, colors)
     with recorded.clock.stage("signals"):
@@ -125,11 +126,12 @@ def start_map(scenario: Scenario, recorded: Recorded, reader: RecordReader) -> S
         return StartedMap(log, None, (f"no map of the ground: {problem}",))
 
 
-def read_map(started: StartedMap, log: Log) -> MapFeatures:
+def read_map(started: StartedMap, log: Log, reader: KeepingReader) -> MapFeatures:
     """Find markings and borders in the map, if there is one, and put them where the poses of the log have them."""
     if started.builder is None:
         return MapFeatures(notes=started.notes)
     ground = started.builder.build()
+    reader.forget()
     markings, borders, notes = find_markings(ground)
     features = MapFeatures(markings, borders, notes=(*ground.notes, *notes))
     return features.moved(lambda points_m: place_as_given(points_m, started.log, log))

@@ -145,7 +145,14 @@ def azimuth_step_rad(xy: Array) -> float:
     turned = rotate(xy, -float(np.arctan2(middle[1], middle[0])))
     steps = np.diff(np.sort(np.arctan2(turned[:, 1], turned[:, 0])))
     steps = steps[steps > MIN_AZIMUTH_STEP_RAD]
-    return float(np.median(steps)) if len(steps) else 0.0
+    return _median(steps) if len(steps) else 0.0
+
+
+def _median(values: Array) -> float:
+    """Return the median of values (N,), N > 0; `np.median` takes several times as long for a few hundred."""
+    k = len(values) // 2
+    ordered = np.partition(values, k)
+    return float(ordered[k]) if len(values) % 2 else float((ordered[:k].max() + ordered[k]) / 2)
 
 
 def sample_surface(range_m: Array, max_count: int) -> NDArray[np.intp]:
@@ -200,7 +207,12 @@ def upper_median(values: NDArray[Any]) -> float:
 def rotate(xy: Array, angle_rad: Array | float) -> Array:
     """Rotate points (..., 2) counter-clockwise by one angle or by one each (...)."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
-    return np.stack([xy[..., 0] * c - xy[..., 1] * s, xy[..., 0] * s + xy[..., 1] * c], axis=-1)
+    x, y = xy[..., 0], xy[..., 1]
+    first = x * c - y * s
+    # Twice as fast as `np.stack`, for the few points of a cluster.
+    out = np.empty((*np.shape(first), 2), dtype=np.result_type(first))
+    out[..., 0], out[..., 1] = first, x * s + y * c
+    return out
 
 
 def axes_swapped(extents_m: Array, sensor: Array, typical: Array) -> bool:
