@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from log2sim import registry
 from log2sim.config_sections import LidarConfig
@@ -80,7 +80,7 @@ def create_lidar_detector(name: str, log: Log, settings: LidarConfig) -> LidarDe
     return checked(detector, registry.say_plugin("lidar_detector", rest))
 
 
-def checked(detector: LidarDetector, source: str) -> LidarDetector:
+def checked(detector: Any, source: str) -> LidarDetector:
     """Return a detector of somebody else whose faults are told in one line each that begins with `source`.
 
     Raises
