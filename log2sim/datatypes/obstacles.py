@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes.log import Deferred
+from log2sim.datatypes.deferred import Deferred
 from log2sim.datatypes.rays import Rays
 from log2sim.geometry import Array
 
@@ -38,12 +38,12 @@ class Obstacles:
 
     stamp_ns: int
     origin: Array
-    xyz: Deferred[NDArray[np.float32]] = Deferred()  # noqa: RUF009  # a descriptor
-    t_s: Deferred[NDArray[np.float32]] = Deferred()  # noqa: RUF009  # a descriptor
+    xyz: Deferred[NDArray[np.float32]] = Deferred()  # a descriptor
+    t_s: Deferred[NDArray[np.float32]] = Deferred()  # a descriptor
     sensor: NDArray[np.float32]  # type: ignore[misc]  # those before it are descriptors, they have no default
-    free: Deferred[Rays | None] = Deferred(None)  # noqa: RUF009  # a descriptor
+    free: Deferred[Rays | None] = Deferred(None)  # a descriptor
     viewpoints: NDArray[np.float32] | None = None
-    seen_from: Deferred[NDArray[np.uint8] | None] = Deferred(None)  # noqa: RUF009  # a descriptor
+    seen_from: Deferred[NDArray[np.uint8] | None] = Deferred(None)  # a descriptor
 
     def sensor_of(self, index: NDArray[np.intp]) -> NDArray[np.float32]:
         """Return the position (3,) of the sensor that sees most of the points at `index`."""
