@@ -592,6 +592,14 @@ def test_collisions_of_the_replay_are_marked_and_visited(browser: Browser, tmp_p
     assert marks == [
         ["known", f"ego and car collide at {event['t_s']:.2f} s, in the scenario itself"], ["new", "car collide at 3.00 s"],
     ]  # fmt: skip
+    script = """return [...document.querySelectorAll('#events .label')].map((label, k) => {
+        const at = document.querySelectorAll('#events button')[k].getBoundingClientRect(), box = label.getBoundingClientRect();
+        return [label.textContent, (box.left + box.right) / 2 - (at.left + at.right) / 2];
+    })"""
+    labels = browser.run(script)
+    assert [text for text, _ in labels] == ["ego × car", "car"]
+    assert max(abs(off) for _, off in labels) < 1.5
+    assert text_of(browser, "collided-count") == "2 collisions"
     browser.press("e")
     assert time_of(browser) == pytest.approx(event["t_s"], abs=1e-4)
     assert browser.run("return log2sim.chosen") == "ego"

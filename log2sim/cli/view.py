@@ -12,7 +12,7 @@ from log2sim.cli.options import Cameras, Overwrite, Quiet, ScenarioPath, Sequenc
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from log2sim.datatypes import Scenario
+    from log2sim.datatypes import Log, Scenario
     from log2sim.visualization.recording.recording import Recorded
 
 DEFAULT_MAX_MB = 40.0
@@ -86,7 +86,7 @@ def view(
             from log2sim.cli.background import load_background
 
             layers["background"] = load_background(background, loaded, sequence, report_progress)
-        elif log is not None and (opened := layers["recorded"].log).cameras and opened.ego is not None:
+        elif log is not None and _shows_ground(opened := layers["recorded"].log):
             from log2sim.cli.background import map_of
 
             layers["background"] = map_of(opened, loaded, report_progress)
@@ -111,6 +111,11 @@ def _recorded(
 
     log = localize_like(open_log(path, sequence=sequence), scenario.provenance)
     return Recorded(log, max_bytes, cameras, progress)
+
+
+def _shows_ground(log: Log) -> bool:
+    """Whether a log has a camera whose place is known, so that its ground can be mapped."""
+    return any(camera.mount == "map" or log.ego is not None for camera in log.cameras.values())
 
 
 def _metrics(path: Path) -> tuple[str, str]:

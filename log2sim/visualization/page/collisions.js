@@ -28,19 +28,16 @@ const nameCollisions = (painter, events, t) => {
   }
 };
 
-// Hide labels below the slider that would cover an earlier one, and keep the rest inside.
+// Keep labels below the slider inside, and hide those that would cover another; what only the replay has comes first.
 const placeEventLabels = () => {
-  const whole = byId("events").clientWidth;
-  let end = -Infinity;
-  for (const label of byId("events").querySelectorAll(".label")) {
-    label.style.visibility = "hidden";
+  const whole = byId("events").clientWidth, taken = [];
+  for (const label of [...byId("events").querySelectorAll(".label.new"), ...byId("events").querySelectorAll(".label:not(.new)")]) {
     label.style.marginLeft = "0";
-    const half = label.offsetWidth / 2, at = label.offsetLeft + half;
-    const from = Math.min(Math.max(at - half, 0), Math.max(whole - 2 * half, 0));
+    const width = label.offsetWidth, at = label.offsetLeft, from = Math.min(Math.max(at - width / 2, 0), whole - width);
+    const free = from >= 0 && taken.every(([left, right]) => from > right + 6 || from + width < left - 6);
     label.style.marginLeft = `${from - at}px`;
-    if (from < end) continue;
-    label.style.visibility = "visible";
-    end = from + 2 * half + 6;
+    label.style.visibility = free ? "visible" : "hidden";
+    if (free) taken.push([from, from + width]);
   }
 };
 

@@ -87,9 +87,20 @@ const toggle = (layer) => {
 const colorPoints = () => {
   if (!data.points?.entry.intensity) return;
   data.points.byIntensity = !data.points.byIntensity;
-  data.points.applyTheme();
-  byId("points-color").textContent = data.points.byIntensity ? "by intensity" : "by height";
+  showPointColors();
   requestDraw();
+};
+
+// The colors of points with what they stand for.
+const showPointColors = () => {
+  const button = byId("points-color");
+  data.points?.applyTheme();
+  if (button === null) return;
+  const ramp = element("span"), [lowest, step] = data.points.entry.height_m;
+  ramp.style.background = `linear-gradient(90deg, ${data.points.colors.join(", ")})`;
+  const range = data.points.byIntensity ? "weak to strong" : `${lowest} to ${(lowest + 255 * step).toFixed(0)} m above the ground`;
+  button.replaceChildren(ramp, data.points.byIntensity ? "by intensity" : "by height");
+  button.title = `Color of the points: ${range} (h)`;
 };
 
 // On a narrow screen the layers are behind a button.
@@ -155,7 +166,7 @@ const listen = () => {
   window.addEventListener("hashchange", readAddress);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
     applyTheme(data.layers);
-    data.points?.applyTheme();
+    showPointColors();
     list.show();
     listDoubtful();
     listWarnings(data.warnings, data.warned, showEvent);
@@ -205,9 +216,10 @@ const start = () => {
     byId("layers").append(button);
   }
   if (data.points?.entry.intensity) {
-    const color = element("button", { id: "points-color", type: "button", title: "Color of the points (h)" }, "by height");
+    const color = element("button", { id: "points-color", type: "button" });
     color.addEventListener("click", colorPoints);
     byId("layers").append(color);
+    showPointColors();
   }
   for (const note of data.recording?.notes ?? []) byId("notes").append(element("p", {}, note));
   byId("pictures").hidden = pictures === null;

@@ -44,7 +44,8 @@ class CameraTile {
     this.key = key;
     const ctx = scaledContext(this.canvas), { clientWidth: width, clientHeight: height } = this.canvas;
     const picture = this.shown < 0 ? null : this.decoded.get(this.shown);
-    this.caption.textContent = this.shown < 0 ? `${this.name}: no picture` : `${this.name} · ${this.t[this.shown].toFixed(2)} s`;
+    const what = this.shown < 0 ? ": no picture" : picture === null ? ": picture cannot be shown" : ` · ${this.t[this.shown].toFixed(2)} s`;
+    this.caption.textContent = `${this.name}${what}`;
     ctx.fillStyle = theme.frame;
     ctx.fillRect(0, 0, width, height);
     if (!picture) return;
@@ -68,6 +69,8 @@ class Pictures {
     this.tiles = entry.cameras.map((camera) => new CameraTile(camera, agents, { ...act, enlarge }));
     this.large = null;
     byId("tiles").append(...this.tiles.map((tile) => tile.element));
+    byId("pictures").classList.toggle("single", this.tiles.length === 1);
+    byId("tiles").style.setProperty("--aspect", this.tiles[0].width / this.tiles[0].height);
     this.buttons = [null, ...this.tiles].map((tile) => {
       const button = element("button", { type: "button" }, tile?.name ?? (this.tiles.length > 1 ? "All" : "Small"));
       button.addEventListener("click", () => this.enlarge(tile));
