@@ -235,3 +235,19 @@ def test_ticks_at_which_nothing_was_recorded_do_not_count_against_a_track() -> N
     assert sweep_confidence(seen) == sweep_confidence(missed)
     [half] = mark_unrecorded([missed], {"": recorded | (np.arange(60) % 2 == 0)})
     assert sweep_confidence(missed) < sweep_confidence(half) < sweep_confidence(silent)
+
+
+def test_ticks_at_which_no_picture_was_searched_do_not_count_against_what_pictures_show() -> None:
+    whole = track_of(60, 0.7)
+    shown = np.arange(60) % 3 == 0
+    rows = whole.measurements
+    track = Track("car", whole.tick, replace(rows, camera=np.where(shown, "front", "")))
+    [always] = mark_unrecorded([track], {"": np.ones(60, dtype=bool), "front": np.ones(60, dtype=bool)})
+    [third] = mark_unrecorded([track], {"": np.ones(60, dtype=bool), "front": shown})
+    assert (always.searched, third.searched) == (1.0, pytest.approx(1 / 3))
+    assert image_confidence(third) == pytest.approx(3 * image_confidence(always))
+    everywhere = replace(track, measurements=replace(rows, camera=np.full(60, "front")))
+    [certain] = mark_unrecorded([everywhere], {"front": np.ones(60, dtype=bool)})
+    assert image_confidence(third) == pytest.approx(image_confidence(certain))
+    [sweeps] = mark_unrecorded([whole], {"": np.ones(60, dtype=bool), "front": shown})
+    assert sweeps.searched == 1.0

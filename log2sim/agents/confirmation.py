@@ -52,7 +52,7 @@ def agent_confidence(track: Track) -> float:
 
 
 def image_confidence(track: Track) -> float:
-    """Return the share of its ticks at which a track is detected in images, times the mean of the best scores there."""
+    """Return the share of its searched ticks at which a track is detected in images, times the mean of the best scores there."""
     m, tick = track.measurements, track.tick
     weak = (m.score < MIN_COUNTED_SCORE) & (GROUP_OF[track.category] in WEAK_GROUPS)
     counted = ~(weak & np.isnan(m.box_yaw_rad))
@@ -62,7 +62,7 @@ def image_confidence(track: Track) -> float:
         return 0.0
     return (
         detection_rate(m.t_ns, tick, track.unrecorded)
-        * float(in_image.mean())
+        * min(float(in_image.mean()) / track.searched, 1.0)
         * float(_strongest(m.score[in_image]).mean())
     )
 

@@ -24,12 +24,15 @@ class Track:
     unrecorded : (U,) int64
         Increasing indices of ticks at which no sensor that measured it recorded anything: that it was not measured there says
         nothing.
+    searched : float
+        Share of its ticks, above 0, at which pictures of a camera that measured it were searched; 1 for a track of sweeps alone.
     """
 
     category: str
     tick: NDArray[np.int64]
     measurements: Measurements
     unrecorded: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    searched: float = 1.0
 
     def __len__(self) -> int:
         """Return the number of measurements."""

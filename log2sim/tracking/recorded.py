@@ -1,4 +1,4 @@
-"""At which ticks nothing was recorded by the sensors that measured a track."""
+"""At which ticks the sensors that measured a track recorded nothing, or were not searched."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SWEEPS = ""
 
 
 def mark_unrecorded(tracks: Sequence[Track], recorded: Mapping[str, NDArray[np.bool_]]) -> list[Track]:
-    """Return tracks that know at which ticks none of the sensors that measured them recorded.
+    """Return tracks that know at which ticks none of the sensors that measured them recorded, and how often pictures were searched.
 
     Parameters
     ----------
@@ -23,7 +23,16 @@ def mark_unrecorded(tracks: Sequence[Track], recorded: Mapping[str, NDArray[np.b
     recorded : mapping of str to (T,) bool
         Whether a camera, or `SWEEPS` any LiDAR, recorded something usable at each tick.
     """
-    return [replace(track, unrecorded=_unrecorded(track, recorded)) for track in tracks]
+    return [
+        replace(track, unrecorded=_unrecorded(track, recorded), searched=_searched(track, recorded)) for track in tracks
+    ]
+
+
+def _searched(track: Track, recorded: Mapping[str, NDArray[np.bool_]]) -> float:
+    """Return at which share of its ticks any camera that measured a track was searched; 1 without a camera."""
+    cameras = {str(camera) for camera in track.measurements.camera} - {SWEEPS}
+    seen = [recorded[name] for name in cameras if name in recorded]
+    return float(np.any(seen, axis=0)[track.tick].mean()) if seen else 1.0
 
 
 def _unrecorded(track: Track, recorded: Mapping[str, NDArray[np.bool_]]) -> NDArray[np.int64]:
