@@ -6,12 +6,14 @@ import gzip
 import os
 import pickle
 import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from log2sim.errors import RecordError
+from log2sim.logs.pandaset import unpickle
 from log2sim.logs.pandaset.unpickle import read_pickled_table
 
 
@@ -167,3 +169,22 @@ def test_anything_but_a_table_is_refused(
         read_pickled_table(tmp_path / "x.pkl", limit_bytes=2_000_000)
     assert words in str(caught.value)
     assert not (tmp_path / "exploded").exists()
+
+
+@pytest.mark.parametrize("part", [slice(None), slice(-4), slice(40), slice(11)])
+def test_either_library_unpacks_the_same_and_refuses_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: slice
+) -> None:
+    pandas, isal_zlib = pytest.importorskip("pandas"), pytest.importorskip("isal.isal_zlib")
+    path, found = tmp_path / "x.pkl.gz", list[object]()
+    pandas.DataFrame({"x": np.random.default_rng(0).normal(size=2000)}).to_pickle(path)
+    path.write_bytes(path.read_bytes()[part])
+    for library, error in ((zlib, zlib.error), (isal_zlib, isal_zlib.IsalError)):
+        monkeypatch.setattr(unpickle, "decompressobj", library.decompressobj)
+        monkeypatch.setattr(unpickle, "GzipError", error)
+        try:
+            found.append(read_pickled_table(path)["x"].tolist())
+        except RecordError as problem:
+            found.append(str(problem))
+    assert found[0] == found[1]
+    assert isinstance(found[0], list) is (part == slice(None))

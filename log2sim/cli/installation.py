@@ -35,6 +35,7 @@ PURPOSES = {
     "osi": "export --to osi",
     "mcap": "export --to mcap",
     "ros": "ROS bags and MCAP as logs",
+    "pandaset": "sweeps of PandaSet in half the time",
     "parquet": "Argoverse 2 and Waymo's parquet as logs",
     "odometry": "--poses lidar and auto",
     "rerun": "export --to rerun",
