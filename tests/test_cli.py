@@ -76,7 +76,7 @@ def test_reconstruct_says_what_came_out_and_writes_nothing_unasked(tiny_folder: 
     ran = run("reconstruct", tiny_folder, "--out", tmp_path / "s.json", "--detector", "labels")
     assert ran.code == 0
     assert names(tmp_path) == ["s.json"]
-    assert "s.json: 3 agents (1 static) over 0.9 s" in ran.out
+    assert "s.json: 3 agents and the ego over 0.9 s" in ran.out
     assert "detecting and measuring: 10 of 10\ntracking\nsmoothing trajectories\n" in ran.err
     again = run("reconstruct", tiny_folder, "--out", tmp_path / "s.json", "--detector", "labels")
     assert again.code == 2
@@ -226,7 +226,7 @@ def test_evaluate_takes_labels_where_a_log_has_no_truth_file(
 
 
 def test_inspect_prints_json(tiny_folder: Path) -> None:
-    document = json.loads(run("inspect", tiny_folder).out)
+    document = json.loads(run("inspect", tiny_folder, "--json").out)
     assert document["format"] == "log2sim"
     assert document["cameras"]["front"]["records"] == 10
     assert document["cameras"]["front"]["rate_hz"] == 10.0
@@ -247,7 +247,7 @@ def test_synth_is_the_same_for_a_seed_and_replaces_only_when_asked(tmp_path: Pat
     (tmp_path / "scene.toml").write_text(tiny_toml(agents=[], duration_s=0.3))
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         assert run("synth", tmp_path / "scene.toml", "--out", tmp_path / name, "--seed", seed, "--quiet").code == 0
-    digest = [json.loads(run("inspect", tmp_path / n).out)["digest"] for n in "abc"]
+    digest = [json.loads(run("inspect", tmp_path / n, "--json").out)["digest"] for n in "abc"]
     sweeps = [(tmp_path / n / "top/000000.npz").read_bytes() for n in "abc"]
     assert digest[0] == digest[1]
     assert sweeps[0] == sweeps[1] != sweeps[2]
@@ -312,14 +312,14 @@ def test_edit_changes_a_scenario_that_then_replays_and_plots(tmp_path: Path) -> 
         "--remove", "bus_1,car_parked", "--remove", "cyclist_north", "--out", out,
     )  # fmt: skip
     assert ran.code == 0, ran.err
-    assert "e.json: 6 edits, 9 agents over 5.8 s, 0 warnings" in ran.out
+    assert "e.json: 6 edits, 8 agents and the ego over 5.8 s, 0 warnings" in ran.out
     kinds = [e["kind"] for e in read(out)["provenance"]["edits"][0]["edits"]]
     assert kinds == ["remove", "remove", "remove", "speed", "lateral", "shift"]
     for command in (("validate", out), ("replay", out, "--strict"), ("plot", out, "--out", tmp_path / "e.png")):
         assert run(*command).code == 0
     only = run("edit", source, "--only", "ego,bus_1", "--only", "car_turning", "--out", out, "--overwrite", "--quiet")
     assert (only.code, only.out, only.err) == (0, "", "")
-    assert "1 edit, 1 agent over 5.2 s" in run("edit", source, "--only", "ego", "--out", out, "--overwrite").out
+    assert "1 edit, no agent but the ego over 5.2 s" in run("edit", source, "--only", "ego", "--out", out, "--overwrite").out
     run("edit", source, "--only", "ego,bus_1,car_turning", "--out", out, "--overwrite")
     assert [a["id"] for a in read(out)["agents"]] == ["ego", "bus_1", "car_turning"]
 
@@ -368,7 +368,7 @@ def test_a_replay_of_another_scenario_is_shown_with_a_warning(tiny_scenario: Pat
         assert "warning" not in run(command, other, "--replay", tmp_path / "r.json", "--out", tmp_path / f"o{name}").out
         run("edit", other, "--remove", "bus_1", "--out", tmp_path / "e.json", "--overwrite")
         fewer = run(command, tmp_path / "e.json", "--replay", tmp_path / "r.json", "--out", tmp_path / f"e{name}")
-        assert "another version of 'crossing': 1 of its 12 agents are not in it" in fewer.out
+        assert "another version of 'crossing': 1 of its 11 agents is not in it" in fewer.out
 
 
 @pytest.mark.parametrize(

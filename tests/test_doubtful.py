@@ -129,12 +129,12 @@ def test_the_command_replays_without_them(tmp_path: Path) -> None:
     arguments = ("replay", tmp_path / "s.json", "--dt", "0.1", "--mode", "exact")
     ran = run(*arguments, "--confidence", "0.5", "--out", tmp_path / "r.json")
     assert ran.code == 0
-    assert "1 of 4 agents left out: unsure (confidence 0.49)" in ran.out
+    assert "1 of 3 agents left out: unsure (confidence 0.49)" in ran.out
     loaded = Replay.load(tmp_path / "r.json")
     assert [a.id for a in loaded.agents] == ["ego", "sure", "phantom"]
     assert loaded.left_out == {"unsure": "confidence 0.49"}
     both = run(*arguments, "--confidence", "0.5", "--drop-doubtful")
-    assert "2 of 4 agents left out: unsure (confidence 0.49), phantom (passes through parked at 1.2 s" in both.out
+    assert "2 of 3 agents left out: unsure (confidence 0.49), phantom (passes through parked at 1.2 s" in both.out
     assert "left out" not in run(*arguments).out
     assert run(*arguments, "--confidence", "2").code == 2
 
@@ -157,11 +157,11 @@ def test_an_export_keeps_or_drops_them_and_says_how_many(to: str, tmp_path: Path
         return ran.out, "".join(f.read_bytes().decode(errors="ignore") for f in (tmp_path / name).iterdir())
 
     said, kept = text("kept")
-    assert "note: 3 of 4 agents are doubtful: ego (brakes with 14 m/s2), phantom (passes" in said
+    assert "note: 2 of 3 agents are doubtful: phantom (passes" in said
     assert "phantom" in kept
     said, dropped = text("dropped", "--doubtful", "drop")
-    assert "note: 2 of 4 agents left out as doubtful: phantom (passes through parked at 1.2 s, 2.8 m wide), uns" in said
-    assert "; 1 of 4 agents are doubtful: ego (brakes with 14 m/s2)" in said
+    assert "note: 2 of 3 agents left out as doubtful: phantom (passes through parked at 1.2 s, 2.8 m wide), uns" in said
+    assert "; the ego is doubtful: brakes with 14 m/s2" in said
     assert "phantom" not in dropped
     assert "sure" in dropped
 

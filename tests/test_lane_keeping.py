@@ -71,8 +71,8 @@ def test_the_summary_tells_how_far_over_the_line_a_vehicle_is() -> None:
 def test_inspect_describes_a_scenario(tmp_path: Path) -> None:
     world = scenario(agent(line(90.0, 91, 0.0, (5.0, 2.0))), map_features=MapFeatures(lanes=road(), notes=("night",)))
     world.save(tmp_path / "scenario.json")
-    document = json.loads(run("inspect", tmp_path / "scenario.json").out)
-    assert document["agents"]["categories"] == {"car": 1}
+    document = json.loads(run("inspect", tmp_path / "scenario.json", "--json").out)
+    assert (document["agents"]["count"], document["ego"]) == (0, {"doubtful": False})
     assert document["lanes"] == {"count": 4, "junctions": 0, "inferred_from": {"markings": 4}, "in_file": True}
     assert document["ego_in_lane"]["aside_m"]["mean"] == pytest.approx(0.25, abs=1e-3)
     assert document["notes"] == ["night"]

@@ -272,7 +272,7 @@ def test_reconstruct_inspect_and_validate_tell_the_same(log_folder: Path, tmp_pa
     assert ran.code == 0
     assert {f"note: {line}" for line in told} <= set(ran.out.splitlines())
     assert told <= set(json.loads(report.read_text())["log"]["notes"])
-    assert told <= set(json.loads(run("inspect", log_folder).out)["notes"])
+    assert told <= set(json.loads(run("inspect", log_folder, "--json").out)["notes"])
     ran = run("validate", log_folder)
     assert ran.code == 3
     assert all(line in ran.err for line in told)

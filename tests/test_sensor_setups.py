@@ -61,7 +61,7 @@ def test_a_log_is_described_checked_and_drawn(
     made: Callable[[str], tuple[Path, Path]], name: str, tmp_path: Path
 ) -> None:
     log, _ = made(name)
-    summary = json.loads(run("inspect", log).out)
+    summary = json.loads(run("inspect", log, "--json").out)
     assert (summary["ego"] is None) == name.startswith("roadside")
     ran = run("validate", log)
     assert (ran.code, ran.out) == (0, f"{log}: valid\n")

@@ -7,7 +7,19 @@ from typing import Annotated, Any
 
 import typer
 
-from log2sim.cli.options import ConfigFile, Format, LogPath, Overwrite, Quiet, Sequence, Settings, say
+from log2sim.cli.options import (
+    ConfigFile,
+    Format,
+    LogPath,
+    Overwrite,
+    Quiet,
+    Sequence,
+    Settings,
+    Start,
+    Stop,
+    complete_detectors,
+    say,
+)
 from log2sim.cli.truth import truth_at
 
 
@@ -23,7 +35,9 @@ def bench(
     detector: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME|MODEL.onnx|labels", help="Detector, see reconstruct; repeat the option to compare several."
+            metavar="NAME|MODEL.onnx|labels",
+            help="Detector, see reconstruct; repeat the option to compare several.",
+            autocompletion=complete_detectors,
         ),
     ] = None,
     format: Format = "auto",
@@ -35,14 +49,20 @@ def bench(
     categories: Annotated[
         str | None, typer.Option(metavar="A,B", help="Compare only these categories or groups, e.g. vehicle.")
     ] = None,
-    start: Annotated[float | None, typer.Option(help="First time to use, in s from the start of the log.")] = None,
-    stop: Annotated[float | None, typer.Option(help="Last time to use, in s from the start of the log.")] = None,
+    start: Start = None,
+    stop: Stop = None,
     config: ConfigFile = None,
     settings: Settings = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Compare methods and settings by error and run time."""
+    """Compare methods and settings by error and run time.
+
+    Examples
+    --------
+    log2sim bench samples/crossing -o bench/
+    log2sim bench samples/crossing --detector labels --detector lidar:vehicle -o bench/
+    """
     from log2sim.cli.progress import progress
     from log2sim.config import Config
     from log2sim.documents import check_targets, write_json

@@ -12,6 +12,11 @@ def config(
     """Print all settings as TOML.
 
     Each with its meaning, unit, choices and default; with --config or --set, the values that these give.
+
+    Examples
+    --------
+    log2sim config
+    log2sim config --set smooth.enabled=false
     """
     from log2sim.config import Config
 

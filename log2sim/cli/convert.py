@@ -14,6 +14,8 @@ from log2sim.cli.options import (
     Overwrite,
     Quiet,
     Sequence,
+    Start,
+    Stop,
     camera_names,
     counted,
     say,
@@ -26,13 +28,18 @@ def convert(
     out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder to write.")],
     format: Format = "auto",
     sequence: Sequence = None,
-    start: Annotated[float | None, typer.Option(help="First time to keep, in s from the start of the log.")] = None,
-    stop: Annotated[float | None, typer.Option(help="Last time to keep, in s from the start of the log.")] = None,
+    start: Start = None,
+    stop: Stop = None,
     cameras: Cameras = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write any log, or a part of it, as a log folder of log2sim; images are copied as they are."""
+    """Write any log, or a part of it, as a log folder of log2sim; images are copied as they are.
+
+    Examples
+    --------
+    log2sim convert samples/crossing --start 1 --stop 3 --cameras front -o part/
+    """
     from log2sim.cli.progress import progress
     from log2sim.documents import check_folder
     from log2sim.logs.excerpt import cut_log

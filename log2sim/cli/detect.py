@@ -7,7 +7,21 @@ from typing import Annotated, Any
 
 import typer
 
-from log2sim.cli.options import ConfigFile, Format, LogPath, Overwrite, Poses, Quiet, Sequence, Settings, counted, say
+from log2sim.cli.options import (
+    ConfigFile,
+    Format,
+    LogPath,
+    Overwrite,
+    Poses,
+    Quiet,
+    Sequence,
+    Settings,
+    Start,
+    Stop,
+    complete_plugins,
+    counted,
+    say,
+)
 
 
 def detect(
@@ -19,21 +33,28 @@ def detect(
             metavar="lidar:NAME|lidar:MODEL.onnx",
             help="Detector in LiDAR sweeps: lidar:vehicle, lidar:roadside, lidar:MODEL.onnx, or lidar:labels (boxes of "
             "the log).",
+            autocompletion=complete_plugins("lidar_detector", prefix="lidar:"),
         ),
     ] = "lidar:vehicle",
     format: Format = "auto",
     sequence: Sequence = None,
-    start: Annotated[float | None, typer.Option(help="First time to use, in s from the start of the log.")] = None,
-    stop: Annotated[float | None, typer.Option(help="Last time to use, in s from the start of the log.")] = None,
+    start: Start = None,
+    stop: Stop = None,
     poses: Poses = None,
     config: ConfigFile = None,
     settings: Settings = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Detect road users in the LiDAR sweeps of a log."""
+    """Detect road users in the LiDAR sweeps of a log.
+
+    Examples
+    --------
+    log2sim detect samples/crossing -o boxes.json
+    log2sim detect kitti_object/ --detector lidar:MODEL.onnx -o boxes.json
+    """
     from log2sim.cli.progress import progress
-    from log2sim.cli.reconstruct import pose_notes
+    from log2sim.cli.run_summary import pose_notes
     from log2sim.config import Config
     from log2sim.documents import check_targets
     from log2sim.evaluation.detection.detect_log import detect_log

@@ -38,8 +38,13 @@ def edit(
 
     Options with values but --out may be given several times. They are applied in this order: only, remove, drop-doubtful,
     speed, lateral, shift.
+
+    Examples
+    --------
+    log2sim edit s.json --shift car-3=-0.5 --lateral ego=0.3 -o edited.json
+    log2sim edit s.json --remove bus-1 --speed car-2=1.2 -o edited.json
     """
-    from log2sim.datatypes import Scenario, list_doubtful
+    from log2sim.datatypes import Scenario, list_doubtful, say_agents
     from log2sim.documents import check_targets
     from log2sim.edit.apply import edit as run
     from log2sim.edit.edits import DropDoubtful as Drop
@@ -62,7 +67,7 @@ def edit(
     for warning in result.warnings:
         say(f"warning: {warning}", quiet=quiet)
     say(
-        f"{out}: {counted(len(edits), 'edit')}, {counted(len(edited.agents), 'agent')} over {edited.duration_s:.1f} s, "
+        f"{out}: {counted(len(edits), 'edit')}, {say_agents(a.id for a in edited.agents)} over {edited.duration_s:.1f} s, "
         f"{counted(len(result.warnings), 'warning')}",
         quiet=quiet,
     )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from log2sim.cli.options import Overwrite, Poses, Quiet, Sequence, say
+from log2sim.cli.options import Overwrite, Poses, Quiet, Sequence, complete, say
 from log2sim.cli.truth import load_truth
 
 if TYPE_CHECKING:
@@ -46,13 +46,17 @@ def evaluate(
         str | None,
         typer.Option(
             metavar="kitti|dair|center",
+            autocompletion=complete("kitti", "dair", "center"),
+            show_default=PROTOCOL,
             help="Of boxes: KITTI's classes, difficulties and IoU; DAIR-V2X's classes and IoU; or distance of centers "
-            f"(nuScenes). Default: {PROTOCOL}.",
+            "(nuScenes).",
         ),
     ] = None,
     score: Annotated[
         float | None,
-        typer.Option(metavar="S", help="Of boxes: score from which precision and recall count them. Default: 0.5."),
+        typer.Option(
+            metavar="S", help="Of boxes: score from which precision and recall count them.", show_default="0.5"
+        ),
     ] = None,
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="Reliability diagram of confidences or scores to write.")
@@ -61,7 +65,13 @@ def evaluate(
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Compare a scenario, or detected boxes, with the ground truth."""
+    """Compare a scenario, or detected boxes, with the ground truth.
+
+    Examples
+    --------
+    log2sim evaluate s.json --truth samples/crossing --range 40
+    log2sim evaluate boxes.json --truth kitti_tracking/ --sequence 0000 --protocol kitti
+    """
     from log2sim.documents import check_targets, read_json, write_json
     from log2sim.errors import ConfigError, ScenarioError
     from log2sim.evaluation.detection.boxes_file import is_boxes_document

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, say
+from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, Verbose, choose, complete_plugins, say
 
 MAX_NOTES = 5
 FORMATS = "openscenario, carla, csv, scenarionet, commonroad, osi, mcap, rerun"  # written out: --help imports nothing
@@ -15,14 +15,21 @@ FORMATS = "openscenario, carla, csv, scenarionet, commonroad, osi, mcap, rerun" 
 
 def export(
     scenario: ScenarioPath,
-    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help=f"One of {FORMATS}.")],
+    to: Annotated[
+        str,
+        typer.Option("--to", metavar="FORMAT", help=f"One of {FORMATS}.", autocompletion=complete_plugins("export")),
+    ],
     out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder to write into.")],
-    revision: Annotated[str | None, typer.Option(help="openscenario: version 1.0, 1.1 or 1.2.")] = None,
+    revision: Annotated[
+        str | None, choose("--revision", "1.0", "1.1", "1.2", help="openscenario: its version.", default="the newest")
+    ] = None,
     map: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="openscenario, carla: OpenDRIVE file to use instead of a generated one."),
     ] = None,
-    mode: Annotated[str | None, typer.Option(help="carla: how agents move, exact or pid.")] = None,
+    mode: Annotated[
+        str | None, choose("--mode", "exact", "pid", help="carla: how agents move.", default="exact")
+    ] = None,
     log: Annotated[
         Path | None, typer.Option(metavar="LOG", help="mcap, rerun: log whose images and points are included.")
     ] = None,
@@ -30,12 +37,19 @@ def export(
         str | None, typer.Option(metavar="AGENT", help="Agent to take as the ego, where the scenario has none.")
     ] = None,
     doubtful: Annotated[
-        str, typer.Option(metavar="keep|drop", help="What to do with agents that the scenario itself doubts.")
+        str, choose("--doubtful", "keep", "drop", help="What to do with agents that the scenario itself doubts.")
     ] = "keep",
     overwrite: Overwrite = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
-    """Write a scenario in the format of a simulator or viewer."""
+    """Write a scenario in the format of a simulator or viewer.
+
+    Examples
+    --------
+    log2sim export s.json --to openscenario -o xosc/
+    log2sim export s.json --to rerun --log samples/crossing -o rerun/
+    """
     from log2sim.datatypes import Scenario
     from log2sim.documents import check_folder
     from log2sim.export.checks import doubtful_note, export_notes
@@ -55,7 +69,7 @@ def export(
     notes = export_notes(chosen)
     if loaded.doubtful:
         say(f"note: {doubtful_note(loaded, chosen)}", quiet=quiet)
-    for note in notes[:MAX_NOTES]:
+    for note in notes if verbose else notes[:MAX_NOTES]:
         say(f"note: {note}", quiet=quiet)
-    if len(notes) > MAX_NOTES:
+    if len(notes) > MAX_NOTES and not verbose:
         say(f"note: and {len(notes) - MAX_NOTES} more", quiet=quiet)

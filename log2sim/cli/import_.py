@@ -16,7 +16,12 @@ def import_(
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Convert an OpenSCENARIO file to a scenario."""
+    """Convert an OpenSCENARIO file to a scenario.
+
+    Examples
+    --------
+    log2sim import scenario.xosc -o s.json
+    """
     from log2sim.documents import check_targets
     from log2sim.export.openscenario.read import load
 

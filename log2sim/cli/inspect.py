@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from log2sim.cli.options import Cameras, Format, Overwrite, Sequence, camera_names, say
+from log2sim.cli.options import AsJson, Cameras, Format, Overwrite, Quiet, Sequence, Verbose, camera_names, say
 from log2sim.errors import ConfigError
 
 
@@ -15,6 +15,7 @@ def inspect(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="Folder or file of a log, or a scenario.json.")],
     format: Format = "auto",
     sequence: Sequence = None,
+    as_json: AsJson = False,
     overlay: Annotated[
         Path | None,
         typer.Option(
@@ -23,14 +24,26 @@ def inspect(
         ),
     ] = None,
     at: Annotated[
-        float | None, typer.Option(help="Time to draw, in s after the first tick. [default: in the middle]")
+        float | None,
+        typer.Option(metavar="S", help="Time to draw, in s after the first tick.", show_default="in the middle"),
     ] = None,
     cameras: Cameras = None,
     overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
-    """Describe the content of a log, or of a scenario.json, as JSON, or draw one tick of a log."""
+    """Describe the content of a log, or of a scenario.json, or draw one tick of a log.
+
+    Examples
+    --------
+    log2sim inspect samples/crossing
+    log2sim inspect s.json --json
+    log2sim inspect samples/crossing --overlay tick.png --at 2
+    """
     import json
 
+    from log2sim.cli.inspect_tables import describe_log, describe_scenario
+    from log2sim.cli.progress import OPENING, progress
     from log2sim.documents import check_targets
     from log2sim.logs.opening import open_log
     from log2sim.logs.summary import summarize
@@ -40,19 +53,25 @@ def inspect(
     if log.suffix.lower() == ".json":
         if overlay is not None:
             raise ConfigError(f"{log}: is a scenario, which --overlay does not draw; log2sim plot does")
-        say(json.dumps(_summary_of_scenario(log), indent=2))
+        document = _summary_of_scenario(log)
+        lines = [json.dumps(document, indent=2)] if as_json else describe_scenario(document, verbose=verbose)
+        say("\n".join(lines), quiet=quiet)
         return
     names = camera_names(cameras)
     check_targets(overlay, overwrite=overwrite)
-    opened = open_log(log, format=format, sequence=sequence)
+    with progress(quiet=quiet) as report_progress:
+        report_progress(OPENING, 0, 0)
+        opened = open_log(log, format=format, sequence=sequence)
     if overlay is None:
-        say(json.dumps(summarize(opened), indent=2))
+        document = summarize(opened)
+        lines = [json.dumps(document, indent=2)] if as_json else describe_log(document, verbose=verbose)
+        say("\n".join(lines), quiet=quiet)
         return
     from log2sim.visualization.overlay.moment import read_moment
     from log2sim.visualization.overlay.picture import write_overlay
 
     write_overlay(read_moment(opened, names, at), overlay, overwrite=overwrite)
-    say(f"{overlay}: written")
+    say(f"{overlay}: written", quiet=quiet)
 
 
 def _summary_of_scenario(path: Path) -> dict[str, Any]:

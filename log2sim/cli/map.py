@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from log2sim.cli.options import Format, LogPath, Overwrite, Quiet, Sequence, say
+from log2sim.cli.options import Format, LogPath, Overwrite, Quiet, Sequence, choose, say
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Log, Scenario
@@ -25,14 +25,22 @@ def map_(
         Path | None,
         typer.Option(metavar="SCENARIO", help="Scenario of the log; its agents are left out of the map."),
     ] = None,
-    layer: Annotated[str, typer.Option(help="What is written: color, intensity (of the LiDAR), height.")] = "color",
+    layer: Annotated[
+        str, choose("--layer", "color", "intensity", "height", help="What is written; intensity is that of the LiDAR.")
+    ] = "color",
     cell: Annotated[float, typer.Option(metavar="M", help="Edge of a cell, in m.")] = 0.05,
     format: Format = "auto",
     sequence: Sequence = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Make a map of the ground of a log: its color, its height, or how strongly it reflects the LiDAR."""
+    """Make a map of the ground of a log: its color, its height, or how strongly it reflects the LiDAR.
+
+    Examples
+    --------
+    log2sim map samples/crossing --scenario s.json -o ground.tif
+    log2sim map samples/crossing --layer intensity -o ground.png
+    """
     from typing import cast
 
     from log2sim.cli.progress import progress

@@ -15,7 +15,7 @@ def predict(
     horizon: Annotated[float, typer.Option(metavar="S", help="Longest prediction in s, from 0.1 to 10.")] = 3.0,
     method: Annotated[
         str | None,
-        typer.Option(metavar="A,B", help="Only these methods: velocity, turn, smoothed, path. Default: all."),
+        typer.Option(metavar="A,B", help="Only these methods: velocity, turn, smoothed, path.", show_default="all"),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", metavar="FILE", help="Figures file to write.")] = None,
     positions: Annotated[
@@ -24,7 +24,12 @@ def predict(
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Predict each agent at each tick from its past, and estimate how far off that is."""
+    """Predict each agent at each tick from its past, and estimate how far off that is.
+
+    Examples
+    --------
+    log2sim predict s.json --horizon 2 -o prediction.json
+    """
     from log2sim.datatypes import Scenario
     from log2sim.documents import check_targets, write_json
     from log2sim.errors import ConfigError

@@ -13,8 +13,12 @@ if TYPE_CHECKING:
 
 LINE_EVERY_S = 5.0
 
+OPENING, VALIDATING = "open", "validate"
+ON_TERMINALS = (OPENING, VALIDATING)
+"""Shown on a terminal alone: elsewhere what is wrong with the log is to be the only line."""
+
 WORDS = {
-    "open": "opening the log",
+    OPENING: "opening the log",
     "odometry": "following the ego in LiDAR sweeps",
     "camera motion": "following the ego in pictures",
     "check cameras": "checking the mounts of cameras",
@@ -30,6 +34,7 @@ WORDS = {
     "map: pictures": "mapping the ground: pictures",
     "replay": "simulating",
     "convert": "writing records",
+    VALIDATING: "reading every record",
     "detect": "detecting",
     "synthesize": "rendering",
     "scenes": "rendering scenes",
@@ -135,6 +140,8 @@ def _lines() -> Report:
     last, current = [time.monotonic()], [""]
 
     def report_progress(stage: str, done: int, total: int) -> None:
+        if stage in ON_TERMINALS:
+            return
         now = time.monotonic()
         begins, current[0] = stage != current[0], stage
         if done == total if total else begins:

@@ -18,19 +18,23 @@ from log2sim.cli.options import (
     Quiet,
     Sequence,
     Settings,
+    Start,
+    Stop,
+    Verbose,
     camera_names,
-    counted,
+    choose,
+    complete_detectors,
     say,
+    write_to,
 )
 
 if TYPE_CHECKING:
-    from log2sim.datatypes import Scenario
     from log2sim.pipeline import Result
 
 
 def reconstruct(
     log: LogPath,
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Scenario file to write.")],
+    out: Annotated[Path, write_to("FILE", "Scenario file to write.")],
     format: Format = "auto",
     sequence: Sequence = None,
     detector: Annotated[
@@ -39,11 +43,13 @@ def reconstruct(
             metavar="NAME|MODEL.onnx|labels|lidar:NAME",
             help="Detector in images: ssd-mobilenet-v2, a path to an ONNX model, or labels (boxes of the log); in LiDAR "
             "sweeps: lidar:vehicle, lidar:roadside, lidar:MODEL.onnx, lidar:labels; both: NAME+lidar:NAME.",
+            autocompletion=complete_detectors,
+            show_default="ssd-mobilenet-v2+lidar:vehicle, or what of it the log and the installation allow",
         ),
     ] = None,
     cameras: Cameras = None,
-    start: Annotated[float | None, typer.Option(help="First time to use, in s from the start of the log.")] = None,
-    stop: Annotated[float | None, typer.Option(help="Last time to use, in s from the start of the log.")] = None,
+    start: Start = None,
+    stop: Stop = None,
     poses: Poses = None,
     fix_time: Annotated[
         bool, typer.Option("--fix-time", help="Correct stamps of sensors by the offsets that the log shows.")
@@ -53,20 +59,29 @@ def reconstruct(
     ] = False,
     ends: Annotated[
         str | None,
-        typer.Option(
-            metavar="both|vehicle|road", help="Use only the sensors on the vehicle, or only those at the road."
+        choose(
+            "--ends",
+            "both",
+            "vehicle",
+            "road",
+            default="both",
+            help="Use only the sensors on the vehicle, or only those at the road.",
         ),
     ] = None,
     fusion: Annotated[
         str | None,
-        typer.Option(
-            metavar="points|boxes|tracks",
-            help="What of the vehicle's and the road's LiDARs is joined, see log2sim config.",
+        choose(
+            "--fusion",
+            "points",
+            "boxes",
+            "tracks",
+            default="see log2sim config",
+            help="What of the vehicle's and the road's LiDARs is joined.",
         ),
     ] = None,
     config: ConfigFile = None,
     settings: Settings = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
+    seed: Annotated[int | None, typer.Option(metavar="N", help="Seed of all random numbers.", show_default="0")] = None,
     report: Annotated[Path | None, typer.Option(metavar="FILE.json", help="Report file to write.")] = None,
     topdown: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="Bird's-eye image of all cameras to write.")
@@ -74,16 +89,19 @@ def reconstruct(
     no_cache: NoCache = False,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
-    """Reconstruct the scenario of a log."""
-    from log2sim.cli.progress import progress
-    from log2sim.config import Config
+    """Reconstruct the scenario of a log.
+
+    Examples
+    --------
+    log2sim reconstruct samples/crossing -o s.json
+    log2sim reconstruct drive.mcap -o s.json --poses auto --stop 20
+    log2sim reconstruct pandaset/ --sequence 002 --detector lidar:vehicle -o s.json
+    """
+    from log2sim.cli.progress import OPENING, progress
     from log2sim.documents import check_targets, write_json
-    from log2sim.errors import ConfigError, MissingExtra
-    from log2sim.logs.opening import open_log
     from log2sim.outputs import together
-    from log2sim.pipeline import reconstruct as run
-    from log2sim.sensors import IMAGE_DETECTOR, choose_detector
 
     check_targets(out, report, topdown, overwrite=overwrite)
     changes: dict[str, Any] = {"start_s": start, "stop_s": stop, "seed": seed}
@@ -95,8 +113,17 @@ def reconstruct(
     changes["cooperation"] = {k: v for k, v in (("ends", ends), ("fusion", fusion)) if v is not None}
     fixes = {"fix_time": fix_time, "fix_mounts": fix_calibration}
     changes["calibration"] = {name: True for name, chosen in fixes.items() if chosen}
-    chosen = Config.load(config, settings or (), **changes)
-    opened = open_log(log, format=format, sequence=sequence)
+    with progress(quiet=quiet) as report_progress:
+        report_progress(OPENING, 0, 0)
+        from log2sim.cli.run_summary import cache_notes, fault_lines, look_line, pose_notes, summarize, unused_records
+        from log2sim.config import Config
+        from log2sim.errors import ConfigError, MissingExtra
+        from log2sim.logs.opening import open_log
+        from log2sim.pipeline import reconstruct as run
+        from log2sim.sensors import IMAGE_DETECTOR, choose_detector
+
+        chosen = Config.load(config, settings or (), **changes)
+        opened = open_log(log, format=format, sequence=sequence)
     if topdown is not None and not opened.cameras:
         raise ConfigError(f"--topdown: {opened.name}: the log has no camera, so there is no picture of the ground")
     for note in opened.notes:
@@ -114,9 +141,9 @@ def reconstruct(
         if report is not None:
             write_json(report, result.report)
         result.scenario.save(out)
-    told = (*unused_records(result.report), *cache_notes(result.report), *feature_notes(result.scenario))
-    notes = [f"note: {note}" for note in told]
-    for line in (*notes, *doubt_lines(result.scenario), f"{out}: {_summary(result)}"):
+    for note in (*unused_records(result.report), *cache_notes(result.report)):
+        say(f"note: {note}", quiet=quiet)
+    for line in summarize(result, look_line(log, sequence, out), out, verbose=verbose):
         say(line, quiet=quiet)
 
 
@@ -132,72 +159,3 @@ def _write_topdown(result: Result, path: Path, *, overwrite: bool) -> None:
     ground = map_ground(result.log, result.scenario, MapConfig(cell_m=CELL_M), reader)
     write_map(ground.around(ground.coverage), path, overwrite=overwrite)
     result.report["unreadable"] = {**reader.summary(), **result.report["unreadable"]}
-
-
-def _summary(result: Result) -> str:
-    counts, rate = result.report["agents"], result.report["ticks_per_second"]
-    static, duration_s = counts["static"], result.scenario.duration_s
-    agents = f"{counts['total']} agents ({static} static) over {duration_s:.1f} s"
-    return ", ".join([agents, *described(result.scenario), f"{rate:.1f} ticks/s", *known_pictures(result.report)])
-
-
-def known_pictures(report: dict[str, Any]) -> list[str]:
-    """Say how many pictures were not searched, since an earlier run had done it."""
-    cache = report["detection_cache"]
-    found = 0 if cache is None else cache["found"]
-    return [f"{counted(found, 'picture')} known from earlier runs"] if found else []
-
-
-def cache_notes(report: dict[str, Any]) -> list[str]:
-    """Say why detections were not kept, where they should have been."""
-    cache = report["detection_cache"]
-    return [f"detections are not kept for later runs: {cache['problem']}"] if cache and cache["problem"] else []
-
-
-def described(scenario: Scenario) -> list[str]:
-    """Count what was found beside the agents; nothing of what was not found or not looked for."""
-    features = scenario.map_features
-    counts = [] if features is None else [(len(features.lanes), "lane"), (len(features.markings), "marking")]
-    counts.append((len(scenario.signals), "traffic light"))
-    return [f"{count} {name}{'s' * (count != 1)}" for count, name in counts if count]
-
-
-def feature_notes(scenario: Scenario) -> tuple[str, ...]:
-    """Return what of the road is not there, and why."""
-    return () if scenario.map_features is None else scenario.map_features.notes
-
-
-def doubt_lines(scenario: Scenario) -> list[str]:
-    """Say how many agents are doubtful and why the first ones are; no line without any. The report has all."""
-    from log2sim.datatypes import list_doubtful, why_doubtful
-
-    ego, others = scenario.ego, [agent for agent in scenario.others if agent.is_doubtful]
-    lines = [f"the ego is doubtful: {why_doubtful(ego)}"] if ego is not None and ego.is_doubtful else []
-    verb = "is" if len(others) == 1 else "are"
-    count = f"{len(others)} of {len(scenario.others)} agents {verb} doubtful"
-    return [*lines, f"{count}: {list_doubtful(others)}"] if others else lines
-
-
-def pose_notes(poses: dict[str, Any]) -> list[str]:
-    """Say which poses were used and why, and what is doubtful about them; nothing of the log's own where no others were asked for."""
-    if poses["source"] == poses["requested"] == "given" or poses["source"] == "none":
-        return []
-    return [f"poses: {poses['source']} ({poses['reason']})", *(f"note: {note}" for note in poses["notes"])]
-
-
-def fault_lines(faults: list[dict[str, Any]]) -> list[str]:
-    """Say what is wrong with the sensors and poses of a log, a line for each fault."""
-    return [f"note: {fault['sensor']}: {fault['message']}" for fault in faults]
-
-
-def unused_records(report: dict[str, Any]) -> list[str]:
-    """List what a run could not use of a log, a line for each stream."""
-    unreadable = report["unreadable"].items()
-    without_pose = report["without_pose"].items()
-    return [
-        *(f"{name}: {u['count']} records could not be read, first: {u['first']}" for name, u in unreadable),
-        *(
-            f"{name}: {count} frames skipped, since no ego pose is known at their stamps"
-            for name, count in without_pose
-        ),
-    ]

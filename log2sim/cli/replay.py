@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from log2sim.cli.options import DropDoubtful, Overwrite, Quiet, ScenarioPath, say
+from log2sim.cli.options import DropDoubtful, Overwrite, Quiet, ScenarioPath, Verbose, choose, say, write_to
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Scenario
@@ -15,14 +15,28 @@ if TYPE_CHECKING:
 
 def replay(
     scenario: ScenarioPath,
-    out: Annotated[Path | None, typer.Option("--out", "-o", metavar="FILE", help="Replay file to write.")] = None,
+    out: Annotated[Path | None, write_to("FILE", "Replay file to write.")] = None,
     mode: Annotated[
-        str, typer.Option(help="pid: vehicles follow their trajectories by a controller; exact: no controller.")
+        str,
+        choose(
+            "--mode",
+            "pid",
+            "exact",
+            help="pid: vehicles follow their trajectories by a controller; exact: no controller.",
+        ),
     ] = "pid",
     model: Annotated[
-        str, typer.Option(help="Vehicle model: auto, kinematic, dynamic or single-track, or a plug-in.")
+        str,
+        choose(
+            "--model",
+            "auto",
+            "kinematic",
+            "dynamic",
+            "single-track",
+            help="Vehicle model, or a plug-in; auto: by how hard each vehicle drives.",
+        ),
     ] = "auto",
-    dt: Annotated[float, typer.Option(help="Time step in s, from 0.0005 to 1.")] = 0.01,
+    dt: Annotated[float, typer.Option(metavar="S", help="Time step in s, from 0.0005 to 1.")] = 0.01,
     ego: Annotated[
         str | None,
         typer.Option(
@@ -32,8 +46,11 @@ def replay(
     ] = None,
     warn: Annotated[
         str | None,
-        typer.Option(
-            metavar="vehicle|road|both",
+        choose(
+            "--warn",
+            "vehicle",
+            "road",
+            "both",
             help="Warn of collisions with the ego by what the sensors at these ends observe.",
         ),
     ] = None,
@@ -47,24 +64,37 @@ def replay(
     ] = 8.0,
     agents: Annotated[
         str,
-        typer.Option(
-            help="Behavior of the other agents: scenario (as it says) or reactive (brake to avoid collisions)."
+        choose(
+            "--agents",
+            "scenario",
+            "reactive",
+            help="Behavior of the other agents: as the scenario says, or braking to avoid collisions.",
         ),
     ] = "scenario",
     react: Annotated[str | None, typer.Option(metavar="ID,ID", help="Make only these agents reactive.")] = None,
     foresight: Annotated[
         str,
-        typer.Option(
-            help="What reactive agents expect of others: path (where the scenario has them go) or motion (as they moved so far)."
+        choose(
+            "--foresight",
+            "path",
+            "motion",
+            help="What reactive agents expect of others: path: where the scenario has them go; motion: as they moved so far.",
         ),
     ] = "path",
     confidence: Annotated[
         float | None, typer.Option(metavar="MIN", help="Leave out agents with a lower confidence; the ego stays.")
     ] = None,
     drop_doubtful: DropDoubtful = False,
-    simulator: Annotated[str, typer.Option(help="own, or carla: agents move in a CARLA server.")] = "own",
-    host: Annotated[str | None, typer.Option(help="carla: address of the server, default 127.0.0.1.")] = None,
-    port: Annotated[int | None, typer.Option(help="carla: port of the server, default 2000.", min=1, max=65535)] = None,
+    simulator: Annotated[
+        str, choose("--simulator", "own", "carla", help="own, or carla: agents move in a CARLA server.")
+    ] = "own",
+    host: Annotated[
+        str | None, typer.Option(metavar="NAME", help="carla: address of the server.", show_default="127.0.0.1")
+    ] = None,
+    port: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="carla: port of the server.", min=1, max=65535, show_default="2000"),
+    ] = None,
     map: Annotated[str | None, typer.Option(metavar="TOWN|FILE.xodr", help="carla: map to load first.")] = None,
     strict: Annotated[
         bool,
@@ -78,8 +108,16 @@ def replay(
     ] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
-    """Simulate a scenario."""
+    """Simulate a scenario.
+
+    Examples
+    --------
+    log2sim replay s.json -o replay.json
+    log2sim replay s.json --ego policy.py:drive --agents reactive
+    log2sim replay s.json --warn road --brake --strict
+    """
     from dataclasses import replace as changed
 
     from log2sim.cli.edit import ids_of
@@ -89,7 +127,7 @@ def replay(
     from log2sim.errors import ConfigError
     from log2sim.simulation.backends import external_simulator
     from log2sim.simulation.metrics.limits import check_limits, parse_limits, require_strict
-    from log2sim.simulation.metrics.summary import summarize
+    from log2sim.simulation.metrics.summary import MAX_LISTED, summarize
     from log2sim.simulation.policy_loading import load_policy
     from log2sim.simulation.runner import replay as run
     from log2sim.simulation.warnings.policy import BrakeWhenWarned
@@ -121,7 +159,7 @@ def replay(
     result = changed(result, left_out=left_out, warnings=warned)
     if out is not None:
         result.save(out)
-    say(summarize(result), quiet=quiet)
+    say(summarize(result, limit=None if verbose else MAX_LISTED), quiet=quiet)
     if strict:
         require_strict(result, limits)
     for broken in check_limits(result, limits):

@@ -70,7 +70,13 @@ def synth(
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Generate a synthetic log with exact ground truth, or random traffic for training and tests."""
+    """Generate a synthetic log with exact ground truth, or random traffic for training and tests.
+
+    Examples
+    --------
+    log2sim synth samples/crossing.toml -o log/
+    log2sim synth --traffic vehicle --scenes 100 -o scenes/
+    """
     from log2sim.cli.progress import progress
     from log2sim.synth.scene import load_scene
     from log2sim.synth.write import write_synthetic

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from log2sim.cli.options import say
+from log2sim.cli.options import counted, say
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Log, Scenario
@@ -15,16 +15,18 @@ if TYPE_CHECKING:
 
 def load_replay(path: Path, scenario: Scenario, *, quiet: bool = False) -> Replay:
     """Load a replay to show with a scenario; warn when it belongs to another scenario."""
+    from log2sim.datatypes import EGO
     from log2sim.simulation.result import Replay as Replayed
 
     loaded = Replayed.load(path)
     known = {a.id for a in scenario.agents}
-    unknown = [a.id for a in loaded.agents if a.id not in known]
+    others = [a.id for a in loaded.agents if a.id != EGO]
+    unknown = [id for id in others if id not in known]
     if loaded.scenario != scenario.name:
         say(f"warning: {path} replays '{loaded.scenario}', not '{scenario.name}'; the two may not match", quiet=quiet)
     elif unknown:
-        count = f"{len(unknown)} of its {len(loaded.agents)} agents"
-        say(f"warning: {path} replays another version of '{scenario.name}': {count} are not in it", quiet=quiet)
+        count = f"{len(unknown)} of its {counted(len(others), 'agent')} {'is' if len(unknown) == 1 else 'are'}"
+        say(f"warning: {path} replays another version of '{scenario.name}': {count} not in it", quiet=quiet)
     return loaded
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from log2sim.cli.options import Format, Sequence, say
+from log2sim.cli.options import Format, Quiet, Sequence, say
 
 
 def validate(
@@ -20,31 +20,39 @@ def validate(
     ],
     format: Format = "auto",
     sequence: Sequence = None,
+    quiet: Quiet = False,
 ) -> None:
     """Validate a file, or every record of a log.
 
     Exits with 3 and lists the problems, if there are any. Gaps between records are no problem; they are
     noted, and so is what a format lacks or its reader left out.
+
+    Examples
+    --------
+    log2sim validate s.json
+    log2sim validate samples/crossing
     """
     from log2sim.errors import LogError
     from log2sim.logs.opening import is_log_file, open_log
 
     if path.is_dir() or is_log_file(path):
+        from log2sim.cli.progress import VALIDATING, progress
         from log2sim.logs.native.reader import READER
         from log2sim.logs.validation import list_gaps, validate_log
 
         opened = open_log(path, format=format, sequence=sequence)
-        problems = validate_log(opened)
+        with progress(quiet=quiet) as report_progress:
+            problems = validate_log(opened, progress=lambda done, total: report_progress(VALIDATING, done, total))
         # Those of native logs are among the problems.
         for note in () if opened.format == READER.name else opened.notes:
-            say(f"note: {note}")
+            say(f"note: {note}", quiet=quiet)
         for gap in list_gaps(opened):
-            say(f"note: {gap}")
+            say(f"note: {gap}", quiet=quiet)
         if problems:
             raise LogError(f"{path}: {len(problems)} problem{'s' * (len(problems) > 1)}\n  " + "\n  ".join(problems))
     else:
         _validate_file(path)
-    say(f"{path}: valid")
+    say(f"{path}: valid", quiet=quiet)
 
 
 def _validate_file(path: Path) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from log2sim.cli.options import Cameras, Overwrite, Quiet, ScenarioPath, Sequence, camera_names, counted, say, write_to
+from log2sim.cli.options import Cameras, Overwrite, Quiet, ScenarioPath, Sequence, camera_names, say, write_to
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -57,10 +57,16 @@ def view(
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write an interactive HTML page of a scenario."""
+    """Write an interactive HTML page of a scenario.
+
+    Examples
+    --------
+    log2sim view s.json --log samples/crossing -o s.html
+    log2sim view s.json --replay replay.json --truth samples/crossing -o s.html
+    """
     from log2sim.cli.progress import progress
     from log2sim.cli.truth import load_replay, load_truth
-    from log2sim.datatypes import Scenario
+    from log2sim.datatypes import Scenario, say_agents
     from log2sim.documents import check_targets
     from log2sim.errors import ConfigError
     from log2sim.visualization.page.writer import write_page
@@ -93,7 +99,7 @@ def view(
         notes = write_page(loaded, out, **layers, predict_s=predict, overwrite=overwrite)
     for note in notes:
         say(note, quiet=quiet)
-    say(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {counted(len(loaded.agents), 'agent')}", quiet=quiet)
+    say(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {say_agents(a.id for a in loaded.agents)}", quiet=quiet)
 
 
 def _recorded(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from log2sim.datatypes.agent import COLOR_NAMES, Agent
+from log2sim.datatypes.agent_counts import say_agents, say_categories
 from log2sim.datatypes.boxes3d import Boxes3D
 from log2sim.datatypes.categories import (
     CATEGORIES,
@@ -106,6 +107,8 @@ __all__ = [
     "end_of",
     "list_doubtful",
     "retime_spans",
+    "say_agents",
+    "say_categories",
     "say_confidence",
     "seen_from",
     "why_doubtful",

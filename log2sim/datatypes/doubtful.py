@@ -23,12 +23,12 @@ def say_confidence(agent: Agent) -> str:
     return f"confidence {math.floor(agent.confidence * 100 + 1e-9) / 100:.2f}"
 
 
-def list_doubtful(agents: Sequence[Agent]) -> str:
-    """List agents on one line, each with why it is doubtful, else with its confidence; `MAX_LISTED` of many.
+def list_doubtful(agents: Sequence[Agent], limit: int | None = MAX_LISTED) -> str:
+    """List agents on one line, each with why it is doubtful, else with its confidence; `limit` of many, or all without one.
 
     Those with a doubt come first, since low confidence alone says less.
     """
-    first = sorted(agents, key=lambda agent: not agent.doubts)[:MAX_LISTED]
+    first = sorted(agents, key=lambda agent: not agent.doubts)[:limit]
     named = [f"{agent.id} ({why_doubtful(agent) or say_confidence(agent)})" for agent in first]
-    rest = len(agents) - MAX_LISTED
+    rest = len(agents) - len(first)
     return ", ".join(named) + (f" and {rest} more" if rest > 0 else "")

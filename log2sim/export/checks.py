@@ -10,7 +10,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, Scenario, list_doubtful
+from log2sim.datatypes import Agent, Scenario, list_doubtful, why_doubtful
 from log2sim.errors import ScenarioError
 from log2sim.geometry import Array, bev_iou, box_corners_bev, rectangles_overlap, wrap_angle
 
@@ -67,12 +67,16 @@ def export_notes(scenario: Scenario) -> list[str]:
 
 def doubtful_note(source: Scenario, exported: Scenario) -> str:
     """Say how many agents of a scenario are doubtful, which, and whether the export has them."""
-    left_out = {a.id for a in source.agents} - {a.id for a in exported.agents}
-    gone = [a for a in source.doubtful if a.id in left_out]
-    there = [a for a in source.doubtful if a.id not in left_out]
-    counts = f"{len(gone)} of {len(source.agents)} agents left out as doubtful: {list_doubtful(gone)}" if gone else ""
-    kept = f"{len(there)} of {len(source.agents)} agents are doubtful: {list_doubtful(there)}" if there else ""
-    return "; ".join(part for part in (counts, kept) if part)
+    kept_ids = {a.id for a in exported.agents}
+    ego, doubtful, total = source.ego, [a for a in source.others if a.is_doubtful], len(source.others)
+    gone = [a for a in doubtful if a.id not in kept_ids]
+    there = [a for a in doubtful if a.id in kept_ids]
+    parts = [
+        f"{len(gone)} of {total} agents left out as doubtful: {list_doubtful(gone)}" if gone else "",
+        f"{len(there)} of {total} agents are doubtful: {list_doubtful(there)}" if there else "",
+        f"the ego is doubtful: {why_doubtful(ego)}" if ego is not None and ego.is_doubtful else "",
+    ]
+    return "; ".join(part for part in parts if part)
 
 
 def require_start_as_in_scenario(agents: Sequence[Agent], placed: Array) -> None:

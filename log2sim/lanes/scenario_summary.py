@@ -11,24 +11,25 @@ from log2sim.lanes.lane_keeping import summarize_lane_keeping
 
 
 def summarize_scenario(scenario: Scenario) -> dict[str, Any]:
-    """Summarize a scenario as a JSON document; lanes that it does not hold are inferred from paths."""
+    """Summarize a scenario as a JSON document: agents without the ego; lanes that it does not hold are inferred from paths."""
     features = scenario.map_features or MapFeatures()
     lanes, notes = features.lanes, features.notes
     if not lanes:
         lanes, more = infer_lanes(features.markings, features.borders, scenario)
         notes = (*notes, *more)
-    moving = [agent for agent in scenario.agents if not agent.static]
+    agents = scenario.others
     return {
         "name": scenario.name,
         "t0_ns": scenario.t0_ns,
         "duration_s": scenario.duration_s,
         "agents": {
-            "count": len(scenario.agents),
-            "moving": len(moving),
-            "doubtful": len(scenario.doubtful),
-            "categories": dict(sorted(Counter(agent.category for agent in scenario.agents).items())),
-            "colors": dict(sorted(Counter(a.color["name"] for a in scenario.agents if a.color is not None).items())),
+            "count": len(agents),
+            "moving": sum(not agent.static for agent in agents),
+            "doubtful": sum(agent.is_doubtful for agent in agents),
+            "categories": dict(sorted(Counter(agent.category for agent in agents).items())),
+            "colors": dict(sorted(Counter(a.color["name"] for a in agents if a.color is not None).items())),
         },
+        "ego": None if scenario.ego is None else {"doubtful": scenario.ego.is_doubtful},
         "markings": dict(sorted(Counter(marking.kind for marking in features.markings).items())),
         "borders": dict(sorted(Counter(border.kind for border in features.borders).items())),
         "lanes": {

@@ -14,6 +14,7 @@ from log2sim.simulation.metrics.box_tracks import BoxTracks
 from log2sim.simulation.metrics.collisions import REPLAY, SCENARIO, collisions
 from log2sim.simulation.metrics.comfort import comfort
 from log2sim.simulation.metrics.conflicts import conflicts, most_critical
+from log2sim.simulation.metrics.ego_figures import ego_figures
 from log2sim.simulation.metrics.tracking_error import TrackingErrors, agent_metrics, scenario_metrics
 from log2sim.simulation.result import AgentReplay
 from log2sim.simulation.step_clock import StepClock
@@ -65,8 +66,14 @@ def replay_metrics(
     }
     on_time = {a.id: len(a) for a in agents if a.driver == "pid"}
     on_way = on_time | {a.id: len(a) for a in agents if a.driver == "reactive"}
+    driven = next((k for k, agent in enumerate(agents) if agent.driver == "policy"), None)
+    ego = {}
+    if driven is not None:
+        path = trajectories[ids[driven]]
+        ego["ego"] = _with_id(ego_figures(agents[driven], driven, replayed, t_s, path), ids)
     return {
         **scenario_metrics(by_agent, on_time, on_way),
+        **ego,
         "collisions": events,
         "new_collisions": sum(e["belongs_to"] == REPLAY for e in events),
         "min_ttc": most_critical(near, "min_ttc"),
@@ -74,6 +81,12 @@ def replay_metrics(
         "conflicts": near,
         "by_agent": by_agent,
     }
+
+
+def _with_id(figures: dict[str, Any], ids: Sequence[str]) -> dict[str, Any]:
+    """Return figures of the ego with the id of the agent to which the gap was smallest, instead of its column."""
+    gap = figures["min_gap"]
+    return {**figures, "min_gap": None if gap is None else {**gap, "agent": ids[gap["agent"]]}}
 
 
 def _by_agent(records: Iterable[Mapping[str, Any]]) -> dict[str, list[Any]]:
