@@ -118,7 +118,7 @@ def test_the_command_edits_without_them(tmp_path: Path) -> None:
     ran = run("edit", tmp_path / "s.json", "--drop-doubtful", "--shift", "sure=1", "--out", tmp_path / "out.json")
     assert ran.code == 0
     assert "left out as doubtful: phantom (passes through parked at 1.2 s, 2.8 m wide), unsure (conf" in ran.out
-    assert "out.json: 2 edits, 2 agents" in ran.out
+    assert "out.json: 2 edits, 1 agent and the ego" in ran.out
     assert ids(Scenario.load(tmp_path / "out.json")) == ["ego", "sure"]
     again = run("edit", tmp_path / "out.json", "--drop-doubtful", "--out", tmp_path / "again.json")
     assert "left out as doubtful: none" in again.out
