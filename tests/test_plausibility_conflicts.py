@@ -9,8 +9,9 @@ import pytest
 from test_overlap import agent, candidate
 
 from log2sim.agents.naming import name_agents
+from log2sim.agents.plausibility import box_table
 from log2sim.agents.plausibility.box_table import BoxTable
-from log2sim.agents.plausibility.conflicts import conflict_doubts, find_conflicts, resolve_conflicts
+from log2sim.agents.plausibility.conflicts import conflict_doubts, find_all_conflicts, find_conflicts, resolve_conflicts
 
 T = np.linspace(0.0, 4.0, 5)
 
@@ -156,3 +157,18 @@ def test_whoever_is_seen_at_a_single_tick_stays_as_in_logs_of_one_frame() -> Non
     once = replace(now, waypoints=now.waypoints.take(slice(2, 3)))
     assert [len(a.waypoints.t_s) for a, _ in judged((once, 3.0))] == [1]
     assert judged((replace(once, waypoints=agent(0.5).waypoints.take(slice(2, 3))), 3.0), ego=agent(0.0)) == []
+
+
+def test_conflicts_are_the_same_whether_ticks_are_looked_at_together_or_in_turn(monkeypatch):
+    agents = [agent(0.0), agent(2.2), agent(0.0, t=(1.0, 2.0)), agent(-50.0), agent(-50.0, yaw=np.pi / 2, t=(0.0, 1.5))]
+    together = find_conflicts(BoxTable.of(agents, T))
+    monkeypatch.setattr(box_table, "TICKS_AT_A_TIME", 3)
+    in_turn, present = find_all_conflicts(agents, T)
+    assert len(together) > 2
+    assert [(c.first, c.second, c.tick.tolist()) for c in in_turn] == [
+        (c.first, c.second, c.tick.tolist()) for c in together
+    ]
+    for one, other in zip(in_turn, together):
+        np.testing.assert_allclose(one.share, other.share)
+        np.testing.assert_allclose(one.depth_m, other.depth_m)
+    np.testing.assert_array_equal(present, BoxTable.of(agents, T).present)

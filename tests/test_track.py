@@ -7,8 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.integrate import quad_vec
 from scipy.linalg import expm
+from scipy.optimize import linear_sum_assignment
 from worlds import rows_at
 
 from log2sim.datatypes import Measurements, Track
@@ -16,7 +19,7 @@ from log2sim.geometry import NS_PER_S
 from log2sim.tracking.category import decide_category
 from log2sim.tracking.forward import track_forward
 from log2sim.tracking.motion import CENTER_SIGMA_M, innovation, measurement_noise, predict, update
-from log2sim.tracking.stitch import stitch
+from log2sim.tracking.stitch import FORBIDDEN, _choose_joins, stitch
 from log2sim.tracking.tracker import min_hits, track
 
 PERIOD_S = 0.1
@@ -490,3 +493,17 @@ def test_a_few_wrong_positions_do_not_make_a_pedestrian_a_cyclist() -> None:
 def test_a_track_too_short_to_have_a_speed_keeps_its_category() -> None:
     rows = seen(np.array([[0.0, 0.0], [4.0, 0.0]]), stamps(2), category="pedestrian")
     assert decide_category(rows) == "pedestrian"
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.dictionaries(st.tuples(st.integers(0, 7), st.integers(0, 7)), st.integers(0, 50), max_size=14))
+def test_joins_of_groups_are_as_good_as_those_of_all_together(costs):
+    """As many joins as possible, and of those the cheapest: as over a table of all pairs."""
+    pairs = np.array(list(costs), dtype=np.intp).reshape(-1, 2)
+    cost = np.array(list(costs.values()), dtype=float)
+    first, second = _choose_joins((pairs[:, 0], pairs[:, 1], cost))
+    table = np.full((8, 8), FORBIDDEN)
+    table[pairs[:, 0], pairs[:, 1]] = cost
+    i, j = linear_sum_assignment(table)
+    assert len(set(first.tolist())) == len(set(second.tolist())) == len(first) == np.sum(table[i, j] < FORBIDDEN)
+    assert table[first, second].sum() == table[i, j][table[i, j] < FORBIDDEN].sum()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from log2sim.geometry import Array
@@ -167,33 +168,39 @@ def _in_context(lines: list[PaintedLine]) -> list[PaintedLine]:
     distance = np.abs(offset[:, 1] * np.cos(heading[a]) - offset[:, 0] * np.sin(heading[a]))
     parallel = (turn < PARALLEL_RAD) & (distance > BESIDE_M[0])
     crossing = (turn > np.pi / 4) & (np.linalg.norm(offset, axis=1) < 0.5)
-    shared = np.zeros((2, len(lines), len(lines)), np.int32)
-    np.add.at(shared[0], (owner[a[parallel]], owner[b[parallel]]), 1)
-    np.add.at(shared[1], (owner[a[crossing]], owner[b[crossing]]), 1)
+    length, odds = (np.array([getattr(line, name) for line in lines]) for name in ("length_m", "log_odds"))
     contrast = np.array([float(np.median(np.nan_to_num(line.pieces.color))) for line in lines])
-    alike = _alike(lines, contrast)
-    beside = np.stack([shared[0, k] > BESIDE_PER_M * line.length_m for k, line in enumerate(lines)])
-    crowded = np.count_nonzero(beside & alike, axis=1) > MAX_BESIDE
-    out = []
-    for k, line in enumerate(lines):
-        odds = CROWDED if crowded[k] else 0.0
-        # Combs do not tell against what they cross, unless that is a comb, too.
-        crossings = np.count_nonzero((shared[1, k] > 0) & alike[k] & (~crowded | np.any(beside[k])))
-        if crossings > MAX_CROSSINGS and crossings > MAX_CROSSINGS_PER_M * line.length_m:
-            odds += CROWDED
-        brighter = beside[k] & np.array([other.log_odds > line.log_odds - 1 for other in lines])
-        if np.any(brighter) and contrast[k] < REMNANT_SHARE * float(contrast[brighter].max()):
-            odds += REMNANT
-        out.append(replace(line, log_odds=line.log_odds + odds))
-    return out
+    # Pairs of lines, not a table of all: a long log has thousands.
+    i, j, count = _counted(owner[a[parallel]], owner[b[parallel]])
+    beside = count > BESIDE_PER_M * length[i]
+    i, j = i[beside], j[beside]
+    crowded = np.bincount(i[_alike(lines, contrast, i, j)], minlength=len(lines)) > MAX_BESIDE
+    added = np.where(crowded, CROWDED, 0.0)
+    # Combs do not tell against what they cross, unless that is a comb, too.
+    k, other, _ = _counted(owner[a[crossing]], owner[b[crossing]])
+    told = _alike(lines, contrast, k, other) & (~crowded[other] | (np.bincount(i, minlength=len(lines)) > 0)[k])
+    crossings = np.bincount(k[told], minlength=len(lines))
+    added += np.where((crossings > MAX_CROSSINGS) & (crossings > MAX_CROSSINGS_PER_M * length), CROWDED, 0.0)
+    brighter = odds[j] > odds[i] - 1
+    brightest = np.full(len(lines), -np.inf)
+    np.maximum.at(brightest, i[brighter], contrast[j[brighter]])
+    added += np.where(np.isfinite(brightest) & (contrast < REMNANT_SHARE * brightest), REMNANT, 0.0)
+    return [replace(line, log_odds=line.log_odds + more) for line, more in zip(lines, added.tolist())]
 
 
-def _alike(lines: list[PaintedLine], contrast: Array) -> Mask:
-    """Mask (L, L) of lines (second) that look like another (first) and are as likely: what combs and grids are made of."""
+def _counted(first: NDArray[np.intp], second: NDArray[np.intp]) -> tuple[NDArray[np.intp], ...]:
+    """Return each pair of numbers (P,), (P,) once, and how often (P,) it is there."""
+    most = int(second.max(initial=0)) + 1
+    pair, count = np.unique(first * most + second, return_counts=True)
+    return pair // most, pair % most, count
+
+
+def _alike(lines: list[PaintedLine], contrast: Array, one: NDArray[np.intp], other: NDArray[np.intp]) -> Mask:
+    """Mask (P,) of pairs of lines that look alike, and the other as likely as the one: what combs and grids are made of."""
     width, odds = np.array([line.width_m for line in lines]), np.array([line.log_odds for line in lines])
-    same = np.maximum(width[:, None], width) <= 2 * np.minimum(width[:, None], width)
-    same &= np.maximum(contrast[:, None], contrast) <= 2 * np.minimum(contrast[:, None], contrast)
-    return np.asarray(same & (odds > odds[:, None] - 2))
+    same = np.maximum(width[one], width[other]) <= 2 * np.minimum(width[one], width[other])
+    same &= np.maximum(contrast[one], contrast[other]) <= 2 * np.minimum(contrast[one], contrast[other])
+    return np.asarray(same & (odds[other] > odds[one] - 2))
 
 
 def _headings(points: Array) -> Array:
