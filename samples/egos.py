@@ -1,9 +1,14 @@
-"""Two drivers for the ego, as examples of a policy.
+"""Drivers for the ego, as examples of a policy.
 
-    log2sim replay scenario.json --ego samples/egos.py:BrakeLate --agents reactive --out replay.json
-    log2sim replay scenario.json --ego samples/egos.py:ChangeLane --agents reactive --out replay.json
+    log2sim edit scenario.json --lateral car-2=3 --out blocked.json
+    log2sim replay blocked.json --ego samples/egos.py:BrakeLate --out late.json
+    log2sim replay blocked.json --ego samples/egos.py:BrakeInTime --out in_time.json
+    log2sim replay scenario.json --ego samples/egos.py:ChangeLane --agents reactive --out change.json
 
-A policy is called once a step with an `Observation` and answers with `Controls`. Both drivers take all they need from what
+In the scenario of samples/crossing the first line puts a parked car into the lane of the ego. `BrakeLate` hits it, `BrakeInTime`
+stops behind it.
+
+A policy is called once a step with an `Observation` and answers with `Controls`. These drivers take all they need from what
 they see, so they drive any scenario that has an ego.
 """
 
@@ -12,18 +17,20 @@ from __future__ import annotations
 import numpy as np
 
 from log2sim.datatypes import Scenario
+from log2sim.geometry import Array
 from log2sim.simulation.policy import Controls, EgoState, Observation, Others, PathAhead
 
 
-class BrakeLate:
+class BrakeInTime:
     """Drives the way of the scenario, yet does not slow down with it: it brakes hard, and only when it must.
 
     It is in a hurry: `hurry` times the highest speed that the scenario has on the next 30 m. What stands or moves on
-    its way is ignored until `late_mps2` would be needed to stop short of it, or to get as slow as it is.
+    its way is ignored until `brake_at_mps2` would be needed to stop `room_m` short of it, or to get as slow as it is.
     """
 
-    def __init__(self, late_mps2: float = 5.0, room_m: float = 1.5, hurry: float = 1.5) -> None:
-        self.late_mps2, self.room_m, self.hurry = late_mps2, room_m, hurry
+    def __init__(self, brake_at_mps2: float = 5.0, room_m: float = 1.5, hurry: float = 1.5) -> None:
+        self.brake_at_mps2, self.room_m, self.hurry = brake_at_mps2, room_m, hurry
+        self.braking = False
 
     def reset(self, scenario: Scenario) -> None:
         self.braking = False
@@ -35,14 +42,21 @@ class BrakeLate:
         closing = max(ego.speed_mps - pace_mps, 0.0)
         needed_mps2 = closing**2 / (2 * left_m)
         # Once it brakes it goes on until it is as slow as the leader.
-        self.braking = needed_mps2 > self.late_mps2 or (self.braking and closing > 0 and np.isfinite(gap_m))
+        self.braking = needed_mps2 > self.brake_at_mps2 or (self.braking and closing > 0 and np.isfinite(gap_m))
         if self.braking:
-            accel = -max(needed_mps2, self.late_mps2)
+            accel = -max(needed_mps2, self.brake_at_mps2)
         else:
             cruise_mps = self.hurry * float(seen.path.speed_mps[:30].max())
             close = gap_m < 2 * self.room_m + 0.5 * ego.speed_mps
             accel = hold_speed(ego, min(cruise_mps, pace_mps) if close else cruise_mps)
         return Controls(accel, steer_along(ego, seen.path))
+
+
+class BrakeLate(BrakeInTime):
+    """The same driver, who does not brake before more than dry tires hold would be needed, which is too late."""
+
+    def __init__(self) -> None:
+        super().__init__(brake_at_mps2=15.0, room_m=0.3)
 
 
 class ChangeLane:
@@ -53,9 +67,10 @@ class ChangeLane:
 
     def __init__(self, lane_m: float = 3.5, over_s: float = 4.0) -> None:
         self.lane_m, self.over_s = lane_m, over_s
+        self.side, self.done_m, self.length_m = 0.0, 0.0, 1.0
 
     def reset(self, scenario: Scenario) -> None:
-        self.side, self.done_m, self.length_m, self.before = 0.0, 0.0, 1.0, None
+        self.side, self.done_m, self.length_m = 0.0, 0.0, 1.0
 
     def __call__(self, seen: Observation) -> Controls:
         ego, path = seen.ego, seen.path
@@ -84,7 +99,7 @@ def hold_speed(ego: EgoState, speed_mps: float) -> float:
     return float(np.clip((speed_mps - ego.speed_mps) / 0.5, -4.0, 2.5))
 
 
-def steer_along(ego: EgoState, path: PathAhead, left_m: np.ndarray | float = 0.0) -> float:
+def steer_along(ego: EgoState, path: PathAhead, left_m: Array | float = 0.0) -> float:
     """Steering angle in rad that leads along the way, or along one that is `left_m` (P,) to its left.
 
     The curvature of the way a bit ahead, for the wheels take their time, and what brings offset and heading back to it as
@@ -101,7 +116,7 @@ def steer_along(ego: EgoState, path: PathAhead, left_m: np.ndarray | float = 0.0
     return float(np.arctan(ego.wheelbase_m * curvature * (1 + ego.understeer_s2pm2 * ego.speed_mps**2)))
 
 
-def along_path(others: Others, path: PathAhead) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def along_path(others: Others, path: PathAhead) -> tuple[Array, Array, Array]:
     """How far ahead on the way, how far left of it, and how fast along it others are: (A,), (A,), (A,)."""
     dx, dy = others.x_m[:, None] - path.x_m, others.y_m[:, None] - path.y_m
     k = np.argmin(np.hypot(dx, dy), axis=1)

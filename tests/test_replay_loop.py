@@ -15,7 +15,8 @@ from command_line import run
 from replay_maneuvers import MANEUVERS, agent_from, scenario_of
 from replay_scenes import LENGTH_M, Speed, gap, line, parked, walker
 
-from log2sim.datatypes import Trajectory
+from log2sim.datatypes import Scenario, Trajectory
+from log2sim.edit import Lateral, edit
 from log2sim.errors import ConfigError
 from log2sim.simulation.policy import Controls
 from log2sim.simulation.policy_loading import load_policy
@@ -319,11 +320,11 @@ def test_the_command_line_lets_agents_react(tmp_path):
 # The example egos.
 
 
-def test_the_ego_that_brakes_late_brakes_hard_and_stops_short_of_what_stands():
+def test_the_ego_that_brakes_in_time_brakes_hard_and_stops_short_of_what_stands():
     scene = scenario_of(
         line("ego", 0, speed=12, duration_s=12), line("f", -25, speed=12, duration_s=12), parked("p", 80, 0)
     )
-    driver = load_policy(f"{EGOS}:BrakeLate")
+    driver = load_policy(f"{EGOS}:BrakeInTime")
     result = replay(scene, ego=driver, agents="reactive", dt_s=0.02)
     ego = result.agent("ego")
     assert result.metrics["collisions"] == []
@@ -362,8 +363,22 @@ def test_the_ego_that_changes_lane_takes_the_free_side_or_stays():
         assert result.metrics["collisions"] == []
 
 
-@pytest.mark.parametrize("name", ["BrakeLate", "ChangeLane"])
+@pytest.mark.parametrize("name", ["BrakeInTime", "ChangeLane"])
 def test_the_example_egos_drive_the_sample(name, tmp_path):
     ran = run("replay", SAMPLE, "--ego", f"{EGOS}:{name}", "--agents", "reactive", "--dt", 0.05, "--strict",
               "--out", tmp_path / "r.json")  # fmt: skip
     assert ran.code == 0, ran.err
+
+
+def test_of_the_example_egos_one_brakes_too_late_and_one_in_time():
+    blocked = edit(Scenario.load(SAMPLE), [Lateral("car_parked", 3.0)]).scenario
+    late, in_time = (
+        replay(blocked, ego=load_policy(f"{EGOS}:{name}"), dt_s=0.05) for name in ("BrakeLate", "BrakeInTime")
+    )
+    (hit,) = late.metrics["collisions"]
+    assert hit["agents"] == ["ego", "car_parked"]
+    assert hit["belongs_to"] == "replay"
+    assert in_time.metrics["collisions"] == []
+    assert in_time.agent("ego").speed_mps[-1] == 0.0  # it stands, and not because it never came near
+    gap_m = 12.6 - 4.1 / 2 - (in_time.agent("ego").x_m[-1] + 4.6 / 2)
+    assert 0.3 < gap_m < 2.5

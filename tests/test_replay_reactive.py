@@ -155,7 +155,7 @@ def test_at_the_edge_of_a_conflict_an_agent_does_not_hunt():
         line("ego", 0, speed=12, duration_s=9), line("f", -25, speed=12, duration_s=9), parked("p", 80, 0),
         line("c", 40, -70, 10, 9, np.pi / 2), line("on", 150, 3.5, 12, 9, np.pi),
     )  # fmt: skip
-    brakes_late = load_policy(f"{SAMPLE.parents[1]}/egos.py:BrakeLate")
+    brakes_late = load_policy(f"{SAMPLE.parents[1]}/egos.py:BrakeInTime")
     result = run(scene, ego=brakes_late, agents="reactive", dt_s=0.02)
     c = result.agent("c")
     assert new_collisions(result) == []

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from log2sim.errors import ConfigError
 from log2sim.input_files import read_file, require_readable
 from log2sim.perception.detect.preprocessing import InputSpec
+from log2sim.perception.onnx_session import open_session
 from log2sim.threads import usable_threads
 
 MAX_FILE_BYTES = 2 * 1024**3
@@ -85,7 +86,7 @@ def load_model(path: Path, *, threads: int | None = None) -> OnnxModel:
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 3
     try:
-        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        session = open_session(path, options)
     except Exception as error:  # as above
         raise ConfigError(f"{path}: not a model that ONNX Runtime can load: {first_line(error)}") from None
     metadata = dict(session.get_modelmeta().custom_metadata_map)

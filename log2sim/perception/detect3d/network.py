@@ -19,6 +19,7 @@ from log2sim.errors import ConfigError
 from log2sim.input_files import require_readable
 from log2sim.model_errors import first_problem
 from log2sim.perception.detect3d.grid import CHANNELS, MIN_SIZE_CELLS
+from log2sim.perception.onnx_session import open_session
 
 METADATA_KEY = "log2sim.lidar"
 VERSION = 1
@@ -208,7 +209,7 @@ def load_network(path: Path) -> Network:
     options.log_severity_level = 3
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
-        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        session = open_session(path, options)
     except Exception as error:  # as in `Network.run`
         raise ConfigError(f"{path}: not a network that ONNX Runtime can load: {brief(error)}") from None
     check_names(session, path)

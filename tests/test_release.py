@@ -1,0 +1,199 @@
+"""What is released: the version, wheel and sdist outside the checkout, the citation, typed examples, no telemetry."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import log2sim
+from log2sim.version import FALLBACK, read_version
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+GIT = ("git", "-c", "user.name=test", "-c", "user.email=test@example.org", "-c", "commit.gpgsign=false")
+UNTYPED = ("[no-untyped-def]", "[no-untyped-call]", "[union-attr]")
+"""What short examples of the README may do: state no types, and save the figure of axes, which could be a part of one."""
+
+INSTALLED = """
+import json, sys
+from importlib import resources
+import log2sim
+from log2sim.config import Config
+from log2sim.datatypes import Log
+from log2sim.documents import load_schema
+from log2sim.perception.detect3d.detectors import create_lidar_detector
+detector = create_lidar_detector("lidar:vehicle", Log("made", "log2sim", {}, {}, {}), Config().lidar)
+page = resources.files("log2sim.visualization.page").joinpath("page.html").read_text(encoding="utf-8")
+typed = resources.files("log2sim").joinpath("py.typed").is_file()
+print(json.dumps([log2sim.__file__, log2sim.__version__, load_schema("scenario-1")["$schema"], detector.name, len(page), typed]))
+"""
+
+
+def test_the_version_is_what_the_build_wrote(tmp_path: Path) -> None:
+    file = tmp_path / "version.txt"
+    assert read_version(file) == FALLBACK == PROJECT["tool"]["setuptools_scm"]["fallback_version"]
+    file.write_text("1.2.3.dev4+gabcdef\n", encoding="ascii")
+    assert read_version(file) == "1.2.3.dev4+gabcdef"
+    written = ROOT / PROJECT["tool"]["setuptools_scm"]["version_file"]
+    assert log2sim.__version__ == read_version(written)
+
+
+def test_the_oldest_python_is_the_same_everywhere() -> None:
+    versions = [c.rsplit(" ", 1)[1] for c in PROJECT["project"]["classifiers"] if re.search(r":: 3\.\d+$", c)]
+    assert versions == ["3.11", "3.12", "3.13"]
+    assert PROJECT["project"]["requires-python"] == f">={versions[0]}"
+    assert PROJECT["tool"]["mypy"]["python_version"] == versions[0]
+    assert PROJECT["tool"]["ruff"]["target-version"] == f"py{versions[0].replace('.', '')}"
+
+
+def test_the_citation_names_the_project_and_its_papers() -> None:
+    yaml = pytest.importorskip("yaml")
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["cff-version"] == "1.2.0"
+    assert {"message", "title", "authors"} <= set(citation)
+    assert citation["title"] == PROJECT["project"]["name"]
+    assert citation["license"] == PROJECT["project"]["license"]
+    assert citation["authors"] == [{"name": "log2sim developers"}]
+    assert len(citation["references"]) == 4
+    for reference in citation["references"]:
+        assert {"type", "title", "authors"} <= set(reference)
+        assert all({"given-names", "family-names"} <= set(author) for author in reference["authors"])
+
+
+def test_telemetry_is_off_wherever_a_model_is_opened(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    import onnxruntime
+
+    from log2sim.perception.onnx_session import open_session
+
+    called: list[str] = []
+    monkeypatch.setattr(onnxruntime, "disable_telemetry_events", lambda: called.append("off"))
+    monkeypatch.setattr(onnxruntime, "InferenceSession", lambda *_, **__: called.append("session"))
+    open_session(tmp_path / "model.onnx", None)
+    assert called == ["off", "session"]
+    opening = re.compile(r"InferenceSession\(")
+    sources = [f for f in (ROOT / "log2sim").rglob("*.py") if opening.search(f.read_text(encoding="utf-8"))]
+    assert [f.name for f in sources] == ["onnx_session.py"]
+
+
+def call(*command: str | Path, cwd: Path, **variables: str) -> str:
+    """Run a command outside the checkout and return what it prints."""
+    kept = {name: value for name, value in os.environ.items() if name != "PYTHONPATH" and "SETUPTOOLS_SCM" not in name}
+    ran = subprocess.run(
+        [str(c) for c in command], cwd=cwd, env=kept | variables, capture_output=True, text=True, check=False
+    )
+    assert ran.returncode == 0, ran.stderr[-2000:]
+    return ran.stdout
+
+
+@pytest.fixture(scope="module")
+def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A repository with the files of this one and a tag."""
+    pytest.importorskip("setuptools_scm")
+    if shutil.which("git") is None or not (ROOT / ".git").exists():
+        pytest.skip("needs git to tell the files of the checkout from others")
+    folder = tmp_path_factory.mktemp("release") / "checkout"
+    listed = call("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", cwd=ROOT)
+    wanted = ("log2sim/", "schemas/", "pyproject.toml", "README.md", "LICENSE", ".gitignore")
+    for name in filter(None, listed.split("\0")):
+        if name.startswith(wanted) and (ROOT / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, folder / name)
+    call("git", "init", "-q", cwd=folder)
+    call("git", "add", "--all", cwd=folder)
+    call(*GIT, "commit", "-q", "-m", "all", cwd=folder)
+    return folder
+
+
+@pytest.mark.slow
+def test_a_checkout_without_tags_and_a_copy_without_git_have_a_version(checkout: Path, tmp_path: Path) -> None:
+    ask = "import setuptools_scm; print(setuptools_scm.get_version(root='.', fallback_version='0.1.dev0'))"
+    assert re.match(r"0\.1\.dev1\+g[0-9a-f]+", call(sys.executable, "-c", ask, cwd=checkout))
+    shutil.copy(checkout / "pyproject.toml", tmp_path)
+    build = "import setuptools.build_meta as b; print(b.prepare_metadata_for_build_wheel('.'))"
+    (tmp_path / "pyproject.toml").write_text(
+        re.sub(
+            r"(?m)^(packages|readme|license-files) = .*$|^log2sim_schemas = .*$",
+            "",
+            (tmp_path / "pyproject.toml").read_text(),
+        )
+    )
+    (tmp_path / "log2sim").mkdir()
+    call(sys.executable, "-c", build, cwd=tmp_path)
+    assert (tmp_path / "log2sim/version.txt").read_text().strip() == FALLBACK
+
+
+@pytest.mark.slow
+def test_a_wheel_of_the_sdist_works_outside_the_checkout(checkout: Path, tiny_folder: Path, tmp_path: Path) -> None:
+    call("git", "tag", "v1.2.3", cwd=checkout)
+    build = "import setuptools.build_meta as b; b.build_sdist({!r})"
+    call(sys.executable, "-c", build.format(str(tmp_path)), cwd=checkout)
+    with tarfile.open(tmp_path / "log2sim-1.2.3.tar.gz") as packed:
+        packed.extractall(tmp_path, filter="data")
+    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "-q")
+    call(*pip, "wheel", "--no-build-isolation", "--no-deps", "-w", tmp_path, tmp_path / "log2sim-1.2.3", cwd=tmp_path)
+    site, away = tmp_path / "site", tmp_path / "away"
+    away.mkdir()
+    call(
+        *pip,
+        "install",
+        "--no-deps",
+        "--no-index",
+        "--target",
+        site,
+        tmp_path / "log2sim-1.2.3-py3-none-any.whl",
+        cwd=away,
+    )
+    # Without site an editable installation of the checkout is out of the way, and what log2sim needs is still there.
+    paths = os.pathsep.join([str(site), sysconfig.get_path("purelib"), sysconfig.get_path("platlib")])
+
+    def python(*arguments: str | Path) -> str:
+        return call(sys.executable, "-S", *arguments, cwd=away, PYTHONPATH=paths)
+
+    where, version, schema, detector, page, typed = json.loads(python("-c", INSTALLED))
+    assert Path(where).is_relative_to(site)
+    assert (version, detector, typed) == ("1.2.3", "lidar:vehicle", True)
+    assert schema.startswith("https://json-schema.org/")
+    assert page > 1000
+    assert python("-m", "log2sim", "--version") == "1.2.3\n"
+    python("-m", "log2sim", "reconstruct", tiny_folder, "--detector", "labels", "--out", away / "s.json", "--quiet")
+    assert json.loads((away / "s.json").read_text())["provenance"]["log2sim_version"] == "1.2.3"
+
+
+@pytest.mark.slow
+def test_examples_have_the_types_that_they_use(tmp_path: Path) -> None:
+    blocks = re.findall(
+        r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    )
+    files = [tmp_path / f"readme_{k}.py" for k in range(len(blocks))]
+    for file, block in zip(files, blocks):
+        file.write_text(block, encoding="utf-8")
+    files += sorted((ROOT / "samples").glob("*.py"))
+    assert len(files) > len(blocks) > 0
+    # The cache of the checkout: the run of mypy over the package, which follows, finds all that is done here.
+    command = [
+        sys.executable,
+        "-m",
+        "mypy",
+        "--config-file",
+        ROOT / "pyproject.toml",
+        "--cache-dir",
+        ROOT / ".mypy_cache",
+        *files,
+    ]
+    ran = subprocess.run([str(c) for c in command], cwd=ROOT, capture_output=True, text=True, check=False)
+    examples = {str(file) for file in files} | {
+        str(file.relative_to(ROOT)) for file in files if file.is_relative_to(ROOT)
+    }
+    errors = [line for line in ran.stdout.splitlines() if ": error:" in line and line.split(":")[0] in examples]
+    assert [line for line in errors if not line.endswith(UNTYPED) or line.startswith("samples/")] == []
+    assert ran.returncode in (0, 1), ran.stderr[-1000:]
