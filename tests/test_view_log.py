@@ -207,6 +207,12 @@ def test_view_shows_a_log(log_folder: Path, tmp_path: Path) -> None:
     assert document["background"] is not None
     assert document["metrics"][0][0] == "Metrics against tiny"
     assert "HOTA" in document["metrics"][0][1]
+    other = json.loads(truth.read_text())
+    (tmp_path / "other.json").write_text(json.dumps({**other, "t0_ns": other["t0_ns"] + 10**12}))
+    assert (
+        "choose the log that"
+        in run("view", tmp_path / "other.json", "--log", log_folder, "--quiet", "--out", tmp_path / "b.html").line
+    )
     assert "add --log" in run("view", truth, "--max-mb", "3", "--out", tmp_path / "b.html").line
     assert "expected metrics" in run("view", truth, "--metrics", truth, "--out", tmp_path / "b.html").line
 

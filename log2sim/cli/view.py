@@ -32,7 +32,8 @@ def view(
         float | None,
         typer.Option(
             metavar="MB",
-            help="Size of a page with --log, in millions of bytes; pictures and points are chosen to fit. Default: 40.",
+            help="Size of a page with --log, in millions of bytes; pictures and points are chosen to fit.",
+            show_default="40",
         ),
     ] = None,
     cameras: Cameras = None,
@@ -50,7 +51,8 @@ def view(
         Path | None,
         typer.Option(
             metavar="LOG|MAP.png",
-            help="Log whose map of the ground is shown below, or a map of log2sim map. Default: that of --log.",
+            help="Log whose map of the ground is shown below, or a map of log2sim map.",
+            show_default="that of --log",
         ),
     ] = None,
     sequence: Sequence = None,
@@ -113,9 +115,11 @@ def _recorded(
     """Open the log whose pictures and points are shown, with the poses that the scenario was made with."""
     from log2sim.localization.choice import localize_like
     from log2sim.logs.opening import open_log
+    from log2sim.visualization.recording.choice import require_overlap
     from log2sim.visualization.recording.recording import Recorded
 
     log = localize_like(open_log(path, sequence=sequence), scenario.provenance)
+    require_overlap(log, scenario)
     return Recorded(log, max_bytes, cameras, progress)
 
 
@@ -129,17 +133,17 @@ def _metrics(path: Path) -> tuple[str, str]:
 
     Raises
     ------
-    ConfigError
+    LogError
         When it is none.
     """
     from log2sim.documents import read_json
-    from log2sim.errors import ConfigError
+    from log2sim.errors import LogError
     from log2sim.evaluation.metrics.table import format_table
 
-    document = read_json(path, ConfigError)
+    document = read_json(path, LogError)
     try:
         return f"Metrics against {document['truth']}", format_table(document)
     except (KeyError, TypeError, AttributeError, ValueError):
-        raise ConfigError(
+        raise LogError(
             f"{path}: expected metrics of a scenario, as `log2sim evaluate SCENARIO --truth TRUTH --out FILE` writes them"
         ) from None

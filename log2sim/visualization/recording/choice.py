@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Log, Scenario
-from log2sim.errors import ConfigError
+from log2sim.errors import ConfigError, LogError
 from log2sim.geometry import NS_PER_S, Camera, nearest_index, period_of
 
 MARGIN_S = 0.05
@@ -39,6 +39,24 @@ def _place(camera: Camera) -> tuple[int, float]:
     if camera.mount != "ego":
         return 2, 0.0
     return (1 if abs(azimuth) > BACK_RAD else 0), -azimuth
+
+
+def require_overlap(log: Log, scenario: Scenario) -> None:
+    """Require that a log has records during a scenario.
+
+    Raises
+    ------
+    LogError
+        When it has none.
+    """
+    spans = [(int(s.t_ns[0]), int(s.t_ns[-1])) for s in log.streams.values() if len(s.t_ns)]
+    if spans and not any(len(records_within(stream.t_ns, scenario)) for stream in log.streams.values()):
+        first, last = min(span[0] for span in spans), max(span[1] for span in spans)
+        end_ns = scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
+        raise LogError(
+            f"{log.name}: its records are from stamp {first} to {last} ns, the scenario '{scenario.name}' from {scenario.t0_ns} "
+            f"to {end_ns} ns; choose the log that the scenario was made of"
+        )
 
 
 def records_within(t_ns: NDArray[np.int64], scenario: Scenario) -> NDArray[np.int64]:
