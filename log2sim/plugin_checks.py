@@ -71,7 +71,8 @@ def find_member_defect(found: Any, members: tuple[str, ...], call: Call) -> str 
     """Return which of its members an object lacks, or why its method `detect` cannot be called; None where nothing is wrong."""
     missing = [name for name in members if not hasattr(found, name)]
     if missing:
-        return f"made a {type(found).__name__} without {', '.join(repr(name) for name in missing)}"
+        lacking = ", ".join(repr(name) for name in missing)
+        return f"is a {type(found).__name__} without {lacking}; expected an object with {', '.join(members)}"
     return find_call_defect(found.detect, call)
 
 

@@ -136,7 +136,10 @@ def test_an_incomplete_object_names_what_it_lacks() -> None:
         def detect(self, frame: Frame) -> Detections:
             return Detections.empty()
 
-    with pytest.raises(PluginError, match=r"^detector 'mine': made a Incomplete without 'default_min_score'"):
+    with pytest.raises(
+        PluginError,
+        match=r"^detector 'mine': is a Incomplete without 'default_min_score'; expected an object with name, default_min_score, detect",
+    ):
         sort_detectors(Incomplete(), Config())
 
 

@@ -121,6 +121,7 @@ def test_help_lists_installed_plug_ins_and_imports_none(packages: Path) -> None:
     install(packages, "mine", code, {f"log2sim.{kind}": named for kind, named in kinds.items()})
     expected = {
         "reconstruct": ["--format my-log", "--detector my-detector", "--detector lidar:my-lidar_detector"],
+        "detect": ["--format my-log", "--detector lidar:my-lidar_detector"],
         "export": ["--to my-export"],
         "replay": ["--ego my-policy", "--model my-vehicle_model"],
     }
@@ -215,7 +216,7 @@ def test_what_is_no_plug_in_is_one_line_that_names_the_package(
 @pytest.mark.parametrize(
     ("code", "message"),
     [
-        ("def THING(log, **k): return 3", r"made a int without 'name', 'default_min_score', 'detect'"),
+        ("def THING(log, **k): return 3", r"is a int without 'name', 'default_min_score', 'detect'"),
         ("def THING(log, **k): return {}['x']", r"raised KeyError: 'x' \(line 1 of broken\.py\)"),
         (
             "{D}    def detect(self): pass",
